@@ -1,0 +1,57 @@
+"""The one look of every figure: colours, sizes, the landmark legend, image panels."""
+
+from __future__ import annotations
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+__all__ = ["COLOURS", "LANDMARK_COLOURS", "figure", "show_image"]
+
+#: Colour-blind safe (Okabe and Ito), named by what they mean here.
+COLOURS = {
+    "ours": "#0072B2",
+    "paper": "#D55E00",
+    "truth": "#009E73",
+    "baseline": "#999999",
+    "left": "#0072B2",
+    "right": "#CC79A7",
+    "warning": "#E69F00",
+}
+LANDMARK_COLOURS = {"base": "#56B4E9", "tip_1": "#F0E442", "tip_2": "#CC79A7"}
+
+_RC = {
+    "figure.dpi": 100,
+    "savefig.dpi": 100,
+    "figure.facecolor": "white",
+    "font.size": 10,
+    "axes.titlesize": 11,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": "#e6e6e6",
+    "grid.linewidth": 0.6,
+    "axes.axisbelow": True,
+    "lines.linewidth": 1.8,
+    "legend.frameon": False,
+    "image.cmap": "viridis",
+}
+
+
+def figure(rows: int = 1, columns: int = 1, *, width_in: float = 10.0, height_in: float = 4.0, **subplots) -> tuple[Figure, np.ndarray | Axes]:
+    """A figure in the workbench's look; `subplots` goes to `matplotlib.pyplot.subplots` (squeezed as there)."""
+    with plt.rc_context(_RC):
+        return plt.subplots(rows, columns, figsize=(width_in, height_in), layout="constrained", **subplots)
+
+
+def show_image(axes: Axes, image: np.ndarray, title: str = "") -> Axes:
+    """An image without ticks or grid, pixel centres on integers."""
+    axes.imshow(image, cmap="gray" if image.ndim == 2 else None, interpolation="antialiased")
+    axes.set(xticks=[], yticks=[], title=title)
+    axes.grid(False)
+    for spine in axes.spines.values():
+        spine.set_visible(False)
+    return axes

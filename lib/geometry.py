@@ -1,0 +1,138 @@
+"""Rigid transforms, pixel grids and the argument checks that several modules share.
+
+Conventions: points are rows, (n, 3) millimetres or (n, 2) pixels (x right, y down, integer coordinates are
+pixel centres); a transform is named ``target_from_source``; angles are radians.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
+
+__all__ = ["RigidTransform", "cell_from_image", "finite_points", "image_from_cell", "points"]
+
+
+def points(values: ArrayLike, dimension: int, name: str) -> np.ndarray:
+    """`values` as a float64 array (n, dimension); NaN passes.
+
+    Raises
+    ------
+    ValueError
+        If the shape is not (n, dimension) or a single (dimension,) point; `name` is the argument named.
+    """
+    array = np.asarray(values, dtype=np.float64)
+    if array.ndim == 1 and array.shape == (dimension,):
+        array = array[None]
+    if array.ndim != 2 or array.shape[1] != dimension:
+        raise ValueError(
+            f"{name}: expected an array of shape (n, {dimension}), got {array.shape}. "
+            f"Give one point a row, {dimension} coordinates each."
+        )
+    return array
+
+
+def finite_points(values: ArrayLike, dimension: int, name: str) -> np.ndarray:
+    """`points`, with NaN and infinity refused.
+
+    Raises
+    ------
+    ValueError
+        Also if a row is not finite; the message counts the rows and names the first.
+    """
+    array = points(values, dimension, name)
+    bad = np.flatnonzero(~np.isfinite(array).all(axis=1))
+    if bad.size:
+        raise ValueError(
+            f"{name}: {bad.size} of {len(array)} rows are not finite (the first is row {bad[0]}). "
+            "Drop the rows of missing landmarks first."
+        )
+    return array
+
+
+@dataclass(frozen=True, eq=False)
+class RigidTransform:
+    """x_target = R @ x_source + t, named ``target_from_source``.
+
+    Attributes
+    ----------
+    R:
+        Rotation (3, 3), orthonormal with determinant +1.
+    t:
+        Translation (3,) in mm.
+    """
+
+    R: np.ndarray
+    t: np.ndarray
+
+    def __post_init__(self) -> None:
+        R = np.array(self.R, dtype=np.float64)
+        t = np.array(self.t, dtype=np.float64)
+        if R.shape != (3, 3) or t.shape != (3,):
+            raise ValueError(f"RigidTransform: R must be (3, 3) and t (3,), got {R.shape} and {t.shape}.")
+        if not (np.isfinite(R).all() and np.isfinite(t).all()):
+            raise ValueError("RigidTransform: R and t must be finite.")
+        if not np.allclose(R @ R.T, np.eye(3), atol=1e-6) or np.linalg.det(R) < 0:
+            raise ValueError("RigidTransform: R is not a rotation (orthonormal, determinant +1).")
+        R.setflags(write=False)
+        t.setflags(write=False)
+        object.__setattr__(self, "R", R)
+        object.__setattr__(self, "t", t)
+
+    @classmethod
+    def identity(cls) -> RigidTransform:
+        """The transform that moves nothing."""
+        return cls(np.eye(3), np.zeros(3))
+
+    @classmethod
+    def from_rotation_vector(cls, rotation_rad: ArrayLike, t_mm: ArrayLike = (0.0, 0.0, 0.0)) -> RigidTransform:
+        """Rotation by the angle |rotation_rad| about its direction, then translation by t_mm."""
+        return cls(Rotation.from_rotvec(np.asarray(rotation_rad, dtype=float)).as_matrix(), np.asarray(t_mm))
+
+    def apply(self, x: ArrayLike) -> np.ndarray:
+        """Points (n, 3) or one point (3,) moved from the source to the target frame."""
+        array = np.asarray(x, dtype=np.float64)
+        if array.shape[-1:] != (3,):
+            raise ValueError(f"x: expected 3 coordinates in the last axis, got shape {array.shape}.")
+        return array @ self.R.T + self.t
+
+    def inverse(self) -> RigidTransform:
+        """source_from_target."""
+        return RigidTransform(self.R.T, -self.R.T @ self.t)
+
+    def compose(self, other: RigidTransform) -> RigidTransform:
+        """``a_from_b.compose(b_from_c)`` is ``a_from_c``: `other` is applied first."""
+        return RigidTransform(self.R @ other.R, self.R @ other.t + self.t)
+
+    @property
+    def rotation_vector_rad(self) -> np.ndarray:
+        """Axis times angle, (3,)."""
+        return Rotation.from_matrix(self.R).as_rotvec()
+
+    @property
+    def euler_rad(self) -> np.ndarray:
+        """Angles (3,) about the fixed axes x, y, z, in this order (the paper's Phi_X, Phi_Y, Phi_Z)."""
+        return Rotation.from_matrix(self.R).as_euler("xyz")
+
+    @property
+    def matrix(self) -> np.ndarray:
+        """Homogeneous (4, 4)."""
+        return np.vstack([np.column_stack([self.R, self.t]), [0.0, 0.0, 0.0, 1.0]])
+
+
+def image_from_cell(u_cell: ArrayLike, stride: ArrayLike) -> np.ndarray:
+    """Pixels of the finer grid from cells of the coarser: u = s * u_cell + (s - 1) / 2, per axis.
+
+    Integer coordinates are centres on both grids, so the centre of cell 0 lies at (s - 1) / 2.  `stride` is
+    a number, or (s_x, s_y) where a resize is anisotropic; it need not be an integer.
+    """
+    s = np.asarray(stride, dtype=np.float64)
+    return s * np.asarray(u_cell, dtype=np.float64) + (s - 1.0) / 2.0
+
+
+def cell_from_image(u: ArrayLike, stride: ArrayLike) -> np.ndarray:
+    """The inverse of `image_from_cell`."""
+    s = np.asarray(stride, dtype=np.float64)
+    return (np.asarray(u, dtype=np.float64) - (s - 1.0) / 2.0) / s

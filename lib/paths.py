@@ -1,0 +1,42 @@
+"""Where things lie: the one place that knows the folders of the workbench."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+NOTEBOOKS = ROOT / "notebooks"
+DATA = ROOT / "data"
+MODELS = DATA / "models"
+RESULTS = DATA / "results"
+GALLERY = DATA / "gallery"
+CACHE = DATA / "cache"
+RUNS = ROOT / "runs"
+SHIPPED_RECORDING = DATA / "open_sky_eye"
+
+REAL_DATA_VARIABLE = "MICROSTEREO_DATA"
+
+
+def real_data(name: str) -> Path | None:
+    """The folder of a real data set, or None where it is not at hand.
+
+    Real recordings do not ship.  The environment variable ``MICROSTEREO_DATA`` names the folder that holds
+    them, one folder a data set (`data/README.md` says where a user gets each).
+
+    Parameters
+    ----------
+    name:
+        Folder of the data set, such as ``"retinal_microsurgery"``.
+    """
+    root = os.environ.get(REAL_DATA_VARIABLE)
+    if not root:
+        return None
+    folder = (ROOT / Path(root)).resolve() if not Path(root).is_absolute() else Path(root)
+    folder = folder / name
+    return folder if folder.is_dir() else None
+
+
+def missing_data_line(name: str) -> str:
+    """The one line a notebook prints when a real data set is not at hand, and then goes on."""
+    return f"Skipped: the real data set '{name}' is not at hand; point {REAL_DATA_VARIABLE} at the folder that holds it."
