@@ -1,0 +1,161 @@
+"""What a notebook states: metrics and named figures that the main job collects from the executed notebook.
+
+Both travel inside the notebook's outputs (a metric as JSON under its own mime type, a figure as a PNG that knows
+its name), so an executed notebook alone is the record of what it found.  Outside Jupyter they print one line.
+"""
+
+from __future__ import annotations
+
+import html
+import io
+import math
+import re
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from matplotlib.figure import Figure
+
+__all__ = ["FIGURE_METADATA", "METRIC_MIME", "record", "show", "timed"]
+
+#: Mime type of a metric in a notebook's outputs; the JSON holds name, value, unit, paper, note.
+METRIC_MIME = "application/vnd.microstereo.metric+json"
+#: Key of the output metadata that names a figure: {"name": ..., "caption": ...}.
+FIGURE_METADATA = "microstereo_figure"
+
+_NAME = re.compile(r"[a-z][a-z0-9_.]*")
+
+
+def record(name: str, value: float, unit: str, *, paper: float | None = None, note: str = "") -> None:
+    """State one figure: shown as a small row, and collected into the run's ``metrics.json``.
+
+    Parameters
+    ----------
+    name:
+        Lower-case snake case that starts with the stage, such as ``"calibration_reprojection_px"``.
+        Recording a name again in the same notebook replaces its value.
+    value:
+        A number; NaN and infinity are stored as null (JSON has no word for them).
+    unit:
+        ``"px"``, ``"mm"``, ``"um"``, ``"s"``, ``"%"``, ...; ``""`` for a pure number.
+    paper:
+        The paper's value in the same unit, where it states one.
+    note:
+        What a reader must know to judge the figure: the data, the number of samples.
+
+    Raises
+    ------
+    ValueError
+        For a name that is not snake case, or a value that is not a number.
+    """
+    metric = {
+        "name": _checked_name(name),
+        "value": _number(value, "value"),
+        "unit": unit,
+        "paper": None if paper is None else _number(paper, "paper"),
+        "note": note,
+    }
+    text = f"{name} = {format_value(metric['value'])} {unit}".rstrip()
+    if paper is not None:
+        text += f" (paper: {format_value(metric['paper'])} {unit})".replace(" )", ")")
+    if note:
+        text += f"  # {note}"
+    _publish({METRIC_MIME: metric, "text/html": _row_html(metric), "text/plain": text}, text)
+
+
+def show(figure: Figure, name: str, caption: str) -> None:
+    """Display a matplotlib figure as a PNG with its caption, named for the run's ``figures/``, and close it.
+
+    Parameters
+    ----------
+    name:
+        Lower-case snake case that starts with the stage; the file's name in ``figures/``.
+    caption:
+        One line: what the reader sees, and what to look at.
+    """
+    import matplotlib.pyplot as plt
+
+    _checked_name(name)
+    text = f"Figure {name}: {caption}"
+    try:
+        if _in_notebook():
+            buffer = io.BytesIO()
+            figure.savefig(buffer, format="png")
+            _publish(
+                {"image/png": buffer.getvalue(), "text/plain": text},
+                text,
+                {FIGURE_METADATA: {"name": name, "caption": caption}, "image/png": {"alt": caption}},
+            )
+            style = "max-width:60em;margin:0 0 1.2em;color:#555;font-size:90%"
+            _publish({"text/html": f'<p style="{style}">{html.escape(caption)}</p>', "text/plain": caption}, caption)
+        else:
+            print(text)
+    finally:
+        plt.close(figure)
+
+
+@contextmanager
+def timed(stage: str) -> Iterator[None]:
+    """Record the wall-clock seconds of the block as the metric ``seconds_<stage>``; nothing if the block raises."""
+    name = _checked_name(f"seconds_{stage}")
+    start = time.perf_counter()
+    yield
+    record(name, round(time.perf_counter() - start, 4), "s")
+
+
+def format_value(value: float | None) -> str:
+    """A number as a reader wants it: four significant digits, no exponent where none is needed."""
+    if value is None:
+        return "n/a"
+    if isinstance(value, int) or (float(value).is_integer() and abs(value) < 1e7):
+        return f"{int(value)}"
+    return f"{value:.4g}" if 1e-4 <= abs(value) < 1e7 else f"{value:.3e}"
+
+
+def _checked_name(name: str) -> str:
+    if not _NAME.fullmatch(name):
+        raise ValueError(f"name: {name!r} is not lower-case snake case, such as 'calibration_reprojection_px'.")
+    return name
+
+
+def _number(value: float, argument: str) -> float | int | None:
+    try:
+        number = value.item() if hasattr(value, "item") else value  # numpy and torch scalars
+        number = int(number) if isinstance(number, int) else float(number)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ValueError(f"{argument}: one number is needed, got {value!r} ({error}).") from None
+    return number if math.isfinite(number) else None
+
+
+def _row_html(metric: dict) -> str:
+    unit = html.escape(metric["unit"])
+    cells = [
+        f"<code>{html.escape(metric['name'])}</code>",
+        f"<b>{format_value(metric['value'])}</b> {unit}",
+    ]
+    if metric["paper"] is not None:
+        cells.append(f'<span style="color:#b34a00">paper: {format_value(metric["paper"])} {unit}</span>')
+    if metric["note"]:
+        cells.append(f'<span style="color:#777">{html.escape(metric["note"])}</span>')
+    return f'<div style="font-size:90%;padding:1px 0">{" &ensp; ".join(cells)}</div>'
+
+
+def _in_notebook() -> bool:
+    """True in a Jupyter kernel (not in plain Python, nor in terminal IPython)."""
+    ipython = sys.modules.get("IPython")
+    shell = ipython.get_ipython() if ipython else None
+    return shell is not None and getattr(shell, "kernel", None) is not None
+
+
+def _publish(bundle: dict, line: str, metadata: dict | None = None) -> None:
+    if not _in_notebook():
+        print(line)
+        return
+    from IPython.display import display
+
+    if "image/png" in bundle:
+        import base64
+
+        bundle = {**bundle, "image/png": base64.b64encode(bundle["image/png"]).decode("ascii")}
+    display(bundle, metadata=metadata, raw=True)
