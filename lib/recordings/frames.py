@@ -1,0 +1,188 @@
+"""The stereo frames of a recording: folders of images or two videos, decoded when asked for."""
+
+from __future__ import annotations
+
+import itertools
+from collections import OrderedDict
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol, overload
+
+import cv2
+import numpy as np
+from PIL import Image, UnidentifiedImageError
+
+__all__ = ["IMAGE_SUFFIXES", "Frames", "StereoFrame", "open_side", "read_image"]
+
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
+_CACHED_PAIRS = 4
+
+
+@dataclass(frozen=True)
+class StereoFrame:
+    """One stereo pair: `left` and `right` (h, w, 3) uint8 RGB, read-only; `time_s` on the video clock."""
+
+    left: np.ndarray
+    right: np.ndarray
+    time_s: float
+
+
+def read_image(path: Path, image_size_px: tuple[int, int] | None = None) -> np.ndarray:
+    """An image file as (h, w, 3) uint8 RGB.
+
+    Raises
+    ------
+    FileNotFoundError, ValueError
+        If there is no such file, it cannot be decoded, or its size is not `image_size_px` (width, height).
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such image.")
+    data = np.fromfile(path, dtype=np.uint8)  # not cv2.imread: it fails on non-ASCII paths on some systems
+    image = cv2.imdecode(data, cv2.IMREAD_COLOR_RGB) if data.size else None
+    if image is None:
+        raise ValueError(f"{path}: the image is corrupt; it cannot be decoded. Export it again.")
+    _check_size(path, (image.shape[1], image.shape[0]), image_size_px)
+    return image
+
+
+def _check_size(path: Path, size: tuple[int, int], expected: tuple[int, int] | None) -> None:
+    if expected is not None and size != tuple(expected):
+        raise ValueError(
+            f"{path}: {size[0]} x {size[1]} px, but recording.toml says image_size_px = [{expected[0]}, {expected[1]}]."
+        )
+
+
+class Side(Protocol):
+    """The frames of one camera."""
+
+    def __len__(self) -> int: ...
+    def read(self, index: int) -> np.ndarray: ...
+
+
+class ImageFolder:
+    """Images numbered from 0 without a gap; the header and the end of every file are checked at once."""
+
+    def __init__(self, folder: Path, image_size_px: tuple[int, int]) -> None:
+        self.image_size_px = image_size_px
+        self.paths = sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES)
+        for index, path in enumerate(self.paths):
+            if not path.stem.isdecimal():
+                raise ValueError(f"{path}: frames are named by number, such as 000000{path.suffix}.")
+            if int(path.stem) != index:
+                raise ValueError(
+                    f"{folder}: frame {index:06d} is missing or named twice (found {path.name} in its place). "
+                    "Frames are numbered from 000000 without a gap."
+                )
+            self._check(path)
+
+    def _check(self, path: Path) -> None:
+        try:
+            with Image.open(path) as image:  # reads the header only
+                size = image.size
+        except (UnidentifiedImageError, OSError, SyntaxError):
+            raise ValueError(f"{path}: the image is corrupt; its header cannot be read. Export it again.") from None
+        _check_size(path, size, self.image_size_px)
+        with path.open("rb") as stream:
+            stream.seek(-min(path.stat().st_size, 32), 2)
+            end = stream.read()
+        if (b"IEND" if path.suffix.lower() == ".png" else b"\xff\xd9") not in end:
+            raise ValueError(f"{path}: the image is cut off before its end. Export it again.")
+
+    def __len__(self) -> int:
+        return len(self.paths)
+
+    def read(self, index: int) -> np.ndarray:
+        return read_image(self.paths[index], self.image_size_px)
+
+
+class Video:
+    """A video file; reading in order decodes each frame once, going back seeks."""
+
+    def __init__(self, path: Path, image_size_px: tuple[int, int]) -> None:
+        self.path = path
+        self._capture = cv2.VideoCapture(str(path))
+        if not self._capture.isOpened():
+            raise ValueError(f"{path}: the video cannot be opened; H.264 or MPEG-4 in an .mp4 file works.")
+        size = tuple(int(self._capture.get(key)) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+        _check_size(path, size, image_size_px)
+        self._count = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        self._next = 0
+
+    def __len__(self) -> int:
+        return self._count
+
+    def read(self, index: int) -> np.ndarray:
+        if not self._next <= index < self._next + 32:
+            self._capture.set(cv2.CAP_PROP_POS_FRAMES, index)
+            self._next = index
+        while self._next <= index:
+            ok, image = self._capture.read()
+            if not ok:
+                raise ValueError(
+                    f"{self.path}: frame {self._next} of {self._count} cannot be decoded; the file is cut."
+                )
+            self._next += 1
+        return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+def open_side(folder: Path, side: str, image_size_px: tuple[int, int]) -> Side:
+    """The frames of one camera (`side` is "left" or "right") of a recording's folder."""
+    images, video = folder / side, folder / f"{side}.mp4"
+    if images.is_dir() and video.is_file():
+        raise ValueError(f"{folder}: both {side}/ and {side}.mp4; keep one.")
+    if video.is_file():
+        return Video(video, image_size_px)
+    if images.is_dir():
+        return ImageFolder(images, image_size_px)
+    raise FileNotFoundError(f"{folder}: no {side}/ folder of images and no {side}.mp4.")
+
+
+class Frames(Sequence[StereoFrame]):
+    """Stereo frames in order of time; decoded when indexed, the last few kept.
+
+    A slice is again `Frames` and decodes nothing.
+
+    Attributes
+    ----------
+    time_s:
+        (n,) video clock, strictly increasing.
+    """
+
+    def __init__(self, left: Side, right: Side, time_s: np.ndarray) -> None:
+        self.time_s = np.array(time_s, dtype=np.float64)
+        self.time_s.setflags(write=False)
+        self._sides = (left, right)
+        self._indices = range(len(self.time_s))
+        self._cache: OrderedDict[int, StereoFrame] = OrderedDict()
+
+    def __len__(self) -> int:
+        return len(self._indices)
+
+    @overload
+    def __getitem__(self, index: int) -> StereoFrame: ...
+    @overload
+    def __getitem__(self, index: slice) -> Frames: ...
+    def __getitem__(self, index: int | slice) -> StereoFrame | Frames:
+        if isinstance(index, slice):
+            part = object.__new__(Frames)
+            part.time_s, part._sides, part._indices = self.time_s[index], self._sides, self._indices[index]
+            part._cache = self._cache  # keyed by the frame's number on disk
+            return part
+        try:
+            number, time_s = self._indices[index], float(self.time_s[index])
+        except IndexError:
+            raise IndexError(f"frame {index}: the recording has {len(self)} frames.") from None
+        if number in self._cache:
+            self._cache.move_to_end(number)
+            return self._cache[number]
+        left, right = (side.read(number) for side in self._sides)
+        left.setflags(write=False)
+        right.setflags(write=False)
+        self._cache[number] = frame = StereoFrame(left, right, time_s)
+        for old in list(itertools.islice(self._cache, max(0, len(self._cache) - _CACHED_PAIRS))):
+            del self._cache[old]
+        return frame
+
+    def __iter__(self) -> Iterator[StereoFrame]:
+        return (self[i] for i in range(len(self)))

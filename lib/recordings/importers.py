@@ -1,0 +1,78 @@
+"""Importers of public data sets that are not recordings in the sense of this package."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from lib.recordings.frames import read_image
+from lib.recordings.tables import columns, read_table
+
+__all__ = ["MonocularSequence", "import_retinal_microsurgery"]
+
+
+@dataclass(frozen=True)
+class MonocularSequence:
+    """Labelled frames of one camera, no kinematics.
+
+    Attributes
+    ----------
+    frame_numbers:
+        (n,) int, the numbers in the original video.
+    paths:
+        n image files.
+    u:
+        (n, 3, 2) px of base, tip_1, tip_2; NaN where not visible.
+    image_size_px:
+        (width, height).
+    """
+
+    name: str
+    frame_numbers: np.ndarray
+    paths: tuple[Path, ...]
+    u: np.ndarray
+    image_size_px: tuple[int, int]
+
+    def __len__(self) -> int:
+        return len(self.paths)
+
+    def image(self, index: int) -> np.ndarray:
+        """Frame `index` as (h, w, 3) uint8 RGB."""
+        return read_image(self.paths[index], self.image_size_px)
+
+
+def import_retinal_microsurgery(folder: str | Path) -> list[MonocularSequence]:
+    """The Retinal Microsurgery sequences (Sznitman et al., MICCAI 2012): in-vivo frames with tool landmarks.
+
+    Parameters
+    ----------
+    folder:
+        Holds ``seq1/``, ``seq2/``, ...: images named by frame number and ``landmarks.csv`` (frame, then x and y of
+        shaft, base, tip_1, tip_2 in whole pixels, empty = not visible).
+
+    Raises
+    ------
+    FileNotFoundError, ValueError
+        Naming the file.
+    """
+    folder = Path(folder)
+    tables = sorted(folder.glob("*/landmarks.csv"))
+    if not tables:
+        raise FileNotFoundError(f"{folder}: no SEQUENCE/landmarks.csv; expected seq1/landmarks.csv and so on.")
+    sequences = []
+    for path in tables:
+        table = read_table(path, ["frame", "shaft_x", "shaft_y", *columns(["x", "y"])])
+        if not len(table) or np.isnan(table[:, 0]).any():
+            raise ValueError(f"{path}: empty, or a row without a frame number.")
+        numbers = table[:, 0].astype(np.int64)
+        images = tuple(path.with_name(f"{number:06d}.jpg") for number in numbers)
+        missing = [image for image in images if not image.is_file()]
+        if missing:
+            raise FileNotFoundError(f"{missing[0]}: no such image ({len(missing)} of {len(images)} missing).")
+        u = table[:, 3:].reshape(-1, 3, 2)
+        u[np.isnan(u).any(axis=2)] = np.nan
+        first = read_image(images[0])
+        sequences.append(MonocularSequence(path.parent.name, numbers, images, u, (first.shape[1], first.shape[0])))
+    return sequences
