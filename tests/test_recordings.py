@@ -1,0 +1,435 @@
+"""Recordings: what is written is read, and what is wrong is refused with the file's name."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+
+from lib import paths
+from lib.recordings import Kinematics, Recording, RecordingWriter, import_retinal_microsurgery
+from lib.simulator.rig import reference_rig
+
+N, SIZE = 4, (64, 48)
+
+
+def tool(m: int) -> np.ndarray:
+    """Landmarks (m, 3, 3) mm of a tool of 4 mm that moves on a line."""
+    shape = np.array([[0.0, 0, 0], [4.0, 0.5, 0], [4.0, -0.5, 0]])
+    return shape + np.linspace(0, 1, m)[:, None, None] * np.array([1.0, 2.0, 3.0])
+
+
+def frames(seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 256, (N, 2, SIZE[1], SIZE[0], 3), dtype=np.uint8)
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """A small, complete recording, read-only by agreement; `folder` gives a copy to spoil."""
+    folder = tmp_path_factory.mktemp("recordings") / "whole"
+    rng = np.random.default_rng(1)
+    u = rng.uniform(0, 47, (2, N, 3, 2))
+    u[0, 1, 2] = np.nan
+    with RecordingWriter(
+        folder,
+        name="whole",
+        fps=25.0,
+        image_size_px=SIZE,
+        readout_s=0.02,
+        offset_s=0.1,
+        suffix=".png",
+        details={"seed": 1},
+    ) as writer:
+        for left, right in frames():
+            writer.add(left, right)
+        writer.kinematics(np.arange(40) * 0.01, tool(40))
+        writer.annotations(*u)
+        visibility = np.full((N, 3), 2)
+        grid = np.arange(0.0, 64, 8), np.arange(0.0, 48, 8)
+        surface = np.stack([*np.meshgrid(*grid), np.ones((6, 8))], axis=-1)
+        writer.truth(reference_rig(), tool(N), *u, visibility, visibility, surface=(*grid, surface))
+    return folder, u
+
+
+@pytest.fixture
+def folder(written, tmp_path):
+    return shutil.copytree(written[0], tmp_path / "copy")
+
+
+def edit(path, old: str, new: str) -> None:
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+
+
+def test_what_is_written_is_read(written):
+    folder, u = written
+    recording = Recording.open(folder)
+    assert (recording.name, recording.fps, recording.image_size_px) == ("whole", 25.0, SIZE)
+    assert (recording.readout_s, recording.offset_s, recording.robot_accuracy_mm) == (0.02, 0.1, 0.010)
+    assert recording.details == {"seed": 1}
+    assert len(recording) == len(recording.frames) == N
+    np.testing.assert_allclose(recording.frames.time_s, np.arange(N) / 25)
+    for i, frame in enumerate(recording.frames):
+        np.testing.assert_array_equal([frame.left, frame.right], frames()[i])  # PNG is lossless; the order is RGB
+        assert frame.time_s == pytest.approx(i / 25)
+    np.testing.assert_allclose(recording.kinematics.x_mm, tool(40), atol=1e-6)
+    np.testing.assert_allclose(recording.annotations.u_left, u[0], atol=1e-3)
+    assert recording.annotations.visibility_left[1].tolist() == [2, 2, 0]
+    assert recording.truth is not None
+    np.testing.assert_array_equal(recording.truth.rig.linear, reference_rig().linear)
+    np.testing.assert_allclose(recording.truth.landmarks_mm, tool(N), atol=1e-7)
+    np.testing.assert_allclose(recording.truth.u_right, u[1], atol=1e-5)
+    np.testing.assert_allclose(recording.truth.surface([[3.0, 7.0]]), [[3, 7, 1]], atol=1e-6)
+    assert np.isnan(recording.truth.surface([[63.0, 7.0]])).all()
+    assert not (folder.parent / "whole.partial").exists()
+
+
+def test_slices_share_frames_and_images_are_read_only(written):
+    whole = Recording.open(written[0]).frames
+    part = whole[1:3]
+    assert len(part) == 2
+    assert part[0] is whole[1]
+    assert part[-1].time_s == pytest.approx(2 / 25)
+    with pytest.raises(ValueError, match="read-only"):
+        part[0].left[0, 0] = 0
+    with pytest.raises(IndexError, match="4 frames"):
+        whole[4]
+
+
+def test_cache_is_small(written):
+    whole = Recording.open(written[0]).frames
+    first = whole[0]
+    for _ in range(3):
+        list(whole)
+    assert len(whole._cache) <= 4
+    np.testing.assert_array_equal(whole[0].left, first.left)
+
+
+def test_kinematics_interpolate_on_the_robot_clock(written):
+    recording = Recording.open(written[0])
+    expected = recording.kinematics.at(recording.frames.time_s + 0.1)
+    np.testing.assert_allclose(recording.landmarks_mm(), expected)
+    speed_mm_s = np.array([1.0, 2.0, 3.0]) / 0.39
+    # A landmark in the last row is read half a readout after the middle row.
+    u = np.full((N, 3, 2), np.nan)
+    u[:, 1, 1] = SIZE[1] - 1
+    shifted = recording.landmarks_mm(u) - recording.landmarks_mm()
+    np.testing.assert_allclose(shifted[:, 1], np.broadcast_to(0.01 * speed_mm_s, (N, 3)), atol=1e-5)
+    np.testing.assert_allclose(shifted[:, [0, 2]], 0, atol=1e-12)
+    with pytest.raises(ValueError, match=r"u: expected \(4, 3, 2\)"):
+        recording.landmarks_mm(u[:2])
+
+
+def test_dropped_samples_do_not_spread():
+    x = tool(4)
+    x[2, 1] = np.nan
+    kinematics = Kinematics(np.array([0.0, 1.0, 2.0, 3.0]), x)
+    at = kinematics.at([0.0, 0.5, 1.0, 1.5, 3.0, 3.1, -0.1])
+    np.testing.assert_allclose(at[1], (x[0] + x[1]) / 2)
+    np.testing.assert_array_equal(at[2], x[1])  # exactly on a sample beside the dropped one
+    assert np.isnan(at[3, 1]).all()
+    assert np.isfinite(at[3, [0, 2]]).all()
+    np.testing.assert_array_equal(at[4], x[3])
+    assert np.isnan(at[5:]).all()
+    np.testing.assert_array_equal(Kinematics(np.array([1.0]), x[:1]).at([1.0, 2.0])[0], x[0])
+
+
+def test_dropped_samples_survive_the_round_trip(tmp_path):
+    x = tool(5)
+    x[3] = np.nan
+    with RecordingWriter(tmp_path / "r", name="r", fps=10, image_size_px=SIZE, jpeg_quality=50) as writer:
+        writer.add(*frames()[0], time_s=0.003)
+        writer.kinematics([0.0, 0.1], x[:2])
+        writer.kinematics(np.arange(2, 5) / 10, x[2:])
+    recording = Recording.open(tmp_path / "r")
+    np.testing.assert_allclose(recording.kinematics.x_mm, x, atol=1e-6)
+    assert recording.frames.time_s == pytest.approx([0.003])  # uneven times go to frames.csv
+    assert recording.annotations is None
+    assert recording.truth is None
+
+
+def spoil_jpeg(path):
+    path.write_bytes(path.read_bytes()[:200])
+
+
+SPOILERS = {
+    "no header": (lambda f: (f / "recording.toml").unlink(), FileNotFoundError, r"recording\.toml"),
+    "bad toml": (lambda f: edit(f / "recording.toml", "fps =", "fps"), ValueError, "not valid TOML"),
+    "unknown key": (
+        lambda f: edit(f / "recording.toml", "readout_s", "readout_ms"),
+        ValueError,
+        "unknown key readout_ms",
+    ),
+    "missing key": (lambda f: edit(f / "recording.toml", "fps = 25.0", ""), ValueError, "fps is missing"),
+    "wrong type": (lambda f: edit(f / "recording.toml", "fps = 25.0", 'fps = "25"'), ValueError, "fps = '25'"),
+    "zero fps": (lambda f: edit(f / "recording.toml", "fps = 25.0", "fps = 0"), ValueError, "must be positive"),
+    "nan offset": (
+        lambda f: edit(f / "recording.toml", "offset_s = 0.1", "offset_s = nan"),
+        ValueError,
+        "offset_s = nan",
+    ),
+    "readout in ms": (
+        lambda f: edit(f / "recording.toml", "readout_s = 0.02", "readout_s = 20"),
+        ValueError,
+        "readout_s = 20",
+    ),
+    "accuracy in um": (
+        lambda f: edit(f / "recording.toml", "robot_accuracy_mm = 0.01", "robot_accuracy_mm = 10"),
+        ValueError,
+        "not plausible in mm",
+    ),
+    "units": (lambda f: edit(f / "recording.toml", 'length = "mm"', 'length = "m"'), ValueError, "units.length = 'm'"),
+    "skeleton": (lambda f: edit(f / "recording.toml", '"tip_1", "tip_2"', '"tip_2", "tip_1"'), ValueError, "skeleton"),
+    "missing frame": (lambda f: (f / "left/000001.png").unlink(), ValueError, "frame 000001 is missing"),
+    "mismatched counts": (lambda f: (f / "right/000003.png").unlink(), ValueError, "4 left and 3 right"),
+    "misnamed frame": (lambda f: (f / "left/000003.png").rename(f / "left/last.png"), ValueError, "named by number"),
+    "not an image": (
+        lambda f: (f / "left/000002.png").write_bytes(b"hello"),
+        ValueError,
+        r"000002\.png: the image is corrupt",
+    ),
+    "empty image": (
+        lambda f: (f / "left/000002.png").write_bytes(b""),
+        ValueError,
+        r"000002\.png: the image is corrupt",
+    ),
+    "cut image": (lambda f: spoil_jpeg(f / "right/000002.png"), ValueError, r"000002\.png: the image is cut off"),
+    "wrong size": (
+        lambda f: cv2.imwrite(str(f / "right/000002.png"), np.zeros((10, 12, 3), np.uint8)),
+        ValueError,
+        r"000002\.png: 12 x 10 px, but .* \[64, 48\]",
+    ),
+    "no side": (lambda f: shutil.rmtree(f / "right"), FileNotFoundError, r"no right/ folder"),
+    "empty recording": (
+        lambda f: [p.unlink() for side in ("left", "right") for p in (f / side).iterdir()],
+        ValueError,
+        "recording is empty",
+    ),
+    "no kinematics": (lambda f: (f / "kinematics.csv").unlink(), FileNotFoundError, r"kinematics\.csv"),
+    "nan kinematics": (
+        lambda f: edit(f / "kinematics.csv", ",0.000000", ",nan"),
+        ValueError,
+        r"kinematics\.csv, line 2, column base_",
+    ),
+    "half a landmark": (
+        lambda f: edit(f / "kinematics.csv", ",4.000000", ","),
+        ValueError,
+        "line 2: a landmark has some",
+    ),
+    "text kinematics": (
+        lambda f: edit(f / "kinematics.csv", "0.0100000", "soon"),
+        ValueError,
+        "line 3, column time_s: 'soon'",
+    ),
+    "short row": (lambda f: edit(f / "kinematics.csv", "4.000000,", ""), ValueError, "line 2: 9 cells"),
+    "time goes back": (lambda f: edit(f / "kinematics.csv", "0.0300000", "0.0100000"), ValueError, "line 5: time_s"),
+    "column in metres": (
+        lambda f: edit(f / "kinematics.csv", "base_x_mm", "base_x_m"),
+        ValueError,
+        "missing: base_x_mm; unknown: base_x_m",
+    ),
+    "no kinematic rows": (
+        lambda f: (f / "kinematics.csv").write_text((f / "kinematics.csv").read_text().splitlines()[0] + "\n"),
+        ValueError,
+        "table is empty",
+    ),
+    "clocks apart": (
+        lambda f: edit(f / "recording.toml", "offset_s = 0.1", "offset_s = 99"),
+        ValueError,
+        "do not overlap",
+    ),
+    "frames.csv": (
+        lambda f: (f / "frames.csv").write_text("frame,time_s\n0,0\n1,1\n"),
+        ValueError,
+        r"frames\.csv: expected one row",
+    ),
+    "frame times": (
+        lambda f: (f / "frames.csv").write_text("frame,time_s\n0,0\n1,.1\n2,.1\n3,.3\n"),
+        ValueError,
+        r"frames\.csv, line 4",
+    ),
+    "bad coco": (lambda f: (f / "annotations.json").write_text("{}"), ValueError, "not COCO keypoints"),
+    "truth without rig": (lambda f: (f / "truth/rig.json").unlink(), FileNotFoundError, r"rig\.json"),
+    "short truth": (
+        lambda f: (f / "truth/landmarks.csv").write_text(
+            "\n".join((f / "truth/landmarks.csv").read_text().splitlines()[:3])
+        ),
+        ValueError,
+        "expected one row for each of the 4 frames",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", SPOILERS)
+def test_bad_recordings_are_refused(folder, case):
+    spoil, kind, text = SPOILERS[case]
+    spoil(folder)
+    with pytest.raises(kind, match=text):
+        Recording.open(folder)
+
+
+def test_metres_are_refused(tmp_path):
+    writer = RecordingWriter(tmp_path / "r", name="r", fps=25, image_size_px=SIZE)
+    with pytest.raises(ValueError, match="Metres or micrometres"), writer:
+        writer.add(*frames()[0])
+        writer.kinematics([0.0, 1.0], tool(2) * 1e-3)
+    assert list(tmp_path.iterdir()) == []  # whole or not at all
+
+
+def test_pixels_that_rot_after_opening_are_noticed(folder):
+    recording = Recording.open(folder)
+    path = folder / "left/000001.png"
+    data = path.read_bytes()
+    path.write_bytes(data[:50] + bytes(200))
+    recording.frames[0]
+    with pytest.raises(ValueError, match=r"000001\.png: the image is corrupt"):
+        recording.frames[1]
+    path.unlink()
+    with pytest.raises(FileNotFoundError, match=r"000001\.png"):
+        recording.frames[1]
+
+
+def test_missing_folder(tmp_path):
+    with pytest.raises(FileNotFoundError, match="no such recording"):
+        Recording.open(tmp_path / "nowhere")
+
+
+def coco(folder, change) -> None:
+    path = folder / "annotations.json"
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+
+
+def test_coco_keypoints_in_any_order(folder):
+    before = Recording.open(folder).annotations
+
+    def reorder(content):
+        content["categories"][0]["keypoints"] = ["tip_2", "shaft", "tip_1", "base"]
+        for entry in content["annotations"]:
+            base, tip_1, tip_2 = np.reshape(entry["keypoints"], (3, 3)).tolist()
+            entry["keypoints"] = [*tip_2, 1, 1, 2, *tip_1, *base]
+
+    coco(folder, reorder)
+    np.testing.assert_array_equal(Recording.open(folder).annotations.u_left, before.u_left)
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        (lambda c: c["images"][0].update(file_name="left/000099.jpg"), "not a frame of this recording"),
+        (lambda c: c["images"][0].update(file_name="000000.jpg"), "not a frame of this recording"),
+        (lambda c: c["annotations"].append(c["annotations"][0]), "annotated twice"),
+        (lambda c: c["annotations"][0].update(image_id=99), "image 99"),
+        (lambda c: c["annotations"][0].update(keypoints=[1, 2]), "x, y, visibility"),
+        (lambda c: c["annotations"][0].update(keypoints=[1, 2, 3] * 3), "visibility is 0, 1 or 2"),
+        (lambda c: c["annotations"][0].update(keypoints=[64, 2, 2] * 3), "outside the image"),
+        (lambda c: c["categories"][0].update(keypoints=["a", "b", "c"]), "are needed"),
+    ],
+)
+def test_bad_annotations_are_refused(folder, change, text):
+    coco(folder, change)
+    with pytest.raises(ValueError, match=text):
+        Recording.open(folder)
+
+
+def test_videos(tmp_path):
+    """A pair of videos behaves like two folders, forwards, backwards and in jumps."""
+    folder = tmp_path / "video"
+    with RecordingWriter(folder, name="v", fps=25, image_size_px=SIZE) as writer:
+        writer.add(*frames()[0])
+        writer.kinematics([0.0, 2.0], tool(2))
+    level = np.arange(10, 250, 6)  # 40 frames, told apart by their grey level
+    for side in ("left", "right"):
+        shutil.rmtree(folder / side)
+        video = cv2.VideoWriter(str(folder / f"{side}.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 25, SIZE)
+        for value in level:
+            video.write(np.full((SIZE[1], SIZE[0], 3), value, np.uint8))
+        video.release()
+    read = Recording.open(folder).frames
+    assert len(read) == 40
+    for i in [0, 1, 2, 39, 5, 38, 3]:
+        assert abs(read[i].left.mean() - level[i]) < 3  # the codec rounds; the next level is 6 away
+    (folder / "left").mkdir()
+    with pytest.raises(ValueError, match="keep one"):
+        Recording.open(folder)
+    (folder / "left").rmdir()
+    (folder / "left.mp4").write_bytes(b"no video")
+    with pytest.raises(ValueError, match="cannot be opened"):
+        Recording.open(folder)
+
+
+def test_writer_refuses_bad_input(tmp_path, written):
+    with pytest.raises(FileExistsError, match="overwrite=True"):
+        RecordingWriter(written[0], name="x", fps=25, image_size_px=SIZE)
+    with pytest.raises(ValueError, match="suffix"):
+        RecordingWriter(tmp_path / "r", name="x", fps=25, image_size_px=SIZE, suffix=".bmp")
+    writer = RecordingWriter(tmp_path / "r", name="x", fps=25, image_size_px=SIZE)
+    with writer:
+        with pytest.raises(ValueError, match="uint8 RGB"):
+            writer.add(np.zeros((48, 64), np.uint8), np.zeros((48, 64), np.uint8))
+        with pytest.raises(ValueError, match="x_mm"):
+            writer.kinematics([0.0], np.zeros((2, 3, 3)))
+        with pytest.raises(ValueError, match="u_left"):
+            writer.annotations(np.zeros((3, 2)), np.zeros((3, 2)))
+        writer.add(*frames()[0])
+        writer.kinematics([0.0, 1.0], tool(2))
+    with RecordingWriter(tmp_path / "r", name="second", fps=25, image_size_px=SIZE, overwrite=True) as writer:
+        writer.add(*frames()[0])
+        writer.kinematics([0.0, 1.0], tool(2))
+    assert Recording.open(tmp_path / "r").name == "second"
+
+
+def test_points_outside_the_image_are_written_as_not_labelled(tmp_path):
+    u = np.full((1, 3, 2), 5.0)
+    u[0, 0, 0] = 64.0
+    with RecordingWriter(tmp_path / "r", name="r", fps=25, image_size_px=SIZE) as writer:
+        writer.add(*frames()[0])
+        writer.kinematics([0.0, 1.0], tool(2))
+        writer.annotations(u, u)
+    annotations = Recording.open(tmp_path / "r").annotations
+    assert annotations.visibility_left.tolist() == [[0, 2, 2]]
+    assert np.isnan(annotations.u_left[0, 0]).all()
+
+
+def test_failure_leaves_nothing(tmp_path):
+    with pytest.raises(RuntimeError), RecordingWriter(tmp_path / "r", name="r", fps=25, image_size_px=SIZE) as writer:
+        writer.add(*frames()[0])
+        raise RuntimeError
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_retinal_microsurgery_layout(tmp_path):
+    sequence = tmp_path / "seq1"
+    sequence.mkdir()
+    header = "frame,shaft_x,shaft_y,base_x,base_y,tip_1_x,tip_1_y,tip_2_x,tip_2_y\n"
+    (sequence / "landmarks.csv").write_text(header + "7,1,2,3,4,5,6,7,8\n8,1,2,,,5,6,7,8\n")
+    with pytest.raises(FileNotFoundError, match="2 of 2 missing"):
+        import_retinal_microsurgery(tmp_path)
+    for number in (7, 8):
+        cv2.imwrite(str(sequence / f"{number:06d}.jpg"), np.zeros((6, 8, 3), np.uint8))
+    (read,) = import_retinal_microsurgery(tmp_path)
+    assert (read.name, len(read), read.image_size_px) == ("seq1", 2, (8, 6))
+    np.testing.assert_array_equal(read.u[0], [[3, 4], [5, 6], [7, 8]])
+    assert np.isnan(read.u[1, 0]).all()
+    assert read.image(1).shape == (6, 8, 3)
+    with pytest.raises(FileNotFoundError, match=r"landmarks\.csv"):
+        import_retinal_microsurgery(tmp_path / "nowhere")
+
+
+@pytest.mark.skipif(
+    paths.real_data("retinal_microsurgery") is None, reason=paths.missing_data_line("retinal_microsurgery")
+)
+def test_real_retinal_microsurgery():
+    sequences = import_retinal_microsurgery(paths.real_data("retinal_microsurgery"))
+    assert [len(sequence) for sequence in sequences] == [402, 222]
+    for sequence in sequences:
+        assert sequence.image(len(sequence) // 2).shape == (480, 640, 3)
+        assert np.nanmin(sequence.u) >= 0
+        assert (np.nanmax(sequence.u, axis=(0, 1)) < [640, 480]).all()
+        reach = np.linalg.norm(sequence.u[:, 1:].mean(axis=1) - sequence.u[:, 0], axis=1)
+        assert 28 < np.nanmedian(reach) < 63  # the jaw's size that the data set states
