@@ -1,0 +1,382 @@
+"""Registration: exact data give the motion, noisy data the minimum, and the cameras that moved are named."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import least_squares, minimize
+from scipy.spatial.transform import Rotation
+
+from lib.cameras import StereoRig
+from lib.geometry import RigidTransform
+from lib.registration import (
+    DriftMonitor,
+    Registration,
+    identify_motion,
+    perturb,
+    register,
+    register_cameras,
+    register_images,
+    registration_errors,
+    tool_frames,
+)
+from lib.registration.experiment import motion_error, random_motion
+from lib.registration.rigid import motion_jacobian
+from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
+
+CENTRE_MM = ROBOT_FROM_MICROSCOPE.t
+RIG = reference_rig()
+SIGMA_PX, SIGMA_MM = 1.5, 0.010
+
+
+def scene(seed: int, n: int = 10, noise: float = 1.0, motion: RigidTransform | None = None, **moved):
+    """(motion, x (3 n, 3), u_left, u_right) of a tool seen by the moved reference rig."""
+    rng = np.random.default_rng(seed)
+    motion = motion or random_motion(rng, centre_mm=CENTRE_MM)
+    frames = tool_frames(
+        n, rng=rng, rig=perturb(RIG, motion, **moved), sigma_u_px=noise * SIGMA_PX, sigma_x_mm=noise * SIGMA_MM
+    )
+    return motion, frames.x_mm.reshape(-1, 3), frames.u_left.reshape(-1, 2), frames.u_right.reshape(-1, 2)
+
+
+def assert_same(estimate: RigidTransform, truth: RigidTransform, tolerance: float = 1e-9) -> None:
+    np.testing.assert_allclose(estimate.R, truth.R, atol=tolerance)
+    np.testing.assert_allclose(estimate.t, truth.t, atol=100 * tolerance)
+
+
+def mahalanobis2(fit: Registration, truth: RigidTransform) -> float:
+    """Squared error in units of the claimed covariance; its mean is 6 if the claim is right."""
+    error = fit.transform.compose(truth.inverse())
+    twist = np.concatenate([error.rotation_vector_rad, error.apply(fit.centre_mm) - fit.centre_mm])
+    return float(twist @ np.linalg.solve(fit.covariance, twist))
+
+
+# --- point sets, Eq. (7) -----------------------------------------------------------------------------------------
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), n=st.integers(3, 20), loss=st.sampled_from(["norm", "squared"]))
+def test_exact_points_give_the_motion(seed, n, loss):
+    rng = np.random.default_rng(seed)
+    truth = RigidTransform(Rotation.random(random_state=rng).as_matrix(), rng.normal(0, 50, 3))
+    x = rng.normal(0, 3, (n, 3))
+    fit = register(x, truth.apply(x), loss=loss)
+    assert_same(fit.transform, truth)
+    np.testing.assert_allclose(fit.residuals, 0, atol=1e-9)
+
+
+def test_half_the_points_may_be_wrong():
+    """The sum of norms recovers exactly what the sum of squares cannot."""
+    rng = np.random.default_rng(3)
+    truth = random_motion(rng, centre_mm=CENTRE_MM)
+    x = rng.normal(0, 3, (30, 3))
+    y = truth.apply(x)
+    y[:12] += rng.uniform(-5, 5, (12, 3))
+    assert_same(register(x, y).transform, truth, 1e-6)
+    assert motion_error(register(x, y, loss="squared").transform, truth, CENTRE_MM)[0] > 0.1
+    assert register(x, y).weights[:12].max() < 1e-3 < register(x, y).weights[12:].min()
+
+
+@pytest.mark.parametrize("loss", ["norm", "squared"])
+def test_minimum_is_that_of_a_general_solver(loss):
+    power = {"norm": 1, "squared": 2}[loss]
+    for seed in range(3):
+        _, x, u_left, u_right = scene(seed, 5)
+        source = RIG.triangulate(u_left, u_right).x_mm
+        fit = register(source, x, loss=loss)
+
+        def cost(p, source=source, x=x, fit=fit):
+            turn = Rotation.from_rotvec(p[:3]).as_matrix()
+            moved = (fit.transform.apply(source) - fit.centre_mm) @ turn.T + fit.centre_mm + p[3:]
+            return (np.linalg.norm(moved - x, axis=1) ** power).sum()
+
+        assert cost(np.zeros(6)) == pytest.approx(fit.cost, rel=1e-12)
+        best = min(
+            minimize(cost, start, method="Nelder-Mead", options={"maxfev": 3000, "xatol": 1e-10, "fatol": 1e-13}).fun
+            for start in (np.zeros(6), np.full(6, 0.02))
+        )
+        assert fit.cost <= best * (1 + 1e-9)
+
+
+def test_mirrored_points_are_not_matched_by_a_reflection():
+    x = np.random.default_rng(0).normal(size=(10, 3))
+    fit = register(x, x * [1, 1, -1])
+    assert np.linalg.det(fit.transform.R) == pytest.approx(1)
+    assert fit.cost > 1
+
+
+@pytest.mark.parametrize(
+    ("source", "target", "text"),
+    [
+        (np.zeros((2, 3)), np.zeros((2, 3)), "x_source: 2 points"),
+        (
+            np.arange(12.0).reshape(4, 3),
+            np.random.default_rng(0).normal(size=(4, 3)),
+            "x_source: the points lie on one line",
+        ),
+        (np.random.default_rng(0).normal(size=(4, 3)), np.ones((4, 3)), "x_target: the points lie on one line"),
+        (np.full((4, 3), np.nan), np.zeros((4, 3)), "x_source: 4 of 4 rows are not finite"),
+        (np.eye(3), np.eye(4)[:, :3], "3 and 4 points"),
+        (np.eye(4), np.eye(4), r"x_source: expected an array of shape \(n, 3\)"),
+    ],
+)
+def test_bad_point_sets(source, target, text):
+    with pytest.raises(ValueError, match=text):
+        register(source, target)
+
+
+def test_unknown_losses():
+    with pytest.raises(ValueError, match="loss: 'norm' or 'squared'"):
+        register(np.eye(3), np.eye(3), loss="huber")
+    with pytest.raises(ValueError, match="loss: 'squared' or 'robust'"):
+        register_images(RIG, *scene(0)[1:], loss="norm")
+
+
+def test_motion_jacobian():
+    offset = np.random.default_rng(0).normal(size=(5, 3))
+    step = 1e-6
+    numeric = np.stack(
+        [(RigidTransform.from_rotation_vector(p[:3], p[3:]).apply(offset) - offset) / step for p in np.eye(6) * step],
+        axis=2,
+    )
+    np.testing.assert_allclose(motion_jacobian(offset), numeric, atol=1e-5)
+
+
+# --- images --------------------------------------------------------------------------------------------------------
+
+
+def test_perturb_moves_what_is_triangulated():
+    motion, x, u_left, u_right = scene(0, noise=0)
+    np.testing.assert_allclose(motion.apply(RIG.triangulate(u_left, u_right).x_mm), x, atol=1e-9)
+    back = perturb(perturb(RIG, motion), motion.inverse())
+    np.testing.assert_allclose(back.linear, RIG.linear, atol=1e-10)
+    np.testing.assert_allclose(back.offset_px, RIG.offset_px, atol=1e-8)
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), n=st.integers(2, 8), loss=st.sampled_from(["squared", "robust"]))
+def test_exact_images_give_the_motion(seed, n, loss):
+    motion, *data = scene(seed, n, noise=0)
+    assert_same(register_images(RIG, *data, covariance_px2=1.0, loss=loss).transform, motion, 1e-7)
+
+
+def test_image_minimum_is_that_of_a_general_solver():
+    for seed in range(3):
+        motion, x, u_left, u_right = scene(seed, 4)
+        fit = register_images(RIG, x, u_left, u_right, covariance_px2=SIGMA_PX**2, sigma_x_mm=SIGMA_MM)
+        whiten = np.linalg.cholesky(np.linalg.inv(SIGMA_PX**2 * np.eye(4) + SIGMA_MM**2 * RIG.linear @ RIG.linear.T)).T
+        y = np.hstack([u_left, u_right])
+
+        def residual(p, x=x, y=y, motion=motion, whiten=whiten):
+            moved = RigidTransform.from_rotation_vector(p[:3], p[3:]).compose(motion.inverse())
+            return ((y - np.hstack(RIG.project(moved.apply(x)))) @ whiten.T).ravel()
+
+        best = least_squares(residual, np.zeros(6), x_scale="jac", xtol=1e-14, ftol=1e-14, gtol=1e-14)
+        assert fit.cost == pytest.approx(2 * best.cost, rel=1e-9)
+        np.testing.assert_allclose(fit.residuals**2 @ np.ones(12), fit.cost, rtol=1e-9)
+
+
+def test_covariances_hold():
+    """Errors over repeated noise are as large as claimed (Monte Carlo against the closed form)."""
+    scores = {"norm": [], "squared": [], "image": [], "unknown": [], "robust": []}
+    known = {"covariance_px2": SIGMA_PX**2, "sigma_x_mm": SIGMA_MM}
+    for seed in range(60):
+        motion, x, *u = scene(seed, 30)
+        source = RIG.triangulate(*u).x_mm
+        scores["norm"].append(mahalanobis2(register(source, x), motion))
+        scores["squared"].append(mahalanobis2(register(source, x, loss="squared"), motion))
+        scores["image"].append(mahalanobis2(register_images(RIG, x, *u, **known), motion))
+        scores["unknown"].append(mahalanobis2(register_images(RIG, x, *u), motion))
+        scores["robust"].append(mahalanobis2(register_images(RIG, x, *u, loss="robust", **known), motion))
+    mean = {name: np.mean(values) for name, values in scores.items()}
+    # 6 +- 0.45 where the model is right; more room where the sandwich is estimated from the residuals.
+    assert 4.6 < mean["image"] < 7.4
+    assert 4.6 < mean["unknown"] < 8.5
+    assert 4.6 < mean["squared"] < 8.5
+    assert 4.6 < mean["robust"] < 8.5
+    assert 3.0 < mean["norm"] < 10.0
+
+
+def test_covariance_at_grows_with_distance():
+    _, *data = scene(1)
+    fit = register_images(RIG, *data)
+    near, far = fit.covariance_at(fit.transform.inverse().apply(fit.centre_mm + np.array([[0, 0, 0], [20.0, 0, 0]])))
+    np.testing.assert_allclose(near, fit.covariance[3:, 3:], rtol=1e-9)
+    assert np.trace(far) > 2 * np.trace(near)
+    np.testing.assert_allclose(fit.translation_sd_mm, np.sqrt(np.diag(near)))
+    assert fit.rotation_sd_rad.shape == (3,)
+
+
+def test_one_image_of_a_landmark_still_counts():
+    motion, x, u_left, u_right = scene(5, 6, noise=0)
+    u_left[::3], u_right[1::3] = np.nan, np.nan
+    u_left[4] = u_right[4] = np.nan
+    fit = register_images(RIG, x, u_left, u_right)
+    assert_same(fit.transform, motion, 1e-7)
+    assert np.isnan(fit.residuals).sum() == 1
+
+
+def test_per_landmark_covariances_steer_the_fit():
+    motion, x, u_left, u_right = scene(2, 6, noise=0)
+    u_left[:3] += 30.0
+    covariance = np.tile(np.eye(4), (len(x), 1, 1))
+    plain = register_images(RIG, x, u_left, u_right, covariance_px2=covariance)
+    covariance[:3] *= 1e8
+    steered = register_images(RIG, x, u_left, u_right, covariance_px2=covariance)
+    assert (
+        motion_error(steered.transform, motion, CENTRE_MM)[0]
+        < 1e-4
+        < motion_error(plain.transform, motion, CENTRE_MM)[0]
+    )
+
+
+def test_gross_outliers_lose_their_weight():
+    motion, x, u_left, u_right = scene(7)
+    u_left[[2, 9, 20]] += [[80.0, -60.0]]
+    fit = register_images(RIG, x, u_left, u_right, covariance_px2=SIGMA_PX**2, loss="robust")
+    plain = register_images(RIG, x, u_left, u_right, covariance_px2=SIGMA_PX**2)
+    assert motion_error(fit.transform, motion, CENTRE_MM)[0] < 0.1 < motion_error(plain.transform, motion, CENTRE_MM)[0]
+    assert fit.weights[[2, 9, 20]].max() < 0.05
+    assert np.delete(fit.weights, [2, 9, 20]).min() > 0.1
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        (lambda x, ul, ur: (x[:2], ul[:2], ur[:2]), "2 points"),
+        (lambda x, ul, ur: (x, ul[:-1], ur), "30, 29 and 30 rows"),
+        (lambda x, ul, ur: (x * np.nan, ul, ur), "x_mm: 30 of 30"),
+        (lambda x, ul, ur: (x, ul * np.nan, ur * np.nan), "0 points"),
+        (lambda x, ul, ur: (np.linspace(0, 1, 30)[:, None] * [1, 2, 3] + CENTRE_MM, ul, ur), "on one line"),
+        (lambda x, ul, ur: (x, ul, ur * np.nan), "leave the motion open"),
+    ],
+)
+def test_bad_images(change, text):
+    with pytest.raises(ValueError, match=text):
+        register_images(RIG, *change(*scene(0)[1:]))
+
+
+def test_bad_noise():
+    data = scene(0)[1:]
+    with pytest.raises(ValueError, match="covariance_px2"):
+        register_images(RIG, *data, covariance_px2=np.eye(3))
+    with pytest.raises(ValueError, match="sigma_x_mm"):
+        register_images(RIG, *data, sigma_x_mm=-1)
+
+
+# --- cameras that move apart -----------------------------------------------------------------------------------------
+
+
+def grid_error_mm(rig: StereoRig, truth: StereoRig) -> float:
+    """Root mean square triangulation error of `rig` over the workspace when `truth` took the pictures."""
+    x = tool_frames(40, rng=np.random.default_rng(99)).true_x_mm.reshape(-1, 3)
+    return float(np.sqrt(((rig.triangulate(*truth.project(x)).x_mm - x) ** 2).sum(axis=1).mean()))
+
+
+def test_cameras_moved_apart_are_recovered_exactly():
+    rng = np.random.default_rng(4)
+    left, right = (random_motion(rng, centre_mm=CENTRE_MM) for _ in range(2))
+    truth = perturb(RIG, left, right)
+    _, *data = scene(0, 4, noise=0, motion=left, right=right)
+    found = register_cameras(RIG, *data, covariance_px2=1.0)
+    np.testing.assert_allclose(found.rig.linear, truth.linear, atol=1e-6)
+    assert grid_error_mm(found.rig, truth) < 1e-6
+
+
+def test_one_camera_alone_breaks_the_rigid_copy():
+    """1 degree of one camera: triangulated points are no rigid copy, Eq. (7) cannot mend it, the images can."""
+    turn = RigidTransform.from_rotation_vector(np.deg2rad(1.0) * RIG.left.viewing_direction)
+    motion = RigidTransform(turn.R, CENTRE_MM - turn.R @ CENTRE_MM)
+    stay = RigidTransform.identity()
+    truth = perturb(RIG, motion, stay)
+    _, *data = scene(0, 20, noise=0, motion=motion, right=stay)
+    rigid = register(RIG.triangulate(*data[1:]).x_mm, data[0], loss="squared")
+    assert np.sqrt((rigid.residuals**2).mean()) > 0.02
+    found = identify_motion(RIG, *data, covariance_px2=1.0)
+    assert found.moved == "left"
+    assert found.right is None
+    assert grid_error_mm(found.rig, truth) < 1e-4 < 0.02 < grid_error_mm(perturb(RIG, rigid.transform), truth)
+
+
+@pytest.mark.parametrize("moved", ["none", "together", "left", "right", "apart"])
+def test_the_camera_that_moved_is_named(moved):
+    rng = np.random.default_rng(8)
+    stay = RigidTransform.identity()
+    a, b = (random_motion(rng, centre_mm=CENTRE_MM, rotation_rad=0.05, translation_mm=0.3) for _ in range(2))
+    pair = {"none": (stay, stay), "together": (a, a), "left": (a, stay), "right": (stay, b), "apart": (a, b)}[moved]
+    _, x, u_left, u_right = scene(11, 8, motion=pair[0], right=pair[1])
+    u_left[3] += 70.0  # one gross error must not decide
+    found = identify_motion(RIG, x, u_left, u_right, covariance_px2=SIGMA_PX**2, sigma_x_mm=SIGMA_MM)
+    assert found.moved == moved
+    assert min(found.bic, key=found.bic.get) == moved
+    assert grid_error_mm(found.rig, perturb(RIG, *pair)) < 0.15
+
+
+# --- drift -----------------------------------------------------------------------------------------------------------
+
+
+def monitor_frames(rig: StereoRig, n: int, seed: int = 0):
+    frames = tool_frames(n, rng=np.random.default_rng(seed), rig=rig)
+    return zip(frames.x_mm, frames.u_left, frames.u_right, strict=True)
+
+
+def test_drift_is_noticed_and_noise_is_not():
+    monitor = DriftMonitor(RIG, covariance_px2=SIGMA_PX**2, sigma_x_mm=SIGMA_MM)
+    assert not any(monitor.update(*frame) for frame in monitor_frames(RIG, 500))
+    chi2 = np.array([entry[0] for entry in monitor.history])
+    assert chi2.mean() == pytest.approx(12, abs=0.7)  # 12 +- 0.22
+    for shift_mm, within in ((0.05, 5), (0.1, 3), (1.0, 3)):
+        moved = perturb(RIG, RigidTransform.from_rotation_vector((0, 0, 0), (shift_mm, 0, 0)))
+        monitor.reset(RIG)
+        alarms = [monitor.update(*frame) for frame in monitor_frames(moved, 6, seed=1)]
+        assert alarms.index(True) < within
+        assert monitor.alarm
+        monitor.reset(moved)
+        assert not any(monitor.update(*frame) for frame in monitor_frames(moved, 100, seed=2))
+
+
+def test_one_bad_frame_raises_no_alarm():
+    monitor = DriftMonitor(RIG, covariance_px2=SIGMA_PX**2)
+    for i, (x, u_left, u_right) in enumerate(monitor_frames(RIG, 20)):
+        assert not monitor.update(x, u_left + 500.0 * (i == 10), u_right)
+
+
+def test_missing_landmarks_do_not_count():
+    monitor = DriftMonitor(RIG, covariance_px2=SIGMA_PX**2)
+    ((x, u_left, u_right),) = monitor_frames(RIG, 1)
+    u_left[0] = np.nan
+    monitor.update(x, u_left, u_right)
+    assert monitor.history[-1][1] == 8
+    before = monitor.statistic
+    monitor.update(x, u_left * np.nan, u_right)
+    assert monitor.history[-1] == (0.0, 0, before)
+    with pytest.raises(ValueError, match="slack"):
+        DriftMonitor(RIG, covariance_px2=1.0, slack=0)
+
+
+# --- the paper's experiment ------------------------------------------------------------------------------------------
+
+
+def test_the_papers_experiment():
+    """Below 150 um after 3 frames, and the image-space estimate is the better one (Sec. V, Fig. Tool Registration)."""
+    estimators = {
+        "norm": lambda rig, x, u_left, u_right: register(rig.triangulate(u_left, u_right).x_mm, x),
+        "image": lambda rig, x, u_left, u_right: register_images(rig, x, u_left, u_right),
+    }
+    errors = registration_errors(estimators, [1, 3, 10], trials=40, rng=np.random.default_rng(0))
+    rms_um = {name: 1e3 * np.sqrt((translation**2).mean(axis=0)) for name, (translation, _) in errors.items()}
+    assert errors["norm"][1].shape == (40, 3, 3)
+    assert (np.diff(rms_um["norm"]) < 0).all()
+    assert rms_um["norm"][1] < 150
+    assert (rms_um["image"] < 0.85 * rms_um["norm"]).all()
+
+
+def test_tool_frames_have_the_tools_size():
+    frames = tool_frames(50, rng=np.random.default_rng(0))
+    jaw = np.linalg.norm(frames.true_x_mm[:, 1:] - frames.true_x_mm[:, :1], axis=2)
+    assert jaw == pytest.approx(jaw[0, 0])
+    assert 2 <= jaw[0, 0] <= 4
+    for u in (frames.u_left, frames.u_right):
+        assert ((u > -200) & (u < [2120, 1280])).all()
