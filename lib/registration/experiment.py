@@ -1,4 +1,4 @@
-"""The paper's registration experiment (Sec. V): known projections moved by a known motion, recovered from few frames."""
+"""The paper's registration experiment (Sec. V): known projections moved by a known motion, then recovered."""
 
 from __future__ import annotations
 
