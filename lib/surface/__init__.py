@@ -1,0 +1,36 @@
+"""Robust bicubic B-spline surfaces from semi-dense stereo points (paper Sec. IV-B).
+
+`fit_surface` solves Eq. (6); what it returns evaluates position, normal, curvature, uncertainty and the distance of a
+tool.  `surface_mesh`, `depth_map` and the `save_` functions take it to other programs.
+"""
+
+from lib.surface.bspline import BSplineSurface, Curvature, SplineGrid, ToolDistance
+from lib.surface.export import (
+    Mesh,
+    depth_map,
+    remove_outliers,
+    save_depth_map,
+    save_mesh,
+    save_points,
+    surface_mesh,
+)
+from lib.surface.fitting import SurfaceFit, fit_surface
+from lib.surface.sphere import Sphere, fit_sphere
+
+__all__ = [
+    "BSplineSurface",
+    "Curvature",
+    "Mesh",
+    "Sphere",
+    "SplineGrid",
+    "SurfaceFit",
+    "ToolDistance",
+    "depth_map",
+    "fit_sphere",
+    "fit_surface",
+    "remove_outliers",
+    "save_depth_map",
+    "save_mesh",
+    "save_points",
+    "surface_mesh",
+]

@@ -244,9 +244,9 @@ class BSplineSurface:
 
     def on_grid(self, x_px: ArrayLike, y_px: ArrayLike) -> np.ndarray:
         """Points (len(y), len(x), 3) on the lattice of columns `x_px` and rows `y_px`: fast for whole images."""
-        x0, y0, x1, y1 = self.grid.domain
         bases, outside = [], []
-        for values, low, cell, n in zip((x_px, y_px), (x0, y0), self.grid.cell_px, self.grid.control, strict=True):
+        axes = zip((x_px, y_px), self.grid.domain[:2], self.grid.cell_px, self.grid.control, strict=True)
+        for values, low, cell, n in axes:
             position = (np.asarray(values, dtype=np.float64) - low) / cell
             index = np.clip(np.floor(np.nan_to_num(position)), 0, n - 4).astype(np.intp)
             basis = np.zeros((len(position), n))

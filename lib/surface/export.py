@@ -1,0 +1,249 @@
+"""Surfaces for other programs: textured meshes (GLB), point clouds (PLY), depth maps (TIFF).
+
+Open3D writes and filters point clouds; it is imported only where it is used, since it needs system libraries.  Files
+appear whole or not at all.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike
+
+from lib.cameras import AffineCamera
+from lib.geometry import finite_points
+from lib.surface.bspline import BSplineSurface
+
+__all__ = ["Mesh", "depth_map", "remove_outliers", "save_depth_map", "save_mesh", "save_points", "surface_mesh"]
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """Triangles of a surface.
+
+    Attributes
+    ----------
+    vertices_mm, normals:
+        (n, 3), and unit vectors (n, 3) towards the camera.
+    faces:
+        (m, 3) int32, counter-clockwise as the camera sees them.
+    u:
+        (n, 2) px of the left image, the texture coordinates.
+    texture:
+        (h, w, 3) uint8 RGB left image, or None.
+    """
+
+    vertices_mm: np.ndarray
+    normals: np.ndarray
+    faces: np.ndarray
+    u: np.ndarray
+    texture: np.ndarray | None = None
+
+    @property
+    def colours(self) -> np.ndarray:
+        """Colour (n, 3) uint8 of each vertex in the texture; grey without one."""
+        if self.texture is None:
+            return np.full((len(self.u), 3), 160, dtype=np.uint8)
+        h, w = self.texture.shape[:2]
+        x, y = np.clip(np.rint(self.u), 0, (w - 1, h - 1)).astype(int).T
+        return self.texture[y, x]
+
+
+def surface_mesh(
+    surface: BSplineSurface, *, step_px: float = 12.0, image: np.ndarray | None = None, mask: np.ndarray | None = None
+) -> Mesh:
+    """Triangles over the surface's domain.
+
+    Parameters
+    ----------
+    step_px:
+        Distance of neighbouring vertices in the left image, at most.
+    image:
+        (h, w, 3) uint8 RGB left image for the texture.
+    mask:
+        (h, w) bool, True where the surface is to be shown; None is everywhere.
+
+    Raises
+    ------
+    ValueError
+        For a step that is not positive, or a mask that leaves no triangle.
+    """
+    if not step_px > 0:
+        raise ValueError(f"step_px: must be positive, got {step_px}.")
+    x0, y0, x1, y1 = surface.grid.domain
+    x = np.linspace(x0, x1, int(np.ceil((x1 - x0) / step_px)) + 1)
+    y = np.linspace(y0, y1, int(np.ceil((y1 - y0) / step_px)) + 1)
+    u = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    corner = (np.arange(len(y) - 1)[:, None] * len(x) + np.arange(len(x) - 1)).ravel()
+    right, below = corner + 1, corner + len(x)
+    faces = np.concatenate([np.stack([corner, below, right], axis=1), np.stack([right, below, below + 1], axis=1)])
+    if mask is not None:
+        column, row = np.clip(np.rint(u), 0, (mask.shape[1] - 1, mask.shape[0] - 1)).astype(int).T
+        faces = faces[np.asarray(mask, dtype=bool)[row, column][faces].all(axis=1)]
+        if not len(faces):
+            raise ValueError("mask: it hides the whole surface; True marks what is shown.")
+        kept, faces = np.unique(faces, return_inverse=True)
+        u, faces = u[kept], faces.reshape(-1, 3)
+    return Mesh(surface(u), surface.normal(u), faces.astype(np.int32), u, image)
+
+
+def save_mesh(mesh: Mesh, path: str | Path) -> Path:
+    """Write a mesh as binary glTF 2.0 (.glb) with its texture inside; vertices in mm under a node scaled to metres.
+
+    Raises
+    ------
+    ValueError
+        For another suffix.
+    """
+    path = _suffixed(path, ".glb")
+    height, width = (1, 1) if mesh.texture is None else mesh.texture.shape[:2]
+    # glTF counts texture coordinates from the image's corner, pixel centres are half a pixel in.
+    uv = (mesh.u + 0.5) / (width, height)
+    arrays = [mesh.vertices_mm, mesh.normals, uv]
+    chunks = [np.ascontiguousarray(a, dtype="<f4").tobytes() for a in arrays]
+    chunks.append(np.ascontiguousarray(mesh.faces, dtype="<u4").tobytes())
+    accessors = [
+        {"bufferView": i, "componentType": 5126, "count": len(a), "type": f"VEC{a.shape[1]}"}
+        for i, a in enumerate(arrays)
+    ]
+    position = mesh.vertices_mm.astype("<f4")
+    accessors[0] |= {"min": position.min(axis=0).tolist(), "max": position.max(axis=0).tolist()}
+    accessors.append({"bufferView": 3, "componentType": 5125, "count": mesh.faces.size, "type": "SCALAR"})
+    material: dict = {"doubleSided": True, "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.9}}
+    document: dict = {
+        "asset": {"version": "2.0", "generator": "microstereo"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "scale": [0.001, 0.001, 0.001]}],
+        "meshes": [
+            {"primitives": [{"attributes": {"POSITION": 0, "NORMAL": 1, "TEXCOORD_0": 2}, "indices": 3, "material": 0}]}
+        ],
+        "accessors": accessors,
+        "materials": [material],
+    }
+    if mesh.texture is not None:
+        chunks.append(_encoded(".jpg", mesh.texture[..., ::-1], "texture"))
+        material["pbrMetallicRoughness"]["baseColorTexture"] = {"index": 0}
+        document |= {"textures": [{"source": 0}], "images": [{"bufferView": 4, "mimeType": "image/jpeg"}]}
+    padded = [chunk + b"\0" * (-len(chunk) % 4) for chunk in chunks]
+    starts = np.concatenate([[0], np.cumsum([len(chunk) for chunk in padded])]).tolist()
+    document["buffers"] = [{"byteLength": starts[-1]}]
+    document["bufferViews"] = [
+        {"buffer": 0, "byteOffset": start, "byteLength": len(chunk)}
+        for start, chunk in zip(starts[:-1], chunks, strict=True)
+    ]
+    text = json.dumps(document, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    body = b"".join(padded)
+    header = struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + len(body))
+    blocks = [header, struct.pack("<I4s", len(text), b"JSON"), text, struct.pack("<I4s", len(body), b"BIN\0"), body]
+    return _write_whole(path, lambda partial: partial.write_bytes(b"".join(blocks)))
+
+
+def save_points(
+    path: str | Path, x_mm: ArrayLike, *, colours: np.ndarray | None = None, normals: ArrayLike | None = None
+) -> Path:
+    """Write points (n, 3) mm as a binary PLY, with colours (n, 3) uint8 RGB and normals (n, 3) where given.
+
+    Raises
+    ------
+    ValueError
+        For NaN, counts that differ, or another suffix.
+    ImportError
+        Where Open3D's system libraries are missing.
+    """
+    path = _suffixed(path, ".ply")
+    x = finite_points(x_mm, 3, "x_mm")
+    for name, values in (("colours", colours), ("normals", normals)):
+        if values is not None and np.shape(values) != x.shape:
+            raise ValueError(f"{name}: expected one row a point, {x.shape}, got {np.shape(values)}.")
+    o3d = _open3d()
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(x))
+    if colours is not None:
+        cloud.colors = o3d.utility.Vector3dVector(np.asarray(colours, dtype=np.float64) / 255)
+    if normals is not None:
+        cloud.normals = o3d.utility.Vector3dVector(np.asarray(normals, dtype=np.float64))
+
+    def write(partial: Path) -> None:
+        if not o3d.io.write_point_cloud(str(partial), cloud):
+            raise OSError(f"{path}: Open3D could not write it.")
+
+    return _write_whole(path, write)
+
+
+def remove_outliers(x_mm: ArrayLike, *, neighbours: int = 20, sigmas: float = 2.0) -> np.ndarray:
+    """Which points (n,) Open3D's statistical outlier removal keeps.
+
+    A point goes when its mean distance to its nearest `neighbours` exceeds the cloud's mean of it by `sigmas`
+    standard deviations.
+    """
+    x = finite_points(x_mm, 3, "x_mm")
+    if len(x) <= neighbours:
+        raise ValueError(f"neighbours: {neighbours} neighbours need more than {len(x)} points; ask for fewer.")
+    o3d = _open3d()
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(x))
+    kept = np.zeros(len(x), dtype=bool)
+    kept[np.asarray(cloud.remove_statistical_outlier(neighbours, sigmas)[1], dtype=int)] = True
+    return kept
+
+
+def depth_map(surface: BSplineSurface, camera: AffineCamera, image_size_px: tuple[int, int]) -> np.ndarray:
+    """Depth (h, w) float32 mm of every left pixel along the viewing direction, NaN outside the domain.
+
+    Depth 0 is the plane across the view through the origin of the surface's frame: an affine camera has no centre to
+    measure from.
+    """
+    width, height = image_size_px
+    x = surface.on_grid(np.arange(width), np.arange(height))
+    return (x @ camera.viewing_direction).astype(np.float32)
+
+
+def save_depth_map(path: str | Path, depth_mm: np.ndarray) -> Path:
+    """Write a depth map (h, w) as a 32-bit float TIFF in mm (NaN where there is none)."""
+    path = _suffixed(path, ".tiff", ".tif")
+    if np.ndim(depth_mm) != 2:
+        raise ValueError(f"depth_mm: expected (h, w), got shape {np.shape(depth_mm)}.")
+    encoded = _encoded(".tiff", np.asarray(depth_mm, dtype=np.float32), "depth_mm")
+    return _write_whole(path, lambda partial: partial.write_bytes(encoded))
+
+
+def _open3d():
+    try:
+        import open3d
+    except (ImportError, OSError) as error:
+        raise ImportError(
+            f"Open3D does not load ({error}). On Debian and Ubuntu: apt-get install libegl1 libgl1 libusb-1.0-0"
+        ) from error
+    return open3d
+
+
+def _encoded(suffix: str, image: np.ndarray, name: str) -> bytes:
+    ok, data = cv2.imencode(suffix, np.ascontiguousarray(image))
+    if not ok:
+        raise ValueError(f"{name}: OpenCV cannot encode an image of shape {image.shape}, type {image.dtype}.")
+    return data.tobytes()
+
+
+def _suffixed(path: str | Path, *suffixes: str) -> Path:
+    path = Path(path)
+    if path.suffix.lower() not in suffixes:
+        raise ValueError(f"path: {path.name} should end in {' or '.join(suffixes)}.")
+    return path
+
+
+def _write_whole(path: Path, write: Callable[[Path], object]) -> Path:
+    # The suffix stays last, since writers choose the format by it.
+    partial = path.with_name(f"{path.stem}.partial{path.suffix}")
+    try:
+        write(partial)
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+    return path

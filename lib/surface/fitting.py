@@ -1,0 +1,339 @@
+"""Robust surface fit: data, smoothness, rejection and uncertainty around the solver (paper Sec. IV-B, Eq. 6)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.linalg import cho_solve_banded, cholesky_banded
+
+from lib.geometry import points
+from lib.surface.bspline import BSplineSurface, SplineGrid
+from lib.surface.solver import L1Problem, L1Solution, cvxpy_reference, interior_point
+
+if TYPE_CHECKING:
+    from lib.cameras import AffineCamera
+
+__all__ = ["REJECT_MEDIANS", "SurfaceFit", "fit_surface"]
+
+#: Default rejection: points whose L1 norm exceeds this many times the median.  Gaussian noise along one axis puts
+#: 0.1 % of its points beyond it.
+REJECT_MEDIANS = 5.0
+
+_SOLVERS = {"interior_point": interior_point, "cvxpy": cvxpy_reference}
+_FOLDS = 3
+_LADDER = 10.0**0.5  # step between candidates of the smoothness
+_EXTENT = 8  # at most so many steps from the first candidate, either way
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceFit:
+    """How a surface was found.
+
+    Attributes
+    ----------
+    objective:
+        Eq. (6) over the final inliers: sum of (weighted) L1 norms in mm plus `smoothness` times the bending energy in
+        mm^2 / px^2.  With point covariances the norms are whitened, with a camera they are depths.
+    duality_gap:
+        Proven bound, in the unit of the objective, on its distance from the minimum (NaN from cvxpy).
+    smoothness:
+        mu of Eq. (6), px^2 / mm: given, or chosen by held-out error.
+    reject_mm:
+        Bound on the L1 norm of a point's residual that was applied, after the first fit.
+    inliers:
+        (n,) points that the final fit used.
+    residual_mm:
+        (n, 3) Psi(u) - x of every given point at the final surface; NaN where u lies outside.
+    iterations:
+        Newton steps of the final solve.
+    held_out:
+        (m, 2) candidates of the smoothness and their mean held-out L1 error (mm), where it was chosen; else (0, 2).
+    axes:
+        (k, 3) orthonormal directions along which the L1 norm was taken: the axes of the frame for the plain fit.
+    """
+
+    objective: float
+    duality_gap: float
+    smoothness: float
+    reject_mm: float
+    inliers: np.ndarray
+    residual_mm: np.ndarray
+    iterations: int
+    held_out: np.ndarray
+    axes: np.ndarray
+    _problem: L1Problem = field(repr=False)
+    _mu: np.ndarray = field(repr=False)
+    _weights: np.ndarray = field(repr=False)
+    _residual: np.ndarray = field(repr=False)
+
+    def covariance(self, grid: SplineGrid, u: np.ndarray) -> np.ndarray:
+        """Covariance (n, 3, 3) mm^2 of Psi(u) (n, 2), NaN outside the domain.
+
+        The curvature of the expected L1 loss is 2 f(0) B'B, where f(0) is the density of the residuals at zero; with
+        the bending energy as the prior this gives C = (2 f B'B + 2 mu R)^-1 / (2 f) for the coefficients of an output
+        (Koenker, Quantile Regression, Sec. 4.2; Wahba, J. R. Stat. Soc. B 45, 1983, for reading the penalty as a
+        prior, which makes the bands hold the smoothing bias on average).  Outputs correlate as the signs of their
+        residuals do.  Errors that neighbouring points share, such as those of the calibration, are not in it.
+        """
+        result = np.full((len(u), 3, 3), np.nan)
+        inside = np.flatnonzero(grid.inside(u))
+        for part in np.array_split(inside, max(1, len(inside) // 2048)):
+            columns = grid.design(u[part]).toarray().T
+            variance = [
+                (columns * cho_solve_banded((factor, True), columns)).sum(axis=0) / (2 * density)
+                for factor, density in self._posterior
+            ]
+            sigma = np.sqrt(np.stack(variance, axis=1))
+            covariance = sigma[:, :, None] * self._correlation * sigma[:, None, :]
+            result[part] = np.einsum("ki,nkl,lj->nij", self.axes, covariance, self.axes)
+        return result
+
+    @cached_property
+    def _posterior(self) -> list[tuple[np.ndarray, float]]:
+        """Factor of 2 f B'W^2 B + 2 mu R and density f, one an output."""
+        posterior = []
+        scatter = (self._weights * self._residual).T
+        for mu, weights, residual in zip(self._mu, self._weights.T, scatter, strict=True):
+            # Half of the residuals lie within their median.
+            density = 0.25 / max(np.median(np.abs(residual)), np.finfo(float).tiny)
+            band = 2 * density * self._problem.gram_band(weights**2) + 2 * mu * self._problem.bending_band
+            posterior.append((cholesky_banded(band, lower=True), density))
+        return posterior
+
+    @cached_property
+    def _correlation(self) -> np.ndarray:
+        signs = np.sign(self._residual)
+        product = signs.T @ signs
+        norm = np.sqrt(np.maximum(np.diag(product), 1.0))
+        correlation = product / np.outer(norm, norm)
+        np.fill_diagonal(correlation, 1.0)
+        return correlation
+
+
+def fit_surface(
+    u: ArrayLike,
+    x_mm: ArrayLike,
+    *,
+    domain: tuple[float, float, float, float],
+    control: tuple[int, int] = (20, 20),
+    smoothness: float | None = None,
+    reject_mm: float | None = None,
+    weights: ArrayLike | None = None,
+    covariance_mm2: ArrayLike | None = None,
+    camera: AffineCamera | None = None,
+    method: Literal["interior_point", "cvxpy"] = "interior_point",
+    tolerance: float = 1e-8,
+) -> BSplineSurface:
+    """The bicubic B-spline Psi that minimises paper Eq. (6), sum_i |Psi(u_i) - x_i|_1 + mu int |d^2 Psi / du^2|^2 du.
+
+    Points whose L1 norm exceeds `reject_mm` at this surface are dropped and it is fitted once more, as in the paper.
+
+    Parameters
+    ----------
+    u:
+        (n, 2) left image points, px.  Points outside the domain are not used.
+    x_mm:
+        (n, 3) points, mm.
+    domain:
+        (x0, y0, x1, y1) px that the surface covers.
+    control:
+        (n_x, n_y) control points.
+    smoothness:
+        mu >= 0, px^2 / mm.  None chooses it by the mean L1 error of held-out points (three deterministic folds that
+        do not depend on the order of the points), on a ladder of half decades.
+    reject_mm:
+        Bound on the L1 norm of a point's residual.  None is `REJECT_MEDIANS` times the median L1 norm at the first
+        fit; infinity keeps all.
+    weights:
+        (n,) factors of the points' norms, at least 0; points of weight 0, such as those outside the field of view or
+        under a glint, are not used, and may be NaN.
+    covariance_mm2:
+        Covariance of the points, (3, 3) or (n, 3, 3).  Eq. (6) is then taken in whitened coordinates: along the
+        principal axes of the mean covariance, each residual divided by its own standard deviation, the bending of an
+        axis by a typical one (and the whole multiplied by the mean, so that it stays in mm).  Triangulated points are
+        ten times worse along the view than across it.  None is the paper's plain norm.
+    camera:
+        The left camera.  Its ray through u is then exact, Psi(u) = ray(u) + s(u) d, and only the depth s along the
+        viewing direction d is fitted, to d.x: one spline in the place of three.  Give `u` as matched in the image.
+    method:
+        "interior_point", or "cvxpy" for the reference solution by CLARABEL.
+    tolerance:
+        Duality gap at which the solver stops, relative to the objective.
+
+    Raises
+    ------
+    ValueError
+        For shapes or counts that do not fit, NaN, negative smoothness, points that do not determine a surface: fewer
+        in the domain than a quarter of the control points, or than 16.
+    """
+    grid = SplineGrid(domain, control)
+    u, x, weights = _checked(u, x_mm, weights)
+    if smoothness is not None and not (np.isfinite(smoothness) and smoothness >= 0):
+        raise ValueError(f"smoothness: mu must be a number >= 0 px^2/mm, or None to choose it; got {smoothness}.")
+    if reject_mm is not None and not reject_mm > 0:
+        raise ValueError(f"reject_mm: a bound in mm above 0, infinity, or None; got {reject_mm}.")
+    if method not in _SOLVERS:
+        raise ValueError(f"method: one of {sorted(_SOLVERS)}, got {method!r}.")
+    used = (weights > 0) & grid.inside(u)
+    _check_enough(u[used], len(u), grid)
+
+    axes, values, norms = _outputs(x, weights, covariance_mm2, camera)
+    stiffness = _stiffness(norms[used], weights[used])
+    held_out = np.empty((0, 2))
+    if smoothness is None:
+        smoothness, held_out = _choose_smoothness(grid, u[used], values[used], norms[used], stiffness)
+
+    def solve(chosen: np.ndarray) -> tuple[L1Problem, L1Solution, BSplineSurface]:
+        problem = L1Problem(grid, u[chosen])
+        mu = smoothness * stiffness
+        solution = _SOLVERS[method](problem, values[chosen], mu, norms[chosen], tolerance=tolerance)
+        control_points = grid.unflatten(solution.coefficients) @ axes
+        if camera is not None:
+            control_points = control_points + _rays(grid.sites.reshape(-1, 2), camera).reshape(control_points.shape)
+        return problem, solution, BSplineSurface(grid, control_points)
+
+    def residuals(surface: BSplineSurface) -> np.ndarray:
+        # With a camera only the depth is fitted, so only it can be wrong.
+        difference = surface(u) - x
+        return difference if camera is None else (difference @ axes.T) @ axes
+
+    problem, solution, surface = solve(used)
+    norm = np.abs(residuals(surface)).sum(axis=1)
+    if reject_mm is None:
+        reject_mm = REJECT_MEDIANS * float(np.median(norm[used]))
+    inliers = used & (np.nan_to_num(norm, nan=np.inf) <= reject_mm)
+    if (inliers != used).any():
+        if inliers.sum() < _least(grid):
+            raise ValueError(
+                f"reject_mm: only {inliers.sum()} of {used.sum()} points lie within {reject_mm:.4g} mm of the surface; "
+                "increase it."
+            )
+        problem, solution, surface = solve(inliers)
+    fit = SurfaceFit(
+        objective=float(solution.objective.sum()),
+        duality_gap=float(solution.duality_gap.sum()),
+        smoothness=float(smoothness),
+        reject_mm=float(reject_mm),
+        inliers=inliers,
+        residual_mm=residuals(surface),
+        iterations=solution.iterations,
+        held_out=held_out,
+        axes=axes,
+        _problem=problem,
+        _mu=smoothness * stiffness,
+        _weights=norms[inliers],
+        _residual=problem.design @ solution.coefficients - values[inliers],
+    )
+    return BSplineSurface(grid, surface.control_points_mm, fit)
+
+
+def _checked(u: ArrayLike, x_mm: ArrayLike, weights: ArrayLike | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    u, x = points(u, 2, "u"), points(x_mm, 3, "x_mm")
+    if len(u) != len(x):
+        raise ValueError(f"u, x_mm: {len(u)} image points and {len(x)} points; they come in pairs.")
+    weights = np.ones(len(u)) if weights is None else np.asarray(weights, dtype=np.float64)
+    if weights.shape != (len(u),) or not (np.isfinite(weights) & (weights >= 0)).all():
+        raise ValueError(f"weights: expected ({len(u)},) numbers >= 0, got shape {weights.shape}.")
+    for values, name in ((u, "u"), (x, "x_mm")):
+        bad = np.flatnonzero(~np.isfinite(values).all(axis=1) & (weights > 0))
+        if bad.size:
+            raise ValueError(
+                f"{name}: {bad.size} of {len(values)} rows are not finite (the first is row {bad[0]}). Drop them, or "
+                "give them weight 0."
+            )
+    return u, x, weights
+
+
+def _least(grid: SplineGrid) -> int:
+    return max(16, grid.size // 4)
+
+
+def _check_enough(u: np.ndarray, n_given: int, grid: SplineGrid) -> None:
+    if len(u) < _least(grid):
+        raise ValueError(
+            f"u: {len(u)} of {n_given} points lie in the domain with weight, and a grid of {grid.control[0]} x "
+            f"{grid.control[1]} control points needs {_least(grid)} or more. Match more points, give fewer control "
+            "points, or check that domain and u are both px of the left image."
+        )
+    spread = np.linalg.svd(u - u.mean(axis=0), compute_uv=False)
+    if spread[1] < 1e-6 * spread[0]:
+        raise ValueError("u: the points lie on one line of the image, which does not determine a surface.")
+
+
+def _outputs(
+    x: np.ndarray, weights: np.ndarray, covariance_mm2: ArrayLike | None, camera: AffineCamera | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(axes (k, 3), values (n, k) = x along them, weights (n, k) of their absolute residuals)."""
+    n = len(x)
+    axes = np.eye(3) if camera is None else camera.viewing_direction[None]
+    if covariance_mm2 is None:
+        return axes, x @ axes.T, np.repeat(weights[:, None], len(axes), axis=1)
+    covariance = np.asarray(covariance_mm2, dtype=np.float64)
+    if covariance.shape not in {(3, 3), (n, 3, 3)}:
+        raise ValueError(f"covariance_mm2: expected (3, 3) or ({n}, 3, 3), got {covariance.shape}.")
+    covariance = np.broadcast_to(covariance, (n, 3, 3))
+    used = weights > 0
+    if camera is None:
+        mean = covariance[used].mean(axis=0)
+        axes = np.linalg.eigh(mean)[1].T if np.isfinite(mean).all() else axes
+    variance = np.einsum("ki,nij,kj->nk", axes, covariance, axes)
+    if not (np.isfinite(variance[used]) & (variance[used] > 0)).all():
+        raise ValueError("covariance_mm2: must be finite and positive definite for every point that has weight.")
+    inverse_sigma = np.zeros(variance.shape)
+    inverse_sigma[used] = variance[used] ** -0.5
+    return axes, x @ axes.T, weights[:, None] * inverse_sigma / inverse_sigma[used].mean()
+
+
+def _stiffness(norms: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Factor (k,) of the bending energy of each output: 1, or its whitening."""
+    return norms.sum(axis=0) / weights.sum()
+
+
+def _rays(u: np.ndarray, camera: AffineCamera) -> np.ndarray:
+    """The point (n, 3) of each pixel's ray that lies in the plane through the origin across the view."""
+    return (u - camera.offset_px) @ np.linalg.pinv(camera.linear).T
+
+
+def _choose_smoothness(
+    grid: SplineGrid, u: np.ndarray, values: np.ndarray, norms: np.ndarray, stiffness: np.ndarray
+) -> tuple[float, np.ndarray]:
+    """The smoothness of least held-out error, and the candidates tried with their errors (m, 2).
+
+    It walks down a ladder of half decades to the lowest rung, then takes the parabola through it and its neighbours.
+    The error is in mm also where the fit is whitened: else the axes across the view, which are all but linear in u and
+    so like any smoothness, would outvote the depth.
+    """
+    order = np.lexsort((*values.T, u[:, 0], u[:, 1]))
+    fold = np.empty(len(u), dtype=np.intp)
+    fold[order] = np.arange(len(u)) % _FOLDS
+    parts = [(L1Problem(grid, u[fold != f]), fold != f, grid.design(u[fold == f]), fold == f) for f in range(_FOLDS)]
+    # mu where bending over one cell by the spread of the data costs what the cell's points then do, scaled to the
+    # middle of what surfaces have needed; any start leads to the same end.
+    spread = np.median(np.abs(values - np.median(values, axis=0)))
+    unit = 0.01 * len(u) * float(np.prod(grid.cell_px)) / max(spread, 1e-9)
+    errors: dict[int, float] = {}
+
+    def error(step: int) -> float:
+        if step not in errors:
+            total = 0.0
+            for problem, train, design, test in parts:
+                mu = unit * _LADDER**step * train.mean() * stiffness
+                solution = interior_point(problem, values[train], mu, norms[train], tolerance=1e-4)
+                total += float((norms[test] / stiffness * np.abs(design @ solution.coefficients - values[test])).sum())
+            errors[step] = total / len(u)
+        return errors[step]
+
+    best, direction = (0, 1) if error(1) < error(0) else (0, -1)
+    while abs(best) < _EXTENT and error(best + direction) < error(best):
+        best += direction
+    exponent = float(best)
+    if {best - 1, best + 1} <= errors.keys():
+        slope = (errors[best + 1] - errors[best - 1]) / 2
+        curvature = errors[best + 1] - 2 * errors[best] + errors[best - 1]
+        exponent -= float(np.clip(slope / max(curvature, 1e-300), -0.5, 0.5))
+    table = [(unit * _LADDER**step, errors[step]) for step in sorted(errors)]
+    return unit * _LADDER**exponent, np.array(table)
