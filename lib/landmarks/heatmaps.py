@@ -1,0 +1,262 @@
+"""Heatmaps and how to read them: Gaussian targets from float coordinates, and five decoders behind one function.
+
+Cells and pixels obey the half-pixel rule of `lib.geometry`: cell c of a heatmap of stride s is centred on pixel
+s * c + (s - 1) / 2.  Sigma is in pixels of the network's input whatever the stride.  Decoders work on all heatmaps of
+a batch at once, in float32 or wider.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+__all__ = ["DECODERS", "SIGMA_PX", "Peaks", "decode", "disc_as_printed", "render", "sigma_cells"]
+
+#: Standard deviation of the targets (paper Sec. V-B), px of the network's input.
+SIGMA_PX = 5.0
+
+
+def sigma_cells(stride: int, sigma_px: float = SIGMA_PX) -> float:
+    """Sigma in cells, at least 0.6: a narrower Gaussian falls between the cells (the encoder's stride 64)."""
+    return max(sigma_px / stride, 0.6)
+
+
+def render(u: Tensor, image_size: tuple[int, int], stride: int, sigma_px: float = SIGMA_PX) -> Tensor:
+    """Gaussians of peak 1 centred on float coordinates: the l2 targets (paper Sec. III).
+
+    Parameters
+    ----------
+    u:
+        (n, k, 2) px of the input, x right, y down; NaN gives an empty heatmap.
+    image_size:
+        (h, w) of the input.
+
+    Returns
+    -------
+    (n, k, ceil(h / stride), ceil(w / stride)), the type of `u`.
+    """
+    h, w = image_size
+    rows = torch.arange(-(-h // stride), dtype=u.dtype, device=u.device)
+    columns = torch.arange(-(-w // stride), dtype=u.dtype, device=u.device)
+    cells = (u - (stride - 1) / 2) / stride
+    scale = -0.5 / sigma_cells(stride, sigma_px) ** 2
+    along_x = torch.exp(scale * (columns - cells[..., :1]) ** 2)
+    along_y = torch.exp(scale * (rows - cells[..., 1:]) ** 2)
+    return torch.nan_to_num(along_y[..., :, None] * along_x[..., None, :], nan=0.0)
+
+
+def _pixels(u_cell: Tensor, stride: int) -> Tensor:
+    """`lib.geometry.image_from_cell` for tensors."""
+    return stride * u_cell + (stride - 1) / 2
+
+
+@dataclass(frozen=True)
+class Peaks:
+    """What a decoder found, one a heatmap.
+
+    Attributes
+    ----------
+    u:
+        (n, k, 2) px of the network's input.
+    value:
+        (n, k) height of the peak; 1 is the target's.
+    width:
+        (n, k) sigma of the peak over the target's; 1 where the decoder does not fit it.
+    covariance:
+        (n, k, 2, 2) px^2, from the fit's residual; NaN where the decoder has none.
+    """
+
+    u: Tensor
+    value: Tensor
+    width: Tensor
+    covariance: Tensor
+
+
+def _argmax(heatmaps: Tensor) -> tuple[Tensor, Tensor]:
+    """Integer cell (n, k, 2) as x, y, and value (n, k) of the highest cell."""
+    value, flat = heatmaps.flatten(-2).max(-1)
+    w = heatmaps.shape[-1]
+    return torch.stack([flat % w, torch.div(flat, w, rounding_mode="floor")], -1), value
+
+
+def _patches(heatmaps: Tensor, centre: Tensor, radius: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Square neighbourhoods: values (n, k, p), offsets (p, 2) from `centre` in cells, inside (n, k, p) bool."""
+    n, k, h, w = heatmaps.shape
+    side = torch.arange(-radius, radius + 1, device=heatmaps.device)
+    dy, dx = torch.meshgrid(side, side, indexing="ij")
+    offsets = torch.stack([dx, dy], -1).reshape(-1, 2)
+    at = centre[..., None, :] + offsets
+    inside = ((at >= 0) & (at < torch.tensor([w, h], device=heatmaps.device))).all(-1)
+    flat = at[..., 1].clamp(0, h - 1) * w + at[..., 0].clamp(0, w - 1)
+    return heatmaps.flatten(-2).gather(-1, flat), offsets.to(heatmaps.dtype), inside
+
+
+def _plain(u_cells: Tensor, value: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    nan = torch.full((*u_cells.shape, 2), torch.nan, dtype=u_cells.dtype, device=u_cells.device)
+    return u_cells, value, torch.ones_like(value), nan
+
+
+def _decode_argmax(heatmaps: Tensor, sigma: float) -> tuple[Tensor, ...]:
+    cell, value = _argmax(heatmaps)
+    return _plain(cell.to(heatmaps.dtype), value)
+
+
+def _disc(heatmaps: Tensor, sigma: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Argmax cell, its value, the disc's weights (n, k, p) and offsets (p, 2): Delta and p_k of Eq. (1)."""
+    cell, value = _argmax(heatmaps)
+    p, offsets, inside = _patches(heatmaps, cell, int(3 * sigma))
+    # A regressed activation can be negative, a probability cannot.
+    weights = p.clamp_min(0) * inside * (offsets.square().sum(-1) <= (3 * sigma) ** 2)
+    return cell.to(heatmaps.dtype), value, weights, offsets
+
+
+def _decode_disc(heatmaps: Tensor, sigma: float) -> tuple[Tensor, ...]:
+    cell, value, weights, offsets = _disc(heatmaps, sigma)
+    total = weights.sum(-1, keepdim=True)
+    return _plain(cell + (weights @ offsets) / total.clamp_min(torch.finfo(total.dtype).tiny), value)
+
+
+def disc_as_printed(heatmaps: Tensor, stride: int, sigma_px: float = SIGMA_PX) -> Tensor:
+    """Eq. (1) to the letter: the sum of (u_max + Delta) p over |Delta|, which is no mean.  (n, k, 2) px.
+
+    A unit Gaussian sums to about 2 pi sigma^2 and the disc of 3 sigma has 9 pi sigma^2 cells, so the printed form
+    shrinks every coordinate to about 0.22 of its value.  It is here to be shown, not to be used.
+    """
+    sigma = sigma_cells(stride, sigma_px)
+    cell, _, weights, offsets = _disc(heatmaps, sigma)
+    area = (offsets.square().sum(-1) <= (3 * sigma) ** 2).sum()
+    at = _pixels(cell[..., None, :] + offsets, stride)
+    return (weights[..., None] * at).sum(-2) / area
+
+
+def _decode_kornia(heatmaps: Tensor, sigma: float) -> tuple[Tensor, ...]:
+    """kornia's spatial expectation over the square of 3 sigma around the peak."""
+    from kornia.geometry.subpix import spatial_expectation2d  # imported late: decoding by default needs no kornia
+
+    cell, value = _argmax(heatmaps)
+    radius = int(3 * sigma)
+    p, _, inside = _patches(heatmaps, cell, radius)
+    p = p.clamp_min(0) * inside
+    p = p / p.sum(-1, keepdim=True).clamp_min(torch.finfo(p.dtype).tiny)
+    side = 2 * radius + 1
+    expectation = spatial_expectation2d(p.reshape(*p.shape[:2], side, side), normalized_coordinates=False)
+    return _plain(cell.to(heatmaps.dtype) + expectation - radius, value)
+
+
+def _decode_dark(heatmaps: Tensor, sigma: float) -> tuple[Tensor, ...]:
+    """Blur by sigma, then one Newton step on the logarithm (Zhang et al. 2020, DARK)."""
+    k = heatmaps.shape[1]
+    radius = max(1, round(3 * sigma))
+    x = torch.arange(-radius, radius + 1, dtype=heatmaps.dtype, device=heatmaps.device)
+    g = torch.exp(-0.5 * (x / sigma) ** 2)
+    g = (g / g.sum()).expand(k, 1, 1, -1)
+    blurred = F.conv2d(heatmaps, g, padding=(0, radius), groups=k)
+    blurred = F.conv2d(blurred, g.transpose(-1, -2), padding=(radius, 0), groups=k)
+    h, w = heatmaps.shape[-2:]
+    _, value = _argmax(heatmaps)
+    cell, _ = _argmax(blurred)
+    inner = torch.stack([cell[..., 0].clamp(1, max(w - 2, 1)), cell[..., 1].clamp(1, max(h - 2, 1))], -1)
+    p, _, _ = _patches(blurred, inner, 1)
+    a, b, c, d, e, f, g2, h2, i = p.clamp_min(1e-10).log().unbind(-1)
+    gx, gy = (f - d) / 2, (h2 - b) / 2
+    gxx, gyy, gxy = f - 2 * e + d, h2 - 2 * e + b, (i - g2 - c + a) / 4
+    determinant = gxx * gyy - gxy**2
+    peak = (determinant > 1e-12) & (gxx < 0)
+    safe = torch.where(peak, determinant, torch.ones_like(determinant))
+    step = torch.stack([gxy * gy - gyy * gx, gxy * gx - gxx * gy], -1) / safe[..., None]
+    step = torch.where(peak[..., None], step.clamp(-1.5, 1.5), torch.zeros_like(step))
+    return _plain(inner.to(heatmaps.dtype) + step, value)
+
+
+def _decode_gauss_newton(heatmaps: Tensor, sigma: float, iterations: int = 6) -> tuple[Tensor, ...]:
+    """Least-squares fit of a exp(-|c - x|^2 / (2 (w sigma)^2)) + b in a disc, started from the paper's disc centroid.
+
+    Five unknowns: x, y, width w, height a, offset b.  Steps are damped and limited; a fit that leaves the disc or
+    ends with a width below 0.4 or above 2.5 falls back to the centroid, with a wide covariance.
+    """
+    start, value, *_ = _decode_disc(heatmaps, sigma)
+    h, w = heatmaps.shape[-2:]
+    limit = torch.tensor([w - 1, h - 1], device=heatmaps.device)
+    cell = torch.minimum(start.round().long().clamp_min(0), limit)
+    reach = max(2.0 * sigma, 1.5)
+    p, offsets, inside = _patches(heatmaps, cell, int(reach + 0.5))
+    p = p.double()
+    offsets = offsets.double()
+    weight = (inside & (offsets.square().sum(-1) <= (reach + 0.25) ** 2)).double()
+    theta = torch.stack(
+        [*(start - cell).double().unbind(-1), torch.ones_like(value).double(), value.double(), torch.zeros_like(value)],
+        -1,
+    )
+
+    def model(theta: Tensor) -> tuple[Tensor, Tensor]:
+        x, y, width, a, b = (t[..., None] for t in theta.unbind(-1))
+        dx, dy, s2 = offsets[:, 0] - x, offsets[:, 1] - y, (width * sigma) ** 2
+        g = torch.exp(-0.5 * (dx**2 + dy**2) / s2)
+        jacobian = torch.stack([a * g * dx / s2, a * g * dy / s2, a * g * (dx**2 + dy**2) / (s2 * width), g, g * 0 + 1])
+        return (p - a * g - b) * weight, jacobian.movedim(0, -1) * weight[..., None]
+
+    damping = 1e-6 * torch.eye(5, dtype=torch.float64, device=p.device)
+    step_limit = torch.tensor([0.7 * sigma, 0.7 * sigma, 0.4, 1.0, 1.0], dtype=torch.float64, device=p.device)
+    for _ in range(iterations):
+        residual, jacobian = model(theta)
+        normal = jacobian.mT @ jacobian + damping
+        step = torch.linalg.solve(normal, (jacobian.mT @ residual[..., None])[..., 0])
+        theta = theta + torch.maximum(torch.minimum(step, step_limit), -step_limit)
+        theta[..., 2].clamp_(0.3, 3.0)
+    residual, jacobian = model(theta)
+    freedom = (weight.sum(-1) - 5).clamp_min(1)
+    variance = residual.square().sum(-1) / freedom + 1e-8
+    covariance = variance[..., None, None] * torch.linalg.inv(jacobian.mT @ jacobian + damping)[..., :2, :2]
+    good = (theta[..., :2].norm(dim=-1) <= reach) & (theta[..., 2] > 0.4) & (theta[..., 2] < 2.5)
+    good &= torch.isfinite(theta).all(-1) & (theta[..., 3] > 0)
+    u = torch.where(good[..., None], cell + theta[..., :2], start.double())
+    fallback = sigma**2 * torch.eye(2, dtype=torch.float64, device=p.device)
+    covariance = torch.where(good[..., None, None], covariance, fallback)
+    width = torch.where(good, theta[..., 2], torch.full_like(theta[..., 2], 3.0))
+    return u, value, width, covariance
+
+
+_DECODERS: dict[str, Callable[[Tensor, float], tuple[Tensor, ...]]] = {
+    "argmax": _decode_argmax,
+    "paper": _decode_disc,
+    "dark": _decode_dark,
+    "kornia": _decode_kornia,
+    "gauss_newton": _decode_gauss_newton,
+}
+#: Names `decode` knows.
+DECODERS = tuple(_DECODERS)
+
+
+def decode(heatmaps: Tensor, stride: int, *, method: str = "gauss_newton", sigma_px: float = SIGMA_PX) -> Peaks:
+    """The landmark of every heatmap, in pixels of the network's input.
+
+    Parameters
+    ----------
+    heatmaps:
+        (n, k, h, w).
+    stride:
+        Input pixels per cell.
+    method:
+        ``"argmax"``: the highest cell.  ``"paper"``: centroid of the disc of 3 sigma around it, Eq. (1) divided by the
+        sum of p (as printed it is divided by the disc's area, see `disc_as_printed`).  ``"dark"``: Zhang et al. 2020.
+        ``"kornia"``: spatial expectation in a window.  ``"gauss_newton"``: Gaussian fit, with covariance.
+
+    Raises
+    ------
+    ValueError
+        For an unknown method, heatmaps that are not (n, k, h, w), or not finite.
+    """
+    if method not in _DECODERS:
+        raise ValueError(f"method: {method!r} is no decoder; choose one of {', '.join(DECODERS)}.")
+    if heatmaps.ndim != 4 or not heatmaps.numel():
+        raise ValueError(f"heatmaps: expected a non-empty (n, k, h, w), got {tuple(heatmaps.shape)}.")
+    heatmaps = heatmaps.float() if heatmaps.dtype != torch.float64 else heatmaps
+    if not torch.isfinite(heatmaps).all():
+        raise ValueError("heatmaps: not finite; the network or its input is broken (look for NaN in the images).")
+    u, value, width, covariance = _DECODERS[method](heatmaps, sigma_cells(stride, sigma_px))
+    u_px = _pixels(u, stride)
+    return Peaks(u_px.to(heatmaps.dtype), value, width.to(heatmaps.dtype), (covariance * stride**2).to(heatmaps.dtype))

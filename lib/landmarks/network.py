@@ -1,0 +1,190 @@
+"""The Stacked Hourglass network (Newell et al. 2016; paper Sec. III), one class with the paper's five configurations.
+
+Every layer keeps the half-pixel rule of `lib.geometry`: the stem's even kernel is centred on its cell, pooling and
+nearest-neighbour upsampling are aligned with cell borders.  A network therefore has nothing to unlearn before
+the centre of heatmap cell c lies at pixel stride * c + (stride - 1) / 2 of its input.
+"""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+from torch.nn.utils.fusion import fuse_conv_bn_eval
+
+__all__ = ["ABLATION", "HourglassConfig", "StackedHourglass"]
+
+LANDMARKS = ("base", "tip_1", "tip_2")
+STEM_STRIDE = 4
+
+
+@dataclass(frozen=True)
+class HourglassConfig:
+    """What a network is; the paper leaves `features` open (the note in notebook 02 says why it is below 256).
+
+    Attributes
+    ----------
+    features:
+        Channels of the hourglass, an even number.
+    stacks:
+        Hourglasses in a row, each supervised.
+    depth:
+        Halvings inside an hourglass; 4 makes inputs a multiple of 4 * 2**4 = 64.
+    decoder, skips, residual:
+        What the ablation adds one after the other; without a decoder the heatmaps have stride 4 * 2**depth.
+    """
+
+    features: int = 64
+    stacks: int = 2
+    depth: int = 4
+    decoder: bool = True
+    skips: bool = True
+    residual: bool = True
+
+    def __post_init__(self) -> None:
+        if self.features < 2 or self.features % 2:
+            raise ValueError(f"features: must be an even number of at least 2, got {self.features}.")
+        if self.stacks < 1 or self.depth < 1:
+            raise ValueError(f"stacks and depth: must be at least 1, got {self.stacks} and {self.depth}.")
+        if self.skips and not self.decoder:
+            raise ValueError("skips: skip connections end in the decoder; set decoder=True or skips=False.")
+        if self.stacks > 1 and not self.decoder:
+            raise ValueError("stacks: hourglasses without a decoder cannot be stacked; set stacks=1 or decoder=True.")
+
+    @property
+    def stride(self) -> int:
+        """Input pixels per heatmap cell."""
+        return STEM_STRIDE if self.decoder else self.multiple
+
+    @property
+    def multiple(self) -> int:
+        """Height and width are padded to a multiple of this."""
+        return STEM_STRIDE * 2**self.depth
+
+
+#: The five columns of the paper's ablation table, in its order.
+ABLATION: dict[str, dict[str, int | bool]] = {
+    "encoder": {"stacks": 1, "decoder": False, "skips": False, "residual": False},
+    "+ decoder": {"stacks": 1, "decoder": True, "skips": False, "residual": False},
+    "+ skips": {"stacks": 1, "decoder": True, "skips": True, "residual": False},
+    "+ stack": {"stacks": 2, "decoder": True, "skips": True, "residual": False},
+    "+ residual": {"stacks": 2, "decoder": True, "skips": True, "residual": True},
+}
+
+
+def _conv(inputs: int, outputs: int, kernel: int, *, relu: bool = True) -> nn.Sequential:
+    layers = [nn.Conv2d(inputs, outputs, kernel, padding=kernel // 2, bias=False), nn.BatchNorm2d(outputs)]
+    return nn.Sequential(*layers, nn.ReLU(inplace=True)) if relu else nn.Sequential(*layers)
+
+
+class _Block(nn.Module):
+    """A box of the paper's figure: a bottleneck residual module (He et al. 2016), or a plain 3 x 3 convolution."""
+
+    def __init__(self, inputs: int, outputs: int, residual: bool):
+        super().__init__()
+        if residual:
+            middle = max(outputs // 2, 1)
+            self.body = nn.Sequential(
+                _conv(inputs, middle, 1), _conv(middle, middle, 3), _conv(middle, outputs, 1, relu=False)
+            )
+            self.skip = nn.Identity() if inputs == outputs else _conv(inputs, outputs, 1, relu=False)
+        else:
+            self.body, self.skip = _conv(inputs, outputs, 3), None
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.body(x) if self.skip is None else F.relu(self.body(x) + self.skip(x))
+
+
+class _Hourglass(nn.Module):
+    """Halve, process (recursively), double, and add what the skip connection kept."""
+
+    def __init__(self, config: HourglassConfig, depth: int):
+        super().__init__()
+        f, residual = config.features, config.residual
+        self.skip = _Block(f, f, residual) if config.skips else None
+        self.down = _Block(f, f, residual)
+        self.inner = _Hourglass(config, depth - 1) if depth > 1 else _Block(f, f, residual)
+        self.up = _Block(f, f, residual) if config.decoder else None
+
+    def forward(self, x: Tensor) -> Tensor:
+        y = self.inner(self.down(F.max_pool2d(x, 2)))
+        if self.up is None:
+            return y
+        y = F.interpolate(self.up(y), scale_factor=2.0, mode="nearest")
+        return y if self.skip is None else y + self.skip(x)
+
+
+class StackedHourglass(nn.Module):
+    """Images to landmark heatmaps.
+
+    ``forward(images)`` takes float images (n, 3, h, w) in [0, 1], RGB, of any size, pads them with zeros at the right
+    and bottom, and returns one (n, 3, ceil(h / stride), ceil(w / stride)) heatmap tensor per stack, the final one last.
+
+    Raises
+    ------
+    ValueError
+        If the images have not three channels.
+    """
+
+    def __init__(self, config: HourglassConfig | None = None):
+        super().__init__()
+        self.config = config = config or HourglassConfig()
+        f, half, residual = config.features, config.features // 2, config.residual
+        self.stem = nn.Sequential(
+            nn.Conv2d(3, half, 6, stride=2, padding=2, bias=False),  # even kernel: centred between pixels 2i and 2i + 1
+            nn.BatchNorm2d(half),
+            nn.ReLU(inplace=True),
+            _Block(half, half, residual),
+            nn.MaxPool2d(2),
+            _Block(half, f, residual),
+            _Block(f, f, residual),
+        )
+        stacks = range(config.stacks)
+        self.hourglasses = nn.ModuleList([_Hourglass(config, config.depth) for _ in stacks])
+        self.features = nn.ModuleList([nn.Sequential(_Block(f, f, residual), _conv(f, f, 1)) for _ in stacks])
+        self.heads = nn.ModuleList([nn.Conv2d(f, len(LANDMARKS), 1) for _ in stacks])
+        between = stacks[:-1]
+        self.merge_features = nn.ModuleList([nn.Conv2d(f, f, 1) for _ in between])
+        self.merge_heatmaps = nn.ModuleList([nn.Conv2d(len(LANDMARKS), f, 1) for _ in between])
+        for head in self.heads:  # targets are almost everywhere 0: start there
+            nn.init.normal_(head.weight, std=1e-3)
+            nn.init.zeros_(head.bias)
+
+    @property
+    def stride(self) -> int:
+        """Input pixels per heatmap cell."""
+        return self.config.stride
+
+    def forward(self, images: Tensor) -> list[Tensor]:
+        if images.ndim != 4 or images.shape[1] != 3:
+            raise ValueError(
+                f"images: the network takes (n, 3, h, w) RGB, got {tuple(images.shape)}. "
+                "Repeat a grey channel three times; drop an alpha channel."
+            )
+        h, w = images.shape[-2:]
+        multiple, stride = self.config.multiple, self.stride
+        padded = F.pad(images, (0, -w % multiple, 0, -h % multiple))
+        x = self.stem((padded - 0.5) * 4.0)  # about zero mean and unit variance
+        outputs = []
+        for i, hourglass in enumerate(self.hourglasses):
+            y = self.features[i](hourglass(x))
+            heatmaps = self.heads[i](y)
+            outputs.append(heatmaps[..., : -(-h // stride), : -(-w // stride)])
+            if i + 1 < len(self.hourglasses):
+                x = x + self.merge_features[i](y) + self.merge_heatmaps[i](heatmaps)
+        return outputs
+
+    def fused(self) -> StackedHourglass:
+        """A copy for inference: batch normalisation folded into the convolutions, channels last (same outputs)."""
+        network = copy.deepcopy(self).eval()
+        for module in list(network.modules()):
+            if not isinstance(module, nn.Sequential):
+                continue
+            for i in range(len(module) - 1):
+                if isinstance(module[i], nn.Conv2d) and isinstance(module[i + 1], nn.BatchNorm2d):
+                    module[i] = fuse_conv_bn_eval(module[i], module[i + 1])
+                    module[i + 1] = nn.Identity()
+        return network.to(memory_format=torch.channels_last)
