@@ -1,0 +1,133 @@
+"""Semi-dense stereo matching: DeepMatching, its fast form along epipolar lines, and alternatives (paper Sec. IV-B).
+
+    matches = match(left, right, rig=rig)                    # along the epipolar lines, sub-pixel: the default
+    matches = match(left, right)                             # free DeepMatching, no calibration needed
+    matches = match(left, right, rig=RECTIFIED)              # a rectified pair: rows correspond
+    points = rig.triangulate(matches.u_left, matches.u_right, matches.covariance_px2)
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from lib.cameras import StereoRig
+from lib.matching.band import SETTINGS, match_band
+from lib.matching.descriptors import as_gray
+from lib.matching.evaluation import DisparityScore, non_occluded, score_against_disparity
+from lib.matching.free import ResponseMap, match_free, predicted_bytes, response_maps
+from lib.matching.masks import field_mask, glint_mask, tool_mask
+from lib.matching.opencv import DisparityFunction, match_with
+from lib.matching.rectification import RECTIFIED
+from lib.matching.result import Matches
+
+__all__ = [
+    "RECTIFIED",
+    "DisparityFunction",
+    "DisparityScore",
+    "Matches",
+    "ResponseMap",
+    "field_mask",
+    "glint_mask",
+    "match",
+    "non_occluded",
+    "predicted_bytes",
+    "response_maps",
+    "score_against_disparity",
+    "tool_mask",
+]
+
+
+def _mask(mask: ArrayLike | None, shape: tuple[int, int], name: str) -> np.ndarray | None:
+    if mask is None:
+        return None
+    mask = np.asarray(mask)
+    if mask.shape != shape or mask.dtype != bool:
+        raise ValueError(f"{name}: expected a bool array {shape}, True = ignore, got {mask.dtype} {mask.shape}.")
+    if mask.all():
+        raise ValueError(f"{name}: everything is masked, so nothing can be matched; True means ignore.")
+    return mask if mask.any() else None
+
+
+def match(
+    left: ArrayLike,
+    right: ArrayLike,
+    *,
+    method: str | DisparityFunction | None = None,
+    rig: StereoRig | None = None,
+    mask_left: ArrayLike | None = None,
+    mask_right: ArrayLike | None = None,
+    depth_range_mm: tuple[float, float] | None = None,
+    setting: str = "quality",
+    downscale: int | None = None,
+    budget_bytes: int = 2 << 30,
+    device: str = "cpu",
+) -> Matches:
+    """Match the two images of a stereo pair.
+
+    Parameters
+    ----------
+    left, right:
+        (h, w, 3) uint8 RGB or (h, w) uint8 grey; sizes may differ.
+    method:
+        "deepmatching": free DeepMatching, integer positions, as published; a rig is only used for `epipolar_px`.
+        "band": DeepMatching along the epipolar lines, sub-pixel; needs a rig.
+        "sgbm", "dis": OpenCV's, on rectified canvases; without a rig the pair is taken as rectified.
+        A callable `f(left, right, (low, high)) -> (disparity, confidence)` of rectified grey uint8 images (h, w),
+        x_right = x_left - disparity, not finite = none: the slot for learned matchers.
+        None is "band" with a rig, else "deepmatching".
+    rig:
+        Calibrated rig, or `RECTIFIED` for a pair whose rows correspond (depth is then disparity in px).
+    mask_left, mask_right:
+        (h, w) bool, True = ignore (see `glint_mask`, `tool_mask`, `field_mask`).
+    depth_range_mm:
+        (near, far): the values of d.x to search, where d is the left camera's `viewing_direction` and x a point in
+        the rig's frame (so the sign and the origin are those of the rig's frame along d).  None = found by a coarse
+        pass.  Only used with a rig.
+    setting:
+        "quality" searches at full resolution (up to 3 Mpx), "fast" at up to 0.8 Mpx.  Not for "deepmatching".
+    downscale:
+        DeepMatching only: descriptors are pooled by 2^downscale; None is the smallest from 1 that fits the budget.
+    budget_bytes:
+        Memory that free DeepMatching may take.  It is predicted before anything is allocated; what does not fit is
+        matched in tiles of the left image, or refused with the figure.
+    device:
+        torch device of free DeepMatching, such as "cuda".
+
+    Returns
+    -------
+    Matches
+        Possibly none, where there is no texture.
+
+    Raises
+    ------
+    ValueError
+        For images of a wrong type or shape, masks of a wrong shape or that leave nothing, an unknown method or
+        setting, too small a budget, or a rig that does not fit the images (with the epipolar error).
+    """
+    images = as_gray(left, "left"), as_gray(right, "right")
+    masks = _mask(mask_left, images[0].shape, "mask_left"), _mask(mask_right, images[1].shape, "mask_right")
+    if setting not in SETTINGS:
+        raise ValueError(f"setting: expected one of {sorted(SETTINGS)}, got {setting!r}.")
+    if depth_range_mm is not None:
+        depth_range_mm = tuple(float(z) for z in depth_range_mm)
+        if len(depth_range_mm) != 2 or not np.isfinite(depth_range_mm).all() or depth_range_mm[0] >= depth_range_mm[1]:
+            raise ValueError(f"depth_range_mm: expected (near, far) with near < far, got {depth_range_mm}.")
+    if method is None:
+        method = "deepmatching" if rig is None else "band"
+    if method == "deepmatching":
+        matches = match_free(images, masks, downscale=downscale, budget_bytes=budget_bytes, device=device)
+    elif method == "band":
+        if rig is None:
+            raise ValueError("rig: method 'band' needs a calibrated rig, or RECTIFIED for a rectified pair.")
+        matches = match_band(images, masks, rig, depth_range_mm=depth_range_mm, setting=SETTINGS[setting])
+    elif callable(method) or method in ("sgbm", "dis"):
+        matches = match_with(method, images, masks, rig, depth_range_mm=depth_range_mm, setting=SETTINGS[setting])
+    else:
+        raise ValueError(f"method: expected 'deepmatching', 'band', 'sgbm', 'dis' or a callable, got {method!r}.")
+    if rig is None or not len(matches):
+        return matches
+    distance = np.abs(rig.epipolar_distance(matches.u_left, matches.u_right))
+    return replace(matches, epipolar_px=float(np.median(distance)))

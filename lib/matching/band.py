@@ -1,0 +1,217 @@
+"""Matching along the epipolar lines of a calibrated rig: rectify, find the depth range, match, refine.
+
+A coarse pass on small images, free to leave the epipolar line, tells two things: whether the rig fits the images,
+and the range of depth.  The fine pass searches only the band that is left.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from lib.cameras import StereoRig
+from lib.matching.descriptors import CHANNELS, pixel_descriptors
+from lib.matching.free import MIN_SEEN, patch_quality
+from lib.matching.rectification import Rectification, rectify, warp
+from lib.matching.result import Matches
+from lib.matching.volume import PATCH, VolumeMatches, correlation_volume, match_volume
+
+__all__ = ["SETTINGS", "CoarseView", "Setting", "coarse_view", "match_band"]
+
+
+@dataclass(frozen=True)
+class Setting:
+    """How finely the band is searched.
+
+    Attributes
+    ----------
+    max_pixels:
+        The canvas is halved until it has no more.
+    downscale:
+        Binary logarithm of the pooling of the descriptors.
+    off_line:
+        Cells searched on either side of the epipolar line.
+    """
+
+    max_pixels: int
+    downscale: int
+    off_line: int
+
+    def scale(self, size_px: tuple[int, int]) -> float:
+        """Canvas pixels per left pixel for a canvas that has this (width, height) at scale 1."""
+        scale = 1.0
+        while size_px[0] * size_px[1] * scale**2 > self.max_pixels:
+            scale /= 2
+        return scale
+
+
+SETTINGS = {
+    "fast": Setting(max_pixels=800_000, downscale=1, off_line=1),
+    "quality": Setting(max_pixels=3_000_000, downscale=1, off_line=2),
+}
+
+COARSE_WIDTH_PX = 256
+COARSE_OFF_LINE = 8
+#: Half width of the coarse search, as a fraction of the canvas.
+COARSE_REACH = 0.2
+MIN_SUPPORTED = 12
+
+
+@dataclass(frozen=True, eq=False)
+class CoarseView:
+    """What the coarse pass saw.
+
+    Attributes
+    ----------
+    displacement_px:
+        (n, 2) along and off the epipolar line, in pixels of a canvas of scale 1, of the supported matches.
+    epipolar_px:
+        |median| of the distance off the line, NaN with fewer than 12 supported matches.
+    range_px:
+        (low, high) displacement to search, with margin.
+    """
+
+    displacement_px: np.ndarray
+    epipolar_px: float
+    range_px: tuple[float, float]
+
+
+def _descriptors(
+    images: tuple[np.ndarray, np.ndarray],
+    masks: tuple[np.ndarray | None, np.ndarray | None],
+    rectification: Rectification,
+    setting: Setting,
+    low: int,
+    n: int,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Left grid (4 gy, 4 gx, 9) and the right grid with the margins that the band needs."""
+    cell = 1 << setting.downscale
+    step = PATCH * cell
+    width, height = (side // step * step for side in rectification.size_px)
+    margin_y = setting.off_line * cell
+
+    def one(side: int) -> np.ndarray:
+        if side == 0:
+            target, size, shift = rectification.left_from_canvas, (width, height), (0, 0)
+        else:
+            target = rectification.right_from_canvas
+            size, shift = (width + (n - 1) * cell, height + 2 * margin_y), (low * cell, -margin_y)
+        gray, valid = warp(images[side], target, size, shift_px=shift, mask=masks[side])
+        return pixel_descriptors(gray, setting.downscale, valid=valid)
+
+    with ThreadPoolExecutor(2) as pool:
+        return tuple(pool.map(one, (0, 1)))
+
+
+def _match(left: np.ndarray, right: np.ndarray, low: int, n: int, off_line: int) -> VolumeMatches:
+    """Matches of two grids, without those on flat or mostly ignored patches and those at the end of the range."""
+    matches = match_volume(correlation_volume(torch.from_numpy(left), torch.from_numpy(right), low, n, off_line), low)
+    x, y = matches.patch.T
+    start = matches.cell - (low, -off_line) + matches.patch * PATCH
+    seen_right = np.mean(
+        [right[start[:, 1] + r, start[:, 0] + c, CHANNELS - 1] > 0 for r in range(PATCH) for c in range(PATCH)], axis=0
+    )
+    kept = patch_quality(left)[y, x] & (seen_right >= MIN_SEEN) & (matches.curvature[:, 0] > 0)
+    return matches.keep(kept)
+
+
+def _supported(matches: VolumeMatches, tolerance: float = 1.5) -> np.ndarray:
+    """Mask (n,) of the matches with at least three neighbours on the lattice that moved alike (cells)."""
+    gx, gy = matches.patch.max(axis=0, initial=0) + 1
+    field = np.full((gy + 2, gx + 2, 2), np.nan)
+    x, y = matches.patch.T + 1
+    field[y, x] = matches.displacement
+    support = np.zeros(len(x), int)
+    for dy in (-1, 0, 1):
+        for dx in (-1, 0, 1):
+            if dy or dx:
+                apart = np.abs(field[y + dy, x + dx] - matches.displacement).max(axis=1, initial=0)
+                support += apart <= tolerance
+    return support >= 3
+
+
+def coarse_view(
+    images: tuple[np.ndarray, np.ndarray], masks: tuple[np.ndarray | None, np.ndarray | None], rig: StereoRig
+) -> CoarseView:
+    """Match small images in a wide window around the epipolar lines.
+
+    Parameters
+    ----------
+    images:
+        Left and right, (h, w) float32 grey.
+    masks:
+        Left and right, (h, w) bool, True = ignore, or None.
+    """
+    shapes = images[0].shape, images[1].shape
+    whole = rectify(rig, *shapes)
+    scale = min(1.0, COARSE_WIDTH_PX / max(whole.size_px))
+    rectification = rectify(rig, *shapes, scale=scale)
+    setting = Setting(0, downscale=1, off_line=COARSE_OFF_LINE)
+    reach = int(np.ceil(COARSE_REACH * rectification.size_px[0] / 2))
+    low, n = -reach, 2 * reach + 1
+    left, right = _descriptors(images, masks, rectification, setting, low, n)
+    matches = _match(left, right, low, n, COARSE_OFF_LINE)
+    displacement = matches.displacement[_supported(matches)] * 2 / scale
+    # Both canvases refer to the same depth only up to whole coarse pixels.
+    displacement[:, 0] += (
+        rectification.reference_depth_mm - whole.reference_depth_mm
+    ) * whole.displacement_px_per_mm
+    if len(displacement) < MIN_SUPPORTED:
+        widest = COARSE_REACH * whole.size_px[0]
+        return CoarseView(displacement, float("nan"), (-widest, widest))
+    low_px, high_px = np.percentile(displacement[:, 0], (0.5, 99.5))
+    margin = 4 / scale
+    return CoarseView(
+        displacement, float(abs(np.median(displacement[:, 1]))), (float(low_px - margin), float(high_px + margin))
+    )
+
+
+def match_band(
+    images: tuple[np.ndarray, np.ndarray],
+    masks: tuple[np.ndarray | None, np.ndarray | None],
+    rig: StereoRig,
+    *,
+    depth_range_mm: tuple[float, float] | None = None,
+    setting: Setting = SETTINGS["quality"],
+) -> Matches:
+    """Matches of a calibrated pair; arguments as in `coarse_view` and `lib.matching.match`.
+
+    Raises
+    ------
+    ValueError
+        If the rig does not fit the images.
+    """
+    shapes = images[0].shape, images[1].shape
+    whole = rectify(rig, *shapes)
+    scale = setting.scale(whole.size_px)
+    cell_px = (1 << setting.downscale) / scale
+
+    coarse = coarse_view(images, masks, rig)
+    allowed = (setting.off_line + 0.5) * cell_px
+    if coarse.epipolar_px > allowed:
+        raise ValueError(
+            f"rig: it does not fit the images: the median of {len(coarse.displacement_px)} free matches lies "
+            f"{coarse.epipolar_px:.1f} px off its epipolar lines, {allowed:.1f} px are searched. "
+            "Calibrate again, or check that left and right are not exchanged."
+        )
+    rectification = rectify(rig, *shapes, scale=scale)
+    range_px = coarse.range_px if depth_range_mm is None else whole.displacement_range_px(depth_range_mm)
+    shift = (whole.reference_depth_mm - rectification.reference_depth_mm) * whole.displacement_px_per_mm
+    low, high = (np.array(range_px) + shift) / cell_px
+    low = int(np.floor(low)) - 1
+    n = int(np.ceil(high)) + 2 - low
+    left, right = _descriptors(images, masks, rectification, setting, low, n)
+    found = _match(left, right, low, n, setting.off_line)
+
+    cell = 1 << setting.downscale
+    canvas = (found.patch * PATCH + PATCH / 2) * float(cell) - 0.5
+    u_left = rectification.u_left(canvas)
+    u_right = rectification.u_right(canvas + found.displacement * cell)
+    n_matches = len(u_left)
+    covariance = np.zeros((n_matches, 4, 4))
+    covariance[:, [0, 1], [0, 1]] = 0.05**2
+    covariance[:, [2, 3], [2, 3]] = 0.25 * cell_px**2 / 4
+    return Matches(u_left, u_right, np.clip(found.score, 0, 1), covariance, method="band")

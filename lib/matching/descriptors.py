@@ -1,0 +1,87 @@
+"""Pixel descriptors of DeepMatching: soft histograms of gradient orientation, computed with OpenCV on the CPU.
+
+Source: Weinzaepfel, Revaud, Harchaoui, Schmid, DeepFlow (ICCV 2013); Revaud et al., DeepMatching: Hierarchical
+Deformable Dense Matching (IJCV 2016), Sec. 3.1.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike
+
+__all__ = ["CHANNELS", "as_gray", "pixel_descriptors"]
+
+#: Eight orientations and one constant, which keeps flat patches from matching noise.
+CHANNELS = 9
+
+SIGMA_PX = 1.0
+SLOPE = 0.2
+CONSTANT = 0.3
+
+
+def as_gray(image: ArrayLike, name: str) -> np.ndarray:
+    """A float32 grey image (h, w), 0..255, of an RGB (h, w, 3) or grey (h, w) uint8 image.
+
+    Raises
+    ------
+    ValueError
+        For any other shape or type, or an image below 16 x 16 px; `name` is the argument named.
+    """
+    image = np.asarray(image)
+    if image.dtype != np.uint8:
+        raise ValueError(f"{name}: expected a uint8 image (0..255), got {image.dtype}. Convert it first.")
+    if image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3):
+        raise ValueError(f"{name}: expected (h, w, 3) RGB or (h, w) grey, got shape {image.shape}.")
+    if min(image.shape[:2]) < 16:
+        raise ValueError(f"{name}: {image.shape[1]} x {image.shape[0]} px is too small; give at least 16 x 16 px.")
+    if image.ndim == 3:
+        image = cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY)
+    return image.astype(np.float32)
+
+
+def _blur(image: np.ndarray) -> np.ndarray:
+    return cv2.GaussianBlur(image, (7, 7), SIGMA_PX, borderType=cv2.BORDER_REPLICATE)
+
+
+def pixel_descriptors(gray: np.ndarray, downscale: int = 1, *, valid: np.ndarray | None = None) -> np.ndarray:
+    """Descriptors of a grey image, average-pooled by 2^downscale.
+
+    The image is smoothed, its gradient projected on eight directions and rectified, smoothed, squashed by
+    2 / (1 + exp(-0.2 x)) - 1 (so that contrast matters little), smoothed again; a constant ninth channel ends it.
+
+    Parameters
+    ----------
+    gray:
+        (h, w) float32, 0..255.
+    downscale:
+        Binary logarithm of the pooling.
+    valid:
+        (h, w) bool; descriptors of cells with any invalid pixel are zero, and so say nothing.
+
+    Returns
+    -------
+    np.ndarray
+        (h >> downscale, w >> downscale, 9) float32.  The centre of cell 0 lies at (2^downscale - 1) / 2 px.
+    """
+    smooth = _blur(gray)
+    dx = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=1, borderType=cv2.BORDER_REPLICATE)
+    dy = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=1, borderType=cv2.BORDER_REPLICATE)
+    half = np.float32(np.sqrt(0.5))
+    stride = 1 << downscale
+    rows, columns = gray.shape[0] // stride, gray.shape[1] // stride
+    descriptors = np.empty((rows, columns, CHANNELS), np.float32)
+    projections = (dx, (dx + dy) * half, dy, (dy - dx) * half)
+    for k, projection in enumerate(projections):
+        for opposite in (False, True):
+            positive = np.maximum(-projection if opposite else projection, 0.0)
+            squashed = np.tanh(_blur(positive) * np.float32(SLOPE / 2))
+            channel = _blur(squashed)[: rows * stride, : columns * stride]
+            if stride > 1:
+                channel = cv2.resize(channel, (columns, rows), interpolation=cv2.INTER_AREA)
+            descriptors[:, :, k + 4 * opposite] = channel
+    descriptors[:, :, 8] = CONSTANT
+    if valid is not None and not valid.all():
+        cells = valid[: rows * stride, : columns * stride].reshape(rows, stride, columns, stride).all(axis=(1, 3))
+        descriptors *= cells[:, :, None]
+    return descriptors

@@ -1,0 +1,119 @@
+"""Scores of matches against measured disparity (evaluation only: nothing here is seen by a matcher)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.ndimage import map_coordinates
+
+from lib.matching.result import Matches
+
+__all__ = ["DisparityScore", "non_occluded", "score_against_disparity"]
+
+
+@dataclass(frozen=True)
+class DisparityScore:
+    """Errors |x_left - x_right - disparity| of matches in a rectified pair.
+
+    Attributes
+    ----------
+    n:
+        Matches scored.
+    median_px, rms_px:
+        Median absolute error, and RMS of the errors up to 2 px.
+    above_1, above_2, above_4:
+        Fraction of the scored matches whose error is above 1, 2, 4 px.
+    error_px:
+        (n,) signed errors, and `u_left` (n, 2) where they are.
+    """
+
+    n: int
+    median_px: float
+    rms_px: float
+    above_1: float
+    above_2: float
+    above_4: float
+    error_px: np.ndarray
+    u_left: np.ndarray
+
+
+def non_occluded(disparity_px: ArrayLike, *, tolerance_px: float = 1.0) -> np.ndarray:
+    """Mask (h, w) of the pixels of the left image that the right camera sees too.
+
+    A pixel is hidden when another one of its row with a larger disparity (nearer) lands within `tolerance_px` of
+    the same right column, or when it lands outside the right image.  Unknown disparity (not finite) is False.
+    """
+    disparity = np.asarray(disparity_px, dtype=np.float32)
+    height, width = disparity.shape
+    known = np.isfinite(disparity)
+    target = np.arange(width, dtype=np.float32) - np.where(known, disparity, np.inf)
+    rows, columns = np.nonzero(known & (target >= 0) & (target <= width - 1))
+    # Nearest disparity that lands on each right pixel, spread over both neighbouring columns: no holes by rounding.
+    nearest = np.full((height, width + 1), -np.inf, np.float32)
+    left = np.floor(target[rows, columns]).astype(np.intp)
+    for column in (left, left + 1):
+        np.maximum.at(nearest, (rows, column), disparity[rows, columns])
+    visible = np.zeros((height, width), bool)
+    column = np.rint(target[rows, columns]).astype(np.intp)
+    visible[rows, columns] = nearest[rows, column] <= disparity[rows, columns] + tolerance_px
+    return visible
+
+
+def score_against_disparity(
+    matches: Matches, disparity_px: ArrayLike, *, flat_window_px: int | None = 3, flat_range_px: float = 1.0
+) -> DisparityScore:
+    """Score matches of a rectified pair where ground truth is known and not occluded.
+
+    Parameters
+    ----------
+    matches:
+        In pixels of the image that `disparity_px` belongs to.
+    disparity_px:
+        (h, w), x_right = x_left - disparity; not finite = unknown.
+    flat_window_px, flat_range_px:
+        Score only where the truth is known in a window of this width around the match and varies by no more than
+        `flat_range_px` in it: a patch across a depth step has no single disparity.  None scores all matches that
+        are not occluded.
+
+    Raises
+    ------
+    ValueError
+        If `disparity_px` is not a 2-D array.
+    """
+    disparity = np.asarray(disparity_px, dtype=np.float32)
+    if disparity.ndim != 2:
+        raise ValueError(f"disparity_px: expected (h, w), got shape {disparity.shape}.")
+    usable = non_occluded(disparity)
+    if flat_window_px is not None:
+        kernel = np.ones((flat_window_px, flat_window_px), np.uint8)
+        known = np.isfinite(disparity)
+        low, high = (cv2.erode(np.where(known, disparity, -1e6), kernel), cv2.dilate(np.where(known, disparity, 1e6), kernel))
+        usable &= high - low <= flat_range_px
+    height, width = disparity.shape
+    x, y = np.rint(matches.u_left).astype(np.intp).T
+    inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+    scored = np.flatnonzero(inside)[usable[y[inside], x[inside]]]
+    u_left = matches.u_left[scored]
+    # Bilinear truth where flat; the nearest pixel otherwise, where interpolation would mix two surfaces.
+    if flat_window_px is None:
+        truth = disparity[y[scored], x[scored]]
+    else:
+        filled = np.where(np.isfinite(disparity), disparity, 0.0)
+        truth = map_coordinates(filled, u_left.T[::-1], order=1)
+    error = u_left[:, 0] - matches.u_right[scored, 0] - truth
+    size = np.abs(error)
+    if not len(size):
+        nan = float("nan")
+        return DisparityScore(0, nan, nan, nan, nan, nan, error, u_left)
+    small = size[size <= 2]
+    return DisparityScore(
+        len(size),
+        float(np.median(size)),
+        float(np.sqrt(np.mean(small**2))) if small.size else float("nan"),
+        *(float(np.mean(size > limit)) for limit in (1, 2, 4)),
+        error,
+        u_left,
+    )

@@ -1,0 +1,114 @@
+"""Masks of what a matcher should ignore: True = ignore, (h, w) bool."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike
+
+__all__ = ["field_mask", "glint_mask", "tool_mask"]
+
+
+def glint_mask(image: ArrayLike, *, level: int = 245, grow_px: int = 5) -> np.ndarray:
+    """Specular reflections: pixels whose every channel is nearly saturated, grown by a margin.
+
+    A glint moves with the viewpoint, not with the surface, so a match on one has the depth of a mirror image.
+
+    Parameters
+    ----------
+    image:
+        (h, w, 3) RGB or (h, w), uint8.
+    level:
+        Smallest value of the darkest channel.
+    grow_px:
+        Margin for the halo around the saturated core.
+
+    Returns
+    -------
+    np.ndarray
+        (h, w) bool, True = ignore.
+    """
+    image = np.asarray(image)
+    if image.dtype != np.uint8 or image.ndim not in (2, 3):
+        raise ValueError(f"image: expected a uint8 image (h, w, 3) or (h, w), got {image.dtype} {image.shape}.")
+    darkest = image if image.ndim == 2 else cv2.min(cv2.min(image[..., 0], image[..., 1]), image[..., 2])
+    core = (darkest >= level).astype(np.uint8)
+    if grow_px and core.any():
+        core = cv2.dilate(core, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * grow_px + 1,) * 2))
+    return core.astype(bool)
+
+
+def tool_mask(
+    shape: tuple[int, int], u_landmarks: ArrayLike, *, width_px: float | None = None, shaft_px: float | None = None
+) -> np.ndarray:
+    """The forceps, from its three landmarks: both jaws, and the shaft continued beyond the base.
+
+    Parameters
+    ----------
+    shape:
+        (h, w) of the image.
+    u_landmarks:
+        (3, 2) px: base, tip_1, tip_2; NaN = missing.  A jaw without its tip is left out; without the base, or with
+        both tips missing, the mask is empty.
+    width_px:
+        Full width of jaws and shaft, with margin; None is 0.45 of the mean jaw length.
+    shaft_px:
+        How far the shaft reaches behind the base, away from the tips; None is beyond the image.
+
+    Returns
+    -------
+    np.ndarray
+        (h, w) bool, True = ignore.
+    """
+    u = np.asarray(u_landmarks, dtype=np.float64)
+    if u.shape != (3, 2):
+        raise ValueError(f"u_landmarks: expected (3, 2) px, base, tip_1, tip_2, got {u.shape}.")
+    height, width = shape[:2]
+    mask = np.zeros((height, width), np.uint8)
+    base, tips = u[0], u[1:][np.isfinite(u[1:]).all(axis=1)]
+    if not np.isfinite(base).all() or not len(tips):
+        return mask.astype(bool)
+    lengths = np.linalg.norm(tips - base, axis=1)
+    thickness = max(1, round(0.45 * lengths.mean() if width_px is None else width_px))
+    backwards = base - tips.mean(axis=0)
+    size = np.linalg.norm(backwards)
+    reach = np.hypot(height, width) + np.abs(base).max() if shaft_px is None else shaft_px
+    ends = [*tips]
+    if size > 0:
+        ends.append(base + backwards / size * reach)
+    shift = 4  # fractional bits of OpenCV's line drawing
+    limit = 2 ** (30 - shift) / 8
+    for end in ends:
+        a, b = (tuple(int(v) for v in np.clip(np.rint(p * 2**shift), -limit, limit)) for p in (base, end))
+        cv2.line(mask, a, b, 1, thickness, cv2.LINE_8, shift)
+    return mask.astype(bool)
+
+
+def field_mask(image: ArrayLike, *, level: int = 12, margin_px: int = 8) -> np.ndarray:
+    """Outside the field of view: everything dark that is connected to the image's border, grown by a margin.
+
+    Parameters
+    ----------
+    image:
+        (h, w, 3) RGB or (h, w), uint8.
+    level:
+        Brightest value of the surround (brightest channel, after smoothing).
+    margin_px:
+        Width of the vignetted rim that is ignored with it.
+
+    Returns
+    -------
+    np.ndarray
+        (h, w) bool, True = ignore.
+    """
+    image = np.asarray(image)
+    if image.dtype != np.uint8 or image.ndim not in (2, 3):
+        raise ValueError(f"image: expected a uint8 image (h, w, 3) or (h, w), got {image.dtype} {image.shape}.")
+    brightest = image if image.ndim == 2 else image.max(axis=2)
+    dark = (cv2.blur(brightest, (5, 5)) <= level).astype(np.uint8)
+    _, labels = cv2.connectedComponents(dark)
+    border = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
+    outside = np.isin(labels, border[border > 0]).astype(np.uint8)
+    if margin_px and outside.any():
+        outside = cv2.dilate(outside, np.ones((2 * margin_px + 1,) * 2, np.uint8))
+    return outside.astype(bool)

@@ -1,0 +1,172 @@
+"""Affine rectification: two 2-D affine maps that make the epipolar lines of a rig the rows of one canvas.
+
+For an affine rig a point seen at u_left lies at u_right = H (u_left - t_l) + t_r + z e, where z = d.x is its depth
+along the left viewing direction d, H = A_r pinv(A_l) and e = A_r d.  So the right image warped by H looks like the
+left one up to a shift along H^-1 e that is linear in depth.  There is no singular configuration, unlike for
+perspective cameras, as long as the two viewing directions differ.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from lib.cameras import AffineCamera, StereoRig
+
+__all__ = ["RECTIFIED", "Rectification", "rectify", "warp"]
+
+#: The rig of an already rectified pair: x = (x_left, y, disparity) px instead of mm, u_right = (x - disparity, y).
+#: Depth is disparity (times -1 never: nearer is larger), so `depth_range_mm` is the range of disparity in px.
+RECTIFIED = StereoRig(
+    AffineCamera(np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0]])),
+    AffineCamera(np.array([[1.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0]])),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Rectification:
+    """A canvas on which both images share their rows.
+
+    Attributes
+    ----------
+    left_from_canvas, right_from_canvas:
+        (2, 3) affine maps from canvas to image pixels, pixel centres on integers.  The right one holds at
+        `reference_depth_mm`.
+    size_px:
+        (width, height) of the canvas; it covers the left image.
+    displacement_px_per_mm:
+        A point dz deeper than the reference appears on the right canvas shifted by this times dz along +x.
+    reference_depth_mm:
+        Depth d.x along the left viewing direction d at which the displacement is 0.
+    """
+
+    left_from_canvas: np.ndarray
+    right_from_canvas: np.ndarray
+    size_px: tuple[int, int]
+    displacement_px_per_mm: float
+    reference_depth_mm: float
+
+    def displacement_range_px(self, depth_range_mm: tuple[float, float]) -> tuple[float, float]:
+        """(low, high) displacement on the canvas of a range of depth."""
+        ends = (np.asarray(depth_range_mm, dtype=np.float64) - self.reference_depth_mm) * self.displacement_px_per_mm
+        return float(ends.min()), float(ends.max())
+
+    def depth_range_mm(self, displacement_range_px: tuple[float, float]) -> tuple[float, float]:
+        """The inverse of `displacement_range_px`."""
+        ends = self.reference_depth_mm + np.asarray(displacement_range_px) / self.displacement_px_per_mm
+        return float(ends.min()), float(ends.max())
+
+    def u_left(self, canvas: np.ndarray) -> np.ndarray:
+        """Left pixels (n, 2) of canvas points (n, 2)."""
+        return canvas @ self.left_from_canvas[:, :2].T + self.left_from_canvas[:, 2]
+
+    def u_right(self, canvas: np.ndarray) -> np.ndarray:
+        """Right pixels (n, 2) of (displaced) canvas points (n, 2)."""
+        return canvas @ self.right_from_canvas[:, :2].T + self.right_from_canvas[:, 2]
+
+
+def rectify(
+    rig: StereoRig, shape_left: tuple[int, int], shape_right: tuple[int, int], *, scale: float = 1.0
+) -> Rectification:
+    """The rectification of a rig for images of these shapes (h, w).
+
+    Parameters
+    ----------
+    scale:
+        Canvas pixels per left pixel.
+
+    Raises
+    ------
+    ValueError
+        If the rig's two cameras look along the same direction (no depth can be seen).
+    """
+    A_l, A_r = rig.left.linear, rig.right.linear
+    H = A_r @ np.linalg.pinv(A_l)
+    per_mm = A_r @ rig.left.viewing_direction
+    if np.linalg.norm(per_mm) < 1e-6 * np.linalg.norm(A_r):
+        raise ValueError("rig: both cameras look along the same direction, so depth cannot be seen; calibrate again.")
+    shift = np.linalg.solve(H, per_mm)
+    direction = shift / np.linalg.norm(shift) * (1.0 if shift[0] >= 0 else -1.0)
+    Q = np.array([direction, [-direction[1], direction[0]]])
+
+    height, width = shape_left
+    corners = np.array([[-0.5, -0.5], [width - 0.5, -0.5], [-0.5, height - 0.5], [width - 0.5, height - 0.5]]) @ Q.T
+    origin = corners.min(axis=0)
+    size = tuple(int(n) for n in np.ceil((corners.max(axis=0) - origin) * scale - 1e-6))
+    # canvas = scale (Q u - origin) - 1/2, so that with Q = 1 and scale 1 the canvas is the left image.
+    left = np.column_stack([Q.T / scale, Q.T @ (0.5 / scale + origin)])
+    at_zero = H @ (left[:, 2] - rig.left.offset_px) + rig.right.offset_px
+    right_linear = H @ left[:, :2]
+
+    # Depth zero may be far away: refer to the depth that brings the image centres together, moved by whole
+    # canvas pixels so that an already rectified pair is not resampled.
+    displacement = float(scale * direction @ shift)
+    canvas_centre = (np.array(size) - 1) / 2
+    gap = (np.array(shape_right[::-1]) - 1) / 2 - (right_linear @ canvas_centre + at_zero)
+    whole = np.rint(np.linalg.solve(right_linear, gap)[0])
+    right = np.column_stack([right_linear, at_zero + right_linear @ np.array([whole, 0.0])])
+    return Rectification(left, right, size, displacement, whole / displacement)
+
+
+def _shrink(image: np.ndarray, factor: int) -> np.ndarray:
+    """Area-average by an integer factor; a rest of rows or columns is dropped."""
+    rows, columns = image.shape[0] // factor, image.shape[1] // factor
+    return cv2.resize(image[: rows * factor, : columns * factor], (columns, rows), interpolation=cv2.INTER_AREA)
+
+
+def warp(
+    gray: np.ndarray,
+    image_from_canvas: np.ndarray,
+    size_px: tuple[int, int],
+    *,
+    shift_px: tuple[int, int] = (0, 0),
+    mask: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """An image on a canvas, anti-aliased where the canvas is coarser.
+
+    Parameters
+    ----------
+    gray:
+        (h, w) float32.
+    image_from_canvas:
+        (2, 3).
+    size_px, shift_px:
+        (width, height) of the part of the canvas, which starts at canvas pixel `shift_px`.
+    mask:
+        (h, w) bool, True = ignore.
+
+    Returns
+    -------
+    (gray, valid)
+        (height, width) float32, borders continued; and bool, False outside the image and where masked.
+    """
+    linear = image_from_canvas[:, :2]
+    offset = image_from_canvas[:, 2] + linear @ np.asarray(shift_px, dtype=np.float64)
+    height, width = gray.shape
+    whole = np.rint(offset).astype(int)
+    if np.array_equal(linear, np.eye(2)) and np.array_equal(offset, whole):
+        # A shift by whole pixels: copy, so that nothing is resampled.
+        right, bottom = whole + np.array(size_px)
+        pad = (max(0, -whole[1]), max(0, bottom - height), max(0, -whole[0]), max(0, right - width))
+        rows = slice(max(0, whole[1]), max(0, min(height, bottom)))
+        columns = slice(max(0, whole[0]), max(0, min(width, right)))
+        if rows.stop <= rows.start or columns.stop <= columns.start:
+            return np.zeros(size_px[::-1], np.float32), np.zeros(size_px[::-1], bool)
+        inside = np.ones_like(gray[rows, columns], np.uint8) if mask is None else (~mask[rows, columns]).astype(np.uint8)
+        out = cv2.copyMakeBorder(gray[rows, columns], *pad, cv2.BORDER_REPLICATE)
+        valid = cv2.copyMakeBorder(inside, *pad, cv2.BORDER_CONSTANT, value=0)
+        return out, valid.astype(bool)
+    factor = max(1, int(np.sqrt(abs(np.linalg.det(linear))) + 0.25))
+    ignored = None if mask is None else mask.astype(np.float32)
+    if factor > 1:
+        gray = _shrink(gray, factor)
+        ignored = None if ignored is None else _shrink(ignored, factor)
+        linear, offset = linear / factor, (offset - (factor - 1) / 2) / factor
+    matrix = np.column_stack([linear, offset])
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    out = cv2.warpAffine(gray, matrix, size_px, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+    seen = np.ones_like(gray) if ignored is None else (ignored < 1e-3).astype(np.float32)
+    valid = cv2.warpAffine(seen, matrix, size_px, flags=flags, borderMode=cv2.BORDER_CONSTANT, borderValue=0.0)
+    return out, valid > 0.999

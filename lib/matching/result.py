@@ -1,0 +1,51 @@
+"""What every matcher returns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+__all__ = ["Matches"]
+
+
+@dataclass(frozen=True, eq=False)
+class Matches:
+    """Semi-dense correspondences of a stereo pair.
+
+    Attributes
+    ----------
+    u_left, u_right:
+        (n, 2) px, integer coordinates at pixel centres.  `u_left` lies on a lattice chosen by the matcher.
+    score:
+        (n,) confidence in [0, 1]; larger is surer.  Comparable within one call, not between methods.
+    covariance_px2:
+        (n, 4, 4) covariance of (u_left, u_right).  A match says where in the right image lies what is seen at
+        `u_left`, so nearly all of the noise stands in the right block.
+    epipolar_px:
+        Median over the matches of the absolute distance from the rig's epipolar constraint (as in
+        `StereoRig.epipolar_distance`); NaN without a rig or matches.
+    method:
+        Name of the matcher.
+    """
+
+    u_left: np.ndarray
+    u_right: np.ndarray
+    score: np.ndarray
+    covariance_px2: np.ndarray
+    epipolar_px: float = field(default=float("nan"), kw_only=True)
+    method: str = field(default="", kw_only=True)
+
+    def __len__(self) -> int:
+        return len(self.u_left)
+
+    def keep(self, chosen: np.ndarray) -> Matches:
+        """The matches of a mask (n,) or of indices."""
+        return Matches(
+            self.u_left[chosen],
+            self.u_right[chosen],
+            self.score[chosen],
+            self.covariance_px2[chosen],
+            epipolar_px=self.epipolar_px,
+            method=self.method,
+        )
