@@ -139,10 +139,11 @@ class SplineGrid:
         (n_x, n_y), (h_x, h_y) = self.control, self.cell_px
         gram_x = [_gram(n_x, k) * h_x ** (1 - 2 * k) for k in range(3)]
         gram_y = [_gram(n_y, k) * h_y ** (1 - 2 * k) for k in range(3)]
+        slow, fast = (gram_y, gram_x) if self.stride[0] == 1 else (gram_x, gram_y)
         terms = ((1.0, 2, 0), (2.0, 1, 1), (1.0, 0, 2))
-        if self.stride[0] == 1:
-            return sum(f * sparse.kron(gram_y[q], gram_x[p]) for f, p, q in terms).tocsr()
-        return sum(f * sparse.kron(gram_x[p], gram_y[q]) for f, p, q in terms).tocsr()
+        bending = sum(factor * sparse.kron(slow[p], fast[q], format="csr") for factor, p, q in terms).tocsr()
+        bending.eliminate_zeros()  # kron stores whole blocks
+        return bending
 
     def flatten(self, control_points: np.ndarray) -> np.ndarray:
         """Coefficients (size, k) of control points (n_y, n_x, k)."""

@@ -103,35 +103,34 @@ def save_mesh(mesh: Mesh, path: str | Path) -> Path:
         For another suffix.
     """
     path = _suffixed(path, ".glb")
-    height, width = (1, 1) if mesh.texture is None else mesh.texture.shape[:2]
-    # glTF counts texture coordinates from the image's corner, pixel centres are half a pixel in.
-    uv = (mesh.u + 0.5) / (width, height)
-    arrays = [mesh.vertices_mm, mesh.normals, uv]
-    chunks = [np.ascontiguousarray(a, dtype="<f4").tobytes() for a in arrays]
-    chunks.append(np.ascontiguousarray(mesh.faces, dtype="<u4").tobytes())
-    accessors = [
+    arrays = {"POSITION": mesh.vertices_mm.astype("<f4"), "NORMAL": mesh.normals.astype("<f4")}
+    if mesh.texture is not None:
+        # glTF counts texture coordinates from the image's corner, pixel centres are half a pixel in.
+        arrays["TEXCOORD_0"] = ((mesh.u + 0.5) / mesh.texture.shape[1::-1]).astype("<f4")
+    faces = len(arrays)  # the faces' accessor comes last
+    accessors: list[dict] = [
         {"bufferView": i, "componentType": 5126, "count": len(a), "type": f"VEC{a.shape[1]}"}
-        for i, a in enumerate(arrays)
+        for i, a in enumerate(arrays.values())
     ]
-    position = mesh.vertices_mm.astype("<f4")
-    accessors[0] |= {"min": position.min(axis=0).tolist(), "max": position.max(axis=0).tolist()}
-    accessors.append({"bufferView": 3, "componentType": 5125, "count": mesh.faces.size, "type": "SCALAR"})
+    accessors[0] |= {"min": arrays["POSITION"].min(axis=0).tolist(), "max": arrays["POSITION"].max(axis=0).tolist()}
+    accessors.append({"bufferView": faces, "componentType": 5125, "count": mesh.faces.size, "type": "SCALAR"})
+    chunks = [np.ascontiguousarray(a).tobytes() for a in (*arrays.values(), mesh.faces.astype("<u4"))]
+    attributes = {name: i for i, name in enumerate(arrays)}
     material: dict = {"doubleSided": True, "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.9}}
     document: dict = {
         "asset": {"version": "2.0", "generator": "microstereo"},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0, "scale": [0.001, 0.001, 0.001]}],
-        "meshes": [
-            {"primitives": [{"attributes": {"POSITION": 0, "NORMAL": 1, "TEXCOORD_0": 2}, "indices": 3, "material": 0}]}
-        ],
+        "meshes": [{"primitives": [{"attributes": attributes, "indices": faces, "material": 0}]}],
         "accessors": accessors,
         "materials": [material],
     }
     if mesh.texture is not None:
-        chunks.append(_encoded(".jpg", mesh.texture[..., ::-1], "texture"))
         material["pbrMetallicRoughness"]["baseColorTexture"] = {"index": 0}
-        document |= {"textures": [{"source": 0}], "images": [{"bufferView": 4, "mimeType": "image/jpeg"}]}
+        images = [{"bufferView": len(chunks), "mimeType": "image/jpeg"}]
+        document |= {"textures": [{"source": 0}], "images": images}
+        chunks.append(_encoded(".jpg", mesh.texture[..., ::-1], "texture"))
     padded = [chunk + b"\0" * (-len(chunk) % 4) for chunk in chunks]
     starts = np.concatenate([[0], np.cumsum([len(chunk) for chunk in padded])]).tolist()
     document["buffers"] = [{"byteLength": starts[-1]}]

@@ -1,0 +1,216 @@
+"""fit_surface: accuracy on a known surface, smoothness, rejection, uncertainty, bad input."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lib.surface import fit_sphere, fit_surface
+from lib.surface.solver import L1Problem, cvxpy_reference
+
+
+def rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def test_recovers_the_bowl_from_noisy_matches_with_outliers(bowl):
+    surface = fit_surface(bowl.u_left, bowl.points.x_mm, domain=bowl.domain)
+    noise = np.sqrt(np.trace(bowl.points.covariance_mm2[0]))
+    assert rms(bowl.depth_error_mm(surface)) < noise / 2
+    inside = np.isfinite(surface.fit.residual_mm).all(axis=1)
+    gross = bowl.outlier & inside & (np.abs(surface(bowl.u_left) - bowl.points.x_mm).sum(axis=1) > 0.5)
+    assert gross.sum() > 20 and not surface.inliers[gross].any()
+    assert surface.inliers[~bowl.outlier & inside].mean() > 0.97
+    assert not surface.inliers[~inside].any()
+
+
+def test_objective_is_equation_6_over_the_inliers(bowl):
+    surface = fit_surface(bowl.u_left, bowl.points.x_mm, domain=bowl.domain, smoothness=2e4, reject_mm=0.4)
+    u, x = bowl.u_left[surface.inliers], bowl.points.x_mm[surface.inliers]
+    energy = np.abs(surface(u) - x).sum() + 2e4 * surface.bending_energy()
+    assert surface.objective == pytest.approx(energy, rel=1e-9)
+    problem = L1Problem(surface.grid, u)
+    reference = cvxpy_reference(problem, x, 2e4)
+    assert surface.objective == pytest.approx(reference.objective.sum(), rel=1e-6)
+    assert 0 <= surface.fit.duality_gap < 1e-6 * surface.objective
+    # The bound was applied to the first fit, over all points.
+    first = fit_surface(bowl.u_left, bowl.points.x_mm, domain=bowl.domain, smoothness=2e4, reject_mm=np.inf)
+    norm = np.abs(first.fit.residual_mm).sum(axis=1)
+    np.testing.assert_array_equal(surface.inliers, norm <= 0.4)
+
+
+def test_cvxpy_gives_the_same_surface(bowl):
+    arguments = {"domain": bowl.domain, "control": (9, 8), "smoothness": 1e4, "reject_mm": 0.5}
+    ours = fit_surface(bowl.u_left, bowl.points.x_mm, **arguments)
+    reference = fit_surface(bowl.u_left, bowl.points.x_mm, method="cvxpy", **arguments)
+    assert ours.objective == pytest.approx(reference.objective, rel=1e-7)
+    assert np.isnan(reference.fit.duality_gap)
+    assert rms(bowl.depth_error_mm(ours) - bowl.depth_error_mm(reference)) < 1e-3
+
+
+def test_order_and_units_of_the_points_do_not_matter(bowl):
+    order = np.random.default_rng(5).permutation(len(bowl.u_left))
+    one = fit_surface(bowl.u_left, bowl.points.x_mm, domain=bowl.domain, control=(10, 8))
+    other = fit_surface(bowl.u_left[order], bowl.points.x_mm[order], domain=bowl.domain, control=(10, 8))
+    assert other.fit.smoothness == pytest.approx(one.fit.smoothness, rel=1e-6)
+    np.testing.assert_array_equal(other.inliers, one.inliers[order])
+    moved = fit_surface(
+        bowl.u_left, bowl.points.x_mm + 1000, domain=bowl.domain, control=(10, 8), smoothness=one.fit.smoothness
+    )
+    np.testing.assert_allclose(moved(bowl.u_left) - 1000, one(bowl.u_left), atol=1e-4)
+
+
+def test_held_out_smoothness_is_near_the_best_one(bowl_factory):
+    for seed in range(2):
+        bowl = bowl_factory(1500, seed=seed)
+        chosen = fit_surface(bowl.u_left, bowl.points.x_mm, domain=bowl.domain, camera=bowl.rig.left)
+        errors = [
+            rms(
+                bowl.depth_error_mm(
+                    fit_surface(bowl.u_left, bowl.points.x_mm, domain=bowl.domain, camera=bowl.rig.left, smoothness=mu)
+                )
+            )
+            for mu in 10.0 ** np.arange(2, 8)
+        ]
+        assert rms(bowl.depth_error_mm(chosen)) < 1.3 * min(errors) < 0.5 * max(errors)
+        candidates, error = chosen.fit.held_out.T
+        assert len(candidates) >= 3 and (np.diff(candidates) > 0).all()
+        assert candidates[error.argmin()] / 2 < chosen.fit.smoothness < candidates[error.argmin()] * 2
+
+
+def test_robust_where_least_squares_is_not(bowl_factory):
+    bowl = bowl_factory(2000, outliers=0.25)
+    surface = fit_surface(bowl.u_left, bowl.points.x_mm, domain=bowl.domain)
+    B = surface.grid.design(bowl.u_left[inside := surface.grid.inside(bowl.u_left)])
+    n, mu = B.shape[0], surface.fit.smoothness * 10
+    c = np.linalg.solve((B.T @ B + mu * surface.grid.bending).toarray(), B.T @ bowl.points.x_mm[inside])
+    squares = type(surface)(surface.grid, surface.grid.unflatten(c))
+    assert n > 1000
+    assert rms(bowl.depth_error_mm(surface)) < 0.5 * rms(bowl.depth_error_mm(squares))
+
+
+def test_depth_only_fit_is_exact_across_the_view(bowl):
+    scalar = fit_surface(bowl.u_left, bowl.points.x_mm, domain=bowl.domain, camera=bowl.rig.left)
+    u = bowl.u_left[scalar.grid.inside(bowl.u_left)]
+    np.testing.assert_allclose(bowl.rig.left.project(scalar(u)), u, atol=1e-8)
+    vector = fit_surface(bowl.u_left, bowl.points.x_mm, domain=bowl.domain)
+    assert rms(bowl.depth_error_mm(scalar)) < 1.2 * rms(bowl.depth_error_mm(vector))
+
+
+def test_whitening_with_one_covariance_only_turns_the_axes(bowl):
+    arguments = {"domain": bowl.domain, "control": (12, 10), "smoothness": 2e4, "reject_mm": np.inf}
+    white = fit_surface(bowl.u_left, bowl.points.x_mm, covariance_mm2=bowl.points.covariance_mm2[0], **arguments)
+    axes = white.fit.axes
+    np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
+    turned = fit_surface(bowl.u_left, bowl.points.x_mm @ axes.T, **arguments)
+    np.testing.assert_allclose(white(bowl.u_left) @ axes.T, turned(bowl.u_left), atol=1e-4)
+
+
+def test_whitening_trusts_the_precise_points(bowl_factory):
+    bowl = bowl_factory(2000, outliers=0.0)
+    rng = np.random.default_rng(7)
+    factor = np.where(rng.random(2000) < 0.5, 1.0, 10.0)
+    x = bowl.points.x_mm + rng.normal(size=(2000, 1)) * 0.3 * (factor[:, None] > 1) * bowl.rig.left.viewing_direction
+    covariance = bowl.points.covariance_mm2 * factor[:, None, None] ** 2
+    arguments = {"domain": bowl.domain, "smoothness": 1e4, "reject_mm": np.inf}
+    white = fit_surface(bowl.u_left, x, covariance_mm2=covariance, **arguments)
+    plain = fit_surface(bowl.u_left, x, **arguments)
+    assert rms(bowl.depth_error_mm(white)) < 0.8 * rms(bowl.depth_error_mm(plain))
+
+
+@pytest.mark.parametrize("kind", ["plain", "depth"])
+def test_uncertainty_tells_the_true_error(bowl_factory, kind):
+    ratios = []
+    for seed in range(4):
+        bowl = bowl_factory(1500, seed=seed)
+        camera = bowl.rig.left if kind == "depth" else None
+        surface = fit_surface(bowl.u_left, bowl.points.x_mm, domain=bowl.domain, control=(14, 12), camera=camera)
+        u = np.random.default_rng(seed).uniform(bowl.domain[:2], bowl.domain[2:], (200, 2))
+        d = bowl.rig.left.viewing_direction
+        covariance = surface.covariance(u)
+        np.testing.assert_allclose(covariance, covariance.transpose(0, 2, 1))
+        assert np.linalg.eigvalsh(covariance).min() > -1e-12
+        sigma = np.sqrt(np.einsum("i,nij,j->n", d, covariance, d))
+        ratios.append((surface(u) - bowl.truth(u)) @ d / sigma)
+    assert 0.7 < rms(np.concatenate(ratios)) < 1.4
+
+
+def test_uncertainty_grows_where_points_are_missing(bowl):
+    hole = np.linalg.norm(bowl.u_left - (960, 540), axis=1) > 200
+    surface = fit_surface(bowl.u_left, bowl.points.x_mm, domain=bowl.domain, weights=hole.astype(float))
+    centre, away = np.trace(surface.covariance([[960, 540], [500, 540]]), axis1=1, axis2=2)
+    assert centre > 4 * away
+    assert np.isnan(surface.covariance([[0.0, 0.0]])).all()
+
+
+def test_points_of_no_weight_are_not_seen(bowl):
+    x = bowl.points.x_mm.copy()
+    weights = np.ones(len(x))
+    weights[::3] = 0
+    x[::3] = np.nan
+    with_holes = fit_surface(bowl.u_left, x, domain=bowl.domain, smoothness=1e4, weights=weights)
+    without = fit_surface(bowl.u_left[weights > 0], x[weights > 0], domain=bowl.domain, smoothness=1e4)
+    np.testing.assert_array_equal(with_holes(bowl.u_left), without(bowl.u_left))
+    assert not with_holes.inliers[::3].any()
+
+
+def test_planes_and_exact_data_are_fine():
+    u = np.random.default_rng(0).uniform(0, 100, (200, 2))
+    x = np.column_stack([u / 100, u @ [0.01, 0.02]])
+    surface = fit_surface(u, x, domain=(0, 0, 100, 100), control=(8, 8))
+    np.testing.assert_allclose(surface(u), x, atol=1e-6)
+
+
+def test_a_sphere_is_found_and_is_too_rigid_for_this_bowl(bowl):
+    sphere = fit_sphere(bowl.points.x_mm)
+    assert 10 < sphere.radius_mm < 14
+    u = np.random.default_rng(0).uniform(bowl.domain[:2], bowl.domain[2:], (300, 2))
+    error = (sphere.along_view(u, bowl.rig.left) - bowl.truth(u)) @ bowl.rig.left.viewing_direction
+    assert rms(error) > 1.5 * rms(bowl.depth_error_mm(fit_surface(bowl.u_left, bowl.points.x_mm, domain=bowl.domain)))
+
+
+def test_sphere_on_exact_points_with_outliers():
+    rng = np.random.default_rng(0)
+    direction = rng.normal(size=(400, 3))
+    direction = direction[direction[:, 2] > 0.3]
+    x = np.array([1.0, -2.0, 30.0]) + 12 * direction / np.linalg.norm(direction, axis=1, keepdims=True)
+    x[:20] += rng.uniform(-3, 3, (20, 3))
+    sphere = fit_sphere(x)
+    np.testing.assert_allclose(sphere.centre_mm, [1, -2, 30], atol=1e-4)
+    assert sphere.radius_mm == pytest.approx(12, abs=1e-4)
+    assert not sphere.inliers[:20].all()
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"u": np.full((2000, 2), np.nan)}, "u: .*not finite"),
+        ({"u": np.zeros((1999, 2))}, "u, x_mm"),
+        ({"u": np.zeros((2000, 3))}, "u: expected"),
+        ({"x_mm": np.full((2000, 3), np.inf)}, "x_mm: .*not finite"),
+        ({"domain": (5000, 5000, 6000, 6000)}, "u: 0 of 2000 points lie in the domain"),
+        ({"smoothness": -1.0}, "smoothness"),
+        ({"smoothness": np.nan}, "smoothness"),
+        ({"reject_mm": 0.0}, "reject_mm"),
+        ({"reject_mm": 1e-9}, "reject_mm: only"),
+        ({"control": (100, 100)}, "u: .*control points"),
+        ({"control": (3, 20)}, "control"),
+        ({"weights": np.zeros(2000)}, "u: 0 of"),
+        ({"weights": -np.ones(2000)}, "weights"),
+        ({"weights": np.ones(7)}, "weights"),
+        ({"covariance_mm2": np.zeros((3, 3))}, "covariance_mm2"),
+        ({"covariance_mm2": np.eye(2)}, "covariance_mm2"),
+        ({"method": "magic"}, "method"),
+        ({"u": np.column_stack([np.linspace(310, 1600, 2000), np.full(2000, 500.0)])}, "u: .*one line"),
+    ],
+)
+def test_bad_input_is_named(bowl, change, named):
+    arguments = {"u": bowl.u_left, "x_mm": bowl.points.x_mm, "domain": bowl.domain, "smoothness": 1e4} | change
+    with pytest.raises(ValueError, match=named):
+        fit_surface(arguments.pop("u"), arguments.pop("x_mm"), **arguments)
+
+
+@pytest.mark.parametrize("x", [np.zeros((3, 3)), np.full((9, 3), np.nan), np.eye(3)[np.arange(9) % 3]])
+def test_bad_spheres_are_named(x):
+    with pytest.raises(ValueError, match="x_mm"):
+        fit_sphere(x)
