@@ -72,7 +72,9 @@ class DriftMonitor:
         """True while the statistic is above the threshold."""
         return self.statistic > self.threshold
 
-    def update(self, x_mm: ArrayLike, u_left: ArrayLike, u_right: ArrayLike) -> bool:
+    def update(
+        self, x_mm: ArrayLike, u_left: ArrayLike, u_right: ArrayLike, covariance_px2: ArrayLike | None = None
+    ) -> bool:
         """Take in one frame; True = the cameras have moved.
 
         Parameters
@@ -80,13 +82,18 @@ class DriftMonitor:
         x_mm, u_left, u_right:
             (k, 3) mm and (k, 2) px: the frame's landmarks; rows with NaN are left out.  A frame without any changes
             nothing.
+        covariance_px2:
+            (k, 4, 4) of the residuals of this frame, if it is known better than in general: where the rig itself is
+            uncertain, far from the landmarks that it was calibrated with.
         """
         x = points(x_mm, 3, "x_mm")
         y = np.hstack([points(u_left, 2, "u_left"), points(u_right, 2, "u_right")])
         residual = y - np.hstack(self.rig.project(x))
-        residual = residual[np.isfinite(residual).all(axis=1)]
+        covariance = stack_covariance(self._covariance if covariance_px2 is None else covariance_px2, len(x))
+        seen = np.isfinite(residual).all(axis=1)
+        residual = residual[seen]
         freedom = residual.size
-        chi2 = float((residual * np.linalg.solve(self._covariance, residual.T).T).sum())
+        chi2 = float((residual * np.linalg.solve(covariance[seen], residual[:, :, None])[:, :, 0]).sum())
         if freedom:
             spread = 2.0 / (9.0 * freedom)
             score = (np.cbrt(chi2 / freedom) - (1.0 - spread)) / np.sqrt(spread)

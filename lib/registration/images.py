@@ -22,6 +22,7 @@ __all__ = ["MovedCameras", "identify_motion", "perturb", "register_cameras", "re
 
 _FREEDOM = 4.0  # of the Student t that "robust" supposes: gross errors lose their weight, small ones keep it
 _ITERATIONS = 100
+_OPEN = 1e-12  # curvature, relative to the largest, below which a direction is not determined
 Loss = Literal["squared", "robust"]
 
 
@@ -292,6 +293,8 @@ def _fit(A: np.ndarray, offset: np.ndarray, data: _Data, start: RigidTransform, 
         distance2 = np.einsum("ni,nij,nj->n", residual, data.information, residual) / scale2
         return residual, distance2, float(_loss(distance2, data, loss).sum())
 
+    jacobian = A @ motion_jacobian(stale.apply(data.x) - centre)
+    _check_determined((np.swapaxes(jacobian, 1, 2) @ data.information @ jacobian).sum(axis=0), freedom)
     residual, distance2, cost = evaluate(stale)
     damping, iterations = 1e-6, 0
     while iterations < _ITERATIONS:
@@ -353,19 +356,26 @@ def _scale2(distance2: np.ndarray, dimension: np.ndarray, freedom: int, loss: Lo
 
 
 def _pseudo_inverse(hessian: np.ndarray, rank: int) -> np.ndarray:
-    """Inverse over the `rank` observable directions.
+    """Inverse over the `rank` observable directions; one that the data hardly hold gets no infinite step."""
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-300))
+    values, vectors = np.linalg.eigh(scale[:, None] * hessian * scale)
+    values, vectors = values[-rank:], vectors[:, -rank:]
+    values = np.maximum(values, _OPEN * values[-1])
+    return scale[:, None] * ((vectors / values) @ vectors.T) * scale
+
+
+def _check_determined(hessian: np.ndarray, rank: int) -> None:
+    """Refuse landmarks that leave more open than the shift that an affine camera never sees.
 
     Raises
     ------
     ValueError
-        If the data leave more than that open.
+        Naming the arguments.
     """
     scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-300))
-    values, vectors = np.linalg.eigh(scale[:, None] * hessian * scale)
-    values, vectors = values[-rank:], vectors[:, -rank:]
-    if values[0] <= 1e-12 * values[-1]:
+    values = np.linalg.eigvalsh(scale[:, None] * hessian * scale)
+    if values[-rank] <= _OPEN * values[-1]:
         raise ValueError("x_mm, u_left, u_right: these landmarks leave the motion open. Add frames in other positions.")
-    return scale[:, None] * ((vectors / values) @ vectors.T) * scale
 
 
 def _covariance(A, data, stale, centre, residual, weights, scale2, freedom, loss) -> np.ndarray:
@@ -378,6 +388,8 @@ def _covariance(A, data, stale, centre, residual, weights, scale2, freedom, loss
     gradient = np.einsum("nij,nj->ni", JtW, residual)
     # The weights fall with the residual, which bends the loss less than the weights alone say.
     flatter = hessian - gradient.T @ (gradient * (2.0 / (_FREEDOM + 2 * data.seen.sum(axis=1)))[:, None])
-    inverse = _pseudo_inverse(flatter, freedom)
+    # Where nothing fits, the sum may curve the wrong way: then the weights alone.
+    bent = np.linalg.eigvalsh(flatter)[-freedom] <= _OPEN * np.linalg.eigvalsh(hessian)[-1]
+    inverse = _pseudo_inverse(hessian if bent else flatter, freedom)
     n = int(data.seen.any(axis=1).sum())
     return inverse @ (gradient.T @ gradient) @ inverse * (n / max(n - freedom, 1))

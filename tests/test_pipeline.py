@@ -1,0 +1,304 @@
+"""The online pipeline on components whose answers are known: what it does with good, bad and missing input."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from lib.cameras import AffineCamera, StereoRig
+from lib.geometry import RigidTransform
+from lib.matching.result import Matches
+from lib.pipeline import STAGES, FrameResult, OnlinePipeline, Settings
+from lib.registration import perturb, tool_frames
+from lib.registration.experiment import random_motion
+from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
+
+RIG = reference_rig()
+BLANK = np.zeros((1080, 1920, 3), np.uint8)
+CENTRE_MM = ROBOT_FROM_MICROSCOPE.t
+#: The eye of these tests: a plane 1.5 mm below the focal plane.
+DEPTH_MM = 1.5
+
+
+class World:
+    """What the cameras see; detector and matcher look it up instead of looking at pixels."""
+
+    def __init__(self, seed: int = 0, sigma_px: float = 1.0) -> None:
+        self.rng = np.random.default_rng(seed)
+        self.rig, self.sigma_px = RIG, sigma_px
+        self.x_mm = tool_frames(400, rng=np.random.default_rng(seed + 1), sigma_x_mm=0.0).true_x_mm
+        self.frame = -1
+
+    def advance(self) -> np.ndarray:
+        self.frame += 1
+        return self.x_mm[self.frame] + self.rng.normal(0, 0.01, (3, 3))
+
+    def detect(self, images: np.ndarray) -> SimpleNamespace:
+        assert images.shape == (2, *BLANK.shape)
+        u = np.stack(self.rig.project(self.x_mm[self.frame]))
+        return SimpleNamespace(u=u + self.rng.normal(0, self.sigma_px, u.shape), confidence=np.full((2, 3), 0.9))
+
+    def match(self, left, right, *, rig, mask_left, mask_right) -> Matches:
+        assert mask_left.shape == mask_right.shape == BLANK.shape[:2]
+        x, y = np.meshgrid(np.linspace(-6, 6, 25), np.linspace(-4, 4, 17))
+        plane = np.stack([x.ravel(), y.ravel(), np.full(x.size, DEPTH_MM)], axis=1)
+        u_left, u_right = self.rig.project(ROBOT_FROM_MICROSCOPE.apply(plane))
+        n = len(u_left)
+        return Matches(u_left, u_right, np.ones(n), np.tile(np.eye(4), (n, 1, 1)))
+
+
+class Plane:
+    """A surface that is a plane in the image: what the pipeline asks of a surface, and no more."""
+
+    def __init__(self, u: np.ndarray, x: np.ndarray) -> None:
+        self.coefficients = np.linalg.lstsq(np.column_stack([u, np.ones(len(u))]), x, rcond=None)[0]
+
+    def distance(self, x_mm: np.ndarray, camera: AffineCamera) -> SimpleNamespace:
+        surface = np.column_stack([camera.project(x_mm), np.ones(len(x_mm))]) @ self.coefficients
+        return SimpleNamespace(along_view_mm=(surface - x_mm) @ camera.viewing_direction)
+
+
+def calibrate(x_mm: np.ndarray, u: list[np.ndarray], *, ransac_px: float) -> SimpleNamespace:
+    homogeneous = np.column_stack([x_mm, np.ones(len(x_mm))])
+    if np.linalg.matrix_rank(homogeneous) < 4:
+        raise ValueError("x_mm: coplanar.")
+    return SimpleNamespace(
+        rig=StereoRig(*(AffineCamera(np.linalg.lstsq(homogeneous, side, rcond=None)[0].T) for side in u))
+    )
+
+
+def fit_plane(u, x_mm, *, domain, control, smoothness, camera) -> Plane:
+    return Plane(u, x_mm)
+
+
+def make(world: World, **options) -> OnlinePipeline:
+    components = {"calibrate": calibrate, "match": world.match, "fit_surface": fit_plane} | options
+    return OnlinePipeline(components.pop("detector", world.detect), **components)
+
+
+def run(pipeline: OnlinePipeline, world: World, n: int) -> list[FrameResult]:
+    return [pipeline.step(BLANK, BLANK, world.advance()) for _ in range(n)]
+
+
+def rig_error_mm(rig: StereoRig, world: World) -> float:
+    x = world.x_mm[:100].reshape(-1, 3)
+    return float(np.sqrt(((rig.triangulate(*world.rig.project(x)).x_mm - x) ** 2).sum(axis=1).mean()))
+
+
+def test_from_nothing_to_distances():
+    world = World()
+    pipeline = make(world)
+    results = run(pipeline, world, 40)
+    assert [r.state for r in results] == ["calibrating"] * 7 + ["tracking"] * 33
+    assert not any(r.failures for r in results)
+    assert [r.index for r in results] == list(range(40))
+    first, last = results[7], results[-1]
+    assert rig_error_mm(first.rig, world) < 0.2
+    assert rig_error_mm(last.rig, world) < 0.05
+    assert pipeline.noise_px == pytest.approx(np.hypot(1.0, 1.0), rel=0.25)  # 1 px of detections, 1 px of the robot
+    assert set(last.seconds) <= set(STAGES)
+    assert min(last.seconds.values()) >= 0
+    # The plane is DEPTH_MM below the focal plane; tools are above it by what their own depth says.
+    view = (RIG.left.viewing_direction, ROBOT_FROM_MICROSCOPE.R[:, 2])
+    depth = ROBOT_FROM_MICROSCOPE.inverse().apply(world.x_mm[world.frame])[:, 2]
+    np.testing.assert_allclose(last.distance_mm * (view[0] @ view[1]), DEPTH_MM - depth, atol=0.1)
+    np.testing.assert_allclose(last.x_tool_mm, world.x_mm[world.frame], atol=0.6)
+    assert 300 < len(last.points.x_mm) == len(last.u_points) < 25 * 17  # but for what the tool hides
+
+
+def test_nothing_unusual_raises_no_alarm():
+    world = World(3)
+    assert all(r.motion is None for r in run(make(world), world, 100))
+
+
+@pytest.mark.parametrize("moved", ["together", "left", "right", "apart"])
+def test_moved_cameras_are_noticed_and_registered(moved):
+    world = World(5)
+    pipeline = make(world)
+    run(pipeline, world, 30)
+    stay = RigidTransform.identity()
+    a, b = (random_motion(world.rng, centre_mm=CENTRE_MM, rotation_rad=0.05, translation_mm=0.4) for _ in range(2))
+    pair = {"together": (a, a), "left": (a, stay), "right": (stay, b), "apart": (a, b)}[moved]
+    world.rig = perturb(RIG, *pair)
+    assert rig_error_mm(pipeline.rig, world) > 0.1
+    results = run(pipeline, world, 15)
+    noticed = next(i for i, r in enumerate(results) if r.drift > 1)
+    registered = next(i for i, r in enumerate(results) if r.motion is not None)
+    assert noticed <= 2
+    assert registered <= 3  # the paper: about 3 frames
+    assert results[-1].state == "tracking"
+    assert [r.motion for r in results if r.motion][-1].moved == moved
+    assert rig_error_mm(pipeline.rig, world) < 0.12
+    assert not np.isnan(results[-1].distance_mm).any()
+    # And it goes on: the next hundred frames hold still, the next motion is noticed again.
+    assert all(r.state == "tracking" for r in run(pipeline, world, 30))
+    world.rig = perturb(world.rig, a)
+    assert any(r.motion for r in run(pipeline, world, 5))
+    assert rig_error_mm(pipeline.rig, world) < 0.3
+
+
+def test_changed_optics_are_calibrated_afresh():
+    """No motion explains a turned zoom."""
+    world = World(6)
+    pipeline = make(world)
+    run(pipeline, world, 30)
+    world.rig = reference_rig(pixels_per_mm=(150.0, 120.0))
+    results = run(pipeline, world, 30)
+    assert any("no motion explains" in r.failures.get("register", "") for r in results)
+    assert "calibrating" in [r.state for r in results]
+    assert results[-1].state == "tracking"
+    assert rig_error_mm(pipeline.rig, world) < 0.1
+
+
+def test_a_given_rig_is_used_from_the_first_frame_and_kept():
+    world = World()
+    pipeline = make(world, rig=RIG, noise_px=1.5)
+    results = run(pipeline, world, 30)
+    assert results[0].state == "tracking"
+    assert np.isfinite(results[0].distance_mm).all()
+    assert pipeline.rig is RIG
+
+
+def test_without_kinematics_the_rig_still_measures():
+    world = World()
+    pipeline = make(world, rig=RIG)
+    world.advance()
+    result = pipeline.step(BLANK, BLANK)
+    assert np.isfinite(result.x_tool_mm).all()
+    assert np.isfinite(result.distance_mm).all()
+    assert not result.failures
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "kinematics"),
+    [
+        (BLANK[:, :, 0], BLANK, np.zeros((3, 3))),
+        (BLANK, BLANK[:100], np.zeros((3, 3))),
+        (BLANK / 255.0, BLANK / 255.0, np.zeros((3, 3))),
+        (None, None, None),
+        (BLANK, BLANK, np.zeros((2, 3))),
+        (BLANK, BLANK, "soon"),
+    ],
+)
+def test_bad_input_is_a_failed_frame(left, right, kinematics):
+    world = World()
+    pipeline = make(world)
+    run(pipeline, world, 10)
+    result = pipeline.step(left, right, kinematics)
+    assert set(result.failures) == {"detect"}
+    assert result.points is None
+    assert result.state == "tracking"
+    assert not run(pipeline, world, 1)[0].failures
+
+
+def test_missing_landmarks():
+    world = World()
+
+    def detect(images):
+        found = world.detect(images)
+        found.u[0, 0] = np.nan  # the left base is never seen
+        found.confidence[0, 0] = 0.0
+        if world.frame % 3 == 0:
+            found.confidence[1, 2] = 0.01  # too unsure to count
+        if world.frame % 5 == 0:
+            found.u[:], found.confidence[:] = np.nan, 0.0
+        return found
+
+    pipeline = make(world, detector=detect)
+    results = run(pipeline, world, 40)
+    assert results[-1].state == "tracking"
+    assert not any(r.failures for r in results)
+    assert np.isnan(results[30].u_left).all()
+    assert np.isfinite(results[30].distance_mm).all()  # from the robot's report
+    assert results[30].points is not None
+    assert np.isnan(results[33].u_right[2]).all()
+
+
+def test_nan_kinematics():
+    world = World()
+    pipeline = make(world)
+    for i in range(40):
+        x = world.advance()
+        x[i % 3] = np.nan
+        result = pipeline.step(BLANK, BLANK, x)
+        assert not result.failures
+    assert result.state == "tracking"
+    assert np.isfinite(result.distance_mm).all()  # the missing one is taken from the triangulated landmark
+
+
+def test_a_calibration_that_is_refused_is_tried_again():
+    world = World()
+
+    def refuse_at_first(x_mm, u, **options):
+        if len(x_mm) < 12 * 3:
+            raise ValueError("x_mm: coplanar. Move the tool in depth.")
+        return calibrate(x_mm, u, **options)
+
+    results = run(make(world, calibrate=refuse_at_first), world, 14)
+    assert [r.state for r in results] == ["calibrating"] * 11 + ["tracking"] * 3
+    assert "Move the tool in depth" in results[10].failures["calibrate"]
+    assert not results[11].failures
+
+
+@pytest.mark.parametrize("stage", ["detect", "calibrate", "match", "surface", "distance"])
+def test_a_failing_stage_is_named_and_the_others_go_on(stage):
+    world = World()
+
+    def fail(*args, **kwargs):
+        raise RuntimeError("out of order")
+
+    broken = {
+        "detect": {"detector": fail},
+        "calibrate": {"calibrate": fail},
+        "match": {"match": fail},
+        "surface": {"fit_surface": fail},
+        "distance": {"fit_surface": lambda *args, **kwargs: SimpleNamespace(distance=fail)},
+    }[stage]
+    result = run(make(world, **broken), world, 12)[-1]
+    assert result.failures == {stage: "RuntimeError: out of order"}
+    assert result.state == ("calibrating" if stage in ("detect", "calibrate") else "tracking")
+    assert (result.points is None) == (stage in ("detect", "calibrate", "match"))
+
+
+def test_interrupts_are_not_swallowed():
+    world = World()
+
+    def interrupted(images):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(make(world, detector=interrupted), world, 1)
+
+
+def test_matches_on_the_tool_and_off_the_epipolar_line_are_dropped():
+    world = World()
+
+    def match(left, right, **options):
+        matches = world.match(left, right, **options)
+        matches.u_right[:50, 1] += 30.0
+        matches.u_left[60] = world.rig.project(world.x_mm[world.frame, 1])[0][0]
+        matches.u_right[60] = world.rig.project(world.x_mm[world.frame, 1])[1][0]
+        return matches
+
+    result = run(make(world, match=match), world, 20)[-1]
+    u = result.u_points
+    tip = world.rig.project(world.x_mm[world.frame, 1])[0][0]
+    assert np.linalg.norm(u - tip, axis=1).min() > 5
+    assert len(u) <= 25 * 17 - 51
+    assert np.abs(result.points.epipolar_px).max() <= 2.0
+
+
+def test_surface_every_other_frame():
+    world = World()
+    results = run(make(world, rig=RIG, settings=Settings(surface_every=2)), world, 4)
+    assert ["match" in r.seconds for r in results] == [True, False, True, False]
+    assert np.isfinite(results[1].distance_mm).all()
+
+
+def test_bad_settings():
+    with pytest.raises(ValueError, match="registration_frames"):
+        Settings(registration_frames=(1, 5))
+    with pytest.raises(ValueError, match="surface_every"):
+        Settings(surface_every=0)
