@@ -28,6 +28,8 @@ class Camera(Protocol):
 
     def project(self, x: ArrayLike) -> np.ndarray: ...
 
+    def jacobian(self, x: ArrayLike) -> np.ndarray: ...
+
 
 @dataclass(frozen=True)
 class Resection:
@@ -93,6 +95,15 @@ class AffineCamera:
         """Pixels (n, 2) of points (n, 3) in mm; NaN rows stay NaN."""
         return points(x, 3, "x") @ self.linear.T + self.offset_px
 
+    def jacobian(self, x: ArrayLike) -> np.ndarray:
+        """Derivative of `project`, (n, 2, 3) px per mm; the same at every point."""
+        return np.broadcast_to(self.linear, (len(points(x, 3, "x")), 2, 3))
+
+    @property
+    def projection_matrix(self) -> np.ndarray:
+        """Homogeneous P (3, 4); an affine camera's last row is (0, 0, 0, 1)."""
+        return np.vstack([self.matrix, [0.0, 0.0, 0.0, 1.0]])
+
     def resect(self, *, mirrored: bool = False) -> Resection:
         """K, R and t of the camera by RQ factorisation (paper Eq. 5).
 
@@ -116,43 +127,74 @@ class AffineCamera:
 
 @dataclass(frozen=True, eq=False)
 class NearAffineCamera:
-    """A camera at a finite working distance d, one parameter beyond affine: u = c + (M [x; 1] - c) / (1 + r3.x / d).
+    """A camera at a finite working distance d, one parameter beyond affine: u = c + (M [x; 1] - c) / D.
 
-    Affine is 1/d = 0, a regular point, so 1/d can be estimated and tested where perspective resection is
-    ill-conditioned.  r3 is the viewing direction of M, away from the camera; d is the distance from the
-    camera to the robot origin along r3.
+    D = 1 + r3.(x - reference) / d.  Affine is 1/d = 0, a regular point, so 1/d can be estimated and tested where
+    perspective resection is ill-conditioned.  r3 is the viewing direction of M, away from the camera; d is the
+    distance along r3 from the camera to the plane through the reference point.  A mirrored image shows as a
+    negative 1/d, since reflection turns the direction r3 that M implies round.
 
     Attributes
     ----------
     matrix:
-        M (2, 4), the affine camera that touches this one in the plane r3.x = 0.
+        M (2, 4), the affine camera that touches this one in the plane r3.(x - reference) = 0.
     inverse_distance_per_mm:
         1/d.
     centre_px:
         c, the principal point (2,), towards which distant points shrink.
+    reference_mm:
+        A point (3,) of the plane where the two touch; the origin unless given.
+    radial_per_px2:
+        k of radial distortion about c: the pixel above moves by k |u - c|^2 (u - c).
     """
 
     matrix: np.ndarray
     inverse_distance_per_mm: float
     centre_px: np.ndarray
+    reference_mm: np.ndarray = (0.0, 0.0, 0.0)
+    radial_per_px2: float = 0.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "matrix", _matrix(self.matrix))
-        centre = np.array(self.centre_px, dtype=np.float64)
-        if centre.shape != (2,) or not np.isfinite(centre).all():
-            raise ValueError("centre_px: expected two finite pixels, the principal point.")
-        if not np.isfinite(self.inverse_distance_per_mm):
-            raise ValueError("inverse_distance_per_mm: must be finite; 0 is the affine camera.")
-        object.__setattr__(self, "inverse_distance_per_mm", float(self.inverse_distance_per_mm))
-        object.__setattr__(self, "centre_px", centre)
+        for name, size in (("centre_px", 2), ("reference_mm", 3)):
+            vector = np.array(getattr(self, name), dtype=np.float64)
+            if vector.shape != (size,) or not np.isfinite(vector).all():
+                raise ValueError(f"{name}: expected {size} finite numbers, got {vector}.")
+            vector.setflags(write=False)
+            object.__setattr__(self, name, vector)
+        for name in ("inverse_distance_per_mm", "radial_per_px2"):
+            if not np.isfinite(getattr(self, name)):
+                raise ValueError(f"{name}: must be finite; 0 is the affine camera.")
+            object.__setattr__(self, name, float(getattr(self, name)))
 
     @property
     def affine(self) -> AffineCamera:
-        """The affine camera that touches this one at the robot origin's depth."""
+        """The affine camera that touches this one in the reference plane."""
         return AffineCamera(self.matrix)
 
+    @property
+    def linear(self) -> np.ndarray:
+        """A, (2, 3) px per mm in the reference plane."""
+        return self.matrix[:, :3]
+
+    @property
+    def offset_px(self) -> np.ndarray:
+        """M's last column (2,)."""
+        return self.matrix[:, 3]
+
+    @cached_property
+    def viewing_direction(self) -> np.ndarray:
+        """r3, unit (3,)."""
+        return self.affine.viewing_direction
+
+    def _depth_ratio(self, x: np.ndarray) -> np.ndarray:
+        ratio = 1.0 + self.inverse_distance_per_mm * ((x - self.reference_mm) @ self.viewing_direction)
+        if (ratio <= 0).any():
+            raise ValueError("x: a point lies behind the camera; check the units (mm) and the frame.")
+        return ratio
+
     def project(self, x: ArrayLike) -> np.ndarray:
-        """Pixels (n, 2) of points (n, 3) in mm.
+        """Pixels (n, 2) of points (n, 3) in mm; NaN rows stay NaN.
 
         Raises
         ------
@@ -160,10 +202,92 @@ class NearAffineCamera:
             If a point lies behind the camera.
         """
         x = points(x, 3, "x")
-        depth_ratio = 1.0 + self.inverse_distance_per_mm * (x @ self.affine.viewing_direction)
-        if (depth_ratio <= 0).any():
-            raise ValueError("x: a point lies behind the camera; check the units (mm) and the frame.")
-        return self.centre_px + (self.affine.project(x) - self.centre_px) / depth_ratio[:, None]
+        v = (x @ self.linear.T + self.offset_px - self.centre_px) / self._depth_ratio(x)[:, None]
+        return self.centre_px + v * (1.0 + self.radial_per_px2 * (v**2).sum(axis=1, keepdims=True))
+
+    def jacobian(self, x: ArrayLike) -> np.ndarray:
+        """Derivative of `project`, (n, 2, 3) px per mm."""
+        x = points(x, 3, "x")
+        ratio = self._depth_ratio(x)[:, None]
+        v = (x @ self.linear.T + self.offset_px - self.centre_px) / ratio
+        J = (self.linear - self.inverse_distance_per_mm * v[:, :, None] * self.viewing_direction) / ratio[:, :, None]
+        return radial_derivative(v, self.radial_per_px2) @ J if self.radial_per_px2 else J
+
+    def undistort(self, u: ArrayLike) -> np.ndarray:
+        """Pixels (n, 2) with the radial distortion taken out (Newton's method on the radius)."""
+        u = points(u, 2, "u")
+        if not self.radial_per_px2:
+            return u
+        w = u - self.centre_px
+        distorted = np.linalg.norm(w, axis=1)
+        radius = distorted.copy()
+        for _ in range(20):
+            step = (radius + self.radial_per_px2 * radius**3 - distorted) / (1 + 3 * self.radial_per_px2 * radius**2)
+            radius = radius - step
+            if not (np.abs(step) > 1e-13 * np.maximum(distorted, 1.0)).any():
+                break
+        return self.centre_px + w * np.divide(radius, distorted, out=np.ones_like(radius), where=distorted > 0)[:, None]
+
+    @property
+    def projection_matrix(self) -> np.ndarray:
+        """Homogeneous P (3, 4) of the camera without its radial distortion; it is 1 in the reference plane."""
+        last = self.inverse_distance_per_mm * np.append(self.viewing_direction, 0.0)
+        last[3] = 1.0 - last[:3] @ self.reference_mm
+        return np.vstack([self.matrix + np.outer(self.centre_px, last - [0, 0, 0, 1]), last])
+
+    @classmethod
+    def from_projection_matrix(cls, matrix: ArrayLike, radial_per_px2: float = 0.0) -> NearAffineCamera:
+        """The camera of a homogeneous P (3, 4), scaled as `projection_matrix` writes it (depth grows along its third row).
+
+        Raises
+        ------
+        ValueError
+            If P is affine (the third row's first three entries vanish) or not finite.
+        """
+        P = np.array(matrix, dtype=np.float64)
+        if P.shape != (3, 4) or not np.isfinite(P).all():
+            raise ValueError("matrix: a projection matrix is (3, 4) and finite.")
+        depth = P[2, :3]
+        size = np.linalg.norm(depth)
+        if size == 0:
+            raise ValueError("matrix: its last row is (0, 0, 0, w), an affine camera; use AffineCamera.")
+        reference = (1.0 - P[2, 3]) * depth / size**2
+        centre = P[:2, :3] @ depth / size**2
+        M = P[:2] - np.outer(centre, P[2] - [0, 0, 0, 1])
+        sign = np.sign(np.cross(M[0, :3], M[1, :3]) @ depth)
+        return cls(M, sign * size, centre, reference, radial_per_px2)
+
+
+def radial_derivative(v: np.ndarray, k: float) -> np.ndarray:
+    """d/dv of v (1 + k |v|^2), (n, 2, 2), for v (n, 2)."""
+    scale = 1.0 + k * (v**2).sum(axis=1)
+    return scale[:, None, None] * np.eye(2) + 2.0 * k * v[:, :, None] * v[:, None, :]
+
+
+def camera_to_dict(camera: AffineCamera | NearAffineCamera) -> dict:
+    """Plain numbers of a camera, for JSON."""
+    content = {"matrix": camera.matrix.tolist()}
+    if isinstance(camera, NearAffineCamera):
+        content |= {
+            "inverse_distance_per_mm": camera.inverse_distance_per_mm,
+            "centre_px": camera.centre_px.tolist(),
+            "reference_mm": camera.reference_mm.tolist(),
+            "radial_per_px2": camera.radial_per_px2,
+        }
+    return content
+
+
+def camera_from_dict(content: dict) -> AffineCamera | NearAffineCamera:
+    """The inverse of `camera_to_dict`; KeyError or ValueError where an entry is missing or wrong."""
+    if "inverse_distance_per_mm" not in content:
+        return AffineCamera(content["matrix"])
+    return NearAffineCamera(
+        content["matrix"],
+        content["inverse_distance_per_mm"],
+        content["centre_px"],
+        content.get("reference_mm", (0.0, 0.0, 0.0)),
+        content.get("radial_per_px2", 0.0),
+    )
 
 
 @dataclass(frozen=True)
@@ -179,8 +303,13 @@ class Points:
 class StereoRig:
     """Two calibrated cameras that share the frame of their points (the robot's, unless a name says otherwise)."""
 
-    left: AffineCamera
-    right: AffineCamera
+    left: AffineCamera | NearAffineCamera
+    right: AffineCamera | NearAffineCamera
+
+    @cached_property
+    def is_affine(self) -> bool:
+        """True where both cameras are affine, so that every formula below is one constant matrix."""
+        return isinstance(self.left, AffineCamera) and isinstance(self.right, AffineCamera)
 
     @cached_property
     def linear(self) -> np.ndarray:
@@ -200,7 +329,18 @@ class StereoRig:
 
     @property
     def fundamental(self) -> np.ndarray:
-        """Affine fundamental matrix F (3, 3), [u_right; 1].F.[u_left; 1] = 0, scaled so that its value is px."""
+        """Fundamental matrix F (3, 3), [u_right; 1].F.[u_left; 1] = 0; of an affine pair scaled so that its value is px.
+
+        Of near-affine cameras it holds for undistorted pixels and has unit Frobenius norm.
+        """
+        if not self.is_affine:
+            P, Q = self.left.projection_matrix, self.right.projection_matrix
+            F = np.empty((3, 3))
+            for i in range(3):
+                for j in range(3):
+                    rows = np.vstack([np.delete(P, j, axis=0), np.delete(Q, i, axis=0)])
+                    F[i, j] = (-1) ** (i + j) * np.linalg.det(rows)
+            return F / np.linalg.norm(F)
         n, e = self.epipolar_normal, -self.epipolar_normal @ self.offset_px
         return np.array([[0.0, 0.0, n[2]], [0.0, 0.0, n[3]], [n[0], n[1], e]])
 
@@ -220,6 +360,8 @@ class StereoRig:
         The distance is in the four pixel coordinates together, so independent noise of 1 px in each gives a
         distance of standard deviation 1 px (Hartley and Zisserman, Sec. 14.4).
         """
+        if not self.is_affine:
+            return self.triangulate(u_left, u_right).epipolar_px
         return (self._stack(u_left, u_right) - self.offset_px) @ self.epipolar_normal
 
     def triangulate(self, u_left: ArrayLike, u_right: ArrayLike, covariance_px2: ArrayLike | None = None) -> Points:
@@ -238,8 +380,10 @@ class StereoRig:
         Points
             With the covariance of each point from the noise of its match.
         """
-        y = self._stack(u_left, u_right) - self.offset_px
-        A, n = self.linear, len(y)
+        if self.is_affine and (covariance_px2 is None or np.ndim(covariance_px2) == 0):
+            return self._triangulate_isotropic(u_left, u_right, 1.0 if covariance_px2 is None else covariance_px2)
+        y = self._stack(u_left, u_right)
+        n = len(y)
         covariance = np.asarray(1.0 if covariance_px2 is None else covariance_px2, dtype=np.float64)
         if covariance.ndim == 0:
             covariance = covariance * np.eye(4)
@@ -249,11 +393,61 @@ class StereoRig:
             raise ValueError(
                 f"covariance_px2: expected a number, (2, 2), (4, 4) or ({n}, 4, 4), got {covariance.shape}."
             )
-        weight_A = np.linalg.solve(covariance, np.broadcast_to(A, covariance.shape[:-2] + (4, 3)))
-        covariance_mm2 = np.linalg.inv(A.T @ weight_A)
-        gain = covariance_mm2 @ np.swapaxes(weight_A, -1, -2)
+        if not self.is_affine:
+            return self._triangulate_near_affine(y, covariance)
+        y = y - self.offset_px
+        gain, covariance_mm2 = _gain(self.linear, covariance)
         x = y @ gain.T if gain.ndim == 2 else np.einsum("nij,nj->ni", gain, y)
         return Points(x, np.broadcast_to(covariance_mm2, (n, 3, 3)), y @ self.epipolar_normal)
+
+    def jacobian(self, x: ArrayLike) -> np.ndarray:
+        """Derivative of the four pixel coordinates, (n, 4, 3) px per mm."""
+        return np.concatenate([self.left.jacobian(x), self.right.jacobian(x)], axis=1)
+
+    @cached_property
+    def _isotropic(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """P (4, 4) and c (4,) so that P y + c is (x, epipolar distance), and the covariance of x for 1 px^2."""
+        gain, covariance_mm2 = _gain(self.linear, np.eye(4))
+        P = np.vstack([gain, self.epipolar_normal])
+        return P, -P @ self.offset_px, covariance_mm2
+
+    def _triangulate_isotropic(self, u_left: ArrayLike, u_right: ArrayLike, variance_px2: float) -> Points:
+        P, c, covariance_mm2 = self._isotropic
+        u_left, u_right = _matches(u_left, u_right)
+        n = len(u_left)
+        y = np.empty((4, n))  # a row a coordinate: numpy adds long rows about twice as fast as short ones
+        y[:2], y[2:] = u_left.T, u_right.T
+        z = P @ y
+        z += c[:, None]
+        return Points(z[:3].T, np.broadcast_to(covariance_mm2 * variance_px2, (n, 3, 3)), z[3])
+
+    def _triangulate_near_affine(self, y: np.ndarray, covariance: np.ndarray, steps: int = 2) -> Points:
+        """Linear per point (the projection's denominator multiplied out), then Gauss-Newton steps on the pixels."""
+        rows, values = [], []
+        for camera, u in ((self.left, y[:, :2]), (self.right, y[:, 2:])):
+            if isinstance(camera, NearAffineCamera):
+                u = camera.undistort(u)
+            P = camera.projection_matrix
+            rows.append(P[:2, :3] - u[:, :, None] * P[2, :3])
+            values.append(u * P[2, 3] - P[:2, 3])
+        A, b = np.concatenate(rows, axis=1), np.hstack(values)
+        known = np.isfinite(b).all(axis=1)
+        x = np.full((len(y), 3), np.nan)
+        covariance_mm2 = np.full((len(y), 3, 3), np.nan)
+        epipolar = np.full(len(y), np.nan)
+        A, b, y = A[known], b[known], y[known]
+        if covariance.ndim == 3:
+            covariance = covariance[known]
+        At = np.swapaxes(A, 1, 2)
+        found = np.linalg.solve(At @ A, (At @ b[..., None]))[..., 0]
+        for _ in range(steps):
+            gain, covariance_found = _gain(self.jacobian(found), covariance)
+            found = found + np.einsum("nij,nj->ni", gain, y - np.hstack(self.project(found)))
+        # The residual lies along the left null vector of the Jacobian; its sign is that of the affine normal.
+        residual = y - np.hstack(self.project(found))
+        x[known], covariance_mm2[known] = found, covariance_found
+        epipolar[known] = np.einsum("ni,ni->n", residual, _left_null_vector(self.jacobian(found), self.epipolar_normal))
+        return Points(x, covariance_mm2, epipolar)
 
     def save(self, path: str | Path) -> None:
         """Write the rig as JSON (matrices, units); the file appears whole or not at all."""
@@ -262,8 +456,8 @@ class StereoRig:
             {
                 "format": "microstereo.stereo_rig",
                 "units": {"point": "mm", "image": "px"},
-                "left": {"matrix": self.left.matrix.tolist()},
-                "right": {"matrix": self.right.matrix.tolist()},
+                "left": camera_to_dict(self.left),
+                "right": camera_to_dict(self.right),
             },
             indent=1,
         )
@@ -285,13 +479,33 @@ class StereoRig:
             raise FileNotFoundError(f"{path}: no such file; StereoRig.save writes one.")
         try:
             content = json.loads(path.read_text(encoding="utf-8"))
-            return cls(AffineCamera(content["left"]["matrix"]), AffineCamera(content["right"]["matrix"]))
+            return cls(camera_from_dict(content["left"]), camera_from_dict(content["right"]))
         except (ValueError, KeyError, TypeError) as error:
-            raise ValueError(f"{path}: not a stereo rig written by StereoRig.save ({error}).") from None
+            raise ValueError(f"{path}: not a stereo rig written by StereoRig.save ({type(error).__name__}: {error}).") from None
 
     @staticmethod
     def _stack(u_left: ArrayLike, u_right: ArrayLike) -> np.ndarray:
-        u_left, u_right = points(u_left, 2, "u_left"), points(u_right, 2, "u_right")
-        if len(u_left) != len(u_right):
-            raise ValueError(f"u_left, u_right: {len(u_left)} and {len(u_right)} points; matches come in pairs.")
-        return np.hstack([u_left, u_right])
+        return np.hstack(_matches(u_left, u_right))
+
+
+def _matches(u_left: ArrayLike, u_right: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    u_left, u_right = points(u_left, 2, "u_left"), points(u_right, 2, "u_right")
+    if len(u_left) != len(u_right):
+        raise ValueError(f"u_left, u_right: {len(u_left)} and {len(u_right)} points; matches come in pairs.")
+    return u_left, u_right
+
+
+def _gain(A: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Best linear estimator (..., 3, 4) of x from y = A x + noise, and the estimate's covariance (..., 3, 3)."""
+    shape = np.broadcast_shapes(A.shape[:-2], covariance.shape[:-2])
+    weight_A = np.linalg.solve(covariance, np.broadcast_to(A, (*shape, 4, 3)))
+    covariance_mm2 = np.linalg.inv(np.swapaxes(A, -1, -2) @ weight_A)
+    return covariance_mm2 @ np.swapaxes(weight_A, -1, -2), covariance_mm2
+
+
+def _left_null_vector(J: np.ndarray, along: np.ndarray) -> np.ndarray:
+    """Unit vectors (n, 4) orthogonal to the columns of J (n, 4, 3), turned to the side of `along` (4,)."""
+    minors = [np.linalg.det(np.delete(J, i, axis=1)) * (-1) ** i for i in range(4)]
+    normal = np.stack(minors, axis=1)
+    normal *= np.sign(normal @ along)[:, None]
+    return normal / np.linalg.norm(normal, axis=1, keepdims=True)
