@@ -11,8 +11,7 @@ from lib.cameras import AffineCamera, StereoRig
 from lib.geometry import RigidTransform
 from lib.matching.result import Matches
 from lib.pipeline import STAGES, FrameResult, OnlinePipeline, Settings
-from lib.registration import perturb, tool_frames
-from lib.registration.experiment import random_motion
+from lib.registration import perturb, random_motion, tool_frames
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
 
 RIG = reference_rig()

@@ -15,14 +15,16 @@ from lib.registration import (
     DriftMonitor,
     Registration,
     identify_motion,
+    motion_error,
     perturb,
+    random_motion,
+    recorded_registration_errors,
     register,
     register_cameras,
     register_images,
     registration_errors,
     tool_frames,
 )
-from lib.registration.experiment import motion_error, random_motion
 from lib.registration.rigid import motion_jacobian
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
 
@@ -366,11 +368,26 @@ def test_the_papers_experiment():
         "image": lambda rig, x, u_left, u_right: register_images(rig, x, u_left, u_right),
     }
     errors = registration_errors(estimators, [1, 3, 10], trials=40, rng=np.random.default_rng(0))
-    rms_um = {name: 1e3 * np.sqrt((translation**2).mean(axis=0)) for name, (translation, _) in errors.items()}
-    assert errors["norm"][1].shape == (40, 3, 3)
+    rms_um = {name: error.translation_rms_um for name, error in errors.items()}
+    assert errors["norm"].euler_rad.shape == (40, 3, 3)
     assert (np.diff(rms_um["norm"]) < 0).all()
+    assert (np.diff(errors["image"].euler_rms_deg.max(axis=1)) < 0).all()
     assert rms_um["norm"][1] < 150
     assert (rms_um["image"] < 0.85 * rms_um["norm"]).all()
+
+
+def test_the_experiment_on_a_recording():
+    """Moving the calibrated projections needs no truth; exact landmarks give no error, missing ones are left out."""
+    frames = tool_frames(12, rng=np.random.default_rng(0), sigma_u_px=0, sigma_x_mm=0)
+    frames.u_left[3, 1] = np.nan
+    frames.x_mm[5] = np.nan
+    options = {"rig": RIG, "x_mm": frames.x_mm, "u_left": frames.u_left, "u_right": frames.u_right}
+    estimators = {"image": lambda rig, *data: register_images(rig, *data)}
+    rng = np.random.default_rng(1)
+    found = recorded_registration_errors(estimators, [2, 4], trials=10, rng=rng, **options)["image"]
+    assert np.nanmax(found.translation_mm[:, 1]) < 1e-6
+    with pytest.raises(ValueError, match="n_frames: up to 20"):
+        recorded_registration_errors(estimators, [20], trials=1, rng=rng, **options)
 
 
 def test_tool_frames_have_the_tools_size():

@@ -14,7 +14,15 @@ from lib.registration.images import perturb
 from lib.registration.rigid import Registration
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
 
-__all__ = ["ToolFrames", "motion_error", "random_motion", "registration_errors", "tool_frames"]
+__all__ = [
+    "MotionErrors",
+    "ToolFrames",
+    "motion_error",
+    "random_motion",
+    "recorded_registration_errors",
+    "registration_errors",
+    "tool_frames",
+]
 
 #: An estimator of the motion from what is at hand: (rig, x_mm (n, 3), u_left (n, 2), u_right (n, 2)).
 Estimator = Callable[[StereoRig, np.ndarray, np.ndarray, np.ndarray], Registration]
@@ -28,6 +36,40 @@ class ToolFrames:
     u_left: np.ndarray
     u_right: np.ndarray
     true_x_mm: np.ndarray
+
+
+@dataclass(frozen=True)
+class MotionErrors:
+    """Errors of one estimator over trials: NaN where it could not tell.
+
+    Attributes
+    ----------
+    n_frames:
+        (k,) frames used.
+    translation_mm:
+        (trials, k) of a point at the workspace.
+    euler_rad:
+        (trials, k, 3) about the robot's x, y, z axes.
+    """
+
+    n_frames: tuple[int, ...]
+    translation_mm: np.ndarray
+    euler_rad: np.ndarray
+
+    @classmethod
+    def empty(cls, trials: int, n_frames: Sequence[int]) -> MotionErrors:
+        shape = (trials, len(n_frames))
+        return cls(tuple(int(n) for n in n_frames), np.full(shape, np.nan), np.full((*shape, 3), np.nan))
+
+    @property
+    def translation_rms_um(self) -> np.ndarray:
+        """(k,) root mean square over the trials."""
+        return 1e3 * np.sqrt(np.nanmean(self.translation_mm**2, axis=0))
+
+    @property
+    def euler_rms_deg(self) -> np.ndarray:
+        """(k, 3) root mean square over the trials."""
+        return np.rad2deg(np.sqrt(np.nanmean(self.euler_rad**2, axis=0)))
 
 
 def tool_frames(
@@ -102,7 +144,7 @@ def registration_errors(
     rng: np.random.Generator,
     outliers: float = 0.0,
     **options: float,
-) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+) -> dict[str, MotionErrors]:
     """Errors of each estimator after 1, 2, ... frames of one moved rig, over many motions and tools.
 
     Parameters
@@ -115,26 +157,63 @@ def registration_errors(
         Share of detections replaced by a random pixel up to 100 px away.
     options:
         For `tool_frames`, such as sigma_u_px.
-
-    Returns
-    -------
-    dict
-        Name to (translation (trials, len(n_frames)) in mm, Euler angles (trials, len(n_frames), 3) in rad).
     """
     rig = reference_rig()
     centre_mm = ROBOT_FROM_MICROSCOPE.t
-    translation = {name: np.empty((trials, len(n_frames))) for name in estimators}
-    angles = {name: np.empty((trials, len(n_frames), 3)) for name in estimators}
+    errors = {name: MotionErrors.empty(trials, n_frames) for name in estimators}
     for trial in range(trials):
         motion = random_motion(rng, centre_mm=centre_mm)
         frames = tool_frames(max(n_frames), rng=rng, rig=perturb(rig, motion), **options)
-        u = [frames.u_left.copy(), frames.u_right.copy()]
-        for image in u:
-            bad = rng.random(image.shape[:2]) < outliers
-            image[bad] += rng.uniform(-100, 100, (int(bad.sum()), 2))
-        for j, n in enumerate(n_frames):
-            data = (frames.x_mm[:n].reshape(-1, 3), u[0][:n].reshape(-1, 2), u[1][:n].reshape(-1, 2))
-            for name, estimator in estimators.items():
-                error = motion_error(estimator(rig, *data).transform, motion, centre_mm)
-                translation[name][trial, j], angles[name][trial, j] = error
-    return {name: (translation[name], angles[name]) for name in estimators}
+        for u in (frames.u_left, frames.u_right):
+            bad = rng.random(u.shape[:2]) < outliers
+            u[bad] += rng.uniform(-100, 100, (int(bad.sum()), 2))
+        _estimate_all(errors, trial, estimators, rig, (frames.x_mm, frames.u_left, frames.u_right), motion, centre_mm)
+    return errors
+
+
+def recorded_registration_errors(
+    estimators: Mapping[str, Estimator],
+    n_frames: Sequence[int],
+    *,
+    rig: StereoRig,
+    x_mm: np.ndarray,
+    u_left: np.ndarray,
+    u_right: np.ndarray,
+    trials: int,
+    rng: np.random.Generator,
+) -> dict[str, MotionErrors]:
+    """The same from a recording, needing no truth: it is the calibrated projections that are moved, by a known motion.
+
+    Parameters
+    ----------
+    rig:
+        Calibrated with other frames than these.
+    x_mm, u_left, u_right:
+        (n, 3, 3) mm as the robot reports, (n, 3, 2) px as detected, in order of time; NaN = missing.  Each trial uses
+        consecutive frames from a random one on.
+    """
+    if len(x_mm) < max(n_frames):
+        raise ValueError(f"n_frames: up to {max(n_frames)} frames are asked for, the recording has {len(x_mm)}.")
+    centre_mm = np.nanmean(x_mm, axis=(0, 1))
+    errors = {name: MotionErrors.empty(trials, n_frames) for name in estimators}
+    for trial in range(trials):
+        motion = random_motion(rng, centre_mm=centre_mm)
+        stale = perturb(rig, motion.inverse())
+        first = int(rng.integers(0, len(x_mm) - max(n_frames) + 1))
+        window = tuple(values[first:] for values in (x_mm, u_left, u_right))
+        _estimate_all(errors, trial, estimators, stale, window, motion, centre_mm)
+    return errors
+
+
+def _estimate_all(errors, trial, estimators, rig, window, motion, centre_mm) -> None:
+    for name, estimator in estimators.items():
+        for j, n in enumerate(errors[name].n_frames):
+            x, u_left, u_right = (values[:n].reshape(-1, values.shape[-1]) for values in window)
+            seen = np.isfinite(np.hstack([x, u_left, u_right])).all(axis=1)
+            try:
+                found = estimator(rig, x[seen], u_left[seen], u_right[seen]).transform
+            except ValueError:
+                continue  # too few landmarks in these frames: the errors stay NaN
+            errors[name].translation_mm[trial, j], errors[name].euler_rad[trial, j] = motion_error(
+                found, motion, centre_mm
+            )

@@ -5,8 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lib.registration import DriftMonitor, identify_motion, perturb, register, register_images, tool_frames
-from lib.registration.experiment import random_motion
+from lib.registration import (
+    DriftMonitor,
+    identify_motion,
+    perturb,
+    random_motion,
+    register,
+    register_images,
+    tool_frames,
+)
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
 
 RIG = reference_rig()
