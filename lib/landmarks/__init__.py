@@ -1,0 +1,5 @@
+"""Landmarks of the forceps in an image: base, tip_1, tip_2, with covariance and confidence (paper Sec. III)."""
+
+from lib.landmarks.inference import Detector, Landmarks
+
+__all__ = ["Detector", "Landmarks"]

@@ -1,0 +1,159 @@
+"""Augmentation with kornia: image and landmarks move together, landmarks that leave the frame become absent.
+
+The paper's is rotation within 30 degrees and zoom 0.75 to 1.25.  `best` adds shifts, mirroring (which swaps the tips:
+tip_1 is the left one, see `lib.simulator.forceps`) and what a microscope does to an image: gain, colour, defocus,
+noise, glints, things in front of the tool.  Left out on purpose: kornia's elastic, thin-plate and fisheye transforms
+move the image and not the points, and its motion blur shifts content unless its direction is 0.
+
+Random numbers come from a `numpy.random.Generator` given with every batch, so a resumed training repeats itself.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import kornia.augmentation as K
+import numpy as np
+import torch
+from torch import Tensor
+
+__all__ = ["AUGMENTATIONS", "Augmentation", "Batch"]
+
+OCCLUDED, VISIBLE = 1, 2
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Images (n, 3, h, w) float in [0, 1], landmarks u (n, 3, 2) px, visibility (n, 3).
+
+    Visibility as in COCO: 2 visible, 1 occluded, 0 not in the frame.  A NaN landmark is unlabelled.
+    """
+
+    images: Tensor
+    u: Tensor
+    visibility: Tensor
+
+    @property
+    def weight(self) -> Tensor:
+        """(n, 3): 0 masks the loss of occluded and of unlabelled landmarks.
+
+        A landmark known to be out of the frame has weight 1 and an empty heatmap: absence is trained.
+        """
+        unlabelled = torch.isnan(self.u).any(-1) & (self.visibility > 0)
+        return (~unlabelled & (self.visibility != OCCLUDED)).to(self.images.dtype)
+
+    @property
+    def target_u(self) -> Tensor:
+        """`u` where a peak belongs, NaN where the heatmap is empty or masked."""
+        return torch.where((self.visibility == VISIBLE)[..., None], self.u, torch.nan)
+
+
+@dataclass(frozen=True)
+class Augmentation:
+    """Ranges of the random transforms; 0 or False switches one off.
+
+    Attributes
+    ----------
+    rotation_deg:
+        Up to this angle either way, about the image's centre.
+    zoom:
+        Factor, drawn uniformly from this range.
+    shift:
+        Part of the image's size, either way.
+    mirror:
+        Flip top and bottom every second time, and swap the tips.
+    photometric:
+        Strength of the changes of light and optics, 0 to 1.
+    """
+
+    rotation_deg: float = 30.0
+    zoom: tuple[float, float] = (0.75, 1.25)
+    shift: float = 0.0
+    mirror: bool = False
+    photometric: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not 0 < self.zoom[0] <= self.zoom[1]:
+            raise ValueError(f"zoom: expected 0 < smallest <= largest, got {self.zoom}.")
+        if not 0 <= self.photometric <= 1:
+            raise ValueError(f"photometric: must lie between 0 and 1, got {self.photometric}.")
+
+    def __call__(self, batch: Batch, rng: np.random.Generator) -> Batch:
+        """The batch transformed; the caller's is left alone."""
+        with torch.random.fork_rng(devices=[]):  # kornia draws from torch's global generator
+            torch.manual_seed(int(rng.integers(2**63)))
+            images, u = self._geometric(batch.images, batch.u)
+            if self.photometric:
+                images = self._photometric(images)
+        u, visibility = u.clone(), batch.visibility.clone()
+        if self.mirror:
+            flip = torch.from_numpy(rng.random(len(u)) < 0.5)
+            h = images.shape[-2]
+            images = torch.where(flip[:, None, None, None], images.flip(-2), images)
+            mirrored = torch.stack([u[..., 0], (h - 1) - u[..., 1]], -1)[:, [0, 2, 1]]
+            u = torch.where(flip[:, None, None], mirrored, u)
+            visibility = torch.where(flip[:, None], visibility[:, [0, 2, 1]], visibility)
+        if self.photometric:
+            images, visibility = self._occluders(images, u, visibility, rng)
+        return Batch(images, u, leave_frame(u, visibility, images.shape[-2:]))
+
+    def _geometric(self, images: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+        shift = (self.shift, self.shift) if self.shift else None
+        if self.rotation_deg == 0 and self.zoom == (1.0, 1.0) and shift is None:
+            return images, u
+        affine = K.RandomAffine(self.rotation_deg, translate=shift, scale=self.zoom, padding_mode="border", p=1.0)
+        moved, points = K.AugmentationSequential(affine, data_keys=["input", "keypoints"])(images, u.to(images.dtype))
+        return moved, points.to(u.dtype)  # NaN points stay NaN
+
+    def _photometric(self, images: Tensor) -> Tensor:
+        s = self.photometric
+        light = K.ImageSequential(
+            K.ColorJiggle(0.25 * s, 0.3 * s, 0.4 * s, 0.06 * s, p=0.8),
+            K.RandomGamma((1 - 0.35 * s, 1 + 0.45 * s), p=0.5),
+            K.RandomLinearIllumination((0.01, 0.3 * s), p=0.3),
+            K.RandomGaussianBlur((7, 7), (0.3, 0.3 + 1.7 * s), p=0.4),
+            K.RandomMotionBlur(5, 180.0, 0.0, p=0.15),  # direction 0: the content stays where it is
+            K.RandomGaussianNoise(0.0, 0.03 * s, p=0.5),
+        )
+        return light(images).clamp(0, 1)
+
+    def _occluders(self, images: Tensor, u: Tensor, visibility: Tensor, rng: np.random.Generator):
+        """Glints (bright discs) and things in front (smooth dark or coloured ellipses); what they cover is occluded."""
+        images, visibility = images.clone(), visibility.clone()
+        n, _, h, w = images.shape
+        y, x = torch.meshgrid(torch.arange(h), torch.arange(w), indexing="ij")
+        for i in range(n):
+            if rng.random() < 0.3 * self.photometric:
+                centre, radius = rng.uniform((0, 0), (w, h)), rng.uniform(1.0, 0.03 * h + 2)
+                glow = torch.exp(-0.5 * ((x - centre[0]) ** 2 + (y - centre[1]) ** 2) / radius**2)
+                images[i] = (images[i] + rng.uniform(0.4, 1.0) * glow).clamp(0, 1)
+            if rng.random() < 0.15 * self.photometric:
+                centre, axes = rng.uniform((0, 0), (w, h)), rng.uniform(0.03, 0.12, 2) * h
+                angle = rng.uniform(0, np.pi)
+                c, s = np.cos(angle), np.sin(angle)
+                d = ((c * (x - centre[0]) + s * (y - centre[1])) / axes[0]) ** 2
+                d = d + ((c * (y - centre[1]) - s * (x - centre[0])) / axes[1]) ** 2
+                cover = torch.sigmoid((1 - d) * 6)
+                colour = torch.tensor(rng.uniform(0.02, 0.8) * rng.uniform(0.5, 1.0, 3), dtype=images.dtype)
+                images[i] = images[i] * (1 - cover) + colour[:, None, None] * cover
+                at = torch.nan_to_num(u[i], nan=-1.0).round().long()
+                inside = (at >= 0).all(-1) & (at[:, 0] < w) & (at[:, 1] < h)
+                covered = cover[at[:, 1].clamp(0, h - 1), at[:, 0].clamp(0, w - 1)] > 0.3
+                visibility[i] = torch.where(inside & covered & (visibility[i] == VISIBLE), OCCLUDED, visibility[i])
+        return images, visibility
+
+
+def leave_frame(u: Tensor, visibility: Tensor, image_size: tuple[int, int]) -> Tensor:
+    """Visibility with 0 for every labelled landmark outside the pixels of an (h, w) image."""
+    h, w = image_size
+    outside = (u < -0.5).any(-1) | (u[..., 0] >= w - 0.5) | (u[..., 1] >= h - 0.5)  # NaN is not outside
+    return torch.where(outside, 0, visibility)
+
+
+#: Presets: the paper's, and the one that trains the shipped detector's whole-frame and window networks.
+AUGMENTATIONS = {
+    "none": Augmentation(0.0, (1.0, 1.0)),
+    "paper": Augmentation(),
+    "best": Augmentation(180.0, (0.7, 1.3), shift=0.15, mirror=True, photometric=1.0),
+    "windows": Augmentation(0.0, (1.0, 1.0), mirror=True, photometric=1.0),  # placed by `lib.landmarks.windows`
+}

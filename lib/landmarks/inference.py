@@ -1,0 +1,398 @@
+"""The detector: images in, landmarks with covariance and confidence out.
+
+Two stages on the CPU (`Detector` with a window network): the whole frame at low resolution finds the tool, upright windows
+at full resolution measure its landmarks.  Without a window network the first stage alone is the paper's detector.
+Everything a detector needs lies in one safetensors file: weights, configuration, calibration and provenance.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save as safetensors_bytes
+from torch import Tensor
+
+from lib import paths
+from lib.geometry import image_from_cell
+from lib.landmarks.heatmaps import Peaks, decode
+from lib.landmarks.network import HourglassConfig, StackedHourglass
+from lib.landmarks.windows import cut, direction_rad, window_from_image
+
+__all__ = ["Calibration", "Detector", "Landmarks", "as_tensor", "read_checkpoint", "write_checkpoint"]
+
+FORMAT = "microstereo.detector"
+#: Landmarks below this confidence are missing: NaN.
+MIN_CONFIDENCE = 0.05
+
+
+@dataclass(frozen=True)
+class Landmarks:
+    """Detections of n images; the order is base, tip_1, tip_2.
+
+    Attributes
+    ----------
+    u:
+        (n, 3, 2) px, NaN where missing.
+    covariance:
+        (n, 3, 2, 2) px^2, NaN where missing.
+    confidence:
+        (n, 3), the probability that the landmark is in view and `u` lies within 5 % of the tool's length of it;
+        0 where missing.
+    """
+
+    u: np.ndarray
+    covariance: np.ndarray
+    confidence: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.u)
+
+    def __getitem__(self, index: slice | np.ndarray) -> Landmarks:
+        return Landmarks(self.u[index], self.covariance[index], self.confidence[index])
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What makes covariance and confidence true, fitted on validation images (`lib.landmarks.evaluation.calibrate`).
+
+    log of the error's variance per coordinate = `log_variance` . features; logit of the confidence =
+    `logit` . features; the features of a peak are in `peak_features`.  The shape of the ellipse is the fit's.
+    """
+
+    log_variance: tuple[float, ...] = (0.0, 1.0, 0.0, 0.0)
+    logit: tuple[float, ...] = (-4.0, 0.0, 8.0, 0.0)
+
+
+def peak_features(variance_px2: np.ndarray, value: np.ndarray, width: np.ndarray) -> np.ndarray:
+    """(..., 4): 1, log of the fit's variance in px^2, height of the peak, |log of its relative width|."""
+    variance = np.log(np.clip(variance_px2, 1e-4, 1e4))
+    return np.stack([np.ones_like(value), variance, np.clip(value, -0.5, 1.5), np.abs(np.log(width))], axis=-1)
+
+
+def as_tensor(images: ArrayLike | Tensor) -> Tensor:
+    """Images (n, h, w, 3), uint8 or float in [0, 1], as the networks take them: (n, 3, h, w) float, channels last.
+
+    Raises
+    ------
+    ValueError
+        For another shape, type or range.
+    """
+    array = np.asarray(images)
+    if array.ndim != 4 or array.shape[-1] != 3:
+        raise ValueError(
+            f"images: expected (n, h, w, 3) RGB, got {array.shape}. "
+            "Add a first axis for one image; repeat a grey channel three times; drop an alpha channel."
+        )
+    if not array.size:
+        raise ValueError(f"images: empty, {array.shape}.")
+    tensor = torch.from_numpy(np.ascontiguousarray(array)).permute(0, 3, 1, 2)
+    if array.dtype == np.uint8:
+        return tensor.float().div_(255.0)
+    if not np.issubdtype(array.dtype, np.floating):
+        raise ValueError(f"images: expected uint8 or float, got {array.dtype}; convert with astype(np.uint8).")
+    low, high = float(array.min()), float(array.max())
+    if not (low >= 0.0 and high <= 1.0):
+        raise ValueError(f"images: float images must lie in [0, 1], got {low:g} to {high:g}; divide by 255?")
+    return tensor.float()
+
+
+def write_checkpoint(path: str | Path, tensors: dict[str, Tensor], metadata: dict[str, object]) -> None:
+    """Write a safetensors file with JSON metadata, whole or not at all: a full disk leaves the old file as it was."""
+    path = Path(path)
+    partial = path.with_name(path.name + ".partial")
+    data = safetensors_bytes(
+        {name: tensor.detach().contiguous() for name, tensor in tensors.items()},
+        metadata={name: json.dumps(value) for name, value in metadata.items()},
+    )
+    try:
+        partial.write_bytes(data)
+        os.replace(partial, path)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        raise OSError(
+            error.errno, f"{path}: not saved ({error.strerror}); an earlier file there is unharmed"
+        ) from error
+
+
+def read_checkpoint(path: str | Path, kind: str) -> tuple[dict[str, Tensor], dict[str, object]]:
+    """Tensors and metadata of a file that `write_checkpoint` wrote with ``metadata["format"] == kind``.
+
+    Raises
+    ------
+    FileNotFoundError, ValueError
+        If there is none, or it is corrupt or something else.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such weights file; train one with `python3 -m lib train`.")
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = {name: json.loads(value) for name, value in (file.metadata() or {}).items()}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118, not a dict
+    except (SafetensorError, json.JSONDecodeError, OSError) as error:
+        raise ValueError(f"{path}: corrupt or no safetensors file of this program ({error}).") from error
+    if metadata.get("format") != kind:
+        raise ValueError(f"{path}: holds {metadata.get('format', 'foreign weights')!r}, expected {kind!r}.")
+    return tensors, metadata
+
+
+def load_network(path: str | Path, config: object, tensors: dict[str, Tensor]) -> StackedHourglass:
+    """A network from its configuration and weights; errors name the file."""
+    try:
+        network = StackedHourglass(HourglassConfig(**config))  # type: ignore[arg-type]
+        network.load_state_dict(tensors)
+    except (TypeError, RuntimeError, ValueError) as error:
+        raise ValueError(f"{path}: its weights do not fit its configuration ({str(error).splitlines()[0]}).") from error
+    return network
+
+
+@dataclass(frozen=True, eq=False)
+class Detector:
+    """Landmarks of whole frames, any size, any number; the same object for the left and the right camera.
+
+    Attributes
+    ----------
+    frame_network:
+        Sees the frame reduced by `reduction`.
+    reduction:
+        Image pixels per pixel of the frame network's input, an integer; 1 is the paper's whole-frame detector.
+    window_network:
+        Sees upright windows of `window_px` around what the first stage found; None = the first stage is all.
+    calibration:
+        One per landmark source: ``"frame"`` and ``"window"``.
+    """
+
+    frame_network: StackedHourglass
+    reduction: int = 1
+    window_network: StackedHourglass | None = None
+    window_px: int = 128
+    method: str = "gauss_newton"
+    calibration: dict[str, Calibration] = field(default_factory=dict)
+    metadata: dict[str, object] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.reduction < 1 or self.reduction != int(self.reduction):
+            raise ValueError(f"reduction: must be a positive integer, got {self.reduction}.")
+        networks = {"frame": self.frame_network.fused()}
+        if self.window_network is not None:
+            if self.window_px % self.window_network.config.multiple:
+                raise ValueError(f"window_px: must be a multiple of {self.window_network.config.multiple}.")
+            networks["window"] = self.window_network.fused()
+        object.__setattr__(self, "_fused", networks)
+
+    # Files
+
+    @classmethod
+    def load(cls, path_or_name: str | Path | None = None) -> Detector:
+        """A detector from a weights file, or from a name in ``data/models``; None is the shipped default.
+
+        Raises
+        ------
+        FileNotFoundError, ValueError
+            Naming the file: missing, corrupt, or not a detector.
+        """
+        path = Path(path_or_name or "default")
+        if not path.suffix and not path.is_file():
+            path = paths.MODELS / f"{path.name}.safetensors"
+        tensors, metadata = read_checkpoint(path, FORMAT)
+        parts: dict[str, StackedHourglass] = {}
+        for name, config in metadata["networks"].items():
+            own = {key.removeprefix(name + "."): value for key, value in tensors.items() if key.startswith(name + ".")}
+            parts[name] = load_network(path, config, own)
+        return cls(
+            parts["frame"],
+            reduction=metadata["reduction"],
+            window_network=parts.get("window"),
+            window_px=metadata["window_px"],
+            method=metadata["method"],
+            calibration={
+                name: Calibration(*(tuple(values) for values in fit)) for name, fit in metadata["calibration"].items()
+            },
+            metadata=metadata["provenance"],
+        )
+
+    def save(self, path: str | Path) -> None:
+        """Write the detector as one safetensors file."""
+        networks = {"frame": self.frame_network, "window": self.window_network}
+        networks = {name: network for name, network in networks.items() if network is not None}
+        tensors = {
+            f"{name}.{key}": value for name, network in networks.items() for key, value in network.state_dict().items()
+        }
+        metadata = {
+            "format": FORMAT,
+            "networks": {name: asdict(network.config) for name, network in networks.items()},
+            "reduction": self.reduction,
+            "window_px": self.window_px,
+            "method": self.method,
+            "calibration": {name: [fit.log_variance, fit.logit] for name, fit in self.calibration.items()},
+            "provenance": self.metadata,
+        }
+        write_checkpoint(path, tensors, metadata)
+
+    # Detection
+
+    def __call__(self, images: ArrayLike, *, batch: int = 4) -> Landmarks:
+        """Landmarks of images (n, h, w, 3), uint8 RGB or float in [0, 1]; `batch` images at a time.
+
+        Raises
+        ------
+        ValueError
+            For images of another shape, type or range.
+        """
+        images = _images(images)
+        found = []
+        for start in range(0, len(images), batch):
+            part = images[start : start + batch]
+            peaks, _ = self.frame_peaks(part)
+            rough = self._calibrated(peaks, "frame", self.reduction)
+            found.append(self._refined(part, rough) if self.window_network is not None else rough)
+        return _missing(_joined(found))
+
+    def track(self, images: ArrayLike, previous: Landmarks, *, min_confidence: float = 0.5) -> Landmarks:
+        """Landmarks of the frames that follow `previous`: windows alone, the whole frame where they fail.
+
+        Parameters
+        ----------
+        images:
+            (n, h, w, 3), such as the left and the right image of one time.
+        previous:
+            Landmarks of the n images before.
+        min_confidence:
+            An image with a landmark below this is searched as a whole.
+        """
+        images = _images(images)
+        if len(previous) != len(images):
+            raise ValueError(f"previous: holds {len(previous)} images, but images {len(images)}.")
+        if self.window_network is None:
+            return self(images)
+        usable = np.flatnonzero((previous.confidence >= min_confidence).all(1) & np.isfinite(previous.u).all((1, 2)))
+        result = Landmarks(
+            np.full((len(images), 3, 2), np.nan), np.full((len(images), 3, 2, 2), np.nan), np.zeros((len(images), 3))
+        )
+        if usable.size:
+            _put(result, usable, self._refined(images[usable], previous[usable]))
+        lost = np.flatnonzero((result.confidence < min_confidence).any(1))
+        if lost.size:
+            _put(result, lost, self(images[lost]))
+        return _missing(result)
+
+    def frame_heatmaps(self, images: ArrayLike) -> Tensor:
+        """Heatmaps (n, 3, h, w) of the first stage."""
+        reduced = self.reduced(_images(images))
+        with torch.inference_mode():
+            return self._fused["frame"](as_tensor(reduced))[-1]
+
+    def frame_peaks(self, images: ArrayLike, method: str | None = None) -> tuple[Peaks, Tensor]:
+        """What the first stage decodes, in pixels of its reduced input, and its heatmaps."""
+        heatmaps = self.frame_heatmaps(images)
+        return decode(heatmaps, self.frame_network.stride, method=method or self.method), heatmaps
+
+    def window_heatmaps(self, images: np.ndarray, u: ArrayLike) -> tuple[Tensor, np.ndarray, np.ndarray]:
+        """The second stage's heatmaps around landmarks u (n, 3, 2).
+
+        Returns
+        -------
+        Heatmaps (m, 1, h, w), each window's own landmark; window_from_image (m, 2, 3); (m, 2) indices of image and
+        landmark.  Landmarks that are NaN, or of a tool without direction, have no window.
+        """
+        u = np.asarray(u, dtype=np.float64)
+        angle = direction_rad(u)
+        which = np.argwhere(np.isfinite(u).all(2) & np.isfinite(angle)[:, None])
+        centre = u[which[:, 0], which[:, 1]]
+        matrices = window_from_image(centre, angle[which[:, 0]], self.window_px)
+        stride = self.window_network.stride
+        cells = -(-self.window_px // stride)
+        if not len(which):
+            return torch.zeros((0, 1, cells, cells)), matrices, which
+        windows = np.stack(
+            [cut(images[i], matrix, self.window_px) for (i, _), matrix in zip(which, matrices, strict=True)]
+        )
+        with torch.inference_mode():
+            heatmaps = self._fused["window"](as_tensor(windows))[-1]
+        own = heatmaps[torch.arange(len(which)), torch.from_numpy(which[:, 1])][:, None]
+        return own, matrices, which
+
+    def _refined(self, images: np.ndarray, rough: Landmarks) -> Landmarks:
+        heatmaps, matrices, which = self.window_heatmaps(images, rough.u)
+        result = Landmarks(rough.u.copy(), rough.covariance.copy(), rough.confidence.copy())
+        if not len(which):
+            return result
+        peaks = decode(heatmaps, self.window_network.stride, method=self.method)
+        fine = self._calibrated(peaks, "window", 1)
+        # Back to the image: the inverse of a rotation and a shift.
+        turn = matrices[:, :, :2]
+        u = ((fine.u[:, 0] - matrices[:, :, 2])[:, None] @ turn)[:, 0]
+        covariance = turn.mT @ fine.covariance[:, 0] @ turn
+        i, k = which.T
+        result.u[i, k], result.covariance[i, k], result.confidence[i, k] = u, covariance, fine.confidence[:, 0]
+        return result
+
+    def reduced(self, images: np.ndarray) -> np.ndarray:
+        """Images averaged over blocks of `reduction` pixels, black beyond the right and bottom border."""
+        r = self.reduction
+        if r == 1:
+            return images
+        n, h, w, _ = images.shape
+        images = np.pad(images, ((0, 0), (0, -h % r), (0, -w % r), (0, 0))) if h % r or w % r else images
+        size = (images.shape[2] // r, images.shape[1] // r)
+        return np.stack([cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in images]) if n else images
+
+    def _calibrated(self, peaks: Peaks, source: str, scale: int) -> Landmarks:
+        """Peaks in pixels of a network's input to landmarks in image pixels."""
+        u = image_from_cell(peaks.u.numpy(), scale)
+        fit = self.calibration.get(source, Calibration())
+        shape, features = shape_and_features(peaks, scale)
+        variance = np.exp(np.clip(features @ np.array(fit.log_variance), -12, 12))
+        covariance = shape * variance[..., None, None]
+        confidence = 1 / (1 + np.exp(-features @ np.array(fit.logit)))
+        return Landmarks(u, covariance, confidence)
+
+    def with_calibration(self, **fits: Calibration) -> Detector:
+        """A copy with the calibration of ``frame=`` or ``window=`` replaced."""
+        return replace(self, calibration={**self.calibration, **fits})
+
+
+def shape_and_features(peaks: Peaks, scale: float) -> tuple[np.ndarray, np.ndarray]:
+    """Shape of the ellipses, (..., 2, 2) of determinant 1, and `peak_features` (..., 4)."""
+    covariance = peaks.covariance.double().numpy() * scale**2
+    covariance = np.where(np.isfinite(covariance), covariance, np.eye(2))
+    determinant = np.clip(np.linalg.det(covariance), 1e-12, None)
+    scalar = np.sqrt(determinant)
+    shape = covariance / scalar[..., None, None]
+    return shape, peak_features(scalar, peaks.value.double().numpy(), peaks.width.double().numpy())
+
+
+def _images(images: ArrayLike) -> np.ndarray:
+    array = np.asarray(images)
+    if array.dtype != np.uint8:
+        as_tensor(array)  # raises what is wrong
+        array = np.round(array * 255).astype(np.uint8)
+    elif array.ndim != 4 or array.shape[-1] != 3 or not array.size:
+        as_tensor(array)
+    return array
+
+
+def _joined(parts: list[Landmarks]) -> Landmarks:
+    return Landmarks(*(np.concatenate([getattr(p, name) for p in parts]) for name in ("u", "covariance", "confidence")))
+
+
+def _put(into: Landmarks, rows: np.ndarray, values: Landmarks) -> None:
+    into.u[rows], into.covariance[rows], into.confidence[rows] = values.u, values.covariance, values.confidence
+
+
+def _missing(found: Landmarks) -> Landmarks:
+    """NaN and confidence 0 for what is below `MIN_CONFIDENCE`."""
+    missing = ~(found.confidence >= MIN_CONFIDENCE)
+    return Landmarks(
+        np.where(missing[..., None], np.nan, found.u),
+        np.where(missing[..., None, None], np.nan, found.covariance),
+        np.where(missing, 0.0, found.confidence),
+    )

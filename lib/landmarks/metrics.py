@@ -1,0 +1,164 @@
+"""How good detections are: PCK, pixel errors, and whether covariance and confidence mean what they say."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.stats import chi2
+
+__all__ = [
+    "PCK_THRESHOLDS",
+    "Scores",
+    "calibration_error",
+    "coverage",
+    "errors_px",
+    "nees",
+    "pck",
+    "reliability",
+    "score",
+]
+
+#: The paper's range of thresholds, as parts of the tool's length.
+PCK_THRESHOLDS = np.linspace(0.001, 0.2, 200)
+
+
+def _pairs(u: ArrayLike, u_true: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    u, u_true = np.asarray(u, dtype=np.float64), np.asarray(u_true, dtype=np.float64)
+    if u.ndim != 3 or u.shape[1:] != (3, 2) or u.shape != u_true.shape:
+        raise ValueError(f"u and u_true: expected two arrays (n, 3, 2), got {u.shape} and {u_true.shape}.")
+    return u, u_true
+
+
+def errors_px(u: ArrayLike, u_true: ArrayLike) -> np.ndarray:
+    """Distance (n, 3) of detections (n, 3, 2) from labels: infinite where nothing was detected, NaN without a label."""
+    u, u_true = _pairs(u, u_true)
+    error = np.linalg.norm(u - u_true, axis=2)
+    labelled = np.isfinite(u_true).all(axis=2)
+    return np.where(labelled, np.where(np.isfinite(error), error, np.inf), np.nan)
+
+
+def tool_length_px(u_true: ArrayLike) -> np.ndarray:
+    """Mean distance (n,) of the labelled tips from the base, the PCK's unit; NaN without a base or without a tip.
+
+    The paper normalises by "the distance of the tool-tip from its base" and leaves open which tip.
+    """
+    u_true = np.asarray(u_true, dtype=np.float64)
+    distance = np.linalg.norm(u_true[:, 1:] - u_true[:, :1], axis=2)
+    known = np.isfinite(distance)
+    return np.where(known.any(1), np.where(known, distance, 0).sum(1) / np.maximum(known.sum(1), 1), np.nan)
+
+
+def pck(u: ArrayLike, u_true: ArrayLike, threshold: ArrayLike = PCK_THRESHOLDS, *, length_px: ArrayLike | None = None):
+    """Percentage of correct keypoints (paper Sec. V-B): nearer to the label than `threshold` times the tool's length.
+
+    Parameters
+    ----------
+    u, u_true:
+        (n, 3, 2) px; a missing detection counts as wrong, a missing label is not counted.
+    threshold:
+        A number or (t,).
+    length_px:
+        (n,) tool lengths; None = from the labels.  Frames without one are not counted.
+
+    Returns
+    -------
+    Percent, a float or (t,) as `threshold`; NaN where no label counts.
+    """
+    length = tool_length_px(u_true) if length_px is None else np.asarray(length_px, dtype=np.float64)
+    with np.errstate(invalid="ignore"):
+        relative = errors_px(u, u_true) / length[:, None]
+    relative = np.sort(relative[~np.isnan(relative)])
+    if not relative.size:
+        return np.full(np.shape(threshold), np.nan)[()]
+    return 100.0 * np.searchsorted(relative, np.asarray(threshold), side="right")[()] / relative.size
+
+
+def nees(u: ArrayLike, u_true: ArrayLike, covariance: ArrayLike) -> np.ndarray:
+    """Normalised estimation error squared (n, 3): mean 2 and chi-square with 2 degrees where covariances are true."""
+    u, u_true = _pairs(u, u_true)
+    difference = u - u_true
+    covariance = np.asarray(covariance, dtype=np.float64)
+    known = np.isfinite(difference).all(2) & np.isfinite(covariance).all((2, 3))
+    value = np.full(difference.shape[:2], np.nan)
+    d = difference[known]
+    value[known] = np.einsum("ni,ni->n", d, np.linalg.solve(covariance[known], d[..., None])[..., 0])
+    return value
+
+
+def coverage(values: ArrayLike, probability: float = 0.95) -> float:
+    """Percent of `nees` values inside the ellipse that should hold `probability` of them."""
+    values = np.asarray(values)
+    values = values[np.isfinite(values)]
+    return 100.0 * float((values <= chi2.ppf(probability, 2)).mean()) if values.size else np.nan
+
+
+def reliability(confidence: ArrayLike, correct: ArrayLike, bins: int = 10) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Mean confidence, fraction correct and count per bin of confidence, (bins,) each; NaN for empty bins."""
+    confidence, correct = np.ravel(confidence).astype(float), np.ravel(correct).astype(float)
+    which = np.clip((confidence * bins).astype(int), 0, bins - 1)
+    count = np.bincount(which, minlength=bins)
+    with np.errstate(invalid="ignore"):
+        mean = np.bincount(which, confidence, bins) / count
+        fraction = np.bincount(which, correct, bins) / count
+    return mean, fraction, count
+
+
+def calibration_error(confidence: ArrayLike, correct: ArrayLike, bins: int = 10) -> float:
+    """Expected calibration error: the mean of |confidence - fraction correct| over bins, weighted by their counts."""
+    mean, fraction, count = reliability(confidence, correct, bins)
+    used = count > 0
+    return float(np.average(np.abs(mean - fraction)[used], weights=count[used])) if used.any() else np.nan
+
+
+@dataclass(frozen=True)
+class Scores:
+    """The figures of an evaluation; percent, pixels, counts.
+
+    `median_px`, `p95_px` and `bias_px` are over detected landmarks with a label; `missed` counts labels without
+    a detection, which PCK counts as wrong.  `nees` is the mean after leaving out errors beyond 20 px, which no covariance
+    means to explain (`gross` counts them).
+    """
+
+    pck_0_01: float
+    pck_0_05: float
+    pck_0_10: float
+    auc: float
+    median_px: float
+    p95_px: float
+    bias_px: tuple[float, float]
+    nees: float
+    coverage_95: float
+    labels: int
+    missed: int
+    gross: int
+
+    def as_dict(self) -> dict[str, object]:
+        """For JSON."""
+        return asdict(self)
+
+
+def score(u: ArrayLike, u_true: ArrayLike, covariance: ArrayLike | None = None, *, length_px=None) -> Scores:
+    """All figures at once; arguments as in `pck` and `nees`."""
+    u, u_true = _pairs(u, u_true)
+    error = errors_px(u, u_true)
+    found = error[np.isfinite(error)]
+    curve = pck(u, u_true, length_px=length_px)
+    bias = (u - u_true)[np.isfinite(error) & (error < 20)]
+    squared = nees(u, u_true, covariance)[error < 20] if covariance is not None else np.array([])
+    squared = squared[np.isfinite(squared)]
+    median, p95 = np.percentile(found, [50, 95]) if found.size else (np.nan, np.nan)
+    x, y = bias.mean(axis=0) if bias.size else (np.nan, np.nan)
+    return Scores(
+        *(float(pck(u, u_true, t, length_px=length_px)) for t in (0.01, 0.05, 0.10)),
+        auc=float(np.trapezoid(curve, PCK_THRESHOLDS) / np.ptp(PCK_THRESHOLDS)),
+        median_px=float(median),
+        p95_px=float(p95),
+        bias_px=(float(x), float(y)),
+        nees=float(squared.mean()) if squared.size else np.nan,
+        coverage_95=coverage(squared),
+        labels=int((~np.isnan(error)).sum()),
+        missed=int(np.isinf(error).sum()),
+        gross=int((found >= 20).sum()),
+    )
