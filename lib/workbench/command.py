@@ -1,0 +1,255 @@
+"""``python3 -m lib run``: the notebooks one after the other, and the report growing beside them."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import datetime
+import json
+import os
+import shutil
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from lib import paths
+from lib.workbench import collection, pages
+from lib.workbench.execution import Failure, execute, kernel_environment
+from lib.workbench.index import index_html
+from lib.workbench.parameters import (
+    UsageError,
+    choose_notebooks,
+    declared_parameters,
+    parse_parameters,
+    title_of,
+)
+
+__all__ = ["main", "run"]
+
+PROFILES = ("quick", "paper")
+
+
+def main(argv: Sequence[str]) -> int:
+    """Parse the command line and run; 0 if every notebook came to its end, 1 if one failed, 2 for a misspelt command."""
+    parser = argparse.ArgumentParser(prog="python3 -m lib run", description=__doc__.split(":", 1)[1].strip())
+    parser.add_argument("notebooks", nargs="*", metavar="NOTEBOOK", help="path, name or number (default: all)")
+    parser.add_argument("--profile", choices=PROFILES, default="quick", help="quick: minutes; paper: the paper's sizes")
+    parser.add_argument("-p", dest="pairs", nargs=2, action="append", default=[], metavar=("NAME", "VALUE"),
+                        help="a parameter of the notebooks that declare it")  # fmt: skip
+    parser.add_argument("--cell-timeout", type=float, metavar="S", help="longest time of one cell (default: 900 for quick)")
+    parser.add_argument("--runs", type=Path, default=paths.RUNS, metavar="FOLDER", help="where the run's folder appears")
+    options = parser.parse_args(argv)
+    timeout = options.cell_timeout or (900.0 if options.profile == "quick" else None)
+    try:
+        result = run(options.notebooks, options.profile, options.pairs, cell_timeout_s=timeout, runs=options.runs)
+    except UsageError as error:
+        print(f"python3 -m lib run: {error}", file=sys.stderr)
+        return 2
+    return {"complete": 0, "failed": 1, "stopped": 130}[result["state"]]
+
+
+def run(
+    names: Sequence[str] = (),
+    profile: str = "quick",
+    pairs: Sequence[tuple[str, str]] = (),
+    *,
+    cell_timeout_s: float | None = None,
+    runs: Path = paths.RUNS,
+    notebooks: Path = paths.NOTEBOOKS,
+) -> dict:
+    """Execute notebooks into a new folder of `runs`; a failing one is told and the others still run.
+
+    Everything is written as it comes about, so that a run that is killed leaves a readable report of what it got to.
+
+    Returns
+    -------
+    dict
+        The content of the run's metrics.json.
+
+    Raises
+    ------
+    UsageError
+        Before anything runs: for an unknown notebook or parameter, or a value of the wrong type.
+    """
+    chosen = choose_notebooks(names, notebooks)
+    values = parse_parameters(pairs, chosen)
+    for book in chosen:
+        if "profile" in declared_parameters(book):
+            values[book].setdefault("profile", profile)
+    kernel_environment()
+    report = _Report(_new_folder(runs, profile), chosen, profile, dict(pairs))
+    width = max(len(book.stem) for book in chosen)
+    try:
+        for number, book in enumerate(chosen, start=1):
+            with _Progress(f"[{number}/{len(chosen)}] {book.stem:<{width}}") as progress:
+                report.begin(book)
+                failure = execute(
+                    book, report.executed(book), values[book], cell_timeout_s=cell_timeout_s, on_cell=progress.cell
+                )
+                report.end(book, failure, progress.seconds)
+                progress.done(str(failure) if failure else None)
+        report.finish()
+    except KeyboardInterrupt:
+        report.finish("stopped")
+        print("\nStopped.")
+    for entry in report.content["notebooks"]:
+        if entry["state"] == "failed":
+            failure = entry["failure"]
+            print(f"FAILED {entry['name']}: {Failure(**failure)}", file=sys.stderr)
+    print(f"\nReport: {report.folder / 'index.html'}")
+    return report.content
+
+
+class _Report:
+    """The folder of a run and the content of its metrics.json, kept in step."""
+
+    def __init__(self, folder: Path, notebooks: Sequence[Path], profile: str, given: dict[str, str]):
+        self.folder, self.notebooks = folder, list(notebooks)
+        self.start = time.monotonic()
+        self.content = {
+            "format": "microstereo.metrics",
+            "version": 1,
+            "state": "running",
+            "profile": profile,
+            "parameters": given,
+            "started": datetime.datetime.now().astimezone().isoformat(timespec="seconds"),
+            "seconds": 0.0,
+            "commit": collection.commit(),
+            "machine": collection.machine(),
+            "versions": collection.versions(),
+            "notebooks": [
+                {"name": book.stem, "title": title_of(book), "state": "pending", "seconds": None, "failure": None,
+                 "page": None, "executed": None}
+                for book in notebooks
+            ],
+            "metrics": [],
+            "figures": [],
+        }  # fmt: skip
+        (folder / "figures").mkdir()
+        self.write()
+
+    def executed(self, book: Path) -> Path:
+        return self.folder / book.name
+
+    def begin(self, book: Path) -> None:
+        self._entry(book)["state"] = "running"
+        self.write()
+
+    def end(self, book: Path, failure: Failure | None, seconds: float) -> None:
+        """Collect what the notebook recorded (also one that failed, up to there) and write its page."""
+        entry, executed = self._entry(book), self.executed(book)
+        entry.update(state="failed" if failure else "complete", seconds=round(seconds, 2))
+        entry["failure"] = failure.as_dict() if failure else None
+        if executed.is_file():
+            self.content["metrics"] += [{"notebook": book.stem, **m} for m in collection.metrics_of(executed)]
+            for figure in collection.figures_of(executed):
+                self._add_figure(book, figure)
+            self._write_page(book, entry)
+        self.write()
+
+    def finish(self, state: str | None = None) -> None:
+        failed = any(entry["state"] == "failed" for entry in self.content["notebooks"])
+        self.content["state"] = state or ("failed" if failed else "complete")
+        for entry in self.content["notebooks"]:
+            if entry["state"] == "running":
+                entry["state"] = "pending"
+        self.write()
+
+    def write(self) -> None:
+        self.content["seconds"] = round(time.monotonic() - self.start, 2)
+        _write(self.folder / "metrics.json", json.dumps(self.content, indent=1, ensure_ascii=False) + "\n")
+        _write(self.folder / "index.html", index_html(self.content))
+
+    def _add_figure(self, book: Path, figure: collection.NamedFigure) -> None:
+        file = f"figures/{figure.name}.png"
+        if any(other["file"] == file for other in self.content["figures"]):
+            file = f"figures/{book.stem}.{figure.name}.png"
+        (self.folder / file).write_bytes(figure.png)
+        self.content["figures"].append(
+            {"notebook": book.stem, "name": figure.name, "file": file, "caption": figure.caption}
+        )
+
+    def _write_page(self, book: Path, entry: dict) -> None:
+        place = self.notebooks.index(book)
+        neighbours = [
+            (f"{self.notebooks[i].stem}.html", self.content["notebooks"][i]["title"]) if 0 <= i < len(self.notebooks)
+            else None for i in (place - 1, place + 1)
+        ]  # fmt: skip
+        text = pages.page(
+            self.executed(book),
+            title=entry["title"],
+            folder=book.parent,
+            previous=neighbours[0],
+            following=neighbours[1],
+        )
+        if pages.PLOTLY_FILE in text and not (self.folder / pages.PLOTLY_FILE).exists():
+            import plotly
+
+            shutil.copy(Path(plotly.__file__).parent / "package_data" / pages.PLOTLY_FILE, self.folder)
+        _write(self.folder / f"{book.stem}.html", text)
+        entry.update(page=f"{book.stem}.html", executed=book.name)
+
+    def _entry(self, book: Path) -> dict:
+        return self.content["notebooks"][self.notebooks.index(book)]
+
+
+class _Progress:
+    """One line a notebook: on a terminal it counts cells and seconds, elsewhere it says now and then how far it is."""
+
+    def __init__(self, label: str):
+        self.label, self.now = label, ""
+        self.start = time.monotonic()
+        self.live = sys.stdout.isatty()
+        self.stop = threading.Event()
+        self.thread = threading.Thread(target=self._tell, daemon=True)
+
+    @property
+    def seconds(self) -> float:
+        return time.monotonic() - self.start
+
+    def __enter__(self) -> _Progress:
+        self.thread.start()
+        return self
+
+    def __exit__(self, *_) -> None:
+        self.stop.set()
+        self.thread.join()
+
+    def cell(self, number: int, of: int) -> None:
+        self.now = f"cell {number}/{of}"
+
+    def done(self, failure: str | None) -> None:
+        self.__exit__()
+        end = "\r\033[K" if self.live else ""
+        print(f"{end}{self.label}  {self.seconds:6.1f} s  {failure or 'done'}", flush=True)
+
+    def _tell(self) -> None:
+        while not self.stop.wait(0.2 if self.live else 20.0):
+            if self.live:
+                width = shutil.get_terminal_size().columns - 1
+                line = f"{self.label}  {self.seconds:6.1f} s  {self.now}"
+                print(f"\r\033[K{line[:width]}", end="", flush=True)
+            else:
+                print(f"{self.label}  {self.seconds:6.1f} s  {self.now}", flush=True)
+
+
+def _new_folder(runs: Path, profile: str) -> Path:
+    """``<date>-<profile>``, and with ``-2``, ``-3``, ... where that is taken: no run touches another's files."""
+    runs.mkdir(parents=True, exist_ok=True)
+    stem = f"{datetime.date.today().isoformat()}-{profile}"
+    number = 1
+    while True:
+        folder = runs / (stem if number == 1 else f"{stem}-{number}")
+        with contextlib.suppress(FileExistsError):
+            folder.mkdir()
+            return folder
+        number += 1
+
+
+def _write(path: Path, text: str) -> None:
+    """Whole or not at all."""
+    partial = path.with_name(path.name + ".partial")
+    partial.write_text(text, encoding="utf-8")
+    os.replace(partial, path)

@@ -1,0 +1,143 @@
+"""Executes one notebook with papermill and judges by its outputs whether it went well."""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import nbformat
+from nbclient.exceptions import CellTimeoutError, DeadKernelError
+
+__all__ = ["Failure", "execute", "failure_of", "kernel_environment"]
+
+_ADDED = {"injected-parameters", "papermill-error-cell-tag"}
+_ANSI = re.compile(r"\x1b\[[0-9;]*m")
+
+
+@dataclass(frozen=True)
+class Failure:
+    """Why a notebook did not get to its end: `cell` counts its cells from 1."""
+
+    kind: str  # "error", "timeout", "dead kernel", "unreadable"
+    cell: int | None
+    message: str
+
+    def __str__(self) -> str:
+        where = f" in cell {self.cell}" if self.cell else ""
+        return f"{self.kind}{where}: {self.message}"
+
+    as_dict = asdict
+
+
+def kernel_environment(cpu_threads: int | None = None) -> None:
+    """Set the environment variables that kernels inherit: this interpreter's own kernel, and quiet libraries."""
+    os.environ["JUPYTER_PREFER_ENV_PATH"] = "1"  # a kernel named python3 elsewhere on the machine must not win
+    os.environ.pop("JUPYTER_PATH", None)
+    os.environ["OPEN3D_DISABLE_WEB_VISUALIZER"] = "true"  # it hangs without a display
+    os.environ["PYDEVD_DISABLE_FILE_VALIDATION"] = "1"  # a warning of the debugger on every start
+    if cpu_threads:
+        os.environ["OMP_NUM_THREADS"] = str(cpu_threads)
+
+
+def execute(
+    notebook: Path,
+    output: Path,
+    parameters: dict,
+    *,
+    cell_timeout_s: float | None = None,
+    on_cell: Callable[[int, int], None] = lambda cell, n_cells: None,
+) -> Failure | None:
+    """Execute `notebook` into `output` (written after each cell); None if every cell came to its end.
+
+    Parameters
+    ----------
+    cell_timeout_s:
+        The longest that one cell may take; None is without end.
+    on_cell:
+        Called with the cell that starts (from 1) and the number of cells.
+    """
+    import papermill
+    from papermill.engines import NBClientEngine, papermill_engines
+    from papermill.exceptions import PapermillExecutionError
+
+    engine_name = f"workbench-{id(on_cell)}-{time.monotonic_ns()}"
+    running = 0
+
+    class Engine(NBClientEngine):
+        """papermill's own, telling which cell starts."""
+
+        @classmethod
+        def execute_managed_notebook(cls, manager, kernel_name, **options):
+            tell = manager.cell_start
+
+            def cell_start(cell, cell_index=None, **more):
+                nonlocal running
+                added = [_is_added(other) for other in manager.nb.cells]
+                running = (cell_index or 0) + 1 - sum(added[:cell_index])
+                on_cell(running, len(added) - sum(added))
+                return tell(cell, cell_index=cell_index, **more)
+
+            manager.cell_start = cell_start
+            super().execute_managed_notebook(manager, kernel_name, **options)
+
+    papermill_engines.register(engine_name, Engine)
+    logging.getLogger("papermill").setLevel(logging.CRITICAL)  # what it says is told by the failure returned
+    failure = None
+    try:
+        papermill.execute_notebook(
+            str(notebook),
+            str(output),
+            parameters,
+            engine_name=engine_name,
+            kernel_name="python3",
+            progress_bar=False,
+            execution_timeout=cell_timeout_s,
+            extra_arguments=["--IPKernelApp.log_level=50"],  # its warning of unencrypted TCP on every start
+        )
+    except PapermillExecutionError:
+        pass  # told by the outputs, below
+    except CellTimeoutError:
+        failure = Failure("timeout", running, _longer_than(cell_timeout_s))
+    except DeadKernelError:
+        failure = Failure("dead kernel", running, "the kernel died; the machine may have run out of memory.")
+    except (nbformat.reader.NotJSONError, nbformat.ValidationError, OSError, ValueError, RuntimeError) as error:
+        failure = Failure("unreadable" if not running else "error", running or None, f"{type(error).__name__}: {error}")
+    finally:
+        papermill_engines._engines.pop(engine_name, None)
+    return failure or failure_of(output, cell_timeout_s)
+
+
+def failure_of(executed: Path, cell_timeout_s: float | None = None) -> Failure | None:
+    """Judge an executed notebook by its outputs: papermill calls a cell that was timed out completed."""
+    cells = [cell for cell in nbformat.read(executed, as_version=4).cells if not _is_added(cell)]
+    for number, cell in enumerate(cells, start=1):
+        if cell.cell_type != "code" or "raises-exception" in cell.metadata.get("tags", []):
+            continue
+        status = cell.metadata.get("papermill", {})
+        for output in cell.outputs:
+            if output.output_type != "error":
+                continue
+            if output.ename == "KeyboardInterrupt" and cell_timeout_s and _seconds(status) >= cell_timeout_s:
+                return Failure("timeout", number, _longer_than(cell_timeout_s))
+            return Failure("error", number, f"{output.ename}: {_ANSI.sub('', output.evalue)}")
+        if cell.source.strip() and status.get("status") not in (None, "completed"):
+            return Failure("error", number, f"the cell is {status.get('status')}.")
+    return None
+
+
+def _is_added(cell) -> bool:
+    """papermill's own cells (values given, error marks), which the author does not count."""
+    return bool(_ADDED & set(cell.metadata.get("tags", [])))
+
+
+def _seconds(status: dict) -> float:
+    return float(status.get("duration") or 0.0)
+
+
+def _longer_than(seconds: float | None) -> str:
+    return f"the cell took longer than {seconds:g} s (--cell-timeout)."

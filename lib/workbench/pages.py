@@ -1,0 +1,160 @@
+"""One HTML page of an executed notebook: a single file that opens without network, equations and all."""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import nbformat
+from nbconvert.filters.ansi import ansi2html
+from nbconvert.filters.markdown_mistune import IPythonRenderer, MarkdownWithMath
+from pygments import highlight
+from pygments.formatters import HtmlFormatter
+from pygments.lexers import PythonLexer
+
+from lib.workbench import equations
+from lib.workbench.style import PAGE_CSS
+
+__all__ = ["PLOTLY_FILE", "markdown_html", "page"]
+
+#: plotly's script lies once beside the pages that show a 3D view.
+PLOTLY_FILE = "plotly.min.js"
+PLOTLY_MIME = "application/vnd.plotly.v1+json"
+WIDGET_MIME = "application/vnd.jupyter.widget-view+json"
+WIDGET_STATE = "application/vnd.jupyter.widget-state+json"
+
+_IMAGES = {"image/png": "png", "image/jpeg": "jpeg", "image/gif": "gif"}
+
+
+class _Renderer(IPythonRenderer):
+    """Markdown as JupyterLab shows it, equations drawn."""
+
+    def block_math(self, body: str) -> str:
+        return equations.svg(body, display=True)
+
+    def inline_math(self, body: str) -> str:
+        return equations.svg(body, display=False)
+
+    def latex_environment(self, name: str, body: str) -> str:
+        return equations.svg(f"\\begin{{{name}}}{body}\\end{{{name}}}", display=True)
+
+
+def markdown_html(source: str, *, folder: Path = Path(), attachments: dict | None = None) -> str:
+    """Markdown with TeX as HTML; pictures it names, relative to `folder`, are embedded."""
+    renderer = _Renderer(
+        escape=False, embed_images=True, path=str(folder), attachments=attachments or {}, exclude_anchor_links=True
+    )
+    return MarkdownWithMath(renderer=renderer).render(source)
+
+
+def page(
+    executed: Path, *, title: str, folder: Path, previous: tuple[str, str] | None, following: tuple[str, str] | None
+) -> str:
+    """The HTML of an executed notebook.
+
+    Parameters
+    ----------
+    folder:
+        Where the notebook's source lies: what its relative pictures are relative to.
+    previous, following:
+        (file, title) of the neighbouring pages.
+    """
+    notebook = nbformat.read(executed, as_version=4)
+    widgets = notebook.metadata.get("widgets", {}).get(WIDGET_STATE, {}).get("state", {})
+    body = "\n".join(_cell(cell, folder, widgets) for cell in notebook.cells)
+    script = f'<script src="{PLOTLY_FILE}"></script>' if 'class="plotly-view"' in body else ""
+    back = f'<a href="{previous[0]}">&larr; {html.escape(previous[1])}</a>' if previous else "<span></span>"
+    on = f'<a href="{following[0]}">{html.escape(following[1])} &rarr;</a>' if following else "<span></span>"
+    return f"""<!DOCTYPE html>
+<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{html.escape(title)} - microstereo</title>
+<style>{PAGE_CSS}
+{HtmlFormatter(style="friendly").get_style_defs(".code")}</style>{script}</head>
+<body><nav><a class="home" href="index.html">microstereo</a>{back}{on}</nav>
+<main>
+{body}
+</main>
+<nav class="foot">{back}<a href="index.html">Report of this run</a>{on}</nav>
+</body></html>
+"""
+
+
+def _cell(cell, folder: Path, widgets: dict) -> str:
+    tags = set(cell.metadata.get("tags", []))
+    if "papermill-error-cell-tag" in tags or not cell.source.strip():
+        return ""
+    if cell.cell_type == "markdown":
+        return f'<section class="prose">{markdown_html(cell.source, folder=folder, attachments=cell.get("attachments"))}</section>'
+    if cell.cell_type != "code":
+        return f"<pre>{html.escape(cell.source)}</pre>"
+    code = highlight(cell.source, PythonLexer(), HtmlFormatter(cssclass="code"))
+    if "injected-parameters" in tags:
+        code = f'<div class="given">Values given to this run{code}</div>'
+    outputs = "".join(_outputs(cell.outputs, widgets))
+    return f'<section class="cell">{code}{f"<div class=output>{outputs}</div>" if outputs else ""}</section>'
+
+
+def _outputs(outputs: list, widgets: dict) -> Iterator[str]:
+    for output in outputs:
+        if output["output_type"] == "stream":
+            text = _settled(output["text"])
+            if text.strip():
+                yield f'<pre class="{output["name"]}">{ansi2html(text)}</pre>'
+        elif output["output_type"] == "error":
+            yield f'<pre class="error">{ansi2html(chr(10).join(output["traceback"]))}</pre>'
+        else:
+            yield _rich(output["data"], widgets, output.get("metadata", {}))
+
+
+def _rich(data: dict, widgets: dict, metadata: dict) -> str:
+    """The richest form of one output that needs no network."""
+    if WIDGET_MIME in data:
+        return _widget(data[WIDGET_MIME]["model_id"], widgets)
+    if PLOTLY_MIME in data:
+        figure = json.dumps({key: data[PLOTLY_MIME].get(key, {}) for key in ("data", "layout")}).replace("</", "<\\/")
+        return (
+            '<div class="plotly-view"></div><script>(f => Plotly.newPlot('
+            "document.currentScript.previousElementSibling, f.data, f.layout, {responsive: true}))"
+            f"({figure})</script>"
+        )
+    if "text/html" in data:
+        return f'<div class="rich">{data["text/html"]}</div>'
+    if "image/svg+xml" in data:
+        return data["image/svg+xml"]
+    for mime, kind in _IMAGES.items():
+        if mime in data:
+            alt = html.escape(metadata.get(mime, {}).get("alt", ""), quote=True)
+            encoded = data[mime].replace("\n", "")
+            return f'<img src="data:image/{kind};base64,{encoded}" alt="{alt}">'
+    if "text/markdown" in data:
+        return markdown_html(data["text/markdown"])
+    if "text/latex" in data:
+        return equations.svg(data["text/latex"].strip("$ \n"), display=True)
+    return f"<pre>{html.escape(data.get('text/plain', ''))}</pre>"
+
+
+def _widget(model_id: str, widgets: dict) -> str:
+    """An interactive part as a page can show it: what its output area held, and where to find it alive."""
+    held = "".join(_outputs(list(_held_outputs(model_id, widgets)), widgets))
+    return f'<div class="interactive">{held}<p>Interactive: open the notebook in JupyterLab to move the controls.</p></div>'
+
+
+def _held_outputs(model_id: str, widgets: dict) -> Iterator[dict]:
+    state = widgets.get(model_id, {}).get("state", {})
+    yield from state.get("outputs", [])
+    for child in state.get("children", []):
+        yield from _held_outputs(child.removeprefix("IPY_MODEL_"), widgets)
+
+
+def _settled(text: str) -> str:
+    """A terminal's view of text with carriage returns: of a progress bar only its last state."""
+    return "\n".join(line.rstrip("\r").rsplit("\r", 1)[-1] for line in re.sub(r"\x1b\[A", "", text).split("\n"))
+
+
+def data_uri(png: bytes) -> str:
+    """A PNG to put into an img tag."""
+    return "data:image/png;base64," + base64.b64encode(png).decode("ascii")
