@@ -8,15 +8,22 @@ and returns the duality gap as proof; `cvxpy_reference` solves the same with CLA
 from __future__ import annotations
 
 import itertools
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
-import scipy.sparse as sparse
+from scipy import sparse
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from lib.surface.bspline import SplineGrid, cubic_basis
 
 __all__ = ["L1Problem", "L1Solution", "cvxpy_reference", "interior_point"]
+
+try:
+    from threadpoolctl import ThreadpoolController
+except ImportError:  # without it the solver is as right, and slower on a busy machine
+    ThreadpoolController = None
 
 _PAIRS = [(i, j) for i in range(4) for j in range(i, 4)]
 
@@ -163,10 +170,14 @@ def interior_point(
         If the data do not determine the coefficients (a control point without data, at mu = 0).
     """
     weights = np.ones_like(x) if weights is None else weights
-    outputs = [
-        _interior_point(problem, np.ascontiguousarray(x_k), mu_k, np.ascontiguousarray(w_k), tolerance, max_iterations)
-        for x_k, mu_k, w_k in zip(x.T, np.broadcast_to(mu, x.shape[1]), weights.T, strict=True)
-    ]
+    columns = zip(x.T, np.broadcast_to(mu, x.shape[1]), weights.T, strict=True)
+    with _one_blas_thread():
+        outputs = [
+            _interior_point(
+                problem, np.ascontiguousarray(x_k), mu_k, np.ascontiguousarray(w_k), tolerance, max_iterations
+            )
+            for x_k, mu_k, w_k in columns
+        ]
     coefficients, objective, gap, dual, iterations = zip(*outputs, strict=True)
     return L1Solution(
         np.stack(coefficients, axis=1), np.array(objective), np.array(gap), np.stack(dual, axis=1), max(iterations)
@@ -243,6 +254,17 @@ def _interior_point(
         slack_p, slack_q = slack_p - alpha * dy, slack_q + alpha * dy
 
     return c * scale + centre, objective * scale, gap * scale, y, iteration
+
+
+@cache
+def _blas() -> ThreadpoolController | None:
+    return ThreadpoolController() if ThreadpoolController else None
+
+
+def _one_blas_thread() -> AbstractContextManager:
+    """BLAS on one thread: narrow bands gain nothing from more, and where cores are busy they wait for each other."""
+    controller = _blas()
+    return controller.limit(limits=1, user_api="blas") if controller else nullcontext()
 
 
 def _step_length(*pairs: tuple[np.ndarray, np.ndarray]) -> float:
