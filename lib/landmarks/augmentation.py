@@ -20,6 +20,8 @@ from torch import Tensor
 __all__ = ["AUGMENTATIONS", "Augmentation", "Batch"]
 
 OCCLUDED, VISIBLE = 1, 2
+#: Height of an occluded landmark's target: its place is still learnt, and its height tells that it is not seen.
+OCCLUDED_PEAK = 0.5
 
 
 @dataclass(frozen=True)
@@ -35,17 +37,18 @@ class Batch:
 
     @property
     def weight(self) -> Tensor:
-        """(n, 3): 0 masks the loss of occluded and of unlabelled landmarks.
+        """(n, 3): 0 masks the loss of unlabelled landmarks.
 
         A landmark known to be out of the frame has weight 1 and an empty heatmap: absence is trained.
         """
         unlabelled = torch.isnan(self.u).any(-1) & (self.visibility > 0)
-        return (~unlabelled & (self.visibility != OCCLUDED)).to(self.images.dtype)
+        return (~unlabelled).to(self.images.dtype)
 
     @property
-    def target_u(self) -> Tensor:
-        """`u` where a peak belongs, NaN where the heatmap is empty or masked."""
-        return torch.where((self.visibility == VISIBLE)[..., None], self.u, torch.nan)
+    def peak(self) -> Tensor:
+        """(n, 3) height of the target: 1 visible, `OCCLUDED_PEAK` occluded (where it must be, yet not seen), 0 absent."""
+        heights = torch.tensor([0.0, OCCLUDED_PEAK, 1.0], dtype=self.images.dtype)
+        return heights[self.visibility.long()]
 
 
 @dataclass(frozen=True)

@@ -85,7 +85,7 @@ def _argmax(heatmaps: Tensor) -> tuple[Tensor, Tensor]:
 
 def _patches(heatmaps: Tensor, centre: Tensor, radius: int) -> tuple[Tensor, Tensor, Tensor]:
     """Square neighbourhoods: values (n, k, p), offsets (p, 2) from `centre` in cells, inside (n, k, p) bool."""
-    n, k, h, w = heatmaps.shape
+    h, w = heatmaps.shape[-2:]
     side = torch.arange(-radius, radius + 1, device=heatmaps.device)
     dy, dx = torch.meshgrid(side, side, indexing="ij")
     offsets = torch.stack([dx, dy], -1).reshape(-1, 2)

@@ -252,7 +252,7 @@ class Detector:
         for start in range(0, len(images), batch):
             part = images[start : start + batch]
             peaks, _ = self.frame_peaks(part)
-            rough = self._calibrated(peaks, "frame", self.reduction)
+            rough = _missing(self._calibrated(peaks, "frame", self.reduction))
             found.append(self._refined(part, rough) if self.window_network is not None else rough)
         return _missing(_joined(found))
 

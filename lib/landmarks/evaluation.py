@@ -1,0 +1,246 @@
+"""Evaluating a detector on labelled frames, and calibrating its covariance and confidence on validation frames."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.optimize import minimize
+from tqdm.auto import tqdm
+
+from lib.landmarks.heatmaps import decode
+from lib.landmarks.inference import Calibration, Detector, Landmarks, _missing, shape_and_features
+from lib.landmarks.metrics import Scores, errors_px, pck, score, tool_length_px
+from lib.landmarks.network import LANDMARKS
+from lib.recordings import Recording
+
+__all__ = ["Evaluation", "calibrate", "evaluate", "evaluate_recording", "main"]
+
+#: Errors beyond this are gross: not what a covariance describes.
+GROSS_PX = 20.0
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Detections beside their labels.
+
+    Attributes
+    ----------
+    landmarks:
+        What the detector says of n images.
+    u_true:
+        (n, 3, 2) labels, NaN where there is none (or the landmark is out of the frame).
+    visibility:
+        (n, 3) 0, 1, 2.
+    length_px:
+        (n,) the tool's length, the PCK's unit, also where a tip is out of the frame.
+    names:
+        (n,) which frame each image is, such as ``"left 12"``.
+    """
+
+    landmarks: Landmarks
+    u_true: np.ndarray
+    visibility: np.ndarray
+    length_px: np.ndarray
+    names: list[str]
+
+    @property
+    def scores(self) -> Scores:
+        """Over all landmarks."""
+        return self._score(np.ones(self.u_true.shape[:2], bool))
+
+    @property
+    def error_px(self) -> np.ndarray:
+        """(n, 3): infinite where missed, NaN without a label."""
+        return errors_px(self.landmarks.u, self.u_true)
+
+    @property
+    def correct(self) -> np.ndarray:
+        """(n, 3) bool: in view and within 5 % of the tool's length: what confidence is the probability of."""
+        return self.error_px <= 0.05 * self.length_px[:, None]
+
+    def by_landmark(self) -> dict[str, Scores]:
+        """Scores of base, tip_1, tip_2."""
+        columns = np.arange(3)
+        return {name: self._score(np.broadcast_to(columns == k, self.u_true.shape[:2])) for k, name in enumerate(LANDMARKS)}
+
+    def by_visibility(self) -> dict[str, Scores]:
+        """Scores of visible and of occluded landmarks, where there are any."""
+        parts = {"visible": self.visibility == 2, "occluded": self.visibility == 1}
+        return {name: self._score(which) for name, which in parts.items() if which.any()}
+
+    def curve(self, thresholds: np.ndarray) -> np.ndarray:
+        """PCK in percent at thresholds (parts of the tool's length)."""
+        return pck(self.landmarks.u, self.u_true, thresholds, length_px=self.length_px)
+
+    def worst(self, n: int) -> np.ndarray:
+        """Indices of the n images with the largest error."""
+        return np.argsort(-np.nan_to_num(self.error_px, nan=-1.0, posinf=1e9).max(1), kind="stable")[:n]
+
+    def _score(self, which: np.ndarray) -> Scores:
+        labels = np.where(which[..., None], self.u_true, np.nan)
+        return score(self.landmarks.u, labels, self.landmarks.covariance, length_px=self.length_px)
+
+
+def evaluate(
+    detector: Detector, frames: Iterable[tuple[str, np.ndarray, np.ndarray, np.ndarray]], *, progress: bool = False
+) -> Evaluation:
+    """Run a detector over labelled frames.
+
+    Parameters
+    ----------
+    frames:
+        (name, image (h, w, 3) uint8, u (3, 2) px or NaN, visibility (3,)) of each.
+
+    Raises
+    ------
+    ValueError
+        If there is no frame.
+    """
+    names, found, labels, visibility, length = [], [], [], [], []
+    for name, image, u, v in tqdm(frames, disable=not progress, unit="image"):
+        names.append(name)
+        found.append(detector(image[None]))
+        in_view = np.isfinite(u).all(1) & (np.asarray(v) > 0)
+        labels.append(np.where(in_view[:, None], u, np.nan))
+        visibility.append(v)
+        length.append(tool_length_px(np.asarray(u, dtype=float)[None])[0])
+    if not names:
+        raise ValueError("frames: no labelled frame to evaluate on.")
+    landmarks = Landmarks(
+        *(np.concatenate([getattr(f, part) for f in found]) for part in ("u", "covariance", "confidence"))
+    )
+    return Evaluation(landmarks, np.stack(labels), np.stack(visibility), np.array(length), names)
+
+
+def labelled_frames(recording: Recording, *, every: int = 1) -> Iterable[tuple[str, np.ndarray, np.ndarray, np.ndarray]]:
+    """Left and right images of a recording with their labels: the exact truth if simulated, else the annotations.
+
+    Raises
+    ------
+    ValueError
+        If the recording has neither.
+    """
+    labels = recording.truth or recording.annotations
+    if labels is None:
+        raise ValueError(f"{recording.name}: neither truth/ nor annotations.json, so there is nothing to compare with.")
+    for i in range(0, len(recording.frames), every):
+        frame = recording.frames[i]
+        yield f"left {i}", frame.left, labels.u_left[i], labels.visibility_left[i]
+        yield f"right {i}", frame.right, labels.u_right[i], labels.visibility_right[i]
+
+
+def evaluate_recording(
+    detector: Detector, recording: Recording | str | Path, *, every: int = 1, progress: bool = False
+) -> Evaluation:
+    """`evaluate` on both cameras' images of a recording, every `every`-th frame."""
+    recording = recording if isinstance(recording, Recording) else Recording.open(recording)
+    return evaluate(detector, labelled_frames(recording, every=every), progress=progress)
+
+
+def calibrate(
+    detector: Detector, frames: Iterable[tuple[str, np.ndarray, np.ndarray, np.ndarray]], *, progress: bool = False
+) -> Detector:
+    """The detector with covariance and confidence fitted to its errors on validation frames, never trained on.
+
+    Variance: maximum likelihood of the errors below `GROSS_PX` (and of the first stage's below six times that), log
+    linear in the peak's features; its intercept makes the mean normalised squared error 2.  Confidence:
+    logistic regression of "in view and within 5 % of the tool's length" on the same features.
+    """
+    frames = list(frames)
+    stages = ["frame"] if detector.window_network is None else ["frame", "window"]
+    for stage in stages:
+        features, shapes, errors, correct = [], [], [], []
+        for _, image, u, v in tqdm(frames, disable=not progress, unit="image", desc=f"calibrating {stage}"):
+            in_view = np.isfinite(u).all(1) & (np.asarray(v) > 0)
+            labels = np.where(in_view[:, None], u, np.nan)
+            tolerance = 0.05 * tool_length_px(np.asarray(u, dtype=float)[None])[0]
+            peaks, _ = detector.frame_peaks(image[None])
+            rough = detector._calibrated(peaks, "frame", detector.reduction)
+            if stage == "frame":
+                shape, feature = shape_and_features(peaks, detector.reduction)
+                difference = rough.u[0] - labels
+                shape, feature = shape[0], feature[0]
+            else:
+                heatmaps, matrices, which = detector.window_heatmaps(image[None], _missing(rough).u)
+                if not len(which):
+                    continue
+                peaks = decode(heatmaps, detector.window_network.stride, method=detector.method)
+                shape, feature = (part[:, 0] for part in shape_and_features(peaks, 1))
+                k = which[:, 1]
+                true = (matrices[:, :, :2] @ labels[k][..., None])[..., 0] + matrices[:, :, 2]
+                difference = peaks.u[:, 0].double().numpy() - true
+            features.append(feature)
+            shapes.append(shape)
+            errors.append(difference)
+            with np.errstate(invalid="ignore"):
+                correct.append(np.linalg.norm(difference, axis=1) <= tolerance)
+        joined = (np.concatenate(part) for part in (features, shapes, errors, correct))
+        fit = _fit(*joined, gross_px=GROSS_PX if stage == "window" else 6 * GROSS_PX)
+        detector = detector.with_calibration(**{stage: fit})
+    return detector
+
+
+def _fit(features: np.ndarray, shapes: np.ndarray, errors: np.ndarray, correct: np.ndarray, gross_px: float) -> Calibration:
+    size = np.linalg.norm(errors, axis=1)
+    use = np.isfinite(size) & (size < gross_px)
+    if use.sum() < 20:
+        raise ValueError(f"frames: only {use.sum()} landmarks to calibrate on; give at least 20.")
+    x, e = features[use], errors[use]
+    squared = np.einsum("ni,nij,nj->n", e, np.linalg.inv(shapes[use]), e)
+
+    def deviance(beta: np.ndarray) -> tuple[float, np.ndarray]:
+        log_variance = x @ beta
+        ratio = squared * np.exp(-log_variance) / 2
+        ridge = 1e-3 * np.array([0.0, 1.0, 1.0, 1.0])
+        return (log_variance + ratio).mean() + ridge @ beta**2, x.T @ (1 - ratio) / len(x) + 2 * ridge * beta
+
+    start = np.array([np.log(max(squared.mean() / 2, 1e-6)), 0.0, 0.0, 0.0])
+    log_variance = minimize(deviance, start, jac=True, method="L-BFGS-B").x
+
+    y = correct.astype(float)
+
+    def cost(beta: np.ndarray) -> tuple[float, np.ndarray]:
+        z = features @ beta
+        ridge = 1e-3 * np.array([0.0, 1.0, 1.0, 1.0])
+        p = 1 / (1 + np.exp(-z))
+        return (np.logaddexp(0, z) - y * z).mean() + ridge @ beta**2, features.T @ (p - y) / len(y) + 2 * ridge * beta
+
+    logit = minimize(cost, np.array([-4.0, 0.0, 8.0, 0.0]), jac=True, method="L-BFGS-B").x
+    return Calibration(tuple(map(float, log_variance)), tuple(map(float, logit)))
+
+
+def main(argv: list[str] | None = None) -> int:
+    """`python3 -m lib evaluate`: a weights file on a recording; prints the scores, and writes them as JSON on request."""
+    parser = argparse.ArgumentParser(prog="python3 -m lib evaluate", description=main.__doc__.split(": ", 1)[1])
+    parser.add_argument("recording", type=Path, help="folder of a recording with truth/ or annotations.json")
+    parser.add_argument("--weights", default=None, help="weights file or name in data/models (default: the shipped ones)")
+    parser.add_argument("--every", type=int, default=1, help="evaluate every N-th frame")
+    parser.add_argument("--json", type=Path, help="write the scores here")
+    arguments = parser.parse_args(argv)
+    if arguments.every < 1:
+        parser.error("--every: must be at least 1.")
+    try:
+        result = evaluate_recording(
+            Detector.load(arguments.weights), arguments.recording, every=arguments.every, progress=True
+        )
+    except (ValueError, FileNotFoundError) as error:
+        print(error, file=sys.stderr)
+        return 2
+    rows = {"all": result.scores} | result.by_landmark() | result.by_visibility()
+    print(f"{'':10}{'PCK@0.01':>10}{'PCK@0.05':>10}{'PCK@0.10':>10}{'median px':>11}{'95 % px':>9}{'missed':>8}{'labels':>8}")
+    for name, s in rows.items():
+        print(
+            f"{name:10}{s.pck_0_01:10.1f}{s.pck_0_05:10.1f}{s.pck_0_10:10.1f}{s.median_px:11.2f}{s.p95_px:9.2f}"
+            f"{s.missed:8d}{s.labels:8d}"
+        )
+    s = result.scores
+    print(f"normalised squared error {s.nees:.2f} (2 is right), 95 % ellipses hold {s.coverage_95:.1f} %")
+    if arguments.json:
+        arguments.json.write_text(json.dumps({k: v.as_dict() for k, v in rows.items()}, indent=1) + "\n", encoding="utf-8")
+    return 0

@@ -1,0 +1,450 @@
+"""Training a Stacked Hourglass: l2 loss with intermediate supervision, presets, exact resume.
+
+All randomness of step t comes from a generator seeded with (seed, t), so a run that was interrupted and resumed equals one
+that was not, bit for bit on the CPU: the step's number is the whole state of the generators.
+"""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import csv
+import hashlib
+import math
+import os
+import subprocess
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from tqdm.auto import tqdm
+
+from lib import paths
+from lib.landmarks.augmentation import AUGMENTATIONS, Augmentation, Batch, leave_frame
+from lib.landmarks.heatmaps import SIGMA_PX, decode, render, sigma_cells
+from lib.landmarks.inference import as_tensor, load_network, read_checkpoint, write_checkpoint
+from lib.landmarks.metrics import errors_px, pck, tool_length_px
+from lib.landmarks.network import HourglassConfig, StackedHourglass
+
+__all__ = ["PRESETS", "Samples", "Training", "TrainingConfig", "heatmap_loss", "load_training", "train", "validate"]
+
+FORMAT = "microstereo.training"
+
+
+class Source(Protocol):
+    """Labelled images that training draws from; all of one size."""
+
+    def __len__(self) -> int: ...
+
+    def draw(self, index: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Image (h, w, 3) uint8, landmarks (3, 2) px, visibility (3,)."""
+        ...
+
+    @property
+    def fingerprint(self) -> str:
+        """Tells this data from other data."""
+        ...
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Labelled images in memory.
+
+    Attributes
+    ----------
+    images:
+        (n, h, w, 3) uint8 RGB.
+    u:
+        (n, 3, 2) px; NaN = unlabelled.
+    visibility:
+        (n, 3): 2 visible, 1 occluded, 0 not in the frame.
+    """
+
+    images: np.ndarray
+    u: np.ndarray
+    visibility: np.ndarray
+
+    def __post_init__(self) -> None:
+        n = len(self.images)
+        if n == 0:
+            raise ValueError("images: an empty data set; give at least one labelled image.")
+        if self.images.ndim != 4 or self.images.shape[-1] != 3 or self.images.dtype != np.uint8:
+            raise ValueError(f"images: expected (n, h, w, 3) uint8, got {self.images.shape} {self.images.dtype}.")
+        if self.u.shape != (n, 3, 2) or self.visibility.shape != (n, 3):
+            raise ValueError(
+                f"u and visibility: expected ({n}, 3, 2) and ({n}, 3), got {self.u.shape} and {self.visibility.shape}."
+            )
+        if not (np.isfinite(self.u).all(2) & (self.visibility == 2)).any():
+            raise ValueError("u: all landmarks of all images are missing; there is nothing to learn.")
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    def draw(self, index: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return self.images[index], self.u[index], self.visibility[index]
+
+    @property
+    def fingerprint(self) -> str:
+        digest = hashlib.sha256(np.ascontiguousarray(self.images[:, ::7, ::7]).tobytes())
+        digest.update(np.nan_to_num(self.u, nan=-1.0).tobytes())
+        return digest.hexdigest()[:16]
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """Everything that decides a training, but the data.
+
+    Attributes
+    ----------
+    optimiser, learning_rate, schedule:
+        ``"rmsprop"`` (alpha 0.99, no momentum, as printed) or ``"adamw"``; ``"constant"`` or ``"cosine"`` after a warm-up.
+    ema:
+        Decay of the weights' moving average that is validated and returned; 0 = the weights themselves.
+    clip:
+        Largest norm of the gradient; 0 = unlimited.
+    precision:
+        ``"fp32"``, or ``"bf16"`` mixed precision; the loss is always float32.
+    patience:
+        Validations without a better one before training stops; 0 = never.
+    """
+
+    network: HourglassConfig = field(default_factory=HourglassConfig)
+    augmentation: Augmentation = AUGMENTATIONS["paper"]
+    steps: int = 1000
+    batch_size: int = 4
+    optimiser: str = "rmsprop"
+    learning_rate: float = 5e-5
+    schedule: str = "constant"
+    ema: float = 0.0
+    clip: float = 0.0
+    precision: str = "fp32"
+    sigma_px: float = SIGMA_PX
+    validate_every: int = 100
+    patience: int = 0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name, choices in (
+            ("optimiser", ("rmsprop", "adamw")),
+            ("schedule", ("constant", "cosine")),
+            ("precision", ("fp32", "bf16")),
+        ):
+            if getattr(self, name) not in choices:
+                raise ValueError(f"{name}: expected one of {', '.join(choices)}, got {getattr(self, name)!r}.")
+        if min(self.steps, self.batch_size, self.validate_every) < 1:
+            raise ValueError("steps, batch_size, validate_every: must be at least 1.")
+
+    def rate(self, step: int) -> float:
+        """Learning rate of a step."""
+        if self.schedule == "constant":
+            return self.learning_rate
+        warm = min(1.0, (step + 1) / max(1, min(100, self.steps // 10)))
+        return self.learning_rate * warm * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * step / self.steps)))
+
+
+#: `paper`: as printed. `best`: what trains the shipped networks.
+PRESETS = {
+    "paper": TrainingConfig(),
+    "best": TrainingConfig(
+        augmentation=AUGMENTATIONS["best"],
+        batch_size=12,
+        optimiser="adamw",
+        learning_rate=2e-3,
+        schedule="cosine",
+        ema=0.998,
+        clip=1.0,
+        precision="bf16",
+    ),
+}
+
+
+def heatmap_loss(outputs: Sequence[Tensor], batch: Batch, stride: int, sigma_px: float = SIGMA_PX) -> Tensor:
+    """Squared distance of every stack's heatmaps from the Gaussians, so scaled that empty heatmaps cost 1.
+
+    Sum over cells divided by pi sigma^2 (what a Gaussian of peak 1 has), mean over the landmarks that count, mean over
+    stacks (intermediate supervision).
+    """
+    target = render(batch.u.float(), tuple(batch.images.shape[-2:]), stride, sigma_px) * batch.peak[..., None, None]
+    weight = batch.weight
+    scale = math.pi * sigma_cells(stride, sigma_px) ** 2 * weight.sum().clamp_min(1)
+    losses = [((output.float() - target).square().sum((-2, -1)) * weight).sum() / scale for output in outputs]
+    return torch.stack(losses).mean()
+
+
+@dataclass(frozen=True)
+class Training:
+    """A finished (or stopped) training: the network to use, one log row per validation, and where it came from."""
+
+    network: StackedHourglass
+    log: list[dict[str, float]]
+    provenance: dict[str, object]
+
+
+def _batch(source: Source, config: TrainingConfig, step: int) -> Batch:
+    rng = np.random.default_rng([config.seed, step])
+    indices = rng.choice(len(source), config.batch_size, replace=len(source) < config.batch_size)
+    drawn = [source.draw(int(i), rng) for i in indices]
+    images = as_tensor(np.stack([image for image, _, _ in drawn])).contiguous()
+    u = torch.from_numpy(np.stack([u for _, u, _ in drawn])).float()
+    visibility = torch.from_numpy(np.stack([v for _, _, v in drawn]).astype(np.int64))
+    visibility = leave_frame(u, visibility, tuple(images.shape[-2:]))
+    return config.augmentation(Batch(images, u, visibility), rng)
+
+
+@torch.no_grad()
+def validate(network: StackedHourglass, samples: Samples, config: TrainingConfig, *, batch: int = 16) -> dict[str, float]:
+    """Loss, PCK and median error on held-out images, and two signs of a collapsed network.
+
+    `peak` (the mean height of visible landmarks' heatmaps; 1 is right) near 0, or `spread` (the deviation of
+    predictions over that of the labels) near 0, say that the network predicts nothing, or always the same.
+    """
+    network.eval()
+    losses, found, values = [], [], []
+    for start in range(0, len(samples), batch):
+        part = slice(start, start + batch)
+        images = as_tensor(samples.images[part])
+        u, visibility = torch.from_numpy(samples.u[part]).float(), torch.from_numpy(samples.visibility[part])
+        visibility = leave_frame(u, visibility, tuple(images.shape[-2:]))
+        outputs = network(images)
+        losses.append(heatmap_loss(outputs, Batch(images, u, visibility), network.stride, config.sigma_px).item())
+        peaks = decode(outputs[-1], network.stride, sigma_px=config.sigma_px)
+        found.append(peaks.u.numpy())
+        values.append(torch.where(visibility == 2, peaks.value, torch.nan).numpy())
+    u = np.concatenate(found).astype(float)
+    h, w = samples.images.shape[1:3]
+    inside = (samples.u > -0.5).all(2) & (samples.u < (w - 0.5, h - 0.5)).all(2) & (samples.visibility == 2)
+    labels = np.where(inside[..., None], samples.u, np.nan)
+    error = errors_px(u, labels)
+    length = tool_length_px(samples.u)
+    spread = np.nanmean(np.nanstd(np.where(inside[..., None], u, np.nan), 0)) / np.nanmean(np.nanstd(labels, 0))
+    return {
+        "validation_loss": float(np.mean(losses)),
+        "pck_0.05": float(pck(u, labels, 0.05, length_px=length)),
+        "pck_0.10": float(pck(u, labels, 0.10, length_px=length)),
+        "median_px": float(np.nanmedian(error)),
+        "p95_px": float(np.nanpercentile(error, 95)),
+        "peak": float(np.nanmean(np.concatenate(values))),
+        "spread": float(spread),
+    }
+
+
+class _Run:
+    """Weights, optimiser and log of a training under way, and their file."""
+
+    def __init__(self, config: TrainingConfig, initial: StackedHourglass | None):
+        self.config = config
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(config.seed)
+            self.network = copy.deepcopy(initial) if initial is not None else StackedHourglass(config.network)
+        self.network.to(memory_format=torch.channels_last)
+        self.average = copy.deepcopy(self.network) if config.ema else None
+        parameters = self.network.parameters()
+        if config.optimiser == "rmsprop":
+            self.optimiser: torch.optim.Optimizer = torch.optim.RMSprop(parameters, config.learning_rate, alpha=0.99)
+        else:
+            self.optimiser = torch.optim.AdamW(parameters, config.learning_rate, weight_decay=1e-4)
+        self.step, self.seconds, self.log = 0, 0.0, []
+        self.best = math.inf
+
+    @property
+    def usable(self) -> StackedHourglass:
+        return self.average if self.average is not None else self.network
+
+    def advance(self, batch: Batch) -> float:
+        """One step; returns its loss."""
+        self.network.train()
+        for group in self.optimiser.param_groups:
+            group["lr"] = self.config.rate(self.step)
+        with torch.autocast("cpu", torch.bfloat16, enabled=self.config.precision == "bf16"):
+            outputs = self.network(batch.images.contiguous(memory_format=torch.channels_last))
+        loss = heatmap_loss(outputs, batch, self.network.stride, self.config.sigma_px)
+        self.optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        if self.config.clip:
+            nn.utils.clip_grad_norm_(self.network.parameters(), self.config.clip)
+        self.optimiser.step()
+        if self.average is not None:
+            # A young average must not remember the random start.
+            decay = min(self.config.ema, (1 + self.step) / (10 + self.step))
+            with torch.no_grad():
+                for mean, value in zip(
+                    self.average.state_dict().values(), self.network.state_dict().values(), strict=True
+                ):
+                    mean.lerp_(value, 1 - decay) if mean.is_floating_point() else mean.copy_(value)
+        self.step += 1
+        return loss.item()
+
+    def save(self, path: Path, provenance: dict[str, object]) -> None:
+        tensors = {f"network.{k}": v for k, v in self.network.state_dict().items()}
+        if self.average is not None:
+            tensors |= {f"average.{k}": v for k, v in self.average.state_dict().items()}
+        for i, values in self.optimiser.state_dict()["state"].items():
+            tensors |= {f"optimiser.{i}.{k}": torch.as_tensor(v) for k, v in values.items()}
+        metadata = {
+            "format": FORMAT,
+            "config": asdict(self.config),
+            "step": self.step,
+            "seconds": self.seconds,
+            "best": self.best if math.isfinite(self.best) else None,
+            "log": self.log,
+            "provenance": provenance,
+        }
+        write_checkpoint(path, tensors, metadata)
+
+    def restore(self, path: Path, fingerprint: str) -> None:
+        tensors, metadata = read_checkpoint(path, FORMAT)
+        own = asdict(self.config)
+        # Only what may change between two sittings of one run.
+        free = {"validate_every", "patience"}
+        changed = [k for k, v in metadata["config"].items() if k not in free and _plain(own.get(k)) != _plain(v)]
+        if changed:
+            raise ValueError(f"{path}: belongs to a training with another {', '.join(changed)}; use another folder.")
+        if metadata["provenance"]["data"] != fingerprint:
+            raise ValueError(f"{path}: was trained on other data (fingerprint differs); use another folder.")
+        self.network.load_state_dict(_part(tensors, "network."))
+        if self.average is not None:
+            self.average.load_state_dict(_part(tensors, "average."))
+        state: dict[int, dict[str, Tensor]] = {}
+        for name, value in _part(tensors, "optimiser.").items():
+            i, _, key = name.partition(".")
+            state.setdefault(int(i), {})[key] = value
+        self.optimiser.load_state_dict(self.optimiser.state_dict() | {"state": state})
+        self.step, self.seconds, self.log = metadata["step"], metadata["seconds"], metadata["log"]
+        self.best = math.inf if metadata["best"] is None else metadata["best"]
+
+
+def train(
+    config: TrainingConfig,
+    source: Source,
+    validation: Samples,
+    folder: str | Path | None = None,
+    *,
+    initial: StackedHourglass | None = None,
+    max_seconds: float | None = None,
+    progress: bool = True,
+    on_validation: Callable[[list[dict[str, float]]], None] | None = None,
+) -> Training:
+    """Train a network, resuming from `folder` where an earlier run was interrupted.
+
+    Parameters
+    ----------
+    source, validation:
+        Training and held-out images; validation is never trained on.
+    folder:
+        Keeps ``last.safetensors`` (weights, average, optimiser, step, log), ``best.safetensors`` (the same at the best
+        validation) and ``log.csv``; None keeps nothing.
+    initial:
+        Start from these weights, for fine-tuning.
+    max_seconds:
+        Stop (resumably) after this long.
+    on_validation:
+        Called with the log after every validation: live curves.
+
+    Raises
+    ------
+    ValueError
+        For an empty data set, or a folder that holds another training.
+    """
+    if len(source) == 0 or len(validation) == 0:
+        raise ValueError("source and validation: must not be empty; give labelled images.")
+    run = _Run(config, initial)
+    provenance: dict[str, object] = {
+        "data": source.fingerprint,
+        "images": len(source),
+        "commit": _commit(),
+        "torch": torch.__version__,
+    }
+    if folder is not None:
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        if (folder / "last.safetensors").exists():
+            run.restore(folder / "last.safetensors", source.fingerprint)
+    began, before, loss_sum, since = time.perf_counter(), run.seconds, 0.0, 0
+    bar = tqdm(total=config.steps, initial=run.step, disable=not progress, unit="step", mininterval=1.0)
+    stale = _stale(run.log)
+    try:
+        while run.step < config.steps and not (config.patience and stale >= config.patience):
+            loss_sum, since = loss_sum + run.advance(_batch(source, config, run.step)), since + 1
+            bar.update()
+            run.seconds = before + time.perf_counter() - began
+            stop = max_seconds is not None and time.perf_counter() - began > max_seconds
+            if run.step % config.validate_every and run.step < config.steps and not stop:
+                continue
+            row = {"step": run.step, "seconds": round(run.seconds, 1), "loss": loss_sum / since}
+            row |= validate(run.usable, validation, config)
+            loss_sum, since = 0.0, 0
+            run.log.append(row)
+            better = row["validation_loss"] < run.best
+            run.best, stale = (row["validation_loss"], 0) if better else (run.best, stale + 1)
+            bar.set_postfix(loss=f"{row['loss']:.3f}", pck=f"{row['pck_0.05']:.1f}", median=f"{row['median_px']:.2f}px")
+            if folder is not None:
+                provenance["metrics"] = row
+                run.save(folder / "last.safetensors", provenance)
+                if better:
+                    run.save(folder / "best.safetensors", provenance)
+                _write_log(folder / "log.csv", run.log)
+            if on_validation is not None:
+                on_validation(run.log)
+            if stop:
+                break
+    finally:
+        bar.close()
+    provenance |= {"metrics": run.log[-1] if run.log else {}, "seconds": run.seconds, "steps": run.step}
+    return Training(copy.deepcopy(run.usable).eval(), run.log, provenance)
+
+
+def load_training(path: str | Path) -> Training:
+    """The network of a training's checkpoint, finished or not.
+
+    Raises
+    ------
+    FileNotFoundError, ValueError
+        Naming the file.
+    """
+    tensors, metadata = read_checkpoint(path, FORMAT)
+    prefix = "average." if any(name.startswith("average.") for name in tensors) else "network."
+    network = load_network(path, metadata["config"]["network"], _part(tensors, prefix)).eval()
+    return Training(
+        network,
+        metadata["log"],
+        metadata["provenance"] | {"steps": metadata["step"], "seconds": metadata["seconds"], "config": metadata["config"]},
+    )
+
+
+def _part(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
+
+
+def _plain(value: object) -> object:
+    """As JSON gives it back: tuples are lists."""
+    if isinstance(value, dict):
+        return {k: _plain(v) for k, v in value.items()}
+    return [_plain(v) for v in value] if isinstance(value, list | tuple) else value
+
+
+def _stale(log: list[dict[str, float]]) -> int:
+    """Validations since the best one."""
+    return len(log) - 1 - int(np.argmin([row["validation_loss"] for row in log])) if log else 0
+
+
+def _write_log(path: Path, log: list[dict[str, float]]) -> None:
+    partial = path.with_name(path.name + ".partial")
+    with partial.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(log[0]))
+        writer.writeheader()
+        writer.writerows(log)
+    os.replace(partial, path)
+
+
+def _commit() -> str:
+    """The repository's commit, or "unknown" outside a clone."""
+    try:
+        command = ["git", "rev-parse", "--short=12", "HEAD"]
+        return subprocess.run(command, cwd=paths.ROOT, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        return "unknown"
