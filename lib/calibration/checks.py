@@ -1,0 +1,180 @@
+"""What is refused before any fit, with the reason and the cure."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from lib.geometry import finite_points, points
+
+__all__ = ["check_duplicates", "check_order", "check_spread", "check_units", "correspondences", "pixel_covariance"]
+
+#: Zoom (px per mm) between a room camera and the resolution of light; what lies outside has the wrong unit.
+PLAUSIBLE_PX_PER_MM = (0.2, 5000.0)
+#: The robot accuracy assumed where none is given (the paper's), for judging whether points are coplanar.
+ROBOT_ACCURACY_MM = 0.010
+
+
+def correspondences(x_mm: ArrayLike, u: Sequence[ArrayLike]) -> tuple[np.ndarray, np.ndarray]:
+    """x (n, 3) and the stacked pixels y (n, 2 cameras), finite and of one length.
+
+    Raises
+    ------
+    ValueError
+        For another number of cameras than one or two, unequal lengths, NaN rows, fewer than four points.
+    """
+    x = finite_points(x_mm, 3, "x_mm")
+    if isinstance(u, np.ndarray) and u.ndim == 2:
+        u = [u]
+    u = list(u)
+    if len(u) not in (1, 2):
+        raise ValueError(f"u: expected [u_left, u_right] or [u], got {len(u)} arrays.")
+    names = ["u_left", "u_right"] if len(u) == 2 else ["u"]
+    y = [points(pixels, 2, name) for pixels, name in zip(u, names, strict=True)]
+    for pixels, name in zip(y, names, strict=True):
+        if len(pixels) != len(x):
+            raise ValueError(f"{name}: {len(pixels)} points, x_mm has {len(x)}; correspondences go row by row.")
+        finite_points(pixels, 2, name)
+    if len(x) < 4:
+        raise ValueError(f"x_mm: {len(x)} points; an affine camera needs at least 4, better 50, not in one plane.")
+    return x, np.hstack(y)
+
+
+def check_spread(x: np.ndarray, u: np.ndarray, sigma_x_mm: float = 0.0) -> None:
+    """Refuse points that do not span a volume.
+
+    Raises
+    ------
+    ValueError
+        If lengths differ, there are fewer than four points, or they are coplanar or collinear: exactly, or but for
+        a thickness of less than twice the robot's accuracy.
+    """
+    if len(x) != len(u):
+        raise ValueError(f"x_mm, u: {len(x)} and {len(u)} points; correspondences go row by row.")
+    if len(x) < 4:
+        raise ValueError(f"x_mm: {len(x)} points; an affine camera needs at least 4, not in one plane.")
+    extent = np.sqrt(np.maximum(np.linalg.eigvalsh(np.cov(x.T, bias=True))[::-1], 0.0))
+    least = max(1e-6 * extent[0], 2.0 * sigma_x_mm)
+    if extent[0] <= least:
+        raise ValueError(f"x_mm: the points hardly move (RMS {extent[0]:.3g} mm); move the tool through the volume.")
+    if extent[1] <= least:
+        raise ValueError(
+            f"x_mm: the points are collinear (RMS {extent[1]:.3g} mm off their line); move the tool in all three directions."
+        )
+    if extent[2] <= least:
+        raise ValueError(
+            f"x_mm: the points are coplanar (RMS {extent[2]:.3g} mm off their plane, robot accuracy {sigma_x_mm:.3g} mm); "
+            "cover a few depths as well."
+        )
+
+
+def check_units(x: np.ndarray, y: np.ndarray) -> None:
+    """Refuse points whose implied zoom no camera has: metres or micrometres given as millimetres.
+
+    Raises
+    ------
+    ValueError
+    """
+    zoom = y.std(axis=0).max() / max(x.std(axis=0).max(), 1e-300)
+    low, high = PLAUSIBLE_PX_PER_MM
+    if zoom > high:
+        raise ValueError(
+            f"x_mm: the images show {zoom:.3g} px per mm, finer than light resolves; "
+            "the points look like metres: multiply them by 1000."
+        )
+    if zoom < low:
+        raise ValueError(
+            f"x_mm: the images show {zoom:.3g} px per mm, coarser than any camera over a tool (or the tool hardly moves in "
+            "the image); the points look like micrometres: divide them by 1000."
+        )
+
+
+def check_duplicates(x: np.ndarray, y: np.ndarray) -> None:
+    """Refuse rows that repeat another row in every digit: they add no information and fake precision.
+
+    Raises
+    ------
+    ValueError
+    """
+    rows = np.ascontiguousarray(np.hstack([x, y])).view(np.dtype((np.void, 8 * (x.shape[1] + y.shape[1])))).ravel()
+    repeated = len(rows) - len(np.unique(rows))
+    if repeated:
+        raise ValueError(
+            f"x_mm, u: {repeated} of {len(rows)} rows repeat another row exactly (a frozen video or frames read twice); "
+            "drop the duplicated frames."
+        )
+
+
+def check_order(A: np.ndarray, sd_rad: float) -> None:
+    """Refuse a stereo head whose left camera stands on the right, where the geometry leaves no doubt.
+
+    Judged only where the two images are alike in rotation (30 degrees), the axes converge by 1 to 30 degrees, the baseline
+    runs along the image rows, and its sign is five standard deviations from zero.
+
+    Parameters
+    ----------
+    A:
+        (4, 3) of both cameras.
+    sd_rad:
+        Standard deviation of the angle between the two axes.
+
+    Raises
+    ------
+    ValueError
+    """
+    a, b, c, d = A / np.linalg.norm(A, axis=1, keepdims=True)
+    left, right = np.cross(a, b), np.cross(c, d)
+    left, right = left / np.linalg.norm(left), right / np.linalg.norm(right)
+    if a @ c < np.cos(np.deg2rad(30)) or b @ d < np.cos(np.deg2rad(30)):
+        return
+    # Cameras stand against their viewing directions, so the right camera lies along left - right.
+    along, across = (left - right) @ (a + c) / 2, (left - right) @ (b + d) / 2
+    if not np.deg2rad(1) < np.hypot(along, across) < np.deg2rad(30):
+        return
+    if along < -max(3.0 * abs(across), 5.0 * sd_rad):
+        raise ValueError(
+            "u: the cameras are swapped, the one called left stands on the right by "
+            f"{np.rad2deg(-along):.1f} degrees; exchange u_left and u_right (or both images are mirrored: flip them). "
+            "checks=False takes them as they are."
+        )
+
+
+def pixel_covariance(covariance_px2: ArrayLike | Sequence[ArrayLike] | None, n: int, cameras: int) -> np.ndarray | None:
+    """Covariance of the stacked pixels, (m, m) or (n, m, m) with m = 2 cameras, or None.
+
+    Parameters
+    ----------
+    covariance_px2:
+        A number, (2, 2) for every image, (m, m), (n, m, m), (n, 2, 2) for one camera, or a list of one (n, 2, 2) a camera.
+
+    Raises
+    ------
+    ValueError
+        For another shape, or a matrix that is not positive definite.
+    """
+    if covariance_px2 is None:
+        return None
+    m = 2 * cameras
+    if isinstance(covariance_px2, (list, tuple)) and len(covariance_px2) == cameras and np.ndim(covariance_px2[0]) == 3:
+        blocks = [np.asarray(block, dtype=np.float64) for block in covariance_px2]
+        if any(block.shape != (n, 2, 2) for block in blocks):
+            raise ValueError(f"covariance_px2: expected one ({n}, 2, 2) a camera, got {[b.shape for b in blocks]}.")
+        covariance = np.zeros((n, m, m))
+        for i, block in enumerate(blocks):
+            covariance[:, 2 * i : 2 * i + 2, 2 * i : 2 * i + 2] = block
+    else:
+        covariance = np.asarray(covariance_px2, dtype=np.float64)
+        if covariance.ndim == 0:
+            covariance = covariance * np.eye(m)
+        elif covariance.shape == (2, 2):
+            covariance = np.kron(np.eye(cameras), covariance)
+    if covariance.shape not in {(m, m), (n, m, m)}:
+        raise ValueError(
+            f"covariance_px2: expected a number, (2, 2), ({m}, {m}), ({n}, {m}, {m}) or a list of ({n}, 2, 2), "
+            f"got {covariance.shape}."
+        )
+    if not np.isfinite(covariance).all() or (np.linalg.eigvalsh(covariance)[..., 0] <= 0).any():
+        raise ValueError("covariance_px2: every covariance must be finite and positive definite.")
+    return covariance

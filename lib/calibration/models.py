@@ -1,0 +1,349 @@
+"""The ladder of camera models, their analytic Jacobians, and the constrained minimum of the same energy.
+
+A model is a base and options joined by "+":
+
+    affine        8 numbers a camera
+    zero_skew     K diagonal (the paper's): rotation, two zooms, two offsets; 7 a camera
+    square        one zoom a camera; 6
+    common_zoom   one zoom for both; 11 a pair
+    +distance     one 1/distance for all cameras (near-affine), +distances one a camera
+    +radial       one radial distortion coefficient a camera
+
+"near_affine" is short for "zero_skew+distance".  A state moves by increments; every model is a selection matrix
+from its own increments to the increments of its free parameters, so one set of derivatives serves all.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from lib.cameras import AffineCamera, NearAffineCamera, radial_derivative
+
+__all__ = ["Fit", "Model", "State", "fit"]
+
+BASES = ("affine", "zero_skew", "square", "common_zoom")
+OPTIONS = ("distance", "distances", "radial")
+
+
+@dataclass(frozen=True)
+class Model:
+    """A rung of the ladder for one or two cameras."""
+
+    base: str
+    distance: str | None
+    radial: bool
+    cameras: int
+
+    @classmethod
+    def parse(cls, name: str, cameras: int) -> Model:
+        """The model called `name`.
+
+        Raises
+        ------
+        ValueError
+            For an unknown name; the message lists the known ones.
+        """
+        base, *options = ("zero_skew+distance" if name == "near_affine" else str(name)).split("+")
+        known = base in BASES and all(o in OPTIONS for o in options) and len(set(options)) == len(options)
+        if not known or {"distance", "distances"} <= set(options):
+            raise ValueError(
+                f"model: unknown model {name!r}; take one of {', '.join(BASES)} or near_affine, and add +distance or "
+                "+distances, +radial."
+            )
+        distance = next((o for o in options if o != "radial"), None)
+        return cls(base, distance, "radial" in options, cameras)
+
+    @property
+    def is_affine(self) -> bool:
+        """True where the projection is linear in the points."""
+        return self.distance is None and not self.radial
+
+    @cached_property
+    def increments(self) -> int:
+        """Increments of one camera before the model's constraints."""
+        return 10 if self.base == "affine" else 9
+
+    @cached_property
+    def _selection(self) -> tuple[np.ndarray, list[str]]:
+        k, c = self.increments, self.cameras
+        sides = ["left ", "right "] if c == 2 else [""]
+        columns: dict[str, list[int]] = {}
+        for i, side in enumerate(sides):
+            at = i * k
+            if self.base == "affine":
+                names = [f"a{r}{s} (px/mm)" for r in (1, 2) for s in (1, 2, 3)] + ["offset x (px)", "offset y (px)"]
+            else:
+                zoom = {"zero_skew": ("log zoom x", "log zoom y"), "square": ("log zoom",) * 2}.get(self.base)
+                names = [f"rotation {axis} (rad)" for axis in "xyz"]
+                names += list(zoom or ("both log zoom",) * 2) + ["offset x (px)", "offset y (px)"]
+            if self.distance:
+                names.append("1/distance (1/mm)" if self.distance == "distances" else "both 1/distance (1/mm)")
+            else:
+                names.append("")
+            names.append("radial (1/px^2)" if self.radial else "")
+            for j, name in enumerate(names):
+                if name:
+                    key = name.removeprefix("both ") if name.startswith("both ") else side + name
+                    columns.setdefault(key, []).append(at + j)
+        matrix = np.zeros((k * c, len(columns)))
+        for column, rows in enumerate(columns.values()):
+            matrix[rows, column] = 1.0
+        return matrix, list(columns)
+
+    @property
+    def selection(self) -> np.ndarray:
+        """(increments of all cameras, parameters), zeros and ones."""
+        return self._selection[0]
+
+    @property
+    def parameter_names(self) -> list[str]:
+        """Names of the increments, with units."""
+        return self._selection[1]
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """Cameras about a reference point: u = c + v (1 + k |v|^2), v = (A (x - x0) + o - c) / (1 + rho r3.(x - x0)).
+
+    Attributes
+    ----------
+    A:
+        (cameras, 2, 3).
+    offset:
+        o (cameras, 2), the pixel of the reference point.
+    rho, radial:
+        (cameras,) 1/mm and 1/px^2.
+    rotation, zoom:
+        (cameras, 3, 3) and (cameras, 2) of a structured base, A = diag(zoom) rotation[:2]; None for the affine base.
+    reference, centre:
+        x0 (3,) mm and c (cameras, 2) px, fixed.
+    """
+
+    A: np.ndarray
+    offset: np.ndarray
+    rho: np.ndarray
+    radial: np.ndarray
+    rotation: np.ndarray | None
+    zoom: np.ndarray | None
+    reference: np.ndarray
+    centre: np.ndarray
+
+    @classmethod
+    def start(cls, model: Model, matrix: np.ndarray, reference: np.ndarray, centre: np.ndarray) -> State:
+        """From affine cameras, `matrix` (2 cameras, 4), brought to the model's base."""
+        c = model.cameras
+        A = matrix[:, :3].reshape(c, 2, 3)
+        offset = (matrix[:, :3] @ reference + matrix[:, 3]).reshape(c, 2)
+        zeros = np.zeros(c)
+        if model.base == "affine":
+            return cls(A, offset, zeros, zeros, None, None, reference, centre)
+        rotation, zoom = np.empty((c, 3, 3)), np.empty((c, 2))
+        for i in range(c):
+            # Polar factors: the orthonormal rows nearest to A's, whichever axis the skew came from.
+            left, sizes, right = np.linalg.svd(A[i], full_matrices=False)
+            rows = left @ right
+            rotation[i] = np.vstack([rows, np.cross(*rows)])
+            zoom[i] = np.diag(left @ np.diag(sizes) @ left.T)
+        if model.base == "square":
+            zoom = np.repeat(zoom.mean(axis=1, keepdims=True), 2, axis=1)
+        elif model.base == "common_zoom":
+            zoom = np.full((c, 2), zoom.mean())
+        return cls(zoom[:, :, None] * rotation[:, :2], offset, zeros, zeros, rotation, zoom, reference, centre)
+
+    def moved(self, increments: np.ndarray) -> State:
+        """The state after full increments (cameras * k,)."""
+        d = increments.reshape(len(self.A), -1)
+        common = dict(rho=self.rho + d[:, -2], radial=self.radial + d[:, -1], offset=self.offset + d[:, -4:-2])
+        if self.rotation is None:
+            return replace(self, A=self.A + d[:, :6].reshape(-1, 2, 3), **common)
+        rotation = Rotation.from_rotvec(d[:, :3]).as_matrix() @ self.rotation
+        zoom = self.zoom * np.exp(d[:, 3:5])
+        return replace(self, A=zoom[:, :, None] * rotation[:, :2], rotation=rotation, zoom=zoom, **common)
+
+    def cameras(self, model: Model) -> tuple[AffineCamera | NearAffineCamera, ...]:
+        """The cameras of the public interface."""
+        found = []
+        for A, o, rho, k, c in zip(self.A, self.offset, self.rho, self.radial, self.centre, strict=True):
+            M = np.column_stack([A, o - A @ self.reference])
+            found.append(AffineCamera(M) if model.is_affine else NearAffineCamera(M, rho, c, self.reference, k))
+        return tuple(found)
+
+    def evaluate(
+        self, x: np.ndarray, h: np.ndarray | None = None, *, derivatives: bool = True
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Pixels y (n, m), dy/dx (n, m, 3) and dy/d(full increments) (n, m, cameras k) at x - x0 = `x` (n, 3).
+
+        `h` (n,) replaces the 1 that multiplies the offset (used for compressed data of affine models).
+        """
+        n, c = len(x), len(self.A)
+        k = 10 if self.rotation is None else 9
+        h = np.ones(n) if h is None else h
+        y, J_x, J_c = np.empty((n, 2 * c)), np.empty((n, 2 * c, 3)), np.zeros((n, 2 * c, k * c if derivatives else 0))
+        for i in range(c):
+            rows = slice(2 * i, 2 * i + 2)
+            A, centre = self.A[i], self.centre[i]
+            q = x @ A.T + h[:, None] * (self.offset[i] - centre)
+            normal = np.cross(A[0], A[1])
+            size = np.linalg.norm(normal)
+            r_3 = normal / size
+            depth = x @ r_3
+            ratio = (1.0 + self.rho[i] * depth)[:, None]
+            v = q / ratio
+            dv_dx = (A - self.rho[i] * v[:, :, None] * r_3) / ratio[:, :, None]
+            bend = radial_derivative(v, self.radial[i]) if self.radial[i] else None
+            square = (v**2).sum(axis=1, keepdims=True)
+            y[:, rows] = h[:, None] * centre + v * (1.0 + self.radial[i] * square)
+            J_x[:, rows] = dv_dx if bend is None else bend @ dv_dx
+            if not derivatives:
+                continue
+            dv = np.zeros((n, 2, k))
+            if self.rotation is None:
+                # d r3 = (I - r3 r3^T) (da1 x a2 + a1 x da2) / |a1 x a2|; v x (d q) = rho x.(d r3) v
+                flat = (x - depth[:, None] * r_3) / size
+                dv[:, 0, 0:3] = x
+                dv[:, 1, 3:6] = x
+                tilt = np.hstack([np.cross(A[1], flat), np.cross(flat, A[0])])  # x.(d r3) per entry of A
+                dv[:, :, :6] -= self.rho[i] * v[:, :, None] * tilt[:, None, :]
+            else:
+                R, zoom = self.rotation[i], self.zoom[i]
+                p = x @ R.T  # camera axes; a left increment turns p by delta x p
+                dv[:, 0, 1], dv[:, 0, 2] = zoom[0] * p[:, 2], -zoom[0] * p[:, 1]
+                dv[:, 1, 0], dv[:, 1, 2] = -zoom[1] * p[:, 2], zoom[1] * p[:, 0]
+                dv[:, 0, 3], dv[:, 1, 4] = zoom[0] * p[:, 0], zoom[1] * p[:, 1]
+                turn = np.stack([p[:, 1], -p[:, 0], np.zeros(n)], axis=1)  # third component of delta x p
+                dv[:, :, :3] -= self.rho[i] * v[:, :, None] * turn[:, None, :]
+            dv[:, 0, k - 4] = dv[:, 1, k - 3] = h
+            dv[:, :, k - 2] = -v * depth[:, None]
+            dv /= ratio[:, :, None]
+            if bend is not None:
+                dv = bend @ dv
+            dv[:, :, k - 1] = v * square
+            J_c[:, rows, i * k : (i + 1) * k] = dv
+        return y, J_x, J_c
+
+    def matrix_jacobian(self) -> np.ndarray:
+        """Derivative of the matrices' entries (8 a camera, row by row, left first) by the full increments."""
+        c = len(self.A)
+        plain = replace(self, rho=np.zeros(c), radial=np.zeros(c), centre=np.zeros((c, 2)))
+        J = plain.evaluate(np.vstack([np.eye(3), np.zeros(3)]), np.append(np.zeros(3), 1.0))[2]
+        k = J.shape[2] // c
+        J[:, :, [i * k + j for i in range(c) for j in (k - 2, k - 1)]] = 0.0
+        columns, offset = J[:3], J[3] - np.tensordot(self.reference, J[:3], axes=1)
+        entries = np.concatenate([columns, offset[None]]).transpose(1, 0, 2)  # (2c, 4, full)
+        return entries.reshape(8 * c, -1)
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A minimum: the state, the energy, and what uncertainty needs.
+
+    Attributes
+    ----------
+    state, cost:
+        Where the energy is least, and the energy there.
+    residuals:
+        (n, m) px, linearised: y - f(x~) - J (x - x~), whose covariance is Sigma + v_x J J^T.
+    points:
+        x~ - x0 (n, 3), the corrected points.
+    information:
+        (p, p) Gauss-Newton Hessian in the model's parameters.
+    converged:
+        False where the iterations ran out.
+    """
+
+    state: State
+    cost: float
+    residuals: np.ndarray
+    points: np.ndarray
+    information: np.ndarray
+    converged: bool
+
+
+def _settle(
+    state: State, x: np.ndarray, y: np.ndarray, h: np.ndarray | None, noise: np.ndarray, variance_x: float, linear: bool
+) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
+    """Best corrected points of a state: cost, linearised residuals, x~, S^-1."""
+    points, rounds = x, 1 if linear or variance_x == 0 else 4
+    for _ in range(rounds):
+        f, J, _ = state.evaluate(points, h, derivatives=False)
+        if linear:
+            J = J[:1]
+        r = y - f - np.einsum("nij,nj->ni", np.broadcast_to(J, (len(x), *J.shape[1:])), x - points)
+        weight = np.linalg.inv(noise + variance_x * J @ np.swapaxes(J, 1, 2))
+        white = (weight @ r[:, :, None])[:, :, 0]
+        points = x + variance_x * (np.swapaxes(J, 1, 2) @ white[:, :, None])[:, :, 0]
+    return 0.5 * float((r * white).sum()), r, points, weight
+
+
+def fit(
+    model: Model,
+    start: State,
+    x: np.ndarray,
+    y: np.ndarray,
+    noise: np.ndarray,
+    variance_x: float,
+    h: np.ndarray | None = None,
+    *,
+    iterations: int = 60,
+) -> Fit:
+    """Minimum of 1/2 sum (y - f(x~))^T noise^-1 (y - f(x~)) + |x~ - x|^2 / variance_x by Levenberg-Marquardt.
+
+    Every point is eliminated exactly (its normal equations are 3 x 3), which leaves residuals of covariance
+    S = noise + variance_x J J^T and a system in the camera parameters alone.
+
+    Parameters
+    ----------
+    x:
+        (n, 3) mm relative to the state's reference.
+    y:
+        (n, m) px.
+    noise:
+        (1, m, m) or (n, m, m) px^2.
+    """
+    T, linear = model.selection, model.is_affine
+    state, damping = start, 0.0
+    cost, r, settled, weight = _settle(state, x, y, h, noise, variance_x, linear)
+    converged = False
+    for _ in range(iterations):
+        J = state.evaluate(settled, h)[2] @ T
+        WJ = np.broadcast_to(weight, (len(x), *weight.shape[1:])) @ J
+        flat = J.reshape(-1, J.shape[2])
+        information = flat.T @ WJ.reshape(flat.shape)
+        gradient = WJ.reshape(flat.shape).T @ r.ravel()
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
+        scaled = information * np.outer(scale, scale)
+        for _ in range(12):
+            step = scale * np.linalg.lstsq(scaled + damping * np.eye(len(scaled)), scale * gradient, rcond=1e-15)[0]
+            trial = state.moved(T @ step)
+            new = _trial(trial, x, y, h, noise, variance_x, linear)
+            if new is not None and new[0] <= cost * (1 + 1e-14) + 1e-300:
+                break
+            damping = max(10.0 * damping, 1e-6)
+        else:
+            converged = True  # no step lowers the energy: the floor of rounding
+            break
+        decrease = cost - new[0]
+        state, (cost, r, settled, weight), damping = trial, new, damping / 30.0 if damping > 1e-9 else 0.0
+        if 0.5 * gradient @ step <= 1e-13 * cost + 1e-22 and decrease <= 1e-13 * cost + 1e-22:
+            converged = True
+            break
+    J = state.evaluate(settled, h)[2] @ T
+    WJ = np.broadcast_to(weight, (len(x), *weight.shape[1:])) @ J
+    flat = J.reshape(-1, J.shape[2])
+    return Fit(state, cost, r, settled, flat.T @ WJ.reshape(flat.shape), converged)
+
+
+def _trial(state: State, *data) -> tuple | None:
+    """`_settle`, or None where the step left the model's domain (a point behind a camera)."""
+    x = data[0]
+    for A, rho in zip(state.A, state.rho, strict=True):
+        normal = np.cross(A[0], A[1])
+        if rho and (1.0 + rho * (x @ normal) / np.linalg.norm(normal)).min() <= 0.05:
+            return None
+    with np.errstate(all="ignore"):
+        found = _settle(state, *data)
+    return found if np.isfinite(found[0]) else None

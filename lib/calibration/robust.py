@@ -1,0 +1,142 @@
+"""Joint stereo RANSAC with local optimisation: which rows are correspondences at all.
+
+Samples of four points give both cameras at once; each camera keeps its own best sample (an error of one camera's
+detector must not cost the other's), and a row counts only where both agree.  Local optimisation refits on the rows kept
+until they no longer change (Chum, Matas and Kittler, "Locally optimized RANSAC", 2003).  Without a threshold samples are
+ranked by their median residual (Rousseeuw's least median of squares), the noise is measured on the rows kept, and a row
+is dropped where its residual would appear once in 10 000 data sets (chi-square, Bonferroni).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.stats import chi2
+
+from lib.calibration.affine import Moments, _regress, affine_minimum, estimate_noise
+
+__all__ = ["consensus", "gate"]
+
+FALSE_ALARM = 1e-4
+_ROWS_RANKED = 500
+
+
+def gate(n: int, m: int) -> float:
+    """Largest squared Mahalanobis distance of a row, exceeded once in 10 000 data sets of n rows, m pixels each."""
+    return float(chi2.isf(FALSE_ALARM / n, m))
+
+
+def consensus(
+    x: np.ndarray,
+    y: np.ndarray,
+    threshold_px: float | None,
+    rng: np.random.Generator,
+    *,
+    sigma_x_mm: float | None = None,
+    samples: int = 300,
+) -> np.ndarray:
+    """Rows (n,) bool that agree on one pair of affine cameras.
+
+    Parameters
+    ----------
+    x, y:
+        (n, 3) mm and (n, m) px.
+    threshold_px:
+        Largest reprojection distance of a row in any image; None measures the noise and decides by it.
+    sigma_x_mm:
+        Robot accuracy: samples whose smallest singular value is below five times it are not used.
+
+    Raises
+    ------
+    ValueError
+        Where no affine camera explains at least half the rows (with a threshold: at least eight, and a tenth).
+    """
+    n, m = y.shape
+    if n < 8:
+        return np.ones(n, dtype=bool)
+    x = x - x.mean(axis=0)
+    y_scale = float(y.std(axis=0).max())
+    sets = _samples(x, samples, rng, 5.0 * (sigma_x_mm or 0.0))
+    H = np.column_stack([x, np.ones(n)])
+    M = np.linalg.solve(H[sets], y[sets])  # (s, 4, m)
+    rows = np.arange(n) if n <= _ROWS_RANKED else rng.choice(n, _ROWS_RANKED, replace=False)
+    residuals = (H[rows] @ M.transpose(1, 0, 2).reshape(4, -1)).reshape(len(rows), len(sets), m // 2, 2)
+    residuals -= y[rows].reshape(len(rows), 1, m // 2, 2)
+    distance2 = np.einsum("rsck,rsck->csr", residuals, residuals)  # (cameras, samples, rows)
+    if threshold_px is None:
+        score = np.partition(distance2, len(rows) // 2, axis=2)[:, :, len(rows) // 2]
+    else:
+        score = np.minimum(distance2, threshold_px**2).sum(axis=2)  # MSAC
+    best = score.argmin(axis=1)
+    fits = np.hstack([M[b][:, 2 * c : 2 * c + 2] for c, b in enumerate(best)])
+    distance2 = ((y - H @ fits) ** 2).reshape(n, m // 2, 2).sum(axis=2)
+    if threshold_px is not None:
+        keep = _by_threshold(x, y, H, (distance2 < threshold_px**2).all(axis=1), threshold_px)
+        enough = max(8, n // 10)
+    else:
+        # The median of |r|^2 is 1.386 variances where the noise is Gaussian.
+        scale2 = np.median(distance2, axis=0) / chi2.ppf(0.5, 2) + 1e-18 * y_scale**2
+        keep = (distance2 < chi2.ppf(0.99, 2) * scale2).all(axis=1)
+        keep = _by_noise(x, y, keep)
+        enough = max(8, int(0.25 * n))
+    if keep.sum() < enough:
+        raise ValueError(
+            f"u: only {int(keep.sum())} of {n} rows agree on affine cameras; check that x_mm and u belong together "
+            "(frames, order of landmarks, time offset), or raise ransac_px."
+        )
+    residual = y[keep] - H[keep] @ _regress(x[keep], y[keep]).T
+    if np.sqrt((residual**2).mean()) > 0.25 * np.sqrt(y[keep].var(axis=0).mean()):
+        raise ValueError(
+            "u: no consensus, all rows look like outliers: the best affine cameras leave "
+            f"{np.sqrt((residual**2).mean()):.3g} px RMS; check that x_mm and u belong together."
+        )
+    return keep
+
+
+def _samples(x: np.ndarray, count: int, rng: np.random.Generator, least: float) -> np.ndarray:
+    """Sets (count, 4) of rows whose four points span a volume."""
+    n = len(x)
+    thickness = np.sqrt(np.linalg.eigvalsh(x.T @ x / n)[0])
+    sets = np.argpartition(rng.random((3 * count, n)), 4, axis=1)[:, :4] if n < 40 else rng.integers(0, n, (3 * count, 4))
+    corners = x[sets]
+    corners = corners - corners.mean(axis=1, keepdims=True)
+    smallest = np.sqrt(np.maximum(np.linalg.eigvalsh(np.swapaxes(corners, 1, 2) @ corners)[:, 0], 0.0))
+    good = sets[smallest > max(least, 0.3 * thickness)]
+    if len(good) < 20:  # thin data: take the best there are
+        good = sets[np.argsort(-smallest)[:count]]
+        good = good[smallest[np.argsort(-smallest)[: len(good)]] > 1e-9 * thickness]
+    return good[:count]
+
+
+def _by_threshold(x: np.ndarray, y: np.ndarray, H: np.ndarray, keep: np.ndarray, threshold_px: float) -> np.ndarray:
+    for _ in range(10):
+        if keep.sum() < 5:
+            break
+        distance2 = ((y - H @ _regress(x[keep], y[keep]).T) ** 2).reshape(len(y), -1, 2).sum(axis=2)
+        new = (distance2 < threshold_px**2).all(axis=1)
+        if (new == keep).all():
+            break
+        keep = new
+    return keep
+
+
+def _by_noise(x: np.ndarray, y: np.ndarray, keep: np.ndarray) -> np.ndarray:
+    n, m = y.shape
+    limit = gate(n, m)
+    # A first cut at 99 % and a last at the gate: the noise is measured on a set that is not yet contaminated.
+    for bound in (*(chi2.ppf(0.99, m),) * 3, *(limit,) * 10):
+        if keep.sum() < 6:
+            break
+        fitted = affine_minimum(Moments.of(x[keep], y[keep]), 1.0, 0.0).matrix
+        r = y - x @ fitted[:, :3].T - fitted[:, 3]
+        sigma_u, sigma_x = estimate_noise(r[keep], fitted[:, :3], 4 * m)
+        # Rounding sets the floor for data without noise.
+        floor = (1e-11 * np.abs(y).max()) ** 2
+        S = (sigma_u**2 + floor) * np.eye(m) + sigma_x**2 * fitted[:, :3] @ fitted[:, :3].T
+        distance2 = np.einsum("ni,ij,nj->n", r, np.linalg.inv(S), r)
+        # Heavy tails or a model error widen the bound: the median of the distance is known.
+        distance2 /= max(1.0, np.median(distance2[keep]) / chi2.ppf(0.5, m))
+        new = distance2 < bound
+        if bound == limit and (new == keep).all():
+            break
+        keep = new
+    return keep
