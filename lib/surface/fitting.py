@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Literal
@@ -12,7 +13,7 @@ from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from lib.geometry import points
 from lib.surface.bspline import BSplineSurface, SplineGrid
-from lib.surface.solver import L1Problem, L1Solution, cvxpy_reference, interior_point
+from lib.surface.solver import L1Problem, L1Solution, cvxpy_reference, interior_point, least_squares
 
 if TYPE_CHECKING:
     from lib.cameras import AffineCamera
@@ -23,7 +24,7 @@ __all__ = ["REJECT_MEDIANS", "SurfaceFit", "fit_surface"]
 #: 0.1 % of its points beyond it.
 REJECT_MEDIANS = 5.0
 
-_SOLVERS = {"interior_point": interior_point, "cvxpy": cvxpy_reference}
+_SOLVERS = {"interior_point": interior_point, "cvxpy": cvxpy_reference, "least_squares": least_squares}
 _FOLDS = 3
 _ENOUGH_HELD_OUT = 1500  # points in the folds that are tried: more only cost time
 _LADDER = 10.0**0.5  # step between candidates of the smoothness
@@ -55,6 +56,8 @@ class SurfaceFit:
         (m, 2) candidates of the smoothness and their mean held-out L1 error (mm), where it was chosen; else (0, 2).
     axes:
         (k, 3) orthonormal directions along which the L1 norm was taken: the axes of the frame for the plain fit.
+    method:
+        The solver.
     """
 
     objective: float
@@ -66,6 +69,7 @@ class SurfaceFit:
     iterations: int
     held_out: np.ndarray
     axes: np.ndarray
+    method: str
     _problem: L1Problem = field(repr=False)
     _mu: np.ndarray = field(repr=False)
     _weights: np.ndarray = field(repr=False)
@@ -79,7 +83,14 @@ class SurfaceFit:
         (Koenker, Quantile Regression, Sec. 4.2; Wahba, J. R. Stat. Soc. B 45, 1983, for reading the penalty as a
         prior, which makes the bands hold the smoothing bias on average).  Outputs correlate as the signs of their
         residuals do.  Errors that neighbouring points share, such as those of the calibration, are not in it.
+
+        Raises
+        ------
+        ValueError
+            For a fit by least squares, to which this does not apply.
         """
+        if self.method == "least_squares":
+            raise ValueError("covariance: of the L1 fit; fit with method 'interior_point'.")
         result = np.full((len(u), 3, 3), np.nan)
         inside = np.flatnonzero(grid.inside(u))
         for part in np.array_split(inside, max(1, len(inside) // 2048)):
@@ -126,7 +137,7 @@ def fit_surface(
     weights: ArrayLike | None = None,
     covariance_mm2: ArrayLike | None = None,
     camera: AffineCamera | None = None,
-    method: Literal["interior_point", "cvxpy"] = "interior_point",
+    method: Literal["interior_point", "cvxpy", "least_squares"] = "interior_point",
     tolerance: float = 1e-8,
 ) -> BSplineSurface:
     """The bicubic B-spline Psi that minimises paper Eq. (6), sum_i |Psi(u_i) - x_i|_1 + mu int |d^2 Psi / du^2|^2 du.
@@ -161,7 +172,8 @@ def fit_surface(
         The left camera.  Its ray through u is then exact, Psi(u) = ray(u) + s(u) d, and only the depth s along the
         viewing direction d is fitted, to d.x: one spline in the place of three.  Give `u` as matched in the image.
     method:
-        "interior_point", or "cvxpy" for the reference solution by CLARABEL.
+        "interior_point", or "cvxpy" for the same minimum from CLARABEL, the reference.  "least_squares" replaces the
+        L1 norms by squares (mu is then in px^2), the baseline that outliers ruin.
     tolerance:
         Duality gap at which the solver stops, relative to the objective.
 
@@ -179,6 +191,7 @@ def fit_surface(
         raise ValueError(f"reject_mm: a bound in mm above 0, infinity, or None; got {reject_mm}.")
     if method not in _SOLVERS:
         raise ValueError(f"method: one of {sorted(_SOLVERS)}, got {method!r}.")
+    solver = _SOLVERS[method]
     used = (weights > 0) & grid.inside(u)
     _check_enough(u[used], len(u), grid)
 
@@ -186,12 +199,14 @@ def fit_surface(
     stiffness = _stiffness(norms[used], weights[used])
     held_out = np.empty((0, 2))
     if smoothness is None:
-        smoothness, held_out = _choose_smoothness(grid, u[used], values[used], norms[used], stiffness)
+        # The reference chooses as the interior point method does: it has the same minimum, and takes longer.
+        quick = least_squares if method == "least_squares" else interior_point
+        smoothness, held_out = _choose_smoothness(quick, grid, u[used], values[used], norms[used], stiffness)
 
     def solve(chosen: np.ndarray) -> tuple[L1Problem, L1Solution, BSplineSurface]:
         problem = L1Problem(grid, u[chosen])
         mu = smoothness * stiffness
-        solution = _SOLVERS[method](problem, values[chosen], mu, norms[chosen], tolerance=tolerance)
+        solution = solver(problem, values[chosen], mu, norms[chosen], tolerance=tolerance)
         control_points = grid.unflatten(solution.coefficients) @ axes
         if camera is not None:
             control_points = control_points + _rays(grid.sites.reshape(-1, 2), camera).reshape(control_points.shape)
@@ -224,6 +239,7 @@ def fit_surface(
         iterations=solution.iterations,
         held_out=held_out,
         axes=axes,
+        method=method,
         _problem=problem,
         _mu=smoothness * stiffness,
         _weights=norms[inliers],
@@ -300,7 +316,12 @@ def _rays(u: np.ndarray, camera: AffineCamera) -> np.ndarray:
 
 
 def _choose_smoothness(
-    grid: SplineGrid, u: np.ndarray, values: np.ndarray, norms: np.ndarray, stiffness: np.ndarray
+    solver: Callable[..., L1Solution],
+    grid: SplineGrid,
+    u: np.ndarray,
+    values: np.ndarray,
+    norms: np.ndarray,
+    stiffness: np.ndarray,
 ) -> tuple[float, np.ndarray]:
     """The smoothness of least held-out error, and the candidates tried with their errors (m, 2).
 
@@ -324,7 +345,7 @@ def _choose_smoothness(
             total = 0.0
             for problem, train, design, test in parts:
                 mu = unit * _LADDER**step * train.mean() * stiffness
-                solution = interior_point(problem, values[train], mu, norms[train], tolerance=1e-3)
+                solution = solver(problem, values[train], mu, norms[train], tolerance=1e-3)
                 total += float((norms[test] / stiffness * np.abs(design @ solution.coefficients - values[test])).sum())
             errors[step] = total / (fold < tried).sum()
         return errors[step]

@@ -81,12 +81,20 @@ def test_held_out_smoothness_is_near_the_best_one(bowl_factory):
 def test_robust_where_least_squares_is_not(bowl_factory):
     bowl = bowl_factory(2000, outliers=0.25)
     surface = fit_surface(bowl.u_left, bowl.points.x_mm, domain=bowl.domain)
-    B = surface.grid.design(bowl.u_left[inside := surface.grid.inside(bowl.u_left)])
-    n, mu = B.shape[0], surface.fit.smoothness * 10
-    c = np.linalg.solve((B.T @ B + mu * surface.grid.bending).toarray(), B.T @ bowl.points.x_mm[inside])
-    squares = type(surface)(surface.grid, surface.grid.unflatten(c))
-    assert n > 1000
+    squares = fit_surface(bowl.u_left, bowl.points.x_mm, domain=bowl.domain, method="least_squares", reject_mm=np.inf)
     assert rms(bowl.depth_error_mm(surface)) < 0.5 * rms(bowl.depth_error_mm(squares))
+    with pytest.raises(ValueError, match="covariance"):
+        squares.covariance(bowl.u_left)
+
+
+def test_least_squares_solves_its_normal_equations(bowl):
+    surface = fit_surface(
+        bowl.u_left, bowl.points.x_mm, domain=bowl.domain, method="least_squares", smoothness=3e3, reject_mm=np.inf
+    )
+    inside = surface.inliers
+    B, x = surface.grid.design(bowl.u_left[inside]), bowl.points.x_mm[inside]
+    c = surface.grid.flatten(surface.control_points_mm)
+    np.testing.assert_allclose(B.T @ (B @ c - x) + 3e3 * surface.grid.bending @ c, 0, atol=1e-6)
 
 
 def test_depth_only_fit_is_exact_across_the_view(bowl):
