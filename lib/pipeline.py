@@ -24,7 +24,7 @@ from lib.cameras import AffineCamera, Points, StereoRig
 from lib.matching.masks import glint_mask, tool_mask
 from lib.registration import DriftMonitor, MovedCameras, identify_motion
 
-__all__ = ["STAGES", "FrameResult", "OnlinePipeline", "Settings"]
+__all__ = ["STAGES", "FrameResult", "OnlinePipeline", "Settings", "errors_against_truth"]
 
 #: The stages whose seconds and failures a `FrameResult` names, in their order.
 STAGES = ("detect", "calibrate", "register", "match", "triangulate", "surface", "distance")
@@ -419,3 +419,48 @@ class _Support:
         """(n,) variance of the prediction in units of one observation's (Cook and Weisberg 1982)."""
         offset = x - self.centre_mm
         return (1.0 / self.n if self.n else 0.0) + np.einsum("ni,ij,nj->n", offset, self.information, offset)
+
+
+def errors_against_truth(
+    results: list[FrameResult], truth: Any, rigs: list[StereoRig] | None = None
+) -> dict[str, np.ndarray]:
+    """How wrong each frame was, in mm, (n,) each, NaN where there was nothing yet.  For evaluation only.
+
+    Parameters
+    ----------
+    results:
+        Of frames 0, 1, ... of a simulated recording.
+    truth:
+        Its `lib.recordings.Truth`.
+    rigs:
+        The true rig in each frame where the cameras moved; None = the recording's throughout.
+
+    Returns
+    -------
+    dict
+        "rig": RMS error of triangulating, with the frame's rig, exact pixels of the tool's positions in the recording.
+        "surface": RMS distance along the view of the surface fitted in this frame to the true one, on a lattice of
+        pixels.  "distance": largest error of a landmark's distance to the surface.
+    """
+    workspace = truth.landmarks_mm.reshape(-1, 3)
+    errors = {name: np.full(len(results), np.nan) for name in ("rig", "surface", "distance")}
+    for i, result in enumerate(results):
+        rig = truth.rig if rigs is None else rigs[i]
+        view = truth.rig.left.viewing_direction
+        if result.rig is not None:
+            off = result.rig.triangulate(*rig.project(workspace)).x_mm - workspace
+            errors["rig"][i] = np.sqrt(np.mean((off**2).sum(axis=1)))
+        if result.surface is None:
+            continue
+        if result.points is not None:
+            x0, y0, x1, y1 = result.surface.grid.domain
+            lattice = np.stack(np.meshgrid(np.linspace(x0, x1, 40), np.linspace(y0, y1, 30)), axis=-1).reshape(-1, 2)
+            # The truth is known by the pixels of the cameras that did not move.
+            x = result.surface(lattice)
+            off = (x - truth.surface(truth.rig.left.project(x))) @ view
+            errors["surface"][i] = np.sqrt(np.nanmean(off**2))
+        x = truth.landmarks_mm[i]
+        true_distance = (truth.surface(truth.rig.left.project(x)) - x) @ view
+        off = np.abs(result.distance_mm - true_distance)
+        errors["distance"][i] = np.nanmax(off) if np.isfinite(off).any() else np.nan
+    return errors

@@ -14,6 +14,7 @@ from lib.geometry import RigidTransform
 from lib.registration import (
     DriftMonitor,
     Registration,
+    bumped_images,
     identify_motion,
     motion_error,
     perturb,
@@ -388,6 +389,23 @@ def test_the_experiment_on_a_recording():
     assert np.nanmax(found.translation_mm[:, 1]) < 1e-6
     with pytest.raises(ValueError, match="n_frames: up to 20"):
         recorded_registration_errors(estimators, [20], trials=1, rng=rng, **options)
+
+
+def test_bumped_images_show_what_moved_cameras_see():
+    """A bright dot on black lands where the moved rig projects its point."""
+    small = reference_rig(pixels_per_mm=(10.0, 9.0), image_size_px=(192, 108))
+    x = ROBOT_FROM_MICROSCOPE.apply(np.array([[1.0, -0.5, 0.3]]))
+    images = []
+    for u in small.project(x):
+        grid = np.stack(np.meshgrid(np.arange(192), np.arange(108)), axis=-1)
+        images.append(np.uint8(255 * np.exp(-((grid - u[0]) ** 2).sum(axis=2) / 18))[:, :, None].repeat(3, axis=2))
+    motion = RigidTransform(np.eye(3), np.array([0.8, -0.4, 0.7]))
+    moved = perturb(small, motion).project(x)
+    assert np.linalg.norm(np.subtract(moved, small.project(x))) > 5
+    for image, u in zip(bumped_images(*images, small, motion), moved, strict=True):
+        weight = image[:, :, 0].astype(float)
+        centroid = (grid * weight[:, :, None]).sum(axis=(0, 1)) / weight.sum()
+        np.testing.assert_allclose(centroid, u[0], atol=0.05)
 
 
 def test_tool_frames_have_the_tools_size():

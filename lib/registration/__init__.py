@@ -9,6 +9,7 @@ from lib.registration.drift import DriftMonitor
 from lib.registration.experiment import (
     MotionErrors,
     ToolFrames,
+    bumped_images,
     motion_error,
     random_motion,
     recorded_registration_errors,
@@ -24,6 +25,7 @@ __all__ = [
     "MovedCameras",
     "Registration",
     "ToolFrames",
+    "bumped_images",
     "identify_motion",
     "motion_error",
     "perturb",

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -17,6 +18,7 @@ from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
 __all__ = [
     "MotionErrors",
     "ToolFrames",
+    "bumped_images",
     "motion_error",
     "random_motion",
     "recorded_registration_errors",
@@ -217,3 +219,28 @@ def _estimate_all(errors, trial, estimators, rig, window, motion, centre_mm) -> 
             errors[name].translation_mm[trial, j], errors[name].euler_rad[trial, j] = motion_error(
                 found, motion, centre_mm
             )
+
+
+def bumped_images(
+    left: np.ndarray, right: np.ndarray, rig: StereoRig, motion: RigidTransform
+) -> tuple[np.ndarray, np.ndarray]:
+    """A stereo pair as cameras that moved by `motion` would have taken it: warped by what the motion does to images.
+
+    Exact for a shift in any direction, and for a rotation about a camera's own axis; other rotations would show parts
+    of the scene differently, which no warp can.
+
+    Parameters
+    ----------
+    left, right:
+        (h, w, 3) uint8.
+    rig:
+        The cameras that took them.
+    """
+    moved = perturb(rig, motion)
+    images = []
+    for image, before, after in ((left, rig.left, moved.left), (right, rig.right, moved.right)):
+        turn = after.linear @ np.linalg.pinv(before.linear)
+        warp = np.column_stack([turn, after.offset_px - turn @ before.offset_px])
+        size = (image.shape[1], image.shape[0])
+        images.append(cv2.warpAffine(image, warp, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+    return images[0], images[1]

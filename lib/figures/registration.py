@@ -1,0 +1,173 @@
+"""Figures of notebook 05: the moved microscope, errors against frames, noise in 3D, drift, one camera alone."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.patches import Ellipse
+
+from lib.cameras import StereoRig
+from lib.figures.style import COLOURS, figure
+from lib.geometry import RigidTransform
+from lib.registration import DriftMonitor, MotionErrors
+
+__all__ = ["drift_chart", "error_curves", "hypotheses", "moved_tool", "noise_ellipses"]
+
+_ESTIMATORS = {
+    "squared norms": (COLOURS["baseline"], "s", "--"),
+    "sum of norms, Eq. (7)": (COLOURS["paper"], "o", "-"),
+    "images": (COLOURS["ours"], "D", "-"),
+    "images, robust": (COLOURS["truth"], "^", "-"),
+}
+
+
+def _style(name: str) -> dict:
+    colour, marker, line = _ESTIMATORS.get(name, ("black", "x", "-"))
+    return {"color": colour, "marker": marker, "linestyle": line, "markersize": 5, "label": name}
+
+
+def moved_tool(
+    x_robot: np.ndarray,
+    x_stale: np.ndarray,
+    x_registered: np.ndarray,
+    microscope_from_robot: RigidTransform,
+) -> Figure:
+    """The tool's landmarks from above and from the side: told by the robot, seen by the stale rig, registered.
+
+    Parameters
+    ----------
+    x_robot, x_stale, x_registered:
+        (n, 3, 3) mm, n frames of base, tip_1, tip_2.
+    """
+    page, axes = figure(1, 2, width_in=11, height_in=4.2)
+    sets = (
+        ("robot", x_robot, COLOURS["truth"], 5.0),
+        ("stale rig", x_stale, COLOURS["paper"], 1.4),
+        ("registered", x_registered, COLOURS["ours"], 1.4),
+    )
+    for ax, (i, j), title in zip(axes, ((0, 1), (0, 2)), ("From above", "From the side"), strict=True):
+        for label, x, colour, width in sets:
+            y = microscope_from_robot.apply(x)
+            for k, frame in enumerate(y):
+                jaws = frame[[1, 0, 2]]
+                ax.plot(
+                    jaws[:, i],
+                    jaws[:, j],
+                    "-o",
+                    color=colour,
+                    linewidth=width,
+                    markersize=3,
+                    alpha=0.45 if width > 2 else 1.0,
+                    label=label if k == 0 else None,
+                )
+        ax.set(xlabel="x in mm", ylabel=("y in mm", "depth z in mm")[j - 1], title=title, aspect="equal")
+        ax.invert_yaxis()
+    axes[0].legend()
+    return page
+
+
+def error_curves(errors: Mapping[str, MotionErrors], *, paper_um: float | None = 150.0, title: str = "") -> Figure:
+    """The paper's figure "Tool Registration": RMS errors against the number of frames, quartiles as a band."""
+    page, axes = figure(1, 4, width_in=14, height_in=4.0)
+    for name, error in errors.items():
+        style = _style(name)
+        n = np.array(error.n_frames)
+        axes[0].plot(n, error.translation_rms_um, **style)
+        low, high = 1e3 * np.nanpercentile(error.translation_mm, [25, 75], axis=0)
+        axes[0].fill_between(n, low, high, color=style["color"], alpha=0.15, linewidth=0)
+        for k in range(3):
+            axes[k + 1].plot(n, error.euler_rms_deg[:, k], **style)
+    if paper_um is not None:
+        axes[0].axhline(paper_um, color=COLOURS["warning"], linestyle=":", label="paper: below this after 3")
+    ticks = list(next(iter(errors.values())).n_frames)
+    shared = [value for error in errors.values() for value in error.euler_rms_deg.ravel()]
+    for k, ax in enumerate(axes):
+        ax.set(xscale="log", yscale="log", xlabel="frames")
+        ax.set_xticks(ticks, [str(t) for t in ticks])
+        ax.minorticks_off()
+        if k:
+            ax.set_title(f"Rotation $\\Phi_{'XYZ'[k - 1]}$ in degrees")
+            ax.set_ylim(0.8 * np.nanmin(shared), 1.25 * np.nanmax(shared))
+        _plain_log_ticks(ax)
+    axes[0].set_title("Translation in um")
+    page.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=5)
+    if title:
+        page.suptitle(title, x=0.01, ha="left", fontsize=11)
+    return page
+
+
+def _plain_log_ticks(ax) -> None:
+    low, high = ax.get_ylim()
+    ticks = [m * 10.0**e for e in range(-4, 6) for m in (1, 2, 5) if low <= m * 10.0**e <= high]
+    ax.set_yticks(ticks, [f"{t:g}" for t in ticks])
+
+
+def noise_ellipses(rig: StereoRig, sigma_px: float, microscope_from_robot: RigidTransform) -> Figure:
+    """One-sigma ellipses of a triangulated landmark, from above and from the side, to one scale."""
+    covariance_px2 = sigma_px**2
+    covariance = rig.triangulate(np.zeros((1, 2)), np.zeros((1, 2)), covariance_px2).covariance_mm2[0]
+    covariance = 1e6 * microscope_from_robot.R @ covariance @ microscope_from_robot.R.T
+    page, axes = figure(1, 2, width_in=8, height_in=4)
+    reach = 1.25 * np.sqrt(covariance.diagonal().max())
+    for ax, (i, j), title in zip(axes, ((0, 1), (0, 2)), ("From above", "From the side"), strict=True):
+        values, vectors = np.linalg.eigh(covariance[np.ix_((i, j), (i, j))])
+        angle = np.rad2deg(np.arctan2(vectors[1, 1], vectors[0, 1]))
+        ax.add_patch(Ellipse((0, 0), *(2 * np.sqrt(values[::-1])), angle=angle, facecolor=COLOURS["ours"], alpha=0.5))
+        sd = np.sqrt(covariance.diagonal())
+        ax.set(
+            xlim=(-reach, reach),
+            ylim=(reach, -reach),
+            aspect="equal",
+            xlabel=f"x in um (sd {sd[0]:.0f})",
+            ylabel=f"{'xyz'[j]} in um (sd {sd[j]:.0f})",
+            title=title,
+        )
+    return page
+
+
+def drift_chart(monitors: Mapping[str, DriftMonitor], shift_at: int) -> Figure:
+    """Left: chi-square of each frame; right: the cumulative sum with its alarm level."""
+    page, axes = figure(1, 2, width_in=12, height_in=3.8)
+    colours = [COLOURS["baseline"], COLOURS["warning"], COLOURS["ours"], COLOURS["paper"]]
+    top = 0.0
+    for (name, monitor), colour in zip(monitors.items(), colours, strict=False):
+        chi2, freedom, statistic = np.array(monitor.history).T
+        axes[0].plot(chi2 / freedom, color=colour, linewidth=1.0, label=name)
+        axes[1].plot(statistic, color=colour, label=name)
+        top = monitor.threshold
+    axes[0].set(yscale="log", xlabel="frame", title="One frame: chi-square per degree of freedom")
+    axes[1].axhline(top, color="black", linestyle=":", linewidth=1)
+    axes[1].set(ylim=(0, 3 * top), xlabel="frame", title="Cumulative sum, and the alarm level")
+    for ax in axes:
+        ax.axvline(shift_at - 0.5, color=COLOURS["truth"], linestyle="--", linewidth=1)
+    axes[1].legend(loc="upper left")
+    return page
+
+
+def hypotheses(bic: Mapping[str, float], error_um: Mapping[str, float]) -> Figure:
+    """Left: how much worse each hypothesis explains the landmarks; right: triangulation error after each remedy."""
+    page, axes = figure(1, 2, width_in=11, height_in=3.4)
+    names = list(bic)
+    excess = np.array([bic[name] for name in names])
+    excess = excess - excess.min()
+    colours = [COLOURS["truth"] if value == 0 else COLOURS["baseline"] for value in excess]
+    axes[0].barh(names, excess, color=colours)
+    for i, value in enumerate(excess):
+        axes[0].text(value, i, f" {value:.0f}" if value else " best", va="center")
+    axes[0].set(xlabel="BIC above the best", xlim=(0, 1.15 * excess.max()), title="Which camera moved?")
+    axes[0].invert_yaxis()
+    _bars(axes[1], list(error_um), list(error_um.values()))
+    axes[1].set(xlabel="RMS triangulation error in um", title="What it costs to be wrong")
+    for ax in axes:
+        ax.grid(axis="y", visible=False)
+    return page
+
+
+def _bars(ax, names: Sequence[str], values: Sequence[float]) -> None:
+    ax.barh(names, values, color=[COLOURS["truth"] if v == min(values) else COLOURS["paper"] for v in values])
+    for i, value in enumerate(values):
+        ax.text(value, i, f" {value:.0f}", va="center")
+    ax.set_xlim(0, 1.15 * max(values))
+    ax.invert_yaxis()
