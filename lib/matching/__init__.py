@@ -1,9 +1,9 @@
 """Semi-dense stereo matching: DeepMatching, its fast form along epipolar lines, and alternatives (paper Sec. IV-B).
 
-    matches = match(left, right, rig=rig)                    # along the epipolar lines, sub-pixel: the default
-    matches = match(left, right)                             # free DeepMatching, no calibration needed
-    matches = match(left, right, rig=RECTIFIED)              # a rectified pair: rows correspond
-    points = rig.triangulate(matches.u_left, matches.u_right, matches.covariance_px2)
+matches = match(left, right, rig=rig)                    # along the epipolar lines, sub-pixel: the default
+matches = match(left, right)                             # free DeepMatching, no calibration needed
+matches = match(left, right, rig=RECTIFIED)              # a rectified pair: rows correspond
+points = rig.triangulate(matches.u_left, matches.u_right, matches.covariance_px2)
 """
 
 from __future__ import annotations
@@ -63,6 +63,7 @@ def match(
     setting: str = "quality",
     downscale: int | None = None,
     budget_bytes: int = 2 << 30,
+    max_epipolar_px: float = 6.0,
     device: str = "cpu",
 ) -> Matches:
     """Match the two images of a stereo pair.
@@ -93,6 +94,8 @@ def match(
     budget_bytes:
         Memory that free DeepMatching may take.  It is predicted before anything is allocated; what does not fit is
         matched in tiles of the left image, or refused with the figure.
+    max_epipolar_px:
+        "band" refuses a rig whose epipolar lines lie farther than this from what free coarse matches say.
     device:
         torch device of free DeepMatching, such as "cuda".
 
@@ -122,7 +125,14 @@ def match(
     elif method == "band":
         if rig is None:
             raise ValueError("rig: method 'band' needs a calibrated rig, or RECTIFIED for a rectified pair.")
-        matches = match_band(images, masks, rig, depth_range_mm=depth_range_mm, setting=SETTINGS[setting])
+        matches = match_band(
+            images,
+            masks,
+            rig,
+            depth_range_mm=depth_range_mm,
+            setting=SETTINGS[setting],
+            max_epipolar_px=max_epipolar_px,
+        )
     elif callable(method) or method in ("sgbm", "dis"):
         matches = match_with(method, images, masks, rig, depth_range_mm=depth_range_mm, setting=SETTINGS[setting])
     else:

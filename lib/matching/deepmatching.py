@@ -117,8 +117,8 @@ def plan_tiles(grid_left: tuple[int, int], grid_right: tuple[int, int], budget_b
     while (need := predicted_bytes((size_y * PATCH, size_x * PATCH), grid_right)) > budget_bytes:
         if max(size_y, size_x) <= 16:
             raise ValueError(
-                f"budget_bytes: DeepMatching needs {predicted_bytes(grid_left, grid_right) / 2**30:.1f} GiB in one piece "
-                f"and {need / 2**30:.2f} GiB in its smallest tiles, the budget is {budget_bytes / 2**30:.2f} GiB. "
+                f"budget_bytes: DeepMatching needs {predicted_bytes(grid_left, grid_right) / 2**30:.1f} GiB in one "
+                f"piece and {need / 2**30:.2f} GiB in its smallest tiles, the budget is {budget_bytes / 2**30:.2f} GiB. "
                 "Raise downscale, or match with a rig (method 'band')."
             )
         if size_y >= size_x:
@@ -227,7 +227,7 @@ def _axis_factor(n_lattice: int, off: int, n_map: int, level: int, like: torch.T
         exists = np.stack([i - off >= 0, i + off < n_lattice])
     valid = exists & np.stack([p - 1 >= 0, p + 1 < n_map])
     n_exist, n_valid = exists.sum(axis=0), valid.sum(axis=0)
-    factor = np.where(n_valid > 0, np.maximum(n_exist, 1) ** (BORDER_POWER - 1) * np.maximum(n_valid, 1) ** -BORDER_POWER, 0.0)
+    factor = np.maximum(n_exist, 1) ** (BORDER_POWER - 1) * np.maximum(n_valid, 1) ** -BORDER_POWER * (n_valid > 0)
     return torch.as_tensor(factor, dtype=like.dtype, device=like.device)
 
 
@@ -332,7 +332,7 @@ def bottom_up(left: torch.Tensor, right: torch.Tensor, *, levels: int | None = N
 
 
 def top_down(pyramid: Pyramid) -> torch.Tensor:
-    """Scores (gy, gx, h, w) of the best path to every pooled cell of the atomic patches' maps; -inf where none leads."""
+    """Scores (gy, gx, h, w) of the best path to every pooled cell of the atomic patches; -inf where none leads."""
     if not pyramid.responses:
         return pyramid.pooled[0]
     score = pyramid.responses[-1]
@@ -377,9 +377,7 @@ def _best(pyramid: Pyramid, score: torch.Tensor) -> tuple[torch.Tensor, torch.Te
     return best, corner, bins
 
 
-def match_grids(
-    left: torch.Tensor, right: torch.Tensor, tiles: list[tuple[slice, slice]] | None = None
-) -> GridMatches:
+def match_grids(left: torch.Tensor, right: torch.Tensor, tiles: list[tuple[slice, slice]] | None = None) -> GridMatches:
     """Reciprocal matches of two descriptor grids.
 
     Parameters

@@ -18,6 +18,9 @@ CHANNELS = 9
 SIGMA_PX = 1.0
 SLOPE = 0.2
 CONSTANT = 0.3
+#: How far a descriptor looks: three blurs of 3 px and a gradient of 1 px.
+REACH_PX = 10
+STRIP_PIXELS = 1 << 17
 
 
 def as_gray(image: ArrayLike, name: str) -> np.ndarray:
@@ -64,24 +67,41 @@ def pixel_descriptors(gray: np.ndarray, downscale: int = 1, *, valid: np.ndarray
     np.ndarray
         (h >> downscale, w >> downscale, 9) float32.  The centre of cell 0 lies at (2^downscale - 1) / 2 px.
     """
+    stride = 1 << downscale
+    rows, columns = gray.shape[0] // stride, gray.shape[1] // stride
+    descriptors = np.empty((rows, columns, CHANNELS), np.float32)
+    # Strips that stay in the cache, with the rows around them that the three blurs and the gradient reach.
+    strip = max(1, STRIP_PIXELS // (gray.shape[1] * stride))
+    for first in range(0, rows, strip):
+        last = min(first + strip, rows)
+        top = max(0, first * stride - REACH_PX)
+        _describe(
+            gray[top : min(len(gray), last * stride + REACH_PX), :],
+            slice(first * stride - top, last * stride - top),
+            stride,
+            descriptors[first:last],
+        )
+    if valid is not None:
+        seen = valid[: rows * stride, : columns * stride].view(np.uint8) * np.uint8(255)
+        descriptors[cv2.resize(seen, (columns, rows), interpolation=cv2.INTER_AREA) < 255] = 0.0
+    return descriptors
+
+
+def _describe(gray: np.ndarray, rows: slice, stride: int, out: np.ndarray) -> None:
+    """Fill `out` (rows / stride, w / stride, 9) with the descriptors of some rows of a strip."""
     smooth = _blur(gray)
     dx = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=1, borderType=cv2.BORDER_REPLICATE)
     dy = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=1, borderType=cv2.BORDER_REPLICATE)
     half = np.float32(np.sqrt(0.5))
-    stride = 1 << downscale
-    rows, columns = gray.shape[0] // stride, gray.shape[1] // stride
-    descriptors = np.empty((rows, columns, CHANNELS), np.float32)
-    projections = (dx, (dx + dy) * half, dy, (dy - dx) * half)
-    for k, projection in enumerate(projections):
+    height, width = out.shape[:2]
+    for k, projection in enumerate((dx, (dx + dy) * half, dy, (dy - dx) * half)):
         for opposite in (False, True):
             positive = np.maximum(-projection if opposite else projection, 0.0)
-            squashed = np.tanh(_blur(positive) * np.float32(SLOPE / 2))
-            channel = _blur(squashed)[: rows * stride, : columns * stride]
+            squashed = _blur(positive)
+            squashed *= np.float32(SLOPE / 2)
+            np.tanh(squashed, out=squashed)  # 2 / (1 + exp(-SLOPE x)) - 1
+            channel = _blur(squashed)[rows, : width * stride]
             if stride > 1:
-                channel = cv2.resize(channel, (columns, rows), interpolation=cv2.INTER_AREA)
-            descriptors[:, :, k + 4 * opposite] = channel
-    descriptors[:, :, 8] = CONSTANT
-    if valid is not None and not valid.all():
-        cells = valid[: rows * stride, : columns * stride].reshape(rows, stride, columns, stride).all(axis=(1, 3))
-        descriptors *= cells[:, :, None]
-    return descriptors
+                channel = cv2.resize(channel, (width, height), interpolation=cv2.INTER_AREA)
+            out[:, :, k + 4 * opposite] = channel
+    out[:, :, CHANNELS - 1] = CONSTANT

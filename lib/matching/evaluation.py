@@ -90,7 +90,8 @@ def score_against_disparity(
     if flat_window_px is not None:
         kernel = np.ones((flat_window_px, flat_window_px), np.uint8)
         known = np.isfinite(disparity)
-        low, high = (cv2.erode(np.where(known, disparity, -1e6), kernel), cv2.dilate(np.where(known, disparity, 1e6), kernel))
+        low = cv2.erode(np.where(known, disparity, -1e6), kernel)
+        high = cv2.dilate(np.where(known, disparity, 1e6), kernel)
         usable &= high - low <= flat_range_px
     height, width = disparity.shape
     x, y = np.rint(matches.u_left).astype(np.intp).T

@@ -119,4 +119,5 @@ def match_with(
     u_right = rectification.u_right(canvas - np.column_stack([d[kept], np.zeros(kept.sum())]))
     sigma = SIGMA_PX.get(name, 0.5) / scale
     covariance = np.tile(np.diag([0.05**2, 0.05**2, sigma**2, sigma**2]), (len(u_left), 1, 1))
-    return Matches(u_left, u_right, np.clip(confidence[y, x][kept], 0.0, 1.0).astype(np.float64), covariance, method=name)
+    score = np.clip(confidence[y, x][kept], 0.0, 1.0).astype(np.float64)
+    return Matches(u_left, u_right, score, covariance, method=name)

@@ -18,7 +18,7 @@ from lib.cameras import AffineCamera, StereoRig
 __all__ = ["RECTIFIED", "Rectification", "rectify", "warp"]
 
 #: The rig of an already rectified pair: x = (x_left, y, disparity) px instead of mm, u_right = (x - disparity, y).
-#: Depth is disparity (times -1 never: nearer is larger), so `depth_range_mm` is the range of disparity in px.
+#: Depth is then disparity (nearer is larger), so `depth_range_mm` is the range of disparity in px.
 RECTIFIED = StereoRig(
     AffineCamera(np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0]])),
     AffineCamera(np.array([[1.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0]])),
@@ -154,19 +154,17 @@ def warp(
         columns = slice(max(0, whole[0]), max(0, min(width, right)))
         if rows.stop <= rows.start or columns.stop <= columns.start:
             return np.zeros(size_px[::-1], np.float32), np.zeros(size_px[::-1], bool)
-        inside = np.ones_like(gray[rows, columns], np.uint8) if mask is None else (~mask[rows, columns]).astype(np.uint8)
+        inside = np.ones(gray.shape, np.uint8) if mask is None else (~mask).view(np.uint8)
         out = cv2.copyMakeBorder(gray[rows, columns], *pad, cv2.BORDER_REPLICATE)
-        valid = cv2.copyMakeBorder(inside, *pad, cv2.BORDER_CONSTANT, value=0)
+        valid = cv2.copyMakeBorder(inside[rows, columns], *pad, cv2.BORDER_CONSTANT, value=0)
         return out, valid.astype(bool)
     factor = max(1, int(np.sqrt(abs(np.linalg.det(linear))) + 0.25))
-    ignored = None if mask is None else mask.astype(np.float32)
+    seen = np.full(gray.shape, 255, np.uint8) if mask is None else (~mask).view(np.uint8) * np.uint8(255)
     if factor > 1:
-        gray = _shrink(gray, factor)
-        ignored = None if ignored is None else _shrink(ignored, factor)
+        gray, seen = _shrink(gray, factor), _shrink(seen, factor)
         linear, offset = linear / factor, (offset - (factor - 1) / 2) / factor
     matrix = np.column_stack([linear, offset])
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     out = cv2.warpAffine(gray, matrix, size_px, flags=flags, borderMode=cv2.BORDER_REPLICATE)
-    seen = np.ones_like(gray) if ignored is None else (ignored < 1e-3).astype(np.float32)
-    valid = cv2.warpAffine(seen, matrix, size_px, flags=flags, borderMode=cv2.BORDER_CONSTANT, borderValue=0.0)
-    return out, valid > 0.999
+    seen = cv2.warpAffine(seen, matrix, size_px, flags=flags, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+    return out, seen == 255

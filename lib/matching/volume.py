@@ -7,6 +7,7 @@ A volume holds (gy, gx, 2 v + 1, D) responses: lattice of patches, rows off the 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -16,6 +17,8 @@ __all__ = ["VolumeMatches", "correlation_volume", "match_volume", "n_levels"]
 
 PATCH = 4
 POWER = 1.4
+#: Lattice rows that are correlated at once.
+ROWS = 16
 
 
 @dataclass(frozen=True)
@@ -81,33 +84,37 @@ def correlation_volume(left: torch.Tensor, right: torch.Tensor, low: int, n: int
     patches = left.reshape(gy, PATCH, gx, PATCH, channels).permute(0, 2, 1, 3, 4).reshape(gy, gx, depth)
     patches = patches / patches.norm(dim=2, keepdim=True).clamp_min(1e-12)
 
-    # (x, y, 4 cells of the row): any window is then depth contiguous numbers, so BLAS reads it in place.
-    rows = right.shape[0]
-    n_x = right.shape[1] - PATCH + 1
-    strip = right.new_empty(n_x, rows, PATCH * channels)
-    turned = right.transpose(0, 1)
-    for c in range(PATCH):
-        strip[:, :, c * channels : (c + 1) * channels] = turned[c : c + n_x]
+    n_x, n_y = right.shape[1] - PATCH + 1, right.shape[0] - PATCH + 1
     energy = right.square().sum(dim=2)
     energy = sum(energy[:, c : c + n_x] for c in range(PATCH))
-    energy = sum(energy[r : r + rows - PATCH + 1] for r in range(PATCH))
+    energy = sum(energy[r : r + n_y] for r in range(PATCH))
     inverse_norm = torch.where(energy > 1e-12, energy.clamp_min(1e-12).rsqrt(), 0.0).contiguous()
 
+    # Windows as (x, y, 4 cells of the row): any window is then `depth` contiguous numbers, so that BLAS reads it in
+    # place.  One chunk of lattice rows at a time, which stays in the cache.
     volume = right.new_empty(gy, gx, 2 * v + 1, n)
     block = max(4, min(gx, n // (2 * PATCH)))
-    row_stride = PATCH * channels
-    for j in range(2 * v + 1):
-        for start in range(0, gx, block):
-            b = min(block, gx - start)
-            windows = PATCH * (b - 1) + n
-            view = strip.as_strided(
-                (gy, windows, depth),
-                (PATCH * row_stride, rows * row_stride, 1),
-                PATCH * start * rows * row_stride + j * row_stride,
-            )
-            product = torch.bmm(patches[:, start : start + b], view.transpose(1, 2))
-            volume[:, start : start + b, j] = product.as_strided((gy, b, n), (b * windows, windows + PATCH, 1))
-        volume[:, :, j] *= inverse_norm.as_strided((gy, gx, n), (PATCH * n_x, PATCH, 1), j * n_x)
+    row = PATCH * channels
+    height_max = PATCH * ROWS + 2 * v
+    strip = right.new_empty(n_x, height_max, row)
+    column = height_max * row
+    turned = right.transpose(0, 1)
+    for top in range(0, gy, ROWS):
+        k = min(ROWS, gy - top)
+        rows = slice(PATCH * top, PATCH * (top + k) + 2 * v)
+        for c in range(PATCH):
+            strip[:, : rows.stop - rows.start, c * channels : (c + 1) * channels] = turned[c : c + n_x, rows]
+        for j in range(2 * v + 1):
+            for start in range(0, gx, block):
+                b = min(block, gx - start)
+                windows = PATCH * (b - 1) + n
+                view = strip.as_strided((k, windows, depth), (PATCH * row, column, 1), PATCH * start * column + j * row)
+                product = torch.bmm(patches[top : top + k, start : start + b], view.transpose(1, 2))
+                skewed = product.as_strided((k, b, n), (b * windows, windows + PATCH, 1))
+                scale = inverse_norm.as_strided(
+                    (k, b, n), (PATCH * n_x, PATCH, 1), (PATCH * top + j) * n_x + PATCH * start
+                )
+                torch.mul(skewed, scale, out=volume[top : top + k, start : start + b, j])
     return volume
 
 
@@ -140,8 +147,10 @@ def _starts(shape: torch.Size) -> int:
     return (shape[2] // 2) % 2
 
 
-def _pool(volume: torch.Tensor) -> torch.Tensor:
-    return _pool_axis(_pool_axis(volume, 3, 0), 2, _starts(volume.shape))
+def _pool(volume: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Maximum over three displacements along x at every second one; and of these over three along y."""
+    along_x = _pool_axis(volume, 3, 0)
+    return along_x, _pool_axis(along_x, 2, _starts(volume.shape))
 
 
 def _offset(level: int) -> int:
@@ -180,29 +189,32 @@ def _scatter(score: torch.Tensor, axis: int, level: int) -> torch.Tensor:
     out = torch.empty_like(score)
     out.narrow(axis, 0, off).copy_(score.narrow(axis, off, off))
     out.narrow(axis, n - off, off).copy_(score.narrow(axis, n - 2 * off, off))
-    torch.maximum(
-        score.narrow(axis, 0, n - 2 * off), score.narrow(axis, 2 * off, n - 2 * off), out=out.narrow(axis, off, n - 2 * off)
-    )
+    inner = out.narrow(axis, off, n - 2 * off)
+    torch.maximum(score.narrow(axis, 0, n - 2 * off), score.narrow(axis, 2 * off, n - 2 * off), out=inner)
     return out
 
 
-def _unpool(response: torch.Tensor, pooled: torch.Tensor, score: torch.Tensor) -> torch.Tensor:
+def _unpool_axis(
+    response: torch.Tensor, pooled: torch.Tensor, score: torch.Tensor, axis: int, start: int
+) -> torch.Tensor:
     """Give each pooled sample's score to the displacement that was its maximum; unreached ones get -inf."""
     out = torch.full_like(response, -torch.inf)
-    start = _starts(response.shape)
-    for y in (start - 1, start, start + 1):
-        for x in (-1, 0, 1):
-            skip_y, skip_x = int(y < 0), int(x < 0)
-            target = (slice(None), slice(None), slice(y + 2 * skip_y, None, 2), slice(x + 2 * skip_x, None, 2))
-            n_y = min(response[target].shape[2], pooled.shape[2] - skip_y)
-            n_x = min(response[target].shape[3], pooled.shape[3] - skip_x)
-            if n_y <= 0 or n_x <= 0:
-                continue
-            source = (slice(None), slice(None), slice(skip_y, skip_y + n_y), slice(skip_x, skip_x + n_x))
-            there = out[target][:, :, :n_y, :n_x]
-            chosen = response[target][:, :, :n_y, :n_x] == pooled[source]
-            torch.maximum(there, torch.where(chosen, score[source], -torch.inf), out=there)
+    for first in (start - 1, start, start + 1):
+        skip = int(first < 0)
+        index = [slice(None)] * 4
+        index[axis] = slice(first + 2 * skip, None, 2)
+        there, here = out[tuple(index)], response[tuple(index)]
+        n = min(here.shape[axis], pooled.shape[axis] - skip)
+        if n > 0:
+            there, here = there.narrow(axis, 0, n), here.narrow(axis, 0, n)
+            chosen = here == pooled.narrow(axis, skip, n)
+            torch.maximum(there, torch.where(chosen, score.narrow(axis, skip, n), -torch.inf), out=there)
     return out
+
+
+def _unpool(response: torch.Tensor, along_x: torch.Tensor, pooled: torch.Tensor, score: torch.Tensor) -> torch.Tensor:
+    score = _unpool_axis(along_x, pooled, score, 2, _starts(response.shape))
+    return _unpool_axis(response, along_x, score, 3, 0)
 
 
 def _parabola(volume: torch.Tensor, i: tuple[torch.Tensor, ...], axis: int) -> tuple[torch.Tensor, torch.Tensor]:
@@ -236,39 +248,51 @@ def match_volume(volume: torch.Tensor, low: int) -> VolumeMatches:
         below = responses[-1]
         if below.shape[2] * below.shape[3] == 1:
             break
-        pools.append(_pool(below))
+        along_x, pooled = _pool(below)
+        pools.append((along_x, pooled))
         # The power is monotone, so at the bottom it may follow the maximum: a quarter of the work.
-        gains.append(pools[-1] ** POWER if level == 1 else pools[-1])
+        gains.append(pooled**POWER if level == 1 else pooled)
         responses.append(_gather(_gather(gains[-1], 0, level), 1, level).pow_(POWER))
 
     score = responses.pop()
     for level in range(len(pools), 0, -1):
         score = _scatter(_scatter(score, 0, level), 1, level).add_(gains[level - 1])
-        score = _unpool(responses[level - 1], pools[level - 1], score)
-    return _reciprocal(volume, score, low, len(pools) + 1)
+        if level > 1:
+            score = _unpool(responses[level - 1], *pools[level - 1], score)
+
+    def bottom(rows: slice) -> torch.Tensor:
+        """Scores of some lattice rows: at the bottom they are needed only once, so never all at a time."""
+        return _unpool(volume[rows], *(pool[rows] for pool in pools[0]), score[rows]) if pools else score[rows]
+
+    return _reciprocal(volume, bottom, low, len(pools) + 1)
 
 
-def _reciprocal(volume: torch.Tensor, score: torch.Tensor, low: int, levels: int) -> VolumeMatches:
+def _reciprocal(
+    volume: torch.Tensor, scores_of: Callable[[slice], torch.Tensor], low: int, levels: int
+) -> VolumeMatches:
     """Best displacement of each patch, kept if it is also the best of its bin in the right grid."""
     gy, gx, rows, n = volume.shape
     v = rows // 2
-    best, flat = score.reshape(gy, gx, -1).max(dim=2)
-    j, k = flat // n, flat % n
-
     # The centre of a patch lies at cell 4 g + 2; its displaced copy falls into the bin (4 g + 2 + d) // 4, so
     # displacements in fours share a bin for every patch.
     bin_x, bin_y = (low + np.arange(n) + 2) // PATCH, (np.arange(-v, v + 1) + 2) // PATCH
     span_x, span_y = (int(bin_x[0]), int(bin_x[-1])), (int(bin_y[0]), int(bin_y[-1]))
-    bins = score.new_full((gy + span_y[1] - span_y[0], gx + span_x[1] - span_x[0]), -torch.inf)
-    for y in range(span_y[0], span_y[1] + 1):
-        in_y = np.flatnonzero(bin_y == y)
-        for x in range(span_x[0], span_x[1] + 1):
-            in_x = np.flatnonzero(bin_x == x)
-            strongest = score[:, :, in_y[0] : in_y[-1] + 1, in_x[0] : in_x[-1] + 1].amax(dim=(2, 3))
-            there = bins[y - span_y[0] : y - span_y[0] + gy, x - span_x[0] : x - span_x[0] + gx]
-            torch.maximum(there, strongest, out=there)
+    bins = volume.new_full((gy + span_y[1] - span_y[0], gx + span_x[1] - span_x[0]), -torch.inf)
+    best, flat = volume.new_empty(gy, gx), torch.empty(gy, gx, dtype=torch.long, device=volume.device)
+    for top in range(0, gy, ROWS):
+        part = slice(top, min(top + ROWS, gy))
+        score = scores_of(part)
+        torch.max(score.reshape(*score.shape[:2], -1), dim=2, out=(best[part], flat[part]))
+        for y in range(span_y[0], span_y[1] + 1):
+            in_y = np.flatnonzero(bin_y == y)
+            for x in range(span_x[0], span_x[1] + 1):
+                in_x = np.flatnonzero(bin_x == x)
+                strongest = score[:, :, in_y[0] : in_y[-1] + 1, in_x[0] : in_x[-1] + 1].amax(dim=(2, 3))
+                there = bins[part.start + y - span_y[0] : part.stop + y - span_y[0], x - span_x[0] : x - span_x[0] + gx]
+                torch.maximum(there, strongest, out=there)
+    j, k = flat // n, flat % n
     grid_y, grid_x = torch.meshgrid(
-        torch.arange(gy, device=score.device), torch.arange(gx, device=score.device), indexing="ij"
+        torch.arange(gy, device=volume.device), torch.arange(gx, device=volume.device), indexing="ij"
     )
     own_y = grid_y + torch.div(j - v + 2, PATCH, rounding_mode="floor") - span_y[0]
     own_x = grid_x + torch.div(k + low + 2, PATCH, rounding_mode="floor") - span_x[0]
