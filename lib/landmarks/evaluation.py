@@ -67,7 +67,9 @@ class Evaluation:
     def by_landmark(self) -> dict[str, Scores]:
         """Scores of base, tip_1, tip_2."""
         columns = np.arange(3)
-        return {name: self._score(np.broadcast_to(columns == k, self.u_true.shape[:2])) for k, name in enumerate(LANDMARKS)}
+        return {
+            name: self._score(np.broadcast_to(columns == k, self.u_true.shape[:2])) for k, name in enumerate(LANDMARKS)
+        }
 
     def by_visibility(self) -> dict[str, Scores]:
         """Scores of visible and of occluded landmarks, where there are any."""
@@ -118,7 +120,9 @@ def evaluate(
     return Evaluation(landmarks, np.stack(labels), np.stack(visibility), np.array(length), names)
 
 
-def labelled_frames(recording: Recording, *, every: int = 1) -> Iterable[tuple[str, np.ndarray, np.ndarray, np.ndarray]]:
+def labelled_frames(
+    recording: Recording, *, every: int = 1
+) -> Iterable[tuple[str, np.ndarray, np.ndarray, np.ndarray]]:
     """Left and right images of a recording with their labels: the exact truth if simulated, else the annotations.
 
     Raises
@@ -186,7 +190,9 @@ def calibrate(
     return detector
 
 
-def _fit(features: np.ndarray, shapes: np.ndarray, errors: np.ndarray, correct: np.ndarray, gross_px: float) -> Calibration:
+def _fit(
+    features: np.ndarray, shapes: np.ndarray, errors: np.ndarray, correct: np.ndarray, gross_px: float
+) -> Calibration:
     size = np.linalg.norm(errors, axis=1)
     use = np.isfinite(size) & (size < gross_px)
     if use.sum() < 20:
@@ -219,7 +225,9 @@ def main(argv: list[str] | None = None) -> int:
     """`python3 -m lib evaluate`: a weights file on a recording; prints the scores, and writes them as JSON on request."""
     parser = argparse.ArgumentParser(prog="python3 -m lib evaluate", description=main.__doc__.split(": ", 1)[1])
     parser.add_argument("recording", type=Path, help="folder of a recording with truth/ or annotations.json")
-    parser.add_argument("--weights", default=None, help="weights file or name in data/models (default: the shipped ones)")
+    parser.add_argument(
+        "--weights", default=None, help="weights file or name in data/models (default: the shipped ones)"
+    )
     parser.add_argument("--every", type=int, default=1, help="evaluate every N-th frame")
     parser.add_argument("--json", type=Path, help="write the scores here")
     arguments = parser.parse_args(argv)
@@ -233,7 +241,9 @@ def main(argv: list[str] | None = None) -> int:
         print(error, file=sys.stderr)
         return 2
     rows = {"all": result.scores} | result.by_landmark() | result.by_visibility()
-    print(f"{'':10}{'PCK@0.01':>10}{'PCK@0.05':>10}{'PCK@0.10':>10}{'median px':>11}{'95 % px':>9}{'missed':>8}{'labels':>8}")
+    print(
+        f"{'':10}{'PCK@0.01':>10}{'PCK@0.05':>10}{'PCK@0.10':>10}{'median px':>11}{'95 % px':>9}{'missed':>8}{'labels':>8}"
+    )
     for name, s in rows.items():
         print(
             f"{name:10}{s.pck_0_01:10.1f}{s.pck_0_05:10.1f}{s.pck_0_10:10.1f}{s.median_px:11.2f}{s.p95_px:9.2f}"
@@ -242,5 +252,7 @@ def main(argv: list[str] | None = None) -> int:
     s = result.scores
     print(f"normalised squared error {s.nees:.2f} (2 is right), 95 % ellipses hold {s.coverage_95:.1f} %")
     if arguments.json:
-        arguments.json.write_text(json.dumps({k: v.as_dict() for k, v in rows.items()}, indent=1) + "\n", encoding="utf-8")
+        arguments.json.write_text(
+            json.dumps({k: v.as_dict() for k, v in rows.items()}, indent=1) + "\n", encoding="utf-8"
+        )
     return 0

@@ -6,7 +6,6 @@ that was not, bit for bit on the CPU: the step's number is the whole state of th
 
 from __future__ import annotations
 
-import argparse
 import copy
 import csv
 import hashlib
@@ -15,7 +14,7 @@ import os
 import subprocess
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Protocol
 
@@ -197,7 +196,9 @@ def _batch(source: Source, config: TrainingConfig, step: int) -> Batch:
 
 
 @torch.no_grad()
-def validate(network: StackedHourglass, samples: Samples, config: TrainingConfig, *, batch: int = 16) -> dict[str, float]:
+def validate(
+    network: StackedHourglass, samples: Samples, config: TrainingConfig, *, batch: int = 16
+) -> dict[str, float]:
     """Loss, PCK and median error on held-out images, and two signs of a collapsed network.
 
     `peak` (the mean height of visible landmarks' heatmaps; 1 is right) near 0, or `spread` (the deviation of
@@ -412,7 +413,8 @@ def load_training(path: str | Path) -> Training:
     return Training(
         network,
         metadata["log"],
-        metadata["provenance"] | {"steps": metadata["step"], "seconds": metadata["seconds"], "config": metadata["config"]},
+        metadata["provenance"]
+        | {"steps": metadata["step"], "seconds": metadata["seconds"], "config": metadata["config"]},
     )
 
 
@@ -445,6 +447,8 @@ def _commit() -> str:
     """The repository's commit, or "unknown" outside a clone."""
     try:
         command = ["git", "rev-parse", "--short=12", "HEAD"]
-        return subprocess.run(command, cwd=paths.ROOT, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+        return subprocess.run(
+            command, cwd=paths.ROOT, capture_output=True, text=True, check=True, timeout=10
+        ).stdout.strip()
     except (OSError, subprocess.SubprocessError):
         return "unknown"

@@ -1,0 +1,160 @@
+"""Training data for the two-stage detector: simulated frames, cut to what its networks see.
+
+Frames come from `lib.simulator.training.sample`, whose eyes and tools no test recording uses.  A shard is an .npz file of a
+few frames.  Of every frame it keeps the whole at the first stage's
+resolution and a crop around each landmark at full resolution; validation shards keep the full frame as JPEG too.
+Shards are written whole or not at all, so generating them can be stopped at any time and goes on where it stopped.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from tqdm.auto import tqdm
+
+from lib.geometry import cell_from_image
+from lib.landmarks.training import Samples
+from lib.landmarks.windows import cut, direction_rad, map_points, window_from_image
+from lib.simulator.training import sample
+
+__all__ = ["REDUCTION", "WindowSource", "frame_samples", "generate", "validation_frames"]
+
+REDUCTION = 5
+CROP_PX = 288
+FRAMES = 16
+
+
+def generate(folder: str | Path, shards: int, *, validation: bool = False, progress: bool = True) -> None:
+    """Write shards 0 to `shards` - 1 of `FRAMES` frames into `folder`, skipping those that stand."""
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    for i in tqdm(range(shards), disable=not progress, unit="shard"):
+        path = folder / f"{'validation' if validation else 'training'}_{i:04d}.npz"
+        if not path.exists():
+            rng = np.random.default_rng([int(validation), i])
+            _write_shard(path, [sample(rng) for _ in range(FRAMES)], keep_frames=validation)
+
+
+def _write_shard(path: Path, views: list[tuple[np.ndarray, np.ndarray, np.ndarray]], *, keep_frames: bool) -> None:
+    frames, crops, crop_u, crop_visibility, crop_landmark, jpegs = [], [], [], [], [], []
+    for image, u, visibility in views:
+        h, w = image.shape[:2]
+        frames.append(cv2.resize(image, (w // REDUCTION, h // REDUCTION), interpolation=cv2.INTER_AREA))
+        for k in np.flatnonzero(visibility):
+            corner = np.round(u[k] - (CROP_PX - 1) / 2)
+            crops.append(cut(image, np.column_stack([np.eye(2), -corner]), CROP_PX))
+            crop_u.append(u - corner)
+            crop_visibility.append(visibility)
+            crop_landmark.append(k)
+        if keep_frames:
+            quality = [cv2.IMWRITE_JPEG_QUALITY, 95]
+            jpegs.append(cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), quality)[1])
+    arrays = {
+        "frames": np.stack(frames),
+        "u": np.stack([u for _, u, _ in views]),
+        "visibility": np.stack([visibility for _, _, visibility in views]),
+        "crops": np.stack(crops),
+        "crop_u": np.stack(crop_u),
+        "crop_visibility": np.stack(crop_visibility),
+        "crop_landmark": np.array(crop_landmark),
+        "jpegs": np.concatenate([j.ravel() for j in jpegs]) if jpegs else np.zeros(0, np.uint8),
+        "jpeg_ends": np.cumsum([j.size for j in jpegs]),
+    }
+    partial = path.with_name(path.name + ".partial")
+    with partial.open("wb") as file:
+        np.savez(file, **arrays)
+    os.replace(partial, path)
+
+
+def _load(folder: str | Path, pattern: str, names: tuple[str, ...]) -> list[np.ndarray]:
+    shards = sorted(Path(folder).glob(pattern))
+    if not shards:
+        raise FileNotFoundError(f"{folder}: no shard {pattern}; make some with `python3 -m lib train --generate`.")
+    parts: dict[str, list[np.ndarray]] = {name: [] for name in names}
+    for path in shards:
+        try:
+            with np.load(path, allow_pickle=False) as shard:
+                for name in names:
+                    parts[name].append(shard[name])
+        except (ValueError, KeyError, OSError) as error:
+            raise ValueError(f"{path}: corrupt; delete it and generate it again ({error}).") from error
+    return [np.concatenate(parts[name]) for name in names]
+
+
+def frame_samples(folder: str | Path, *, validation: bool = False) -> Samples:
+    """Whole frames at the first stage's resolution."""
+    pattern = "validation_*.npz" if validation else "training_*.npz"
+    frames, u, visibility = _load(folder, pattern, ("frames", "u", "visibility"))
+    return Samples(frames, cell_from_image(u, REDUCTION), visibility)
+
+
+def validation_frames(folder: str | Path) -> Iterator[tuple[str, np.ndarray, np.ndarray, np.ndarray]]:
+    """Full validation frames, for `lib.landmarks.evaluation`: name, image, u, visibility."""
+    for path in sorted(Path(folder).glob("validation_*.npz")):
+        with np.load(path, allow_pickle=False) as shard:
+            pieces = np.split(shard["jpegs"], shard["jpeg_ends"][:-1])
+            for i, piece in enumerate(pieces):
+                image = cv2.cvtColor(cv2.imdecode(piece, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+                yield f"{path.stem} {i}", image, shard["u"][i], shard["visibility"][i]
+
+
+@dataclass(frozen=True)
+class WindowSource:
+    """Upright windows around landmarks, placed as badly as the first stage may place them.
+
+    Attributes
+    ----------
+    crops, u, visibility, landmark:
+        (n, c, c, 3) uint8 around landmark (n,), labels (n, 3, 2) in crop pixels, (n, 3).
+    size:
+        Of the windows.
+    shift_px, turn_rad:
+        Standard deviations of the error of place and direction; a tenth of the windows has three times as much.
+    zoom:
+        Range of magnification.
+    """
+
+    crops: np.ndarray
+    u: np.ndarray
+    visibility: np.ndarray
+    landmark: np.ndarray
+    size: int = 128
+    shift_px: float = 6.0
+    turn_rad: float = 0.08
+    zoom: tuple[float, float] = (0.85, 1.2)
+
+    @classmethod
+    def load(cls, folder: str | Path, *, validation: bool = False, size: int = 128) -> WindowSource:
+        """From the shards of a folder."""
+        names = ("crops", "crop_u", "crop_visibility", "crop_landmark")
+        return cls(*_load(folder, "validation_*.npz" if validation else "training_*.npz", names), size=size)
+
+    def __len__(self) -> int:
+        return len(self.crops)
+
+    def draw(self, index: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        u = self.u[index]
+        worse = 3.0 if rng.random() < 0.1 else 1.0
+        limit = 0.3 * self.size
+        centre = u[self.landmark[index]] + np.clip(rng.normal(0, worse * self.shift_px, 2), -limit, limit)
+        angle = direction_rad(u[None])[0] + np.clip(rng.normal(0, worse * self.turn_rad), -0.6, 0.6)
+        matrix = window_from_image(centre, angle, self.size, rng.uniform(*self.zoom))
+        return cut(self.crops[index], matrix, self.size), map_points(matrix, u), self.visibility[index]
+
+    def fixed(self, seed: int = 0) -> Samples:
+        """One drawn window of every crop: validation samples."""
+        rng = np.random.default_rng(seed)
+        images, u, visibility = zip(*(self.draw(i, rng) for i in range(len(self))), strict=True)
+        return Samples(np.stack(images), np.stack(u), np.stack(visibility))
+
+    @property
+    def fingerprint(self) -> str:
+        digest = hashlib.sha256(np.ascontiguousarray(self.crops[:, ::17, ::17]).tobytes())
+        digest.update(self.u.tobytes())
+        return digest.hexdigest()[:16]
