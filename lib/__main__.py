@@ -169,6 +169,7 @@ def ruff_options() -> list[str]:
 
     def flat(table: dict, prefix: str = ""):
         for key, value in table.items():
+            key = key if key.replace("-", "").isalnum() else json.dumps(key)
             if isinstance(value, dict):
                 yield from flat(value, f"{prefix}{key}.")
             else:

@@ -17,7 +17,7 @@ from contextlib import contextmanager
 
 from matplotlib.figure import Figure
 
-__all__ = ["FIGURE_METADATA", "METRIC_MIME", "record", "show", "timed"]
+__all__ = ["FIGURE_METADATA", "METRIC_MIME", "format_value", "record", "show", "timed", "unit_text"]
 
 #: Mime type of a metric in a notebook's outputs; the JSON holds name, value, unit, paper, note.
 METRIC_MIME = "application/vnd.microstereo.metric+json"
@@ -113,6 +113,11 @@ def format_value(value: float | None) -> str:
     return f"{value:.4g}" if 1e-4 <= abs(value) < 1e7 else f"{value:.3e}"
 
 
+def unit_text(unit: str) -> str:
+    """A unit as a reader expects it: micrometres with their sign."""
+    return {"um": "µm", "um^2": "µm²", "px^2": "px²", "mm^2": "mm²", "deg": "°"}.get(unit, unit)
+
+
 def _checked_name(name: str) -> str:
     if not _NAME.fullmatch(name):
         raise ValueError(f"name: {name!r} is not lower-case snake case, such as 'calibration_reprojection_px'.")
@@ -129,7 +134,7 @@ def _number(value: float, argument: str) -> float | int | None:
 
 
 def _row_html(metric: dict) -> str:
-    unit = html.escape(metric["unit"])
+    unit = html.escape(unit_text(metric["unit"]))
     cells = [
         f"<code>{html.escape(metric['name'])}</code>",
         f"<b>{format_value(metric['value'])}</b> {unit}",

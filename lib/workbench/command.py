@@ -38,8 +38,12 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("--profile", choices=PROFILES, default="quick", help="quick: minutes; paper: the paper's sizes")
     parser.add_argument("-p", dest="pairs", nargs=2, action="append", default=[], metavar=("NAME", "VALUE"),
                         help="a parameter of the notebooks that declare it")  # fmt: skip
-    parser.add_argument("--cell-timeout", type=float, metavar="S", help="longest time of one cell (default: 900 for quick)")
-    parser.add_argument("--runs", type=Path, default=paths.RUNS, metavar="FOLDER", help="where the run's folder appears")
+    parser.add_argument(
+        "--cell-timeout", type=float, metavar="S", help="longest time of one cell (default: 900 for quick)"
+    )
+    parser.add_argument(
+        "--runs", type=Path, default=paths.RUNS, metavar="FOLDER", help="where the run's folder appears"
+    )
     options = parser.parse_args(argv)
     timeout = options.cell_timeout or (900.0 if options.profile == "quick" else None)
     try:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 
-from lib.report import format_value
+from lib.report import format_value, unit_text
 from lib.workbench.pages import markdown_html
 from lib.workbench.style import INDEX_CSS, PAGE_CSS
 
@@ -67,7 +67,7 @@ def _comparison(run: dict) -> str:
     if not rows:
         return ""
     body = "".join(
-        f'<tr><td>{html.escape(_words(m["name"]))}<small>{html.escape(m["note"])}</small></td>'
+        f"<tr><td>{html.escape(_words(m))}<small>{html.escape(m['note'])}</small></td>"
         f'<td class="number paper">{_with_unit(m["paper"], m["unit"])}</td>'
         f'<td class="number ours">{_with_unit(m["value"], m["unit"])}</td><td>{_link(run, m["notebook"])}</td></tr>'
         for m in rows
@@ -87,8 +87,11 @@ def _steps(run: dict) -> str:
         picture = next((figure for figure in run["figures"] if figure["notebook"] == book["name"]), None)
         image = f'<img src="{picture["file"]}" alt="" loading="lazy">' if picture else ""
         state = {"complete": _duration(book["seconds"]), "pending": "waiting", "running": "running ..."}
-        line = f'<p class="why">{html.escape(_failure_line(book))}</p>' if book["state"] == "failed" else (
-            f'<p class="dim">{state[book["state"]]}</p>')
+        line = (
+            f'<p class="why">{html.escape(_failure_line(book))}</p>'
+            if book["state"] == "failed"
+            else (f'<p class="dim">{state[book["state"]]}</p>')
+        )
         links = ""
         if book["page"]:
             links = f'<p><a href="{book["page"]}">Read</a> &middot; <a href="{book["executed"]}">Notebook</a></p>'
@@ -116,7 +119,7 @@ def _all_metrics(run: dict) -> str:
         metrics = [metric for metric in run["metrics"] if metric["notebook"] == book["name"]]
         if metrics:
             rows = "".join(
-                f'<tr><td><code>{html.escape(m["name"])}</code></td>'
+                f"<tr><td><code>{html.escape(m['name'])}</code></td>"
                 f'<td class="number ours">{_with_unit(m["value"], m["unit"])}</td>'
                 f'<td class="note">{html.escape(m["note"])}</td></tr>'
                 for m in metrics
@@ -141,9 +144,11 @@ def _provenance(run: dict) -> str:
 
 
 def _failure_line(book: dict) -> str:
-    return f"{book['name']}: {book['failure']['kind']}" + (
-        f" in cell {book['failure']['cell']}" if book["failure"]["cell"] else ""
-    ) + f": {book['failure']['message']}"
+    return (
+        f"{book['name']}: {book['failure']['kind']}"
+        + (f" in cell {book['failure']['cell']}" if book["failure"]["cell"] else "")
+        + f": {book['failure']['message']}"
+    )
 
 
 def _link(run: dict, name: str) -> str:
@@ -151,12 +156,13 @@ def _link(run: dict, name: str) -> str:
     return f'<a href="{book["page"]}">{html.escape(book["title"])}</a>'
 
 
-def _words(name: str) -> str:
-    return name.replace("_", " ")
+def _words(metric: dict) -> str:
+    """The metric's name as words, without the unit that stands beside it."""
+    return metric["name"].removesuffix(f"_{metric['unit']}").replace("_", " ")
 
 
 def _with_unit(value: float | None, unit: str) -> str:
-    return f"{format_value(value)} {html.escape(unit)}".rstrip()
+    return f"{format_value(value)} {html.escape(unit_text(unit))}".rstrip()
 
 
 def _duration(seconds: float | None) -> str:

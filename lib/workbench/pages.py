@@ -88,7 +88,8 @@ def _cell(cell, folder: Path, widgets: dict) -> str:
     if "papermill-error-cell-tag" in tags or not cell.source.strip():
         return ""
     if cell.cell_type == "markdown":
-        return f'<section class="prose">{markdown_html(cell.source, folder=folder, attachments=cell.get("attachments"))}</section>'
+        prose = markdown_html(cell.source, folder=folder, attachments=cell.get("attachments"))
+        return f'<section class="prose">{prose}</section>'
     if cell.cell_type != "code":
         return f"<pre>{html.escape(cell.source)}</pre>"
     code = highlight(cell.source, PythonLexer(), HtmlFormatter(cssclass="code"))

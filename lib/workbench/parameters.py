@@ -49,8 +49,11 @@ def declared_parameters(notebook: Path) -> dict[str, str]:
     """Names and declared types ("int", "str", ...; "" where none is) of the cell tagged ``parameters``."""
     import papermill
 
-    with _quiet_papermill():
-        found = papermill.inspect_notebook(str(notebook))
+    try:
+        with _quiet_papermill():
+            found = papermill.inspect_notebook(str(notebook))
+    except (ValueError, nbformat.ValidationError) as error:  # also text that is no JSON
+        raise UsageError(f"{notebook}: not a notebook ({error}).") from None
     return {name: (entry["inferred_type_name"] or "").replace("None", "") for name, entry in found.items()}
 
 

@@ -1,0 +1,36 @@
+"""What every test runs under: few threads, no display, reproducible examples."""
+
+from __future__ import annotations
+
+import os
+import shutil
+
+for _variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+    os.environ.setdefault(_variable, "2")  # before numpy and torch are imported
+os.environ.setdefault("MPLBACKEND", "Agg")
+os.environ.setdefault("OPEN3D_DISABLE_WEB_VISUALIZER", "true")
+
+import hypothesis
+import pytest
+
+hypothesis.settings.register_profile("microstereo", derandomize=True, deadline=None, max_examples=50, database=None)
+hypothesis.settings.load_profile("microstereo")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--slow", action="store_true", help="also run the tests marked slow")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    cuda = shutil.which("nvidia-smi") is not None and _torch_sees_cuda()
+    for item in items:
+        if "slow" in item.keywords and not config.getoption("--slow"):
+            item.add_marker(pytest.mark.skip(reason="slow: give --slow"))
+        if "cuda" in item.keywords and not cuda:
+            item.add_marker(pytest.mark.skip(reason="no NVIDIA GPU"))
+
+
+def _torch_sees_cuda() -> bool:
+    import torch
+
+    return torch.cuda.is_available()

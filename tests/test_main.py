@@ -1,0 +1,99 @@
+"""The command line, without running what it starts."""
+
+from __future__ import annotations
+
+import ast
+from collections import namedtuple
+from pathlib import Path
+
+import pytest
+
+from lib import __main__ as command_line
+from lib import environment, paths
+
+
+@pytest.fixture
+def inside(monkeypatch):
+    """As in the finished environment: nothing is installed, nothing is executed anew."""
+    monkeypatch.setattr(environment, "ensure", lambda torch=None: Path("python"))
+    monkeypatch.setattr(command_line.sys, "prefix", str(paths.ROOT / ".venv"))
+
+
+def test_help_names_every_command(capsys):
+    assert command_line.main(["--help"]) == 0
+    text = capsys.readouterr().out
+    assert all(command in text for command in command_line.COMMANDS)
+
+
+@pytest.mark.parametrize("argv", [[], ["rum"]])
+def test_unknown_command_is_an_error(argv, capsys):
+    assert command_line.main(argv) == 2
+
+
+def test_commands_get_what_follows_them(inside, monkeypatch):
+    monkeypatch.setitem(command_line.COMMANDS, "run", lambda argv: argv)
+    assert command_line.main(["run", "03", "--profile", "paper"]) == ["03", "--profile", "paper"]
+    assert command_line.main(["run", "03", "--torch", "cpu", "-p", "seed", "1"]) == ["03", "-p", "seed", "1"]
+    assert command_line.main(["run", "--torch=cuda", "03"]) == ["03"]
+
+
+def test_the_torch_build_reaches_the_environment(inside, monkeypatch):
+    asked = []
+    monkeypatch.setattr(environment, "ensure", lambda torch=None: asked.append(torch) or Path("python"))
+    monkeypatch.setitem(command_line.COMMANDS, "run", lambda argv: 0)
+    command_line.main(["run", "--torch", "cuda"])
+    command_line.main(["run"])
+    assert asked == ["cuda", None]
+
+
+def test_an_unknown_torch_build_is_an_error(inside, capsys):
+    assert command_line.main(["run", "--torch", "rocm"]) == 1
+    assert "choose one of cpu, cuda" in capsys.readouterr().err
+
+
+def test_a_problem_of_the_environment_is_told_without_traceback(monkeypatch, capsys):
+    def fail(torch=None):
+        raise environment.Problem("sudo apt-get install it")
+
+    monkeypatch.setattr(environment, "ensure", fail)
+    assert command_line.main(["run"]) == 1
+    assert capsys.readouterr().err == "\nsudo apt-get install it\n"
+
+
+def test_outside_the_environment_it_becomes_its_python(monkeypatch):
+    monkeypatch.setattr(environment, "ensure", lambda torch=None: Path("/x/.venv/bin/python"))
+    monkeypatch.setattr(command_line.sys, "prefix", "/usr")
+    monkeypatch.setattr(command_line, "_become", lambda command: command)
+    assert command_line.main(["test", "-k", "x"]) == ["/x/.venv/bin/python", "-m", "lib", "test", "-k", "x"]
+
+
+VersionInfo = namedtuple("VersionInfo", "major minor micro releaselevel serial")
+
+
+@pytest.mark.parametrize("version", [(3, 9), (3, 15)])
+def test_an_unfit_python_uses_a_fitting_one_or_says_so(version, monkeypatch, capsys):
+    monkeypatch.setattr(command_line.sys, "version_info", VersionInfo(*version, 0, "final", 0))
+    monkeypatch.setattr(command_line, "_become", lambda command: command)
+    monkeypatch.setattr(command_line.shutil, "which", lambda name: f"/bin/{name}" if name == "python3.12" else None)
+    assert command_line.main(["run"]) == ["/bin/python3.12", "-m", "lib", "run"]
+    monkeypatch.setattr(command_line.shutil, "which", lambda name: None)
+    assert command_line.main(["run"]) == 1
+    assert "needs Python 3.11 to 3.14" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("module", ["__init__.py", "__main__.py", "environment.py"])
+def test_the_launcher_parses_on_an_old_python(module):
+    """Else it could not say that the Python is too old."""
+    ast.parse((paths.ROOT / "lib" / module).read_text(encoding="utf-8"), feature_version=(3, 7))
+
+
+def test_supported_pythons_agree_with_environment_toml():
+    (low, high) = command_line.PYTHONS
+    wanted = f">={low[0]}.{low[1]},<{high[0]}.{high[1]}"
+    assert environment.manifest()["project"]["requires-python"] == wanted
+
+
+def test_ruff_is_told_what_environment_toml_says():
+    options = command_line.ruff_options()
+    assert "--config=line-length = 120" in options
+    assert any(option.startswith('--config=lint.select = ["E"') for option in options)

@@ -1,0 +1,277 @@
+"""The main job on tiny notebooks, one for each way to fail."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import nbformat
+import pytest
+from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
+
+from lib import paths
+from lib.workbench import UsageError, choose_notebooks, command, equations, main, parse_parameters, run
+from lib.workbench.pages import markdown_html
+from lib.workbench.sweep import sweep
+
+PARAMETERS = """\
+profile: str = "quick"  # "quick" or "paper"
+seed: int = 0  # drives every random source
+noise_px: float = 0.5  # of the detections
+crop: bool = False  # the images
+sizes: list = [1, 2]  # of the windows
+"""
+
+GOOD = [
+    "from lib import report\nimport matplotlib.pyplot as plt",
+    'report.record("calibration_reprojection_px", 1.5 + seed, "px", paper=2.0, note="of <b>75</b> frames")\n'
+    'report.record("landmark_pck", float("nan"), "%")',
+    "fig, ax = plt.subplots(figsize=(2, 1)); ax.plot([1, 2])\n"
+    'report.show(fig, "calibration_residuals", "Small everywhere.")',
+    'with report.timed("calibration"): pass\nprint(profile)',
+    "import plotly.graph_objects as go\ngo.Figure(go.Scatter(x=[1], y=[2]))",
+    "import ipywidgets\nipywidgets.interactive(lambda k: print('k is', k), k=3)",
+]
+
+
+def write_notebook(folder: Path, name: str, *cells: str, title: str = "A title", parameters: str = PARAMETERS) -> Path:
+    prose = f"# {title}\n\nEquation $u = M x$:\n\n$$\\operatorname*{{arg\\,min}}_{{M}} \\lVert u - M x \\rVert^2$$"
+    notebook = new_notebook(
+        cells=[
+            new_markdown_cell(prose),
+            new_code_cell(parameters, metadata={"tags": ["parameters"]}),
+            *(new_code_cell(cell) for cell in cells),
+        ],
+        metadata={"kernelspec": {"name": "python3", "display_name": "Python 3", "language": "python"}},
+    )
+    path = folder / f"{name}.ipynb"
+    nbformat.write(notebook, path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def books(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("notebooks")
+    write_notebook(folder, "00_error", "1 / 0", "print('never')", title="It fails")
+    write_notebook(folder, "01_slow", "import time; time.sleep(60)")
+    write_notebook(folder, "02_dead", "import os; os.kill(os.getpid(), 9)")
+    write_notebook(folder, "03_good", *GOOD, title="It <works>")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def finished(books, tmp_path_factory) -> tuple[dict, Path]:
+    """One run of them all, (metrics.json, folder)."""
+    runs = tmp_path_factory.mktemp("runs")
+    content = run(pairs=[("seed", "3")], cell_timeout_s=3, runs=runs, notebooks=books)
+    (folder,) = runs.iterdir()
+    assert content == json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
+    return content, folder
+
+
+# --- each way to fail
+
+
+def failure(finished, name: str) -> dict:
+    return next(book for book in finished[0]["notebooks"] if book["name"] == name)["failure"]
+
+
+def test_an_error_is_told_with_its_cell(finished):
+    assert failure(finished, "00_error") == {
+        "kind": "error", "cell": 3, "message": "ZeroDivisionError: division by zero"
+    }  # fmt: skip
+
+
+def test_a_timeout_is_detected(finished):
+    assert failure(finished, "01_slow")["kind"] == "timeout" and failure(finished, "01_slow")["cell"] == 3
+
+
+def test_a_dead_kernel_is_told(finished):
+    assert failure(finished, "02_dead")["kind"] == "dead kernel" and failure(finished, "02_dead")["cell"] == 3
+
+
+def test_the_others_still_run(finished):
+    content, _ = finished
+    assert content["state"] == "failed"
+    assert [book["state"] for book in content["notebooks"]] == ["failed", "failed", "failed", "complete"]
+
+
+def test_a_notebook_that_is_no_json_fails_before_anything_runs(tmp_path):
+    (tmp_path / "00_torn.ipynb").write_text('{"cells": [', encoding="utf-8")
+    with pytest.raises(UsageError, match="00_torn.ipynb: not a notebook"):
+        run(runs=tmp_path / "runs", notebooks=tmp_path)
+    assert not (tmp_path / "runs").exists()
+
+
+# --- what a run leaves
+
+
+def test_metrics_follow_the_schema(finished):
+    content, _ = finished
+    assert set(content) == {"format", "version", "state", "profile", "parameters", "started", "seconds", "commit",
+                            "machine", "versions", "notebooks", "metrics", "figures"}  # fmt: skip
+    assert content["format"] == "microstereo.metrics" and content["parameters"] == {"seed": "3"}
+    assert content["metrics"][0] == {
+        "notebook": "03_good", "name": "calibration_reprojection_px", "value": 4.5, "unit": "px", "paper": 2.0,
+        "note": "of <b>75</b> frames",
+    }  # fmt: skip
+    assert [m["name"] for m in content["metrics"][1:]] == ["landmark_pck", "seconds_calibration"]
+    assert content["metrics"][1]["value"] is None
+    assert content["machine"]["cores"] >= 1 and content["versions"]["python"]
+    assert sum(book["seconds"] for book in content["notebooks"]) <= content["seconds"]
+
+
+def test_figures_are_files(finished):
+    content, folder = finished
+    (figure,) = content["figures"]
+    assert figure["file"] == "figures/calibration_residuals.png" and figure["caption"] == "Small everywhere."
+    assert (folder / figure["file"]).read_bytes().startswith(b"\x89PNG")
+
+
+def test_pages_need_no_network_and_show_equations(finished):
+    _, folder = finished
+    for file in folder.glob("*.html"):
+        text = file.read_text(encoding="utf-8")
+        assert not re.search(r'(src|href)="(https?:)?//', text), file
+        assert "$$" not in text
+    good = (folder / "03_good.html").read_text(encoding="utf-8")
+    assert good.count("<svg ") == 2 and "arg\\,min" in good
+    assert "Small everywhere." in good and "Plotly.newPlot" in good and (folder / "plotly.min.js").is_file()
+    assert "k is 3" in good and "Interactive: open the notebook" in good
+
+
+def test_index_shows_paper_and_run_and_escapes_text(finished):
+    text = (finished[1] / "index.html").read_text(encoding="utf-8")
+    assert '<td class="number paper">2 px</td>' in text and '<td class="number ours">4.5 px</td>' in text
+    assert "of &lt;b&gt;75&lt;/b&gt; frames" in text and "It &lt;works&gt;" in text
+    assert "00_error: error in cell 3: ZeroDivisionError" in text
+    assert "figures/calibration_residuals.png" in text
+
+
+def test_every_link_leads_somewhere(finished):
+    _, folder = finished
+    for file in folder.glob("*.html"):
+        for link in re.findall(r'(?:href|src)="([^"#:]+)"', file.read_text(encoding="utf-8")):
+            assert (folder / link).is_file(), (file.name, link)
+
+
+def test_exit_codes(books, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(command, "choose_notebooks", lambda names, folder: choose_notebooks(names, books))
+    assert main(["00", "--runs", str(tmp_path)]) == 1
+    assert "FAILED 00_error: error in cell 3: ZeroDivisionError: division by zero" in capsys.readouterr().err
+    assert main(["03", "--runs", str(tmp_path), "-p", "sede", "1"]) == 2
+    assert "unknown parameter: sede" in capsys.readouterr().err
+    assert main(["07", "--runs", str(tmp_path)]) == 2
+    assert "unknown notebook: 07" in capsys.readouterr().err
+
+
+def test_a_killed_run_leaves_a_report_and_the_next_its_own(tmp_path):
+    books = tmp_path / "books"
+    books.mkdir()
+    write_notebook(books, "00_quick", "1 + 1")
+    write_notebook(books, "01_slow", "import time; time.sleep(60 if seed == 0 else 0)")
+    runs = tmp_path / "runs"
+    code = "import sys; from pathlib import Path; from lib.workbench import run; "
+    code += "run(runs=Path(sys.argv[1]), notebooks=Path(sys.argv[2]))"
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, str(runs), str(books)], cwd=paths.ROOT, stdout=subprocess.DEVNULL
+    )
+    states: list[str] = []
+    for _ in range(300):
+        time.sleep(0.1)
+        for file in runs.glob("*/metrics.json"):
+            states = [book["state"] for book in json.loads(file.read_text(encoding="utf-8"))["notebooks"]]
+        if states == ["complete", "running"]:
+            break
+    os.kill(process.pid, signal.SIGKILL if os.name != "nt" else signal.SIGTERM)
+    process.wait()
+    assert states == ["complete", "running"]
+    assert run(["00"], runs=runs, notebooks=books)["state"] == "complete"
+    first, second = sorted(runs.iterdir(), key=lambda folder: len(folder.name))
+    assert second.name == f"{first.name}-2"
+    assert json.loads((first / "metrics.json").read_text(encoding="utf-8"))["state"] == "running"
+    assert "00_quick.html" in (first / "index.html").read_text(encoding="utf-8")
+
+
+# --- notebooks and parameters
+
+
+def test_notebooks_are_chosen_by_number_name_or_path(books):
+    assert [book.stem for book in choose_notebooks([], books)] == ["00_error", "01_slow", "02_dead", "03_good"]
+    assert [book.stem for book in choose_notebooks(["03", "00_error", "00"], books)] == ["00_error", "03_good"]
+    assert choose_notebooks([str(books / "03_good.ipynb")], books) == [(books / "03_good.ipynb").resolve()]
+    with pytest.raises(UsageError, match="unknown notebook: 3. There are: 00_error"):
+        choose_notebooks(["3"], books)
+
+
+def test_values_take_the_declared_type(books):
+    pairs = [("seed", "7"), ("noise_px", "1e-3"), ("crop", "true"), ("sizes", "[3]"), ("profile", "1")]
+    (values,) = parse_parameters(pairs, [books / "03_good.ipynb"]).values()
+    assert values == {"seed": 7, "noise_px": 0.001, "crop": True, "sizes": [3], "profile": "1"}
+
+
+@pytest.mark.parametrize(
+    ("name", "text"), [("seed", "1.5"), ("noise_px", "much"), ("crop", "maybe"), ("sizes", "(1,)")]
+)
+def test_a_value_of_another_type_is_an_error(books, name, text):
+    with pytest.raises(UsageError, match=f"parameter {name}: .* is not of type"):
+        parse_parameters([(name, text)], [books / "03_good.ipynb"])
+
+
+def test_a_parameter_reaches_only_who_declares_it(tmp_path):
+    one = write_notebook(tmp_path, "00_one", parameters="a: int = 1  # one")
+    two = write_notebook(tmp_path, "01_two", parameters="b: int = 1  # two")
+    assert parse_parameters([("b", "2")], [one, two]) == {one: {}, two: {"b": 2}}
+    with pytest.raises(UsageError, match=r"unknown parameter: c. Declared are: a, b\."):
+        parse_parameters([("c", "2")], [one, two])
+
+
+# --- a sweep
+
+
+def test_sweep_makes_a_table_and_goes_on(tmp_path):
+    write_notebook(
+        tmp_path, "00_sum",
+        "from lib import report\nassert seed != 2, 'two'\nreport.record('sum', seed + noise_px, 'px')",
+    )  # fmt: skip
+    grid = {"seed": ["0", "2"], "noise_px": ["0.5"]}
+    table, failures = sweep("00", grid, workers=2, runs=tmp_path / "runs", notebooks=tmp_path)
+    assert list(failures) == ["seed=2,noise_px=0.5"] and "AssertionError: two" in failures["seed=2,noise_px=0.5"]
+    (row,) = csv.DictReader(table.read_text(encoding="utf-8").splitlines())
+    assert row["seed"] == "0" and row["sum"] == "0.5"
+    before = (table.parent / row["notebook"]).stat().st_mtime_ns
+    table, failures = sweep("00", {"seed": ["0", "1"], "noise_px": ["0.5"]}, runs=tmp_path / "runs", notebooks=tmp_path)
+    rows = list(csv.DictReader(table.read_text(encoding="utf-8").splitlines()))
+    assert not failures and [row["sum"] for row in rows] == ["0.5", "1.5"]
+    assert (table.parent / rows[0]["notebook"]).stat().st_mtime_ns == before
+    with pytest.raises(UsageError, match="unknown parameter: sede"):
+        sweep("00", {"sede": ["0"]}, runs=tmp_path / "runs", notebooks=tmp_path)
+
+
+# --- prose
+
+
+TEX = [
+    r"\begin{aligned} a &= b \\ c &= d \end{aligned}",
+    r"\operatorname{diag}(x)",
+    r"\bigl\lVert x \bigr\rVert_1",
+    r"\mathbb R^3",
+]
+
+
+@pytest.mark.parametrize("tex", TEX)
+def test_equations_are_drawn(tex):
+    drawn = equations.svg(tex, display=True)
+    assert drawn.startswith('<div class="equation"><svg ') and 'role="img"' in drawn
+
+
+def test_markdown_keeps_code_and_dollars_apart():
+    html = markdown_html("Cost `$a$` and $x < y$.")
+    assert "<code>$a$</code>" in html and html.count("<svg ") == 1 and "x &lt; y" in html
