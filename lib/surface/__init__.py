@@ -15,19 +15,24 @@ from lib.surface.export import (
     surface_mesh,
 )
 from lib.surface.fitting import SurfaceFit, fit_surface
+from lib.surface.reconstruct import EPIPOLAR_SIGMAS, Reconstruction, epipolar_inliers, reconstruct
 from lib.surface.sphere import Sphere, fit_sphere
 
 __all__ = [
+    "EPIPOLAR_SIGMAS",
     "BSplineSurface",
     "Curvature",
     "Mesh",
+    "Reconstruction",
     "Sphere",
     "SplineGrid",
     "SurfaceFit",
     "ToolDistance",
     "depth_map",
+    "epipolar_inliers",
     "fit_sphere",
     "fit_surface",
+    "reconstruct",
     "remove_outliers",
     "save_depth_map",
     "save_mesh",

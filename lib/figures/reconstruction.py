@@ -1,0 +1,309 @@
+"""Figures of notebook 04: matching, epipolar geometry, triangulation, surfaces and their errors."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import LightSource, PowerNorm
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+
+from lib.cameras import StereoRig
+from lib.figures.style import COLOURS, figure, show_image
+from lib.matching import Matches, ResponseMap
+from lib.surface import BSplineSurface, Mesh
+
+if TYPE_CHECKING:
+    import plotly.graph_objects as go
+
+__all__ = [
+    "descriptor_channels",
+    "disparity_errors",
+    "epipolar_geometry",
+    "error_budget",
+    "error_maps",
+    "held_out_curve",
+    "iso_depth",
+    "match_fields",
+    "mesh_still",
+    "mesh_view",
+    "point_errors",
+    "profiles",
+    "reconstruction",
+    "response_pyramid",
+]
+
+_SIGNED = "RdBu_r"
+_ERROR = "magma"
+
+
+def descriptor_channels(image: np.ndarray, channels: np.ndarray) -> Figure:
+    """An image and the pixel descriptor of DeepMatching on it, channels (h, w, c): one panel a gradient direction."""
+    count = min(channels.shape[2], 8)
+    page, axes = figure(2, 5, width_in=13, height_in=4.2)
+    merged = page.add_subplot(axes[0, 0].get_gridspec()[:, 0])
+    axes[0, 0].remove()
+    axes[1, 0].remove()
+    show_image(merged, image, "Image")
+    for k, ax in zip(range(count), axes[:, 1:].ravel(), strict=True):
+        show_image(ax, channels[..., k], f"Gradient towards {k * 45}°")
+        ax.images[0].set(cmap="inferno", clim=(0, np.quantile(channels[..., :8], 0.999)))
+        ax.title.set_fontsize(9)
+    return page
+
+
+def response_pyramid(left: np.ndarray, right: np.ndarray, maps: list[ResponseMap]) -> Figure:
+    """One patch of the left image at growing sizes, and below each how well it fits everywhere in the right image."""
+    page, axes = figure(2, len(maps), width_in=3.2 * len(maps), height_in=4.6)
+    for (top, bottom), level in zip(axes.T, maps, strict=True):
+        show_image(top, left, f"{level.size_px} px patch")
+        corner = level.centre_px - level.size_px / 2
+        top.add_patch(Rectangle(corner, level.size_px, level.size_px, fill=False, color=COLOURS["warning"], lw=2))
+        show_image(bottom, right)
+        x0, x1, y1, y0 = level.extent_px
+        # Contrast by rank within the map: the background of a flat correlation is high, the peak is what counts.
+        shown = np.clip((level.response - np.median(level.response)) / np.ptp(level.response), 0, 1)
+        bottom.imshow(shown, extent=(x0, x1, y1, y0), cmap="inferno", alpha=0.85, norm=PowerNorm(0.8))
+        near = level.response > 0.9 * level.response.max()
+        bottom.plot(*level.peak_px, "+", color="cyan", markersize=14, markeredgewidth=2)
+        bottom.set_title(f"above 90 % of the peak: {100 * near.mean():.1f} %", fontsize=9)
+        bottom.set(xlim=(-0.5, right.shape[1] - 0.5), ylim=(right.shape[0] - 0.5, -0.5))
+    return page
+
+
+def match_fields(left: np.ndarray, fields: dict[str, Matches], *, direction: np.ndarray | None = None) -> Figure:
+    """Matches on the left image, coloured by their displacement along `direction` (2,); None is the image's x."""
+    direction = np.array([1.0, 0.0]) if direction is None else direction
+    shifts = {name: (m.u_right - m.u_left) @ direction for name, m in fields.items()}
+    low, high = np.percentile(np.concatenate(list(shifts.values())), (3, 97))
+    page, axes = figure(1, len(fields), width_in=5.2 * len(fields), height_in=3.5, squeeze=False)
+    for ax, (name, matches) in zip(axes[0], fields.items(), strict=True):
+        show_image(ax, _grey(left), f"{name}: {len(matches)} matches")
+        size = 12 * max(1.0, 2000 / max(len(matches), 1)) ** 0.5
+        dots = ax.scatter(*matches.u_left.T, c=shifts[name], s=min(size, 30), vmin=low, vmax=high, linewidths=0)
+    page.colorbar(dots, ax=axes[0].tolist(), label="displacement (px)", shrink=0.8)
+    return page
+
+
+def epipolar_geometry(
+    left: np.ndarray, right: np.ndarray, rig: StereoRig, u_left: np.ndarray, distance_px: np.ndarray, limit_px: float
+) -> Figure:
+    """Left points (k, 2), their epipolar lines in the right image, and the distances (n,) of matches."""
+    page, axes = figure(1, 3, width_in=14, height_in=3.4, width_ratios=(1, 1, 0.75))
+    show_image(axes[0], left, "Left: points")
+    show_image(axes[1], right, "Right: their epipolar lines are parallel")
+    width = right.shape[1]
+    for point, colour in zip(u_left, plt.colormaps["turbo"](np.linspace(0.1, 0.9, len(u_left))), strict=True):
+        axes[0].plot(*point, "o", color=colour, markeredgecolor="white", markersize=7)
+        a, b, c = rig.fundamental @ [*point, 1.0]
+        x = np.array([0.0, width - 1.0])
+        axes[1].plot(x, -(a * x + c) / b, color=colour)
+    for ax, image in zip(axes, (left, right), strict=False):
+        ax.set(xlim=(-0.5, image.shape[1] - 0.5), ylim=(image.shape[0] - 0.5, -0.5))
+    span = 4 * limit_px
+    axes[2].hist(np.clip(distance_px, -span, span), bins=81, color=COLOURS["ours"])
+    axes[2].axvspan(
+        -limit_px, limit_px, color=COLOURS["truth"], alpha=0.15, label=f"kept: |distance| < {limit_px:.1f} px"
+    )
+    axes[2].set(xlabel="epipolar distance of free matches (px)", ylabel="matches", title="The filter", yscale="log")
+    axes[2].legend(loc="upper right", fontsize=8)
+    return page
+
+
+def point_errors(errors_mm: dict[str, np.ndarray], sigma_um: dict[str, float]) -> Figure:
+    """Histograms of the errors of triangulated points along named directions, and their predicted sigma (um)."""
+    page, axes = figure(1, len(errors_mm), width_in=4.2 * len(errors_mm), height_in=3.0, sharey=True)
+    for ax, (name, error) in zip(axes, errors_mm.items(), strict=True):
+        error = error * 1000
+        spread = 1.4826 * np.median(np.abs(error - np.median(error)))
+        span = 6 * max(sigma_um.values())
+        ax.hist(np.clip(error, -span, span), bins=np.linspace(-span, span, 91), density=True, color=COLOURS["ours"])
+        x = np.linspace(-span, span, 400)
+        gauss = np.exp(-0.5 * (x / sigma_um[name]) ** 2) / (sigma_um[name] * np.sqrt(2 * np.pi))
+        ax.plot(x, gauss, color=COLOURS["paper"], label=f"predicted sigma {sigma_um[name]:.1f} um")
+        ax.set(xlabel="error (um)", title=f"{name}: robust sigma {spread:.1f} um", yscale="log", ylim=(1e-6, None))
+        ax.legend(loc="upper right", fontsize=8)
+    axes[0].set_ylabel("density per um")
+    return page
+
+
+def profiles(
+    position_mm: np.ndarray,
+    points: tuple[np.ndarray, np.ndarray],
+    curves: dict[str, tuple[np.ndarray, str]],
+    *,
+    title: str = "",
+) -> Figure:
+    """A section through the surface: the depths of the points near it, and curves (depth mm, colour) by name."""
+    page, ax = figure(width_in=11, height_in=3.4)
+    ax.plot(*points, ".", color=COLOURS["baseline"], markersize=3, alpha=0.6, label="triangulated points")
+    for name, (depth, colour) in curves.items():
+        ax.plot(position_mm, depth, color=COLOURS[colour], label=name, lw=2.4 if colour == "truth" else 1.6)
+    all_depths = np.concatenate([depth for depth, _ in curves.values()])
+    margin = 0.25 * np.ptp(all_depths[np.isfinite(all_depths)])
+    ax.set(
+        xlabel="along the image row (mm)",
+        ylabel="depth along the view (mm)",
+        ylim=(np.nanmax(all_depths) + margin, np.nanmin(all_depths) - margin),
+        title=title,
+    )
+    ax.legend(loc="best", fontsize=8, ncols=2)
+    return page
+
+
+def held_out_curve(
+    held_out: np.ndarray, chosen: float, smoothness: np.ndarray | None = None, error_um: np.ndarray | None = None
+) -> Figure:
+    """Held-out error of the candidates (m, 2), the choice, and the true error of fits where it is known."""
+    page, ax = figure(width_in=7, height_in=3.4)
+    ax.plot(held_out[:, 0], held_out[:, 1] * 1000, "o-", color=COLOURS["ours"], label="held-out L1 error (left axis)")
+    ax.axvline(chosen, color=COLOURS["ours"], ls=":", label="chosen")
+    ax.set(xscale="log", xlabel="smoothness mu (px²/mm)", ylabel="held-out L1 error (um)")
+    if error_um is not None:
+        true = ax.twinx()
+        true.plot(smoothness, error_um, "s--", color=COLOURS["truth"], label="true surface error (right axis)")
+        true.set(ylabel="RMS surface error (um)", yscale="log")
+        true.grid(False)
+        true.spines["right"].set_visible(True)
+        handles = ax.get_legend_handles_labels()[0] + true.get_legend_handles_labels()[0]
+        ax.legend(handles=handles, fontsize=8, loc="upper center")
+    else:
+        ax.legend(fontsize=8)
+    return page
+
+
+def error_maps(maps_um: dict[str, np.ndarray], *, limit_um: float | None = None, signed: bool = True) -> Figure:
+    """Maps (h, w) of an error over the image, NaN where there is none, one colour scale."""
+    if limit_um is None:
+        limit_um = float(np.nanpercentile(np.abs(np.concatenate([m.ravel() for m in maps_um.values()])), 98))
+    page, axes = figure(1, len(maps_um), width_in=4.6 * len(maps_um), height_in=2.9, squeeze=False)
+    for ax, (name, values) in zip(axes[0], maps_um.items(), strict=True):
+        rms = np.sqrt(np.nanmean(values**2))
+        show_image(ax, values, f"{name}: {rms:.1f} um RMS")
+        ax.images[0].set(cmap=_SIGNED if signed else _ERROR, clim=(-limit_um if signed else 0, limit_um))
+        ax.set_facecolor("#dddddd")
+    page.colorbar(axes[0][-1].images[0], ax=axes[0].tolist(), label="depth error (um)" if signed else "um", shrink=0.85)
+    return page
+
+
+def iso_depth(axes: Axes, image: np.ndarray, depth_mm: np.ndarray, *, step_mm: float = 0.1, title: str = "") -> Axes:
+    """Lines of equal depth (h, w) mm over the image; NaN is left blank."""
+    show_image(axes, image, title)
+    step = max(1, image.shape[1] // 320)
+    shown = depth_mm[::step, ::step]
+    x, y = np.arange(0, image.shape[1], step), np.arange(0, image.shape[0], step)
+    levels = np.arange(np.floor(np.nanmin(shown) / step_mm), np.nanmax(shown) / step_mm + 1) * step_mm
+    axes.contour(x, y, np.ma.masked_invalid(shown), levels=levels, cmap="viridis_r", linewidths=1.1)
+    return axes
+
+
+def mesh_still(axes: Axes, surface_mm: np.ndarray, image: np.ndarray) -> Axes:
+    """A still of the surface (h, w, 3) mm with the image (h, w, 3) as its skin, on a 3D axes; depth drawn twofold."""
+    light = LightSource(azdeg=300, altdeg=50)
+    x, y, z = np.moveaxis(surface_mm, 2, 0)
+    shade = light.hillshade(np.nan_to_num(-z, nan=np.nanmean(-z)), vert_exag=3)[..., None]
+    skin = np.clip(image / 255 * (0.55 + 0.6 * shade), 0, 1)
+    axes.plot_surface(x, y, z, facecolors=skin, rstride=1, cstride=1, shade=False, antialiased=False)
+    axes.set_box_aspect((np.nanmax(x) - np.nanmin(x), np.nanmax(y) - np.nanmin(y), 2 * (np.nanmax(z) - np.nanmin(z))))
+    axes.set(xlabel="x (mm)", ylabel="y (mm)", zlabel="depth (mm)")
+    axes.invert_zaxis()
+    axes.invert_yaxis()
+    axes.view_init(elev=42, azim=-70)
+    axes.tick_params(labelsize=7, pad=-1)
+    return axes
+
+
+def reconstruction(
+    image: np.ndarray, surface: BSplineSurface, rig: StereoRig, *, mask: np.ndarray | None = None
+) -> Figure:
+    """The left image with iso-depth lines beside a still of the surface seen obliquely.
+
+    `mask` (h, w), True = no surface there.
+    """
+    h, w = image.shape[:2]
+    step = max(1, w // 160)
+    y, x = np.arange(0, h, step), np.arange(0, w, step)
+    axes_mm = np.stack([*_across(rig), rig.left.viewing_direction])
+    points = surface.on_grid(x, y) @ axes_mm.T
+    points -= np.nanmean(points, axis=(0, 1))
+    if mask is not None:
+        points[mask[np.ix_(y, x)]] = np.nan
+    page = figure(width_in=14, height_in=4.4)[0]
+    page.clf()
+    left, right = page.add_subplot(1, 2, 1), page.add_subplot(1, 2, 2, projection="3d")
+    depth = np.full((h, w), np.nan)
+    depth[np.ix_(y, x)] = points[..., 2]
+    show_image(left, image, "Lines of equal depth, every 0.1 mm")
+    levels = np.arange(np.floor(np.nanmin(points[..., 2]) * 10), np.nanmax(points[..., 2]) * 10 + 1) / 10
+    left.contour(x, y, np.ma.masked_invalid(points[..., 2]), levels=levels, cmap="viridis_r", linewidths=1.1)
+    mesh_still(right, points, image[np.ix_(y, x)])
+    right.set_title("The surface, depth drawn twofold")
+    return page
+
+
+def mesh_view(mesh: Mesh, *, height_px: int = 520) -> go.Figure:
+    """A plotly figure of the mesh that turns under the mouse in JupyterLab; no window, no renderer."""
+    import plotly.graph_objects as go
+
+    colours = [f"rgb({r},{g},{b})" for r, g, b in mesh.colours.tolist()]
+    x, y, z = np.round(mesh.vertices_mm, 4).T
+    i, j, k = mesh.faces.T
+    view = go.Figure(go.Mesh3d(x=x, y=y, z=z, i=i, j=j, k=k, vertexcolor=colours, flatshading=False))
+    view.update_traces(lighting={"ambient": 0.65, "diffuse": 0.6, "specular": 0.05}, hoverinfo="x+y+z")
+    view.update_layout(
+        scene={"aspectmode": "data", "xaxis_title": "x (mm)", "yaxis_title": "y (mm)", "zaxis_title": "z (mm)"},
+        margin={"l": 0, "r": 0, "t": 0, "b": 0},
+        height=height_px,
+    )
+    return view
+
+
+def error_budget(rms_um: dict[str, float], *, highlight: str | None = None, target_um: float | None = None) -> Figure:
+    """RMS surface error of variants of the pipeline, as bars."""
+    page, ax = figure(width_in=9, height_in=0.42 * len(rms_um) + 1.1)
+    names = list(rms_um)[::-1]
+    values = [rms_um[name] for name in names]
+    colours = [COLOURS["ours"] if name == highlight else COLOURS["baseline"] for name in names]
+    bars = ax.barh(names, values, color=colours)
+    ax.bar_label(bars, fmt="%.1f", padding=3, fontsize=9)
+    if target_um is not None:
+        ax.axvline(target_um, color=COLOURS["paper"], ls="--", label=f"paper, flat checkerboard: {target_um:.1f} um")
+        ax.legend(fontsize=8, loc="lower right")
+    ax.set(xlabel="RMS error along the view (um)", xscale="log", xlim=(0.7 * min(values), 1.6 * max(values)))
+    ax.grid(axis="y", visible=False)
+    return page
+
+
+def disparity_errors(
+    image: np.ndarray,
+    truth_px: np.ndarray,
+    errors_px: dict[str, tuple[np.ndarray, np.ndarray]],
+    *,
+    limit_px: float = 4.0,
+) -> Figure:
+    """A real image, its measured disparity (h, w), and for each matcher its points (n, 2) and errors (n,) px."""
+    page, axes = figure(1, 2 + len(errors_px), width_in=3.5 * (2 + len(errors_px)), height_in=2.9)
+    show_image(axes[0], _grey(image), "Left image")
+    show_image(axes[1], truth_px, "Measured disparity")
+    axes[1].images[0].set_cmap("viridis")
+    for ax, (name, (u, error)) in zip(axes[2:], errors_px.items(), strict=True):
+        show_image(ax, np.full_like(_grey(image), 235), f"{name}: median {np.median(np.abs(error)):.2f} px")
+        ax.images[0].set(cmap="gray", clim=(0, 255))
+        size = 3.0 if len(u) > 5000 else 5.0
+        dots = ax.scatter(*u.T, c=np.abs(error), s=size, cmap=_ERROR, vmin=0, vmax=limit_px, linewidths=0)
+        ax.title.set_fontsize(10)
+    page.colorbar(dots, ax=axes.tolist(), label="|error| (px)", shrink=0.75)
+    return page
+
+
+def _grey(image: np.ndarray) -> np.ndarray:
+    return image if image.ndim == 2 else image.mean(axis=2)
+
+
+def _across(rig: StereoRig) -> tuple[np.ndarray, np.ndarray]:
+    """Unit vectors (3,) across the left view: right and down in the image, made orthogonal to the view."""
+    camera = rig.left.resect()
+    return camera.R[0], camera.R[1]
