@@ -167,15 +167,12 @@ def ruff_options() -> list[str]:
 
     from lib.environment import manifest
 
-    def flat(table: dict, prefix: str = ""):
-        for key, value in table.items():
-            key = key if key.replace("-", "").isalnum() else json.dumps(key)
-            if isinstance(value, dict):
-                yield from flat(value, f"{prefix}{key}.")
-            else:
-                yield f"--config={prefix}{key} = {json.dumps(value)}"
+    def toml(value: object) -> str:
+        if isinstance(value, dict):
+            return "{" + ", ".join(f"{json.dumps(key)} = {toml(item)}" for key, item in value.items()) + "}"
+        return json.dumps(value)
 
-    return ["--isolated", *flat(manifest()["tool"]["ruff"])]
+    return ["--isolated", *(f"--config={key} = {toml(value)}" for key, value in manifest()["tool"]["ruff"].items())]
 
 
 COMMANDS = {command.__name__: command for command in (run, test, lab, bench, sweep, simulate, train, evaluate)}

@@ -176,8 +176,8 @@ def _make(root: Path, venv: Path, torch: str | None, lock_file) -> None:
     uv = shutil.which("uv")
     _say(
         f"{'Updating' if update else 'Making'} the environment in .venv with {'uv' if uv else 'pip'}, "
-        f"torch for {torch}. Once; takes {'about a minute' if uv else '3 to 5 minutes'}, {workbench['disk_gb'][torch]} GB of disk "
-        f"and up to {workbench['download_gb'][torch]} GB of download."
+        f"torch for {torch}. Once; takes {'a minute' if uv else '1 to 5 minutes'}, {workbench['disk_gb'][torch]} GB "
+        f"of disk and up to {workbench['download_gb'][torch]} GB of download."
     )
     start = time.monotonic()
     venv.mkdir(exist_ok=True)
