@@ -1,0 +1,172 @@
+"""The forceps: a shaft and two curved tapered jaws, as chains of round cones, and their landmarks.
+
+Tool frame: origin at the base, x along the shaft towards the tips, y towards jaw 1, z = x cross y.  The base is
+the point of the shaft's axis where the shaft ends and the jaws begin; tip_1 and tip_2 are the ends of the jaws.
+Jaw 1 is the left one for somebody who looks along the shaft towards the tips from where the microscope stands,
+so in an image that is not mirrored tip_1 lies left of the direction base to tips.  `Pose` keeps the roll about
+the shaft small enough (60 degrees) for that to hold in every image.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+__all__ = ["MAX_PITCH_RAD", "MAX_ROLL_RAD", "Forceps", "Pose"]
+
+MAX_ROLL_RAD = np.deg2rad(60.0)
+MAX_PITCH_RAD = np.deg2rad(60.0)
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Where the tool is, in the microscope frame.
+
+    Attributes
+    ----------
+    base_mm:
+        The base (3,).
+    azimuth_rad:
+        Direction of base to tips in the image plane, from x (right) towards y (down).
+    pitch_rad:
+        How far the tips dip below the base, into the eye; 0 is parallel to the image.
+    roll_rad:
+        About the shaft; 0 has both jaws equally deep.
+    opening_mm:
+        Distance between the tips.
+    """
+
+    base_mm: tuple[float, float, float] = (0.0, 0.0, -1.0)
+    azimuth_rad: float = 0.0
+    pitch_rad: float = 0.35
+    roll_rad: float = 0.0
+    opening_mm: float = 0.8
+
+    def __post_init__(self) -> None:
+        if np.shape(self.base_mm) != (3,) or not np.isfinite(self.base_mm).all():
+            raise ValueError(f"base_mm: expected three finite coordinates, got {self.base_mm}.")
+        if not 0 <= self.pitch_rad <= MAX_PITCH_RAD:
+            raise ValueError(f"pitch_rad: must lie between 0 and {MAX_PITCH_RAD:.2f}, got {self.pitch_rad}.")
+        if not abs(self.roll_rad) <= MAX_ROLL_RAD:
+            raise ValueError(
+                f"roll_rad: beyond {MAX_ROLL_RAD:.2f} an image no longer tells tip_1 from tip_2, got {self.roll_rad}."
+            )
+        if not self.opening_mm >= 0:
+            raise ValueError(f"opening_mm: must not be negative, got {self.opening_mm}.")
+
+    @property
+    def microscope_from_tool(self) -> np.ndarray:
+        """Rotation (3, 3): columns are the tool's x, y and z in the microscope frame."""
+        # At azimuth 0 jaw 1 (tool y) points up in the image, -y; the tool's z then points out of the eye.
+        upright = np.diag([1.0, -1.0, -1.0])
+        turn = Rotation.from_euler("ZY", [self.azimuth_rad, -self.pitch_rad]).as_matrix()
+        return turn @ upright @ Rotation.from_euler("x", self.roll_rad).as_matrix()
+
+    def moved(self, **changes: object) -> Pose:
+        """A copy with some attributes changed."""
+        return replace(self, **changes)
+
+
+@dataclass(frozen=True)
+class Forceps:
+    """The design of a forceps; lengths in mm.
+
+    Attributes
+    ----------
+    shaft_radius_mm:
+        0.3 is the usual 23 gauge, 0.6 mm thick.
+    jaw_length_mm:
+        Along the shaft's axis from the base to the tips of the closed tool.
+    jaw_radius_mm, tip_radius_mm:
+        Of the jaws at the base and at the very end; the taper between is a power law.
+    taper:
+        Its exponent: 1 is a cone, below 1 keeps the jaw thick until close to the tip.
+    bow_mm:
+        How far the jaws arch away from each other in the middle when the tips touch.
+    bend_mm:
+        How far both tips bend out of the plane of the jaws, towards the retina.
+    hook_mm:
+        How far the last fifth of each jaw turns inwards.
+    brightness, brushed:
+        Reflectance of the metal and contrast of its brush marks.
+    """
+
+    shaft_radius_mm: float = 0.30
+    jaw_length_mm: float = 3.0
+    jaw_radius_mm: float = 0.13
+    tip_radius_mm: float = 0.010
+    taper: float = 0.6
+    bow_mm: float = 0.18
+    bend_mm: float = 0.20
+    hook_mm: float = 0.05
+    shaft_length_mm: float = 40.0
+    brightness: float = 0.55
+    brushed: float = 0.25
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("shaft_radius_mm", "jaw_length_mm", "jaw_radius_mm", "tip_radius_mm", "taper", "shaft_length_mm"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name}: must be positive, got {getattr(self, name)}.")
+        if not self.tip_radius_mm <= self.jaw_radius_mm <= self.shaft_radius_mm:
+            raise ValueError(
+                "tip_radius_mm, jaw_radius_mm, shaft_radius_mm: must not decrease in this order, got "
+                f"{self.tip_radius_mm}, {self.jaw_radius_mm}, {self.shaft_radius_mm}."
+            )
+        if self.tip_radius_mm > 0.03:
+            raise ValueError(f"tip_radius_mm: beyond 0.03 a tip is no point to measure, got {self.tip_radius_mm}.")
+        if not 0 < self.brightness <= 1:
+            raise ValueError(f"brightness: must lie between 0 and 1, got {self.brightness}.")
+
+    def jaw(self, side: int, opening_mm: float, n: int = 15) -> tuple[np.ndarray, np.ndarray]:
+        """Centreline (n, 3) in the tool frame and radii (n,), from the base to the tip; `side` +1 is jaw 1.
+
+        The last centre lies one tip radius before the landmark, so that the landmark is the jaw's end.
+        """
+        s = 1 - (1 - np.linspace(0, 1, n)) ** 1.4  # denser towards the tip
+        half = max(opening_mm / 2, self.tip_radius_mm)
+        root = 0.45 * self.jaw_radius_mm
+        y = root * (1 - s) ** 2 + self.bow_mm * np.sin(np.pi * s) ** 1.2
+        y += self.hook_mm * np.clip((s - 0.6) / 0.2, 0, 1) * np.clip((1 - s) / 0.2, 0, 1)
+        y += half * s**1.5
+        z = -self.bend_mm * s**2
+        # Opening the jaws turns them, it does not stretch them.
+        x = s * np.sqrt(max(self.jaw_length_mm**2 - max(half - self.tip_radius_mm, 0) ** 2, 1e-6))
+        line = np.column_stack([x, side * y, z])
+        radii = self.tip_radius_mm + (self.jaw_radius_mm - self.tip_radius_mm) * (1 - s) ** self.taper
+        end = line[-1] - line[-2]
+        line[-1] -= self.tip_radius_mm * end / np.linalg.norm(end)
+        return line, radii
+
+    def landmarks_in_tool(self, opening_mm: float) -> np.ndarray:
+        """base, tip_1, tip_2 (3, 3) in the tool frame."""
+        points = [np.zeros(3)]
+        for side in (+1, -1):
+            line, radii = self.jaw(side, opening_mm)
+            direction = line[-1] - line[-2]
+            points.append(line[-1] + radii[-1] * direction / np.linalg.norm(direction))
+        return np.array(points)
+
+    def landmarks(self, pose: Pose) -> np.ndarray:
+        """base, tip_1, tip_2 (3, 3) mm in the microscope frame."""
+        return self.landmarks_in_tool(pose.opening_mm) @ pose.microscope_from_tool.T + np.asarray(pose.base_mm)
+
+    def nodes(self, pose: Pose, shaft_step_mm: float = 1.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The tool as chains of round cones, in the microscope frame.
+
+        Returns
+        -------
+        (n, 3) centres, (n,) radii in mm, (n,) chain of each node: 0 shaft (far end first), 1 and 2 the jaws.
+        """
+        k = max(2, round(self.shaft_length_mm / shaft_step_mm) + 1)
+        shaft = np.column_stack([np.linspace(-self.shaft_length_mm, 0, k), np.zeros(k), np.zeros(k)])
+        lines, radii, chains = [shaft], [np.full(k, self.shaft_radius_mm)], [np.zeros(k, int)]
+        for chain, side in ((1, +1), (2, -1)):
+            line, radius = self.jaw(side, pose.opening_mm)
+            lines.append(line)
+            radii.append(radius)
+            chains.append(np.full(len(line), chain))
+        centres = np.vstack(lines) @ pose.microscope_from_tool.T + np.asarray(pose.base_mm)
+        return centres, np.concatenate(radii), np.concatenate(chains)

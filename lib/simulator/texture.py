@@ -1,0 +1,164 @@
+"""Procedural fundus texture: pigment, choroid, branching arteries and veins, optic disc, macula, sclera.
+
+A texture is an image of reflectance, (n, n, 3) uint8 RGB with display gamma, square, centred on the eye's axis;
+row and column run along y and x of the microscope frame.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+__all__ = ["EXTENT_MM", "GAMMA", "fundus_texture", "photograph_texture", "smooth_noise"]
+
+#: Side of the square of the eye that a texture covers.
+EXTENT_MM = 26.0
+#: Encoding of textures and camera images: value = linear ** (1 / GAMMA).
+GAMMA = 2.2
+
+# Linear reflectance (red, green, blue) of healthy, dark, pale and brown fundi; an eye mixes two of them.
+_PIGMENTS = np.array([[0.50, 0.165, 0.062], [0.36, 0.085, 0.035], [0.62, 0.28, 0.14], [0.34, 0.16, 0.075]])
+_DISC = np.array([0.70, 0.42, 0.20])
+_SCLERA = np.array([0.70, 0.53, 0.45])
+# Absorption of blood per unit of optical density, for red, green and blue light.
+_BLOOD = {"artery": np.array([0.35, 1.5, 1.3]), "vein": np.array([0.75, 1.75, 1.5])}
+
+
+def smooth_noise(rng: np.random.Generator, size_px: int, cells: int, octaves: int = 1, gain: float = 0.5) -> np.ndarray:
+    """Band-limited noise (size_px, size_px) float32 of unit variance, `cells` blobs across at the first octave."""
+    total = np.zeros((size_px, size_px), np.float32)
+    for octave in range(octaves):
+        n = min(cells * 2**octave, size_px) + 4
+        grid = rng.standard_normal((n, n), dtype=np.float32)
+        total += gain**octave * cv2.resize(grid, (size_px, size_px), interpolation=cv2.INTER_CUBIC)
+    return total / max(float(total.std()), 1e-6)
+
+
+def _vessel_tree(rng: np.random.Generator, disc_mm: np.ndarray, kind: str) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Centrelines (k, 2) mm and widths (k,) mm of one kind of vessel, grown outwards from the optic disc."""
+    caliber = 0.17 if kind == "vein" else 0.125
+    towards_centre = np.arctan2(-disc_mm[1], -disc_mm[0])
+    branches, stack = [], []
+    for arcade in (-2.2, -1.15, 1.15, 2.2):
+        heading = towards_centre + arcade + rng.normal(0, 0.15) + (0.12 if kind == "vein" else -0.12)
+        bend = -np.sign(arcade) * rng.uniform(0.10, 0.17) * (1 if abs(arcade) < 1.5 else 0.3)
+        stack.append((disc_mm + rng.normal(0, 0.08, 2), heading, caliber * rng.uniform(0.8, 1.15), bend))
+    while stack and len(branches) < 60:
+        point, heading, width, bend = stack.pop()
+        line, widths, wiggle, step = [point], [width], 0.0, 0.12
+        since = 0.0
+        while width > 0.02 and np.abs(point).max() < EXTENT_MM / 2:
+            wiggle = 0.8 * wiggle + rng.normal(0, 0.03)
+            outwards = np.arctan2(*(point - disc_mm)[::-1])
+            heading += bend * step + wiggle + 0.03 * np.sin(outwards - heading)
+            bend *= 0.99
+            point = point + step * np.array([np.cos(heading), np.sin(heading)])
+            width *= 0.994
+            line.append(point)
+            widths.append(width)
+            since += step
+            if since > 0.7 and rng.random() < 0.09:
+                side, share = rng.choice([-1, 1]), rng.uniform(0.35, 0.8)
+                child = width * share
+                if child > 0.024:
+                    stack.append((point, heading + side * rng.uniform(0.5, 1.1), child, -side * rng.uniform(0, 0.2)))
+                    width *= (1 - share**3) ** (1 / 3) * 0.3 + 0.7  # Murray's law, softened
+                    heading -= side * 0.15 * share
+                since = 0.0
+        branches.append((np.array(line), np.array(widths)))
+    return branches
+
+
+def _draw(branches: list[tuple[np.ndarray, np.ndarray]], size_px: int, share: float = 1.0) -> np.ndarray:
+    """Optical density (size_px, size_px) of vessels in 0..1, of `share` of their width."""
+    image, scale = np.zeros((size_px, size_px), np.uint8), size_px / EXTENT_MM
+    for line, widths in branches:
+        pixels = np.round(((line + EXTENT_MM / 2) * scale - 0.5) * 16).astype(np.int32)
+        for a, b, width in zip(pixels[:-1], pixels[1:], widths[1:] * share * scale, strict=True):
+            value = int(255 * min(1.0, 0.35 + width / 14.0))
+            cv2.line(image, tuple(map(int, a)), tuple(map(int, b)), value, max(1, round(width)), cv2.LINE_AA, 4)
+    return image.astype(np.float32) / 255
+
+
+@lru_cache(maxsize=48)
+def fundus_texture(seed: int, size_px: int = 2048, rim_mm: float = 9.3) -> np.ndarray:
+    """Reflectance of a fundus, (size_px, size_px, 3) uint8 RGB, read-only; `seed` decides everything.
+
+    Parameters
+    ----------
+    rim_mm:
+        Where the retina ends and sclera begins, on average.
+    """
+    rng = np.random.default_rng([seed, 7])
+    axis = (np.arange(size_px, dtype=np.float32) + 0.5) * (EXTENT_MM / size_px) - EXTENT_MM / 2
+    x, y = np.meshgrid(axis, axis)
+    pigment = rng.dirichlet([0.9] * len(_PIGMENTS)) @ _PIGMENTS
+    angle = rng.uniform(0, 2 * np.pi)
+    disc = rng.uniform(2.0, 5.0) * np.array([np.cos(angle), np.sin(angle)])
+    macula = disc + rng.uniform(4.0, 5.0) * -np.array([np.cos(angle), np.sin(angle)])
+
+    # Pigment is log-normal; choroidal vessels show as a pale net through it.
+    density = 0.14 * smooth_noise(rng, size_px, 5, 3) + 0.06 * smooth_noise(rng, size_px, 60, 3, 0.7)
+    density += 0.05 * smooth_noise(rng, size_px, 420, 2, 0.9)
+    net = np.exp(-((smooth_noise(rng, size_px, 22, 2) / 0.35) ** 2)) + 0.6 * np.exp(
+        -((smooth_noise(rng, size_px, 40, 2) / 0.3) ** 2)
+    )
+    density -= rng.uniform(0.10, 0.34) * net * (0.6 + 0.4 * np.tanh(smooth_noise(rng, size_px, 3)))
+    density += 0.35 * np.exp(-((x - macula[0]) ** 2 + (y - macula[1]) ** 2) / (2 * 0.8**2))
+
+    artery, vein = _vessel_tree(rng, disc, "artery"), _vessel_tree(rng, disc, "vein")
+    blur = (0, 0), size_px / 2048
+    artery_map, vein_map = (cv2.GaussianBlur(_draw(tree, size_px), *blur) for tree in (artery, vein))
+    reflex = cv2.GaussianBlur(_draw(artery, size_px, 0.3), *blur)
+
+    distance = np.hypot((x - disc[0]) * rng.uniform(0.9, 1.1), (y - disc[1]))
+    radius = rng.uniform(0.75, 1.0)
+    disc_share = 1 / (1 + np.exp((distance - radius - 0.05 * smooth_noise(rng, size_px, 40, 2)) / 0.09))
+    cup = np.exp(-((distance / (0.55 * radius)) ** 2))
+    ring = np.exp(-(((distance - radius - 0.12) / 0.12) ** 2))
+
+    rim = rim_mm + 0.12 * smooth_noise(rng, size_px, 8, 3)
+    rho = np.hypot(x, y)
+    sclera_share = 1 / (1 + np.exp(np.clip((rim - rho) / 0.09, -60, 60)))
+    blotches = 0.10 * smooth_noise(rng, size_px, 14, 3) + 0.05 * smooth_noise(rng, size_px, 300, 2, 0.9)
+    border = np.exp(-(((rho - rim) / 0.22) ** 2))
+
+    texture = np.empty((size_px, size_px, 3), np.uint8)
+    for channel in range(3):
+        tint = (0.75, 1.0, 1.1)[channel]
+        retina = pigment[channel] * np.exp(-tint * density - 0.35 * ring)
+        pale = _DISC[channel] * (0.75 + 0.35 * cup) * np.exp(-0.4 * density)
+        value = retina + disc_share * (pale - retina)
+        value *= np.exp(-_BLOOD["artery"][channel] * 0.55 * artery_map - _BLOOD["vein"][channel] * 0.75 * vein_map)
+        value += 0.09 * reflex * (1.0, 0.55, 0.45)[channel]
+        sclera = _SCLERA[channel] * np.exp(-(0.6, 1.0, 1.0)[channel] * (0.25 + blotches)) * (1 - 0.15 * border)
+        value += sclera_share * (sclera - value)
+        value *= 1 - 0.45 * border * (0.6, 1.0, 1.0)[channel]
+        texture[..., channel] = np.round(255 * np.clip(value, 0, 1) ** (1 / GAMMA))
+    texture.setflags(write=False)
+    return texture
+
+
+@lru_cache(maxsize=4)
+def photograph_texture(path: str | Path, size_px: int = 2048) -> np.ndarray:
+    """Any photograph as a texture: its central square stretched over the retina.
+
+    Raises
+    ------
+    FileNotFoundError, ValueError
+        If there is no such file, or OpenCV cannot read it.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"texture: {path}: no such file; give the path of a photograph.")
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR_RGB)
+    if image is None:
+        raise ValueError(f"texture: {path}: not a picture that OpenCV reads; give a PNG or JPEG.")
+    side = min(image.shape[:2])
+    top, left = (image.shape[0] - side) // 2, (image.shape[1] - side) // 2
+    texture = cv2.resize(image[top : top + side, left : left + side], (size_px, size_px), interpolation=cv2.INTER_AREA)
+    texture.setflags(write=False)
+    return texture
