@@ -8,8 +8,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from lib.figures.style import COLOURS, LANDMARK_COLOURS, figure, show_image
+from lib.pipeline import FrameResult
 
-__all__ = ["frame_pair", "landmarks_on", "pipeline_page"]
+__all__ = ["frame_pair", "landmarks_on", "pipeline_page", "pixel_grid"]
 
 
 def landmarks_on(axes: Axes, u: np.ndarray, *, label: bool = True) -> None:
@@ -31,16 +32,21 @@ def frame_pair(left: np.ndarray, right: np.ndarray, u_left: np.ndarray, u_right:
     return page
 
 
+def pixel_grid(domain: tuple[float, float, float, float], columns: int = 96) -> np.ndarray:
+    """Pixels (rows, columns, 2) evenly over the domain (x0, y0, x1, y1), square cells."""
+    x0, y0, x1, y1 = domain
+    rows = max(round(columns * (y1 - y0) / (x1 - x0)), 2)
+    return np.stack(np.meshgrid(np.linspace(x0, x1, columns), np.linspace(y0, y1, rows)), axis=-1)
+
+
 def pipeline_page(
     left: np.ndarray,
     u_left: np.ndarray,
-    matches_left: np.ndarray,
-    inliers: np.ndarray,
+    result: FrameResult,
     residuals_px: np.ndarray,
-    surface_error_um: np.ndarray,
     surface_mm: np.ndarray,
+    error_um: np.ndarray | None,
     registration_um: dict[str, tuple[np.ndarray, np.ndarray]],
-    seconds: dict[str, float],
 ) -> Figure:
     """Six panels, one a stage.
 
@@ -48,57 +54,65 @@ def pipeline_page(
     ----------
     left, u_left:
         A left image and its landmarks (3, 2) px.
-    matches_left, inliers:
-        Matched points (n, 2) px of the left image, and which of them the surface kept.
+    result:
+        Of the online pipeline for this frame, with points and surface.
     residuals_px:
-        Reprojection residuals (m, 2) of the calibration.
-    surface_error_um, surface_mm:
-        (h, w) signed error of the reconstructed surface on a grid over the image, and its points (h, w, 3) mm.
+        Reprojection residuals (m, 4) of the calibration, left and right.
+    surface_mm, error_um:
+        Points (h, w, 3) of the surface over a `pixel_grid`, robot frame, and its error (h, w); None without a truth.
     registration_um:
         For each method, frames used (k,) and translation error (k,) in um.
-    seconds:
-        Time of each stage.
     """
-    page = plt.figure(figsize=(13, 7.2), layout="constrained", facecolor="white")
+    page = plt.figure(figsize=(13, 7.4), layout="constrained", facecolor="white")
     grid = page.add_gridspec(2, 3)
-    height, width = left.shape[:2]
+    title = {"loc": "left", "fontweight": "bold", "fontsize": 11}
 
-    ax = show_image(page.add_subplot(grid[0, 0]), left, "1  Landmarks found in the image")
+    ax = show_image(page.add_subplot(grid[0, 0]), left)
+    ax.set_title("1  Landmarks", **title)
     landmarks_on(ax, u_left)
 
     ax = page.add_subplot(grid[0, 1])
-    ax.plot(*residuals_px.T, ".", color=COLOURS["ours"], markersize=3, alpha=0.6)
+    for columns, side in ((slice(0, 2), "left"), (slice(2, 4), "right")):
+        ax.plot(*residuals_px[:, columns].T, ".", color=COLOURS[side], markersize=4, alpha=0.6, label=side)
     radius = 1.1 * np.nanquantile(np.abs(residuals_px), 0.995)
     ax.set(xlim=(-radius, radius), ylim=(-radius, radius), aspect="equal", xlabel="x, px", ylabel="y, px")
-    ax.set_title("2  Calibration: reprojection residuals", loc="left", fontweight="bold", fontsize=11)
+    ax.legend(fontsize=8)
+    ax.set_title("2  Calibration residuals", **title)
 
-    ax = show_image(page.add_subplot(grid[0, 2]), left, "3  Semi-dense matches")
-    ax.plot(*matches_left[inliers].T, ",", color=COLOURS["truth"])
-    ax.plot(*matches_left[~inliers].T, ".", color=COLOURS["paper"], markersize=1.5)
+    ax = show_image(page.add_subplot(grid[0, 2]), left)
+    ax.plot(*result.u_points.T, ".", color=COLOURS["truth"], markersize=1.0)
+    ax.set(xlim=(0, left.shape[1]), ylim=(left.shape[0], 0))
+    ax.set_title(f"3  {len(result.u_points)} matches", **title)
 
     ax = page.add_subplot(grid[1, 0], projection="3d")
-    centred = surface_mm - surface_mm.reshape(-1, 3).mean(axis=0)
-    ax.plot_surface(*np.moveaxis(centred, -1, 0), cmap="viridis", linewidth=0, antialiased=True, rcount=60, ccount=60)
-    ax.set_aspect("equal")
-    ax.set(xlabel="mm", ylabel="mm", zlabel="mm")
-    ax.set_title("4  Retina in the robot frame", loc="left", fontweight="bold", fontsize=11)
+    x, y, height = _upright(surface_mm, result.surface_camera.resect().R)
+    ax.plot_surface(x, y, height, cmap="viridis", linewidth=0, antialiased=True, rcount=60, ccount=60)
+    ax.set_box_aspect((np.ptp(x), np.ptp(y), 2.5 * max(np.ptp(height), 0.2)))
+    ax.view_init(elev=35, azim=-65)
+    ax.set(xlabel="mm", ylabel="mm")
+    ax.set_title("4  The retina, heights 2.5 times", **title)
 
     ax = page.add_subplot(grid[1, 1])
-    limit = np.nanquantile(np.abs(surface_error_um), 0.98)
-    picture = ax.imshow(surface_error_um, cmap="RdBu", vmin=-limit, vmax=limit, extent=(0, width, height, 0))
-    page.colorbar(picture, ax=ax, shrink=0.8, label="um")
+    shown, unit, map_name = (height * 1e3, "height, um", "viridis") if error_um is None else (error_um, "um", "RdBu")
+    limit = np.nanquantile(np.abs(shown), 0.98)
+    picture = ax.imshow(shown, cmap=map_name, vmin=-limit, vmax=limit, aspect="equal")
+    page.colorbar(picture, ax=ax, shrink=0.7, label=unit)
     ax.set(xticks=[], yticks=[])
-    ax.set_title("5  Its error against the truth", loc="left", fontweight="bold", fontsize=11)
+    rms = "" if error_um is None else f", {np.sqrt(np.nanmean(error_um**2)):.0f} um RMS"
+    ax.set_title(("5  Height" if error_um is None else "5  Error against the truth") + rms, **title)
 
     ax = page.add_subplot(grid[1, 2])
-    for (method, (frames, error_um)), colour in zip(
-        registration_um.items(), (COLOURS["paper"], COLOURS["ours"]), strict=False
-    ):
-        ax.plot(frames, error_um, "o-", color=colour, label=method)
-    ax.axhline(150, color=COLOURS["baseline"], linestyle="--", label="paper: 150 um after 3 frames")
-    ax.set(xlabel="frames", ylabel="translation error, um", yscale="log")
-    ax.legend(fontsize=8)
-    total = ", ".join(f"{stage} {value:.2f} s" for stage, value in seconds.items())
-    ax.set_title("6  Registration of a moved microscope", loc="left", fontweight="bold", fontsize=11)
-    page.supxlabel(total, fontsize=9, color="#555555")
+    for (method, (frames, error)), colour in zip(registration_um.items(), (COLOURS["paper"], COLOURS["ours"]), strict=False):
+        ax.plot(frames, error, "o-", color=colour, label=method)
+    ax.axhline(150, color=COLOURS["baseline"], linestyle="--", label="paper: below 150 um after 3 frames")
+    ax.set(xlabel="frames of the tool", ylabel="translation error, um", yscale="log")
+    ax.grid(True, color="#e6e6e6", linewidth=0.6)
+    ax.legend(fontsize=8, frameon=False)
+    ax.set_title("6  A moved microscope, registered", **title)
     return page
+
+
+def _upright(surface_mm: np.ndarray, camera_from_robot: np.ndarray) -> np.ndarray:
+    """(3, h, w) mm: right and up in the image, and height towards the camera, about the middle of the surface."""
+    seen = (surface_mm - np.nanmean(surface_mm.reshape(-1, 3), axis=0)) @ camera_from_robot.T
+    return np.moveaxis(seen * (1.0, -1.0, -1.0), -1, 0)
