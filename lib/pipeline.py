@@ -52,7 +52,7 @@ class Settings:
         Complete frames before the first calibration, and frames after which it is left alone.  In between it is
         repeated whenever a quarter more frames are at hand.
     ransac_px:
-        Bound of the calibration's outlier rejection.
+        Bound of the calibration's outlier rejection; None judges by the noise that it measures.
     robot_accuracy_mm:
         Standard deviation of the robot's report, per coordinate.
     registration_frames:
@@ -62,6 +62,8 @@ class Settings:
         Frames without a convincing registration after which the rig is calibrated afresh (someone turned the zoom).
     surface_every:
         Match and fit the surface in every n-th frame.
+    matching:
+        "fast" or "quality", as `lib.matching.match` has it.
     epipolar_px:
         Matches further from the epipolar constraint are dropped before triangulation.
     control:
@@ -70,11 +72,12 @@ class Settings:
 
     min_confidence: float = 0.2
     calibration_frames: tuple[int, int] = (8, 60)
-    ransac_px: float = 10.0
+    ransac_px: float | None = None
     robot_accuracy_mm: float = 0.010
     registration_frames: tuple[int, int] = (3, 12)
     give_up_frames: int = 8
     surface_every: int = 1
+    matching: str = "fast"
     epipolar_px: float = 2.0
     control: tuple[int, int] = (16, 12)
 
@@ -369,7 +372,8 @@ class OnlinePipeline:
                 glint_mask(image) | tool_mask(image.shape[:2], u)
                 for image, u in ((left, result.u_left), (right, result.u_right))
             ]
-            matches = self._match(left, right, rig=self.rig, mask_left=masks[0], mask_right=masks[1])
+            options = {"mask_left": masks[0], "mask_right": masks[1], "setting": self.settings.matching}
+            matches = self._match(left, right, rig=self.rig, **options)
             # The mask that a matcher is given is about patches; this one is about points.
             column, row = np.rint(matches.u_left).astype(int).T
             good = ~masks[0][np.clip(row, 0, left.shape[0] - 1), np.clip(column, 0, left.shape[1] - 1)]

@@ -39,7 +39,7 @@ class World:
         u = np.stack(self.rig.project(self.x_mm[self.frame]))
         return SimpleNamespace(u=u + self.rng.normal(0, self.sigma_px, u.shape), confidence=np.full((2, 3), 0.9))
 
-    def match(self, left, right, *, rig, mask_left, mask_right) -> Matches:
+    def match(self, left, right, *, rig, mask_left, mask_right, setting) -> Matches:
         assert mask_left.shape == mask_right.shape == BLANK.shape[:2]
         x, y = np.meshgrid(np.linspace(-6, 6, 25), np.linspace(-4, 4, 17))
         plane = np.stack([x.ravel(), y.ravel(), np.full(x.size, DEPTH_MM)], axis=1)
