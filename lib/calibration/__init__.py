@@ -1,15 +1,61 @@
 """Calibration of affine and near-affine cameras from a robot's kinematics, and how good it is (paper Sec. IV-A)."""
 
+from lib.calibration.advice import Advice, advise, box_grid, next_position, next_positions
 from lib.calibration.affine import AffineMinimum, Moments, affine_minimum, dlt, estimate_noise, paper_variances
+from lib.calibration.baselines import (
+    Factorisation,
+    PerspectiveCamera,
+    factorise,
+    perspective_dlt,
+    similarity,
+    triangulate_perspective,
+)
 from lib.calibration.estimate import Calibration, calibrate
+from lib.calibration.export import read_json, read_opencv, read_ros, write_json, write_opencv, write_ros
+from lib.calibration.ladder import LADDER, Comparison, Rung, compare_models
+from lib.calibration.online import OnlineCalibration
+from lib.calibration.optics import Optics, optics
+from lib.calibration.pivot import Pivot, ToolOffsets, pivot_calibration, tool_offsets
+from lib.calibration.timing import TimeOffset, estimate_time_offset, rolling_shutter
 
 __all__ = [
+    "LADDER",
+    "Advice",
     "AffineMinimum",
     "Calibration",
+    "Comparison",
+    "Factorisation",
     "Moments",
+    "OnlineCalibration",
+    "Optics",
+    "PerspectiveCamera",
+    "Pivot",
+    "Rung",
+    "TimeOffset",
+    "ToolOffsets",
+    "advise",
     "affine_minimum",
+    "box_grid",
     "calibrate",
+    "compare_models",
     "dlt",
     "estimate_noise",
+    "estimate_time_offset",
+    "factorise",
+    "next_position",
+    "next_positions",
+    "optics",
     "paper_variances",
+    "perspective_dlt",
+    "pivot_calibration",
+    "read_json",
+    "read_opencv",
+    "read_ros",
+    "rolling_shutter",
+    "similarity",
+    "tool_offsets",
+    "triangulate_perspective",
+    "write_json",
+    "write_opencv",
+    "write_ros",
 ]

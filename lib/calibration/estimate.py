@@ -279,7 +279,7 @@ def calibrate(
     check_spread(x[inliers], y[inliers], assumed_x if checks else 0.0)
     centre = (np.asarray(image_size_px, dtype=float) - 1) / 2 if image_size_px is not None else None
 
-    known = dict(sigma_u_px=sigma_u_px, sigma_x_mm=sigma_x_mm)
+    known = {"sigma_u_px": sigma_u_px, "sigma_x_mm": sigma_x_mm}
     for _ in range(4):
         minimum, levels, variances = _minimise(plan, x, y, inliers, noise, weighting, known, centre)
         if not automatic or plan.is_affine:
@@ -334,7 +334,7 @@ def _minimise(
 ) -> tuple[Fit, tuple[float, float], tuple[np.ndarray, float]]:
     """The minimum over the inliers, the noise levels (sigma_u, sigma_x), and the variances that weighed it."""
     x, y = (x, y) if inliers.all() else (x[inliers], y[inliers])
-    n, m = y.shape
+    m = y.shape[1]
     per_point = noise is not None and noise.ndim == 3
     sigma = noise[inliers] if per_point else None if noise is None else noise[None]
     moments = Moments.of(x, y)

@@ -157,7 +157,7 @@ class State:
     def moved(self, increments: np.ndarray) -> State:
         """The state after full increments (cameras * k,)."""
         d = increments.reshape(len(self.A), -1)
-        common = dict(rho=self.rho + d[:, -2], radial=self.radial + d[:, -1], offset=self.offset + d[:, -4:-2])
+        common = {"rho": self.rho + d[:, -2], "radial": self.radial + d[:, -1], "offset": self.offset + d[:, -4:-2]}
         if self.rotation is None:
             return replace(self, A=self.A + d[:, :6].reshape(-1, 2, 3), **common)
         rotation = Rotation.from_rotvec(d[:, :3]).as_matrix() @ self.rotation

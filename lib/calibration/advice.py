@@ -1,0 +1,139 @@
+"""Is this data enough, and where should the tool go next."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from lib.calibration.estimate import Calibration
+from lib.geometry import finite_points, points
+
+__all__ = ["Advice", "advise", "box_grid", "next_position", "next_positions"]
+
+
+@dataclass(frozen=True)
+class Advice:
+    """What to do.
+
+    Attributes
+    ----------
+    enough:
+        True where the calibration's own error adds less than a tenth to a triangulated point's, everywhere asked.
+    worst_ratio:
+        Largest sd of a triangulated point from calibration, in units of the sd of one detection, over the workspace.
+    worst_depth_um:
+        Largest depth sd from the calibration alone, over the workspace.
+    next_position_mm:
+        (3,) the reachable position whose correspondence helps most.
+    gain:
+        log det of the information after that correspondence over before.
+    text:
+        The same in a sentence.
+    """
+
+    enough: bool
+    worst_ratio: float
+    worst_depth_um: float
+    next_position_mm: np.ndarray
+    gain: float
+    text: str
+
+
+def box_grid(low_mm: ArrayLike, high_mm: ArrayLike, steps: int = 5) -> np.ndarray:
+    """(steps^3, 3) points of a box in the robot frame, its corners among them.
+
+    Raises
+    ------
+    ValueError
+        If a side is not positive.
+    """
+    low, high = finite_points(low_mm, 3, "low_mm")[0], finite_points(high_mm, 3, "high_mm")[0]
+    if not (high > low).all():
+        raise ValueError(f"high_mm: must be above low_mm in every coordinate, got {low} and {high}.")
+    return np.array(list(product(*(np.linspace(a, b, steps) for a, b in zip(low, high, strict=True)))))
+
+
+def _information_gain(calibration: Calibration, covariance: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """log det(I + S^-1 J C J^T) (n,): D-optimality of one more correspondence at each x."""
+    centred = x - calibration._fit.state.reference
+    J = calibration._fit.state.evaluate(centred)[2] @ calibration._model.selection
+    S = calibration._residual_covariance(centred, calibration.noise_px2[None])
+    inside = np.eye(S.shape[-1]) + np.linalg.solve(S, J @ covariance @ np.swapaxes(J, 1, 2))
+    return np.linalg.slogdet(inside)[1]
+
+
+def next_positions(
+    calibration: Calibration, candidates_mm: ArrayLike, count: int = 1
+) -> tuple[np.ndarray, np.ndarray]:
+    """The `count` positions, chosen one after another, whose correspondences raise det(information) most.
+
+    det(H^T H + h h^T) = det(H^T H)(1 + leverage), so for the affine model this is the largest leverage; after each choice
+    the covariance is updated, so the positions differ.
+
+    Returns
+    -------
+    positions:
+        (count, 3) mm in the robot frame.
+    gains:
+        (count,) log det gained by each.
+    """
+    x = finite_points(candidates_mm, 3, "candidates_mm")
+    covariance = calibration.parameter_covariance
+    chosen, gains = [], []
+    for _ in range(count):
+        gain = _information_gain(calibration, covariance, x)
+        best = int(gain.argmax())
+        centred = x[best : best + 1] - calibration._fit.state.reference
+        J = (calibration._fit.state.evaluate(centred)[2] @ calibration._model.selection)[0]
+        S = calibration._residual_covariance(centred, calibration.noise_px2[None])[0]
+        CJ = covariance @ J.T
+        covariance = covariance - CJ @ np.linalg.solve(S + J @ CJ, CJ.T)
+        chosen.append(x[best])
+        gains.append(gain[best])
+    return np.array(chosen), np.array(gains)
+
+
+def next_position(calibration: Calibration, low_mm: ArrayLike, high_mm: ArrayLike) -> tuple[np.ndarray, float]:
+    """The most helpful position of a reachable box (3,), and its gain.
+
+    Leverage is a convex function of the position, so over a box it is largest at a corner.
+    """
+    positions, gains = next_positions(calibration, box_grid(low_mm, high_mm, steps=2))
+    return positions[0], float(gains[0])
+
+
+def advise(
+    calibration: Calibration, low_mm: ArrayLike, high_mm: ArrayLike, workspace_mm: ArrayLike | None = None
+) -> Advice:
+    """Judge a stereo calibration over a workspace, and say where to move next.
+
+    Parameters
+    ----------
+    low_mm, high_mm:
+        Corners of the box that the tool can reach in view of both cameras, robot frame.
+    workspace_mm:
+        (n, 3) points that will be reconstructed; None is a grid over the box.
+
+    Raises
+    ------
+    ValueError
+        For a single camera or an empty box.
+    """
+    grid = box_grid(low_mm, high_mm) if workspace_mm is None else points(workspace_mm, 3, "workspace_mm")
+    alone = calibration.point_covariance(grid, detection=False)
+    both = calibration.point_covariance(grid)
+    # Per point, the direction in which calibration adds most to what one detection leaves uncertain anyway.
+    ratio = np.sqrt(np.linalg.eigvals(np.linalg.solve(both - alone, alone)).real.max(axis=1).max())
+    depth_um = 1e3 * float(calibration.depth_sd_mm(grid).max())
+    position, gain = next_position(calibration, low_mm, high_mm)
+    added = np.sqrt(1 + ratio**2) - 1
+    enough = bool(added < 0.10)
+    text = (
+        f"Calibration error adds at most {100 * added:.0f} % to a triangulated point's and {depth_um:.0f} um of depth "
+        f"over the workspace: {'enough data.' if enough else 'not enough data.'} "
+        f"The next correspondence helps most at ({position[0]:.2f}, {position[1]:.2f}, {position[2]:.2f}) mm."
+    )
+    return Advice(enough, float(ratio), depth_um, position, gain, text)
