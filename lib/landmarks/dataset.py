@@ -1,8 +1,8 @@
 """Training data for the two-stage detector: simulated frames, cut to what its networks see.
 
-Frames come from `lib.simulator.training.sample`, whose eyes and tools no test recording uses.  A shard is an .npz file of a
-few frames.  Of every frame it keeps the whole at the first stage's
-resolution and a crop around each landmark at full resolution; validation shards keep the full frame as JPEG too.
+Frames come from `lib.simulator.training.sample`, whose eyes and tools no test recording uses.  A shard is an .npz
+file of a few frames.  Of every frame it keeps the whole at the first stage's resolution and a crop around each
+landmark at full resolution; validation shards keep the full frame as JPEG too.
 Shards are written whole or not at all, so generating them can be stopped at any time and goes on where it stopped.
 """
 
@@ -23,7 +23,7 @@ from lib.landmarks.training import Samples
 from lib.landmarks.windows import cut, direction_rad, map_points, window_from_image
 from lib.simulator.training import sample
 
-__all__ = ["REDUCTION", "WindowSource", "frame_samples", "generate", "validation_frames"]
+__all__ = ["REDUCTION", "WindowSource", "frame_samples", "generate", "simulated_samples", "validation_frames"]
 
 REDUCTION = 5
 CROP_PX = 288
@@ -158,3 +158,18 @@ class WindowSource:
         digest = hashlib.sha256(np.ascontiguousarray(self.crops[:, ::17, ::17]).tobytes())
         digest.update(self.u.tobytes())
         return digest.hexdigest()[:16]
+
+
+def simulated_samples(
+    n: int,
+    *,
+    seed: int,
+    crop_px: int | None = None,
+    size_px: tuple[int, int] | None = None,
+    progress: bool = False,
+) -> Samples:
+    """n simulated images in memory: windows of `crop_px` at full resolution, or the whole field at `size_px` (w, h)."""
+    rng = np.random.default_rng([3, seed])
+    drawn = (sample(rng, crop_px=crop_px, size_px=size_px) for _ in range(n))
+    images, u, visibility = zip(*tqdm(drawn, total=n, disable=not progress, unit="image"), strict=True)
+    return Samples(np.stack(images), np.stack(u), np.stack(visibility))

@@ -86,7 +86,9 @@ def detect(
         frame = recording.frames[int(i)]
         found.append(detector(np.stack([frame.left, frame.right])))
     left, right = (
-        Landmarks(*(np.stack([getattr(pair, name)[side] for pair in found]) for name in ("u", "covariance", "confidence")))
+        Landmarks(
+            *(np.stack([getattr(pair, name)[side] for pair in found]) for name in ("u", "covariance", "confidence"))
+        )
         for side in (0, 1)
     )
     return StereoLandmarks(left, right, recording.landmarks_mm()[chosen])

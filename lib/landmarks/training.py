@@ -6,15 +6,17 @@ that was not, bit for bit on the CPU: the step's number is the whole state of th
 
 from __future__ import annotations
 
+import argparse
 import copy
 import csv
 import hashlib
 import math
 import os
 import subprocess
+import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Protocol
 
@@ -30,7 +32,18 @@ from lib.landmarks.inference import as_tensor, load_network, read_checkpoint, wr
 from lib.landmarks.metrics import errors_px, pck, tool_length_px
 from lib.landmarks.network import HourglassConfig, StackedHourglass
 
-__all__ = ["PRESETS", "Samples", "Training", "TrainingConfig", "heatmap_loss", "load_training", "train", "validate"]
+__all__ = [
+    "PRESETS",
+    "Samples",
+    "Training",
+    "TrainingConfig",
+    "commit",
+    "heatmap_loss",
+    "load_training",
+    "main",
+    "train",
+    "validate",
+]
 
 FORMAT = "microstereo.training"
 
@@ -357,7 +370,7 @@ def train(
     provenance: dict[str, object] = {
         "data": source.fingerprint,
         "images": len(source),
-        "commit": _commit(),
+        "commit": commit(),
         "torch": torch.__version__,
     }
     if folder is not None:
@@ -443,7 +456,7 @@ def _write_log(path: Path, log: list[dict[str, float]]) -> None:
     os.replace(partial, path)
 
 
-def _commit() -> str:
+def commit() -> str:
     """The repository's commit, or "unknown" outside a clone."""
     try:
         command = ["git", "rev-parse", "--short=12", "HEAD"]
@@ -452,3 +465,61 @@ def _commit() -> str:
         ).stdout.strip()
     except (OSError, subprocess.SubprocessError):
         return "unknown"
+
+
+def main(argv: list[str] | None = None) -> int:
+    """`python3 -m lib train`: generate data, train one stage (resuming), or join two trained stages into a detector."""
+    from lib.landmarks import assembly, dataset  # late: dataset imports this module
+
+    parser = argparse.ArgumentParser(prog="python3 -m lib train", description=main.__doc__.split(": ", 1)[1])
+    parser.add_argument("what", choices=["generate", "frame", "window", "whole", "assemble"],
+                        help="data; a stage of the shipped detector; the paper's one network on crops; the detector")  # fmt: skip
+    parser.add_argument("--data", type=Path, default=paths.CACHE / "landmarks", help="folder of the shards")
+    parser.add_argument("--folder", type=Path, default=paths.CACHE / "training", help="checkpoints, one folder a stage")
+    parser.add_argument("--shards", type=int, default=60, help="generate: training shards of 16 frames")
+    parser.add_argument("--preset", choices=sorted(PRESETS), default="best")
+    parser.add_argument("--steps", type=int, default=6000)
+    parser.add_argument("--features", type=int, default=None, help="channels (default: the shipped detector's)")
+    parser.add_argument("--stacks", type=int, default=2)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--initial", type=Path, help="checkpoint to fine-tune from")
+    parser.add_argument("--out", type=Path, default=paths.MODELS / "default.safetensors", help="assemble: weights file")
+    parser.add_argument("--threads", type=int, default=0, help="torch threads (default: torch's choice)")
+    a = parser.parse_args(argv)
+    if a.threads:
+        torch.set_num_threads(a.threads)
+    try:
+        if a.what == "generate":
+            dataset.generate(a.data, max(3, a.shards // 20), validation=True)
+            dataset.generate(a.data, a.shards)
+        elif a.what == "assemble":
+            assembly.assemble(a.folder, a.data, a.out)
+        else:
+            features = a.features or {"frame": 32, "window": 48, "whole": 64}[a.what]
+            config = replace(
+                PRESETS[a.preset],
+                network=HourglassConfig(features, a.stacks),
+                steps=a.steps,
+                seed=a.seed,
+                validate_every=200,
+            )
+            source: Source
+            if a.what == "frame":
+                source = dataset.frame_samples(a.data)
+                validation = dataset.frame_samples(a.data, validation=True)
+            elif a.what == "window":
+                source = dataset.WindowSource.load(a.data)
+                validation = dataset.WindowSource.load(a.data, validation=True).fixed()
+                config = replace(config, augmentation=AUGMENTATIONS["windows"])
+            else:
+                source = dataset.simulated_samples(400, seed=a.seed, crop_px=512, progress=True)
+                validation = dataset.simulated_samples(40, seed=a.seed + 10_000, crop_px=512)
+            initial = load_training(a.initial).network if a.initial else None
+            print(train(config, source, validation, a.folder / a.what, initial=initial).provenance["metrics"])
+    except KeyboardInterrupt:
+        print("\nStopped; the same command goes on from the last checkpoint.", file=sys.stderr)
+        return 130
+    except (ValueError, OSError) as error:
+        print(error, file=sys.stderr)
+        return 2
+    return 0

@@ -1,0 +1,116 @@
+"""From two trained stages to the shipped detector: join, calibrate, measure, write the weights and their card."""
+
+from __future__ import annotations
+
+import json
+import platform
+from pathlib import Path
+
+from lib.landmarks.dataset import REDUCTION, validation_frames
+from lib.landmarks.evaluation import calibrate, evaluate
+from lib.landmarks.inference import Detector
+from lib.landmarks.metrics import calibration_error
+from lib.landmarks.training import commit, load_training
+
+__all__ = ["assemble"]
+
+
+def assemble(folder: str | Path, data: str | Path, out: str | Path) -> Detector:
+    """Join ``frame/`` and ``window/`` of a training folder, calibrate on the validation frames, write `out` and its card.
+
+    Half of the validation frames calibrate, the other half give the figures on the card.
+
+    Raises
+    ------
+    FileNotFoundError, ValueError
+        If a stage or the validation frames are missing.
+    """
+    folder, out = Path(folder), Path(out)
+    frame, window = (load_training(folder / stage / "last.safetensors") for stage in ("frame", "window"))
+    frames = list(validation_frames(data))
+    if not frames:
+        raise FileNotFoundError(f"{data}: no validation shard; make some with `python3 -m lib train generate`.")
+    detector = Detector(frame.network, REDUCTION, window.network)
+    held_out = evaluate(calibrate(detector, frames[::2]), frames[1::2])
+    detector = calibrate(detector, frames)
+    keys = ("data", "images", "commit", "steps", "seconds", "config", "metrics")
+    provenance = {
+        "trained_on": "simulated frames only (lib.simulator.training); no eye or tool of a shipped recording",
+        "commit": commit(),
+        "machine": f"{platform.machine()} CPU, no GPU",
+        "stages": {
+            name: {key: training.provenance.get(key) for key in keys}
+            for name, training in (("frame", frame), ("window", window))
+        },
+        "validation_frames": len(frames),
+        "metrics": held_out.scores.as_dict()
+        | {
+            "confidence_calibration_error": calibration_error(held_out.landmarks.confidence, held_out.correct),
+            "by_landmark_median_px": {k: v.median_px for k, v in held_out.by_landmark().items()},
+        },
+    }
+    provenance = json.loads(json.dumps(provenance, default=float))
+    detector = Detector(
+        detector.frame_network,
+        detector.reduction,
+        detector.window_network,
+        detector.window_px,
+        detector.method,
+        detector.calibration,
+        provenance,
+    )
+    out.parent.mkdir(parents=True, exist_ok=True)
+    detector.save(out)
+    out.with_name("README.md").write_text(card(detector, out), encoding="utf-8")
+    return detector
+
+
+def card(detector: Detector, path: Path) -> str:
+    """The Markdown card of a weights file, computed from its metadata."""
+    p = detector.metadata
+    m = p["metrics"]
+    lines = [
+        f"# {path.name}",
+        "",
+        "Weights of the landmark detector: base, tip_1 and tip_2 of the forceps in microscope images.",
+        f"Trained on {p['trained_on']}.",
+        "",
+        "| | whole frame | windows |",
+        "|---|---|---|",
+    ]
+    frame, window = p["stages"]["frame"], p["stages"]["window"]
+
+    def row(name: str, value) -> None:
+        lines.append(f"| {name} | {value(frame)} | {value(window)} |")
+
+    row("stacks x features", lambda s: "{stacks} x {features}".format(**s["config"]["network"]))
+    row("training images", lambda s: s["images"])
+    row("preset, optimiser", lambda s: f"best, {s['config']['optimiser']}, {s['config']['precision']}")
+    row("steps x batch", lambda s: f"{s['steps']} x {s['config']['batch_size']}")
+    row("hours on one CPU core", lambda s: f"{s['seconds'] / 3600:.2f}")
+    row("data fingerprint", lambda s: f"`{s['data']}`")
+    row("commit", lambda s: f"`{s['commit']}`")
+    lines += [
+        "",
+        (
+            f"The first stage sees the frame at 1/{detector.reduction} of its resolution, the second windows of "
+            f"{detector.window_px} px at full resolution."
+        ),
+        f"File: {path.stat().st_size / 1e6:.1f} MB, safetensors; configuration, calibration and this card's figures inside.",
+        "",
+        f"Held-out simulated full-HD frames ({p['validation_frames'] // 2}, neither trained nor calibrated on):",
+        "",
+        "| figure | value |",
+        "|---|---|",
+        f"| PCK@0.01 / 0.05 / 0.10 | {m['pck_0_01']:.1f} / {m['pck_0_05']:.1f} / {m['pck_0_10']:.1f} % |",
+        f"| median, 95th percentile of the error | {m['median_px']:.2f} px, {m['p95_px']:.2f} px |",
+        *(f"| median error of {k} | {v:.2f} px |" for k, v in m["by_landmark_median_px"].items()),
+        f"| normalised squared error (2 is right) | {m['nees']:.2f} |",
+        f"| 95 % ellipses hold | {m['coverage_95']:.1f} % |",
+        f"| confidence calibration error | {m['confidence_calibration_error']:.3f} |",
+        f"| missed, gross (above 20 px), of labels | {m['missed']}, {m['gross']}, {m['labels']} |",
+        "",
+        "Made by `python3 -m lib train generate`, `train frame`, `train window`, `train assemble`.",
+        "",
+    ]
+    return "\n".join(lines)
