@@ -1,1 +1,13 @@
-"""Recordings with known truth: eye, forceps, microscope and motion of the reference rig."""
+"""Recordings with known truth: eye, forceps, microscope and motion of the reference rig.
+
+Everything here is in the microscope frame (`rig.py`) until a recording is written, which is in the robot's.
+"""
+
+from lib.simulator.eye import Eye
+from lib.simulator.forceps import Forceps, Pose
+from lib.simulator.microscope import Microscope
+from lib.simulator.motion import Motion
+from lib.simulator.recording import simulate
+from lib.simulator.render import View, render_pair
+
+__all__ = ["Eye", "Forceps", "Microscope", "Motion", "Pose", "View", "render_pair", "simulate"]

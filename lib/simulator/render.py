@@ -14,7 +14,7 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from lib.cameras import AffineCamera, NearAffineCamera
+from lib.cameras import AffineCamera, NearAffineCamera, StereoRig
 from lib.geometry import RigidTransform
 from lib.simulator.eye import Scene
 from lib.simulator.forceps import Forceps, Pose
@@ -22,7 +22,7 @@ from lib.simulator.microscope import Microscope
 from lib.simulator.raster import ToolRaster, rasterise
 from lib.simulator.texture import GAMMA, smooth_noise
 
-__all__ = ["View", "render_pair", "render_view"]
+__all__ = ["View", "render_pair", "render_view", "surface_grid"]
 
 _STEP_PX = 8  # of the coarse grid
 _LINEAR = (np.arange(256, dtype=np.float32) / 255) ** GAMMA
@@ -448,18 +448,19 @@ def render_pair(
     forceps: Forceps | None = None,
     pose: Pose | None = None,
     later: tuple[Pose, float] | None = None,
+    rig: StereoRig | None = None,
     rng: np.random.Generator | None = None,
     factor: int = 3,
     surface: bool = False,
 ) -> tuple[View, View]:
-    """The left and right view of one moment; arguments as for `render_view`.
+    """The left and right view of one moment; arguments as for `render_view`, `rig` in the microscope frame.
 
     Raises
     ------
     ValueError
         If the tool is entirely outside the field of both cameras.
     """
-    rig = microscope.rig(_FLAT)
+    rig = rig or microscope.rig(_FLAT)
     size = microscope.image_size_px
     if forceps is not None and pose is not None:
         landmarks = forceps.landmarks(pose)
@@ -479,3 +480,16 @@ def render_pair(
             )
         )  # fmt: skip
     return views[0], views[1]
+
+
+def surface_grid(
+    scene: Scene, camera: AffineCamera | NearAffineCamera, size_px: tuple[int, int], step_px: int = 8
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The true surface: columns (a,) px, rows (b,) px and points (b, a, 3) mm, microscope frame, seen there.
+
+    Between grid points linear interpolation is right to 1 um for eyes at the default step.
+    """
+    width, height = size_px
+    x_px = np.append(np.arange(0, width - 1, step_px), width - 1).astype(float)
+    y_px = np.append(np.arange(0, height - 1, step_px), height - 1).astype(float)
+    return x_px, y_px, np.stack(_intersect(scene, camera, tuple(np.meshgrid(x_px, y_px))), axis=-1)

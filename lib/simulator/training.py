@@ -1,8 +1,8 @@
 """Training images: everything varies per image - eye, tool, pose, light, optics, glints, noise.
 
 One view, not a pair, and only what the network sees: a window of the full-HD image round the tool (`crop_px`), or
-the whole field at a reduced size (`size_px`).  Designs are drawn from ranges and seeds that exclude those of
-`RESERVED_SEEDS`: recordings made for tests use them, so no test frame shows an eye or a tool trained on.
+the whole field at a reduced size (`size_px`).  Eyes of `RESERVED_SEEDS` and tools with jaws of `RESERVED_JAW_MM` are
+never drawn: recordings made for tests use them, so no test frame shows an eye or a tool trained on.
 """
 
 from __future__ import annotations
@@ -21,12 +21,14 @@ from lib.simulator.render import render_view
 from lib.simulator.rig import IMAGE_SIZE_PX
 
 __all__ = [
+    "RESERVED_JAW_MM",
     "RESERVED_SEEDS",
     "TEXTURE_SEEDS",
     "random_eye",
     "random_forceps",
     "random_microscope",
     "random_pose",
+    "reserved_forceps",
     "sample",
 ]
 
@@ -34,6 +36,8 @@ __all__ = [
 RESERVED_SEEDS = range(0, 10_000)
 #: Textures of the training eyes: few enough to stay in memory, each turned, tinted and shaped anew per image.
 TEXTURE_SEEDS = range(10_000, 10_028)
+#: Jaw lengths that training never draws: recordings for tests have tools of these.
+RESERVED_JAW_MM = (2.95, 3.15)
 _TEXTURE_PX = 1536
 
 
@@ -52,10 +56,12 @@ def random_eye(rng: np.random.Generator) -> Eye:
 
 
 def random_forceps(rng: np.random.Generator, seed: int | None = None) -> Forceps:
-    """A design: jaws of 2 to 4 mm, their width, taper, arch, bend and hook, and the metal."""
+    """A design: jaws of 2 to 4 mm (not the reserved lengths), width, taper, arch, bend, hook and metal."""
+    low, high = RESERVED_JAW_MM
+    length = rng.uniform(2.0, 4.0 - (high - low))
     return Forceps(
         shaft_radius_mm=rng.uniform(0.22, 0.38),
-        jaw_length_mm=rng.uniform(2.0, 4.0),
+        jaw_length_mm=float(length + (high - low) * (length >= low)),
         jaw_radius_mm=rng.uniform(0.07, 0.19),
         tip_radius_mm=rng.uniform(0.008, 0.016),
         taper=rng.uniform(0.35, 0.95),
@@ -65,6 +71,17 @@ def random_forceps(rng: np.random.Generator, seed: int | None = None) -> Forceps
         brightness=rng.uniform(0.18, 0.85),
         brushed=rng.uniform(0.0, 0.45),
         seed=int(rng.integers(RESERVED_SEEDS.stop, 2**31)) if seed is None else seed,
+    )
+
+
+def reserved_forceps(rng: np.random.Generator, seed: int) -> Forceps:
+    """A design that training never draws; `seed`, one of `RESERVED_SEEDS`, makes its brush marks."""
+    return replace(
+        random_forceps(rng, seed),
+        shaft_radius_mm=0.30,
+        jaw_length_mm=float(rng.uniform(*RESERVED_JAW_MM)),
+        jaw_radius_mm=float(rng.uniform(0.10, 0.15)),
+        brightness=float(rng.uniform(0.45, 0.65)),
     )
 
 

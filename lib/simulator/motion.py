@@ -1,0 +1,152 @@
+"""Motion of the tool: calibration sweeps that fill a volume, and a surgeon's approach, grasp and peel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.interpolate import PchipInterpolator
+
+from lib.simulator.eye import Scene
+from lib.simulator.forceps import MAX_ROLL_RAD, Forceps, Pose
+
+__all__ = ["MOTIONS", "Motion"]
+
+MOTIONS = ("sweep", "surgeon", "both")
+_CLEARANCE_MM = 0.12  # between a tip and the retina
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A smooth trajectory through random waypoints, the same for the same seed.
+
+    Attributes
+    ----------
+    kind:
+        "sweep": the jaws scan the field at several depths, turning and opening; "surgeon": descend, grasp, peel,
+        pause, release and go elsewhere; "both": a sweep for two thirds of the time, then a surgeon.
+    duration_s:
+        Of the whole trajectory; the faster the shorter.
+    depths_mm:
+        Heights of the tips swept through, z in the microscope frame; the retina bounds them.
+    half_field_mm:
+        Half extents (x, y) that the jaws' centre reaches.
+    tremor_mm:
+        Peak-to-peak amplitude of the physiological tremor, 8 to 12 Hz, in the surgeon's part; 0 filters it.
+    """
+
+    forceps: Forceps
+    scene: Scene
+    kind: str = "sweep"
+    seed: int = 0
+    duration_s: float = 30.0
+    depths_mm: tuple[float, ...] = (-1.5, -0.7, 0.1, 0.9)
+    half_field_mm: tuple[float, float] = (6.8, 3.4)
+    tremor_mm: float = 0.15
+
+    def __post_init__(self) -> None:
+        if self.kind not in MOTIONS:
+            raise ValueError(f"motion: unknown kind {self.kind!r}; one of {', '.join(MOTIONS)}.")
+        if not self.duration_s > 0:
+            raise ValueError(f"duration_s: must be positive, got {self.duration_s}.")
+        if not self.depths_mm:
+            raise ValueError("depths_mm: at least one height to sweep through.")
+        if min(self.half_field_mm) <= 0:
+            raise ValueError(f"half_field_mm: must be positive, got {self.half_field_mm}.")
+        if self.tremor_mm < 0:
+            raise ValueError(f"tremor_mm: must not be negative, got {self.tremor_mm}.")
+
+    @cached_property
+    def _parts(self) -> tuple[tuple[float, PchipInterpolator], ...]:
+        """(start, interpolator of (jaw centre x, y, tip z, azimuth, pitch, roll, opening)) in order of time."""
+        rng = np.random.default_rng([self.seed, 23])
+        side = rng.uniform(-np.pi, np.pi)  # where the robot stands
+        sweep_end = {"sweep": 1.0, "surgeon": 0.0, "both": 0.66}[self.kind] * self.duration_s
+        parts = []
+        if sweep_end > 0:
+            points = self._sweep(rng, side)
+            parts.append((0.0, self._through(points, np.linspace(0, sweep_end, len(points)))))
+        if sweep_end < self.duration_s:
+            points, shares = self._surgeon(rng, side)
+            times = np.concatenate([[0], np.cumsum(shares)]) / np.sum(shares) * (self.duration_s - sweep_end)
+            parts.append((sweep_end, self._through(points, sweep_end + times)))
+        return tuple(parts)
+
+    @staticmethod
+    def _through(points: list[list[float]], times: np.ndarray) -> PchipInterpolator:
+        return PchipInterpolator(times, np.array(points), axis=0, extrapolate=True)
+
+    def _sweep(self, rng: np.random.Generator, side: float) -> list[list[float]]:
+        half_x, half_y = self.half_field_mm
+        points = []
+        for layer, z in enumerate(rng.permutation(self.depths_mm)):
+            rows = np.array([-0.85, 0.0, 0.85]) * (1 if layer % 2 else -1)
+            for k, row in enumerate(rows):
+                for column in np.array([-0.9, -0.3, 0.3, 0.9]) * (1 if k % 2 else -1):
+                    x, y = column * half_x + rng.normal(0, 0.5), row * half_y + rng.normal(0, 0.35)
+                    turn = [side + rng.normal(0, 0.45), rng.uniform(0.12, 0.6), np.clip(rng.normal(0, 0.3), -0.9, 0.9)]
+                    opening = rng.uniform(0.1, 0.5) * self.forceps.jaw_length_mm
+                    points.append([x, y, z + rng.normal(0, 0.12), *turn, opening])
+        return points
+
+    def _surgeon(self, rng: np.random.Generator, side: float) -> tuple[list[list[float]], list[float]]:
+        half_x, half_y = 0.7 * np.array(self.half_field_mm)
+        points: list[list[float]] = []
+        shares: list[float] = []
+        for _ in range(max(1, round(self.duration_s * (0.34 if self.kind == "both" else 1.0) / 9))):
+            x, y = rng.uniform(-half_x, half_x), rng.uniform(-half_y, half_y)
+            ground = float(self.scene.height(np.array(x), np.array(y)))
+            turn = np.array(
+                [side + rng.normal(0, 0.3), rng.uniform(0.25, 0.6), np.clip(rng.normal(0, 0.25), -0.8, 0.8)]
+            )
+            wide, shut = 0.35 * self.forceps.jaw_length_mm, 0.03
+            peel = rng.uniform(0.8, 2.2) * np.array([np.cos(side + np.pi), np.sin(side + np.pi)]) + rng.normal(
+                0, 0.4, 2
+            )
+            path = [
+                ((0, 0), 2.2, wide * 0.6, 1.6),  # come near
+                ((0, 0), 0.5, wide, 1.0),  # open and descend
+                ((0, 0), 0.15, wide, 0.4),  # wait
+                ((0, 0), 0.15, shut, 0.6),  # grasp
+                (0.5 * peel, 0.3, shut, 1.2),  # peel
+                (peel, 0.8, shut, 1.2),
+                (peel, 0.85, shut, 0.7),  # pause
+                (peel, 1.1, wide, 0.5),  # release
+                (peel, 2.2, wide * 0.6, 1.2),  # retreat
+            ]
+            for (dx, dy), above, opening, share in path:
+                drift = rng.normal(0, 0.03, 3)
+                points.append([x + dx, y + dy, ground - above, *(turn + drift), opening])
+                shares.append(share)
+        return points, shares[1:]
+
+    def pose(self, time_s: float) -> Pose:
+        """The pose at `time_s` from the start; the ends hold for times outside."""
+        time = float(np.clip(time_s, 0, self.duration_s))
+        start, path = [part for part in self._parts if part[0] <= time][-1]
+        x, y, z, azimuth, pitch, roll, opening = path(time)
+        pose = Pose(
+            (0.0, 0.0, 0.0), azimuth, max(pitch, 0.0), np.clip(roll, -MAX_ROLL_RAD, MAX_ROLL_RAD), max(opening, 0)
+        )
+        base, *tips = self.forceps.landmarks(pose)
+        lowest = max(tip[2] for tip in tips)
+        centre = (base + np.mean(tips, axis=0)) / 2
+        moved = np.array([x - centre[0], y - centre[1], z - lowest])
+        for tip in tips:
+            ground = float(self.scene.height(np.array(tip[0] + moved[0]), np.array(tip[1] + moved[1])))
+            moved[2] = min(moved[2], ground - _CLEARANCE_MM - tip[2])
+        surgeon = (self.kind != "sweep" and start > 0) or self.kind == "surgeon"
+        if surgeon and self.tremor_mm:
+            moved += self._tremor(time)
+        return pose.moved(base_mm=tuple(float(v) for v in moved))
+
+    def _tremor(self, time: float) -> np.ndarray:
+        rng = np.random.default_rng([self.seed, 29])
+        frequency, phase = rng.uniform(8, 12, (3, 3)), rng.uniform(0, 2 * np.pi, (3, 3))
+        size = self.tremor_mm / 2 * np.array([0.75, 0.75, 0.4])[:, None] * np.array([0.6, 0.3, 0.2])
+        return (size * np.sin(2 * np.pi * frequency * time + phase)).sum(axis=1)
+
+    def later(self, time_s: float, step_s: float = 1e-3) -> tuple[Pose, float]:
+        """What the renderer's `later` takes: the pose a moment after."""
+        return self.pose(time_s + step_s), step_s
