@@ -213,7 +213,7 @@ class OnlinePipeline:
         self._waiting = 0
         self._surface, self._surface_camera, self._smoothness = None, None, None
 
-    def step(self, left: np.ndarray, right: np.ndarray, kinematics: ArrayLike | None = None) -> FrameResult:
+    def step(self, left: np.ndarray, right: np.ndarray, kinematics: ArrayLike | Callable | None = None) -> FrameResult:
         """Take in one stereo frame.
 
         Parameters
@@ -222,7 +222,8 @@ class OnlinePipeline:
             (h, w, 3) uint8 RGB.
         kinematics:
             (3, 3) mm, base, tip_1, tip_2 in the robot frame at the time of the frame; NaN or None where the robot said
-            nothing.
+            nothing.  Or a function of the detected left pixels (3, 2) that returns it, such as
+            ``functools.partial(recording.landmarks_at, index)``: with a rolling shutter each row has its own time.
         """
         self._index += 1
         result = FrameResult(self._index)
@@ -264,18 +265,18 @@ class OnlinePipeline:
         finally:
             result.seconds[name] = result.seconds.get(name, 0.0) + time.perf_counter() - start
 
-    def _detect(self, result: FrameResult, left: np.ndarray, right: np.ndarray, kinematics: ArrayLike | None) -> None:
-        if kinematics is not None:
-            x = np.asarray(kinematics, dtype=np.float64)
-            if x.shape != (3, 3):
-                raise ValueError(f"kinematics: expected (3, 3) mm, one landmark a row, got {x.shape}.")
-            result.x_robot_mm = np.where(np.isfinite(x).all(axis=1, keepdims=True), x, np.nan)
+    def _detect(self, result: FrameResult, left: np.ndarray, right: np.ndarray, kinematics) -> None:
         left, right = np.asarray(left), np.asarray(right)
         if left.ndim != 3 or left.shape[2] != 3 or left.dtype != np.uint8 or right.shape != left.shape:
             raise ValueError(f"left, right: expected two (h, w, 3) uint8 images, got {left.shape} and {right.shape}.")
         landmarks = self._detector(np.stack([left, right]))
         confidence = np.asarray(landmarks.confidence, dtype=np.float64)
         u = np.where(confidence[..., None] >= self.settings.min_confidence, landmarks.u, np.nan)
+        if kinematics is not None:
+            x = np.asarray(kinematics(u[0]) if callable(kinematics) else kinematics, dtype=np.float64)
+            if x.shape != (3, 3):
+                raise ValueError(f"kinematics: expected (3, 3) mm, one landmark a row, got {x.shape}.")
+            result.x_robot_mm = np.where(np.isfinite(x).all(axis=1, keepdims=True), x, np.nan)
         result.u_left, result.u_right, result.confidence = u[0], u[1], confidence
 
     # --- the rig -----------------------------------------------------------------------------------------------------

@@ -120,6 +120,8 @@ def test_kinematics_interpolate_on_the_robot_clock(written):
     shifted = recording.landmarks_mm(u) - recording.landmarks_mm()
     np.testing.assert_allclose(shifted[:, 1], np.broadcast_to(0.01 * speed_mm_s, (N, 3)), atol=1e-5)
     np.testing.assert_allclose(shifted[:, [0, 2]], 0, atol=1e-12)
+    np.testing.assert_allclose(recording.landmarks_at(2, u[2]), recording.landmarks_mm(u)[2])
+    np.testing.assert_allclose(recording.landmarks_at(2), recording.landmarks_mm()[2])
     with pytest.raises(ValueError, match=r"u: expected \(4, 3, 2\)"):
         recording.landmarks_mm(u[:2])
 

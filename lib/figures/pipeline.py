@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
+from matplotlib.ticker import MaxNLocator
 
 from lib.figures.overview import landmarks_on
 from lib.figures.style import COLOURS, LANDMARK_COLOURS, figure, show_image
@@ -48,9 +49,7 @@ def timeline(results: Sequence[FrameResult], *, bump_at: int | None = None) -> F
     for result in results:
         if result.motion is not None:
             axes[1].axvline(result.index, color=COLOURS["truth"], linewidth=1, alpha=0.6)
-    axes[1].set(
-        title="Drift statistic, alarm at 1 (green: the cameras were registered)", yscale="symlog", ylim=(0, None)
-    )
+    axes[1].set(title="Drift statistic, alarm at 1 (green: the cameras were registered)", ylim=(0, 1.6))
     distance = np.array([result.distance_mm for result in results])
     for k, (name, colour) in enumerate(LANDMARK_COLOURS.items()):
         axes[2].plot(index, distance[:, k], color=colour, marker=".", label=name)
@@ -68,21 +67,21 @@ def stage_times(results: Sequence[FrameResult], *, paper_hz: float = 5.0) -> Fig
     index = np.array([result.index for result in results])
     below = np.zeros(len(results))
     for stage in STAGES:
-        seconds = np.array([result.seconds.get(stage, 0.0) for result in results])
+        seconds = np.array([1e3 * result.seconds.get(stage, 0.0) for result in results])
         axes[0].bar(index, seconds, bottom=below, color=_STAGE_COLOURS[stage], width=0.85, label=stage)
         below += seconds
-    axes[0].axhline(1 / paper_hz, color="black", linestyle=":", label=f"paper, {paper_hz:g} Hz")
-    axes[0].set(xlabel="frame", ylabel="s", title="Seconds of each frame")
+    axes[0].axhline(1e3 / paper_hz, color="black", linestyle=":", label=f"paper, {paper_hz:g} Hz")
+    axes[0].set(xlabel="frame", ylabel="ms", title="Time of each frame, by stage")
     axes[0].legend(fontsize=8, ncols=2)
     medians = {
-        stage: float(np.median([r.seconds[stage] for r in results if stage in r.seconds]))
+        stage: 1e3 * float(np.median([r.seconds[stage] for r in results if stage in r.seconds]))
         for stage in STAGES
         if any(stage in r.seconds for r in results)
     }
     axes[1].barh(list(medians), list(medians.values()), color=[_STAGE_COLOURS[stage] for stage in medians])
     for i, value in enumerate(medians.values()):
-        axes[1].text(value, i, f" {1e3 * value:.0f} ms" if value >= 1e-3 else f" {1e6 * value:.0f} us", va="center")
-    axes[1].set(xlim=(0, 1.3 * max(medians.values())), xlabel="s", title="Median where it ran")
+        axes[1].text(value, i, f" {value:.0f}" if value >= 10 else f" {value:.1f}", va="center")
+    axes[1].set(xlim=(0, 1.3 * max(medians.values())), xlabel="ms", title="Median where it ran")
     axes[1].invert_yaxis()
     axes[1].grid(axis="y", visible=False)
     return page
@@ -123,24 +122,28 @@ def dashboard(left: np.ndarray, result: FrameResult) -> Figure:
     x0, y0, x1, y1 = result.surface.grid.domain
     x = result.surface.on_grid(np.linspace(x0, x1, 60), np.linspace(y0, y1, 45))
     view = camera.resect().R  # x right, y down, z away from the camera
-    seen = x @ view.T
+    centre = np.nanmean(x.reshape(-1, 3), axis=0)
+    seen = (x - centre) @ view.T
     bottom = np.nanmax(seen[..., 2])
     height = bottom - seen[..., 2]
     if result.points is not None:
         shown = np.arange(0, len(result.u_points), max(1, len(result.u_points) // 1500))
-        h = bottom - result.points.x_mm[shown] @ view[2]
+        h = bottom - (result.points.x_mm[shown] - centre) @ view[2]
         dots = axes[0].scatter(*result.u_points[shown].T, c=h, s=3, vmin=0, vmax=np.nanmax(height), cmap="viridis")
         page.colorbar(dots, ax=axes[0], label="height in mm", shrink=0.8)
     axes[1].remove()
-    scene = page.add_subplot(1, 2, 2, projection="3d")
+    scene = page.add_subplot(axes[1].get_subplotspec(), projection="3d")
     scene.plot_surface(seen[..., 0], -seen[..., 1], height, cmap="viridis", linewidth=0, antialiased=True, alpha=0.9)
-    tool = np.where(np.isfinite(result.x_robot_mm), result.x_robot_mm, result.x_tool_mm) @ view.T
+    tool = np.where(np.isfinite(result.x_robot_mm), result.x_robot_mm, result.x_tool_mm)
+    tool = (tool - centre) @ view.T
     tool = np.column_stack([tool[:, 0], -tool[:, 1], bottom - tool[:, 2]])
     for tip in (1, 2):
         scene.plot(*tool[[0, tip]].T, color="black", linewidth=2)
     for name, point in zip(LANDMARK_COLOURS, tool, strict=True):
         scene.scatter(*point, color=LANDMARK_COLOURS[name], edgecolor="black", s=25)
-    scene.set(xlabel="x in mm", ylabel="y in mm", zlabel="height in mm")
+    scene.set(xlabel="x in mm", ylabel="y in mm", zlabel="height")
+    for axis in (scene.xaxis, scene.yaxis, scene.zaxis):
+        axis.set_major_locator(MaxNLocator(4))
     ranges = np.ptp(np.stack([seen[..., 0], seen[..., 1]]).reshape(2, -1), axis=1)
     scene.set_box_aspect((ranges[0], ranges[1], 0.6 * ranges[1]))
     scene.view_init(elev=30, azim=-70)

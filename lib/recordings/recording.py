@@ -199,6 +199,18 @@ class Recording:
         truth = _read_truth(folder / "truth", len(frames)) if (folder / "truth").is_dir() else None
         return cls(folder=folder, frames=frames, kinematics=kinematics, annotations=annotations, truth=truth, **header)
 
+    def landmarks_at(self, index: int, u: ArrayLike | None = None) -> np.ndarray:
+        """`landmarks_mm` of one frame, (3, 3) mm, for `u` (3, 2) px or None: what arrives while a recording runs."""
+        time_s = np.full((1, len(LANDMARKS)), self.frames.time_s[index] + self.offset_s)
+        if u is not None:
+            time_s = time_s + self._row_delay_s(points(u, 2, "u"))
+        return self.kinematics.at(time_s)[0]
+
+    def _row_delay_s(self, u: np.ndarray) -> np.ndarray:
+        """When a rolling shutter read the rows of pixels (..., 2), seconds after the frame's time."""
+        row = u[..., 1] / (self.image_size_px[1] - 1) - 0.5
+        return self.readout_s * np.where(np.isfinite(row), row, 0.0)
+
     def landmarks_mm(self, u: ArrayLike | None = None) -> np.ndarray:
         """The robot's landmarks (n, 3, 3) mm at the frames' times, NaN where the robot says nothing.
 
@@ -213,8 +225,7 @@ class Recording:
             u = np.asarray(u, dtype=np.float64)
             if u.shape != (len(self), len(LANDMARKS), 2):
                 raise ValueError(f"u: expected ({len(self)}, {len(LANDMARKS)}, 2), got {u.shape}.")
-            row = u[..., 1] / (self.image_size_px[1] - 1) - 0.5
-            time += self.readout_s * np.where(np.isfinite(row), row, 0.0)
+            time += self._row_delay_s(u)
         return self.kinematics.at(time)
 
 
