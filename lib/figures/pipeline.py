@@ -144,7 +144,7 @@ def dashboard(left: np.ndarray, result: FrameResult) -> Figure:
     scene.set(xlabel="x in mm", ylabel="y in mm", zlabel="height")
     for axis in (scene.xaxis, scene.yaxis, scene.zaxis):
         axis.set_major_locator(MaxNLocator(4))
-    ranges = np.ptp(np.stack([seen[..., 0], seen[..., 1]]).reshape(2, -1), axis=1)
+    ranges = np.nanmax(seen, axis=(0, 1)) - np.nanmin(seen, axis=(0, 1))
     scene.set_box_aspect((ranges[0], ranges[1], 0.6 * ranges[1]))
     scene.view_init(elev=30, azim=-70)
     distance = ", ".join(
