@@ -66,7 +66,9 @@ class Motion:
         parts = []
         if sweep_end > 0:
             points = self._sweep(rng, side)
-            parts.append((0.0, self._through(points, np.linspace(0, sweep_end, len(points)))))
+            pace = np.linalg.norm(np.diff(np.array(points)[:, :3], axis=0), axis=1) + 0.8  # mm, plus time to turn
+            times = np.concatenate([[0], np.cumsum(pace)]) / pace.sum() * sweep_end
+            parts.append((0.0, self._through(points, times)))
         if sweep_end < self.duration_s:
             points, shares = self._surgeon(rng, side)
             times = np.concatenate([[0], np.cumsum(shares)]) / np.sum(shares) * (self.duration_s - sweep_end)

@@ -95,7 +95,7 @@ def _bumps(seed: int) -> np.ndarray:
     """Slopes (n, n, 2) float32 of the wet film's ripples, over a square of `_BUMP_MM` that tiles by reflection."""
     rng = np.random.default_rng([seed, 5])
     return np.stack(
-        [smooth_noise(rng, _BUMP_PX, 7, 2) + 0.35 * smooth_noise(rng, _BUMP_PX, 60) for _ in range(2)], axis=-1
+        [smooth_noise(rng, _BUMP_PX, 5, 2) + 0.2 * smooth_noise(rng, _BUMP_PX, 50) for _ in range(2)], axis=-1
     )
 
 

@@ -102,7 +102,7 @@ def fundus_texture(seed: int, size_px: int = 2048, rim_mm: float = 9.3) -> np.nd
 
     # Pigment is log-normal; choroidal vessels show as a pale net through it.
     density = 0.14 * smooth_noise(rng, size_px, 5, 3) + 0.06 * smooth_noise(rng, size_px, 60, 3, 0.7)
-    density += 0.05 * smooth_noise(rng, size_px, 420, 2, 0.9)
+    density += 0.08 * smooth_noise(rng, size_px, 420, 2, 0.9)
     net = np.exp(-((smooth_noise(rng, size_px, 22, 2) / 0.35) ** 2)) + 0.6 * np.exp(
         -((smooth_noise(rng, size_px, 40, 2) / 0.3) ** 2)
     )
