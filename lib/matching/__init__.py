@@ -137,6 +137,10 @@ def match(
         matches = match_with(method, images, masks, rig, depth_range_mm=depth_range_mm, setting=SETTINGS[setting])
     else:
         raise ValueError(f"method: expected 'deepmatching', 'band', 'sgbm', 'dis' or a callable, got {method!r}.")
+    inside = np.ones(len(matches), bool)
+    for u, image in ((matches.u_left, images[0]), (matches.u_right, images[1])):
+        inside &= ((u >= 0) & (u <= np.array(image.shape[::-1]) - 1)).all(axis=1)
+    matches = matches.keep(inside)
     if rig is None or not len(matches):
         return matches
     distance = np.abs(rig.epipolar_distance(matches.u_left, matches.u_right))

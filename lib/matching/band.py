@@ -63,13 +63,11 @@ COARSE_OFF_LINE = 5
 COARSE_REACH = 0.2
 MIN_SUPPORTED = 12
 
-#: Standard deviation along the line, in cells: gain times what `refine` says, and a floor.  Measured on synthetic
-#: affine pairs with known surface (noise 2 grey values, unequal gain and blur): the normalised errors then have
+#: Standard deviation along and off the line, in cells: gain times what `refine` says, and a floor.  Measured on
+#: synthetic affine pairs with known surface (noise 2 grey values, unequal gain and blur): the normalised errors then have
 #: a robust standard deviation of 1 (tests hold it between 0.7 and 1.4).
 SIGMA_GAIN = 3.5
 SIGMA_FLOOR = 0.015
-#: Off the line, in cells, where a parabola finds the peak.
-SIGMA_OFF_LINE = 0.15
 #: The left point is chosen, not measured; a patch has no sharper centre than this.
 SIGMA_LEFT_PX = 0.05
 #: `refine`'s sigma, in cells, at which every second match is wrong (Middlebury pairs, error above 2 px).
@@ -227,14 +225,14 @@ def match_band(
     start = found.patch * PATCH
     on_line = start + np.column_stack([found.cell[:, 0] - low, np.full(len(start), setting.off_line)])
     step, sigma = refine(left, right, start, on_line, margin=setting.refine_margin)
-    displacement = np.column_stack([found.cell[:, 0] + step, found.displacement[:, 1]])
+    displacement = step + np.column_stack([found.cell[:, 0], np.zeros(len(step))])
     canvas = (start + PATCH / 2) * float(cell) - 0.5
     u_left = rectification.u_left(canvas)
     u_right = rectification.u_right(canvas + displacement * cell + (0.0, off_line_px))
 
-    deviation = np.column_stack([np.hypot(SIGMA_GAIN * sigma, SIGMA_FLOOR), np.full(len(sigma), SIGMA_OFF_LINE)]) * cell
+    deviation = np.hypot(SIGMA_GAIN * sigma, SIGMA_FLOOR) * cell
     right_from_canvas = rectification.right_from_canvas[:, :2]
     covariance = np.zeros((len(sigma), 4, 4))
     covariance[:, :2, :2] = SIGMA_LEFT_PX**2 * np.eye(2)
     covariance[:, 2:, 2:] = np.einsum("ij,nj,kj->nik", right_from_canvas, deviation**2, right_from_canvas)
-    return Matches(u_left, u_right, 1 / (1 + (sigma / SIGMA_HALF) ** 4), covariance, method="band")
+    return Matches(u_left, u_right, 1 / (1 + (sigma[:, 0] / SIGMA_HALF) ** 4), covariance, method="band")

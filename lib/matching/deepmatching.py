@@ -118,7 +118,7 @@ def plan_tiles(grid_left: tuple[int, int], grid_right: tuple[int, int], budget_b
         if max(size_y, size_x) <= 16:
             raise ValueError(
                 f"budget_bytes: DeepMatching needs {predicted_bytes(grid_left, grid_right) / 2**30:.1f} GiB in one "
-                f"piece and {need / 2**30:.2f} GiB in its smallest tiles, the budget is {budget_bytes / 2**30:.2f} GiB. "
+                f"piece and {need / 2**30:.2f} GiB in its smallest tiles; the budget is {budget_bytes / 2**30:.2f}. "
                 "Raise downscale, or match with a rig (method 'band')."
             )
         if size_y >= size_x:

@@ -1,0 +1,58 @@
+"""Masks of glints, tool and surround."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lib.matching import field_mask, glint_mask, tool_mask
+
+
+def test_glints_are_saturated_in_every_channel_and_grown():
+    image = np.full((60, 80, 3), 120, np.uint8)
+    image[20:24, 30:34] = 255
+    image[40, 10] = (255, 200, 90)  # bright, but coloured
+    mask = glint_mask(image, grow_px=3)
+    assert mask.dtype == bool and mask.shape == (60, 80)
+    assert mask[17:27, 31:33].all() and mask[22, 27:37].all()
+    assert not mask[40, 10] and mask.sum() < 12 * 12
+    assert glint_mask(image, grow_px=0).sum() == 16
+    assert np.array_equal(glint_mask(image[..., 0], grow_px=0)[20:24, 30:34], np.ones((4, 4), bool))
+    with pytest.raises(ValueError, match="image: expected a uint8"):
+        glint_mask(image / 255.0)
+
+
+def test_tool_covers_jaws_and_shaft():
+    u = np.array([[100.0, 60.0], [140.0, 50.0], [140.0, 70.0]])
+    mask = tool_mask((120, 200), u, width_px=6)
+    for x, y in [(100, 60), (120, 55), (120, 65), (138, 50), (60, 60), (5, 60)]:
+        assert mask[y, x], (x, y)
+    for x, y in [(160, 60), (135, 60), (100, 80), (60, 75)]:
+        assert not mask[y, x], (x, y)
+    assert not tool_mask((120, 200), u, width_px=6, shaft_px=20)[60, 60]
+    assert mask.sum() < tool_mask((120, 200), u).sum()
+
+
+def test_missing_landmarks_leave_out_what_is_unknown():
+    u = np.array([[100.0, 60.0], [140.0, 50.0], [np.nan, np.nan]])
+    mask = tool_mask((120, 200), u, width_px=6)
+    assert mask[55, 120] and not mask[68, 135]
+    assert not tool_mask((120, 200), np.full((3, 2), np.nan)).any()
+    u = np.array([[np.nan, np.nan], [140.0, 50.0], [140.0, 70.0]])
+    assert not tool_mask((120, 200), u).any()
+    with pytest.raises(ValueError, match=r"u_landmarks: expected \(3, 2\)"):
+        tool_mask((120, 200), np.zeros((2, 2)))
+
+
+def test_field_is_what_light_reaches():
+    y, x = np.mgrid[:120, :160]
+    inside = (x - 80) ** 2 + (y - 60) ** 2 < 50**2
+    image = np.where(inside, 130, 3).astype(np.uint8)
+    image[55:65, 75:85] = 0  # dark, but inside
+    mask = field_mask(image, margin_px=4)
+    assert mask[0].all() and mask[:, 0].all()
+    assert not mask[50:70, 70:90].any()
+    assert mask[60, 129] and not mask[60, 118]
+    assert not field_mask(np.full((50, 50, 3), 90, np.uint8)).any()
+    with pytest.raises(ValueError, match="image: expected a uint8"):
+        field_mask(image.astype(float))

@@ -1,0 +1,188 @@
+"""The one interface of all matchers: accuracy on a known affine pair, masks, bad input."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lib.cameras import AffineCamera, StereoRig
+from lib.geometry import RigidTransform
+from lib.matching import RECTIFIED, Matches, glint_mask, match
+from lib.simulator.rig import reference_rig
+
+
+def shifted(image: np.ndarray, pixels: int) -> np.ndarray:
+    """The right image of a fronto-parallel plane: x_right = x_left - pixels."""
+    return np.roll(image, -pixels, axis=1)
+
+
+@pytest.mark.parametrize(
+    ("method", "median_px", "above_2"),
+    [(None, 0.15, 0.02), ("band", 0.15, 0.02), ("sgbm", 0.35, 0.03), ("dis", 0.35, 0.06)],
+)
+def test_matchers_find_the_surface_of_an_affine_pair(affine_pair, method, median_px, above_2):
+    matches = match(affine_pair.left, affine_pair.right, method=method, rig=affine_pair.rig)
+    along, off = affine_pair.errors_px(matches)
+    lattice = 80 * 45
+    assert len(matches) > 0.8 * lattice
+    assert np.median(np.abs(along)) < median_px
+    assert np.mean(np.abs(along) > 2) < above_2
+    assert np.median(np.abs(off)) < 0.5
+    assert matches.covariance_px2.shape == (len(matches), 4, 4)
+    assert (np.linalg.eigvalsh(matches.covariance_px2) > 0).all()
+    assert ((matches.score >= 0) & (matches.score <= 1)).all()
+    assert matches.epipolar_px < 0.5
+
+
+def test_band_is_unbiased_and_its_covariance_is_calibrated(affine_pair):
+    matches = match(affine_pair.left, affine_pair.right, rig=affine_pair.rig)
+    error = matches.u_right - affine_pair.rig.right.project(affine_pair.surface(matches.u_left))
+    along, _ = affine_pair.errors_px(matches)
+    assert abs(np.median(along)) < 0.02
+    whitened = np.linalg.solve(np.linalg.cholesky(matches.covariance_px2[:, 2:, 2:]), error[:, :, None])[:, :, 0]
+    robust = np.median(np.abs(whitened), axis=0) / 0.6745
+    assert ((robust > 0.7) & (robust < 1.4)).all()
+    # And it tells the good from the bad: the surer half is clearly better.
+    sure = matches.score > np.median(matches.score)
+    assert np.median(np.abs(along[sure])) < 0.8 * np.median(np.abs(along[~sure]))
+
+
+def test_fast_setting_halves_large_images(affine_pair):
+    large = [np.kron(image, np.ones((3, 3), np.uint8)) for image in (affine_pair.left, affine_pair.right)]
+    scaled = StereoRig(
+        *(
+            AffineCamera(np.column_stack([3 * camera.linear, 3 * camera.offset_px + 1]))
+            for camera in (affine_pair.rig.left, affine_pair.rig.right)
+        )
+    )
+    matches = match(*large, rig=scaled, setting="fast")
+    along = matches.u_right - scaled.right.project(affine_pair.surface((matches.u_left - 1) / 3))
+    assert np.median(np.abs(along)) < 0.6
+    assert len(matches) > 0.8 * 120 * 67
+
+
+def test_depth_range_limits_the_search(affine_pair):
+    rig = affine_pair.rig
+    depth = affine_pair.surface(match(affine_pair.left, affine_pair.right, rig=rig).u_left) @ rig.left.viewing_direction
+    whole = (depth.min() - 0.1, depth.max() + 0.1)
+    found = match(affine_pair.left, affine_pair.right, rig=rig, depth_range_mm=whole)
+    along, _ = affine_pair.errors_px(found)
+    assert np.median(np.abs(along)) < 0.15
+    wrong = match(affine_pair.left, affine_pair.right, rig=rig, depth_range_mm=(depth.max() + 1, depth.max() + 2))
+    along, _ = affine_pair.errors_px(wrong)
+    assert np.mean(np.abs(along) < 2) < 0.05
+
+
+def test_works_in_any_robot_frame_and_on_rgb(affine_pair):
+    robot = RigidTransform.from_rotation_vector((0.4, 2.6, -0.3), (12.0, -7.0, 35.0))
+    rig = reference_rig(robot_from_microscope=robot, image_size_px=(640, 360))
+    colour = [np.repeat(image[:, :, None], 3, axis=2) for image in (affine_pair.left, affine_pair.right)]
+    matches = match(*colour, rig=rig)
+    assert len(matches) > 0.8 * 80 * 45
+    assert np.median(np.abs(affine_pair.errors_px(matches)[0])) < 0.15
+
+
+@pytest.mark.parametrize("method", ["band", "deepmatching", "sgbm", "dis"])
+def test_masks_mean_ignore(textured, method):
+    mask = np.zeros(textured.shape, bool)
+    mask[40:90, 50:110] = True
+    free = match(textured, textured, method=method, rig=RECTIFIED)
+    matches = match(textured, textured, method=method, rig=RECTIFIED, mask_left=mask, mask_right=mask)
+    assert 0.6 * len(free) < len(matches) < len(free)
+    for u in (matches.u_left, matches.u_right):
+        x, y = np.rint(u).astype(int).T
+        assert not ((x >= 56) & (x < 104) & (y >= 46) & (y < 84)).any()
+
+
+def test_glints_do_harm_without_a_mask_and_little_with_one(affine_pair):
+    left, right = affine_pair.left.copy(), affine_pair.right.copy()
+    rng = np.random.default_rng(1)
+    for image in (left, right):
+        for x, y in rng.uniform((40, 40), (600, 320), (12, 2)).astype(int):
+            image[y - 7 : y + 7, x - 9 : x + 9] = 255
+    plain = match(left, right, rig=affine_pair.rig)
+    masked = match(left, right, rig=affine_pair.rig, mask_left=glint_mask(left), mask_right=glint_mask(right))
+    bad = [np.mean(np.abs(affine_pair.errors_px(m)[0]) > 1) for m in (plain, masked)]
+    assert bad[1] < 0.7 * bad[0]
+
+
+def test_a_callable_is_a_matcher(textured):
+    def block_matcher(left, right, range_px):
+        assert left.dtype == np.uint8 and left.shape == right.shape
+        assert range_px[0] <= 12 <= range_px[1]
+        return np.full(left.shape, 12.0), np.full(left.shape, 0.7)
+
+    matches = match(textured, shifted(textured, 12), method=block_matcher, rig=RECTIFIED)
+    assert np.allclose(matches.u_left - matches.u_right, (12, 0))
+    assert np.allclose(matches.score, 0.7)
+    assert matches.method == "block_matcher"
+    with pytest.raises(ValueError, match=r"method: .* shape"):
+        match(textured, textured, method=lambda left, right, range_px: (left[:5], left), rig=RECTIFIED)
+
+
+@pytest.mark.parametrize("method", ["band", "deepmatching", "sgbm", "dis"])
+def test_identical_images_do_not_move(textured, method):
+    matches = match(textured, textured, method=method, rig=RECTIFIED)
+    assert len(matches) > 0.6 * 20 * 16
+    assert np.median(np.abs(matches.u_left - matches.u_right)) < 1e-6
+
+
+@pytest.mark.parametrize("method", ["band", "deepmatching"])
+@pytest.mark.parametrize("value", [0, 255])
+def test_no_texture_gives_no_match(method, value):
+    flat = np.full((120, 160), value, np.uint8)
+    matches = match(flat, flat, method=method, rig=RECTIFIED)
+    assert isinstance(matches, Matches) and len(matches) == 0
+    assert np.isnan(matches.epipolar_px)
+
+
+@pytest.mark.parametrize("method", ["band", "deepmatching"])
+def test_sizes_may_differ(textured, method):
+    matches = match(textured, shifted(textured, 8)[:104, :130], method=method, rig=RECTIFIED)
+    assert len(matches) > 100
+    assert np.median(np.abs(matches.u_left - matches.u_right - (8, 0))) < 0.1
+    assert (matches.u_right[:, 0] < 130).all() and (matches.u_right[:, 1] < 104).all()
+
+
+def test_a_rig_that_does_not_fit_is_reported(affine_pair):
+    rig = affine_pair.rig
+    moved = AffineCamera(rig.right.matrix + np.array([[0, 0, 0, 0], [0, 0, 0, 15.0]]))
+    with pytest.raises(ValueError, match=r"rig: it does not fit the images: .* 1[45]\.\d px off"):
+        match(affine_pair.left, affine_pair.right, rig=StereoRig(rig.left, moved))
+    with pytest.raises(ValueError, match="rig: it does not fit"):
+        match(affine_pair.left, affine_pair.left, rig=StereoRig(rig.left, moved))
+    # A small misfit is followed and told.
+    nudged = AffineCamera(rig.right.matrix + np.array([[0, 0, 0, 0], [0, 0, 0, 4.0]]))
+    matches = match(affine_pair.left, affine_pair.right, rig=StereoRig(rig.left, nudged))
+    along, _ = affine_pair.errors_px(matches)
+    assert np.median(np.abs(along)) < 0.2
+    assert matches.epipolar_px == pytest.approx(4 / np.sqrt(2), abs=0.3)
+
+
+def test_a_rig_without_parallax_is_refused(affine_pair):
+    with pytest.raises(ValueError, match="rig: both cameras look along the same direction"):
+        match(affine_pair.left, affine_pair.right, rig=StereoRig(affine_pair.rig.left, affine_pair.rig.left))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"left": np.zeros((100, 100), np.float32)}, "left: expected a uint8 image"),
+        ({"right": np.zeros((100, 100, 4), np.uint8)}, "right: expected .h, w, 3. RGB"),
+        ({"left": np.zeros((8, 100), np.uint8)}, "left: .* too small"),
+        ({"mask_left": np.ones((128, 160), bool)}, "mask_left: everything is masked"),
+        ({"mask_right": np.ones((10, 10), bool)}, "mask_right: expected a bool array"),
+        ({"mask_left": np.zeros((128, 160))}, "mask_left: expected a bool array"),
+        ({"method": "orb"}, "method: expected"),
+        ({"method": "band"}, "rig: method 'band' needs"),
+        ({"setting": "best"}, "setting: expected one of"),
+        ({"depth_range_mm": (3, 1)}, "depth_range_mm: expected .near, far."),
+        ({"depth_range_mm": (0, np.nan)}, "depth_range_mm: expected .near, far."),
+        ({"method": "deepmatching", "downscale": 9}, "downscale: expected 0 to"),
+        ({"method": "deepmatching", "downscale": 1, "budget_bytes": 1000}, "budget_bytes: .* needs .* GiB"),
+    ],
+)
+def test_bad_input_is_named(textured, change, message):
+    arguments = {"left": textured, "right": textured} | change
+    with pytest.raises(ValueError, match=message):
+        match(**arguments)

@@ -1,0 +1,89 @@
+"""The displacement volume: correlations against direct products, matches against known motion."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from lib.matching.refine import refine
+from lib.matching.volume import correlation_volume, match_volume
+
+
+@pytest.fixture(scope="module")
+def grids():
+    rng = np.random.default_rng(0)
+    gy, gx, low, n, v = 9, 11, -5, 17, 2
+    left = rng.random((4 * gy, 4 * gx, 9)).astype(np.float32)
+    right = rng.random((4 * gy + 2 * v, 4 * gx + n - 1, 9)).astype(np.float32)
+    return left, right, low, n, v
+
+
+def test_correlations_are_cosines_of_patches(grids):
+    left, right, low, n, v = grids
+    right = right.copy()
+    right[:6, :9] = 0.0  # masked
+    volume = correlation_volume(torch.from_numpy(left), torch.from_numpy(right), low, n, v).numpy()
+    assert volume.shape == (9, 11, 2 * v + 1, n)
+    for y, x, j, k in [(0, 0, 0, 0), (3, 5, 2, 5), (8, 10, 4, 16), (0, 10, 1, 3), (8, 0, 3, 9), (0, 1, 1, 6)]:
+        patch = left[4 * y : 4 * y + 4, 4 * x : 4 * x + 4].ravel()
+        window = right[4 * y + j : 4 * y + j + 4, 4 * x + k : 4 * x + k + 4].ravel()
+        expected = patch @ window / max(np.linalg.norm(patch) * np.linalg.norm(window), 1e-12)
+        assert volume[y, x, j, k] == pytest.approx(expected, abs=1e-5)
+
+
+def test_every_size_of_volume_works_and_finds_the_motion():
+    rng = np.random.default_rng(1)
+    for gy, gx, low, n, v in [
+        (1, 1, 0, 1, 0),
+        (2, 9, -3, 8, 1),
+        (9, 2, -3, 7, 0),
+        (16, 17, -4, 9, 3),
+        (5, 33, -7, 20, 2),
+    ]:
+        left = rng.random((4 * gy, 4 * gx, 9)).astype(np.float32)
+        right = rng.random((4 * gy + 2 * v, 4 * gx + n - 1, 9)).astype(np.float32)
+        shift, drop = n // 2, v  # on the line
+        right[drop : drop + 4 * gy, shift : shift + 4 * gx] = left
+        found = match_volume(correlation_volume(torch.from_numpy(left), torch.from_numpy(right), low, n, v), low)
+        assert len(found.patch) == gy * gx
+        assert (found.cell == (low + shift, 0)).all()
+        assert np.allclose(found.response, 1, atol=1e-5)
+
+
+def test_matches_are_one_to_one(grids):
+    left, right, low, n, v = grids
+    found = match_volume(correlation_volume(*map(torch.from_numpy, (left, right)), low, n, v), low)
+    assert 0 < len(found.patch) < 99
+    bins = (found.patch * 4 + 2 + found.cell) // 4
+    assert len(np.unique(bins, axis=0)) == len(bins)
+    assert np.abs(found.displacement - found.cell).max() <= 0.5
+    kept = found.keep(found.score > np.median(found.score))
+    assert len(kept.patch) == len(kept.score) < len(found.patch)
+
+
+@pytest.mark.parametrize("margin", [0, 1])
+def test_refinement_recovers_fractions_of_a_cell(margin):
+    y, x = np.mgrid[:48, :64].astype(np.float32)
+
+    def field(dx: float, dy: float) -> np.ndarray:
+        a, b = x - dx, y - dy
+        waves = [np.sin(0.5 * a + 0.3 * b + k) + np.cos(0.35 * a - 0.45 * b + 2 * k) for k in range(9)]
+        return (2 + np.stack(waves, axis=2)).astype(np.float32)
+
+    start = np.stack(np.meshgrid(np.arange(8, 52, 4), np.arange(8, 36, 4)), axis=-1).reshape(-1, 2)
+    for dx, dy in [(0.0, 0.0), (0.3, 0.0), (-0.45, 0.0), (0.2, 0.15)]:
+        step, sigma = refine(field(0, 0), field(dx, dy), start, start, margin=margin)
+        tolerance = 1e-6 if dx == dy == 0 else 0.03
+        assert np.median(np.abs(step[:, 1] - dy)) < max(tolerance, 0.05 * abs(dy) + 0.02 * (dy != 0))
+        if dy == 0:  # x is told for a match on the line
+            assert np.abs(step[:, 0] - dx).max() < tolerance
+        assert (sigma >= 0).all()
+
+
+def test_refinement_ignores_gain_and_works_at_the_border():
+    rng = np.random.default_rng(4)
+    grid = rng.random((16, 20, 9)).astype(np.float32)
+    corners = np.array([[0, 0], [16, 0], [0, 12], [16, 12]])
+    step, _ = refine(grid, 0.5 * grid, corners, corners, margin=1)
+    assert np.abs(step).max() < 1e-5
