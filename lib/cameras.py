@@ -60,7 +60,7 @@ def _matrix(values: ArrayLike) -> np.ndarray:
         raise ValueError(f"matrix: an affine camera is (2, 4), got {matrix.shape}.")
     if not np.isfinite(matrix).all():
         raise ValueError("matrix: an affine camera must be finite.")
-    if np.linalg.svd(matrix[:, :3], compute_uv=False)[1] < 1e-9 * np.abs(matrix[:, :3]).max():
+    if np.linalg.svd(matrix[:, :3], compute_uv=False)[1] <= 1e-9 * np.abs(matrix[:, :3]).max():
         raise ValueError("matrix: its linear part has rank below 2, so it sees a line, not a plane.")
     matrix.setflags(write=False)
     return matrix

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import BSpline, CubicSpline, make_lsq_spline
 
 from lib.calibration.affine import Moments, affine_minimum, dlt, estimate_noise
 
@@ -30,7 +30,12 @@ class TimeOffset:
         return f"video to robot: {1e3 * self.offset_s:.2f} +- {1e3 * self.sd_s:.2f} ms"
 
 
-def _spline(time_s: ArrayLike, x_mm: ArrayLike) -> tuple[CubicSpline, np.ndarray, int]:
+def _spline(time_s: ArrayLike, x_mm: ArrayLike, smooth_s: float) -> tuple[CubicSpline, BSpline, np.ndarray]:
+    """Interpolating and smoothing splines of the kinematics (values (n, k, 3)), and the checked times.
+
+    The derivative of an interpolating spline is mostly encoder noise at 100 Hz, and noise in the velocity biases whatever is
+    regressed on it.  The smoothing one is a least-squares cubic with a knot every `smooth_s`.
+    """
     time, x = np.asarray(time_s, dtype=np.float64), np.asarray(x_mm, dtype=np.float64)
     if x.ndim == 2:
         x = x[:, None]
@@ -38,7 +43,10 @@ def _spline(time_s: ArrayLike, x_mm: ArrayLike) -> tuple[CubicSpline, np.ndarray
         raise ValueError(f"kinematics: expected times (m,) and positions (m, k, 3) or (m, 3), got {time.shape}, {x.shape}.")
     if len(time) < 4 or not np.isfinite(time).all() or not np.isfinite(x).all() or (np.diff(time) <= 0).any():
         raise ValueError("kinematics: times must increase, and at least four samples, all finite, are needed.")
-    return CubicSpline(time, x), time, x.shape[1]
+    every = max(4, int(np.ceil(smooth_s / np.median(np.diff(time)))))
+    inner = time[every : len(time) - every : every]
+    knots = np.concatenate([np.full(4, time[0]), inner, np.full(4, time[-1])])
+    return CubicSpline(time, x), make_lsq_spline(time, x, knots, k=3), time
 
 
 def _images(u: Sequence[ArrayLike], frames: int, landmarks: int) -> np.ndarray:
@@ -61,6 +69,7 @@ def estimate_time_offset(
     *,
     start_s: float = 0.0,
     search_s: float = 0.2,
+    smooth_s: float = 0.1,
 ) -> TimeOffset:
     """Offset of the clocks: the shift of the kinematics that lets affine cameras explain the video best.
 
@@ -76,15 +85,17 @@ def estimate_time_offset(
         (m,) and (m, 3) or (m, k, 3), denser than the motion is fast.
     start_s, search_s:
         Middle and half width of the search.
+    smooth_s:
+        Time within which the motion is smooth: the kinematics' noise is averaged over it.
 
     Raises
     ------
     ValueError
         For wrong shapes, or fewer than eight frames inside the kinematics, or a tool that stands still.
     """
-    spline, robot_time, landmarks = _spline(robot_time_s, robot_x_mm)
+    _, spline, robot_time = _spline(robot_time_s, robot_x_mm, smooth_s)
     time = np.asarray(video_time_s, dtype=np.float64)
-    y = _images(u, len(time), landmarks)
+    y = _images(u, len(time), spline.c.shape[1])
     m = y.shape[2]
     inside = (time + start_s - search_s >= robot_time[0]) & (time + start_s + search_s <= robot_time[-1])
     if inside.sum() < 8:
@@ -128,6 +139,7 @@ def rolling_shutter(
     readout_s: float,
     height_px: int,
     offset_s: float = 0.0,
+    smooth_s: float = 0.1,
 ) -> tuple[np.ndarray, list[np.ndarray]]:
     """Correspondences of a rolling shutter: kinematics at the time when the landmark's own row was read.
 
@@ -148,6 +160,8 @@ def rolling_shutter(
         Image height.
     offset_s:
         t_robot = t_video + offset_s.
+    smooth_s:
+        As in `estimate_time_offset`, for the velocity.
 
     Returns
     -------
@@ -163,8 +177,8 @@ def rolling_shutter(
     """
     if readout_s < 0 or height_px < 2:
         raise ValueError(f"readout_s, height_px: {readout_s} and {height_px} make no shutter.")
-    spline, robot_time, landmarks = _spline(robot_time_s, robot_x_mm)
-    time = np.asarray(frame_time_s, dtype=np.float64)
+    spline, smooth, robot_time = _spline(robot_time_s, robot_x_mm, smooth_s)
+    time, landmarks = np.asarray(frame_time_s, dtype=np.float64), smooth.c.shape[1]
     y = _images(u, len(time), landmarks).reshape(len(time), landmarks, -1, 2)
     row_time = readout_s * y[..., 1] / (height_px - 1)  # (n, k, cameras)
     mean_time = time[:, None] + offset_s + row_time.mean(axis=2)
@@ -173,7 +187,7 @@ def rolling_shutter(
     for k in range(landmarks):
         use = known[:, k]
         x[use, k] = spline(mean_time[use, k])[:, k]
-        v[use, k] = spline(mean_time[use, k], 1)[:, k]
+        v[use, k] = smooth(mean_time[use, k], 1)[:, k]
     corrected = []
     for c, given in enumerate(u):
         pixels = y[:, :, c]

@@ -1,0 +1,398 @@
+"""Estimators: exact recovery, the minimum itself, noise levels, outliers, covariances, clear errors."""
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from lib.calibration import (
+    Moments,
+    affine_minimum,
+    calibrate,
+    dlt,
+    estimate_noise,
+    paper_variances,
+)
+from lib.cameras import NearAffineCamera, StereoRig
+from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig, simulate_correspondences
+
+SIZE = (1920, 1080)
+
+
+def data(n=120, seed=0, **options):
+    return simulate_correspondences(n, rng=np.random.default_rng(seed), **options)
+
+
+def near_rig(distance_mm=200.0, radial=0.0):
+    rig = reference_rig()
+    return StereoRig(
+        *(
+            NearAffineCamera(c.matrix, 1 / distance_mm, (959.5, 539.5), ROBOT_FROM_MICROSCOPE.t, radial)
+            for c in (rig.left, rig.right)
+        )
+    )
+
+
+def contaminated(n, share, seed, columns=slice(0, 2)):
+    c = data(n, seed)
+    rng = np.random.default_rng(seed + 1000)
+    bad = rng.random(n) < share
+    u = np.hstack([c.u_left, c.u_right])
+    u[bad, columns] = rng.uniform(0, 1900, (bad.sum(), 2))
+    return c, [u[:, :2], u[:, 2:]], bad
+
+
+@pytest.mark.parametrize("model", ["affine", "zero_skew", "square", "near_affine", "affine+distances", "square+distance+radial"])
+@pytest.mark.parametrize("weighting", ["likelihood", "paper"])
+def test_exact_correspondences_give_exact_cameras(model, weighting):
+    c = data(60, sigma_u_px=0, sigma_x_mm=0)
+    found = calibrate(c.x_mm, [c.u_left, c.u_right], model=model, weighting=weighting)
+    for camera, true in zip(found.cameras, (c.true_rig.left, c.true_rig.right), strict=True):
+        np.testing.assert_allclose(camera.matrix, true.matrix, rtol=1e-9, atol=1e-9)
+    assert found.inliers.all()
+
+
+def test_four_points_suffice():
+    c = data(4, sigma_u_px=0, sigma_x_mm=0)
+    found = calibrate(c.x_mm, [c.u_left, c.u_right], model="affine")
+    np.testing.assert_allclose(found.rig.left.matrix, c.true_rig.left.matrix, atol=1e-8)
+    np.testing.assert_allclose(dlt(c.x_mm, c.u_left).matrix, c.true_rig.left.matrix, atol=1e-8)
+
+
+def test_exact_perspective_pair_is_recovered():
+    rig, c = near_rig(150.0, radial=3e-9), data(80, 4)
+    found = calibrate(c.true_x_mm, rig.project(c.true_x_mm), model="zero_skew+distances+radial", image_size_px=SIZE)
+    for a, b in zip(found.rig.project(c.true_x_mm), rig.project(c.true_x_mm), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-7)
+    depth = (c.true_x_mm.mean(axis=0) - ROBOT_FROM_MICROSCOPE.t) @ rig.left.viewing_direction
+    assert 1 / found.cameras[0].inverse_distance_per_mm == pytest.approx(150 + depth, rel=1e-5)
+    assert found.cameras[1].radial_per_px2 == pytest.approx(3e-9, rel=1e-4)
+
+
+@pytest.mark.parametrize("weighting", ["likelihood", "paper"])
+def test_affine_minimum_is_that_of_a_bundle_adjuster_over_all_unknowns(weighting):
+    """Eq. (3) as printed, over cameras, points and (paper) corrected pixels, by a general solver."""
+    sigma_u, sigma_x, n = 1.5, 0.02, 10
+    c = data(n, 2, sigma_x_mm=sigma_x, half_size_mm=(4, 3, 1))
+    y = np.hstack([c.u_left, c.u_right])
+    mean = c.x_mm.mean(axis=0)
+
+    def residuals(z):  # unknowns scaled to about one: A in 100 px/mm, offsets in px, points in their noise
+        A, t, x = 100 * z[:12].reshape(4, 3), z[12:16], c.x_mm - mean + sigma_x * z[16 : 16 + 3 * n].reshape(n, 3)
+        if weighting == "likelihood":
+            parts = [(x @ A.T + t - y) / sigma_u, z[16 : 16 + 3 * n]]
+        else:
+            corrected = y + z[16 + 3 * n :].reshape(n, 4)
+            parts = [corrected - x @ A.T - t, (corrected - y) * sigma_u**-0.5, (x - c.x_mm + mean) * sigma_x**-0.5]
+        return np.concatenate([p.ravel() for p in parts])
+
+    unknowns = 16 + 3 * n + (4 * n if weighting == "paper" else 0)
+    start = np.concatenate([c.true_rig.linear.ravel() / 100, y.mean(axis=0), np.zeros(unknowns - 16)])
+    general = least_squares(residuals, start, method="lm", xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    found = calibrate(
+        c.x_mm, [c.u_left, c.u_right], model="affine", weighting=weighting, sigma_u_px=sigma_u, sigma_x_mm=sigma_x,
+        ransac_px=np.inf, checks=False,
+    )  # fmt: skip
+    assert found.cost <= general.cost * (1 + 1e-9)
+    assert found.cost == pytest.approx(general.cost, rel=1e-8)
+    np.testing.assert_allclose(found.rig.linear, general.x[:12].reshape(4, 3), rtol=1e-3, atol=0.05)
+
+
+def test_constrained_minimum_from_moments_is_that_from_all_points():
+    """An affine model is fitted on eight compressed rows; per-point covariances take all rows.  Same answer."""
+    c = data(80, 3)
+    known = {"sigma_u_px": 1.5, "sigma_x_mm": 0.01, "ransac_px": np.inf}
+    for model in ("affine", "zero_skew", "square", "common_zoom"):
+        packed = calibrate(c.x_mm, [c.u_left, c.u_right], model=model, **known)
+        each = np.broadcast_to(2.25 * np.eye(4), (80, 4, 4))
+        full = calibrate(c.x_mm, [c.u_left, c.u_right], model=model, covariance_px2=each, **known)
+        assert packed.cost == pytest.approx(full.cost, rel=1e-10)
+        np.testing.assert_allclose(packed.rig.linear, full.rig.linear, rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(packed.covariance, full.covariance, rtol=1e-3, atol=1e-4 * packed.covariance.max())
+
+
+def test_constraints_hold_and_cost_grows_with_them():
+    c = data(100, 5)
+    costs = []
+    for model in ("affine", "zero_skew", "square", "common_zoom"):
+        found = calibrate(
+            c.x_mm, [c.u_left, c.u_right], model=model, sigma_u_px=1.5, sigma_x_mm=0.01, ransac_px=np.inf
+        )
+        costs.append(found.cost)
+        K = np.stack([r.K for r in found.resections()])
+        if model != "affine":
+            np.testing.assert_allclose(K[:, 0, 1], 0, atol=1e-9)
+        if model in ("square", "common_zoom"):
+            np.testing.assert_allclose(K[:, 0, 0], K[:, 1, 1])
+    np.testing.assert_allclose(K[0], K[1], atol=1e-9)
+    assert costs == sorted(costs)
+
+
+def test_moments_merge_and_fade():
+    rng = np.random.default_rng(0)
+    x, y = rng.normal(size=(30, 3)) + 50, rng.normal(size=(30, 4)) * 7 + 900
+    whole, parts = Moments.of(x, y), Moments.of(x[:11], y[:11]).merged(Moments.of(x[11:], y[11:]))
+    assert parts.weight == whole.weight
+    np.testing.assert_allclose(parts.scatter, whole.scatter, rtol=1e-10, atol=1e-8)
+    weights = rng.uniform(1, 2, 30)
+    np.testing.assert_allclose(Moments.of(x, y, weights).faded(0.5).mean, weights @ np.hstack([y, x]) / weights.sum())
+
+
+def test_minimum_is_stationary_and_below_least_squares():
+    c = data(60, 6, sigma_x_mm=0.05, half_size_mm=(4, 3, 0.3))
+    y = np.hstack([c.u_left, c.u_right])
+    moments = Moments.of(c.x_mm, y)
+    best = affine_minimum(moments, 2.25, 0.0025)
+
+    def energy(matrix):
+        r = y - c.x_mm @ matrix[:, :3].T - matrix[:, 3]
+        S = 2.25 * np.eye(4) + 0.0025 * matrix[:, :3] @ matrix[:, :3].T
+        return 0.5 * np.einsum("ni,ij,nj->", r, np.linalg.inv(S), r)
+
+    assert energy(best.matrix) == pytest.approx(best.cost, rel=1e-9)
+    assert best.cost < energy(affine_minimum(moments, 1.0, 0.0).matrix)
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        assert energy(best.matrix + rng.normal(size=(4, 4)) * 1e-3) > best.cost
+
+
+def test_noise_levels_are_found():
+    found = np.array(
+        [
+            (k.sigma_u_px, k.sigma_x_mm)
+            for seed in range(20)
+            for c in [data(300, seed)]
+            for k in [calibrate(c.x_mm, [c.u_left, c.u_right])]
+        ]
+    )
+    assert found[:, 0].mean() == pytest.approx(1.5, rel=0.03)
+    assert found[:, 1].mean() == pytest.approx(0.010, rel=0.04)
+
+
+def test_one_camera_attributes_all_noise_to_its_pixels_or_keeps_what_is_given():
+    c = data(400, 1)
+    alone = calibrate(c.x_mm, [c.u_left], model="affine")
+    assert alone.rig is None and alone.sigma_x_mm == 0
+    assert alone.sigma_u_px == pytest.approx(np.hypot(1.5, 1.0), rel=0.06)
+    assert calibrate(c.x_mm, [c.u_left], sigma_x_mm=0.01).sigma_u_px == pytest.approx(1.5, rel=0.1)
+    assert calibrate(c.x_mm, [c.u_left], sigma_u_px=1.5).sigma_x_mm == pytest.approx(0.01, rel=0.25)
+    r = np.random.default_rng(0).normal(size=(5, 4))
+    assert estimate_noise(r, np.ones((4, 3)), 16, sigma_u_px=2.0, sigma_x_mm=0.1) == (2.0, 0.1)
+
+
+def test_paper_weighting_depends_on_the_unit_of_length_and_likelihood_does_not():
+    c = data(200, 2, half_size_mm=(4, 3, 0.2))
+    options = {"sigma_u_px": 1.5, "model": "affine", "ransac_px": np.inf, "checks": False}
+    cm = {w: calibrate(c.x_mm / 10, [c.u_left, c.u_right], weighting=w, sigma_x_mm=0.001, **options) for w in ("paper", "likelihood")}
+    mm = {w: calibrate(c.x_mm, [c.u_left, c.u_right], weighting=w, sigma_x_mm=0.01, **options) for w in ("paper", "likelihood")}
+    np.testing.assert_allclose(cm["likelihood"].rig.linear / 10, mm["likelihood"].rig.linear, rtol=1e-6)
+    assert np.abs(cm["paper"].rig.linear / 10 - mm["paper"].rig.linear).max() > 0.5
+    assert paper_variances(1.5, 0.01) == (2.5, 0.01)
+
+
+@pytest.mark.parametrize("share", [0.1, 0.4])
+@pytest.mark.parametrize("known", [{}, {"sigma_u_px": 1.5, "sigma_x_mm": 0.01}, {"ransac_px": 10.0}])
+def test_gross_outliers_are_found(share, known):
+    for seed in range(4):
+        c, u, bad = contaminated(200, share, seed)
+        found = calibrate(c.x_mm, u, seed=seed, **known)
+        assert not (found.inliers & bad & (np.abs(found.residuals_px).max(axis=1) > 15)).any()
+        assert (found.inliers & ~bad).sum() >= 0.98 * (~bad).sum()
+        clean = calibrate(c.x_mm[~bad], [u[0][~bad], u[1][~bad]], ransac_px=np.inf)
+        grid = c.true_x_mm
+        for a, b in zip(found.rig.project(grid), clean.rig.project(grid), strict=True):
+            assert np.abs(a - b).max() < 1.5
+
+
+def test_outliers_in_both_detectors_at_once():
+    c, (u_left, u_right), bad = contaminated(400, 0.4, 9)
+    rng = np.random.default_rng(99)
+    bad_right = rng.random(400) < 0.4
+    u_right = u_right.copy()
+    u_right[bad_right] = rng.uniform(0, 1900, (bad_right.sum(), 2))
+    found = calibrate(c.x_mm, [u_left, u_right])
+    assert found.inliers.sum() >= 0.97 * (~(bad | bad_right)).sum()
+    assert found.sigma_u_px == pytest.approx(1.5, rel=0.15)
+
+
+def test_gaussian_data_keep_every_row():
+    kept = [calibrate(c.x_mm, [c.u_left, c.u_right]).inliers.all() for seed in range(40) for c in [data(100, seed)]]
+    assert sum(kept) >= 39
+
+
+def test_perspective_is_not_mistaken_for_outliers():
+    rig, c = near_rig(120.0), data(200, 7)
+    rng = np.random.default_rng(0)
+    u = [p + rng.normal(0, 0.5, p.shape) for p in rig.project(c.true_x_mm)]
+    found = calibrate(c.true_x_mm, u, model="near_affine", image_size_px=SIZE)
+    assert found.inliers.all()
+    assert found.sigma_u_px == pytest.approx(0.5, rel=0.1)
+
+
+def test_detector_covariances_weigh_their_points():
+    rng = np.random.default_rng(0)
+    errors = {"with": [], "without": []}
+    for seed in range(15):
+        c = data(100, seed, sigma_u_px=0)
+        sd = rng.uniform(0.3, 6, (2, 100))
+        u = [p + s[:, None] * rng.normal(size=p.shape) for p, s in zip((c.u_left, c.u_right), sd, strict=True)]
+        covariance = [s[:, None, None] ** 2 * np.eye(2) for s in sd]
+        for name, given in (("with", covariance), ("without", None)):
+            found = calibrate(c.x_mm, u, covariance_px2=given, ransac_px=np.inf)
+            errors[name].append(found.rig.left.project(c.true_x_mm) - c.true_rig.left.project(c.true_x_mm))
+            if given is not None:
+                assert found.sigma_x_mm == pytest.approx(0.01, rel=0.35)
+    assert np.std(errors["with"]) < 0.75 * np.std(errors["without"])
+
+
+def test_covariance_covers_the_truth():
+    """Mahalanobis distances of the error, in the model's own (nonsingular) number of dimensions."""
+    distances = {m: [] for m in ("affine", "zero_skew", "square+distance")}
+    rng = np.random.default_rng(0)
+    base = reference_rig()
+    for seed in range(90):
+        c = data(100, seed)
+        for model, values in distances.items():
+            rig = near_rig() if "distance" in model else base
+            u = [p + rng.normal(0, 1.5, p.shape) for p in rig.project(c.true_x_mm)]
+            found = calibrate(c.x_mm, u, model=model, ransac_px=np.inf, image_size_px=SIZE)
+            # Judged by what counts: the projections of four points that no plane holds.
+            corners = c.true_x_mm[:5]
+            error = np.hstack([a - b for a, b in zip(found.rig.project(corners), rig.project(corners), strict=True)]).ravel()
+            J = found._fit.state.evaluate(corners - found._fit.state.reference)[2] @ found._model.selection
+            J = J.reshape(-1, J.shape[2])
+            covariance = J @ found.parameter_covariance @ J.T
+            rank = len(found.parameter_names)
+            w, V = np.linalg.eigh(covariance)
+            values.append(((V[:, -rank:].T @ error) ** 2 / w[-rank:]).sum() / rank)
+    for model, values in distances.items():
+        assert np.mean(values) == pytest.approx(1, abs=0.12), model
+
+
+def test_affine_covariance_is_the_cramer_rao_bound():
+    c = data(500, 1)
+    found = calibrate(c.x_mm, [c.u_left, c.u_right], model="affine", sigma_u_px=1.5, sigma_x_mm=0.01, ransac_px=np.inf)
+    A = c.true_rig.linear
+    H = np.column_stack([c.true_x_mm, np.ones(500)])
+    bound = np.kron(1.5**2 * np.eye(4) + 1e-4 * A @ A.T, np.linalg.inv(H.T @ H))
+    np.testing.assert_allclose(np.diag(found.covariance), np.diag(bound), rtol=0.02)
+
+
+def test_paper_weighting_reports_the_sandwich():
+    c = data(200, 3, half_size_mm=(4, 3, 0.3))
+    errors, claims = [], []
+    rng = np.random.default_rng(0)
+    for _ in range(150):
+        x = c.true_x_mm + rng.normal(0, 0.01, (200, 3))
+        u = [p + rng.normal(0, 1.5, p.shape) for p in c.true_rig.project(c.true_x_mm)]
+        found = calibrate(
+            x, u, model="zero_skew", weighting="paper", sigma_u_px=1.5, sigma_x_mm=0.01, ransac_px=np.inf, checks=False
+        )
+        errors.append(np.concatenate([camera.matrix.ravel() for camera in found.cameras]))
+        claims.append(np.diag(found.covariance))
+    ratio = np.var(errors, axis=0) / np.mean(claims, axis=0)
+    assert ratio.mean() == pytest.approx(1, abs=0.2)
+
+
+# ---- bad input -------------------------------------------------------------------------------------------------------
+
+
+def good():
+    c = data(60, 11)
+    return c.x_mm.copy(), [c.u_left.copy(), c.u_right.copy()]
+
+
+def flat(x, u):
+    rig, y = reference_rig(), ROBOT_FROM_MICROSCOPE.inverse().apply(x)
+    y[:, 2] = 0.3
+    x = ROBOT_FROM_MICROSCOPE.apply(y)
+    return x + np.random.default_rng(0).normal(0, 0.005, x.shape), list(rig.project(x))
+
+
+def line(x, u):
+    x = x.mean(axis=0) + np.outer(np.linspace(-4, 4, len(x)), [0.6, 0.8, 0])
+    return x, list(reference_rig().project(x))
+
+
+def nan_rows(x, u):
+    x[3] = np.nan
+    return x, u
+
+
+def nan_pixels(x, u):
+    u[1][[4, 9]] = np.nan
+    return x, u
+
+
+def noise_only(x, u):
+    rng = np.random.default_rng(0)
+    return x, [rng.uniform(0, 1000, p.shape) for p in u]
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (flat, "coplanar"),
+        (line, "collinear"),
+        (lambda x, u: (x * 0 + x[:1], u), "repeat|hardly move"),
+        (lambda x, u: (x[:3], [p[:3] for p in u]), "at least 4"),
+        (lambda x, u: (x[:0], [p[:0] for p in u]), "at least 4"),
+        (lambda x, u: (x / 1000, u), "metres"),
+        (lambda x, u: (x * 1000, u), "micrometres"),
+        (lambda x, u: (x, u[::-1]), "swapped"),
+        (nan_rows, "x_mm: 1 of 60 rows"),
+        (nan_pixels, "u_right: 2 of 60 rows"),
+        (noise_only, "outliers|agree"),
+        (lambda x, u: (np.vstack([x, x[:5]]), [np.vstack([p, p[:5]]) for p in u]), "5 of 65 rows repeat"),
+        (lambda x, u: (x, [u[0], u[1][:-1]]), "u_right: 59 points"),
+        (lambda x, u: (x, [u[0], u[1], u[1]]), "3 arrays"),
+        (lambda x, u: (x[:, :2], u), "x_mm"),
+    ],
+)
+def test_bad_data_are_refused_with_the_reason(spoil, message):
+    x, u = spoil(*good())
+    with pytest.raises(ValueError, match=message):
+        calibrate(x, u)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"model": "perspective"}, "unknown model 'perspective'"),
+        ({"model": "affine+distance+distances"}, "unknown model"),
+        ({"weighting": "bayes"}, "weighting"),
+        ({"sigma_u_px": -1.0}, "sigma_u_px"),
+        ({"sigma_u_px": 0.0}, "sigma_u_px"),
+        ({"sigma_x_mm": np.nan}, "sigma_x_mm"),
+        ({"ransac_px": -3.0}, "ransac_px"),
+        ({"covariance_px2": np.eye(3)}, "covariance_px2"),
+        ({"covariance_px2": -np.eye(4)}, "positive definite"),
+        ({"covariance_px2": np.tile(np.eye(4), (60, 1, 1)), "weighting": "paper"}, "one sigma_u"),
+        ({"ransac_px": 1e-3}, "rows agree"),
+    ],
+)
+def test_bad_options_are_named(options, message):
+    x, u = good()
+    with pytest.raises(ValueError, match=message):
+        calibrate(x, u, **options)
+
+
+def test_checks_can_be_waived():
+    x, u = good()
+    swapped = calibrate(x, u[::-1], checks=False)
+    np.testing.assert_allclose(swapped.rig.left.matrix, calibrate(x, u).rig.right.matrix, rtol=1e-6)
+
+
+def test_a_head_whose_geometry_leaves_doubt_is_not_called_swapped():
+    x, (u_left, u_right) = good()
+    calibrate(x, [u_right, np.column_stack([1919 - u_left[:, 0], u_left[:, 1]])])  # one channel mirrored
+    calibrate(x, [u_right, u_left[:, ::-1] * [1, -1] + [0, 1919]])  # one image turned by 90 degrees
+
+
+def test_dlt_refuses_what_it_cannot_solve():
+    x, u = good()
+    with pytest.raises(ValueError, match="not finite"):
+        dlt(nan_rows(*good())[0], u[0])
+    with pytest.raises(ValueError, match="coplanar"):
+        dlt(np.column_stack([x[:, :2], np.zeros(60)]), u[0])
+    with pytest.raises(ValueError, match="60 and 59"):
+        dlt(x, u[0][:-1])

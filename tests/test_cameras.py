@@ -1,0 +1,221 @@
+"""Cameras and the stereo pair: known answers, properties, degenerate cases, files."""
+
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lib.cameras import AffineCamera, Camera, NearAffineCamera, StereoRig
+from lib.geometry import RigidTransform
+from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
+
+
+@pytest.fixture
+def rig():
+    return reference_rig()
+
+
+@pytest.fixture
+def near(rig):
+    centre, at = (959.5, 539.5), ROBOT_FROM_MICROSCOPE.t
+    return StereoRig(
+        NearAffineCamera(rig.left.matrix, 1 / 180, centre, at),
+        NearAffineCamera(rig.right.matrix, 1 / 190, centre, at, radial_per_px2=2e-9),
+    )
+
+
+def workspace(n, seed=0):
+    rng = np.random.default_rng(seed)
+    return ROBOT_FROM_MICROSCOPE.apply(rng.uniform(-1, 1, (n, 3)) * [8, 4.5, 1.5])
+
+
+def homogeneous(u):
+    return np.column_stack([u, np.ones(len(u))])
+
+
+def test_affine_projection_is_the_matrix_product():
+    camera = AffineCamera([[1, 2, 3, 4], [5, 6, 8, 7]])
+    np.testing.assert_allclose(camera.project([[1, 1, 2], [0, 0, 0]]), [[13, 34], [4, 7]])
+    assert isinstance(camera, Camera)
+
+
+def test_nan_rows_stay_nan(rig):
+    u = rig.left.project([[1, 2, 3], [np.nan, 0, 0]])
+    assert np.isfinite(u[0]).all() and np.isnan(u[1]).all()
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    st.lists(st.floats(-3, 3), min_size=3, max_size=3),
+    st.floats(0.5, 200),
+    st.floats(0.5, 200),
+    st.floats(-5, 5),
+    st.booleans(),
+)
+def test_resection_recomposes_the_matrix(rotation, zoom_x, zoom_y, skew, mirrored):
+    R = RigidTransform.from_rotation_vector(rotation).R
+    M = np.column_stack([np.array([[zoom_x, skew], [0, zoom_y]]) @ R[:2], [10.0, -4.0]])
+    found = AffineCamera(M).resect(mirrored=mirrored)
+    again = found.K @ np.column_stack([found.R[:2], found.t])
+    np.testing.assert_allclose(again, M, atol=1e-9 * np.abs(M).max())
+    np.testing.assert_allclose(found.R @ found.R.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(found.R) == pytest.approx(1)
+    if not mirrored:
+        np.testing.assert_allclose(found.K, [[zoom_x, skew], [0, zoom_y]], atol=1e-9 * max(zoom_x, zoom_y, 5))
+
+
+def test_triangulation_inverts_projection(rig, near):
+    x = workspace(200)
+    for pair in (rig, near):
+        found = pair.triangulate(*pair.project(x))
+        np.testing.assert_allclose(found.x_mm, x, atol=1e-9)
+        np.testing.assert_allclose(found.epipolar_px, 0, atol=1e-8)
+
+
+def test_near_affine_triangulation_with_one_affine_camera(rig, near):
+    pair = StereoRig(rig.left, near.right)
+    x = workspace(20)
+    np.testing.assert_allclose(pair.triangulate(*pair.project(x)).x_mm, x, atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["affine", "near"])
+@pytest.mark.parametrize("shape", ["number", "pair", "each"])
+def test_triangulation_is_the_weighted_minimum_and_its_covariance_is_right(rig, near, kind, shape):
+    pair = rig if kind == "affine" else near
+    rng = np.random.default_rng(3)
+    x = np.repeat(workspace(1), 4000, axis=0)
+    L = np.diag([1.0, 2.0, 0.7, 1.5])
+    L[1, 0] = 0.6
+    S = L @ L.T if shape != "number" else 4.0 * np.eye(4)
+    noise = rng.normal(size=(4000, 4)) @ np.linalg.cholesky(S).T
+    u_left, u_right = (u + e for u, e in zip(pair.project(x), (noise[:, :2], noise[:, 2:]), strict=True))
+    given_covariance = {"number": 4.0, "pair": S, "each": np.broadcast_to(S, (4000, 4, 4))}[shape]
+    found = pair.triangulate(u_left, u_right, given_covariance)
+    error = found.x_mm - x
+    mahalanobis = np.einsum("ni,nij,nj->n", error, np.linalg.inv(found.covariance_mm2), error)
+    assert mahalanobis.mean() == pytest.approx(3, rel=0.08)
+    # Minimum: the gradient of the weighted reprojection error vanishes.
+    r = np.hstack([u_left, u_right]) - np.hstack(pair.project(found.x_mm))
+    gradient = np.einsum("nij,nik,nk->nj", pair.jacobian(found.x_mm), np.broadcast_to(np.linalg.inv(S), (4000, 4, 4)), r)
+    assert np.abs(gradient).max() < 1e-3 * 100
+
+
+def test_triangulation_keeps_missing_matches_missing(rig, near):
+    x = workspace(5)
+    for pair in (rig, near):
+        u_left, u_right = (u.copy() for u in pair.project(x))
+        u_right[2] = np.nan
+        found = pair.triangulate(u_left, u_right)
+        assert np.isnan(found.x_mm[2]).all() and np.isnan(found.epipolar_px[2])
+        np.testing.assert_allclose(np.delete(found.x_mm, 2, 0), np.delete(x, 2, 0), atol=1e-9)
+
+
+def test_fundamental_matrix_and_epipolar_distance(rig, near):
+    x = workspace(50)
+    for pair in (rig, StereoRig(near.left, NearAffineCamera(rig.right.matrix, 1 / 200, (900, 500), x[0]))):
+        u_left, u_right = pair.project(x)
+        values = np.einsum("ni,ij,nj->n", homogeneous(u_right), pair.fundamental, homogeneous(u_left))
+        np.testing.assert_allclose(values, 0, atol=1e-8)
+    rng = np.random.default_rng(0)
+    u_left, u_right = (rng.uniform(0, 1000, (50, 2)) for _ in range(2))
+    value = np.einsum("ni,ij,nj->n", homogeneous(u_right), rig.fundamental, homogeneous(u_left))
+    np.testing.assert_allclose(value, rig.epipolar_distance(u_left, u_right), rtol=1e-9)
+
+
+def test_epipolar_distance_of_unit_noise_has_unit_variance(rig, near):
+    rng = np.random.default_rng(1)
+    for pair in (rig, near):
+        u = [p + rng.normal(size=p.shape) for p in pair.project(workspace(5000))]
+        assert pair.epipolar_distance(*u).std() == pytest.approx(1, rel=0.05)
+
+
+def test_near_affine_is_affine_where_the_inverse_distance_is_zero(rig):
+    camera = NearAffineCamera(rig.left.matrix, 0.0, (959.5, 539.5))
+    x = workspace(10)
+    np.testing.assert_allclose(camera.project(x), rig.left.project(x), atol=1e-9)
+    np.testing.assert_array_equal(camera.affine.matrix, rig.left.matrix)
+
+
+def test_near_affine_is_a_pinhole():
+    distance, focal = 150.0, 15000.0
+    K = np.array([[focal, 0, 640], [0, focal, 480], [0, 0, 1.0]])
+    P = K @ np.column_stack([np.eye(3), [0, 0, distance]])
+    x = np.random.default_rng(0).uniform(-5, 5, (30, 3))
+    h = x @ P[:, :3].T + P[:, 3]
+    camera = NearAffineCamera.from_projection_matrix(P / distance)
+    assert camera.inverse_distance_per_mm == pytest.approx(1 / distance)
+    np.testing.assert_allclose(camera.centre_px, [640, 480], atol=1e-9)
+    np.testing.assert_allclose(camera.project(x), h[:, :2] / h[:, 2:], atol=1e-9)
+
+
+def test_jacobians_are_finite_differences(rig, near):
+    x, step = workspace(20), 1e-4
+    for camera in (rig.left, near.left, near.right):
+        numeric = np.stack(
+            [(camera.project(x + e) - camera.project(x - e)) / (2 * step) for e in step * np.eye(3)], axis=2
+        )
+        np.testing.assert_allclose(camera.jacobian(x), numeric, atol=1e-4)
+
+
+def test_radial_distortion_is_undone(near):
+    u = np.random.default_rng(0).uniform(0, 1900, (50, 2))
+    v = near.right.undistort(u) - near.right.centre_px
+    again = near.right.centre_px + v * (1 + near.right.radial_per_px2 * (v**2).sum(axis=1, keepdims=True))
+    np.testing.assert_allclose(again, u, atol=1e-9)
+    np.testing.assert_allclose(near.right.undistort(near.right.centre_px[None])[0], near.right.centre_px)
+
+
+def test_projection_matrix_round_trip(near):
+    x = workspace(20)
+    again = NearAffineCamera.from_projection_matrix(near.right.projection_matrix, near.right.radial_per_px2)
+    np.testing.assert_allclose(again.project(x), near.right.project(x), atol=1e-9)
+    np.testing.assert_array_equal(AffineCamera(near.left.matrix).projection_matrix[2], [0, 0, 0, 1])
+
+
+def test_files_round_trip(rig, near, tmp_path):
+    x = workspace(20)
+    for pair in (rig, near, StereoRig(rig.left, near.right)):
+        pair.save(tmp_path / "rig.json")
+        again = StereoRig.load(tmp_path / "rig.json")
+        assert type(again.right) is type(pair.right)
+        for a, b in zip(again.project(x), pair.project(x), strict=True):
+            np.testing.assert_array_equal(a, b)
+    assert [p.name for p in tmp_path.iterdir()] == ["rig.json"]
+
+
+def test_bad_files_are_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match="nothing"):
+        StereoRig.load(tmp_path / "nothing.json")
+    bad = tmp_path / "bad.json"
+    for text in ("{", "[]", "{}", json.dumps({"left": {"matrix": [[1, 2]]}, "right": {}})):
+        bad.write_text(text)
+        with pytest.raises(ValueError, match="bad.json"):
+            StereoRig.load(bad)
+
+
+@pytest.mark.parametrize("matrix", [np.eye(3), np.full((2, 4), np.nan), np.zeros((2, 4)), [[1, 2, 3, 0], [2, 4, 6, 1]]])
+def test_no_camera_from_a_bad_matrix(matrix):
+    with pytest.raises(ValueError, match="matrix"):
+        AffineCamera(matrix)
+
+
+def test_bad_arguments_are_named(rig):
+    M = rig.left.matrix
+    with pytest.raises(ValueError, match="centre_px"):
+        NearAffineCamera(M, 0.01, (1, 2, 3))
+    with pytest.raises(ValueError, match="inverse_distance_per_mm"):
+        NearAffineCamera(M, np.nan, (1, 2))
+    with pytest.raises(ValueError, match="reference_mm"):
+        NearAffineCamera(M, 0.01, (1, 2), (np.inf, 0, 0))
+    with pytest.raises(ValueError, match="behind"):
+        NearAffineCamera(M, 0.01, (1, 2)).project(-1000 * AffineCamera(M).viewing_direction[None])
+    with pytest.raises(ValueError, match="affine"):
+        NearAffineCamera.from_projection_matrix(rig.left.projection_matrix)
+    with pytest.raises(ValueError, match="pairs"):
+        rig.triangulate(np.zeros((3, 2)), np.zeros((4, 2)))
+    with pytest.raises(ValueError, match="covariance_px2"):
+        rig.triangulate(np.zeros((3, 2)), np.zeros((3, 2)), np.eye(3))
+    with pytest.raises(ValueError, match="x: expected"):
+        rig.left.project(np.zeros((3, 2)))
