@@ -27,7 +27,7 @@ class Optics:
     zoom_px_per_mm:
         (cameras,) geometric mean zoom.
     roll_rad:
-        In-plane rotation of the right image relative to the left.
+        Rotation of the right image's content relative to the left's, x towards y.
     robot_from_microscope:
         Pose of the stereo head: x right in the mean image, z along the mean viewing direction, origin where the
         image centres' rays come closest.
@@ -74,7 +74,7 @@ def optics(calibration: Calibration) -> Optics:
     x /= np.linalg.norm(x)
     y = np.cross(z, x)
     zoom = np.array([np.abs(np.linalg.det(c.linear @ c.linear.T)) ** 0.25 for c in (rig.left, rig.right)])
-    roll = float(np.arctan2(rows[1][0] @ rows[0][1], rows[1][0] @ rows[0][0]))
+    roll = float(np.arctan2(-rows[1][0] @ rows[0][1], rows[1][0] @ rows[0][0]))
     if calibration.image_size_px is not None:
         centre = (np.asarray(calibration.image_size_px, dtype=float) - 1) / 2
     else:

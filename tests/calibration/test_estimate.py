@@ -94,7 +94,7 @@ def test_affine_minimum_is_that_of_a_bundle_adjuster_over_all_unknowns(weighting
     )  # fmt: skip
     assert found.cost <= general.cost * (1 + 1e-9)
     assert found.cost == pytest.approx(general.cost, rel=1e-8)
-    np.testing.assert_allclose(found.rig.linear, general.x[:12].reshape(4, 3), rtol=1e-3, atol=0.05)
+    np.testing.assert_allclose(found.rig.linear, 100 * general.x[:12].reshape(4, 3), rtol=1e-3, atol=0.01)
 
 
 def test_constrained_minimum_from_moments_is_that_from_all_points():
