@@ -14,7 +14,7 @@ from lib.surface.export import (
     save_points,
     surface_mesh,
 )
-from lib.surface.fitting import SurfaceFit, fit_surface
+from lib.surface.fitting import SurfaceFit, fit_surface, held_out_errors
 from lib.surface.reconstruct import EPIPOLAR_SIGMAS, Reconstruction, epipolar_inliers, reconstruct
 from lib.surface.sphere import Sphere, fit_sphere
 
@@ -32,6 +32,7 @@ __all__ = [
     "epipolar_inliers",
     "fit_sphere",
     "fit_surface",
+    "held_out_errors",
     "reconstruct",
     "remove_outliers",
     "save_depth_map",

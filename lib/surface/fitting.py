@@ -18,7 +18,7 @@ from lib.surface.solver import L1Problem, L1Solution, cvxpy_reference, interior_
 if TYPE_CHECKING:
     from lib.cameras import AffineCamera
 
-__all__ = ["REJECT_MEDIANS", "SurfaceFit", "fit_surface"]
+__all__ = ["REJECT_MEDIANS", "SurfaceFit", "fit_surface", "held_out_errors"]
 
 #: Default rejection: points whose L1 norm exceeds this many times the median.  Gaussian noise along one axis puts
 #: 0.1 % of its points beyond it.
@@ -74,6 +74,7 @@ class SurfaceFit:
     _mu: np.ndarray = field(repr=False)
     _weights: np.ndarray = field(repr=False)
     _residual: np.ndarray = field(repr=False)
+    _quarter: np.ndarray = field(repr=False)
 
     def covariance(self, grid: SplineGrid, u: np.ndarray) -> np.ndarray:
         """Covariance (n, 3, 3) mm^2 of Psi(u) (n, 2), NaN outside the domain.
@@ -81,8 +82,10 @@ class SurfaceFit:
         The curvature of the expected L1 loss is 2 f(0) B'B, where f(0) is the density of the residuals at zero; with
         the bending energy as the prior this gives C = (2 f B'B + 2 mu R)^-1 / (2 f) for the coefficients of an output
         (Koenker, Quantile Regression, Sec. 4.2; Wahba, J. R. Stat. Soc. B 45, 1983, for reading the penalty as a
-        prior, which makes the bands hold the smoothing bias on average).  Outputs correlate as the signs of their
-        residuals do.  Errors that neighbouring points share, such as those of the calibration, are not in it.
+        prior, which makes the bands hold the smoothing bias on average).  Neighbouring matches share part of their
+        error; C is inflated by how much more the signs of residuals in a quarter of a cell agree than independent ones
+        would.  Outputs correlate as the signs of their residuals do.  What all points share, such as the error of the
+        calibration, is not in it.
 
         Raises
         ------
@@ -99,7 +102,7 @@ class SurfaceFit:
                 (columns * cho_solve_banded((factor, True), columns)).sum(axis=0) / (2 * density)
                 for factor, density in self._posterior
             ]
-            sigma = np.sqrt(np.stack(variance, axis=1))
+            sigma = np.sqrt(np.stack(variance, axis=1) * self._inflation)
             covariance = sigma[:, :, None] * self._correlation * sigma[:, None, :]
             result[part] = np.einsum("ki,nkl,lj->nij", self.axes, covariance, self.axes)
         return result
@@ -115,6 +118,14 @@ class SurfaceFit:
             band = 2 * density * self._problem.gram_band(weights**2) + 2 * mu * self._problem.bending_band
             posterior.append((cholesky_banded(band, lower=True), density))
         return posterior
+
+    @cached_property
+    def _inflation(self) -> np.ndarray:
+        """Variance (k,) of the sum of residual signs in a quarter of a cell, over that of independent signs."""
+        signs = np.sign(self._residual)
+        _, place, counts = np.unique(self._quarter, return_inverse=True, return_counts=True)
+        sums = np.stack([np.bincount(place, column) for column in signs.T], axis=1)
+        return np.maximum((sums**2).sum(axis=0) / counts.sum(), 1.0)
 
     @cached_property
     def _correlation(self) -> np.ndarray:
@@ -183,30 +194,22 @@ def fit_surface(
         For shapes or counts that do not fit, NaN, negative smoothness, points that do not determine a surface: fewer
         in the domain than a quarter of the control points, or than 16.
     """
-    grid = SplineGrid(domain, control)
-    u, x, weights = _checked(u, x_mm, weights)
-    if smoothness is not None and not (np.isfinite(smoothness) and smoothness >= 0):
-        raise ValueError(f"smoothness: mu must be a number >= 0 px^2/mm, or None to choose it; got {smoothness}.")
+    data = _prepared(u, x_mm, domain, control, weights, covariance_mm2, camera)
+    if smoothness is not None:
+        smoothness = _checked_smoothness(smoothness)
     if reject_mm is not None and not reject_mm > 0:
         raise ValueError(f"reject_mm: a bound in mm above 0, infinity, or None; got {reject_mm}.")
     if method not in _SOLVERS:
         raise ValueError(f"method: one of {sorted(_SOLVERS)}, got {method!r}.")
-    solver = _SOLVERS[method]
-    used = (weights > 0) & grid.inside(u)
-    _check_enough(u[used], len(u), grid)
-
-    axes, values, norms = _outputs(x, weights, covariance_mm2, camera)
-    stiffness = _stiffness(norms[used], weights[used])
+    solver, grid, x, axes, used = _SOLVERS[method], data.grid, data.x, data.axes, data.used
     held_out = np.empty((0, 2))
     if smoothness is None:
-        # The reference chooses as the interior point method does: it has the same minimum, and takes longer.
-        quick = least_squares if method == "least_squares" else interior_point
-        smoothness, held_out = _choose_smoothness(quick, grid, u[used], values[used], norms[used], stiffness)
+        smoothness, held_out = _choose_smoothness(data, _quick(method))
+    mu = smoothness * data.stiffness
 
     def solve(chosen: np.ndarray) -> tuple[L1Problem, L1Solution, BSplineSurface]:
-        problem = L1Problem(grid, u[chosen])
-        mu = smoothness * stiffness
-        solution = solver(problem, values[chosen], mu, norms[chosen], tolerance=tolerance)
+        problem = L1Problem(grid, data.u[chosen])
+        solution = solver(problem, data.values[chosen], mu, data.norms[chosen], tolerance=tolerance)
         control_points = grid.unflatten(solution.coefficients) @ axes
         if camera is not None:
             control_points = control_points + _rays(grid.sites.reshape(-1, 2), camera).reshape(control_points.shape)
@@ -214,7 +217,7 @@ def fit_surface(
 
     def residuals(surface: BSplineSurface) -> np.ndarray:
         # With a camera only the depth is fitted, so only it can be wrong.
-        difference = surface(u) - x
+        difference = surface(data.u) - x
         return difference if camera is None else (difference @ axes.T) @ axes
 
     problem, solution, surface = solve(used)
@@ -241,11 +244,76 @@ def fit_surface(
         axes=axes,
         method=method,
         _problem=problem,
-        _mu=smoothness * stiffness,
-        _weights=norms[inliers],
-        _residual=problem.design @ solution.coefficients - values[inliers],
+        _mu=mu,
+        _weights=data.norms[inliers],
+        _quarter=_quarters(grid, data.u[inliers]),
+        _residual=problem.design @ solution.coefficients - data.values[inliers],
     )
     return BSplineSurface(grid, surface.control_points_mm, fit)
+
+
+def held_out_errors(
+    u: ArrayLike,
+    x_mm: ArrayLike,
+    smoothness: ArrayLike,
+    *,
+    domain: tuple[float, float, float, float],
+    control: tuple[int, int] = (20, 20),
+    weights: ArrayLike | None = None,
+    covariance_mm2: ArrayLike | None = None,
+    camera: AffineCamera | None = None,
+    method: Literal["interior_point", "least_squares"] = "interior_point",
+) -> np.ndarray:
+    """Mean L1 error (k,) mm of points kept out of the fit at each smoothness (k,), over all folds.
+
+    `fit_surface` chooses by it; the other arguments are as there.
+    """
+    data = _prepared(u, x_mm, domain, control, weights, covariance_mm2, camera)
+    error = _HeldOut(data, _quick(method), _FOLDS)
+    return np.array([error(_checked_smoothness(mu)) for mu in np.atleast_1d(smoothness)])
+
+
+@dataclass(frozen=True)
+class _Data:
+    """Checked arguments of a fit: n points with k outputs, `used` (n,) of them in the domain and with weight."""
+
+    grid: SplineGrid
+    u: np.ndarray
+    x: np.ndarray
+    used: np.ndarray
+    axes: np.ndarray  # (k, 3)
+    values: np.ndarray  # (n, k), x along the axes
+    norms: np.ndarray  # (n, k), factors of the absolute residuals
+    stiffness: np.ndarray  # (k,), factors of the bending energy: 1, or its whitening
+
+
+def _prepared(
+    u: ArrayLike,
+    x_mm: ArrayLike,
+    domain: tuple[float, float, float, float],
+    control: tuple[int, int],
+    weights: ArrayLike | None,
+    covariance_mm2: ArrayLike | None,
+    camera: AffineCamera | None,
+) -> _Data:
+    grid = SplineGrid(domain, control)
+    u, x, weights = _checked(u, x_mm, weights)
+    used = (weights > 0) & grid.inside(u)
+    _check_enough(u[used], len(u), grid)
+    axes, values, norms = _outputs(x, weights, covariance_mm2, camera)
+    stiffness = norms[used].sum(axis=0) / weights[used].sum()
+    return _Data(grid, u, x, used, axes, values, norms, stiffness)
+
+
+def _checked_smoothness(smoothness: float) -> float:
+    if not (np.isfinite(smoothness) and smoothness >= 0):
+        raise ValueError(f"smoothness: mu must be a number >= 0 px^2/mm, or None to choose it; got {smoothness}.")
+    return float(smoothness)
+
+
+def _quick(method: str) -> Callable[..., L1Solution]:
+    """The solver that smoothness is chosen with: the reference has the same minimum, and takes longer."""
+    return least_squares if method == "least_squares" else interior_point
 
 
 def _checked(u: ArrayLike, x_mm: ArrayLike, weights: ArrayLike | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -305,9 +373,10 @@ def _outputs(
     return axes, x @ axes.T, weights[:, None] * inverse_sigma / inverse_sigma[used].mean()
 
 
-def _stiffness(norms: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Factor (k,) of the bending energy of each output: 1, or its whitening."""
-    return norms.sum(axis=0) / weights.sum()
+def _quarters(grid: SplineGrid, u: np.ndarray) -> np.ndarray:
+    """Number (n,) of the quarter cell that each point lies in."""
+    cell, t = grid.locate(u)
+    return (2 * cell + (t >= 0.5)) @ (1, 2 * grid.cells[0])
 
 
 def _rays(u: np.ndarray, camera: AffineCamera) -> np.ndarray:
@@ -315,39 +384,52 @@ def _rays(u: np.ndarray, camera: AffineCamera) -> np.ndarray:
     return (u - camera.offset_px) @ np.linalg.pinv(camera.linear).T
 
 
-def _choose_smoothness(
-    solver: Callable[..., L1Solution],
-    grid: SplineGrid,
-    u: np.ndarray,
-    values: np.ndarray,
-    norms: np.ndarray,
-    stiffness: np.ndarray,
-) -> tuple[float, np.ndarray]:
+class _HeldOut:
+    """Mean L1 error, in mm, of points kept out of the fit, as a function of mu.
+
+    It is in mm also where the fit is whitened: else the axes across the view, which are all but linear in u and so like
+    any smoothness, would outvote the depth.
+    """
+
+    def __init__(self, data: _Data, solver: Callable[..., L1Solution], folds: int) -> None:
+        self.data, self.solver = data, solver
+        u, values = data.u[data.used], data.values[data.used]
+        order = np.lexsort((*values.T, u[:, 0], u[:, 1]))
+        fold = np.empty(len(u), dtype=np.intp)
+        fold[order] = np.arange(len(u)) % _FOLDS
+        rows = np.flatnonzero(data.used)
+        self.parts = [
+            (L1Problem(data.grid, u[fold != f]), rows[fold != f], data.grid.design(u[fold == f]), rows[fold == f])
+            for f in range(folds)
+        ]
+
+    def __call__(self, mu: float) -> float:
+        data, total, count = self.data, 0.0, 0
+        for problem, train, design, test in self.parts:
+            scaled = mu * data.stiffness * len(train) / data.used.sum()
+            solution = self.solver(problem, data.values[train], scaled, data.norms[train], tolerance=1e-3)
+            error = np.abs(design @ solution.coefficients - data.values[test])
+            total += float((data.norms[test] / data.stiffness * error).sum())
+            count += len(test)
+        return total / count
+
+
+def _choose_smoothness(data: _Data, solver: Callable[..., L1Solution]) -> tuple[float, np.ndarray]:
     """The smoothness of least held-out error, and the candidates tried with their errors (m, 2).
 
     It walks down a ladder of half decades to the lowest rung, then takes the parabola through it and its neighbours.
-    The error is in mm also where the fit is whitened: else the axes across the view, which are all but linear in u and
-    so like any smoothness, would outvote the depth.
     """
-    order = np.lexsort((*values.T, u[:, 0], u[:, 1]))
-    fold = np.empty(len(u), dtype=np.intp)
-    fold[order] = np.arange(len(u)) % _FOLDS
-    tried = min(_FOLDS, -(-_ENOUGH_HELD_OUT * _FOLDS // len(u)))
-    parts = [(L1Problem(grid, u[fold != f]), fold != f, grid.design(u[fold == f]), fold == f) for f in range(tried)]
-    # mu where bending over one cell by the spread of the data costs what the cell's points then do, scaled to the
-    # middle of what surfaces have needed; any start leads to the same end.
+    n = int(data.used.sum())
+    held_out = _HeldOut(data, solver, min(_FOLDS, -(-_ENOUGH_HELD_OUT * _FOLDS // n)))
+    # In the middle of what surfaces have needed; any start leads to the same end.
+    values = data.values[data.used]
     spread = np.median(np.abs(values - np.median(values, axis=0)))
-    unit = 0.001 * len(u) * float(np.prod(grid.cell_px)) / max(spread, 1e-9)
+    unit = 0.001 * n * float(np.prod(data.grid.cell_px)) / max(spread, 1e-9)
     errors: dict[int, float] = {}
 
     def error(step: int) -> float:
         if step not in errors:
-            total = 0.0
-            for problem, train, design, test in parts:
-                mu = unit * _LADDER**step * train.mean() * stiffness
-                solution = solver(problem, values[train], mu, norms[train], tolerance=1e-3)
-                total += float((norms[test] / stiffness * np.abs(design @ solution.coefficients - values[test])).sum())
-            errors[step] = total / (fold < tried).sum()
+            errors[step] = held_out(unit * _LADDER**step)
         return errors[step]
 
     best, direction = (0, 1) if error(1) < error(0) else (0, -1)
