@@ -9,5 +9,17 @@ from lib.simulator.microscope import Microscope
 from lib.simulator.motion import Motion
 from lib.simulator.recording import simulate
 from lib.simulator.render import View, render_pair
+from lib.simulator.scenes import Checkerboard, Relief
 
-__all__ = ["Eye", "Forceps", "Microscope", "Motion", "Pose", "View", "render_pair", "simulate"]
+__all__ = [
+    "Checkerboard",
+    "Eye",
+    "Forceps",
+    "Microscope",
+    "Motion",
+    "Pose",
+    "Relief",
+    "View",
+    "render_pair",
+    "simulate",
+]

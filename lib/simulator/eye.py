@@ -18,7 +18,9 @@ class Scene(Protocol):
     """What the renderer needs of a surface.  Lengths are mm in the microscope frame (z into the eye).
 
     `height(x, y)` is the surface z, `texture` its reflectance (n, n, 3) uint8 over a square of side `extent_mm`
-    round the origin, `gloss` the strength of the wet film's mirror image, 0 for a matt surface.
+    round the origin, `gloss` the strength of the wet film's mirror image, 0 for a matt surface.  Optional:
+    `texture_from_surface` (2, 3), where on the texture (x, y) lies, and `step_px`, the grid on which the
+    surface is solved for (8; a rough surface needs less).
     """
 
     gloss: float
@@ -54,6 +56,8 @@ class Eye:
         A photograph to put on the retina in place of the procedural fundus.
     gloss:
         Strength of the reflection of the wet surface, 0 to switch it off.
+    turn_rad:
+        Turns the texture on the surface: more eyes from one texture.
     """
 
     seed: int = 0
@@ -65,6 +69,7 @@ class Eye:
     texture_path: str | Path | None = None
     texture_px: int = 2048
     gloss: float = 1.0
+    turn_rad: float = 0.0
 
     def __post_init__(self) -> None:
         if not self.radius_mm > 0:
@@ -84,6 +89,12 @@ class Eye:
     def extent_mm(self) -> float:
         """Side of the textured square."""
         return EXTENT_MM
+
+    @property
+    def texture_from_surface(self) -> np.ndarray:
+        """(2, 3): texture coordinates (mm from its middle) of the surface point over (x, y)."""
+        cosine, sine = np.cos(self.turn_rad), np.sin(self.turn_rad)
+        return np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0]])
 
     @property
     def texture(self) -> np.ndarray:

@@ -96,7 +96,7 @@ class Forceps:
     shaft_radius_mm: float = 0.30
     jaw_length_mm: float = 3.0
     jaw_radius_mm: float = 0.13
-    tip_radius_mm: float = 0.010
+    tip_radius_mm: float = 0.006
     taper: float = 0.6
     bow_mm: float = 0.18
     bend_mm: float = 0.20
@@ -115,8 +115,8 @@ class Forceps:
                 "tip_radius_mm, jaw_radius_mm, shaft_radius_mm: must not decrease in this order, got "
                 f"{self.tip_radius_mm}, {self.jaw_radius_mm}, {self.shaft_radius_mm}."
             )
-        if self.tip_radius_mm > 0.03:
-            raise ValueError(f"tip_radius_mm: beyond 0.03 a tip is no point to measure, got {self.tip_radius_mm}.")
+        if self.tip_radius_mm > 0.02:
+            raise ValueError(f"tip_radius_mm: beyond 0.02 a tip is no point to measure, got {self.tip_radius_mm}.")
         if not 0 < self.brightness <= 1:
             raise ValueError(f"brightness: must lie between 0 and 1, got {self.brightness}.")
 

@@ -52,6 +52,7 @@ def random_eye(rng: np.random.Generator) -> Eye:
         centre_z_mm=rng.uniform(0.4, 1.8),
         texture_px=_TEXTURE_PX,
         gloss=float(rng.choice([0.0, 1.0], p=[0.08, 0.92]) * rng.uniform(0.3, 1.6)),
+        turn_rad=float(rng.uniform(-np.pi, np.pi)),
     )
 
 
@@ -63,10 +64,10 @@ def random_forceps(rng: np.random.Generator, seed: int | None = None) -> Forceps
         shaft_radius_mm=rng.uniform(0.22, 0.38),
         jaw_length_mm=float(length + (high - low) * (length >= low)),
         jaw_radius_mm=rng.uniform(0.07, 0.19),
-        tip_radius_mm=rng.uniform(0.008, 0.016),
+        tip_radius_mm=rng.uniform(0.004, 0.007),
         taper=rng.uniform(0.35, 0.95),
         bow_mm=rng.uniform(0.02, 0.38),
-        bend_mm=rng.uniform(-0.1, 0.6),
+        bend_mm=rng.uniform(-0.1, 0.45),
         hook_mm=rng.choice([0.0, 1.0]) * rng.uniform(0.02, 0.12),
         brightness=rng.uniform(0.18, 0.85),
         brushed=rng.uniform(0.0, 0.45),
@@ -193,7 +194,7 @@ def sample(
     later = (pose.moved(base_mm=tuple(np.asarray(pose.base_mm) + 1e-3 * speed)), 1e-3)
     view = render_view(
         eye, microscope, camera, size, forceps=forceps, pose=pose, later=later, rng=rng, factor=2,
-        field_px=whole, origin_px=tuple(origin), turn_rad=float(rng.uniform(-np.pi, np.pi)),
+        field_px=whole, origin_px=tuple(origin),
     )  # fmt: skip
     image, u = view.image, view.u
     if size_px is not None and tuple(size_px) != size:
