@@ -104,11 +104,8 @@ def run(argv: list[str]) -> int:
 
 
 def test(argv: list[str]) -> int:
-    if "-h" not in argv and "--help" not in argv:
-        code = subprocess.call([sys.executable, "-m", "ruff", "check", *ruff_options(), str(ROOT)])
-        if code:
-            return code
-    return _pytest(argv)
+    style = subprocess.call([sys.executable, "-m", "ruff", "check", "--output-format=concise", *ruff_options(), str(ROOT)])
+    return _pytest(argv) or style
 
 
 def bench(argv: list[str]) -> int:

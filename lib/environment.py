@@ -11,6 +11,7 @@ import ast
 import contextlib
 import ctypes
 import hashlib
+import importlib.util
 import json
 import os
 import re
@@ -162,7 +163,7 @@ def _sole_maker(root: Path):
 
 def _make(root: Path, venv: Path, torch: str | None, lock_file) -> None:
     workbench = manifest(root)["tool"]["workbench"]
-    check_system_libraries(workbench["system_libraries"])
+    check_system(workbench["system_libraries"])
     stamp = _read_stamp(venv)
     if venv.exists() and not stamp and any(venv.iterdir()):
         raise Problem(f"{venv} was not made by microstereo; move it away and start again.")
@@ -199,19 +200,9 @@ def _make(root: Path, venv: Path, torch: str | None, lock_file) -> None:
 def _make_venv(venv: Path, uv: str | None) -> None:
     """An empty environment with pip in it, from the interpreter that runs this."""
     interpreter = getattr(sys, "_base_executable", sys.executable)
-    try:
-        import ensurepip  # noqa: F401
-    except ImportError:
-        if not uv:
-            version = f"{sys.version_info[0]}.{sys.version_info[1]}"
-            raise Problem(
-                "This Python cannot make virtual environments (no ensurepip). On Debian or Ubuntu type:\n"
-                f"    sudo apt-get install python{version}-venv"
-            ) from None
-        _call(
-            [uv, "venv", "--quiet", "--seed", "--allow-existing", "--python", interpreter, str(venv)],
-            "uv could not make the virtual environment",
-        )
+    if not _makes_environments():
+        command = [str(uv), "venv", "--quiet", "--seed", "--allow-existing", "--python", interpreter, str(venv)]
+        _call(command, "uv could not make the virtual environment")
         return
     _call([interpreter, "-m", "venv", str(venv)], "Python could not make the virtual environment")
 
@@ -309,8 +300,11 @@ def _write_site_files(root: Path, venv: Path) -> None:
 # --- what the machine has -----------------------------------------------------------------------------------------
 
 
-def check_system_libraries(libraries: dict[str, str], *, loads=None, install=None) -> None:
-    """See that Open3D's system libraries are there; install them as root or with password-less sudo where apt is.
+def check_system(libraries: dict[str, str], *, loads=None, install=None) -> None:
+    """See that what no wheel brings is there; install it as root or with password-less sudo where apt is.
+
+    That is Open3D's system libraries on Linux, and the part of Python that makes virtual environments, which
+    Debian and Ubuntu pack apart.
 
     Parameters
     ----------
@@ -324,22 +318,33 @@ def check_system_libraries(libraries: dict[str, str], *, loads=None, install=Non
     Problem
         With the one line to type.
     """
-    if not sys.platform.startswith("linux"):
-        return
     loads, install = loads or _loads, install or _apt_install
-    missing = [name for name in libraries if not loads(name)]
-    if not missing:
+
+    def missing() -> dict[str, str]:
+        found = {}
+        if sys.platform.startswith("linux"):
+            found = {name: package for name, package in libraries.items() if not loads(name)}
+        if not _makes_environments() and not shutil.which("uv"):
+            found["ensurepip"] = f"python{sys.version_info[0]}.{sys.version_info[1]}-venv"
+        return found
+
+    lacks = missing()
+    if not lacks:
         return
-    packages = [libraries[name] for name in missing]
-    _say(f"Open3D needs system libraries that are missing: {', '.join(missing)}.")
-    if install(packages) and all(loads(name) for name in missing):
+    _say(f"The system lacks {', '.join(lacks)} (needed by Open3D and by virtual environments).")
+    if install(list(lacks.values())) and not missing():
         return
     if shutil.which("apt-get"):
-        raise Problem(f"Type this, then start again:\n    sudo apt-get install -y {' '.join(packages)}")
+        raise Problem(f"Type this, then start again:\n    sudo apt-get install -y {' '.join(lacks.values())}")
     raise Problem(
-        f"Install what brings {', '.join(missing)}, then start again. On Fedora:\n"
-        "    sudo dnf install mesa-libEGL mesa-libGL libusb1"
+        f"Install what brings {', '.join(lacks)}, then start again. On Fedora:\n"
+        "    sudo dnf install mesa-libEGL mesa-libGL libusb1 python3-pip"
     )
+
+
+def _makes_environments() -> bool:
+    importlib.invalidate_caches()
+    return importlib.util.find_spec("ensurepip") is not None
 
 
 def _loads(shared_object: str) -> bool:

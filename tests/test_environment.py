@@ -209,7 +209,7 @@ def test_missing_libraries_are_installed_where_that_is_allowed():
         there.update(LIBRARIES)
         return True
 
-    environment.check_system_libraries(LIBRARIES, loads=there.__contains__, install=install)
+    environment.check_system(LIBRARIES, loads=there.__contains__, install=install)
     assert asked == ["libegl1"]
 
 
@@ -218,10 +218,12 @@ def test_too_little_disk(tmp_path):
         environment._check_disk(tmp_path, 1e9)
 
 
-def test_no_ensurepip_says_what_to_type(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "ensurepip", None)  # what Debian's python3 without python3-venv looks like
-    with pytest.raises(Problem, match=r"sudo apt-get install python3\.\d+-venv"):
-        environment._make_venv(tmp_path / ".venv", uv=None)
+def test_no_ensurepip_says_what_to_type(monkeypatch):
+    """What Debian's python3 without python3-venv looks like."""
+    monkeypatch.setattr(environment, "_makes_environments", lambda: False)
+    monkeypatch.setattr(environment.shutil, "which", lambda name: "/usr/bin/apt-get" if name == "apt-get" else None)
+    with pytest.raises(Problem, match=r"sudo apt-get install -y python3\.\d+-venv"):
+        environment.check_system({}, install=lambda packages: False)
 
 
 def test_a_failing_installer_shows_its_last_words(tmp_path, monkeypatch):
