@@ -1,7 +1,7 @@
 """Training data for the two-stage detector: simulated frames, cut to what its networks see.
 
 Frames come from `lib.simulator.training.sample`, whose eyes and tools no test recording uses.  A shard is an .npz
-file of a few frames.  Of every frame it keeps the whole at the first stage's resolution and a crop around each
+file of a few frames.  Of every frame it keeps the whole at a reduced resolution and a crop around each
 landmark at full resolution; validation shards keep the full frame as JPEG too.
 Shards are written whole or not at all, so generating them can be stopped at any time and goes on where it stopped.
 """
@@ -25,7 +25,8 @@ from lib.simulator.training import sample
 
 __all__ = ["REDUCTION", "WindowSource", "frame_samples", "generate", "simulated_samples", "validation_frames"]
 
-REDUCTION = 5
+#: Of the stored frames, and of the first stage's input.
+STORED_REDUCTION, REDUCTION = 5, 8
 CROP_PX = 288
 FRAMES = 16
 
@@ -45,7 +46,7 @@ def _write_shard(path: Path, views: list[tuple[np.ndarray, np.ndarray, np.ndarra
     frames, crops, crop_u, crop_visibility, crop_landmark, jpegs = [], [], [], [], [], []
     for image, u, visibility in views:
         h, w = image.shape[:2]
-        frames.append(cv2.resize(image, (w // REDUCTION, h // REDUCTION), interpolation=cv2.INTER_AREA))
+        frames.append(cv2.resize(image, (w // STORED_REDUCTION, h // STORED_REDUCTION), interpolation=cv2.INTER_AREA))
         for k in np.flatnonzero(visibility):
             corner = np.round(u[k] - (CROP_PX - 1) / 2)
             crops.append(cut(image, np.column_stack([np.eye(2), -corner]), CROP_PX))
@@ -88,9 +89,11 @@ def _load(folder: str | Path, pattern: str, names: tuple[str, ...]) -> list[np.n
 
 
 def frame_samples(folder: str | Path, *, validation: bool = False) -> Samples:
-    """Whole frames at the first stage's resolution."""
+    """Whole frames at the first stage's resolution (shards keep more, so that the resolution can be chosen later)."""
     pattern = "validation_*.npz" if validation else "training_*.npz"
     frames, u, visibility = _load(folder, pattern, ("frames", "u", "visibility"))
+    size = (frames.shape[2] * STORED_REDUCTION // REDUCTION, frames.shape[1] * STORED_REDUCTION // REDUCTION)
+    frames = np.stack([cv2.resize(frame, size, interpolation=cv2.INTER_AREA) for frame in frames])
     return Samples(frames, cell_from_image(u, REDUCTION), visibility)
 
 

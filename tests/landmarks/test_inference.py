@@ -1,0 +1,211 @@
+import json
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from lib import paths
+from lib.landmarks import Detector, Landmarks
+from lib.landmarks.inference import Calibration, as_tensor, peak_features, write_checkpoint
+from lib.landmarks.network import HourglassConfig, StackedHourglass
+from lib.landmarks.windows import cut, direction_rad, map_points, window_from_image
+
+
+def sure():
+    """A calibration that keeps every detection."""
+    return {name: Calibration(logit=(5.0, 0.0, 0.0, 0.0)) for name in ("frame", "window")}
+
+
+def untrained(reduction=2):
+    torch.manual_seed(0)
+    networks = [StackedHourglass(HourglassConfig(8, 1)) for _ in range(2)]
+    return Detector(networks[0], reduction, networks[1], window_px=64, calibration=sure())
+
+
+@pytest.fixture(scope="module")
+def images():
+    return np.random.default_rng(0).integers(0, 256, (3, 130, 171, 3), dtype=np.uint8)
+
+
+def test_shapes(images):
+    found = untrained()(images)
+    assert found.u.shape == (3, 3, 2)
+    assert found.covariance.shape == (3, 3, 2, 2)
+    assert found.confidence.shape == (3, 3)
+    assert np.isfinite(found.u).all()
+    assert (np.linalg.eigvalsh(found.covariance) > 0).all()
+    assert len(found[1:]) == 2
+
+
+def test_batches_do_not_matter(images):
+    detector = untrained()
+    together, single = detector(images, batch=3), detector(images, batch=1)
+    assert np.allclose(together.u, single.u, atol=1e-2)
+
+
+def test_float_images_are_the_same_as_uint8(images):
+    detector = untrained()
+    assert np.allclose(detector(images).u, detector(images / 255.0).u)
+
+
+def test_save_and_load(images, tmp_path):
+    detector = untrained()
+    detector.save(tmp_path / "weights.safetensors")
+    loaded = Detector.load(tmp_path / "weights.safetensors")
+    for name in ("u", "covariance", "confidence"):
+        assert np.array_equal(getattr(loaded(images), name), getattr(detector(images), name), equal_nan=True)
+
+
+def test_missing_is_nan_with_confidence_zero(images):
+    never = {name: Calibration(logit=(-50.0, 0.0, 0.0, 0.0)) for name in ("frame", "window")}
+    found = untrained().with_calibration(**never)(images)
+    assert np.isnan(found.u).all()
+    assert np.isnan(found.covariance).all()
+    assert (found.confidence == 0).all()
+
+
+def test_whole_frame_detector_has_no_windows(images):
+    detector = Detector(StackedHourglass(HourglassConfig(8, 2)), calibration=sure())
+    assert detector.frame_heatmaps(images).shape == (3, 3, 33, 43)
+    assert np.isfinite(detector(images).u).all()
+
+
+def test_windows_point_right_and_are_measured_exactly():
+    """A Gaussian dot in the image is found at its mapped place in the turned window, and mapped back."""
+    h, w, u = 200, 240, np.array([[[100.3, 90.7], [60.2, 120.9], [75.5, 135.1]]])
+    y, x = np.mgrid[:h, :w]
+    image = np.zeros((h, w, 3), np.uint8)
+    for p in u[0]:
+        image = np.maximum(image, (255 * np.exp(-((x - p[0]) ** 2 + (y - p[1]) ** 2) / 32))[..., None].astype(np.uint8))
+    angle = direction_rad(u)
+    tips = u[0, 1:].mean(0) - u[0, 0]
+    assert angle[0] == pytest.approx(np.arctan2(tips[1], tips[0]))
+    for k in range(3):
+        matrix = window_from_image(u[0, k], angle[0], 64)
+        assert np.allclose(map_points(matrix, u[0, k]), 31.5)
+        window = cut(image, matrix, 64).astype(float)[20:44, 20:44, 0]
+        rows, columns = np.mgrid[20:44, 20:44]
+        window = np.where((rows - 31.5) ** 2 + (columns - 31.5) ** 2 < 100, window, 0)
+        centre = np.array([(window * columns).sum(), (window * rows).sum()]) / window.sum()
+        assert np.allclose(centre, 31.5, atol=0.1)
+    mapped = map_points(window_from_image(u[0, 0], angle[0], 64), u[0])
+    assert mapped[1, 0] > mapped[0, 0]
+    assert mapped[2, 0] > mapped[0, 0]
+
+
+def test_direction_needs_a_base_and_a_tip():
+    u = np.array([[[0, 0], [5, 5], [np.nan] * 2], [[np.nan] * 2, [1, 1], [2, 2]], [[0, 0], [np.nan] * 2, [np.nan] * 2]])
+    angle = direction_rad(u)
+    assert angle[0] == pytest.approx(np.pi / 4)
+    assert np.isnan(angle[1:]).all()
+
+
+def test_reduced_frames_keep_the_half_pixel_rule():
+    """A blob at u shrinks to cell_from_image(u): the rule of lib.geometry, here with the library's own resize."""
+    y, x = np.mgrid[:100, :120]
+    image = (255 * np.exp(-((x - 61.7) ** 2 + (y - 44.1) ** 2) / 200)).astype(np.uint8)[..., None].repeat(3, 2)
+    small = untrained(5).reduced(image[None])[0, ..., 0].astype(float)
+    rows, columns = np.mgrid[:20, :24]
+    centre = np.array([(small * columns).sum(), (small * rows).sum()]) / small.sum()
+    assert np.allclose(5 * centre + 2, (61.7, 44.1), atol=0.1)
+
+
+@pytest.mark.parametrize(
+    ("bad", "text"),
+    [
+        (np.zeros((1, 64, 64, 1), np.uint8), "grey channel"),
+        (np.zeros((1, 64, 64, 4), np.uint8), "alpha"),
+        (np.zeros((64, 64, 3), np.uint8), "first axis"),
+        (np.full((1, 64, 64, 3), 200.0), r"must lie in \[0, 1\]"),
+        (np.full((1, 64, 64, 3), np.nan), r"must lie in \[0, 1\]"),
+        (np.zeros((1, 64, 64, 3), np.int32), "int32"),
+        (np.zeros((0, 64, 64, 3), np.uint8), "empty"),
+    ],
+)
+def test_bad_images_are_named(bad, text):
+    with pytest.raises(ValueError, match=f"images: .*{text}"):
+        untrained()(bad)
+    with pytest.raises(ValueError, match="images: "):
+        as_tensor(bad)
+
+
+def test_missing_corrupt_and_foreign_files_are_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"nothing\.safetensors"):
+        Detector.load(tmp_path / "nothing.safetensors")
+    corrupt = tmp_path / "corrupt.safetensors"
+    untrained().save(corrupt)
+    corrupt.write_bytes(corrupt.read_bytes()[:-100])
+    with pytest.raises(ValueError, match=r"corrupt\.safetensors: corrupt"):
+        Detector.load(corrupt)
+    corrupt.write_bytes(b"PK\x03\x04 a pickle, perhaps")
+    with pytest.raises(ValueError, match=r"corrupt\.safetensors: corrupt"):
+        Detector.load(corrupt)
+    foreign = tmp_path / "foreign.safetensors"
+    save_file({"layer": torch.zeros(3)}, foreign)
+    with pytest.raises(ValueError, match=r"foreign\.safetensors: holds 'foreign weights'"):
+        Detector.load(foreign)
+
+
+def test_weights_of_another_network_are_named(tmp_path):
+    path = tmp_path / "weights.safetensors"
+    network = StackedHourglass(HourglassConfig(8, 1))
+    metadata = {
+        "format": "microstereo.detector", "networks": {"frame": {"features": 16}}, "reduction": 1, "window_px": 64,
+        "method": "paper", "calibration": {}, "provenance": {},
+    }  # fmt: skip
+    write_checkpoint(path, {f"frame.{k}": v for k, v in network.state_dict().items()}, metadata)
+    with pytest.raises(ValueError, match=r"weights\.safetensors: its weights do not fit"):
+        Detector.load(path)
+
+
+def test_tracking_needs_as_many_landmarks_as_images(images):
+    with pytest.raises(ValueError, match="previous"):
+        untrained().track(images, Landmarks(np.zeros((1, 3, 2)), np.zeros((1, 3, 2, 2)), np.zeros((1, 3))))
+
+
+def test_features_are_finite_for_any_peak():
+    features = peak_features(np.array([0.0, 1e9]), np.array([-3.0, 5.0]), np.array([0.4, 3.0]))
+    assert np.isfinite(features).all()
+
+
+@pytest.mark.skipif(not (paths.MODELS / "default.safetensors").exists(), reason="the shipped weights are not there")
+class TestShipped:
+    def test_is_small_and_says_where_it_comes_from(self):
+        path = paths.MODELS / "default.safetensors"
+        assert path.stat().st_size < 16e6
+        metadata = Detector.load().metadata
+        assert {"trained_on", "commit", "stages", "metrics"} <= set(metadata)
+        assert json.dumps(metadata)
+
+    def test_finds_the_landmarks_of_the_shipped_recording(self):
+        if not paths.SHIPPED_RECORDING.exists():
+            pytest.skip("the shipped recording is not there")
+        from lib.landmarks.evaluation import evaluate_recording
+
+        result = evaluate_recording(Detector.load(), paths.SHIPPED_RECORDING, every=4)
+        assert result.scores.pck_0_10 >= 80
+        swapped = np.linalg.norm(result.landmarks.u[:, [0, 2, 1]] - result.u_true, axis=2)
+        separated = np.linalg.norm(result.u_true[:, 1] - result.u_true[:, 2], axis=1) > 20
+        assert not (swapped[separated, 1:] < result.error_px[separated, 1:]).any()
+
+    def test_tracking_agrees_with_whole_frames(self):
+        if not paths.SHIPPED_RECORDING.exists():
+            pytest.skip("the shipped recording is not there")
+        from lib.recordings import Recording
+
+        frame = Recording.open(paths.SHIPPED_RECORDING).frames[0]
+        pair = np.stack([frame.left, frame.right])
+        detector = Detector.load()
+        whole = detector(pair)
+        moved = Landmarks(whole.u + 4.0, whole.covariance, whole.confidence)
+        tracked = detector.track(pair, moved)
+        both = (whole.confidence > 0.5) & (tracked.confidence > 0.5)
+        assert both.any()
+        assert np.median(np.linalg.norm(tracked.u - whole.u, axis=2)[both]) < 0.5
+
+    def test_an_empty_field_has_no_landmarks(self):
+        ground = np.random.default_rng(0).integers(90, 140, (27, 48, 3), dtype=np.uint8)
+        found = Detector.load()(cv2.resize(ground, (1920, 1080))[None])
+        assert (found.confidence < 0.5).all()

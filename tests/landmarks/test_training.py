@@ -1,0 +1,152 @@
+import errno
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from lib.landmarks import training
+from lib.landmarks.augmentation import Augmentation, Batch
+from lib.landmarks.heatmaps import render
+from lib.landmarks.network import HourglassConfig
+from lib.landmarks.training import PRESETS, Samples, TrainingConfig, heatmap_loss, load_training, train
+
+SMALL = replace(
+    PRESETS["best"],
+    network=HourglassConfig(8, 1, 3),
+    augmentation=Augmentation(20.0, (0.8, 1.2), photometric=0.5, mirror=True),
+    steps=6,
+    batch_size=2,
+    validate_every=2,
+)
+
+
+def same(a, b):
+    return all(torch.equal(x, y) for x, y in zip(a.state_dict().values(), b.state_dict().values(), strict=True))
+
+
+def test_training_lowers_the_loss_and_finds_the_landmarks(toy):
+    config = replace(
+        PRESETS["best"],
+        network=HourglassConfig(16, 1, 3),
+        augmentation=Augmentation(15.0, (0.9, 1.1)),
+        steps=90,
+        batch_size=8,
+        validate_every=30,
+        precision="fp32",
+    )
+    log = train(config, toy(60), toy(20, seed=1), progress=False).log
+    assert log[-1]["loss"] < 0.4 * log[0]["loss"]
+    assert log[-1]["validation_loss"] < 0.4
+    assert log[-1]["pck_0.10"] > 80
+    assert log[-1]["spread"] == pytest.approx(1, abs=0.3)
+
+
+@pytest.mark.parametrize("changes", [{}, {"optimiser": "rmsprop", "ema": 0.0, "schedule": "constant", "precision": "fp32"}])
+def test_resume_is_exact(toy, tmp_path, changes):
+    config = replace(SMALL, **changes)
+    data, held_out = toy(8), toy(4, seed=1)
+    whole = train(config, data, held_out, progress=False)
+
+    class Interrupt(Exception):
+        pass
+
+    def interrupt(log):
+        if log[-1]["step"] == 4:
+            raise Interrupt
+
+    with pytest.raises(Interrupt):
+        train(config, data, held_out, tmp_path, progress=False, on_validation=interrupt)
+    resumed = train(config, data, held_out, tmp_path, progress=False)
+    assert same(whole.network, resumed.network)
+    assert [row["step"] for row in resumed.log] == [2, 4, 6]
+    assert resumed.log[-1]["validation_loss"] == whole.log[-1]["validation_loss"]
+    assert same(load_training(tmp_path / "last.safetensors").network, whole.network)
+    assert (tmp_path / "log.csv").read_text().count("\n") == 4
+
+
+def test_another_seed_is_another_training(toy):
+    a, b = (train(replace(SMALL, steps=2, seed=s), toy(8), toy(4), progress=False).network for s in (0, 1))
+    assert not same(a, b)
+
+
+def test_a_folder_of_another_training_or_data_is_refused(toy, tmp_path):
+    config = replace(SMALL, steps=2)
+    train(config, toy(8), toy(4), tmp_path, progress=False)
+    with pytest.raises(ValueError, match="another learning_rate"):
+        train(replace(config, learning_rate=1e-4), toy(8), toy(4), tmp_path, progress=False)
+    with pytest.raises(ValueError, match="other data"):
+        train(config, toy(9), toy(4), tmp_path, progress=False)
+
+
+def test_disk_full_leaves_the_last_checkpoint(toy, tmp_path, monkeypatch):
+    config = replace(SMALL, steps=4)
+    path = tmp_path / "last.safetensors"
+    train(replace(config, steps=4), toy(8), toy(4), tmp_path, progress=False, max_seconds=0.0)
+    good = path.read_bytes()
+    real = Path.write_bytes
+
+    def full(self, data):
+        real(self, data[: len(data) // 2])
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(OSError, match=r"last\.safetensors: not saved \(No space left.*unharmed"):
+        train(config, toy(8), toy(4), tmp_path, progress=False)
+    assert path.read_bytes() == good
+    assert not list(tmp_path.glob("*.partial"))
+    monkeypatch.undo()
+    assert train(config, toy(8), toy(4), tmp_path, progress=False).log[-1]["step"] == 4
+
+
+def test_patience_stops_a_training_that_no_longer_improves(toy):
+    config = replace(SMALL, steps=40, learning_rate=1e-12, validate_every=1, patience=2, ema=0.0)
+    frozen = train(config, toy(4), toy(2, seed=1), progress=False)
+    assert len(frozen.log) < 40
+
+
+def test_paper_preset_is_as_printed():
+    run = training._Run(replace(PRESETS["paper"], network=HourglassConfig(8, 1, 3)), None)
+    group = run.optimiser.param_groups[0]
+    assert isinstance(run.optimiser, torch.optim.RMSprop)
+    assert (group["alpha"], group["momentum"], group["lr"]) == (0.99, 0, 5e-5)
+    paper = PRESETS["paper"].augmentation
+    assert (paper.rotation_deg, paper.zoom, paper.photometric) == (30.0, (0.75, 1.25), 0)
+
+
+def test_loss_of_empty_heatmaps_is_one_and_of_the_target_zero():
+    u = torch.tensor([[[30.0, 30.0], [60.0, 50.0], [40.0, 64.0]]])
+    batch = Batch(torch.zeros(1, 3, 96, 128), u, torch.full((1, 3), 2))
+    target = render(u, (96, 128), 4)
+    assert heatmap_loss([torch.zeros_like(target)], batch, 4).item() == pytest.approx(1, abs=0.01)
+    assert heatmap_loss([target, target], batch, 4).item() == 0
+    # Intermediate supervision: both stacks count alike.
+    assert heatmap_loss([target, 0 * target], batch, 4) == heatmap_loss([0 * target, target], batch, 4)
+
+
+def test_unlabelled_landmarks_have_no_loss():
+    u = torch.tensor([[[30.0, 30.0], [60.0, 50.0], [torch.nan, torch.nan]]])
+    batch = Batch(torch.zeros(1, 3, 96, 128), u, torch.full((1, 3), 2))
+    output = render(u, (96, 128), 4)
+    output[:, 2] = 5.0
+    assert heatmap_loss([output], batch, 4) == 0
+
+
+def test_bad_data_is_named(toy):
+    good = toy(2)
+    with pytest.raises(ValueError, match="empty data set"):
+        Samples(good.images[:0], good.u[:0], good.visibility[:0])
+    with pytest.raises(ValueError, match="all landmarks of all images are missing"):
+        Samples(good.images, np.full_like(good.u, np.nan), good.visibility)
+    with pytest.raises(ValueError, match="images: expected"):
+        Samples(good.images[..., :1], good.u, good.visibility)
+    with pytest.raises(ValueError, match="u and visibility"):
+        Samples(good.images, good.u[:1], good.visibility)
+
+
+@pytest.mark.parametrize("changes", [{"optimiser": "sgd"}, {"schedule": "step"}, {"precision": "fp8"}, {"steps": 0}])
+def test_bad_configurations_are_named(changes):
+    with pytest.raises(ValueError, match=next(iter(changes))):
+        TrainingConfig(**changes)
