@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from lib.cameras import StereoRig
-from lib.figures.style import COLOURS, figure, show_image
-from lib.matching import Matches, ResponseMap
+from lib.figures.style import COLOURS, LANDMARK_COLOURS, figure, show_image
+from lib.matching import DisparityScore, Matches, ResponseMap
 from lib.surface import BSplineSurface, Mesh
 
 if TYPE_CHECKING:
@@ -34,10 +34,25 @@ __all__ = [
     "profiles",
     "reconstruction",
     "response_pyramid",
+    "score_table",
+    "smoothness_sections",
+    "smoothness_slider",
+    "stereo_pair",
 ]
 
 _SIGNED = "RdBu_r"
 _ERROR = "magma"
+
+
+def stereo_pair(left: np.ndarray, right: np.ndarray, u_tool: tuple[np.ndarray, np.ndarray]) -> Figure:
+    """The pair, with the landmarks of the tool, (3, 2) px each, NaN = missing."""
+    page, axes = figure(1, 2, width_in=13, height_in=3.9)
+    for ax, image, u, side in zip(axes, (left, right), u_tool, ("Left", "Right"), strict=True):
+        show_image(ax, image, side)
+        for (name, colour), point in zip(LANDMARK_COLOURS.items(), u, strict=True):
+            ax.plot(*point, "o", color=colour, markeredgecolor="black", label=name)
+        ax.legend(loc="upper right", fontsize=8)
+    return page
 
 
 def descriptor_channels(image: np.ndarray, channels: np.ndarray) -> Figure:
@@ -57,7 +72,7 @@ def descriptor_channels(image: np.ndarray, channels: np.ndarray) -> Figure:
 
 def response_pyramid(left: np.ndarray, right: np.ndarray, maps: list[ResponseMap]) -> Figure:
     """One patch of the left image at growing sizes, and below each how well it fits everywhere in the right image."""
-    page, axes = figure(2, len(maps), width_in=3.2 * len(maps), height_in=4.6)
+    page, axes = figure(2, len(maps), width_in=3.2 * len(maps), height_in=4.1)
     for (top, bottom), level in zip(axes.T, maps, strict=True):
         show_image(top, left, f"{level.size_px} px patch")
         corner = level.centre_px - level.size_px / 2
@@ -67,9 +82,9 @@ def response_pyramid(left: np.ndarray, right: np.ndarray, maps: list[ResponseMap
         # Contrast by rank within the map: the background of a flat correlation is high, the peak is what counts.
         shown = np.clip((level.response - np.median(level.response)) / np.ptp(level.response), 0, 1)
         bottom.imshow(shown, extent=(x0, x1, y1, y0), cmap="inferno", alpha=0.85, norm=PowerNorm(0.8))
-        near = level.response > 0.9 * level.response.max()
+        rivals = int((level.response > 0.8 * level.response.max()).sum()) - 1
         bottom.plot(*level.peak_px, "+", color="cyan", markersize=14, markeredgewidth=2)
-        bottom.set_title(f"above 90 % of the peak: {100 * near.mean():.1f} %", fontsize=9)
+        bottom.set_title(f"{rivals} of {level.response.size} places above 80 % of the peak", fontsize=9)
         bottom.set(xlim=(-0.5, right.shape[1] - 0.5), ylim=(right.shape[0] - 0.5, -0.5))
     return page
 
@@ -79,7 +94,7 @@ def match_fields(left: np.ndarray, fields: dict[str, Matches], *, direction: np.
     direction = np.array([1.0, 0.0]) if direction is None else direction
     shifts = {name: (m.u_right - m.u_left) @ direction for name, m in fields.items()}
     low, high = np.percentile(np.concatenate(list(shifts.values())), (3, 97))
-    page, axes = figure(1, len(fields), width_in=5.2 * len(fields), height_in=3.5, squeeze=False)
+    page, axes = figure(1, len(fields), width_in=5.6 * len(fields), height_in=3.1, squeeze=False)
     for ax, (name, matches) in zip(axes[0], fields.items(), strict=True):
         show_image(ax, _grey(left), f"{name}: {len(matches)} matches")
         size = 12 * max(1.0, 2000 / max(len(matches), 1)) ** 0.5
@@ -92,7 +107,7 @@ def epipolar_geometry(
     left: np.ndarray, right: np.ndarray, rig: StereoRig, u_left: np.ndarray, distance_px: np.ndarray, limit_px: float
 ) -> Figure:
     """Left points (k, 2), their epipolar lines in the right image, and the distances (n,) of matches."""
-    page, axes = figure(1, 3, width_in=14, height_in=3.4, width_ratios=(1, 1, 0.75))
+    page, axes = figure(1, 3, width_in=14, height_in=2.9, width_ratios=(1, 1, 0.75))
     show_image(axes[0], left, "Left: points")
     show_image(axes[1], right, "Right: their epipolar lines are parallel")
     width = right.shape[1]
@@ -106,25 +121,27 @@ def epipolar_geometry(
     span = 4 * limit_px
     axes[2].hist(np.clip(distance_px, -span, span), bins=81, color=COLOURS["ours"])
     axes[2].axvspan(
-        -limit_px, limit_px, color=COLOURS["truth"], alpha=0.15, label=f"kept: |distance| < {limit_px:.1f} px"
+        -limit_px, limit_px, color=COLOURS["truth"], alpha=0.15, label=f"kept: |distance| < {limit_px:.2f} px"
     )
-    axes[2].set(xlabel="epipolar distance of free matches (px)", ylabel="matches", title="The filter", yscale="log")
+    axes[2].set(xlabel="epipolar distance of matches (px)", ylabel="matches", title="The filter", yscale="log")
     axes[2].legend(loc="upper right", fontsize=8)
     return page
 
 
 def point_errors(errors_mm: dict[str, np.ndarray], sigma_um: dict[str, float]) -> Figure:
     """Histograms of the errors of triangulated points along named directions, and their predicted sigma (um)."""
-    page, axes = figure(1, len(errors_mm), width_in=4.2 * len(errors_mm), height_in=3.0, sharey=True)
+    page, axes = figure(1, len(errors_mm), width_in=5.2 * len(errors_mm), height_in=3.0)
     for ax, (name, error) in zip(axes, errors_mm.items(), strict=True):
-        error = error * 1000
+        error = error[np.isfinite(error)] * 1000
         spread = 1.4826 * np.median(np.abs(error - np.median(error)))
-        span = 6 * max(sigma_um.values())
+        span = 8 * max(sigma_um[name], spread)
         ax.hist(np.clip(error, -span, span), bins=np.linspace(-span, span, 91), density=True, color=COLOURS["ours"])
         x = np.linspace(-span, span, 400)
         gauss = np.exp(-0.5 * (x / sigma_um[name]) ** 2) / (sigma_um[name] * np.sqrt(2 * np.pi))
         ax.plot(x, gauss, color=COLOURS["paper"], label=f"predicted sigma {sigma_um[name]:.1f} um")
-        ax.set(xlabel="error (um)", title=f"{name}: robust sigma {spread:.1f} um", yscale="log", ylim=(1e-6, None))
+        ax.set(
+            xlabel="error (um)", title=f"{name}: robust sigma {spread:.1f} um", yscale="log", ylim=(2e-3 / span, None)
+        )
         ax.legend(loc="upper right", fontsize=8)
     axes[0].set_ylabel("density per um")
     return page
@@ -139,29 +156,33 @@ def profiles(
 ) -> Figure:
     """A section through the surface: the depths of the points near it, and curves (depth mm, colour) by name."""
     page, ax = figure(width_in=11, height_in=3.4)
-    ax.plot(*points, ".", color=COLOURS["baseline"], markersize=3, alpha=0.6, label="triangulated points")
-    for name, (depth, colour) in curves.items():
-        ax.plot(position_mm, depth, color=COLOURS[colour], label=name, lw=2.4 if colour == "truth" else 1.6)
-    all_depths = np.concatenate([depth for depth, _ in curves.values()])
-    margin = 0.25 * np.ptp(all_depths[np.isfinite(all_depths)])
-    ax.set(
-        xlabel="along the image row (mm)",
-        ylabel="depth along the view (mm)",
-        ylim=(np.nanmax(all_depths) + margin, np.nanmin(all_depths) - margin),
-        title=title,
-    )
+    _section(ax, position_mm, points, curves)
+    ax.set(ylabel="depth along the view (mm)", title=title)
     ax.legend(loc="best", fontsize=8, ncols=2)
     return page
+
+
+def _section(
+    ax: Axes, position_mm: np.ndarray, points: tuple[np.ndarray, np.ndarray], curves: dict[str, tuple[np.ndarray, str]]
+) -> None:
+    ax.plot(*points, ".", color=COLOURS["baseline"], markersize=3, alpha=0.6, label="triangulated points")
+    for name, (depth, colour) in curves.items():
+        ax.plot(position_mm, depth, color=COLOURS[colour], label=name, lw=2.6 if colour == "truth" else 1.6)
+    depths = np.concatenate([depth for depth, _ in curves.values()])
+    margin = 0.25 * np.ptp(depths[np.isfinite(depths)])
+    ax.set(xlabel="along the image row (mm)", ylim=(np.nanmax(depths) + margin, np.nanmin(depths) - margin))
 
 
 def held_out_curve(
     held_out: np.ndarray, chosen: float, smoothness: np.ndarray | None = None, error_um: np.ndarray | None = None
 ) -> Figure:
-    """Held-out error of the candidates (m, 2), the choice, and the true error of fits where it is known."""
+    """Held-out error of candidates (m, 2), in percent above the least; the choice; the true error where it is known."""
     page, ax = figure(width_in=7, height_in=3.4)
-    ax.plot(held_out[:, 0], held_out[:, 1] * 1000, "o-", color=COLOURS["ours"], label="held-out L1 error (left axis)")
+    excess = (held_out[:, 1] / held_out[:, 1].min() - 1) * 100
+    ax.plot(held_out[:, 0], excess, "o-", color=COLOURS["ours"], label="held-out error (left axis)")
     ax.axvline(chosen, color=COLOURS["ours"], ls=":", label="chosen")
-    ax.set(xscale="log", xlabel="smoothness mu (px²/mm)", ylabel="held-out L1 error (um)")
+    ax.set(xscale="log", xlabel="smoothness mu (px²/mm)", ylabel="held-out L1 error above the least (%)")
+    ax.set_yscale("symlog", linthresh=0.1)
     if error_um is not None:
         true = ax.twinx()
         true.plot(smoothness, error_um, "s--", color=COLOURS["truth"], label="true surface error (right axis)")
@@ -172,6 +193,62 @@ def held_out_curve(
         ax.legend(handles=handles, fontsize=8, loc="upper center")
     else:
         ax.legend(fontsize=8)
+    return page
+
+
+def smoothness_slider(
+    smoothness: np.ndarray,
+    depths_mm: list[np.ndarray],
+    position_mm: np.ndarray,
+    points: tuple[np.ndarray, np.ndarray],
+    reference: dict[str, tuple[np.ndarray, str]],
+) -> None:
+    """A slider over sections of surfaces of growing smoothness (in JupyterLab; elsewhere nothing moves)."""
+    import ipywidgets
+    from IPython.display import display
+
+    def draw(step: int) -> None:
+        curves = reference | {"surface": (depths_mm[step], "ours")}
+        page = profiles(position_mm, points, curves, title=f"mu = {smoothness[step]:.2g} px²/mm")
+        display(page)
+        plt.close(page)
+
+    labels = [(f"{mu:.1e}", k) for k, mu in enumerate(smoothness)]
+    slider = ipywidgets.SelectionSlider(options=labels, value=len(labels) // 2, description="mu")
+    ipywidgets.interact(draw, step=slider)
+
+
+def smoothness_sections(
+    smoothness: np.ndarray,
+    depths_mm: list[np.ndarray],
+    position_mm: np.ndarray,
+    points: tuple[np.ndarray, np.ndarray],
+    reference: dict[str, tuple[np.ndarray, str]],
+) -> Figure:
+    """Sections of three of the surfaces: too rough, in the middle, too smooth."""
+    page, axes = figure(1, 3, width_in=14, height_in=3.1, sharey=True)
+    for ax, step in zip(axes, (0, len(smoothness) // 2, len(smoothness) - 1), strict=True):
+        _section(ax, position_mm, points, reference | {"surface": (depths_mm[step], "ours")})
+        ax.set_title(f"mu = {smoothness[step]:.2g} px²/mm")
+    axes[0].set_ylabel("depth along the view (mm)")
+    axes[0].legend(loc="best", fontsize=8)
+    return page
+
+
+def score_table(scores: dict[str, dict[str, tuple[Matches, DisparityScore, float]]]) -> Figure:
+    """Matchers on real pairs: matches, median error, share above 1 and 2 px, seconds."""
+    header = ["pair", "method", "matches", "median (px)", "> 1 px", "> 2 px", "seconds"]
+    rows = [
+        [pair, method, f"{len(m)}", f"{s.median_px:.3f}", f"{s.above_1:.1%}", f"{s.above_2:.1%}", f"{seconds:.2f}"]
+        for pair, found in scores.items()
+        for method, (m, s, seconds) in found.items()
+    ]
+    page, ax = figure(width_in=9, height_in=0.32 * len(rows) + 0.6)
+    ax.axis("off")
+    table = ax.table(rows, colLabels=header, loc="center", cellLoc="center", edges="horizontal")
+    table.auto_set_font_size(False)
+    table.set_fontsize(10)
+    table.scale(1, 1.4)
     return page
 
 
@@ -207,7 +284,8 @@ def mesh_still(axes: Axes, surface_mm: np.ndarray, image: np.ndarray) -> Axes:
     shade = light.hillshade(np.nan_to_num(-z, nan=np.nanmean(-z)), vert_exag=3)[..., None]
     skin = np.clip(image / 255 * (0.55 + 0.6 * shade), 0, 1)
     axes.plot_surface(x, y, z, facecolors=skin, rstride=1, cstride=1, shade=False, antialiased=False)
-    axes.set_box_aspect((np.nanmax(x) - np.nanmin(x), np.nanmax(y) - np.nanmin(y), 2 * (np.nanmax(z) - np.nanmin(z))))
+    size = [np.nanmax(v) - np.nanmin(v) for v in (x, y, z)]
+    axes.set_box_aspect((size[0], size[1], 2 * size[2]), zoom=1.3)
     axes.set(xlabel="x (mm)", ylabel="y (mm)", zlabel="depth (mm)")
     axes.invert_zaxis()
     axes.invert_yaxis()
@@ -261,7 +339,7 @@ def mesh_view(mesh: Mesh, *, height_px: int = 520) -> go.Figure:
     return view
 
 
-def error_budget(rms_um: dict[str, float], *, highlight: str | None = None, target_um: float | None = None) -> Figure:
+def error_budget(rms_um: dict[str, float], *, highlight: str | None = None, paper_um: float | None = None) -> Figure:
     """RMS surface error of variants of the pipeline, as bars."""
     page, ax = figure(width_in=9, height_in=0.42 * len(rms_um) + 1.1)
     names = list(rms_um)[::-1]
@@ -269,10 +347,10 @@ def error_budget(rms_um: dict[str, float], *, highlight: str | None = None, targ
     colours = [COLOURS["ours"] if name == highlight else COLOURS["baseline"] for name in names]
     bars = ax.barh(names, values, color=colours)
     ax.bar_label(bars, fmt="%.1f", padding=3, fontsize=9)
-    if target_um is not None:
-        ax.axvline(target_um, color=COLOURS["paper"], ls="--", label=f"paper, flat checkerboard: {target_um:.1f} um")
+    if paper_um is not None:
+        ax.axvline(paper_um, color=COLOURS["paper"], ls="--", label=f"paper, flat checkerboard: {paper_um:.1f} um")
         ax.legend(fontsize=8, loc="lower right")
-    ax.set(xlabel="RMS error along the view (um)", xscale="log", xlim=(0.7 * min(values), 1.6 * max(values)))
+    ax.set(xlabel="RMS surface error (um)", xscale="log", xlim=(0.7 * min(values), 1.6 * max(values)))
     ax.grid(axis="y", visible=False)
     return page
 
@@ -285,16 +363,19 @@ def disparity_errors(
     limit_px: float = 4.0,
 ) -> Figure:
     """A real image, its measured disparity (h, w), and for each matcher its points (n, 2) and errors (n,) px."""
-    page, axes = figure(1, 2 + len(errors_px), width_in=3.5 * (2 + len(errors_px)), height_in=2.9)
-    show_image(axes[0], _grey(image), "Left image")
-    show_image(axes[1], truth_px, "Measured disparity")
-    axes[1].images[0].set_cmap("viridis")
-    for ax, (name, (u, error)) in zip(axes[2:], errors_px.items(), strict=True):
+    columns = (3 + len(errors_px)) // 2
+    page, axes = figure(2, columns, width_in=4.3 * columns, height_in=5.6)
+    panels = axes.ravel()
+    show_image(panels[0], _grey(image), "Left image")
+    show_image(panels[1], truth_px, "Measured disparity")
+    panels[1].images[0].set_cmap("viridis")
+    for ax, (name, (u, error)) in zip(panels[2:], errors_px.items(), strict=False):
         show_image(ax, np.full_like(_grey(image), 235), f"{name}: median {np.median(np.abs(error)):.2f} px")
         ax.images[0].set(cmap="gray", clim=(0, 255))
-        size = 3.0 if len(u) > 5000 else 5.0
+        size = 5.0 if len(u) > 1500 else 9.0
         dots = ax.scatter(*u.T, c=np.abs(error), s=size, cmap=_ERROR, vmin=0, vmax=limit_px, linewidths=0)
-        ax.title.set_fontsize(10)
+    for ax in panels[2 + len(errors_px) :]:
+        ax.axis("off")
     page.colorbar(dots, ax=axes.tolist(), label="|error| (px)", shrink=0.75)
     return page
 
