@@ -84,7 +84,7 @@ def response_pyramid(left: np.ndarray, right: np.ndarray, maps: list[ResponseMap
         bottom.imshow(shown, extent=(x0, x1, y1, y0), cmap="inferno", alpha=0.85, norm=PowerNorm(0.8))
         rivals = int((level.response > 0.8 * level.response.max()).sum()) - 1
         bottom.plot(*level.peak_px, "+", color="cyan", markersize=14, markeredgewidth=2)
-        bottom.set_title(f"{rivals} of {level.response.size} places above 80 % of the peak", fontsize=9)
+        bottom.set_title(f"{rivals} of {level.response.size} rivals above 80 % of the peak", fontsize=9)
         bottom.set(xlim=(-0.5, right.shape[1] - 0.5), ylim=(right.shape[0] - 0.5, -0.5))
     return page
 
@@ -285,7 +285,7 @@ def mesh_still(axes: Axes, surface_mm: np.ndarray, image: np.ndarray) -> Axes:
     skin = np.clip(image / 255 * (0.55 + 0.6 * shade), 0, 1)
     axes.plot_surface(x, y, z, facecolors=skin, rstride=1, cstride=1, shade=False, antialiased=False)
     size = [np.nanmax(v) - np.nanmin(v) for v in (x, y, z)]
-    axes.set_box_aspect((size[0], size[1], 2 * size[2]), zoom=1.3)
+    axes.set_box_aspect((size[0], size[1], 2 * size[2]), zoom=1.12)
     axes.set(xlabel="x (mm)", ylabel="y (mm)", zlabel="depth (mm)")
     axes.invert_zaxis()
     axes.invert_yaxis()
@@ -376,7 +376,7 @@ def disparity_errors(
         dots = ax.scatter(*u.T, c=np.abs(error), s=size, cmap=_ERROR, vmin=0, vmax=limit_px, linewidths=0)
     for ax in panels[2 + len(errors_px) :]:
         ax.axis("off")
-    page.colorbar(dots, ax=axes.tolist(), label="|error| (px)", shrink=0.75)
+    page.colorbar(dots, ax=panels.tolist(), label="|error| (px)", shrink=0.75)
     return page
 
 

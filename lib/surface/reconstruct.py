@@ -18,7 +18,7 @@ from lib.surface.fitting import fit_surface
 __all__ = ["EPIPOLAR_SIGMAS", "Reconstruction", "epipolar_inliers", "reconstruct"]
 
 #: Matches further from their epipolar line than so many standard deviations are dropped.
-EPIPOLAR_SIGMAS = 3.0
+EPIPOLAR_SIGMAS = 2.0
 
 
 @dataclass(frozen=True, eq=False)
