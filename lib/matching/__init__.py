@@ -61,6 +61,7 @@ def match(
     mask_right: ArrayLike | None = None,
     depth_range_mm: tuple[float, float] | None = None,
     setting: str = "quality",
+    min_score: float | None = None,
     downscale: int | None = None,
     budget_bytes: int = 2 << 30,
     max_epipolar_px: float = 6.0,
@@ -89,6 +90,9 @@ def match(
         pass.  Only used with a rig.
     setting:
         "quality" searches at full resolution (up to 3 Mpx), "fast" at up to 0.8 Mpx.  Not for "deepmatching".
+    min_score:
+        Matches with a lower score are dropped.  None is 0.5 for "band", whose score falls with the predicted standard
+        deviation (half of the wrong matches and few of the right ones lie below), and 0 for the others.
     downscale:
         DeepMatching only: descriptors are pooled by 2^downscale; None is the smallest from 1 that fits the budget.
     budget_bytes:
@@ -140,7 +144,9 @@ def match(
     inside = np.ones(len(matches), bool)
     for u, image in ((matches.u_left, images[0]), (matches.u_right, images[1])):
         inside &= ((u >= 0) & (u <= np.array(image.shape[::-1]) - 1)).all(axis=1)
-    matches = matches.keep(inside)
+    if min_score is None:
+        min_score = 0.5 if method == "band" else 0.0
+    matches = matches.keep(inside & (matches.score >= min_score))
     if rig is None or not len(matches):
         return matches
     distance = np.abs(rig.epipolar_distance(matches.u_left, matches.u_right))

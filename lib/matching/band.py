@@ -64,13 +64,14 @@ COARSE_REACH = 0.2
 MIN_SUPPORTED = 12
 
 #: Standard deviation along and off the line, in cells: gain times what `refine` says, and a floor.  Measured on
-#: synthetic affine pairs with known surface (noise 2 grey values, unequal gain and blur): the normalised errors then have
-#: a robust standard deviation of 1 (tests hold it between 0.7 and 1.4).
+#: synthetic affine pairs with known surface (noise 2 grey values, unequal gain and blur): the normalised errors then
+#: have a robust standard deviation of 1 (tests hold it between 0.7 and 1.4).
 SIGMA_GAIN = 3.5
 SIGMA_FLOOR = 0.015
 #: The left point is chosen, not measured; a patch has no sharper centre than this.
 SIGMA_LEFT_PX = 0.05
-#: `refine`'s sigma, in cells, at which every second match is wrong (Middlebury pairs, error above 2 px).
+#: `refine`'s sigma, in cells, at which the score is one half: there every third match of the Middlebury pairs and
+#: every twentieth of simulated eyes is wrong by more than 3/4 cell; below a third of it hardly any is.
 SIGMA_HALF = 0.06
 
 

@@ -18,7 +18,7 @@ __all__ = ["VolumeMatches", "correlation_volume", "match_volume", "n_levels"]
 PATCH = 4
 POWER = 1.4
 #: Lattice rows that are correlated at once.
-ROWS = 16
+ROWS = 8
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ def correlation_volume(left: torch.Tensor, right: torch.Tensor, low: int, n: int
     # Windows as (x, y, 4 cells of the row): any window is then `depth` contiguous numbers, so that BLAS reads it in
     # place.  One chunk of lattice rows at a time, which stays in the cache.
     volume = right.new_empty(gy, gx, 2 * v + 1, n)
-    block = max(4, min(gx, n // (2 * PATCH)))
+    block = max(4, min(gx, n // 2))
     row = PATCH * channels
     height_max = PATCH * ROWS + 2 * v
     strip = right.new_empty(n_x, height_max, row)
