@@ -104,8 +104,10 @@ def run(argv: list[str]) -> int:
 
 
 def test(argv: list[str]) -> int:
-    style = subprocess.call([sys.executable, "-m", "ruff", "check", "--output-format=concise", *ruff_options(), str(ROOT)])
-    return _pytest(argv) or style
+    style = subprocess.call(
+        [sys.executable, "-m", "ruff", "check", "--output-format=concise", *ruff_options(), str(ROOT)]
+    )
+    return _pytest(argv, failed=style)
 
 
 def bench(argv: list[str]) -> int:
@@ -123,10 +125,7 @@ def bench(argv: list[str]) -> int:
 def lab(argv: list[str]) -> int:
     root = ["--allow-root"] if hasattr(os, "geteuid") and os.geteuid() == 0 else []
     command = [sys.executable, "-m", "jupyterlab", f"--notebook-dir={ROOT}", "--LabApp.default_url=/lab/tree/notebooks"]
-    try:
-        return subprocess.call([*command, *root, *argv])
-    except KeyboardInterrupt:
-        return 0
+    return _become([*command, *root, *argv])
 
 
 def sweep(argv: list[str]) -> int:
@@ -153,9 +152,10 @@ def evaluate(argv: list[str]) -> int:
     return main(argv)
 
 
-def _pytest(argv: list[str]) -> int:
+def _pytest(argv: list[str], failed: int = 0) -> int:
     options = ["-c", str(ROOT / "environment.toml"), f"--rootdir={ROOT}"]
-    return subprocess.call([sys.executable, "-m", "pytest", *options, *argv])
+    command = [sys.executable, "-m", "pytest", *options, *argv]
+    return (subprocess.call(command) or failed) if failed else _become(command)
 
 
 def ruff_options() -> list[str]:

@@ -93,7 +93,7 @@ def run(
                     book, report.executed(book), values[book], cell_timeout_s=cell_timeout_s, on_cell=progress.cell
                 )
                 report.end(book, failure, progress.seconds)
-                progress.done(str(failure) if failure else None)
+                progress.done("failed" if failure else "done")
         report.finish()
     except KeyboardInterrupt:
         report.finish("stopped")
@@ -224,10 +224,10 @@ class _Progress:
     def cell(self, number: int, of: int) -> None:
         self.now = f"cell {number}/{of}"
 
-    def done(self, failure: str | None) -> None:
+    def done(self, how: str) -> None:
         self.__exit__()
         end = "\r\033[K" if self.live else ""
-        print(f"{end}{self.label}  {self.seconds:6.1f} s  {failure or 'done'}", flush=True)
+        print(f"{end}{self.label}  {self.seconds:6.1f} s  {how}", flush=True)
 
     def _tell(self) -> None:
         while not self.stop.wait(0.2 if self.live else 20.0):

@@ -7,6 +7,7 @@ import html
 import re
 
 import ziamath
+from latex2mathml.converter import convert as mathml
 
 __all__ = ["svg"]
 
@@ -17,7 +18,9 @@ _REWRITES = [
     (re.compile(r"\\operatorname\*?\{([^{}]*)\}"), r"\\mathrm{\1}\\,"),
     (re.compile(r"\\(begin|end)\{(aligned|gathered|align|equation)\}"), r"\\\1{align*}"),
     (re.compile(r"\\math(bb|cal|bf|rm|sf)\s+(\w)"), r"\\math\1{\2}"),
-    (re.compile(r"\\([bB]igg?)[lr]?\\[lr]?Vert\b"), r"\\\1\\Vert "),
+    (re.compile(r"\\[bB]igg?l\s*\\(?:[lr]?Vert\b|\|)"), r"\\left\\lVert "),
+    (re.compile(r"\\[bB]igg?r\s*\\(?:[lr]?Vert\b|\|)"), r"\\right\\rVert "),
+    (re.compile(r"\\[bB]igg?\s*\\(?:[lr]?Vert\b|\|)"), r"\\Vert "),
     (re.compile(r"\\tag\{([^{}]*)\}"), r"\\qquad\\mathrm{(\1)}"),
 ]
 
@@ -32,6 +35,8 @@ def svg(tex: str, *, display: bool, size_px: float = 17.0) -> str:
     for pattern, replacement in _REWRITES:
         text = pattern.sub(replacement, text)
     try:
+        if re.search(r"\\|&#x0005C;", mathml(text)):
+            raise ValueError("a command that the converter does not know")
         drawn = ziamath.Latex(text, size=size_px, inline=not display)
         picture = drawn.svg()
     except Exception:  # whatever the converter stumbles over: the reader still gets the TeX
