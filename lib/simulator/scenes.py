@@ -66,10 +66,10 @@ class Checkerboard:
         """(n, n, 3) uint8, white outside the squares."""
         square = 96
         n = (max(self.columns, self.rows) + 3) * square
-        texture = np.full((n, n), 225, np.uint8)
+        texture = np.full((n, n), 195, np.uint8)
         x0, y0 = (n - self.columns * square) // 2, (n - self.rows * square) // 2
         parity = np.add.outer(np.arange(self.rows), np.arange(self.columns)) % 2
-        squares = np.where(parity, 225, 28).astype(np.uint8)
+        squares = np.where(parity, 195, 28).astype(np.uint8)
         texture[y0 : y0 + self.rows * square, x0 : x0 + self.columns * square] = np.kron(
             squares, np.ones((square, square), np.uint8)
         )
@@ -215,7 +215,7 @@ def _screw(x: np.ndarray, y: np.ndarray, rng: np.random.Generator) -> tuple[np.n
     thread = 0.16 * np.cos(2 * np.pi * (x + 0.12 * y) / 0.7) * (np.abs(y) < 0.8)
     along = _step(x + 4.2) * _step(3.0 - x)
     head = np.sqrt(np.maximum(1.5**2 - y**2, 0)) * _step(x - 3.0) * _step(4.6 - x)
-    rise = np.maximum(along * np.where(core > 0, 0.75 + core + thread, 0), head + 0.3 * (head > 0)) * 0.85
+    rise = np.maximum(along * np.where(core > 0, 0.75 + core + thread, 0), head + 0.3 * (head > 0.02)) * 0.85
     share = _step(rise - 0.15)
     return rise, _mix(share, (0.42, 0.40, 0.36), (0.30, 0.22, 0.15))
 

@@ -1,0 +1,175 @@
+"""Figures of notebook 01: rig, imaging effects, sequences, labels, realism."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from lib.cameras import StereoRig
+from lib.figures.style import COLOURS, LANDMARK_COLOURS, figure, show_image
+from lib.recordings import Recording
+from lib.simulator.eye import Scene
+from lib.simulator.forceps import Forceps
+from lib.simulator.microscope import Microscope
+from lib.simulator.motion import Motion
+
+__all__ = [
+    "annotation_errors",
+    "contact_sheet",
+    "gallery",
+    "motion_page",
+    "realism_page",
+    "rig_page",
+    "volume_page",
+]
+
+
+def gallery(images: Mapping[str, np.ndarray], *, columns: int = 4, width_in: float = 12.0) -> Figure:
+    """Titled images of one size in rows."""
+    rows = -(-len(images) // columns)
+    height, width = next(iter(images.values())).shape[:2]
+    page, axes = figure(
+        rows, columns, width_in=width_in, height_in=rows * (width_in / columns * height / width + 0.3), squeeze=False
+    )
+    for ax in axes.flat:
+        ax.set_axis_off()
+    for ax, (title, image) in zip(axes.flat, images.items(), strict=False):
+        show_image(ax, image, title)
+        ax.title.set_fontsize(9)
+    return page
+
+
+def contact_sheet(recording: Recording, indices: Sequence[int], *, columns: int = 4, shrink: int = 4) -> Figure:
+    """Left images of a recording with the annotated landmarks."""
+    rows = -(-len(indices) // columns)
+    width, height = recording.image_size_px
+    page, axes = figure(
+        rows, columns, width_in=12, height_in=rows * (12 / columns * height / width + 0.25), squeeze=False
+    )
+    for ax in axes.flat:
+        ax.set_axis_off()
+    for ax, k in zip(axes.flat, indices, strict=False):
+        show_image(ax, recording.frames[k].left[::shrink, ::shrink], f"{recording.frames.time_s[k]:.1f} s")
+        ax.title.set_fontsize(9)
+        for colour, u in zip(LANDMARK_COLOURS.values(), recording.annotations.u_left[k], strict=True):
+            ax.plot(*((u + 0.5) / shrink - 0.5), "o", color=colour, markersize=5, markeredgecolor="black")
+    return page
+
+
+def rig_page(scene: Scene, microscope: Microscope, rig: StereoRig) -> Figure:
+    """A section through the eye with the two rays of one point, and depth error against the angle between the axes.
+
+    `rig` is in the microscope frame.
+    """
+    page, (section, error) = figure(1, 2, width_in=12, height_in=4.2, width_ratios=(1.7, 1))
+    x = np.linspace(-9.6, 9.6, 400)
+    z = scene.height(x, np.zeros_like(x))
+    half = microscope.depth_of_field_mm / 2
+    if np.isfinite(half):
+        section.axhspan(microscope.focus_z_mm - half, microscope.focus_z_mm + half, color="#e8f1f8", zorder=0)
+        section.text(-9.4, microscope.focus_z_mm - half + 0.08, "depth of field", va="top", fontsize=9, color="#446")
+    section.fill_between(x, z, 4, color="#e9b08a")
+    section.plot(x, z, color="#a4502c")
+    point = np.array([1.0, 0.0, float(scene.height(np.array(1.0), np.array(0.0)))])
+    for name, camera in (("left", rig.left), ("right", rig.right)):
+        d = camera.viewing_direction
+        start = point - d * (point[2] + 4.5) / d[2]
+        section.annotate("", point[[0, 2]], start[[0, 2]], arrowprops={"arrowstyle": "->", "color": COLOURS[name]})
+        section.text(start[0], start[2] - 0.1, name, color=COLOURS[name], ha="center")
+    section.set(
+        xlim=(-9.6, 9.6), ylim=(3.2, -5.2), xlabel="x (mm)", ylabel="z (mm), into the eye",
+        title="Section through the microscope's frame, y = 0",
+    )  # fmt: skip
+    angle = np.deg2rad(np.linspace(2, 20, 60))
+    um = 1e3 / (np.mean(microscope.pixels_per_mm) * np.sqrt(2) * np.sin(angle / 2))
+    error.plot(np.rad2deg(angle), um, color=COLOURS["ours"])
+    error.plot(
+        np.rad2deg(rig.convergence_rad),
+        np.interp(rig.convergence_rad, angle, um),
+        "o",
+        color=COLOURS["paper"],
+    )
+    error.set(
+        xlabel="angle between the axes (degrees)", ylabel="depth error (um)", ylim=(0, None),
+        title="Depth error of 1 px noise",
+    )  # fmt: skip
+    return page
+
+
+def motion_page(motions: Mapping[str, Motion], *, samples: int = 1500) -> Figure:
+    """Depth and opening over time for each motion, and the spectrum of a surgeon's tremor."""
+    page, axes = figure(len(motions), 3, width_in=12, height_in=2.7 * len(motions), squeeze=False)
+    for row, (name, motion) in zip(axes, motions.items(), strict=True):
+        time = np.linspace(0, motion.duration_s, samples)
+        poses = [motion.pose(t) for t in time]
+        x = np.array([motion.forceps.landmarks(pose) for pose in poses])
+        for k, (landmark, colour) in enumerate(LANDMARK_COLOURS.items()):
+            row[0].plot(time, x[:, k, 2], color=colour, label=landmark)
+        row[0].invert_yaxis()
+        row[0].set(xlabel="time (s)", ylabel="z (mm)", title=f"{name}: depth")
+        row[0].legend(fontsize=8)
+        row[1].plot(time, [pose.opening_mm for pose in poses], color=COLOURS["ours"])
+        row[1].set(xlabel="time (s)", ylabel="opening (mm)", title="Jaws")
+        step = 1 / 200
+        dense = np.array([motion.pose(t).base_mm for t in np.arange(0, min(motion.duration_s, 10), step)])
+        spectrum = np.abs(np.fft.rfft(np.diff(dense, axis=0) * np.hanning(len(dense) - 1)[:, None], axis=0)).sum(axis=1)
+        row[2].plot(np.fft.rfftfreq(len(dense) - 1, step), spectrum, color=COLOURS["ours"])
+        row[2].axvspan(8, 12, color="#fdebd0", zorder=0)
+        row[2].set(xlim=(0, 20), yscale="log", xlabel="frequency (Hz)", title="Velocity spectrum (tremor: 8 to 12 Hz)")
+    return page
+
+
+def volume_page(recording: Recording, forceps: Forceps | None = None) -> Figure:
+    """Where the landmarks were: in the left image, in depth, and the opening of the jaws."""
+    page, axes = figure(1, 3, width_in=12, height_in=3.6)
+    x = recording.landmarks_mm()
+    u = recording.annotations.u_left
+    depth = recording.truth.rig.left.viewing_direction
+    for k, (name, colour) in enumerate(LANDMARK_COLOURS.items()):
+        axes[0].plot(*u[:, k].T, "o", color=colour, markeredgecolor="black", markersize=5, label=name)
+        z = x[:, k] @ depth
+        axes[1].hist(z - np.nanmean(x @ depth), bins=14, color=colour, alpha=0.7, edgecolor="black", linewidth=0.4)
+    width, height = recording.image_size_px
+    axes[0].set(xlim=(0, width), ylim=(height, 0), aspect="equal", title="Annotations, left image (px)")
+    axes[0].legend(fontsize=8)
+    axes[1].set(xlabel="depth about its mean (mm)", title="Depths covered")
+    axes[2].plot(recording.frames.time_s, np.linalg.norm(x[:, 1] - x[:, 2], axis=1), "o-", color=COLOURS["ours"])
+    axes[2].set(xlabel="time (s)", ylabel="mm", title="Distance between the tips, from kinematics")
+    return page
+
+
+def annotation_errors(recording: Recording) -> np.ndarray:
+    """Clicked minus true landmarks, (n, 2) px, both cameras; needs a simulated recording."""
+    if recording.truth is None or recording.annotations is None:
+        raise ValueError(f"recording: {recording.name} has no truth or no annotations; take a simulated one.")
+    errors = [
+        (getattr(recording.annotations, f"u_{side}") - getattr(recording.truth, f"u_{side}")).reshape(-1, 2)
+        for side in ("left", "right")
+    ]
+    errors = np.concatenate(errors)
+    return errors[np.isfinite(errors).all(axis=1)]
+
+
+def realism_page(real: Mapping[str, np.ndarray], simulated: Mapping[str, np.ndarray]) -> Figure:
+    """Each statistic's distribution, simulated against the real frames' 5th to 95th percentile.
+
+    Both map a statistic to its values (n,).
+    """
+    columns = 4
+    rows = -(-len(real) // columns)
+    page, axes = figure(rows, columns, width_in=12, height_in=2.1 * rows, squeeze=False)
+    for ax in axes.flat[len(real) :]:
+        ax.set_axis_off()
+    for ax, name in zip(axes.flat, real, strict=False):
+        low, high = np.percentile(np.concatenate([real[name], simulated[name]]), [1, 97])
+        bins = np.linspace(low, high if high > low else low + 1, 18)
+        ax.axvspan(*np.percentile(real[name], [5, 95]), color="#eeeeee", zorder=0)
+        ax.hist(real[name], bins=bins, density=True, color=COLOURS["baseline"], alpha=0.8, label="real")
+        ax.hist(simulated[name], bins=bins, density=True, histtype="step", color=COLOURS["ours"], label="simulated")
+        ax.axvline(np.median(simulated[name]), color=COLOURS["ours"], linestyle="--", linewidth=1)
+        ax.set(yticks=[], title=name.replace("_", " "))
+        ax.title.set_fontsize(9)
+    axes.flat[0].legend(fontsize=7)
+    return page

@@ -1,0 +1,93 @@
+"""What each imaging effect does: the same window of the same moment, with one effect at a time."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from lib.cameras import AffineCamera
+from lib.geometry import RigidTransform
+from lib.simulator.eye import Eye
+from lib.simulator.forceps import Forceps, Pose
+from lib.simulator.microscope import Microscope
+from lib.simulator.render import View, render_view
+
+__all__ = ["PLAIN", "effect_gallery", "render_window"]
+
+#: A microscope without any imperfection: everything sharp, evenly lit, noiseless and lossless.
+PLAIN = Microscope(
+    depth_of_field_mm=float("inf"),
+    psf_px=0.5,
+    exposure_s=0.0,
+    readout_s=0.0,
+    spot_radius_mm=1e3,
+    vignetting=0.0,
+    gain=((1.0, 1.0, 1.0), (1.0, 1.0, 1.0)),
+    full_well=float("inf"),
+    jpeg_quality=None,
+)
+
+
+def render_window(
+    eye: Eye,
+    forceps: Forceps,
+    pose: Pose,
+    microscope: Microscope,
+    *,
+    side: int = 0,
+    size_px: tuple[int, int] = (420, 320),
+    velocity_mm_s: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    seed: int = 0,
+) -> View:
+    """A window of the full-resolution image round the jaws: cheap enough for a slider.
+
+    Parameters
+    ----------
+    velocity_mm_s:
+        Of the tool, for motion blur and rolling shutter.
+    """
+    rig = microscope.rig(RigidTransform.identity())
+    camera = (rig.left, rig.right)[side]
+    centre = rig.left.project(forceps.landmarks(pose)).mean(axis=0)
+    origin = np.round(centre - np.array(size_px) / 2)
+    window = AffineCamera(np.column_stack([camera.linear, camera.offset_px - origin]))
+    later = (pose.moved(base_mm=tuple(np.asarray(pose.base_mm) + 1e-3 * np.asarray(velocity_mm_s))), 1e-3)
+    view = render_view(
+        eye, microscope, window, size_px, side=side, forceps=forceps, pose=pose, later=later,
+        rng=np.random.default_rng(seed), factor=3, field_px=microscope.image_size_px, origin_px=tuple(origin),
+    )  # fmt: skip
+    if microscope.jpeg_quality is None:
+        return view
+    data = cv2.imencode(".jpg", view.image, [cv2.IMWRITE_JPEG_QUALITY, microscope.jpeg_quality])[1]
+    return replace(view, image=cv2.imdecode(data, cv2.IMREAD_COLOR))
+
+
+def effect_gallery(eye: Eye, forceps: Forceps, pose: Pose) -> dict[str, np.ndarray]:
+    """Title -> image (h, w, 3): nothing, each effect alone (stronger than by default, to be seen), and all together."""
+    matt = replace(eye, gloss=0.0)
+    fast = (9.0, 14.0, 0.0)
+    default = Microscope()
+    shots = {
+        "Geometry, texture, shadow": (matt, PLAIN, {}),
+        "+ wet surface, left eye": (eye, PLAIN, {}),
+        "+ wet surface, right eye": (eye, PLAIN, {"side": 1}),
+        "Defocus, depth of field 1 mm": (matt, replace(PLAIN, depth_of_field_mm=1.0), {}),
+        "Motion blur, 17 mm/s, 20 ms": (matt, replace(PLAIN, exposure_s=0.020), {"velocity_mm_s": fast}),
+        "Rolling shutter, 120 mm/s": (matt, replace(PLAIN, readout_s=0.03), {"velocity_mm_s": (120.0, 0.0, 0.0)}),
+        "Coaxial light, vignetting": (
+            matt,
+            replace(PLAIN, spot_radius_mm=2.0, spot_mm=(pose.base_mm[0] + 2, pose.base_mm[1] - 1.5), vignetting=0.9),
+            {},
+        ),
+        "Shot and read noise": (matt, replace(PLAIN, full_well=700.0, read_noise=12.0), {}),
+        "JPEG, quality 15": (matt, replace(PLAIN, jpeg_quality=15), {}),
+        "Colour of the other eye": (matt, replace(PLAIN, gain=((0.8, 1.0, 1.35),) * 2), {}),
+        "All, default left": (eye, default, {}),
+        "All, default right": (eye, default, {"side": 1}),
+    }
+    return {
+        title: render_window(scene, forceps, pose, microscope, **options).image
+        for title, (scene, microscope, options) in shots.items()
+    }
