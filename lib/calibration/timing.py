@@ -10,20 +10,22 @@ from numpy.typing import ArrayLike
 from scipy.interpolate import BSpline, CubicSpline, make_lsq_spline
 
 from lib.calibration.affine import Moments, affine_minimum, dlt, estimate_noise
+from lib.calibration.robust import consensus
 
 __all__ = ["TimeOffset", "estimate_time_offset", "rolling_shutter"]
 
 
 @dataclass(frozen=True)
 class TimeOffset:
-    """t_robot = t_video + offset_s, its standard deviation, and whether it differs from zero by three of them."""
+    """t_robot = t_video + offset_s, its standard deviation, and the reprojection RMS (px, distance in an image) there."""
 
     offset_s: float
     sd_s: float
+    rms_px: float
 
     @property
     def significant(self) -> bool:
-        """True where ignoring it would be wrong."""
+        """True where the offset differs from zero by more than three standard deviations."""
         return abs(self.offset_s) > 3.0 * self.sd_s
 
     def __str__(self) -> str:
@@ -106,7 +108,11 @@ def estimate_time_offset(
     known = np.isfinite(y).all(axis=1)
     y = y[known]
 
-    def solve(offset: float) -> tuple[float, float, float]:
+    def misfit(offset: float) -> float:
+        x = spline(time + offset).reshape(-1, 3)[known]
+        return affine_minimum(Moments.of(x, y), 1.0, 0.0).cost
+
+    def step_and_sd(offset: float) -> tuple[float, float]:
         x = spline(time + offset).reshape(-1, 3)[known]
         v = spline(time + offset, 1).reshape(-1, 3)[known]
         matrix = affine_minimum(Moments.of(x, y), 1.0, 0.0).matrix
@@ -119,15 +125,15 @@ def estimate_time_offset(
         information = np.einsum("ni,ij,nj->", image, W, image)
         if information <= 0:
             raise ValueError("robot_x_mm: the tool moves at no varying speed; the offset cannot be seen.")
-        return float((r**2).sum()), float(np.einsum("ni,ij,nj->", image, W, r) / information), float(information**-0.5)
+        return float(np.einsum("ni,ij,nj->", image, W, r) / information), float(information**-0.5)
 
-    offset = min(np.linspace(start_s - search_s, start_s + search_s, 41), key=lambda s: solve(s)[0])
+    offset = min(np.linspace(start_s - search_s, start_s + search_s, 41), key=misfit)
     for _ in range(20):
-        _, step, sd = solve(offset)
+        step, sd = step_and_sd(offset)
         offset = float(np.clip(offset + step, start_s - search_s, start_s + search_s))
         if abs(step) < 1e-7:
             break
-    return TimeOffset(offset, sd)
+    return TimeOffset(offset, sd, float(np.sqrt(4.0 * misfit(offset) / y.size)))
 
 
 def rolling_shutter(
@@ -143,7 +149,7 @@ def rolling_shutter(
 ) -> tuple[np.ndarray, list[np.ndarray]]:
     """Correspondences of a rolling shutter: kinematics at the time when the landmark's own row was read.
 
-    Row 0 is read at the frame's time, the last row `readout_s` later.  The two cameras see a landmark on different rows; x is
+    The middle row is read at the frame's time, the last row half `readout_s` later.  The two cameras see a landmark on different rows; x is
     taken at the mean of their times, and each camera's pixel is moved to it by the landmark's velocity.
 
     Parameters
@@ -180,7 +186,7 @@ def rolling_shutter(
     spline, smooth, robot_time = _spline(robot_time_s, robot_x_mm, smooth_s)
     time, landmarks = np.asarray(frame_time_s, dtype=np.float64), smooth.c.shape[1]
     y = _images(u, len(time), landmarks).reshape(len(time), landmarks, -1, 2)
-    row_time = readout_s * y[..., 1] / (height_px - 1)  # (n, k, cameras)
+    row_time = readout_s * (y[..., 1] / (height_px - 1) - 0.5)  # (n, k, cameras)
     mean_time = time[:, None] + offset_s + row_time.mean(axis=2)
     known = np.isfinite(mean_time) & (mean_time >= robot_time[0]) & (mean_time <= robot_time[-1])
     x, v = np.full((*mean_time.shape, 3), np.nan), np.full((*mean_time.shape, 3), np.nan)
@@ -189,9 +195,11 @@ def rolling_shutter(
         x[use, k] = spline(mean_time[use, k])[:, k]
         v[use, k] = smooth(mean_time[use, k], 1)[:, k]
     corrected = []
+    agree = known.copy()  # a gross outlier must not spoil the cameras that turn velocity into pixels
+    agree[known] = consensus(x[known], y[known].reshape(known.sum(), -1), None, np.random.default_rng(0))
     for c, given in enumerate(u):
         pixels = y[:, :, c]
-        A = dlt(x[known], pixels[known]).linear
+        A = dlt(x[agree], pixels[agree]).linear
         moved = pixels - (v @ A.T) * (row_time[..., c] - row_time.mean(axis=2))[..., None]
         corrected.append(moved.reshape(np.shape(given)))
     return (x[:, 0] if np.ndim(robot_x_mm) == 2 else x), corrected

@@ -44,7 +44,7 @@ def video(offset_s, seed, frames=300, readout_s=0.0):
     for camera in (rig.left, rig.right):
         pixels = camera.project(sweep(time + offset_s))
         for _ in range(4):  # the row decides the time, the time the row
-            rows = readout_s * pixels[:, 1] / 1079
+            rows = readout_s * (pixels[:, 1] / 1079 - 0.5)
             pixels = camera.project(sweep(time + offset_s + rows))
         u.append(pixels + rng.normal(0, 1.5, pixels.shape))
     return time, u, robot_time, robot_x

@@ -1,0 +1,238 @@
+"""Figures of notebook 03: calibration and how well it is known."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from lib.calibration.estimate import Calibration
+from lib.calibration.ladder import Comparison
+from lib.calibration.real_robot import RobotFrames, SphereFit
+from lib.calibration.studies import NoiseStudy
+from lib.figures.style import COLOURS, LANDMARK_COLOURS, figure, show_image
+from lib.geometry import RigidTransform
+
+__all__ = [
+    "advice_curves",
+    "advice_view",
+    "correspondences",
+    "ellipsoids",
+    "focal_lengths",
+    "frame_residuals",
+    "ladder",
+    "noise_errors",
+    "residuals",
+    "robot_frames",
+    "shallow_bias",
+    "time_offset",
+    "working_distance",
+]
+
+
+def correspondences(x_mm: np.ndarray, u_left: np.ndarray, u_right: np.ndarray, size_px: tuple[int, int]) -> Figure:
+    """Robot positions (n, 3) in 3D and their detections in both images, coloured by depth along z of the robot."""
+    page, _ = figure(1, 3, width_in=13, height_in=3.8)
+    page.clear()
+    axes = page.add_subplot(1, 3, 1, projection="3d")
+    colour = x_mm[:, 2]
+    axes.scatter(*x_mm.T, c=colour, s=8)
+    axes.set(xlabel="x (mm)", ylabel="y (mm)", zlabel="z (mm)", title="Robot: where the landmarks were")
+    axes.set_box_aspect(np.ptp(x_mm, axis=0))
+    for i, (u, side) in enumerate(((u_left, "Left"), (u_right, "Right"))):
+        flat = page.add_subplot(1, 3, i + 2)
+        flat.scatter(*u.T, c=colour, s=8)
+        flat.set(xlim=(0, size_px[0]), ylim=(size_px[1], 0), aspect="equal", xlabel="x (px)", title=f"{side} image: where they were seen")
+    return page
+
+
+def noise_errors(study: NoiseStudy) -> Figure:
+    """Triangulation and reprojection error against detector noise, affine and perspective (the paper's figure)."""
+    page, axes = figure(1, 2, width_in=11, height_in=3.8)
+    for ax, affine, perspective, unit, title in (
+        (axes[0], study.affine_um, study.perspective_um, "um", "Triangulation error (3D RMS)"),
+        (axes[1], study.affine_px, study.perspective_px, "px", "Reprojection error (RMS)"),
+    ):
+        for values, name, colour in ((affine, "affine, joint", "ours"), (perspective, "perspective DLT", "paper")):
+            low, middle, high = np.percentile(values, [10, 50, 90], axis=1)
+            ax.plot(study.sigma_u_px, middle, "o-", color=COLOURS[colour], label=name)
+            ax.fill_between(study.sigma_u_px, low, high, color=COLOURS[colour], alpha=0.2, linewidth=0)
+        ax.set(xlabel="detector noise (px per coordinate)", ylabel=unit, title=title, xscale="log", yscale="log")
+        ax.legend()
+    return page
+
+
+def focal_lengths(found_px: np.ndarray, true_px: float) -> Figure:
+    """Focal lengths that a perspective decomposition returns for a far camera."""
+    page, ax = figure(width_in=8, height_in=3.0)
+    bins = np.geomspace(found_px.min() * 0.8, true_px * 1.5, 40)
+    ax.hist(found_px, bins=bins, color=COLOURS["paper"], label="perspective DLT, decomposed")
+    ax.axvline(true_px, color=COLOURS["truth"], linewidth=2.5, label="true focal length")
+    ax.set(xscale="log", xlabel="focal length (px)", ylabel="runs", title="A far camera's focal length is noise")
+    ax.legend(loc="upper center")
+    return page
+
+
+def shallow_bias(half_depth_mm: Sequence[float], ratios: Mapping[str, np.ndarray]) -> Figure:
+    """Estimated over true depth column against the depth covered by the tool."""
+    page, ax = figure(width_in=8.5, height_in=3.8)
+    styles = {"DLT": ("baseline", "s-"), "likelihood": ("ours", "o-"), "as printed, mm": ("paper", "^-"), "as printed, um": ("warning", "v-")}
+    for name, values in ratios.items():
+        colour, style = styles[name]
+        ax.plot(half_depth_mm, values, style, color=COLOURS[colour], label=name)
+    ax.axhline(1, color="black", linewidth=0.8)
+    ax.set(xscale="log", xlabel="half depth covered by the tool (mm)", ylabel="depth scale found / true", ylim=(0.7, 1.6), title="Weights matter where the sweep is shallow")
+    ax.legend(ncols=2)
+    return page
+
+
+def ladder(comparisons: Mapping[str, Comparison]) -> Figure:
+    """BIC above the best model's, a panel a data set."""
+    page, axes = figure(1, len(comparisons), width_in=12, height_in=3.8, sharey=True, squeeze=False)
+    for ax, (title, comparison) in zip(axes[0], comparisons.items(), strict=True):
+        names = [rung.model for rung in comparison.rungs]
+        delta = [rung.bic - comparison.best.bic for rung in comparison.rungs]
+        colours = [COLOURS["ours"] if rung is comparison.best else COLOURS["baseline"] for rung in comparison.rungs]
+        ax.barh(names, np.array(delta) + 1, color=colours)
+        for i, rung in enumerate(comparison.rungs):
+            ax.text(delta[i] + 1.3, i, f"{delta[i]:.0f}" if rung is not comparison.best else "chosen", va="center", fontsize=8)
+        ax.set(xscale="log", xlim=(1, 4e4), xlabel="BIC above the best + 1", title=title)
+        ax.invert_yaxis()
+    return page
+
+
+def ellipsoids(calibration: Calibration, x_mm: np.ndarray, *, scale: float = 10.0) -> Figure:
+    """Uncertainty ellipsoids of triangulated points (n, 3), with and without the noise of their own detection, enlarged."""
+    page, _ = figure(1, 2, width_in=12, height_in=4.6)
+    page.clear()
+    a, b = np.meshgrid(np.linspace(0, 2 * np.pi, 25), np.linspace(0, np.pi, 13))
+    sphere = np.stack([np.cos(a) * np.sin(b), np.sin(a) * np.sin(b), np.cos(b)], axis=-1)
+    panels = ((True, 3 * scale / 10, "Detection and calibration"), (False, scale, "Calibration alone"))
+    for i, (detection, factor, title) in enumerate(panels):
+        axes = page.add_subplot(1, 2, i + 1, projection="3d")
+        sd = []
+        for x, covariance in zip(x_mm, calibration.point_covariance(x_mm, detection=detection), strict=True):
+            values, vectors = np.linalg.eigh(covariance)
+            surface = x + factor * (sphere * np.sqrt(values)) @ vectors.T
+            axes.plot_surface(*np.moveaxis(surface, -1, 0), color=COLOURS["ours" if detection else "paper"], alpha=0.7, linewidth=0)
+            sd.append(1e3 * np.sqrt(values[-1]))
+        axes.set(xlabel="x (mm)", ylabel="y (mm)", zlabel="z (mm)")
+        axes.set_title(f"{title}: 1 sd enlarged {factor:.0f} times\nlongest half axis {min(sd):.0f} to {max(sd):.0f} um")
+        axes.set_aspect("equal")
+        axes.set(xlabel="x (mm)", ylabel="y (mm)", zlabel="z (mm)")
+    return page
+
+
+def advice_view(
+    calibration: Calibration, robot_from_microscope: RigidTransform, half_size_mm: np.ndarray, advised_mm: np.ndarray
+) -> Figure:
+    """Depth sd from calibration over the focal plane, the correspondences used, and the advised position (3,)."""
+    page, ax = figure(width_in=8.5, height_in=4.4)
+    x, y = np.meshgrid(*(np.linspace(-h, h, 41) for h in half_size_mm[:2]))
+    plane = robot_from_microscope.apply(np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]))
+    depth = 1e3 * calibration.depth_sd_mm(plane).reshape(x.shape)
+    extent = (-half_size_mm[0], half_size_mm[0], -half_size_mm[1], half_size_mm[1])
+    image = ax.imshow(depth, extent=extent, origin="lower", cmap="viridis", vmin=0, aspect="equal")
+    used, advised = (robot_from_microscope.inverse().apply(p) for p in (calibration.x_mm, advised_mm[None]))
+    ax.plot(*used[:, :2].T, "o", color="white", markersize=4, markeredgecolor="black", label="correspondences", clip_on=False)
+    ax.plot(
+        *advised[:, :2].T, "*", color=COLOURS["warning"], markersize=18, markeredgecolor="black", label="go here next", clip_on=False
+    )
+    page.colorbar(image, ax=ax, label="depth sd from calibration (um)")
+    ax.set(xlabel="x (mm)", ylabel="y (mm)")
+    ax.set_title(f"{len(used)} correspondences: {depth.mean():.0f} um mean, {depth.max():.0f} um worst", pad=14)
+    ax.grid(False)
+    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2)
+    return page
+
+
+def advice_curves(curves: Mapping[str, np.ndarray], start: int) -> Figure:
+    """RMS sqrt(leverage) over the workspace against the number of added points."""
+    page, ax = figure(width_in=8, height_in=3.4)
+    for name, colour in (("random", "baseline"), ("advised", "ours")):
+        ax.plot(np.arange(len(curves[name])), curves[name], "o-", markersize=3, color=COLOURS[colour], label=name)
+    ax.set(xlabel=f"positions added to {start} clustered ones", ylabel="calibration sd / sd of a row", yscale="log", title="Where the tool goes matters more than how often")
+    ax.legend()
+    return page
+
+
+def residuals(calibration: Calibration) -> Figure:
+    """Residual arrows over each image, their distribution against the Gaussian expected, and against depth."""
+    c = len(calibration.cameras)
+    page, axes = figure(1, c + 1, width_in=13, height_in=3.6)
+    good = calibration.inliers
+    for i, side in enumerate(["Left", "Right"] if c == 2 else ["Camera"]):
+        u, r = calibration.y_px[:, 2 * i : 2 * i + 2], calibration.residuals_px[:, 2 * i : 2 * i + 2]
+        ax = axes[i]
+        ax.quiver(*u[good].T, *r[good].T, angles="xy", scale_units="xy", scale=0.04, color=COLOURS["ours"], width=0.003)
+        ax.plot(*u[~good].T, "x", color=COLOURS["paper"], label="outlier")
+        ax.invert_yaxis()
+        ax.set(aspect="equal", title=f"{side}: residuals, 25 times", xlabel="px")
+        if (~good).any():
+            ax.legend()
+    r = calibration.residuals_px[good].ravel()
+    span = np.linspace(-4 * r.std(), 4 * r.std(), 200)
+    axes[-1].hist(r, bins=30, density=True, color=COLOURS["baseline"], label="residuals")
+    axes[-1].plot(span, np.exp(-0.5 * (span / r.std()) ** 2) / (r.std() * np.sqrt(2 * np.pi)), color=COLOURS["ours"], label="Gaussian")
+    axes[-1].set(xlabel="px", title=f"{r.std():.2f} px a coordinate", yticks=[])
+    axes[-1].legend()
+    return page
+
+
+def frame_residuals(image: np.ndarray, detected: np.ndarray, predicted: np.ndarray, title: str) -> Figure:
+    """One frame: detections (3, 2) and where the calibrated camera puts the robot's landmarks, with a magnified view."""
+    page, axes = figure(1, 2, width_in=13, height_in=4.2, width_ratios=[1.6, 1])
+    middle, half = np.nanmean(detected, axis=0), max(90.0, 0.7 * float(np.nanmax(np.nanmax(detected, 0) - np.nanmin(detected, 0))))
+    for ax in axes:
+        show_image(ax, image, title if ax is axes[0] else "Magnified")
+        size = 5 if ax is axes[0] else 11
+        for name, d, p in zip(LANDMARK_COLOURS, detected, predicted, strict=True):
+            ax.plot(*d, "o", color=LANDMARK_COLOURS[name], markersize=size, markeredgecolor="black", label=f"{name} detected")
+            ax.plot(*p, "+", color="white", markersize=1.6 * size, markeredgewidth=2)
+    axes[1].set(xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] + half, middle[1] - half))
+    axes[0].plot([], [], "+", color="white", markersize=9, markeredgewidth=2, label="robot, projected")
+    axes[0].legend(loc="upper right", fontsize=8, labelcolor="white")
+    return page
+
+
+def working_distance(distances_mm: Sequence[float], study: Mapping[str, np.ndarray]) -> Figure:
+    """3D error of the affine and the near-affine model against working distance."""
+    page, ax = figure(width_in=8, height_in=3.6)
+    labels = [f"{d:.0f}" if np.isfinite(d) else "affine" for d in distances_mm]
+    at = np.arange(len(labels))
+    ax.bar(at - 0.2, study["affine_um"], 0.4, color=COLOURS["paper"], label="affine (zero skew)")
+    ax.bar(at + 0.2, study["near_affine_um"], 0.4, color=COLOURS["ours"], label="with 1/distance")
+    for i, share in enumerate(study["chosen"]):
+        ax.text(i, max(study["affine_um"][i], study["near_affine_um"][i]) + 3, f"BIC takes 1/distance: {100 * share:.0f} %", ha="center", fontsize=8)
+    ax.set(xticks=at, xticklabels=labels, xlabel="working distance (mm)", ylabel="held-out 3D RMS (um)", title="The one parameter that pays")
+    ax.legend()
+    return page
+
+
+def time_offset(offsets_ms: np.ndarray, reprojection_px: np.ndarray, found_ms: float, sd_ms: float) -> Figure:
+    """Reprojection error against the assumed clock offset, and the estimate."""
+    page, ax = figure(width_in=8, height_in=3.2)
+    ax.plot(offsets_ms, reprojection_px, color=COLOURS["baseline"])
+    ax.axvspan(found_ms - 3 * sd_ms, found_ms + 3 * sd_ms, color=COLOURS["ours"], alpha=0.4, label=f"estimate {found_ms:.2f} +- {sd_ms:.2f} ms (3 sd shown)")
+    ax.set(xlabel="assumed offset between the clocks (ms)", ylabel="reprojection RMS (px)", title="The clocks reveal themselves")
+    ax.legend()
+    return page
+
+
+def robot_frames(frames: RobotFrames, rows: Sequence[int], fits: Mapping[str, Sequence[SphereFit]]) -> Figure:
+    """Frames of the real robot with the spheres found, and leave-one-out residuals (20 times) of two models."""
+    page, axes = figure(1, len(rows), width_in=13, height_in=3.6)
+    colours = dict(zip(fits, (COLOURS["warning"], COLOURS["ours"]), strict=True))
+    for ax, row in zip(axes, rows, strict=True):
+        show_image(ax, frames.image(row), f"Frame {frames.index[row]}")
+        for s in range(2):
+            u, radius = frames.u[row, s], frames.radius_px[row, s]
+            angle = np.linspace(0, 2 * np.pi, 100)
+            ax.plot(u[0] + radius * np.cos(angle), u[1] + radius * np.sin(angle), color="white", linewidth=1.2)
+            for name, both in fits.items():
+                ax.annotate("", u + 20 * both[s].leave_one_out_px[row], u, arrowprops={"arrowstyle": "->", "color": colours[name], "linewidth": 2})
+    for name, colour in colours.items():
+        axes[0].plot([], [], color=colour, label=f"{name}, 20 times")
+    axes[0].legend(loc="lower right", fontsize=8, labelcolor="white")
+    return page
