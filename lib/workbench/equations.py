@@ -18,9 +18,9 @@ _REWRITES = [
     (re.compile(r"\\operatorname\*?\{([^{}]*)\}"), r"\\mathrm{\1}\\,"),
     (re.compile(r"\\(begin|end)\{(aligned|gathered|align|equation)\}"), r"\\\1{align*}"),
     (re.compile(r"\\math(bb|cal|bf|rm|sf)\s+(\w)"), r"\\math\1{\2}"),
-    (re.compile(r"\\[bB]igg?l\s*\\(?:[lr]?Vert\b|\|)"), r"\\left\\lVert "),
-    (re.compile(r"\\[bB]igg?r\s*\\(?:[lr]?Vert\b|\|)"), r"\\right\\rVert "),
-    (re.compile(r"\\[bB]igg?\s*\\(?:[lr]?Vert\b|\|)"), r"\\Vert "),
+    (re.compile(r"\\[bB]igg?l\s*\\(?:[lr]?Vert(?![A-Za-z])|\|)"), r"\\left\\lVert "),
+    (re.compile(r"\\[bB]igg?r\s*\\(?:[lr]?Vert(?![A-Za-z])|\|)"), r"\\right\\rVert "),
+    (re.compile(r"\\[bB]igg?\s*\\(?:[lr]?Vert(?![A-Za-z])|\|)"), r"\\Vert "),
     (re.compile(r"\\tag\{([^{}]*)\}"), r"\\qquad\\mathrm{(\1)}"),
 ]
 
