@@ -302,7 +302,7 @@ def reconstruction(
     `mask` (h, w), True = no surface there.
     """
     h, w = image.shape[:2]
-    step = max(1, w // 160)
+    step = max(1, w // 128)
     y, x = np.arange(0, h, step), np.arange(0, w, step)
     axes_mm = np.stack([*_across(rig), rig.left.viewing_direction])
     points = surface.on_grid(x, y) @ axes_mm.T
