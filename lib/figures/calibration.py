@@ -98,17 +98,17 @@ def ladder(comparisons: Mapping[str, Comparison]) -> Figure:
         for i, rung in enumerate(comparison.rungs):
             ax.text(delta[i] + 1.3, i, f"{delta[i]:.0f}" if rung is not comparison.best else "chosen", va="center", fontsize=8)
         ax.set(xscale="log", xlim=(1, 4e4), xlabel="BIC above the best + 1", title=title)
-        ax.invert_yaxis()
+    axes[0, 0].invert_yaxis()  # shared
     return page
 
 
-def ellipsoids(calibration: Calibration, x_mm: np.ndarray, *, scale: float = 10.0) -> Figure:
+def ellipsoids(calibration: Calibration, x_mm: np.ndarray, *, scale: float = 30.0) -> Figure:
     """Uncertainty ellipsoids of triangulated points (n, 3), with and without the noise of their own detection, enlarged."""
     page, _ = figure(1, 2, width_in=12, height_in=4.6)
     page.clear()
     a, b = np.meshgrid(np.linspace(0, 2 * np.pi, 25), np.linspace(0, np.pi, 13))
     sphere = np.stack([np.cos(a) * np.sin(b), np.sin(a) * np.sin(b), np.cos(b)], axis=-1)
-    panels = ((True, 3 * scale / 10, "Detection and calibration"), (False, scale, "Calibration alone"))
+    panels = ((True, scale / 3, "Detection and calibration"), (False, scale, "Calibration alone"))
     for i, (detection, factor, title) in enumerate(panels):
         axes = page.add_subplot(1, 2, i + 1, projection="3d")
         sd = []
@@ -192,7 +192,7 @@ def frame_residuals(image: np.ndarray, detected: np.ndarray, predicted: np.ndarr
             ax.plot(*p, "+", color="white", markersize=1.6 * size, markeredgewidth=2)
     axes[1].set(xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] + half, middle[1] - half))
     axes[0].plot([], [], "+", color="white", markersize=9, markeredgewidth=2, label="robot, projected")
-    axes[0].legend(loc="upper right", fontsize=8, labelcolor="white")
+    axes[0].legend(loc="upper right", fontsize=8, labelcolor="white", facecolor="black", framealpha=0.6)
     return page
 
 
@@ -204,8 +204,8 @@ def working_distance(distances_mm: Sequence[float], study: Mapping[str, np.ndarr
     ax.bar(at - 0.2, study["affine_um"], 0.4, color=COLOURS["paper"], label="affine (zero skew)")
     ax.bar(at + 0.2, study["near_affine_um"], 0.4, color=COLOURS["ours"], label="with 1/distance")
     for i, share in enumerate(study["chosen"]):
-        ax.text(i, max(study["affine_um"][i], study["near_affine_um"][i]) + 3, f"BIC takes 1/distance: {100 * share:.0f} %", ha="center", fontsize=8)
-    ax.set(xticks=at, xticklabels=labels, xlabel="working distance (mm)", ylabel="held-out 3D RMS (um)", title="The one parameter that pays")
+        ax.text(i, max(study["affine_um"][i], study["near_affine_um"][i]) + 3, f"1/d chosen:\n{100 * share:.0f} %", ha="center", fontsize=8)
+    ax.set(xticks=at, xticklabels=labels, xlabel="working distance (mm)", ylabel="held-out 3D RMS (um)", ylim=(0, 1.2 * study["affine_um"].max()), title="The one parameter that pays")
     ax.legend()
     return page
 
@@ -221,7 +221,7 @@ def time_offset(offsets_ms: np.ndarray, reprojection_px: np.ndarray, found_ms: f
 
 
 def robot_frames(frames: RobotFrames, rows: Sequence[int], fits: Mapping[str, Sequence[SphereFit]]) -> Figure:
-    """Frames of the real robot with the spheres found, and leave-one-out residuals (20 times) of two models."""
+    """Frames of the real robot with the spheres found, and leave-one-out residuals (40 times) of two models."""
     page, axes = figure(1, len(rows), width_in=13, height_in=3.6)
     colours = dict(zip(fits, (COLOURS["warning"], COLOURS["ours"]), strict=True))
     for ax, row in zip(axes, rows, strict=True):
@@ -231,8 +231,8 @@ def robot_frames(frames: RobotFrames, rows: Sequence[int], fits: Mapping[str, Se
             angle = np.linspace(0, 2 * np.pi, 100)
             ax.plot(u[0] + radius * np.cos(angle), u[1] + radius * np.sin(angle), color="white", linewidth=1.2)
             for name, both in fits.items():
-                ax.annotate("", u + 20 * both[s].leave_one_out_px[row], u, arrowprops={"arrowstyle": "->", "color": colours[name], "linewidth": 2})
+                ax.annotate("", u + 40 * both[s].leave_one_out_px[row], u, arrowprops={"arrowstyle": "->", "color": colours[name], "linewidth": 2})
     for name, colour in colours.items():
-        axes[0].plot([], [], color=colour, label=f"{name}, 20 times")
-    axes[0].legend(loc="lower right", fontsize=8, labelcolor="white")
+        axes[0].plot([], [], color=colour, label=f"{name}, 40 times")
+    axes[0].legend(loc="lower right", fontsize=8, labelcolor="white", facecolor="black", framealpha=0.6)
     return page
