@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 import platform
+from dataclasses import replace
 from pathlib import Path
 
-from lib.landmarks.dataset import REDUCTION, validation_frames
+from lib.landmarks.dataset import REDUCTION, TOOL_REDUCTION, validation_frames
 from lib.landmarks.evaluation import calibrate, evaluate
 from lib.landmarks.inference import Detector
 from lib.landmarks.metrics import calibration_error
@@ -16,7 +17,7 @@ __all__ = ["assemble"]
 
 
 def assemble(folder: str | Path, data: str | Path, out: str | Path) -> Detector:
-    """Join ``frame/`` and ``window/`` of a training folder, calibrate on the validation frames, write `out` and its card.
+    """Join ``frame/``, ``tool/`` and ``window/`` of a training folder, calibrate on the validation frames, write `out` and its card.
 
     Half of the validation frames calibrate, the other half give the figures on the card.
 
@@ -26,11 +27,17 @@ def assemble(folder: str | Path, data: str | Path, out: str | Path) -> Detector:
         If a stage or the validation frames are missing.
     """
     folder, out = Path(folder), Path(out)
-    frame, window = (load_training(folder / stage / "last.safetensors") for stage in ("frame", "window"))
+    stages = {stage: load_training(folder / stage / "last.safetensors") for stage in ("frame", "tool", "window")}
     frames = list(validation_frames(data))
     if not frames:
         raise FileNotFoundError(f"{data}: no validation shard; make some with `python3 -m lib train generate`.")
-    detector = Detector(frame.network, REDUCTION, window.network)
+    detector = Detector(
+        stages["frame"].network,
+        REDUCTION,
+        window_network=stages["window"].network,
+        tool_network=stages["tool"].network,
+        tool_reduction=TOOL_REDUCTION,
+    )
     held_out = evaluate(calibrate(detector, frames[::2]), frames[1::2])
     detector = calibrate(detector, frames)
     keys = ("data", "images", "commit", "steps", "seconds", "config", "metrics")
@@ -38,10 +45,7 @@ def assemble(folder: str | Path, data: str | Path, out: str | Path) -> Detector:
         "trained_on": "simulated frames only (lib.simulator.training); no eye or tool of a shipped recording",
         "commit": commit(),
         "machine": f"{platform.machine()} CPU, no GPU",
-        "stages": {
-            name: {key: training.provenance.get(key) for key in keys}
-            for name, training in (("frame", frame), ("window", window))
-        },
+        "stages": {name: {key: training.provenance.get(key) for key in keys} for name, training in stages.items()},
         "validation_frames": len(frames),
         "metrics": held_out.scores.as_dict()
         | {
@@ -50,15 +54,7 @@ def assemble(folder: str | Path, data: str | Path, out: str | Path) -> Detector:
         },
     }
     provenance = json.loads(json.dumps(provenance, default=float))
-    detector = Detector(
-        detector.frame_network,
-        detector.reduction,
-        detector.window_network,
-        detector.window_px,
-        detector.method,
-        detector.calibration,
-        provenance,
-    )
+    detector = replace(detector, metadata=provenance)
     out.parent.mkdir(parents=True, exist_ok=True)
     detector.save(out)
     out.with_name("README.md").write_text(card(detector, out), encoding="utf-8")
@@ -75,13 +71,12 @@ def card(detector: Detector, path: Path) -> str:
         "Weights of the landmark detector: base, tip_1 and tip_2 of the forceps in microscope images.",
         f"Trained on {p['trained_on']}.",
         "",
-        "| | whole frame | windows |",
-        "|---|---|---|",
+        "| | whole frame | tool | landmarks |",
+        "|---|---|---|---|",
     ]
-    frame, window = p["stages"]["frame"], p["stages"]["window"]
 
     def row(name: str, value) -> None:
-        lines.append(f"| {name} | {value(frame)} | {value(window)} |")
+        lines.append("| " + " | ".join([name, *(str(value(stage)) for stage in p["stages"].values())]) + " |")
 
     row("stacks x features", lambda s: "{stacks} x {features}".format(**s["config"]["network"]))
     row("training images", lambda s: s["images"])
@@ -93,8 +88,9 @@ def card(detector: Detector, path: Path) -> str:
     lines += [
         "",
         (
-            f"The first stage sees the frame at 1/{detector.reduction} of its resolution, the second windows of "
-            f"{detector.window_px} px at full resolution."
+            f"The first stage sees the frame at 1/{detector.reduction} of its resolution, the second a window of "
+            f"{detector.window_px} px at 1/{detector.tool_reduction} round the tool, the third windows of as many pixels "
+            "at full resolution round each landmark."
         ),
         f"File: {path.stat().st_size / 1e6:.1f} MB, safetensors; configuration, calibration and this card's figures inside.",
         "",
@@ -110,7 +106,7 @@ def card(detector: Detector, path: Path) -> str:
         f"| confidence calibration error | {m['confidence_calibration_error']:.3f} |",
         f"| missed, gross (above 20 px), of labels | {m['missed']}, {m['gross']}, {m['labels']} |",
         "",
-        "Made by `python3 -m lib train generate`, `train frame`, `train window`, `train assemble`.",
+        "Made by `python3 -m lib train generate`, `train frame`, `train tool`, `train window`, `train assemble`.",
         "",
     ]
     return "\n".join(lines)

@@ -20,13 +20,15 @@ from tqdm.auto import tqdm
 
 from lib.geometry import cell_from_image
 from lib.landmarks.training import Samples
-from lib.landmarks.windows import cut, direction_rad, map_points, window_from_image
+from lib.landmarks.windows import cut, direction_rad, map_points, tool_centre, window_from_image
 from lib.simulator.training import sample
 
 __all__ = ["REDUCTION", "WindowSource", "frame_samples", "generate", "simulated_samples", "validation_frames"]
 
 #: Of the stored frames, and of the first stage's input.
 STORED_REDUCTION, REDUCTION = 5, 8
+#: Of the middle stage's windows, and the place of the landmark index that means the whole tool.
+TOOL_REDUCTION, TOOL = STORED_REDUCTION, 3
 CROP_PX = 288
 FRAMES = 16
 
@@ -114,7 +116,8 @@ class WindowSource:
     Attributes
     ----------
     crops, u, visibility, landmark:
-        (n, c, c, 3) uint8 around landmark (n,), labels (n, 3, 2) in crop pixels, (n, 3).
+        (n, h, w, 3) uint8, labels (n, 3, 2) in crop pixels, (n, 3), and which landmark (n,) each window is round;
+        `TOOL` is the middle of the tool.
     size:
         Of the windows.
     shift_px, turn_rad:
@@ -138,6 +141,15 @@ class WindowSource:
         names = ("crops", "crop_u", "crop_visibility", "crop_landmark")
         return cls(*_load(folder, "validation_*.npz" if validation else "training_*.npz", names), size=size)
 
+    @classmethod
+    def load_tools(cls, folder: str | Path, *, validation: bool = False, size: int = 128) -> WindowSource:
+        """Windows round the whole tool at `TOOL_REDUCTION`, for the middle stage."""
+        pattern = "validation_*.npz" if validation else "training_*.npz"
+        frames, u, visibility = _load(folder, pattern, ("frames", "u", "visibility"))
+        u = cell_from_image(u, TOOL_REDUCTION)
+        which = np.full(len(frames), TOOL)
+        return cls(frames, u, visibility, which, size, shift_px=8.0, turn_rad=0.2, zoom=(0.75, 1.3))
+
     def __len__(self) -> int:
         return len(self.crops)
 
@@ -145,7 +157,8 @@ class WindowSource:
         u = self.u[index]
         worse = 3.0 if rng.random() < 0.1 else 1.0
         limit = 0.3 * self.size
-        centre = u[self.landmark[index]] + np.clip(rng.normal(0, worse * self.shift_px, 2), -limit, limit)
+        at = tool_centre(u[None])[0] if self.landmark[index] == TOOL else u[self.landmark[index]]
+        centre = at + np.clip(rng.normal(0, worse * self.shift_px, 2), -limit, limit)
         angle = direction_rad(u[None])[0] + np.clip(rng.normal(0, worse * self.turn_rad), -0.6, 0.6)
         matrix = window_from_image(centre, angle, self.size, rng.uniform(*self.zoom))
         return cut(self.crops[index], matrix, self.size), map_points(matrix, u), self.visibility[index]

@@ -13,10 +13,11 @@ import numpy as np
 from scipy.optimize import minimize
 from tqdm.auto import tqdm
 
-from lib.landmarks.heatmaps import decode
+from lib.geometry import image_from_cell
 from lib.landmarks.inference import Calibration, Detector, Landmarks, _missing, shape_and_features
 from lib.landmarks.metrics import Scores, errors_px, pck, score, tool_length_px
 from lib.landmarks.network import LANDMARKS
+from lib.landmarks.windows import map_points
 from lib.recordings import Recording
 
 __all__ = ["Evaluation", "calibrate", "evaluate", "evaluate_recording", "main"]
@@ -157,36 +158,42 @@ def calibrate(
     logistic regression of "in view and within 5 % of the tool's length" on the same features.
     """
     frames = list(frames)
-    stages = ["frame"] if detector.window_network is None else ["frame", "window"]
-    for stage in stages:
+    rough: list[Landmarks] = []
+    for stage in detector.networks:
         features, shapes, errors, correct = [], [], [], []
-        for _, image, u, v in tqdm(frames, disable=not progress, unit="image", desc=f"calibrating {stage}"):
+        zoom = 1.0
+        for i, (_, image, u, v) in enumerate(tqdm(frames, disable=not progress, unit="image", desc=stage)):
             in_view = np.isfinite(u).all(1) & (np.asarray(v) > 0)
             labels = np.where(in_view[:, None], u, np.nan)
             tolerance = 0.05 * tool_length_px(np.asarray(u, dtype=float)[None])[0]
-            peaks, _ = detector.frame_peaks(image[None])
-            rough = detector._calibrated(peaks, "frame", detector.reduction)
             if stage == "frame":
-                shape, feature = shape_and_features(peaks, detector.reduction)
-                difference = rough.u[0] - labels
-                shape, feature = shape[0], feature[0]
+                peaks, _ = detector.frame_peaks(image[None])
+                shape, feature = (part[0] for part in shape_and_features(peaks, detector.reduction))
+                difference = image_from_cell(peaks.u[0].double().numpy(), detector.reduction) - labels
             else:
-                heatmaps, matrices, which = detector.window_heatmaps(image[None], _missing(rough).u)
+                peaks, matrices, which = detector.stage_peaks(image[None], rough[i].u, stage)
                 if not len(which):
                     continue
-                peaks = decode(heatmaps, detector.window_network.stride, method=detector.method)
                 shape, feature = (part[:, 0] for part in shape_and_features(peaks, 1))
-                k = which[:, 1]
-                true = (matrices[:, :, :2] @ labels[k][..., None])[..., 0] + matrices[:, :, 2]
-                difference = peaks.u[:, 0].double().numpy() - true
+                # Errors in the windows' pixels, as the stage's covariance is.
+                difference = peaks.u[:, 0].double().numpy() - map_points(matrices, labels[which[:, 1]])
+                zoom = np.sqrt(np.linalg.det(matrices[0, :, :2]))
             features.append(feature)
             shapes.append(shape)
             errors.append(difference)
             with np.errstate(invalid="ignore"):
-                correct.append(np.linalg.norm(difference, axis=1) <= tolerance)
+                correct.append(np.linalg.norm(difference, axis=1) <= tolerance * zoom)
         joined = (np.concatenate(part) for part in (features, shapes, errors, correct))
-        fit = _fit(*joined, gross_px=GROSS_PX if stage == "window" else 6 * GROSS_PX)
-        detector = detector.with_calibration(**{stage: fit})
+        gross = {"frame": 6 * GROSS_PX, "tool": 2 * GROSS_PX * zoom, "window": GROSS_PX}[stage]
+        detector = detector.with_calibration(**{stage: _fit(*joined, gross_px=gross)})
+        # What the next stage starts from.
+        if stage == "frame":
+            rough = [
+                _missing(detector._calibrated(detector.frame_peaks(f[1][None])[0], stage, detector.reduction))
+                for f in frames
+            ]
+        elif stage == "tool":
+            rough = [detector._refined(f[1][None], r, stage) for f, r in zip(frames, rough, strict=True)]
     return detector
 
 

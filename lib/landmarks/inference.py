@@ -1,7 +1,8 @@
 """The detector: images in, landmarks with covariance and confidence out.
 
-Two stages on the CPU (`Detector` with a window network): the whole frame at low resolution finds the tool, upright windows
-at full resolution measure its landmarks.  Without a window network the first stage alone is the paper's detector.
+Coarse to fine on the CPU: the whole frame at low resolution finds the tool, one upright window round the tool names its
+landmarks, a small window at full resolution measures each.  The first stage alone, at full resolution, is the paper's
+detector.
 Everything a detector needs lies in one safetensors file: weights, configuration, calibration and provenance.
 """
 
@@ -24,7 +25,7 @@ from lib import paths
 from lib.geometry import image_from_cell
 from lib.landmarks.heatmaps import Peaks, decode
 from lib.landmarks.network import HourglassConfig, StackedHourglass
-from lib.landmarks.windows import cut, direction_rad, window_from_image
+from lib.landmarks.windows import cut, direction_rad, tool_centre, window_from_image
 
 __all__ = ["Calibration", "Detector", "Landmarks", "as_tensor", "read_checkpoint", "write_checkpoint"]
 
@@ -165,14 +166,18 @@ class Detector:
     reduction:
         Image pixels per pixel of the frame network's input, an integer; 1 is the paper's whole-frame detector.
     window_network:
-        Sees upright windows of `window_px` around what the first stage found; None = the first stage is all.
+        Sees upright full-resolution windows of `window_px` around each landmark; None = there is no such stage.
+    tool_network, tool_reduction:
+        Sees one upright window of `window_px` round the tool, that much reduced, between the two; None = no such stage.
     calibration:
-        One per landmark source: ``"frame"`` and ``"window"``.
+        One per stage: ``"frame"``, ``"tool"`` and ``"window"``.
     """
 
     frame_network: StackedHourglass
     reduction: int = 1
     window_network: StackedHourglass | None = None
+    tool_network: StackedHourglass | None = None
+    tool_reduction: int = 5
     window_px: int = 128
     method: str = "gauss_newton"
     calibration: dict[str, Calibration] = field(default_factory=dict)
@@ -181,12 +186,13 @@ class Detector:
     def __post_init__(self) -> None:
         if self.reduction < 1 or self.reduction != int(self.reduction):
             raise ValueError(f"reduction: must be a positive integer, got {self.reduction}.")
-        networks = {"frame": self.frame_network.fused()}
-        if self.window_network is not None:
-            if self.window_px % self.window_network.config.multiple:
-                raise ValueError(f"window_px: must be a multiple of {self.window_network.config.multiple}.")
-            networks["window"] = self.window_network.fused()
-        object.__setattr__(self, "_fused", networks)
+        object.__setattr__(self, "_fused", {name: network.fused() for name, network in self.networks.items()})
+
+    @property
+    def networks(self) -> dict[str, StackedHourglass]:
+        """The stages there are, in the order of their use."""
+        stages = {"frame": self.frame_network, "tool": self.tool_network, "window": self.window_network}
+        return {name: network for name, network in stages.items() if network is not None}
 
     # Files
 
@@ -211,6 +217,8 @@ class Detector:
             parts["frame"],
             reduction=metadata["reduction"],
             window_network=parts.get("window"),
+            tool_network=parts.get("tool"),
+            tool_reduction=metadata["tool_reduction"],
             window_px=metadata["window_px"],
             method=metadata["method"],
             calibration={
@@ -221,8 +229,7 @@ class Detector:
 
     def save(self, path: str | Path) -> None:
         """Write the detector as one safetensors file."""
-        networks = {"frame": self.frame_network, "window": self.window_network}
-        networks = {name: network for name, network in networks.items() if network is not None}
+        networks = self.networks
         tensors = {
             f"{name}.{key}": value for name, network in networks.items() for key, value in network.state_dict().items()
         }
@@ -230,6 +237,7 @@ class Detector:
             "format": FORMAT,
             "networks": {name: asdict(network.config) for name, network in networks.items()},
             "reduction": self.reduction,
+            "tool_reduction": self.tool_reduction,
             "window_px": self.window_px,
             "method": self.method,
             "calibration": {name: [fit.log_variance, fit.logit] for name, fit in self.calibration.items()},
@@ -252,8 +260,10 @@ class Detector:
         for start in range(0, len(images), batch):
             part = images[start : start + batch]
             peaks, _ = self.frame_peaks(part)
-            rough = _missing(self._calibrated(peaks, "frame", self.reduction))
-            found.append(self._refined(part, rough) if self.window_network is not None else rough)
+            result = _missing(self._calibrated(peaks, "frame", self.reduction))
+            for stage in list(self.networks)[1:]:
+                result = self._refined(part, result, stage)
+            found.append(result)
         return _missing(_joined(found))
 
     def track(self, images: ArrayLike, previous: Landmarks, *, min_confidence: float = 0.5) -> Landmarks:
@@ -278,7 +288,7 @@ class Detector:
             np.full((len(images), 3, 2), np.nan), np.full((len(images), 3, 2, 2), np.nan), np.zeros((len(images), 3))
         )
         if usable.size:
-            _put(result, usable, self._refined(images[usable], previous[usable]))
+            _put(result, usable, self._refined(images[usable], previous[usable], "window"))
         lost = np.flatnonzero((result.confidence < min_confidence).any(1))
         if lost.size:
             _put(result, lost, self(images[lost]))
@@ -295,45 +305,67 @@ class Detector:
         heatmaps = self.frame_heatmaps(images)
         return decode(heatmaps, self.frame_network.stride, method=method or self.method), heatmaps
 
-    def window_heatmaps(self, images: np.ndarray, u: ArrayLike) -> tuple[Tensor, np.ndarray, np.ndarray]:
-        """The second stage's heatmaps around landmarks u (n, 3, 2).
+    def windows(self, images: np.ndarray, u: ArrayLike, stage: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """What stage ``"tool"`` or ``"window"`` looks at, given the rough landmarks u (n, 3, 2).
 
         Returns
         -------
-        Heatmaps (m, 1, h, w), each window's own landmark; window_from_image (m, 2, 3); (m, 2) indices of image and
-        landmark.  Landmarks that are NaN, or of a tool without direction, have no window.
+        Windows (m, s, s, 3) uint8; window_from_image (m, 2, 3); the image (m,) of each window (``"tool"``), or image
+        and landmark (m, 2) (``"window"``).  A tool without base or tips, a missing landmark have none.
         """
         u = np.asarray(u, dtype=np.float64)
         angle = direction_rad(u)
-        which = np.argwhere(np.isfinite(u).all(2) & np.isfinite(angle)[:, None])
-        centre = u[which[:, 0], which[:, 1]]
-        matrices = window_from_image(centre, angle[which[:, 0]], self.window_px)
-        stride = self.window_network.stride
-        cells = -(-self.window_px // stride)
+        if stage == "tool":
+            which = np.flatnonzero(np.isfinite(angle))
+            image, centre, zoom = which, tool_centre(u[which]), 1 / self.tool_reduction
+        else:
+            which = np.argwhere(np.isfinite(u).all(2) & np.isfinite(angle)[:, None])
+            image, zoom = which[:, 0], 1.0
+            centre = u[image, which[:, 1]]
         if not len(which):
-            return torch.zeros((0, 1, cells, cells)), matrices, which
-        windows = np.stack(
-            [cut(images[i], matrix, self.window_px) for (i, _), matrix in zip(which, matrices, strict=True)]
-        )
-        with torch.inference_mode():
-            heatmaps = self._fused["window"](as_tensor(windows))[-1]
-        own = heatmaps[torch.arange(len(which)), torch.from_numpy(which[:, 1])][:, None]
-        return own, matrices, which
+            return np.zeros((0, self.window_px, self.window_px, 3), np.uint8), np.zeros((0, 2, 3)), which
+        matrices = window_from_image(centre, angle[image], self.window_px, zoom)
+        windows = [cut(images[i], matrix, self.window_px) for i, matrix in zip(image, matrices, strict=True)]
+        return np.stack(windows), matrices, which
 
-    def _refined(self, images: np.ndarray, rough: Landmarks) -> Landmarks:
-        heatmaps, matrices, which = self.window_heatmaps(images, rough.u)
+    def heatmaps(self, windows: np.ndarray, stage: str) -> Tensor:
+        """Heatmaps (m, 3, h, w) of windows (m, s, s, 3)."""
+        with torch.inference_mode():
+            return self._fused[stage](as_tensor(windows))[-1]
+
+    def stage_peaks(self, images: np.ndarray, u: ArrayLike, stage: str) -> tuple[Peaks, np.ndarray, np.ndarray]:
+        """What a window stage decodes: peaks (m, 1) in pixels of the windows, window_from_image (m, 2, 3), (m, 2) which.
+
+        Each row of the last is image and landmark.
+        """
+        windows, matrices, which = self.windows(images, u, stage)
+        if not len(which):
+            empty = torch.zeros((0, 1))
+            return (
+                Peaks(torch.zeros((0, 1, 2)), empty, empty, torch.zeros((0, 1, 2, 2))),
+                matrices,
+                np.zeros((0, 2), int),
+            )
+        heatmaps = self.heatmaps(windows, stage)
+        if stage == "tool":  # one window holds all three landmarks
+            which = np.stack([np.repeat(which, 3), np.tile(np.arange(3), len(which))], axis=1)
+            matrices, heatmaps = np.repeat(matrices, 3, axis=0), heatmaps.flatten(0, 1)[:, None]
+        else:
+            heatmaps = heatmaps[torch.arange(len(which)), torch.from_numpy(which[:, 1])][:, None]
+        return decode(heatmaps, self.networks[stage].stride, method=self.method), matrices, which
+
+    def _refined(self, images: np.ndarray, rough: Landmarks, stage: str) -> Landmarks:
+        peaks, matrices, which = self.stage_peaks(images, rough.u, stage)
         result = Landmarks(rough.u.copy(), rough.covariance.copy(), rough.confidence.copy())
         if not len(which):
             return result
-        peaks = decode(heatmaps, self.window_network.stride, method=self.method)
-        fine = self._calibrated(peaks, "window", 1)
-        # Back to the image: the inverse of a rotation and a shift.
-        turn = matrices[:, :, :2]
-        u = ((fine.u[:, 0] - matrices[:, :, 2])[:, None] @ turn)[:, 0]
-        covariance = turn.mT @ fine.covariance[:, 0] @ turn
+        fine = self._calibrated(peaks, stage, 1)
+        back = np.linalg.inv(matrices[:, :, :2])
+        u = (back @ (fine.u[:, 0] - matrices[:, :, 2])[..., None])[..., 0]
         i, k = which.T
-        result.u[i, k], result.covariance[i, k], result.confidence[i, k] = u, covariance, fine.confidence[:, 0]
-        return result
+        result.u[i, k], result.confidence[i, k] = u, fine.confidence[:, 0]
+        result.covariance[i, k] = back @ fine.covariance[:, 0] @ back.mT
+        return _missing(result)
 
     def reduced(self, images: np.ndarray) -> np.ndarray:
         """Images averaged over blocks of `reduction` pixels, black beyond the right and bottom border."""

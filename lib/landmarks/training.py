@@ -472,7 +472,7 @@ def main(argv: list[str] | None = None) -> int:
     from lib.landmarks import assembly, dataset  # late: dataset imports this module
 
     parser = argparse.ArgumentParser(prog="python3 -m lib train", description=main.__doc__.split(": ", 1)[1])
-    parser.add_argument("what", choices=["generate", "frame", "window", "whole", "assemble"],
+    parser.add_argument("what", choices=["generate", "frame", "tool", "window", "whole", "assemble"],
                         help="data; a stage of the shipped detector; the paper's one network on crops; the detector")  # fmt: skip
     parser.add_argument("--data", type=Path, default=paths.CACHE / "landmarks", help="folder of the shards")
     parser.add_argument("--folder", type=Path, default=paths.CACHE / "training", help="checkpoints, one folder a stage")
@@ -495,7 +495,7 @@ def main(argv: list[str] | None = None) -> int:
         elif a.what == "assemble":
             assembly.assemble(a.folder, a.data, a.out)
         else:
-            features = a.features or {"frame": 32, "window": 48, "whole": 64}[a.what]
+            features = a.features or {"frame": 32, "tool": 48, "window": 48, "whole": 64}[a.what]
             config = replace(
                 PRESETS[a.preset],
                 network=HourglassConfig(features, a.stacks),
@@ -505,8 +505,13 @@ def main(argv: list[str] | None = None) -> int:
             )
             source: Source
             if a.what == "frame":
+                config = replace(config, network=replace(config.network, depth=3), batch_size=8, ema=0.995)
                 source = dataset.frame_samples(a.data)
                 validation = dataset.frame_samples(a.data, validation=True)
+            elif a.what == "tool":
+                source = dataset.WindowSource.load_tools(a.data)
+                validation = dataset.WindowSource.load_tools(a.data, validation=True).fixed()
+                config = replace(config, augmentation=AUGMENTATIONS["windows"], ema=0.995)
             elif a.what == "window":
                 source = dataset.WindowSource.load(a.data)
                 validation = dataset.WindowSource.load(a.data, validation=True).fixed()

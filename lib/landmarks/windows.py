@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-__all__ = ["cut", "direction_rad", "map_points", "window_from_image"]
+__all__ = ["cut", "direction_rad", "map_points", "tool_centre", "window_from_image"]
 
 
 def direction_rad(u: ArrayLike) -> np.ndarray:
@@ -21,6 +21,14 @@ def direction_rad(u: ArrayLike) -> np.ndarray:
     tips = np.where(known[..., None], u[:, 1:], 0).sum(1) / np.maximum(known.sum(1), 1)[:, None]
     d = tips - u[:, 0]
     return np.where(known.any(1), np.arctan2(d[:, 1], d[:, 0]), np.nan)
+
+
+def tool_centre(u: ArrayLike) -> np.ndarray:
+    """Halfway (n, 2) between the base and the mean of the known tips; NaN without a base or without a tip."""
+    u = np.asarray(u, dtype=np.float64)
+    known = np.isfinite(u[:, 1:]).all(axis=2)
+    tips = np.where(known[..., None], u[:, 1:], 0).sum(1) / np.maximum(known.sum(1), 1)[:, None]
+    return np.where(known.any(1)[:, None], (u[:, 0] + tips) / 2, np.nan)
 
 
 def window_from_image(centre: ArrayLike, angle_rad: ArrayLike, size: int, zoom: ArrayLike = 1.0) -> np.ndarray:
