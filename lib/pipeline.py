@@ -464,7 +464,8 @@ def errors_against_truth(
             x = result.surface(lattice)
             off = (x - truth.surface(truth.rig.left.project(x))) @ view
             errors["surface"][i] = np.sqrt(np.nanmean(off**2))
-        x = truth.landmarks_mm[i]
+        # As imaged: a rolling shutter sees each landmark at its own time.
+        x = truth.rig.triangulate(truth.u_left[i], truth.u_right[i]).x_mm
         true_distance = (truth.surface(truth.rig.left.project(x)) - x) @ view
         off = np.abs(result.distance_mm - true_distance)
         errors["distance"][i] = np.nanmax(off) if np.isfinite(off).any() else np.nan

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping, Sequence
 
+import matplotlib.pyplot as plt
 import numpy as np
+from ipywidgets import Image, IntSlider, VBox
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
@@ -12,8 +15,9 @@ from matplotlib.ticker import MaxNLocator
 from lib.figures.overview import landmarks_on
 from lib.figures.style import COLOURS, LANDMARK_COLOURS, figure, show_image
 from lib.pipeline import STAGES, FrameResult
+from lib.recordings import StereoFrame
 
-__all__ = ["dashboard", "error_timeline", "stage_times", "timeline"]
+__all__ = ["dashboard", "error_timeline", "frame_browser", "stage_times", "timeline"]
 
 _STATE_COLOURS = {"calibrating": "#f0f0f0", "tracking": "white", "moved": "#fde3c8"}
 _STAGE_COLOURS = dict(
@@ -152,3 +156,23 @@ def dashboard(left: np.ndarray, result: FrameResult) -> Figure:
     )
     scene.set_title(f"Above the surface, mm: {distance}" if distance else "Tool outside the surface", fontsize=10)
     return page
+
+
+def frame_browser(frames: Sequence[StereoFrame], results: Sequence[FrameResult], *, start: int = 0) -> VBox:
+    """A slider over the frames with their dashboards; without a browser it shows `start`."""
+    slider = IntSlider(value=start, min=0, max=len(results) - 1, description="frame", continuous_update=False)
+    # An image widget, not captured output: the executing client answers large captured outputs by hanging.
+    picture = Image(value=_png(dashboard(frames[start].left, results[start])), format="png")
+
+    def draw(change: Mapping[str, int]) -> None:
+        picture.value = _png(dashboard(frames[change["new"]].left, results[change["new"]]))
+
+    slider.observe(draw, names="value")
+    return VBox([slider, picture])
+
+
+def _png(page: Figure) -> bytes:
+    buffer = io.BytesIO()
+    page.savefig(buffer, format="png", dpi=80)
+    plt.close(page)
+    return buffer.getvalue()
