@@ -73,11 +73,11 @@ def rig_page(scene: Scene, microscope: Microscope, rig: StereoRig) -> Figure:
     section.fill_between(x, z, 4, color="#e9b08a")
     section.plot(x, z, color="#a4502c")
     point = np.array([1.0, 0.0, float(scene.height(np.array(1.0), np.array(0.0)))])
-    for name, camera in (("left", rig.left), ("right", rig.right)):
+    for name, camera, side in (("left", rig.left, "right"), ("right", rig.right, "left")):
         d = camera.viewing_direction
         start = point - d * (point[2] + 4.5) / d[2]
         section.annotate("", point[[0, 2]], start[[0, 2]], arrowprops={"arrowstyle": "->", "color": COLOURS[name]})
-        section.text(start[0], start[2] - 0.1, name, color=COLOURS[name], ha="center")
+        section.text(start[0], start[2] - 0.1, f" {name} ", color=COLOURS[name], ha=side)
     section.set(
         xlim=(-9.6, 9.6), ylim=(3.2, -5.2), xlabel="x (mm)", ylabel="z (mm), into the eye",
         title="Section through the microscope's frame, y = 0",

@@ -96,7 +96,7 @@ class Forceps:
     shaft_radius_mm: float = 0.30
     jaw_length_mm: float = 3.0
     jaw_radius_mm: float = 0.13
-    tip_radius_mm: float = 0.006
+    tip_radius_mm: float = 0.005
     taper: float = 0.6
     bow_mm: float = 0.18
     bend_mm: float = 0.20

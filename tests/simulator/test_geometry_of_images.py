@@ -1,0 +1,228 @@
+"""Images against geometry that needs no faith in the renderer: masks, depths, warps, speeds."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from lib.cameras import AffineCamera, NearAffineCamera
+from lib.geometry import RigidTransform
+from lib.simulator import Eye, Forceps, Microscope, Pose, render_pair
+from lib.simulator.effects import PLAIN
+from lib.simulator.raster import rasterise
+from lib.simulator.render import render_view, surface_grid
+from lib.simulator.scenes import Checkerboard, Plane, Relief, Sphere, checkerboard_poses
+from lib.simulator.training import random_forceps, random_pose
+
+IDENTITY = RigidTransform.identity()
+RIG = PLAIN.rig(IDENTITY)
+
+
+def window(camera: AffineCamera, centre: np.ndarray, size: int) -> tuple[AffineCamera, np.ndarray]:
+    """The camera of a square window round a pixel, and its origin."""
+    origin = np.round(centre - size / 2)
+    return AffineCamera(np.column_stack([camera.linear, camera.offset_px - origin])), origin
+
+
+def test_visible_tips_lie_on_the_boundary_of_the_rendered_tool():
+    rng = np.random.default_rng(0)
+    factor, size, distances = 8, 24, []
+    for _ in range(25):
+        forceps = random_forceps(rng)
+        pose = random_pose(rng, forceps)
+        pose = pose.moved(
+            pitch_rad=min(pose.pitch_rad, 0.6), opening_mm=float(rng.uniform(0.15, 0.5) * forceps.jaw_length_mm)
+        )
+        centres, radii, chains = forceps.nodes(pose)
+        for k in (1, 2):
+            tip = forceps.landmarks(pose)[k]
+            camera, _ = window(RIG.left, RIG.left.project(tip)[0], size)
+            R, zoom = camera.resect().R, camera.resect().K[0, 0]
+            seen = np.column_stack([camera.project(centres) / zoom, centres @ R[2]])
+            raster = rasterise(seen, radii, chains, zoom=zoom, size_px=(size, size), factor=factor)
+            own = (raster.part == k + 1).astype(np.uint8)
+            edge = np.argwhere(own & ~cv2.erode(own, np.ones((3, 3), np.uint8)).astype(bool))
+            edge_px = (edge[:, ::-1] + 0.5) / factor - 0.5 + raster.origin_px
+            distances.append(np.linalg.norm(edge_px - camera.project(tip)[0], axis=1).min())
+    assert max(distances) <= 0.25
+
+
+def test_base_is_midway_between_the_edges_of_the_shaft():
+    rng = np.random.default_rng(1)
+    for _ in range(6):
+        forceps = random_forceps(rng)
+        pose = random_pose(rng, forceps)
+        camera, _ = window(RIG.right, RIG.right.project(np.array(pose.base_mm))[0], 160)
+        view = render_view(Plane(4.0), PLAIN, camera, (160, 160), forceps=forceps, pose=pose, factor=4)
+        shaft = camera.linear @ pose.microscope_from_tool[:, 0]
+        along = shaft / np.linalg.norm(shaft)
+        across = np.array([-along[1], along[0]])
+        # Coverage across the shaft, just behind the base.
+        offsets = np.arange(-60, 60, 0.05)
+        points = view.u[0] - 4 * along + offsets[:, None] * across
+        profile = cv2.remap(view.tool_mask.astype(np.float32), *np.float32(points.T), cv2.INTER_LINEAR).ravel() / 255
+        inside = offsets[profile > 0.5]
+        assert abs(inside.min() + inside.max()) / 2 <= 0.25
+        assert_allclose(np.ptp(inside), 2 * forceps.shaft_radius_mm * np.linalg.norm(camera.linear[0]), atol=0.5)
+
+
+@pytest.mark.parametrize("camera", [RIG.left, NearAffineCamera(RIG.right.matrix, 1 / 150, np.array([959.5, 539.5]))])
+def test_depth_of_plane_and_sphere_is_right_to_a_micrometre(camera):
+    """Against the closed-form intersection of each pixel's own ray."""
+    size = (480, 320)
+    affine = AffineCamera(np.column_stack([camera.matrix[:, :3], camera.matrix[:, 3] - [700, 300]]))
+    if isinstance(camera, NearAffineCamera):
+        shown = NearAffineCamera(affine.matrix, camera.inverse_distance_per_mm, camera.centre_px - [700, 300])
+    else:
+        shown = affine
+    plane, sphere = Plane(0.4, (0.1, -0.2)), Sphere()
+    depths = [render_view(s, PLAIN, shown, size, surface=True).surface_mm for s in (plane, sphere)]
+    u = np.stack(np.meshgrid(np.arange(size[0]), np.arange(size[1])), axis=-1).reshape(-1, 2)[::371].astype(float)
+    for surface, depth in zip((plane, sphere), depths, strict=True):
+        z = depth[u[:, 1].astype(int), u[:, 0].astype(int)].astype(float)
+        # The point on the surface that projects to u, by Newton on (x, y), from an independent projection.
+        xy = np.zeros((len(u), 2))
+        for _ in range(30):
+            x = np.column_stack([xy, surface.height(*xy.T)])
+            xy += (u - shown.project(x)) @ np.linalg.inv(affine.linear[:, :2]).T
+        assert np.abs(shown.project(x) - u).max() < 1e-6
+        assert np.abs(z - x[:, 2]).max() < 1e-3
+
+
+def test_left_image_warped_by_the_true_surface_is_the_right_one():
+    eye = Eye(seed=3, gloss=0.0, texture_px=1024)
+    noisy = Microscope(
+        depth_of_field_mm=float("inf"), psf_px=0.5, vignetting=0.0, jpeg_quality=None, full_well=4000.0,
+        gain=PLAIN.gain, pixels_per_mm=(50.0, 50.0), image_size_px=(640, 400),
+    )  # fmt: skip
+    rig = noisy.rig(IDENTITY)
+    clean = [render_view(eye, PLAIN_SMALL, camera, (640, 400), surface=True) for camera in (rig.left, rig.right)]
+    rng = np.random.default_rng(0)
+    right = render_view(eye, noisy, rig.right, (640, 400), side=1, rng=rng).image.astype(float)
+    u = np.stack(np.meshgrid(np.arange(640.0), np.arange(400.0)), axis=-1)
+    z = clean[1].surface_mm
+    A = rig.right.linear
+    xy = np.einsum("ij,hwj->hwi", np.linalg.inv(A[:, :2]), u - rig.right.offset_px - A[:, 2] * z[..., None])
+    u_left = rig.left.project(np.dstack([xy, z]).reshape(-1, 3)).reshape(400, 640, 2).astype(np.float32)
+    left = render_view(eye, replace_noise(noisy), rig.left, (640, 400)).image.astype(np.float32)
+    warped = cv2.remap(left, u_left[..., 0], u_left[..., 1], cv2.INTER_CUBIC)
+    inside = np.s_[40:-40, 40:-40]
+    # Noise predicted from the sensor model, carried through the gamma curve.
+    linear = (clean_right(eye, noisy, rig) / 255.0) ** 2.2
+    variance = linear / noisy.full_well + (noisy.read_noise / noisy.full_well) ** 2
+    slope = 255 / 2.2 * np.maximum(linear, 1e-3) ** (1 / 2.2 - 1)
+    predicted = np.sqrt(variance * slope**2 + 2 / 12)
+    residual = (right - warped)[inside]
+    unsaturated = (right[inside] < 250) & (right[inside] > 5)
+    ratio = np.sqrt(np.mean(residual[unsaturated] ** 2) / np.mean(predicted[inside][unsaturated] ** 2))
+    assert 0.9 < ratio <= 1.1
+    # One pixel off, the test would notice.
+    shifted = cv2.remap(left, u_left[..., 0] + 1, u_left[..., 1], cv2.INTER_CUBIC)
+    assert np.mean((right - shifted)[inside][unsaturated] ** 2) > 1.3 * np.mean(residual[unsaturated] ** 2)
+
+
+PLAIN_SMALL = Microscope(
+    depth_of_field_mm=float("inf"), psf_px=0.5, vignetting=0.0, full_well=float("inf"), gain=PLAIN.gain,
+    pixels_per_mm=(50.0, 50.0), image_size_px=(640, 400),
+)  # fmt: skip
+
+
+def replace_noise(microscope: Microscope) -> Microscope:
+    return replace(microscope, full_well=float("inf"))
+
+
+def clean_right(eye: Eye, microscope: Microscope, rig) -> np.ndarray:
+    return render_view(eye, replace_noise(microscope), rig.right, (640, 400), side=1).image.astype(float)
+
+
+def edge_position(mask: np.ndarray, row: int) -> float:
+    """Column of the middle of the tool's coverage in a row, px."""
+    weight = mask[row].astype(float)
+    return float((weight * np.arange(len(weight))).sum() / weight.sum())
+
+
+def test_rolling_shutter_moves_the_tool_by_what_its_speed_predicts():
+    """A shaft along the rows' normal, moving sideways, leans; the landmarks say by how much each."""
+    rolling = replace(PLAIN, readout_s=0.020)
+    forceps = Forceps()
+    pose = Pose((0.0, 0.0, -1.0), azimuth_rad=np.pi / 2, pitch_rad=0.2)
+    speed = 30.0  # mm/s along x
+    later = (pose.moved(base_mm=(speed * 1e-3, 0.0, -1.0)), 1e-3)
+    camera = RIG.left
+    centre = camera.project(np.array(pose.base_mm))[0]
+    shown, origin = window(camera, centre, 300)
+    common = {
+        "forceps": forceps,
+        "pose": pose,
+        "field_px": PLAIN.image_size_px,
+        "origin_px": tuple(origin),
+        "factor": 8,
+    }
+    still = render_view(Plane(3.0), rolling, shown, (300, 300), **common)
+    moving = render_view(Plane(3.0), rolling, shown, (300, 300), later=later, **common)
+    for row in (10, 60, 110):
+        delay = 0.020 * ((row + origin[1]) / 1079 - 0.5)
+        predicted = speed * delay * camera.linear[0, 0]
+        # The shaft itself is nearly vertical, so a row's shift is the tool's.
+        assert_allclose(edge_position(moving.tool_mask, row) - edge_position(still.tool_mask, row), predicted, atol=0.1)
+    delay = 0.020 * ((moving.u[:, 1] + origin[1]) / 1079 - 0.5)
+    expected = still.u + (speed * delay)[:, None] * camera.linear[:, 0]
+    assert_allclose(moving.u, expected, atol=0.02)
+
+
+def test_defocus_grows_with_the_distance_from_focus_as_designed():
+    """The width of a board's edge is the hypotenuse of point spread and |z| / (depth of field / 2) px."""
+    microscope = replace(PLAIN, depth_of_field_mm=2.0, psf_px=0.8)
+    camera = RIG.left
+    widths = []
+    for z in (0.0, 1.0, 2.0, 4.0):
+        board = Checkerboard(RigidTransform(np.eye(3), np.array([0.0, 0.0, z])), square_mm=1.0, columns=4, rows=4)
+        shown, _ = window(camera, camera.project(board.corners_mm[0])[0] + [0, 50], 90)
+        image = render_view(board, microscope, shown, (90, 90)).image[..., 1].astype(float)
+        linear = (image / 255) ** 2.2
+        profile = np.abs(np.diff(linear, axis=1))[25:66]
+        columns = np.arange(89.0)
+        rows = []
+        for line in profile:
+            middle = (line * columns).sum() / line.sum()
+            rows.append(np.sqrt((line * (columns - middle) ** 2).sum() / line.sum()))
+        widths.append(np.median(rows))
+    designed = np.hypot(0.8, [0.0, 1.0, 2.0, 4.0])
+    assert (np.diff(widths) > 0).all()
+    assert_allclose(widths, designed, rtol=0.15)
+
+
+def test_checkerboard_corners_are_where_the_truth_says():
+    rng = np.random.default_rng(2)
+    small = Microscope(image_size_px=(640, 400), full_well=float("inf"))
+    for pose in checkerboard_poses(2, rng, half_size_mm=(0.5, 0.3, 0.8)):
+        board = Checkerboard(pose, columns=9, rows=7)
+        for view, u in zip(render_pair(board, small), small.rig(IDENTITY).project(board.corners_mm), strict=True):
+            u = u[((u > 12) & (u < np.array([640, 400]) - 12)).all(axis=1)]
+            grey = cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY)
+            found = cv2.cornerSubPix(
+                grey, np.ascontiguousarray(u[:, None], np.float32), (5, 5), (-1, -1), (3, 60, 1e-4)
+            )[:, 0]
+            assert np.sqrt(np.mean((found - u) ** 2)) < 0.1
+
+
+def test_surface_grid_lies_on_the_surface_and_projects_to_its_pixels():
+    for scene in (Eye(seed=8), Relief("leaf")):
+        x_px, y_px, x_mm = surface_grid(scene, RIG.left, (1920, 1080), step_px=120)
+        u = np.stack(np.meshgrid(x_px, y_px), axis=-1)
+        assert_allclose(RIG.left.project(x_mm.reshape(-1, 3)).reshape(u.shape), u, atol=1e-6)
+        assert_allclose(scene.height(x_mm[..., 0], x_mm[..., 1]), x_mm[..., 2], atol=1e-4)
+
+
+def test_tip_1_is_left_of_the_shaft_in_both_images():
+    rng = np.random.default_rng(5)
+    for _ in range(200):
+        forceps = random_forceps(rng)
+        pose = random_pose(rng, forceps).moved(opening_mm=0.5)
+        for camera in (RIG.left, RIG.right):
+            base, tip_1, tip_2 = camera.project(forceps.landmarks(pose))
+            ahead = (tip_1 + tip_2) / 2 - base
+            left = np.array([ahead[1], -ahead[0]])  # y is down
+            assert (tip_1 - tip_2) @ left > 0
