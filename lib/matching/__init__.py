@@ -96,8 +96,8 @@ def match(
     downscale:
         DeepMatching only: descriptors are pooled by 2^downscale; None is the smallest from 1 that fits the budget.
     budget_bytes:
-        Memory that free DeepMatching may take.  It is predicted before anything is allocated; what does not fit is
-        matched in tiles of the left image, or refused with the figure.
+        Memory that DeepMatching may take.  It is predicted before anything is allocated; what does not fit is matched
+        in tiles of the left image (free DeepMatching), or refused with the figure.
     max_epipolar_px:
         "band" refuses a rig whose epipolar lines lie farther than this from what free coarse matches say.
     device:
@@ -136,6 +136,7 @@ def match(
             depth_range_mm=depth_range_mm,
             setting=SETTINGS[setting],
             max_epipolar_px=max_epipolar_px,
+            budget_bytes=budget_bytes,
         )
     elif callable(method) or method in ("sgbm", "dis"):
         matches = match_with(method, images, masks, rig, depth_range_mm=depth_range_mm, setting=SETTINGS[setting])

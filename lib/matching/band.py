@@ -18,7 +18,14 @@ from lib.matching.free import MIN_SEEN, patch_quality
 from lib.matching.rectification import Rectification, rectify, warp
 from lib.matching.refine import refine
 from lib.matching.result import Matches
-from lib.matching.volume import PATCH, VolumeMatches, correlation_volume, match_volume
+from lib.matching.volume import (
+    PATCH,
+    VolumeMatches,
+    correlation_volume,
+    match_volume,
+    predicted_bytes,
+    single_threaded_torch,
+)
 
 __all__ = ["SETTINGS", "CoarseView", "Setting", "coarse_view", "match_band"]
 
@@ -83,15 +90,19 @@ class CoarseView:
     ----------
     displacement_px:
         (n, 2) along and off the epipolar line, in pixels of a canvas of scale 1, of the supported matches.
-    off_line_px:
-        Median displacement off the line, NaN with fewer than 12 supported matches.
+    off_line_px, epipolar_px:
+        Median displacement off the line, and median of its size; NaN with fewer than 12 supported matches.
     range_px:
         (low, high) displacement to search, with margin.
+    n_found:
+        Matches before those without support were left out.
     """
 
     displacement_px: np.ndarray
     off_line_px: float
+    epipolar_px: float
     range_px: tuple[float, float]
+    n_found: int
 
 
 def _descriptors(
@@ -124,7 +135,9 @@ def _descriptors(
 
 def _match(left: np.ndarray, right: np.ndarray, low: int, n: int, off_line: int) -> VolumeMatches:
     """Matches of two grids, without those on flat or mostly ignored patches and those at the end of the range."""
-    matches = match_volume(correlation_volume(torch.from_numpy(left), torch.from_numpy(right), low, n, off_line), low)
+    with single_threaded_torch():
+        volume = correlation_volume(torch.from_numpy(left), torch.from_numpy(right), low, n, off_line)
+        matches = match_volume(volume, low)
     x, y = matches.patch.T
     start = matches.cell - (low, -off_line) + matches.patch * PATCH
     seen_right = np.mean(
@@ -170,16 +183,23 @@ def coarse_view(
     low, n = -reach, 2 * reach + 1
     left, right = _descriptors(images, masks, rectification, setting, low, n)
     matches = _match(left, right, low, n, COARSE_OFF_LINE)
-    displacement = matches.displacement[_supported(matches)] * 2 / scale
+    chosen = matches.keep(_supported(matches))
+    start = chosen.patch * PATCH
+    step, _ = refine(left, right, start, start + chosen.cell - (low, -COARSE_OFF_LINE))
+    displacement = (chosen.cell + step) * 2 / scale
     # Both canvases refer to the same depth only up to whole coarse pixels.
     displacement[:, 0] += (rectification.reference_depth_mm - whole.reference_depth_mm) * whole.displacement_px_per_mm
     if len(displacement) < MIN_SUPPORTED:
         widest = COARSE_REACH * whole.size_px[0]
-        return CoarseView(displacement, float("nan"), (-widest, widest))
+        return CoarseView(displacement, float("nan"), float("nan"), (-widest, widest), len(matches.patch))
     low_px, high_px = np.percentile(displacement[:, 0], (0.5, 99.5))
     margin = 4 / scale
     return CoarseView(
-        displacement, float(np.median(displacement[:, 1])), (float(low_px - margin), float(high_px + margin))
+        displacement,
+        float(np.median(displacement[:, 1])),
+        float(np.median(np.abs(displacement[:, 1]))),
+        (float(low_px - margin), float(high_px + margin)),
+        len(matches.patch),
     )
 
 
@@ -191,13 +211,15 @@ def match_band(
     depth_range_mm: tuple[float, float] | None = None,
     setting: Setting = SETTINGS["quality"],
     max_epipolar_px: float = 6.0,
+    budget_bytes: int = 2 << 30,
 ) -> Matches:
     """Matches of a calibrated pair; arguments as in `coarse_view` and `lib.matching.match`.
 
     Raises
     ------
     ValueError
-        If the rig does not fit the images.
+        If the rig does not fit the images, nothing in the depth range is seen by both cameras, or the search would
+        need more memory than the budget.
     """
     shapes = images[0].shape, images[1].shape
     whole = rectify(rig, *shapes)
@@ -206,19 +228,28 @@ def match_band(
     cell = 1 << setting.downscale
 
     coarse = coarse_view(images, masks, rig)
-    if abs(coarse.off_line_px) > max_epipolar_px:
+    if coarse.epipolar_px > max_epipolar_px:
         raise ValueError(
             f"rig: it does not fit the images: the median of {len(coarse.displacement_px)} free matches lies "
-            f"{abs(coarse.off_line_px):.1f} px off its epipolar lines, {max_epipolar_px:.1f} px are allowed "
+            f"{coarse.epipolar_px:.1f} px off its epipolar lines, {max_epipolar_px:.1f} px are allowed "
             "(max_epipolar_px). Calibrate again, or check that left and right are not exchanged."
         )
+    if not coarse.n_found and depth_range_mm is None:
+        return Matches(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros((0, 4, 4)), method="band")
     # The band follows a small misfit, so that it may be narrow; below half a pixel nothing is resampled for it.
     off_line_px = coarse.off_line_px * scale if abs(coarse.off_line_px) >= 0.5 else 0.0
-    range_px = coarse.range_px if depth_range_mm is None else whole.displacement_range_px(depth_range_mm)
-    shift = (whole.reference_depth_mm - rectification.reference_depth_mm) * whole.displacement_px_per_mm
-    low, high = (np.array(range_px) + shift) * scale / cell
-    low = int(np.floor(low)) - 1
-    n = int(np.ceil(high)) + 2 - low
+    if depth_range_mm is None:
+        depth_range_mm = whole.depth_range_mm(coarse.range_px)
+    low, high = rectification.search_range_px(depth_range_mm, shapes[1])
+    low, high = int(np.floor(low / cell)) - 1, int(np.ceil(high / cell)) + 1
+    n = high - low + 1
+    gx, gy = (side // (PATCH * cell) for side in rectification.size_px)
+    need = predicted_bytes(gy, gx, n, setting.off_line)
+    if need > budget_bytes:
+        raise ValueError(
+            f"budget_bytes: {n} displacements of {gx} x {gy} patches need {need / 2**30:.2f} GiB, the budget is "
+            f"{budget_bytes / 2**30:.2f} GiB. Narrow depth_range_mm, or take setting='fast'."
+        )
     left, right = _descriptors(images, masks, rectification, setting, low, n, off_line_px)
     found = _match(left, right, low, n, setting.off_line)
 

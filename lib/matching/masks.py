@@ -31,9 +31,9 @@ def glint_mask(image: ArrayLike, *, level: int = 245, grow_px: int = 5) -> np.nd
     image = np.asarray(image)
     if image.dtype != np.uint8 or image.ndim not in (2, 3):
         raise ValueError(f"image: expected a uint8 image (h, w, 3) or (h, w), got {image.dtype} {image.shape}.")
-    darkest = image if image.ndim == 2 else cv2.min(cv2.min(image[..., 0], image[..., 1]), image[..., 2])
-    core = (darkest >= level).astype(np.uint8)
-    if grow_px and core.any():
+    channels = 1 if image.ndim == 2 else image.shape[2]
+    core = cv2.inRange(np.ascontiguousarray(image), (level,) * channels, (255,) * channels)
+    if grow_px:
         core = cv2.dilate(core, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * grow_px + 1,) * 2))
     return core.astype(bool)
 

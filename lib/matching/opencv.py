@@ -86,7 +86,7 @@ def match_with(
     rectification = rectify(rig, *shapes, scale=scale)
     if depth_range_mm is None:
         depth_range_mm = whole.depth_range_mm(coarse_view(images, masks, rig).range_px)
-    low, high = rectification.displacement_range_px(depth_range_mm)
+    low, high = rectification.search_range_px(depth_range_mm, shapes[1])
     name = function if isinstance(function, str) else getattr(function, "__name__", "callable")
     call = {"sgbm": _sgbm, "dis": _dis}[function] if isinstance(function, str) else function
 

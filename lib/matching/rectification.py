@@ -58,6 +58,31 @@ class Rectification:
         ends = self.reference_depth_mm + np.asarray(displacement_range_px) / self.displacement_px_per_mm
         return float(ends.min()), float(ends.max())
 
+    def visible_range_px(self, shape_right: tuple[int, int]) -> tuple[float, float]:
+        """(low, high) displacements that any point seen by both cameras can have, for a right image (h, w)."""
+        height, width = shape_right
+        corners = np.array([[0, 0], [width - 1, 0], [0, height - 1], [width - 1, height - 1]], dtype=np.float64)
+        x = np.linalg.solve(self.right_from_canvas[:, :2], (corners - self.right_from_canvas[:, 2]).T)[0]
+        return float(x.min() - self.size_px[0]), float(x.max())
+
+    def search_range_px(self, depth_range_mm: tuple[float, float], shape_right: tuple[int, int]) -> tuple[float, float]:
+        """(low, high) displacements of a range of depth, as far as both cameras can see it.
+
+        Raises
+        ------
+        ValueError
+            If they see nothing of it; the message says what depths they see.
+        """
+        low, high = self.displacement_range_px(depth_range_mm)
+        visible = self.visible_range_px(shape_right)
+        if high < visible[0] or low > visible[1]:
+            near, far = self.depth_range_mm(visible)
+            raise ValueError(
+                f"depth_range_mm: nothing from {depth_range_mm[0]:g} to {depth_range_mm[1]:g} mm along the left "
+                f"viewing direction is seen by both cameras; they share {near:.1f} to {far:.1f} mm."
+            )
+        return max(low, visible[0]), min(high, visible[1])
+
     def u_left(self, canvas: np.ndarray) -> np.ndarray:
         """Left pixels (n, 2) of canvas points (n, 2)."""
         return canvas @ self.left_from_canvas[:, :2].T + self.left_from_canvas[:, 2]

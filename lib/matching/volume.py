@@ -7,13 +7,22 @@ A volume holds (gy, gx, 2 v + 1, D) responses: lattice of patches, rows off the 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
 
-__all__ = ["VolumeMatches", "correlation_volume", "match_volume", "n_levels"]
+__all__ = [
+    "VolumeMatches",
+    "correlation_volume",
+    "match_volume",
+    "n_levels",
+    "predicted_bytes",
+    "single_threaded_torch",
+]
 
 PATCH = 4
 POWER = 1.4
@@ -53,6 +62,22 @@ class VolumeMatches:
         return VolumeMatches(*(getattr(self, field.name)[chosen] for field in fields(self)))
 
 
+@contextmanager
+def single_threaded_torch() -> Iterator[None]:
+    """Many small tensors: torch's own threads gain nothing here, and spin where the machine has other work."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+def predicted_bytes(gy: int, gx: int, n: int, v: int) -> int:
+    """Peak memory (float32) of `correlation_volume` and `match_volume`: the volume, and its pooled copies."""
+    return int(4 * gy * gx * (2 * v + 1) * n * 2.7)
+
+
 def n_levels(gy: int, gx: int) -> int:
     """Levels above the atomic patches: patches double while they fit the longer side and their children exist."""
     levels = 0
@@ -90,18 +115,21 @@ def correlation_volume(left: torch.Tensor, right: torch.Tensor, low: int, n: int
     energy = sum(energy[r : r + n_y] for r in range(PATCH))
     inverse_norm = torch.where(energy > 1e-12, energy.clamp_min(1e-12).rsqrt(), 0.0).contiguous()
 
-    # Windows as (x, y, 4 cells of the row): any window is then `depth` contiguous numbers, so that BLAS reads it in
-    # place.  One chunk of lattice rows at a time, which stays in the cache.
     volume = right.new_empty(gy, gx, 2 * v + 1, n)
     block = max(4, min(gx, n // 2))
     row = PATCH * channels
-    height_max = PATCH * ROWS + 2 * v
-    strip = right.new_empty(n_x, height_max, row)
-    column = height_max * row
+    column = (PATCH * ROWS + 2 * v) * row
     turned = right.transpose(0, 1)
-    for top in range(0, gy, ROWS):
+
+    def correlate(top: int) -> None:
+        """One chunk of lattice rows, which stays in the cache.
+
+        Windows are laid out as (x, y, 4 cells of the row): any window is then `depth` contiguous numbers, so that BLAS
+        reads it in place.
+        """
         k = min(ROWS, gy - top)
         rows = slice(PATCH * top, PATCH * (top + k) + 2 * v)
+        strip = right.new_empty(n_x, column // row, row)
         for c in range(PATCH):
             strip[:, : rows.stop - rows.start, c * channels : (c + 1) * channels] = turned[c : c + n_x, rows]
         for j in range(2 * v + 1):
@@ -115,6 +143,9 @@ def correlation_volume(left: torch.Tensor, right: torch.Tensor, low: int, n: int
                     (k, b, n), (PATCH * n_x, PATCH, 1), (PATCH * top + j) * n_x + PATCH * start
                 )
                 torch.mul(skewed, scale, out=volume[top : top + k, start : start + b, j])
+
+    with ThreadPoolExecutor(2) as pool:
+        list(pool.map(correlate, range(0, gy, ROWS)))
     return volume
 
 

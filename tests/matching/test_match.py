@@ -70,7 +70,11 @@ def test_depth_range_limits_the_search(affine_pair):
     assert np.median(np.abs(along)) < 0.15
     wrong = match(affine_pair.left, affine_pair.right, rig=rig, depth_range_mm=(depth.max() + 1, depth.max() + 2))
     along, _ = affine_pair.errors_px(wrong)
-    assert np.mean(np.abs(along) < 2) < 0.05
+    assert len(wrong) < 0.2 * len(found) and np.mean(np.abs(along) < 2) < 0.05
+    with pytest.raises(ValueError, match="depth_range_mm: nothing from 500 to 600 mm"):
+        match(affine_pair.left, affine_pair.right, rig=rig, depth_range_mm=(500, 600))
+    with pytest.raises(ValueError, match=r"budget_bytes: \d+ displacements"):
+        match(affine_pair.left, affine_pair.right, rig=rig, depth_range_mm=(-1e3, 1e3), budget_bytes=1 << 24)
 
 
 def test_works_in_any_robot_frame_and_on_rgb(affine_pair):
@@ -144,6 +148,15 @@ def test_sizes_may_differ(textured, method):
     assert (matches.u_right[:, 0] < 130).all() and (matches.u_right[:, 1] < 104).all()
 
 
+def turned(rig: StereoRig) -> StereoRig:
+    """The rig with its right camera rolled by 8 degrees about the image centre: right in the middle only."""
+    c, s, centre = np.cos(0.14), np.sin(0.14), (np.array([640, 360]) - 1) / 2
+    R = np.array([[c, -s], [s, c]])
+    return StereoRig(
+        rig.left, AffineCamera(np.column_stack([R @ rig.right.linear, R @ (rig.right.offset_px - centre) + centre]))
+    )
+
+
 def test_a_rig_that_does_not_fit_is_reported(affine_pair):
     rig = affine_pair.rig
     moved = AffineCamera(rig.right.matrix + np.array([[0, 0, 0, 0], [0, 0, 0, 15.0]]))
@@ -151,6 +164,8 @@ def test_a_rig_that_does_not_fit_is_reported(affine_pair):
         match(affine_pair.left, affine_pair.right, rig=StereoRig(rig.left, moved))
     with pytest.raises(ValueError, match="rig: it does not fit"):
         match(affine_pair.left, affine_pair.left, rig=StereoRig(rig.left, moved))
+    with pytest.raises(ValueError, match="rig: it does not fit"):
+        match(affine_pair.left, affine_pair.right, rig=turned(rig))
     # A small misfit is followed and told.
     nudged = AffineCamera(rig.right.matrix + np.array([[0, 0, 0, 0], [0, 0, 0, 4.0]]))
     matches = match(affine_pair.left, affine_pair.right, rig=StereoRig(rig.left, nudged))
