@@ -7,7 +7,7 @@ import pytest
 from lib.landmarks.training import Samples
 
 
-def draw_tool(rng: np.random.Generator, size=(96, 128)) -> tuple[np.ndarray, np.ndarray]:
+def draw_tool(rng: np.random.Generator, size=(64, 96)) -> tuple[np.ndarray, np.ndarray]:
     """One image (h, w, 3) uint8 and its landmarks (3, 2): base, then the left tip, then the right one."""
     h, w = size
     image = cv2.resize(rng.integers(60, 120, (8, 10, 3), np.uint8), (w, h), interpolation=cv2.INTER_CUBIC)
@@ -26,7 +26,7 @@ def draw_tool(rng: np.random.Generator, size=(96, 128)) -> tuple[np.ndarray, np.
     return image, np.array([base, *tips])
 
 
-def toy_samples(n: int, seed: int = 0, size=(96, 128)) -> Samples:
+def toy_samples(n: int, seed: int = 0, size=(64, 96)) -> Samples:
     rng = np.random.default_rng(seed)
     images, u = zip(*[draw_tool(rng, size) for _ in range(n)], strict=True)
     return Samples(np.stack(images), np.stack(u), np.full((n, 3), 2))

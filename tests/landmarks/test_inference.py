@@ -26,22 +26,22 @@ def untrained(reduction=2):
 
 @pytest.fixture(scope="module")
 def images():
-    return np.random.default_rng(0).integers(0, 256, (3, 130, 171, 3), dtype=np.uint8)
+    return np.random.default_rng(0).integers(0, 256, (2, 98, 131, 3), dtype=np.uint8)
 
 
 def test_shapes(images):
     found = untrained()(images)
-    assert found.u.shape == (3, 3, 2)
-    assert found.covariance.shape == (3, 3, 2, 2)
-    assert found.confidence.shape == (3, 3)
+    assert found.u.shape == (2, 3, 2)
+    assert found.covariance.shape == (2, 3, 2, 2)
+    assert found.confidence.shape == (2, 3)
     assert np.isfinite(found.u).all()
     assert (np.linalg.eigvalsh(found.covariance) > 0).all()
-    assert len(found[1:]) == 2
+    assert len(found[1:]) == 1
 
 
 def test_batches_do_not_matter(images):
     detector = untrained()
-    together, single = detector(images, batch=3), detector(images, batch=1)
+    together, single = detector(images, batch=2), detector(images, batch=1)
     assert np.allclose(together.u, single.u, atol=1e-2)
 
 
@@ -68,7 +68,7 @@ def test_missing_is_nan_with_confidence_zero(images):
 
 def test_whole_frame_detector_has_no_windows(images):
     detector = Detector(StackedHourglass(HourglassConfig(8, 2)), calibration=sure())
-    assert detector.frame_heatmaps(images).shape == (3, 3, 33, 43)
+    assert detector.frame_heatmaps(images).shape == (2, 3, 25, 33)
     assert np.isfinite(detector(images).u).all()
 
 

@@ -15,7 +15,7 @@ from lib.landmarks.training import PRESETS, Samples, TrainingConfig, heatmap_los
 
 SMALL = replace(
     PRESETS["best"],
-    network=HourglassConfig(8, 1, 3),
+    network=HourglassConfig(6, 1, 2),
     augmentation=Augmentation(20.0, (0.8, 1.2), photometric=0.5, mirror=True),
     steps=6,
     batch_size=2,
@@ -30,24 +30,24 @@ def same(a, b):
 def test_training_lowers_the_loss_and_finds_the_landmarks(toy):
     config = replace(
         PRESETS["best"],
-        network=HourglassConfig(16, 1, 3),
+        network=HourglassConfig(12, 1, 2),
         augmentation=Augmentation(15.0, (0.9, 1.1)),
-        steps=90,
-        batch_size=8,
-        validate_every=30,
+        steps=60,
+        batch_size=6,
+        validate_every=20,
         precision="fp32",
     )
-    log = train(config, toy(60), toy(20, seed=1), progress=False).log
-    assert log[-1]["loss"] < 0.4 * log[0]["loss"]
-    assert log[-1]["validation_loss"] < 0.4
-    assert log[-1]["pck_0.10"] > 80
+    log = train(config, toy(60), toy(12, seed=1), progress=False).log
+    assert log[-1]["loss"] < 0.6 * log[0]["loss"]
+    assert log[-1]["validation_loss"] < log[0]["validation_loss"]
+    assert log[-1]["pck_0.10"] > max(30, log[0]["pck_0.10"])
     assert log[-1]["spread"] == pytest.approx(1, abs=0.3)
 
 
 @pytest.mark.parametrize("changes", [{}, {"optimiser": "rmsprop", "ema": 0.0, "schedule": "constant", "precision": "fp32"}])
 def test_resume_is_exact(toy, tmp_path, changes):
     config = replace(SMALL, **changes)
-    data, held_out = toy(8), toy(4, seed=1)
+    data, held_out = toy(6), toy(2, seed=1)
     whole = train(config, data, held_out, progress=False)
 
     class Interrupt(Exception):
@@ -102,9 +102,9 @@ def test_disk_full_leaves_the_last_checkpoint(toy, tmp_path, monkeypatch):
 
 
 def test_patience_stops_a_training_that_no_longer_improves(toy):
-    config = replace(SMALL, steps=40, learning_rate=1e-12, validate_every=1, patience=2, ema=0.0)
+    config = replace(SMALL, steps=20, learning_rate=1e-12, validate_every=1, patience=2, ema=0.0)
     frozen = train(config, toy(4), toy(2, seed=1), progress=False)
-    assert len(frozen.log) < 40
+    assert len(frozen.log) < 20
 
 
 def test_paper_preset_is_as_printed():
