@@ -105,7 +105,7 @@ def register_images(
         if rows.sum() >= 3 and np.linalg.matrix_rank(data.x[rows] - data.x[rows].mean(axis=0), tol=1e-6) >= 2:
             x_stale = (data.y[rows] - rig.offset_px) @ np.linalg.pinv(rig.linear).T
             starts.append(register(x_stale, data.x[rows], loss=kind).transform)
-    return min((_fit(rig.linear, rig.offset_px, data, start, loss) for start in starts), key=lambda fit: fit.cost)
+    return _best_fit(rig.linear, rig.offset_px, data, starts, loss)
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,7 +245,7 @@ def _fit_one(rig: StereoRig, data: _Data, side: int, loss: Loss) -> Registration
     seen = data.seen[:, 0]
     check_spread(data.x[seen], f"x_mm (rows seen by the {('left', 'right')[side]} camera)")
     starts = [RigidTransform.identity(), _affine_start(camera, data.x[seen], data.y[seen])]
-    return min((_fit(camera.linear, camera.offset_px, data, start, loss) for start in starts), key=lambda fit: fit.cost)
+    return _best_fit(camera.linear, camera.offset_px, data, starts, loss)
 
 
 def _affine_start(camera: AffineCamera, x: np.ndarray, y: np.ndarray) -> RigidTransform:
@@ -276,10 +276,16 @@ def _loss(distance2: np.ndarray, data: _Data, loss: Loss) -> np.ndarray:
     return (_FREEDOM + dimension) * np.log1p(distance2 / _FREEDOM)
 
 
-def _fit(A: np.ndarray, offset: np.ndarray, data: _Data, start: RigidTransform, loss: Loss) -> Registration:
-    """Levenberg-Marquardt over the motion; A is (4, 3) of the pair or (2, 3) of one camera."""
+def _best_fit(A: np.ndarray, offset: np.ndarray, data: _Data, starts: list[RigidTransform], loss: Loss) -> Registration:
+    """From the two starts that explain the data best."""
     if loss not in ("squared", "robust"):
         raise ValueError(f"loss: 'squared' or 'robust', got {loss!r}.")
+    starts = sorted(starts, key=lambda start: _loss(_distance2(A, offset, data, start), data, loss).sum())
+    return min((_fit(A, offset, data, start, loss) for start in starts[:2]), key=lambda fit: fit.cost)
+
+
+def _fit(A: np.ndarray, offset: np.ndarray, data: _Data, start: RigidTransform, loss: Loss) -> Registration:
+    """Levenberg-Marquardt over the motion; A is (4, 3) of the pair or (2, 3) of one camera."""
     dimension = 2 * data.seen.sum(axis=1)
     freedom = 6 if len(A) == 4 else 5
     seen = dimension > 0
