@@ -104,9 +104,9 @@ def match_fields(left: np.ndarray, fields: dict[str, Matches], *, direction: np.
 
 
 def epipolar_geometry(
-    left: np.ndarray, right: np.ndarray, rig: StereoRig, u_left: np.ndarray, distance_px: np.ndarray, limit_px: float
+    left: np.ndarray, right: np.ndarray, rig: StereoRig, u_left: np.ndarray, distance_px: np.ndarray, kept: np.ndarray
 ) -> Figure:
-    """Left points (k, 2), their epipolar lines in the right image, and the distances (n,) of matches."""
+    """Left points (k, 2), their epipolar lines in the right image, and the distances (n,) of matches, kept or not."""
     page, axes = figure(1, 3, width_in=14, height_in=2.9, width_ratios=(1, 1, 0.75))
     show_image(axes[0], left, "Left: points")
     show_image(axes[1], right, "Right: their epipolar lines are parallel")
@@ -118,10 +118,13 @@ def epipolar_geometry(
         axes[1].plot(x, -(a * x + c) / b, color=colour)
     for ax, image in zip(axes, (left, right), strict=False):
         ax.set(xlim=(-0.5, image.shape[1] - 0.5), ylim=(image.shape[0] - 0.5, -0.5))
-    span = 4 * limit_px
-    axes[2].hist(np.clip(distance_px, -span, span), bins=81, color=COLOURS["ours"])
-    axes[2].axvspan(
-        -limit_px, limit_px, color=COLOURS["truth"], alpha=0.15, label=f"kept: |distance| < {limit_px:.2f} px"
+    span = float(np.abs(distance_px).max()) + 1e-6
+    axes[2].hist(
+        [distance_px[kept], distance_px[~kept]],
+        bins=np.linspace(-span, span, 82),
+        stacked=True,
+        color=[COLOURS["ours"], COLOURS["warning"]],
+        label=[f"kept: {kept.mean():.0%}", "beyond their own sigmas"],
     )
     axes[2].set(xlabel="epipolar distance of matches (px)", ylabel="matches", title="The filter", yscale="log")
     axes[2].legend(loc="upper right", fontsize=8)

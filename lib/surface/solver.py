@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 
 import numpy as np
 from scipy import sparse
@@ -44,12 +44,36 @@ class L1Problem:
     """
 
     def __init__(self, grid: SplineGrid, u: np.ndarray) -> None:
-        self.grid = grid
-        self.design = grid.design(u)
-        self.design_T = self.design.T.tocsr()
-        self.bending = grid.bending
-        self.bending_band = self._band(grid.bending)
-        self._pack(u)
+        self.grid, self.u = grid, u
+
+    @cached_property
+    def design(self) -> sparse.csr_matrix:
+        """B (n, size)."""
+        return self.grid.design(self.u)
+
+    @cached_property
+    def design_T(self) -> sparse.csr_matrix:
+        """B', stored by rows too: products with it then run through the points in order."""
+        return self.design.T.tocsr()
+
+    @property
+    def bending(self) -> sparse.csr_matrix:
+        """R (size, size)."""
+        return self.grid.bending
+
+    @cached_property
+    def bending_band(self) -> np.ndarray:
+        """R as a lower band (bandwidth + 1, size)."""
+        entries = sparse.tril(self.bending).tocoo()
+        band = np.zeros((self.grid.bandwidth + 1, self.grid.size))
+        band[entries.row - entries.col, entries.col] = entries.data
+        return band
+
+    @cached_property
+    def by_cells(self) -> tuple[np.ndarray, L1Problem]:
+        """Order (n,) of the points by cells, and the problem in that order: neighbours in space are so in memory."""
+        order = np.argsort(self.grid.locate(self.u)[0] @ self.grid.stride, kind="stable")
+        return order, L1Problem(self.grid, self.u[order])
 
     def gram_band(self, weights: np.ndarray) -> np.ndarray:
         """B' diag(weights) B for weights (n,), as a lower band (bandwidth + 1, size).
@@ -57,22 +81,24 @@ class L1Problem:
         A cell's 16 x 16 block is a sum over its points of products of basis functions that separate in x and y, so it
         is one small matrix product of the 10 distinct products along x with the 10 along y.
         """
-        n_blocks, _, size = self._along_x.shape
+        slot, (along_x, along_y), layers, scatter = self._blocks
+        n_blocks, _, size = along_x.shape
         packed = np.zeros(n_blocks * size)
-        packed[self._slot] = weights
-        blocks = np.matmul(self._along_y * packed.reshape(n_blocks, 1, size), self._along_x.transpose(0, 2, 1))
-        cells = blocks[: self._layers[0][1]]
-        for first, last in self._layers[1:]:
+        packed[slot] = weights
+        blocks = np.matmul(along_y * packed.reshape(n_blocks, 1, size), along_x.transpose(0, 2, 1))
+        cells = blocks[: layers[0][1]]
+        for first, last in layers[1:]:
             cells[: last - first] += blocks[first:last]
-        return (self._scatter @ cells.ravel()).reshape(self.grid.bandwidth + 1, self.grid.size)
+        return (scatter @ cells.ravel()).reshape(self.grid.bandwidth + 1, self.grid.size)
 
-    def _pack(self, u: np.ndarray) -> None:
-        """Sort the points into their cells, in blocks of equal size so that the cells' sums are batched products.
+    @cached_property
+    def _blocks(self) -> tuple[np.ndarray, list[np.ndarray], list[tuple[int, int]], sparse.csr_matrix]:
+        """The points in their cells, in blocks of equal size so that the cells' sums are batched products.
 
         The fullest cells come first, and the blocks in layers (every cell's first block, then the second ones, ...), so
         that a layer adds to the first cells only.
         """
-        grid = self.grid
+        grid, u = self.grid, self.u
         cell, t = grid.locate(u)
         cell_id, inverse, counts = np.unique(cell @ (1, grid.cells[0]), return_inverse=True, return_counts=True)
         order = np.argsort(-counts, kind="stable")
@@ -82,16 +108,17 @@ class L1Problem:
         size = int(np.clip(-(-len(u) // len(counts)), 4, 64))
         cells_in_layer = [int((counts > layer * size).sum()) for layer in range(-(-int(counts[0]) // size))]
         starts = np.concatenate([[0], np.cumsum(cells_in_layer)])
-        self._layers = list(itertools.pairwise(starts.tolist()))
+        layers = list(itertools.pairwise(starts.tolist()))
         rank = np.empty(len(u), dtype=np.intp)
         rank[np.argsort(inverse, kind="stable")] = np.arange(len(u)) - np.repeat(np.cumsum(counts) - counts, counts)
         block = starts[rank // size] + inverse
-        self._slot = block * size + rank % size
-        for name, axis in (("_along_x", 0), ("_along_y", 1)):
+        slot = block * size + rank % size
+        along = []
+        for axis in (0, 1):
             basis = cubic_basis(t[:, axis])
             products = np.zeros((starts[-1], 10, size))
             products[block, :, rank % size] = np.stack([basis[:, i] * basis[:, j] for i, j in _PAIRS], axis=1)
-            setattr(self, name, products)
+            along.append(products)
 
         # Where each of the 10 x 10 products of a cell goes in the band.
         step_x, step_y = grid.stride
@@ -106,16 +133,11 @@ class L1Problem:
         column = first[:, None] + local[lower_b]
         row = (local[lower_a] - local[lower_b]) * grid.size + column
         origin = np.arange(len(cell_id))[:, None] * 100 + source
-        self._scatter = sparse.csr_matrix(
+        scatter = sparse.csr_matrix(
             (np.ones(row.size), (row.ravel(), origin.ravel())),
             shape=((grid.bandwidth + 1) * grid.size, 100 * len(cell_id)),
         )
-
-    def _band(self, matrix: sparse.csr_matrix) -> np.ndarray:
-        entries = sparse.tril(matrix).tocoo()
-        band = np.zeros((self.grid.bandwidth + 1, self.grid.size))
-        band[entries.row - entries.col, entries.col] = entries.data
-        return band
+        return slot, along, layers, scatter
 
 
 @dataclass(frozen=True)
@@ -174,17 +196,20 @@ def interior_point(
         If the data do not determine the coefficients (a control point without data, at mu = 0).
     """
     weights = np.ones_like(x) if weights is None else weights
-    columns = zip(x.T, np.broadcast_to(mu, x.shape[1]), weights.T, strict=True)
+    order, sorted_problem = problem.by_cells
+    columns = zip(x[order].T, np.broadcast_to(mu, x.shape[1]), weights[order].T, strict=True)
     with _one_blas_thread():
         outputs = [
             _interior_point(
-                problem, np.ascontiguousarray(x_k), mu_k, np.ascontiguousarray(w_k), tolerance, max_iterations
+                sorted_problem, np.ascontiguousarray(x_k), mu_k, np.ascontiguousarray(w_k), tolerance, max_iterations
             )
             for x_k, mu_k, w_k in columns
         ]
     coefficients, objective, gap, dual, iterations = zip(*outputs, strict=True)
+    unsorted_dual = np.empty_like(x)
+    unsorted_dual[order] = np.stack(dual, axis=1)
     return L1Solution(
-        np.stack(coefficients, axis=1), np.array(objective), np.array(gap), np.stack(dual, axis=1), max(iterations)
+        np.stack(coefficients, axis=1), np.array(objective), np.array(gap), unsorted_dual, max(iterations)
     )
 
 

@@ -48,12 +48,12 @@ def test_solver_beside_clarabel(benchmark, control, n):
     cvxpy_reference(L1Problem(grid, u[:500]), x[:500, :1], mu)  # imports and compiles
 
     def ours():
-        return interior_point(L1Problem(grid, u), x, mu)
+        return interior_point(L1Problem(grid, u), x, mu, tolerance=1e-8)
 
     found, seconds = cpu_seconds(ours)
     seconds = min(seconds, *(cpu_seconds(ours)[1] for _ in range(3)))
     problem = L1Problem(grid, u)
-    reference, reference_seconds = cpu_seconds(lambda: cvxpy_reference(problem, x, mu))
+    reference, reference_seconds = cpu_seconds(lambda: cvxpy_reference(problem, x, mu, tolerance=1e-8))
     benchmark.extra_info |= {
         "relative_difference": float(found.objective.sum() / reference.objective.sum() - 1),
         "duality_gap": float(found.duality_gap.sum() / found.objective.sum()),

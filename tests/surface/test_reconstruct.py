@@ -119,7 +119,9 @@ def test_every_figure_draws(scene, result):
         figures.stereo_pair(scene.left, scene.right, scene.u_tool),
         figures.descriptor_channels(scene.left, np.random.default_rng(0).random((36, 64, 9))),
         figures.match_fields(scene.left, {"band": result.matches}),
-        figures.epipolar_geometry(scene.left, scene.right, rig, np.array([[100.0, 50.0]]), np.zeros(9), 1.0),
+        figures.epipolar_geometry(
+            scene.left, scene.right, rig, np.array([[100.0, 50.0]]), np.arange(9.0), np.arange(9) < 7
+        ),
         figures.point_errors({"a": np.array([0.01, np.nan, -0.02]), "b": np.ones(4) * 0.01}, {"a": 10.0, "b": 1.0}),
         figures.profiles(position, dots, curves, title="section"),
         figures.smoothness_sections(np.array([1.0, 2.0, 3.0]), [np.cos(position)] * 3, position, dots, curves),
