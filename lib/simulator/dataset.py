@@ -104,7 +104,7 @@ def _make_sequence(folder: Path, seed: int, index: int, n_pairs: int) -> str:
 
 
 def _seconds_a_pair() -> float:
-    """CPU seconds of a stereo pair on this machine, from one pair without a tool; tool, JPEG and kinematics add a half."""
+    """CPU seconds of a stereo pair on this machine: of one pair without a tool, and half as much for the rest."""
     eye = Eye(texture_px=256)
     eye.texture  # noqa: B018 - once an eye, not once a pair
     start = time.process_time()

@@ -26,22 +26,23 @@ class ToolRaster:
         Samples per pixel and axis; sample k of pixel i is at i + (k + 0.5) / factor - 0.5.
     depth_mm:
         (h, w) float32 along the viewing direction, infinity where there is no tool.
-    normal:
-        (h, w, 3) float32 in the camera frame (z away from the camera).
-    tangent:
-        (h, w, 3) float32, direction along the part.
     part:
         (h, w) uint8: 0 none, 1 shaft, 2 jaw 1, 3 jaw 2.
+    hit:
+        (rows, columns), (n,) each, of the samples with tool; the following are theirs.
+    normal, tangent:
+        (n, 3) float32 in the camera frame (z away from the camera); the tangent runs along the part.
     along_mm:
-        (h, w) float32, position along the part, for brush marks.
+        (n,) float32, position along the part, for brush marks.
     """
 
     origin_px: tuple[int, int]
     factor: int
     depth_mm: np.ndarray
+    part: np.ndarray
+    hit: tuple[np.ndarray, np.ndarray]
     normal: np.ndarray
     tangent: np.ndarray
-    part: np.ndarray
     along_mm: np.ndarray
 
 
@@ -84,49 +85,51 @@ def rasterise(
     depth = np.full(shape, np.inf, np.float32)
     parameter = np.zeros(shape, np.float32)
     index = np.full(shape, -1, np.int16)
-    step = 1.0 / factor
+    step = np.float32(1.0 / factor)
     for k, (lx, ly), (hx, hy) in zip(joined, low, high, strict=True):
         a, b = centres[k], centres[k + 1]
         r, dr = radii[k], radii[k + 1] - radii[k]
         c, dz = b[:2] - a[:2], b[2] - a[2]
-        wx = ((np.arange((hx - lx) * factor) + 0.5) * step - 0.5 + lx) / zoom - a[0]
-        wy = ((np.arange((hy - ly) * factor) + 0.5) * step - 0.5 + ly) / zoom - a[1]
         A = dr * dr - c @ c
         if A > -1e-9:  # one ball hides the other
             continue
-        B = (r * dr + wy * c[1])[:, None] + (wx * c[0])[None]
-        C = (r * r - wy * wy)[:, None] - (wx * wx)[None]
-        y = dz * np.sqrt(np.maximum(B * B - A * C, 0) / (dz * dz - A))
-        s = (y - B) / A
+        # Relative to the node and small, so single precision is exact to nanometres.
+        wx = (((np.arange((hx - lx) * factor) + 0.5) / factor - 0.5 + lx) / zoom - a[0]).astype(np.float32)
+        wy = (((np.arange((hy - ly) * factor) + 0.5) / factor - 0.5 + ly) / zoom - a[1]).astype(np.float32)
+        A, gain = np.float32(A), np.float32(dz / np.sqrt(dz * dz - A))
+        B = np.add.outer((r * dr + wy * c[1]).astype(np.float32), (wx * c[0]).astype(np.float32))
+        C = np.subtract.outer((r * r - wy * wy).astype(np.float32), wx * wx)
+        s = np.sqrt(np.maximum(B * B - A * C, 0))
+        s *= gain
+        s -= B
+        s /= A
         flat = chains[k] == 0 and (k + 2 >= len(chains) or chains[k + 2] != 0)
-        inside = s <= 1 if flat else True
-        s = np.clip(s, 0, 1)
-        Q = A * s * s + 2 * B * s + C
+        past = s > 1 if flat else None
+        np.clip(s, 0, 1, out=s)
+        Q = (A * s + 2 * B) * s + C
+        z = np.float32(a[2]) + s * np.float32(dz) - np.sqrt(np.maximum(Q, 0))
         view = np.s_[(ly - y0) * factor : (hy - y0) * factor, (lx - x0) * factor : (hx - x0) * factor]
-        z = np.where((Q > 0) & inside, a[2] + s * dz - np.sqrt(np.maximum(Q, 0)), np.inf)
-        closer = z < depth[view]
-        depth[view][closer] = z[closer]
-        parameter[view][closer] = s[closer]
-        index[view][closer] = k
-    hit = index >= 0
-    k, s = index[hit], parameter[hit].astype(np.float64)[:, None]
+        closer = (Q > 0) & (z < depth[view])
+        if past is not None:
+            closer &= ~past
+        np.copyto(depth[view], z, where=closer)
+        np.copyto(parameter[view], s, where=closer)
+        np.copyto(index[view], np.int16(k), where=closer)
+    rows, columns = np.nonzero(index >= 0)
+    k, s = index[rows, columns], parameter[rows, columns][:, None]
     span = centres[1:] - centres[:-1]
-    rows, columns = np.nonzero(hit)
+    length = np.linalg.norm(span, axis=1)
     surface = np.column_stack(
         [
             ((columns + 0.5) * step - 0.5 + x0) / zoom,
             ((rows + 0.5) * step - 0.5 + y0) / zoom,
-            depth[hit],
+            depth[rows, columns],
         ]
     )
-    normal = np.zeros((*shape, 3), np.float32)
-    out = surface - (centres[k] + s * span[k])
-    normal[hit] = out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-9)
-    tangent = np.zeros((*shape, 3), np.float32)
-    length = np.linalg.norm(span, axis=1)
-    tangent[hit] = (span / np.maximum(length, 1e-9)[:, None])[k]
-    along = np.zeros(shape, np.float32)
-    along[hit] = np.concatenate([[0], np.cumsum(length)])[k] + s[:, 0] * length[k]
+    out = (surface - centres[k] - s * span[k]).astype(np.float32)
+    normal = out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-9)
+    tangent = (span / np.maximum(length, 1e-9)[:, None]).astype(np.float32)[k]
+    along = (np.concatenate([[0], np.cumsum(length)])[k] + s[:, 0] * length[k]).astype(np.float32)
     part = np.zeros(shape, np.uint8)
-    part[hit] = chains[k] + 1
-    return ToolRaster((int(x0), int(y0)), factor, depth, normal, tangent, part, along)
+    part[rows, columns] = chains[k] + 1
+    return ToolRaster((int(x0), int(y0)), factor, depth, part, (rows, columns), normal, tangent, along)

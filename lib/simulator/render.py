@@ -156,8 +156,7 @@ def _shadow(x: np.ndarray, y: np.ndarray, z: np.ndarray, nodes: tuple, slope: tu
 
 def _metal(raster: ToolRaster, forceps: Forceps, light: np.ndarray, glow: np.ndarray) -> np.ndarray:
     """Linear colour (n, 3) of the raster's tool samples under the lamp, with the retina's glow from below."""
-    hit = raster.part > 0
-    normal, tangent = raster.normal[hit], raster.tangent[hit]
+    normal, tangent = raster.normal, raster.tangent
     facing = np.clip(-normal[:, 2], 0, 1)
     up = 2 * facing * facing - 1  # of the mirrored view ray: 1 looks back into the microscope, -1 at the retina
     half = light - np.array([0, 0, 1.0])
@@ -169,7 +168,7 @@ def _metal(raster: ToolRaster, forceps: Forceps, light: np.ndarray, glow: np.nda
     marks /= marks.std()
     around = np.arctan2(normal[:, 0] * tangent[:, 1] - normal[:, 1] * tangent[:, 0], facing)
     rows = ((around / np.pi + 1) * 128).astype(int) % 256
-    brush = 1 + forceps.brushed * marks[rows, (raster.along_mm[hit] * 6).astype(int) % 128]
+    brush = 1 + forceps.brushed * marks[rows, (raster.along_mm * 6).astype(int) % 128]
     lamp = 1 / (1 + np.exp(-(up - 0.55) / 0.14))
     body = forceps.brightness * (0.10 + 0.50 * lamp + 0.22 * np.clip(up + 0.2, 0, 1))
     grey = (body + 1.1 * forceps.brightness * streak) * np.clip(brush, 0.2, 2)
@@ -383,16 +382,18 @@ def _to_camera(forceps, pose, later, nodes, camera, microscope, R, offset, zoom,
 
 def _tool_layer(raster, forceps, lamp, glow, microscope):
     """Premultiplied colour (h, w, 3), coverage (h, w) and mean depth (h, w) of the tool at image resolution."""
-    hit = raster.part > 0
-    fine = np.zeros((*hit.shape, 5), np.float32)
-    fine[hit, :3] = _metal(raster, forceps, lamp / np.linalg.norm(lamp), glow) * np.float32(
-        1.15 * microscope.brightness
-    )
-    fine[..., 3] = hit
-    fine[hit, 4] = raster.depth_mm[hit]
-    size = (hit.shape[1] // raster.factor, hit.shape[0] // raster.factor)
-    layer = cv2.resize(fine, size, interpolation=cv2.INTER_AREA)
-    return layer[..., :3], layer[..., 3], layer[..., 4] / np.maximum(layer[..., 3], 1e-6)
+    rows, columns = raster.hit
+    height, width = (side // raster.factor for side in raster.part.shape)
+    pixel = (rows // raster.factor) * width + columns // raster.factor
+    metal = _metal(raster, forceps, lamp / np.linalg.norm(lamp), glow) * np.float32(1.15 * microscope.brightness)
+
+    def total(weights: np.ndarray | None = None) -> np.ndarray:
+        return np.bincount(pixel, weights, height * width).reshape(height, width).astype(np.float32)
+
+    samples = raster.factor**2
+    count = total()
+    colour = np.dstack([total(metal[:, channel]) for channel in range(3)]) / samples
+    return colour, count / samples, total(raster.depth_mm[rows, columns]) / np.maximum(count, 1)
 
 
 def _compose(linear, tool_mask, raster, colour, alpha, depth, microscope, scale, R, shift):

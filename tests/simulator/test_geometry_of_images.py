@@ -173,7 +173,7 @@ def test_rolling_shutter_moves_the_tool_by_what_its_speed_predicts():
 
 
 def test_defocus_grows_with_the_distance_from_focus_as_designed():
-    """The width of a board's edge is the hypotenuse of point spread and |z| / (depth of field / 2) px."""
+    """The width of a board's edge is the hypotenuse of what it is in focus and |z| / (depth of field / 2) px."""
     microscope = replace(PLAIN, depth_of_field_mm=2.0, psf_px=0.8)
     camera = RIG.left
     widths = []
@@ -189,9 +189,10 @@ def test_defocus_grows_with_the_distance_from_focus_as_designed():
             middle = (line * columns).sum() / line.sum()
             rows.append(np.sqrt((line * (columns - middle) ** 2).sum() / line.sum()))
         widths.append(np.median(rows))
-    designed = np.hypot(0.8, [0.0, 1.0, 2.0, 4.0])
     assert (np.diff(widths) > 0).all()
-    assert_allclose(widths, designed, rtol=0.15)
+    # What is wider than in focus, where the point spread and the texture's own softness remain.
+    added = np.sqrt(np.square(widths[1:]) - widths[0] ** 2)
+    assert_allclose(added, [1.0, 2.0, 4.0], rtol=0.05)
 
 
 def test_checkerboard_corners_are_where_the_truth_says():
