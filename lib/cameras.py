@@ -481,7 +481,9 @@ class StereoRig:
             content = json.loads(path.read_text(encoding="utf-8"))
             return cls(camera_from_dict(content["left"]), camera_from_dict(content["right"]))
         except (ValueError, KeyError, TypeError) as error:
-            raise ValueError(f"{path}: not a stereo rig written by StereoRig.save ({type(error).__name__}: {error}).") from None
+            raise ValueError(
+                f"{path}: not a stereo rig written by StereoRig.save ({type(error).__name__}: {error})."
+            ) from None
 
     @staticmethod
     def _stack(u_left: ArrayLike, u_right: ArrayLike) -> np.ndarray:

@@ -98,7 +98,9 @@ def test_triangulation_is_the_weighted_minimum_and_its_covariance_is_right(rig, 
     assert mahalanobis.mean() == pytest.approx(3, rel=0.08)
     # Minimum: the gradient of the weighted reprojection error vanishes.
     r = np.hstack([u_left, u_right]) - np.hstack(pair.project(found.x_mm))
-    gradient = np.einsum("nij,nik,nk->nj", pair.jacobian(found.x_mm), np.broadcast_to(np.linalg.inv(S), (4000, 4, 4)), r)
+    gradient = np.einsum(
+        "nij,nik,nk->nj", pair.jacobian(found.x_mm), np.broadcast_to(np.linalg.inv(S), (4000, 4, 4)), r
+    )
     assert np.abs(gradient).max() < 1e-3 * 100
 
 

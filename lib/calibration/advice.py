@@ -65,9 +65,7 @@ def _information_gain(calibration: Calibration, covariance: np.ndarray, x: np.nd
     return np.linalg.slogdet(inside)[1]
 
 
-def next_positions(
-    calibration: Calibration, candidates_mm: ArrayLike, count: int = 1
-) -> tuple[np.ndarray, np.ndarray]:
+def next_positions(calibration: Calibration, candidates_mm: ArrayLike, count: int = 1) -> tuple[np.ndarray, np.ndarray]:
     """The `count` positions, chosen one after another, whose correspondences raise det(information) most.
 
     det(H^T H + h h^T) = det(H^T H)(1 + leverage), so for the affine model this is the largest leverage; after each choice

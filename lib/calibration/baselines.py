@@ -12,7 +12,14 @@ from scipy.linalg import rq
 from lib.calibration.checks import check_spread
 from lib.geometry import finite_points, points
 
-__all__ = ["Factorisation", "PerspectiveCamera", "factorise", "perspective_dlt", "similarity", "triangulate_perspective"]
+__all__ = [
+    "Factorisation",
+    "PerspectiveCamera",
+    "factorise",
+    "perspective_dlt",
+    "similarity",
+    "triangulate_perspective",
+]
 
 
 @dataclass(frozen=True, eq=False)

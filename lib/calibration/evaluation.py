@@ -1,6 +1,6 @@
 """Evidence: every claim on calibration measured anew and written to ``data/results/calibration.json``.
 
-    python3 -m lib.calibration.evaluation [--runs 2000] [--out FILE] [STUDY ...]
+python3 -m lib.calibration.evaluation [--runs 2000] [--out FILE] [STUDY ...]
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def solve_with_ceres(x: np.ndarray, y: np.ndarray, sigma_u: float, sigma_x: floa
             self.set_num_residuals(4)
             self.set_parameter_block_sizes([16, 3])
 
-        def Evaluate(self, parameters, residuals, jacobians):  # noqa: N802 (Ceres' name)
+        def Evaluate(self, parameters, residuals, jacobians):
             M, point = parameters[0].reshape(4, 4), parameters[1]
             residuals[:] = (M[:, :3] @ point + M[:, 3] - self.pixels) / sigma_u
             if jacobians is not None:
@@ -93,7 +93,7 @@ def solve_with_ceres(x: np.ndarray, y: np.ndarray, sigma_u: float, sigma_x: floa
             self.set_num_residuals(3)
             self.set_parameter_block_sizes([3])
 
-        def Evaluate(self, parameters, residuals, jacobians):  # noqa: N802
+        def Evaluate(self, parameters, residuals, jacobians):
             residuals[:] = (parameters[0] - self.position) / sigma_x
             if jacobians is not None and jacobians[0] is not None:
                 jacobians[0][:] = np.eye(3).ravel() / sigma_x
@@ -237,7 +237,10 @@ def working_distance(runs: int) -> dict:
     """Affine and near-affine model against working distance."""
     distances = [100.0, 200.0, 400.0, 1000.0, np.inf]
     study = studies.working_distance_study(distances, runs=max(3, runs // 200))
-    return {"distance_mm": [d if np.isfinite(d) else None for d in distances], **{k: v.tolist() for k, v in study.items()}}
+    return {
+        "distance_mm": [d if np.isfinite(d) else None for d in distances],
+        **{k: v.tolist() for k, v in study.items()},
+    }
 
 
 def robot(runs: int) -> dict:
@@ -267,7 +270,9 @@ STUDIES: dict[str, Callable[[int], dict]] = {
 
 def _commit() -> str:
     try:
-        done = subprocess.run(["git", "rev-parse", "--short", "HEAD"], cwd=paths.ROOT, capture_output=True, text=True, check=True)
+        done = subprocess.run(
+            ["git", "rev-parse", "--short", "HEAD"], cwd=paths.ROOT, capture_output=True, text=True, check=True
+        )
         return done.stdout.strip()
     except (OSError, subprocess.CalledProcessError):
         return "unknown"

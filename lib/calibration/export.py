@@ -56,9 +56,7 @@ def write_json(calibration: Calibration, path: str | Path) -> None:
         "rows": len(calibration.inliers),
         "inliers": int(calibration.inliers.sum()),
         "reprojection_rms_px": calibration.reprojection_rms_px,
-        "cameras": {
-            name: camera_to_dict(camera) for name, camera in zip(names, calibration.cameras, strict=True)
-        },
+        "cameras": {name: camera_to_dict(camera) for name, camera in zip(names, calibration.cameras, strict=True)},
         "matrix_covariance": calibration.covariance.tolist(),
         "parameters": calibration.parameter_names,
         "parameter_covariance": calibration.parameter_covariance.tolist(),
@@ -80,11 +78,13 @@ def read_json(path: str | Path) -> tuple[Camera, ...] | StereoRig:
             return StereoRig(camera_from_dict(cameras["left"]), camera_from_dict(cameras["right"]))
         return (camera_from_dict(cameras["camera"]),)
     except (ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{path}: not a calibration written by write_json ({type(error).__name__}: {error}).") from None
+        raise ValueError(
+            f"{path}: not a calibration written by write_json ({type(error).__name__}: {error})."
+        ) from None
 
 
 def write_opencv(camera: Camera, path: str | Path, image_size_px: tuple[int, int]) -> None:
-    """OpenCV FileStorage YAML: `projection_matrix` 3 x 4 (an affine camera's last row is 0 0 0 1), image size, radial term."""
+    """OpenCV FileStorage YAML: `projection_matrix` 3 x 4 (affine: last row 0 0 0 1), image size, radial term."""
     values = ", ".join(repr(float(v)) for v in camera.projection_matrix.ravel())
     radial = camera.radial_per_px2 if isinstance(camera, NearAffineCamera) else 0.0
     _write(
@@ -106,7 +106,9 @@ def read_opencv(path: str | Path) -> Camera:
         Naming the file.
     """
     text = _read(path)
-    found = re.search(r"projection_matrix:\s*!!opencv-matrix\s+rows:\s*3\s+cols:\s*4\s+dt:\s*\w\s+data:\s*\[(.*?)\]", text, re.S)
+    found = re.search(
+        r"projection_matrix:\s*!!opencv-matrix\s+rows:\s*3\s+cols:\s*4\s+dt:\s*\w\s+data:\s*\[(.*?)\]", text, re.S
+    )
     if not found:
         raise ValueError(f"{path}: no 3 x 4 projection_matrix; write_opencv or cv2.FileStorage writes one.")
     radial = re.search(r"^radial_per_px2:\s*(\S+)", text, re.M)
@@ -123,7 +125,7 @@ def _numbers(text: str, path: str | Path) -> np.ndarray:
 def write_ros(camera: Camera, path: str | Path, image_size_px: tuple[int, int], name: str = "camera") -> None:
     """ROS CameraInfo YAML (camera_info_manager).  P carries the whole camera, millimetres of the robot frame to pixels.
 
-    K and R are identities and D is zero, since an affine camera has no pinhole K: only P has a meaning, as the file's comment says.
+    K and R are identities and D is zero, since an affine camera has no pinhole K: only P has a meaning.
 
     Raises
     ------

@@ -87,8 +87,9 @@ class Comparison:
         for rung in self.rungs:
             p = "" if rung.against is None else f"{rung.p_value:.3g}"
             mark = " <- chosen" if rung is self.best else ""
+            above = rung.bic - self.best.bic
             lines.append(
-                f"{rung.model:28s} {rung.parameters:4d} {rung.chi_square:10.1f} {rung.bic - self.best.bic:10.1f} {p:>14s}{mark}"
+                f"{rung.model:28s} {rung.parameters:4d} {rung.chi_square:10.1f} {above:10.1f} {p:>14s}{mark}"
             )
         return "\n".join(lines)
 
@@ -121,7 +122,8 @@ def compare_models(
         models = [m for m in models if m != "common_zoom" and "distances" not in m]
     common = {"covariance_px2": covariance_px2, "seed": seed, "image_size_px": image_size_px}
     fits = [
-        calibrate(x_mm, u, model=m, sigma_u_px=sigma_u_px, sigma_x_mm=sigma_x_mm, ransac_px=ransac_px, **common) for m in models
+        calibrate(x_mm, u, model=m, sigma_u_px=sigma_u_px, sigma_x_mm=sigma_x_mm, ransac_px=ransac_px, **common)
+        for m in models
     ]
     freest = max(fits, key=lambda c: len(c.parameter_names))
     rows = freest.inliers

@@ -74,7 +74,8 @@ def tool_offsets(
 ) -> ToolOffsets:
     """Landmark offsets and affine cameras together, from poses and images: y = A (R_i p_k + t_i) + o.
 
-    Bilinear in the cameras and the offsets.  Gauss-Newton on both, started from the lifted problem, linear in (A, A (x) p, o).
+    Bilinear in the cameras and the offsets.  Gauss-Newton on both, started from the lifted problem that is linear
+    in (A, A (x) p, o).
 
     Parameters
     ----------
@@ -93,7 +94,7 @@ def tool_offsets(
     if any(i.ndim != 3 or i.shape[0] != len(R) or i.shape[2] != 2 or i.shape != images[0].shape for i in images):
         raise ValueError(f"u: expected ({len(R)}, k, 2) pixels a camera, got {[i.shape for i in images]}.")
     y = np.concatenate(images, axis=2)
-    n, k, m = y.shape
+    k, m = y.shape[1:]
     frame, landmark = np.nonzero(np.isfinite(y).all(axis=2))
     pixels, R, t = y[frame, landmark], R[frame], t[frame]
     finite_points(pixels[:, :2], 2, "u")

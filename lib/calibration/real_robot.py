@@ -74,8 +74,8 @@ def read_robot_frames(folder: str | Path) -> RobotFrames:
 def find_spheres(image: np.ndarray) -> np.ndarray | None:
     """The two red spheres of an RGB image, upper first: (2, 3) of x, y, radius in px at sub-pixel; None if not both are there.
 
-    A red region gives the rough circle; the outline is then the steepest fall of redness along 180 rays, found to a fraction of
-    a pixel, and the circle the robust fit to it, blind to where the shaft, highlights or tape cross the outline.
+    A red region gives the rough circle; the outline is then the steepest fall of redness along 180 rays, found to a
+    fraction of a pixel, and the circle the robust fit to it, blind to where the shaft, highlights or tape cross the outline.
     """
     channels = image.astype(np.float32)
     redness = channels[:, :, 0] - np.maximum(channels[:, :, 1], channels[:, :, 2])
@@ -158,7 +158,12 @@ class SphereFit:
 
 
 def calibrate_sphere(
-    joint_mm: ArrayLike, u: ArrayLike, *, model: str, image_size_px: tuple[int, int], along_shaft_mm: float | None = None
+    joint_mm: ArrayLike,
+    u: ArrayLike,
+    *,
+    model: str,
+    image_size_px: tuple[int, int],
+    along_shaft_mm: float | None = None,
 ) -> SphereFit:
     """Camera and length l of one sphere, and honest leave-one-out residuals: everything is estimated anew without the frame.
 
@@ -181,7 +186,9 @@ def calibrate_sphere(
     def best_length(rows: np.ndarray, bounds: tuple[float, float]) -> float:
         if along_shaft_mm is not None:
             return along_shaft_mm
-        return float(minimize_scalar(lambda s: fit(rows, s).cost, bounds=bounds, method="bounded", options={"xatol": 0.05}).x)
+        return float(
+            minimize_scalar(lambda s: fit(rows, s).cost, bounds=bounds, method="bounded", options={"xatol": 0.05}).x
+        )
 
     everything = np.ones(len(u), dtype=bool)
     length = best_length(everything, (-150.0, 150.0))

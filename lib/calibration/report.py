@@ -68,7 +68,9 @@ def verdicts(calibration: Calibration) -> list[tuple[bool, str]]:
     ]
     if freedom > 0:
         fits = chi2.sf(value, freedom) > 1e-3
-        found.append((fits, "residuals are as large as the noise levels say" if fits else "residuals exceed the noise levels"))
+        found.append(
+            (fits, "residuals are as large as the noise levels say" if fits else "residuals exceed the noise levels")
+        )
     x = c.x_mm[c.inliers]
     extent = np.sqrt(np.linalg.eigvalsh(np.cov(x.T))[::-1])
     deep = extent[2] > 10 * max(c.sigma_x_mm, 0.001)

@@ -101,7 +101,9 @@ def _samples(x: np.ndarray, count: int, rng: np.random.Generator, least: float) 
     """Sets (count, 4) of rows whose four points span a volume."""
     n = len(x)
     thickness = np.sqrt(np.linalg.eigvalsh(x.T @ x / n)[0])
-    sets = np.argpartition(rng.random((3 * count, n)), 4, axis=1)[:, :4] if n < 40 else rng.integers(0, n, (3 * count, 4))
+    sets = (
+        np.argpartition(rng.random((3 * count, n)), 4, axis=1)[:, :4] if n < 40 else rng.integers(0, n, (3 * count, 4))
+    )
     corners = x[sets]
     corners = corners - corners.mean(axis=1, keepdims=True)
     smallest = np.sqrt(np.maximum(np.linalg.eigvalsh(np.swapaxes(corners, 1, 2) @ corners)[:, 0], 0.0))

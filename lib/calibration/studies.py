@@ -24,6 +24,7 @@ from lib.cameras import NearAffineCamera, StereoRig
 from lib.geometry import RigidTransform
 from lib.landmarks.stereo import Correspondences, StereoLandmarks
 from lib.recordings import Recording
+from lib.simulator.rig import Correspondences as SimulatedCorrespondences
 from lib.simulator.rig import (
     IMAGE_SIZE_PX,
     ROBOT_FROM_MICROSCOPE,
@@ -38,8 +39,8 @@ __all__ = [
     "bound_study",
     "factorisation_study",
     "focal_study",
-    "nested_study",
     "near_affine_rig",
+    "nested_study",
     "noise_study",
     "shallow_study",
     "time_offset_study",
@@ -282,7 +283,9 @@ def tool_offset_study(*, frames: int = 300, runs: int = 10, seed: int = 0) -> np
             for _ in range(frames)
         ]
         x = np.stack([pose.apply(offsets) for pose in poses])
-        u = [np.stack([c.project(row) for row in x]) + rng.normal(0, 1.5, (frames, 3, 2)) for c in (rig.left, rig.right)]
+        u = [
+            np.stack([c.project(row) for row in x]) + rng.normal(0, 1.5, (frames, 3, 2)) for c in (rig.left, rig.right)
+        ]
         errors.append(tool_offsets(poses, u).offset_mm - offsets)
     return np.array(errors)
 
@@ -290,8 +293,8 @@ def tool_offset_study(*, frames: int = 300, runs: int = 10, seed: int = 0) -> np
 def factorisation_study(poses: Sequence[int], *, n: int = 75, runs: int = 10, seed: int = 0) -> dict[str, np.ndarray]:
     """3D RMS (um) of n points seen from several poses of the stereo head (two views each), medians, {name: (len,)}.
 
-    By factorisation, given the best similarity to the truth for free, and by triangulation with all the views calibrated from the
-    robot, which needs none.
+    By factorisation, given the best similarity to the truth for free, and by triangulation with all the views calibrated
+    from the robot, which needs none.
     """
     rng = np.random.default_rng(seed)
     result = {"factorisation_um": np.empty((len(poses), runs)), "robot_um": np.empty((len(poses), runs))}
@@ -300,7 +303,9 @@ def factorisation_study(poses: Sequence[int], *, n: int = 75, runs: int = 10, se
             x = simulate_correspondences(n, rng=rng).true_x_mm
             images, matrices = [], []
             for k in range(count):
-                tilt = RigidTransform.from_rotation_vector(rng.uniform(-0.1, 0.1, 3)) if k else RigidTransform.identity()
+                tilt = (
+                    RigidTransform.from_rotation_vector(rng.uniform(-0.1, 0.1, 3)) if k else RigidTransform.identity()
+                )
                 rig = reference_rig(robot_from_microscope=ROBOT_FROM_MICROSCOPE.compose(tilt))
                 noisy, u = _noisy(rig, x, rng, 1.5, 0.01)
                 images += u

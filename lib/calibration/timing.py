@@ -42,7 +42,9 @@ def _spline(time_s: ArrayLike, x_mm: ArrayLike, smooth_s: float) -> tuple[CubicS
     if x.ndim == 2:
         x = x[:, None]
     if time.ndim != 1 or x.ndim != 3 or x.shape[2] != 3 or len(x) != len(time):
-        raise ValueError(f"kinematics: expected times (m,) and positions (m, k, 3) or (m, 3), got {time.shape}, {x.shape}.")
+        raise ValueError(
+            f"kinematics: expected times (m,) and positions (m, k, 3) or (m, 3), got {time.shape}, {x.shape}."
+        )
     if len(time) < 4 or not np.isfinite(time).all() or not np.isfinite(x).all() or (np.diff(time) <= 0).any():
         raise ValueError("kinematics: times must increase, and at least four samples, all finite, are needed.")
     every = max(4, int(np.ceil(smooth_s / np.median(np.diff(time)))))
@@ -149,8 +151,8 @@ def rolling_shutter(
 ) -> tuple[np.ndarray, list[np.ndarray]]:
     """Correspondences of a rolling shutter: kinematics at the time when the landmark's own row was read.
 
-    The middle row is read at the frame's time, the last row half `readout_s` later.  The two cameras see a landmark on different rows; x is
-    taken at the mean of their times, and each camera's pixel is moved to it by the landmark's velocity.
+    The middle row is read at the frame's time, the last row half `readout_s` later.  The two cameras
+    see a landmark on different rows; x is taken at the mean of their times, and each camera's pixel is moved to it by the landmark's velocity.
 
     Parameters
     ----------

@@ -43,7 +43,13 @@ def correspondences(x_mm: np.ndarray, u_left: np.ndarray, u_right: np.ndarray, s
     for i, (u, side) in enumerate(((u_left, "Left"), (u_right, "Right"))):
         flat = page.add_subplot(1, 3, i + 2)
         flat.scatter(*u.T, c=colour, s=8)
-        flat.set(xlim=(0, size_px[0]), ylim=(size_px[1], 0), aspect="equal", xlabel="x (px)", title=f"{side} image: where they were seen")
+        flat.set(
+            xlim=(0, size_px[0]),
+            ylim=(size_px[1], 0),
+            aspect="equal",
+            xlabel="x (px)",
+            title=f"{side} image: where they were seen",
+        )
     return page
 
 
@@ -77,12 +83,23 @@ def focal_lengths(found_px: np.ndarray, true_px: float) -> Figure:
 def shallow_bias(half_depth_mm: Sequence[float], ratios: Mapping[str, np.ndarray]) -> Figure:
     """Estimated over true depth column against the depth covered by the tool."""
     page, ax = figure(width_in=8.5, height_in=3.8)
-    styles = {"DLT": ("baseline", "s-"), "likelihood": ("ours", "o-"), "as printed, mm": ("paper", "^-"), "as printed, um": ("warning", "v-")}
+    styles = {
+        "DLT": ("baseline", "s-"),
+        "likelihood": ("ours", "o-"),
+        "as printed, mm": ("paper", "^-"),
+        "as printed, um": ("warning", "v-"),
+    }
     for name, values in ratios.items():
         colour, style = styles[name]
         ax.plot(half_depth_mm, values, style, color=COLOURS[colour], label=name)
     ax.axhline(1, color="black", linewidth=0.8)
-    ax.set(xscale="log", xlabel="half depth covered by the tool (mm)", ylabel="depth scale found / true", ylim=(0.7, 1.6), title="Weights matter where the sweep is shallow")
+    ax.set(
+        xscale="log",
+        xlabel="half depth covered by the tool (mm)",
+        ylabel="depth scale found / true",
+        ylim=(0.7, 1.6),
+        title="Weights matter where the sweep is shallow",
+    )
     ax.legend(ncols=2)
     return page
 
@@ -96,7 +113,13 @@ def ladder(comparisons: Mapping[str, Comparison]) -> Figure:
         colours = [COLOURS["ours"] if rung is comparison.best else COLOURS["baseline"] for rung in comparison.rungs]
         ax.barh(names, np.array(delta) + 1, color=colours)
         for i, rung in enumerate(comparison.rungs):
-            ax.text(delta[i] + 1.3, i, f"{delta[i]:.0f}" if rung is not comparison.best else "chosen", va="center", fontsize=8)
+            ax.text(
+                delta[i] + 1.3,
+                i,
+                f"{delta[i]:.0f}" if rung is not comparison.best else "chosen",
+                va="center",
+                fontsize=8,
+            )
         ax.set(xscale="log", xlim=(1, 4e4), xlabel="BIC above the best + 1", title=title)
     axes[0, 0].invert_yaxis()  # shared
     return page
@@ -115,10 +138,14 @@ def ellipsoids(calibration: Calibration, x_mm: np.ndarray, *, scale: float = 30.
         for x, covariance in zip(x_mm, calibration.point_covariance(x_mm, detection=detection), strict=True):
             values, vectors = np.linalg.eigh(covariance)
             surface = x + factor * (sphere * np.sqrt(values)) @ vectors.T
-            axes.plot_surface(*np.moveaxis(surface, -1, 0), color=COLOURS["ours" if detection else "paper"], alpha=0.7, linewidth=0)
+            axes.plot_surface(
+                *np.moveaxis(surface, -1, 0), color=COLOURS["ours" if detection else "paper"], alpha=0.7, linewidth=0
+            )
             sd.append(1e3 * np.sqrt(values[-1]))
         axes.set(xlabel="x (mm)", ylabel="y (mm)", zlabel="z (mm)")
-        axes.set_title(f"{title}: 1 sd enlarged {factor:.0f} times\nlongest half axis {min(sd):.0f} to {max(sd):.0f} um")
+        axes.set_title(
+            f"{title}: 1 sd enlarged {factor:.0f} times\nlongest half axis {min(sd):.0f} to {max(sd):.0f} um"
+        )
         axes.set_aspect("equal")
         axes.set(xlabel="x (mm)", ylabel="y (mm)", zlabel="z (mm)")
     return page
@@ -135,9 +162,23 @@ def advice_view(
     extent = (-half_size_mm[0], half_size_mm[0], -half_size_mm[1], half_size_mm[1])
     image = ax.imshow(depth, extent=extent, origin="lower", cmap="viridis", vmin=0, aspect="equal")
     used, advised = (robot_from_microscope.inverse().apply(p) for p in (calibration.x_mm, advised_mm[None]))
-    ax.plot(*used[:, :2].T, "o", color="white", markersize=4, markeredgecolor="black", label="correspondences", clip_on=False)
     ax.plot(
-        *advised[:, :2].T, "*", color=COLOURS["warning"], markersize=18, markeredgecolor="black", label="go here next", clip_on=False
+        *used[:, :2].T,
+        "o",
+        color="white",
+        markersize=4,
+        markeredgecolor="black",
+        label="correspondences",
+        clip_on=False,
+    )
+    ax.plot(
+        *advised[:, :2].T,
+        "*",
+        color=COLOURS["warning"],
+        markersize=18,
+        markeredgecolor="black",
+        label="go here next",
+        clip_on=False,
     )
     page.colorbar(image, ax=ax, label="depth sd from calibration (um)")
     ax.set(xlabel="x (mm)", ylabel="y (mm)")
@@ -152,7 +193,12 @@ def advice_curves(curves: Mapping[str, np.ndarray], start: int) -> Figure:
     page, ax = figure(width_in=8, height_in=3.4)
     for name, colour in (("random", "baseline"), ("advised", "ours")):
         ax.plot(np.arange(len(curves[name])), curves[name], "o-", markersize=3, color=COLOURS[colour], label=name)
-    ax.set(xlabel=f"positions added to {start} clustered ones", ylabel="calibration sd / sd of a row", yscale="log", title="Where the tool goes matters more than how often")
+    ax.set(
+        xlabel=f"positions added to {start} clustered ones",
+        ylabel="calibration sd / sd of a row",
+        yscale="log",
+        title="Where the tool goes matters more than how often",
+    )
     ax.legend()
     return page
 
@@ -174,7 +220,12 @@ def residuals(calibration: Calibration) -> Figure:
     r = calibration.residuals_px[good].ravel()
     span = np.linspace(-4 * r.std(), 4 * r.std(), 200)
     axes[-1].hist(r, bins=30, density=True, color=COLOURS["baseline"], label="residuals")
-    axes[-1].plot(span, np.exp(-0.5 * (span / r.std()) ** 2) / (r.std() * np.sqrt(2 * np.pi)), color=COLOURS["ours"], label="Gaussian")
+    axes[-1].plot(
+        span,
+        np.exp(-0.5 * (span / r.std()) ** 2) / (r.std() * np.sqrt(2 * np.pi)),
+        color=COLOURS["ours"],
+        label="Gaussian",
+    )
     axes[-1].set(xlabel="px", title=f"{r.std():.2f} px a coordinate", yticks=[])
     axes[-1].legend()
     return page
@@ -183,12 +234,22 @@ def residuals(calibration: Calibration) -> Figure:
 def frame_residuals(image: np.ndarray, detected: np.ndarray, predicted: np.ndarray, title: str) -> Figure:
     """One frame: detections (3, 2) and where the calibrated camera puts the robot's landmarks, with a magnified view."""
     page, axes = figure(1, 2, width_in=13, height_in=4.2, width_ratios=[1.6, 1])
-    middle, half = np.nanmean(detected, axis=0), max(90.0, 0.7 * float(np.nanmax(np.nanmax(detected, 0) - np.nanmin(detected, 0))))
+    middle, half = (
+        np.nanmean(detected, axis=0),
+        max(90.0, 0.7 * float(np.nanmax(np.nanmax(detected, 0) - np.nanmin(detected, 0)))),
+    )
     for ax in axes:
         show_image(ax, image, title if ax is axes[0] else "Magnified")
         size = 5 if ax is axes[0] else 11
         for name, d, p in zip(LANDMARK_COLOURS, detected, predicted, strict=True):
-            ax.plot(*d, "o", color=LANDMARK_COLOURS[name], markersize=size, markeredgecolor="black", label=f"{name} detected")
+            ax.plot(
+                *d,
+                "o",
+                color=LANDMARK_COLOURS[name],
+                markersize=size,
+                markeredgecolor="black",
+                label=f"{name} detected",
+            )
             ax.plot(*p, "+", color="white", markersize=1.6 * size, markeredgewidth=2)
     axes[1].set(xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] + half, middle[1] - half))
     axes[0].plot([], [], "+", color="white", markersize=9, markeredgewidth=2, label="robot, projected")
@@ -204,8 +265,21 @@ def working_distance(distances_mm: Sequence[float], study: Mapping[str, np.ndarr
     ax.bar(at - 0.2, study["affine_um"], 0.4, color=COLOURS["paper"], label="affine (zero skew)")
     ax.bar(at + 0.2, study["near_affine_um"], 0.4, color=COLOURS["ours"], label="with 1/distance")
     for i, share in enumerate(study["chosen"]):
-        ax.text(i, max(study["affine_um"][i], study["near_affine_um"][i]) + 3, f"1/d chosen:\n{100 * share:.0f} %", ha="center", fontsize=8)
-    ax.set(xticks=at, xticklabels=labels, xlabel="working distance (mm)", ylabel="held-out 3D RMS (um)", ylim=(0, 1.2 * study["affine_um"].max()), title="The one parameter that pays")
+        ax.text(
+            i,
+            max(study["affine_um"][i], study["near_affine_um"][i]) + 3,
+            f"1/d chosen:\n{100 * share:.0f} %",
+            ha="center",
+            fontsize=8,
+        )
+    ax.set(
+        xticks=at,
+        xticklabels=labels,
+        xlabel="working distance (mm)",
+        ylabel="held-out 3D RMS (um)",
+        ylim=(0, 1.2 * study["affine_um"].max()),
+        title="The one parameter that pays",
+    )
     ax.legend()
     return page
 
@@ -214,8 +288,18 @@ def time_offset(offsets_ms: np.ndarray, reprojection_px: np.ndarray, found_ms: f
     """Reprojection error against the assumed clock offset, and the estimate."""
     page, ax = figure(width_in=8, height_in=3.2)
     ax.plot(offsets_ms, reprojection_px, color=COLOURS["baseline"])
-    ax.axvspan(found_ms - 3 * sd_ms, found_ms + 3 * sd_ms, color=COLOURS["ours"], alpha=0.4, label=f"estimate {found_ms:.2f} +- {sd_ms:.2f} ms (3 sd shown)")
-    ax.set(xlabel="assumed offset between the clocks (ms)", ylabel="reprojection RMS (px)", title="The clocks reveal themselves")
+    ax.axvspan(
+        found_ms - 3 * sd_ms,
+        found_ms + 3 * sd_ms,
+        color=COLOURS["ours"],
+        alpha=0.4,
+        label=f"estimate {found_ms:.2f} +- {sd_ms:.2f} ms (3 sd shown)",
+    )
+    ax.set(
+        xlabel="assumed offset between the clocks (ms)",
+        ylabel="reprojection RMS (px)",
+        title="The clocks reveal themselves",
+    )
     ax.legend()
     return page
 
@@ -231,7 +315,12 @@ def robot_frames(frames: RobotFrames, rows: Sequence[int], fits: Mapping[str, Se
             angle = np.linspace(0, 2 * np.pi, 100)
             ax.plot(u[0] + radius * np.cos(angle), u[1] + radius * np.sin(angle), color="white", linewidth=1.2)
             for name, both in fits.items():
-                ax.annotate("", u + 40 * both[s].leave_one_out_px[row], u, arrowprops={"arrowstyle": "->", "color": colours[name], "linewidth": 2})
+                ax.annotate(
+                    "",
+                    u + 40 * both[s].leave_one_out_px[row],
+                    u,
+                    arrowprops={"arrowstyle": "->", "color": colours[name], "linewidth": 2},
+                )
     for name, colour in colours.items():
         axes[0].plot([], [], color=colour, label=f"{name}, 40 times")
     axes[0].legend(loc="lower right", fontsize=8, labelcolor="white", facecolor="black", framealpha=0.6)

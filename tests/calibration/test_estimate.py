@@ -41,7 +41,9 @@ def contaminated(n, share, seed, columns=slice(0, 2)):
     return c, [u[:, :2], u[:, 2:]], bad
 
 
-@pytest.mark.parametrize("model", ["affine", "zero_skew", "square", "near_affine", "affine+distances", "square+distance+radial"])
+@pytest.mark.parametrize(
+    "model", ["affine", "zero_skew", "square", "near_affine", "affine+distances", "square+distance+radial"]
+)
 @pytest.mark.parametrize("weighting", ["likelihood", "paper"])
 def test_exact_correspondences_give_exact_cameras(model, weighting):
     c = data(60, sigma_u_px=0, sigma_x_mm=0)
@@ -114,9 +116,7 @@ def test_constraints_hold_and_cost_grows_with_them():
     c = data(100, 5)
     costs = []
     for model in ("affine", "zero_skew", "square", "common_zoom"):
-        found = calibrate(
-            c.x_mm, [c.u_left, c.u_right], model=model, sigma_u_px=1.5, sigma_x_mm=0.01, ransac_px=np.inf
-        )
+        found = calibrate(c.x_mm, [c.u_left, c.u_right], model=model, sigma_u_px=1.5, sigma_x_mm=0.01, ransac_px=np.inf)
         costs.append(found.cost)
         K = np.stack([r.K for r in found.resections()])
         if model != "affine":
@@ -182,8 +182,14 @@ def test_one_camera_attributes_all_noise_to_its_pixels_or_keeps_what_is_given():
 def test_paper_weighting_depends_on_the_unit_of_length_and_likelihood_does_not():
     c = data(200, 2, half_size_mm=(4, 3, 0.2))
     options = {"sigma_u_px": 1.5, "model": "affine", "ransac_px": np.inf, "checks": False}
-    cm = {w: calibrate(c.x_mm / 10, [c.u_left, c.u_right], weighting=w, sigma_x_mm=0.001, **options) for w in ("paper", "likelihood")}
-    mm = {w: calibrate(c.x_mm, [c.u_left, c.u_right], weighting=w, sigma_x_mm=0.01, **options) for w in ("paper", "likelihood")}
+    cm = {
+        w: calibrate(c.x_mm / 10, [c.u_left, c.u_right], weighting=w, sigma_x_mm=0.001, **options)
+        for w in ("paper", "likelihood")
+    }
+    mm = {
+        w: calibrate(c.x_mm, [c.u_left, c.u_right], weighting=w, sigma_x_mm=0.01, **options)
+        for w in ("paper", "likelihood")
+    }
     np.testing.assert_allclose(cm["likelihood"].rig.linear / 10, mm["likelihood"].rig.linear, rtol=1e-6)
     assert np.abs(cm["paper"].rig.linear / 10 - mm["paper"].rig.linear).max() > 0.5
     assert paper_variances(1.5, 0.01) == (2.5, 0.01)
@@ -257,7 +263,9 @@ def test_covariance_covers_the_truth():
             found = calibrate(c.x_mm, u, model=model, ransac_px=np.inf, image_size_px=SIZE)
             # Judged by what counts: the projections of four points that no plane holds.
             corners = c.true_x_mm[:5]
-            error = np.hstack([a - b for a, b in zip(found.rig.project(corners), rig.project(corners), strict=True)]).ravel()
+            error = np.hstack(
+                [a - b for a, b in zip(found.rig.project(corners), rig.project(corners), strict=True)]
+            ).ravel()
             J = found._fit.state.evaluate(corners - found._fit.state.reference)[2] @ found._model.selection
             J = J.reshape(-1, J.shape[2])
             covariance = J @ found.parameter_covariance @ J.T

@@ -115,9 +115,7 @@ def test_online_is_the_batch_minimum():
         online.solve()
     for rows in np.arange(90).reshape(30, 3):
         assert online.add(c.x_mm[rows], c.u_left[rows], c.u_right[rows]).all()
-    batch = calibrate(
-        c.x_mm, [c.u_left, c.u_right], model="affine", sigma_u_px=1.5, sigma_x_mm=0.01, ransac_px=np.inf
-    )
+    batch = calibrate(c.x_mm, [c.u_left, c.u_right], model="affine", sigma_u_px=1.5, sigma_x_mm=0.01, ransac_px=np.inf)
     np.testing.assert_allclose(online.solve().linear, batch.rig.linear, rtol=1e-8, atol=1e-6)
     np.testing.assert_allclose(np.diag(online.covariance), np.diag(batch.covariance), rtol=0.02)
 
@@ -146,7 +144,9 @@ def test_online_drops_gaps_and_gross_errors_and_forgets():
 def poses(n, seed, angle_rad=0.5):
     rng = np.random.default_rng(seed)
     return [
-        RigidTransform.from_rotation_vector(rng.uniform(-angle_rad, angle_rad, 3), ROBOT_FROM_MICROSCOPE.t + rng.uniform(-3, 3, 3))
+        RigidTransform.from_rotation_vector(
+            rng.uniform(-angle_rad, angle_rad, 3), ROBOT_FROM_MICROSCOPE.t + rng.uniform(-3, 3, 3)
+        )
         for _ in range(n)
     ]
 

@@ -25,7 +25,10 @@ def state(model, seed=0):
     if model.base == "affine":
         scale[:6] = 3.0
     scale[-4:-2], scale[-2], scale[-1] = 20.0, 4e-3, 3e-9
-    return start.moved(model.selection @ (model.selection.T @ (np.tile(scale, model.cameras) * rng.normal(size=model.increments * model.cameras))))
+    return start.moved(
+        model.selection
+        @ (model.selection.T @ (np.tile(scale, model.cameras) * rng.normal(size=model.increments * model.cameras)))
+    )
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -39,7 +42,9 @@ def test_jacobians_are_finite_differences(name):
         step = 1e-11 if "radial" in name_j else 1e-6 if "1/distance" in name_j else 1e-5
         move = model.selection[:, j] * step
         numeric = (at.moved(move).evaluate(x)[0] - at.moved(-move).evaluate(x)[0]) / (2 * step)
-        np.testing.assert_allclose(J[:, :, j], numeric, rtol=1e-6, atol=1e-6 * np.abs(numeric).max() + 1e-4, err_msg=name_j)
+        np.testing.assert_allclose(
+            J[:, :, j], numeric, rtol=1e-6, atol=1e-6 * np.abs(numeric).max() + 1e-4, err_msg=name_j
+        )
     for j, e in enumerate(1e-5 * np.eye(3)):
         numeric = (at.evaluate(x + e)[0] - at.evaluate(x - e)[0]) / 2e-5
         np.testing.assert_allclose(J_x[:, :, j], numeric, rtol=1e-6, atol=1e-4)
@@ -105,7 +110,10 @@ def test_minimum_is_stationary(name):
 def near_pair(distance_mm):
     rig = reference_rig()
     return StereoRig(
-        *(NearAffineCamera(c.matrix, 1 / distance_mm, (959.5, 539.5), ROBOT_FROM_MICROSCOPE.t) for c in (rig.left, rig.right))
+        *(
+            NearAffineCamera(c.matrix, 1 / distance_mm, (959.5, 539.5), ROBOT_FROM_MICROSCOPE.t)
+            for c in (rig.left, rig.right)
+        )
     )
 
 
@@ -133,7 +141,9 @@ def test_nested_tests_reject_rarely_what_is_true_and_always_what_is_not():
     p = []
     for seed in range(30):
         x, u = seen(reference_rig(), seed, n=80)
-        rungs = compare_models(x, u, models=("common_zoom", "square", "zero_skew", "affine"), sigma_u_px=1.5, sigma_x_mm=0.01)
+        rungs = compare_models(
+            x, u, models=("common_zoom", "square", "zero_skew", "affine"), sigma_u_px=1.5, sigma_x_mm=0.01
+        )
         assert rungs["common_zoom"].p_value < 1e-6  # the reference rig zooms by 100 and 98
         p += [rungs["square"].p_value, rungs["zero_skew"].p_value]
     assert 0.38 < np.mean(p) < 0.62 and np.mean(np.array(p) < 0.05) < 0.15

@@ -35,11 +35,21 @@ def test_leave_one_out_is_what_refitting_without_the_row_gives():
 
 def test_leave_one_out_of_the_near_affine_model():
     c, found = made(40, model="near_affine")
-    known = {"sigma_u_px": found.sigma_u_px, "sigma_x_mm": found.sigma_x_mm, "ransac_px": np.inf, "image_size_px": (1920, 1080)}
+    known = {
+        "sigma_u_px": found.sigma_u_px,
+        "sigma_x_mm": found.sigma_x_mm,
+        "ransac_px": np.inf,
+        "image_size_px": (1920, 1080),
+    }
     for i in (0, 7, 23):
         keep = np.arange(40) != i
         refit = calibrate(c.x_mm[keep], [c.u_left[keep], c.u_right[keep]], model="near_affine", **known)
-        expected = np.hstack([u[i] - camera.project(c.x_mm[i])[0] for u, camera in zip((c.u_left, c.u_right), refit.cameras, strict=True)])
+        expected = np.hstack(
+            [
+                u[i] - camera.project(c.x_mm[i])[0]
+                for u, camera in zip((c.u_left, c.u_right), refit.cameras, strict=True)
+            ]
+        )
         np.testing.assert_allclose(found.leave_one_out_px[i], expected, atol=0.25)
 
 
@@ -57,7 +67,9 @@ def test_covariance_of_points_holds_calibration_and_detection():
         points = found.triangulate(*detected)
         error = points.x_mm[0] - corner[0]
         distances.append(error @ np.linalg.solve(points.covariance_mm2[0], error))
-        assert (np.linalg.eigvalsh(points.covariance_mm2[0] - found.point_covariance(corner, detection=False)[0]) > 0).all()
+        assert (
+            np.linalg.eigvalsh(points.covariance_mm2[0] - found.point_covariance(corner, detection=False)[0]) > 0
+        ).all()
     assert np.mean(distances) == pytest.approx(3, rel=0.15)
 
 

@@ -1,0 +1,51 @@
+"""Seconds of calibration: `python3 -m lib bench`, or pytest on this folder."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lib.calibration import Moments, OnlineCalibration, affine_minimum, calibrate
+from lib.calibration.evaluation import solve_with_ceres, solve_with_scipy
+from lib.simulator.rig import simulate_correspondences
+
+
+def stacked(n):
+    c = simulate_correspondences(n, rng=np.random.default_rng(0))
+    return c, np.hstack([c.u_left, c.u_right])
+
+
+@pytest.mark.parametrize("n", [300, 3000, 30000])
+def test_closed_form_minimum(benchmark, n):
+    c, y = stacked(n)
+    assert benchmark(lambda: affine_minimum(Moments.of(c.x_mm, y), 2.25, 1e-4)).cost > 0
+
+
+@pytest.mark.parametrize("solver", [solve_with_scipy, solve_with_ceres])
+def test_general_bundle_adjusters_reach_the_same_minimum(benchmark, solver):
+    c, y = stacked(3000)
+    cost, _ = benchmark.pedantic(solver, args=(c.x_mm, y, 1.5, 0.010), rounds=1)
+    assert cost == pytest.approx(affine_minimum(Moments.of(c.x_mm, y), 2.25, 1e-4).cost, rel=1e-9)
+
+
+@pytest.mark.parametrize("model", ["affine", "zero_skew", "near_affine"])
+def test_calibration_with_outliers_and_report(benchmark, model):
+    c, _ = stacked(1500)
+    rng = np.random.default_rng(1)
+    wrong = rng.random(1500) < 0.3
+    u_left = c.u_left.copy()
+    u_left[wrong] = rng.uniform(0, 1900, (wrong.sum(), 2))
+    text = benchmark(lambda: calibrate(c.x_mm, [u_left, c.u_right], model=model).report())
+    assert "outliers" in text
+
+
+def test_online_frame(benchmark):
+    c, _ = stacked(3000)
+    online = OnlineCalibration(sigma_u_px=1.5, sigma_x_mm=0.010)
+    online.add(c.x_mm[:300], c.u_left[:300], c.u_right[:300])
+
+    def frame():
+        online.add(c.x_mm[300:303], c.u_left[300:303], c.u_right[300:303])
+        return online.solve()
+
+    assert benchmark(frame).linear.shape == (4, 3)
