@@ -44,7 +44,9 @@ def test_training_lowers_the_loss_and_finds_the_landmarks(toy):
     assert log[-1]["spread"] == pytest.approx(1, abs=0.3)
 
 
-@pytest.mark.parametrize("changes", [{}, {"optimiser": "rmsprop", "ema": 0.0, "schedule": "constant", "precision": "fp32"}])
+@pytest.mark.parametrize(
+    "changes", [{}, {"optimiser": "rmsprop", "ema": 0.0, "schedule": "constant", "precision": "fp32"}]
+)
 def test_resume_is_exact(toy, tmp_path, changes):
     config = replace(SMALL, **changes)
     data, held_out = toy(6), toy(2, seed=1)

@@ -1,0 +1,52 @@
+"""The paper's timing table, a batch of left and right with decoding, and coarse to fine beside it: `python3 -m lib bench`.
+
+Seconds per pair; the paper's Hz (Titan X) are in the benchmark's extra_info.
+"""
+
+import numpy as np
+import pytest
+import torch
+
+from lib.landmarks import Detector, Landmarks
+from lib.landmarks.heatmaps import DECODERS, decode, render
+from lib.landmarks.inference import Calibration
+from lib.landmarks.network import HourglassConfig, StackedHourglass
+
+PAPER_HZ = {(1080, 1920): 35, (480, 854): 77, (480, 640): 95, (256, 448): 140}
+
+
+def pair(size):
+    return np.random.default_rng(0).integers(0, 256, (2, *size, 3), dtype=np.uint8)
+
+
+@pytest.mark.parametrize("size", PAPER_HZ, ids=lambda s: f"{s[0]}x{s[1]}")
+def test_the_papers_configuration(benchmark, size):
+    """Two stacks of 64 features over the whole frame."""
+    benchmark.extra_info.update(paper_hz=PAPER_HZ[size], threads=torch.get_num_threads())
+    sure = {"frame": Calibration(logit=(9.0, 0.0, 0.0, 0.0))}
+    detector = Detector(StackedHourglass(HourglassConfig(64, 2)), method="paper", calibration=sure)
+    benchmark.pedantic(detector, (pair(size),), rounds=3, warmup_rounds=1)
+
+
+@pytest.mark.parametrize("mode", ["whole frame", "tracking"])
+def test_coarse_to_fine(benchmark, mode):
+    """The shipped networks at 1080p; weights do not change the time, so all stages run on noise."""
+    shipped = Detector.load()
+    sure = Calibration(logit=(9.0, 0.0, 0.0, 0.0))
+    detector = shipped.with_calibration(frame=sure, tool=sure, window=sure)
+    images = pair((1080, 1920))
+    benchmark.extra_info.update(paper_hz=35, threads=torch.get_num_threads())
+    if mode == "tracking":
+        u = np.tile([[[900.0, 500.0], [1150.0, 480.0], [1150.0, 560.0]]], (2, 1, 1))
+        previous = Landmarks(u, np.tile(np.eye(2), (2, 3, 1, 1)), np.ones((2, 3)))
+        benchmark.pedantic(detector.track, (images, previous), rounds=20, warmup_rounds=3)
+    else:
+        benchmark.pedantic(detector, (images,), rounds=20, warmup_rounds=3)
+
+
+@pytest.mark.parametrize("method", DECODERS)
+def test_decoders(benchmark, method):
+    """Six heatmaps of a full-HD pair at stride 4."""
+    u = torch.rand(2, 3, 2) * 900 + 60
+    heatmaps = render(u, (1080, 1920), 4)
+    benchmark.pedantic(decode, (heatmaps, 4), {"method": method}, rounds=10, warmup_rounds=2)

@@ -1,0 +1,134 @@
+"""Evaluation, calibration and training data; the simulator is replaced by the toy renderer where it would be slow."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lib import paths
+from lib.landmarks import Detector, dataset, evaluation, metrics
+from lib.landmarks.augmentation import Augmentation
+from lib.landmarks.evaluation import _fit, calibrate, evaluate
+from lib.landmarks.inference import Calibration
+from lib.landmarks.network import HourglassConfig
+from lib.landmarks.training import PRESETS, main, train
+
+
+@pytest.fixture(scope="module")
+def small():
+    """A whole-frame detector trained for a moment on toys, and toys it has not seen."""
+    from conftest import toy_samples
+
+    config = replace(
+        PRESETS["best"], network=HourglassConfig(12, 1, 2), augmentation=Augmentation(10.0, (0.9, 1.1)), steps=50,
+        batch_size=6, ema=0.9, learning_rate=4e-3, validate_every=50, precision="fp32",
+    )  # fmt: skip
+    unseen = toy_samples(40, seed=5)
+    network = train(config, toy_samples(60), toy_samples(4, seed=2), progress=False).network
+    keep = Calibration(logit=(5.0, 0.0, 0.0, 0.0))
+    frames = [(str(i), unseen.images[i], unseen.u[i], unseen.visibility[i]) for i in range(40)]
+    return Detector(network, calibration={"frame": keep}), frames
+
+
+def test_calibration_makes_covariances_and_confidence_true(small):
+    detector, frames = small
+    result = evaluate(calibrate(detector, frames[:20]), frames[20:])
+    assert 0.5 < result.scores.nees < 6
+    assert 75 < result.scores.coverage_95 <= 100
+    before = evaluate(detector, frames[20:])
+    labelled = ~np.isnan(result.error_px)
+    error = [metrics.calibration_error(r.landmarks.confidence[labelled], r.correct[labelled]) for r in (before, result)]
+    assert error[1] <= max(error[0], 0.25)
+
+
+def test_fitted_variance_of_known_errors():
+    """Errors drawn with a variance that depends on a feature: the fit finds the dependence, and the mean NEES is 2."""
+    rng = np.random.default_rng(0)
+    features = np.column_stack([np.ones(4000), rng.normal(0, 1, 4000), rng.uniform(0.2, 1, 4000), np.zeros(4000)])
+    sigma = np.exp((0.3 + 0.8 * features[:, 1]) / 2)
+    errors = rng.normal(0, 1, (4000, 2)) * sigma[:, None]
+    correct = np.linalg.norm(errors, axis=1) < 2
+    fit = _fit(features, np.broadcast_to(np.eye(2), (4000, 2, 2)), errors, correct, gross_px=1e9)
+    assert fit.log_variance[0] + 0.6 * fit.log_variance[2] == pytest.approx(0.3, abs=0.1)
+    assert fit.log_variance[1] == pytest.approx(0.8, abs=0.05)
+    squared = (errors**2).sum(1) / np.exp(features @ np.array(fit.log_variance))
+    assert squared.mean() == pytest.approx(2, abs=0.05)
+    confidence = 1 / (1 + np.exp(-features @ np.array(fit.logit)))
+    assert metrics.calibration_error(confidence, correct) < 0.05
+
+
+def test_evaluation_counts_only_labels_in_view(small):
+    detector, frames = small
+    name, image, u, visibility = frames[0]
+    hidden = visibility.copy()
+    hidden[2] = 0
+    result = evaluate(detector, [(name, image, u, hidden)])
+    assert result.scores.labels == 2
+    assert result.length_px[0] == pytest.approx(metrics.tool_length_px(u[None])[0])
+    assert list(result.by_landmark()) == ["base", "tip_1", "tip_2"]
+    assert result.worst(1)[0] == 0
+
+
+def test_nothing_to_evaluate_is_named(small):
+    with pytest.raises(ValueError, match="frames: no labelled frame"):
+        evaluate(small[0], [])
+    with pytest.raises(ValueError, match="to calibrate on"):
+        calibrate(small[0], small[1][:2])
+
+
+def test_shards_hold_what_the_stages_see(tmp_path, monkeypatch, toy):
+    """Full-HD toys instead of the simulator: crops and reduced frames carry the landmarks of the full frame."""
+    samples = toy(2, size=(540, 960))
+    drawn = iter([(samples.images[i % 2], samples.u[i % 2], samples.visibility[i % 2]) for i in range(8)])
+    monkeypatch.setattr(dataset, "sample", lambda rng: next(drawn))
+    monkeypatch.setattr(dataset, "FRAMES", 2)
+    dataset.generate(tmp_path, 1, progress=False)
+    dataset.generate(tmp_path, 1, validation=True, progress=False)
+    dataset.generate(tmp_path, 1, progress=False)  # stands already: draws nothing
+    assert len(list(drawn)) == 4
+    frames = dataset.frame_samples(tmp_path)
+    assert np.allclose(8 * frames.u + 3.5, samples.u)
+    windows = dataset.WindowSource.load(tmp_path)
+    assert len(windows) == 6
+    rng = np.random.default_rng(0)
+    for index in range(6):
+        image, u, _ = windows.draw(index, rng)
+        assert image.shape == (128, 128, 3)
+        k = windows.landmark[index]
+        assert np.linalg.norm(u[k] - 63.5) < 60
+        assert u[1:, 0].mean() > u[0, 0]  # the tool points right
+        assert u[1, 1] < u[2, 1]  # and tip_1 is above
+    tools = dataset.WindowSource.load_tools(tmp_path)
+    assert len(tools) == 2
+    assert len(windows.fixed()) == 6
+    _, image, u, _ = next(iter(dataset.validation_frames(tmp_path)))
+    assert image.shape == (540, 960, 3)
+    assert np.allclose(u, samples.u[0])
+
+
+def test_missing_and_corrupt_shards_are_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match="no shard training"):
+        dataset.frame_samples(tmp_path)
+    (tmp_path / "training_0000.npz").write_bytes(b"not an archive")
+    with pytest.raises(ValueError, match=r"training_0000\.npz: corrupt"):
+        dataset.frame_samples(tmp_path)
+
+
+def test_the_train_command_names_what_is_missing(tmp_path, capsys):
+    assert main(["frame", "--data", str(tmp_path), "--folder", str(tmp_path)]) == 2
+    assert "no shard" in capsys.readouterr().err
+    assert main(["assemble", "--data", str(tmp_path), "--folder", str(tmp_path)]) == 2
+    assert "last.safetensors" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(
+    not (paths.SHIPPED_RECORDING.exists() and (paths.MODELS / "default.safetensors").exists()),
+    reason="the shipped recording and weights are not there",
+)
+def test_the_evaluate_command(tmp_path, capsys):
+    out = tmp_path / "scores.json"
+    assert evaluation.main([str(paths.SHIPPED_RECORDING), "--every", "12", "--json", str(out)]) == 0
+    assert "PCK@0.05" in capsys.readouterr().out
+    assert set(json.loads(out.read_text())) >= {"all", "base", "tip_1", "tip_2"}
+    assert evaluation.main([str(tmp_path)]) == 2
