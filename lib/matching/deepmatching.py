@@ -25,11 +25,13 @@ from lib.matching.descriptors import CHANNELS
 
 __all__ = [
     "PATCH",
+    "POWER",
     "GridMatches",
     "Pyramid",
     "atomic_response",
     "bottom_up",
     "match_grids",
+    "n_levels",
     "plan_tiles",
     "predicted_bytes",
     "top_down",
@@ -70,7 +72,8 @@ class Pyramid:
     responses: list[torch.Tensor]
 
 
-def _n_levels(gy: int, gx: int) -> int:
+def n_levels(gy: int, gx: int) -> int:
+    """Levels above the atomic patches: patches double while they fit the longer side and all their children exist."""
     levels = 0
     while 2 ** (levels + 1) <= max(gy, gx) and 2 ** max(levels - 1, 0) <= min(gy, gx) / 2:
         levels += 1
@@ -92,7 +95,7 @@ def predicted_bytes(grid_left: tuple[int, int], grid_right: tuple[int, int]) -> 
     lattice = (gy + 1) * (gx + 1) * 4
     # Going down, the bottom scores (as many as pooled responses) stand beside everything else.
     scores = gy * gx * n_y * n_x * 4 + lattice * n_y * n_x
-    for _ in range(_n_levels(gy, gx)):
+    for _ in range(n_levels(gy, gx)):
         total += lattice * n_y * n_x
         n_y, n_x = _half(n_y), _half(n_x)
         total += lattice * n_y * n_x
@@ -323,7 +326,7 @@ def bottom_up(left: torch.Tensor, right: torch.Tensor, *, levels: int | None = N
     del windows
     pooled.pow_(POWER)
     pools, responses = [pooled], []
-    top = _n_levels(gy, gx) if levels is None else levels
+    top = n_levels(gy, gx) if levels is None else levels
     for level in range(1, top + 1):
         responses.append(_aggregate(pools[-1], level))
         if level < top:
@@ -390,14 +393,14 @@ def match_grids(left: torch.Tensor, right: torch.Tensor, tiles: list[tuple[slice
     """
     gy, gx = left.shape[0] // PATCH, left.shape[1] // PATCH
     tiles = tiles or [(slice(0, gy * PATCH), slice(0, gx * PATCH))]
-    levels = _n_levels(*(side // PATCH for side in left[tiles[0]].shape[:2]))
+    levels = n_levels(*(side // PATCH for side in left[tiles[0]].shape[:2]))
     best = left.new_full((gy, gx), -torch.inf)
     corner = torch.zeros((gy, gx, 2), dtype=torch.long, device=left.device)
     bins = None
     for rows, columns in tiles:
         part = left[rows, columns]
         height, width = part.shape[0] // PATCH, part.shape[1] // PATCH
-        pyramid = bottom_up(part, right, levels=min(levels, _n_levels(height, width)))
+        pyramid = bottom_up(part, right, levels=min(levels, n_levels(height, width)))
         score = top_down(pyramid)
         target = (slice(rows.start // PATCH, rows.stop // PATCH), slice(columns.start // PATCH, columns.stop // PATCH))
         best[target], corner[target], tile_bins = _best(pyramid, score)

@@ -15,17 +15,16 @@ from dataclasses import dataclass, fields
 import numpy as np
 import torch
 
+from lib.matching.deepmatching import PATCH, POWER, n_levels
+
 __all__ = [
     "VolumeMatches",
     "correlation_volume",
     "match_volume",
-    "n_levels",
     "predicted_bytes",
     "single_threaded_torch",
 ]
 
-PATCH = 4
-POWER = 1.4
 #: Lattice rows that are correlated at once.
 ROWS = 8
 
@@ -76,14 +75,6 @@ def single_threaded_torch() -> Iterator[None]:
 def predicted_bytes(gy: int, gx: int, n: int, v: int) -> int:
     """Peak memory (float32) of `correlation_volume` and `match_volume`: the volume, and its pooled copies."""
     return int(4 * gy * gx * (2 * v + 1) * n * 2.7)
-
-
-def n_levels(gy: int, gx: int) -> int:
-    """Levels above the atomic patches: patches double while they fit the longer side and their children exist."""
-    levels = 0
-    while PATCH * 2 ** (levels + 1) <= PATCH * max(gy, gx) and 2 ** max(levels - 1, 0) <= min(gy, gx) / 2:
-        levels += 1
-    return levels
 
 
 def correlation_volume(left: torch.Tensor, right: torch.Tensor, low: int, n: int, v: int) -> torch.Tensor:
