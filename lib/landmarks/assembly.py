@@ -40,7 +40,7 @@ def assemble(folder: str | Path, data: str | Path, out: str | Path) -> Detector:
     )
     held_out = evaluate(calibrate(detector, frames[::2]), frames[1::2])
     detector = calibrate(detector, frames)
-    keys = ("data", "images", "commit", "steps", "seconds", "config", "metrics")
+    keys = ("data", "images", "commit", "steps", "seconds", "config", "metrics", "before")
     provenance = {
         "trained_on": "simulated frames only (lib.simulator.training); no eye or tool of a shipped recording",
         "commit": commit(),
@@ -59,6 +59,12 @@ def assemble(folder: str | Path, data: str | Path, out: str | Path) -> Detector:
     detector.save(out)
     out.with_name("README.md").write_text(card(detector, out), encoding="utf-8")
     return detector
+
+
+def _history(provenance: dict) -> list[dict]:
+    """A training and those it was fine-tuned from, the first one first."""
+    before = provenance.get("before")
+    return [*(_history(before) if before else []), provenance]
 
 
 def card(detector: Detector, path: Path) -> str:
@@ -81,8 +87,8 @@ def card(detector: Detector, path: Path) -> str:
     row("stacks x features", lambda s: "{stacks} x {features}".format(**s["config"]["network"]))
     row("training images", lambda s: s["images"])
     row("preset, optimiser", lambda s: f"best, {s['config']['optimiser']}, {s['config']['precision']}")
-    row("steps x batch", lambda s: f"{s['steps']} x {s['config']['batch_size']}")
-    row("hours on one CPU core", lambda s: f"{s['seconds'] / 3600:.2f}")
+    row("steps x batch", lambda s: " then ".join(f"{t['steps']} x {t['config']['batch_size']}" for t in _history(s)))
+    row("hours on a shared CPU core", lambda s: f"{sum(t['seconds'] for t in _history(s)) / 3600:.2f}")
     row("data fingerprint", lambda s: f"`{s['data']}`")
     row("commit", lambda s: f"`{s['commit']}`")
     lines += [

@@ -21,6 +21,7 @@ from tqdm.auto import tqdm
 from lib.geometry import cell_from_image
 from lib.landmarks.training import Samples
 from lib.landmarks.windows import cut, direction_rad, map_points, tool_centre, window_from_image
+from lib.simulator import training as simulator_training
 from lib.simulator.training import sample
 
 __all__ = ["REDUCTION", "WindowSource", "frame_samples", "generate", "simulated_samples", "validation_frames"]
@@ -182,10 +183,21 @@ def simulated_samples(
     seed: int,
     crop_px: int | None = None,
     size_px: tuple[int, int] | None = None,
+    textures: int | None = None,
     progress: bool = False,
 ) -> Samples:
-    """n simulated images in memory: windows of `crop_px` at full resolution, or the whole field at `size_px` (w, h)."""
+    """n simulated images in memory: windows of `crop_px` at full resolution, or the whole field at `size_px` (w, h).
+
+    `textures` limits how many of the simulator's training textures are used, as each takes a second to make; None = all.
+    """
+    if n < 1:
+        raise ValueError(f"n: must be at least 1, got {n}.")
     rng = np.random.default_rng([3, seed])
-    drawn = (sample(rng, crop_px=crop_px, size_px=size_px) for _ in range(n))
-    images, u, visibility = zip(*tqdm(drawn, total=n, disable=not progress, unit="image"), strict=True)
+    every = simulator_training.TEXTURE_SEEDS
+    try:
+        simulator_training.TEXTURE_SEEDS = every[:textures]
+        drawn = (sample(rng, crop_px=crop_px, size_px=size_px) for _ in range(n))
+        images, u, visibility = zip(*tqdm(drawn, total=n, disable=not progress, unit="image"), strict=True)
+    finally:
+        simulator_training.TEXTURE_SEEDS = every
     return Samples(np.stack(images), np.stack(u), np.stack(visibility))

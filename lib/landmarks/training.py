@@ -338,7 +338,7 @@ def train(
     validation: Samples,
     folder: str | Path | None = None,
     *,
-    initial: StackedHourglass | None = None,
+    initial: Training | None = None,
     max_seconds: float | None = None,
     progress: bool = True,
     on_validation: Callable[[list[dict[str, float]]], None] | None = None,
@@ -353,7 +353,7 @@ def train(
         Keeps ``last.safetensors`` (weights, average, optimiser, step, log), ``best.safetensors`` (the same at the best
         validation) and ``log.csv``; None keeps nothing.
     initial:
-        Start from these weights, for fine-tuning.
+        Start from the weights of this training, for fine-tuning; its provenance is kept under ``before``.
     max_seconds:
         Stop (resumably) after this long.
     on_validation:
@@ -366,13 +366,15 @@ def train(
     """
     if len(source) == 0 or len(validation) == 0:
         raise ValueError("source and validation: must not be empty; give labelled images.")
-    run = _Run(config, initial)
+    run = _Run(config, initial.network if initial is not None else None)
     provenance: dict[str, object] = {
         "data": source.fingerprint,
         "images": len(source),
         "commit": commit(),
         "torch": torch.__version__,
     }
+    if initial is not None:
+        provenance["before"] = initial.provenance
     if folder is not None:
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
@@ -519,7 +521,7 @@ def main(argv: list[str] | None = None) -> int:
             else:
                 source = dataset.simulated_samples(400, seed=a.seed, crop_px=512, progress=True)
                 validation = dataset.simulated_samples(40, seed=a.seed + 10_000, crop_px=512)
-            initial = load_training(a.initial).network if a.initial else None
+            initial = load_training(a.initial) if a.initial else None
             print(train(config, source, validation, a.folder / a.what, initial=initial).provenance["metrics"])
     except KeyboardInterrupt:
         print("\nStopped; the same command goes on from the last checkpoint.", file=sys.stderr)
