@@ -59,6 +59,9 @@ def simulate(
         `lib.simulator.training.sample` never draws.
     motion:
         "sweep" (calibration), "surgeon", "both", or a `Motion`.
+    microscope:
+        With a finite working distance the truth's rig is the affine one that touches the cameras in the focal plane,
+        and the truth's landmarks in the images are those of the cameras.
     robot_from_microscope:
         Where the microscope stands; the recording is in the robot frame.
     duration_s:
@@ -116,6 +119,8 @@ def simulate(
         "depth_of_field_mm": microscope.depth_of_field_mm,
         "exposure_s": microscope.exposure_s,
     }
+    if microscope.inverse_distance_per_mm:
+        details["inverse_distance_per_mm"] = microscope.inverse_distance_per_mm
     if camera_motion is not None:
         details["camera_moved_at_frame"] = moved_at
     with RecordingWriter(

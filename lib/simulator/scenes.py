@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import cv2
 import numpy as np
@@ -147,7 +147,8 @@ class Sphere:
         return self.centre_mm[2] + inside - slope * np.maximum(rho - edge, 0)
 
 
-def _speckle(seed: int, size_px: int = 1536) -> np.ndarray:
+@lru_cache(maxsize=4)
+def _speckle(seed: int, size_px: int = 1024) -> np.ndarray:
     rng = np.random.default_rng([seed, 41])
     grey = 0.35 * np.exp(0.35 * smooth_noise(rng, size_px, 40, 3, 0.8))
     return _encode(grey[..., None] * np.array([1.0, 0.8, 0.6]))

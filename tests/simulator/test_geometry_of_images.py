@@ -227,3 +227,17 @@ def test_tip_1_is_left_of_the_shaft_in_both_images():
             ahead = (tip_1 + tip_2) / 2 - base
             left = np.array([ahead[1], -ahead[0]])  # y is down
             assert (tip_1 - tip_2) @ left > 0
+
+
+def test_a_finite_working_distance_shows_the_tool_where_the_near_affine_camera_does():
+    small = replace(PLAIN, image_size_px=(320, 200), inverse_distance_per_mm=1 / 150, pixels_per_mm=(25.0, 25.0))
+    forceps, pose = Forceps(), Pose((-2.0, 1.0, -2.0), pitch_rad=0.4)
+    rig = small.rig(IDENTITY)
+    views = render_pair(Plane(2.0), small, forceps=forceps, pose=pose)
+    for view, camera in zip(views, (rig.left, rig.right), strict=True):
+        near = NearAffineCamera(camera.matrix, 1 / 150, np.array([159.5, 99.5]))
+        landmarks = forceps.landmarks(pose)
+        assert_allclose(view.u, near.project(landmarks), atol=1e-6)
+        assert np.abs(view.u - camera.project(landmarks)).max() > 0.5
+        base = np.round(view.u[0]).astype(int)
+        assert view.tool_mask[base[1], base[0]] == 255
