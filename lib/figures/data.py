@@ -136,7 +136,7 @@ def volume_page(recording: Recording, forceps: Forceps | None = None) -> Figure:
     axes[0].legend(fontsize=8)
     axes[1].set(xlabel="depth about its mean (mm)", title="Depths covered")
     axes[2].plot(recording.frames.time_s, np.linalg.norm(x[:, 1] - x[:, 2], axis=1), "o-", color=COLOURS["ours"])
-    axes[2].set(xlabel="time (s)", ylabel="mm", title="Distance between the tips, from kinematics")
+    axes[2].set(xlabel="time (s)", ylabel="mm", title="Distance between the tips")
     return page
 
 

@@ -25,7 +25,7 @@ from lib.simulator.eye import Eye
 from lib.simulator.microscope import Microscope
 from lib.simulator.recording import simulate
 from lib.simulator.render import render_pair
-from lib.simulator.training import RESERVED_JAW_MM, RESERVED_SEEDS, random_forceps, reserved_forceps
+from lib.simulator.training import RESERVED_SEEDS, random_forceps, reserved_forceps
 
 __all__ = ["TEST_SEQUENCES", "TRAIN_SEQUENCES", "main", "make_dataset", "make_shipped_recording", "sequence_name"]
 
@@ -68,7 +68,6 @@ def _make_sequence(folder: Path, seed: int, index: int, n_pairs: int) -> str:
     else:
         eye_seed = RESERVED_SEEDS.stop + 1000 + 100 * seed + index
         forceps = random_forceps(rng, eye_seed)
-        assert not RESERVED_JAW_MM[0] < forceps.jaw_length_mm < RESERVED_JAW_MM[1]
     eye = Eye(
         seed=eye_seed,
         depth_mm=float(rng.uniform(1.6, 2.6)),
