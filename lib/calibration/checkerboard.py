@@ -102,6 +102,9 @@ def measure_boards(
     pooled = {}
     for name, errors in found.items():
         n = np.array([e.corners for e in errors])
-        mean = [np.sqrt((n * np.square([getattr(e, k) for e in errors])).sum() / n.sum()) for k in ("aligned_um", "robot_um")]
+        mean = [
+            np.sqrt((n * np.square([getattr(e, k) for e in errors])).sum() / n.sum())
+            for k in ("aligned_um", "robot_um")
+        ]
         pooled[name] = BoardError(float(mean[0]), float(mean[1]), int(n.sum()))
     return pooled

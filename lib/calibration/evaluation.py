@@ -243,6 +243,19 @@ def working_distance(runs: int) -> dict:
     }
 
 
+def checkerboard(runs: int) -> dict:
+    """0.5 mm checkerboards from rendered images: affine optics, and a microscope 200 mm away."""
+    result = {}
+    for name, distance in (("affine optics", np.inf), ("working distance 200 mm", 200.0)):
+        for sigma in (0.3, 0.5, 1.0):
+            errors = studies.board_study(distance, sigma_u_px=sigma, boards=4)
+            result[f"{name}, detections {sigma} px"] = {
+                model: {"aligned_um": e.aligned_um, "robot_um": e.robot_um, "corners": e.corners}
+                for model, e in errors.items()
+            }
+    return result
+
+
 def robot(runs: int) -> dict:
     """Leave-one-out errors on the real robot, affine and with 1/distance."""
     from lib.calibration import real_robot
@@ -264,7 +277,7 @@ def robot(runs: int) -> dict:
 
 
 STUDIES: dict[str, Callable[[int], dict]] = {
-    f.__name__: f for f in (bound, nested, instruments, minimum, speed, outliers, working_distance, robot)
+    f.__name__: f for f in (bound, nested, instruments, minimum, speed, outliers, working_distance, checkerboard, robot)
 }
 
 

@@ -16,6 +16,7 @@ from lib.calibration.baselines import (
     similarity,
     triangulate_perspective,
 )
+from lib.calibration.checkerboard import BoardError, measure_boards
 from lib.calibration.estimate import Calibration, calibrate
 from lib.calibration.ladder import compare_models
 from lib.calibration.pivot import tool_offsets
@@ -24,15 +25,16 @@ from lib.cameras import NearAffineCamera, StereoRig
 from lib.geometry import RigidTransform
 from lib.landmarks.stereo import Correspondences, StereoLandmarks
 from lib.recordings import Recording
-from lib.simulator.rig import Correspondences as SimulatedCorrespondences
 from lib.simulator.rig import (
     IMAGE_SIZE_PX,
     ROBOT_FROM_MICROSCOPE,
     reference_rig,
     simulate_correspondences,
 )
+from lib.simulator.rig import Correspondences as SimulatedCorrespondences
 
 __all__ = [
+    "board_study",
     "BoundStudy",
     "NoiseStudy",
     "advice_study",
@@ -211,6 +213,21 @@ def working_distance_study(
                 result[name][i, j] = 1e3 * _rms(found - test)
             result["chosen"][i, j] = "distance" in comparison.best.model
     return {name: value.mean(axis=1) for name, value in result.items()}
+
+
+def board_study(
+    distance_mm: float, *, frames: int = 75, sigma_u_px: float = 0.5, boards: int = 3, seed: int = 0
+) -> dict[str, BoardError]:
+    """Rendered checkerboards reconstructed with calibrations from `frames` simulated tool frames of three landmarks each.
+
+    Returns the errors of the models "zero_skew" and "near_affine".
+    """
+    rng = np.random.default_rng(seed)
+    rig = near_affine_rig(distance_mm)
+    x = simulate_correspondences(3 * frames, rng=rng).true_x_mm
+    noisy, u = _noisy(rig, x, rng, sigma_u_px, 0.010)
+    rigs = {m: calibrate(noisy, u, model=m, image_size_px=IMAGE_SIZE_PX).rig for m in ("zero_skew", "near_affine")}
+    return measure_boards(rigs, inverse_distance_per_mm=1.0 / distance_mm, boards=boards, seed=seed)
 
 
 def advice_study(*, start: int = 12, more: int = 32, runs: int = 20, seed: int = 0) -> dict[str, np.ndarray]:
