@@ -378,7 +378,10 @@ class Judgement:
     calibration_um:
         3D RMS of the true landmarks, from their exact pixels: the calibration's own error.
     over_bound:
-        RMS error of the projections at the landmarks over its Cramer-Rao prediction, at the noise measured against truth.
+        `calibration_um` over its Cramer-Rao prediction, at the noise measured against truth.
+    projection_over_bound:
+        The same of the projections at the landmarks (px): it also sees shifts common to both images, which a detector
+        that is systematically off by some pixels of the tool causes.
     sigma_u_px:
         RMS error of the inliers' detections per coordinate, measured against truth.
     """
@@ -386,6 +389,7 @@ class Judgement:
     triangulation_um: float
     calibration_um: float
     over_bound: float
+    projection_over_bound: float
     sigma_u_px: float
 
 
@@ -413,8 +417,12 @@ def judge(calibration: Calibration, recording: Recording, rows: Correspondences)
     leverage = np.einsum("ni,ij,nj->n", H, np.linalg.inv(H.T @ H), H)
     S = sigma_u**2 * np.eye(4) + recording.robot_accuracy_mm**2 * A @ A.T
     error = np.hstack(calibration.rig.project(x[good])) - np.hstack(truth.rig.project(x[good]))
-    predicted = np.sqrt(leverage.mean() * np.trace(S))
-    return Judgement(1e3 * _rms((found - x)[good]), 1e3 * _rms(own - x), _rms(error) / float(predicted), sigma_u)
+    gain = np.linalg.pinv(A)
+    predicted = np.sqrt(leverage.mean() * np.array([np.trace(gain @ S @ gain.T), np.trace(S)]))
+    own_error = _rms((own - x)[good])
+    return Judgement(
+        1e3 * _rms((found - x)[good]), 1e3 * own_error, own_error / predicted[0], _rms(error) / predicted[1], sigma_u
+    )
 
 
 def calibrate_labels(recording: Recording, *, click_px: float = 1.0, seed: int = 0) -> Judgement:
