@@ -91,7 +91,9 @@ def test_rolling_shutter_is_undone():
     with_it = calibrate(x, corrected, **options)
     without = calibrate(sweep(time + 0.01), u, **options)
     assert with_it.reprojection_rms_px == pytest.approx(1.5 * np.sqrt(2), rel=0.06)
-    assert without.reprojection_rms_px > 1.1 * with_it.reprojection_rms_px
+    # The same detections: what is left over above the noise is the shutter (0.35 px RMS at this speed).
+    excess = without.reprojection_rms_px**2 - with_it.reprojection_rms_px**2
+    assert excess > 0.3**2
     error = [np.abs(a - b).max() for a, b in zip(with_it.rig.project(sweep(time)), exact, strict=True)]
     assert max(error) < 1.0
 
