@@ -102,7 +102,9 @@ def pipeline_page(
     ax.set_title(("5  Height" if error_um is None else "5  Error against the truth") + rms, **title)
 
     ax = page.add_subplot(grid[1, 2])
-    for (method, (frames, error)), colour in zip(registration_um.items(), (COLOURS["paper"], COLOURS["ours"]), strict=False):
+    for (method, (frames, error)), colour in zip(
+        registration_um.items(), (COLOURS["paper"], COLOURS["ours"]), strict=False
+    ):
         ax.plot(frames, error, "o-", color=colour, label=method)
     ax.axhline(150, color=COLOURS["baseline"], linestyle="--", label="paper: below 150 um after 3 frames")
     ax.set(xlabel="frames of the tool", ylabel="translation error, um", yscale="log")

@@ -39,12 +39,14 @@ _RC = {
     "legend.frameon": False,
     "image.cmap": "viridis",
 }
+plt.rcParams.update(_RC)  # once, for all: titles and labels that are set later take the look too
 
 
-def figure(rows: int = 1, columns: int = 1, *, width_in: float = 10.0, height_in: float = 4.0, **subplots) -> tuple[Figure, np.ndarray | Axes]:
+def figure(
+    rows: int = 1, columns: int = 1, *, width_in: float = 10.0, height_in: float = 4.0, **subplots
+) -> tuple[Figure, np.ndarray | Axes]:
     """A figure in the workbench's look; `subplots` goes to `matplotlib.pyplot.subplots` (squeezed as there)."""
-    with plt.rc_context(_RC):
-        return plt.subplots(rows, columns, figsize=(width_in, height_in), layout="constrained", **subplots)
+    return plt.subplots(rows, columns, figsize=(width_in, height_in), layout="constrained", **subplots)
 
 
 def show_image(axes: Axes, image: np.ndarray, title: str = "") -> Axes:

@@ -17,7 +17,7 @@ __all__ = ["assemble"]
 
 
 def assemble(folder: str | Path, data: str | Path, out: str | Path) -> Detector:
-    """Join ``frame/``, ``tool/`` and ``window/`` of a training folder, calibrate on the validation frames, write `out` and its card.
+    """Join ``frame/``, ``tool/`` and ``window/`` of a training folder, calibrate, write `out` and its card.
 
     Half of the validation frames calibrate, the other half give the figures on the card.
 

@@ -45,7 +45,7 @@ class Correspondences:
 
 @dataclass(frozen=True)
 class StereoLandmarks:
-    """Detections `left` and `right` of n stereo frames, and `x_mm` (n, 3, 3), the robot's report at their times."""
+    """Detections `left` and `right` of n stereo frames, and `x_mm` (n, 3, 3), the robot's report when each was seen."""
 
     left: Landmarks
     right: Landmarks
@@ -91,4 +91,6 @@ def detect(
         )
         for side in (0, 1)
     )
-    return StereoLandmarks(left, right, recording.landmarks_mm()[chosen])
+    # A rolling shutter reads the two images alike, so the left one's rows tell when each landmark was seen.
+    x_mm = np.stack([recording.landmarks_at(int(i), u) for i, u in zip(chosen, left.u, strict=True)])
+    return StereoLandmarks(left, right, x_mm)

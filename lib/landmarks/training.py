@@ -474,8 +474,11 @@ def main(argv: list[str] | None = None) -> int:
     from lib.landmarks import assembly, dataset  # late: dataset imports this module
 
     parser = argparse.ArgumentParser(prog="python3 -m lib train", description=main.__doc__.split(": ", 1)[1])
-    parser.add_argument("what", choices=["generate", "frame", "tool", "window", "whole", "assemble"],
-                        help="data; a stage of the shipped detector; the paper's one network on crops; the detector")  # fmt: skip
+    parser.add_argument(
+        "what",
+        choices=["generate", "frame", "tool", "window", "whole", "assemble"],
+        help="data; a stage of the shipped detector; the paper's one network on crops; the detector",
+    )
     parser.add_argument("--data", type=Path, default=paths.CACHE / "landmarks", help="folder of the shards")
     parser.add_argument("--folder", type=Path, default=paths.CACHE / "training", help="checkpoints, one folder a stage")
     parser.add_argument("--shards", type=int, default=60, help="generate: training shards of 16 frames")

@@ -16,7 +16,16 @@ def recording():
     ]
     x_mm = np.arange(45.0).reshape(5, 3, 3)
     x_mm[3] = np.nan
-    return type("Fake", (), {"frames": frames, "__len__": lambda self: 5, "landmarks_mm": lambda self: x_mm})()
+    return type(
+        "Fake",
+        (),
+        {
+            "frames": frames,
+            "__len__": lambda self: 5,
+            "landmarks_mm": lambda self: x_mm,
+            "landmarks_at": lambda self, i, u: x_mm[i],
+        },
+    )()
 
 
 def detector(images):
