@@ -88,9 +88,7 @@ class Comparison:
             p = "" if rung.against is None else f"{rung.p_value:.3g}"
             mark = " <- chosen" if rung is self.best else ""
             above = rung.bic - self.best.bic
-            lines.append(
-                f"{rung.model:28s} {rung.parameters:4d} {rung.chi_square:10.1f} {above:10.1f} {p:>14s}{mark}"
-            )
+            lines.append(f"{rung.model:28s} {rung.parameters:4d} {rung.chi_square:10.1f} {above:10.1f} {p:>14s}{mark}")
         return "\n".join(lines)
 
 

@@ -72,7 +72,7 @@ def read_robot_frames(folder: str | Path) -> RobotFrames:
 
 
 def find_spheres(image: np.ndarray) -> np.ndarray | None:
-    """The two red spheres of an RGB image, upper first: (2, 3) of x, y, radius in px at sub-pixel; None if not both are there.
+    """The two red spheres of an RGB image, upper first: (2, 3) of x, y, radius in px; None if not both are there.
 
     A red region gives the rough circle; the outline is then the steepest fall of redness along 180 rays, found to a
     fraction of a pixel, and the circle the robust fit to it, blind to where the shaft, highlights or tape cross the outline.

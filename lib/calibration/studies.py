@@ -34,10 +34,10 @@ from lib.simulator.rig import (
 from lib.simulator.rig import Correspondences as SimulatedCorrespondences
 
 __all__ = [
-    "board_study",
     "BoundStudy",
     "NoiseStudy",
     "advice_study",
+    "board_study",
     "bound_study",
     "factorisation_study",
     "focal_study",

@@ -151,8 +151,9 @@ def rolling_shutter(
 ) -> tuple[np.ndarray, list[np.ndarray]]:
     """Correspondences of a rolling shutter: kinematics at the time when the landmark's own row was read.
 
-    The middle row is read at the frame's time, the last row half `readout_s` later.  The two cameras
-    see a landmark on different rows; x is taken at the mean of their times, and each camera's pixel is moved to it by the landmark's velocity.
+    The middle row is read at the frame's time, the last row half `readout_s` later.  The two cameras see a landmark
+    on different rows; x is taken at the mean of their times, and each camera's pixel is moved to it by the
+    landmark's velocity.
 
     Parameters
     ----------

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping, Sequence
 
-import matplotlib.pyplot as plt
 import numpy as np
-from ipywidgets import Image, IntSlider, VBox
+from ipywidgets import IntSlider, VBox
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
+from lib.figures.interactive import explore
 from lib.figures.overview import landmarks_on
 from lib.figures.style import COLOURS, LANDMARK_COLOURS, figure, show_image
 from lib.pipeline import STAGES, FrameResult
@@ -160,19 +159,5 @@ def dashboard(left: np.ndarray, result: FrameResult) -> Figure:
 
 def frame_browser(frames: Sequence[StereoFrame], results: Sequence[FrameResult], *, start: int = 0) -> VBox:
     """A slider over the frames with their dashboards; without a browser it shows `start`."""
-    slider = IntSlider(value=start, min=0, max=len(results) - 1, description="frame", continuous_update=False)
-    # An image widget, not captured output: the executing client answers large captured outputs by hanging.
-    picture = Image(value=_png(dashboard(frames[start].left, results[start])), format="png")
-
-    def draw(change: Mapping[str, int]) -> None:
-        picture.value = _png(dashboard(frames[change["new"]].left, results[change["new"]]))
-
-    slider.observe(draw, names="value")
-    return VBox([slider, picture])
-
-
-def _png(page: Figure) -> bytes:
-    buffer = io.BytesIO()
-    page.savefig(buffer, format="png", dpi=80)
-    plt.close(page)
-    return buffer.getvalue()
+    slider = IntSlider(value=start, min=0, max=len(results) - 1, continuous_update=False)
+    return explore(lambda frame: dashboard(frames[frame].left, results[frame]), frame=slider)

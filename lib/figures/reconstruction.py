@@ -6,12 +6,14 @@ from typing import TYPE_CHECKING
 
 import matplotlib.pyplot as plt
 import numpy as np
+from ipywidgets import SelectionSlider, VBox
 from matplotlib.axes import Axes
 from matplotlib.colors import LightSource, PowerNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from lib.cameras import StereoRig
+from lib.figures.interactive import explore
 from lib.figures.style import COLOURS, LANDMARK_COLOURS, figure, show_image
 from lib.matching import DisparityScore, Matches, ResponseMap
 from lib.surface import BSplineSurface, Mesh
@@ -205,20 +207,15 @@ def smoothness_slider(
     position_mm: np.ndarray,
     points: tuple[np.ndarray, np.ndarray],
     reference: dict[str, tuple[np.ndarray, str]],
-) -> None:
+) -> VBox:
     """A slider over sections of surfaces of growing smoothness (in JupyterLab; elsewhere nothing moves)."""
-    import ipywidgets
-    from IPython.display import display
 
-    def draw(step: int) -> None:
-        curves = reference | {"surface": (depths_mm[step], "ours")}
-        page = profiles(position_mm, points, curves, title=f"mu = {smoothness[step]:.2g} px²/mm")
-        display(page)
-        plt.close(page)
+    def draw(mu: int) -> Figure:
+        curves = reference | {"surface": (depths_mm[mu], "ours")}
+        return profiles(position_mm, points, curves, title=f"mu = {smoothness[mu]:.2g} px²/mm")
 
     labels = [(f"{mu:.1e}", k) for k, mu in enumerate(smoothness)]
-    slider = ipywidgets.SelectionSlider(options=labels, value=len(labels) // 2, description="mu")
-    ipywidgets.interact(draw, step=slider)
+    return explore(draw, mu=SelectionSlider(options=labels, value=len(labels) // 2))
 
 
 def smoothness_sections(
