@@ -183,12 +183,18 @@ def simulated_samples(
     seed: int,
     crop_px: int | None = None,
     size_px: tuple[int, int] | None = None,
+    reduction: int = 1,
     textures: int | None = None,
     progress: bool = False,
 ) -> Samples:
     """n simulated images in memory: windows of `crop_px` at full resolution, or the whole field at `size_px` (w, h).
 
-    `textures` limits how many of the simulator's training textures are used, as each takes a second to make; None = all.
+    Parameters
+    ----------
+    reduction:
+        Shrinks every image, and its landmarks, by this whole number.
+    textures:
+        How many of the simulator's training textures are used, as each takes a second to make; None = all.
     """
     if n < 1:
         raise ValueError(f"n: must be at least 1, got {n}.")
@@ -200,4 +206,8 @@ def simulated_samples(
         images, u, visibility = zip(*tqdm(drawn, total=n, disable=not progress, unit="image"), strict=True)
     finally:
         simulator_training.TEXTURE_SEEDS = every
+    if reduction > 1:
+        scale = 1.0 / reduction
+        images = [cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) for image in images]
+        u = [cell_from_image(landmarks, reduction) for landmarks in u]
     return Samples(np.stack(images), np.stack(u), np.stack(visibility))

@@ -32,7 +32,7 @@ def toy_samples(n: int, seed: int = 0, size=(64, 96)) -> Samples:
     return Samples(np.stack(images), np.stack(u), np.full((n, 3), 2))
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def toy():
     """`toy(n, seed=0, size=(h, w))` -> Samples."""
     return toy_samples

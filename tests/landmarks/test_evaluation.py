@@ -16,16 +16,14 @@ from lib.landmarks.training import PRESETS, main, train
 
 
 @pytest.fixture(scope="module")
-def small():
+def small(toy):
     """A whole-frame detector trained for a moment on toys, and toys it has not seen."""
-    from conftest import toy_samples
-
     config = replace(
         PRESETS["best"], network=HourglassConfig(12, 1, 2), augmentation=Augmentation(10.0, (0.9, 1.1)), steps=50,
         batch_size=6, ema=0.9, learning_rate=4e-3, validate_every=50, precision="fp32",
     )  # fmt: skip
-    unseen = toy_samples(40, seed=5)
-    network = train(config, toy_samples(60), toy_samples(4, seed=2), progress=False).network
+    unseen = toy(40, seed=5)
+    network = train(config, toy(60), toy(4, seed=2), progress=False).network
     keep = Calibration(logit=(5.0, 0.0, 0.0, 0.0))
     frames = [(str(i), unseen.images[i], unseen.u[i], unseen.visibility[i]) for i in range(40)]
     return Detector(network, calibration={"frame": keep}), frames
