@@ -130,3 +130,12 @@ def test_the_evaluate_command(tmp_path, capsys):
     assert "PCK@0.05" in capsys.readouterr().out
     assert set(json.loads(out.read_text())) >= {"all", "base", "tip_1", "tip_2"}
     assert evaluation.main([str(tmp_path)]) == 2
+
+
+def test_reduced_windows_keep_their_landmarks():
+    whole, reduced = (
+        dataset.simulated_samples(1, seed=0, crop_px=256, reduction=k, textures=1, progress=False) for k in (1, 4)
+    )
+    assert reduced.images.shape == (1, 64, 64, 3)
+    np.testing.assert_allclose(4 * reduced.u + 1.5, whole.u)
+    np.testing.assert_array_equal(reduced.images[0, 3, 5].round(), whole.images[0, 12:16, 20:24].mean((0, 1)).round())
