@@ -18,6 +18,14 @@ SHIPPED_RECORDING = DATA / "open_sky_eye"
 REAL_DATA_VARIABLE = "MICROSTEREO_DATA"
 
 
+def recording_folder(folder: str = "") -> Path:
+    """The folder of a recording as a notebook's parameter names it: "" is the one that ships.
+
+    Relative folders count from the root of the workbench, wherever a notebook runs.
+    """
+    return ROOT / folder if folder else SHIPPED_RECORDING
+
+
 def real_data(name: str) -> Path | None:
     """The folder of a real data set, or None where it is not at hand.
 

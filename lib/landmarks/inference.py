@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import os
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
@@ -26,6 +27,7 @@ from lib.geometry import image_from_cell
 from lib.landmarks.heatmaps import Peaks, decode
 from lib.landmarks.network import HourglassConfig, StackedHourglass
 from lib.landmarks.windows import cut, direction_rad, tool_centre, window_from_image
+from lib.threads import single_threaded_torch
 
 __all__ = ["Calibration", "Detector", "Landmarks", "as_tensor", "read_checkpoint", "write_checkpoint"]
 
@@ -257,13 +259,14 @@ class Detector:
         """
         images = _images(images)
         found = []
-        for start in range(0, len(images), batch):
-            part = images[start : start + batch]
-            peaks, _ = self.frame_peaks(part)
-            result = _missing(self._calibrated(peaks, "frame", self.reduction))
-            for stage in list(self.networks)[1:]:
-                result = self._refined(part, result, stage)
-            found.append(result)
+        with self._threads():
+            for start in range(0, len(images), batch):
+                part = images[start : start + batch]
+                peaks, _ = self.frame_peaks(part)
+                result = _missing(self._calibrated(peaks, "frame", self.reduction))
+                for stage in list(self.networks)[1:]:
+                    result = self._refined(part, result, stage)
+                found.append(result)
         return _missing(_joined(found))
 
     def track(self, images: ArrayLike, previous: Landmarks, *, min_confidence: float = 0.5) -> Landmarks:
@@ -288,11 +291,16 @@ class Detector:
             np.full((len(images), 3, 2), np.nan), np.full((len(images), 3, 2, 2), np.nan), np.zeros((len(images), 3))
         )
         if usable.size:
-            _put(result, usable, self._refined(images[usable], previous[usable], "window"))
+            with self._threads():
+                _put(result, usable, self._refined(images[usable], previous[usable], "window"))
         lost = np.flatnonzero((result.confidence < min_confidence).any(1))
         if lost.size:
             _put(result, lost, self(images[lost]))
         return _missing(result)
+
+    def _threads(self) -> AbstractContextManager[None]:
+        """One thread for small windows, torch's own for whole frames."""
+        return nullcontext() if self.window_network is None else single_threaded_torch()
 
     def frame_heatmaps(self, images: ArrayLike) -> Tensor:
         """Heatmaps (n, 3, h, w) of the first stage."""

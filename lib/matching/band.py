@@ -24,8 +24,8 @@ from lib.matching.volume import (
     correlation_volume,
     match_volume,
     predicted_bytes,
-    single_threaded_torch,
 )
+from lib.threads import single_threaded_torch
 
 __all__ = ["SETTINGS", "CoarseView", "Setting", "coarse_view", "match_band"]
 

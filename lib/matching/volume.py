@@ -7,9 +7,8 @@ A volume holds (gy, gx, 2 v + 1, D) responses: lattice of patches, rows off the 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -22,7 +21,6 @@ __all__ = [
     "correlation_volume",
     "match_volume",
     "predicted_bytes",
-    "single_threaded_torch",
 ]
 
 #: Lattice rows that are correlated at once.
@@ -59,17 +57,6 @@ class VolumeMatches:
     def keep(self, chosen: np.ndarray) -> VolumeMatches:
         """The matches of a mask (n,) or of indices."""
         return VolumeMatches(*(getattr(self, field.name)[chosen] for field in fields(self)))
-
-
-@contextmanager
-def single_threaded_torch() -> Iterator[None]:
-    """Many small tensors: torch's own threads gain nothing here, and spin where the machine has other work."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 def predicted_bytes(gy: int, gx: int, n: int, v: int) -> int:
