@@ -8,22 +8,18 @@ and returns the duality gap as proof; `cvxpy_reference` solves the same with CLA
 from __future__ import annotations
 
 import itertools
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cache, cached_property
 
 import numpy as np
 from scipy import sparse
 from scipy.linalg import cho_solve_banded, cholesky_banded
+from threadpoolctl import ThreadpoolController
 
 from lib.surface.bspline import SplineGrid, cubic_basis
 
 __all__ = ["L1Problem", "L1Solution", "cvxpy_reference", "interior_point", "least_squares"]
-
-try:
-    from threadpoolctl import ThreadpoolController
-except ImportError:  # without it the solver is as right, and slower on a busy machine
-    ThreadpoolController = None
 
 _UNHELD = (
     "smoothness: too small to hold the control points that have no data near them; increase it, or use fewer control "
@@ -283,14 +279,13 @@ def _interior_point(
 
 
 @cache
-def _blas() -> ThreadpoolController | None:
-    return ThreadpoolController() if ThreadpoolController else None
+def _blas() -> ThreadpoolController:
+    return ThreadpoolController()
 
 
 def _one_blas_thread() -> AbstractContextManager:
     """BLAS on one thread: narrow bands gain nothing from more, and where cores are busy they wait for each other."""
-    controller = _blas()
-    return controller.limit(limits=1, user_api="blas") if controller else nullcontext()
+    return _blas().limit(limits=1, user_api="blas")
 
 
 def _step_length(*pairs: tuple[np.ndarray, np.ndarray]) -> float:
