@@ -28,9 +28,7 @@ def glint_mask(image: ArrayLike, *, level: int = 245, grow_px: int = 5) -> np.nd
     np.ndarray
         (h, w) bool, True = ignore.
     """
-    image = np.asarray(image)
-    if image.dtype != np.uint8 or image.ndim not in (2, 3):
-        raise ValueError(f"image: expected a uint8 image (h, w, 3) or (h, w), got {image.dtype} {image.shape}.")
+    image = _checked(image)
     channels = 1 if image.ndim == 2 else image.shape[2]
     core = cv2.inRange(np.ascontiguousarray(image), (level,) * channels, (255,) * channels)
     if grow_px:
@@ -101,9 +99,7 @@ def field_mask(image: ArrayLike, *, level: int = 12, margin_px: int = 8) -> np.n
     np.ndarray
         (h, w) bool, True = ignore.
     """
-    image = np.asarray(image)
-    if image.dtype != np.uint8 or image.ndim not in (2, 3):
-        raise ValueError(f"image: expected a uint8 image (h, w, 3) or (h, w), got {image.dtype} {image.shape}.")
+    image = _checked(image)
     brightest = image if image.ndim == 2 else image.max(axis=2)
     dark = (cv2.blur(brightest, (5, 5)) <= level).astype(np.uint8)
     _, labels = cv2.connectedComponents(dark)
@@ -112,3 +108,10 @@ def field_mask(image: ArrayLike, *, level: int = 12, margin_px: int = 8) -> np.n
     if margin_px and outside.any():
         outside = cv2.dilate(outside, np.ones((2 * margin_px + 1,) * 2, np.uint8))
     return outside.astype(bool)
+
+
+def _checked(image: ArrayLike) -> np.ndarray:
+    image = np.asarray(image)
+    if image.dtype != np.uint8 or image.ndim not in (2, 3):
+        raise ValueError(f"image: expected a uint8 image (h, w, 3) or (h, w), got {image.dtype} {image.shape}.")
+    return image
