@@ -21,8 +21,8 @@ from tqdm.auto import tqdm
 from lib.geometry import cell_from_image
 from lib.landmarks.training import Samples
 from lib.landmarks.windows import cut, direction_rad, map_points, tool_centre, window_from_image
-from lib.simulator import training as simulator_training
-from lib.simulator.training import sample
+from lib.parallel import in_processes
+from lib.simulator.training import TEXTURE_SEEDS, VALIDATION_TEXTURE_SEEDS, sample
 
 __all__ = ["REDUCTION", "WindowSource", "frame_samples", "generate", "simulated_samples", "validation_frames"]
 
@@ -34,15 +34,36 @@ CROP_PX = 288
 FRAMES = 16
 
 
-def generate(folder: str | Path, shards: int, *, validation: bool = False, progress: bool = True) -> None:
-    """Write shards 0 to `shards` - 1 of `FRAMES` frames into `folder`, skipping those that stand."""
+def generate(
+    folder: str | Path,
+    shards: int,
+    *,
+    validation: bool = False,
+    first: int = 0,
+    workers: int | None = None,
+    progress: bool = True,
+) -> None:
+    """Write shards `first` to `first` + `shards` - 1 of `FRAMES` frames into `folder`, skipping those that stand.
+
+    A shard depends on its number alone.  `workers` processes share the work, by default one a core.
+    """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    for i in tqdm(range(shards), disable=not progress, unit="shard"):
-        path = folder / f"{'validation' if validation else 'training'}_{i:04d}.npz"
-        if not path.exists():
-            rng = np.random.default_rng([int(validation), i])
-            _write_shard(path, [sample(rng) for _ in range(FRAMES)], keep_frames=validation)
+    kind = "validation" if validation else "training"
+    wanted = {i: folder / f"{kind}_{i:04d}.npz" for i in range(first, first + shards)}
+    missing = {i: path for i, path in wanted.items() if not path.exists()}
+    bar = tqdm(
+        total=shards, initial=shards - len(missing), desc=f"Simulating {kind}", disable=not progress, unit="shard"
+    )
+    with bar:
+        for _ in in_processes(_make_shard, [(path, i, validation) for i, path in missing.items()], workers):
+            bar.update()
+
+
+def _make_shard(path: Path, index: int, validation: bool) -> None:
+    rng = np.random.default_rng([int(validation), index])
+    textures = VALIDATION_TEXTURE_SEEDS if validation else TEXTURE_SEEDS
+    _write_shard(path, [sample(rng, textures=textures) for _ in range(FRAMES)], keep_frames=validation)
 
 
 def _write_shard(path: Path, views: list[tuple[np.ndarray, np.ndarray, np.ndarray]], *, keep_frames: bool) -> None:
@@ -199,13 +220,8 @@ def simulated_samples(
     if n < 1:
         raise ValueError(f"n: must be at least 1, got {n}.")
     rng = np.random.default_rng([3, seed])
-    every = simulator_training.TEXTURE_SEEDS
-    try:
-        simulator_training.TEXTURE_SEEDS = every[:textures]
-        drawn = (sample(rng, crop_px=crop_px, size_px=size_px) for _ in range(n))
-        images, u, visibility = zip(*tqdm(drawn, total=n, disable=not progress, unit="image"), strict=True)
-    finally:
-        simulator_training.TEXTURE_SEEDS = every
+    drawn = (sample(rng, crop_px=crop_px, size_px=size_px, textures=TEXTURE_SEEDS[:textures]) for _ in range(n))
+    images, u, visibility = zip(*tqdm(drawn, total=n, disable=not progress, unit="image"), strict=True)
     if reduction > 1:
         scale = 1.0 / reduction
         images = [cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) for image in images]

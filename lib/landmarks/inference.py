@@ -27,7 +27,7 @@ from lib.geometry import image_from_cell
 from lib.landmarks.heatmaps import Peaks, decode
 from lib.landmarks.network import HourglassConfig, StackedHourglass
 from lib.landmarks.windows import cut, direction_rad, tool_centre, window_from_image
-from lib.threads import single_threaded_torch
+from lib.parallel import single_threaded_torch
 
 __all__ = ["Calibration", "Detector", "Landmarks", "as_tensor", "read_checkpoint", "write_checkpoint"]
 

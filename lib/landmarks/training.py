@@ -481,7 +481,8 @@ def main(argv: list[str] | None = None) -> int:
     )
     parser.add_argument("--data", type=Path, default=paths.CACHE / "landmarks", help="folder of the shards")
     parser.add_argument("--folder", type=Path, default=paths.CACHE / "training", help="checkpoints, one folder a stage")
-    parser.add_argument("--shards", type=int, default=60, help="generate: training shards of 16 frames")
+    parser.add_argument("--shards", type=int, default=120, help="generate: training shards of 16 frames")
+    parser.add_argument("--workers", type=int, help="generate: processes (default: one a core)")
     parser.add_argument("--preset", choices=sorted(PRESETS), default="best")
     parser.add_argument("--steps", type=int, default=6000)
     parser.add_argument("--features", type=int, default=None, help="channels (default: the shipped detector's)")
@@ -495,8 +496,8 @@ def main(argv: list[str] | None = None) -> int:
         torch.set_num_threads(a.threads)
     try:
         if a.what == "generate":
-            dataset.generate(a.data, max(3, a.shards // 20), validation=True)
-            dataset.generate(a.data, a.shards)
+            dataset.generate(a.data, max(3, a.shards // 15), validation=True, workers=a.workers)
+            dataset.generate(a.data, a.shards, workers=a.workers)
         elif a.what == "assemble":
             assembly.assemble(a.folder, a.data, a.out)
         else:

@@ -25,7 +25,7 @@ from lib.matching.volume import (
     match_volume,
     predicted_bytes,
 )
-from lib.threads import single_threaded_torch
+from lib.parallel import single_threaded_torch
 
 __all__ = ["SETTINGS", "CoarseView", "Setting", "coarse_view", "match_band"]
 

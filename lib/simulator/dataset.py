@@ -12,14 +12,13 @@ import json
 import os
 import time
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 
-import cv2
 import numpy as np
 from tqdm.auto import tqdm
 
 from lib import paths
+from lib.parallel import in_processes
 from lib.recordings import Recording
 from lib.simulator.eye import Eye
 from lib.simulator.microscope import Microscope
@@ -56,7 +55,6 @@ def make_shipped_recording(folder: Path = paths.SHIPPED_RECORDING) -> Recording:
 
 def _make_sequence(folder: Path, seed: int, index: int, n_pairs: int) -> str:
     """One sequence, unless it is there already; runs in its own process."""
-    cv2.setNumThreads(1)
     target = folder / sequence_name(index)
     if target.exists():
         return target.name
@@ -131,20 +129,10 @@ def make_dataset(folder: Path, *, seed: int = 0, n_pairs: int = 80, workers: int
     os.replace(partial, stamp)
     indices = [*TRAIN_SEQUENCES, *TEST_SEQUENCES]
     missing = [k for k in indices if not (folder / sequence_name(k)).exists()]
-    workers = min(workers or os.cpu_count() or 1, max(len(missing), 1))
-    with ProcessPoolExecutor(workers) as pool:
-        jobs = [pool.submit(_make_sequence, folder, seed, k, n_pairs) for k in missing]
-        bar = tqdm(total=len(indices), initial=len(indices) - len(missing), desc="Simulating", unit="sequence")
-        try:
-            for job in as_completed(jobs):
-                bar.set_postfix_str(job.result())
-                bar.update()
-        except BaseException:
-            for job in jobs:
-                job.cancel()
-            raise
-        finally:
-            bar.close()
+    with tqdm(total=len(indices), initial=len(indices) - len(missing), desc="Simulating", unit="sequence") as bar:
+        for name in in_processes(_make_sequence, [(folder, seed, k, n_pairs) for k in missing], workers):
+            bar.set_postfix_str(name)
+            bar.update()
     return [folder / sequence_name(k) for k in indices]
 
 

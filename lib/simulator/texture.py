@@ -83,7 +83,7 @@ def _draw(branches: list[tuple[np.ndarray, np.ndarray]], size_px: int, share: fl
     return image.astype(np.float32) / 255
 
 
-@lru_cache(maxsize=48)
+@lru_cache(maxsize=128)
 def fundus_texture(seed: int, size_px: int = 2048, rim_mm: float = 9.3) -> np.ndarray:
     """Reflectance of a fundus, (size_px, size_px, 3) uint8 RGB, read-only; `seed` decides everything.
 

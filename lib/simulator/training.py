@@ -7,6 +7,7 @@ never drawn: recordings made for tests use them, so no test frame shows an eye o
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import cv2
@@ -24,6 +25,7 @@ __all__ = [
     "RESERVED_JAW_MM",
     "RESERVED_SEEDS",
     "TEXTURE_SEEDS",
+    "VALIDATION_TEXTURE_SEEDS",
     "random_eye",
     "random_forceps",
     "random_microscope",
@@ -35,23 +37,25 @@ __all__ = [
 #: Eyes (and the textures and brush marks that go with them) that training never draws.
 RESERVED_SEEDS = range(0, 10_000)
 #: Textures of the training eyes: few enough to stay in memory, each turned, tinted and shaped anew per image.
-TEXTURE_SEEDS = range(10_000, 10_028)
+TEXTURE_SEEDS = range(10_000, 10_096)
+#: Textures of the eyes that validate a training: none of those it sees.
+VALIDATION_TEXTURE_SEEDS = range(10_096, 10_112)
 #: Jaw lengths that training never draws: recordings for tests have tools of these.
 RESERVED_JAW_MM = (2.95, 3.15)
 _TEXTURE_PX = 1536
 
 
-def random_eye(rng: np.random.Generator) -> Eye:
-    """An eye of the training population: shape, folds, gloss and texture."""
+def random_eye(rng: np.random.Generator, textures: Sequence[int] = TEXTURE_SEEDS) -> Eye:
+    """An eye of the training population: shape, folds, gloss, and one of `textures`."""
     return Eye(
-        seed=int(rng.integers(TEXTURE_SEEDS.start, TEXTURE_SEEDS.stop)),
+        seed=int(textures[rng.integers(len(textures))]),
         radius_mm=9.3,
         depth_mm=rng.uniform(1.2, 3.2),
         fold_mm=rng.uniform(0.02, 0.18),
         tilt_rad=rng.uniform(0.0, 0.08),
         centre_z_mm=rng.uniform(0.4, 1.8),
         texture_px=_TEXTURE_PX,
-        gloss=float(rng.choice([0.0, 1.0], p=[0.08, 0.92]) * rng.uniform(0.3, 1.6)),
+        gloss=float(rng.choice([0.0, 1.0], p=[0.08, 0.92]) * rng.uniform(0.3, 2.2)),
         turn_rad=float(rng.uniform(-np.pi, np.pi)),
     )
 
@@ -132,6 +136,7 @@ def sample(
     size_px: tuple[int, int] | None = None,
     jitter: float = 0.35,
     zoom: tuple[float, float] = (0.85, 1.18),
+    textures: Sequence[int] = TEXTURE_SEEDS,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """One training image with its landmarks.
 
@@ -147,6 +152,8 @@ def sample(
         How far the jaws' centre may lie from the window's centre, as a share of its side.
     zoom:
         Range of the magnification, relative to 100 px per mm.
+    textures:
+        Seeds of the fundus textures to draw from; each takes a second to make and then stays in memory.
 
     Returns
     -------
@@ -162,7 +169,7 @@ def sample(
         raise ValueError("crop_px, size_px: give one, a window at full resolution or the field at a reduced one.")
     if min(crop_px or 64, *(size_px or (64, 64))) < 32:
         raise ValueError(f"crop_px, size_px: must be at least 32, got {crop_px}, {size_px}.")
-    eye, forceps, microscope = random_eye(rng), random_forceps(rng), random_microscope(rng)
+    eye, forceps, microscope = random_eye(rng, textures), random_forceps(rng), random_microscope(rng)
     pose = random_pose(rng, forceps, eye.centre_z_mm - 0.35 * eye.depth_mm)
     magnification = 100.0 * rng.uniform(*zoom)
     side = rng.choice([-1, 1])
