@@ -21,6 +21,9 @@ from lib.geometry import points
 
 __all__ = ["AffineCamera", "Camera", "NearAffineCamera", "Points", "Resection", "StereoRig"]
 
+#: Points triangulated at a time by near-affine pairs: few enough for their arrays to stay in the processor's cache.
+_BLOCK = 4096
+
 
 @runtime_checkable
 class Camera(Protocol):
@@ -367,6 +370,8 @@ class StereoRig:
     def triangulate(self, u_left: ArrayLike, u_right: ArrayLike, covariance_px2: ArrayLike | None = None) -> Points:
         """Maximum-likelihood points of matches; NaN rows stay NaN.
 
+        So does a match that only a point behind a near-affine camera would explain.
+
         Parameters
         ----------
         u_left, u_right:
@@ -422,32 +427,71 @@ class StereoRig:
         return Points(z[:3].T, np.broadcast_to(covariance_mm2 * variance_px2, (n, 3, 3)), z[3])
 
     def _triangulate_near_affine(self, y: np.ndarray, covariance: np.ndarray, steps: int = 2) -> Points:
-        """Linear per point (the projection's denominator multiplied out), then Gauss-Newton steps on the pixels."""
-        rows, values = [], []
-        for camera, u in ((self.left, y[:, :2]), (self.right, y[:, 2:])):
+        """Linear per point (the projection's denominator multiplied out), then Gauss-Newton steps on the pixels.
+
+        A point's normal equations are 3 x 3: they are solved by cofactors, with an array a matrix entry and a block of
+        points at a time, which is many times faster than stacks of small matrices.
+        """
+        n = len(y)
+        x, covariance_mm2 = np.full((n, 3), np.nan), np.full((n, 3, 3), np.nan)
+        epipolar = np.full(n, np.nan)
+        ideal = y.copy()
+        for camera, columns in ((self.left, slice(0, 2)), (self.right, slice(2, 4))):
             if isinstance(camera, NearAffineCamera):
-                u = camera.undistort(u)
-            P = camera.projection_matrix
-            rows.append(P[:2, :3] - u[:, :, None] * P[2, :3])
-            values.append(u * P[2, 3] - P[:2, 3])
-        A, b = np.concatenate(rows, axis=1), np.hstack(values)
-        known = np.isfinite(b).all(axis=1)
-        x = np.full((len(y), 3), np.nan)
-        covariance_mm2 = np.full((len(y), 3, 3), np.nan)
-        epipolar = np.full(len(y), np.nan)
-        A, b, y = A[known], b[known], y[known]
-        if covariance.ndim == 3:
-            covariance = covariance[known]
-        At = np.swapaxes(A, 1, 2)
-        found = np.linalg.solve(At @ A, (At @ b[..., None]))[..., 0]
-        for _ in range(steps):
-            gain, covariance_found = _gain(self.jacobian(found), covariance)
-            found = found + np.einsum("nij,nj->ni", gain, y - np.hstack(self.project(found)))
-        # The residual lies along the left null vector of the Jacobian; its sign is that of the affine normal.
-        residual = y - np.hstack(self.project(found))
-        x[known], covariance_mm2[known] = found, covariance_found
-        epipolar[known] = np.einsum("ni,ni->n", residual, _left_null_vector(self.jacobian(found), self.epipolar_normal))
+                ideal[:, columns] = camera.undistort(y[:, columns])
+        known = np.flatnonzero(np.isfinite(y).all(axis=1))
+        root = np.linalg.cholesky(covariance)
+        for start in range(0, len(known), _BLOCK):
+            rows = known[start : start + _BLOCK]
+            L = root if root.ndim == 2 else np.ascontiguousarray(np.moveaxis(root[rows], 0, -1))
+            pixels = list(y[rows].T)
+            found = _solve_normal(*self._linear_system(ideal[rows].T), np.eye(4))[0]
+            for _ in range(steps):
+                J, r, _ = self._linearised(found, pixels)
+                step, inverse = _solve_normal(J, r, L)
+                found = [a + b for a, b in zip(found, step, strict=True)]
+            J, r, in_front = self._linearised(found, pixels)
+            for k in range(3):
+                x[rows, k] = np.where(in_front, found[k], np.nan)
+                for j in range(3):
+                    covariance_mm2[rows, j, k] = inverse[min(j, k)][max(j, k) - min(j, k)]
+            covariance_mm2[rows[~in_front]] = np.nan
+            # The residual lies along the left null vector of the Jacobian; its sign is that of the affine normal.
+            epipolar[rows] = np.where(in_front, _along_null_vector(J, r, self.epipolar_normal), np.nan)
         return Points(x, covariance_mm2, epipolar)
+
+    def _linear_system(self, u: np.ndarray) -> tuple[list[list[np.ndarray]], list[np.ndarray]]:
+        """Rows and right-hand sides of the equations linear in x, for undistorted pixels u (4, n)."""
+        P = [camera.projection_matrix for camera in (self.left, self.right)]
+        rows = [[P[i // 2][i % 2, k] - u[i] * P[i // 2][2, k] for k in range(3)] for i in range(4)]
+        return rows, [u[i] * P[i // 2][2, 3] - P[i // 2][i % 2, 3] for i in range(4)]
+
+    def _linearised(
+        self, x: list[np.ndarray], y: list[np.ndarray]
+    ) -> tuple[list[list[np.ndarray]], list[np.ndarray], np.ndarray]:
+        """Jacobian (4 rows of 3), residuals (4) at points x (3 coordinates), and which points lie before the cameras."""
+        J, r, in_front = [], [], np.ones(len(x[0]), dtype=bool)
+        for camera, pixels in ((self.left, y[:2]), (self.right, y[2:])):
+            A, t = camera.linear, camera.offset_px
+            if not isinstance(camera, NearAffineCamera):
+                J += [list(A[i]) for i in range(2)]
+                r += [pixels[i] - (A[i, 0] * x[0] + A[i, 1] * x[1] + A[i, 2] * x[2] + t[i]) for i in range(2)]
+                continue
+            c, k = camera.centre_px, camera.radial_per_px2
+            slope = camera.inverse_distance_per_mm * camera.viewing_direction
+            ratio = slope[0] * x[0] + slope[1] * x[1] + slope[2] * x[2] + (1.0 - slope @ camera.reference_mm)
+            in_front &= ratio > 0
+            inverse = 1.0 / ratio
+            v = [(A[i, 0] * x[0] + A[i, 1] * x[1] + A[i, 2] * x[2] + (t[i] - c[i])) * inverse for i in range(2)]
+            rows = [[(A[i, j] - slope[j] * v[i]) * inverse for j in range(3)] for i in range(2)]
+            if k:
+                scale, cross = 1.0 + k * (v[0] ** 2 + v[1] ** 2), 2.0 * k * v[0] * v[1]
+                bend = [scale + 2.0 * k * v[i] ** 2 for i in range(2)]
+                rows = [[bend[i] * a + cross * b for a, b in zip(rows[i], rows[1 - i], strict=True)] for i in range(2)]
+                v = [scale * v[i] for i in range(2)]
+            J += rows
+            r += [pixels[i] - c[i] - v[i] for i in range(2)]
+        return J, r, in_front
 
     def save(self, path: str | Path) -> None:
         """Write the rig as JSON (matrices, units); the file appears whole or not at all."""
@@ -505,9 +549,59 @@ def _gain(A: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray
     return covariance_mm2 @ np.swapaxes(weight_A, -1, -2), covariance_mm2
 
 
-def _left_null_vector(J: np.ndarray, along: np.ndarray) -> np.ndarray:
-    """Unit vectors (n, 4) orthogonal to the columns of J (n, 4, 3), turned to the side of `along` (4,)."""
-    minors = [np.linalg.det(np.delete(J, i, axis=1)) * (-1) ** i for i in range(4)]
-    normal = np.stack(minors, axis=1)
-    normal *= np.sign(normal @ along)[:, None]
-    return normal / np.linalg.norm(normal, axis=1, keepdims=True)
+def _solve_normal(
+    J: list[list[np.ndarray]], r: list[np.ndarray], L: np.ndarray
+) -> tuple[list[np.ndarray], list[list[np.ndarray]]]:
+    """Least squares of L^-1 (r - J x), many points at once: x (3 arrays) and the inverse of the normal matrix.
+
+    Parameters
+    ----------
+    J, r:
+        Four rows of three arrays (n,) or numbers, and four arrays (n,).
+    L:
+        Cholesky root of the covariance, (4, 4) or (4, 4, n).
+
+    Returns
+    -------
+    The upper triangle of the inverse comes row by row: three, two, one arrays.
+    """
+    rows = [[*J[i], r[i]] for i in range(4)]
+    for i in range(4):
+        for j in range(i):
+            if L.ndim == 3 or L[i, j]:
+                rows[i] = [a - L[i, j] * b for a, b in zip(rows[i], rows[j], strict=True)]
+        if L.ndim == 3 or L[i, i] != 1:
+            scale = 1.0 / L[i, i]
+            rows[i] = [scale * a for a in rows[i]]
+
+    def product(a: int, b: int) -> np.ndarray:
+        return rows[0][a] * rows[0][b] + rows[1][a] * rows[1][b] + rows[2][a] * rows[2][b] + rows[3][a] * rows[3][b]
+
+    n00, n01, n02, n11, n12, n22 = (product(a, b) for a, b in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)))
+    g = [product(k, 3) for k in range(3)]
+    c00, c01, c02 = n11 * n22 - n12**2, n02 * n12 - n01 * n22, n01 * n12 - n02 * n11
+    c11, c12, c22 = n00 * n22 - n02**2, n01 * n02 - n00 * n12, n00 * n11 - n01**2
+    scale = 1.0 / (n00 * c00 + n01 * c01 + n02 * c02)
+    c00, c01, c02, c11, c12, c22 = (scale * c for c in (c00, c01, c02, c11, c12, c22))
+    x = [
+        c00 * g[0] + c01 * g[1] + c02 * g[2],
+        c01 * g[0] + c11 * g[1] + c12 * g[2],
+        c02 * g[0] + c12 * g[1] + c22 * g[2],
+    ]
+    return x, [[c00, c01, c02], [c11, c12], [c22]]
+
+
+def _along_null_vector(J: list[list[np.ndarray]], r: list[np.ndarray], along: np.ndarray) -> np.ndarray:
+    """Component (n,) of r along the unit vectors orthogonal to the columns of J, turned to the side of `along` (4,)."""
+    normal = []
+    for i in range(4):
+        a, b, c = (J[k] for k in range(4) if k != i)
+        minor = (
+            a[0] * (b[1] * c[2] - b[2] * c[1]) - a[1] * (b[0] * c[2] - b[2] * c[0]) + a[2] * (b[0] * c[1] - b[1] * c[0])
+        )
+        normal.append(minor if i % 2 == 0 else -minor)
+
+    def times(v: list[np.ndarray] | np.ndarray) -> np.ndarray:
+        return normal[0] * v[0] + normal[1] * v[1] + normal[2] * v[2] + normal[3] * v[3]
+
+    return times(r) * np.sign(times(along)) / np.sqrt(times(normal))

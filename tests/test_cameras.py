@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.optimize import least_squares
 
 from lib.cameras import AffineCamera, Camera, NearAffineCamera, StereoRig
 from lib.geometry import RigidTransform
@@ -102,6 +103,42 @@ def test_triangulation_is_the_weighted_minimum_and_its_covariance_is_right(rig, 
         "nij,nik,nk->nj", pair.jacobian(found.x_mm), np.broadcast_to(np.linalg.inv(S), (4000, 4, 4)), r
     )
     assert np.abs(gradient).max() < 1e-3 * 100
+
+
+@pytest.mark.parametrize("each", [False, True])
+def test_near_affine_triangulation_is_that_of_a_general_solver(near, each, monkeypatch):
+    monkeypatch.setattr("lib.cameras._BLOCK", 7)
+    rng = np.random.default_rng(5)
+    x = workspace(23)
+    u_left, u_right = (u + rng.normal(0, 3, u.shape) for u in near.project(x))
+    u_left[11] = np.nan
+    L = np.tril(rng.uniform(-0.4, 0.4, (23, 4, 4))) + 1.5 * np.eye(4)
+    S = L @ L.transpose(0, 2, 1) if each else np.broadcast_to(L[0] @ L[0].T, (23, 4, 4))
+    found = near.triangulate(u_left, u_right, S if each else S[0])
+    for i in np.delete(np.arange(23), 11):
+        white = np.linalg.inv(np.linalg.cholesky(S[i]))
+        y = np.concatenate([u_left[i], u_right[i]])
+        general = least_squares(
+            lambda p: white @ (np.concatenate(near.project(p[None]), axis=1)[0] - y), x[i], xtol=1e-15, ftol=1e-15, gtol=1e-15
+        )  # fmt: skip
+        np.testing.assert_allclose(found.x_mm[i], general.x, atol=1e-8)
+        np.testing.assert_allclose(found.covariance_mm2[i] @ (general.jac.T @ general.jac), np.eye(3), atol=1e-5)
+    assert np.isnan(found.x_mm[11]).all() and np.isnan(found.covariance_mm2[11]).all()
+
+
+def test_match_of_a_point_behind_the_cameras_is_missing(near):
+    x = workspace(3)
+    u_left, u_right = near.project(x)
+    # A point 400 mm towards the cameras, behind both, as the homogeneous projection sees it.
+    behind = np.append(x[1] - 400 * near.left.viewing_direction, 1.0)
+    for u, camera in ((u_left, near.left), (u_right, near.right)):
+        h = camera.projection_matrix @ behind
+        assert h[2] < 0
+        u[1] = h[:2] / h[2]
+    pair = StereoRig(near.left, NearAffineCamera(near.right.matrix, 1 / 190, (959.5, 539.5), ROBOT_FROM_MICROSCOPE.t))
+    found = pair.triangulate(u_left, u_right)
+    assert np.isnan(found.x_mm[1]).all() and np.isnan(found.epipolar_px[1])
+    assert np.isfinite(found.x_mm[[0, 2]]).all()
 
 
 def test_triangulation_keeps_missing_matches_missing(rig, near):
