@@ -97,10 +97,12 @@ def _write_shard(path: Path, views: list[tuple[np.ndarray, np.ndarray, np.ndarra
     os.replace(partial, path)
 
 
-def _load(folder: str | Path, pattern: str, names: tuple[str, ...]) -> list[np.ndarray]:
-    shards = sorted(Path(folder).glob(pattern))
+def _load(
+    folder: str | Path, pattern: str, names: tuple[str, ...], first_shards: int | None = None
+) -> list[np.ndarray]:
+    shards = sorted(Path(folder).glob(pattern))[:first_shards]
     if not shards:
-        raise FileNotFoundError(f"{folder}: no shard {pattern}; make some with `python3 -m lib train --generate`.")
+        raise FileNotFoundError(f"{folder}: no shard {pattern}; make some with `python3 -m lib train generate`.")
     parts: dict[str, list[np.ndarray]] = {name: [] for name in names}
     for path in shards:
         try:
@@ -158,16 +160,20 @@ class WindowSource:
     zoom: tuple[float, float] = (0.85, 1.2)
 
     @classmethod
-    def load(cls, folder: str | Path, *, validation: bool = False, size: int = 128) -> WindowSource:
-        """From the shards of a folder."""
+    def load(
+        cls, folder: str | Path, *, validation: bool = False, size: int = 128, shards: int | None = None
+    ) -> WindowSource:
+        """From the shards of a folder, or from its first `shards`."""
         names = ("crops", "crop_u", "crop_visibility", "crop_landmark")
-        return cls(*_load(folder, "validation_*.npz" if validation else "training_*.npz", names), size=size)
+        return cls(*_load(folder, "validation_*.npz" if validation else "training_*.npz", names, shards), size=size)
 
     @classmethod
-    def load_tools(cls, folder: str | Path, *, validation: bool = False, size: int = 128) -> WindowSource:
+    def load_tools(
+        cls, folder: str | Path, *, validation: bool = False, size: int = 128, shards: int | None = None
+    ) -> WindowSource:
         """Windows round the whole tool at `TOOL_REDUCTION`, for the middle stage."""
         pattern = "validation_*.npz" if validation else "training_*.npz"
-        frames, u, visibility = _load(folder, pattern, ("frames", "u", "visibility"))
+        frames, u, visibility = _load(folder, pattern, ("frames", "u", "visibility"), shards)
         u = cell_from_image(u, TOOL_REDUCTION)
         which = np.full(len(frames), TOOL)
         return cls(frames, u, visibility, which, size, shift_px=8.0, turn_rad=0.2, zoom=(0.75, 1.3))

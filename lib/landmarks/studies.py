@@ -1,0 +1,490 @@
+"""Long studies of the detector: ``python3 -m lib.landmarks.studies NAME``; figures go to data/results/detector.json.
+
+Every training keeps its checkpoints in data/cache/studies, so a study that was stopped goes on where it was, and one that
+is complete is only evaluated anew.  Its budget (what a training may cost) is the same for all that it compares.
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import json
+import os
+import platform
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+
+from lib import paths
+from lib.geometry import cell_from_image
+from lib.landmarks import real
+from lib.landmarks.augmentation import AUGMENTATIONS
+from lib.landmarks.dataset import TOOL, TOOL_REDUCTION, WindowSource, validation_frames
+from lib.landmarks.evaluation import Evaluation, evaluate, labelled_frames
+from lib.landmarks.inference import Detector, Landmarks
+from lib.landmarks.metrics import calibration_error
+from lib.landmarks.network import ABLATION, HourglassConfig
+from lib.landmarks.resolution import RESOLUTIONS, ReducedDetector, resolution_windows
+from lib.landmarks.training import PRESETS, Samples, Source, Training, TrainingConfig, commit, train, validate
+from lib.recordings import Recording, import_retinal_microsurgery
+
+__all__ = ["STUDIES", "main", "read_results", "summary"]
+
+#: Thresholds of recorded PCK curves, parts of the tool's length.
+CURVE = (0.001, 0.002, 0.005, 0.01, 0.015, 0.02, 0.03, 0.04, 0.05, 0.06, 0.08, 0.1, 0.12, 0.15, 0.2)
+
+
+@dataclass(frozen=True)
+class Options:
+    """What the command line decides.
+
+    Attributes
+    ----------
+    data:
+        Folder of training and validation shards (`lib.landmarks.dataset`).
+    test:
+        Folder of simulated sequences; its ``test_*`` recordings are the test where there are any, else the validation
+        shards' second half.
+    folder:
+        Keeps the checkpoints.
+    shards:
+        So many training shards of 16 frames are used: 100 are the paper's > 1500 images.
+    """
+
+    data: Path
+    test: Path
+    folder: Path
+    seeds: int
+    steps: int
+    batch: int
+    features: int
+    shards: int
+    progress: bool = True
+    #: Called with a study's result whenever it has grown.
+    record: Callable[[dict], None] = field(default=lambda _: None)
+
+    @property
+    def budget(self) -> dict[str, object]:
+        return {
+            "steps": self.steps,
+            "batch": self.batch,
+            "features": self.features,
+            "training_frames": 16 * self.shards,
+            "optimiser": "adamw 2e-3, cosine, average of weights 0.99, bf16",
+            "seeds": self.seeds,
+        }
+
+    def config(self, network: HourglassConfig, seed: int) -> TrainingConfig:
+        return replace(
+            PRESETS["best"],
+            network=network,
+            augmentation=AUGMENTATIONS["none"],  # rotation and zoom are drawn with the windows, as in the paper
+            steps=self.steps,
+            batch_size=self.batch,
+            ema=0.99,
+            validate_every=max(1, self.steps // 2),
+            seed=seed,
+        )
+
+
+def read_results(path: Path | None = None) -> dict[str, dict]:
+    """Recorded results of all studies that have been run, by name; empty where there are none."""
+    path = path or paths.RESULTS / "detector.json"
+    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+
+
+# --- statistics ----------------------------------------------------------------------------------------------------
+
+
+def summary(values: Sequence[float]) -> dict[str, object]:
+    """Mean over seeds, its standard error (NaN for one seed), and the values."""
+    v = np.asarray(values, dtype=float)
+    error = v.std(ddof=1) / np.sqrt(len(v)) if len(v) > 1 else np.nan
+    return {"mean": float(v.mean()), "standard_error": float(error), "per_seed": v.tolist()}
+
+
+def verdicts(rows: Mapping[str, Mapping[str, object]]) -> dict[str, str]:
+    """Each row against the one before it: "better", "worse", or "tie" below two standard errors of the difference."""
+    names, result = list(rows), {}
+    for before, name in pairwise(names):
+        a, b = rows[before], rows[name]
+        difference = b["mean"] - a["mean"]
+        error = np.hypot(a["standard_error"], b["standard_error"])
+        if not np.isfinite(error):
+            result[f"{before} -> {name}"] = "one seed: no statement"
+        else:
+            result[f"{before} -> {name}"] = (
+                "tie" if abs(difference) < 2 * error else "better" if difference > 0 else "worse"
+            )
+    return result
+
+
+# --- data ----------------------------------------------------------------------------------------------------------
+
+
+def test_frames(options: Options, every: int = 2) -> tuple[str, list[tuple[str, np.ndarray, np.ndarray, np.ndarray]]]:
+    """What the test is, in words, and its full-HD frames: name, image, u, visibility."""
+    recordings = sorted(options.test.glob("test_*"))
+    if recordings:
+        frames = [
+            (f"{folder.name} {name}", *rest)
+            for folder in recordings
+            for name, *rest in labelled_frames(Recording.open(folder), every=every)
+        ]
+        return f"{len(frames)} full-HD images of {len(recordings)} sequences, eyes and tools never trained on", frames
+    frames = list(validation_frames(options.data))[1::2]
+    return f"{len(frames)} simulated full-HD images, textures never trained on", frames
+
+
+def _tool_windows(frames: Sequence[tuple[str, np.ndarray, np.ndarray, np.ndarray]], template: WindowSource) -> Samples:
+    """One window round the tool of each frame, displaced, turned and zoomed at random as in training."""
+    small, labels, visible = [], [], []
+    for _, image, u, visibility in frames:
+        if np.isfinite(u).all():
+            size = (image.shape[1] // TOOL_REDUCTION, image.shape[0] // TOOL_REDUCTION)
+            small.append(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
+            labels.append(cell_from_image(u, TOOL_REDUCTION))
+            visible.append(visibility)
+    source = replace(
+        template,
+        crops=np.stack(small),
+        u=np.stack(labels),
+        visibility=np.stack(visible),
+        landmark=np.full(len(small), TOOL),
+    )
+    return source.fixed(seed=1)
+
+
+def _trained(
+    options: Options,
+    name: str,
+    seed: int,
+    network: HourglassConfig,
+    source: Source,
+    validation: Samples,
+    initial: Training | None = None,
+    **changes: object,
+) -> Training:
+    """The training of `name` with this seed, from its checkpoint as far as there is one."""
+    config = replace(options.config(network, seed), **changes)
+    if options.progress:
+        print(f"{name}, seed {seed}", flush=True)
+    folder = options.folder / name / f"seed{seed}"
+    return train(config, source, validation, folder, initial=initial, progress=options.progress)
+
+
+# --- the studies ---------------------------------------------------------------------------------------------------
+
+
+def ablation(options: Options) -> None:
+    """The five columns of the paper's table, on windows round the tool at a fifth of full HD."""
+    turned = {"shift_px": 8.0, "turn_rad": np.radians(15.0), "zoom": (0.75, 1.25)}
+    source = replace(WindowSource.load_tools(options.data, shards=options.shards), **turned)
+    held_out = replace(WindowSource.load_tools(options.data, validation=True), **turned)
+    validation = held_out.fixed()
+    what, frames = test_frames(options)
+    test = _tool_windows(frames, held_out)
+    figures: dict[str, dict[str, list[float]]] = {name: {} for name in ABLATION}
+    seconds: dict[str, list[float]] = {name: [] for name in ABLATION}
+    for seed in range(options.seeds):
+        for name, columns in ABLATION.items():
+            # Halvings: the tool is 60 px long here, not 300, so 3 make it as many cells of the bottleneck as in the paper.
+            network = HourglassConfig(options.features, depth=3, **columns)
+            done = _trained(options, f"ablation/{name.replace('+ ', '')}", seed, network, source, validation)
+            scores = validate(done.network, test, options.config(network, seed))
+            for key in ("pck_0.05", "pck_0.10", "median_px"):
+                figures[name].setdefault(key, []).append(scores[key])
+            seconds[name].append(done.provenance["seconds"])
+        rows = {name: {key: summary(v) for key, v in values.items()} for name, values in figures.items()}
+        options.record(
+            {
+                "what": "windows of 128 px round the tool at 1/5 of full HD, each displaced by 8 px and turned by 15 "
+                "degrees (standard deviations, three times that in a tenth of them), zoom 0.75 to 1.25",
+                "test": what,
+                "columns": rows,
+                "verdicts": verdicts({name: row["pck_0.05"] for name, row in rows.items()}),
+                "paper_pck_0.05": dict(zip(ABLATION, (8.4, 75.1, 95.2, 99.6, 99.7), strict=True)),
+                "seconds": {name: round(float(np.mean(s))) for name, s in seconds.items()},
+            }
+        )
+
+
+def _finder() -> Detector:
+    return replace(Detector.load(), window_network=None)
+
+
+def _figures(e: Evaluation) -> dict[str, float]:
+    s = e.scores
+    known = ~np.isnan(e.error_px)
+    return {
+        "pck_0.01": s.pck_0_01,
+        "pck_0.05": s.pck_0_05,
+        "pck_0.10": s.pck_0_10,
+        "median_px": s.median_px,
+        "p95_px": s.p95_px,
+        "nees": s.nees,
+        "coverage_95": s.coverage_95,
+        "confidence_error": calibration_error(e.landmarks.confidence[known], e.correct[known]),
+        "missed": s.missed,
+        "labels": s.labels,
+    }
+
+
+class _FullHd:
+    """Validation and test frames with what the finder says of them: the same for every network of the last stage."""
+
+    def __init__(self, options: Options):
+        finder = _finder()
+        self.finder = finder
+        fit_on = list(validation_frames(options.data))[::2]
+        self.what, frames = test_frames(options)
+        self.fit = evaluate(finder, fit_on), np.stack([f[1] for f in fit_on]), np.stack([f[2] for f in fit_on])
+        self.test, self.images = evaluate(finder, frames), [f[1] for f in frames]
+
+    def judge(self, training: Training, name: str, folder: Path) -> Evaluation:
+        """Calibrate the network on validation frames, and evaluate it on the test's."""
+        detector = ReducedDetector(self.finder, training.network, RESOLUTIONS[name])
+        fit, images, u = self.fit
+        detector = detector.calibrated(images, fit.landmarks, u, fit.visibility)
+        detector.save_calibration(folder)
+        parts = [detector.refine(image[None], self.test.landmarks[i : i + 1]) for i, image in enumerate(self.images)]
+        landmarks = Landmarks(
+            *(np.concatenate([getattr(p, key) for p in parts]) for key in ("u", "covariance", "confidence"))
+        )
+        return replace(self.test, landmarks=landmarks)
+
+
+def _network(options: Options) -> HourglassConfig:
+    return HourglassConfig(options.features, **ABLATION["+ residual"])
+
+
+def resolution(options: Options) -> None:
+    """The last stage at the paper's four resolutions, on full-HD frames."""
+    crops, held_out = (
+        WindowSource.load(options.data, shards=options.shards),
+        WindowSource.load(options.data, validation=True),
+    )
+    frames = _FullHd(options)
+    figures: dict[str, dict[str, list[float]]] = {name: {} for name in RESOLUTIONS}
+    curves: dict[str, list[np.ndarray]] = {name: [] for name in RESOLUTIONS}
+    seconds: dict[str, list[float]] = {name: [] for name in RESOLUTIONS}
+    for seed in range(options.seeds):
+        for name, size in RESOLUTIONS.items():
+            source = resolution_windows(crops, size)
+            validation = resolution_windows(held_out, size).fixed()
+            done = _trained(options, f"resolution/{name}", seed, _network(options), source, validation)
+            judged = frames.judge(done, name, options.folder / "resolution" / name / f"seed{seed}")
+            for key, value in _figures(judged).items():
+                figures[name].setdefault(key, []).append(value)
+            curves[name].append(judged.curve(np.array(CURVE)))
+            seconds[name].append(done.provenance["seconds"])
+        rows = {name: {key: summary(v) for key, v in values.items()} for name, values in figures.items()}
+        options.record(
+            {
+                "what": "the frame shrunk to the resolution, windows of 128 full-HD px round each landmark; the shipped "
+                "detector's first two stages, the same for all, place them",
+                "test": frames.what,
+                "finder_pck_0.10": frames.test.scores.pck_0_10,
+                "resolutions": rows,
+                "verdicts": verdicts({name: rows[name]["pck_0.01"] for name in reversed(rows)}),
+                "thresholds": list(CURVE),
+                "curves": {name: np.mean(c, axis=0).tolist() for name, c in curves.items()},
+                "seconds": {name: round(float(np.mean(s))) for name, s in seconds.items()},
+            }
+        )
+
+
+def label_noise(options: Options, sigma_px: float = 1.0) -> None:
+    """Annotations off by 1 px (standard deviation per coordinate) in training, against exact ones; the test is exact."""
+    crops, held_out = (
+        WindowSource.load(options.data, shards=options.shards),
+        WindowSource.load(options.data, validation=True),
+    )
+    frames = _FullHd(options)
+    validation = resolution_windows(held_out, RESOLUTIONS["1080p"]).fixed()
+    figures: dict[str, dict[str, list[float]]] = {"exact": {}, "noisy": {}}
+    for seed in range(options.seeds):
+        for name, folder, source in (
+            ("exact", "resolution/1080p", crops),
+            ("noisy", "label_noise/noisy", _noisy(crops, options, sigma_px)),
+        ):
+            source = resolution_windows(source, RESOLUTIONS["1080p"])
+            done = _trained(options, folder, seed, _network(options), source, validation)
+            judged = frames.judge(done, "1080p", options.folder / folder / f"seed{seed}")
+            for key, value in _figures(judged).items():
+                figures[name].setdefault(key, []).append(value)
+        rows = {name: {key: summary(v) for key, v in values.items()} for name, values in figures.items()}
+        cost = np.array(figures["noisy"]["median_px"]) - np.array(figures["exact"]["median_px"])
+        options.record(
+            {
+                "what": f"the resolution study's 1080p network, labels off by {sigma_px:g} px per coordinate in training",
+                "test": frames.what,
+                "labels": rows,
+                "median_cost_px": summary(cost),
+            }
+        )
+
+
+def _noisy(source: WindowSource, options: Options, sigma_px: float) -> WindowSource:
+    """One click a landmark and frame: the crops of a frame share its errors."""
+    from lib.landmarks.dataset import _load
+
+    (visibility,) = _load(options.data, "training_*.npz", ("visibility",), options.shards)
+    frame, landmark = np.nonzero(visibility)  # the order in which shards keep crops
+    if not np.array_equal(landmark, source.landmark):
+        raise ValueError(f"{options.data}: crops and frames of the shards do not belong together; generate them again.")
+    clicks = np.random.default_rng(99).normal(0, sigma_px, (len(visibility), 3, 2))
+    return replace(source, u=source.u + clicks[frame])
+
+
+def few_labels(options: Options, counts: Sequence[int] = (10, 30, 100, 300, 750)) -> None:
+    """PCK against the number of annotated frames: the tool stage fine-tuned from the shipped weights, and from scratch."""
+    shipped = Detector.load()
+    source = WindowSource.load_tools(options.data, shards=options.shards)
+    held_out = WindowSource.load_tools(options.data, validation=True)
+    validation = held_out.fixed()
+    what, frames = test_frames(options)
+    test = _tool_windows(frames, held_out)
+    network = shipped.tool_network.config
+    initial = Training(shipped.tool_network, [], {"shipped": shipped.metadata.get("commit")})
+    figures: dict[str, dict[str, dict[str, list[float]]]] = {"fine-tuned": {}, "from scratch": {}}
+    none = validate(shipped.tool_network, test, options.config(network, 0))
+    for seed in range(options.seeds):
+        for count in counts:
+            chosen = np.random.default_rng([5, seed]).permutation(len(source))[:count]
+            part = replace(
+                source, **{key: getattr(source, key)[chosen] for key in ("crops", "u", "visibility", "landmark")}
+            )
+            for name in figures:
+                start = initial if name == "fine-tuned" else None
+                rate = 3e-4 if start else 2e-3
+                done = _trained(
+                    options, f"few_labels/{name.replace(' ', '_')}_{count}", seed, network, part, validation, start,
+                    learning_rate=rate, augmentation=AUGMENTATIONS["windows"],
+                )  # fmt: skip
+                scores = validate(done.network, test, options.config(network, seed))
+                row = figures[name].setdefault(str(count), {})
+                for key in ("pck_0.05", "pck_0.10", "median_px"):
+                    row.setdefault(key, []).append(scores[key])
+        options.record(
+            {
+                "what": f"the tool stage ({network.stacks} x {network.features} features), windows at 1/5 of full HD; "
+                "the shipped weights have seen simulated frames of this kind, so they need no label of them",
+                "test": what,
+                "no_label": {key: none[key] for key in ("pck_0.05", "pck_0.10", "median_px")},
+                "frames": {
+                    name: {n: {k: summary(v) for k, v in row.items()} for n, row in rows.items()}
+                    for name, rows in figures.items()
+                },
+            }
+        )
+
+
+def real_frames(options: Options) -> None:
+    """Real sequences: first half to second half, one to the other, and no real frame at all; also few labels."""
+    folder = paths.real_data("retinal_microsurgery")
+    if folder is None:
+        print(paths.missing_data_line("retinal_microsurgery"))
+        return
+    detector = Detector.load()
+    sequences = import_retinal_microsurgery(folder)
+    thresholds = np.round(np.linspace(0.05, 0.5, 10), 3)
+    result: dict[str, dict[str, object]] = {}
+
+    def keep(name: str, e: Evaluation) -> None:
+        curve = e.curve(thresholds)
+        result[name] = {
+            "pck_0.20": float(e.curve(np.array([0.2]))[0]),
+            "median_px": e.scores.median_px,
+            "frames": len(e.names),
+            "curve": curve.tolist(),
+        }
+        options.record({"thresholds": thresholds.tolist(), "results": dict(result), "steps": options.steps})
+
+    for i, sequence in enumerate(sequences):
+        other = sequences[1 - i]
+        keep(f"{sequence.name}: first half to second", real.train_on_sequence(sequence, steps=options.steps, every=1))
+        keep(
+            f"{sequence.name}: trained on its first half, tested on {other.name}",
+            real.train_on_sequence(sequence, steps=options.steps, every=1, test=other),
+        )
+        keep(f"{sequence.name}: simulated frames only", real.simulated_to_real(detector, sequence, every=4))
+
+
+STUDIES: dict[str, Callable[[Options], None]] = {
+    f.__name__: f for f in (resolution, ablation, label_noise, few_labels, real_frames)
+}
+#: Steps of each training unless the command says otherwise: what fits 15 to 40 minutes of one core.
+STEPS = {"resolution": 2000, "ablation": 1500, "label_noise": 2000, "few_labels": 300, "real_frames": 1500}
+
+
+def _plain(value: object) -> object:
+    if isinstance(value, dict):
+        return {k: _plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    if isinstance(value, float | np.floating):
+        return float(f"{float(value):.5g}") if np.isfinite(value) else None
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run one study (or go on with it) and merge its figures into the results file after every seed."""
+    parser = argparse.ArgumentParser(prog="python3 -m lib.landmarks.studies", description=__doc__.split(";")[0])
+    parser.add_argument("study", choices=list(STUDIES))
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--steps", type=int, help=f"of each training (default: {STEPS})")
+    parser.add_argument("--batch", type=int, default=12)
+    parser.add_argument("--features", type=int, default=32)
+    parser.add_argument("--shards", type=int, default=100, help="training shards of 16 frames")
+    parser.add_argument("--threads", type=int, default=1, help="of torch")
+    parser.add_argument("--data", type=Path, default=paths.CACHE / "landmarks")
+    parser.add_argument("--test", type=Path, default=paths.CACHE / "dataset-0")
+    parser.add_argument("--folder", type=Path, default=paths.CACHE / "studies")
+    parser.add_argument("--out", type=Path, default=paths.RESULTS / "detector.json")
+    a = parser.parse_args(argv)
+    torch.set_num_threads(a.threads)
+    steps = a.steps or STEPS[a.study]
+    command = f"python3 -m lib.landmarks.studies {a.study} --threads {a.threads} --seeds {a.seeds} --steps {steps}"
+    start, cpu = time.perf_counter(), time.process_time()
+
+    def record(result: dict) -> None:
+        content = read_results(a.out)  # anew each time: another study may be running
+        content[a.study] = _plain(
+            {
+                "result": result,
+                "budget": options.budget,
+                "command": command,
+                "commit": commit(),
+                "machine": f"{platform.machine()}, {os.cpu_count()} cores, no GPU; one of them used",
+                "date": datetime.date.today().isoformat(),
+                "seconds": time.perf_counter() - start,
+                "cpu_seconds": time.process_time() - cpu,
+            }
+        )
+        a.out.parent.mkdir(parents=True, exist_ok=True)
+        partial = a.out.with_name(a.out.name + f".{a.study}.partial")
+        partial.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+        os.replace(partial, a.out)
+
+    options = Options(a.data, a.test, a.folder, a.seeds, steps, a.batch, a.features, a.shards, record=record)
+    try:
+        STUDIES[a.study](options)
+    except KeyboardInterrupt:
+        print("\nStopped; the same command goes on from the last checkpoint.", file=sys.stderr)
+        return 130
+    except (ValueError, OSError) as error:
+        print(error, file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
