@@ -16,7 +16,14 @@ from numpy.typing import ArrayLike
 from lib.cameras import StereoRig
 from lib.matching.band import SETTINGS, match_band
 from lib.matching.descriptors import as_gray
-from lib.matching.evaluation import DisparityScore, non_occluded, score_against_disparity
+from lib.matching.evaluation import (
+    CONFIDENCES,
+    DisparityScore,
+    detection_auc,
+    non_occluded,
+    score_against_disparity,
+    sparsification,
+)
 from lib.matching.free import ResponseMap, match_free, predicted_bytes, response_maps
 from lib.matching.masks import field_mask, glint_mask, tool_mask
 from lib.matching.opencv import DisparityFunction, match_with
@@ -24,11 +31,13 @@ from lib.matching.rectification import RECTIFIED
 from lib.matching.result import Matches
 
 __all__ = [
+    "CONFIDENCES",
     "RECTIFIED",
     "DisparityFunction",
     "DisparityScore",
     "Matches",
     "ResponseMap",
+    "detection_auc",
     "field_mask",
     "glint_mask",
     "match",
@@ -36,6 +45,7 @@ __all__ = [
     "predicted_bytes",
     "response_maps",
     "score_against_disparity",
+    "sparsification",
     "tool_mask",
 ]
 
@@ -65,6 +75,7 @@ def match(
     downscale: int | None = None,
     budget_bytes: int = 2 << 30,
     max_epipolar_px: float = 6.0,
+    reciprocal: bool = True,
     device: str = "cpu",
 ) -> Matches:
     """Match the two images of a stereo pair.
@@ -78,7 +89,8 @@ def match(
         "band": DeepMatching along the epipolar lines, sub-pixel; needs a rig.
         "sgbm", "dis": OpenCV's, on rectified canvases; without a rig the pair is taken as rectified.
         A callable `f(left, right, (low, high)) -> (disparity, confidence)` of rectified grey uint8 images (h, w),
-        x_right = x_left - disparity, not finite = none: the slot for learned matchers.
+        x_right = x_left - disparity, not finite = none: the slot for learned matchers.  A third array (h, w) bool, where
+        it returns one, is its own check of the way back.
         None is "band" with a rig, else "deepmatching".
     rig:
         Calibrated rig, or `RECTIFIED` for a pair whose rows correspond (depth is then disparity in px).
@@ -100,13 +112,17 @@ def match(
         in tiles of the left image (free DeepMatching), or refused with the figure.
     max_epipolar_px:
         "band" refuses a rig whose epipolar lines lie farther than this from what free coarse matches say.
+    reciprocal:
+        Drop matches whose way back from the right image leads elsewhere (occlusions, above all).  False keeps them;
+        `Matches.reciprocal` says which.
     device:
         torch device of free DeepMatching, such as "cuda".
 
     Returns
     -------
     Matches
-        Possibly none, where there is no texture.
+        Possibly none, where there is no texture.  Of three confidences the score tells wrong matches best; the peak ratio
+        and the reciprocal check mean the same for every method (`detection_auc` measures each).
 
     Raises
     ------
@@ -125,7 +141,9 @@ def match(
     if method is None:
         method = "deepmatching" if rig is None else "band"
     if method == "deepmatching":
-        matches = match_free(images, masks, downscale=downscale, budget_bytes=budget_bytes, device=device)
+        matches = match_free(
+            images, masks, downscale=downscale, budget_bytes=budget_bytes, reciprocal=reciprocal, device=device
+        )
     elif method == "band":
         if rig is None:
             raise ValueError("rig: method 'band' needs a calibrated rig, or RECTIFIED for a rectified pair.")
@@ -137,9 +155,12 @@ def match(
             setting=SETTINGS[setting],
             max_epipolar_px=max_epipolar_px,
             budget_bytes=budget_bytes,
+            reciprocal=reciprocal,
         )
     elif callable(method) or method in ("sgbm", "dis"):
-        matches = match_with(method, images, masks, rig, depth_range_mm=depth_range_mm, setting=SETTINGS[setting])
+        matches = match_with(
+            method, images, masks, rig, depth_range_mm=depth_range_mm, setting=SETTINGS[setting], reciprocal=reciprocal
+        )
     else:
         raise ValueError(f"method: expected 'deepmatching', 'band', 'sgbm', 'dis' or a callable, got {method!r}.")
     inside = np.ones(len(matches), bool)

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from lib.cameras import StereoRig
+from lib.matching.confidence import peak_ratio
 from lib.matching.descriptors import CHANNELS, pixel_descriptors
 from lib.matching.free import MIN_SEEN, patch_quality
 from lib.matching.rectification import Rectification, rectify, warp
@@ -133,18 +134,24 @@ def _descriptors(
         return tuple(pool.map(one, (0, 1)))
 
 
-def _match(left: np.ndarray, right: np.ndarray, low: int, n: int, off_line: int) -> VolumeMatches:
-    """Matches of two grids, without those on flat or mostly ignored patches and those at the end of the range."""
+def _match(
+    left: np.ndarray, right: np.ndarray, low: int, n: int, off_line: int, *, reciprocal: bool = True
+) -> tuple[VolumeMatches, np.ndarray]:
+    """Matches of two grids, without those on flat or mostly ignored patches and those at the end of the range.
+
+    And their peak ratios (n,).
+    """
     with single_threaded_torch():
         volume = correlation_volume(torch.from_numpy(left), torch.from_numpy(right), low, n, off_line)
-        matches = match_volume(volume, low)
+        matches = match_volume(volume, low, reciprocal=reciprocal)
     x, y = matches.patch.T
     start = matches.cell - (low, -off_line) + matches.patch * PATCH
     seen_right = np.mean(
         [right[start[:, 1] + r, start[:, 0] + c, CHANNELS - 1] > 0 for r in range(PATCH) for c in range(PATCH)], axis=0
     )
     kept = patch_quality(left)[y, x] & (seen_right >= MIN_SEEN) & (matches.curvature[:, 0] > 0)
-    return matches.keep(kept)
+    matches = matches.keep(kept)
+    return matches, peak_ratio(volume.numpy(), matches.patch, matches.cell[:, 0] - low)
 
 
 def _supported(matches: VolumeMatches, tolerance: float = 1.5) -> np.ndarray:
@@ -182,7 +189,7 @@ def coarse_view(
     reach = int(np.ceil(COARSE_REACH * rectification.size_px[0] / 2))
     low, n = -reach, 2 * reach + 1
     left, right = _descriptors(images, masks, rectification, setting, low, n)
-    matches = _match(left, right, low, n, COARSE_OFF_LINE)
+    matches, _ = _match(left, right, low, n, COARSE_OFF_LINE)
     chosen = matches.keep(_supported(matches))
     start = chosen.patch * PATCH
     step, _ = refine(left, right, start, start + chosen.cell - (low, -COARSE_OFF_LINE))
@@ -212,6 +219,7 @@ def match_band(
     setting: Setting = SETTINGS["quality"],
     max_epipolar_px: float = 6.0,
     budget_bytes: int = 2 << 30,
+    reciprocal: bool = True,
 ) -> Matches:
     """Matches of a calibrated pair; arguments as in `coarse_view` and `lib.matching.match`.
 
@@ -251,7 +259,7 @@ def match_band(
             f"{budget_bytes / 2**30:.2f} GiB. Narrow depth_range_mm, or take setting='fast'."
         )
     left, right = _descriptors(images, masks, rectification, setting, low, n, off_line_px)
-    found = _match(left, right, low, n, setting.off_line)
+    found, ratio = _match(left, right, low, n, setting.off_line, reciprocal=reciprocal)
 
     # Where the rig says the match lies: on the line, at the best whole cell, and one step from there.
     start = found.patch * PATCH
@@ -267,4 +275,12 @@ def match_band(
     covariance = np.zeros((len(sigma), 4, 4))
     covariance[:, :2, :2] = SIGMA_LEFT_PX**2 * np.eye(2)
     covariance[:, 2:, 2:] = np.einsum("ij,nj,kj->nik", right_from_canvas, deviation**2, right_from_canvas)
-    return Matches(u_left, u_right, 1 / (1 + (sigma[:, 0] / SIGMA_HALF) ** 4), covariance, method="band")
+    return Matches(
+        u_left,
+        u_right,
+        1 / (1 + (sigma[:, 0] / SIGMA_HALF) ** 4),
+        covariance,
+        peak_ratio=ratio,
+        reciprocal=found.reciprocal,
+        method="band",
+    )

@@ -46,11 +46,17 @@ CHUNK_BYTES = 96 << 20
 
 @dataclass(frozen=True)
 class GridMatches:
-    """Matches in cells of the descriptor grids: patch centres in corner coordinates (cell i spans [i, i + 1])."""
+    """Matches in cells of the descriptor grids: patch centres in corner coordinates (cell i spans [i, i + 1]).
+
+    Beside the (n,) score: the response of the atomic patch over the best one elsewhere, and whether no other patch fits
+    the same place better.
+    """
 
     left: np.ndarray
     right: np.ndarray
     score: np.ndarray
+    peak_ratio: np.ndarray
+    reciprocal: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -347,8 +353,8 @@ def top_down(pyramid: Pyramid) -> torch.Tensor:
     return score
 
 
-def _best(pyramid: Pyramid, score: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Per patch its best score (gy, gx) and right corner (gy, gx, 2) (x, y); per right bin its best score."""
+def _best(pyramid: Pyramid, score: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    """Per patch its best score and peak ratio (gy, gx) and right corner (gy, gx, 2) (x, y); per right bin its best score."""
     gy, gx, n_y, n_x = score.shape
     best, flat = score.reshape(gy, gx, -1).max(dim=2)
     offset = pyramid.offset.reshape(gy, gx, -1).gather(2, flat[:, :, None])[:, :, 0].long()
@@ -377,10 +383,35 @@ def _best(pyramid: Pyramid, score: torch.Tensor) -> tuple[torch.Tensor, torch.Te
                         y, x = 1 - int(back_y), 1 - int(back_x)
                         there = bins[y : y + some.shape[0], x : x + some.shape[1]]
                         torch.maximum(there, some, out=there)
-    return best, corner, bins
+    return best, _peak_ratio(pyramid.pooled[0], flat), corner, bins
 
 
-def match_grids(left: torch.Tensor, right: torch.Tensor, tiles: list[tuple[slice, slice]] | None = None) -> GridMatches:
+def _peak_ratio(pooled: torch.Tensor, flat: torch.Tensor) -> torch.Tensor:
+    """Response (gy, gx) around the pooled cells `flat` over the largest one elsewhere, before the power.
+
+    The cells around the peak are blotted out in place and put back, so that no second copy of the maps is needed.
+    """
+    gy, gx, n_y, n_x = pooled.shape
+    y, x = torch.div(flat, n_x, rounding_mode="floor"), flat % n_x
+    step = torch.arange(-1, 2, device=pooled.device)
+    rows = (y[..., None, None] + step[:, None]).clamp(0, n_y - 1)
+    columns = (x[..., None, None] + step).clamp(0, n_x - 1)
+    around = (rows * n_x + columns).reshape(gy, gx, 9)
+    maps = pooled.view(gy, gx, n_y * n_x)
+    saved = maps.gather(2, around)
+    maps.scatter_(2, around, 0.0)
+    rival = maps.amax(dim=2)
+    maps.scatter_(2, around, saved)
+    return (saved.amax(dim=2) / rival) ** (1 / POWER)
+
+
+def match_grids(
+    left: torch.Tensor,
+    right: torch.Tensor,
+    tiles: list[tuple[slice, slice]] | None = None,
+    *,
+    reciprocal: bool = True,
+) -> GridMatches:
     """Reciprocal matches of two descriptor grids.
 
     Parameters
@@ -390,11 +421,13 @@ def match_grids(left: torch.Tensor, right: torch.Tensor, tiles: list[tuple[slice
     tiles:
         Parts of the left grid from `plan_tiles`, None = one piece.  Every tile has its own pyramid, as high as the
         first tile's, so that scores compare.
+    reciprocal:
+        False keeps the matches that fail the reciprocal check too.
     """
     gy, gx = left.shape[0] // PATCH, left.shape[1] // PATCH
     tiles = tiles or [(slice(0, gy * PATCH), slice(0, gx * PATCH))]
     levels = n_levels(*(side // PATCH for side in left[tiles[0]].shape[:2]))
-    best = left.new_full((gy, gx), -torch.inf)
+    best, ratio = left.new_full((2, gy, gx), -torch.inf)
     corner = torch.zeros((gy, gx, 2), dtype=torch.long, device=left.device)
     bins = None
     for rows, columns in tiles:
@@ -403,16 +436,19 @@ def match_grids(left: torch.Tensor, right: torch.Tensor, tiles: list[tuple[slice
         pyramid = bottom_up(part, right, levels=min(levels, n_levels(height, width)))
         score = top_down(pyramid)
         target = (slice(rows.start // PATCH, rows.stop // PATCH), slice(columns.start // PATCH, columns.stop // PATCH))
-        best[target], corner[target], tile_bins = _best(pyramid, score)
+        best[target], ratio[target], corner[target], tile_bins = _best(pyramid, score)
         bins = tile_bins if bins is None else torch.maximum(bins, tile_bins)
         del pyramid, score
     x, y = corner.unbind(dim=2)
     own = bins[torch.div(y, PATCH, rounding_mode="floor") + 1, torch.div(x, PATCH, rounding_mode="floor") + 1]
-    kept = torch.isfinite(best) & (best >= own)
+    passed = best >= own
+    kept = torch.isfinite(best) & passed if reciprocal else torch.isfinite(best)
     grid_y, grid_x = torch.nonzero(kept, as_tuple=True)
     centre = torch.stack([grid_x, grid_y], dim=1) * PATCH + PATCH // 2
     return GridMatches(
         centre.cpu().numpy().astype(np.float64),
         corner[kept].cpu().numpy().astype(np.float64),
         (best[kept] / (levels + 1)).cpu().numpy().astype(np.float64),
+        ratio[kept].cpu().numpy().astype(np.float64),
+        passed[kept].cpu().numpy(),
     )

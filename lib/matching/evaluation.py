@@ -8,10 +8,21 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.ndimage import map_coordinates
+from scipy.stats import rankdata
 
 from lib.matching.result import Matches
 
-__all__ = ["DisparityScore", "non_occluded", "score_against_disparity"]
+__all__ = [
+    "CONFIDENCES",
+    "DisparityScore",
+    "detection_auc",
+    "non_occluded",
+    "score_against_disparity",
+    "sparsification",
+]
+
+#: The confidences of `Matches`, larger is surer.
+CONFIDENCES = ("score", "peak_ratio", "reciprocal")
 
 
 @dataclass(frozen=True)
@@ -118,3 +129,44 @@ def score_against_disparity(
         error,
         u_left,
     )
+
+
+def detection_auc(confidence: ArrayLike, wrong: ArrayLike) -> float:
+    """Probability that a wrong match has the lower confidence of a wrong and a right one, ties counting half.
+
+    The area under the ROC curve of the confidence as a detector of wrong matches: 1 tells all, 0.5 tells nothing.
+
+    Parameters
+    ----------
+    confidence:
+        (n,), larger is surer; NaN (not told) is taken as the least sure.
+    wrong:
+        (n,) bool.  NaN is returned where all or none are wrong.
+    """
+    confidence, wrong = _confidence(confidence), np.asarray(wrong, dtype=bool)
+    n_wrong, n_right = int(wrong.sum()), int((~wrong).sum())
+    if not n_wrong or not n_right:
+        return float("nan")
+    ranks = rankdata(confidence)
+    return float(1 - (ranks[wrong].sum() - n_wrong * (n_wrong + 1) / 2) / (n_wrong * n_right))
+
+
+def sparsification(confidence: ArrayLike, wrong: ArrayLike, kept: ArrayLike) -> np.ndarray:
+    """Share of wrong matches among the surest `kept` (k,) in (0, 1] of all; among equals, their mean.
+
+    Parameters
+    ----------
+    confidence, wrong:
+        (n,) as for `detection_auc`, n > 0.
+    """
+    confidence, wrong = _confidence(confidence), np.asarray(wrong, dtype=float)
+    _, level, count = np.unique(confidence, return_inverse=True, return_counts=True)
+    smooth = (np.bincount(level, wrong) / count)[level]
+    sorted_wrong = smooth[np.argsort(-confidence, kind="stable")]
+    n = np.clip(np.ceil(np.asarray(kept) * len(wrong)).astype(np.intp), 1, len(wrong))
+    return np.cumsum(sorted_wrong)[n - 1] / n
+
+
+def _confidence(confidence: ArrayLike) -> np.ndarray:
+    confidence = np.asarray(confidence, dtype=np.float64)
+    return np.where(np.isnan(confidence), -np.inf, confidence)

@@ -43,6 +43,7 @@ def match_free(
     *,
     downscale: int | None = None,
     budget_bytes: int = 2 << 30,
+    reciprocal: bool = True,
     device: str = "cpu",
 ) -> Matches:
     """DeepMatching without any calibration; arguments as in `lib.matching.match`, images (h, w) float32 grey."""
@@ -61,7 +62,8 @@ def match_free(
         pixel_descriptors(image, downscale, valid=None if mask is None else ~mask)
         for image, mask in zip(images, masks, strict=True)
     )
-    found = deepmatching.match_grids(torch.from_numpy(left).to(device), torch.from_numpy(right).to(device), tiles)
+    grids = (torch.from_numpy(grid).to(device) for grid in (left, right))
+    found = deepmatching.match_grids(*grids, tiles, reciprocal=reciprocal)
     patch = (found.left // PATCH).astype(np.intp)
     target = np.clip(np.rint(found.right).astype(np.intp), 0, np.array(right.shape[1::-1]) - 1)
     kept = patch_quality(left)[patch[:, 1], patch[:, 0]] & (right[target[:, 1], target[:, 0], CHANNELS - 1] > 0)
@@ -70,7 +72,15 @@ def match_free(
     # Positions are multiples of the stride: a uniform error, beside what the descriptor itself cannot tell.
     variance = stride**2 / 12 + 0.25 * stride**2 / 4
     covariance = np.tile(np.diag([0.05**2, 0.05**2, variance, variance]), (len(u_left), 1, 1))
-    return Matches(u_left, u_right, np.clip(found.score[kept], 0, 1), covariance, method="deepmatching")
+    return Matches(
+        u_left,
+        u_right,
+        np.clip(found.score[kept], 0, 1),
+        covariance,
+        peak_ratio=found.peak_ratio[kept],
+        reciprocal=found.reciprocal[kept],
+        method="deepmatching",
+    )
 
 
 @dataclass(frozen=True, eq=False)

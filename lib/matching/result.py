@@ -22,6 +22,12 @@ class Matches:
     covariance_px2:
         (n, 4, 4) covariance of (u_left, u_right).  A match says where in the right image lies what is seen at
         `u_left`, so nearly all of the noise stands in the right block.
+    peak_ratio:
+        (n,) response of the descriptors at the match over the best response elsewhere among the places searched; at 1
+        and below another place fits as well.  Infinite where nothing else responds, NaN where there was no other place.
+    reciprocal:
+        (n,) bool, whether the way back from the right image leads to the same left patch (DeepMatching, band), or to
+        within a pixel (SGBM, DIS).  `match` drops the others unless told otherwise.
     epipolar_px:
         Median over the matches of the absolute distance from the rig's epipolar constraint (as in
         `StereoRig.epipolar_distance`); NaN without a rig or matches.
@@ -33,8 +39,16 @@ class Matches:
     u_right: np.ndarray
     score: np.ndarray
     covariance_px2: np.ndarray
+    peak_ratio: np.ndarray = field(default=None, kw_only=True)
+    reciprocal: np.ndarray = field(default=None, kw_only=True)
     epipolar_px: float = field(default=float("nan"), kw_only=True)
     method: str = field(default="", kw_only=True)
+
+    def __post_init__(self) -> None:
+        if self.peak_ratio is None:
+            object.__setattr__(self, "peak_ratio", np.full(len(self.u_left), np.nan))
+        if self.reciprocal is None:
+            object.__setattr__(self, "reciprocal", np.ones(len(self.u_left), dtype=bool))
 
     def __len__(self) -> int:
         return len(self.u_left)
@@ -46,6 +60,8 @@ class Matches:
             self.u_right[chosen],
             self.score[chosen],
             self.covariance_px2[chosen],
+            peak_ratio=self.peak_ratio[chosen],
+            reciprocal=self.reciprocal[chosen],
             epipolar_px=self.epipolar_px,
             method=self.method,
         )

@@ -45,6 +45,8 @@ class VolumeMatches:
         (n, 2) minus the second difference of the response along x and y per cell^2; 0 where it has no interior peak.
     score:
         (n,) sum of the responses over the pyramid, divided by the number of levels.
+    reciprocal:
+        (n,) bool, whether no other patch fits the same place of the right image better.
     """
 
     patch: np.ndarray
@@ -53,6 +55,7 @@ class VolumeMatches:
     response: np.ndarray
     curvature: np.ndarray
     score: np.ndarray
+    reciprocal: np.ndarray
 
     def keep(self, chosen: np.ndarray) -> VolumeMatches:
         """The matches of a mask (n,) or of indices."""
@@ -241,7 +244,7 @@ def _parabola(volume: torch.Tensor, i: tuple[torch.Tensor, ...], axis: int) -> t
     return vertex, torch.where(interior, curvature, 0.0)
 
 
-def match_volume(volume: torch.Tensor, low: int) -> VolumeMatches:
+def match_volume(volume: torch.Tensor, low: int, *, reciprocal: bool = True) -> VolumeMatches:
     """DeepMatching on a volume of correlations: bottom-up, top-down, reciprocal check, sub-cell peak.
 
     Parameters
@@ -250,6 +253,8 @@ def match_volume(volume: torch.Tensor, low: int) -> VolumeMatches:
         (gy, gx, 2 v + 1, n) from `correlation_volume`.
     low:
         Its first displacement along x, cells.
+    reciprocal:
+        False keeps the matches that fail the reciprocal check too.
     """
     gy, gx = volume.shape[:2]
     responses, pools, gains = [volume], [], []
@@ -273,13 +278,13 @@ def match_volume(volume: torch.Tensor, low: int) -> VolumeMatches:
         """Scores of some lattice rows: at the bottom they are needed only once, so never all at a time."""
         return _unpool(volume[rows], *(pool[rows] for pool in pools[0]), score[rows]) if pools else score[rows]
 
-    return _reciprocal(volume, bottom, low, len(pools) + 1)
+    return _reciprocal(volume, bottom, low, len(pools) + 1, reciprocal)
 
 
 def _reciprocal(
-    volume: torch.Tensor, scores_of: Callable[[slice], torch.Tensor], low: int, levels: int
+    volume: torch.Tensor, scores_of: Callable[[slice], torch.Tensor], low: int, levels: int, only: bool
 ) -> VolumeMatches:
-    """Best displacement of each patch, kept if it is also the best of its bin in the right grid."""
+    """Best displacement of each patch; `only` if it is also the best of its bin in the right grid."""
     gy, gx, rows, n = volume.shape
     v = rows // 2
     # The centre of a patch lies at cell 4 g + 2; its displaced copy falls into the bin (4 g + 2 + d) // 4, so
@@ -305,7 +310,8 @@ def _reciprocal(
     )
     own_y = grid_y + torch.div(j - v + 2, PATCH, rounding_mode="floor") - span_y[0]
     own_x = grid_x + torch.div(k + low + 2, PATCH, rounding_mode="floor") - span_x[0]
-    kept = torch.isfinite(best) & (best >= bins[own_y, own_x])
+    reciprocal = best >= bins[own_y, own_x]
+    kept = torch.isfinite(best) & reciprocal if only else torch.isfinite(best)
 
     y, x, j, k = grid_y[kept], grid_x[kept], j[kept], k[kept]
     vertex_x, curvature_x = _parabola(volume, (y, x, j, k), 3)
@@ -318,4 +324,5 @@ def _reciprocal(
         response=volume[y, x, j, k].cpu().numpy(),
         curvature=torch.stack([curvature_x, curvature_y], dim=1).cpu().numpy(),
         score=(best[kept] / levels).cpu().numpy(),
+        reciprocal=reciprocal[kept].cpu().numpy(),
     )

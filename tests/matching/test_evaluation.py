@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lib.matching import Matches, non_occluded, score_against_disparity
+from lib.matching import Matches, detection_auc, non_occluded, score_against_disparity, sparsification
 
 
 def matches_of(u_left: np.ndarray, disparity: np.ndarray) -> Matches:
@@ -62,3 +62,16 @@ def test_nothing_to_score():
     with pytest.raises(ValueError, match="disparity_px: expected"):
         non = np.zeros(5)
         score_against_disparity(matches_of(np.zeros((0, 2)), np.zeros(0)), non)
+
+
+def test_detection_of_wrong_matches_by_confidence():
+    wrong = np.array([True, False, True, False, False])
+    assert detection_auc([0.1, 0.9, 0.2, 0.8, 0.3], wrong) == 1
+    assert detection_auc([0.9, 0.1, 0.8, 0.2, 0.3], wrong) == 0
+    assert detection_auc(np.ones(5), wrong) == 0.5
+    assert detection_auc([0.5, 0.9, np.nan, 0.5, 0.5], wrong) == pytest.approx((3 + 2) / 6)
+    assert np.isnan(detection_auc([0.1, 0.2], [False, False]))
+    kept = np.array([0.2, 0.6, 1.0])
+    assert np.allclose(sparsification([0.1, 0.9, 0.2, 0.8, 0.3], wrong, kept), (0, 0, 0.4))
+    assert np.allclose(sparsification(np.ones(5), wrong, kept), 0.4)
+    assert np.allclose(sparsification([True, True, False, True, True], wrong, kept), (0.25, 0.25, 0.4))

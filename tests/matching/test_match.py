@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
 from lib.cameras import AffineCamera, StereoRig
 from lib.geometry import RigidTransform
-from lib.matching import RECTIFIED, Matches, glint_mask, match
+from lib.matching import RECTIFIED, Matches, detection_auc, glint_mask, match
 from lib.simulator.rig import reference_rig
 
 
@@ -120,8 +121,52 @@ def test_a_callable_is_a_matcher(textured):
     assert np.allclose(matches.u_left - matches.u_right, (12, 0))
     assert np.allclose(matches.score, 0.7)
     assert matches.method == "block_matcher"
+    assert matches.reciprocal.all()  # it tells no way back
+    assert np.median(matches.peak_ratio) > 1.03
+
+    def checking(left, right, range_px):
+        passed = np.ones(left.shape, bool)
+        passed[:64] = False
+        return *block_matcher(left, right, range_px), passed
+
+    lower = match(textured, shifted(textured, 12), method=checking, rig=RECTIFIED)
+    assert (lower.u_left[:, 1] > 63).all() and 0 < len(lower) < len(matches)
+    every = match(textured, shifted(textured, 12), method=checking, rig=RECTIFIED, reciprocal=False)
+    assert len(every) == len(matches) and np.array_equal(every.reciprocal, every.u_left[:, 1] > 63)
     with pytest.raises(ValueError, match=r"method: .* shape"):
         match(textured, textured, method=lambda left, right, range_px: (left[:5], left), rig=RECTIFIED)
+
+
+@pytest.mark.parametrize("method", ["band", "deepmatching", "sgbm", "dis"])
+def test_a_repeated_pattern_has_a_peak_ratio_of_one(textured, method):
+    """Tiles repeat every 32 px: a match 32 px off fits as well, and only the peak ratio can tell."""
+    repeated = np.tile(textured[:, :32], (1, 5))
+    options = {"method": method, "rig": RECTIFIED, "min_score": 0}
+    unique = match(textured, shifted(textured, 4), **options)
+    ambiguous = match(repeated, shifted(repeated, 4), depth_range_mm=(-60, 60), **options)
+    assert len(unique) > 100 and len(ambiguous) > 50
+    assert np.median(unique.peak_ratio) > 1.03
+    assert np.median(ambiguous.peak_ratio) == pytest.approx(1.0, abs=0.012)
+    assert np.mean(ambiguous.peak_ratio < 1.02) > 0.8 and np.mean(unique.peak_ratio < 1.02) < 0.3
+
+
+@pytest.mark.parametrize("method", ["band", "deepmatching", "sgbm", "dis"])
+def test_hidden_surfaces_have_no_way_back(method):
+    """A near strip hides what lies left of it from the right camera: matches there fail the reciprocal check."""
+    rng = np.random.default_rng(8)
+    wall, strip = (cv2.GaussianBlur(rng.standard_normal((192, 256)).astype(np.float32), (0, 0), 1.5) for _ in range(2))
+    wall, strip = (np.clip(128 + 40 * noise / noise.std(), 0, 255).astype(np.uint8) for noise in (wall, strip))
+    left, right = wall.copy(), shifted(wall, 8)
+    left[:, 128:192], right[:, 88:152] = strip[:, :64], strip[:, :64]  # disparity 40
+    options = {"method": method, "rig": RECTIFIED, "min_score": 0, "depth_range_mm": (0, 60)}
+    every = match(left, right, reciprocal=False, **options)
+    hidden = (every.u_left[:, 0] > 100) & (every.u_left[:, 0] < 124)
+    seen = (every.u_left[:, 0] > 196) | ((every.u_left[:, 0] > 20) & (every.u_left[:, 0] < 84))
+    assert hidden.sum() > 10
+    assert every.reciprocal[hidden].mean() < 0.5 < 0.75 < every.reciprocal[seen].mean()
+    only = match(left, right, **options)
+    assert only.reciprocal.all() and len(only) <= every.reciprocal.sum() + 2
+    assert detection_auc(every.reciprocal[hidden | seen], hidden[hidden | seen]) > 0.7
 
 
 @pytest.mark.parametrize("method", ["band", "deepmatching", "sgbm", "dis"])

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from lib.matching.confidence import peak_ratio
 from lib.matching.refine import refine
 from lib.matching.volume import correlation_volume, match_volume
 
@@ -87,3 +88,27 @@ def test_refinement_ignores_gain_and_works_at_the_border():
     corners = np.array([[0, 0], [16, 0], [0, 12], [16, 12]])
     step, _ = refine(grid, 0.5 * grid, corners, corners, margin=1)
     assert np.abs(step).max() < 1e-5
+
+
+def test_peak_ratio_compares_the_match_with_the_best_place_elsewhere():
+    volume = np.zeros((2, 3, 3, 8), np.float32)
+    volume[1, 2, 1, [2, 3, 6]] = 0.8, 0.9, 0.6
+    volume[0, 0, 0, 0], volume[0, 0, 2, 2] = 0.4, 0.8  # what is elsewhere may lie off the line
+    volume[0, 1, 1, 7] = 0.5  # nothing else responds
+    ratio = peak_ratio(volume, np.array([[2, 1], [2, 1], [0, 0], [1, 0]]), np.array([3, 6, 0, 7]))
+    assert ratio == pytest.approx([1.5, 2 / 3, 0.5, np.inf], rel=1e-6)
+    assert np.isnan(peak_ratio(volume[..., :3], np.array([[2, 1]]), np.array([1]))).all()
+    assert peak_ratio(volume, np.zeros((0, 2), int), np.zeros(0, int)).shape == (0,)
+
+
+def test_only_the_best_of_two_patches_on_one_place_is_reciprocal():
+    rng = np.random.default_rng(3)
+    left, right = rng.random((4, 16, 9)).astype(np.float32), rng.random((4, 20, 9)).astype(np.float32)
+    left[:, 4:8] = 0.9 * left[:, :4] + 0.1 * left[:, 4:8]  # a worse copy of the first patch
+    right[:, 4:8], right[:, 12:20] = left[:, :4], left[:, 8:]
+    volume = correlation_volume(torch.from_numpy(left), torch.from_numpy(right), 0, 5, 0)
+    every = match_volume(volume, 0, reciprocal=False)
+    assert every.patch[:, 0].tolist() == [0, 1, 2, 3] and every.cell[:, 0].tolist() == [4, 0, 4, 4]
+    assert every.reciprocal.tolist() == [True, False, True, True]
+    only = match_volume(volume, 0)
+    assert only.reciprocal.all() and only.patch[:, 0].tolist() == [0, 2, 3]
