@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
+import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
@@ -11,9 +13,10 @@ from typing import TypeVar
 import cv2
 import torch
 
-__all__ = ["in_processes", "single_threaded_torch"]
+__all__ = ["in_processes", "single_threaded_torch", "step"]
 
 _T = TypeVar("_T")
+_steps = None  # in a worker: the queue to the process that waits
 
 
 @contextmanager
@@ -27,25 +30,66 @@ def single_threaded_torch() -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
-def in_processes(function: Callable[..., _T], arguments: Iterable[tuple], workers: int | None = None) -> Iterator[_T]:
+def in_processes(
+    function: Callable[..., _T],
+    arguments: Iterable[tuple],
+    workers: int | None = None,
+    *,
+    on_step: Callable[[], object] | None = None,
+) -> Iterator[_T]:
     """Results of ``function(*arguments[i])`` in the order in which they come, `workers` at a time (default: one a core).
 
-    An error, or Ctrl-C, drops what has not begun and passes on.  `function` must be importable, not a closure.
+    An error, or Ctrl-C, drops what has not begun and passes on; workers whose parent is killed end too.  `function`
+    must be importable, not a closure.
+
+    Parameters
+    ----------
+    on_step:
+        Called here, in a thread of its own, whenever a worker calls `step`: progress within a job.
     """
     jobs_arguments = list(arguments)
     if not jobs_arguments:
         return
-    with ProcessPoolExecutor(min(workers or os.cpu_count() or 1, len(jobs_arguments)), initializer=_alone) as pool:
-        jobs = [pool.submit(function, *a) for a in jobs_arguments]
-        try:
-            for job in as_completed(jobs):
-                yield job.result()
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+    steps = multiprocessing.SimpleQueue()
+    listener = threading.Thread(target=_listen, args=(steps, on_step), daemon=True)
+    listener.start()
+    workers = min(workers or os.cpu_count() or 1, len(jobs_arguments))
+    try:
+        with ProcessPoolExecutor(workers, initializer=_begin, initargs=(steps,)) as pool:
+            jobs = [pool.submit(function, *a) for a in jobs_arguments]
+            try:
+                for job in as_completed(jobs):
+                    yield job.result()
+            except BaseException:
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise
+    finally:
+        steps.put(False)
+        listener.join()
 
 
-def _alone() -> None:
+def step() -> None:
+    """In a worker of `in_processes`: a part of the job is done."""
+    if _steps is not None:
+        _steps.put(True)
+
+
+def _listen(steps: multiprocessing.SimpleQueue, on_step: Callable[[], object] | None) -> None:
+    while steps.get():
+        if on_step is not None:
+            on_step()
+
+
+def _begin(steps: multiprocessing.SimpleQueue) -> None:
     """A worker keeps to one core: the others have theirs."""
+    global _steps
+    _steps = steps
     cv2.setNumThreads(1)
     torch.set_num_threads(1)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """A killed parent cannot stop its workers: they would write beside those of the next run, or wait for ever."""
+    multiprocessing.parent_process().join()
+    os._exit(1)

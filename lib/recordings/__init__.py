@@ -8,7 +8,8 @@ A recording is a folder of plain files that a lab can write from any program::
       left/ right/       000000.jpg (or .png) ..., or left.mp4 and right.mp4
       kinematics.csv     time_s, base_x_mm, base_y_mm, base_z_mm, tip_1_x_mm, ...: robot clock, robot frame
       annotations.json   optional, COCO keypoints of both cameras
-      truth/             simulated recordings only: rig.json, landmarks.csv, surface.npz
+      truth/             simulated recordings only: rig.json (cameras), surface.npz, and landmarks.csv (3D, pixels,
+                         visibility and, in newer ones, in_glint: saturated light on or right beside a landmark)
 
 Two clocks: t_robot = t_video + offset_s.  A frame's time is the instant its middle row is read; with a rolling shutter
 row y is read readout_s * (y / (height - 1) - 1/2) later.

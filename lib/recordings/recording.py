@@ -19,7 +19,16 @@ from lib.recordings.annotations import Annotations, read_coco
 from lib.recordings.frames import Frames, open_side
 from lib.recordings.tables import LANDMARKS, columns, read_table
 
-__all__ = ["FORMAT", "KINEMATICS_COLUMNS", "TRUTH_COLUMNS", "UNITS", "Kinematics", "Recording", "Truth"]
+__all__ = [
+    "FORMAT",
+    "GLINT_COLUMNS",
+    "KINEMATICS_COLUMNS",
+    "TRUTH_COLUMNS",
+    "UNITS",
+    "Kinematics",
+    "Recording",
+    "Truth",
+]
 
 FORMAT = "microstereo.recording"
 UNITS = {"length": "mm", "image": "px", "time": "s"}
@@ -29,6 +38,8 @@ TRUTH_COLUMNS = [
     *columns(["x_mm", "y_mm", "z_mm"]),
     *columns(["left_x_px", "left_y_px", "left_visibility", "right_x_px", "right_y_px", "right_visibility"]),
 ]
+#: Optional, after `TRUTH_COLUMNS`.
+GLINT_COLUMNS = columns(["left_in_glint", "right_in_glint"])
 # A forceps jaw or shaft in mm; metres and micrometres fall far outside.
 _PLAUSIBLE_TOOL_MM = (0.1, 100.0)
 _REQUIRED = {"name": str, "fps": float, "image_size_px": list}
@@ -99,6 +110,9 @@ class Truth:
         (n, 3) int: 0 outside the image, 1 hidden, 2 visible.
     folder:
         truth/, for what else a simulator leaves there.
+    in_glint_left, in_glint_right:
+        (n, 3) bool, whether saturated light lies on the landmark or right beside it; None where a recording does not
+        say.
     """
 
     rig: StereoRig
@@ -108,6 +122,8 @@ class Truth:
     visibility_left: np.ndarray
     visibility_right: np.ndarray
     folder: Path
+    in_glint_left: np.ndarray | None = None
+    in_glint_right: np.ndarray | None = None
 
     @cached_property
     def _surface(self) -> RegularGridInterpolator:
@@ -325,11 +341,16 @@ def _read_kinematics(path: Path) -> Kinematics:
 
 def _read_truth(folder: Path, n: int) -> Truth:
     path = folder / "landmarks.csv"
-    table = read_table(path, TRUTH_COLUMNS)
+    table = read_table(path, TRUTH_COLUMNS, optional=GLINT_COLUMNS)
     if len(table) != n or not np.array_equal(table[:, 0], np.arange(n)):
         raise ValueError(f"{path}: expected one row for each of the {n} frames, got {len(table)}.")
     x = table[:, 1:10].reshape(n, 3, 3)
-    image = table[:, 10:].reshape(n, 3, 2, 3)
+    image = table[:, 10:28].reshape(n, 3, 2, 3)
     u, visibility = image[..., :2], np.nan_to_num(image[..., 2]).astype(np.int64)
     rig = StereoRig.load(folder / "rig.json")
-    return Truth(rig, x, u[:, :, 0], u[:, :, 1], visibility[:, :, 0], visibility[:, :, 1], folder)
+    glints = table[:, 28:].reshape(n, 3, 2)
+    known = not np.isnan(glints).all()
+    if known and not np.isin(glints, (0, 1)).all():
+        raise ValueError(f"{path}: in_glint is 0 or 1 for every landmark.")
+    in_glint = [glints[:, :, side] == 1 if known else None for side in (0, 1)]
+    return Truth(rig, x, u[:, :, 0], u[:, :, 1], visibility[:, :, 0], visibility[:, :, 1], folder, *in_glint)

@@ -21,8 +21,10 @@ def columns(axes: Sequence[str]) -> list[str]:
     return [f"{landmark}_{axis}" for landmark in LANDMARKS for axis in axes]
 
 
-def read_table(path: Path, names: Sequence[str]) -> np.ndarray:
-    """The columns `names` of a CSV file as (rows, columns) float64; an empty cell is NaN.
+def read_table(path: Path, names: Sequence[str], optional: Sequence[str] = ()) -> np.ndarray:
+    """The columns `names`, then `optional`, of a CSV file as (rows, columns) float64; an empty cell is NaN.
+
+    A file has all of the optional columns or none; then they are NaN.
 
     Raises
     ------
@@ -37,24 +39,27 @@ def read_table(path: Path, names: Sequence[str]) -> np.ndarray:
     with path.open(encoding="utf-8-sig", newline="") as stream:
         reader = csv.reader(stream)
         header = [cell.strip() for cell in next(reader, [])]
-        if header != list(names):
-            missing = [name for name in names if name not in header]
-            unknown = [name for name in header if name not in names]
+        wanted = [*names, *optional] if set(header) & set(optional) else list(names)
+        if header != wanted:
+            missing = [name for name in wanted if name not in header]
+            unknown = [name for name in header if name not in wanted]
             detail = "; ".join(
                 f"{what}: {', '.join(which)}" for what, which in (("missing", missing), ("unknown", unknown)) if which
             )
             raise ValueError(
-                f"{path}, line 1: wrong columns ({detail or 'order or repetition'}). Expected: {','.join(names)}."
+                f"{path}, line 1: wrong columns ({detail or 'order or repetition'}). Expected: {','.join(wanted)}."
             )
         rows = []
         for row in reader:
             line = reader.line_num
             if not row:
                 continue
-            if len(row) != len(names):
-                raise ValueError(f"{path}, line {line}: {len(row)} cells where the header has {len(names)}.")
-            rows.append([_number(cell, path, line, name) for cell, name in zip(row, names, strict=True)])
-    return np.array(rows, dtype=np.float64).reshape(len(rows), len(names))
+            if len(row) != len(wanted):
+                raise ValueError(f"{path}, line {line}: {len(row)} cells where the header has {len(wanted)}.")
+            rows.append([_number(cell, path, line, name) for cell, name in zip(row, wanted, strict=True)])
+    table = np.full((len(rows), len(names) + len(optional)), np.nan)
+    table[:, : len(wanted)] = np.array(rows, dtype=np.float64).reshape(len(rows), len(wanted))
+    return table
 
 
 def _number(cell: str, path: Path, line: int, name: str) -> float:

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from lib.cameras import StereoRig
 from lib.recordings.annotations import Annotations, write_coco
-from lib.recordings.recording import FORMAT, KINEMATICS_COLUMNS, TRUTH_COLUMNS, UNITS, Recording
+from lib.recordings.recording import FORMAT, GLINT_COLUMNS, KINEMATICS_COLUMNS, TRUTH_COLUMNS, UNITS, Recording
 from lib.recordings.tables import LANDMARKS, write_table, write_text
 
 __all__ = ["RecordingWriter"]
@@ -159,6 +159,7 @@ class RecordingWriter:
         visibility_left: ArrayLike,
         visibility_right: ArrayLike,
         surface: tuple[ArrayLike, ArrayLike, ArrayLike] | None = None,
+        in_glint: tuple[ArrayLike, ArrayLike] | None = None,
     ) -> None:
         """What the simulator knows; shapes as in `Truth`.
 
@@ -166,6 +167,8 @@ class RecordingWriter:
         ----------
         surface:
             (x_px (a,), y_px (b,), x_mm (b, a, 3)): surface points seen on a grid of left pixels.
+        in_glint:
+            (left, right), (n, 3) bool each: whether saturated light lies on the landmark or right beside it.
         """
         rig.save(self.truth_folder / "rig.json")
         x = np.asarray(landmarks_mm, dtype=np.float64)
@@ -174,7 +177,12 @@ class RecordingWriter:
         for side, (u, visibility) in enumerate(((u_left, visibility_left), (u_right, visibility_right))):
             image[:, :, side, :2], image[:, :, side, 2] = u, visibility
         table = np.column_stack([np.arange(n), x.reshape(n, 9), image.reshape(n, 18)])
-        write_table(self.truth_folder / "landmarks.csv", TRUTH_COLUMNS, table, [0] + [7] * 9 + [5, 5, 0] * 6)
+        names, decimals = TRUTH_COLUMNS, [0] + [7] * 9 + [5, 5, 0] * 6
+        if in_glint is not None:
+            glints = np.stack([np.asarray(side, dtype=bool) for side in in_glint], axis=-1)
+            table = np.column_stack([table, glints.reshape(n, 6)])
+            names, decimals = [*names, *GLINT_COLUMNS], decimals + [0] * 6
+        write_table(self.truth_folder / "landmarks.csv", names, table, decimals)
         if surface is not None:
             x_px, y_px, x_mm = (np.asarray(values) for values in surface)
             np.savez_compressed(self.truth_folder / "surface.npz", x_px=x_px, y_px=y_px, x_mm=x_mm.astype(np.float32))

@@ -2,36 +2,66 @@
 
 python3 -m lib simulate                    # data/cache/dataset-0, resumes where it stopped
 python3 -m lib simulate --dry-run          # says how long and how many GB
+python3 -m lib simulate --record           # also writes what was made, and its cost, to data/results/dataset.json
 python3 -m lib simulate --shipped          # remakes data/open_sky_eye
 """
 
 from __future__ import annotations
 
 import argparse
+import cProfile
+import csv
+import datetime
 import json
 import os
+import pstats
+import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from tqdm.auto import tqdm
 
 from lib import paths
-from lib.parallel import in_processes
-from lib.recordings import Recording
+from lib.parallel import in_processes, step
+from lib.recordings import LANDMARKS, Recording
 from lib.simulator.eye import Eye
+from lib.simulator.forceps import Forceps
 from lib.simulator.microscope import Microscope
 from lib.simulator.recording import simulate
-from lib.simulator.render import render_pair
 from lib.simulator.training import RESERVED_SEEDS, random_forceps, reserved_forceps
+from lib.workbench.collection import commit, machine
 
-__all__ = ["TEST_SEQUENCES", "TRAIN_SEQUENCES", "main", "make_dataset", "make_shipped_recording", "sequence_name"]
+__all__ = [
+    "TEST_SEQUENCES",
+    "TRAIN_SEQUENCES",
+    "SequenceDesign",
+    "landmark_counts",
+    "main",
+    "make_dataset",
+    "make_shipped_recording",
+    "seconds_by_stage",
+    "sequence_design",
+    "sequence_name",
+]
 
 TRAIN_SEQUENCES = range(0, 7)
 TEST_SEQUENCES = range(7, 10)
 _SHIPPED_SEED = 27
 _MB_PER_PAIR = 0.62
+_LOG_COLUMNS = ("sequence", "finished", "wall_s", "cpu_s")
+#: Stage of the making of a pair -> the functions (Python's, numpy's, OpenCV's) whose own time belongs to it.
+_STAGES = {
+    "surface under every pixel": ("_intersect", "_ray_points", "height", "full", "surface_grid"),
+    "texture, light, glints": ("render_view", "remap", "LUT", "exp", "_shadow", "line"),
+    "tool": ("rasterise", "_tool_layer", "_metal", "_to_camera", "_visibility", "total", "bincount", "_compose"),
+    "defocus and motion blur": ("_blur", "_blur_by_depth", "GaussianBlur", "filter2D", "copyMakeBorder", "blur"),
+    "sensor noise and gamma": ("_develop", "standard_normal", "pow", "convertScaleAbs"),
+    "JPEG and files": ("imencode", "cvtColor", "tofile", "add"),
+}
+_THE_REST = "motion, kinematics, the rest"
 
 
 def sequence_name(index: int) -> str:
@@ -53,11 +83,17 @@ def make_shipped_recording(folder: Path = paths.SHIPPED_RECORDING) -> Recording:
     )
 
 
-def _make_sequence(folder: Path, seed: int, index: int, n_pairs: int) -> str:
-    """One sequence, unless it is there already; runs in its own process."""
-    target = folder / sequence_name(index)
-    if target.exists():
-        return target.name
+class SequenceDesign(NamedTuple):
+    """What a sequence of the data set shows, and through what: all but its movement."""
+
+    eye: Eye
+    forceps: Forceps
+    microscope: Microscope
+    offset_s: float
+
+
+def sequence_design(seed: int, index: int, *, shrink: int = 1) -> SequenceDesign:
+    """Eye, tool and microscope of sequence `index` of the data set of this seed."""
     rng = np.random.default_rng([seed, 211, index])
     # Test sequences have eyes and tools that the training sampler never draws either.
     if index in TEST_SEQUENCES:
@@ -72,45 +108,66 @@ def _make_sequence(folder: Path, seed: int, index: int, n_pairs: int) -> str:
         fold_mm=float(rng.uniform(0.05, 0.15)),
         tilt_rad=float(rng.uniform(0.02, 0.06)),
         gloss=float(rng.uniform(0.6, 1.2)),
+        texture_px=max(Eye.texture_px // shrink, 64),
     )
     gain = tuple(tuple(float(g) for g in np.exp(rng.normal(0, 0.06, 3))) for _ in range(2))
     microscope = Microscope(
-        pixels_per_mm=tuple(float(v) for v in rng.uniform(95, 105, 2)),
+        image_size_px=tuple(side // shrink for side in Microscope.image_size_px),
+        pixels_per_mm=tuple(float(v) / shrink for v in rng.uniform(95, 105, 2)),
         image_rotation_rad=tuple(float(v) for v in rng.normal(0, 0.03, 2)),
         light_slope=tuple(float(v) for v in rng.uniform(-0.5, 0.5, 2)),
         spot_mm=tuple(float(v) for v in rng.normal(0, 1.2, 2)),
         brightness=float(rng.uniform(0.8, 1.15)),
         gain=gain,
     )
+    return SequenceDesign(eye, forceps, microscope, float(np.round(rng.uniform(-0.05, 0.05), 4)))
+
+
+def _make_sequence(
+    folder: Path, seed: int, index: int, n_pairs: int, duration_s: float, shrink: int
+) -> tuple[str, float, float]:
+    """One sequence in a process of its own: its name, and the wall and CPU seconds that it took."""
+    wall, cpu = time.perf_counter(), time.process_time()
+    target = folder / sequence_name(index)
+    design = sequence_design(seed, index, shrink=shrink)
     simulate(
         target,
         seed=1000 * seed + index,
         n_frames=n_pairs,
         motion="both",
-        eye=eye,
-        forceps=forceps,
-        microscope=microscope,
-        duration_s=60.0,
-        offset_s=float(np.round(rng.uniform(-0.05, 0.05), 4)),
+        eye=design.eye,
+        forceps=design.forceps,
+        microscope=design.microscope,
+        duration_s=duration_s,
+        offset_s=design.offset_s,
         dropout=0.01,
         name=target.name,
         description="Simulated data set: calibration sweep, then a surgeon's movements.",
-        progress=False,
+        progress=step,
     )
-    return target.name
+    return target.name, time.perf_counter() - wall, time.process_time() - cpu
 
 
-def _seconds_a_pair() -> float:
-    """CPU seconds of a stereo pair on this machine: of one pair without a tool, and half as much for the rest."""
-    eye = Eye(texture_px=256)
-    eye.texture  # noqa: B018 - once an eye, not once a pair
-    start = time.process_time()
-    render_pair(eye, Microscope(), rng=np.random.default_rng(0))
-    return 1.5 * (time.process_time() - start)
-
-
-def make_dataset(folder: Path, *, seed: int = 0, n_pairs: int = 80, workers: int | None = None) -> list[Path]:
+def make_dataset(
+    folder: Path,
+    *,
+    seed: int = 0,
+    n_pairs: int = 80,
+    duration_s: float = 60.0,
+    workers: int | None = None,
+    shrink: int = 1,
+) -> list[Path]:
     """Make the sequences that are missing in `folder`, in parallel; identical for the same seed and size.
+
+    A sequence appears whole or not at all, so after a kill the ones that stand are kept and the others are made anew.
+    ``log.csv`` in `folder` gains a line for each.
+
+    Parameters
+    ----------
+    n_pairs, duration_s:
+        Of each sequence.
+    shrink:
+        Images and textures this many times smaller, for a quick look.
 
     Raises
     ------
@@ -119,7 +176,8 @@ def make_dataset(folder: Path, *, seed: int = 0, n_pairs: int = 80, workers: int
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    stamp, description = folder / "dataset.json", {"seed": seed, "pairs_a_sequence": n_pairs, "version": 1}
+    stamp = folder / "dataset.json"
+    description = {"seed": seed, "pairs_a_sequence": n_pairs, "duration_s": duration_s, "shrink": shrink}
     if stamp.is_file() and json.loads(stamp.read_text()) != description:
         raise ValueError(
             f"{folder}: holds another data set ({stamp.read_text().strip()}); delete it or choose another folder."
@@ -129,11 +187,117 @@ def make_dataset(folder: Path, *, seed: int = 0, n_pairs: int = 80, workers: int
     os.replace(partial, stamp)
     indices = [*TRAIN_SEQUENCES, *TEST_SEQUENCES]
     missing = [k for k in indices if not (folder / sequence_name(k)).exists()]
-    with tqdm(total=len(indices), initial=len(indices) - len(missing), desc="Simulating", unit="sequence") as bar:
-        for name in in_processes(_make_sequence, [(folder, seed, k, n_pairs) for k in missing], workers):
-            bar.set_postfix_str(name)
-            bar.update()
+    jobs = [(folder, seed, k, n_pairs, duration_s, shrink) for k in missing]
+    log = folder / "log.csv"
+    with tqdm(
+        total=len(indices) * n_pairs,
+        initial=(len(indices) - len(missing)) * n_pairs,
+        desc="Simulating",
+        unit="pair",
+        smoothing=0.1,
+    ) as bar:
+        for name, wall_s, cpu_s in in_processes(_make_sequence, jobs, workers, on_step=bar.update):
+            bar.set_postfix_str(f"{name} stands")
+            finished = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+            with log.open("a", newline="", encoding="utf-8") as stream:
+                if not stream.tell():
+                    csv.writer(stream).writerow(_LOG_COLUMNS)
+                csv.writer(stream).writerow([name, finished, f"{wall_s:.2f}", f"{cpu_s:.2f}"])
     return [folder / sequence_name(k) for k in indices]
+
+
+def landmark_counts(recordings: Sequence[Recording]) -> dict[str, dict[str, int]]:
+    """How many landmarks of both cameras are visible, hidden by the tool, outside, and in glint, for each landmark."""
+    truths = [recording.truth for recording in recordings]
+    if None in truths:
+        raise ValueError("recordings: one has no truth; take simulated ones.")
+    visibility = np.concatenate([np.stack([t.visibility_left, t.visibility_right]) for t in truths], axis=1)
+    counts = {
+        name: {
+            "visible": int((visibility[..., k] == 2).sum()),
+            "hidden": int((visibility[..., k] == 1).sum()),
+            "outside": int((visibility[..., k] == 0).sum()),
+        }
+        for k, name in enumerate(LANDMARKS)
+    }
+    if all(t.in_glint_left is not None for t in truths):
+        in_glint = np.concatenate([np.stack([t.in_glint_left, t.in_glint_right]) for t in truths], axis=1)
+        for k, name in enumerate(LANDMARKS):
+            counts[name]["in_glint"] = int(in_glint[..., k].sum())
+    return counts
+
+
+def seconds_by_stage(n_pairs: int = 6, shrink: int = 1) -> dict[str, float]:
+    """CPU seconds of a pair of the data set, truth and files included, by stage of its making.
+
+    From a profile of `n_pairs` pairs of one recording, which slows small functions a little.  The eye's texture, once a
+    recording, is not in it.
+    """
+    eye = Eye(seed=27, texture_px=max(Eye.texture_px // shrink, 64))
+    microscope = Microscope(
+        image_size_px=tuple(side // shrink for side in Microscope.image_size_px),
+        pixels_per_mm=tuple(zoom / shrink for zoom in Microscope.pixels_per_mm),
+    )
+    eye.texture  # noqa: B018 - once an eye, not once a pair
+    profile = cProfile.Profile(time.process_time)
+    duration_s = n_pairs * 60 / 80
+    with tempfile.TemporaryDirectory() as folder:
+        profile.enable()
+        simulate(
+            Path(folder) / "pairs", seed=27, n_frames=n_pairs, eye=eye, forceps=Forceps(), microscope=microscope,
+            duration_s=duration_s, progress=False,
+        )  # fmt: skip
+        profile.disable()
+    stages = dict.fromkeys([*_STAGES, _THE_REST], 0.0)
+    stage_of = {function: stage for stage, functions in _STAGES.items() for function in functions}
+    for (_, _, name), (_, _, own_s, _, _) in pstats.Stats(profile).stats.items():
+        # "<built-in method numpy.array>", "<method 'exp' of ...>", "<GaussianBlur>" or a plain name.
+        words = name.strip("<>").removeprefix("built-in ").removeprefix("method ")
+        function = words.split(" of ")[0].strip("'").split(".")[-1]
+        stages[stage_of.get(function, _THE_REST)] += own_s / n_pairs
+    return stages
+
+
+def _seconds_a_pair(shrink: int) -> float:
+    """CPU seconds of a stereo pair of the data set on this machine, from two of them."""
+    return sum(seconds_by_stage(2, shrink).values())
+
+
+def _record(folder: Path, command: str, seconds: float) -> Path:
+    """Write what a data set holds and what it cost to ``data/results/dataset.json``."""
+    recordings = [Recording.open(folder / sequence_name(k)) for k in [*TRAIN_SEQUENCES, *TEST_SEQUENCES]]
+    pairs = sum(len(recording) for recording in recordings)
+    with (folder / "log.csv").open(encoding="utf-8", newline="") as stream:
+        log = list(csv.DictReader(stream))
+    content = {
+        "command": command,
+        "commit": commit(),
+        "machine": machine(),
+        "date": datetime.date.today().isoformat(),
+        "sequences": len(recordings),
+        "pairs": pairs,
+        "gigabytes": sum(f.stat().st_size for f in folder.rglob("*") if f.is_file()) / 1e9,
+        "minutes_of_the_last_run": seconds / 60,
+        "cpu_seconds_a_pair": sum(float(row["cpu_s"]) for row in log) / pairs,
+        "wall_seconds_a_pair_of_one_worker": sum(float(row["wall_s"]) for row in log) / pairs,
+        "cpu_seconds_a_pair_by_stage": seconds_by_stage(),
+        "landmarks": {
+            kind: landmark_counts([r for r in recordings if r.name.startswith(kind)]) for kind in ("train", "test")
+        },
+        "log": log,
+    }
+    paths.RESULTS.mkdir(parents=True, exist_ok=True)
+    target = paths.RESULTS / "dataset.json"
+    partial = target.with_name(target.name + ".partial")
+    partial.write_text(json.dumps(_rounded(content), indent=1) + "\n")
+    os.replace(partial, target)
+    return target
+
+
+def _rounded(value: object) -> object:
+    if isinstance(value, dict):
+        return {key: _rounded(item) for key, item in value.items()}
+    return float(f"{value:.4g}") if isinstance(value, float) else value
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -144,25 +308,43 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--pairs", type=int, default=80, help="stereo pairs a sequence (default: 80, 1600 images in all)"
     )
+    parser.add_argument("--duration", type=float, default=60.0, help="seconds of motion a sequence (default: 60)")
     parser.add_argument("--workers", type=int, help="processes (default: one a core)")
+    parser.add_argument("--shrink", type=int, default=1, help="images this many times smaller, for a quick look")
     parser.add_argument("--dry-run", action="store_true", help="only say how long it takes and how many GB")
+    parser.add_argument("--record", action="store_true", help="also write data/results/dataset.json")
     parser.add_argument("--shipped", action="store_true", help="remake data/open_sky_eye instead")
     arguments = parser.parse_args(argv)
     if arguments.shipped:
         recording = make_shipped_recording()
         print(f"{recording.folder}: {len(recording.frames)} pairs.")
         return 0
-    if arguments.pairs < 1 or (arguments.workers is not None and arguments.workers < 1):
-        parser.error("--pairs and --workers must be at least 1.")
+    if min(arguments.pairs, arguments.shrink, 1 if arguments.workers is None else arguments.workers) < 1:
+        parser.error("--pairs, --workers and --shrink must be at least 1.")
     folder = arguments.folder or paths.CACHE / f"dataset-{arguments.seed}"
     left = sum(not (folder / sequence_name(k)).exists() for k in range(10)) * arguments.pairs
     workers = min(arguments.workers or os.cpu_count() or 1, 10)
-    minutes = left * _seconds_a_pair() / workers / 60
+    minutes = left * _seconds_a_pair(arguments.shrink) / workers / 60 if left else 0.0
     print(
-        f"{folder}: {left} of {10 * arguments.pairs} stereo pairs to make, about {minutes:.0f} min on {workers} "
-        f"idle cores, {left * _MB_PER_PAIR / 1000:.2f} GB.",
+        f"{folder}: {left} of {10 * arguments.pairs} stereo pairs to make, about {minutes:.0f} min on {workers} idle "
+        f"core{'s' if workers > 1 else ''}, {left * _MB_PER_PAIR / arguments.shrink**2 / 1000:.2f} GB.",
         flush=True,
     )
-    if not arguments.dry_run:
-        make_dataset(folder, seed=arguments.seed, n_pairs=arguments.pairs, workers=workers)
+    if arguments.dry_run:
+        return 0
+    start = time.perf_counter()
+    make_dataset(
+        folder,
+        seed=arguments.seed,
+        n_pairs=arguments.pairs,
+        duration_s=arguments.duration,
+        workers=arguments.workers,
+        shrink=arguments.shrink,
+    )
+    seconds = time.perf_counter() - start
+    if left:
+        print(f"{left} pairs in {seconds / 60:.1f} min, {seconds / left:.2f} s a pair.")
+    if arguments.record:
+        words = " ".join(argv) if argv is not None else ""
+        print(_record(folder, f"python3 -m lib simulate {words}".strip(), seconds))
     return 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -15,13 +16,15 @@ from lib.simulator.eye import Eye, Scene
 from lib.simulator.forceps import Forceps
 from lib.simulator.microscope import Microscope
 from lib.simulator.motion import Motion
-from lib.simulator.render import render_pair, surface_grid
+from lib.simulator.render import View, render_pair, surface_grid
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE
 from lib.simulator.training import RESERVED_SEEDS, reserved_forceps
 
 __all__ = ["simulate"]
 
 _KINEMATICS_HZ = 100.0
+_GLINT_REACH_PX = 3  # a detector looks at a landmark's surroundings, not at one pixel
+_CLIPPED = 250  # of 255
 
 
 def simulate(
@@ -44,7 +47,7 @@ def simulate(
     masks: bool = False,
     name: str | None = None,
     description: str = "",
-    progress: bool = True,
+    progress: bool | Callable[[], object] = True,
     overwrite: bool = False,
 ) -> Recording:
     """Simulate a recording and write it to `folder`, which appears whole or not at all.
@@ -77,6 +80,8 @@ def simulate(
         truth's rig is the one before; ``truth/moved_rig.json`` holds the one after.
     masks:
         Also write ``truth/masks``: tool and glints of every frame (PNG, red and green channel).
+    progress:
+        Whether to show a bar, or what to call after every pair.
 
     Raises
     ------
@@ -104,6 +109,7 @@ def simulate(
     step = max(1, int(motion.duration_s * fps / n_frames))
     time_s = np.arange(n_frames) * step / fps
     u, visibility = np.empty((2, n_frames, 3, 2)), np.empty((2, n_frames, 3), int)
+    in_glint = np.zeros((2, n_frames, 3), bool)
     landmarks = np.empty((n_frames, 3, 3))
     rig = microscope.rig(RigidTransform.identity())
     moved_at, moved_rig = n_frames, rig
@@ -137,7 +143,7 @@ def simulate(
         jpeg_quality=microscope.jpeg_quality or 90,
         overwrite=overwrite,
     ) as writer:
-        for k in tqdm(range(n_frames), desc=f"Simulating {folder.name}", unit="pair", disable=not progress):
+        for k in tqdm(range(n_frames), desc=f"Simulating {folder.name}", unit="pair", disable=progress is not True):
             pose = motion.pose(time_s[k])
             views = render_pair(
                 eye, microscope, forceps=forceps, pose=pose, later=motion.later(time_s[k]),
@@ -146,13 +152,15 @@ def simulate(
             writer.add(views[0].image, views[1].image, time_s[k])
             landmarks[k] = forceps.landmarks(pose)
             for side, view in enumerate(views):
-                u[side, k], visibility[side, k] = view.u, view.visibility
+                u[side, k], visibility[side, k], in_glint[side, k] = view.u, view.visibility, _in_glint(view)
             if masks:
                 for side, view in zip(("left", "right"), views, strict=True):
                     path = writer.truth_folder / "masks" / side / f"{k:06d}.png"
                     path.parent.mkdir(parents=True, exist_ok=True)
                     empty = np.zeros_like(view.tool_mask)
                     cv2.imencode(".png", np.dstack([empty, view.glint_mask, view.tool_mask]))[1].tofile(path)
+            if callable(progress):
+                progress()
         margin = 5
         count = int(np.ceil(time_s[-1] * _KINEMATICS_HZ)) + 1 + 2 * margin
         sample_s = (np.arange(count) - margin) / _KINEMATICS_HZ
@@ -168,11 +176,30 @@ def simulate(
             *u,
             *visibility,
             surface=_in_robot(surface_grid(eye, rig.left, microscope.image_size_px), robot_from_microscope),
+            in_glint=tuple(in_glint),
         )
         if camera_motion is not None:
             before = robot_from_microscope.compose(camera_motion[1].inverse())
             microscope.rig(before).save(writer.truth_folder / "moved_rig.json")
     return Recording.open(folder)
+
+
+def _in_glint(view: View) -> np.ndarray:
+    """(3,) bool: whether saturated light lies within `_GLINT_REACH_PX` of a landmark in view.
+
+    Either the wet surface's mirror image of the lamp, which never covers the tool itself but may surround a tip, or a
+    highlight of the metal: two of three channels at full scale, as one alone may be the colour of the light.
+    """
+    found = np.zeros(3, bool)
+    for k in np.flatnonzero(view.visibility):
+        column, row = np.round(view.u[k]).astype(int)
+        near = np.s_[
+            max(row - _GLINT_REACH_PX, 0) : row + _GLINT_REACH_PX + 1,
+            max(column - _GLINT_REACH_PX, 0) : column + _GLINT_REACH_PX + 1,
+        ]
+        clipped = np.sort(view.image[near], axis=2)[..., 1] >= _CLIPPED
+        found[k] = clipped.any() or view.glint_mask[near].any()
+    return found
 
 
 def _in_robot(surface: tuple[np.ndarray, ...], robot_from_microscope: RigidTransform) -> tuple[np.ndarray, ...]:

@@ -1,15 +1,16 @@
 """Recordings, training images and bad parameters."""
 
-import json
+from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from lib.cameras import StereoRig
 from lib.geometry import RigidTransform
+from lib.recordings import Recording
 from lib.simulator import Eye, Forceps, Microscope, Motion, Pose, Relief, render_pair, simulate
-from lib.simulator.dataset import main, make_dataset
 from lib.simulator.realism import STATISTICS, image_statistics, landmark_window
 from lib.simulator.scenes import Checkerboard, Plane, Sphere
 from lib.simulator.training import RESERVED_JAW_MM, RESERVED_SEEDS, TEXTURE_SEEDS, random_forceps, sample
@@ -43,6 +44,32 @@ def test_a_recording_agrees_with_its_truth(made):
     assert labelled.mean() > 0.5
     assert np.abs(made.annotations.u_left - truth.u_left)[labelled].max() < 5
     assert len(list((made.folder / "truth" / "masks" / "left").iterdir())) == 5
+
+
+def test_truth_says_which_landmarks_saturated_light_touches(tmp_path):
+    """Against the images and masks on disk; a recording of before, without these columns, still opens."""
+    options = {"seed": 6, "n_frames": 6, "motion": "sweep", "duration_s": 4.0, "progress": False, "masks": True}
+    bright = replace(SMALL, brightness=1.6, jpeg_quality=None)
+    recording = simulate(tmp_path / "bright", eye=replace(EYE, gloss=2.0), microscope=bright, **options)
+    truth = recording.truth
+    for side in ("left", "right"):
+        u, visibility, told = (getattr(truth, f"{name}_{side}") for name in ("u", "visibility", "in_glint"))
+        assert told.dtype == bool and told.shape == (6, 3)
+        for k, frame in enumerate(recording.frames):
+            mask = cv2.imread(str(truth.folder / "masks" / side / f"{k:06d}.png"))
+            for landmark in range(3):
+                x, y = np.round(u[k, landmark]).astype(int)
+                if not visibility[k, landmark] or not (3 <= x < 317 and 3 <= y < 177):
+                    continue
+                near = np.s_[y - 3 : y + 4, x - 3 : x + 4]
+                bright_channels = (getattr(frame, side)[near] >= 250).sum(axis=2)
+                assert told[k, landmark] == ((bright_channels >= 2).any() or mask[near][..., 1].any())
+    assert 0 < np.mean([truth.in_glint_left, truth.in_glint_right]) < 1
+    dim = simulate(tmp_path / "dim", eye=replace(EYE, gloss=0.0), microscope=replace(SMALL, brightness=0.2), **options)
+    assert not dim.truth.in_glint_left.any()
+    table = dim.truth.folder / "landmarks.csv"
+    table.write_text("\n".join(",".join(line.split(",")[:28]) for line in table.read_text().splitlines()) + "\n")
+    assert Recording.open(dim.folder).truth.in_glint_left is None
 
 
 def test_kinematics_have_noise_drop_outs_and_the_clock_offset(made):
@@ -118,47 +145,6 @@ def test_training_never_draws_what_test_recordings_show():
     assert not ((lengths > RESERVED_JAW_MM[0]) & (lengths < RESERVED_JAW_MM[1])).any()
     assert lengths.min() >= 2 and lengths.max() <= 4
     assert not set(TEXTURE_SEEDS) & set(RESERVED_SEEDS)
-
-
-def test_dataset_resumes_and_splits(tmp_path, monkeypatch, capsys):
-    made = []
-
-    def quick(folder, seed, index, n_pairs):
-        made.append(index)
-        (folder / f"{'train' if index < 7 else 'test'}_{index:02d}").mkdir()
-        return str(index)
-
-    class Inline:
-        def __init__(self, workers):
-            pass
-
-        def __enter__(self):
-            return self
-
-        def __exit__(self, *error):
-            return None
-
-        def submit(self, call, *arguments):
-            from concurrent.futures import Future
-
-            future = Future()
-            future.set_result(call(*arguments))
-            return future
-
-    monkeypatch.setattr("lib.simulator.dataset._make_sequence", quick)
-    monkeypatch.setattr("lib.simulator.dataset.ProcessPoolExecutor", Inline)
-    (tmp_path / "test_08").mkdir()
-    folders = make_dataset(tmp_path, n_pairs=3)
-    assert made == [0, 1, 2, 3, 4, 5, 6, 7, 9]
-    assert [f.name[:5] for f in folders].count("train") == 7
-    with pytest.raises(ValueError, match="another data set"):
-        make_dataset(tmp_path, n_pairs=4)
-    assert json.loads((tmp_path / "dataset.json").read_text())["pairs_a_sequence"] == 3
-    monkeypatch.setattr("lib.simulator.dataset._seconds_a_pair", lambda: 2.0)
-    assert main(["--folder", str(tmp_path / "new"), "--dry-run", "--workers", "2"]) == 0
-    said = capsys.readouterr().out
-    assert "800 of 800 stereo pairs" in said and "13 min" in said and "GB" in said
-    assert not (tmp_path / "new").exists()
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,120 @@
+"""The data set's command: progress, parallel work, resuming after a kill, the same files for the same seed."""
+
+import re
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lib import paths
+from lib.recordings import Recording
+from lib.simulator.dataset import landmark_counts, main, make_dataset, sequence_name
+
+OPTIONS = {"n_pairs": 2, "duration_s": 4.0, "shrink": 8}  # 240 x 135 px
+WORDS = ["--pairs", "2", "--duration", "4", "--shrink", "8"]
+NAMES = {sequence_name(k) for k in range(10)}
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """Two pairs of each sequence, by two processes; treated as read-only."""
+    folder = tmp_path_factory.mktemp("dataset") / "made"
+    assert make_dataset(folder, workers=2, **OPTIONS) == [folder / sequence_name(k) for k in range(10)]
+    return folder
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Every file of the sequences by its name."""
+    return {str(f.relative_to(folder)): f.read_bytes() for f in folder.glob("t*_*/**/*") if f.is_file()}
+
+
+def test_splits_by_eye_and_tool(made):
+    recordings = [Recording.open(made / name) for name in sorted(NAMES)]
+    assert [recording.name[:5] for recording in recordings].count("train") == 7
+    assert {len(recording) for recording in recordings} == {2}
+    # Ten tools: no two have jaws of the same length.
+    jaws = [np.linalg.norm(r.truth.landmarks_mm[0, 1:].mean(axis=0) - r.truth.landmarks_mm[0, 0]) for r in recordings]
+    assert np.diff(np.sort(jaws)).min() > 1e-4
+    counts = landmark_counts(recordings)
+    assert {sum(counts[name][k] for k in ("visible", "hidden", "outside")) for name in counts} == {10 * 2 * 2}
+    assert counts["base"]["visible"] > 20 and "in_glint" in counts["tip_1"]
+
+
+def test_a_killed_run_resumes_to_the_same_files(made, tmp_path):
+    """kill -9 in the middle, once the workers are at it; another number of workers finishes the rest."""
+    folder = tmp_path / "killed"
+    command = [sys.executable, "-m", "lib", "simulate", "--folder", str(folder), *WORDS]
+    run = subprocess.Popen([*command, "--workers", "2"], cwd=paths.ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    try:
+        wait_for(lambda: 2 <= len(finished(folder)) and any(folder.glob("*.partial")), run)
+        workers = children(run.pid)
+    finally:
+        run.kill()  # SIGKILL: nothing can be tidied up
+    run.communicate()
+    wait_for(lambda: not any(alive(pid) for pid in workers), None)  # else they would write beside the next run
+    kept = finished(folder)
+    assert kept < NAMES
+    before = {name: (folder / name).stat().st_mtime_ns for name in kept}
+    make_dataset(folder, workers=1, **OPTIONS)
+    assert finished(folder) == NAMES and not any(folder.glob("*.partial"))
+    assert {name: (folder / name).stat().st_mtime_ns for name in kept} == before
+    assert contents(folder) == contents(made)
+
+
+def test_another_seed_gives_other_images(made, tmp_path, capfd):
+    assert main(["--folder", str(tmp_path / "a"), "--seed", "1", *WORDS]) == 0
+    said = capfd.readouterr()
+    assert "20 of 20 stereo pairs to make" in said.out and "s a pair" in said.out
+    # One tick a pair, with the remaining time.
+    assert re.search(r"20/20 \[\d\d:\d\d<\d\d:\d\d", said.err)
+    here, there = (contents(folder)["test_08/kinematics.csv"] for folder in (tmp_path / "a", made))
+    assert here != there
+
+
+def test_says_beforehand_how_long_and_how_large(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("lib.simulator.dataset._seconds_a_pair", lambda shrink: 2.0)
+    assert main(["--folder", str(tmp_path / "new"), "--dry-run", "--workers", "2"]) == 0
+    said = capsys.readouterr().out
+    assert "800 of 800 stereo pairs" in said and "13 min on 2 idle cores" in said and "0.50 GB" in said
+    assert not (tmp_path / "new").exists()
+
+
+def test_another_data_set_in_the_folder_is_refused(made):
+    with pytest.raises(ValueError, match="another data set"):
+        make_dataset(made, **(OPTIONS | {"n_pairs": 4}))
+    assert main(["--folder", str(made), *WORDS]) == 0  # nothing left to make
+
+
+def finished(folder: Path) -> set[str]:
+    return {p.name for p in folder.glob("t*_??")}
+
+
+def wait_for(true, run: subprocess.Popen | None, timeout_s: float = 300.0) -> None:
+    deadline = time.monotonic() + timeout_s
+    while not true():
+        assert run is None or run.poll() is None, run.communicate()[1].decode()
+        assert time.monotonic() < deadline, "waited too long"
+        time.sleep(0.02)
+
+
+def children(pid: int) -> list[int]:
+    """Processes whose parent is `pid`; empty where there is no /proc."""
+    found = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = stat.read_text().rpartition(")")[2].split()
+        except OSError:
+            continue
+        if int(fields[1]) == pid:
+            found.append(int(stat.parent.name))
+    return found
+
+
+def alive(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
