@@ -115,12 +115,13 @@ def test_near_affine_triangulation_is_that_of_a_general_solver(near, each, monke
     L = np.tril(rng.uniform(-0.4, 0.4, (23, 4, 4))) + 1.5 * np.eye(4)
     S = L @ L.transpose(0, 2, 1) if each else np.broadcast_to(L[0] @ L[0].T, (23, 4, 4))
     found = near.triangulate(u_left, u_right, S if each else S[0])
+
+    def residuals(p, white, y):
+        return white @ (np.hstack(near.project(p[None]))[0] - y)
+
     for i in np.delete(np.arange(23), 11):
-        white = np.linalg.inv(np.linalg.cholesky(S[i]))
-        y = np.concatenate([u_left[i], u_right[i]])
-        general = least_squares(
-            lambda p: white @ (np.concatenate(near.project(p[None]), axis=1)[0] - y), x[i], xtol=1e-15, ftol=1e-15, gtol=1e-15
-        )  # fmt: skip
+        data = np.linalg.inv(np.linalg.cholesky(S[i])), np.hstack([u_left[i], u_right[i]])
+        general = least_squares(residuals, x[i], args=data, xtol=1e-15, ftol=1e-15, gtol=1e-15)
         np.testing.assert_allclose(found.x_mm[i], general.x, atol=1e-8)
         np.testing.assert_allclose(found.covariance_mm2[i] @ (general.jac.T @ general.jac), np.eye(3), atol=1e-5)
     assert np.isnan(found.x_mm[11]).all() and np.isnan(found.covariance_mm2[11]).all()

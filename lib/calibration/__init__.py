@@ -13,6 +13,7 @@ from lib.calibration.baselines import (
 from lib.calibration.estimate import Calibration, calibrate
 from lib.calibration.export import read_json, read_opencv, read_ros, write_json, write_opencv, write_ros
 from lib.calibration.ladder import LADDER, Comparison, Rung, compare_models
+from lib.calibration.offsets import OffsetCalibration, calibrate_with_offsets, tool_axes
 from lib.calibration.online import OnlineCalibration
 from lib.calibration.optics import Optics, optics
 from lib.calibration.pivot import Pivot, ToolOffsets, pivot_calibration, tool_offsets
@@ -26,6 +27,7 @@ __all__ = [
     "Comparison",
     "Factorisation",
     "Moments",
+    "OffsetCalibration",
     "OnlineCalibration",
     "Optics",
     "PerspectiveCamera",
@@ -37,6 +39,7 @@ __all__ = [
     "affine_minimum",
     "box_grid",
     "calibrate",
+    "calibrate_with_offsets",
     "compare_models",
     "dlt",
     "estimate_noise",
@@ -53,6 +56,7 @@ __all__ = [
     "read_ros",
     "rolling_shutter",
     "similarity",
+    "tool_axes",
     "tool_offsets",
     "triangulate_perspective",
     "write_json",

@@ -182,7 +182,11 @@ def estimate_noise(
         v_u = float(sigma_u_px) ** 2
     else:
         v_u = max(observed[0], floor)
-    v_x = 0.0 if sigma_x_mm is None else float(sigma_x_mm) ** 2
+    if sigma_x_mm is not None:
+        v_x = float(sigma_x_mm) ** 2
+    else:  # a start that is right where either noise is negligible
+        seen = gain > 1e-9 * gain.max()
+        v_x = float(np.median(np.maximum(observed[seen] - v_u, 0.0) / gain[seen])) if seen.any() else 0.0
     design = np.column_stack([np.ones(m), gain])
     free = np.array([sigma_u_px is None, sigma_x_mm is None])
     v = np.array([v_u, v_x])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.stats import chi2
@@ -16,31 +16,29 @@ from lib.calibration.baselines import (
     similarity,
     triangulate_perspective,
 )
-from lib.calibration.checkerboard import BoardError, measure_boards
 from lib.calibration.estimate import Calibration, calibrate
 from lib.calibration.ladder import compare_models
 from lib.calibration.pivot import tool_offsets
-from lib.calibration.timing import estimate_time_offset, rolling_shutter
+from lib.calibration.timing import estimate_time_offset
 from lib.cameras import NearAffineCamera, StereoRig
 from lib.geometry import RigidTransform
-from lib.landmarks.stereo import Correspondences, StereoLandmarks
-from lib.recordings import Recording
 from lib.simulator.rig import (
     IMAGE_SIZE_PX,
     ROBOT_FROM_MICROSCOPE,
+    Correspondences,
     reference_rig,
     simulate_correspondences,
 )
-from lib.simulator.rig import Correspondences as SimulatedCorrespondences
 
 __all__ = [
     "BoundStudy",
     "NoiseStudy",
     "advice_study",
-    "board_study",
     "bound_study",
+    "dlt_is_enough",
     "factorisation_study",
     "focal_study",
+    "follow_advice",
     "near_affine_rig",
     "nested_study",
     "noise_study",
@@ -215,21 +213,6 @@ def working_distance_study(
     return {name: value.mean(axis=1) for name, value in result.items()}
 
 
-def board_study(
-    distance_mm: float, *, frames: int = 75, sigma_u_px: float = 0.5, boards: int = 3, seed: int = 0
-) -> dict[str, BoardError]:
-    """Rendered checkerboards reconstructed with calibrations from `frames` simulated tool frames of three landmarks each.
-
-    Returns the errors of the models "zero_skew" and "near_affine".
-    """
-    rng = np.random.default_rng(seed)
-    rig = near_affine_rig(distance_mm)
-    x = simulate_correspondences(3 * frames, rng=rng).true_x_mm
-    noisy, u = _noisy(rig, x, rng, sigma_u_px, 0.010)
-    rigs = {m: calibrate(noisy, u, model=m, image_size_px=IMAGE_SIZE_PX).rig for m in ("zero_skew", "near_affine")}
-    return measure_boards(rigs, inverse_distance_per_mm=1.0 / distance_mm, boards=boards, seed=seed)
-
-
 def advice_study(*, start: int = 12, more: int = 32, runs: int = 20, seed: int = 0) -> dict[str, np.ndarray]:
     """RMS over the workspace of sqrt(leverage), (more + 1,), after random and after advised positions, means over runs.
 
@@ -307,7 +290,9 @@ def tool_offset_study(*, frames: int = 300, runs: int = 10, seed: int = 0) -> np
     return np.array(errors)
 
 
-def factorisation_study(poses: Sequence[int], *, n: int = 75, runs: int = 10, seed: int = 0) -> dict[str, np.ndarray]:
+def factorisation_study(
+    poses: Sequence[int], *, n: int = 75, runs: int = 10, sigma_u_px: float = 1.5, seed: int = 0
+) -> dict[str, np.ndarray]:
     """3D RMS (um) of n points seen from several poses of the stereo head (two views each), medians, {name: (len,)}.
 
     By factorisation, given the best similarity to the truth for free, and by triangulation with all the views calibrated
@@ -324,7 +309,7 @@ def factorisation_study(poses: Sequence[int], *, n: int = 75, runs: int = 10, se
                     RigidTransform.from_rotation_vector(rng.uniform(-0.1, 0.1, 3)) if k else RigidTransform.identity()
                 )
                 rig = reference_rig(robot_from_microscope=ROBOT_FROM_MICROSCOPE.compose(tilt))
-                noisy, u = _noisy(rig, x, rng, 1.5, 0.01)
+                noisy, u = _noisy(rig, x, rng, sigma_u_px, 0.01)
                 images += u
                 matrices += [dlt(noisy, pixels).matrix for pixels in u]
             shape = factorise(np.stack(images)).shape
@@ -336,7 +321,7 @@ def factorisation_study(poses: Sequence[int], *, n: int = 75, runs: int = 10, se
 
 
 def follow_advice(
-    few: SimulatedCorrespondences,
+    few: Correspondences,
     advised_mm: np.ndarray,
     seen: Sequence[np.ndarray],
     followed: int,
@@ -348,97 +333,6 @@ def follow_advice(
     x = np.vstack([few.x_mm, advised_mm[:followed]])
     u = [np.vstack([a, b[:followed]]) for a, b in zip((few.u_left, few.u_right), seen, strict=True)]
     return calibrate(x, u, model="affine", sigma_u_px=sigma_u_px, sigma_x_mm=sigma_x_mm, ransac_px=np.inf)
-
-
-def row_timed(recording: Recording, landmarks: StereoLandmarks, *, min_confidence: float = 0.2) -> Correspondences:
-    """Correspondences of a recording with every position taken when its own image row was read (`rolling_shutter`)."""
-    rows = landmarks.correspondences(min_confidence=min_confidence)
-    x, u = rolling_shutter(
-        recording.frames.time_s,
-        [landmarks.left.u, landmarks.right.u],
-        recording.kinematics.time_s,
-        recording.kinematics.x_mm,
-        readout_s=recording.readout_s,
-        height_px=recording.image_size_px[1],
-        offset_s=recording.offset_s,
-    )
-    at = (rows.frame, rows.landmark)
-    good = np.isfinite(x[at]).all(axis=1)
-    return replace(rows, x_mm=x[at], u_left=u[0][at], u_right=u[1][at])[good]
-
-
-@dataclass(frozen=True)
-class Judgement:
-    """A calibration against the truth of a simulated recording.
-
-    Attributes
-    ----------
-    triangulation_um:
-        3D RMS of the detected landmarks triangulated, against where they were.
-    calibration_um:
-        3D RMS of the true landmarks, from their exact pixels: the calibration's own error.
-    over_bound:
-        `calibration_um` over its Cramer-Rao prediction, at the noise measured against truth.
-    projection_over_bound:
-        The same of the projections at the landmarks (px): it also sees shifts common to both images, which a detector
-        that is systematically off by some pixels of the tool causes.
-    sigma_u_px:
-        RMS error of the inliers' detections per coordinate, measured against truth.
-    """
-
-    triangulation_um: float
-    calibration_um: float
-    over_bound: float
-    projection_over_bound: float
-    sigma_u_px: float
-
-
-def judge(calibration: Calibration, recording: Recording, rows: Correspondences) -> Judgement:
-    """Compare a calibration of a simulated recording, from correspondences `rows`, with the recording's truth.
-
-    Raises
-    ------
-    ValueError
-        If the recording has no truth.
-    """
-    truth = recording.truth
-    if truth is None:
-        raise ValueError(f"{recording.name}: no truth; only a simulated recording can be judged.")
-    at = (rows.frame, rows.landmark)
-    good = calibration.inliers
-    exact = np.hstack([truth.u_left[at], truth.u_right[at]])
-    # The landmarks' positions when their pixels were read, from those pixels and the true rig.
-    x = truth.rig.triangulate(exact[:, :2], exact[:, 2:]).x_mm
-    found = calibration.rig.triangulate(rows.u_left, rows.u_right).x_mm
-    own = calibration.rig.triangulate(exact[:, :2], exact[:, 2:]).x_mm
-    sigma_u = float(np.sqrt(((calibration.y_px - exact)[good] ** 2).mean()))
-    A = truth.rig.linear
-    H = np.column_stack([x[good], np.ones(good.sum())])
-    leverage = np.einsum("ni,ij,nj->n", H, np.linalg.inv(H.T @ H), H)
-    S = sigma_u**2 * np.eye(4) + recording.robot_accuracy_mm**2 * A @ A.T
-    error = np.hstack(calibration.rig.project(x[good])) - np.hstack(truth.rig.project(x[good]))
-    gain = np.linalg.pinv(A)
-    predicted = np.sqrt(leverage.mean() * np.array([np.trace(gain @ S @ gain.T), np.trace(S)]))
-    own_error = _rms((own - x)[good])
-    return Judgement(
-        1e3 * _rms((found - x)[good]), 1e3 * own_error, own_error / predicted[0], _rms(error) / predicted[1], sigma_u
-    )
-
-
-def calibrate_labels(recording: Recording, *, click_px: float = 1.0, seed: int = 0) -> Judgement:
-    """`judge` of a calibration from exact landmark pixels with Gaussian click noise, as careful labels would be."""
-    rng = np.random.default_rng(seed)
-    truth = recording.truth
-    if truth is None:
-        raise ValueError(f"{recording.name}: no truth; only a simulated recording can be judged.")
-    x = recording.landmarks_mm((truth.u_left + truth.u_right) / 2)
-    good = np.isfinite(x).all(axis=2) & np.isfinite(truth.u_left).all(axis=2) & np.isfinite(truth.u_right).all(axis=2)
-    frame, landmark = np.nonzero(good)
-    u = [pixels[good] + rng.normal(0, click_px, (good.sum(), 2)) for pixels in (truth.u_left, truth.u_right)]
-    covariance = np.broadcast_to(click_px**2 * np.eye(4), (len(frame), 4, 4))
-    rows = Correspondences(x[good], *u, covariance, frame, landmark)
-    found = calibrate(rows.x_mm, u, image_size_px=recording.image_size_px, ransac_px=np.inf)
-    return judge(found, recording, rows)
 
 
 def dlt_is_enough(n: int = 300, *, runs: int = 200, seed: int = 0) -> tuple[float, float]:

@@ -168,6 +168,17 @@ def test_noise_levels_are_found():
     assert found[:, 1].mean() == pytest.approx(0.010, rel=0.04)
 
 
+def test_noise_levels_are_found_where_one_is_negligible():
+    for sigma_u, sigma_x in ((0.001, 0.01), (0.01, 0.01), (3.0, 1e-5)):
+        c = data(300, 3, sigma_u_px=sigma_u, sigma_x_mm=sigma_x)
+        A = c.true_rig.linear
+        r = np.hstack([c.u_left, c.u_right]) - np.hstack(c.true_rig.project(c.x_mm))
+        r[:, 0] += 1e-3 * np.abs(np.random.default_rng(0).normal(size=300))  # not quite Gaussian, as real residuals are
+        found_u, found_x = estimate_noise(r, A, 16)
+        assert found_u == pytest.approx(sigma_u, rel=0.15)
+        assert found_x == pytest.approx(sigma_x, rel=0.15) if sigma_x > 1e-4 else found_x < 0.01
+
+
 def test_one_camera_attributes_all_noise_to_its_pixels_or_keeps_what_is_given():
     c = data(400, 1)
     alone = calibrate(c.x_mm, [c.u_left], model="affine")

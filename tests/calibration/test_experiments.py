@@ -8,7 +8,8 @@ import pytest
 
 from lib import paths
 from lib.calibration import Moments, affine_minimum, evaluation, real_robot, studies
-from lib.simulator.rig import simulate_correspondences
+from lib.calibration.checkerboard import measure_boards
+from lib.simulator.rig import reference_rig, simulate_correspondences
 
 
 def test_a_general_sparse_solver_reaches_the_closed_form_minimum():
@@ -29,10 +30,10 @@ def test_ceres_reaches_the_closed_form_minimum():
     assert evaluation.solve_with_ceres(c.x_mm, y, 1.5, 0.010)[0] == pytest.approx(closed.cost, rel=1e-9)
 
 
-def test_checkerboard_is_flat_square_and_in_place():
-    affine = studies.board_study(np.inf, boards=1, sigma_u_px=0.3)["zero_skew"]
-    assert affine.corners == 13 * 9
-    assert affine.aligned_um < 6 and affine.robot_um < 12
+def test_true_cameras_find_the_checkerboard_flat_square_and_in_place():
+    found = measure_boards({"true": reference_rig()}, boards=1)["true"]
+    assert found.corners == 13 * 9
+    assert found.aligned_um < 3 and found.robot_um < 3
 
 
 def spheres_image(shaft=True):
