@@ -24,6 +24,7 @@ from torch import Tensor
 
 from lib import paths
 from lib.geometry import image_from_cell
+from lib.landmarks.engines import accelerated, default_engine
 from lib.landmarks.heatmaps import Peaks, decode
 from lib.landmarks.network import HourglassConfig, StackedHourglass
 from lib.landmarks.windows import cut, direction_rad, tool_centre, window_from_image
@@ -173,6 +174,8 @@ class Detector:
         Sees one upright window of `window_px` round the tool, that much reduced, between the two; None = no such stage.
     calibration:
         One per stage: ``"frame"``, ``"tool"`` and ``"window"``.
+    engine:
+        What runs the networks, one of `lib.landmarks.engines.ENGINES`; the weights are the same.
     """
 
     frame_network: StackedHourglass
@@ -184,11 +187,13 @@ class Detector:
     method: str = "gauss_newton"
     calibration: dict[str, Calibration] = field(default_factory=dict)
     metadata: dict[str, object] = field(default_factory=dict)
+    engine: str = "torch"
 
     def __post_init__(self) -> None:
         if self.reduction < 1 or self.reduction != int(self.reduction):
             raise ValueError(f"reduction: must be a positive integer, got {self.reduction}.")
-        object.__setattr__(self, "_fused", {name: network.fused() for name, network in self.networks.items()})
+        fast = {name: accelerated(network, self.engine) for name, network in self.networks.items()}
+        object.__setattr__(self, "_fused", fast)
 
     @property
     def networks(self) -> dict[str, StackedHourglass]:
@@ -199,8 +204,10 @@ class Detector:
     # Files
 
     @classmethod
-    def load(cls, path_or_name: str | Path | None = None) -> Detector:
+    def load(cls, path_or_name: str | Path | None = None, *, engine: str | None = None) -> Detector:
         """A detector from a weights file, or from a name in ``data/models``; None is the shipped default.
+
+        `engine` runs its networks; None is the fastest that is installed (`lib.landmarks.engines`).
 
         Raises
         ------
@@ -227,6 +234,7 @@ class Detector:
                 name: Calibration(*(tuple(values) for values in fit)) for name, fit in metadata["calibration"].items()
             },
             metadata=metadata["provenance"],
+            engine=engine or default_engine(),
         )
 
     def save(self, path: str | Path) -> None:
@@ -292,7 +300,8 @@ class Detector:
         )
         if usable.size:
             with self._threads():
-                _put(result, usable, self._refined(images[usable], previous[usable], "window"))
+                part = images if usable.size == len(images) else images[usable]  # a pair of frames takes 12 MB
+                _put(result, usable, self._refined(part, previous[usable], "window"))
         lost = np.flatnonzero((result.confidence < min_confidence).any(1))
         if lost.size:
             _put(result, lost, self(images[lost]))

@@ -1,0 +1,143 @@
+"""Engines that run a network on a CPU: torch, or OpenVINO, several times as fast on the detector's small windows.
+
+`data/results/detector.json` holds the measurement that chose (study ``engines``).  OpenVINO computes in bfloat16 where the
+processor has units for it (heatmaps then differ by about 0.01 of their height), else in float32.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import sys
+import threading
+import warnings
+from collections import OrderedDict
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from lib.landmarks.network import StackedHourglass
+
+__all__ = ["ENGINES", "LastHeatmaps", "OpenVinoNetwork", "accelerated", "default_engine", "openvino"]
+
+ENGINES = ("torch", "openvino")
+
+#: Compiled networks by weights, input shape and threads: copies of a detector share them.
+_COMPILED: OrderedDict[tuple, object] = OrderedDict()
+_KEPT = 12
+_lock = threading.Lock()
+
+
+def openvino():
+    """The module.  Without its telemetry package, which would tell its makers of every import, it stays silent."""
+    sys.modules.setdefault("openvino_telemetry", None)  # type: ignore[arg-type]
+    import openvino
+
+    return openvino
+
+
+def default_engine() -> str:
+    """``"openvino"`` where it is installed, else ``"torch"``."""
+    return "openvino" if importlib.util.find_spec("openvino") else "torch"
+
+
+def accelerated(network: StackedHourglass, engine: str) -> Callable[[Tensor], list[Tensor]]:
+    """The network for inference: called with images (n, 3, h, w), its last output are the last stack's heatmaps.
+
+    Raises
+    ------
+    ValueError
+        For an unknown engine, or one that is not installed.
+    """
+    if engine not in ENGINES:
+        raise ValueError(f"engine: {engine!r} is none; choose one of {', '.join(ENGINES)}.")
+    if engine == "openvino":
+        if not importlib.util.find_spec("openvino"):
+            raise ValueError("engine: openvino is not installed here; choose 'torch'.")
+        return OpenVinoNetwork(network)
+    return network.fused()
+
+
+class LastHeatmaps(nn.Module):
+    """A network whose only output are the heatmaps of its last stack: what is traced and exported."""
+
+    def __init__(self, network: StackedHourglass):
+        super().__init__()
+        self.network = network.fused().to(memory_format=torch.contiguous_format)
+
+    def forward(self, images: Tensor) -> Tensor:
+        return self.network(images)[-1]
+
+
+class OpenVinoNetwork:
+    """A network run by OpenVINO, image by image, as many at once as torch has threads.
+
+    It is compiled, in about a second, for each size of image that it meets.
+    """
+
+    def __init__(self, network: StackedHourglass, *, precision: str | None = None, threads: int | None = None):
+        self._network, self._precision = network, precision
+        self._threads = threads or torch.get_num_threads()
+        digest = hashlib.sha256(repr(network.config).encode())
+        for value in network.state_dict().values():
+            digest.update(np.ascontiguousarray(value.numpy()).tobytes())
+        self._digest = digest.hexdigest()
+
+    def __call__(self, images: Tensor) -> list[Tensor]:
+        x = np.ascontiguousarray(images.numpy())
+        if x.ndim != 4 or x.shape[1] != 3:
+            return self._network(images)  # raises what is wrong
+        with _lock:  # the queue is shared
+            queue, shape = self._queue(x.shape[1:])
+            found = np.empty((len(x), *shape), np.float32)
+
+            def keep(request, index: int) -> None:
+                found[index] = request.get_output_tensor(0).data[0]
+
+            queue.set_callback(keep)
+            for i in range(len(x)):
+                queue.start_async({0: x[i : i + 1]}, i)
+            queue.wait_all()
+        return [torch.from_numpy(found)]
+
+    def _queue(self, shape: tuple[int, int, int]) -> tuple:
+        key = (self._digest, shape, self._threads, self._precision)
+        if key not in _COMPILED:
+            _COMPILED[key] = self._compile((1, *shape))
+            while len(_COMPILED) > _KEPT:
+                _COMPILED.popitem(last=False)
+        _COMPILED.move_to_end(key)
+        return _COMPILED[key]
+
+    def _compile(self, shape: tuple[int, int, int, int]) -> tuple:
+        ov = openvino()
+        options = {
+            "PERFORMANCE_HINT": "THROUGHPUT",
+            "NUM_STREAMS": self._threads,
+            "INFERENCE_NUM_THREADS": self._threads,
+        }
+        if self._precision:
+            options["INFERENCE_PRECISION_HINT"] = self._precision
+        compiled = ov.Core().compile_model(_converted(LastHeatmaps(self._network).eval(), shape), "CPU", options)
+        return ov.AsyncInferQueue(compiled, self._threads), tuple(compiled.output(0).shape)[1:]
+
+
+def _converted(module: nn.Module, shape: tuple[int, ...]):
+    """An OpenVINO model of fixed input shape, from a trace: much quicker than its own conversion of a module."""
+    ov = openvino()
+    from openvino.frontend import FrontEndManager
+    from openvino.frontend.pytorch.ts_decoder import TorchScriptPythonDecoder
+
+    example = torch.zeros(shape)
+    with torch.no_grad(), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # tracing fixes the shape, which is what is wanted
+        traced = torch.jit.freeze(torch.jit.trace(module, example, check_trace=False))
+        frontend = FrontEndManager().load_by_framework("pytorch")
+        decoder = TorchScriptPythonDecoder(traced, example_input=(example,))  # must outlive `loaded`
+        loaded = frontend.load(decoder)
+        model = frontend.convert(loaded)
+    model.inputs[0].get_node().set_element_type(ov.Type.f32)
+    model.reshape(shape)
+    return model
