@@ -124,10 +124,10 @@ class SplineGrid:
         along_x = cubic_basis(t[:, 0], derivative[0]) * scale[0]
         along_y = cubic_basis(t[:, 1], derivative[1]) * scale[1]
         step_x, step_y = self.stride
-        offset = np.arange(4)[:, None] * step_y + np.arange(4) * step_x
-        columns = (cell @ self.stride)[:, None, None] + offset
+        offset = np.arange(4, dtype=np.int32)[:, None] * step_y + np.arange(4, dtype=np.int32) * step_x
+        columns = (cell @ self.stride).astype(np.int32)[:, None, None] + offset
         values = along_y[:, :, None] * along_x[:, None, :]
-        indptr = np.arange(0, 16 * len(u) + 1, 16)
+        indptr = np.arange(0, 16 * len(u) + 1, 16, dtype=np.int32)
         return sparse.csr_matrix((values.ravel(), columns.ravel(), indptr), shape=(len(u), self.size))
 
     @cached_property

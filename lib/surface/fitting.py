@@ -115,7 +115,7 @@ class SurfaceFit:
         for mu, weights, residual in zip(self._mu, self._weights.T, scatter, strict=True):
             # Half of the residuals lie within their median.
             density = 0.25 / max(np.median(np.abs(residual)), np.finfo(float).tiny)
-            band = 2 * density * self._problem.gram_band(weights**2) + 2 * mu * self._problem.bending_band
+            band = self._problem.normal_band(2 * density * weights**2, 2 * mu)
             posterior.append((cholesky_banded(band, lower=True), density))
         return posterior
 

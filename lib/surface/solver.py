@@ -14,7 +14,7 @@ from functools import cache, cached_property
 
 import numpy as np
 from scipy import sparse
-from scipy.linalg import cho_solve_banded, cholesky_banded
+from scipy.linalg.lapack import dpbtrf, dpbtrs
 from threadpoolctl import ThreadpoolController
 
 from lib.surface.bspline import SplineGrid, cubic_basis
@@ -25,7 +25,8 @@ _UNHELD = (
     "smoothness: too small to hold the control points that have no data near them; increase it, or use fewer control "
     "points."
 )
-_PAIRS = [(i, j) for i in range(4) for j in range(i, 4)]
+_PAIRS = np.triu_indices(4)
+_CACHED = 1 << 12  # points whose products stay in the cache
 
 
 class L1Problem:
@@ -58,37 +59,37 @@ class L1Problem:
         return self.grid.bending
 
     @cached_property
-    def bending_band(self) -> np.ndarray:
-        """R as a lower band (bandwidth + 1, size)."""
-        entries = sparse.tril(self.bending).tocoo()
-        band = np.zeros((self.grid.bandwidth + 1, self.grid.size))
-        band[entries.row - entries.col, entries.col] = entries.data
-        return band
-
-    @cached_property
     def by_cells(self) -> tuple[np.ndarray, L1Problem]:
         """Order (n,) of the points by cells, and the problem in that order: neighbours in space are so in memory."""
         order = np.argsort(self.grid.locate(self.u)[0] @ self.grid.stride, kind="stable")
         return order, L1Problem(self.grid, self.u[order])
 
-    def gram_band(self, weights: np.ndarray) -> np.ndarray:
-        """B' diag(weights) B for weights (n,), as a lower band (bandwidth + 1, size).
+    def normal_band(self, weights: np.ndarray, stiffness: float = 0.0) -> np.ndarray:
+        """B' diag(weights) B + stiffness R for weights (n,), as a lower band (bandwidth + 1, size).
 
         A cell's 16 x 16 block is a sum over its points of products of basis functions that separate in x and y, so it
         is one small matrix product of the 10 distinct products along x with the 10 along y.
         """
         slot, (along_x, along_y), layers, scatter = self._blocks
-        n_blocks, _, size = along_x.shape
-        packed = np.zeros(n_blocks * size)
-        packed[slot] = weights
-        blocks = np.matmul(along_y * packed.reshape(n_blocks, 1, size), along_x.transpose(0, 2, 1))
-        cells = blocks[: layers[0][1]]
+        n_blocks, size, _ = along_x.shape
+        packed = np.zeros((n_blocks, size, 1))
+        packed.ravel()[slot] = weights
+        sums = np.empty(1 + 100 * n_blocks)
+        sums[0] = stiffness
+        blocks = sums[1:].reshape(n_blocks, 10, 10)
+        step = max(1, _CACHED // size)
+        for first in range(0, n_blocks, step):
+            part = slice(first, first + step)
+            np.matmul(along_y[part].transpose(0, 2, 1), packed[part] * along_x[part], out=blocks[part])
+        n_cells = layers[0][1]
         for first, last in layers[1:]:
-            cells[: last - first] += blocks[first:last]
-        return (scatter @ cells.ravel()).reshape(self.grid.bandwidth + 1, self.grid.size)
+            blocks[: last - first] += blocks[first:last]
+        # Columns of the band are contiguous, as LAPACK wants them.
+        band = scatter @ sums[: 1 + 100 * n_cells]
+        return band.reshape(self.grid.size, self.grid.bandwidth + 1).T
 
     @cached_property
-    def _blocks(self) -> tuple[np.ndarray, list[np.ndarray], list[tuple[int, int]], sparse.csr_matrix]:
+    def _blocks(self) -> tuple[np.ndarray, list[np.ndarray], list[tuple[int, int]], sparse.csc_matrix]:
         """The points in their cells, in blocks of equal size so that the cells' sums are batched products.
 
         The fullest cells come first, and the blocks in layers (every cell's first block, then the second ones, ...), so
@@ -107,31 +108,37 @@ class L1Problem:
         layers = list(itertools.pairwise(starts.tolist()))
         rank = np.empty(len(u), dtype=np.intp)
         rank[np.argsort(inverse, kind="stable")] = np.arange(len(u)) - np.repeat(np.cumsum(counts) - counts, counts)
-        block = starts[rank // size] + inverse
-        slot = block * size + rank % size
+        slot = (starts[rank // size] + inverse) * size + rank % size
         along = []
         for axis in (0, 1):
             basis = cubic_basis(t[:, axis])
-            products = np.zeros((starts[-1], 10, size))
-            products[block, :, rank % size] = np.stack([basis[:, i] * basis[:, j] for i, j in _PAIRS], axis=1)
+            products = np.zeros((starts[-1], size, 10))
+            products.reshape(-1, 10)[slot] = basis[:, _PAIRS[0]] * basis[:, _PAIRS[1]]
             along.append(products)
 
-        # Where each of the 10 x 10 products of a cell goes in the band.
+        # Where each of the 10 x 10 products of a cell goes in the band, the same in every cell but for a shift; before
+        # them, as the first column, the bending energy.
         step_x, step_y = grid.stride
         i_x, i_y = (axis.ravel() for axis in np.meshgrid(np.arange(4), np.arange(4)))
         local = i_x * step_x + i_y * step_y
         lower_a, lower_b = np.nonzero(local[:, None] >= local[None, :])
         pair = np.zeros((4, 4), dtype=np.intp)
-        for number, (i, j) in enumerate(_PAIRS):
-            pair[i, j] = pair[j, i] = number
+        pair[_PAIRS] = pair[_PAIRS[::-1]] = np.arange(10)
         source = pair[i_y[lower_a], i_y[lower_b]] * 10 + pair[i_x[lower_a], i_x[lower_b]]
+        by_source = np.argsort(source, kind="stable")
+        height = grid.bandwidth + 1
+        goal = (local[lower_b] * height + local[lower_a] - local[lower_b])[by_source]
         first = (cell_id % grid.cells[0]) * step_x + (cell_id // grid.cells[0]) * step_y
-        column = first[:, None] + local[lower_b]
-        row = (local[lower_a] - local[lower_b]) * grid.size + column
-        origin = np.arange(len(cell_id))[:, None] * 100 + source
-        scatter = sparse.csr_matrix(
-            (np.ones(row.size), (row.ravel(), origin.ravel())),
-            shape=((grid.bandwidth + 1) * grid.size, 100 * len(cell_id)),
+        rows = (first * height)[:, None] + goal
+        bending = sparse.tril(grid.bending).tocoo()
+        ends = np.arange(len(cell_id))[:, None] * len(goal) + np.cumsum(np.bincount(source, minlength=100))
+        scatter = sparse.csc_matrix(
+            (
+                np.append(bending.data, np.ones(rows.size)),
+                np.append(bending.col * height + bending.row - bending.col, rows).astype(np.int32),
+                np.append([0, bending.nnz], bending.nnz + ends).astype(np.int32),
+            ),
+            shape=(height * grid.size, 1 + ends.size),
         )
         return slot, along, layers, scatter
 
@@ -220,7 +227,7 @@ def _interior_point(
 
     # A least-squares spline starts it, and its residuals give the unit of length.
     unit = max(np.abs(x).max(), np.finfo(float).tiny)
-    factor = _cholesky(problem.gram_band(w) + 2 * mu / unit * problem.bending_band)
+    factor = _cholesky(problem.normal_band(w, 2 * mu / unit))
     if factor is None:
         raise ValueError(_UNHELD)
     c = _solve(factor, B_T @ (w * x))
@@ -229,51 +236,67 @@ def _interior_point(
     x, c, residual = x / scale, c / scale, residual / scale
     bend = 2 * mu * scale  # the quadratic term grows as scale^2, the L1 term as scale
 
-    # Start inside: y follows the sign of the residual, and the split leaves room on both sides.
-    smooth = np.sqrt(residual**2 + 1.0)
-    y = 0.9 * w * residual / smooth
+    # On the central path but for the dual residual: p - q = residual and p (w - y) = q (w + y) = w.  Every step keeps
+    # the former, so it is never computed again, and shrinks the dual residual by what it leaves of its full length.
+    smooth = 1.0 + np.sqrt(residual**2 + 1.0)
     p, q = (smooth + residual) / 2, (smooth - residual) / 2
-    slack_p, slack_q = w - y, w + y
+    slack_p, slack_q = w / p, w / q
+    dual_residual = np.abs(B_T @ (w - slack_p) + bend * (R @ c)).sum()
 
-    for iteration in range(max_iterations + 1):
+    def certificate() -> tuple[float, float]:
+        """Objective, and bound on how far it lies above the minimum, from nothing but c and y."""
         residual = B @ c - x
-        bending_pull = bend * (R @ c)
-        # Each dual variable from its smaller slack, which keeps its digits.
-        y = np.where(slack_p < slack_q, w - slack_p, slack_q - w)
-        dual_residual = B_T @ y + bending_pull
         objective = w @ np.abs(residual) + c @ bending_pull / 2
         # For every c*: F(c*) >= F(c) - (sum w|r| - y.r) + dual_residual.(c* - c), by convexity.
         gap = np.maximum(w * np.abs(residual) - y * residual, 0.0).sum()
-        gap += np.abs(dual_residual).sum() * np.abs(c).max()
-        if gap <= tolerance * max(objective, 1e-9 * total) or iteration == max_iterations:
+        return objective, gap + np.abs(B_T @ y + bending_pull).sum() * np.abs(c).max()
+
+    for iteration in range(max_iterations + 1):
+        bending_pull = bend * (R @ c)
+        # Each dual variable from its smaller slack, which keeps its digits.
+        y = np.where(slack_p < slack_q, w - slack_p, slack_q - w)
+        product_p, product_q = p * slack_p, q * slack_q
+        complementarity = product_p.sum() + product_q.sum()
+        # The proof costs two products with B, so it waits until it can succeed.
+        enough = tolerance * max(w @ (p + q) + c @ bending_pull / 2, 1e-9 * total)
+        if complementarity + dual_residual * np.abs(c).max() <= 4 * enough:
+            objective, gap = certificate()
+            if gap <= tolerance * max(objective, 1e-9 * total):
+                break
+        p_over, q_over = p / slack_p, q / slack_q
+        D = 1.0 / (p_over + q_over)
+        factor = None
+        if iteration < max_iterations:
+            factor = _cholesky(problem.normal_band(D, bend))
+        if factor is None:  # no more steps, or the limit of double precision: the gap says how near we are
+            objective, gap = certificate()
             break
 
-        D = 1.0 / (p / slack_p + q / slack_q)
-        factor = _cholesky(problem.gram_band(D) + bend * problem.bending_band)
-        if factor is None:  # at the limit of double precision: the gap says how near we are
-            break
-        primal_residual = residual - p + q
+        def newton(pull, D=D, factor=factor, y=y, bending_pull=bending_pull):
+            """Newton step (dc, dy) that closes the dual residual, with D (B dc + pull) = dy."""
+            pull = D * pull
+            dc = _solve(factor, -bending_pull - B_T @ (y + pull))
+            dy = D * (B @ dc)
+            dy += pull
+            return dc, dy
 
-        def step(g_p, g_q, D=D, factor=factor, r_d=dual_residual, r_p=primal_residual, slack=(slack_p, slack_q)):
-            """Newton step that changes p (w - y) by g_p and q (w + y) by g_q to first order, and closes residuals."""
-            g_p, g_q = g_p / slack[0], g_q / slack[1]
-            h = D * (r_p - g_p + g_q)
-            dc = _solve(factor, -r_d - B_T @ h)
-            dy = D * (B @ dc) + h
-            dp, dq = g_p + p / slack[0] * dy, g_q - q / slack[1] * dy  # noqa: B023
-            return dc, dp, dq, dy
-
-        # Predictor: straight to the solution; how far it gets tells how much centring the corrector needs.
-        centrality = (p @ slack_p + q @ slack_q) / (2 * total)
-        _, dp, dq, dy = step(-p * slack_p, -q * slack_q)
-        alpha = _step_length((p, dp), (q, dq), (slack_p, -dy), (slack_q, dy))
-        ahead = (p + alpha * dp) @ (slack_p - alpha * dy) + (q + alpha * dq) @ (slack_q + alpha * dy)
-        target = centrality * min(ahead / (2 * total * centrality), 1.0) ** 3
-        # Corrector: centring and the second-order term of the complementarity.
-        dc, dp, dq, dy = step(target * w - p * slack_p + dp * dy, target * w - q * slack_q - dq * dy)
-        alpha = 0.995 * _step_length((p, dp), (q, dq), (slack_p, -dy), (slack_q, dy))
+        # Predictor: straight to the solution, where both products vanish; how far it gets tells how much centring the
+        # corrector needs, and dp dy and dq dy tell its second-order term.
+        _, dy = newton(p - q)
+        ratio_p, ratio_q = dy / slack_p, dy / slack_q
+        alpha = 1.0 / max(1.0, 1.0 - ratio_p.min(), ratio_p.max(), 1.0 + ratio_q.max(), -ratio_q.min())
+        bent_p, bent_q = product_p * ratio_p * (1.0 - ratio_p), -product_q * ratio_q * (1.0 + ratio_q)
+        ahead = (1.0 - alpha) * complementarity + alpha**2 * (bent_p.sum() + bent_q.sum())
+        centrality = complementarity / (2 * total)
+        target = centrality * min(ahead / complementarity, 1.0) ** 3 * w
+        # Corrector.
+        goal_p, goal_q = (target - bent_p) / slack_p, (target - bent_q) / slack_q
+        dc, dy = newton(p - q - goal_p + goal_q)
+        dp, dq = goal_p - p + p_over * dy, goal_q - q - q_over * dy
+        alpha = (1.0 - np.clip(centrality, 1e-3, 5e-3)) * _step_length((p, dp), (q, dq), (slack_p, -dy), (slack_q, dy))
         c, p, q = c + alpha * dc, p + alpha * dp, q + alpha * dq
         slack_p, slack_q = slack_p - alpha * dy, slack_q + alpha * dy
+        dual_residual *= 1.0 - alpha
 
     return c * scale + centre, objective * scale, gap * scale, y, iteration
 
@@ -294,15 +317,13 @@ def _step_length(*pairs: tuple[np.ndarray, np.ndarray]) -> float:
 
 
 def _solve(factor: np.ndarray, rhs: np.ndarray) -> np.ndarray:
-    return cho_solve_banded((factor, True), rhs, check_finite=False)
+    return dpbtrs(factor, rhs, lower=1)[0]
 
 
 def _cholesky(band: np.ndarray) -> np.ndarray | None:
-    """Lower factor of a banded matrix; None where it is not positive definite in double precision."""
-    try:
-        return cholesky_banded(band, lower=True, overwrite_ab=True, check_finite=False)
-    except np.linalg.LinAlgError:
-        return None
+    """Lower factor of a banded matrix, which is overwritten; None where it is not positive definite in double precision."""
+    factor, info = dpbtrf(band, lower=1, overwrite_ab=1)
+    return None if info else factor
 
 
 def cvxpy_reference(
@@ -357,7 +378,7 @@ def least_squares(
     w = np.ones_like(x) if weights is None else weights
     coefficients = np.empty((problem.grid.size, k))
     for j, mu_j in enumerate(np.broadcast_to(mu, k)):
-        factor = _cholesky(problem.gram_band(w[:, j] ** 2) + mu_j * problem.bending_band)
+        factor = _cholesky(problem.normal_band(w[:, j] ** 2, mu_j))
         if factor is None:
             raise ValueError(_UNHELD)
         coefficients[:, j] = _solve(factor, problem.design_T @ (w[:, j] ** 2 * x[:, j]))

@@ -71,15 +71,15 @@ def test_no_step_downhill_is_left():
         assert value.min() >= found.objective[0] * (1 - 1e-8)
 
 
-def test_the_banded_gram_matrix_is_the_dense_one():
+def test_the_banded_normal_matrix_is_the_dense_one():
     u, _ = noisy_points(300)
     u = np.vstack([u, u[:40] * 0.01])  # one crowded cell among sparse ones
     grid = SplineGrid(DOMAIN, (11, 7))
     problem = L1Problem(grid, u)
     weights = np.random.default_rng(0).uniform(size=len(u))
     B = problem.design.toarray()
-    dense = (B.T * weights) @ B
-    band = problem.gram_band(weights)
+    dense = (B.T * weights) @ B + 3e3 * grid.bending.toarray()
+    band = problem.normal_band(weights, 3e3)
     for diagonal in range(grid.bandwidth + 1):
         np.testing.assert_allclose(band[diagonal, : grid.size - diagonal], np.diag(dense, -diagonal), atol=1e-12)
     assert np.count_nonzero(np.tril(dense, -grid.bandwidth - 1)) == 0
