@@ -27,7 +27,7 @@ from lib.calibration.affine import Moments, affine_minimum
 from lib.calibration.estimate import calibrate
 from lib.simulator.rig import simulate_correspondences
 
-__all__ = ["main", "solve_with_ceres", "solve_with_scipy"]
+__all__ = ["main", "recorded", "solve_with_ceres", "solve_with_scipy"]
 
 
 def _problem(n: int, seed: int) -> tuple[np.ndarray, np.ndarray, float, float]:
@@ -359,6 +359,12 @@ def _plain(value: object) -> object:
     if isinstance(value, (np.floating, float)):
         return float(f"{float(value):.6g}")
     return value.item() if isinstance(value, np.generic) else value
+
+
+def recorded(study: str) -> dict | None:
+    """What `study` found when it was last run for the results file; None where it has not been."""
+    path = paths.RESULTS / "calibration.json"
+    return json.loads(path.read_text()).get(study, {}).get("result") if path.is_file() else None
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -5,10 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from matplotlib.axis import Axis
+from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
+from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullFormatter
 
 from lib.calibration.estimate import Calibration
 from lib.calibration.ladder import Comparison
+from lib.calibration.offsets import OffsetCalibration
 from lib.calibration.real_robot import RobotFrames, SphereFit
 from lib.calibration.studies import NoiseStudy
 from lib.figures.style import COLOURS, LANDMARK_COLOURS, figure, show_image
@@ -17,18 +21,25 @@ from lib.geometry import RigidTransform
 __all__ = [
     "advice_curves",
     "advice_view",
+    "checkerboards",
     "correspondences",
     "ellipsoids",
     "focal_lengths",
     "frame_residuals",
     "ladder",
     "noise_errors",
+    "offsets",
     "residuals",
+    "resolutions",
     "robot_frames",
     "shallow_bias",
     "time_offset",
     "working_distance",
 ]
+
+
+#: Colours of the depth uncertainty in `advice_view`.
+DEPTH_SCALE_UM = (30.0, 2000.0)
 
 
 def correspondences(x_mm: np.ndarray, u_left: np.ndarray, u_right: np.ndarray, size_px: tuple[int, int]) -> Figure:
@@ -38,8 +49,10 @@ def correspondences(x_mm: np.ndarray, u_left: np.ndarray, u_right: np.ndarray, s
     axes = page.add_subplot(1, 3, 1, projection="3d")
     colour = x_mm[:, 2]
     axes.scatter(*x_mm.T, c=colour, s=8)
-    axes.set(xlabel="x (mm)", ylabel="y (mm)", zlabel="z (mm)", title="Robot: where the landmarks were")
-    axes.set_box_aspect(np.ptp(x_mm, axis=0))
+    axes.set(xlabel="x (mm)", ylabel="y (mm)", zlabel="z (mm)")
+    axes.set_title("Robot: where the landmarks were", y=0.92)
+    axes.set_box_aspect(np.ptp(x_mm, axis=0), zoom=0.8)
+    axes.locator_params(nbins=4)
     for i, (u, side) in enumerate(((u_left, "Left"), (u_right, "Right"))):
         flat = page.add_subplot(1, 3, i + 2)
         flat.scatter(*u.T, c=colour, s=8)
@@ -51,6 +64,13 @@ def correspondences(x_mm: np.ndarray, u_left: np.ndarray, u_right: np.ndarray, s
             title=f"{side} image: where they were seen",
         )
     return page
+
+
+def _plain_log(axis: Axis, ticks: Sequence[float] | None = None) -> None:
+    """Plain numbers on a logarithmic axis: 1, 2, 5 and their decades, or `ticks`."""
+    axis.set_major_locator(FixedLocator(ticks) if ticks is not None else LogLocator(subs=(1, 2, 5)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
 
 
 def noise_errors(study: NoiseStudy) -> Figure:
@@ -65,6 +85,8 @@ def noise_errors(study: NoiseStudy) -> Figure:
             ax.plot(study.sigma_u_px, middle, "o-", color=COLOURS[colour], label=name)
             ax.fill_between(study.sigma_u_px, low, high, color=COLOURS[colour], alpha=0.2, linewidth=0)
         ax.set(xlabel="detector noise (px per coordinate)", ylabel=unit, title=title, xscale="log", yscale="log")
+        _plain_log(ax.xaxis, study.sigma_u_px)
+        _plain_log(ax.yaxis)
         ax.legend()
     return page
 
@@ -76,7 +98,7 @@ def focal_lengths(found_px: np.ndarray, true_px: float) -> Figure:
     ax.hist(found_px, bins=bins, color=COLOURS["paper"], label="perspective DLT, decomposed")
     ax.axvline(true_px, color=COLOURS["truth"], linewidth=2.5, label="true focal length")
     ax.set(xscale="log", xlabel="focal length (px)", ylabel="runs", title="A far camera's focal length is noise")
-    ax.legend(loc="upper center")
+    ax.legend(loc="upper left")
     return page
 
 
@@ -100,6 +122,7 @@ def shallow_bias(half_depth_mm: Sequence[float], ratios: Mapping[str, np.ndarray
         ylim=(0.7, 1.6),
         title="Weights matter where the sweep is shallow",
     )
+    _plain_log(ax.xaxis, half_depth_mm)
     ax.legend(ncols=2)
     return page
 
@@ -160,7 +183,9 @@ def advice_view(
     plane = robot_from_microscope.apply(np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]))
     depth = 1e3 * calibration.depth_sd_mm(plane).reshape(x.shape)
     extent = (-half_size_mm[0], half_size_mm[0], -half_size_mm[1], half_size_mm[1])
-    image = ax.imshow(depth, extent=extent, origin="lower", cmap="viridis", vmin=0, aspect="equal")
+    # One scale whatever the slider says, so that the colours tell of progress.
+    norm = LogNorm(*DEPTH_SCALE_UM, clip=True)
+    image = ax.imshow(depth, extent=extent, origin="lower", cmap="viridis_r", norm=norm, aspect="equal")
     used, advised = (robot_from_microscope.inverse().apply(p) for p in (calibration.x_mm, advised_mm[None]))
     ax.plot(
         *used[:, :2].T,
@@ -180,7 +205,7 @@ def advice_view(
         label="go here next",
         clip_on=False,
     )
-    page.colorbar(image, ax=ax, label="depth sd from calibration (um)")
+    _plain_log(page.colorbar(image, ax=ax, label="depth sd from calibration (um)").ax.yaxis)
     ax.set(xlabel="x (mm)", ylabel="y (mm)")
     ax.set_title(f"{len(used)} correspondences: {depth.mean():.0f} um mean, {depth.max():.0f} um worst", pad=14)
     ax.grid(False)
@@ -199,6 +224,7 @@ def advice_curves(curves: Mapping[str, np.ndarray], start: int) -> Figure:
         yscale="log",
         title="Where the tool goes matters more than how often",
     )
+    _plain_log(ax.yaxis)
     ax.legend()
     return page
 
@@ -300,7 +326,80 @@ def time_offset(offsets_ms: np.ndarray, reprojection_px: np.ndarray, found_ms: f
         ylabel="reprojection RMS (px)",
         title="The clocks reveal themselves",
     )
-    ax.legend()
+    ax.legend(loc="lower right")
+    return page
+
+
+def checkerboards(results: Mapping[str, Mapping[str, Mapping[str, float]]], paper_um: float = 25.479) -> Figure:
+    """Errors of reconstructed checkerboards, a panel a kind of optics: {optics: {"model, estimate": errors in um}}."""
+    page, axes = figure(1, len(results), width_in=13, height_in=4.4, sharey=True, squeeze=False)
+    for ax, (title, errors) in zip(axes[0], results.items(), strict=True):
+        at = np.arange(len(errors))
+        for key, offset, colour, name in (
+            ("aligned_um", -0.2, "ours", "after rigid alignment"),
+            ("robot_um", 0.2, "baseline", "in the robot frame"),
+        ):
+            values = [e[key] for e in errors.values()]
+            ax.barh(at + offset, values, 0.4, color=COLOURS[colour], label=name)
+            for y, value in zip(at + offset, values, strict=True):
+                ax.text(value + 0.6, y, f"{value:.1f}", va="center", fontsize=8)
+        ax.axvline(paper_um, color=COLOURS["paper"], linestyle="--", label="the paper, aligned")
+        ax.set(yticks=at, xlabel="RMS 3D distance to the grid (um)", title=title[0].upper() + title[1:])
+        ax.set_yticklabels([name.replace("_", " ") for name in errors])
+        ax.margins(x=0.1)
+        ax.grid(axis="y", visible=False)
+    axes[0, 0].invert_yaxis()  # shared
+    axes[0, -1].legend(loc="lower right", fontsize=8)
+    return page
+
+
+def resolutions(study: Mapping[str, Mapping[str, float]]) -> Figure:
+    """The paper's figure: 3D and reprojection error of calibrations from labels and from detectors at four resolutions."""
+    page, axes = figure(1, 2, width_in=12, height_in=3.8)
+    names = [f"{name}\n{row['sigma_u_px']:.1f} px" for name, row in study.items()]
+    at = np.arange(len(names))
+    for ax, key, unit, title in (
+        (axes[0], "triangulation_um", "um", "Triangulation error (3D RMS)"),
+        (axes[1], "projection_px", "px", "Projection error (RMS)"),
+    ):
+        for model, offset, colour in (("affine", -0.2, "ours"), ("perspective", 0.2, "paper")):
+            values = [row[f"{model}_{key}"] for row in study.values()]
+            ax.bar(
+                at + offset,
+                values,
+                0.4,
+                color=COLOURS[colour],
+                label="affine" if model == "affine" else "perspective DLT",
+            )
+            for x, value in zip(at + offset, values, strict=True):
+                ax.text(x, value, f"{value:.3g}", ha="center", va="bottom", fontsize=8)
+        ax.set(xticks=at, xticklabels=names, ylabel=unit, title=title, yscale="log")
+        ax.grid(axis="x", visible=False)
+        ax.margins(y=0.2)
+        _plain_log(ax.yaxis)
+    axes[1].set_xlabel("what was calibrated from, and its error a coordinate")
+    axes[0].legend()
+    return page
+
+
+def offsets(names: Sequence[str], found: OffsetCalibration, *, unit_um: float = 1e3) -> Figure:
+    """Where the landmarks are seen, in the tool's axes, with two standard deviations."""
+    page, ax = figure(width_in=8.5, height_in=3.4)
+    at = np.arange(3)
+    for k, name in enumerate(names):
+        ax.errorbar(
+            at + 0.2 * (k - 1), unit_um * found.offset[k], 2 * unit_um * found.standard_deviation[k], fmt="o",
+            color=LANDMARK_COLOURS[name], markeredgecolor="black", ecolor="black", capsize=4, label=name,
+        )  # fmt: skip
+    ax.axhline(0, color="black", linewidth=0.8)
+    ax.set(
+        xticks=at,
+        xticklabels=["along the tool", "from tip to tip", "normal to both"],
+        ylabel="seen minus reported (um)",
+        title="Is a landmark where the robot says it is?",
+    )
+    ax.legend(loc="upper center", ncols=3)
+    ax.margins(y=0.25)
     return page
 
 
