@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import matplotlib.pyplot as plt
@@ -21,7 +22,11 @@ from lib.surface import BSplineSurface, Mesh
 if TYPE_CHECKING:
     import plotly.graph_objects as go
 
+    from lib.surface.evaluation import Case
+
 __all__ = [
+    "case_table",
+    "cases",
     "descriptor_channels",
     "disparity_errors",
     "epipolar_geometry",
@@ -39,7 +44,9 @@ __all__ = [
     "score_table",
     "smoothness_sections",
     "smoothness_slider",
+    "sparsification",
     "stereo_pair",
+    "table",
 ]
 
 _SIGNED = "RdBu_r"
@@ -243,13 +250,7 @@ def score_table(scores: dict[str, dict[str, tuple[Matches, DisparityScore, float
         for pair, found in scores.items()
         for method, (m, s, seconds) in found.items()
     ]
-    page, ax = figure(width_in=9, height_in=0.32 * len(rows) + 0.6)
-    ax.axis("off")
-    table = ax.table(rows, colLabels=header, loc="center", cellLoc="center", edges="horizontal")
-    table.auto_set_font_size(False)
-    table.set_fontsize(10)
-    table.scale(1, 1.4)
-    return page
+    return table(header, rows)
 
 
 def error_maps(maps_um: dict[str, np.ndarray], *, limit_um: float | None = None, signed: bool = True) -> Figure:
@@ -301,6 +302,23 @@ def reconstruction(
 
     `mask` (h, w), True = no surface there.
     """
+    page = plt.figure(figsize=(14, 4.4), layout="constrained")
+    left, right = page.add_subplot(1, 2, 1), page.add_subplot(1, 2, 2, projection="3d")
+    step_mm = _surface_views(left, right, image, surface, rig, mask)
+    left.set_title(f"Lines of equal depth, every {step_mm:g} mm")
+    right.set_title("The surface, depth drawn twofold")
+    return page
+
+
+def _surface_views(
+    flat: Axes,
+    oblique: Axes,
+    image: np.ndarray,
+    surface: BSplineSurface,
+    rig: StereoRig,
+    mask: np.ndarray | None = None,
+) -> float:
+    """Iso-depth lines over the image, and a still of the surface; returns the lines' spacing in mm."""
     h, w = image.shape[:2]
     step = max(1, w // 128)
     y, x = np.arange(0, h, step), np.arange(0, w, step)
@@ -309,17 +327,98 @@ def reconstruction(
     points -= np.nanmean(points, axis=(0, 1))
     if mask is not None:
         points[mask[np.ix_(y, x)]] = np.nan
-    page = figure(width_in=14, height_in=4.4)[0]
-    page.clf()
-    left, right = page.add_subplot(1, 2, 1), page.add_subplot(1, 2, 2, projection="3d")
-    depth = np.full((h, w), np.nan)
-    depth[np.ix_(y, x)] = points[..., 2]
-    show_image(left, image, "Lines of equal depth, every 0.1 mm")
-    levels = np.arange(np.floor(np.nanmin(points[..., 2]) * 10), np.nanmax(points[..., 2]) * 10 + 1) / 10
-    left.contour(x, y, np.ma.masked_invalid(points[..., 2]), levels=levels, cmap="viridis_r", linewidths=1.1)
-    mesh_still(right, points, image[np.ix_(y, x)])
-    right.set_title("The surface, depth drawn twofold")
+    depth = points[..., 2]
+    step_mm = 0.1 if np.nanmax(depth) - np.nanmin(depth) < 2.5 else 0.2
+    levels = np.arange(np.floor(np.nanmin(depth) / step_mm), np.nanmax(depth) / step_mm + 1) * step_mm
+    show_image(flat, image)
+    flat.contour(x, y, np.ma.masked_invalid(depth), levels=levels, cmap="viridis_r", linewidths=1.1)
+    mesh_still(oblique, points, image[np.ix_(y, x)])
+    return step_mm
+
+
+def cases(found: Sequence[Case], *, limit_um: float = 60.0) -> Figure:
+    """A row for each simulated scene: the left image, the surface as lines and as a body, the error along the view.
+
+    Where a scene is an eye, the error of the sphere prior stands last.
+    """
+    with_sphere = any(one.sphere_error_mm is not None for one in found)
+    columns = 5 if with_sphere else 4
+    page = plt.figure(figsize=(3.7 * columns, 2.55 * len(found)), layout="constrained")
+    maps = []
+    for row, one in enumerate(found):
+        axes = [
+            page.add_subplot(len(found), columns, row * columns + k + 1, projection="3d" if k == 2 else None)
+            for k in range(columns)
+        ]
+        pair, view = one.pair, one.pair.rig.left.viewing_direction
+        show_image(axes[0], pair.left, f"{pair.name}: left image")
+        step_mm = _surface_views(axes[1], axes[2], pair.left, one.found.surface, pair.rig)
+        axes[2].set(xlabel="", ylabel="", zlabel="", xticklabels=[], yticklabels=[], zticklabels=[])
+        axes[2].set_title("Depth drawn twofold")
+        axes[1].set_title(f"Depth lines, every {step_mm:g} mm")
+        for ax, error, rms, name in zip(
+            axes[3:],
+            (one.error_mm, one.sphere_error_mm),
+            (one.rms_um, one.sphere_rms_um),
+            ("surface", "sphere prior"),
+            strict=False,
+        ):
+            if error is None:
+                continue
+            show_image(ax, np.where(one.seen, 1e3 * error @ view, np.nan), f"{name}: {rms:.1f} um RMS")
+            ax.images[0].set(cmap=_SIGNED, clim=(-limit_um, limit_um))
+            ax.set_facecolor("#dddddd")
+            maps.append(ax)
+    page.colorbar(maps[0].images[0], ax=maps, label="depth error (um)", shrink=0.8)
     return page
+
+
+def sparsification(curves: dict[str, dict[str, tuple[float, np.ndarray]]], kept: np.ndarray) -> Figure:
+    """For each set of matches the share of wrong ones among the surest `kept` (k,), by each confidence (AUC, share)."""
+    page, axes = figure(1, len(curves), width_in=4.6 * len(curves), height_in=3.3, squeeze=False)
+    colours = {"score": "ours", "peak_ratio": "warning", "reciprocal": "truth"}
+    for ax, (name, measures) in zip(axes[0], curves.items(), strict=True):
+        for measure, (auc, share) in measures.items():
+            label = f"{measure.replace('_', ' ')} (AUC {auc:.2f})"
+            ax.plot(100 * kept, 100 * share, color=COLOURS[colours[measure]], label=label)
+        ax.axhline(100 * next(iter(measures.values()))[1][-1], color=COLOURS["baseline"], ls="--", label="told nothing")
+        ax.set(xlabel="surest matches kept (%)", title=name, ylim=(0, None))
+        ax.legend(fontsize=8)
+    axes[0, 0].set_ylabel("wrong by more than 2 px (%)")
+    return page
+
+
+def table(header: Sequence[str], rows: Sequence[Sequence[str]], *, width_in: float = 9.0) -> Figure:
+    """Rows of text under a header."""
+    page, ax = figure(width_in=width_in, height_in=0.32 * len(rows) + 0.6)
+    ax.axis("off")
+    drawn = ax.table(
+        [list(row) for row in rows], colLabels=list(header), loc="center", cellLoc="center", edges="horizontal"
+    )
+    drawn.auto_set_font_size(False)
+    drawn.set_fontsize(10)
+    drawn.scale(1, 1.4)
+    return page
+
+
+def case_table(found: Sequence[Case]) -> Figure:
+    """Surface error of simulated scenes, and of the sphere prior on eyes."""
+    header = ["scene", "matches used", "surface RMS (um)", "depth RMS (um)", "sphere prior RMS (um)", "times better"]
+    rows = []
+    for one in found:
+        depth = 1e3 * one.error_mm[one.seen] @ one.pair.rig.left.viewing_direction
+        sphere = one.sphere_error_mm is not None
+        rows.append(
+            [
+                one.pair.name,
+                f"{one.found.surface.inliers.sum()}",
+                f"{one.rms_um:.1f}",
+                f"{np.sqrt(np.nanmean(depth**2)):.1f}",
+                f"{one.sphere_rms_um:.0f}" if sphere else "",
+                f"{one.sphere_rms_um / one.rms_um:.0f}" if sphere else "",
+            ]
+        )
+    return table(header, rows, width_in=11)
 
 
 def mesh_view(mesh: Mesh, *, height_px: int = 520) -> go.Figure:

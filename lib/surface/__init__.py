@@ -15,6 +15,7 @@ from lib.surface.export import (
     surface_mesh,
 )
 from lib.surface.fitting import SurfaceFit, fit_surface, held_out_errors
+from lib.surface.joint import refine_rig
 from lib.surface.reconstruct import EPIPOLAR_SIGMAS, Reconstruction, epipolar_inliers, reconstruct
 from lib.surface.sphere import Sphere, fit_sphere
 
@@ -34,6 +35,7 @@ __all__ = [
     "fit_surface",
     "held_out_errors",
     "reconstruct",
+    "refine_rig",
     "remove_outliers",
     "save_depth_map",
     "save_mesh",

@@ -3,25 +3,42 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
+from scipy.interpolate import RegularGridInterpolator
 
 from lib.cameras import AffineCamera, StereoRig
+from lib.geometry import RigidTransform
 from lib.matching import RECTIFIED, DisparityScore, Matches, match, score_against_disparity
+from lib.simulator.dataset import TEST_SEQUENCES, sequence_design, sequence_name
+from lib.simulator.eye import Scene
+from lib.simulator.microscope import Microscope
+from lib.simulator.render import render_pair, surface_grid
+from lib.simulator.rig import IMAGE_SIZE_PX, ROBOT_FROM_MICROSCOPE
+from lib.simulator.scenes import OBJECTS, Relief
 from lib.surface.bspline import BSplineSurface
-from lib.surface.sphere import Sphere
+from lib.surface.reconstruct import Reconstruction, reconstruct
+from lib.surface.sphere import Sphere, fit_sphere
 
 __all__ = [
+    "Case",
     "RealPair",
+    "SimulatedPair",
+    "aligned_rms_um",
+    "case",
     "compare_matchers",
     "error_variants",
+    "eyes",
+    "objects",
     "real_pair",
     "rms_um",
+    "simulated_pair",
     "surface_error_mm",
+    "wrong_matches",
 ]
 
 TruthSurface = Callable[[np.ndarray], np.ndarray]
@@ -51,6 +68,123 @@ def rms_um(error_mm: np.ndarray, where: np.ndarray | None = None) -> float:
     return float(1000 * np.sqrt(np.mean(length[chosen] ** 2))) if chosen.any() else float("nan")
 
 
+def aligned_rms_um(error_mm: np.ndarray, truth_mm: np.ndarray, where: np.ndarray | None = None) -> dict[str, float]:
+    """RMS length in um of errors (..., 3) of points `truth_mm` (..., 3): as they are, and after alignment to the truth.
+
+    "robot frame" is what a tool would notice.  "rigid" and "affine" take out the best motion and the best affine map,
+    which is all that a wrong affine calibration of exact matches can cause: what is left is the matching's.
+    """
+    chosen = np.isfinite(error_mm).all(axis=-1) & np.isfinite(truth_mm).all(axis=-1)
+    if where is not None:
+        chosen &= where
+    truth, error = truth_mm[chosen], error_mm[chosen]
+    if len(truth) < 4:
+        return dict.fromkeys(("robot frame", "rigid", "affine"), float("nan"))
+    found = truth + error
+    a, b = found - found.mean(axis=0), truth - truth.mean(axis=0)
+    U, _, Vt = np.linalg.svd(a.T @ b)
+    R = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
+    design = np.column_stack([a, np.ones(len(a))])
+    remaining = {
+        "robot frame": error,
+        "rigid": a @ R - b,
+        "affine": design @ np.linalg.lstsq(design, b, rcond=None)[0] - b,
+    }
+    return {name: float(1000 * np.sqrt((e**2).sum(axis=1).mean())) for name, e in remaining.items()}
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedPair:
+    """Images (h, w, 3) uint8 of one scene, the exact `rig` in the robot frame, and `truth(u)`: the surface point (n, 3) mm
+    that the left camera sees at pixels (n, 2); `eye` tells whether a sphere is a prior for it."""
+
+    name: str
+    left: np.ndarray
+    right: np.ndarray
+    rig: StereoRig
+    truth: TruthSurface
+    eye: bool
+
+
+def simulated_pair(
+    name: str, scene: Scene, microscope: Microscope, *, seed: int = 0, eye: bool = True
+) -> SimulatedPair:
+    """One pair of a scene without a tool; a full-HD pair takes 1.5 CPU seconds, and an eye's texture as much."""
+    views = render_pair(scene, microscope, rng=np.random.default_rng([seed, 109]))
+    rig = microscope.rig()
+    x_px, y_px, x_mm = surface_grid(
+        scene, microscope.rig(RigidTransform.identity()).left, microscope.image_size_px, step_px=4
+    )
+    truth = RegularGridInterpolator((y_px, x_px), ROBOT_FROM_MICROSCOPE.apply(x_mm), bounds_error=False)
+    return SimulatedPair(name, views[0].image, views[1].image, rig, lambda u: truth(np.asarray(u)[:, ::-1]), eye)
+
+
+def eyes(*, shrink: int = 1, seed: int = 0) -> Iterator[SimulatedPair]:
+    """The eyes of the simulated data set's three test sequences, through their microscopes."""
+    for index in TEST_SEQUENCES:
+        design = sequence_design(seed, index, shrink=shrink)
+        yield simulated_pair(sequence_name(index).replace("_", " "), design.eye, design.microscope, seed=index)
+
+
+def objects(*, shrink: int = 1) -> Iterator[SimulatedPair]:
+    """The four everyday objects under the reference rig."""
+    microscope = Microscope(
+        image_size_px=tuple(side // shrink for side in IMAGE_SIZE_PX),
+        pixels_per_mm=tuple(zoom / shrink for zoom in Microscope.pixels_per_mm),
+    )
+    for index, name in enumerate(OBJECTS):
+        yield simulated_pair(name, Relief(name), microscope, seed=index, eye=False)
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """A simulated pair, what was reconstructed, and its errors on a lattice of left pixels.
+
+    Attributes
+    ----------
+    x_px, y_px:
+        The lattice.
+    error_mm:
+        (len(y), len(x), 3) of the surface; `sphere_error_mm` of the sphere prior, None for objects.
+    seen:
+        (len(y), len(x)) bool, False under reflections.
+    rms_um, sphere_rms_um:
+        3D, over what is seen; `sphere_rms_um` is NaN for objects.
+    """
+
+    pair: SimulatedPair
+    found: Reconstruction
+    x_px: np.ndarray
+    y_px: np.ndarray
+    error_mm: np.ndarray
+    sphere_error_mm: np.ndarray | None
+    seen: np.ndarray
+    rms_um: float
+    sphere_rms_um: float
+
+
+def case(pair: SimulatedPair, **options) -> Case:
+    """Reconstruct a simulated pair with its true cameras, and judge it; `options` go to `reconstruct`."""
+    height, width = pair.left.shape[:2]
+    step = max(1, width // 160)
+    x_px, y_px = np.arange(0, width, step), np.arange(0, height, step)
+    found = reconstruct(pair.left, pair.right, pair.rig, **options)
+    seen = ~found.mask_left[np.ix_(y_px, x_px)]
+    error = surface_error_mm(found.surface, pair.truth, x_px, y_px)
+    sphere_error = None
+    if pair.eye:
+        sphere_error = surface_error_mm(fit_sphere(found.points.x_mm), pair.truth, x_px, y_px, camera=pair.rig.left)
+    sphere_rms = rms_um(sphere_error, seen) if pair.eye else float("nan")
+    return Case(pair, found, x_px, y_px, error, sphere_error, seen, rms_um(error, seen), sphere_rms)
+
+
+def wrong_matches(matches: Matches, truth: TruthSurface, rig: StereoRig, *, limit_px: float = 2.0) -> np.ndarray:
+    """Which matches (n,) end more than `limit_px` from where the true surface is seen, 1 or 0; NaN off the truth."""
+    x = truth(matches.u_left)
+    off = np.linalg.norm(matches.u_right - rig.right.project(x), axis=1)
+    return np.where(np.isfinite(off), off > limit_px, np.nan)
+
+
 def error_variants(
     variants: Mapping[str, tuple[BSplineSurface | Sphere, StereoRig]],
     truth: TruthSurface,
@@ -71,6 +205,16 @@ class RealPair:
     left: np.ndarray
     right: np.ndarray
     disparity_px: np.ndarray
+
+    def wrong_matches(self, matches: Matches, *, limit_px: float = 2.0) -> np.ndarray:
+        """Which matches (n,) miss the disparity by more than `limit_px`, 1 or 0; NaN where it is not known.
+
+        Where the disparity is known but the right camera is blocked every match counts as it is: wrong, as a rule.
+        """
+        height, width = self.disparity_px.shape
+        x, y = np.clip(np.rint(matches.u_left), 0, (width - 1, height - 1)).astype(int).T
+        off = np.abs(matches.u_left[:, 0] - matches.u_right[:, 0] - self.disparity_px[y, x])
+        return np.where(np.isfinite(off), off > limit_px, np.nan)
 
 
 def real_pair(folder: Path) -> RealPair:

@@ -1,0 +1,238 @@
+"""Evidence: every claim on matching and surfaces measured anew and written to ``data/results/reconstruction.json``.
+
+python3 -m lib.surface.studies [--out FILE] [--recordings 3] [STUDY ...]
+
+`calibrated` needs recordings of 75 stereo frames, which are simulated once (80 CPU seconds each) and kept in
+data/cache/reconstruction; so with new detector weights the same command only detects, calibrates and judges anew.
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import hashlib
+import json
+import os
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from lib import paths
+from lib.calibration import calibrate
+from lib.landmarks import Detector
+from lib.landmarks.stereo import detect
+from lib.matching import CONFIDENCES, RECTIFIED, detection_auc, match
+from lib.recordings import Recording
+from lib.simulator.eye import Eye
+from lib.simulator.microscope import Microscope
+from lib.simulator.recording import simulate
+from lib.simulator.training import RESERVED_SEEDS
+from lib.surface import evaluation
+from lib.surface.reconstruct import reconstruct
+from lib.workbench.collection import commit, machine
+
+__all__ = ["STUDIES", "main"]
+
+#: Stereo frames of the calibration, as many as the paper's.
+N_FRAMES = 75
+FIRST_SEED = 61
+#: Frames that are reconstructed: of the calibration sweep, and of the surgeon's movements.
+RECONSTRUCTED = (20, 60)
+SETTINGS = ("quality", "fast")
+
+
+def eyes(options: argparse.Namespace) -> dict:
+    """True cameras: RMS surface error (um) of eyes of the reference rig and of the three test sequences, and of a sphere."""
+    result = {}
+    reference = (
+        evaluation.simulated_pair(f"eye {seed}", Eye(seed=RESERVED_SEEDS[seed]), Microscope(), seed=seed)
+        for seed in range(200, 200 + options.eyes)
+    )
+    for group in (reference, evaluation.eyes()):
+        for pair in group:
+            found = {setting: evaluation.case(pair, setting=setting) for setting in SETTINGS}
+            result[pair.name] = {setting: found[setting].rms_um for setting in SETTINGS} | {
+                "sphere prior": found["quality"].sphere_rms_um
+            }
+    return result | {"mean": _mean(result)}
+
+
+def objects(options: argparse.Namespace) -> dict:
+    """True cameras: RMS and median surface error (um) of the four objects, with the paper's grid and a finer one."""
+    result = {}
+    for pair in evaluation.objects():
+        result[pair.name] = {}
+        for control in ((20, 20), (40, 40)):
+            found = evaluation.case(pair, control=control)
+            length = 1e3 * np.linalg.norm(found.error_mm[found.seen], axis=-1)
+            result[pair.name][f"{control[0]} x {control[1]}"] = {
+                "rms": found.rms_um,
+                "median": np.nanmedian(length),
+            }
+    return result
+
+
+def calibrated(options: argparse.Namespace) -> dict:
+    """Cameras calibrated from 75 frames of the detector: surface errors (um) in the robot frame and after alignments.
+
+    "refined" gives `reconstruct` the calibration, so that the matches correct its epipolar geometry.
+    """
+    detector, result = Detector.load(), {"weights": _digest(paths.MODELS / "default.safetensors")}
+    for seed in range(FIRST_SEED, FIRST_SEED + options.recordings):
+        recording = _recording(seed)
+        found = detect(recording, detector)
+        seen, truth = found.correspondences(), recording.truth
+        pixels = [seen.u_left, seen.u_right]
+        plain = calibrate(seen.x_mm, pixels)
+        own = calibrate(seen.x_mm, pixels, covariance_px2=seen.covariance_px2)
+        rigs = {
+            "true cameras": truth.rig,
+            "calibrated": plain.rig,
+            "calibrated, refined": plain,
+            "calibrated with the detector's covariances, refined": own,
+        }
+        errors: dict[str, dict[str, list]] = {}
+        for k in RECONSTRUCTED:
+            pair, u = recording.frames[k], (found.left.u[k], found.right.u[k])
+            lattice = tuple(np.arange(0, side, 12) for side in pair.left.shape[1::-1])
+            x_true = truth.surface(np.stack(np.meshgrid(*lattice), axis=-1).reshape(-1, 2).astype(float))
+            for name, rig in rigs.items():
+                for setting in SETTINGS:
+                    made = reconstruct(pair.left, pair.right, rig, u_landmarks=u, setting=setting)
+                    error = evaluation.surface_error_mm(made.surface, truth.surface, *lattice)
+                    visible = ~made.mask_left[np.ix_(*lattice[::-1])]
+                    rms = evaluation.aligned_rms_um(error, x_true.reshape(error.shape), visible)
+                    for alignment, value in rms.items():
+                        errors.setdefault(f"{name}, {setting}", {}).setdefault(alignment, []).append(value)
+        offsets = [side.u - u for side, u in ((found.left, truth.u_left), (found.right, truth.u_right))]
+        result[recording.folder.name] = {
+            "correspondences": len(seen),
+            "inliers": plain.inliers.mean(),
+            "sigma_u_px": plain.sigma_u_px,
+            "detector_bias_px": [np.nanmedian(offset, axis=0) for offset in offsets],
+            "surface_rms_um": {
+                name: {alignment: np.mean(values) for alignment, values in by.items()} for name, by in errors.items()
+            },
+        }
+    result["mean surface_rms_um"] = _mean(
+        {name: entry["surface_rms_um"] for name, entry in result.items() if isinstance(entry, dict)}
+    )
+    return result
+
+
+def confidence(options: argparse.Namespace) -> dict:
+    """How well each confidence tells the wrong matches (error above 2 px), reciprocal or not: area under the ROC curve."""
+    result = {}
+    for name, matches, wrong in _judged_matches():
+        judged = np.isfinite(wrong)
+        bad, passed = wrong[judged] > 0, matches.reciprocal[judged]
+        result[name] = {
+            f"auc_{measure}": detection_auc(getattr(matches, measure)[judged], bad) for measure in CONFIDENCES
+        }
+        result[name] |= {
+            "matches": int(judged.sum()),
+            "wrong_share": bad.mean(),
+            "wrong_share_of_reciprocal": bad[passed].mean(),
+            "wrong_share_of_others": bad[~passed].mean() if (~passed).any() else None,
+        }
+    return result
+
+
+def _judged_matches():
+    """(name, matches, wrong (n,)) of every method on the real pairs and of those with a rig on the shipped recording."""
+    every = {"reciprocal": False, "min_score": 0.0}
+    folder = paths.real_data("stereo_pairs")
+    if folder is None:
+        print(paths.missing_data_line("stereo_pairs"))
+    for name in ("motorcycle", "cones") if folder is not None else ():
+        pair = evaluation.real_pair(folder / name)
+        for method in ("deepmatching", "band", "sgbm", "dis"):
+            matches = match(pair.left, pair.right, method=method, rig=RECTIFIED, **every)
+            yield f"{name}, {method}", matches, pair.wrong_matches(matches)
+    recording = Recording.open(paths.SHIPPED_RECORDING)
+    frame, truth = recording.frames[0], recording.truth
+    for method in ("band", "sgbm", "dis"):
+        matches = match(frame.left, frame.right, method=method, rig=truth.rig, **every)
+        yield f"simulated eye, {method}", matches, evaluation.wrong_matches(matches, truth.surface, truth.rig)
+
+
+STUDIES: dict[str, Callable[[argparse.Namespace], dict]] = {
+    f.__name__: f for f in (eyes, objects, calibrated, confidence)
+}
+
+
+def _recording(seed: int) -> Recording:
+    """A sweep and a surgeon's movements over an eye of the reference rig, from the cache or simulated."""
+    folder = paths.CACHE / "reconstruction" / f"eye_{seed}_{N_FRAMES}"
+    if folder.is_dir():
+        return Recording.open(folder)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    return simulate(folder, seed=seed, n_frames=N_FRAMES, motion="both", name=folder.name)
+
+
+def _mean(results: dict[str, dict]) -> dict:
+    """Mean over the entries of nested dictionaries of the same keys."""
+    first = next(iter(results.values()))
+    return {
+        key: _mean({name: entry[key] for name, entry in results.items()})
+        if isinstance(first[key], dict)
+        else float(np.mean([entry[key] for entry in results.values()]))
+        for key in first
+    }
+
+
+def _digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:12]
+
+
+def _plain(value: object) -> object:
+    if isinstance(value, dict):
+        return {k: _plain(v) for k, v in value.items()}
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, (list, tuple)):
+        return [_plain(v) for v in value]
+    if isinstance(value, (np.floating, float)):
+        return float(f"{float(value):.5g}") if np.isfinite(value) else None
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the studies named (all by default) and merge them into the results file, which is written whole after each."""
+    parser = argparse.ArgumentParser(
+        prog="python3 -m lib.surface.studies", description="Measure matching and surfaces."
+    )
+    parser.add_argument("studies", nargs="*", metavar="STUDY", help=f"some of: {', '.join(STUDIES)}; default all")
+    parser.add_argument("--eyes", type=int, default=5, help="eyes of the reference rig, beside the three test eyes")
+    parser.add_argument("--recordings", type=int, default=3, help=f"recordings of {N_FRAMES} frames of `calibrated`")
+    parser.add_argument("--out", type=Path, default=paths.RESULTS / "reconstruction.json")
+    options = parser.parse_args(argv)
+    unknown = set(options.studies) - set(STUDIES)
+    if unknown:
+        parser.error(f"unknown study {', '.join(sorted(unknown))}; take some of {', '.join(STUDIES)}")
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    for name in options.studies or STUDIES:
+        start, cpu = time.perf_counter(), time.process_time()
+        result = _plain(STUDIES[name](options))
+        content = json.loads(options.out.read_text()) if options.out.is_file() else {}
+        content[name] = {
+            "result": result,
+            "command": f"python3 -m lib.surface.studies {name} --eyes {options.eyes} --recordings {options.recordings}",
+            "commit": commit(),
+            "machine": machine(),
+            "date": datetime.date.today().isoformat(),
+            "seconds": _plain(time.perf_counter() - start),
+            "cpu_seconds": _plain(time.process_time() - cpu),
+        }
+        partial = options.out.with_name(options.out.name + ".partial")
+        partial.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+        os.replace(partial, options.out)
+        print(f"{name}: {json.dumps(result)}", flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
