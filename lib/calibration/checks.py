@@ -9,7 +9,15 @@ from numpy.typing import ArrayLike
 
 from lib.geometry import finite_points, points
 
-__all__ = ["check_duplicates", "check_order", "check_spread", "check_units", "correspondences", "pixel_covariance"]
+__all__ = [
+    "check_duplicates",
+    "check_images",
+    "check_order",
+    "check_spread",
+    "check_units",
+    "correspondences",
+    "pixel_covariance",
+]
 
 #: Zoom (px per mm) between a room camera and the resolution of light; what lies outside has the wrong unit.
 PLAUSIBLE_PX_PER_MM = (0.2, 5000.0)
@@ -108,6 +116,22 @@ def check_duplicates(x: np.ndarray, y: np.ndarray) -> None:
             f"x_mm, u: {repeated} of {len(rows)} rows repeat another row exactly (a frozen video or frames read twice); "
             "drop the duplicated frames."
         )
+
+
+def check_images(y: np.ndarray) -> None:
+    """Refuse pixels (n, m) that no calibration can use: standing still or on a line in a camera, or the same in both.
+
+    Raises
+    ------
+    ValueError
+    """
+    names = ["u_left", "u_right"] if y.shape[1] == 4 else ["u"]
+    for name, u in zip(names, np.split(y, len(names), axis=1), strict=True):
+        size = np.linalg.svd(u - u.mean(axis=0), compute_uv=False)
+        if size[1] <= 1e-9 * np.abs(u).max() * np.sqrt(len(u)):
+            raise ValueError(f"{name}: the detections stand still or lie on one line; is this the moving tool?")
+    if len(names) == 2 and (y[:, :2] == y[:, 2:]).all(axis=1).mean() > 0.5:
+        raise ValueError("u_right: the same pixels as u_left; give the right camera's own detections.")
 
 
 def check_order(A: np.ndarray, sd_rad: float) -> None:

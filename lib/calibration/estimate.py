@@ -13,6 +13,7 @@ from lib.calibration.affine import Moments, affine_minimum, estimate_noise, pape
 from lib.calibration.checks import (
     ROBOT_ACCURACY_MM,
     check_duplicates,
+    check_images,
     check_order,
     check_spread,
     check_units,
@@ -248,8 +249,8 @@ def calibrate(
     Raises
     ------
     ValueError
-        For NaN rows, fewer than four points, coplanar or collinear points, wrong units, repeated rows, swapped cameras,
-        no consensus, an unknown model or weighting.
+        For NaN rows, fewer than four points, coplanar or collinear points, wrong units, repeated rows, detections that stand
+        still or are the same in both images, swapped cameras, no consensus, an unknown model or weighting.
     """
     x, y = correspondences(x_mm, u)
     n, m = y.shape
@@ -271,6 +272,7 @@ def calibrate(
         check_units(x, y)
     assumed_x = ROBOT_ACCURACY_MM if sigma_x_mm is None else sigma_x_mm
     check_spread(x, y, assumed_x if checks else 0.0)
+    check_images(y)
     automatic = ransac_px is None
     if ransac_px is not None and np.isinf(ransac_px):
         inliers = np.ones(n, dtype=bool)

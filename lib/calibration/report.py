@@ -86,6 +86,10 @@ def verdicts(calibration: Calibration) -> list[tuple[bool, str]]:
         )
     )
     if c.rig is not None:
+        depth_mm = float(np.median(c.depth_sd_mm(x, detection=True)))
+        known = f"depth of one detected point known to {1e3 * depth_mm:.0f} um"
+        seen = depth_mm < extent[0]
+        found.append((seen, known if seen else known + ": the two views hardly differ (the same camera twice?)"))
         mirrored = optics(c).mirrored
         found.append((mirrored in ("no", "unknown"), f"mirrored optics: {mirrored}"))
     return found

@@ -365,6 +365,9 @@ def noise_only(x, u):
         (lambda x, u: (x, [u[0], u[1][:-1]]), "u_right: 59 points"),
         (lambda x, u: (x, [u[0], u[1], u[1]]), "3 arrays"),
         (lambda x, u: (x[:, :2], u), "x_mm"),
+        (lambda x, u: (x, [u[0] * 0 + 5, u[1]]), "u_left: the detections stand still"),
+        (lambda x, u: (x, [u[0], u[1] * [1, 0]]), "u_right: the detections .* on one line"),
+        (lambda x, u: (x, [u[0], u[0]]), "the same pixels as u_left"),
     ],
 )
 def test_bad_data_are_refused_with_the_reason(spoil, message):

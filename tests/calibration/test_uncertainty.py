@@ -153,6 +153,8 @@ def test_report_says_what_is_wrong():
     assert "curved" in calibrate(c.true_x_mm, u).report()
     assert "working distance" in calibrate(c.true_x_mm, u, model="near_affine").report()
     assert "camera" in calibrate(c.x_mm, [c.u_left]).report()
+    twice = [c.u_left, c.u_left + np.random.default_rng(0).normal(size=(100, 2))]
+    assert "hardly differ" in calibrate(c.x_mm, twice).report()
 
 
 def test_optics_of_the_reference_rig():
