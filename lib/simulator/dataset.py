@@ -263,7 +263,7 @@ def _seconds_a_pair(shrink: int) -> float:
     return sum(seconds_by_stage(2, shrink).values())
 
 
-def _record(folder: Path, command: str, seconds: float) -> Path:
+def _record(folder: Path, command: str, workers: int, seconds: float) -> Path:
     """Write what a data set holds and what it cost to ``data/results/dataset.json``."""
     recordings = [Recording.open(folder / sequence_name(k)) for k in [*TRAIN_SEQUENCES, *TEST_SEQUENCES]]
     pairs = sum(len(recording) for recording in recordings)
@@ -277,9 +277,11 @@ def _record(folder: Path, command: str, seconds: float) -> Path:
         "sequences": len(recordings),
         "pairs": pairs,
         "gigabytes": sum(f.stat().st_size for f in folder.rglob("*") if f.is_file()) / 1e9,
+        "workers": workers,
         "minutes_of_the_last_run": seconds / 60,
+        "minutes_of_all_sequences_one_by_one": sum(float(row["wall_s"]) for row in log) / 60,
+        "wall_seconds_a_pair": sum(float(row["wall_s"]) for row in log) / pairs,
         "cpu_seconds_a_pair": sum(float(row["cpu_s"]) for row in log) / pairs,
-        "wall_seconds_a_pair_of_one_worker": sum(float(row["wall_s"]) for row in log) / pairs,
         "cpu_seconds_a_pair_by_stage": seconds_by_stage(),
         "landmarks": {
             kind: landmark_counts([r for r in recordings if r.name.startswith(kind)]) for kind in ("train", "test")
@@ -345,6 +347,5 @@ def main(argv: Sequence[str] | None = None) -> int:
     if left:
         print(f"{left} pairs in {seconds / 60:.1f} min, {seconds / left:.2f} s a pair.")
     if arguments.record:
-        words = " ".join(argv) if argv is not None else ""
-        print(_record(folder, f"python3 -m lib simulate {words}".strip(), seconds))
+        print(_record(folder, " ".join(["python3 -m lib simulate", *(argv or [])]), workers, seconds))
     return 0

@@ -11,6 +11,7 @@ from lib.cameras import AffineCamera, NearAffineCamera
 from lib.geometry import RigidTransform
 from lib.simulator import Eye, Forceps, Microscope, Pose, render_pair
 from lib.simulator.effects import PLAIN
+from lib.simulator.forceps import MAX_PITCH_RAD, MAX_ROLL_RAD
 from lib.simulator.raster import rasterise
 from lib.simulator.render import render_view, surface_grid
 from lib.simulator.scenes import Checkerboard, Plane, Relief, Sphere, checkerboard_poses
@@ -26,46 +27,67 @@ def window(camera: AffineCamera, centre: np.ndarray, size: int) -> tuple[AffineC
     return AffineCamera(np.column_stack([camera.linear, camera.offset_px - origin])), origin
 
 
-def test_visible_tips_lie_on_the_boundary_of_the_rendered_tool():
-    rng = np.random.default_rng(0)
-    factor, size, distances = 8, 24, []
-    for _ in range(25):
+def tip_distances(rng: np.random.Generator, n: int, max_pitch_rad: float) -> tuple[np.ndarray, np.ndarray]:
+    """Distance (2 n,) px of each tip from the edge of its jaw on a grid of 1/8 px, and what the renderer's view says
+    of its visibility; poses all over the range that `Pose` allows, up to `max_pitch_rad`."""
+    factor, size, distances, visibilities = 8, 24, [], []
+    for i in range(n):
         forceps = random_forceps(rng)
-        pose = random_pose(rng, forceps)
-        pose = pose.moved(
-            pitch_rad=min(pose.pitch_rad, 0.6), opening_mm=float(rng.uniform(0.15, 0.5) * forceps.jaw_length_mm)
+        pose = random_pose(rng, forceps).moved(
+            pitch_rad=rng.uniform(0, max_pitch_rad),
+            roll_rad=rng.uniform(-MAX_ROLL_RAD, MAX_ROLL_RAD),
+            opening_mm=rng.uniform(0.0, 0.55) * forceps.jaw_length_mm,
         )
         centres, radii, chains = forceps.nodes(pose)
+        whole = (RIG.left, RIG.right)[i % 2]
         for k in (1, 2):
             tip = forceps.landmarks(pose)[k]
-            camera, _ = window(RIG.left, RIG.left.project(tip)[0], size)
+            camera, _ = window(whole, whole.project(tip)[0], size)
+            view = render_view(Plane(4.0), PLAIN, camera, (size, size), forceps=forceps, pose=pose, factor=3)
             R, zoom = camera.resect().R, camera.resect().K[0, 0]
             seen = np.column_stack([camera.project(centres) / zoom, centres @ R[2]])
             raster = rasterise(seen, radii, chains, zoom=zoom, size_px=(size, size), factor=factor)
             own = (raster.part == k + 1).astype(np.uint8)
             edge = np.argwhere(own & ~cv2.erode(own, np.ones((3, 3), np.uint8)).astype(bool))
             edge_px = (edge[:, ::-1] + 0.5) / factor - 0.5 + raster.origin_px
-            distances.append(np.linalg.norm(edge_px - camera.project(tip)[0], axis=1).min())
-    assert max(distances) <= 0.25
+            distances.append(np.linalg.norm(edge_px - view.u[k], axis=1).min(initial=np.inf))
+            visibilities.append(view.visibility[k])
+    return np.array(distances), np.array(visibilities)
+
+
+def test_visible_tips_lie_on_the_boundary_of_the_rendered_tool():
+    # As far as motions and training images dip; steeper, a blunt jaw may hide its own tip and still count as visible.
+    distance_px, visibility = tip_distances(np.random.default_rng(0), 150, 0.75)
+    assert (visibility == 2).mean() > 0.95
+    assert distance_px[visibility == 2].max() <= 0.25
 
 
 def test_base_is_midway_between_the_edges_of_the_shaft():
     rng = np.random.default_rng(1)
-    for _ in range(6):
+    seen = 0
+    for i in range(40):
         forceps = random_forceps(rng)
-        pose = random_pose(rng, forceps)
-        camera, _ = window(RIG.right, RIG.right.project(np.array(pose.base_mm))[0], 160)
-        view = render_view(Plane(4.0), PLAIN, camera, (160, 160), forceps=forceps, pose=pose, factor=4)
+        pose = random_pose(rng, forceps).moved(
+            pitch_rad=rng.uniform(0, MAX_PITCH_RAD), roll_rad=rng.uniform(-MAX_ROLL_RAD, MAX_ROLL_RAD)
+        )
+        whole = (RIG.left, RIG.right)[i % 2]
+        camera, _ = window(whole, whole.project(np.array(pose.base_mm))[0], 120)
+        view = render_view(Plane(4.0), PLAIN, camera, (120, 120), forceps=forceps, pose=pose, factor=4)
+        if view.visibility[0] != 2:
+            continue
+        seen += 1
         shaft = camera.linear @ pose.microscope_from_tool[:, 0]
         along = shaft / np.linalg.norm(shaft)
         across = np.array([-along[1], along[0]])
-        # Coverage across the shaft, just behind the base.
-        offsets = np.arange(-60, 60, 0.05)
-        points = view.u[0] - 4 * along + offsets[:, None] * across
+        # Coverage across the shaft, just behind the base and the roots of the jaws, which may bulge out beside it.
+        offsets = np.arange(-48, 48, 0.05)
+        behind_px = 4 + 120 * forceps.jaw_radius_mm
+        points = view.u[0] - behind_px * along + offsets[:, None] * across
         profile = cv2.remap(view.tool_mask.astype(np.float32), *np.float32(points.T), cv2.INTER_LINEAR).ravel() / 255
         inside = offsets[profile > 0.5]
         assert abs(inside.min() + inside.max()) / 2 <= 0.25
         assert_allclose(np.ptp(inside), 2 * forceps.shaft_radius_mm * np.linalg.norm(camera.linear[0]), atol=0.5)
+    assert seen > 35
 
 
 @pytest.mark.parametrize("camera", [RIG.left, NearAffineCamera(RIG.right.matrix, 1 / 150, np.array([959.5, 539.5]))])

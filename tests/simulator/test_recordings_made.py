@@ -48,7 +48,7 @@ def test_a_recording_agrees_with_its_truth(made):
 
 def test_truth_says_which_landmarks_saturated_light_touches(tmp_path):
     """Against the images and masks on disk; a recording of before, without these columns, still opens."""
-    options = {"seed": 6, "n_frames": 6, "motion": "sweep", "duration_s": 4.0, "progress": False, "masks": True}
+    options = {"seed": 6, "n_frames": 6, "motion": "surgeon", "duration_s": 4.0, "progress": False, "masks": True}
     bright = replace(SMALL, brightness=1.6, jpeg_quality=None)
     recording = simulate(tmp_path / "bright", eye=replace(EYE, gloss=2.0), microscope=bright, **options)
     truth = recording.truth
