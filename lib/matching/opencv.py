@@ -12,6 +12,7 @@ from lib.cameras import StereoRig
 from lib.matching.band import COARSE_REACH, SETTINGS, Setting, coarse_view
 from lib.matching.confidence import peak_ratio
 from lib.matching.descriptors import pixel_descriptors
+from lib.matching.free import patch_quality
 from lib.matching.rectification import RECTIFIED, rectify, warp
 from lib.matching.result import Matches
 from lib.matching.volume import PATCH, correlation_volume
@@ -150,21 +151,24 @@ def match_with(
     covariance = np.tile(np.diag([0.05**2, 0.05**2, sigma**2, sigma**2]), (len(u_left), 1, 1))
     score = np.clip(confidence[y, x][kept], 0.0, 1.0).astype(np.float64)
     points = np.column_stack([x, y])[kept]
-    ratio = _peak_ratio((left, right), (valid_left, valid_right), reach, (low, high), points, -d[kept])
-    return Matches(
+    ratio, textured = _judge((left, right), (valid_left, valid_right), reach, (low, high), points, -d[kept])
+    matches = Matches(
         u_left, u_right, score, covariance, peak_ratio=ratio, reciprocal=passed[y[kept], x[kept]], method=name
     )
+    return matches.keep(textured)
 
 
-def _peak_ratio(
+def _judge(
     images: tuple[np.ndarray, np.ndarray],
     valid: tuple[np.ndarray, np.ndarray],
     reach: int,
     range_px: tuple[float, float],
     points: np.ndarray,
     displacement: np.ndarray,
-) -> np.ndarray:
+) -> tuple[np.ndarray, np.ndarray]:
     """Peak ratio (n,) of the descriptors' correlation, as in the band, at displacements (n,) of lattice points (n, 2).
+
+    And which of them (n,) have texture: on a flat patch a smooth disparity is made up from its neighbours.
 
     `reach`, a multiple of the lattice, is how far the canvases go on beyond the lattice on either side.
     """
@@ -186,4 +190,4 @@ def _peak_ratio(
     ratio = np.full(len(points), np.nan)
     patch = points // LATTICE_PX - (reach // LATTICE_PX, 0)
     ratio[searched] = peak_ratio(volume, patch[searched], index[searched])
-    return ratio
+    return ratio, patch_quality(left)[patch[:, 1], patch[:, 0]]

@@ -123,6 +123,11 @@ def reconstruct(
                 masks[side] |= tool_mask(image.shape[:2], u_landmarks[side])
             more = (mask_left, mask_right)[side]
             if more is not None:
+                if np.shape(more) != masks[side].shape or np.asarray(more).dtype != bool:
+                    raise ValueError(
+                        f"{('mask_left', 'mask_right')[side]}: expected a bool array {masks[side].shape}, True = ignore, "
+                        f"got {np.asarray(more).dtype} {np.shape(more)}."
+                    )
                 masks[side] |= more
     if isinstance(rig, Calibration):
         with stage("refine"):

@@ -176,7 +176,7 @@ def test_identical_images_do_not_move(textured, method):
     assert np.median(np.abs(matches.u_left - matches.u_right)) < 1e-6
 
 
-@pytest.mark.parametrize("method", ["band", "deepmatching"])
+@pytest.mark.parametrize("method", ["band", "deepmatching", "sgbm", "dis"])
 @pytest.mark.parametrize("value", [0, 255])
 def test_no_texture_gives_no_match(method, value):
     flat = np.full((120, 160), value, np.uint8)
@@ -185,7 +185,7 @@ def test_no_texture_gives_no_match(method, value):
     assert np.isnan(matches.epipolar_px)
 
 
-@pytest.mark.parametrize("method", ["band", "deepmatching"])
+@pytest.mark.parametrize("method", ["band", "deepmatching", "sgbm", "dis"])
 def test_sizes_may_differ(textured, method):
     matches = match(textured, shifted(textured, 8)[:104, :130], method=method, rig=RECTIFIED)
     assert len(matches) > 100

@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 
 from lib import paths
-from lib.cameras import StereoRig
+from lib.calibration import calibrate
+from lib.cameras import AffineCamera, StereoRig
+from lib.geometry import RigidTransform
 from lib.simulator.eye import Eye
 from lib.simulator.forceps import Forceps, Pose
 from lib.simulator.microscope import Microscope
 from lib.simulator.render import render_pair
-from lib.simulator.rig import ROBOT_FROM_MICROSCOPE
+from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, simulate_correspondences
 from lib.surface import BSplineSurface, SplineGrid, epipolar_inliers, evaluation, reconstruct, surface_mesh
 
 matplotlib.use("Agg")
@@ -95,6 +97,72 @@ def test_black_images_and_full_masks_are_refused(scene):
         reconstruct(scene.left, scene.right, scene.rig, mask_left=np.ones(black.shape[:2], dtype=bool))
 
 
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"control": (90, 60)}, "u: .* points lie in the domain .* control points"),
+        ({"mask_left": np.ones((5, 5), dtype=bool)}, "mask_left: expected a bool array"),
+        ({"mask_right": np.zeros((360, 640))}, "mask_right: expected a bool array"),
+        ({"setting": "best"}, "setting"),
+        ({"right": np.zeros((360, 640, 3), np.uint8)}, "left, right: no match"),
+        ({"rig": "off its lines"}, r"rig: it does not fit the images: .* px off"),
+    ],
+)
+def test_bad_input_is_named(scene, change, named):
+    moved = AffineCamera(scene.rig.right.matrix + np.array([[0, 0, 0, 0], [0, 0, 0, 15.0]]))
+    arguments = {"left": scene.left, "right": scene.right, "rig": scene.rig} | change
+    if arguments["rig"] == "off its lines":
+        arguments["rig"] = StereoRig(scene.rig.left, moved)
+    with pytest.raises(ValueError, match=named):
+        reconstruct(**arguments)
+
+
+def test_a_calibration_is_brought_to_agree_with_the_matches(scene, result):
+    seen = simulate_correspondences(75, rng=np.random.default_rng(4), rig=scene.rig, sigma_u_px=1.0)
+    calibration = calibrate(seen.x_mm, [seen.u_left, seen.u_right])
+    found = reconstruct(scene.left, scene.right, calibration, u_landmarks=scene.u_tool, control=(14, 10))
+    assert list(found.seconds) == ["mask", "refine", "match", "triangulate", "surface"]
+    exact = scene.rig.project(result.surface(result.matches.u_left))
+    before, after = (np.abs(rig.epipolar_distance(*exact)).mean() for rig in (calibration.rig, found.rig))
+    assert after < 0.5 * before
+    assert result.rig is scene.rig
+
+
+def test_what_an_alignment_takes_out():
+    rng = np.random.default_rng(0)
+    truth = rng.normal(size=(20, 30, 3))
+    turned = RigidTransform.from_rotation_vector((0.02, -0.01, 0.03), (0.1, 0.0, -0.2)).apply(truth.reshape(-1, 3))
+    rms = evaluation.aligned_rms_um(turned.reshape(truth.shape) - truth, truth)
+    assert rms["robot frame"] > 100 and rms["rigid"] < 1e-6 and rms["affine"] < 1e-6
+    rms = evaluation.aligned_rms_um(0.01 * truth * (1, 2, 0), truth)
+    assert rms["rigid"] > 1 and rms["affine"] < 1e-6
+    noise = 0.005 * rng.normal(size=truth.shape)
+    noise[0, 0] = np.nan
+    rms = evaluation.aligned_rms_um(noise, truth)
+    assert rms["affine"] == pytest.approx(rms["robot frame"], rel=0.05) == pytest.approx(5 * np.sqrt(3), rel=0.1)
+    assert np.isnan(evaluation.aligned_rms_um(noise, truth, np.zeros((20, 30), dtype=bool))["rigid"])
+
+
+def test_simulated_scenes_are_reconstructed_and_judged():
+    import matplotlib.pyplot as plt
+
+    from lib.figures import reconstruction as figures
+
+    found = []
+    for pair in (next(evaluation.eyes(shrink=4)), next(evaluation.objects(shrink=4))):
+        one = evaluation.case(pair, control=(12, 8), smoothness=1e4)
+        u = np.array([[100.0, 60.0], [400.0, 200.0]])
+        assert np.abs(pair.rig.left.project(pair.truth(u)) - u).max() < 0.01
+        assert np.nanmedian(np.linalg.norm(one.error_mm, axis=2)) < 0.1
+        found.append(one)
+    assert found[0].rms_um < 0.7 * found[0].sphere_rms_um and np.isnan(found[1].sphere_rms_um)
+    wrong = evaluation.wrong_matches(found[0].found.matches, found[0].pair.truth, found[0].pair.rig)
+    assert np.nanmean(wrong) < 0.1
+    for page in (figures.cases(found), figures.case_table(found)):
+        page.canvas.draw()
+        plt.close(page)
+
+
 def test_error_measures():
     grid = SplineGrid((0, 0, 100, 80), (4, 4))
     plane = BSplineSurface(grid, np.dstack([grid.sites / 100, np.zeros((4, 4))]))
@@ -130,6 +198,7 @@ def test_every_figure_draws(scene, result):
         figures.error_maps({"one": error_um, "two": error_um}),
         figures.error_budget({"quality": 10.0, "sphere": 90.0}, highlight="quality", paper_um=25.479),
         figures.reconstruction(scene.left, surface, rig, mask=result.mask_left),
+        figures.sparsification({"eye": {"score": (0.9, np.linspace(0, 0.1, 5))}}, np.linspace(0.2, 1, 5)),
     ]
     for page in pages:
         page.canvas.draw()
