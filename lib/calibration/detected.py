@@ -319,22 +319,27 @@ def board_study(
     distance_mm: float,
     *,
     weights: str | Path | None = None,
-    seed: int = SEED,
+    seeds: Sequence[int] = (SEED,),
     boards: int = 4,
     models: Sequence[str] = ("zero_skew", "near_affine"),
-) -> dict[str, BoardError]:
+) -> dict[str, list[BoardError]]:
     """The paper's second experiment: 0.5 mm checkerboards rendered under the microscope that the tool calibrated.
 
     Tool frames and boards are rendered alike, landmarks found by the detector, corners by OpenCV.  Returns the errors of
-    every model and estimate, ``"zero_skew, detected"`` and so on, and of the true cameras: what the corners alone cost.
+    every model and estimate, ``"zero_skew, detected"`` and so on, one a sweep, all on the same boards; and of the true
+    cameras: what the corners alone cost.
     """
-    recording = sweep(distance_mm, seed=seed)
-    landmarks = detections(recording, weights)
-    rigs = {"true cameras": true_rig(recording)}
-    for model in models:
-        for name, (found, _) in estimates(recording, landmarks, model=model).items():
-            rigs[f"{model}, {name}"] = found.rig
-    return measure_boards(rigs, inverse_distance_per_mm=1.0 / distance_mm, boards=boards, seed=seed)
+    rigs, names = {"true cameras": true_rig(sweep(distance_mm, seed=seeds[0]))}, {"true cameras": ["true cameras"]}
+    for seed in seeds:
+        recording = sweep(distance_mm, seed=seed)
+        landmarks = detections(recording, weights)
+        for model in models:
+            for name, (found, _) in estimates(recording, landmarks, model=model).items():
+                key = f"{model}, {name}"
+                rigs[f"{key}, {seed}"] = found.rig
+                names.setdefault(key, []).append(f"{key}, {seed}")
+    errors = measure_boards(rigs, inverse_distance_per_mm=1.0 / distance_mm, boards=boards, seed=seeds[0])
+    return {name: [errors[key] for key in keys] for name, keys in names.items()}
 
 
 def resolution_study(
@@ -345,7 +350,7 @@ def resolution_study(
     Parameters
     ----------
     folder:
-        Checkpoints of `lib.landmarks.resolution`; None = where its study keeps them.  A resolution without is left out.
+        Checkpoints of `lib.landmarks.resolution`; None = where its study keeps them.  What is not trained is left out.
 
     Returns
     -------
@@ -360,13 +365,12 @@ def resolution_study(
     sources = {"labels": label_rows(recording, click_px=1.0)}
     for name in RESOLUTIONS:
         trained = root / name / f"seed{training_seed}"
-        if not (trained / "last.safetensors").is_file():
+        if not (trained / "calibration.json").is_file():  # written when the training is done
             continue
-        beside = [SHIPPED_WEIGHTS, *trained.glob("calibration.json")]
         landmarks = detections(
             recording,
             trained / "last.safetensors",
-            beside=beside,
+            beside=[SHIPPED_WEIGHTS, trained / "calibration.json"],
             load=lambda _, name=name: load_resolution(name, seed=training_seed, folder=root),
         )
         sources[name] = row_timed(recording, landmarks)

@@ -354,13 +354,13 @@ def checkerboards(results: Mapping[str, Mapping[str, Mapping[str, float]]], pape
 
 
 def resolutions(study: Mapping[str, Mapping[str, float]]) -> Figure:
-    """The paper's figure: 3D and reprojection error of calibrations from labels and from detectors at four resolutions."""
+    """The paper's figure: 3D and projection error of calibrations from labels and from detectors at four resolutions."""
     page, axes = figure(1, 2, width_in=12, height_in=3.8)
     names = [f"{name}\n{row['sigma_u_px']:.1f} px" for name, row in study.items()]
     at = np.arange(len(names))
     for ax, key, unit, title in (
-        (axes[0], "triangulation_um", "um", "Triangulation error (3D RMS)"),
-        (axes[1], "projection_px", "px", "Projection error (RMS)"),
+        (axes[0], "calibration_um", "um", "Calibration's triangulation error (3D RMS, exact pixels)"),
+        (axes[1], "projection_px", "px", "Calibration's projection error (RMS)"),
     ):
         for model, offset, colour in (("affine", -0.2, "ours"), ("perspective", 0.2, "paper")):
             values = [row[f"{model}_{key}"] for row in study.values()]

@@ -109,5 +109,14 @@ def test_estimates_and_resolutions_of_a_recording(recording, tmp_path, monkeypat
     assert labels["affine_calibration_um"] < labels["perspective_calibration_um"]
 
 
+def test_boards_are_measured_with_every_estimate(recording, monkeypatch):
+    monkeypatch.setattr(detected, "sweep", lambda *_, **__: recording)
+    monkeypatch.setattr(detected, "detections", lambda *_: noisy(recording, sigma_px=0.3))
+    found = detected.board_study(np.inf, boards=1, models=("zero_skew",), seeds=(0,))
+    assert found["true cameras"][0].aligned_um < 3
+    assert found["zero_skew, detected"][0].aligned_um < 6 and found["zero_skew, detected"][0].robot_um < 30
+    assert len(found) == 6 and all(len(errors) == 1 for errors in found.values())
+
+
 def test_root_mean_square():
     assert evaluation._root_mean_square([3.0, 4.0]) == pytest.approx(np.sqrt(12.5))
