@@ -109,6 +109,8 @@ def calibrate_with_offsets(
     x, landmark = np.asarray(x_mm, dtype=np.float64), np.asarray(landmark)
     if landmark.shape != (len(x),) or not np.issubdtype(landmark.dtype, np.integer) or (landmark < 0).any():
         raise ValueError(f"landmark: expected {len(x)} integers from 0, got {landmark.dtype} {landmark.shape}.")
+    if len(x) < 4:
+        raise ValueError(f"x_mm: {len(x)} points are too few; frames with shut jaws have no axes and do not count.")
     if axes is not None:
         axes = np.asarray(axes, dtype=np.float64)
         if axes.shape != (len(x), 3, 3) or not np.isfinite(axes).all():

@@ -119,6 +119,8 @@ def test_bad_arguments_are_named():
         calibrate_with_offsets(x, u, landmark, axes, weighting="paper")
     with pytest.raises(ValueError, match="prior_sd"):
         calibrate_with_offsets(x, u, landmark, axes, prior_sd=0.0)
+    with pytest.raises(ValueError, match="too few"):
+        calibrate_with_offsets(x[:0], [part[:0] for part in u], landmark[:0], axes[:0])
     x[3] = np.nan
     with pytest.raises(ValueError, match="not finite"):
         calibrate_with_offsets(x, u, landmark, axes)
