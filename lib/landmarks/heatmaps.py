@@ -172,6 +172,19 @@ def _decode_dark(heatmaps: Tensor, sigma: float) -> tuple[Tensor, ...]:
     return _plain(inner.to(heatmaps.dtype) + step, value)
 
 
+def _solve(matrix: Tensor, right: Tensor) -> Tensor:
+    """X (..., n, m) of matrix (..., n, n) X = right; matrix positive definite."""
+    if not torch.onnx.is_in_onnx_export():
+        return torch.linalg.solve(matrix, right)
+    # ONNX has no solver: Gauss-Jordan, which needs no pivoting here.
+    n, both = matrix.shape[-1], torch.cat([matrix, right], -1)
+    for i in range(n):
+        row = both[..., i : i + 1, :] / both[..., i : i + 1, i : i + 1]
+        both = both - both[..., :, i : i + 1] * row
+        both = torch.cat([both[..., :i, :], row, both[..., i + 1 :, :]], -2)
+    return both[..., n:]
+
+
 def _decode_gauss_newton(heatmaps: Tensor, sigma: float, iterations: int = 6) -> tuple[Tensor, ...]:
     """Least-squares fit of a exp(-|c - x|^2 / (2 (w sigma)^2)) + b in a disc, started from the paper's disc centroid.
 
@@ -203,16 +216,17 @@ def _decode_gauss_newton(heatmaps: Tensor, sigma: float, iterations: int = 6) ->
     step_limit = torch.tensor([0.7 * sigma, 0.7 * sigma, 0.4, 1.0, 1.0], dtype=torch.float64, device=p.device)
     for _ in range(iterations):
         residual, jacobian = model(theta)
-        normal = jacobian.mT @ jacobian + damping
-        step = torch.linalg.solve(normal, (jacobian.mT @ residual[..., None])[..., 0])
+        normal = jacobian.transpose(-1, -2) @ jacobian + damping
+        step = _solve(normal, jacobian.transpose(-1, -2) @ residual[..., None])[..., 0]
         theta = theta + torch.maximum(torch.minimum(step, step_limit), -step_limit)
-        theta[..., 2].clamp_(0.3, 3.0)
+        theta = torch.cat([theta[..., :2], theta[..., 2:3].clamp(0.3, 3.0), theta[..., 3:]], -1)
     residual, jacobian = model(theta)
     freedom = (weight.sum(-1) - 5).clamp_min(1)
     variance = residual.square().sum(-1) / freedom + 1e-8
-    covariance = variance[..., None, None] * torch.linalg.inv(jacobian.mT @ jacobian + damping)[..., :2, :2]
-    good = (theta[..., :2].norm(dim=-1) <= reach) & (theta[..., 2] > 0.4) & (theta[..., 2] < 2.5)
-    good &= torch.isfinite(theta).all(-1) & (theta[..., 3] > 0)
+    unit = torch.eye(5, dtype=torch.float64, device=p.device)[:, :2].expand(*jacobian.shape[:-2], 5, 2)
+    covariance = variance[..., None, None] * _solve(jacobian.transpose(-1, -2) @ jacobian + damping, unit)[..., :2, :]
+    near = (theta[..., :2].square().sum(-1) <= reach**2) & (theta[..., 2] > 0.4) & (theta[..., 2] < 2.5)
+    good = near & (theta.abs() < torch.inf).all(-1) & (theta[..., 3] > 0)  # NaN is not below infinity
     u = torch.where(good[..., None], cell + theta[..., :2], start.double())
     fallback = sigma**2 * torch.eye(2, dtype=torch.float64, device=p.device)
     covariance = torch.where(good[..., None, None], covariance, fallback)
@@ -255,7 +269,7 @@ def decode(heatmaps: Tensor, stride: int, *, method: str = "gauss_newton", sigma
     if heatmaps.ndim != 4 or not heatmaps.numel():
         raise ValueError(f"heatmaps: expected a non-empty (n, k, h, w), got {tuple(heatmaps.shape)}.")
     heatmaps = heatmaps.float() if heatmaps.dtype != torch.float64 else heatmaps
-    if not torch.isfinite(heatmaps).all():
+    if not torch.onnx.is_in_onnx_export() and not torch.isfinite(heatmaps).all():
         raise ValueError("heatmaps: not finite; the network or its input is broken (look for NaN in the images).")
     u, value, width, covariance = _DECODERS[method](heatmaps, sigma_cells(stride, sigma_px))
     u_px = _pixels(u, stride)

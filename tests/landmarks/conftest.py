@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
+from lib.landmarks.dataset import _write_shard
 from lib.landmarks.training import Samples
 
 
@@ -36,3 +37,17 @@ def toy_samples(n: int, seed: int = 0, size=(64, 96)) -> Samples:
 def toy():
     """`toy(n, seed=0, size=(h, w))` -> Samples."""
     return toy_samples
+
+
+@pytest.fixture(scope="session")
+def toy_shards():
+    """`toy_shards(folder, n, size=(h, w))`: one training and one validation shard of n large toys -> those Samples."""
+
+    def write(folder, n: int, size=(540, 960)) -> Samples:
+        samples = toy_samples(n, size=size)
+        views = list(zip(samples.images, samples.u, samples.visibility, strict=True))
+        _write_shard(folder / "training_0000.npz", views, keep_frames=False)
+        _write_shard(folder / "validation_0000.npz", views, keep_frames=True)
+        return samples
+
+    return write

@@ -75,16 +75,13 @@ def test_nothing_to_evaluate_is_named(small):
         calibrate(small[0], small[1][:2])
 
 
-def test_shards_hold_what_the_stages_see(tmp_path, monkeypatch, toy):
-    """Full-HD toys instead of the simulator: crops and reduced frames carry the landmarks of the full frame."""
-    samples = toy(2, size=(540, 960))
-    drawn = iter([(samples.images[i % 2], samples.u[i % 2], samples.visibility[i % 2]) for i in range(8)])
-    monkeypatch.setattr(dataset, "sample", lambda rng: next(drawn))
-    monkeypatch.setattr(dataset, "FRAMES", 2)
-    dataset.generate(tmp_path, 1, progress=False)
+def test_shards_hold_what_the_stages_see(tmp_path, toy_shards):
+    """Large toys instead of the simulator: crops and reduced frames carry the landmarks of the full frame."""
+    samples = toy_shards(tmp_path, 2)
+    standing = {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
+    dataset.generate(tmp_path, 1, progress=False)  # stands already: nothing is drawn
     dataset.generate(tmp_path, 1, validation=True, progress=False)
-    dataset.generate(tmp_path, 1, progress=False)  # stands already: draws nothing
-    assert len(list(drawn)) == 4
+    assert standing == {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
     frames = dataset.frame_samples(tmp_path)
     assert np.allclose(8 * frames.u + 3.5, samples.u)
     windows = dataset.WindowSource.load(tmp_path)

@@ -1,0 +1,131 @@
+"""The detector for other programs: each stage as ONNX with its decoding and calibration inside, checked against torch.
+
+A stage takes its own input, RGB in [0, 1] of shape (n, 3, h, w), and gives what `Landmarks` holds: u (n, 3, 2) px, covariance
+(n, 3, 2, 2) px^2 and confidence (n, 3); those of the first stage in pixels of the unreduced frame.  The stage for
+landmarks sees a window for each and its caller takes that landmark's row.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from lib.landmarks.engines import LastHeatmaps, openvino
+from lib.landmarks.heatmaps import decode
+from lib.landmarks.inference import MIN_CONFIDENCE, Calibration, Detector, as_tensor
+
+__all__ = ["PARITY_PX", "StageWithDecoding", "export", "run_onnx"]
+
+#: Largest difference from torch that an exported stage may show.
+PARITY_PX = 0.01
+OPSET = 18
+
+
+class StageWithDecoding(nn.Module):
+    """Images to landmarks in one graph: network, decoder, and the calibration of covariance and confidence.
+
+    Attributes
+    ----------
+    scale:
+        Image pixels per pixel of the stage's input.
+    """
+
+    def __init__(self, detector: Detector, stage: str):
+        super().__init__()
+        network = detector.networks[stage]
+        self.heatmaps, self.stride, self.method = LastHeatmaps(network), network.stride, detector.method
+        self.scale = detector.reduction if stage == "frame" else 1
+        fit = detector.calibration.get(stage, Calibration())
+        self.register_buffer("log_variance", torch.tensor(fit.log_variance))
+        self.register_buffer("logit", torch.tensor(fit.logit))
+
+    def forward(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        peaks = decode(self.heatmaps(images), self.stride, method=self.method)
+        xx, xy, yy = (peaks.covariance[..., i, j] * self.scale**2 for i, j in ((0, 0), (0, 1), (1, 1)))
+        size = (xx * yy - xy * xy).clamp_min(1e-12).sqrt()
+        features = torch.stack(
+            [
+                torch.ones_like(size),
+                size.clamp(1e-4, 1e4).log(),
+                peaks.value.clamp(-0.5, 1.5),
+                peaks.width.log().abs(),
+            ],
+            -1,
+        )
+        variance = (features * self.log_variance).sum(-1).clamp(-12, 12).exp() / size
+        covariance = torch.stack([xx, xy, xy, yy], -1) * variance[..., None]
+        u = peaks.u * self.scale + (self.scale - 1) / 2
+        return u, covariance.unflatten(-1, (2, 2)), torch.sigmoid((features * self.logit).sum(-1))
+
+
+def export(detector: Detector, folder: str | Path, examples: np.ndarray) -> dict[str, tuple[Path, float]]:
+    """Write every stage as ``STAGE.onnx`` into `folder`, if it agrees with torch.
+
+    Parameters
+    ----------
+    examples:
+        Frames (n, h, w, 3) uint8 with the tool in view: what is compared, and the size of frame that the first stage takes.
+
+    Returns
+    -------
+    File of each stage, and its largest difference from torch in px, over landmarks that are not missing.
+
+    Raises
+    ------
+    ValueError
+        If a stage differs by more than `PARITY_PX` (its file is not written), or nothing is found in `examples`.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    detector = replace(detector, engine="torch")
+    rough, result = detector(examples).u, {}
+    for stage in detector.networks:
+        images = detector.reduced(examples) if stage == "frame" else detector.windows(examples, rough, stage)[0]
+        if not len(images):
+            raise ValueError("examples: no tool was found in them, so nothing can be compared; give other frames.")
+        x = as_tensor(images).contiguous()
+        module = StageWithDecoding(detector, stage).eval()
+        with tempfile.TemporaryDirectory() as scratch:
+            path = Path(scratch) / f"{stage}.onnx"
+            _write(module, x, path)
+            u, _, confidence = run_onnx(path, x.numpy())
+            with torch.inference_mode():
+                expected, _, expected_confidence = (part.numpy() for part in module(x))
+            seen = (expected_confidence >= MIN_CONFIDENCE) & (confidence >= MIN_CONFIDENCE)
+            if not seen.any():
+                raise ValueError(f"examples: the stage {stage!r} finds nothing in them; give other frames.")
+            difference = float(np.abs(u - expected)[seen].max())
+            if not difference <= PARITY_PX:
+                raise ValueError(
+                    f"{stage}: ONNX and torch differ by {difference:.3g} px, more than {PARITY_PX}; not exported."
+                )
+            partial = folder / f"{stage}.onnx.partial"
+            partial.write_bytes(path.read_bytes())
+            os.replace(partial, folder / f"{stage}.onnx")
+        result[stage] = folder / f"{stage}.onnx", difference
+    return result
+
+
+def _write(module: nn.Module, example: Tensor, path: Path) -> None:
+    names = ["u", "covariance", "confidence"]
+    with torch.no_grad(), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # sizes are fixed by tracing, as they shall be
+        torch.onnx.export(
+            module, (example,), str(path), dynamo=False, opset_version=OPSET, input_names=["images"], output_names=names,
+            dynamic_axes={name: {0: "n"} for name in ["images", *names]},
+        )  # fmt: skip
+
+
+def run_onnx(path: str | Path, images: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """u, covariance and confidence that an exported stage gives for images (n, 3, h, w) in [0, 1], in float32."""
+    ov = openvino()
+    model = ov.Core().compile_model(ov.Core().read_model(str(path)), "CPU", {"INFERENCE_PRECISION_HINT": "f32"})
+    found = model(images)
+    return found["u"], found["covariance"], found["confidence"]
