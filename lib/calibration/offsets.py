@@ -4,7 +4,8 @@ A landmark is a point that a designer chose, and what a detector (or a person) m
 of a millimetre beside it, always in the same direction of the tool.  Such a systematic error does not average out.
 With the robot's landmark k at x and the tool's axes R, the marked point is x + R d_k.  The nine numbers d are nuisance
 parameters: estimated together with the cameras, or rather, since not all of them can be told from a shift of the
-cameras, with a Gaussian prior of zero mean.  What the data cannot tell then stays in the covariance.
+cameras, with a Gaussian prior of zero mean, whose width the data choose too (empirical Bayes).  What the data cannot tell
+then stays in the covariance.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ class OffsetCalibration:
     covariance:
         (k, d, d) of each landmark's offset, in the squared unit.
     prior_sd:
-        Of a coordinate before the data.
+        Of a coordinate before the data, given or chosen by the evidence.
     p_value:
         Probability of offsets as large as the data show if there are none (score test).
     """
@@ -99,7 +100,8 @@ def calibrate_with_offsets(
         a detector that is off by some pixels whatever the tool does; what all landmarks have in common can then not be
         told from a shift of the cameras.
     prior_sd:
-        Standard deviation of an offset's coordinate: 0.05 mm, or 5 px in the images, unless given.
+        Standard deviation of an offset's coordinate, mm or px.  None = the one that makes the data most probable, between 0.1
+        and 300 um, or 0.01 and 30 px; without sign of an offset it is the least, which leaves the landmarks where they are.
 
     Raises
     ------
@@ -117,8 +119,7 @@ def calibrate_with_offsets(
             raise ValueError(f"axes: expected ({len(x)}, 3, 3) finite, got {axes.shape}; drop rows of shut jaws.")
     if options.get("weighting", "likelihood") != "likelihood":
         raise ValueError("weighting: offsets need the likelihood's weights.")
-    prior_sd = prior_sd if prior_sd is not None else 0.05 if axes is not None else 5.0
-    if not prior_sd > 0:
+    if prior_sd is not None and not prior_sd > 0:
         raise ValueError(f"prior_sd: must be positive, got {prior_sd}.")
     k, m = int(landmark.max()) + 1, 2 * len(u)
     size = 3 if axes is not None else m
@@ -146,7 +147,9 @@ def calibrate_with_offsets(
         information = np.einsum("nip,niq->pq", J, WJ) - H_co.T @ explained
         gradient = np.einsum("nip,ni->p", WJ, r)
         if np.isnan(p_value):
-            p_value = _score_test(information, gradient, prior_sd)
+            least = 1e-4 if axes is not None else 1e-2
+            p_value = _score_test(information, gradient, 500 * least)
+            prior_sd = prior_sd or _most_probable(information, gradient, least * np.geomspace(1, 3000, 60))
         covariance = np.linalg.inv(information + np.eye(k * size) / prior_sd**2)
         step = covariance @ (gradient - offset.ravel() / prior_sd**2)
         offset = offset + step.reshape(offset.shape)
@@ -167,10 +170,19 @@ def _system(c: Calibration) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndar
     return J_c @ c._model.selection, J_x, np.linalg.inv(S), c._fit.residuals
 
 
-def _score_test(information: np.ndarray, gradient: np.ndarray, prior_sd: float) -> float:
-    """p-value of no offsets, in the directions that the data know better than the prior does."""
+def _most_probable(information: np.ndarray, gradient: np.ndarray, candidates: np.ndarray) -> float:
+    """The prior's standard deviation of greatest evidence, the offsets integrated out."""
     values, vectors = np.linalg.eigh(information)
-    known = values * prior_sd**2 > 1.0
+    values, along = np.maximum(values, 0.0), (vectors.T @ gradient) ** 2
+    inflation = 1.0 + candidates[:, None] ** 2 * values
+    evidence = (along * candidates[:, None] ** 2 / inflation - np.log(inflation)).sum(axis=1)
+    return float(candidates[np.argmax(evidence)])
+
+
+def _score_test(information: np.ndarray, gradient: np.ndarray, largest: float) -> float:
+    """p-value of no offsets, in the directions that the data know better than to `largest`."""
+    values, vectors = np.linalg.eigh(information)
+    known = values * largest**2 > 1.0
     if not known.any():
         return 1.0
     return float(chi2.sf(((vectors.T @ gradient)[known] ** 2 / values[known]).sum(), known.sum()))

@@ -59,7 +59,7 @@ def test_offsets_are_found_with_honest_deviations_and_the_cameras_lose_their_bia
         x, u, landmark, axes, rig, true = tool_sweep(seed, distance_mm=distance_mm)
         options = {"model": model, "image_size_px": IMAGE_SIZE_PX}
         found = calibrate_with_offsets(x, u, landmark, axes, **options)
-        assert found.p_value < 1e-6
+        assert found.p_value < 1e-6 and 0.008 < found.prior_sd < 0.04
         normalised.append((found.offset - OFFSETS_MM) / found.standard_deviation)
         exact = np.hstack(rig.project(true))
         none = calibrate_with_offsets(x, u, landmark, axes, prior_sd=1e-9, **options)
@@ -73,23 +73,25 @@ def test_offsets_are_found_with_honest_deviations_and_the_cameras_lose_their_bia
 
 
 def test_without_offsets_none_are_claimed():
-    p_values = []
+    p_values, priors = [], []
     for seed in range(12):
         x, u, landmark, axes, _, _ = tool_sweep(seed, offset_mm=np.zeros((3, 3)))
         found = calibrate_with_offsets(x, u, landmark, axes)
         p_values.append(found.p_value)
+        priors.append(found.prior_sd)
         assert (np.abs(found.offset) < 4.5 * found.standard_deviation).all()
     assert min(p_values) > 1e-3 and 0.2 < np.mean(p_values) < 0.8
+    assert np.median(priors) < 0.004
 
 
 def test_a_tool_that_never_turns_tells_only_the_difference_between_landmarks():
     x, u, landmark, axes, _, true = tool_sweep(0, turn_rad=0.0)
-    found = calibrate_with_offsets(x, u, landmark, axes)
+    found = calibrate_with_offsets(x, u, landmark, axes, prior_sd=0.05)
     # What all landmarks have in common is a shift of the cameras: only the prior speaks, and the cameras say so.
     assert (found.standard_deviation > 0.9 * 0.05 / np.sqrt(3)).all()
     difference = (found.offset - found.offset.mean(axis=0)) - (OFFSETS_MM - OFFSETS_MM.mean(axis=0))
     assert np.abs(difference).max() < 0.012
-    turned = calibrate_with_offsets(*tool_sweep(0)[:4])
+    turned = calibrate_with_offsets(*tool_sweep(0)[:4], prior_sd=0.05)
     assert turned.learnt.min() > 0.9
     alone, both = (np.trace(f.calibration.projection_covariance(true[:1])[0]) for f in (turned, found))
     assert both > 20 * alone
@@ -99,7 +101,7 @@ def test_offsets_in_the_images_leave_their_mean_to_the_cameras():
     x, u, landmark, _, rig, true = tool_sweep(1, offset_mm=np.zeros((3, 3)))
     bias = np.array([[1.7, -0.3, 1.4, 0.2], [-1.3, 0.1, -1.2, 0.0], [0.2, 0.5, 0.1, 0.4]])
     u = [part + bias[landmark, 2 * i : 2 * i + 2] for i, part in enumerate(u)]
-    found = calibrate_with_offsets(x, u, landmark, None)
+    found = calibrate_with_offsets(x, u, landmark, None, prior_sd=5.0)
     assert found.offset.shape == (3, 4) and found.p_value < 1e-6
     np.testing.assert_allclose(found.offset - found.offset.mean(axis=0), bias - bias.mean(axis=0), atol=0.35)
     assert (found.standard_deviation > 2.5).all()
