@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import matplotlib.pyplot as plt
@@ -40,6 +40,7 @@ __all__ = [
     "point_errors",
     "profiles",
     "reconstruction",
+    "recorded_table",
     "response_pyramid",
     "score_table",
     "smoothness_sections",
@@ -81,7 +82,7 @@ def descriptor_channels(image: np.ndarray, channels: np.ndarray) -> Figure:
 
 def response_pyramid(left: np.ndarray, right: np.ndarray, maps: list[ResponseMap]) -> Figure:
     """One patch of the left image at growing sizes, and below each how well it fits everywhere in the right image."""
-    page, axes = figure(2, len(maps), width_in=3.2 * len(maps), height_in=4.1)
+    page, axes = figure(2, len(maps), width_in=3.2 * len(maps), height_in=4.4)
     for (top, bottom), level in zip(axes.T, maps, strict=True):
         show_image(top, left, f"{level.size_px} px patch")
         corner = level.centre_px - level.size_px / 2
@@ -93,7 +94,7 @@ def response_pyramid(left: np.ndarray, right: np.ndarray, maps: list[ResponseMap
         bottom.imshow(shown, extent=(x0, x1, y1, y0), cmap="inferno", alpha=0.85, norm=PowerNorm(0.8))
         rivals = int((level.response > 0.8 * level.response.max()).sum()) - 1
         bottom.plot(*level.peak_px, "+", color="cyan", markersize=14, markeredgewidth=2)
-        bottom.set_title(f"{rivals} of {level.response.size} rivals above 80 % of the peak", fontsize=9)
+        bottom.set_title(f"{rivals} of {level.response.size} places\nabove 80 % of the peak", fontsize=9)
         bottom.set(xlim=(-0.5, right.shape[1] - 0.5), ylim=(right.shape[0] - 0.5, -0.5))
     return page
 
@@ -147,13 +148,13 @@ def point_errors(errors_mm: dict[str, np.ndarray], sigma_um: dict[str, float]) -
         error = error[np.isfinite(error)] * 1000
         spread = 1.4826 * np.median(np.abs(error - np.median(error)))
         span = 8 * max(sigma_um[name], spread)
-        ax.hist(np.clip(error, -span, span), bins=np.linspace(-span, span, 91), density=True, color=COLOURS["ours"])
+        bins = np.linspace(-span, span, 91)
+        density = ax.hist(np.clip(error, -span, span), bins=bins, density=True, color=COLOURS["ours"])[0]
         x = np.linspace(-span, span, 400)
         gauss = np.exp(-0.5 * (x / sigma_um[name]) ** 2) / (sigma_um[name] * np.sqrt(2 * np.pi))
         ax.plot(x, gauss, color=COLOURS["paper"], label=f"predicted sigma {sigma_um[name]:.1f} um")
-        ax.set(
-            xlabel="error (um)", title=f"{name}: robust sigma {spread:.1f} um", yscale="log", ylim=(2e-3 / span, None)
-        )
+        ax.set(xlabel="error (um)", title=f"{name}: robust sigma {spread:.1f} um", yscale="log")
+        ax.set_ylim(2e-3 / span, 3 * max(density.max(), gauss.max()))
         ax.legend(loc="upper right", fontsize=8)
     axes[0].set_ylabel("density per um")
     return page
@@ -195,10 +196,14 @@ def held_out_curve(
     ax.axvline(chosen, color=COLOURS["ours"], ls=":", label="chosen")
     ax.set(xscale="log", xlabel="smoothness mu (px²/mm)", ylabel="held-out L1 error above the least (%)")
     ax.set_yscale("symlog", linthresh=0.1)
+    ax.set_ylim(-0.02, 3 * excess.max() + 0.1)
+    ax.yaxis.set_major_formatter("{x:g}")
     if error_um is not None:
         true = ax.twinx()
         true.plot(smoothness, error_um, "s--", color=COLOURS["truth"], label="true surface error (right axis)")
         true.set(ylabel="RMS surface error (um)", yscale="log")
+        true.yaxis.set_major_formatter("{x:g}")
+        true.yaxis.set_minor_formatter("")
         true.grid(False)
         true.spines["right"].set_visible(True)
         handles = ax.get_legend_handles_labels()[0] + true.get_legend_handles_labels()[0]
@@ -218,8 +223,11 @@ def smoothness_slider(
     """A slider over sections of surfaces of growing smoothness (in JupyterLab; elsewhere nothing moves)."""
 
     def draw(mu: int) -> Figure:
-        curves = reference | {"surface": (depths_mm[mu], "ours")}
-        return profiles(position_mm, points, curves, title=f"mu = {smoothness[mu]:.2g} px²/mm")
+        page, ax = figure(width_in=11, height_in=3.4)
+        _relative_section(ax, mu, depths_mm, position_mm, points, reference)
+        ax.set(title=f"mu = {smoothness[mu]:.2g} px²/mm", ylabel="depth beyond the chosen surface (um)")
+        ax.legend(loc="upper right", fontsize=8, ncols=3)
+        return page
 
     labels = [(f"{mu:.1e}", k) for k, mu in enumerate(smoothness)]
     return explore(draw, mu=SelectionSlider(options=labels, value=len(labels) // 2))
@@ -232,14 +240,33 @@ def smoothness_sections(
     points: tuple[np.ndarray, np.ndarray],
     reference: dict[str, tuple[np.ndarray, str]],
 ) -> Figure:
-    """Sections of three of the surfaces: too rough, in the middle, too smooth."""
+    """Sections of three of the surfaces, against the middle one: too rough, in the middle, too smooth."""
     page, axes = figure(1, 3, width_in=14, height_in=3.1, sharey=True)
-    for ax, step in zip(axes, (0, len(smoothness) // 2, len(smoothness) - 1), strict=True):
-        _section(ax, position_mm, points, reference | {"surface": (depths_mm[step], "ours")})
+    for ax, step in zip(axes, (0, len(smoothness) // 2, -1), strict=True):
+        _relative_section(ax, step, depths_mm, position_mm, points, reference)
         ax.set_title(f"mu = {smoothness[step]:.2g} px²/mm")
-    axes[0].set_ylabel("depth along the view (mm)")
+    axes[0].set_ylabel("depth beyond the chosen surface (um)")
     axes[0].legend(loc="best", fontsize=8)
     return page
+
+
+def _relative_section(
+    ax: Axes,
+    step: int,
+    depths_mm: list[np.ndarray],
+    position_mm: np.ndarray,
+    points: tuple[np.ndarray, np.ndarray],
+    reference: dict[str, tuple[np.ndarray, str]],
+    limit_um: float = 120.0,
+) -> None:
+    """A section of which the middle one of the surfaces is taken out: a bowl of millimetres hides errors of microns."""
+    middle = depths_mm[len(depths_mm) // 2]
+    apart = 1e3 * (points[1] - np.interp(points[0], position_mm, middle))
+    ax.plot(points[0], apart, ".", color=COLOURS["baseline"], markersize=3, alpha=0.6, label="triangulated points")
+    for name, (depth, colour) in (reference | {"surface": (depths_mm[step], "ours")}).items():
+        width = 2.6 if colour == "truth" else 1.6
+        ax.plot(position_mm, 1e3 * (depth - middle), color=COLOURS[colour], label=name, lw=width)
+    ax.set(xlabel="along the image row (mm)", ylim=(limit_um, -limit_um))
 
 
 def score_table(scores: dict[str, dict[str, tuple[Matches, DisparityScore, float]]]) -> Figure:
@@ -278,7 +305,7 @@ def iso_depth(axes: Axes, image: np.ndarray, depth_mm: np.ndarray, *, step_mm: f
     return axes
 
 
-def mesh_still(axes: Axes, surface_mm: np.ndarray, image: np.ndarray) -> Axes:
+def mesh_still(axes: Axes, surface_mm: np.ndarray, image: np.ndarray, *, zoom: float = 1.12) -> Axes:
     """A still of the surface (h, w, 3) mm with the image (h, w, 3) as its skin, on a 3D axes; depth drawn twofold."""
     light = LightSource(azdeg=300, altdeg=50)
     x, y, z = np.moveaxis(surface_mm, 2, 0)
@@ -286,7 +313,7 @@ def mesh_still(axes: Axes, surface_mm: np.ndarray, image: np.ndarray) -> Axes:
     skin = np.clip(image / 255 * (0.55 + 0.6 * shade), 0, 1)
     axes.plot_surface(x, y, z, facecolors=skin, rstride=1, cstride=1, shade=False, antialiased=False)
     size = [np.nanmax(v) - np.nanmin(v) for v in (x, y, z)]
-    axes.set_box_aspect((size[0], size[1], 2 * size[2]), zoom=1.12)
+    axes.set_box_aspect((size[0], size[1], 2 * size[2]), zoom=zoom)
     axes.set(xlabel="x (mm)", ylabel="y (mm)", zlabel="depth (mm)")
     axes.invert_zaxis()
     axes.invert_yaxis()
@@ -317,6 +344,8 @@ def _surface_views(
     surface: BSplineSurface,
     rig: StereoRig,
     mask: np.ndarray | None = None,
+    *,
+    zoom: float = 1.12,
 ) -> float:
     """Iso-depth lines over the image, and a still of the surface; returns the lines' spacing in mm."""
     h, w = image.shape[:2]
@@ -332,7 +361,7 @@ def _surface_views(
     levels = np.arange(np.floor(np.nanmin(depth) / step_mm), np.nanmax(depth) / step_mm + 1) * step_mm
     show_image(flat, image)
     flat.contour(x, y, np.ma.masked_invalid(depth), levels=levels, cmap="viridis_r", linewidths=1.1)
-    mesh_still(oblique, points, image[np.ix_(y, x)])
+    mesh_still(oblique, points, image[np.ix_(y, x)], zoom=zoom)
     return step_mm
 
 
@@ -352,9 +381,9 @@ def cases(found: Sequence[Case], *, limit_um: float = 60.0) -> Figure:
         ]
         pair, view = one.pair, one.pair.rig.left.viewing_direction
         show_image(axes[0], pair.left, f"{pair.name}: left image")
-        step_mm = _surface_views(axes[1], axes[2], pair.left, one.found.surface, pair.rig)
+        step_mm = _surface_views(axes[1], axes[2], pair.left, one.found.surface, pair.rig, zoom=1.25)
         axes[2].set(xlabel="", ylabel="", zlabel="", xticklabels=[], yticklabels=[], zticklabels=[])
-        axes[2].set_title("Depth drawn twofold")
+        axes[2].set_title("Depth drawn twofold", y=0.98)
         axes[1].set_title(f"Depth lines, every {step_mm:g} mm")
         for ax, error, rms, name in zip(
             axes[3:],
@@ -398,6 +427,25 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]], *, width_in: flo
     drawn.auto_set_font_size(False)
     drawn.set_fontsize(10)
     drawn.scale(1, 1.4)
+    return page
+
+
+def recorded_table(recorded: Mapping[str, dict]) -> Figure:
+    """What `python3 -m lib.surface.studies` recorded: surface errors with true and with calibrated cameras."""
+    result = {name: entry["result"] for name, entry in recorded.items()}
+    eyes = result.get("eyes", {})
+    rows = [
+        [f"{len(eyes) - 1} eyes, true cameras, {name}", f"{rms:.1f}", "", ""]
+        for name, rms in eyes.get("mean", {}).items()
+    ]
+    for name, grids in result.get("objects", {}).items():
+        rows += [
+            [f"{name}, true cameras, {grid} control points", f"{e['rms']:.1f}", "", ""] for grid, e in grids.items()
+        ]
+    for name, rms in result.get("calibrated", {}).get("mean surface_rms_um", {}).items():
+        rows.append([f"75 frames: {name}", *(f"{rms[key]:.1f}" for key in ("robot frame", "rigid", "affine"))])
+    page = table(["surface", "RMS (um)", "rigid motion taken out", "affine map taken out"], rows, width_in=13)
+    page.axes[0].tables[0].auto_set_column_width(range(4))
     return page
 
 

@@ -13,7 +13,16 @@ from scipy.interpolate import RegularGridInterpolator
 
 from lib.cameras import AffineCamera, StereoRig
 from lib.geometry import RigidTransform
-from lib.matching import RECTIFIED, DisparityScore, Matches, match, score_against_disparity
+from lib.matching import (
+    CONFIDENCES,
+    RECTIFIED,
+    DisparityScore,
+    Matches,
+    detection_auc,
+    match,
+    score_against_disparity,
+    sparsification,
+)
 from lib.simulator.dataset import TEST_SEQUENCES, sequence_design, sequence_name
 from lib.simulator.eye import Scene
 from lib.simulator.microscope import Microscope
@@ -31,6 +40,7 @@ __all__ = [
     "aligned_rms_um",
     "case",
     "compare_matchers",
+    "confidence_curves",
     "error_variants",
     "eyes",
     "objects",
@@ -183,6 +193,20 @@ def wrong_matches(matches: Matches, truth: TruthSurface, rig: StereoRig, *, limi
     x = truth(matches.u_left)
     off = np.linalg.norm(matches.u_right - rig.right.project(x), axis=1)
     return np.where(np.isfinite(off), off > limit_px, np.nan)
+
+
+def confidence_curves(matches: Matches, wrong: np.ndarray, kept: np.ndarray) -> dict[str, tuple[float, np.ndarray]]:
+    """For each confidence its AUC as a detector of wrong matches, and the wrong share of the surest `kept` (k,) ones.
+
+    `wrong` is (n,), NaN where nobody knows, as `wrong_matches` tells it.
+    """
+    known = np.isfinite(wrong)
+    bad = wrong[known] > 0
+    found = {}
+    for name in CONFIDENCES:
+        value = getattr(matches, name)[known]
+        found[name] = detection_auc(value, bad), sparsification(value, bad, kept)
+    return found
 
 
 def error_variants(

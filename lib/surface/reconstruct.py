@@ -87,7 +87,7 @@ def reconstruct(
         (h, w, 3) uint8 RGB.
     rig:
         The cameras; or the calibration that found them, and then a first, fast matching corrects its epipolar geometry
-        (`refine_rig`), which takes about a third off the error that the calibration causes.
+        (`refine_rig`), so that matches do not slide along edges.
     setting:
         "quality", or "fast" for several pairs a second; see `lib.matching.match`.
     u_landmarks:
@@ -155,5 +155,6 @@ def reconstruct(
             reject_mm=reject_mm,
             camera=rig.left if (fast if depth_only is None else depth_only) else None,
             tolerance=1e-4 if fast else 1e-8,
+            quick=fast,
         )
     return Reconstruction(surface, matches, points, len(found), masks[0], seconds, rig)

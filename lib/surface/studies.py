@@ -24,7 +24,7 @@ from lib import paths
 from lib.calibration import calibrate
 from lib.landmarks import Detector
 from lib.landmarks.stereo import detect
-from lib.matching import CONFIDENCES, RECTIFIED, detection_auc, match
+from lib.matching import RECTIFIED, match
 from lib.recordings import Recording
 from lib.simulator.eye import Eye
 from lib.simulator.microscope import Microscope
@@ -34,7 +34,7 @@ from lib.surface import evaluation
 from lib.surface.reconstruct import reconstruct
 from lib.workbench.collection import commit, machine
 
-__all__ = ["STUDIES", "main"]
+__all__ = ["STUDIES", "main", "recorded"]
 
 #: Stereo frames of the calibration, as many as the paper's.
 N_FRAMES = 75
@@ -129,9 +129,8 @@ def confidence(options: argparse.Namespace) -> dict:
     for name, matches, wrong in _judged_matches():
         judged = np.isfinite(wrong)
         bad, passed = wrong[judged] > 0, matches.reciprocal[judged]
-        result[name] = {
-            f"auc_{measure}": detection_auc(getattr(matches, measure)[judged], bad) for measure in CONFIDENCES
-        }
+        curves = evaluation.confidence_curves(matches, wrong, np.array([1.0]))
+        result[name] = {f"auc_{measure}": auc for measure, (auc, _) in curves.items()}
         result[name] |= {
             "matches": int(judged.sum()),
             "wrong_share": bad.mean(),
@@ -157,6 +156,11 @@ def _judged_matches():
     for method in ("band", "sgbm", "dis"):
         matches = match(frame.left, frame.right, method=method, rig=truth.rig, **every)
         yield f"simulated eye, {method}", matches, evaluation.wrong_matches(matches, truth.surface, truth.rig)
+
+
+def recorded(path: Path = paths.RESULTS / "reconstruction.json") -> dict[str, dict]:
+    """What the studies recorded last, by name; empty where nothing is."""
+    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
 
 
 STUDIES: dict[str, Callable[[argparse.Namespace], dict]] = {
@@ -217,7 +221,7 @@ def main(argv: list[str] | None = None) -> int:
     for name in options.studies or STUDIES:
         start, cpu = time.perf_counter(), time.process_time()
         result = _plain(STUDIES[name](options))
-        content = json.loads(options.out.read_text()) if options.out.is_file() else {}
+        content = recorded(options.out)
         content[name] = {
             "result": result,
             "command": f"python3 -m lib.surface.studies {name} --eyes {options.eyes} --recordings {options.recordings}",
