@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -13,7 +13,7 @@ from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from lib.geometry import points
 from lib.surface.bspline import BSplineSurface, SplineGrid
-from lib.surface.solver import L1Problem, L1Solution, cvxpy_reference, interior_point, least_squares
+from lib.surface.solver import L1Problem, L1Solution, cvxpy_reference, interior_point, least_squares, reweighted
 
 if TYPE_CHECKING:
     from lib.cameras import AffineCamera
@@ -150,6 +150,7 @@ def fit_surface(
     camera: AffineCamera | None = None,
     method: Literal["interior_point", "cvxpy", "least_squares"] = "interior_point",
     tolerance: float = 1e-8,
+    quick: bool = False,
 ) -> BSplineSurface:
     """The bicubic B-spline Psi that minimises paper Eq. (6), sum_i |Psi(u_i) - x_i|_1 + mu int |d^2 Psi / du^2|^2 du.
 
@@ -187,6 +188,9 @@ def fit_surface(
         L1 norms by squares (mu is then in px^2), the baseline that outliers ruin.
     tolerance:
         Duality gap at which the solver stops, relative to the objective.
+    quick:
+        Choose the smoothness with a looser tolerance, and reject points at a fit by reweighted least squares, within a
+        percent of the minimum; only the final fit is solved to `tolerance`.
 
     Raises
     ------
@@ -204,12 +208,12 @@ def fit_surface(
     solver, grid, x, axes, used = _SOLVERS[method], data.grid, data.x, data.axes, data.used
     held_out = np.empty((0, 2))
     if smoothness is None:
-        smoothness, held_out = _choose_smoothness(data, _quick(method))
+        smoothness, held_out = _choose_smoothness(data, _searcher(method, quick))
     mu = smoothness * data.stiffness
 
-    def solve(chosen: np.ndarray) -> tuple[L1Problem, L1Solution, BSplineSurface]:
+    def solve(chosen: np.ndarray, solver: Callable[..., L1Solution]) -> tuple[L1Problem, L1Solution, BSplineSurface]:
         problem = L1Problem(grid, data.u[chosen])
-        solution = solver(problem, data.values[chosen], mu, data.norms[chosen], tolerance=tolerance)
+        solution = solver(problem, data.values[chosen], mu, data.norms[chosen])
         control_points = grid.unflatten(solution.coefficients) @ axes
         if camera is not None:
             control_points = control_points + _rays(grid.sites.reshape(-1, 2), camera).reshape(control_points.shape)
@@ -220,18 +224,20 @@ def fit_surface(
         difference = surface(data.u) - x
         return difference if camera is None else (difference @ axes.T) @ axes
 
-    problem, solution, surface = solve(used)
+    rough = quick and method != "least_squares"
+    exact = partial(solver, tolerance=tolerance)
+    problem, solution, surface = solve(used, reweighted if rough else exact)
     norm = np.abs(residuals(surface)).sum(axis=1)
     if reject_mm is None:
         reject_mm = REJECT_MEDIANS * float(np.median(norm[used]))
     inliers = used & (np.nan_to_num(norm, nan=np.inf) <= reject_mm)
-    if (inliers != used).any():
+    if rough or (inliers != used).any():
         if inliers.sum() < _least(grid):
             raise ValueError(
                 f"reject_mm: only {inliers.sum()} of {used.sum()} points lie within {reject_mm:.4g} mm of the surface; "
                 "increase it."
             )
-        problem, solution, surface = solve(inliers)
+        problem, solution, surface = solve(inliers, exact)
     fit = SurfaceFit(
         objective=float(solution.objective.sum()),
         duality_gap=float(solution.duality_gap.sum()),
@@ -269,7 +275,7 @@ def held_out_errors(
     `fit_surface` chooses by it; the other arguments are as there.
     """
     data = _prepared(u, x_mm, domain, control, weights, covariance_mm2, camera)
-    error = _HeldOut(data, _quick(method), _FOLDS)
+    error = _HeldOut(data, _searcher(method), _FOLDS)
     return np.array([error(_checked_smoothness(mu)) for mu in np.atleast_1d(smoothness)])
 
 
@@ -311,9 +317,11 @@ def _checked_smoothness(smoothness: float) -> float:
     return float(smoothness)
 
 
-def _quick(method: str) -> Callable[..., L1Solution]:
-    """The solver that smoothness is chosen with: the reference has the same minimum, and takes longer."""
-    return least_squares if method == "least_squares" else interior_point
+def _searcher(method: str, quick: bool = False) -> Callable[..., L1Solution]:
+    """The solver that smoothness is chosen with: as near the minimum as the choice needs."""
+    if method == "least_squares":
+        return least_squares
+    return partial(interior_point, tolerance=3e-3 if quick else 1e-3)
 
 
 def _checked(u: ArrayLike, x_mm: ArrayLike, weights: ArrayLike | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -407,7 +415,7 @@ class _HeldOut:
         data, total, count = self.data, 0.0, 0
         for problem, train, design, test in self.parts:
             scaled = mu * data.stiffness * len(train) / data.used.sum()
-            solution = self.solver(problem, data.values[train], scaled, data.norms[train], tolerance=1e-3)
+            solution = self.solver(problem, data.values[train], scaled, data.norms[train])
             error = np.abs(design @ solution.coefficients - data.values[test])
             total += float((data.norms[test] / data.stiffness * error).sum())
             count += len(test)
