@@ -47,8 +47,12 @@ class Batch:
     @property
     def peak(self) -> Tensor:
         """(n, 3) height of the target: 1 visible, `OCCLUDED_PEAK` occluded (where it must be, yet not seen), 0 absent."""
-        heights = torch.tensor([0.0, OCCLUDED_PEAK, 1.0], dtype=self.images.dtype)
+        heights = torch.tensor([0.0, OCCLUDED_PEAK, 1.0], dtype=self.images.dtype, device=self.visibility.device)
         return heights[self.visibility.long()]
+
+    def to(self, device: torch.device) -> Batch:
+        """The batch on another device."""
+        return Batch(self.images.to(device), self.u.to(device), self.visibility.to(device))
 
 
 @dataclass(frozen=True)

@@ -17,11 +17,13 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from lib import paths
 from lib.landmarks.engines import LastHeatmaps, openvino
 from lib.landmarks.heatmaps import decode
 from lib.landmarks.inference import MIN_CONFIDENCE, Calibration, Detector, as_tensor
+from lib.recordings import Recording
 
-__all__ = ["PARITY_PX", "StageWithDecoding", "export", "run_onnx"]
+__all__ = ["PARITY_PX", "StageWithDecoding", "export", "export_shipped", "run_onnx"]
 
 #: Largest difference from torch that an exported stage may show.
 PARITY_PX = 0.01
@@ -111,6 +113,13 @@ def export(detector: Detector, folder: str | Path, examples: np.ndarray) -> dict
             os.replace(partial, folder / f"{stage}.onnx")
         result[stage] = folder / f"{stage}.onnx", difference
     return result
+
+
+def export_shipped(weights: str | Path | None, folder: str | Path) -> dict[str, tuple[Path, float]]:
+    """`export` of a weights file, compared on frames of the recording that ships."""
+    frames = Recording.open(paths.SHIPPED_RECORDING).frames
+    chosen = [frames[i] for i in (0, len(frames) // 2)]
+    return export(Detector.load(weights), folder, np.stack([image for f in chosen for image in (f.left, f.right)]))
 
 
 def _write(module: nn.Module, example: Tensor, path: Path) -> None:

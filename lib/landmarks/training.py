@@ -22,6 +22,7 @@ from typing import Protocol
 
 import numpy as np
 import torch
+import torch.distributed as dist
 from torch import Tensor, nn
 from tqdm.auto import tqdm
 
@@ -197,8 +198,25 @@ class Training:
     provenance: dict[str, object]
 
 
-def _batch(source: Source, config: TrainingConfig, step: int) -> Batch:
-    rng = np.random.default_rng([config.seed, step])
+def _processes() -> tuple[int, int]:
+    """Rank of this process, and how many train together: torchrun starts them and tells each by its environment."""
+    world = int(os.environ.get("WORLD_SIZE", "1"))
+    if world > 1 and not dist.is_initialized():
+        dist.init_process_group("nccl" if torch.cuda.is_available() else "gloo")
+    return (dist.get_rank(), world) if world > 1 else (0, 1)
+
+
+def _average(tensors: Sequence[Tensor], world: int) -> None:
+    """Replace tensors by their means over the processes."""
+    together = torch.cat([t.flatten() for t in tensors])
+    dist.all_reduce(together)
+    together /= world
+    for tensor, mean in zip(tensors, together.split([t.numel() for t in tensors]), strict=True):
+        tensor.copy_(mean.view_as(tensor))
+
+
+def _batch(source: Source, config: TrainingConfig, step: int, rank: int = 0) -> Batch:
+    rng = np.random.default_rng([config.seed, step, rank] if rank else [config.seed, step])
     indices = rng.choice(len(source), config.batch_size, replace=len(source) < config.batch_size)
     drawn = [source.draw(int(i), rng) for i in indices]
     images = as_tensor(np.stack([image for image, _, _ in drawn])).contiguous()
@@ -218,13 +236,14 @@ def validate(
     predictions over that of the labels) near 0, say that the network predicts nothing, or always the same.
     """
     network.eval()
+    device = next(network.parameters()).device
     losses, found, values = [], [], []
     for start in range(0, len(samples), batch):
         part = slice(start, start + batch)
         images = as_tensor(samples.images[part])
         u, visibility = torch.from_numpy(samples.u[part]).float(), torch.from_numpy(samples.visibility[part])
         visibility = leave_frame(u, visibility, tuple(images.shape[-2:]))
-        outputs = network(images)
+        outputs = [output.cpu() for output in network(images.to(device))]
         losses.append(heatmap_loss(outputs, Batch(images, u, visibility), network.stride, config.sigma_px).item())
         peaks = decode(outputs[-1], network.stride, sigma_px=config.sigma_px)
         found.append(peaks.u.numpy())
@@ -255,7 +274,11 @@ class _Run:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(config.seed)
             self.network = copy.deepcopy(initial) if initial is not None else StackedHourglass(config.network)
-        self.network.to(memory_format=torch.channels_last)
+        self.rank, self.world = _processes()
+        self.device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")) if self.world > 1 else 0)
+        if not torch.cuda.is_available():
+            self.device = torch.device("cpu")
+        self.network.to(self.device, memory_format=torch.channels_last)
         self.average = copy.deepcopy(self.network) if config.ema else None
         parameters = self.network.parameters()
         if config.optimiser == "rmsprop":
@@ -274,11 +297,16 @@ class _Run:
         self.network.train()
         for group in self.optimiser.param_groups:
             group["lr"] = self.config.rate(self.step)
-        with torch.autocast("cpu", torch.bfloat16, enabled=self.config.precision == "bf16"):
+        batch = batch.to(self.device)
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.config.precision == "bf16"):
             outputs = self.network(batch.images.contiguous(memory_format=torch.channels_last))
         loss = heatmap_loss(outputs, batch, self.network.stride, self.config.sigma_px)
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
+        if self.world > 1:
+            with torch.no_grad():
+                _average([p.grad for p in self.network.parameters() if p.grad is not None], self.world)
+                _average([b for b in self.network.buffers() if b.is_floating_point()], self.world)
         if self.config.clip:
             nn.utils.clip_grad_norm_(self.network.parameters(), self.config.clip)
         self.optimiser.step()
@@ -292,6 +320,14 @@ class _Run:
                     mean.lerp_(value, 1 - decay) if mean.is_floating_point() else mean.copy_(value)
         self.step += 1
         return loss.item()
+
+    def agreed(self, stop: bool) -> bool:
+        """What the first process says: clocks differ, and all must stop together."""
+        if self.world == 1:
+            return stop
+        flag = torch.tensor(float(stop), device=self.device)
+        dist.broadcast(flag, 0)
+        return bool(flag)
 
     def save(self, path: Path, provenance: dict[str, object]) -> None:
         tensors = {f"network.{k}": v for k, v in self.network.state_dict().items()}
@@ -373,6 +409,8 @@ def train(
         "commit": commit(),
         "torch": torch.__version__,
     }
+    if run.world > 1:
+        provenance["processes"] = run.world
     if initial is not None:
         provenance["before"] = initial.provenance
     if folder is not None:
@@ -381,14 +419,15 @@ def train(
         if (folder / "last.safetensors").exists():
             run.restore(folder / "last.safetensors", source.fingerprint)
     began, before, loss_sum, since = time.perf_counter(), run.seconds, 0.0, 0
-    bar = tqdm(total=config.steps, initial=run.step, disable=not progress, unit="step", mininterval=1.0)
+    quiet = not progress or run.rank > 0
+    bar = tqdm(total=config.steps, initial=run.step, disable=quiet, unit="step", mininterval=1.0)
     stale = _stale(run.log)
     try:
         while run.step < config.steps and not (config.patience and stale >= config.patience):
-            loss_sum, since = loss_sum + run.advance(_batch(source, config, run.step)), since + 1
+            loss_sum, since = loss_sum + run.advance(_batch(source, config, run.step, run.rank)), since + 1
             bar.update()
             run.seconds = before + time.perf_counter() - began
-            stop = max_seconds is not None and time.perf_counter() - began > max_seconds
+            stop = run.agreed(max_seconds is not None and time.perf_counter() - began > max_seconds)
             if run.step % config.validate_every and run.step < config.steps and not stop:
                 continue
             row = {"step": run.step, "seconds": round(run.seconds, 1), "loss": loss_sum / since}
@@ -398,20 +437,20 @@ def train(
             better = row["validation_loss"] < run.best
             run.best, stale = (row["validation_loss"], 0) if better else (run.best, stale + 1)
             bar.set_postfix(loss=f"{row['loss']:.3f}", pck=f"{row['pck_0.05']:.1f}", median=f"{row['median_px']:.2f}px")
-            if folder is not None:
+            if folder is not None and run.rank == 0:
                 provenance["metrics"] = row
                 run.save(folder / "last.safetensors", provenance)
                 if better:
                     run.save(folder / "best.safetensors", provenance)
                 _write_log(folder / "log.csv", run.log)
-            if on_validation is not None:
+            if on_validation is not None and run.rank == 0:
                 on_validation(run.log)
             if stop:
                 break
     finally:
         bar.close()
     provenance |= {"metrics": run.log[-1] if run.log else {}, "seconds": run.seconds, "steps": run.step}
-    return Training(copy.deepcopy(run.usable).eval(), run.log, provenance)
+    return Training(copy.deepcopy(run.usable).cpu().eval(), run.log, provenance)
 
 
 def load_training(path: str | Path) -> Training:
@@ -476,8 +515,8 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python3 -m lib train", description=main.__doc__.split(": ", 1)[1])
     parser.add_argument(
         "what",
-        choices=["generate", "frame", "tool", "window", "whole", "assemble"],
-        help="data; a stage of the shipped detector; the paper's one network on crops; the detector",
+        choices=["generate", "frame", "tool", "window", "whole", "assemble", "export"],
+        help="data; a stage of the shipped detector; the paper's one network on crops; the detector; its stages as ONNX",
     )
     parser.add_argument("--data", type=Path, default=paths.CACHE / "landmarks", help="folder of the shards")
     parser.add_argument("--folder", type=Path, default=paths.CACHE / "training", help="checkpoints, one folder a stage")
@@ -490,6 +529,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--initial", type=Path, help="checkpoint to fine-tune from")
     parser.add_argument("--out", type=Path, default=paths.MODELS / "default.safetensors", help="assemble: weights file")
+    parser.add_argument("--onnx", type=Path, default=paths.CACHE / "onnx", help="export: folder of the ONNX files")
     parser.add_argument("--threads", type=int, default=0, help="torch threads (default: torch's choice)")
     a = parser.parse_args(argv)
     if a.threads:
@@ -500,6 +540,11 @@ def main(argv: list[str] | None = None) -> int:
             dataset.generate(a.data, a.shards, workers=a.workers)
         elif a.what == "assemble":
             assembly.assemble(a.folder, a.data, a.out)
+        elif a.what == "export":
+            from lib.landmarks.export import export_shipped  # needs onnx, which nothing else does
+
+            for stage, (path, difference) in export_shipped(a.out, a.onnx).items():
+                print(f"{stage}: {path}, at most {difference:.2g} px from torch")
         else:
             features = a.features or {"frame": 32, "tool": 48, "window": 48, "whole": 64}[a.what]
             config = replace(
@@ -534,3 +579,7 @@ def main(argv: list[str] | None = None) -> int:
         print(error, file=sys.stderr)
         return 2
     return 0
+
+
+if __name__ == "__main__":  # for torchrun
+    sys.exit(main())

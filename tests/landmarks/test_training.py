@@ -1,5 +1,7 @@
 import errno
 import os
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +12,7 @@ import torch
 from lib.landmarks import training
 from lib.landmarks.augmentation import Augmentation, Batch
 from lib.landmarks.heatmaps import render
-from lib.landmarks.network import HourglassConfig
+from lib.landmarks.network import HourglassConfig, StackedHourglass
 from lib.landmarks.training import PRESETS, Samples, TrainingConfig, heatmap_loss, load_training, train
 
 SMALL = replace(
@@ -152,3 +154,54 @@ def test_bad_data_is_named(toy):
 def test_bad_configurations_are_named(changes):
     with pytest.raises(ValueError, match=next(iter(changes))):
         TrainingConfig(**changes)
+
+
+def test_two_processes_train_one_network(tmp_path):
+    """torchrun on two CPU processes: other batches, the same weights, a falling loss, one log."""
+    script = tmp_path / "two.py"
+    script.write_text(
+        "import os, sys, torch\n"
+        f"sys.path[:0] = [{str(Path(__file__).parent)!r}, {str(Path(__file__).parents[2])!r}]\n"
+        "from dataclasses import replace\n"
+        "from conftest import toy_samples\n"
+        "from lib.landmarks.network import HourglassConfig\n"
+        "from lib.landmarks.training import PRESETS, train\n"
+        "torch.set_num_threads(1)\n"
+        "config = replace(PRESETS['best'], network=HourglassConfig(6, 1, 2), steps=12, batch_size=2,\n"
+        "                 validate_every=4, precision='fp32', learning_rate=4e-3)\n"
+        "done = train(config, toy_samples(20), toy_samples(4, 1), sys.argv[1], progress=False)\n"
+        "torch.save((done.network.state_dict(), done.log), f'{sys.argv[1]}/rank{os.environ[\"RANK\"]}.pt')\n"
+    )
+    out = tmp_path / "out"
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", str(script), out]
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
+    done = subprocess.run(list(map(str, command)), capture_output=True, text=True, timeout=240, env=environment)
+    assert done.returncode == 0, done.stderr[-2000:]
+    (a, log), (b, _) = (torch.load(out / f"rank{rank}.pt") for rank in (0, 1))
+    assert all(torch.equal(a[name], b[name]) for name in a)
+    assert log[-1]["loss"] < log[0]["loss"]
+    alone = load_training(out / "last.safetensors")
+    assert alone.provenance["processes"] == 2
+    assert [row["step"] for row in alone.log] == [4, 8, 12]
+    assert all(torch.equal(a[name], value) for name, value in alone.network.state_dict().items())
+
+
+def test_averaging_over_processes_is_a_batch_of_all(monkeypatch, toy):
+    """The mean of the processes' gradients is the gradient of the joined batch (without batch statistics)."""
+    network = StackedHourglass(HourglassConfig(6, 1, 2)).eval()
+    for head in network.heads:
+        torch.nn.init.normal_(head.weight, std=0.1)
+    data = toy(4)
+    batches = [training._batch(data, replace(SMALL, seed=s), 0) for s in (0, 1)]
+
+    def gradients(batch):
+        network.zero_grad()
+        heatmap_loss(network(batch.images), batch, network.stride).backward()
+        return [p.grad.clone() for p in network.parameters() if p.grad is not None]
+
+    joined = Batch(*(torch.cat([getattr(b, k) for b in batches]) for k in ("images", "u", "visibility")))
+    mine, others = gradients(batches[0]), gradients(batches[1])
+    monkeypatch.setattr(training.dist, "all_reduce", lambda t: t.add_(torch.cat([g.flatten() for g in others])))
+    training._average(mine, 2)
+    for a, b in zip(mine, gradients(joined), strict=True):
+        assert torch.allclose(a, b, atol=1e-5 + 1e-3 * float(b.abs().max()))
