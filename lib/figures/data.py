@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 
 from lib.cameras import StereoRig
 from lib.figures.style import COLOURS, LANDMARK_COLOURS, figure, show_image
@@ -14,13 +15,16 @@ from lib.simulator.eye import Scene
 from lib.simulator.forceps import Forceps
 from lib.simulator.microscope import Microscope
 from lib.simulator.motion import Motion
+from lib.simulator.realism import Profiles
 
 __all__ = [
     "annotation_errors",
     "contact_sheet",
     "gallery",
     "motion_page",
+    "profiles_page",
     "realism_page",
+    "realism_sheet",
     "rig_page",
     "volume_page",
 ]
@@ -172,4 +176,53 @@ def realism_page(real: Mapping[str, np.ndarray], simulated: Mapping[str, np.ndar
         ax.set(yticks=[], title=name.replace("_", " "))
         ax.title.set_fontsize(9)
     axes.flat[0].legend(fontsize=7)
+    return page
+
+
+def profiles_page(pairs: Mapping[str, tuple[Profiles, Profiles]]) -> Figure:
+    """Distributions of real and simulated images, a row for each pair (real, simulated).
+
+    Lines are means over images; the grey band holds the middle 90 % of the real ones.
+    """
+    page, axes = figure(len(pairs), 4, width_in=12, height_in=2.6 * len(pairs), squeeze=False)
+    channels = dict(zip(("red", "green", "blue"), ("#c0392b", "#2e8b57", "#2b6cc0"), strict=True))
+    for row, (name, (real, simulated)) in zip(axes, pairs.items(), strict=True):
+        curves = (
+            ("level", "luminance", "luminance", f"{name}: luminance"),
+            ("slope", "gradient", "derivative along x (1/px)", "Gradients"),
+            ("frequency", "power", "frequency (cycles/px)", "Power spectrum"),
+        )
+        for ax, (x, y, label, title) in zip((row[0], row[2], row[3]), curves, strict=True):
+            low, high = np.percentile(getattr(real, y), [5, 95], axis=0)
+            ax.fill_between(getattr(real, x), low, high, color="#e4e4e4", zorder=0)
+            for profile, colour, kind in ((real, "#555555", "real"), (simulated, COLOURS["ours"], "simulated")):
+                ax.plot(getattr(profile, x), getattr(profile, y).mean(axis=0), color=colour, label=kind)
+            ax.set(xlabel=label, title=title)
+        for k, (channel, colour) in enumerate(channels.items()):
+            row[1].plot(real.level, real.colour[:, k].mean(axis=0), color=colour, linewidth=1.2, label=channel)
+            row[1].plot(simulated.level, simulated.colour[:, k].mean(axis=0), "--", color=colour)
+        row[1].set(xlabel="red, green, blue", title="Colour (dashed: simulated)", ylim=(0, None))
+        row[0].set(ylim=(0, None))
+        row[2].set(yscale="log", ylim=(1e-3, None))
+        row[3].set(xscale="log", yscale="log")
+        row[3].set_xticks([0.03, 0.1, 0.3], ["0.03", "0.1", "0.3"])
+        row[3].xaxis.set_minor_formatter(NullFormatter())
+    axes[0, 0].legend(fontsize=8)
+    return page
+
+
+def realism_sheet(
+    pairs: Mapping[str, tuple[Sequence[np.ndarray], Sequence[np.ndarray]]], *, columns: int = 8
+) -> Figure:
+    """Rows of real windows, each with a row of simulated ones below."""
+    page, axes = figure(2 * len(pairs), columns, width_in=12, height_in=3.1 * len(pairs), squeeze=False)
+    rows = [
+        (f"{kind}, {name}", images)
+        for name, pair in pairs.items()
+        for kind, images in zip(("real", "simulated"), pair, strict=True)
+    ]
+    for line, (title, images) in zip(axes, rows, strict=True):
+        for k, ax in enumerate(line):
+            show_image(ax, images[k * len(images) // columns], title if k == 0 else "")
+            ax.title.set_fontsize(9)
     return page

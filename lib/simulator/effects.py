@@ -78,10 +78,10 @@ def effect_gallery(eye: Eye, forceps: Forceps, pose: Pose) -> dict[str, np.ndarr
         "Rolling shutter, 120 mm/s": (matt, replace(PLAIN, readout_s=0.03), {"velocity_mm_s": (120.0, 0.0, 0.0)}),
         "Coaxial light, vignetting": (
             matt,
-            replace(PLAIN, spot_radius_mm=2.0, spot_mm=(pose.base_mm[0] + 2, pose.base_mm[1] - 1.5), vignetting=0.9),
+            replace(PLAIN, spot_radius_mm=1.2, spot_mm=(pose.base_mm[0] + 2.5, pose.base_mm[1] - 1.0), vignetting=0.9),
             {},
         ),
-        "Shot and read noise": (matt, replace(PLAIN, full_well=700.0, read_noise=12.0), {}),
+        "Shot and read noise": (matt, replace(PLAIN, full_well=150.0, read_noise=8.0), {}),
         "JPEG, quality 15": (matt, replace(PLAIN, jpeg_quality=15), {}),
         "Colour of the other eye": (matt, replace(PLAIN, gain=((0.8, 1.0, 1.35),) * 2), {}),
         "All, default left": (eye, default, {}),

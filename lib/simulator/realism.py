@@ -1,14 +1,17 @@
 """How much simulated images are like real ones: image statistics, and a preset that mimics the public in-vivo frames.
 
 The public frames with forceps (Sznitman et al., MICCAI 2012) come from another set-up than the open-sky one: a
-640 x 480 video camera looks through the pupil at a fifth of the magnification, under a blue or a green endoilluminator.
-`in_vivo_window` renders that, so that statistics can be compared like with like.  Its light, blur and noise were set
-by hand on these very frames: the comparison shows that the renderer can reach them, not that it predicts them.
+640 x 480 video camera looks through the pupil at a fifth of the magnification, under a blue (first sequence) or a green
+endoilluminator (second).  `in_vivo_window` renders that, so that statistics can be compared like with like.  Light, blur
+and noise of the preset (`LIGHTS`) were set by hand on the first half of each sequence and are judged on the second: the
+comparison shows that the renderer can reach such frames, not that it predicts a microscope never seen.
 """
 
 from __future__ import annotations
 
 import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -17,19 +20,29 @@ import numpy as np
 from lib.cameras import AffineCamera
 from lib.geometry import RigidTransform
 from lib.recordings import import_retinal_microsurgery
+from lib.recordings.frames import read_image
 from lib.simulator.eye import Eye
 from lib.simulator.forceps import Forceps, Pose
 from lib.simulator.microscope import Microscope
 from lib.simulator.render import render_view
+from lib.simulator.texture import EXTENT_MM, fundus_texture
 
 __all__ = [
+    "FUNDUS_SET_BY",
+    "LIGHTS",
     "STATISTICS",
+    "Light",
+    "Profiles",
     "compare",
+    "exceptions_text",
+    "fundus_windows",
     "image_statistics",
     "in_vivo_window",
     "landmark_window",
+    "profiles",
     "real_windows",
     "statistics_table",
+    "table_text",
 ]
 
 #: name -> what it is.
@@ -47,6 +60,81 @@ STATISTICS = {
     "sharpness_centre": "mean |Laplacian| of the central ninth",
     "sharpness_border": "mean |Laplacian| of the rest",
 }
+#: What sets a statistic in the simulator: why it may lie elsewhere.
+_EXPOSURE = "the exposure, which a sequence changes with every move of its lamp and the preset draws from one range"
+_DETAIL = "blur, sharpening and noise of the camera, one value a preset, while focus changes within a sequence"
+_SET_BY = {
+    "luminance_mean": _EXPOSURE,
+    "luminance_std": "the hot spot of the lamp and the brightness of the tool against the retina",
+    "luminance_p05": "the darkest of tool, shadow and border of the lit field, which has no border here",
+    "luminance_p95": _EXPOSURE,
+    "red_over_green": "the colour of the lamp, and of the tissue near the tool",
+    "blue_over_green": "the colour of the lamp, and of the tissue near the tool",
+    "saturated_share": _EXPOSURE + "; white membranes that saturate near the tool have no counterpart here",
+    "gradient_mean": _DETAIL,
+    "gradient_kurtosis": "few strong edges: tool, vessels and glints, whose share of a window the preset fixes",
+    "spectrum_slope": _DETAIL,
+    "sharpness_centre": _DETAIL,
+    "sharpness_border": _DETAIL,
+}
+#: The same for `fundus_windows`.
+FUNDUS_SET_BY = dict.fromkeys(
+    STATISTICS, "the texture's fine grain, which no optics has blurred yet, unlike a photograph's"
+) | {
+    name: "the pigment drawn for an eye, and the photograph's own exposure and colour"
+    for name in (
+        "luminance_mean",
+        "luminance_std",
+        "luminance_p05",
+        "luminance_p95",
+        "red_over_green",
+        "blue_over_green",
+        "saturated_share",
+    )
+}
+
+
+@dataclass(frozen=True)
+class Light:
+    """An endoilluminator with its camera, set by hand on the first half of one real sequence.
+
+    Attributes
+    ----------
+    colour:
+        Mean red, green and blue of a picture over its green.
+    exposure, exposure_spread:
+        Median green in linear light, and the spread of its logarithm from picture to picture.
+    metal, gloss:
+        Reflectance of the tool, and strength of the wet surface's reflection.
+    spot_distance_mm, spot_radius_mm:
+        Ranges of where the hot spot lies from the jaws, and of its Gaussian radius.
+    psf_px, sharpening, noise:
+        Blur at three times the resolution, the camera's unsharp mask, and shot noise at full scale.
+    veil:
+        Share of the light that vitreous and optics scatter, and that arrives blurred.
+    contrast:
+        Exponent of the camera's tone curve about the median, on top of gamma.
+    """
+
+    colour: tuple[float, float, float]
+    exposure: float
+    exposure_spread: float
+    metal: float
+    gloss: float
+    spot_distance_mm: tuple[float, float]
+    spot_radius_mm: tuple[float, float]
+    psf_px: float
+    sharpening: float
+    noise: float
+    veil: float
+    contrast: float
+
+
+#: By the sequence whose first half each was set on.
+LIGHTS = {
+    "seq1": Light((0.70, 1.0, 1.30), 0.26, 0.25, 0.03, 0.4, (1.2, 3.5), (0.8, 1.5), 2.4, 0.9, 0.004, 0.45, 1.0),
+    "seq2": Light((0.755, 1.0, 0.55), 0.41, 0.15, 0.33, 0.4, (1.5, 3.0), (1.2, 2.0), 2.6, 0.8, 0.015, 0.18, 1.35),
+}
 
 
 def image_statistics(image: np.ndarray) -> dict[str, float]:
@@ -54,14 +142,10 @@ def image_statistics(image: np.ndarray) -> dict[str, float]:
     if image.ndim != 3 or image.shape[2] != 3 or min(image.shape[:2]) < 33:
         raise ValueError(f"image: expected (h, w, 3) of at least 33 x 33 px, got {image.shape}.")
     rgb = image.astype(np.float32) / 255
-    grey = rgb @ np.array([0.299, 0.587, 0.114], np.float32)
+    grey = _luminance(image)
     height, width = grey.shape
     d_x, d_y = np.diff(grey, axis=1)[:-1], np.diff(grey, axis=0)[:, :-1]
-    side = min(height, width)
-    window = np.outer(np.hanning(side), np.hanning(side))
-    patch = grey[(height - side) // 2 :, (width - side) // 2 :][:side, :side]
-    power = np.abs(np.fft.fft2((patch - patch.mean()) * window)) ** 2
-    frequency = np.hypot(*np.meshgrid(np.fft.fftfreq(side), np.fft.fftfreq(side)))
+    frequency, power = _power(grey)
     edges = np.geomspace(1 / 32, 1 / 4, 9)
     rings = [(frequency >= low) & (frequency < high) for low, high in itertools.pairwise(edges)]
     means = np.array([power[ring].mean() for ring in rings])
@@ -88,6 +172,21 @@ def image_statistics(image: np.ndarray) -> dict[str, float]:
     }
 
 
+def _luminance(image: np.ndarray) -> np.ndarray:
+    """(h, w) float32, 0 to 1, of (h, w, 3) uint8 RGB."""
+    return image.astype(np.float32) / 255 @ np.array([0.299, 0.587, 0.114], np.float32)
+
+
+def _power(grey: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Frequency (cycles per px) and power, (side, side) each, of the central square under a Hann window."""
+    height, width = grey.shape
+    side = min(height, width)
+    window = np.outer(np.hanning(side), np.hanning(side))
+    patch = grey[(height - side) // 2 :, (width - side) // 2 :][:side, :side]
+    frequency = np.hypot(*np.meshgrid(np.fft.fftfreq(side), np.fft.fftfreq(side)))
+    return frequency, np.abs(np.fft.fft2((patch - patch.mean()) * window)) ** 2
+
+
 def landmark_window(image: np.ndarray, u: np.ndarray, size_px: int = 96) -> np.ndarray:
     """The square of an image round the mean of its known landmarks u (3, 2), moved inside where it sticks out."""
     centre = np.nanmean(u, axis=0)
@@ -97,21 +196,30 @@ def landmark_window(image: np.ndarray, u: np.ndarray, size_px: int = 96) -> np.n
     return image[corner[1] : corner[1] + size_px, corner[0] : corner[0] + size_px]
 
 
-def in_vivo_window(rng: np.random.Generator, size_px: int = 96) -> tuple[np.ndarray, np.ndarray]:
+def in_vivo_window(
+    rng: np.random.Generator, size_px: int = 96, light: str | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """A window of a simulated in-vivo frame round the jaws, and its landmarks u (3, 2) px.
 
-    Rendered at three times the resolution: 18 px per mm, a pale fundus under coloured light whose hot spot lies near
-    the tool, glare of the optics, and the sensor's sharpening and noise.
+    Rendered at three times the resolution: 18 px per mm, a pale fundus under one of the coloured `LIGHTS` whose hot
+    spot lies near the tool, glare of the optics, and the sensor's sharpening and noise.
+
+    Parameters
+    ----------
+    light:
+        One of `LIGHTS`; None draws it.
     """
-    green = rng.random() < 0.5
+    if light is not None and light not in LIGHTS:
+        raise ValueError(f"light: unknown {light!r}; one of {', '.join(LIGHTS)}.")
+    lamp = LIGHTS[light or str(rng.choice(list(LIGHTS)))]
     fine, zoom = 3, 18.0 * rng.uniform(0.85, 1.15)
-    eye = Eye(seed=int(rng.integers(40, 46)), texture_px=768, radius_mm=13.0, depth_mm=3.0, gloss=0.7 if green else 0.3)
+    eye = Eye(seed=int(rng.integers(40, 46)), texture_px=768, radius_mm=13.0, depth_mm=3.0, gloss=lamp.gloss)
     forceps = Forceps(
         shaft_radius_mm=0.36,
         jaw_length_mm=rng.uniform(2.0, 2.6),
         jaw_radius_mm=0.16,
         bow_mm=rng.uniform(0.15, 0.4),
-        brightness=0.75 if green else 0.22,
+        brightness=lamp.metal,
         tip_radius_mm=0.015,
     )
     place = rng.normal(0, 2.5, 2)
@@ -122,31 +230,37 @@ def in_vivo_window(rng: np.random.Generator, size_px: int = 96) -> tuple[np.ndar
         roll_rad=float(np.clip(rng.normal(0, 0.3), -0.9, 0.9)),
         opening_mm=rng.uniform(0.1, 1.2),
     )
-    # Colours are those of the light and of the camera: the mean of the picture, not of the eye, is what is known.
-    target = np.array([0.76, 1.0, 0.56] if green else [0.72, 1.0, 1.30]) * np.exp(rng.normal(0, 0.03, 3))
-    mean = (eye.texture.reshape(-1, 3)[::97] / 255.0).mean(axis=0)
-    gain = (target / target[1] / (mean / mean[1])) ** 2.2
-    gain = tuple(float(v) for v in gain * (0.50 / (mean[1] ** 2.2)))
+    away = rng.uniform(-np.pi, np.pi)
+    spot = place + rng.uniform(*lamp.spot_distance_mm) * np.array([np.cos(away), np.sin(away)])
     microscope = Microscope(
         depth_of_field_mm=rng.uniform(1.5, 4.0),
-        psf_px=3.0,
+        psf_px=lamp.psf_px,
         light_slope=tuple(float(v) for v in rng.uniform(-1.2, 1.2, 2)),
-        spot_mm=tuple(float(v) for v in place + rng.normal(0, 1.6, 2)),
-        spot_radius_mm=rng.uniform(1.6, 3.5),
-        brightness=float(np.exp(rng.normal(-0.15, 0.3))),
+        spot_mm=tuple(float(v) for v in spot),
+        spot_radius_mm=rng.uniform(*lamp.spot_radius_mm),
+        brightness=1.0,
         vignetting=0.0,
-        gain=(gain, gain),
-        full_well=2500.0,
-        read_noise=8.0,
+        gain=((1.0, 1.0, 1.0),) * 2,
+        full_well=float("inf"),
     )
     R = RigidTransform.from_rotation_vector((0.0, rng.normal(0, 0.05), rng.uniform(-np.pi, np.pi))).R
     middle = R[:2] @ forceps.landmarks(pose).mean(axis=0)
     n = fine * size_px
     camera = AffineCamera(np.column_stack([fine * zoom * R[:2], (n - 1) / 2 - fine * zoom * middle]))
-    view = render_view(eye, microscope, camera, (n, n), forceps=forceps, pose=pose, rng=rng)
-    image = cv2.resize(view.image, (size_px, size_px), interpolation=cv2.INTER_AREA)
-    image = cv2.addWeighted(image, 1.4, cv2.GaussianBlur(image, (0, 0), 1.2), -0.4, 0)
-    return image, (view.u + 0.5) / fine - 0.5
+    view = render_view(eye, microscope, camera, (n, n), forceps=forceps, pose=pose)
+    # A narrow lamp: the picture keeps little of the fundus's own colour, and shows it in the lamp's.
+    linear = cv2.resize((view.image / 255.0) ** 2.2, (size_px, size_px), interpolation=cv2.INTER_AREA)
+    linear += lamp.veil * (cv2.GaussianBlur(linear, (0, 0), 0.1 * size_px) - linear)
+    grey = linear @ np.array([0.25, 0.6, 0.15])
+    own = linear / np.maximum(linear.reshape(-1, 3).mean(axis=0), 1e-6) * grey.mean()
+    colour = np.array(lamp.colour) * np.exp(rng.normal(0, 0.03, 3))
+    tone = (grey / np.median(grey)) ** (lamp.contrast - 1)
+    tinted = (0.35 * own + 0.65 * grey[..., None]) * colour**2.2 * tone[..., None]
+    exposed = tinted * (lamp.exposure * np.exp(rng.normal(0, lamp.exposure_spread)) / np.median(tinted[..., 1]))
+    noisy = exposed + rng.normal(0, 1, exposed.shape) * np.sqrt(exposed * lamp.noise**2 + 1e-6)
+    image = np.clip(noisy, 0, 1) ** (1 / 2.2)
+    image = image + lamp.sharpening * (image - cv2.GaussianBlur(image, (0, 0), 1.2))
+    return np.round(255 * np.clip(image, 0, 1)).astype(np.uint8), (view.u + 0.5) / fine - 0.5
 
 
 def statistics_table(windows: list[np.ndarray]) -> dict[str, np.ndarray]:
@@ -158,30 +272,138 @@ def statistics_table(windows: list[np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def compare(real: dict[str, np.ndarray], simulated: dict[str, np.ndarray]) -> list[dict[str, float | str | bool]]:
-    """One row a statistic: the real 5th, 50th and 95th percentile, the simulated median, and whether it lies within."""
+    """One row a statistic: 5th, 50th and 95th percentile of both, and whether the simulated median lies within."""
     rows = []
     for name, values in real.items():
-        low, middle, high = np.percentile(values, [5, 50, 95])
-        median = float(np.median(simulated[name]))
-        rows.append(
-            {
-                "statistic": STATISTICS[name],
-                "real_p05": float(low),
-                "real_median": float(middle),
-                "real_p95": float(high),
-                "simulated_median": median,
-                "within": bool(low <= median <= high),
-            }
-        )
+        row = {"name": name, "statistic": STATISTICS[name]}
+        for kind, of_kind in (("real", values), ("simulated", simulated[name])):
+            for percentile, value in zip(("p05", "median", "p95"), np.percentile(of_kind, [5, 50, 95]), strict=True):
+                row[f"{kind}_{percentile}"] = float(value)
+        row["within"] = bool(row["real_p05"] <= row["simulated_median"] <= row["real_p95"])
+        rows.append(row)
     return rows
 
 
-def real_windows(folder: str | Path, n: int, size_px: int = 96) -> list[np.ndarray]:
-    """Windows round the tool of about `n` real frames, evenly from each sequence of the public in-vivo data."""
-    windows = []
+def table_text(rows: list[dict[str, float | str | bool]]) -> str:
+    """`compare` as a table of plain text."""
+    head = f"{'statistic':<20}{'real: 5 %':>10}{'median':>9}{'95 %':>9}{'simulated: 5 %':>17}{'median':>9}{'95 %':>9}"
+    lines = [
+        f"{r['name']:<20}{r['real_p05']:10.3f}{r['real_median']:9.3f}{r['real_p95']:9.3f}"
+        f"{r['simulated_p05']:17.3f}{r['simulated_median']:9.3f}{r['simulated_p95']:9.3f}"
+        f"   {'within' if r['within'] else 'OUTSIDE'}"
+        for r in rows
+    ]
+    return "\n".join([head, *lines])
+
+
+def exceptions_text(rows: list[dict[str, float | str | bool]], set_by: Mapping[str, str] = _SET_BY) -> str:
+    """What `compare` finds outside, by how much, and what sets that statistic in the simulator.
+
+    `set_by` says it for each statistic; the default is for `in_vivo_window`, `FUNDUS_SET_BY` for bare textures.
+    """
+    outside = [r for r in rows if not r["within"]]
+    if not outside:
+        return f"No exception among {len(rows)} statistics."
+    lines = [f"{len(outside)} of {len(rows)} statistics lie outside:"]
+    for r in outside:
+        above = r["simulated_median"] > r["real_p95"]
+        limit = r["real_p95" if above else "real_p05"]
+        lines.append(
+            f"- {r['statistic']}: simulated {r['simulated_median']:.3g}, {'above' if above else 'below'} the real frames' "
+            f"{'95th' if above else '5th'} percentile {limit:.3g}. Set by {set_by[r['name']]}."
+        )
+    return "\n".join(lines)
+
+
+def real_windows(folder: str | Path, n: int, size_px: int = 96, part: str = "judged") -> dict[str, list[np.ndarray]]:
+    """Windows round the tool of about `n` real frames, by sequence of the public in-vivo data.
+
+    Parameters
+    ----------
+    part:
+        "tuned": evenly from the first half of each sequence, on which `LIGHTS` was set; "judged": from the second.
+    """
+    if part not in ("tuned", "judged"):
+        raise ValueError(f"part: 'tuned' or 'judged', got {part!r}.")
+    windows = {}
     sequences = import_retinal_microsurgery(folder)
     for sequence in sequences:
         known = np.flatnonzero(np.isfinite(sequence.u).all(axis=2).any(axis=1))
-        for k in known[np.linspace(0, len(known) - 1, max(n // len(sequences), 1)).astype(int)]:
-            windows.append(landmark_window(sequence.image(int(k)), sequence.u[k], size_px))
+        known = known[: len(known) // 2] if part == "tuned" else known[len(known) // 2 :]
+        chosen = known[np.linspace(0, len(known) - 1, max(n // len(sequences), 1)).astype(int)]
+        windows[sequence.name] = [landmark_window(sequence.image(int(k)), sequence.u[k], size_px) for k in chosen]
     return windows
+
+
+def fundus_windows(photograph: str | Path, seeds: Sequence[int], n: int, size_px: int = 160) -> tuple[list, list]:
+    """Windows (real, simulated), n each, of a fundus photograph and of procedural textures, at 40 px per mm.
+
+    A photograph of 45 degrees is taken to show 13 mm of retina; black surroundings are left out.
+    """
+    rng = np.random.default_rng(0)
+    picture = read_image(Path(photograph))
+    across = round(13.0 * 40)
+    shown = cv2.resize(
+        picture, (across, round(across * picture.shape[0] / picture.shape[1])), interpolation=cv2.INTER_AREA
+    )
+    textures = [fundus_texture(int(seed), round(EXTENT_MM * 40)) for seed in seeds]
+    pairs = []
+    for images, reach_mm in (([shown], 6.0), (textures, 6.0)):
+        windows = []
+        for k in range(n):
+            image = images[k % len(images)]
+            # The window's corners stay within the disc that is shown.
+            radius = (reach_mm * 40 - size_px / np.sqrt(2)) * np.sqrt(rng.random())
+            angle = rng.uniform(0, 2 * np.pi)
+            corner = np.array(image.shape[1::-1]) / 2 + radius * np.array([np.cos(angle), np.sin(angle)]) - size_px / 2
+            x, y = np.round(corner).astype(int)
+            windows.append(image[y : y + size_px, x : x + size_px])
+        pairs.append(windows)
+    return pairs[0], pairs[1]
+
+
+@dataclass(frozen=True)
+class Profiles:
+    """Whole distributions of n images, a row an image.
+
+    Attributes
+    ----------
+    level, luminance, colour:
+        Bin centres (b,) in 0..1, shares (n, b) of the pixels a bin, and the same of red, green and blue (n, 3, b).
+    slope, gradient:
+        Bin centres (g,) of the luminance's derivative along x, 1/px, and their densities (n, g).
+    frequency, power:
+        Cycles per px (f,), and the radially averaged power (n, f) of the luminance about its mean.
+    """
+
+    level: np.ndarray
+    luminance: np.ndarray
+    colour: np.ndarray
+    slope: np.ndarray
+    gradient: np.ndarray
+    frequency: np.ndarray
+    power: np.ndarray
+
+
+def profiles(windows: list[np.ndarray], bins: int = 32) -> Profiles:
+    """Histograms of luminance and colour, the distribution of gradients and the power spectrum of each image."""
+    if not windows:
+        raise ValueError("windows: no image to take distributions of.")
+    edges, slopes = np.linspace(0, 1, bins + 1), np.linspace(-0.3, 0.3, 62)
+    rings = np.geomspace(1 / 48, 1 / 2, 15)
+    rows = []
+    for window in windows:
+        rgb, grey = window / 255.0, _luminance(window)
+        derivative = np.diff(grey, axis=1)
+        frequency, power = _power(grey)
+        rows.append(
+            (
+                np.histogram(grey, edges)[0] / grey.size,
+                [np.histogram(rgb[..., c], edges)[0] / grey.size for c in range(3)],
+                np.histogram(derivative, slopes)[0] / derivative.size / np.diff(slopes),
+                [power[(frequency >= a) & (frequency < b)].mean() for a, b in itertools.pairwise(rings)],
+            )
+        )
+    luminance, colour, gradient, spectrum = (np.array(values) for values in zip(*rows, strict=True))
+    middle = (edges[1:] + edges[:-1]) / 2, (slopes[1:] + slopes[:-1]) / 2, np.sqrt(rings[1:] * rings[:-1])
+    return Profiles(middle[0], luminance, colour, middle[1], gradient, middle[2], spectrum)
