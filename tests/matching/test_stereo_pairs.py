@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from lib import paths
-from lib.matching import RECTIFIED, match, score_against_disparity
+from lib.matching import CONFIDENCES, RECTIFIED, detection_auc, match, score_against_disparity
 
 FOLDER = paths.real_data("stereo_pairs")
 pytestmark = pytest.mark.skipif(FOLDER is None, reason=paths.missing_data_line("stereo_pairs"))
@@ -46,6 +46,18 @@ def test_surer_matches_are_better():
     sure = score_against_disparity(match(left, right, rig=RECTIFIED, min_score=0.9), disparity, flat_window_px=None)
     assert every.n > some.n > sure.n > 1500
     assert every.above_2 > 1.4 * some.above_2 > 1.4 * sure.above_2
+
+
+def test_confidences_tell_the_wrong_matches():
+    left, right, disparity = load("motorcycle", (512, 384))
+    matches = match(left, right, rig=RECTIFIED, min_score=0, reciprocal=False)
+    x, y = np.rint(matches.u_left).astype(int).T
+    error = np.abs(matches.u_left[:, 0] - matches.u_right[:, 0] - disparity[y, x])
+    known, wrong = np.isfinite(error), error > 2
+    auc = {name: detection_auc(getattr(matches, name)[known], wrong[known]) for name in CONFIDENCES}
+    assert auc["score"] > 0.8 and auc["peak_ratio"] > 0.58 and auc["reciprocal"] > 0.6
+    passed = matches.reciprocal
+    assert wrong[known & ~passed].mean() > 4 * wrong[known & passed].mean()
 
 
 def test_free_deepmatching_equals_the_published_implementation():
