@@ -343,7 +343,7 @@ def board_study(
 
 
 def resolution_study(
-    folder: str | Path | None = None, *, seed: int = SEED, training_seed: int = 0
+    folder: str | Path | None = None, *, seeds: Sequence[int] = (SEED,), training_seed: int = 0
 ) -> dict[str, dict[str, float]]:
     """The paper's figure: calibration from labels, and from detectors that see the frames at four resolutions.
 
@@ -351,49 +351,55 @@ def resolution_study(
     ----------
     folder:
         Checkpoints of `lib.landmarks.resolution`; None = where its study keeps them.  What is not trained is left out.
+    seeds:
+        Sweeps, each calibrated by itself.
 
     Returns
     -------
-    For ``labels`` (1 px of click noise) and each resolution: sigma_u_px, the detections' error per coordinate, and for
-    the affine cameras and perspective DLT on the same rows: triangulation_um of the detected landmarks, calibration_um
-    (exact pixels triangulated) and projection_px, as in `Judgement`.
+    For ``labels`` (1 px of click noise) and each resolution, root mean squares over the sweeps: sigma_u_px, the
+    detections' error per coordinate, and for the affine cameras and perspective DLT on the same rows: triangulation_um of
+    the detected landmarks, calibration_um (exact pixels triangulated) and projection_px, as in `Judgement`.
     """
     from lib.landmarks.resolution import RESOLUTIONS, load_resolution
 
-    recording = sweep(seed=seed)
     root = Path(folder) if folder is not None else paths.CACHE / "studies" / "resolution"
-    sources = {"labels": label_rows(recording, click_px=1.0)}
-    for name in RESOLUTIONS:
-        trained = root / name / f"seed{training_seed}"
-        if not (trained / "calibration.json").is_file():  # written when the training is done
-            continue
-        landmarks = detections(
-            recording,
-            trained / "last.safetensors",
-            beside=[SHIPPED_WEIGHTS, trained / "calibration.json"],
-            load=lambda _, name=name: load_resolution(name, seed=training_seed, folder=root),
-        )
-        sources[name] = row_timed(recording, landmarks)
-    result = {}
-    for name, rows in sources.items():
-        u = [rows.u_left, rows.u_right]
-        found = calibrate(rows.x_mm, u, image_size_px=recording.image_size_px)
-        judged, good = judge(found, recording, rows), found.inliers
-        result[name] = {
-            "rows": int(good.sum()),
-            "sigma_u_px": judged.sigma_u_px,
-            "affine_triangulation_um": judged.triangulation_um,
-            "affine_calibration_um": judged.calibration_um,
-            "affine_projection_px": judged.projection_px,
-        }
-        # Perspective DLT is not robust: it is given the rows that the affine calibration kept.
-        pair = [perspective_dlt(rows.x_mm[good], pixels[good]) for pixels in u]
-        exact = [side[rows.frame, rows.landmark] for side in (recording.truth.u_left, recording.truth.u_right)]
-        x = true_rig(recording).triangulate(*exact).x_mm
-        projected = np.hstack([camera.project(x) for camera in pair]) - np.hstack(exact)
-        result[name] |= {
-            "perspective_triangulation_um": 1e3 * _rms((triangulate_perspective(pair, u) - x)[good]),
-            "perspective_calibration_um": 1e3 * _rms(triangulate_perspective(pair, exact) - x),
-            "perspective_projection_px": _rms(projected) / np.sqrt(2),
-        }
-    return result
+    found: dict[str, list[dict[str, float]]] = {"labels": []}
+    for seed in seeds:
+        recording = sweep(seed=seed)
+        found["labels"].append(_affine_and_perspective(recording, label_rows(recording, click_px=1.0)))
+        for name in RESOLUTIONS:
+            trained = root / name / f"seed{training_seed}"
+            if not (trained / "calibration.json").is_file():  # written when the training is done
+                continue
+            landmarks = detections(
+                recording,
+                trained / "last.safetensors",
+                beside=[SHIPPED_WEIGHTS, trained / "calibration.json"],
+                load=lambda _, name=name: load_resolution(name, seed=training_seed, folder=root),
+            )
+            found.setdefault(name, []).append(_affine_and_perspective(recording, row_timed(recording, landmarks)))
+    return {
+        name: {key: float(np.sqrt(np.mean([row[key] ** 2 for row in rows]))) for key in rows[0]}
+        for name, rows in found.items()
+    }
+
+
+def _affine_and_perspective(recording: Recording, rows: Correspondences) -> dict[str, float]:
+    u = [rows.u_left, rows.u_right]
+    found = calibrate(rows.x_mm, u, image_size_px=recording.image_size_px)
+    judged, good = judge(found, recording, rows), found.inliers
+    # Perspective DLT is not robust: it is given the rows that the affine calibration kept.
+    pair = [perspective_dlt(rows.x_mm[good], pixels[good]) for pixels in u]
+    exact = [side[rows.frame, rows.landmark] for side in (recording.truth.u_left, recording.truth.u_right)]
+    x = true_rig(recording).triangulate(*exact).x_mm
+    projected = np.hstack([camera.project(x) for camera in pair]) - np.hstack(exact)
+    return {
+        "rows": int(good.sum()),
+        "sigma_u_px": judged.sigma_u_px,
+        "affine_triangulation_um": judged.triangulation_um,
+        "affine_calibration_um": judged.calibration_um,
+        "affine_projection_px": judged.projection_px,
+        "perspective_triangulation_um": 1e3 * _rms((triangulate_perspective(pair, u) - x)[good]),
+        "perspective_calibration_um": 1e3 * _rms(triangulate_perspective(pair, exact) - x),
+        "perspective_projection_px": _rms(projected) / np.sqrt(2),
+    }

@@ -308,7 +308,7 @@ def _root_mean_square(values: list[float]) -> float:
 
 def resolution(runs: int) -> dict:
     """Calibration from labels and from detectors at the paper's four resolutions, affine and perspective."""
-    return detected.resolution_study()
+    return detected.resolution_study(seeds=SWEEPS)
 
 
 def robot(runs: int) -> dict:
