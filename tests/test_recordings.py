@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 
 import cv2
@@ -50,7 +51,10 @@ def written(tmp_path_factory):
         visibility = np.full((N, 3), 2)
         grid = np.arange(0.0, 64, 8), np.arange(0.0, 48, 8)
         surface = np.stack([*np.meshgrid(*grid), np.ones((6, 8))], axis=-1)
-        writer.truth(reference_rig(), tool(N), *u, visibility, visibility, surface=(*grid, surface))
+        in_glint = np.arange(2 * N * 3).reshape(2, N, 3) % 5 == 0
+        writer.truth(
+            reference_rig(), tool(N), *u, visibility, visibility, surface=(*grid, surface), in_glint=tuple(in_glint)
+        )
     return folder, u
 
 
@@ -83,6 +87,8 @@ def test_what_is_written_is_read(written):
     np.testing.assert_array_equal(recording.truth.rig.linear, reference_rig().linear)
     np.testing.assert_allclose(recording.truth.landmarks_mm, tool(N), atol=1e-7)
     np.testing.assert_allclose(recording.truth.u_right, u[1], atol=1e-5)
+    in_glint = np.stack([recording.truth.in_glint_left, recording.truth.in_glint_right])
+    np.testing.assert_array_equal(in_glint, np.arange(2 * N * 3).reshape(2, N, 3) % 5 == 0)
     np.testing.assert_allclose(recording.truth.surface([[3.0, 7.0]]), [[3, 7, 1]], atol=1e-6)
     assert np.isnan(recording.truth.surface([[63.0, 7.0]])).all()
     assert not (folder.parent / "whole.partial").exists()
@@ -262,6 +268,18 @@ SPOILERS = {
         ),
         ValueError,
         "expected one row for each of the 4 frames",
+    ),
+    "some glints": (
+        lambda f: edit(f / "truth/landmarks.csv", ",tip_2_right_in_glint", ""),
+        ValueError,
+        "missing: tip_2_right_in_glint",
+    ),
+    "half a glint": (
+        lambda f: (f / "truth/landmarks.csv").write_text(
+            re.sub(r"[01]$", "0.5", (f / "truth/landmarks.csv").read_text().strip())
+        ),
+        ValueError,
+        "in_glint is 0 or 1",
     ),
 }
 
