@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LightSource, PowerNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
+from matplotlib.ticker import LogLocator
 
 from lib.cameras import StereoRig
 from lib.figures.interactive import explore
@@ -202,6 +203,7 @@ def held_out_curve(
         true = ax.twinx()
         true.plot(smoothness, error_um, "s--", color=COLOURS["truth"], label="true surface error (right axis)")
         true.set(ylabel="RMS surface error (um)", yscale="log")
+        true.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         true.yaxis.set_major_formatter("{x:g}")
         true.yaxis.set_minor_formatter("")
         true.grid(False)
@@ -346,8 +348,9 @@ def _surface_views(
     mask: np.ndarray | None = None,
     *,
     zoom: float = 1.12,
+    every: int = 1,
 ) -> float:
-    """Iso-depth lines over the image, and a still of the surface; returns the lines' spacing in mm."""
+    """Iso-depth lines over the image, and a still of `every` n-th point of them; returns the lines' spacing in mm."""
     h, w = image.shape[:2]
     step = max(1, w // 128)
     y, x = np.arange(0, h, step), np.arange(0, w, step)
@@ -361,7 +364,7 @@ def _surface_views(
     levels = np.arange(np.floor(np.nanmin(depth) / step_mm), np.nanmax(depth) / step_mm + 1) * step_mm
     show_image(flat, image)
     flat.contour(x, y, np.ma.masked_invalid(depth), levels=levels, cmap="viridis_r", linewidths=1.1)
-    mesh_still(oblique, points, image[np.ix_(y, x)], zoom=zoom)
+    mesh_still(oblique, points[::every, ::every], image[np.ix_(y[::every], x[::every])], zoom=zoom)
     return step_mm
 
 
@@ -381,7 +384,7 @@ def cases(found: Sequence[Case], *, limit_um: float = 60.0) -> Figure:
         ]
         pair, view = one.pair, one.pair.rig.left.viewing_direction
         show_image(axes[0], pair.left, f"{pair.name}: left image")
-        step_mm = _surface_views(axes[1], axes[2], pair.left, one.found.surface, pair.rig, zoom=1.25)
+        step_mm = _surface_views(axes[1], axes[2], pair.left, one.found.surface, pair.rig, zoom=1.25, every=2)
         axes[2].set(xlabel="", ylabel="", zlabel="", xticklabels=[], yticklabels=[], zticklabels=[])
         axes[2].set_title("Depth drawn twofold", y=0.98)
         axes[1].set_title(f"Depth lines, every {step_mm:g} mm")

@@ -1,10 +1,10 @@
-"""How far a match stands out among the places where it might have been."""
+"""Whether matches can be trusted: how far one stands out among the places where it might have been, and the rig's fit."""
 
 from __future__ import annotations
 
 import numpy as np
 
-__all__ = ["peak_ratio"]
+__all__ = ["peak_ratio", "require_fit"]
 
 
 def peak_ratio(volume: np.ndarray, patch: np.ndarray, index: np.ndarray) -> np.ndarray:
@@ -34,3 +34,19 @@ def peak_ratio(volume: np.ndarray, patch: np.ndarray, index: np.ndarray) -> np.n
     rival = curves.max(axis=1, initial=-1.0)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(rival >= 0, response / np.maximum(rival, 0.0), np.nan).astype(np.float64)
+
+
+def require_fit(n_matches: int, epipolar_px: float, max_epipolar_px: float) -> None:
+    """Refuse a rig from whose epipolar lines `n_matches` free matches lie too far, by their median `epipolar_px`.
+
+    Raises
+    ------
+    ValueError
+        With the distance; NaN (too few matches to tell) passes.
+    """
+    if epipolar_px > max_epipolar_px:
+        raise ValueError(
+            f"rig: it does not fit the images: the median of {n_matches} free matches lies {epipolar_px:.1f} px off its "
+            f"epipolar lines, {max_epipolar_px:.1f} px are allowed (max_epipolar_px). Calibrate again, or check that left "
+            "and right are not exchanged."
+        )

@@ -10,7 +10,7 @@ import torch
 
 from lib.cameras import StereoRig
 from lib.matching.band import COARSE_REACH, SETTINGS, Setting, coarse_view
-from lib.matching.confidence import peak_ratio
+from lib.matching.confidence import peak_ratio, require_fit
 from lib.matching.descriptors import pixel_descriptors
 from lib.matching.free import patch_quality
 from lib.matching.rectification import RECTIFIED, rectify, warp
@@ -98,6 +98,7 @@ def match_with(
     depth_range_mm: tuple[float, float] | None = None,
     setting: Setting = SETTINGS["quality"],
     reciprocal: bool = True,
+    max_epipolar_px: float = 6.0,
 ) -> Matches:
     """Rectify by the rig, call a disparity function, and sample its result on a lattice.
 
@@ -109,8 +110,10 @@ def match_with(
     whole = rectify(rig, *shapes)
     scale = setting.scale(whole.size_px)
     rectification = rectify(rig, *shapes, scale=scale)
+    coarse = coarse_view(images, masks, rig)
+    require_fit(len(coarse.displacement_px), coarse.epipolar_px, max_epipolar_px)
     if depth_range_mm is None:
-        depth_range_mm = whole.depth_range_mm(coarse_view(images, masks, rig).range_px)
+        depth_range_mm = whole.depth_range_mm(coarse.range_px)
     low, high = rectification.search_range_px(depth_range_mm, shapes[1])
     name = function if isinstance(function, str) else getattr(function, "__name__", "callable")
     known = {"sgbm": _sgbm if reciprocal else _sgbm_unchecked, "dis": _dis}
