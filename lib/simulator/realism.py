@@ -79,7 +79,8 @@ _SET_BY = {
 }
 #: The same for `fundus_windows`.
 FUNDUS_SET_BY = dict.fromkeys(
-    STATISTICS, "the texture's fine grain, which no optics has blurred yet, unlike a photograph's"
+    STATISTICS,
+    "grain and blotches of the pigment, stronger than in one photograph, and which no optics has blurred yet",
 ) | {
     name: "the pigment drawn for an eye, and the photograph's own exposure and colour"
     for name in (
