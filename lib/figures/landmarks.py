@@ -13,19 +13,25 @@ from scipy.stats import chi2
 
 from lib.figures.style import COLOURS, LANDMARK_COLOURS, figure, show_image
 from lib.landmarks.evaluation import Evaluation
+from lib.landmarks.inference import Landmarks
 from lib.landmarks.metrics import PCK_THRESHOLDS, reliability
 from lib.landmarks.network import HourglassConfig
 
 __all__ = [
+    "ablation_bars",
     "augmented",
     "decoder_errors",
     "detection",
+    "error_groups",
+    "few_labels_curves",
+    "frame_explorer",
     "heatmap_grid",
     "landmark_dots",
     "learning_curves",
     "network_page",
     "pck_curves",
     "printed_equation",
+    "resolution_curves",
     "stages",
     "uncertainty",
     "worst_frames",
@@ -225,6 +231,91 @@ def uncertainty(evaluation: Evaluation, squared: np.ndarray) -> Figure:
     )
     b.set(title="Reliability", xlabel="confidence", ylabel="fraction correct", xlim=(-0.02, 1.05), ylim=(-0.02, 1.05))
     b.legend()
+    return fig
+
+
+def ablation_bars(columns: Mapping[str, Mapping], paper: Mapping[str, float]) -> Figure:
+    """Recorded PCK@0.05 of the five networks: a dot a seed, a bar for the mean, and the paper's value."""
+    fig, ax = figure(width_in=8, height_in=3.2)
+    for i, (name, row) in enumerate(columns.items()):
+        values = row["pck_0.05"]["per_seed"]
+        ax.bar(i, row["pck_0.05"]["mean"], 0.55, color=COLOURS["ours"], alpha=0.5, label="mean" if i == 0 else None)
+        ax.plot(np.full(len(values), i), values, "o", color=COLOURS["ours"], ms=5, label="one seed" if i == 0 else None)
+        ax.plot(i, paper[name], "D", color=COLOURS["paper"], ms=7, label="paper" if i == 0 else None)
+    ax.set_xticks(range(len(columns)), list(columns))
+    ax.set(ylabel="PCK@0.05, %", ylim=(0, 105), title="Ablation")
+    ax.legend(loc="upper left", fontsize=8)
+    return fig
+
+
+def resolution_curves(thresholds: Sequence[float], curves: Mapping[str, Sequence[float]]) -> Figure:
+    """PCK against the threshold at the paper's four resolutions."""
+    fig, ax = figure(width_in=8, height_in=3.6)
+    colours = [COLOURS["ours"], COLOURS["truth"], COLOURS["right"], COLOURS["warning"]]
+    for (name, curve), colour in zip(curves.items(), colours, strict=True):
+        ax.plot(100 * np.asarray(thresholds), curve, color=colour, marker="o", ms=3, label=name)
+    ax.set(xscale="log", ylim=(0, 101), xlabel="threshold, % of the tool's length", ylabel="PCK, %", title="Resolution")
+    ticks = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20)
+    ax.set_xticks(ticks, [f"{t:g}" for t in ticks])
+    ax.minorticks_off()
+    ax.legend(loc="upper left", fontsize=9)
+    return fig
+
+
+def few_labels_curves(result: Mapping) -> Figure:
+    """PCK@0.05 against the number of annotated frames: recorded means with two standard errors."""
+    fig, ax = figure(width_in=7.5, height_in=3.4)
+    for (name, rows), colour in zip(result["frames"].items(), (COLOURS["ours"], COLOURS["paper"]), strict=False):
+        n = [int(count) for count in rows]
+        mean = np.array([row["pck_0.05"]["mean"] for row in rows.values()])
+        error = np.array([row["pck_0.05"]["standard_error"] or 0.0 for row in rows.values()], dtype=float)
+        ax.errorbar(n, mean, yerr=2 * error, color=colour, marker="o", ms=4, capsize=3, label=name)
+    ax.axhline(result["no_label"]["pck_0.05"], color=COLOURS["baseline"], ls="--", label="shipped weights, no label")
+    ax.set(xscale="log", ylim=(0, 101), xlabel="annotated frames", ylabel="PCK@0.05, %", title="How many labels?")
+    ax.set_xticks(n, [str(count) for count in n])
+    ax.minorticks_off()
+    ax.legend(fontsize=8)
+    return fig
+
+
+def error_groups(groups: Mapping[str, Mapping]) -> Figure:
+    """Median error (dot) and 95th percentile (tick) of groups of landmarks, one panel a grouping: name -> its `Scores`."""
+    fig, axes = figure(1, len(groups), width_in=12, height_in=2.9, squeeze=False)
+    for ax, (title, rows) in zip(axes.flat, groups.items(), strict=True):
+        for i, s in enumerate(rows.values()):
+            ax.plot([i, i], [s.median_px, s.p95_px], color=COLOURS["baseline"], lw=1.5)
+            ax.plot(i, s.median_px, "o", color=COLOURS["ours"], label="median" if i == 0 else None)
+            ax.plot(i, s.p95_px, "_", color=COLOURS["paper"], ms=14, mew=2, label="95 %" if i == 0 else None)
+        ax.set_xticks(range(len(rows)), [f"{name}\n({s.labels})" for name, s in rows.items()], fontsize=8)
+        ax.set(title=title, ylabel="error, px", xlim=(-0.6, len(rows) - 0.4))
+        ax.set_ylim(bottom=0)
+    axes.flat[0].legend(fontsize=8)
+    return fig
+
+
+def frame_explorer(
+    image: np.ndarray, found: Landmarks, windows: np.ndarray, matrices: np.ndarray, heatmaps: np.ndarray
+) -> Figure:
+    """One frame with its landmarks; each landmark's window with its heatmap laid over, and its 95 % ellipse.
+
+    `windows` (m, s, s, 3), `matrices` window_from_image (m, 2, 3) and `heatmaps` (m, h, w) of the m landmarks found.
+    """
+    fig, axes = figure(1, 4, width_in=13, height_in=3.1, width_ratios=[1.9, 1, 1, 1])
+    show_image(axes[0], image[::2, ::2], "frame")
+    landmark_dots(axes[0], found.u[0] / 2 - 0.25)
+    names, seen = list(LANDMARK_COLOURS), np.flatnonzero(np.isfinite(found.u[0]).all(axis=1))
+    for ax, name in zip(axes[1:], names, strict=True):
+        ax.set_axis_off()
+        ax.set_title(f"{name}: missed")
+    for window, matrix, heatmap, k in zip(windows, matrices, heatmaps, seen, strict=False):
+        ax, side = axes[1 + k], window.shape[0]
+        show_image(ax, window.mean(axis=2), f"{names[k]}: confidence {found.confidence[0, k]:.2f}")
+        ax.imshow(heatmap, cmap="inferno", alpha=0.45, extent=(-0.5, side - 0.5, side - 0.5, -0.5), vmin=0, vmax=1)
+        u = matrix[:, :2] @ found.u[0, k] + matrix[:, 2]
+        covariance = matrix[:, :2] @ found.covariance[0, k] @ matrix[:, :2].T
+        _ellipse(ax, u, covariance, LANDMARK_COLOURS[names[k]])
+        reach = 24
+        ax.set(xlim=(u[0] - reach, u[0] + reach), ylim=(u[1] + reach, u[1] - reach))
     return fig
 
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,7 @@ from lib.landmarks.network import LANDMARKS
 from lib.landmarks.windows import map_points
 from lib.recordings import Recording
 
-__all__ = ["Evaluation", "calibrate", "compare_decoders", "evaluate", "evaluate_recording", "main"]
+__all__ = ["Evaluation", "calibrate", "compare_decoders", "evaluate", "evaluate_recording", "focus_distance_mm", "main"]
 
 #: Errors beyond this are gross: not what a covariance describes.
 GROSS_PX = 20.0
@@ -77,6 +78,27 @@ class Evaluation:
         """Scores of visible and of occluded landmarks, where there are any."""
         parts = {"visible": self.visibility == 2, "occluded": self.visibility == 1}
         return {name: self._score(which) for name, which in parts.items() if which.any()}
+
+    def by_depth(self, depth_mm: np.ndarray, edges_mm: Sequence[float]) -> dict[str, Scores]:
+        """Scores of landmarks by their distance from the focal plane (n, 3) mm, between `edges_mm`; where there are any."""
+        parts = {
+            f"{low:g} to {high:g} mm": (np.abs(depth_mm) >= low) & (np.abs(depth_mm) < high)
+            for low, high in pairwise(edges_mm)
+        }
+        return {name: self._score(which) for name, which in parts.items() if (which & (self.visibility > 0)).any()}
+
+    def detection(self, min_confidence: float = 0.5) -> dict[str, float]:
+        """Does confidence tell what is there: precision and recall, in percent, of "seen" (above `min_confidence`).
+
+        ``"in_view"``: the landmark lies in the frame, hidden or not.  ``"visible"``: it is not hidden either.
+        """
+        said = self.landmarks.confidence >= min_confidence
+        result = {}
+        for name, there in (("in_view", self.visibility > 0), ("visible", self.visibility == 2)):
+            hit = float((said & there).sum())
+            result[f"{name}_precision"] = 100 * hit / said.sum() if said.any() else np.nan
+            result[f"{name}_recall"] = 100 * hit / there.sum() if there.any() else np.nan
+        return result
 
     def curve(self, thresholds: np.ndarray) -> np.ndarray:
         """PCK in percent at thresholds (parts of the tool's length)."""
@@ -139,6 +161,23 @@ def labelled_frames(
         frame = recording.frames[i]
         yield f"left {i}", frame.left, labels.u_left[i], labels.visibility_left[i]
         yield f"right {i}", frame.right, labels.u_right[i], labels.visibility_right[i]
+
+
+def focus_distance_mm(recording: Recording, *, every: int = 1) -> np.ndarray:
+    """Depth (n, 3) mm of the landmarks beyond the focal plane in a simulated recording, in `labelled_frames`' order.
+
+    Raises
+    ------
+    ValueError
+        If the recording is not simulated.
+    """
+    from lib.simulator.rig import ROBOT_FROM_MICROSCOPE  # the truth of simulated recordings, for evaluation only
+
+    if recording.truth is None:
+        raise ValueError(f"{recording.name}: no truth/, so the distance from focus is not known.")
+    x = recording.truth.landmarks_mm[: len(recording.frames) : every]
+    z = ROBOT_FROM_MICROSCOPE.inverse().apply(x.reshape(-1, 3))[:, 2].reshape(-1, 3)
+    return np.repeat(z, 2, axis=0)
 
 
 def evaluate_recording(
@@ -284,6 +323,7 @@ def main(argv: list[str] | None = None) -> int:
         )
     s = result.scores
     print(f"normalised squared error {s.nees:.2f} (2 is right), 95 % ellipses hold {s.coverage_95:.1f} %")
+    print(f"bias {s.bias_px[0]:+.2f}, {s.bias_px[1]:+.2f} px; confidence above 0.5 means, in %:", result.detection())
     if arguments.json:
         arguments.json.write_text(
             json.dumps({k: v.as_dict() for k, v in rows.items()}, indent=1) + "\n", encoding="utf-8"

@@ -12,7 +12,9 @@ import json
 import os
 import platform
 import sys
+import tempfile
 import time
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
@@ -27,6 +29,7 @@ from lib.geometry import cell_from_image
 from lib.landmarks import real
 from lib.landmarks.augmentation import AUGMENTATIONS
 from lib.landmarks.dataset import TOOL, TOOL_REDUCTION, WindowSource, validation_frames
+from lib.landmarks.engines import LastHeatmaps, OpenVinoNetwork
 from lib.landmarks.evaluation import Evaluation, evaluate, labelled_frames
 from lib.landmarks.inference import Detector, Landmarks
 from lib.landmarks.metrics import calibration_error
@@ -418,11 +421,73 @@ def real_frames(options: Options) -> None:
         keep(f"{sequence.name}: simulated frames only", real.simulated_to_real(detector, sequence, every=4))
 
 
+def engines(options: Options, repeats: int = 20) -> None:
+    """What runs the window stage fastest on this CPU: six windows, those of a stereo pair, in ms of wall and CPU time."""
+    network = Detector.load(engine="torch").window_network
+    images = torch.rand((6, 3, 128, 128), generator=torch.Generator().manual_seed(0))
+    plain, nchw = LastHeatmaps(network).eval(), images.contiguous()
+    fused, nhwc = network.fused(), images.to(memory_format=torch.channels_last)
+
+    def bfloat16() -> object:
+        with torch.autocast("cpu", torch.bfloat16):
+            return fused(nhwc)
+
+    def compiled() -> Callable[[], object]:
+        run = torch.compile(fused)
+        return lambda: run(nhwc)
+
+    def frozen() -> Callable[[], object]:
+        run = torch.jit.freeze(torch.jit.trace(plain, nchw, check_trace=False))
+        return lambda: run(nchw)
+
+    def open_vino(precision: str) -> Callable[[], object]:
+        run = OpenVinoNetwork(network, precision=precision)
+        return lambda: run(nchw)
+
+    def onnx_runtime() -> Callable[[], object]:
+        import onnxruntime  # no part of the environment: measured where a user has it
+
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "window.onnx"
+            torch.onnx.export(plain, (nchw,), str(path), dynamo=False, opset_version=18, input_names=["images"])
+            settings = onnxruntime.SessionOptions()
+            settings.intra_op_num_threads = torch.get_num_threads()
+            session = onnxruntime.InferenceSession(str(path), settings, providers=["CPUExecutionProvider"])
+        return lambda: session.run(None, {"images": nchw.numpy()})
+
+    rows: dict[str, object] = {}
+    for name, make in {
+        "torch, float32": lambda: lambda: fused(nhwc),
+        "torch, bfloat16": lambda: bfloat16,
+        "torch.jit, float32": frozen,
+        "torch.compile, float32": compiled,
+        "ONNX Runtime, float32": onnx_runtime,
+        "OpenVINO, float32": lambda: open_vino("f32"),
+        "OpenVINO, bfloat16": lambda: open_vino("bf16"),
+    }.items():
+        try:
+            with torch.inference_mode(), warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                run = make()
+                for _ in range(3):
+                    run()
+                wall, cpu = [], time.process_time()
+                for _ in range(repeats):
+                    start = time.perf_counter()
+                    run()
+                    wall.append(time.perf_counter() - start)
+                cpu = (time.process_time() - cpu) / repeats
+            rows[name] = {"wall_ms": 1e3 * float(np.median(wall)), "cpu_ms": 1e3 * cpu}
+        except Exception as error:  # an engine that is missing or broken here is a result too
+            rows[name] = {"failed": f"{type(error).__name__}: {str(error).splitlines()[0][:120] if str(error) else ''}"}
+    options.record({"threads": torch.get_num_threads(), "windows": 6, "engines": rows})
+
+
 STUDIES: dict[str, Callable[[Options], None]] = {
-    f.__name__: f for f in (resolution, ablation, label_noise, few_labels, real_frames)
+    f.__name__: f for f in (resolution, ablation, label_noise, few_labels, real_frames, engines)
 }
 #: Steps of each training unless the command says otherwise: what fits 10 to 20 minutes of one idle core.
-STEPS = {"resolution": 1000, "ablation": 800, "label_noise": 1000, "few_labels": 250, "real_frames": 1500}
+STEPS = {"resolution": 1000, "ablation": 800, "label_noise": 1000, "few_labels": 250, "real_frames": 1500, "engines": 1}
 
 
 def _plain(value: object) -> object:
