@@ -101,7 +101,7 @@ def match(
         the rig's frame (so the sign and the origin are those of the rig's frame along d).  None = found by a coarse
         pass.  Only used with a rig.
     setting:
-        "quality" searches at full resolution (up to 3 Mpx), "fast" at up to 0.8 Mpx.  Not for "deepmatching".
+        "quality" searches at full resolution (up to 3 Mpx), "fast" at up to 0.4 Mpx.  Not for "deepmatching".
     min_score:
         Matches with a lower score are dropped.  None is 0.5 for "band", whose score falls with the predicted standard
         deviation (half of the wrong matches and few of the right ones lie below), and 0 for the others.
@@ -111,7 +111,8 @@ def match(
         Memory that DeepMatching may take.  It is predicted before anything is allocated; what does not fit is matched
         in tiles of the left image (free DeepMatching), or refused with the figure.
     max_epipolar_px:
-        "band" refuses a rig whose epipolar lines lie farther than this from what free coarse matches say.
+        Every method that searches along the rig's epipolar lines refuses a rig whose lines lie farther than this from what
+        free coarse matches say.
     reciprocal:
         Drop matches whose way back from the right image leads elsewhere (occlusions, above all).  False keeps them;
         `Matches.reciprocal` says which.
@@ -159,7 +160,14 @@ def match(
         )
     elif callable(method) or method in ("sgbm", "dis"):
         matches = match_with(
-            method, images, masks, rig, depth_range_mm=depth_range_mm, setting=SETTINGS[setting], reciprocal=reciprocal
+            method,
+            images,
+            masks,
+            rig,
+            depth_range_mm=depth_range_mm,
+            setting=SETTINGS[setting],
+            reciprocal=reciprocal,
+            max_epipolar_px=max_epipolar_px,
         )
     else:
         raise ValueError(f"method: expected 'deepmatching', 'band', 'sgbm', 'dis' or a callable, got {method!r}.")

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from lib.cameras import StereoRig
-from lib.matching.confidence import peak_ratio
+from lib.matching.confidence import peak_ratio, require_fit
 from lib.matching.descriptors import CHANNELS, pixel_descriptors
 from lib.matching.free import MIN_SEEN, patch_quality
 from lib.matching.rectification import Rectification, rectify, warp
@@ -38,7 +38,7 @@ class Setting:
     Attributes
     ----------
     max_pixels:
-        The canvas is halved until it has no more.
+        The canvas is shrunk to so many, if it has more.
     downscale:
         Binary logarithm of the pooling of the descriptors.
     off_line:
@@ -54,14 +54,11 @@ class Setting:
 
     def scale(self, size_px: tuple[int, int]) -> float:
         """Canvas pixels per left pixel for a canvas that has this (width, height) at scale 1."""
-        scale = 1.0
-        while size_px[0] * size_px[1] * scale**2 > self.max_pixels:
-            scale /= 2
-        return scale
+        return min(1.0, float(np.sqrt(self.max_pixels / (size_px[0] * size_px[1]))))
 
 
 SETTINGS = {
-    "fast": Setting(max_pixels=800_000, downscale=1, off_line=1),
+    "fast": Setting(max_pixels=400_000, downscale=1, off_line=1),
     "quality": Setting(max_pixels=3_000_000, downscale=1, off_line=1, refine_margin=1),
 }
 
@@ -177,7 +174,7 @@ def coarse_view(
     Parameters
     ----------
     images:
-        Left and right, (h, w) float32 grey.
+        Left and right, (h, w) uint8 grey.
     masks:
         Left and right, (h, w) bool, True = ignore, or None.
     """
@@ -236,12 +233,7 @@ def match_band(
     cell = 1 << setting.downscale
 
     coarse = coarse_view(images, masks, rig)
-    if coarse.epipolar_px > max_epipolar_px:
-        raise ValueError(
-            f"rig: it does not fit the images: the median of {len(coarse.displacement_px)} free matches lies "
-            f"{coarse.epipolar_px:.1f} px off its epipolar lines, {max_epipolar_px:.1f} px are allowed "
-            "(max_epipolar_px). Calibrate again, or check that left and right are not exchanged."
-        )
+    require_fit(len(coarse.displacement_px), coarse.epipolar_px, max_epipolar_px)
     if not coarse.n_found and depth_range_mm is None:
         return Matches(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros((0, 4, 4)), method="band")
     # The band follows a small misfit, so that it may be narrow; below half a pixel nothing is resampled for it.

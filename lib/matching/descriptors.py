@@ -24,7 +24,7 @@ STRIP_PIXELS = 1 << 17
 
 
 def as_gray(image: ArrayLike, name: str) -> np.ndarray:
-    """A float32 grey image (h, w), 0..255, of an RGB (h, w, 3) or grey (h, w) uint8 image.
+    """A grey uint8 image (h, w) of an RGB (h, w, 3) or grey (h, w) uint8 image.
 
     Raises
     ------
@@ -39,8 +39,8 @@ def as_gray(image: ArrayLike, name: str) -> np.ndarray:
     if min(image.shape[:2]) < 16:
         raise ValueError(f"{name}: {image.shape[1]} x {image.shape[0]} px is too small; give at least 16 x 16 px.")
     if image.ndim == 3:
-        image = cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY)
-    return image.astype(np.float32)
+        return cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY)
+    return image
 
 
 def _blur(image: np.ndarray) -> np.ndarray:
@@ -56,7 +56,7 @@ def pixel_descriptors(gray: np.ndarray, downscale: int = 1, *, valid: np.ndarray
     Parameters
     ----------
     gray:
-        (h, w) float32, 0..255.
+        (h, w) float32 or uint8, 0..255.
     downscale:
         Binary logarithm of the pooling.
     valid:
@@ -89,7 +89,7 @@ def pixel_descriptors(gray: np.ndarray, downscale: int = 1, *, valid: np.ndarray
 
 def _describe(gray: np.ndarray, rows: slice, stride: int, out: np.ndarray) -> None:
     """Fill `out` (rows / stride, w / stride, 9) with the descriptors of some rows of a strip."""
-    smooth = _blur(gray)
+    smooth = _blur(gray.astype(np.float32, copy=False))
     dx = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=1, borderType=cv2.BORDER_REPLICATE)
     dy = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=1, borderType=cv2.BORDER_REPLICATE)
     half = np.float32(np.sqrt(0.5))

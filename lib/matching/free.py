@@ -32,8 +32,11 @@ def patch_quality(grid: np.ndarray) -> np.ndarray:
     """Mask (gy, gx) of the atomic patches that have texture and are mostly not masked, of descriptors (h, w, 9)."""
     gy, gx = grid.shape[0] // PATCH, grid.shape[1] // PATCH
     cells = grid[: gy * PATCH, : gx * PATCH].reshape(gy, PATCH, gx, PATCH, CHANNELS)
-    seen = (cells[..., CHANNELS - 1] > 0).mean(axis=(1, 3))
-    texture = np.square(cells[..., : CHANNELS - 1]).sum(axis=4).mean(axis=(1, 3))
+    constant = np.ascontiguousarray(cells[..., CHANNELS - 1])
+    seen = (constant > 0).mean(axis=(1, 3))
+    rows = cells.reshape(gy, PATCH, gx, PATCH * CHANNELS)
+    texture = np.einsum("yrxk,yrxk->yx", rows, rows) - np.einsum("yrxc,yrxc->yx", constant, constant)
+    texture /= PATCH**2
     return (seen >= MIN_SEEN) & (texture > MIN_TEXTURE)
 
 
@@ -46,7 +49,7 @@ def match_free(
     reciprocal: bool = True,
     device: str = "cpu",
 ) -> Matches:
-    """DeepMatching without any calibration; arguments as in `lib.matching.match`, images (h, w) float32 grey."""
+    """DeepMatching without any calibration; arguments as in `lib.matching.match`, images (h, w) uint8 grey."""
     shapes = images[0].shape, images[1].shape
     largest = int(np.log2(min(shapes[0] + shapes[1]) / (2 * PATCH)))
     if downscale is None:

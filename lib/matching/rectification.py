@@ -154,7 +154,7 @@ def warp(
     Parameters
     ----------
     gray:
-        (h, w) float32.
+        (h, w) float32 or uint8.
     image_from_canvas:
         (2, 3).
     size_px, shift_px:
@@ -180,7 +180,7 @@ def warp(
         if rows.stop <= rows.start or columns.stop <= columns.start:
             return np.zeros(size_px[::-1], np.float32), np.zeros(size_px[::-1], bool)
         inside = np.ones(gray.shape, np.uint8) if mask is None else (~mask).view(np.uint8)
-        out = cv2.copyMakeBorder(gray[rows, columns], *pad, cv2.BORDER_REPLICATE)
+        out = cv2.copyMakeBorder(gray[rows, columns].astype(np.float32, copy=False), *pad, cv2.BORDER_REPLICATE)
         valid = cv2.copyMakeBorder(inside[rows, columns], *pad, cv2.BORDER_CONSTANT, value=0)
         return out, valid.astype(bool)
     factor = max(1, int(np.sqrt(abs(np.linalg.det(linear))) + 0.25))
@@ -190,6 +190,7 @@ def warp(
         linear, offset = linear / factor, (offset - (factor - 1) / 2) / factor
     matrix = np.column_stack([linear, offset])
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    gray = gray.astype(np.float32, copy=False)
     out = cv2.warpAffine(gray, matrix, size_px, flags=flags, borderMode=cv2.BORDER_REPLICATE)
     seen = cv2.warpAffine(seen, matrix, size_px, flags=flags, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
     return out, seen == 255

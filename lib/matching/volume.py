@@ -293,17 +293,23 @@ def _reciprocal(
     span_x, span_y = (int(bin_x[0]), int(bin_x[-1])), (int(bin_y[0]), int(bin_y[-1]))
     bins = volume.new_full((gy + span_y[1] - span_y[0], gx + span_x[1] - span_x[0]), -torch.inf)
     best, flat = volume.new_empty(gy, gx), torch.empty(gy, gx, dtype=torch.long, device=volume.device)
-    for top in range(0, gy, ROWS):
+    bins_y, bins_x = (range(span[0], span[1] + 1) for span in (span_y, span_x))
+
+    def search(top: int) -> list[list[torch.Tensor]]:
+        """Best displacements of a chunk of lattice rows; its strongest scores per bin, (chunk, gx) for each (y, x)."""
         part = slice(top, min(top + ROWS, gy))
         score = scores_of(part)
         torch.max(score.reshape(*score.shape[:2], -1), dim=2, out=(best[part], flat[part]))
-        for y in range(span_y[0], span_y[1] + 1):
-            in_y = np.flatnonzero(bin_y == y)
-            for x in range(span_x[0], span_x[1] + 1):
-                in_x = np.flatnonzero(bin_x == x)
-                strongest = score[:, :, in_y[0] : in_y[-1] + 1, in_x[0] : in_x[-1] + 1].amax(dim=(2, 3))
-                there = bins[part.start + y - span_y[0] : part.stop + y - span_y[0], x - span_x[0] : x - span_x[0] + gx]
-                torch.maximum(there, strongest, out=there)
+        in_y, in_x = ([np.flatnonzero(bin_ == i) for i in bins_] for bin_, bins_ in ((bin_y, bins_y), (bin_x, bins_x)))
+        return [[score[:, :, y[0] : y[-1] + 1, x[0] : x[-1] + 1].amax(dim=(2, 3)) for x in in_x] for y in in_y]
+
+    tops = range(0, gy, ROWS)
+    with ThreadPoolExecutor(2) as pool:
+        for top, strongest in zip(tops, pool.map(search, tops), strict=True):
+            for y, row in enumerate(strongest):
+                for x, chunk in enumerate(row):
+                    there = bins[top + y : top + y + len(chunk), x : x + gx]
+                    torch.maximum(there, chunk, out=there)
     j, k = flat // n, flat % n
     grid_y, grid_x = torch.meshgrid(
         torch.arange(gy, device=volume.device), torch.arange(gx, device=volume.device), indexing="ij"

@@ -27,6 +27,7 @@ REJECT_MEDIANS = 5.0
 _SOLVERS = {"interior_point": interior_point, "cvxpy": cvxpy_reference, "least_squares": least_squares}
 _FOLDS = 3
 _ENOUGH_HELD_OUT = 1500  # points in the folds that are tried: more only cost time
+_QUICK_HELD_OUT = 1000
 _LADDER = 10.0**0.5  # step between candidates of the smoothness
 _EXTENT = 8  # at most so many steps from the first candidate, either way
 
@@ -189,8 +190,8 @@ def fit_surface(
     tolerance:
         Duality gap at which the solver stops, relative to the objective.
     quick:
-        Choose the smoothness with a looser tolerance, and reject points at a fit by reweighted least squares, within a
-        percent of the minimum; only the final fit is solved to `tolerance`.
+        Choose the smoothness with a looser tolerance and fewer held-out points (1000), and reject points at a fit by
+        reweighted least squares, within a percent of the minimum; only the final fit is solved to `tolerance`.
 
     Raises
     ------
@@ -208,7 +209,8 @@ def fit_surface(
     solver, grid, x, axes, used = _SOLVERS[method], data.grid, data.x, data.axes, data.used
     held_out = np.empty((0, 2))
     if smoothness is None:
-        smoothness, held_out = _choose_smoothness(data, _searcher(method, quick))
+        enough = _QUICK_HELD_OUT if quick else _ENOUGH_HELD_OUT
+        smoothness, held_out = _choose_smoothness(data, _searcher(method, quick), enough)
     mu = smoothness * data.stiffness
 
     def solve(chosen: np.ndarray, solver: Callable[..., L1Solution]) -> tuple[L1Problem, L1Solution, BSplineSurface]:
@@ -422,17 +424,17 @@ class _HeldOut:
         return total / count
 
 
-def _choose_smoothness(data: _Data, solver: Callable[..., L1Solution]) -> tuple[float, np.ndarray]:
+def _choose_smoothness(data: _Data, solver: Callable[..., L1Solution], enough: int) -> tuple[float, np.ndarray]:
     """The smoothness of least held-out error, and the candidates tried with their errors (m, 2).
 
     It walks down a ladder of half decades to the lowest rung, then takes the parabola through it and its neighbours.
     """
     n = int(data.used.sum())
-    held_out = _HeldOut(data, solver, min(_FOLDS, -(-_ENOUGH_HELD_OUT * _FOLDS // n)))
+    held_out = _HeldOut(data, solver, min(_FOLDS, -(-enough * _FOLDS // n)))
     # In the middle of what surfaces have needed; any start leads to the same end.
     values = data.values[data.used]
     spread = np.median(np.abs(values - np.median(values, axis=0)))
-    unit = 0.001 * n * float(np.prod(data.grid.cell_px)) / max(spread, 1e-9)
+    unit = 0.001 / _LADDER * n * float(np.prod(data.grid.cell_px)) / max(spread, 1e-9)
     errors: dict[int, float] = {}
 
     def error(step: int) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -117,7 +118,8 @@ def reconstruct(
         seconds[name] = time.perf_counter() - start
 
     with stage("mask"):
-        masks = [glint_mask(image) for image in (left, right)]
+        with ThreadPoolExecutor(2) as pool:
+            masks = list(pool.map(glint_mask, (left, right)))
         for side, image in enumerate((left, right)):
             if u_landmarks is not None:
                 masks[side] |= tool_mask(image.shape[:2], u_landmarks[side])

@@ -30,7 +30,7 @@ from lib.simulator.eye import Eye
 from lib.simulator.microscope import Microscope
 from lib.simulator.recording import simulate
 from lib.simulator.training import RESERVED_SEEDS
-from lib.surface import evaluation
+from lib.surface import evaluation, speed
 from lib.surface.reconstruct import reconstruct
 from lib.workbench.collection import commit, machine
 
@@ -163,8 +163,35 @@ def recorded(path: Path = paths.RESULTS / "reconstruction.json") -> dict[str, di
     return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
 
 
+def solver(options: argparse.Namespace) -> dict:
+    """Our L1 solver beside CLARABEL: CPU seconds in the same run, and how far the objectives are apart."""
+    return {f"{c} x {c}, n = {n}": speed.solver(c, n) for c in speed.CONTROL for n in speed.POINTS}
+
+
+def pair(options: argparse.Namespace) -> dict:
+    """A full-HD pair to its surface, seconds by stage and error: the depth alone, and the paper's three splines."""
+    return {
+        f"{setting}, {'depth' if depth else 'three splines'}": speed.pair_to_surface(setting, depth_only=depth)
+        for setting in SETTINGS
+        for depth in (True, False)
+    }
+
+
+def motorcycle(options: argparse.Namespace) -> dict:
+    """Every matcher on the Middlebury pair that the published implementation was run on: seconds and errors."""
+    folder = paths.real_data("stereo_pairs")
+    if folder is None:
+        print(paths.missing_data_line("stereo_pairs"))
+        return {}
+    result = {"deepmatching, 512 px": speed.motorcycle(folder / "motorcycle", "deepmatching", 512, rounds=0)}
+    for method in ("band", "sgbm", "dis"):
+        for width in (512, 1024):
+            result[f"{method}, {width} px"] = speed.motorcycle(folder / "motorcycle", method, width)
+    return result
+
+
 STUDIES: dict[str, Callable[[argparse.Namespace], dict]] = {
-    f.__name__: f for f in (eyes, objects, calibrated, confidence)
+    f.__name__: f for f in (eyes, objects, calibrated, confidence, solver, pair, motorcycle)
 }
 
 

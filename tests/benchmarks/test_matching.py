@@ -8,8 +8,9 @@ import pytest
 
 from lib import paths
 from lib.geometry import RigidTransform
-from lib.matching import RECTIFIED, glint_mask, match
+from lib.matching import glint_mask, match
 from lib.simulator.rig import IMAGE_SIZE_PX, reference_rig
+from lib.surface import speed
 
 
 def full_hd_pair():
@@ -55,18 +56,18 @@ def test_full_hd(benchmark, full_hd, method, setting):
 
 
 @pytest.mark.benchmark(group="motorcycle")
-@pytest.mark.parametrize("size_px", [(512, 384), (1024, 768)])
+@pytest.mark.parametrize("width_px", [512, 1024])
 @pytest.mark.parametrize("method", ["band", "sgbm", "dis", "deepmatching"])
-def test_motorcycle(benchmark, method, size_px):
+def test_motorcycle(benchmark, method, width_px):
+    """Seconds and errors; ``python3 -m lib.surface.studies motorcycle`` records them."""
     folder = paths.real_data("stereo_pairs")
     if folder is None:
         pytest.skip(paths.missing_data_line("stereo_pairs"))
-    if method == "deepmatching" and size_px[0] > 512:
+    if method == "deepmatching" and width_px > 512:
         pytest.skip("free DeepMatching grows with the fourth power of the width")
-    images = [cv2.imread(str(folder / "motorcycle" / f"{side}.png"))[..., ::-1] for side in ("left", "right")]
-    images = [cv2.resize(np.ascontiguousarray(image[:, :667]), size_px) for image in images]
-    rounds = 1 if method == "deepmatching" else 5
-    matches = benchmark.pedantic(
-        match, images, {"rig": RECTIFIED, "method": method}, rounds=rounds, warmup_rounds=rounds - 1
+    rounds = 0 if method == "deepmatching" else 5
+    benchmark.extra_info |= benchmark.pedantic(
+        speed.motorcycle, (folder / "motorcycle", method, width_px), {"rounds": rounds}
     )
-    assert len(matches) > 2000
+    print(f"\nmotorcycle, {width_px} px, {method}: {benchmark.extra_info}")
+    assert benchmark.extra_info["matches"] > 2000
