@@ -15,7 +15,7 @@ from lib.landmarks.network import HourglassConfig
 from lib.landmarks.training import PRESETS, Samples, train
 from lib.recordings import MonocularSequence
 
-__all__ = ["simulated_to_real", "train_on_sequence"]
+__all__ = ["detector_of_first_half", "evaluate_on_sequence", "simulated_to_real", "train_on_sequence"]
 
 #: The networks see these frames reduced by this: the tool is then 14 to 32 px long.
 REDUCTION = 2
@@ -27,19 +27,10 @@ def _visibility(u: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(u).all(axis=-1), 2, 0)
 
 
-def train_on_sequence(
-    sequence: MonocularSequence,
-    *,
-    steps: int = 150,
-    max_seconds: float | None = None,
-    every: int = 3,
-    seed: int = 0,
-    test: MonocularSequence | None = None,
-) -> Evaluation:
-    """Train on the first half of a sequence, test on the second (or on all of `test`), every `every`-th frame of it.
-
-    Consecutive frames are alike, so halves in time are the honest split; the labels are clicks.
-    """
+def detector_of_first_half(
+    sequence: MonocularSequence, *, steps: int = 150, max_seconds: float | None = None, seed: int = 0
+) -> Detector:
+    """A small whole-frame detector trained on the first half of a sequence; the labels are clicks."""
     half = len(sequence) // 2
     images = np.stack([_reduce(sequence.image(i)) for i in range(half)])
     u = cell_from_image(sequence.u[:half], REDUCTION)
@@ -58,9 +49,30 @@ def train_on_sequence(
     # The few frames that "validate" only fill the log; nothing is chosen by them.
     few = Samples(images[-4:], u[-4:], _visibility(u[-4:])) if np.isfinite(u[-4:]).any() else samples
     trained = train(config, samples, few, max_seconds=max_seconds, progress=False)
-    detector = Detector(trained.network, REDUCTION, calibration={"frame": _ALWAYS})
-    target, first = (sequence, half) if test is None else (test, 0)
-    return evaluate(detector, _frames(target, first, every))
+    return Detector(trained.network, REDUCTION, calibration={"frame": _ALWAYS})
+
+
+def evaluate_on_sequence(
+    detector: Detector, sequence: MonocularSequence, *, second_half: bool = False, every: int = 1
+) -> Evaluation:
+    """A detector on every `every`-th labelled frame of a sequence, or of its second half."""
+    return evaluate(detector, _frames(sequence, len(sequence) // 2 if second_half else 0, every))
+
+
+def train_on_sequence(
+    sequence: MonocularSequence,
+    *,
+    steps: int = 150,
+    max_seconds: float | None = None,
+    every: int = 3,
+    seed: int = 0,
+) -> Evaluation:
+    """Train on the first half of a sequence, test on every `every`-th frame of the second.
+
+    Consecutive frames are alike, so halves in time are the honest split.
+    """
+    detector = detector_of_first_half(sequence, steps=steps, max_seconds=max_seconds, seed=seed)
+    return evaluate_on_sequence(detector, sequence, second_half=True, every=every)
 
 
 def simulated_to_real(

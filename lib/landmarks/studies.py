@@ -391,7 +391,7 @@ def few_labels(options: Options, counts: Sequence[int] = (10, 30, 100, 300, 750)
 
 
 def real_frames(options: Options) -> None:
-    """Real sequences: first half to second half, one to the other, and no real frame at all; also few labels."""
+    """Real sequences: first half to second half, one to the other, and no real frame in training at all."""
     folder = paths.real_data("retinal_microsurgery")
     if folder is None:
         print(paths.missing_data_line("retinal_microsurgery"))
@@ -411,13 +411,12 @@ def real_frames(options: Options) -> None:
         }
         options.record({"thresholds": thresholds.tolist(), "results": dict(result), "steps": options.steps})
 
-    for i, sequence in enumerate(sequences):
-        other = sequences[1 - i]
-        keep(f"{sequence.name}: first half to second", real.train_on_sequence(sequence, steps=options.steps, every=1))
-        keep(
-            f"{sequence.name}: trained on its first half, tested on {other.name}",
-            real.train_on_sequence(sequence, steps=options.steps, every=1, test=other),
-        )
+    for sequence in sequences:
+        trained = real.detector_of_first_half(sequence, steps=options.steps)
+        keep(f"{sequence.name}: first half to second", real.evaluate_on_sequence(trained, sequence, second_half=True))
+        for other in sequences:
+            if other is not sequence:
+                keep(f"{sequence.name}: to {other.name}", real.evaluate_on_sequence(trained, other))
         keep(f"{sequence.name}: simulated frames only", real.simulated_to_real(detector, sequence, every=4))
 
 

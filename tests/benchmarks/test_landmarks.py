@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from lib.landmarks import Detector, Landmarks
+from lib.landmarks.engines import ENGINES, default_engine
 from lib.landmarks.heatmaps import DECODERS, decode, render
 from lib.landmarks.inference import Calibration
 from lib.landmarks.network import HourglassConfig, StackedHourglass
@@ -28,10 +29,13 @@ def test_the_papers_configuration(benchmark, size):
     benchmark.pedantic(detector, (pair(size),), rounds=3, warmup_rounds=1)
 
 
+@pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("mode", ["whole frame", "tracking"])
-def test_coarse_to_fine(benchmark, mode):
+def test_coarse_to_fine(benchmark, mode, engine):
     """The shipped networks at 1080p; weights do not change the time, so all stages run on noise."""
-    shipped = Detector.load()
+    if engine == "openvino" and default_engine() != engine:
+        pytest.skip("OpenVINO is not installed here")
+    shipped = Detector.load(engine=engine)
     sure = Calibration(logit=(9.0, 0.0, 0.0, 0.0))
     detector = shipped.with_calibration(frame=sure, tool=sure, window=sure)
     images = pair((1080, 1920))
