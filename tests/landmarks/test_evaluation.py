@@ -136,3 +136,27 @@ def test_reduced_windows_keep_their_landmarks():
     assert reduced.images.shape == (1, 64, 64, 3)
     np.testing.assert_allclose(4 * reduced.u + 1.5, whole.u)
     np.testing.assert_array_equal(reduced.images[0, 3, 5].round(), whole.images[0, 12:16, 20:24].mean((0, 1)).round())
+
+
+def test_groups_by_focus_and_what_confidence_says(small):
+    detector, frames = small
+    frames = [(name, image, u, np.array([2, 2, 0]) if int(name) % 2 else v) for name, image, u, v in frames]
+    result = evaluate(detector, frames)
+    depth = np.tile([-0.2, 0.7, 3.0], (len(frames), 1))
+    groups = result.by_depth(depth, (0, 0.5, 1.0, 2.0))
+    assert list(groups) == ["0 to 0.5 mm", "0.5 to 1 mm"]  # nothing lies between 1 and 2
+    assert groups["0 to 0.5 mm"].labels == len(frames)
+    assert groups["0 to 0.5 mm"].median_px == result.by_landmark()["base"].median_px
+    said = result.detection(min_confidence=0.0)  # everything is said to be there: of 6 landmarks 5 are
+    assert said["in_view_recall"] == said["visible_recall"] == 100
+    assert said["in_view_precision"] == pytest.approx(100 * 5 / 6)
+
+
+@pytest.mark.skipif(not paths.SHIPPED_RECORDING.exists(), reason="the shipped recording is not there")
+def test_distance_from_focus_is_within_the_microscopes_reach():
+    from lib.recordings import Recording
+
+    recording = Recording.open(paths.SHIPPED_RECORDING)
+    depth = evaluation.focus_distance_mm(recording, every=2)
+    assert depth.shape == (len(list(evaluation.labelled_frames(recording, every=2))), 3)
+    assert np.abs(depth).max() < 5
