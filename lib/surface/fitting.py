@@ -190,8 +190,8 @@ def fit_surface(
     tolerance:
         Duality gap at which the solver stops, relative to the objective.
     quick:
-        Choose the smoothness with a looser tolerance and fewer held-out points (1000), and reject points at a fit by
-        reweighted least squares, within a percent of the minimum; only the final fit is solved to `tolerance`.
+        Choose the smoothness with five Newton steps a fit and fewer held-out points (1000), and reject points at a fit
+        by reweighted least squares, within a percent of the minimum; only the final fit is solved to `tolerance`.
 
     Raises
     ------
@@ -323,7 +323,7 @@ def _searcher(method: str, quick: bool = False) -> Callable[..., L1Solution]:
     """The solver that smoothness is chosen with: as near the minimum as the choice needs."""
     if method == "least_squares":
         return least_squares
-    return partial(interior_point, tolerance=3e-3 if quick else 1e-3)
+    return partial(interior_point, max_iterations=5) if quick else partial(interior_point, tolerance=1e-3)
 
 
 def _checked(u: ArrayLike, x_mm: ArrayLike, weights: ArrayLike | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

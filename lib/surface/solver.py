@@ -159,8 +159,6 @@ class L1Solution:
         y (n, k), |y_i| <= w_i: the pull of each point on the surface.
     iterations:
         Newton steps taken.
-    solver_seconds:
-        What CLARABEL says it took, without cvxpy's modelling; NaN for other solvers.
     """
 
     coefficients: np.ndarray
@@ -168,7 +166,6 @@ class L1Solution:
     duality_gap: np.ndarray
     dual: np.ndarray
     iterations: int
-    solver_seconds: float = float("nan")
 
 
 def interior_point(
@@ -349,7 +346,7 @@ def cvxpy_reference(
     centre = np.average(x, axis=0, weights=w[:, 0])
     unit = np.maximum(np.abs(x - centre).max(axis=0), np.finfo(float).tiny)
     coefficients, dual = np.empty((problem.grid.size, k)), np.empty((n, k))
-    iterations, seconds = 0, 0.0
+    iterations = 0
     for j in range(k):
         c, residual = cp.Variable(problem.grid.size), cp.Variable(n)
         split = residual == problem.design @ c - (x[:, j] - centre[j]) / unit[j]
@@ -360,10 +357,9 @@ def cvxpy_reference(
             raise ValueError(f"smoothness: CLARABEL found no solution ({model.status}); increase it.")
         coefficients[:, j], dual[:, j] = c.value * unit[j] + centre[j], split.dual_value
         iterations = max(iterations, model.solver_stats.num_iters or 0)
-        seconds += model.solver_stats.solve_time
     fitted = problem.design @ coefficients - x
     objective = (w * np.abs(fitted)).sum(axis=0) + mu * (coefficients * (problem.bending @ coefficients)).sum(axis=0)
-    return L1Solution(coefficients, objective, np.full(k, np.nan), dual, iterations, seconds)
+    return L1Solution(coefficients, objective, np.full(k, np.nan), dual, iterations)
 
 
 def reweighted(

@@ -19,7 +19,7 @@ def test_solver_beside_clarabel(benchmark, control, n):
     print(f"\n{control} x {control}, n = {n}: {benchmark.extra_info}")
     u, x = speed.retina_points(n)
     grid = SplineGrid(speed.DOMAIN, (control, control))
-    benchmark.pedantic(lambda: interior_point(L1Problem(grid, u), x, 5.0 * n, tolerance=1e-8), rounds=3)
+    benchmark.pedantic(lambda: interior_point(L1Problem(grid, u), x, 5.0 * n, tolerance=speed.TOLERANCE), rounds=3)
     assert abs(benchmark.extra_info["relative_difference"]) < 1e-7
 
 
