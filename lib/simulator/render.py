@@ -41,7 +41,7 @@ class View:
     u:
         Landmarks base, tip_1, tip_2 (3, 2) px as imaged, rolling shutter included; NaN without a tool.
     visibility:
-        (3,) COCO: 0 out of the image, 1 hidden by another part of the tool, 2 visible.
+        (3,) COCO: 0 out of the image, 1 hidden by the tool, 2 visible.
     in_glint:
         (3,) bool, whether a specular glint covers the landmark.
     surface_mm:
@@ -340,6 +340,9 @@ def render_view(
             colour, alpha, depth = _tool_layer(raster, forceps, lamp, glow, microscope)
             _compose(linear, tool_mask, raster, colour, alpha, depth, microscope, scale, R, shift)
             visibility = _visibility(raster, landmarks, u, inside, forceps)
+            for k in np.flatnonzero(visibility == 2):
+                if k > 0 and _behind_its_jaw(u[k], centres, radii, chains == k, zoom):
+                    visibility[k] = 1
         for k in np.flatnonzero(inside):
             column, row = np.round(u[k]).astype(int)
             in_glint[k] = bool(glint_mask[row, column]) and not tool_mask[row, column]
@@ -437,6 +440,22 @@ def _visibility(raster, landmarks, u, inside, forceps):
             if part not in ((0, 1) if k == 0 else (0, k + 1)) and in_front:
                 visibility[k] = 1
     return visibility
+
+
+def _behind_its_jaw(u: np.ndarray, centres: np.ndarray, radii: np.ndarray, jaw: np.ndarray, zoom: float) -> bool:
+    """Whether a blunt jaw that points steeply away hides its own tip: the tip then lies inside the jaw's outline."""
+    factor, reach_px = 16, 0.25
+    corner = np.round(u) - 2
+    shifted = centres[jaw] - np.append(corner / zoom, 0)
+    raster = rasterise(shifted, radii[jaw], np.ones(jaw.sum(), int), zoom=zoom, size_px=(5, 5), factor=factor)
+    if raster is None:
+        return False
+    covered = np.zeros((5 * factor, 5 * factor), bool)
+    (x0, y0), (height, width) = raster.origin_px, raster.part.shape
+    covered[y0 * factor : y0 * factor + height, x0 * factor : x0 * factor + width] = raster.part > 0
+    sample = (np.arange(5 * factor) + 0.5) / factor - 0.5
+    near = np.add.outer((sample - (u - corner)[1]) ** 2, (sample - (u - corner)[0]) ** 2) < reach_px**2
+    return bool(covered[near].all())
 
 
 def render_pair(
