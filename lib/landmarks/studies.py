@@ -381,6 +381,8 @@ def few_labels(options: Options, counts: Sequence[int] = (10, 30, 100, 300, 750)
                 "what": f"the tool stage ({network.stacks} x {network.features} features), windows at 1/5 of full HD; "
                 "the shipped weights have seen simulated frames of this kind, so they need no label of them",
                 "test": what,
+                "budget": options.budget
+                | {"features": network.features, "learning_rate": {"fine-tuned": 3e-4, "from scratch": 2e-3}},
                 "no_label": {key: none[key] for key in ("pck_0.05", "pck_0.10", "median_px")},
                 "frames": {
                     name: {n: {k: summary(v) for k, v in row.items()} for n, row in rows.items()}
@@ -409,7 +411,8 @@ def real_frames(options: Options) -> None:
             "frames": len(e.names),
             "curve": curve.tolist(),
         }
-        options.record({"thresholds": thresholds.tolist(), "results": dict(result), "steps": options.steps})
+        budget = {"steps": options.steps, "batch": 4, "features": 24, "stacks": 1, "seeds": 1}
+        options.record({"thresholds": thresholds.tolist(), "results": dict(result), "budget": budget})
 
     for sequence in sequences:
         trained = real.detector_of_first_half(sequence, steps=options.steps)
@@ -479,7 +482,7 @@ def engines(options: Options, repeats: int = 20) -> None:
             rows[name] = {"wall_ms": 1e3 * float(np.median(wall)), "cpu_ms": 1e3 * cpu}
         except Exception as error:  # an engine that is missing or broken here is a result too
             rows[name] = {"failed": f"{type(error).__name__}: {str(error).splitlines()[0][:120] if str(error) else ''}"}
-    options.record({"threads": torch.get_num_threads(), "windows": 6, "engines": rows})
+    options.record({"threads": torch.get_num_threads(), "windows": 6, "engines": rows, "budget": {"repeats": repeats}})
 
 
 STUDIES: dict[str, Callable[[Options], None]] = {
@@ -524,7 +527,7 @@ def main(argv: list[str] | None = None) -> int:
         content[a.study] = _plain(
             {
                 "result": result,
-                "budget": options.budget,
+                "budget": result.pop("budget", options.budget),
                 "command": command,
                 "commit": commit(),
                 "machine": f"{platform.machine()}, {os.cpu_count()} cores, no GPU; one of them used",
