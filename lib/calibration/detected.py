@@ -258,7 +258,12 @@ def calibrate_labels(recording: Recording, *, click_px: float = 1.0, seed: int =
 
 
 def calibrate_offsets(
-    recording: Recording, rows: Correspondences, *, in_images: bool = False, **options: object
+    recording: Recording,
+    rows: Correspondences,
+    *,
+    in_images: bool = False,
+    own_covariances: bool = False,
+    **options: object,
 ) -> tuple[OffsetCalibration, Correspondences]:
     """`calibrate_with_offsets` of a recording's correspondences, the tool's axes from the robot; and the rows used."""
     axes = None
@@ -266,6 +271,8 @@ def calibrate_offsets(
         axes = tool_axes(recording.landmarks_mm())[rows.frame]
         open_jaws = np.isfinite(axes).all(axis=(1, 2))
         rows, axes = rows[open_jaws], axes[open_jaws]
+    if own_covariances:
+        options["covariance_px2"] = rows.covariance_px2
     found = calibrate_with_offsets(
         rows.x_mm, [rows.u_left, rows.u_right], rows.landmark, axes, image_size_px=recording.image_size_px, **options
     )
@@ -279,7 +286,8 @@ def estimates(
 
     ``detected`` weighs all detections alike, with the noise measured from the residuals; ``own_covariances`` by the
     detector's covariances; ``tool_offsets`` and ``image_offsets`` estimate constant offsets of the landmarks along
-    (`lib.calibration.offsets`); ``labels_1_px`` is given exact labels with 1 px of click noise instead.  None sees the truth.
+    (`lib.calibration.offsets`), ``offsets_and_covariances`` offsets in the tool's axes with the detector's covariances;
+    ``labels_1_px`` is given exact labels with 1 px of click noise instead.  None sees the truth.
     """
     rows = row_timed(recording, landmarks)
     common = {"model": model, "image_size_px": recording.image_size_px, "seed": seed}
@@ -288,8 +296,12 @@ def estimates(
         return calibrate(rows.x_mm, [rows.u_left, rows.u_right], **common, **options), rows
 
     found = {"detected": plain(rows), "own_covariances": plain(rows, covariance_px2=rows.covariance_px2)}
-    for name, in_images in (("tool_offsets", False), ("image_offsets", True)):
-        fit, used = calibrate_offsets(recording, rows, in_images=in_images, model=model, seed=seed)
+    for name, choice in (
+        ("tool_offsets", {}),
+        ("image_offsets", {"in_images": True}),
+        ("offsets_and_covariances", {"own_covariances": True}),
+    ):
+        fit, used = calibrate_offsets(recording, rows, model=model, seed=seed, **choice)
         found[name] = fit.calibration, used
     found["labels_1_px"] = plain(label_rows(recording, click_px=1.0, seed=seed))
     return found
