@@ -368,9 +368,10 @@ def resolution_study(
 
     Returns
     -------
-    For ``labels`` (1 px of click noise) and each resolution, root mean squares over the sweeps: sigma_u_px, the
-    detections' error per coordinate, and for the affine cameras and perspective DLT on the same rows: triangulation_um of
-    the detected landmarks, calibration_um (exact pixels triangulated) and projection_px, as in `Judgement`.
+    For ``labels`` (1 px of click noise) and each resolution, root mean squares over the sweeps: rows, how many were
+    used; sigma_u_px, the detections' error per coordinate; and for the affine cameras and perspective DLT on the same
+    rows: triangulation_um of the detected landmarks, calibration_um (exact pixels triangulated) and projection_px, as in
+    `Judgement`.
     """
     from lib.landmarks.resolution import RESOLUTIONS, load_resolution
 

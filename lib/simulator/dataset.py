@@ -56,7 +56,17 @@ _LOG_COLUMNS = ("sequence", "finished", "wall_s", "cpu_s")
 _STAGES = {
     "surface under every pixel": ("_intersect", "_ray_points", "height", "full", "surface_grid"),
     "texture, light, glints": ("render_view", "remap", "LUT", "exp", "_shadow", "line"),
-    "tool": ("rasterise", "_tool_layer", "_metal", "_to_camera", "_visibility", "total", "bincount", "_compose"),
+    "tool": (
+        "rasterise",
+        "_tool_layer",
+        "_metal",
+        "_to_camera",
+        "_visibility",
+        "_behind_its_jaw",
+        "total",
+        "bincount",
+        "_compose",
+    ),
     "defocus and motion blur": ("_blur", "_blur_by_depth", "GaussianBlur", "filter2D", "copyMakeBorder", "blur"),
     "sensor noise and gamma": ("_develop", "standard_normal", "pow", "convertScaleAbs"),
     "JPEG and files": ("imencode", "cvtColor", "tofile", "add"),
@@ -268,7 +278,8 @@ def _record(folder: Path, command: str, workers: int, seconds: float) -> Path:
     recordings = [Recording.open(folder / sequence_name(k)) for k in [*TRAIN_SEQUENCES, *TEST_SEQUENCES]]
     pairs = sum(len(recording) for recording in recordings)
     with (folder / "log.csv").open(encoding="utf-8", newline="") as stream:
-        log = list(csv.DictReader(stream))
+        # A sequence that was made anew counts once.
+        log = list({row["sequence"]: row for row in csv.DictReader(stream)}.values())
     content = {
         "command": command,
         "commit": commit(),

@@ -349,12 +349,12 @@ def fundus_windows(photograph: str | Path, seeds: Sequence[int], n: int, size_px
     )
     textures = [fundus_texture(int(seed), round(EXTENT_MM * 40)) for seed in seeds]
     pairs = []
-    for images, reach_mm in (([shown], 6.0), (textures, 6.0)):
+    for images in ([shown], textures):
         windows = []
         for k in range(n):
             image = images[k % len(images)]
-            # The window's corners stay within the disc that is shown.
-            radius = (reach_mm * 40 - size_px / np.sqrt(2)) * np.sqrt(rng.random())
+            # The window's corners stay within 6 mm of the middle, inside the disc that is shown.
+            radius = (6.0 * 40 - size_px / np.sqrt(2)) * np.sqrt(rng.random())
             angle = rng.uniform(0, 2 * np.pi)
             corner = np.array(image.shape[1::-1]) / 2 + radius * np.array([np.cos(angle), np.sin(angle)]) - size_px / 2
             x, y = np.round(corner).astype(int)

@@ -42,8 +42,6 @@ class View:
         Landmarks base, tip_1, tip_2 (3, 2) px as imaged, rolling shutter included; NaN without a tool.
     visibility:
         (3,) COCO: 0 out of the image, 1 hidden by the tool, 2 visible.
-    in_glint:
-        (3,) bool, whether a specular glint covers the landmark.
     surface_mm:
         (h, w) float32, the scene's z in the microscope frame, or None if not asked for.
     tool_mask, glint_mask:
@@ -53,7 +51,6 @@ class View:
     image: np.ndarray
     u: np.ndarray
     visibility: np.ndarray
-    in_glint: np.ndarray
     surface_mm: np.ndarray | None
     tool_mask: np.ndarray
     glint_mask: np.ndarray
@@ -323,12 +320,11 @@ def render_view(
     linear = _blur_by_depth(linear, sigma, grid)
 
     u, visibility = np.full((3, 2), np.nan), np.zeros(3, int)
-    in_glint, tool_mask = np.zeros(3, bool), np.zeros((height, width), np.uint8)
+    tool_mask = np.zeros((height, width), np.uint8)
     if nodes is not None:
-        landmarks, velocity, tip_velocity = _to_camera(
+        landmarks, (centres, radii, chains), tip_velocity = _to_camera(
             forceps, pose, later, nodes, camera, microscope, R, offset, zoom, field_px, origin_px
         )
-        centres, radii, chains = velocity
         u = landmarks[:, :2] * zoom
         raster = rasterise(centres, radii, chains, zoom=zoom, size_px=size_px, factor=factor)
         inside = ((u > -0.5) & (u < np.array(size_px) - 0.5)).all(axis=1)
@@ -343,19 +339,16 @@ def render_view(
             for k in np.flatnonzero(visibility == 2):
                 if k > 0 and _behind_its_jaw(u[k], centres, radii, chains == k, zoom):
                     visibility[k] = 1
-        for k in np.flatnonzero(inside):
-            column, row = np.round(u[k]).astype(int)
-            in_glint[k] = bool(glint_mask[row, column]) and not tool_mask[row, column]
     centre = (np.array(field_px) - 1) / 2 - origin_px
     radius2 = ((grid.u[0] - centre[0]) ** 2 + (grid.u[1] - centre[1]) ** 2) / (np.hypot(*field_px) / 2) ** 2
     linear *= grid.full(1 - microscope.vignetting * radius2)[..., None]
     image = _develop(linear, microscope, np.array(microscope.gain[side]), rng)
     glint_mask[tool_mask > 0] = 0
-    return View(image, u, visibility, in_glint, grid.full(z) if surface else None, tool_mask, glint_mask)
+    return View(image, u, visibility, grid.full(z) if surface else None, tool_mask, glint_mask)
 
 
 def _to_camera(forceps, pose, later, nodes, camera, microscope, R, offset, zoom, field_px, origin_px):
-    """Landmarks (3, 3) and nodes in the camera frame, each where it is when its own row is exposed."""
+    """Landmarks (3, 3), nodes and the tips' mean velocity in the camera frame, each when its own row is exposed."""
     centres, radii, chains = nodes
     points = np.vstack([forceps.landmarks(pose), centres])
     speed = np.zeros_like(points)
