@@ -1,4 +1,4 @@
-"""Engines that run a network on a CPU: torch, or OpenVINO, several times as fast on the detector's small windows.
+"""Engines that run a network on a CPU: torch, or OpenVINO, two to three times as fast on the detector's small windows.
 
 `data/results/detector.json` holds the measurement that chose (study ``engines``).  OpenVINO computes in bfloat16 where the
 processor has units for it (heatmaps then differ by about 0.01 of their height), else in float32.

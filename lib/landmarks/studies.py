@@ -520,6 +520,7 @@ def main(argv: list[str] | None = None) -> int:
     torch.set_num_threads(a.threads)
     steps = a.steps or STEPS[a.study]
     command = f"python3 -m lib.landmarks.studies {a.study} --threads {a.threads} --seeds {a.seeds} --steps {steps}"
+    gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else "no GPU"
     start, cpu = time.perf_counter(), time.process_time()
 
     def record(result: dict) -> None:
@@ -530,7 +531,7 @@ def main(argv: list[str] | None = None) -> int:
                 "budget": result.pop("budget", options.budget),
                 "command": command,
                 "commit": commit(),
-                "machine": f"{platform.machine()}, {os.cpu_count()} cores, no GPU; one of them used",
+                "machine": f"{platform.machine()}, {os.cpu_count()} cores, {gpu}; torch on {a.threads} of the cores",
                 "date": datetime.date.today().isoformat(),
                 "seconds": time.perf_counter() - start,
                 "cpu_seconds": time.process_time() - cpu,

@@ -122,8 +122,9 @@ def match(
     Returns
     -------
     Matches
-        Possibly none, where there is no texture.  Of three confidences the score tells wrong matches best; the peak ratio
-        and the reciprocal check mean the same for every method (`detection_auc` measures each).
+        Possibly none, where there is no texture.  Of three confidences the score tells wrong matches best as a rule, but
+        SGBM has none (always 1); the peak ratio and the reciprocal check mean the same for every method
+        (`detection_auc` measures each).
 
     Raises
     ------

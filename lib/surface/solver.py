@@ -380,12 +380,13 @@ def reweighted(
     k = x.shape[1]
     coefficients, objective, dual = np.empty((problem.grid.size, k)), np.full(k, np.inf), np.empty_like(x)
     B, B_T, R = problem.design, problem.design_T, problem.bending
+    steps = 0
     for j, mu_j in enumerate(np.broadcast_to(mu, k)):
         w_j = np.ascontiguousarray(w[:, j])
         centre = w_j @ x[:, j] / w_j.sum()
         x_j = x[:, j] - centre
         size = np.full(len(x), max(np.abs(x_j).max(), np.finfo(float).tiny))
-        for _ in range(max_iterations):
+        for iteration in range(max_iterations):
             D = w_j / size
             with _one_blas_thread():
                 factor = _cholesky(problem.normal_band(D, 2 * mu_j))
@@ -400,7 +401,8 @@ def reweighted(
                 break
             size = np.maximum(size, max(np.median(size) / 2, np.finfo(float).tiny))
         coefficients[:, j] = c + centre
-    return L1Solution(coefficients, objective, np.full(k, np.nan), dual, max_iterations)
+        steps = max(steps, iteration + 1)
+    return L1Solution(coefficients, objective, np.full(k, np.nan), dual, steps)
 
 
 def least_squares(

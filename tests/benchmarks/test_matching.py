@@ -59,7 +59,10 @@ def test_full_hd(benchmark, full_hd, method, setting):
 @pytest.mark.parametrize("width_px", [512, 1024])
 @pytest.mark.parametrize("method", ["band", "sgbm", "dis", "deepmatching"])
 def test_motorcycle(benchmark, method, width_px):
-    """Seconds and errors; ``python3 -m lib.surface.studies motorcycle`` records them."""
+    """Seconds and errors; ``python3 -m lib.surface.studies motorcycle`` records them.
+
+    The benchmark's own table times the whole measurement, all rounds; a pair's seconds are in `extra_info`.
+    """
     folder = paths.real_data("stereo_pairs")
     if folder is None:
         pytest.skip(paths.missing_data_line("stereo_pairs"))

@@ -26,6 +26,9 @@ def test_solver_beside_clarabel(benchmark, control, n):
 @pytest.mark.parametrize("depth_only", [True, False])
 @pytest.mark.parametrize("setting", ["fast", "quality"])
 def test_pair_to_surface(benchmark, setting, depth_only):
-    """One spline, the depth, and the paper's three: what each costs and gains."""
+    """One spline, the depth, and the paper's three: what each costs and gains.
+
+    The benchmark's own table times the whole measurement, eight pairs; a pair's seconds are in `extra_info`.
+    """
     benchmark.extra_info |= benchmark.pedantic(speed.pair_to_surface, (setting,), {"depth_only": depth_only})
     print(f"\n{setting}, {'depth' if depth_only else 'three splines'}: {benchmark.extra_info}")
