@@ -9,8 +9,6 @@ import argparse
 import datetime
 import json
 import os
-import platform
-import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -26,6 +24,7 @@ from lib.calibration import detected, studies
 from lib.calibration.affine import Moments, affine_minimum
 from lib.calibration.estimate import calibrate
 from lib.simulator.rig import simulate_correspondences
+from lib.workbench.collection import commit, machine
 
 __all__ = ["main", "recorded", "solve_with_ceres", "solve_with_scipy"]
 
@@ -349,16 +348,6 @@ STUDIES: dict[str, Callable[[int], dict]] = {
 }
 
 
-def _commit() -> str:
-    try:
-        done = subprocess.run(
-            ["git", "rev-parse", "--short", "HEAD"], cwd=paths.ROOT, capture_output=True, text=True, check=True
-        )
-        return done.stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
-        return "unknown"
-
-
 def _plain(value: object) -> object:
     if isinstance(value, dict):
         return {k: _plain(v) for k, v in value.items()}
@@ -393,8 +382,8 @@ def main(argv: list[str] | None = None) -> int:
         content[name] = {
             "result": result,
             "command": f"python3 -m lib.calibration.evaluation {name} --runs {arguments.runs}",
-            "commit": _commit(),
-            "machine": f"{platform.machine()}, {os.cpu_count()} cores",
+            "commit": commit(),
+            "machine": machine(),
             "date": datetime.date.today().isoformat(),
             "seconds": _plain(time.perf_counter() - start),
             "cpu_seconds": _plain(time.process_time() - cpu),
