@@ -7,6 +7,7 @@ import os
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from typing import TypeVar
 
@@ -46,6 +47,11 @@ def in_processes(
     ----------
     on_step:
         Called here, in a thread of its own, whenever a worker calls `step`: progress within a job.
+
+    Raises
+    ------
+    ChildProcessError
+        If a worker was killed.
     """
     jobs_arguments = list(arguments)
     if not jobs_arguments:
@@ -63,9 +69,14 @@ def in_processes(
             except BaseException:
                 pool.shutdown(wait=False, cancel_futures=True)
                 raise
+    except BrokenProcessPool as error:
+        raise ChildProcessError(
+            "A worker was killed, perhaps for want of memory; try fewer at a time (workers)."
+        ) from error
     finally:
-        steps.put(False)
-        listener.join()
+        # A worker that was killed while it told a step still holds the queue: then there is nobody to wake.
+        threading.Thread(target=steps.put, args=(False,), daemon=True).start()
+        listener.join(timeout=2.0)
 
 
 def step() -> None:

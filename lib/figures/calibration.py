@@ -353,8 +353,9 @@ def checkerboards(results: Mapping[str, Mapping[str, Mapping[str, float]]], pape
     return page
 
 
-def resolutions(study: Mapping[str, Mapping[str, float]]) -> Figure:
+def resolutions(study: Mapping[str, object]) -> Figure:
     """The paper's figure: 3D and projection error of calibrations from labels and from detectors at four resolutions."""
+    study = {name: row for name, row in study.items() if isinstance(row, dict)}
     page, axes = figure(1, 2, width_in=12, height_in=3.8)
     names = [f"{name}\n{row['sigma_u_px']:.1f} px" for name, row in study.items()]
     at = np.arange(len(names))
