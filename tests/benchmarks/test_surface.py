@@ -32,3 +32,4 @@ def test_pair_to_surface(benchmark, setting, depth_only):
     """
     benchmark.extra_info |= benchmark.pedantic(speed.pair_to_surface, (setting,), {"depth_only": depth_only})
     print(f"\n{setting}, {'depth' if depth_only else 'three splines'}: {benchmark.extra_info}")
+    assert benchmark.extra_info["surface_rms_um"] <= {"fast": 25.0, "quality": 12.0}[setting]

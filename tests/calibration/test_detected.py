@@ -122,3 +122,13 @@ def test_boards_are_measured_with_every_estimate(recording, monkeypatch):
 
 def test_root_mean_square():
     assert evaluation._root_mean_square([3.0, 4.0]) == pytest.approx(np.sqrt(12.5))
+
+
+def test_recorded_checkerboard_stays_within_its_limits():
+    """Affine optics, cameras from 75 detected frames: 6 um aligned and 12 um in the robot frame, root mean squares."""
+    study = evaluation.recorded("checkerboard")
+    near = study["affine optics"]
+    for estimate in ("detected", "own_covariances", "offsets_and_covariances"):
+        row = near[f"zero_skew, {estimate}"]
+        assert row["sweeps"] >= 4
+        assert row["aligned_um"] <= 6 and row["robot_um"] <= 12
