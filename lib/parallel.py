@@ -56,12 +56,14 @@ def in_processes(
     jobs_arguments = list(arguments)
     if not jobs_arguments:
         return
-    steps = multiprocessing.SimpleQueue()
+    # A fresh interpreter each: a fork of a program with threads (torch, OpenVINO) can wait for ever for one of their locks.
+    context = multiprocessing.get_context("spawn")
+    steps = context.SimpleQueue()
     listener = threading.Thread(target=_listen, args=(steps, on_step), daemon=True)
     listener.start()
     workers = min(workers or os.cpu_count() or 1, len(jobs_arguments))
     try:
-        with ProcessPoolExecutor(workers, initializer=_begin, initargs=(steps,)) as pool:
+        with ProcessPoolExecutor(workers, mp_context=context, initializer=_begin, initargs=(steps,)) as pool:
             jobs = [pool.submit(function, *a) for a in jobs_arguments]
             try:
                 for job in as_completed(jobs):

@@ -290,8 +290,8 @@ DEFINITION = (
     "bound: RMS of the Cramer-Rao prediction of the fitted model at the true cameras and the rows used, for independent "
     "Gaussian noise of the detections' RMS error per coordinate (measured against truth over the rows used, bias included) "
     "and 10 um of the robot. over_bound: 3D RMS of the true landmarks triangulated from their exact pixels over its bound; "
-    "projection_over_bound: RMS of their projections over its bound. Pooled over the sweeps (root mean squares). Estimators that "
-    "weigh detections by their own covariances may go below 1: the bound takes all detections as equally noisy."
+    "projection_over_bound: RMS of their projections over its bound. Pooled over the sweeps (root mean squares). Estimators "
+    "that weigh detections by their own covariances may go below 1: the bound takes all detections as equally noisy."
 )
 
 

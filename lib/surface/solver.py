@@ -390,7 +390,8 @@ def reweighted(
         centre = w_j @ x[:, j] / w_j.sum()
         x_j = x[:, j] - centre
         size = np.full(len(x), max(np.abs(x_j).max(), np.finfo(float).tiny))
-        for iteration in range(max_iterations):
+        for iteration in range(1, max_iterations + 1):
+            steps = max(steps, iteration)
             D = w_j / size
             with _one_blas_thread():
                 factor = _cholesky(problem.normal_band(D, 2 * mu_j))
@@ -405,7 +406,6 @@ def reweighted(
                 break
             size = np.maximum(size, max(np.median(size) / 2, np.finfo(float).tiny))
         coefficients[:, j] = c + centre
-        steps = max(steps, iteration + 1)
     return L1Solution(coefficients, objective, np.full(k, np.nan), dual, steps)
 
 

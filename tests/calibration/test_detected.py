@@ -117,7 +117,7 @@ def test_boards_are_measured_with_every_estimate(recording, monkeypatch):
     found = detected.board_study(np.inf, boards=1, models=("zero_skew",), seeds=(0,))
     assert found["true cameras"][0].aligned_um < 3
     assert found["zero_skew, detected"][0].aligned_um < 6 and found["zero_skew, detected"][0].robot_um < 30
-    assert len(found) == 6 and all(len(errors) == 1 for errors in found.values())
+    assert len(found) == 7 and all(len(errors) == 1 for errors in found.values())
 
 
 def test_root_mean_square():
