@@ -345,6 +345,16 @@ class Detector:
         windows = [cut(images[i], matrix, self.window_px) for i, matrix in zip(image, matrices, strict=True)]
         return np.stack(windows), matrices, which
 
+    def explained(self, image: np.ndarray) -> tuple[Landmarks, np.ndarray, np.ndarray, np.ndarray]:
+        """What the last stage saw in one image (h, w, 3): landmarks, windows (m, s, s, 3), window_from_image (m, 2, 3), and
+        each window's heatmap (m, c, c) of its own landmark."""
+        found = self(image[None])
+        windows, matrices, which = self.windows(image[None], found.u, "window")
+        if not len(which):
+            return found, windows, matrices, windows[..., 0]
+        heat = self.heatmaps(windows, "window").numpy()[np.arange(len(which)), which[:, 1]]
+        return found, windows, matrices, heat
+
     def heatmaps(self, windows: np.ndarray, stage: str) -> Tensor:
         """Heatmaps (m, 3, h, w) of windows (m, s, s, 3)."""
         with torch.inference_mode():
