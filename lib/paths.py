@@ -26,6 +26,12 @@ def recording_folder(folder: str = "") -> Path:
     return ROOT / folder if folder else SHIPPED_RECORDING
 
 
+def shown(path: Path) -> str:
+    """A path as a user types it in the workbench's folder: relative to it where it lies inside."""
+    path = Path(path).absolute()
+    return str(path.relative_to(ROOT) if path.is_relative_to(ROOT) else path)
+
+
 def real_data(name: str) -> Path | None:
     """The folder of a real data set, or None where it is not at hand.
 

@@ -6,9 +6,7 @@ python3 -m lib.calibration.evaluation [--runs 2000] [--out FILE] [STUDY ...]
 from __future__ import annotations
 
 import argparse
-import datetime
 import json
-import os
 import sys
 import time
 from collections.abc import Callable
@@ -23,8 +21,8 @@ from lib import paths
 from lib.calibration import detected, studies
 from lib.calibration.affine import Moments, affine_minimum
 from lib.calibration.estimate import calibrate
+from lib.records import Provenance, read_records, write_record
 from lib.simulator.rig import simulate_correspondences
-from lib.workbench.collection import commit, machine
 
 __all__ = ["main", "recorded", "solve_with_ceres", "solve_with_scipy"]
 
@@ -358,20 +356,9 @@ STUDIES: dict[str, Callable[[int], dict]] = {
 }
 
 
-def _plain(value: object) -> object:
-    if isinstance(value, dict):
-        return {k: _plain(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(v) for v in value]
-    if isinstance(value, (np.floating, float)):
-        return float(f"{float(value):.6g}")
-    return value.item() if isinstance(value, np.generic) else value
-
-
 def recorded(study: str) -> dict | None:
     """What `study` found when it was last run for the results file; None where it has not been."""
-    path = paths.RESULTS / "calibration.json"
-    return json.loads(path.read_text()).get(study, {}).get("result") if path.is_file() else None
+    return read_records(paths.RESULTS / "calibration.json").get(study, {}).get("result")
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -384,24 +371,10 @@ def main(argv: list[str] | None = None) -> int:
     unknown = set(arguments.studies) - set(STUDIES)
     if unknown:
         parser.error(f"unknown study {', '.join(sorted(unknown))}; take some of {', '.join(STUDIES)}")
-    arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    content = json.loads(arguments.out.read_text()) if arguments.out.is_file() else {}
     for name in arguments.studies or STUDIES:
-        start, cpu = time.perf_counter(), time.process_time()
-        result = _plain(STUDIES[name](arguments.runs))
-        content[name] = {
-            "result": result,
-            "command": f"python3 -m lib.calibration.evaluation {name} --runs {arguments.runs}",
-            "commit": commit(),
-            "machine": machine(),
-            "date": datetime.date.today().isoformat(),
-            "seconds": _plain(time.perf_counter() - start),
-            "cpu_seconds": _plain(time.process_time() - cpu),
-        }
-        partial = arguments.out.with_name(arguments.out.name + ".partial")
-        partial.write_text(json.dumps(content, indent=1) + "\n")
-        os.replace(partial, arguments.out)
-        print(f"{name}: {json.dumps(result)}", flush=True)
+        provenance = Provenance(f"python3 -m lib.calibration.evaluation {name} --runs {arguments.runs}")
+        record = write_record(arguments.out, name, STUDIES[name](arguments.runs), provenance)
+        print(f"{name}: {json.dumps(record['result'])}", flush=True)
     return 0
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import platform
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +10,8 @@ from lib.landmarks.dataset import REDUCTION, TOOL_REDUCTION, validation_frames
 from lib.landmarks.evaluation import calibrate, evaluate
 from lib.landmarks.inference import Detector
 from lib.landmarks.metrics import calibration_error
-from lib.landmarks.training import commit, load_training
+from lib.landmarks.training import load_training
+from lib.records import commit_id, machine
 
 __all__ = ["assemble"]
 
@@ -43,8 +43,8 @@ def assemble(folder: str | Path, data: str | Path, out: str | Path) -> Detector:
     keys = ("data", "images", "commit", "steps", "seconds", "config", "metrics", "before")
     provenance = {
         "trained_on": "simulated frames only (lib.simulator.training); no eye or tool of a shipped recording",
-        "commit": commit(),
-        "machine": f"{platform.machine()} CPU, no GPU",
+        "commit": commit_id(),
+        "machine": machine(),
         "stages": {name: {key: training.provenance.get(key) for key in keys} for name, training in stages.items()},
         "validation_frames": len(frames),
         "metrics": held_out.scores.as_dict()

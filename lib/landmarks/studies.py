@@ -7,10 +7,7 @@ is complete is only evaluated anew.  Its budget (what a training may cost) is th
 from __future__ import annotations
 
 import argparse
-import datetime
-import json
-import os
-import platform
+import shlex
 import sys
 import tempfile
 import time
@@ -35,8 +32,9 @@ from lib.landmarks.inference import Detector, Landmarks
 from lib.landmarks.metrics import calibration_error
 from lib.landmarks.network import ABLATION, HourglassConfig
 from lib.landmarks.resolution import RESOLUTIONS, ReducedDetector, resolution_windows
-from lib.landmarks.training import PRESETS, Samples, Source, Training, TrainingConfig, commit, train, validate
+from lib.landmarks.training import PRESETS, Samples, Source, Training, TrainingConfig, train, validate
 from lib.recordings import Recording, import_retinal_microsurgery
+from lib.records import Provenance, read_records, write_record
 
 __all__ = ["STUDIES", "main", "read_results", "summary"]
 
@@ -72,6 +70,8 @@ class Options:
     progress: bool = True
     #: Called with a study's result whenever it has grown.
     record: Callable[[dict], None] = field(default=lambda _: None)
+    #: What each training took, all its sittings together: the study itself may only have evaluated it anew.
+    trained_s: dict[str, float] = field(default_factory=dict)
 
     @property
     def budget(self) -> dict[str, object]:
@@ -99,8 +99,7 @@ class Options:
 
 def read_results(path: Path | None = None) -> dict[str, dict]:
     """Recorded results of all studies that have been run, by name; empty where there are none."""
-    path = path or paths.RESULTS / "detector.json"
-    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    return read_records(path or paths.RESULTS / "detector.json")
 
 
 # --- statistics ----------------------------------------------------------------------------------------------------
@@ -180,7 +179,9 @@ def _trained(
     if options.progress:
         print(f"{name}, seed {seed}", flush=True)
     folder = options.folder / name / f"seed{seed}"
-    return train(config, source, validation, folder, initial=initial, progress=options.progress)
+    done = train(config, source, validation, folder, initial=initial, progress=options.progress)
+    options.trained_s[f"{name}/seed{seed}"] = done.provenance["seconds"]
+    return done
 
 
 # --- the studies ---------------------------------------------------------------------------------------------------
@@ -339,7 +340,7 @@ def _noisy(source: WindowSource, options: Options, sigma_px: float) -> WindowSou
     """One click a landmark and frame: the crops of a frame share its errors."""
     from lib.landmarks.dataset import _load
 
-    (visibility,) = _load(options.data, "training_*.npz", ("visibility",), options.shards)
+    (visibility,) = _load(options.data, ("training_*.npz",), ("visibility",), options.shards)
     frame, landmark = np.nonzero(visibility)  # the order in which shards keep crops
     if not np.array_equal(landmark, source.landmark):
         raise ValueError(f"{options.data}: crops and frames of the shards do not belong together; generate them again.")
@@ -348,7 +349,10 @@ def _noisy(source: WindowSource, options: Options, sigma_px: float) -> WindowSou
 
 
 def few_labels(options: Options, counts: Sequence[int] = (10, 30, 100, 300, 750)) -> None:
-    """PCK against the number of annotated frames: the tool stage fine-tuned from the shipped weights, and from scratch."""
+    """PCK against the number of annotated frames: the tool stage fine-tuned from the shipped weights, and from scratch.
+
+    The shipped weights were trained on these very shards, so only the curve from scratch says what so many labels are worth.
+    """
     shipped = Detector.load()
     source = WindowSource.load_tools(options.data, shards=options.shards)
     held_out = WindowSource.load_tools(options.data, validation=True)
@@ -379,7 +383,7 @@ def few_labels(options: Options, counts: Sequence[int] = (10, 30, 100, 300, 750)
         options.record(
             {
                 "what": f"the tool stage ({network.stacks} x {network.features} features), windows at 1/5 of full HD; "
-                "the shipped weights have seen simulated frames of this kind, so they need no label of them",
+                "the shipped weights were trained on these very shards, so the fine-tuned curve is no test of transfer",
                 "test": what,
                 "budget": options.budget
                 | {"features": network.features, "learning_rate": {"fine-tuned": 3e-4, "from scratch": 2e-3}},
@@ -393,7 +397,8 @@ def few_labels(options: Options, counts: Sequence[int] = (10, 30, 100, 300, 750)
 
 
 def real_frames(options: Options) -> None:
-    """Real sequences: first half to second half, one to the other, and no real frame in training at all."""
+    """Real sequences: trained on the first half of one, tested on its second half and on the other sequence; and the
+    shipped detector, which has seen no real frame."""
     folder = paths.real_data("retinal_microsurgery")
     if folder is None:
         print(paths.missing_data_line("retinal_microsurgery"))
@@ -412,14 +417,19 @@ def real_frames(options: Options) -> None:
             "curve": curve.tolist(),
         }
         budget = {"steps": options.steps, "batch": 4, "features": 24, "stacks": 1, "seeds": 1}
-        options.record({"thresholds": thresholds.tolist(), "results": dict(result), "budget": budget})
+        what = (
+            "a small network trained on the first half of a sequence, and the shipped detector, which saw no real frame"
+        )
+        options.record({"what": what, "thresholds": thresholds.tolist(), "results": dict(result), "budget": budget})
 
     for sequence in sequences:
+        start = time.perf_counter()
         trained = real.detector_of_first_half(sequence, steps=options.steps)
+        options.trained_s[sequence.name] = time.perf_counter() - start
         keep(f"{sequence.name}: first half to second", real.evaluate_on_sequence(trained, sequence, second_half=True))
         for other in sequences:
             if other is not sequence:
-                keep(f"{sequence.name}: to {other.name}", real.evaluate_on_sequence(trained, other))
+                keep(f"{sequence.name}: first half to {other.name}", real.evaluate_on_sequence(trained, other))
         keep(f"{sequence.name}: simulated frames only", real.simulated_to_real(detector, sequence, every=4))
 
 
@@ -492,14 +502,13 @@ STUDIES: dict[str, Callable[[Options], None]] = {
 STEPS = {"resolution": 1000, "ablation": 800, "label_noise": 1000, "few_labels": 250, "real_frames": 1500, "engines": 1}
 
 
-def _plain(value: object) -> object:
-    if isinstance(value, dict):
-        return {k: _plain(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(v) for v in value]
-    if isinstance(value, float | np.floating):
-        return float(f"{float(value):.5g}") if np.isfinite(value) else None
-    return value.item() if isinstance(value, np.generic) else value
+def _command(parser: argparse.ArgumentParser, given: argparse.Namespace) -> str:
+    """The command with every option that differs from its default."""
+    words = ["python3", "-m", "lib.landmarks.studies", given.study]
+    for name, value in vars(given).items():
+        if name != "study" and value != parser.get_default(name):
+            words += [f"--{name}", paths.shown(value) if isinstance(value, Path) else str(value)]
+    return shlex.join(words)
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -519,28 +528,12 @@ def main(argv: list[str] | None = None) -> int:
     a = parser.parse_args(argv)
     torch.set_num_threads(a.threads)
     steps = a.steps or STEPS[a.study]
-    command = f"python3 -m lib.landmarks.studies {a.study} --threads {a.threads} --seeds {a.seeds} --steps {steps}"
-    gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else "no GPU"
-    start, cpu = time.perf_counter(), time.process_time()
+    provenance = Provenance(_command(parser, a))
 
     def record(result: dict) -> None:
-        content = read_results(a.out)  # anew each time: another study may be running
-        content[a.study] = _plain(
-            {
-                "result": result,
-                "budget": result.pop("budget", options.budget),
-                "command": command,
-                "commit": commit(),
-                "machine": f"{platform.machine()}, {os.cpu_count()} cores, {gpu}; torch on {a.threads} of the cores",
-                "date": datetime.date.today().isoformat(),
-                "seconds": time.perf_counter() - start,
-                "cpu_seconds": time.process_time() - cpu,
-            }
-        )
-        a.out.parent.mkdir(parents=True, exist_ok=True)
-        partial = a.out.with_name(a.out.name + f".{a.study}.partial")
-        partial.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-        os.replace(partial, a.out)
+        budget = result.pop("budget", options.budget)
+        trainings = {"training_seconds": sum(options.trained_s.values())} if options.trained_s else {}
+        write_record(a.out, a.study, result, provenance, budget=budget, torch_threads=a.threads, **trainings)
 
     options = Options(a.data, a.test, a.folder, a.seeds, steps, a.batch, a.features, a.shards, record=record)
     try:

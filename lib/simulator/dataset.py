@@ -15,6 +15,7 @@ import datetime
 import json
 import os
 import pstats
+import shlex
 import tempfile
 import time
 from collections.abc import Sequence
@@ -27,12 +28,12 @@ from tqdm.auto import tqdm
 from lib import paths
 from lib.parallel import in_processes, step
 from lib.recordings import LANDMARKS, Recording
+from lib.records import Provenance, write_record
 from lib.simulator.eye import Eye
 from lib.simulator.forceps import Forceps
 from lib.simulator.microscope import Microscope
 from lib.simulator.recording import simulate
 from lib.simulator.training import RESERVED_SEEDS, random_forceps, reserved_forceps
-from lib.workbench.collection import commit, machine
 
 __all__ = [
     "TEST_SEQUENCES",
@@ -273,18 +274,20 @@ def _seconds_a_pair(shrink: int) -> float:
     return sum(seconds_by_stage(2, shrink).values())
 
 
-def _record(folder: Path, command: str, workers: int, seconds: float) -> Path:
-    """Write what a data set holds and what it cost to ``data/results/dataset.json``."""
+def _record(target: Path, folder: Path, provenance: Provenance, workers: int, shrink: int, seconds: float) -> None:
+    """Write what the data set in `folder` holds and what it cost to the results file `target`.
+
+    Parameters
+    ----------
+    seconds:
+        What this run spent on the sequences that were missing.
+    """
     recordings = [Recording.open(folder / sequence_name(k)) for k in [*TRAIN_SEQUENCES, *TEST_SEQUENCES]]
     pairs = sum(len(recording) for recording in recordings)
     with (folder / "log.csv").open(encoding="utf-8", newline="") as stream:
         # A sequence that was made anew counts once.
         log = list({row["sequence"]: row for row in csv.DictReader(stream)}.values())
-    content = {
-        "command": command,
-        "commit": commit(),
-        "machine": machine(),
-        "date": datetime.date.today().isoformat(),
+    result = {
         "sequences": len(recordings),
         "pairs": pairs,
         "gigabytes": sum(f.stat().st_size for f in folder.rglob("*") if f.is_file()) / 1e9,
@@ -293,24 +296,13 @@ def _record(folder: Path, command: str, workers: int, seconds: float) -> Path:
         "minutes_of_all_sequences_one_by_one": sum(float(row["wall_s"]) for row in log) / 60,
         "wall_seconds_a_pair": sum(float(row["wall_s"]) for row in log) / pairs,
         "cpu_seconds_a_pair": sum(float(row["cpu_s"]) for row in log) / pairs,
-        "cpu_seconds_a_pair_by_stage": seconds_by_stage(),
+        "cpu_seconds_a_pair_by_stage": seconds_by_stage(shrink=shrink),
         "landmarks": {
             kind: landmark_counts([r for r in recordings if r.name.startswith(kind)]) for kind in ("train", "test")
         },
         "log": log,
     }
-    paths.RESULTS.mkdir(parents=True, exist_ok=True)
-    target = paths.RESULTS / "dataset.json"
-    partial = target.with_name(target.name + ".partial")
-    partial.write_text(json.dumps(_rounded(content), indent=1) + "\n")
-    os.replace(partial, target)
-    return target
-
-
-def _rounded(value: object) -> object:
-    if isinstance(value, dict):
-        return {key: _rounded(item) for key, item in value.items()}
-    return float(f"{value:.4g}") if isinstance(value, float) else value
+    write_record(target, "dataset", result, provenance)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -325,7 +317,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--workers", type=int, help="processes (default: one a core)")
     parser.add_argument("--shrink", type=int, default=1, help="images this many times smaller, for a quick look")
     parser.add_argument("--dry-run", action="store_true", help="only say how long it takes and how many GB")
-    parser.add_argument("--record", action="store_true", help="also write data/results/dataset.json")
+    parser.add_argument("--record", action="store_true", help="also write what was made, and its cost, to --out")
+    parser.add_argument("--out", type=Path, default=paths.RESULTS / "dataset.json", help="record: results file")
     parser.add_argument("--shipped", action="store_true", help="remake data/open_sky_eye instead")
     arguments = parser.parse_args(argv)
     if arguments.shipped:
@@ -339,12 +332,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     workers = min(arguments.workers or os.cpu_count() or 1, 10)
     minutes = left * _seconds_a_pair(arguments.shrink) / workers / 60 if left else 0.0
     print(
-        f"{folder}: {left} of {10 * arguments.pairs} stereo pairs to make, about {minutes:.0f} min on {workers} idle "
-        f"core{'s' if workers > 1 else ''}, {left * _MB_PER_PAIR / arguments.shrink**2 / 1000:.2f} GB.",
+        f"{paths.shown(folder)}: {left} of {10 * arguments.pairs} stereo pairs to make, about {minutes:.0f} min on "
+        f"{workers} idle core{'s' if workers > 1 else ''}, {left * _MB_PER_PAIR / arguments.shrink**2 / 1000:.2f} GB.",
         flush=True,
     )
     if arguments.dry_run:
         return 0
+    provenance = Provenance(shlex.join(["python3", "-m", "lib", "simulate", *(argv or [])]))
     start = time.perf_counter()
     make_dataset(
         folder,
@@ -358,5 +352,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     if left:
         print(f"{left} pairs in {seconds / 60:.1f} min, {seconds / left:.2f} s a pair.")
     if arguments.record:
-        print(_record(folder, " ".join(["python3 -m lib simulate", *(argv or [])]), workers, seconds))
+        _record(arguments.out, folder, provenance, workers, arguments.shrink, seconds)
+        print(paths.shown(arguments.out))
     return 0

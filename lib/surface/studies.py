@@ -9,12 +9,9 @@ data/cache/reconstruction; so with new detector weights the same command only de
 from __future__ import annotations
 
 import argparse
-import datetime
 import hashlib
 import json
-import os
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -26,13 +23,13 @@ from lib.landmarks import Detector
 from lib.landmarks.stereo import detect
 from lib.matching import RECTIFIED, match
 from lib.recordings import Recording
+from lib.records import Provenance, read_records, write_record
 from lib.simulator.eye import Eye
 from lib.simulator.microscope import Microscope
 from lib.simulator.recording import simulate
 from lib.simulator.training import RESERVED_SEEDS
 from lib.surface import evaluation, speed
 from lib.surface.reconstruct import reconstruct
-from lib.workbench.collection import commit, machine
 
 __all__ = ["STUDIES", "main", "recorded"]
 
@@ -160,7 +157,7 @@ def _judged_matches():
 
 def recorded(path: Path = paths.RESULTS / "reconstruction.json") -> dict[str, dict]:
     """What the studies recorded last, by name; empty where nothing is."""
-    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    return read_records(path)
 
 
 def solver(options: argparse.Namespace) -> dict:
@@ -219,18 +216,6 @@ def _digest(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()[:12]
 
 
-def _plain(value: object) -> object:
-    if isinstance(value, dict):
-        return {k: _plain(v) for k, v in value.items()}
-    if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
-    if isinstance(value, (list, tuple)):
-        return [_plain(v) for v in value]
-    if isinstance(value, (np.floating, float)):
-        return float(f"{float(value):.5g}") if np.isfinite(value) else None
-    return value.item() if isinstance(value, np.generic) else value
-
-
 def main(argv: list[str] | None = None) -> int:
     """Run the studies named (all by default) and merge them into the results file, which is written whole after each."""
     parser = argparse.ArgumentParser(
@@ -244,24 +229,11 @@ def main(argv: list[str] | None = None) -> int:
     unknown = set(options.studies) - set(STUDIES)
     if unknown:
         parser.error(f"unknown study {', '.join(sorted(unknown))}; take some of {', '.join(STUDIES)}")
-    options.out.parent.mkdir(parents=True, exist_ok=True)
     for name in options.studies or STUDIES:
-        start, cpu = time.perf_counter(), time.process_time()
-        result = _plain(STUDIES[name](options))
-        content = recorded(options.out)
-        content[name] = {
-            "result": result,
-            "command": f"python3 -m lib.surface.studies {name} --eyes {options.eyes} --recordings {options.recordings}",
-            "commit": commit(),
-            "machine": machine(),
-            "date": datetime.date.today().isoformat(),
-            "seconds": _plain(time.perf_counter() - start),
-            "cpu_seconds": _plain(time.process_time() - cpu),
-        }
-        partial = options.out.with_name(options.out.name + ".partial")
-        partial.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-        os.replace(partial, options.out)
-        print(f"{name}: {json.dumps(result)}", flush=True)
+        command = f"python3 -m lib.surface.studies {name} --eyes {options.eyes} --recordings {options.recordings}"
+        provenance = Provenance(command)
+        record = write_record(options.out, name, STUDIES[name](options), provenance)
+        print(f"{name}: {json.dumps(record['result'])}", flush=True)
     return 0
 
 

@@ -14,7 +14,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from lib import paths
+from lib import paths, records
 from lib.workbench import collection, pages
 from lib.workbench.execution import Failure, execute, kernel_environment
 from lib.workbench.index import index_html
@@ -120,8 +120,8 @@ class _Report:
             "parameters": given,
             "started": datetime.datetime.now().astimezone().isoformat(timespec="seconds"),
             "seconds": 0.0,
-            "commit": collection.commit(),
-            "machine": collection.machine(),
+            "commit": records.commit(),
+            "machine": records.machine(),
             "versions": collection.versions(),
             "notebooks": [
                 {"name": book.stem, "title": title_of(book), "state": "pending", "seconds": None, "failure": None,

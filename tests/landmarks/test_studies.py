@@ -99,6 +99,12 @@ def test_a_study_goes_on_where_it_was_and_records(tmp_path, toy_shards):
     assert checkpoint.stat().st_mtime_ns == written
     second = read_results(tmp_path / "r.json")["ablation"]
     assert {"command", "commit", "machine", "date", "budget", "seconds"} <= set(second)
+    # What differs from the defaults is named; what the trainings took is theirs, not this evaluation's.
+    words = second["command"].split()
+    assert words[:4] == ["python3", "-m", "lib.landmarks.studies", "ablation"]
+    assert {"--steps", "--shards", "--features", "--batch", "--data", "--folder", "--seeds"} <= set(words)
+    assert "--seeds" in first["command"].split() and "--threads" not in words
+    assert second["training_seconds"] > first["training_seconds"] > 0
     for name, row in second["result"]["columns"].items():
         assert row["median_px"]["per_seed"][0] == first["result"]["columns"][name]["median_px"]["per_seed"][0]
         assert len(row["median_px"]["per_seed"]) == 2

@@ -11,6 +11,7 @@ import pytest
 
 from lib import paths
 from lib.recordings import Recording
+from lib.records import read_records
 from lib.simulator.dataset import landmark_counts, main, make_dataset, sequence_name
 
 OPTIONS = {"n_pairs": 2, "duration_s": 4.0, "shrink": 8}  # 240 x 135 px
@@ -86,6 +87,23 @@ def test_another_data_set_in_the_folder_is_refused(made):
     with pytest.raises(ValueError, match="another data set"):
         make_dataset(made, **(OPTIONS | {"n_pairs": 4}))
     assert main(["--folder", str(made), *WORDS]) == 0  # nothing left to make
+
+
+def test_a_record_says_what_was_made_and_its_cost(made, tmp_path):
+    out = tmp_path / "dataset.json"
+    assert main(["--folder", str(made), *WORDS, "--record", "--out", str(out)]) == 0
+    record = read_records(out)["dataset"]
+    result = record["result"]
+    assert result["pairs"] == 20 and result["sequences"] == 10 and {row["sequence"] for row in result["log"]} == NAMES
+    assert result["cpu_seconds_a_pair"] > 0 and result["gigabytes"] == pytest.approx(size_gb(made), rel=1e-5)
+    assert sum(result["landmarks"]["test"]["base"][key] for key in ("visible", "hidden", "outside")) == 3 * 2 * 2
+    # The recorded one has the same entries.
+    assert set(result) <= set(read_records(paths.RESULTS / "dataset.json")["dataset"]["result"])
+    assert record["command"].startswith("python3 -m lib simulate --folder")
+
+
+def size_gb(folder: Path) -> float:
+    return sum(file.stat().st_size for file in folder.rglob("*") if file.is_file()) / 1e9
 
 
 def finished(folder: Path) -> set[str]:

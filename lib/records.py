@@ -1,0 +1,169 @@
+"""Recorded results: ``data/results/*.json``, each a table of named records with what was run, by which commit and where.
+
+A record holds `result` and, where a study has one, its `budget`; and always command, commit, machine, date, wall seconds
+and CPU seconds.
+"""
+
+from __future__ import annotations
+
+import datetime
+import json
+import os
+import platform
+import subprocess
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from lib import paths
+
+__all__ = ["Provenance", "commit", "commit_id", "machine", "plain", "read_records", "write_record"]
+
+
+def commit(root: Path = paths.ROOT) -> dict | None:
+    """Commit of the workbench and whether its files differ from it; None outside a git checkout."""
+    git = ["git", "-C", str(root)]
+    try:
+        head = subprocess.run([*git, "rev-parse", "HEAD"], capture_output=True, text=True, check=True)
+        status = subprocess.run([*git, "status", "--porcelain"], capture_output=True, text=True, check=True)
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return {"id": head.stdout.strip(), "modified": bool(status.stdout.strip())}
+
+
+def commit_id() -> str:
+    """The commit in one word, its first 12 characters; "unknown" outside a git checkout."""
+    found = commit()
+    return found["id"][:12] if found else "unknown"
+
+
+def machine() -> dict:
+    """System, processor, cores that this process may use, memory and GPU."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return {
+        "system": f"{platform.system()} {platform.release()}",
+        "processor": _processor(),
+        "cores": cores,
+        "memory_gb": _memory_gb(),
+        "gpu": _gpu(),
+    }
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """Made when a measurement starts: its command, the commit whose code runs, and the clocks.
+
+    Attributes
+    ----------
+    command:
+        What a user types to measure the same anew.
+    """
+
+    command: str
+    commit: dict | None = field(default_factory=commit)
+    wall_s: float = field(default_factory=time.perf_counter)
+    cpu_s: float = field(default_factory=lambda: _cpu_s())
+
+    def so_far(self) -> dict[str, object]:
+        """The entries of a record that is written now; CPU seconds are those of finished child processes too."""
+        return {
+            "command": self.command,
+            "commit": self.commit,
+            "machine": machine(),
+            "date": datetime.date.today().isoformat(),
+            "seconds": time.perf_counter() - self.wall_s,
+            "cpu_seconds": _cpu_s() - self.cpu_s,
+        }
+
+
+def write_record(
+    path: Path, name: str, result: dict, provenance: Provenance, *, budget: dict | None = None, **more: object
+) -> dict:
+    """Put one named record into a results file, whole or not at all; the others in it stay as they are.
+
+    The file is read just before it is written, since another study may be running.
+
+    Parameters
+    ----------
+    budget:
+        What the study was allowed to cost, where it has such a limit.
+    more:
+        Further entries of the record, beside its seconds.
+
+    Returns
+    -------
+    The record as `read_records` gives it.
+    """
+    given = {"result": result} | ({} if budget is None else {"budget": budget})
+    record = plain(given | provenance.so_far() | more)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
+    try:
+        content = read_records(path) | {name: record}
+        partial.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+    return record
+
+
+def read_records(path: Path) -> dict[str, dict]:
+    """Records of a results file by name; empty where there is no file.
+
+    Raises
+    ------
+    ValueError
+        If the file is no JSON.
+    """
+    if not path.is_file():
+        return {}
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except json.JSONDecodeError as error:
+        raise ValueError(f"{path}: no JSON ({error}); restore or delete the file.") from error
+
+
+def plain(value: object) -> object:
+    """What JSON holds: lists for arrays and tuples, numbers of 6 digits, None for NaN and infinity."""
+    if isinstance(value, dict):
+        return {key: plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, float | np.floating):
+        return float(f"{float(value):.6g}") if np.isfinite(value) else None
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def _cpu_s() -> float:
+    times = os.times()
+    return times.user + times.system + times.children_user + times.children_system
+
+
+def _processor() -> str:
+    try:
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    except OSError:
+        pass
+    return platform.processor() or platform.machine()
+
+
+def _memory_gb() -> float | None:
+    try:
+        return round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9, 1)
+    except (AttributeError, ValueError, OSError):
+        return None
+
+
+def _gpu() -> str | None:
+    try:
+        command = ["nvidia-smi", "--query-gpu=name", "--format=csv,noheader"]
+        answer = subprocess.run(command, capture_output=True, text=True, timeout=20)
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return answer.stdout.splitlines()[0].strip() if answer.returncode == 0 and answer.stdout.strip() else None
