@@ -48,6 +48,7 @@ __all__ = [
     "rms_um",
     "simulated_pair",
     "surface_error_mm",
+    "surface_on_rays",
     "wrong_matches",
 ]
 
@@ -101,6 +102,21 @@ def aligned_rms_um(error_mm: np.ndarray, truth_mm: np.ndarray, where: np.ndarray
         "affine": design @ np.linalg.lstsq(design, b, rcond=None)[0] - b,
     }
     return {name: float(1000 * np.sqrt((e**2).sum(axis=1).mean())) for name, e in remaining.items()}
+
+
+def surface_on_rays(
+    camera: AffineCamera, height_mm: Callable[[np.ndarray, np.ndarray], np.ndarray], u: np.ndarray
+) -> np.ndarray:
+    """Where the rays of pixels u (n, 2) meet a surface z = `height_mm(x, y)` of the microscope's frame: (n, 3) mm, robot.
+
+    The view is all but the microscope's axis, so steps along the ray by the height that is left contract fast.
+    """
+    ray = (u - camera.offset_px) @ np.linalg.pinv(camera.linear).T
+    along = np.full(len(u), float(camera.viewing_direction @ ROBOT_FROM_MICROSCOPE.t))
+    for _ in range(60):
+        x = ROBOT_FROM_MICROSCOPE.inverse().apply(ray + along[:, None] * camera.viewing_direction)
+        along -= x[:, 2] - height_mm(x[:, 0], x[:, 1])
+    return ray + along[:, None] * camera.viewing_direction
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,6 +255,18 @@ class RealPair:
         x, y = np.clip(np.rint(matches.u_left), 0, (width - 1, height - 1)).astype(int).T
         off = np.abs(matches.u_left[:, 0] - matches.u_right[:, 0] - self.disparity_px[y, x])
         return np.where(np.isfinite(off), off > limit_px, np.nan)
+
+    def left_part(self, width_px: int, height_px: int) -> RealPair:
+        """The left part of this shape, as high as the photographs (or all, where they are narrower), at this size."""
+        width = min(round(self.left.shape[0] * width_px / height_px), self.left.shape[1])
+        scale, size = width_px / width, (width_px, height_px)
+        resample = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
+        images = (
+            cv2.resize(np.ascontiguousarray(image[:, :width]), size, interpolation=resample)
+            for image in (self.left, self.right)
+        )
+        disparity = scale * cv2.resize(self.disparity_px[:, :width], size, interpolation=cv2.INTER_NEAREST)
+        return RealPair(self.name, *images, disparity)
 
 
 def real_pair(folder: Path) -> RealPair:

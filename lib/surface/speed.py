@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
-import cv2
 import numpy as np
 from threadpoolctl import threadpool_limits
 
@@ -85,16 +84,7 @@ def full_hd_pair():
     eye = Eye(seed=9001)
     left, right = render_pair(eye, microscope, forceps=Forceps(), pose=pose, rng=np.random.default_rng(1))
     rig = microscope.rig()
-
-    def truth(u: np.ndarray) -> np.ndarray:
-        ray = (u - rig.left.offset_px) @ np.linalg.pinv(rig.left.linear).T
-        along = np.full(len(u), float(rig.left.viewing_direction @ ROBOT_FROM_MICROSCOPE.t))
-        for _ in range(60):
-            x = ROBOT_FROM_MICROSCOPE.inverse().apply(ray + along[:, None] * rig.left.viewing_direction)
-            along -= x[:, 2] - eye.height(x[:, 0], x[:, 1])
-        return ray + along[:, None] * rig.left.viewing_direction
-
-    return left, right, rig, truth
+    return left, right, rig, partial(evaluation.surface_on_rays, rig.left, eye.height)
 
 
 def pair_to_surface(setting: str, *, depth_only: bool | None = None, rounds: int = 7) -> dict[str, float]:
@@ -127,21 +117,12 @@ def motorcycle(folder: Path, method: str, width_px: int, *, rounds: int = 5) -> 
 
     Errors are over matches that are not occluded: where the truth is flat around them, and of all.
     """
-    pair = evaluation.real_pair(folder)
-    crop = round(pair.left.shape[0] * 4 / 3)
-    size = width_px, round(width_px * 3 / 4)
-    scale = width_px / crop
-    resample = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
-    images = [
-        cv2.resize(np.ascontiguousarray(image[:, :crop]), size, interpolation=resample)
-        for image in (pair.left, pair.right)
-    ]
-    disparity = scale * cv2.resize(pair.disparity_px[:, :crop], size, interpolation=cv2.INTER_NEAREST)
+    pair = evaluation.real_pair(folder).left_part(width_px, round(width_px * 3 / 4))
     options = {"method": method, "downscale": 1} if method == "deepmatching" else {"method": method, "rig": RECTIFIED}
     wall, cpu = [], []
     for _ in range(rounds + 1):
         start = time.perf_counter()
-        matches, seconds = _cpu(lambda: match(*images, **options))
+        matches, seconds = _cpu(lambda: match(pair.left, pair.right, **options))
         wall.append(time.perf_counter() - start)
         cpu.append(seconds)
     result = {
@@ -150,7 +131,7 @@ def motorcycle(folder: Path, method: str, width_px: int, *, rounds: int = 5) -> 
         "cpu_seconds": float(np.median(cpu[1:] or cpu)),
     }
     for name, window in (("flat", 3), ("all", None)):
-        score = score_against_disparity(matches, disparity, flat_window_px=window)
+        score = score_against_disparity(matches, pair.disparity_px, flat_window_px=window)
         result |= {f"{name}_n": score.n, f"{name}_median_px": score.median_px, f"{name}_above_2": score.above_2}
     return result
 

@@ -5,34 +5,27 @@ DeepMatching 1.2.2 on motorcycle, 512 x 384: 2653 matches, median 0.633 px, 8.4 
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 import pytest
 
 from lib import paths
 from lib.matching import CONFIDENCES, RECTIFIED, detection_auc, match, score_against_disparity
+from lib.surface.evaluation import real_pair
 
 FOLDER = paths.real_data("stereo_pairs")
 pytestmark = pytest.mark.skipif(FOLDER is None, reason=paths.missing_data_line("stereo_pairs"))
 
 
-def load(name: str, size_px: tuple[int, int]):
-    """Left and right RGB images and disparity at this size; motorcycle is cropped to its left 4:3."""
-    left, right = (cv2.imread(str(FOLDER / name / f"{side}.png"))[..., ::-1] for side in ("left", "right"))
-    disparity = np.load(FOLDER / name / "disparity.npz", allow_pickle=False)["arr_0"].astype(np.float32)
-    disparity[~(disparity > 0)] = np.nan
-    width = round(left.shape[0] * 4 / 3)
-    left, right, disparity = left[:, :width], right[:, :width], disparity[:, :width]
-    scale = size_px[0] / left.shape[1]
-    resample = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
-    images = [cv2.resize(np.ascontiguousarray(image), size_px, interpolation=resample) for image in (left, right)]
-    return *images, scale * cv2.resize(disparity, size_px, interpolation=cv2.INTER_NEAREST)
+def load(name: str):
+    """Left and right RGB images and disparity at 512 x 384 px; motorcycle is cropped to its left 4:3."""
+    pair = real_pair(FOLDER / name).left_part(512, 384)
+    return pair.left, pair.right, pair.disparity_px
 
 
 @pytest.mark.parametrize("flat_window_px", [3, None])
 @pytest.mark.parametrize("name", ["motorcycle", "cones"])
 def test_band_is_twice_as_accurate_as_the_published_implementation(name, flat_window_px):
-    left, right, disparity = load(name, (512, 384))
+    left, right, disparity = load(name)
     score = score_against_disparity(match(left, right, rig=RECTIFIED), disparity, flat_window_px=flat_window_px)
     assert score.n > 1700
     assert score.median_px <= 0.32
@@ -40,7 +33,7 @@ def test_band_is_twice_as_accurate_as_the_published_implementation(name, flat_wi
 
 
 def test_surer_matches_are_better():
-    left, right, disparity = load("motorcycle", (512, 384))
+    left, right, disparity = load("motorcycle")
     every = score_against_disparity(match(left, right, rig=RECTIFIED, min_score=0), disparity, flat_window_px=None)
     some = score_against_disparity(match(left, right, rig=RECTIFIED), disparity, flat_window_px=None)
     sure = score_against_disparity(match(left, right, rig=RECTIFIED, min_score=0.9), disparity, flat_window_px=None)
@@ -49,7 +42,7 @@ def test_surer_matches_are_better():
 
 
 def test_confidences_tell_the_wrong_matches():
-    left, right, disparity = load("motorcycle", (512, 384))
+    left, right, disparity = load("motorcycle")
     matches = match(left, right, rig=RECTIFIED, min_score=0, reciprocal=False)
     x, y = np.rint(matches.u_left).astype(int).T
     error = np.abs(matches.u_left[:, 0] - matches.u_right[:, 0] - disparity[y, x])
@@ -61,7 +54,7 @@ def test_confidences_tell_the_wrong_matches():
 
 
 def test_free_deepmatching_equals_the_published_implementation():
-    left, right, disparity = load("motorcycle", (512, 384))
+    left, right, disparity = load("motorcycle")
     matches = match(left, right, method="deepmatching", downscale=1)
     assert len(matches) >= 2600
     for flat_window_px in (3, None):
@@ -72,7 +65,7 @@ def test_free_deepmatching_equals_the_published_implementation():
 
 @pytest.mark.parametrize("method", ["sgbm", "dis"])
 def test_opencv_matchers_on_a_real_pair(method):
-    left, right, disparity = load("motorcycle", (512, 384))
+    left, right, disparity = load("motorcycle")
     score = score_against_disparity(match(left, right, method=method, rig=RECTIFIED), disparity)
     assert score.n > 1800
     assert score.median_px <= 0.3

@@ -9,6 +9,7 @@ import pytest
 
 from lib.cameras import Points, StereoRig
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
+from lib.surface.evaluation import surface_on_rays
 
 DOMAIN = (300.0, 150.0, 1620.0, 930.0)
 
@@ -25,13 +26,7 @@ class Bowl:
 
     def truth(self, u: np.ndarray) -> np.ndarray:
         """The surface point (n, 3) in the robot frame on the left camera's ray through each u (n, 2)."""
-        left = self.rig.left
-        ray = (u - left.offset_px) @ np.linalg.pinv(left.linear).T
-        along = np.full(len(u), float(left.viewing_direction @ ROBOT_FROM_MICROSCOPE.t))
-        for _ in range(40):  # the view is all but the microscope's axis: Newton with slope 1 contracts fast
-            x = ROBOT_FROM_MICROSCOPE.inverse().apply(ray + along[:, None] * left.viewing_direction)
-            along -= x[:, 2] - depth_mm(x[:, 0], x[:, 1])
-        return ray + along[:, None] * left.viewing_direction
+        return surface_on_rays(self.rig.left, depth_mm, u)
 
     def depth_error_mm(self, surface) -> np.ndarray:
         """Error along the view on a lattice of the domain."""

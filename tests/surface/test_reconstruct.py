@@ -16,7 +16,7 @@ from lib.simulator.eye import Eye
 from lib.simulator.forceps import Forceps, Pose
 from lib.simulator.microscope import Microscope
 from lib.simulator.render import render_pair
-from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, simulate_correspondences
+from lib.simulator.rig import simulate_correspondences
 from lib.surface import BSplineSurface, SplineGrid, epipolar_inliers, evaluation, reconstruct, surface_mesh
 
 matplotlib.use("Agg")
@@ -33,13 +33,7 @@ class Scene:
     eye: Eye
 
     def truth(self, u: np.ndarray) -> np.ndarray:
-        camera, robot_to_microscope = self.rig.left, ROBOT_FROM_MICROSCOPE.inverse()
-        ray = (u - camera.offset_px) @ np.linalg.pinv(camera.linear).T
-        along = np.full(len(u), float(camera.viewing_direction @ ROBOT_FROM_MICROSCOPE.t))
-        for _ in range(60):
-            x = robot_to_microscope.apply(ray + along[:, None] * camera.viewing_direction)
-            along -= x[:, 2] - self.eye.height(x[:, 0], x[:, 1])
-        return ray + along[:, None] * camera.viewing_direction
+        return evaluation.surface_on_rays(self.rig.left, self.eye.height, u)
 
 
 @pytest.fixture(scope="module")
