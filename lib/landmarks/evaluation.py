@@ -208,13 +208,13 @@ def calibrate(
             tolerance = 0.05 * tool_length_px(np.asarray(u, dtype=float)[None])[0]
             if stage == "frame":
                 peaks, _ = detector.frame_peaks(image[None])
-                shape, feature = (part[0] for part in shape_and_features(peaks, detector.reduction))
+                shape, feature = (part[0].numpy() for part in shape_and_features(peaks.double(), detector.reduction))
                 difference = image_from_cell(peaks.u[0].double().numpy(), detector.reduction) - labels
             else:
                 peaks, matrices, which = detector.stage_peaks(image[None], rough[i].u, stage)
                 if not len(which):
                     continue
-                shape, feature = (part[:, 0] for part in shape_and_features(peaks, 1))
+                shape, feature = (part[:, 0].numpy() for part in shape_and_features(peaks.double(), 1))
                 # Errors in the windows' pixels, as the stage's covariance is.
                 difference = peaks.u[:, 0].double().numpy() - map_points(matrices, labels[which[:, 1]])
                 zoom = np.sqrt(np.linalg.det(matrices[0, :, :2]))

@@ -7,6 +7,7 @@ landmarks sees a window for each and its caller takes that landmark's row.
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import tempfile
 import warnings
@@ -20,13 +21,14 @@ from torch import Tensor, nn
 from lib import paths
 from lib.landmarks.engines import LastHeatmaps, openvino
 from lib.landmarks.heatmaps import decode
-from lib.landmarks.inference import MIN_CONFIDENCE, Calibration, Detector, as_tensor
+from lib.landmarks.inference import MIN_CONFIDENCE, Calibration, Detector, as_tensor, calibrated
 from lib.recordings import Recording
 
-__all__ = ["PARITY_PX", "StageWithDecoding", "export", "export_shipped", "run_onnx"]
+__all__ = ["PARITY_CONFIDENCE", "PARITY_PX", "StageWithDecoding", "export", "export_shipped", "run_onnx"]
 
-#: Largest difference from torch that an exported stage may show.
+#: Largest differences from torch that an exported stage may show.
 PARITY_PX = 0.01
+PARITY_CONFIDENCE = 0.001
 OPSET = 18
 
 
@@ -50,21 +52,8 @@ class StageWithDecoding(nn.Module):
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         peaks = decode(self.heatmaps(images), self.stride, method=self.method)
-        xx, xy, yy = (peaks.covariance[..., i, j] * self.scale**2 for i, j in ((0, 0), (0, 1), (1, 1)))
-        size = (xx * yy - xy * xy).clamp_min(1e-12).sqrt()
-        features = torch.stack(
-            [
-                torch.ones_like(size),
-                size.clamp(1e-4, 1e4).log(),
-                peaks.value.clamp(-0.5, 1.5),
-                peaks.width.log().abs(),
-            ],
-            -1,
-        )
-        variance = (features * self.log_variance).sum(-1).clamp(-12, 12).exp() / size
-        covariance = torch.stack([xx, xy, xy, yy], -1) * variance[..., None]
-        u = peaks.u * self.scale + (self.scale - 1) / 2
-        return u, covariance.unflatten(-1, (2, 2)), torch.sigmoid((features * self.logit).sum(-1))
+        covariance, confidence = calibrated(peaks, self.scale, self.log_variance, self.logit)
+        return peaks.u * self.scale + (self.scale - 1) / 2, covariance, confidence
 
 
 def export(detector: Detector, folder: str | Path, examples: np.ndarray) -> dict[str, tuple[Path, float]]:
@@ -82,8 +71,14 @@ def export(detector: Detector, folder: str | Path, examples: np.ndarray) -> dict
     Raises
     ------
     ValueError
-        If a stage differs by more than `PARITY_PX` (its file is not written), or nothing is found in `examples`.
+        If a stage differs by more than `PARITY_PX` or `PARITY_CONFIDENCE` (its file is not written), nothing is found in
+        `examples`, or a package is missing.
     """
+    for package in ("onnx", "openvino"):  # one writes the files, the other runs them for the comparison
+        if not importlib.util.find_spec(package):
+            raise ValueError(
+                f"export: needs the package {package}, which is not installed here; `pip install {package}`."
+            )
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     detector = replace(detector, engine="torch")
@@ -97,17 +92,21 @@ def export(detector: Detector, folder: str | Path, examples: np.ndarray) -> dict
         with tempfile.TemporaryDirectory() as scratch:
             path = Path(scratch) / f"{stage}.onnx"
             _write(module, x, path)
-            u, _, _ = run_onnx(path, x.numpy())
+            u, _, confidence = run_onnx(path, x.numpy())
             with torch.inference_mode():
                 expected, _, expected_confidence = (part.numpy() for part in module(x))
             seen = expected_confidence >= MIN_CONFIDENCE
             if not seen.any():
                 raise ValueError(f"examples: the stage {stage!r} finds nothing in them; give other frames.")
             difference = float(np.abs(u - expected)[seen].max())
-            if not difference <= PARITY_PX:
-                raise ValueError(
-                    f"{stage}: ONNX and torch differ by {difference:.3g} px, more than {PARITY_PX}; not exported."
-                )
+            for largest, limit, unit in (
+                (difference, PARITY_PX, "px"),
+                (float(np.abs(confidence - expected_confidence).max()), PARITY_CONFIDENCE, "of confidence"),
+            ):
+                if not largest <= limit:
+                    raise ValueError(
+                        f"{stage}: ONNX and torch differ by {largest:.3g} {unit}, more than {limit}; not exported."
+                    )
             partial = folder / f"{stage}.onnx.partial"
             partial.write_bytes(path.read_bytes())
             os.replace(partial, folder / f"{stage}.onnx")

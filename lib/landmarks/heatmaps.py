@@ -75,6 +75,10 @@ class Peaks:
     width: Tensor
     covariance: Tensor
 
+    def double(self) -> Peaks:
+        """The same in float64."""
+        return Peaks(self.u.double(), self.value.double(), self.width.double(), self.covariance.double())
+
 
 def _argmax(heatmaps: Tensor) -> tuple[Tensor, Tensor]:
     """Integer cell (n, k, 2) as x, y, and value (n, k) of the highest cell."""

@@ -75,10 +75,26 @@ class Calibration:
     logit: tuple[float, ...] = (-4.0, 0.0, 8.0, 0.0)
 
 
-def peak_features(variance_px2: np.ndarray, value: np.ndarray, width: np.ndarray) -> np.ndarray:
+def peak_features(variance_px2: Tensor, value: Tensor, width: Tensor) -> Tensor:
     """(..., 4): 1, log of the fit's variance in px^2, height of the peak, |log of its relative width|."""
-    variance = np.log(np.clip(variance_px2, 1e-4, 1e4))
-    return np.stack([np.ones_like(value), variance, np.clip(value, -0.5, 1.5), np.abs(np.log(width))], axis=-1)
+    variance = variance_px2.clamp(1e-4, 1e4).log()
+    return torch.stack([torch.ones_like(value), variance, value.clamp(-0.5, 1.5), width.log().abs()], dim=-1)
+
+
+def shape_and_features(peaks: Peaks, scale: float) -> tuple[Tensor, Tensor]:
+    """Shape of the ellipses, (..., 2, 2) of determinant 1, and `peak_features` (..., 4); `scale` image pixels a pixel."""
+    covariance = peaks.covariance * scale**2
+    covariance = torch.where(torch.isfinite(covariance), covariance, torch.eye(2, dtype=covariance.dtype))
+    (xx, xy), (yx, yy) = (row.unbind(-1) for row in covariance.unbind(-2))
+    size = (xx * yy - xy * yx).clamp_min(1e-12).sqrt()
+    return covariance / size[..., None, None], peak_features(size, peaks.value, peaks.width)
+
+
+def calibrated(peaks: Peaks, scale: float, log_variance: Tensor, logit: Tensor) -> tuple[Tensor, Tensor]:
+    """Covariance (..., 2, 2) px^2 and confidence (...) of peaks by the two rows of a `Calibration`; torch can trace it."""
+    shape, features = shape_and_features(peaks, scale)
+    variance = (features * log_variance).sum(-1).clamp(-12, 12).exp()
+    return shape * variance[..., None, None], torch.sigmoid((features * logit).sum(-1))
 
 
 def as_tensor(images: ArrayLike | Tensor) -> Tensor:
@@ -408,25 +424,13 @@ class Detector:
         """Peaks in pixels of a network's input to landmarks in image pixels."""
         u = image_from_cell(peaks.u.numpy(), scale)
         fit = self.calibration.get(source, Calibration())
-        shape, features = shape_and_features(peaks, scale)
-        variance = np.exp(np.clip(features @ np.array(fit.log_variance), -12, 12))
-        covariance = shape * variance[..., None, None]
-        confidence = 1 / (1 + np.exp(-features @ np.array(fit.logit)))
-        return Landmarks(u, covariance, confidence)
+        rows = (torch.tensor(row, dtype=torch.float64) for row in (fit.log_variance, fit.logit))
+        covariance, confidence = calibrated(peaks.double(), scale, *rows)
+        return Landmarks(u, covariance.numpy(), confidence.numpy())
 
     def with_calibration(self, **fits: Calibration) -> Detector:
         """A copy with the calibration of ``frame=`` or ``window=`` replaced."""
         return replace(self, calibration={**self.calibration, **fits})
-
-
-def shape_and_features(peaks: Peaks, scale: float) -> tuple[np.ndarray, np.ndarray]:
-    """Shape of the ellipses, (..., 2, 2) of determinant 1, and `peak_features` (..., 4)."""
-    covariance = peaks.covariance.double().numpy() * scale**2
-    covariance = np.where(np.isfinite(covariance), covariance, np.eye(2))
-    determinant = np.clip(np.linalg.det(covariance), 1e-12, None)
-    scalar = np.sqrt(determinant)
-    shape = covariance / scalar[..., None, None]
-    return shape, peak_features(scalar, peaks.value.double().numpy(), peaks.width.double().numpy())
 
 
 def _images(images: ArrayLike) -> np.ndarray:

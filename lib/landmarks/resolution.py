@@ -119,7 +119,7 @@ class ReducedDetector:
             peaks, matrices, which = self._last.stage_peaks(small, at, "window")
             if not len(which):
                 continue
-            shape, feature = (part[:, 0] for part in shape_and_features(peaks, 1))
+            shape, feature = (part[:, 0].numpy() for part in shape_and_features(peaks.double(), 1))
             true = cell_from_image(labels[i], stride)[which[:, 1]]
             difference = peaks.u[:, 0].double().numpy() - map_points(matrices, true)
             turned = np.linalg.inv(matrices[:, :, :2]) @ difference[..., None]

@@ -8,14 +8,23 @@ import numpy as np
 import pytest
 import torch
 
-from lib.landmarks import Detector
+from lib import paths
+from lib.landmarks import Detector, Landmarks
+from lib.landmarks import export as module
 from lib.landmarks.engines import OpenVinoNetwork, accelerated, default_engine, openvino
-from lib.landmarks.export import PARITY_PX, export, run_onnx
+from lib.landmarks.evaluation import evaluate_recording
+from lib.landmarks.export import PARITY_CONFIDENCE, PARITY_PX, export, export_shipped, run_onnx
 from lib.landmarks.inference import Calibration, as_tensor
 from lib.landmarks.network import HourglassConfig, StackedHourglass
 from lib.landmarks.training import PRESETS, train
+from lib.landmarks.training import main as training_main
+from lib.recordings import Recording
 
 needs_openvino = pytest.mark.skipif(not importlib.util.find_spec("openvino"), reason="OpenVINO is not installed here")
+needs_shipped = pytest.mark.skipif(
+    not ((paths.MODELS / "default.safetensors").is_file() and paths.SHIPPED_RECORDING.is_dir()),
+    reason="the shipped weights and recording are not there",
+)
 needs_onnx = pytest.mark.skipif(not importlib.util.find_spec("onnx"), reason="onnx is not installed here")
 
 
@@ -86,17 +95,78 @@ def test_onnx_holds_network_decoding_and_calibration(trained, tmp_path):
     found = expected.confidence > 0
     assert found.any()
     np.testing.assert_allclose(u[found], expected.u[found], atol=PARITY_PX)
-    np.testing.assert_allclose(confidence[found], expected.confidence[found], atol=1e-3)
+    np.testing.assert_allclose(confidence[found], expected.confidence[found], atol=PARITY_CONFIDENCE)
     np.testing.assert_allclose(covariance[found], expected.covariance[found], rtol=2e-2, atol=1e-4)
 
 
 @needs_onnx
 @needs_openvino
-def test_an_export_that_differs_is_not_written(trained, tmp_path, monkeypatch):
-    from lib.landmarks import export as module
+@needs_shipped
+def test_every_exported_stage_is_that_of_the_detector(tmp_path):
+    """The shipped detector put together from its ONNX files, by the README of the stages: same landmarks."""
+    written = export_shipped(None, tmp_path)
+    assert {file.name for file in tmp_path.iterdir()} == {"frame.onnx", "tool.onnx", "window.onnx"}
+    assert all(difference <= PARITY_PX for _, difference in written.values())
+    images, detector = shipped_pairs(1), Detector.load(engine="torch")
+    found = Landmarks(*run_onnx(tmp_path / "frame.onnx", rgb(detector.reduced(images))))
+    np.testing.assert_allclose(found.u, replace(detector, tool_network=None, window_network=None)(images).u, atol=0.02)
+    windows, matrices, which = detector.windows(images, found.u, "tool")
+    u, covariance, confidence = run_onnx(tmp_path / "tool.onnx", rgb(windows))
+    back = np.linalg.inv(matrices[:, None, :, :2])
+    u = (back @ (u - matrices[:, None, :, 2])[..., None])[..., 0]
+    expected = replace(detector, window_network=None)(images)
+    np.testing.assert_allclose(u, expected.u[which], atol=5 * PARITY_PX)  # the stage's pixels are 5 of the frame
+    np.testing.assert_allclose(back @ covariance @ back.mT, expected.covariance[which], rtol=2e-2, atol=1e-3)
+    np.testing.assert_allclose(confidence, expected.confidence[which], atol=PARITY_CONFIDENCE)
+    windows, matrices, which = detector.windows(images, expected.u, "window")
+    own = tuple(np.arange(len(which))), tuple(which[:, 1])  # of each window its own landmark
+    u, covariance, confidence = (part[own] for part in run_onnx(tmp_path / "window.onnx", rgb(windows)))
+    back = np.linalg.inv(matrices[:, :, :2])
+    expected, (image, landmark) = detector(images), which.T
+    u = (back @ (u - matrices[:, :, 2])[..., None])[..., 0]
+    np.testing.assert_allclose(u, expected.u[image, landmark], atol=PARITY_PX)
+    np.testing.assert_allclose(back @ covariance @ back.mT, expected.covariance[image, landmark], rtol=2e-2, atol=1e-3)
+    np.testing.assert_allclose(confidence, expected.confidence[image, landmark], atol=PARITY_CONFIDENCE)
 
+
+@needs_onnx
+@needs_openvino
+@pytest.mark.parametrize(("part", "off", "unit"), [(0, 0.02, "px"), (2, 0.01, "of confidence")])
+def test_an_export_that_differs_is_not_written(trained, tmp_path, monkeypatch, part, off, unit):
     right = run_onnx
-    monkeypatch.setattr(module, "run_onnx", lambda *a: tuple(v + 0.02 * (v.ndim == 3) for v in right(*a)))
-    with pytest.raises(ValueError, match="frame: ONNX and torch differ"):
-        module.export(*trained[:1], tmp_path, trained[1])
+    monkeypatch.setattr(module, "run_onnx", lambda *a: tuple(v + off * (i == part) for i, v in enumerate(right(*a))))
+    with pytest.raises(ValueError, match=f"frame: ONNX and torch differ by .* {unit}"):
+        export(*trained[:1], tmp_path, trained[1])
     assert not list(tmp_path.iterdir())
+
+
+def test_a_missing_package_is_one_line_with_the_cure(trained, tmp_path, monkeypatch, capsys):
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "onnx" else find(name))
+    with pytest.raises(ValueError, match=r"needs the package onnx, which is not installed here; `pip install onnx`"):
+        export(*trained[:1], tmp_path, trained[1])
+    assert training_main(["export", "--onnx", str(tmp_path)]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+@needs_openvino
+@needs_shipped
+def test_the_default_engine_on_the_shipped_weights_agrees_with_torch():
+    """The whole chain as it ships, in the precision that OpenVINO chooses here, on frames with known truth."""
+    recording = Recording.open(paths.SHIPPED_RECORDING)
+    fast, slow = (evaluate_recording(Detector.load(engine=e), recording, every=3) for e in (None, "torch"))
+    assert default_engine() == "openvino"
+    apart = np.linalg.norm(fast.landmarks.u - slow.landmarks.u, axis=2)
+    assert np.nanmedian(apart) < 0.1
+    assert abs(fast.scores.pck_0_05 - slow.scores.pck_0_05) <= 0.3
+
+
+def rgb(images: np.ndarray) -> np.ndarray:
+    """(n, 3, h, w) in [0, 1], what a stage takes."""
+    return as_tensor(images).contiguous().numpy()
+
+
+def shipped_pairs(n: int) -> np.ndarray:
+    """Left and right images (2 n, h, w, 3) of the first pairs of the shipped recording."""
+    frames = Recording.open(paths.SHIPPED_RECORDING).frames
+    return np.stack([image for i in range(n) for image in (frames[i].left, frames[i].right)])

@@ -166,8 +166,8 @@ def test_tracking_needs_as_many_landmarks_as_images(images):
 
 
 def test_features_are_finite_for_any_peak():
-    features = peak_features(np.array([0.0, 1e9]), np.array([-3.0, 5.0]), np.array([0.4, 3.0]))
-    assert np.isfinite(features).all()
+    features = peak_features(torch.tensor([0.0, 1e9]), torch.tensor([-3.0, 5.0]), torch.tensor([0.4, 3.0]))
+    assert torch.isfinite(features).all()
 
 
 @pytest.mark.skipif(not (paths.MODELS / "default.safetensors").exists(), reason="the shipped weights are not there")
