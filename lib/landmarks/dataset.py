@@ -24,7 +24,7 @@ from lib.landmarks.windows import cut, direction_rad, map_points, tool_centre, w
 from lib.parallel import in_processes
 from lib.simulator.training import TEXTURE_SEEDS, VALIDATION_TEXTURE_SEEDS, sample
 
-__all__ = ["REDUCTION", "WindowSource", "frame_samples", "generate", "simulated_samples", "validation_frames"]
+__all__ = ["REDUCTION", "WindowSource", "crop_frames", "frame_samples", "generate", "simulated_samples", "validation_frames"]
 
 #: Of the stored frames, and of the first stage's input.
 STORED_REDUCTION, REDUCTION = 5, 8
@@ -121,6 +121,12 @@ def frame_samples(folder: str | Path, *, validation: bool = False) -> Samples:
     size = (frames.shape[2] * STORED_REDUCTION // REDUCTION, frames.shape[1] * STORED_REDUCTION // REDUCTION)
     frames = np.stack([cv2.resize(frame, size, interpolation=cv2.INTER_AREA) for frame in frames])
     return Samples(frames, cell_from_image(u, REDUCTION), visibility)
+
+
+def crop_frames(folder: str | Path, shards: int | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Frame (n,), counted over the folder, and landmark (n,) of each crop of its first `shards` training shards of frames."""
+    (visibility,) = _load(folder, "training_*.npz", ("visibility",), shards)
+    return np.nonzero(visibility)  # the order in which shards keep crops
 
 
 def validation_frames(folder: str | Path) -> Iterator[tuple[str, np.ndarray, np.ndarray, np.ndarray]]:

@@ -25,7 +25,7 @@ from lib import paths
 from lib.geometry import cell_from_image
 from lib.landmarks import real
 from lib.landmarks.augmentation import AUGMENTATIONS
-from lib.landmarks.dataset import TOOL, TOOL_REDUCTION, WindowSource, validation_frames
+from lib.landmarks.dataset import TOOL, TOOL_REDUCTION, WindowSource, crop_frames, validation_frames
 from lib.landmarks.engines import LastHeatmaps, OpenVinoNetwork
 from lib.landmarks.evaluation import Evaluation, evaluate, labelled_frames
 from lib.landmarks.inference import Detector, Landmarks
@@ -338,13 +338,10 @@ def label_noise(options: Options, sigma_px: float = 1.0) -> None:
 
 def _noisy(source: WindowSource, options: Options, sigma_px: float) -> WindowSource:
     """One click a landmark and frame: the crops of a frame share its errors."""
-    from lib.landmarks.dataset import _load
-
-    (visibility,) = _load(options.data, ("training_*.npz",), ("visibility",), options.shards)
-    frame, landmark = np.nonzero(visibility)  # the order in which shards keep crops
+    frame, landmark = crop_frames(options.data, options.shards)
     if not np.array_equal(landmark, source.landmark):
         raise ValueError(f"{options.data}: crops and frames of the shards do not belong together; generate them again.")
-    clicks = np.random.default_rng(99).normal(0, sigma_px, (len(visibility), 3, 2))
+    clicks = np.random.default_rng(99).normal(0, sigma_px, (frame.max() + 1, 3, 2))
     return replace(source, u=source.u + clicks[frame])
 
 

@@ -12,7 +12,6 @@ import csv
 import hashlib
 import math
 import os
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -32,13 +31,13 @@ from lib.landmarks.heatmaps import SIGMA_PX, decode, render, sigma_cells
 from lib.landmarks.inference import as_tensor, load_network, read_checkpoint, write_checkpoint
 from lib.landmarks.metrics import errors_px, pck, tool_length_px
 from lib.landmarks.network import HourglassConfig, StackedHourglass
+from lib.records import commit_id
 
 __all__ = [
     "PRESETS",
     "Samples",
     "Training",
     "TrainingConfig",
-    "commit",
     "heatmap_loss",
     "load_training",
     "main",
@@ -356,6 +355,11 @@ class _Run:
             raise ValueError(f"{path}: belongs to a training with another {', '.join(changed)}; use another folder.")
         if metadata["provenance"]["data"] != fingerprint:
             raise ValueError(f"{path}: was trained on other data (fingerprint differs); use another folder.")
+        processes = metadata["provenance"].get("processes", 1)
+        if processes != self.world:  # the batches, and so the result, would be others
+            raise ValueError(
+                f"{path}: was begun by {processes} process(es), now {self.world}; start as many, or use another folder."
+            )
         self.network.load_state_dict(_part(tensors, "network."))
         if self.average is not None:
             self.average.load_state_dict(_part(tensors, "average."))
@@ -406,7 +410,7 @@ def train(
     provenance: dict[str, object] = {
         "data": source.fingerprint,
         "images": len(source),
-        "commit": commit(),
+        "commit": commit_id(),
         "torch": torch.__version__,
     }
     if run.world > 1:
@@ -495,17 +499,6 @@ def _write_log(path: Path, log: list[dict[str, float]]) -> None:
         writer.writeheader()
         writer.writerows(log)
     os.replace(partial, path)
-
-
-def commit() -> str:
-    """The repository's commit, or "unknown" outside a clone."""
-    try:
-        command = ["git", "rev-parse", "--short=12", "HEAD"]
-        return subprocess.run(
-            command, cwd=paths.ROOT, capture_output=True, text=True, check=True, timeout=10
-        ).stdout.strip()
-    except (OSError, subprocess.SubprocessError):
-        return "unknown"
 
 
 def main(argv: list[str] | None = None) -> int:
