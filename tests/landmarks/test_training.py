@@ -156,7 +156,7 @@ def test_bad_configurations_are_named(changes):
         TrainingConfig(**changes)
 
 
-def test_two_processes_train_one_network(tmp_path):
+def test_two_processes_train_one_network(toy, tmp_path):
     """torchrun on two CPU processes: other batches, the same weights, a falling loss, one log."""
     script = tmp_path / "two.py"
     script.write_text(
@@ -184,6 +184,12 @@ def test_two_processes_train_one_network(tmp_path):
     assert alone.provenance["processes"] == 2
     assert [row["step"] for row in alone.log] == [4, 8, 12]
     assert all(torch.equal(a[name], value) for name, value in alone.network.state_dict().items())
+    config = replace(
+        PRESETS["best"], network=HourglassConfig(6, 1, 2), steps=12, batch_size=2, validate_every=4, precision="fp32",
+        learning_rate=4e-3,
+    )  # fmt: skip
+    with pytest.raises(ValueError, match=r"begun by 2 process\(es\), now 1; start as many"):
+        train(config, toy(20), toy(4, 1), out, progress=False)
 
 
 def test_averaging_over_processes_is_a_batch_of_all(monkeypatch, toy):
