@@ -1,7 +1,7 @@
 """Calibration from rendered frames, as on a real robot: a sweep under the microscope, the detector, the cameras.
 
 Nothing is simulated but the images and the robot's report.  The truth only judges.  Frames are kept in
-``data/cache/calibration``, and so are detections, by the digest of the weights that made them.
+``data/cache/calibration``, and so are detections, by what made them: the weights, the engine and the detector's code.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ from lib.calibration.estimate import Calibration, calibrate
 from lib.calibration.offsets import OffsetCalibration, calibrate_with_offsets, tool_axes
 from lib.calibration.timing import rolling_shutter
 from lib.cameras import NearAffineCamera, StereoRig
-from lib.landmarks.inference import Detector, Landmarks
+from lib.landmarks.engines import default_engine
+from lib.landmarks.inference import CODE_VERSION, Detector, Landmarks
 from lib.landmarks.stereo import Correspondences, StereoLandmarks, detect
 from lib.recordings import Recording
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE
@@ -110,7 +111,8 @@ def detections(
         If a file is missing.
     """
     path = Path(weights) if weights is not None else SHIPPED_WEIGHTS
-    stored = paths.CACHE / "calibration" / "detections" / f"{recording.name}-{digest(path, *beside)}.npz"
+    made_by = f"{digest(path, *beside)}-{default_engine()}-{CODE_VERSION}"
+    stored = paths.CACHE / "calibration" / "detections" / f"{recording.name}-{made_by}.npz"
     if not stored.is_file():
         found = detect(recording, load(path))
         stored.parent.mkdir(parents=True, exist_ok=True)

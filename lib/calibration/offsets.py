@@ -10,6 +10,7 @@ then stays in the covariance.
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -103,6 +104,9 @@ def calibrate_with_offsets(
         Standard deviation of an offset's coordinate, mm or px.  None = the one that makes the data most probable, between 0.1
         and 300 um, or 0.01 and 30 px; without sign of an offset it is the least, which leaves the landmarks where they are.
 
+    iterations:
+        Most steps; a `RuntimeWarning` says so where they were not enough.
+
     Raises
     ------
     ValueError
@@ -119,6 +123,8 @@ def calibrate_with_offsets(
             raise ValueError(f"axes: expected ({len(x)}, 3, 3) finite, got {axes.shape}; drop rows of shut jaws.")
     if options.get("weighting", "likelihood") != "likelihood":
         raise ValueError("weighting: offsets need the likelihood's weights.")
+    if iterations < 1:
+        raise ValueError(f"iterations: must be at least 1, got {iterations}.")
     if prior_sd is not None and not prior_sd > 0:
         raise ValueError(f"prior_sd: must be positive, got {prior_sd}.")
     k, m = int(landmark.max()) + 1, 2 * len(u)
@@ -155,6 +161,13 @@ def calibrate_with_offsets(
         offset = offset + step.reshape(offset.shape)
         if np.abs(step).max() < 1e-4 * np.sqrt(np.diag(covariance).min()):
             break
+    else:
+        warnings.warn(
+            f"iterations: the offsets still move by up to {np.abs(step).max():.2g} {'px' if axes is None else 'mm'} after "
+            f"{iterations}; allow more, or look at the outliers (`ransac_px`), which may differ from step to step.",
+            RuntimeWarning,
+            stacklevel=2,
+        )
     parameters = found.parameter_covariance + explained @ covariance @ explained.T
     G = found._fit.state.matrix_jacobian() @ found._model.selection
     found = replace(found, parameter_covariance=parameters, covariance=G @ parameters @ G.T)

@@ -33,6 +33,9 @@ from lib.parallel import single_threaded_torch
 __all__ = ["Calibration", "Detector", "Landmarks", "as_tensor", "read_checkpoint", "write_checkpoint"]
 
 FORMAT = "microstereo.detector"
+#: Of the code between weights and landmarks (windows, decoding, what is missing): raised with every change of it that moves
+#: landmarks, so that kept detections are made anew.
+CODE_VERSION = 1
 #: Landmarks below this confidence are missing: NaN.
 MIN_CONFIDENCE = 0.05
 

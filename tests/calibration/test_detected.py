@@ -60,7 +60,7 @@ def test_only_a_recording_with_truth_is_judged(recording):
             judge()
 
 
-def test_detections_are_kept_by_the_digest_of_their_weights(recording, tmp_path, monkeypatch):
+def test_detections_are_kept_by_what_made_them(recording, tmp_path, monkeypatch):
     monkeypatch.setattr(paths, "CACHE", tmp_path)
     weights, calls = tmp_path / "weights.bin", []
     short = replace(recording, frames=_First(recording.frames, 2))
@@ -80,7 +80,12 @@ def test_detections_are_kept_by_the_digest_of_their_weights(recording, tmp_path,
     weights.write_bytes(b"two")
     detected.detections(short, weights, load=load)
     assert len(calls) == 2
-    assert len(list((tmp_path / "calibration" / "detections").iterdir())) == 2
+    monkeypatch.setattr(detected, "default_engine", lambda: "another")
+    detected.detections(short, weights, load=load)
+    monkeypatch.setattr(detected, "CODE_VERSION", detected.CODE_VERSION + 1)
+    detected.detections(short, weights, load=load)
+    assert len(calls) == 4
+    assert len(list((tmp_path / "calibration" / "detections").iterdir())) == 4
 
 
 class _First:

@@ -1,5 +1,7 @@
 """Constant offsets of the landmarks: found where the tool turns, left to the prior where it does not."""
 
+import warnings
+
 import numpy as np
 import pytest
 
@@ -109,6 +111,15 @@ def test_offsets_in_the_images_leave_their_mean_to_the_cameras():
     np.testing.assert_allclose(with_mean.mean(axis=0), bias.mean(axis=0), atol=0.5)
 
 
+def test_too_few_iterations_are_told():
+    x, u, landmark, axes, _, _ = tool_sweep(0)
+    with pytest.warns(RuntimeWarning, match=r"iterations: the offsets still move by up to .* mm after 1; allow more"):
+        calibrate_with_offsets(x, u, landmark, axes, iterations=1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        calibrate_with_offsets(x, u, landmark, axes)
+
+
 def test_bad_arguments_are_named():
     x, u, landmark, axes, _, _ = tool_sweep(0, frames=8)
     with pytest.raises(ValueError, match="landmark"):
@@ -121,6 +132,8 @@ def test_bad_arguments_are_named():
         calibrate_with_offsets(x, u, landmark, axes, weighting="paper")
     with pytest.raises(ValueError, match="prior_sd"):
         calibrate_with_offsets(x, u, landmark, axes, prior_sd=0.0)
+    with pytest.raises(ValueError, match="iterations"):
+        calibrate_with_offsets(x, u, landmark, axes, iterations=0)
     with pytest.raises(ValueError, match="too few"):
         calibrate_with_offsets(x[:0], [part[:0] for part in u], landmark[:0], axes[:0])
     x[3] = np.nan
