@@ -339,14 +339,24 @@ def real_windows(folder: str | Path, n: int, size_px: int = 96, part: str = "jud
 def fundus_windows(photograph: str | Path, seeds: Sequence[int], n: int, size_px: int = 160) -> tuple[list, list]:
     """Windows (real, simulated), n each, of a fundus photograph and of procedural textures, at 40 px per mm.
 
-    A photograph of 45 degrees is taken to show 13 mm of retina; black surroundings are left out.
+    A square photograph of 45 degrees is taken to show 13 mm of retina; black surroundings are left out.
+
+    Raises
+    ------
+    ValueError
+        If the photograph is not square, or the windows do not fit into the 12 mm that are used.
     """
     rng = np.random.default_rng(0)
     picture = read_image(Path(photograph))
+    height, width = picture.shape[:2]
+    if abs(width - height) > 0.02 * height:
+        raise ValueError(
+            f"{photograph}: {width} x {height} px, expected a square; crop it to the disc, whose width says its scale."
+        )
+    if size_px > 6.0 * 40 * np.sqrt(2):
+        raise ValueError(f"size_px: a window of {size_px} px does not fit; at most {int(6.0 * 40 * np.sqrt(2))}.")
     across = round(13.0 * 40)
-    shown = cv2.resize(
-        picture, (across, round(across * picture.shape[0] / picture.shape[1])), interpolation=cv2.INTER_AREA
-    )
+    shown = cv2.resize(picture, (across, across), interpolation=cv2.INTER_AREA)
     textures = [fundus_texture(int(seed), round(EXTENT_MM * 40)) for seed in seeds]
     pairs = []
     for images in ([shown], textures):

@@ -72,6 +72,11 @@ def test_fundus_windows_leave_out_the_black_surround(tmp_path):
     assert len(real) == len(simulated) == 6
     assert all(window.shape == (96, 96, 3) and window.min() > 20 for window in real)
     assert all(window.shape == (96, 96, 3) and window.std() > 3 for window in simulated)
+    with pytest.raises(ValueError, match="size_px: a window of 400 px does not fit; at most 339"):
+        fundus_windows(tmp_path / "fundus.png", seeds=[40], n=1, size_px=400)
+    cv2.imwrite(str(tmp_path / "wide.png"), photograph[50:350])
+    with pytest.raises(ValueError, match=r"wide\.png: 400 x 300 px, expected a square; crop it"):
+        fundus_windows(tmp_path / "wide.png", seeds=[40], n=1)
 
 
 def test_frames_that_tune_and_frames_that_judge_are_different(tmp_path):

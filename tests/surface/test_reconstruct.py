@@ -12,6 +12,7 @@ from lib import paths
 from lib.calibration import calibrate
 from lib.cameras import AffineCamera, StereoRig
 from lib.geometry import RigidTransform
+from lib.recordings import Recording
 from lib.simulator.eye import Eye
 from lib.simulator.forceps import Forceps, Pose
 from lib.simulator.microscope import Microscope
@@ -89,6 +90,14 @@ def test_black_images_and_full_masks_are_refused(scene):
         reconstruct(black, black, scene.rig)
     with pytest.raises(ValueError, match="mask_left"):
         reconstruct(scene.left, scene.right, scene.rig, mask_left=np.ones(black.shape[:2], dtype=bool))
+
+
+def test_the_left_image_twice_is_refused():
+    """Two identical images and a true rig: they cannot both be right, and the error says by how much."""
+    recording = Recording.open(paths.SHIPPED_RECORDING)
+    left = recording.frames[0].left
+    with pytest.raises(ValueError, match=r"rig: it does not fit the images: .* 16\.\d px off"):
+        reconstruct(left, left, recording.truth.rig)
 
 
 def window(x: int, y: int, size: int) -> np.ndarray:
