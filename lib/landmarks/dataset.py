@@ -24,7 +24,16 @@ from lib.landmarks.windows import cut, direction_rad, map_points, tool_centre, w
 from lib.parallel import in_processes
 from lib.simulator.training import TEXTURE_SEEDS, VALIDATION_TEXTURE_SEEDS, sample
 
-__all__ = ["REDUCTION", "WindowSource", "crop_frames", "frame_samples", "generate", "simulated_samples", "validation_frames"]
+__all__ = [
+    "REDUCTION",
+    "WindowSource",
+    "crop_frames",
+    "frame_samples",
+    "generate",
+    "generate_windows",
+    "simulated_samples",
+    "validation_frames",
+]
 
 #: Of the stored frames, and of the first stage's input.
 STORED_REDUCTION, REDUCTION = 5, 8
@@ -32,6 +41,8 @@ STORED_REDUCTION, REDUCTION = 5, 8
 TOOL_REDUCTION, TOOL = STORED_REDUCTION, 3
 CROP_PX = 288
 FRAMES = 16
+#: Windows of a shard that holds windows alone.
+WINDOWS = 512
 
 
 def generate(
@@ -66,6 +77,43 @@ def _make_shard(path: Path, index: int, validation: bool) -> None:
     _write_shard(path, [sample(rng, textures=textures) for _ in range(FRAMES)], keep_frames=validation)
 
 
+def generate_windows(
+    folder: str | Path, shards: int, *, first: int = 0, workers: int | None = None, progress: bool = True
+) -> None:
+    """Like `generate`, shards of `WINDOWS` full-resolution crops alone, each of a frame, an eye and a tool of its own.
+
+    Only what the last stage sees is rendered: twenty times as many scenes a second as whole frames.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    wanted = {i: folder / f"windows_{i:04d}.npz" for i in range(first, first + shards)}
+    missing = [(path, i) for i, path in wanted.items() if not path.exists()]
+    bar = tqdm(
+        total=shards, initial=shards - len(missing), desc="Simulating windows", disable=not progress, unit="shard"
+    )
+    with bar:
+        for _ in in_processes(_make_windows, missing, workers):
+            bar.update()
+
+
+def _make_windows(path: Path, index: int) -> None:
+    rng = np.random.default_rng([2, index])
+    crops = np.empty((WINDOWS, CROP_PX, CROP_PX, 3), np.uint8)
+    crop_u, crop_visibility = np.empty((WINDOWS, 3, 2)), np.empty((WINDOWS, 3), int)
+    crop_landmark = rng.integers(3, size=WINDOWS)
+    for i, k in enumerate(crop_landmark):
+        while True:
+            image, u, visibility = sample(rng, crop_px=CROP_PX, around=k, jitter=0.0)
+            if visibility[k]:
+                break
+        corner = np.round(u[k] - (CROP_PX - 1) / 2)  # not 0 where the field ends
+        crops[i] = cut(image, np.column_stack([np.eye(2), -corner]), CROP_PX)
+        crop_u[i], crop_visibility[i] = u - corner, visibility
+    _write(
+        path, crops=crops, crop_u=crop_u, crop_visibility=crop_visibility, crop_landmark=crop_landmark.astype(np.int64)
+    )
+
+
 def _write_shard(path: Path, views: list[tuple[np.ndarray, np.ndarray, np.ndarray]], *, keep_frames: bool) -> None:
     frames, crops, crop_u, crop_visibility, crop_landmark, jpegs = [], [], [], [], [], []
     for image, u, visibility in views:
@@ -91,18 +139,33 @@ def _write_shard(path: Path, views: list[tuple[np.ndarray, np.ndarray, np.ndarra
         "jpegs": np.concatenate([j.ravel() for j in jpegs]) if jpegs else np.zeros(0, np.uint8),
         "jpeg_ends": np.cumsum([j.size for j in jpegs]),
     }
+    _write(path, **arrays)
+
+
+def _write(path: Path, **arrays: np.ndarray) -> None:
     partial = path.with_name(path.name + ".partial")
     with partial.open("wb") as file:
         np.savez(file, **arrays)
     os.replace(partial, path)
 
 
+def _joined(parts: list[np.ndarray]) -> np.ndarray:
+    """Concatenated, each part given up as soon as it is copied: gigabytes are never held twice."""
+    whole = np.empty((sum(len(part) for part in parts), *parts[0].shape[1:]), parts[0].dtype)
+    end = len(whole)
+    while parts:
+        part = parts.pop()
+        whole[end - len(part) : end] = part
+        end -= len(part)
+    return whole
+
+
 def _load(
-    folder: str | Path, pattern: str, names: tuple[str, ...], first_shards: int | None = None
+    folder: str | Path, patterns: tuple[str, ...], names: tuple[str, ...], first_shards: int | None = None
 ) -> list[np.ndarray]:
-    shards = sorted(Path(folder).glob(pattern))[:first_shards]
+    shards = [path for pattern in patterns for path in sorted(Path(folder).glob(pattern))][:first_shards]
     if not shards:
-        raise FileNotFoundError(f"{folder}: no shard {pattern}; make some with `python3 -m lib train generate`.")
+        raise FileNotFoundError(f"{folder}: no shard {patterns[0]}; make some with `python3 -m lib train generate`.")
     parts: dict[str, list[np.ndarray]] = {name: [] for name in names}
     for path in shards:
         try:
@@ -111,13 +174,13 @@ def _load(
                     parts[name].append(shard[name])
         except (ValueError, KeyError, OSError) as error:
             raise ValueError(f"{path}: corrupt; delete it and generate it again ({error}).") from error
-    return [np.concatenate(parts[name]) for name in names]
+    return [_joined(parts.pop(name)) for name in names]
 
 
 def frame_samples(folder: str | Path, *, validation: bool = False) -> Samples:
     """Whole frames at the first stage's resolution (shards keep more, so that the resolution can be chosen later)."""
-    pattern = "validation_*.npz" if validation else "training_*.npz"
-    frames, u, visibility = _load(folder, pattern, ("frames", "u", "visibility"))
+    patterns = ("validation_*.npz" if validation else "training_*.npz",)
+    frames, u, visibility = _load(folder, patterns, ("frames", "u", "visibility"))
     size = (frames.shape[2] * STORED_REDUCTION // REDUCTION, frames.shape[1] * STORED_REDUCTION // REDUCTION)
     frames = np.stack([cv2.resize(frame, size, interpolation=cv2.INTER_AREA) for frame in frames])
     return Samples(frames, cell_from_image(u, REDUCTION), visibility)
@@ -125,7 +188,7 @@ def frame_samples(folder: str | Path, *, validation: bool = False) -> Samples:
 
 def crop_frames(folder: str | Path, shards: int | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Frame (n,), counted over the folder, and landmark (n,) of each crop of its first `shards` training shards of frames."""
-    (visibility,) = _load(folder, "training_*.npz", ("visibility",), shards)
+    (visibility,) = _load(folder, ("training_*.npz",), ("visibility",), shards)
     return np.nonzero(visibility)  # the order in which shards keep crops
 
 
@@ -169,17 +232,18 @@ class WindowSource:
     def load(
         cls, folder: str | Path, *, validation: bool = False, size: int = 128, shards: int | None = None
     ) -> WindowSource:
-        """From the shards of a folder, or from its first `shards`."""
+        """From the shards of a folder, those of windows alone included; or from its first `shards` of frames."""
         names = ("crops", "crop_u", "crop_visibility", "crop_landmark")
-        return cls(*_load(folder, "validation_*.npz" if validation else "training_*.npz", names, shards), size=size)
+        patterns = ("validation_*.npz",) if validation else ("training_*.npz", "windows_*.npz")[: 1 if shards else 2]
+        return cls(*_load(folder, patterns, names, shards), size=size)
 
     @classmethod
     def load_tools(
         cls, folder: str | Path, *, validation: bool = False, size: int = 128, shards: int | None = None
     ) -> WindowSource:
         """Windows round the whole tool at `TOOL_REDUCTION`, for the middle stage."""
-        pattern = "validation_*.npz" if validation else "training_*.npz"
-        frames, u, visibility = _load(folder, pattern, ("frames", "u", "visibility"), shards)
+        patterns = ("validation_*.npz" if validation else "training_*.npz",)
+        frames, u, visibility = _load(folder, patterns, ("frames", "u", "visibility"), shards)
         u = cell_from_image(u, TOOL_REDUCTION)
         which = np.full(len(frames), TOOL)
         return cls(frames, u, visibility, which, size, shift_px=8.0, turn_rad=0.2, zoom=(0.75, 1.3))

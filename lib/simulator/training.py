@@ -134,6 +134,7 @@ def sample(
     *,
     crop_px: int | None = None,
     size_px: tuple[int, int] | None = None,
+    around: int | None = None,
     jitter: float = 0.35,
     zoom: tuple[float, float] = (0.85, 1.18),
     textures: Sequence[int] = TEXTURE_SEEDS,
@@ -148,8 +149,10 @@ def sample(
         Side of a square window of the full-resolution image that holds the jaws somewhere.
     size_px:
         (w, h) of the whole field shrunk to this size.  Without either the frame is full HD.
+    around:
+        The landmark that a window holds, 0 base, 1 or 2 a tip; None = the jaws' centre.
     jitter:
-        How far the jaws' centre may lie from the window's centre, as a share of its side.
+        How far that may lie from the window's centre, as a share of its side.
     zoom:
         Range of the magnification, relative to 100 px per mm.
     textures:
@@ -181,8 +184,9 @@ def sample(
     origin = np.zeros(2)
     size, whole = IMAGE_SIZE_PX, IMAGE_SIZE_PX
     if crop_px is not None:
-        jaws = camera.project(forceps.landmarks(pose)).mean(axis=0)
-        origin = jaws - (crop_px - 1) / 2 + rng.uniform(-jitter, jitter, 2) * crop_px
+        landmarks = camera.project(forceps.landmarks(pose))
+        held = landmarks.mean(axis=0) if around is None else landmarks[around]
+        origin = held - (crop_px - 1) / 2 + rng.uniform(-jitter, jitter, 2) * crop_px
         origin = np.round(np.clip(origin, 0, np.maximum(field - crop_px, 0)))
         size = (crop_px, crop_px)
         camera = AffineCamera(np.column_stack([camera.linear, camera.offset_px - origin]))

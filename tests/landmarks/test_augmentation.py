@@ -128,6 +128,14 @@ def test_photometric_changes_move_nothing():
         assert sum(s == (0, 0) for s in shift) >= 6  # a glint or an occluder may outweigh the Gaussians
 
 
+def test_a_share_of_the_batch_is_changed_photometrically():
+    batch = gaussians(4)
+    changed = Augmentation(0.0, (1.0, 1.0), photometric=1.0, photometric_share=0.5)(batch, np.random.default_rng(0))
+    assert torch.equal(changed.images[2:], batch.images[2:])
+    assert torch.equal(changed.visibility[2:], batch.visibility[2:])
+    assert all((a != b).any() for a, b in zip(changed.images[:2], batch.images[:2], strict=True))
+
+
 def _correlation(a, b):
     a, b = (np.fft.fft2(x - x.mean()) for x in (a, b))
     return np.fft.ifft2(a * b.conj()).real
@@ -143,3 +151,5 @@ def test_impossible_ranges_are_named():
         Augmentation(zoom=(0.0, 1.0))
     with pytest.raises(ValueError, match="photometric"):
         Augmentation(photometric=2.0)
+    with pytest.raises(ValueError, match="photometric_share"):
+        Augmentation(photometric_share=-0.1)

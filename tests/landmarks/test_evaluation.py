@@ -102,6 +102,35 @@ def test_shards_hold_what_the_stages_see(tmp_path, toy_shards):
     assert np.allclose(u, samples.u[0])
 
 
+def test_shards_of_windows_alone_are_centred_on_their_landmark(tmp_path, toy_shards, monkeypatch):
+    """A stand-in for the simulator, whose landmark lies off the centre where the field ends, and is now and then unseen."""
+
+    def off_centre(rng, *, crop_px, around, jitter):
+        image, u = np.zeros((crop_px, crop_px, 3), np.uint8), rng.uniform(60, 200, (3, 2))
+        x, y = np.round(u[around]).astype(int)
+        image[y, x] = 255
+        return image, u, np.where(np.arange(3) == around, rng.integers(0, 3), 2)
+
+    monkeypatch.setattr(dataset, "sample", off_centre)
+    monkeypatch.setattr(dataset, "WINDOWS", 5)
+    for index in range(2):
+        dataset._make_windows(tmp_path / f"windows_{index:04d}.npz", index)
+    dataset.generate_windows(tmp_path, 2, progress=False)  # they stand already: nothing is drawn
+    with np.load(tmp_path / "windows_0001.npz") as shard:
+        for crop, u, visibility, k in zip(
+            *(shard[name] for name in ("crops", "crop_u", "crop_visibility", "crop_landmark")), strict=True
+        ):
+            assert np.abs(u[k] - (dataset.CROP_PX - 1) / 2).max() <= 0.5
+            assert visibility[k] > 0
+            assert np.abs(np.argwhere(crop[..., 0])[0][::-1] - u[k]).max() <= 0.5
+    toy_shards(tmp_path, 2)
+    both = dataset.WindowSource.load(tmp_path)
+    assert len(both) == 2 * 3 + 2 * 5
+    assert len(dataset.WindowSource.load(tmp_path, shards=1)) == 6  # frames alone
+    first = np.load(tmp_path / "training_0000.npz")["crops"]
+    assert np.array_equal(both.crops[: len(first)], first)
+
+
 def test_missing_and_corrupt_shards_are_named(tmp_path):
     with pytest.raises(FileNotFoundError, match="no shard training"):
         dataset.frame_samples(tmp_path)

@@ -13,7 +13,15 @@ from lib.landmarks import training
 from lib.landmarks.augmentation import Augmentation, Batch
 from lib.landmarks.heatmaps import render
 from lib.landmarks.network import HourglassConfig, StackedHourglass
-from lib.landmarks.training import PRESETS, Samples, TrainingConfig, heatmap_loss, load_training, train
+from lib.landmarks.training import (
+    PRESETS,
+    Samples,
+    TrainingConfig,
+    heatmap_loss,
+    load_training,
+    position_loss,
+    train,
+)
 
 SMALL = replace(
     PRESETS["best"],
@@ -69,6 +77,32 @@ def test_resume_is_exact(toy, tmp_path, changes):
     assert resumed.log[-1]["validation_loss"] == whole.log[-1]["validation_loss"]
     assert same(load_training(tmp_path / "last.safetensors").network, whole.network)
     assert (tmp_path / "log.csv").read_text().count("\n") == 4
+
+
+def test_position_loss_is_the_distance_of_the_peaks():
+    u = torch.tensor([[[40.3, 41.8], [20.0, 70.5], [90.1, 33.3]]])
+    batch = Batch(torch.zeros(1, 3, 96, 128), u, torch.full((1, 3), 2))
+    smoothed = [np.hypot(d, 0.2) - 0.2 for d in (0.0, 0.5, 3.0)]
+    moved = u + torch.tensor([[[0.0, 0.0], [0.3, -0.4], [0.0, 3.0]]])
+    for height in (1.0, 0.6):
+        heatmaps = height * render(moved, (96, 128), 4)
+        assert position_loss([heatmaps, heatmaps], batch, 4).item() == pytest.approx(np.mean(smoothed), abs=2e-3)
+    exact = render(u, (96, 128), 4).requires_grad_()
+    position_loss([exact], batch, 4).backward()
+    assert exact.grad.abs().max() < 1e-3
+
+
+def test_position_loss_counts_only_peaks_that_can_be_measured():
+    u = torch.tensor([[[3.0, 50.0], [torch.nan, torch.nan], [60.0, 50.0]]])
+    batch = Batch(torch.zeros(1, 3, 96, 128), u, torch.tensor([[2, 2, 1]]))  # at the border, unlabelled, occluded
+    heatmaps = render(torch.full((1, 3, 2), 50.0), (96, 128), 4).requires_grad_()
+    loss = position_loss([heatmaps], batch, 4)
+    loss.backward()
+    assert loss.item() == 0
+    assert not heatmaps.grad.any()
+    far = render(torch.full((1, 3, 2), 10.0), (96, 128), 4)  # no peak near the landmark: the l2 loss brings it there
+    seen = Batch(batch.images, torch.full((1, 3, 2), 60.0), torch.full((1, 3), 2))
+    assert position_loss([far], seen, 4).item() == 0
 
 
 def test_another_seed_is_another_training(toy):

@@ -138,6 +138,14 @@ def test_training_images(size, monkeypatch):
     assert_array_equal(image, again[0])
 
 
+def test_training_windows_hold_the_landmark_asked_for(monkeypatch):
+    monkeypatch.setattr("lib.simulator.training._TEXTURE_PX", 256)
+    rng = np.random.default_rng(2)
+    for around in (0, 1, 2):
+        _, u, _ = sample(rng, crop_px=160, around=around, jitter=0.0, textures=range(10_000, 10_001))
+        assert np.abs(u[around] - 79.5).max() <= 0.5
+
+
 def test_training_never_draws_what_test_recordings_show():
     rng = np.random.default_rng(0)
     lengths = np.array([random_forceps(rng).jaw_length_mm for _ in range(2000)])
