@@ -41,6 +41,7 @@ __all__ = [
     "point_errors",
     "profiles",
     "reconstruction",
+    "recorded_speeds",
     "recorded_table",
     "response_pyramid",
     "score_table",
@@ -425,7 +426,11 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]], *, width_in: flo
     page, ax = figure(width_in=width_in, height_in=0.32 * len(rows) + 0.6)
     ax.axis("off")
     drawn = ax.table(
-        [list(row) for row in rows], colLabels=list(header), loc="center", cellLoc="center", edges="horizontal"
+        [list(row) for row in rows] or [[""] * len(header)],
+        colLabels=list(header),
+        loc="center",
+        cellLoc="center",
+        edges="horizontal",
     )
     drawn.auto_set_font_size(False)
     drawn.set_fontsize(10)
@@ -449,6 +454,47 @@ def recorded_table(recorded: Mapping[str, dict]) -> Figure:
         rows.append([f"75 frames: {name}", *(f"{rms[key]:.1f}" for key in ("robot frame", "rigid", "affine"))])
     page = table(["surface", "RMS (um)", "rigid motion taken out", "affine map taken out"], rows, width_in=13)
     page.axes[0].tables[0].auto_set_column_width(range(4))
+    return page
+
+
+def recorded_speeds(recorded: Mapping[str, dict]) -> Figure:
+    """What `python3 -m lib.surface.studies` recorded of `solver`, `pair` and `motorcycle`: how fast, and how good beside it.
+
+    CPU seconds hold on a busy machine, wall seconds on an idle one.
+    """
+    result = {name: entry["result"] for name, entry in recorded.items()}
+    rows = [
+        [
+            f"Eq. 6, {size}",
+            f"{e['cpu_seconds']:.3f}",
+            "",
+            f"objective {abs(e['relative_difference']):.0e} from CLARABEL's",
+            f"CLARABEL {e['clarabel_cpu_seconds']:.2f} s, {e['clarabel_over_ours']:.0f} times ours",
+        ]
+        for size, e in result.get("solver", {}).items()
+    ]
+    rows += [
+        [
+            f"full-HD pair, {setting}",
+            f"{e['cpu_seconds']:.2f}",
+            f"{e['total']:.2f}",
+            f"{e['surface_rms_um']:.1f} um RMS",
+            f"{e['matches']} matches; {e['match']:.2f} s to match, {e['surface']:.2f} s to fit",
+        ]
+        for setting, e in result.get("pair", {}).items()
+    ]
+    rows += [
+        [
+            f"motorcycle, {method}",
+            f"{e['cpu_seconds']:.2f}",
+            f"{e['seconds']:.2f}",
+            f"median {e['all_median_px']:.2f} px, {100 * e['all_above_2']:.1f} % above 2 px",
+            f"{e['matches']} matches; where flat {e['flat_median_px']:.2f} px, {100 * e['flat_above_2']:.1f} %",
+        ]
+        for method, e in result.get("motorcycle", {}).items()
+    ]
+    page = table(["measured", "CPU (s)", "wall (s)", "error", "beside it"], rows, width_in=13)
+    page.axes[0].tables[0].auto_set_column_width(range(5))
     return page
 
 

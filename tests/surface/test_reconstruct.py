@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import matplotlib
+import matplotlib.pyplot
 import numpy as np
 import pytest
 
@@ -18,7 +19,7 @@ from lib.simulator.forceps import Forceps, Pose
 from lib.simulator.microscope import Microscope
 from lib.simulator.render import render_pair
 from lib.simulator.rig import simulate_correspondences
-from lib.surface import BSplineSurface, SplineGrid, epipolar_inliers, evaluation, reconstruct, surface_mesh
+from lib.surface import BSplineSurface, SplineGrid, epipolar_inliers, evaluation, reconstruct, studies, surface_mesh
 
 matplotlib.use("Agg")
 
@@ -181,6 +182,17 @@ def test_error_measures():
     assert error.shape == (9, 12, 3) and np.isnan(error[0, 11]).all()
     assert evaluation.rms_um(error) == pytest.approx(3.0)
     assert np.isnan(evaluation.rms_um(error, np.zeros(error.shape[:2], dtype=bool)))
+
+
+def test_recorded_studies_are_tabled():
+    from lib.figures import reconstruction as figures
+
+    recorded = studies.recorded()
+    table = figures.recorded_speeds(recorded).axes[0].tables[0]
+    assert len(table.get_celld()) == 5 * (1 + sum(len(recorded[k]["result"]) for k in ("solver", "pair", "motorcycle")))
+    for page in (figures.recorded_table(recorded), figures.recorded_table({}), figures.recorded_speeds({})):
+        page.canvas.draw()
+    matplotlib.pyplot.close("all")
 
 
 def test_every_figure_draws(scene, result):
