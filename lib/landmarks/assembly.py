@@ -3,23 +3,30 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from lib.landmarks.dataset import REDUCTION, TOOL_REDUCTION, validation_frames
-from lib.landmarks.evaluation import calibrate, evaluate
+from lib.landmarks.evaluation import calibrate, evaluate, labelled_frames
 from lib.landmarks.inference import Detector
 from lib.landmarks.metrics import calibration_error
 from lib.landmarks.training import load_training
+from lib.recordings import Recording
 from lib.records import commit_id, machine
 
 __all__ = ["assemble"]
 
+#: Of a recording's frames so many give one to the fit of the covariances.
+TYPICAL_EVERY = 4
 
-def assemble(folder: str | Path, data: str | Path, out: str | Path) -> Detector:
+
+def assemble(folder: str | Path, data: str | Path, out: str | Path, recordings: Sequence[str | Path] = ()) -> Detector:
     """Join ``frame/``, ``tool/`` and ``window/`` of a training folder, calibrate, write `out` and its card.
 
-    Half of the validation frames calibrate, the other half give the figures on the card.
+    Half of the validation frames calibrate, the other half give the figures on the card.  The covariances are fitted on
+    labelled `recordings` where there are any: moderate frames as they will be measured, where the validation frames vary
+    more than those of any microscope.  None of either was trained on.
 
     Raises
     ------
@@ -31,6 +38,8 @@ def assemble(folder: str | Path, data: str | Path, out: str | Path) -> Detector:
     frames = list(validation_frames(data))
     if not frames:
         raise FileNotFoundError(f"{data}: no validation shard; make some with `python3 -m lib train generate`.")
+    opened = [Recording.open(path) for path in recordings]
+    typical = [frame for recording in opened for frame in labelled_frames(recording, every=TYPICAL_EVERY)]
     detector = Detector(
         stages["frame"].network,
         REDUCTION,
@@ -38,8 +47,8 @@ def assemble(folder: str | Path, data: str | Path, out: str | Path) -> Detector:
         tool_network=stages["tool"].network,
         tool_reduction=TOOL_REDUCTION,
     )
-    held_out = evaluate(calibrate(detector, frames[::2]), frames[1::2])
-    detector = calibrate(detector, frames)
+    held_out = evaluate(calibrate(detector, frames[::2], typical), frames[1::2])
+    detector = calibrate(detector, frames, typical)
     keys = ("data", "images", "commit", "steps", "seconds", "config", "metrics", "before")
     provenance = {
         "trained_on": "simulated frames only (lib.simulator.training); no eye or tool of a shipped recording",
@@ -47,6 +56,8 @@ def assemble(folder: str | Path, data: str | Path, out: str | Path) -> Detector:
         "machine": machine(),
         "stages": {name: {key: training.provenance.get(key) for key in keys} for name, training in stages.items()},
         "validation_frames": len(frames),
+        "covariance_frames": len(typical),
+        "covariance_recordings": [recording.name for recording in opened],
         "metrics": held_out.scores.as_dict()
         | {
             "confidence_calibration_error": calibration_error(held_out.landmarks.confidence, held_out.correct),
@@ -100,6 +111,15 @@ def card(detector: Detector, path: Path) -> str:
         ),
         f"File: {path.stat().st_size / 1e6:.1f} MB, safetensors; configuration, calibration and this card's figures inside.",
         "",
+        *(
+            [
+                f"Covariances are fitted on {p['covariance_frames']} frames of the simulated recordings "
+                f"{', '.join(p['covariance_recordings'])}, confidence on these and the validation frames.",
+                "",
+            ]
+            if p.get("covariance_frames")
+            else []
+        ),
         f"Held-out simulated full-HD frames ({p['validation_frames'] // 2}, neither trained nor calibrated on):",
         "",
         "| figure | value |",

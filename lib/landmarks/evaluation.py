@@ -16,7 +16,7 @@ from tqdm.auto import tqdm
 
 from lib.geometry import image_from_cell
 from lib.landmarks.heatmaps import DECODERS, decode
-from lib.landmarks.inference import Calibration, Detector, Landmarks, _missing, shape_and_features
+from lib.landmarks.inference import Calibration, Detector, Landmarks, _missing, joined, shape_and_features
 from lib.landmarks.metrics import Scores, errors_px, pck, score, tool_length_px
 from lib.landmarks.network import LANDMARKS
 from lib.landmarks.windows import map_points
@@ -138,10 +138,7 @@ def evaluate(
         length.append(tool_length_px(np.asarray(u, dtype=float)[None])[0])
     if not names:
         raise ValueError("frames: no labelled frame to evaluate on.")
-    landmarks = Landmarks(
-        *(np.concatenate([getattr(f, part) for f in found]) for part in ("u", "covariance", "confidence"))
-    )
-    return Evaluation(landmarks, np.stack(labels), np.stack(visibility), np.array(length), names)
+    return Evaluation(joined(found), np.stack(labels), np.stack(visibility), np.array(length), names)
 
 
 def labelled_frames(
@@ -189,18 +186,33 @@ def evaluate_recording(
 
 
 def calibrate(
-    detector: Detector, frames: Iterable[tuple[str, np.ndarray, np.ndarray, np.ndarray]], *, progress: bool = False
+    detector: Detector,
+    frames: Iterable[tuple[str, np.ndarray, np.ndarray, np.ndarray]],
+    typical: Iterable[tuple[str, np.ndarray, np.ndarray, np.ndarray]] = (),
+    *,
+    progress: bool = False,
 ) -> Detector:
     """The detector with covariance and confidence fitted to its errors on validation frames, never trained on.
 
     Variance: maximum likelihood of the errors below `GROSS_PX` (and of the first stage's below six times that), log
     linear in the peak's features; its intercept makes the mean normalised squared error 2.  Confidence:
     logistic regression of "in view and within 5 % of the tool's length" on the same features.
+
+    Parameters
+    ----------
+    frames:
+        As for `evaluate`; easy and hard, since confidence is learnt from failures.
+    typical:
+        Frames of the kind that will be measured, where they differ from `frames`: the variance is fitted on them alone,
+        confidence on both.
     """
     frames = list(frames)
+    typical = list(typical)
+    only_confidence = len(frames) if typical else 0
+    frames = [*frames, *typical]
     rough: list[Landmarks] = []
     for stage in detector.networks:
-        features, shapes, errors, correct = [], [], [], []
+        features, shapes, errors, correct, counted = [], [], [], [], []
         zoom = 1.0
         for i, (_, image, u, v) in enumerate(tqdm(frames, disable=not progress, unit="image", desc=stage)):
             in_view = np.isfinite(u).all(1) & (np.asarray(v) > 0)
@@ -221,11 +233,12 @@ def calibrate(
             features.append(feature)
             shapes.append(shape)
             errors.append(difference)
+            counted.append(np.full(len(difference), i >= only_confidence))
             with np.errstate(invalid="ignore"):
                 correct.append(np.linalg.norm(difference, axis=1) <= tolerance * zoom)
-        joined = (np.concatenate(part) for part in (features, shapes, errors, correct))
+        together = (np.concatenate(part) for part in (features, shapes, errors, correct, counted))
         gross = {"frame": 6 * GROSS_PX, "tool": 2 * GROSS_PX * zoom, "window": GROSS_PX}[stage]
-        detector = detector.with_calibration(**{stage: _fit(*joined, gross_px=gross)})
+        detector = detector.with_calibration(**{stage: _fit(*together, gross_px=gross)})
         # What the next stage starts from.
         if stage == "frame":
             rough = [
@@ -263,10 +276,15 @@ def compare_decoders(
 
 
 def _fit(
-    features: np.ndarray, shapes: np.ndarray, errors: np.ndarray, correct: np.ndarray, gross_px: float
+    features: np.ndarray,
+    shapes: np.ndarray,
+    errors: np.ndarray,
+    correct: np.ndarray,
+    counted: np.ndarray,
+    gross_px: float,
 ) -> Calibration:
     size = np.linalg.norm(errors, axis=1)
-    use = np.isfinite(size) & (size < gross_px)
+    use = counted & np.isfinite(size) & (size < gross_px)
     if use.sum() < 20:
         raise ValueError(f"frames: only {use.sum()} landmarks to calibrate on; give at least 20.")
     x, e = features[use], errors[use]

@@ -30,7 +30,7 @@ from lib.landmarks.network import HourglassConfig, StackedHourglass
 from lib.landmarks.windows import cut, direction_rad, tool_centre, window_from_image
 from lib.parallel import single_threaded_torch
 
-__all__ = ["Calibration", "Detector", "Landmarks", "as_tensor", "read_checkpoint", "write_checkpoint"]
+__all__ = ["Calibration", "Detector", "Landmarks", "as_tensor", "joined", "read_checkpoint", "write_checkpoint"]
 
 FORMAT = "microstereo.detector"
 #: Of the code between weights and landmarks (windows, decoding, what is missing): raised with every change of it that moves
@@ -294,7 +294,7 @@ class Detector:
                 for stage in list(self.networks)[1:]:
                     result = self._refined(part, result, stage)
                 found.append(result)
-        return _missing(_joined(found))
+        return _missing(joined(found))
 
     def track(self, images: ArrayLike, previous: Landmarks, *, min_confidence: float = 0.5) -> Landmarks:
         """Landmarks of the frames that follow `previous`: windows alone, the whole frame where they fail.
@@ -446,7 +446,8 @@ def _images(images: ArrayLike) -> np.ndarray:
     return array
 
 
-def _joined(parts: list[Landmarks]) -> Landmarks:
+def joined(parts: list[Landmarks]) -> Landmarks:
+    """Landmarks of several sets of images, one after the other."""
     return Landmarks(*(np.concatenate([getattr(p, name) for p in parts]) for name in ("u", "covariance", "confidence")))
 
 

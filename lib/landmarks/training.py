@@ -560,6 +560,13 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--initial", type=Path, help="checkpoint to fine-tune from")
     parser.add_argument("--out", type=Path, default=paths.MODELS / "default.safetensors", help="assemble: weights file")
+    parser.add_argument(
+        "--recordings",
+        type=Path,
+        nargs="*",
+        default=[],
+        help="assemble: labelled recordings that the covariances are fitted on",
+    )
     parser.add_argument("--onnx", type=Path, default=paths.CACHE / "onnx", help="export: folder of the ONNX files")
     parser.add_argument("--threads", type=int, default=0, help="torch threads (default: torch's choice)")
     a = parser.parse_args(argv)
@@ -571,7 +578,7 @@ def main(argv: list[str] | None = None) -> int:
             dataset.generate(a.data, a.shards, workers=a.workers)
             dataset.generate_windows(a.data, a.windows, workers=a.workers)
         elif a.what == "assemble":
-            assembly.assemble(a.folder, a.data, a.out)
+            assembly.assemble(a.folder, a.data, a.out, a.recordings)
         elif a.what == "export":
             from lib.landmarks.export import export_shipped  # needs onnx, which nothing else does
 
