@@ -236,9 +236,9 @@ def calibrate(
             counted.append(np.full(len(difference), i >= only_confidence))
             with np.errstate(invalid="ignore"):
                 correct.append(np.linalg.norm(difference, axis=1) <= tolerance * zoom)
-        together = (np.concatenate(part) for part in (features, shapes, errors, correct, counted))
+        together = (np.concatenate(part) for part in (features, shapes, errors, correct))
         gross = {"frame": 6 * GROSS_PX, "tool": 2 * GROSS_PX * zoom, "window": GROSS_PX}[stage]
-        detector = detector.with_calibration(**{stage: _fit(*together, gross_px=gross)})
+        detector = detector.with_calibration(**{stage: _fit(*together, gross, np.concatenate(counted))})
         # What the next stage starts from.
         if stage == "frame":
             rough = [
@@ -280,9 +280,10 @@ def _fit(
     shapes: np.ndarray,
     errors: np.ndarray,
     correct: np.ndarray,
-    counted: np.ndarray,
     gross_px: float,
+    counted: np.ndarray | bool = True,
 ) -> Calibration:
+    """Fit to m peaks; the variance to those that are `counted`, (m,) bool."""
     size = np.linalg.norm(errors, axis=1)
     use = counted & np.isfinite(size) & (size < gross_px)
     if use.sum() < 20:

@@ -383,10 +383,10 @@ class _Run:
 
     def restore(self, path: Path, fingerprint: str) -> None:
         tensors, metadata = read_checkpoint(path, FORMAT)
-        own = asdict(self.config)
         # Only what may change between two sittings of one run.
         free = {"validate_every", "patience"}
-        changed = [k for k, v in metadata["config"].items() if k not in free and _plain(own.get(k)) != _plain(v)]
+        own, other = asdict(self.config), asdict(_config(path, metadata["config"]))
+        changed = [name for name, value in own.items() if name not in free and value != other[name]]
         if changed:
             raise ValueError(f"{path}: belongs to a training with another {', '.join(changed)}; use another folder.")
         if metadata["provenance"]["data"] != fingerprint:
@@ -516,11 +516,14 @@ def _part(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
     return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
 
 
-def _plain(value: object) -> object:
-    """As JSON gives it back: tuples are lists."""
-    if isinstance(value, dict):
-        return {k: _plain(v) for k, v in value.items()}
-    return [_plain(v) for v in value] if isinstance(value, list | tuple) else value
+def _config(path: Path, values: dict) -> TrainingConfig:
+    """A checkpoint's configuration; what it does not name, since it is older, is as by default."""
+    try:
+        augmentation = values["augmentation"] | {"zoom": tuple(values["augmentation"]["zoom"])}
+        parts = {"network": HourglassConfig(**values["network"]), "augmentation": Augmentation(**augmentation)}
+        return TrainingConfig(**values | parts)
+    except (TypeError, KeyError) as error:
+        raise ValueError(f"{path}: its configuration is not one of this program ({error}).") from error
 
 
 def _stale(log: list[dict[str, float]]) -> int:

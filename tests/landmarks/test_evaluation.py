@@ -48,7 +48,7 @@ def test_fitted_variance_of_known_errors():
     errors = rng.normal(0, 1, (4000, 2)) * sigma[:, None]
     correct = np.linalg.norm(errors, axis=1) < 2
     shapes, counted = np.broadcast_to(np.eye(2), (4000, 2, 2)), np.ones(4000, bool)
-    fit = _fit(features, shapes, errors, correct, counted, gross_px=1e9)
+    fit = _fit(features, shapes, errors, correct, gross_px=1e9)
     assert fit.log_variance[0] + 0.6 * fit.log_variance[2] == pytest.approx(0.3, abs=0.1)
     assert fit.log_variance[1] == pytest.approx(0.8, abs=0.05)
     squared = (errors**2).sum(1) / np.exp(features @ np.array(fit.log_variance))
@@ -57,7 +57,7 @@ def test_fitted_variance_of_known_errors():
     assert metrics.calibration_error(confidence, correct) < 0.05
     errors[2000:] *= 5  # hard frames teach confidence alone
     counted[2000:] = False
-    again = _fit(features, shapes, errors, correct, counted, gross_px=1e9)
+    again = _fit(features, shapes, errors, correct, 1e9, counted)
     assert np.allclose(again.log_variance, fit.log_variance, atol=0.15)
     assert np.allclose(again.logit, fit.logit)
 

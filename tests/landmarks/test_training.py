@@ -245,3 +245,20 @@ def test_averaging_over_processes_is_a_batch_of_all(monkeypatch, toy):
     training._average(mine, 2)
     for a, b in zip(mine, gradients(joined), strict=True):
         assert torch.allclose(a, b, atol=1e-5 + 1e-3 * float(b.abs().max()))
+
+
+def test_a_checkpoint_older_than_an_option_resumes_by_its_default(toy, tmp_path):
+    config = replace(SMALL, steps=4)
+    train(replace(config), toy(6), toy(2), tmp_path, progress=False, max_seconds=0)
+    path = tmp_path / "last.safetensors"
+    tensors, metadata = training.read_checkpoint(path, training.FORMAT)
+    assert metadata["step"] < 4
+    del metadata["config"]["position_weight_per_px"], metadata["config"]["augmentation"]["photometric_share"]
+    training.write_checkpoint(path, tensors, metadata)
+    with pytest.raises(ValueError, match="another position_weight_per_px"):
+        train(replace(config, position_weight_per_px=0.1), toy(6), toy(2), tmp_path, progress=False)
+    assert train(config, toy(6), toy(2), tmp_path, progress=False).provenance["steps"] == 4
+    metadata["config"]["magic"] = 1
+    training.write_checkpoint(path, tensors, metadata)
+    with pytest.raises(ValueError, match="not one of this program"):
+        train(config, toy(6), toy(2), tmp_path, progress=False)
