@@ -8,7 +8,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Ellipse, FancyArrowPatch, FancyBboxPatch
+from matplotlib.patches import Ellipse, FancyArrowPatch, FancyBboxPatch, Patch
 from scipy.stats import chi2
 
 from lib.figures.style import COLOURS, LANDMARK_COLOURS, figure, show_image
@@ -22,18 +22,28 @@ __all__ = [
     "augmented",
     "decoder_errors",
     "detection",
+    "engine_bars",
     "error_groups",
     "few_labels_curves",
     "frame_explorer",
+    "half_within",
     "heatmap_grid",
+    "label_noise_pairs",
     "landmark_dots",
     "learning_curves",
+    "loss_slopes",
     "network_page",
     "pck_curves",
     "printed_equation",
+    "real_curves",
+    "real_frames",
     "resolution_curves",
+    "shipped_curve",
+    "shipped_table",
     "stages",
+    "timing_bars",
     "uncertainty",
+    "visibility_bars",
     "worst_frames",
 ]
 
@@ -48,16 +58,16 @@ def landmark_dots(axes: Axes, u: np.ndarray, *, size: float = 60.0, label: bool 
 
 def network_page(config: HourglassConfig, parameters: int) -> Figure:
     """The stacked hourglass drawn to its depth: boxes are blocks, their height the resolution, arcs the skips."""
-    fig, ax = figure(width_in=11, height_in=3.2)
+    fig, ax = figure(width_in=10, height_in=3.4)
     ax.set_axis_off()
     ax.grid(False)
-    x, centres = 0.0, []
+    x = 0.0
 
     def box(height: float, colour: str, text: str = "") -> float:
         nonlocal x
         ax.add_patch(FancyBboxPatch((x, -height / 2), 0.5, height, boxstyle="round,pad=0.03", fc=colour, ec="white"))
         if text:
-            ax.text(x + 0.25, -height / 2 - 0.12, text, ha="center", va="top", fontsize=8)
+            ax.text(x + 0.25, -height / 2 - 0.12, text, ha="center", va="top", fontsize=10)
         x += 0.75
         return x - 0.5
 
@@ -75,7 +85,8 @@ def network_page(config: HourglassConfig, parameters: int) -> Figure:
                         arrowstyle="-|>", mutation_scale=8, color=COLOURS["baseline"], lw=1,
                     )  # fmt: skip
                     ax.add_patch(arrow)
-        centres.append(box(2.0, COLOURS["paper"], f"heatmaps {stack + 1}\nl2 loss"))
+        box(2.0, COLOURS["paper"], f"\nheatmaps\n+ loss {stack + 1}")
+        x += 0.35
     ax.set(xlim=(-0.2, x), ylim=(-2.3, 2.3))
     ax.set_title(
         f"{config.stacks} hourglass{'es' if config.stacks > 1 else ''}, {config.features} features, "
@@ -86,10 +97,11 @@ def network_page(config: HourglassConfig, parameters: int) -> Figure:
 
 def heatmap_grid(image: np.ndarray, heatmaps: np.ndarray, u: np.ndarray, stride: int) -> Figure:
     """One image with its three heatmaps (3, h, w) laid over it; `u` (3, 2) in image pixels."""
-    fig, axes = figure(1, 4, width_in=12, height_in=3.3)
+    fig, axes = figure(1, 4, width_in=10.5, height_in=2.9)
     show_image(axes[0], image, "image and landmarks")
-    landmark_dots(axes[0], u)
+    landmark_dots(axes[0], u, size=90)
     h, w = heatmaps.shape[1:]
+    axes[0].set(xlim=(-0.5, image.shape[1] - 0.5), ylim=(image.shape[0] - 0.5, -0.5))
     extent = (-0.5, w * stride - 0.5, h * stride - 0.5, -0.5)
     grey = image.mean(axis=2)
     for ax, name, heatmap in zip(axes[1:], LANDMARK_COLOURS, heatmaps, strict=True):
@@ -101,7 +113,7 @@ def heatmap_grid(image: np.ndarray, heatmaps: np.ndarray, u: np.ndarray, stride:
 
 def printed_equation(heatmap: np.ndarray, truth: np.ndarray, points: Mapping[str, np.ndarray]) -> Figure:
     """A heatmap (h, w) of stride 1 with what Eq. (1) gives, printed and normalised."""
-    fig, ax = figure(width_in=5.2, height_in=4)
+    fig, ax = figure(width_in=4.6, height_in=4.2)
     show_image(ax, heatmap)
     ax.images[0].set_cmap("inferno")
     ax.scatter(*truth, marker="+", s=120, c="white", label="truth")
@@ -115,12 +127,12 @@ def augmented(images: Sequence[np.ndarray], u: Sequence[np.ndarray], titles: Seq
     """Images (h, w, 3) in [0, 1] or uint8 with their landmarks."""
     columns = min(6, len(images))
     rows = -(-len(images) // columns)
-    fig, axes = figure(rows, columns, width_in=12, height_in=2.15 * rows, squeeze=False)
+    fig, axes = figure(rows, columns, width_in=10, height_in=1.8 * rows, squeeze=False)
     for ax in axes.flat:
         ax.set_axis_off()
     for ax, image, points, title in zip(axes.flat, images, u, titles, strict=False):
         show_image(ax, image)
-        ax.set_title(title, fontsize=9)
+        ax.set_title(title)
         h, w = image.shape[:2]
         inside = ((points > -0.5) & (points < (w - 0.5, h - 0.5))).all(axis=1)
         landmark_dots(ax, np.where(inside[:, None], points, np.nan), size=40)
@@ -129,19 +141,22 @@ def augmented(images: Sequence[np.ndarray], u: Sequence[np.ndarray], titles: Seq
 
 def learning_curves(logs: Mapping[str, list[dict[str, float]]]) -> Figure:
     """Loss and validation PCK against steps, one colour a training."""
-    fig, (a, b, c) = figure(1, 3, width_in=12, height_in=3.2)
+    fig, (a, b, c) = figure(1, 3, width_in=11, height_in=3.4)
     for (name, log), colour in zip(logs.items(), (COLOURS["ours"], COLOURS["paper"], COLOURS["truth"]), strict=False):
         step = [row["step"] for row in log]
         a.plot(step, [row["loss"] for row in log], color=colour, label=f"{name}, training")
         a.plot(step, [row["validation_loss"] for row in log], color=colour, ls="--", label="validation")
-        b.plot(step, [row["pck_0.10"] for row in log], color=colour, label="threshold 0.10")
-        b.plot(step, [row["pck_0.05"] for row in log], color=colour, ls="--", label="threshold 0.05")
-        c.plot(step, [row["median_px"] for row in log], color=colour, label=name)
-    a.set(title="l2 loss (1 = empty heatmaps)", xlabel="step", yscale="log")
+        b.plot(step, [row["pck_0.10"] for row in log], color=colour, marker="o", ms=4, label="PCK@0.10")
+        b.plot(step, [row["pck_0.05"] for row in log], color=colour, ls="--", marker="o", ms=4, label="PCK@0.05")
+        c.plot(step, [row["median_px"] for row in log], color=colour, marker="o", ms=4, label=name)
+    a.set(title="loss (1 = empty heatmaps)", xlabel="step")
     b.set(title="validation PCK", xlabel="step", ylabel="%", ylim=(0, 100))
     c.set(title="median error", xlabel="step", ylabel="px", yscale="log")
-    a.legend(fontsize=8)
-    b.legend(fontsize=8)
+    a.set_ylim(bottom=0)
+    c.yaxis.set_major_formatter("{x:g}")
+    c.yaxis.set_minor_formatter("{x:g}")
+    a.legend()
+    b.legend()
     return fig
 
 
@@ -160,7 +175,7 @@ def pck_curves(
     ticks = [t for t in (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5) if thresholds[0] <= t <= thresholds[-1]]
     ax.set_xticks(ticks, [f"{t:g}" for t in ticks])
     ax.minorticks_off()
-    ax.legend(loc="lower right", fontsize=9)
+    ax.legend(loc="lower right")
     return fig
 
 
@@ -173,11 +188,11 @@ def _ellipse(axes: Axes, u: np.ndarray, covariance: np.ndarray, colour: str, pro
 
 def detection(image: np.ndarray, evaluation: Evaluation, index: int, *, half_px: int = 14) -> Figure:
     """A frame with its detections, and each landmark close up: 95 % ellipse, detection (dot) and label (cross)."""
-    fig, axes = figure(1, 4, width_in=13, height_in=3.2, width_ratios=[2.2, 1, 1, 1])
+    fig, axes = figure(1, 4, width_in=11, height_in=2.9, width_ratios=[1.8, 1, 1, 1])
     found, truth = evaluation.landmarks, evaluation.u_true[index]
     show_image(axes[0], image[::2, ::2], evaluation.names[index])
     landmark_dots(axes[0], found.u[index] / 2 - 0.25, label=True)
-    axes[0].legend(loc="lower left", fontsize=8, labelcolor="white")
+    axes[0].legend(loc="lower left", labelcolor="white")
     h, w = image.shape[:2]
     for k, (ax, (name, colour)) in enumerate(zip(axes[1:], LANDMARK_COLOURS.items(), strict=True)):
         centre = found.u[index, k] if np.isfinite(found.u[index, k]).all() else truth[k]
@@ -197,7 +212,7 @@ def detection(image: np.ndarray, evaluation: Evaluation, index: int, *, half_px:
 
 def worst_frames(images: Sequence[np.ndarray], evaluation: Evaluation, indices: Sequence[int]) -> Figure:
     """The frames with the largest errors: circles are detections, crosses labels."""
-    fig, axes = figure(1, len(images), width_in=12.5, height_in=3.4, squeeze=False)
+    fig, axes = figure(1, len(images), width_in=11, height_in=3.1, squeeze=False)
     for ax, image, i in zip(axes.flat, images, indices, strict=True):
         truth, found = evaluation.u_true[i], evaluation.landmarks.u[i]
         error = evaluation.error_px[i]
@@ -209,6 +224,17 @@ def worst_frames(images: Sequence[np.ndarray], evaluation: Evaluation, indices: 
         reach = 60 if np.isfinite(error[k]) and error[k] < 50 else 250
         x, y = np.clip(truth[k], reach, (w - 1 - reach, h - 1 - reach))
         ax.set(xlim=(x - reach, x + reach), ylim=(y + reach, y - reach))
+    return fig
+
+
+def real_frames(images: Sequence[np.ndarray], evaluation: Evaluation, indices: Sequence[int]) -> Figure:
+    """Real frames with the detections (circles) and the clicked labels (crosses)."""
+    fig, axes = figure(1, len(images), width_in=11, height_in=8.6 / max(1, len(images)), squeeze=False)
+    for ax, image, i in zip(axes.flat, images, indices, strict=True):
+        error = evaluation.error_px[i] / evaluation.length_px[i]
+        show_image(ax, image, f"{evaluation.names[i]}: {100 * np.nanmax(error):.0f} % of the length off")
+        landmark_dots(ax, evaluation.landmarks.u[i], size=110)
+        ax.scatter(*evaluation.u_true[i].T, marker="+", s=110, c="white", linewidths=1.8)
     return fig
 
 
@@ -239,12 +265,13 @@ def ablation_bars(columns: Mapping[str, Mapping], paper: Mapping[str, float]) ->
     fig, ax = figure(width_in=8, height_in=3.2)
     for i, (name, row) in enumerate(columns.items()):
         values = row["pck_0.05"]["per_seed"]
-        ax.bar(i, row["pck_0.05"]["mean"], 0.55, color=COLOURS["ours"], alpha=0.5, label="mean" if i == 0 else None)
+        ax.bar(i, row["pck_0.05"]["mean"], 0.55, color=COLOURS["ours"], alpha=0.4, label="mean" if i == 0 else None)
+        ax.text(i, 4, f"{row['pck_0.05']['mean']:.1f}", ha="center", fontsize=13, weight="bold")
         ax.plot(np.full(len(values), i), values, "o", color=COLOURS["ours"], ms=5, label="one seed" if i == 0 else None)
         ax.plot(i, paper[name], "D", color=COLOURS["paper"], ms=7, label="paper" if i == 0 else None)
     ax.set_xticks(range(len(columns)), list(columns))
     ax.set(ylabel="PCK@0.05, %", ylim=(0, 105), title="Ablation")
-    ax.legend(loc="upper left", fontsize=8)
+    ax.legend(loc="upper left")
     return fig
 
 
@@ -258,38 +285,225 @@ def resolution_curves(thresholds: Sequence[float], curves: Mapping[str, Sequence
     ticks = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20)
     ax.set_xticks(ticks, [f"{t:g}" for t in ticks])
     ax.minorticks_off()
-    ax.legend(loc="upper left", fontsize=9)
+    ax.legend(loc="upper left")
     return fig
 
 
 def few_labels_curves(result: Mapping) -> Figure:
     """PCK@0.05 against the number of annotated frames: recorded means with two standard errors."""
-    fig, ax = figure(width_in=7.5, height_in=3.4)
+    fig, ax = figure(width_in=8, height_in=3.8)
     for (name, rows), colour in zip(result["frames"].items(), (COLOURS["ours"], COLOURS["paper"]), strict=False):
         n = [int(count) for count in rows]
         mean = np.array([row["pck_0.05"]["mean"] for row in rows.values()])
         error = np.array([row["pck_0.05"]["standard_error"] or 0.0 for row in rows.values()], dtype=float)
-        ax.errorbar(n, mean, yerr=2 * error, color=colour, marker="o", ms=4, capsize=3, label=name)
+        ax.errorbar(n, mean, yerr=2 * error, color=colour, marker="o", ms=6, capsize=4, label=name)
     ax.axhline(result["no_label"]["pck_0.05"], color=COLOURS["baseline"], ls="--", label="shipped weights, no label")
     ax.set(xscale="log", ylim=(0, 101), xlabel="annotated frames", ylabel="PCK@0.05, %", title="How many labels?")
     ax.set_xticks(n, [str(count) for count in n])
     ax.minorticks_off()
-    ax.legend(fontsize=8)
+    ax.legend(title="bars: two standard errors")
+    return fig
+
+
+def label_noise_pairs(result: Mapping) -> Figure:
+    """Recorded median error of networks trained with exact and with noisy labels; a line joins those of one seed."""
+    fig, ax = figure(width_in=5.5, height_in=3.4)
+    medians = np.array([result["labels"][name]["median_px"]["per_seed"] for name in ("exact", "noisy")])
+    ax.plot([0, 1], medians, "o-", color=COLOURS["ours"], ms=7)
+    ax.set_xticks([0, 1], ["exact labels", "noisy labels"])
+    ax.set(xlim=(-0.4, 1.4), ylabel="median error, px", title=f"What noise costs: {_cost(result)} px")
+    ax.set_ylim(0, 1.25 * medians.max())
+    return fig
+
+
+def _cost(result: Mapping) -> str:
+    cost = result["median_cost_px"]
+    error = cost["standard_error"]
+    return f"{cost['mean']:+.3f}" + (" (one seed)" if error is None else f" ± {error:.3f}")
+
+
+def _table(header: Sequence[str], rows: Sequence[Sequence[str]], *, width_in: float, first: float) -> Figure:
+    """Rows of text under a bold header; the first column, `first` of the width, stands to the left."""
+    fig, ax = figure(width_in=width_in, height_in=0.34 * (len(rows) + 1))
+    ax.axis("off")
+    rest = (1 - first) / (len(header) - 1)
+    drawn = ax.table(
+        [list(row) for row in rows], colLabels=list(header), edges="horizontal", cellLoc="center",
+        colWidths=[first] + [rest] * (len(header) - 1), bbox=(0, 0, 1, 1),
+    )  # fmt: skip
+    drawn.auto_set_font_size(False)
+    drawn.set_fontsize(12)
+    for (row, column), cell in drawn.get_celld().items():
+        cell.set_edgecolor(COLOURS["baseline"])
+        if row == 0:
+            cell.set_text_props(weight="bold")
+        if column == 0:
+            cell.set_text_props(ha="left")
+    return fig
+
+
+def shipped_curve(result: Mapping) -> Figure:
+    """Recorded PCK of the shipped detector: whole frames with tracking beside them, and the top enlarged."""
+    fig, axes = figure(1, 2, width_in=11, height_in=3.8)
+    at = np.array([0.01, 0.05, 0.10])
+    for ax, lowest in zip(axes, (0.0, 95.0), strict=True):
+        ax.plot(result["thresholds"], result["curve"], "o-", color=COLOURS["ours"], ms=4, label="whole frames")
+        tracking = [result["tracking"][f"pck_{t:.2f}"] for t in at]
+        ax.plot(at, tracking, "s", color=COLOURS["right"], ms=8, mfc="none", mew=2, label="tracking")
+        ax.plot(0.05, 99.7, "D", color=COLOURS["paper"], ms=7, label="paper, 1080p")
+        thresholds = np.array(result["thresholds"])
+        first = thresholds[0] if lowest == 0 else 0.0075
+        ax.set(xscale="log", xlim=(first, 1.05 * thresholds[-1]), ylim=(lowest, 100 + (100 - lowest) / 50))
+        ticks = [t for t in (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2) if first <= t <= thresholds[-1]]
+        ax.set_xticks(ticks, [f"{t:g}" for t in ticks])
+        ax.minorticks_off()
+        ax.set(xlabel="threshold, part of the tool's length", ylabel="PCK, %")
+    axes[0].set_title("Correct landmarks")
+    axes[1].set_title("The top of it, enlarged")
+    axes[0].legend(loc="lower right")
+    return fig
+
+
+def shipped_table(result: Mapping) -> Figure:
+    """Recorded figures of the shipped detector: all whole frames, tracking, by landmark, by sequence."""
+    rows: dict[str, Mapping] = {"all, whole frames": result["whole_frames"], "all, tracking": result["tracking"]}
+    rows |= result["by_landmark"] | result["by_sequence"]
+
+    def cells(row: Mapping) -> list[str]:
+        pck = [row.get(f"pck_{t}", row.get(f"pck_{t.replace('.', '_')}")) for t in ("0.01", "0.05")]
+        numbers = [f"{row['median_px']:.2f}", f"{row['p95_px']:.2f}", *(f"{p:.1f}" for p in pck)]
+        return [*numbers, f"{row['nees']:.2f}", f"{row['coverage_95']:.1f}", f"{row['missed']}/{row['labels']}"]
+
+    header = [
+        "", "median, px", "95 %, px", "PCK@0.01", "PCK@0.05", "NEES (2)", "in 95 % ellipse", "missed",
+    ]  # fmt: skip
+    return _table(header, [[name, *cells(row)] for name, row in rows.items()], width_in=11.5, first=0.24)
+
+
+def visibility_bars(result: Mapping) -> Figure:
+    """Recorded precision and recall of "seen" (confidence of at least one half), for whole frames and while tracking."""
+    fig, ax = figure(width_in=9, height_in=3.2)
+    names = [f"{there}_{what}" for there in ("in_view", "visible") for what in ("precision", "recall")]
+    for i, (mode, colour) in enumerate((("whole_frames", COLOURS["ours"]), ("tracking", COLOURS["right"]))):
+        values = [result[mode][name] for name in names]
+        x = np.arange(len(names)) + 0.4 * i - 0.2
+        ax.bar(x, values, 0.36, color=colour, alpha=0.7, label=mode.replace("_", " "))
+        for at, value in zip(x, values, strict=True):
+            ax.text(at, value / 2, f"{value:.2f}", ha="center", va="center", fontsize=11, weight="bold")
+    ax.set_xticks(
+        range(len(names)),
+        [name.replace("_", " ").replace("view ", "view\n").replace("ble ", "ble\n") for name in names],
+    )
+    ax.set(ylabel="%", ylim=(0, 119), title="Does it know what is there?")
+    ax.legend(loc="upper right", ncols=2)
+    return fig
+
+
+def real_curves(thresholds: Sequence[float], curves: Mapping[str, Sequence[float]]) -> Figure:
+    """PCK on real frames, a panel a kind of test; names are "sequence: what was trained on and tested on"."""
+    panels: dict[str, dict[str, Sequence[float]]] = {}
+    for name, curve in curves.items():
+        sequence, how = name.split(": ", 1)
+        kind = "another sequence" if how.startswith("first half to ") and how != "first half to second" else how
+        label = f"{sequence} to {how.removeprefix('first half to ')}" if kind == "another sequence" else sequence
+        panels.setdefault(kind, {})[label] = curve
+    fig, axes = figure(1, max(1, len(panels)), width_in=11, height_in=3.5, sharey=True, squeeze=False)
+    for ax, (kind, rows) in zip(axes.flat, panels.items(), strict=False):
+        for (name, curve), colour in zip(
+            rows.items(), (COLOURS["ours"], COLOURS["paper"], COLOURS["truth"]), strict=False
+        ):
+            ax.plot(thresholds, curve, "o-", color=colour, ms=4, label=name)
+        ax.axvline(0.2, color=COLOURS["baseline"], lw=1)
+        ax.set(xlim=(0.05, 0.5), ylim=(0, 101), xlabel="threshold, part of the tool's length", title=kind)
+        ax.set_xticks([0.1, 0.2, 0.3, 0.4, 0.5])
+        ax.legend(loc="best")
+    axes.flat[0].set_ylabel("PCK, %")
+    return fig
+
+
+def half_within(thresholds: Sequence[float], curve: Sequence[float]) -> str:
+    """How far a PCK curve is, in words: the part of the tool's length within which half of all landmarks lie."""
+    curve = np.asarray(curve, dtype=float)
+    reached = np.flatnonzero(curve >= 50)
+    if not len(reached):
+        return f"not even half within {100 * thresholds[-1]:.0f} % of the tool's length"
+    end = reached[0]
+    if end == 0:
+        return f"half within less than {100 * thresholds[0]:.0f} % of the tool's length"
+    at = np.interp(50, curve[end - 1 : end + 1], thresholds[end - 1 : end + 1])
+    return f"half within {100 * at:.0f} % of the tool's length"
+
+
+def engine_bars(rows: Mapping[str, Mapping]) -> Figure:
+    """Recorded milliseconds of six windows on each engine: wall and CPU time, or why it failed."""
+    fig, ax = figure(width_in=9, height_in=0.42 * len(rows) + 1.1)
+    for i, row in enumerate(rows.values()):
+        if "failed" in row:
+            ax.text(0, i, " " + row["failed"][:70], va="center", color=COLOURS["warning"])
+            continue
+        for at, key, colour in ((i - 0.19, "cpu_ms", COLOURS["ours"]), (i + 0.19, "wall_ms", COLOURS["baseline"])):
+            ax.barh(at, row[key], 0.36, color=colour, label=key.split("_")[0] if i == 0 else None)
+            ax.text(row[key], at, f" {row[key]:.0f}", va="center")
+    ax.set_yticks(range(len(rows)), list(rows))
+    ax.set_ylim(len(rows) - 0.4, -0.6)
+    ax.margins(x=0.1)
+    handles = [Patch(color=COLOURS["ours"], label="CPU time"), Patch(color=COLOURS["baseline"], label="wall time")]
+    ax.legend(handles=handles, loc="lower right")
+    ax.set(xlabel="ms", title="Six windows of a stereo pair")
+    return fig
+
+
+def timing_bars(pairs_per_s: Mapping[str, float], paper_hz: Mapping[str, float]) -> Figure:
+    """Stereo pairs a second of each row here, and the paper's on its graphics card; logarithmic."""
+    fig, ax = figure(width_in=9, height_in=0.5 * len(pairs_per_s) + 1.1)
+    for i, (name, rate) in enumerate(pairs_per_s.items()):
+        ax.barh(i, rate, 0.6, color=COLOURS["baseline" if name.startswith("paper") else "ours"])
+        ax.text(rate, i, f" {rate:.3g}", va="center", fontsize=11, weight="bold")
+        if name in paper_hz:
+            ax.plot(paper_hz[name], i, "D", color=COLOURS["paper"], ms=8)
+            ax.text(1.15 * paper_hz[name], i, f"{paper_hz[name]:g}", va="center", color=COLOURS["paper"])
+    ax.plot([], [], "D", color=COLOURS["paper"], label="paper, Titan X")
+    ax.set_yticks(range(len(pairs_per_s)), list(pairs_per_s))
+    ax.invert_yaxis()
+    ax.set(xscale="log", xlabel="stereo pairs a second", title="Speed, decoding included")
+    ax.set_xlim(0.5 * min(pairs_per_s.values()), 2 * max(*pairs_per_s.values(), *paper_hz.values()))
+    ax.xaxis.set_major_formatter("{x:g}")
+    ax.legend(loc="lower right", bbox_to_anchor=(1, 1))
+    return fig
+
+
+def loss_slopes(displacement_px: np.ndarray, losses: Mapping[str, Sequence[float]]) -> Figure:
+    """What a heatmap costs that is a perfect Gaussian at a wrong place: each loss against the displacement."""
+    fig, ax = figure(width_in=7.5, height_in=3.6)
+    for (name, values), colour in zip(
+        losses.items(), (COLOURS["baseline"], COLOURS["paper"], COLOURS["ours"]), strict=False
+    ):
+        ax.plot(displacement_px, values, color=colour, lw=2.5, label=name)
+    ax.set(xlabel="the peak is displaced by, px", ylabel="loss", title="The last pixel", ylim=(0, None))
+    ax.set_xlim(0, displacement_px[-1])
+    ax.legend(loc="upper left")
     return fig
 
 
 def error_groups(groups: Mapping[str, Mapping]) -> Figure:
     """Median error (dot) and 95th percentile (tick) of groups of landmarks, one panel a grouping: name -> its `Scores`."""
-    fig, axes = figure(1, len(groups), width_in=12, height_in=2.9, squeeze=False)
+    fig, axes = figure(
+        1,
+        len(groups),
+        width_in=11,
+        height_in=3.2,
+        squeeze=False,
+        width_ratios=[max(2, len(r)) for r in groups.values()],
+    )
     for ax, (title, rows) in zip(axes.flat, groups.items(), strict=True):
         for i, s in enumerate(rows.values()):
             ax.plot([i, i], [s.median_px, s.p95_px], color=COLOURS["baseline"], lw=1.5)
             ax.plot(i, s.median_px, "o", color=COLOURS["ours"], label="median" if i == 0 else None)
             ax.plot(i, s.p95_px, "_", color=COLOURS["paper"], ms=14, mew=2, label="95 %" if i == 0 else None)
-        ax.set_xticks(range(len(rows)), [f"{name}\n({s.labels})" for name, s in rows.items()], fontsize=8)
+        ax.set_xticks(range(len(rows)), [f"{name}\n({s.labels})" for name, s in rows.items()])
         ax.set(title=title, ylabel="error, px", xlim=(-0.6, len(rows) - 0.4))
         ax.set_ylim(bottom=0)
-    axes.flat[0].legend(fontsize=8)
+    axes.flat[0].legend()
     return fig
 
 
@@ -300,7 +514,7 @@ def frame_explorer(
 
     `windows` (m, s, s, 3), `matrices` window_from_image (m, 2, 3) and `heatmaps` (m, h, w) of the m landmarks found.
     """
-    fig, axes = figure(1, 4, width_in=13, height_in=3.1, width_ratios=[1.9, 1, 1, 1])
+    fig, axes = figure(1, 4, width_in=11, height_in=2.7, width_ratios=[1.8, 1, 1, 1])
     show_image(axes[0], image[::2, ::2], "frame")
     landmark_dots(axes[0], found.u[0] / 2 - 0.25)
     names, seen = list(LANDMARK_COLOURS), np.flatnonzero(np.isfinite(found.u[0]).all(axis=1))
@@ -339,13 +553,16 @@ def decoder_errors(errors_px: Mapping[str, np.ndarray]) -> Figure:
         ylabel="% below",
         title="Decoders, trained heatmaps",
     )
+    ax.xaxis.set_major_formatter("{x:g}")
     ax.legend(title="median", loc="upper left")
     return fig
 
 
 def stages(image: np.ndarray, panels: Sequence[tuple[str, np.ndarray, np.ndarray]], u: np.ndarray) -> Figure:
     """Coarse to fine: the frame with its landmarks, then (title, input, heatmap) of each stage."""
-    fig, axes = figure(1, 1 + len(panels), width_in=14, height_in=2.9, width_ratios=[1.8] + [1.0] * len(panels))
+    fig, axes = figure(
+        1, 1 + len(panels), width_in=11.5, height_in=2.0, width_ratios=[1.7, 1.7] + [1.0] * (len(panels) - 1)
+    )
     show_image(axes[0], image[::3, ::3], "frame")
     landmark_dots(axes[0], (np.asarray(u) - 1) / 3)
     for ax, (title, seen, heatmap) in zip(axes[1:], panels, strict=True):
