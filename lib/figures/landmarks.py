@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse, FancyArrowPatch, FancyBboxPatch, Patch
+from matplotlib.ticker import LogLocator
 from scipy.stats import chi2
 
 from lib.figures.style import COLOURS, LANDMARK_COLOURS, figure, show_image
@@ -153,8 +154,9 @@ def learning_curves(logs: Mapping[str, list[dict[str, float]]]) -> Figure:
     b.set(title="validation PCK", xlabel="step", ylabel="%", ylim=(0, 100))
     c.set(title="median error", xlabel="step", ylabel="px", yscale="log")
     a.set_ylim(bottom=0)
+    c.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     c.yaxis.set_major_formatter("{x:g}")
-    c.yaxis.set_minor_formatter("{x:g}")
+    c.yaxis.set_minor_formatter("")
     a.legend()
     b.legend()
     return fig
@@ -229,12 +231,17 @@ def worst_frames(images: Sequence[np.ndarray], evaluation: Evaluation, indices: 
 
 def real_frames(images: Sequence[np.ndarray], evaluation: Evaluation, indices: Sequence[int]) -> Figure:
     """Real frames with the detections (circles) and the clicked labels (crosses)."""
-    fig, axes = figure(1, len(images), width_in=11, height_in=8.6 / max(1, len(images)), squeeze=False)
+    fig, axes = figure(1, len(images), width_in=11, height_in=11.6 / max(1, len(images)), squeeze=False)
     for ax, image, i in zip(axes.flat, images, indices, strict=True):
         error = evaluation.error_px[i] / evaluation.length_px[i]
         show_image(ax, image, f"{evaluation.names[i]}: {100 * np.nanmax(error):.0f} % of the length off")
         landmark_dots(ax, evaluation.landmarks.u[i], size=110)
         ax.scatter(*evaluation.u_true[i].T, marker="+", s=110, c="white", linewidths=1.8)
+        both = np.concatenate([evaluation.u_true[i], evaluation.landmarks.u[i]])
+        low, high = np.nanmin(both, axis=0), np.nanmax(both, axis=0)
+        reach = 0.5 * (high - low).max() + evaluation.length_px[i]
+        x, y = (low + high) / 2
+        ax.set(xlim=(x - reach, x + reach), ylim=(y + reach, y - reach))
     return fig
 
 
@@ -266,7 +273,9 @@ def ablation_bars(columns: Mapping[str, Mapping], paper: Mapping[str, float]) ->
     for i, (name, row) in enumerate(columns.items()):
         values = row["pck_0.05"]["per_seed"]
         ax.bar(i, row["pck_0.05"]["mean"], 0.55, color=COLOURS["ours"], alpha=0.4, label="mean" if i == 0 else None)
-        ax.text(i, 4, f"{row['pck_0.05']['mean']:.1f}", ha="center", fontsize=13, weight="bold")
+        ax.text(
+            i, row["pck_0.05"]["mean"] / 2, f"{row['pck_0.05']['mean']:.1f}", ha="center", fontsize=13, weight="bold"
+        )
         ax.plot(np.full(len(values), i), values, "o", color=COLOURS["ours"], ms=5, label="one seed" if i == 0 else None)
         ax.plot(i, paper[name], "D", color=COLOURS["paper"], ms=7, label="paper" if i == 0 else None)
     ax.set_xticks(range(len(columns)), list(columns))
@@ -528,7 +537,7 @@ def frame_explorer(
         u = matrix[:, :2] @ found.u[0, k] + matrix[:, 2]
         covariance = matrix[:, :2] @ found.covariance[0, k] @ matrix[:, :2].T
         _ellipse(ax, u, covariance, LANDMARK_COLOURS[names[k]])
-        reach = 24
+        reach = 16
         ax.set(xlim=(u[0] - reach, u[0] + reach), ylim=(u[1] + reach, u[1] - reach))
     return fig
 
