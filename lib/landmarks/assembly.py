@@ -46,6 +46,7 @@ def assemble(folder: str | Path, data: str | Path, out: str | Path, recordings: 
         window_network=stages["window"].network,
         tool_network=stages["tool"].network,
         tool_reduction=TOOL_REDUCTION,
+        mirror=True,
     )
     held_out = evaluate(calibrate(detector, frames[::2], typical), frames[1::2])
     detector = calibrate(detector, frames, typical)
@@ -107,7 +108,8 @@ def card(detector: Detector, path: Path) -> str:
         (
             f"The first stage sees the frame at 1/{detector.reduction} of its resolution, the second a window of "
             f"{detector.window_px} px at 1/{detector.tool_reduction} round the tool, the third windows of as many pixels "
-            "at full resolution round each landmark."
+            "at full resolution round each landmark"
+            + (", and their mirror images, of which it takes the mean." if detector.mirror else ".")
         ),
         f"File: {path.stat().st_size / 1e6:.1f} MB, safetensors; configuration, calibration and this card's figures inside.",
         "",

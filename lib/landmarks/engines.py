@@ -44,8 +44,10 @@ def default_engine() -> str:
     return "openvino" if importlib.util.find_spec("openvino") else "torch"
 
 
-def accelerated(network: StackedHourglass, engine: str) -> Callable[[Tensor], list[Tensor]]:
+def accelerated(network: StackedHourglass, engine: str, *, mirror: bool = False) -> Callable[[Tensor], list[Tensor]]:
     """The network for inference: called with images (n, 3, h, w), its last output are the last stack's heatmaps.
+
+    With `mirror` they are the mean of what it says of the images and of their mirror images (`LastHeatmaps`).
 
     Raises
     ------
@@ -57,19 +59,27 @@ def accelerated(network: StackedHourglass, engine: str) -> Callable[[Tensor], li
     if engine == "openvino":
         if not importlib.util.find_spec("openvino"):
             raise ValueError("engine: openvino is not installed here; choose 'torch'.")
-        return OpenVinoNetwork(network)
-    return network.fused()
+        return OpenVinoNetwork(network, mirror=mirror)
+    last = LastHeatmaps(network, mirror=mirror).to(memory_format=torch.channels_last)
+    return lambda images: [last(images)]
 
 
 class LastHeatmaps(nn.Module):
-    """A network whose only output are the heatmaps of its last stack: what is traced and exported."""
+    """A network whose only output are the heatmaps of its last stack: what is traced and exported.
 
-    def __init__(self, network: StackedHourglass):
+    With `mirror` it looks at every image a second time with top and bottom exchanged, and with the tips exchanged (tip_1 is
+    the left one), and returns the mean of both: heights for a multiple of the stride, where the cells coincide.
+    """
+
+    def __init__(self, network: StackedHourglass, *, mirror: bool = False):
         super().__init__()
-        self.network = network.fused().to(memory_format=torch.contiguous_format)
+        self.network, self.mirror = network.fused().to(memory_format=torch.contiguous_format), mirror
 
     def forward(self, images: Tensor) -> Tensor:
-        return self.network(images)[-1]
+        if not self.mirror:
+            return self.network(images)[-1]
+        seen, mirrored = self.network(torch.cat([images, images.flip(-2)]))[-1].chunk(2)
+        return (seen + mirrored.flip(-2)[:, [0, 2, 1]]) / 2
 
 
 class OpenVinoNetwork:
@@ -78,8 +88,15 @@ class OpenVinoNetwork:
     It is compiled, in about a second, for each size of image that it meets.
     """
 
-    def __init__(self, network: StackedHourglass, *, precision: str | None = None, threads: int | None = None):
-        self._network, self._precision = network, precision
+    def __init__(
+        self,
+        network: StackedHourglass,
+        *,
+        mirror: bool = False,
+        precision: str | None = None,
+        threads: int | None = None,
+    ):
+        self._network, self._mirror, self._precision = network, mirror, precision
         self._threads = threads or torch.get_num_threads()
         digest = hashlib.sha256(repr(network.config).encode())
         for value in network.state_dict().values():
@@ -104,7 +121,7 @@ class OpenVinoNetwork:
         return [torch.from_numpy(found)]
 
     def _queue(self, shape: tuple[int, int, int]) -> tuple:
-        key = (self._digest, shape, self._threads, self._precision)
+        key = (self._digest, self._mirror, shape, self._threads, self._precision)
         if key not in _COMPILED:
             _COMPILED[key] = self._compile((1, *shape))
             while len(_COMPILED) > _KEPT:
@@ -121,7 +138,8 @@ class OpenVinoNetwork:
         }
         if self._precision:
             options["INFERENCE_PRECISION_HINT"] = self._precision
-        compiled = ov.Core().compile_model(_converted(LastHeatmaps(self._network).eval(), shape), "CPU", options)
+        module = LastHeatmaps(self._network, mirror=self._mirror).eval()
+        compiled = ov.Core().compile_model(_converted(module, shape), "CPU", options)
         return ov.AsyncInferQueue(compiled, self._threads), tuple(compiled.output(0).shape)[1:]
 
 

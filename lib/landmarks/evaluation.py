@@ -195,7 +195,7 @@ def calibrate(
     """The detector with covariance and confidence fitted to its errors on validation frames, never trained on.
 
     Variance: maximum likelihood of the errors below `GROSS_PX` (and of the first stage's below six times that), log
-    linear in the peak's features; its intercept makes the mean normalised squared error 2.  Confidence:
+    linear in the peak's features; its intercept makes the mean normalised squared error of each landmark 2.  Confidence:
     logistic regression of "in view and within 5 % of the tool's length" on the same features.
 
     Parameters
@@ -212,7 +212,7 @@ def calibrate(
     frames = [*frames, *typical]
     rough: list[Landmarks] = []
     for stage in detector.networks:
-        features, shapes, errors, correct, counted = [], [], [], [], []
+        features, shapes, errors, correct, landmark, counted = [], [], [], [], [], []
         zoom = 1.0
         for i, (_, image, u, v) in enumerate(tqdm(frames, disable=not progress, unit="image", desc=stage)):
             in_view = np.isfinite(u).all(1) & (np.asarray(v) > 0)
@@ -220,6 +220,7 @@ def calibrate(
             tolerance = 0.05 * tool_length_px(np.asarray(u, dtype=float)[None])[0]
             if stage == "frame":
                 peaks, _ = detector.frame_peaks(image[None])
+                which = np.indices((1, 3)).reshape(2, 3).T
                 shape, feature = (part[0].numpy() for part in shape_and_features(peaks.double(), detector.reduction))
                 difference = image_from_cell(peaks.u[0].double().numpy(), detector.reduction) - labels
             else:
@@ -233,10 +234,11 @@ def calibrate(
             features.append(feature)
             shapes.append(shape)
             errors.append(difference)
+            landmark.append(which[:, 1])
             counted.append(np.full(len(difference), i >= only_confidence))
             with np.errstate(invalid="ignore"):
                 correct.append(np.linalg.norm(difference, axis=1) <= tolerance * zoom)
-        together = (np.concatenate(part) for part in (features, shapes, errors, correct))
+        together = (np.concatenate(part) for part in (features, shapes, errors, correct, landmark))
         gross = {"frame": 6 * GROSS_PX, "tool": 2 * GROSS_PX * zoom, "window": GROSS_PX}[stage]
         detector = detector.with_calibration(**{stage: _fit(*together, gross, np.concatenate(counted))})
         # What the next stage starts from.
@@ -280,6 +282,7 @@ def _fit(
     shapes: np.ndarray,
     errors: np.ndarray,
     correct: np.ndarray,
+    landmark: np.ndarray,
     gross_px: float,
     counted: np.ndarray | bool = True,
 ) -> Calibration:
@@ -299,6 +302,9 @@ def _fit(
 
     start = np.array([np.log(max(squared.mean() / 2, 1e-6)), 0.0, 0.0, 0.0])
     log_variance = minimize(deviance, start, jac=True, method="L-BFGS-B").x
+    ratio = squared * np.exp(-x @ log_variance) / 2
+    each = [ratio[landmark[use] == k] for k in range(3)]
+    by_landmark = [float(np.log(r.mean())) if len(r) >= 20 and r.any() else 0.0 for r in each]
 
     y = correct.astype(float)
 
@@ -309,7 +315,7 @@ def _fit(
         return (np.logaddexp(0, z) - y * z).mean() + ridge @ beta**2, features.T @ (p - y) / len(y) + 2 * ridge * beta
 
     logit = minimize(cost, np.array([-4.0, 0.0, 8.0, 0.0]), jac=True, method="L-BFGS-B").x
-    return Calibration(tuple(map(float, log_variance)), tuple(map(float, logit)))
+    return Calibration(tuple(map(float, log_variance)), tuple(map(float, logit)), tuple(by_landmark))
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -24,11 +24,21 @@ from lib.landmarks.heatmaps import decode
 from lib.landmarks.inference import MIN_CONFIDENCE, Calibration, Detector, as_tensor, calibrated
 from lib.recordings import Recording
 
-__all__ = ["PARITY_CONFIDENCE", "PARITY_PX", "StageWithDecoding", "export", "export_shipped", "run_onnx"]
+__all__ = [
+    "PARITY_CONFIDENCE",
+    "PARITY_COVARIANCE",
+    "PARITY_PX",
+    "StageWithDecoding",
+    "export",
+    "export_shipped",
+    "run_onnx",
+]
 
 #: Largest differences from torch that an exported stage may show.
 PARITY_PX = 0.01
 PARITY_CONFIDENCE = 0.001
+#: Share of a landmark's variance.
+PARITY_COVARIANCE = 0.02
 OPSET = 18
 
 
@@ -44,10 +54,11 @@ class StageWithDecoding(nn.Module):
     def __init__(self, detector: Detector, stage: str):
         super().__init__()
         network = detector.networks[stage]
-        self.heatmaps, self.stride, self.method = LastHeatmaps(network), network.stride, detector.method
+        self.heatmaps = LastHeatmaps(network, mirror=detector.mirror and stage == "window")
+        self.stride, self.method = network.stride, detector.method
         self.scale = detector.reduction if stage == "frame" else 1
         fit = detector.calibration.get(stage, Calibration())
-        self.register_buffer("log_variance", torch.tensor(fit.log_variance))
+        self.register_buffer("log_variance", torch.tensor(fit.of_landmarks, dtype=torch.float32))
         self.register_buffer("logit", torch.tensor(fit.logit))
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -71,8 +82,8 @@ def export(detector: Detector, folder: str | Path, examples: np.ndarray) -> dict
     Raises
     ------
     ValueError
-        If a stage differs by more than `PARITY_PX` or `PARITY_CONFIDENCE` (its file is not written), nothing is found in
-        `examples`, or a package is missing.
+        If a stage differs by more than `PARITY_PX`, `PARITY_CONFIDENCE` or `PARITY_COVARIANCE` (its file is not written),
+        nothing is found in `examples`, or a package is missing.
     """
     for package in ("onnx", "openvino"):  # one writes the files, the other runs them for the comparison
         if not importlib.util.find_spec(package):
@@ -92,15 +103,21 @@ def export(detector: Detector, folder: str | Path, examples: np.ndarray) -> dict
         with tempfile.TemporaryDirectory() as scratch:
             path = Path(scratch) / f"{stage}.onnx"
             _write(module, x, path)
-            u, _, confidence = run_onnx(path, x.numpy())
+            u, covariance, confidence = run_onnx(path, x.numpy())
             with torch.inference_mode():
-                expected, _, expected_confidence = (part.numpy() for part in module(x))
+                expected, expected_covariance, expected_confidence = (part.numpy() for part in module(x))
             seen = expected_confidence >= MIN_CONFIDENCE
             if not seen.any():
                 raise ValueError(f"examples: the stage {stage!r} finds nothing in them; give other frames.")
             difference = float(np.abs(u - expected)[seen].max())
+            variance = np.trace(expected_covariance, axis1=-2, axis2=-1)[..., None, None]
             for largest, limit, unit in (
                 (difference, PARITY_PX, "px"),
+                (
+                    float((np.abs(covariance - expected_covariance) / variance)[seen].max()),
+                    PARITY_COVARIANCE,
+                    "of variance",
+                ),
                 (float(np.abs(confidence - expected_confidence).max()), PARITY_CONFIDENCE, "of confidence"),
             ):
                 if not largest <= limit:

@@ -35,7 +35,7 @@ __all__ = ["Calibration", "Detector", "Landmarks", "as_tensor", "joined", "read_
 FORMAT = "microstereo.detector"
 #: Of the code between weights and landmarks (windows, decoding, what is missing): raised with every change of it that moves
 #: landmarks, so that kept detections are made anew.
-CODE_VERSION = 1
+CODE_VERSION = 2
 #: Landmarks below this confidence are missing: NaN.
 MIN_CONFIDENCE = 0.05
 
@@ -70,12 +70,18 @@ class Landmarks:
 class Calibration:
     """What makes covariance and confidence true, fitted on validation images (`lib.landmarks.evaluation.calibrate`).
 
-    log of the error's variance per coordinate = `log_variance` . features; logit of the confidence =
+    log of the error's variance per coordinate = `log_variance` . features + `by_landmark`; logit of the confidence =
     `logit` . features; the features of a peak are in `peak_features`.  The shape of the ellipse is the fit's.
     """
 
     log_variance: tuple[float, ...] = (0.0, 1.0, 0.0, 0.0)
     logit: tuple[float, ...] = (-4.0, 0.0, 8.0, 0.0)
+    by_landmark: tuple[float, ...] = (0.0, 0.0, 0.0)
+
+    @property
+    def of_landmarks(self) -> np.ndarray:
+        """Coefficients (3, 4) of the features in each landmark's log variance: the first feature is 1."""
+        return np.array(self.log_variance) + np.outer(self.by_landmark, [1.0, 0.0, 0.0, 0.0])
 
 
 def peak_features(variance_px2: Tensor, value: Tensor, width: Tensor) -> Tensor:
@@ -94,7 +100,10 @@ def shape_and_features(peaks: Peaks, scale: float) -> tuple[Tensor, Tensor]:
 
 
 def calibrated(peaks: Peaks, scale: float, log_variance: Tensor, logit: Tensor) -> tuple[Tensor, Tensor]:
-    """Covariance (..., 2, 2) px^2 and confidence (...) of peaks by the two rows of a `Calibration`; torch can trace it."""
+    """Covariance (..., 2, 2) px^2 and confidence (...) of peaks; torch can trace it.
+
+    `log_variance` (..., 4) are the coefficients of each peak's landmark (`Calibration.of_landmarks`), `logit` is (4,).
+    """
     shape, features = shape_and_features(peaks, scale)
     variance = (features * log_variance).sum(-1).clamp(-12, 12).exp()
     return shape * variance[..., None, None], torch.sigmoid((features * logit).sum(-1))
@@ -193,6 +202,8 @@ class Detector:
         Sees one upright window of `window_px` round the tool, that much reduced, between the two; None = no such stage.
     calibration:
         One per stage: ``"frame"``, ``"tool"`` and ``"window"``.
+    mirror:
+        The last stage looks at every window and its mirror image, and takes the mean: twice the work.
     engine:
         What runs the networks, one of `lib.landmarks.engines.ENGINES`; the weights are the same.
     """
@@ -206,12 +217,18 @@ class Detector:
     method: str = "gauss_newton"
     calibration: dict[str, Calibration] = field(default_factory=dict)
     metadata: dict[str, object] = field(default_factory=dict)
+    mirror: bool = False
     engine: str = "torch"
 
     def __post_init__(self) -> None:
         if self.reduction < 1 or self.reduction != int(self.reduction):
             raise ValueError(f"reduction: must be a positive integer, got {self.reduction}.")
-        fast = {name: accelerated(network, self.engine) for name, network in self.networks.items()}
+        if self.mirror and self.window_network and self.window_px % self.window_network.stride:
+            raise ValueError(f"mirror: needs window_px to be a multiple of the stride, got {self.window_px}.")
+        fast = {
+            name: accelerated(network, self.engine, mirror=self.mirror and name == "window")
+            for name, network in self.networks.items()
+        }
         object.__setattr__(self, "_fused", fast)
 
     @property
@@ -253,6 +270,7 @@ class Detector:
                 name: Calibration(*(tuple(values) for values in fit)) for name, fit in metadata["calibration"].items()
             },
             metadata=metadata["provenance"],
+            mirror=metadata.get("mirror", False),
             engine=engine or default_engine(),
         )
 
@@ -269,7 +287,10 @@ class Detector:
             "tool_reduction": self.tool_reduction,
             "window_px": self.window_px,
             "method": self.method,
-            "calibration": {name: [fit.log_variance, fit.logit] for name, fit in self.calibration.items()},
+            "mirror": self.mirror,
+            "calibration": {
+                name: [fit.log_variance, fit.logit, fit.by_landmark] for name, fit in self.calibration.items()
+            },
             "provenance": self.metadata,
         }
         write_checkpoint(path, tensors, metadata)
@@ -405,7 +426,7 @@ class Detector:
         result = Landmarks(rough.u.copy(), rough.covariance.copy(), rough.confidence.copy())
         if not len(which):
             return result
-        fine = self._calibrated(peaks, stage, 1)
+        fine = self._calibrated(peaks, stage, 1, which[:, 1:])
         back = np.linalg.inv(matrices[:, :, :2])
         u = (back @ (fine.u[:, 0] - matrices[:, :, 2])[..., None])[..., 0]
         i, k = which.T
@@ -423,11 +444,11 @@ class Detector:
         size = (images.shape[2] // r, images.shape[1] // r)
         return np.stack([cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in images]) if n else images
 
-    def _calibrated(self, peaks: Peaks, source: str, scale: int) -> Landmarks:
-        """Peaks in pixels of a network's input to landmarks in image pixels."""
+    def _calibrated(self, peaks: Peaks, source: str, scale: int, landmark: np.ndarray | slice = np.s_[:]) -> Landmarks:
+        """Peaks in pixels of a network's input to landmarks in image pixels; `landmark` says which each peak is."""
         u = image_from_cell(peaks.u.numpy(), scale)
         fit = self.calibration.get(source, Calibration())
-        rows = (torch.tensor(row, dtype=torch.float64) for row in (fit.log_variance, fit.logit))
+        rows = (torch.as_tensor(row, dtype=torch.float64) for row in (fit.of_landmarks[landmark], fit.logit))
         covariance, confidence = calibrated(peaks.double(), scale, *rows)
         return Landmarks(u, covariance.numpy(), confidence.numpy())
 

@@ -113,7 +113,7 @@ class ReducedDetector:
         `u` (n, 3, 2) and `visibility` (n, 3) are their labels, `rough` where the finder sees the landmarks.
         """
         labels = np.where((np.isfinite(u).all(2) & (visibility > 0))[..., None], u, np.nan)
-        features, shapes, errors, correct = [], [], [], []
+        features, shapes, errors, correct, landmark = [], [], [], [], []
         for i in range(len(images)):
             small, at, stride = self.reduced(images[i : i + 1], rough.u[i : i + 1])
             peaks, matrices, which = self._last.stage_peaks(small, at, "window")
@@ -129,8 +129,9 @@ class ReducedDetector:
             features.append(feature)
             shapes.append(shape)
             errors.append(difference)
+            landmark.append(which[:, 1])
         gross = GROSS_PX * window_side_px(self.size_px) / FIELD_PX
-        fit = _fit(*(np.concatenate(part) for part in (features, shapes, errors, correct)), gross_px=gross)
+        fit = _fit(*(np.concatenate(part) for part in (features, shapes, errors, correct, landmark)), gross_px=gross)
         return replace(self, calibration=fit)
 
     def save_calibration(self, folder: Path) -> None:

@@ -36,7 +36,7 @@ def trained(toy):
         validate_every=40, precision="fp32",
     )  # fmt: skip
     network = train(config, toy(60), toy(4, seed=2), progress=False).network
-    fit = Calibration((0.3, 0.9, -0.2, 0.1), (3.0, -0.1, 2.0, -0.3))
+    fit = Calibration((0.3, 0.9, -0.2, 0.1), (3.0, -0.1, 2.0, -0.3), (-0.4, 0.1, 0.2))
     return Detector(network, 1, calibration={"frame": fit}), toy(3, seed=7).images
 
 
@@ -65,6 +65,24 @@ def test_a_detector_finds_the_same_with_either_engine(trained, tmp_path):
     # bfloat16 where the processor has it: a network trained for seconds may then prefer the other of two equal peaks.
     assert np.nanmedian(np.linalg.norm(a.u - b.u, axis=2)) < 0.2
     assert Detector.load(tmp_path / "weights.safetensors").engine == default_engine() == "openvino"
+
+
+@pytest.mark.parametrize("engine", ["torch", pytest.param("openvino", marks=needs_openvino)])
+def test_the_mean_with_the_mirror_image_does_not_know_left_from_right(engine):
+    torch.manual_seed(0)
+    network = StackedHourglass(HourglassConfig(8, 1, 2)).eval()
+    for head in network.heads:
+        torch.nn.init.normal_(head.weight)
+    images = torch.rand(2, 3, 48, 64)
+    mirrored = accelerated(network, engine, mirror=True)
+    with torch.inference_mode():
+        seen, turned = mirrored(images)[-1].clone(), mirrored(images.flip(-2))[-1]
+        single = network(images)[-1]
+    close = {"atol": 0.02 * float(seen.abs().max())}  # bfloat16 where the processor has it
+    assert torch.allclose(turned, seen.flip(-2)[:, [0, 2, 1]], **close)
+    assert not torch.allclose(seen, single, **close)
+    with pytest.raises(ValueError, match="mirror: needs window_px"):
+        Detector(network, window_network=network, window_px=126, mirror=True)
 
 
 @needs_openvino

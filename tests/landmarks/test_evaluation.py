@@ -41,23 +41,26 @@ def test_calibration_makes_covariances_and_confidence_true(small):
 
 
 def test_fitted_variance_of_known_errors():
-    """Errors drawn with a variance that depends on a feature: the fit finds the dependence, and the mean NEES is 2."""
+    """Errors drawn with a variance that depends on a feature and the landmark: the fit finds both, and NEES is 2."""
     rng = np.random.default_rng(0)
-    features = np.column_stack([np.ones(4000), rng.normal(0, 1, 4000), rng.uniform(0.2, 1, 4000), np.zeros(4000)])
-    sigma = np.exp((0.3 + 0.8 * features[:, 1]) / 2)
-    errors = rng.normal(0, 1, (4000, 2)) * sigma[:, None]
+    features = np.column_stack([np.ones(6000), rng.normal(0, 1, 6000), rng.uniform(0.2, 1, 6000), np.zeros(6000)])
+    landmark = rng.integers(3, size=6000)
+    sigma = np.exp((0.3 + 0.8 * features[:, 1] + np.array([-0.6, 0.2, 0.4])[landmark]) / 2)
+    errors = rng.normal(0, 1, (6000, 2)) * sigma[:, None]
     correct = np.linalg.norm(errors, axis=1) < 2
-    shapes, counted = np.broadcast_to(np.eye(2), (4000, 2, 2)), np.ones(4000, bool)
-    fit = _fit(features, shapes, errors, correct, gross_px=1e9)
-    assert fit.log_variance[0] + 0.6 * fit.log_variance[2] == pytest.approx(0.3, abs=0.1)
+    shapes = np.broadcast_to(np.eye(2), (6000, 2, 2))
+    fit = _fit(features, shapes, errors, correct, landmark, gross_px=1e9)
     assert fit.log_variance[1] == pytest.approx(0.8, abs=0.05)
-    squared = (errors**2).sum(1) / np.exp(features @ np.array(fit.log_variance))
-    assert squared.mean() == pytest.approx(2, abs=0.05)
+    assert np.subtract(fit.by_landmark[1:], fit.by_landmark[0]) == pytest.approx([0.8, 1.0], abs=0.1)
+    log_variance = features @ np.array(fit.log_variance) + np.array(fit.by_landmark)[landmark]
+    squared = (errors**2).sum(1) / np.exp(log_variance)
+    for k in range(3):
+        assert squared[landmark == k].mean() == pytest.approx(2, abs=1e-6)
     confidence = 1 / (1 + np.exp(-features @ np.array(fit.logit)))
     assert metrics.calibration_error(confidence, correct) < 0.05
-    errors[2000:] *= 5  # hard frames teach confidence alone
-    counted[2000:] = False
-    again = _fit(features, shapes, errors, correct, 1e9, counted)
+    counted = np.arange(6000) < 3000
+    errors[~counted] *= 5  # hard frames teach confidence alone
+    again = _fit(features, shapes, errors, correct, landmark, 1e9, counted)
     assert np.allclose(again.log_variance, fit.log_variance, atol=0.15)
     assert np.allclose(again.logit, fit.logit)
 
