@@ -1,105 +1,225 @@
-"""Real frames without kinematics: a small whole-frame detector trained on half a sequence, and the simulated one on it."""
+"""Real frames without kinematics: the shipped finder fine-tuned on half a sequence, and the simulated one as it is.
+
+The finder (the detector's first stage) sees the real frames at full resolution, where the tool is as long as in its
+simulated frames: 20 to 45 px.  Half of what it is fine-tuned on stays simulated, so that it does not forget tools, poses and
+eyes that half a sequence does not show.
+"""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import cv2
 import numpy as np
 
-from lib.geometry import cell_from_image
 from lib.landmarks.augmentation import Augmentation
+from lib.landmarks.dataset import REDUCTION, simulated_samples
 from lib.landmarks.evaluation import Evaluation, evaluate
 from lib.landmarks.inference import Calibration, Detector
-from lib.landmarks.network import HourglassConfig
-from lib.landmarks.training import PRESETS, Samples, train
+from lib.landmarks.training import PRESETS, Samples, Training, TrainingConfig, train
 from lib.recordings import MonocularSequence
+from lib.simulator.rig import IMAGE_SIZE_PX
 
-__all__ = ["detector_of_first_half", "evaluate_on_sequence", "simulated_to_real", "train_on_sequence"]
+__all__ = [
+    "Crops",
+    "Mixed",
+    "evaluate_on_sequence",
+    "finder_alone",
+    "labels",
+    "real_config",
+    "real_samples",
+    "simulated_frames",
+    "simulated_to_real",
+    "train_on_first_half",
+]
 
-#: The networks see these frames reduced by this: the tool is then 14 to 32 px long.
-REDUCTION = 2
-#: Every detection counts: a network trained for seconds has no calibrated confidence.
+#: The data set's first tip is the right one for somebody who looks from the base to the tips, the simulator's the left one.
+TIPS_AS_SIMULATED = [0, 2, 1]
+#: Of the crops that training sees.
+CROP_PX = 128
+#: Magnification that gives the tool (about 34 px) the length it has in the detector's own recordings (about 270 px).
+ZOOM = REDUCTION
+#: Every detection counts: on real frames confidence is not calibrated.
 _ALWAYS = Calibration(logit=(9.0, 0.0, 0.0, 0.0))
+
+
+def labels(sequence: MonocularSequence) -> np.ndarray:
+    """(n, 3, 2) px of base, tip_1, tip_2, the tips named as everywhere else here: tip_1 is the left one."""
+    return sequence.u[:, TIPS_AS_SIMULATED]
+
+
+def real_samples(sequence: MonocularSequence, first: int, end: int) -> Samples:
+    """Frames `first` to `end` - 1 of a sequence in memory."""
+    u = labels(sequence)[first:end]
+    return Samples(np.stack([sequence.image(i) for i in range(first, end)]), u, _visibility(u))
+
+
+def simulated_frames(n: int, *, seed: int = 0, textures: int | None = None) -> Samples:
+    """n simulated whole frames at the finder's resolution, as `lib.landmarks.dataset.frame_samples` reads from shards."""
+    size = tuple(side // REDUCTION for side in IMAGE_SIZE_PX)
+    return simulated_samples(n, seed=seed, size_px=size, textures=textures)
+
+
+@dataclass(frozen=True)
+class Crops:
+    """Squares of `size` px out of larger images, three of four round the tool and the others anywhere."""
+
+    samples: Samples
+    size: int = CROP_PX
+
+    def __post_init__(self) -> None:
+        if min(self.samples.images.shape[1:3]) < self.size:
+            raise ValueError(f"size: {self.size} px do not fit images of {self.samples.images.shape[2:0:-1]} px.")
+
+    def __len__(self) -> int:
+        return len(self.samples)
+
+    def draw(self, index: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        image, u, visibility = self.samples.draw(index, rng)
+        h, w = image.shape[:2]
+        known = np.isfinite(u).all(axis=1)
+        near = rng.random() < 0.75 and known.any()
+        shift = rng.uniform(-0.4, 0.4, 2) * self.size
+        centre = u[known].mean(axis=0) + shift if near else rng.uniform((0, 0), (w, h))
+        x, y = np.clip(np.round(centre - self.size / 2), 0, (w - self.size, h - self.size)).astype(int)
+        return image[y : y + self.size, x : x + self.size], u - (x, y), visibility
+
+    def fixed(self, seed: int = 0) -> Samples:
+        """One drawn crop of every image: validation samples."""
+        rng = np.random.default_rng(seed)
+        images, u, visibility = zip(*(self.draw(i, rng) for i in range(len(self))), strict=True)
+        return Samples(np.stack(images), np.stack(u), np.stack(visibility))
+
+    @property
+    def fingerprint(self) -> str:
+        return f"{self.samples.fingerprint} {self.size}"
+
+
+@dataclass(frozen=True)
+class Mixed:
+    """Real crops, and simulated ones in `share` of the draws."""
+
+    real: Crops
+    simulated: Crops
+    share: float = 0.5
+
+    def __len__(self) -> int:
+        return len(self.real) + len(self.simulated)
+
+    def draw(self, index: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        part = self.simulated if rng.random() < self.share else self.real
+        return part.draw(index % len(part), rng)
+
+    @property
+    def fingerprint(self) -> str:
+        return f"{self.real.fingerprint} {self.simulated.fingerprint} {self.share}"
+
+
+def real_config(steps: int, *, batch: int = 12, seed: int = 0) -> TrainingConfig:
+    """How the finder is fine-tuned."""
+    return replace(
+        PRESETS["best"],
+        augmentation=Augmentation(30.0, (0.65, 1.3), photometric=0.7),
+        steps=steps,
+        batch_size=batch,
+        learning_rate=1e-3,
+        ema=0.99,
+        validate_every=max(1, steps // 3),
+        seed=seed,
+    )
+
+
+def train_on_first_half(
+    sequence: MonocularSequence,
+    detector: Detector,
+    simulated: Samples,
+    config: TrainingConfig,
+    *,
+    folder: Path | None = None,
+    max_seconds: float | None = None,
+    progress: bool = False,
+) -> Training:
+    """The detector's first stage fine-tuned on crops of the first half of a sequence and of simulated frames.
+
+    `config` is one of `real_config`; `folder` keeps checkpoints, from which the same call goes on.  The labels are clicks.
+    """
+    real = Crops(real_samples(sequence, 0, len(sequence) // 2))
+    # What "validates" are crops of training frames: they only fill the log, nothing is chosen by them.
+    few = Crops(_every(real.samples, 8)).fixed()
+    initial = Training(detector.frame_network, [], {"shipped": detector.metadata.get("commit")})
+    config = replace(config, network=detector.frame_network.config)
+    source = Mixed(real, Crops(simulated))
+    return train(config, source, few, folder, initial=initial, max_seconds=max_seconds, progress=progress)
+
+
+def finder_alone(detector: Detector, training: Training | None = None) -> Detector:
+    """The detector's first stage alone, at full resolution; with a training's weights where one is given."""
+    return replace(
+        detector,
+        frame_network=training.network if training else detector.frame_network,
+        tool_network=None,
+        window_network=None,
+        reduction=1,
+        mirror=False,
+        calibration={"frame": _ALWAYS},
+    )
+
+
+def evaluate_on_sequence(
+    detector: Detector, sequence: MonocularSequence, *, second_half: bool = False, every: int = 1
+) -> Evaluation:
+    """A detector on every `every`-th labelled frame of a sequence, or of its second half.
+
+    Consecutive frames are alike, so halves in time are the honest split.
+    """
+    return evaluate(detector, _frames(sequence, len(sequence) // 2 if second_half else 0, every))
+
+
+def simulated_to_real(
+    detector: Detector, sequence: MonocularSequence, *, every: int = 8, zoom: float = ZOOM
+) -> Evaluation:
+    """The shipped detector on real frames, magnified by `zoom` to the tool's size in its own recordings.
+
+    It has seen no real frame.  The result is in the frames' own pixels.
+    """
+    detector = replace(detector, calibration={stage: _always(fit) for stage, fit in detector.calibration.items()})
+    size = tuple(round(zoom * s) for s in sequence.image_size_px)
+    frames = (
+        (name, cv2.resize(image, size, interpolation=cv2.INTER_CUBIC), zoom * u + (zoom - 1) / 2, visibility)
+        for name, image, u, visibility in _frames(sequence, 0, every)
+    )
+    found = evaluate(detector, frames)
+    landmarks = replace(
+        found.landmarks,
+        u=_reduced(found.landmarks.u, zoom),
+        covariance=found.landmarks.covariance / zoom**2,
+    )
+    return replace(found, landmarks=landmarks, u_true=_reduced(found.u_true, zoom), length_px=found.length_px / zoom)
+
+
+def _reduced(u: np.ndarray, zoom: float) -> np.ndarray:
+    return (u + 0.5) / zoom - 0.5
+
+
+def _always(fit: Calibration) -> Calibration:
+    return replace(fit, logit=_ALWAYS.logit)
+
+
+def _every(samples: Samples, n: int) -> Samples:
+    return Samples(samples.images[::n], samples.u[::n], samples.visibility[::n])
 
 
 def _visibility(u: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(u).all(axis=-1), 2, 0)
 
 
-def detector_of_first_half(
-    sequence: MonocularSequence, *, steps: int = 150, max_seconds: float | None = None, seed: int = 0
-) -> Detector:
-    """A small whole-frame detector trained on the first half of a sequence; the labels are clicks."""
-    half = len(sequence) // 2
-    images = np.stack([_reduce(sequence.image(i)) for i in range(half)])
-    u = cell_from_image(sequence.u[:half], REDUCTION)
-    samples = Samples(images, u, _visibility(u))
-    config = replace(
-        PRESETS["best"],
-        network=HourglassConfig(24, 1, 4),
-        augmentation=Augmentation(20.0, (0.85, 1.15), shift=0.1, photometric=0.3),
-        steps=steps,
-        batch_size=4,
-        learning_rate=4e-3,
-        ema=0.95,
-        validate_every=steps,
-        seed=seed,
-    )
-    # The few frames that "validate" only fill the log; nothing is chosen by them.
-    few = Samples(images[-4:], u[-4:], _visibility(u[-4:])) if np.isfinite(u[-4:]).any() else samples
-    trained = train(config, samples, few, max_seconds=max_seconds, progress=False)
-    return Detector(trained.network, REDUCTION, calibration={"frame": _ALWAYS})
-
-
-def evaluate_on_sequence(
-    detector: Detector, sequence: MonocularSequence, *, second_half: bool = False, every: int = 1
-) -> Evaluation:
-    """A detector on every `every`-th labelled frame of a sequence, or of its second half."""
-    return evaluate(detector, _frames(sequence, len(sequence) // 2 if second_half else 0, every))
-
-
-def train_on_sequence(
-    sequence: MonocularSequence,
-    *,
-    steps: int = 150,
-    max_seconds: float | None = None,
-    every: int = 3,
-    seed: int = 0,
-) -> Evaluation:
-    """Train on the first half of a sequence, test on every `every`-th frame of the second.
-
-    Consecutive frames are alike, so halves in time are the honest split.
-    """
-    detector = detector_of_first_half(sequence, steps=steps, max_seconds=max_seconds, seed=seed)
-    return evaluate_on_sequence(detector, sequence, second_half=True, every=every)
-
-
-def simulated_to_real(
-    detector: Detector, sequence: MonocularSequence, *, every: int = 8, zoom: float = 3.0
-) -> Evaluation:
-    """The shipped detector on real frames, magnified by `zoom` to the tool's size in its own recordings.
-
-    It has seen no real frame.  What it misses counts as wrong.
-    """
-    size = tuple(round(zoom * s) for s in sequence.image_size_px)
-    frames = (
-        (name, cv2.resize(image, size, interpolation=cv2.INTER_CUBIC), zoom * u + (zoom - 1) / 2, visibility)
-        for name, image, u, visibility in _frames(sequence, 0, every)
-    )
-    return evaluate(detector, frames)
-
-
-def _reduce(image: np.ndarray) -> np.ndarray:
-    return cv2.resize(image, None, fx=1 / REDUCTION, fy=1 / REDUCTION, interpolation=cv2.INTER_AREA)
-
-
-def _frames(sequence: MonocularSequence, first: int, every: int):
+def _frames(
+    sequence: MonocularSequence, first: int, every: int
+) -> Iterator[tuple[str, np.ndarray, np.ndarray, np.ndarray]]:
+    u = labels(sequence)
     for i in range(first, len(sequence), every):
-        if np.isfinite(sequence.u[i]).any():
-            yield (
-                f"{sequence.name} {sequence.frame_numbers[i]}",
-                sequence.image(i),
-                sequence.u[i],
-                _visibility(sequence.u[i]),
-            )
+        if np.isfinite(u[i]).any():
+            name = f"{sequence.name} {sequence.frame_numbers[i]}"
+            yield name, sequence.image(i), u[i], _visibility(u[i])
