@@ -147,7 +147,7 @@ def train_on_first_half(
     """
     real = Crops(real_samples(sequence, 0, len(sequence) // 2))
     # What "validates" are crops of training frames: they only fill the log, nothing is chosen by them.
-    few = Crops(_every(real.samples, 8)).fixed()
+    few = Crops(_every(real.samples, 1 + len(real) // 25)).fixed()
     initial = Training(detector.frame_network, [], {"shipped": detector.metadata.get("commit")})
     config = replace(config, network=detector.frame_network.config)
     source = Mixed(real, Crops(simulated))

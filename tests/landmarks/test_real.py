@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from lib import paths
-from lib.landmarks import Detector, real
+from lib.landmarks import Detector, real, studies
 from lib.landmarks.metrics import tool_length_px
 from lib.landmarks.network import HourglassConfig, StackedHourglass
 from lib.landmarks.training import Samples
@@ -110,6 +110,33 @@ def test_simulated_frames_have_the_finders_size():
     samples = real.simulated_frames(2, textures=1)
     assert samples.images.shape == (2, 135, 240, 3)
     assert (side(samples.u) < 0).all()  # tip_1 is the left one
+
+
+def test_the_study_records_each_kind_of_test(sequence, detector, toy_shards, tmp_path, monkeypatch):
+    toy_shards(tmp_path, 2, size=(1080, 1920))
+    both = [sequence, replace(sequence, name="other")]
+    monkeypatch.setattr(studies, "import_retinal_microsurgery", lambda folder: both)
+    monkeypatch.setattr(studies.paths, "real_data", lambda name: tmp_path)
+    monkeypatch.setattr(studies.Detector, "load", classmethod(lambda cls: detector))
+    recorded = {}
+    options = studies.Options(
+        tmp_path, tmp_path, tmp_path / "kept", seeds=1, steps=1, batch=2, features=4, shards=1, progress=False,
+        record=recorded.update,
+    )  # fmt: skip
+    studies.real_frames(options)
+    results = recorded["results"]
+    assert set(results) == {
+        *(f"{name}: {how}" for name in ("toy", "other") for how in ("first half to second", "simulated frames only")),
+        "toy: first half to other",
+        "other: first half to toy",
+    }
+    assert results["toy: first half to second"]["frames"] == 4
+    assert results["toy: first half to other"]["frames"] == 8
+    assert len(results["toy: first half to second"]["curve"]) == len(recorded["thresholds"]) == 10
+    assert set(results["toy: first half to second"]["pck_0.20_by_landmark"]) == {"base", "tip_1", "tip_2"}
+    assert (recorded["budget"]["steps"], recorded["budget"]["features"]) == (1, 4)
+    assert recorded["budget"]["real_frames"] == {"toy": 4, "other": 4}
+    assert set(options.trained_s) == {"toy/seed0", "other/seed0"}
 
 
 @pytest.mark.skipif(RETINAL is None, reason=paths.missing_data_line("retinal_microsurgery"))
