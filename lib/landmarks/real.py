@@ -15,12 +15,11 @@ import cv2
 import numpy as np
 
 from lib.landmarks.augmentation import Augmentation
-from lib.landmarks.dataset import REDUCTION, simulated_samples
+from lib.landmarks.dataset import REDUCTION
 from lib.landmarks.evaluation import Evaluation, evaluate
 from lib.landmarks.inference import Calibration, Detector
 from lib.landmarks.training import PRESETS, Samples, Training, TrainingConfig, train
 from lib.recordings import MonocularSequence
-from lib.simulator.rig import IMAGE_SIZE_PX
 
 __all__ = [
     "Crops",
@@ -28,9 +27,9 @@ __all__ = [
     "evaluate_on_sequence",
     "finder_alone",
     "labels",
+    "quick_config",
     "real_config",
     "real_samples",
-    "simulated_frames",
     "simulated_to_real",
     "train_on_first_half",
 ]
@@ -54,12 +53,6 @@ def real_samples(sequence: MonocularSequence, first: int, end: int) -> Samples:
     """Frames `first` to `end` - 1 of a sequence in memory."""
     u = labels(sequence)[first:end]
     return Samples(np.stack([sequence.image(i) for i in range(first, end)]), u, _visibility(u))
-
-
-def simulated_frames(n: int, *, seed: int = 0, textures: int | None = None) -> Samples:
-    """n simulated whole frames at the finder's resolution, as `lib.landmarks.dataset.frame_samples` reads from shards."""
-    size = tuple(side // REDUCTION for side in IMAGE_SIZE_PX)
-    return simulated_samples(n, seed=seed, size_px=size, textures=textures)
 
 
 @dataclass(frozen=True)
@@ -131,10 +124,21 @@ def real_config(steps: int, *, batch: int = 12, seed: int = 0) -> TrainingConfig
     )
 
 
+def quick_config(steps: int, *, seed: int = 0) -> TrainingConfig:
+    """For a minute or less, on real crops alone: small batches, mild augmentation."""
+    return replace(
+        real_config(steps, batch=6, seed=seed),
+        augmentation=Augmentation(15.0, (0.85, 1.15)),
+        learning_rate=2e-3,
+        ema=0.97,
+        validate_every=steps,
+    )
+
+
 def train_on_first_half(
     sequence: MonocularSequence,
     detector: Detector,
-    simulated: Samples,
+    simulated: Samples | None,
     config: TrainingConfig,
     *,
     folder: Path | None = None,
@@ -143,14 +147,21 @@ def train_on_first_half(
 ) -> Training:
     """The detector's first stage fine-tuned on crops of the first half of a sequence and of simulated frames.
 
-    `config` is one of `real_config`; `folder` keeps checkpoints, from which the same call goes on.  The labels are clicks.
+    Parameters
+    ----------
+    simulated:
+        Whole frames at the finder's resolution, half of what is drawn; None = real frames alone.
+    config:
+        `real_config` or `quick_config`.
+    folder:
+        Keeps checkpoints, from which the same call goes on.
     """
     real = Crops(real_samples(sequence, 0, len(sequence) // 2))
     # What "validates" are crops of training frames: they only fill the log, nothing is chosen by them.
     few = Crops(_every(real.samples, 1 + len(real) // 25)).fixed()
     initial = Training(detector.frame_network, [], {"shipped": detector.metadata.get("commit")})
     config = replace(config, network=detector.frame_network.config)
-    source = Mixed(real, Crops(simulated))
+    source = Mixed(real, Crops(simulated)) if simulated is not None else real
     return train(config, source, few, folder, initial=initial, max_seconds=max_seconds, progress=progress)
 
 

@@ -91,6 +91,8 @@ def test_only_the_first_half_is_trained_on(sequence, toy, detector, tmp_path, mo
     assert again.provenance["steps"] == trained.provenance["steps"] == 2
     assert again.provenance["seconds"] == trained.provenance["seconds"]
     assert trained.network.config == detector.frame_network.config
+    quick = real.train_on_first_half(sequence, detector, None, real.quick_config(1))
+    assert quick.provenance["images"] == 4  # no simulated frame
     tuned = real.finder_alone(detector, trained)
     assert tuned.reduction == 1 and list(tuned.networks) == ["frame"]
 
@@ -104,12 +106,6 @@ def test_evaluation_names_tips_as_the_simulator(sequence, detector, toy):
     magnified = real.simulated_to_real(detector, sequence, every=8, zoom=2.0)
     np.testing.assert_allclose(magnified.u_true[0], toy(8, size=(144, 160)).u[0])
     np.testing.assert_allclose(magnified.length_px, tool_length_px(magnified.u_true))
-
-
-def test_simulated_frames_have_the_finders_size():
-    samples = real.simulated_frames(2, textures=1)
-    assert samples.images.shape == (2, 135, 240, 3)
-    assert (side(samples.u) < 0).all()  # tip_1 is the left one
 
 
 def test_the_study_records_each_kind_of_test(sequence, detector, toy_shards, tmp_path, monkeypatch):
