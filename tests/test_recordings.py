@@ -434,7 +434,7 @@ def test_retinal_microsurgery_layout(tmp_path):
         cv2.imwrite(str(sequence / f"{number:06d}.jpg"), np.zeros((6, 8, 3), np.uint8))
     (read,) = import_retinal_microsurgery(tmp_path)
     assert (read.name, len(read), read.image_size_px) == ("seq1", 2, (8, 6))
-    np.testing.assert_array_equal(read.u[0], [[3, 4], [5, 6], [7, 8]])
+    np.testing.assert_array_equal(read.u[0], [[3, 4], [7, 8], [5, 6]])  # the left tip first
     assert np.isnan(read.u[1, 0]).all()
     assert read.image(1).shape == (6, 8, 3)
     with pytest.raises(FileNotFoundError, match=r"landmarks\.csv"):

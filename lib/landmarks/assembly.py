@@ -17,16 +17,16 @@ from lib.records import commit_id, machine
 
 __all__ = ["assemble"]
 
-#: Of a recording's frames so many give one to the fit of the covariances.
-TYPICAL_EVERY = 4
+#: So many images of each recording go into the calibration, from its beginning to its end.
+_IMAGES = 16
 
 
 def assemble(folder: str | Path, data: str | Path, out: str | Path, recordings: Sequence[str | Path] = ()) -> Detector:
     """Join ``frame/``, ``tool/`` and ``window/`` of a training folder, calibrate, write `out` and its card.
 
-    Half of the validation frames calibrate, the other half give the figures on the card.  The covariances are fitted on
-    labelled `recordings` where there are any: moderate frames as they will be measured, where the validation frames vary
-    more than those of any microscope.  None of either was trained on.
+    Half of the validation frames calibrate, the other half give the figures on the card; then all calibrate.  Labelled
+    `recordings` calibrate too where there are any: moderate frames as they will be measured, where the validation frames
+    vary more than those of any microscope.  None of either was trained on.
 
     Raises
     ------
@@ -39,7 +39,11 @@ def assemble(folder: str | Path, data: str | Path, out: str | Path, recordings: 
     if not frames:
         raise FileNotFoundError(f"{data}: no validation shard; make some with `python3 -m lib train generate`.")
     opened = [Recording.open(path) for path in recordings]
-    typical = [frame for recording in opened for frame in labelled_frames(recording, every=TYPICAL_EVERY)]
+    typical = [
+        frame
+        for recording in opened
+        for frame in labelled_frames(recording, every=max(1, 2 * len(recording.frames) // _IMAGES))
+    ]
     detector = Detector(
         stages["frame"].network,
         REDUCTION,
@@ -48,8 +52,8 @@ def assemble(folder: str | Path, data: str | Path, out: str | Path, recordings: 
         tool_reduction=TOOL_REDUCTION,
         mirror=True,
     )
-    held_out = evaluate(calibrate(detector, frames[::2], typical), frames[1::2])
-    detector = calibrate(detector, frames, typical)
+    held_out = evaluate(calibrate(detector, frames[::2] + typical), frames[1::2])
+    detector = calibrate(detector, frames + typical)
     keys = ("data", "images", "commit", "steps", "seconds", "config", "metrics", "before")
     provenance = {
         "trained_on": "simulated frames only (lib.simulator.training); no eye or tool of a shipped recording",
@@ -57,8 +61,8 @@ def assemble(folder: str | Path, data: str | Path, out: str | Path, recordings: 
         "machine": machine(),
         "stages": {name: {key: training.provenance.get(key) for key in keys} for name, training in stages.items()},
         "validation_frames": len(frames),
-        "covariance_frames": len(typical),
-        "covariance_recordings": [recording.name for recording in opened],
+        "recorded_frames": len(typical),
+        "recordings": len(opened),
         "metrics": held_out.scores.as_dict()
         | {
             "confidence_calibration_error": calibration_error(held_out.landmarks.confidence, held_out.correct),
@@ -115,11 +119,11 @@ def card(detector: Detector, path: Path) -> str:
         "",
         *(
             [
-                f"Covariances are fitted on {p['covariance_frames']} frames of the simulated recordings "
-                f"{', '.join(p['covariance_recordings'])}, confidence on these and the validation frames.",
+                f"Covariance and confidence are fitted on the validation frames and {p['recorded_frames']} frames of "
+                f"{p['recordings']} simulated recordings, each with an eye and a tool of its own.",
                 "",
             ]
-            if p.get("covariance_frames")
+            if p.get("recordings")
             else []
         ),
         f"Held-out simulated full-HD frames ({p['validation_frames'] // 2}, neither trained nor calibrated on):",

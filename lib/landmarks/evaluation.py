@@ -16,7 +16,7 @@ from tqdm.auto import tqdm
 
 from lib.geometry import image_from_cell
 from lib.landmarks.heatmaps import DECODERS, decode
-from lib.landmarks.inference import Calibration, Detector, Landmarks, _missing, joined, shape_and_features
+from lib.landmarks.inference import Calibration, Detector, Landmarks, _missing, features_of, joined
 from lib.landmarks.metrics import Scores, errors_px, pck, score, tool_length_px
 from lib.landmarks.network import LANDMARKS
 from lib.landmarks.windows import map_points
@@ -188,31 +188,25 @@ def evaluate_recording(
 def calibrate(
     detector: Detector,
     frames: Iterable[tuple[str, np.ndarray, np.ndarray, np.ndarray]],
-    typical: Iterable[tuple[str, np.ndarray, np.ndarray, np.ndarray]] = (),
     *,
     progress: bool = False,
 ) -> Detector:
     """The detector with covariance and confidence fitted to its errors on validation frames, never trained on.
 
-    Variance: maximum likelihood of the errors below `GROSS_PX` (and of the first stage's below six times that), log
-    linear in the peak's features; its intercept makes the mean normalised squared error of each landmark 2.  Confidence:
-    logistic regression of "in view and within 5 % of the tool's length" on the same features.
+    Variances: maximum likelihood of the errors below `GROSS_PX` (and of the first stage's below six times that), log
+    linear in the peak's features; their constants make the mean normalised squared error of each landmark 2.
+    Confidence: logistic regression of "in view and within 5 % of the tool's length" on the same features.
 
     Parameters
     ----------
     frames:
-        As for `evaluate`; easy and hard, since confidence is learnt from failures.
-    typical:
-        Frames of the kind that will be measured, where they differ from `frames`: the variance is fitted on them alone,
-        confidence on both.
+        As for `evaluate`; easy and hard, since confidence is learnt from failures, and of many tools, since what makes
+        errors alike is the tool.
     """
     frames = list(frames)
-    typical = list(typical)
-    only_confidence = len(frames) if typical else 0
-    frames = [*frames, *typical]
     rough: list[Landmarks] = []
     for stage in detector.networks:
-        features, shapes, errors, correct, landmark, counted = [], [], [], [], [], []
+        features, errors, correct, landmark = [], [], [], []
         zoom = 1.0
         for i, (_, image, u, v) in enumerate(tqdm(frames, disable=not progress, unit="image", desc=stage)):
             in_view = np.isfinite(u).all(1) & (np.asarray(v) > 0)
@@ -221,26 +215,24 @@ def calibrate(
             if stage == "frame":
                 peaks, _ = detector.frame_peaks(image[None])
                 which = np.indices((1, 3)).reshape(2, 3).T
-                shape, feature = (part[0].numpy() for part in shape_and_features(peaks.double(), detector.reduction))
+                feature = features_of(peaks.double(), detector.reduction)[0].numpy()
                 difference = image_from_cell(peaks.u[0].double().numpy(), detector.reduction) - labels
             else:
                 peaks, matrices, which = detector.stage_peaks(image[None], rough[i].u, stage)
                 if not len(which):
                     continue
-                shape, feature = (part[:, 0].numpy() for part in shape_and_features(peaks.double(), 1))
+                feature = features_of(peaks.double(), 1)[:, 0].numpy()
                 # Errors in the windows' pixels, as the stage's covariance is.
                 difference = peaks.u[:, 0].double().numpy() - map_points(matrices, labels[which[:, 1]])
                 zoom = np.sqrt(np.linalg.det(matrices[0, :, :2]))
             features.append(feature)
-            shapes.append(shape)
             errors.append(difference)
             landmark.append(which[:, 1])
-            counted.append(np.full(len(difference), i >= only_confidence))
             with np.errstate(invalid="ignore"):
                 correct.append(np.linalg.norm(difference, axis=1) <= tolerance * zoom)
-        together = (np.concatenate(part) for part in (features, shapes, errors, correct, landmark))
+        together = (np.concatenate(part) for part in (features, errors, correct, landmark))
         gross = {"frame": 6 * GROSS_PX, "tool": 2 * GROSS_PX * zoom, "window": GROSS_PX}[stage]
-        detector = detector.with_calibration(**{stage: _fit(*together, gross, np.concatenate(counted))})
+        detector = detector.with_calibration(**{stage: _fit(*together, gross)})
         # What the next stage starts from.
         if stage == "frame":
             rough = [
@@ -278,33 +270,25 @@ def compare_decoders(
 
 
 def _fit(
-    features: np.ndarray,
-    shapes: np.ndarray,
-    errors: np.ndarray,
-    correct: np.ndarray,
-    landmark: np.ndarray,
-    gross_px: float,
-    counted: np.ndarray | bool = True,
+    features: np.ndarray, errors: np.ndarray, correct: np.ndarray, landmark: np.ndarray, gross_px: float
 ) -> Calibration:
-    """Fit to m peaks; the variance to those that are `counted`, (m,) bool."""
+    """Fit to m peaks: features (m, 4), errors (m, 2), correct (m,), and which landmark each is, (m,)."""
     size = np.linalg.norm(errors, axis=1)
-    use = counted & np.isfinite(size) & (size < gross_px)
+    use = np.isfinite(size) & (size < gross_px)
     if use.sum() < 20:
         raise ValueError(f"frames: only {use.sum()} landmarks to calibrate on; give at least 20.")
-    x, e = features[use], errors[use]
-    squared = np.einsum("ni,nij,nj->n", e, np.linalg.inv(shapes[use]), e)
+    x = np.column_stack([landmark[use, None] == np.arange(3), features[use, 1:]]).astype(float)
 
-    def deviance(beta: np.ndarray) -> tuple[float, np.ndarray]:
-        log_variance = x @ beta
-        ratio = squared * np.exp(-log_variance) / 2
-        ridge = 1e-3 * np.array([0.0, 1.0, 1.0, 1.0])
-        return (log_variance + ratio).mean() + ridge @ beta**2, x.T @ (1 - ratio) / len(x) + 2 * ridge * beta
+    def variance(squared: np.ndarray) -> tuple[float, ...]:
+        def deviance(beta: np.ndarray) -> tuple[float, np.ndarray]:
+            log_variance = x @ beta
+            ratio = squared * np.exp(-log_variance)
+            slopes = 1e-3 * np.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])
+            value = (log_variance + ratio).mean() + slopes @ beta**2
+            return value, x.T @ (1 - ratio) / len(x) + 2 * slopes * beta
 
-    start = np.array([np.log(max(squared.mean() / 2, 1e-6)), 0.0, 0.0, 0.0])
-    log_variance = minimize(deviance, start, jac=True, method="L-BFGS-B").x
-    ratio = squared * np.exp(-x @ log_variance) / 2
-    each = [ratio[landmark[use] == k] for k in range(3)]
-    by_landmark = [float(np.log(r.mean())) if len(r) >= 20 and r.any() else 0.0 for r in each]
+        start = np.array([np.log(max(squared.mean(), 1e-6))] * 3 + [0.0] * 3)
+        return tuple(map(float, minimize(deviance, start, jac=True, method="L-BFGS-B").x))
 
     y = correct.astype(float)
 
@@ -315,7 +299,7 @@ def _fit(
         return (np.logaddexp(0, z) - y * z).mean() + ridge @ beta**2, features.T @ (p - y) / len(y) + 2 * ridge * beta
 
     logit = minimize(cost, np.array([-4.0, 0.0, 8.0, 0.0]), jac=True, method="L-BFGS-B").x
-    return Calibration(tuple(map(float, log_variance)), tuple(map(float, logit)), tuple(by_landmark))
+    return Calibration(tuple(variance(errors[use, axis] ** 2) for axis in (0, 1)), tuple(map(float, logit)))
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -58,7 +58,7 @@ class StageWithDecoding(nn.Module):
         self.stride, self.method = network.stride, detector.method
         self.scale = detector.reduction if stage == "frame" else 1
         fit = detector.calibration.get(stage, Calibration())
-        self.register_buffer("log_variance", torch.tensor(fit.of_landmarks, dtype=torch.float32))
+        self.register_buffer("log_variance", torch.tensor(fit.coefficients, dtype=torch.float32))
         self.register_buffer("logit", torch.tensor(fit.logit))
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -35,7 +36,7 @@ __all__ = ["Calibration", "Detector", "Landmarks", "as_tensor", "joined", "read_
 FORMAT = "microstereo.detector"
 #: Of the code between weights and landmarks (windows, decoding, what is missing): raised with every change of it that moves
 #: landmarks, so that kept detections are made anew.
-CODE_VERSION = 2
+CODE_VERSION = 3
 #: Landmarks below this confidence are missing: NaN.
 MIN_CONFIDENCE = 0.05
 
@@ -70,18 +71,39 @@ class Landmarks:
 class Calibration:
     """What makes covariance and confidence true, fitted on validation images (`lib.landmarks.evaluation.calibrate`).
 
-    log of the error's variance per coordinate = `log_variance` . features + `by_landmark`; logit of the confidence =
-    `logit` . features; the features of a peak are in `peak_features`.  The shape of the ellipse is the fit's.
+    The covariance of a peak is diagonal in the axes of its stage's input: in the upright windows along the tool and across
+    it, where errors are as different as the image is sharp.  log of the variance in px^2 = coefficients . features,
+    logit of the confidence = `logit` . features; the features are in `peak_features`.
+
+    Attributes
+    ----------
+    log_variance:
+        (2, 6): for x and y the constants of base, tip_1 and tip_2, and the slopes of the other three features.
+    logit:
+        (4,).
     """
 
-    log_variance: tuple[float, ...] = (0.0, 1.0, 0.0, 0.0)
+    log_variance: tuple[tuple[float, ...], ...] = ((0.0, 0.0, 0.0, 1.0, 0.0, 0.0),) * 2
     logit: tuple[float, ...] = (-4.0, 0.0, 8.0, 0.0)
-    by_landmark: tuple[float, ...] = (0.0, 0.0, 0.0)
+
+    @classmethod
+    def of(cls, log_variance: Sequence[Sequence[float]], logit: Sequence[float], **older: object) -> Calibration:
+        """From the lists that JSON keeps.
+
+        Raises
+        ------
+        ValueError
+            For lists of other lengths.
+        """
+        if np.shape(log_variance) != (2, 6) or np.shape(logit) != (4,):
+            raise ValueError("calibration: is of another version; make it anew (`train assemble`, or the study).")
+        return cls(tuple(map(tuple, log_variance)), tuple(logit))
 
     @property
-    def of_landmarks(self) -> np.ndarray:
-        """Coefficients (3, 4) of the features in each landmark's log variance: the first feature is 1."""
-        return np.array(self.log_variance) + np.outer(self.by_landmark, [1.0, 0.0, 0.0, 0.0])
+    def coefficients(self) -> np.ndarray:
+        """(3, 2, 4): of the features in each landmark's log variance along x and y."""
+        rows = np.array(self.log_variance)
+        return np.stack([np.column_stack([rows[:, k], rows[:, 3:]]) for k in range(3)])
 
 
 def peak_features(variance_px2: Tensor, value: Tensor, width: Tensor) -> Tensor:
@@ -90,23 +112,22 @@ def peak_features(variance_px2: Tensor, value: Tensor, width: Tensor) -> Tensor:
     return torch.stack([torch.ones_like(value), variance, value.clamp(-0.5, 1.5), width.log().abs()], dim=-1)
 
 
-def shape_and_features(peaks: Peaks, scale: float) -> tuple[Tensor, Tensor]:
-    """Shape of the ellipses, (..., 2, 2) of determinant 1, and `peak_features` (..., 4); `scale` image pixels a pixel."""
+def features_of(peaks: Peaks, scale: float) -> Tensor:
+    """`peak_features` (..., 4) of peaks whose pixels are `scale` image pixels."""
     covariance = peaks.covariance * scale**2
     covariance = torch.where(torch.isfinite(covariance), covariance, torch.eye(2, dtype=covariance.dtype))
     (xx, xy), (yx, yy) = (row.unbind(-1) for row in covariance.unbind(-2))
-    size = (xx * yy - xy * yx).clamp_min(1e-12).sqrt()
-    return covariance / size[..., None, None], peak_features(size, peaks.value, peaks.width)
+    return peak_features((xx * yy - xy * yx).clamp_min(1e-12).sqrt(), peaks.value, peaks.width)
 
 
 def calibrated(peaks: Peaks, scale: float, log_variance: Tensor, logit: Tensor) -> tuple[Tensor, Tensor]:
     """Covariance (..., 2, 2) px^2 and confidence (...) of peaks; torch can trace it.
 
-    `log_variance` (..., 4) are the coefficients of each peak's landmark (`Calibration.of_landmarks`), `logit` is (4,).
+    `log_variance` (..., 2, 4) are the `Calibration.coefficients` of each peak's landmark, `logit` is (4,).
     """
-    shape, features = shape_and_features(peaks, scale)
-    variance = (features * log_variance).sum(-1).clamp(-12, 12).exp()
-    return shape * variance[..., None, None], torch.sigmoid((features * logit).sum(-1))
+    features = features_of(peaks, scale)
+    variance = (features[..., None, :] * log_variance).sum(-1).clamp(-12, 12).exp()
+    return variance[..., None] * torch.eye(2, dtype=variance.dtype), torch.sigmoid((features * logit).sum(-1))
 
 
 def as_tensor(images: ArrayLike | Tensor) -> Tensor:
@@ -266,9 +287,7 @@ class Detector:
             tool_reduction=metadata["tool_reduction"],
             window_px=metadata["window_px"],
             method=metadata["method"],
-            calibration={
-                name: Calibration(*(tuple(values) for values in fit)) for name, fit in metadata["calibration"].items()
-            },
+            calibration={name: Calibration.of(*fit) for name, fit in metadata["calibration"].items()},
             metadata=metadata["provenance"],
             mirror=metadata.get("mirror", False),
             engine=engine or default_engine(),
@@ -288,9 +307,7 @@ class Detector:
             "window_px": self.window_px,
             "method": self.method,
             "mirror": self.mirror,
-            "calibration": {
-                name: [fit.log_variance, fit.logit, fit.by_landmark] for name, fit in self.calibration.items()
-            },
+            "calibration": {name: [fit.log_variance, fit.logit] for name, fit in self.calibration.items()},
             "provenance": self.metadata,
         }
         write_checkpoint(path, tensors, metadata)
@@ -448,7 +465,7 @@ class Detector:
         """Peaks in pixels of a network's input to landmarks in image pixels; `landmark` says which each peak is."""
         u = image_from_cell(peaks.u.numpy(), scale)
         fit = self.calibration.get(source, Calibration())
-        rows = (torch.as_tensor(row, dtype=torch.float64) for row in (fit.of_landmarks[landmark], fit.logit))
+        rows = (torch.as_tensor(row, dtype=torch.float64) for row in (fit.coefficients[landmark], fit.logit))
         covariance, confidence = calibrated(peaks.double(), scale, *rows)
         return Landmarks(u, covariance.numpy(), confidence.numpy())
 

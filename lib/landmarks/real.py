@@ -26,7 +26,6 @@ __all__ = [
     "Mixed",
     "evaluate_on_sequence",
     "finder_alone",
-    "labels",
     "quick_config",
     "real_config",
     "real_samples",
@@ -34,8 +33,6 @@ __all__ = [
     "train_on_first_half",
 ]
 
-#: The data set's first tip is the right one for somebody who looks from the base to the tips, the simulator's the left one.
-TIPS_AS_SIMULATED = [0, 2, 1]
 #: Of the crops that training sees.
 CROP_PX = 128
 #: Magnification that gives the tool (about 34 px) the length it has in the detector's own recordings (about 270 px).
@@ -44,14 +41,9 @@ ZOOM = REDUCTION
 _ALWAYS = Calibration(logit=(9.0, 0.0, 0.0, 0.0))
 
 
-def labels(sequence: MonocularSequence) -> np.ndarray:
-    """(n, 3, 2) px of base, tip_1, tip_2, the tips named as everywhere else here: tip_1 is the left one."""
-    return sequence.u[:, TIPS_AS_SIMULATED]
-
-
 def real_samples(sequence: MonocularSequence, first: int, end: int) -> Samples:
     """Frames `first` to `end` - 1 of a sequence in memory."""
-    u = labels(sequence)[first:end]
+    u = sequence.u[first:end]
     return Samples(np.stack([sequence.image(i) for i in range(first, end)]), u, _visibility(u))
 
 
@@ -229,7 +221,7 @@ def _visibility(u: np.ndarray) -> np.ndarray:
 def _frames(
     sequence: MonocularSequence, first: int, every: int
 ) -> Iterator[tuple[str, np.ndarray, np.ndarray, np.ndarray]]:
-    u = labels(sequence)
+    u = sequence.u
     for i in range(first, len(sequence), every):
         if np.isfinite(u[i]).any():
             name = f"{sequence.name} {sequence.frame_numbers[i]}"

@@ -19,7 +19,7 @@ from lib import paths
 from lib.geometry import cell_from_image, image_from_cell
 from lib.landmarks.dataset import WindowSource
 from lib.landmarks.evaluation import GROSS_PX, _fit
-from lib.landmarks.inference import Calibration, Detector, Landmarks, shape_and_features
+from lib.landmarks.inference import Calibration, Detector, Landmarks, features_of
 from lib.landmarks.metrics import tool_length_px
 from lib.landmarks.network import StackedHourglass
 from lib.landmarks.training import load_training
@@ -113,13 +113,13 @@ class ReducedDetector:
         `u` (n, 3, 2) and `visibility` (n, 3) are their labels, `rough` where the finder sees the landmarks.
         """
         labels = np.where((np.isfinite(u).all(2) & (visibility > 0))[..., None], u, np.nan)
-        features, shapes, errors, correct, landmark = [], [], [], [], []
+        features, errors, correct, landmark = [], [], [], []
         for i in range(len(images)):
             small, at, stride = self.reduced(images[i : i + 1], rough.u[i : i + 1])
             peaks, matrices, which = self._last.stage_peaks(small, at, "window")
             if not len(which):
                 continue
-            shape, feature = (part[:, 0].numpy() for part in shape_and_features(peaks.double(), 1))
+            feature = features_of(peaks.double(), 1)[:, 0].numpy()
             true = cell_from_image(labels[i], stride)[which[:, 1]]
             difference = peaks.u[:, 0].double().numpy() - map_points(matrices, true)
             turned = np.linalg.inv(matrices[:, :, :2]) @ difference[..., None]
@@ -127,11 +127,10 @@ class ReducedDetector:
             with np.errstate(invalid="ignore"):
                 correct.append(distance <= 0.05 * tool_length_px(u[i : i + 1])[0])
             features.append(feature)
-            shapes.append(shape)
             errors.append(difference)
             landmark.append(which[:, 1])
         gross = GROSS_PX * window_side_px(self.size_px) / FIELD_PX
-        fit = _fit(*(np.concatenate(part) for part in (features, shapes, errors, correct, landmark)), gross_px=gross)
+        fit = _fit(*(np.concatenate(part) for part in (features, errors, correct, landmark)), gross_px=gross)
         return replace(self, calibration=fit)
 
     def save_calibration(self, folder: Path) -> None:
@@ -164,6 +163,6 @@ def load_resolution(
     network = load_training(folder / "last.safetensors").network
     fit = Calibration()
     if (folder / "calibration.json").is_file():
-        fit = Calibration(**{k: tuple(v) for k, v in json.loads((folder / "calibration.json").read_text()).items()})
+        fit = Calibration.of(**json.loads((folder / "calibration.json").read_text()))
     finder = finder or Detector.load()
     return ReducedDetector(replace(finder, window_network=None), network, RESOLUTIONS[name], fit)

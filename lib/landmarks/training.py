@@ -438,10 +438,14 @@ def train(
     Raises
     ------
     ValueError
-        For an empty data set, or a folder that holds another training.
+        For an empty data set, an `initial` training of another network, or a folder that holds another training.
     """
     if len(source) == 0 or len(validation) == 0:
         raise ValueError("source and validation: must not be empty; give labelled images.")
+    if initial is not None and initial.network.config != config.network:
+        raise ValueError(
+            f"initial: is a network {initial.network.config}, the configuration asks for {config.network}; make them equal."
+        )
     run = _Run(config, initial.network if initial is not None else None)
     provenance: dict[str, object] = {
         "data": source.fingerprint,
@@ -558,6 +562,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--preset", choices=sorted(PRESETS), default="best")
     parser.add_argument("--steps", type=int, default=6000)
     parser.add_argument("--rate", type=float, help="learning rate (default: the preset's)")
+    parser.add_argument("--position-weight", type=float, default=0.04, help="window: of the position loss, per px")
     parser.add_argument("--features", type=int, default=None, help="channels (default: the shipped detector's)")
     parser.add_argument("--stacks", type=int, default=2)
     parser.add_argument("--seed", type=int, default=0)
@@ -598,6 +603,8 @@ def main(argv: list[str] | None = None) -> int:
             )
             if a.rate:
                 config = replace(config, learning_rate=a.rate)
+            if a.what == "window":
+                config = replace(config, position_weight_per_px=a.position_weight)
             source: Source
             if a.what == "frame":
                 config = replace(config, network=replace(config.network, depth=3), batch_size=8, ema=0.995)
@@ -611,7 +618,7 @@ def main(argv: list[str] | None = None) -> int:
                 # The simulator varies the magnification itself.
                 source = replace(dataset.WindowSource.load(a.data), zoom=(0.9, 1.1))
                 validation = dataset.WindowSource.load(a.data, validation=True).fixed()
-                config = replace(config, augmentation=AUGMENTATIONS["windows"], position_weight_per_px=0.04)
+                config = replace(config, augmentation=AUGMENTATIONS["windows"])
             else:
                 source = dataset.simulated_samples(400, seed=a.seed, crop_px=512, progress=True)
                 validation = dataset.simulated_samples(40, seed=a.seed + 10_000, crop_px=512)

@@ -36,7 +36,7 @@ def trained(toy):
         validate_every=40, precision="fp32",
     )  # fmt: skip
     network = train(config, toy(60), toy(4, seed=2), progress=False).network
-    fit = Calibration((0.3, 0.9, -0.2, 0.1), (3.0, -0.1, 2.0, -0.3), (-0.4, 0.1, 0.2))
+    fit = Calibration(((-0.1, 0.4, 0.5, 0.9, -0.2, 0.1), (0.3, 0.1, -0.2, 0.8, 0.1, 0.0)), (3.0, -0.1, 2.0, -0.3))
     return Detector(network, 1, calibration={"frame": fit}), toy(3, seed=7).images
 
 

@@ -41,28 +41,31 @@ def test_calibration_makes_covariances_and_confidence_true(small):
 
 
 def test_fitted_variance_of_known_errors():
-    """Errors drawn with a variance that depends on a feature and the landmark: the fit finds both, and NEES is 2."""
+    """Errors drawn with a variance that depends on feature, landmark and axis: the fit finds all three, and NEES is 2."""
     rng = np.random.default_rng(0)
     features = np.column_stack([np.ones(6000), rng.normal(0, 1, 6000), rng.uniform(0.2, 1, 6000), np.zeros(6000)])
     landmark = rng.integers(3, size=6000)
-    sigma = np.exp((0.3 + 0.8 * features[:, 1] + np.array([-0.6, 0.2, 0.4])[landmark]) / 2)
-    errors = rng.normal(0, 1, (6000, 2)) * sigma[:, None]
+    along = 0.3 + 0.8 * features[:, 1] + np.array([-0.6, 0.2, 0.4])[landmark]
+    across = -1.2 + 0.2 * features[:, 1]
+    sigma = np.exp(np.column_stack([along, across]) / 2)
+    errors = rng.normal(0, 1, (6000, 2)) * sigma
     correct = np.linalg.norm(errors, axis=1) < 2
-    shapes = np.broadcast_to(np.eye(2), (6000, 2, 2))
-    fit = _fit(features, shapes, errors, correct, landmark, gross_px=1e9)
-    assert fit.log_variance[1] == pytest.approx(0.8, abs=0.05)
-    assert np.subtract(fit.by_landmark[1:], fit.by_landmark[0]) == pytest.approx([0.8, 1.0], abs=0.1)
-    log_variance = features @ np.array(fit.log_variance) + np.array(fit.by_landmark)[landmark]
-    squared = (errors**2).sum(1) / np.exp(log_variance)
+    fit = _fit(features, errors, correct, landmark, gross_px=1e9)
+    coefficients = fit.coefficients
+    assert coefficients[:, :, 1] == pytest.approx(np.tile([0.8, 0.2], (3, 1)), abs=0.05)
+    assert coefficients[1:, :, 0] - coefficients[0, :, 0] == pytest.approx(np.array([[0.8, 0], [1.0, 0]]), abs=0.1)
+    log_variance = np.einsum("mij,mj->mi", coefficients[landmark], features)
+    squared = errors**2 / np.exp(log_variance)
     for k in range(3):
-        assert squared[landmark == k].mean() == pytest.approx(2, abs=1e-6)
+        assert squared[landmark == k].mean(0) == pytest.approx([1, 1], abs=1e-4)
     confidence = 1 / (1 + np.exp(-features @ np.array(fit.logit)))
     assert metrics.calibration_error(confidence, correct) < 0.05
-    counted = np.arange(6000) < 3000
-    errors[~counted] *= 5  # hard frames teach confidence alone
-    again = _fit(features, shapes, errors, correct, landmark, 1e9, counted)
-    assert np.allclose(again.log_variance, fit.log_variance, atol=0.15)
-    assert np.allclose(again.logit, fit.logit)
+
+
+def test_calibration_of_another_version_is_named():
+    assert Calibration.of([[0.0] * 6] * 2, [1.0] * 4).coefficients.shape == (3, 2, 4)
+    with pytest.raises(ValueError, match="another version; make it anew"):
+        Calibration.of([0.0] * 4, [1.0] * 4)
 
 
 def test_evaluation_counts_only_labels_in_view(small):

@@ -23,7 +23,7 @@ def sequence(tmp_path, toy) -> MonocularSequence:
     files = tuple(tmp_path / f"{i:06d}.png" for i in range(8))
     for path, image in zip(files, samples.images, strict=True):
         cv2.imwrite(str(path), image[..., ::-1])
-    return MonocularSequence("toy", np.arange(8), files, samples.u[:, real.TIPS_AS_SIMULATED], (160, 144))
+    return MonocularSequence("toy", np.arange(8), files, samples.u, (160, 144))
 
 
 @pytest.fixture
@@ -138,5 +138,5 @@ def test_the_study_records_each_kind_of_test(sequence, detector, toy_shards, tmp
 @pytest.mark.skipif(RETINAL is None, reason=paths.missing_data_line("retinal_microsurgery"))
 def test_real_tips_are_named_as_the_simulators():
     for sequence in import_retinal_microsurgery(RETINAL):
-        u = real.labels(sequence)
+        u = sequence.u
         assert (side(u[np.isfinite(u).all((1, 2))]) < 0).all()

@@ -262,3 +262,15 @@ def test_a_checkpoint_older_than_an_option_resumes_by_its_default(toy, tmp_path)
     training.write_checkpoint(path, tensors, metadata)
     with pytest.raises(ValueError, match="not one of this program"):
         train(config, toy(6), toy(2), tmp_path, progress=False)
+
+
+def test_fine_tuning_starts_from_the_same_network_or_says_so(toy):
+    first = train(SMALL, toy(6), toy(2, seed=1), progress=False)
+    still = replace(SMALL, steps=1, learning_rate=1e-12)
+    again = train(still, toy(6), toy(2, seed=1), initial=first, progress=False)
+    for one, other in zip(again.network.parameters(), first.network.parameters(), strict=True):
+        assert torch.allclose(one, other, atol=1e-9)
+    assert again.provenance["before"] == first.provenance
+    wider = replace(SMALL, network=replace(SMALL.network, features=2 * SMALL.network.features))
+    with pytest.raises(ValueError, match="initial: is a network"):
+        train(wider, toy(6), toy(2, seed=1), initial=first, progress=False)
