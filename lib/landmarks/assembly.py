@@ -104,6 +104,10 @@ def card(detector: Detector, path: Path) -> str:
     row("training images", lambda s: s["images"])
     row("preset, optimiser", lambda s: f"best, {s['config']['optimiser']}, {s['config']['precision']}")
     row("steps x batch", lambda s: " then ".join(f"{t['steps']} x {t['config']['batch_size']}" for t in _history(s)))
+    row(
+        "position loss, per px",
+        lambda s: " then ".join(f"{t['config'].get('position_weight_per_px', 0):g}" for t in _history(s)),
+    )
     row("hours on a shared CPU core", lambda s: f"{sum(t['seconds'] for t in _history(s)) / 3600:.2f}")
     row("data fingerprint", lambda s: f"`{s['data']}`")
     row("commit", lambda s: f"`{s['commit']}`")
@@ -138,7 +142,9 @@ def card(detector: Detector, path: Path) -> str:
         f"| confidence calibration error | {m['confidence_calibration_error']:.3f} |",
         f"| missed, gross (above 20 px), of labels | {m['missed']}, {m['gross']}, {m['labels']} |",
         "",
-        "Made by `python3 -m lib train generate`, `train frame`, `train tool`, `train window`, `train assemble`.",
+        "Made by `python3 -m lib train generate`, `train frame`, `train tool` and `train window`, each step above from the one "
+        "before (`--initial`), and `train assemble`"
+        + (", its `--recordings` by `python3 -m lib simulate`." if p.get("recordings") else "."),
         "",
     ]
     return "\n".join(lines)
