@@ -27,7 +27,9 @@ ENGINES = ("torch", "openvino")
 
 #: Compiled networks by weights, input shape and threads: copies of a detector share them.
 _COMPILED: OrderedDict[tuple, object] = OrderedDict()
-_KEPT = 12
+_KEPT = 16
+#: How many images are run at once; fewer are filled up to the next of these.
+BATCHES = (1, 2, 3, 6)
 _lock = threading.Lock()
 
 
@@ -83,9 +85,10 @@ class LastHeatmaps(nn.Module):
 
 
 class OpenVinoNetwork:
-    """A network run by OpenVINO, image by image, as many at once as torch has threads.
+    """A network run by OpenVINO with as many threads as torch has, a few images at once.
 
-    It is compiled, in about a second, for each size of image that it meets.
+    It is compiled, in about a second, for each size of image that it meets and each number of them in `BATCHES`: a batch
+    of six windows takes two thirds of the time of six windows alone.
     """
 
     def __init__(
@@ -107,40 +110,36 @@ class OpenVinoNetwork:
         x = np.ascontiguousarray(images.numpy())
         if x.ndim != 4 or x.shape[1] != 3:
             return self._network(images)  # raises what is wrong
-        with _lock:  # the queue is shared
-            queue, shape = self._queue(x.shape[1:])
-            found = np.empty((len(x), *shape), np.float32)
+        found = []
+        with _lock:  # a request is shared
+            for part in np.array_split(x, range(BATCHES[-1], len(x), BATCHES[-1])):
+                n = next(size for size in BATCHES if size >= len(part))
+                full = np.concatenate([part, np.zeros((n - len(part), *x.shape[1:]), np.float32)])
+                request = self._request(full.shape)
+                found.append(request.infer({0: full})[0][: len(part)].copy())
+        return [torch.from_numpy(np.concatenate(found))]
 
-            def keep(request, index: int) -> None:
-                found[index] = request.get_output_tensor(0).data[0]
-
-            queue.set_callback(keep)
-            for i in range(len(x)):
-                queue.start_async({0: x[i : i + 1]}, i)
-            queue.wait_all()
-        return [torch.from_numpy(found)]
-
-    def _queue(self, shape: tuple[int, int, int]) -> tuple:
+    def _request(self, shape: tuple[int, ...]) -> object:
         key = (self._digest, self._mirror, shape, self._threads, self._precision)
         if key not in _COMPILED:
-            _COMPILED[key] = self._compile((1, *shape))
+            _COMPILED[key] = self._compile(shape)
             while len(_COMPILED) > _KEPT:
                 _COMPILED.popitem(last=False)
         _COMPILED.move_to_end(key)
         return _COMPILED[key]
 
-    def _compile(self, shape: tuple[int, int, int, int]) -> tuple:
+    def _compile(self, shape: tuple[int, ...]) -> object:
         ov = openvino()
         options = {
-            "PERFORMANCE_HINT": "THROUGHPUT",
-            "NUM_STREAMS": self._threads,
+            "PERFORMANCE_HINT": "LATENCY",
+            "NUM_STREAMS": 1,
             "INFERENCE_NUM_THREADS": self._threads,
         }
         if self._precision:
             options["INFERENCE_PRECISION_HINT"] = self._precision
         module = LastHeatmaps(self._network, mirror=self._mirror).eval()
         compiled = ov.Core().compile_model(_converted(module, shape), "CPU", options)
-        return ov.AsyncInferQueue(compiled, self._threads), tuple(compiled.output(0).shape)[1:]
+        return compiled.create_infer_request()
 
 
 def _converted(module: nn.Module, shape: tuple[int, ...]):

@@ -224,7 +224,8 @@ class Detector:
     calibration:
         One per stage: ``"frame"``, ``"tool"`` and ``"window"``.
     mirror:
-        The last stage looks at every window and its mirror image, and takes the mean: twice the work.
+        The last stage looks at every window and its mirror image, and takes the mean: twice the work.  While tracking,
+        where time counts, it looks once.
     engine:
         What runs the networks, one of `lib.landmarks.engines.ENGINES`; the weights are the same.
     """
@@ -251,6 +252,10 @@ class Detector:
             for name, network in self.networks.items()
         }
         object.__setattr__(self, "_fused", fast)
+        once = (
+            accelerated(self.window_network, self.engine) if self.mirror and self.window_network else fast.get("window")
+        )
+        object.__setattr__(self, "_once", once)
 
     @property
     def networks(self) -> dict[str, StackedHourglass]:
@@ -358,7 +363,7 @@ class Detector:
         if usable.size:
             with self._threads():
                 part = images if usable.size == len(images) else images[usable]  # a pair of frames takes 12 MB
-                _put(result, usable, self._refined(part, previous[usable], "window"))
+                _put(result, usable, self._refined(part, previous[usable], "window", once=True))
         lost = np.flatnonzero((result.confidence < min_confidence).any(1))
         if lost.size:
             _put(result, lost, self(images[lost]))
@@ -412,12 +417,14 @@ class Detector:
         heat = self.heatmaps(windows, "window").numpy()[np.arange(len(which)), which[:, 1]]
         return found, windows, matrices, heat
 
-    def heatmaps(self, windows: np.ndarray, stage: str) -> Tensor:
-        """Heatmaps (m, 3, h, w) of windows (m, s, s, 3)."""
+    def heatmaps(self, windows: np.ndarray, stage: str, *, once: bool = False) -> Tensor:
+        """Heatmaps (m, 3, h, w) of windows (m, s, s, 3); with `once` the last stage looks once, `mirror` or not."""
         with torch.inference_mode():
-            return self._fused[stage](as_tensor(windows))[-1]
+            return (self._once if once and stage == "window" else self._fused[stage])(as_tensor(windows))[-1]
 
-    def stage_peaks(self, images: np.ndarray, u: ArrayLike, stage: str) -> tuple[Peaks, np.ndarray, np.ndarray]:
+    def stage_peaks(
+        self, images: np.ndarray, u: ArrayLike, stage: str, *, once: bool = False
+    ) -> tuple[Peaks, np.ndarray, np.ndarray]:
         """What a window stage decodes: peaks (m, 1) in pixels of the windows, window_from_image (m, 2, 3), (m, 2) which.
 
         Each row of the last is image and landmark.
@@ -430,7 +437,7 @@ class Detector:
                 matrices,
                 np.zeros((0, 2), int),
             )
-        heatmaps = self.heatmaps(windows, stage)
+        heatmaps = self.heatmaps(windows, stage, once=once)
         if stage == "tool":  # one window holds all three landmarks
             which = np.stack([np.repeat(which, 3), np.tile(np.arange(3), len(which))], axis=1)
             matrices, heatmaps = np.repeat(matrices, 3, axis=0), heatmaps.flatten(0, 1)[:, None]
@@ -438,8 +445,8 @@ class Detector:
             heatmaps = heatmaps[torch.arange(len(which)), torch.from_numpy(which[:, 1])][:, None]
         return decode(heatmaps, self.networks[stage].stride, method=self.method), matrices, which
 
-    def _refined(self, images: np.ndarray, rough: Landmarks, stage: str) -> Landmarks:
-        peaks, matrices, which = self.stage_peaks(images, rough.u, stage)
+    def _refined(self, images: np.ndarray, rough: Landmarks, stage: str, *, once: bool = False) -> Landmarks:
+        peaks, matrices, which = self.stage_peaks(images, rough.u, stage, once=once)
         result = Landmarks(rough.u.copy(), rough.covariance.copy(), rough.confidence.copy())
         if not len(which):
             return result

@@ -8,6 +8,7 @@ import pytest
 
 from lib import paths
 from lib.landmarks import Detector, dataset, evaluation, metrics
+from lib.landmarks.assembly import card
 from lib.landmarks.augmentation import Augmentation
 from lib.landmarks.evaluation import _fit, calibrate, evaluate
 from lib.landmarks.inference import Calibration
@@ -201,3 +202,8 @@ def test_distance_from_focus_is_within_the_microscopes_reach():
     depth = evaluation.focus_distance_mm(recording, every=2)
     assert depth.shape == (len(list(evaluation.labelled_frames(recording, every=2))), 3)
     assert np.abs(depth).max() < 5
+
+
+def test_the_card_beside_the_shipped_weights_is_theirs():
+    path = paths.MODELS / "default.safetensors"
+    assert card(Detector.load(), path) == path.with_name("README.md").read_text(encoding="utf-8")
