@@ -142,8 +142,8 @@ def card(detector: Detector, path: Path) -> str:
         f"| confidence calibration error | {m['confidence_calibration_error']:.3f} |",
         f"| missed, gross (above 20 px), of labels | {m['missed']}, {m['gross']}, {m['labels']} |",
         "",
-        "Made by `python3 -m lib train generate`, `train frame`, `train tool` and `train window`, each step above from the one "
-        "before (`--initial`), and `train assemble`"
+        "Made by `python3 -m lib train generate`, `train frame`, `train tool` and `train window`, each step above from the "
+        "one before (`--initial`), and `train assemble`"
         + (", its `--recordings` by `python3 -m lib simulate`." if p.get("recordings") else "."),
         "",
     ]

@@ -261,12 +261,6 @@ class WindowSource:
         matrix = window_from_image(centre, angle, self.size, rng.uniform(*self.zoom))
         return cut(self.crops[index], matrix, self.size), map_points(matrix, u), self.visibility[index]
 
-    def fixed(self, seed: int = 0) -> Samples:
-        """One drawn window of every crop: validation samples."""
-        rng = np.random.default_rng(seed)
-        images, u, visibility = zip(*(self.draw(i, rng) for i in range(len(self))), strict=True)
-        return Samples(np.stack(images), np.stack(u), np.stack(visibility))
-
     @property
     def fingerprint(self) -> str:
         digest = hashlib.sha256(np.ascontiguousarray(self.crops[:, ::17, ::17]).tobytes())

@@ -87,7 +87,7 @@ class Calibration:
     logit: tuple[float, ...] = (-4.0, 0.0, 8.0, 0.0)
 
     @classmethod
-    def of(cls, log_variance: Sequence[Sequence[float]], logit: Sequence[float], **older: object) -> Calibration:
+    def of(cls, log_variance: Sequence[Sequence[float]], logit: Sequence[float]) -> Calibration:
         """From the lists that JSON keeps.
 
         Raises

@@ -71,12 +71,6 @@ class Crops:
         x, y = np.clip(np.round(centre - self.size / 2), 0, (w - self.size, h - self.size)).astype(int)
         return image[y : y + self.size, x : x + self.size], u - (x, y), visibility
 
-    def fixed(self, seed: int = 0) -> Samples:
-        """One drawn crop of every image: validation samples."""
-        rng = np.random.default_rng(seed)
-        images, u, visibility = zip(*(self.draw(i, rng) for i in range(len(self))), strict=True)
-        return Samples(np.stack(images), np.stack(u), np.stack(visibility))
-
     @property
     def fingerprint(self) -> str:
         return f"{self.samples.fingerprint} {self.size}"
@@ -150,7 +144,7 @@ def train_on_first_half(
     """
     real = Crops(real_samples(sequence, 0, len(sequence) // 2))
     # What "validates" are crops of training frames: they only fill the log, nothing is chosen by them.
-    few = Crops(_every(real.samples, 1 + len(real) // 25)).fixed()
+    few = Samples.drawn(Crops(_every(real.samples, 1 + len(real) // 25)))
     initial = Training(detector.frame_network, [], {"shipped": detector.metadata.get("commit")})
     config = replace(config, network=detector.frame_network.config)
     source = Mixed(real, Crops(simulated)) if simulated is not None else real

@@ -161,7 +161,7 @@ def _tool_windows(frames: Sequence[tuple[str, np.ndarray, np.ndarray, np.ndarray
         visibility=np.stack(visible),
         landmark=np.full(len(small), TOOL),
     )
-    return source.fixed(seed=1)
+    return Samples.drawn(source, seed=1)
 
 
 def _trained(
@@ -192,7 +192,7 @@ def ablation(options: Options) -> None:
     turned = {"shift_px": 8.0, "turn_rad": np.radians(15.0), "zoom": (0.75, 1.25)}
     source = replace(WindowSource.load_tools(options.data, shards=options.shards), **turned)
     held_out = replace(WindowSource.load_tools(options.data, validation=True), **turned)
-    validation = held_out.fixed()
+    validation = Samples.drawn(held_out)
     what, frames = test_frames(options)
     test = _tool_windows(frames, held_out)
     figures: dict[str, dict[str, list[float]]] = {name: {} for name in ABLATION}
@@ -282,7 +282,7 @@ def resolution(options: Options) -> None:
     for seed in range(options.seeds):
         for name, size in RESOLUTIONS.items():
             source = resolution_windows(crops, size)
-            validation = resolution_windows(held_out, size).fixed()
+            validation = Samples.drawn(resolution_windows(held_out, size))
             done = _trained(options, f"resolution/{name}", seed, _network(options), source, validation)
             judged = frames.judge(done, name, options.folder / "resolution" / name / f"seed{seed}")
             for key, value in _figures(judged).items():
@@ -312,7 +312,7 @@ def label_noise(options: Options, sigma_px: float = 1.0) -> None:
         WindowSource.load(options.data, validation=True),
     )
     frames = _FullHd(options)
-    validation = resolution_windows(held_out, RESOLUTIONS["1080p"]).fixed()
+    validation = Samples.drawn(resolution_windows(held_out, RESOLUTIONS["1080p"]))
     figures: dict[str, dict[str, list[float]]] = {"exact": {}, "noisy": {}}
     for seed in range(options.seeds):
         for name, folder, source in (
@@ -353,7 +353,7 @@ def few_labels(options: Options, counts: Sequence[int] = (10, 30, 100, 300, 750)
     shipped = Detector.load()
     source = WindowSource.load_tools(options.data, shards=options.shards)
     held_out = WindowSource.load_tools(options.data, validation=True)
-    validation = held_out.fixed()
+    validation = Samples.drawn(held_out)
     what, frames = test_frames(options)
     test = _tool_windows(frames, held_out)
     network = shipped.tool_network.config

@@ -95,6 +95,13 @@ class Samples:
         if not (np.isfinite(self.u).all(2) & (self.visibility == 2)).any():
             raise ValueError("u: all landmarks of all images are missing; there is nothing to learn.")
 
+    @classmethod
+    def drawn(cls, source: Source, seed: int = 0) -> Samples:
+        """One drawn image of each that `source` has: validation samples."""
+        rng = np.random.default_rng(seed)
+        images, u, visibility = zip(*(source.draw(i, rng) for i in range(len(source))), strict=True)
+        return cls(np.stack(images), np.stack(u), np.stack(visibility))
+
     def __len__(self) -> int:
         return len(self.images)
 
@@ -612,12 +619,12 @@ def main(argv: list[str] | None = None) -> int:
                 validation = dataset.frame_samples(a.data, validation=True)
             elif a.what == "tool":
                 source = dataset.WindowSource.load_tools(a.data)
-                validation = dataset.WindowSource.load_tools(a.data, validation=True).fixed()
+                validation = Samples.drawn(dataset.WindowSource.load_tools(a.data, validation=True))
                 config = replace(config, augmentation=AUGMENTATIONS["windows"], ema=0.995)
             elif a.what == "window":
                 # The simulator varies the magnification itself.
                 source = replace(dataset.WindowSource.load(a.data), zoom=(0.9, 1.1))
-                validation = dataset.WindowSource.load(a.data, validation=True).fixed()
+                validation = Samples.drawn(dataset.WindowSource.load(a.data, validation=True))
                 config = replace(config, augmentation=AUGMENTATIONS["windows"])
             else:
                 source = dataset.simulated_samples(400, seed=a.seed, crop_px=512, progress=True)

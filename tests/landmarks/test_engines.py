@@ -81,6 +81,11 @@ def test_the_mean_with_the_mirror_image_does_not_know_left_from_right(engine):
     close = {"atol": 0.02 * float(seen.abs().max())}  # bfloat16 where the processor has it
     assert torch.allclose(turned, seen.flip(-2)[:, [0, 2, 1]], **close)
     assert not torch.allclose(seen, single, **close)
+    windows = np.random.default_rng(0).integers(0, 256, (3, 128, 128, 3), dtype=np.uint8)
+    plain = Detector(network, window_network=network, engine=engine)
+    both = replace(plain, mirror=True)
+    assert torch.equal(both.heatmaps(windows, "window", once=True), plain.heatmaps(windows, "window"))
+    assert not torch.allclose(both.heatmaps(windows, "window"), plain.heatmaps(windows, "window"), **close)
     with pytest.raises(ValueError, match="mirror: needs window_px"):
         Detector(network, window_network=network, window_px=126, mirror=True)
 

@@ -13,7 +13,7 @@ from lib.landmarks.augmentation import Augmentation
 from lib.landmarks.evaluation import _fit, calibrate, evaluate
 from lib.landmarks.inference import Calibration
 from lib.landmarks.network import HourglassConfig
-from lib.landmarks.training import PRESETS, main, train
+from lib.landmarks.training import PRESETS, Samples, main, train
 
 
 @pytest.fixture(scope="module")
@@ -109,7 +109,7 @@ def test_shards_hold_what_the_stages_see(tmp_path, toy_shards):
         assert u[1, 1] < u[2, 1]  # and tip_1 is above
     tools = dataset.WindowSource.load_tools(tmp_path)
     assert len(tools) == 2
-    assert len(windows.fixed()) == 6
+    assert len(Samples.drawn(windows)) == 6
     _, image, u, _ = next(iter(dataset.validation_frames(tmp_path)))
     assert image.shape == (540, 960, 3)
     assert np.allclose(u, samples.u[0])

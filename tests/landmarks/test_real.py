@@ -18,7 +18,7 @@ RETINAL = paths.real_data("retinal_microsurgery")
 
 @pytest.fixture
 def sequence(tmp_path, toy) -> MonocularSequence:
-    """Eight toy frames with the tips named as in the real data, the other way round."""
+    """Eight toy frames as files."""
     samples = toy(8, size=(144, 160))
     files = tuple(tmp_path / f"{i:06d}.png" for i in range(8))
     for path, image in zip(files, samples.images, strict=True):
@@ -52,7 +52,7 @@ def test_crops_keep_their_landmarks(toy):
                 held += 1
                 np.testing.assert_array_equal(image[b, a], samples.images[i, y, x])
     assert held > 40
-    assert crops.fixed().images.shape == (4, 64, 64, 3)
+    assert Samples.drawn(crops).images.shape == (4, 64, 64, 3)
     with pytest.raises(ValueError, match="do not fit"):
         real.Crops(samples, 200)
 
@@ -97,8 +97,8 @@ def test_only_the_first_half_is_trained_on(sequence, toy, detector, tmp_path, mo
     assert tuned.reduction == 1 and list(tuned.networks) == ["frame"]
 
 
-def test_evaluation_names_tips_as_the_simulator(sequence, detector, toy):
-    """Labels come back in the order of the toys, and the second half is the second half."""
+def test_evaluation_is_of_the_second_half(sequence, detector, toy):
+    """And its labels are those of the toys, magnified or not."""
     tested = real.evaluate_on_sequence(real.finder_alone(detector), sequence, second_half=True, every=2)
     assert tested.names == ["toy 4", "toy 6"]
     np.testing.assert_array_equal(tested.u_true, toy(8, size=(144, 160)).u[4::2])
