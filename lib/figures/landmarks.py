@@ -14,6 +14,7 @@ from scipy.stats import chi2
 
 from lib.figures.style import COLOURS, LANDMARK_COLOURS, figure, show_image
 from lib.landmarks.evaluation import Evaluation
+from lib.landmarks.heatmaps import Peaks
 from lib.landmarks.inference import Landmarks
 from lib.landmarks.metrics import PCK_THRESHOLDS, reliability
 from lib.landmarks.network import HourglassConfig
@@ -539,6 +540,21 @@ def frame_explorer(
         _ellipse(ax, u, covariance, LANDMARK_COLOURS[names[k]])
         reach = 16
         ax.set(xlim=(u[0] - reach, u[0] + reach), ylim=(u[1] + reach, u[1] - reach))
+    return fig
+
+
+def closeups(windows: np.ndarray, expected: np.ndarray, seen: Peaks, kept: Peaks, names: Sequence[str]) -> Figure:
+    """Closeups (n, s, s, 3): where the windows said the landmark lies (cross, `expected` (n, 2)), where the network sees
+    it with its 95 % ellipse (`seen`, (n, 1)), and what is believed (dot, `kept`, (n, 1))."""
+    fig, axes = figure(1, len(windows), width_in=9, height_in=3.2, squeeze=False)
+    for i, (ax, name) in enumerate(zip(axes.flat, names, strict=True)):
+        show_image(ax, windows[i], name)
+        deviation = np.sqrt(np.diag(seen.covariance[i, 0].numpy()))
+        ax.plot(*expected[i], "+", ms=14, mew=2, color="white", label="windows")
+        size = 2 * np.sqrt(chi2.ppf(0.95, 2)) * deviation
+        ax.add_patch(Ellipse(seen.u[i, 0].numpy(), *size, fill=False, ec=COLOURS["ours"], lw=2))
+        ax.plot(*kept.u[i, 0].numpy(), "o", ms=5, color=COLOURS["ours"], label="believed")
+    axes.flat[0].legend(loc="lower left")
     return fig
 
 

@@ -1,4 +1,4 @@
-"""From two trained stages to the shipped detector: join, calibrate, measure, write the weights and their card."""
+"""From trained stages to the shipped detector: join, calibrate, measure, write the weights and their card."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from lib.landmarks.evaluation import calibrate, evaluate, labelled_frames
 from lib.landmarks.inference import Detector
 from lib.landmarks.metrics import calibration_error
 from lib.landmarks.training import load_training
+from lib.landmarks.windows import CLOSEUP_ZOOM
 from lib.recordings import Recording
 from lib.records import commit_id, machine
 
@@ -22,7 +23,7 @@ _IMAGES = 16
 
 
 def assemble(folder: str | Path, data: str | Path, out: str | Path, recordings: Sequence[str | Path] = ()) -> Detector:
-    """Join ``frame/``, ``tool/`` and ``window/`` of a training folder, calibrate, write `out` and its card.
+    """Join ``frame/``, ``tool/``, ``window/`` and ``closeup/`` of a training folder, calibrate, write `out` and its card.
 
     Half of the validation frames calibrate, the other half give the figures on the card; then all calibrate.  Labelled
     `recordings` calibrate too where there are any: moderate frames as they will be measured, where the validation frames
@@ -34,7 +35,9 @@ def assemble(folder: str | Path, data: str | Path, out: str | Path, recordings: 
         If a stage or the validation frames are missing.
     """
     folder, out = Path(folder), Path(out)
-    stages = {stage: load_training(folder / stage / "last.safetensors") for stage in ("frame", "tool", "window")}
+    stages = {
+        stage: load_training(folder / stage / "last.safetensors") for stage in ("frame", "tool", "window", "closeup")
+    }
     frames = list(validation_frames(data))
     if not frames:
         raise FileNotFoundError(f"{data}: no validation shard; make some with `python3 -m lib train generate`.")
@@ -51,10 +54,11 @@ def assemble(folder: str | Path, data: str | Path, out: str | Path, recordings: 
         tool_network=stages["tool"].network,
         tool_reduction=TOOL_REDUCTION,
         mirror=True,
+        closeup_network=stages["closeup"].network,
     )
     held_out = evaluate(calibrate(detector, frames[::2] + typical), frames[1::2])
     detector = calibrate(detector, frames + typical)
-    keys = ("data", "images", "commit", "steps", "seconds", "config", "metrics", "before")
+    keys = ("data", "images", "commit", "steps", "seconds", "processes", "config", "metrics", "before")
     provenance = {
         "trained_on": "simulated frames only (lib.simulator.training); no eye or tool of a shipped recording",
         "commit": commit_id(),
@@ -83,6 +87,12 @@ def _history(provenance: dict) -> list[dict]:
     return [*(_history(before) if before else []), provenance]
 
 
+def _network(config: dict) -> str:
+    if "stacks" in config:
+        return "hourglass, {stacks} x {features} features".format(**config)
+    return "offset network, {features} features".format(**config)
+
+
 def card(detector: Detector, path: Path) -> str:
     """The Markdown card of a weights file, computed from its metadata."""
     p = detector.metadata
@@ -93,14 +103,14 @@ def card(detector: Detector, path: Path) -> str:
         "Weights of the landmark detector: base, tip_1 and tip_2 of the forceps in microscope images.",
         f"Trained on {p['trained_on']}.",
         "",
-        "| | whole frame | tool | landmarks |",
-        "|---|---|---|---|",
+        "| | whole frame | tool | windows | closeups |",
+        "|---|---|---|---|---|",
     ]
 
     def row(name: str, value) -> None:
         lines.append("| " + " | ".join([name, *(str(value(stage)) for stage in p["stages"].values())]) + " |")
 
-    row("stacks x features", lambda s: "{stacks} x {features}".format(**s["config"]["network"]))
+    row("network", lambda s: _network(s["config"]["network"]))
     row("training images", lambda s: s["images"])
     row("preset, optimiser", lambda s: f"best, {s['config']['optimiser']}, {s['config']['precision']}")
     row("steps x batch", lambda s: " then ".join(f"{t['steps']} x {t['config']['batch_size']}" for t in _history(s)))
@@ -108,7 +118,10 @@ def card(detector: Detector, path: Path) -> str:
         "position loss, per px",
         lambda s: " then ".join(f"{t['config'].get('position_weight_per_px', 0):g}" for t in _history(s)),
     )
-    row("hours on a shared CPU core", lambda s: f"{sum(t['seconds'] for t in _history(s)) / 3600:.2f}")
+    row(
+        "hours on a shared CPU core",
+        lambda s: f"{sum(t['seconds'] * (t.get('processes') or 1) for t in _history(s)) / 3600:.2f}",
+    )
     row("data fingerprint", lambda s: f"`{s['data']}`")
     row("commit", lambda s: f"`{s['commit']}`")
     lines += [
@@ -117,7 +130,9 @@ def card(detector: Detector, path: Path) -> str:
             f"The first stage sees the frame at 1/{detector.reduction} of its resolution, the second a window of "
             f"{detector.window_px} px at 1/{detector.tool_reduction} round the tool, the third windows of as many pixels "
             "at full resolution round each landmark"
-            + (", and their mirror images, of which it takes the mean." if detector.mirror else ".")
+            + (", and their mirror images, of which it takes the mean, the last " if detector.mirror else ", the last ")
+            + f"closeups of {detector.closeup_network.config.size_px} px, "
+            f"the base at {CLOSEUP_ZOOM[0]:g} of full resolution, the tips at {CLOSEUP_ZOOM[1]:g}."
         ),
         f"File: {path.stat().st_size / 1e6:.1f} MB, safetensors; configuration, calibration and this card's figures inside.",
         "",
@@ -142,8 +157,8 @@ def card(detector: Detector, path: Path) -> str:
         f"| confidence calibration error | {m['confidence_calibration_error']:.3f} |",
         f"| missed, gross (above 20 px), of labels | {m['missed']}, {m['gross']}, {m['labels']} |",
         "",
-        "Made by `python3 -m lib train generate`, `train frame`, `train tool` and `train window`, each step above from the "
-        "one before (`--initial`), and `train assemble`"
+        "Made by `python3 -m lib train generate`, `train frame`, `train tool`, `train window` and `train closeup`, each step "
+        "above from the one before (`--initial`), and `train assemble`"
         + (", its `--recordings` by `python3 -m lib simulate`." if p.get("recordings") else "."),
         "",
     ]

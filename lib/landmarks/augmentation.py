@@ -173,4 +173,7 @@ AUGMENTATIONS = {
     "windows": Augmentation(
         0.0, (1.0, 1.0), mirror=True, photometric=1.0, photometric_share=0.25
     ),  # placed by `lib.landmarks.windows`
+    "closeups": Augmentation(
+        0.0, (1.0, 1.0), photometric=1.0, photometric_share=0.25
+    ),  # tip_2 is mirrored there, nothing at random
 }

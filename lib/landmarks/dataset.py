@@ -1,8 +1,9 @@
-"""Training data for the two-stage detector: simulated frames, cut to what its networks see.
+"""Training data for the coarse-to-fine detector: simulated frames, cut to what its networks see.
 
 Frames come from `lib.simulator.training.sample`, whose eyes and tools no test recording uses.  A shard is an .npz
 file of a few frames.  Of every frame it keeps the whole at a reduced resolution and a crop around each
 landmark at full resolution; validation shards keep the full frame as JPEG too.
+Shards of windows and of closeups hold crops alone.
 Shards are written whole or not at all, so generating them can be stopped at any time and goes on where it stopped.
 """
 
@@ -19,18 +20,21 @@ import numpy as np
 from tqdm.auto import tqdm
 
 from lib.geometry import cell_from_image
+from lib.landmarks.inference import CLOSEUP_REACH_PX
 from lib.landmarks.training import Samples
-from lib.landmarks.windows import cut, direction_rad, map_points, tool_centre, window_from_image
+from lib.landmarks.windows import closeup_from_image, cut, direction_rad, map_points, tool_centre, window_from_image
 from lib.parallel import in_processes
+from lib.simulator.render import motion_kernel
 from lib.simulator.training import TEXTURE_SEEDS, VALIDATION_TEXTURE_SEEDS, sample
 
 __all__ = [
     "REDUCTION",
+    "CloseupSource",
     "WindowSource",
     "crop_frames",
     "frame_samples",
     "generate",
-    "generate_windows",
+    "generate_crops",
     "simulated_samples",
     "validation_frames",
 ]
@@ -41,8 +45,11 @@ STORED_REDUCTION, REDUCTION = 5, 8
 TOOL_REDUCTION, TOOL = STORED_REDUCTION, 3
 CROP_PX = 288
 FRAMES = 16
-#: Windows of a shard that holds windows alone.
-WINDOWS = 512
+#: Shards that hold crops alone, by the first part of their names: side in px, how many, and what seeds them.
+_CROPS = {"windows": (CROP_PX, 512, 2), "closeups": (128, 2048, 4)}
+#: Landmarks lie anywhere within a JPEG's block of this many pixels.  Were their place in it always the same, a network would
+#: learn to read it off the blocks: a quarter of its error would vanish, and come back on every other image.
+_BLOCK_PX = 16
 
 
 def generate(
@@ -77,37 +84,39 @@ def _make_shard(path: Path, index: int, validation: bool) -> None:
     _write_shard(path, [sample(rng, textures=textures) for _ in range(FRAMES)], keep_frames=validation)
 
 
-def generate_windows(
-    folder: str | Path, shards: int, *, first: int = 0, workers: int | None = None, progress: bool = True
+def generate_crops(
+    folder: str | Path, shards: int, kind: str, *, first: int = 0, workers: int | None = None, progress: bool = True
 ) -> None:
-    """Like `generate`, shards of `WINDOWS` full-resolution crops alone, each of a frame, an eye and a tool of its own.
+    """Like `generate`, shards of crops round a landmark alone, each of a frame, an eye and a tool of its own.
 
-    Only what the last stage sees is rendered: twenty times as many scenes a second as whole frames.
+    `kind` is ``"windows"`` or ``"closeups"``, which are smaller: only what the last stages see is rendered, twenty and forty
+    times as many scenes a second as whole frames.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    wanted = {i: folder / f"windows_{i:04d}.npz" for i in range(first, first + shards)}
-    missing = [(path, i) for i, path in wanted.items() if not path.exists()]
+    wanted = {i: folder / f"{kind}_{i:04d}.npz" for i in range(first, first + shards)}
+    missing = [(path, i, *_CROPS[kind]) for i, path in wanted.items() if not path.exists()]
     bar = tqdm(
-        total=shards, initial=shards - len(missing), desc="Simulating windows", disable=not progress, unit="shard"
+        total=shards, initial=shards - len(missing), desc=f"Simulating {kind}", disable=not progress, unit="shard"
     )
     with bar:
-        for _ in in_processes(_make_windows, missing, workers):
+        for _ in in_processes(_make_crops, missing, workers):
             bar.update()
 
 
-def _make_windows(path: Path, index: int) -> None:
-    rng = np.random.default_rng([2, index])
-    crops = np.empty((WINDOWS, CROP_PX, CROP_PX, 3), np.uint8)
-    crop_u, crop_visibility = np.empty((WINDOWS, 3, 2)), np.empty((WINDOWS, 3), int)
-    crop_landmark = rng.integers(3, size=WINDOWS)
+def _make_crops(path: Path, index: int, side_px: int, n: int, kind_seed: int) -> None:
+    rng = np.random.default_rng([kind_seed, index])
+    crops = np.empty((n, side_px, side_px, 3), np.uint8)
+    crop_u, crop_visibility = np.empty((n, 3, 2)), np.empty((n, 3), int)
+    crop_landmark = rng.integers(3, size=n)
     for i, k in enumerate(crop_landmark):
         while True:
-            image, u, visibility = sample(rng, crop_px=CROP_PX, around=k, jitter=0.0)
+            rendered_px = side_px + _BLOCK_PX
+            image, u, visibility = sample(rng, crop_px=rendered_px, around=k, jitter=_BLOCK_PX / 2 / rendered_px)
             if visibility[k]:
                 break
-        corner = np.round(u[k] - (CROP_PX - 1) / 2)  # not 0 where the field ends
-        crops[i] = cut(image, np.column_stack([np.eye(2), -corner]), CROP_PX)
+        corner = np.round(u[k] - (side_px - 1) / 2)  # not 0 where the field ends
+        crops[i] = cut(image, np.column_stack([np.eye(2), -corner]), side_px)
         crop_u[i], crop_visibility[i] = u - corner, visibility
     _write(
         path, crops=crops, crop_u=crop_u, crop_visibility=crop_visibility, crop_landmark=crop_landmark.astype(np.int64)
@@ -263,9 +272,95 @@ class WindowSource:
 
     @property
     def fingerprint(self) -> str:
-        digest = hashlib.sha256(np.ascontiguousarray(self.crops[:, ::17, ::17]).tobytes())
-        digest.update(self.u.tobytes())
-        return digest.hexdigest()[:16]
+        return _fingerprint(self.crops, self.u)
+
+
+@dataclass(frozen=True)
+class CloseupSource:
+    """Closeups of landmarks, placed as badly as windows or the frame before may place them, of tools more or less stretched.
+
+    Stretching and shearing the image keeps the labels true and makes many tools of one.
+
+    Attributes
+    ----------
+    crops, u, landmark:
+        (n, h, w, 3) uint8, labels (n, 3, 2) in crop pixels, and which landmark (n,), a visible one, each closeup shows.
+    size:
+        Of the closeups.
+    shifts_px, shift_shares:
+        Standard deviations of the error of place, and how many closeups have which.
+    turn_rad:
+        Standard deviation of the error of direction.
+    alone:
+        Share of closeups whose direction is that to one tip, the other one being missing.
+    stretch, shear:
+        Standard deviations of the logarithms of two stretches, along and across the tool, and of the shear.
+    motion_px:
+        Standard deviation along x and y of the movement that half of the closeups are blurred by, closeup pixels: a tool on
+        its way moves more often than the simulator's.
+    """
+
+    crops: np.ndarray
+    u: np.ndarray
+    landmark: np.ndarray
+    size: int = 64
+    shifts_px: tuple[float, ...] = (2.0, 4.0, 8.0)
+    shift_shares: tuple[float, ...] = (0.5, 0.25, 0.25)
+    turn_rad: float = 0.03
+    alone: float = 0.05
+    stretch: float = 0.1
+    shear: float = 0.05
+    motion_px: float = 1.7
+
+    @classmethod
+    def load(cls, folder: str | Path, *, validation: bool = False, shards: int | None = None) -> CloseupSource:
+        """From a folder's shards of closeups, or the first `shards`; to validate, from whole frames, not stretched."""
+        patterns = ("validation_*.npz",) if validation else ("closeups_*.npz",)
+        names = ("crops", "crop_u", "crop_visibility", "crop_landmark")
+        crops, u, visibility, landmark = _load(folder, patterns, names, shards)
+        seen = visibility[np.arange(len(landmark)), landmark] == 2
+        if not seen.all():
+            crops, u, landmark = crops[seen], u[seen], landmark[seen]
+        return cls(crops, u, landmark, stretch=0.0, shear=0.0, motion_px=0.0) if validation else cls(crops, u, landmark)
+
+    def __len__(self) -> int:
+        return len(self.crops)
+
+    def draw(self, index: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """A closeup; only its own landmark counts as visible."""
+        k = self.landmark[index]
+        # A crop ends before a turned closeup's corners do.  Where it ends must not tell where its middle was.
+        corner = rng.integers(0, _BLOCK_PX, 2, endpoint=True)
+        crop, u = self.crops[index], self.u[index] - corner
+        crop = crop[
+            corner[1] : crop.shape[0] - _BLOCK_PX + corner[1], corner[0] : crop.shape[1] - _BLOCK_PX + corner[0]
+        ]
+        shift = rng.normal(0, self.shifts_px[rng.choice(len(self.shifts_px), p=self.shift_shares)], 2)
+        centre = u[k] + shift * min(1.0, CLOSEUP_REACH_PX / max(np.linalg.norm(shift), 1e-9))
+        known = u.copy()
+        if rng.random() < self.alone:
+            known[rng.choice([j for j in (1, 2) if j != k])] = np.nan
+        angle = direction_rad(known[None])[0] + rng.normal(0, self.turn_rad)
+        matrix = closeup_from_image(centre, angle, self.size, k)
+        along, across = np.exp(rng.normal(0, self.stretch, 2))
+        deform = np.array([[along, 0.0], [rng.normal(0, self.shear), across]])
+        middle = (self.size - 1) / 2
+        matrix = np.column_stack([deform @ matrix[:, :2], deform @ (matrix[:, 2] - middle) + middle])
+        image = cut(crop, matrix, self.size, border=cv2.BORDER_REPLICATE)
+        kernel = motion_kernel(rng.normal(0, self.motion_px, 2)) if self.motion_px and rng.random() < 0.5 else None
+        if kernel is not None:  # centred, so the landmark stays
+            image = cv2.filter2D(image, -1, kernel)
+        return image, map_points(matrix, u), np.where(np.arange(3) == k, 2, 0)
+
+    @property
+    def fingerprint(self) -> str:
+        return _fingerprint(self.crops, self.u)
+
+
+def _fingerprint(crops: np.ndarray, u: np.ndarray) -> str:
+    digest = hashlib.sha256(np.ascontiguousarray(crops[:, ::17, ::17]).tobytes())
+    digest.update(u.tobytes())
+    return digest.hexdigest()[:16]
 
 
 def simulated_samples(

@@ -19,9 +19,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from lib.landmarks.network import StackedHourglass
+from lib.landmarks.network import OffsetNetwork, StackedHourglass
 
-__all__ = ["ENGINES", "LastHeatmaps", "OpenVinoNetwork", "accelerated", "default_engine", "openvino"]
+__all__ = ["ENGINES", "LastOutput", "OpenVinoNetwork", "accelerated", "default_engine", "openvino"]
 
 ENGINES = ("torch", "openvino")
 
@@ -46,10 +46,12 @@ def default_engine() -> str:
     return "openvino" if importlib.util.find_spec("openvino") else "torch"
 
 
-def accelerated(network: StackedHourglass, engine: str, *, mirror: bool = False) -> Callable[[Tensor], list[Tensor]]:
-    """The network for inference: called with images (n, 3, h, w), its last output are the last stack's heatmaps.
+def accelerated(
+    network: StackedHourglass | OffsetNetwork, engine: str, *, mirror: bool = False
+) -> Callable[[Tensor], list[Tensor]]:
+    """The network for inference: called with images (n, 3, h, w), its last output is the network's last.
 
-    With `mirror` they are the mean of what it says of the images and of their mirror images (`LastHeatmaps`).
+    With `mirror` that is the mean of the heatmaps of the images and of their mirror images (`LastOutput`).
 
     Raises
     ------
@@ -62,18 +64,18 @@ def accelerated(network: StackedHourglass, engine: str, *, mirror: bool = False)
         if not importlib.util.find_spec("openvino"):
             raise ValueError("engine: openvino is not installed here; choose 'torch'.")
         return OpenVinoNetwork(network, mirror=mirror)
-    last = LastHeatmaps(network, mirror=mirror).to(memory_format=torch.channels_last)
+    last = LastOutput(network, mirror=mirror).to(memory_format=torch.channels_last)
     return lambda images: [last(images)]
 
 
-class LastHeatmaps(nn.Module):
-    """A network whose only output are the heatmaps of its last stack: what is traced and exported.
+class LastOutput(nn.Module):
+    """A network whose only output is the last one, of a hourglass the last stack's heatmaps: what is traced and exported.
 
     With `mirror` it looks at every image a second time with top and bottom exchanged, and with the tips exchanged (tip_1 is
     the left one), and returns the mean of both: heights for a multiple of the stride, where the cells coincide.
     """
 
-    def __init__(self, network: StackedHourglass, *, mirror: bool = False):
+    def __init__(self, network: StackedHourglass | OffsetNetwork, *, mirror: bool = False):
         super().__init__()
         self.network, self.mirror = network.fused().to(memory_format=torch.contiguous_format), mirror
 
@@ -93,7 +95,7 @@ class OpenVinoNetwork:
 
     def __init__(
         self,
-        network: StackedHourglass,
+        network: StackedHourglass | OffsetNetwork,
         *,
         mirror: bool = False,
         precision: str | None = None,
@@ -137,7 +139,7 @@ class OpenVinoNetwork:
         }
         if self._precision:
             options["INFERENCE_PRECISION_HINT"] = self._precision
-        module = LastHeatmaps(self._network, mirror=self._mirror).eval()
+        module = LastOutput(self._network, mirror=self._mirror).eval()
         compiled = ov.Core().compile_model(_converted(module, shape), "CPU", options)
         return compiled.create_infer_request()
 

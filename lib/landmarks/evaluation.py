@@ -6,7 +6,7 @@ import argparse
 import json
 import sys
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -16,16 +16,27 @@ from tqdm.auto import tqdm
 
 from lib.geometry import image_from_cell
 from lib.landmarks.heatmaps import DECODERS, decode
-from lib.landmarks.inference import Calibration, Detector, Landmarks, _missing, features_of, joined
+from lib.landmarks.inference import (
+    CLOSEUP_REACH_PX,
+    MIN_TRACKED,
+    Calibration,
+    Detector,
+    Landmarks,
+    _missing,
+    features_of,
+    joined,
+)
 from lib.landmarks.metrics import Scores, errors_px, pck, score, tool_length_px
 from lib.landmarks.network import LANDMARKS
-from lib.landmarks.windows import map_points
+from lib.landmarks.windows import CLOSEUP_ZOOM, expected_in_closeup, map_points
 from lib.recordings import Recording
 
 __all__ = ["Evaluation", "calibrate", "compare_decoders", "evaluate", "evaluate_recording", "focus_distance_mm", "main"]
 
 #: Errors beyond this are gross: not what a covariance describes.
 GROSS_PX = 20.0
+#: What a tool of 2 mm/s moves between two frames at 25 Hz.
+TRACKED_SHIFT_PX = 8.0
 
 
 @dataclass(frozen=True)
@@ -193,8 +204,12 @@ def calibrate(
 ) -> Detector:
     """The detector with covariance and confidence fitted to its errors on validation frames, never trained on.
 
-    Variances: maximum likelihood of the errors below `GROSS_PX` (and of the first stage's below six times that), log
-    linear in the peak's features; their constants make the mean normalised squared error of each landmark 2.
+    Variances: maximum likelihood of the errors below `GROSS_PX` (of the first stage's below six times that, of the closeups'
+    below `CLOSEUP_REACH_PX`), log linear in the peak's features; their constants make the mean normalised squared error
+    of each landmark 2.
+    Of a closeup's correction as much is believed as leaves the smallest errors, which are then centred (`Calibration.gain`,
+    `bias`); while tracking, all of it.  Tracking is fitted on the same frames, the tool displaced by `TRACKED_SHIFT_PX`,
+    every fourth time by five times as much.
     Confidence: logistic regression of "in view and within 5 % of the tool's length" on the same features.
 
     Parameters
@@ -204,42 +219,80 @@ def calibrate(
         errors alike is the tool.
     """
     frames = list(frames)
+    # What a closeup sees of itself, not what was believed of it so far.
+    detector = replace(
+        detector, calibration={k: v for k, v in detector.calibration.items() if k not in ("closeup", "tracking")}
+    )
     rough: list[Landmarks] = []
-    for stage in detector.networks:
-        features, errors, correct, landmark = [], [], [], []
-        zoom = 1.0
+    rng = np.random.default_rng(0)
+    for stage in [*detector.networks, *(["tracking"] if detector.closeup_network else [])]:
+        features, errors, tolerances, landmark, steps = [], [], [], [], []
+        close = stage in ("closeup", "tracking")
         for i, (_, image, u, v) in enumerate(tqdm(frames, disable=not progress, unit="image", desc=stage)):
             in_view = np.isfinite(u).all(1) & (np.asarray(v) > 0)
             labels = np.where(in_view[:, None], u, np.nan)
-            tolerance = 0.05 * tool_length_px(np.asarray(u, dtype=float)[None])[0]
+            tolerance = 0.05 * tool_length_px(np.asarray(u, dtype=float)[None])
             if stage == "frame":
                 peaks, _ = detector.frame_peaks(image[None])
                 which = np.indices((1, 3)).reshape(2, 3).T
                 feature = features_of(peaks.double(), detector.reduction)[0].numpy()
                 difference = image_from_cell(peaks.u[0].double().numpy(), detector.reduction) - labels
             else:
-                peaks, matrices, which = detector.stage_peaks(image[None], rough[i].u, stage)
+                start = rough[i].u
+                if close and not (rough[i].confidence >= MIN_TRACKED).all():
+                    continue  # such images are neither looked at closely nor followed
+                if stage == "tracking":
+                    # A tool that jumps now and then, which tracking has to notice.
+                    moved_px = TRACKED_SHIFT_PX * (5 if rng.random() < 0.25 else 1)
+                    before = replace(rough[i], u=start + rng.normal(0, moved_px / np.sqrt(2), (1, 1, 2)))
+                    start = detector._refined(image[None], before, stage).u
+                peaks, matrices, which = detector.stage_peaks(image[None], start, stage)
                 if not len(which):
                     continue
                 feature = features_of(peaks.double(), 1)[:, 0].numpy()
                 # Errors in the windows' pixels, as the stage's covariance is.
                 difference = peaks.u[:, 0].double().numpy() - map_points(matrices, labels[which[:, 1]])
-                zoom = np.sqrt(np.linalg.det(matrices[0, :, :2]))
+                tolerance = tolerance * np.sqrt(np.abs(np.linalg.det(matrices[:, :, :2])))
+                if close:
+                    seen = peaks.value[:, 0].numpy() > 0
+                    expected = expected_in_closeup(detector.closeup_network.config.size_px, which[:, 1])
+                    steps.append((peaks.u[:, 0].double().numpy() - expected)[seen])
+                    feature, difference, which, tolerance = (
+                        part[seen] for part in (feature, difference, which, tolerance)
+                    )
             features.append(feature)
             errors.append(difference)
             landmark.append(which[:, 1])
-            with np.errstate(invalid="ignore"):
-                correct.append(np.linalg.norm(difference, axis=1) <= tolerance * zoom)
-        together = (np.concatenate(part) for part in (features, errors, correct, landmark))
-        gross = {"frame": 6 * GROSS_PX, "tool": 2 * GROSS_PX * zoom, "window": GROSS_PX}[stage]
-        detector = detector.with_calibration(**{stage: _fit(*together, gross)})
+            tolerances.append(np.broadcast_to(tolerance, len(which)))
+        if not features:
+            raise ValueError("frames: the detector finds nothing in them to calibrate on; give other frames.")
+        feature, error, tolerance, which = (np.concatenate(part) for part in (features, errors, tolerances, landmark))
+        gross = {
+            "frame": 6 * GROSS_PX,
+            "tool": 2 * GROSS_PX / detector.tool_reduction,
+            "window": GROSS_PX,
+            "closeup": CLOSEUP_REACH_PX * min(CLOSEUP_ZOOM),
+            "tracking": CLOSEUP_REACH_PX * min(CLOSEUP_ZOOM),
+        }[stage]
+        gain, bias = np.ones((3, 2)), np.zeros((3, 2))
+        if close:
+            # While tracking the place where a landmark is expected is an old one, which is evidence of nothing.
+            gains = [1.0] if stage == "tracking" else np.linspace(0, 1, 51)
+            moved = np.concatenate(steps)
+            gain, bias = _belief(moved, error, which, gross, gains)
+            error = error + (gain[which] - 1) * moved - bias[which]
+        with np.errstate(invalid="ignore"):
+            correct = np.linalg.norm(error, axis=1) <= tolerance
+        fit = _fit(feature, error, correct, which, gross)
+        fit = Calibration.of(fit.log_variance, fit.logit, gain.tolist(), bias.tolist())
+        detector = detector.with_calibration(**{stage: fit})
         # What the next stage starts from.
         if stage == "frame":
             rough = [
                 _missing(detector._calibrated(detector.frame_peaks(f[1][None])[0], stage, detector.reduction))
                 for f in frames
             ]
-        elif stage == "tool":
+        elif stage != "tracking":
             rough = [detector._refined(f[1][None], r, stage) for f, r in zip(frames, rough, strict=True)]
     return detector
 
@@ -247,7 +300,7 @@ def calibrate(
 def compare_decoders(
     detector: Detector, frames: Iterable[tuple[str, np.ndarray, np.ndarray, np.ndarray]], *, seed: int = 0
 ) -> dict[str, np.ndarray]:
-    """Errors (m,) px of every decoder on the same heatmaps: those of the last stage, its windows off by up to 2 px.
+    """Errors (m,) px of every decoder on the same heatmaps: those of the windows, off by up to 2 px.
 
     Without the small shift every landmark would lie between four cells, which favours some decoders.
     """
@@ -261,7 +314,7 @@ def compare_decoders(
         windows, matrices, which = detector.windows(image[None], near, "window")
         if not len(which):
             continue
-        heatmaps = detector.heatmaps(windows, "window")[np.arange(len(which)), which[:, 1]][:, None]
+        heatmaps = detector.outputs(windows, "window")[np.arange(len(which)), which[:, 1]][:, None]
         true = map_points(matrices, labels[which[:, 1]])
         for method in DECODERS:
             found = decode(heatmaps, detector.window_network.stride, method=method).u[:, 0].double().numpy()
@@ -272,14 +325,17 @@ def compare_decoders(
 def _fit(
     features: np.ndarray, errors: np.ndarray, correct: np.ndarray, landmark: np.ndarray, gross_px: float
 ) -> Calibration:
-    """Fit to m peaks: features (m, 4), errors (m, 2), correct (m,), and which landmark each is, (m,)."""
+    """Fit to m peaks: features (m, 3, 4), errors (m, 2), correct (m,), and which landmark each is, (m,)."""
     size = np.linalg.norm(errors, axis=1)
     use = np.isfinite(size) & (size < gross_px)
     if use.sum() < 20:
         raise ValueError(f"frames: only {use.sum()} landmarks to calibrate on; give at least 20.")
-    x = np.column_stack([landmark[use, None] == np.arange(3), features[use, 1:]]).astype(float)
+    own = landmark[use, None] == np.arange(3)
 
-    def variance(squared: np.ndarray) -> tuple[float, ...]:
+    def variance(axis: int) -> tuple[float, ...]:
+        squared = errors[use, axis] ** 2
+        x = np.column_stack([own, features[use, axis, 1:]]).astype(float)
+
         def deviance(beta: np.ndarray) -> tuple[float, np.ndarray]:
             log_variance = x @ beta
             ratio = squared * np.exp(-log_variance)
@@ -293,13 +349,37 @@ def _fit(
     y = correct.astype(float)
 
     def cost(beta: np.ndarray) -> tuple[float, np.ndarray]:
-        z = features @ beta
+        z = features[:, 2] @ beta
         ridge = 1e-3 * np.array([0.0, 1.0, 1.0, 1.0])
         p = 1 / (1 + np.exp(-z))
-        return (np.logaddexp(0, z) - y * z).mean() + ridge @ beta**2, features.T @ (p - y) / len(y) + 2 * ridge * beta
+        return (np.logaddexp(0, z) - y * z).mean() + ridge @ beta**2, features[:, 2].T @ (p - y) / len(
+            y
+        ) + 2 * ridge * beta
 
     logit = minimize(cost, np.array([-4.0, 0.0, 8.0, 0.0]), jac=True, method="L-BFGS-B").x
-    return Calibration(tuple(variance(errors[use, axis] ** 2) for axis in (0, 1)), tuple(map(float, logit)))
+    return Calibration((variance(0), variance(1)), tuple(map(float, logit)))
+
+
+def _belief(
+    moved: np.ndarray, errors: np.ndarray, landmark: np.ndarray, gross_px: float, gains: Sequence[float]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Gain, one of `gains`, and bias (3, 2) of each landmark and axis that leave the smallest absolute errors.
+
+    `moved` (m, 2) are the closeups' whole corrections, `errors` (m, 2) what they leave.
+    """
+    use = (
+        np.linalg.norm(errors - moved, axis=1) < gross_px
+    )  # expected at the right tool; a closeup's own blunders count
+    best, bias = np.ones((3, 2)), np.zeros((3, 2))
+    for k, axis in np.ndindex(3, 2):
+        own = use & (landmark == k)
+        if not own.any():
+            continue
+        left = errors[own, axis] + (np.asarray(gains)[:, None] - 1) * moved[own, axis]
+        centre = np.median(left, axis=1)
+        i = np.abs(left - centre[:, None]).mean(1).argmin()
+        best[k, axis], bias[k, axis] = gains[i], centre[i]
+    return best, bias
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -1,8 +1,10 @@
 """The detector for other programs: each stage as ONNX with its decoding and calibration inside, checked against torch.
 
 A stage takes its own input, RGB in [0, 1] of shape (n, 3, h, w), and gives what `Landmarks` holds: u (n, 3, 2) px, covariance
-(n, 3, 2, 2) px^2 and confidence (n, 3); those of the first stage in pixels of the unreduced frame.  The stage for
-landmarks sees a window for each and its caller takes that landmark's row.
+(n, 3, 2, 2) px^2 and confidence (n, 3); those of the first stage in pixels of the unreduced frame.  The stages for
+landmarks see a window or a closeup of each and their caller takes that landmark's row.  ``closeup`` corrects what the windows
+are sure of (the windows' confidence is kept), ``tracking`` follows what was found in the frame before: the same closeups,
+believed otherwise.
 """
 
 from __future__ import annotations
@@ -19,9 +21,19 @@ import torch
 from torch import Tensor, nn
 
 from lib import paths
-from lib.landmarks.engines import LastHeatmaps, openvino
+from lib.landmarks.engines import LastOutput, openvino
 from lib.landmarks.heatmaps import decode
-from lib.landmarks.inference import MIN_CONFIDENCE, Calibration, Detector, as_tensor, calibrated
+from lib.landmarks.inference import (
+    CLOSEUP_REACH_PX,
+    MIN_CONFIDENCE,
+    Calibration,
+    Detector,
+    as_tensor,
+    believed,
+    calibrated,
+    closeup_peaks,
+)
+from lib.landmarks.windows import CLOSEUP_ZOOM, expected_in_closeup
 from lib.recordings import Recording
 
 __all__ = [
@@ -53,18 +65,30 @@ class StageWithDecoding(nn.Module):
 
     def __init__(self, detector: Detector, stage: str):
         super().__init__()
-        network = detector.networks[stage]
-        self.heatmaps = LastHeatmaps(network, mirror=detector.mirror and stage == "window")
-        self.stride, self.method = network.stride, detector.method
+        network = detector.networks["closeup" if stage == "tracking" else stage]
+        self.network = LastOutput(network, mirror=detector.mirror and stage == "window")
+        self.closeup = stage in ("closeup", "tracking")
+        self.stride, self.method = None if self.closeup else network.stride, detector.method
         self.scale = detector.reduction if stage == "frame" else 1
         fit = detector.calibration.get(stage, Calibration())
         self.register_buffer("log_variance", torch.tensor(fit.coefficients, dtype=torch.float32))
         self.register_buffer("logit", torch.tensor(fit.logit))
+        self.register_buffer("gain", torch.tensor(fit.gain))
+        self.register_buffer("bias", torch.tensor(fit.bias))
+        if self.closeup:
+            expected = expected_in_closeup(network.config.size_px, np.arange(3))
+            self.register_buffer("expected", torch.tensor(expected, dtype=torch.float32))
+            self.register_buffer("reach", CLOSEUP_REACH_PX * torch.tensor(CLOSEUP_ZOOM))
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        peaks = decode(self.heatmaps(images), self.stride, method=self.method)
+        seen = self.network(images)
+        if self.closeup:
+            peaks = believed(closeup_peaks(seen, images.shape[-1]), self.expected, self.gain, self.bias, self.reach)
+        else:
+            peaks = decode(seen, self.stride, method=self.method)
         covariance, confidence = calibrated(peaks, self.scale, self.log_variance, self.logit)
-        return peaks.u * self.scale + (self.scale - 1) / 2, covariance, confidence
+        u = peaks.u * self.scale + (self.scale - 1) / 2
+        return u, covariance, confidence.expand(-1, 3)
 
 
 def export(detector: Detector, folder: str | Path, examples: np.ndarray) -> dict[str, tuple[Path, float]]:
@@ -94,7 +118,7 @@ def export(detector: Detector, folder: str | Path, examples: np.ndarray) -> dict
     folder.mkdir(parents=True, exist_ok=True)
     detector = replace(detector, engine="torch")
     rough, result = detector(examples).u, {}
-    for stage in detector.networks:
+    for stage in [*detector.networks, *(["tracking"] if detector.closeup_network else [])]:
         images = detector.reduced(examples) if stage == "frame" else detector.windows(examples, rough, stage)[0]
         if not len(images):
             raise ValueError("examples: no tool was found in them, so nothing can be compared; give other frames.")

@@ -1,8 +1,8 @@
 """The detector: images in, landmarks with covariance and confidence out.
 
 Coarse to fine on the CPU: the whole frame at low resolution finds the tool, one upright window round the tool names its
-landmarks, a small window at full resolution measures each.  The first stage alone, at full resolution, is the paper's
-detector.
+landmarks, a small window at full resolution finds each, and a closeup measures it.  The first stage alone, at full
+resolution, is the paper's detector.
 Everything a detector needs lies in one safetensors file: weights, configuration, calibration and provenance.
 """
 
@@ -27,8 +27,16 @@ from lib import paths
 from lib.geometry import image_from_cell
 from lib.landmarks.engines import accelerated, default_engine
 from lib.landmarks.heatmaps import Peaks, decode
-from lib.landmarks.network import HourglassConfig, StackedHourglass
-from lib.landmarks.windows import cut, direction_rad, tool_centre, window_from_image
+from lib.landmarks.network import OffsetNetwork, StackedHourglass, config_of, network_of
+from lib.landmarks.windows import (
+    CLOSEUP_ZOOM,
+    closeup_from_image,
+    cut,
+    direction_rad,
+    expected_in_closeup,
+    tool_centre,
+    window_from_image,
+)
 from lib.parallel import single_threaded_torch
 
 __all__ = ["Calibration", "Detector", "Landmarks", "as_tensor", "joined", "read_checkpoint", "write_checkpoint"]
@@ -36,9 +44,13 @@ __all__ = ["Calibration", "Detector", "Landmarks", "as_tensor", "joined", "read_
 FORMAT = "microstereo.detector"
 #: Of the code between weights and landmarks (windows, decoding, what is missing): raised with every change of it that moves
 #: landmarks, so that kept detections are made anew.
-CODE_VERSION = 3
+CODE_VERSION = 4
 #: Landmarks below this confidence are missing: NaN.
 MIN_CONFIDENCE = 0.05
+#: Landmarks below this confidence are neither looked at closely nor followed from frame to frame.
+MIN_TRACKED = 0.5
+#: A closeup is believed if it sees its landmark nearer than this to where that was thought to be, image pixels.
+CLOSEUP_REACH_PX = 20.0
 
 
 @dataclass(frozen=True)
@@ -81,13 +93,25 @@ class Calibration:
         (2, 6): for x and y the constants of base, tip_1 and tip_2, and the slopes of the other three features.
     logit:
         (4,).
+    gain, bias:
+        (3, 2): of base, tip_1 and tip_2 along x and y, how much of the way from where a closeup expects its landmark to
+        where it sees it is believed (the window that said where to look knows something too), and how far beyond its
+        landmark that still is, in the closeup's pixels.
     """
 
     log_variance: tuple[tuple[float, ...], ...] = ((0.0, 0.0, 0.0, 1.0, 0.0, 0.0),) * 2
     logit: tuple[float, ...] = (-4.0, 0.0, 8.0, 0.0)
+    gain: tuple[tuple[float, ...], ...] = ((1.0, 1.0),) * 3
+    bias: tuple[tuple[float, ...], ...] = ((0.0, 0.0),) * 3
 
     @classmethod
-    def of(cls, log_variance: Sequence[Sequence[float]], logit: Sequence[float]) -> Calibration:
+    def of(
+        cls,
+        log_variance: Sequence[Sequence[float]],
+        logit: Sequence[float],
+        gain: Sequence[Sequence[float]] = ((1.0, 1.0),) * 3,
+        bias: Sequence[Sequence[float]] = ((0.0, 0.0),) * 3,
+    ) -> Calibration:
         """From the lists that JSON keeps.
 
         Raises
@@ -95,9 +119,9 @@ class Calibration:
         ValueError
             For lists of other lengths.
         """
-        if np.shape(log_variance) != (2, 6) or np.shape(logit) != (4,):
+        if [np.shape(part) for part in (log_variance, logit, gain, bias)] != [(2, 6), (4,), (3, 2), (3, 2)]:
             raise ValueError("calibration: is of another version; make it anew (`train assemble`, or the study).")
-        return cls(tuple(map(tuple, log_variance)), tuple(logit))
+        return cls(tuple(map(tuple, log_variance)), tuple(logit), tuple(map(tuple, gain)), tuple(map(tuple, bias)))
 
     @property
     def coefficients(self) -> np.ndarray:
@@ -107,17 +131,18 @@ class Calibration:
 
 
 def peak_features(variance_px2: Tensor, value: Tensor, width: Tensor) -> Tensor:
-    """(..., 4): 1, log of the fit's variance in px^2, height of the peak, |log of its relative width|."""
+    """(..., 4): 1, log of a variance in px^2, height of the peak, |log of its relative width|."""
     variance = variance_px2.clamp(1e-4, 1e4).log()
     return torch.stack([torch.ones_like(value), variance, value.clamp(-0.5, 1.5), width.log().abs()], dim=-1)
 
 
 def features_of(peaks: Peaks, scale: float) -> Tensor:
-    """`peak_features` (..., 4) of peaks whose pixels are `scale` image pixels."""
+    """`peak_features` (..., 3, 4) of peaks whose pixels are `scale` image pixels: of the variances along x, y, and both."""
     covariance = peaks.covariance * scale**2
     covariance = torch.where(torch.isfinite(covariance), covariance, torch.eye(2, dtype=covariance.dtype))
     (xx, xy), (yx, yy) = (row.unbind(-1) for row in covariance.unbind(-2))
-    return peak_features((xx * yy - xy * yx).clamp_min(1e-12).sqrt(), peaks.value, peaks.width)
+    both = (xx * yy - xy * yx).clamp_min(1e-12).sqrt()
+    return torch.stack([peak_features(v, peaks.value, peaks.width) for v in (xx, yy, both)], -2)
 
 
 def calibrated(peaks: Peaks, scale: float, log_variance: Tensor, logit: Tensor) -> tuple[Tensor, Tensor]:
@@ -126,8 +151,31 @@ def calibrated(peaks: Peaks, scale: float, log_variance: Tensor, logit: Tensor) 
     `log_variance` (..., 2, 4) are the `Calibration.coefficients` of each peak's landmark, `logit` is (4,).
     """
     features = features_of(peaks, scale)
-    variance = (features[..., None, :] * log_variance).sum(-1).clamp(-12, 12).exp()
-    return variance[..., None] * torch.eye(2, dtype=variance.dtype), torch.sigmoid((features * logit).sum(-1))
+    variance = (features[..., :2, :] * log_variance).sum(-1).clamp(-12, 12).exp()
+    confidence = torch.sigmoid((features[..., 2, :] * logit).sum(-1))
+    return variance[..., None] * torch.eye(2, dtype=variance.dtype), confidence
+
+
+def closeup_peaks(found: Tensor, size_px: int) -> Peaks:
+    """What an `OffsetNetwork` says of closeups, (n, 4), as peaks (n, 1): of height and width 1, and of its variances.
+
+    A Laplace distribution of scale b has the variance 2 b^2.
+    """
+    u = (size_px - 1) / 2 + found[:, None, :2]
+    one = torch.ones_like(u[..., 0])
+    variance = 2 * (2 * found[:, None, 2:]).exp()
+    return Peaks(u, one, one, variance[..., None] * torch.eye(2, dtype=variance.dtype))
+
+
+def believed(peaks: Peaks, expected: Tensor, gain: Tensor, bias: Tensor, reach: Tensor) -> Peaks:
+    """Closeups' peaks, `Calibration.gain` of the way from where their landmark was `expected`, less the bias.
+
+    All three (n, k, 2) or one for all.  Beyond `reach` (n, k) closeup pixels, further than it was trained for, the network
+    sees another thing: such peaks have the value 0.  Torch can trace it.
+    """
+    move = peaks.u - expected
+    near = (move.square().sum(-1) < reach.square()).to(move.dtype)
+    return replace(peaks, u=expected + gain * move - bias, value=peaks.value * near)
 
 
 def as_tensor(images: ArrayLike | Tensor) -> Tensor:
@@ -197,10 +245,10 @@ def read_checkpoint(path: str | Path, kind: str) -> tuple[dict[str, Tensor], dic
     return tensors, metadata
 
 
-def load_network(path: str | Path, config: object, tensors: dict[str, Tensor]) -> StackedHourglass:
+def load_network(path: str | Path, config: dict, tensors: dict[str, Tensor]) -> StackedHourglass | OffsetNetwork:
     """A network from its configuration and weights; errors name the file."""
     try:
-        network = StackedHourglass(HourglassConfig(**config))  # type: ignore[arg-type]
+        network = network_of(config_of(config))
         network.load_state_dict(tensors)
     except (TypeError, RuntimeError, ValueError) as error:
         raise ValueError(f"{path}: its weights do not fit its configuration ({str(error).splitlines()[0]}).") from error
@@ -221,11 +269,13 @@ class Detector:
         Sees upright full-resolution windows of `window_px` around each landmark; None = there is no such stage.
     tool_network, tool_reduction:
         Sees one upright window of `window_px` round the tool, that much reduced, between the two; None = no such stage.
+    closeup_network:
+        Sees a closeup of each landmark that the windows found, and says where in it the landmark lies; None = no such stage.
     calibration:
-        One per stage: ``"frame"``, ``"tool"`` and ``"window"``.
+        One per stage: ``"frame"``, ``"tool"``, ``"window"`` and ``"closeup"``; and ``"tracking"`` of the closeups that follow
+        a landmark from frame to frame.
     mirror:
-        The last stage looks at every window and its mirror image, and takes the mean: twice the work.  While tracking,
-        where time counts, it looks once.
+        The windows' network looks at every window and its mirror image, and takes the mean: twice the work.
     engine:
         What runs the networks, one of `lib.landmarks.engines.ENGINES`; the weights are the same.
     """
@@ -239,12 +289,15 @@ class Detector:
     method: str = "gauss_newton"
     calibration: dict[str, Calibration] = field(default_factory=dict)
     metadata: dict[str, object] = field(default_factory=dict)
+    closeup_network: OffsetNetwork | None = None
     mirror: bool = False
     engine: str = "torch"
 
     def __post_init__(self) -> None:
         if self.reduction < 1 or self.reduction != int(self.reduction):
             raise ValueError(f"reduction: must be a positive integer, got {self.reduction}.")
+        if self.closeup_network and not self.window_network:
+            raise ValueError("closeup_network: looks at what a window_network has found; give one.")
         if self.mirror and self.window_network and self.window_px % self.window_network.stride:
             raise ValueError(f"mirror: needs window_px to be a multiple of the stride, got {self.window_px}.")
         fast = {
@@ -252,15 +305,16 @@ class Detector:
             for name, network in self.networks.items()
         }
         object.__setattr__(self, "_fused", fast)
-        once = (
-            accelerated(self.window_network, self.engine) if self.mirror and self.window_network else fast.get("window")
-        )
-        object.__setattr__(self, "_once", once)
 
     @property
-    def networks(self) -> dict[str, StackedHourglass]:
+    def networks(self) -> dict[str, StackedHourglass | OffsetNetwork]:
         """The stages there are, in the order of their use."""
-        stages = {"frame": self.frame_network, "tool": self.tool_network, "window": self.window_network}
+        stages = {
+            "frame": self.frame_network,
+            "tool": self.tool_network,
+            "window": self.window_network,
+            "closeup": self.closeup_network,
+        }
         return {name: network for name, network in stages.items() if network is not None}
 
     # Files
@@ -280,7 +334,7 @@ class Detector:
         if not path.suffix and not path.is_file():
             path = paths.MODELS / f"{path.name}.safetensors"
         tensors, metadata = read_checkpoint(path, FORMAT)
-        parts: dict[str, StackedHourglass] = {}
+        parts: dict[str, StackedHourglass | OffsetNetwork] = {}
         for name, config in metadata["networks"].items():
             own = {key.removeprefix(name + "."): value for key, value in tensors.items() if key.startswith(name + ".")}
             parts[name] = load_network(path, config, own)
@@ -294,6 +348,7 @@ class Detector:
             method=metadata["method"],
             calibration={name: Calibration.of(*fit) for name, fit in metadata["calibration"].items()},
             metadata=metadata["provenance"],
+            closeup_network=parts.get("closeup"),
             mirror=metadata.get("mirror", False),
             engine=engine or default_engine(),
         )
@@ -310,9 +365,11 @@ class Detector:
             "reduction": self.reduction,
             "tool_reduction": self.tool_reduction,
             "window_px": self.window_px,
-            "method": self.method,
             "mirror": self.mirror,
-            "calibration": {name: [fit.log_variance, fit.logit] for name, fit in self.calibration.items()},
+            "method": self.method,
+            "calibration": {
+                name: [fit.log_variance, fit.logit, fit.gain, fit.bias] for name, fit in self.calibration.items()
+            },
             "provenance": self.metadata,
         }
         write_checkpoint(path, tensors, metadata)
@@ -339,8 +396,8 @@ class Detector:
                 found.append(result)
         return _missing(joined(found))
 
-    def track(self, images: ArrayLike, previous: Landmarks, *, min_confidence: float = 0.5) -> Landmarks:
-        """Landmarks of the frames that follow `previous`: windows alone, the whole frame where they fail.
+    def track(self, images: ArrayLike, previous: Landmarks, *, min_confidence: float = MIN_TRACKED) -> Landmarks:
+        """Landmarks of the frames that follow `previous`: closeups (or windows) alone, the whole frame where they fail.
 
         Parameters
         ----------
@@ -363,7 +420,11 @@ class Detector:
         if usable.size:
             with self._threads():
                 part = images if usable.size == len(images) else images[usable]  # a pair of frames takes 12 MB
-                _put(result, usable, self._refined(part, previous[usable], "window", once=True))
+                near, stage = previous[usable], "window" if self.closeup_network is None else "tracking"
+                # The first closeup says where to look closely.
+                for _ in range(1 if stage == "window" else 2):
+                    near = self._refined(part, near, stage)
+                _put(result, usable, near)
         lost = np.flatnonzero((result.confidence < min_confidence).any(1))
         if lost.size:
             _put(result, lost, self(images[lost]))
@@ -385,46 +446,43 @@ class Detector:
         return decode(heatmaps, self.frame_network.stride, method=method or self.method), heatmaps
 
     def windows(self, images: np.ndarray, u: ArrayLike, stage: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """What stage ``"tool"`` or ``"window"`` looks at, given the rough landmarks u (n, 3, 2).
+        """What a stage after the first looks at, given the rough landmarks u (n, 3, 2); ``"tracking"`` at closeups too.
 
         Returns
         -------
         Windows (m, s, s, 3) uint8; window_from_image (m, 2, 3); the image (m,) of each window (``"tool"``), or image
-        and landmark (m, 2) (``"window"``).  A tool without base or tips, a missing landmark have none.
+        and landmark (m, 2) (the others).  A tool without base or tips, a missing landmark have none.
         """
         u = np.asarray(u, dtype=np.float64)
         angle = direction_rad(u)
+        size = self.window_px if stage in ("tool", "window") else self.closeup_network.config.size_px
         if stage == "tool":
-            which = np.flatnonzero(np.isfinite(angle))
-            image, centre, zoom = which, tool_centre(u[which]), 1 / self.tool_reduction
+            image = which = np.flatnonzero(np.isfinite(angle))
+            matrices = window_from_image(tool_centre(u[which]), angle[which], size, 1 / self.tool_reduction)
         else:
             which = np.argwhere(np.isfinite(u).all(2) & np.isfinite(angle)[:, None])
-            image, zoom = which[:, 0], 1.0
-            centre = u[image, which[:, 1]]
-        if not len(which):
-            return np.zeros((0, self.window_px, self.window_px, 3), np.uint8), np.zeros((0, 2, 3)), which
-        matrices = window_from_image(centre, angle[image], self.window_px, zoom)
-        windows = [cut(images[i], matrix, self.window_px) for i, matrix in zip(image, matrices, strict=True)]
-        return np.stack(windows), matrices, which
+            image, landmark = which.T
+            place = u[image, landmark], angle[image], size
+            matrices = window_from_image(*place) if stage == "window" else closeup_from_image(*place, landmark)
+        windows = [cut(images[i], matrix, size) for i, matrix in zip(image, matrices, strict=True)]
+        return np.stack(windows) if windows else np.zeros((0, size, size, 3), np.uint8), matrices, which
 
     def explained(self, image: np.ndarray) -> tuple[Landmarks, np.ndarray, np.ndarray, np.ndarray]:
-        """What the last stage saw in one image (h, w, 3): landmarks, windows (m, s, s, 3), window_from_image (m, 2, 3), and
+        """What the windows saw in one image (h, w, 3): landmarks, windows (m, s, s, 3), window_from_image (m, 2, 3), and
         each window's heatmap (m, c, c) of its own landmark."""
         found = self(image[None])
         windows, matrices, which = self.windows(image[None], found.u, "window")
         if not len(which):
             return found, windows, matrices, windows[..., 0]
-        heat = self.heatmaps(windows, "window").numpy()[np.arange(len(which)), which[:, 1]]
+        heat = self.outputs(windows, "window").numpy()[np.arange(len(which)), which[:, 1]]
         return found, windows, matrices, heat
 
-    def heatmaps(self, windows: np.ndarray, stage: str, *, once: bool = False) -> Tensor:
-        """Heatmaps (m, 3, h, w) of windows (m, s, s, 3); with `once` the last stage looks once, `mirror` or not."""
+    def outputs(self, windows: np.ndarray, stage: str) -> Tensor:
+        """Heatmaps (m, 3, h, w) of windows (m, s, s, 3); of closeups what the `OffsetNetwork` says, (m, 4)."""
         with torch.inference_mode():
-            return (self._once if once and stage == "window" else self._fused[stage])(as_tensor(windows))[-1]
+            return self._fused["closeup" if stage == "tracking" else stage](as_tensor(windows))[-1]
 
-    def stage_peaks(
-        self, images: np.ndarray, u: ArrayLike, stage: str, *, once: bool = False
-    ) -> tuple[Peaks, np.ndarray, np.ndarray]:
+    def stage_peaks(self, images: np.ndarray, u: ArrayLike, stage: str) -> tuple[Peaks, np.ndarray, np.ndarray]:
         """What a window stage decodes: peaks (m, 1) in pixels of the windows, window_from_image (m, 2, 3), (m, 2) which.
 
         Each row of the last is image and landmark.
@@ -437,25 +495,40 @@ class Detector:
                 matrices,
                 np.zeros((0, 2), int),
             )
-        heatmaps = self.heatmaps(windows, stage, once=once)
+        outputs = self.outputs(windows, stage)
+        if stage in ("closeup", "tracking"):
+            size, k = windows.shape[1], which[:, 1]
+            fit, reach = self.calibration.get(stage, Calibration()), CLOSEUP_REACH_PX * np.array(CLOSEUP_ZOOM)
+            parts = (expected_in_closeup(size, k), np.array(fit.gain)[k], np.array(fit.bias)[k], reach[k])
+            belief = (torch.from_numpy(part)[:, None].float() for part in parts)
+            return believed(closeup_peaks(outputs, size), *belief), matrices, which
         if stage == "tool":  # one window holds all three landmarks
             which = np.stack([np.repeat(which, 3), np.tile(np.arange(3), len(which))], axis=1)
-            matrices, heatmaps = np.repeat(matrices, 3, axis=0), heatmaps.flatten(0, 1)[:, None]
+            matrices, heatmaps = np.repeat(matrices, 3, axis=0), outputs.flatten(0, 1)[:, None]
         else:
-            heatmaps = heatmaps[torch.arange(len(which)), torch.from_numpy(which[:, 1])][:, None]
+            heatmaps = outputs[torch.arange(len(which)), torch.from_numpy(which[:, 1])][:, None]
         return decode(heatmaps, self.networks[stage].stride, method=self.method), matrices, which
 
-    def _refined(self, images: np.ndarray, rough: Landmarks, stage: str, *, once: bool = False) -> Landmarks:
-        peaks, matrices, which = self.stage_peaks(images, rough.u, stage, once=once)
+    def _refined(self, images: np.ndarray, rough: Landmarks, stage: str) -> Landmarks:
+        peaks, matrices, which = self.stage_peaks(images, rough.u, stage)
         result = Landmarks(rough.u.copy(), rough.covariance.copy(), rough.confidence.copy())
         if not len(which):
             return result
         fine = self._calibrated(peaks, stage, 1, which[:, 1:])
         back = np.linalg.inv(matrices[:, :, :2])
         u = (back @ (fine.u[:, 0] - matrices[:, :, 2])[..., None])[..., 0]
+        covariance = back @ fine.covariance[:, 0] @ back.mT
+        confidence = fine.confidence[:, 0]
+        if stage in ("closeup", "tracking"):
+            seen = peaks.value[:, 0].numpy() > 0
+            confidence = np.where(seen, confidence, 0.0)
+        if stage == "closeup":  # that the landmark is there the windows know; an unsure one is left where they saw it
+            seen &= rough.confidence[which[:, 0], which[:, 1]] >= MIN_TRACKED
+            u, covariance, which = u[seen], covariance[seen], which[seen]
+        else:
+            result.confidence[which[:, 0], which[:, 1]] = confidence
         i, k = which.T
-        result.u[i, k], result.confidence[i, k] = u, fine.confidence[:, 0]
-        result.covariance[i, k] = back @ fine.covariance[:, 0] @ back.mT
+        result.u[i, k], result.covariance[i, k] = u, covariance
         return _missing(result)
 
     def reduced(self, images: np.ndarray) -> np.ndarray:
@@ -477,7 +550,7 @@ class Detector:
         return Landmarks(u, covariance.numpy(), confidence.numpy())
 
     def with_calibration(self, **fits: Calibration) -> Detector:
-        """A copy with the calibration of ``frame=`` or ``window=`` replaced."""
+        """A copy with the calibration of some stages (``frame=``, ``window=``, ...) replaced."""
         return replace(self, calibration={**self.calibration, **fits})
 
 

@@ -1,7 +1,9 @@
 """The Stacked Hourglass network (Newell et al. 2016; paper Sec. III), one class with the paper's five configurations.
 
-Every layer keeps the half-pixel rule of `lib.geometry`: the stem's even kernel is centred on its cell, pooling and
-nearest-neighbour upsampling are aligned with cell borders.  A network therefore has nothing to unlearn before
+Beside it `OffsetNetwork`, which the paper has not: it looks closely at one landmark that a hourglass has found.
+
+Every layer of the hourglass keeps the half-pixel rule of `lib.geometry`: the stem's even kernel is centred on its cell,
+pooling and nearest-neighbour upsampling are aligned with cell borders.  A network therefore has nothing to unlearn before
 the centre of heatmap cell c lies at pixel stride * c + (stride - 1) / 2 of its input.
 """
 
@@ -9,13 +11,22 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass
+from typing import TypeVar
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-__all__ = ["ABLATION", "HourglassConfig", "StackedHourglass"]
+__all__ = [
+    "ABLATION",
+    "HourglassConfig",
+    "OffsetConfig",
+    "OffsetNetwork",
+    "StackedHourglass",
+    "config_of",
+    "network_of",
+]
 
 LANDMARKS = ("base", "tip_1", "tip_2")
 STEM_STRIDE = 4
@@ -179,12 +190,116 @@ class StackedHourglass(nn.Module):
 
     def fused(self) -> StackedHourglass:
         """A copy for inference: batch normalisation folded into the convolutions, channels last (same outputs)."""
-        network = copy.deepcopy(self).eval()
-        for module in list(network.modules()):
-            if not isinstance(module, nn.Sequential):
-                continue
-            for i in range(len(module) - 1):
-                if isinstance(module[i], nn.Conv2d) and isinstance(module[i + 1], nn.BatchNorm2d):
-                    module[i] = fuse_conv_bn_eval(module[i], module[i + 1])
-                    module[i + 1] = nn.Identity()
-        return network.to(memory_format=torch.channels_last)
+        return _fused(self)
+
+
+@dataclass(frozen=True)
+class OffsetConfig:
+    """What an `OffsetNetwork` is.
+
+    Attributes
+    ----------
+    features:
+        Channels at half the closeup's resolution; more where it is lower.
+    size_px:
+        Of the closeups, a multiple of 16.
+    """
+
+    features: int = 32
+    size_px: int = 64
+
+    def __post_init__(self) -> None:
+        if self.features < 1:
+            raise ValueError(f"features: must be positive, got {self.features}.")
+        if self.size_px < 16 or self.size_px % 16:
+            raise ValueError(f"size_px: must be a multiple of 16, got {self.size_px}.")
+
+
+class _Residual(nn.Module):
+    """Two 3 x 3 convolutions and what they add to (He et al. 2016), halving the resolution where `halve`."""
+
+    def __init__(self, inputs: int, outputs: int, halve: bool = False):
+        super().__init__()
+        first = nn.Conv2d(inputs, outputs, 3, stride=2 if halve else 1, padding=1, bias=False)
+        self.body = nn.Sequential(
+            nn.Sequential(first, nn.BatchNorm2d(outputs), nn.ReLU(inplace=True)), _conv(outputs, outputs, 3, relu=False)
+        )
+        pool = nn.AvgPool2d(2) if halve else nn.Identity()
+        same = inputs == outputs and not halve
+        self.skip = nn.Identity() if same else nn.Sequential(pool, _conv(inputs, outputs, 1, relu=False))
+
+    def forward(self, x: Tensor) -> Tensor:
+        return F.relu(self.body(x) + self.skip(x))
+
+
+class OffsetNetwork(nn.Module):
+    """Closeups to where their landmark lies, and how well that is known.
+
+    ``forward(images)`` takes float images (n, 3, s, s) in [0, 1], RGB, and returns one tensor (n, 4) in a list, as the
+    hourglass does: the landmark's distance from the closeup's centre along x and y in pixels, and the logarithms of the
+    scales, in pixels, of their errors, within -6 and 5 (`lib.landmarks.training.offset_loss`).
+
+    Raises
+    ------
+    ValueError
+        If the images have another size.
+    """
+
+    def __init__(self, config: OffsetConfig | None = None):
+        super().__init__()
+        self.config = config = config or OffsetConfig()
+        f = config.features
+        stem = nn.Sequential(
+            nn.Conv2d(3, f, 5, stride=2, padding=2, bias=False), nn.BatchNorm2d(f), nn.ReLU(inplace=True)
+        )
+        self.body = nn.Sequential(
+            stem,
+            _Residual(f, f),
+            _Residual(f, 2 * f, halve=True),
+            _Residual(2 * f, 2 * f),
+            _Residual(2 * f, 3 * f, halve=True),
+            _Residual(3 * f, 3 * f),
+            _Residual(3 * f, 4 * f, halve=True),
+        )
+        # Fully connected: where something is seen decides, which a mean over the closeup would forget.
+        self.head = nn.Sequential(
+            nn.Flatten(), nn.Linear(4 * f * (config.size_px // 16) ** 2, 128), nn.ReLU(inplace=True), nn.Linear(128, 4)
+        )
+        nn.init.zeros_(self.head[-1].weight)  # start at "in the middle, give or take a pixel"
+        nn.init.zeros_(self.head[-1].bias)
+
+    def forward(self, images: Tensor) -> list[Tensor]:
+        size = self.config.size_px
+        if images.ndim != 4 or tuple(images.shape[1:]) != (3, size, size):
+            raise ValueError(f"images: the network takes (n, 3, {size}, {size}) RGB, got {tuple(images.shape)}.")
+        y = self.head(self.body((images - 0.5) * 4.0))
+        return [torch.cat([y[:, :2] * (size / 8), y[:, 2:].clamp(-6, 5)], dim=1)]
+
+    def fused(self) -> OffsetNetwork:
+        """A copy for inference: batch normalisation folded into the convolutions, channels last (same outputs)."""
+        return _fused(self)
+
+
+def network_of(config: HourglassConfig | OffsetConfig) -> StackedHourglass | OffsetNetwork:
+    """A fresh network of a configuration."""
+    return OffsetNetwork(config) if isinstance(config, OffsetConfig) else StackedHourglass(config)
+
+
+def config_of(values: dict[str, object]) -> HourglassConfig | OffsetConfig:
+    """The configuration that JSON kept."""
+    return (OffsetConfig if "size_px" in values else HourglassConfig)(**values)  # type: ignore[arg-type]
+
+
+_Network = TypeVar("_Network", bound=nn.Module)
+
+
+def _fused(network: _Network) -> _Network:
+    network = copy.deepcopy(network).eval()
+    for module in list(network.modules()):
+        if not isinstance(module, nn.Sequential):
+            continue
+        for i in range(len(module) - 1):
+            if isinstance(module[i], nn.Conv2d) and isinstance(module[i + 1], nn.BatchNorm2d):
+                module[i] = fuse_conv_bn_eval(module[i], module[i + 1])
+                module[i + 1] = nn.Identity()
+    return network.to(memory_format=torch.channels_last)

@@ -158,6 +158,7 @@ def finder_alone(detector: Detector, training: Training | None = None) -> Detect
         frame_network=training.network if training else detector.frame_network,
         tool_network=None,
         window_network=None,
+        closeup_network=None,
         reduction=1,
         mirror=False,
         calibration={"frame": _ALWAYS},

@@ -1,6 +1,6 @@
 """The detector at the paper's four input resolutions (paper Sec. V-B, figure of PCK over thresholds).
 
-The frame is first shrunk to the resolution under study, so nothing finer reaches the last stage; the first two stages, which
+The frame is first shrunk to the resolution under study, so nothing finer reaches the windows; the first two stages, which
 find the tool and need less than any of the four, are those of the shipped detector.  Results are full-HD pixels again.
 """
 
@@ -29,13 +29,13 @@ __all__ = ["FIELD_PX", "RESOLUTIONS", "ReducedDetector", "load_resolution", "res
 
 #: (width, height) of the network's frames, by the paper's names.
 RESOLUTIONS = {"1080p": (1920, 1080), "480p": (854, 480), "480x640": (640, 480), "256x448": (448, 256)}
-#: What a window of the last stage shows, in full-HD pixels, whatever the resolution.
+#: What a window shows, in full-HD pixels, whatever the resolution.
 FIELD_PX = 128
 _FULL = np.array(RESOLUTIONS["1080p"], dtype=float)
 
 
 def window_side_px(size_px: tuple[int, int]) -> int:
-    """Side of the last stage's windows in frames of this (width, height): `FIELD_PX` shrunk, a multiple of 4."""
+    """Side of the windows in frames of this (width, height): `FIELD_PX` shrunk, a multiple of 4."""
     return 4 * round(FIELD_PX * np.sqrt(np.prod(np.array(size_px) / _FULL)) / 4)
 
 
@@ -59,14 +59,14 @@ def resolution_windows(source: WindowSource, size_px: tuple[int, int]) -> Window
 
 @dataclass(frozen=True, eq=False)
 class ReducedDetector:
-    """A detector whose last stage sees the frame at another resolution; called as `Detector` is, on full-HD images.
+    """A detector whose windows are of the frame at another resolution; called as `Detector` is, on full-HD images.
 
     Attributes
     ----------
     finder:
         Names the tool's rough landmarks: the shipped stages before the last.
     network:
-        The last stage, trained at this resolution.
+        The windows' stage, trained at this resolution.
     size_px:
         (width, height) of the frames it sees.
     calibration:
@@ -92,14 +92,14 @@ class ReducedDetector:
         return self.refine(np.asarray(images), self.finder(images, batch=batch))
 
     def reduced(self, images: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Images and points as the last stage sees them, and the stride (x, y) of its pixels, in pixels of `images`."""
+        """Images and points as the windows' stage sees them, and the stride (x, y) of its pixels, in pixels of `images`."""
         stride = np.array(images.shape[2:0:-1]) / self.size_px
         if (stride != 1).any():
             images = np.stack([cv2.resize(image, self.size_px, interpolation=cv2.INTER_AREA) for image in images])
         return images, cell_from_image(u, stride), stride
 
     def refine(self, images: np.ndarray, rough: Landmarks) -> Landmarks:
-        """The last stage alone, from rough landmarks in the images' pixels."""
+        """The windows' stage alone, from rough landmarks in the images' pixels."""
         small, u, stride = self.reduced(images, rough.u)
         scale = np.outer(stride, stride)
         found = self._last._refined(small, Landmarks(u, rough.covariance / scale, rough.confidence), "window")
@@ -165,4 +165,4 @@ def load_resolution(
     if (folder / "calibration.json").is_file():
         fit = Calibration.of(**json.loads((folder / "calibration.json").read_text()))
     finder = finder or Detector.load()
-    return ReducedDetector(replace(finder, window_network=None), network, RESOLUTIONS[name], fit)
+    return ReducedDetector(replace(finder, window_network=None, closeup_network=None), network, RESOLUTIONS[name], fit)

@@ -26,8 +26,8 @@ from lib.geometry import cell_from_image
 from lib.landmarks import real
 from lib.landmarks.augmentation import AUGMENTATIONS
 from lib.landmarks.dataset import TOOL, TOOL_REDUCTION, WindowSource, crop_frames, frame_samples, validation_frames
-from lib.landmarks.engines import LastHeatmaps, OpenVinoNetwork
-from lib.landmarks.evaluation import Evaluation, evaluate, labelled_frames
+from lib.landmarks.engines import LastOutput, OpenVinoNetwork
+from lib.landmarks.evaluation import TRACKED_SHIFT_PX, Evaluation, evaluate, labelled_frames
 from lib.landmarks.inference import Detector, Landmarks, joined
 from lib.landmarks.metrics import calibration_error
 from lib.landmarks.network import ABLATION, LANDMARKS, HourglassConfig
@@ -221,7 +221,7 @@ def ablation(options: Options) -> None:
 
 
 def _finder() -> Detector:
-    return replace(Detector.load(), window_network=None)
+    return replace(Detector.load(), window_network=None, closeup_network=None)
 
 
 def _figures(e: Evaluation) -> dict[str, float]:
@@ -242,7 +242,7 @@ def _figures(e: Evaluation) -> dict[str, float]:
 
 
 class _FullHd:
-    """Validation and test frames with what the finder says of them: the same for every network of the last stage."""
+    """Validation and test frames with what the finder says of them: the same for every network of the windows."""
 
     def __init__(self, options: Options):
         finder = _finder()
@@ -270,7 +270,7 @@ def _network(options: Options) -> HourglassConfig:
 
 
 def resolution(options: Options) -> None:
-    """The last stage at the paper's four resolutions, on full-HD frames."""
+    """The windows' stage at the paper's four resolutions, on full-HD frames."""
     crops, held_out = (
         WindowSource.load(options.data, shards=options.shards),
         WindowSource.load(options.data, validation=True),
@@ -468,12 +468,8 @@ def _real_figures(of_seeds: Sequence[Evaluation], thresholds: np.ndarray) -> dic
     }
 
 
-#: What a tool of 2 mm/s moves between two frames at 25 Hz.
-TRACKED_SHIFT_PX = 8.0
-
-
 def shipped(options: Options) -> None:
-    """The shipped weights on every test sequence and the shipped recording: whole frames, and windows as when tracking."""
+    """The shipped weights on every test sequence and the shipped recording: whole frames, and closeups as when tracking."""
     detector = Detector.load()
     recordings = [Recording.open(folder) for folder in sorted(options.test.glob("test_*"))]
     recordings.append(Recording.open(paths.DATA / "open_sky_eye"))
@@ -490,7 +486,7 @@ def shipped(options: Options) -> None:
     whole, windows = _together(parts), _together(tracked)
     options.record(
         {
-            "what": "the shipped detector; tracking: windows placed where the landmarks were found, the whole tool "
+            "what": "the shipped detector; tracking: closeups placed where the landmarks were found, the whole tool "
             f"displaced by {TRACKED_SHIFT_PX:g} px (root mean square: 2 mm/s at 25 Hz)",
             "test": f"{len(whole.names)} full-HD images of {len(recordings)} sequences, eyes and tools never trained on",
             "weights": detector.metadata.get("commit"),
@@ -518,7 +514,7 @@ def engines(options: Options, repeats: int = 20) -> None:
     """What runs the window stage fastest on this CPU: six windows, those of a stereo pair, in ms of wall and CPU time."""
     network = Detector.load(engine="torch").window_network
     images = torch.rand((6, 3, 128, 128), generator=torch.Generator().manual_seed(0))
-    plain, nchw = LastHeatmaps(network).eval(), images.contiguous()
+    plain, nchw = LastOutput(network).eval(), images.contiguous()
     fused, nhwc = network.fused(), images.to(memory_format=torch.channels_last)
 
     def bfloat16() -> object:

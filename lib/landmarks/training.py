@@ -1,4 +1,4 @@
-"""Training a Stacked Hourglass: l2 loss with intermediate supervision, presets, exact resume.
+"""Training a Stacked Hourglass: l2 loss with intermediate supervision, presets, exact resume.  Offset networks train alike.
 
 All randomness of step t comes from a generator seeded with (seed, t), so a run that was interrupted and resumed equals one
 that was not, bit for bit on the CPU: the step's number is the whole state of the generators.
@@ -28,9 +28,16 @@ from tqdm.auto import tqdm
 from lib import paths
 from lib.landmarks.augmentation import AUGMENTATIONS, Augmentation, Batch, leave_frame
 from lib.landmarks.heatmaps import SIGMA_PX, decode, render, sigma_cells
-from lib.landmarks.inference import as_tensor, load_network, read_checkpoint, write_checkpoint
+from lib.landmarks.inference import as_tensor, closeup_peaks, load_network, read_checkpoint, write_checkpoint
 from lib.landmarks.metrics import errors_px, pck, tool_length_px
-from lib.landmarks.network import HourglassConfig, StackedHourglass
+from lib.landmarks.network import (
+    HourglassConfig,
+    OffsetConfig,
+    OffsetNetwork,
+    StackedHourglass,
+    config_of,
+    network_of,
+)
 from lib.records import commit_id
 
 __all__ = [
@@ -41,6 +48,7 @@ __all__ = [
     "heatmap_loss",
     "load_training",
     "main",
+    "offset_loss",
     "position_loss",
     "train",
     "validate",
@@ -135,7 +143,7 @@ class TrainingConfig:
         Validations without a better one before training stops; 0 = never.
     """
 
-    network: HourglassConfig = field(default_factory=HourglassConfig)
+    network: HourglassConfig | OffsetConfig = field(default_factory=HourglassConfig)
     augmentation: Augmentation = AUGMENTATIONS["paper"]
     steps: int = 1000
     batch_size: int = 4
@@ -228,11 +236,37 @@ def position_loss(outputs: Sequence[Tensor], batch: Batch, stride: int, sigma_px
     return torch.stack(losses).mean()
 
 
+def offset_loss(outputs: Sequence[Tensor], batch: Batch) -> Tensor:
+    """Negative log likelihood of an `OffsetNetwork`'s errors under Laplace distributions of the scales that it states.
+
+    Each closeup has one visible landmark, or none: then it does not count.  The absolute error, smoothed within 0.1 px,
+    makes blunders weigh little; divided by the scale, a sharp image weighs more than a blurred one.
+    """
+    (found,) = outputs
+    centre = (batch.images.shape[-1] - 1) / 2
+    own = batch.visibility == 2
+    there = own.any(1).float()
+    true = torch.where(own[..., None], batch.u.float(), 0.0).sum(1) - centre
+    distance = ((found[:, :2].float() - true).square() + 0.01).sqrt()
+    log_scale = found[:, 2:].float()
+    return ((log_scale + distance * (-log_scale).exp()).sum(1) * there).sum() / there.sum().clamp_min(1)
+
+
+def _loss(network: nn.Module, outputs: Sequence[Tensor], batch: Batch, config: TrainingConfig) -> Tensor:
+    if isinstance(network, OffsetNetwork):
+        return offset_loss(outputs, batch)
+    loss = heatmap_loss(outputs, batch, network.stride, config.sigma_px)
+    if config.position_weight_per_px:
+        where = position_loss(outputs, batch, network.stride, config.sigma_px)
+        loss = loss + config.position_weight_per_px * where
+    return loss
+
+
 @dataclass(frozen=True)
 class Training:
     """A finished (or stopped) training: the network to use, one log row per validation, and where it came from."""
 
-    network: StackedHourglass
+    network: StackedHourglass | OffsetNetwork
     log: list[dict[str, float]]
     provenance: dict[str, object]
 
@@ -267,12 +301,13 @@ def _batch(source: Source, config: TrainingConfig, step: int, rank: int = 0) -> 
 
 @torch.no_grad()
 def validate(
-    network: StackedHourglass, samples: Samples, config: TrainingConfig, *, batch: int = 16
+    network: StackedHourglass | OffsetNetwork, samples: Samples, config: TrainingConfig, *, batch: int = 16
 ) -> dict[str, float]:
     """Loss, PCK and median error on held-out images, and two signs of a collapsed network.
 
     `peak` (the mean height of visible landmarks' heatmaps; 1 is right) near 0, or `spread` (the deviation of
-    predictions over that of the labels) near 0, say that the network predicts nothing, or always the same.
+    predictions over that of the labels) near 0, say that the network predicts nothing, or always the same.  An
+    `OffsetNetwork` has no peaks, and no height of them.
     """
     network.eval()
     device = next(network.parameters()).device
@@ -283,9 +318,13 @@ def validate(
         u, visibility = torch.from_numpy(samples.u[part]).float(), torch.from_numpy(samples.visibility[part])
         visibility = leave_frame(u, visibility, tuple(images.shape[-2:]))
         outputs = [output.cpu() for output in network(images.to(device))]
-        losses.append(heatmap_loss(outputs, Batch(images, u, visibility), network.stride, config.sigma_px).item())
-        peaks = decode(outputs[-1], network.stride, sigma_px=config.sigma_px)
-        found.append(peaks.u.numpy())
+        measured = replace(config, position_weight_per_px=0.0)
+        losses.append(_loss(network, outputs, Batch(images, u, visibility), measured).item())
+        if isinstance(network, OffsetNetwork):
+            peaks = closeup_peaks(outputs[-1], images.shape[-1])
+        else:
+            peaks = decode(outputs[-1], network.stride, sigma_px=config.sigma_px)
+        found.append(peaks.u.expand(-1, 3, -1).numpy())
         values.append(torch.where(visibility == 2, peaks.value, torch.nan).numpy())
     u = np.concatenate(found).astype(float)
     h, w = samples.images.shape[1:3]
@@ -294,7 +333,7 @@ def validate(
     error = errors_px(u, labels)
     length = tool_length_px(samples.u)
     spread = np.nanmean(np.nanstd(np.where(inside[..., None], u, np.nan), 0)) / np.nanmean(np.nanstd(labels, 0))
-    return {
+    result = {
         "validation_loss": float(np.mean(losses)),
         "pck_0.05": float(pck(u, labels, 0.05, length_px=length)),
         "pck_0.10": float(pck(u, labels, 0.10, length_px=length)),
@@ -303,16 +342,19 @@ def validate(
         "peak": float(np.nanmean(np.concatenate(values))),
         "spread": float(spread),
     }
+    if isinstance(network, OffsetNetwork):
+        del result["peak"]
+    return result
 
 
 class _Run:
     """Weights, optimiser and log of a training under way, and their file."""
 
-    def __init__(self, config: TrainingConfig, initial: StackedHourglass | None):
+    def __init__(self, config: TrainingConfig, initial: StackedHourglass | OffsetNetwork | None):
         self.config = config
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(config.seed)
-            self.network = copy.deepcopy(initial) if initial is not None else StackedHourglass(config.network)
+            self.network = copy.deepcopy(initial) if initial is not None else network_of(config.network)
         self.rank, self.world = _processes()
         self.device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")) if self.world > 1 else 0)
         if not torch.cuda.is_available():
@@ -328,7 +370,7 @@ class _Run:
         self.best = math.inf
 
     @property
-    def usable(self) -> StackedHourglass:
+    def usable(self) -> StackedHourglass | OffsetNetwork:
         return self.average if self.average is not None else self.network
 
     def advance(self, batch: Batch) -> float:
@@ -339,10 +381,7 @@ class _Run:
         batch = batch.to(self.device)
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.config.precision == "bf16"):
             outputs = self.network(batch.images.contiguous(memory_format=torch.channels_last))
-        loss = heatmap_loss(outputs, batch, self.network.stride, self.config.sigma_px)
-        if self.config.position_weight_per_px:
-            where = position_loss(outputs, batch, self.network.stride, self.config.sigma_px)
-            loss = loss + self.config.position_weight_per_px * where
+        loss = _loss(self.network, outputs, batch, self.config)
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
         if self.world > 1:
@@ -531,7 +570,7 @@ def _config(path: Path, values: dict) -> TrainingConfig:
     """A checkpoint's configuration; what it does not name, since it is older, is as by default."""
     try:
         augmentation = values["augmentation"] | {"zoom": tuple(values["augmentation"]["zoom"])}
-        parts = {"network": HourglassConfig(**values["network"]), "augmentation": Augmentation(**augmentation)}
+        parts = {"network": config_of(values["network"]), "augmentation": Augmentation(**augmentation)}
         return TrainingConfig(**values | parts)
     except (TypeError, KeyError) as error:
         raise ValueError(f"{path}: its configuration is not one of this program ({error}).") from error
@@ -552,19 +591,24 @@ def _write_log(path: Path, log: list[dict[str, float]]) -> None:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """`python3 -m lib train`: generate data, train one stage (resuming), or join two trained stages into a detector."""
+    """`python3 -m lib train`: generate data, train one stage (resuming), or join the trained stages into a detector."""
     from lib.landmarks import assembly, dataset  # late: dataset imports this module
 
     parser = argparse.ArgumentParser(prog="python3 -m lib train", description=main.__doc__.split(": ", 1)[1])
     parser.add_argument(
         "what",
-        choices=["generate", "frame", "tool", "window", "whole", "assemble", "export"],
+        choices=["generate", "frame", "tool", "window", "closeup", "whole", "assemble", "export"],
         help="data; a stage of the shipped detector; the paper's one network on crops; the detector; its stages as ONNX",
     )
     parser.add_argument("--data", type=Path, default=paths.CACHE / "landmarks", help="folder of the shards")
     parser.add_argument("--folder", type=Path, default=paths.CACHE / "training", help="checkpoints, one folder a stage")
     parser.add_argument("--shards", type=int, default=120, help="generate: training shards of 16 frames")
-    parser.add_argument("--windows", type=int, default=60, help="generate: training shards of 512 last-stage windows")
+    parser.add_argument(
+        "--windows", type=int, default=60, help="generate: training shards of 512 windows round a landmark"
+    )
+    parser.add_argument(
+        "--closeups", type=int, default=24, help="generate: training shards of 2048 closeups of a landmark"
+    )
     parser.add_argument("--workers", type=int, help="generate: processes (default: one a core)")
     parser.add_argument("--preset", choices=sorted(PRESETS), default="best")
     parser.add_argument("--steps", type=int, default=6000)
@@ -591,7 +635,8 @@ def main(argv: list[str] | None = None) -> int:
         if a.what == "generate":
             dataset.generate(a.data, max(3, a.shards // 15), validation=True, workers=a.workers)
             dataset.generate(a.data, a.shards, workers=a.workers)
-            dataset.generate_windows(a.data, a.windows, workers=a.workers)
+            dataset.generate_crops(a.data, a.windows, "windows", workers=a.workers)
+            dataset.generate_crops(a.data, a.closeups, "closeups", workers=a.workers)
         elif a.what == "assemble":
             assembly.assemble(a.folder, a.data, a.out, a.recordings)
         elif a.what == "export":
@@ -600,10 +645,10 @@ def main(argv: list[str] | None = None) -> int:
             for stage, (path, difference) in export_shipped(a.out, a.onnx).items():
                 print(f"{stage}: {path}, at most {difference:.2g} px from torch")
         else:
-            features = a.features or {"frame": 32, "tool": 48, "window": 96, "whole": 64}[a.what]
+            features = a.features or {"frame": 32, "tool": 48, "window": 96, "closeup": 32, "whole": 64}[a.what]
             config = replace(
                 PRESETS[a.preset],
-                network=HourglassConfig(features, a.stacks),
+                network=OffsetConfig(features) if a.what == "closeup" else HourglassConfig(features, a.stacks),
                 steps=a.steps,
                 seed=a.seed,
                 validate_every=200,
@@ -626,6 +671,10 @@ def main(argv: list[str] | None = None) -> int:
                 source = replace(dataset.WindowSource.load(a.data), zoom=(0.9, 1.1))
                 validation = Samples.drawn(dataset.WindowSource.load(a.data, validation=True))
                 config = replace(config, augmentation=AUGMENTATIONS["windows"])
+            elif a.what == "closeup":
+                source = dataset.CloseupSource.load(a.data)
+                validation = Samples.drawn(dataset.CloseupSource.load(a.data, validation=True))
+                config = replace(config, augmentation=AUGMENTATIONS["closeups"], batch_size=64, clip=2.0)
             else:
                 source = dataset.simulated_samples(400, seed=a.seed, crop_px=512, progress=True)
                 validation = dataset.simulated_samples(40, seed=a.seed + 10_000, crop_px=512)

@@ -1,8 +1,8 @@
-"""Windows around landmarks: upright crops in which the tool points right, at full resolution.
+"""Windows around landmarks: upright crops in which the tool points right.
 
-The second stage of the detector looks at one small window per landmark.  Each is turned so that the direction from
-base to tips points right and tip_1, the left one for somebody who looks along the tool, lies above: whatever
-the tool's direction in the image, the network sees one pose.
+The later stages of the detector look at small windows.  Each is turned so that the direction from base to tips points right
+and tip_1, the left one for somebody who looks along the tool, lies above: whatever the tool's direction in the
+image, the network sees one pose.  Closeups are reduced a little, and mirrored for tip_2, so that both tips look alike.
 """
 
 from __future__ import annotations
@@ -11,7 +11,22 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-__all__ = ["cut", "direction_rad", "map_points", "tool_centre", "window_from_image"]
+__all__ = [
+    "CLOSEUP_BEHIND_PX",
+    "CLOSEUP_ZOOM",
+    "closeup_from_image",
+    "cut",
+    "direction_rad",
+    "expected_in_closeup",
+    "map_points",
+    "tool_centre",
+    "window_from_image",
+]
+
+#: Closeup pixels per image pixel, of base, tip_1 and tip_2: the base shows between the edges of the shaft.
+CLOSEUP_ZOOM = (0.65, 0.85, 0.85)
+#: How far behind its landmark, along the tool, a closeup is centred, image pixels: how a jaw tapers tells where it ends.
+CLOSEUP_BEHIND_PX = (0.0, 18.0, 18.0)
 
 
 def direction_rad(u: ArrayLike) -> np.ndarray:
@@ -40,11 +55,29 @@ def window_from_image(centre: ArrayLike, angle_rad: ArrayLike, size: int, zoom: 
     return np.concatenate([linear, shift], -1)
 
 
+def closeup_from_image(centre: ArrayLike, angle_rad: ArrayLike, size: int, landmark: ArrayLike) -> np.ndarray:
+    """Matrices (..., 2, 3) like `window_from_image`, of `CLOSEUP_ZOOM`, mirrored for tip_2, and centred behind `centre`
+    (..., 2), where the landmark (...) is thought to lie; `angle_rad` is (...)."""
+    landmark, angle = np.asarray(landmark), np.asarray(angle_rad, dtype=np.float64)
+    behind = np.array(CLOSEUP_BEHIND_PX)[landmark][..., None] * np.stack([np.cos(angle), np.sin(angle)], -1)
+    matrix = window_from_image(np.asarray(centre) - behind, angle, size, np.array(CLOSEUP_ZOOM)[landmark])
+    mirrored = np.asarray(landmark == 2)[..., None]
+    matrix[..., 1, :] = np.where(mirrored, [0.0, 0.0, size - 1.0] - matrix[..., 1, :], matrix[..., 1, :])
+    return matrix
+
+
+def expected_in_closeup(size: int, landmark: ArrayLike) -> np.ndarray:
+    """Where (..., 2), in closeup pixels, a closeup shows its landmark (...) if that lies where it was thought to."""
+    landmark = np.asarray(landmark)
+    ahead = np.array(CLOSEUP_BEHIND_PX)[landmark] * np.array(CLOSEUP_ZOOM)[landmark]
+    return (size - 1) / 2 + np.stack([ahead, np.zeros_like(ahead)], -1)
+
+
 def map_points(matrix: np.ndarray, u: ArrayLike) -> np.ndarray:
     """Points (n, 2) through a (2, 3) matrix, or point i (..., 2) through matrix i (..., 2, 3)."""
     return (matrix[..., :2] @ np.asarray(u, dtype=np.float64)[..., None])[..., 0] + matrix[..., 2]
 
 
-def cut(image: np.ndarray, matrix: np.ndarray, size: int) -> np.ndarray:
-    """The window (size, size, 3) uint8 of an image; black where it leaves the image."""
-    return cv2.warpAffine(image, matrix, (size, size), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+def cut(image: np.ndarray, matrix: np.ndarray, size: int, *, border: int = cv2.BORDER_CONSTANT) -> np.ndarray:
+    """The window (size, size, 3) uint8 of an image; black, or what OpenCV's `border` says, where it leaves the image."""
+    return cv2.warpAffine(image, matrix, (size, size), flags=cv2.INTER_LINEAR, borderMode=border)

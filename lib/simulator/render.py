@@ -22,7 +22,7 @@ from lib.simulator.microscope import Microscope
 from lib.simulator.raster import ToolRaster, rasterise
 from lib.simulator.texture import GAMMA, smooth_noise
 
-__all__ = ["View", "render_pair", "render_view", "surface_grid"]
+__all__ = ["View", "motion_kernel", "render_pair", "render_view", "surface_grid"]
 
 _STEP_PX = 8  # of the coarse grid
 _LINEAR = (np.arange(256, dtype=np.float32) / 255) ** GAMMA
@@ -192,7 +192,7 @@ def _blur_by_depth(image: np.ndarray, sigma: np.ndarray, grid: _Grid | None) -> 
     return result
 
 
-def _motion_kernel(shift_px: np.ndarray) -> np.ndarray | None:
+def motion_kernel(shift_px: np.ndarray) -> np.ndarray | None:
     """A box along the movement during the exposure, centred, or None if it is too short to see."""
     length = float(np.hypot(*shift_px))
     if length < 0.3:
@@ -412,7 +412,7 @@ def _compose(linear, tool_mask, raster, colour, alpha, depth, microscope, scale,
         layer = _blur_by_depth(layer, sigma, None)
     else:
         layer = _blur(layer, microscope.psf_px)
-    kernel = _motion_kernel(shift)
+    kernel = motion_kernel(shift)
     if kernel is not None:
         layer = cv2.filter2D(layer, -1, kernel)
     target = linear[y0 - pad[0] : y0 + height + pad[1], x0 - pad[2] : x0 + width + pad[3]]

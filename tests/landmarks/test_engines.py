@@ -15,7 +15,7 @@ from lib.landmarks.engines import OpenVinoNetwork, accelerated, default_engine, 
 from lib.landmarks.evaluation import evaluate_recording
 from lib.landmarks.export import PARITY_CONFIDENCE, PARITY_PX, export, export_shipped, run_onnx
 from lib.landmarks.inference import Calibration, as_tensor
-from lib.landmarks.network import HourglassConfig, StackedHourglass
+from lib.landmarks.network import HourglassConfig, OffsetConfig, OffsetNetwork, StackedHourglass
 from lib.landmarks.training import PRESETS, train
 from lib.landmarks.training import main as training_main
 from lib.recordings import Recording
@@ -68,6 +68,20 @@ def test_a_detector_finds_the_same_with_either_engine(trained, tmp_path):
 
 
 @pytest.mark.parametrize("engine", ["torch", pytest.param("openvino", marks=needs_openvino)])
+def test_an_offset_network_says_the_same_with_either_engine(engine):
+    torch.manual_seed(0)
+    network = OffsetNetwork(OffsetConfig(8, 32)).eval()
+    torch.nn.init.normal_(network.head[-1].weight, std=0.3)
+    images = torch.rand(4, 3, 32, 32)
+    with torch.inference_mode():
+        expected = network(images)[-1]
+        found = accelerated(network, engine)(images)[-1]
+    assert found.shape == (4, 4)
+    assert expected.std() > 0.1
+    assert torch.allclose(found, expected, atol=0.03 * float(expected.abs().max()))  # bfloat16 where there is
+
+
+@pytest.mark.parametrize("engine", ["torch", pytest.param("openvino", marks=needs_openvino)])
 def test_the_mean_with_the_mirror_image_does_not_know_left_from_right(engine):
     torch.manual_seed(0)
     network = StackedHourglass(HourglassConfig(8, 1, 2)).eval()
@@ -84,8 +98,7 @@ def test_the_mean_with_the_mirror_image_does_not_know_left_from_right(engine):
     windows = np.random.default_rng(0).integers(0, 256, (3, 128, 128, 3), dtype=np.uint8)
     plain = Detector(network, window_network=network, engine=engine)
     both = replace(plain, mirror=True)
-    assert torch.equal(both.heatmaps(windows, "window", once=True), plain.heatmaps(windows, "window"))
-    assert not torch.allclose(both.heatmaps(windows, "window"), plain.heatmaps(windows, "window"), **close)
+    assert not torch.allclose(both.outputs(windows, "window"), plain.outputs(windows, "window"), **close)
     with pytest.raises(ValueError, match="mirror: needs window_px"):
         Detector(network, window_network=network, window_px=126, mirror=True)
 
@@ -128,28 +141,34 @@ def test_onnx_holds_network_decoding_and_calibration(trained, tmp_path):
 def test_every_exported_stage_is_that_of_the_detector(tmp_path):
     """The shipped detector put together from its ONNX files, by the README of the stages: same landmarks."""
     written = export_shipped(None, tmp_path)
-    assert {file.name for file in tmp_path.iterdir()} == {"frame.onnx", "tool.onnx", "window.onnx"}
+    assert {file.name for file in tmp_path.iterdir()} == {
+        f"{stage}.onnx" for stage in ("frame", "tool", "window", "closeup", "tracking")
+    }
     assert all(difference <= PARITY_PX for _, difference in written.values())
     images, detector = shipped_pairs(1), Detector.load(engine="torch")
     found = Landmarks(*run_onnx(tmp_path / "frame.onnx", rgb(detector.reduced(images))))
-    np.testing.assert_allclose(found.u, replace(detector, tool_network=None, window_network=None)(images).u, atol=0.02)
+    finder = replace(detector, window_network=None, closeup_network=None)
+    np.testing.assert_allclose(found.u, replace(finder, tool_network=None)(images).u, atol=0.02)
     windows, matrices, which = detector.windows(images, found.u, "tool")
     u, covariance, confidence = run_onnx(tmp_path / "tool.onnx", rgb(windows))
     back = np.linalg.inv(matrices[:, None, :, :2])
     u = (back @ (u - matrices[:, None, :, 2])[..., None])[..., 0]
-    expected = replace(detector, window_network=None)(images)
+    expected = finder(images)
     np.testing.assert_allclose(u, expected.u[which], atol=5 * PARITY_PX)  # the stage's pixels are 5 of the frame
     np.testing.assert_allclose(back @ covariance @ back.mT, expected.covariance[which], rtol=2e-2, atol=1e-3)
     np.testing.assert_allclose(confidence, expected.confidence[which], atol=PARITY_CONFIDENCE)
-    windows, matrices, which = detector.windows(images, expected.u, "window")
-    own = tuple(np.arange(len(which))), tuple(which[:, 1])  # of each window its own landmark
-    u, covariance, confidence = (part[own] for part in run_onnx(tmp_path / "window.onnx", rgb(windows)))
-    back = np.linalg.inv(matrices[:, :, :2])
-    expected, (image, landmark) = detector(images), which.T
-    u = (back @ (u - matrices[:, :, 2])[..., None])[..., 0]
-    np.testing.assert_allclose(u, expected.u[image, landmark], atol=PARITY_PX)
-    np.testing.assert_allclose(back @ covariance @ back.mT, expected.covariance[image, landmark], rtol=2e-2, atol=1e-3)
-    np.testing.assert_allclose(confidence, expected.confidence[image, landmark], atol=PARITY_CONFIDENCE)
+    for stage, reference in (("window", replace(detector, closeup_network=None)), ("closeup", detector)):
+        windows, matrices, which = detector.windows(images, expected.u, stage)
+        own = tuple(np.arange(len(which))), tuple(which[:, 1])  # of each window its own landmark
+        u, covariance, confidence = (part[own] for part in run_onnx(tmp_path / f"{stage}.onnx", rgb(windows)))
+        back = np.linalg.inv(matrices[:, :, :2])
+        expected, (image, landmark) = reference(images), which.T
+        u = (back @ (u - matrices[:, :, 2])[..., None])[..., 0]
+        np.testing.assert_allclose(u, expected.u[image, landmark], atol=PARITY_PX)
+        turned = back @ covariance @ back.mT
+        np.testing.assert_allclose(turned, expected.covariance[image, landmark], rtol=2e-2, atol=1e-3)
+        if stage == "window":  # which is what counts for closeups too
+            np.testing.assert_allclose(confidence, expected.confidence[image, landmark], atol=PARITY_CONFIDENCE)
 
 
 @needs_onnx

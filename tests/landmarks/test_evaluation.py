@@ -5,14 +5,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from lib import paths
-from lib.landmarks import Detector, dataset, evaluation, metrics
+from lib.landmarks import Detector, dataset, evaluation, inference, metrics
 from lib.landmarks.assembly import card
 from lib.landmarks.augmentation import Augmentation
-from lib.landmarks.evaluation import _fit, calibrate, evaluate
+from lib.landmarks.evaluation import _belief, _fit, calibrate, evaluate
 from lib.landmarks.inference import Calibration
-from lib.landmarks.network import HourglassConfig
+from lib.landmarks.network import HourglassConfig, OffsetConfig, OffsetNetwork
 from lib.landmarks.training import PRESETS, Samples, main, train
 
 
@@ -44,10 +45,12 @@ def test_calibration_makes_covariances_and_confidence_true(small):
 def test_fitted_variance_of_known_errors():
     """Errors drawn with a variance that depends on feature, landmark and axis: the fit finds all three, and NEES is 2."""
     rng = np.random.default_rng(0)
-    features = np.column_stack([np.ones(6000), rng.normal(0, 1, 6000), rng.uniform(0.2, 1, 6000), np.zeros(6000)])
+    features = np.stack(
+        [np.ones((6000, 3)), rng.normal(0, 1, (6000, 3)), rng.uniform(0.2, 1, (6000, 3)), np.zeros((6000, 3))], 2
+    )
     landmark = rng.integers(3, size=6000)
-    along = 0.3 + 0.8 * features[:, 1] + np.array([-0.6, 0.2, 0.4])[landmark]
-    across = -1.2 + 0.2 * features[:, 1]
+    along = 0.3 + 0.8 * features[:, 0, 1] + np.array([-0.6, 0.2, 0.4])[landmark]
+    across = -1.2 + 0.2 * features[:, 1, 1]
     sigma = np.exp(np.column_stack([along, across]) / 2)
     errors = rng.normal(0, 1, (6000, 2)) * sigma
     correct = np.linalg.norm(errors, axis=1) < 2
@@ -55,18 +58,54 @@ def test_fitted_variance_of_known_errors():
     coefficients = fit.coefficients
     assert coefficients[:, :, 1] == pytest.approx(np.tile([0.8, 0.2], (3, 1)), abs=0.05)
     assert coefficients[1:, :, 0] - coefficients[0, :, 0] == pytest.approx(np.array([[0.8, 0], [1.0, 0]]), abs=0.1)
-    log_variance = np.einsum("mij,mj->mi", coefficients[landmark], features)
+    log_variance = (coefficients[landmark] * features[:, :2]).sum(-1)
     squared = errors**2 / np.exp(log_variance)
     for k in range(3):
         assert squared[landmark == k].mean(0) == pytest.approx([1, 1], abs=1e-4)
-    confidence = 1 / (1 + np.exp(-features @ np.array(fit.logit)))
+    confidence = 1 / (1 + np.exp(-features[:, 2] @ np.array(fit.logit)))
     assert metrics.calibration_error(confidence, correct) < 0.05
+
+
+def test_closeups_that_know_nothing_do_no_harm(small, monkeypatch):
+    """The corrections of an untrained offset network are a constant, which is bias, or noise, which is not believed."""
+    for module in (evaluation, inference):
+        monkeypatch.setattr(module, "MIN_TRACKED", 0.0)  # toys are too small to be sure of
+    detector, frames = small
+    torch.manual_seed(0)
+    closeup = OffsetNetwork(OffsetConfig(4, 32)).eval()
+    torch.nn.init.normal_(closeup.head[-1].weight, std=0.5)
+    full = replace(detector, window_network=detector.frame_network, window_px=64, closeup_network=closeup)
+    once = calibrate(full, frames)
+    assert set(once.calibration) == {"frame", "window", "closeup", "tracking"}
+    gain = np.array(once.calibration["closeup"].gain)
+    assert ((gain >= 0) & (gain <= 1)).all()
+    assert once.calibration["tracking"].gain == ((1.0, 1.0),) * 3
+    assert calibrate(once, frames).calibration == once.calibration  # what was believed before does not matter
+    errors = [np.nanmedian(evaluate(d, frames).error_px) for d in (once, replace(once, closeup_network=None))]
+    assert errors[0] < errors[1] + 0.5
+
+
+def test_as_much_of_a_correction_is_believed_as_helps():
+    """A closeup that overshoots by a known factor and lies off by a known bias; gross errors do not count."""
+    rng = np.random.default_rng(1)
+    landmark = rng.integers(3, size=3000)
+    gain, bias = np.array([[0.2, 0.8], [0.5, 1.0], [0.0, 0.6]]), np.array([[0.3, 0.0], [-0.2, 0.1], [0.0, 0.5]])
+    moved = rng.normal(0, 2, (3000, 2))
+    truth = gain[landmark] * moved - bias[landmark] + rng.laplace(0, 0.05, (3000, 2))  # from where it was expected
+    errors = moved - truth
+    errors[:20], errors[20:40] = 50.0, np.nan
+    found, off = _belief(moved, errors, landmark, 20.0, np.linspace(0, 1, 51))
+    np.testing.assert_allclose(found, gain, atol=0.021)
+    np.testing.assert_allclose(off, bias, atol=0.02)
+    whole, _ = _belief(moved, errors, landmark, 20.0, [1.0])
+    np.testing.assert_array_equal(whole, np.ones((3, 2)))
 
 
 def test_calibration_of_another_version_is_named():
     assert Calibration.of([[0.0] * 6] * 2, [1.0] * 4).coefficients.shape == (3, 2, 4)
-    with pytest.raises(ValueError, match="another version; make it anew"):
-        Calibration.of([0.0] * 4, [1.0] * 4)
+    for parts in (([0.0] * 4, [1.0] * 4), ([[0.0] * 6] * 2, [1.0] * 4, [1.0, 1.0])):
+        with pytest.raises(ValueError, match="another version; make it anew"):
+            Calibration.of(*parts)
 
 
 def test_evaluation_counts_only_labels_in_view(small):
@@ -125,10 +164,9 @@ def test_shards_of_windows_alone_are_centred_on_their_landmark(tmp_path, toy_sha
         return image, u, np.where(np.arange(3) == around, rng.integers(0, 3), 2)
 
     monkeypatch.setattr(dataset, "sample", off_centre)
-    monkeypatch.setattr(dataset, "WINDOWS", 5)
     for index in range(2):
-        dataset._make_windows(tmp_path / f"windows_{index:04d}.npz", index)
-    dataset.generate_windows(tmp_path, 2, progress=False)  # they stand already: nothing is drawn
+        dataset._make_crops(tmp_path / f"windows_{index:04d}.npz", index, dataset.CROP_PX, 5, 2)
+    dataset.generate_crops(tmp_path, 2, "windows", progress=False)  # they stand already: nothing is drawn
     with np.load(tmp_path / "windows_0001.npz") as shard:
         for crop, u, visibility, k in zip(
             *(shard[name] for name in ("crops", "crop_u", "crop_visibility", "crop_landmark")), strict=True
@@ -142,6 +180,54 @@ def test_shards_of_windows_alone_are_centred_on_their_landmark(tmp_path, toy_sha
     assert len(dataset.WindowSource.load(tmp_path, shards=1)) == 6  # frames alone
     first = np.load(tmp_path / "training_0000.npz")["crops"]
     assert np.array_equal(both.crops[: len(first)], first)
+
+
+def test_where_a_landmark_lies_in_its_jpeg_blocks_does_not_tell_its_place(monkeypatch, tmp_path):
+    """A stand-in for the simulator that asks where the landmark will lie in the image that is compressed."""
+    places = []
+
+    def sample(rng, *, crop_px, around, jitter):
+        u = (crop_px - 1) / 2 - np.round(rng.uniform(-jitter, jitter, (3, 2)) * crop_px)
+        places.append(u[around])
+        return np.zeros((crop_px, crop_px, 3), np.uint8), u, np.full(3, 2)
+
+    monkeypatch.setattr(dataset, "sample", sample)
+    dataset._make_crops(tmp_path / "closeups_0000.npz", 0, 128, 400, 4)
+    inside = np.array(places).ravel() % dataset._BLOCK_PX
+    assert len(np.unique(inside)) == dataset._BLOCK_PX
+    with np.load(tmp_path / "closeups_0000.npz") as shard:
+        own = shard["crop_u"][np.arange(400), shard["crop_landmark"]]
+    assert np.abs(own - 63.5).max() <= 0.5
+
+
+def test_closeups_are_stretched_with_their_landmark(tmp_path):
+    """A dot at the landmark lies where the label says, in every closeup; its own landmark alone is visible."""
+    rng = np.random.default_rng(0)
+    rows, columns = np.mgrid[:128, :128]
+    crops, u, landmark = [], [], np.arange(30) % 3
+    for k in landmark:
+        points = rng.uniform(-30, 30, (3, 2)) + 64
+        points[k] = rng.uniform(63, 64, 2)
+        dot = 255 * np.exp(-((columns - points[k, 0]) ** 2 + (rows - points[k, 1]) ** 2) / 8)
+        crops.append(np.repeat(dot[..., None], 3, 2).round().astype(np.uint8))
+        u.append(points)
+    arrays = {"crops": np.stack(crops), "crop_u": np.stack(u), "crop_landmark": landmark}
+    visibility = np.full((30, 3), 2)
+    visibility[4, 1] = 1  # hidden: not trained on
+    np.savez(tmp_path / "closeups_0000.npz", crop_visibility=visibility, **arrays)
+    source = dataset.CloseupSource.load(tmp_path)
+    assert len(source) == 29
+    for i in range(len(source)):
+        image, at, seen = source.draw(i, rng)
+        k = source.landmark[i]
+        assert image.shape == (64, 64, 3)
+        assert seen.tolist() == [2 * (j == k) for j in range(3)]
+        y, x = np.mgrid[:64, :64]
+        mass = image[..., 0].astype(float)
+        if (np.abs(at[k] - 31.5) < 18).all():
+            found = np.array([(x * mass).sum(), (y * mass).sum()]) / mass.sum()
+            assert np.abs(found - at[k]).max() < 0.15
+    assert source.fingerprint != replace(source, u=source.u + 1).fingerprint
 
 
 def test_missing_and_corrupt_shards_are_named(tmp_path):

@@ -1,10 +1,14 @@
 """Figures of recorded results, drawn from small made-up records: what is stated is what was recorded."""
 
+from dataclasses import replace
+
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+import torch
 
 from lib.figures import landmarks as plots
+from lib.landmarks.heatmaps import Peaks
 from lib.landmarks.studies import CURVE, summary
 
 
@@ -140,3 +144,17 @@ def test_the_loss_figure_takes_what_it_is_given():
     at = np.linspace(0, 4, 5)
     ax = plots.loss_slopes(at, {"l2": at**2, "position": at}).axes[0]
     np.testing.assert_allclose(ax.lines[1].get_xydata(), np.column_stack([at, at]))
+
+
+def test_closeups_show_what_was_expected_seen_and_believed():
+    at = torch.tensor([[[20.0, 12.0]], [[16.0, 16.0]]])
+    one = torch.ones(2, 1)
+    peaks = Peaks(at, one, one, torch.eye(2).expand(2, 1, 2, 2))
+    expected = np.full((2, 2), 16.0)
+    kept = replace(peaks, u=(at + 16) / 2)
+    figure = plots.closeups(np.zeros((2, 32, 32, 3), np.uint8), expected, peaks, kept, ["base", "tip_1"])
+    first = figure.axes[0]
+    drawn = [tuple(float(v) for v in line.get_xydata()[0]) for line in first.lines]
+    assert drawn == [(16.0, 16.0), (18.0, 14.0)]
+    assert tuple(first.patches[0].center) == (20.0, 12.0)
+    assert {"base", "tip_1"} <= set(texts(figure))

@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -9,8 +10,16 @@ from safetensors.torch import save_file
 from lib import paths
 from lib.landmarks import Detector, Landmarks
 from lib.landmarks.inference import Calibration, as_tensor, peak_features, write_checkpoint
-from lib.landmarks.network import HourglassConfig, StackedHourglass
-from lib.landmarks.windows import cut, direction_rad, map_points, window_from_image
+from lib.landmarks.network import HourglassConfig, OffsetConfig, OffsetNetwork, StackedHourglass
+from lib.landmarks.windows import (
+    CLOSEUP_BEHIND_PX,
+    CLOSEUP_ZOOM,
+    closeup_from_image,
+    cut,
+    direction_rad,
+    map_points,
+    window_from_image,
+)
 
 
 def sure():
@@ -158,6 +167,79 @@ def test_weights_of_another_network_are_named(tmp_path):
     write_checkpoint(path, {f"frame.{k}": v for k, v in network.state_dict().items()}, metadata)
     with pytest.raises(ValueError, match=r"weights\.safetensors: its weights do not fit"):
         Detector.load(path)
+
+
+def test_a_closeup_moves_what_the_windows_found_and_keeps_its_confidence(images):
+    """An offset network that says "10 right of the middle, 2 below" puts each landmark there, turned back into the image."""
+    closeup = OffsetNetwork(OffsetConfig(4, 32)).eval()
+    size = closeup.config.size_px
+    with torch.no_grad():
+        closeup.head[-1].bias.copy_(torch.tensor([10 * 8 / size, 2 * 8 / size, -1.0, 0.5]))
+    plain = untrained()
+    detector = replace(plain, closeup_network=closeup)
+    before, after = plain(images), detector(images)
+    seen = np.isfinite(before.u).all(axis=2)
+    assert seen.all()
+    np.testing.assert_array_equal(after.confidence, before.confidence)
+    angle = direction_rad(before.u)
+    for i, k in np.argwhere(seen):
+        zoom, side = CLOSEUP_ZOOM[k], -1 if k == 2 else 1
+        c, s = np.cos(angle[i]), np.sin(angle[i])
+        ahead = 10.0 / zoom - CLOSEUP_BEHIND_PX[k]
+        turn = np.array([[c, -s], [s, c]])
+        moved = turn @ np.array([ahead, side * 2.0 / zoom])
+        np.testing.assert_allclose(after.u[i, k] - before.u[i, k], moved, atol=1e-3)
+        spread = turn @ np.diag([2 * np.exp(-2.0), 2 * np.exp(1.0)]) @ turn.T / zoom**2  # of Laplace distributions
+        np.testing.assert_allclose(after.covariance[i, k], spread, rtol=1e-3)
+    with torch.no_grad():
+        closeup.head[-1].bias[0] = 40 * 8 / size  # further than a closeup is believed
+    np.testing.assert_array_equal(replace(plain, closeup_network=closeup)(images).u, before.u)
+
+
+def test_tracking_looks_twice_at_closeups_and_knows_when_it_lost_the_tool(images, monkeypatch):
+    closeup = OffsetNetwork(OffsetConfig(4, 32)).eval()
+    detector = replace(untrained(), closeup_network=closeup)
+    looks = []
+
+    def refined(self, part, rough, stage):
+        looks.append(stage)
+        return Landmarks(
+            rough.u + 1.0, rough.covariance, np.full((len(part), 3), 0.9 if rough.u[0, 0, 0] < 50 else 0.1)
+        )
+
+    monkeypatch.setattr(Detector, "_refined", refined)
+    before = Landmarks(np.full((1, 3, 2), 20.0), np.tile(np.eye(2), (1, 3, 1, 1)), np.ones((1, 3)))
+    np.testing.assert_array_equal(detector.track(images[:1], before).u, before.u + 2)
+    assert looks == ["tracking", "tracking"]
+    lost = replace(before, u=before.u + 40)
+    monkeypatch.setattr(Detector, "__call__", lambda self, part: before)
+    np.testing.assert_array_equal(detector.track(images[:1], lost).u, before.u)
+
+
+def test_closeups_and_what_is_believed_of_them_are_saved(tmp_path, images):
+    fit = Calibration(gain=((0.5, 0.25),) * 3, bias=((0.1, -0.1),) * 3)
+    detector = replace(untrained(), closeup_network=OffsetNetwork(OffsetConfig(4, 32)).eval())
+    detector = detector.with_calibration(closeup=fit)
+    detector.save(tmp_path / "weights.safetensors")
+    loaded = Detector.load(tmp_path / "weights.safetensors", engine="torch")
+    assert loaded.closeup_network.config == OffsetConfig(4, 32)
+    assert loaded.calibration["closeup"] == fit
+    np.testing.assert_array_equal(loaded(images).u, detector(images).u)
+
+
+def test_a_closeup_needs_windows():
+    with pytest.raises(ValueError, match="closeup_network"):
+        Detector(StackedHourglass(HourglassConfig(8, 1, 2)), closeup_network=OffsetNetwork())
+
+
+def test_closeups_mirror_the_second_tip():
+    """What lies 4 px ahead and 2 px towards the middle of the tool, seen from either tip, is one place in their closeups."""
+    tips = np.array([[100.0, 80.0], [100.0, 140.0]])
+    matrices = closeup_from_image(tips, np.zeros(2), 64, [1, 2])
+    at = 31.5 + CLOSEUP_ZOOM[1] * np.array([CLOSEUP_BEHIND_PX[1], 0.0])
+    np.testing.assert_allclose(map_points(matrices, tips), [at] * 2)
+    ahead = tips + [[4.0, 2.0], [4.0, -2.0]]
+    np.testing.assert_allclose(map_points(matrices, ahead), [at + CLOSEUP_ZOOM[1] * np.array([4.0, 2.0])] * 2)
 
 
 def test_tracking_needs_as_many_landmarks_as_images(images):

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from lib.landmarks.network import ABLATION, HourglassConfig, StackedHourglass
+from lib.landmarks.network import ABLATION, HourglassConfig, OffsetConfig, OffsetNetwork, StackedHourglass
 
 
 @pytest.mark.parametrize("name", ABLATION)
@@ -91,3 +91,28 @@ def test_deeper_ablation_columns_have_more_parameters():
         if n != "+ residual"  # bottlenecks are thinner than plain 3 x 3 convolutions
     ]
     assert np.all(np.diff(sizes) > 0)
+
+
+def test_offset_network_starts_in_the_middle_and_survives_fusing():
+    torch.manual_seed(0)
+    network = OffsetNetwork(OffsetConfig(8, 48))
+    network(torch.rand(8, 3, 48, 48))  # batch statistics
+    network.eval()
+    images = torch.rand(3, 3, 48, 48)
+    with torch.inference_mode():
+        (found,) = network(images)
+        assert torch.equal(found, torch.zeros(3, 4))
+        torch.nn.init.normal_(network.head[-1].weight)
+        (found,), (fused,) = network(images), network.fused()(images)
+    assert found.std() > 0.1
+    assert torch.allclose(fused, found, atol=1e-4 * float(found.abs().max()))
+
+
+def test_offset_networks_name_what_they_cannot_take():
+    with pytest.raises(ValueError, match="size_px"):
+        OffsetConfig(size_px=40)
+    with pytest.raises(ValueError, match="features"):
+        OffsetConfig(features=0)
+    for shape in ((1, 3, 32, 64), (1, 1, 64, 64), (3, 64, 64)):
+        with pytest.raises(ValueError, match="images"):
+            OffsetNetwork()(torch.zeros(shape))

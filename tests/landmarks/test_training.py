@@ -12,13 +12,14 @@ import torch
 from lib.landmarks import training
 from lib.landmarks.augmentation import Augmentation, Batch
 from lib.landmarks.heatmaps import render
-from lib.landmarks.network import HourglassConfig, StackedHourglass
+from lib.landmarks.network import HourglassConfig, OffsetConfig, OffsetNetwork, StackedHourglass
 from lib.landmarks.training import (
     PRESETS,
     Samples,
     TrainingConfig,
     heatmap_loss,
     load_training,
+    offset_loss,
     position_loss,
     train,
 )
@@ -274,3 +275,48 @@ def test_fine_tuning_starts_from_the_same_network_or_says_so(toy):
     wider = replace(SMALL, network=replace(SMALL.network, features=2 * SMALL.network.features))
     with pytest.raises(ValueError, match="initial: is a network"):
         train(wider, toy(6), toy(2, seed=1), initial=first, progress=False)
+
+
+def closeups(n, seed):
+    """A bright dot near the middle of each, with the role of one landmark."""
+    rng = np.random.default_rng(seed)
+    rows, columns = np.mgrid[:32, :32]
+    u, visibility = np.full((n, 3, 2), 5.0), np.zeros((n, 3), int)
+    which = rng.integers(3, size=n)
+    own = 15.5 + rng.uniform(-5, 5, (n, 2))
+    u[np.arange(n), which], visibility[np.arange(n), which] = own, 2
+    dots = 200 * np.exp(-((columns - own[:, 0, None, None]) ** 2 + (rows - own[:, 1, None, None]) ** 2) / 12)
+    return Samples(np.repeat((dots + rng.uniform(0, 30, dots.shape))[..., None], 3, 3).astype(np.uint8), u, visibility)
+
+
+def test_offset_loss_is_the_laplace_likelihood_of_the_own_landmark():
+    u = torch.tensor([[[20.0, 20.0], [18.5, 11.5], [0.0, 0.0]], [[15.5, 15.5]] * 3])
+    batch = Batch(torch.zeros(2, 3, 32, 32), u, torch.tensor([[0, 2, 0], [0, 1, 0]]))  # the second shows none
+    found = torch.tensor([[3.0, 0.0, 0.0, np.log(2.0)], [9.0, 9.0, 9.0, 9.0]], requires_grad=True)
+    loss = offset_loss([found], batch)
+    assert loss.item() == pytest.approx(0.1 + np.log(2.0) + np.hypot(4.0, 0.1) / 2)
+    loss.backward()
+    assert found.grad[1].abs().max() == 0
+    assert found.grad[0, 3].item() == pytest.approx(1 - np.hypot(4.0, 0.1) / 2)
+    absent = Batch(batch.images[1:], u[1:], batch.visibility[1:])
+    assert offset_loss([found[1:]], absent).item() == 0.0
+
+
+def test_an_offset_network_learns_where_a_dot_is_and_how_well_it_knows(tmp_path):
+    config = replace(
+        PRESETS["best"], network=OffsetConfig(6, 32), augmentation=Augmentation(0.0, (1.0, 1.0)), steps=60, batch_size=32,
+        ema=0.9, learning_rate=1e-2, validate_every=30, precision="fp32",
+    )  # fmt: skip
+    source, unseen = closeups(400, 0), closeups(60, 1)
+    trained = train(config, source, unseen, tmp_path / "whole", progress=False)
+    first, last = trained.log[0], trained.log[-1]
+    assert last["validation_loss"] < first["validation_loss"]
+    assert last["median_px"] < 1.0
+    assert "peak" not in last
+    loaded = load_training(tmp_path / "whole" / "last.safetensors").network
+    assert isinstance(loaded, OffsetNetwork)
+    assert same(loaded, trained.network)
+    # Interrupted and resumed it is the same network.
+    half = train(config, source, unseen, tmp_path / "parts", max_seconds=0.0, progress=False)
+    assert half.provenance["steps"] < 60
+    assert same(train(config, source, unseen, tmp_path / "parts", progress=False).network, trained.network)
