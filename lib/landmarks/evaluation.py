@@ -7,7 +7,7 @@ import json
 import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
 
 import numpy as np
@@ -206,7 +206,7 @@ def calibrate(
 
     Variances: maximum likelihood of the errors below `GROSS_PX` (of the first stage's below six times that, of the closeups'
     below `CLOSEUP_REACH_PX`), log linear in the peak's features; their constants make the mean normalised squared error
-    of each landmark 2.
+    of the base 2, and of the tips, which are each other's mirror images and so share everything.
     Of a closeup's correction as much is believed as leaves the smallest errors, which are then centred (`Calibration.gain`,
     `bias`); while tracking, all of it.  Tracking is fitted on the same frames, the tool displaced by `TRACKED_SHIFT_PX`,
     every fourth time by five times as much.
@@ -330,21 +330,22 @@ def _fit(
     use = np.isfinite(size) & (size < gross_px)
     if use.sum() < 20:
         raise ValueError(f"frames: only {use.sum()} landmarks to calibrate on; give at least 20.")
-    own = landmark[use, None] == np.arange(3)
+    tip = landmark[use, None] > 0
 
     def variance(axis: int) -> tuple[float, ...]:
         squared = errors[use, axis] ** 2
-        x = np.column_stack([own, features[use, axis, 1:]]).astype(float)
+        x = np.column_stack([~tip, tip, features[use, axis, 1:]]).astype(float)
 
         def deviance(beta: np.ndarray) -> tuple[float, np.ndarray]:
             log_variance = x @ beta
             ratio = squared * np.exp(-log_variance)
-            slopes = 1e-3 * np.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])
+            slopes = 1e-3 * np.array([0.0, 0.0, 1.0, 1.0, 1.0])
             value = (log_variance + ratio).mean() + slopes @ beta**2
             return value, x.T @ (1 - ratio) / len(x) + 2 * slopes * beta
 
-        start = np.array([np.log(max(squared.mean(), 1e-6))] * 3 + [0.0] * 3)
-        return tuple(map(float, minimize(deviance, start, jac=True, method="L-BFGS-B").x))
+        start = np.array([np.log(max(squared.mean(), 1e-6))] * 2 + [0.0] * 3)
+        base, tips, *slopes = map(float, minimize(deviance, start, jac=True, method="L-BFGS-B").x)
+        return (base, tips, tips, *slopes)
 
     y = correct.astype(float)
 
@@ -363,7 +364,7 @@ def _fit(
 def _belief(
     moved: np.ndarray, errors: np.ndarray, landmark: np.ndarray, gross_px: float, gains: Sequence[float]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Gain, one of `gains`, and bias (3, 2) of each landmark and axis that leave the smallest absolute errors.
+    """Gain, one of `gains`, and bias (3, 2) of the base and the tips along each axis that leave the smallest absolute errors.
 
     `moved` (m, 2) are the closeups' whole corrections, `errors` (m, 2) what they leave.
     """
@@ -371,8 +372,8 @@ def _belief(
         np.linalg.norm(errors - moved, axis=1) < gross_px
     )  # expected at the right tool; a closeup's own blunders count
     best, bias = np.ones((3, 2)), np.zeros((3, 2))
-    for k, axis in np.ndindex(3, 2):
-        own = use & (landmark == k)
+    for k, axis in product((np.s_[:1], np.s_[1:]), (0, 1)):  # the base, and both tips
+        own = use & np.isin(landmark, np.arange(3)[k])
         if not own.any():
             continue
         left = errors[own, axis] + (np.asarray(gains)[:, None] - 1) * moved[own, axis]

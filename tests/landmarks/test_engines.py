@@ -157,17 +157,23 @@ def test_every_exported_stage_is_that_of_the_detector(tmp_path):
     np.testing.assert_allclose(u, expected.u[which], atol=5 * PARITY_PX)  # the stage's pixels are 5 of the frame
     np.testing.assert_allclose(back @ covariance @ back.mT, expected.covariance[which], rtol=2e-2, atol=1e-3)
     np.testing.assert_allclose(confidence, expected.confidence[which], atol=PARITY_CONFIDENCE)
-    for stage, reference in (("window", replace(detector, closeup_network=None)), ("closeup", detector)):
+    looks = {
+        "window": replace(detector, closeup_network=None),
+        "closeup": detector,
+        "tracking": lambda images: detector._refined(images, expected, "tracking"),
+    }
+    for stage, reference in looks.items():
         windows, matrices, which = detector.windows(images, expected.u, stage)
         own = tuple(np.arange(len(which))), tuple(which[:, 1])  # of each window its own landmark
         u, covariance, confidence = (part[own] for part in run_onnx(tmp_path / f"{stage}.onnx", rgb(windows)))
         back = np.linalg.inv(matrices[:, :, :2])
         expected, (image, landmark) = reference(images), which.T
+        assert len(which)
         u = (back @ (u - matrices[:, :, 2])[..., None])[..., 0]
         np.testing.assert_allclose(u, expected.u[image, landmark], atol=PARITY_PX)
         turned = back @ covariance @ back.mT
         np.testing.assert_allclose(turned, expected.covariance[image, landmark], rtol=2e-2, atol=1e-3)
-        if stage == "window":  # which is what counts for closeups too
+        if stage != "closeup":  # there the windows' confidence is kept
             np.testing.assert_allclose(confidence, expected.confidence[image, landmark], atol=PARITY_CONFIDENCE)
 
 
