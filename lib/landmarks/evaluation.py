@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 from scipy.optimize import minimize
+from scipy.stats import chi2
 from tqdm.auto import tqdm
 
 from lib.geometry import image_from_cell
@@ -205,8 +206,9 @@ def calibrate(
     """The detector with covariance and confidence fitted to its errors on validation frames, never trained on.
 
     Variances: maximum likelihood of the errors below `GROSS_PX` (of the first stage's below six times that, of the closeups'
-    below `CLOSEUP_REACH_PX`), log linear in the peak's features; their constants make the mean normalised squared error
-    of the base 2, and of the tips, which are each other's mirror images and so share everything.
+    below `CLOSEUP_REACH_PX`), log linear in the peak's features.  The tips, each other's mirror images, share everything.
+    Errors have longer tails than a Gaussian: a mean normalised squared error of 2 leaves more than 5 % outside the 95 %
+    ellipses, and ellipses that hold 95 % make it less than 2.  The constants stand halfway, for the base and for the tips.
     Of a closeup's correction as much is believed as leaves the smallest errors, which are then centred (`Calibration.gain`,
     `bias`); while tracking, all of it.  Tracking is fitted on the same frames, the tool displaced by `TRACKED_SHIFT_PX`,
     every fourth time by five times as much.
@@ -358,7 +360,13 @@ def _fit(
         ) + 2 * ridge * beta
 
     logit = minimize(cost, np.array([-4.0, 0.0, 8.0, 0.0]), jac=True, method="L-BFGS-B").x
-    return Calibration((variance(0), variance(1)), tuple(map(float, logit)))
+    log_variance = np.array([variance(0), variance(1)])
+    rows = Calibration(tuple(map(tuple, log_variance.tolist()))).coefficients[landmark[use]]
+    squared = (errors[use] ** 2 / np.exp((rows * features[use, :2]).sum(-1))).sum(1)
+    for own, columns in ((~tip[:, 0], np.s_[:1]), (tip[:, 0], np.s_[1:3])):
+        if own.any():
+            log_variance[:, columns] += 0.5 * np.log(np.quantile(squared[own], 0.95) / chi2.ppf(0.95, 2))
+    return Calibration(tuple(map(tuple, log_variance.tolist())), tuple(map(float, logit)))
 
 
 def _belief(

@@ -61,7 +61,7 @@ def test_fitted_variance_of_known_errors():
     log_variance = (coefficients[landmark] * features[:, :2]).sum(-1)
     squared = errors**2 / np.exp(log_variance)
     for own in (landmark == 0, landmark > 0):
-        assert squared[own].mean(0) == pytest.approx([1, 1], abs=1e-4)
+        assert squared[own].mean(0) == pytest.approx([1, 1], abs=0.05)
     confidence = 1 / (1 + np.exp(-features[:, 2] @ np.array(fit.logit)))
     assert metrics.calibration_error(confidence, correct) < 0.05
 
