@@ -545,16 +545,20 @@ def frame_explorer(
 
 def closeups(windows: np.ndarray, expected: np.ndarray, seen: Peaks, kept: Peaks, names: Sequence[str]) -> Figure:
     """Closeups (n, s, s, 3): where the windows said the landmark lies (cross, `expected` (n, 2)), where the network sees
-    it with its 95 % ellipse (`seen`, (n, 1)), and what is believed (dot, `kept`, (n, 1))."""
-    fig, axes = figure(1, len(windows), width_in=9, height_in=3.2, squeeze=False)
-    for i, (ax, name) in enumerate(zip(axes.flat, names, strict=True)):
-        show_image(ax, windows[i], name)
+    it with its 95 % ellipse (`seen`, (n, 1)), and what is believed (dot, `kept`, (n, 1)); below, 12 px of each."""
+    fig, axes = figure(2, len(windows), width_in=9, height_in=6.2, squeeze=False)
+    for i, (whole, ax, name) in enumerate(zip(*axes, names, strict=True)):
+        show_image(whole, windows[i], name)
+        whole.plot(*expected[i], "+", ms=14, mew=1.5, color="white")
+        show_image(ax, windows[i], "")
+        x, y = expected[i]
+        ax.set(xlim=(x - 6, x + 6), ylim=(y + 6, y - 6))
         deviation = np.sqrt(np.diag(seen.covariance[i, 0].numpy()))
-        ax.plot(*expected[i], "+", ms=14, mew=2, color="white", label="windows")
+        ax.plot(*expected[i], "+", ms=18, mew=2, color="white", label="windows")
         size = 2 * np.sqrt(chi2.ppf(0.95, 2)) * deviation
-        ax.add_patch(Ellipse(seen.u[i, 0].numpy(), *size, fill=False, ec=COLOURS["ours"], lw=2))
-        ax.plot(*kept.u[i, 0].numpy(), "o", ms=5, color=COLOURS["ours"], label="believed")
-    axes.flat[0].legend(loc="lower left")
+        ax.add_patch(Ellipse(seen.u[i, 0].numpy(), *size, fill=False, ec="yellow", lw=2, label="closeup, 95 %"))
+        ax.plot(*kept.u[i, 0].numpy(), "o", ms=7, color=COLOURS["ours"], label="believed")
+    axes[1, 0].legend(loc="lower left")
     return fig
 
 

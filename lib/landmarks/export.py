@@ -22,7 +22,7 @@ from torch import Tensor, nn
 
 from lib import paths
 from lib.landmarks.engines import LastOutput, openvino
-from lib.landmarks.heatmaps import decode
+from lib.landmarks.heatmaps import Peaks, decode
 from lib.landmarks.inference import (
     CLOSEUP_REACH_PX,
     MIN_CONFIDENCE,
@@ -83,12 +83,21 @@ class StageWithDecoding(nn.Module):
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         seen = self.network(images)
         if self.closeup:
-            peaks = believed(closeup_peaks(seen, images.shape[-1]), self.expected, self.gain, self.bias, self.reach)
+            one = closeup_peaks(
+                seen, images.shape[-1]
+            )  # believed in three ways, as which landmark it shows is not known here
+            parts = (
+                one.u.repeat(1, 3, 1),
+                one.value.repeat(1, 3),
+                one.width.repeat(1, 3),
+                one.covariance.repeat(1, 3, 1, 1),
+            )
+            peaks = believed(Peaks(*parts), self.expected, self.gain, self.bias, self.reach)
         else:
             peaks = decode(seen, self.stride, method=self.method)
         covariance, confidence = calibrated(peaks, self.scale, self.log_variance, self.logit)
         u = peaks.u * self.scale + (self.scale - 1) / 2
-        return u, covariance, confidence.expand(-1, 3)
+        return u, covariance, confidence
 
 
 def export(detector: Detector, folder: str | Path, examples: np.ndarray) -> dict[str, tuple[Path, float]]:

@@ -153,7 +153,7 @@ def test_closeups_show_what_was_expected_seen_and_believed():
     expected = np.full((2, 2), 16.0)
     kept = replace(peaks, u=(at + 16) / 2)
     figure = plots.closeups(np.zeros((2, 32, 32, 3), np.uint8), expected, peaks, kept, ["base", "tip_1"])
-    first = figure.axes[0]
+    first = figure.axes[2]  # the near view of the first
     drawn = [tuple(float(v) for v in line.get_xydata()[0]) for line in first.lines]
     assert drawn == [(16.0, 16.0), (18.0, 14.0)]
     assert tuple(first.patches[0].center) == (20.0, 12.0)
