@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -65,16 +65,27 @@ def generate(
 
     A shard depends on its number alone.  `workers` processes share the work, by default one a core.
     """
+    kind = "validation" if validation else "training"
+    _generate(folder, kind, range(first, first + shards), _make_shard, (validation,), workers, progress)
+
+
+def _generate(
+    folder: str | Path,
+    kind: str,
+    indices: range,
+    make: Callable[..., None],
+    arguments: tuple,
+    workers: int | None,
+    progress: bool,
+) -> None:
+    """Have ``make(path, index, *arguments)`` write the shards of a kind that do not stand yet."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    kind = "validation" if validation else "training"
-    wanted = {i: folder / f"{kind}_{i:04d}.npz" for i in range(first, first + shards)}
-    missing = {i: path for i, path in wanted.items() if not path.exists()}
-    bar = tqdm(
-        total=shards, initial=shards - len(missing), desc=f"Simulating {kind}", disable=not progress, unit="shard"
-    )
-    with bar:
-        for _ in in_processes(_make_shard, [(path, i, validation) for i, path in missing.items()], workers):
+    wanted = {i: folder / f"{kind}_{i:04d}.npz" for i in indices}
+    missing = [(path, i, *arguments) for i, path in wanted.items() if not path.exists()]
+    done = len(wanted) - len(missing)
+    with tqdm(total=len(wanted), initial=done, desc=f"Simulating {kind}", disable=not progress, unit="shard") as bar:
+        for _ in in_processes(make, missing, workers):
             bar.update()
 
 
@@ -92,16 +103,7 @@ def generate_crops(
     `kind` is ``"windows"`` or ``"closeups"``, which are smaller: only what the last stages see is rendered, twenty and forty
     times as many scenes a second as whole frames.
     """
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    wanted = {i: folder / f"{kind}_{i:04d}.npz" for i in range(first, first + shards)}
-    missing = [(path, i, *_CROPS[kind]) for i, path in wanted.items() if not path.exists()]
-    bar = tqdm(
-        total=shards, initial=shards - len(missing), desc=f"Simulating {kind}", disable=not progress, unit="shard"
-    )
-    with bar:
-        for _ in in_processes(_make_crops, missing, workers):
-            bar.update()
+    _generate(folder, kind, range(first, first + shards), _make_crops, _CROPS[kind], workers, progress)
 
 
 def _make_crops(path: Path, index: int, side_px: int, n: int, kind_seed: int) -> None:

@@ -18,6 +18,7 @@ from tqdm.auto import tqdm
 from lib.geometry import image_from_cell
 from lib.landmarks.heatmaps import DECODERS, decode
 from lib.landmarks.inference import (
+    CLOSE,
     CLOSEUP_REACH_PX,
     MIN_TRACKED,
     Calibration,
@@ -219,17 +220,20 @@ def calibrate(
     frames:
         As for `evaluate`; easy and hard, since confidence is learnt from failures, and of many tools, since what makes
         errors alike is the tool.
+
+    Raises
+    ------
+    ValueError
+        If too few landmarks are found in them.
     """
     frames = list(frames)
     # What a closeup sees of itself, not what was believed of it so far.
-    detector = replace(
-        detector, calibration={k: v for k, v in detector.calibration.items() if k not in ("closeup", "tracking")}
-    )
+    detector = replace(detector, calibration={k: v for k, v in detector.calibration.items() if k not in CLOSE})
     rough: list[Landmarks] = []
     rng = np.random.default_rng(0)
-    for stage in [*detector.networks, *(["tracking"] if detector.closeup_network else [])]:
+    for stage in detector.stages:
         features, errors, tolerances, landmark, steps = [], [], [], [], []
-        close = stage in ("closeup", "tracking")
+        close = stage in CLOSE
         for i, (_, image, u, v) in enumerate(tqdm(frames, disable=not progress, unit="image", desc=stage)):
             in_view = np.isfinite(u).all(1) & (np.asarray(v) > 0)
             labels = np.where(in_view[:, None], u, np.nan)
@@ -242,7 +246,7 @@ def calibrate(
             else:
                 start = rough[i].u
                 if close and not (rough[i].confidence >= MIN_TRACKED).all():
-                    continue  # such images are neither looked at closely nor followed
+                    continue  # nothing is followed from such an image
                 if stage == "tracking":
                     # A tool that jumps now and then, which tracking has to notice.
                     moved_px = TRACKED_SHIFT_PX * (5 if rng.random() < 0.25 else 1)
@@ -349,15 +353,13 @@ def _fit(
         base, tips, *slopes = map(float, minimize(deviance, start, jac=True, method="L-BFGS-B").x)
         return (base, tips, tips, *slopes)
 
-    y = correct.astype(float)
+    y, both = correct.astype(float), features[:, 2]
 
     def cost(beta: np.ndarray) -> tuple[float, np.ndarray]:
-        z = features[:, 2] @ beta
+        z = both @ beta
         ridge = 1e-3 * np.array([0.0, 1.0, 1.0, 1.0])
         p = 1 / (1 + np.exp(-z))
-        return (np.logaddexp(0, z) - y * z).mean() + ridge @ beta**2, features[:, 2].T @ (p - y) / len(
-            y
-        ) + 2 * ridge * beta
+        return (np.logaddexp(0, z) - y * z).mean() + ridge @ beta**2, both.T @ (p - y) / len(y) + 2 * ridge * beta
 
     logit = minimize(cost, np.array([-4.0, 0.0, 8.0, 0.0]), jac=True, method="L-BFGS-B").x
     log_variance = np.array([variance(0), variance(1)])
@@ -376,12 +378,11 @@ def _belief(
 
     `moved` (m, 2) are the closeups' whole corrections, `errors` (m, 2) what they leave.
     """
-    use = (
-        np.linalg.norm(errors - moved, axis=1) < gross_px
-    )  # expected at the right tool; a closeup's own blunders count
+    # What was expected must be near the landmark; a closeup's own blunders count.
+    use = np.linalg.norm(errors - moved, axis=1) < gross_px
     best, bias = np.ones((3, 2)), np.zeros((3, 2))
-    for k, axis in product((np.s_[:1], np.s_[1:]), (0, 1)):  # the base, and both tips
-        own = use & np.isin(landmark, np.arange(3)[k])
+    for k, axis in product(([0], [1, 2]), (0, 1)):  # the base, and both tips
+        own = use & np.isin(landmark, k)
         if not own.any():
             continue
         left = errors[own, axis] + (np.asarray(gains)[:, None] - 1) * moved[own, axis]

@@ -24,6 +24,7 @@ from lib import paths
 from lib.landmarks.engines import LastOutput, openvino
 from lib.landmarks.heatmaps import Peaks, decode
 from lib.landmarks.inference import (
+    CLOSE,
     CLOSEUP_REACH_PX,
     MIN_CONFIDENCE,
     Calibration,
@@ -65,9 +66,9 @@ class StageWithDecoding(nn.Module):
 
     def __init__(self, detector: Detector, stage: str):
         super().__init__()
-        network = detector.networks["closeup" if stage == "tracking" else stage]
+        self.closeup = stage in CLOSE
+        network = detector.networks["closeup" if self.closeup else stage]
         self.network = LastOutput(network, mirror=detector.mirror and stage == "window")
-        self.closeup = stage in ("closeup", "tracking")
         self.stride, self.method = None if self.closeup else network.stride, detector.method
         self.scale = detector.reduction if stage == "frame" else 1
         fit = detector.calibration.get(stage, Calibration())
@@ -127,7 +128,7 @@ def export(detector: Detector, folder: str | Path, examples: np.ndarray) -> dict
     folder.mkdir(parents=True, exist_ok=True)
     detector = replace(detector, engine="torch")
     rough, result = detector(examples).u, {}
-    for stage in [*detector.networks, *(["tracking"] if detector.closeup_network else [])]:
+    for stage in detector.stages:
         images = detector.reduced(examples) if stage == "frame" else detector.windows(examples, rough, stage)[0]
         if not len(images):
             raise ValueError("examples: no tool was found in them, so nothing can be compared; give other frames.")

@@ -49,6 +49,8 @@ CODE_VERSION = 4
 MIN_CONFIDENCE = 0.05
 #: Landmarks below this confidence are neither looked at closely nor followed from frame to frame.
 MIN_TRACKED = 0.5
+#: Stages that look at closeups: of what the windows found, and of what was found in the frame before.
+CLOSE = ("closeup", "tracking")
 #: A closeup is believed if it sees its landmark nearer than this to where that was thought to be, image pixels.
 CLOSEUP_REACH_PX = 20.0
 
@@ -317,6 +319,11 @@ class Detector:
         }
         return {name: network for name, network in stages.items() if network is not None}
 
+    @property
+    def stages(self) -> list[str]:
+        """What has a calibration: the networks, and tracking, which looks through that of the closeups."""
+        return [*self.networks, *(["tracking"] if self.closeup_network else [])]
+
     # Files
 
     @classmethod
@@ -480,7 +487,7 @@ class Detector:
     def outputs(self, windows: np.ndarray, stage: str) -> Tensor:
         """Heatmaps (m, 3, h, w) of windows (m, s, s, 3); of closeups what the `OffsetNetwork` says, (m, 4)."""
         with torch.inference_mode():
-            return self._fused["closeup" if stage == "tracking" else stage](as_tensor(windows))[-1]
+            return self._fused["closeup" if stage in CLOSE else stage](as_tensor(windows))[-1]
 
     def stage_peaks(self, images: np.ndarray, u: ArrayLike, stage: str) -> tuple[Peaks, np.ndarray, np.ndarray]:
         """What a window stage decodes: peaks (m, 1) in pixels of the windows, window_from_image (m, 2, 3), (m, 2) which.
@@ -496,7 +503,7 @@ class Detector:
                 np.zeros((0, 2), int),
             )
         outputs = self.outputs(windows, stage)
-        if stage in ("closeup", "tracking"):
+        if stage in CLOSE:
             size, k = windows.shape[1], which[:, 1]
             fit, reach = self.calibration.get(stage, Calibration()), CLOSEUP_REACH_PX * np.array(CLOSEUP_ZOOM)
             parts = (expected_in_closeup(size, k), np.array(fit.gain)[k], np.array(fit.bias)[k], reach[k])
@@ -519,7 +526,7 @@ class Detector:
         u = (back @ (fine.u[:, 0] - matrices[:, :, 2])[..., None])[..., 0]
         covariance = back @ fine.covariance[:, 0] @ back.mT
         confidence = fine.confidence[:, 0]
-        if stage in ("closeup", "tracking"):
+        if stage in CLOSE:
             seen = peaks.value[:, 0].numpy() > 0
             confidence = np.where(seen, confidence, 0.0)
         if stage == "closeup":  # that the landmark is there the windows know; an unsure one is left where they saw it

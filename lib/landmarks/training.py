@@ -312,13 +312,13 @@ def validate(
     network.eval()
     device = next(network.parameters()).device
     losses, found, values = [], [], []
+    measured = replace(config, position_weight_per_px=0.0)
     for start in range(0, len(samples), batch):
         part = slice(start, start + batch)
         images = as_tensor(samples.images[part])
         u, visibility = torch.from_numpy(samples.u[part]).float(), torch.from_numpy(samples.visibility[part])
         visibility = leave_frame(u, visibility, tuple(images.shape[-2:]))
         outputs = [output.cpu() for output in network(images.to(device))]
-        measured = replace(config, position_weight_per_px=0.0)
         losses.append(_loss(network, outputs, Batch(images, u, visibility), measured).item())
         if isinstance(network, OffsetNetwork):
             peaks = closeup_peaks(outputs[-1], images.shape[-1])
