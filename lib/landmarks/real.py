@@ -18,6 +18,7 @@ from lib.landmarks.augmentation import Augmentation
 from lib.landmarks.dataset import REDUCTION
 from lib.landmarks.evaluation import Evaluation, evaluate
 from lib.landmarks.inference import Calibration, Detector
+from lib.landmarks.metrics import tool_length_px
 from lib.landmarks.training import PRESETS, Samples, Training, TrainingConfig, train
 from lib.recordings import MonocularSequence
 
@@ -26,6 +27,7 @@ __all__ = [
     "Mixed",
     "evaluate_on_sequence",
     "finder_alone",
+    "label_repeatability",
     "quick_config",
     "real_config",
     "real_samples",
@@ -173,6 +175,21 @@ def evaluate_on_sequence(
     Consecutive frames are alike, so halves in time are the honest split.
     """
     return evaluate(detector, _frames(sequence, len(sequence) // 2 if second_half else 0, every))
+
+
+def label_repeatability(sequence: MonocularSequence, threshold: float = 0.2) -> float:
+    """Percentage of the second half's clicks that clicks themselves hit: what a PCK of such labels can be.
+
+    Each click is compared with the mean of those one frame before and after.  If all err alike that difference has 3/2 of
+    one click's variance, and is divided by the root of that; what the tool moves otherwise than evenly adds to it.
+    """
+    middle = len(sequence) // 2
+    u, number = sequence.u[middle:], np.asarray(sequence.frame_numbers)[middle:]
+    consecutive = (np.diff(number[:-1]) == 1) & (np.diff(number[1:]) == 1)
+    between = np.where(consecutive[:, None, None], (u[:-2] + u[2:]) / 2, np.nan)
+    error = np.linalg.norm(u[1:-1] - between, axis=-1) / np.sqrt(1.5)
+    known = np.isfinite(error)
+    return float(100 * (error <= threshold * tool_length_px(u[1:-1])[:, None])[known].mean()) if known.any() else np.nan
 
 
 def simulated_to_real(

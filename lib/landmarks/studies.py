@@ -428,6 +428,9 @@ def real_frames(options: Options) -> None:
                 "as many, of simulated frames; and the whole shipped detector, which saw no real frame; means over seeds",
                 "thresholds": thresholds.tolist(),
                 "results": {name: _real_figures(of_seeds, thresholds) for name, of_seeds in kept.items()},
+                "labels_of_the_second_half_hit_by_their_neighbours": {
+                    s.name: real.label_repeatability(s) for s in sequences
+                },
                 "weights": detector.metadata.get("commit"),
                 "budget": budget,
             }

@@ -1,6 +1,7 @@
 """Training on half a real sequence: what is cut, mixed and named, on toy frames; and the real labels' naming."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -140,3 +141,19 @@ def test_real_tips_are_named_as_the_simulators():
     for sequence in import_retinal_microsurgery(RETINAL):
         u = sequence.u
         assert (side(u[np.isfinite(u).all((1, 2))]) < 0).all()
+
+
+def test_clicks_that_jitter_bound_what_can_be_hit():
+    """Of Gaussian clicks about an even motion, as many are hit as by somebody who knows where the tool is."""
+    rng = np.random.default_rng(0)
+    n, jitter_px = 4000, 3.0
+    u = np.array([[0.0, 0.0], [30.0, 10.0], [30.0, -10.0]]) + 0.5 * np.arange(n)[:, None, None]
+    clicks = u + rng.normal(0, jitter_px, u.shape)
+    files = tuple(Path(f"{i}.png") for i in range(n))
+    still = MonocularSequence("even", np.arange(n), files, u, (640, 480))
+    assert real.label_repeatability(still) == 100.0
+    jittery = replace(still, u=clicks)
+    length = tool_length_px(clicks[n // 2 :])[:, None]
+    knowing = 100 * (np.linalg.norm((clicks - u)[n // 2 :], axis=-1) <= 0.2 * length).mean()
+    assert real.label_repeatability(jittery) == pytest.approx(knowing, abs=1.0)
+    assert np.isnan(real.label_repeatability(replace(still, frame_numbers=2 * np.arange(n))))
