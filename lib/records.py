@@ -34,9 +34,9 @@ def commit(root: Path = paths.ROOT) -> dict | None:
 
 
 def commit_id() -> str:
-    """The commit in one word, its first 12 characters; "unknown" outside a git checkout."""
+    """The commit in one word, its first 12 characters, and "+modified" if files differ; "unknown" outside a git checkout."""
     found = commit()
-    return found["id"][:12] if found else "unknown"
+    return found["id"][:12] + "+modified" * found["modified"] if found else "unknown"
 
 
 def machine() -> dict:

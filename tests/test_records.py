@@ -100,7 +100,7 @@ def test_reading_nothing_and_something_broken(tmp_path):
 def test_the_commit_and_the_machine(tmp_path):
     assert commit(tmp_path) is None
     found = commit()
-    assert commit_id() == (found["id"][:12] if found else "unknown")
+    assert commit_id() == (found["id"][:12] + ("+modified" if found["modified"] else "") if found else "unknown")
     here = machine()
     assert here["cores"] >= 1 and set(here) == {"system", "processor", "cores", "memory_gb", "gpu"}
 

@@ -390,14 +390,14 @@ def shipped_table(result: Mapping) -> Figure:
     return _table(header, [[name, *cells(row)] for name, row in rows.items()], width_in=11.5, first=0.24)
 
 
-def visibility_bars(result: Mapping) -> Figure:
-    """Recorded precision and recall of "seen" (confidence of at least one half), for whole frames and while tracking."""
+def visibility_bars(rows: Mapping[str, Mapping[str, float]]) -> Figure:
+    """Precision and recall of "seen" (`Evaluation.detection`) of each row, in two kinds of frames."""
     fig, ax = figure(width_in=9, height_in=3.2)
     names = [f"{there}_{what}" for there in ("in_view", "visible") for what in ("precision", "recall")]
-    for i, (mode, colour) in enumerate((("whole_frames", COLOURS["ours"]), ("tracking", COLOURS["right"]))):
-        values = [result[mode][name] for name in names]
+    for i, ((label, row), colour) in enumerate(zip(rows.items(), (COLOURS["ours"], COLOURS["right"]), strict=True)):
+        values = [row[name] for name in names]
         x = np.arange(len(names)) + 0.4 * i - 0.2
-        ax.bar(x, values, 0.36, color=colour, alpha=0.7, label=mode.replace("_", " "))
+        ax.bar(x, values, 0.36, color=colour, alpha=0.7, label=label)
         for at, value in zip(x, values, strict=True):
             ax.text(at, value / 2, f"{value:.2f}", ha="center", va="center", fontsize=11, weight="bold")
     ax.set_xticks(

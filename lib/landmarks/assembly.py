@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from itertools import groupby
 from pathlib import Path
 
 from lib.landmarks.dataset import REDUCTION, TOOL_REDUCTION, validation_frames
 from lib.landmarks.evaluation import calibrate, evaluate, labelled_frames
 from lib.landmarks.inference import Detector
-from lib.landmarks.metrics import calibration_error
-from lib.landmarks.training import load_training
+from lib.landmarks.training import PRESETS, load_training
 from lib.landmarks.windows import CLOSEUP_ZOOM
 from lib.recordings import Recording
 from lib.records import commit_id, machine
@@ -22,12 +22,19 @@ __all__ = ["assemble"]
 _IMAGES = 16
 
 
-def assemble(folder: str | Path, data: str | Path, out: str | Path, recordings: Sequence[str | Path] = ()) -> Detector:
+def assemble(
+    folder: str | Path,
+    data: str | Path,
+    out: str | Path,
+    recordings: Sequence[str | Path] = (),
+    notes: Sequence[str] = (),
+) -> Detector:
     """Join ``frame/``, ``tool/``, ``window/`` and ``closeup/`` of a training folder, calibrate, write `out` and its card.
 
     Half of the validation frames calibrate, the other half give the figures on the card; then all calibrate.  Labelled
     `recordings` calibrate too where there are any: moderate frames as they will be measured, where the validation frames
-    vary more than those of any microscope.  None of either was trained on.
+    vary more than those of any microscope.  None of either was trained on.  The card ends with `notes`: what a reader should
+    know of the trainings and the checkpoints do not tell.
 
     Raises
     ------
@@ -67,9 +74,14 @@ def assemble(folder: str | Path, data: str | Path, out: str | Path, recordings: 
         "validation_frames": len(frames),
         "recorded_frames": len(typical),
         "recordings": len(opened),
+        "notes": list(notes),
         "metrics": held_out.scores.as_dict()
         | {
-            "confidence_calibration_error": calibration_error(held_out.landmarks.confidence, held_out.correct),
+            "confidence_calibration_error": held_out.confidence_error,
+            "detection": held_out.detection(),
+            "by_visibility": {
+                k: {"labels": v.labels, "median_px": v.median_px} for k, v in held_out.by_visibility().items()
+            },
             "by_landmark_median_px": {k: v.median_px for k, v in held_out.by_landmark().items()},
         },
     }
@@ -85,6 +97,23 @@ def _history(provenance: dict) -> list[dict]:
     """A training and those it was fine-tuned from, the first one first."""
     before = provenance.get("before")
     return [*(_history(before) if before else []), provenance]
+
+
+def _preset(config: dict) -> str:
+    """The preset whose optimiser and schedule a training had."""
+    return next(
+        (k for k, p in PRESETS.items() if (p.optimiser, p.schedule) == (config["optimiser"], config["schedule"])), ""
+    )
+
+
+def _steps(training: dict) -> str:
+    batch, processes = training["config"]["batch_size"], training.get("processes") or 1
+    return f"{training['steps']} x {batch}" + (f" x {processes}" if processes > 1 else "")
+
+
+def _each(values: Iterable[object]) -> str:
+    """In their order, one that comes again next said once."""
+    return " then ".join(str(value) for value, _ in groupby(values))
 
 
 def _network(config: dict) -> str:
@@ -111,19 +140,22 @@ def card(detector: Detector, path: Path) -> str:
         lines.append("| " + " | ".join([name, *(str(value(stage)) for stage in p["stages"].values())]) + " |")
 
     row("network", lambda s: _network(s["config"]["network"]))
-    row("training images", lambda s: s["images"])
-    row("preset, optimiser", lambda s: f"best, {s['config']['optimiser']}, {s['config']['precision']}")
-    row("steps x batch", lambda s: " then ".join(f"{t['steps']} x {t['config']['batch_size']}" for t in _history(s)))
+    row("training images", lambda s: _each(t["images"] for t in _history(s)))
+    row(
+        "preset, optimiser",
+        lambda s: f"{_preset(s['config'])}, {s['config']['optimiser']}, {s['config']['precision']}",
+    )
+    row("steps x batch x processes", lambda s: " then ".join(map(_steps, _history(s))))
     row(
         "position loss, per px",
-        lambda s: " then ".join(f"{t['config'].get('position_weight_per_px', 0):g}" for t in _history(s)),
+        lambda s: _each(f"{t['config'].get('position_weight_per_px', 0):g}" for t in _history(s)),
     )
     row(
-        "hours on a shared CPU core",
+        "hours of a GPU" if p["machine"]["gpu"] else "hours of a shared CPU core",
         lambda s: f"{sum(t['seconds'] * (t.get('processes') or 1) for t in _history(s)) / 3600:.2f}",
     )
-    row("data fingerprint", lambda s: f"`{s['data']}`")
-    row("commit", lambda s: f"`{s['commit']}`")
+    row("data fingerprint", lambda s: _each(f"`{t['data']}`" for t in _history(s)))
+    row("commit", lambda s: _each(f"`{t['commit']}`" for t in _history(s)))
     lines += [
         "",
         (
@@ -132,8 +164,10 @@ def card(detector: Detector, path: Path) -> str:
             "at full resolution round each landmark"
             + (", and their mirror images, of which it takes the mean, the last " if detector.mirror else ", the last ")
             + f"closeups of {detector.closeup_network.config.size_px} px, "
-            f"the base at {CLOSEUP_ZOOM[0]:g} of full resolution, the tips at {CLOSEUP_ZOOM[1]:g}."
+            f"the base at {CLOSEUP_ZOOM[0]:g} of full resolution, the tips at {CLOSEUP_ZOOM[1]:g}. "
+            "Each is trained on what it sees: the first two on reduced frames, the others on crops."
         ),
+        "Machine: {processor}, {cores} cores, {gpu}.".format(**p["machine"] | {"gpu": p["machine"]["gpu"] or "no GPU"}),
         f"File: {path.stat().st_size / 1e6:.1f} MB, safetensors; configuration, calibration and this card's figures inside.",
         "",
         *(
@@ -145,21 +179,33 @@ def card(detector: Detector, path: Path) -> str:
             if p.get("recordings")
             else []
         ),
-        f"Held-out simulated full-HD frames ({p['validation_frames'] // 2}, neither trained nor calibrated on):",
+        f"Held-out simulated full-HD frames ({p['validation_frames'] // 2}, not trained on; these figures are of a "
+        "calibration by the other half, the file's own is by both):",
         "",
         "| figure | value |",
         "|---|---|",
         f"| PCK@0.01 / 0.05 / 0.10 | {m['pck_0_01']:.1f} / {m['pck_0_05']:.1f} / {m['pck_0_10']:.1f} % |",
         f"| median, 95th percentile of the error | {m['median_px']:.2f} px, {m['p95_px']:.2f} px |",
         *(f"| median error of {k} | {v:.2f} px |" for k, v in m["by_landmark_median_px"].items()),
-        f"| normalised squared error (2 is right) | {m['nees']:.2f} |",
-        f"| 95 % ellipses hold | {m['coverage_95']:.1f} % |",
+        *(
+            f"| median error where {k} ({v['labels']} labels) | {v['median_px']:.2f} px |"
+            for k, v in m["by_visibility"].items()
+        ),
+        f"| normalised squared error of errors below 20 px (2 is right) | {m['nees']:.2f} |",
+        f"| 95 % ellipses hold, of errors below 20 px | {m['coverage_95']:.1f} % |",
         f"| confidence calibration error | {m['confidence_calibration_error']:.3f} |",
+        *(
+            f'| "{name.replace("_", " ")}" said (confidence above 0.5): precision, recall | '
+            f"{m['detection'][name + '_precision']:.1f} %, {m['detection'][name + '_recall']:.1f} % |"
+            for name in ("in_view", "visible")
+        ),
         f"| missed, gross (above 20 px), of labels | {m['missed']}, {m['gross']}, {m['labels']} |",
         "",
         "Made by `python3 -m lib train generate`, `train frame`, `train tool`, `train window` and `train closeup`, each step "
         "above from the one before (`--initial`), and `train assemble`"
         + (", its `--recordings` by `python3 -m lib simulate`." if p.get("recordings") else "."),
         "",
+        *(f"- {note}" for note in p.get("notes", [])),
+        *([""] if p.get("notes") else []),
     ]
     return "\n".join(lines)

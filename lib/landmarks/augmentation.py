@@ -97,7 +97,7 @@ class Augmentation:
             torch.manual_seed(int(rng.integers(2**63)))
             images, u = self._geometric(batch.images, batch.u)
             if changed:
-                images = torch.cat([self._photometric(images[:changed]), images[changed:]])
+                images = torch.cat([self.light()(images[:changed]).clamp(0, 1), images[changed:]])
         u, visibility = u.clone(), batch.visibility.clone()
         if self.mirror:
             flip = torch.from_numpy(rng.random(len(u)) < 0.5)
@@ -120,9 +120,10 @@ class Augmentation:
         moved, points = K.AugmentationSequential(affine, data_keys=["input", "keypoints"])(images, u.to(images.dtype))
         return moved, points.to(u.dtype)  # NaN points stay NaN
 
-    def _photometric(self, images: Tensor) -> Tensor:
+    def light(self) -> K.ImageSequential:
+        """The changes of light, focus and sensor."""
         s = self.photometric
-        light = K.ImageSequential(
+        return K.ImageSequential(
             K.ColorJiggle(0.25 * s, 0.3 * s, 0.4 * s, 0.06 * s, p=0.8),
             K.RandomGamma((1 - 0.35 * s, 1 + 0.45 * s), p=0.5),
             K.RandomLinearIllumination((0.01, 0.3 * s), p=0.3),
@@ -130,7 +131,6 @@ class Augmentation:
             K.RandomMotionBlur(5, 180.0, 0.0, p=0.15),  # direction 0: the content stays where it is
             K.RandomGaussianNoise(0.0, 0.03 * s, p=0.5),
         )
-        return light(images).clamp(0, 1)
 
     def _occluders(self, images: Tensor, u: Tensor, visibility: Tensor, rng: np.random.Generator):
         """Glints (bright discs) and things in front (smooth dark or coloured ellipses); what they cover is occluded."""

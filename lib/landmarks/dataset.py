@@ -11,8 +11,10 @@ from __future__ import annotations
 
 import hashlib
 import os
+import zipfile
+import zlib
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import cv2
@@ -171,6 +173,15 @@ def _joined(parts: list[np.ndarray]) -> np.ndarray:
     return whole
 
 
+def _read(path: Path, names: tuple[str, ...]) -> list[np.ndarray]:
+    """Arrays of one shard."""
+    try:
+        with np.load(path, allow_pickle=False) as shard:
+            return [shard[name] for name in names]
+    except (ValueError, KeyError, OSError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        raise ValueError(f"{path}: corrupt; delete it and generate it again ({error}).") from error
+
+
 def _load(
     folder: str | Path, patterns: tuple[str, ...], names: tuple[str, ...], first_shards: int | None = None
 ) -> list[np.ndarray]:
@@ -179,12 +190,8 @@ def _load(
         raise FileNotFoundError(f"{folder}: no shard {patterns[0]}; make some with `python3 -m lib train generate`.")
     parts: dict[str, list[np.ndarray]] = {name: [] for name in names}
     for path in shards:
-        try:
-            with np.load(path, allow_pickle=False) as shard:
-                for name in names:
-                    parts[name].append(shard[name])
-        except (ValueError, KeyError, OSError) as error:
-            raise ValueError(f"{path}: corrupt; delete it and generate it again ({error}).") from error
+        for name, array in zip(names, _read(path, names), strict=True):
+            parts[name].append(array)
     return [_joined(parts.pop(name)) for name in names]
 
 
@@ -206,11 +213,10 @@ def crop_frames(folder: str | Path, shards: int | None = None) -> tuple[np.ndarr
 def validation_frames(folder: str | Path) -> Iterator[tuple[str, np.ndarray, np.ndarray, np.ndarray]]:
     """Full validation frames, for `lib.landmarks.evaluation`: name, image, u, visibility."""
     for path in sorted(Path(folder).glob("validation_*.npz")):
-        with np.load(path, allow_pickle=False) as shard:
-            pieces = np.split(shard["jpegs"], shard["jpeg_ends"][:-1])
-            for i, piece in enumerate(pieces):
-                image = cv2.cvtColor(cv2.imdecode(piece, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
-                yield f"{path.stem} {i}", image, shard["u"][i], shard["visibility"][i]
+        jpegs, ends, u, visibility = _read(path, ("jpegs", "jpeg_ends", "u", "visibility"))
+        for i, piece in enumerate(np.split(jpegs, ends[:-1])):
+            image = cv2.cvtColor(cv2.imdecode(piece, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+            yield f"{path.stem} {i}", image, u[i], visibility[i]
 
 
 @dataclass(frozen=True)
@@ -274,7 +280,7 @@ class WindowSource:
 
     @property
     def fingerprint(self) -> str:
-        return _fingerprint(self.crops, self.u)
+        return _fingerprint(self)
 
 
 @dataclass(frozen=True)
@@ -356,12 +362,16 @@ class CloseupSource:
 
     @property
     def fingerprint(self) -> str:
-        return _fingerprint(self.crops, self.u)
+        return _fingerprint(self)
 
 
-def _fingerprint(crops: np.ndarray, u: np.ndarray) -> str:
-    digest = hashlib.sha256(np.ascontiguousarray(crops[:, ::17, ::17]).tobytes())
-    digest.update(u.tobytes())
+def _fingerprint(source: WindowSource | CloseupSource) -> str:
+    """Of the images, their labels, and how windows are drawn from them."""
+    digest = hashlib.sha256(np.ascontiguousarray(source.crops[:, ::17, ::17]).tobytes())
+    for field in fields(source):
+        value = getattr(source, field.name)
+        if field.name != "crops":
+            digest.update(value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode())
     return digest.hexdigest()[:16]
 
 

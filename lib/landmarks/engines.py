@@ -1,8 +1,7 @@
-"""Engines that run a network on a CPU: torch, or OpenVINO, in a half to a third of the CPU time on the detector's windows.
+"""Engines that run a network on a CPU: torch, or OpenVINO, which is faster in the same precision.
 
-That is against torch in float32; against its bfloat16 it is 1.8 times as fast (`data/results/detector.json`, study
-``engines``: the measurement that chose).  OpenVINO computes in bfloat16 where the processor has units for it (heatmaps then
-differ by about 0.01 of their height), else in float32.
+`data/results/detector.json`, study ``engines``, holds the measurement that chose.  OpenVINO computes in bfloat16 where the
+processor has units for it (heatmaps then differ by about 0.01 of their height), else in float32.
 """
 
 from __future__ import annotations

@@ -28,7 +28,7 @@ from lib.landmarks.inference import (
     features_of,
     joined,
 )
-from lib.landmarks.metrics import Scores, errors_px, pck, score, tool_length_px
+from lib.landmarks.metrics import Scores, calibration_error, errors_px, pck, score, tool_length_px
 from lib.landmarks.network import LANDMARKS
 from lib.landmarks.windows import CLOSEUP_ZOOM, expected_in_closeup, map_points
 from lib.recordings import Recording
@@ -79,6 +79,12 @@ class Evaluation:
     def correct(self) -> np.ndarray:
         """(n, 3) bool: in view and within 5 % of the tool's length: what confidence is the probability of."""
         return self.error_px <= 0.05 * self.length_px[:, None]
+
+    @property
+    def confidence_error(self) -> float:
+        """Of confidence as the probability of being `correct`, which no landmark out of view is (`calibration_error`)."""
+        known = np.isfinite(self.u_true).all(2) | (self.visibility == 0)
+        return calibration_error(self.landmarks.confidence[known], self.correct[known])
 
     def by_landmark(self) -> dict[str, Scores]:
         """Scores of base, tip_1, tip_2."""

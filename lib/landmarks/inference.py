@@ -89,6 +89,8 @@ class Calibration:
     it, where errors are as different as the image is sharp.  log of the variance in px^2 = coefficients . features,
     logit of the confidence = `logit` . features; the features are in `peak_features`.
 
+    There is a row for each landmark; `calibrate` gives the tips, each other's mirror images, equal ones.
+
     Attributes
     ----------
     log_variance:

@@ -116,9 +116,9 @@ def calibration_error(confidence: ArrayLike, correct: ArrayLike, bins: int = 10)
 class Scores:
     """The figures of an evaluation; percent, pixels, counts.
 
-    `median_px`, `p95_px` and `bias_px` are over detected landmarks with a label; `missed` counts labels without
-    a detection, which PCK counts as wrong.  `nees` is the mean after leaving out errors beyond 20 px, which no covariance
-    means to explain (`gross` counts them).
+    `median_px` and `p95_px` are over detected landmarks with a label; `missed` counts labels without a detection, which PCK
+    counts as wrong.  `bias_px`, `nees` (the mean) and `coverage_95` leave out errors beyond 20 px, which no covariance means
+    to explain (`gross` counts them).
     """
 
     pck_0_01: float

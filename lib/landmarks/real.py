@@ -14,6 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from lib.geometry import cell_from_image, image_from_cell
 from lib.landmarks.augmentation import Augmentation
 from lib.landmarks.dataset import REDUCTION
 from lib.landmarks.evaluation import Evaluation, evaluate
@@ -202,20 +203,18 @@ def simulated_to_real(
     detector = replace(detector, calibration={stage: _always(fit) for stage, fit in detector.calibration.items()})
     size = tuple(round(zoom * s) for s in sequence.image_size_px)
     frames = (
-        (name, cv2.resize(image, size, interpolation=cv2.INTER_CUBIC), zoom * u + (zoom - 1) / 2, visibility)
+        (name, cv2.resize(image, size, interpolation=cv2.INTER_CUBIC), image_from_cell(u, zoom), visibility)
         for name, image, u, visibility in _frames(sequence, 0, every)
     )
     found = evaluate(detector, frames)
     landmarks = replace(
         found.landmarks,
-        u=_reduced(found.landmarks.u, zoom),
+        u=cell_from_image(found.landmarks.u, zoom),
         covariance=found.landmarks.covariance / zoom**2,
     )
-    return replace(found, landmarks=landmarks, u_true=_reduced(found.u_true, zoom), length_px=found.length_px / zoom)
-
-
-def _reduced(u: np.ndarray, zoom: float) -> np.ndarray:
-    return (u + 0.5) / zoom - 0.5
+    return replace(
+        found, landmarks=landmarks, u_true=cell_from_image(found.u_true, zoom), length_px=found.length_px / zoom
+    )
 
 
 def _always(fit: Calibration) -> Calibration:

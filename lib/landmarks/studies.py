@@ -28,8 +28,7 @@ from lib.landmarks.augmentation import AUGMENTATIONS
 from lib.landmarks.dataset import TOOL, TOOL_REDUCTION, WindowSource, crop_frames, frame_samples, validation_frames
 from lib.landmarks.engines import LastOutput, OpenVinoNetwork
 from lib.landmarks.evaluation import TRACKED_SHIFT_PX, Evaluation, evaluate, labelled_frames
-from lib.landmarks.inference import Detector, Landmarks, joined
-from lib.landmarks.metrics import calibration_error
+from lib.landmarks.inference import Detector, joined
 from lib.landmarks.network import ABLATION, LANDMARKS, HourglassConfig
 from lib.landmarks.resolution import RESOLUTIONS, ReducedDetector, resolution_windows
 from lib.landmarks.training import PRESETS, Samples, Source, Training, TrainingConfig, train, validate
@@ -226,7 +225,6 @@ def _finder() -> Detector:
 
 def _figures(e: Evaluation) -> dict[str, float]:
     s = e.scores
-    known = ~np.isnan(e.error_px)
     return {
         "pck_0.01": s.pck_0_01,
         "pck_0.05": s.pck_0_05,
@@ -235,7 +233,7 @@ def _figures(e: Evaluation) -> dict[str, float]:
         "p95_px": s.p95_px,
         "nees": s.nees,
         "coverage_95": s.coverage_95,
-        "confidence_error": calibration_error(e.landmarks.confidence[known], e.correct[known]),
+        "confidence_error": e.confidence_error,
         "missed": s.missed,
         "labels": s.labels,
     }
@@ -259,10 +257,7 @@ class _FullHd:
         detector = detector.calibrated(images, fit.landmarks, u, fit.visibility)
         detector.save_calibration(folder)
         parts = [detector.refine(image[None], self.test.landmarks[i : i + 1]) for i, image in enumerate(self.images)]
-        landmarks = Landmarks(
-            *(np.concatenate([getattr(p, key) for p in parts]) for key in ("u", "covariance", "confidence"))
-        )
-        return replace(self.test, landmarks=landmarks)
+        return replace(self.test, landmarks=joined(parts))
 
 
 def _network(options: Options) -> HourglassConfig:

@@ -120,6 +120,7 @@ class Samples:
     def fingerprint(self) -> str:
         digest = hashlib.sha256(np.ascontiguousarray(self.images[:, ::7, ::7]).tobytes())
         digest.update(np.nan_to_num(self.u, nan=-1.0).tobytes())
+        digest.update(np.asarray(self.visibility, dtype=np.int64).tobytes())
         return digest.hexdigest()[:16]
 
 
@@ -367,6 +368,7 @@ class _Run:
         else:
             self.optimiser = torch.optim.AdamW(parameters, config.learning_rate, weight_decay=1e-4)
         self.step, self.seconds, self.log = 0, 0.0, []
+        self.loss_sum, self.since = 0.0, 0  # since the last validation
         self.best = math.inf
 
     @property
@@ -423,11 +425,14 @@ class _Run:
             "seconds": self.seconds,
             "best": self.best if math.isfinite(self.best) else None,
             "log": self.log,
+            "loss_sum": self.loss_sum,
+            "since": self.since,
             "provenance": provenance,
         }
         write_checkpoint(path, tensors, metadata)
 
-    def restore(self, path: Path, fingerprint: str) -> None:
+    def restore(self, path: Path, provenance: dict[str, object]) -> None:
+        """Go on from a checkpoint; `provenance` is completed by where that came from."""
         tensors, metadata = read_checkpoint(path, FORMAT)
         # Only what may change between two sittings of one run.
         free = {"validate_every", "patience"}
@@ -435,9 +440,13 @@ class _Run:
         changed = [name for name, value in own.items() if name not in free and value != other[name]]
         if changed:
             raise ValueError(f"{path}: belongs to a training with another {', '.join(changed)}; use another folder.")
-        if metadata["provenance"]["data"] != fingerprint:
+        kept = metadata["provenance"]
+        if kept["data"] != provenance["data"]:
             raise ValueError(f"{path}: was trained on other data (fingerprint differs); use another folder.")
-        processes = metadata["provenance"].get("processes", 1)
+        if provenance.get("initial") not in (None, kept.get("initial")):
+            raise ValueError(f"{path}: was begun from other weights; give those as `initial`, or use another folder.")
+        provenance |= {key: kept[key] for key in ("initial", "before", "metrics") if key in kept}
+        processes = kept.get("processes", 1)
         if processes != self.world:  # the batches, and so the result, would be others
             raise ValueError(
                 f"{path}: was begun by {processes} process(es), now {self.world}; start as many, or use another folder."
@@ -451,6 +460,7 @@ class _Run:
             state.setdefault(int(i), {})[key] = value
         self.optimiser.load_state_dict(self.optimiser.state_dict() | {"state": state})
         self.step, self.seconds, self.log = metadata["step"], metadata["seconds"], metadata["log"]
+        self.loss_sum, self.since = metadata.get("loss_sum", 0.0), metadata.get("since", 0)
         self.best = math.inf if metadata["best"] is None else metadata["best"]
 
 
@@ -484,7 +494,8 @@ def train(
     Raises
     ------
     ValueError
-        For an empty data set, an `initial` training of another network, or a folder that holds another training.
+        For an empty data set, an `initial` training of another network, or a folder that holds another training, one of
+        other data, or one that began from other weights.
     """
     if len(source) == 0 or len(validation) == 0:
         raise ValueError("source and validation: must not be empty; give labelled images.")
@@ -502,36 +513,42 @@ def train(
     if run.world > 1:
         provenance["processes"] = run.world
     if initial is not None:
-        provenance["before"] = initial.provenance
+        provenance |= {"before": initial.provenance, "initial": _weights_fingerprint(initial.network)}
     if folder is not None:
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
         if (folder / "last.safetensors").exists():
-            run.restore(folder / "last.safetensors", source.fingerprint)
-    began, before, loss_sum, since = time.perf_counter(), run.seconds, 0.0, 0
+            run.restore(folder / "last.safetensors", provenance)
+    keeps = folder is not None and run.rank == 0
+    began, before = time.perf_counter(), run.seconds
     quiet = not progress or run.rank > 0
     bar = tqdm(total=config.steps, initial=run.step, disable=quiet, unit="step", mininterval=1.0)
     stale = _stale(run.log)
     try:
         while run.step < config.steps and not (config.patience and stale >= config.patience):
-            loss_sum, since = loss_sum + run.advance(_batch(source, config, run.step, run.rank)), since + 1
+            run.loss_sum += run.advance(_batch(source, config, run.step, run.rank))
+            run.since += 1
             bar.update()
             run.seconds = before + time.perf_counter() - began
             stop = run.agreed(max_seconds is not None and time.perf_counter() - began > max_seconds)
-            if run.step % config.validate_every and run.step < config.steps and not stop:
+            due = run.step % config.validate_every == 0 or run.step == config.steps
+            if not (due or stop):
                 continue
-            row = {"step": run.step, "seconds": round(run.seconds, 1), "loss": loss_sum / since}
+            if keeps and not due:  # without the validation below, which a run that is not stopped does not have
+                run.save(folder / "last.safetensors", provenance)
+            row = {"step": run.step, "seconds": round(run.seconds, 1), "loss": run.loss_sum / run.since}
             row |= validate(run.usable, validation, config)
-            loss_sum, since = 0.0, 0
             run.log.append(row)
             better = row["validation_loss"] < run.best
-            run.best, stale = (row["validation_loss"], 0) if better else (run.best, stale + 1)
             bar.set_postfix(loss=f"{row['loss']:.3f}", pck=f"{row['pck_0.05']:.1f}", median=f"{row['median_px']:.2f}px")
-            if folder is not None and run.rank == 0:
+            if due:
+                run.loss_sum, run.since = 0.0, 0
+                run.best, stale = (row["validation_loss"], 0) if better else (run.best, stale + 1)
+            if keeps and due:
                 provenance["metrics"] = row
-                run.save(folder / "last.safetensors", provenance)
-                if better:
-                    run.save(folder / "best.safetensors", provenance)
+                # The last one says what is the best: were it written first, a crash between the two would lose the best.
+                for name in ("best", "last") if better else ("last",):
+                    run.save(folder / f"{name}.safetensors", provenance)
                 _write_log(folder / "log.csv", run.log)
             if on_validation is not None and run.rank == 0:
                 on_validation(run.log)
@@ -574,6 +591,13 @@ def _config(path: Path, values: dict) -> TrainingConfig:
         return TrainingConfig(**values | parts)
     except (TypeError, KeyError) as error:
         raise ValueError(f"{path}: its configuration is not one of this program ({error}).") from error
+
+
+def _weights_fingerprint(network: nn.Module) -> str:
+    digest = hashlib.sha256()
+    for tensor in network.state_dict().values():
+        digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()[:16]
 
 
 def _stale(log: list[dict[str, float]]) -> int:
@@ -626,6 +650,7 @@ def main(argv: list[str] | None = None) -> int:
         default=[],
         help="assemble: labelled recordings that the covariances are fitted on",
     )
+    parser.add_argument("--note", action="append", default=[], help="assemble: a line for the card; may be repeated")
     parser.add_argument("--onnx", type=Path, default=paths.CACHE / "onnx", help="export: folder of the ONNX files")
     parser.add_argument("--threads", type=int, default=0, help="torch threads (default: torch's choice)")
     a = parser.parse_args(argv)
@@ -638,7 +663,7 @@ def main(argv: list[str] | None = None) -> int:
             dataset.generate_crops(a.data, a.windows, "windows", workers=a.workers)
             dataset.generate_crops(a.data, a.closeups, "closeups", workers=a.workers)
         elif a.what == "assemble":
-            assembly.assemble(a.folder, a.data, a.out, a.recordings)
+            assembly.assemble(a.folder, a.data, a.out, a.recordings, a.note)
         elif a.what == "export":
             from lib.landmarks.export import export_shipped  # needs onnx, which nothing else does
 

@@ -227,15 +227,29 @@ def test_closeups_are_stretched_with_their_landmark(tmp_path):
         if (np.abs(at[k] - 31.5) < 18).all():
             found = np.array([(x * mass).sum(), (y * mass).sum()]) / mass.sum()
             assert np.abs(found - at[k]).max() < 0.15
-    assert source.fingerprint != replace(source, u=source.u + 1).fingerprint
+    for change in (
+        {"u": source.u + 1},
+        {"stretch": 0.3},
+        {"shifts_px": (1.0, 2.0, 3.0)},
+        {"landmark": 2 - source.landmark},
+    ):
+        assert source.fingerprint != replace(source, **change).fingerprint
 
 
 def test_missing_and_corrupt_shards_are_named(tmp_path):
     with pytest.raises(FileNotFoundError, match="no shard training"):
         dataset.frame_samples(tmp_path)
-    (tmp_path / "training_0000.npz").write_bytes(b"not an archive")
-    with pytest.raises(ValueError, match=r"training_0000\.npz: corrupt"):
-        dataset.frame_samples(tmp_path)
+    dataset._write(tmp_path / "whole.npz", **{name: np.zeros((2, 40, 60, 3), np.uint8) for name in ("frames", "jpegs")})
+    whole = (tmp_path / "whole.npz").read_bytes()
+    flipped = bytearray(whole)
+    flipped[len(whole) // 4] ^= 1
+    for content in (b"not an archive", b"", whole, whole[: len(whole) // 2], bytes(flipped)):
+        for name in ("training_0000.npz", "validation_0000.npz"):
+            (tmp_path / name).write_bytes(content)
+        with pytest.raises(ValueError, match=r"training_0000\.npz: corrupt"):
+            dataset.frame_samples(tmp_path)
+        with pytest.raises(ValueError, match=r"validation_0000\.npz: corrupt"):
+            list(dataset.validation_frames(tmp_path))
 
 
 def test_the_train_command_names_what_is_missing(tmp_path, capsys):

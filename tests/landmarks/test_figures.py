@@ -64,7 +64,8 @@ def test_the_shipped_curve_shows_tracking_beside_whole_frames(shipped):
 
 
 def test_precision_and_recall_of_visibility(shipped):
-    assert texts(plots.visibility_bars(shipped)).count("97.25") == 8
+    rows = {"easy": shipped["whole_frames"], "hard": shipped["tracking"]}
+    assert texts(plots.visibility_bars(rows)).count("97.25") == 8
 
 
 def test_few_labels_are_two_curves_with_error_bars():

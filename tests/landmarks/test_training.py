@@ -132,7 +132,7 @@ def test_disk_full_leaves_the_last_checkpoint(toy, tmp_path, monkeypatch):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(Path, "write_bytes", full)
-    with pytest.raises(OSError, match=r"last\.safetensors: not saved \(No space left.*unharmed"):
+    with pytest.raises(OSError, match=r"best\.safetensors: not saved \(No space left.*unharmed"):
         train(config, toy(8), toy(4), tmp_path, progress=False)
     assert path.read_bytes() == good
     assert not list(tmp_path.glob("*.partial"))
@@ -263,6 +263,53 @@ def test_a_checkpoint_older_than_an_option_resumes_by_its_default(toy, tmp_path)
     training.write_checkpoint(path, tensors, metadata)
     with pytest.raises(ValueError, match="not one of this program"):
         train(config, toy(6), toy(2), tmp_path, progress=False)
+
+
+def test_a_stop_at_any_step_changes_nothing(toy, tmp_path):
+    """Not the log, from which early stopping decides, either."""
+    data, held_out = toy(6), toy(2, seed=1)
+    whole = train(SMALL, data, held_out, progress=False)
+    steps = []
+    while not steps or steps[-1] < SMALL.steps:
+        part = train(SMALL, data, held_out, tmp_path, progress=False, max_seconds=0.0)  # one step a sitting
+        steps.append(part.log[-1]["step"])
+    assert steps == [1, 2, 3, 4, 5, 6]
+    assert same(part.network, whole.network)
+    for row, other in zip(part.log, whole.log, strict=True):
+        assert {**row, "seconds": 0} == {**other, "seconds": 0}
+
+
+def test_a_crash_between_two_files_does_not_lose_the_best(toy, tmp_path, monkeypatch):
+    class Crash(Exception):
+        pass
+
+    save = training._Run.save
+
+    def crash(run, path, provenance):
+        if path.name == "last.safetensors" and run.step == 4:
+            raise Crash
+        save(run, path, provenance)
+
+    monkeypatch.setattr(training._Run, "save", crash)
+    with pytest.raises(Crash):
+        train(SMALL, toy(6), toy(2, seed=1), tmp_path, progress=False)
+    monkeypatch.undo()
+    done = train(SMALL, toy(6), toy(2, seed=1), tmp_path, progress=False)
+    best = min(done.log, key=lambda row: row["validation_loss"])
+    assert load_training(tmp_path / "best.safetensors").provenance["steps"] == best["step"]
+
+
+def test_a_fine_tuning_remembers_where_it_began(toy, tmp_path):
+    data, held_out = toy(6), toy(2, seed=1)
+    first, second = (train(replace(SMALL, seed=seed), data, held_out, progress=False) for seed in (0, 1))
+    train(SMALL, data, held_out, tmp_path, initial=first, max_seconds=0.0, progress=False)
+    with pytest.raises(ValueError, match=r"last\.safetensors: was begun from other weights"):
+        train(SMALL, data, held_out, tmp_path, initial=second, progress=False)
+    resumed = train(SMALL, data, held_out, tmp_path, progress=False)
+    assert resumed.provenance["steps"] == SMALL.steps
+    for provenance in (resumed.provenance, load_training(tmp_path / "last.safetensors").provenance):
+        assert provenance["before"]["data"] == first.provenance["data"]
+        assert provenance["before"]["steps"] == SMALL.steps
 
 
 def test_fine_tuning_starts_from_the_same_network_or_says_so(toy):
