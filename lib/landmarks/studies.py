@@ -29,7 +29,7 @@ from lib.landmarks.dataset import TOOL, TOOL_REDUCTION, WindowSource, crop_frame
 from lib.landmarks.engines import LastOutput, OpenVinoNetwork
 from lib.landmarks.evaluation import TRACKED_SHIFT_PX, Evaluation, evaluate, labelled_frames
 from lib.landmarks.inference import Detector, joined
-from lib.landmarks.network import ABLATION, LANDMARKS, HourglassConfig
+from lib.landmarks.network import ABLATION, LANDMARKS, HourglassConfig, StackedHourglass
 from lib.landmarks.resolution import RESOLUTIONS, ReducedDetector, resolution_windows
 from lib.landmarks.training import PRESETS, Samples, Source, Training, TrainingConfig, train, validate
 from lib.recordings import Recording, import_retinal_microsurgery
@@ -508,6 +508,42 @@ def _together(parts: Sequence[Evaluation]) -> Evaluation:
     return Evaluation(joined([e.landmarks for e in parts]), u_true, visibility, length, names)
 
 
+def speed(options: Options, repeats: int = 20) -> None:
+    """Stereo pairs a second, decoding included: the shipped detector on whole full-HD frames and while tracking, beside the
+    paper's network at its four resolutions, one after the other on the same threads (``--threads``)."""
+    detector, recording = Detector.load(), Recording.open(paths.SHIPPED_RECORDING)
+    pair = np.stack([recording.frames[0].left, recording.frames[0].right])
+    found = detector(pair)
+    papers = Detector(
+        StackedHourglass(HourglassConfig(features=64, stacks=2)), method="paper"
+    )  # weights do not change the time
+
+    def seconds(run: Callable[[], object], times: int) -> dict[str, float]:
+        run()  # the first call warms up
+        taken = []
+        for _ in range(times):
+            start = time.perf_counter()
+            run()
+            taken.append(time.perf_counter() - start)
+        return {"pairs_per_second": 1 / float(np.median(taken)), "repeats": times}
+
+    rows = {
+        "whole frames": seconds(lambda: detector(pair), repeats),
+        "tracking": seconds(lambda: detector.track(pair, found), repeats),
+    }
+    for width, height in RESOLUTIONS.values():
+        part = pair[:, :height, :width]
+        rows[f"paper's network, {width} x {height}"] = seconds(lambda part=part: papers(part), 3)
+    options.record(
+        {
+            "what": "a left and a right image of the shipped recording, from pixels to landmarks",
+            "engine": detector.engine,
+            "rows": rows,
+            "budget": {},
+        }
+    )
+
+
 def engines(options: Options, repeats: int = 20) -> None:
     """What runs the window stage fastest on this CPU: six windows, those of a stereo pair, in ms of wall and CPU time."""
     network = Detector.load(engine="torch").window_network
@@ -571,7 +607,7 @@ def engines(options: Options, repeats: int = 20) -> None:
 
 
 STUDIES: dict[str, Callable[[Options], None]] = {
-    f.__name__: f for f in (resolution, ablation, label_noise, few_labels, real_frames, shipped, engines)
+    f.__name__: f for f in (resolution, ablation, label_noise, few_labels, real_frames, shipped, speed, engines)
 }
 #: Steps of each training unless the command says otherwise: what fits 10 to 20 minutes of one idle core.
 STEPS = {"resolution": 1000, "ablation": 800, "label_noise": 1000, "few_labels": 250, "real_frames": 1200}

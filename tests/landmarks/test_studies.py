@@ -123,6 +123,20 @@ def test_noisy_labels_are_the_same_in_all_crops_of_a_frame(tmp_path, toy_shards)
         studies._noisy(replace(source, landmark=source.landmark[::-1]), options, 1.0)
 
 
+def test_speed_is_of_both_ways_and_every_resolution(tmp_path, monkeypatch):
+    recorded = {}
+    options = studies.Options(tmp_path, tmp_path, tmp_path, 1, 1, 1, 4, 1, record=recorded.update)
+    monkeypatch.setattr(studies, "RESOLUTIONS", {"small": (96, 64), "smaller": (64, 64)})
+    studies.speed(options, repeats=1)
+    assert list(recorded["rows"]) == [
+        "whole frames",
+        "tracking",
+        "paper's network, 96 x 64",
+        "paper's network, 64 x 64",
+    ]
+    assert all(row["pairs_per_second"] > 0 for row in recorded["rows"].values())
+
+
 def test_what_is_missing_is_named(tmp_path):
     with pytest.raises(ValueError, match="'4k' is no resolution"):
         load_resolution("4k")
