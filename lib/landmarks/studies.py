@@ -27,7 +27,7 @@ from lib.landmarks import real
 from lib.landmarks.augmentation import AUGMENTATIONS
 from lib.landmarks.dataset import TOOL, TOOL_REDUCTION, WindowSource, crop_frames, frame_samples, validation_frames
 from lib.landmarks.engines import LastOutput, OpenVinoNetwork
-from lib.landmarks.evaluation import TRACKED_SHIFT_PX, Evaluation, evaluate, labelled_frames
+from lib.landmarks.evaluation import TRACKED_SHIFT_PX, Evaluation, evaluate, focus_distance_mm, labelled_frames
 from lib.landmarks.inference import Detector, joined
 from lib.landmarks.network import ABLATION, LANDMARKS, HourglassConfig, StackedHourglass
 from lib.landmarks.resolution import RESOLUTIONS, ReducedDetector, resolution_windows
@@ -482,6 +482,7 @@ def shipped(options: Options) -> None:
         pieces = [detector.track(image[None], before[i : i + 1]) for i, (_, image, _, _) in enumerate(frames)]
         tracked.append(replace(parts[-1], landmarks=joined(pieces)))
     whole, windows = _together(parts), _together(tracked)
+    depth_mm = np.concatenate([focus_distance_mm(recording) for recording in recordings])
     options.record(
         {
             "what": "the shipped detector; tracking: closeups placed where the landmarks were found, the whole tool "
@@ -491,6 +492,9 @@ def shipped(options: Options) -> None:
             "whole_frames": _figures(whole) | {"auc": whole.scores.auc} | whole.detection(),
             "tracking": _figures(windows) | windows.detection(),
             "by_landmark": {name: asdict(s) for name, s in whole.by_landmark().items()},
+            "by_distance_from_focus": {
+                name: asdict(s) for name, s in whole.by_depth(depth_mm, (0, 0.5, 1, 2, 4)).items()
+            },
             "by_sequence": {r.name: _figures(e) for r, e in zip(recordings, parts, strict=True)},
             "thresholds": list(CURVE),
             "curve": whole.curve(np.array(CURVE)).tolist(),
