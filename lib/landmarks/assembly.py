@@ -190,6 +190,7 @@ def card(detector: Detector, path: Path) -> str:
         *(
             f"| median error where {k} ({v['labels']} labels) | {v['median_px']:.2f} px |"
             for k, v in m["by_visibility"].items()
+            if len(m["by_visibility"]) > 1
         ),
         f"| normalised squared error of errors below 20 px (2 is right) | {m['nees']:.2f} |",
         f"| 95 % ellipses hold, of errors below 20 px | {m['coverage_95']:.1f} % |",
