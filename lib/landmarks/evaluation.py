@@ -98,10 +98,16 @@ class Evaluation:
         parts = {"visible": self.visibility == 2, "occluded": self.visibility == 1}
         return {name: self._score(which) for name, which in parts.items() if which.any()}
 
-    def by_depth(self, depth_mm: np.ndarray, edges_mm: Sequence[float]) -> dict[str, Scores]:
-        """Scores of landmarks by their distance from the focal plane (n, 3) mm, between `edges_mm`; where there are any."""
+    def by_depth(
+        self, depth_mm: np.ndarray, edges_mm: Sequence[float], landmarks: Sequence[int] = (0, 1, 2)
+    ) -> dict[str, Scores]:
+        """Scores of `landmarks` by their distance from the focal plane (n, 3) mm, between `edges_mm`; where there are any.
+
+        A tool comes from above, so its base lies further from focus than its tips: they are better told apart.
+        """
+        asked = np.isin(np.arange(3), landmarks)
         parts = {
-            f"{low:g} to {high:g} mm": (np.abs(depth_mm) >= low) & (np.abs(depth_mm) < high)
+            f"{low:g} to {high:g} mm": asked & (np.abs(depth_mm) >= low) & (np.abs(depth_mm) < high)
             for low, high in pairwise(edges_mm)
         }
         return {name: self._score(which) for name, which in parts.items() if (which & (self.visibility > 0)).any()}

@@ -493,7 +493,8 @@ def shipped(options: Options) -> None:
             "tracking": _figures(windows) | windows.detection(),
             "by_landmark": {name: asdict(s) for name, s in whole.by_landmark().items()},
             "by_distance_from_focus": {
-                name: asdict(s) for name, s in whole.by_depth(depth_mm, (0, 0.5, 1, 2, 4)).items()
+                which: {name: asdict(s) for name, s in whole.by_depth(depth_mm, (0, 0.5, 1, 2, 4), k).items()}
+                for which, k in (("base", [0]), ("tips", [1, 2]))
             },
             "by_sequence": {r.name: _figures(e) for r, e in zip(recordings, parts, strict=True)},
             "thresholds": list(CURVE),
