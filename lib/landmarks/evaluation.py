@@ -118,11 +118,11 @@ class Evaluation:
         ``"in_view"``: the landmark lies in the frame, hidden or not.  ``"visible"``: it is not hidden either.
         """
         said = self.landmarks.confidence >= min_confidence
-        result = {}
+        result: dict[str, float] = {}
         for name, there in (("in_view", self.visibility > 0), ("visible", self.visibility == 2)):
-            hit = float((said & there).sum())
-            result[f"{name}_precision"] = 100 * hit / said.sum() if said.any() else np.nan
-            result[f"{name}_recall"] = 100 * hit / there.sum() if there.any() else np.nan
+            hit = int((said & there).sum())
+            result[f"{name}_precision"] = 100 * hit / int(said.sum()) if said.any() else np.nan
+            result[f"{name}_recall"] = 100 * hit / int(there.sum()) if there.any() else np.nan
         return result
 
     def curve(self, thresholds: np.ndarray) -> np.ndarray:
@@ -434,7 +434,9 @@ def main(argv: list[str] | None = None) -> int:
         )
     s = result.scores
     print(f"normalised squared error {s.nees:.2f} (2 is right), 95 % ellipses hold {s.coverage_95:.1f} %")
-    print(f"bias {s.bias_px[0]:+.2f}, {s.bias_px[1]:+.2f} px; confidence above 0.5 means, in %:", result.detection())
+    print(f"bias {s.bias_px[0]:+.2f}, {s.bias_px[1]:+.2f} px")
+    seen = ", ".join(f"{name.replace('_', ' ')} {value:.1f} %" for name, value in result.detection().items())
+    print(f"confidence above 0.5 means seen: {seen}")
     if arguments.json:
         arguments.json.write_text(
             json.dumps({k: v.as_dict() for k, v in rows.items()}, indent=1) + "\n", encoding="utf-8"
