@@ -65,7 +65,7 @@ def assemble(
     )
     held_out = evaluate(calibrate(detector, frames[::2] + typical), frames[1::2])
     detector = calibrate(detector, frames + typical)
-    keys = ("data", "images", "commit", "steps", "seconds", "processes", "config", "metrics", "before")
+    keys = ("data", "images", "commit", "steps", "seconds", "processes", "machine", "config", "metrics", "before")
     provenance = {
         "trained_on": "simulated frames only (lib.simulator.training); no eye or tool of a shipped recording",
         "commit": commit_id(),
@@ -151,7 +151,7 @@ def card(detector: Detector, path: Path) -> str:
         lambda s: _each(f"{t['config'].get('position_weight_per_px', 0):g}" for t in _history(s)),
     )
     row(
-        "hours of a GPU" if p["machine"]["gpu"] else "hours of a shared CPU core",
+        "hours x processes",
         lambda s: f"{sum(t['seconds'] * (t.get('processes') or 1) for t in _history(s)) / 3600:.2f}",
     )
     row("data fingerprint", lambda s: _each(f"`{t['data']}`" for t in _history(s)))
@@ -167,7 +167,9 @@ def card(detector: Detector, path: Path) -> str:
             f"the base at {CLOSEUP_ZOOM[0]:g} of full resolution, the tips at {CLOSEUP_ZOOM[1]:g}. "
             "Each is trained on what it sees: the first two on reduced frames, the others on crops."
         ),
-        "Machine: {processor}, {cores} cores, {gpu}.".format(**p["machine"] | {"gpu": p["machine"]["gpu"] or "no GPU"}),
+        "Assembled and measured on: {processor}, {cores} cores, {gpu}.".format(
+            **p["machine"] | {"gpu": p["machine"]["gpu"] or "no GPU"}
+        ),
         f"File: {path.stat().st_size / 1e6:.1f} MB, safetensors; configuration, calibration and this card's figures inside.",
         "",
         *(
@@ -188,9 +190,8 @@ def card(detector: Detector, path: Path) -> str:
         f"| median, 95th percentile of the error | {m['median_px']:.2f} px, {m['p95_px']:.2f} px |",
         *(f"| median error of {k} | {v:.2f} px |" for k, v in m["by_landmark_median_px"].items()),
         *(
-            f"| median error where {k} ({v['labels']} labels) | {v['median_px']:.2f} px |"
+            f"| median error where {k}, of {v['labels']} labels | {v['median_px']:.2f} px |"
             for k, v in m["by_visibility"].items()
-            if len(m["by_visibility"]) > 1
         ),
         f"| normalised squared error of errors below 20 px (2 is right) | {m['nees']:.2f} |",
         f"| 95 % ellipses hold, of errors below 20 px | {m['coverage_95']:.1f} % |",
@@ -206,7 +207,7 @@ def card(detector: Detector, path: Path) -> str:
         "above from the one before (`--initial`), and `train assemble`"
         + (", its `--recordings` by `python3 -m lib simulate`." if p.get("recordings") else "."),
         "",
-        *(f"- {note}" for note in p.get("notes", [])),
-        *([""] if p.get("notes") else []),
     ]
+    if p["notes"]:
+        lines += [*(f"- {note}" for note in p["notes"]), ""]
     return "\n".join(lines)

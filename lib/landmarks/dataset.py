@@ -338,11 +338,9 @@ class CloseupSource:
         """A closeup; only its own landmark counts as visible."""
         k = self.landmark[index]
         # A crop ends before a turned closeup's corners do.  Where it ends must not tell where its middle was.
-        corner = rng.integers(0, _BLOCK_PX, 2, endpoint=True)
-        crop, u = self.crops[index], self.u[index] - corner
-        crop = crop[
-            corner[1] : crop.shape[0] - _BLOCK_PX + corner[1], corner[0] : crop.shape[1] - _BLOCK_PX + corner[0]
-        ]
+        x, y = rng.integers(0, _BLOCK_PX, 2, endpoint=True)
+        h, w = (side - _BLOCK_PX for side in self.crops.shape[1:3])
+        crop, u = self.crops[index, y : y + h, x : x + w], self.u[index] - (x, y)
         shift = rng.normal(0, self.shifts_px[rng.choice(len(self.shifts_px), p=self.shift_shares)], 2)
         centre = u[k] + shift * min(1.0, CLOSEUP_REACH_PX / max(np.linalg.norm(shift), 1e-9))
         known = u.copy()

@@ -86,8 +86,9 @@ ABLATION: dict[str, dict[str, int | bool]] = {
 }
 
 
-def _conv(inputs: int, outputs: int, kernel: int, *, relu: bool = True) -> nn.Sequential:
-    layers = [nn.Conv2d(inputs, outputs, kernel, padding=kernel // 2, bias=False), nn.BatchNorm2d(outputs)]
+def _conv(inputs: int, outputs: int, kernel: int, *, stride: int = 1, relu: bool = True) -> nn.Sequential:
+    convolution = nn.Conv2d(inputs, outputs, kernel, stride, padding=kernel // 2, bias=False)
+    layers = [convolution, nn.BatchNorm2d(outputs)]
     return nn.Sequential(*layers, nn.ReLU(inplace=True)) if relu else nn.Sequential(*layers)
 
 
@@ -220,10 +221,8 @@ class _Residual(nn.Module):
 
     def __init__(self, inputs: int, outputs: int, halve: bool = False):
         super().__init__()
-        first = nn.Conv2d(inputs, outputs, 3, stride=2 if halve else 1, padding=1, bias=False)
-        self.body = nn.Sequential(
-            nn.Sequential(first, nn.BatchNorm2d(outputs), nn.ReLU(inplace=True)), _conv(outputs, outputs, 3, relu=False)
-        )
+        first = _conv(inputs, outputs, 3, stride=2 if halve else 1)
+        self.body = nn.Sequential(first, _conv(outputs, outputs, 3, relu=False))
         pool = nn.AvgPool2d(2) if halve else nn.Identity()
         same = inputs == outputs and not halve
         self.skip = nn.Identity() if same else nn.Sequential(pool, _conv(inputs, outputs, 1, relu=False))
@@ -249,11 +248,8 @@ class OffsetNetwork(nn.Module):
         super().__init__()
         self.config = config = config or OffsetConfig()
         f = config.features
-        stem = nn.Sequential(
-            nn.Conv2d(3, f, 5, stride=2, padding=2, bias=False), nn.BatchNorm2d(f), nn.ReLU(inplace=True)
-        )
         self.body = nn.Sequential(
-            stem,
+            _conv(3, f, 5, stride=2),
             _Residual(f, f),
             _Residual(f, 2 * f, halve=True),
             _Residual(2 * f, 2 * f),

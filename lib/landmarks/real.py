@@ -19,7 +19,7 @@ from lib.landmarks.augmentation import Augmentation
 from lib.landmarks.dataset import REDUCTION
 from lib.landmarks.evaluation import Evaluation, evaluate
 from lib.landmarks.inference import Calibration, Detector
-from lib.landmarks.metrics import tool_length_px
+from lib.landmarks.metrics import pck, tool_length_px
 from lib.landmarks.training import PRESETS, Samples, Training, TrainingConfig, train
 from lib.recordings import MonocularSequence
 
@@ -187,10 +187,9 @@ def label_repeatability(sequence: MonocularSequence, threshold: float = 0.2) -> 
     middle = len(sequence) // 2
     u, number = sequence.u[middle:], np.asarray(sequence.frame_numbers)[middle:]
     consecutive = (np.diff(number[:-1]) == 1) & (np.diff(number[1:]) == 1)
-    between = np.where(consecutive[:, None, None], (u[:-2] + u[2:]) / 2, np.nan)
-    error = np.linalg.norm(u[1:-1] - between, axis=-1) / np.sqrt(1.5)
-    known = np.isfinite(error)
-    return float(100 * (error <= threshold * tool_length_px(u[1:-1])[:, None])[known].mean()) if known.any() else np.nan
+    click, between = u[1:-1], (u[:-2] + u[2:]) / 2
+    compared = np.where(consecutive[:, None, None] & np.isfinite(between), click, np.nan)
+    return float(pck(click + (between - click) / np.sqrt(1.5), compared, threshold, length_px=tool_length_px(click)))
 
 
 def simulated_to_real(

@@ -11,9 +11,11 @@ import shlex
 import sys
 import tempfile
 import time
+import timeit
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
@@ -519,26 +521,19 @@ def speed(options: Options, repeats: int = 20) -> None:
     detector, recording = Detector.load(), Recording.open(paths.SHIPPED_RECORDING)
     pair = np.stack([recording.frames[0].left, recording.frames[0].right])
     found = detector(pair)
-    papers = Detector(
-        StackedHourglass(HourglassConfig(features=64, stacks=2)), method="paper"
-    )  # weights do not change the time
+    # Random weights: they do not change the time.
+    papers = Detector(StackedHourglass(HourglassConfig(features=64, stacks=2)), method="paper")
 
-    def seconds(run: Callable[[], object], times: int) -> dict[str, float]:
+    def rate(run: Callable[[], object], times: int) -> dict[str, float]:
         run()  # the first call warms up
-        taken = []
-        for _ in range(times):
-            start = time.perf_counter()
-            run()
-            taken.append(time.perf_counter() - start)
-        return {"pairs_per_second": 1 / float(np.median(taken)), "repeats": times}
+        return {"pairs_per_second": 1 / float(np.median(timeit.repeat(run, number=1, repeat=times))), "repeats": times}
 
     rows = {
-        "whole frames": seconds(lambda: detector(pair), repeats),
-        "tracking": seconds(lambda: detector.track(pair, found), repeats),
+        "whole frames": rate(lambda: detector(pair), repeats),
+        "tracking": rate(lambda: detector.track(pair, found), repeats),
     }
     for width, height in RESOLUTIONS.values():
-        part = pair[:, :height, :width]
-        rows[f"paper's network, {width} x {height}"] = seconds(lambda part=part: papers(part), 3)
+        rows[f"paper's network, {width} x {height}"] = rate(partial(papers, pair[:, :height, :width]), 3)
     options.record(
         {
             "what": "a left and a right image of the shipped recording, from pixels to landmarks",

@@ -38,7 +38,7 @@ from lib.landmarks.network import (
     config_of,
     network_of,
 )
-from lib.records import commit_id
+from lib.records import commit_id, machine
 
 __all__ = [
     "PRESETS",
@@ -508,6 +508,7 @@ def train(
         "data": source.fingerprint,
         "images": len(source),
         "commit": commit_id(),
+        "machine": machine(),
         "torch": torch.__version__,
     }
     if run.world > 1:
