@@ -141,13 +141,13 @@ def simulate(argv: list[str]) -> int:
 
 
 def train(argv: list[str]) -> int:
-    from lib.landmarks.training import main
+    from lib.training.loop import main
 
     return main(argv)
 
 
 def evaluate(argv: list[str]) -> int:
-    from lib.landmarks.evaluation import main
+    from lib.training.evaluation import main
 
     return main(argv)
 

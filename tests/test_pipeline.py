@@ -10,9 +10,10 @@ import pytest
 from lib.cameras import AffineCamera, StereoRig
 from lib.geometry import RigidTransform
 from lib.matching.result import Matches
-from lib.pipeline import STAGES, FrameResult, OnlinePipeline, Settings
-from lib.registration import perturb, random_motion, tool_frames
+from lib.online.pipeline import STAGES, FrameResult, OnlinePipeline, Settings
+from lib.registration import perturb
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
+from notebooks.studies.registration_experiment import random_motion, tool_frames
 
 RIG = reference_rig()
 SELDOM = Settings(surface_every=20)  # for long runs, where the surface is not the point

@@ -13,8 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lib import paths, records
-from lib.records import Provenance, commit, commit_id, machine, plain, read_records, write_record
+from lib import paths
+from lib import provenance as records
+from lib.provenance import Provenance, commit, commit_id, machine, plain, read_records, write_record
 
 ENTRIES = {"result", "command", "commit", "machine", "date", "seconds", "cpu_seconds"}
 

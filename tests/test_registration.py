@@ -14,20 +14,22 @@ from lib.geometry import RigidTransform
 from lib.registration import (
     DriftMonitor,
     Registration,
-    bumped_images,
     identify_motion,
-    motion_error,
     perturb,
-    random_motion,
-    recorded_registration_errors,
     register,
     register_cameras,
     register_images,
-    registration_errors,
-    tool_frames,
 )
 from lib.registration.rigid import motion_jacobian
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
+from notebooks.studies.registration_experiment import (
+    bumped_images,
+    motion_error,
+    random_motion,
+    recorded_registration_errors,
+    registration_errors,
+    tool_frames,
+)
 
 CENTRE_MM = ROBOT_FROM_MICROSCOPE.t
 RIG = reference_rig()

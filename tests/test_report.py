@@ -1,4 +1,4 @@
-"""lib.report outside Jupyter; tests/test_workbench.py has what travels in an executed notebook."""
+"""lib.workbench.report outside Jupyter; tests/test_workbench.py has what travels in an executed notebook."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
-from lib import report
+from lib.workbench import report
 
 
 def test_record_prints_one_line(capsys):

@@ -2,14 +2,6 @@
 
 from lib.calibration.advice import Advice, advise, box_grid, next_position, next_positions
 from lib.calibration.affine import AffineMinimum, Moments, affine_minimum, dlt, estimate_noise, paper_variances
-from lib.calibration.baselines import (
-    Factorisation,
-    PerspectiveCamera,
-    factorise,
-    perspective_dlt,
-    similarity,
-    triangulate_perspective,
-)
 from lib.calibration.estimate import Calibration, calibrate
 from lib.calibration.export import read_json, read_opencv, read_ros, write_json, write_opencv, write_ros
 from lib.calibration.ladder import LADDER, Comparison, Rung, compare_models
@@ -25,12 +17,10 @@ __all__ = [
     "AffineMinimum",
     "Calibration",
     "Comparison",
-    "Factorisation",
     "Moments",
     "OffsetCalibration",
     "OnlineCalibration",
     "Optics",
-    "PerspectiveCamera",
     "Pivot",
     "Rung",
     "TimeOffset",
@@ -44,21 +34,17 @@ __all__ = [
     "dlt",
     "estimate_noise",
     "estimate_time_offset",
-    "factorise",
     "next_position",
     "next_positions",
     "optics",
     "paper_variances",
-    "perspective_dlt",
     "pivot_calibration",
     "read_json",
     "read_opencv",
     "read_ros",
     "rolling_shutter",
-    "similarity",
     "tool_axes",
     "tool_offsets",
-    "triangulate_perspective",
     "write_json",
     "write_opencv",
     "write_ros",

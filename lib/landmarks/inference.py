@@ -83,7 +83,7 @@ class Landmarks:
 
 @dataclass(frozen=True)
 class Calibration:
-    """What makes covariance and confidence true, fitted on validation images (`lib.landmarks.evaluation.calibrate`).
+    """What makes covariance and confidence true, fitted on validation images (`lib.training.evaluation.calibrate`).
 
     The covariance of a peak is diagonal in the axes of its stage's input: in the upright windows along the tool and across
     it, where errors are as different as the image is sharp.  log of the variance in px^2 = coefficients . features,

@@ -16,14 +16,6 @@ from numpy.typing import ArrayLike
 from lib.cameras import StereoRig
 from lib.matching.band import SETTINGS, match_band
 from lib.matching.descriptors import as_gray
-from lib.matching.evaluation import (
-    CONFIDENCES,
-    DisparityScore,
-    detection_auc,
-    non_occluded,
-    score_against_disparity,
-    sparsification,
-)
 from lib.matching.free import ResponseMap, match_free, predicted_bytes, response_maps
 from lib.matching.masks import field_mask, glint_mask, tool_mask
 from lib.matching.opencv import DisparityFunction, match_with
@@ -31,21 +23,15 @@ from lib.matching.rectification import RECTIFIED
 from lib.matching.result import Matches
 
 __all__ = [
-    "CONFIDENCES",
     "RECTIFIED",
     "DisparityFunction",
-    "DisparityScore",
     "Matches",
     "ResponseMap",
-    "detection_auc",
     "field_mask",
     "glint_mask",
     "match",
-    "non_occluded",
     "predicted_bytes",
     "response_maps",
-    "score_against_disparity",
-    "sparsification",
     "tool_mask",
 ]
 

@@ -6,34 +6,16 @@ stale rig to the robot frame, and ``perturb(rig, motion)`` is the rig as it is n
 """
 
 from lib.registration.drift import DriftMonitor
-from lib.registration.experiment import (
-    MotionErrors,
-    ToolFrames,
-    bumped_images,
-    motion_error,
-    random_motion,
-    recorded_registration_errors,
-    registration_errors,
-    tool_frames,
-)
 from lib.registration.images import MovedCameras, identify_motion, perturb, register_cameras, register_images
 from lib.registration.rigid import Registration, register
 
 __all__ = [
     "DriftMonitor",
-    "MotionErrors",
     "MovedCameras",
     "Registration",
-    "ToolFrames",
-    "bumped_images",
     "identify_motion",
-    "motion_error",
     "perturb",
-    "random_motion",
-    "recorded_registration_errors",
     "register",
     "register_cameras",
     "register_images",
-    "registration_errors",
-    "tool_frames",
 ]

@@ -27,13 +27,13 @@ from tqdm.auto import tqdm
 
 from lib import paths
 from lib.parallel import in_processes, step
+from lib.provenance import Provenance, write_record
 from lib.recordings import LANDMARKS, Recording
-from lib.records import Provenance, write_record
 from lib.simulator.eye import Eye
 from lib.simulator.forceps import Forceps
 from lib.simulator.microscope import Microscope
+from lib.simulator.population import RESERVED_SEEDS, random_forceps, reserved_forceps
 from lib.simulator.recording import simulate
-from lib.simulator.training import RESERVED_SEEDS, random_forceps, reserved_forceps
 
 __all__ = [
     "TEST_SEQUENCES",

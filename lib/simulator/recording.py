@@ -16,9 +16,9 @@ from lib.simulator.eye import Eye, Scene
 from lib.simulator.forceps import Forceps
 from lib.simulator.microscope import Microscope
 from lib.simulator.motion import Motion
+from lib.simulator.population import RESERVED_SEEDS, reserved_forceps
 from lib.simulator.render import View, render_pair, surface_grid
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE
-from lib.simulator.training import RESERVED_SEEDS, reserved_forceps
 
 __all__ = ["simulate"]
 
@@ -59,7 +59,7 @@ def simulate(
     ----------
     seed:
         Drives every random source; also chooses eye and forceps where they are None, from designs that
-        `lib.simulator.training.sample` never draws.
+        `lib.simulator.population.sample` never draws.
     motion:
         "sweep" (calibration), "surgeon", "both", or a `Motion`.
     microscope:

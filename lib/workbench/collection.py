@@ -10,7 +10,7 @@ from pathlib import Path
 
 import nbformat
 
-from lib.report import FIGURE_METADATA, METRIC_MIME
+from lib.workbench.report import FIGURE_METADATA, METRIC_MIME
 
 __all__ = ["NamedFigure", "figures_of", "metrics_of", "versions"]
 
@@ -20,7 +20,7 @@ _TOLD = ("numpy", "scipy", "torch", "kornia", "opencv-python-headless", "open3d-
 
 @dataclass(frozen=True)
 class NamedFigure:
-    """A picture that a notebook showed through `lib.report.show`."""
+    """A picture that a notebook showed through `lib.workbench.report.show`."""
 
     name: str
     caption: str

@@ -14,7 +14,8 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from lib import paths, records
+from lib import paths
+from lib import provenance as records
 from lib.workbench import collection, pages
 from lib.workbench.execution import Failure, execute, kernel_environment
 from lib.workbench.index import index_html

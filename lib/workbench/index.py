@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import html
 
-from lib.report import format_value, unit_text
 from lib.workbench.pages import markdown_html
+from lib.workbench.report import format_value, unit_text
 from lib.workbench.style import INDEX_CSS, PAGE_CSS
 
 __all__ = ["index_html"]

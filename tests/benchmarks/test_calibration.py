@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from lib.calibration import Moments, OnlineCalibration, affine_minimum, calibrate
-from lib.calibration.evaluation import solve_with_ceres, solve_with_scipy
 from lib.simulator.rig import simulate_correspondences
+from notebooks.studies.calibration_evaluation import solve_with_ceres, solve_with_scipy
 
 
 def stacked(n):

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from lib.calibration.studies import near_affine_rig
 from lib.simulator.rig import simulate_correspondences
+from notebooks.studies.calibration_studies import near_affine_rig
 
 POINTS = 100_000
 

@@ -10,7 +10,7 @@ from lib import paths
 from lib.geometry import RigidTransform
 from lib.matching import glint_mask, match
 from lib.simulator.rig import IMAGE_SIZE_PX, reference_rig
-from lib.surface import speed
+from notebooks.studies import surface_speed as speed
 
 
 def full_hd_pair():
@@ -59,7 +59,7 @@ def test_full_hd(benchmark, full_hd, method, setting):
 @pytest.mark.parametrize("width_px", [512, 1024])
 @pytest.mark.parametrize("method", ["band", "sgbm", "dis", "deepmatching"])
 def test_motorcycle(benchmark, method, width_px):
-    """Seconds and errors; ``python3 -m lib.surface.studies motorcycle`` records them.
+    """Seconds and errors; ``python3 -m notebooks.studies.surface_studies motorcycle`` records them.
 
     The benchmark's own table times the whole measurement, all rounds; a pair's seconds are in `extra_info`.
     """

@@ -6,9 +6,9 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from lib.pipeline import OnlinePipeline, Settings
-from lib.registration import tool_frames
+from lib.online.pipeline import OnlinePipeline, Settings
 from lib.simulator.rig import reference_rig
+from notebooks.studies.registration_experiment import tool_frames
 
 
 def test_step(benchmark):

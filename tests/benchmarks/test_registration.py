@@ -5,16 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lib.registration import (
-    DriftMonitor,
-    identify_motion,
-    perturb,
-    random_motion,
-    register,
-    register_images,
-    tool_frames,
-)
+from lib.registration import DriftMonitor, identify_motion, perturb, register, register_images
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
+from notebooks.studies.registration_experiment import random_motion, tool_frames
 
 RIG = reference_rig()
 

@@ -6,7 +6,7 @@ import pytest
 
 from lib.simulator import Eye, Forceps, Microscope, Pose, render_pair
 from lib.simulator.dataset import seconds_by_stage
-from lib.simulator.training import sample
+from lib.simulator.population import sample
 
 EYE, FORCEPS, POSE = Eye(seed=27), Forceps(), Pose((-1.0, 0.8, -1.0), -0.5, 0.35, 0.2, 0.9)
 LATER = (POSE.moved(base_mm=(-0.995, 0.8, -1.0)), 1e-3)

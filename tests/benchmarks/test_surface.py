@@ -1,15 +1,16 @@
 """Benchmarks of surfaces: our solver beside CLARABEL, and a full-HD pair to its surface by stage.
 
 Run with ``python3 -m lib bench`` or ``pytest -s tests/benchmarks/test_surface.py``; each prints what
-``python3 -m lib.surface.studies solver pair`` records.
+``python3 -m notebooks.studies.surface_studies solver pair`` records.
 """
 
 from __future__ import annotations
 
 import pytest
 
-from lib.surface import SplineGrid, speed
+from lib.surface import SplineGrid
 from lib.surface.solver import L1Problem, interior_point
+from notebooks.studies import surface_speed as speed
 
 
 @pytest.mark.parametrize("n", speed.POINTS)

@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 
 from lib import paths
-from lib.calibration import calibrate, detected, evaluation
+from lib.calibration import calibrate
 from lib.landmarks.inference import Landmarks
 from lib.landmarks.stereo import StereoLandmarks
 from lib.recordings import Recording
+from notebooks.studies import calibration_evaluation as evaluation
+from notebooks.studies import detected
 
 
 @pytest.fixture(scope="module")

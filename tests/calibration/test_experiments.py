@@ -7,9 +7,12 @@ import numpy as np
 import pytest
 
 from lib import paths
-from lib.calibration import Moments, affine_minimum, evaluation, real_robot, studies
-from lib.calibration.checkerboard import measure_boards
+from lib.calibration import Moments, affine_minimum
 from lib.simulator.rig import reference_rig, simulate_correspondences
+from notebooks.studies import calibration_evaluation as evaluation
+from notebooks.studies import calibration_studies as studies
+from notebooks.studies import real_robot
+from notebooks.studies.checkerboard import measure_boards
 
 
 def test_a_general_sparse_solver_reaches_the_closed_form_minimum():

@@ -8,16 +8,12 @@ from lib.calibration import (
     OnlineCalibration,
     calibrate,
     estimate_time_offset,
-    factorise,
-    perspective_dlt,
     pivot_calibration,
     read_json,
     read_opencv,
     read_ros,
     rolling_shutter,
-    similarity,
     tool_offsets,
-    triangulate_perspective,
     write_json,
     write_opencv,
     write_ros,
@@ -25,6 +21,7 @@ from lib.calibration import (
 from lib.cameras import AffineCamera, NearAffineCamera, StereoRig
 from lib.geometry import RigidTransform
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig, simulate_correspondences
+from notebooks.studies.baselines import factorise, perspective_dlt, similarity, triangulate_perspective
 
 
 def sweep(time_s, speed_mm_s=2.0):

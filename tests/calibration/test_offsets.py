@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from lib.calibration.offsets import calibrate_with_offsets, tool_axes
-from lib.calibration.studies import near_affine_rig
 from lib.geometry import RigidTransform
 from lib.simulator.rig import IMAGE_SIZE_PX, ROBOT_FROM_MICROSCOPE
+from notebooks.studies.calibration_studies import near_affine_rig
 
 LANDMARKS_MM = np.array([[0.0, 0.0, 0.0], [3.0, -0.5, 0.1], [3.0, 0.5, 0.1]])
 OFFSETS_MM = np.array([[0.040, 0.0, -0.010], [-0.010, 0.004, 0.006], [0.012, -0.003, 0.002]])

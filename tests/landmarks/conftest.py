@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from lib.landmarks.dataset import _write_shard
-from lib.landmarks.training import Samples
+from lib.training.loop import Samples
+from lib.training.samples import _write_shard
 
 
 def draw_tool(rng: np.random.Generator, size=(64, 96)) -> tuple[np.ndarray, np.ndarray]:

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from lib.landmarks.augmentation import AUGMENTATIONS, Augmentation, Batch, leave_frame
 from lib.landmarks.heatmaps import decode, render
+from lib.training.augmentation import AUGMENTATIONS, Augmentation, Batch, leave_frame
 
 
 def gaussians(n=4, size=(160, 200), seed=0, low=0.35, high=0.65):

@@ -12,13 +12,13 @@ from lib import paths
 from lib.landmarks import Detector, Landmarks
 from lib.landmarks import export as module
 from lib.landmarks.engines import OpenVinoNetwork, accelerated, default_engine, openvino
-from lib.landmarks.evaluation import evaluate_recording
 from lib.landmarks.export import PARITY_CONFIDENCE, PARITY_PX, export, export_shipped, run_onnx
 from lib.landmarks.inference import Calibration, as_tensor
 from lib.landmarks.network import HourglassConfig, OffsetConfig, OffsetNetwork, StackedHourglass
-from lib.landmarks.training import PRESETS, train
-from lib.landmarks.training import main as training_main
 from lib.recordings import Recording
+from lib.training.evaluation import evaluate_recording
+from lib.training.loop import PRESETS, train
+from lib.training.loop import main as training_main
 
 needs_openvino = pytest.mark.skipif(not importlib.util.find_spec("openvino"), reason="OpenVINO is not installed here")
 needs_shipped = pytest.mark.skipif(

@@ -8,13 +8,15 @@ import pytest
 import torch
 
 from lib import paths
-from lib.landmarks import Detector, dataset, evaluation, inference, metrics
-from lib.landmarks.assembly import card
-from lib.landmarks.augmentation import Augmentation
-from lib.landmarks.evaluation import _belief, _fit, calibrate, evaluate
+from lib.landmarks import Detector, inference, metrics
 from lib.landmarks.inference import Calibration
 from lib.landmarks.network import HourglassConfig, OffsetConfig, OffsetNetwork
-from lib.landmarks.training import PRESETS, Samples, main, train
+from lib.training import evaluation
+from lib.training import samples as dataset
+from lib.training.assembly import card
+from lib.training.augmentation import Augmentation
+from lib.training.evaluation import _belief, _fit, calibrate, evaluate
+from lib.training.loop import PRESETS, Samples, main, train
 
 
 @pytest.fixture(scope="module")

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from lib.figures import landmarks as plots
 from lib.landmarks.heatmaps import Peaks
-from lib.landmarks.studies import CURVE, summary
+from notebooks.figures import landmarks as plots
+from notebooks.studies.detector_studies import CURVE, summary
 
 
 @pytest.fixture(autouse=True)

@@ -264,7 +264,7 @@ class TestShipped:
     def test_finds_the_landmarks_of_the_shipped_recording(self):
         if not paths.SHIPPED_RECORDING.exists():
             pytest.skip("the shipped recording is not there")
-        from lib.landmarks.evaluation import evaluate_recording
+        from lib.training.evaluation import evaluate_recording
 
         result = evaluate_recording(Detector.load(), paths.SHIPPED_RECORDING, every=4)
         assert result.scores.pck_0_10 >= 80

@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 
 from lib import paths
-from lib.landmarks import Detector, real, studies
+from lib.landmarks import Detector
 from lib.landmarks.metrics import tool_length_px
 from lib.landmarks.network import HourglassConfig, StackedHourglass
-from lib.landmarks.training import Samples
 from lib.recordings import MonocularSequence, import_retinal_microsurgery
+from lib.training.loop import Samples
+from notebooks.studies import detector_studies as studies
+from notebooks.studies import real
 
 RETINAL = paths.real_data("retinal_microsurgery")
 

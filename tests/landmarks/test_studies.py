@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 
 from lib import paths
-from lib.landmarks import Detector, Landmarks, studies
-from lib.landmarks.dataset import WindowSource
+from lib.landmarks import Detector, Landmarks
 from lib.landmarks.network import HourglassConfig, StackedHourglass
-from lib.landmarks.resolution import (
+from lib.training.samples import WindowSource
+from notebooks.studies import detector_studies as studies
+from notebooks.studies.detector_studies import main, read_results, summary, verdicts
+from notebooks.studies.resolution import (
     FIELD_PX,
     RESOLUTIONS,
     ReducedDetector,
@@ -19,7 +21,6 @@ from lib.landmarks.resolution import (
     resolution_windows,
     window_side_px,
 )
-from lib.landmarks.studies import main, read_results, summary, verdicts
 
 
 def test_summary_and_ties():
@@ -101,7 +102,7 @@ def test_a_study_goes_on_where_it_was_and_records(tmp_path, toy_shards):
     assert {"command", "commit", "machine", "date", "budget", "seconds"} <= set(second)
     # What differs from the defaults is named; what the trainings took is theirs, not this evaluation's.
     words = second["command"].split()
-    assert words[:4] == ["python3", "-m", "lib.landmarks.studies", "ablation"]
+    assert words[:4] == ["python3", "-m", "notebooks.studies.detector_studies", "ablation"]
     assert {"--steps", "--shards", "--features", "--batch", "--data", "--folder", "--seeds"} <= set(words)
     assert "--seeds" in first["command"].split() and "--threads" not in words
     assert second["training_seconds"] > first["training_seconds"] > 0

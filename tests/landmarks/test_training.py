@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 
-from lib.landmarks import training
-from lib.landmarks.augmentation import Augmentation, Batch
 from lib.landmarks.heatmaps import render
 from lib.landmarks.network import HourglassConfig, OffsetConfig, OffsetNetwork, StackedHourglass
-from lib.landmarks.training import (
+from lib.training import loop as training
+from lib.training.augmentation import Augmentation, Batch
+from lib.training.loop import (
     PRESETS,
     Samples,
     TrainingConfig,
@@ -200,7 +200,7 @@ def test_two_processes_train_one_network(toy, tmp_path):
         "from dataclasses import replace\n"
         "from conftest import toy_samples\n"
         "from lib.landmarks.network import HourglassConfig\n"
-        "from lib.landmarks.training import PRESETS, train\n"
+        "from lib.training.loop import PRESETS, train\n"
         "torch.set_num_threads(1)\n"
         "config = replace(PRESETS['best'], network=HourglassConfig(6, 1, 2), steps=12, batch_size=2,\n"
         "                 validate_every=4, precision='fp32', learning_rate=4e-3)\n"

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lib.matching import Matches, detection_auc, non_occluded, score_against_disparity, sparsification
+from lib.matching import Matches
+from notebooks.studies.matching_evaluation import detection_auc, non_occluded, score_against_disparity, sparsification
 
 
 def matches_of(u_left: np.ndarray, disparity: np.ndarray) -> Matches:

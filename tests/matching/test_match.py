@@ -8,8 +8,9 @@ import pytest
 
 from lib.cameras import AffineCamera, StereoRig
 from lib.geometry import RigidTransform
-from lib.matching import RECTIFIED, Matches, detection_auc, glint_mask, match
+from lib.matching import RECTIFIED, Matches, glint_mask, match
 from lib.simulator.rig import reference_rig
+from notebooks.studies.matching_evaluation import detection_auc
 
 
 def shifted(image: np.ndarray, pixels: int) -> np.ndarray:

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from lib import paths
-from lib.matching import CONFIDENCES, RECTIFIED, detection_auc, match, score_against_disparity
-from lib.surface.evaluation import real_pair
+from lib.matching import RECTIFIED, match
+from notebooks.studies.matching_evaluation import CONFIDENCES, detection_auc, score_against_disparity
+from notebooks.studies.surface_evaluation import real_pair
 
 FOLDER = paths.real_data("stereo_pairs")
 pytestmark = pytest.mark.skipif(FOLDER is None, reason=paths.missing_data_line("stereo_pairs"))

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from lib import paths
+from lib.provenance import read_records
 from lib.recordings import Recording
-from lib.records import read_records
 from lib.simulator.dataset import landmark_counts, main, make_dataset, sequence_name
 
 OPTIONS = {"n_pairs": 2, "duration_s": 4.0, "shrink": 8}  # 240 x 135 px

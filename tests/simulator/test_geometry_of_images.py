@@ -10,12 +10,12 @@ from numpy.testing import assert_allclose
 from lib.cameras import AffineCamera, NearAffineCamera
 from lib.geometry import RigidTransform
 from lib.simulator import Eye, Forceps, Microscope, Pose, render_pair
-from lib.simulator.effects import PLAIN
 from lib.simulator.forceps import MAX_PITCH_RAD, MAX_ROLL_RAD
+from lib.simulator.population import random_forceps, random_pose
 from lib.simulator.raster import rasterise
 from lib.simulator.render import render_view, surface_grid
 from lib.simulator.scenes import Checkerboard, Plane, Relief, Sphere, checkerboard_poses
-from lib.simulator.training import random_forceps, random_pose
+from notebooks.studies.effects import PLAIN
 
 IDENTITY = RigidTransform.identity()
 RIG = PLAIN.rig(IDENTITY)

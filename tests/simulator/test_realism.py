@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from lib.simulator.realism import (
+from notebooks.studies.realism import (
     LIGHTS,
     STATISTICS,
     compare,

@@ -11,9 +11,9 @@ from lib.cameras import StereoRig
 from lib.geometry import RigidTransform
 from lib.recordings import Recording
 from lib.simulator import Eye, Forceps, Microscope, Motion, Pose, Relief, render_pair, simulate
-from lib.simulator.realism import STATISTICS, image_statistics, landmark_window
+from lib.simulator.population import RESERVED_JAW_MM, RESERVED_SEEDS, TEXTURE_SEEDS, random_forceps, sample
 from lib.simulator.scenes import Checkerboard, Plane, Sphere
-from lib.simulator.training import RESERVED_JAW_MM, RESERVED_SEEDS, TEXTURE_SEEDS, random_forceps, sample
+from notebooks.studies.realism import STATISTICS, image_statistics, landmark_window
 
 SMALL = Microscope(pixels_per_mm=(17.0, 16.5), image_size_px=(320, 180), readout_s=0.0)
 EYE = Eye(seed=5, texture_px=256)
@@ -127,7 +127,7 @@ def test_tremor_is_physiological():
 
 @pytest.mark.parametrize("size", [{"crop_px": 160}, {"size_px": (240, 135)}, {"size_px": (160, 120)}])
 def test_training_images(size, monkeypatch):
-    monkeypatch.setattr("lib.simulator.training._TEXTURE_PX", 256)
+    monkeypatch.setattr("lib.simulator.population._TEXTURE_PX", 256)
     image, u, visibility = sample(np.random.default_rng(1), textures=range(10_000, 10_001), **size)
     again = sample(np.random.default_rng(1), textures=range(10_000, 10_001), **size)
     shape = (size["crop_px"],) * 2 if "crop_px" in size else size["size_px"][::-1]
@@ -139,9 +139,9 @@ def test_training_images(size, monkeypatch):
 
 
 def test_training_windows_hold_the_landmark_asked_for(monkeypatch):
-    monkeypatch.setattr("lib.simulator.training._TEXTURE_PX", 256)
+    monkeypatch.setattr("lib.simulator.population._TEXTURE_PX", 256)
     # Far from the field's border, beyond which no window reaches.
-    monkeypatch.setattr("lib.simulator.training.random_pose", lambda *_: Pose(azimuth_rad=0.7))
+    monkeypatch.setattr("lib.simulator.population.random_pose", lambda *_: Pose(azimuth_rad=0.7))
     rng = np.random.default_rng(2)
     for around in (0, 1, 2):
         _, u, _ = sample(rng, crop_px=160, around=around, jitter=0.0, textures=range(10_000, 10_001))

@@ -9,7 +9,7 @@ import pytest
 
 from lib.cameras import Points, StereoRig
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
-from lib.surface.evaluation import surface_on_rays
+from notebooks.studies.surface_evaluation import surface_on_rays
 
 DOMAIN = (300.0, 150.0, 1620.0, 930.0)
 

@@ -19,7 +19,9 @@ from lib.simulator.forceps import Forceps, Pose
 from lib.simulator.microscope import Microscope
 from lib.simulator.render import render_pair
 from lib.simulator.rig import simulate_correspondences
-from lib.surface import BSplineSurface, SplineGrid, epipolar_inliers, evaluation, reconstruct, studies, surface_mesh
+from lib.surface import BSplineSurface, SplineGrid, epipolar_inliers, reconstruct, surface_mesh
+from notebooks.studies import surface_evaluation as evaluation
+from notebooks.studies import surface_studies as studies
 
 matplotlib.use("Agg")
 
@@ -157,7 +159,7 @@ def test_what_an_alignment_takes_out():
 def test_simulated_scenes_are_reconstructed_and_judged():
     import matplotlib.pyplot as plt
 
-    from lib.figures import reconstruction as figures
+    from notebooks.figures import reconstruction as figures
 
     found = []
     for pair in (next(evaluation.eyes(shrink=4)), next(evaluation.objects(shrink=4))):
@@ -185,7 +187,7 @@ def test_error_measures():
 
 
 def test_recorded_studies_are_tabled():
-    from lib.figures import reconstruction as figures
+    from notebooks.figures import reconstruction as figures
 
     recorded = studies.recorded()
     table = figures.recorded_speeds(recorded).axes[0].tables[0]
@@ -198,7 +200,7 @@ def test_recorded_studies_are_tabled():
 def test_every_figure_draws(scene, result):
     import matplotlib.pyplot as plt
 
-    from lib.figures import reconstruction as figures
+    from notebooks.figures import reconstruction as figures
 
     surface, rig = result.surface, scene.rig
     error_um = 1e3 * evaluation.surface_error_mm(surface, scene.truth, *lattice())[..., 2]
@@ -237,7 +239,7 @@ def test_real_pairs_are_scored_beside_each_other():
         pytest.skip(paths.missing_data_line("stereo_pairs"))
     import matplotlib.pyplot as plt
 
-    from lib.figures import reconstruction as figures
+    from notebooks.figures import reconstruction as figures
 
     pair = evaluation.real_pair(folder / "cones")
     found = evaluation.compare_matchers(pair, {"band": {"method": "band"}, "SGBM": {"method": "sgbm"}})

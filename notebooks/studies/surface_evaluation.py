@@ -13,16 +13,7 @@ from scipy.interpolate import RegularGridInterpolator
 
 from lib.cameras import AffineCamera, StereoRig
 from lib.geometry import RigidTransform
-from lib.matching import (
-    CONFIDENCES,
-    RECTIFIED,
-    DisparityScore,
-    Matches,
-    detection_auc,
-    match,
-    score_against_disparity,
-    sparsification,
-)
+from lib.matching import RECTIFIED, Matches, match
 from lib.simulator.dataset import TEST_SEQUENCES, sequence_design, sequence_name
 from lib.simulator.eye import Scene
 from lib.simulator.microscope import Microscope
@@ -32,6 +23,13 @@ from lib.simulator.scenes import OBJECTS, Relief
 from lib.surface.bspline import BSplineSurface
 from lib.surface.reconstruct import Reconstruction, reconstruct
 from lib.surface.sphere import Sphere, fit_sphere
+from notebooks.studies.matching_evaluation import (
+    CONFIDENCES,
+    DisparityScore,
+    detection_auc,
+    score_against_disparity,
+    sparsification,
+)
 
 __all__ = [
     "Case",

@@ -1,6 +1,6 @@
 """Evidence: every claim on calibration measured anew and written to ``data/results/calibration.json``.
 
-python3 -m lib.calibration.evaluation [--runs 2000] [--out FILE] [STUDY ...]
+python3 -m notebooks.studies.calibration_evaluation [--runs 2000] [--out FILE] [STUDY ...]
 """
 
 from __future__ import annotations
@@ -18,11 +18,12 @@ from scipy.optimize import least_squares
 from scipy.sparse import lil_array
 
 from lib import paths
-from lib.calibration import detected, studies
 from lib.calibration.affine import Moments, affine_minimum
 from lib.calibration.estimate import calibrate
-from lib.records import Provenance, read_records, write_record
+from lib.provenance import Provenance, read_records, write_record
 from lib.simulator.rig import simulate_correspondences
+from notebooks.studies import calibration_studies as studies
+from notebooks.studies import detected
 
 __all__ = ["main", "recorded", "solve_with_ceres", "solve_with_scipy"]
 
@@ -320,7 +321,7 @@ def resolution(runs: int) -> dict:
 
 def robot(runs: int) -> dict:
     """Leave-one-out errors on the real robot, affine and with 1/distance."""
-    from lib.calibration import real_robot
+    from notebooks.studies import real_robot
 
     folder = paths.real_data("dvrk_hand_eye")
     if folder is None:
@@ -363,7 +364,7 @@ def recorded(study: str) -> dict | None:
 
 def main(argv: list[str] | None = None) -> int:
     """Run the studies named (all by default) and merge them into the results file, which is written whole after each."""
-    parser = argparse.ArgumentParser(prog="lib.calibration.evaluation", description="Measure the calibration's claims.")
+    parser = argparse.ArgumentParser(prog="notebooks.studies.calibration_evaluation", description="Measure the calibration's claims.")
     parser.add_argument("studies", nargs="*", metavar="STUDY", help=f"some of: {', '.join(STUDIES)}; default all")
     parser.add_argument("--runs", type=int, default=2000, help="repetitions of the largest study")
     parser.add_argument("--out", type=Path, default=paths.RESULTS / "calibration.json")
@@ -372,7 +373,7 @@ def main(argv: list[str] | None = None) -> int:
     if unknown:
         parser.error(f"unknown study {', '.join(sorted(unknown))}; take some of {', '.join(STUDIES)}")
     for name in arguments.studies or STUDIES:
-        provenance = Provenance(f"python3 -m lib.calibration.evaluation {name} --runs {arguments.runs}")
+        provenance = Provenance(f"python3 -m notebooks.studies.calibration_evaluation {name} --runs {arguments.runs}")
         record = write_record(arguments.out, name, STUDIES[name](arguments.runs), provenance)
         print(f"{name}: {json.dumps(record['result'])}", flush=True)
     return 0

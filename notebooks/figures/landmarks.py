@@ -12,12 +12,12 @@ from matplotlib.patches import Ellipse, FancyArrowPatch, FancyBboxPatch, Patch
 from matplotlib.ticker import LogLocator
 from scipy.stats import chi2
 
-from lib.figures.style import COLOURS, LANDMARK_COLOURS, figure, show_image
-from lib.landmarks.evaluation import Evaluation
 from lib.landmarks.heatmaps import Peaks
 from lib.landmarks.inference import Landmarks
 from lib.landmarks.metrics import PCK_THRESHOLDS, reliability
 from lib.landmarks.network import HourglassConfig
+from lib.training.evaluation import Evaluation
+from notebooks.figures.style import COLOURS, LANDMARK_COLOURS, figure, show_image
 
 __all__ = [
     "ablation_bars",

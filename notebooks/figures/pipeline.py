@@ -10,11 +10,11 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
-from lib.figures.interactive import explore
-from lib.figures.overview import landmarks_on
-from lib.figures.style import COLOURS, LANDMARK_COLOURS, figure, show_image
-from lib.pipeline import STAGES, FrameResult
+from lib.online.pipeline import STAGES, FrameResult
 from lib.recordings import StereoFrame
+from notebooks.figures.interactive import explore
+from notebooks.figures.overview import landmarks_on
+from notebooks.figures.style import COLOURS, LANDMARK_COLOURS, figure, show_image
 
 __all__ = ["dashboard", "error_timeline", "frame_browser", "stage_times", "timeline"]
 

@@ -15,13 +15,13 @@ import cv2
 import numpy as np
 
 from lib.geometry import cell_from_image, image_from_cell
-from lib.landmarks.augmentation import Augmentation
-from lib.landmarks.dataset import REDUCTION
-from lib.landmarks.evaluation import Evaluation, evaluate
 from lib.landmarks.inference import Calibration, Detector
 from lib.landmarks.metrics import pck, tool_length_px
-from lib.landmarks.training import PRESETS, Samples, Training, TrainingConfig, train
 from lib.recordings import MonocularSequence
+from lib.training.augmentation import Augmentation
+from lib.training.evaluation import Evaluation, evaluate
+from lib.training.loop import PRESETS, Samples, Training, TrainingConfig, train
+from lib.training.samples import REDUCTION
 
 __all__ = [
     "Crops",

@@ -9,9 +9,10 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
 from lib.cameras import StereoRig
-from lib.figures.style import COLOURS, figure
 from lib.geometry import RigidTransform
-from lib.registration import DriftMonitor, MotionErrors
+from lib.registration import DriftMonitor
+from notebooks.figures.style import COLOURS, figure
+from notebooks.studies.registration_experiment import MotionErrors
 
 __all__ = ["drift_chart", "error_curves", "hypotheses", "moved_tool", "noise_ellipses"]
 

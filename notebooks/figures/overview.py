@@ -7,8 +7,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from lib.figures.style import COLOURS, LANDMARK_COLOURS, figure, show_image
-from lib.pipeline import FrameResult
+from lib.online.pipeline import FrameResult
+from notebooks.figures.style import COLOURS, LANDMARK_COLOURS, figure, show_image
 
 __all__ = ["frame_pair", "landmarks_on", "pipeline_page", "pixel_grid"]
 

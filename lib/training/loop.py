@@ -26,7 +26,6 @@ from torch import Tensor, nn
 from tqdm.auto import tqdm
 
 from lib import paths
-from lib.landmarks.augmentation import AUGMENTATIONS, Augmentation, Batch, leave_frame
 from lib.landmarks.heatmaps import SIGMA_PX, decode, render, sigma_cells
 from lib.landmarks.inference import as_tensor, closeup_peaks, load_network, read_checkpoint, write_checkpoint
 from lib.landmarks.metrics import errors_px, pck, tool_length_px
@@ -38,7 +37,8 @@ from lib.landmarks.network import (
     config_of,
     network_of,
 )
-from lib.records import commit_id, machine
+from lib.provenance import commit_id, machine
+from lib.training.augmentation import AUGMENTATIONS, Augmentation, Batch, leave_frame
 
 __all__ = [
     "PRESETS",
@@ -617,7 +617,8 @@ def _write_log(path: Path, log: list[dict[str, float]]) -> None:
 
 def main(argv: list[str] | None = None) -> int:
     """`python3 -m lib train`: generate data, train one stage (resuming), or join the trained stages into a detector."""
-    from lib.landmarks import assembly, dataset  # late: dataset imports this module
+    from lib.training import assembly
+    from lib.training import samples as dataset
 
     parser = argparse.ArgumentParser(prog="python3 -m lib train", description=main.__doc__.split(": ", 1)[1])
     parser.add_argument(

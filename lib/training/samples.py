@@ -1,6 +1,6 @@
 """Training data for the coarse-to-fine detector: simulated frames, cut to what its networks see.
 
-Frames come from `lib.simulator.training.sample`, whose eyes and tools no test recording uses.  A shard is an .npz
+Frames come from `lib.simulator.population.sample`, whose eyes and tools no test recording uses.  A shard is an .npz
 file of a few frames.  Of every frame it keeps the whole at a reduced resolution and a crop around each
 landmark at full resolution; validation shards keep the full frame as JPEG too.
 Shards of windows and of closeups hold crops alone.
@@ -23,11 +23,11 @@ from tqdm.auto import tqdm
 
 from lib.geometry import cell_from_image
 from lib.landmarks.inference import CLOSEUP_REACH_PX
-from lib.landmarks.training import Samples
 from lib.landmarks.windows import closeup_from_image, cut, direction_rad, map_points, tool_centre, window_from_image
 from lib.parallel import in_processes
+from lib.simulator.population import TEXTURE_SEEDS, VALIDATION_TEXTURE_SEEDS, sample
 from lib.simulator.render import motion_kernel
-from lib.simulator.training import TEXTURE_SEEDS, VALIDATION_TEXTURE_SEEDS, sample
+from lib.training.loop import Samples
 
 __all__ = [
     "REDUCTION",
@@ -211,7 +211,7 @@ def crop_frames(folder: str | Path, shards: int | None = None) -> tuple[np.ndarr
 
 
 def validation_frames(folder: str | Path) -> Iterator[tuple[str, np.ndarray, np.ndarray, np.ndarray]]:
-    """Full validation frames, for `lib.landmarks.evaluation`: name, image, u, visibility."""
+    """Full validation frames, for `lib.training.evaluation`: name, image, u, visibility."""
     for path in sorted(Path(folder).glob("validation_*.npz")):
         jpegs, ends, u, visibility = _read(path, ("jpegs", "jpeg_ends", "u", "visibility"))
         for i, piece in enumerate(np.split(jpegs, ends[:-1])):

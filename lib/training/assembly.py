@@ -8,13 +8,13 @@ from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
 
-from lib.landmarks.dataset import REDUCTION, TOOL_REDUCTION, validation_frames
-from lib.landmarks.evaluation import calibrate, evaluate, labelled_frames
 from lib.landmarks.inference import Detector
-from lib.landmarks.training import PRESETS, load_training
 from lib.landmarks.windows import CLOSEUP_ZOOM
+from lib.provenance import commit_id, machine
 from lib.recordings import Recording
-from lib.records import commit_id, machine
+from lib.training.evaluation import calibrate, evaluate, labelled_frames
+from lib.training.loop import PRESETS, load_training
+from lib.training.samples import REDUCTION, TOOL_REDUCTION, validation_frames
 
 __all__ = ["assemble"]
 
@@ -67,7 +67,7 @@ def assemble(
     detector = calibrate(detector, frames + typical)
     keys = ("data", "images", "commit", "steps", "seconds", "processes", "machine", "config", "metrics", "before")
     provenance = {
-        "trained_on": "simulated frames only (lib.simulator.training); no eye or tool of a shipped recording",
+        "trained_on": "simulated frames only (lib.simulator.population); no eye or tool of a shipped recording",
         "commit": commit_id(),
         "machine": machine(),
         "stages": {name: {key: training.provenance.get(key) for key in keys} for name, training in stages.items()},

@@ -9,13 +9,13 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from lib.cameras import StereoRig
-from lib.figures.style import COLOURS, LANDMARK_COLOURS, figure, show_image
 from lib.recordings import Recording
 from lib.simulator.eye import Scene
 from lib.simulator.forceps import Forceps
 from lib.simulator.microscope import Microscope
 from lib.simulator.motion import Motion
-from lib.simulator.realism import Profiles
+from notebooks.figures.style import COLOURS, LANDMARK_COLOURS, figure, show_image
+from notebooks.studies.realism import Profiles
 
 __all__ = [
     "annotation_errors",

@@ -10,12 +10,6 @@ from scipy.stats import chi2
 
 from lib.calibration.advice import box_grid, next_positions
 from lib.calibration.affine import Moments, affine_minimum, dlt, paper_variances
-from lib.calibration.baselines import (
-    factorise,
-    perspective_dlt,
-    similarity,
-    triangulate_perspective,
-)
 from lib.calibration.estimate import Calibration, calibrate
 from lib.calibration.ladder import compare_models
 from lib.calibration.pivot import tool_offsets
@@ -28,6 +22,12 @@ from lib.simulator.rig import (
     Correspondences,
     reference_rig,
     simulate_correspondences,
+)
+from notebooks.studies.baselines import (
+    factorise,
+    perspective_dlt,
+    similarity,
+    triangulate_perspective,
 )
 
 __all__ = [

@@ -13,10 +13,10 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullForma
 from lib.calibration.estimate import Calibration
 from lib.calibration.ladder import Comparison
 from lib.calibration.offsets import OffsetCalibration
-from lib.calibration.real_robot import RobotFrames, SphereFit
-from lib.calibration.studies import NoiseStudy
-from lib.figures.style import COLOURS, LANDMARK_COLOURS, figure, show_image
 from lib.geometry import RigidTransform
+from notebooks.figures.style import COLOURS, LANDMARK_COLOURS, figure, show_image
+from notebooks.studies.calibration_studies import NoiseStudy
+from notebooks.studies.real_robot import RobotFrames, SphereFit
 
 __all__ = [
     "advice_curves",

@@ -14,8 +14,6 @@ from pathlib import Path
 import numpy as np
 
 from lib import paths
-from lib.calibration.baselines import perspective_dlt, triangulate_perspective
-from lib.calibration.checkerboard import BoardError, measure_boards
 from lib.calibration.estimate import Calibration, calibrate
 from lib.calibration.offsets import OffsetCalibration, calibrate_with_offsets, tool_axes
 from lib.calibration.timing import rolling_shutter
@@ -25,6 +23,8 @@ from lib.landmarks.inference import CODE_VERSION, Detector, Landmarks
 from lib.landmarks.stereo import Correspondences, StereoLandmarks, detect
 from lib.recordings import Recording
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE
+from notebooks.studies.baselines import perspective_dlt, triangulate_perspective
+from notebooks.studies.checkerboard import BoardError, measure_boards
 
 __all__ = [
     "Judgement",
@@ -364,7 +364,7 @@ def resolution_study(
     Parameters
     ----------
     folder:
-        Checkpoints of `lib.landmarks.resolution`; None = where its study keeps them.  What is not trained is left out.
+        Checkpoints of `notebooks.studies.resolution`; None = where its study keeps them.  What is not trained is left out.
     seeds:
         Sweeps, each calibrated by itself.
 
@@ -375,7 +375,7 @@ def resolution_study(
     rows: triangulation_um of the detected landmarks, calibration_um (exact pixels triangulated) and projection_px, as in
     `Judgement`.
     """
-    from lib.landmarks.resolution import RESOLUTIONS, load_resolution
+    from notebooks.studies.resolution import RESOLUTIONS, load_resolution
 
     root = Path(folder) if folder is not None else paths.CACHE / "studies" / "resolution"
     found: dict[str, list[dict[str, float]]] = {"labels": []}

@@ -1,4 +1,4 @@
-"""Long studies of the detector: ``python3 -m lib.landmarks.studies NAME``; figures go to data/results/detector.json.
+"""Long studies of the detector: ``python3 -m notebooks.studies.detector_studies NAME``; figures go to data/results/detector.json.
 
 Every training keeps its checkpoints in data/cache/studies, so a study that was stopped goes on where it was, and one that
 is complete is only evaluated anew.  Its budget (what a training may cost) is the same for all that it compares.
@@ -25,17 +25,17 @@ import torch
 
 from lib import paths
 from lib.geometry import cell_from_image
-from lib.landmarks import real
-from lib.landmarks.augmentation import AUGMENTATIONS
-from lib.landmarks.dataset import TOOL, TOOL_REDUCTION, WindowSource, crop_frames, frame_samples, validation_frames
 from lib.landmarks.engines import LastOutput, OpenVinoNetwork
-from lib.landmarks.evaluation import TRACKED_SHIFT_PX, Evaluation, evaluate, focus_distance_mm, labelled_frames
 from lib.landmarks.inference import Detector, joined
 from lib.landmarks.network import ABLATION, LANDMARKS, HourglassConfig, StackedHourglass
-from lib.landmarks.resolution import RESOLUTIONS, ReducedDetector, resolution_windows
-from lib.landmarks.training import PRESETS, Samples, Source, Training, TrainingConfig, train, validate
+from lib.provenance import Provenance, read_records, write_record
 from lib.recordings import Recording, import_retinal_microsurgery
-from lib.records import Provenance, read_records, write_record
+from lib.training.augmentation import AUGMENTATIONS
+from lib.training.evaluation import TRACKED_SHIFT_PX, Evaluation, evaluate, focus_distance_mm, labelled_frames
+from lib.training.loop import PRESETS, Samples, Source, Training, TrainingConfig, train, validate
+from lib.training.samples import TOOL, TOOL_REDUCTION, WindowSource, crop_frames, frame_samples, validation_frames
+from notebooks.studies import real
+from notebooks.studies.resolution import RESOLUTIONS, ReducedDetector, resolution_windows
 
 __all__ = ["STUDIES", "main", "read_results", "summary"]
 
@@ -50,7 +50,7 @@ class Options:
     Attributes
     ----------
     data:
-        Folder of training and validation shards (`lib.landmarks.dataset`).
+        Folder of training and validation shards (`lib.training.samples`).
     test:
         Folder of simulated sequences; its ``test_*`` recordings are the test where there are any, else the validation
         shards' second half.
@@ -615,7 +615,7 @@ STEPS = {"resolution": 1000, "ablation": 800, "label_noise": 1000, "few_labels":
 
 def _command(parser: argparse.ArgumentParser, given: argparse.Namespace) -> str:
     """The command with every option that differs from its default."""
-    words = ["python3", "-m", "lib.landmarks.studies", given.study]
+    words = ["python3", "-m", "notebooks.studies.detector_studies", given.study]
     for name, value in vars(given).items():
         if name != "study" and value != parser.get_default(name):
             words += [f"--{name}", paths.shown(value) if isinstance(value, Path) else str(value)]
@@ -624,7 +624,7 @@ def _command(parser: argparse.ArgumentParser, given: argparse.Namespace) -> str:
 
 def main(argv: list[str] | None = None) -> int:
     """Run one study (or go on with it) and merge its figures into the results file after every seed."""
-    parser = argparse.ArgumentParser(prog="python3 -m lib.landmarks.studies", description=__doc__.split(";")[0])
+    parser = argparse.ArgumentParser(prog="python3 -m notebooks.studies.detector_studies", description=__doc__.split(";")[0])
     parser.add_argument("study", choices=list(STUDIES))
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--steps", type=int, help=f"of each training (default: {STEPS})")

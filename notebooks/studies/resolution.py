@@ -17,13 +17,13 @@ from numpy.typing import ArrayLike
 
 from lib import paths
 from lib.geometry import cell_from_image, image_from_cell
-from lib.landmarks.dataset import WindowSource
-from lib.landmarks.evaluation import GROSS_PX, _fit
 from lib.landmarks.inference import Calibration, Detector, Landmarks, features_of
 from lib.landmarks.metrics import tool_length_px
 from lib.landmarks.network import StackedHourglass
-from lib.landmarks.training import load_training
 from lib.landmarks.windows import map_points
+from lib.training.evaluation import GROSS_PX, _fit
+from lib.training.loop import load_training
+from lib.training.samples import WindowSource
 
 __all__ = ["FIELD_PX", "RESOLUTIONS", "ReducedDetector", "load_resolution", "resolution_windows", "window_side_px"]
 
@@ -159,7 +159,7 @@ def load_resolution(
         raise ValueError(f"name: {name!r} is no resolution of the paper; choose one of {', '.join(RESOLUTIONS)}.")
     folder = Path(folder or paths.CACHE / "studies" / "resolution") / name / f"seed{seed}"
     if not (folder / "last.safetensors").is_file():
-        raise FileNotFoundError(f"{folder}: not trained; run `python3 -m lib.landmarks.studies resolution`.")
+        raise FileNotFoundError(f"{folder}: not trained; run `python3 -m notebooks.studies.detector_studies resolution`.")
     network = load_training(folder / "last.safetensors").network
     fit = Calibration()
     if (folder / "calibration.json").is_file():

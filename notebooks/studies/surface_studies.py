@@ -1,6 +1,6 @@
 """Evidence: every claim on matching and surfaces measured anew and written to ``data/results/reconstruction.json``.
 
-python3 -m lib.surface.studies [--out FILE] [--recordings 3] [STUDY ...]
+python3 -m notebooks.studies.surface_studies [--out FILE] [--recordings 3] [STUDY ...]
 
 `calibrated` needs recordings of 75 stereo frames, which are simulated once (80 CPU seconds each) and kept in
 data/cache/reconstruction; so with new detector weights the same command only detects, calibrates and judges anew.
@@ -22,14 +22,15 @@ from lib.calibration import calibrate
 from lib.landmarks import Detector
 from lib.landmarks.stereo import detect
 from lib.matching import RECTIFIED, match
+from lib.provenance import Provenance, read_records, write_record
 from lib.recordings import Recording
-from lib.records import Provenance, read_records, write_record
 from lib.simulator.eye import Eye
 from lib.simulator.microscope import Microscope
+from lib.simulator.population import RESERVED_SEEDS
 from lib.simulator.recording import simulate
-from lib.simulator.training import RESERVED_SEEDS
-from lib.surface import evaluation, speed
 from lib.surface.reconstruct import reconstruct
+from notebooks.studies import surface_evaluation as evaluation
+from notebooks.studies import surface_speed as speed
 
 __all__ = ["STUDIES", "main", "recorded"]
 
@@ -219,7 +220,7 @@ def _digest(path: Path) -> str:
 def main(argv: list[str] | None = None) -> int:
     """Run the studies named (all by default) and merge them into the results file, which is written whole after each."""
     parser = argparse.ArgumentParser(
-        prog="python3 -m lib.surface.studies", description="Measure matching and surfaces."
+        prog="python3 -m notebooks.studies.surface_studies", description="Measure matching and surfaces."
     )
     parser.add_argument("studies", nargs="*", metavar="STUDY", help=f"some of: {', '.join(STUDIES)}; default all")
     parser.add_argument("--eyes", type=int, default=5, help="eyes of the reference rig, beside the three test eyes")
@@ -230,7 +231,7 @@ def main(argv: list[str] | None = None) -> int:
     if unknown:
         parser.error(f"unknown study {', '.join(sorted(unknown))}; take some of {', '.join(STUDIES)}")
     for name in options.studies or STUDIES:
-        command = f"python3 -m lib.surface.studies {name} --eyes {options.eyes} --recordings {options.recordings}"
+        command = f"python3 -m notebooks.studies.surface_studies {name} --eyes {options.eyes} --recordings {options.recordings}"
         provenance = Provenance(command)
         record = write_record(options.out, name, STUDIES[name](options), provenance)
         print(f"{name}: {json.dumps(record['result'])}", flush=True)

@@ -1,5 +1,5 @@
 """How fast the surface solver, the way from a pair to its surface, and the matchers are, beside how good: one function
-for the benchmarks (``tests/benchmarks``) and for the recorded results (`lib.surface.studies`).
+for the benchmarks (``tests/benchmarks``) and for the recorded results (`notebooks.studies.surface_studies`).
 
 CPU seconds are on one thread and hold on a busy machine; wall seconds need an idle one.
 """
@@ -14,16 +14,17 @@ from pathlib import Path
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from lib.matching import RECTIFIED, match, score_against_disparity
+from lib.matching import RECTIFIED, match
 from lib.simulator.eye import Eye
 from lib.simulator.forceps import Forceps, Pose
 from lib.simulator.microscope import Microscope
 from lib.simulator.render import render_pair
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE
-from lib.surface import evaluation
 from lib.surface.bspline import SplineGrid
 from lib.surface.reconstruct import reconstruct
 from lib.surface.solver import L1Problem, cvxpy_reference, interior_point
+from notebooks.studies import surface_evaluation as evaluation
+from notebooks.studies.matching_evaluation import score_against_disparity
 
 __all__ = ["CONTROL", "POINTS", "full_hd_pair", "motorcycle", "pair_to_surface", "retina_points", "solver"]
 

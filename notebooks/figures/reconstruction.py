@@ -15,15 +15,16 @@ from matplotlib.patches import Rectangle
 from matplotlib.ticker import LogLocator
 
 from lib.cameras import StereoRig
-from lib.figures.interactive import explore
-from lib.figures.style import COLOURS, LANDMARK_COLOURS, figure, show_image
-from lib.matching import DisparityScore, Matches, ResponseMap
+from lib.matching import Matches, ResponseMap
 from lib.surface import BSplineSurface, Mesh
+from notebooks.figures.interactive import explore
+from notebooks.figures.style import COLOURS, LANDMARK_COLOURS, figure, show_image
+from notebooks.studies.matching_evaluation import DisparityScore
 
 if TYPE_CHECKING:
     import plotly.graph_objects as go
 
-    from lib.surface.evaluation import Case
+    from notebooks.studies.surface_evaluation import Case
 
 __all__ = [
     "case_table",
@@ -439,7 +440,7 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]], *, width_in: flo
 
 
 def recorded_table(recorded: Mapping[str, dict]) -> Figure:
-    """What `python3 -m lib.surface.studies` recorded: surface errors with true and with calibrated cameras."""
+    """What `python3 -m notebooks.studies.surface_studies` recorded: surface errors with true and with calibrated cameras."""
     result = {name: entry["result"] for name, entry in recorded.items()}
     eyes = result.get("eyes", {})
     rows = [
@@ -458,7 +459,7 @@ def recorded_table(recorded: Mapping[str, dict]) -> Figure:
 
 
 def recorded_speeds(recorded: Mapping[str, dict]) -> Figure:
-    """What `python3 -m lib.surface.studies` recorded of `solver`, `pair` and `motorcycle`: how fast, and how good beside it.
+    """What `python3 -m notebooks.studies.surface_studies` recorded of `solver`, `pair` and `motorcycle`: how fast, and how good beside it.
 
     CPU seconds hold on a busy machine, wall seconds on an idle one.
     """

@@ -1,0 +1,1 @@
+"""The online system: every stage, frame by frame (paper Sec. V)."""
