@@ -6,13 +6,22 @@ pixel centres); a transform is named ``target_from_source``; angles are radians.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-__all__ = ["RigidTransform", "cell_from_image", "finite_points", "image_from_cell", "points"]
+__all__ = [
+    "RigidTransform",
+    "align_rotation",
+    "cell_from_image",
+    "finite_points",
+    "image_from_cell",
+    "pair_covariance",
+    "points",
+]
 
 
 def points(values: ArrayLike, dimension: int, name: str) -> np.ndarray:
@@ -50,6 +59,73 @@ def finite_points(values: ArrayLike, dimension: int, name: str) -> np.ndarray:
             "Drop the rows of missing landmarks first."
         )
     return array
+
+
+def pair_covariance(covariance_px2: ArrayLike | Sequence[ArrayLike] | None, n: int, images: int = 2) -> np.ndarray:
+    """Covariance of the stacked pixels (u_left, u_right) of n matches: (1, 4, 4) where all share it, else (n, 4, 4).
+
+    Parameters
+    ----------
+    covariance_px2:
+        px^2: a number (the variance of each coordinate), (2, 2) for every image, (4, 4) for the pair, (n, 4, 4) one a
+        match, (n, 2, 2, 2) one a match and image, or a list of one (n, 2, 2) an image.  None is 1 px^2.  NaN passes, for
+        landmarks that are not seen.
+    images:
+        2, or 1 for a single camera; then (2, 2) and (n, 2, 2) take the place of (4, 4) and (n, 4, 4).
+
+    Raises
+    ------
+    ValueError
+        For another shape, or a finite matrix that is not positive definite.
+
+    Examples
+    --------
+    >>> pair_covariance(4.0, 10)[0].diagonal()
+    array([4., 4., 4., 4.])
+    """
+    m = 2 * images
+    if isinstance(covariance_px2, (list, tuple)) and len(covariance_px2) == images and np.ndim(covariance_px2[0]) == 3:
+        covariance_px2 = np.stack(covariance_px2, axis=1)
+    given = np.asarray(1.0 if covariance_px2 is None else covariance_px2, dtype=np.float64)
+    if given.ndim == 0:
+        covariance = given * np.eye(m)[None]
+    elif given.shape == (2, 2):
+        covariance = np.kron(np.eye(images), given)[None]
+    elif given.shape == (n, images, 2, 2):
+        covariance = np.zeros((n, m, m))
+        for i in range(images):
+            covariance[:, 2 * i : 2 * i + 2, 2 * i : 2 * i + 2] = given[:, i]
+    elif given.shape == (m, m):
+        covariance = given[None]
+    elif given.shape == (n, m, m):
+        covariance = given
+    else:
+        raise ValueError(
+            f"covariance_px2: expected a number, (2, 2), ({m}, {m}), ({n}, {m}, {m}), ({n}, {images}, 2, 2) or a list of "
+            f"({n}, 2, 2), got {given.shape}."
+        )
+    known = covariance[np.isfinite(covariance).all(axis=(1, 2))]
+    if (np.linalg.eigvalsh(known)[:, 0] <= 0).any():
+        raise ValueError("covariance_px2: every covariance must be positive definite.")
+    return covariance
+
+
+def align_rotation(moment: ArrayLike) -> np.ndarray:
+    """The rotation R (..., 3, 3) that maximises trace(R^T moment), the one nearest to `moment`.
+
+    With moment = sum y x^T of two centred sets of points it is the least-squares alignment y = R x (Kabsch, 1976; Umeyama,
+    1991).
+
+    Examples
+    --------
+    >>> R = RigidTransform.from_rotation_vector((0.1, -0.2, 0.3)).R
+    >>> x = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]])
+    >>> bool(np.allclose(align_rotation((x @ R.T).T @ x), R))
+    True
+    """
+    U, _, Vt = np.linalg.svd(np.asarray(moment, dtype=np.float64))
+    U[..., :, 2] *= np.sign(np.linalg.det(U @ Vt))[..., None]
+    return U @ Vt
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,7 +4,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from lib.geometry import RigidTransform, cell_from_image, finite_points, image_from_cell, points
+from lib.geometry import (
+    RigidTransform,
+    align_rotation,
+    cell_from_image,
+    finite_points,
+    image_from_cell,
+    pair_covariance,
+    points,
+)
 
 vectors = arrays(np.float64, 3, elements=st.floats(-3, 3))
 strides = st.tuples(st.floats(0.25, 8), st.floats(0.25, 8))
@@ -74,3 +82,31 @@ def test_one_point_becomes_a_row_and_nan_passes_only_where_allowed():
 def test_wrong_shapes_name_the_argument(shape):
     with pytest.raises(ValueError, match="u_left: expected"):
         points(np.zeros(shape), 2, "u_left")
+
+
+def test_pair_covariance_takes_every_form():
+    rng = np.random.default_rng(0)
+    blocks = rng.uniform(1, 2, (5, 2, 1, 1)) * np.eye(2)
+    expected = np.zeros((5, 4, 4))
+    expected[:, :2, :2], expected[:, 2:, 2:] = blocks[:, 0], blocks[:, 1]
+    for form in (expected, blocks, [blocks[:, 0], blocks[:, 1]]):
+        np.testing.assert_array_equal(pair_covariance(form, 5), expected)
+    for form, diagonal in ((None, 1), (2.5, 2.5), (2.5 * np.eye(2), 2.5), (2.5 * np.eye(4), 2.5)):
+        np.testing.assert_array_equal(pair_covariance(form, 5), diagonal * np.eye(4)[None])
+    np.testing.assert_array_equal(pair_covariance(blocks[:, 0], 5, images=1), blocks[:, 0])
+    unseen = expected.copy()
+    unseen[2, :2] = np.nan
+    assert np.isnan(pair_covariance(unseen, 5)[2]).any()
+
+
+@pytest.mark.parametrize("bad", [np.eye(3), np.ones((4, 4, 4)), -1.0, np.diag([1.0, 1, 1, -1]), np.zeros((5, 4, 4))])
+def test_pair_covariance_refuses_what_is_no_covariance(bad):
+    with pytest.raises(ValueError, match="covariance_px2"):
+        pair_covariance(bad, 5)
+
+
+def test_align_rotation_finds_the_nearest_rotation_and_never_a_reflection():
+    rng = np.random.default_rng(1)
+    R = np.stack([RigidTransform.from_rotation_vector(v).R for v in rng.normal(size=(4, 3))])
+    np.testing.assert_allclose(align_rotation(R * rng.uniform(1, 3, (4, 1, 1))), R, atol=1e-12)
+    assert np.linalg.det(align_rotation(np.diag([1.0, 1.0, -0.5]))) == pytest.approx(1)

@@ -1,0 +1,113 @@
+"""Levenberg and Marquardt's damped least squares, for any energy that knows its own normal equations.
+
+Nocedal and Wright, "Numerical Optimization", 2006, Sec. 10.3.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+__all__ = ["Minimum", "minimise"]
+
+
+@dataclass(frozen=True, eq=False)
+class Minimum:
+    """Where the energy is least.
+
+    Attributes
+    ----------
+    state, energy, work:
+        As the caller's functions made them at the minimum.
+    information:
+        (p, p) Gauss-Newton Hessian there.
+    iterations, converged:
+        Steps taken; False where they ran out.
+    """
+
+    state: Any
+    energy: float
+    work: Any
+    information: np.ndarray
+    iterations: int
+    converged: bool
+
+
+def minimise(
+    start: Any,
+    evaluate: Callable[[Any], tuple[float, Any] | None],
+    normal_equations: Callable[[Any, Any], tuple[np.ndarray, np.ndarray]],
+    move: Callable[[Any, np.ndarray], Any],
+    *,
+    rank: int | None = None,
+    iterations: int = 60,
+    tolerance: float = 1e-13,
+) -> Minimum:
+    """Minimum of an energy by damped Gauss-Newton steps; no step raises the energy.
+
+    Parameters
+    ----------
+    start:
+        The first state, of any type.
+    evaluate:
+        state -> (energy, work), or None where the state is not allowed; `work` is what `normal_equations` needs.
+    normal_equations:
+        (state, work) -> (information (p, p), gradient (p,)): the Gauss-Newton Hessian of the energy and the direction
+        J^T W r in which the energy falls.
+    move:
+        (state, step (p,)) -> the state after an increment.
+    rank:
+        Number of directions that the data determine; steps leave the others alone.  None is all p.
+    iterations:
+        Most steps.
+    tolerance:
+        Relative decrease of the energy below which it is at its minimum.
+
+    Raises
+    ------
+    ValueError
+        If the start is not allowed.
+
+    Examples
+    --------
+    The x where exp(x) = 2:
+
+    >>> def evaluate(x):
+    ...     return 0.5 * float(2 - np.exp(x)) ** 2, 2 - np.exp(x)
+    >>> def normal_equations(x, r):
+    ...     return np.array([[np.exp(2 * x)]]), np.array([np.exp(x) * r])
+    >>> found = minimise(0.0, evaluate, normal_equations, lambda x, step: x + step[0])
+    >>> print(round(found.state, 6), found.converged)
+    0.693147 True
+    """
+    first = evaluate(start)
+    if first is None:
+        raise ValueError("start: the energy is not defined there.")
+    state, (energy, work), damping, converged, count = start, first, 0.0, False, 0
+    for count in range(1, iterations + 1):
+        information, gradient = normal_equations(state, work)
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
+        values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
+        if rank is not None:
+            values, vectors = values[-rank:], vectors[:, -rank:]
+        values = np.maximum(values, 1e-15 * values[-1])
+        along = vectors.T @ (scale * gradient)
+        for _ in range(12):
+            step = scale * (vectors @ (along / (values + damping)))
+            trial = move(state, step)
+            new = evaluate(trial)
+            if new is not None and new[0] <= energy * (1 + 1e-14) + 1e-300:
+                break
+            damping = max(10.0 * damping, 1e-6)
+        else:
+            converged = True  # no step lowers the energy: the floor of rounding
+            break
+        decrease, floor = energy - new[0], tolerance * energy + 1e-22
+        state, (energy, work), damping = trial, new, damping / 30.0 if damping > 1e-9 else 0.0
+        if 0.5 * gradient @ step <= floor and decrease <= floor:
+            converged = True
+            break
+    return Minimum(state, energy, work, normal_equations(state, work)[0], count, converged)
