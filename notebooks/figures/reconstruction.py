@@ -459,7 +459,7 @@ def recorded_table(recorded: Mapping[str, dict]) -> Figure:
 
 
 def recorded_speeds(recorded: Mapping[str, dict]) -> Figure:
-    """What `python3 -m notebooks.studies.surface_studies` recorded of `solver`, `pair` and `motorcycle`: how fast, and how good beside it.
+    """What `python3 -m notebooks.studies.surface_studies` recorded: how fast, and how good beside it.
 
     CPU seconds hold on a busy machine, wall seconds on an idle one.
     """

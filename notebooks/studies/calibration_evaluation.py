@@ -364,7 +364,7 @@ def recorded(study: str) -> dict | None:
 
 def main(argv: list[str] | None = None) -> int:
     """Run the studies named (all by default) and merge them into the results file, which is written whole after each."""
-    parser = argparse.ArgumentParser(prog="notebooks.studies.calibration_evaluation", description="Measure the calibration's claims.")
+    parser = argparse.ArgumentParser(prog="calibration_evaluation", description="Measure the calibration's claims.")
     parser.add_argument("studies", nargs="*", metavar="STUDY", help=f"some of: {', '.join(STUDIES)}; default all")
     parser.add_argument("--runs", type=int, default=2000, help="repetitions of the largest study")
     parser.add_argument("--out", type=Path, default=paths.RESULTS / "calibration.json")

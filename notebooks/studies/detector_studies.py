@@ -1,4 +1,4 @@
-"""Long studies of the detector: ``python3 -m notebooks.studies.detector_studies NAME``; figures go to data/results/detector.json.
+"""Long studies of the detector: ``python3 -m notebooks.studies.detector_studies NAME``; numbers go to data/results.
 
 Every training keeps its checkpoints in data/cache/studies, so a study that was stopped goes on where it was, and one that
 is complete is only evaluated anew.  Its budget (what a training may cost) is the same for all that it compares.

@@ -231,7 +231,7 @@ def main(argv: list[str] | None = None) -> int:
     if unknown:
         parser.error(f"unknown study {', '.join(sorted(unknown))}; take some of {', '.join(STUDIES)}")
     for name in options.studies or STUDIES:
-        command = f"python3 -m notebooks.studies.surface_studies {name} --eyes {options.eyes} --recordings {options.recordings}"
+        command = f"surface_studies {name} --eyes {options.eyes} --recordings {options.recordings}"
         provenance = Provenance(command)
         record = write_record(options.out, name, STUDIES[name](options), provenance)
         print(f"{name}: {json.dumps(record['result'])}", flush=True)
