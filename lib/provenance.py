@@ -1,8 +1,4 @@
-"""Recorded results: ``data/results/*.json``, each a table of named records with what was run, by which commit and where.
-
-A record holds `result` and, where a study has one, its `budget`; and always command, commit, machine, date, wall seconds
-and CPU seconds.
-"""
+"""Provenance of a result: command, commit, machine, date, wall seconds and CPU seconds."""
 
 from __future__ import annotations
 
@@ -17,17 +13,24 @@ from pathlib import Path
 
 import numpy as np
 
-from lib import paths
+from lib import files, paths
 
 __all__ = ["Provenance", "commit", "commit_id", "machine", "plain", "read_records", "write_record"]
 
 
+#: What decides a result: these files of the repository, and not the results that are being written.
+_CODE = ("lib", "notebooks", "tests", "environment.toml")
+
+
 def commit(root: Path = paths.ROOT) -> dict | None:
-    """Commit of the workbench and whether its files differ from it; None outside a git checkout."""
+    """The checked-out commit, as {"id": ..., "modified": ...}; None outside a git checkout.
+
+    `modified` is true if the code (lib, notebooks, tests, environment.toml) differs from the commit.
+    """
     git = ["git", "-C", str(root)]
     try:
         head = subprocess.run([*git, "rev-parse", "HEAD"], capture_output=True, text=True, check=True)
-        status = subprocess.run([*git, "status", "--porcelain"], capture_output=True, text=True, check=True)
+        status = subprocess.run([*git, "status", "--porcelain", "--", *_CODE], capture_output=True, text=True, check=True)
     except (OSError, subprocess.CalledProcessError):
         return None
     return {"id": head.stdout.strip(), "modified": bool(status.stdout.strip())}
@@ -99,13 +102,7 @@ def write_record(
     given = {"result": result} | ({} if budget is None else {"budget": budget})
     record = plain(given | provenance.so_far() | more)
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
-    try:
-        content = read_records(path) | {name: record}
-        partial.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
+    files.write_json(path, read_records(path) | {name: record})
     return record
 
 

@@ -1,4 +1,4 @@
-"""Recorded results: whole or not at all, with their circumstances, and only what JSON holds."""
+"""Provenance: what a record says of its origin, and that records are written whole."""
 
 from __future__ import annotations
 
@@ -13,8 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lib import paths
-from lib import provenance as records
+from lib import files, paths
 from lib.provenance import Provenance, commit, commit_id, machine, plain, read_records, write_record
 
 ENTRIES = {"result", "command", "commit", "machine", "date", "seconds", "cpu_seconds"}
@@ -59,17 +58,17 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch, where):
     write_record(path, "study", {"n": 1}, Provenance("before"))
     before = path.read_bytes()
 
-    def full_disk(file, text, **_):
-        file.write_bytes(text[:10].encode())
+    def full_disk(file, data):
+        file.write_text("torn")
         raise OSError(errno.ENOSPC, "No space left on device")
 
     def interrupted(*_):
         raise KeyboardInterrupt
 
     if where == "write":
-        monkeypatch.setattr(Path, "write_text", full_disk)
+        monkeypatch.setattr(Path, "write_bytes", full_disk)
     else:
-        monkeypatch.setattr(records.os, "replace", interrupted)
+        monkeypatch.setattr(files.os, "replace", interrupted)
     with pytest.raises((OSError, KeyboardInterrupt)):
         write_record(path, "study", {"n": 2}, Provenance("after"))
     assert path.read_bytes() == before and [file.name for file in tmp_path.iterdir()] == ["r.json"]
@@ -96,6 +95,23 @@ def test_reading_nothing_and_something_broken(tmp_path):
     (tmp_path / "broken.json").write_text("{")
     with pytest.raises(ValueError, match=r"broken\.json: no JSON .*restore or delete"):
         read_records(tmp_path / "broken.json")
+
+
+def test_modified_means_code_and_not_results(tmp_path):
+    def git(*words):
+        subprocess.run(["git", "-C", tmp_path, "-c", "user.name=n", "-c", "user.email=e", *words], check=True)
+
+    (tmp_path / "lib").mkdir()
+    (tmp_path / "data").mkdir()
+    (tmp_path / "lib" / "code.py").write_text("a = 1\n")
+    (tmp_path / "data" / "results.csv").write_text("1\n")
+    git("init", "-q")
+    git("add", ".")
+    git("commit", "-qm", "first")
+    (tmp_path / "data" / "results.csv").write_text("2\n")
+    assert commit(tmp_path)["modified"] is False
+    (tmp_path / "lib" / "code.py").write_text("a = 2\n")
+    assert commit(tmp_path)["modified"] is True
 
 
 def test_the_commit_and_the_machine(tmp_path):

@@ -1,0 +1,84 @@
+"""Files written whole or not at all, and the digests that name their content.  Standard library only."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+__all__ = ["digest", "whole", "write_bytes", "write_json", "write_text"]
+
+
+@contextmanager
+def whole(path: str | Path) -> Iterator[Path]:
+    """Yield a partial path beside `path`; when the block ends well, what was written there takes the place of `path`.
+
+    The partial file keeps the suffix, since many writers choose the format by it.  On any error (a full disk above all)
+    it is removed and the file that was there stays.
+
+    Raises
+    ------
+    OSError
+        If nothing was written, or the disk is full.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> target = Path(tempfile.mkdtemp()) / "points.csv"
+    >>> with whole(target) as partial:
+    ...     _ = partial.write_text("x_mm")
+    >>> target.read_text()
+    'x_mm'
+    """
+    path = Path(path)
+    partial = path.with_name(f"{path.stem}.{os.getpid()}.partial{path.suffix}")
+    try:
+        yield partial
+        with open(partial, "rb+") as file:  # an error of writing back would else go unnoticed
+            os.fsync(file.fileno())
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def write_text(path: str | Path, text: str) -> None:
+    """Write `text` as UTF-8 with the line ends that it has."""
+    write_bytes(path, text.encode("utf-8"))
+
+
+def write_bytes(path: str | Path, data: bytes) -> None:
+    """Write `data`."""
+    with whole(path) as partial:
+        partial.write_bytes(data)
+
+
+def write_json(path: str | Path, value: object) -> None:
+    """Write `value` as readable JSON.
+
+    Raises
+    ------
+    ValueError
+        For NaN and infinity, for which JSON has no word; give None.
+    """
+    write_text(path, json.dumps(value, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
+
+
+def digest(*files: str | Path, length: int = 12) -> str:
+    """The first `length` hexadecimal digits of the SHA-256 of the files' contents, one after the other.
+
+    Raises
+    ------
+    FileNotFoundError
+        Naming the file.
+    """
+    total = hashlib.sha256()
+    for path in files:
+        if not Path(path).is_file():
+            raise FileNotFoundError(f"{path}: no such file.")
+        with open(path, "rb") as file:
+            for block in iter(lambda: file.read(1 << 20), b""):
+                total.update(block)
+    return total.hexdigest()[:length]

@@ -1,0 +1,150 @@
+"""Recorded results: tables that ship in ``data/results``, made by studies and read by notebooks.
+
+A table is two files: ``NAME.csv`` (a row a run; units stand in the names of the columns) and ``NAME.json`` (its
+provenance: command, commit, machine, date).
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from lib import files, paths
+from lib.provenance import plain
+
+__all__ = ["Table", "csv_text", "read", "write"]
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows with the same named columns, and where they come from.
+
+    Attributes
+    ----------
+    rows:
+        One dict a row: numbers, truth values, texts; NaN where a number is missing.
+    provenance:
+        Command, commit, machine and date of the runs; empty if unknown.
+
+    Examples
+    --------
+    >>> table = Table([{"noise_px": 0.5, "error_um": 12.0}, {"noise_px": 1.0, "error_um": 24.0}])
+    >>> table.columns["error_um"]
+    array([12., 24.])
+    >>> table.where(noise_px=1.0).rows
+    [{'noise_px': 1.0, 'error_um': 24.0}]
+    """
+
+    rows: list[dict]
+    provenance: dict = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    @cached_property
+    def columns(self) -> dict[str, np.ndarray | list[str]]:
+        """Name -> array of numbers or truth values (n,), or list of n texts; NaN or "" where a row has no entry."""
+        found: dict[str, np.ndarray | list[str]] = {}
+        for name in dict.fromkeys(key for row in self.rows for key in row):
+            values = [row.get(name) for row in self.rows]
+            if any(isinstance(value, str) and value for value in values):
+                found[name] = ["" if value is None or value != value else str(value) for value in values]
+            else:
+                found[name] = np.array([math.nan if value in (None, "") else value for value in values])
+        return found
+
+    def where(self, **equal: object) -> Table:
+        """The rows whose entries equal those given, such as ``table.where(method="band", seed=0)``.
+
+        Raises
+        ------
+        ValueError
+            For a name that is no column.
+        """
+        for name in equal:
+            if name not in self.columns:
+                raise ValueError(f"{name}: no such column; there are {', '.join(self.columns)}.")
+        rows = [row for row in self.rows if all(row.get(name) == value for name, value in equal.items())]
+        return Table(rows, self.provenance)
+
+
+def read(name: str, folder: Path = paths.RESULTS) -> Table | None:
+    """The recorded table `name`; None if there is none.
+
+    Raises
+    ------
+    ValueError
+        If one of its files is damaged; the text names it.
+    """
+    table, origin = folder / f"{name}.csv", folder / f"{name}.json"
+    if not table.is_file():
+        return None
+    try:
+        provenance = json.loads(origin.read_text(encoding="utf-8")) if origin.is_file() else {}
+    except ValueError as error:
+        raise ValueError(f"{origin}: not JSON ({error}); restore it.") from error
+    with table.open(encoding="utf-8", newline="") as stream:
+        reader = csv.DictReader(stream, restkey="", strict=True)
+        rows = list(reader)
+    for number, row in enumerate(rows, start=2):
+        if "" in row or None in row.values():
+            raise ValueError(f"{table}: row {number} does not have {len(reader.fieldnames or ())} entries; restore it.")
+    kinds = {key: _kind([row[key] for row in rows]) for key in reader.fieldnames or ()}
+    return Table([{key: kinds[key](text) for key, text in row.items()} for row in rows], provenance)
+
+
+def write(name: str, rows: Iterable[Mapping], provenance: Mapping, folder: Path = paths.RESULTS) -> Path:
+    """Write the table `name` with its provenance; returns the CSV file.
+
+    Parameters
+    ----------
+    rows:
+        One mapping a row; None and NaN become empty entries, numbers keep six digits.
+    provenance:
+        As `lib.provenance.Provenance.so_far` gives it.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    files.write_text(folder / f"{name}.csv", csv_text(rows))
+    files.write_json(folder / f"{name}.json", plain(dict(provenance)))
+    return folder / f"{name}.csv"
+
+
+def csv_text(rows: Iterable[Mapping]) -> str:
+    """Rows as CSV; the columns stand in the order in which they first appear.
+
+    Examples
+    --------
+    >>> print(csv_text([{"seed": 0, "error_um": 1 / 3}, {"seed": 1, "error_um": None}]), end="")
+    seed,error_um
+    0,0.333333
+    1,
+    """
+    rows = [{key: plain(value) for key, value in row.items()} for row in rows]
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(dict.fromkeys(key for row in rows for key in row)), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def _kind(texts: list[str]):
+    """The narrowest type that reads all entries of a column."""
+    given = [text for text in texts if text]
+    if given and set(given) <= {"True", "False"} and len(given) == len(texts):
+        return lambda text: text == "True"
+    for kind in (int, float):
+        try:
+            [kind(text) for text in given]
+        except ValueError:
+            continue
+        if kind is float or len(given) == len(texts):
+            return lambda text, kind=kind: kind(text) if text else math.nan
+    return str
