@@ -1,0 +1,20 @@
+"""Affine and near-affine cameras and the calibrated stereo pair."""
+
+from lib.cameras.affine import AffineCamera, Camera, Resection
+from lib.cameras.near_affine import NearAffineCamera, radial_derivative
+from lib.cameras.rig import StereoRig, camera_from_dict, camera_to_dict
+from lib.cameras.triangulation import Points, best_linear, pair_covariance
+
+__all__ = [
+    "AffineCamera",
+    "Camera",
+    "NearAffineCamera",
+    "Points",
+    "Resection",
+    "StereoRig",
+    "best_linear",
+    "camera_from_dict",
+    "camera_to_dict",
+    "pair_covariance",
+    "radial_derivative",
+]

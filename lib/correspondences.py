@@ -1,0 +1,320 @@
+"""Correspondences: where the robot says a landmark is and where two cameras see it, each row at its own instant.
+
+This is the one type that calibration, clocks, registration, drift and the online system take, whoever found the
+landmarks: the detector, a person who labels, or the simulator (paper Eq. 2).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from lib.geometry import points
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+__all__ = ["LANDMARKS", "MIN_CONFIDENCE", "Correspondences", "of_recording", "pair_with_robot"]
+
+#: The landmarks of the forceps, in the order of every array.
+LANDMARKS = ("base", "tip_1", "tip_2")
+#: A detection of lower confidence counts as not seen.
+MIN_CONFIDENCE = 0.2
+#: Half the time over which a velocity is measured: long enough to average the robot's noise, short for its motion.
+_VELOCITY_S = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class Correspondences:
+    """Rows of one landmark in one stereo frame, with NaN where the robot is silent or an image does not show it.
+
+    Attributes
+    ----------
+    x_mm:
+        (n, 3) as the robot reports, robot frame.
+    u_left, u_right:
+        (n, 2) px.
+    covariance_px2:
+        (n, 2, 2, 2): of the left and of the right pixel; NaN = unknown.
+    confidence:
+        (n, 2) of left and right; 0 where missing, 1 for labels.
+    frame, landmark:
+        (n,) number of the frame in its recording, and of the landmark (0 base, 1 tip_1, 2 tip_2).
+    time_s:
+        (n,) video clock: the mean of the instants at which the two images' rows of the landmark were read.
+
+    Examples
+    --------
+    >>> c = Correspondences.of_points([[0, 0, 0], [1, 0, 0]], [[5, 5], [105, 5]], [[9, 5], [np.nan, np.nan]])
+    >>> len(c), len(c.complete), c.seen.tolist()
+    (2, 1, [[True, True], [True, False]])
+    """
+
+    x_mm: np.ndarray
+    u_left: np.ndarray
+    u_right: np.ndarray
+    covariance_px2: np.ndarray
+    confidence: np.ndarray
+    frame: np.ndarray
+    landmark: np.ndarray
+    time_s: np.ndarray
+
+    def __post_init__(self) -> None:
+        n = len(np.atleast_1d(self.frame))
+        for name, tail in _SHAPES.items():
+            dtype = np.int64 if name in ("frame", "landmark") else np.float64
+            array = np.asarray(getattr(self, name), dtype=dtype)
+            if array.shape != (n, *tail):
+                raise ValueError(f"{name}: expected {(n, *tail)}, got {array.shape}.")
+            object.__setattr__(self, name, array)
+
+    def __len__(self) -> int:
+        return len(self.x_mm)
+
+    @classmethod
+    def of_points(
+        cls,
+        x_mm: ArrayLike,
+        u_left: ArrayLike,
+        u_right: ArrayLike,
+        *,
+        covariance_px2: ArrayLike | None = None,
+        confidence: ArrayLike | None = None,
+        frame: ArrayLike | None = None,
+        landmark: ArrayLike | None = None,
+        time_s: ArrayLike | None = None,
+    ) -> Correspondences:
+        """From plain arrays of n rows; what is not given is unknown (covariance, time) or certain (confidence 1).
+
+        Without `frame` every row is a frame of its own, of landmark 0.
+        """
+        x, left, right = points(x_mm, 3, "x_mm"), points(u_left, 2, "u_left"), points(u_right, 2, "u_right")
+        n = len(x)
+        seen = np.stack([np.isfinite(left).all(axis=1), np.isfinite(right).all(axis=1)], axis=-1)
+        return cls(
+            x,
+            left,
+            right,
+            np.full((n, 2, 2, 2), np.nan) if covariance_px2 is None else covariance_px2,
+            seen.astype(np.float64) if confidence is None else confidence,
+            np.arange(n) if frame is None else frame,
+            np.zeros(n, dtype=np.int64) if landmark is None else landmark,
+            np.full(n, np.nan) if time_s is None else time_s,
+        )
+
+    @classmethod
+    def join(cls, parts: Iterable[Correspondences]) -> Correspondences:
+        """The rows of several, in their order."""
+        parts = list(parts)
+        return cls(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)))
+
+    @property
+    def seen(self) -> np.ndarray:
+        """(n, 2) bool: the left and the right image show the landmark, with `MIN_CONFIDENCE` or more."""
+        finite = np.stack([np.isfinite(self.u_left).all(axis=1), np.isfinite(self.u_right).all(axis=1)], axis=-1)
+        return finite & (self.confidence >= MIN_CONFIDENCE)
+
+    @property
+    def is_complete(self) -> np.ndarray:
+        """(n,) bool: both images show the landmark and the robot reports it."""
+        return self.seen.all(axis=1) & np.isfinite(self.x_mm).all(axis=1)
+
+    @property
+    def complete(self) -> Correspondences:
+        """The rows that are complete."""
+        return self.subset(self.is_complete)
+
+    @property
+    def pair_covariance_px2(self) -> np.ndarray:
+        """(n, 4, 4) of (u_left, u_right); the two images' errors are independent."""
+        covariance = np.zeros((len(self), 4, 4))
+        covariance[:, :2, :2], covariance[:, 2:, 2:] = self.covariance_px2[:, 0], self.covariance_px2[:, 1]
+        return covariance
+
+    def subset(self, rows: slice | ArrayLike) -> Correspondences:
+        """The rows that a slice, a mask or an array of indices names."""
+        rows = rows if isinstance(rows, slice) else np.asarray(rows)
+        return type(self)(*(getattr(self, f.name)[rows] for f in fields(self)))
+
+    def of_frames(self, frames: ArrayLike) -> Correspondences:
+        """The rows of these frames."""
+        return self.subset(np.isin(self.frame, np.atleast_1d(frames)))
+
+    def grid(self, name: str) -> np.ndarray:
+        """An attribute with one row a frame, (m, 3, ...): frames in ascending order, NaN where there is no row.
+
+        >>> x, u = np.zeros((2, 3)), np.ones((2, 2))
+        >>> c = Correspondences.of_points(x, u, u, frame=[4, 4], landmark=[0, 2])
+        >>> c.grid("u_left").shape, c.grid("u_left")[0, :, 0].tolist()
+        ((1, 3, 2), [1.0, nan, 1.0])
+        """
+        values = getattr(self, name)
+        frames, row = np.unique(self.frame, return_inverse=True)
+        table = np.full((len(frames), max(len(LANDMARKS), self.landmark.max(initial=0) + 1), *values.shape[1:]), np.nan)
+        table[row, self.landmark] = values
+        return table
+
+
+_SHAPES = {
+    "x_mm": (3,),
+    "u_left": (2,),
+    "u_right": (2,),
+    "covariance_px2": (2, 2, 2),
+    "confidence": (2,),
+    "frame": (),
+    "landmark": (),
+    "time_s": (),
+}
+
+
+def pair_with_robot(
+    u_left: ArrayLike,
+    u_right: ArrayLike,
+    *,
+    position: Callable[[np.ndarray], np.ndarray],
+    time_s: ArrayLike,
+    height_px: int,
+    readout_s: float = 0.0,
+    offset_s: float = 0.0,
+    covariance_px2: ArrayLike | None = None,
+    confidence: ArrayLike | None = None,
+    frame: ArrayLike | None = None,
+    linear: np.ndarray | None = None,
+) -> Correspondences:
+    """Landmarks of m stereo frames with the robot's positions at the instants at which their image rows were read.
+
+    A rolling shutter reads the middle row at the frame's time and the last row half `readout_s` later, so the two
+    images show a landmark at two instants.  The position is taken at their mean, and each pixel is moved to that
+    instant by the landmark's velocity.  A landmark seen in one image alone is taken at that image's instant.
+
+    Parameters
+    ----------
+    u_left, u_right:
+        (m, k, 2) px, NaN = not seen.
+    position:
+        Robot times (j, k) in s -> (j, k, 3) mm, NaN where the robot is silent: `lib.recordings.Kinematics.at`.
+    time_s:
+        (m,) times of the frames, video clock.
+    height_px:
+        Rows of an image.
+    readout_s:
+        Time from the first to the last row; 0 is a global shutter.
+    offset_s:
+        t_robot = t_video + offset_s.
+    covariance_px2, confidence:
+        (m, k, 2, 2, 2) and (m, k, 2), left and right; as in `Correspondences.of_points` where not given.
+    frame:
+        (m,) numbers of the frames; 0 to m - 1 where not given.
+    linear:
+        (4, 3) px per mm, left and right, that turns velocities into pixels; None = fitted to these rows.
+
+    Returns
+    -------
+    Correspondences
+        m * k rows, frame by frame.
+
+    Raises
+    ------
+    ValueError
+        For wrong shapes, or a read-out time or height that make no shutter.
+
+    Examples
+    --------
+    A landmark moves down at 10 mm/s; at 100 px/mm a shutter of 20 ms sees it in the first and the last row, 20 ms apart:
+
+    >>> def position(time_s):
+    ...     return np.stack([0 * time_s, 10 * time_s, 0 * time_s], axis=-1)
+    >>> c = pair_with_robot([[[50, 0]]], [[[50, 100]]], position=position, time_s=[1.0], height_px=101, readout_s=0.02,
+    ...                     linear=np.array([[100, 0, 0], [0, 100, 0], [100, 0, 0], [0, 100, 0]]))
+    >>> c.x_mm.round(3).tolist(), c.u_left.round(1).tolist(), c.u_right.round(1).tolist()
+    ([[0.0, 10.0, 0.0]], [[50.0, 10.0]], [[50.0, 90.0]])
+    """
+    if readout_s < 0 or height_px < 2:
+        raise ValueError(f"readout_s, height_px: {readout_s} and {height_px} make no shutter.")
+    time, y = np.asarray(time_s, dtype=np.float64), np.stack([u_left, u_right], axis=2).astype(np.float64)
+    if time.ndim != 1 or y.ndim != 4 or y.shape[0] != len(time) or y.shape[3] != 2:
+        shapes = f"{np.shape(u_left)}, {np.shape(u_right)}"
+        raise ValueError(f"u_left, u_right: expected ({len(time)}, k, 2) px, got {shapes}.")
+    m, k = y.shape[:2]
+    delay = readout_s * (y[..., 1] / (height_px - 1) - 0.5)  # (m, k, 2), NaN where not seen
+    n_seen = np.isfinite(delay).sum(axis=2)
+    mean_delay = np.nansum(delay, axis=2) / np.maximum(n_seen, 1)  # of neither image: the middle row
+    row_time = time[:, None] + mean_delay
+    x = np.asarray(position(row_time + offset_s), dtype=np.float64)
+    if x.shape != (m, k, 3):
+        raise ValueError(f"position: expected ({m}, {k}, 3) mm, got {x.shape}.")
+    if readout_s and (n_seen == 2).any():
+        after, before = (np.asarray(position(row_time + offset_s + h)) for h in (_VELOCITY_S, -_VELOCITY_S))
+        step = np.where(np.isfinite(after), after, x) - np.where(np.isfinite(before), before, x)
+        span = _VELOCITY_S * (np.isfinite(after).astype(float) + np.isfinite(before))
+        velocity = np.nan_to_num(step / np.maximum(span, _VELOCITY_S))
+        if linear is None:
+            linear = np.vstack([_affine(x.reshape(-1, 3), y[:, :, c].reshape(-1, 2)) for c in (0, 1)])
+        shift = np.nan_to_num(delay - mean_delay[..., None])
+        y = y - shift[..., None] * np.einsum("cij,mkj->mkci", np.reshape(linear, (2, 2, 3)), velocity)
+    numbers = np.arange(m) if frame is None else np.asarray(frame)
+
+    def rows(values: ArrayLike | None, *shape: int) -> np.ndarray | None:
+        return None if values is None else np.asarray(values, dtype=np.float64).reshape(m * k, *shape)
+
+    return Correspondences.of_points(
+        x.reshape(-1, 3),
+        y[:, :, 0].reshape(-1, 2),
+        y[:, :, 1].reshape(-1, 2),
+        covariance_px2=rows(covariance_px2, 2, 2, 2),
+        confidence=rows(confidence, 2),
+        frame=np.repeat(numbers, k),
+        landmark=np.tile(np.arange(k), m),
+        time_s=row_time.ravel(),
+    )
+
+
+def of_recording(
+    recording: object,
+    u_left: ArrayLike,
+    u_right: ArrayLike,
+    *,
+    covariance_px2: ArrayLike | None = None,
+    confidence: ArrayLike | None = None,
+    frames: Sequence[int] | slice | None = None,
+) -> Correspondences:
+    """`pair_with_robot` with the clocks, shutter and kinematics of a `lib.recordings.Recording`.
+
+    Parameters
+    ----------
+    u_left, u_right, covariance_px2, confidence:
+        Of the frames chosen, as in `pair_with_robot`.
+    frames:
+        Which frames of the recording these are; None = all.
+    """
+    chosen = np.arange(len(recording.frames))[slice(None) if frames is None else frames]
+    return pair_with_robot(
+        u_left,
+        u_right,
+        position=recording.kinematics.at,
+        time_s=recording.frames.time_s[chosen],
+        height_px=recording.image_size_px[1],
+        readout_s=recording.readout_s,
+        offset_s=recording.offset_s,
+        covariance_px2=covariance_px2,
+        confidence=confidence,
+        frame=chosen,
+    )
+
+
+def _affine(x: np.ndarray, u: np.ndarray, rounds: int = 10) -> np.ndarray:
+    """A (2, 3) px per mm of the affine camera with the least sum of distances: it only turns small shifts into pixels."""
+    known = np.isfinite(np.hstack([x, u])).all(axis=1)
+    if known.sum() < 5:
+        return np.zeros((2, 3))
+    H, u = np.column_stack([x[known], np.ones(known.sum())]), u[known]
+    H[:, :3] -= H[:, :3].mean(axis=0)
+    weight = np.ones((len(H), 1))
+    for _ in range(rounds):
+        M = np.linalg.lstsq(np.sqrt(weight) * H, np.sqrt(weight) * u, rcond=1e-6)[0]
+        weight = 1.0 / np.maximum(np.linalg.norm(u - H @ M, axis=1, keepdims=True), 0.1)
+    return M[:3].T

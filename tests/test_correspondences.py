@@ -1,0 +1,113 @@
+"""Rows, clocks and shutters of `lib.correspondences`."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lib import paths
+from lib.correspondences import LANDMARKS, MIN_CONFIDENCE, Correspondences, of_recording, pair_with_robot
+from lib.recordings import Recording
+
+A = np.array([[100, 3, 5], [-3, 100, 2], [99, 1, 16], [-2, 98, 3.0]])
+T = np.array([960, 540, 950, 545.0])
+
+
+def path(time_s):
+    """A smooth path of three landmarks, mm, that reports nothing between 1.0 and 1.2 s."""
+    t = np.asarray(time_s, dtype=float)[..., None]
+    x = np.concatenate([2 * np.sin(t), 1.5 * np.cos(1.3 * t), 0.5 * np.sin(0.7 * t)], axis=-1)
+    x = x + np.array([[0, 0, 0], [2, 0.5, -0.4], [2, -0.5, -0.4]])
+    return np.where((t > 1.0) & (t < 1.2), np.nan, x)
+
+
+def shutter_pixels(time_s, readout_s, height_px):
+    """Pixels (m, 3, 4) of a rolling shutter: every camera sees a landmark when its own row is read."""
+    y = path(np.repeat(time_s[:, None], 3, axis=1)) @ A.T + T
+    for _ in range(50):
+        for rows in (slice(0, 2), slice(2, 4)):
+            row_time = time_s[:, None] + readout_s * (y[..., rows][..., 1] / (height_px - 1) - 0.5)
+            y[..., rows] = path(row_time) @ A[rows].T + T[rows]
+    return y
+
+
+def test_each_row_has_the_robots_position_at_its_own_instant():
+    time_s = np.linspace(0, 4, 60)
+    y = shutter_pixels(time_s, 0.03, 1080)
+    c = pair_with_robot(y[..., :2], y[..., 2:], position=path, time_s=time_s, height_px=1080, readout_s=0.03)
+    assert len(c) == 180 and list(c.landmark[:3]) == [0, 1, 2] and c.frame[-1] == 59
+    good = c.complete
+    assert 150 < len(good) < 180  # the gap in the robot's report stops nothing else
+    r = np.hstack([good.u_left, good.u_right]) - good.x_mm @ A.T - T
+    assert np.abs(r).max() < 0.02
+    still = pair_with_robot(y[..., :2], y[..., 2:], position=path, time_s=time_s, height_px=1080).complete
+    assert np.abs(np.hstack([still.u_left, still.u_right]) - still.x_mm @ A.T - T).max() > 1
+
+
+def test_landmark_in_one_image_alone_keeps_its_instant():
+    time_s = np.linspace(2, 3, 8)
+    y = shutter_pixels(time_s, 0.03, 1080)
+    y[3, 1, 2:] = np.nan
+    c = pair_with_robot(y[..., :2], y[..., 2:], position=path, time_s=time_s, height_px=1080, readout_s=0.03)
+    row = 3 * 3 + 1
+    assert not c.is_complete[row] and c.seen[row].tolist() == [True, False]
+    assert np.allclose(c.u_left[row], y[3, 1, :2]) and np.allclose(
+        c.x_mm[row] @ A[:2].T + T[:2], c.u_left[row], atol=1e-6
+    )
+
+
+def test_wrong_detections_hardly_spoil_the_shift():
+    rng = np.random.default_rng(0)
+    time_s = np.linspace(2, 5, 40)
+    y = shutter_pixels(time_s, 0.03, 1080)
+    wrong = rng.random(y.shape[:2]) < 0.3
+    spoiled = np.where(wrong[..., None], rng.uniform(0, 1000, y.shape), y)
+    c = pair_with_robot(
+        spoiled[..., :2], spoiled[..., 2:], position=path, time_s=time_s, height_px=1080, readout_s=0.03
+    )
+    r = (np.hstack([c.u_left, c.u_right]) - c.x_mm @ A.T - T)[~wrong.ravel()]
+    assert np.abs(r).max() < 0.2
+
+
+def test_shipped_recording_at_its_labels():
+    recording = Recording.open(paths.SHIPPED_RECORDING)
+    truth = recording.truth
+    c = of_recording(recording, truth.u_left, truth.u_right)
+    x = truth.rig.triangulate(c.u_left, c.u_right).x_mm
+    assert len(c) == len(recording) * len(LANDMARKS)
+    assert np.nanmedian(np.linalg.norm(x - c.x_mm, axis=1)) < 0.03  # the robot's 10 um a coordinate
+    some = of_recording(recording, truth.u_left[4:6], truth.u_right[4:6], frames=slice(4, 6))
+    assert np.array_equal(np.unique(some.frame), [4, 5])
+    assert np.allclose(some.x_mm, c.of_frames([4, 5]).x_mm, equal_nan=True)
+
+
+def test_rows_are_chosen_and_joined():
+    c = Correspondences.of_points(
+        np.zeros((4, 3)), np.ones((4, 2)), np.ones((4, 2)), confidence=[[1, 1]] * 3 + [[1, 0.1]]
+    )
+    assert 0.1 < MIN_CONFIDENCE and len(c.complete) == 3
+    assert len(Correspondences.join([c, c.subset([0]), c.subset(np.array([True, False, True, False]))])) == 7
+    assert np.isnan(c.covariance_px2).all() and c.pair_covariance_px2.shape == (4, 4, 4)
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"readout_s": -1}, "readout_s"),
+        ({"height_px": 1}, "height_px"),
+        ({"time_s": [0.0]}, "u_left"),
+        ({"position": lambda t: np.zeros((2, 3))}, "position"),
+    ],
+)
+def test_bad_arguments_are_named(change, named):
+    u = np.ones((2, 3, 2))
+    good = {"position": path, "time_s": [0.0, 0.1], "height_px": 1080}
+    with pytest.raises(ValueError, match=named):
+        pair_with_robot(u, u, **(good | change))
+
+
+def test_wrong_shapes_are_named():
+    with pytest.raises(ValueError, match="u_left"):
+        Correspondences.of_points(np.zeros((2, 3)), np.zeros((2, 3)), np.zeros((2, 2)))
+    with pytest.raises(ValueError, match="confidence"):
+        Correspondences.of_points(np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, 2)), confidence=[1, 1])
