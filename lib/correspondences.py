@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lib.geometry import points
+from lib.geometry import pair_covariance, points
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -131,9 +131,7 @@ class Correspondences:
     @property
     def pair_covariance_px2(self) -> np.ndarray:
         """(n, 4, 4) of (u_left, u_right); the two images' errors are independent."""
-        covariance = np.zeros((len(self), 4, 4))
-        covariance[:, :2, :2], covariance[:, 2:, 2:] = self.covariance_px2[:, 0], self.covariance_px2[:, 1]
-        return covariance
+        return pair_covariance(self.covariance_px2, len(self))
 
     def subset(self, rows: slice | ArrayLike) -> Correspondences:
         """The rows that a slice, a mask or an array of indices names."""

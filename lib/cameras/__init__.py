@@ -3,7 +3,7 @@
 from lib.cameras.affine import AffineCamera, Camera, Resection
 from lib.cameras.near_affine import NearAffineCamera, radial_derivative
 from lib.cameras.rig import StereoRig, camera_from_dict, camera_to_dict
-from lib.cameras.triangulation import Points, best_linear, pair_covariance
+from lib.cameras.triangulation import Points, best_linear
 
 __all__ = [
     "AffineCamera",
@@ -15,6 +15,5 @@ __all__ = [
     "best_linear",
     "camera_from_dict",
     "camera_to_dict",
-    "pair_covariance",
     "radial_derivative",
 ]

@@ -16,9 +16,9 @@ from numpy.typing import ArrayLike
 
 from lib.cameras.affine import AffineCamera
 from lib.cameras.near_affine import NearAffineCamera
-from lib.cameras.triangulation import Points, best_linear, pair_covariance, triangulate_near_affine
+from lib.cameras.triangulation import Points, best_linear, triangulate_near_affine
 from lib.files import write_json
-from lib.geometry import RigidTransform, points
+from lib.geometry import RigidTransform, pair_covariance, points
 
 __all__ = ["StereoRig", "camera_from_dict", "camera_to_dict"]
 
@@ -141,7 +141,7 @@ class StereoRig:
         u_left, u_right:
             (n, 2) px.
         covariance_px2:
-            Of the matches, in any form that `pair_covariance` takes; None is 1 px^2.
+            Of the matches, in any form that `lib.geometry.pair_covariance` takes; None is 1 px^2.
 
         Returns
         -------
@@ -156,7 +156,7 @@ class StereoRig:
             return triangulate_near_affine((self.left, self.right), y, covariance)
         y = y - self.offset_px
         gain, covariance_mm2 = best_linear(self.linear, covariance)
-        x = y @ gain.T if gain.ndim == 2 else np.einsum("nij,nj->ni", gain, y)
+        x = y @ gain[0].T if len(gain) == 1 else np.einsum("nij,nj->ni", gain, y)
         return Points(x, np.broadcast_to(covariance_mm2, (len(y), 3, 3)), y @ self.epipolar_normal)
 
     def jacobian(self, x: ArrayLike) -> np.ndarray:

@@ -5,12 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from lib.cameras.affine import AffineCamera
 from lib.cameras.near_affine import NearAffineCamera
 
-__all__ = ["Points", "best_linear", "pair_covariance", "triangulate_near_affine"]
+__all__ = ["Points", "best_linear", "triangulate_near_affine"]
 
 _Pair = tuple[AffineCamera | NearAffineCamera, AffineCamera | NearAffineCamera]
 #: Points at a time: few enough for their arrays to stay in the processor's cache.
@@ -24,46 +23,6 @@ class Points:
     x_mm: np.ndarray
     covariance_mm2: np.ndarray
     epipolar_px: np.ndarray
-
-
-def pair_covariance(covariance_px2: ArrayLike | None, n: int) -> np.ndarray:
-    """Covariance of (u_left, u_right) in px^2, (4, 4) for all matches or (n, 4, 4).
-
-    Parameters
-    ----------
-    covariance_px2:
-        A number (the variance of each coordinate), (2, 2) for both images, (4, 4) for the pair, (n, 2, 2, 2) for the left
-        and the right pixel of each match, or (n, 4, 4).  None is 1 px^2.
-
-    Raises
-    ------
-    ValueError
-        For other shapes, and for variances that are not positive (NaN rows pass).
-
-    Examples
-    --------
-    >>> pair_covariance(0.25, 7).diagonal().tolist()
-    [0.25, 0.25, 0.25, 0.25]
-    """
-    covariance = np.asarray(1.0 if covariance_px2 is None else covariance_px2, dtype=np.float64)
-    if covariance.ndim == 0:
-        covariance = covariance * np.eye(4)
-    elif covariance.shape == (2, 2):
-        covariance = np.kron(np.eye(2), covariance)
-    elif covariance.shape == (n, 2, 2, 2):
-        pairs = np.zeros((n, 4, 4))
-        pairs[:, :2, :2], pairs[:, 2:, 2:] = covariance[:, 0], covariance[:, 1]
-        covariance = pairs
-    if covariance.shape not in {(4, 4), (n, 4, 4)}:
-        raise ValueError(
-            f"covariance_px2: expected a number, (2, 2), (4, 4), ({n}, 2, 2, 2) or ({n}, 4, 4), got {covariance.shape}."
-        )
-    variance = np.einsum("...ii->...i", covariance)
-    cross = covariance**2 - variance[..., :, None] * variance[..., None, :]
-    np.einsum("...ii->...i", cross)[...] = -1.0
-    if (variance <= 0).any() or (cross > 0).any():
-        raise ValueError("covariance_px2: a variance is not positive, or a covariance larger than its variances allow.")
-    return covariance
 
 
 def best_linear(A: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -82,14 +41,14 @@ def triangulate_near_affine(cameras: _Pair, y: np.ndarray, covariance: np.ndarra
     y:
         (n, 4) left and right pixels; NaN rows stay NaN, and so does a match that only a point behind a camera explains.
     covariance:
-        (4, 4) or (n, 4, 4), as `pair_covariance` gives it.
+        (1, 4, 4) or (n, 4, 4), as `lib.geometry.pair_covariance` gives it.
     """
     n = len(y)
     x, covariance_mm2, epipolar = np.full((n, 3), np.nan), np.full((n, 3, 3), np.nan), np.full(n, np.nan)
     known = np.flatnonzero(np.isfinite(y).all(axis=1))
     for start in range(0, len(known), _BLOCK):
         rows = known[start : start + _BLOCK]
-        W = np.linalg.inv(covariance if covariance.ndim == 2 else covariance[rows])
+        W = np.linalg.inv(covariance if len(covariance) == 1 else covariance[rows])
         found, in_front = _linear(cameras, y[rows]), np.ones(len(rows), dtype=bool)
         for _ in range(steps):
             J, r, ahead = _linearised(cameras, found, y[rows])
