@@ -53,6 +53,10 @@ class Matches:
     def __len__(self) -> int:
         return len(self.u_left)
 
+    def sigma_along(self, direction: np.ndarray) -> np.ndarray:
+        """Standard deviation (n,) px of each match along a direction (4,) of (u_left, u_right)."""
+        return np.sqrt(np.einsum("i,nij,j->n", direction, self.covariance_px2, direction))
+
     def keep(self, chosen: np.ndarray) -> Matches:
         """The matches of a mask (n,) or of indices."""
         return Matches(

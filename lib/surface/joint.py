@@ -1,69 +1,67 @@
-"""Calibration and dense matches together: thousands of matches know the epipolar geometry better than any calibration.
+"""Refine a calibrated rig by the epipolar geometry of dense matches.
 
 A calibration from a few hundred landmarks leaves its epipolar lines off by some tenths of a pixel.  A matcher that
-searches along them then slides along oblique edges, which bends the surface.  But a match also tells how far off its
-line it lies.  With true cameras (A*, t*) and n the unit normal of the calibrated rig, n.A = 0, that distance is
+searches along these lines slides along oblique edges, which bends the surface.  But each match also measures its own
+distance from the line.  With true cameras (A*, t*) and n the unit normal of the calibrated rig, n.A = 0, that distance is
 
-    r = n.(y - t) = n.((A* - A) x + (t* - t)) + noise,
+    r = n.(y - t) = n.((A* - A) x + (t* - t)) + noise.
 
-linear in the point x: a robust regression over all matches measures four numbers of the calibration's error, and the
-calibration's covariance carries them over to all sixteen entries of its matrices (the update of a Kalman filter, with
-the calibration as the prior).  No truth, no target, nothing but the pair itself.
+It is linear in the point x.  A robust regression over all matches therefore measures four numbers of the calibration's
+error, and the covariance of the calibration carries them over to all sixteen entries of its matrices: the update of a
+Kalman filter whose prior is the calibration.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from lib.calibration import Calibration
 from lib.cameras import AffineCamera, StereoRig
 from lib.matching import Matches
 
 __all__ = ["refine_rig"]
 
-#: So many neighbouring matches count as one: their errors off the line are alike.
+#: Neighbouring matches share their errors off the line; this many count as one.
 ALIKE = 10.0
-#: Residuals from here on, in robust standard deviations, count less and less.
+#: Residuals beyond this many robust standard deviations lose their weight.
 SOFT = 2.0
 
 
-def refine_rig(calibration: Calibration, matches: Matches) -> StereoRig:
-    """The calibrated rig, brought to agree with the epipolar geometry of dense matches.
+def refine_rig(rig: StereoRig, covariance: np.ndarray, matches: Matches) -> StereoRig:
+    """The rig that agrees best with its own calibration and with the epipolar geometry of dense matches.
 
-    The cameras move only along what the calibration itself is unsure of, so few or poor matches change little; with the
-    same weight for every landmark coordinate the correction is all off the epipolar lines.
+    The cameras move only along directions that the calibration leaves uncertain, so few or poor matches change little.
 
     Parameters
     ----------
-    calibration:
-        Of an affine stereo pair.
+    rig:
+        A calibrated affine pair.
+    covariance:
+        (16, 16) of the entries of its matrices, row by row, left first (`Calibration.covariance`).
     matches:
-        Of `lib.matching.match` with the calibrated rig, or with one that this function returned: the result depends on
-        where the matches are, not on the rig that found them.  Best are those on the static scene, tool masked.
+        Of `lib.matching.match` with this rig, best of the static scene with the tool masked.
 
     Raises
     ------
     ValueError
-        If the calibration is not of an affine stereo pair.
+        If the rig is not affine, or the covariance has another shape.
     """
-    rig = calibration.rig
     if rig is None or not rig.is_affine:
-        raise ValueError("calibration: an affine stereo pair is needed, with both cameras.")
+        raise ValueError("rig: only an affine stereo pair can be refined; reconstruct with refine=False.")
+    prior = np.asarray(covariance, dtype=np.float64)
+    if prior.shape != (16, 16):
+        raise ValueError(f"covariance: expected (16, 16), the entries of both matrices, got {prior.shape}.")
     if len(matches) < 5:
         return rig
     normal = rig.epipolar_normal
     points = rig.triangulate(matches.u_left, matches.u_right, matches.covariance_px2)
-    distance = rig.epipolar_distance(matches.u_left, matches.u_right)
-    sigma = np.sqrt(np.einsum("i,nij,j->n", normal, matches.covariance_px2, normal))
     centre = points.x_mm.mean(axis=0)
-    measured, information = _regression(points.x_mm - centre, distance, sigma)
+    measured, information = _regression(points.x_mm - centre, points.epipolar_px, matches.sigma_along(normal))
 
-    # What a change of the matrices' entries, camera by camera and row by row, does to the four numbers.
+    # The effect (4, 16) of a change of the entries on the four measured numbers.
     about_centre = np.eye(4)
     about_centre[3, :3] = centre
     effect = np.hstack([n * about_centre for n in normal])
-    prior = calibration.covariance
-    # In the information's form, since a flat scene does not tell how the distance changes with depth.
+    # In information form, because a flat scene does not measure how the distance changes with depth.
     innovation = np.linalg.solve(np.eye(4) + information @ effect @ prior @ effect.T, information @ measured)
     matrices = np.vstack([rig.left.matrix, rig.right.matrix]) + (prior @ effect.T @ innovation).reshape(4, 4)
     return StereoRig(AffineCamera(matrices[:2]), AffineCamera(matrices[2:]))
@@ -78,6 +76,6 @@ def _regression(x: np.ndarray, value: np.ndarray, sigma: np.ndarray) -> tuple[np
         information = weighted.T @ design
         found = np.linalg.lstsq(information, weighted.T @ target, rcond=1e-12)[0]
         residual = target - design @ found
-        scale = max(1.4826 * np.median(np.abs(residual)), 1.0)  # never surer than the matches say
+        scale = max(1.4826 * np.median(np.abs(residual)), 1.0)  # not below what the matches state
         weight = 1 / (1 + (residual / (SOFT * scale)) ** 2) ** 2
     return found, information / (ALIKE * scale**2)

@@ -1,4 +1,7 @@
-"""From a stereo pair to its surface in one call: masks, matches, epipolar filter, triangulation, fit (Sec. IV-B)."""
+"""From a stereo pair to its surface: mask, refine, match, triangulate, fit (paper Sec. IV-B).
+
+This is the one way from two images to a surface; the notebooks and the online system both take it.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +23,7 @@ from lib.surface.joint import refine_rig
 
 __all__ = ["EPIPOLAR_SIGMAS", "Reconstruction", "epipolar_inliers", "reconstruct"]
 
-#: Matches further from their epipolar line than so many standard deviations are dropped.
+#: Matches farther from their epipolar line than this many of their own standard deviations are dropped.
 EPIPOLAR_SIGMAS = 2.0
 
 
@@ -31,37 +34,45 @@ class Reconstruction:
     Attributes
     ----------
     surface:
-        Fitted to `points` over the image points `matches.u_left`.
-    matches, points:
-        The matches that passed the epipolar filter, and their points.
+        Fitted to `points` over the left image points `u`.
+    points:
+        The triangulated points, with their covariances.
+    matches:
+        The matches that passed the epipolar filter, one a point.
     n_matches:
-        Matches before the filter.
+        Number of matches before the filter.
     mask_left:
         (h, w) bool, True where tool or glints hid the surface.
-    seconds:
-        Wall clock of each stage, in order.
     rig:
-        The cameras that made the points: as given, or a calibration brought to agree with the matches.
+        The cameras that made the points: as given, or refined by the matches.
+    seconds:
+        Wall clock of each stage: "mask", "refine" (only where the rig was refined), "match", "triangulate", "surface".
     """
 
     surface: BSplineSurface
-    matches: Matches
     points: Points
+    matches: Matches
     n_matches: int
     mask_left: np.ndarray
-    seconds: dict[str, float]
     rig: StereoRig
+    seconds: dict[str, float]
+
+    @property
+    def u(self) -> np.ndarray:
+        """Left image points (n, 2) px of `points`."""
+        return self.matches.u_left
 
 
 def epipolar_inliers(rig: StereoRig, matches: Matches, *, sigmas: float = EPIPOLAR_SIGMAS) -> np.ndarray:
-    """Which matches (n,) lie on their epipolar lines, by the standard deviation that each match states.
+    """Mask (n,) of the matches that lie on their epipolar lines, within `sigmas` of their own standard deviations.
 
-    The distances' median is taken out first: a calibrated rig may be off by a fraction of a pixel, for all alike.
+    The median distance is subtracted first: the lines of a calibrated rig may be off by a fraction of a pixel,
+    the same for all matches.
     """
+    if not len(matches):
+        return np.zeros(0, dtype=bool)
     distance = rig.epipolar_distance(matches.u_left, matches.u_right)
-    normal = rig.epipolar_normal
-    sigma = np.sqrt(np.einsum("i,nij,j->n", normal, matches.covariance_px2, normal))
-    return np.abs(distance - np.median(distance)) < sigmas * sigma if len(distance) else np.zeros(0, dtype=bool)
+    return np.abs(distance - np.median(distance)) < sigmas * matches.sigma_along(rig.epipolar_normal)
 
 
 def reconstruct(
@@ -70,84 +81,108 @@ def reconstruct(
     rig: StereoRig | Calibration,
     *,
     setting: str = "quality",
+    method: str | None = None,
+    refine: bool | None = None,
     u_landmarks: tuple[ArrayLike, ArrayLike] | None = None,
     mask_left: np.ndarray | None = None,
     mask_right: np.ndarray | None = None,
-    method: str | None = None,
-    depth_only: bool | None = None,
+    epipolar_sigmas: float = EPIPOLAR_SIGMAS,
     domain: tuple[float, float, float, float] | None = None,
+    percentiles: tuple[float, float] = (0.0, 100.0),
     control: tuple[int, int] = (20, 20),
     smoothness: float | None = None,
     reject_mm: float | None = None,
+    depth_only: bool | None = None,
+    seconds: dict[str, float] | None = None,
 ) -> Reconstruction:
-    """The surface that a calibrated stereo pair shows.
+    """Reconstruct the surface that a calibrated stereo pair shows.
 
     Parameters
     ----------
     left, right:
         (h, w, 3) uint8 RGB.
     rig:
-        The cameras; or the calibration that found them, and then a first, fast matching corrects its epipolar geometry
-        (`refine_rig`), so that matches do not slide along edges.
+        The cameras, or the calibration that found them.
     setting:
-        "quality", or "fast" for several pairs a second; see `lib.matching.match`.
+        "quality", or "fast" for several pairs a second: coarser matching (see `lib.matching.match`), an approximate
+        choice of smoothness, and `depth_only`.
+    method:
+        The matcher; see `lib.matching.match`.
+    refine:
+        Correct the epipolar geometry of the rig by a first, fast matching (`refine_rig`).  This needs the covariance of
+        the rig, so `rig` must be a calibration of an affine pair.  None refines where that covariance is known.
     u_landmarks:
         Landmarks of the tool, (3, 2) px left and right, to mask the tool; NaN = missing.
     mask_left, mask_right:
-        (h, w) bool, more that is to be ignored (True), beside glints and tool.
-    method:
-        Of `lib.matching.match`.
-    depth_only:
-        Fit the depth along the left view alone, one spline in the place of three; None does in the fast setting.
+        (h, w) bool, True = ignore, beside glints and tool.
+    epipolar_sigmas:
+        Matches farther from their epipolar line than this many of their own standard deviations are dropped.
     domain:
-        (x0, y0, x1, y1) px; None is what the matches cover.
-    control, smoothness, reject_mm:
+        (x0, y0, x1, y1) px that the surface covers.  None takes it from the matches.
+    percentiles:
+        (low, high) of the matches' coordinates that bound the domain where `domain` is None: (0, 100) covers all
+        matches, (1, 99) leaves out the rim, where few matches hold the surface.
+    control, reject_mm:
         As for `fit_surface`.
+    smoothness:
+        As for `fit_surface`.  An online system gives the smoothness that an earlier frame chose
+        (`Reconstruction.surface.fit.smoothness`), which saves the search.
+    depth_only:
+        Fit one spline, the depth along the rays of the left camera, in place of three.  It needs an affine left camera.
+        None is True in the fast setting with an affine rig.
+    seconds:
+        A dictionary that is filled with the seconds of each stage as it ends.  After an error its last key is the stage
+        that failed.
 
     Raises
     ------
     ValueError
-        As `match` and `fit_surface` do: unfit images, a rig that does not fit them, too few matches.
+        As `match` and `fit_surface` do: unfit images, a rig that does not fit them, too few matches; and for
+        `refine=True` without a covariance.
+
+    Example
+    -------
+    >>> from lib import paths
+    >>> from lib.recordings import Recording
+    >>> recording = Recording.open(paths.SHIPPED_RECORDING)
+    >>> pair, truth = recording.frames[0], recording.truth
+    >>> tool = truth.u_left[0], truth.u_right[0]
+    >>> found = reconstruct(pair.left, pair.right, truth.rig, setting="fast", u_landmarks=tool)
+    >>> bool(len(found.u) > 3000 and found.surface.distance([truth.landmarks_mm[0, 1]], truth.rig.left).along_view_mm > 0)
+    True
     """
-    seconds: dict[str, float] = {}
+    seconds = {} if seconds is None else seconds
+    covariance = rig.covariance if isinstance(rig, Calibration) else None
+    rig = rig.rig if isinstance(rig, Calibration) else rig
+    if rig is None:
+        raise ValueError("rig: the calibration is of one camera; a stereo pair needs both.")
+    if refine and covariance is None:
+        raise ValueError("refine: needs the covariance of the rig; give the Calibration in place of its rig.")
+    if refine is None:
+        refine = covariance is not None and rig.is_affine
+    low, high = percentiles
+    if not 0 <= low < high <= 100:
+        raise ValueError(f"percentiles: expected 0 <= low < high <= 100, got {percentiles}.")
+    fast = setting == "fast"
 
-    @contextmanager
-    def stage(name: str) -> Iterator[None]:
-        start = time.perf_counter()
-        yield
-        seconds[name] = time.perf_counter() - start
-
-    with stage("mask"):
-        with ThreadPoolExecutor(2) as pool:
-            masks = list(pool.map(glint_mask, (left, right)))
-        for side, image in enumerate((left, right)):
-            if u_landmarks is not None:
-                masks[side] |= tool_mask(image.shape[:2], u_landmarks[side])
-            more = (mask_left, mask_right)[side]
-            if more is not None:
-                if np.shape(more) != masks[side].shape or np.asarray(more).dtype != bool:
-                    raise ValueError(
-                        f"{('mask_left', 'mask_right')[side]}: expected a bool array {masks[side].shape}, True = ignore, "
-                        f"got {np.asarray(more).dtype} {np.shape(more)}."
-                    )
-                masks[side] |= more
-    if isinstance(rig, Calibration):
-        with stage("refine"):
-            first = match(left, right, rig=rig.rig, mask_left=masks[0], mask_right=masks[1], setting="fast")
-            rig = refine_rig(rig, first)
-    with stage("match"):
-        found = match(
-            left, right, rig=rig, method=method, mask_left=masks[0], mask_right=masks[1], setting=setting
-        )  # fmt: skip
-    with stage("triangulate"):
-        matches = found.keep(epipolar_inliers(rig, found))
+    with _timed(seconds, "mask"):
+        masks = _masks((left, right), u_landmarks, (mask_left, mask_right))
+    options = {"mask_left": masks[0], "mask_right": masks[1]}
+    if refine:
+        with _timed(seconds, "refine"):
+            rig = refine_rig(rig, covariance, match(left, right, rig=rig, setting="fast", **options))
+    with _timed(seconds, "match"):
+        found = match(left, right, rig=rig, method=method, setting=setting, **options)
+    with _timed(seconds, "triangulate"):
+        matches = found.keep(epipolar_inliers(rig, found, sigmas=epipolar_sigmas))
         points = rig.triangulate(matches.u_left, matches.u_right, matches.covariance_px2)
-    with stage("surface"):
+    with _timed(seconds, "surface"):
         if domain is None:
             if not len(matches):
                 raise ValueError("left, right: no match lies on its epipolar line; is there texture, does the rig fit?")
-            domain = (*matches.u_left.min(axis=0).tolist(), *matches.u_left.max(axis=0).tolist())
-        fast = setting == "fast"
+            domain = tuple(np.percentile(matches.u_left, percentiles, axis=0).ravel().tolist())
+        if depth_only is None:
+            depth_only = fast and rig.is_affine
         surface = fit_surface(
             matches.u_left,
             points.x_mm,
@@ -155,8 +190,40 @@ def reconstruct(
             control=control,
             smoothness=smoothness,
             reject_mm=reject_mm,
-            camera=rig.left if (fast if depth_only is None else depth_only) else None,
+            camera=rig.left if depth_only else None,
             tolerance=1e-4 if fast else 1e-8,
             quick=fast,
         )
-    return Reconstruction(surface, matches, points, len(found), masks[0], seconds, rig)
+    return Reconstruction(surface, points, matches, len(found), masks[0], rig, dict(seconds))
+
+
+@contextmanager
+def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
+    start = time.perf_counter()
+    try:
+        yield
+    finally:
+        seconds.pop(stage, None)  # so that the stage stands last
+        seconds[stage] = time.perf_counter() - start
+
+
+def _masks(
+    images: tuple[np.ndarray, np.ndarray],
+    u_landmarks: tuple[ArrayLike, ArrayLike] | None,
+    given: tuple[np.ndarray | None, np.ndarray | None],
+) -> list[np.ndarray]:
+    """What hides the surface in each image, (h, w) bool: glints, the tool, and what the caller masks."""
+    with ThreadPoolExecutor(2) as pool:
+        masks = list(pool.map(glint_mask, images))
+    for side, (mask, more) in enumerate(zip(masks, given, strict=True)):
+        if u_landmarks is not None:
+            mask |= tool_mask(mask.shape, u_landmarks[side])
+        if more is None:
+            continue
+        if np.shape(more) != mask.shape or np.asarray(more).dtype != bool:
+            name = ("mask_left", "mask_right")[side]
+            raise ValueError(
+                f"{name}: expected a bool array {mask.shape}, True = ignore, got {np.asarray(more).dtype} {np.shape(more)}."
+            )
+        mask |= more
+    return masks

@@ -141,6 +141,27 @@ def test_a_calibration_is_brought_to_agree_with_the_matches(scene, result):
     assert result.rig is scene.rig
 
 
+def test_refinement_is_a_named_option_and_nothing_else_depends_on_the_type(scene):
+    seen = simulate_correspondences(75, rng=np.random.default_rng(4), rig=scene.rig, sigma_u_px=1.0)
+    calibration = calibrate(seen.x_mm, [seen.u_left, seen.u_right])
+    options = {"setting": "fast", "control": (10, 8), "smoothness": 1e4, "percentiles": (1, 99)}
+    one = reconstruct(scene.left, scene.right, calibration, refine=False, **options)
+    other = reconstruct(scene.left, scene.right, calibration.rig, **options)
+    np.testing.assert_array_equal(one.surface.control_points_mm, other.surface.control_points_mm)
+    assert one.surface.grid.domain == tuple(np.percentile(one.u, (1, 99), axis=0).ravel())
+    with pytest.raises(ValueError, match="refine: needs the covariance"):
+        reconstruct(scene.left, scene.right, calibration.rig, refine=True)
+    with pytest.raises(ValueError, match="percentiles: expected"):
+        reconstruct(scene.left, scene.right, calibration.rig, percentiles=(99, 1))
+
+
+def test_after_an_error_the_last_stage_is_the_one_that_failed(scene):
+    seconds = {"detect": 0.1, "mask": 9.0}
+    with pytest.raises(ValueError):
+        reconstruct(scene.left, np.zeros_like(scene.left), scene.rig, seconds=seconds)
+    assert list(seconds) == ["detect", "mask", "match", "triangulate", "surface"] and seconds["mask"] < 9.0
+
+
 def test_what_an_alignment_takes_out():
     rng = np.random.default_rng(0)
     truth = rng.normal(size=(20, 30, 3))
