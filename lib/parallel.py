@@ -1,28 +1,104 @@
-"""Threads and processes: torch on one thread where more cost time, and work shared out over processes."""
+"""Many jobs on a Dask cluster: the cores of this machine, or any cluster whose scheduler is given.
+
+A job makes one file or folder.  What exists is not made again, so that work that was stopped goes on where it was.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import logging
 import multiprocessing
 import os
+import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
-from typing import TypeVar
+from dataclasses import dataclass
+from pathlib import Path
 
-import cv2
-import torch
+from tqdm.auto import tqdm
 
-__all__ = ["in_processes", "single_threaded_torch", "step"]
+__all__ = ["Finished", "cores", "in_processes", "run_jobs", "single_threaded_torch", "step"]
 
-_T = TypeVar("_T")
-_steps = None  # in a worker: the queue to the process that waits
+_STEPS = "microstereo-steps"
 
 
-@contextmanager
+@dataclass(frozen=True)
+class Finished:
+    """A job that came to its end: the path that it makes, and what it returned or the error that ended it."""
+
+    path: Path
+    value: object = None
+    error: BaseException | None = None
+
+
+def run_jobs(
+    function: Callable[..., object],
+    jobs: Mapping[Path, tuple],
+    *,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    title: str = "",
+    unit: str = "job",
+    steps: int = 0,
+    progress: bool = True,
+) -> Iterator[Finished]:
+    """Call ``function(path, *jobs[path])`` for every path that does not exist; yield each job as it finishes.
+
+    A job whose worker process was killed is given to another worker, three times at most.  Closing the iterator drops
+    the jobs that have not begun.
+
+    Parameters
+    ----------
+    function:
+        Importable (not a closure).  It makes `path` whole or not at all, as `lib.files.whole` does.
+    workers:
+        Processes on this machine, at most one a job; None is one a core.
+    scheduler:
+        Address of a running Dask scheduler, such as ``"tcp://10.0.0.1:8786"``, instead of processes on this machine.
+        Its workers need this environment and the same folders.
+    title, unit, progress:
+        Of the progress bar.
+    steps:
+        Parts of a job that it reports by `step`; 0 counts whole jobs.
+
+    Raises
+    ------
+    ConnectionError
+        If no scheduler answers at the address.
+    """
+    missing = {path: arguments for path, arguments in jobs.items() if not path.exists()}
+    a_job = max(steps, 1)
+    with tqdm(total=len(jobs) * a_job, initial=(len(jobs) - len(missing)) * a_job, desc=title, unit=unit,
+              disable=not progress, smoothing=0.1) as bar:  # fmt: skip
+        if missing:
+            with _client(min(workers or cores(), len(missing)), scheduler) as client:
+                if steps:
+                    client.subscribe_topic(_STEPS, lambda event: bar.update())
+                for finished in _finished(client, function, missing):
+                    bar.update(0 if steps else 1)
+                    yield finished
+
+
+def step() -> None:
+    """Inside a job: one of its steps is done."""
+    from distributed import get_worker
+
+    with contextlib.suppress(ValueError):  # called outside a job
+        get_worker().log_event(_STEPS, "")
+
+
+def cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@contextlib.contextmanager
 def single_threaded_torch() -> Iterator[None]:
-    """Many small tensors: torch's own threads gain nothing here, and spin where the machine has other work."""
+    """Run the block with one thread of torch's own: for many small tensors more threads only spin."""
+    import torch
+
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -31,13 +107,74 @@ def single_threaded_torch() -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
+def _finished(client, function: Callable, jobs: Mapping[Path, tuple]) -> Iterator[Finished]:
+    from distributed import as_completed
+
+    futures = {client.submit(_work, function, path, *jobs[path], pure=False): path for path in jobs}
+    try:
+        for future in as_completed(futures):
+            error = future.exception() if future.status == "error" else None
+            if future.status == "cancelled":
+                error = ConnectionError("the scheduler was lost.")
+            yield Finished(futures[future], None if error else future.result(), error)
+    finally:
+        with contextlib.suppress(Exception):  # the scheduler may have gone
+            client.cancel(list(futures))
+
+
+def _work(function: Callable, path: Path, *arguments: object) -> object:
+    """In a worker.  The path exists if an attempt before was lost just after its end."""
+    return None if path.exists() else function(path, *arguments)
+
+
+@contextlib.contextmanager
+def _client(workers: int, scheduler: str | None):
+    """A client of the cluster: of a given scheduler, or of processes on this machine that end with the block."""
+    import dask
+    from distributed import Client, LocalCluster
+
+    if scheduler:
+        try:
+            client = Client(scheduler, timeout=15)
+        except (OSError, ValueError) as error:  # also a timeout
+            raise ConnectionError(f"{scheduler}: no Dask scheduler answers ({error or type(error).__name__}).") from None
+        with client:
+            if not client.scheduler_info()["workers"]:
+                print(f"{scheduler} has no workers yet; waiting for the first.", file=sys.stderr)
+            yield client
+        return
+    threads = max(1, cores() // workers)  # libraries read these when a worker, or its notebook's kernel, starts
+    limits = dict.fromkeys(
+        ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"), threads
+    )
+    environment = dict(os.environ)
+    settings = {
+        "distributed.nanny.pre-spawn-environ": limits,
+        "distributed.worker.profile.enabled": False,
+        "logging": {"distributed": "critical"},
+    }
+    with dask.config.set(settings):
+        try:
+            with (
+                LocalCluster(
+                    n_workers=workers, threads_per_worker=1, memory_limit=None, silence_logs=logging.CRITICAL,
+                    dashboard_address="127.0.0.1:0", scheduler_kwargs={"dashboard": False},
+                ) as cluster,
+                Client(cluster) as client,
+            ):  # fmt: skip
+                yield client
+        finally:
+            os.environ.clear()  # Dask sets the limits in this process too
+            os.environ.update(environment)
+
+
 def in_processes(
-    function: Callable[..., _T],
+    function: Callable[..., object],
     arguments: Iterable[tuple],
     workers: int | None = None,
     *,
     on_step: Callable[[], object] | None = None,
-) -> Iterator[_T]:
+) -> Iterator[object]:
     """Results of ``function(*arguments[i])`` in the order in which they come, `workers` at a time (default: one a core).
 
     An error, or Ctrl-C, drops what has not begun and passes on; workers whose parent is killed end too.  `function`
@@ -81,12 +218,6 @@ def in_processes(
         listener.join(timeout=2.0)
 
 
-def step() -> None:
-    """In a worker of `in_processes`: a part of the job is done."""
-    if _steps is not None:
-        _steps.put(True)
-
-
 def _listen(steps: multiprocessing.SimpleQueue, on_step: Callable[[], object] | None) -> None:
     while steps.get():
         if on_step is not None:
@@ -95,10 +226,6 @@ def _listen(steps: multiprocessing.SimpleQueue, on_step: Callable[[], object] | 
 
 def _begin(steps: multiprocessing.SimpleQueue) -> None:
     """A worker keeps to one core: the others have theirs."""
-    global _steps
-    _steps = steps
-    cv2.setNumThreads(1)
-    torch.set_num_threads(1)
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 

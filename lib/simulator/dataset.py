@@ -23,10 +23,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from tqdm.auto import tqdm
 
 from lib import paths
-from lib.parallel import in_processes, step
+from lib.parallel import cores, run_jobs, step
 from lib.provenance import Provenance, write_record
 from lib.recordings import LANDMARKS, Recording
 from lib.simulator.eye import Eye
@@ -135,11 +134,10 @@ def sequence_design(seed: int, index: int, *, shrink: int = 1) -> SequenceDesign
 
 
 def _make_sequence(
-    folder: Path, seed: int, index: int, n_pairs: int, duration_s: float, shrink: int
-) -> tuple[str, float, float]:
-    """One sequence in a process of its own: its name, and the wall and CPU seconds that it took."""
+    target: Path, seed: int, index: int, n_pairs: int, duration_s: float, shrink: int
+) -> tuple[float, float]:
+    """Make one sequence in a worker process; returns the wall and CPU seconds that it took."""
     wall, cpu = time.perf_counter(), time.process_time()
-    target = folder / sequence_name(index)
     design = sequence_design(seed, index, shrink=shrink)
     simulate(
         target,
@@ -156,7 +154,7 @@ def _make_sequence(
         description="Simulated data set: calibration sweep, then a surgeon's movements.",
         progress=step,
     )
-    return target.name, time.perf_counter() - wall, time.process_time() - cpu
+    return time.perf_counter() - wall, time.process_time() - cpu
 
 
 def make_dataset(
@@ -196,25 +194,21 @@ def make_dataset(
     partial = stamp.with_name("dataset.json.partial")
     partial.write_text(json.dumps(description) + "\n")
     os.replace(partial, stamp)
-    indices = [*TRAIN_SEQUENCES, *TEST_SEQUENCES]
-    missing = [k for k in indices if not (folder / sequence_name(k)).exists()]
-    jobs = [(folder, seed, k, n_pairs, duration_s, shrink) for k in missing]
-    log = folder / "log.csv"
-    with tqdm(
-        total=len(indices) * n_pairs,
-        initial=(len(indices) - len(missing)) * n_pairs,
-        desc="Simulating",
-        unit="pair",
-        smoothing=0.1,
-    ) as bar:
-        for name, wall_s, cpu_s in in_processes(_make_sequence, jobs, workers, on_step=bar.update):
-            bar.set_postfix_str(f"{name} stands")
-            finished = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-            with log.open("a", newline="", encoding="utf-8") as stream:
-                if not stream.tell():
-                    csv.writer(stream).writerow(_LOG_COLUMNS)
-                csv.writer(stream).writerow([name, finished, f"{wall_s:.2f}", f"{cpu_s:.2f}"])
-    return [folder / sequence_name(k) for k in indices]
+    jobs = {
+        folder / sequence_name(k): (seed, k, n_pairs, duration_s, shrink) for k in [*TRAIN_SEQUENCES, *TEST_SEQUENCES]
+    }
+    for done in run_jobs(_make_sequence, jobs, workers=workers, title="Simulating", unit="pair", steps=n_pairs):
+        if done.error:
+            raise done.error
+        if done.value is None:  # made by a worker that was lost just after
+            continue
+        wall_s, cpu_s = done.value
+        finished = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+        with (folder / "log.csv").open("a", newline="", encoding="utf-8") as stream:
+            if not stream.tell():
+                csv.writer(stream).writerow(_LOG_COLUMNS)
+            csv.writer(stream).writerow([done.path.name, finished, f"{wall_s:.2f}", f"{cpu_s:.2f}"])
+    return list(jobs)
 
 
 def landmark_counts(recordings: Sequence[Recording]) -> dict[str, dict[str, int]]:
@@ -329,7 +323,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.error("--pairs, --workers and --shrink must be at least 1.")
     folder = arguments.folder or paths.CACHE / f"dataset-{arguments.seed}"
     left = sum(not (folder / sequence_name(k)).exists() for k in range(10)) * arguments.pairs
-    workers = min(arguments.workers or os.cpu_count() or 1, 10)
+    workers = min(arguments.workers or cores(), 10)
     minutes = left * _seconds_a_pair(arguments.shrink) / workers / 60 if left else 0.0
     print(
         f"{paths.shown(folder)}: {left} of {10 * arguments.pairs} stereo pairs to make, about {minutes:.0f} min on "
