@@ -94,6 +94,8 @@ class Correspondences:
         """
         x, left, right = points(x_mm, 3, "x_mm"), points(u_left, 2, "u_left"), points(u_right, 2, "u_right")
         n = len(x)
+        if not n == len(left) == len(right):
+            raise ValueError(f"x_mm, u_left, u_right: {n}, {len(left)} and {len(right)} rows; give one of each a landmark.")
         seen = np.stack([np.isfinite(left).all(axis=1), np.isfinite(right).all(axis=1)], axis=-1)
         return cls(
             x,

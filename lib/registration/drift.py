@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lib.cameras import StereoRig
-from lib.geometry import points
-from lib.registration.images import stack_covariance
+from lib.correspondences import Correspondences
+from lib.geometry import pair_covariance
 
 __all__ = ["DriftMonitor"]
 
@@ -27,20 +27,28 @@ class DriftMonitor:
         Of (u_left, u_right): a number, (2, 2) or (4, 4).
     sigma_x_mm:
         Standard deviation of the robot's report, per coordinate.
-    slack:
-        Score that still counts as no change; half of the shift that should be noticed.
-    threshold:
-        Alarm level.  With the defaults a false alarm comes less than once in a million frames, once in ten thousand
-        where the noise is 10 % larger than said.
-    cap:
-        Largest score of one frame, below `threshold` + `slack` so that a single bad detection raises no alarm.
+    slack, threshold, cap:
+        Score that still counts as no change, half of the shift that should be noticed; alarm level; and largest score
+        of one frame, below threshold + slack so that a single bad detection raises no alarm.  With the defaults a false
+        alarm comes less than once in a million frames, once in ten thousand where the noise is 10 % larger than stated.
 
     Attributes
     ----------
-    statistic:
-        S after the last frame.
-    history:
-        (chi2, degrees of freedom, S) of every frame.
+    statistic, history:
+        S after the last frame; (chi2, degrees of freedom, S) of every frame.
+
+    Raises
+    ------
+    ValueError
+        For a covariance that is not positive definite, a negative sigma_x_mm, or levels that make no test.
+
+    Examples
+    --------
+    >>> from lib.cameras import AffineCamera
+    >>> camera = AffineCamera([[100, 0, 0, 0], [0, 100, 0, 0]])
+    >>> monitor = DriftMonitor(StereoRig(camera, camera), covariance_px2=1.0)
+    >>> [monitor.update([[0, 0, 0]], [[u, 0]], [[u, 0]]) for u in (0.5, 9.0, 9.0)]
+    [False, False, True]
     """
 
     def __init__(
@@ -53,19 +61,16 @@ class DriftMonitor:
         threshold: float = 8.0,
         cap: float = 6.0,
     ) -> None:
-        if not 0 < slack < cap or not threshold > 0:
-            raise ValueError("slack, threshold, cap: need 0 < slack < cap and threshold > 0.")
-        self.covariance_px2 = stack_covariance(covariance_px2, 1)[0]
-        self.sigma_x_mm = float(sigma_x_mm)
-        self.slack, self.threshold, self.cap = float(slack), float(threshold), float(cap)
+        if not (0 < slack < cap and threshold > 0 and sigma_x_mm >= 0):
+            raise ValueError("slack, threshold, cap, sigma_x_mm: need 0 < slack < cap, threshold > 0, sigma_x_mm >= 0.")
+        self.covariance_px2, self.sigma_x_mm = pair_covariance(covariance_px2, 1), sigma_x_mm
+        self.slack, self.threshold, self.cap = slack, threshold, cap
         self.history: list[tuple[float, int, float]] = []
         self.reset(rig)
 
     def reset(self, rig: StereoRig) -> None:
         """Go on with another rig, from a clean slate; `history` stays."""
-        self.rig = rig
-        self.statistic = 0.0
-        self._covariance = self.covariance_px2 + self.sigma_x_mm**2 * rig.linear @ rig.linear.T
+        self.rig, self.statistic = rig, 0.0
 
     @property
     def alarm(self) -> bool:
@@ -73,27 +78,34 @@ class DriftMonitor:
         return self.statistic > self.threshold
 
     def update(
-        self, x_mm: ArrayLike, u_left: ArrayLike, u_right: ArrayLike, covariance_px2: ArrayLike | None = None
+        self,
+        data: Correspondences | ArrayLike,
+        u_left: ArrayLike | None = None,
+        u_right: ArrayLike | None = None,
+        covariance_px2: ArrayLike | None = None,
     ) -> bool:
         """Take in one frame; True = the cameras have moved.
 
         Parameters
         ----------
-        x_mm, u_left, u_right:
-            (k, 3) mm and (k, 2) px: the frame's landmarks; rows with NaN are left out.  A frame without any changes
-            nothing.
+        data, u_left, u_right:
+            The frame's Correspondences; or x_mm (k, 3) and pixels (k, 2).  Incomplete rows are left out.
         covariance_px2:
             (k, 4, 4) of the residuals of this frame, if it is known better than in general: where the rig itself is
             uncertain, far from the landmarks that it was calibrated with.
         """
-        x = points(x_mm, 3, "x_mm")
-        y = np.hstack([points(u_left, 2, "u_left"), points(u_right, 2, "u_right")])
-        residual = y - np.hstack(self.rig.project(x))
-        covariance = stack_covariance(self._covariance if covariance_px2 is None else covariance_px2, len(x))
-        seen = np.isfinite(residual).all(axis=1)
-        residual = residual[seen]
+        data = data if isinstance(data, Correspondences) else Correspondences.of_points(data, u_left, u_right)
+        if covariance_px2 is None:
+            covariance = self.covariance_px2 + self.sigma_x_mm**2 * self.rig.linear @ self.rig.linear.T
+        else:
+            covariance = pair_covariance(covariance_px2, len(data))
+        used = data.is_complete
+        covariance, data = np.broadcast_to(covariance, (len(used), 4, 4))[used], data.subset(used)
+        if not np.isfinite(covariance).all():
+            raise ValueError("covariance_px2: must be finite for every landmark that both images show.")
+        residual = np.hstack([data.u_left, data.u_right]) - np.hstack(self.rig.project(data.x_mm))
         freedom = residual.size
-        chi2 = float((residual * np.linalg.solve(covariance[seen], residual[:, :, None])[:, :, 0]).sum())
+        chi2 = float((residual * np.linalg.solve(covariance, residual[:, :, None])[:, :, 0]).sum())
         if freedom:
             spread = 2.0 / (9.0 * freedom)
             score = (np.cbrt(chi2 / freedom) - (1.0 - spread)) / np.sqrt(spread)

@@ -1,4 +1,4 @@
-"""Rigid registration of point sets: the sum of norms of Eq. (7), and the sum of squares it is not."""
+"""Rigid registration of point sets: the sum of norms of Eq. (7), and the sum of squared norms."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lib.geometry import RigidTransform, finite_points, points
+from lib.geometry import RigidTransform, align_rotation, finite_points, points
 
-__all__ = ["Registration", "check_spread", "motion_jacobian", "register"]
+__all__ = ["Registration", "check_spread", "motion_jacobian", "register", "sandwich"]
 
 _STARTS = 12  # minimal triples tried beside the least-squares start
 _ITERATIONS = 300
@@ -18,27 +18,24 @@ _ITERATIONS = 300
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """An estimated rigid motion and how sure it is.
+    """An estimated rigid motion and its uncertainty.
 
     Attributes
     ----------
     transform:
-        target_from_source.  For the image-based estimates the source is the stale rig's frame and the target the
-        robot's: the motion of the cameras, in robot coordinates.
+        target_from_source: the motion of the cameras in robot coordinates, if the source is what the stale rig sees.
     covariance:
         (6, 6) of a small error of the transform, (rotation in rad, translation in mm), both in the target frame, the
         rotation about `centre_mm`: a registered point p is off by omega x (p - centre) + tau.
     centre_mm:
-        (3,) centre of the data in the target frame, about which rotation and translation are nearly independent.
+        (3,) centre of the data in the target frame.  About it rotation and translation are nearly independent.
     residuals:
-        (n,) one a point: the norm in mm (`register`), the Mahalanobis distance (from images; px where no covariance
-        was given).  NaN for a point that was not seen.
+        (n,) one a row: the norm in mm (`register`), or the Mahalanobis distance (`register_images`; px where the noise
+        is unknown).  NaN for a row that was not used.
     weights:
-        (n,) what each point counted in the last step, 1 = fully.
+        (n,) what each row counted in the last step, 1 = fully.
     cost:
         The minimum reached, in the estimator's own terms.
-    iterations:
-        Steps of the run that reached it.
     """
 
     transform: RigidTransform
@@ -47,7 +44,6 @@ class Registration:
     residuals: np.ndarray
     weights: np.ndarray
     cost: float
-    iterations: int
 
     @property
     def rotation_sd_rad(self) -> np.ndarray:
@@ -67,36 +63,24 @@ class Registration:
 
 def motion_jacobian(offset: np.ndarray) -> np.ndarray:
     """(n, 3, 6): how points at `offset` (n, 3) from the centre of rotation move with (omega, tau)."""
-    x, y, z = offset.T
-    jacobian = np.zeros((len(offset), 3, 6))
-    jacobian[:, 0, 1], jacobian[:, 0, 2] = z, -y
-    jacobian[:, 1, 0], jacobian[:, 1, 2] = -z, x
-    jacobian[:, 2, 0], jacobian[:, 2, 1] = y, -x
-    jacobian[:, [0, 1, 2], [3, 4, 5]] = 1.0
+    jacobian = np.broadcast_to(np.eye(3, 6, 3), (len(offset), 3, 6)).copy()
+    jacobian[:, :, :3] = np.swapaxes(np.cross(np.eye(3), offset[:, None]), 1, 2)
     return jacobian
 
 
 def check_spread(x: np.ndarray, name: str) -> None:
-    """Refuse fewer than three points, and points on a line: they leave a rotation open.
-
-    Raises
-    ------
-    ValueError
-        Naming the argument.
-    """
+    """Raise a ValueError for fewer than three points, and for points on a line: they leave a rotation open."""
     if len(x) < 3:
         raise ValueError(f"{name}: {len(x)} points; a rigid motion needs at least 3 that are not on a line.")
     spread = np.linalg.svd(x - x.mean(axis=0), compute_uv=False)
     if spread[1] <= 1e-6 * max(spread[0], 1e-12 * max(1.0, np.abs(x).max())):
-        raise ValueError(
-            f"{name}: the points lie on one line (or coincide), so the rotation about it is open. Add frames."
-        )
+        raise ValueError(f"{name}: the points lie on one line or coincide; the rotation about it is open. Add frames.")
 
 
 def register(
     x_source: ArrayLike, x_target: ArrayLike, *, loss: Literal["norm", "squared"] = "norm", seed: int = 0
 ) -> Registration:
-    """The rigid transform that takes `x_source` to `x_target`, point by point.
+    """The rigid transform that takes `x_source` to `x_target`, point by point (paper Eq. 7).
 
     Parameters
     ----------
@@ -111,14 +95,21 @@ def register(
     Returns
     -------
     Registration
-        With the sandwich covariance of an M-estimator (Huber 1967), which supposes neither Gaussian nor isotropic
-        noise but many points: below about ten it says little, and for the norm, whose curvature has to be smoothed,
-        standard deviations are good to about 30 %.
+        With the sandwich covariance of an M-estimator (Huber 1967).  It assumes neither Gaussian nor isotropic noise
+        but many points: below about ten it says little.  Standard deviations of the norm are good to about 30 %.
 
     Raises
     ------
     ValueError
         For rows that do not pair up, NaN, fewer than three points, or points on a line.
+
+    Examples
+    --------
+    >>> x = np.array([[0.0, 0, 0], [4, 0, 0], [0, 3, 0], [0, 0, 2]])
+    >>> y = x + [0.5, 0, -1]
+    >>> y[3] += 10.0  # one gross error of four points
+    >>> register(x, y).transform.t.round(6).tolist()
+    [0.5, 0.0, -1.0]
     """
     x, y = finite_points(x_source, 3, "x_source"), finite_points(x_target, 3, "x_target")
     if len(x) != len(y):
@@ -129,45 +120,39 @@ def register(
     check_spread(y, "x_target")
     centre_x, centre_y = x.mean(axis=0), y.mean(axis=0)
     x0, y0 = x - centre_x, y - centre_y
-    R, t = _kabsch(x0, y0, np.ones((1, len(x))))
-    iterations = 1
     if loss == "norm":
-        R, t, iterations = _sum_of_norms(x0, y0, R, t, np.random.default_rng(seed))
+        R, t = _sum_of_norms(x0, y0, np.random.default_rng(seed))
+    else:
+        R, t = _kabsch(x0, y0, np.ones((1, len(x))))
     R, t = R[0], t[0]
     residual = x0 @ R.T + t - y0
     norm = np.linalg.norm(residual, axis=1)
-    weights = (
-        np.ones(len(x)) if loss == "squared" else 1.0 / np.maximum(norm, max(1e-6 * float(np.median(norm)), 1e-12))
-    )
+    median = float(np.median(norm))
+    weights = np.ones(len(x)) if loss == "squared" else 1.0 / np.maximum(norm, max(1e-6 * median, 1e-12))
     centre = weights @ y0 / weights.sum()
     # The norm has no curvature to measure at a point: take that of sqrt(r^2 + s^2) with s of the size of the residuals.
-    smooth = np.inf if loss == "squared" else max(0.4 * float(np.median(norm)), 1e-12)
-    covariance = _sandwich(x0 @ R.T + t - centre, residual, smooth)
+    smooth = np.inf if loss == "squared" else max(0.4 * median, 1e-12)
+    covariance = _covariance(x0 @ R.T + t - centre, residual, smooth)
     transform = RigidTransform(R, t + centre_y - R @ centre_x)
     cost = float(norm.sum() if loss == "norm" else (norm**2).sum())
-    return Registration(transform, covariance, centre + centre_y, norm, weights / weights.max(), cost, iterations)
+    return Registration(transform, covariance, centre + centre_y, norm, weights / weights.max(), cost)
 
 
 def _kabsch(x: np.ndarray, y: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Weighted least-squares rotations (s, 3, 3) and translations (s, 3) for weights (s, n)."""
     weights = weights / weights.sum(axis=1, keepdims=True)
     mean_x, mean_y = weights @ x, weights @ y
-    moment = np.swapaxes(weights[:, :, None] * x, 1, 2) @ y - mean_x[:, :, None] * mean_y[:, None, :]
-    U, _, Vt = np.linalg.svd(moment)
-    Vt[:, 2] *= np.sign(np.linalg.det(U @ Vt))[:, None]
-    R = np.swapaxes(U @ Vt, 1, 2)
+    R = align_rotation(np.swapaxes(weights[:, :, None] * y, 1, 2) @ x - mean_y[:, :, None] * mean_x[:, None, :])
     return R, mean_y - np.einsum("sij,sj->si", R, mean_x)
 
 
-def _sum_of_norms(
-    x: np.ndarray, y: np.ndarray, R: np.ndarray, t: np.ndarray, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray, int]:
+def _sum_of_norms(x: np.ndarray, y: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Weiszfeld's iteration with a rotation in it, from the least-squares start and from minimal triples."""
-    triples = np.zeros((_STARTS, len(x)))
-    for row in triples:
+    starts = np.zeros((1 + _STARTS, len(x)))
+    starts[0] = 1.0
+    for row in starts[1:]:
         row[rng.choice(len(x), 3, replace=False)] = 1.0
-    starts = _kabsch(x, y, triples)
-    R, t = np.concatenate([R, starts[0]]), np.concatenate([t, starts[1]])
+    R, t = _kabsch(x, y, starts)
     floor = 1e-12 * max(1.0, float(np.abs(y).max()))
 
     def norms() -> np.ndarray:
@@ -184,11 +169,11 @@ def _sum_of_norms(
             R, t, norm, cost, before = R[best], t[best], norm[best], cost[best], before[best]
         if iteration >= 8 and before[0] - cost[0] <= 1e-14 * cost[0] + floor:
             break
-    return R, t, iteration
+    return R, t
 
 
-def _sandwich(offset: np.ndarray, residual: np.ndarray, smooth: float) -> np.ndarray:
-    """H^-1 B H^-1: H the Hessian of sum sqrt(r^2 + smooth^2) (inf: half the squares), B the scatter of gradients."""
+def _covariance(offset: np.ndarray, residual: np.ndarray, smooth: float) -> np.ndarray:
+    """Of (omega, tau) where sum sqrt(r^2 + smooth^2) is least (smooth = inf: half the squares)."""
     jacobian = motion_jacobian(offset)
     curvature = np.broadcast_to(np.eye(3), (len(offset), 3, 3))
     if np.isfinite(smooth):
@@ -197,6 +182,10 @@ def _sandwich(offset: np.ndarray, residual: np.ndarray, smooth: float) -> np.nda
         curvature = (curvature - direction[:, :, None] * direction[:, None, :]) / length[:, None]
         residual = residual / np.maximum(np.linalg.norm(residual, axis=1), 1e-300)[:, None]
     hessian = np.einsum("nki,nkl,nlj->ij", jacobian, curvature, jacobian)
-    gradient = np.einsum("nki,nk->ni", jacobian, residual)
-    bread = np.linalg.pinv(hessian, hermitian=True)
-    return bread @ (gradient.T @ gradient) @ bread * (len(offset) / max(len(offset) - 6, 1))
+    return sandwich(hessian, np.einsum("nki,nk->ni", jacobian, residual), 6)
+
+
+def sandwich(hessian: np.ndarray, gradient: np.ndarray, parameters: int) -> np.ndarray:
+    """Covariance of an M-estimator (Huber 1967) from its Hessian and each row's gradient (n, 6)."""
+    n, bread = len(gradient), np.linalg.pinv(hessian, rcond=1e-12, hermitian=True)
+    return bread @ (gradient.T @ gradient) @ bread * (n / max(n - parameters, 1))

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from lib.cameras import StereoRig
 from lib.geometry import RigidTransform
-from lib.registration.images import perturb
-from lib.registration.rigid import Registration
+
+from lib.registration import Registration
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
 
 __all__ = [
@@ -165,7 +165,7 @@ def registration_errors(
     errors = {name: MotionErrors.empty(trials, n_frames) for name in estimators}
     for trial in range(trials):
         motion = random_motion(rng, centre_mm=centre_mm)
-        frames = tool_frames(max(n_frames), rng=rng, rig=perturb(rig, motion), **options)
+        frames = tool_frames(max(n_frames), rng=rng, rig=rig.moved(motion), **options)
         for u in (frames.u_left, frames.u_right):
             bad = rng.random(u.shape[:2]) < outliers
             u[bad] += rng.uniform(-100, 100, (int(bad.sum()), 2))
@@ -200,7 +200,7 @@ def recorded_registration_errors(
     errors = {name: MotionErrors.empty(trials, n_frames) for name in estimators}
     for trial in range(trials):
         motion = random_motion(rng, centre_mm=centre_mm)
-        stale = perturb(rig, motion.inverse())
+        stale = rig.moved(motion.inverse())
         first = int(rng.integers(0, len(x_mm) - max(n_frames) + 1))
         window = tuple(values[first:] for values in (x_mm, u_left, u_right))
         _estimate_all(errors, trial, estimators, stale, window, motion, centre_mm)
@@ -236,7 +236,7 @@ def bumped_images(
     rig:
         The cameras that took them.
     """
-    moved = perturb(rig, motion)
+    moved = rig.moved(motion)
     images = []
     for image, before, after in ((left, rig.left, moved.left), (right, rig.right, moved.right)):
         turn = after.linear @ np.linalg.pinv(before.linear)

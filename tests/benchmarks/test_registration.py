@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lib.registration import DriftMonitor, identify_motion, perturb, register, register_images
+from lib.registration import DriftMonitor, identify_motion, register, register_images
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
 from notebooks.studies.registration_experiment import random_motion, tool_frames
 
@@ -14,7 +14,7 @@ RIG = reference_rig()
 
 def data(n_frames: int):
     rng = np.random.default_rng(0)
-    moved = perturb(RIG, random_motion(rng, centre_mm=ROBOT_FROM_MICROSCOPE.t))
+    moved = RIG.moved(random_motion(rng, centre_mm=ROBOT_FROM_MICROSCOPE.t))
     frames = tool_frames(n_frames, rng=rng, rig=moved)
     return frames.x_mm.reshape(-1, 3), frames.u_left.reshape(-1, 2), frames.u_right.reshape(-1, 2)
 

@@ -11,7 +11,6 @@ from lib.cameras import AffineCamera, StereoRig
 from lib.geometry import RigidTransform
 from lib.matching.result import Matches
 from lib.online.pipeline import STAGES, FrameResult, OnlinePipeline, Settings
-from lib.registration import perturb
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
 from notebooks.studies.registration_experiment import random_motion, tool_frames
 
@@ -122,7 +121,7 @@ def test_moved_cameras_are_noticed_and_registered(moved):
     stay = RigidTransform.identity()
     a, b = (random_motion(world.rng, centre_mm=CENTRE_MM, rotation_rad=0.05, translation_mm=0.4) for _ in range(2))
     pair = {"together": (a, a), "left": (a, stay), "right": (stay, b), "apart": (a, b)}[moved]
-    world.rig = perturb(RIG, *pair)
+    world.rig = RIG.moved(*pair)
     assert rig_error_mm(pipeline.rig, world) > 0.1
     results = run(pipeline, world, 15)
     noticed = next(i for i, r in enumerate(results) if r.drift > 1)
@@ -135,7 +134,7 @@ def test_moved_cameras_are_noticed_and_registered(moved):
     assert not np.isnan(results[-1].distance_mm).any()
     # And it goes on: the next hundred frames hold still, the next motion is noticed again.
     assert all(r.state == "tracking" for r in run(pipeline, world, 30))
-    world.rig = perturb(world.rig, a)
+    world.rig = world.rig.moved(a)
     assert any(r.motion for r in run(pipeline, world, 5))
     assert rig_error_mm(pipeline.rig, world) < 0.3
 
