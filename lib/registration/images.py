@@ -9,7 +9,7 @@ J is the derivative of the projection.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Literal
 
 import numpy as np
@@ -259,9 +259,8 @@ def _fit(rig: StereoRig, data: _Observed, starts: list[RigidTransform], loss: Lo
             before, scale2 = scale2, max(float(mean if loss == "squared" else median), 1e-18)
             if abs(scale2 - before) <= 1e-6 * before:
                 break
-        stale = minimise(
-            stale, lambda stale: _evaluate(rig, data, stale, loss, scale2), normal_equations, move, rank=parameters
-        ).state
+        evaluate = partial(_evaluate, rig, data, loss=loss, scale2=scale2)
+        stale = minimise(stale, evaluate, normal_equations, move, rank=parameters).state
     energy, work = _evaluate(rig, data, stale, loss, scale2)
     information, gradient, weights = gradients(stale, work)
     if np.linalg.matrix_rank(information, tol=_OPEN * np.trace(information), hermitian=True) < parameters:

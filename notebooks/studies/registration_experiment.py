@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 
 from lib.cameras import StereoRig
 from lib.geometry import RigidTransform
-
 from lib.registration import Registration
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
 

@@ -15,9 +15,7 @@ from lib.registration import (
     DriftMonitor,
     Registration,
     identify_motion,
-
     register,
-
     register_images,
 )
 from lib.registration.rigid import motion_jacobian
