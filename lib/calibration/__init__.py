@@ -1,24 +1,25 @@
 """Calibration of affine and near-affine cameras from a robot's kinematics, and how good it is (paper Sec. IV-A)."""
 
 from lib.calibration.advice import Advice, advise, box_grid, next_position, next_positions
-from lib.calibration.affine import AffineMinimum, Moments, affine_minimum, dlt, estimate_noise, paper_variances
-from lib.calibration.estimate import Calibration, calibrate
-from lib.calibration.export import read_json, read_opencv, read_ros, write_json, write_opencv, write_ros
+from lib.calibration.affine import Moments, affine_minimum, dlt, estimate_noise, paper_variances
+from lib.calibration.calibration import Calibration, LandmarkOffsets
+from lib.calibration.estimate import calibrate
+from lib.calibration.export import write_opencv, write_ros
 from lib.calibration.ladder import LADDER, Comparison, Rung, compare_models
-from lib.calibration.offsets import OffsetCalibration, calibrate_with_offsets, tool_axes
+from lib.calibration.offsets import tool_axes
 from lib.calibration.online import OnlineCalibration
 from lib.calibration.optics import Optics, optics
 from lib.calibration.pivot import Pivot, ToolOffsets, pivot_calibration, tool_offsets
-from lib.calibration.timing import TimeOffset, estimate_time_offset, rolling_shutter
+from lib.calibration.report import report
+from lib.calibration.timing import TimeOffset, estimate_time_offset
 
 __all__ = [
     "LADDER",
     "Advice",
-    "AffineMinimum",
     "Calibration",
     "Comparison",
+    "LandmarkOffsets",
     "Moments",
-    "OffsetCalibration",
     "OnlineCalibration",
     "Optics",
     "Pivot",
@@ -29,7 +30,6 @@ __all__ = [
     "affine_minimum",
     "box_grid",
     "calibrate",
-    "calibrate_with_offsets",
     "compare_models",
     "dlt",
     "estimate_noise",
@@ -39,13 +39,9 @@ __all__ = [
     "optics",
     "paper_variances",
     "pivot_calibration",
-    "read_json",
-    "read_opencv",
-    "read_ros",
-    "rolling_shutter",
+    "report",
     "tool_axes",
     "tool_offsets",
-    "write_json",
     "write_opencv",
     "write_ros",
 ]

@@ -8,7 +8,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lib.calibration.estimate import Calibration
+from lib.calibration.calibration import Calibration
 from lib.geometry import finite_points, points
 
 __all__ = ["Advice", "advise", "box_grid", "next_position", "next_positions"]
@@ -56,15 +56,6 @@ def box_grid(low_mm: ArrayLike, high_mm: ArrayLike, steps: int = 5) -> np.ndarra
     return np.array(list(product(*(np.linspace(a, b, steps) for a, b in zip(low, high, strict=True)))))
 
 
-def _information_gain(calibration: Calibration, covariance: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """log det(I + S^-1 J C J^T) (n,): D-optimality of one more correspondence at each x."""
-    centred = x - calibration._fit.state.reference
-    J = calibration._fit.state.evaluate(centred)[2] @ calibration._model.selection
-    S = calibration._residual_covariance(centred, calibration.noise_px2[None])
-    inside = np.eye(S.shape[-1]) + np.linalg.solve(S, J @ covariance @ np.swapaxes(J, 1, 2))
-    return np.linalg.slogdet(inside)[1]
-
-
 def next_positions(calibration: Calibration, candidates_mm: ArrayLike, count: int = 1) -> tuple[np.ndarray, np.ndarray]:
     """The `count` positions, chosen one after another, whose correspondences raise det(information) most.
 
@@ -79,16 +70,16 @@ def next_positions(calibration: Calibration, candidates_mm: ArrayLike, count: in
         (count,) log det gained by each.
     """
     x = finite_points(candidates_mm, 3, "candidates_mm")
+    J, S = calibration.derivatives(x)[1], calibration.row_covariance(x)
     covariance = calibration.parameter_covariance
     chosen, gains = [], []
     for _ in range(count):
-        gain = _information_gain(calibration, covariance, x)
+        # D-optimality of one more correspondence at each x: log det(I + S^-1 J C J^T).
+        own = J @ covariance @ np.swapaxes(J, 1, 2)
+        gain = np.linalg.slogdet(np.eye(S.shape[-1]) + np.linalg.solve(S, own))[1]
         best = int(gain.argmax())
-        centred = x[best : best + 1] - calibration._fit.state.reference
-        J = (calibration._fit.state.evaluate(centred)[2] @ calibration._model.selection)[0]
-        S = calibration._residual_covariance(centred, calibration.noise_px2[None])[0]
-        CJ = covariance @ J.T
-        covariance = covariance - CJ @ np.linalg.solve(S + J @ CJ, CJ.T)
+        CJ = covariance @ J[best].T
+        covariance = covariance - CJ @ np.linalg.solve(S[best] + own[best], CJ.T)
         chosen.append(x[best])
         gains.append(gain[best])
     return np.array(chosen), np.array(gains)

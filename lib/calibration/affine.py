@@ -17,7 +17,7 @@ from lib.calibration.checks import check_spread
 from lib.cameras import AffineCamera
 from lib.geometry import finite_points
 
-__all__ = ["AffineMinimum", "Moments", "affine_minimum", "dlt", "estimate_noise", "paper_variances"]
+__all__ = ["AffineMinimum", "Moments", "affine_minimum", "dlt", "estimate_noise", "paper_variances", "regress"]
 
 
 def dlt(x_mm: ArrayLike, u: ArrayLike) -> AffineCamera:
@@ -37,10 +37,10 @@ def dlt(x_mm: ArrayLike, u: ArrayLike) -> AffineCamera:
     """
     x, u = finite_points(x_mm, 3, "x_mm"), finite_points(u, 2, "u")
     check_spread(x, u)
-    return AffineCamera(_regress(x, u))
+    return AffineCamera(regress(x, u))
 
 
-def _regress(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+def regress(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """[A, t] (m, 4) of the least-squares fit y = A x + t, on centred and scaled points."""
     mean, scale = x.mean(axis=0), x.std()
     A = np.linalg.lstsq((x - mean) / scale, y - y.mean(axis=0), rcond=None)[0].T / scale
@@ -66,17 +66,12 @@ class Moments:
     scatter: np.ndarray
 
     @classmethod
-    def of(cls, x: np.ndarray, y: np.ndarray, weights: np.ndarray | None = None) -> Moments:
+    def of(cls, x: np.ndarray, y: np.ndarray) -> Moments:
         """Moments of points x (n, 3) and stacked pixels y (n, m)."""
         z = np.hstack([y, x])
-        if weights is None:
-            mean = z.mean(axis=0)
-            z -= mean
-            return cls(float(len(z)), mean, z.T @ z)
-        total = weights.sum()
-        mean = weights @ z / total
+        mean = z.mean(axis=0)
         z -= mean
-        return cls(float(total), mean, (z * weights[:, None]).T @ z)
+        return cls(float(len(z)), mean, z.T @ z)
 
     def merged(self, other: Moments) -> Moments:
         """Moments of both sets together (Chan, Golub and LeVeque's update)."""

@@ -15,8 +15,7 @@ __all__ = [
     "check_order",
     "check_spread",
     "check_units",
-    "correspondences",
-    "pixel_covariance",
+    "stacked_rows",
 ]
 
 #: Zoom (px per mm) between a room camera and the resolution of light; what lies outside has the wrong unit.
@@ -25,7 +24,7 @@ PLAUSIBLE_PX_PER_MM = (0.2, 5000.0)
 ROBOT_ACCURACY_MM = 0.010
 
 
-def correspondences(x_mm: ArrayLike, u: Sequence[ArrayLike]) -> tuple[np.ndarray, np.ndarray]:
+def stacked_rows(x_mm: ArrayLike, u: Sequence[ArrayLike]) -> tuple[np.ndarray, np.ndarray]:
     """x (n, 3) and the stacked pixels y (n, 2 cameras), finite and of one length.
 
     Raises
@@ -85,10 +84,15 @@ def check_units(x: np.ndarray, y: np.ndarray) -> None:
     ------
     ValueError
     """
-    extent = x.std(axis=0).max()
-    if extent <= 1e-9 * np.abs(x).max():
+
+    def extent(values: np.ndarray) -> float:  # robust: a few gross rows must not look like another unit
+        middle = np.median(np.abs(values - np.median(values, axis=0)), axis=0).max()
+        return float(middle or values.std(axis=0).max())
+
+    size = extent(x)
+    if size <= 1e-9 * np.abs(x).max():
         return  # no motion at all: `check_spread` says so
-    zoom = y.std(axis=0).max() / extent
+    zoom = extent(y) / size
     low, high = PLAUSIBLE_PX_PER_MM
     if zoom > high:
         raise ValueError(
@@ -118,8 +122,10 @@ def check_duplicates(x: np.ndarray, y: np.ndarray) -> None:
         )
 
 
-def check_images(y: np.ndarray) -> None:
-    """Refuse pixels (n, m) that no calibration can use: standing still or on a line in a camera, or the same in both.
+def check_images(y: np.ndarray, image_size_px: tuple[int, int] | None = None) -> None:
+    """Refuse pixels (n, m) that no calibration can use.
+
+    They stand still or lie on a line in a camera, are the same in both, or leave the image (rows before columns).
 
     Raises
     ------
@@ -130,6 +136,16 @@ def check_images(y: np.ndarray) -> None:
         size = np.linalg.svd(u - u.mean(axis=0), compute_uv=False)
         if size[1] <= 1e-9 * np.abs(u).max() * np.sqrt(len(u)):
             raise ValueError(f"{name}: the detections stand still or lie on one line; is this the moving tool?")
+        if image_size_px is None:
+            continue
+        margin, limit = 0.1 * np.asarray(image_size_px, dtype=float), np.asarray(image_size_px, dtype=float)
+        outside = ((u < -margin) | (u > limit + margin)).any(axis=1).mean()
+        swapped = ((u[:, ::-1] < -margin) | (u[:, ::-1] > limit + margin)).any(axis=1).mean()
+        if outside > 0.1 and swapped < 0.5 * outside:
+            raise ValueError(
+                f"{name}: {100 * outside:.0f} % of the pixels lie outside the image of {image_size_px[0]} x "
+                f"{image_size_px[1]}; give (x, y), x to the right, not (row, column)."
+            )
     if len(names) == 2 and (y[:, :2] == y[:, 2:]).all(axis=1).mean() > 0.5:
         raise ValueError("u_right: the same pixels as u_left; give the right camera's own detections.")
 
@@ -166,42 +182,3 @@ def check_order(A: np.ndarray, sd_rad: float) -> None:
             f"{np.rad2deg(-along):.1f} degrees; exchange u_left and u_right (or both images are mirrored: flip them). "
             "checks=False takes them as they are."
         )
-
-
-def pixel_covariance(covariance_px2: ArrayLike | Sequence[ArrayLike] | None, n: int, cameras: int) -> np.ndarray | None:
-    """Covariance of the stacked pixels, (m, m) or (n, m, m) with m = 2 cameras, or None.
-
-    Parameters
-    ----------
-    covariance_px2:
-        A number, (2, 2) for every image, (m, m), (n, m, m), (n, 2, 2) for one camera, or a list of one (n, 2, 2) a camera.
-
-    Raises
-    ------
-    ValueError
-        For another shape, or a matrix that is not positive definite.
-    """
-    if covariance_px2 is None:
-        return None
-    m = 2 * cameras
-    if isinstance(covariance_px2, (list, tuple)) and len(covariance_px2) == cameras and np.ndim(covariance_px2[0]) == 3:
-        blocks = [np.asarray(block, dtype=np.float64) for block in covariance_px2]
-        if any(block.shape != (n, 2, 2) for block in blocks):
-            raise ValueError(f"covariance_px2: expected one ({n}, 2, 2) a camera, got {[b.shape for b in blocks]}.")
-        covariance = np.zeros((n, m, m))
-        for i, block in enumerate(blocks):
-            covariance[:, 2 * i : 2 * i + 2, 2 * i : 2 * i + 2] = block
-    else:
-        covariance = np.asarray(covariance_px2, dtype=np.float64)
-        if covariance.ndim == 0:
-            covariance = covariance * np.eye(m)
-        elif covariance.shape == (2, 2):
-            covariance = np.kron(np.eye(cameras), covariance)
-    if covariance.shape not in {(m, m), (n, m, m)}:
-        raise ValueError(
-            f"covariance_px2: expected a number, (2, 2), ({m}, {m}), ({n}, {m}, {m}) or a list of ({n}, 2, 2), "
-            f"got {covariance.shape}."
-        )
-    if not np.isfinite(covariance).all() or (np.linalg.eigvalsh(covariance)[..., 0] <= 0).any():
-        raise ValueError("covariance_px2: every covariance must be finite and positive definite.")
-    return covariance

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from lib.calibration.affine import Moments, affine_minimum, estimate_noise, paper_variances
+from lib.calibration.calibration import Calibration
 from lib.calibration.checks import (
     ROBOT_ACCURACY_MM,
     check_duplicates,
@@ -17,196 +18,27 @@ from lib.calibration.checks import (
     check_order,
     check_spread,
     check_units,
-    correspondences,
-    pixel_covariance,
+    stacked_rows,
 )
 from lib.calibration.models import Fit, Model, State, fit
+from lib.calibration.offsets import estimate_offsets, rows_axes
 from lib.calibration.robust import consensus, gate
-from lib.cameras import AffineCamera, NearAffineCamera, Points, Resection, StereoRig
-from lib.geometry import points
+from lib.cameras import StereoRig
+from lib.correspondences import Correspondences
+from lib.geometry import pair_covariance
 
-__all__ = ["Calibration", "calibrate"]
+__all__ = ["calibrate"]
 
-
-@dataclass(frozen=True, eq=False)
-class Calibration:
-    """Cameras, and how well they are known.
-
-    Attributes
-    ----------
-    cameras:
-        One or two; affine unless the model has 1/distance or radial distortion.
-    rig:
-        The stereo pair, None for one camera.
-    inliers:
-        (n,) bool, the rows used.
-    cost:
-        The energy at the minimum over the inliers (Eq. 3 as printed for ``paper``, else half the chi-square).
-    covariance:
-        (8 cameras, 8 cameras) of the entries of the matrices M, row by row, left first; px^2, px^2/mm, px^2/mm^2.
-    parameter_covariance:
-        (p, p) of the model's own parameters, `parameter_names`.
-    sigma_u_px, sigma_x_mm:
-        Noise levels, given or estimated.  With `covariance_px2` given, sigma_u_px is the RMS of the detector's own.
-    residuals_px:
-        (n, 2 cameras) of all rows, u - project(x): what the eye would see, robot error included.
-    model, weighting:
-        As asked for.
-    x_mm, y_px:
-        The data, (n, 3) and (n, 2 cameras).
-    """
-
-    cameras: tuple[AffineCamera | NearAffineCamera, ...]
-    rig: StereoRig | None
-    inliers: np.ndarray
-    cost: float
-    covariance: np.ndarray
-    parameter_covariance: np.ndarray
-    parameter_names: list[str]
-    sigma_u_px: float
-    sigma_x_mm: float
-    residuals_px: np.ndarray
-    model: str
-    weighting: str
-    x_mm: np.ndarray
-    y_px: np.ndarray
-    covariance_px2: np.ndarray | None = None
-    image_size_px: tuple[int, int] | None = None
-    _model: Model = field(repr=False, default=None)
-    _fit: Fit = field(repr=False, default=None)
-
-    @property
-    def reprojection_rms_px(self) -> float:
-        """RMS over inliers of the distance |u - project(x)| in an image."""
-        return float(np.sqrt((self.residuals_px[self.inliers] ** 2).sum() / (self.inliers.sum() * len(self.cameras))))
-
-    @property
-    def chi_square(self) -> tuple[float, int]:
-        """Twice the likelihood energy over the inliers and its degrees of freedom; the two are alike where all is well."""
-        S = self._residual_covariance(self._fit.points, self._inlier_noise)
-        r = self._fit.residuals
-        value = np.einsum("ni,nij,nj->", r, np.broadcast_to(np.linalg.inv(S), (len(r), *S.shape[1:])), r)
-        return float(value), r.size - len(self.parameter_names)
-
-    @property
-    def inverse_distance_per_mm(self) -> tuple[float, float]:
-        """1/d and its standard deviation (the first, where each camera has its own); (0, 0) for affine models."""
-        for i, name in enumerate(self.parameter_names):
-            if "1/distance" in name:
-                return float(self._fit.state.rho[0]), float(np.sqrt(self.parameter_covariance[i, i]))
-        return 0.0, 0.0
-
-    @cached_property
-    def standard_deviations(self) -> dict[str, float]:
-        """Standard deviation of every parameter by name (names carry the unit; a log zoom is a relative zoom)."""
-        return dict(zip(self.parameter_names, np.sqrt(np.diag(self.parameter_covariance)).tolist(), strict=True))
-
-    def resections(self) -> tuple[Resection, ...]:
-        """K, R, t of each camera (paper Eq. 5); mirrored optics are told by `optics`."""
-        return tuple(AffineCamera(camera.matrix).resect() for camera in self.cameras)
-
-    # ---- uncertainty -------------------------------------------------------------------------------------------------
-
-    @property
-    def noise_px2(self) -> np.ndarray:
-        """(m, m) covariance assumed for a new detection of the pair."""
-        m = 2 * len(self.cameras)
-        return self.sigma_u_px**2 * np.eye(m)
-
-    @property
-    def _inlier_noise(self) -> np.ndarray:
-        if self.covariance_px2 is None:
-            return self.noise_px2[None]
-        return self.covariance_px2[None] if self.covariance_px2.ndim == 2 else self.covariance_px2[self.inliers]
-
-    def _residual_covariance(self, centred: np.ndarray, noise: np.ndarray) -> np.ndarray:
-        J = self._fit.state.evaluate(centred, derivatives=False)[1]
-        if self._model.is_affine:
-            J = J[:1]
-        return noise + self.sigma_x_mm**2 * J @ np.swapaxes(J, 1, 2)
-
-    def projection_covariance(self, x_mm: ArrayLike) -> np.ndarray:
-        """(n, m, m) px^2 covariance of the projections of exact points, from the calibration's uncertainty alone."""
-        x = points(x_mm, 3, "x_mm") - self._fit.state.reference
-        J = self._fit.state.evaluate(x)[2] @ self._model.selection
-        return J @ self.parameter_covariance @ np.swapaxes(J, 1, 2)
-
-    def leverage(self, x_mm: ArrayLike) -> np.ndarray:
-        """(n,) how much a point's projection hangs on the calibration: its covariance in units of one row's noise.
-
-        For the affine model it is h^T (H^T H)^-1 h with h = [x; 1], and averages 4/n over the data.
-        """
-        x = points(x_mm, 3, "x_mm")
-        S = self._residual_covariance(x - self._fit.state.reference, self.noise_px2[None])
-        return np.trace(np.linalg.solve(S, self.projection_covariance(x)), axis1=1, axis2=2) / S.shape[-1]
-
-    def point_covariance(self, x_mm: ArrayLike, *, detection: bool = True) -> np.ndarray:
-        """(n, 3, 3) mm^2 covariance of triangulated points, with the calibration's own uncertainty.
-
-        Parameters
-        ----------
-        x_mm:
-            Where, (n, 3).
-        detection:
-            False leaves out the noise of the detections: what more calibration data could still remove.
-        """
-        if self.rig is None:
-            raise ValueError("point_covariance: needs a stereo pair; calibrate with [u_left, u_right].")
-        x = points(x_mm, 3, "x_mm")
-        J = self.rig.jacobian(x)
-        weight = np.linalg.inv(self.noise_px2)
-        gain = np.linalg.solve(np.swapaxes(J, 1, 2) @ weight @ J, np.swapaxes(J, 1, 2) @ weight)
-        noise = self.projection_covariance(x)
-        if detection:
-            noise = noise + self.noise_px2
-        return gain @ noise @ np.swapaxes(gain, 1, 2)
-
-    def triangulate(self, u_left: ArrayLike, u_right: ArrayLike, covariance_px2: ArrayLike | None = None) -> Points:
-        """`StereoRig.triangulate` whose covariance has the calibration's uncertainty and the estimated sigma_u in it."""
-        if self.rig is None:
-            raise ValueError("triangulate: needs a stereo pair; calibrate with [u_left, u_right].")
-        found = self.rig.triangulate(u_left, u_right, self.noise_px2 if covariance_px2 is None else covariance_px2)
-        known = np.isfinite(found.x_mm).all(axis=1)
-        covariance = found.covariance_mm2.copy()
-        covariance[known] += self.point_covariance(found.x_mm[known], detection=False)
-        return Points(found.x_mm, covariance, found.epipolar_px)
-
-    def depth_sd_mm(self, x_mm: ArrayLike, *, detection: bool = False) -> np.ndarray:
-        """(n,) standard deviation along the mean viewing direction, for maps of the workspace."""
-        direction = sum(camera.viewing_direction for camera in self.cameras)
-        direction = direction / np.linalg.norm(direction)
-        return np.sqrt(np.einsum("i,nij,j->n", direction, self.point_covariance(x_mm, detection=detection), direction))
-
-    @cached_property
-    def leave_one_out_px(self) -> np.ndarray:
-        """(inliers, m) residual of each inlier to the cameras fitted without it, in closed form.
-
-        (I - L)^-1 r with L the row's own share of its prediction: r / (1 - leverage) for the affine model, exact for DLT.
-        """
-        state, x = self._fit.state, self._fit.points
-        J = state.evaluate(x)[2] @ self._model.selection
-        S = self._residual_covariance(x, self._inlier_noise)
-        own = J @ self.parameter_covariance @ np.swapaxes(J, 1, 2) @ np.linalg.inv(S)
-        return np.linalg.solve(np.eye(own.shape[1]) - own, self._fit.residuals[:, :, None])[:, :, 0]
-
-    @property
-    def press_rms_px(self) -> float:
-        """Cross-validated reprojection error: RMS distance in an image, each row predicted by the others."""
-        return float(np.sqrt((self.leave_one_out_px**2).sum() / (len(self.leave_one_out_px) * len(self.cameras))))
-
-    # ---- reports -----------------------------------------------------------------------------------------------------
-
-    def report(self) -> str:
-        """The calibration in words: figures with units, verdicts, outliers (see `lib.calibration.report`)."""
-        from lib.calibration.report import report
-
-        return report(self)
+#: Fewest rows with the tool's axes from which offsets are estimated unasked.
+_OFFSET_ROWS = 45
 
 
 def calibrate(
-    x_mm: ArrayLike,
-    u: Sequence[ArrayLike],
+    data: Correspondences | ArrayLike,
+    u: Sequence[ArrayLike] | None = None,
     *,
+    offsets: bool | Literal["tool", "image"] | None = None,
+    offset_prior_sd: float | None = None,
     model: str = "zero_skew",
     weighting: str = "likelihood",
     sigma_u_px: float | None = None,
@@ -221,10 +53,18 @@ def calibrate(
 
     Parameters
     ----------
-    x_mm:
-        (n, 3) landmark positions in the robot frame.
+    data:
+        `Correspondences`, whose incomplete rows are left out and whose covariances weigh the rows where every complete row
+        has one; or (n, 3) mm landmark positions in the robot frame.
     u:
-        [u_left, u_right] or [u], (n, 2) px each, row by row with `x_mm`.
+        With plain positions: [u_left, u_right] or [u], (n, 2) px each, row by row with them.
+    offsets:
+        Constant offsets of the landmarks along with the cameras (`lib.calibration.offsets`).  "tool" or True: in the tool's
+        axes, from frames in which the robot reports three landmarks of open jaws; "image": in the images, for a detector that
+        is off by some pixels whatever the tool does; False: none.  None: "tool" where at least 45 rows and half of all allow
+        it, else none.
+    offset_prior_sd:
+        Standard deviation of an offset's coordinate, mm or px; None = chosen by the data.
     model:
         "affine", "zero_skew" (the paper's), "square", "common_zoom"; with "+distance" (one 1/distance) or "+distances"
         (one a camera), and "+radial".  "near_affine" is "zero_skew+distance".
@@ -234,8 +74,7 @@ def calibrate(
     sigma_u_px, sigma_x_mm:
         Noise of a pixel coordinate and of a robot coordinate; None = estimated from the data.
     covariance_px2:
-        The detector's own covariance in place of sigma_u: a number, (2, 2), (m, m), (n, m, m) or a list of one
-        (n, 2, 2) a camera.
+        The detector's own covariance in place of sigma_u, in any form of `lib.geometry.pair_covariance`.
     ransac_px:
         Largest reprojection distance of an inlier in any image; None measures the noise and drops rows that Gaussian
         noise would not produce once in 10 000 data sets; infinity keeps all rows.
@@ -244,15 +83,103 @@ def calibrate(
     image_size_px:
         (width, height); its centre is the principal point of near-affine models (else the middle of the detections is).
     checks:
-        False skips the plausibility checks: units, repeated rows, swapped cameras.
+        False skips the plausibility checks: units, repeated rows, swapped cameras, pixels outside the image.
 
     Raises
     ------
     ValueError
         For NaN rows, fewer than four points, coplanar or collinear points, wrong units, repeated rows, detections that stand
-        still or are the same in both images, swapped cameras, no consensus, an unknown model or weighting.
+        still or are the same in both images, swapped cameras, no consensus, an unknown model or weighting, offsets that the
+        data cannot tell.
+
+    Examples
+    --------
+    >>> from lib.cameras import AffineCamera
+    >>> rng = np.random.default_rng(0)
+    >>> left, right = AffineCamera([[99, 0, 9, 900], [0, 99, 0, 500]]), AffineCamera([[99, 0, -9, 900], [0, 99, 0, 500]])
+    >>> x = rng.uniform(-4, 4, (60, 3))
+    >>> found = calibrate(x, [c.project(x) + rng.normal(0, 1, (60, 2)) for c in (left, right)])
+    >>> found.rig.left.matrix.round(0)[0].tolist(), int(found.inliers.sum())
+    ([99.0, 0.0, 9.0, 900.0], 60)
     """
-    x, y = correspondences(x_mm, u)
+    options = {
+        "model": model, "weighting": weighting, "sigma_u_px": sigma_u_px, "sigma_x_mm": sigma_x_mm, "ransac_px": ransac_px,
+        "seed": seed, "image_size_px": image_size_px, "checks": checks,
+    }  # fmt: skip
+    if not isinstance(data, Correspondences):
+        if u is None:
+            raise ValueError("u: give [u_left, u_right] with plain positions, or Correspondences alone.")
+        if offsets or offset_prior_sd is not None:
+            raise ValueError("offsets: they need to know which landmark a row is; give Correspondences.of_points(...).")
+        x, y = stacked_rows(data, u)
+        noise = None if covariance_px2 is None else pair_covariance(covariance_px2, len(x), y.shape[1] // 2)
+        return _calibrate(x, y, noise, **options)
+    if u is not None:
+        raise ValueError("u: Correspondences have their own pixels; leave u out.")
+    if offset_prior_sd is not None and not offset_prior_sd > 0:
+        raise ValueError(f"offset_prior_sd: must be positive, got {offset_prior_sd}.")
+    usable, axes = data.is_complete, None
+    if offsets not in (None, False, True, "tool", "image"):
+        raise ValueError(f"offsets: expected 'tool', 'image', True, False or None, got {offsets!r}.")
+    if offsets and weighting != "likelihood":
+        raise ValueError("weighting: offsets need the likelihood's weights.")
+    if offsets in (True, "tool") or (offsets is None and weighting == "likelihood"):
+        axes = rows_axes(data)
+        open_jaws = usable & np.isfinite(axes).all(axis=(1, 2))
+        if offsets is None and open_jaws.sum() < max(_OFFSET_ROWS, 0.5 * usable.sum()):
+            axes = None
+        elif open_jaws.sum() < 4:
+            raise ValueError(
+                f"offsets: {open_jaws.sum()} rows have the tool's axes; the robot must report three landmarks a frame, jaws open."
+            )
+        else:
+            usable = open_jaws
+    rows = data.subset(usable)
+    x, y = stacked_rows(rows.x_mm, [rows.u_left, rows.u_right])
+    if covariance_px2 is not None:
+        noise = pair_covariance(covariance_px2, len(data))
+        noise = noise[usable] if len(noise) > 1 else noise
+    elif weighting == "likelihood" and sigma_u_px is None and np.isfinite(rows.covariance_px2).all():
+        noise = pair_covariance(rows.covariance_px2, len(rows))
+    else:
+        noise = None
+    if axes is None and offsets != "image":
+        found = _calibrate(x, y, noise, **options)
+    else:
+        axes = None if axes is None else axes[usable]
+        found = estimate_offsets(lambda x, y: _calibrate(x, y, noise, **options), x, y, rows.landmark, axes, offset_prior_sd)
+    return _spread_out(found, usable)
+
+
+def _spread_out(found: Calibration, usable: np.ndarray) -> Calibration:
+    """The calibration of the usable rows with an entry for every row given."""
+
+    def full(values: np.ndarray, filler: object) -> np.ndarray:
+        result = np.full((len(usable), *values.shape[1:]), filler)
+        result[usable] = values
+        return result
+
+    names = ["residuals_px", "x_mm", "y_px"]
+    if found.covariance_px2 is not None and found.covariance_px2.ndim == 3:
+        names.append("covariance_px2")
+    return replace(found, inliers=full(found.inliers, False), **{n: full(getattr(found, n), np.nan) for n in names})
+
+
+def _calibrate(
+    x: np.ndarray,
+    y: np.ndarray,
+    noise: np.ndarray | None,
+    *,
+    model: str,
+    weighting: str,
+    sigma_u_px: float | None,
+    sigma_x_mm: float | None,
+    ransac_px: float | None,
+    seed: int,
+    image_size_px: tuple[int, int] | None,
+    checks: bool,
+) -> Calibration:
+    """`calibrate` of complete rows x (n, 3) and y (n, m) with their covariances, (1, m, m) or (n, m, m)."""
     n, m = y.shape
     plan = Model.parse(model, m // 2)
     if weighting not in ("likelihood", "paper"):
@@ -262,9 +189,11 @@ def calibrate(
             raise ValueError(f"{name}: must not be negative, got {value}.")
     if sigma_u_px == 0:
         raise ValueError("sigma_u_px: must be positive; None estimates it.")
-    if 2 * n * (m // 2) < len(plan.parameter_names):
+    if y.size < len(plan.parameter_names):
         raise ValueError(f"x_mm: {n} points are too few for the {len(plan.parameter_names)} parameters of '{model}'.")
-    noise = pixel_covariance(covariance_px2, n, m // 2)
+    if noise is not None and not np.isfinite(noise).all():
+        raise ValueError("covariance_px2: must be finite in every row.")
+    noise = noise if noise is None or len(noise) > 1 else noise[0]
     if weighting == "paper" and noise is not None and noise.ndim == 3:
         raise ValueError("weighting: the paper's energy has one sigma_u; give sigma_u_px, or weighting='likelihood'.")
     if checks:
@@ -272,7 +201,7 @@ def calibrate(
         check_units(x, y)
     assumed_x = ROBOT_ACCURACY_MM if sigma_x_mm is None else sigma_x_mm
     check_spread(x, y, assumed_x if checks else 0.0)
-    check_images(y)
+    check_images(y, image_size_px if checks else None)
     automatic = ransac_px is None
     if ransac_px is not None and np.isinf(ransac_px):
         inliers = np.ones(n, dtype=bool)
@@ -293,9 +222,8 @@ def calibrate(
         inliers = new
 
     sigma_u, sigma_x = levels
-    T = plan.selection
     parameter_covariance = _parameter_covariance(plan, minimum, noise, inliers, sigma_u, sigma_x, variances)
-    G = minimum.state.matrix_jacobian() @ T
+    G = minimum.state.matrix_jacobian() @ plan.selection
     cameras = minimum.state.cameras(plan)
     result = Calibration(
         cameras=cameras,
@@ -304,18 +232,17 @@ def calibrate(
         cost=minimum.cost,
         covariance=G @ parameter_covariance @ G.T,
         parameter_covariance=parameter_covariance,
-        parameter_names=plan.parameter_names,
         sigma_u_px=sigma_u,
         sigma_x_mm=sigma_x,
-        residuals_px=_reprojection(minimum.state, x, y),
+        residuals_px=y - minimum.state.evaluate(x - minimum.state.reference, derivatives=False)[0],
         model=model,
         weighting=weighting,
         x_mm=x,
         y_px=y,
         covariance_px2=noise,
         image_size_px=None if image_size_px is None else tuple(image_size_px),
-        _model=plan,
-        _fit=minimum,
+        plan=plan,
+        minimum=minimum,
     )
     if checks and len(cameras) == 2:
         spread = np.sqrt(np.linalg.eigvalsh(np.cov(x[inliers].T))[0])
@@ -457,7 +384,3 @@ def _judge(
     r = y - f
     distance2 = np.einsum("ni,nij,nj->n", r, np.linalg.inv(sigma + sigma_x**2 * J @ np.swapaxes(J, 1, 2)), r)
     return distance2 < gate(*y.shape)
-
-
-def _reprojection(state: State, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    return y - state.evaluate(x - state.reference, derivatives=False)[0]

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.stats import chi2
 
-from lib.calibration.estimate import Calibration, calibrate
+from lib.calibration.calibration import Calibration
+from lib.calibration.estimate import calibrate
 
 __all__ = ["LADDER", "Comparison", "Rung", "compare_models"]
 
@@ -50,7 +51,7 @@ class Rung:
     chi_square:
         Twice the energy at the common noise levels.
     bic:
-        chi_square + parameters ln(number of pixels coordinates); the least is the choice.
+        chi_square + parameters ln(number of pixel coordinates); the least is the choice.
     against, p_value:
         The freer model it is nested in, and the probability of a larger likelihood ratio if the constraint is true.
     calibration:

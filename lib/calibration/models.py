@@ -22,8 +22,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lib.cameras import AffineCamera, NearAffineCamera, radial_derivative
+from lib.least_squares import minimise
 
-__all__ = ["Fit", "Model", "State", "fit"]
+__all__ = ["Fit", "Model", "State", "fit", "settle"]
 
 BASES = ("affine", "zero_skew", "square", "common_zoom")
 OPTIONS = ("distance", "distances", "radial")
@@ -263,7 +264,7 @@ class Fit:
     converged: bool
 
 
-def _settle(
+def settle(
     state: State, x: np.ndarray, y: np.ndarray, h: np.ndarray | None, noise: np.ndarray, variance_x: float, linear: bool
 ) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
     """Best corrected points of a state: cost, linearised residuals, x~, S^-1."""
@@ -287,8 +288,6 @@ def fit(
     noise: np.ndarray,
     variance_x: float,
     h: np.ndarray | None = None,
-    *,
-    iterations: int = 60,
 ) -> Fit:
     """Minimum of 1/2 sum (y - f(x~))^T noise^-1 (y - f(x~)) + |x~ - x|^2 / variance_x by Levenberg-Marquardt.
 
@@ -304,46 +303,23 @@ def fit(
     noise:
         (1, m, m) or (n, m, m) px^2.
     """
-    T, linear = model.selection, model.is_affine
-    state, damping = start, 0.0
-    cost, r, settled, weight = _settle(state, x, y, h, noise, variance_x, linear)
-    converged = False
-    for _ in range(iterations):
+    T = model.selection
+
+    def evaluate(state: State) -> tuple[float, tuple] | None:
+        for A, rho in zip(state.A, state.rho, strict=True):
+            normal = np.cross(A[0], A[1])
+            if rho and (1.0 + rho * (x @ normal) / np.linalg.norm(normal)).min() <= 0.05:
+                return None  # a point lies behind the camera
+        with np.errstate(all="ignore"):
+            cost, *work = settle(state, x, y, h, noise, variance_x, model.is_affine)
+        return (cost, work) if np.isfinite(cost) else None
+
+    def normal_equations(state: State, work: tuple) -> tuple[np.ndarray, np.ndarray]:
+        r, settled, weight = work
         J = state.evaluate(settled, h)[2] @ T
-        WJ = np.broadcast_to(weight, (len(x), *weight.shape[1:])) @ J
-        flat = J.reshape(-1, J.shape[2])
-        information = flat.T @ WJ.reshape(flat.shape)
-        gradient = WJ.reshape(flat.shape).T @ r.ravel()
-        scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
-        scaled = information * np.outer(scale, scale)
-        for _ in range(12):
-            step = scale * np.linalg.lstsq(scaled + damping * np.eye(len(scaled)), scale * gradient, rcond=1e-15)[0]
-            trial = state.moved(T @ step)
-            new = _trial(trial, x, y, h, noise, variance_x, linear)
-            if new is not None and new[0] <= cost * (1 + 1e-14) + 1e-300:
-                break
-            damping = max(10.0 * damping, 1e-6)
-        else:
-            converged = True  # no step lowers the energy: the floor of rounding
-            break
-        decrease = cost - new[0]
-        state, (cost, r, settled, weight), damping = trial, new, damping / 30.0 if damping > 1e-9 else 0.0
-        if 0.5 * gradient @ step <= 1e-13 * cost + 1e-22 and decrease <= 1e-13 * cost + 1e-22:
-            converged = True
-            break
-    J = state.evaluate(settled, h)[2] @ T
-    WJ = np.broadcast_to(weight, (len(x), *weight.shape[1:])) @ J
-    flat = J.reshape(-1, J.shape[2])
-    return Fit(state, cost, r, settled, flat.T @ WJ.reshape(flat.shape), converged)
+        WJ = (np.broadcast_to(weight, (len(x), *weight.shape[1:])) @ J).reshape(-1, J.shape[2])
+        return J.reshape(WJ.shape).T @ WJ, WJ.T @ r.ravel()
 
-
-def _trial(state: State, *data) -> tuple | None:
-    """`_settle`, or None where the step left the model's domain (a point behind a camera)."""
-    x = data[0]
-    for A, rho in zip(state.A, state.rho, strict=True):
-        normal = np.cross(A[0], A[1])
-        if rho and (1.0 + rho * (x @ normal) / np.linalg.norm(normal)).min() <= 0.05:
-            return None
-    with np.errstate(all="ignore"):
-        found = _settle(state, *data)
-    return found if np.isfinite(found[0]) else None
+    found = minimise(start, evaluate, normal_equations, lambda state, step: state.moved(T @ step))
+    r, settled, _ = found.work
+    return Fit(found.state, found.energy, r, settled, found.information, found.converged)

@@ -1,31 +1,36 @@
-"""Landmarks that are not seen where the robot says they are: constant offsets estimated along with the cameras.
+"""Constant offsets of the landmarks, estimated along with the cameras.
 
-A landmark is a point that a designer chose, and what a detector (or a person) marks on the tool may lie some hundredths
-of a millimetre beside it, always in the same direction of the tool.  Such a systematic error does not average out.
-With the robot's landmark k at x and the tool's axes R, the marked point is x + R d_k.  The nine numbers d are nuisance
-parameters: estimated together with the cameras, or rather, since not all of them can be told from a shift of the
-cameras, with a Gaussian prior of zero mean, whose width the data choose too (empirical Bayes).  What the data cannot tell
-then stays in the covariance.
+A designer chooses a landmark on the tool.  What a detector (or a person) marks may lie some hundredths of a millimetre
+beside it, always in the same direction of the tool, and such an error does not average out.  With the robot's landmark k at
+x and the tool's axes R, the marked point is x + R d_k.  The data cannot tell all of the nine numbers d from a shift of the
+cameras, so they have a Gaussian prior of zero mean, whose width the data choose (empirical Bayes).  What the data cannot
+tell stays in the covariance.
 """
 
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, replace
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.stats import chi2
 
-from lib.calibration.estimate import Calibration, calibrate
+from lib.calibration.calibration import Calibration, LandmarkOffsets
+from lib.correspondences import Correspondences
 
-__all__ = ["OffsetCalibration", "calibrate_with_offsets", "tool_axes"]
+__all__ = ["estimate_offsets", "rows_axes", "tool_axes"]
 
 
 def tool_axes(x_mm: ArrayLike) -> np.ndarray:
     """Axes R (n, 3, 3) of a forceps from its landmarks (n, 3, 3) mm: columns along it, from tip to tip, and their normal.
 
     NaN where the jaws are shut (tips closer than 5 % of the tool's length) or a landmark is missing.
+
+    >>> tool_axes([[[0, 0, 0], [3, -0.5, 0], [3, 0.5, 0]]])[0]
+    array([[1., 0., 0.],
+           [0., 1., 0.],
+           [0., 0., 1.]])
     """
     x = np.asarray(x_mm, dtype=np.float64)
     if x.ndim != 3 or x.shape[1:] != (3, 3):
@@ -41,111 +46,50 @@ def tool_axes(x_mm: ArrayLike) -> np.ndarray:
     return np.stack([along, across, np.cross(along, across)], axis=2)
 
 
-@dataclass(frozen=True, eq=False)
-class OffsetCalibration:
-    """Cameras, and where the landmarks are seen.
-
-    Attributes
-    ----------
-    calibration:
-        As `calibrate` gives it, its covariances with the offsets' uncertainty in them; `x_mm` are the corrected positions.
-    offset:
-        (k, 3) mm in the tool's axes (along, across, normal), or (k, m) px in the images.
-    covariance:
-        (k, d, d) of each landmark's offset, in the squared unit.
-    prior_sd:
-        Of a coordinate before the data, given or chosen by the evidence.
-    p_value:
-        Probability of offsets as large as the data show if there are none (score test).
-    """
-
-    calibration: Calibration
-    offset: np.ndarray
-    covariance: np.ndarray
-    prior_sd: float
-    p_value: float
-
-    @property
-    def standard_deviation(self) -> np.ndarray:
-        """(k, d) of the offsets."""
-        return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
-
-    @property
-    def learnt(self) -> np.ndarray:
-        """(k, d): 1 where the data determine an offset, 0 where only the prior speaks."""
-        return 1.0 - (self.standard_deviation / self.prior_sd) ** 2
+def rows_axes(data: Correspondences) -> np.ndarray:
+    """`tool_axes` of each row's frame (n, 3, 3), from where the robot reports the frame's landmarks."""
+    if len(data) == 0 or data.landmark.max() > 2:
+        return np.full((len(data), 3, 3), np.nan)
+    return tool_axes(data.grid("x_mm"))[np.unique(data.frame, return_inverse=True)[1]]
 
 
-def calibrate_with_offsets(
-    x_mm: ArrayLike,
-    u: list[ArrayLike],
-    landmark: ArrayLike,
-    axes: ArrayLike | None,
-    *,
+def estimate_offsets(
+    fit: Callable[[np.ndarray, np.ndarray], Calibration],
+    x: np.ndarray,
+    y: np.ndarray,
+    landmark: np.ndarray,
+    axes: np.ndarray | None,
     prior_sd: float | None = None,
     iterations: int = 20,
-    **options: object,
-) -> OffsetCalibration:
-    """`calibrate` with one constant offset a landmark, in the tool's axes or (axes=None) in the images.
+) -> Calibration:
+    """The calibration with one constant offset a landmark, in the tool's axes or (axes=None) in the images.
 
     Gauss-Newton on the offsets with the cameras eliminated: every step is a whole calibration and one Schur complement.
 
     Parameters
     ----------
-    x_mm, u, options:
-        As in `calibrate`; weighting must be "likelihood".
-    landmark:
-        (n,) which landmark each row is, 0 to k - 1.
+    fit:
+        Calibrates positions (n, 3) and pixels (n, m) by likelihood.
+    x, y, landmark:
+        The rows: (n, 3) mm, (n, m) px, and (n,) which landmark.
     axes:
-        R (n, 3, 3) of the tool in each row, from the robot's pose or from `tool_axes`.  None = offsets in the images, for
-        a detector that is off by some pixels whatever the tool does; what all landmarks have in common can then not be
-        told from a shift of the cameras.
+        R (n, 3, 3) of the tool in each row; None = offsets in the images.
     prior_sd:
         Standard deviation of an offset's coordinate, mm or px.  None = the one that makes the data most probable, between 0.1
         and 300 um, or 0.01 and 30 px; without sign of an offset it is the least, which leaves the landmarks where they are.
-
     iterations:
         Most steps; a `RuntimeWarning` says so where they were not enough.
-
-    Raises
-    ------
-    ValueError
-        As `calibrate`, and for arguments that do not fit together.
     """
-    x, landmark = np.asarray(x_mm, dtype=np.float64), np.asarray(landmark)
-    if landmark.shape != (len(x),) or not np.issubdtype(landmark.dtype, np.integer) or (landmark < 0).any():
-        raise ValueError(f"landmark: expected {len(x)} integers from 0, got {landmark.dtype} {landmark.shape}.")
-    if len(x) < 4:
-        raise ValueError(f"x_mm: {len(x)} points are too few; frames with shut jaws have no axes and do not count.")
-    if axes is not None:
-        axes = np.asarray(axes, dtype=np.float64)
-        if axes.shape != (len(x), 3, 3) or not np.isfinite(axes).all():
-            raise ValueError(f"axes: expected ({len(x)}, 3, 3) finite, got {axes.shape}; drop rows of shut jaws.")
-    if options.get("weighting", "likelihood") != "likelihood":
-        raise ValueError("weighting: offsets need the likelihood's weights.")
-    if iterations < 1:
-        raise ValueError(f"iterations: must be at least 1, got {iterations}.")
-    if prior_sd is not None and not prior_sd > 0:
-        raise ValueError(f"prior_sd: must be positive, got {prior_sd}.")
-    k, m = int(landmark.max()) + 1, 2 * len(u)
-    size = 3 if axes is not None else m
-    offset = np.zeros((k, size))
-    pixels = [np.asarray(part, dtype=np.float64) for part in u]
+    size, m = (3 if axes is not None else y.shape[1]), y.shape[1]
+    offset = np.zeros((int(landmark.max()) + 1, size))
     p_value = np.nan
     for _ in range(iterations):
-        if axes is not None:
-            moved, seen = x + np.einsum("nij,nj->ni", axes, offset[landmark]), pixels
-        else:
-            moved = x
-            seen = [part - offset[landmark, 2 * i : 2 * i + 2] for i, part in enumerate(pixels)]
-        found = calibrate(moved, seen, **options)
+        shift = offset[landmark]
+        found = fit(x, y - shift) if axes is None else fit(x + np.einsum("nij,nj->ni", axes, shift), y)
         rows = found.inliers
-        J_c, J_x, weight, r = _system(found)
+        J_x, J_c, weight, r = found.system
         J_o = J_x @ axes[rows] if axes is not None else np.broadcast_to(np.eye(m), (rows.sum(), m, m))
-        J = np.zeros((rows.sum(), m, k * size))
-        for j in range(k):
-            own = landmark[rows] == j
-            J[own, :, j * size : (j + 1) * size] = J_o[own]
+        J = (J_o[:, :, None] * (landmark[rows][:, None] == np.arange(len(offset)))[:, None, :, None]).reshape(len(r), m, -1)
         WJ = weight @ J
         H_cc = np.einsum("nip,niq->pq", J_c, weight @ J_c)
         H_co = np.einsum("nip,niq->pq", J_c, WJ)
@@ -156,31 +100,23 @@ def calibrate_with_offsets(
             least = 1e-4 if axes is not None else 1e-2
             p_value = _score_test(information, gradient, 500 * least)
             prior_sd = prior_sd or _most_probable(information, gradient, least * np.geomspace(1, 3000, 60))
-        covariance = np.linalg.inv(information + np.eye(k * size) / prior_sd**2)
+        covariance = np.linalg.inv(information + np.eye(offset.size) / prior_sd**2)
         step = covariance @ (gradient - offset.ravel() / prior_sd**2)
         offset = offset + step.reshape(offset.shape)
         if np.abs(step).max() < 1e-4 * np.sqrt(np.diag(covariance).min()):
             break
     else:
         warnings.warn(
-            f"iterations: the offsets still move by up to {np.abs(step).max():.2g} {'px' if axes is None else 'mm'} after "
-            f"{iterations}; allow more, or look at the outliers (`ransac_px`), which may differ from step to step.",
+            f"offsets: they still move by up to {np.abs(step).max():.2g} {'px' if axes is None else 'mm'} after {iterations} "
+            "steps; look at the outliers (`ransac_px`), which may differ from step to step.",
             RuntimeWarning,
-            stacklevel=2,
+            stacklevel=3,
         )
-    parameters = found.parameter_covariance + explained @ covariance @ explained.T
-    G = found._fit.state.matrix_jacobian() @ found._model.selection
-    found = replace(found, parameter_covariance=parameters, covariance=G @ parameters @ G.T)
-    blocks = np.stack([covariance[j * size : (j + 1) * size, j * size : (j + 1) * size] for j in range(k)])
-    return OffsetCalibration(found, offset, blocks, prior_sd, p_value)
-
-
-def _system(c: Calibration) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Over the inliers: derivatives by the parameters and by the points, inverse covariance of the residuals, residuals."""
-    state, points = c._fit.state, c._fit.points
-    _, J_x, J_c = state.evaluate(points)
-    S = c._residual_covariance(points, c._inlier_noise)
-    return J_c @ c._model.selection, J_x, np.linalg.inv(S), c._fit.residuals
+    blocks = np.stack([covariance[j : j + size, j : j + size] for j in range(0, offset.size, size)])
+    return found.with_parameter_covariance(
+        found.parameter_covariance + explained @ covariance @ explained.T,
+        LandmarkOffsets(offset, blocks, prior_sd, p_value),
+    )
 
 
 def _most_probable(information: np.ndarray, gradient: np.ndarray, candidates: np.ndarray) -> float:

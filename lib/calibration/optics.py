@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lib.calibration.estimate import Calibration
+from lib.calibration.calibration import Calibration
 from lib.cameras import NearAffineCamera
 from lib.geometry import RigidTransform
 

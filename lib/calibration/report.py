@@ -1,30 +1,35 @@
-"""A calibration in words: figures with units, plain verdicts, the list of outliers."""
+"""A calibration in words: numbers with units, plain verdicts, the list of outliers."""
 
 from __future__ import annotations
 
 import numpy as np
 from scipy.stats import chi2
 
-from lib.calibration.estimate import Calibration
+from lib.calibration.calibration import Calibration
 from lib.calibration.optics import optics
+from lib.correspondences import LANDMARKS
 
-__all__ = ["report"]
+__all__ = ["report", "verdicts"]
 
 
-def report(calibration: Calibration, *, longest: int = 10) -> str:
+def report(calibration: Calibration, *, robot_accuracy_mm: float | None = None, longest: int = 10) -> str:
     """Several lines of text.
 
     Parameters
     ----------
+    robot_accuracy_mm:
+        As the robot's maker states it (`Recording.robot_accuracy_mm`), to compare the estimated noise with.
     longest:
         Outliers listed at most, largest residual first.
     """
     c = calibration
-    rows, used = len(c.inliers), int(c.inliers.sum())
+    rows, used, outliers = len(c.inliers), int(c.inliers.sum()), np.flatnonzero(c.usable & ~c.inliers)
+    usable = int(c.usable.sum())
     value, freedom = c.chi_square
+    left_out = "" if usable == rows else f", {rows - usable} without a detection, position or axes"
     lines = [
         f"Calibration: model {c.model}, weighting {c.weighting}, {len(c.parameter_names)} parameters",
-        f"  rows          {used} of {rows} used, {rows - used} outliers ({100 * (rows - used) / rows:.0f} %)",
+        f"  rows          {used} of {rows} used, {len(outliers)} outliers ({100 * len(outliers) / usable:.0f} %){left_out}",
         f"  noise         sigma_u {c.sigma_u_px:.2f} px, sigma_x {1e3 * c.sigma_x_mm:.1f} um",
         f"  reprojection  {c.reprojection_rms_px:.2f} px RMS, {c.press_rms_px:.2f} px cross-validated (leave one out)",
         f"  chi-square    {value:.0f} for {freedom} degrees of freedom",
@@ -46,45 +51,46 @@ def report(calibration: Calibration, *, longest: int = 10) -> str:
         alone, both = 1e3 * np.median(c.depth_sd_mm(x)), 1e3 * np.median(c.depth_sd_mm(x, detection=True))
         lines.append(f"  head          convergence {np.rad2deg(o.convergence_rad):.2f} deg, mirrored: {o.mirrored}")
         lines.append(f"  depth         {both:.0f} um sd of one detected point, of which the calibration {alone:.1f} um")
+    if c.offsets is not None:
+        scale, unit = (1e3, "um along, across, normal") if c.offsets.offset.shape[1] == 3 else (1.0, "px, left and right")
+        lines.append(f"  offsets       p = {c.offsets.p_value:.2g} without any; {unit}:")
+        for k, (values, sds) in enumerate(zip(c.offsets.offset, c.offsets.standard_deviation, strict=True)):
+            name = LANDMARKS[k] if k < len(LANDMARKS) else f"landmark {k}"
+            lines.append(f"    {name:10s}  " + ", ".join(f"{scale * v:.1f} +- {scale * s:.1f}" for v, s in zip(values, sds)))
     lines.append("Verdicts")
-    lines += [f"  {'ok  ' if fine else 'LOOK'}  {text}" for fine, text in verdicts(c)]
-    outliers = np.flatnonzero(~c.inliers)
+    lines += [f"  {'ok  ' if fine else 'LOOK'}  {text}" for fine, text in verdicts(c, robot_accuracy_mm)]
     if outliers.size:
         distance = np.linalg.norm(c.residuals_px[outliers].reshape(len(outliers), -1, 2), axis=2).max(axis=1)
         lines.append(f"Outliers (row: largest residual of an image), {min(longest, outliers.size)} of {outliers.size}")
-        for i in np.argsort(-distance)[:longest]:
-            lines.append(f"  {outliers[i]:6d}: {distance[i]:.1f} px")
+        lines += [f"  {outliers[i]:6d}: {distance[i]:.1f} px" for i in np.argsort(-distance)[:longest]]
     return "\n".join(lines)
 
 
-def verdicts(calibration: Calibration) -> list[tuple[bool, str]]:
+def verdicts(calibration: Calibration, robot_accuracy_mm: float | None = None) -> list[tuple[bool, str]]:
     """(fine, sentence) for each question a user should ask."""
     c = calibration
-    rows, used = len(c.inliers), int(c.inliers.sum())
+    used, usable = int(c.inliers.sum()), int(c.usable.sum())
     value, freedom = c.chi_square
     found = [
         (used >= 50, f"{used} correspondences" + ("" if used >= 50 else "; 50 or more make the noise estimate firm")),
-        (rows - used <= 0.2 * rows, f"{100 * (rows - used) / rows:.0f} % outliers"),
+        (usable - used <= 0.2 * usable, f"{100 * (usable - used) / usable:.0f} % outliers"),
     ]
     if freedom > 0:
         fits = chi2.sf(value, freedom) > 1e-3
         found.append(
             (fits, "residuals are as large as the noise levels say" if fits else "residuals exceed the noise levels")
         )
+    if robot_accuracy_mm is not None:
+        fine = c.sigma_x_mm <= 2.0 * robot_accuracy_mm
+        text = f"robot noise {1e3 * c.sigma_x_mm:.1f} um, its stated accuracy is {1e3 * robot_accuracy_mm:.1f} um"
+        found.append((fine, text if fine else text + ": check the time offset"))
     x = c.x_mm[c.inliers]
     extent = np.sqrt(np.linalg.eigvalsh(np.cov(x.T))[::-1])
     deep = extent[2] > 10 * max(c.sigma_x_mm, 0.001)
     found.append((deep, f"volume covered: RMS {extent[0]:.2f} x {extent[1]:.2f} x {extent[2]:.2f} mm"))
-    # Residuals without structure: a linear trend was fitted away, a quadratic one would be a wrong model.
-    curvature = _curvature(c)
-    found.append(
-        (
-            curvature > 1e-3,
-            "residuals show no curvature (the camera model fits)"
-            if curvature > 1e-3
-            else "residuals are curved: try model='near_affine' (finite working distance)",
-        )
-    )
+    straight = _curvature(c) > 1e-3
+    curved = "residuals are curved: try model='near_affine' (finite working distance)"
+    found.append((straight, "residuals show no curvature (the camera model fits)" if straight else curved))
     if c.rig is not None:
         depth_mm = float(np.median(c.depth_sd_mm(x, detection=True)))
         known = f"depth of one detected point known to {1e3 * depth_mm:.0f} um"
@@ -96,9 +102,12 @@ def verdicts(calibration: Calibration) -> list[tuple[bool, str]]:
 
 
 def _curvature(c: Calibration) -> float:
-    """p-value of the six quadratic terms of the position in the residuals (an F-like chi-square test)."""
+    """p-value of the six quadratic terms of the position in the residuals (an F-like chi-square test).
+
+    The fit takes any linear trend out of the residuals; a quadratic one means a wrong camera model.
+    """
     x = c.x_mm[c.inliers] - c.x_mm[c.inliers].mean(axis=0)
-    r = c._fit.residuals
+    r = c.system[3]
     if len(x) < 30:
         return 1.0
     x = x / x.std(axis=0)

@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import gammainccinv, gammaincinv
 
-from lib.calibration.affine import Moments, _regress, affine_minimum, estimate_noise
+from lib.calibration.affine import Moments, regress, affine_minimum, estimate_noise
 
 __all__ = ["consensus", "gate"]
 
@@ -88,7 +88,7 @@ def consensus(
             f"u: only {int(keep.sum())} of {n} rows agree on affine cameras; check that x_mm and u belong together "
             "(frames, order of landmarks, time offset), or raise ransac_px."
         )
-    residual = y[keep] - H[keep] @ _regress(x[keep], y[keep]).T
+    residual = y[keep] - H[keep] @ regress(x[keep], y[keep]).T
     if np.sqrt((residual**2).mean()) > 0.25 * np.sqrt(y[keep].var(axis=0).mean()):
         raise ValueError(
             "u: no consensus, all rows look like outliers: the best affine cameras leave "
@@ -118,7 +118,7 @@ def _by_threshold(x: np.ndarray, y: np.ndarray, H: np.ndarray, keep: np.ndarray,
     for _ in range(10):
         if keep.sum() < 5:
             break
-        distance2 = ((y - H @ _regress(x[keep], y[keep]).T) ** 2).reshape(len(y), -1, 2).sum(axis=2)
+        distance2 = ((y - H @ regress(x[keep], y[keep]).T) ** 2).reshape(len(y), -1, 2).sum(axis=2)
         new = (distance2 < threshold_px**2).all(axis=1)
         if (new == keep).all():
             break

@@ -1,27 +1,41 @@
-"""Clocks: the offset between video and robot, and the rows of a rolling shutter."""
+"""The offset between the clocks of video and robot."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.interpolate import BSpline, CubicSpline, make_lsq_spline
+from scipy.interpolate import BSpline, make_lsq_spline
 
-from lib.calibration.affine import Moments, affine_minimum, dlt, estimate_noise
-from lib.calibration.robust import consensus
+from lib.calibration.affine import Moments, affine_minimum, estimate_noise
+from lib.correspondences import Correspondences
+from lib.recordings import Kinematics
 
-__all__ = ["TimeOffset", "estimate_time_offset", "rolling_shutter"]
+__all__ = ["TimeOffset", "estimate_time_offset"]
+
+_GRID = 41  # trial offsets of the coarse search
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TimeOffset:
-    """t_robot = t_video + offset_s, its standard deviation, and the reprojection RMS (px, distance in an image) there."""
+    """t_robot = t_video + offset_s.
+
+    Attributes
+    ----------
+    offset_s, sd_s:
+        The offset and its standard deviation.
+    rms_px:
+        Reprojection RMS there (distance in an image).
+    trial_s, trial_rms_px:
+        Offsets of the coarse search and the RMS at each.
+    """
 
     offset_s: float
     sd_s: float
     rms_px: float
+    trial_s: np.ndarray
+    trial_rms_px: np.ndarray
 
     @property
     def significant(self) -> bool:
@@ -32,44 +46,46 @@ class TimeOffset:
         return f"video to robot: {1e3 * self.offset_s:.2f} +- {1e3 * self.sd_s:.2f} ms"
 
 
-def _spline(time_s: ArrayLike, x_mm: ArrayLike, smooth_s: float) -> tuple[CubicSpline, BSpline, np.ndarray]:
-    """Interpolating and smoothing splines of the kinematics (values (n, k, 3)), and the checked times.
+class _Path:
+    """One landmark's motion as smoothing splines, a piece for each stretch without a gap.
 
     The derivative of an interpolating spline is mostly encoder noise at 100 Hz, and noise in the velocity biases whatever is
-    regressed on it.  The smoothing one is a least-squares cubic with a knot every `smooth_s`.
+    regressed on it.  The pieces are least-squares cubics with a knot every `smooth_s`.
     """
-    time, x = np.asarray(time_s, dtype=np.float64), np.asarray(x_mm, dtype=np.float64)
-    if x.ndim == 2:
-        x = x[:, None]
-    if time.ndim != 1 or x.ndim != 3 or x.shape[2] != 3 or len(x) != len(time):
-        raise ValueError(
-            f"kinematics: expected times (m,) and positions (m, k, 3) or (m, 3), got {time.shape}, {x.shape}."
-        )
-    if len(time) < 4 or not np.isfinite(time).all() or not np.isfinite(x).all() or (np.diff(time) <= 0).any():
-        raise ValueError("kinematics: times must increase, and at least four samples, all finite, are needed.")
-    every = max(4, int(np.ceil(smooth_s / np.median(np.diff(time)))))
-    inner = time[every : len(time) - every : every]
-    knots = np.concatenate([np.full(4, time[0]), inner, np.full(4, time[-1])])
-    return CubicSpline(time, x), make_lsq_spline(time, x, knots, k=3), time
 
+    def __init__(self, time: np.ndarray, x: np.ndarray, smooth_s: float) -> None:
+        known = np.isfinite(x).all(axis=1)
+        time, x = time[known], x[known]
+        self.pieces: list[tuple[float, float, BSpline]] = []
+        if len(time) < 4:
+            return
+        step = float(np.median(np.diff(time)))
+        every = max(4, int(np.ceil(smooth_s / step)))
+        # The motion is smooth within `smooth_s`, so a dropped sample is bridged; a longer silence is not.
+        for part in np.split(np.arange(len(time)), 1 + np.flatnonzero(np.diff(time) > max(smooth_s, 2.5 * step))):
+            if len(part) >= 4:
+                t = time[part]
+                inner = t[every : len(t) - every : every]
+                knots = np.concatenate([np.full(4, t[0]), inner, np.full(4, t[-1])])
+                self.pieces.append((t[0], t[-1], make_lsq_spline(t, x[part], knots, k=3)))
 
-def _images(u: Sequence[ArrayLike], frames: int, landmarks: int) -> np.ndarray:
-    arrays = []
-    for pixels in u:
-        pixels = np.asarray(pixels, dtype=np.float64)
-        if pixels.ndim == 2:
-            pixels = pixels[:, None]
-        if pixels.shape != (frames, landmarks, 2):
-            raise ValueError(f"u: expected ({frames}, {landmarks}, 2) pixels a camera, got {pixels.shape}.")
-        arrays.append(pixels)
-    return np.concatenate(arrays, axis=2)
+    def covers(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        """(n,) bool: one piece holds the whole interval."""
+        inside = [(low >= first) & (high <= last) for first, last, _ in self.pieces]
+        return np.any(inside, axis=0) if inside else np.zeros(len(low), dtype=bool)
+
+    def at(self, time: np.ndarray, derivative: int = 0) -> np.ndarray:
+        """(n, 3) mm, or mm/s, at times that the pieces cover."""
+        x = np.full((len(time), 3), np.nan)
+        for first, last, spline in self.pieces:
+            rows = (time >= first) & (time <= last)
+            x[rows] = spline(time[rows], derivative)
+        return x
 
 
 def estimate_time_offset(
-    video_time_s: ArrayLike,
-    u: Sequence[ArrayLike],
-    robot_time_s: ArrayLike,
-    robot_x_mm: ArrayLike,
+    data: Correspondences | tuple[ArrayLike, list[ArrayLike]],
+    kinematics: Kinematics | tuple[ArrayLike, ArrayLike],
     *,
     start_s: float = 0.0,
     search_s: float = 0.2,
@@ -81,12 +97,12 @@ def estimate_time_offset(
 
     Parameters
     ----------
-    video_time_s:
-        (n,) of the frames.
-    u:
-        One array a camera, (n, 2) or (n, k, 2) px; NaN = missing.
-    robot_time_s, robot_x_mm:
-        (m,) and (m, 3) or (m, k, 3), denser than the motion is fast.
+    data:
+        `Correspondences` with their times, or (time_s (n,), u) with one array a camera, (n, 2) or (n, k, 2) px.  Rows with a
+        missing landmark are left out.
+    kinematics:
+        `lib.recordings.Kinematics`, or (time_s (m,), x_mm (m, 3) or (m, k, 3)), denser than the motion is fast.  NaN where
+        the robot is silent: rows that fall into a gap of more than `smooth_s` are left out.
     start_s, search_s:
         Middle and half width of the search.
     smooth_s:
@@ -95,28 +111,36 @@ def estimate_time_offset(
     Raises
     ------
     ValueError
-        For wrong shapes, or fewer than eight frames inside the kinematics, or a tool that stands still.
+        For wrong shapes, fewer than eight instants inside the kinematics, a tool that stands still, or an offset at the end
+        of the search.
     """
-    _, spline, robot_time = _spline(robot_time_s, robot_x_mm, smooth_s)
-    time = np.asarray(video_time_s, dtype=np.float64)
-    y = _images(u, len(time), spline.c.shape[1])
-    m = y.shape[2]
-    inside = (time + start_s - search_s >= robot_time[0]) & (time + start_s + search_s <= robot_time[-1])
-    if inside.sum() < 8:
+    time, landmark, y = _rows(data)
+    paths, span = _paths(kinematics, smooth_s)
+    if landmark.max(initial=0) >= len(paths):
+        raise ValueError(f"u: {landmark.max() + 1} landmarks, the kinematics have {len(paths)}.")
+    known = np.isfinite(y).all(axis=1) & np.isfinite(time)
+    for k, path in enumerate(paths):
+        rows = known & (landmark == k)
+        known[rows] = path.covers(time[rows] + start_s - search_s, time[rows] + start_s + search_s)
+    if len(np.unique(time[known])) < 8:
         raise ValueError(
-            f"video_time_s: {int(inside.sum())} frames lie inside the kinematics by search_s = {search_s} s; 8 are needed."
+            f"data: {len(np.unique(time[known]))} frames lie inside the kinematics ({span[0]:.3f} to {span[1]:.3f} s) by "
+            f"search_s = {search_s} s, away from gaps; 8 are needed."
         )
-    time, y = time[inside], y[inside].reshape(-1, m)
-    known = np.isfinite(y).all(axis=1)
-    y = y[known]
+    time, landmark, y = time[known], landmark[known], y[known]
+    m = y.shape[1]
 
-    def misfit(offset: float) -> float:
-        x = spline(time + offset).reshape(-1, 3)[known]
-        return affine_minimum(Moments.of(x, y), 1.0, 0.0).cost
+    def at(offset: float, derivative: int = 0) -> np.ndarray:
+        x = np.empty((len(time), 3))
+        for k, path in enumerate(paths):
+            x[landmark == k] = path.at(time[landmark == k] + offset, derivative)
+        return x
+
+    def rms(offset: float) -> float:
+        return float(np.sqrt(4.0 * affine_minimum(Moments.of(at(offset), y), 1.0, 0.0).cost / y.size))
 
     def step_and_sd(offset: float) -> tuple[float, float]:
-        x = spline(time + offset).reshape(-1, 3)[known]
-        v = spline(time + offset, 1).reshape(-1, 3)[known]
+        x, v = at(offset), at(offset, 1)
         matrix = affine_minimum(Moments.of(x, y), 1.0, 0.0).matrix
         r = y - x @ matrix[:, :3].T - matrix[:, 3]
         sigma_u, sigma_x = estimate_noise(r, matrix[:, :3], 4 * m)
@@ -126,83 +150,48 @@ def estimate_time_offset(
         image = (v - H @ np.linalg.lstsq(H, v, rcond=None)[0]) @ matrix[:, :3].T
         information = np.einsum("ni,ij,nj->", image, W, image)
         if information <= 0:
-            raise ValueError("robot_x_mm: the tool moves at no varying speed; the offset cannot be seen.")
+            raise ValueError("kinematics: the tool moves at no varying speed; the offset cannot be seen.")
         return float(np.einsum("ni,ij,nj->", image, W, r) / information), float(information**-0.5)
 
-    offset = min(np.linspace(start_s - search_s, start_s + search_s, 41), key=misfit)
+    low, high = start_s - search_s, start_s + search_s
+    trial = np.linspace(low, high, _GRID)
+    misfit = np.array([rms(offset) for offset in trial])
+    offset = float(trial[misfit.argmin()])
     for _ in range(20):
         step, sd = step_and_sd(offset)
-        offset = float(np.clip(offset + step, start_s - search_s, start_s + search_s))
+        offset = float(np.clip(offset + step, low, high))
         if abs(step) < 1e-7:
             break
-    return TimeOffset(offset, sd, float(np.sqrt(4.0 * misfit(offset) / y.size)))
+    if offset in (low, high):
+        raise ValueError(
+            f"search_s: the best offset, {offset:.3f} s, lies at the end of the search; widen search_s or move start_s."
+        )
+    return TimeOffset(offset, sd, rms(offset), trial, misfit)
 
 
-def rolling_shutter(
-    frame_time_s: ArrayLike,
-    u: Sequence[ArrayLike],
-    robot_time_s: ArrayLike,
-    robot_x_mm: ArrayLike,
-    *,
-    readout_s: float,
-    height_px: int,
-    offset_s: float = 0.0,
-    smooth_s: float = 0.1,
-) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Correspondences of a rolling shutter: kinematics at the time when the landmark's own row was read.
+def _rows(data: Correspondences | tuple) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Times (n,), landmarks (n,) and pixels (n, m), a row a landmark."""
+    if isinstance(data, Correspondences):
+        seen = data.seen.all(axis=1)[:, None]
+        return data.time_s, data.landmark, np.where(seen, np.hstack([data.u_left, data.u_right]), np.nan)
+    time, u = np.asarray(data[0], dtype=np.float64), [np.asarray(pixels, dtype=np.float64) for pixels in data[1]]
+    u = [pixels[:, None] if pixels.ndim == 2 else pixels for pixels in u]
+    if any(p.ndim != 3 or p.shape != (len(time), u[0].shape[1], 2) for p in u):
+        raise ValueError(f"u: expected ({len(time)}, k, 2) pixels a camera, got {[p.shape for p in u]}.")
+    k = u[0].shape[1]
+    return np.repeat(time, k), np.tile(np.arange(k), len(time)), np.concatenate(u, axis=2).reshape(len(time) * k, -1)
 
-    The middle row is read at the frame's time, the last row half `readout_s` later.  The two cameras see a landmark
-    on different rows; x is taken at the mean of their times, and each camera's pixel is moved to it by the
-    landmark's velocity.
 
-    Parameters
-    ----------
-    frame_time_s:
-        (n,) video clock.
-    u:
-        One array a camera, (n, 2) or (n, k, 2) px; NaN = missing.
-    robot_time_s, robot_x_mm:
-        (m,) robot clock and (m, 3) or (m, k, 3) mm.
-    readout_s:
-        First to last row; 0 is a global shutter.
-    height_px:
-        Image height.
-    offset_s:
-        t_robot = t_video + offset_s.
-    smooth_s:
-        As in `estimate_time_offset`, for the velocity.
-
-    Returns
-    -------
-    x_mm:
-        (n, 3) or (n, k, 3), as `robot_x_mm` is; NaN outside the kinematics or where a pixel is missing.
-    u:
-        One array a camera, shaped as given.
-
-    Raises
-    ------
-    ValueError
-        For wrong shapes or a negative read-out time.
-    """
-    if readout_s < 0 or height_px < 2:
-        raise ValueError(f"readout_s, height_px: {readout_s} and {height_px} make no shutter.")
-    spline, smooth, robot_time = _spline(robot_time_s, robot_x_mm, smooth_s)
-    time, landmarks = np.asarray(frame_time_s, dtype=np.float64), smooth.c.shape[1]
-    y = _images(u, len(time), landmarks).reshape(len(time), landmarks, -1, 2)
-    row_time = readout_s * (y[..., 1] / (height_px - 1) - 0.5)  # (n, k, cameras)
-    mean_time = time[:, None] + offset_s + row_time.mean(axis=2)
-    known = np.isfinite(mean_time) & (mean_time >= robot_time[0]) & (mean_time <= robot_time[-1])
-    x, v = np.full((*mean_time.shape, 3), np.nan), np.full((*mean_time.shape, 3), np.nan)
-    for k in range(landmarks):
-        use = known[:, k]
-        x[use, k] = spline(mean_time[use, k])[:, k]
-        v[use, k] = smooth(mean_time[use, k], 1)[:, k]
-    corrected = []
-    agree = known.copy()  # a gross outlier must not spoil the cameras that turn velocity into pixels
-    agree[known] = consensus(x[known], y[known].reshape(known.sum(), -1), None, np.random.default_rng(0))
-    for c, given in enumerate(u):
-        pixels = y[:, :, c]
-        A = dlt(x[agree], pixels[agree]).linear
-        moved = pixels - (v @ A.T) * (row_time[..., c] - row_time.mean(axis=2))[..., None]
-        corrected.append(moved.reshape(np.shape(given)))
-    return (x[:, 0] if np.ndim(robot_x_mm) == 2 else x), corrected
+def _paths(kinematics: Kinematics | tuple, smooth_s: float) -> tuple[list[_Path], tuple[float, float]]:
+    """A path for each landmark, and the first and last time."""
+    given = kinematics if isinstance(kinematics, tuple) else (kinematics.time_s, kinematics.x_mm)
+    time, x = (np.asarray(values, dtype=np.float64) for values in given)
+    if x.ndim == 2:
+        x = x[:, None]
+    if time.ndim != 1 or x.ndim != 3 or x.shape[2] != 3 or len(x) != len(time):
+        raise ValueError(
+            f"kinematics: expected times (m,) and positions (m, k, 3) or (m, 3), got {time.shape}, {x.shape}."
+        )
+    if len(time) < 4 or not np.isfinite(time).all() or (np.diff(time) <= 0).any():
+        raise ValueError("kinematics: times must be finite and increase, and at least four samples are needed.")
+    return [_Path(time, x[:, k], smooth_s) for k in range(x.shape[1])], (time[0], time[-1])

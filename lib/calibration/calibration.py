@@ -1,0 +1,244 @@
+"""`Calibration`: cameras, and how well they are known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from lib.calibration.models import Fit, Model
+from lib.cameras import AffineCamera, NearAffineCamera, Points, Resection, StereoRig
+from lib.geometry import points
+
+__all__ = ["Calibration", "LandmarkOffsets"]
+
+
+@dataclass(frozen=True, eq=False)
+class LandmarkOffsets:
+    """Where the landmarks are seen, relative to where the robot reports them.
+
+    Attributes
+    ----------
+    offset:
+        (k, 3) mm in the tool's axes (along, across, normal), or (k, m) px in the images.
+    covariance:
+        (k, d, d) of each landmark's offset, in the squared unit.
+    prior_sd:
+        Of a coordinate before the data, given or chosen by the evidence.
+    p_value:
+        Probability of offsets as large as the data show if there are none (score test).
+    """
+
+    offset: np.ndarray
+    covariance: np.ndarray
+    prior_sd: float
+    p_value: float
+
+    @property
+    def standard_deviation(self) -> np.ndarray:
+        """(k, d) of the offsets."""
+        return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
+
+    @property
+    def learnt(self) -> np.ndarray:
+        """(k, d): 1 where the data determine an offset, 0 where only the prior speaks."""
+        return 1.0 - (self.standard_deviation / self.prior_sd) ** 2
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """Cameras, and how well they are known; `lib.calibration.calibrate` makes it.
+
+    Attributes
+    ----------
+    cameras:
+        One or two; affine unless the model has 1/distance or radial distortion.
+    rig:
+        The stereo pair, None for one camera.
+    inliers:
+        (n,) bool, the rows used, one entry for each row given.
+    cost:
+        The energy at the minimum over the inliers (Eq. 3 as printed for ``paper``, else half the chi-square).
+    covariance:
+        (8 cameras, 8 cameras) of the entries of the matrices M, row by row, left first; px^2, px^2/mm, px^2/mm^2.
+    parameter_covariance:
+        (p, p) of the model's own parameters.
+    sigma_u_px, sigma_x_mm:
+        Noise levels, given or estimated.  Where the detector's covariances weigh the rows, sigma_u_px is their RMS.
+    residuals_px:
+        (n, 2 cameras) u - project(x), robot error included; NaN in rows that were not usable.
+    model, weighting:
+        As asked for.
+    x_mm, y_px:
+        (n, 3) and (n, 2 cameras), the data, moved by the offsets where these were estimated; NaN in rows that are not
+        usable: a landmark that is missing, or a tool with shut jaws where offsets in its axes are estimated.
+    covariance_px2:
+        Of the pixels: None, (m, m), or (n, m, m) with m = 2 cameras.
+    image_size_px:
+        (width, height), None where not given.
+    plan, minimum:
+        The parsed model and its fit to the inliers.
+    offsets:
+        Constant offsets of the landmarks, None where they were not estimated.
+    """
+
+    cameras: tuple[AffineCamera | NearAffineCamera, ...]
+    rig: StereoRig | None
+    inliers: np.ndarray
+    cost: float
+    covariance: np.ndarray
+    parameter_covariance: np.ndarray
+    sigma_u_px: float
+    sigma_x_mm: float
+    residuals_px: np.ndarray
+    model: str
+    weighting: str
+    x_mm: np.ndarray
+    y_px: np.ndarray
+    covariance_px2: np.ndarray | None
+    image_size_px: tuple[int, int] | None
+    plan: Model
+    minimum: Fit
+    offsets: LandmarkOffsets | None = None
+
+    @property
+    def parameter_names(self) -> list[str]:
+        """Names of the model's parameters, with units."""
+        return self.plan.parameter_names
+
+    @property
+    def usable(self) -> np.ndarray:
+        """(n,) bool: the rows that could be used; those that are no inliers are outliers."""
+        return np.isfinite(self.residuals_px).all(axis=1)
+
+    @property
+    def reprojection_rms_px(self) -> float:
+        """RMS over inliers of the distance |u - project(x)| in an image."""
+        return float(np.sqrt((self.residuals_px[self.inliers] ** 2).sum() / (self.inliers.sum() * len(self.cameras))))
+
+    @property
+    def chi_square(self) -> tuple[float, int]:
+        """Twice the likelihood energy over the inliers and its degrees of freedom; the two are alike where all is well."""
+        _, _, weight, r = self.system
+        value = np.einsum("ni,nij,nj->", r, np.broadcast_to(weight, (len(r), *weight.shape[1:])), r)
+        return float(value), r.size - len(self.parameter_names)
+
+    @property
+    def inverse_distance_per_mm(self) -> tuple[float, float]:
+        """1/d and its standard deviation (the first, where each camera has its own); (0, 0) for affine models."""
+        for i, name in enumerate(self.parameter_names):
+            if "1/distance" in name:
+                return float(self.minimum.state.rho[0]), float(np.sqrt(self.parameter_covariance[i, i]))
+        return 0.0, 0.0
+
+    @cached_property
+    def standard_deviations(self) -> dict[str, float]:
+        """Standard deviation of every parameter by name; that of a log zoom is a relative zoom."""
+        return dict(zip(self.parameter_names, np.sqrt(np.diag(self.parameter_covariance)).tolist(), strict=True))
+
+    def resections(self) -> tuple[Resection, ...]:
+        """K, R, t (paper Eq. 5) of each camera, or of the affine camera that touches a near-affine one."""
+        return tuple(AffineCamera(camera.matrix).resect() for camera in self.cameras)
+
+    # ---- linearised ------------------------------------------------------------------------------------------------
+
+    @property
+    def noise_px2(self) -> np.ndarray:
+        """(m, m) covariance assumed for a new detection of the pair."""
+        return self.sigma_u_px**2 * np.eye(2 * len(self.cameras))
+
+    def derivatives(self, x_mm: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+        """Of the projections at x (n, 3): by the points (n, m, 3) and by the model's parameters (n, m, p)."""
+        _, J_x, J_c = self.minimum.state.evaluate(points(x_mm, 3, "x_mm") - self.minimum.state.reference)
+        return J_x, J_c @ self.plan.selection
+
+    def row_covariance(self, x_mm: ArrayLike) -> np.ndarray:
+        """(n, m, m) px^2 of a new row's residual at x: the noise of its detection and of the robot's report."""
+        J = self.derivatives(x_mm)[0]
+        return self.noise_px2 + self.sigma_x_mm**2 * J @ np.swapaxes(J, 1, 2)
+
+    @cached_property
+    def system(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Over the inliers: derivatives by points and parameters, inverse covariance of the residuals, residuals."""
+        _, J_x, J_c = self.minimum.state.evaluate(self.minimum.points)
+        if self.covariance_px2 is None:
+            noise = self.noise_px2[None]
+        else:
+            noise = self.covariance_px2[None] if self.covariance_px2.ndim == 2 else self.covariance_px2[self.inliers]
+        J = J_x[:1] if self.plan.is_affine else J_x
+        weight = np.linalg.inv(noise + self.sigma_x_mm**2 * J @ np.swapaxes(J, 1, 2))
+        return J_x, J_c @ self.plan.selection, weight, self.minimum.residuals
+
+    def with_parameter_covariance(self, covariance: np.ndarray, offsets: LandmarkOffsets) -> Calibration:
+        """The same cameras with the uncertainty of the landmarks' offsets in theirs."""
+        G = self.minimum.state.matrix_jacobian() @ self.plan.selection
+        return replace(self, parameter_covariance=covariance, covariance=G @ covariance @ G.T, offsets=offsets)
+
+    # ---- uncertainty -----------------------------------------------------------------------------------------------
+
+    def projection_covariance(self, x_mm: ArrayLike) -> np.ndarray:
+        """(n, m, m) px^2 covariance of the projections of exact points, from the calibration's uncertainty alone."""
+        J = self.derivatives(x_mm)[1]
+        return J @ self.parameter_covariance @ np.swapaxes(J, 1, 2)
+
+    def leverage(self, x_mm: ArrayLike) -> np.ndarray:
+        """(n,) how much a point's projection depends on the calibration: its covariance in units of one row's noise.
+
+        For the affine model it is h^T (H^T H)^-1 h with h = [x; 1], and averages 4/n over the data.
+        """
+        S = self.row_covariance(x_mm)
+        return np.trace(np.linalg.solve(S, self.projection_covariance(x_mm)), axis1=1, axis2=2) / S.shape[-1]
+
+    def point_covariance(self, x_mm: ArrayLike, *, detection: bool = True) -> np.ndarray:
+        """(n, 3, 3) mm^2 covariance of triangulated points, with the calibration's own uncertainty.
+
+        Parameters
+        ----------
+        x_mm:
+            Where, (n, 3).
+        detection:
+            False leaves out the noise of the detections: what more calibration data could still remove.
+        """
+        if self.rig is None:
+            raise ValueError("point_covariance: needs a stereo pair; calibrate with [u_left, u_right].")
+        J = self.rig.jacobian(x_mm)
+        weight = np.linalg.inv(self.noise_px2)
+        gain = np.linalg.solve(np.swapaxes(J, 1, 2) @ weight @ J, np.swapaxes(J, 1, 2) @ weight)
+        noise = self.projection_covariance(x_mm)
+        if detection:
+            noise = noise + self.noise_px2
+        return gain @ noise @ np.swapaxes(gain, 1, 2)
+
+    def triangulate(self, u_left: ArrayLike, u_right: ArrayLike, covariance_px2: ArrayLike | None = None) -> Points:
+        """`StereoRig.triangulate`, with the calibration's uncertainty in the covariance and sigma_u_px as the default."""
+        if self.rig is None:
+            raise ValueError("triangulate: needs a stereo pair; calibrate with [u_left, u_right].")
+        found = self.rig.triangulate(u_left, u_right, self.noise_px2 if covariance_px2 is None else covariance_px2)
+        known = np.isfinite(found.x_mm).all(axis=1)
+        covariance = found.covariance_mm2.copy()
+        covariance[known] += self.point_covariance(found.x_mm[known], detection=False)
+        return Points(found.x_mm, covariance, found.epipolar_px)
+
+    def depth_sd_mm(self, x_mm: ArrayLike, *, detection: bool = False) -> np.ndarray:
+        """(n,) standard deviation along the mean viewing direction, for maps of the workspace."""
+        direction = sum(camera.viewing_direction for camera in self.cameras)
+        direction = direction / np.linalg.norm(direction)
+        return np.sqrt(np.einsum("i,nij,j->n", direction, self.point_covariance(x_mm, detection=detection), direction))
+
+    @cached_property
+    def leave_one_out_px(self) -> np.ndarray:
+        """(inliers, m) residual of each inlier to the cameras fitted without it, in closed form.
+
+        It is (I - L)^-1 r, with L the row's own share of its prediction: r / (1 - leverage) for the affine model, exact for
+        DLT.
+        """
+        _, J, weight, r = self.system
+        own = J @ self.parameter_covariance @ np.swapaxes(J, 1, 2) @ weight
+        return np.linalg.solve(np.eye(own.shape[1]) - own, r[:, :, None])[:, :, 0]
+
+    @property
+    def press_rms_px(self) -> float:
+        """Cross-validated reprojection error: RMS distance in an image, each row predicted by the others."""
+        return float(np.sqrt((self.leave_one_out_px**2).sum() / (len(self.leave_one_out_px) * len(self.cameras))))
