@@ -130,7 +130,8 @@ def calibrate(
             axes = None
         elif open_jaws.sum() < 4:
             raise ValueError(
-                f"offsets: {open_jaws.sum()} rows have the tool's axes; the robot must report three landmarks a frame, jaws open."
+                f"offsets: {open_jaws.sum()} rows have the tool's axes; the robot must report three landmarks a frame, with "
+                "open jaws."
             )
         else:
             usable = open_jaws

@@ -56,7 +56,8 @@ def report(calibration: Calibration, *, robot_accuracy_mm: float | None = None, 
         lines.append(f"  offsets       p = {c.offsets.p_value:.2g} without any; {unit}:")
         for k, (values, sds) in enumerate(zip(c.offsets.offset, c.offsets.standard_deviation, strict=True)):
             name = LANDMARKS[k] if k < len(LANDMARKS) else f"landmark {k}"
-            lines.append(f"    {name:10s}  " + ", ".join(f"{scale * v:.1f} +- {scale * s:.1f}" for v, s in zip(values, sds)))
+            numbers = [f"{scale * v:.1f} +- {scale * s:.1f}" for v, s in zip(values, sds, strict=True)]
+            lines.append(f"    {name:10s}  {', '.join(numbers)}")
     lines.append("Verdicts")
     lines += [f"  {'ok  ' if fine else 'LOOK'}  {text}" for fine, text in verdicts(c, robot_accuracy_mm)]
     if outliers.size:

@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import gammainccinv, gammaincinv
 
-from lib.calibration.affine import Moments, regress, affine_minimum, estimate_noise
+from lib.calibration.affine import Moments, affine_minimum, estimate_noise, regress
 
 __all__ = ["consensus", "gate"]
 

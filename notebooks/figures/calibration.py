@@ -10,9 +10,8 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullFormatter
 
-from lib.calibration.estimate import Calibration
+from lib.calibration import Calibration, LandmarkOffsets
 from lib.calibration.ladder import Comparison
-from lib.calibration.offsets import OffsetCalibration
 from lib.geometry import RigidTransform
 from notebooks.figures.style import COLOURS, LANDMARK_COLOURS, figure, show_image
 from notebooks.studies.calibration_studies import NoiseStudy
@@ -383,7 +382,7 @@ def resolutions(study: Mapping[str, object]) -> Figure:
     return page
 
 
-def offsets(names: Sequence[str], found: OffsetCalibration, *, unit_um: float = 1e3) -> Figure:
+def offsets(names: Sequence[str], found: LandmarkOffsets, *, unit_um: float = 1e3) -> Figure:
     """Where the landmarks are seen, in the tool's axes, with two standard deviations."""
     page, ax = figure(width_in=8.5, height_in=3.4)
     at = np.arange(3)

@@ -18,8 +18,8 @@ from scipy.optimize import least_squares
 from scipy.sparse import lil_array
 
 from lib import paths
+from lib.calibration import calibrate, report
 from lib.calibration.affine import Moments, affine_minimum
-from lib.calibration.estimate import calibrate
 from lib.provenance import Provenance, read_records, write_record
 from lib.simulator.rig import simulate_correspondences
 from notebooks.studies import calibration_studies as studies
@@ -194,7 +194,7 @@ def speed(runs: int) -> dict:
     u_left = c.u_left.copy()
     u_left[wrong] = rng.uniform(0, 1900, (wrong.sum(), 2))
     found = calibrate(c.x_mm, [u_left, c.u_right])
-    whole = _best(lambda: calibrate(c.x_mm, [u_left, c.u_right]).report(), 20)
+    whole = _best(lambda: report(calibrate(c.x_mm, [u_left, c.u_right])), 20)
     many = simulate_correspondences(100_000, rng=rng)
     rig = found.rig
     P = [camera.projection_matrix for camera in (rig.left, rig.right)]

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2
 
+from lib.calibration import Calibration, calibrate
 from lib.calibration.advice import box_grid, next_positions
 from lib.calibration.affine import Moments, affine_minimum, dlt, paper_variances
-from lib.calibration.estimate import Calibration, calibrate
 from lib.calibration.ladder import compare_models
 from lib.calibration.pivot import tool_offsets
 from lib.calibration.timing import estimate_time_offset
@@ -265,7 +265,8 @@ def video_of_sweep(
 def time_offset_study(*, offset_s: float = 0.030, runs: int = 40, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Errors and claimed standard deviations (runs,) in seconds, 300 frames of three landmarks at 2 mm/s."""
     rng = np.random.default_rng(seed)
-    found = [estimate_time_offset(*video_of_sweep(offset_s, rng=rng)) for _ in range(runs)]
+    videos = [video_of_sweep(offset_s, rng=rng) for _ in range(runs)]
+    found = [estimate_time_offset((time, u), (robot_time, x)) for time, u, robot_time, x in videos]
     return np.array([f.offset_s - offset_s for f in found]), np.array([f.sd_s for f in found])
 
 

@@ -13,10 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from lib import paths
-from lib.calibration.estimate import Calibration, calibrate
-from lib.calibration.offsets import OffsetCalibration, calibrate_with_offsets, tool_axes
-from lib.calibration.timing import rolling_shutter
+from lib import correspondences, paths
+from lib.calibration import Calibration, calibrate
 from lib.cameras import NearAffineCamera, StereoRig
 from lib.landmarks.engines import default_engine
 from lib.landmarks.inference import CODE_VERSION, Detector, Landmarks
@@ -138,17 +136,10 @@ def digest(*files: Path) -> str:
 
 
 def row_timed(recording: Recording, landmarks: StereoLandmarks, *, min_confidence: float = 0.2) -> Correspondences:
-    """Correspondences of a recording with every position taken when its own image row was read (`rolling_shutter`)."""
+    """Correspondences of a recording with every position taken when its own image row was read ."""
     rows = landmarks.correspondences(min_confidence=min_confidence)
-    x, u = rolling_shutter(
-        recording.frames.time_s,
-        [landmarks.left.u, landmarks.right.u],
-        recording.kinematics.time_s,
-        recording.kinematics.x_mm,
-        readout_s=recording.readout_s,
-        height_px=recording.image_size_px[1],
-        offset_s=recording.offset_s,
-    )
+    timed = correspondences.of_recording(recording, landmarks.left.u, landmarks.right.u)
+    x, *u = (timed.grid(name) for name in ("x_mm", "u_left", "u_right"))
     at = (rows.frame, rows.landmark)
     good = np.isfinite(x[at]).all(axis=1)
     return replace(rows, x_mm=x[at], u_left=u[0][at], u_right=u[1][at])[good]
@@ -266,17 +257,16 @@ def calibrate_offsets(
     in_images: bool = False,
     own_covariances: bool = False,
     **options: object,
-) -> tuple[OffsetCalibration, Correspondences]:
-    """`calibrate_with_offsets` of a recording's correspondences, the tool's axes from the robot; and the rows used."""
-    axes = None
-    if not in_images:
-        axes = tool_axes(recording.landmarks_mm())[rows.frame]
-        open_jaws = np.isfinite(axes).all(axis=(1, 2))
-        rows, axes = rows[open_jaws], axes[open_jaws]
+) -> tuple[Calibration, Correspondences]:
+    """`calibrate` with offsets of a recording's correspondences; and the rows given."""
+    covariance = None
     if own_covariances:
-        options["covariance_px2"] = rows.covariance_px2
-    found = calibrate_with_offsets(
-        rows.x_mm, [rows.u_left, rows.u_right], rows.landmark, axes, image_size_px=recording.image_size_px, **options
+        covariance = np.stack([rows.covariance_px2[:, :2, :2], rows.covariance_px2[:, 2:, 2:]], axis=1)
+    data = correspondences.Correspondences.of_points(
+        rows.x_mm, rows.u_left, rows.u_right, covariance_px2=covariance, frame=rows.frame, landmark=rows.landmark
+    )
+    found = calibrate(
+        data, offsets="image" if in_images else "tool", image_size_px=recording.image_size_px, **options
     )
     return found, rows
 
@@ -304,7 +294,7 @@ def estimates(
         ("offsets_and_covariances", {"own_covariances": True}),
     ):
         fit, used = calibrate_offsets(recording, rows, model=model, seed=seed, **choice)
-        found[name] = fit.calibration, used
+        found[name] = fit, used
     found["labels_1_px"] = plain(label_rows(recording, click_px=1.0, seed=seed))
     return found
 

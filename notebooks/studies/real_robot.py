@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import minimize_scalar
 
-from lib.calibration.estimate import Calibration, calibrate
+from lib.calibration import Calibration, calibrate
 
 __all__ = ["RobotFrames", "SphereFit", "calibrate_sphere", "find_spheres", "read_robot_frames"]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lib.calibration import Moments, OnlineCalibration, affine_minimum, calibrate
+from lib.calibration import Moments, OnlineCalibration, affine_minimum, calibrate, report
 from lib.simulator.rig import simulate_correspondences
 from notebooks.studies.calibration_evaluation import solve_with_ceres, solve_with_scipy
 
@@ -35,7 +35,7 @@ def test_calibration_with_outliers_and_report(benchmark, model):
     wrong = rng.random(1500) < 0.3
     u_left = c.u_left.copy()
     u_left[wrong] = rng.uniform(0, 1900, (wrong.sum(), 2))
-    text = benchmark(lambda: calibrate(c.x_mm, [u_left, c.u_right], model=model).report())
+    text = benchmark(lambda: report(calibrate(c.x_mm, [u_left, c.u_right], model=model)))
     assert "outliers" in text
 
 

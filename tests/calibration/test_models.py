@@ -99,12 +99,12 @@ def test_minimum_is_stationary(name):
     found = fit(model, start, *data)
     assert found.converged
     sd = np.sqrt(np.diag(np.linalg.inv(found.information)))
-    from lib.calibration.models import _settle
+    from lib.calibration.models import settle
 
     for j, s in enumerate(sd):
         for sign in (-1, 1):
             moved = found.state.moved(model.selection[:, j] * sign * 0.01 * s)
-            assert _settle(moved, *data[:2], None, *data[2:], model.is_affine)[0] >= found.cost
+            assert settle(moved, *data[:2], None, *data[2:], model.is_affine)[0] >= found.cost
 
 
 def near_pair(distance_mm):

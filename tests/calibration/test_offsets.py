@@ -5,7 +5,8 @@ import warnings
 import numpy as np
 import pytest
 
-from lib.calibration.offsets import calibrate_with_offsets, tool_axes
+from lib.calibration import calibrate, tool_axes
+from lib.correspondences import Correspondences
 from lib.geometry import RigidTransform
 from lib.simulator.rig import IMAGE_SIZE_PX, ROBOT_FROM_MICROSCOPE
 from notebooks.studies.calibration_studies import near_affine_rig
