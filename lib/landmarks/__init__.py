@@ -1,5 +1,6 @@
 """Landmarks of the forceps in an image: base, tip_1, tip_2, with covariance and confidence (paper Sec. III)."""
 
-from lib.landmarks.inference import Detector, Landmarks
+from lib.landmarks.detect import detect
+from lib.landmarks.detector import Detector, Landmarks
 
-__all__ = ["Detector", "Landmarks"]
+__all__ = ["Detector", "Landmarks", "detect"]

@@ -21,20 +21,12 @@ import torch
 from torch import Tensor, nn
 
 from lib import paths
+from lib.landmarks.detector import CLOSE, MISSING_BELOW, Detector
 from lib.landmarks.engines import LastOutput, openvino
+from lib.landmarks.error_model import ErrorModel, closeup_peaks, corrected, covariance_and_confidence
 from lib.landmarks.heatmaps import Peaks, decode
-from lib.landmarks.inference import (
-    CLOSE,
-    CLOSEUP_REACH_PX,
-    MIN_CONFIDENCE,
-    Calibration,
-    Detector,
-    as_tensor,
-    believed,
-    calibrated,
-    closeup_peaks,
-)
-from lib.landmarks.windows import CLOSEUP_ZOOM, expected_in_closeup
+from lib.landmarks.images import as_tensor
+from lib.landmarks.windows import CLOSEUP_REACH_PX, CLOSEUP_ZOOM, expected_in_closeup
 from lib.recordings import Recording
 
 __all__ = [
@@ -71,7 +63,7 @@ class StageWithDecoding(nn.Module):
         self.network = LastOutput(network, mirror=detector.mirror and stage == "window")
         self.stride, self.method = None if self.closeup else network.stride, detector.method
         self.scale = detector.reduction if stage == "frame" else 1
-        fit = detector.calibration.get(stage, Calibration())
+        fit = detector.error_models.get(stage, ErrorModel())
         self.register_buffer("log_variance", torch.tensor(fit.coefficients, dtype=torch.float32))
         self.register_buffer("logit", torch.tensor(fit.logit))
         self.register_buffer("gain", torch.tensor(fit.gain))
@@ -93,10 +85,10 @@ class StageWithDecoding(nn.Module):
                 one.width.repeat(1, 3),
                 one.covariance.repeat(1, 3, 1, 1),
             )
-            peaks = believed(Peaks(*parts), self.expected, self.gain, self.bias, self.reach)
+            peaks = corrected(Peaks(*parts), self.expected, self.gain, self.bias, self.reach)
         else:
             peaks = decode(seen, self.stride, method=self.method)
-        covariance, confidence = calibrated(peaks, self.scale, self.log_variance, self.logit)
+        covariance, confidence = covariance_and_confidence(peaks, self.scale, self.log_variance, self.logit)
         u = peaks.u * self.scale + (self.scale - 1) / 2
         return u, covariance, confidence
 
@@ -140,7 +132,7 @@ def export(detector: Detector, folder: str | Path, examples: np.ndarray) -> dict
             u, covariance, confidence = run_onnx(path, x.numpy())
             with torch.inference_mode():
                 expected, expected_covariance, expected_confidence = (part.numpy() for part in module(x))
-            seen = expected_confidence >= MIN_CONFIDENCE
+            seen = expected_confidence >= MISSING_BELOW
             if not seen.any():
                 raise ValueError(f"examples: the stage {stage!r} finds nothing in them; give other frames.")
             difference = float(np.abs(u - expected)[seen].max())

@@ -18,6 +18,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
+from lib.correspondences import LANDMARKS
+
 __all__ = [
     "ABLATION",
     "HourglassConfig",
@@ -28,7 +30,6 @@ __all__ = [
     "network_of",
 ]
 
-LANDMARKS = ("base", "tip_1", "tip_2")
 STEM_STRIDE = 4
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from tqdm.auto import tqdm
 
-from lib.landmarks.inference import Detector, Landmarks
+from lib.landmarks.detector import Detector, Landmarks
 from lib.recordings import Recording
 
 __all__ = ["Correspondences", "StereoLandmarks", "detect"]

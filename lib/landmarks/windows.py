@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 __all__ = [
     "CLOSEUP_BEHIND_PX",
+    "CLOSEUP_REACH_PX",
     "CLOSEUP_ZOOM",
     "closeup_from_image",
     "cut",
@@ -27,6 +28,8 @@ __all__ = [
 CLOSEUP_ZOOM = (0.65, 0.85, 0.85)
 #: How far behind its landmark, along the tool, a closeup is centred, image pixels: how a jaw tapers tells where it ends.
 CLOSEUP_BEHIND_PX = (0.0, 18.0, 18.0)
+#: A closeup counts only if it sees its landmark nearer than this to where it was expected, image pixels.
+CLOSEUP_REACH_PX = 20.0
 
 
 def direction_rad(u: ArrayLike) -> np.ndarray:

@@ -8,7 +8,7 @@ from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
 
-from lib.landmarks.inference import Detector
+from lib.landmarks import Detector
 from lib.landmarks.windows import CLOSEUP_ZOOM
 from lib.provenance import commit_id, machine
 from lib.recordings import Recording

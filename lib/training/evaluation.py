@@ -15,22 +15,13 @@ from scipy.optimize import minimize
 from scipy.stats import chi2
 from tqdm.auto import tqdm
 
+from lib.correspondences import LANDMARKS
 from lib.geometry import image_from_cell
+from lib.landmarks.detector import CLOSE, TRACKED_FROM, Detector, Landmarks
+from lib.landmarks.error_model import ErrorModel, features_of
 from lib.landmarks.heatmaps import DECODERS, decode
-from lib.landmarks.inference import (
-    CLOSE,
-    CLOSEUP_REACH_PX,
-    MIN_TRACKED,
-    Calibration,
-    Detector,
-    Landmarks,
-    _missing,
-    features_of,
-    joined,
-)
 from lib.landmarks.metrics import Scores, calibration_error, errors_px, pck, score, tool_length_px
-from lib.landmarks.network import LANDMARKS
-from lib.landmarks.windows import CLOSEUP_ZOOM, expected_in_closeup, map_points
+from lib.landmarks.windows import CLOSEUP_REACH_PX, CLOSEUP_ZOOM, expected_in_closeup, map_points
 from lib.recordings import Recording
 
 __all__ = ["Evaluation", "calibrate", "compare_decoders", "evaluate", "evaluate_recording", "focus_distance_mm", "main"]
@@ -163,7 +154,7 @@ def evaluate(
         length.append(tool_length_px(np.asarray(u, dtype=float)[None])[0])
     if not names:
         raise ValueError("frames: no labelled frame to evaluate on.")
-    return Evaluation(joined(found), np.stack(labels), np.stack(visibility), np.array(length), names)
+    return Evaluation(Landmarks.join(found), np.stack(labels), np.stack(visibility), np.array(length), names)
 
 
 def labelled_frames(
@@ -222,7 +213,7 @@ def calibrate(
     below `CLOSEUP_REACH_PX`), log linear in the peak's features.  The tips, each other's mirror images, share everything.
     Errors have longer tails than a Gaussian: a mean normalised squared error of 2 leaves more than 5 % outside the 95 %
     ellipses, and ellipses that hold 95 % make it less than 2.  The constants stand halfway, for the base and for the tips.
-    Of a closeup's correction as much is believed as leaves the smallest errors, which are then centred (`Calibration.gain`,
+    Of a closeup's correction as much is believed as leaves the smallest errors, which are then centred (`ErrorModel.gain`,
     `bias`); while tracking, all of it.  Tracking is fitted on the same frames, the tool displaced by `TRACKED_SHIFT_PX`,
     every fourth time by five times as much.
     Confidence: logistic regression of "in view and within 5 % of the tool's length" on the same features.
@@ -240,7 +231,7 @@ def calibrate(
     """
     frames = list(frames)
     # What a closeup sees of itself, not what was believed of it so far.
-    detector = replace(detector, calibration={k: v for k, v in detector.calibration.items() if k not in CLOSE})
+    detector = replace(detector, error_models={k: v for k, v in detector.error_models.items() if k not in CLOSE})
     rough: list[Landmarks] = []
     rng = np.random.default_rng(0)
     for stage in detector.stages:
@@ -251,19 +242,19 @@ def calibrate(
             labels = np.where(in_view[:, None], u, np.nan)
             tolerance = 0.05 * tool_length_px(np.asarray(u, dtype=float)[None])
             if stage == "frame":
-                peaks, _ = detector.frame_peaks(image[None])
+                peaks = detector.frame_peaks(image[None])
                 which = np.indices((1, 3)).reshape(2, 3).T
                 feature = features_of(peaks.double(), detector.reduction)[0].numpy()
                 difference = image_from_cell(peaks.u[0].double().numpy(), detector.reduction) - labels
             else:
                 start = rough[i].u
-                if close and not (rough[i].confidence >= MIN_TRACKED).all():
+                if close and not (rough[i].confidence >= TRACKED_FROM).all():
                     continue  # nothing is followed from such an image
                 if stage == "tracking":
                     # A tool that jumps now and then, which tracking has to notice.
                     moved_px = TRACKED_SHIFT_PX * (5 if rng.random() < 0.25 else 1)
                     before = replace(rough[i], u=start + rng.normal(0, moved_px / np.sqrt(2), (1, 1, 2)))
-                    start = detector._refined(image[None], before, stage).u
+                    start = detector.refine(image[None], before, stage).u
                 peaks, matrices, which = detector.stage_peaks(image[None], start, stage)
                 if not len(which):
                     continue
@@ -302,16 +293,13 @@ def calibrate(
         with np.errstate(invalid="ignore"):
             correct = np.linalg.norm(error, axis=1) <= tolerance
         fit = _fit(feature, error, correct, which, gross)
-        fit = Calibration.of(fit.log_variance, fit.logit, gain.tolist(), bias.tolist())
-        detector = detector.with_calibration(**{stage: fit})
+        fit = ErrorModel.of(fit.log_variance, fit.logit, gain.tolist(), bias.tolist())
+        detector = detector.with_error_models(**{stage: fit})
         # What the next stage starts from.
         if stage == "frame":
-            rough = [
-                _missing(detector._calibrated(detector.frame_peaks(f[1][None])[0], stage, detector.reduction))
-                for f in frames
-            ]
+            rough = [detector.coarse(f[1][None]) for f in frames]
         elif stage != "tracking":
-            rough = [detector._refined(f[1][None], r, stage) for f, r in zip(frames, rough, strict=True)]
+            rough = [detector.refine(f[1][None], r, stage) for f, r in zip(frames, rough, strict=True)]
     return detector
 
 
@@ -342,7 +330,7 @@ def compare_decoders(
 
 def _fit(
     features: np.ndarray, errors: np.ndarray, correct: np.ndarray, landmark: np.ndarray, gross_px: float
-) -> Calibration:
+) -> ErrorModel:
     """Fit to m peaks: features (m, 3, 4), errors (m, 2), correct (m,), and which landmark each is, (m,)."""
     size = np.linalg.norm(errors, axis=1)
     use = np.isfinite(size) & (size < gross_px)
@@ -375,12 +363,12 @@ def _fit(
 
     logit = minimize(cost, np.array([-4.0, 0.0, 8.0, 0.0]), jac=True, method="L-BFGS-B").x
     log_variance = np.array([variance(0), variance(1)])
-    rows = Calibration(tuple(map(tuple, log_variance.tolist()))).coefficients[landmark[use]]
+    rows = ErrorModel(tuple(map(tuple, log_variance.tolist()))).coefficients[landmark[use]]
     squared = (errors[use] ** 2 / np.exp((rows * features[use, :2]).sum(-1))).sum(1)
     for own, columns in ((~tip[:, 0], np.s_[:1]), (tip[:, 0], np.s_[1:3])):
         if own.any():
             log_variance[:, columns] += 0.5 * np.log(np.quantile(squared[own], 0.95) / chi2.ppf(0.95, 2))
-    return Calibration(tuple(map(tuple, log_variance.tolist())), tuple(map(float, logit)))
+    return ErrorModel(tuple(map(tuple, log_variance.tolist())), tuple(map(float, logit)))
 
 
 def _belief(

@@ -26,8 +26,10 @@ from torch import Tensor, nn
 from tqdm.auto import tqdm
 
 from lib import paths
+from lib.landmarks.checkpoints import load_network, read_checkpoint, write_checkpoint
+from lib.landmarks.error_model import closeup_peaks
 from lib.landmarks.heatmaps import SIGMA_PX, decode, render, sigma_cells
-from lib.landmarks.inference import as_tensor, closeup_peaks, load_network, read_checkpoint, write_checkpoint
+from lib.landmarks.images import as_tensor
 from lib.landmarks.metrics import errors_px, pck, tool_length_px
 from lib.landmarks.network import (
     HourglassConfig,

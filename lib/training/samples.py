@@ -22,8 +22,15 @@ import numpy as np
 from tqdm.auto import tqdm
 
 from lib.geometry import cell_from_image
-from lib.landmarks.inference import CLOSEUP_REACH_PX
-from lib.landmarks.windows import closeup_from_image, cut, direction_rad, map_points, tool_centre, window_from_image
+from lib.landmarks.windows import (
+    CLOSEUP_REACH_PX,
+    closeup_from_image,
+    cut,
+    direction_rad,
+    map_points,
+    tool_centre,
+    window_from_image,
+)
 from lib.parallel import in_processes
 from lib.simulator.population import TEXTURE_SEEDS, VALIDATION_TEXTURE_SEEDS, sample
 from lib.simulator.render import motion_kernel

@@ -12,8 +12,8 @@ from matplotlib.patches import Ellipse, FancyArrowPatch, FancyBboxPatch, Patch
 from matplotlib.ticker import LogLocator
 from scipy.stats import chi2
 
+from lib.landmarks import Landmarks
 from lib.landmarks.heatmaps import Peaks
-from lib.landmarks.inference import Landmarks
 from lib.landmarks.metrics import PCK_THRESHOLDS, reliability
 from lib.landmarks.network import HourglassConfig
 from lib.training.evaluation import Evaluation

@@ -16,8 +16,8 @@ import numpy as np
 from lib import correspondences, paths
 from lib.calibration import Calibration, calibrate
 from lib.cameras import NearAffineCamera, StereoRig
+from lib.landmarks.detector import CODE_VERSION, Detector, Landmarks
 from lib.landmarks.engines import default_engine
-from lib.landmarks.inference import CODE_VERSION, Detector, Landmarks
 from lib.landmarks.stereo import Correspondences, StereoLandmarks, detect
 from lib.recordings import Recording
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE

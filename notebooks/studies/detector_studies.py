@@ -24,10 +24,11 @@ import numpy as np
 import torch
 
 from lib import paths
+from lib.correspondences import LANDMARKS
 from lib.geometry import cell_from_image
+from lib.landmarks import Detector, Landmarks
 from lib.landmarks.engines import LastOutput, OpenVinoNetwork
-from lib.landmarks.inference import Detector, joined
-from lib.landmarks.network import ABLATION, LANDMARKS, HourglassConfig, StackedHourglass
+from lib.landmarks.network import ABLATION, HourglassConfig, StackedHourglass
 from lib.provenance import Provenance, read_records, write_record
 from lib.recordings import Recording, import_retinal_microsurgery
 from lib.training.augmentation import AUGMENTATIONS
@@ -259,7 +260,7 @@ class _FullHd:
         detector = detector.calibrated(images, fit.landmarks, u, fit.visibility)
         detector.save_calibration(folder)
         parts = [detector.refine(image[None], self.test.landmarks[i : i + 1]) for i, image in enumerate(self.images)]
-        return replace(self.test, landmarks=joined(parts))
+        return replace(self.test, landmarks=Landmarks.join(parts))
 
 
 def _network(options: Options) -> HourglassConfig:
@@ -482,7 +483,7 @@ def shipped(options: Options) -> None:
         found = parts[-1].landmarks
         before = replace(found, u=found.u + rng.normal(0, TRACKED_SHIFT_PX / np.sqrt(2), (len(frames), 1, 2)))
         pieces = [detector.track(image[None], before[i : i + 1]) for i, (_, image, _, _) in enumerate(frames)]
-        tracked.append(replace(parts[-1], landmarks=joined(pieces)))
+        tracked.append(replace(parts[-1], landmarks=Landmarks.join(pieces)))
     whole, windows = _together(parts), _together(tracked)
     depth_mm = np.concatenate([focus_distance_mm(recording) for recording in recordings])
     options.record(
@@ -512,7 +513,7 @@ def _together(parts: Sequence[Evaluation]) -> Evaluation:
         np.concatenate([getattr(e, name) for e in parts]) for name in ("u_true", "visibility", "length_px")
     )
     names = [name for e in parts for name in e.names]
-    return Evaluation(joined([e.landmarks for e in parts]), u_true, visibility, length, names)
+    return Evaluation(Landmarks.join([e.landmarks for e in parts]), u_true, visibility, length, names)
 
 
 def speed(options: Options, repeats: int = 20) -> None:

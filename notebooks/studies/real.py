@@ -15,7 +15,8 @@ import cv2
 import numpy as np
 
 from lib.geometry import cell_from_image, image_from_cell
-from lib.landmarks.inference import Calibration, Detector
+from lib.landmarks import Detector
+from lib.landmarks.error_model import ErrorModel
 from lib.landmarks.metrics import pck, tool_length_px
 from lib.recordings import MonocularSequence
 from lib.training.augmentation import Augmentation
@@ -41,7 +42,7 @@ CROP_PX = 128
 #: Magnification that gives the tool (about 34 px) the length it has in the detector's own recordings (about 270 px).
 ZOOM = REDUCTION
 #: Every detection counts: on real frames confidence is not calibrated.
-_ALWAYS = Calibration(logit=(9.0, 0.0, 0.0, 0.0))
+_ALWAYS = ErrorModel(logit=(9.0, 0.0, 0.0, 0.0))
 
 
 def real_samples(sequence: MonocularSequence, first: int, end: int) -> Samples:
@@ -164,7 +165,7 @@ def finder_alone(detector: Detector, training: Training | None = None) -> Detect
         closeup_network=None,
         reduction=1,
         mirror=False,
-        calibration={"frame": _ALWAYS},
+        error_models={"frame": _ALWAYS},
     )
 
 
@@ -199,7 +200,7 @@ def simulated_to_real(
 
     It has seen no real frame.  The result is in the frames' own pixels.
     """
-    detector = replace(detector, calibration={stage: _always(fit) for stage, fit in detector.calibration.items()})
+    detector = replace(detector, error_models={stage: _always(fit) for stage, fit in detector.error_models.items()})
     size = tuple(round(zoom * s) for s in sequence.image_size_px)
     frames = (
         (name, cv2.resize(image, size, interpolation=cv2.INTER_CUBIC), image_from_cell(u, zoom), visibility)
@@ -216,7 +217,7 @@ def simulated_to_real(
     )
 
 
-def _always(fit: Calibration) -> Calibration:
+def _always(fit: ErrorModel) -> ErrorModel:
     return replace(fit, logit=_ALWAYS.logit)
 
 

@@ -17,7 +17,8 @@ from numpy.typing import ArrayLike
 
 from lib import paths
 from lib.geometry import cell_from_image, image_from_cell
-from lib.landmarks.inference import Calibration, Detector, Landmarks, features_of
+from lib.landmarks import Detector, Landmarks
+from lib.landmarks.error_model import ErrorModel, features_of
 from lib.landmarks.metrics import tool_length_px
 from lib.landmarks.network import StackedHourglass
 from lib.landmarks.windows import map_points
@@ -76,7 +77,7 @@ class ReducedDetector:
     finder: Detector
     network: StackedHourglass
     size_px: tuple[int, int]
-    calibration: Calibration = field(default_factory=Calibration)
+    calibration: ErrorModel = field(default_factory=ErrorModel)
 
     @cached_property
     def _last(self) -> Detector:
@@ -84,7 +85,7 @@ class ReducedDetector:
             self.finder.frame_network,
             window_network=self.network,
             window_px=window_side_px(self.size_px),
-            calibration={"window": self.calibration},
+            error_models={"window": self.calibration},
         )
 
     def __call__(self, images: ArrayLike, *, batch: int = 4) -> Landmarks:
@@ -102,7 +103,7 @@ class ReducedDetector:
         """The windows' stage alone, from rough landmarks in the images' pixels."""
         small, u, stride = self.reduced(images, rough.u)
         scale = np.outer(stride, stride)
-        found = self._last._refined(small, Landmarks(u, rough.covariance / scale, rough.confidence), "window")
+        found = self._last.refine(small, Landmarks(u, rough.covariance / scale, rough.confidence), "window")
         return Landmarks(image_from_cell(found.u, stride), found.covariance * scale, found.confidence)
 
     def calibrated(
@@ -161,8 +162,8 @@ def load_resolution(
     if not (folder / "last.safetensors").is_file():
         raise FileNotFoundError(f"{folder}: not trained; run `python3 -m notebooks.studies.detector_studies resolution`.")
     network = load_training(folder / "last.safetensors").network
-    fit = Calibration()
+    fit = ErrorModel()
     if (folder / "calibration.json").is_file():
-        fit = Calibration.of(**json.loads((folder / "calibration.json").read_text()))
+        fit = ErrorModel.of(**json.loads((folder / "calibration.json").read_text()))
     finder = finder or Detector.load()
     return ReducedDetector(replace(finder, window_network=None, closeup_network=None), network, RESOLUTIONS[name], fit)

@@ -11,8 +11,8 @@ import torch
 
 from lib.landmarks import Detector, Landmarks
 from lib.landmarks.engines import ENGINES, default_engine
+from lib.landmarks.error_model import ErrorModel
 from lib.landmarks.heatmaps import DECODERS, decode, render
-from lib.landmarks.inference import Calibration
 from lib.landmarks.network import HourglassConfig, StackedHourglass
 
 PAPER_HZ = {(1080, 1920): 35, (480, 854): 77, (480, 640): 95, (256, 448): 140}
@@ -26,8 +26,8 @@ def pair(size):
 def test_the_papers_configuration(benchmark, size):
     """Two stacks of 64 features over the whole frame."""
     benchmark.extra_info.update(paper_hz=PAPER_HZ[size], threads=torch.get_num_threads())
-    sure = {"frame": Calibration(logit=(9.0, 0.0, 0.0, 0.0))}
-    detector = Detector(StackedHourglass(HourglassConfig(64, 2)), method="paper", calibration=sure)
+    sure = {"frame": ErrorModel(logit=(9.0, 0.0, 0.0, 0.0))}
+    detector = Detector(StackedHourglass(HourglassConfig(64, 2)), method="paper", error_models=sure)
     benchmark.pedantic(detector, (pair(size),), rounds=3, warmup_rounds=1)
 
 
@@ -38,8 +38,8 @@ def test_coarse_to_fine(benchmark, mode, engine):
     if engine == "openvino" and default_engine() != engine:
         pytest.skip("OpenVINO is not installed here")
     shipped = Detector.load(engine=engine)
-    sure = Calibration(logit=(9.0, 0.0, 0.0, 0.0))
-    detector = shipped.with_calibration(frame=sure, tool=sure, window=sure, tracking=sure)
+    sure = ErrorModel(logit=(9.0, 0.0, 0.0, 0.0))
+    detector = shipped.with_error_models(frame=sure, tool=sure, window=sure, tracking=sure)
     torch.nn.init.zeros_(detector.closeup_network.head[-1].weight)  # on noise it would lose the tool now and then
     detector = replace(detector)
     images = pair((1080, 1920))

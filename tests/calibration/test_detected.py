@@ -7,7 +7,7 @@ import pytest
 
 from lib import paths
 from lib.calibration import calibrate
-from lib.landmarks.inference import Landmarks
+from lib.landmarks import Landmarks
 from lib.landmarks.stereo import StereoLandmarks
 from lib.recordings import Recording
 from notebooks.studies import calibration_evaluation as evaluation

@@ -12,8 +12,9 @@ from lib import paths
 from lib.landmarks import Detector, Landmarks
 from lib.landmarks import export as module
 from lib.landmarks.engines import OpenVinoNetwork, accelerated, default_engine, openvino
+from lib.landmarks.error_model import ErrorModel
 from lib.landmarks.export import PARITY_CONFIDENCE, PARITY_PX, export, export_shipped, run_onnx
-from lib.landmarks.inference import Calibration, as_tensor
+from lib.landmarks.images import as_tensor
 from lib.landmarks.network import HourglassConfig, OffsetConfig, OffsetNetwork, StackedHourglass
 from lib.recordings import Recording
 from lib.training.evaluation import evaluate_recording
@@ -36,8 +37,8 @@ def trained(toy):
         validate_every=40, precision="fp32",
     )  # fmt: skip
     network = train(config, toy(60), toy(4, seed=2), progress=False).network
-    fit = Calibration(((-0.1, 0.4, 0.5, 0.9, -0.2, 0.1), (0.3, 0.1, -0.2, 0.8, 0.1, 0.0)), (3.0, -0.1, 2.0, -0.3))
-    return Detector(network, 1, calibration={"frame": fit}), toy(3, seed=7).images
+    fit = ErrorModel(((-0.1, 0.4, 0.5, 0.9, -0.2, 0.1), (0.3, 0.1, -0.2, 0.8, 0.1, 0.0)), (3.0, -0.1, 2.0, -0.3))
+    return Detector(network, 1, error_models={"frame": fit}), toy(3, seed=7).images
 
 
 @needs_openvino
@@ -160,7 +161,7 @@ def test_every_exported_stage_is_that_of_the_detector(tmp_path):
     looks = {
         "window": replace(detector, closeup_network=None),
         "closeup": detector,
-        "tracking": lambda images: detector._refined(images, expected, "tracking"),
+        "tracking": lambda images: detector.refine(images, expected, "tracking"),
     }
     for stage, reference in looks.items():
         windows, matrices, which = detector.windows(images, expected.u, stage)

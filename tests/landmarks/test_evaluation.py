@@ -8,8 +8,9 @@ import pytest
 import torch
 
 from lib import paths
-from lib.landmarks import Detector, inference, metrics
-from lib.landmarks.inference import Calibration
+from lib.landmarks import Detector, metrics
+from lib.landmarks import detector as detector_module
+from lib.landmarks.error_model import ErrorModel
 from lib.landmarks.network import HourglassConfig, OffsetConfig, OffsetNetwork
 from lib.training import evaluation
 from lib.training import samples as dataset
@@ -28,9 +29,9 @@ def small(toy):
     )  # fmt: skip
     unseen = toy(40, seed=5)
     network = train(config, toy(60), toy(4, seed=2), progress=False).network
-    keep = Calibration(logit=(5.0, 0.0, 0.0, 0.0))
+    keep = ErrorModel(logit=(5.0, 0.0, 0.0, 0.0))
     frames = [(str(i), unseen.images[i], unseen.u[i], unseen.visibility[i]) for i in range(40)]
-    return Detector(network, calibration={"frame": keep}), frames
+    return Detector(network, error_models={"frame": keep}), frames
 
 
 def test_calibration_makes_covariances_and_confidence_true(small):
@@ -70,19 +71,19 @@ def test_fitted_variance_of_known_errors():
 
 def test_closeups_that_know_nothing_do_no_harm(small, monkeypatch):
     """The corrections of an untrained offset network are a constant, which is bias, or noise, which is not believed."""
-    for module in (evaluation, inference):
-        monkeypatch.setattr(module, "MIN_TRACKED", 0.0)  # toys are too small to be sure of
+    for module in (evaluation, detector_module):
+        monkeypatch.setattr(module, "TRACKED_FROM", 0.0)  # toys are too small to be sure of
     detector, frames = small
     torch.manual_seed(0)
     closeup = OffsetNetwork(OffsetConfig(4, 32)).eval()
     torch.nn.init.normal_(closeup.head[-1].weight, std=0.5)
     full = replace(detector, window_network=detector.frame_network, window_px=64, closeup_network=closeup)
     once = calibrate(full, frames)
-    assert set(once.calibration) == {"frame", "window", "closeup", "tracking"}
-    gain = np.array(once.calibration["closeup"].gain)
+    assert set(once.error_models) == {"frame", "window", "closeup", "tracking"}
+    gain = np.array(once.error_models["closeup"].gain)
     assert ((gain >= 0) & (gain <= 1)).all()
-    assert once.calibration["tracking"].gain == ((1.0, 1.0),) * 3
-    assert calibrate(once, frames).calibration == once.calibration  # what was believed before does not matter
+    assert once.error_models["tracking"].gain == ((1.0, 1.0),) * 3
+    assert calibrate(once, frames).error_models == once.error_models  # what was believed before does not matter
     errors = [np.nanmedian(evaluate(d, frames).error_px) for d in (once, replace(once, closeup_network=None))]
     assert errors[0] < errors[1] + 0.5
 
@@ -104,10 +105,10 @@ def test_as_much_of_a_correction_is_believed_as_helps():
 
 
 def test_calibration_of_another_version_is_named():
-    assert Calibration.of([[0.0] * 6] * 2, [1.0] * 4).coefficients.shape == (3, 2, 4)
+    assert ErrorModel.of([[0.0] * 6] * 2, [1.0] * 4).coefficients.shape == (3, 2, 4)
     for parts in (([0.0] * 4, [1.0] * 4), ([[0.0] * 6] * 2, [1.0] * 4, [1.0, 1.0])):
-        with pytest.raises(ValueError, match="another version; make it anew"):
-            Calibration.of(*parts)
+        with pytest.raises(ValueError, match="another version; fit it anew"):
+            ErrorModel.of(*parts)
 
 
 def test_evaluation_counts_only_labels_in_view(small):

@@ -1,5 +1,6 @@
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -9,7 +10,11 @@ from safetensors.torch import save_file
 
 from lib import paths
 from lib.landmarks import Detector, Landmarks
-from lib.landmarks.inference import Calibration, as_tensor, peak_features, write_checkpoint
+from lib.landmarks.checkpoints import read_checkpoint, write_checkpoint
+from lib.landmarks.detector import FORMAT
+from lib.landmarks.error_model import ErrorModel, features_of
+from lib.landmarks.heatmaps import Peaks
+from lib.landmarks.images import as_tensor
 from lib.landmarks.network import HourglassConfig, OffsetConfig, OffsetNetwork, StackedHourglass
 from lib.landmarks.windows import (
     CLOSEUP_BEHIND_PX,
@@ -24,13 +29,13 @@ from lib.landmarks.windows import (
 
 def sure():
     """A calibration that keeps every detection."""
-    return {name: Calibration(logit=(5.0, 0.0, 0.0, 0.0)) for name in ("frame", "window")}
+    return {name: ErrorModel(logit=(5.0, 0.0, 0.0, 0.0)) for name in ("frame", "window")}
 
 
 def untrained(reduction=2):
     torch.manual_seed(0)
     networks = [StackedHourglass(HourglassConfig(8, 1)) for _ in range(2)]
-    return Detector(networks[0], reduction, networks[1], window_px=64, calibration=sure())
+    return Detector(networks[0], reduction, networks[1], window_px=64, error_models=sure())
 
 
 @pytest.fixture(scope="module")
@@ -68,15 +73,15 @@ def test_save_and_load(images, tmp_path):
 
 
 def test_missing_is_nan_with_confidence_zero(images):
-    never = {name: Calibration(logit=(-50.0, 0.0, 0.0, 0.0)) for name in ("frame", "window")}
-    found = untrained().with_calibration(**never)(images)
+    never = {name: ErrorModel(logit=(-50.0, 0.0, 0.0, 0.0)) for name in ("frame", "window")}
+    found = untrained().with_error_models(**never)(images)
     assert np.isnan(found.u).all()
     assert np.isnan(found.covariance).all()
     assert (found.confidence == 0).all()
 
 
 def test_whole_frame_detector_has_no_windows(images):
-    detector = Detector(StackedHourglass(HourglassConfig(8, 2)), calibration=sure())
+    detector = Detector(StackedHourglass(HourglassConfig(8, 2)), error_models=sure())
     assert detector.frame_heatmaps(images).shape == (2, 3, 25, 33)
     assert np.isfinite(detector(images).u).all()
 
@@ -153,8 +158,51 @@ def test_missing_corrupt_and_foreign_files_are_named(tmp_path):
         Detector.load(corrupt)
     foreign = tmp_path / "foreign.safetensors"
     save_file({"layer": torch.zeros(3)}, foreign)
-    with pytest.raises(ValueError, match=r"foreign\.safetensors: holds 'foreign weights'"):
+    with pytest.raises(ValueError, match=r"foreign\.safetensors: holds 'foreign weights'.*get the file again"):
         Detector.load(foreign)
+
+
+@pytest.mark.parametrize("where", ["metadata", "tensors"])
+def test_a_flipped_bit_is_noticed_wherever_it_is(where, tmp_path):
+    path = tmp_path / "weights.safetensors"
+    untrained().save(path)
+    content = bytearray(path.read_bytes())
+    header = int.from_bytes(content[:8], "little")
+    # In the metadata: a digit of the error model, so that the header can still be read.
+    at = content.index(b"[5.0") + 1 if where == "metadata" else (8 + header + len(content)) // 2
+    content[at] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=r"weights\.safetensors: damaged.*get the file again"):
+        Detector.load(path)
+
+
+def test_missing_metadata_error_models_and_checksums_are_named(tmp_path):
+    whole, path = tmp_path / "whole.safetensors", tmp_path / "weights.safetensors"
+    detector = untrained()
+    detector.save(whole)
+    tensors, metadata = read_checkpoint(whole, FORMAT)
+    for lacking in ("networks", "reduction", "calibration", "provenance"):
+        write_checkpoint(path, tensors, {name: value for name, value in metadata.items() if name != lacking})
+        with pytest.raises(ValueError, match=rf"weights\.safetensors: its metadata lack '{lacking}'; .* anew"):
+            Detector.load(path)
+    write_checkpoint(path, tensors, metadata | {"calibration": {"frame": metadata["calibration"]["frame"]}})
+    with pytest.raises(ValueError, match=r"weights\.safetensors: no error model for the stages window.*train assemble"):
+        Detector.load(path)
+    with pytest.raises(ValueError, match="no error model for the stages frame, window"):
+        replace(detector, error_models={}).save(whole)
+    save_file(tensors, path, {name: json.dumps(value) for name, value in metadata.items()})
+    with pytest.raises(ValueError, match=r"weights\.safetensors: damaged, its SHA-256 checksum is missing"):
+        Detector.load(path)
+
+
+def test_a_full_disk_leaves_the_old_file(tmp_path, monkeypatch):
+    path = tmp_path / "weights.safetensors"
+    untrained().save(path)
+    before = path.read_bytes()
+    monkeypatch.setattr(Path, "write_bytes", lambda self, data: (_ for _ in ()).throw(OSError(28, "No space left")))
+    with pytest.raises(OSError, match=r"weights\.safetensors: not saved \(No space left"):
+        untrained(reduction=4).save(path)
+    assert [file.name for file in tmp_path.iterdir()] == ["weights.safetensors"] and path.read_bytes() == before
 
 
 def test_weights_of_another_network_are_named(tmp_path):
@@ -207,7 +255,7 @@ def test_tracking_looks_twice_at_closeups_and_knows_when_it_lost_the_tool(images
             rough.u + 1.0, rough.covariance, np.full((len(part), 3), 0.9 if rough.u[0, 0, 0] < 50 else 0.1)
         )
 
-    monkeypatch.setattr(Detector, "_refined", refined)
+    monkeypatch.setattr(Detector, "refine", refined)
     before = Landmarks(np.full((1, 3, 2), 20.0), np.tile(np.eye(2), (1, 3, 1, 1)), np.ones((1, 3)))
     np.testing.assert_array_equal(detector.track(images[:1], before).u, before.u + 2)
     assert looks == ["tracking", "tracking"]
@@ -217,13 +265,13 @@ def test_tracking_looks_twice_at_closeups_and_knows_when_it_lost_the_tool(images
 
 
 def test_closeups_and_what_is_believed_of_them_are_saved(tmp_path, images):
-    fit = Calibration(gain=((0.5, 0.25),) * 3, bias=((0.1, -0.1),) * 3)
+    fit = ErrorModel(gain=((0.5, 0.25),) * 3, bias=((0.1, -0.1),) * 3)
     detector = replace(untrained(), closeup_network=OffsetNetwork(OffsetConfig(4, 32)).eval())
-    detector = detector.with_calibration(closeup=fit)
+    detector = detector.with_error_models(closeup=fit, tracking=ErrorModel())
     detector.save(tmp_path / "weights.safetensors")
     loaded = Detector.load(tmp_path / "weights.safetensors", engine="torch")
     assert loaded.closeup_network.config == OffsetConfig(4, 32)
-    assert loaded.calibration["closeup"] == fit
+    assert loaded.error_models["closeup"] == fit
     np.testing.assert_array_equal(loaded(images).u, detector(images).u)
 
 
@@ -248,8 +296,9 @@ def test_tracking_needs_as_many_landmarks_as_images(images):
 
 
 def test_features_are_finite_for_any_peak():
-    features = peak_features(torch.tensor([0.0, 1e9]), torch.tensor([-3.0, 5.0]), torch.tensor([0.4, 3.0]))
-    assert torch.isfinite(features).all()
+    variance = torch.tensor([0.0, 1e9, torch.nan])[:, None, None] * torch.eye(2)
+    peaks = Peaks(torch.zeros(3, 2), torch.tensor([-3.0, 5.0, 1.0]), torch.tensor([0.4, 3.0, 1.0]), variance)
+    assert torch.isfinite(features_of(peaks, 2.0)).all()
 
 
 @pytest.mark.skipif(not (paths.MODELS / "default.safetensors").exists(), reason="the shipped weights are not there")

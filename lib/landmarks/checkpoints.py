@@ -1,0 +1,87 @@
+"""Weights on disk: safetensors files with JSON metadata and a checksum of both."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save as safetensors_bytes
+from torch import Tensor, uint8
+
+from lib import files
+from lib.landmarks.network import OffsetNetwork, StackedHourglass, config_of, network_of
+
+__all__ = ["load_network", "read_checkpoint", "write_checkpoint"]
+
+_CURE = "get the file again, or train one with `python3 -m lib train`."
+
+
+def checksum(tensors: dict[str, Tensor], metadata: dict[str, str]) -> str:
+    """SHA-256 (hexadecimal) over names, types, shapes and bytes of the tensors and over the metadata but ``"sha256"``."""
+    digest = hashlib.sha256()
+    for name, tensor in sorted(tensors.items()):
+        digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}\n".encode())
+        digest.update(tensor.detach().cpu().contiguous().reshape(-1).view(uint8).numpy().data)
+    for name, value in sorted(metadata.items()):
+        if name != "sha256":
+            digest.update(f"{name} {value}\n".encode())
+    return digest.hexdigest()
+
+
+def write_checkpoint(path: str | Path, tensors: dict[str, Tensor], metadata: dict[str, object]) -> None:
+    """Write tensors, JSON metadata and their checksum as a safetensors file; an error leaves the old file as it was.
+
+    Examples
+    --------
+    >>> import tempfile, torch
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_checkpoint(f"{folder}/a.safetensors", {"x": torch.ones(2)}, {"format": "mine"})
+    ...     read_checkpoint(f"{folder}/a.safetensors", "mine")[0]
+    {'x': tensor([1., 1.])}
+    """
+    tensors = {name: tensor.detach().contiguous() for name, tensor in tensors.items()}
+    texts = {name: json.dumps(value) for name, value in metadata.items()}
+    texts["sha256"] = json.dumps(checksum(tensors, texts))
+    try:
+        files.write_bytes(path, safetensors_bytes(tensors, metadata=texts))
+    except OSError as error:
+        text = f"{path}: not saved ({error.strerror}); an earlier file there is unharmed"
+        raise OSError(error.errno, text) from error
+
+
+def read_checkpoint(path: str | Path, kind: str) -> tuple[dict[str, Tensor], dict[str, object]]:
+    """Tensors and metadata of a file that `write_checkpoint` wrote with ``metadata["format"] == kind``.
+
+    Raises
+    ------
+    FileNotFoundError, ValueError
+        If there is no such file; if it is damaged, has no checksum, or holds something else.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such weights file; train one with `python3 -m lib train`.")
+    try:
+        with safe_open(path, framework="pt") as file:
+            texts = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}
+        metadata = {name: json.loads(value) for name, value in texts.items()}
+    except (SafetensorError, ValueError, OSError) as error:
+        raise ValueError(f"{path}: corrupt, or no weights file of this program ({error}); {_CURE}") from error
+    if metadata.get("format") != kind:
+        raise ValueError(f"{path}: holds {metadata.get('format', 'foreign weights')!r}, expected {kind!r}; {_CURE}")
+    if metadata.pop("sha256", None) != checksum(tensors, texts):
+        raise ValueError(f"{path}: damaged, its SHA-256 checksum is missing or does not fit its content; {_CURE}")
+    return tensors, metadata
+
+
+def load_network(path: str | Path, config: dict, tensors: dict[str, Tensor]) -> StackedHourglass | OffsetNetwork:
+    """A network from its configuration and weights; errors name the file."""
+    try:
+        network = network_of(config_of(config))
+        network.load_state_dict(tensors)
+    except (TypeError, RuntimeError, ValueError) as error:
+        text = str(error).splitlines()[0]
+        raise ValueError(f"{path}: its weights do not fit its configuration ({text}); {_CURE}") from error
+    return network

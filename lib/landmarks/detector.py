@@ -1,0 +1,425 @@
+"""The detector: images in, landmarks with covariance and confidence out.
+
+It works from coarse to fine.  The first stage finds the tool in the whole frame at low resolution; the second names its
+landmarks in one upright window round the tool; the third finds each landmark in a small window at full resolution; the
+last measures it in a closeup.  The first stage alone, at full resolution, is the paper's detector (Sec. III).
+One safetensors file holds all that a detector needs: weights, configuration, error models and provenance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from torch import Tensor
+
+from lib import paths
+from lib.geometry import image_from_cell
+from lib.landmarks.checkpoints import load_network, read_checkpoint, write_checkpoint
+from lib.landmarks.engines import accelerated, default_engine
+from lib.landmarks.error_model import ErrorModel, closeup_peaks, corrected, covariance_and_confidence
+from lib.landmarks.heatmaps import Peaks, decode
+from lib.landmarks.images import as_tensor, as_uint8
+from lib.landmarks.network import OffsetNetwork, StackedHourglass
+from lib.landmarks.windows import (
+    CLOSEUP_REACH_PX,
+    CLOSEUP_ZOOM,
+    closeup_from_image,
+    cut,
+    direction_rad,
+    expected_in_closeup,
+    tool_centre,
+    window_from_image,
+)
+from lib.parallel import single_threaded_torch
+
+__all__ = ["CLOSE", "CODE_VERSION", "MISSING_BELOW", "TRACKED_FROM", "Detector", "Landmarks"]
+
+FORMAT = "microstereo.detector"
+#: Version of the code between weights and landmarks (windows, decoding, what counts as missing).  Every change that moves
+#: landmarks raises it, so that stored detections are computed again.
+CODE_VERSION = 4
+#: A landmark with a lower confidence counts as missing: NaN, confidence 0.
+MISSING_BELOW = 0.05
+#: A landmark with a lower confidence gets no closeup and is not followed from frame to frame.
+TRACKED_FROM = 0.5
+#: The stages that look at closeups: of what the windows found, and of what was found in the frame before.
+CLOSE = ("closeup", "tracking")
+
+
+@dataclass(frozen=True)
+class Landmarks:
+    """Detections in n images; the order is base, tip_1, tip_2.
+
+    Attributes
+    ----------
+    u:
+        (n, 3, 2) px, NaN where missing.
+    covariance:
+        (n, 3, 2, 2) px^2, NaN where missing.
+    confidence:
+        (n, 3), the probability that the landmark is in view and `u` lies within 5 % of the tool's length of it;
+        0 where missing.
+
+    Examples
+    --------
+    >>> found = Landmarks.none(2)
+    >>> len(found), len(found[:1]), found.confidence.max()
+    (2, 1, 0.0)
+    """
+
+    u: np.ndarray
+    covariance: np.ndarray
+    confidence: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.u)
+
+    def __getitem__(self, index: slice | np.ndarray) -> Landmarks:
+        return Landmarks(self.u[index], self.covariance[index], self.confidence[index])
+
+    @classmethod
+    def none(cls, n: int) -> Landmarks:
+        """Nothing found in n images."""
+        return cls(np.full((n, 3, 2), np.nan), np.full((n, 3, 2, 2), np.nan), np.zeros((n, 3)))
+
+    @classmethod
+    def join(cls, parts: Sequence[Landmarks]) -> Landmarks:
+        """The landmarks of several sets of images, one after the other."""
+        return cls(*(np.concatenate([getattr(p, name) for p in parts]) for name in ("u", "covariance", "confidence")))
+
+    def without_unsure(self) -> Landmarks:
+        """NaN and confidence 0 for every landmark below `MISSING_BELOW`."""
+        missing = ~(self.confidence >= MISSING_BELOW)
+        return Landmarks(
+            np.where(missing[..., None], np.nan, self.u),
+            np.where(missing[..., None, None], np.nan, self.covariance),
+            np.where(missing, 0.0, self.confidence),
+        )
+
+    def _put(self, rows: np.ndarray, values: Landmarks) -> None:
+        self.u[rows], self.covariance[rows], self.confidence[rows] = values.u, values.covariance, values.confidence
+
+
+@dataclass(frozen=True, eq=False)
+class Detector:
+    """Finds the landmarks in whole frames of any size and number; the same detector serves the left and the right camera.
+
+    Attributes
+    ----------
+    frame_network:
+        Network of the first stage, which sees the frame reduced by `reduction`.
+    reduction:
+        Image pixels per pixel of the first stage's input, an integer; 1 is the paper's whole-frame detector.
+    window_network:
+        Network of the third stage, which sees upright windows of `window_px` at full resolution, one for each landmark;
+        None = no such stage.
+    tool_network, tool_reduction:
+        Network of the second stage, which sees one upright window of `window_px` round the tool, reduced by
+        `tool_reduction`; None = no such stage.
+    closeup_network:
+        Network of the last stage, which sees a closeup of each landmark that the windows found and predicts where in it
+        the landmark lies; None = no such stage.
+    error_models:
+        One for each stage: ``"frame"``, ``"tool"``, ``"window"``, ``"closeup"``, and ``"tracking"`` for the closeups that
+        follow a landmark from frame to frame.
+    mirror:
+        The windows' network sees every window and its mirror image, and the mean counts: twice the work.
+    engine:
+        What runs the networks, one of `lib.landmarks.engines.ENGINES`; the weights are the same.
+
+    Examples
+    --------
+    >>> detector = Detector.load()
+    >>> found = detector(np.zeros((1, 270, 480, 3), np.uint8))
+    >>> found.u.shape, bool((found.confidence < 0.5).all())
+    ((1, 3, 2), True)
+    """
+
+    frame_network: StackedHourglass
+    reduction: int = 1
+    window_network: StackedHourglass | None = None
+    tool_network: StackedHourglass | None = None
+    tool_reduction: int = 5
+    window_px: int = 128
+    method: str = "gauss_newton"
+    error_models: dict[str, ErrorModel] = field(default_factory=dict)
+    metadata: dict[str, object] = field(default_factory=dict)
+    closeup_network: OffsetNetwork | None = None
+    mirror: bool = False
+    engine: str = "torch"
+
+    def __post_init__(self) -> None:
+        if self.reduction < 1 or self.reduction != int(self.reduction):
+            raise ValueError(f"reduction: must be a positive integer, got {self.reduction}.")
+        if self.closeup_network and not self.window_network:
+            raise ValueError("closeup_network: looks at what a window_network has found; give one.")
+        if self.mirror and self.window_network and self.window_px % self.window_network.stride:
+            raise ValueError(f"mirror: needs window_px to be a multiple of the stride, got {self.window_px}.")
+        run = {
+            name: accelerated(network, self.engine, mirror=self.mirror and name == "window")
+            for name, network in self.networks.items()
+        }
+        object.__setattr__(self, "_run", run)
+
+    @property
+    def networks(self) -> dict[str, StackedHourglass | OffsetNetwork]:
+        """The networks by stage, in the order of their use."""
+        stages = {
+            "frame": self.frame_network,
+            "tool": self.tool_network,
+            "window": self.window_network,
+            "closeup": self.closeup_network,
+        }
+        return {name: network for name, network in stages.items() if network is not None}
+
+    @property
+    def stages(self) -> list[str]:
+        """The stages, each with an error model: the networks, and tracking, which uses the closeups' network."""
+        return [*self.networks, *(["tracking"] if self.closeup_network else [])]
+
+    def with_error_models(self, **models: ErrorModel) -> Detector:
+        """A copy with the error models of some stages (``frame=``, ``window=``, ...) replaced."""
+        return replace(self, error_models={**self.error_models, **models})
+
+    # Files
+
+    @classmethod
+    def load(cls, path_or_name: str | Path | None = None, *, engine: str | None = None) -> Detector:
+        """A detector from a weights file, or from a name in ``data/models``; None is the shipped default.
+
+        `engine` runs its networks; None is the fastest that is installed (`lib.landmarks.engines`).
+
+        Raises
+        ------
+        FileNotFoundError, ValueError
+            If the file is missing, damaged, incomplete, or no detector; the text names it and the cure.
+        """
+        path = Path(path_or_name or "default")
+        if not path.suffix and not path.is_file():
+            path = paths.MODELS / f"{path.name}.safetensors"
+        tensors, metadata = read_checkpoint(path, FORMAT)
+        parts: dict[str, StackedHourglass | OffsetNetwork] = {}
+        try:
+            for name, config in metadata["networks"].items():
+                own = {key.removeprefix(f"{name}."): value for key, value in tensors.items() if key.startswith(f"{name}.")}
+                parts[name] = load_network(path, config, own)
+            detector = cls(
+                parts["frame"],
+                window_network=parts.get("window"),
+                tool_network=parts.get("tool"),
+                closeup_network=parts.get("closeup"),
+                error_models={name: ErrorModel.of(*fit) for name, fit in metadata["calibration"].items()},
+                metadata=metadata["provenance"],
+                engine=engine or default_engine(),
+                **{name: metadata[name] for name in _SETTINGS},
+            )
+        except KeyError as error:
+            raise ValueError(f"{path}: its metadata lack {error}; make the file anew with Detector.save.") from error
+        detector._check_complete(path)
+        return detector
+
+    def save(self, path: str | Path) -> None:
+        """Write the detector as one safetensors file; `ValueError` if a stage has no error model."""
+        self._check_complete(path)
+        tensors = {
+            f"{name}.{key}": value
+            for name, network in self.networks.items()
+            for key, value in network.state_dict().items()
+        }
+        metadata = {
+            "format": FORMAT,
+            "networks": {name: asdict(network.config) for name, network in self.networks.items()},
+            "calibration": {
+                name: [fit.log_variance, fit.logit, fit.gain, fit.bias] for name, fit in self.error_models.items()
+            },
+            "provenance": self.metadata,
+        }
+        write_checkpoint(path, tensors, metadata | {name: getattr(self, name) for name in _SETTINGS})
+
+    def _check_complete(self, path: str | Path) -> None:
+        lacking = [stage for stage in self.stages if stage not in self.error_models]
+        if lacking:
+            raise ValueError(
+                f"{path}: no error model for the stages {', '.join(lacking)}, so covariance and confidence would mean "
+                "nothing; fit them with `lib.training.evaluation.calibrate` or `python3 -m lib train assemble`."
+            )
+
+    # Detection
+
+    def __call__(self, images: ArrayLike, *, batch: int = 4) -> Landmarks:
+        """Landmarks of images (n, h, w, 3), uint8 RGB or float in [0, 1]; `batch` images at a time.
+
+        Raises
+        ------
+        ValueError
+            For images of another shape, type or range.
+        """
+        images = as_uint8(images)
+        found = []
+        with self._threads():
+            for start in range(0, len(images), batch):
+                part = images[start : start + batch]
+                result = self.coarse(part)
+                for stage in list(self.networks)[1:]:
+                    result = self.refine(part, result, stage)
+                found.append(result)
+        return Landmarks.join(found)
+
+    def track(self, images: ArrayLike, previous: Landmarks, *, min_confidence: float = TRACKED_FROM) -> Landmarks:
+        """Landmarks of the frames that follow `previous`: by closeups (or windows) alone, by whole frames where these fail.
+
+        Parameters
+        ----------
+        images:
+            (n, h, w, 3), such as the left and the right image of one time.
+        previous:
+            Landmarks of the n images before.
+        min_confidence:
+            An image with a landmark below this is searched as a whole.
+        """
+        images = as_uint8(images)
+        if len(previous) != len(images):
+            raise ValueError(f"previous: holds {len(previous)} images, but images {len(images)}.")
+        if self.window_network is None:
+            return self(images)
+        usable = np.flatnonzero((previous.confidence >= min_confidence).all(1) & np.isfinite(previous.u).all((1, 2)))
+        result = Landmarks.none(len(images))
+        if usable.size:
+            with self._threads():
+                part = images if usable.size == len(images) else images[usable]  # a pair of frames takes 12 MB
+                near = previous[usable]
+                # The first closeup says where to look, the second measures.
+                for stage in ["window"] if self.closeup_network is None else ["tracking", "tracking"]:
+                    near = self.refine(part, near, stage)
+                result._put(usable, near)
+        lost = np.flatnonzero((result.confidence < min_confidence).any(1))
+        if lost.size:
+            result._put(lost, self(images[lost]))
+        return result.without_unsure()
+
+    def _threads(self) -> AbstractContextManager[None]:
+        """One thread for small windows, torch's own for whole frames."""
+        return nullcontext() if self.window_network is None else single_threaded_torch()
+
+    def coarse(self, images: ArrayLike) -> Landmarks:
+        """Landmarks by the first stage alone."""
+        return self._measured(self.frame_peaks(images), "frame", self.reduction).without_unsure()
+
+    def refine(self, images: np.ndarray, rough: Landmarks, stage: str) -> Landmarks:
+        """Landmarks by a later stage, which looks where the `rough` ones lie; ``"tracking"`` is one too."""
+        peaks, matrices, which = self.stage_peaks(images, rough.u, stage)
+        result = Landmarks(rough.u.copy(), rough.covariance.copy(), rough.confidence.copy())
+        if not len(which):
+            return result
+        fine = self._measured(peaks, stage, 1, which[:, 1:])
+        back = np.linalg.inv(matrices[:, :, :2])
+        u = (back @ (fine.u[:, 0] - matrices[:, :, 2])[..., None])[..., 0]
+        covariance = back @ fine.covariance[:, 0] @ back.mT
+        confidence = fine.confidence[:, 0]
+        if stage in CLOSE:
+            seen = peaks.value[:, 0].numpy() > 0
+            confidence = np.where(seen, confidence, 0.0)
+        if stage == "closeup":
+            # The windows decide whether the landmark is there; an unsure one stays where they saw it.
+            seen &= rough.confidence[which[:, 0], which[:, 1]] >= TRACKED_FROM
+            u, covariance, which = u[seen], covariance[seen], which[seen]
+        else:
+            result.confidence[which[:, 0], which[:, 1]] = confidence
+        i, k = which.T
+        result.u[i, k], result.covariance[i, k] = u, covariance
+        return result.without_unsure()
+
+    def frame_heatmaps(self, images: ArrayLike) -> Tensor:
+        """Heatmaps (n, 3, h, w) of the first stage."""
+        return self.outputs(self.reduced(as_uint8(images)), "frame")
+
+    def frame_peaks(self, images: ArrayLike) -> Peaks:
+        """Peaks of the first stage, in pixels of its reduced input."""
+        return decode(self.frame_heatmaps(images), self.frame_network.stride, method=self.method)
+
+    def windows(self, images: np.ndarray, u: ArrayLike, stage: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The inputs of a stage after the first, given rough landmarks u (n, 3, 2); ``"tracking"`` sees closeups too.
+
+        Returns
+        -------
+        Windows (m, s, s, 3) uint8; window_from_image (m, 2, 3); and which (m, 2) image and landmark each window shows,
+        or which image (m,) for ``"tool"``.  A tool without base or tips and a missing landmark have no window.
+        """
+        u = np.asarray(u, dtype=np.float64)
+        angle = direction_rad(u)
+        size = self.window_px if stage in ("tool", "window") else self.closeup_network.config.size_px
+        if stage == "tool":
+            image = which = np.flatnonzero(np.isfinite(angle))
+            matrices = window_from_image(tool_centre(u[which]), angle[which], size, 1 / self.tool_reduction)
+        else:
+            which = np.argwhere(np.isfinite(u).all(2) & np.isfinite(angle)[:, None])
+            image, landmark = which.T
+            place = u[image, landmark], angle[image], size
+            matrices = window_from_image(*place) if stage == "window" else closeup_from_image(*place, landmark)
+        windows = [cut(images[i], matrix, size) for i, matrix in zip(image, matrices, strict=True)]
+        return np.stack(windows) if windows else np.zeros((0, size, size, 3), np.uint8), matrices, which
+
+    def explained(self, image: np.ndarray) -> tuple[Landmarks, np.ndarray, np.ndarray, np.ndarray]:
+        """What the windows show in one image (h, w, 3): landmarks, windows (m, s, s, 3), window_from_image (m, 2, 3), and
+        each window's heatmap (m, c, c) of its own landmark."""
+        found = self(image[None])
+        windows, matrices, which = self.windows(image[None], found.u, "window")
+        if not len(which):
+            return found, windows, matrices, windows[..., 0]
+        heat = self.outputs(windows, "window").numpy()[np.arange(len(which)), which[:, 1]]
+        return found, windows, matrices, heat
+
+    def outputs(self, images: np.ndarray, stage: str) -> Tensor:
+        """A stage's heatmaps (m, 3, h, w) of its input images (m, s, s, 3); of closeups the network's outputs (m, 4)."""
+        with torch.inference_mode():
+            return self._run["closeup" if stage in CLOSE else stage](as_tensor(images))[-1]
+
+    def stage_peaks(self, images: np.ndarray, u: ArrayLike, stage: str) -> tuple[Peaks, np.ndarray, np.ndarray]:
+        """Peaks (m, 1) of a stage after the first, in its windows' pixels; window_from_image (m, 2, 3); which (m, 2).
+
+        Each row of the last is image and landmark.
+        """
+        windows, matrices, which = self.windows(images, u, stage)
+        if not len(which):
+            return Peaks.none(), matrices, np.zeros((0, 2), int)
+        outputs = self.outputs(windows, stage)
+        if stage in CLOSE:
+            size, k = windows.shape[1], which[:, 1]
+            fit, reach = self.error_models.get(stage, ErrorModel()), CLOSEUP_REACH_PX * np.array(CLOSEUP_ZOOM)
+            parts = (expected_in_closeup(size, k), np.array(fit.gain)[k], np.array(fit.bias)[k], reach[k])
+            rows = (torch.from_numpy(part)[:, None].float() for part in parts)
+            return corrected(closeup_peaks(outputs, size), *rows), matrices, which
+        if stage == "tool":  # one window holds all three landmarks
+            which = np.stack([np.repeat(which, 3), np.tile(np.arange(3), len(which))], axis=1)
+            matrices, heatmaps = np.repeat(matrices, 3, axis=0), outputs.flatten(0, 1)[:, None]
+        else:
+            heatmaps = outputs[torch.arange(len(which)), torch.from_numpy(which[:, 1])][:, None]
+        return decode(heatmaps, self.networks[stage].stride, method=self.method), matrices, which
+
+    def reduced(self, images: np.ndarray) -> np.ndarray:
+        """Images averaged over blocks of `reduction` pixels, black beyond the right and bottom border."""
+        r = self.reduction
+        if r == 1:
+            return images
+        h, w = images.shape[1:3]
+        images = np.pad(images, ((0, 0), (0, -h % r), (0, -w % r), (0, 0))) if h % r or w % r else images
+        size = (images.shape[2] // r, images.shape[1] // r)
+        return np.stack([cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in images])
+
+    def _measured(self, peaks: Peaks, stage: str, scale: int, landmark: np.ndarray | slice = np.s_[:]) -> Landmarks:
+        """Peaks in pixels of a network's input as landmarks in image pixels; `landmark` says which each peak is."""
+        fit = self.error_models.get(stage, ErrorModel())
+        rows = (torch.as_tensor(row, dtype=torch.float64) for row in (fit.coefficients[landmark], fit.logit))
+        covariance, confidence = covariance_and_confidence(peaks.double(), scale, *rows)
+        return Landmarks(image_from_cell(peaks.u.numpy(), scale), covariance.numpy(), confidence.numpy())
+
+
+#: The fields that are plain values in a weights file.
+_SETTINGS = ("reduction", "tool_reduction", "window_px", "mirror", "method")

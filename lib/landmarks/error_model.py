@@ -1,0 +1,113 @@
+"""From peaks to covariance and confidence: the error model that is fitted on validation images."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lib.landmarks.heatmaps import Peaks
+
+__all__ = ["ErrorModel", "closeup_peaks", "corrected", "covariance_and_confidence", "features_of"]
+
+
+@dataclass(frozen=True)
+class ErrorModel:
+    """The error model of one stage, fitted by `lib.training.evaluation.calibrate`.
+
+    The covariance of a peak is diagonal in the axes of the stage's input.  In an upright window these run along the tool
+    and across it, the directions in which errors differ most.  The logarithm of the variance in px^2 is a linear function
+    of the peak's features (`features_of`), and so is the logit of the confidence.  The two tips, mirror images of each
+    other, have equal coefficients.
+
+    Attributes
+    ----------
+    log_variance:
+        (2, 6): for x and y the constants of base, tip_1 and tip_2, and the slopes of the other three features.
+    logit:
+        (4,).
+    gain, bias:
+        (3, 2) for base, tip_1 and tip_2 along x and y, closeups only.  A closeup's correction is scaled by the gain that
+        minimises the validation error; the bias is the mean error that this leaves, in the closeup's pixels.
+
+    Examples
+    --------
+    >>> ErrorModel().coefficients.shape
+    (3, 2, 4)
+    """
+
+    log_variance: tuple[tuple[float, ...], ...] = ((0.0, 0.0, 0.0, 1.0, 0.0, 0.0),) * 2
+    logit: tuple[float, ...] = (-4.0, 0.0, 8.0, 0.0)
+    gain: tuple[tuple[float, ...], ...] = ((1.0, 1.0),) * 3
+    bias: tuple[tuple[float, ...], ...] = ((0.0, 0.0),) * 3
+
+    @classmethod
+    def of(
+        cls,
+        log_variance: Sequence[Sequence[float]],
+        logit: Sequence[float],
+        gain: Sequence[Sequence[float]] = ((1.0, 1.0),) * 3,
+        bias: Sequence[Sequence[float]] = ((0.0, 0.0),) * 3,
+    ) -> ErrorModel:
+        """From the lists that JSON keeps; `ValueError` for lists of other lengths."""
+        if [np.shape(part) for part in (log_variance, logit, gain, bias)] != [(2, 6), (4,), (3, 2), (3, 2)]:
+            raise ValueError("error model: is of another version; fit it anew with `python3 -m lib train assemble`.")
+        return cls(tuple(map(tuple, log_variance)), tuple(logit), tuple(map(tuple, gain)), tuple(map(tuple, bias)))
+
+    @property
+    def coefficients(self) -> np.ndarray:
+        """(3, 2, 4): coefficients of the features in each landmark's log variance along x and y."""
+        rows = np.array(self.log_variance)
+        return np.stack([np.column_stack([rows[:, k], rows[:, 3:]]) for k in range(3)])
+
+
+def features_of(peaks: Peaks, scale: float) -> Tensor:
+    """Features (..., 3, 4) of peaks whose pixels are `scale` image pixels: for x, for y, and for both together.
+
+    Each is 1, the log of the fit's variance in px^2, the height of the peak, and |log of its relative width|.
+    """
+    covariance = peaks.covariance * scale**2
+    covariance = torch.where(torch.isfinite(covariance), covariance, torch.eye(2, dtype=covariance.dtype))
+    (xx, xy), (yx, yy) = (row.unbind(-1) for row in covariance.unbind(-2))
+    both = (xx * yy - xy * yx).clamp_min(1e-12).sqrt()
+    one, height, width = torch.ones_like(peaks.value), peaks.value.clamp(-0.5, 1.5), peaks.width.log().abs()
+    rows = [torch.stack([one, v.clamp(1e-4, 1e4).log(), height, width], -1) for v in (xx, yy, both)]
+    return torch.stack(rows, -2)
+
+
+def covariance_and_confidence(
+    peaks: Peaks, scale: float, log_variance: Tensor, logit: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Covariance (..., 2, 2) px^2 and confidence (...) of peaks; torch can trace it.
+
+    `log_variance` (..., 2, 4) are the `ErrorModel.coefficients` of each peak's landmark, `logit` is (4,).
+    """
+    features = features_of(peaks, scale)
+    variance = (features[..., :2, :] * log_variance).sum(-1).clamp(-12, 12).exp()
+    confidence = torch.sigmoid((features[..., 2, :] * logit).sum(-1))
+    return variance[..., None] * torch.eye(2, dtype=variance.dtype), confidence
+
+
+def closeup_peaks(found: Tensor, size_px: int) -> Peaks:
+    """Outputs (n, 4) of an `OffsetNetwork` as peaks (n, 1) of height and width 1.
+
+    The network predicts the scale b of a Laplace distribution, whose variance is 2 b^2.
+    """
+    u = (size_px - 1) / 2 + found[:, None, :2]
+    one = torch.ones_like(u[..., 0])
+    variance = 2 * (2 * found[:, None, 2:]).exp()
+    return Peaks(u, one, one, variance[..., None] * torch.eye(2, dtype=variance.dtype))
+
+
+def corrected(peaks: Peaks, expected: Tensor, gain: Tensor, bias: Tensor, reach: Tensor) -> Peaks:
+    """Closeups' peaks moved from where the landmark was `expected` by `gain` times the correction, less the bias.
+
+    All three are (n, k, 2) or one for all.  A peak further away than `reach` (n, k) closeup pixels gets the value 0: the
+    network was not trained for such distances and sees something else.  Torch can trace it.
+    """
+    move = peaks.u - expected
+    near = (move.square().sum(-1) < reach.square()).to(move.dtype)
+    return replace(peaks, u=expected + gain * move - bias, value=peaks.value * near)
