@@ -1,4 +1,4 @@
-"""Scenes: a smooth height field z(x, y) in the microscope frame with a texture on it.  The eye is the main one."""
+"""The eye: a smooth height field z(x, y) in the microscope frame with a texture on it; and what any scene must offer."""
 
 from __future__ import annotations
 
@@ -9,18 +9,20 @@ from typing import Protocol
 
 import numpy as np
 
+from lib.simulator.limits import check, not_negative, positive
 from lib.simulator.texture import EXTENT_MM, fundus_texture, photograph_texture
 
 __all__ = ["Eye", "Scene"]
 
 
 class Scene(Protocol):
-    """What the renderer needs of a surface.  Lengths are mm in the microscope frame (z into the eye).
+    """What the renderer needs of a surface.  Lengths are mm in the microscope frame (z points into the eye).
 
-    `height(x, y)` is the surface z, `texture` its reflectance (n, n, 3) uint8 over a square of side `extent_mm`
-    round the origin, `gloss` the strength of the wet film's mirror image, 0 for a matt surface.  Optional:
-    `texture_from_surface` (2, 3), where on the texture (x, y) lies, and `step_px`, the grid on which the
-    surface is solved for (8; a rough surface needs less).
+    `height(x, y)` is the surface z.  `texture` is its reflectance (n, n, 3) uint8 over a square of side `extent_mm`
+    around the origin.  `gloss` is the strength of the wet film's mirror image; 0 is a matt surface.
+
+    Two attributes are optional.  `texture_from_surface` (2, 3) maps (x, y, 1) to the texture.  `step_px` is the spacing
+    of the pixels at which the surface is intersected (8 by default; a rough surface needs less).
     """
 
     gloss: float
@@ -41,11 +43,11 @@ class Eye:
     Attributes
     ----------
     seed:
-        Draws folds, tilt and the procedural texture.
+        Draws the folds, the tilt and the procedural texture.
     radius_mm:
-        Of the cut rim.
+        Radius of the cut rim.
     depth_mm:
-        From the rim down to the deepest point.
+        Depth of the deepest point below the rim.
     fold_mm:
         Amplitude of the folds of the collapsed retina.
     tilt_rad:
@@ -53,11 +55,11 @@ class Eye:
     centre_z_mm:
         Height of the deepest point; 0 is the focal plane, positive is deeper.
     texture_path:
-        A photograph to put on the retina in place of the procedural fundus.
+        A photograph that replaces the procedural fundus.
     gloss:
-        Strength of the reflection of the wet surface, 0 to switch it off.
+        Strength of the reflection of the wet surface; 0 switches it off.
     turn_rad:
-        Turns the texture on the surface: more eyes from one texture.
+        Rotation of the texture on the surface, so that one texture serves many eyes.
     """
 
     seed: int = 0
@@ -72,18 +74,12 @@ class Eye:
     turn_rad: float = 0.0
 
     def __post_init__(self) -> None:
-        if not self.radius_mm > 0:
-            raise ValueError(f"radius_mm: the eye's radius must be positive, got {self.radius_mm}.")
-        if not 0 <= self.depth_mm < self.radius_mm:
-            raise ValueError(f"depth_mm: must lie between 0 and the radius {self.radius_mm}, got {self.depth_mm}.")
-        if not 0 <= self.fold_mm <= 0.5:
-            raise ValueError(f"fold_mm: must lie between 0 and 0.5 so that no fold hides another, got {self.fold_mm}.")
-        if not 0 <= self.tilt_rad <= 0.3:
-            raise ValueError(f"tilt_rad: must lie between 0 and 0.3, got {self.tilt_rad}.")
-        if self.gloss < 0:
-            raise ValueError(f"gloss: must not be negative, got {self.gloss}.")
-        if self.texture_px < 64:
-            raise ValueError(f"texture_px: must be at least 64, got {self.texture_px}.")
+        positive(self, "radius_mm")
+        check(self, "depth_mm", lambda v: 0 <= v < self.radius_mm, f"must lie between 0 and the radius {self.radius_mm}")
+        check(self, "fold_mm", lambda v: 0 <= v <= 0.5, "must lie between 0 and 0.5 so that no fold hides another")
+        check(self, "tilt_rad", lambda v: 0 <= v <= 0.3, "must lie between 0 and 0.3")
+        not_negative(self, "gloss")
+        check(self, "texture_px", lambda v: v >= 64, "must be at least 64")
 
     @property
     def extent_mm(self) -> float:

@@ -1,10 +1,10 @@
 """The forceps: a shaft and two curved tapered jaws, as chains of round cones, and their landmarks.
 
-Tool frame: origin at the base, x along the shaft towards the tips, y towards jaw 1, z = x cross y.  The base is
-the point of the shaft's axis where the shaft ends and the jaws begin; tip_1 and tip_2 are the ends of the jaws.
-Jaw 1 is the left one for somebody who looks along the shaft towards the tips from where the microscope stands,
-so in an image that is not mirrored tip_1 lies left of the direction base to tips.  `Pose` keeps the roll about
-the shaft small enough (60 degrees) for that to hold in every image.
+Tool frame: the origin is the base, x runs along the shaft towards the tips, y points towards jaw 1, z = x cross y.
+The base is the point on the shaft's axis where the shaft ends and the jaws begin.  tip_1 and tip_2 are the ends of the
+jaws.  Jaw 1 is the left jaw for an observer at the microscope who looks along the shaft towards the tips.  So in an
+image that is not mirrored, tip_1 lies left of the direction from base to tips.  `Pose` limits the roll about the shaft
+to 60 degrees, so that this holds in every image.
 """
 
 from __future__ import annotations
@@ -13,6 +13,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+
+from lib.simulator.limits import check, not_negative, positive
 
 __all__ = ["MAX_PITCH_RAD", "MAX_ROLL_RAD", "Forceps", "Pose"]
 
@@ -29,11 +31,11 @@ class Pose:
     base_mm:
         The base (3,).
     azimuth_rad:
-        Direction of base to tips in the image plane, from x (right) towards y (down).
+        Direction from base to tips in the image plane, measured from x (right) towards y (down).
     pitch_rad:
-        How far the tips dip below the base, into the eye; 0 is parallel to the image.
+        Angle by which the tips dip below the base, into the eye; 0 is parallel to the image.
     roll_rad:
-        About the shaft; 0 has both jaws equally deep.
+        Rotation about the shaft; at 0 both jaws are equally deep.
     opening_mm:
         Distance between the tips.
     """
@@ -47,14 +49,10 @@ class Pose:
     def __post_init__(self) -> None:
         if np.shape(self.base_mm) != (3,) or not np.isfinite(self.base_mm).all():
             raise ValueError(f"base_mm: expected three finite coordinates, got {self.base_mm}.")
-        if not 0 <= self.pitch_rad <= MAX_PITCH_RAD:
-            raise ValueError(f"pitch_rad: must lie between 0 and {MAX_PITCH_RAD:.2f}, got {self.pitch_rad}.")
-        if not abs(self.roll_rad) <= MAX_ROLL_RAD:
-            raise ValueError(
-                f"roll_rad: beyond {MAX_ROLL_RAD:.2f} an image no longer tells tip_1 from tip_2, got {self.roll_rad}."
-            )
-        if not self.opening_mm >= 0:
-            raise ValueError(f"opening_mm: must not be negative, got {self.opening_mm}.")
+        check(self, "pitch_rad", lambda v: 0 <= v <= MAX_PITCH_RAD, f"must lie between 0 and {MAX_PITCH_RAD:.2f}")
+        rule = f"beyond {MAX_ROLL_RAD:.2f} an image no longer tells tip_1 from tip_2"
+        check(self, "roll_rad", lambda v: abs(v) <= MAX_ROLL_RAD, rule)
+        not_negative(self, "opening_mm")
 
     @property
     def microscope_from_tool(self) -> np.ndarray:
@@ -76,21 +74,21 @@ class Forceps:
     Attributes
     ----------
     shaft_radius_mm:
-        0.3 is the usual 23 gauge, 0.6 mm thick.
+        Radius of the shaft; 0.3 is the usual 23 gauge, 0.6 mm thick.
     jaw_length_mm:
-        Along the shaft's axis from the base to the tips of the closed tool.
+        Distance along the shaft's axis from the base to the tips of the closed tool.
     jaw_radius_mm, tip_radius_mm:
-        Of the jaws at the base and at the very end; the taper between is a power law.
+        Radius of a jaw at the base and at its end; a power law connects the two.
     taper:
-        Its exponent: 1 is a cone, below 1 keeps the jaw thick until close to the tip.
+        Exponent of the power law.  1 is a cone; below 1 the jaw stays thick until close to the tip.
     bow_mm:
-        How far the jaws arch away from each other in the middle when the tips touch.
+        Distance by which each jaw arches outwards in the middle when the tips touch.
     bend_mm:
-        How far both tips bend out of the plane of the jaws, towards the retina.
+        Distance by which both tips bend out of the plane of the jaws, towards the retina.
     hook_mm:
-        How far the last fifth of each jaw turns inwards.
+        Distance by which the last fifth of each jaw turns inwards.
     brightness, brushed:
-        Reflectance of the metal and contrast of its brush marks.
+        Reflectance of the metal, and contrast of its brush marks.
     """
 
     shaft_radius_mm: float = 0.30
@@ -107,18 +105,12 @@ class Forceps:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("shaft_radius_mm", "jaw_length_mm", "jaw_radius_mm", "tip_radius_mm", "taper", "shaft_length_mm"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name}: must be positive, got {getattr(self, name)}.")
-        if not self.tip_radius_mm <= self.jaw_radius_mm <= self.shaft_radius_mm:
-            raise ValueError(
-                "tip_radius_mm, jaw_radius_mm, shaft_radius_mm: must not decrease in this order, got "
-                f"{self.tip_radius_mm}, {self.jaw_radius_mm}, {self.shaft_radius_mm}."
-            )
-        if self.tip_radius_mm > 0.02:
-            raise ValueError(f"tip_radius_mm: beyond 0.02 a tip is no point to measure, got {self.tip_radius_mm}.")
-        if not 0 < self.brightness <= 1:
-            raise ValueError(f"brightness: must lie between 0 and 1, got {self.brightness}.")
+        positive(self, "shaft_radius_mm jaw_length_mm jaw_radius_mm tip_radius_mm taper shaft_length_mm")
+        radii = self.tip_radius_mm, self.jaw_radius_mm, self.shaft_radius_mm
+        if not radii[0] <= radii[1] <= radii[2]:
+            raise ValueError(f"tip_radius_mm, jaw_radius_mm, shaft_radius_mm: must not decrease in this order, got {radii}.")
+        check(self, "tip_radius_mm", lambda v: v <= 0.02, "beyond 0.02 a tip is no point to measure")
+        check(self, "brightness", lambda v: 0 < v <= 1, "must lie between 0 and 1")
 
     def jaw(self, side: int, opening_mm: float, n: int = 15) -> tuple[np.ndarray, np.ndarray]:
         """Centreline (n, 3) in the tool frame and radii (n,), from the base to the tip; `side` +1 is jaw 1.

@@ -8,6 +8,7 @@ import numpy as np
 
 from lib.cameras import StereoRig
 from lib.geometry import RigidTransform
+from lib.simulator.limits import check, not_negative, positive
 from lib.simulator.rig import IMAGE_SIZE_PX, ROBOT_FROM_MICROSCOPE, reference_rig
 
 __all__ = ["Microscope"]
@@ -22,24 +23,26 @@ class Microscope:
     pixels_per_mm, image_rotation_rad, convergence_rad, image_size_px:
         Geometry, as in `reference_rig`.
     depth_of_field_mm:
-        Total range about `focus_z_mm` within which blur adds at most one pixel (standard deviation, at the
-        default zoom) to the sharpest image; infinity switches defocus off.
+        Total range of depth around `focus_z_mm` within which defocus is at most one pixel (standard deviation at
+        100 px per mm); infinity switches defocus off.
     psf_px:
-        Standard deviation of the in-focus point spread.
+        Standard deviation of the point spread in focus.
     exposure_s, readout_s:
         Exposure of a row, and the time between the exposures of the first and the last row (rolling shutter).
     light_slope:
-        Obliqueness of the light (x, y): how far a shadow moves on the retina per mm of height.
+        Obliqueness of the light (x, y): a shadow moves by this many mm on the retina per mm of height.
     spot_mm, spot_radius_mm:
         Where the coaxial light is brightest, and its Gaussian radius.
     brightness, vignetting, gain:
-        Exposure (1 is well exposed), loss at the corners, and each eye's colour gains.
+        Exposure (1 is well exposed), relative loss at the corners, and the colour gains of each eye.
     full_well, read_noise:
-        Electrons at full scale (shot noise) and of read noise; `full_well` infinite switches noise off.
+        Electrons at full scale (shot noise), and read noise in electrons; an infinite `full_well` switches noise off.
     jpeg_quality:
-        Of stored images, 0 to 100; None keeps them lossless.
+        Quality of stored images, 0 to 100; None stores them without loss.
     inverse_distance_per_mm:
         One over the working distance; 0 is affine.
+    fps:
+        Frame rate of the video.
     """
 
     pixels_per_mm: tuple[float, float] = (100.0, 98.0)
@@ -61,36 +64,27 @@ class Microscope:
     read_noise: float = 9.0
     jpeg_quality: int | None = 92
     inverse_distance_per_mm: float = 0.0
+    fps: float = 25.0
 
     def __post_init__(self) -> None:
         if min(self.image_size_px) < 16:
             raise ValueError(f"image_size_px: must be at least 16 x 16, got {self.image_size_px}.")
-        if not self.depth_of_field_mm > 0:
-            raise ValueError(
-                f"depth_of_field_mm: must be positive (infinity switches defocus off), got {self.depth_of_field_mm}."
-            )
-        for name in ("psf_px", "exposure_s", "readout_s", "vignetting", "read_noise", "brightness"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"{name}: must not be negative, got {getattr(self, name)}.")
-        if not self.full_well > 0:
-            raise ValueError(f"full_well: must be positive (infinity switches noise off), got {self.full_well}.")
-        if not self.spot_radius_mm > 0:
-            raise ValueError(f"spot_radius_mm: must be positive, got {self.spot_radius_mm}.")
-        if self.jpeg_quality is not None and not 0 <= self.jpeg_quality <= 100:
-            raise ValueError(f"jpeg_quality: must lie between 0 and 100 or be None, got {self.jpeg_quality}.")
-        if not -0.05 < self.inverse_distance_per_mm < 0.05:
-            raise ValueError(
-                f"inverse_distance_per_mm: the working distance must exceed 20 mm, got {self.inverse_distance_per_mm}."
-            )
+        check(self, "depth_of_field_mm", lambda v: v > 0, "must be positive (infinity switches defocus off)")
+        not_negative(self, "psf_px exposure_s readout_s vignetting read_noise brightness")
+        check(self, "full_well", lambda v: v > 0, "must be positive (infinity switches noise off)")
+        positive(self, "spot_radius_mm fps")
+        check(self, "jpeg_quality", lambda v: v is None or 0 <= v <= 100, "must lie between 0 and 100 or be None")
+        check(self, "inverse_distance_per_mm", lambda v: -0.05 < v < 0.05, "the working distance must exceed 20 mm")
         self.rig(RigidTransform.identity())  # refuses a zoom or convergence that is no rig
 
     def rig(self, robot_from_microscope: RigidTransform = ROBOT_FROM_MICROSCOPE) -> StereoRig:
-        """The true affine cameras; in the microscope frame with `RigidTransform.identity()`."""
+        """The true cameras, affine or near-affine; `RigidTransform.identity()` gives them in the microscope frame."""
         return reference_rig(
             pixels_per_mm=self.pixels_per_mm,
             image_rotation_rad=self.image_rotation_rad,
             convergence_rad=self.convergence_rad,
             image_size_px=self.image_size_px,
+            inverse_distance_per_mm=self.inverse_distance_per_mm,
             robot_from_microscope=robot_from_microscope,
         )
 

@@ -10,6 +10,7 @@ from scipy.interpolate import PchipInterpolator
 
 from lib.simulator.eye import Scene
 from lib.simulator.forceps import MAX_ROLL_RAD, Forceps, Pose
+from lib.simulator.limits import check, not_negative, positive
 
 __all__ = ["MOTIONS", "Motion"]
 
@@ -24,16 +25,16 @@ class Motion:
     Attributes
     ----------
     kind:
-        "sweep": the jaws scan the field at several depths, turning and opening; "surgeon": descend, grasp, peel,
-        pause, release and go elsewhere; "both": a sweep for two thirds of the time, then a surgeon.
+        "sweep": the jaws scan the field at several depths while they turn and open.  "surgeon": descend, grasp, peel,
+        pause, release, then the same elsewhere.  "both": a sweep for two thirds of the time, then a surgeon.
     duration_s:
-        Of the whole trajectory; the faster the shorter.
+        Duration of the whole trajectory; a shorter one is faster.
     depths_mm:
-        Heights of the tips swept through, z in the microscope frame; the retina bounds them.
+        Depths at which the tips sweep, z in the microscope frame; the tips stay above the retina.
     half_field_mm:
-        Half extents (x, y) that the jaws' centre reaches.
+        Half extents (x, y) of the area that the jaws' centre covers.
     tremor_mm:
-        Peak-to-peak amplitude of the physiological tremor, 8 to 12 Hz, in the surgeon's part; 0 filters it.
+        Peak-to-peak amplitude of the physiological tremor (8 to 12 Hz) in the surgeon's part; 0 switches it off.
     """
 
     forceps: Forceps
@@ -48,14 +49,10 @@ class Motion:
     def __post_init__(self) -> None:
         if self.kind not in MOTIONS:
             raise ValueError(f"motion: unknown kind {self.kind!r}; one of {', '.join(MOTIONS)}.")
-        if not self.duration_s > 0:
-            raise ValueError(f"duration_s: must be positive, got {self.duration_s}.")
-        if not self.depths_mm:
-            raise ValueError("depths_mm: at least one height to sweep through.")
-        if min(self.half_field_mm) <= 0:
-            raise ValueError(f"half_field_mm: must be positive, got {self.half_field_mm}.")
-        if self.tremor_mm < 0:
-            raise ValueError(f"tremor_mm: must not be negative, got {self.tremor_mm}.")
+        positive(self, "duration_s")
+        check(self, "depths_mm", len, "at least one height to sweep through")
+        check(self, "half_field_mm", lambda v: min(v) > 0, "must be positive")
+        not_negative(self, "tremor_mm")
 
     @cached_property
     def _parts(self) -> tuple[tuple[float, PchipInterpolator], ...]:
@@ -150,5 +147,5 @@ class Motion:
         return (size * np.sin(2 * np.pi * frequency * time + phase)).sum(axis=1)
 
     def later(self, time_s: float, step_s: float = 1e-3) -> tuple[Pose, float]:
-        """What the renderer's `later` takes: the pose a moment after."""
+        """The pose `step_s` later and `step_s` itself: the renderer's argument `later`."""
         return self.pose(time_s + step_s), step_s

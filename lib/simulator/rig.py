@@ -1,4 +1,4 @@
-"""The reference rig: two affine cameras of a stereo microscope over a robot, and correspondences seen by them.
+"""The reference rig: two cameras of a stereo microscope over a robot, and correspondences as it sees them.
 
 Microscope frame: origin at the centre of the field on the focal plane, x right and y down in the unrotated
 image, z away from the cameras (into the eye), millimetres.
@@ -10,10 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lib.cameras import AffineCamera, StereoRig
+from lib.cameras import AffineCamera, NearAffineCamera, StereoRig
 from lib.geometry import RigidTransform
 
-__all__ = ["IMAGE_SIZE_PX", "ROBOT_FROM_MICROSCOPE", "Correspondences", "reference_rig", "simulate_correspondences"]
+__all__ = ["IMAGE_SIZE_PX", "ROBOT_FROM_MICROSCOPE", "SimulatedSweep", "reference_rig", "simulate_correspondences"]
 
 IMAGE_SIZE_PX = (1920, 1080)
 
@@ -27,6 +27,7 @@ def reference_rig(
     image_rotation_rad: tuple[float, float] = (0.020, -0.015),
     convergence_rad: float = np.deg2rad(6.5),
     image_size_px: tuple[int, int] = IMAGE_SIZE_PX,
+    inverse_distance_per_mm: float = 0.0,
     robot_from_microscope: RigidTransform = ROBOT_FROM_MICROSCOPE,
 ) -> StereoRig:
     """The rig that the simulator models by default: 10 um a pixel, 6.5 degrees between the axes.
@@ -37,6 +38,8 @@ def reference_rig(
         Zoom and in-plane rotation, (left, right), independent of each other.
     convergence_rad:
         Angle between the two viewing directions.
+    inverse_distance_per_mm:
+        One over the working distance; 0 makes the cameras affine, anything else near-affine.
     robot_from_microscope:
         Identity gives the rig in the microscope frame.
 
@@ -44,6 +47,11 @@ def reference_rig(
     ------
     ValueError
         For a zoom or convergence that is not positive.
+
+    Example
+    -------
+    >>> bool(reference_rig().is_affine), bool(reference_rig(inverse_distance_per_mm=1 / 150).is_affine)
+    (True, False)
     """
     if min(pixels_per_mm) <= 0:
         raise ValueError(f"pixels_per_mm: must be positive, got {pixels_per_mm}.")
@@ -58,12 +66,16 @@ def reference_rig(
         spin = RigidTransform.from_rotation_vector((0.0, 0.0, roll))
         camera_from_robot = spin.compose(tilt).compose(microscope_from_robot)
         linear = zoom * camera_from_robot.R[:2]
-        cameras.append(AffineCamera(np.column_stack([linear, zoom * camera_from_robot.t[:2] + centre_px])))
+        matrix = np.column_stack([linear, zoom * camera_from_robot.t[:2] + centre_px])
+        if inverse_distance_per_mm:
+            cameras.append(NearAffineCamera(matrix, inverse_distance_per_mm, centre_px, robot_from_microscope.t))
+        else:
+            cameras.append(AffineCamera(matrix))
     return StereoRig(*cameras)
 
 
 @dataclass(frozen=True)
-class Correspondences:
+class SimulatedSweep:
     """What calibration sees (`x_mm`, `u_left`, `u_right`, with noise) and the noise-free truth beside it."""
 
     x_mm: np.ndarray
@@ -82,8 +94,8 @@ def simulate_correspondences(
     sigma_u_px: float = 1.5,
     sigma_x_mm: float = 0.010,
     robot_from_microscope: RigidTransform = ROBOT_FROM_MICROSCOPE,
-) -> Correspondences:
-    """Landmark positions spread over the field and the depth of field, seen by the rig and told by the robot.
+) -> SimulatedSweep:
+    """Landmark positions spread over the field and the depth of field, as the rig sees them and the robot reports them.
 
     Parameters
     ----------
@@ -97,4 +109,4 @@ def simulate_correspondences(
     rig = rig or reference_rig(robot_from_microscope=robot_from_microscope)
     true_x = robot_from_microscope.apply(rng.uniform(-1, 1, (n, 3)) * half_size_mm)
     u_left, u_right = (u + rng.normal(0, sigma_u_px, u.shape) for u in rig.project(true_x))
-    return Correspondences(true_x + rng.normal(0, sigma_x_mm, (n, 3)), u_left, u_right, true_x, rig)
+    return SimulatedSweep(true_x + rng.normal(0, sigma_x_mm, (n, 3)), u_left, u_right, true_x, rig)

@@ -1,0 +1,147 @@
+"""A window of a camera's image: its frame, the rays of its pixels, and the scene that they meet.
+
+Rays that are parallel, or nearly, meet the smooth height field after a few fixed-point steps.  This is done on a coarse
+grid of pixels; cubic interpolation then gives every pixel with fourth-order accuracy.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+
+import numpy as np
+
+from lib.cameras import AffineCamera, NearAffineCamera
+from lib.simulator.eye import Scene
+
+__all__ = ["Grid", "Window", "intersect", "surface_grid"]
+
+
+@dataclass(frozen=True, eq=False)
+class Window:
+    """What part of a camera's image is rendered.
+
+    Attributes
+    ----------
+    camera:
+        Maps the microscope frame to pixels of the window; square pixels without skew.
+    size_px:
+        (w, h) of the window.
+    field_px, origin_px:
+        (w, h) of the whole image, and the whole image's pixel that is the window's first: vignetting and rolling shutter
+        depend on them.  None is a window that is the whole image.
+    """
+
+    camera: AffineCamera | NearAffineCamera
+    size_px: tuple[int, int]
+    field_px: tuple[int, int] | None = None
+    origin_px: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "field_px", self.field_px or self.size_px)
+        if not np.allclose(self._resection.K, self.zoom * np.eye(2), atol=1e-6 * self.zoom):
+            raise ValueError("camera: the renderer needs square pixels without skew.")
+
+    @cached_property
+    def affine(self) -> AffineCamera:
+        """The affine camera that touches the camera in its reference plane."""
+        return self.camera.affine if isinstance(self.camera, NearAffineCamera) else self.camera
+
+    @cached_property
+    def _resection(self):
+        return self.affine.resect()
+
+    @property
+    def R(self) -> np.ndarray:
+        """Rotation (3, 3) camera_from_microscope; the third row is the viewing direction."""
+        return self._resection.R
+
+    @property
+    def zoom(self) -> float:
+        """px per mm."""
+        return float(self._resection.K[1, 1])
+
+    def seen(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Points (n, 3) mm in the camera frame, and the scale (n,) by which perspective shrinks lengths there.
+
+        In the camera frame pixel = zoom * (x, y), and z is the depth along the viewing direction.
+        """
+        R, camera = self.R, self.camera
+        flat = np.column_stack([x @ R[:2].T + self._resection.t, x @ R[2]])
+        if not isinstance(camera, NearAffineCamera):
+            return flat, np.ones(len(flat))
+        shrink = 1 / (1 + camera.inverse_distance_per_mm * (flat[:, 2] - R[2] @ camera.reference_mm))
+        centre = camera.centre_px / self.zoom
+        return np.column_stack([centre + (flat[:, :2] - centre) * shrink[:, None], flat[:, 2]]), shrink
+
+    def rays(self, u: tuple[np.ndarray, np.ndarray], z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(x, y) mm where the rays of pixels u meet depth z of the microscope frame; all of one shape."""
+        affine, camera = self.affine, self.camera
+        (a, b, c), (d, e, f) = affine.linear
+        right = (u[0] - affine.offset_px[0] - c * z, u[1] - affine.offset_px[1] - f * z)
+        if isinstance(camera, NearAffineCamera):
+            rho, axis, centre = camera.inverse_distance_per_mm, affine.viewing_direction, camera.centre_px
+            du, dv = (u[0] - centre[0]) * rho, (u[1] - centre[1]) * rho
+            along = axis[2] * z - axis @ camera.reference_mm
+            right = (right[0] + du * along, right[1] + dv * along)
+            a, b = a - du * axis[0], b - du * axis[1]
+            d, e = d - dv * axis[0], e - dv * axis[1]
+        determinant = a * e - b * d
+        return (e * right[0] - b * right[1]) / determinant, (a * right[1] - d * right[0]) / determinant
+
+
+def intersect(scene: Scene, window: Window, u: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, ...]:
+    """(x, y, z) mm of the scene at pixels u = (columns, rows).  On an eye each step divides the error by about 30."""
+    z = np.zeros_like(u[0])
+    for _ in range(40):
+        updated = scene.height(*window.rays(u, z))
+        done = np.abs(updated - z).max() < 1e-6
+        z = updated
+        if done:
+            break
+    return *window.rays(u, z), z
+
+
+@lru_cache(maxsize=8)
+def _interpolation(size: int, step: int) -> np.ndarray:
+    """(size, n) weights of the cubic through four neighbours on the coarse grid -step, 0, step, ..."""
+    n = size // step + 4
+    position = np.arange(size) / step + 1
+    first = np.clip(np.floor(position).astype(int) - 1, 0, n - 4)
+    t = position - first  # in 1..2
+    weights = np.zeros((size, n))
+    row = np.arange(size)
+    for j in range(4):
+        others = [k for k in range(4) if k != j]
+        weights[row, first + j] = np.prod([(t - k) / (j - k) for k in others], axis=0)
+    return weights.astype(np.float32)
+
+
+class Grid:
+    """The coarse grid of an image (`u`, its pixels) and the way back to full resolution (`full`)."""
+
+    def __init__(self, size_px: tuple[int, int], step: int) -> None:
+        width, height = size_px
+        self.rows, self.columns = _interpolation(height, step), _interpolation(width, step)
+        self.u = np.meshgrid(
+            (np.arange(self.columns.shape[1]) - 1.0) * step, (np.arange(self.rows.shape[1]) - 1.0) * step
+        )
+
+    def full(self, values: np.ndarray) -> np.ndarray:
+        """(h, w) float32 from values on the coarse grid; exact to 1e-6 of a value of order one."""
+        offset = float(values.mean())
+        return self.rows @ ((values - offset).astype(np.float32) @ self.columns.T) + np.float32(offset)
+
+
+def surface_grid(
+    scene: Scene, camera: AffineCamera | NearAffineCamera, size_px: tuple[int, int], step_px: int = 8
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The true surface: columns (a,) px, rows (b,) px and the points (b, a, 3) mm, microscope frame, seen there.
+
+    Linear interpolation between grid points is right to 1 um for eyes at the default step.
+    """
+    width, height = size_px
+    x_px = np.append(np.arange(0, width - 1, step_px), width - 1).astype(float)
+    y_px = np.append(np.arange(0, height - 1, step_px), height - 1).astype(float)
+    points = intersect(scene, Window(camera, size_px), tuple(np.meshgrid(x_px, y_px)))
+    return x_px, y_px, np.stack(points, axis=-1)
