@@ -1,25 +1,30 @@
 """Recordings with known truth: eye, forceps, microscope and motion of the reference rig.
 
-Everything here is in the microscope frame (`rig.py`) until a recording is written, which is in the robot's.
+Everything here is in the microscope frame (see `rig.py`).  Only a recording that is written is in the robot frame.
 """
 
 from lib.simulator.eye import Eye
 from lib.simulator.forceps import Forceps, Pose
 from lib.simulator.microscope import Microscope
 from lib.simulator.motion import Motion
-from lib.simulator.recording import simulate
-from lib.simulator.render import View, render_pair
+from lib.simulator.recording import Design, Reports, simulate
+from lib.simulator.render import View, render_pair, render_view
 from lib.simulator.scenes import Checkerboard, Relief
+from lib.simulator.window import Window
 
 __all__ = [
     "Checkerboard",
+    "Design",
     "Eye",
     "Forceps",
     "Microscope",
     "Motion",
     "Pose",
     "Relief",
+    "Reports",
     "View",
+    "Window",
     "render_pair",
+    "render_view",
     "simulate",
 ]

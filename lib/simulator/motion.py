@@ -12,9 +12,10 @@ from lib.simulator.eye import Scene
 from lib.simulator.forceps import MAX_ROLL_RAD, Forceps, Pose
 from lib.simulator.limits import check, not_negative, positive
 
-__all__ = ["MOTIONS", "Motion"]
+__all__ = ["DURATIONS_S", "Motion"]
 
-MOTIONS = ("sweep", "surgeon", "both")
+#: Kinds of motion, and how long each takes by default.
+DURATIONS_S = {"sweep": 30.0, "surgeon": 18.0, "both": 45.0}
 _CLEARANCE_MM = 0.12  # between a tip and the retina
 
 
@@ -47,8 +48,8 @@ class Motion:
     tremor_mm: float = 0.15
 
     def __post_init__(self) -> None:
-        if self.kind not in MOTIONS:
-            raise ValueError(f"motion: unknown kind {self.kind!r}; one of {', '.join(MOTIONS)}.")
+        if self.kind not in DURATIONS_S:
+            raise ValueError(f"motion: unknown kind {self.kind!r}; one of {', '.join(DURATIONS_S)}.")
         positive(self, "duration_s")
         check(self, "depths_mm", len, "at least one height to sweep through")
         check(self, "half_field_mm", lambda v: min(v) > 0, "must be positive")

@@ -20,6 +20,7 @@ from lib.simulator.forceps import Forceps, Pose
 from lib.simulator.microscope import Microscope
 from lib.simulator.render import render_view
 from lib.simulator.rig import IMAGE_SIZE_PX
+from lib.simulator.window import Window
 
 __all__ = [
     "RESERVED_JAW_MM",
@@ -203,10 +204,8 @@ def sample(
         microscope = replace(microscope, psf_px=max(0.45, microscope.psf_px * shrink))
     speed = rng.normal(0, 2.0, 3) * (rng.random() < 0.5)
     later = (pose.moved(base_mm=tuple(np.asarray(pose.base_mm) + 1e-3 * speed)), 1e-3)
-    view = render_view(
-        eye, microscope, camera, size, forceps=forceps, pose=pose, later=later, rng=rng, factor=2,
-        field_px=whole, origin_px=tuple(origin),
-    )  # fmt: skip
+    window = Window(camera, size, field_px=whole, origin_px=tuple(origin))
+    view = render_view(eye, microscope, window, forceps=forceps, pose=pose, later=later, rng=rng)
     image, u = view.image, view.u
     if size_px is not None and tuple(size_px) != size:
         factor = np.array(size_px) / size

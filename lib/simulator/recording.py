@@ -3,85 +3,122 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
 import numpy as np
 from tqdm.auto import tqdm
 
-from lib.cameras import AffineCamera, StereoRig
+from lib import files
 from lib.geometry import RigidTransform
 from lib.recordings import Recording, RecordingWriter
 from lib.simulator.eye import Eye, Scene
 from lib.simulator.forceps import Forceps
+from lib.simulator.limits import check, not_negative
 from lib.simulator.microscope import Microscope
-from lib.simulator.motion import Motion
+from lib.simulator.motion import DURATIONS_S, Motion
 from lib.simulator.population import RESERVED_SEEDS, reserved_forceps
-from lib.simulator.render import View, render_pair, surface_grid
+from lib.simulator.render import View, render_pair
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE
+from lib.simulator.window import surface_grid
 
-__all__ = ["simulate"]
+__all__ = ["Design", "Reports", "simulate"]
 
-_KINEMATICS_HZ = 100.0
+_KINEMATICS_HZ, _KINEMATICS_MARGIN = 100.0, 5  # samples before the first and after the last frame
 _GLINT_REACH_PX = 3  # a detector looks at a landmark's surroundings, not at one pixel
 _CLIPPED = 250  # of 255
 
 
-def simulate(
-    folder: str | Path,
-    *,
-    seed: int = 0,
-    n_frames: int = 40,
-    motion: str | Motion = "both",
-    eye: Scene | None = None,
-    forceps: Forceps | None = None,
-    microscope: Microscope | None = None,
-    robot_from_microscope: RigidTransform = ROBOT_FROM_MICROSCOPE,
-    duration_s: float | None = None,
-    fps: float = 25.0,
-    offset_s: float = 0.0,
-    dropout: float = 0.0,
-    robot_accuracy_mm: float = 0.010,
-    click_px: float = 1.0,
-    camera_motion: tuple[int, RigidTransform] | None = None,
-    masks: bool = False,
-    name: str | None = None,
-    description: str = "",
-    progress: bool | Callable[[], object] = True,
-    overwrite: bool = False,
-) -> Recording:
-    """Simulate a recording and write it to `folder`, which appears whole or not at all.
+@dataclass(frozen=True)
+class Reports:
+    """What robot and annotator report, and how well.
 
-    Frames are spread over the motion: the video is kept at every k-th frame of `fps`, as the times in frames.csv
-    say.  The same arguments give the same files.
-
-    Parameters
+    Attributes
     ----------
-    seed:
-        Drives every random source; also chooses eye and forceps where they are None, from designs that
-        `lib.simulator.population.sample` never draws.
-    motion:
-        "sweep" (calibration), "surgeon", "both", or a `Motion`.
-    microscope:
-        With a finite working distance the truth's rig is the affine one that touches the cameras in the focal plane,
-        and the truth's landmarks in the images are those of the cameras.
     robot_from_microscope:
         Where the microscope stands; the recording is in the robot frame.
-    duration_s:
-        Of the motion; None is 30 s for a sweep, 18 s for a surgeon, 45 s for both.
+    robot_accuracy_mm:
+        Standard deviation of the kinematics, per coordinate.
     offset_s:
         t_robot = t_video + offset_s.
     dropout:
         Share of kinematic samples without values.
     click_px:
-        Standard deviation per coordinate of the annotations.
+        Standard deviation of the annotations, per coordinate.
+    """
+
+    robot_from_microscope: RigidTransform = ROBOT_FROM_MICROSCOPE
+    robot_accuracy_mm: float = 0.010
+    offset_s: float = 0.0
+    dropout: float = 0.0
+    click_px: float = 1.0
+
+    def __post_init__(self) -> None:
+        not_negative(self, "robot_accuracy_mm click_px")
+        check(self, "dropout", lambda v: 0 <= v < 1, "a share, at least 0 and below 1")
+
+
+@dataclass(frozen=True)
+class Design:
+    """What a simulated recording shows, and through what.
+
+    Attributes
+    ----------
+    eye, forceps:
+        Scene and tool.  None = chosen by the recording's seed, from designs that
+        `lib.simulator.population.sample` never draws.
+    microscope:
+        Optics, light and sensor.
+    motion, duration_s:
+        "sweep" (calibration), "surgeon" or "both"; None = 30 s for a sweep, 18 s for a surgeon, 45 s for both.
+    reports:
+        Robot and annotator.
     camera_motion:
         (frame, microscope_after_from_before): from that frame on the microscope has moved over eye and robot.  The
         truth's rig is the one before; ``truth/moved_rig.json`` holds the one after.
+    """
+
+    eye: Scene | None = None
+    forceps: Forceps | None = None
+    microscope: Microscope = field(default_factory=Microscope)
+    motion: str = "both"
+    duration_s: float | None = None
+    reports: Reports = field(default_factory=Reports)
+    camera_motion: tuple[int, RigidTransform] | None = None
+
+
+def simulate(
+    folder: str | Path,
+    design: Design | None = None,
+    *,
+    seed: int = 0,
+    n_frames: int = 40,
+    name: str | None = None,
+    description: str = "",
+    masks: bool = False,
+    progress: bool | Callable[[], object] = True,
+    overwrite: bool = False,
+) -> Recording:
+    """Simulate a recording and write it to `folder`, which appears whole or not at all.
+
+    The frames are spread over the motion: the video keeps every k-th frame, as the times in frames.csv say.
+    The same arguments give the same files.
+
+    Parameters
+    ----------
+    design:
+        What the recording shows; None = the default microscope, an eye and a tool chosen by `seed`.
+    seed:
+        Drives every random source.
+    name, description:
+        Of recording.toml; None = the folder's name.
     masks:
         Also write ``truth/masks``: tool and glints of every frame (PNG, red and green channel).
     progress:
-        Whether to show a bar, or what to call after every pair.
+        Whether to show a bar, or a function to call after every pair.
+    overwrite:
+        Replace a recording of that name.
 
     Raises
     ------
@@ -89,35 +126,29 @@ def simulate(
         If a parameter is out of range.
     FileExistsError
         If the folder exists and `overwrite` is False.
+
+    Example
+    -------
+    >>> import tempfile
+    >>> microscope = Microscope(pixels_per_mm=(4.0, 4.0), image_size_px=(80, 60))
+    >>> design = Design(Eye(texture_px=64), microscope=microscope, motion="sweep")
+    >>> made = simulate(tempfile.mkdtemp() + "/mine", design, n_frames=1, progress=False)
+    >>> made.frames[0].left.shape, made.truth.landmarks_mm.shape
+    ((60, 80, 3), (1, 3, 3))
     """
     if n_frames < 1:
         raise ValueError(f"n_frames: must be at least 1, got {n_frames}.")
-    if not 0 <= dropout < 1:
-        raise ValueError(f"dropout: a share, at least 0 and below 1, got {dropout}.")
-    if robot_accuracy_mm < 0 or click_px < 0:
-        raise ValueError(f"robot_accuracy_mm, click_px: must not be negative, got {robot_accuracy_mm}, {click_px}.")
-    if not fps > 0:
-        raise ValueError(f"fps: must be positive, got {fps}.")
-    folder = Path(folder)
-    rng = np.random.default_rng([seed, 101])
-    eye = eye if eye is not None else Eye(seed=RESERVED_SEEDS[seed % len(RESERVED_SEEDS)])
-    forceps = forceps or reserved_forceps(np.random.default_rng([seed, 103]), seed=seed % len(RESERVED_SEEDS))
-    microscope = microscope or Microscope()
-    if not isinstance(motion, Motion):
-        duration_s = duration_s or {"sweep": 30.0, "surgeon": 18.0, "both": 45.0}.get(motion, 30.0)
-        motion = Motion(forceps, eye, kind=motion, seed=seed, duration_s=duration_s)
-    step = max(1, int(motion.duration_s * fps / n_frames))
-    time_s = np.arange(n_frames) * step / fps
-    u, visibility = np.empty((2, n_frames, 3, 2)), np.empty((2, n_frames, 3), int)
-    in_glint = np.zeros((2, n_frames, 3), bool)
-    landmarks = np.empty((n_frames, 3, 3))
+    folder, design = Path(folder), design or Design()
+    microscope, reports = design.microscope, design.reports
+    eye = design.eye if design.eye is not None else Eye(seed=RESERVED_SEEDS[seed % len(RESERVED_SEEDS)])
+    tool_rng = np.random.default_rng([seed, 103])
+    forceps = design.forceps or reserved_forceps(tool_rng, seed=seed % len(RESERVED_SEEDS))
+    duration_s = DURATIONS_S.get(design.motion, 30.0) if design.duration_s is None else design.duration_s
+    motion = Motion(forceps, eye, kind=design.motion, seed=seed, duration_s=duration_s)
+    step = max(1, int(motion.duration_s * microscope.fps / n_frames))
+    time_s = np.arange(n_frames) * step / microscope.fps
     rig = microscope.rig(RigidTransform.identity())
     moved_at, moved_rig = n_frames, rig
-    if camera_motion is not None:
-        moved_at, after_from_before = camera_motion
-        if not 0 < moved_at < n_frames:
-            raise ValueError(f"camera_motion: the frame must lie between 1 and {n_frames - 1}, got {moved_at}.")
-        moved_rig = _moved(rig, after_from_before)
     details = {
         "simulated": True,
         "seed": seed,
@@ -127,59 +158,62 @@ def simulate(
     }
     if microscope.inverse_distance_per_mm:
         details["inverse_distance_per_mm"] = microscope.inverse_distance_per_mm
-    if camera_motion is not None:
+    if design.camera_motion is not None:
+        moved_at, after_from_before = design.camera_motion
+        if not 0 < moved_at < n_frames:
+            raise ValueError(f"camera_motion: the frame must lie between 1 and {n_frames - 1}, got {moved_at}.")
+        moved_rig = rig.moved(after_from_before.inverse())
         details["camera_moved_at_frame"] = moved_at
+    u, visibility = np.empty((2, n_frames, 3, 2)), np.empty((2, n_frames, 3), int)
+    in_glint, landmarks = np.zeros((2, n_frames, 3), bool), np.empty((n_frames, 3, 3))
     with RecordingWriter(
         folder,
         name=name or folder.name,
-        fps=fps,
+        fps=microscope.fps,
         image_size_px=microscope.image_size_px,
         description=description,
         readout_s=microscope.readout_s,
-        offset_s=offset_s,
-        robot_accuracy_mm=robot_accuracy_mm,
+        offset_s=reports.offset_s,
+        robot_accuracy_mm=reports.robot_accuracy_mm,
         details=details,
         suffix=".png" if microscope.jpeg_quality is None else ".jpg",
         jpeg_quality=microscope.jpeg_quality or 90,
         overwrite=overwrite,
     ) as writer:
         for k in tqdm(range(n_frames), desc=f"Simulating {folder.name}", unit="pair", disable=progress is not True):
-            pose = motion.pose(time_s[k])
+            pose, noise = motion.pose(time_s[k]), np.random.default_rng([seed, 107, k])
             views = render_pair(
-                eye, microscope, forceps=forceps, pose=pose, later=motion.later(time_s[k]),
-                rig=rig if k < moved_at else moved_rig, rng=np.random.default_rng([seed, 107, k]),
+                eye, microscope, rig=rig if k < moved_at else moved_rig,
+                forceps=forceps, pose=pose, later=motion.later(time_s[k]), rng=noise,
             )  # fmt: skip
             writer.add(views[0].image, views[1].image, time_s[k])
             landmarks[k] = forceps.landmarks(pose)
             for side, view in enumerate(views):
                 u[side, k], visibility[side, k], in_glint[side, k] = view.u, view.visibility, _in_glint(view)
-            if masks:
-                for side, view in zip(("left", "right"), views, strict=True):
-                    path = writer.truth_folder / "masks" / side / f"{k:06d}.png"
-                    path.parent.mkdir(parents=True, exist_ok=True)
-                    empty = np.zeros_like(view.tool_mask)
-                    cv2.imencode(".png", np.dstack([empty, view.glint_mask, view.tool_mask]))[1].tofile(path)
+                if masks:
+                    _write_masks(writer.truth_folder / "masks" / ("left", "right")[side] / f"{k:06d}.png", view)
             if callable(progress):
                 progress()
-        margin = 5
-        count = int(np.ceil(time_s[-1] * _KINEMATICS_HZ)) + 1 + 2 * margin
-        sample_s = (np.arange(count) - margin) / _KINEMATICS_HZ
+        rng, robot_from_microscope = np.random.default_rng([seed, 101]), reports.robot_from_microscope
+        count = int(np.ceil(time_s[-1] * _KINEMATICS_HZ)) + 1 + 2 * _KINEMATICS_MARGIN
+        sample_s = (np.arange(count) - _KINEMATICS_MARGIN) / _KINEMATICS_HZ
         truth = np.array([forceps.landmarks(motion.pose(t)) for t in sample_s])
-        reported = robot_from_microscope.apply(truth) + rng.normal(0, robot_accuracy_mm, truth.shape)
-        reported[rng.random(count) < dropout] = np.nan
-        writer.kinematics(sample_s + offset_s, reported)
-        clicked = np.where(visibility[..., None] == 2, u + rng.normal(0, click_px, u.shape), np.nan)
+        reported = robot_from_microscope.apply(truth) + rng.normal(0, reports.robot_accuracy_mm, truth.shape)
+        reported[rng.random(count) < reports.dropout] = np.nan
+        writer.kinematics(sample_s + reports.offset_s, reported)
+        clicked = np.where(visibility[..., None] == 2, u + rng.normal(0, reports.click_px, u.shape), np.nan)
         writer.annotations(*clicked, *np.where(visibility == 2, 2, 0))
+        x_px, y_px, surface_mm = surface_grid(eye, rig.left, microscope.image_size_px)
         writer.truth(
             microscope.rig(robot_from_microscope),
             robot_from_microscope.apply(landmarks),
             *u,
             *visibility,
-            surface=_in_robot(surface_grid(eye, rig.left, microscope.image_size_px), robot_from_microscope),
+            surface=(x_px, y_px, robot_from_microscope.apply(surface_mm)),
             in_glint=tuple(in_glint),
         )
-        if camera_motion is not None:
-            before = robot_from_microscope.compose(camera_motion[1].inverse())
+        if design.camera_motion is not None:
+            before = robot_from_microscope.compose(after_from_before.inverse())
             microscope.rig(before).save(writer.truth_folder / "moved_rig.json")
     return Recording.open(folder)
 
@@ -187,27 +221,18 @@ def simulate(
 def _in_glint(view: View) -> np.ndarray:
     """(3,) bool: whether saturated light lies within `_GLINT_REACH_PX` of a landmark in view.
 
-    Either the wet surface's mirror image of the lamp, which never covers the tool itself but may surround a tip, or a
-    highlight of the metal: two of three channels at full scale, as one alone may be the colour of the light.
+    This is either the wet surface's mirror image of the lamp, which never covers the tool itself but may surround a
+    tip, or a highlight of the metal: two of three channels at full scale, as one alone may be the colour of the light.
     """
     found = np.zeros(3, bool)
     for k in np.flatnonzero(view.visibility):
-        column, row = np.round(view.u[k]).astype(int)
-        near = np.s_[
-            max(row - _GLINT_REACH_PX, 0) : row + _GLINT_REACH_PX + 1,
-            max(column - _GLINT_REACH_PX, 0) : column + _GLINT_REACH_PX + 1,
-        ]
-        clipped = np.sort(view.image[near], axis=2)[..., 1] >= _CLIPPED
-        found[k] = clipped.any() or view.glint_mask[near].any()
+        column, row = (slice(max(c - _GLINT_REACH_PX, 0), c + _GLINT_REACH_PX + 1) for c in np.round(view.u[k]).astype(int))
+        clipped = np.sort(view.image[row, column], axis=2)[..., 1] >= _CLIPPED
+        found[k] = clipped.any() or view.glint_mask[row, column].any()
     return found
 
 
-def _in_robot(surface: tuple[np.ndarray, ...], robot_from_microscope: RigidTransform) -> tuple[np.ndarray, ...]:
-    x_px, y_px, x_mm = surface
-    return x_px, y_px, robot_from_microscope.apply(x_mm)
-
-
-def _moved(rig: StereoRig, after_from_before: RigidTransform) -> StereoRig:
-    """The rig in the microscope frame of before the movement, as it stands after it."""
-    motion = after_from_before.matrix
-    return StereoRig(AffineCamera(rig.left.matrix @ motion), AffineCamera(rig.right.matrix @ motion))
+def _write_masks(path: Path, view: View) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    masks = np.dstack([np.zeros_like(view.tool_mask), view.glint_mask, view.tool_mask])
+    files.write_bytes(path, cv2.imencode(".png", masks)[1].tobytes())

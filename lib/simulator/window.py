@@ -82,8 +82,8 @@ class Window:
         if isinstance(camera, NearAffineCamera):
             rho, axis, centre = camera.inverse_distance_per_mm, affine.viewing_direction, camera.centre_px
             du, dv = (u[0] - centre[0]) * rho, (u[1] - centre[1]) * rho
-            along = axis[2] * z - axis @ camera.reference_mm
-            right = (right[0] + du * along, right[1] + dv * along)
+            shift = axis @ camera.reference_mm
+            right = (right[0] + du * axis[2] * z - du * shift, right[1] + dv * axis[2] * z - dv * shift)
             a, b = a - du * axis[0], b - du * axis[1]
             d, e = d - dv * axis[0], e - dv * axis[1]
         determinant = a * e - b * d
