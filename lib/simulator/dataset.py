@@ -26,7 +26,7 @@ from lib.simulator.microscope import Microscope
 from lib.simulator.population import RESERVED_SEEDS, random_forceps, reserved_forceps
 from lib.simulator.recording import Design, Reports, simulate
 
-__all__ = ["TEST_SEQUENCES", "TRAIN_SEQUENCES", "main", "make_dataset", "sequence_design", "sequence_name"]
+__all__ = ["TEST_SEQUENCES", "TRAIN_SEQUENCES", "main", "make_dataset", "seconds_a_pair", "sequence_design", "sequence_name"]
 
 TRAIN_SEQUENCES, TEST_SEQUENCES = range(0, 7), range(7, 10)
 _SEQUENCES = (*TRAIN_SEQUENCES, *TEST_SEQUENCES)
@@ -158,7 +158,7 @@ def _missing(folder: Path) -> list[int]:
     return missing
 
 
-def _seconds_a_pair(shrink: int) -> float:
+def seconds_a_pair(shrink: int) -> float:
     """CPU seconds of a stereo pair of the data set on this machine, measured on two pairs; the eye's texture excluded."""
     design = sequence_design(0, 0, shrink=shrink, duration_s=1.5)
     design.eye.texture  # noqa: B018 - once an eye, not once a pair
@@ -202,7 +202,7 @@ def _run(arguments: argparse.Namespace) -> int:
     folder = arguments.folder or paths.CACHE / f"dataset-{arguments.seed}"
     left = len(_missing(folder)) * pairs
     workers = min(arguments.workers or cores(), len(_SEQUENCES))
-    minutes = left * _seconds_a_pair(shrink) / workers / 60 if left else 0.0
+    minutes = left * seconds_a_pair(shrink) / workers / 60 if left else 0.0
     print(
         f"{paths.shown(folder)}: {left} of {len(_SEQUENCES) * pairs} stereo pairs to make, about {minutes:.0f} min on "
         f"{workers} idle core{'s' if workers > 1 else ''}, {left * _MB_PER_PAIR / shrink**2 / 1000:.2f} GB.",

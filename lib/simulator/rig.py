@@ -6,11 +6,13 @@ image, z away from the cameras (into the eye), millimetres.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lib.cameras import AffineCamera, NearAffineCamera, StereoRig
+from lib.correspondences import Correspondences
 from lib.geometry import RigidTransform
 
 __all__ = ["IMAGE_SIZE_PX", "ROBOT_FROM_MICROSCOPE", "SimulatedSweep", "reference_rig", "simulate_correspondences"]
@@ -74,15 +76,17 @@ def reference_rig(
     return StereoRig(*cameras)
 
 
-@dataclass(frozen=True)
-class SimulatedSweep:
-    """What calibration sees (`x_mm`, `u_left`, `u_right`, with noise) and the noise-free truth beside it."""
+@dataclass(frozen=True, eq=False)
+class SimulatedSweep(Correspondences):
+    """`Correspondences` with noise, and the truth beside them: `true_x_mm` (n, 3) and `true_rig`."""
 
-    x_mm: np.ndarray
-    u_left: np.ndarray
-    u_right: np.ndarray
     true_x_mm: np.ndarray
     true_rig: StereoRig
+
+    def subset(self, rows: slice | ArrayLike) -> Correspondences:
+        """The rows that a slice, a mask or an array of indices names, without the truth."""
+        plain = {f.name: getattr(self, f.name) for f in fields(Correspondences)}
+        return Correspondences(**plain).subset(rows)
 
 
 def simulate_correspondences(
@@ -104,9 +108,18 @@ def simulate_correspondences(
     half_size_mm:
         Half extents (3,) of the box of positions in the microscope frame; the default fills the image.
     sigma_u_px, sigma_x_mm:
-        Standard deviation per coordinate of detections and of the robot's report.
+        Standard deviation per coordinate of detections and of the robot's report.  The rows do not
+        state it.
+
+    Example
+    -------
+    >>> sweep = simulate_correspondences(50, rng=np.random.default_rng(0))
+    >>> len(sweep), float(np.std(sweep.true_rig.left.project(sweep.true_x_mm) - sweep.u_left).round(1))
+    (50, 1.5)
     """
     rig = rig or reference_rig(robot_from_microscope=robot_from_microscope)
     true_x = robot_from_microscope.apply(rng.uniform(-1, 1, (n, 3)) * half_size_mm)
     u_left, u_right = (u + rng.normal(0, sigma_u_px, u.shape) for u in rig.project(true_x))
-    return SimulatedSweep(true_x + rng.normal(0, sigma_x_mm, (n, 3)), u_left, u_right, true_x, rig)
+    x = true_x + rng.normal(0, sigma_x_mm, (n, 3))
+    rows = Correspondences.of_points(x, u_left, u_right)
+    return SimulatedSweep(**vars(rows), true_x_mm=true_x, true_rig=rig)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -12,7 +12,7 @@ from scipy import ndimage
 from lib.geometry import RigidTransform
 from lib.simulator.texture import GAMMA, smooth_noise
 
-__all__ = ["OBJECTS", "Checkerboard", "Plane", "Relief", "Sphere", "checkerboard_poses"]
+__all__ = ["OBJECTS", "Checkerboard", "Relief", "checkerboard_poses"]
 
 
 @dataclass(frozen=True)
@@ -97,61 +97,6 @@ def checkerboard_poses(
         tilt = rng.uniform(0, max_tilt_rad) * np.array([np.cos(axis), np.sin(axis), 0])
         poses.append(RigidTransform.from_rotation_vector(tilt, rng.uniform(-1, 1, 3) * half_size_mm).compose(spin))
     return poses
-
-
-@dataclass(frozen=True)
-class Plane:
-    """z = z_mm + slope . (x, y), textured with noise: the simplest surface with a known depth."""
-
-    z_mm: float = 0.0
-    slope: tuple[float, float] = (0.0, 0.0)
-    seed: int = 0
-    gloss: float = 0.0
-    extent_mm: float = 26.0
-
-    @cached_property
-    def texture(self) -> np.ndarray:
-        """(n, n, 3) uint8."""
-        return _speckle(self.seed)
-
-    def height(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """z at (x, y)."""
-        return self.z_mm + self.slope[0] * x + self.slope[1] * y
-
-
-@dataclass(frozen=True)
-class Sphere:
-    """The far inside of a sphere, as an ideal eye cup; beyond 0.9 of its radius it goes on as a cone."""
-
-    centre_mm: tuple[float, float, float] = (0.0, 0.0, -10.0)
-    radius_mm: float = 11.0
-    seed: int = 0
-    gloss: float = 0.0
-    extent_mm: float = 26.0
-
-    def __post_init__(self) -> None:
-        if not self.radius_mm > 0:
-            raise ValueError(f"radius_mm: must be positive, got {self.radius_mm}.")
-
-    @cached_property
-    def texture(self) -> np.ndarray:
-        """(n, n, 3) uint8."""
-        return _speckle(self.seed)
-
-    def height(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """z at (x, y)."""
-        rho = np.hypot(x - self.centre_mm[0], y - self.centre_mm[1])
-        edge = 0.9 * self.radius_mm
-        inside = np.sqrt(self.radius_mm**2 - np.minimum(rho, edge) ** 2)
-        slope = edge / np.sqrt(self.radius_mm**2 - edge**2)
-        return self.centre_mm[2] + inside - slope * np.maximum(rho - edge, 0)
-
-
-@lru_cache(maxsize=4)
-def _speckle(seed: int, size_px: int = 1024) -> np.ndarray:
-    rng = np.random.default_rng([seed, 41])
-    grey = 0.35 * np.exp(0.35 * smooth_noise(rng, size_px, 40, 3, 0.8))
-    return _encode(grey[..., None] * np.array([1.0, 0.8, 0.6]))
 
 
 def _encode(linear: np.ndarray) -> np.ndarray:

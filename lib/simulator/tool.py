@@ -1,4 +1,4 @@
-"""The tool in an image: where the camera sees it, its metal, its shadow, what hides a landmark, and its place in the image."""
+"""The tool in an image: where the camera sees it, what hides its landmarks, its metal and its shadow."""
 
 from __future__ import annotations
 

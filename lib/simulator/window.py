@@ -6,7 +6,7 @@ grid of pixels; cubic interpolation then gives every pixel with fourth-order acc
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -41,6 +41,21 @@ class Window:
         object.__setattr__(self, "field_px", self.field_px or self.size_px)
         if not np.allclose(self._resection.K, self.zoom * np.eye(2), atol=1e-6 * self.zoom):
             raise ValueError("camera: the renderer needs square pixels without skew.")
+
+    @classmethod
+    def around(
+        cls,
+        camera: AffineCamera | NearAffineCamera,
+        u: np.ndarray,
+        size_px: tuple[int, int],
+        field_px: tuple[int, int] | None = None,
+    ) -> Window:
+        """The window of `size_px` around pixel `u` (2,) of a camera whose whole image has `field_px`."""
+        origin = np.round(np.asarray(u) - np.array(size_px) / 2)
+        moved = {"matrix": camera.matrix - [[0, 0, 0, origin[0]], [0, 0, 0, origin[1]]]}
+        if isinstance(camera, NearAffineCamera):
+            moved["centre_px"] = camera.centre_px - origin
+        return cls(replace(camera, **moved), size_px, field_px, tuple(origin))
 
     @cached_property
     def affine(self) -> AffineCamera:

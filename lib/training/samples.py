@@ -33,7 +33,7 @@ from lib.landmarks.windows import (
 )
 from lib.parallel import in_processes
 from lib.simulator.population import TEXTURE_SEEDS, VALIDATION_TEXTURE_SEEDS, sample
-from lib.simulator.render import motion_kernel
+from lib.simulator.optics import motion_kernel
 from lib.training.loop import Samples
 
 __all__ = [

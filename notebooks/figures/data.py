@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from lib.cameras import StereoRig
+from lib.correspondences import LANDMARKS
 from lib.recordings import Recording
 from lib.simulator.eye import Scene
 from lib.simulator.forceps import Forceps
@@ -21,6 +22,7 @@ __all__ = [
     "annotation_errors",
     "contact_sheet",
     "gallery",
+    "landmark_counts",
     "motion_page",
     "profiles_page",
     "realism_page",
@@ -226,3 +228,24 @@ def realism_sheet(
             show_image(ax, images[k * len(images) // columns], title if k == 0 else "")
             ax.title.set_fontsize(9)
     return page
+
+
+def landmark_counts(recordings: Sequence[Recording]) -> dict[str, dict[str, int]]:
+    """How many landmarks of both cameras are visible, hidden by the tool, outside, and in glint, for each landmark."""
+    truths = [recording.truth for recording in recordings]
+    if None in truths:
+        raise ValueError("recordings: one has no truth; take simulated ones.")
+    visibility = np.concatenate([np.stack([t.visibility_left, t.visibility_right]) for t in truths], axis=1)
+    counts = {
+        name: {
+            "visible": int((visibility[..., k] == 2).sum()),
+            "hidden": int((visibility[..., k] == 1).sum()),
+            "outside": int((visibility[..., k] == 0).sum()),
+        }
+        for k, name in enumerate(LANDMARKS)
+    }
+    if all(t.in_glint_left is not None for t in truths):
+        in_glint = np.concatenate([np.stack([t.in_glint_left, t.in_glint_right]) for t in truths], axis=1)
+        for k, name in enumerate(LANDMARKS):
+            counts[name]["in_glint"] = int(in_glint[..., k].sum())
+    return counts

@@ -19,7 +19,7 @@ from lib.geometry import RigidTransform
 from lib.simulator.rig import (
     IMAGE_SIZE_PX,
     ROBOT_FROM_MICROSCOPE,
-    Correspondences,
+    SimulatedSweep,
     reference_rig,
     simulate_correspondences,
 )
@@ -322,7 +322,7 @@ def factorisation_study(
 
 
 def follow_advice(
-    few: Correspondences,
+    few: SimulatedSweep,
     advised_mm: np.ndarray,
     seen: Sequence[np.ndarray],
     followed: int,

@@ -55,16 +55,15 @@ def sweep(distance_mm: float = np.inf, *, frames: int = FRAMES, seed: int = SEED
     The tool moves at about 2 mm/s, slower than a surgeon's: a robot that calibrates has time.  Seeds differ in tool, eye,
     path and noise; the microscope is the reference rig, affine or `distance_mm` away.
     """
-    from lib.simulator import Microscope, simulate
+    from lib.simulator import Design, Microscope, simulate
 
     name = f"sweep-{frames}-frames-{'affine' if np.isinf(distance_mm) else f'{distance_mm:.0f}-mm'}-seed-{seed}"
     folder = paths.CACHE / "calibration" / name
     if not folder.is_dir():
         folder.parent.mkdir(parents=True, exist_ok=True)
         microscope = Microscope(inverse_distance_per_mm=1.0 / distance_mm)
-        simulate(
-            folder, seed=seed, n_frames=frames, motion="sweep", duration_s=1.2 * frames, microscope=microscope, name=name
-        )  # fmt: skip
+        design = Design(microscope=microscope, motion="sweep", duration_s=1.2 * frames)
+        simulate(folder, design, seed=seed, n_frames=frames, name=name)
     return Recording.open(folder)
 
 

@@ -7,12 +7,12 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from lib.cameras import AffineCamera
 from lib.geometry import RigidTransform
 from lib.simulator.eye import Eye
 from lib.simulator.forceps import Forceps, Pose
 from lib.simulator.microscope import Microscope
 from lib.simulator.render import View, render_view
+from lib.simulator.window import Window
 
 __all__ = ["PLAIN", "effect_gallery", "render_window"]
 
@@ -49,15 +49,13 @@ def render_window(
         Of the tool, for motion blur and rolling shutter.
     """
     rig = microscope.rig(RigidTransform.identity())
-    camera = (rig.left, rig.right)[side]
     centre = rig.left.project(forceps.landmarks(pose)).mean(axis=0)
-    origin = np.round(centre - np.array(size_px) / 2)
-    window = AffineCamera(np.column_stack([camera.linear, camera.offset_px - origin]))
+    window = Window.around((rig.left, rig.right)[side], centre, size_px, microscope.image_size_px)
     later = (pose.moved(base_mm=tuple(np.asarray(pose.base_mm) + 1e-3 * np.asarray(velocity_mm_s))), 1e-3)
+    rng = np.random.default_rng(seed)
     view = render_view(
-        eye, microscope, window, size_px, side=side, forceps=forceps, pose=pose, later=later,
-        rng=np.random.default_rng(seed), factor=3, field_px=microscope.image_size_px, origin_px=tuple(origin),
-    )  # fmt: skip
+        eye, microscope, window, side=side, forceps=forceps, pose=pose, later=later, rng=rng, factor=3
+    )
     if microscope.jpeg_quality is None:
         return view
     data = cv2.imencode(".jpg", view.image, [cv2.IMWRITE_JPEG_QUALITY, microscope.jpeg_quality])[1]

@@ -26,6 +26,7 @@ from lib.simulator.forceps import Forceps, Pose
 from lib.simulator.microscope import Microscope
 from lib.simulator.render import render_view
 from lib.simulator.texture import EXTENT_MM, fundus_texture
+from lib.simulator.window import Window
 
 __all__ = [
     "FUNDUS_SET_BY",
@@ -248,7 +249,7 @@ def in_vivo_window(
     middle = R[:2] @ forceps.landmarks(pose).mean(axis=0)
     n = fine * size_px
     camera = AffineCamera(np.column_stack([fine * zoom * R[:2], (n - 1) / 2 - fine * zoom * middle]))
-    view = render_view(eye, microscope, camera, (n, n), forceps=forceps, pose=pose)
+    view = render_view(eye, microscope, Window(camera, (n, n)), forceps=forceps, pose=pose)
     # A narrow lamp: the picture keeps little of the fundus's own colour, and shows it in the lamp's.
     linear = cv2.resize((view.image / 255.0) ** 2.2, (size_px, size_px), interpolation=cv2.INTER_AREA)
     linear += lamp.veil * (cv2.GaussianBlur(linear, (0, 0), 0.1 * size_px) - linear)

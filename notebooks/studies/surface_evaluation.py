@@ -17,9 +17,10 @@ from lib.matching import RECTIFIED, Matches, match
 from lib.simulator.dataset import TEST_SEQUENCES, sequence_design, sequence_name
 from lib.simulator.eye import Scene
 from lib.simulator.microscope import Microscope
-from lib.simulator.render import render_pair, surface_grid
+from lib.simulator.render import render_pair
 from lib.simulator.rig import IMAGE_SIZE_PX, ROBOT_FROM_MICROSCOPE
 from lib.simulator.scenes import OBJECTS, Relief
+from lib.simulator.window import surface_grid
 from lib.surface.bspline import BSplineSurface
 from lib.surface.reconstruct import Reconstruction, reconstruct
 from lib.surface.sphere import Sphere, fit_sphere

@@ -199,7 +199,7 @@ def _recording(seed: int) -> Recording:
     if folder.is_dir():
         return Recording.open(folder)
     folder.parent.mkdir(parents=True, exist_ok=True)
-    return simulate(folder, seed=seed, n_frames=N_FRAMES, motion="both", name=folder.name)
+    return simulate(folder, seed=seed, n_frames=N_FRAMES)
 
 
 def _mean(results: dict[str, dict]) -> dict:

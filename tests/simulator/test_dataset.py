@@ -1,6 +1,7 @@
 """The data set's command: progress, parallel work, resuming after a kill, the same files for the same seed."""
 
 import re
+import shutil
 import subprocess
 import sys
 import time
@@ -10,9 +11,9 @@ import numpy as np
 import pytest
 
 from lib import paths
-from lib.provenance import read_records
 from lib.recordings import Recording
-from lib.simulator.dataset import landmark_counts, main, make_dataset, sequence_name
+from lib.simulator.dataset import main, make_dataset, sequence_name
+from notebooks.figures.data import landmark_counts
 
 OPTIONS = {"n_pairs": 2, "duration_s": 4.0, "shrink": 8}  # 240 x 135 px
 WORDS = ["--pairs", "2", "--duration", "4", "--shrink", "8"]
@@ -76,7 +77,7 @@ def test_another_seed_gives_other_images(made, tmp_path, capfd):
 
 
 def test_says_beforehand_how_long_and_how_large(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("lib.simulator.dataset._seconds_a_pair", lambda shrink: 2.0)
+    monkeypatch.setattr("lib.simulator.dataset.seconds_a_pair", lambda shrink: 2.0)
     assert main(["--folder", str(tmp_path / "new"), "--dry-run", "--workers", "2"]) == 0
     said = capsys.readouterr().out
     assert "800 of 800 stereo pairs" in said and "13 min on 2 idle cores" in said and "0.50 GB" in said
@@ -89,21 +90,26 @@ def test_another_data_set_in_the_folder_is_refused(made):
     assert main(["--folder", str(made), *WORDS]) == 0  # nothing left to make
 
 
-def test_a_record_says_what_was_made_and_its_cost(made, tmp_path):
-    out = tmp_path / "dataset.json"
-    assert main(["--folder", str(made), *WORDS, "--record", "--out", str(out)]) == 0
-    record = read_records(out)["dataset"]
-    result = record["result"]
-    assert result["pairs"] == 20 and result["sequences"] == 10 and {row["sequence"] for row in result["log"]} == NAMES
-    assert result["cpu_seconds_a_pair"] > 0 and result["gigabytes"] == pytest.approx(size_gb(made), rel=1e-5)
-    assert sum(result["landmarks"]["test"]["base"][key] for key in ("visible", "hidden", "outside")) == 3 * 2 * 2
-    # The recorded one has the same entries.
-    assert set(result) <= set(read_records(paths.RESULTS / "dataset.json")["dataset"]["result"])
-    assert record["command"].startswith("python3 -m lib simulate --folder")
+def test_a_damaged_sequence_is_named_and_not_passed_over(made, tmp_path, capsys):
+    folder = shutil.copytree(made, tmp_path / "damaged")
+    shutil.rmtree(folder / "train_00")
+    (folder / "train_03" / "left" / "000001.jpg").write_bytes(b"")
+    assert main(["--folder", str(folder), *WORDS]) == 1
+    said = capsys.readouterr().err
+    assert "train_03: damaged" in said and "000001.jpg" in said and "Delete the folder" in said
+    assert (folder / "train_03").is_dir() and not (folder / "train_00").exists()
 
 
-def size_gb(folder: Path) -> float:
-    return sum(file.stat().st_size for file in folder.rglob("*") if file.is_file()) / 1e9
+@pytest.mark.parametrize(
+    "words", [["--seed", "-1"], ["--duration", "nan"], ["--duration", "0"], ["--pairs", "0"], ["--folder", "{file}"]]
+)
+def test_wrong_values_end_with_a_message(words, tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    try:
+        code = main([word.format(file=tmp_path / "file") for word in words] + WORDS)
+    except SystemExit as end:  # argparse
+        code = end.code
+    assert code in (1, 2) and "Traceback" not in capsys.readouterr().err
 
 
 def finished(folder: Path) -> set[str]:

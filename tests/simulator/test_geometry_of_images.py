@@ -13,18 +13,38 @@ from lib.simulator import Eye, Forceps, Microscope, Pose, render_pair
 from lib.simulator.forceps import MAX_PITCH_RAD, MAX_ROLL_RAD
 from lib.simulator.population import random_forceps, random_pose
 from lib.simulator.raster import rasterise
-from lib.simulator.render import render_view, surface_grid
-from lib.simulator.scenes import Checkerboard, Plane, Relief, Sphere, checkerboard_poses
+from lib.simulator.render import render_view
+from lib.simulator.scenes import Checkerboard, Relief, checkerboard_poses
+from lib.simulator.texture import smooth_noise
+from lib.simulator.window import Window, surface_grid
 from notebooks.studies.effects import PLAIN
 
 IDENTITY = RigidTransform.identity()
 RIG = PLAIN.rig(IDENTITY)
 
 
-def window(camera: AffineCamera, centre: np.ndarray, size: int) -> tuple[AffineCamera, np.ndarray]:
-    """The camera of a square window round a pixel, and its origin."""
-    origin = np.round(centre - size / 2)
-    return AffineCamera(np.column_stack([camera.linear, camera.offset_px - origin])), origin
+class Plane:
+    """z = z_mm + slope . (x, y), textured with noise: a scene with a known depth."""
+
+    gloss, extent_mm = 0.0, 26.0
+    texture = np.uint8(110 + 30 * smooth_noise(np.random.default_rng(0), 512, 40, 3, 0.8).clip(-2, 2))[..., None].repeat(3, 2)
+
+    def __init__(self, z_mm: float = 0.0, slope: tuple[float, float] = (0.0, 0.0)) -> None:
+        self.z_mm, self.slope = z_mm, slope
+
+    def height(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return self.z_mm + self.slope[0] * x + self.slope[1] * y
+
+
+class Sphere(Plane):
+    """The far inside of a sphere of 11 mm, as an ideal eye cup."""
+
+    def height(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return -10.0 + np.sqrt(11.0**2 - x**2 - y**2)
+
+
+def window(camera: AffineCamera, u: np.ndarray, size: int) -> Window:
+    return Window.around(camera, u, (size, size))
 
 
 def tip_distances(rng: np.random.Generator, n: int, min_pitch_rad: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
@@ -42,10 +62,10 @@ def tip_distances(rng: np.random.Generator, n: int, min_pitch_rad: float = 0.0) 
         whole = (RIG.left, RIG.right)[i % 2]
         for k in (1, 2):
             tip = forceps.landmarks(pose)[k]
-            camera, _ = window(whole, whole.project(tip)[0], size)
-            view = render_view(Plane(4.0), PLAIN, camera, (size, size), forceps=forceps, pose=pose, factor=3)
-            R, zoom = camera.resect().R, camera.resect().K[0, 0]
-            seen = np.column_stack([camera.project(centres) / zoom, centres @ R[2]])
+            shown = window(whole, whole.project(tip)[0], size)
+            view = render_view(Plane(4.0), PLAIN, shown, forceps=forceps, pose=pose, factor=3)
+            R, zoom = shown.camera.resect().R, shown.camera.resect().K[0, 0]
+            seen = np.column_stack([shown.camera.project(centres) / zoom, centres @ R[2]])
             raster = rasterise(seen, radii, chains, zoom=zoom, size_px=(size, size), factor=factor)
             own = (raster.part == k + 1).astype(np.uint8)
             edge = np.argwhere(own & ~cv2.erode(own, np.ones((3, 3), np.uint8)).astype(bool))
@@ -78,8 +98,9 @@ def test_base_is_midway_between_the_edges_of_the_shaft():
             pitch_rad=rng.uniform(0, MAX_PITCH_RAD), roll_rad=rng.uniform(-MAX_ROLL_RAD, MAX_ROLL_RAD)
         )
         whole = (RIG.left, RIG.right)[i % 2]
-        camera, _ = window(whole, whole.project(np.array(pose.base_mm))[0], 120)
-        view = render_view(Plane(4.0), PLAIN, camera, (120, 120), forceps=forceps, pose=pose, factor=4)
+        shown = window(whole, whole.project(np.array(pose.base_mm))[0], 120)
+        camera = shown.camera
+        view = render_view(Plane(4.0), PLAIN, shown, forceps=forceps, pose=pose, factor=4)
         if view.visibility[0] != 2:
             continue
         seen += 1
@@ -101,13 +122,10 @@ def test_base_is_midway_between_the_edges_of_the_shaft():
 def test_depth_of_plane_and_sphere_is_right_to_a_micrometre(camera):
     """Against the closed-form intersection of each pixel's own ray."""
     size = (480, 320)
-    affine = AffineCamera(np.column_stack([camera.matrix[:, :3], camera.matrix[:, 3] - [700, 300]]))
-    if isinstance(camera, NearAffineCamera):
-        shown = NearAffineCamera(affine.matrix, camera.inverse_distance_per_mm, camera.centre_px - [700, 300])
-    else:
-        shown = affine
+    shown = Window.around(camera, np.array([940, 460]), size).camera
+    affine = getattr(shown, "affine", shown)
     plane, sphere = Plane(0.4, (0.1, -0.2)), Sphere()
-    depths = [render_view(s, PLAIN, shown, size, surface=True).surface_mm for s in (plane, sphere)]
+    depths = [render_view(s, PLAIN, Window(shown, size), surface=True).surface_mm for s in (plane, sphere)]
     u = np.stack(np.meshgrid(np.arange(size[0]), np.arange(size[1])), axis=-1).reshape(-1, 2)[::371].astype(float)
     for surface, depth in zip((plane, sphere), depths, strict=True):
         z = depth[u[:, 1].astype(int), u[:, 0].astype(int)].astype(float)
@@ -127,15 +145,15 @@ def test_left_image_warped_by_the_true_surface_is_the_right_one():
         gain=PLAIN.gain, pixels_per_mm=(50.0, 50.0), image_size_px=(640, 400),
     )  # fmt: skip
     rig = noisy.rig(IDENTITY)
-    clean = [render_view(eye, PLAIN_SMALL, camera, (640, 400), surface=True) for camera in (rig.left, rig.right)]
+    clean = [render_view(eye, PLAIN_SMALL, Window(camera, (640, 400)), surface=True) for camera in (rig.left, rig.right)]
     rng = np.random.default_rng(0)
-    right = render_view(eye, noisy, rig.right, (640, 400), side=1, rng=rng).image.astype(float)
+    right = render_view(eye, noisy, Window(rig.right, (640, 400)), side=1, rng=rng).image.astype(float)
     u = np.stack(np.meshgrid(np.arange(640.0), np.arange(400.0)), axis=-1)
     z = clean[1].surface_mm
     A = rig.right.linear
     xy = np.einsum("ij,hwj->hwi", np.linalg.inv(A[:, :2]), u - rig.right.offset_px - A[:, 2] * z[..., None])
     u_left = rig.left.project(np.dstack([xy, z]).reshape(-1, 3)).reshape(400, 640, 2).astype(np.float32)
-    left = render_view(eye, replace_noise(noisy), rig.left, (640, 400)).image.astype(np.float32)
+    left = render_view(eye, replace_noise(noisy), Window(rig.left, (640, 400))).image.astype(np.float32)
     warped = cv2.remap(left, u_left[..., 0], u_left[..., 1], cv2.INTER_CUBIC)
     inside = np.s_[40:-40, 40:-40]
     # Noise predicted from the sensor model, carried through the gamma curve.
@@ -163,7 +181,7 @@ def replace_noise(microscope: Microscope) -> Microscope:
 
 
 def clean_right(eye: Eye, microscope: Microscope, rig) -> np.ndarray:
-    return render_view(eye, replace_noise(microscope), rig.right, (640, 400), side=1).image.astype(float)
+    return render_view(eye, replace_noise(microscope), Window(rig.right, (640, 400)), side=1).image.astype(float)
 
 
 def edge_position(mask: np.ndarray, row: int) -> float:
@@ -181,16 +199,11 @@ def test_rolling_shutter_moves_the_tool_by_what_its_speed_predicts():
     later = (pose.moved(base_mm=(speed * 1e-3, 0.0, -1.0)), 1e-3)
     camera = RIG.left
     centre = camera.project(np.array(pose.base_mm))[0]
-    shown, origin = window(camera, centre, 300)
-    common = {
-        "forceps": forceps,
-        "pose": pose,
-        "field_px": PLAIN.image_size_px,
-        "origin_px": tuple(origin),
-        "factor": 8,
-    }
-    still = render_view(Plane(3.0), rolling, shown, (300, 300), **common)
-    moving = render_view(Plane(3.0), rolling, shown, (300, 300), later=later, **common)
+    shown = Window.around(camera, centre, (300, 300), PLAIN.image_size_px)
+    origin = shown.origin_px
+    common = {"forceps": forceps, "pose": pose, "factor": 8}
+    still = render_view(Plane(3.0), rolling, shown, **common)
+    moving = render_view(Plane(3.0), rolling, shown, later=later, **common)
     for row in (10, 60, 110):
         delay = 0.020 * ((row + origin[1]) / 1079 - 0.5)
         predicted = speed * delay * camera.linear[0, 0]
@@ -208,8 +221,8 @@ def test_defocus_grows_with_the_distance_from_focus_as_designed():
     widths = []
     for z in (0.0, 1.0, 2.0, 4.0):
         board = Checkerboard(RigidTransform(np.eye(3), np.array([0.0, 0.0, z])), square_mm=1.0, columns=4, rows=4)
-        shown, _ = window(camera, camera.project(board.corners_mm[0])[0] + [0, 50], 90)
-        image = render_view(board, microscope, shown, (90, 90)).image[..., 1].astype(float)
+        shown = window(camera, camera.project(board.corners_mm[0])[0] + [0, 50], 90)
+        image = render_view(board, microscope, shown).image[..., 1].astype(float)
         linear = (image / 255) ** 2.2
         profile = np.abs(np.diff(linear, axis=1))[25:66]
         columns = np.arange(89.0)
@@ -264,9 +277,29 @@ def test_a_finite_working_distance_shows_the_tool_where_the_near_affine_camera_d
     rig = small.rig(IDENTITY)
     views = render_pair(Plane(2.0), small, forceps=forceps, pose=pose)
     for view, camera in zip(views, (rig.left, rig.right), strict=True):
-        near = NearAffineCamera(camera.matrix, 1 / 150, np.array([159.5, 99.5]))
         landmarks = forceps.landmarks(pose)
-        assert_allclose(view.u, near.project(landmarks), atol=1e-6)
-        assert np.abs(view.u - camera.project(landmarks)).max() > 0.5
+        assert_allclose(view.u, camera.project(landmarks), atol=1e-6)
+        assert np.abs(view.u - camera.affine.project(landmarks)).max() > 0.5
         base = np.round(view.u[0]).astype(int)
         assert view.tool_mask[base[1], base[0]] == 255
+
+
+def test_a_microscope_that_moved_sees_what_a_moved_scene_would_show():
+    """Near-affine too: the plane in which the cameras touch their affine ones moves along."""
+    near = replace(PLAIN, image_size_px=(160, 100), inverse_distance_per_mm=1 / 150, pixels_per_mm=(12.0, 12.0))
+    after_from_before = RigidTransform.from_rotation_vector((0.03, 0.0, 0.02), (0.3, 0.1, 0.4))
+    moved = near.rig(IDENTITY).moved(after_from_before.inverse())
+    pose = Pose((-2.0, 1.0, -2.0), pitch_rad=0.4)
+    view = render_pair(Plane(2.0), near, rig=moved, forceps=Forceps(), pose=pose)[0]
+    seen = near.rig(IDENTITY).left.project(after_from_before.apply(Forceps().landmarks(pose)))
+    assert_allclose(view.u, seen, atol=1e-6)
+    x_px, y_px, x_mm = surface_grid(Plane(2.0), moved.left, near.image_size_px, step_px=40)
+    u = near.rig(IDENTITY).left.project(after_from_before.apply(x_mm.reshape(-1, 3)))
+    assert_allclose(u, np.stack(np.meshgrid(x_px, y_px), axis=-1).reshape(-1, 2), atol=1e-4)
+
+
+def test_matt_plane_has_no_glints():
+    small = Microscope(pixels_per_mm=(17.0, 16.5), image_size_px=(320, 180), readout_s=0.0)
+    assert not render_pair(Plane(), small)[0].glint_mask.any()
+    glossy, other = render_pair(Eye(seed=5, texture_px=256), small)
+    assert glossy.glint_mask.any() and (glossy.glint_mask != other.glint_mask).any()

@@ -10,9 +10,20 @@ from numpy.testing import assert_allclose, assert_array_equal
 from lib.cameras import StereoRig
 from lib.geometry import RigidTransform
 from lib.recordings import Recording
-from lib.simulator import Eye, Forceps, Microscope, Motion, Pose, Relief, render_pair, simulate
+from lib.simulator import (
+    Checkerboard,
+    Design,
+    Eye,
+    Forceps,
+    Microscope,
+    Motion,
+    Pose,
+    Relief,
+    Reports,
+    render_pair,
+    simulate,
+)
 from lib.simulator.population import RESERVED_JAW_MM, RESERVED_SEEDS, TEXTURE_SEEDS, random_forceps, sample
-from lib.simulator.scenes import Checkerboard, Plane, Sphere
 from notebooks.studies.realism import STATISTICS, image_statistics, landmark_window
 
 SMALL = Microscope(pixels_per_mm=(17.0, 16.5), image_size_px=(320, 180), readout_s=0.0)
@@ -23,10 +34,9 @@ EYE = Eye(seed=5, texture_px=256)
 def made(tmp_path_factory):
     folder = tmp_path_factory.mktemp("simulated") / "made"
     bump = RigidTransform.from_rotation_vector((0.0, 0.0, 0.02), (0.3, 0.1, 0.0))
-    return simulate(
-        folder, seed=4, n_frames=5, motion="both", eye=EYE, microscope=SMALL, offset_s=0.03, dropout=0.2,
-        camera_motion=(3, bump), masks=True, progress=False, duration_s=8.0,
-    )  # fmt: skip
+    reports = Reports(offset_s=0.03, dropout=0.2)
+    design = Design(EYE, microscope=SMALL, duration_s=8.0, reports=reports, camera_motion=(3, bump))
+    return simulate(folder, design, seed=4, n_frames=5, masks=True, progress=False)
 
 
 def test_a_recording_agrees_with_its_truth(made):
@@ -48,9 +58,10 @@ def test_a_recording_agrees_with_its_truth(made):
 
 def test_truth_says_which_landmarks_saturated_light_touches(tmp_path):
     """Against the images and masks on disk; a recording of before, without these columns, still opens."""
-    options = {"seed": 6, "n_frames": 6, "motion": "surgeon", "duration_s": 4.0, "progress": False, "masks": True}
+    options = {"seed": 6, "n_frames": 6, "progress": False, "masks": True}
     bright = replace(SMALL, brightness=1.6, jpeg_quality=None)
-    recording = simulate(tmp_path / "bright", eye=replace(EYE, gloss=2.0), microscope=bright, **options)
+    design = Design(replace(EYE, gloss=2.0), microscope=bright, motion="surgeon", duration_s=4.0)
+    recording = simulate(tmp_path / "bright", design, **options)
     truth = recording.truth
     for side in ("left", "right"):
         u, visibility, told = (getattr(truth, f"{name}_{side}") for name in ("u", "visibility", "in_glint"))
@@ -65,7 +76,8 @@ def test_truth_says_which_landmarks_saturated_light_touches(tmp_path):
                 bright_channels = (getattr(frame, side)[near] >= 250).sum(axis=2)
                 assert told[k, landmark] == ((bright_channels >= 2).any() or mask[near][..., 1].any())
     assert 0 < np.mean([truth.in_glint_left, truth.in_glint_right]) < 1
-    dim = simulate(tmp_path / "dim", eye=replace(EYE, gloss=0.0), microscope=replace(SMALL, brightness=0.2), **options)
+    matt = replace(design, eye=replace(EYE, gloss=0.0), microscope=replace(SMALL, brightness=0.2))
+    dim = simulate(tmp_path / "dim", matt, **options)
     assert not dim.truth.in_glint_left.any()
     table = dim.truth.folder / "landmarks.csv"
     table.write_text("\n".join(",".join(line.split(",")[:28]) for line in table.read_text().splitlines()) + "\n")
@@ -89,16 +101,11 @@ def test_surface_truth_is_seen_at_its_pixels(made):
 
 
 def test_the_same_seed_gives_the_same_files(made, tmp_path):
-    options = {
-        "n_frames": 2,
-        "motion": "surgeon",
-        "eye": EYE,
-        "microscope": SMALL,
-        "progress": False,
-        "duration_s": 4.0,
-    }
-    folders = [simulate(tmp_path / name, seed=seed, name="r", **options).folder for name, seed in
-               (("a", 1), ("b", 1), ("c", 2))]  # fmt: skip
+    design = Design(EYE, microscope=SMALL, motion="surgeon", duration_s=4.0)
+    folders = [
+        simulate(tmp_path / folder, design, seed=seed, name="r", n_frames=2, progress=False).folder
+        for folder, seed in (("a", 1), ("b", 1), ("c", 2))
+    ]
     files = [{p.relative_to(f): p.read_bytes() for p in sorted(f.rglob("*.[jc]*")) if p.is_file()} for f in folders]
     assert files[0] == files[1]
     assert files[0] != files[2]
@@ -161,7 +168,6 @@ def test_training_never_draws_what_test_recordings_show():
     [
         (lambda: Eye(radius_mm=-1), "radius_mm"),
         (lambda: Eye(depth_mm=20), "depth_mm"),
-        (lambda: Sphere(radius_mm=0), "radius_mm"),
         (lambda: Forceps(shaft_radius_mm=-0.3), "shaft_radius_mm"),
         (lambda: Forceps(jaw_radius_mm=0.5), "jaw_radius_mm"),
         (lambda: Forceps(tip_radius_mm=0.05), "tip_radius_mm"),
@@ -180,7 +186,9 @@ def test_training_never_draws_what_test_recordings_show():
         (lambda: Motion(Forceps(), EYE, duration_s=0), "duration_s"),
         (lambda: render_pair(EYE, SMALL, forceps=Forceps(), pose=Pose((50.0, 0.0, 0.0))), "outside the field"),
         (lambda: simulate("x", n_frames=0), "n_frames"),
-        (lambda: simulate("x", dropout=1.0), "dropout"),
+        (lambda: Reports(dropout=1.0), "dropout"),
+        (lambda: Reports(click_px=-1.0), "click_px"),
+        (lambda: Microscope(fps=0.0), "fps"),
         (lambda: sample(np.random.default_rng(0), crop_px=64, size_px=(64, 64)), "give one"),
         (lambda: image_statistics(np.zeros((8, 8, 3), np.uint8)), "image"),
     ],
@@ -207,10 +215,3 @@ def test_image_statistics_of_known_images():
     assert_allclose(statistics["red_over_green"], 1.0, atol=1e-6)
     window = landmark_window(noise, np.array([[0.0, 0.0], [np.nan, np.nan], [4.0, 2.0]]), 48)
     assert window.shape == (48, 48, 3)
-
-
-def test_matt_plane_has_no_glints():
-    left, _ = render_pair(Plane(), SMALL)
-    assert not left.glint_mask.any()
-    glossy, other = render_pair(EYE, SMALL)
-    assert glossy.glint_mask.any() and (glossy.glint_mask != other.glint_mask).any()
