@@ -32,8 +32,8 @@ from lib.landmarks.windows import (
     window_from_image,
 )
 from lib.parallel import in_processes
-from lib.simulator.population import TEXTURE_SEEDS, VALIDATION_TEXTURE_SEEDS, sample
 from lib.simulator.optics import motion_kernel
+from lib.simulator.population import TEXTURE_SEEDS, VALIDATION_TEXTURE_SEEDS, sample
 from lib.training.loop import Samples
 
 __all__ = [
