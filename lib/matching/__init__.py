@@ -15,36 +15,14 @@ from numpy.typing import ArrayLike
 
 from lib.cameras import StereoRig
 from lib.matching.band import SETTINGS, match_band
+from lib.matching.deepmatching import match_free
 from lib.matching.descriptors import as_gray
-from lib.matching.free import ResponseMap, match_free, predicted_bytes, response_maps
-from lib.matching.masks import field_mask, glint_mask, tool_mask
+from lib.matching.masks import checked_mask, glint_mask, tool_mask
 from lib.matching.opencv import DisparityFunction, match_with
 from lib.matching.rectification import RECTIFIED
 from lib.matching.result import Matches
 
-__all__ = [
-    "RECTIFIED",
-    "DisparityFunction",
-    "Matches",
-    "ResponseMap",
-    "field_mask",
-    "glint_mask",
-    "match",
-    "predicted_bytes",
-    "response_maps",
-    "tool_mask",
-]
-
-
-def _mask(mask: ArrayLike | None, shape: tuple[int, int], name: str) -> np.ndarray | None:
-    if mask is None:
-        return None
-    mask = np.asarray(mask)
-    if mask.shape != shape or mask.dtype != bool:
-        raise ValueError(f"{name}: expected a bool array {shape}, True = ignore, got {mask.dtype} {mask.shape}.")
-    if mask.all():
-        raise ValueError(f"{name}: everything is masked, so nothing can be matched; True means ignore.")
-    return mask if mask.any() else None
+__all__ = ["RECTIFIED", "DisparityFunction", "Matches", "checked_mask", "glint_mask", "match", "tool_mask"]
 
 
 def match(
@@ -81,7 +59,7 @@ def match(
     rig:
         Calibrated rig, or `RECTIFIED` for a pair whose rows correspond (depth is then disparity in px).
     mask_left, mask_right:
-        (h, w) bool, True = ignore (see `glint_mask`, `tool_mask`, `field_mask`).
+        (h, w) bool, True = ignore (see `glint_mask`, `tool_mask`).
     depth_range_mm:
         (near, far): the values of d.x to search, where d is the left camera's `viewing_direction` and x a point in
         the rig's frame (so the sign and the origin are those of the rig's frame along d).  None = found by a coarse
@@ -94,11 +72,10 @@ def match(
     downscale:
         DeepMatching only: descriptors are pooled by 2^downscale; None is the smallest from 1 that fits the budget.
     budget_bytes:
-        Memory that DeepMatching may take.  It is predicted before anything is allocated; what does not fit is matched
-        in tiles of the left image (free DeepMatching), or refused with the figure.
+        Memory that DeepMatching may take.  It is predicted before anything is allocated; what does not fit is refused.
     max_epipolar_px:
-        Every method that searches along the rig's epipolar lines refuses a rig whose lines lie farther than this from what
-        free coarse matches say.
+        Every method that searches along the rig's epipolar lines refuses a rig whose lines lie farther than this from
+        what free coarse matches say.
     reciprocal:
         Drop matches whose way back from the right image leads elsewhere (occlusions, above all).  False keeps them;
         `Matches.reciprocal` says which.
@@ -108,18 +85,27 @@ def match(
     Returns
     -------
     Matches
-        Possibly none, where there is no texture.  Of three confidences the score tells wrong matches best as a rule, but
-        SGBM has none (always 1); the peak ratio and the reciprocal check mean the same for every method
-        (`detection_auc` measures each).
+        Possibly none, where there is no texture.  Of three confidences the score is usually the best detector of wrong
+        matches, but SGBM has none (always 1); the peak ratio and the reciprocal check mean the same for every method.
 
     Raises
     ------
     ValueError
         For images of a wrong type or shape, masks of a wrong shape or that leave nothing, an unknown method or
         setting, too small a budget, or a rig that does not fit the images (with the epipolar error).
+
+    Example
+    -------
+    >>> noise = np.random.default_rng(0).integers(0, 255, (48, 64), dtype=np.uint8)
+    >>> matches = match(noise, np.roll(noise, 4, axis=1))
+    >>> np.median(matches.u_right - matches.u_left, axis=0).tolist()
+    [4.0, 0.0]
     """
     images = as_gray(left, "left"), as_gray(right, "right")
-    masks = _mask(mask_left, images[0].shape, "mask_left"), _mask(mask_right, images[1].shape, "mask_right")
+    masks = tuple(
+        None if mask is None else checked_mask(mask, image.shape, name)
+        for mask, image, name in zip((mask_left, mask_right), images, ("mask_left", "mask_right"), strict=True)
+    )
     if setting not in SETTINGS:
         raise ValueError(f"setting: expected one of {sorted(SETTINGS)}, got {setting!r}.")
     if depth_range_mm is not None:
@@ -128,34 +114,21 @@ def match(
             raise ValueError(f"depth_range_mm: expected (near, far) with near < far, got {depth_range_mm}.")
     if method is None:
         method = "deepmatching" if rig is None else "band"
+    along_lines = {
+        "depth_range_mm": depth_range_mm,
+        "setting": SETTINGS[setting],
+        "max_epipolar_px": max_epipolar_px,
+        "reciprocal": reciprocal,
+    }
     if method == "deepmatching":
-        matches = match_free(
-            images, masks, downscale=downscale, budget_bytes=budget_bytes, reciprocal=reciprocal, device=device
-        )
+        options = {"downscale": downscale, "budget_bytes": budget_bytes, "device": device}
+        matches = match_free(images, masks, reciprocal=reciprocal, **options)
     elif method == "band":
         if rig is None:
             raise ValueError("rig: method 'band' needs a calibrated rig, or RECTIFIED for a rectified pair.")
-        matches = match_band(
-            images,
-            masks,
-            rig,
-            depth_range_mm=depth_range_mm,
-            setting=SETTINGS[setting],
-            max_epipolar_px=max_epipolar_px,
-            budget_bytes=budget_bytes,
-            reciprocal=reciprocal,
-        )
+        matches = match_band(images, masks, rig, budget_bytes=budget_bytes, **along_lines)
     elif callable(method) or method in ("sgbm", "dis"):
-        matches = match_with(
-            method,
-            images,
-            masks,
-            rig,
-            depth_range_mm=depth_range_mm,
-            setting=SETTINGS[setting],
-            reciprocal=reciprocal,
-            max_epipolar_px=max_epipolar_px,
-        )
+        matches = match_with(method, images, masks, RECTIFIED if rig is None else rig, **along_lines)
     else:
         raise ValueError(f"method: expected 'deepmatching', 'band', 'sgbm', 'dis' or a callable, got {method!r}.")
     inside = np.ones(len(matches), bool)

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-__all__ = ["CHANNELS", "as_gray", "pixel_descriptors"]
+__all__ = ["CHANNELS", "MIN_SEEN", "as_gray", "patch_quality", "pixel_descriptors"]
 
 #: Eight orientations and one constant, which keeps flat patches from matching noise.
 CHANNELS = 9
@@ -21,6 +21,10 @@ CONSTANT = 0.3
 #: How far a descriptor looks: three blurs of 3 px and a gradient of 1 px.
 REACH_PX = 10
 STRIP_PIXELS = 1 << 17
+#: Mean squared length of the orientation channels below which a patch is flat: gradients well below 1 grey value.
+MIN_TEXTURE = 1e-4
+#: Least part of a patch that must not be masked.
+MIN_SEEN = 0.5
 
 
 def as_gray(image: ArrayLike, name: str) -> np.ndarray:
@@ -105,3 +109,14 @@ def _describe(gray: np.ndarray, rows: slice, stride: int, out: np.ndarray) -> No
                 channel = cv2.resize(channel, (width, height), interpolation=cv2.INTER_AREA)
             out[:, :, k + 4 * opposite] = channel
     out[:, :, CHANNELS - 1] = CONSTANT
+
+
+def patch_quality(grid: np.ndarray, patch: int = 4) -> np.ndarray:
+    """Mask (gy, gx) of the patches that have texture and are mostly not masked, of descriptors (h, w, 9)."""
+    gy, gx = grid.shape[0] // patch, grid.shape[1] // patch
+    cells = grid[: gy * patch, : gx * patch].reshape(gy, patch, gx, patch, CHANNELS)
+    constant = np.ascontiguousarray(cells[..., CHANNELS - 1])
+    seen = (constant > 0).mean(axis=(1, 3))
+    rows = cells.reshape(gy, patch, gx, patch * CHANNELS)
+    texture = np.einsum("yrxk,yrxk->yx", rows, rows) - np.einsum("yrxc,yrxc->yx", constant, constant)
+    return (seen >= MIN_SEEN) & (texture / patch**2 > MIN_TEXTURE)

@@ -1,4 +1,4 @@
-"""Masks of what a matcher should ignore: True = ignore, (h, w) bool."""
+"""Masks of what a matcher should ignore: (h, w) bool, True = ignore."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-__all__ = ["field_mask", "glint_mask", "tool_mask"]
+__all__ = ["checked_mask", "glint_mask", "tool_mask"]
 
 
 def glint_mask(image: ArrayLike, *, level: int = 245, grow_px: int = 5) -> np.ndarray:
@@ -22,13 +22,10 @@ def glint_mask(image: ArrayLike, *, level: int = 245, grow_px: int = 5) -> np.nd
         Smallest value of the darkest channel.
     grow_px:
         Margin for the halo around the saturated core.
-
-    Returns
-    -------
-    np.ndarray
-        (h, w) bool, True = ignore.
     """
-    image = _checked(image)
+    image = np.asarray(image)
+    if image.dtype != np.uint8 or image.ndim not in (2, 3):
+        raise ValueError(f"image: expected a uint8 image (h, w, 3) or (h, w), got {image.dtype} {image.shape}.")
     channels = 1 if image.ndim == 2 else image.shape[2]
     core = cv2.inRange(np.ascontiguousarray(image), (level,) * channels, (255,) * channels)
     if grow_px:
@@ -52,11 +49,6 @@ def tool_mask(
         Full width of jaws and shaft, with margin; None is 0.45 of the mean jaw length.
     shaft_px:
         How far the shaft reaches behind the base, away from the tips; None is beyond the image.
-
-    Returns
-    -------
-    np.ndarray
-        (h, w) bool, True = ignore.
     """
     u = np.asarray(u_landmarks, dtype=np.float64)
     if u.shape != (3, 2):
@@ -82,36 +74,17 @@ def tool_mask(
     return mask.astype(bool)
 
 
-def field_mask(image: ArrayLike, *, level: int = 12, margin_px: int = 8) -> np.ndarray:
-    """Outside the field of view: everything dark that is connected to the image's border, grown by a margin.
+def checked_mask(mask: ArrayLike, shape: tuple[int, int], name: str) -> np.ndarray:
+    """A mask as an array.
 
-    Parameters
-    ----------
-    image:
-        (h, w, 3) RGB or (h, w), uint8.
-    level:
-        Brightest value of the surround (brightest channel, after smoothing).
-    margin_px:
-        Width of the vignetted rim that is ignored with it.
-
-    Returns
-    -------
-    np.ndarray
-        (h, w) bool, True = ignore.
+    Raises
+    ------
+    ValueError
+        If it is not bool (h, w) of this shape, or leaves nothing; `name` is the argument named.
     """
-    image = _checked(image)
-    brightest = image if image.ndim == 2 else image.max(axis=2)
-    dark = (cv2.blur(brightest, (5, 5)) <= level).astype(np.uint8)
-    _, labels = cv2.connectedComponents(dark)
-    border = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
-    outside = np.isin(labels, border[border > 0]).astype(np.uint8)
-    if margin_px and outside.any():
-        outside = cv2.dilate(outside, np.ones((2 * margin_px + 1,) * 2, np.uint8))
-    return outside.astype(bool)
-
-
-def _checked(image: ArrayLike) -> np.ndarray:
-    image = np.asarray(image)
-    if image.dtype != np.uint8 or image.ndim not in (2, 3):
-        raise ValueError(f"image: expected a uint8 image (h, w, 3) or (h, w), got {image.dtype} {image.shape}.")
-    return image
+    mask = np.asarray(mask)
+    if mask.shape != shape or mask.dtype != bool:
+        raise ValueError(f"{name}: expected a bool array {shape}, True = ignore, got {mask.dtype} {mask.shape}.")
+    if mask.all():
+        raise ValueError(f"{name}: everything is masked, so nothing can be matched; True means ignore.")
+    return mask

@@ -27,7 +27,7 @@ RECTIFIED = StereoRig(
 
 @dataclass(frozen=True, eq=False)
 class Rectification:
-    """A canvas on which both images share their rows.
+    """A canvas that covers the left image and on which both images share their rows.
 
     Attributes
     ----------
@@ -35,7 +35,7 @@ class Rectification:
         (2, 3) affine maps from canvas to image pixels, pixel centres on integers.  The right one holds at
         `reference_depth_mm`.
     size_px:
-        (width, height) of the canvas; it covers the left image.
+        (width, height) of the canvas.
     displacement_px_per_mm:
         A point dz deeper than the reference appears on the right canvas shifted by this times dz along +x.
     reference_depth_mm:
@@ -58,15 +58,8 @@ class Rectification:
         ends = self.reference_depth_mm + np.asarray(displacement_range_px) / self.displacement_px_per_mm
         return float(ends.min()), float(ends.max())
 
-    def visible_range_px(self, shape_right: tuple[int, int]) -> tuple[float, float]:
-        """(low, high) displacements that any point seen by both cameras can have, for a right image (h, w)."""
-        height, width = shape_right
-        corners = np.array([[0, 0], [width - 1, 0], [0, height - 1], [width - 1, height - 1]], dtype=np.float64)
-        x = np.linalg.solve(self.right_from_canvas[:, :2], (corners - self.right_from_canvas[:, 2]).T)[0]
-        return float(x.min() - self.size_px[0]), float(x.max())
-
     def search_range_px(self, depth_range_mm: tuple[float, float], shape_right: tuple[int, int]) -> tuple[float, float]:
-        """(low, high) displacements of a range of depth, as far as both cameras can see it.
+        """(low, high) displacements of a range of depth, as far as both cameras can see it in a right image (h, w).
 
         Raises
         ------
@@ -74,7 +67,10 @@ class Rectification:
             If they see nothing of it; the message says what depths they see.
         """
         low, high = self.displacement_range_px(depth_range_mm)
-        visible = self.visible_range_px(shape_right)
+        height, width = shape_right
+        corners = np.array([[0, 0], [width - 1, 0], [0, height - 1], [width - 1, height - 1]], dtype=np.float64)
+        x = np.linalg.solve(self.right_from_canvas[:, :2], (corners - self.right_from_canvas[:, 2]).T)[0]
+        visible = float(x.min() - self.size_px[0]), float(x.max())
         if high < visible[0] or low > visible[1]:
             near, far = self.depth_range_mm(visible)
             raise ValueError(
@@ -95,12 +91,9 @@ class Rectification:
 def rectify(
     rig: StereoRig, shape_left: tuple[int, int], shape_right: tuple[int, int], *, scale: float = 1.0
 ) -> Rectification:
-    """The rectification of a rig for images of these shapes (h, w).
+    """The rectification of a rig for images of these shapes (h, w), with `scale` canvas pixels per left pixel.
 
-    Parameters
-    ----------
-    scale:
-        Canvas pixels per left pixel.
+    Of near-affine cameras it is that of the affine cameras which touch them.
 
     Raises
     ------
@@ -135,26 +128,18 @@ def rectify(
     return Rectification(left, right, size, displacement, whole / displacement)
 
 
-def _shrink(image: np.ndarray, factor: int) -> np.ndarray:
-    """Area-average by an integer factor; a rest of rows or columns is dropped."""
-    rows, columns = image.shape[0] // factor, image.shape[1] // factor
-    return cv2.resize(image[: rows * factor, : columns * factor], (columns, rows), interpolation=cv2.INTER_AREA)
-
-
 def warp(
     gray: np.ndarray,
     image_from_canvas: np.ndarray,
     size_px: tuple[int, int],
     *,
-    shift_px: tuple[int, int] = (0, 0),
+    shift_px: tuple[float, float] = (0, 0),
     mask: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """An image on a canvas, anti-aliased where the canvas is coarser.
+    """An image (h, w), float32 or uint8, on a canvas; anti-aliased where the canvas is coarser.
 
     Parameters
     ----------
-    gray:
-        (h, w) float32 or uint8.
     image_from_canvas:
         (2, 3).
     size_px, shift_px:
@@ -169,27 +154,16 @@ def warp(
     """
     linear = image_from_canvas[:, :2]
     offset = image_from_canvas[:, 2] + linear @ np.asarray(shift_px, dtype=np.float64)
-    height, width = gray.shape
-    whole = np.rint(offset).astype(int)
-    if np.array_equal(linear, np.eye(2)) and np.array_equal(offset, whole):
-        # A shift by whole pixels: copy, so that nothing is resampled.
-        right, bottom = whole + np.array(size_px)
-        pad = (max(0, -whole[1]), max(0, bottom - height), max(0, -whole[0]), max(0, right - width))
-        rows = slice(max(0, whole[1]), max(0, min(height, bottom)))
-        columns = slice(max(0, whole[0]), max(0, min(width, right)))
-        if rows.stop <= rows.start or columns.stop <= columns.start:
-            return np.zeros(size_px[::-1], np.float32), np.zeros(size_px[::-1], bool)
-        inside = np.ones(gray.shape, np.uint8) if mask is None else (~mask).view(np.uint8)
-        out = cv2.copyMakeBorder(gray[rows, columns].astype(np.float32, copy=False), *pad, cv2.BORDER_REPLICATE)
-        valid = cv2.copyMakeBorder(inside[rows, columns], *pad, cv2.BORDER_CONSTANT, value=0)
-        return out, valid.astype(bool)
-    factor = max(1, int(np.sqrt(abs(np.linalg.det(linear))) + 0.25))
     seen = np.full(gray.shape, 255, np.uint8) if mask is None else (~mask).view(np.uint8) * np.uint8(255)
-    if factor > 1:
-        gray, seen = _shrink(gray, factor), _shrink(seen, factor)
+    factor = max(1, int(np.sqrt(abs(np.linalg.det(linear))) + 0.25))
+    if factor > 1:  # the mean of whole blocks; a rest of rows or columns is dropped
+        rows, columns = gray.shape[0] // factor, gray.shape[1] // factor
+        gray, seen = (
+            cv2.resize(image[: rows * factor, : columns * factor], (columns, rows), interpolation=cv2.INTER_AREA)
+            for image in (gray, seen)
+        )
         linear, offset = linear / factor, (offset - (factor - 1) / 2) / factor
-    matrix = np.column_stack([linear, offset])
-    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    matrix, flags = np.column_stack([linear, offset]), cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     gray = gray.astype(np.float32, copy=False)
     out = cv2.warpAffine(gray, matrix, size_px, flags=flags, borderMode=cv2.BORDER_REPLICATE)
     seen = cv2.warpAffine(seen, matrix, size_px, flags=flags, borderMode=cv2.BORDER_CONSTANT, borderValue=0)

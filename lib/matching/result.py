@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-__all__ = ["Matches"]
+__all__ = ["SIGMA_LEFT_PX", "Matches"]
+
+#: Standard deviation of `u_left`: the point is chosen, not measured, but a patch has no sharper centre than this.
+SIGMA_LEFT_PX = 0.05
 
 
 @dataclass(frozen=True, eq=False)
 class Matches:
-    """Semi-dense correspondences of a stereo pair.
+    """Semi-dense matches of a stereo pair.
 
     Attributes
     ----------
@@ -59,13 +62,5 @@ class Matches:
 
     def keep(self, chosen: np.ndarray) -> Matches:
         """The matches of a mask (n,) or of indices."""
-        return Matches(
-            self.u_left[chosen],
-            self.u_right[chosen],
-            self.score[chosen],
-            self.covariance_px2[chosen],
-            peak_ratio=self.peak_ratio[chosen],
-            reciprocal=self.reciprocal[chosen],
-            epipolar_px=self.epipolar_px,
-            method=self.method,
-        )
+        names = ("u_left", "u_right", "score", "covariance_px2", "peak_ratio", "reciprocal")
+        return replace(self, **{name: getattr(self, name)[chosen] for name in names})

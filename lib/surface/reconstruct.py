@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from lib.calibration import Calibration
 from lib.cameras import Points, StereoRig
-from lib.matching import Matches, glint_mask, match, tool_mask
+from lib.matching import Matches, checked_mask, glint_mask, match, tool_mask
 from lib.surface.bspline import BSplineSurface
 from lib.surface.fitting import fit_surface
 from lib.surface.joint import refine_rig
@@ -218,12 +218,6 @@ def _masks(
     for side, (mask, more) in enumerate(zip(masks, given, strict=True)):
         if u_landmarks is not None:
             mask |= tool_mask(mask.shape, u_landmarks[side])
-        if more is None:
-            continue
-        if np.shape(more) != mask.shape or np.asarray(more).dtype != bool:
-            name = ("mask_left", "mask_right")[side]
-            raise ValueError(
-                f"{name}: expected a bool array {mask.shape}, True = ignore, got {np.asarray(more).dtype} {np.shape(more)}."
-            )
-        mask |= more
+        if more is not None:
+            mask |= checked_mask(more, mask.shape, ("mask_left", "mask_right")[side])
     return masks

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import matplotlib.pyplot as plt
 import numpy as np
+import torch
 from ipywidgets import SelectionSlider, VBox
 from matplotlib.axes import Axes
 from matplotlib.colors import LightSource, PowerNorm
@@ -15,7 +17,8 @@ from matplotlib.patches import Rectangle
 from matplotlib.ticker import LogLocator
 
 from lib.cameras import StereoRig
-from lib.matching import Matches, ResponseMap
+from lib.matching import Matches
+from lib.matching.pyramid import PATCH
 from lib.surface import BSplineSurface, Mesh
 from notebooks.figures.interactive import explore
 from notebooks.figures.style import COLOURS, LANDMARK_COLOURS, figure, show_image
@@ -44,6 +47,7 @@ __all__ = [
     "reconstruction",
     "recorded_speeds",
     "recorded_table",
+    "response_map",
     "response_pyramid",
     "score_table",
     "smoothness_sections",
@@ -81,6 +85,45 @@ def descriptor_channels(image: np.ndarray, channels: np.ndarray) -> Figure:
         ax.images[0].set(cmap="inferno", clim=(0, np.quantile(channels[..., :8], 0.999)))
         ax.title.set_fontsize(9)
     return page
+
+
+@dataclass(frozen=True, eq=False)
+class ResponseMap:
+    """How well one patch of the left image fits everywhere in the right one, at one level of the pyramid.
+
+    `centre_px` (2,) and `size_px` of the left patch; `response` (h, w), whose [y, x] stands for the right pixel
+    (x, y) * stride_px - 1/2.
+    """
+
+    centre_px: np.ndarray
+    size_px: int
+    response: np.ndarray
+    stride_px: int
+
+    @property
+    def peak_px(self) -> np.ndarray:
+        """Right pixel (2,) of the largest response."""
+        y, x = np.unravel_index(np.argmax(self.response), self.response.shape)
+        return np.array([x, y]) * self.stride_px - 0.5
+
+    @property
+    def extent_px(self) -> tuple[float, float, float, float]:
+        """(left, right, bottom, top) for imshow over the right image."""
+        height, width = self.response.shape
+        half = self.stride_px / 2
+        return (-0.5 - half, width * self.stride_px - 0.5 - half, height * self.stride_px - 0.5 - half, -0.5 - half)
+
+
+def response_map(responses: torch.Tensor, level: int, u_left: np.ndarray, *, cell_px: int = 2) -> ResponseMap:
+    """The map of the patch nearest to the left pixel u_left (2,), of the responses (gy, gx, h, w) of one level.
+
+    Atomic patches tile the image; the centres of the larger ones lie on the corners of the atomic patches.
+    """
+    width = PATCH * cell_px
+    at = (u_left + 0.5) / width - (0.5 if level == 0 else 0.0)
+    x, y = np.clip(np.rint(at).astype(int), 0, np.array(responses.shape[1::-1]) - 1)
+    centre = (np.array([x, y]) + (0.5 if level == 0 else 0.0)) * width - 0.5
+    return ResponseMap(centre, width << level, responses[y, x].numpy(), cell_px << level)
 
 
 def response_pyramid(left: np.ndarray, right: np.ndarray, maps: list[ResponseMap]) -> Figure:

@@ -11,10 +11,12 @@ import numpy as np
 import pytest
 import torch
 
-from lib.matching import match, predicted_bytes, response_maps
-from lib.matching.deepmatching import bottom_up, match_grids, plan_tiles, top_down
+from lib.matching import match
+from lib.matching.deepmatching import atomic_maps
 from lib.matching.descriptors import pixel_descriptors
+from lib.matching.pyramid import POWER, bottom_up, gather, n_levels, pool, top_down, unpool
 from lib.paths import ROOT
+from notebooks.figures.reconstruction import response_map
 
 
 def slow_scores(left: np.ndarray, right: np.ndarray, levels: int) -> dict[tuple[int, int, int, int], float]:
@@ -105,14 +107,12 @@ def test_whole_map_passes_equal_the_recursion_they_replace():
     left, right = rng.random((16, 16, 9)).astype(np.float32), rng.random((20, 16, 9)).astype(np.float32)
     right[2:18] += 2 * left  # something to find
     slow = slow_scores(left.astype(float), right.astype(float), levels=2)
-    pyramid = bottom_up(torch.from_numpy(left), torch.from_numpy(right))
+    maps = atomic_maps(torch.from_numpy(left), torch.from_numpy(right)) ** POWER
+    along_x, pooled = pool(maps)
+    pyramid = bottom_up(pooled, n_levels(4, 4), shifted=True)
     assert len(pyramid.responses) == 2
-    score, offset = top_down(pyramid).numpy(), pyramid.offset.numpy().astype(int)
-    fast = {}
-    for i, j, y, x in np.argwhere(np.isfinite(score)):
-        dy = (offset[i, j, y, x] + 4) // 3 - 1
-        key = (i, j, 2 * y + dy, 2 * x + offset[i, j, y, x] - 3 * dy)
-        fast[key] = max(fast.get(key, -np.inf), score[i, j, y, x])
+    score = unpool(maps, along_x, pooled, top_down(pyramid)).numpy()
+    fast = {tuple(key): score[tuple(key)] for key in np.argwhere(np.isfinite(score)).tolist()}
     assert fast.keys() == slow.keys()
     assert max(abs(fast[key] - slow[key]) for key in slow) < 1e-4
 
@@ -155,24 +155,6 @@ def test_scale_change_and_rotation_are_followed():
     assert np.median(error) < 1.5
 
 
-def test_tiles_give_nearly_the_same_matches(textured):
-    right = np.roll(textured, -10, axis=1)
-    left_grid, right_grid = (torch.from_numpy(pixel_descriptors(i.astype(np.float32), 1)) for i in (textured, right))
-    shape = tuple(left_grid.shape[:2])
-    whole = match_grids(left_grid, right_grid)
-    need = predicted_bytes(textured.shape, right.shape, downscale=1)
-    tiles = plan_tiles(shape, shape, int(0.8 * need))
-    assert len(tiles) > 1
-    covered = np.zeros(shape, int)
-    for rows, columns in tiles:
-        covered[rows, columns] += 1
-    assert (covered == 1).all()
-    tiled = match_grids(left_grid, right_grid, tiles)
-    there = {tuple(a): tuple(b) for a, b in zip(whole.left, whole.right, strict=True)}
-    same = [there.get(tuple(a)) == tuple(b) for a, b in zip(tiled.left, tiled.right, strict=True)]
-    assert np.mean(same) > 0.9 and len(tiled.left) > 0.9 * len(whole.left)
-
-
 def test_downscale_adapts_to_the_budget(textured):
     free = match(textured, textured, budget_bytes=1 << 30)
     tight = match(textured, textured, budget_bytes=5 << 20)
@@ -185,7 +167,8 @@ def test_memory_is_predicted():
     """Peak resident memory of a fresh process against the prediction."""
     program = (
         "import numpy as np\n"
-        "from lib.matching import match, predicted_bytes\n"
+        "from lib.matching import match\n"
+        "from lib.matching.deepmatching import predicted_bytes\n"
         "def peak():\n"
         "    return int(open('/proc/self/status').read().split('VmHWM:')[1].split()[0]) * 1024\n"
         "image = np.random.default_rng(0).integers(0, 255, (200, 240), dtype=np.uint8)\n"
@@ -200,23 +183,21 @@ def test_memory_is_predicted():
     assert 0.5 < ratio < 1.15
 
 
-def test_response_maps_grow_sure(textured):
-    right = np.roll(textured, -20, axis=1)
-    maps = response_maps(textured, right, (100.0, 60.0))
-    assert [m.level for m in maps] == list(range(len(maps)))
-    assert [m.size_px for m in maps] == [8 * 2**level for level in range(len(maps))]
-    for m in maps:
+def test_responses_grow_sure(textured):
+    """The larger the patch, the fewer places come close to the best one (what notebook 04 shows)."""
+    grids = [torch.from_numpy(pixel_descriptors(i, 1)) for i in (textured, np.roll(textured, -20, axis=1))]
+    responses = [atomic_maps(*grids) ** POWER]
+    for level in (1, 2):
+        pooled = pool(responses[-1])[1]
+        responses.append(gather(gather(pooled, 0, level, shifted=True), 1, level, shifted=True) ** POWER)
+    maps = [response_map(response, level, np.array([100.0, 60.0])) for level, response in enumerate(responses)]
+    assert [m.size_px for m in maps] == [8, 16, 32]
+    for m, level in zip(maps, range(3), strict=True):
         assert m.response.min() >= 0 and m.response.max() <= 1 + 1e-5
         assert np.abs(m.centre_px - (100, 60)).max() <= 4.5
-    for m in maps[:3]:
-        assert np.abs(m.peak_px - m.centre_px - (-20, 0)).max() <= 2 ** (m.level + 1)
-    # The larger the patch, the fewer places come close to the best one.
-    near = [np.mean(m.response > 0.9 * m.response.max()) * m.response.size for m in maps[:3]]
+        assert np.abs(m.peak_px - m.centre_px - (-20, 0)).max() <= 2 ** (level + 1)
+    near = [np.mean(m.response > 0.9 * m.response.max()) * m.response.size for m in maps]
     assert near[2] < near[0]
-    with pytest.raises(ValueError, match="u_left: expected one pixel"):
-        response_maps(textured, right, (500, 60))
-    with pytest.raises(ValueError, match="budget_bytes: the maps need"):
-        response_maps(textured, right, (100, 60), budget_bytes=1 << 20)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")

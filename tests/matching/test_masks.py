@@ -1,11 +1,11 @@
-"""Masks of glints, tool and surround."""
+"""Masks of glints and tool."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from lib.matching import field_mask, glint_mask, tool_mask
+from lib.matching import glint_mask, tool_mask
 
 
 def test_glints_are_saturated_in_every_channel_and_grown():
@@ -17,6 +17,8 @@ def test_glints_are_saturated_in_every_channel_and_grown():
     assert mask[17:27, 31:33].all() and mask[22, 27:37].all()
     assert not mask[40, 10] and mask.sum() < 12 * 12
     assert glint_mask(image, grow_px=0).sum() == 16
+    with pytest.raises(ValueError, match="image: expected a uint8"):
+        glint_mask(image.astype(float))
     assert np.array_equal(glint_mask(image[..., 0], grow_px=0)[20:24, 30:34], np.ones((4, 4), bool))
     with pytest.raises(ValueError, match="image: expected a uint8"):
         glint_mask(image / 255.0)
@@ -42,17 +44,3 @@ def test_missing_landmarks_leave_out_what_is_unknown():
     assert not tool_mask((120, 200), u).any()
     with pytest.raises(ValueError, match=r"u_landmarks: expected \(3, 2\)"):
         tool_mask((120, 200), np.zeros((2, 2)))
-
-
-def test_field_is_what_light_reaches():
-    y, x = np.mgrid[:120, :160]
-    inside = (x - 80) ** 2 + (y - 60) ** 2 < 50**2
-    image = np.where(inside, 130, 3).astype(np.uint8)
-    image[55:65, 75:85] = 0  # dark, but inside
-    mask = field_mask(image, margin_px=4)
-    assert mask[0].all() and mask[:, 0].all()
-    assert not mask[50:70, 70:90].any()
-    assert mask[60, 129] and not mask[60, 118]
-    assert not field_mask(np.full((50, 50, 3), 90, np.uint8)).any()
-    with pytest.raises(ValueError, match="image: expected a uint8"):
-        field_mask(image.astype(float))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from lib.matching.confidence import peak_ratio
+from lib.matching.pyramid import peak_ratio
 from lib.matching.refine import refine
 from lib.matching.volume import correlation_volume, match_volume
 
@@ -21,10 +21,10 @@ def grids():
 
 
 def test_correlations_are_cosines_of_patches(grids):
-    left, right, low, n, v = grids
+    left, right, _, n, v = grids
     right = right.copy()
     right[:6, :9] = 0.0  # masked
-    volume = correlation_volume(torch.from_numpy(left), torch.from_numpy(right), low, n, v).numpy()
+    volume = correlation_volume(torch.from_numpy(left), torch.from_numpy(right), v).numpy()
     assert volume.shape == (9, 11, 2 * v + 1, n)
     for y, x, j, k in [(0, 0, 0, 0), (3, 5, 2, 5), (8, 10, 4, 16), (0, 10, 1, 3), (8, 0, 3, 9), (0, 1, 1, 6)]:
         patch = left[4 * y : 4 * y + 4, 4 * x : 4 * x + 4].ravel()
@@ -46,21 +46,20 @@ def test_every_size_of_volume_works_and_finds_the_motion():
         right = rng.random((4 * gy + 2 * v, 4 * gx + n - 1, 9)).astype(np.float32)
         shift, drop = n // 2, v  # on the line
         right[drop : drop + 4 * gy, shift : shift + 4 * gx] = left
-        found = match_volume(correlation_volume(torch.from_numpy(left), torch.from_numpy(right), low, n, v), low)
+        found = match_volume(correlation_volume(torch.from_numpy(left), torch.from_numpy(right), v), low)
         assert len(found.patch) == gy * gx
         assert (found.cell == (low + shift, 0)).all()
-        assert np.allclose(found.response, 1, atol=1e-5)
 
 
 def test_matches_are_one_to_one(grids):
-    left, right, low, n, v = grids
-    found = match_volume(correlation_volume(*map(torch.from_numpy, (left, right)), low, n, v), low)
+    left, right, low, _, v = grids
+    found = match_volume(correlation_volume(*map(torch.from_numpy, (left, right)), v), low)
     assert 0 < len(found.patch) < 99
     bins = (found.patch * 4 + 2 + found.cell) // 4
     assert len(np.unique(bins, axis=0)) == len(bins)
     assert np.abs(found.displacement - found.cell).max() <= 0.5
-    kept = found.keep(found.score > np.median(found.score))
-    assert len(kept.patch) == len(kept.score) < len(found.patch)
+    kept = found.keep(found.peaked)
+    assert len(kept.patch) == kept.peaked.sum() < len(found.patch)
 
 
 @pytest.mark.parametrize("margin", [0, 1])
@@ -91,14 +90,17 @@ def test_refinement_ignores_gain_and_works_at_the_border():
 
 
 def test_peak_ratio_compares_the_match_with_the_best_place_elsewhere():
-    volume = np.zeros((2, 3, 3, 8), np.float32)
-    volume[1, 2, 1, [2, 3, 6]] = 0.8, 0.9, 0.6
-    volume[0, 0, 0, 0], volume[0, 0, 2, 2] = 0.4, 0.8  # what is elsewhere may lie off the line
-    volume[0, 1, 1, 7] = 0.5  # nothing else responds
-    ratio = peak_ratio(volume, np.array([[2, 1], [2, 1], [0, 0], [1, 0]]), np.array([3, 6, 0, 7]))
+    maps = torch.zeros(4, 1, 8)
+    maps[:2, 0, [2, 3, 6]] = torch.tensor([0.8, 0.9, 0.6])
+    maps[2, 0, [0, 2]] = torch.tensor([0.4, 0.8])
+    maps[3, 0, 7] = 0.5  # nothing else responds
+    ratio = peak_ratio(maps.clone(), torch.zeros(4, dtype=int), torch.tensor([3, 6, 0, 7]))
     assert ratio == pytest.approx([1.5, 2 / 3, 0.5, np.inf], rel=1e-6)
-    assert np.isnan(peak_ratio(volume[..., :3], np.array([[2, 1]]), np.array([1]))).all()
-    assert peak_ratio(volume, np.zeros((0, 2), int), np.zeros(0, int)).shape == (0,)
+    assert np.isnan(peak_ratio(maps[:1, :, :3], *torch.tensor([[0], [1]]))).all()
+    square = torch.zeros(1, 5, 5)
+    square[0, [1, 2, 4], [1, 2, 0]] = torch.tensor([0.9, 0.5, 0.3])
+    assert peak_ratio(square, *torch.tensor([[1], [1]])) == pytest.approx([3.0])
+    assert peak_ratio(torch.zeros(0, 3, 8), *torch.zeros((2, 0), dtype=int)).shape == (0,)
 
 
 def test_only_the_best_of_two_patches_on_one_place_is_reciprocal():
@@ -106,7 +108,7 @@ def test_only_the_best_of_two_patches_on_one_place_is_reciprocal():
     left, right = rng.random((4, 16, 9)).astype(np.float32), rng.random((4, 20, 9)).astype(np.float32)
     left[:, 4:8] = 0.9 * left[:, :4] + 0.1 * left[:, 4:8]  # a worse copy of the first patch
     right[:, 4:8], right[:, 12:20] = left[:, :4], left[:, 8:]
-    volume = correlation_volume(torch.from_numpy(left), torch.from_numpy(right), 0, 5, 0)
+    volume = correlation_volume(torch.from_numpy(left), torch.from_numpy(right), 0)
     every = match_volume(volume, 0, reciprocal=False)
     assert every.patch[:, 0].tolist() == [0, 1, 2, 3] and every.cell[:, 0].tolist() == [4, 0, 4, 4]
     assert every.reciprocal.tolist() == [True, False, True, True]
