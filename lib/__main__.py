@@ -98,7 +98,7 @@ def _become(command: list[str]) -> int:
 
 
 def run(argv: list[str]) -> int:
-    from lib.workbench import main
+    from lib.workbench.command import main
 
     return main(argv)
 

@@ -22,6 +22,8 @@ from tqdm.auto import tqdm
 __all__ = ["Finished", "cores", "in_processes", "run_jobs", "single_threaded_torch", "step"]
 
 _STEPS = "microstereo-steps"
+#: A scheduler must answer within these seconds.
+ANSWER_S = 15.0
 
 
 @dataclass(frozen=True)
@@ -108,12 +110,14 @@ def single_threaded_torch() -> Iterator[None]:
 
 
 def _finished(client, function: Callable, jobs: Mapping[Path, tuple]) -> Iterator[Finished]:
-    from distributed import as_completed
+    from distributed import KilledWorker, as_completed
 
     futures = {client.submit(_work, function, path, *jobs[path], pure=False): path for path in jobs}
     try:
         for future in as_completed(futures):
             error = future.exception() if future.status == "error" else None
+            if isinstance(error, KilledWorker):
+                error = ChildProcessError("its workers were killed again and again, perhaps for lack of memory.")
             if future.status == "cancelled":
                 error = ConnectionError("the scheduler was lost.")
             yield Finished(futures[future], None if error else future.result(), error)
@@ -135,7 +139,7 @@ def _client(workers: int, scheduler: str | None):
 
     if scheduler:
         try:
-            client = Client(scheduler, timeout=15)
+            client = Client(scheduler, timeout=ANSWER_S)
         except (OSError, ValueError) as error:  # also a timeout
             raise ConnectionError(f"{scheduler}: no Dask scheduler answers ({error or type(error).__name__}).") from None
         with client:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import functools
 import json
 import os
 import platform
@@ -157,6 +158,7 @@ def _memory_gb() -> float | None:
         return None
 
 
+@functools.cache
 def _gpu() -> str | None:
     try:
         command = ["nvidia-smi", "--query-gpu=name", "--format=csv,noheader"]

@@ -17,7 +17,7 @@ from pathlib import Path
 from lib import paths
 from lib import provenance as records
 from lib.workbench import collection, pages
-from lib.workbench.execution import Failure, execute, kernel_environment
+from lib.workbench.execution import Failure, execute
 from lib.workbench.index import index_html
 from lib.workbench.parameters import (
     UsageError,
@@ -83,7 +83,6 @@ def run(
     for book in chosen:
         if "profile" in declared_parameters(book):
             values[book].setdefault("profile", profile)
-    kernel_environment()
     report = _Report(_new_folder(runs, profile), chosen, profile, dict(pairs))
     width = max(len(book.stem) for book in chosen)
     try:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import os
 import re
-import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -23,7 +22,7 @@ _ANSI = re.compile(r"\x1b\[[0-9;]*m")
 class Failure:
     """Why a notebook did not get to its end: `cell` counts its cells from 1."""
 
-    kind: str  # "error", "timeout", "dead kernel", "unreadable"
+    kind: str  # "error", "timeout" or "dead kernel"
     cell: int | None
     message: str
 
@@ -34,14 +33,12 @@ class Failure:
     as_dict = asdict
 
 
-def kernel_environment(cpu_threads: int | None = None) -> None:
+def kernel_environment() -> None:
     """Set the environment variables that kernels inherit: this interpreter's own kernel, and quiet libraries."""
     os.environ["JUPYTER_PREFER_ENV_PATH"] = "1"  # a kernel named python3 elsewhere on the machine must not win
     os.environ.pop("JUPYTER_PATH", None)
     os.environ["OPEN3D_DISABLE_WEB_VISUALIZER"] = "true"  # it hangs without a display
     os.environ["PYDEVD_DISABLE_FILE_VALIDATION"] = "1"  # a warning of the debugger on every start
-    if cpu_threads:
-        os.environ["OMP_NUM_THREADS"] = str(cpu_threads)
 
 
 def execute(
@@ -62,54 +59,37 @@ def execute(
         Called with the cell that starts (from 1) and the number of cells.
     """
     import papermill
-    from papermill.engines import NBClientEngine, papermill_engines
     from papermill.exceptions import PapermillExecutionError
 
-    engine_name = f"workbench-{id(on_cell)}-{time.monotonic_ns()}"
-    running = 0
+    running, cells = 0, len(nbformat.read(notebook, as_version=4).cells)
 
-    class Engine(NBClientEngine):
-        """papermill's own, telling which cell starts."""
+    def on_cell_start(cell, cell_index):
+        nonlocal running
+        running += not _is_added(cell)
+        on_cell(running, cells)
 
-        @classmethod
-        def execute_managed_notebook(cls, manager, kernel_name, **options):
-            tell = manager.cell_start
-
-            def cell_start(cell, cell_index=None, **more):
-                nonlocal running
-                added = [_is_added(other) for other in manager.nb.cells]
-                running = (cell_index or 0) + 1 - sum(added[:cell_index])
-                on_cell(running, len(added) - sum(added))
-                return tell(cell, cell_index=cell_index, **more)
-
-            manager.cell_start = cell_start
-            super().execute_managed_notebook(manager, kernel_name, **options)
-
-    papermill_engines.register(engine_name, Engine)
+    kernel_environment()
     logging.getLogger("papermill").setLevel(logging.CRITICAL)  # what it says is told by the failure returned
-    failure = None
     try:
         papermill.execute_notebook(
             str(notebook),
             str(output),
             parameters,
-            engine_name=engine_name,
             kernel_name="python3",
             progress_bar=False,
             execution_timeout=cell_timeout_s,
+            on_cell_start=on_cell_start,  # this and the next are for nbclient
             extra_arguments=["--IPKernelApp.log_level=50"],  # its warning of unencrypted TCP on every start
         )
     except PapermillExecutionError:
         pass  # told by the outputs, below
     except CellTimeoutError:
-        failure = Failure("timeout", running, _longer_than(cell_timeout_s))
+        return Failure("timeout", running, _longer_than(cell_timeout_s))
     except DeadKernelError:
-        failure = Failure("dead kernel", running, "the kernel died; the machine may have run out of memory.")
-    except (nbformat.reader.NotJSONError, nbformat.ValidationError, OSError, ValueError, RuntimeError) as error:
-        failure = Failure("unreadable" if not running else "error", running or None, f"{type(error).__name__}: {error}")
-    finally:
-        papermill_engines._engines.pop(engine_name, None)
-    return failure or failure_of(output, cell_timeout_s)
+        return Failure("dead kernel", running, "the kernel died; the machine may have run out of memory.")
+    except (nbformat.ValidationError, OSError, ValueError, RuntimeError) as error:
+        return Failure("error", running or None, f"{type(error).__name__}: {error}")
+    return failure_of(output, cell_timeout_s)
 
 
 def failure_of(executed: Path, cell_timeout_s: float | None = None) -> Failure | None:

@@ -1,10 +1,13 @@
-"""Which notebooks, and which values for their parameters: everything that is checked before anything runs."""
+"""Which notebooks run, and with which values of their parameters; all of it is checked before anything runs."""
 
 from __future__ import annotations
 
+import argparse
 import ast
 import contextlib
 import logging
+import math
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -12,17 +15,23 @@ import nbformat
 
 from lib import paths
 
-__all__ = ["UsageError", "choose_notebooks", "declared_parameters", "parse_parameters", "title_of"]
+__all__ = ["UsageError", "choose_notebooks", "declared_grid", "declared_parameters", "parse_parameters", "positive",
+           "split_values", "title_of"]  # fmt: skip
+
+#: How the comment of a study's parameter ends: ``; grid: 75, 300, 1500``.
+_GRID = re.compile(r";\s*grid:(.*)$")
+#: A comma outside brackets.
+_COMMA = re.compile(r",(?![^\[({]*[\])}])")
 
 
 class UsageError(ValueError):
-    """The command was misspelt: an unknown notebook or parameter, or a value of the wrong type."""
+    """The command cannot run: an unknown notebook or parameter, a value of the wrong type, a folder out of reach."""
 
 
 def choose_notebooks(names: Sequence[str] = (), folder: Path = paths.NOTEBOOKS) -> list[Path]:
     """The notebooks named, in the order of the paper; all of them for no name.
 
-    A name is a path, a file's name, its stem, or the leading number (``03``).
+    A name is a path, a file's name, its stem, or the leading number (``03``); studies are found by stem too.
 
     Raises
     ------
@@ -34,27 +43,40 @@ def choose_notebooks(names: Sequence[str] = (), folder: Path = paths.NOTEBOOKS) 
         if not shipped:
             raise UsageError(f"{folder} holds no notebooks.")
         return shipped
+    studies = sorted(folder.glob("studies/*.ipynb"))
     chosen = []
     for name in names:
         path = Path(name)
         fits = [path.resolve()] if path.suffix == ".ipynb" and path.is_file() else []
         fits = fits or [book for book in shipped if name in (book.name, book.stem, book.stem.split("_")[0])]
+        fits = fits or [book for book in studies if path.with_suffix("") in (Path(book.stem), Path("studies", book.stem))]
         if not fits:
-            raise UsageError(f"unknown notebook: {name}. There are: {', '.join(book.stem for book in shipped)}.")
+            there = [book.stem for book in shipped] + [f"studies/{book.stem}" for book in studies]
+            raise UsageError(f"unknown notebook: {name}. There are: {', '.join(there)}.")
         chosen += [book for book in fits if book not in chosen]
     return sorted(chosen, key=lambda book: book.name)
 
 
 def declared_parameters(notebook: Path) -> dict[str, str]:
     """Names and declared types ("int", "str", ...; "" where none is) of the cell tagged ``parameters``."""
-    import papermill
+    return {name: (entry["inferred_type_name"] or "").replace("None", "") for name, entry in _inspect(notebook).items()}
 
-    try:
-        with _quiet_papermill():
-            found = papermill.inspect_notebook(str(notebook))
-    except (ValueError, nbformat.ValidationError) as error:  # also text that is no JSON
-        raise UsageError(f"{notebook}: not a notebook ({error}).") from None
-    return {name: (entry["inferred_type_name"] or "").replace("None", "") for name, entry in found.items()}
+
+def declared_grid(notebook: Path) -> dict[str, list[str]]:
+    """The values that a sweep tries, as texts: those that comments of the parameters name after ``; grid:``."""
+    found = {name: _GRID.search(entry["help"] or "") for name, entry in _inspect(notebook).items()}
+    return {name: split_values(grid[1]) for name, grid in found.items() if grid}
+
+
+def split_values(text: str) -> list[str]:
+    """The values of ``75, 300`` or ``[1, 2], [3]``, as texts.
+
+    Examples
+    --------
+    >>> split_values("[1, 2], band")
+    ['[1, 2]', 'band']
+    """
+    return [value.strip() for value in _COMMA.split(text) if value.strip()]
 
 
 def parse_parameters(pairs: Sequence[tuple[str, str]], notebooks: Sequence[Path]) -> dict[Path, dict]:
@@ -74,6 +96,20 @@ def parse_parameters(pairs: Sequence[tuple[str, str]], notebooks: Sequence[Path]
         notebook: {name: _value(name, text, names[name]) for name, text in pairs if name in names}
         for notebook, names in declared.items()
     }
+
+
+def positive(text: str) -> float:
+    """A number of seconds on a command line.
+
+    Raises
+    ------
+    argparse.ArgumentTypeError
+        For anything but a finite number above 0.
+    """
+    with contextlib.suppress(ValueError):
+        if 0 < float(text) < math.inf:
+            return float(text)
+    raise argparse.ArgumentTypeError(f"{text} is not a number of seconds above 0.")
 
 
 def title_of(notebook: Path) -> str:
@@ -107,13 +143,11 @@ def _value(name: str, text: str, kind: str) -> object:
     return {"true": True, "false": False, "none": None}.get(text.lower(), text)
 
 
-@contextlib.contextmanager
-def _quiet_papermill():
-    """No word about notebooks without a parameters cell: `parse_parameters` has its own."""
-    logger = logging.getLogger("papermill")
-    before = logger.level
-    logger.setLevel(logging.ERROR)
+def _inspect(notebook: Path) -> dict[str, dict]:
+    import papermill
+
+    logging.getLogger("papermill").setLevel(logging.ERROR)  # no word about notebooks without a parameters cell
     try:
-        yield
-    finally:
-        logger.setLevel(before)
+        return papermill.inspect_notebook(str(notebook))
+    except (OSError, ValueError, nbformat.ValidationError) as error:  # also text that is not JSON
+        raise UsageError(f"{notebook}: not a notebook ({error}).") from None

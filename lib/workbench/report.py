@@ -14,8 +14,12 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
-from matplotlib.figure import Figure
+if TYPE_CHECKING:
+    from matplotlib.figure import (
+        Figure,  # at run time it would slow every notebook's start
+    )
 
 __all__ = ["FIGURE_METADATA", "METRIC_MIME", "format_value", "record", "show", "timed", "unit_text"]
 

@@ -1,139 +1,247 @@
-"""``python3 -m lib sweep``: one notebook over a grid of parameters, several at a time, and a table of its metrics."""
+"""``python3 -m lib sweep``: one notebook over a grid of parameters, on Dask, into a table and a plot a metric.
+
+Each point of the grid is one run of the notebook, each run one row of the table.
+"""
 
 from __future__ import annotations
 
 import argparse
-import csv
+import contextvars
 import hashlib
-import io
 import itertools
 import json
-import os
+import re
+import shlex
+import shutil
 import sys
-import threading
-from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from tqdm import tqdm
+import nbformat
 
-from lib import paths
-from lib.workbench import collection
-from lib.workbench.execution import execute, kernel_environment
-from lib.workbench.parameters import UsageError, choose_notebooks, declared_parameters, parse_parameters
+from lib import files, paths
+from lib.parallel import run_jobs
+from lib.provenance import Provenance, machine
+from lib.workbench import collection, results
+from lib.workbench.execution import execute
+from lib.workbench.parameters import (
+    UsageError,
+    choose_notebooks,
+    declared_grid,
+    declared_parameters,
+    parse_parameters,
+    positive,
+    split_values,
+)
+from lib.workbench.plots import save_plots
 
-__all__ = ["main", "sweep"]
+__all__ = ["column_name", "main", "sweep"]
+
+_EPILOG = """\
+examples:
+  python3 -m lib sweep studies/working_distance            the grid that its parameters name
+  python3 -m lib sweep 05 -p seed 0,1,2 -p sigma_u_px 0.5,1.0
+
+Runs appear in runs/sweeps/NOTEBOOK-DIGEST; the digest changes with the notebook and with lib/. Started again, the command
+runs what is missing.
+
+Other machines: any Dask cluster whose workers have this environment and see this folder.
+  .venv/bin/dask scheduler                                 prints its address
+  .venv/bin/dask worker ADDRESS --nthreads 1 --nworkers 8  on each machine
+  python3 -m lib sweep NOTEBOOK --scheduler ADDRESS
+
+SLURM: start the scheduler and its workers with .venv/bin/python on the login node, in the folder of the workbench:
+  from dask_jobqueue import SLURMCluster
+  cluster = SLURMCluster(cores=1, processes=1, memory="4GB", walltime="04:00:00", interface="ib0",
+                         worker_extra_args=["--lifetime", "230m"])
+  print(cluster.job_script())          # what each job runs
+  cluster.scale(jobs=40)
+  print(cluster.scheduler_address)     # give it to --scheduler; keep this Python open until the sweep ends
+"""
 
 
 def main(argv: Sequence[str]) -> int:
-    """Parse the command line and sweep; 1 if a point of the grid failed, 2 for a misspelt command."""
+    """Parse the command line and sweep; 1 if a run failed, 2 for a command that cannot run."""
     parser = argparse.ArgumentParser(
         prog="python3 -m lib sweep",
-        description="Run one notebook over every combination of values; run again, it goes on where it was stopped.",
-        epilog="example: python3 -m lib sweep 05 -p seed 0,1,2 -p sigma_u_px 0.5,1.0,2.0",
+        description="Run one notebook at every point of a grid of parameters and make a table of its metrics.",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("notebook", metavar="NOTEBOOK", help="path, name or number")
-    parser.add_argument("-p", dest="pairs", nargs=2, action="append", default=[], metavar=("NAME", "VALUE,VALUE,..."))
-    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="notebooks at a time")
-    parser.add_argument("--cell-timeout", type=float, metavar="S", help="longest time of one cell")
-    parser.add_argument("--runs", type=Path, default=paths.RUNS, metavar="FOLDER")
+    parser.add_argument("notebook", metavar="NOTEBOOK", help="path, name or number, such as studies/NAME or 05")
+    parser.add_argument("-p", dest="pairs", nargs=2, action="append", default=[], metavar=("NAME", "VALUE,VALUE,..."),
+                        help="a parameter and its values (default: the grid in the comments of the parameters)")  # fmt: skip
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument("--workers", type=int, metavar="N", help="runs at a time on this machine (default: one a core)")
+    where.add_argument("--scheduler", metavar="ADDRESS", help="a running Dask scheduler, such as tcp://10.0.0.1:8786")
+    parser.add_argument("--record", action="store_true", help="also write data/results/NOTEBOOK.csv and .json")
+    parser.add_argument("--cell-timeout", type=positive, metavar="S", help="longest time of one cell")
+    parser.add_argument("--runs", type=Path, default=paths.RUNS, metavar="FOLDER", help="where sweeps/ appears")
     options = parser.parse_args(argv)
+    if options.workers is not None and options.workers < 1:
+        parser.error("--workers: at least 1.")
     try:
         table, failures = sweep(
             options.notebook,
-            {name: values.split(",") for name, values in options.pairs},
+            {name: split_values(values) for name, values in options.pairs},
             workers=options.workers,
+            scheduler=options.scheduler,
+            record=options.record,
             cell_timeout_s=options.cell_timeout,
             runs=options.runs,
         )
-    except UsageError as error:
+    except (UsageError, OSError) as error:
         print(f"python3 -m lib sweep: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("\nStopped; run again to go on.")
         return 130
     for point, failure in failures.items():
-        print(f"FAILED {point}: {failure}", file=sys.stderr)
-    print(f"Table: {table}")
+        print(f"FAILED {point or 'the run'}: {failure}", file=sys.stderr)
+    print(f"Table: {paths.shown(table)}")
     return 1 if failures else 0
 
 
 def sweep(
     name: str,
-    grid: dict[str, list[str]],
+    grid: dict[str, list[str]] | None = None,
     *,
-    workers: int = 1,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    record: bool = False,
     cell_timeout_s: float | None = None,
     runs: Path = paths.RUNS,
     notebooks: Path = paths.NOTEBOOKS,
+    recorded: Path = paths.RESULTS,
 ) -> tuple[Path, dict[str, str]]:
-    """Execute a notebook at every point of a grid, `workers` at a time.
+    """Execute a notebook at every point of a grid on a Dask cluster.
 
-    Points that a former sweep of the same notebook finished are taken over; failed ones are tried again.
+    Runs that an earlier sweep with the same notebook and the same code finished are kept; failed ones run again.
 
     Parameters
     ----------
     grid:
-        Values as texts for each parameter.
+        Values as texts for each parameter; none takes the grid that the notebook declares.
+    workers, scheduler:
+        As in `lib.parallel.run_jobs`.
+    record:
+        Also write the table to the folder `recorded`, if no run failed.
 
     Returns
     -------
     tuple
-        ``results.csv`` (a row a point: its parameters, then the metrics), and what failed at which point.
+        ``results.csv`` (a row a run: its parameters, then its metrics), and what failed at which point.
 
     Raises
     ------
     UsageError
-        For an unknown notebook or parameter, a value of the wrong type, or an empty grid.
+        For an unknown notebook or parameter, a value of the wrong type, or a parameter without values.
     """
     chosen = choose_notebooks([name], notebooks)
-    if len(chosen) != 1 or not grid or not all(grid.values()):
-        raise UsageError("a sweep takes one notebook and at least one parameter: -p NAME VALUE,VALUE,...")
+    grid = grid or declared_grid(chosen[0])
+    if len(chosen) != 1 or not all(grid.values()):
+        raise UsageError("a sweep takes one notebook, and values for each parameter: -p NAME VALUE,VALUE,...")
     book = chosen[0]
-    points = [dict(zip(grid, values, strict=True)) for values in itertools.product(*grid.values())]
-    given = [parse_parameters(list(point.items()), [book])[book] for point in points]
-    if "profile" in declared_parameters(book):
-        for values in given:
-            values.setdefault("profile", "quick")
-    version = hashlib.sha256(book.read_bytes()).hexdigest()[:8]  # an edited notebook starts a sweep of its own
-    folder = runs / "sweeps" / f"{book.stem}-{version}"
+    points = [
+        parse_parameters(list(zip(grid, values, strict=True)), [book])[book]
+        for values in itertools.product(*grid.values())
+    ]
+    profile = {"profile": "quick"} if "profile" in declared_parameters(book) else {}
+    folder = runs / "sweeps" / f"{book.stem}-{_code_digest(book)}"
     folder.mkdir(parents=True, exist_ok=True)
-    kernel_environment(cpu_threads=max(1, (os.cpu_count() or 1) // workers))
+    words = ["sweep", name, *itertools.chain(*(("-p", key, ",".join(values)) for key, values in grid.items()))]
+    provenance = Provenance(shlex.join(["python3", "-m", "lib", *words]))
+    of_file = {folder / f"{_label_digest(point)}.ipynb": point for point in points}
+    jobs = {executed: (book, profile | point, cell_timeout_s) for executed, point in of_file.items()}
+    rows = {executed: _row(executed, point) for executed, point in of_file.items() if executed.exists()}
     failures: dict[str, str] = {}
-    rows: dict[int, dict] = {}
-    guard = threading.Lock()
-
-    def work(number: int) -> None:
-        label = ",".join(f"{key}={value}" for key, value in points[number].items())
-        stem = hashlib.sha256(json.dumps(given[number], sort_keys=True, default=str).encode()).hexdigest()[:12]
-        executed = folder / f"{stem}.ipynb"
-        if not executed.exists():
-            partial = folder / f"{stem}.{os.getpid()}.partial.ipynb"
-            failure = execute(book, partial, given[number], cell_timeout_s=cell_timeout_s)
-            if failure:
-                with guard:
-                    failures[label] = f"{failure} ({partial.name})"
-                return
-            os.replace(partial, executed)
-        metrics = {metric["name"]: metric["value"] for metric in collection.metrics_of(executed)}
-        with guard:
-            rows[number] = {**points[number], **metrics, "notebook": executed.name}
-            _write_table(folder / "results.csv", [rows[key] for key in sorted(rows)])
-
-    pool = ThreadPoolExecutor(workers)  # each notebook has a process of its own: its kernel
-    try:
-        list(tqdm(pool.map(work, range(len(points))), total=len(points), desc=book.stem, unit="run"))
-    finally:
-        pool.shutdown(cancel_futures=True)
-    return folder / "results.csv", failures
+    table = folder / "results.csv"
+    for done in run_jobs(run_point, jobs, workers=workers, scheduler=scheduler, title=book.stem, unit="run"):
+        if done.error:
+            log = done.path.with_suffix(".log")
+            if not isinstance(done.error, RunFailed):  # the worker could not write it
+                files.write_text(log, f"{_label(of_file[done.path])}\n{done.error}\n")
+            failures[_label(of_file[done.path])] = f"{done.error} (log: {paths.shown(log)})"
+            continue
+        rows[done.path] = _row(done.path, of_file[done.path])
+        files.write_text(table, results.csv_text(rows[path] for path in of_file if path in rows))
+    in_order = [rows[path] for path in of_file if path in rows]
+    files.write_text(table, results.csv_text(in_order))
+    save_plots(in_order, list(grid), folder)
+    if record and not failures:
+        results.write(book.stem, in_order, provenance.so_far() | _cost(rows), recorded)
+    return table, failures
 
 
-def _write_table(path: Path, rows: list[dict]) -> None:
-    columns = list(dict.fromkeys(key for row in rows for key in row))
-    text = io.StringIO()
-    writer = csv.DictWriter(text, columns, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(text.getvalue(), encoding="utf-8")
-    os.replace(partial, path)
+class RunFailed(RuntimeError):
+    """A run of the notebook failed; its log is written."""
+
+
+def run_point(executed: Path, book: Path, values: dict, cell_timeout_s: float | None) -> None:
+    """In a worker: one run of the notebook into `executed`, or into a log and a failed notebook beside it.
+
+    Raises
+    ------
+    RunFailed
+        With the cell and its error.
+    """
+    log, failed = executed.with_suffix(".log"), executed.with_suffix(".failed.ipynb")
+    with files.whole(executed) as partial:
+        # A context of its own: Jupyter keeps its event loop there, and two threads cannot run the same one.
+        failure = contextvars.Context().run(execute, book, partial, values, cell_timeout_s=cell_timeout_s)
+        if failure:
+            text = [f"{book.name} with {_label(values)}", str(failure)]
+            if partial.exists():
+                shutil.copy(partial, failed)
+                text += [str(output.get("text", "")) or "\n".join(output.get("traceback", []))
+                         for cell in nbformat.read(failed, as_version=4).cells for output in cell.get("outputs", [])]  # fmt: skip
+            files.write_text(log, "\n".join(text) + "\n")
+            raise RunFailed(str(failure))
+        notebook = nbformat.read(partial, as_version=4)
+        notebook.metadata["microstereo"] = {"machine": machine()}
+        nbformat.write(notebook, partial)
+    log.unlink(missing_ok=True)
+    failed.unlink(missing_ok=True)
+
+
+def column_name(metric: str, unit: str) -> str:
+    """The column of a metric: its name, which ends in its unit.
+
+    Examples
+    --------
+    >>> column_name("depth_error", "um"), column_name("depth_error_um", "um"), column_name("pck_0.05", "%")
+    ('depth_error_um', 'depth_error_um', 'pck_0.05_percent')
+    """
+    word = re.sub(r"[^A-Za-z0-9]+", "_", unit.replace("%", "percent").replace("/", "_per_").replace("^", ""))
+    return metric if not word or metric.endswith(f"_{word}") else f"{metric}_{word.strip('_')}"
+
+
+def _row(executed: Path, point: dict) -> dict:
+    metrics = {column_name(m["name"], m["unit"]): m["value"] for m in collection.metrics_of(executed)}
+    return {**point, **metrics}
+
+
+def _cost(executed: Iterable[Path]) -> dict:
+    """What all runs of a table took, also those of an earlier call, and the machines that ran them."""
+    kept = [nbformat.read(path, as_version=4).metadata for path in executed]
+    machines = {json.dumps(metadata.microstereo.machine): metadata.microstereo.machine for metadata in kept}
+    return {
+        "machine": machines.popitem()[1] if len(machines) == 1 else list(machines.values()),
+        "runs": len(kept),
+        "seconds": sum(metadata.papermill.duration for metadata in kept),
+        "cpu_seconds": None,
+    }
+
+
+def _code_digest(book: Path) -> str:
+    """Names what decides the rows: the notebook, its neighbours' helpers, lib and the weights that ship."""
+    code = [*book.parent.glob("*.py"), *(paths.ROOT / "lib").rglob("*.py"), *paths.MODELS.glob("*.safetensors")]
+    return files.digest(book, *sorted(code), length=8)
+
+
+def _label_digest(point: dict) -> str:
+    return hashlib.sha256(json.dumps(point, sort_keys=True, default=str).encode()).hexdigest()[:12]
+
+
+def _label(point: dict) -> str:
+    return ", ".join(f"{key}={value}" for key, value in point.items())

@@ -1,0 +1,80 @@
+"""Jobs on Dask: files once made are kept, lost workers cost nothing, errors are told."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import time
+from pathlib import Path
+
+import pytest
+
+from lib import files, parallel
+
+
+def children(pid: int) -> list[int]:
+    """Processes whose parent is `pid`."""
+    found = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            if int(stat.read_text().rpartition(")")[2].split()[1]) == pid:
+                found.append(int(stat.parent.name))
+        except OSError:
+            continue
+    return found
+
+
+def test_jobs_survive_a_lost_worker_and_run_once(tmp_path):
+    """One of two workers is killed with -9 after the first job; `files.write_text` is a job that any worker can import."""
+    jobs = {tmp_path / f"{k}.txt": (f"job {k}",) for k in range(8)}
+    (tmp_path / "0.txt").write_text("made before")
+    before = set(children(os.getpid()))
+    environment = dict(os.environ)
+    finished = []
+    for done in parallel.run_jobs(files.write_text, jobs, workers=2, progress=False):
+        assert done.error is None
+        if not finished and Path("/proc").exists():
+            os.kill(max(set(children(os.getpid())) - before), signal.SIGKILL)
+        finished.append(done.path.name)
+    assert sorted(finished) == [f"{k}.txt" for k in range(1, 8)]  # the one that was there is not made again
+    assert (tmp_path / "0.txt").read_text() == "made before" and (tmp_path / "7.txt").read_text() == "job 7"
+    assert dict(os.environ) == environment
+    start = time.perf_counter()
+    assert list(parallel.run_jobs(files.write_text, jobs, workers=2, progress=False)) == []
+    assert time.perf_counter() - start < 0.1  # no cluster is started for nothing
+
+
+@pytest.fixture(scope="module")
+def scheduler():
+    """A scheduler and a worker in this process, as `dask scheduler` and `dask worker` would be."""
+    from distributed import LocalCluster
+
+    with LocalCluster(n_workers=1, threads_per_worker=2, processes=False, protocol="tcp://", dashboard_address=None) as it:
+        yield it.scheduler_address
+
+
+def test_errors_stay_with_their_job(tmp_path, scheduler):
+    jobs = {tmp_path / "gone" / "a.txt": ("no such folder",), tmp_path / "b.txt": ("fine",)}
+    ends = {done.path.name: done.error for done in parallel.run_jobs(files.write_text, jobs, scheduler=scheduler)}
+    assert ends["b.txt"] is None and isinstance(ends["a.txt"], FileNotFoundError)
+
+
+def test_steps_move_the_bar(tmp_path, scheduler, capsys):
+    jobs = {tmp_path / "a.txt": (), tmp_path / "b.txt": ()}
+    list(parallel.run_jobs(three_steps, jobs, scheduler=scheduler, title="Stepping", steps=3))
+    assert "Stepping: 100%" in capsys.readouterr().err
+    parallel.step()  # outside a job it does nothing
+
+
+def three_steps(path: Path) -> None:
+    for _ in range(3):
+        parallel.step()
+    time.sleep(0.1)
+    shutil.copy(__file__, path)
+
+
+def test_no_scheduler_is_told(tmp_path, monkeypatch):
+    monkeypatch.setattr(parallel, "ANSWER_S", 0.2)
+    with pytest.raises(ConnectionError, match=r"tcp://127\.0\.0\.1:1: no Dask scheduler answers"):
+        list(parallel.run_jobs(files.write_text, {tmp_path / "a": ("",)}, scheduler="tcp://127.0.0.1:1"))
