@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import platform
+from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -12,7 +13,7 @@ import nbformat
 
 from lib.workbench.report import FIGURE_METADATA, METRIC_MIME
 
-__all__ = ["NamedFigure", "figures_of", "metrics_of", "versions"]
+__all__ = ["NamedFigure", "figures_of", "metrics_of", "outputs", "versions"]
 
 #: Packages whose version can change a figure.
 _TOLD = ("numpy", "scipy", "torch", "kornia", "opencv-python-headless", "open3d-cpu", "open3d", "cvxpy", "clarabel")
@@ -30,7 +31,7 @@ class NamedFigure:
 def metrics_of(executed: Path) -> list[dict]:
     """What the notebook recorded, in order; a name recorded twice counts with its last value."""
     metrics: dict[str, dict] = {}
-    for output in _outputs(executed):
+    for output in outputs(executed):
         metric = output.get("data", {}).get(METRIC_MIME)
         if metric:
             metrics[metric["name"]] = {key: metric[key] for key in ("name", "value", "unit", "paper", "note")}
@@ -40,7 +41,7 @@ def metrics_of(executed: Path) -> list[dict]:
 def figures_of(executed: Path) -> list[NamedFigure]:
     """What the notebook showed, in order; of pictures with one name, the last."""
     figures: dict[str, NamedFigure] = {}
-    for output in _outputs(executed):
+    for output in outputs(executed):
         named = output.get("metadata", {}).get(FIGURE_METADATA)
         if named:
             png = base64.b64decode(output["data"]["image/png"])
@@ -59,6 +60,7 @@ def versions() -> dict[str, str]:
     return found
 
 
-def _outputs(executed: Path):
+def outputs(executed: Path) -> Iterator[dict]:
+    """The outputs of all cells, in order."""
     for cell in nbformat.read(executed, as_version=4).cells:
         yield from cell.get("outputs", [])

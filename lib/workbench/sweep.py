@@ -193,8 +193,8 @@ def run_point(executed: Path, book: Path, values: dict, cell_timeout_s: float | 
             text = [f"{book.name} with {_label(values)}", str(failure)]
             if partial.exists():
                 shutil.copy(partial, failed)
-                text += [str(output.get("text", "")) or "\n".join(output.get("traceback", []))
-                         for cell in nbformat.read(failed, as_version=4).cells for output in cell.get("outputs", [])]  # fmt: skip
+                for output in collection.outputs(failed):
+                    text.append(output.get("text") or "\n".join(output.get("traceback", [])))
             files.write_text(log, "\n".join(text) + "\n")
             raise RunFailed(str(failure))
         notebook = nbformat.read(partial, as_version=4)
