@@ -8,22 +8,22 @@ A recording is a folder of plain files that a lab can write from any program::
       left/ right/       000000.jpg (or .png) ..., or left.mp4 and right.mp4
       kinematics.csv     time_s, base_x_mm, base_y_mm, base_z_mm, tip_1_x_mm, ...: robot clock, robot frame
       annotations.json   optional, COCO keypoints of both cameras
-      truth/             simulated recordings only: rig.json (cameras), surface.npz, and landmarks.csv (3D, pixels,
-                         visibility and, in newer ones, in_glint: saturated light on or right beside a landmark)
+      truth/             simulated recordings only: rig.json (cameras, affine or near-affine), surface.npz, and
+                         landmarks.csv (3D, pixels, visibility; in_glint is optional: saturated light on the landmark
+                         or right beside it)
 
-Two clocks: t_robot = t_video + offset_s.  A frame's time is the instant its middle row is read; with a rolling shutter
-row y is read readout_s * (y / (height - 1) - 1/2) later.
+There are two clocks: t_robot = t_video + offset_s.  The time of a frame is the instant at which its middle row is read.
+A rolling shutter reads row y at readout_s * (y / (height - 1) - 1/2) after that; `lib.correspondences` uses it.
 """
 
 from lib.recordings.annotations import Annotations
-from lib.recordings.frames import Frames, StereoFrame
+from lib.recordings.frames import Frames, StereoFrame, read_image
 from lib.recordings.importers import MonocularSequence, import_retinal_microsurgery
-from lib.recordings.recording import Kinematics, Recording, Truth
-from lib.recordings.tables import LANDMARKS
+from lib.recordings.recording import Kinematics, Recording
+from lib.recordings.truth import Truth
 from lib.recordings.writer import RecordingWriter
 
 __all__ = [
-    "LANDMARKS",
     "Annotations",
     "Frames",
     "Kinematics",
@@ -33,4 +33,5 @@ __all__ = [
     "StereoFrame",
     "Truth",
     "import_retinal_microsurgery",
+    "read_image",
 ]

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import itertools
+import warnings
 from collections import OrderedDict
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, overload
 
 import cv2
 import numpy as np
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
-__all__ = ["IMAGE_SUFFIXES", "Frames", "StereoFrame", "open_side", "read_image"]
+__all__ = ["Frames", "StereoFrame", "open_side", "read_image"]
 
-IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
+_SUFFIXES = (".jpg", ".jpeg", ".png")
 _CACHED_PAIRS = 4
+_EXIF_ORIENTATION = 0x0112
+#: A disk sector: what a crash or a bad copy replaces by zeros.
+_LOST_BYTES = 512
 
 
 @dataclass(frozen=True)
@@ -29,21 +32,46 @@ class StereoFrame:
 
 
 def read_image(path: Path, image_size_px: tuple[int, int] | None = None) -> np.ndarray:
-    """An image file as (h, w, 3) uint8 RGB.
+    """An image file as (h, w, 3) uint8 RGB; its pixels as they are stored, whatever EXIF says.
 
     Raises
     ------
     FileNotFoundError, ValueError
-        If there is no such file, it cannot be decoded, or its size is not `image_size_px` (width, height).
+        If there is no such file, it cannot be decoded, a part of it is lost, or its size is not `image_size_px`
+        (width, height).
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such image.")
-    data = np.fromfile(path, dtype=np.uint8)  # not cv2.imread: it fails on non-ASCII paths on some systems
-    image = cv2.imdecode(data, cv2.IMREAD_COLOR_RGB) if data.size else None
+    data = path.read_bytes()  # not cv2.imread: it fails on non-ASCII paths on some systems
+    if bytes(_LOST_BYTES) in data and not _may_hold_zeros(data):
+        raise ValueError(f"{path}: the image is corrupt; a block of zeros stands in its middle. Export it again.")
+    try:
+        flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
+    except cv2.error:  # more pixels than OpenCV allows
+        image = None
     if image is None:
         raise ValueError(f"{path}: the image is corrupt; it cannot be decoded. Export it again.")
     _check_size(path, (image.shape[1], image.shape[0]), image_size_px)
     return image
+
+
+def _may_hold_zeros(data: bytes) -> bool:
+    """False for a JPEG in which a long run of zeros is damage, which OpenCV decodes without complaint.
+
+    Zeros can be picture only if they end a block in every AC table: an encoder optimised them for a flat image.  In a
+    progressive JPEG they can be; a PNG has check sums.
+    """
+    at, ends_block = 2, []
+    while data[:2] == b"\xff\xd8" and data[at : at + 1] == b"\xff" and data[at + 1 : at + 2] not in (b"\xc2", b"\xda"):
+        after = at + 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+        table = at + 4 if data[at + 1] == 0xC4 else after
+        while table + 17 < min(after, len(data)):  # class and number, 16 counts, symbols in the order of their codes
+            if data[table] >> 4:
+                ends_block.append(data[table + 17] == 0)
+            table += 17 + sum(data[table + 1 : table + 17])
+        at = after
+    return data[:2] != b"\xff\xd8" or data[at + 1 : at + 2] == b"\xc2" or all(ends_block)
 
 
 def _check_size(path: Path, size: tuple[int, int], expected: tuple[int, int] | None) -> None:
@@ -53,36 +81,35 @@ def _check_size(path: Path, size: tuple[int, int], expected: tuple[int, int] | N
         )
 
 
-class Side(Protocol):
-    """The frames of one camera."""
-
-    def __len__(self) -> int: ...
-    def read(self, index: int) -> np.ndarray: ...
-
-
 class ImageFolder:
     """Images numbered from 0 without a gap; the header and the end of every file are checked at once."""
 
     def __init__(self, folder: Path, image_size_px: tuple[int, int]) -> None:
         self.image_size_px = image_size_px
-        self.paths = sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES)
+        self.paths = sorted(p for p in folder.iterdir() if p.suffix.lower() in _SUFFIXES)
         for index, path in enumerate(self.paths):
             if not path.stem.isdecimal():
                 raise ValueError(f"{path}: frames are named by number, such as 000000{path.suffix}.")
             if int(path.stem) != index:
-                raise ValueError(
-                    f"{folder}: frame {index:06d} is missing or named twice (found {path.name} in its place). "
-                    "Frames are numbered from 000000 without a gap."
-                )
+                what = f"frame {index:06d} is missing or named twice (found {path.name} in its place)"
+                raise ValueError(f"{folder}: {what}. Frames are numbered from 000000 without a gap.")
             self._check(path)
 
     def _check(self, path: Path) -> None:
+        if not path.is_file():
+            raise ValueError(f"{path}: not an ordinary file; copy the image to this place.")
         try:
-            with Image.open(path) as image:  # reads the header only
+            with warnings.catch_warnings(action="ignore"), Image.open(path) as image:  # reads the header only
                 size = image.size
-        except (UnidentifiedImageError, OSError, SyntaxError):
+                orientation = image.getexif().get(_EXIF_ORIENTATION, 1) if image.format == "JPEG" else 1
+        except (OSError, SyntaxError, ValueError):
             raise ValueError(f"{path}: the image is corrupt; its header cannot be read. Export it again.") from None
+        except Image.DecompressionBombError as error:
+            raise ValueError(f"{path}: far larger than image_size_px ({error}). Export it again.") from None
         _check_size(path, size, self.image_size_px)
+        if orientation != 1:
+            cure = "Export it upright, without the orientation"
+            raise ValueError(f"{path}: its EXIF orientation is {orientation}, so other programs turn it. {cure}.")
         with path.open("rb") as stream:
             stream.seek(-min(path.stat().st_size, 32), 2)
             end = stream.read()
@@ -119,14 +146,12 @@ class Video:
         while self._next <= index:
             ok, image = self._capture.read()
             if not ok:
-                raise ValueError(
-                    f"{self.path}: frame {self._next} of {self._count} cannot be decoded; the file is cut."
-                )
+                raise ValueError(f"{self.path}: frame {self._next} of {self._count} cannot be decoded; the file is cut.")
             self._next += 1
         return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
-def open_side(folder: Path, side: str, image_size_px: tuple[int, int]) -> Side:
+def open_side(folder: Path, side: str, image_size_px: tuple[int, int]) -> ImageFolder | Video:
     """The frames of one camera (`side` is "left" or "right") of a recording's folder."""
     images, video = folder / side, folder / f"{side}.mp4"
     if images.is_dir() and video.is_file():
@@ -149,7 +174,7 @@ class Frames(Sequence[StereoFrame]):
         (n,) video clock, strictly increasing.
     """
 
-    def __init__(self, left: Side, right: Side, time_s: np.ndarray) -> None:
+    def __init__(self, left: ImageFolder | Video, right: ImageFolder | Video, time_s: np.ndarray) -> None:
         self.time_s = np.array(time_s, dtype=np.float64)
         self.time_s.setflags(write=False)
         self._sides = (left, right)
@@ -159,10 +184,6 @@ class Frames(Sequence[StereoFrame]):
     def __len__(self) -> int:
         return len(self._indices)
 
-    @overload
-    def __getitem__(self, index: int) -> StereoFrame: ...
-    @overload
-    def __getitem__(self, index: slice) -> Frames: ...
     def __getitem__(self, index: int | slice) -> StereoFrame | Frames:
         if isinstance(index, slice):
             part = object.__new__(Frames)
@@ -183,6 +204,3 @@ class Frames(Sequence[StereoFrame]):
         for old in list(itertools.islice(self._cache, max(0, len(self._cache) - _CACHED_PAIRS))):
             del self._cache[old]
         return frame
-
-    def __iter__(self) -> Iterator[StereoFrame]:
-        return (self[i] for i in range(len(self)))

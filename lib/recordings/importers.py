@@ -1,4 +1,4 @@
-"""Importers of public data sets that are not recordings in the sense of this package."""
+"""Public data sets in formats of their own."""
 
 from __future__ import annotations
 
@@ -20,9 +20,7 @@ class MonocularSequence:
     Attributes
     ----------
     frame_numbers:
-        (n,) int, the numbers in the original video.
-    paths:
-        n image files.
+        (n,) int, the numbers in the original video; `paths` are their n image files.
     u:
         (n, 3, 2) px of base, tip_1, tip_2; NaN where not visible.
     image_size_px:
@@ -43,10 +41,6 @@ class MonocularSequence:
         return read_image(self.paths[index], self.image_size_px)
 
 
-#: Of base, tip_1 and tip_2 as the files have them.
-_TIPS_IN_ORDER = [0, 2, 1]
-
-
 def import_retinal_microsurgery(folder: str | Path) -> list[MonocularSequence]:
     """The Retinal Microsurgery sequences (Sznitman et al., MICCAI 2012): in-vivo frames with tool landmarks.
 
@@ -54,8 +48,8 @@ def import_retinal_microsurgery(folder: str | Path) -> list[MonocularSequence]:
     ----------
     folder:
         Holds ``seq1/``, ``seq2/``, ...: images named by frame number and ``landmarks.csv`` (frame, then x and y of
-        shaft, base, tip_1, tip_2 in whole pixels, empty = not visible).  Its tip_1 is the right one for somebody who
-        looks from base to tips; what is returned has the left one first, as every recording here.
+        shaft, base, tip_1, tip_2 in whole pixels, empty = not visible).  Its tip_1 is the right one, seen from base to
+        tips; the result has the left one first, as every recording here.
 
     Raises
     ------
@@ -76,7 +70,7 @@ def import_retinal_microsurgery(folder: str | Path) -> list[MonocularSequence]:
         missing = [image for image in images if not image.is_file()]
         if missing:
             raise FileNotFoundError(f"{missing[0]}: no such image ({len(missing)} of {len(images)} missing).")
-        u = table[:, 3:].reshape(-1, 3, 2)[:, _TIPS_IN_ORDER]
+        u = table[:, 3:].reshape(-1, 3, 2)[:, [0, 2, 1]]
         u[np.isnan(u).any(axis=2)] = np.nan
         first = read_image(images[0])
         sequences.append(MonocularSequence(path.parent.name, numbers, images, u, (first.shape[1], first.shape[0])))

@@ -1,62 +1,67 @@
-"""Numeric CSV tables with errors that name file and line, and the column names of the landmark tables."""
+"""Numeric CSV tables whose errors name file and line, and the column names of landmark tables."""
 
 from __future__ import annotations
 
 import csv
+import io
 import math
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-__all__ = ["LANDMARKS", "columns", "read_table", "write_table", "write_text"]
+from lib.correspondences import LANDMARKS
+from lib.files import write_text
 
-#: The tool's landmarks, in the order of every array.
-LANDMARKS = ("base", "tip_1", "tip_2")
+__all__ = ["columns", "read_table", "write_table"]
 
 
 def columns(axes: Sequence[str]) -> list[str]:
-    """Column names landmark by landmark: ``columns(["x_mm"])`` is ``["base_x_mm", "tip_1_x_mm", "tip_2_x_mm"]``."""
+    """Column names, landmark by landmark.
+
+    >>> columns(["x_mm"])
+    ['base_x_mm', 'tip_1_x_mm', 'tip_2_x_mm']
+    """
     return [f"{landmark}_{axis}" for landmark in LANDMARKS for axis in axes]
 
 
 def read_table(path: Path, names: Sequence[str], optional: Sequence[str] = ()) -> np.ndarray:
     """The columns `names`, then `optional`, of a CSV file as (rows, columns) float64; an empty cell is NaN.
 
-    A file has all of the optional columns or none; then they are NaN.
+    A file has all of the optional columns or none of them; then they are NaN.
 
     Raises
     ------
     FileNotFoundError
         If there is no such file.
     ValueError
-        For a missing, unknown or repeated column, a short or long row, or a cell that is not a finite number
-        ("nan" included: a missing value is an empty cell).  The text names file and line.
+        For text that is not UTF-8; a missing, unknown or repeated column; a short or long row; a cell that is not a
+        finite number ("nan" included: a missing value is an empty cell).  The text names file and line.
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file.")
-    with path.open(encoding="utf-8-sig", newline="") as stream:
-        reader = csv.reader(stream)
+    data = path.read_bytes()
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = data[: error.start].count(b"\n") + 1
+        raise ValueError(f"{path}, line {line}: the text is not UTF-8. Save the file as CSV in UTF-8.") from None
+    reader, rows = csv.reader(io.StringIO(text, newline="")), []
+    try:
         header = [cell.strip() for cell in next(reader, [])]
         wanted = [*names, *optional] if set(header) & set(optional) else list(names)
         if header != wanted:
             missing = [name for name in wanted if name not in header]
             unknown = [name for name in header if name not in wanted]
-            detail = "; ".join(
-                f"{what}: {', '.join(which)}" for what, which in (("missing", missing), ("unknown", unknown)) if which
-            )
-            raise ValueError(
-                f"{path}, line 1: wrong columns ({detail or 'order or repetition'}). Expected: {','.join(wanted)}."
-            )
-        rows = []
-        for row in reader:
-            line = reader.line_num
-            if not row:
-                continue
+            detail = [f"{what}: {', '.join(which)}" for what, which in (("missing", missing), ("unknown", unknown)) if which]
+            found = "; ".join(detail) or "order or repetition"
+            raise ValueError(f"{path}, line 1: wrong columns ({found}). Expected: {','.join(wanted)}.")
+        for row in filter(None, reader):
             if len(row) != len(wanted):
-                raise ValueError(f"{path}, line {line}: {len(row)} cells where the header has {len(wanted)}.")
-            rows.append([_number(cell, path, line, name) for cell, name in zip(row, wanted, strict=True)])
+                raise ValueError(f"{path}, line {reader.line_num}: {len(row)} cells where the header has {len(wanted)}.")
+            rows.append([_number(cell, path, reader.line_num, name) for cell, name in zip(row, wanted, strict=True)])
+    except csv.Error as error:
+        raise ValueError(f"{path}, line {reader.line_num}: not CSV ({error}). Export the table again.") from None
     table = np.full((len(rows), len(names) + len(optional)), np.nan)
     table[:, : len(wanted)] = np.array(rows, dtype=np.float64).reshape(len(rows), len(wanted))
     return table
@@ -64,13 +69,11 @@ def read_table(path: Path, names: Sequence[str], optional: Sequence[str] = ()) -
 
 def _number(cell: str, path: Path, line: int, name: str) -> float:
     text = cell.strip()
-    if not text:
-        return math.nan
     try:
-        value = float(text)
+        value = float(text) if text else math.nan
     except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
+        value = math.inf
+    if text and not math.isfinite(value):
         raise ValueError(
             f"{path}, line {line}, column {name}: {text!r} is not a finite number. Leave the cell empty where a "
             "value is missing."
@@ -79,16 +82,9 @@ def _number(cell: str, path: Path, line: int, name: str) -> float:
 
 
 def write_table(path: Path, names: Sequence[str], values: np.ndarray, decimals: Sequence[int]) -> None:
-    """Write what `read_table` reads: NaN as an empty cell, `decimals` places per column."""
+    """Write what `read_table` reads: NaN as an empty cell, `decimals` places in each column."""
     lines = [",".join(names)]
     for row in np.asarray(values, dtype=np.float64):
         cells = ("" if math.isnan(v) else f"{v:.{places}f}" for v, places in zip(row, decimals, strict=True))
         lines.append(",".join(cells))
     write_text(path, "\n".join(lines) + "\n")
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a text file whole or not at all."""
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(text, encoding="utf-8")
-    os.replace(partial, path)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,10 +14,11 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lib.cameras import StereoRig
+from lib.correspondences import LANDMARKS
+from lib.files import write_bytes, write_text
 from lib.recordings.annotations import Annotations, write_coco
-from lib.recordings.recording import FORMAT, GLINT_COLUMNS, KINEMATICS_COLUMNS, TRUTH_COLUMNS, UNITS, Recording
-from lib.recordings.tables import LANDMARKS, write_table, write_text
+from lib.recordings.recording import FORMAT, KINEMATICS_COLUMNS, UNITS, Recording
+from lib.recordings.tables import write_table
 
 __all__ = ["RecordingWriter"]
 
@@ -24,30 +26,34 @@ __all__ = ["RecordingWriter"]
 class RecordingWriter:
     """Context manager that writes a recording beside its final place and moves it there when it is valid.
 
-    ::
-
-        with RecordingWriter("my_eye", name="my eye", fps=25.0, image_size_px=(1920, 1080)) as writer:
-            for left, right in frames:
-                writer.add(left, right)
-            writer.kinematics(time_s, x_mm)
-
     Parameters
     ----------
     folder:
-        Where the recording appears.  Files are written to ``folder.partial`` first.
+        Where the recording appears.  Until then its files lie beside it, in a folder that ends with ``.partial``.
     image_size_px:
         (width, height).
-    suffix, jpeg_quality:
-        ".jpg" or ".png", and the quality of a JPEG.
     details:
         Own notes (numbers and text), kept in ``[details]`` of recording.toml.
+    suffix, jpeg_quality:
+        ".jpg" or ".png", and the quality of a JPEG.
     overwrite:
-        Replace a recording of that name.
+        Replace a recording of that name.  A folder that is no recording is never replaced.
 
     Raises
     ------
     FileExistsError
-        If `folder` exists and `overwrite` is False.
+        If `folder` exists and `overwrite` is False, or if it is not a recording.
+
+    Example
+    -------
+    >>> import tempfile
+    >>> tool_mm = np.array([[0, 0, 0], [4, 1, 0], [4, -1, 0]])
+    >>> image = np.zeros((48, 64, 3), np.uint8)
+    >>> with RecordingWriter(tempfile.mkdtemp() + "/mine", name="mine", fps=25, image_size_px=(64, 48)) as writer:
+    ...     writer.add(image, image)
+    ...     writer.kinematics([0.0, 1.0], [tool_mm, tool_mm])
+    >>> len(Recording.open(writer.target))
+    1
     """
 
     def __init__(
@@ -68,10 +74,9 @@ class RecordingWriter:
     ) -> None:
         if suffix not in {".jpg", ".png"}:
             raise ValueError(f"suffix: '.jpg' or '.png', got {suffix!r}.")
-        self.target = Path(folder)
-        self.folder = self.target.with_name(self.target.name + ".partial")
-        if self.target.exists() and not overwrite:
-            raise FileExistsError(f"{self.target}: exists already; pass overwrite=True to replace it.")
+        self.target, self._overwrite = Path(folder), overwrite
+        self._check_target()
+        self.folder = self.target.with_name(f"{self.target.name}.{os.getpid()}-{os.urandom(3).hex()}.partial")
         self.fps, self.image_size_px = float(fps), (int(image_size_px[0]), int(image_size_px[1]))
         self._suffix, self._quality = suffix, int(jpeg_quality)
         self._header = {
@@ -90,8 +95,13 @@ class RecordingWriter:
         self._kinematics: list[np.ndarray] = []
         self._annotations: Annotations | None = None
 
+    def _check_target(self) -> None:
+        if self.target.exists() and not self._overwrite:
+            raise FileExistsError(f"{self.target}: exists already; pass overwrite=True to replace it.")
+        if self.target.exists() and not (self.target / "recording.toml").is_file():
+            raise FileExistsError(f"{self.target}: is not a recording and is left alone; choose another name.")
+
     def __enter__(self) -> RecordingWriter:
-        shutil.rmtree(self.folder, ignore_errors=True)  # what a killed run left
         for side in ("left", "right"):
             (self.folder / side).mkdir(parents=True)
         return self
@@ -105,7 +115,7 @@ class RecordingWriter:
 
     @property
     def truth_folder(self) -> Path:
-        """truth/ of the unfinished recording, for further files of a simulator."""
+        """truth/ of the unfinished recording, for `lib.recordings.Truth` and what else a simulator knows."""
         folder = self.folder / "truth"
         folder.mkdir(exist_ok=True)
         return folder
@@ -121,7 +131,7 @@ class RecordingWriter:
             ok, data = cv2.imencode(self._suffix, cv2.cvtColor(image, cv2.COLOR_RGB2BGR), options)
             if not ok:
                 raise ValueError(f"{side}: the image could not be encoded as {self._suffix}.")
-            data.tofile(self.folder / side / f"{index:06d}{self._suffix}")
+            write_bytes(self.folder / side / f"{index:06d}{self._suffix}", data.tobytes())
         self._time_s.append(index / self.fps if time_s is None else float(time_s))
 
     def kinematics(self, time_s: ArrayLike, x_mm: ArrayLike) -> None:
@@ -132,66 +142,15 @@ class RecordingWriter:
             raise ValueError(f"x_mm: expected ({len(time)}, 3, 3), got {x.shape}.")
         self._kinematics.append(np.column_stack([time, x.reshape(len(time), 9)]))
 
-    def annotations(
-        self,
-        u_left: ArrayLike,
-        u_right: ArrayLike,
-        visibility_left: ArrayLike | None = None,
-        visibility_right: ArrayLike | None = None,
-    ) -> None:
-        """Landmarks of all frames, (n, 3, 2) px each, NaN = not labelled; visibility (n, 3), None = all visible (2)."""
-        sides = []
-        for name, u, visibility in (("left", u_left, visibility_left), ("right", u_right, visibility_right)):
-            u = np.asarray(u, dtype=np.float64)
-            v = np.full(u.shape[:2], 2) if visibility is None else np.asarray(visibility)
-            if u.ndim != 3 or u.shape[1:] != (len(LANDMARKS), 2) or v.shape != u.shape[:2]:
-                raise ValueError(f"u_{name}: expected (n, 3, 2) with visibility (n, 3), got {u.shape} and {v.shape}.")
-            sides.append((u, np.where(np.isfinite(u).all(axis=2), v, 0).astype(np.int64)))
-        (u_l, v_l), (u_r, v_r) = sides
-        self._annotations = Annotations(u_l, u_r, v_l, v_r)
-
-    def truth(
-        self,
-        rig: StereoRig,
-        landmarks_mm: ArrayLike,
-        u_left: ArrayLike,
-        u_right: ArrayLike,
-        visibility_left: ArrayLike,
-        visibility_right: ArrayLike,
-        surface: tuple[ArrayLike, ArrayLike, ArrayLike] | None = None,
-        in_glint: tuple[ArrayLike, ArrayLike] | None = None,
-    ) -> None:
-        """What the simulator knows; shapes as in `Truth`.
-
-        Parameters
-        ----------
-        surface:
-            (x_px (a,), y_px (b,), x_mm (b, a, 3)): surface points seen on a grid of left pixels.
-        in_glint:
-            (left, right), (n, 3) bool each: whether saturated light lies on the landmark or right beside it.
-        """
-        rig.save(self.truth_folder / "rig.json")
-        x = np.asarray(landmarks_mm, dtype=np.float64)
-        n = len(x)
-        image = np.empty((n, len(LANDMARKS), 2, 3))
-        for side, (u, visibility) in enumerate(((u_left, visibility_left), (u_right, visibility_right))):
-            image[:, :, side, :2], image[:, :, side, 2] = u, visibility
-        table = np.column_stack([np.arange(n), x.reshape(n, 9), image.reshape(n, 18)])
-        names, decimals = TRUTH_COLUMNS, [0] + [7] * 9 + [5, 5, 0] * 6
-        if in_glint is not None:
-            glints = np.stack([np.asarray(side, dtype=bool) for side in in_glint], axis=-1)
-            table = np.column_stack([table, glints.reshape(n, 6)])
-            names, decimals = [*names, *GLINT_COLUMNS], decimals + [0] * 6
-        write_table(self.truth_folder / "landmarks.csv", names, table, decimals)
-        if surface is not None:
-            x_px, y_px, x_mm = (np.asarray(values) for values in surface)
-            np.savez_compressed(self.truth_folder / "surface.npz", x_px=x_px, y_px=y_px, x_mm=x_mm.astype(np.float32))
+    def annotations(self, *u_and_visibility: ArrayLike) -> None:
+        """Landmarks of all frames: `u_left`, `u_right` and their visibility, as in `Annotations`."""
+        self._annotations = Annotations(*u_and_visibility)
 
     def _finish(self) -> None:
-        lines = [f"{key} = {json.dumps(value, ensure_ascii=False)}" for key, value in self._header.items()]
+        lines = [_toml(key, value) for key, value in self._header.items()]
         for table, values in (("units", UNITS), ("details", self._details)):
             lines += ["", f"[{table}]"] if values else []
-            lines += [f"{key} = {json.dumps(value, ensure_ascii=False)}" for key, value in values.items()]
+            lines += [_toml(key, value) for key, value in values.items()]
         write_text(self.folder / "recording.toml", "\n".join(lines) + "\n")
         time = np.array(self._time_s)
         if not np.allclose(time, np.arange(len(time)) / self.fps, rtol=0, atol=1e-7):
@@ -203,6 +162,19 @@ class RecordingWriter:
         if self._annotations is not None:
             write_coco(self.folder / "annotations.json", self._annotations, self.image_size_px, self._suffix)
         Recording.open(self.folder)  # what is not valid must not appear
+        self._check_target()
+        old = self.folder.with_suffix(".replaced")
         if self.target.exists():
-            shutil.rmtree(self.target)
-        os.replace(self.folder, self.target)
+            os.replace(self.target, old)
+        try:
+            os.replace(self.folder, self.target)
+        except OSError:
+            os.replace(old, self.target)
+            raise
+        shutil.rmtree(old, ignore_errors=True)
+
+
+def _toml(key: str, value: object) -> str:
+    key = key if re.fullmatch(r"[\w-]+", key, re.ASCII) else json.dumps(key)
+    text = json.dumps(value, ensure_ascii=False)
+    return f"{key} = " + {"Infinity": "inf", "-Infinity": "-inf", "NaN": "nan"}.get(text, text)

@@ -12,7 +12,7 @@ from tqdm.auto import tqdm
 
 from lib import files
 from lib.geometry import RigidTransform
-from lib.recordings import Recording, RecordingWriter
+from lib.recordings import Recording, RecordingWriter, Truth
 from lib.simulator.eye import Eye, Scene
 from lib.simulator.forceps import Forceps
 from lib.simulator.limits import check, not_negative
@@ -204,14 +204,9 @@ def simulate(
         clicked = np.where(visibility[..., None] == 2, u + rng.normal(0, reports.click_px, u.shape), np.nan)
         writer.annotations(*clicked, *np.where(visibility == 2, 2, 0))
         x_px, y_px, surface_mm = surface_grid(eye, rig.left, microscope.image_size_px)
-        writer.truth(
-            microscope.rig(robot_from_microscope),
-            robot_from_microscope.apply(landmarks),
-            *u,
-            *visibility,
-            surface=(x_px, y_px, robot_from_microscope.apply(surface_mm)),
-            in_glint=tuple(in_glint),
-        )
+        surface = x_px, y_px, robot_from_microscope.apply(surface_mm)
+        rig_in_robot, x_mm = microscope.rig(robot_from_microscope), robot_from_microscope.apply(landmarks)
+        Truth(rig_in_robot, x_mm, *u, *visibility, writer.truth_folder, *in_glint).write(surface)
         if design.camera_motion is not None:
             before = robot_from_microscope.compose(after_from_before.inverse())
             microscope.rig(before).save(writer.truth_folder / "moved_rig.json")

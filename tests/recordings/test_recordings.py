@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import re
 import shutil
+import struct
+import zlib
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from lib import paths
-from lib.recordings import Kinematics, Recording, RecordingWriter, import_retinal_microsurgery
+from lib.cameras import NearAffineCamera
+from lib.correspondences import of_recording
+from lib.recordings import Kinematics, Recording, RecordingWriter, Truth, import_retinal_microsurgery, read_image
 from lib.simulator.rig import reference_rig
 
 N, SIZE = 4, (64, 48)
@@ -52,9 +60,8 @@ def written(tmp_path_factory):
         grid = np.arange(0.0, 64, 8), np.arange(0.0, 48, 8)
         surface = np.stack([*np.meshgrid(*grid), np.ones((6, 8))], axis=-1)
         in_glint = np.arange(2 * N * 3).reshape(2, N, 3) % 5 == 0
-        writer.truth(
-            reference_rig(), tool(N), *u, visibility, visibility, surface=(*grid, surface), in_glint=tuple(in_glint)
-        )
+        truth = Truth(reference_rig(), tool(N), *u, visibility, visibility, writer.truth_folder, *in_glint)
+        truth.write(surface=(*grid, surface))
     return folder, u
 
 
@@ -116,20 +123,16 @@ def test_cache_is_small(written):
 
 
 def test_kinematics_interpolate_on_the_robot_clock(written):
+    """Without pixels at the frame's time; with pixels when their rows were read."""
     recording = Recording.open(written[0])
     expected = recording.kinematics.at(recording.frames.time_s + 0.1)
     np.testing.assert_allclose(recording.landmarks_mm(), expected)
+    u = np.full((N, 3, 2), (SIZE[1] - 1) / 2)
+    u[:, 1, 1] = SIZE[1] - 1  # the last row is read half a readout after the middle row
+    x_mm = of_recording(recording, u, u).grid("x_mm")
     speed_mm_s = np.array([1.0, 2.0, 3.0]) / 0.39
-    # A landmark in the last row is read half a readout after the middle row.
-    u = np.full((N, 3, 2), np.nan)
-    u[:, 1, 1] = SIZE[1] - 1
-    shifted = recording.landmarks_mm(u) - recording.landmarks_mm()
-    np.testing.assert_allclose(shifted[:, 1], np.broadcast_to(0.01 * speed_mm_s, (N, 3)), atol=1e-5)
-    np.testing.assert_allclose(shifted[:, [0, 2]], 0, atol=1e-12)
-    np.testing.assert_allclose(recording.landmarks_at(2, u[2]), recording.landmarks_mm(u)[2])
-    np.testing.assert_allclose(recording.landmarks_at(2), recording.landmarks_mm()[2])
-    with pytest.raises(ValueError, match=r"u: expected \(4, 3, 2\)"):
-        recording.landmarks_mm(u[:2])
+    np.testing.assert_allclose((x_mm - expected)[:, 1], np.broadcast_to(0.01 * speed_mm_s, (N, 3)), atol=1e-5)
+    np.testing.assert_allclose((x_mm - expected)[:, [0, 2]], 0, atol=1e-12)
 
 
 def test_dropped_samples_do_not_spread():
@@ -164,7 +167,81 @@ def spoil_jpeg(path):
     path.write_bytes(path.read_bytes()[:200])
 
 
+def save(path, image, **options):
+    Image.fromarray(image).save(path, **options)
+
+
+def turned(path):
+    """The frame as a JPEG that asks its readers to turn it by 180 degrees."""
+    path.unlink()
+    exif = Image.Exif()
+    exif[0x0112] = 3
+    save(path.with_suffix(".jpg"), np.zeros((SIZE[1], SIZE[0], 3), np.uint8), exif=exif)
+
+
+def png_bomb(path):
+    """A PNG of 100 bytes that claims 60000 x 60000 px."""
+    header = struct.pack(">IIBBBBB", 60000, 60000, 8, 2, 0, 0, 0)
+    chunks = [(b"IHDR", header), (b"IDAT", zlib.compress(b"")), (b"IEND", b"")]
+    parts = [struct.pack(">I", len(d)) + t + d + struct.pack(">I", zlib.crc32(t + d)) for t, d in chunks]
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(parts))
+
+
+def fifo(path):
+    path.unlink()
+    os.mkfifo(path)
+
+
+def recode(path, old: str, new: str, encoding: str):
+    text = path.read_text()
+    assert old in text
+    path.write_bytes(text.replace(old, new, 1).encode(encoding))
+
+
 SPOILERS = {
+    "turned by EXIF": (
+        lambda f: turned(f / "left/000002.png"),
+        ValueError,
+        r"000002\.jpg: its EXIF orientation is 3.* Export it upright",
+    ),
+    "png bomb": (lambda f: png_bomb(f / "right/000001.png"), ValueError, r"000001\.png: far larger.* Export it again"),
+    "huge png": (
+        lambda f: save(f / "right/000001.png", np.zeros((9500, 9500), np.uint8)),
+        ValueError,
+        r"000001\.png: 9500 x 9500 px, but",
+    ),
+    "pipe": (lambda f: fifo(f / "left/000001.png"), ValueError, r"000001\.png: not an ordinary file"),
+    "pipe of kinematics": (lambda f: fifo(f / "kinematics.csv"), FileNotFoundError, r"kinematics\.csv"),
+    "deep annotations": (
+        lambda f: (f / "annotations.json").write_text("[" * 100_000 + "]" * 100_000),
+        ValueError,
+        r"annotations\.json: not COCO keypoints \(RecursionError.* Export",
+    ),
+    "deep header": (
+        lambda f: (f / "recording.toml").write_text("a = " + "[" * 100_000 + "]" * 100_000),
+        ValueError,
+        r"recording\.toml: not valid TOML",
+    ),
+    "header in Latin-1": (
+        lambda f: recode(f / "recording.toml", "whole", "Öl", "latin-1"),
+        ValueError,
+        r"recording\.toml: not valid TOML.* UTF-8",
+    ),
+    "UTF-16": (
+        lambda f: recode(f / "kinematics.csv", "base", "base", "utf-16"),
+        ValueError,
+        r"kinematics\.csv, line 1: the text is not UTF-8\. Save",
+    ),
+    "Latin-1": (
+        lambda f: recode(f / "kinematics.csv", "0.0300000", "dr\u00fcber", "latin-1"),
+        ValueError,
+        r"kinematics\.csv, line 5: the text is not UTF-8\. Save",
+    ),
+    "endless cell": (
+        lambda f: recode(f / "kinematics.csv", "0.0300000", "3" * 200_000, "utf-8"),
+        ValueError,
+        r"kinematics\.csv, line 5: not CSV .* Export",
+    ),
     "no header": (lambda f: (f / "recording.toml").unlink(), FileNotFoundError, r"recording\.toml"),
     "bad toml": (lambda f: edit(f / "recording.toml", "fps =", "fps"), ValueError, "not valid TOML"),
     "unknown key": (
@@ -292,6 +369,38 @@ def test_bad_recordings_are_refused(folder, case):
         Recording.open(folder)
 
 
+def test_a_zeroed_block_of_a_jpeg_is_noticed(tmp_path):
+    """OpenCV and PIL decode it without complaint; a flat image with optimised tables may hold zeros rightly."""
+    path, flat = tmp_path / "frame.jpg", tmp_path / "flat.jpg"
+    save(path, np.random.default_rng(0).integers(0, 256, (256, 256, 3), dtype=np.uint8), quality=90)
+    assert read_image(path).shape == (256, 256, 3)
+    data = bytearray(path.read_bytes())
+    data[20_000:21_024] = bytes(1024)
+    path.write_bytes(data)
+    with pytest.raises(ValueError, match=r"frame\.jpg: the image is corrupt; a block of zeros.* Export it again"):
+        read_image(path)
+    save(flat, np.zeros((2048, 2048, 3), np.uint8), optimize=True)
+    assert bytes(512) in flat.read_bytes() and not read_image(flat).any()
+
+
+def test_pixels_are_read_as_they_are_stored(tmp_path):
+    image = np.zeros((48, 64, 3), np.uint8)
+    image[:10] = 200
+    exif = Image.Exif()
+    exif[0x0112] = 3
+    save(tmp_path / "turned.jpg", image, exif=exif, quality=95)
+    np.testing.assert_allclose(read_image(tmp_path / "turned.jpg"), image, atol=30)
+
+
+def test_near_affine_cameras_of_the_truth_survive(written, tmp_path):
+    folder = shutil.copytree(written[0], tmp_path / "near")
+    rig = reference_rig(inverse_distance_per_mm=1 / 150)
+    rig.save(folder / "truth" / "rig.json")
+    found = Recording.open(folder).truth.rig
+    assert isinstance(found.left, NearAffineCamera) and not found.is_affine
+    np.testing.assert_array_equal(found.project(tool(5)[:, 0]), rig.project(tool(5)[:, 0]))
+
+
 def test_metres_are_refused(tmp_path):
     writer = RecordingWriter(tmp_path / "r", name="r", fps=25, image_size_px=SIZE)
     with pytest.raises(ValueError, match="Metres or micrometres"), writer:
@@ -402,6 +511,49 @@ def test_writer_refuses_bad_input(tmp_path, written):
         writer.add(*frames()[0])
         writer.kinematics([0.0, 1.0], tool(2))
     assert Recording.open(tmp_path / "r").name == "second"
+
+
+def test_the_writer_deletes_only_recordings(tmp_path):
+    """Neither a folder of another kind, nor what lies where its own files will lie."""
+    thesis, neighbour = tmp_path / "thesis", tmp_path / "eye.partial"
+    for folder in (thesis, neighbour):
+        folder.mkdir()
+        (folder / "chapter.txt").write_text("years of work")
+    with pytest.raises(FileExistsError, match="thesis: is not a recording and is left alone; choose another name"):
+        RecordingWriter(thesis, name="x", fps=25, image_size_px=SIZE, overwrite=True)
+    with RecordingWriter(tmp_path / "eye", name="x", fps=25, image_size_px=SIZE, overwrite=True) as writer:
+        writer.add(*frames()[0])
+        writer.kinematics([0.0, 1.0], tool(2))
+    for folder in (thesis, neighbour):
+        assert (folder / "chapter.txt").read_text() == "years of work"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["eye", "eye.partial", "thesis"]
+
+
+def test_a_full_disk_leaves_the_old_recording(tmp_path, monkeypatch):
+    def write(name: str) -> None:
+        with RecordingWriter(tmp_path / "eye", name=name, fps=25, image_size_px=SIZE, overwrite=True) as writer:
+            writer.add(*frames()[0])
+            writer.kinematics([0.0, 1.0], tool(2))
+
+    def full(path: Path, data: bytes) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    write("first")
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(OSError, match="No space left"):
+        write("second")
+    monkeypatch.undo()
+    assert Recording.open(tmp_path / "eye").name == "first"
+    assert [p.name for p in tmp_path.iterdir()] == ["eye"]
+
+
+def test_notes_of_any_name_and_value_are_read_back(tmp_path):
+    details = {"surgeon's name": 'Dr. "B"', "depth": float("inf"), "seed": 3, "simulated": True}
+    options = {"name": "r", "fps": 25, "image_size_px": SIZE, "details": details}
+    with RecordingWriter(tmp_path / "r", **options) as writer:
+        writer.add(*frames()[0])
+        writer.kinematics([0.0, 1.0], tool(2))
+    assert Recording.open(tmp_path / "r").details == details
 
 
 def test_points_outside_the_image_are_written_as_not_labelled(tmp_path):
