@@ -152,12 +152,18 @@ class Recording:
         truth = Truth.read(folder / "truth", len(frames)) if (folder / "truth").is_dir() else None
         return cls(folder=folder, frames=frames, kinematics=kinematics, annotations=annotations, truth=truth, **header)
 
-    def landmarks_mm(self) -> np.ndarray:
+    def landmarks_at(self, index: int, u: ArrayLike | None = None) -> np.ndarray:  # interim: callers move to lib.correspondences
+        return self.landmarks_mm(None if u is None else np.broadcast_to(u, (len(self), 3, 2)))[index]
+
+    def landmarks_mm(self, u: ArrayLike | None = None) -> np.ndarray:
         """The robot's landmarks (n, 3, 3) mm at the frames' times, NaN where the robot says nothing.
 
         `lib.correspondences.of_recording` gives them at the instants at which the landmarks' image rows were read.
         """
-        return self.kinematics.at(self.frames.time_s + self.offset_s)
+        time = self.frames.time_s + self.offset_s
+        if u is not None:  # interim
+            time = time[:, None] + self.readout_s * np.nan_to_num(u[..., 1] / (self.image_size_px[1] - 1) - 0.5)
+        return self.kinematics.at(time)
 
 
 def _read_header(path: Path) -> dict:
