@@ -152,7 +152,7 @@ class Recording:
         truth = Truth.read(folder / "truth", len(frames)) if (folder / "truth").is_dir() else None
         return cls(folder=folder, frames=frames, kinematics=kinematics, annotations=annotations, truth=truth, **header)
 
-    def landmarks_at(self, index: int, u: ArrayLike | None = None) -> np.ndarray:  # interim: callers move to lib.correspondences
+    def landmarks_at(self, index: int, u: ArrayLike | None = None) -> np.ndarray:  # interim
         return self.landmarks_mm(None if u is None else np.broadcast_to(u, (len(self), 3, 2)))[index]
 
     def landmarks_mm(self, u: ArrayLike | None = None) -> np.ndarray:
