@@ -141,13 +141,13 @@ def simulate(argv: list[str]) -> int:
 
 
 def train(argv: list[str]) -> int:
-    from lib.training.loop import main
+    from lib.training.command import main
 
     return main(argv)
 
 
 def evaluate(argv: list[str]) -> int:
-    from lib.training.evaluation import main
+    from lib.training.command import main_evaluate as main
 
     return main(argv)
 

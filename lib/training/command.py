@@ -1,0 +1,161 @@
+"""``python3 -m lib train`` and ``python3 -m lib evaluate``."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import torch
+
+from lib import paths
+from lib.files import write_json
+from lib.landmarks import Detector
+from lib.recordings import Recording
+from lib.training.assembly import assemble
+from lib.training.config import PRESETS
+from lib.training.evaluation import evaluate, evaluate_recording
+from lib.training.loop import load_training, train
+from lib.training.samples import labelled_images
+from lib.training.shards import generate
+from lib.training.stages import STAGES, finetune, stage_config, stage_data
+
+__all__ = ["main", "main_evaluate"]
+
+
+def main(argv: list[str] | None = None) -> int:
+    """`python3 -m lib train`: simulate training data, train or fine-tune the detector's stages (resuming), assemble them."""
+    parser = argparse.ArgumentParser(prog="python3 -m lib train", description=main.__doc__.split(": ", 1)[1])
+    actions = {
+        "generate": "simulate the training data",
+        **{stage: f"train the {stage} stage" for stage in STAGES},
+        "finetune": "train all stages further on labelled recordings",
+        "assemble": "join the trained stages into a detector with its model card",
+        "export": "write its stages as ONNX",
+    }
+    parser.add_argument("what", choices=actions, help="; ".join(f"{name}: {text}" for name, text in actions.items()))
+    parser.add_argument("recordings", nargs="*", type=Path, help="labelled recordings; finetune holds out the end of each")
+    add = parser.add_argument
+    add("--data", type=Path, default=paths.CACHE / "landmarks", help="folder of the simulated shards")
+    add("--folder", type=Path, default=paths.CACHE / "training", help="checkpoints, one folder a stage")
+    add("--out", type=Path, help="finetune, assemble: weights file to write; export: the one to read (default: shipped)")
+    add("--shards", type=int, default=120, help="generate: training shards of 16 frames")
+    add("--windows", type=int, default=60, help="generate: shards of 512 windows round a landmark")
+    add("--closeups", type=int, default=24, help="generate: shards of 2048 closeups of a landmark")
+    add("--workers", type=int, help="generate: processes (default: one a core)")
+    add("--preset", choices=sorted(PRESETS), default="best")
+    add("--steps", type=int, default=6000)
+    add("--rate", type=float, help="learning rate (default: the preset's)")
+    add("--position-weight", type=float, default=0.04, help="window: of the position loss, per px")
+    add("--features", type=int, help="channels (default: the shipped detector's)")
+    add("--stacks", type=int, default=2)
+    add("--seed", type=int, default=0)
+    add("--initial", type=Path, help="checkpoint (of a stage) or weights file (finetune) to start from")
+    add("--every", type=int, default=1, help="finetune: use every N-th frame")
+    add("--note", action="append", default=[], help="assemble: a line for the card; may be repeated")
+    add("--onnx", type=Path, default=paths.CACHE / "onnx", help="export: folder of the ONNX files")
+    add("--threads", type=int, default=0, help="torch threads (default: torch's choice)")
+    a = parser.parse_args(argv)
+    if a.threads:
+        torch.set_num_threads(a.threads)
+    if a.recordings and a.what not in ("finetune", "assemble"):
+        parser.error(f"{a.what}: takes no recordings.")
+    others = {"generate": _generate, "finetune": _finetune, "assemble": _assemble, "export": _export}
+    return _guarded(others.get(a.what, _train), a)
+
+
+def _guarded(action: Callable[[argparse.Namespace], None], arguments: argparse.Namespace) -> int:
+    try:
+        action(arguments)
+    except KeyboardInterrupt:
+        print("\nStopped; the same command continues from the last checkpoint.", file=sys.stderr)
+        return 130
+    except (ValueError, OSError) as error:
+        print(error, file=sys.stderr)
+        return 2
+    return 0
+
+
+def _generate(a: argparse.Namespace) -> None:
+    shards = {"validation": max(3, a.shards // 15), "training": a.shards, "windows": a.windows, "closeups": a.closeups}
+    for kind, count in shards.items():
+        generate(a.data, kind, count, workers=a.workers)
+
+
+def _train(a: argparse.Namespace) -> None:
+    config = replace(
+        stage_config(a.what, preset=a.preset, features=a.features, stacks=a.stacks),
+        steps=a.steps, seed=a.seed, validate_every=200,
+    )  # fmt: skip
+    if a.rate:
+        config = replace(config, learning_rate=a.rate)
+    if a.what == "window":
+        config = replace(config, position_weight_per_px=a.position_weight)
+    initial = load_training(a.initial) if a.initial else None
+    print(train(config, *stage_data(a.what, a.data), a.folder / a.what, initial=initial).provenance["metrics"])
+
+
+def _finetune(a: argparse.Namespace) -> None:
+    if not a.recordings or a.out is None:
+        raise ValueError("finetune: give labelled recordings, and a weights file to write with --out.")
+    training, held_out = [], []
+    for recording in map(Recording.open, a.recordings):
+        images = list(labelled_images(recording, every=a.every))
+        training += images[: 3 * len(images) // 4]
+        held_out += images[3 * len(images) // 4 :]
+    detector = Detector.load(a.initial)
+    simulated = a.data if any(a.data.glob("training_*.npz")) else None
+    tuned = finetune(detector, training, held_out, a.folder / "finetune", simulated=simulated, steps=a.steps, seed=a.seed)
+    tuned.save(a.out)
+    for name, scores in (("before", evaluate(detector, held_out).scores), ("after", evaluate(tuned, held_out).scores)):
+        print(f"{name}: PCK@0.05 {scores.pck_0_05:.1f} %, median error {scores.median_px:.2f} px on held-out images")
+
+
+def _assemble(a: argparse.Namespace) -> None:
+    assemble(a.folder, a.data, a.out or paths.MODELS / "default.safetensors", a.recordings, a.note)
+
+
+def _export(a: argparse.Namespace) -> None:
+    from lib.landmarks.export import export_shipped  # needs onnx, which nothing else does
+
+    for stage, (path, difference) in export_shipped(a.out, a.onnx).items():
+        print(f"{stage}: {path}, at most {difference:.2g} px from torch")
+
+
+def main_evaluate(argv: list[str] | None = None) -> int:
+    """`python3 -m lib evaluate`: scores of a detector on a labelled recording, printed and, on request, written as JSON."""
+    parser = argparse.ArgumentParser(
+        prog="python3 -m lib evaluate", description=main_evaluate.__doc__.split(": ", 1)[1]
+    )
+    parser.add_argument("recording", type=Path, help="folder of a recording with truth/ or annotations.json")
+    parser.add_argument("--weights", help="weights file or name in data/models (default: the shipped ones)")
+    parser.add_argument("--every", type=int, default=1, help="evaluate every N-th frame")
+    parser.add_argument("--json", type=Path, help="write the scores here")
+    arguments = parser.parse_args(argv)
+    if arguments.every < 1:
+        parser.error("--every: must be at least 1.")
+    return _guarded(_evaluate, arguments)
+
+
+def _evaluate(a: argparse.Namespace) -> None:
+    result = evaluate_recording(Detector.load(a.weights), a.recording, every=a.every, progress=True)
+    rows = {"all": result.scores} | result.by_landmark() | result.by_visibility()
+    print(f"{'':10}{'PCK@0.01':>10}{'PCK@0.05':>10}{'PCK@0.10':>10}{'median px':>11}{'95 % px':>9}{'missed':>8}{'labels':>8}")
+    for name, s in rows.items():
+        print(
+            f"{name:10}{s.pck_0_01:10.1f}{s.pck_0_05:10.1f}{s.pck_0_10:10.1f}{s.median_px:11.2f}{s.p95_px:9.2f}"
+            f"{s.missed:8d}{s.labels:8d}"
+        )
+    s = result.scores
+    print(f"normalised squared error {s.nees:.2f} (2 is right), {s.coverage_95:.1f} % inside the 95 % ellipse")
+    print(f"bias {s.bias_px[0]:+.2f}, {s.bias_px[1]:+.2f} px")
+    detection = ", ".join(f"{name.replace('_', ' ')} {value:.1f} %" for name, value in result.detection().items())
+    print(f"detections with a confidence above 0.5: {detection}")
+    if a.json:
+        write_json(a.json, {name: asdict(s) for name, s in rows.items()})
+
+
+if __name__ == "__main__":  # for torchrun
+    sys.exit(main())

@@ -1,0 +1,112 @@
+"""What decides a training: network, augmentation, optimiser, schedule; and the presets."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+
+from lib.landmarks.heatmaps import SIGMA_PX
+from lib.landmarks.network import HourglassConfig, OffsetConfig
+from lib.training.augmentation import AUGMENTATIONS, Augmentation
+
+__all__ = ["PRESETS", "TrainingConfig"]
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """All options of a training except its data.
+
+    Attributes
+    ----------
+    steps, batch_size:
+        Number of optimiser steps, and images in each.
+    optimiser, learning_rate, schedule:
+        ``"rmsprop"`` (alpha 0.99, no momentum, as the paper prints) or ``"adamw"``; ``"constant"`` or ``"cosine"``, the
+        latter after a warm-up.
+    ema:
+        Decay of the moving average of the weights, which is validated and returned; 0 = the weights themselves.
+    clip:
+        Largest norm of the gradient; 0 = unlimited.
+    precision:
+        ``"fp32"``, or ``"bf16"`` mixed precision; the loss is always float32.
+    sigma_px:
+        Width of the target Gaussians in pixels of the network's input.
+    position_weight_per_px:
+        Weight of `lib.training.losses.position_loss` beside the l2 loss of the heatmaps; the paper has the latter alone (0).
+    validate_every:
+        Steps between two validations.
+    seed:
+        Decides the first weights and every batch.
+
+    Raises
+    ------
+    ValueError
+        For an unknown choice, or a number below 1 where at least 1 is needed.
+
+    Examples
+    --------
+    >>> TrainingConfig(steps=1000, learning_rate=1e-3, schedule="cosine").rate(500)
+    0.000505
+    """
+
+    network: HourglassConfig | OffsetConfig = field(default_factory=HourglassConfig)
+    augmentation: Augmentation = AUGMENTATIONS["paper"]
+    steps: int = 1000
+    batch_size: int = 4
+    optimiser: str = "rmsprop"
+    learning_rate: float = 5e-5
+    schedule: str = "constant"
+    ema: float = 0.0
+    clip: float = 0.0
+    precision: str = "fp32"
+    sigma_px: float = SIGMA_PX
+    position_weight_per_px: float = 0.0
+    validate_every: int = 100
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name, choices in (
+            ("optimiser", ("rmsprop", "adamw")),
+            ("schedule", ("constant", "cosine")),
+            ("precision", ("fp32", "bf16")),
+        ):
+            if getattr(self, name) not in choices:
+                raise ValueError(f"{name}: expected one of {', '.join(choices)}, got {getattr(self, name)!r}.")
+        if min(self.steps, self.batch_size, self.validate_every) < 1:
+            raise ValueError("steps, batch_size, validate_every: must be at least 1.")
+
+    def rate(self, step: int) -> float:
+        """Learning rate of a step."""
+        if self.schedule == "constant":
+            return self.learning_rate
+        warm = min(1.0, (step + 1) / max(1, min(100, self.steps // 10)))
+        return self.learning_rate * warm * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * step / self.steps)))
+
+    def changed(self, stored: Mapping[str, object]) -> list[str]:
+        """Names of the options whose values differ in a checkpoint's configuration; what it does not name has its default.
+
+        `validate_every` may differ between two sittings of one training.
+        """
+        own, default = (json.loads(json.dumps(asdict(config))) for config in (self, TrainingConfig()))
+        for part in ("network", "augmentation"):
+            default[part] = json.loads(json.dumps(asdict(type(getattr(self, part))()))) | dict(stored.get(part, {}))
+        other = default | {name: value for name, value in stored.items() if name not in ("network", "augmentation")}
+        return [name for name in other if name != "validate_every" and own.get(name) != other[name]]
+
+
+#: `paper`: as printed. `best`: trains the shipped networks.
+PRESETS = {
+    "paper": TrainingConfig(),
+    "best": TrainingConfig(
+        augmentation=AUGMENTATIONS["best"],
+        batch_size=12,
+        optimiser="adamw",
+        learning_rate=2e-3,
+        schedule="cosine",
+        ema=0.998,
+        clip=1.0,
+        precision="bf16",
+    ),
+}

@@ -1,0 +1,200 @@
+"""Fitting what makes covariance and confidence true: the error model of each stage, on validation images."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields, replace
+from itertools import product
+
+import numpy as np
+from scipy.optimize import minimize
+from scipy.stats import chi2
+from tqdm.auto import tqdm
+
+from lib.geometry import image_from_cell
+from lib.landmarks.detector import CLOSE, TRACKED_FROM, Detector, Landmarks
+from lib.landmarks.error_model import ErrorModel, features_of
+from lib.landmarks.metrics import tool_length_px
+from lib.landmarks.windows import CLOSEUP_REACH_PX, CLOSEUP_ZOOM, expected_in_closeup, map_points
+from lib.training.samples import LabelledImage
+
+__all__ = ["GROSS_PX", "TRACKED_SHIFT_PX", "Seen", "fit_error_models", "seen_by"]
+
+#: Errors beyond this are gross: no covariance describes them.
+GROSS_PX = 20.0
+#: What a tool of 2 mm/s moves between two frames at 25 Hz.
+TRACKED_SHIFT_PX = 8.0
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Peaks that a stage decoded, and their errors, in pixels of the stage's input.
+
+    Attributes
+    ----------
+    features:
+        (m, 3, 4), as `features_of` gives them.
+    errors:
+        (m, 2), NaN without a label.
+    tolerance:
+        (m,): a landmark is correct below this error.
+    landmark:
+        (m,) 0 base, 1 tip_1, 2 tip_2.
+    moved:
+        (m, 2), in closeups: the whole correction.
+    """
+
+    features: np.ndarray
+    errors: np.ndarray
+    tolerance: np.ndarray
+    landmark: np.ndarray
+    moved: np.ndarray
+
+    @classmethod
+    def joined(cls, parts: Sequence[Seen]) -> Seen:
+        """One after the other."""
+        return cls(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(cls)))
+
+    def fit(self, gross_px: float) -> ErrorModel:
+        """Maximum likelihood of the errors below `gross_px`, and a logistic regression of being correct.
+
+        Variances are log linear in the features; the tips, each other's mirror images, share all coefficients.  Errors have
+        longer tails than a Gaussian: with a mean normalised squared error of 2 more than 5 % lie outside the 95 % ellipses,
+        and ellipses that hold 95 % make it less than 2.  The constants are set halfway, for the base and for the tips.
+
+        Raises
+        ------
+        ValueError
+            For fewer than 20 landmarks.
+        """
+        size = np.linalg.norm(self.errors, axis=1)
+        use = np.isfinite(size) & (size < gross_px)
+        if use.sum() < 20:
+            raise ValueError(f"images: only {use.sum()} landmarks to calibrate on; give at least 20.")
+        features, squared = self.features[use], self.errors[use] ** 2
+        tip = self.landmark[use, None] > 0
+
+        def variance(axis: int) -> tuple[float, ...]:
+            x = np.column_stack([~tip, tip, features[:, axis, 1:]]).astype(float)
+
+            def deviance(beta: np.ndarray) -> tuple[float, np.ndarray]:
+                log_variance = x @ beta
+                ratio = squared[:, axis] * np.exp(-log_variance)
+                slopes = 1e-3 * np.array([0.0, 0.0, 1.0, 1.0, 1.0])
+                value = (log_variance + ratio).mean() + slopes @ beta**2
+                return value, x.T @ (1 - ratio) / len(x) + 2 * slopes * beta
+
+            start = np.array([np.log(max(squared[:, axis].mean(), 1e-6))] * 2 + [0.0] * 3)
+            base, tips, *slopes = map(float, minimize(deviance, start, jac=True, method="L-BFGS-B").x)
+            return (base, tips, tips, *slopes)
+
+        y, both = (size <= self.tolerance).astype(float), self.features[:, 2]
+
+        def cost(beta: np.ndarray) -> tuple[float, np.ndarray]:
+            z = both @ beta
+            ridge = 1e-3 * np.array([0.0, 1.0, 1.0, 1.0])
+            p = 1 / (1 + np.exp(-z))
+            return (np.logaddexp(0, z) - y * z).mean() + ridge @ beta**2, both.T @ (p - y) / len(y) + 2 * ridge * beta
+
+        logit = minimize(cost, np.array([-4.0, 0.0, 8.0, 0.0]), jac=True, method="L-BFGS-B").x
+        log_variance = np.array([variance(0), variance(1)])
+        rows = ErrorModel(tuple(map(tuple, log_variance.tolist()))).coefficients[self.landmark[use]]
+        normalised = (squared / np.exp((rows * features[:, :2]).sum(-1))).sum(1)
+        for own, columns in ((~tip[:, 0], np.s_[:1]), (tip[:, 0], np.s_[1:3])):
+            if own.any():
+                log_variance[:, columns] += 0.5 * np.log(np.quantile(normalised[own], 0.95) / chi2.ppf(0.95, 2))
+        return ErrorModel.of(log_variance.tolist(), logit.tolist())
+
+    def gain(self, gross_px: float, gains: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
+        """Gain (one of `gains`) and bias (3, 2) of base and tips along each axis that leave the smallest absolute errors."""
+        # What was expected must be near the landmark; a closeup's own gross errors count.
+        use = np.linalg.norm(self.errors - self.moved, axis=1) < gross_px
+        best, bias = np.ones((3, 2)), np.zeros((3, 2))
+        for k, axis in product(([0], [1, 2]), (0, 1)):  # the base, and both tips
+            own = use & np.isin(self.landmark, k)
+            if own.any():
+                left = self.errors[own, axis] + (np.asarray(gains)[:, None] - 1) * self.moved[own, axis]
+                centre = np.median(left, axis=1)
+                i = np.abs(left - centre[:, None]).mean(1).argmin()
+                best[k, axis], bias[k, axis] = gains[i], centre[i]
+        return best, bias
+
+
+def seen_by(detector: Detector, stage: str, labelled: LabelledImage, rough: np.ndarray) -> Seen:
+    """What a stage decodes in one image, given the landmarks `rough` (1, 3, 2) of the stage before, beside the labels."""
+    labels, image = labelled.in_view, labelled.image[None]
+    tolerance = 0.05 * tool_length_px(np.asarray(labelled.u, dtype=float)[None])
+    if stage == "frame":
+        peaks = detector.frame_peaks(image)
+        feature = features_of(peaks.double(), detector.reduction)[0].numpy()
+        errors = image_from_cell(peaks.u[0].double().numpy(), detector.reduction) - labels
+        return Seen(feature, errors, np.repeat(tolerance, 3), np.arange(3), np.zeros((3, 2)))
+    peaks, matrices, which = detector.stage_peaks(image, rough, stage)
+    landmark, at = which[:, 1], peaks.u[:, 0].double().numpy()
+    feature, moved = features_of(peaks.double(), 1)[:, 0].numpy(), np.zeros(at.shape)
+    keep = np.ones(len(at), bool)
+    if stage in CLOSE:
+        keep = peaks.value[:, 0].numpy() > 0
+        moved = at - expected_in_closeup(detector.closeup_network.config.size_px, landmark)
+    errors = at - map_points(matrices, labels[landmark])
+    tolerance = tolerance * np.sqrt(np.abs(np.linalg.det(matrices[:, :, :2])))
+    return Seen(*(part[keep] for part in (feature, errors, tolerance, landmark, moved)))
+
+
+def fit_error_models(detector: Detector, images: Iterable[LabelledImage], *, progress: bool = False) -> Detector:
+    """The detector with the error model of every stage fitted on validation images, never trained on.
+
+    A closeup's correction is scaled by the gain that minimises the validation error, and centred; while tracking it counts
+    in full.  Tracking is fitted on the same images, the tool displaced by `TRACKED_SHIFT_PX`, every fourth time by five
+    times as much.
+
+    Parameters
+    ----------
+    images:
+        Easy and hard ones, since confidence is learnt from failures, and of many tools, since errors within a recording
+        correlate because they share one tool.
+
+    Raises
+    ------
+    ValueError
+        If too few landmarks are found in them.
+    """
+    images = list(images)
+    # A closeup is fitted by what it sees itself, not by what an earlier gain leaves of that.
+    detector = replace(detector, error_models={k: v for k, v in detector.error_models.items() if k not in CLOSE})
+    rough: list[Landmarks] = []
+    rng = np.random.default_rng(0)
+    for stage in detector.stages:
+        parts = []
+        for i, labelled in enumerate(tqdm(images, disable=not progress, unit="image", desc=stage)):
+            start = rough[i] if stage != "frame" else None
+            if stage in CLOSE and not (start.confidence >= TRACKED_FROM).all():
+                continue  # nothing is tracked from such an image
+            if stage == "tracking":  # a tool that jumps now and then, which tracking has to notice
+                moved_px = TRACKED_SHIFT_PX * (5 if rng.random() < 0.25 else 1)
+                start = replace(start, u=start.u + rng.normal(0, moved_px / np.sqrt(2), (1, 1, 2)))
+                start = detector.refine(labelled.image[None], start, stage)
+            parts.append(seen_by(detector, stage, labelled, start.u if start is not None else None))
+        parts = [part for part in parts if len(part.landmark)]
+        if not parts:
+            raise ValueError("images: the detector finds nothing in them to calibrate on; give other images.")
+        seen = Seen.joined(parts)
+        gross = {
+            "frame": 6 * GROSS_PX,
+            "tool": 2 * GROSS_PX / detector.tool_reduction,
+            "window": GROSS_PX,
+        }.get(stage, CLOSEUP_REACH_PX * min(CLOSEUP_ZOOM))
+        gain, bias = np.ones((3, 2)), np.zeros((3, 2))
+        if stage in CLOSE:
+            # While tracking, the place where a landmark is expected is an old one, which is evidence of nothing.
+            gain, bias = seen.gain(gross, [1.0] if stage == "tracking" else np.linspace(0, 1, 51))
+            left = seen.errors + (gain[seen.landmark] - 1) * seen.moved - bias[seen.landmark]
+            seen = replace(seen, errors=left)
+        fit = seen.fit(gross)
+        fit = ErrorModel.of(fit.log_variance, fit.logit, gain.tolist(), bias.tolist())
+        detector = detector.with_error_models(**{stage: fit})
+        if stage == "frame":  # the landmarks that the next stage starts from
+            rough = [detector.coarse(part.image[None]) for part in images]
+        elif stage != "tracking":
+            rough = [detector.refine(part.image[None], r, stage) for part, r in zip(images, rough, strict=True)]
+    return detector

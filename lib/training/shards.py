@@ -1,0 +1,200 @@
+"""Training data on disk: .npz shards of frames, cut to what the detector's stages see.
+
+A shard of frames keeps each frame at a reduced resolution and a crop round each landmark at full resolution; validation
+shards keep the full frame as JPEG too.  Shards of windows and of closeups hold crops alone.  Frames come from
+`lib.simulator.population.sample`, whose eyes and tools no test recording uses, or from labelled images of a user.
+Shards are written whole or not at all, so that `generate` can be stopped at any time and continues where it stopped.
+"""
+
+from __future__ import annotations
+
+import zipfile
+import zlib
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from lib.files import whole
+from lib.geometry import cell_from_image
+from lib.landmarks.windows import cut
+from lib.parallel import run_jobs
+from lib.simulator.population import TEXTURE_SEEDS, VALIDATION_TEXTURE_SEEDS, sample
+from lib.training.samples import LabelledImage, Samples
+
+__all__ = [
+    "BLOCK_PX",
+    "REDUCTION",
+    "STORED_REDUCTION",
+    "frame_samples",
+    "generate",
+    "read_shards",
+    "validation_images",
+    "write_frames",
+]
+
+#: Of the stored frames, and of the first stage's input.
+STORED_REDUCTION, REDUCTION = 5, 8
+CROP_PX = 288
+FRAMES = 16
+#: Seeds of each kind of shard.
+_SEEDS = {"training": 0, "validation": 1, "windows": 2, "closeups": 4}
+#: Shards of crops alone: side in px, and how many.
+CROPS = {"windows": (CROP_PX, 512), "closeups": (128, 2048)}
+#: A crop is rendered with its landmark anywhere within a JPEG block of this many pixels.  Were its place in the block always
+#: the same, a network would learn to read it off the blocks: a quarter of its error would vanish, and return on other images.
+BLOCK_PX = 16
+
+
+def generate(
+    folder: str | Path, kind: str, shards: int, *, workers: int | None = None, progress: bool = True
+) -> None:
+    """Write the first `shards` shards of a kind into `folder`, except those that exist.
+
+    A shard depends on its kind and number alone.
+
+    Parameters
+    ----------
+    kind:
+        ``"training"`` and ``"validation"`` hold 16 frames each.  ``"windows"`` and ``"closeups"`` hold 512 and 2048 crops
+        round a landmark, each of an eye and a tool of its own: twenty and forty times as many scenes a second, since only
+        the crops are rendered.
+    workers:
+        Processes that share the work, by default one a core.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    jobs = {folder / f"{kind}_{i:04d}.npz": (kind, i) for i in range(shards)}
+    title = f"Simulating {kind}"
+    for done in run_jobs(make_shard, jobs, workers=workers, title=title, unit="shard", progress=progress):
+        if done.error:
+            raise done.error
+
+
+def make_shard(path: Path, kind: str, index: int) -> None:
+    """Simulate and write one shard."""
+    rng = np.random.default_rng([_SEEDS[kind], index])
+    if kind in CROPS:
+        _write_crops(path, rng, *CROPS[kind])
+        return
+    textures = VALIDATION_TEXTURE_SEEDS if kind == "validation" else TEXTURE_SEEDS
+    frames = (LabelledImage(str(i), *sample(rng, textures=textures)) for i in range(FRAMES))
+    write_frames(path, frames, keep_frames=kind == "validation")
+
+
+def _write_crops(path: Path, rng: np.random.Generator, side_px: int, n: int) -> None:
+    crops = np.empty((n, side_px, side_px, 3), np.uint8)
+    crop_u, crop_visibility = np.empty((n, 3, 2)), np.empty((n, 3), int)
+    crop_landmark = rng.integers(3, size=n)
+    for i, k in enumerate(crop_landmark):
+        while True:
+            rendered_px = side_px + BLOCK_PX
+            image, u, visibility = sample(rng, crop_px=rendered_px, around=k, jitter=BLOCK_PX / 2 / rendered_px)
+            if visibility[k]:
+                break
+        crops[i], crop_u[i] = _crop(image, u, k, side_px)  # the landmark is not in the middle where the field ends
+        crop_visibility[i] = visibility
+    landmark = crop_landmark.astype(np.int64)
+    _write(path, crops=crops, crop_u=crop_u, crop_visibility=crop_visibility, crop_landmark=landmark)
+
+
+def _crop(image: np.ndarray, u: np.ndarray, k: int, side_px: int) -> tuple[np.ndarray, np.ndarray]:
+    """The square round landmark k, and the landmarks in its pixels."""
+    corner = np.round(u[k] - (side_px - 1) / 2)
+    return cut(image, np.column_stack([np.eye(2), -corner]), side_px), u - corner
+
+
+def write_frames(path: Path, images: Iterable[LabelledImage], *, keep_frames: bool) -> None:
+    """Write one shard of full-resolution labelled images of one size; with the images themselves if `keep_frames`."""
+    frames, labels, seen, crops, crop_u, of_crop, jpegs = [], [], [], [], [], [], []
+    for _, image, u, visibility in images:
+        h, w = image.shape[:2]
+        frames.append(cv2.resize(image, (w // STORED_REDUCTION, h // STORED_REDUCTION), interpolation=cv2.INTER_AREA))
+        labels.append(u)
+        seen.append(visibility)
+        for k in np.flatnonzero((visibility > 0) & np.isfinite(u).all(1)):
+            for part, value in zip((crops, crop_u), _crop(image, u, k, CROP_PX), strict=True):
+                part.append(value)
+            of_crop.append((len(frames) - 1, k))
+        if keep_frames:
+            quality = [cv2.IMWRITE_JPEG_QUALITY, 95]
+            jpegs.append(cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), quality)[1].ravel())
+    frame, landmark = np.array(of_crop, dtype=int).reshape(-1, 2).T
+    _write(
+        path,
+        frames=np.stack(frames),
+        u=np.stack(labels),
+        visibility=np.stack(seen),
+        crops=np.array(crops, np.uint8).reshape(-1, CROP_PX, CROP_PX, 3),
+        crop_u=np.array(crop_u).reshape(-1, 3, 2),
+        crop_visibility=np.stack(seen)[frame],
+        crop_landmark=landmark,
+        jpegs=np.concatenate(jpegs) if jpegs else np.zeros(0, np.uint8),
+        jpeg_ends=np.cumsum([j.size for j in jpegs]),
+    )
+
+
+def _write(path: Path, **arrays: np.ndarray) -> None:
+    with whole(path) as partial, partial.open("wb") as file:
+        np.savez(file, **arrays)
+
+
+def _read(path: Path, names: tuple[str, ...]) -> list[np.ndarray]:
+    """Arrays of one shard."""
+    try:
+        with np.load(path, allow_pickle=False) as shard:
+            return [shard[name] for name in names]
+    except (ValueError, KeyError, OSError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        raise ValueError(f"{path}: corrupt; delete it and generate it again ({error}).") from error
+
+
+def read_shards(
+    folder: str | Path, kinds: tuple[str, ...], names: tuple[str, ...], first: int | None = None
+) -> list[np.ndarray]:
+    """Arrays of the (first) shards of some kinds, joined over the shards.
+
+    Raises
+    ------
+    FileNotFoundError, ValueError
+        If there is no shard, one is corrupt, or their images have several sizes.
+    """
+    found = [path for kind in kinds for path in sorted(Path(folder).glob(f"{kind}_*.npz"))][:first]
+    if not found:
+        raise FileNotFoundError(f"{folder}: no shard {kinds[0]}_*.npz; make some with `python3 -m lib train generate`.")
+    parts: dict[str, list[np.ndarray]] = {name: [] for name in names}
+    for path in found:
+        for name, array in zip(names, _read(path, names), strict=True):
+            if parts[name] and array.shape[1:] != parts[name][0].shape[1:]:
+                raise ValueError(f"{path}: its images have another size; keep images of one size in a folder.")
+            parts[name].append(array)
+    return [_joined(parts.pop(name)) for name in names]
+
+
+def _joined(parts: list[np.ndarray]) -> np.ndarray:
+    """Concatenated; each part is released as soon as it is copied, so that gigabytes are never held twice."""
+    result = np.empty((sum(len(part) for part in parts), *parts[0].shape[1:]), parts[0].dtype)
+    end = len(result)
+    while parts:
+        part = parts.pop()
+        result[end - len(part) : end] = part
+        end -= len(part)
+    return result
+
+
+def frame_samples(folder: str | Path, *, validation: bool = False) -> Samples:
+    """Whole frames at the first stage's resolution; shards keep more, so that it can be chosen later."""
+    kind = "validation" if validation else "training"
+    frames, u, visibility = read_shards(folder, (kind,), ("frames", "u", "visibility"))
+    size = (frames.shape[2] * STORED_REDUCTION // REDUCTION, frames.shape[1] * STORED_REDUCTION // REDUCTION)
+    frames = np.stack([cv2.resize(frame, size, interpolation=cv2.INTER_AREA) for frame in frames])
+    return Samples(frames, cell_from_image(u, REDUCTION), visibility)
+
+
+def validation_images(folder: str | Path) -> Iterator[LabelledImage]:
+    """Full validation frames, for `lib.training.evaluation`."""
+    for path in sorted(Path(folder).glob("validation_*.npz")):
+        jpegs, ends, u, visibility = _read(path, ("jpegs", "jpeg_ends", "u", "visibility"))
+        for i, piece in enumerate(np.split(jpegs, ends[:-1])):
+            image = cv2.cvtColor(cv2.imdecode(piece, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+            yield LabelledImage(f"{path.stem} {i}", image, u[i], visibility[i])

@@ -1,0 +1,171 @@
+"""What the later stages train on: upright windows and closeups, placed as badly as the stage before places them."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from lib.geometry import cell_from_image
+from lib.landmarks.windows import (
+    CLOSEUP_REACH_PX,
+    closeup_from_image,
+    cut,
+    direction_rad,
+    map_points,
+    tool_centre,
+    window_from_image,
+)
+from lib.simulator.render import motion_kernel
+from lib.training.shards import BLOCK_PX, STORED_REDUCTION, read_shards
+
+__all__ = ["TOOL", "TOOL_REDUCTION", "CloseupSource", "WindowSource"]
+
+#: Reduction of the middle stage's windows, and the landmark index that means the whole tool.
+TOOL_REDUCTION, TOOL = STORED_REDUCTION, 3
+_CROPS = ("crops", "crop_u", "crop_visibility", "crop_landmark")
+
+
+@dataclass(frozen=True)
+class _Cut:
+    """Windows that are cut out of stored crops.
+
+    Attributes
+    ----------
+    crops, u, visibility:
+        (n, h, w, 3) uint8, labels (n, 3, 2) in crop pixels, and (n, 3).
+    landmark:
+        (n,) which landmark each window shows.
+    """
+
+    crops: np.ndarray
+    u: np.ndarray
+    visibility: np.ndarray
+    landmark: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.crops)
+
+    @property
+    def fingerprint(self) -> str:
+        """Of the images, their labels, and how windows are drawn from them."""
+        digest = hashlib.sha256(np.ascontiguousarray(self.crops[:, ::17, ::17]).tobytes())
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if field.name != "crops":
+                digest.update(value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode())
+        return digest.hexdigest()[:16]
+
+
+@dataclass(frozen=True)
+class WindowSource(_Cut):
+    """Upright windows round landmarks, or, where `landmark` is `TOOL`, round the middle of the tool.
+
+    Attributes
+    ----------
+    size:
+        Side of the windows in px.
+    shift_px, turn_rad:
+        Standard deviations of the error of place and direction; a tenth of the windows has three times as much.
+    zoom:
+        Range of magnification.
+    """
+
+    size: int = 128
+    shift_px: float = 6.0
+    turn_rad: float = 0.08
+    zoom: tuple[float, float] = (0.85, 1.2)
+
+    @classmethod
+    def load(cls, folder: str | Path, *, validation: bool = False, shards: int | None = None) -> WindowSource:
+        """From the shards of a folder, those of windows alone included; or from its first `shards` of frames."""
+        kinds = ("validation",) if validation else ("training", "windows")[: 1 if shards else 2]
+        return cls(*read_shards(folder, kinds, _CROPS, shards))
+
+    @classmethod
+    def load_tools(cls, folder: str | Path, *, validation: bool = False, shards: int | None = None) -> WindowSource:
+        """Windows round the whole tool at `TOOL_REDUCTION`, for the middle stage."""
+        kind = "validation" if validation else "training"
+        frames, u, visibility = read_shards(folder, (kind,), ("frames", "u", "visibility"), shards)
+        which = np.full(len(frames), TOOL)
+        u = cell_from_image(u, TOOL_REDUCTION)
+        return cls(frames, u, visibility, which, shift_px=8.0, turn_rad=0.2, zoom=(0.75, 1.3))
+
+    def draw(self, index: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        u = self.u[index]
+        worse = 3.0 if rng.random() < 0.1 else 1.0
+        limit = 0.3 * self.size
+        at = tool_centre(u[None])[0] if self.landmark[index] == TOOL else u[self.landmark[index]]
+        centre = at + np.clip(rng.normal(0, worse * self.shift_px, 2), -limit, limit)
+        angle = direction_rad(u[None])[0] + np.clip(rng.normal(0, worse * self.turn_rad), -0.6, 0.6)
+        matrix = window_from_image(centre, angle, self.size, rng.uniform(*self.zoom))
+        return cut(self.crops[index], matrix, self.size), map_points(matrix, u), self.visibility[index]
+
+
+@dataclass(frozen=True)
+class CloseupSource(_Cut):
+    """Closeups of visible landmarks, displaced as windows or the frame before may place them, of tools more or less stretched.
+
+    Stretching and shearing an image keeps its labels true and makes many tools of one.
+
+    Attributes
+    ----------
+    size:
+        Side of the closeups in px.
+    shifts_px, shift_shares:
+        Standard deviations of the error of place, and the share of closeups that has each.
+    turn_rad:
+        Standard deviation of the error of direction.
+    alone:
+        Share of closeups whose direction is that to one tip, as if the other one were missing.
+    stretch, shear:
+        Standard deviations of the logarithms of two stretches, along and across the tool, and of the shear.
+    motion_px:
+        Standard deviation along x and y of the movement, in closeup pixels, that blurs half of the closeups: a tool under way
+        moves more often than the simulator's.
+    """
+
+    size: int = 64
+    shifts_px: tuple[float, ...] = (2.0, 4.0, 8.0)
+    shift_shares: tuple[float, ...] = (0.5, 0.25, 0.25)
+    turn_rad: float = 0.03
+    alone: float = 0.05
+    stretch: float = 0.1
+    shear: float = 0.05
+    motion_px: float = 1.7
+
+    @classmethod
+    def load(cls, folder: str | Path, *, validation: bool = False, kind: str = "closeups") -> CloseupSource:
+        """From a folder's shards of a kind; for validation from its whole frames, neither stretched nor blurred."""
+        parts = read_shards(folder, ("validation" if validation else kind,), _CROPS)
+        seen = parts[2][np.arange(len(parts[3])), parts[3]] == 2
+        if not seen.all():
+            parts = [part[seen] for part in parts]
+        return cls(*parts, stretch=0.0, shear=0.0, motion_px=0.0) if validation else cls(*parts)
+
+    def draw(self, index: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """A closeup; only its own landmark counts as visible."""
+        k = self.landmark[index]
+        # A crop ends before a turned closeup's corners do.  Where it ends must not tell where its middle was.
+        x, y = rng.integers(0, BLOCK_PX, 2, endpoint=True)
+        h, w = (side - BLOCK_PX for side in self.crops.shape[1:3])
+        crop, u = self.crops[index, y : y + h, x : x + w], self.u[index] - (x, y)
+        shift = rng.normal(0, self.shifts_px[rng.choice(len(self.shifts_px), p=self.shift_shares)], 2)
+        centre = u[k] + shift * min(1.0, CLOSEUP_REACH_PX / max(np.linalg.norm(shift), 1e-9))
+        known = u.copy()
+        if rng.random() < self.alone:
+            known[rng.choice([j for j in (1, 2) if j != k])] = np.nan
+        angle = direction_rad(known[None])[0] + rng.normal(0, self.turn_rad)
+        matrix = closeup_from_image(centre, angle, self.size, k)
+        along, across = np.exp(rng.normal(0, self.stretch, 2))
+        deform = np.array([[along, 0.0], [rng.normal(0, self.shear), across]])
+        middle = (self.size - 1) / 2
+        matrix = np.column_stack([deform @ matrix[:, :2], deform @ (matrix[:, 2] - middle) + middle])
+        image = cut(crop, matrix, self.size, border=cv2.BORDER_REPLICATE)
+        kernel = motion_kernel(rng.normal(0, self.motion_px, 2)) if self.motion_px and rng.random() < 0.5 else None
+        if kernel is not None:  # centred, so the landmark stays
+            image = cv2.filter2D(image, -1, kernel)
+        return image, map_points(matrix, u), np.where(np.arange(3) == k, 2, 0)

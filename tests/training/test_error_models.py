@@ -1,0 +1,106 @@
+"""Fitted covariances and confidences are true on images that were not fitted on."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from lib.landmarks import Detector, metrics
+from lib.landmarks import detector as detectors
+from lib.landmarks.error_model import ErrorModel
+from lib.landmarks.network import HourglassConfig, OffsetConfig, OffsetNetwork
+from lib.training import error_models
+from lib.training.augmentation import Augmentation
+from lib.training.config import PRESETS
+from lib.training.error_models import Seen, fit_error_models
+from lib.training.evaluation import evaluate
+from lib.training.loop import train
+from tests.toys import toy_images, toy_samples
+
+
+@pytest.fixture(scope="module")
+def small():
+    """A whole-frame detector trained for a moment on toys, and toys it has not seen."""
+    config = replace(
+        PRESETS["best"], network=HourglassConfig(12, 1, 2), augmentation=Augmentation(10.0, (0.9, 1.1)), steps=50,
+        batch_size=6, ema=0.9, learning_rate=4e-3, validate_every=50, precision="fp32",
+    )  # fmt: skip
+    network = train(config, toy_samples(60), toy_samples(4, seed=2), progress=False).network
+    return Detector(network, error_models={"frame": ErrorModel(logit=(5.0, 0.0, 0.0, 0.0))}), toy_images(40, seed=5)
+
+
+def test_calibration_makes_covariances_and_confidence_true(small):
+    detector, frames = small
+    result = evaluate(fit_error_models(detector, frames[:20]), frames[20:])
+    assert 0.5 < result.scores.nees < 6
+    assert 75 < result.scores.coverage_95 <= 100
+    before = evaluate(detector, frames[20:])
+    labelled = ~np.isnan(result.error_px)
+    error = [metrics.error_models_error(r.landmarks.confidence[labelled], r.correct[labelled]) for r in (before, result)]
+    assert error[1] <= max(error[0], 0.25)
+
+
+def test_fitted_variance_of_known_errors():
+    """Errors drawn with a variance that depends on feature, base or tip, and axis: the fit finds all three, and NEES is 2."""
+    rng = np.random.default_rng(0)
+    features = np.stack(
+        [np.ones((6000, 3)), rng.normal(0, 1, (6000, 3)), rng.uniform(0.2, 1, (6000, 3)), np.zeros((6000, 3))], 2
+    )
+    landmark = rng.integers(3, size=6000)
+    along = 0.3 + 0.8 * features[:, 0, 1] + np.array([-0.6, 0.3, 0.3])[landmark]
+    across = -1.2 + 0.2 * features[:, 1, 1]
+    sigma = np.exp(np.column_stack([along, across]) / 2)
+    errors = rng.normal(0, 1, (6000, 2)) * sigma
+    correct = np.linalg.norm(errors, axis=1) < 2
+    fit = Seen(features, errors, np.full(6000, 2.0), landmark, np.zeros((6000, 2))).fit(1e9)
+    coefficients = fit.coefficients
+    assert coefficients[:, :, 1] == pytest.approx(np.tile([0.8, 0.2], (3, 1)), abs=0.05)
+    assert coefficients[1:, :, 0] - coefficients[0, :, 0] == pytest.approx(np.array([[0.9, 0], [0.9, 0]]), abs=0.1)
+    log_variance = (coefficients[landmark] * features[:, :2]).sum(-1)
+    squared = errors**2 / np.exp(log_variance)
+    for own in (landmark == 0, landmark > 0):
+        assert squared[own].mean(0) == pytest.approx([1, 1], abs=0.05)
+    confidence = 1 / (1 + np.exp(-features[:, 2] @ np.array(fit.logit)))
+    assert metrics.error_models_error(confidence, correct) < 0.05
+
+
+def test_closeups_that_know_nothing_do_no_harm(small, monkeypatch):
+    """The corrections of an untrained offset network are a constant, which is bias, or noise, which is not believed."""
+    for module in (error_models, detectors):
+        monkeypatch.setattr(module, "TRACKED_FROM", 0.0)  # toys are too small to be sure of
+    detector, frames = small
+    torch.manual_seed(0)
+    closeup = OffsetNetwork(OffsetConfig(4, 32)).eval()
+    torch.nn.init.normal_(closeup.head[-1].weight, std=0.5)
+    full = replace(detector, window_network=detector.frame_network, window_px=64, closeup_network=closeup)
+    once = fit_error_models(full, frames)
+    assert set(once.error_models) == {"frame", "window", "closeup", "tracking"}
+    gain = np.array(once.error_models["closeup"].gain)
+    assert ((gain >= 0) & (gain <= 1)).all()
+    assert once.error_models["tracking"].gain == ((1.0, 1.0),) * 3
+    assert fit_error_models(once, frames).error_models == once.error_models  # what was believed before does not matter
+    errors = [np.nanmedian(evaluate(d, frames).error_px) for d in (once, replace(once, closeup_network=None))]
+    assert errors[0] < errors[1] + 0.5
+
+
+def test_as_much_of_a_correction_is_believed_as_helps():
+    """A closeup that overshoots by a known factor and lies off by a known bias; gross errors do not count."""
+    rng = np.random.default_rng(1)
+    landmark = rng.integers(3, size=3000)
+    gain, bias = np.array([[0.2, 0.8], [0.5, 1.0], [0.5, 1.0]]), np.array([[0.3, 0.0], [-0.2, 0.1], [-0.2, 0.1]])
+    moved = rng.normal(0, 2, (3000, 2))
+    truth = gain[landmark] * moved - bias[landmark] + rng.laplace(0, 0.05, (3000, 2))  # from where it was expected
+    errors = moved - truth
+    errors[:20], errors[20:40] = 50.0, np.nan
+    seen = Seen(np.ones((3000, 3, 4)), errors, np.ones(3000), landmark, moved)
+    found, off = seen.gain(20.0, np.linspace(0, 1, 51))
+    np.testing.assert_allclose(found, gain, atol=0.021)
+    np.testing.assert_allclose(off, bias, atol=0.02)
+    whole, _ = seen.gain(20.0, [1.0])
+    np.testing.assert_array_equal(whole, np.ones((3, 2)))
+
+
+def test_too_few_landmarks_are_named(small):
+    with pytest.raises(ValueError, match="to calibrate on"):
+        fit_error_models(small[0], small[1][:2])
