@@ -248,7 +248,7 @@ class Detector:
         if lacking:
             raise ValueError(
                 f"{path}: no error model for the stages {', '.join(lacking)}, so covariance and confidence would mean "
-                "nothing; fit them with `lib.training.evaluation.calibrate` or `python3 -m lib train assemble`."
+                "nothing; fit them with `lib.training.error_models.fit_error_models` or `python3 -m lib train assemble`."
             )
 
     # Detection

@@ -16,7 +16,7 @@ __all__ = ["ErrorModel", "closeup_peaks", "corrected", "covariance_and_confidenc
 
 @dataclass(frozen=True)
 class ErrorModel:
-    """The error model of one stage, fitted by `lib.training.evaluation.calibrate`.
+    """The error model of one stage, fitted by `lib.training.error_models.fit_error_models`.
 
     The covariance of a peak is diagonal in the axes of the stage's input.  In an upright window these run along the tool
     and across it, the directions in which errors differ most.  The logarithm of the variance in px^2 is a linear function

@@ -237,7 +237,7 @@ class OffsetNetwork(nn.Module):
 
     ``forward(images)`` takes float images (n, 3, s, s) in [0, 1], RGB, and returns one tensor (n, 4) in a list, as the
     hourglass does: the landmark's distance from the closeup's centre along x and y in pixels, and the logarithms of the
-    scales, in pixels, of their errors, within -6 and 5 (`lib.training.loop.offset_loss`).
+    scales, in pixels, of their errors, within -6 and 5 (`lib.training.losses.offset_loss`).
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Figures of notebook 02: network, heatmaps, augmentation, training, and what the detector finds."""
+"""Figures of notebook 02 that its own run draws: network, heatmaps, augmentation, training, detections."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Ellipse, FancyArrowPatch, FancyBboxPatch, Patch
+from matplotlib.patches import Ellipse, FancyArrowPatch, FancyBboxPatch
 from matplotlib.ticker import LogLocator
 from scipy.stats import chi2
 
@@ -16,21 +16,20 @@ from lib.landmarks import Landmarks
 from lib.landmarks.heatmaps import Peaks
 from lib.landmarks.metrics import PCK_THRESHOLDS, reliability
 from lib.landmarks.network import HourglassConfig
+from lib.recordings import Recording
+from lib.simulator.rig import ROBOT_FROM_MICROSCOPE
 from lib.training.evaluation import Evaluation
 from notebooks.figures.style import COLOURS, LANDMARK_COLOURS, figure, show_image
 
 __all__ = [
-    "ablation_bars",
     "augmented",
     "decoder_errors",
     "detection",
-    "engine_bars",
     "error_groups",
-    "few_labels_curves",
+    "focus_distance_mm",
     "frame_explorer",
     "half_within",
     "heatmap_grid",
-    "label_noise_pairs",
     "landmark_dots",
     "learning_curves",
     "loss_slopes",
@@ -39,13 +38,9 @@ __all__ = [
     "printed_equation",
     "real_curves",
     "real_frames",
-    "resolution_curves",
-    "shipped_curve",
-    "shipped_table",
     "stages",
     "timing_bars",
     "uncertainty",
-    "visibility_bars",
     "worst_frames",
 ]
 
@@ -268,147 +263,6 @@ def uncertainty(evaluation: Evaluation, squared: np.ndarray) -> Figure:
     return fig
 
 
-def ablation_bars(columns: Mapping[str, Mapping], paper: Mapping[str, float]) -> Figure:
-    """Recorded PCK@0.05 of the five networks: a dot a seed, a bar for the mean, and the paper's value."""
-    fig, ax = figure(width_in=8, height_in=3.2)
-    for i, (name, row) in enumerate(columns.items()):
-        values = row["pck_0.05"]["per_seed"]
-        ax.bar(i, row["pck_0.05"]["mean"], 0.55, color=COLOURS["ours"], alpha=0.4, label="mean" if i == 0 else None)
-        ax.text(
-            i, row["pck_0.05"]["mean"] / 2, f"{row['pck_0.05']['mean']:.1f}", ha="center", fontsize=13, weight="bold"
-        )
-        ax.plot(np.full(len(values), i), values, "o", color=COLOURS["ours"], ms=5, label="one seed" if i == 0 else None)
-        ax.plot(i, paper[name], "D", color=COLOURS["paper"], ms=7, label="paper" if i == 0 else None)
-    ax.set_xticks(range(len(columns)), list(columns))
-    ax.set(ylabel="PCK@0.05, %", ylim=(0, 105), title="Ablation")
-    ax.legend(loc="upper left")
-    return fig
-
-
-def resolution_curves(thresholds: Sequence[float], curves: Mapping[str, Sequence[float]]) -> Figure:
-    """PCK against the threshold at the paper's four resolutions."""
-    fig, ax = figure(width_in=8, height_in=3.6)
-    colours = [COLOURS["ours"], COLOURS["truth"], COLOURS["right"], COLOURS["warning"]]
-    for (name, curve), colour in zip(curves.items(), colours, strict=True):
-        ax.plot(100 * np.asarray(thresholds), curve, color=colour, marker="o", ms=3, label=name)
-    ax.set(xscale="log", ylim=(0, 101), xlabel="threshold, % of the tool's length", ylabel="PCK, %", title="Resolution")
-    ticks = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20)
-    ax.set_xticks(ticks, [f"{t:g}" for t in ticks])
-    ax.minorticks_off()
-    ax.legend(loc="upper left")
-    return fig
-
-
-def few_labels_curves(result: Mapping) -> Figure:
-    """PCK@0.05 against the number of annotated frames: recorded means with two standard errors."""
-    fig, ax = figure(width_in=8, height_in=3.8)
-    for (name, rows), colour in zip(result["frames"].items(), (COLOURS["ours"], COLOURS["paper"]), strict=False):
-        n = [int(count) for count in rows]
-        mean = np.array([row["pck_0.05"]["mean"] for row in rows.values()])
-        error = np.array([row["pck_0.05"]["standard_error"] or 0.0 for row in rows.values()], dtype=float)
-        ax.errorbar(n, mean, yerr=2 * error, color=colour, marker="o", ms=6, capsize=4, label=name)
-    ax.axhline(result["no_label"]["pck_0.05"], color=COLOURS["baseline"], ls="--", label="shipped weights, no label")
-    ax.set(xscale="log", ylim=(0, 101), xlabel="annotated frames", ylabel="PCK@0.05, %", title="How many labels?")
-    ax.set_xticks(n, [str(count) for count in n])
-    ax.minorticks_off()
-    ax.legend(title="bars: two standard errors")
-    return fig
-
-
-def label_noise_pairs(result: Mapping) -> Figure:
-    """Recorded median error of networks trained with exact and with noisy labels; a line joins those of one seed."""
-    fig, ax = figure(width_in=5.5, height_in=3.4)
-    medians = np.array([result["labels"][name]["median_px"]["per_seed"] for name in ("exact", "noisy")])
-    ax.plot([0, 1], medians, "o-", color=COLOURS["ours"], ms=7)
-    ax.set_xticks([0, 1], ["exact labels", "noisy labels"])
-    ax.set(xlim=(-0.4, 1.4), ylabel="median error, px", title=f"What noise costs: {_cost(result)} px")
-    ax.set_ylim(0, 1.25 * medians.max())
-    return fig
-
-
-def _cost(result: Mapping) -> str:
-    cost = result["median_cost_px"]
-    error = cost["standard_error"]
-    return f"{cost['mean']:+.3f}" + (" (one seed)" if error is None else f" ± {error:.3f}")
-
-
-def _table(header: Sequence[str], rows: Sequence[Sequence[str]], *, width_in: float, first: float) -> Figure:
-    """Rows of text under a bold header; the first column, `first` of the width, stands to the left."""
-    fig, ax = figure(width_in=width_in, height_in=0.34 * (len(rows) + 1))
-    ax.axis("off")
-    rest = (1 - first) / (len(header) - 1)
-    drawn = ax.table(
-        [list(row) for row in rows], colLabels=list(header), edges="horizontal", cellLoc="center",
-        colWidths=[first] + [rest] * (len(header) - 1), bbox=(0, 0, 1, 1),
-    )  # fmt: skip
-    drawn.auto_set_font_size(False)
-    drawn.set_fontsize(12)
-    for (row, column), cell in drawn.get_celld().items():
-        cell.set_edgecolor(COLOURS["baseline"])
-        if row == 0:
-            cell.set_text_props(weight="bold")
-        if column == 0:
-            cell.set_text_props(ha="left")
-    return fig
-
-
-def shipped_curve(result: Mapping) -> Figure:
-    """Recorded PCK of the shipped detector: whole frames with tracking beside them, and the top enlarged."""
-    fig, axes = figure(1, 2, width_in=11, height_in=3.8)
-    at = np.array([0.01, 0.05, 0.10])
-    for ax, lowest in zip(axes, (0.0, 95.0), strict=True):
-        ax.plot(result["thresholds"], result["curve"], "o-", color=COLOURS["ours"], ms=4, label="whole frames")
-        tracking = [result["tracking"][f"pck_{t:.2f}"] for t in at]
-        ax.plot(at, tracking, "s", color=COLOURS["right"], ms=8, mfc="none", mew=2, label="tracking")
-        ax.plot(0.05, 99.7, "D", color=COLOURS["paper"], ms=7, label="paper, 1080p")
-        thresholds = np.array(result["thresholds"])
-        first = thresholds[0] if lowest == 0 else 0.0075
-        ax.set(xscale="log", xlim=(first, 1.05 * thresholds[-1]), ylim=(lowest, 100 + (100 - lowest) / 50))
-        ticks = [t for t in (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2) if first <= t <= thresholds[-1]]
-        ax.set_xticks(ticks, [f"{t:g}" for t in ticks])
-        ax.minorticks_off()
-        ax.set(xlabel="threshold, part of the tool's length", ylabel="PCK, %")
-    axes[0].set_title("Correct landmarks")
-    axes[1].set_title("The top of it, enlarged")
-    axes[0].legend(loc="lower right")
-    return fig
-
-
-def shipped_table(result: Mapping) -> Figure:
-    """Recorded figures of the shipped detector: all whole frames, tracking, by landmark, by sequence."""
-    rows: dict[str, Mapping] = {"all, whole frames": result["whole_frames"], "all, tracking": result["tracking"]}
-    rows |= result["by_landmark"] | result["by_sequence"]
-
-    def cells(row: Mapping) -> list[str]:
-        pck = [row.get(f"pck_{t}", row.get(f"pck_{t.replace('.', '_')}")) for t in ("0.01", "0.05")]
-        numbers = [f"{row['median_px']:.2f}", f"{row['p95_px']:.2f}", *(f"{p:.1f}" for p in pck)]
-        return [*numbers, f"{row['nees']:.2f}", f"{row['coverage_95']:.1f}", f"{row['missed']}/{row['labels']}"]
-
-    header = [
-        "", "median, px", "95 %, px", "PCK@0.01", "PCK@0.05", "NEES (2)", "in 95 % ellipse", "missed",
-    ]  # fmt: skip
-    return _table(header, [[name, *cells(row)] for name, row in rows.items()], width_in=11.5, first=0.24)
-
-
-def visibility_bars(rows: Mapping[str, Mapping[str, float]]) -> Figure:
-    """Precision and recall of "seen" (`Evaluation.detection`) of each row, in two kinds of frames."""
-    fig, ax = figure(width_in=9, height_in=3.2)
-    names = [f"{there}_{what}" for there in ("in_view", "visible") for what in ("precision", "recall")]
-    for i, ((label, row), colour) in enumerate(zip(rows.items(), (COLOURS["ours"], COLOURS["right"]), strict=True)):
-        values = [row[name] for name in names]
-        x = np.arange(len(names)) + 0.4 * i - 0.2
-        ax.bar(x, values, 0.36, color=colour, alpha=0.7, label=label)
-        for at, value in zip(x, values, strict=True):
-            ax.text(at, value / 2, f"{value:.2f}", ha="center", va="center", fontsize=11, weight="bold")
-    ax.set_xticks(
-        range(len(names)),
-        [name.replace("_", " ").replace("view ", "view\n").replace("ble ", "ble\n") for name in names],
-    )
-    ax.set(ylabel="%", ylim=(0, 119), title="Does it know what is there?")
-    ax.legend(loc="upper right", ncols=2)
-    return fig
-
-
 def real_curves(thresholds: Sequence[float], curves: Mapping[str, Sequence[float]]) -> Figure:
     """PCK on real frames, a panel a kind of test; names are "sequence: what was trained on and tested on"."""
     panels: dict[str, dict[str, Sequence[float]]] = {}
@@ -432,7 +286,7 @@ def real_curves(thresholds: Sequence[float], curves: Mapping[str, Sequence[float
 
 
 def half_within(thresholds: Sequence[float], curve: Sequence[float]) -> str:
-    """How far a PCK curve is, in words: the part of the tool's length within which half of all landmarks lie."""
+    """A PCK curve in words: the fraction of the tool's length within which half of all landmarks lie."""
     curve = np.asarray(curve, dtype=float)
     reached = np.flatnonzero(curve >= 50)
     if not len(reached):
@@ -444,27 +298,9 @@ def half_within(thresholds: Sequence[float], curve: Sequence[float]) -> str:
     return f"half within {100 * at:.0f} % of the tool's length"
 
 
-def engine_bars(rows: Mapping[str, Mapping]) -> Figure:
-    """Recorded milliseconds of six windows on each engine: wall and CPU time, or why it failed."""
-    fig, ax = figure(width_in=9, height_in=0.42 * len(rows) + 1.1)
-    for i, row in enumerate(rows.values()):
-        if "failed" in row:
-            ax.text(0, i, " " + row["failed"][:70], va="center", color=COLOURS["warning"])
-            continue
-        for at, key, colour in ((i - 0.19, "cpu_ms", COLOURS["ours"]), (i + 0.19, "wall_ms", COLOURS["baseline"])):
-            ax.barh(at, row[key], 0.36, color=colour, label=key.split("_")[0] if i == 0 else None)
-            ax.text(row[key], at, f" {row[key]:.0f}", va="center")
-    ax.set_yticks(range(len(rows)), list(rows))
-    ax.set_ylim(len(rows) - 0.4, -0.6)
-    ax.margins(x=0.1)
-    handles = [Patch(color=COLOURS["ours"], label="CPU time"), Patch(color=COLOURS["baseline"], label="wall time")]
-    ax.legend(handles=handles, loc="lower right")
-    ax.set(xlabel="ms", title="Six windows of a stereo pair")
-    return fig
-
-
-def timing_bars(pairs_per_s: Mapping[str, float], paper_hz: Mapping[str, float]) -> Figure:
-    """Stereo pairs a second of each row here, and the paper's on its graphics card; logarithmic."""
+def timing_bars(ms: Mapping[str, float], paper_hz: Mapping[str, float], *, title: str) -> Figure:
+    """Stereo pairs a second of each row (milliseconds a pair), and the paper's on its graphics card; logarithmic."""
+    pairs_per_s = {name: 1e3 / value for name, value in ms.items()}
     fig, ax = figure(width_in=9, height_in=0.5 * len(pairs_per_s) + 1.1)
     for i, (name, rate) in enumerate(pairs_per_s.items()):
         ax.barh(i, rate, 0.6, color=COLOURS["baseline" if name.startswith("paper") else "ours"])
@@ -475,7 +311,7 @@ def timing_bars(pairs_per_s: Mapping[str, float], paper_hz: Mapping[str, float])
     ax.plot([], [], "D", color=COLOURS["paper"], label="paper, Titan X")
     ax.set_yticks(range(len(pairs_per_s)), list(pairs_per_s))
     ax.invert_yaxis()
-    ax.set(xscale="log", xlabel="stereo pairs a second", title="Speed, decoding included")
+    ax.set(xscale="log", xlabel="stereo pairs a second", title=title)
     ax.set_xlim(0.5 * min(pairs_per_s.values()), 2 * max(*pairs_per_s.values(), *paper_hz.values()))
     ax.xaxis.set_major_formatter("{x:g}")
     ax.legend(loc="lower right", bbox_to_anchor=(1, 1))
@@ -493,6 +329,21 @@ def loss_slopes(displacement_px: np.ndarray, losses: Mapping[str, Sequence[float
     ax.set_xlim(0, displacement_px[-1])
     ax.legend(loc="upper left")
     return fig
+
+
+def focus_distance_mm(recording: Recording, *, every: int = 1) -> np.ndarray:
+    """Depth (n, 3) mm of the landmarks beyond the focal plane, in the order of `lib.training.samples.labelled_images`.
+
+    Raises
+    ------
+    ValueError
+        If the recording is not simulated.
+    """
+    if recording.truth is None:
+        raise ValueError(f"{recording.name}: it has no truth/, so the distance from focus is unknown.")
+    x = recording.truth.landmarks_mm[: len(recording.frames) : every]
+    z = ROBOT_FROM_MICROSCOPE.inverse().apply(x.reshape(-1, 3))[:, 2].reshape(-1, 3)
+    return np.repeat(z, 2, axis=0)
 
 
 def error_groups(groups: Mapping[str, Mapping]) -> Figure:
@@ -545,7 +396,7 @@ def frame_explorer(
 
 def closeups(windows: np.ndarray, expected: np.ndarray, seen: Peaks, kept: Peaks, names: Sequence[str]) -> Figure:
     """Closeups (n, s, s, 3): where the windows said the landmark lies (cross, `expected` (n, 2)), where the network sees
-    it with its 95 % ellipse (`seen`, (n, 1)), and what is believed (dot, `kept`, (n, 1)); below, 12 px of each."""
+    it with its 95 % ellipse (`seen`, (n, 1)), and the corrected position (dot, `kept`, (n, 1)); below, 12 px of each."""
     fig, axes = figure(2, len(windows), width_in=9, height_in=6.2, squeeze=False)
     for i, (whole, ax, name) in enumerate(zip(*axes, names, strict=True)):
         show_image(whole, windows[i], name)
@@ -557,7 +408,7 @@ def closeups(windows: np.ndarray, expected: np.ndarray, seen: Peaks, kept: Peaks
         ax.plot(*expected[i], "+", ms=18, mew=2, color="white", label="windows")
         size = 2 * np.sqrt(chi2.ppf(0.95, 2)) * deviation
         ax.add_patch(Ellipse(seen.u[i, 0].numpy(), *size, fill=False, ec="yellow", lw=2, label="closeup, 95 %"))
-        ax.plot(*kept.u[i, 0].numpy(), "o", ms=7, color=COLOURS["ours"], label="believed")
+        ax.plot(*kept.u[i, 0].numpy(), "o", ms=7, color=COLOURS["ours"], label="corrected")
     axes[1, 0].legend(loc="lower left")
     return fig
 

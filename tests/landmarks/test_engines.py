@@ -17,9 +17,10 @@ from lib.landmarks.export import PARITY_CONFIDENCE, PARITY_PX, export, export_sh
 from lib.landmarks.images import as_tensor
 from lib.landmarks.network import HourglassConfig, OffsetConfig, OffsetNetwork, StackedHourglass
 from lib.recordings import Recording
+from lib.training.command import main as training_main
+from lib.training.config import PRESETS
 from lib.training.evaluation import evaluate_recording
-from lib.training.loop import PRESETS, train
-from lib.training.loop import main as training_main
+from lib.training.loop import train
 
 needs_openvino = pytest.mark.skipif(not importlib.util.find_spec("openvino"), reason="OpenVINO is not installed here")
 needs_shipped = pytest.mark.skipif(

@@ -8,12 +8,11 @@ import torch
 
 from lib import paths
 from lib.landmarks import Detector
-from lib.landmarks.error_model import ErrorModel
 from lib.landmarks.network import HourglassConfig, StackedHourglass
+from lib.training import stages
 from lib.training.assembly import card
 from lib.training.command import main, main_evaluate
 from lib.training.loop import load_training
-from lib.training.stages import finetune
 from tests.toys import toy_images
 
 
@@ -41,27 +40,27 @@ def test_the_card_beside_the_shipped_weights_is_theirs():
     assert card(Detector.load(), path) == path.with_name("README.md").read_text(encoding="utf-8")
 
 
-def test_stages_are_fine_tuned_on_labelled_frames(tmp_path):
-    """All stages of a small detector learn, one step each, and resume; images without a labelled base are left out."""
+def test_stages_are_fine_tuned_on_labelled_frames(tmp_path, monkeypatch):
+    """Every stage of a small detector learns, one step each, and resumes; images without a labelled base are left out."""
     torch.manual_seed(0)
-    images = toy_images(24, size=(540, 960))
+    images = toy_images(8, size=(540, 960))
     images[0] = images[0]._replace(u=np.full((3, 2), np.nan))
     hourglass = StackedHourglass(HourglassConfig(4, 1, 2))
-    detector = Detector(
-        hourglass, reduction=8, tool_network=hourglass, window_network=hourglass,
-        error_models={name: ErrorModel(logit=(9.0, 0.0, 0.0, 0.0)) for name in ("frame", "tool", "window")},
-    )  # fmt: skip
+    detector = Detector(hourglass, reduction=8, tool_network=hourglass, window_network=hourglass)
+    fitted_on = []
+    monkeypatch.setattr(stages, "fit_error_models", lambda d, held_out, progress: fitted_on.append(held_out) or d)
     options = {"steps": 1, "progress": False}
-    tuned = finetune(detector, images[:6], images[6:], tmp_path, **options)
-    assert set(tuned.error_models) == {"frame", "tool", "window"}
+    tuned = stages.finetune(detector, images[:6], images[6:], tmp_path, **options)
     for stage, network in tuned.networks.items():
-        log = load_training(tmp_path / stage / "last.safetensors")
-        assert log.provenance["steps"] == 1 and log.provenance["images"] == (15 if stage == "window" else 5)
+        provenance = load_training(tmp_path / stage / "last.safetensors").provenance
+        assert provenance["steps"] == 1 and provenance["images"] == (15 if stage == "window" else 5)
         assert any((a != b).any() for a, b in zip(network.parameters(), hourglass.parameters(), strict=True))
-    again = finetune(detector, images[:6], images[6:], tmp_path, **options)
-    assert again.error_models == tuned.error_models
+    again = stages.finetune(detector, images[:6], images[6:], tmp_path, **options)
+    for a, b in zip(again.window_network.parameters(), tuned.window_network.parameters(), strict=True):
+        assert torch.equal(a, b)
+    assert [len(held_out) for held_out in fitted_on] == [2, 2]
     with pytest.raises(ValueError, match="none has a labelled base and tip"):
-        finetune(detector, images[:1], images[6:], tmp_path / "none", **options)
+        stages.finetune(detector, images[:1], images[6:], tmp_path / "none", **options)
 
 
 def test_fine_tuning_needs_recordings_and_a_file(capsys):

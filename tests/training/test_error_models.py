@@ -37,7 +37,7 @@ def test_calibration_makes_covariances_and_confidence_true(small):
     assert 75 < result.scores.coverage_95 <= 100
     before = evaluate(detector, frames[20:])
     labelled = ~np.isnan(result.error_px)
-    error = [metrics.error_models_error(r.landmarks.confidence[labelled], r.correct[labelled]) for r in (before, result)]
+    error = [metrics.calibration_error(r.landmarks.confidence[labelled], r.correct[labelled]) for r in (before, result)]
     assert error[1] <= max(error[0], 0.25)
 
 
@@ -62,7 +62,7 @@ def test_fitted_variance_of_known_errors():
     for own in (landmark == 0, landmark > 0):
         assert squared[own].mean(0) == pytest.approx([1, 1], abs=0.05)
     confidence = 1 / (1 + np.exp(-features[:, 2] @ np.array(fit.logit)))
-    assert metrics.error_models_error(confidence, correct) < 0.05
+    assert metrics.calibration_error(confidence, correct) < 0.05
 
 
 def test_closeups_that_know_nothing_do_no_harm(small, monkeypatch):
@@ -74,6 +74,7 @@ def test_closeups_that_know_nothing_do_no_harm(small, monkeypatch):
     closeup = OffsetNetwork(OffsetConfig(4, 32)).eval()
     torch.nn.init.normal_(closeup.head[-1].weight, std=0.5)
     full = replace(detector, window_network=detector.frame_network, window_px=64, closeup_network=closeup)
+    frames = frames[:14]
     once = fit_error_models(full, frames)
     assert set(once.error_models) == {"frame", "window", "closeup", "tracking"}
     gain = np.array(once.error_models["closeup"].gain)

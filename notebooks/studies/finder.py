@@ -1,8 +1,7 @@
-"""Real frames without kinematics: the shipped finder fine-tuned on half a sequence, and the simulated one as it is.
+"""Real frames without kinematics (Retinal Microsurgery): the finder fine-tuned on half a sequence, and the shipped detector.
 
-The finder (the detector's first stage) sees the real frames at full resolution, where the tool is as long as in its
-simulated frames: 20 to 45 px.  Half of what it is fine-tuned on stays simulated, so that it does not forget tools, poses and
-eyes that half a sequence does not show.
+The finder is the detector's first stage.  It sees the real frames at full resolution, where the tool is as long as in its
+simulated frames: 20 to 45 px.  Notebook 02 trains it for a moment, ``studies/real_frames`` for longer.
 """
 
 from __future__ import annotations
@@ -20,13 +19,14 @@ from lib.landmarks.error_model import ErrorModel
 from lib.landmarks.metrics import pck, tool_length_px
 from lib.recordings import MonocularSequence
 from lib.training.augmentation import Augmentation
+from lib.training.config import PRESETS, TrainingConfig
 from lib.training.evaluation import Evaluation, evaluate
-from lib.training.loop import PRESETS, Samples, Training, TrainingConfig, train
-from lib.training.samples import REDUCTION
+from lib.training.loop import Training, train
+from lib.training.samples import LabelledImage, Mixed, Samples
+from lib.training.shards import REDUCTION
 
 __all__ = [
     "Crops",
-    "Mixed",
     "evaluate_on_sequence",
     "finder_alone",
     "label_repeatability",
@@ -80,26 +80,6 @@ class Crops:
         return f"{self.samples.fingerprint} {self.size}"
 
 
-@dataclass(frozen=True)
-class Mixed:
-    """Real crops, and simulated ones in `share` of the draws."""
-
-    real: Crops
-    simulated: Crops
-    share: float = 0.5
-
-    def __len__(self) -> int:
-        return len(self.real) + len(self.simulated)
-
-    def draw(self, index: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        part = self.simulated if rng.random() < self.share else self.real
-        return part.draw(index % len(part), rng)
-
-    @property
-    def fingerprint(self) -> str:
-        return f"{self.real.fingerprint} {self.simulated.fingerprint} {self.share}"
-
-
 def real_config(steps: int, *, batch: int = 12, seed: int = 0) -> TrainingConfig:
     """How the finder is fine-tuned."""
     return replace(
@@ -147,7 +127,7 @@ def train_on_first_half(
         Keeps checkpoints, from which the same call goes on.
     """
     real = Crops(real_samples(sequence, 0, len(sequence) // 2))
-    # What "validates" are crops of training frames: they only fill the log, nothing is chosen by them.
+    # These are crops of training frames.  They only fill the log; nothing is chosen by them.
     few = Samples.drawn(Crops(_every(real.samples, 1 + len(real) // 25)))
     initial = Training(detector.frame_network, [], {"shipped": detector.metadata.get("commit")})
     config = replace(config, network=detector.frame_network.config)
@@ -180,10 +160,10 @@ def evaluate_on_sequence(
 
 
 def label_repeatability(sequence: MonocularSequence, threshold: float = 0.2) -> float:
-    """Percentage of the second half's clicks that clicks themselves hit: what a PCK of such labels can be.
+    """PCK in percent that a detector without error would reach on the second half, since clicks jitter.
 
     Each click is compared with the mean of those one frame before and after.  If all err alike that difference has 3/2 of
-    one click's variance, and is divided by the root of that; what the tool moves otherwise than evenly adds to it.
+    one click's variance, and is divided by the root of that.  Uneven motion of the tool adds to it.
     """
     middle = len(sequence) // 2
     u, number = sequence.u[middle:], np.asarray(sequence.frame_numbers)[middle:]
@@ -203,8 +183,8 @@ def simulated_to_real(
     detector = replace(detector, error_models={stage: _always(fit) for stage, fit in detector.error_models.items()})
     size = tuple(round(zoom * s) for s in sequence.image_size_px)
     frames = (
-        (name, cv2.resize(image, size, interpolation=cv2.INTER_CUBIC), image_from_cell(u, zoom), visibility)
-        for name, image, u, visibility in _frames(sequence, 0, every)
+        part._replace(image=cv2.resize(part.image, size, interpolation=cv2.INTER_CUBIC), u=image_from_cell(part.u, zoom))
+        for part in _frames(sequence, 0, every)
     )
     found = evaluate(detector, frames)
     landmarks = replace(
@@ -229,11 +209,9 @@ def _visibility(u: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(u).all(axis=-1), 2, 0)
 
 
-def _frames(
-    sequence: MonocularSequence, first: int, every: int
-) -> Iterator[tuple[str, np.ndarray, np.ndarray, np.ndarray]]:
+def _frames(sequence: MonocularSequence, first: int, every: int) -> Iterator[LabelledImage]:
     u = sequence.u
     for i in range(first, len(sequence), every):
         if np.isfinite(u[i]).any():
             name = f"{sequence.name} {sequence.frame_numbers[i]}"
-            yield name, sequence.image(i), u[i], _visibility(u[i])
+            yield LabelledImage(name, sequence.image(i), u[i], _visibility(u[i]))

@@ -1,0 +1,268 @@
+"""Figures of notebook 02 drawn from recorded tables (``data/results``): the studies of the detector."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from types import SimpleNamespace
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+
+from lib.correspondences import LANDMARKS
+from lib.workbench.results import Table
+from notebooks.figures.style import COLOURS, figure
+
+__all__ = [
+    "ablation_bars",
+    "curve",
+    "depth_groups",
+    "engine_bars",
+    "few_labels_curves",
+    "label_noise_cost",
+    "label_noise_pairs",
+    "mean_and_error",
+    "recorded",
+    "resolution_curves",
+    "shipped_curve",
+    "shipped_table",
+    "speed_rows",
+    "verdicts",
+    "visibility_bars",
+]
+
+#: PCK@0.05 in percent of the five networks in the paper.
+PAPER_ABLATION = {"encoder": 8.4, "+ decoder": 75.1, "+ skips": 95.2, "+ stack": 99.6, "+ residual": 99.7}
+
+
+def recorded(table: Table) -> str:
+    """ "Recorded", and when: the beginning of a caption."""
+    return f"Recorded {table.provenance.get('date', 'at an unknown date')}"
+
+
+def mean_and_error(values: Sequence[float]) -> tuple[float, float]:
+    """Mean over seeds and its standard error, NaN for one seed.
+
+    >>> mean_and_error([1.0, 3.0])
+    (2.0, 1.0)
+    """
+    v = np.asarray(values, dtype=float)
+    return float(v.mean()), float(v.std(ddof=1) / np.sqrt(len(v))) if len(v) > 1 else np.nan
+
+
+def groups(table: Table, column: str) -> dict[object, Table]:
+    """The rows of each value of a column, in their order."""
+    return {value: table.where(**{column: value}) for value in dict.fromkeys(row[column] for row in table.rows)}
+
+
+def verdicts(table: Table, column: str, metric: str) -> dict[str, str]:
+    """Each value of a column against the one before: "better", "worse", or "tie" below two standard errors."""
+    means = {name: mean_and_error(rows.columns[metric]) for name, rows in groups(table, column).items()}
+    result = {}
+    for (before, (a, error_a)), (name, (b, error_b)) in pairwise(means.items()):
+        error = np.hypot(error_a, error_b)
+        tie = "tie" if abs(b - a) < 2 * error else "better" if b > a else "worse"
+        result[f"{before} -> {name}"] = tie if np.isfinite(error) else "one seed: no statement"
+    return result
+
+
+def curve(table: Table) -> tuple[np.ndarray, np.ndarray]:
+    """Thresholds and PCK in percent, the mean over the rows."""
+    found = {float(m[1]): m[0] for m in (re.fullmatch(r"pck_([\d.]+)_percent", name) for name in table.columns) if m}
+    thresholds = np.array(sorted(found))
+    return thresholds, np.array([np.mean(table.columns[found[t]]) for t in thresholds])
+
+
+def ablation_bars(table: Table) -> Figure:
+    """PCK@0.05 of the five networks: a dot a seed, a bar for the mean, and the paper's value."""
+    fig, ax = figure(width_in=8, height_in=3.2)
+    for i, (name, rows) in enumerate(groups(table, "network").items()):
+        values = rows.columns["pck_0.05_percent"]
+        first = i == 0
+        ax.bar(i, values.mean(), 0.55, color=COLOURS["ours"], alpha=0.4, label="mean" if first else None)
+        ax.text(i, values.mean() / 2, f"{values.mean():.1f}", ha="center", fontsize=13, weight="bold")
+        ax.plot(np.full(len(values), i), values, "o", color=COLOURS["ours"], ms=5, label="one seed" if first else None)
+        ax.plot(i, PAPER_ABLATION[name], "D", color=COLOURS["paper"], ms=7, label="paper, 1080p" if first else None)
+    ax.set_xticks(range(len(groups(table, "network"))), list(groups(table, "network")))
+    ax.set(ylabel="PCK@0.05, %", ylim=(0, 105), title="Ablation")
+    ax.legend(loc="upper left")
+    return fig
+
+
+def resolution_curves(table: Table) -> Figure:
+    """PCK against the threshold at the paper's four resolutions."""
+    fig, ax = figure(width_in=8, height_in=3.6)
+    colours = [COLOURS["ours"], COLOURS["truth"], COLOURS["right"], COLOURS["warning"]]
+    for (name, rows), colour in zip(groups(table, "resolution").items(), colours, strict=False):
+        thresholds, pck = curve(rows)
+        ax.plot(100 * thresholds, pck, color=colour, marker="o", ms=3, label=name)
+    ax.set(xscale="log", ylim=(0, 101), xlabel="threshold, % of the tool's length", ylabel="PCK, %", title="Resolution")
+    ticks = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20)
+    ax.set_xticks(ticks, [f"{t:g}" for t in ticks])
+    ax.minorticks_off()
+    ax.legend(loc="upper left")
+    return fig
+
+
+def few_labels_curves(table: Table) -> Figure:
+    """PCK@0.05 against the number of labelled frames: means with two standard errors."""
+    fig, ax = figure(width_in=8, height_in=3.8)
+    trained = Table([row for row in table.rows if row["frames"]])
+    labels = {"shipped": "fine-tuned from the shipped weights", "scratch": "from scratch"}
+    for (start, rows), colour in zip(groups(trained, "start").items(), (COLOURS["ours"], COLOURS["paper"]), strict=True):
+        by_frames = {n: mean_and_error(part.columns["pck_0.05_percent"]) for n, part in groups(rows, "frames").items()}
+        mean, error = np.array(list(by_frames.values())).T
+        bars = 2 * np.nan_to_num(error)
+        ax.errorbar(list(by_frames), mean, yerr=bars, color=colour, marker="o", ms=6, capsize=4, label=labels[start])
+    for row in table.where(frames=0).rows:
+        ax.axhline(row["pck_0.05_percent"], color=COLOURS["baseline"], ls="--", label="shipped weights as they are")
+    ax.set(xscale="log", ylim=(0, 101), xlabel="labelled frames", ylabel="PCK@0.05, %", title="How many labels?")
+    counts = sorted(set(trained.columns["frames"].tolist()))
+    ax.set_xticks(counts, [f"{count:g}" for count in counts])
+    ax.minorticks_off()
+    ax.legend(title="bars: two standard errors")
+    return fig
+
+
+def label_noise_cost(table: Table) -> tuple[float, float]:
+    """Mean and standard error over the seeds of what noisy labels add to the median error, px."""
+    exact, noisy = (
+        {row["seed"]: row["median_px"] for row in table.rows if bool(row["noise_px"]) == is_noisy}
+        for is_noisy in (False, True)
+    )
+    return mean_and_error([noisy[seed] - exact[seed] for seed in exact])
+
+
+def label_noise_pairs(table: Table) -> Figure:
+    """Median error of networks trained with exact and with noisy labels; a line joins those of one seed."""
+    fig, ax = figure(width_in=5.5, height_in=3.4)
+    medians = np.array([rows.columns["median_px"] for rows in groups(table, "noise_px").values()])
+    ax.plot([0, 1], medians, "o-", color=COLOURS["ours"], ms=7)
+    ax.set_xticks([0, 1], ["exact labels", "noisy labels"])
+    mean, error = label_noise_cost(table)
+    cost = f"{mean:+.3f}" + (f" ± {error:.3f}" if np.isfinite(error) else " (one seed)")
+    ax.set(xlim=(-0.4, 1.4), ylabel="median error, px", title=f"Cost of label noise: {cost} px")
+    ax.set_ylim(0, 1.25 * medians.max())
+    return fig
+
+
+def _text_table(header: Sequence[str], rows: Sequence[Sequence[str]], *, width_in: float, first: float) -> Figure:
+    """Rows of text under a bold header; the first column, `first` of the width, is left-aligned."""
+    fig, ax = figure(width_in=width_in, height_in=0.34 * (len(rows) + 1))
+    ax.axis("off")
+    rest = (1 - first) / (len(header) - 1)
+    drawn = ax.table(
+        [list(row) for row in rows], colLabels=list(header), edges="horizontal", cellLoc="center",
+        colWidths=[first] + [rest] * (len(header) - 1), bbox=(0, 0, 1, 1),
+    )  # fmt: skip
+    drawn.auto_set_font_size(False)
+    drawn.set_fontsize(12)
+    for (row, column), cell in drawn.get_celld().items():
+        cell.set_edgecolor(COLOURS["baseline"])
+        if row == 0:
+            cell.set_text_props(weight="bold")
+        if column == 0:
+            cell.set_text_props(ha="left")
+    return fig
+
+
+def shipped_curve(table: Table) -> Figure:
+    """PCK of the shipped detector on the test sequences, whole frames and tracking; right, the top enlarged."""
+    fig, axes = figure(1, 2, width_in=11, height_in=3.8)
+    everything = table.where(recording="all")
+    thresholds, pck = curve(everything.where(mode="whole frames"))
+    (tracking,) = everything.where(mode="tracking").rows
+    at = np.array([0.01, 0.05, 0.10])
+    for ax, lowest in zip(axes, (0.0, 95.0), strict=True):
+        ax.plot(thresholds, pck, "o-", color=COLOURS["ours"], ms=4, label="whole frames")
+        values = [tracking[f"pck_{t:.3f}_percent"] for t in at]
+        ax.plot(at, values, "s", color=COLOURS["right"], ms=8, mfc="none", mew=2, label="tracking")
+        first = thresholds[0] if lowest == 0 else 0.0075
+        ax.set(xscale="log", xlim=(first, 1.05 * thresholds[-1]), ylim=(lowest, 100 + (100 - lowest) / 50))
+        ticks = [t for t in (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2) if first <= t <= thresholds[-1]]
+        ax.set_xticks(ticks, [f"{t:g}" for t in ticks])
+        ax.minorticks_off()
+        ax.set(xlabel="threshold, fraction of the tool's length", ylabel="PCK, %")
+    axes[0].set_title("Correct landmarks")
+    axes[1].set_title("The top of it, enlarged")
+    axes[0].legend(loc="lower right")
+    return fig
+
+
+def shipped_table(table: Table) -> Figure:
+    """Scores of the shipped detector: all whole frames, tracking, by landmark, by sequence."""
+    everything = {row["mode"]: row for row in table.where(recording="all").rows}
+    rows = {f"all, {mode}": row for mode, row in everything.items()}
+    whole = everything["whole frames"]
+    rows |= {k: {n.removeprefix(f"{k}_"): v for n, v in whole.items() if n.startswith(f"{k}_")} for k in LANDMARKS}
+    rows |= {row["recording"]: row for row in table.where(mode="whole frames").rows if row["recording"] != "all"}
+    columns = {
+        "median, px": ("median_px", ".2f"),
+        "95 %, px": ("p95_px", ".2f"),
+        "PCK@0.01": ("pck_0.010_percent", ".1f"),
+        "PCK@0.05": ("pck_0.050_percent", ".1f"),
+        "NEES (2)": ("nees", ".2f"),
+        "in 95 % ellipse": ("coverage_95_percent", ".1f"),
+    }
+    cells = [[name, *(format(row[key], form) for key, form in columns.values())] for name, row in rows.items()]
+    return _text_table(["", *columns], cells, width_in=11.5, first=0.24)
+
+
+def depth_groups(table: Table) -> dict[str, dict[str, SimpleNamespace]]:
+    """Scores of bases and tips by their distance from focus, for `landmarks.error_groups`."""
+    (row,) = table.where(recording="all", mode="whole frames").rows
+    result: dict[str, dict[str, SimpleNamespace]] = {}
+    for name in row:
+        found = re.fullmatch(r"(base|tips)_([\d.]+)_to_([\d.]+)_mm_median_px", name)
+        if found and np.isfinite(row[name]):
+            stem = name.removesuffix("_median_px")
+            scores = SimpleNamespace(**{key: row[f"{stem}_{key}"] for key in ("median_px", "p95_px", "labels")})
+            scores.labels = int(scores.labels)
+            result.setdefault(f"{found[1]}, by distance from focus", {})[f"{found[2]} to {found[3]} mm"] = scores
+    return result
+
+
+def visibility_bars(rows: Mapping[str, Mapping[str, float]]) -> Figure:
+    """Precision and recall of detections (`Evaluation.detection`) in two kinds of frames."""
+    fig, ax = figure(width_in=9, height_in=3.2)
+    names = [f"{there}_{what}" for there in ("in_view", "visible") for what in ("precision", "recall")]
+    for i, ((label, row), colour) in enumerate(zip(rows.items(), (COLOURS["ours"], COLOURS["right"]), strict=True)):
+        values = [row[name] for name in names]
+        x = np.arange(len(names)) + 0.4 * i - 0.2
+        ax.bar(x, values, 0.36, color=colour, alpha=0.7, label=label)
+        for at, value in zip(x, values, strict=True):
+            ax.text(at, value / 2, f"{value:.2f}", ha="center", va="center", fontsize=11, weight="bold")
+    ax.set_xticks(range(len(names)), [name.replace("in_view_", "in view\n").replace("visible_", "visible\n") for name in names])
+    ax.set(ylabel="%", ylim=(0, 119), title="Precision and recall, confidence above 0.5")
+    ax.legend(loc="upper right", ncols=2)
+    return fig
+
+
+def engine_bars(table: Table) -> Figure:
+    """Milliseconds of the window stage (six windows, one thread) on each engine: wall and CPU time."""
+    rows = table.where(network="window stage", images=2, threads=1).rows
+    fig, ax = figure(width_in=9, height_in=0.42 * len(rows) + 1.1)
+    for i, row in enumerate(rows):
+        for at, key, colour in ((i - 0.19, "cpu_ms", COLOURS["ours"]), (i + 0.19, "call_ms", COLOURS["baseline"])):
+            ax.barh(at, row[key], 0.36, color=colour)
+            ax.text(row[key], at, f" {row[key]:.0f}", va="center")
+    ax.set_yticks(range(len(rows)), [row["engine"] for row in rows])
+    ax.set_ylim(len(rows) - 0.4, -0.6)
+    ax.margins(x=0.1)
+    handles = [Patch(color=COLOURS["ours"], label="CPU time"), Patch(color=COLOURS["baseline"], label="wall time")]
+    ax.legend(handles=handles, loc="lower right")
+    ax.set(xlabel="ms", title="Six windows of a stereo pair")
+    return fig
+
+
+def speed_rows(table: Table, threads: int = 2) -> dict[str, dict[str, float]]:
+    """Milliseconds of a stereo pair by engine and precision: the full-HD networks that were timed in it."""
+    pairs = [row for row in table.rows if (row["images"], row["threads"], row["size"]) == (2, threads, "1920x1080")]
+    pairs = [row for row in pairs if row["network"] != "window stage" and np.isfinite(row["call_ms"])]
+    names = {"paper": "paper's network", "coarse to fine": "coarse to fine", "tracking": "the same while tracking"}
+    found: dict[str, dict[str, float]] = {}
+    for row in pairs:
+        found.setdefault(row["engine"], {})[names[row["network"]]] = row["call_ms"]
+    return found
