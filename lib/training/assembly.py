@@ -32,7 +32,7 @@ def assemble(
     recordings: Sequence[str | Path] = (),
     notes: Sequence[str] = (),
 ) -> Detector:
-    """Join ``frame/``, ``tool/``, ``window/`` and ``closeup/`` of a training folder, fit error models, write `out` and its card.
+    """Join the stages of a training folder, fit their error models, write the weights file `out` and its card.
 
     The numbers on the card are of error models fitted on half of the validation frames, measured on the other half; then
     all of them fit the file's own.
@@ -137,7 +137,8 @@ def card(detector: Detector, path: Path) -> str:
 # {path.name}
 
 Weights of the landmark detector: base, tip_1 and tip_2 of the forceps in microscope images. Trained on {p["trained_on"]}.
-{path.stat().st_size / 1e6:.1f} MB, safetensors; configuration, error models and the numbers below are inside. Notebook 02 explains the stages.
+{path.stat().st_size / 1e6:.1f} MB, safetensors; configuration, error models and the numbers below are inside.
+Notebook 02 explains the stages.
 
 | stage | images | optimiser | steps x batch x processes | position loss, per px | hours x processes | data | commit |
 |---|---|---|---|---|---|---|---|

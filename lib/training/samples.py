@@ -134,7 +134,7 @@ class Samples:
 
 @dataclass(frozen=True)
 class Mixed:
-    """Images of one source, and of a second one in `share` of the draws: a network that learns new images and keeps the old."""
+    """Images of one source, and of another in `share` of the draws, so that a network does not forget the latter."""
 
     own: Source
     other: Source

@@ -19,7 +19,7 @@ from lib.landmarks.windows import (
     tool_centre,
     window_from_image,
 )
-from lib.simulator.render import motion_kernel
+from lib.simulator.optics import motion_kernel
 from lib.training.shards import BLOCK_PX, STORED_REDUCTION, read_shards
 
 __all__ = ["TOOL", "TOOL_REDUCTION", "CloseupSource", "WindowSource"]
@@ -107,7 +107,7 @@ class WindowSource(_Cut):
 
 @dataclass(frozen=True)
 class CloseupSource(_Cut):
-    """Closeups of visible landmarks, displaced as windows or the frame before may place them, of tools more or less stretched.
+    """Closeups of visible landmarks, displaced as windows or the frame before may place them, of stretched tools.
 
     Stretching and shearing an image keeps its labels true and makes many tools of one.
 

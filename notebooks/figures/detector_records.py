@@ -234,7 +234,8 @@ def visibility_bars(rows: Mapping[str, Mapping[str, float]]) -> Figure:
         ax.bar(x, values, 0.36, color=colour, alpha=0.7, label=label)
         for at, value in zip(x, values, strict=True):
             ax.text(at, value / 2, f"{value:.2f}", ha="center", va="center", fontsize=11, weight="bold")
-    ax.set_xticks(range(len(names)), [name.replace("in_view_", "in view\n").replace("visible_", "visible\n") for name in names])
+    labels = [name.replace("in_view_", "in view\n").replace("visible_", "visible\n") for name in names]
+    ax.set_xticks(range(len(names)), labels)
     ax.set(ylabel="%", ylim=(0, 119), title="Precision and recall, confidence above 0.5")
     ax.legend(loc="upper right", ncols=2)
     return fig

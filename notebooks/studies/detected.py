@@ -353,7 +353,7 @@ def resolution_study(
     Parameters
     ----------
     folder:
-        Checkpoints of `notebooks.studies.resolution`; None = where its study keeps them.  What is not trained is left out.
+        Checkpoints of `notebooks.studies.reduced`; None = where its study keeps them.  What is not trained is left out.
     seeds:
         Sweeps, each calibrated by itself.
 
@@ -364,7 +364,7 @@ def resolution_study(
     rows: triangulation_um of the detected landmarks, calibration_um (exact pixels triangulated) and projection_px, as in
     `Judgement`.
     """
-    from notebooks.studies.resolution import RESOLUTIONS, load_resolution
+    from notebooks.studies.reduced import RESOLUTIONS, load_resolution
 
     root = Path(folder) if folder is not None else paths.CACHE / "studies" / "resolution"
     found: dict[str, list[dict[str, float]]] = {"labels": []}

@@ -7,9 +7,12 @@ import numpy as np
 import pytest
 import torch
 
+from lib.correspondences import LANDMARKS
 from lib.landmarks.heatmaps import Peaks
+from lib.workbench import results
+from lib.workbench.results import Table
+from notebooks.figures import detector_records as records
 from notebooks.figures import landmarks as plots
-from notebooks.studies.detector_studies import CURVE, summary
 
 
 @pytest.fixture(autouse=True)
@@ -23,82 +26,110 @@ def texts(figure):
     return [text.get_text() for text in figure.findobj(plt.Text)]
 
 
-def scores(separator="."):
-    return {
-        f"pck_0{separator}01": 91.23, f"pck_0{separator}05": 98.76, f"pck_0{separator}10": 99.0, "median_px": 0.456,
-        "p95_px": 2.34, "nees": 1.98, "coverage_95": 94.4, "missed": 3, "labels": 60,
+def scores(**changes):
+    own = {
+        "pck_0.010_percent": 91.23, "pck_0.050_percent": 98.76, "pck_0.100_percent": 99.0, "median_px": 0.456,
+        "p95_px": 2.34, "nees": 1.98, "coverage_95_percent": 94.4,
     }  # fmt: skip
+    return own | changes
 
 
 @pytest.fixture
 def shipped():
-    seen = {f"{a}_{b}": 97.25 for a in ("in_view", "visible") for b in ("precision", "recall")}
-    return {
-        "whole_frames": scores() | seen,
-        "tracking": scores() | seen | {"median_px": 0.512},
-        "by_landmark": {name: scores("_") for name in ("base", "tip_1", "tip_2")},
-        "by_sequence": {"test_07": scores(), "test_08": scores()},
-        "thresholds": list(CURVE),
-        "curve": np.linspace(10, 100, len(CURVE)).tolist(),
-    }
+    whole = scores() | {f"{name}_{key}": value for name in LANDMARKS for key, value in scores().items()}
+    whole |= {"tips_0.5_to_1_mm_median_px": 0.3, "tips_0.5_to_1_mm_p95_px": 0.9, "tips_0.5_to_1_mm_labels": 12}
+    rows = [whole | {"recording": "all", "mode": "whole frames"}]
+    rows += [scores(median_px=0.512) | {"recording": "all", "mode": "tracking"}]
+    rows += [scores() | {"recording": name, "mode": "whole frames"} for name in ("test_07", "test_08")]
+    return Table(rows)
 
 
 def test_the_shipped_table_has_a_row_for_each_landmark_and_sequence(shipped):
-    cells = plots.shipped_table(shipped).axes[0].tables[0].get_celld()
+    cells = records.shipped_table(shipped).axes[0].tables[0].get_celld()
     rows = max(row for row, _ in cells)
-    assert rows == 2 + 3 + 2
     names = [cells[row, 0].get_text().get_text() for row in range(1, rows + 1)]
     assert names == ["all, whole frames", "all, tracking", "base", "tip_1", "tip_2", "test_07", "test_08"]
-    for row in range(1, rows + 1):  # both spellings of the keys: those of scores and those of studies
-        values = [cells[row, column].get_text().get_text() for column in range(1, 8)]
-        assert values == ["0.51" if row == 2 else "0.46", "2.34", "91.2", "98.8", "1.98", "94.4", "3/60"]
+    for row in range(1, rows + 1):
+        values = [cells[row, column].get_text().get_text() for column in range(1, 7)]
+        assert values == ["0.51" if row == 2 else "0.46", "2.34", "91.2", "98.8", "1.98", "94.4"]
 
 
 def test_the_shipped_curve_shows_tracking_beside_whole_frames(shipped):
-    full, top = plots.shipped_curve(shipped).axes
+    full, top = records.shipped_curve(shipped).axes
     for ax in (full, top):
         lines = {line.get_label(): line for line in ax.lines}
-        np.testing.assert_allclose(lines["whole frames"].get_ydata(), shipped["curve"])
+        np.testing.assert_allclose(lines["whole frames"].get_xydata(), [[0.01, 91.23], [0.05, 98.76], [0.1, 99.0]])
         np.testing.assert_allclose(lines["tracking"].get_xydata(), [[0.01, 91.23], [0.05, 98.76], [0.1, 99.0]])
     assert full.get_ylim()[0] == 0 and top.get_ylim()[0] > 90
 
 
-def test_precision_and_recall_of_visibility(shipped):
-    rows = {"easy": shipped["whole_frames"], "hard": shipped["tracking"]}
-    assert texts(plots.visibility_bars(rows)).count("97.25") == 8
+def test_scores_are_grouped_by_distance_from_focus(shipped):
+    (group,) = records.depth_groups(shipped).values()
+    assert {name: (s.median_px, s.p95_px, s.labels) for name, s in group.items()} == {"0.5 to 1 mm": (0.3, 0.9, 12)}
+
+
+def test_precision_and_recall_of_visibility():
+    row = {f"{a}_{b}": 97.25 for a in ("in_view", "visible") for b in ("precision", "recall")}
+    assert texts(records.visibility_bars({"easy": row, "hard": row})).count("97.25") == 8
 
 
 def test_few_labels_are_two_curves_with_error_bars():
-    def row(*values):
-        return {"pck_0.05": summary(values)}
-
-    result = {
-        "frames": {
-            "fine-tuned": {"10": row(90, 92, 94), "100": row(95, 95, 95)},
-            "from scratch": {"10": row(20.0), "100": row(60.0)},  # one seed has no standard error
-        },
-        "no_label": {"pck_0.05": 88.0},
-    }
-    ax = plots.few_labels_curves(result).axes[0]
-    assert [bars.get_label() for bars in ax.containers] == ["fine-tuned", "from scratch"]
+    rows = [{"start": "shipped", "frames": 0, "pck_0.05_percent": 88.0}]
+    for start, frames, values in (("shipped", 10, (90, 92, 94)), ("shipped", 100, (95, 95, 95)), ("scratch", 10, (20,))):
+        rows += [{"start": start, "frames": frames, "pck_0.05_percent": value} for value in values]
+    ax = records.few_labels_curves(Table(rows)).axes[0]
+    assert [bars.get_label() for bars in ax.containers] == ["fine-tuned from the shipped weights", "from scratch"]
     tuned, scratch = (bars.lines for bars in ax.containers)
     np.testing.assert_allclose(tuned[0].get_xydata(), [[10, 92], [100, 95]])
     segment = tuned[2][0].get_segments()[0]
     np.testing.assert_allclose(segment[:, 1], 92 + 2 * 2 / np.sqrt(3) * np.array([-1, 1]))
-    np.testing.assert_allclose(scratch[0].get_ydata(), [20, 60])
+    np.testing.assert_allclose(scratch[0].get_ydata(), [20])  # one seed has no standard error
 
 
-def test_the_cost_of_label_noise_is_stated_with_its_standard_error():
-    exact, noisy = [0.7, 0.8, 0.75], [0.8, 0.9, 0.85]
-    result = {
-        "labels": {"exact": {"median_px": summary(exact)}, "noisy": {"median_px": summary(noisy)}},
-        "median_cost_px": summary([0.1, 0.12, 0.08]),
-    }
-    ax = plots.label_noise_pairs(result).axes[0]
+def test_the_cost_of_label_noise_is_that_of_pairs_of_a_seed():
+    medians = {0.0: [0.7, 0.8, 0.75], 1.0: [0.8, 0.92, 0.83]}
+    rows = [
+        {"noise_px": noise, "seed": seed, "median_px": median}
+        for noise, values in medians.items()
+        for seed, median in enumerate(values)
+    ]
+    assert records.label_noise_cost(Table(rows)) == pytest.approx((0.1, 0.02 / np.sqrt(3)))
+    ax = records.label_noise_pairs(Table(rows)).axes[0]
     assert "+0.100 ± 0.012 px" in ax.get_title(loc="left")
-    np.testing.assert_allclose([line.get_ydata() for line in ax.lines], np.transpose([exact, noisy]))
-    result["median_cost_px"] = {"mean": -0.1, "standard_error": None, "per_seed": [-0.1]}
-    assert "-0.100 (one seed) px" in plots.label_noise_pairs(result).axes[0].get_title(loc="left")
+    np.testing.assert_allclose([line.get_ydata() for line in ax.lines], np.transpose(list(medians.values())))
+    single = Table([row for row in rows if row["seed"] == 0])
+    assert "+0.100 (one seed) px" in records.label_noise_pairs(single).axes[0].get_title(loc="left")
+
+
+def test_differences_below_two_standard_errors_are_ties():
+    values = {"a": [10, 12, 14], "b": [13, 15, 14], "c": [90, 91, 92], "d": [50, 51, 49]}
+    table = Table([{"network": name, "pck": value} for name, own in values.items() for value in own])
+    assert records.verdicts(table, "network", "pck") == {"a -> b": "tie", "b -> c": "better", "c -> d": "worse"}
+    single = Table([{"network": name, "pck": own[0]} for name, own in values.items()])
+    assert set(records.verdicts(single, "network", "pck").values()) == {"one seed: no statement"}
+
+
+def test_speed_is_compared_in_one_engine_and_precision():
+    rows = [
+        {"network": network, "engine": engine, "size": "1920x1080", "images": 2, "threads": 2, "call_ms": ms}
+        for engine, ms in (("torch float32", 100.0), ("openvino bfloat16", np.nan))
+        for network in ("paper", "coarse to fine", "window stage")
+    ]
+    assert records.speed_rows(Table(rows)) == {"torch float32": {"paper's network": 100.0, "coarse to fine": 100.0}}
+
+
+@pytest.mark.parametrize("name", ["ablation", "resolution", "label_noise", "few_labels", "engines_and_speed"])
+def test_every_recorded_table_can_be_drawn(name):
+    table = results.read(name)
+    draw = {
+        "ablation": records.ablation_bars,
+        "resolution": records.resolution_curves,
+        "label_noise": records.label_noise_pairs,
+        "few_labels": records.few_labels_curves,
+        "engines_and_speed": records.engine_bars,
+    }[name]
+    assert draw(table).axes
+    assert records.recorded(table).startswith("Recorded 20")
 
 
 def test_real_curves_have_a_panel_for_each_kind_of_test():
@@ -123,22 +154,12 @@ def test_how_far_a_curve_is_in_words():
     assert plots.half_within(thresholds, [1, 2, 3]) == "not even half within 30 % of the tool's length"
 
 
-def test_an_engine_that_failed_says_why():
-    rows = {"torch": {"wall_ms": 20.0, "cpu_ms": 18.0}, "other": {"failed": "ImportError: no such engine"}}
-    figure = plots.engine_bars(rows)
-    assert {" 20", " 18", " ImportError: no such engine"} <= set(texts(figure))
-
-
 def test_timing_stands_beside_the_papers():
-    figure = plots.timing_bars({"small": 12.3, "large": 0.5, "ours": 70.0}, {"small": 140, "large": 35})
+    ms = {"small": 1e3 / 12.3, "large": 2e3, "ours": 1e3 / 70}
+    figure = plots.timing_bars(ms, {"small": 140, "large": 35}, title="torch float32")
     assert {" 12.3", " 0.5", " 70", "140", "35"} <= set(texts(figure))
     low, high = figure.axes[0].get_xlim()
     assert low < 0.5 and high > 140
-
-
-def test_ablation_states_its_means():
-    columns = {"encoder": {"pck_0.05": summary([50, 60])}, "+ decoder": {"pck_0.05": summary([70.0])}}
-    assert {"55.0", "70.0"} <= set(texts(plots.ablation_bars(columns, {"encoder": 8.4, "+ decoder": 75.1})))
 
 
 def test_the_loss_figure_takes_what_it_is_given():

@@ -12,9 +12,8 @@ from lib.landmarks import Detector
 from lib.landmarks.metrics import tool_length_px
 from lib.landmarks.network import HourglassConfig, StackedHourglass
 from lib.recordings import MonocularSequence, import_retinal_microsurgery
-from lib.training.loop import Samples
-from notebooks.studies import detector_studies as studies
-from notebooks.studies import real
+from lib.training.samples import Mixed, Samples
+from notebooks.studies import finder
 
 RETINAL = paths.real_data("retinal_microsurgery")
 
@@ -43,7 +42,7 @@ def side(u: np.ndarray) -> np.ndarray:
 def test_crops_keep_their_landmarks(toy):
     """Each landmark in a crop shows the same pixel as in its image."""
     samples = toy(4, size=(144, 160))
-    crops = real.Crops(samples, 64)
+    crops = finder.Crops(samples, 64)
     rng = np.random.default_rng(0)
     held = 0
     for i in [0, 1, 2, 3] * 10:
@@ -57,13 +56,13 @@ def test_crops_keep_their_landmarks(toy):
     assert held > 40
     assert Samples.drawn(crops).images.shape == (4, 64, 64, 3)
     with pytest.raises(ValueError, match="do not fit"):
-        real.Crops(samples, 200)
+        finder.Crops(samples, 200)
 
 
 def test_crops_without_labels_lie_anywhere(toy):
     samples = toy(2, size=(144, 160))
     samples.u[0] = np.nan
-    image, u, _ = real.Crops(samples, 64).draw(0, np.random.default_rng(1))
+    image, u, _ = finder.Crops(samples, 64).draw(0, np.random.default_rng(1))
     assert image.shape == (64, 64, 3) and np.isnan(u).all()
 
 
@@ -71,12 +70,12 @@ def test_half_is_simulated(toy):
     dark, bright = toy(3, size=(64, 64)), toy(5, size=(64, 64))
     dark = Samples(np.zeros_like(dark.images), dark.u, dark.visibility)
     bright = Samples(np.full_like(bright.images, 255), bright.u, bright.visibility)
-    mixed = real.Mixed(real.Crops(dark, 32), real.Crops(bright, 32))
+    mixed = Mixed(finder.Crops(dark, 32), finder.Crops(bright, 32))
     rng = np.random.default_rng(0)
     drawn = [mixed.draw(i % len(mixed), rng)[0].mean() for i in range(400)]
     assert len(mixed) == 8
     assert 0.4 < np.mean(np.array(drawn) > 0) < 0.6
-    assert mixed.fingerprint != replace(mixed, real=mixed.simulated).fingerprint
+    assert mixed.fingerprint != replace(mixed, own=mixed.other).fingerprint
 
 
 def test_only_the_first_half_is_trained_on(sequence, toy, detector, tmp_path, monkeypatch):
@@ -86,56 +85,29 @@ def test_only_the_first_half_is_trained_on(sequence, toy, detector, tmp_path, mo
     seen = []
     image = MonocularSequence.image
     monkeypatch.setattr(MonocularSequence, "image", lambda self, i: seen.append(i) or image(self, i))
-    config = real.real_config(2, batch=2)
+    config = finder.real_config(2, batch=2)
     arguments = (sequence, detector, toy(2, size=(135, 240)), config)
-    trained = real.train_on_first_half(*arguments, folder=tmp_path / "kept")
+    trained = finder.train_on_first_half(*arguments, folder=tmp_path / "kept")
     assert sorted(set(seen)) == [0, 1, 2, 3]
-    again = real.train_on_first_half(*arguments, folder=tmp_path / "kept")
+    again = finder.train_on_first_half(*arguments, folder=tmp_path / "kept")
     assert again.provenance["steps"] == trained.provenance["steps"] == 2
     assert again.provenance["seconds"] == trained.provenance["seconds"]
     assert trained.network.config == detector.frame_network.config
-    quick = real.train_on_first_half(sequence, detector, None, real.quick_config(1))
+    quick = finder.train_on_first_half(sequence, detector, None, finder.quick_config(1))
     assert quick.provenance["images"] == 4  # no simulated frame
-    tuned = real.finder_alone(detector, trained)
+    tuned = finder.finder_alone(detector, trained)
     assert tuned.reduction == 1 and list(tuned.networks) == ["frame"]
 
 
 def test_evaluation_is_of_the_second_half(sequence, detector, toy):
     """And its labels are those of the toys, magnified or not."""
-    tested = real.evaluate_on_sequence(real.finder_alone(detector), sequence, second_half=True, every=2)
+    tested = finder.evaluate_on_sequence(finder.finder_alone(detector), sequence, second_half=True, every=2)
     assert tested.names == ["toy 4", "toy 6"]
     np.testing.assert_array_equal(tested.u_true, toy(8, size=(144, 160)).u[4::2])
     assert np.isfinite(tested.error_px).all()  # every detection counts
-    magnified = real.simulated_to_real(detector, sequence, every=8, zoom=2.0)
+    magnified = finder.simulated_to_real(detector, sequence, every=8, zoom=2.0)
     np.testing.assert_allclose(magnified.u_true[0], toy(8, size=(144, 160)).u[0])
     np.testing.assert_allclose(magnified.length_px, tool_length_px(magnified.u_true))
-
-
-def test_the_study_records_each_kind_of_test(sequence, detector, toy_shards, tmp_path, monkeypatch):
-    toy_shards(tmp_path, 2, size=(1080, 1920))
-    both = [sequence, replace(sequence, name="other")]
-    monkeypatch.setattr(studies, "import_retinal_microsurgery", lambda folder: both)
-    monkeypatch.setattr(studies.paths, "real_data", lambda name: tmp_path)
-    monkeypatch.setattr(studies.Detector, "load", classmethod(lambda cls: detector))
-    recorded = {}
-    options = studies.Options(
-        tmp_path, tmp_path, tmp_path / "kept", seeds=1, steps=1, batch=2, features=4, shards=1, progress=False,
-        record=recorded.update,
-    )  # fmt: skip
-    studies.real_frames(options)
-    results = recorded["results"]
-    assert set(results) == {
-        *(f"{name}: {how}" for name in ("toy", "other") for how in ("first half to second", "simulated frames only")),
-        "toy: first half to other",
-        "other: first half to toy",
-    }
-    assert results["toy: first half to second"]["frames"] == 4
-    assert results["toy: first half to other"]["frames"] == 8
-    assert len(results["toy: first half to second"]["curve"]) == len(recorded["thresholds"]) == 10
-    assert set(results["toy: first half to second"]["pck_0.20_by_landmark"]) == {"base", "tip_1", "tip_2"}
-    assert (recorded["budget"]["steps"], recorded["budget"]["features"]) == (1, 4)
-    assert recorded["budget"]["real_frames"] == {"toy": 4, "other": 4}
-    assert set(options.trained_s) == {"toy/seed0", "other/seed0"}
 
 
 @pytest.mark.skipif(RETINAL is None, reason=paths.missing_data_line("retinal_microsurgery"))
@@ -153,9 +125,9 @@ def test_clicks_that_jitter_bound_what_can_be_hit():
     clicks = u + rng.normal(0, jitter_px, u.shape)
     files = tuple(Path(f"{i}.png") for i in range(n))
     still = MonocularSequence("even", np.arange(n), files, u, (640, 480))
-    assert real.label_repeatability(still) == 100.0
+    assert finder.label_repeatability(still) == 100.0
     jittery = replace(still, u=clicks)
     length = tool_length_px(clicks[n // 2 :])[:, None]
     knowing = 100 * (np.linalg.norm((clicks - u)[n // 2 :], axis=-1) <= 0.2 * length).mean()
-    assert real.label_repeatability(jittery) == pytest.approx(knowing, abs=1.0)
-    assert np.isnan(real.label_repeatability(replace(still, frame_numbers=2 * np.arange(n))))
+    assert finder.label_repeatability(jittery) == pytest.approx(knowing, abs=1.0)
+    assert np.isnan(finder.label_repeatability(replace(still, frame_numbers=2 * np.arange(n))))
