@@ -33,8 +33,6 @@ def checksum(tensors: dict[str, Tensor], metadata: dict[str, str]) -> str:
 def write_checkpoint(path: str | Path, tensors: dict[str, Tensor], metadata: dict[str, object]) -> None:
     """Write tensors, JSON metadata and their checksum as a safetensors file; an error leaves the old file as it was.
 
-    Examples
-    --------
     >>> import tempfile, torch
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     write_checkpoint(f"{folder}/a.safetensors", {"x": torch.ones(2)}, {"format": "mine"})
@@ -54,10 +52,7 @@ def write_checkpoint(path: str | Path, tensors: dict[str, Tensor], metadata: dic
 def read_checkpoint(path: str | Path, kind: str) -> tuple[dict[str, Tensor], dict[str, object]]:
     """Tensors and metadata of a file that `write_checkpoint` wrote with ``metadata["format"] == kind``.
 
-    Raises
-    ------
-    FileNotFoundError, ValueError
-        If there is no such file; if it is damaged, has no checksum, or holds something else.
+    Raises `FileNotFoundError` if there is none, `ValueError` if it is damaged, has no checksum, or holds something else.
     """
     path = Path(path)
     if not path.is_file():
@@ -76,11 +71,14 @@ def read_checkpoint(path: str | Path, kind: str) -> tuple[dict[str, Tensor], dic
     return tensors, metadata
 
 
-def load_network(path: str | Path, config: dict, tensors: dict[str, Tensor]) -> StackedHourglass | OffsetNetwork:
-    """A network from its configuration and weights; errors name the file."""
+def load_network(
+    path: str | Path, config: dict, tensors: dict[str, Tensor], prefix: str = ""
+) -> StackedHourglass | OffsetNetwork:
+    """A network from its configuration and those tensors of a file whose names begin with `prefix`; errors name the file."""
+    own = {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
     try:
         network = network_of(config_of(config))
-        network.load_state_dict(tensors)
+        network.load_state_dict(own)
     except (TypeError, RuntimeError, ValueError) as error:
         text = str(error).splitlines()[0]
         raise ValueError(f"{path}: its weights do not fit its configuration ({text}); {_CURE}") from error

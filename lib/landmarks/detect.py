@@ -23,8 +23,6 @@ def detect(
 
     Parameters
     ----------
-    recording:
-        An opened recording.
     detector:
         None is the one that ships.
     frames:
@@ -34,12 +32,9 @@ def detect(
 
     Returns
     -------
-    Correspondences
-        Three rows a frame (base, tip_1, tip_2), with the robot's position at each row's instant; NaN where a landmark is
-        missing.  `Correspondences.complete` keeps the rows that both cameras and the robot saw.
+    Three rows a frame (base, tip_1, tip_2), each with the robot's position at its instant; NaN where a landmark is missing.
+    `Correspondences.complete` keeps the rows that both cameras and the robot saw.
 
-    Examples
-    --------
     >>> from lib import paths
     >>> found = detect(Recording.open(paths.SHIPPED_RECORDING), frames=slice(0, 2))
     >>> len(found), found.x_mm.shape, found.covariance_px2.shape

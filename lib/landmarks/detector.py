@@ -1,9 +1,8 @@
 """The detector: images in, landmarks with covariance and confidence out.
 
-It works from coarse to fine.  The first stage finds the tool in the whole frame at low resolution; the second names its
-landmarks in one upright window round the tool; the third finds each landmark in a small window at full resolution; the
+It works from coarse to fine.  The first stage finds the tool in the whole frame at low resolution.  The second names its
+landmarks in one upright window round the tool.  The third finds each landmark in a small window at full resolution.  The
 last measures it in a closeup.  The first stage alone, at full resolution, is the paper's detector (Sec. III).
-One safetensors file holds all that a detector needs: weights, configuration, error models and provenance.
 """
 
 from __future__ import annotations
@@ -42,6 +41,8 @@ from lib.parallel import single_threaded_torch
 __all__ = ["CLOSE", "CODE_VERSION", "MISSING_BELOW", "TRACKED_FROM", "Detector", "Landmarks"]
 
 FORMAT = "microstereo.detector"
+#: The fields that a weights file keeps as plain values.
+_SETTINGS = ("reduction", "tool_reduction", "window_px", "mirror", "method")
 #: Version of the code between weights and landmarks (windows, decoding, what counts as missing).  Every change that moves
 #: landmarks raises it, so that stored detections are computed again.
 CODE_VERSION = 4
@@ -64,14 +65,12 @@ class Landmarks:
     covariance:
         (n, 3, 2, 2) px^2, NaN where missing.
     confidence:
-        (n, 3), the probability that the landmark is in view and `u` lies within 5 % of the tool's length of it;
-        0 where missing.
+        (n, 3), the probability that the landmark is in view and `u` lies within 5 % of the tool's length of it; 0 where
+        missing.
 
-    Examples
-    --------
     >>> found = Landmarks.none(2)
-    >>> len(found), len(found[:1]), found.confidence.max()
-    (2, 1, 0.0)
+    >>> len(found), len(found[:1]), found.u.shape
+    (2, 1, (2, 3, 2))
     """
 
     u: np.ndarray
@@ -109,35 +108,27 @@ class Landmarks:
 
 @dataclass(frozen=True, eq=False)
 class Detector:
-    """Finds the landmarks in whole frames of any size and number; the same detector serves the left and the right camera.
+    """Finds the landmarks in frames of any size and number; one detector serves both cameras.
 
     Attributes
     ----------
-    frame_network:
-        Network of the first stage, which sees the frame reduced by `reduction`.
-    reduction:
-        Image pixels per pixel of the first stage's input, an integer; 1 is the paper's whole-frame detector.
+    frame_network, reduction:
+        The first stage, which sees the frame with one pixel for `reduction` image pixels, an integer.
     window_network:
-        Network of the third stage, which sees upright windows of `window_px` at full resolution, one for each landmark;
-        None = no such stage.
+        The third stage, which sees one upright window of `window_px` for each landmark; None = no such stage.
     tool_network, tool_reduction:
-        Network of the second stage, which sees one upright window of `window_px` round the tool, reduced by
-        `tool_reduction`; None = no such stage.
+        The second stage, which sees one window of `window_px` round the tool, reduced likewise; None = no such stage.
     closeup_network:
-        Network of the last stage, which sees a closeup of each landmark that the windows found and predicts where in it
-        the landmark lies; None = no such stage.
+        The last stage, which predicts where in a closeup the landmark lies; None = no such stage.
     error_models:
         One for each stage: ``"frame"``, ``"tool"``, ``"window"``, ``"closeup"``, and ``"tracking"`` for the closeups that
         follow a landmark from frame to frame.
     mirror:
-        The windows' network sees every window and its mirror image, and the mean counts: twice the work.
+        The windows' network also sees the mirror image of every window, and the mean counts: twice the work.
     engine:
         What runs the networks, one of `lib.landmarks.engines.ENGINES`; the weights are the same.
 
-    Examples
-    --------
-    >>> detector = Detector.load()
-    >>> found = detector(np.zeros((1, 270, 480, 3), np.uint8))
+    >>> found = Detector.load(engine="torch")(np.zeros((1, 270, 480, 3), np.uint8))
     >>> found.u.shape, bool((found.confidence < 0.5).all())
     ((1, 3, 2), True)
     """
@@ -162,21 +153,14 @@ class Detector:
             raise ValueError("closeup_network: looks at what a window_network has found; give one.")
         if self.mirror and self.window_network and self.window_px % self.window_network.stride:
             raise ValueError(f"mirror: needs window_px to be a multiple of the stride, got {self.window_px}.")
-        run = {
-            name: accelerated(network, self.engine, mirror=self.mirror and name == "window")
-            for name, network in self.networks.items()
-        }
+        mirror = {"window": self.mirror}
+        run = {k: accelerated(network, self.engine, mirror=mirror.get(k, False)) for k, network in self.networks.items()}
         object.__setattr__(self, "_run", run)
 
     @property
     def networks(self) -> dict[str, StackedHourglass | OffsetNetwork]:
         """The networks by stage, in the order of their use."""
-        stages = {
-            "frame": self.frame_network,
-            "tool": self.tool_network,
-            "window": self.window_network,
-            "closeup": self.closeup_network,
-        }
+        stages = {name: getattr(self, f"{name}_network") for name in ("frame", "tool", "window", "closeup")}
         return {name: network for name, network in stages.items() if network is not None}
 
     @property
@@ -192,63 +176,55 @@ class Detector:
 
     @classmethod
     def load(cls, path_or_name: str | Path | None = None, *, engine: str | None = None) -> Detector:
-        """A detector from a weights file, or from a name in ``data/models``; None is the shipped default.
+        """A detector from a weights file, or from a name in ``data/models``; None is the one that ships.
 
         `engine` runs its networks; None is the fastest that is installed (`lib.landmarks.engines`).
 
         Raises
         ------
         FileNotFoundError, ValueError
-            If the file is missing, damaged, incomplete, or no detector; the text names it and the cure.
+            If the file is missing, damaged, incomplete, or no detector; the text names the file and the cure.
         """
         path = Path(path_or_name or "default")
         if not path.suffix and not path.is_file():
             path = paths.MODELS / f"{path.name}.safetensors"
         tensors, metadata = read_checkpoint(path, FORMAT)
-        parts: dict[str, StackedHourglass | OffsetNetwork] = {}
         try:
-            for name, config in metadata["networks"].items():
-                own = {key.removeprefix(f"{name}."): value for key, value in tensors.items() if key.startswith(f"{name}.")}
-                parts[name] = load_network(path, config, own)
+            networks = {
+                f"{stage}_network": load_network(path, config, tensors, f"{stage}.")
+                for stage, config in metadata["networks"].items()
+            }
             detector = cls(
-                parts["frame"],
-                window_network=parts.get("window"),
-                tool_network=parts.get("tool"),
-                closeup_network=parts.get("closeup"),
-                error_models={name: ErrorModel.of(*fit) for name, fit in metadata["calibration"].items()},
+                **networks,
+                **{name: metadata[name] for name in _SETTINGS},
+                error_models={name: ErrorModel(*fit) for name, fit in metadata["calibration"].items()},
                 metadata=metadata["provenance"],
                 engine=engine or default_engine(),
-                **{name: metadata[name] for name in _SETTINGS},
             )
-        except KeyError as error:
-            raise ValueError(f"{path}: its metadata lack {error}; make the file anew with Detector.save.") from error
+        except (KeyError, TypeError) as error:
+            raise ValueError(f"{path}: incomplete ({error}); get the file again, or make it with Detector.save.") from error
         detector._check_complete(path)
         return detector
 
     def save(self, path: str | Path) -> None:
         """Write the detector as one safetensors file; `ValueError` if a stage has no error model."""
         self._check_complete(path)
-        tensors = {
-            f"{name}.{key}": value
-            for name, network in self.networks.items()
-            for key, value in network.state_dict().items()
-        }
-        metadata = {
+        states = {stage: network.state_dict() for stage, network in self.networks.items()}
+        tensors = {f"{stage}.{key}": value for stage, state in states.items() for key, value in state.items()}
+        metadata = {name: getattr(self, name) for name in _SETTINGS} | {
             "format": FORMAT,
-            "networks": {name: asdict(network.config) for name, network in self.networks.items()},
-            "calibration": {
-                name: [fit.log_variance, fit.logit, fit.gain, fit.bias] for name, fit in self.error_models.items()
-            },
+            "networks": {stage: asdict(network.config) for stage, network in self.networks.items()},
+            "calibration": {stage: list(asdict(fit).values()) for stage, fit in self.error_models.items()},
             "provenance": self.metadata,
         }
-        write_checkpoint(path, tensors, metadata | {name: getattr(self, name) for name in _SETTINGS})
+        write_checkpoint(path, tensors, metadata)
 
     def _check_complete(self, path: str | Path) -> None:
         lacking = [stage for stage in self.stages if stage not in self.error_models]
         if lacking:
             raise ValueError(
-                f"{path}: no error model for the stages {', '.join(lacking)}, so covariance and confidence would mean "
-                "nothing; fit them with `lib.training.error_models.fit_error_models` or `python3 -m lib train assemble`."
+                f"{path}: no error model for {', '.join(lacking)}, so covariance and confidence would mean nothing; "
+                "fit them with `lib.training.error_models.fit_error_models` or `python3 -m lib train assemble`."
             )
 
     # Detection
@@ -256,10 +232,7 @@ class Detector:
     def __call__(self, images: ArrayLike, *, batch: int = 4) -> Landmarks:
         """Landmarks of images (n, h, w, 3), uint8 RGB or float in [0, 1]; `batch` images at a time.
 
-        Raises
-        ------
-        ValueError
-            For images of another shape, type or range.
+        Raises `ValueError` for images of another shape, type or range.
         """
         images = as_uint8(images)
         found = []
@@ -273,16 +246,9 @@ class Detector:
         return Landmarks.join(found)
 
     def track(self, images: ArrayLike, previous: Landmarks, *, min_confidence: float = TRACKED_FROM) -> Landmarks:
-        """Landmarks of the frames that follow `previous`: by closeups (or windows) alone, by whole frames where these fail.
+        """Landmarks of images (n, h, w, 3) that follow those of `previous`, such as the next left and right image.
 
-        Parameters
-        ----------
-        images:
-            (n, h, w, 3), such as the left and the right image of one time.
-        previous:
-            Landmarks of the n images before.
-        min_confidence:
-            An image with a landmark below this is searched as a whole.
+        Only closeups (or windows) are looked at.  An image with a landmark below `min_confidence` is searched as a whole.
         """
         images = as_uint8(images)
         if len(previous) != len(images):
@@ -336,21 +302,16 @@ class Detector:
         result.u[i, k], result.covariance[i, k] = u, covariance
         return result.without_unsure()
 
-    def frame_heatmaps(self, images: ArrayLike) -> Tensor:
-        """Heatmaps (n, 3, h, w) of the first stage."""
-        return self.outputs(self.reduced(as_uint8(images)), "frame")
-
     def frame_peaks(self, images: ArrayLike) -> Peaks:
         """Peaks of the first stage, in pixels of its reduced input."""
-        return decode(self.frame_heatmaps(images), self.frame_network.stride, method=self.method)
+        heatmaps = self.outputs(self.reduced(as_uint8(images)), "frame")
+        return decode(heatmaps, self.frame_network.stride, method=self.method)
 
     def windows(self, images: np.ndarray, u: ArrayLike, stage: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The inputs of a stage after the first, given rough landmarks u (n, 3, 2); ``"tracking"`` sees closeups too.
+        """The inputs of a stage after the first, round rough landmarks u (n, 3, 2).
 
-        Returns
-        -------
-        Windows (m, s, s, 3) uint8; window_from_image (m, 2, 3); and which (m, 2) image and landmark each window shows,
-        or which image (m,) for ``"tool"``.  A tool without base or tips and a missing landmark have no window.
+        Returns windows (m, s, s, 3) uint8; window_from_image (m, 2, 3); and which (m, 2) image and landmark each window
+        shows, or which image (m,) for ``"tool"``.  A tool without base or tips and a missing landmark have no window.
         """
         u = np.asarray(u, dtype=np.float64)
         angle = direction_rad(u)
@@ -366,26 +327,14 @@ class Detector:
         windows = [cut(images[i], matrix, size) for i, matrix in zip(image, matrices, strict=True)]
         return np.stack(windows) if windows else np.zeros((0, size, size, 3), np.uint8), matrices, which
 
-    def explained(self, image: np.ndarray) -> tuple[Landmarks, np.ndarray, np.ndarray, np.ndarray]:
-        """What the windows show in one image (h, w, 3): landmarks, windows (m, s, s, 3), window_from_image (m, 2, 3), and
-        each window's heatmap (m, c, c) of its own landmark."""
-        found = self(image[None])
-        windows, matrices, which = self.windows(image[None], found.u, "window")
-        if not len(which):
-            return found, windows, matrices, windows[..., 0]
-        heat = self.outputs(windows, "window").numpy()[np.arange(len(which)), which[:, 1]]
-        return found, windows, matrices, heat
-
     def outputs(self, images: np.ndarray, stage: str) -> Tensor:
         """A stage's heatmaps (m, 3, h, w) of its input images (m, s, s, 3); of closeups the network's outputs (m, 4)."""
         with torch.inference_mode():
             return self._run["closeup" if stage in CLOSE else stage](as_tensor(images))[-1]
 
     def stage_peaks(self, images: np.ndarray, u: ArrayLike, stage: str) -> tuple[Peaks, np.ndarray, np.ndarray]:
-        """Peaks (m, 1) of a stage after the first, in its windows' pixels; window_from_image (m, 2, 3); which (m, 2).
-
-        Each row of the last is image and landmark.
-        """
+        """Peaks (m, 1) of a stage after the first in its windows' pixels, window_from_image (m, 2, 3), and which (m, 2)
+        image and landmark each is."""
         windows, matrices, which = self.windows(images, u, stage)
         if not len(which):
             return Peaks.none(), matrices, np.zeros((0, 2), int)
@@ -419,7 +368,3 @@ class Detector:
         rows = (torch.as_tensor(row, dtype=torch.float64) for row in (fit.coefficients[landmark], fit.logit))
         covariance, confidence = covariance_and_confidence(peaks.double(), scale, *rows)
         return Landmarks(image_from_cell(peaks.u.numpy(), scale), covariance.numpy(), confidence.numpy())
-
-
-#: The fields that are plain values in a weights file.
-_SETTINGS = ("reduction", "tool_reduction", "window_px", "mirror", "method")

@@ -1,7 +1,7 @@
 """Engines that run a network on a CPU: torch, or OpenVINO, which is faster in the same precision.
 
-`data/results/detector.json`, study ``engines``, holds the measurement that chose.  OpenVINO computes in bfloat16 where the
-processor has units for it (heatmaps then differ by about 0.01 of their height), else in float32.
+OpenVINO computes in bfloat16 where the processor has units for it, else in float32.  In bfloat16 heatmaps differ by about
+0.01 of their height.  The recorded table of the detector's speed compares the two.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from lib.landmarks.network import OffsetNetwork, StackedHourglass
 
 __all__ = ["ENGINES", "LastOutput", "OpenVinoNetwork", "accelerated", "default_engine", "openvino"]
 
-#: ``"openvino"`` takes the fastest precision that the CPU has.
+#: ``"openvino"`` computes in the fastest precision that the processor has.
 ENGINES = ("torch", "openvino", "openvino float32")
+#: How many images are run at once; fewer are filled up to the next of these.
+BATCHES = (1, 2, 3, 6)
 
 #: Compiled networks by weights, input shape and threads: copies of a detector share them.
 _COMPILED: OrderedDict[tuple, object] = OrderedDict()
 _KEPT = 16
-#: How many images are run at once; fewer are filled up to the next of these.
-BATCHES = (1, 2, 3, 6)
 _lock = threading.Lock()
 
 
 def openvino():
-    """The module.  Without its telemetry package, which would tell its makers of every import, it stays silent."""
+    """The module OpenVINO, without its telemetry package, which would report every import to its makers."""
     sys.modules.setdefault("openvino_telemetry", None)  # type: ignore[arg-type]
     import openvino
 
@@ -42,16 +42,18 @@ def openvino():
 
 
 def default_engine() -> str:
-    """``"openvino"`` where it is installed, else ``"torch"``."""
+    """``"openvino"`` where it is installed, else ``"torch"``.
+
+    >>> default_engine() in ENGINES
+    True
+    """
     return "openvino" if importlib.util.find_spec("openvino") else "torch"
 
 
 def accelerated(
     network: StackedHourglass | OffsetNetwork, engine: str, *, mirror: bool = False
 ) -> Callable[[Tensor], list[Tensor]]:
-    """The network for inference: called with images (n, 3, h, w), its last output is the network's last.
-
-    With `mirror` that is the mean of the heatmaps of the images and of their mirror images (`LastOutput`).
+    """The network for inference: called with images (n, 3, h, w), its last output is that of `LastOutput`.
 
     Raises
     ------
@@ -69,10 +71,10 @@ def accelerated(
 
 
 class LastOutput(nn.Module):
-    """A network whose only output is the last one, of a hourglass the last stack's heatmaps: what is traced and exported.
+    """A network with only its last output (a hourglass's last heatmaps), fused for inference: what is traced and exported.
 
-    With `mirror` it looks at every image a second time with top and bottom exchanged, and with the tips exchanged (tip_1 is
-    the left one), and returns the mean of both: heights for a multiple of the stride, where the cells coincide.
+    With `mirror` it also sees every image with top and bottom exchanged, exchanges the tips of the result (tip_1 is the
+    left one), and returns the mean of both.  The height must be a multiple of the stride, so that the cells coincide.
     """
 
     def __init__(self, network: StackedHourglass | OffsetNetwork, *, mirror: bool = False):
@@ -94,15 +96,10 @@ class OpenVinoNetwork:
     """
 
     def __init__(
-        self,
-        network: StackedHourglass | OffsetNetwork,
-        *,
-        mirror: bool = False,
-        precision: str | None = None,
-        threads: int | None = None,
+        self, network: StackedHourglass | OffsetNetwork, *, mirror: bool = False, precision: str | None = None
     ):
         self._network, self._mirror, self._precision = network, mirror, precision
-        self._threads = threads or torch.get_num_threads()
+        self._threads = torch.get_num_threads()
         digest = hashlib.sha256(repr(network.config).encode())
         for value in network.state_dict().values():
             digest.update(np.ascontiguousarray(value.numpy()).tobytes())
@@ -132,32 +129,12 @@ class OpenVinoNetwork:
 
     def _compile(self, shape: tuple[int, ...]) -> object:
         ov = openvino()
-        options = {
-            "PERFORMANCE_HINT": "LATENCY",
-            "NUM_STREAMS": 1,
-            "INFERENCE_NUM_THREADS": self._threads,
-        }
+        module = LastOutput(self._network, mirror=self._mirror).eval()
+        with torch.no_grad(), warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # tracing fixes the shape, as it shall
+            traced = torch.jit.freeze(torch.jit.trace(module, torch.zeros(shape), check_trace=False))
+            model = ov.convert_model(traced, input=[(list(shape), np.float32)])  # of a trace it is much quicker
+        options = {"PERFORMANCE_HINT": "LATENCY", "NUM_STREAMS": 1, "INFERENCE_NUM_THREADS": self._threads}
         if self._precision:
             options["INFERENCE_PRECISION_HINT"] = self._precision
-        module = LastOutput(self._network, mirror=self._mirror).eval()
-        compiled = ov.Core().compile_model(_converted(module, shape), "CPU", options)
-        return compiled.create_infer_request()
-
-
-def _converted(module: nn.Module, shape: tuple[int, ...]):
-    """An OpenVINO model of fixed input shape, from a trace: much quicker than its own conversion of a module."""
-    ov = openvino()
-    from openvino.frontend import FrontEndManager
-    from openvino.frontend.pytorch.ts_decoder import TorchScriptPythonDecoder
-
-    example = torch.zeros(shape)
-    with torch.no_grad(), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # tracing fixes the shape, which is what is wanted
-        traced = torch.jit.freeze(torch.jit.trace(module, example, check_trace=False))
-        frontend = FrontEndManager().load_by_framework("pytorch")
-        decoder = TorchScriptPythonDecoder(traced, example_input=(example,))  # must outlive `loaded`
-        loaded = frontend.load(decoder)
-        model = frontend.convert(loaded)
-    model.inputs[0].get_node().set_element_type(ov.Type.f32)
-    model.reshape(shape)
-    return model
+        return ov.Core().compile_model(model, "CPU", options).create_infer_request()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -44,18 +43,12 @@ class ErrorModel:
     gain: tuple[tuple[float, ...], ...] = ((1.0, 1.0),) * 3
     bias: tuple[tuple[float, ...], ...] = ((0.0, 0.0),) * 3
 
-    @classmethod
-    def of(
-        cls,
-        log_variance: Sequence[Sequence[float]],
-        logit: Sequence[float],
-        gain: Sequence[Sequence[float]] = ((1.0, 1.0),) * 3,
-        bias: Sequence[Sequence[float]] = ((0.0, 0.0),) * 3,
-    ) -> ErrorModel:
-        """From the lists that JSON keeps; `ValueError` for lists of other lengths."""
-        if [np.shape(part) for part in (log_variance, logit, gain, bias)] != [(2, 6), (4,), (3, 2), (3, 2)]:
-            raise ValueError("error model: is of another version; fit it anew with `python3 -m lib train assemble`.")
-        return cls(tuple(map(tuple, log_variance)), tuple(logit), tuple(map(tuple, gain)), tuple(map(tuple, bias)))
+    def __post_init__(self) -> None:
+        for name, shape in {"log_variance": (2, 6), "logit": (4,), "gain": (3, 2), "bias": (3, 2)}.items():
+            value = np.array(getattr(self, name), dtype=np.float64)
+            if value.shape != shape:
+                raise ValueError(f"{name}: expected {shape}, got {value.shape}; fit anew (`python3 -m lib train assemble`).")
+            object.__setattr__(self, name, tuple(map(tuple, value.tolist())) if value.ndim == 2 else tuple(value.tolist()))
 
     @property
     def coefficients(self) -> np.ndarray:

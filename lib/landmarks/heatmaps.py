@@ -1,8 +1,7 @@
-"""Heatmaps and how to read them: Gaussian targets from float coordinates, and five decoders behind one function.
+"""Heatmaps: Gaussian targets from float coordinates, and five decoders behind one function.
 
 Cells and pixels obey the half-pixel rule of `lib.geometry`: cell c of a heatmap of stride s is centred on pixel
-s * c + (s - 1) / 2.  Sigma is in pixels of the network's input whatever the stride.  Decoders work on all heatmaps of
-a batch at once, in float32 or wider.
+s * c + (s - 1) / 2.  Sigma is in pixels of the network's input whatever the stride.
 """
 
 from __future__ import annotations
@@ -28,16 +27,14 @@ def sigma_cells(stride: int, sigma_px: float = SIGMA_PX) -> float:
 def render(u: Tensor, image_size: tuple[int, int], stride: int, sigma_px: float = SIGMA_PX) -> Tensor:
     """Gaussians of peak 1 centred on float coordinates: the l2 targets (paper Sec. III).
 
-    Parameters
-    ----------
-    u:
-        (n, k, 2) px of the input, x right, y down; NaN gives an empty heatmap.
-    image_size:
-        (h, w) of the input.
+    Takes points u (n, k, 2) px of an input of size (h, w), and returns heatmaps (n, k, ceil(h / stride), ceil(w / stride)).
+    A point that is NaN gives an empty heatmap.
 
-    Returns
-    -------
-    (n, k, ceil(h / stride), ceil(w / stride)), the type of `u`.
+    Examples
+    --------
+    >>> heatmaps = render(torch.tensor([[[5.5, 9.5]]]), (16, 32), 4)
+    >>> heatmaps.shape, heatmaps[0, 0, 2, 1].item()
+    (torch.Size([1, 1, 4, 8]), 1.0)
     """
     h, w = image_size
     rows = torch.arange(-(-h // stride), dtype=u.dtype, device=u.device)
@@ -56,16 +53,16 @@ def _pixels(u_cell: Tensor, stride: int) -> Tensor:
 
 @dataclass(frozen=True)
 class Peaks:
-    """What a decoder found, one a heatmap.
+    """The peak that a decoder finds in each heatmap.
 
     Attributes
     ----------
     u:
         (n, k, 2) px of the network's input.
     value:
-        (n, k) height of the peak; 1 is the target's.
+        (n, k) height of the peak; that of the target is 1.
     width:
-        (n, k) sigma of the peak over the target's; 1 where the decoder does not fit it.
+        (n, k) sigma of the peak over that of the target; 1 where the decoder does not fit it.
     covariance:
         (n, k, 2, 2) px^2, from the fit's residual; NaN where the decoder has none.
     """
@@ -131,10 +128,10 @@ def _decode_disc(heatmaps: Tensor, sigma: float) -> tuple[Tensor, ...]:
 
 
 def disc_as_printed(heatmaps: Tensor, stride: int, sigma_px: float = SIGMA_PX) -> Tensor:
-    """Eq. (1) to the letter: the sum of (u_max + Delta) p over |Delta|, which is no mean.  (n, k, 2) px.
+    """Eq. (1) as printed: the sum of (u_max + Delta) p over |Delta|, (n, k, 2) px.  For comparison only: it is no mean.
 
     A unit Gaussian sums to about 2 pi sigma^2 and the disc of 3 sigma has 9 pi sigma^2 cells, so the printed form
-    shrinks every coordinate to about 0.22 of its value.  It is here to be shown, not to be used.
+    shrinks every coordinate to about 0.22 of its value.
     """
     sigma = sigma_cells(stride, sigma_px)
     cell, _, weights, offsets = _disc(heatmaps, sigma)
@@ -152,9 +149,8 @@ def _decode_kornia(heatmaps: Tensor, sigma: float) -> tuple[Tensor, ...]:
     p, _, inside = _patches(heatmaps, cell, radius)
     p = p.clamp_min(0) * inside
     p = p / p.sum(-1, keepdim=True).clamp_min(torch.finfo(p.dtype).tiny)
-    side = 2 * radius + 1
-    expectation = spatial_expectation2d(p.reshape(*p.shape[:2], side, side), normalized_coordinates=False)
-    return _plain(cell.to(heatmaps.dtype) + expectation - radius, value)
+    square = p.unflatten(-1, (2 * radius + 1, -1))
+    return _plain(cell.to(heatmaps.dtype) + spatial_expectation2d(square, normalized_coordinates=False) - radius, value)
 
 
 def _decode_dark(heatmaps: Tensor, sigma: float) -> tuple[Tensor, ...]:
@@ -167,8 +163,7 @@ def _decode_dark(heatmaps: Tensor, sigma: float) -> tuple[Tensor, ...]:
     blurred = F.conv2d(heatmaps, g, padding=(0, radius), groups=k)
     blurred = F.conv2d(blurred, g.transpose(-1, -2), padding=(radius, 0), groups=k)
     h, w = heatmaps.shape[-2:]
-    _, value = _argmax(heatmaps)
-    cell, _ = _argmax(blurred)
+    (_, value), (cell, _) = _argmax(heatmaps), _argmax(blurred)
     inner = torch.stack([cell[..., 0].clamp(1, max(w - 2, 1)), cell[..., 1].clamp(1, max(h - 2, 1))], -1)
     p, _, _ = _patches(blurred, inner, 1)
     a, b, c, d, e, f, g2, h2, i = p.clamp_min(1e-10).log().unbind(-1)
@@ -198,8 +193,8 @@ def _solve(matrix: Tensor, right: Tensor) -> Tensor:
 def _decode_gauss_newton(heatmaps: Tensor, sigma: float, iterations: int = 6) -> tuple[Tensor, ...]:
     """Least-squares fit of a exp(-|c - x|^2 / (2 (w sigma)^2)) + b in a disc, started from the paper's disc centroid.
 
-    Five unknowns: x, y, width w, height a, offset b.  Steps are damped and limited; a fit that leaves the disc or
-    ends with a width below 0.4 or above 2.5 falls back to the centroid, with a wide covariance.
+    The five unknowns are x, y, width w, height a and offset b.  Steps are damped and limited.  A fit that leaves the disc
+    or ends with a width below 0.4 or above 2.5 falls back to the centroid, with a wide covariance.
     """
     start, value, *_ = _decode_disc(heatmaps, sigma)
     h, w = heatmaps.shape[-2:]
@@ -256,14 +251,10 @@ DECODERS = tuple(_DECODERS)
 
 
 def decode(heatmaps: Tensor, stride: int, *, method: str = "gauss_newton", sigma_px: float = SIGMA_PX) -> Peaks:
-    """The landmark of every heatmap, in pixels of the network's input.
+    """The peak of every heatmap (n, k, h, w) of `stride` input pixels per cell, in pixels of the network's input.
 
     Parameters
     ----------
-    heatmaps:
-        (n, k, h, w).
-    stride:
-        Input pixels per cell.
     method:
         ``"argmax"``: the highest cell.  ``"paper"``: centroid of the disc of 3 sigma around it, Eq. (1) divided by the
         sum of p (as printed it is divided by the disc's area, see `disc_as_printed`).  ``"dark"``: Zhang et al. 2020.
@@ -273,6 +264,12 @@ def decode(heatmaps: Tensor, stride: int, *, method: str = "gauss_newton", sigma
     ------
     ValueError
         For an unknown method, heatmaps that are not (n, k, h, w), or not finite.
+
+    Examples
+    --------
+    >>> heatmaps = render(torch.tensor([[[20.3, 12.8]]], dtype=torch.float64), (64, 64), 4)
+    >>> decode(heatmaps, 4).u.round(decimals=3).tolist()
+    [[[20.3, 12.8]]]
     """
     if method not in _DECODERS:
         raise ValueError(f"method: {method!r} is no decoder; choose one of {', '.join(DECODERS)}.")

@@ -10,7 +10,12 @@ from torch import Tensor
 __all__ = ["as_tensor", "as_uint8"]
 
 
-def _checked(images: ArrayLike | Tensor) -> np.ndarray:
+def as_uint8(images: ArrayLike) -> np.ndarray:
+    """Images (n, h, w, 3), uint8 or float in [0, 1], as uint8; `ValueError` for another shape, type or range.
+
+    >>> as_uint8(np.full((1, 2, 4, 3), 0.5)).max()
+    np.uint8(128)
+    """
     array = np.asarray(images)
     if array.ndim != 4 or array.shape[-1] != 3:
         raise ValueError(
@@ -26,28 +31,9 @@ def _checked(images: ArrayLike | Tensor) -> np.ndarray:
     low, high = float(array.min()), float(array.max())
     if not (low >= 0.0 and high <= 1.0):
         raise ValueError(f"images: float images must lie in [0, 1], got {low:g} to {high:g}; divide by 255?")
-    return array
+    return np.round(array * 255).astype(np.uint8)
 
 
-def as_tensor(images: ArrayLike | Tensor) -> Tensor:
-    """Images (n, h, w, 3), uint8 or float in [0, 1], as the networks take them: (n, 3, h, w) float, channels last.
-
-    Raises
-    ------
-    ValueError
-        For another shape, type or range.
-
-    Examples
-    --------
-    >>> as_tensor(np.full((1, 2, 4, 3), 255, np.uint8)).shape
-    torch.Size([1, 3, 2, 4])
-    """
-    array = _checked(images)
-    tensor = torch.from_numpy(np.ascontiguousarray(array)).permute(0, 3, 1, 2).float()
-    return tensor.div_(255.0) if array.dtype == np.uint8 else tensor
-
-
-def as_uint8(images: ArrayLike) -> np.ndarray:
-    """Images (n, h, w, 3), uint8 or float in [0, 1], as uint8; errors as of `as_tensor`."""
-    array = _checked(images)
-    return array if array.dtype == np.uint8 else np.round(array * 255).astype(np.uint8)
+def as_tensor(images: ArrayLike) -> Tensor:
+    """The same images as the networks take them: (n, 3, h, w) float in [0, 1], channels last."""
+    return torch.from_numpy(np.ascontiguousarray(as_uint8(images))).permute(0, 3, 1, 2).float().div_(255.0)

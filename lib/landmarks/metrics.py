@@ -1,4 +1,4 @@
-"""How good detections are: PCK, pixel errors, and whether covariance and confidence mean what they say."""
+"""How good detections are: PCK, errors in pixels, and whether covariance and confidence are true."""
 
 from __future__ import annotations
 
@@ -8,20 +8,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.stats import chi2
 
-__all__ = [
-    "PCK_THRESHOLDS",
-    "Scores",
-    "calibration_error",
-    "coverage",
-    "errors_px",
-    "nees",
-    "pck",
-    "reliability",
-    "score",
-]
+__all__ = ["PCK_THRESHOLDS", "Scores", "calibration_error", "coverage", "errors_px", "nees", "pck", "reliability", "score"]
 
 #: The paper's range of thresholds, as parts of the tool's length.
 PCK_THRESHOLDS = np.linspace(0.001, 0.2, 200)
+#: A larger error is gross: no covariance means to explain it.
+GROSS_PX = 20.0
 
 
 def _pairs(u: ArrayLike, u_true: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
@@ -35,8 +27,7 @@ def errors_px(u: ArrayLike, u_true: ArrayLike) -> np.ndarray:
     """Distance (n, 3) of detections (n, 3, 2) from labels: infinite where nothing was detected, NaN without a label."""
     u, u_true = _pairs(u, u_true)
     error = np.linalg.norm(u - u_true, axis=2)
-    labelled = np.isfinite(u_true).all(axis=2)
-    return np.where(labelled, np.where(np.isfinite(error), error, np.inf), np.nan)
+    return np.where(np.isfinite(u_true).all(axis=2), np.where(np.isfinite(error), error, np.inf), np.nan)
 
 
 def tool_length_px(u_true: ArrayLike) -> np.ndarray:
@@ -65,6 +56,10 @@ def pck(u: ArrayLike, u_true: ArrayLike, threshold: ArrayLike = PCK_THRESHOLDS, 
     Returns
     -------
     Percent, a float or (t,) as `threshold`; NaN where no label counts.
+
+    >>> u_true = np.array([[[0.0, 0.0], [100.0, 0.0], [0.0, 100.0]]])
+    >>> pck(u_true + [[[3, 0], [6, 0], [0, 0]]], u_true, [0.02, 0.05, 0.1]).round(1).tolist()
+    [33.3, 66.7, 100.0]
     """
     length = tool_length_px(u_true) if length_px is None else np.asarray(length_px, dtype=np.float64)
     with np.errstate(invalid="ignore"):
@@ -78,11 +73,9 @@ def pck(u: ArrayLike, u_true: ArrayLike, threshold: ArrayLike = PCK_THRESHOLDS, 
 def nees(u: ArrayLike, u_true: ArrayLike, covariance: ArrayLike) -> np.ndarray:
     """Normalised estimation error squared (n, 3): mean 2 and chi-square with 2 degrees where covariances are true."""
     u, u_true = _pairs(u, u_true)
-    difference = u - u_true
     covariance = np.asarray(covariance, dtype=np.float64)
-    known = np.isfinite(difference).all(2) & np.isfinite(covariance).all((2, 3))
-    value = np.full(difference.shape[:2], np.nan)
-    d = difference[known]
+    known = np.isfinite(u - u_true).all(2) & np.isfinite(covariance).all((2, 3))
+    value, d = np.full(known.shape, np.nan), (u - u_true)[known]
     value[known] = np.einsum("ni,ni->n", d, np.linalg.solve(covariance[known], d[..., None])[..., 0])
     return value
 
@@ -100,9 +93,7 @@ def reliability(confidence: ArrayLike, correct: ArrayLike, bins: int = 10) -> tu
     which = np.clip((confidence * bins).astype(int), 0, bins - 1)
     count = np.bincount(which, minlength=bins)
     with np.errstate(invalid="ignore"):
-        mean = np.bincount(which, confidence, bins) / count
-        fraction = np.bincount(which, correct, bins) / count
-    return mean, fraction, count
+        return np.bincount(which, confidence, bins) / count, np.bincount(which, correct, bins) / count, count
 
 
 def calibration_error(confidence: ArrayLike, correct: ArrayLike, bins: int = 10) -> float:
@@ -114,11 +105,11 @@ def calibration_error(confidence: ArrayLike, correct: ArrayLike, bins: int = 10)
 
 @dataclass(frozen=True)
 class Scores:
-    """The figures of an evaluation; percent, pixels, counts.
+    """The numbers of an evaluation: percent, pixels, counts.
 
-    `median_px` and `p95_px` are over detected landmarks with a label; `missed` counts labels without a detection, which PCK
-    counts as wrong.  `bias_px`, `nees` (the mean) and `coverage_95` leave out errors beyond 20 px, which no covariance means
-    to explain (`gross` counts them).
+    `median_px` and `p95_px` are over detected landmarks with a label.  `missed` counts labels without a detection, which
+    PCK counts as wrong; `gross` counts errors beyond `GROSS_PX`, which `bias_px`, `nees` (the mean) and `coverage_95` leave
+    out.
     """
 
     pck_0_01: float
@@ -140,18 +131,17 @@ class Scores:
 
 
 def score(u: ArrayLike, u_true: ArrayLike, covariance: ArrayLike | None = None, *, length_px=None) -> Scores:
-    """All figures at once; arguments as in `pck` and `nees`."""
+    """All numbers at once; arguments as in `pck` and `nees`."""
     u, u_true = _pairs(u, u_true)
     error = errors_px(u, u_true)
-    found = error[np.isfinite(error)]
+    found, fine = error[np.isfinite(error)], error < GROSS_PX
     curve = pck(u, u_true, length_px=length_px)
-    bias = (u - u_true)[np.isfinite(error) & (error < 20)]
-    squared = nees(u, u_true, covariance)[error < 20] if covariance is not None else np.array([])
+    squared = np.zeros(0) if covariance is None else nees(u, u_true, covariance)[fine]
     squared = squared[np.isfinite(squared)]
     median, p95 = np.percentile(found, [50, 95]) if found.size else (np.nan, np.nan)
-    x, y = bias.mean(axis=0) if bias.size else (np.nan, np.nan)
+    x, y = (u - u_true)[fine].mean(axis=0) if fine.any() else (np.nan, np.nan)
     return Scores(
-        *(float(pck(u, u_true, t, length_px=length_px)) for t in (0.01, 0.05, 0.10)),
+        *pck(u, u_true, [0.01, 0.05, 0.10], length_px=length_px).tolist(),
         auc=float(np.trapezoid(curve, PCK_THRESHOLDS) / np.ptp(PCK_THRESHOLDS)),
         median_px=float(median),
         p95_px=float(p95),
@@ -160,5 +150,5 @@ def score(u: ArrayLike, u_true: ArrayLike, covariance: ArrayLike | None = None, 
         coverage_95=coverage(squared),
         labels=int((~np.isnan(error)).sum()),
         missed=int(np.isinf(error).sum()),
-        gross=int((found >= 20).sum()),
+        gross=int((found >= GROSS_PX).sum()),
     )

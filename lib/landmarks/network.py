@@ -1,17 +1,16 @@
-"""The Stacked Hourglass network (Newell et al. 2016; paper Sec. III), one class with the paper's five configurations.
+"""The networks: the Stacked Hourglass (Newell et al. 2016; paper Sec. III) and the offset network for closeups.
 
-Beside it `OffsetNetwork`, which the paper has not: it looks closely at one landmark that a hourglass has found.
-
-Every layer of the hourglass keeps the half-pixel rule of `lib.geometry`: the stem's even kernel is centred on its cell,
-pooling and nearest-neighbour upsampling are aligned with cell borders.  A network therefore has nothing to unlearn before
-the centre of heatmap cell c lies at pixel stride * c + (stride - 1) / 2 of its input.
+The hourglass is one class with the paper's five configurations.  Each of its layers keeps the half-pixel rule of
+`lib.geometry`: the stem's even kernel is centred on its cell, pooling and nearest-neighbour upsampling are aligned with
+cell borders.  So the centre of heatmap cell c lies at pixel stride * c + (stride - 1) / 2 of the input before any training.
+The offset network is not in the paper: it measures one landmark that a hourglass has found.
 """
 
 from __future__ import annotations
 
 import copy
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Self
 
 import torch
 from torch import Tensor, nn
@@ -20,33 +19,30 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from lib.correspondences import LANDMARKS
 
-__all__ = [
-    "ABLATION",
-    "HourglassConfig",
-    "OffsetConfig",
-    "OffsetNetwork",
-    "StackedHourglass",
-    "config_of",
-    "network_of",
-]
+__all__ = ["ABLATION", "HourglassConfig", "OffsetConfig", "OffsetNetwork", "StackedHourglass", "config_of", "network_of"]
 
 STEM_STRIDE = 4
 
 
 @dataclass(frozen=True)
 class HourglassConfig:
-    """What a network is; the paper leaves `features` open (the note in notebook 02 says why it is below 256).
+    """Configuration of a `StackedHourglass`.
 
     Attributes
     ----------
     features:
-        Channels of the hourglass, an even number.
+        Channels of the hourglass, an even number.  The paper does not state it; notebook 02 derives that it is below 256.
     stacks:
         Hourglasses in a row, each supervised.
     depth:
         Halvings inside an hourglass; 4 makes inputs a multiple of 4 * 2**4 = 64.
     decoder, skips, residual:
-        What the ablation adds one after the other; without a decoder the heatmaps have stride 4 * 2**depth.
+        The parts that the ablation adds one by one.  Without a decoder the heatmaps have stride 4 * 2**depth.
+
+    Examples
+    --------
+    >>> HourglassConfig().stride, HourglassConfig(**ABLATION["encoder"]).stride
+    (4, 64)
     """
 
     features: int = 64
@@ -93,6 +89,20 @@ def _conv(inputs: int, outputs: int, kernel: int, *, stride: int = 1, relu: bool
     return nn.Sequential(*layers, nn.ReLU(inplace=True)) if relu else nn.Sequential(*layers)
 
 
+class _Network(nn.Module):
+    def fused(self) -> Self:
+        """A copy for inference: batch normalisation folded into the convolutions, channels last (same outputs)."""
+        network = copy.deepcopy(self).eval()
+        for module in list(network.modules()):
+            if not isinstance(module, nn.Sequential):
+                continue
+            for i in range(len(module) - 1):
+                if isinstance(module[i], nn.Conv2d) and isinstance(module[i + 1], nn.BatchNorm2d):
+                    module[i] = fuse_conv_bn_eval(module[i], module[i + 1])
+                    module[i + 1] = nn.Identity()
+        return network.to(memory_format=torch.channels_last)
+
+
 class _Block(nn.Module):
     """A box of the paper's figure: a bottleneck residual module (He et al. 2016), or a plain 3 x 3 convolution."""
 
@@ -130,16 +140,18 @@ class _Hourglass(nn.Module):
         return y if self.skip is None else y + self.skip(x)
 
 
-class StackedHourglass(nn.Module):
+class StackedHourglass(_Network):
     """Images to landmark heatmaps.
 
     ``forward(images)`` takes float images (n, 3, h, w) in [0, 1], RGB, of any size, pads them with zeros at the right
     and bottom, and returns one (n, 3, ceil(h / stride), ceil(w / stride)) heatmap tensor per stack, the final one last.
+    It raises `ValueError` if the images do not have three channels.
 
-    Raises
-    ------
-    ValueError
-        If the images have not three channels.
+    Examples
+    --------
+    >>> heatmaps = StackedHourglass(HourglassConfig(features=8))(torch.zeros(1, 3, 60, 100))
+    >>> len(heatmaps), heatmaps[-1].shape
+    (2, torch.Size([1, 3, 15, 25]))
     """
 
     def __init__(self, config: HourglassConfig | None = None):
@@ -190,21 +202,17 @@ class StackedHourglass(nn.Module):
                 x = x + self.merge_features[i](y) + self.merge_heatmaps[i](heatmaps)
         return outputs
 
-    def fused(self) -> StackedHourglass:
-        """A copy for inference: batch normalisation folded into the convolutions, channels last (same outputs)."""
-        return _fused(self)
-
 
 @dataclass(frozen=True)
 class OffsetConfig:
-    """What an `OffsetNetwork` is.
+    """Configuration of an `OffsetNetwork`.
 
     Attributes
     ----------
     features:
-        Channels at half the closeup's resolution; more where it is lower.
+        Channels at half the closeup's resolution; there are more at lower resolutions.
     size_px:
-        Of the closeups, a multiple of 16.
+        Side of the closeups, a multiple of 16.
     """
 
     features: int = 32
@@ -218,7 +226,7 @@ class OffsetConfig:
 
 
 class _Residual(nn.Module):
-    """Two 3 x 3 convolutions and what they add to (He et al. 2016), halving the resolution where `halve`."""
+    """Two 3 x 3 convolutions and their skip connection (He et al. 2016); `halve` halves the resolution."""
 
     def __init__(self, inputs: int, outputs: int, halve: bool = False):
         super().__init__()
@@ -232,17 +240,17 @@ class _Residual(nn.Module):
         return F.relu(self.body(x) + self.skip(x))
 
 
-class OffsetNetwork(nn.Module):
-    """Closeups to where their landmark lies, and how well that is known.
+class OffsetNetwork(_Network):
+    """Closeups to the offset of their landmark from the centre, and the scale of its error.
 
-    ``forward(images)`` takes float images (n, 3, s, s) in [0, 1], RGB, and returns one tensor (n, 4) in a list, as the
-    hourglass does: the landmark's distance from the closeup's centre along x and y in pixels, and the logarithms of the
-    scales, in pixels, of their errors, within -6 and 5 (`lib.training.losses.offset_loss`).
+    ``forward(images)`` takes float images (n, 3, s, s) in [0, 1], RGB, and returns, as the hourglass does, a list, of one
+    tensor (n, 4): the offset along x and y in pixels, and the logarithms of the scales of its errors in pixels, limited to
+    -6 to 5.  It raises `ValueError` if the images have another size.
 
-    Raises
-    ------
-    ValueError
-        If the images have another size.
+    Examples
+    --------
+    >>> OffsetNetwork(OffsetConfig(features=8)).eval()(torch.zeros(2, 3, 64, 64))[0].shape
+    torch.Size([2, 4])
     """
 
     def __init__(self, config: OffsetConfig | None = None):
@@ -258,11 +266,11 @@ class OffsetNetwork(nn.Module):
             _Residual(3 * f, 3 * f),
             _Residual(3 * f, 4 * f, halve=True),
         )
-        # Fully connected: where something is seen decides, which a mean over the closeup would forget.
+        # Fully connected, because a mean over the closeup would lose where something is seen.
         self.head = nn.Sequential(
             nn.Flatten(), nn.Linear(4 * f * (config.size_px // 16) ** 2, 128), nn.ReLU(inplace=True), nn.Linear(128, 4)
         )
-        nn.init.zeros_(self.head[-1].weight)  # start at "in the middle, give or take a pixel"
+        nn.init.zeros_(self.head[-1].weight)  # the start: in the middle, within about a pixel
         nn.init.zeros_(self.head[-1].bias)
 
     def forward(self, images: Tensor) -> list[Tensor]:
@@ -272,31 +280,12 @@ class OffsetNetwork(nn.Module):
         y = self.head(self.body((images - 0.5) * 4.0))
         return [torch.cat([y[:, :2] * (size / 8), y[:, 2:].clamp(-6, 5)], dim=1)]
 
-    def fused(self) -> OffsetNetwork:
-        """A copy for inference: batch normalisation folded into the convolutions, channels last (same outputs)."""
-        return _fused(self)
-
 
 def network_of(config: HourglassConfig | OffsetConfig) -> StackedHourglass | OffsetNetwork:
-    """A fresh network of a configuration."""
+    """A new network of a configuration."""
     return OffsetNetwork(config) if isinstance(config, OffsetConfig) else StackedHourglass(config)
 
 
 def config_of(values: dict[str, object]) -> HourglassConfig | OffsetConfig:
-    """The configuration that JSON kept."""
+    """The configuration from the values that JSON keeps."""
     return (OffsetConfig if "size_px" in values else HourglassConfig)(**values)  # type: ignore[arg-type]
-
-
-_Network = TypeVar("_Network", bound=nn.Module)
-
-
-def _fused(network: _Network) -> _Network:
-    network = copy.deepcopy(network).eval()
-    for module in list(network.modules()):
-        if not isinstance(module, nn.Sequential):
-            continue
-        for i in range(len(module) - 1):
-            if isinstance(module[i], nn.Conv2d) and isinstance(module[i + 1], nn.BatchNorm2d):
-                module[i] = fuse_conv_bn_eval(module[i], module[i + 1])
-                module[i + 1] = nn.Identity()
-    return network.to(memory_format=torch.channels_last)

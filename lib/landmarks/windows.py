@@ -1,8 +1,8 @@
 """Windows around landmarks: upright crops in which the tool points right.
 
-The later stages of the detector look at small windows.  Each is turned so that the direction from base to tips points right
-and tip_1, the left one for somebody who looks along the tool, lies above: whatever the tool's direction in the
-image, the network sees one pose.  Closeups are reduced a little, and mirrored for tip_2, so that both tips look alike.
+The later stages of the detector see small windows.  Each is turned so that the direction from base to tips points right and
+tip_1, the left tip as seen along the tool, lies above.  So the network sees one pose whatever the tool's direction in the
+image.  Closeups are reduced a little, and mirrored for tip_2, so that both tips look alike.
 """
 
 from __future__ import annotations
@@ -12,17 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 __all__ = [
-    "CLOSEUP_BEHIND_PX",
-    "CLOSEUP_REACH_PX",
-    "CLOSEUP_ZOOM",
-    "closeup_from_image",
-    "cut",
-    "direction_rad",
-    "expected_in_closeup",
-    "map_points",
-    "tool_centre",
-    "window_from_image",
-]
+    "CLOSEUP_BEHIND_PX", "CLOSEUP_REACH_PX", "CLOSEUP_ZOOM", "closeup_from_image", "cut", "direction_rad",
+    "expected_in_closeup", "map_points", "tool_centre", "window_from_image",
+]  # fmt: skip
 
 #: Closeup pixels per image pixel, of base, tip_1 and tip_2: the base shows between the edges of the shaft.
 CLOSEUP_ZOOM = (0.65, 0.85, 0.85)
@@ -32,21 +24,29 @@ CLOSEUP_BEHIND_PX = (0.0, 18.0, 18.0)
 CLOSEUP_REACH_PX = 20.0
 
 
-def direction_rad(u: ArrayLike) -> np.ndarray:
-    """Angle (n,) of base to the mean of the known tips, from x towards y; NaN without a base or without a tip."""
+def _base_and_tip(u: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    """Base and mean of the known tips, (n, 2) each; NaN where unknown."""
     u = np.asarray(u, dtype=np.float64)
     known = np.isfinite(u[:, 1:]).all(axis=2)
-    tips = np.where(known[..., None], u[:, 1:], 0).sum(1) / np.maximum(known.sum(1), 1)[:, None]
-    d = tips - u[:, 0]
-    return np.where(known.any(1), np.arctan2(d[:, 1], d[:, 0]), np.nan)
+    tip = np.where(known[..., None], u[:, 1:], 0).sum(1) / np.maximum(known.sum(1), 1)[:, None]
+    return u[:, 0], np.where(known.any(1)[:, None], tip, np.nan)
+
+
+def direction_rad(u: ArrayLike) -> np.ndarray:
+    """Angle (n,) from the base to the mean of the known tips, from x towards y; NaN without a base or without a tip.
+
+    >>> direction_rad([[[0, 0], [10, 0], [0, 10]]]).round(3)
+    array([0.785])
+    """
+    base, tip = _base_and_tip(u)
+    d = tip - base
+    return np.arctan2(d[:, 1], d[:, 0])
 
 
 def tool_centre(u: ArrayLike) -> np.ndarray:
     """Halfway (n, 2) between the base and the mean of the known tips; NaN without a base or without a tip."""
-    u = np.asarray(u, dtype=np.float64)
-    known = np.isfinite(u[:, 1:]).all(axis=2)
-    tips = np.where(known[..., None], u[:, 1:], 0).sum(1) / np.maximum(known.sum(1), 1)[:, None]
-    return np.where(known.any(1)[:, None], (u[:, 0] + tips) / 2, np.nan)
+    base, tip = _base_and_tip(u)
+    return (base + tip) / 2
 
 
 def window_from_image(centre: ArrayLike, angle_rad: ArrayLike, size: int, zoom: ArrayLike = 1.0) -> np.ndarray:

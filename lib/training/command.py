@@ -118,9 +118,9 @@ def _assemble(a: argparse.Namespace) -> None:
 
 
 def _export(a: argparse.Namespace) -> None:
-    from lib.landmarks.export import export_shipped  # needs onnx, which nothing else does
+    from lib.landmarks.export import export  # needs onnx, which nothing else does
 
-    for stage, (path, difference) in export_shipped(a.out, a.onnx).items():
+    for stage, (path, difference) in export(Detector.load(a.out), a.onnx).items():
         print(f"{stage}: {path}, at most {difference:.2g} px from torch")
 
 

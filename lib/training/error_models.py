@@ -103,7 +103,7 @@ class Seen:
         for own, columns in ((~tip[:, 0], np.s_[:1]), (tip[:, 0], np.s_[1:3])):
             if own.any():
                 log_variance[:, columns] += 0.5 * np.log(np.quantile(normalised[own], 0.95) / chi2.ppf(0.95, 2))
-        return ErrorModel.of(log_variance.tolist(), logit.tolist())
+        return ErrorModel(log_variance, logit)
 
     def gain(self, gross_px: float, gains: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
         """Gain (one of `gains`) and bias (3, 2) of base and tips along each axis that leave the smallest absolute errors."""
@@ -191,7 +191,7 @@ def fit_error_models(detector: Detector, images: Iterable[LabelledImage], *, pro
             left = seen.errors + (gain[seen.landmark] - 1) * seen.moved - bias[seen.landmark]
             seen = replace(seen, errors=left)
         fit = seen.fit(gross)
-        fit = ErrorModel.of(fit.log_variance, fit.logit, gain.tolist(), bias.tolist())
+        fit = ErrorModel(fit.log_variance, fit.logit, gain, bias)
         detector = detector.with_error_models(**{stage: fit})
         if stage == "frame":  # the landmarks that the next stage starts from
             rough = [detector.coarse(part.image[None]) for part in images]

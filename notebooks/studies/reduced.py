@@ -136,6 +136,6 @@ def load_resolution(
     if not (folder / "errors.json").is_file():  # written when the training is done
         raise FileNotFoundError(f"{folder}: not trained; run `python3 -m lib sweep studies/resolution`.")
     network = load_training(folder / "last.safetensors").network
-    errors = ErrorModel.of(**json.loads((folder / "errors.json").read_text(encoding="utf-8")))
+    errors = ErrorModel(**json.loads((folder / "errors.json").read_text(encoding="utf-8")))
     finder = replace(finder or Detector.load(), window_network=None, closeup_network=None)
     return ReducedDetector(finder, network, RESOLUTIONS[name], errors)

@@ -13,7 +13,7 @@ from lib.landmarks import Detector, Landmarks
 from lib.landmarks import export as module
 from lib.landmarks.engines import OpenVinoNetwork, accelerated, default_engine, openvino
 from lib.landmarks.error_model import ErrorModel
-from lib.landmarks.export import PARITY_CONFIDENCE, PARITY_PX, export, export_shipped, run_onnx
+from lib.landmarks.export import LARGEST, export, run_onnx
 from lib.landmarks.images import as_tensor
 from lib.landmarks.network import HourglassConfig, OffsetConfig, OffsetNetwork, StackedHourglass
 from lib.recordings import Recording
@@ -127,13 +127,13 @@ def test_onnx_holds_network_decoding_and_calibration(trained, tmp_path):
     detector, images = trained
     written = export(detector, tmp_path, images)
     path, difference = written["frame"]
-    assert difference <= PARITY_PX
+    assert difference <= LARGEST["px"]
     u, covariance, confidence = run_onnx(path, as_tensor(images[:2]).contiguous().numpy())  # another batch size
     expected = detector(images[:2])
     found = expected.confidence > 0
     assert found.any()
-    np.testing.assert_allclose(u[found], expected.u[found], atol=PARITY_PX)
-    np.testing.assert_allclose(confidence[found], expected.confidence[found], atol=PARITY_CONFIDENCE)
+    np.testing.assert_allclose(u[found], expected.u[found], atol=LARGEST["px"])
+    np.testing.assert_allclose(confidence[found], expected.confidence[found], atol=LARGEST["of confidence"])
     np.testing.assert_allclose(covariance[found], expected.covariance[found], rtol=2e-2, atol=1e-4)
 
 
@@ -142,11 +142,11 @@ def test_onnx_holds_network_decoding_and_calibration(trained, tmp_path):
 @needs_shipped
 def test_every_exported_stage_is_that_of_the_detector(tmp_path):
     """The shipped detector put together from its ONNX files, by the README of the stages: same landmarks."""
-    written = export_shipped(None, tmp_path)
+    written = export(Detector.load(), tmp_path)
     assert {file.name for file in tmp_path.iterdir()} == {
         f"{stage}.onnx" for stage in ("frame", "tool", "window", "closeup", "tracking")
     }
-    assert all(difference <= PARITY_PX for _, difference in written.values())
+    assert all(difference <= LARGEST["px"] for _, difference in written.values())
     images, detector = shipped_pairs(1), Detector.load(engine="torch")
     found = Landmarks(*run_onnx(tmp_path / "frame.onnx", rgb(detector.reduced(images))))
     finder = replace(detector, window_network=None, closeup_network=None)
@@ -156,9 +156,9 @@ def test_every_exported_stage_is_that_of_the_detector(tmp_path):
     back = np.linalg.inv(matrices[:, None, :, :2])
     u = (back @ (u - matrices[:, None, :, 2])[..., None])[..., 0]
     expected = finder(images)
-    np.testing.assert_allclose(u, expected.u[which], atol=5 * PARITY_PX)  # the stage's pixels are 5 of the frame
+    np.testing.assert_allclose(u, expected.u[which], atol=5 * LARGEST["px"])  # the stage's pixels are 5 of the frame
     np.testing.assert_allclose(back @ covariance @ back.mT, expected.covariance[which], rtol=2e-2, atol=1e-3)
-    np.testing.assert_allclose(confidence, expected.confidence[which], atol=PARITY_CONFIDENCE)
+    np.testing.assert_allclose(confidence, expected.confidence[which], atol=LARGEST["of confidence"])
     looks = {
         "window": replace(detector, closeup_network=None),
         "closeup": detector,
@@ -172,11 +172,11 @@ def test_every_exported_stage_is_that_of_the_detector(tmp_path):
         expected, (image, landmark) = reference(images), which.T
         assert len(which)
         u = (back @ (u - matrices[:, :, 2])[..., None])[..., 0]
-        np.testing.assert_allclose(u, expected.u[image, landmark], atol=PARITY_PX)
+        np.testing.assert_allclose(u, expected.u[image, landmark], atol=LARGEST["px"])
         turned = back @ covariance @ back.mT
         np.testing.assert_allclose(turned, expected.covariance[image, landmark], rtol=2e-2, atol=1e-3)
         if stage != "closeup":  # there the windows' confidence is kept
-            np.testing.assert_allclose(confidence, expected.confidence[image, landmark], atol=PARITY_CONFIDENCE)
+            np.testing.assert_allclose(confidence, expected.confidence[image, landmark], atol=LARGEST["of confidence"])
 
 
 @needs_onnx
