@@ -16,14 +16,14 @@ from lib.simulator.rig import IMAGE_SIZE_PX, ROBOT_FROM_MICROSCOPE, reference_ri
 __all__ = ["PerspectiveCamera", "near_affine_rig", "perspective_dlt", "rms", "triangulate_perspective"]
 
 
-def near_affine_rig(distance_mm: float) -> StereoRig:
-    """The reference rig at a finite working distance; infinity is the reference rig itself."""
+def near_affine_rig(inverse_distance_per_mm: float) -> StereoRig:
+    """The reference rig at a finite working distance; 0 is the reference rig itself."""
     rig = reference_rig()
-    if np.isinf(distance_mm):
+    if not inverse_distance_per_mm:
         return rig
     centre = (np.array(IMAGE_SIZE_PX) - 1) / 2
     return StereoRig(
-        *(NearAffineCamera(c.matrix, 1 / distance_mm, centre, ROBOT_FROM_MICROSCOPE.t) for c in (rig.left, rig.right))
+        *(NearAffineCamera(c.matrix, inverse_distance_per_mm, centre, ROBOT_FROM_MICROSCOPE.t) for c in (rig.left, rig.right))
     )
 
 

@@ -1,4 +1,4 @@
-"""The real robot: a da Vinci research kit whose tool carries two red spheres, seen by one colour camera.
+"""A real robot: a da Vinci research kit whose tool carries two red spheres, seen by one colour camera.
 
 The data set `dvrk_hand_eye` (Imperial College London, BSD-3) holds 50 frames and the recorded positions of joint 4.
 The spheres sit further along the shaft, which always passes through the robot's base (the remote centre), so a sphere is at
