@@ -10,22 +10,26 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullFormatter
 
-from lib.calibration import Calibration, LandmarkOffsets
+from lib.calibration import Calibration, LandmarkOffsets, TimeOffset
 from lib.calibration.ladder import Comparison
+from lib.correspondences import Correspondences
 from lib.geometry import RigidTransform
+from lib.workbench.results import Table
 from notebooks.figures.style import COLOURS, LANDMARK_COLOURS, figure, show_image
-from notebooks.studies.calibration_studies import NoiseStudy
-from notebooks.studies.real_robot import RobotFrames, SphereFit
+from notebooks.studies.dvrk import RobotFrames, SphereFit
 
 __all__ = [
     "advice_curves",
     "advice_view",
     "checkerboards",
     "correspondences",
+    "coverage",
     "ellipsoids",
+    "estimators",
     "focal_lengths",
     "frame_residuals",
     "ladder",
+    "root_mean_square",
     "noise_errors",
     "offsets",
     "residuals",
@@ -33,10 +37,12 @@ __all__ = [
     "robot_frames",
     "shallow_bias",
     "time_offset",
+    "when_affine_wins",
     "working_distance",
 ]
 
 
+_WHITE = {"facecolor": "white", "edgecolor": "none", "pad": 0.5}
 #: Colours of the depth uncertainty in `advice_view`.
 DEPTH_SCALE_UM = (30.0, 2000.0)
 
@@ -72,21 +78,43 @@ def _plain_log(axis: Axis, ticks: Sequence[float] | None = None) -> None:
     axis.set_minor_formatter(NullFormatter())
 
 
-def noise_errors(study: NoiseStudy) -> Figure:
-    """Triangulation and reprojection error against detector noise, affine and perspective (the paper's figure)."""
+def noise_errors(table: Table) -> Figure:
+    """Recorded errors against detector noise, affine and perspective (the paper's figure)."""
     page, axes = figure(1, 2, width_in=11, height_in=3.8)
-    for ax, affine, perspective, unit, title in (
-        (axes[0], study.affine_um, study.perspective_um, "um", "Triangulation error (3D RMS)"),
-        (axes[1], study.affine_px, study.perspective_px, "px", "Reprojection error (RMS)"),
+    c = table.columns
+    for ax, key, unit, title in (
+        (axes[0], "exact_pixels_um", "um", "Triangulation error (3D RMS, exact pixels)"),
+        (axes[1], "reprojection_px", "px", "Reprojection error (RMS)"),
     ):
-        for values, name, colour in ((affine, "affine, joint", "ours"), (perspective, "perspective DLT", "paper")):
-            low, middle, high = np.percentile(values, [10, 50, 90], axis=1)
-            ax.plot(study.sigma_u_px, middle, "o-", color=COLOURS[colour], label=name)
-            ax.fill_between(study.sigma_u_px, low, high, color=COLOURS[colour], alpha=0.2, linewidth=0)
+        for model, name, colour in (("affine", "affine, joint", "ours"), ("perspective", "perspective DLT", "paper")):
+            ax.plot(c["sigma_u_px"], c[f"{model}_{key}"], "o-", color=COLOURS[colour], label=name)
         ax.set(xlabel="detector noise (px per coordinate)", ylabel=unit, title=title, xscale="log", yscale="log")
-        _plain_log(ax.xaxis, study.sigma_u_px)
+        _plain_log(ax.xaxis, c["sigma_u_px"])
         _plain_log(ax.yaxis)
         ax.legend()
+    return page
+
+
+def when_affine_wins(table: Table) -> Figure:
+    """Recorded error of perspective DLT over the affine one's, by four measures, against the number of correspondences."""
+    measures = {
+        "reprojection": "Reprojection, held out",
+        "exact_pixels": "Triangulation, held-out exact pixels",
+        "detections": "Triangulation, held-out detections",
+        "fitted_detections": "Triangulation, the fitted detections",
+    }
+    page, axes = figure(1, 4, width_in=14, height_in=3.6, sharey=True)
+    depths = sorted(set(table.columns["half_depth_mm"]), reverse=True)
+    for ax, (key, title) in zip(axes, measures.items(), strict=True):
+        for depth, colour in zip(depths, ("ours", "warning", "paper"), strict=False):
+            c = table.where(half_depth_mm=depth).columns
+            ax.plot(c["n_rows"], c[f"ratio_{key}"], "o-", color=COLOURS[colour], label=f"sweep of +-{depth:g} mm")
+        ax.axhline(1, color="black", linewidth=0.8)
+        ax.set(xscale="log", xlabel="correspondences", title=title)
+        ax.set_title(title, fontsize=10)
+        _plain_log(ax.xaxis, sorted(set(table.columns["n_rows"])))
+    axes[0].set_ylabel("perspective error / affine error")
+    axes[0].legend(fontsize=8)
     return page
 
 
@@ -101,18 +129,18 @@ def focal_lengths(found_px: np.ndarray, true_px: float) -> Figure:
     return page
 
 
-def shallow_bias(half_depth_mm: Sequence[float], ratios: Mapping[str, np.ndarray]) -> Figure:
-    """Estimated over true depth column against the depth covered by the tool."""
+def shallow_bias(table: Table) -> Figure:
+    """Recorded estimated over true depth column against the depth covered by the tool."""
     page, ax = figure(width_in=8.5, height_in=3.8)
     styles = {
-        "DLT": ("baseline", "s-"),
-        "likelihood": ("ours", "o-"),
-        "as printed, mm": ("paper", "^-"),
-        "as printed, um": ("warning", "v-"),
+        "dlt": ("DLT", "baseline", "s-"),
+        "likelihood": ("likelihood", "ours", "o-"),
+        "printed_mm": ("as printed, mm", "paper", "^-"),
+        "printed_um": ("as printed, um", "warning", "v-"),
     }
-    for name, values in ratios.items():
-        colour, style = styles[name]
-        ax.plot(half_depth_mm, values, style, color=COLOURS[colour], label=name)
+    c = table.columns
+    for key, (name, colour, style) in styles.items():
+        ax.plot(c["half_depth_mm"], c[f"{key}_depth_scale"], style, color=COLOURS[colour], label=name)
     ax.axhline(1, color="black", linewidth=0.8)
     ax.set(
         xscale="log",
@@ -121,7 +149,7 @@ def shallow_bias(half_depth_mm: Sequence[float], ratios: Mapping[str, np.ndarray
         ylim=(0.7, 1.6),
         title="Weights matter where the sweep is shallow",
     )
-    _plain_log(ax.xaxis, half_depth_mm)
+    _plain_log(ax.xaxis, c["half_depth_mm"])
     ax.legend(ncols=2)
     return page
 
@@ -212,13 +240,14 @@ def advice_view(
     return page
 
 
-def advice_curves(curves: Mapping[str, np.ndarray], start: int) -> Figure:
-    """RMS sqrt(leverage) over the workspace against the number of added points."""
+def advice_curves(table: Table, first: int) -> Figure:
+    """Recorded RMS sqrt(leverage) over the workspace against the number of added positions."""
     page, ax = figure(width_in=8, height_in=3.4)
+    c = table.columns
     for name, colour in (("random", "baseline"), ("advised", "ours")):
-        ax.plot(np.arange(len(curves[name])), curves[name], "o-", markersize=3, color=COLOURS[colour], label=name)
+        ax.plot(c["added"], c[f"{name}_sd"], "o-", markersize=3, color=COLOURS[colour], label=name)
     ax.set(
-        xlabel=f"positions added to {start} clustered ones",
+        xlabel=f"positions added to {first} clustered ones",
         ylabel="calibration sd / sd of a row",
         yscale="log",
         title="Where the tool goes matters more than how often",
@@ -282,44 +311,42 @@ def frame_residuals(image: np.ndarray, detected: np.ndarray, predicted: np.ndarr
     return page
 
 
-def working_distance(distances_mm: Sequence[float], study: Mapping[str, np.ndarray]) -> Figure:
-    """3D error of the affine and the near-affine model against working distance."""
+def working_distance(table: Table) -> Figure:
+    """Recorded 3D error of the affine and the near-affine model against working distance."""
     page, ax = figure(width_in=8, height_in=3.6)
-    labels = [f"{d:.0f}" if np.isfinite(d) else "affine" for d in distances_mm]
+    c = table.columns
+    labels = [f"{1e3 / inverse:.0f}" if inverse else "affine" for inverse in c["inverse_distance_per_m"]]
     at = np.arange(len(labels))
-    ax.bar(at - 0.2, study["affine_um"], 0.4, color=COLOURS["paper"], label="affine (zero skew)")
-    ax.bar(at + 0.2, study["near_affine_um"], 0.4, color=COLOURS["ours"], label="with 1/distance")
-    for i, share in enumerate(study["chosen"]):
-        ax.text(
-            i,
-            max(study["affine_um"][i], study["near_affine_um"][i]) + 3,
-            f"1/d chosen:\n{100 * share:.0f} %",
-            ha="center",
-            fontsize=8,
-        )
+    ax.bar(at - 0.2, c["affine_um"], 0.4, color=COLOURS["paper"], label="affine (zero skew)")
+    ax.bar(at + 0.2, c["near_affine_um"], 0.4, color=COLOURS["ours"], label="with 1/distance")
+    top = np.maximum(c["affine_um"], c["near_affine_um"])
+    for x, y, share in zip(at, top, c["distance_chosen_percent"], strict=True):
+        ax.text(x, y + 3, f"1/d chosen:\n{share:.0f} %", ha="center", fontsize=8)
     ax.set(
         xticks=at,
         xticklabels=labels,
         xlabel="working distance (mm)",
         ylabel="held-out 3D RMS (um)",
-        ylim=(0, 1.2 * study["affine_um"].max()),
-        title="The one parameter that pays",
+        ylim=(0, 1.25 * top.max()),
+        title="One parameter removes the error of the model",
     )
     ax.legend()
     return page
 
 
-def time_offset(offsets_ms: np.ndarray, reprojection_px: np.ndarray, found_ms: float, sd_ms: float) -> Figure:
-    """Reprojection error against the assumed clock offset, and the estimate."""
+def time_offset(found: TimeOffset, true_s: float) -> Figure:
+    """Reprojection error against the assumed clock offset, the estimate and the truth."""
     page, ax = figure(width_in=8, height_in=3.2)
-    ax.plot(offsets_ms, reprojection_px, color=COLOURS["baseline"])
+    ax.plot(1e3 * found.trial_s, found.trial_rms_px, color=COLOURS["baseline"])
+    middle, sd = 1e3 * found.offset_s, 1e3 * found.sd_s
     ax.axvspan(
-        found_ms - 3 * sd_ms,
-        found_ms + 3 * sd_ms,
+        middle - 3 * sd,
+        middle + 3 * sd,
         color=COLOURS["ours"],
         alpha=0.4,
-        label=f"estimate {found_ms:.2f} +- {sd_ms:.2f} ms (3 sd shown)",
+        label=f"estimate {middle:.2f} +- {sd:.2f} ms (3 sd shown)",
     )
+    ax.axvline(1e3 * true_s, color=COLOURS["truth"], linewidth=1, label=f"truth {1e3 * true_s:.0f} ms")
     ax.set(
         xlabel="assumed offset between the clocks (ms)",
         ylabel="reprojection RMS (px)",
@@ -329,22 +356,26 @@ def time_offset(offsets_ms: np.ndarray, reprojection_px: np.ndarray, found_ms: f
     return page
 
 
-def checkerboards(results: Mapping[str, Mapping[str, Mapping[str, float]]], paper_um: float = 25.479) -> Figure:
-    """Errors of reconstructed checkerboards, a panel a kind of optics: {optics: {"model, estimate": errors in um}}."""
-    page, axes = figure(1, len(results), width_in=13, height_in=4.4, sharey=True, squeeze=False)
-    for ax, (title, errors) in zip(axes[0], results.items(), strict=True):
-        at = np.arange(len(errors))
+def checkerboards(table: Table, paper_um: float = 25.479) -> Figure:
+    """Recorded errors of reconstructed checkerboards, a panel a kind of optics, root mean squares over the sweeps."""
+    optics = {inverse: table.where(inverse_distance_per_m=inverse) for inverse in sorted(set(table.columns["inverse_distance_per_m"]))}
+    page, axes = figure(1, len(optics), width_in=13, height_in=4.6, sharey=True, squeeze=False)
+    names = [key.removesuffix("_aligned_um") for key in table.columns if key.endswith("_aligned_um")]
+    at = np.arange(len(names))
+    for ax, (inverse, rows) in zip(axes[0], optics.items(), strict=True):
         for key, offset, colour, name in (
             ("aligned_um", -0.2, "ours", "after rigid alignment"),
             ("robot_um", 0.2, "baseline", "in the robot frame"),
         ):
-            values = [e[key] for e in errors.values()]
+            values = [root_mean_square(rows.columns[f"{n}_{key}"]) for n in names]
             ax.barh(at + offset, values, 0.4, color=COLOURS[colour], label=name)
             for y, value in zip(at + offset, values, strict=True):
-                ax.text(value + 0.6, y, f"{value:.1f}", va="center", fontsize=8)
+                ax.text(value + 0.6, y, f"{value:.1f}", va="center", fontsize=8, bbox=_WHITE, zorder=3)
         ax.axvline(paper_um, color=COLOURS["paper"], linestyle="--", label="the paper, aligned")
-        ax.set(yticks=at, xlabel="RMS 3D distance to the grid (um)", title=title[0].upper() + title[1:])
-        ax.set_yticklabels([name.replace("_", " ") for name in errors])
+        title = f"Working distance {1e3 / inverse:.0f} mm" if inverse else "Affine optics"
+        sweeps = f"{len(rows)} sweep" + "s" * (len(rows) > 1)
+        ax.set(yticks=at, xlabel="RMS 3D distance to the grid (um)", title=f"{title}: {sweeps}")
+        ax.set_yticklabels([name.replace("_", " ") for name in names])
         ax.margins(x=0.1)
         ax.grid(axis="y", visible=False)
     axes[0, 0].invert_yaxis()  # shared
@@ -352,33 +383,78 @@ def checkerboards(results: Mapping[str, Mapping[str, Mapping[str, float]]], pape
     return page
 
 
-def resolutions(study: Mapping[str, object]) -> Figure:
-    """The paper's figure: 3D and projection error of calibrations from labels and from detectors at four resolutions."""
-    study = {name: row for name, row in study.items() if isinstance(row, dict)}
-    page, axes = figure(1, 2, width_in=12, height_in=3.8)
-    names = [f"{name}\n{row['sigma_u_px']:.1f} px" for name, row in study.items()]
+def root_mean_square(values: np.ndarray) -> float:
+    """Root mean square of what is finite."""
+    values = np.asarray(values, dtype=np.float64)
+    return float(np.sqrt(np.mean(values[np.isfinite(values)] ** 2)))
+
+
+def estimators(chosen: Table, fresh: Table) -> Figure:
+    """Recorded error over its bound, an estimator a group: on the sweeps that chose the estimator and on fresh ones."""
+    page, axes = figure(1, 2, width_in=13, height_in=3.8, sharey=True)
+    names = [key.removesuffix("_projection_over_bound") for key in chosen.columns if key.endswith("_projection_over_bound")]
+    at = np.arange(len(names))
+    for ax, key, title in (
+        (axes[0], "over_bound", "Triangulation error of exact pixels"),
+        (axes[1], "projection_over_bound", "Projection error"),
+    ):
+        for table, offset, colour, name in ((chosen, -0.2, "baseline", "sweeps that chose"), (fresh, 0.2, "ours", "fresh sweeps")):
+            columns = [table.columns[f"{n}_{key}"] for n in names]
+            values = [root_mean_square(column) for column in columns]
+            ax.bar(at + offset, values, 0.4, color=COLOURS[colour], label=f"{name} ({len(table)})")
+            for x, value, column in zip(at + offset, values, columns, strict=True):
+                ax.plot(np.full(len(column), x), column, ".", color="black", markersize=3)
+                ax.text(x, value + 0.02, f"{value:.2f}", ha="center", fontsize=8, bbox=_WHITE, zorder=3)
+        ax.axhline(1, color="black", linewidth=0.8)
+        ax.set(xticks=at, title=title)
+        ax.set_xticklabels([n.replace("_", "\n") for n in names])
+        ax.grid(axis="x", visible=False)
+    axes[0].set_ylabel("error / Cramer-Rao bound")
+    axes[0].legend(fontsize=8)
+    return page
+
+
+def coverage(table: Table) -> Figure:
+    """Recorded repetitions: share of errors inside the reported 95 % region, and rejections of true constraints."""
+    page, axes = figure(1, 2, width_in=11, height_in=3.2)
+    c = table.columns
+    axes[0].plot(c["n_rows"], c["coverage_95_percent"], "o-", color=COLOURS["ours"])
+    axes[0].axhline(95, color=COLOURS["truth"], linewidth=1)
+    axes[0].set(ylabel="%", title="Inside the reported 95 % region")
+    for key, name, colour in (("zero_skew", "zero skew", "ours"), ("square", "square pixels", "paper"), ("common_zoom", "common zoom", "warning")):
+        axes[1].plot(c["n_rows"], c[f"{key}_rejected_percent"], "o-", color=COLOURS[colour], label=name)
+    axes[1].axhline(5, color=COLOURS["truth"], linewidth=1)
+    axes[1].set(ylabel="%", ylim=(0, None), title="True constraints rejected at 5 %")
+    axes[1].legend(fontsize=8)
+    for ax in axes:
+        ax.set(xscale="log", xlabel="correspondences")
+        _plain_log(ax.xaxis, c["n_rows"])
+    return page
+
+
+def resolutions(table: Table) -> Figure:
+    """The paper's figure, recorded: errors of calibrations from labels and from detectors at four resolutions."""
+    page, axes = figure(1, 3, width_in=14, height_in=3.8)
+    groups = {name: table.where(detector=name).columns for name in dict.fromkeys(table.columns["detector"])}
+    names = [f"{name}\n{root_mean_square(c['sigma_u_px']):.1f} px" for name, c in groups.items()]
     at = np.arange(len(names))
     for ax, key, unit, title in (
-        (axes[0], "calibration_um", "um", "Calibration's triangulation error (3D RMS, exact pixels)"),
-        (axes[1], "projection_px", "px", "Calibration's projection error (RMS)"),
+        (axes[0], "detections_um", "um", "Detections triangulated (the paper's)"),
+        (axes[1], "um", "um", "Exact pixels triangulated"),
+        (axes[2], "projection_px", "px", "Projections"),
     ):
         for model, offset, colour in (("affine", -0.2, "ours"), ("perspective", 0.2, "paper")):
-            values = [row[f"{model}_{key}"] for row in study.values()]
-            ax.bar(
-                at + offset,
-                values,
-                0.4,
-                color=COLOURS[colour],
-                label="affine" if model == "affine" else "perspective DLT",
-            )
+            values = [root_mean_square(c[f"{model}_{key}"]) for c in groups.values()]
+            label = "affine" if model == "affine" else "perspective DLT"
+            ax.bar(at + offset, values, 0.4, color=COLOURS[colour], label=label)
             for x, value in zip(at + offset, values, strict=True):
-                ax.text(x, value, f"{value:.3g}", ha="center", va="bottom", fontsize=8)
-        ax.set(xticks=at, xticklabels=names, ylabel=unit, title=title, yscale="log")
+                ax.text(x, value, f"{value:.3g}", ha="center", va="bottom", fontsize=7)
+        ax.set(xticks=at, xticklabels=names, ylabel=f"RMS ({unit})", title=title, yscale="log")
         ax.grid(axis="x", visible=False)
         ax.margins(y=0.2)
         _plain_log(ax.yaxis)
     axes[1].set_xlabel("what was calibrated from, and its error a coordinate")
-    axes[0].legend()
+    axes[0].legend(fontsize=8)
     return page
 
 

@@ -1,4 +1,4 @@
-"""Cameras that the studies set beside the affine one: perspective resection by DLT, and a microscope at a finite distance."""
+"""Perspective cameras by DLT, which the studies compare with affine ones."""
 
 from __future__ import annotations
 
@@ -9,22 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import rq
 
-from lib.cameras import NearAffineCamera, StereoRig
 from lib.geometry import finite_points, points
-from lib.simulator.rig import IMAGE_SIZE_PX, ROBOT_FROM_MICROSCOPE, reference_rig
 
-__all__ = ["PerspectiveCamera", "near_affine_rig", "perspective_dlt", "rms", "triangulate_perspective"]
-
-
-def near_affine_rig(inverse_distance_per_mm: float) -> StereoRig:
-    """The reference rig at a finite working distance; 0 is the reference rig itself."""
-    rig = reference_rig()
-    if not inverse_distance_per_mm:
-        return rig
-    centre = (np.array(IMAGE_SIZE_PX) - 1) / 2
-    return StereoRig(
-        *(NearAffineCamera(c.matrix, inverse_distance_per_mm, centre, ROBOT_FROM_MICROSCOPE.t) for c in (rig.left, rig.right))
-    )
+__all__ = ["PerspectiveCamera", "perspective_dlt", "rms", "triangulate_perspective"]
 
 
 def rms(error: ArrayLike) -> float:

@@ -12,7 +12,7 @@ from lib import paths
 from lib.calibration import Calibration, calibrate
 from lib.correspondences import Correspondences, of_recording
 from lib.recordings import Recording
-from lib.simulator import Microscope, simulate
+from lib.simulator import Design, Microscope, simulate
 from notebooks.studies.cameras import rms
 
 __all__ = ["ESTIMATORS", "Judgement", "estimate", "exact_pixels", "judge", "label_rows", "sweep"]
@@ -39,10 +39,9 @@ def sweep(seed: int = 75, *, inverse_distance_per_m: float = 0.0, frames: int = 
     if not folder.is_dir():
         folder.parent.mkdir(parents=True, exist_ok=True)
         microscope = Microscope(inverse_distance_per_mm=1e-3 * inverse_distance_per_m)
+        design = Design(microscope=microscope, motion="sweep", duration_s=1.2 * frames)
         own = folder.with_name(f"{name}-{os.getpid()}")  # several runs may render the same sweep at once
-        simulate(
-            own, seed=seed, n_frames=frames, motion="sweep", duration_s=1.2 * frames, microscope=microscope, name=name
-        )  # fmt: skip
+        simulate(own, design, seed=seed, n_frames=frames, name=name)
         try:
             own.rename(folder)
         except OSError:  # another run was faster
