@@ -7,7 +7,6 @@ import pytest
 
 from lib.calibration import Moments, OnlineCalibration, affine_minimum, calibrate, report
 from lib.simulator.rig import simulate_correspondences
-from notebooks.studies.calibration_evaluation import solve_with_ceres, solve_with_scipy
 
 
 def stacked(n):
@@ -19,13 +18,6 @@ def stacked(n):
 def test_closed_form_minimum(benchmark, n):
     c, y = stacked(n)
     assert benchmark(lambda: affine_minimum(Moments.of(c.x_mm, y), 2.25, 1e-4)).cost > 0
-
-
-@pytest.mark.parametrize("solver", [solve_with_scipy, solve_with_ceres])
-def test_general_bundle_adjusters_reach_the_same_minimum(benchmark, solver):
-    c, y = stacked(3000)
-    cost, _ = benchmark.pedantic(solver, args=(c.x_mm, y, 1.5, 0.010), rounds=1)
-    assert cost == pytest.approx(affine_minimum(Moments.of(c.x_mm, y), 2.25, 1e-4).cost, rel=1e-9)
 
 
 @pytest.mark.parametrize("model", ["affine", "zero_skew", "near_affine"])

@@ -6,8 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from lib.simulator.rig import simulate_correspondences
-from notebooks.studies.calibration_studies import near_affine_rig
+from lib.simulator.rig import reference_rig, simulate_correspondences
 
 POINTS = 100_000
 
@@ -31,7 +30,7 @@ def test_opencv_triangulation(benchmark, matches):
 
 
 def test_near_affine_triangulation(benchmark, matches):
-    rig = near_affine_rig(200.0)
+    rig = reference_rig(inverse_distance_per_mm=1 / 200)
     u = rig.project(matches.true_x_mm)
     found = benchmark.pedantic(rig.triangulate, args=u, rounds=3)
     np.testing.assert_allclose(found.x_mm, matches.true_x_mm, atol=1e-9)

@@ -1,4 +1,4 @@
-"""Clocks, rolling shutter, online calibration, tool offsets, exports, baselines."""
+"""Clocks, rolling shutter, online calibration, tool offsets, exports."""
 
 import cv2
 import numpy as np
@@ -21,7 +21,6 @@ from lib.calibration import (
 from lib.cameras import AffineCamera, NearAffineCamera, StereoRig
 from lib.geometry import RigidTransform
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig, simulate_correspondences
-from notebooks.studies.baselines import factorise, perspective_dlt, similarity, triangulate_perspective
 
 
 def sweep(time_s, speed_mm_s=2.0):
@@ -243,58 +242,6 @@ def test_one_camera_json_and_bad_files(tmp_path):
         (tmp_path / "bad").write_text("{}")
         with pytest.raises(ValueError, match="bad"):
             read(tmp_path / "bad")
-
-
-def pinhole(distance_mm, focal_px, seed=0, noise_px=0.0, n=200):
-    rng = np.random.default_rng(seed)
-    K = np.array([[focal_px, 0, 960], [0, focal_px, 540], [0, 0, 1.0]])
-    P = K @ np.column_stack([RigidTransform.from_rotation_vector((0.2, -0.3, 0.1)).R, [1, 2, distance_mm]])
-    x = rng.uniform(-1, 1, (n, 3)) * [5, 4, 3]
-    h = x @ P[:, :3].T + P[:, 3]
-    return K, x, h[:, :2] / h[:, 2:] + rng.normal(0, noise_px, (n, 2))
-
-
-def test_perspective_dlt_finds_a_perspective_camera_and_cannot_find_an_affine_one():
-    K, x, u = pinhole(30.0, 3000.0)
-    found = perspective_dlt(x, u)
-    np.testing.assert_allclose(found.decompose()[0], K, rtol=1e-6, atol=1e-4)
-    np.testing.assert_allclose(found.project(x), u, atol=1e-6)
-    R = found.decompose()[1]
-    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-9)
-    focal = [perspective_dlt(*pinhole(20000.0, 2e6, seed, 1.5)[1:]).decompose()[0][0, 0] for seed in range(10)]
-    assert np.median(focal) < 0.2 * 2e6  # the noise decides, not the camera
-    with pytest.raises(ValueError, match="at least 6"):
-        perspective_dlt(x[:5], u[:5])
-
-
-def test_perspective_triangulation():
-    rig = reference_rig(convergence_rad=0.4)
-    near = [NearAffineCamera(c.matrix, 1 / 60, (959.5, 539.5), ROBOT_FROM_MICROSCOPE.t) for c in (rig.left, rig.right)]
-    x = simulate_correspondences(40, rng=np.random.default_rng(0)).true_x_mm
-    u = [c.project(x) for c in near]
-    found = triangulate_perspective([perspective_dlt(x, p) for p in u], u)
-    np.testing.assert_allclose(found, x, atol=1e-5)
-
-
-def test_factorisation_recovers_shape_up_to_a_similarity():
-    rng = np.random.default_rng(0)
-    shape = rng.uniform(-1, 1, (40, 3)) * [8, 4, 2]
-    views = []
-    for _ in range(6):
-        R = RigidTransform.from_rotation_vector(rng.uniform(-0.6, 0.6, 3)).R
-        views.append(rng.uniform(90, 110) * shape @ R[:2].T + rng.uniform(0, 500, 2))
-    found = factorise(np.stack(views))
-    assert found.metric
-    np.testing.assert_allclose(similarity(found.shape, shape), shape, atol=1e-6)
-    again = found.shape @ found.linear[2].T + found.offset_px[2]
-    np.testing.assert_allclose(again, views[2], atol=1e-6)
-    with pytest.raises(ValueError, match="v >= 3"):
-        factorise(np.stack(views[:2]))
-    with pytest.raises(ValueError, match="NaN"):
-        factorise(np.stack(views) * np.nan)
-    flat = np.column_stack([shape[:, :2], np.zeros(40)])
-    with pytest.raises(ValueError, match="coplanar"):
-        factorise(np.stack([flat @ RigidTransform.from_rotation_vector((0, a, 0)).R[:2].T for a in (0.1, 0.4, 0.9)]))
 
 
 def test_rig_of_a_calibration_saves_and_loads(tmp_path):
