@@ -12,7 +12,6 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullForma
 
 from lib.calibration import Calibration, LandmarkOffsets, TimeOffset
 from lib.calibration.ladder import Comparison
-from lib.correspondences import Correspondences
 from lib.geometry import RigidTransform
 from lib.workbench.results import Table
 from notebooks.figures.style import COLOURS, LANDMARK_COLOURS, figure, show_image
@@ -29,12 +28,12 @@ __all__ = [
     "focal_lengths",
     "frame_residuals",
     "ladder",
-    "root_mean_square",
     "noise_errors",
     "offsets",
     "residuals",
     "resolutions",
     "robot_frames",
+    "root_mean_square",
     "shallow_bias",
     "time_offset",
     "when_affine_wins",
@@ -358,7 +357,10 @@ def time_offset(found: TimeOffset, true_s: float) -> Figure:
 
 def checkerboards(table: Table, paper_um: float = 25.479) -> Figure:
     """Recorded errors of reconstructed checkerboards, a panel a kind of optics, root mean squares over the sweeps."""
-    optics = {inverse: table.where(inverse_distance_per_m=inverse) for inverse in sorted(set(table.columns["inverse_distance_per_m"]))}
+    optics = {
+        inverse: table.where(inverse_distance_per_m=inverse)
+        for inverse in sorted(set(table.columns["inverse_distance_per_m"]))
+    }
     page, axes = figure(1, len(optics), width_in=13, height_in=4.6, sharey=True, squeeze=False)
     names = [key.removesuffix("_aligned_um") for key in table.columns if key.endswith("_aligned_um")]
     at = np.arange(len(names))
@@ -392,13 +394,18 @@ def root_mean_square(values: np.ndarray) -> float:
 def estimators(chosen: Table, fresh: Table) -> Figure:
     """Recorded error over its bound, an estimator a group: on the sweeps that chose the estimator and on fresh ones."""
     page, axes = figure(1, 2, width_in=13, height_in=3.8, sharey=True)
-    names = [key.removesuffix("_projection_over_bound") for key in chosen.columns if key.endswith("_projection_over_bound")]
+    names = [
+        key.removesuffix("_projection_over_bound") for key in chosen.columns if key.endswith("_projection_over_bound")
+    ]
     at = np.arange(len(names))
     for ax, key, title in (
         (axes[0], "over_bound", "Triangulation error of exact pixels"),
         (axes[1], "projection_over_bound", "Projection error"),
     ):
-        for table, offset, colour, name in ((chosen, -0.2, "baseline", "sweeps that chose"), (fresh, 0.2, "ours", "fresh sweeps")):
+        for table, offset, colour, name in (
+            (chosen, -0.2, "baseline", "sweeps that chose"),
+            (fresh, 0.2, "ours", "fresh sweeps"),
+        ):
             columns = [table.columns[f"{n}_{key}"] for n in names]
             values = [root_mean_square(column) for column in columns]
             ax.bar(at + offset, values, 0.4, color=COLOURS[colour], label=f"{name} ({len(table)})")
@@ -421,7 +428,11 @@ def coverage(table: Table) -> Figure:
     axes[0].plot(c["n_rows"], c["coverage_95_percent"], "o-", color=COLOURS["ours"])
     axes[0].axhline(95, color=COLOURS["truth"], linewidth=1)
     axes[0].set(ylabel="%", title="Inside the reported 95 % region")
-    for key, name, colour in (("zero_skew", "zero skew", "ours"), ("square", "square pixels", "paper"), ("common_zoom", "common zoom", "warning")):
+    for key, name, colour in (
+        ("zero_skew", "zero skew", "ours"),
+        ("square", "square pixels", "paper"),
+        ("common_zoom", "common zoom", "warning"),
+    ):
         axes[1].plot(c["n_rows"], c[f"{key}_rejected_percent"], "o-", color=COLOURS[colour], label=name)
     axes[1].axhline(5, color=COLOURS["truth"], linewidth=1)
     axes[1].set(ylabel="%", ylim=(0, None), title="True constraints rejected at 5 %")

@@ -18,7 +18,7 @@ from lib.calibration import (
     write_opencv,
     write_ros,
 )
-from lib.cameras import AffineCamera, NearAffineCamera, StereoRig
+from lib.cameras import AffineCamera, StereoRig
 from lib.geometry import RigidTransform
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig, simulate_correspondences
 
