@@ -96,11 +96,11 @@ def calibrate(
     --------
     >>> from lib.cameras import AffineCamera
     >>> rng = np.random.default_rng(0)
-    >>> left, right = AffineCamera([[99, 0, 9, 900], [0, 99, 0, 500]]), AffineCamera([[99, 0, -9, 900], [0, 99, 0, 500]])
+    >>> left, right = AffineCamera([[99, 0, -9, 900], [0, 99, 0, 500]]), AffineCamera([[99, 0, 9, 900], [0, 99, 0, 500]])
     >>> x = rng.uniform(-4, 4, (60, 3))
     >>> found = calibrate(x, [c.project(x) + rng.normal(0, 1, (60, 2)) for c in (left, right)])
     >>> found.rig.left.matrix.round(0)[0].tolist(), int(found.inliers.sum())
-    ([99.0, 0.0, 9.0, 900.0], 60)
+    ([99.0, 0.0, -9.0, 900.0], 60)
     """
     options = {
         "model": model, "weighting": weighting, "sigma_u_px": sigma_u_px, "sigma_x_mm": sigma_x_mm, "ransac_px": ransac_px,

@@ -36,7 +36,8 @@ def write_opencv(camera: AffineCamera | NearAffineCamera, path: str | Path, imag
     >>> import tempfile
     >>> file = Path(tempfile.mkdtemp()) / "left.yml"
     >>> write_opencv(AffineCamera([[100, 0, 5, 960], [0, 100, 0, 540]]), file, (1920, 1080))
-    >>> cv2.FileStorage(str(file), cv2.FILE_STORAGE_READ).getNode("projection_matrix").mat()[0].tolist()
+    >>> storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_READ)
+    >>> storage.getNode("projection_matrix").mat()[0].tolist()
     [100.0, 0.0, 5.0, 960.0]
     """
     path = Path(path)

@@ -310,8 +310,7 @@ def fit(
             normal = np.cross(A[0], A[1])
             if rho and (1.0 + rho * (x @ normal) / np.linalg.norm(normal)).min() <= 0.05:
                 return None  # a point lies behind the camera
-        with np.errstate(all="ignore"):
-            cost, *work = settle(state, x, y, h, noise, variance_x, model.is_affine)
+        cost, *work = settle(state, x, y, h, noise, variance_x, model.is_affine)
         return (cost, work) if np.isfinite(cost) else None
 
     def normal_equations(state: State, work: tuple) -> tuple[np.ndarray, np.ndarray]:
@@ -320,6 +319,7 @@ def fit(
         WJ = (np.broadcast_to(weight, (len(x), *weight.shape[1:])) @ J).reshape(-1, J.shape[2])
         return J.reshape(WJ.shape).T @ WJ, WJ.T @ r.ravel()
 
-    found = minimise(start, evaluate, normal_equations, lambda state, step: state.moved(T @ step))
+    with np.errstate(all="ignore"):  # a first step may be far too long: its energy is not finite, and it is shortened
+        found = minimise(start, evaluate, normal_equations, lambda state, step: state.moved(T @ step))
     r, settled, _ = found.work
     return Fit(found.state, found.energy, r, settled, found.information, found.converged)

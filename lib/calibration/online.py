@@ -6,22 +6,47 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lib.calibration.affine import Moments, affine_minimum
-from lib.calibration.robust import gate
+from lib.calibration.robust import consensus, gate
 from lib.cameras import AffineCamera, StereoRig
+from lib.correspondences import Correspondences
 from lib.geometry import points
 
 __all__ = ["OnlineCalibration"]
+
+_START_ROWS = 30  # that must agree on a rig before single rows are judged by it
+_MOST_ROWS = 240  # kept until then
 
 
 class OnlineCalibration:
     """The affine minimum of all rows so far, older ones weighed down, in constant time and memory.
 
+    The first rows are kept and judged together, so a gross error among them does not decide which later rows are right.  From
+    then on a row is judged by the rig of those before it.
+
     Parameters
     ----------
     sigma_u_px, sigma_x_mm:
-        Noise levels; they weigh the terms and gate outliers.
+        Noise levels; they weigh the terms and judge the rows.
     forgetting:
         Weight that remains of the past after each `add`, in (0, 1]; 1 forgets nothing.
+
+    Attributes
+    ----------
+    moments:
+        Of the rows used, None before they agree on a rig.
+    rejected_share:
+        Of the newest rows (about 100), how many were judged wrong.  Near 1, the cameras moved or the noise levels are wrong.
+
+    Examples
+    --------
+    >>> rng, A = np.random.default_rng(0), np.array([[99.0, 0, 9], [0, 99, 0], [99, 0, -9], [0, 99, 0]])
+    >>> online = OnlineCalibration()
+    >>> for _ in range(20):
+    ...     x = rng.uniform(-4, 4, (3, 3))
+    ...     y = x @ A.T + rng.normal(0, 1, (3, 4))
+    ...     _ = online.add(x, y[:, :2], y[:, 2:])
+    >>> online.ready, online.solve().linear.round(0)[0].tolist()
+    (True, [99.0, 0.0, 9.0])
     """
 
     def __init__(self, *, sigma_u_px: float = 1.0, sigma_x_mm: float = 0.010, forgetting: float = 1.0) -> None:
@@ -31,46 +56,80 @@ class OnlineCalibration:
             raise ValueError(f"forgetting: must lie in (0, 1], got {forgetting}.")
         self.sigma_u_px, self.sigma_x_mm, self.forgetting = sigma_u_px, sigma_x_mm, forgetting
         self.moments: Moments | None = None
+        self.rejected_share = 0.0
         self._matrix: np.ndarray | None = None
+        self._first: np.ndarray | None = np.empty((0, 7))  # rows (x, y) until they agree on a rig
 
     @property
     def ready(self) -> bool:
-        """True as soon as the rows span a volume well beyond the robot's accuracy."""
-        if self.moments is None or self.moments.weight < 6:
-            return False
-        thickness = np.sqrt(max(np.linalg.eigvalsh(self.moments.scatter[-3:, -3:])[0], 0.0) / self.moments.weight)
-        return bool(thickness > max(5.0 * self.sigma_x_mm, 1e-9))
+        """True as soon as rows that agree span a volume well beyond the robot's accuracy."""
+        return self.moments is not None and self.moments.weight >= 8 and self._spans(self.moments)
 
-    def add(self, x_mm: ArrayLike, u_left: ArrayLike, u_right: ArrayLike) -> np.ndarray:
-        """Fold in the rows of a frame; rows with NaN, and rows beyond the gate once `ready`, are left out.
+    def add(
+        self, data: Correspondences | ArrayLike, u_left: ArrayLike | None = None, u_right: ArrayLike | None = None
+    ) -> np.ndarray:
+        """Fold in the rows of a frame; incomplete rows, and rows judged wrong, are left out.
+
+        Parameters
+        ----------
+        data:
+            `Correspondences`; or positions (n, 3) mm with `u_left` and `u_right` (n, 2) px, NaN where missing.
 
         Returns
         -------
         (n,) bool, the rows used.
         """
-        x = points(x_mm, 3, "x_mm")
+        complete = None
+        if isinstance(data, Correspondences):
+            data, u_left, u_right, complete = data.x_mm, data.u_left, data.u_right, data.is_complete
+        x = points(data, 3, "x_mm")
         y = np.hstack([points(u_left, 2, "u_left"), points(u_right, 2, "u_right")])
         if len(x) != len(y):
             raise ValueError(f"x_mm, u: {len(x)} and {len(y)} rows; correspondences go row by row.")
         used = np.isfinite(x).all(axis=1) & np.isfinite(y).all(axis=1)
-        if self.ready and used.any():
-            matrix = self._solve()
-            A = matrix[:, :3]
-            r = np.where(used[:, None], y - x @ A.T - matrix[:, 3], 0.0)
-            # A new row's residual also has the calibration's own uncertainty: (1 + leverage) S.
-            d = x - self.moments.mean[4:]
-            inverse = np.linalg.inv(self.moments.scatter[4:, 4:])
-            leverage = 1.0 / self.moments.weight + np.einsum("ni,ij,nj->n", d, inverse, d)
-            S = self.sigma_u_px**2 * np.eye(4) + self.sigma_x_mm**2 * A @ A.T
-            distance2 = np.einsum("ni,ij,nj->n", r, np.linalg.inv(S), r) / (1.0 + leverage)
-            used &= distance2 < gate(100, 4)
-        if self.moments is not None:
-            self.moments = self.moments.faded(self.forgetting)
-        if used.any():
-            new = Moments.of(x[used], y[used])
-            self.moments = new if self.moments is None else self.moments.merged(new)
-            self._matrix = None
+        if complete is not None:
+            used &= complete
+        if not used.any():
+            return used
+        right = self._start(x[used], y[used]) if self._first is not None else self._fold(x[used], y[used])
+        for fine in right:
+            self.rejected_share += 0.01 * (float(not fine) - self.rejected_share)
+        used[used] = right
+        self._matrix = None
         return used
+
+    def _start(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Judge all rows so far together."""
+        self._first = np.vstack([self._first, np.hstack([x, y])])
+        keep = np.ones(len(self._first), dtype=bool)
+        first_x, first_y = self._first[:, :3], self._first[:, 3:]
+        if len(keep) >= 8 and self._spans(Moments.of(first_x, first_y)):
+            try:
+                keep = consensus(first_x, first_y, None, np.random.default_rng(0), sigma_x_mm=self.sigma_x_mm)
+            except ValueError:  # nothing agrees yet
+                keep[:] = False
+        self.moments = Moments.of(first_x[keep], first_y[keep]) if keep.any() else None
+        if len(keep) >= _START_ROWS and self.ready:
+            self._first = None
+        elif len(keep) > _MOST_ROWS:
+            self._first = self._first[::2]
+        return keep[-len(x) :]
+
+    def _fold(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Judge the rows by the rig of those before, and add them to the moments."""
+        matrix = self._solve()
+        A = matrix[:, :3]
+        r = y - x @ A.T - matrix[:, 3]
+        # A new row's residual also has the calibration's own uncertainty: (1 + leverage) S.
+        d = x - self.moments.mean[4:]
+        inverse = np.linalg.inv(self.moments.scatter[4:, 4:])
+        leverage = 1.0 / self.moments.weight + np.einsum("ni,ij,nj->n", d, inverse, d)
+        S = self.sigma_u_px**2 * np.eye(4) + self.sigma_x_mm**2 * A @ A.T
+        right = np.einsum("ni,ij,nj->n", r, np.linalg.inv(S), r) / (1.0 + leverage) < gate(100, 4)
+        self.moments = self.moments.faded(self.forgetting)
+        if right.any():
+            self.moments = self.moments.merged(Moments.of(x[right], y[right]))
+        return right
 
     def solve(self) -> StereoRig:
         """The rig of the rows so far.
@@ -96,6 +155,10 @@ class OnlineCalibration:
         HtH[:3, 3] = HtH[3, :3] = n * mean
         HtH[3, 3] = n
         return np.kron(S, np.linalg.inv(HtH))
+
+    def _spans(self, moments: Moments) -> bool:
+        thickness = np.sqrt(max(np.linalg.eigvalsh(moments.scatter[-3:, -3:])[0], 0.0) / moments.weight)
+        return bool(thickness > max(5.0 * self.sigma_x_mm, 1e-9))
 
     def _solve(self) -> np.ndarray:
         if self._matrix is None:

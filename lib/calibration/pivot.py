@@ -25,6 +25,10 @@ class Pivot:
     rms_mm: float
 
 
+_TURN = 0.02  # least RMS turn (rad) about a second axis: 10 um of the robot's noise then leave 0.5 mm / sqrt(poses)
+_LARGEST_SD_MM = 1.0  # of an offset's coordinate, beyond which the motion determines nothing
+
+
 def _poses(robot_from_tool: Sequence[RigidTransform]) -> tuple[np.ndarray, np.ndarray]:
     poses = list(robot_from_tool)
     if len(poses) < 3:
@@ -32,7 +36,7 @@ def _poses(robot_from_tool: Sequence[RigidTransform]) -> tuple[np.ndarray, np.nd
     R, t = np.stack([p.R for p in poses]), np.stack([p.t for p in poses])
     # A landmark is seen only through rotations that move it: two different axes at least.
     turned = (R - R.mean(axis=0)).reshape(-1, 3)
-    if np.linalg.svd(turned, compute_uv=False)[2] < 1e-3 * np.sqrt(len(R)):
+    if np.linalg.svd(turned, compute_uv=False)[2] < _TURN * np.sqrt(len(R)):
         raise ValueError("robot_from_tool: the tool hardly turns, or about one axis only; rotate it about two axes.")
     return R, t
 
@@ -43,7 +47,14 @@ def pivot_calibration(robot_from_tool: Sequence[RigidTransform]) -> Pivot:
     Raises
     ------
     ValueError
-        For fewer than three poses, or rotations about one axis only.
+        For fewer than three poses, rotations about one axis only, or a tip that did not rest.
+
+    Examples
+    --------
+    >>> R = [RigidTransform.from_rotation_vector(v).R for v in ((0, 0, 0), (0.4, 0, 0), (0, 0.4, 0), (-0.3, 0.2, 0))]
+    >>> tip, rest = np.array([0.0, 1.0, 12.0]), np.array([5.0, 5.0, 5.0])
+    >>> pivot_calibration([RigidTransform(r, rest - r @ tip) for r in R]).offset_mm.round(6).tolist()
+    [0.0, 1.0, 12.0]
     """
     R, t = _poses(robot_from_tool)
     n = len(R)
@@ -52,7 +63,23 @@ def pivot_calibration(robot_from_tool: Sequence[RigidTransform]) -> Pivot:
     r = design @ solution + t.ravel()
     variance = float(r @ r) / max(3 * n - 6, 1)
     covariance = variance * np.linalg.inv(design.T @ design)
-    return Pivot(solution[:3], solution[3:], covariance, float(np.sqrt((r**2).sum() / n)))
+    rms, spread = float(np.sqrt((r**2).sum() / n)), float(np.sqrt(((t - t.mean(axis=0)) ** 2).sum() / n))
+    if rms > max(0.25 * spread, 0.05):
+        raise ValueError(
+            f"robot_from_tool: the tip did not rest in one point ({rms:.2f} mm RMS about the best one); hold it in a divot, or "
+            "use tool_offsets, which takes any motion with images."
+        )
+    _check_determined(covariance[:3, :3])
+    return Pivot(solution[:3], solution[3:], covariance, rms)
+
+
+def _check_determined(covariance_mm2: np.ndarray) -> None:
+    sd = np.sqrt(np.diagonal(covariance_mm2, axis1=-2, axis2=-1))
+    if not (sd < _LARGEST_SD_MM).all():
+        raise ValueError(
+            f"robot_from_tool: the motion leaves an offset open by {np.nanmax(sd):.2g} mm; turn the tool further, about two "
+            "axes, or give more poses."
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +114,7 @@ def tool_offsets(
     Raises
     ------
     ValueError
-        For too few poses or rotations about one axis only, or shapes that do not match.
+        For too few poses, motion that does not determine the offsets, or shapes that do not match.
     """
     R, t = _poses(robot_from_tool)
     images = [np.asarray(pixels, dtype=np.float64) for pixels in u]
@@ -121,6 +148,7 @@ def tool_offsets(
     variance = float((r**2).sum()) / max(r.size - 4 * m - 3 * k, 1)
     covariance = variance * np.linalg.inv(flat.T @ flat)
     blocks = np.stack([covariance[3 * j : 3 * j + 3, 3 * j : 3 * j + 3] for j in range(k)])
+    _check_determined(blocks)
     cameras = tuple(AffineCamera(matrix[2 * c : 2 * c + 2]) for c in range(m // 2))
     return ToolOffsets(offset, blocks, cameras, float(np.sqrt((r**2).sum() / (len(r) * m / 2))))
 

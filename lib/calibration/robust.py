@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.special import gammainccinv, gammaincinv
+from scipy.stats import f as f_distribution
 
 from lib.calibration.affine import Moments, affine_minimum, estimate_noise, regress
 
@@ -18,6 +19,7 @@ __all__ = ["consensus", "gate"]
 
 FALSE_ALARM = 1e-4
 _ROWS_RANKED = 500
+_FEW = 25  # rows, below which the noise of the best sample is no measure
 
 
 def gate(n: int, m: int) -> float:
@@ -77,6 +79,9 @@ def consensus(
     if threshold_px is not None:
         keep = _by_threshold(x, y, H, (distance2 < threshold_px**2).all(axis=1), threshold_px)
         enough = max(8, n // 10)
+    elif n < _FEW:
+        keep = _by_growth(x, y, distance2.max(axis=1))
+        enough = min(8, n - n // 4)
     else:
         # The median of |r|^2 is 1.386 variances where the noise is Gaussian.
         scale2 = np.median(distance2, axis=0) / _chi2_quantile(0.5, 2) + 1e-18 * y_scale**2
@@ -124,6 +129,42 @@ def _by_threshold(x: np.ndarray, y: np.ndarray, H: np.ndarray, keep: np.ndarray,
             break
         keep = new
     return keep
+
+
+def _by_growth(x: np.ndarray, y: np.ndarray, distance2: np.ndarray) -> np.ndarray:
+    """Few rows: from the half that agrees best, taking in the next best row as long as an F test lets it.
+
+    Of few rows some minimal sample always fits a few others by chance, so its residuals say too little about the noise
+    (Atkinson and Riani, "Robust diagnostic regression analysis", 2000: the forward search).
+    """
+    n, m = y.shape
+    size = (n + 5) // 2
+    keep = np.argsort(distance2)[:size]
+    for _ in range(10):  # concentrate: the rows nearest to their own fit
+        r = y - np.column_stack([x, np.ones(n)]) @ regress(x[keep], y[keep]).T
+        new = np.argsort((r**2).sum(axis=1))[:size]
+        if set(new) == set(keep):
+            break
+        keep = new
+    while True:
+        H = np.column_stack([x, np.ones(n)])
+        M = regress(x[keep], y[keep])
+        r = y - H @ M.T
+        freedom = len(keep) - 4
+        sigma_u, sigma_x = estimate_noise(r[keep], M[:, :3], 4 * m)
+        S = (sigma_u**2 + (1e-11 * np.abs(y).max()) ** 2) * np.eye(m) + sigma_x**2 * M[:, :3] @ M[:, :3].T
+        # A row outside the fit is predicted with the fit's own uncertainty.
+        leverage = np.einsum("ni,ij,nj->n", H, np.linalg.inv(H[keep].T @ H[keep]), H)
+        distance2 = np.einsum("ni,ij,nj->n", r, np.linalg.inv(S), r) / (1.0 + leverage)
+        distance2[keep] = -1.0
+        order = np.argsort(distance2)
+        bound = m * f_distribution.isf(FALSE_ALARM / n, m, max(m * freedom // 2, 1))
+        if len(keep) == n or distance2[order[len(keep)]] > bound:
+            break
+        keep = order[: len(keep) + 1]
+    inside = np.zeros(n, dtype=bool)
+    inside[keep] = True
+    return inside
 
 
 def _by_noise(x: np.ndarray, y: np.ndarray, keep: np.ndarray) -> np.ndarray:
