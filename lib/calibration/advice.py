@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import product
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -26,10 +25,8 @@ class Advice:
         Largest sd of a triangulated point from calibration, in units of the sd of one detection, over the workspace.
     worst_depth_um:
         Largest depth sd from the calibration alone, over the workspace.
-    next_position_mm:
-        (3,) the reachable position whose correspondence helps most.
-    gain:
-        log det of the information after that correspondence over before.
+    next_position_mm, gain:
+        (3,) the reachable position whose correspondence helps most, and the log det of the information that it adds.
     text:
         The same in a sentence.
     """
@@ -45,29 +42,21 @@ class Advice:
 def box_grid(low_mm: ArrayLike, high_mm: ArrayLike, steps: int = 5) -> np.ndarray:
     """(steps^3, 3) points of a box in the robot frame, its corners among them.
 
-    Raises
-    ------
-    ValueError
-        If a side is not positive.
+    >>> box_grid([0, 0, 0], [1, 2, 3], steps=2)[-1].tolist()
+    [1.0, 2.0, 3.0]
     """
     low, high = finite_points(low_mm, 3, "low_mm")[0], finite_points(high_mm, 3, "high_mm")[0]
     if not (high > low).all():
         raise ValueError(f"high_mm: must be above low_mm in every coordinate, got {low} and {high}.")
-    return np.array(list(product(*(np.linspace(a, b, steps) for a, b in zip(low, high, strict=True)))))
+    axes = np.linspace(low, high, steps).T
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
 def next_positions(calibration: Calibration, candidates_mm: ArrayLike, count: int = 1) -> tuple[np.ndarray, np.ndarray]:
     """The `count` positions, chosen one after another, whose correspondences raise det(information) most.
 
     det(H^T H + h h^T) = det(H^T H)(1 + leverage), so for the affine model this is the largest leverage; after each choice
-    the covariance is updated, so the positions differ.
-
-    Returns
-    -------
-    positions:
-        (count, 3) mm in the robot frame.
-    gains:
-        (count,) log det gained by each.
+    the covariance is updated, so the positions differ.  Returns positions (count, 3) mm and the log det that each gains.
     """
     x = finite_points(candidates_mm, 3, "candidates_mm")
     J, S = calibration.derivatives(x)[1], calibration.row_covariance(x)
@@ -102,14 +91,9 @@ def advise(
     Parameters
     ----------
     low_mm, high_mm:
-        Corners of the box that the tool can reach in view of both cameras, robot frame.
+        Corners of the box that the tool can reach in view of both cameras, robot frame; an empty box is a ValueError.
     workspace_mm:
         (n, 3) points that will be reconstructed; None is a grid over the box.
-
-    Raises
-    ------
-    ValueError
-        For a single camera or an empty box.
     """
     grid = box_grid(low_mm, high_mm) if workspace_mm is None else points(workspace_mm, 3, "workspace_mm")
     alone = calibration.point_covariance(grid, detection=False)

@@ -9,6 +9,7 @@ So E depends on the data only through their second moments, and its global minim
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,15 +26,14 @@ def dlt(x_mm: ArrayLike, u: ArrayLike) -> AffineCamera:
 
     Parameters
     ----------
-    x_mm:
-        (n, 3) points in the robot frame, n >= 4, not coplanar.
-    u:
-        (n, 2) pixels.
+    x_mm, u:
+        (n, 3) points in the robot frame and their (n, 2) pixels, n >= 4, finite, not coplanar (else a ValueError).
 
-    Raises
-    ------
-    ValueError
-        For NaN rows, fewer than four points, coplanar or collinear points.
+    Examples
+    --------
+    >>> x = np.vstack([np.zeros(3), np.eye(3)])
+    >>> dlt(x, AffineCamera([[100, 0, 8, 960], [0, 100, 0, 540]]).project(x)).matrix.round(6).tolist()
+    [[100.0, 0.0, 8.0, 960.0], [0.0, 100.0, 0.0, 540.0]]
     """
     x, u = finite_points(x_mm, 3, "x_mm"), finite_points(u, 2, "u")
     check_spread(x, u)
@@ -49,16 +49,9 @@ def regress(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Moments:
-    """Weight, mean and scatter of z = (y, x): all that the affine problem needs to know of its data.
+    """All that the affine problem needs to know of its data, z = (y, x) with the pixels first.
 
-    Attributes
-    ----------
-    weight:
-        Number of points, or the sum of their weights.
-    mean:
-        (m + 3,), pixels first, then mm.
-    scatter:
-        (m + 3, m + 3), the weighted sum of (z - mean)(z - mean)^T.
+    `weight` is the number of points, `mean` (m + 3,) and `scatter` (m + 3, m + 3) the sum of (z - mean)(z - mean)^T.
     """
 
     weight: float
@@ -85,8 +78,7 @@ class Moments:
         return Moments(self.weight * factor, self.mean, self.scatter * factor)
 
 
-@dataclass(frozen=True, eq=False)
-class AffineMinimum:
+class AffineMinimum(NamedTuple):
     """The cameras [A, t] stacked as `matrix` (m, 4), and the energy `cost` there."""
 
     matrix: np.ndarray
@@ -98,13 +90,7 @@ def affine_minimum(moments: Moments, variance_u: float, variance_x: float) -> Af
 
     With z = (y / sigma_u, x / sigma_x) centred, the energy is the squared distance of the z to a 3-dimensional
     subspace, so the three leading eigenvectors of their scatter solve it: no initial value, no iteration.
-
-    Parameters
-    ----------
-    moments:
-        Of the correspondences.
-    variance_u, variance_x:
-        px^2 and mm^2; variance_x = 0 is plain least squares (DLT).
+    The variances are in px^2 and mm^2; variance_x = 0 is plain least squares (DLT).
     """
     m = len(moments.mean) - 3
     scatter = moments.scatter
@@ -140,57 +126,37 @@ def estimate_noise(
     sigma_u_px: float | None = None,
     sigma_x_mm: float | None = None,
 ) -> tuple[float, float]:
-    """sigma_u and sigma_x from residuals whose covariance is sigma_u^2 I + sigma_x^2 A A^T.
+    """sigma_u and sigma_x from residuals (n, m) whose covariance is sigma_u^2 I + sigma_x^2 A A^T.
 
     Along the epipolar direction (n^T A = 0) the robot's error cannot show, so the residual there is sigma_u alone; the
     other directions add sigma_x.  Maximum likelihood by Fisher scoring over the eigenvectors of A A^T.  A single camera
-    has no epipolar direction: unless one level is given, everything is attributed to the pixels.
-
-    Parameters
-    ----------
-    residuals:
-        (n, m) px, y - A x - t.
-    A:
-        (m, 3).
-    parameters:
-        Fitted parameters, for the degrees of freedom.
-    sigma_u_px, sigma_x_mm:
-        A level that is known and kept.
-
-    Returns
-    -------
-    sigma_u_px, sigma_x_mm
+    has no epipolar direction: unless one level is given, everything is attributed to the pixels.  `parameters` is the
+    number of fitted ones, for the degrees of freedom; a level that is given is kept.
     """
     n, m = residuals.shape
-    if sigma_u_px is not None and sigma_x_mm is not None:
-        return float(sigma_u_px), float(sigma_x_mm)
+    known = [np.nan if sigma is None else float(sigma) for sigma in (sigma_u_px, sigma_x_mm)]
+    free = np.isnan(known)
     freedom = n - parameters / m
-    if freedom < 2:  # nothing to learn from: the weights that make plain least squares of the cameras
-        return (1.0 if sigma_u_px is None else float(sigma_u_px)), (0.0 if sigma_x_mm is None else float(sigma_x_mm))
+    if freedom < 2 or not free.any():  # nothing to learn from: the weights that make plain least squares of the cameras
+        return tuple(np.where(free, [1.0, 0.0], known).tolist())
     gain, directions = np.linalg.eigh(A @ A.T)
     gain = np.maximum(gain, 0.0)
     observed = ((residuals @ directions) ** 2).sum(axis=0) / freedom
     floor = 1e-18 + 1e-24 * gain.max()
-    if sigma_u_px is None and sigma_x_mm is None and m < 3:
+    if free.all() and m < 3:
         return float(np.sqrt(max(observed.mean(), floor))), 0.0
-    if sigma_u_px is not None:
-        v_u = float(sigma_u_px) ** 2
-    else:
-        v_u = max(observed[0], floor)
-    if sigma_x_mm is not None:
-        v_x = float(sigma_x_mm) ** 2
-    else:  # a start that is right where either noise is negligible
-        seen = gain > 1e-9 * gain.max()
-        v_x = float(np.median(np.maximum(observed[seen] - v_u, 0.0) / gain[seen])) if seen.any() else 0.0
+    # A start that is right where either noise is negligible.
+    v = np.where(free, [max(observed[0], floor), 0.0], np.square(known))
+    seen = gain > 1e-9 * gain.max()
+    if free[1] and seen.any():
+        v[1] = np.median(np.maximum(observed[seen] - v[0], 0.0) / gain[seen])
     design = np.column_stack([np.ones(m), gain])
-    free = np.array([sigma_u_px is None, sigma_x_mm is None])
-    v = np.array([v_u, v_x])
     for _ in range(50):
         weight = 1.0 / np.maximum(design @ v, floor) ** 2
-        active = free.copy()
-        target = observed - design[:, ~active] @ v[~active]
+        root, scale = np.sqrt(weight), np.abs(design[:, free]).max(axis=0)
+        target = observed - design[:, ~free] @ v[~free]
         new = v.copy()
-        new[active] = _weighted(design[:, active], target, weight)
+        new[free] = np.linalg.lstsq(design[:, free] / scale * root[:, None], target * root, rcond=None)[0] / scale
         if new[1] < 0 and free[1]:  # the bound v_x >= 0 binds
             new[1] = 0.0
             if free[0]:
@@ -200,9 +166,3 @@ def estimate_noise(
             break
         v = new
     return float(np.sqrt(new[0])), float(np.sqrt(new[1]))
-
-
-def _weighted(design: np.ndarray, target: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    scale = np.abs(design).max(axis=0)
-    B = design / scale
-    return np.linalg.lstsq(B * np.sqrt(weight)[:, None], target * np.sqrt(weight), rcond=None)[0] / scale

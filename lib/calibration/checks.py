@@ -1,4 +1,4 @@
-"""What is refused before any fit, with the reason and the cure."""
+"""What is refused before any fit: each check raises a ValueError with the reason and the cure."""
 
 from __future__ import annotations
 
@@ -9,14 +9,7 @@ from numpy.typing import ArrayLike
 
 from lib.geometry import finite_points, points
 
-__all__ = [
-    "check_duplicates",
-    "check_images",
-    "check_order",
-    "check_spread",
-    "check_units",
-    "stacked_rows",
-]
+__all__ = ["check_duplicates", "check_images", "check_order", "check_spread", "check_units", "stacked_rows"]
 
 #: Zoom (px per mm) between a room camera and the resolution of light; what lies outside has the wrong unit.
 PLAUSIBLE_PX_PER_MM = (0.2, 5000.0)
@@ -25,17 +18,9 @@ ROBOT_ACCURACY_MM = 0.010
 
 
 def stacked_rows(x_mm: ArrayLike, u: Sequence[ArrayLike]) -> tuple[np.ndarray, np.ndarray]:
-    """x (n, 3) and the stacked pixels y (n, 2 cameras), finite and of one length.
-
-    Raises
-    ------
-    ValueError
-        For another number of cameras than one or two, unequal lengths, NaN rows, fewer than four points.
-    """
+    """x (n, 3) and the stacked pixels y (n, 2 cameras) of one or two cameras, finite and of one length, four at least."""
     x = finite_points(x_mm, 3, "x_mm")
-    if isinstance(u, np.ndarray) and u.ndim == 2:
-        u = [u]
-    u = list(u)
+    u = [u] if isinstance(u, np.ndarray) and u.ndim == 2 else list(u)
     if len(u) not in (1, 2):
         raise ValueError(f"u: expected [u_left, u_right] or [u], got {len(u)} arrays.")
     names = ["u_left", "u_right"] if len(u) == 2 else ["u"]
@@ -50,14 +35,7 @@ def stacked_rows(x_mm: ArrayLike, u: Sequence[ArrayLike]) -> tuple[np.ndarray, n
 
 
 def check_spread(x: np.ndarray, u: np.ndarray, sigma_x_mm: float = 0.0) -> None:
-    """Refuse points that do not span a volume.
-
-    Raises
-    ------
-    ValueError
-        If lengths differ, there are fewer than four points, or they are coplanar or collinear: exactly, or but for
-        a thickness of less than twice the robot's accuracy.
-    """
+    """Refuse fewer than four points, and coplanar or collinear ones, but for a thickness of twice the robot's accuracy."""
     if len(x) != len(u):
         raise ValueError(f"x_mm, u: {len(x)} and {len(u)} points; correspondences go row by row.")
     if len(x) < 4:
@@ -78,12 +56,7 @@ def check_spread(x: np.ndarray, u: np.ndarray, sigma_x_mm: float = 0.0) -> None:
 
 
 def check_units(x: np.ndarray, y: np.ndarray) -> None:
-    """Refuse points whose implied zoom no camera has: metres or micrometres given as millimetres.
-
-    Raises
-    ------
-    ValueError
-    """
+    """Refuse points whose implied zoom no camera has: metres or micrometres given as millimetres."""
 
     def extent(values: np.ndarray) -> float:  # robust: a few gross rows must not look like another unit
         middle = np.median(np.abs(values - np.median(values, axis=0)), axis=0).max()
@@ -92,8 +65,7 @@ def check_units(x: np.ndarray, y: np.ndarray) -> None:
     size = extent(x)
     if size <= 1e-9 * np.abs(x).max():
         return  # no motion at all: `check_spread` says so
-    zoom = extent(y) / size
-    low, high = PLAUSIBLE_PX_PER_MM
+    zoom, (low, high) = extent(y) / size, PLAUSIBLE_PX_PER_MM
     if zoom > high:
         raise ValueError(
             f"x_mm: the images show {zoom:.3g} px per mm, finer than light resolves; "
@@ -107,65 +79,41 @@ def check_units(x: np.ndarray, y: np.ndarray) -> None:
 
 
 def check_duplicates(x: np.ndarray, y: np.ndarray) -> None:
-    """Refuse rows that repeat another row in every digit: they add no information and fake precision.
-
-    Raises
-    ------
-    ValueError
-    """
-    rows = np.ascontiguousarray(np.hstack([x, y])).view(np.dtype((np.void, 8 * (x.shape[1] + y.shape[1])))).ravel()
-    repeated = len(rows) - len(np.unique(rows))
+    """Refuse rows that repeat another row in every digit: they add no information and fake precision."""
+    repeated = len(x) - len(np.unique(np.hstack([x, y]), axis=0))
     if repeated:
         raise ValueError(
-            f"x_mm, u: {repeated} of {len(rows)} rows repeat another row exactly (a frozen video or frames read twice); "
+            f"x_mm, u: {repeated} of {len(x)} rows repeat another row exactly (a frozen video or frames read twice); "
             "drop the duplicated frames."
         )
 
 
 def check_images(y: np.ndarray, image_size_px: tuple[int, int] | None = None) -> None:
-    """Refuse pixels (n, m) that no calibration can use.
-
-    They stand still or lie on a line in a camera, are the same in both, or leave the image (rows before columns).
-
-    Raises
-    ------
-    ValueError
-    """
+    """Refuse pixels (n, m) that stand still or on a line in a camera, are the same in both, or leave the image."""
     names = ["u_left", "u_right"] if y.shape[1] == 4 else ["u"]
     for name, u in zip(names, np.split(y, len(names), axis=1), strict=True):
         size = np.linalg.svd(u - u.mean(axis=0), compute_uv=False)
         if size[1] <= 1e-9 * np.abs(u).max() * np.sqrt(len(u)):
             raise ValueError(f"{name}: the detections stand still or lie on one line; is this the moving tool?")
-        if image_size_px is None:
-            continue
-        margin, limit = 0.1 * np.asarray(image_size_px, dtype=float), np.asarray(image_size_px, dtype=float)
-        outside = ((u < -margin) | (u > limit + margin)).any(axis=1).mean()
-        swapped = ((u[:, ::-1] < -margin) | (u[:, ::-1] > limit + margin)).any(axis=1).mean()
-        if outside > 0.1 and swapped < 0.5 * outside:
-            raise ValueError(
-                f"{name}: {100 * outside:.0f} % of the pixels lie outside the image of {image_size_px[0]} x "
-                f"{image_size_px[1]}; give (x, y), x to the right, not (row, column)."
+        if image_size_px is not None:
+            limit = np.asarray(image_size_px, dtype=float)
+            outside, swapped = (
+                ((v < -0.1 * limit) | (v > 1.1 * limit)).any(axis=1).mean() for v in (u, u[:, ::-1])
             )
+            if outside > 0.1 and swapped < 0.5 * outside:
+                raise ValueError(
+                    f"{name}: {100 * outside:.0f} % of the pixels lie outside the image of {image_size_px[0]} x "
+                    f"{image_size_px[1]}; give (x, y), x to the right, not (row, column)."
+                )
     if len(names) == 2 and (y[:, :2] == y[:, 2:]).all(axis=1).mean() > 0.5:
         raise ValueError("u_right: the same pixels as u_left; give the right camera's own detections.")
 
 
 def check_order(A: np.ndarray, sd_rad: float) -> None:
-    """Refuse a stereo head whose left camera stands on the right, where the geometry leaves no doubt.
+    """Refuse a stereo head A (4, 3) whose left camera stands on the right, where the geometry leaves no doubt.
 
     Judged only where the two images are alike in rotation (30 degrees), the axes converge by 1 to 30 degrees, the baseline
-    runs along the image rows, and its sign is five standard deviations from zero.
-
-    Parameters
-    ----------
-    A:
-        (4, 3) of both cameras.
-    sd_rad:
-        Standard deviation of the angle between the two axes.
-
-    Raises
-    ------
-    ValueError
+    runs along the image rows, and its sign is five standard deviations `sd_rad` of the convergence from zero.
     """
     a, b, c, d = A / np.linalg.norm(A, axis=1, keepdims=True)
     left, right = np.cross(a, b), np.cross(c, d)
@@ -174,9 +122,7 @@ def check_order(A: np.ndarray, sd_rad: float) -> None:
         return
     # Cameras stand against their viewing directions, so the right camera lies along left - right.
     along, across = (left - right) @ (a + c) / 2, (left - right) @ (b + d) / 2
-    if not np.deg2rad(1) < np.hypot(along, across) < np.deg2rad(30):
-        return
-    if along < -max(3.0 * abs(across), 5.0 * sd_rad):
+    if np.deg2rad(1) < np.hypot(along, across) < np.deg2rad(30) and along < -max(3.0 * abs(across), 5.0 * sd_rad):
         raise ValueError(
             "u: the cameras are swapped, the one called left stands on the right by "
             f"{np.rad2deg(-along):.1f} degrees; exchange u_left and u_right (or both images are mirrored: flip them). "

@@ -285,14 +285,11 @@ def _minimise(
         weigh = variance_u * np.eye(m)[None] if sigma is None or weighting == "paper" else sigma
         if len(weigh) == 1 and np.allclose(weigh[0], variance_u * np.eye(m), rtol=1e-12, atol=0):
             start = affine_minimum(moments, variance_u, variance_x)
-        state = State.start(plan, start.matrix, reference, middles)
-        if plan.is_affine and len(weigh) == 1:
-            # Eight weighted rows have the moments of all n: the energy of an affine model is a function of them.
-            rows, h = _compressed(moments, reference)
-            packed = fit(plan, state, rows[:, m:], rows[:, :m], weigh, variance_x, h)
-            minimum = _unpacked(packed, x - reference, y, weigh, variance_x)
+        if minimum is None or (plan.is_affine and len(weigh) == 1):
+            state = State.start(plan, start.matrix, reference, middles)
         else:
-            minimum = fit(plan, state if minimum is None else minimum.state, x - reference, y, weigh, variance_x)
+            state = minimum.state
+        minimum = fit(plan, state, x - reference, y, weigh, variance_x)
         if known["sigma_x_mm"] is not None and (sigma is not None or known["sigma_u_px"] is not None):
             break
         residuals, A = minimum.residuals, minimum.state.A.reshape(m, 3)
@@ -324,27 +321,6 @@ def _levels(
             break
         v = new
     return sigma_u, float(np.sqrt(new))
-
-
-def _compressed(moments: Moments, reference: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows (m + 4, m + 3) and their weights h of the constant, with the moments of the whole data about `reference`."""
-    values, vectors = np.linalg.eigh(moments.scatter / np.outer(*(2 * [np.sqrt(np.diag(moments.scatter))])))
-    root = (vectors * np.sqrt(np.maximum(values, 0.0))).T * np.sqrt(np.diag(moments.scatter))
-    mean = moments.mean.copy()
-    mean[-3:] -= reference
-    rows = np.vstack([root, np.sqrt(moments.weight) * mean])
-    return rows, np.append(np.zeros(len(root)), np.sqrt(moments.weight))
-
-
-def _unpacked(packed: Fit, centred: np.ndarray, y: np.ndarray, weigh: np.ndarray, variance_x: float) -> Fit:
-    """The fit of the compressed rows, with residuals and corrected points of the real ones."""
-    state = packed.state
-    m = y.shape[1]
-    A = state.A.reshape(m, 3)
-    r = y - centred @ A.T - state.offset.ravel()
-    white = r @ np.linalg.inv(weigh[0] + variance_x * A @ A.T)
-    corrected = centred + variance_x * white @ A
-    return Fit(state, 0.5 * float((r * white).sum()), r, corrected, packed.information, packed.converged)
 
 
 def _parameter_covariance(

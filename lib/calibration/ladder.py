@@ -11,22 +11,13 @@ from scipy.stats import chi2
 
 from lib.calibration.calibration import Calibration
 from lib.calibration.estimate import calibrate
+from lib.calibration.models import Model
+from lib.correspondences import Correspondences
 
 __all__ = ["LADDER", "Comparison", "Rung", "compare_models"]
 
-#: From the stiffest to the freest; a pair's cameras have their own zoom, so `common_zoom` is the first to fall.
-LADDER = (
-    "common_zoom",
-    "square",
-    "zero_skew",
-    "affine",
-    "square+distance",
-    "zero_skew+distance",
-    "zero_skew+distances",
-    "affine+distance",
-    "zero_skew+distance+radial",
-)
-#: Each model's next freer one, whose likelihood-ratio test asks whether the constraint between them holds.
+#: Each model's next freer one, whose likelihood-ratio test asks whether the constraint between them holds; from the stiffest
+#: to the freest.  A pair's cameras have their own zoom, so `common_zoom` is the first to fall.
 _FREER = {
     "common_zoom": "square",
     "square": "zero_skew",
@@ -38,6 +29,7 @@ _FREER = {
     "affine+distance": None,
     "zero_skew+distance+radial": None,
 }
+LADDER = tuple(_FREER)
 
 
 @dataclass(frozen=True)
@@ -94,51 +86,52 @@ class Comparison:
 
 
 def compare_models(
-    x_mm: ArrayLike,
-    u: Sequence[ArrayLike],
+    data: Correspondences | ArrayLike,
+    u: Sequence[ArrayLike] | None = None,
     *,
     models: Sequence[str] = LADDER,
-    sigma_u_px: float | None = None,
-    sigma_x_mm: float | None = None,
-    covariance_px2: ArrayLike | None = None,
-    ransac_px: float | None = None,
-    seed: int = 0,
-    image_size_px: tuple[int, int] | None = None,
+    **options: object,
 ) -> Comparison:
     """Fit every model on the same rows with the same noise levels, and compare.
 
-    The rows and, where not given, the noise levels are those of the freest model (most parameters), so a model error
-    shows as chi-square instead of hiding in larger noise.  Arguments as in `calibrate`; of a single camera the models
-    that tie two cameras are left out.
+    The rows, their offsets and, where not given, the noise levels are those of the freest model (most parameters), so a
+    model error shows as chi-square instead of hiding in larger noise.  Of a single camera the models that tie two cameras are
+    left out.
 
-    Raises
-    ------
-    ValueError
-        As `calibrate`.
+    Parameters
+    ----------
+    data, u, options:
+        As in `calibrate`, with its errors.
+    models:
+        Names of the models.
+
+    Examples
+    --------
+    >>> from lib.simulator.rig import simulate_correspondences
+    >>> c = simulate_correspondences(100, rng=np.random.default_rng(0))
+    >>> compare_models(c.x_mm, [c.u_left, c.u_right], models=("common_zoom", "square", "affine")).best.model
+    'square'
     """
-    single = len(u) == 1
-    if single:
+    cameras = 1 if u is not None and len(u) == 1 else 2
+    if cameras == 1:
         models = [m for m in models if m != "common_zoom" and "distances" not in m]
-    common = {"covariance_px2": covariance_px2, "seed": seed, "image_size_px": image_size_px}
-    fits = [
-        calibrate(x_mm, u, model=m, sigma_u_px=sigma_u_px, sigma_x_mm=sigma_x_mm, ransac_px=ransac_px, **common)
-        for m in models
-    ]
-    freest = max(fits, key=lambda c: len(c.parameter_names))
-    rows = freest.inliers
-    if covariance_px2 is not None and freest.covariance_px2.ndim == 3:
-        common["covariance_px2"] = freest.covariance_px2[rows]
-    x, pixels = freest.x_mm[rows], [p[rows] for p in np.split(freest.y_px, len(u), axis=1)]
-    levels = {"sigma_u_px": freest.sigma_u_px, "sigma_x_mm": freest.sigma_x_mm}
-    fits = {m: calibrate(x, pixels, model=m, ransac_px=np.inf, checks=False, **levels, **common) for m in models}
-    observations = x.shape[0] * 2 * len(u)
+    freest = calibrate(
+        data, u, model=max(models, key=lambda m: len(Model.parse(m, cameras).parameter_names)), **options
+    )
+    rows, covariance = freest.inliers, freest.covariance_px2
+    x, pixels = freest.x_mm[rows], np.split(freest.y_px[rows], cameras, axis=1)
+    same = {
+        "sigma_u_px": freest.sigma_u_px, "sigma_x_mm": freest.sigma_x_mm, "image_size_px": freest.image_size_px,
+        "covariance_px2": covariance[rows] if np.ndim(covariance) == 3 else covariance,
+    }  # fmt: skip
+    fits = {m: calibrate(x, pixels, model=m, ransac_px=np.inf, checks=False, **same) for m in models}
     rungs = []
     for m, c in fits.items():
-        k, value = len(c.parameter_names), 2.0 * c.cost
-        freer = _FREER.get(m) if _FREER.get(m) in fits else None
-        p = np.nan
-        if freer is not None:
+        k, value, freer = len(c.parameter_names), 2.0 * c.cost, _FREER.get(m)
+        if freer in fits:
             gain, more = value - 2.0 * fits[freer].cost, len(fits[freer].parameter_names) - k
             p = float(chi2.sf(max(gain, 0.0), more))
-        rungs.append(Rung(m, k, value, value + k * float(np.log(observations)), freer, p, c))
+        else:
+            freer, p = None, np.nan
+        rungs.append(Rung(m, k, value, value + k * float(np.log(x.shape[0] * 2 * cameras)), freer, p, c))
     return Comparison(rungs, freest.sigma_u_px, freest.sigma_x_mm)

@@ -64,46 +64,28 @@ class Model:
         return self.distance is None and not self.radial
 
     @cached_property
-    def increments(self) -> int:
-        """Increments of one camera before the model's constraints."""
-        return 10 if self.base == "affine" else 9
-
-    @cached_property
-    def _selection(self) -> tuple[np.ndarray, list[str]]:
-        k, c = self.increments, self.cameras
-        sides = ["left ", "right "] if c == 2 else [""]
-        columns: dict[str, list[int]] = {}
-        for i, side in enumerate(sides):
-            at = i * k
-            if self.base == "affine":
-                names = [f"a{r}{s} (px/mm)" for r in (1, 2) for s in (1, 2, 3)] + ["offset x (px)", "offset y (px)"]
-            else:
-                zoom = {"zero_skew": ("log zoom x", "log zoom y"), "square": ("log zoom",) * 2}.get(self.base)
-                names = [f"rotation {axis} (rad)" for axis in "xyz"]
-                names += list(zoom or ("both log zoom",) * 2) + ["offset x (px)", "offset y (px)"]
-            if self.distance:
-                names.append("1/distance (1/mm)" if self.distance == "distances" else "both 1/distance (1/mm)")
-            else:
-                names.append("")
-            names.append("radial (1/px^2)" if self.radial else "")
-            for j, name in enumerate(names):
-                if name:
-                    key = name.removeprefix("both ") if name.startswith("both ") else side + name
-                    columns.setdefault(key, []).append(at + j)
-        matrix = np.zeros((k * c, len(columns)))
-        for column, rows in enumerate(columns.values()):
-            matrix[rows, column] = 1.0
-        return matrix, list(columns)
-
-    @property
     def selection(self) -> np.ndarray:
         """(increments of all cameras, parameters), zeros and ones."""
-        return self._selection[0]
+        names = self._increment_names
+        return np.array([[float(name == parameter) for parameter in self.parameter_names] for name in names])
 
-    @property
+    @cached_property
     def parameter_names(self) -> list[str]:
-        """Names of the increments, with units."""
-        return self._selection[1]
+        """Names of the free increments, with units."""
+        return list(dict.fromkeys(name for name in self._increment_names if name))
+
+    @cached_property
+    def _increment_names(self) -> list[str]:
+        """A name for each increment of all cameras; increments of one name are tied, those without one are fixed."""
+        if self.base == "affine":
+            names = [f"a{r}{s} (px/mm)" for r in (1, 2) for s in (1, 2, 3)]
+        else:
+            zoom = {"zero_skew": ["log zoom x", "log zoom y"], "square": ["log zoom"] * 2}
+            names = [f"rotation {axis} (rad)" for axis in "xyz"] + zoom.get(self.base, ["both log zoom"] * 2)
+        distance = {None: "", "distance": "both 1/distance (1/mm)", "distances": "1/distance (1/mm)"}[self.distance]
+        names += ["offset x (px)", "offset y (px)", distance, "radial (1/px^2)" if self.radial else ""]
+        sides = ["left ", "right "] if self.cameras == 2 else [""]
+        return [n.removeprefix("both ") if n.startswith("both ") else n and side + n for side in sides for n in names]
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,20 +156,16 @@ class State:
         return tuple(found)
 
     def evaluate(
-        self, x: np.ndarray, h: np.ndarray | None = None, *, derivatives: bool = True
+        self, x: np.ndarray, *, derivatives: bool = True
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Pixels y (n, m), dy/dx (n, m, 3) and dy/d(full increments) (n, m, cameras k) at x - x0 = `x` (n, 3).
-
-        `h` (n,) replaces the 1 that multiplies the offset (used for compressed data of affine models).
-        """
+        """Pixels y (n, m), dy/dx (n, m, 3) and dy/d(all increments) (n, m, cameras k) at x - x0 = `x` (n, 3)."""
         n, c = len(x), len(self.A)
         k = 10 if self.rotation is None else 9
-        h = np.ones(n) if h is None else h
         y, J_x, J_c = np.empty((n, 2 * c)), np.empty((n, 2 * c, 3)), np.zeros((n, 2 * c, k * c if derivatives else 0))
         for i in range(c):
             rows = slice(2 * i, 2 * i + 2)
             A, centre = self.A[i], self.centre[i]
-            q = x @ A.T + h[:, None] * (self.offset[i] - centre)
+            q = x @ A.T + (self.offset[i] - centre)
             normal = np.cross(A[0], A[1])
             size = np.linalg.norm(normal)
             r_3 = normal / size
@@ -197,7 +175,7 @@ class State:
             dv_dx = (A - self.rho[i] * v[:, :, None] * r_3) / ratio[:, :, None]
             bend = radial_derivative(v, self.radial[i]) if self.radial[i] else None
             square = (v**2).sum(axis=1, keepdims=True)
-            y[:, rows] = h[:, None] * centre + v * (1.0 + self.radial[i] * square)
+            y[:, rows] = centre + v * (1.0 + self.radial[i] * square)
             J_x[:, rows] = dv_dx if bend is None else bend @ dv_dx
             if not derivatives:
                 continue
@@ -217,7 +195,7 @@ class State:
                 dv[:, 0, 3], dv[:, 1, 4] = zoom[0] * p[:, 0], zoom[1] * p[:, 1]
                 turn = np.stack([p[:, 1], -p[:, 0], np.zeros(n)], axis=1)  # third component of delta x p
                 dv[:, :, :3] -= self.rho[i] * v[:, :, None] * turn[:, None, :]
-            dv[:, 0, k - 4] = dv[:, 1, k - 3] = h
+            dv[:, 0, k - 4] = dv[:, 1, k - 3] = 1.0
             dv[:, :, k - 2] = -v * depth[:, None]
             dv /= ratio[:, :, None]
             if bend is not None:
@@ -230,30 +208,20 @@ class State:
         """Derivative of the matrices' entries (8 a camera, row by row, left first) by the full increments."""
         c = len(self.A)
         plain = replace(self, rho=np.zeros(c), radial=np.zeros(c), centre=np.zeros((c, 2)))
-        J = plain.evaluate(np.vstack([np.eye(3), np.zeros(3)]), np.append(np.zeros(3), 1.0))[2]
+        J = plain.evaluate(np.vstack([np.eye(3), np.zeros(3)]))[2]
         k = J.shape[2] // c
         J[:, :, [i * k + j for i in range(c) for j in (k - 2, k - 1)]] = 0.0
-        columns, offset = J[:3], J[3] - np.tensordot(self.reference, J[:3], axes=1)
-        entries = np.concatenate([columns, offset[None]]).transpose(1, 0, 2)  # (2c, 4, full)
-        return entries.reshape(8 * c, -1)
+        columns = J[:3] - J[3]
+        offset = J[3] - np.tensordot(self.reference, columns, axes=1)
+        return np.concatenate([columns, offset[None]]).transpose(1, 0, 2).reshape(8 * c, -1)
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """A minimum: the state, the energy, and what uncertainty needs.
+    """A minimum: the state, the energy `cost`, the corrected points x~ - x0 (n, 3), and what uncertainty needs.
 
-    Attributes
-    ----------
-    state, cost:
-        Where the energy is least, and the energy there.
-    residuals:
-        (n, m) px, linearised: y - f(x~) - J (x - x~), whose covariance is Sigma + v_x J J^T.
-    points:
-        x~ - x0 (n, 3), the corrected points.
-    information:
-        (p, p) Gauss-Newton Hessian in the model's parameters.
-    converged:
-        False where the iterations ran out.
+    The `residuals` (n, m) px are linearised, y - f(x~) - J (x - x~), so that their covariance is Sigma + v_x J J^T;
+    `information` (p, p) is the Gauss-Newton Hessian in the model's parameters.
     """
 
     state: State
@@ -265,12 +233,12 @@ class Fit:
 
 
 def settle(
-    state: State, x: np.ndarray, y: np.ndarray, h: np.ndarray | None, noise: np.ndarray, variance_x: float, linear: bool
+    state: State, x: np.ndarray, y: np.ndarray, noise: np.ndarray, variance_x: float, linear: bool
 ) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
     """Best corrected points of a state: cost, linearised residuals, x~, S^-1."""
     points, rounds = x, 1 if linear or variance_x == 0 else 4
     for _ in range(rounds):
-        f, J, _ = state.evaluate(points, h, derivatives=False)
+        f, J, _ = state.evaluate(points, derivatives=False)
         if linear:
             J = J[:1]
         r = y - f - np.einsum("nij,nj->ni", np.broadcast_to(J, (len(x), *J.shape[1:])), x - points)
@@ -281,27 +249,13 @@ def settle(
 
 
 def fit(
-    model: Model,
-    start: State,
-    x: np.ndarray,
-    y: np.ndarray,
-    noise: np.ndarray,
-    variance_x: float,
-    h: np.ndarray | None = None,
+    model: Model, start: State, x: np.ndarray, y: np.ndarray, noise: np.ndarray, variance_x: float
 ) -> Fit:
     """Minimum of 1/2 sum (y - f(x~))^T noise^-1 (y - f(x~)) + |x~ - x|^2 / variance_x by Levenberg-Marquardt.
 
     Every point is eliminated exactly (its normal equations are 3 x 3), which leaves residuals of covariance
-    S = noise + variance_x J J^T and a system in the camera parameters alone.
-
-    Parameters
-    ----------
-    x:
-        (n, 3) mm relative to the state's reference.
-    y:
-        (n, m) px.
-    noise:
-        (1, m, m) or (n, m, m) px^2.
+    S = noise + variance_x J J^T and a system in the camera parameters alone.  x (n, 3) is in mm relative to the state's
+    reference, y (n, m) in px, and noise (1, m, m) or (n, m, m) in px^2.
     """
     T = model.selection
 
@@ -310,12 +264,12 @@ def fit(
             normal = np.cross(A[0], A[1])
             if rho and (1.0 + rho * (x @ normal) / np.linalg.norm(normal)).min() <= 0.05:
                 return None  # a point lies behind the camera
-        cost, *work = settle(state, x, y, h, noise, variance_x, model.is_affine)
+        cost, *work = settle(state, x, y, noise, variance_x, model.is_affine)
         return (cost, work) if np.isfinite(cost) else None
 
     def normal_equations(state: State, work: tuple) -> tuple[np.ndarray, np.ndarray]:
         r, settled, weight = work
-        J = state.evaluate(settled, h)[2] @ T
+        J = state.evaluate(settled)[2] @ T
         WJ = (np.broadcast_to(weight, (len(x), *weight.shape[1:])) @ J).reshape(-1, J.shape[2])
         return J.reshape(WJ.shape).T @ WJ, WJ.T @ r.ravel()
 
