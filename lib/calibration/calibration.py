@@ -19,16 +19,9 @@ __all__ = ["Calibration", "LandmarkOffsets"]
 class LandmarkOffsets:
     """Where the landmarks are seen, relative to where the robot reports them.
 
-    Attributes
-    ----------
-    offset:
-        (k, 3) mm in the tool's axes (along, across, normal), or (k, m) px in the images.
-    covariance:
-        (k, d, d) of each landmark's offset, in the squared unit.
-    prior_sd:
-        Of a coordinate before the data, given or chosen by the evidence.
-    p_value:
-        Probability of offsets as large as the data show if there are none (score test).
+    `offset` is (k, 3) mm in the tool's axes (along, across, normal), or (k, m) px in the images, and `covariance` (k, d, d)
+    that of each landmark's.  `prior_sd` is that of a coordinate before the data, given or chosen by the evidence; `p_value`
+    the probability of offsets as large as the data show if there are none (score test).
     """
 
     offset: np.ndarray
@@ -75,7 +68,7 @@ class Calibration:
         (n, 3) and (n, 2 cameras), the data, moved by the offsets where these were estimated; NaN in rows that are not
         usable: a landmark that is missing, or a tool with shut jaws where offsets in its axes are estimated.
     covariance_px2:
-        Of the pixels: None, (m, m), or (n, m, m) with m = 2 cameras.
+        Of the pixels: None, (1, m, m), or (n, m, m) with m = 2 cameras.
     image_size_px:
         (width, height), None where not given.
     plan, minimum:
@@ -163,10 +156,8 @@ class Calibration:
     def system(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Over the inliers: derivatives by points and parameters, inverse covariance of the residuals, residuals."""
         _, J_x, J_c = self.minimum.state.evaluate(self.minimum.points)
-        if self.covariance_px2 is None:
-            noise = self.noise_px2[None]
-        else:
-            noise = self.covariance_px2[None] if self.covariance_px2.ndim == 2 else self.covariance_px2[self.inliers]
+        noise = self.noise_px2[None] if self.covariance_px2 is None else self.covariance_px2
+        noise = noise if len(noise) == 1 else noise[self.inliers]
         J = J_x[:1] if self.plan.is_affine else J_x
         weight = np.linalg.inv(noise + self.sigma_x_mm**2 * J @ np.swapaxes(J, 1, 2))
         return J_x, J_c @ self.plan.selection, weight, self.minimum.residuals
@@ -194,12 +185,7 @@ class Calibration:
     def point_covariance(self, x_mm: ArrayLike, *, detection: bool = True) -> np.ndarray:
         """(n, 3, 3) mm^2 covariance of triangulated points, with the calibration's own uncertainty.
 
-        Parameters
-        ----------
-        x_mm:
-            Where, (n, 3).
-        detection:
-            False leaves out the noise of the detections: what more calibration data could still remove.
+        Without `detection` the noise of the detections is left out: what more calibration data could still remove.
         """
         if self.rig is None:
             raise ValueError("point_covariance: needs a stereo pair; calibrate with [u_left, u_right].")
@@ -231,8 +217,7 @@ class Calibration:
     def leave_one_out_px(self) -> np.ndarray:
         """(inliers, m) residual of each inlier to the cameras fitted without it, in closed form.
 
-        It is (I - L)^-1 r, with L the row's own share of its prediction: r / (1 - leverage) for the affine model, exact for
-        DLT.
+        It is (I - L)^-1 r with L the row's own share of its prediction: r / (1 - leverage) for affine models, exact for DLT.
         """
         _, J, weight, r = self.system
         own = J @ self.parameter_covariance @ np.swapaxes(J, 1, 2) @ weight

@@ -53,11 +53,9 @@ def calibrate(
 
     Parameters
     ----------
-    data:
-        `Correspondences`, whose incomplete rows are left out and whose covariances weigh the rows where every complete row
-        has one; or (n, 3) mm landmark positions in the robot frame.
-    u:
-        With plain positions: [u_left, u_right] or [u], (n, 2) px each, row by row with them.
+    data, u:
+        `Correspondences` alone, whose incomplete rows are left out and whose covariances weigh the rows where every complete
+        row has one; or (n, 3) mm positions in the robot frame and [u_left, u_right] or [u], (n, 2) px each.
     offsets:
         Constant offsets of the landmarks along with the cameras (`lib.calibration.offsets`).  "tool" or True: in the tool's
         axes, from frames in which the robot reports three landmarks of open jaws; "image": in the images, for a detector that
@@ -102,54 +100,63 @@ def calibrate(
     >>> found.rig.left.matrix.round(0)[0].tolist(), int(found.inliers.sum())
     ([99.0, 0.0, -9.0, 900.0], 60)
     """
-    options = {
-        "model": model, "weighting": weighting, "sigma_u_px": sigma_u_px, "sigma_x_mm": sigma_x_mm, "ransac_px": ransac_px,
-        "seed": seed, "image_size_px": image_size_px, "checks": checks,
-    }  # fmt: skip
-    if not isinstance(data, Correspondences):
+    if isinstance(data, Correspondences):
+        if u is not None:
+            raise ValueError("u: Correspondences have their own pixels; leave u out.")
+        usable, axes = _usable_rows(data, offsets, weighting)
+        rows = data.subset(usable)
+        x, y = stacked_rows(rows.x_mm, [rows.u_left, rows.u_right])
+        if covariance_px2 is not None:
+            noise = pair_covariance(covariance_px2, len(data))
+            noise = noise[usable] if len(noise) > 1 else noise
+        else:
+            own = weighting == "likelihood" and sigma_u_px is None and np.isfinite(rows.covariance_px2).all()
+            noise = rows.pair_covariance_px2 if own else None
+    else:
         if u is None:
             raise ValueError("u: give [u_left, u_right] with plain positions, or Correspondences alone.")
         if offsets or offset_prior_sd is not None:
             raise ValueError("offsets: they need to know which landmark a row is; give Correspondences.of_points(...).")
         x, y = stacked_rows(data, u)
+        usable, axes = None, None
         noise = None if covariance_px2 is None else pair_covariance(covariance_px2, len(x), y.shape[1] // 2)
-        return _calibrate(x, y, noise, **options)
-    if u is not None:
-        raise ValueError("u: Correspondences have their own pixels; leave u out.")
     if offset_prior_sd is not None and not offset_prior_sd > 0:
         raise ValueError(f"offset_prior_sd: must be positive, got {offset_prior_sd}.")
-    usable, axes = data.is_complete, None
+
+    def fitted(x: np.ndarray, y: np.ndarray) -> Calibration:
+        return _calibrate(
+            x, y, noise, model=model, weighting=weighting, sigma_u_px=sigma_u_px, sigma_x_mm=sigma_x_mm,
+            ransac_px=ransac_px, seed=seed, image_size_px=image_size_px, checks=checks,
+        )  # fmt: skip
+
+    if axes is None and offsets != "image":
+        found = fitted(x, y)
+    else:
+        found = estimate_offsets(fitted, x, y, rows.landmark, axes, offset_prior_sd)
+    return found if usable is None else _spread_out(found, usable)
+
+
+def _usable_rows(
+    data: Correspondences, offsets: bool | str | None, weighting: str
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """Mask of the rows to calibrate with, and the tool's axes in them (None: no offsets in the tool's axes)."""
     if offsets not in (None, False, True, "tool", "image"):
         raise ValueError(f"offsets: expected 'tool', 'image', True, False or None, got {offsets!r}.")
     if offsets and weighting != "likelihood":
         raise ValueError("weighting: offsets need the likelihood's weights.")
-    if offsets in (True, "tool") or (offsets is None and weighting == "likelihood"):
-        axes = rows_axes(data)
-        open_jaws = usable & np.isfinite(axes).all(axis=(1, 2))
-        if offsets is None and open_jaws.sum() < max(_OFFSET_ROWS, 0.5 * usable.sum()):
-            axes = None
-        elif open_jaws.sum() < 4:
-            raise ValueError(
-                f"offsets: {open_jaws.sum()} rows have the tool's axes; the robot must report three landmarks a frame, with "
-                "open jaws."
-            )
-        else:
-            usable = open_jaws
-    rows = data.subset(usable)
-    x, y = stacked_rows(rows.x_mm, [rows.u_left, rows.u_right])
-    if covariance_px2 is not None:
-        noise = pair_covariance(covariance_px2, len(data))
-        noise = noise[usable] if len(noise) > 1 else noise
-    elif weighting == "likelihood" and sigma_u_px is None and np.isfinite(rows.covariance_px2).all():
-        noise = pair_covariance(rows.covariance_px2, len(rows))
-    else:
-        noise = None
-    if axes is None and offsets != "image":
-        found = _calibrate(x, y, noise, **options)
-    else:
-        axes = None if axes is None else axes[usable]
-        found = estimate_offsets(lambda x, y: _calibrate(x, y, noise, **options), x, y, rows.landmark, axes, offset_prior_sd)
-    return _spread_out(found, usable)
+    usable = data.is_complete
+    if offsets not in (None, True, "tool") or weighting != "likelihood":
+        return usable, None
+    axes = rows_axes(data)
+    open_jaws = usable & np.isfinite(axes).all(axis=(1, 2))
+    if offsets is None and open_jaws.sum() < max(_OFFSET_ROWS, 0.5 * usable.sum()):
+        return usable, None
+    if open_jaws.sum() < 4:
+        raise ValueError(
+            f"offsets: {open_jaws.sum()} rows have the tool's axes; the robot must report three landmarks a frame, with "
+            "open jaws."
+        )
+    return open_jaws, axes[open_jaws]
 
 
 def _spread_out(found: Calibration, usable: np.ndarray) -> Calibration:
@@ -161,7 +168,7 @@ def _spread_out(found: Calibration, usable: np.ndarray) -> Calibration:
         return result
 
     names = ["residuals_px", "x_mm", "y_px"]
-    if found.covariance_px2 is not None and found.covariance_px2.ndim == 3:
+    if found.covariance_px2 is not None and len(found.covariance_px2) > 1:
         names.append("covariance_px2")
     return replace(found, inliers=full(found.inliers, False), **{n: full(getattr(found, n), np.nan) for n in names})
 
@@ -194,48 +201,56 @@ def _calibrate(
         raise ValueError(f"x_mm: {n} points are too few for the {len(plan.parameter_names)} parameters of '{model}'.")
     if noise is not None and not np.isfinite(noise).all():
         raise ValueError("covariance_px2: must be finite in every row.")
-    noise = noise if noise is None or len(noise) > 1 else noise[0]
-    if weighting == "paper" and noise is not None and noise.ndim == 3:
+    if weighting == "paper" and noise is not None and len(noise) > 1:
         raise ValueError("weighting: the paper's energy has one sigma_u; give sigma_u_px, or weighting='likelihood'.")
     if checks:
         check_duplicates(x, y)
         check_units(x, y)
-    assumed_x = ROBOT_ACCURACY_MM if sigma_x_mm is None else sigma_x_mm
-    check_spread(x, y, assumed_x if checks else 0.0)
+    assumed_x = 0.0 if not checks else ROBOT_ACCURACY_MM if sigma_x_mm is None else sigma_x_mm
+    check_spread(x, y, assumed_x)
     check_images(y, image_size_px if checks else None)
-    automatic = ransac_px is None
-    if ransac_px is not None and np.isinf(ransac_px):
+    if ransac_px == np.inf:
         inliers = np.ones(n, dtype=bool)
     else:
         inliers = consensus(x, y, ransac_px, np.random.default_rng(seed), sigma_x_mm=sigma_x_mm)
-    check_spread(x[inliers], y[inliers], assumed_x if checks else 0.0)
+    check_spread(x[inliers], y[inliers], assumed_x)
     centre = (np.asarray(image_size_px, dtype=float) - 1) / 2 if image_size_px is not None else None
 
     known = {"sigma_u_px": sigma_u_px, "sigma_x_mm": sigma_x_mm}
     for _ in range(4):
-        minimum, levels, variances = _minimise(plan, x, y, inliers, noise, weighting, known, centre)
-        if not automatic or plan.is_affine:
+        rows_noise = noise if noise is None or len(noise) == 1 else noise[inliers]
+        minimum, (sigma_u, sigma_x), variances = _minimise(plan, x[inliers], y[inliers], rows_noise, weighting, known, centre)
+        state = minimum.state
+        f, J, _ = state.evaluate(x - state.reference, derivatives=False)
+        residuals = y - f
+        if ransac_px is not None or plan.is_affine:
             break
         # A curved projection looked like outliers to the affine consensus: judge again by the model itself.
-        new = _judge(minimum, x, y, noise, *levels)
+        S = (sigma_u**2 * np.eye(m)[None] if noise is None else noise) + sigma_x**2 * J @ np.swapaxes(J, 1, 2)
+        new = np.einsum("ni,nij,nj->n", residuals, np.linalg.inv(S), residuals) < gate(n, m)
         if (new == inliers).all() or new.sum() < inliers.sum():
             break
         inliers = new
 
-    sigma_u, sigma_x = levels
-    parameter_covariance = _parameter_covariance(plan, minimum, noise, inliers, sigma_u, sigma_x, variances)
-    G = minimum.state.matrix_jacobian() @ plan.selection
-    cameras = minimum.state.cameras(plan)
-    result = Calibration(
+    true = sigma_u**2 * np.eye(m)[None] if rows_noise is None else rows_noise
+    parameter_covariance = _parameter_covariance(plan, minimum, true, sigma_x, *variances)
+    G = state.matrix_jacobian() @ plan.selection
+    cameras = state.cameras(plan)
+    rig = StereoRig(*cameras) if len(cameras) == 2 else None
+    if checks and rig is not None:
+        spread = np.sqrt(np.linalg.eigvalsh(np.cov(x[inliers].T))[0])
+        zoom = np.sqrt(np.abs(np.linalg.det(cameras[0].linear @ cameras[0].linear.T)) ** 0.5)
+        check_order(rig.linear, np.hypot(sigma_u / zoom, sigma_x) / (spread * np.sqrt(inliers.sum() / 2)))
+    return Calibration(
         cameras=cameras,
-        rig=StereoRig(*cameras) if len(cameras) == 2 else None,
+        rig=rig,
         inliers=inliers,
         cost=minimum.cost,
         covariance=G @ parameter_covariance @ G.T,
         parameter_covariance=parameter_covariance,
         sigma_u_px=sigma_u,
         sigma_x_mm=sigma_x,
-        residuals_px=y - minimum.state.evaluate(x - minimum.state.reference, derivatives=False)[0],
+        residuals_px=residuals,
         model=model,
         weighting=weighting,
         x_mm=x,
@@ -245,28 +260,19 @@ def _calibrate(
         plan=plan,
         minimum=minimum,
     )
-    if checks and len(cameras) == 2:
-        spread = np.sqrt(np.linalg.eigvalsh(np.cov(x[inliers].T))[0])
-        zoom = np.sqrt(np.abs(np.linalg.det(cameras[0].linear @ cameras[0].linear.T)) ** 0.5)
-        check_order(result.rig.linear, np.hypot(sigma_u / zoom, sigma_x) / (spread * np.sqrt(inliers.sum() / 2)))
-    return result
 
 
 def _minimise(
     plan: Model,
     x: np.ndarray,
     y: np.ndarray,
-    inliers: np.ndarray,
     noise: np.ndarray | None,
     weighting: str,
     known: dict[str, float | None],
     centre: np.ndarray | None,
 ) -> tuple[Fit, tuple[float, float], tuple[np.ndarray, float]]:
-    """The minimum over the inliers, the noise levels (sigma_u, sigma_x), and the variances that weighed it."""
-    x, y = (x, y) if inliers.all() else (x[inliers], y[inliers])
+    """The minimum over inliers, the noise levels (sigma_u, sigma_x), and the variances that weighed it."""
     m = y.shape[1]
-    per_point = noise is not None and noise.ndim == 3
-    sigma = noise[inliers] if per_point else None if noise is None else noise[None]
     moments = Moments.of(x, y)
     reference = moments.mean[m:]
     middles = np.tile(centre, (m // 2, 1)) if centre is not None else ((y.max(0) + y.min(0)) / 2).reshape(-1, 2)
@@ -274,15 +280,12 @@ def _minimise(
     residuals, A, used = y - x @ start.matrix[:, :3].T - start.matrix[:, 3], start.matrix[:, :3], 4 * m
     levels, minimum = None, None
     for _ in range(3):
-        before, levels = levels, _levels(residuals, A, used, sigma, known)
+        before, levels = levels, _levels(residuals, A, used, noise, known)
         if before is not None and np.allclose(before, levels, rtol=1e-3, atol=1e-12):
             levels = before
             break
-        if weighting == "paper":
-            variance_u, variance_x = paper_variances(*levels)
-        else:
-            variance_u, variance_x = levels[0] ** 2, levels[1] ** 2
-        weigh = variance_u * np.eye(m)[None] if sigma is None or weighting == "paper" else sigma
+        variance_u, variance_x = paper_variances(*levels) if weighting == "paper" else np.square(levels).tolist()
+        weigh = variance_u * np.eye(m)[None] if noise is None or weighting == "paper" else noise
         if len(weigh) == 1 and np.allclose(weigh[0], variance_u * np.eye(m), rtol=1e-12, atol=0):
             start = affine_minimum(moments, variance_u, variance_x)
         if minimum is None or (plan.is_affine and len(weigh) == 1):
@@ -290,28 +293,27 @@ def _minimise(
         else:
             state = minimum.state
         minimum = fit(plan, state, x - reference, y, weigh, variance_x)
-        if known["sigma_x_mm"] is not None and (sigma is not None or known["sigma_u_px"] is not None):
+        if known["sigma_x_mm"] is not None and (noise is not None or known["sigma_u_px"] is not None):
             break
-        residuals, A = minimum.residuals, minimum.state.A.reshape(m, 3)
-        used = len(plan.parameter_names)
+        residuals, A, used = minimum.residuals, minimum.state.A.reshape(m, 3), len(plan.parameter_names)
     return minimum, levels, (weigh, variance_x)
 
 
 def _levels(
-    residuals: np.ndarray, A: np.ndarray, parameters: int, sigma: np.ndarray | None, known: dict[str, float | None]
+    residuals: np.ndarray, A: np.ndarray, parameters: int, noise: np.ndarray | None, known: dict[str, float | None]
 ) -> tuple[float, float]:
     """(sigma_u, sigma_x): given, or estimated from the residuals; the detector's covariances replace sigma_u."""
-    if sigma is None:
+    if noise is None:
         return estimate_noise(residuals, A, parameters, **known)
     n, m = residuals.shape
-    sigma_u = float(np.sqrt(np.trace(sigma, axis1=1, axis2=2).mean() / m))
+    sigma_u = float(np.sqrt(np.trace(noise, axis1=1, axis2=2).mean() / m))
     if known["sigma_x_mm"] is not None:
         return sigma_u, float(known["sigma_x_mm"])
     # Maximum likelihood of one variance v in S_i = Sigma_i + v A A^T, by Fisher scoring.
     B, v = A @ A.T, 0.0
     inflate = n / max(n - parameters / m, 1.0)
     for _ in range(50):
-        W = np.linalg.inv(sigma + v * B)
+        W = np.linalg.inv(noise + v * B)
         WB = W @ B
         white = np.einsum("nij,nj->ni", np.broadcast_to(W, (n, m, m)), residuals)
         score = inflate * np.einsum("ni,ij,nj->", white, B, white) - np.trace(WB, axis1=1, axis2=2).sum() * (n / len(W))
@@ -324,40 +326,15 @@ def _levels(
 
 
 def _parameter_covariance(
-    plan: Model,
-    minimum: Fit,
-    noise: np.ndarray | None,
-    inliers: np.ndarray,
-    sigma_u: float,
-    sigma_x: float,
-    variances: tuple[np.ndarray, float],
+    plan: Model, minimum: Fit, noise: np.ndarray, sigma_x: float, weigh: np.ndarray, variance_x: float
 ) -> np.ndarray:
     """Inverse information; where the weights were not the noise's, the sandwich H^-1 G H^-1."""
-    weigh, variance_x = variances
-    m = weigh.shape[-1]
-    if noise is None:
-        true = sigma_u**2 * np.eye(m)[None]
-    else:
-        true = noise[None] if noise.ndim == 2 else noise[inliers]
     scale = 1.0 / np.sqrt(np.diag(minimum.information))
     inverse = np.linalg.inv(minimum.information * np.outer(scale, scale)) * np.outer(scale, scale)
-    if np.allclose(weigh, true, rtol=1e-9, atol=0) and np.isclose(variance_x, sigma_x**2, rtol=1e-9, atol=0):
+    if np.allclose(weigh, noise, rtol=1e-9, atol=0) and np.isclose(variance_x, sigma_x**2, rtol=1e-9, atol=0):
         return inverse
-    J = minimum.state.evaluate(minimum.points)[2] @ plan.selection
-    J_x = minimum.state.evaluate(minimum.points, derivatives=False)[1]
+    _, J_x, J_c = minimum.state.evaluate(minimum.points)
     outer = J_x @ np.swapaxes(J_x, 1, 2)
-    W = np.linalg.inv(weigh + variance_x * outer)
-    WJ = W @ J
-    meat = np.einsum("nip,nij,njq->pq", WJ, true + sigma_x**2 * outer, WJ)
+    WJ = np.linalg.inv(weigh + variance_x * outer) @ J_c @ plan.selection
+    meat = np.einsum("nip,nij,njq->pq", WJ, noise + sigma_x**2 * outer, WJ)
     return inverse @ meat @ inverse
-
-
-def _judge(
-    minimum: Fit, x: np.ndarray, y: np.ndarray, noise: np.ndarray | None, sigma_u: float, sigma_x: float
-) -> np.ndarray:
-    """Rows within the gate of the fitted model."""
-    f, J, _ = minimum.state.evaluate(x - minimum.state.reference, derivatives=False)
-    sigma = sigma_u**2 * np.eye(y.shape[1])[None] if noise is None else noise if noise.ndim == 3 else noise[None]
-    r = y - f
-    distance2 = np.einsum("ni,nij,nj->n", r, np.linalg.inv(sigma + sigma_x**2 * J @ np.swapaxes(J, 1, 2)), r)
-    return distance2 < gate(*y.shape)

@@ -122,7 +122,7 @@ def compare_models(
     x, pixels = freest.x_mm[rows], np.split(freest.y_px[rows], cameras, axis=1)
     same = {
         "sigma_u_px": freest.sigma_u_px, "sigma_x_mm": freest.sigma_x_mm, "image_size_px": freest.image_size_px,
-        "covariance_px2": covariance[rows] if np.ndim(covariance) == 3 else covariance,
+        "covariance_px2": covariance if covariance is None or len(covariance) == 1 else covariance[rows],
     }  # fmt: skip
     fits = {m: calibrate(x, pixels, model=m, ransac_px=np.inf, checks=False, **same) for m in models}
     rungs = []

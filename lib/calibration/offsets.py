@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,7 +20,7 @@ from scipy.stats import chi2
 from lib.calibration.calibration import Calibration, LandmarkOffsets
 from lib.correspondences import Correspondences
 
-__all__ = ["estimate_offsets", "rows_axes", "tool_axes"]
+__all__ = ["estimate_offsets", "rows_axes", "tool_axes", "with_offsets"]
 
 
 def tool_axes(x_mm: ArrayLike) -> np.ndarray:
@@ -53,6 +54,21 @@ def rows_axes(data: Correspondences) -> np.ndarray:
     return tool_axes(data.grid("x_mm"))[np.unique(data.frame, return_inverse=True)[1]]
 
 
+def with_offsets(data: Correspondences, offsets: LandmarkOffsets | None) -> Correspondences:
+    """The rows with their landmarks where the detector sees them, as far as `Calibration.offsets` has learnt it.
+
+    Positions move by offsets in the tool's axes, where the robot reports open jaws; pixels by offsets in the images.  None
+    changes nothing.
+    """
+    if offsets is None:
+        return data
+    shift = offsets.offset[data.landmark]
+    if shift.shape[1] == 4:
+        return replace(data, u_left=data.u_left - shift[:, :2], u_right=data.u_right - shift[:, 2:])
+    shift = np.einsum("nij,nj->ni", rows_axes(data), shift)
+    return replace(data, x_mm=data.x_mm + np.where(np.isfinite(shift), shift, 0.0))
+
+
 def estimate_offsets(
     fit: Callable[[np.ndarray, np.ndarray], Calibration],
     x: np.ndarray,
@@ -62,23 +78,12 @@ def estimate_offsets(
     prior_sd: float | None = None,
     iterations: int = 20,
 ) -> Calibration:
-    """The calibration with one constant offset a landmark, in the tool's axes or (axes=None) in the images.
+    """The calibration with one constant offset a landmark, in the tool's axes (n, 3, 3) or (axes=None) in the images.
 
-    Gauss-Newton on the offsets with the cameras eliminated: every step is a whole calibration and one Schur complement.
-
-    Parameters
-    ----------
-    fit:
-        Calibrates positions (n, 3) and pixels (n, m) by likelihood.
-    x, y, landmark:
-        The rows: (n, 3) mm, (n, m) px, and (n,) which landmark.
-    axes:
-        R (n, 3, 3) of the tool in each row; None = offsets in the images.
-    prior_sd:
-        Standard deviation of an offset's coordinate, mm or px.  None = the one that makes the data most probable, between 0.1
-        and 300 um, or 0.01 and 30 px; without sign of an offset it is the least, which leaves the landmarks where they are.
-    iterations:
-        Most steps; a `RuntimeWarning` says so where they were not enough.
+    Gauss-Newton on the offsets with the cameras eliminated: every step is a whole calibration `fit` of positions (n, 3) and
+    pixels (n, m), and one Schur complement.  Where too few steps are allowed, a `RuntimeWarning` says so.  Without `prior_sd`
+    it is the one that makes the data most probable, between 0.1 and 300 um, or 0.01 and 30 px; without sign of an offset it is
+    the least, which leaves the landmarks where they are.
     """
     size, m = (3 if axes is not None else y.shape[1]), y.shape[1]
     offset = np.zeros((int(landmark.max()) + 1, size))
