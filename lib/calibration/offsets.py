@@ -82,8 +82,8 @@ def estimate_offsets(
 
     Gauss-Newton on the offsets with the cameras eliminated: every step is a whole calibration `fit` of positions (n, 3) and
     pixels (n, m), and one Schur complement.  Where too few steps are allowed, a `RuntimeWarning` says so.  Without `prior_sd`
-    it is the one that makes the data most probable, between 0.1 and 300 um, or 0.01 and 30 px; without sign of an offset it is
-    the least, which leaves the landmarks where they are.
+    it is the one that makes the data most probable, between 0.1 and 300 um, or 0.01 and 30 px; without sign of an offset it
+    is the least, which leaves the landmarks where they are.
     """
     size, m = (3 if axes is not None else y.shape[1]), y.shape[1]
     offset = np.zeros((int(landmark.max()) + 1, size))

@@ -66,8 +66,8 @@ def pivot_calibration(robot_from_tool: Sequence[RigidTransform]) -> Pivot:
     rms, spread = float(np.sqrt((r**2).sum() / n)), float(np.sqrt(((t - t.mean(axis=0)) ** 2).sum() / n))
     if rms > max(0.25 * spread, 0.05):
         raise ValueError(
-            f"robot_from_tool: the tip did not rest in one point ({rms:.2f} mm RMS about the best one); hold it in a divot, or "
-            "use tool_offsets, which takes any motion with images."
+            f"robot_from_tool: the tip did not rest in one point ({rms:.2f} mm RMS about the best one); hold it in a divot, "
+            "or use tool_offsets, which takes any motion with images."
         )
     _check_determined(covariance[:3, :3])
     return Pivot(solution[:3], solution[3:], covariance, rms)
@@ -139,11 +139,11 @@ def _poses(robot_from_tool: Sequence[RigidTransform]) -> tuple[np.ndarray, np.nd
 
 
 def _check_determined(covariance_mm2: np.ndarray) -> None:
-    sd = np.sqrt(np.diagonal(covariance_mm2, axis1=-2, axis2=-1))
-    if not (sd < _LARGEST_SD_MM).all():
+    variance = np.diagonal(covariance_mm2, axis1=-2, axis2=-1)
+    if not ((variance >= 0) & (variance < _LARGEST_SD_MM**2)).all():
         raise ValueError(
-            f"robot_from_tool: the motion leaves an offset open by {sd.max():.2g} mm; turn the tool further, about two axes, "
-            "or give more poses."
+            f"robot_from_tool: the motion leaves an offset open by {np.sqrt(np.abs(variance).max()):.2g} mm; turn the tool "
+            "further, about two axes, or give more poses."
         )
 
 

@@ -3,33 +3,21 @@
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
+from scipy.stats import chi2
 
 from lib.calibration import (
     Moments,
     affine_minimum,
     calibrate,
+    compare_models,
     dlt,
     estimate_noise,
     paper_variances,
 )
-from lib.cameras import NearAffineCamera, StereoRig
-from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig, simulate_correspondences
+from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
+from tests.calibration.rigs import data, near_rig
 
 SIZE = (1920, 1080)
-
-
-def data(n=120, seed=0, **options):
-    return simulate_correspondences(n, rng=np.random.default_rng(seed), **options)
-
-
-def near_rig(distance_mm=200.0, radial=0.0):
-    rig = reference_rig()
-    return StereoRig(
-        *(
-            NearAffineCamera(c.matrix, 1 / distance_mm, (959.5, 539.5), ROBOT_FROM_MICROSCOPE.t, radial)
-            for c in (rig.left, rig.right)
-        )
-    )
 
 
 def contaminated(n, share, seed, columns=slice(0, 2)):
@@ -99,17 +87,16 @@ def test_affine_minimum_is_that_of_a_bundle_adjuster_over_all_unknowns(weighting
     np.testing.assert_allclose(found.rig.linear, 100 * general.x[:12].reshape(4, 3), rtol=1e-3, atol=0.01)
 
 
-def test_constrained_minimum_from_moments_is_that_from_all_points():
-    """An affine model is fitted on eight compressed rows; per-point covariances take all rows.  Same answer."""
+def test_one_covariance_and_the_same_for_each_row_give_the_same_answer():
     c = data(80, 3)
     known = {"sigma_u_px": 1.5, "sigma_x_mm": 0.01, "ransac_px": np.inf}
     for model in ("affine", "zero_skew", "square", "common_zoom"):
-        packed = calibrate(c.x_mm, [c.u_left, c.u_right], model=model, **known)
+        one = calibrate(c.x_mm, [c.u_left, c.u_right], model=model, **known)
         each = np.broadcast_to(2.25 * np.eye(4), (80, 4, 4))
         full = calibrate(c.x_mm, [c.u_left, c.u_right], model=model, covariance_px2=each, **known)
-        assert packed.cost == pytest.approx(full.cost, rel=1e-10)
-        np.testing.assert_allclose(packed.rig.linear, full.rig.linear, rtol=1e-6, atol=1e-6)
-        np.testing.assert_allclose(packed.covariance, full.covariance, rtol=1e-3, atol=1e-4 * packed.covariance.max())
+        assert one.cost == pytest.approx(full.cost, rel=1e-10)
+        np.testing.assert_allclose(one.rig.linear, full.rig.linear, rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(one.covariance, full.covariance, rtol=1e-3, atol=1e-4 * one.covariance.max())
 
 
 def test_constraints_hold_and_cost_grows_with_them():
@@ -133,8 +120,7 @@ def test_moments_merge_and_fade():
     whole, parts = Moments.of(x, y), Moments.of(x[:11], y[:11]).merged(Moments.of(x[11:], y[11:]))
     assert parts.weight == whole.weight
     np.testing.assert_allclose(parts.scatter, whole.scatter, rtol=1e-10, atol=1e-8)
-    weights = rng.uniform(1, 2, 30)
-    np.testing.assert_allclose(Moments.of(x, y, weights).faded(0.5).mean, weights @ np.hstack([y, x]) / weights.sum())
+    np.testing.assert_allclose(whole.faded(0.5).scatter, 0.5 * whole.scatter)
 
 
 def test_minimum_is_stationary_and_below_least_squares():
@@ -266,8 +252,8 @@ def test_covariance_covers_the_truth():
     distances = {m: [] for m in ("affine", "zero_skew", "square+distance")}
     rng = np.random.default_rng(0)
     base = reference_rig()
-    for seed in range(90):
-        c = data(100, seed)
+    for seed in range(70):
+        c = data(60, seed)
         for model, values in distances.items():
             rig = near_rig() if "distance" in model else base
             u = [p + rng.normal(0, 1.5, p.shape) for p in rig.project(c.true_x_mm)]
@@ -277,14 +263,14 @@ def test_covariance_covers_the_truth():
             error = np.hstack(
                 [a - b for a, b in zip(found.rig.project(corners), rig.project(corners), strict=True)]
             ).ravel()
-            J = found._fit.state.evaluate(corners - found._fit.state.reference)[2] @ found._model.selection
+            J = found.derivatives(corners)[1]
             J = J.reshape(-1, J.shape[2])
             covariance = J @ found.parameter_covariance @ J.T
             rank = len(found.parameter_names)
             w, V = np.linalg.eigh(covariance)
             values.append(((V[:, -rank:].T @ error) ** 2 / w[-rank:]).sum() / rank)
     for model, values in distances.items():
-        assert np.mean(values) == pytest.approx(1, abs=0.12), model
+        assert np.mean(values) == pytest.approx(1, abs=0.13), model
 
 
 def test_affine_covariance_is_the_cramer_rao_bound():
@@ -296,11 +282,63 @@ def test_affine_covariance_is_the_cramer_rao_bound():
     np.testing.assert_allclose(np.diag(found.covariance), np.diag(bound), rtol=0.02)
 
 
+def test_estimates_scatter_as_the_bound_and_their_own_covariances_say():
+    """Variance over the Cramer-Rao bound, Mahalanobis distances and the size of nested tests, over simulated data sets."""
+    rng, rig, x = np.random.default_rng(0), reference_rig(pixels_per_mm=(100.0, 100.0)), data(100, 0).true_x_mm
+    H = np.column_stack([x, np.ones(100)])
+    bound = np.kron(1.5**2 * np.eye(4) + 1e-4 * rig.linear @ rig.linear.T, np.linalg.inv(H.T @ H))
+    truth = np.concatenate([rig.left.matrix.ravel(), rig.right.matrix.ravel()])
+    errors, claimed, rejected, runs = [], [], [], 250
+    for run in range(runs):
+        noisy = x + rng.normal(0, 0.01, x.shape)
+        u = [p + rng.normal(0, 1.5, p.shape) for p in rig.project(x)]
+        found = calibrate(noisy, u, model="affine", ransac_px=np.inf)
+        errors.append(np.concatenate([camera.matrix.ravel() for camera in found.cameras]) - truth)
+        claimed.append(errors[-1] @ np.linalg.solve(found.covariance, errors[-1]))
+        if run < 80:
+            models = ("common_zoom", "square", "zero_skew", "affine")
+            rungs = compare_models(noisy, u, models=models, sigma_u_px=1.5, sigma_x_mm=0.01, ransac_px=np.inf).rungs
+            rejected += [rung.p_value < 0.05 for rung in rungs if rung.against]
+    ratio = np.mean(np.square(errors), axis=0) / np.diag(bound)
+    assert ratio.mean() == pytest.approx(1, abs=0.1)  # four standard deviations
+    np.testing.assert_allclose(ratio, 1, atol=0.4)
+    assert np.mean(claimed) / 16 == pytest.approx(1, abs=0.1)
+    assert np.mean(np.array(claimed) < chi2.ppf(0.95, 16)) == pytest.approx(0.95, abs=0.05)
+    assert np.mean(rejected) == pytest.approx(0.05, abs=0.045)
+
+
+@pytest.mark.parametrize("n", [6, 7, 8, 9, 10, 12, 15, 20, 24])
+def test_few_clean_rows_are_never_refused_nor_dropped(n):
+    for seed in range(12):
+        c = data(n, 1000 * n + seed)
+        assert calibrate(c.x_mm, [c.u_left, c.u_right], seed=seed).inliers.all()
+
+
+@pytest.mark.parametrize(("n", "wrong"), [(8, 1), (10, 2), (16, 4), (24, 6)])
+def test_gross_outliers_among_few_rows_are_found(n, wrong):
+    missed = 0
+    for seed in range(12):
+        c = data(n, seed)
+        u_left = c.u_left.copy()
+        u_left[:wrong] += np.random.default_rng(seed).choice([-1, 1], (wrong, 2)) * [400, 300]
+        inliers = calibrate(c.x_mm, [u_left, c.u_right], seed=seed).inliers
+        assert inliers[wrong:].all()
+        missed += inliers[:wrong].any()
+    assert missed <= 1
+
+
+def test_one_gross_row_does_not_look_like_another_unit():
+    x, u = good()
+    u[0][5] = [1e6, -1e6]
+    x[7] += 5000
+    np.testing.assert_array_equal(np.flatnonzero(~calibrate(x, u).inliers), [5, 7])
+
+
 def test_paper_weighting_reports_the_sandwich():
     c = data(200, 3, half_size_mm=(4, 3, 0.3))
     errors, claims = [], []
     rng = np.random.default_rng(0)
-    for _ in range(150):
+    for _ in range(100):
         x = c.true_x_mm + rng.normal(0, 0.01, (200, 3))
         u = [p + rng.normal(0, 1.5, p.shape) for p in c.true_rig.project(c.true_x_mm)]
         found = calibrate(
@@ -309,7 +347,7 @@ def test_paper_weighting_reports_the_sandwich():
         errors.append(np.concatenate([camera.matrix.ravel() for camera in found.cameras]))
         claims.append(np.diag(found.covariance))
     ratio = np.var(errors, axis=0) / np.mean(claims, axis=0)
-    assert ratio.mean() == pytest.approx(1, abs=0.2)
+    assert ratio.mean() == pytest.approx(1, abs=0.25)
 
 
 # ---- bad input -------------------------------------------------------------------------------------------------------
@@ -396,6 +434,12 @@ def test_bad_options_are_named(options, message):
     x, u = good()
     with pytest.raises(ValueError, match=message):
         calibrate(x, u, **options)
+
+
+def test_rows_before_columns_are_noticed():
+    x, u = good()
+    with pytest.raises(ValueError, match="not \\(row, column\\)"):
+        calibrate(x, [p[:, ::-1] for p in u], image_size_px=SIZE)
 
 
 def test_checks_can_be_waived():

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from lib.calibration import compare_models
-from lib.calibration.models import Model, State, fit
-from lib.cameras import NearAffineCamera, StereoRig
+from lib.calibration.models import Model, State, fit, settle
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig, simulate_correspondences
+from tests.calibration.rigs import near_rig
 
 NAMES = [
     base + options
@@ -21,13 +21,14 @@ def state(model, seed=0):
     rig = reference_rig()
     matrix = np.vstack([rig.left.matrix, rig.right.matrix])[: 2 * model.cameras]
     start = State.start(model, matrix, ROBOT_FROM_MICROSCOPE.t, np.tile([959.5, 539.5], (model.cameras, 1)))
-    scale = np.full(model.increments, 0.05)
+    increments = len(model.selection) // model.cameras
+    scale = np.full(increments, 0.05)
     if model.base == "affine":
         scale[:6] = 3.0
     scale[-4:-2], scale[-2], scale[-1] = 20.0, 4e-3, 3e-9
     return start.moved(
         model.selection
-        @ (model.selection.T @ (np.tile(scale, model.cameras) * rng.normal(size=model.increments * model.cameras)))
+        @ (model.selection.T @ (np.tile(scale, model.cameras) * rng.normal(size=increments * model.cameras)))
     )
 
 
@@ -99,22 +100,10 @@ def test_minimum_is_stationary(name):
     found = fit(model, start, *data)
     assert found.converged
     sd = np.sqrt(np.diag(np.linalg.inv(found.information)))
-    from lib.calibration.models import settle
-
     for j, s in enumerate(sd):
         for sign in (-1, 1):
             moved = found.state.moved(model.selection[:, j] * sign * 0.01 * s)
-            assert settle(moved, *data[:2], None, *data[2:], model.is_affine)[0] >= found.cost
-
-
-def near_pair(distance_mm):
-    rig = reference_rig()
-    return StereoRig(
-        *(
-            NearAffineCamera(c.matrix, 1 / distance_mm, (959.5, 539.5), ROBOT_FROM_MICROSCOPE.t)
-            for c in (rig.left, rig.right)
-        )
-    )
+            assert settle(moved, *data, model.is_affine)[0] >= found.cost
 
 
 def seen(rig, seed, n=200):
@@ -128,7 +117,7 @@ def test_bic_chooses_affine_where_it_is_and_distance_where_it_is():
     for seed in range(3):
         x, u = seen(reference_rig(), seed)
         assert "distance" not in compare_models(x, u, models=models).best.model
-        x, u = seen(near_pair(200), seed)
+        x, u = seen(near_rig(200), seed)
         comparison = compare_models(x, u, models=models, image_size_px=(1920, 1080))
         assert "distance" in comparison.best.model
         value, sd = comparison.best.calibration.inverse_distance_per_mm
@@ -150,7 +139,7 @@ def test_nested_tests_reject_rarely_what_is_true_and_always_what_is_not():
 
 
 def test_a_single_camera_has_a_ladder_too():
-    x, u = seen(near_pair(100), 1)
+    x, u = seen(near_rig(100), 1)
     comparison = compare_models(x, u[:1], sigma_x_mm=0.01, image_size_px=(1920, 1080))
     assert {r.model for r in comparison.rungs}.isdisjoint({"common_zoom", "zero_skew+distances"})
     assert "distance" in comparison.best.model

@@ -26,7 +26,7 @@ def test_axes_are_those_of_the_tool():
 
 
 @pytest.mark.parametrize(
-    ("model", "distance_mm", "runs"), [("zero_skew", np.inf, 8), ("affine", np.inf, 6), ("near_affine", 200.0, 4)]
+    ("model", "distance_mm", "runs"), [("zero_skew", np.inf, 5), ("affine", np.inf, 3), ("near_affine", 200.0, 2)]
 )
 def test_offsets_are_found_with_honest_deviations_and_the_cameras_lose_their_bias(model, distance_mm, runs):
     normalised, with_offsets, without, claims = [], [], [], []
@@ -48,7 +48,7 @@ def test_offsets_are_found_with_honest_deviations_and_the_cameras_lose_their_bia
 
 def test_without_offsets_none_are_claimed():
     p_values, priors = [], []
-    for seed in range(8):
+    for seed in range(6):
         found = calibrate(tool_sweep(seed, offset_mm=np.zeros((3, 3)))[0]).offsets
         p_values.append(found.p_value)
         priors.append(found.prior_sd)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lib.calibration import advise, box_grid, calibrate, dlt, next_position, next_positions, optics
+from lib.calibration import advise, box_grid, calibrate, dlt, next_position, next_positions, optics, report
 from lib.cameras import NearAffineCamera
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig, simulate_correspondences
 
@@ -141,20 +141,20 @@ def test_advice_says_when_the_data_are_enough():
 
 def test_report_says_what_is_wrong():
     c, found = made(100, model="zero_skew")
-    text = found.report()
+    text = report(found)
     assert "LOOK" not in text and "px/mm" in text and "Outliers" not in text
     u_left = c.u_left.copy()
     u_left[[3, 50]] += 400
-    text = calibrate(c.x_mm, [u_left, c.u_right]).report()
+    text = report(calibrate(c.x_mm, [u_left, c.u_right]))
     assert "2 outliers" in text and "    50:" in text
     rig = reference_rig()
     near = [NearAffineCamera(k.matrix, 1 / 80, (959.5, 539.5), ROBOT_FROM_MICROSCOPE.t) for k in (rig.left, rig.right)]
     u = [k.project(c.true_x_mm) + np.random.default_rng(0).normal(size=(100, 2)) for k in near]
-    assert "curved" in calibrate(c.true_x_mm, u).report()
-    assert "working distance" in calibrate(c.true_x_mm, u, model="near_affine").report()
-    assert "camera" in calibrate(c.x_mm, [c.u_left]).report()
+    assert "curved" in report(calibrate(c.true_x_mm, u))
+    assert "working distance" in report(calibrate(c.true_x_mm, u, model="near_affine"))
+    assert "camera" in report(calibrate(c.x_mm, [c.u_left]))
     twice = [c.u_left, c.u_left + np.random.default_rng(0).normal(size=(100, 2))]
-    assert "hardly differ" in calibrate(c.x_mm, twice).report()
+    assert "hardly differ" in report(calibrate(c.x_mm, twice))
 
 
 def test_optics_of_the_reference_rig():
