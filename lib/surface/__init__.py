@@ -4,20 +4,22 @@
 tool.  `surface_mesh`, `depth_map` and the `save_` functions take it to other programs.
 """
 
-from lib.surface.bspline import BSplineSurface, Curvature, SplineGrid, ToolDistance
+from lib.surface.bspline import BSplineSurface, Curvature, ToolDistance
 from lib.surface.export import (
     Mesh,
     depth_map,
+    open3d,
     remove_outliers,
     save_depth_map,
     save_mesh,
     save_points,
     surface_mesh,
 )
-from lib.surface.fitting import SurfaceFit, fit_surface, held_out_errors
+from lib.surface.fit import SurfaceFit
+from lib.surface.fitting import fit_surface, held_out_errors
+from lib.surface.grid import SplineGrid
 from lib.surface.joint import refine_rig
 from lib.surface.reconstruct import EPIPOLAR_SIGMAS, Reconstruction, epipolar_inliers, reconstruct
-from lib.surface.sphere import Sphere, fit_sphere
 
 __all__ = [
     "EPIPOLAR_SIGMAS",
@@ -25,15 +27,14 @@ __all__ = [
     "Curvature",
     "Mesh",
     "Reconstruction",
-    "Sphere",
     "SplineGrid",
     "SurfaceFit",
     "ToolDistance",
     "depth_map",
     "epipolar_inliers",
-    "fit_sphere",
     "fit_surface",
     "held_out_errors",
+    "open3d",
     "reconstruct",
     "refine_rig",
     "remove_outliers",

@@ -1,27 +1,52 @@
 """Surfaces for other programs: textured meshes (GLB), point clouds (PLY), depth maps (TIFF).
 
-Open3D writes and filters point clouds; it is imported only where it is used, since it needs system libraries.  Files
-appear whole or not at all.
+Open3D writes meshes and point clouds, and removes outliers.  It is imported here only, when it is first needed, since it
+needs system libraries.  Files appear whole or not at all.
 """
 
 from __future__ import annotations
 
-import json
-import os
-import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
 from lib.cameras import AffineCamera
+from lib.files import whole, write_bytes
 from lib.geometry import finite_points
 from lib.surface.bspline import BSplineSurface
 
-__all__ = ["Mesh", "depth_map", "remove_outliers", "save_depth_map", "save_mesh", "save_points", "surface_mesh"]
+__all__ = [
+    "Mesh",
+    "depth_map",
+    "open3d",
+    "remove_outliers",
+    "save_depth_map",
+    "save_mesh",
+    "save_points",
+    "surface_mesh",
+]
+
+
+def open3d() -> ModuleType:
+    """The module open3d.
+
+    Raises
+    ------
+    ImportError
+        Where it or its system libraries are missing, in one line that says what to install.
+    """
+    try:
+        import open3d
+    except (ImportError, OSError) as error:
+        raise ImportError(
+            f"Open3D does not load ({error}). On Debian and Ubuntu: apt-get install libegl1 libgl1 libusb-1.0-0"
+        ) from error
+    return open3d
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,55 +120,37 @@ def surface_mesh(
 
 
 def save_mesh(mesh: Mesh, path: str | Path) -> Path:
-    """Write a mesh as binary glTF 2.0 (.glb) with its texture inside; vertices in mm under a node scaled to metres.
+    """Write a mesh as binary glTF (.glb) with its texture inside, in metres, the unit of glTF.
 
     Raises
     ------
     ValueError
         For another suffix.
+    ImportError, OSError
+        Where Open3D does not load, or cannot write the file.
     """
     path = _suffixed(path, ".glb")
-    arrays = {"POSITION": mesh.vertices_mm.astype("<f4"), "NORMAL": mesh.normals.astype("<f4")}
+    o3d = open3d()
+
+    def tensor(values: np.ndarray) -> object:
+        return o3d.core.Tensor(np.ascontiguousarray(values))
+
+    written = o3d.t.geometry.TriangleMesh(tensor(mesh.vertices_mm.astype(np.float32) / 1000), tensor(mesh.faces))
+    written.vertex.normals = tensor(mesh.normals.astype(np.float32))
     if mesh.texture is not None:
-        # glTF counts texture coordinates from the image's corner, pixel centres are half a pixel in.
-        arrays["TEXCOORD_0"] = ((mesh.u + 0.5) / mesh.texture.shape[1::-1]).astype("<f4")
-    faces = len(arrays)  # the faces' accessor comes last
-    accessors: list[dict] = [
-        {"bufferView": i, "componentType": 5126, "count": len(a), "type": f"VEC{a.shape[1]}"}
-        for i, a in enumerate(arrays.values())
-    ]
-    accessors[0] |= {"min": arrays["POSITION"].min(axis=0).tolist(), "max": arrays["POSITION"].max(axis=0).tolist()}
-    accessors.append({"bufferView": faces, "componentType": 5125, "count": mesh.faces.size, "type": "SCALAR"})
-    chunks = [np.ascontiguousarray(a).tobytes() for a in (*arrays.values(), mesh.faces.astype("<u4"))]
-    attributes = {name: i for i, name in enumerate(arrays)}
-    material: dict = {"doubleSided": True, "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.9}}
-    document: dict = {
-        "asset": {"version": "2.0", "generator": "microstereo"},
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "scale": [0.001, 0.001, 0.001]}],
-        "meshes": [{"primitives": [{"attributes": attributes, "indices": faces, "material": 0}]}],
-        "accessors": accessors,
-        "materials": [material],
-    }
-    if mesh.texture is not None:
-        material["pbrMetallicRoughness"]["baseColorTexture"] = {"index": 0}
-        images = [{"bufferView": len(chunks), "mimeType": "image/jpeg"}]
-        document |= {"textures": [{"source": 0}], "images": images}
-        chunks.append(_encoded(".jpg", mesh.texture[..., ::-1], "texture"))
-    padded = [chunk + b"\0" * (-len(chunk) % 4) for chunk in chunks]
-    starts = np.concatenate([[0], np.cumsum([len(chunk) for chunk in padded])]).tolist()
-    document["buffers"] = [{"byteLength": starts[-1]}]
-    document["bufferViews"] = [
-        {"buffer": 0, "byteOffset": start, "byteLength": len(chunk)}
-        for start, chunk in zip(starts[:-1], chunks, strict=True)
-    ]
-    text = json.dumps(document, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 4)
-    body = b"".join(padded)
-    header = struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + len(body))
-    blocks = [header, struct.pack("<I4s", len(text), b"JSON"), text, struct.pack("<I4s", len(body), b"BIN\0"), body]
-    return _write_whole(path, lambda partial: partial.write_bytes(b"".join(blocks)))
+        # Open3D counts texture coordinates from the lower left corner; pixel centres lie half a pixel in.
+        uv = (mesh.u + 0.5) / mesh.texture.shape[1::-1] * (1, -1) + (0, 1)
+        written.triangle.texture_uvs = tensor(uv[mesh.faces].astype(np.float32))
+        written.material.set_default_properties()
+        written.material.material_name = "defaultLit"
+        written.material.texture_maps["albedo"] = o3d.t.geometry.Image(tensor(mesh.texture))
+    # The header of a GLB states the length of the file.
+    _write(
+        path,
+        lambda name: o3d.t.io.write_triangle_mesh(name, written),
+        lambda data: len(data) > 12 and int.from_bytes(data[8:12], "little") == len(data),
+    )
+    return path
 
 
 def save_points(
@@ -155,26 +162,22 @@ def save_points(
     ------
     ValueError
         For NaN, counts that differ, or another suffix.
-    ImportError
-        Where Open3D's system libraries are missing.
+    ImportError, OSError
+        Where Open3D does not load, or cannot write the file.
     """
     path = _suffixed(path, ".ply")
     x = finite_points(x_mm, 3, "x_mm")
     for name, values in (("colours", colours), ("normals", normals)):
         if values is not None and np.shape(values) != x.shape:
             raise ValueError(f"{name}: expected one row a point, {x.shape}, got {np.shape(values)}.")
-    o3d = _open3d()
+    o3d = open3d()
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(x))
     if colours is not None:
         cloud.colors = o3d.utility.Vector3dVector(np.asarray(colours, dtype=np.float64) / 255)
     if normals is not None:
         cloud.normals = o3d.utility.Vector3dVector(np.asarray(normals, dtype=np.float64))
-
-    def write(partial: Path) -> None:
-        if not o3d.io.write_point_cloud(str(partial), cloud):
-            raise OSError(f"{path}: Open3D could not write it.")
-
-    return _write_whole(path, write)
+    _write(path, lambda name: o3d.io.write_point_cloud(name, cloud), lambda data: len(data) >= x.nbytes)
+    return path
 
 
 def remove_outliers(x_mm: ArrayLike, *, neighbours: int = 20, sigmas: float = 2.0) -> np.ndarray:
@@ -186,7 +189,7 @@ def remove_outliers(x_mm: ArrayLike, *, neighbours: int = 20, sigmas: float = 2.
     x = finite_points(x_mm, 3, "x_mm")
     if len(x) <= neighbours:
         raise ValueError(f"neighbours: {neighbours} neighbours need more than {len(x)} points; ask for fewer.")
-    o3d = _open3d()
+    o3d = open3d()
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(x))
     kept = np.zeros(len(x), dtype=bool)
     kept[np.asarray(cloud.remove_statistical_outlier(neighbours, sigmas)[1], dtype=int)] = True
@@ -209,40 +212,24 @@ def save_depth_map(path: str | Path, depth_mm: np.ndarray) -> Path:
     path = _suffixed(path, ".tiff", ".tif")
     if np.ndim(depth_mm) != 2:
         raise ValueError(f"depth_mm: expected (h, w), got shape {np.shape(depth_mm)}.")
-    encoded = _encoded(".tiff", np.asarray(depth_mm, dtype=np.float32), "depth_mm")
-    return _write_whole(path, lambda partial: partial.write_bytes(encoded))
+    write_bytes(path, cv2.imencode(".tiff", np.asarray(depth_mm, dtype=np.float32))[1].tobytes())
+    return path
 
 
-def _open3d():
-    try:
-        import open3d
-    except (ImportError, OSError) as error:
-        raise ImportError(
-            f"Open3D does not load ({error}). On Debian and Ubuntu: apt-get install libegl1 libgl1 libusb-1.0-0"
-        ) from error
-    return open3d
+def _write(path: Path, write: Callable[[str], bool], is_whole: Callable[[bytes], bool]) -> None:
+    """Let one of Open3D's writers fill a file, whole or not at all.
 
-
-def _encoded(suffix: str, image: np.ndarray, name: str) -> bytes:
-    ok, data = cv2.imencode(suffix, np.ascontiguousarray(image))
-    if not ok:
-        raise ValueError(f"{name}: OpenCV cannot encode an image of shape {image.shape}, type {image.dtype}.")
-    return data.tobytes()
+    The writers return False on an error, but on a full disk some return True and leave part of the file.
+    """
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"{path.parent}: no such folder.")
+    with whole(path) as partial:
+        if not write(str(partial)) or not is_whole(partial.read_bytes()):
+            raise OSError(f"{path}: Open3D could not write the whole file; is the disk full?")
 
 
 def _suffixed(path: str | Path, *suffixes: str) -> Path:
     path = Path(path)
     if path.suffix.lower() not in suffixes:
         raise ValueError(f"path: {path.name} should end in {' or '.join(suffixes)}.")
-    return path
-
-
-def _write_whole(path: Path, write: Callable[[Path], object]) -> Path:
-    # The suffix stays last, since writers choose the format by it.
-    partial = path.with_name(f"{path.stem}.partial{path.suffix}")
-    try:
-        write(partial)
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
     return path

@@ -3,139 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from functools import cached_property, partial
-from typing import TYPE_CHECKING, Literal
+from dataclasses import dataclass
+from functools import partial
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.linalg import cho_solve_banded, cholesky_banded
 
+from lib.cameras import AffineCamera
 from lib.geometry import points
-from lib.surface.bspline import BSplineSurface, SplineGrid
-from lib.surface.solver import L1Problem, L1Solution, cvxpy_reference, interior_point, least_squares, reweighted
+from lib.surface.bspline import BSplineSurface
+from lib.surface.fit import SurfaceFit
+from lib.surface.grid import SplineGrid
+from lib.surface.solver import L1Problem, L1Solution, interior_point, least_squares, reweighted
 
-if TYPE_CHECKING:
-    from lib.cameras import AffineCamera
-
-__all__ = ["REJECT_MEDIANS", "SurfaceFit", "fit_surface", "held_out_errors"]
+__all__ = ["REJECT_MEDIANS", "fit_surface", "held_out_errors"]
 
 #: Default rejection: points whose L1 norm exceeds this many times the median.  Gaussian noise along one axis puts
 #: 0.1 % of its points beyond it.
 REJECT_MEDIANS = 5.0
 
-_SOLVERS = {"interior_point": interior_point, "cvxpy": cvxpy_reference, "least_squares": least_squares}
+_SOLVERS = {"interior_point": interior_point, "least_squares": least_squares}
 _FOLDS = 3
 _ENOUGH_HELD_OUT = 1500  # points in the folds that are tried: more only cost time
 _QUICK_HELD_OUT = 1000
 _LADDER = 10.0**0.5  # step between candidates of the smoothness
 _EXTENT = 8  # at most so many steps from the first candidate, either way
-
-
-@dataclass(frozen=True, eq=False)
-class SurfaceFit:
-    """How a surface was found.
-
-    Attributes
-    ----------
-    objective:
-        Eq. (6) over the final inliers: sum of (weighted) L1 norms in mm plus `smoothness` times the bending energy in
-        mm^2 / px^2.  With point covariances the norms are whitened, with a camera they are depths.
-    duality_gap:
-        Proven bound, in the unit of the objective, on its distance from the minimum (NaN from cvxpy).
-    smoothness:
-        mu of Eq. (6), px^2 / mm: given, or chosen by held-out error.
-    reject_mm:
-        Bound on the L1 norm of a point's residual that was applied, after the first fit.
-    inliers:
-        (n,) points that the final fit used.
-    residual_mm:
-        (n, 3) Psi(u) - x of every given point at the final surface; NaN where u lies outside.
-    iterations:
-        Newton steps of the final solve.
-    held_out:
-        (m, 2) candidates of the smoothness and their mean held-out L1 error (mm), where it was chosen; else (0, 2).
-    axes:
-        (k, 3) orthonormal directions along which the L1 norm was taken: the axes of the frame for the plain fit.
-    method:
-        The solver.
-    """
-
-    objective: float
-    duality_gap: float
-    smoothness: float
-    reject_mm: float
-    inliers: np.ndarray
-    residual_mm: np.ndarray
-    iterations: int
-    held_out: np.ndarray
-    axes: np.ndarray
-    method: str
-    _problem: L1Problem = field(repr=False)
-    _mu: np.ndarray = field(repr=False)
-    _weights: np.ndarray = field(repr=False)
-    _residual: np.ndarray = field(repr=False)
-    _quarter: np.ndarray = field(repr=False)
-
-    def covariance(self, grid: SplineGrid, u: np.ndarray) -> np.ndarray:
-        """Covariance (n, 3, 3) mm^2 of Psi(u) (n, 2), NaN outside the domain.
-
-        The curvature of the expected L1 loss is 2 f(0) B'B, where f(0) is the density of the residuals at zero; with
-        the bending energy as the prior this gives C = (2 f B'B + 2 mu R)^-1 / (2 f) for the coefficients of an output
-        (Koenker, Quantile Regression, Sec. 4.2; Wahba, J. R. Stat. Soc. B 45, 1983, for reading the penalty as a
-        prior, which makes the bands hold the smoothing bias on average).  Neighbouring matches share part of their
-        error; C is inflated by how much more the signs of residuals in a quarter of a cell agree than independent ones
-        would.  Outputs correlate as the signs of their residuals do.  What all points share, such as the error of the
-        calibration, is not in it.
-
-        Raises
-        ------
-        ValueError
-            For a fit by least squares, to which this does not apply.
-        """
-        if self.method == "least_squares":
-            raise ValueError("covariance: of the L1 fit; fit with method 'interior_point'.")
-        result = np.full((len(u), 3, 3), np.nan)
-        inside = np.flatnonzero(grid.inside(u))
-        for part in np.array_split(inside, max(1, len(inside) // 2048)):
-            columns = grid.design(u[part]).toarray().T
-            variance = [
-                (columns * cho_solve_banded((factor, True), columns)).sum(axis=0) / (2 * density)
-                for factor, density in self._posterior
-            ]
-            sigma = np.sqrt(np.stack(variance, axis=1) * self._inflation)
-            covariance = sigma[:, :, None] * self._correlation * sigma[:, None, :]
-            result[part] = np.einsum("ki,nkl,lj->nij", self.axes, covariance, self.axes)
-        return result
-
-    @cached_property
-    def _posterior(self) -> list[tuple[np.ndarray, float]]:
-        """Factor of 2 f B'W^2 B + 2 mu R and density f, one an output."""
-        posterior = []
-        scatter = (self._weights * self._residual).T
-        for mu, weights, residual in zip(self._mu, self._weights.T, scatter, strict=True):
-            # Half of the residuals lie within their median.
-            density = 0.25 / max(np.median(np.abs(residual)), np.finfo(float).tiny)
-            band = self._problem.normal_band(2 * density * weights**2, 2 * mu)
-            posterior.append((cholesky_banded(band, lower=True), density))
-        return posterior
-
-    @cached_property
-    def _inflation(self) -> np.ndarray:
-        """Variance (k,) of the sum of residual signs in a quarter of a cell, over that of independent signs."""
-        signs = np.sign(self._residual)
-        _, place, counts = np.unique(self._quarter, return_inverse=True, return_counts=True)
-        sums = np.stack([np.bincount(place, column) for column in signs.T], axis=1)
-        return np.maximum((sums**2).sum(axis=0) / counts.sum(), 1.0)
-
-    @cached_property
-    def _correlation(self) -> np.ndarray:
-        signs = np.sign(self._residual)
-        product = signs.T @ signs
-        norm = np.sqrt(np.maximum(np.diag(product), 1.0))
-        correlation = product / np.outer(norm, norm)
-        np.fill_diagonal(correlation, 1.0)
-        return correlation
 
 
 def fit_surface(
@@ -149,7 +42,7 @@ def fit_surface(
     weights: ArrayLike | None = None,
     covariance_mm2: ArrayLike | None = None,
     camera: AffineCamera | None = None,
-    method: Literal["interior_point", "cvxpy", "least_squares"] = "interior_point",
+    method: Literal["interior_point", "least_squares"] = "interior_point",
     tolerance: float = 1e-8,
     quick: bool = False,
 ) -> BSplineSurface:
@@ -182,11 +75,11 @@ def fit_surface(
         axis by a typical one (and the whole multiplied by the mean, so that it stays in mm).  Triangulated points are
         ten times worse along the view than across it.  None is the paper's plain norm.
     camera:
-        The left camera.  Its ray through u is then exact, Psi(u) = ray(u) + s(u) d, and only the depth s along the
+        The left camera, affine.  Its ray through u is then exact, Psi(u) = ray(u) + s(u) d, and only the depth s along the
         viewing direction d is fitted, to d.x: one spline in the place of three.  Give `u` as matched in the image.
     method:
-        "interior_point", or "cvxpy" for the same minimum from CLARABEL, the reference.  "least_squares" replaces the
-        L1 norms by squares (mu is then in px^2), the baseline that outliers ruin.
+        "interior_point".  "least_squares" replaces the L1 norms by squares (mu is then in px^2), the baseline that
+        outliers ruin.
     tolerance:
         Duality gap at which the solver stops, relative to the objective.
     quick:
@@ -251,11 +144,10 @@ def fit_surface(
         held_out=held_out,
         axes=axes,
         method=method,
-        _problem=problem,
-        _mu=mu,
-        _weights=data.norms[inliers],
-        _quarter=_quarters(grid, data.u[inliers]),
-        _residual=problem.design @ solution.coefficients - data.values[inliers],
+        problem=problem,
+        penalty=mu,
+        weights=data.norms[inliers],
+        residual=problem.design @ solution.coefficients - data.values[inliers],
     )
     return BSplineSurface(grid, surface.control_points_mm, fit)
 
@@ -363,6 +255,11 @@ def _outputs(
     x: np.ndarray, weights: np.ndarray, covariance_mm2: ArrayLike | None, camera: AffineCamera | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(axes (k, 3), values (n, k) = x along them, weights (n, k) of their absolute residuals)."""
+    if camera is not None and not isinstance(camera, AffineCamera):
+        raise ValueError(
+            "camera: the rays of a near-affine camera are not parallel, so the depth along them is no B-spline; fit all "
+            "three coordinates, without a camera."
+        )
     n = len(x)
     axes = np.eye(3) if camera is None else camera.viewing_direction[None]
     if covariance_mm2 is None:
@@ -381,12 +278,6 @@ def _outputs(
     inverse_sigma = np.zeros(variance.shape)
     inverse_sigma[used] = variance[used] ** -0.5
     return axes, x @ axes.T, weights[:, None] * inverse_sigma / inverse_sigma[used].mean()
-
-
-def _quarters(grid: SplineGrid, u: np.ndarray) -> np.ndarray:
-    """Number (n,) of the quarter cell that each point lies in."""
-    cell, t = grid.locate(u)
-    return (2 * cell + (t >= 0.5)) @ (1, 2 * grid.cells[0])
 
 
 def _rays(u: np.ndarray, camera: AffineCamera) -> np.ndarray:

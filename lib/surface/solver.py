@@ -2,7 +2,7 @@
 
 Eq. (6) decouples over x, y and z, and each output is a quadratic programme whose Newton matrix B'DB + 2 mu R has the
 narrow band of the spline's own grid.  `interior_point` walks to its exact minimum in a dozen banded factorisations
-and returns the duality gap as proof; `cvxpy_reference` solves the same with CLARABEL, to compare.
+and returns the duality gap as proof.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from scipy import sparse
 from scipy.linalg.lapack import dpbtrf, dpbtrs
 from threadpoolctl import ThreadpoolController
 
-from lib.surface.bspline import SplineGrid, cubic_basis
+from lib.surface.grid import SplineGrid, cubic_basis
 
-__all__ = ["L1Problem", "L1Solution", "cvxpy_reference", "interior_point", "least_squares", "reweighted"]
+__all__ = ["UNHELD", "L1Problem", "L1Solution", "interior_point", "least_squares", "reweighted"]
 
-_UNHELD = (
+UNHELD = (
     "smoothness: too small to hold the control points that have no data near them; increase it, or use fewer control "
     "points."
 )
@@ -159,8 +159,6 @@ class L1Solution:
         y (n, k), |y_i| <= w_i: the pull of each point on the surface.
     iterations:
         Newton steps taken.
-    solve_seconds:
-        What CLARABEL says that it took without the building of its model; NaN for our own.
     """
 
     coefficients: np.ndarray
@@ -168,7 +166,6 @@ class L1Solution:
     duality_gap: np.ndarray
     dual: np.ndarray
     iterations: int
-    solve_seconds: float = np.nan
 
 
 def interior_point(
@@ -232,7 +229,7 @@ def _interior_point(
     unit = max(np.abs(x).max(), np.finfo(float).tiny)
     factor = _cholesky(problem.normal_band(w, 2 * mu / unit))
     if factor is None:
-        raise ValueError(_UNHELD)
+        raise ValueError(UNHELD)
     c = _solve(factor, B_T @ (w * x))
     residual = B @ c - x
     scale = max(w @ np.abs(residual) / total, 1e-12 * unit)
@@ -329,43 +326,6 @@ def _cholesky(band: np.ndarray) -> np.ndarray | None:
     return None if info else factor
 
 
-def cvxpy_reference(
-    problem: L1Problem,
-    x: np.ndarray,
-    mu: float | np.ndarray,
-    weights: np.ndarray | None = None,
-    *,
-    tolerance: float = 1e-9,
-) -> L1Solution:
-    """The same minimum from CLARABEL through cvxpy: slower, and independent of this module's algorithm.
-
-    Its `duality_gap` is NaN: CLARABEL's own stopping rule stands for it.
-    """
-    import cvxpy as cp
-
-    n, k = x.shape
-    w = np.ones((n, k)) if weights is None else weights
-    mu = np.broadcast_to(mu, k)
-    centre = np.average(x, axis=0, weights=w[:, 0])
-    unit = np.maximum(np.abs(x - centre).max(axis=0), np.finfo(float).tiny)
-    coefficients, dual = np.empty((problem.grid.size, k)), np.empty((n, k))
-    iterations, solve_seconds = 0, 0.0
-    for j in range(k):
-        c, residual = cp.Variable(problem.grid.size), cp.Variable(n)
-        split = residual == problem.design @ c - (x[:, j] - centre[j]) / unit[j]
-        energy = cp.quad_form(c, mu[j] * unit[j] * problem.bending, assume_PSD=True)
-        model = cp.Problem(cp.Minimize(w[:, j] @ cp.abs(residual) + energy), [split])
-        model.solve(solver=cp.CLARABEL, tol_gap_rel=tolerance, tol_gap_abs=tolerance, tol_feas=min(1e-8, tolerance))
-        if c.value is None:
-            raise ValueError(f"smoothness: CLARABEL found no solution ({model.status}); increase it.")
-        coefficients[:, j], dual[:, j] = c.value * unit[j] + centre[j], split.dual_value
-        iterations = max(iterations, model.solver_stats.num_iters or 0)
-        solve_seconds += model.solver_stats.solve_time or 0.0
-    fitted = problem.design @ coefficients - x
-    objective = (w * np.abs(fitted)).sum(axis=0) + mu * (coefficients * (problem.bending @ coefficients)).sum(axis=0)
-    return L1Solution(coefficients, objective, np.full(k, np.nan), dual, iterations, solve_seconds)
-
-
 def reweighted(
     problem: L1Problem,
     x: np.ndarray,
@@ -396,7 +356,7 @@ def reweighted(
             with _one_blas_thread():
                 factor = _cholesky(problem.normal_band(D, 2 * mu_j))
                 if factor is None:
-                    raise ValueError(_UNHELD)
+                    raise ValueError(UNHELD)
                 c = _solve(factor, B_T @ (D * x_j))
             residual = B @ c - x_j
             dual[:, j] = D * residual
@@ -427,7 +387,7 @@ def least_squares(
     for j, mu_j in enumerate(np.broadcast_to(mu, k)):
         factor = _cholesky(problem.normal_band(w[:, j] ** 2, mu_j))
         if factor is None:
-            raise ValueError(_UNHELD)
+            raise ValueError(UNHELD)
         coefficients[:, j] = _solve(factor, problem.design_T @ (w[:, j] ** 2 * x[:, j]))
     residual = problem.design @ coefficients - x
     energy = (coefficients * (problem.bending @ coefficients)).sum(axis=0)

@@ -23,7 +23,6 @@ from lib.simulator.scenes import OBJECTS, Relief
 from lib.simulator.window import surface_grid
 from lib.surface.bspline import BSplineSurface
 from lib.surface.reconstruct import Reconstruction, reconstruct
-from lib.surface.sphere import Sphere, fit_sphere
 from notebooks.studies.matching_evaluation import (
     CONFIDENCES,
     DisparityScore,
@@ -31,6 +30,7 @@ from notebooks.studies.matching_evaluation import (
     score_against_disparity,
     sparsification,
 )
+from notebooks.studies.sphere import Sphere, fit_sphere
 
 __all__ = [
     "Case",

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from lib.cameras import AffineCamera
 from lib.geometry import RigidTransform
 from lib.surface import BSplineSurface, SplineGrid
-from lib.surface.bspline import cubic_basis
+from lib.surface.grid import cubic_basis
 
 DOMAIN = (10.0, -5.0, 410.0, 295.0)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+import sys
 
 import cv2
 import numpy as np
@@ -59,25 +60,59 @@ def test_mask_hides_triangles(surface):
 
 
 @pytest.mark.parametrize("textured", [True, False])
-def test_glb_is_read_by_open3d(surface, image, tmp_path, textured):
+def test_glb_is_glTF_in_metres_with_its_texture(surface, image, tmp_path, textured):
     mesh = surface_mesh(surface, step_px=60, image=image if textured else None)
     path = save_mesh(mesh, tmp_path / "eye.glb")
     assert [p.name for p in tmp_path.iterdir()] == ["eye.glb"]
     content = path.read_bytes()
-    magic, version, length = struct.unpack_from("<4sII", content)
+    magic, version, length, size = struct.unpack_from("<4sIII", content)
     assert (magic, version, length) == (b"glTF", 2, len(content))
-    document = json.loads(content[20 : 20 + struct.unpack_from("<I", content, 12)[0]])
+    document, body = json.loads(content[20 : 20 + size]), content[28 + size :]
+    attributes = document["meshes"][0]["primitives"][0]["attributes"]
+
+    def read(name: str, width: int) -> np.ndarray:
+        accessor = document["accessors"][attributes[name]]
+        start = document["bufferViews"][accessor["bufferView"]].get("byteOffset", 0) + accessor.get("byteOffset", 0)
+        return np.frombuffer(body, "<f4", accessor["count"] * width, start).reshape(-1, width)
+
+    distance, index = KDTree(mesh.vertices_mm).query(1000 * read("POSITION", 3).astype(float))
+    assert distance.max() < 1e-3 and len(np.unique(index)) == len(mesh.vertices_mm)
+    np.testing.assert_allclose(read("NORMAL", 3), mesh.normals[index], atol=1e-5)
     assert ("images" in document) == textured
-    read = o3d.io.read_triangle_mesh(str(path))
-    # Open3D sorts vertices and faces its own way, and turns v upside down: compare each face's corners.
-    theirs = np.asarray(read.vertices)[np.asarray(read.triangles)].reshape(-1, 9) * 1000
-    ours = mesh.vertices_mm[mesh.faces].reshape(-1, 9)
-    assert len(ours) == len(theirs)
-    distance, index = KDTree(theirs).query(ours)
-    assert distance.max() < 1e-3 and len(np.unique(index)) == len(ours)
-    if textured:
-        uv = np.abs(np.asarray(read.triangle_uvs).reshape(-1, 3, 2) - [0, 1])[index]
-        np.testing.assert_allclose(uv, ((mesh.u + 0.5) / (1920, 1080))[mesh.faces], atol=1e-5)
+    if textured:  # glTF counts from the upper left corner of the image
+        np.testing.assert_allclose(read("TEXCOORD_0", 2), ((mesh.u + 0.5) / (1920, 1080))[index], atol=1e-5)
+        view = document["bufferViews"][document["images"][0]["bufferView"]]
+        encoded = np.frombuffer(body, np.uint8, view["byteLength"], view.get("byteOffset", 0))
+        stored = cv2.imdecode(encoded, cv2.IMREAD_COLOR)[..., ::-1]
+        assert stored.shape == image.shape and np.abs(stored.astype(int) - image).mean() < 3
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="limits the size of files")
+def test_a_full_disk_is_an_error_and_the_old_file_stays(surface, tmp_path):
+    import resource
+
+    mesh = surface_mesh(surface, step_px=60)
+    save_points(tmp_path / "cloud.ply", np.zeros((4, 3)))
+    before, limit = (tmp_path / "cloud.ply").read_bytes(), resource.getrlimit(resource.RLIMIT_FSIZE)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (4000, limit[1]))  # what is longer fails, as on a full disk
+        with pytest.raises(OSError, match="cloud"):
+            save_points(tmp_path / "cloud.ply", mesh.vertices_mm)
+        with pytest.raises(OSError, match="eye"):
+            save_mesh(mesh, tmp_path / "eye.glb")
+        with pytest.raises(OSError):
+            save_depth_map(tmp_path / "depth.tiff", np.zeros((100, 100)))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+    assert [p.name for p in tmp_path.iterdir()] == ["cloud.ply"]
+    assert (tmp_path / "cloud.ply").read_bytes() == before
+
+
+def test_without_open3d_one_line_says_what_to_install(monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "open3d", None)
+    with pytest.raises(ImportError, match="apt-get install") as failure:
+        save_points(tmp_path / "cloud.ply", np.zeros((4, 3)))
+    assert "\n" not in str(failure.value)
 
 
 def test_ply_comes_back_with_colours_and_normals(surface, image, bowl, tmp_path):

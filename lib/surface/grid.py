@@ -1,0 +1,158 @@
+"""Uniform bicubic B-splines over an image: basis, control grid, exact bending energy.
+
+A grid of ``control = (n_x, n_y)`` control points covers the domain (x0, y0, x1, y1) px with (n_x - 3) x (n_y - 3) cells,
+so the control points reach one cell beyond it on each side.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy import sparse
+
+__all__ = ["SplineGrid", "cubic_basis"]
+
+# Element matrices of one span of width 1: integrals over it of products of the four cubic basis functions that live
+# there, and of their first and second derivatives.  Summed over the spans they give the Gram matrices exactly.
+_ELEMENT = (
+    np.array([[20, 129, 60, 1], [129, 1188, 933, 60], [60, 933, 1188, 129], [1, 60, 129, 20]]) / 5040.0,
+    np.array([[6, 7, -12, -1], [7, 34, -29, -12], [-12, -29, 34, 7], [-1, -12, 7, 6]]) / 120.0,
+    np.array([[2, -3, 0, 1], [-3, 6, -3, 0], [0, -3, 6, -3], [1, 0, -3, 2]]) / 6.0,
+)
+
+
+def cubic_basis(t: np.ndarray, derivative: int = 0) -> np.ndarray:
+    """The four uniform cubic B-splines that live on a span, (..., 4), at t in [0, 1], or a derivative in t."""
+    s = 1.0 - t
+    if derivative == 0:
+        return np.stack([s**3, (3 * t - 6) * t**2 + 4, (3 * s - 6) * s**2 + 4, t**3], axis=-1) / 6
+    if derivative == 1:
+        return np.stack([-(s**2), (3 * t - 4) * t, (4 - 3 * s) * s, t**2], axis=-1) / 2
+    if derivative == 2:
+        return np.stack([s, 3 * t - 2, 3 * s - 2, t], axis=-1)
+    raise ValueError(f"derivative: 0, 1 or 2, got {derivative}.")
+
+
+def _gram(n: int, derivative: int) -> sparse.csr_matrix:
+    """Integrals (n, n) over the domain of products of the basis functions' derivatives, spans of width 1."""
+    cell = np.arange(n - 3)[:, None, None]
+    row, column = np.broadcast_arrays(cell + np.arange(4)[:, None], cell + np.arange(4))
+    values = np.broadcast_to(_ELEMENT[derivative], row.shape)
+    return sparse.csr_matrix((values.ravel(), (row.ravel(), column.ravel())), shape=(n, n))
+
+
+@dataclass(frozen=True)
+class SplineGrid:
+    """Where the control points of a bicubic spline lie.
+
+    Coefficients are flat vectors (n_x n_y,) whose fast axis is the shorter side of the grid: this makes every matrix
+    of the fit as narrow-banded as can be.
+
+    Attributes
+    ----------
+    domain:
+        (x0, y0, x1, y1) px.
+    control:
+        (n_x, n_y), each at least 4.
+    """
+
+    domain: tuple[float, float, float, float]
+    control: tuple[int, int]
+
+    def __post_init__(self) -> None:
+        domain = np.asarray(self.domain, dtype=np.float64)
+        if domain.shape != (4,) or not np.isfinite(domain).all() or not (domain[:2] < domain[2:]).all():
+            raise ValueError(f"domain: expected (x0, y0, x1, y1) px with x0 < x1 and y0 < y1, got {self.domain}.")
+        control = np.asarray(self.control)
+        if control.shape != (2,) or not np.issubdtype(control.dtype, np.integer) or control.min() < 4:
+            raise ValueError(f"control: expected (n_x, n_y) control points, 4 or more each, got {self.control}.")
+        object.__setattr__(self, "domain", tuple(float(v) for v in domain))
+        object.__setattr__(self, "control", tuple(int(v) for v in control))
+
+    @property
+    def size(self) -> int:
+        """Number of control points."""
+        return self.control[0] * self.control[1]
+
+    @property
+    def cells(self) -> tuple[int, int]:
+        """(n_x - 3, n_y - 3)."""
+        return self.control[0] - 3, self.control[1] - 3
+
+    @property
+    def cell_px(self) -> np.ndarray:
+        """Width and height (2,) of a cell."""
+        x0, y0, x1, y1 = self.domain
+        return np.array([x1 - x0, y1 - y0]) / self.cells
+
+    @property
+    def stride(self) -> tuple[int, int]:
+        """Steps of the flat index for one control point to the right, and for one down."""
+        n_x, n_y = self.control
+        return (1, n_x) if n_x <= n_y else (n_y, 1)
+
+    @property
+    def bandwidth(self) -> int:
+        """Number of diagonals below the main one that matrices of this grid fill."""
+        return 3 * sum(self.stride)
+
+    def inside(self, u: np.ndarray) -> np.ndarray:
+        """Which of the points (n, 2) lie in the domain, borders included; NaN does not."""
+        x0, y0, x1, y1 = self.domain
+        return (u[:, 0] >= x0) & (u[:, 0] <= x1) & (u[:, 1] >= y0) & (u[:, 1] <= y1)
+
+    def locate(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Cell (n, 2) int of each point, and its place (n, 2) in that cell, in [0, 1] for points inside."""
+        position = (u - self.domain[:2]) / self.cell_px
+        cell = np.clip(np.floor(position), 0, np.array(self.cells) - 1).astype(np.intp)
+        return cell, position - cell
+
+    def design(self, u: np.ndarray, derivative: tuple[int, int] = (0, 0)) -> sparse.csr_matrix:
+        """B (n, size) with 16 entries a row: B @ coefficients is the spline, or its derivative per px, at u (n, 2)."""
+        cell, t = self.locate(u)
+        scale = self.cell_px ** -np.array(derivative, dtype=float)
+        along_x = cubic_basis(t[:, 0], derivative[0]) * scale[0]
+        along_y = cubic_basis(t[:, 1], derivative[1]) * scale[1]
+        step_x, step_y = self.stride
+        offset = np.arange(4, dtype=np.int32)[:, None] * step_y + np.arange(4, dtype=np.int32) * step_x
+        columns = (cell @ self.stride).astype(np.int32)[:, None, None] + offset
+        values = along_y[:, :, None] * along_x[:, None, :]
+        indptr = np.arange(0, 16 * len(u) + 1, 16, dtype=np.int32)
+        return sparse.csr_matrix((values.ravel(), columns.ravel(), indptr), shape=(len(u), self.size))
+
+    @cached_property
+    def bending(self) -> sparse.csr_matrix:
+        """R (size, size): c.R.c = integral over the domain of s_xx^2 + 2 s_xy^2 + s_yy^2, exact (per px^2, over px^2).
+
+        Its null space is the linear functions, of dimension 3.
+        """
+        (n_x, n_y), (h_x, h_y) = self.control, self.cell_px
+        gram_x = [_gram(n_x, k) * h_x ** (1 - 2 * k) for k in range(3)]
+        gram_y = [_gram(n_y, k) * h_y ** (1 - 2 * k) for k in range(3)]
+        slow, fast = (gram_y, gram_x) if self.stride[0] == 1 else (gram_x, gram_y)
+        terms = ((1.0, 2, 0), (2.0, 1, 1), (1.0, 0, 2))
+        bending = sum(factor * sparse.kron(slow[p], fast[q], format="csr") for factor, p, q in terms).tocsr()
+        bending.eliminate_zeros()  # kron stores whole blocks
+        return bending
+
+    def flatten(self, control_points: np.ndarray) -> np.ndarray:
+        """Coefficients (size, k) of control points (n_y, n_x, k)."""
+        array = control_points if self.stride[0] == 1 else control_points.swapaxes(0, 1)
+        return array.reshape(self.size, -1)
+
+    def unflatten(self, coefficients: np.ndarray) -> np.ndarray:
+        """Control points (n_y, n_x, k) of coefficients (size, k)."""
+        n_x, n_y = self.control
+        if self.stride[0] == 1:
+            return coefficients.reshape(n_y, n_x, -1)
+        return coefficients.reshape(n_x, n_y, -1).swapaxes(0, 1)
+
+    @property
+    def sites(self) -> np.ndarray:
+        """Image points (n_y, n_x, 2) of the control points: f(sites) as control points reproduce a linear f exactly."""
+        (n_x, n_y), cell = self.control, self.cell_px
+        x = self.domain[0] + (np.arange(n_x) - 1) * cell[0]
+        y = self.domain[1] + (np.arange(n_y) - 1) * cell[1]
+        return np.stack(np.meshgrid(x, y), axis=-1)
