@@ -2,24 +2,28 @@
 
 from __future__ import annotations
 
+import argparse
+import importlib
+import json
 import os
 import shutil
 import subprocess
 import sys
+import traceback
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 
 USAGE = """\
-usage: python3 -m lib COMMAND [options]        (in the folder of the workbench)
+python3 -m lib COMMAND [options]        (in the folder of the workbench)
 
-  run [NOTEBOOK ...] [--profile quick|paper] [-p NAME VALUE ...]
+  run [NOTEBOOK ...] [--profile quick|paper] [-p NAME VALUE]
               work through the notebooks; the report appears in runs/<date>-<profile>/index.html
   test [...]  style and tests; what follows goes to pytest
   lab  [...]  open the notebooks in JupyterLab
   bench [...] benchmarks; what follows goes to pytest
-  sweep NOTEBOOK -p NAME VALUE,VALUE,... [-p ...]
-              one notebook over a grid of parameters; the results appear as a table
+  sweep NOTEBOOK [-p NAME VALUE,VALUE,...] [--workers N | --scheduler ADDRESS] [--record]
+              one notebook over a grid of parameters, on Dask; a table and a plot of each metric
   simulate, train, evaluate [...]
               make recordings and data sets; train the landmark detector; measure it (--help says more)
   setup       only make the environment (each command does it when it is needed)
@@ -35,21 +39,23 @@ PYTHONS = ((3, 11), (3, 15))
 def main(argv: list[str]) -> int:
     """Find a fitting Python and environment, then dispatch; returns the exit code."""
     if not argv or argv[0] in ("-h", "--help", "help"):
-        print(USAGE)
+        print(f"usage: {USAGE}")
         return 0 if argv else 2
     if argv[0] not in {*COMMANDS, "setup", "lock"}:
-        print(f"unknown command: {argv[0]}\n\n{USAGE}", file=sys.stderr)
+        print(f"unknown command: {argv[0]}\n\nusage: {USAGE}", file=sys.stderr)
         return 2
     if not PYTHONS[0] <= sys.version_info[:2] < PYTHONS[1]:
         return _use_another_python(argv)
     from lib import environment
 
+    parser = argparse.ArgumentParser(prog="python3 -m lib", usage=USAGE, add_help=False, allow_abbrev=False)
+    parser.add_argument("--torch", choices=environment.TORCH_BUILDS)
+    options, argv = parser.parse_known_args(argv)
     try:
-        torch, argv = _take_torch(argv)
         if argv[0] == "lock":
             print(f"Wrote {environment.lock(upgrade='--upgrade' in argv).relative_to(ROOT)}")
             return 0
-        python = environment.ensure(torch=torch)
+        python = environment.ensure(torch=options.torch)
     except environment.Problem as problem:
         print(f"\n{problem}", file=sys.stderr)
         return 1
@@ -61,19 +67,6 @@ def main(argv: list[str]) -> int:
     if Path(sys.prefix).resolve() != (ROOT / ".venv").resolve():
         return _become([str(python), "-m", "lib", *argv])
     return COMMANDS[argv[0]](argv[1:]) or 0
-
-
-def _take_torch(argv: list[str]) -> tuple[str | None, list[str]]:
-    """Split ``--torch BUILD`` off, wherever it stands."""
-    from lib.environment import TORCH_BUILDS, Problem
-
-    for i, word in enumerate(argv):
-        if word == "--torch" or word.startswith("--torch="):
-            build = word[8:] if "=" in word else "".join(argv[i + 1 : i + 2])
-            if build not in TORCH_BUILDS:
-                raise Problem(f"--torch {build}: choose one of {', '.join(TORCH_BUILDS)}.")
-            return build, argv[:i] + argv[i + (1 if "=" in word else 2) :]
-    return None, argv
 
 
 def _use_another_python(argv: list[str]) -> int:
@@ -94,32 +87,14 @@ def _become(command: list[str]) -> int:
     os.execv(command[0], command)
 
 
-# --- the commands, inside .venv; each imports what it needs --------------------------------------------------------
-
-
-def run(argv: list[str]) -> int:
-    from lib.workbench.command import main
-
-    return main(argv)
-
-
 def test(argv: list[str]) -> int:
-    style = subprocess.call(
-        [sys.executable, "-m", "ruff", "check", "--output-format=concise", *ruff_options(), str(ROOT)]
-    )
-    return _pytest(argv, failed=style)
+    style = subprocess.call([sys.executable, "-m", "ruff", "check", "--output-format=concise", *ruff_options(), ROOT])
+    return _pytest(argv) or style
 
 
 def bench(argv: list[str]) -> int:
-    return _pytest(
-        [
-            "--override-ini=addopts=--import-mode=importlib --strict-markers",
-            "--benchmark-only",
-            "--benchmark-disable-gc",
-            str(ROOT / "tests" / "benchmarks"),
-            *argv,
-        ]
-    )
+    plain = "--override-ini=addopts=--import-mode=importlib --strict-markers"
+    return _pytest([plain, "--benchmark-only", "--benchmark-disable-gc", str(ROOT / "tests" / "benchmarks"), *argv])
 
 
 def lab(argv: list[str]) -> int:
@@ -128,40 +103,30 @@ def lab(argv: list[str]) -> int:
     return _become([*command, *root, *argv])
 
 
-def sweep(argv: list[str]) -> int:
-    from lib.workbench.sweep import main
-
-    return main(argv)
+def _pytest(argv: list[str]) -> int:
+    return subprocess.call([sys.executable, "-m", "pytest", "-c", ROOT / "environment.toml", f"--rootdir={ROOT}", *argv])
 
 
-def simulate(argv: list[str]) -> int:
-    from lib.simulator.dataset import main
+def _main_of(name: str, module: str, function: str):
+    """The command `name`: a function of a module.  An error that a user can mend is told in one line, without a traceback."""
 
-    return main(argv)
+    def command(argv: list[str]) -> int:
+        try:
+            return getattr(importlib.import_module(module), function)(argv)
+        except KeyboardInterrupt:
+            print("\nStopped; start again to go on.", file=sys.stderr)
+            return 130
+        except (OSError, ValueError) as error:
+            ours = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename.startswith(str(ROOT))]
+            where = f"{Path(ours[-1].filename).relative_to(ROOT)}, line {ours[-1].lineno}"
+            print(f"python3 -m lib {name}: {error} ({where})", file=sys.stderr)
+            return 2
 
-
-def train(argv: list[str]) -> int:
-    from lib.training.command import main
-
-    return main(argv)
-
-
-def evaluate(argv: list[str]) -> int:
-    from lib.training.command import main_evaluate as main
-
-    return main(argv)
-
-
-def _pytest(argv: list[str], failed: int = 0) -> int:
-    options = ["-c", str(ROOT / "environment.toml"), f"--rootdir={ROOT}"]
-    command = [sys.executable, "-m", "pytest", *options, *argv]
-    return (subprocess.call(command) or failed) if failed else _become(command)
+    return command
 
 
 def ruff_options() -> list[str]:
     """[tool.ruff] of environment.toml as command-line options (ruff reads only files of its own names)."""
-    import json
-
     from lib.environment import manifest
 
     def toml(value: object) -> str:
@@ -172,7 +137,15 @@ def ruff_options() -> list[str]:
     return ["--isolated", *(f"--config={key} = {toml(value)}" for key, value in manifest()["tool"]["ruff"].items())]
 
 
-COMMANDS = {command.__name__: command for command in (run, test, lab, bench, sweep, simulate, train, evaluate)}
+#: Command -> the function that it calls, and its module.
+FUNCTIONS = {
+    "run": ("lib.workbench.command", "main"),
+    "sweep": ("lib.workbench.sweep", "main"),
+    "simulate": ("lib.simulator.dataset", "main"),
+    "train": ("lib.training.command", "main"),
+    "evaluate": ("lib.training.command", "main_evaluate"),
+}
+COMMANDS = {"test": test, "bench": bench, "lab": lab, **{name: _main_of(name, *FUNCTIONS[name]) for name in FUNCTIONS}}
 
 if __name__ == "__main__":
     sys.exit(main(sys.argv[1:]))

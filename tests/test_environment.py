@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+import venv as venv_module
 
 import pytest
 from packaging.markers import Marker
@@ -16,7 +17,6 @@ from packaging.markers import Marker
 from lib import environment, paths
 from lib.environment import Problem
 
-LIBRARIES = {"libEGL.so.1": "libegl1", "libGL.so.1": "libgl1"}
 LOCK = (paths.ROOT / "lib" / "environment.lock").read_text(encoding="utf-8")
 
 
@@ -83,12 +83,12 @@ def made(monkeypatch):
     """A list that grows by one for each environment made from nothing."""
     times = []
 
-    def make_venv(venv, uv):
+    def make_venv(venv):
         times.append(time.monotonic())
-        subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(venv)], check=True)
+        venv_module.create(venv, with_pip=False)
 
     monkeypatch.setattr(environment, "_make_venv", make_venv)
-    monkeypatch.setattr(environment._Installer, "__call__", lambda self, what, arguments, total=0: None)
+    monkeypatch.setattr(environment, "_install", lambda venv, what, arguments, lock_file, uv=None: None)
     monkeypatch.setattr(environment, "_loads", lambda name: True)
     monkeypatch.setattr(environment, "_has_nvidia_gpu", lambda: False)
     monkeypatch.setattr(environment, "_check_disk", lambda folder, gb: None)
@@ -123,7 +123,7 @@ def test_lib_is_imported_from_any_folder_and_after_a_move(root, made, tmp_path_f
     elsewhere = tmp_path_factory.mktemp("elsewhere")
     moved = elsewhere / "moved"
     shutil.move(root, moved)
-    command = [str(environment.python_of(moved / ".venv")), "-c", "import lib; print(lib.__file__)"]
+    command = [str(environment.python_of(moved / ".venv")), "-E", "-c", "import lib; print(lib.__file__)"]
     answer = subprocess.run(command, cwd=elsewhere, capture_output=True, text=True, check=True)
     assert answer.stdout.strip() == str(moved / "lib" / "__init__.py")
 
@@ -140,7 +140,7 @@ def test_half_made_is_made_anew(root, made, monkeypatch):
         def killed(*_):
             raise KeyboardInterrupt
 
-        patch.setattr(environment, "_install_torch", killed)
+        patch.setattr(environment, "_write_site_files", killed)
         with pytest.raises(KeyboardInterrupt):
             environment.ensure(root)
     assert stamp(root)["state"] == "making"
@@ -193,27 +193,19 @@ def test_two_at_a_time_make_it_once(root, made):
 # --- what the machine lacks
 
 
-def test_missing_libraries_stop_before_anything_is_made(root, made, monkeypatch, capsys):
-    monkeypatch.setattr(environment, "_loads", lambda name: False)
-    monkeypatch.setattr(environment, "_apt_install", lambda packages: False)
-    monkeypatch.setattr(environment.shutil, "which", lambda name: "/usr/bin/apt-get" if name == "apt-get" else None)
-    with pytest.raises(Problem, match="sudo apt-get install -y libegl1 libgl1 libusb-1.0-0"):
-        environment.ensure(root)
-    assert not made and not (root / ".venv").exists()
+def test_missing_libraries_stop_nothing_and_are_told_in_one_line(root, made, monkeypatch, capsys):
+    monkeypatch.setattr(environment, "_loads", lambda name: name == "libGL.so.1")
+    monkeypatch.setattr(environment.sys, "platform", "linux")
+    environment.ensure(root)
+    assert stamp(root)["state"] == "ready"
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if "Open3D" in line]
+    assert "all else runs" in line and line.endswith("apt-get install libegl1 libusb-1.0-0")
+    assert environment.missing_libraries({"libGL.so.1": "libgl1"}) == ""
 
 
-def test_missing_libraries_are_installed_where_that_is_allowed(monkeypatch):
-    monkeypatch.setattr(environment, "_makes_environments", lambda: True)
-    there = {"libGL.so.1"}
-    asked = []
-
-    def install(packages):
-        asked.extend(packages)
-        there.update(LIBRARIES)
-        return True
-
-    environment.check_system(LIBRARIES, loads=there.__contains__, install=install)
-    assert asked == ["libegl1"]
+def test_the_launcher_asks_for_no_rights():
+    text = (paths.ROOT / "lib" / "environment.py").read_text(encoding="utf-8")
+    assert "sudo" not in text and "unsafe-best-match" not in text
 
 
 def test_too_little_disk(tmp_path):
@@ -221,54 +213,54 @@ def test_too_little_disk(tmp_path):
         environment._check_disk(tmp_path, 1e9)
 
 
-def test_no_ensurepip_says_what_to_type(monkeypatch):
+def test_no_ensurepip_says_what_to_install(tmp_path, monkeypatch):
     """What Debian's python3 without python3-venv looks like."""
-    monkeypatch.setattr(environment, "_makes_environments", lambda: False)
-    monkeypatch.setattr(environment.shutil, "which", lambda name: "/usr/bin/apt-get" if name == "apt-get" else None)
-    with pytest.raises(Problem, match=r"sudo apt-get install -y python3\.\d+-venv"):
-        environment.check_system({}, install=lambda packages: False)
+    monkeypatch.setattr(environment.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(environment.shutil, "which", lambda name: None)
+    with pytest.raises(Problem, match=r"install python3\.\d+-venv \(or uv\), then start again"):
+        environment._make_venv(tmp_path / ".venv")
 
 
 def test_a_failing_installer_shows_its_last_words(tmp_path, monkeypatch):
-    installer = environment._Installer(tmp_path / ".venv", None, (tmp_path / "lock").open("wb"))
-    words = [sys.executable, "-c", "print('ERROR: no route to host'); raise SystemExit(1)"]
-    monkeypatch.setattr(installer, "command", lambda arguments: words)
-    with pytest.raises(Problem, match="Installing packages failed:\n    ERROR: no route to host"):
-        installer("packages", [])
+    words = "import sys; print('ERROR: no route to', sys.argv[-1]); raise SystemExit(1)"
+    (tmp_path / "python").write_text(f'#!/bin/sh\nexec {sys.executable} -c "{words}" "$@"\n')
+    (tmp_path / "python").chmod(0o755)
+    monkeypatch.setattr(environment, "python_of", lambda venv: tmp_path / "python")
+    with (tmp_path / "lock").open("wb") as lock, pytest.raises(Problem, match="packages failed:\n    ERROR: no route to x"):
+        environment._install(tmp_path, "packages", ["x"], lock)
 
 
-# --- builds of torch, sources of packages
+def test_where_uv_fails_pip_installs(root, made, monkeypatch):
+    """uv knows nothing of pip's configuration, such as a mirror or a folder of wheels."""
+    asked = []
+
+    def install(venv, what, arguments, lock_file, uv=None):
+        asked.append((what, uv))
+        if uv:
+            raise Problem("no route to host")
+
+    monkeypatch.setattr(environment.shutil, "which", lambda name: "/bin/uv" if name == "uv" else None)
+    monkeypatch.setattr(environment, "_install", install)
+    environment.ensure(root)
+    assert asked == [("packages", "/bin/uv"), ("packages with pip", None), ("torch (cpu)", None)]
+
+
+# --- builds of torch
 
 INDEXES = {"cpu_index": "https://cpu", "windows_cuda_index": "https://cuda"}
 
 
 def test_a_cpu_user_on_linux_never_gets_the_default_build():
-    attempts = environment.torch_attempts("2.13.0", "cpu", "linux", INDEXES)
-    assert attempts[0] == ["--no-deps", "torch==2.13.0+cpu"]
-    assert attempts[1] == ["--no-deps", "--index-url", "https://cpu", "torch==2.13.0"]
-    assert len(attempts) == 2
+    arguments = environment.torch_arguments("2.13.0", "cpu", "linux", INDEXES)
+    assert arguments == ["--no-deps", "--extra-index-url", "https://cpu", "torch==2.13.0+cpu"]
 
 
 def test_a_cuda_user_never_gets_the_cpu_build():
-    assert environment.torch_attempts("2.13.0", "cuda", "linux", INDEXES) == [["torch==2.13.0,!=2.13.0+cpu"]]
-    assert environment.torch_attempts("2.13.0", "cuda", "win32", INDEXES)[0][:2] == ["--index-url", "https://cuda"]
+    assert environment.torch_arguments("2.13.0", "cuda", "linux", INDEXES) == ["torch==2.13.0,!=2.13.0+cpu"]
+    assert environment.torch_arguments("2.13.0", "cuda", "win32", INDEXES)[:2] == ["--index-url", "https://cuda"]
     with pytest.raises(Problem, match="no CUDA on a Mac"):
-        environment.torch_attempts("2.13.0", "cuda", "darwin", INDEXES)
+        environment.torch_arguments("2.13.0", "cuda", "darwin", INDEXES)
 
 
 def test_elsewhere_the_default_build_is_the_cpu_build():
-    assert environment.torch_attempts("2.13.0", "cpu", "darwin", INDEXES) == [["--no-deps", "torch==2.13.0"]]
-
-
-def test_uv_gets_the_sources_of_pip():
-    arguments = environment._uv_sources({"extra-index-url": "https://a https://b", "find-links": "/wheels"})
-    assert arguments == [
-        *("--index", "https://a", "--index", "https://b", "--find-links", "/wheels"),
-        *("--index-strategy", "unsafe-best-match"),
-    ]
-    assert environment._uv_sources({}) == []
-
-
-def test_pip_configuration_is_read(monkeypatch):
-    monkeypatch.setenv("PIP_FIND_LINKS", "/a/folder")
-    assert environment._pip_configuration(sys.executable)["find-links"] == "/a/folder"
+    assert environment.torch_arguments("2.13.0", "cpu", "darwin", INDEXES) == ["--no-deps", "torch==2.13.0"]

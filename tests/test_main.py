@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 from collections import namedtuple
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -47,8 +48,33 @@ def test_the_torch_build_reaches_the_environment(inside, monkeypatch):
 
 
 def test_an_unknown_torch_build_is_an_error(inside, capsys):
-    assert command_line.main(["run", "--torch", "rocm"]) == 1
-    assert "choose one of cpu, cuda" in capsys.readouterr().err
+    with pytest.raises(SystemExit) as stop:
+        command_line.main(["run", "--torch", "rocm"])
+    assert stop.value.code == 2 and "invalid choice: 'rocm'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("module", "function"), command_line.FUNCTIONS.values())
+def test_every_command_has_its_function(module, function):
+    source = (paths.ROOT / Path(*module.split("."))).with_suffix(".py").read_text(encoding="utf-8")
+    assert any(getattr(node, "name", "") == function for node in ast.parse(source).body)
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "text"),
+    [
+        (ValueError("frames: 0; give at least 3."), 2, "python3 -m lib run: frames: 0; give at least 3. (tests"),
+        (OSError(28, "No space left on device", "a.png"), 2, "No space left on device: 'a.png'"),
+        (KeyboardInterrupt(), 130, "start again to go on"),
+    ],
+)
+def test_what_a_user_can_mend_is_told_in_one_line(inside, monkeypatch, capsys, error, code, text):
+    def fails(argv):
+        raise error
+
+    monkeypatch.setattr(command_line.importlib, "import_module", lambda name: SimpleNamespace(main=fails))
+    assert command_line.main(["run"]) == code
+    said = capsys.readouterr().err
+    assert text in said and len(said.strip().splitlines()) == 1
 
 
 def test_a_problem_of_the_environment_is_told_without_traceback(monkeypatch, capsys):
