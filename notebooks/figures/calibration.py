@@ -257,18 +257,19 @@ def advice_curves(table: Table, first: int) -> Figure:
 
 
 def residuals(calibration: Calibration) -> Figure:
-    """Residual arrows over each image, their distribution against the Gaussian expected, and against depth."""
+    """Residual arrows over each image, and their distribution beside the Gaussian of the same width."""
     c = len(calibration.cameras)
     page, axes = figure(1, c + 1, width_in=13, height_in=3.6)
     good = calibration.inliers
+    outlier = calibration.usable & ~good
     for i, side in enumerate(["Left", "Right"] if c == 2 else ["Camera"]):
         u, r = calibration.y_px[:, 2 * i : 2 * i + 2], calibration.residuals_px[:, 2 * i : 2 * i + 2]
         ax = axes[i]
         ax.quiver(*u[good].T, *r[good].T, angles="xy", scale_units="xy", scale=0.04, color=COLOURS["ours"], width=0.003)
-        ax.plot(*u[~good].T, "x", color=COLOURS["paper"], label="outlier")
+        ax.plot(*u[outlier].T, "x", color=COLOURS["paper"], label="outlier")
         ax.invert_yaxis()
         ax.set(aspect="equal", title=f"{side}: residuals, 25 times", xlabel="px")
-        if (~good).any():
+        if outlier.any():
             ax.legend()
     r = calibration.residuals_px[good].ravel()
     span = np.linspace(-4 * r.std(), 4 * r.std(), 200)
@@ -351,7 +352,7 @@ def time_offset(found: TimeOffset, true_s: float) -> Figure:
         ylabel="reprojection RMS (px)",
         title="The clocks reveal themselves",
     )
-    ax.legend(loc="lower right")
+    ax.legend(loc="upper center")
     return page
 
 
