@@ -1,4 +1,4 @@
-"""Figures of notebook 01: rig, imaging effects, sequences, labels, realism."""
+"""Figures of notebook 01: rig, imaging effects, recordings, labels, realism."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from lib.cameras import StereoRig
 from lib.correspondences import LANDMARKS
 from lib.recordings import Recording
 from lib.simulator.eye import Scene
-from lib.simulator.forceps import Forceps
 from lib.simulator.microscope import Microscope
 from lib.simulator.motion import Motion
+from lib.simulator.window import Window
 from notebooks.figures.style import COLOURS, LANDMARK_COLOURS, figure, show_image
 from notebooks.studies.realism import Profiles
 
@@ -25,9 +25,12 @@ __all__ = [
     "landmark_counts",
     "motion_page",
     "profiles_page",
+    "ray_cast_depth",
     "realism_page",
     "realism_sheet",
     "rig_page",
+    "stages_page",
+    "verdict_page",
     "volume_page",
 ]
 
@@ -65,7 +68,7 @@ def contact_sheet(recording: Recording, indices: Sequence[int], *, columns: int 
 
 
 def rig_page(scene: Scene, microscope: Microscope, rig: StereoRig) -> Figure:
-    """A section through the eye with the two rays of one point, and depth error against the angle between the axes.
+    """A section through the eye with the two rays of one point, and the depth error against the angle between the axes.
 
     `rig` is in the microscope frame.
     """
@@ -127,8 +130,8 @@ def motion_page(motions: Mapping[str, Motion], *, samples: int = 1500) -> Figure
     return page
 
 
-def volume_page(recording: Recording, forceps: Forceps | None = None) -> Figure:
-    """Where the landmarks were: in the left image, in depth, and the opening of the jaws."""
+def volume_page(recording: Recording) -> Figure:
+    """Where the landmarks were in the left image and in depth, and how far the jaws opened."""
     page, axes = figure(1, 3, width_in=12, height_in=3.6)
     x = recording.landmarks_mm()
     u = recording.annotations.u_left
@@ -147,7 +150,7 @@ def volume_page(recording: Recording, forceps: Forceps | None = None) -> Figure:
 
 
 def annotation_errors(recording: Recording) -> np.ndarray:
-    """Clicked minus true landmarks, (n, 2) px, both cameras; needs a simulated recording."""
+    """Clicked minus true landmarks (n, 2) px of both cameras; needs a simulated recording."""
     if recording.truth is None or recording.annotations is None:
         raise ValueError(f"recording: {recording.name} has no truth or no annotations; take a simulated one.")
     errors = [
@@ -159,9 +162,9 @@ def annotation_errors(recording: Recording) -> np.ndarray:
 
 
 def realism_page(real: Mapping[str, np.ndarray], simulated: Mapping[str, np.ndarray]) -> Figure:
-    """Each statistic's distribution, simulated against the real frames' 5th to 95th percentile.
+    """Distribution of each statistic: simulated windows against the 5th to 95th percentile of the real frames.
 
-    Both map a statistic to its values (n,).
+    Both arguments map a statistic to its values (n,).
     """
     columns = 4
     rows = -(-len(real) // columns)
@@ -181,10 +184,42 @@ def realism_page(real: Mapping[str, np.ndarray], simulated: Mapping[str, np.ndar
     return page
 
 
+def verdict_page(judgements: Mapping[str, Sequence[Mapping]]) -> Figure:
+    """Where the median of the simulated windows lies in the range of the real frames, statistic by statistic.
+
+    Parameters
+    ----------
+    judgements:
+        Name of a comparison -> its rows from `notebooks.studies.realism.compare`.
+    """
+    page, ax = figure(width_in=9, height_in=4.6)
+    markers = zip(judgements.items(), "osDv^P", COLOURS.values(), strict=False)
+    for k, ((name, rows), marker, colour) in enumerate(markers):
+        place = np.array([(r["simulated_median"] - r["real_p05"]) / (r["real_p95"] - r["real_p05"]) for r in rows])
+        y = np.arange(len(rows)) + 0.12 * (k - (len(judgements) - 1) / 2)
+        ax.plot(place.clip(-0.6, 1.6), y, marker, color=colour, label=name, markersize=6)
+    ax.axvspan(0, 1, color="#eeeeee", zorder=0)
+    ax.set_yticks(range(len(rows)), [r["name"].replace("_", " ") for r in rows])
+    ax.set(xlim=(-0.65, 1.65), xlabel="0: the real 5th percentile, 1: the 95th (beyond the axis: drawn at its end)")
+    ax.set_title("Median of the simulated windows")
+    ax.invert_yaxis()
+    ax.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    return page
+
+
+def stages_page(seconds: Mapping[str, float]) -> Figure:
+    """CPU seconds of a stereo pair by stage of its making, as bars."""
+    page, ax = figure(width_in=8, height_in=0.35 * len(seconds) + 0.9)
+    ax.barh(list(seconds), list(seconds.values()), color=COLOURS["baseline"])
+    ax.invert_yaxis()
+    ax.set(xlabel="CPU seconds a pair")
+    return page
+
+
 def profiles_page(pairs: Mapping[str, tuple[Profiles, Profiles]]) -> Figure:
     """Distributions of real and simulated images, a row for each pair (real, simulated).
 
-    Lines are means over images; the grey band holds the middle 90 % of the real ones.
+    Lines are means over images; the grey band holds the middle 90 % of the real images.
     """
     page, axes = figure(len(pairs), 4, width_in=12, height_in=2.6 * len(pairs), squeeze=False)
     channels = dict(zip(("red", "green", "blue"), ("#c0392b", "#2e8b57", "#2b6cc0"), strict=True))
@@ -231,7 +266,7 @@ def realism_sheet(
 
 
 def landmark_counts(recordings: Sequence[Recording]) -> dict[str, dict[str, int]]:
-    """How many landmarks of both cameras are visible, hidden by the tool, outside, and in glint, for each landmark."""
+    """For each landmark, in how many images of both cameras it is visible, hidden by the tool, outside, and in glint."""
     truths = [recording.truth for recording in recordings]
     if None in truths:
         raise ValueError("recordings: one has no truth; take simulated ones.")
@@ -249,3 +284,32 @@ def landmark_counts(recordings: Sequence[Recording]) -> dict[str, dict[str, int]
         for k, name in enumerate(LANDMARKS):
             counts[name]["in_glint"] = int(in_glint[..., k].sum())
     return counts
+
+
+def ray_cast_depth(scene: Scene, window: Window, u: np.ndarray, *, step_mm: float = 0.01) -> np.ndarray | None:
+    """Depth z (n,) mm of a scene at pixels u (n, 2) by Open3D's ray caster; None where Open3D cannot be imported.
+
+    The surface becomes a mesh of triangles of `step_mm`.  Rays start far above it, so nothing is shared with our renderer
+    but the height field and the camera.
+    """
+    try:
+        import open3d as o3d
+    except (ImportError, OSError) as error:
+        print(f"Skipped: Open3D cannot be imported ({error}).")
+        return None
+    low, high = (np.stack(window.rays(u.T, np.full(len(u), z)), axis=1) for z in (-20.0, 20.0))
+    corners = np.vstack([np.stack(window.rays(u.T, np.full(len(u), z)), axis=1) for z in (-4.0, 4.0)])
+    box = zip(corners.min(axis=0) - step_mm, corners.max(axis=0) + step_mm, strict=True)
+    x, y = (np.arange(a, b, step_mm) for a, b in box)
+    grid = np.stack(np.meshgrid(x, y), axis=-1)
+    z = scene.height(grid[..., 0], grid[..., 1])
+    vertices = np.dstack([grid, z]).reshape(-1, 3).astype(np.float32)
+    first = (np.arange(len(y) - 1)[:, None] * len(x) + np.arange(len(x) - 1)).ravel()
+    right, below = first + 1, first + len(x)
+    triangles = np.concatenate([np.stack([first, right, below], 1), np.stack([right, below + 1, below], 1)])
+    caster = o3d.t.geometry.RaycastingScene()
+    caster.add_triangles(o3d.core.Tensor(vertices), o3d.core.Tensor(triangles.astype(np.uint32)))
+    start, end = np.column_stack([low, np.full(len(u), -20.0)]), np.column_stack([high, np.full(len(u), 20.0)])
+    rays = np.hstack([start, end - start]).astype(np.float32)
+    share = caster.cast_rays(o3d.core.Tensor(rays))["t_hit"].numpy()
+    return start[:, 2] + share * (end - start)[:, 2]

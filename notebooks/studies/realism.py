@@ -1,10 +1,10 @@
-"""How much simulated images are like real ones: image statistics, and a preset that mimics the public in-vivo frames.
+"""How similar are simulated and real images?  Image statistics, and a preset that mimics the public in-vivo frames.
 
-The public frames with forceps (Sznitman et al., MICCAI 2012) come from another set-up than the open-sky one: a
-640 x 480 video camera looks through the pupil at a fifth of the magnification, under a blue (first sequence) or a green
-endoilluminator (second).  `in_vivo_window` renders that, so that statistics can be compared like with like.  Light, blur
-and noise of the preset (`LIGHTS`) were set by hand on the first half of each sequence and are judged on the second: the
-comparison shows that the renderer can reach such frames, not that it predicts a microscope never seen.
+The public frames with forceps (Sznitman et al., MICCAI 2012) come from another set-up than the open-sky one: a 640 x 480
+video camera looks through the pupil at a fifth of the magnification.  The first sequence is lit by a blue endoilluminator,
+the second by a green one.  `in_vivo_window` renders that set-up, so that like is compared with like.  Light, blur and noise
+of the preset (`LIGHTS`) were set by hand on the first half of each sequence and are judged on the second half.  So the
+comparison shows that the renderer can reach such frames; it does not show that it predicts a microscope never seen.
 """
 
 from __future__ import annotations
@@ -19,8 +19,7 @@ import numpy as np
 
 from lib.cameras import AffineCamera
 from lib.geometry import RigidTransform
-from lib.recordings import import_retinal_microsurgery
-from lib.recordings.frames import read_image
+from lib.recordings import import_retinal_microsurgery, read_image
 from lib.simulator.eye import Eye
 from lib.simulator.forceps import Forceps, Pose
 from lib.simulator.microscope import Microscope
@@ -31,11 +30,12 @@ from lib.simulator.window import Window
 __all__ = [
     "FUNDUS_SET_BY",
     "LIGHTS",
+    "SET_BY",
     "STATISTICS",
     "Light",
     "Profiles",
     "compare",
-    "exceptions_text",
+    "exceptions",
     "fundus_windows",
     "image_statistics",
     "in_vivo_window",
@@ -43,7 +43,6 @@ __all__ = [
     "profiles",
     "real_windows",
     "statistics_table",
-    "table_text",
 ]
 
 #: name -> what it is.
@@ -61,10 +60,10 @@ STATISTICS = {
     "sharpness_centre": "mean |Laplacian| of the central ninth",
     "sharpness_border": "mean |Laplacian| of the rest",
 }
-#: What sets a statistic in the simulator: why it may lie elsewhere.
+#: What sets a statistic in the simulator, and so may put it elsewhere.
 _EXPOSURE = "the exposure, which a sequence changes with every move of its lamp and the preset draws from one range"
 _DETAIL = "blur, sharpening and noise of the camera, one value a preset, while focus changes within a sequence"
-_SET_BY = {
+SET_BY = {
     "luminance_mean": _EXPOSURE,
     "luminance_std": "the hot spot of the lamp and the brightness of the tool against the retina",
     "luminance_p05": "the darkest of tool, shadow and border of the lit field, which has no border here",
@@ -98,24 +97,24 @@ FUNDUS_SET_BY = dict.fromkeys(
 
 @dataclass(frozen=True)
 class Light:
-    """An endoilluminator with its camera, set by hand on the first half of one real sequence.
+    """An endoilluminator and its camera, set by hand on the first half of one real sequence.
 
     Attributes
     ----------
     colour:
-        Mean red, green and blue of a picture over its green.
+        Mean red, green and blue of an image, divided by its mean green.
     exposure, exposure_spread:
-        Median green in linear light, and the spread of its logarithm from picture to picture.
+        Median green in linear light, and the standard deviation of its logarithm over images.
     metal, gloss:
         Reflectance of the tool, and strength of the wet surface's reflection.
     spot_distance_mm, spot_radius_mm:
-        Ranges of where the hot spot lies from the jaws, and of its Gaussian radius.
+        Ranges of the hot spot's distance from the jaws, and of its Gaussian radius.
     psf_px, sharpening, noise:
-        Blur at three times the resolution, the camera's unsharp mask, and shot noise at full scale.
+        Blur at three times the resolution, strength of the camera's unsharp mask, and shot noise at full scale.
     veil:
-        Share of the light that vitreous and optics scatter, and that arrives blurred.
+        Share of the light that vitreous and optics scatter, so that it arrives blurred.
     contrast:
-        Exponent of the camera's tone curve about the median, on top of gamma.
+        Exponent of the camera's tone curve about the median, applied after gamma.
     """
 
     colour: tuple[float, float, float]
@@ -132,7 +131,7 @@ class Light:
     contrast: float
 
 
-#: By the sequence whose first half each was set on.
+#: Name of a sequence -> the lamp that was set on its first half.
 LIGHTS = {
     "seq1": Light((0.70, 1.0, 1.30), 0.26, 0.25, 0.03, 0.4, (1.2, 3.5), (0.8, 1.5), 2.4, 0.9, 0.004, 0.45, 1.0),
     "seq2": Light((0.755, 1.0, 0.55), 0.41, 0.15, 0.33, 0.4, (1.5, 3.0), (1.2, 2.0), 2.6, 0.8, 0.015, 0.18, 1.35),
@@ -190,7 +189,7 @@ def _power(grey: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def landmark_window(image: np.ndarray, u: np.ndarray, size_px: int = 96) -> np.ndarray:
-    """The square of an image round the mean of its known landmarks u (3, 2), moved inside where it sticks out."""
+    """The square of an image around the mean of its known landmarks u (3, 2), moved so that it lies inside the image."""
     centre = np.nanmean(u, axis=0)
     if not np.isfinite(centre).all():
         raise ValueError("u: no landmark is known; choose a labelled frame.")
@@ -201,15 +200,15 @@ def landmark_window(image: np.ndarray, u: np.ndarray, size_px: int = 96) -> np.n
 def in_vivo_window(
     rng: np.random.Generator, size_px: int = 96, light: str | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A window of a simulated in-vivo frame round the jaws, and its landmarks u (3, 2) px.
+    """A window of a simulated in-vivo frame around the jaws, and its landmarks u (3, 2) px.
 
-    Rendered at three times the resolution: 18 px per mm, a pale fundus under one of the coloured `LIGHTS` whose hot
-    spot lies near the tool, glare of the optics, and the sensor's sharpening and noise.
+    It shows 18 px per mm and is rendered at three times the resolution: a pale fundus under one of the coloured `LIGHTS`,
+    whose hot spot lies near the tool, with glare of the optics, sharpening and noise.
 
     Parameters
     ----------
     light:
-        One of `LIGHTS`; None draws it.
+        One of `LIGHTS`; None draws one.
     """
     if light is not None and light not in LIGHTS:
         raise ValueError(f"light: unknown {light!r}; one of {', '.join(LIGHTS)}.")
@@ -250,7 +249,7 @@ def in_vivo_window(
     n = fine * size_px
     camera = AffineCamera(np.column_stack([fine * zoom * R[:2], (n - 1) / 2 - fine * zoom * middle]))
     view = render_view(eye, microscope, Window(camera, (n, n)), forceps=forceps, pose=pose)
-    # A narrow lamp: the picture keeps little of the fundus's own colour, and shows it in the lamp's.
+    # Under a narrow lamp the image keeps little of the fundus's own colour and takes on the lamp's.
     linear = cv2.resize((view.image / 255.0) ** 2.2, (size_px, size_px), interpolation=cv2.INTER_AREA)
     linear += lamp.veil * (cv2.GaussianBlur(linear, (0, 0), 0.1 * size_px) - linear)
     grey = linear @ np.array([0.25, 0.6, 0.15])
@@ -274,7 +273,7 @@ def statistics_table(windows: list[np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def compare(real: dict[str, np.ndarray], simulated: dict[str, np.ndarray]) -> list[dict[str, float | str | bool]]:
-    """One row a statistic: 5th, 50th and 95th percentile of both, and whether the simulated median lies within."""
+    """A row for each statistic: 5th, 50th and 95th percentile of both, and whether the simulated median lies within."""
     rows = []
     for name, values in real.items():
         row = {"name": name, "statistic": STATISTICS[name]}
@@ -286,44 +285,30 @@ def compare(real: dict[str, np.ndarray], simulated: dict[str, np.ndarray]) -> li
     return rows
 
 
-def table_text(rows: list[dict[str, float | str | bool]]) -> str:
-    """`compare` as a table of plain text."""
-    head = f"{'statistic':<20}{'real: 5 %':>10}{'median':>9}{'95 %':>9}{'simulated: 5 %':>17}{'median':>9}{'95 %':>9}"
-    lines = [
-        f"{r['name']:<20}{r['real_p05']:10.3f}{r['real_median']:9.3f}{r['real_p95']:9.3f}"
-        f"{r['simulated_p05']:17.3f}{r['simulated_median']:9.3f}{r['simulated_p95']:9.3f}"
-        f"   {'within' if r['within'] else 'OUTSIDE'}"
-        for r in rows
-    ]
-    return "\n".join([head, *lines])
+def exceptions(rows: list[dict[str, float | str | bool]], set_by: Mapping[str, str] = SET_BY) -> list[str]:
+    """A line for each statistic that `compare` finds outside: by how much, and what sets it in the simulator.
 
-
-def exceptions_text(rows: list[dict[str, float | str | bool]], set_by: Mapping[str, str] = _SET_BY) -> str:
-    """What `compare` finds outside, by how much, and what sets that statistic in the simulator.
-
-    `set_by` says it for each statistic; the default is for `in_vivo_window`, `FUNDUS_SET_BY` for bare textures.
+    `set_by` says what sets each statistic; the default is for `in_vivo_window`, `FUNDUS_SET_BY` for bare textures.
     """
-    outside = [r for r in rows if not r["within"]]
-    if not outside:
-        return f"No exception among {len(rows)} statistics."
-    lines = [f"{len(outside)} of {len(rows)} statistics lie outside:"]
-    for r in outside:
-        above = r["simulated_median"] > r["real_p95"]
-        limit = r["real_p95" if above else "real_p05"]
-        lines.append(
-            f"- {r['statistic']}: simulated {r['simulated_median']:.3g}, {'above' if above else 'below'} the real frames' "
-            f"{'95th' if above else '5th'} percentile {limit:.3g}. Set by {set_by[r['name']]}."
-        )
-    return "\n".join(lines)
+    lines = []
+    for r in rows:
+        if not r["within"]:
+            above = r["simulated_median"] > r["real_p95"]
+            limit = f"{'above' if above else 'below'} the real {'95th' if above else '5th'} percentile"
+            lines.append(
+                f"{r['statistic']}: simulated {r['simulated_median']:.3g}, {limit} "
+                f"{r['real_p95' if above else 'real_p05']:.3g}. Set by {set_by[r['name']]}."
+            )
+    return lines
 
 
 def real_windows(folder: str | Path, n: int, size_px: int = 96, part: str = "judged") -> dict[str, list[np.ndarray]]:
-    """Windows round the tool of about `n` real frames, by sequence of the public in-vivo data.
+    """Windows around the tool of about `n` real frames, by sequence of the public in-vivo data.
 
     Parameters
     ----------
     part:
-        "tuned": evenly from the first half of each sequence, on which `LIGHTS` was set; "judged": from the second.
+        "tuned": frames of the first half of each sequence, on which `LIGHTS` was set; "judged": of the second half.
     """
     if part not in ("tuned", "judged"):
         raise ValueError(f"part: 'tuned' or 'judged', got {part!r}.")
@@ -340,7 +325,7 @@ def real_windows(folder: str | Path, n: int, size_px: int = 96, part: str = "jud
 def fundus_windows(photograph: str | Path, seeds: Sequence[int], n: int, size_px: int = 160) -> tuple[list, list]:
     """Windows (real, simulated), n each, of a fundus photograph and of procedural textures, at 40 px per mm.
 
-    A square photograph of 45 degrees is taken to show 13 mm of retina; black surroundings are left out.
+    A square photograph of 45 degrees is assumed to show 13 mm of retina; the black surround is left out.
 
     Raises
     ------

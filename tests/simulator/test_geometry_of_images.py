@@ -17,7 +17,8 @@ from lib.simulator.render import render_view
 from lib.simulator.scenes import Checkerboard, Relief, checkerboard_poses
 from lib.simulator.texture import smooth_noise
 from lib.simulator.window import Window, surface_grid
-from notebooks.studies.effects import PLAIN
+from notebooks.figures.data import ray_cast_depth
+from notebooks.figures.effects import PLAIN
 
 IDENTITY = RigidTransform.identity()
 RIG = PLAIN.rig(IDENTITY)
@@ -136,6 +137,17 @@ def test_depth_of_plane_and_sphere_is_right_to_a_micrometre(camera):
             xy += (u - shown.project(x)) @ np.linalg.inv(affine.linear[:, :2]).T
         assert np.abs(shown.project(x) - u).max() < 1e-6
         assert np.abs(z - x[:, 2]).max() < 1e-3
+
+
+def test_depth_agrees_with_an_independent_ray_caster():
+    eye = Eye(seed=27, texture_px=64)
+    shown = Window.around(RIG.left, np.array([700, 500]), (96, 64))
+    u = np.stack(np.meshgrid(np.arange(0, 96, 5), np.arange(0, 64, 5)), axis=-1).reshape(-1, 2).astype(float)
+    cast = ray_cast_depth(eye, shown, u)
+    if cast is None:
+        pytest.skip("Open3D cannot be imported")
+    ours = render_view(eye, PLAIN, shown, surface=True).surface_mm[u[:, 1].astype(int), u[:, 0].astype(int)]
+    assert np.abs(cast - ours).max() < 1e-3
 
 
 def test_left_image_warped_by_the_true_surface_is_the_right_one():

@@ -1,4 +1,4 @@
-"""What each imaging effect does: the same window of the same moment, with one effect at a time."""
+"""Pictures of imaging effects: the same window of the same moment, with one effect at a time."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from lib.simulator.window import Window
 
 __all__ = ["PLAIN", "effect_gallery", "render_window"]
 
-#: A microscope without any imperfection: everything sharp, evenly lit, noiseless and lossless.
+#: A microscope without imperfections: everything is sharp, evenly lit, free of noise and stored without loss.
 PLAIN = Microscope(
     depth_of_field_mm=float("inf"),
     psf_px=0.5,
@@ -41,12 +41,9 @@ def render_window(
     velocity_mm_s: tuple[float, float, float] = (0.0, 0.0, 0.0),
     seed: int = 0,
 ) -> View:
-    """A window of the full-resolution image round the jaws: cheap enough for a slider.
+    """A window of the full-resolution image around the jaws: fast enough for a slider.
 
-    Parameters
-    ----------
-    velocity_mm_s:
-        Of the tool, for motion blur and rolling shutter.
+    `velocity_mm_s` is the tool's, for motion blur and rolling shutter.
     """
     rig = microscope.rig(RigidTransform.identity())
     centre = rig.left.project(forceps.landmarks(pose)).mean(axis=0)
@@ -63,7 +60,7 @@ def render_window(
 
 
 def effect_gallery(eye: Eye, forceps: Forceps, pose: Pose) -> dict[str, np.ndarray]:
-    """Title -> image (h, w, 3): nothing, each effect alone (stronger than by default, to be seen), and all together."""
+    """Title -> image (h, w, 3): no effect, each effect alone (stronger than by default, to be seen), and all together."""
     matt = replace(eye, gloss=0.0)
     fast = (9.0, 14.0, 0.0)
     default = Microscope()
