@@ -7,10 +7,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from lib.calibration import calibrate, tool_axes
 from lib.cameras import AffineCamera, StereoRig
+from lib.correspondences import pair_with_robot
 from lib.geometry import RigidTransform
-from lib.matching.result import Matches
-from lib.online.pipeline import STAGES, FrameResult, OnlinePipeline, Settings
+from lib.landmarks.inference import Landmarks
+from lib.online import STAGES, FrameResult, OnlinePipeline, Settings
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
 from notebooks.studies.registration_experiment import random_motion, tool_frames
 
@@ -35,22 +37,26 @@ class World:
         self.frame += 1
         return self.x_mm[self.frame] + self.rng.normal(0, 0.01, (3, 3))
 
-    def detect(self, images: np.ndarray) -> SimpleNamespace:
+    def detect(self, images: np.ndarray) -> Landmarks:
         assert images.shape == (2, *BLANK.shape)
         u = np.stack(self.rig.project(self.x_mm[self.frame]))
-        return SimpleNamespace(u=u + self.rng.normal(0, self.sigma_px, u.shape), confidence=np.full((2, 3), 0.9))
+        covariance = np.tile(self.sigma_px**2 * np.eye(2), (2, 3, 1, 1))
+        return Landmarks(u + self.rng.normal(0, self.sigma_px, u.shape), covariance, np.full((2, 3), 0.9))
 
-    def match(self, left, right, *, rig, mask_left, mask_right, setting) -> Matches:
-        assert mask_left.shape == mask_right.shape == BLANK.shape[:2]
+    def reconstruct(self, left, right, rig, *, u_landmarks, seconds, setting, **options) -> SimpleNamespace:
+        assert np.shape(u_landmarks) == (2, 3, 2)
         x, y = np.meshgrid(np.linspace(-6, 6, 25), np.linspace(-4, 4, 17))
         plane = np.stack([x.ravel(), y.ravel(), np.full(x.size, DEPTH_MM)], axis=1)
         u_left, u_right = self.rig.project(ROBOT_FROM_MICROSCOPE.apply(plane))
-        n = len(u_left)
-        return Matches(u_left, u_right, np.ones(n), np.tile(np.eye(4), (n, 1, 1)))
+        seconds |= {"mask": 0.01, "match": 0.02, "triangulate": 0.03, "surface": 0.04}
+        points = rig.triangulate(u_left, u_right)
+        return SimpleNamespace(surface=Plane(u_left, points.x_mm), points=points, u=u_left, rig=rig)
 
 
 class Plane:
     """A surface that is a plane in the image: what the pipeline asks of a surface, and no more."""
+
+    fit = SimpleNamespace(smoothness=1.0)
 
     def __init__(self, u: np.ndarray, x: np.ndarray) -> None:
         self.coefficients = np.linalg.lstsq(np.column_stack([u, np.ones(len(u))]), x, rcond=None)[0]
@@ -60,22 +66,9 @@ class Plane:
         return SimpleNamespace(along_view_mm=(surface - x_mm) @ camera.viewing_direction)
 
 
-def calibrate(x_mm: np.ndarray, u: list[np.ndarray], *, ransac_px: float) -> SimpleNamespace:
-    homogeneous = np.column_stack([x_mm, np.ones(len(x_mm))])
-    if np.linalg.matrix_rank(homogeneous) < 4:
-        raise ValueError("x_mm: coplanar.")
-    return SimpleNamespace(
-        rig=StereoRig(*(AffineCamera(np.linalg.lstsq(homogeneous, side, rcond=None)[0].T) for side in u))
-    )
-
-
-def fit_plane(u, x_mm, *, domain, control, smoothness, camera) -> Plane:
-    return Plane(u, x_mm)
-
-
 def make(world: World, **options) -> OnlinePipeline:
-    components = {"calibrate": calibrate, "match": world.match, "fit_surface": fit_plane} | options
-    return OnlinePipeline(components.pop("detector", world.detect), **components)
+    components = {"detector": world.detect, "reconstruct": world.reconstruct} | options
+    return OnlinePipeline(**components)
 
 
 def run(pipeline: OnlinePipeline, world: World, n: int) -> list[FrameResult]:
@@ -97,7 +90,8 @@ def test_from_nothing_to_distances():
     first, last = results[7], results[-1]
     assert rig_error_mm(first.rig, world) < 0.2
     assert rig_error_mm(last.rig, world) < 0.05
-    assert pipeline.noise_px == pytest.approx(np.hypot(1.0, 1.0), rel=0.25)  # 1 px of detections, 1 px of the robot
+    assert pipeline.calibration.sigma_x_mm == pytest.approx(0.01, rel=0.25)
+    assert last.reconstructed
     assert set(last.seconds) <= set(STAGES)
     assert min(last.seconds.values()) >= 0
     # The plane is DEPTH_MM below the focal plane; tools are above it by what their own depth says.
@@ -105,7 +99,6 @@ def test_from_nothing_to_distances():
     depth = ROBOT_FROM_MICROSCOPE.inverse().apply(world.x_mm[world.frame])[:, 2]
     np.testing.assert_allclose(last.distance_mm * (view[0] @ view[1]), DEPTH_MM - depth, atol=0.1)
     np.testing.assert_allclose(last.x_tool_mm, world.x_mm[world.frame], atol=0.6)
-    assert 300 < len(last.points.x_mm) == len(last.u_points) < 25 * 17  # but for what the tool hides
 
 
 def test_nothing_unusual_raises_no_alarm():
@@ -188,7 +181,7 @@ def test_bad_input_is_a_failed_frame(left, right, kinematics):
     run(pipeline, world, 10)
     result = pipeline.step(left, right, kinematics)
     assert set(result.failures) == {"detect"}
-    assert result.points is None
+    assert not result.reconstructed
     assert result.state == "tracking"
     assert not run(pipeline, world, 1)[0].failures
 
@@ -210,20 +203,121 @@ def test_missing_landmarks():
     results = run(pipeline, world, 40)
     assert results[-1].state == "tracking"
     assert not any(r.failures for r in results)
-    assert np.isnan(results[30].u_left).all()
+    assert np.isnan(results[30].landmarks.u_left).all()
     assert np.isfinite(results[30].distance_mm).all()  # from the robot's report
-    assert results[30].points is not None
-    assert np.isnan(results[33].u_right[2]).all()
+    assert results[30].reconstructed
+    assert np.isnan(results[33].landmarks.u_right[2]).all()
 
 
-def test_kinematics_may_depend_on_where_the_landmarks_were_seen():
+def test_kinematics_may_pair_each_landmark_with_its_own_instant():
     world = World()
     pipeline = make(world, rig=RIG)
     x = world.advance()
     asked = []
-    result = pipeline.step(BLANK, BLANK, lambda u: asked.append(u) or x)
-    np.testing.assert_array_equal(asked[0], result.u_left)
-    np.testing.assert_array_equal(result.x_robot_mm, x)
+
+    def pair(u_left, u_right, *, covariance_px2, confidence):
+        asked.append((u_left.shape, u_right.shape, covariance_px2.shape, confidence.shape))
+        return pair_with_robot(
+            u_left, u_right, position=lambda time_s: x[None] + 0 * time_s[..., None], time_s=[3.0], height_px=1080,
+            covariance_px2=covariance_px2, confidence=confidence, frame=[77],
+        )  # fmt: skip
+
+    result = pipeline.step(BLANK, BLANK, pair)
+    assert asked == [((1, 3, 2), (1, 3, 2), (1, 3, 2, 2, 2), (1, 3, 2))]
+    np.testing.assert_array_equal(result.landmarks.x_mm, x)
+    np.testing.assert_array_equal(result.landmarks.time_s, 3.0)
+    np.testing.assert_array_equal(result.landmarks.frame, 0)  # numbered by the pipeline
+
+
+def test_landmarks_are_followed_from_frame_to_frame_and_searched_anew_after_a_failure():
+    world = World()
+    calls = []
+
+    class Follower:
+        def __call__(self, images):
+            calls.append("whole")
+            if world.frame == 3:
+                raise RuntimeError("dark")
+            return world.detect(images)
+
+        def track(self, images, previous):
+            assert previous.u.shape == (2, 3, 2)
+            calls.append("track")
+            if world.frame == 2:
+                raise RuntimeError("dark")
+            return world.detect(images)
+
+    results = run(make(world, detector=Follower()), world, 6)
+    assert calls == ["whole", "track", "track", "whole", "whole", "track"]
+    assert ["detect" in r.failures for r in results] == [False, False, True, True, False, False]
+
+
+def test_the_detectors_covariances_weigh_the_rows():
+    """One landmark is seen 8 times less well.  If the detector says so, the rig is the better for it."""
+
+    def error(seed: int, honest: bool) -> float:
+        world = World(seed)
+
+        def detect(images):
+            found = world.detect(images)
+            found.u[:, 1] += world.rng.normal(0, 8.0, (2, 2))
+            if honest:
+                found.covariance[:, 1] += 64.0 * np.eye(2)
+            return found
+
+        pipeline = make(world, detector=detect, settings=SELDOM)
+        run(pipeline, world, 12)
+        return rig_error_mm(pipeline.rig, world)
+
+    assert sum(error(seed, True) for seed in range(3)) < 0.7 * sum(error(seed, False) for seed in range(3))
+
+
+def test_landmark_offsets_are_learnt_and_raise_no_alarm():
+    """The detector marks the base 0.06 mm beside where the robot reports it."""
+    world = World(2)
+    told = world.x_mm.copy()
+    axes = tool_axes(world.x_mm)
+    world.x_mm[:, 0] += np.einsum("nij,j->ni", axes, [0.06, 0.0, 0.0])
+    pipeline = make(world, settings=SELDOM)
+    results = []
+    for i in range(60):
+        world.advance()
+        results.append(pipeline.step(BLANK, BLANK, told[i] + world.rng.normal(0, 0.01, (3, 3))))
+    assert abs(pipeline.calibration.offsets.offset[0, 0] - 0.06) < 0.02
+    assert all(r.motion is None for r in results)
+    assert all(r.state == "tracking" for r in results[10:])
+
+
+def test_after_the_last_calibration_each_frame_updates_the_moments():
+    world = World(1)
+    calls = []
+
+    def counted(data, **options):
+        calls.append(len(np.unique(data.frame)))
+        return calibrate(data, offsets=False, **options)
+
+    pipeline = make(world, calibrate=counted, settings=Settings(surface_every=1000, calibration_frames=(8, 12)))
+    run(pipeline, world, 14)
+    early = rig_error_mm(pipeline.rig, world)
+    results = run(pipeline, world, 150)
+    assert calls[0] == 8
+    assert len(calls) == 2
+    assert rig_error_mm(pipeline.rig, world) < 0.6 * early
+    assert all(r.state == "tracking" for r in results)
+    assert "calibrate" in results[-1].seconds
+
+
+def test_one_bad_frame_does_not_block_the_calibration_for_good():
+    world = World()
+
+    def refuse(data, **options):
+        if 0 in data.frame:
+            raise ValueError("x_mm: the robot stood at 99999 mm.")
+        return calibrate(data, **options)
+
+    results = run(make(world, calibrate=refuse, settings=SELDOM), world, 20)
+    assert "99999" in results[7].failures["calibrate"]
+    assert results[-1].state == "tracking"
 
 
 def test_nan_kinematics():
@@ -241,10 +335,10 @@ def test_nan_kinematics():
 def test_a_calibration_that_is_refused_is_tried_again():
     world = World()
 
-    def refuse_at_first(x_mm, u, **options):
-        if len(x_mm) < 12 * 3:
+    def refuse_at_first(data, **options):
+        if len(data) < 12 * 3:
             raise ValueError("x_mm: coplanar. Move the tool in depth.")
-        return calibrate(x_mm, u, **options)
+        return calibrate(data, **options)
 
     results = run(make(world, calibrate=refuse_at_first), world, 14)
     assert [r.state for r in results] == ["calibrating"] * 11 + ["tracking"] * 3
@@ -259,17 +353,26 @@ def test_a_failing_stage_is_named_and_the_others_go_on(stage):
     def fail(*args, **kwargs):
         raise RuntimeError("out of order")
 
+    def fail_while_fitting(*args, seconds, **kwargs):
+        seconds |= {"mask": 0.0, "match": 0.0, "triangulate": 0.0, "surface": 0.0}
+        fail()
+
+    def without_distance(*args, **kwargs):
+        found = world.reconstruct(*args, **kwargs)
+        found.surface.distance = fail
+        return found
+
     broken = {
         "detect": {"detector": fail},
         "calibrate": {"calibrate": fail},
-        "match": {"match": fail},
-        "surface": {"fit_surface": fail},
-        "distance": {"fit_surface": lambda *args, **kwargs: SimpleNamespace(distance=fail)},
+        "match": {"reconstruct": fail},
+        "surface": {"reconstruct": fail_while_fitting},
+        "distance": {"reconstruct": without_distance},
     }[stage]
     result = run(make(world, **broken), world, 12)[-1]
     assert result.failures == {stage: "RuntimeError: out of order"}
     assert result.state == ("calibrating" if stage in ("detect", "calibrate") else "tracking")
-    assert (result.points is None) == (stage in ("detect", "calibrate", "match"))
+    assert result.reconstructed == (stage == "distance")
 
 
 def test_interrupts_are_not_swallowed():
@@ -282,22 +385,14 @@ def test_interrupts_are_not_swallowed():
         run(make(world, detector=interrupted), world, 1)
 
 
-def test_matches_on_the_tool_and_off_the_epipolar_line_are_dropped():
+def test_a_calibration_may_be_given():
     world = World()
-
-    def match(left, right, **options):
-        matches = world.match(left, right, **options)
-        matches.u_right[:50, 1] += 30.0
-        matches.u_left[60] = world.rig.project(world.x_mm[world.frame, 1])[0][0]
-        matches.u_right[60] = world.rig.project(world.x_mm[world.frame, 1])[1][0]
-        return matches
-
-    result = run(make(world, match=match), world, 20)[-1]
-    u = result.u_points
-    tip = world.rig.project(world.x_mm[world.frame, 1])[0][0]
-    assert np.linalg.norm(u - tip, axis=1).min() > 5
-    assert len(u) <= 25 * 17 - 51
-    assert np.abs(result.points.epipolar_px).max() <= 2.0
+    learning = make(world, settings=SELDOM)
+    run(learning, world, 20)
+    pipeline = make(world, rig=learning.calibration)
+    results = run(pipeline, world, 20)
+    assert all(r.state == "tracking" and not r.failures for r in results)
+    assert pipeline.rig is learning.calibration.rig
 
 
 def test_surface_every_other_frame():
