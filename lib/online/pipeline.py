@@ -20,8 +20,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lib.calibration import Calibration, OnlineCalibration, calibrate
-from lib.calibration.offsets import rows_axes
+from lib.calibration import Calibration, OnlineCalibration, calibrate, with_offsets
 from lib.cameras import StereoRig
 from lib.correspondences import LANDMARKS, MIN_CONFIDENCE, Correspondences
 from lib.registration import DriftMonitor, MovedCameras, identify_motion
@@ -88,7 +87,9 @@ class Settings:
 def _nothing() -> Correspondences:
     """The three landmarks, none of them seen or reported."""
     missing = np.full((len(LANDMARKS), 2), np.nan)
-    return Correspondences.of_points(np.full((len(LANDMARKS), 3), np.nan), missing, missing, landmark=range(len(LANDMARKS)))
+    return Correspondences.of_points(
+        np.full((len(LANDMARKS), 3), np.nan), missing, missing, landmark=range(len(LANDMARKS))
+    )
 
 
 @dataclass
@@ -280,7 +281,9 @@ class OnlinePipeline:
         self._scale2 = 1.0
         if calibration is not None:
             _, _, weight, r = calibration.system
-            scatter = np.median(np.einsum("ni,nij,nj->n", r, np.broadcast_to(weight, (len(r), 4, 4)), r)) / _CHI2_4_MEDIAN
+            scatter = (
+                np.median(np.einsum("ni,nij,nj->n", r, np.broadcast_to(weight, (len(r), 4, 4)), r)) / _CHI2_4_MEDIAN
+            )
             # Corrected for the 16 parameters that the residuals have paid for, and the upper end of what so few allow.
             self._scale2 = scatter / (1.0 - 16.0 / max(r.size, 17)) * (1.0 + 1.0 / np.sqrt(len(r))) ** 2
 
@@ -366,11 +369,8 @@ class OnlinePipeline:
             self._motion = found
 
     def _corrected(self, data: Correspondences) -> Correspondences:
-        """With the landmarks where the detector sees them on the tool, as far as the calibration has learnt it."""
-        if self.calibration is None or self.calibration.offsets is None:
-            return data
-        shift = np.einsum("nij,nj->ni", rows_axes(data), self.calibration.offsets.offset[data.landmark])
-        return replace(data, x_mm=data.x_mm + np.where(np.isfinite(shift), shift, 0.0))
+        """With the landmarks where the detector sees them on the tool."""
+        return with_offsets(data, None if self.calibration is None else self.calibration.offsets)
 
     def _noise(self, data: Correspondences) -> np.ndarray:
         """(n, 4, 4) px^2 of landmarks' residuals: of the detections, and of the robot's report."""

@@ -185,7 +185,7 @@ def _register_both(rig: StereoRig, data: _Observed, loss: Loss) -> Registration:
     distance = np.abs(points.epipolar_px)
     gated = both & (distance <= (3.5 * 1.4826 * np.median(distance[both]) if both.any() else 0.0))
     starts = [RigidTransform.identity()]
-    for rows, kind in ((both, "squared"), (gated, "norm")):
+    for rows, kind in ((both, "squared"), (gated, "norm"))[: 1 if loss == "squared" else 2]:
         if rows.sum() >= 3 and np.linalg.matrix_rank(data.x[rows] - data.x[rows].mean(axis=0), tol=1e-6) >= 2:
             starts.append(register(points.x_mm[rows], data.x[rows], loss=kind).transform)
     return _fit(rig, data, starts, loss, 6)

@@ -1,1 +1,1 @@
-"""Every plot of the workbench, one look: a module for each notebook, the style they share in `style`."""
+"""Figures of the notebooks: a module for each notebook, and the look that they share in `style`."""

@@ -1,4 +1,4 @@
-"""Pictures to turn knobs at: the same in JupyterLab, in a headless run and in a page without a kernel."""
+"""Figures with sliders and menus: the same in JupyterLab, in a headless run and in a page without a kernel."""
 
 from __future__ import annotations
 
@@ -6,15 +6,17 @@ import io
 from collections.abc import Callable
 
 import matplotlib.pyplot as plt
-from ipywidgets import HBox, Image, VBox
+from ipywidgets import HBox, Image, Layout, VBox
 from ipywidgets.widgets.widget_description import DescriptionWidget
 from matplotlib.figure import Figure
 
 __all__ = ["explore"]
 
+_DPI = 80
+
 
 def explore(draw: Callable[..., Figure], **knobs: DescriptionWidget) -> VBox:
-    """The figure `draw(name=value, ...)` below its knobs, drawn anew when one is turned.
+    """The figure `draw(name=value, ...)` below its controls, drawn anew when one of them changes.
 
     Not `ipywidgets.interact`: an executing client that captures large outputs of a widget may wait for ever.
 
@@ -23,23 +25,26 @@ def explore(draw: Callable[..., Figure], **knobs: DescriptionWidget) -> VBox:
     draw:
         Makes a figure; it is closed here.
     knobs:
-        For each argument of `draw` a widget with a value, such as an `IntSlider`; its name is its description, where it
-        has none.
+        For each argument of `draw` a widget with a value, such as an `IntSlider`.  A widget without a description is
+        described by the argument's name.
     """
     for name, knob in knobs.items():
         knob.description = knob.description or name.replace("_", " ")
 
-    def png() -> bytes:
+    def draw_png() -> tuple[bytes, int]:
         buffer = io.BytesIO()
         page = draw(**{name: knob.value for name, knob in knobs.items()})
-        page.savefig(buffer, format="png", dpi=80)
+        page.savefig(buffer, format="png", dpi=_DPI)
+        width = round(page.get_figwidth() * _DPI)
         plt.close(page)
-        return buffer.getvalue()
+        return buffer.getvalue(), width
 
-    picture = Image(value=png(), format="png")
+    value, width = draw_png()
+    # In its own size: stretched to the width of the cell it would be blurred.
+    picture = Image(value=value, format="png", layout=Layout(width=f"{width}px", max_width="100%", height="auto"))
 
     def redraw(_: object) -> None:
-        picture.value = png()
+        picture.value = draw_png()[0]
 
     for knob in knobs.values():
         knob.observe(redraw, names="value")

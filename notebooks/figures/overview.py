@@ -7,19 +7,20 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from lib.online.pipeline import FrameResult
+from lib.online import FrameResult
 from notebooks.figures.style import COLOURS, LANDMARK_COLOURS, figure, show_image
 
 __all__ = ["frame_pair", "landmarks_on", "pipeline_page", "pixel_grid"]
 
 
 def landmarks_on(axes: Axes, u: np.ndarray, *, label: bool = True) -> None:
-    """Mark base, tip_1 and tip_2, u (3, 2) px, and draw the jaws between them; missing landmarks are left out."""
+    """Mark base, tip_1 and tip_2, u (3, 2) px, and draw the jaws between them.  Missing landmarks have no legend entry."""
     for tip in (1, 2):
         axes.plot(*u[[0, tip]].T, color="white", linewidth=1.0, alpha=0.8)
     for name, point in zip(LANDMARK_COLOURS, u, strict=True):
-        axes.plot(*point, "o", color=LANDMARK_COLOURS[name], markersize=5, markeredgecolor="black", label=name)
-    if label:
+        if np.isfinite(point).all():
+            axes.plot(*point, "o", color=LANDMARK_COLOURS[name], markersize=5, markeredgecolor="black", label=name)
+    if label and axes.get_legend_handles_labels()[0]:
         axes.legend(loc="upper right", fontsize=8, labelcolor="white")
 
 
@@ -55,7 +56,7 @@ def pipeline_page(
     left, u_left:
         A left image and its landmarks (3, 2) px.
     result:
-        Of the online pipeline for this frame, with points and surface.
+        Of the online pipeline for this frame, with a reconstruction.
     residuals_px:
         Reprojection residuals (m, 4) of the calibration, left and right.
     surface_mm, error_um:
@@ -80,12 +81,12 @@ def pipeline_page(
     ax.set_title("2  Calibration residuals", **title)
 
     ax = show_image(page.add_subplot(grid[0, 2]), left)
-    ax.plot(*result.u_points.T, ".", color=COLOURS["truth"], markersize=1.0)
+    ax.plot(*result.reconstruction.u.T, ".", color=COLOURS["truth"], markersize=1.0)
     ax.set(xlim=(0, left.shape[1]), ylim=(left.shape[0], 0))
-    ax.set_title(f"3  {len(result.u_points)} matches", **title)
+    ax.set_title(f"3  {len(result.reconstruction.u)} matches", **title)
 
     ax = page.add_subplot(grid[1, 0], projection="3d")
-    x, y, height = _upright(surface_mm, result.surface_camera.resect().R)
+    x, y, height = _upright(surface_mm, result.reconstruction.rig.left.resect().R)
     ax.plot_surface(x, y, height, cmap="viridis", linewidth=0, antialiased=True, rcount=60, ccount=60)
     ax.set_box_aspect((np.ptp(x), np.ptp(y), 2.5 * max(np.ptp(height), 0.2)))
     ax.view_init(elev=35, azim=-65)

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
-from lib.online.pipeline import STAGES, FrameResult
+from lib.online import STAGES, FrameResult
 from lib.recordings import StereoFrame
 from notebooks.figures.interactive import explore
 from notebooks.figures.overview import landmarks_on
@@ -20,7 +20,7 @@ __all__ = ["dashboard", "error_timeline", "frame_browser", "stage_times", "timel
 
 _STATE_COLOURS = {"calibrating": "#f0f0f0", "tracking": "white", "moved": "#fde3c8"}
 _STAGE_COLOURS = dict(
-    zip(STAGES, ("#0072B2", "#56B4E9", "#CC79A7", "#D55E00", "#F0E442", "#009E73", "#999999"), strict=True)
+    zip(STAGES, ("#0072B2", "#56B4E9", "#CC79A7", "#D55E00", "#E69F00", "#009E73", "#999999"), strict=True)
 )
 
 
@@ -38,8 +38,8 @@ def timeline(results: Sequence[FrameResult], *, bump_at: int | None = None) -> F
         if bump_at is not None:
             ax.axvline(bump_at - 0.5, color=COLOURS["warning"], linestyle="--")
     names = [f"{side} {landmark}" for side in ("left", "right") for landmark in LANDMARK_COLOURS]
-    confidence = np.array([result.confidence.reshape(6) for result in results]).T
-    seen = np.array([np.isfinite(np.stack([r.u_left, r.u_right])).all(axis=2).reshape(6) for r in results]).T
+    confidence = np.array([result.landmarks.confidence.T.reshape(6) for result in results]).T
+    seen = np.array([result.landmarks.seen.T.reshape(6) for result in results]).T
     for k, name in enumerate(names):
         colour = LANDMARK_COLOURS[name.split()[1]]
         axes[0].scatter(
@@ -65,7 +65,10 @@ def timeline(results: Sequence[FrameResult], *, bump_at: int | None = None) -> F
 
 
 def stage_times(results: Sequence[FrameResult], *, paper_hz: float = 5.0) -> Figure:
-    """Left: seconds of the stages of each frame, stacked, and the paper's; right: their medians where a stage ran."""
+    """Left: time of the stages of each frame, stacked, and the paper's; right: their medians where a stage ran.
+
+    A frame that takes far longer than the others (the first, which warms up) is cut off and its time written beside it.
+    """
     page, axes = figure(1, 2, width_in=12, height_in=4, width_ratios=[2.2, 1])
     index = np.array([result.index for result in results])
     below = np.zeros(len(results))
@@ -73,6 +76,10 @@ def stage_times(results: Sequence[FrameResult], *, paper_hz: float = 5.0) -> Fig
         seconds = np.array([1e3 * result.seconds.get(stage, 0.0) for result in results])
         axes[0].bar(index, seconds, bottom=below, color=_STAGE_COLOURS[stage], width=0.85, label=stage)
         below += seconds
+    top = 1.3 * max(float(np.quantile(below, 0.95)), 1e3 / paper_hz)
+    axes[0].set_ylim(0, top)
+    for i in np.flatnonzero(below > top):
+        axes[0].text(index[i] + 0.6, 0.97 * top, f"{below[i] / 1e3:.1f} s", va="top", fontsize=8)
     axes[0].axhline(1e3 / paper_hz, color="black", linestyle=":", label=f"paper, {paper_hz:g} Hz")
     axes[0].set(xlabel="frame", ylabel="ms", title="Time of each frame, by stage")
     axes[0].legend(fontsize=8, ncols=2)
@@ -113,31 +120,33 @@ def dashboard(left: np.ndarray, result: FrameResult) -> Figure:
     """
     page, axes = figure(1, 2, width_in=13, height_in=4.2, width_ratios=[1.35, 1])
     show_image(axes[0], left, f"Frame {result.index}: {result.state}")
-    landmarks_on(axes[0], result.u_left, label=False)
+    landmarks_on(axes[0], result.landmarks.u_left, label=False)
     axes[1].set_axis_off()
     text = "\n".join(f"{stage}: {why}" for stage, why in result.failures.items())
     if text:
         axes[0].text(0.01, 0.02, text[:160], transform=axes[0].transAxes, color="white", fontsize=8, va="bottom")
-    if result.surface is None or not hasattr(result.surface, "on_grid"):
+    if result.reconstruction is None or not hasattr(result.reconstruction.surface, "on_grid"):
         axes[1].text(0.5, 0.5, "no surface yet", ha="center")
         return page
-    camera = result.surface_camera
-    x0, y0, x1, y1 = result.surface.grid.domain
-    x = result.surface.on_grid(np.linspace(x0, x1, 60), np.linspace(y0, y1, 45))
+    surface, camera = result.reconstruction.surface, result.reconstruction.rig.left
+    x0, y0, x1, y1 = surface.grid.domain
+    x = surface.on_grid(np.linspace(x0, x1, 60), np.linspace(y0, y1, 45))
     view = camera.resect().R  # x right, y down, z away from the camera
     centre = np.nanmean(x.reshape(-1, 3), axis=0)
     seen = (x - centre) @ view.T
     bottom = np.nanmax(seen[..., 2])
     height = bottom - seen[..., 2]
-    if result.points is not None:
-        shown = np.arange(0, len(result.u_points), max(1, len(result.u_points) // 1500))
-        h = bottom - (result.points.x_mm[shown] - centre) @ view[2]
-        dots = axes[0].scatter(*result.u_points[shown].T, c=h, s=3, vmin=0, vmax=np.nanmax(height), cmap="viridis")
+    if result.reconstructed:
+        u, points = result.reconstruction.u, result.reconstruction.points.x_mm
+        shown = np.arange(0, len(u), max(1, len(u) // 1500))
+        h = bottom - (points[shown] - centre) @ view[2]
+        dots = axes[0].scatter(*u[shown].T, c=h, s=3, vmin=0, vmax=np.nanmax(height), cmap="viridis")
         page.colorbar(dots, ax=axes[0], label="height in mm", shrink=0.8)
     axes[1].remove()
-    scene = page.add_subplot(axes[1].get_subplotspec(), projection="3d")
+    # Drawn in the order given: by its own depth order matplotlib hides the tool behind the surface that it is above.
+    scene = page.add_subplot(axes[1].get_subplotspec(), projection="3d", computed_zorder=False)
     scene.plot_surface(seen[..., 0], -seen[..., 1], height, cmap="viridis", linewidth=0, antialiased=True, alpha=0.9)
-    tool = np.where(np.isfinite(result.x_robot_mm), result.x_robot_mm, result.x_tool_mm)
+    tool = np.where(np.isfinite(result.landmarks.x_mm), result.landmarks.x_mm, result.x_tool_mm)
     tool = (tool - centre) @ view.T
     tool = np.column_stack([tool[:, 0], -tool[:, 1], bottom - tool[:, 2]])
     for tip in (1, 2):
@@ -148,7 +157,7 @@ def dashboard(left: np.ndarray, result: FrameResult) -> Figure:
     for axis in (scene.xaxis, scene.yaxis, scene.zaxis):
         axis.set_major_locator(MaxNLocator(4))
     ranges = np.nanmax(seen, axis=(0, 1)) - np.nanmin(seen, axis=(0, 1))
-    scene.set_box_aspect((ranges[0], ranges[1], 0.6 * ranges[1]))
+    scene.set_box_aspect((ranges[0], ranges[1], 0.6 * ranges[1]), zoom=0.85)  # leaves room for the labels
     scene.view_init(elev=30, azim=-70)
     distance = ", ".join(
         f"{name} {d:.2f}" for name, d in zip(LANDMARK_COLOURS, result.distance_mm, strict=True) if np.isfinite(d)

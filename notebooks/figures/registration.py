@@ -1,4 +1,4 @@
-"""Figures of notebook 05: the moved microscope, errors against frames, noise in 3D, drift, one camera alone."""
+"""Figures of notebook 05: the moved microscope, errors against frames, ICP, noise in 3D, drift, one camera alone."""
 
 from __future__ import annotations
 
@@ -12,10 +12,12 @@ from lib.cameras import StereoRig
 from lib.geometry import RigidTransform
 from lib.registration import DriftMonitor
 from notebooks.figures.style import COLOURS, figure
-from notebooks.studies.registration_experiment import MotionErrors
+from notebooks.studies.moved_cameras import MotionErrors
 
-__all__ = ["drift_chart", "error_curves", "hypotheses", "moved_tool", "noise_ellipses"]
+__all__ = ["drift_chart", "error_curves", "hypotheses", "icp_chart", "moved_tool", "noise_ellipses"]
 
+#: Fewer trials have no quartiles worth drawing.
+_FEW = 30
 _ESTIMATORS = {
     "squared norms": (COLOURS["baseline"], "s", "--"),
     "sum of norms, Eq. (7)": (COLOURS["paper"], "o", "-"),
@@ -35,7 +37,7 @@ def moved_tool(
     x_registered: np.ndarray,
     microscope_from_robot: RigidTransform,
 ) -> Figure:
-    """The tool's landmarks from above and from the side: told by the robot, seen by the stale rig, registered.
+    """The tool's landmarks from above and from the side: reported by the robot, seen by the stale rig, registered.
 
     Parameters
     ----------
@@ -70,14 +72,21 @@ def moved_tool(
 
 
 def error_curves(errors: Mapping[str, MotionErrors], *, paper_um: float | None = 150.0, title: str = "") -> Figure:
-    """The paper's figure "Tool Registration": RMS errors against the number of frames, quartiles as a band."""
+    """The paper's figure "Tool Registration": RMS errors against the number of frames.
+
+    Many trials have their quartiles as a band; fewer than `_FEW` are shown one by one.
+    """
     page, axes = figure(1, 4, width_in=14, height_in=4.0)
     for name, error in errors.items():
         style = _style(name)
         n = np.array(error.n_frames)
         axes[0].plot(n, error.translation_rms_um, **style)
-        low, high = 1e3 * np.nanpercentile(error.translation_mm, [25, 75], axis=0)
-        axes[0].fill_between(n, low, high, color=style["color"], alpha=0.15, linewidth=0)
+        if error.trials.max() < _FEW:
+            every = np.broadcast_to(n, error.translation_mm.shape)
+            axes[0].plot(every.ravel(), 1e3 * error.translation_mm.ravel(), ".", color=style["color"], alpha=0.3)
+        else:
+            low, high = 1e3 * np.nanpercentile(error.translation_mm, [25, 75], axis=0)
+            axes[0].fill_between(n, low, high, color=style["color"], alpha=0.15, linewidth=0)
         for k in range(3):
             axes[k + 1].plot(n, error.euler_rms_deg[:, k], **style)
     if paper_um is not None:
@@ -103,6 +112,20 @@ def _plain_log_ticks(ax) -> None:
     low, high = ax.get_ylim()
     ticks = [m * 10.0**e for e in range(-4, 6) for m in (1, 2, 5) if low <= m * 10.0**e <= high]
     ax.set_yticks(ticks, [f"{t:g}" for t in ticks])
+
+
+def icp_chart(shift_mm: Sequence[float], error_um: Mapping[str, np.ndarray], spacing_mm: float) -> Figure:
+    """Errors (trials, k) of each method against the size of the motion, its median as a line."""
+    page, ax = figure(1, 1, width_in=8, height_in=3.8)
+    for (name, errors), colour in zip(error_um.items(), (COLOURS["ours"], COLOURS["paper"]), strict=True):
+        ax.plot(np.broadcast_to(shift_mm, errors.shape).ravel(), errors.ravel(), ".", color=colour, alpha=0.3)
+        ax.plot(shift_mm, np.median(errors, axis=0), "o-", color=colour, markersize=5, label=name)
+    ax.axvline(spacing_mm, color=COLOURS["warning"], linestyle=":", label="median distance of neighbouring points")
+    ax.set(xscale="log", yscale="log", xlabel="shift of the microscope in mm", ylabel="translation error in um")
+    ax.set_xticks(shift_mm, [f"{shift:g}" for shift in shift_mm])
+    ax.minorticks_off()
+    ax.legend()
+    return page
 
 
 def noise_ellipses(rig: StereoRig, sigma_px: float, microscope_from_robot: RigidTransform) -> Figure:

@@ -1,4 +1,4 @@
-"""The one look of every figure: colours, sizes, the landmark legend, image panels."""
+"""The look that all figures share: colours, sizes, image panels."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ COLOURS = {
     "right": "#CC79A7",
     "warning": "#E69F00",
 }
-LANDMARK_COLOURS = {"base": "#56B4E9", "tip_1": "#F0E442", "tip_2": "#CC79A7"}
+#: Legible on dark images and on white.
+LANDMARK_COLOURS = {"base": "#56B4E9", "tip_1": "#E69F00", "tip_2": "#CC79A7"}
 
 _RC = {
     "figure.dpi": 100,
@@ -39,7 +40,7 @@ _RC = {
     "legend.frameon": False,
     "image.cmap": "viridis",
 }
-plt.rcParams.update(_RC)  # once, for all: titles and labels that are set later take the look too
+plt.rcParams.update(_RC)  # at import, so that titles and labels that a notebook sets later take the look too
 
 
 def figure(

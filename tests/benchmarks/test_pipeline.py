@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import numpy as np
 
-from lib.online.pipeline import OnlinePipeline, Settings
+from lib.landmarks import Landmarks
+from lib.online import OnlinePipeline, Settings
 from lib.simulator.rig import reference_rig
-from notebooks.studies.registration_experiment import tool_frames
+from notebooks.studies.moved_cameras import tool_frames
 
 
 def test_step(benchmark):
     rig = reference_rig()
     frames = tool_frames(10_000, rng=np.random.default_rng(0))
-    pair = iter(zip(frames.x_mm, frames.u_left, frames.u_right, strict=True))
+    pair = iter(zip(*(frames.grid(name) for name in ("x_mm", "u_left", "u_right")), strict=True))
     image = np.zeros((1080, 1920, 3), np.uint8)
     seen = {}
 
     def detect(images):
-        return SimpleNamespace(u=seen["u"], confidence=np.ones((2, 3)))
+        return Landmarks(seen["u"], np.tile(np.eye(2), (2, 3, 1, 1)), np.ones((2, 3)))
 
     pipeline = OnlinePipeline(detect, rig=rig, settings=Settings(surface_every=10**9))
 

@@ -7,7 +7,7 @@ import pytest
 
 from lib.registration import DriftMonitor, identify_motion, register, register_images
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
-from notebooks.studies.registration_experiment import random_motion, tool_frames
+from notebooks.studies.moved_cameras import random_motion, tool_frames
 
 RIG = reference_rig()
 
@@ -16,7 +16,7 @@ def data(n_frames: int):
     rng = np.random.default_rng(0)
     moved = RIG.moved(random_motion(rng, centre_mm=ROBOT_FROM_MICROSCOPE.t))
     frames = tool_frames(n_frames, rng=rng, rig=moved)
-    return frames.x_mm.reshape(-1, 3), frames.u_left.reshape(-1, 2), frames.u_right.reshape(-1, 2)
+    return frames.x_mm, frames.u_left, frames.u_right
 
 
 @pytest.mark.parametrize("n_frames", [3, 30, 300])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -10,6 +12,7 @@ from scipy.optimize import least_squares, minimize
 from scipy.spatial.transform import Rotation
 
 from lib.cameras import StereoRig
+from lib.correspondences import MIN_CONFIDENCE, Correspondences
 from lib.geometry import RigidTransform
 from lib.registration import (
     DriftMonitor,
@@ -20,12 +23,13 @@ from lib.registration import (
 )
 from lib.registration.rigid import motion_jacobian
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
-from notebooks.studies.registration_experiment import (
-    bumped_images,
+from notebooks.studies.moved_cameras import (
+    by_points,
     motion_error,
+    pushed_images,
     random_motion,
-    recorded_registration_errors,
-    registration_errors,
+    recorded_errors,
+    simulated_errors,
     tool_frames,
 )
 
@@ -41,7 +45,7 @@ def scene(seed: int, n: int = 10, noise: float = 1.0, motion: RigidTransform | N
     frames = tool_frames(
         n, rng=rng, rig=RIG.moved(motion, **moved), sigma_u_px=noise * SIGMA_PX, sigma_x_mm=noise * SIGMA_MM
     )
-    return motion, frames.x_mm.reshape(-1, 3), frames.u_left.reshape(-1, 2), frames.u_right.reshape(-1, 2)
+    return motion, frames.x_mm, frames.u_left, frames.u_right
 
 
 def assert_same(estimate: RigidTransform, truth: RigidTransform, tolerance: float = 1e-9) -> None:
@@ -274,7 +278,7 @@ def test_bad_noise():
 
 def grid_error_mm(rig: StereoRig, truth: StereoRig) -> float:
     """Root mean square triangulation error of `rig` over the workspace when `truth` took the pictures."""
-    x = tool_frames(40, rng=np.random.default_rng(99)).true_x_mm.reshape(-1, 3)
+    x = tool_frames(40, rng=np.random.default_rng(99)).true_x_mm
     return float(np.sqrt(((rig.triangulate(*truth.project(x)).x_mm - x) ** 2).sum(axis=1).mean()))
 
 
@@ -318,38 +322,125 @@ def test_the_camera_that_moved_is_named(moved):
     assert grid_error_mm(found.rig, RIG.moved(*pair)) < 0.15
 
 
+# --- near-affine cameras -----------------------------------------------------------------------------------------------
+
+NEAR = reference_rig(inverse_distance_per_mm=1 / 150.0)
+
+
+def test_near_affine_rigs_are_moved_exactly():
+    motion, x, *_ = scene(1)
+    for u, expected in zip(NEAR.moved(motion).project(motion.apply(x)), NEAR.project(x), strict=True):
+        np.testing.assert_allclose(u, expected, atol=1e-8)
+    assert np.abs(np.hstack(NEAR.project(x)) - np.hstack(RIG.project(x))).max() > 5.0
+
+
+@pytest.mark.parametrize("loss", ["squared", "robust"])
+def test_near_affine_rigs_are_registered_exactly(loss):
+    motion = random_motion(np.random.default_rng(3), centre_mm=CENTRE_MM)
+    data = tool_frames(5, rng=np.random.default_rng(3), rig=NEAR.moved(motion), sigma_u_px=0, sigma_x_mm=0)
+    assert_same(register_images(NEAR, data, covariance_px2=1.0, loss=loss).transform, motion, 1e-7)
+
+
+@pytest.mark.parametrize("moved", ["none", "together", "left", "apart"])
+def test_the_near_affine_camera_that_moved_is_named(moved):
+    rng = np.random.default_rng(8)
+    stay = RigidTransform.identity()
+    a, b = (random_motion(rng, centre_mm=CENTRE_MM, rotation_rad=0.05, translation_mm=0.3) for _ in range(2))
+    pair = {"none": (stay, stay), "together": (a, a), "left": (a, stay), "apart": (a, b)}[moved]
+    now = NEAR.moved(*pair)
+    data = tool_frames(12, rng=rng, rig=now)
+    found = identify_motion(NEAR, data, covariance_px2=SIGMA_PX**2, sigma_x_mm=SIGMA_MM)
+    assert found.moved == moved
+    assert grid_error_mm(found.rig, now) < 0.15
+
+
+# --- correspondences ---------------------------------------------------------------------------------------------------
+
+
+def with_covariance(data: Correspondences, variance_px2: np.ndarray) -> Correspondences:
+    plain = data.subset(slice(None))
+    return replace(plain, covariance_px2=variance_px2[:, None, None, None] * np.eye(2) + np.zeros((len(data), 2, 1, 1)))
+
+
+def test_correspondences_bring_their_own_noise():
+    motion = random_motion(np.random.default_rng(5))
+    data = tool_frames(6, rng=np.random.default_rng(5), rig=RIG.moved(motion))
+    data.u_left[:3] += 30.0
+    data.u_right[7] = np.nan
+    stated = with_covariance(data, np.where(np.arange(len(data)) < 3, 1e6, SIGMA_PX**2))
+    arrays = (data.x_mm, data.u_left, data.u_right)
+    given = register_images(RIG, *arrays, covariance_px2=stated.pair_covariance_px2)
+    assert_same(register_images(RIG, stated).transform, given.transform, 1e-12)
+    assert motion_error(given.transform, motion, CENTRE_MM)[0] < 0.1
+    assert identify_motion(RIG, stated).moved == "together"
+    with pytest.raises(ValueError, match="covariance_px2: give the noise"):
+        identify_motion(RIG, *arrays)
+
+
+def test_landmarks_of_low_confidence_and_without_the_robot_do_not_count():
+    motion, *arrays = scene(6, 8, noise=0)
+    x, u_left, u_right = (values.copy() for values in arrays)
+    x[4] = np.nan
+    u_left[7] += 50.0
+    confidence = np.ones((len(x), 2))
+    confidence[7, 0] = 0.5 * MIN_CONFIDENCE
+    data = Correspondences.of_points(x, u_left, u_right, confidence=confidence)
+    fit = register_images(RIG, data, covariance_px2=1.0)
+    assert_same(fit.transform, motion, 1e-7)
+    assert np.flatnonzero(np.isnan(fit.residuals)).tolist() == [4]
+    monitor = DriftMonitor(RIG.moved(motion), covariance_px2=1.0)
+    monitor.update(data)
+    assert monitor.history[-1][1] == 4 * (len(x) - 2)
+
+
+@pytest.mark.parametrize("bad", [-1.0, 0.0, -np.eye(4), np.diag([1.0, 1, 1, -1])])
+def test_what_is_no_covariance_is_refused(bad):
+    """A negative variance would turn a large residual into a small statistic, and no drift would ever be noticed."""
+    _, *data = scene(0)
+    with pytest.raises(ValueError, match="covariance_px2"):
+        register_images(RIG, *data, covariance_px2=bad)
+    with pytest.raises(ValueError, match="covariance_px2"):
+        DriftMonitor(RIG, covariance_px2=bad)
+    monitor = DriftMonitor(RIG, covariance_px2=1.0)
+    with pytest.raises(ValueError, match="covariance_px2"):
+        monitor.update(*data, covariance_px2=bad)
+    with pytest.raises(ValueError, match="covariance_px2: must be finite"):
+        monitor.update(*data, covariance_px2=np.full((len(data[0]), 4, 4), np.nan))
+
+
 # --- drift -----------------------------------------------------------------------------------------------------------
 
 
 def monitor_frames(rig: StereoRig, n: int, seed: int = 0):
     frames = tool_frames(n, rng=np.random.default_rng(seed), rig=rig)
-    return zip(frames.x_mm, frames.u_left, frames.u_right, strict=True)
+    return [frames.of_frames(i) for i in range(n)]
 
 
 def test_drift_is_noticed_and_noise_is_not():
     monitor = DriftMonitor(RIG, covariance_px2=SIGMA_PX**2, sigma_x_mm=SIGMA_MM)
-    assert not any(monitor.update(*frame) for frame in monitor_frames(RIG, 500))
+    assert not any(monitor.update(frame) for frame in monitor_frames(RIG, 500))
     chi2 = np.array([entry[0] for entry in monitor.history])
     assert chi2.mean() == pytest.approx(12, abs=0.7)  # 12 +- 0.22
     for shift_mm, within in ((0.05, 5), (0.1, 3), (1.0, 3)):
         moved = RIG.moved(RigidTransform.from_rotation_vector((0, 0, 0), (shift_mm, 0, 0)))
         monitor.reset(RIG)
-        alarms = [monitor.update(*frame) for frame in monitor_frames(moved, 6, seed=1)]
+        alarms = [monitor.update(frame) for frame in monitor_frames(moved, 6, seed=1)]
         assert alarms.index(True) < within
         assert monitor.alarm
         monitor.reset(moved)
-        assert not any(monitor.update(*frame) for frame in monitor_frames(moved, 100, seed=2))
+        assert not any(monitor.update(frame) for frame in monitor_frames(moved, 100, seed=2))
 
 
 def test_one_bad_frame_raises_no_alarm():
     monitor = DriftMonitor(RIG, covariance_px2=SIGMA_PX**2)
-    for i, (x, u_left, u_right) in enumerate(monitor_frames(RIG, 20)):
-        assert not monitor.update(x, u_left + 500.0 * (i == 10), u_right)
+    for i, frame in enumerate(monitor_frames(RIG, 20)):
+        assert not monitor.update(frame.x_mm, frame.u_left + 500.0 * (i == 10), frame.u_right)
 
 
 def test_missing_landmarks_do_not_count():
     monitor = DriftMonitor(RIG, covariance_px2=SIGMA_PX**2)
-    ((x, u_left, u_right),) = monitor_frames(RIG, 1)
+    (frame,) = monitor_frames(RIG, 1)
+    x, u_left, u_right = frame.x_mm, frame.u_left, frame.u_right
     u_left[0] = np.nan
     monitor.update(x, u_left, u_right)
     assert monitor.history[-1][1] == 8
@@ -365,11 +456,8 @@ def test_missing_landmarks_do_not_count():
 
 def test_the_papers_experiment():
     """Below 150 um after 3 frames, and the image-space estimate is the better one (Sec. V, Fig. Tool Registration)."""
-    estimators = {
-        "norm": lambda rig, x, u_left, u_right: register(rig.triangulate(u_left, u_right).x_mm, x),
-        "image": lambda rig, x, u_left, u_right: register_images(rig, x, u_left, u_right),
-    }
-    errors = registration_errors(estimators, [1, 3, 10], trials=40, rng=np.random.default_rng(0))
+    estimators = {"norm": by_points, "image": register_images}
+    errors = simulated_errors(estimators, [1, 3, 10], trials=40, rng=np.random.default_rng(0))
     rms_um = {name: error.translation_rms_um for name, error in errors.items()}
     assert errors["norm"].euler_rad.shape == (40, 3, 3)
     assert (np.diff(rms_um["norm"]) < 0).all()
@@ -379,20 +467,19 @@ def test_the_papers_experiment():
 
 
 def test_the_experiment_on_a_recording():
-    """Moving the calibrated projections needs no truth; exact landmarks give no error, missing ones are left out."""
-    frames = tool_frames(12, rng=np.random.default_rng(0), sigma_u_px=0, sigma_x_mm=0)
-    frames.u_left[3, 1] = np.nan
-    frames.x_mm[5] = np.nan
-    options = {"rig": RIG, "x_mm": frames.x_mm, "u_left": frames.u_left, "u_right": frames.u_right}
-    estimators = {"image": lambda rig, *data: register_images(rig, *data)}
+    """Each window of frames is one trial; exact landmarks give no error, missing ones are left out."""
+    data = tool_frames(12, rng=np.random.default_rng(0), sigma_u_px=0, sigma_x_mm=0)
+    data.u_left[3 * 3 + 1] = np.nan
+    data.x_mm[15:18] = np.nan
     rng = np.random.default_rng(1)
-    found = recorded_registration_errors(estimators, [2, 4], trials=10, rng=rng, **options)["image"]
+    found = recorded_errors({"image": register_images}, [2, 4], rig=RIG, data=data, rng=rng)["image"]
+    assert found.trials.tolist() == [11, 9]
     assert np.nanmax(found.translation_mm[:, 1]) < 1e-6
     with pytest.raises(ValueError, match="n_frames: up to 20"):
-        recorded_registration_errors(estimators, [20], trials=1, rng=rng, **options)
+        recorded_errors({"image": register_images}, [20], rig=RIG, data=data, rng=rng)
 
 
-def test_bumped_images_show_what_moved_cameras_see():
+def test_pushed_images_show_what_moved_cameras_see():
     """A bright dot on black lands where the moved rig projects its point."""
     small = reference_rig(pixels_per_mm=(10.0, 9.0), image_size_px=(192, 108))
     x = ROBOT_FROM_MICROSCOPE.apply(np.array([[1.0, -0.5, 0.3]]))
@@ -403,7 +490,7 @@ def test_bumped_images_show_what_moved_cameras_see():
     motion = RigidTransform(np.eye(3), np.array([0.8, -0.4, 0.7]))
     moved = small.moved(motion).project(x)
     assert np.linalg.norm(np.subtract(moved, small.project(x))) > 5
-    for image, u in zip(bumped_images(*images, small, motion), moved, strict=True):
+    for image, u in zip(pushed_images(*images, small, motion), moved, strict=True):
         weight = image[:, :, 0].astype(float)
         centroid = (grid * weight[:, :, None]).sum(axis=(0, 1)) / weight.sum()
         np.testing.assert_allclose(centroid, u[0], atol=0.05)
@@ -411,7 +498,8 @@ def test_bumped_images_show_what_moved_cameras_see():
 
 def test_tool_frames_have_the_tools_size():
     frames = tool_frames(50, rng=np.random.default_rng(0))
-    jaw = np.linalg.norm(frames.true_x_mm[:, 1:] - frames.true_x_mm[:, :1], axis=2)
+    x = frames.true_x_mm.reshape(-1, 3, 3)
+    jaw = np.linalg.norm(x[:, 1:] - x[:, :1], axis=2)
     assert jaw == pytest.approx(jaw[0, 0])
     assert 2 <= jaw[0, 0] <= 4
     for u in (frames.u_left, frames.u_right):

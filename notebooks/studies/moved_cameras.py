@@ -1,47 +1,48 @@
-"""The paper's registration experiment (Sec. V): known projections moved by a known motion, then recovered."""
+"""The paper's registration experiment (Sec. V): known projections are moved by a known motion, then registered.
+
+Notebooks 00, 05 and 06 and the study of registration share it.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lib.cameras import StereoRig
+from lib.correspondences import LANDMARKS, Correspondences
 from lib.geometry import RigidTransform
-from lib.registration import Registration
-from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
+from lib.registration import Registration, register
+from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, SimulatedSweep, reference_rig
 
 __all__ = [
+    "Estimator",
     "MotionErrors",
-    "ToolFrames",
-    "bumped_images",
+    "by_points",
     "motion_error",
+    "pushed_images",
     "random_motion",
-    "recorded_registration_errors",
-    "registration_errors",
+    "recorded_errors",
+    "simulated_errors",
     "tool_frames",
 ]
 
-#: An estimator of the motion from what is at hand: (rig, x_mm (n, 3), u_left (n, 2), u_right (n, 2)).
-Estimator = Callable[[StereoRig, np.ndarray, np.ndarray, np.ndarray], Registration]
+#: An estimator of the motion: (stale rig, Correspondences after the motion) -> Registration.
+Estimator = Callable[[StereoRig, Correspondences], Registration]
 
 
-@dataclass(frozen=True)
-class ToolFrames:
-    """Landmarks of a moving tool: `x_mm` (n, 3, 3) and `u_left`, `u_right` (n, 3, 2) with noise, and the true x."""
-
-    x_mm: np.ndarray
-    u_left: np.ndarray
-    u_right: np.ndarray
-    true_x_mm: np.ndarray
+def by_points(rig: StereoRig, data: Correspondences, loss: str = "norm") -> Registration:
+    """Eq. (7) (or its sum of squares): the triangulated landmarks are registered to the robot's report of them."""
+    data = data.complete
+    return register(rig.triangulate(data.u_left, data.u_right).x_mm, data.x_mm, loss=loss)
 
 
 @dataclass(frozen=True)
 class MotionErrors:
-    """Errors of one estimator over trials: NaN where it could not tell.
+    """Errors of one estimator after 1, 2, ... frames, a row a trial; NaN where there is no trial or no estimate.
 
     Attributes
     ----------
@@ -57,10 +58,10 @@ class MotionErrors:
     translation_mm: np.ndarray
     euler_rad: np.ndarray
 
-    @classmethod
-    def empty(cls, trials: int, n_frames: Sequence[int]) -> MotionErrors:
-        shape = (trials, len(n_frames))
-        return cls(tuple(int(n) for n in n_frames), np.full(shape, np.nan), np.full((*shape, 3), np.nan))
+    @property
+    def trials(self) -> np.ndarray:
+        """(k,) trials with an estimate."""
+        return np.isfinite(self.translation_mm).sum(axis=0)
 
     @property
     def translation_rms_um(self) -> np.ndarray:
@@ -83,14 +84,13 @@ def tool_frames(
     half_size_mm: tuple[float, float, float] = (5.0, 3.0, 1.2),
     jaw_mm: tuple[float, float] = (2.0, 4.0),
     opening_rad: tuple[float, float] = (0.05, 0.40),
-    robot_from_microscope: RigidTransform = ROBOT_FROM_MICROSCOPE,
-) -> ToolFrames:
-    """A forceps in n poses of the field, seen by `rig` and told by the robot.
+) -> SimulatedSweep:
+    """A forceps in n poses of the field, seen by `rig` and reported by the robot: 3 n rows.
 
     Parameters
     ----------
     rig:
-        What the cameras are now (a perturbed one in the experiment); None is the reference rig.
+        What the cameras are now (a moved one in the experiment); None is the reference rig.
     half_size_mm:
         Half extents of the base's positions in the microscope frame, within the field and the depth of field.
     jaw_mm:
@@ -98,7 +98,7 @@ def tool_frames(
     opening_rad:
         Angle between the jaws, drawn for each frame.
     """
-    rig = rig or reference_rig(robot_from_microscope=robot_from_microscope)
+    rig = rig or reference_rig()
     jaw = rng.uniform(*jaw_mm)
     half = rng.uniform(*opening_rad, n) / 2
     zero = np.zeros(n)
@@ -109,15 +109,22 @@ def tool_frames(
     swing, dip, roll = rng.uniform([-0.6, 0.2, -0.8], [0.6, 0.7, 0.8], (n, 3)).T
     turn = Rotation.from_euler("ZYX", np.stack([swing, -dip, roll], axis=1)).as_matrix()
     base = rng.uniform(-1, 1, (n, 3)) * half_size_mm
-    x = robot_from_microscope.apply(np.einsum("nij,nkj->nki", turn, shape) + base[:, None])
-    u_left, u_right = (u.reshape(n, 3, 2) + rng.normal(0, sigma_u_px, (n, 3, 2)) for u in rig.project(x.reshape(-1, 3)))
-    return ToolFrames(x + rng.normal(0, sigma_x_mm, x.shape), u_left, u_right, x)
+    x = ROBOT_FROM_MICROSCOPE.apply(np.einsum("nij,nkj->nki", turn, shape) + base[:, None]).reshape(-1, 3)
+    u_left, u_right = (u + rng.normal(0, sigma_u_px, u.shape) for u in rig.project(x))
+    rows = Correspondences.of_points(
+        x + rng.normal(0, sigma_x_mm, x.shape),
+        u_left,
+        u_right,
+        frame=np.repeat(np.arange(n), len(LANDMARKS)),
+        landmark=np.tile(np.arange(len(LANDMARKS)), n),
+    )
+    return SimulatedSweep(**vars(rows), true_x_mm=x, true_rig=rig)
 
 
 def random_motion(
     rng: np.random.Generator,
     *,
-    centre_mm: np.ndarray,
+    centre_mm: np.ndarray = ROBOT_FROM_MICROSCOPE.t,
     rotation_rad: float = np.deg2rad(5.0),
     translation_mm: float = 1.0,
 ) -> RigidTransform:
@@ -137,14 +144,14 @@ def motion_error(estimate: RigidTransform, truth: RigidTransform, centre_mm: np.
     return float(np.linalg.norm(residual.apply(centre_mm) - centre_mm)), residual.euler_rad
 
 
-def registration_errors(
+def simulated_errors(
     estimators: Mapping[str, Estimator],
     n_frames: Sequence[int],
     *,
     trials: int,
     rng: np.random.Generator,
     outliers: float = 0.0,
-    **options: float,
+    **options: object,
 ) -> dict[str, MotionErrors]:
     """Errors of each estimator after 1, 2, ... frames of one moved rig, over many motions and tools.
 
@@ -159,74 +166,76 @@ def registration_errors(
     options:
         For `tool_frames`, such as sigma_u_px.
     """
-    rig = reference_rig()
-    centre_mm = ROBOT_FROM_MICROSCOPE.t
-    errors = {name: MotionErrors.empty(trials, n_frames) for name in estimators}
+    rig, centre_mm = reference_rig(), ROBOT_FROM_MICROSCOPE.t
+    errors = _no_errors(estimators, n_frames, trials)
     for trial in range(trials):
-        motion = random_motion(rng, centre_mm=centre_mm)
-        frames = tool_frames(max(n_frames), rng=rng, rig=rig.moved(motion), **options)
-        for u in (frames.u_left, frames.u_right):
-            bad = rng.random(u.shape[:2]) < outliers
+        motion = random_motion(rng)
+        data = tool_frames(max(n_frames), rng=rng, rig=rig.moved(motion), **options)
+        for u in (data.u_left, data.u_right):
+            bad = rng.random(len(u)) < outliers
             u[bad] += rng.uniform(-100, 100, (int(bad.sum()), 2))
-        _estimate_all(errors, trial, estimators, rig, (frames.x_mm, frames.u_left, frames.u_right), motion, centre_mm)
+        for j, n in enumerate(n_frames):
+            _estimate(errors, (trial, j), estimators, rig, data.of_frames(np.arange(n)), motion, centre_mm)
     return errors
 
 
-def recorded_registration_errors(
+def recorded_errors(
     estimators: Mapping[str, Estimator],
     n_frames: Sequence[int],
     *,
     rig: StereoRig,
-    x_mm: np.ndarray,
-    u_left: np.ndarray,
-    u_right: np.ndarray,
-    trials: int,
+    data: Correspondences,
     rng: np.random.Generator,
 ) -> dict[str, MotionErrors]:
     """The same from a recording, needing no truth: it is the calibrated projections that are moved, by a known motion.
+
+    Every window of n consecutive frames is one trial, so a recording of m frames has m - n + 1 of them.  Windows
+    overlap, and their errors are alike where they do.
 
     Parameters
     ----------
     rig:
         Calibrated with other frames than these.
-    x_mm, u_left, u_right:
-        (n, 3, 3) mm as the robot reports, (n, 3, 2) px as detected, in order of time; NaN = missing.  Each trial uses
-        consecutive frames from a random one on.
+    data:
+        Landmarks of the held-out frames, as detected and as the robot reports them.
     """
-    if len(x_mm) < max(n_frames):
-        raise ValueError(f"n_frames: up to {max(n_frames)} frames are asked for, the recording has {len(x_mm)}.")
-    centre_mm = np.nanmean(x_mm, axis=(0, 1))
-    errors = {name: MotionErrors.empty(trials, n_frames) for name in estimators}
-    for trial in range(trials):
-        motion = random_motion(rng, centre_mm=centre_mm)
-        stale = rig.moved(motion.inverse())
-        first = int(rng.integers(0, len(x_mm) - max(n_frames) + 1))
-        window = tuple(values[first:] for values in (x_mm, u_left, u_right))
-        _estimate_all(errors, trial, estimators, stale, window, motion, centre_mm)
+    frames, centre_mm = np.unique(data.frame), np.nanmean(data.x_mm, axis=0)
+    if len(frames) < max(n_frames):
+        raise ValueError(f"n_frames: up to {max(n_frames)} frames are asked for, the recording has {len(frames)}.")
+    errors = _no_errors(estimators, n_frames, len(frames) - min(n_frames) + 1)
+    for j, n in enumerate(n_frames):
+        for first in range(len(frames) - n + 1):
+            motion = random_motion(rng, centre_mm=centre_mm)
+            window = data.of_frames(frames[first : first + n])
+            _estimate(errors, (first, j), estimators, rig.moved(motion.inverse()), window, motion, centre_mm)
     return errors
 
 
-def _estimate_all(errors, trial, estimators, rig, window, motion, centre_mm) -> None:
+def _no_errors(estimators: Mapping[str, Estimator], n_frames: Sequence[int], trials: int) -> dict[str, MotionErrors]:
+    shape = (trials, len(n_frames))
+    empty = MotionErrors(tuple(int(n) for n in n_frames), np.full(shape, np.nan), np.full((*shape, 3), np.nan))
+    return {
+        name: replace(empty, translation_mm=empty.translation_mm.copy(), euler_rad=empty.euler_rad.copy())
+        for name in estimators
+    }
+
+
+def _estimate(errors, at, estimators, rig, data, motion, centre_mm) -> None:
     for name, estimator in estimators.items():
-        for j, n in enumerate(errors[name].n_frames):
-            x, u_left, u_right = (values[:n].reshape(-1, values.shape[-1]) for values in window)
-            seen = np.isfinite(np.hstack([x, u_left, u_right])).all(axis=1)
-            try:
-                found = estimator(rig, x[seen], u_left[seen], u_right[seen]).transform
-            except ValueError:
-                continue  # too few landmarks in these frames: the errors stay NaN
-            errors[name].translation_mm[trial, j], errors[name].euler_rad[trial, j] = motion_error(
-                found, motion, centre_mm
-            )
+        try:
+            found = estimator(rig, data).transform
+        except ValueError:
+            continue  # too few landmarks in these frames: the errors stay NaN
+        errors[name].translation_mm[at], errors[name].euler_rad[at] = motion_error(found, motion, centre_mm)
 
 
-def bumped_images(
+def pushed_images(
     left: np.ndarray, right: np.ndarray, rig: StereoRig, motion: RigidTransform
 ) -> tuple[np.ndarray, np.ndarray]:
     """A stereo pair as cameras that moved by `motion` would have taken it: warped by what the motion does to images.
 
-    Exact for a shift in any direction, and for a rotation about a camera's own axis; other rotations would show parts
-    of the scene differently, which no warp can.
+    Exact for a shift in any direction, and for a rotation about a camera's own axis.  After other rotations parts of
+    the scene would look different, which no warp can show.
 
     Parameters
     ----------
