@@ -281,12 +281,13 @@ def of_recording(
     covariance_px2: ArrayLike | None = None,
     confidence: ArrayLike | None = None,
     frames: Sequence[int] | slice | None = None,
+    linear: np.ndarray | None = None,
 ) -> Correspondences:
     """`pair_with_robot` with the clocks, shutter and kinematics of a `lib.recordings.Recording`.
 
     Parameters
     ----------
-    u_left, u_right, covariance_px2, confidence:
+    u_left, u_right, covariance_px2, confidence, linear:
         Of the frames chosen, as in `pair_with_robot`.
     frames:
         Which frames of the recording these are; None = all.
@@ -303,6 +304,7 @@ def of_recording(
         covariance_px2=covariance_px2,
         confidence=confidence,
         frame=chosen,
+        linear=linear,
     )
 
 

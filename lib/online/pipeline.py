@@ -150,6 +150,14 @@ class FrameResult:
             self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
 
 
+@dataclass(frozen=True)
+class _Frame:
+    """Landmarks of a frame, and how to pair them with the robot by another rig, which moves pixels to one instant."""
+
+    data: Correspondences
+    pair: Callable[[StereoRig | None], Correspondences]
+
+
 class OnlinePipeline:
     """Landmarks, calibration, drift and registration, reconstruction and distance, one `step` a frame.
 
@@ -207,19 +215,21 @@ class OnlinePipeline:
         kinematics:
             (3, 3) mm, base, tip_1, tip_2 in the robot frame at the time of the frame; NaN or None where the robot said
             nothing.  Or a function that pairs the detections with the robot's positions at the instants at which their
-            rows were read: ``partial(of_recording, recording, frames=[index])`` of `lib.correspondences`.
+            rows were read, given as to `lib.correspondences.pair_with_robot`, and returns the frame's Correspondences:
+            ``partial(of_recording, recording, frames=[index])``.
         """
         self._index += 1
-        result = FrameResult(self._index)
+        result, accepted = FrameResult(self._index), []
         with result.stage("detect"):
-            result.landmarks = self._detect(left, right, kinematics)
-        data, accepted = result.landmarks, []
+            frame = self._detect(left, right, kinematics)
+            result.landmarks = frame.data
+        data = result.landmarks
         if data.is_complete.any():
             if self.rig is None:
-                accepted = [data]
+                accepted = [frame]
             else:
                 with result.stage("register"):
-                    accepted = self._watch(result)
+                    accepted = self._watch(result, frame)
         if self._takes_in(accepted):
             with result.stage("calibrate"):
                 self._improve_rig(accepted)
@@ -237,7 +247,7 @@ class OnlinePipeline:
                 result.distance_mm = self._surface.surface.distance(x, self._surface.rig.left).along_view_mm
         return result
 
-    def _detect(self, left: np.ndarray, right: np.ndarray, kinematics: ArrayLike | Callable | None) -> Correspondences:
+    def _detect(self, left: np.ndarray, right: np.ndarray, kinematics: ArrayLike | Callable | None) -> _Frame:
         left, right = np.asarray(left), np.asarray(right)
         if left.ndim != 3 or left.shape[2] != 3 or left.dtype != np.uint8 or right.shape != left.shape:
             raise ValueError(f"left, right: expected two (h, w, 3) uint8 images, got {left.shape} and {right.shape}.")
@@ -247,29 +257,36 @@ class OnlinePipeline:
         found = self._detector.track(images, previous) if follow else self._detector(images)
         self._seen = found
         u = np.where(found.confidence[..., None] >= MIN_CONFIDENCE, found.u, np.nan)
-        pixels = {"covariance_px2": np.swapaxes(found.covariance, 0, 1), "confidence": np.transpose(found.confidence)}
+        stated = {"covariance_px2": np.swapaxes(found.covariance, 0, 1), "confidence": np.transpose(found.confidence)}
+        index = np.full(len(LANDMARKS), self._index)
         if callable(kinematics):
-            pixels = {name: values[None] for name, values in pixels.items()}
-            data = kinematics(u[:1], u[1:], **pixels)
-            if not isinstance(data, Correspondences) or data.landmark.tolist() != list(range(len(LANDMARKS))):
-                raise ValueError("kinematics: expected a function that returns the Correspondences of one frame.")
-            return replace(data, frame=np.full(len(data), self._index))
+
+            def pair(rig: StereoRig | None) -> Correspondences:
+                linear = None if rig is None else rig.linear
+                rows = kinematics(
+                    u[:1], u[1:], linear=linear, **{name: values[None] for name, values in stated.items()}
+                )
+                if not isinstance(rows, Correspondences) or rows.landmark.tolist() != list(range(len(LANDMARKS))):
+                    raise ValueError("kinematics: expected a function that returns the Correspondences of one frame.")
+                return replace(rows, frame=index)
+
+            return _Frame(pair(self.rig), pair)
         x = np.full((3, 3), np.nan) if kinematics is None else np.array(kinematics, dtype=np.float64)
         if x.shape != (3, 3):
             raise ValueError(f"kinematics: expected (3, 3) mm, one landmark a row, got {x.shape}.")
-        frame = np.full(len(x), self._index)
-        return Correspondences.of_points(x, *u, frame=frame, landmark=range(len(LANDMARKS)), **pixels)
+        data = Correspondences.of_points(x, *u, frame=index, landmark=range(len(LANDMARKS)), **stated)
+        return _Frame(data, lambda rig: data)
 
     # --- the rig -----------------------------------------------------------------------------------------------------
 
-    def _start_again(self, frames: list[Correspondences]) -> None:
+    def _start_again(self, frames: list[_Frame]) -> None:
         """Without a rig: at first, and where the optics changed, not only the pose."""
         self.rig, self.calibration, self.state = None, None, "calibrating"
         self._frames = frames  # that the rig is calibrated with; no more are added once the cameras moved
         self._calibrated = 0  # how many of them it was calibrated with
         self._moments: OnlineCalibration | None = None  # take the frames after the last calibration
         self._monitor: DriftMonitor | None = None
-        self._since: list[Correspondences] = []  # frames since the monitor last saw nothing unusual
+        self._since: list[_Frame] = []  # frames since the monitor last saw nothing unusual
         self._before: StereoRig | None = None  # the rig before the cameras moved, while they are being registered
         self._motion: MovedCameras | None = None
         self._waiting = 0
@@ -287,7 +304,7 @@ class OnlinePipeline:
             # Corrected for the 16 parameters that the residuals have paid for, and the upper end of what so few allow.
             self._scale2 = scatter / (1.0 - 16.0 / max(r.size, 17)) * (1.0 + 1.0 / np.sqrt(len(r))) ** 2
 
-    def _takes_in(self, accepted: list[Correspondences]) -> bool:
+    def _takes_in(self, accepted: list[_Frame]) -> bool:
         """As soon as possible, then whenever a quarter more frames are at hand; never again once the cameras moved."""
         first, last = self.settings.calibration_frames
         if self._given or self._motion is not None or self._moments is not None:
@@ -296,7 +313,7 @@ class OnlinePipeline:
         n = len(self._frames)
         return n >= first if self.rig is None else n > last or n >= 1.25 * self._calibrated
 
-    def _improve_rig(self, accepted: list[Correspondences]) -> None:
+    def _improve_rig(self, accepted: list[_Frame]) -> None:
         """Calibrate with all frames so far; after the last calibration let each frame update its moments."""
         if self.rig is not None and len(self._frames) > self.settings.calibration_frames[1]:
             if self._moments is None:
@@ -304,13 +321,14 @@ class OnlinePipeline:
                 self._moments = OnlineCalibration(sigma_u_px=known.sigma_u_px, sigma_x_mm=known.sigma_x_mm)
                 self._moments.add(known.x_mm[rows], known.y_px[rows, :2], known.y_px[rows, 2:])
                 accepted = self._frames[self._calibrated :]
-            for data in map(self._corrected, accepted):
+            for frame in accepted:
+                data = self._corrected(frame.data)
                 self._moments.add(data.x_mm, data.u_left, data.u_right)
             self.rig = self._moments.solve()
             self._monitor.reset(self.rig)
             return
         try:
-            found = self._calibrate(Correspondences.join(self._frames))
+            found = self._calibrate(Correspondences.join(frame.pair(self.rig) for frame in self._frames))
         except Exception:
             # One bad frame must not stand in the way for good: forget the newest, or the older half of the first ones.
             n = len(self._frames)
@@ -322,12 +340,12 @@ class OnlinePipeline:
         self._calibrated = len(self._frames)
         self._use(found.rig, found)
 
-    def _watch(self, result: FrameResult) -> list[Correspondences]:
+    def _watch(self, result: FrameResult, frame: _Frame) -> list[_Frame]:
         """Do the cameras still stand where they stood?  If not, where now?  Returns frames that may improve the rig."""
-        accepted: list[Correspondences] = []
-        self._since.append(result.landmarks)
+        accepted: list[_Frame] = []
+        self._since.append(frame)
         if self.state == "tracking":
-            data = self._corrected(result.landmarks)
+            data = self._corrected(frame.data)
             alarm = self._monitor.update(data, covariance_px2=self._residual_covariance(data))
             result.drift = self._monitor.statistic / self._monitor.threshold
             if alarm:
@@ -344,7 +362,9 @@ class OnlinePipeline:
     def _register(self, result: FrameResult) -> None:
         """Which camera moved, and how, from the frames since; convinced only if the newest frames agree."""
         newest = self._since[-self.settings.registration_frames[0] :]
-        data, last = (self._corrected(Correspondences.join(frames)) for frames in (self._since, newest))
+        data, last = (
+            self._corrected(Correspondences.join(frame.data for frame in frames)) for frames in (self._since, newest)
+        )
         try:
             found = identify_motion(self._before, data, covariance_px2=self._noise(data))
             last = last.complete

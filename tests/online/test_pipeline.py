@@ -215,15 +215,16 @@ def test_kinematics_may_pair_each_landmark_with_its_own_instant():
     x = world.advance()
     asked = []
 
-    def pair(u_left, u_right, *, covariance_px2, confidence):
-        asked.append((u_left.shape, u_right.shape, covariance_px2.shape, confidence.shape))
+    def pair(u_left, u_right, *, covariance_px2, confidence, linear):
+        asked.append((u_left.shape, u_right.shape, covariance_px2.shape, confidence.shape, linear))
         return pair_with_robot(
             u_left, u_right, position=lambda time_s: x[None] + 0 * time_s[..., None], time_s=[3.0], height_px=1080,
             covariance_px2=covariance_px2, confidence=confidence, frame=[77],
         )  # fmt: skip
 
     result = pipeline.step(BLANK, BLANK, pair)
-    assert asked == [((1, 3, 2), (1, 3, 2), (1, 3, 2, 2, 2), (1, 3, 2))]
+    assert asked[0][:4] == ((1, 3, 2), (1, 3, 2), (1, 3, 2, 2, 2), (1, 3, 2))
+    np.testing.assert_array_equal(asked[0][4], RIG.linear)
     np.testing.assert_array_equal(result.landmarks.x_mm, x)
     np.testing.assert_array_equal(result.landmarks.time_s, 3.0)
     np.testing.assert_array_equal(result.landmarks.frame, 0)  # numbered by the pipeline
