@@ -7,19 +7,15 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import multiprocessing
 import os
 import sys
-import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from tqdm.auto import tqdm
 
-__all__ = ["Finished", "cores", "in_processes", "run_jobs", "single_threaded_torch", "step"]
+__all__ = ["Finished", "cores", "run_jobs", "single_threaded_torch", "step"]
 
 _STEPS = "microstereo-steps"
 #: A scheduler must answer within these seconds.
@@ -170,70 +166,3 @@ def _client(workers: int, scheduler: str | None):
         finally:
             os.environ.clear()  # Dask sets the limits in this process too
             os.environ.update(environment)
-
-
-def in_processes(
-    function: Callable[..., object],
-    arguments: Iterable[tuple],
-    workers: int | None = None,
-    *,
-    on_step: Callable[[], object] | None = None,
-) -> Iterator[object]:
-    """Results of ``function(*arguments[i])`` in the order in which they come, `workers` at a time (default: one a core).
-
-    An error, or Ctrl-C, drops what has not begun and passes on; workers whose parent is killed end too.  `function`
-    must be importable, not a closure.
-
-    Parameters
-    ----------
-    on_step:
-        Called here, in a thread of its own, whenever a worker calls `step`: progress within a job.
-
-    Raises
-    ------
-    ChildProcessError
-        If a worker was killed.
-    """
-    jobs_arguments = list(arguments)
-    if not jobs_arguments:
-        return
-    # A fresh interpreter each: a fork of a program with threads (torch, OpenVINO) can wait for ever for one of their locks.
-    context = multiprocessing.get_context("spawn")
-    steps = context.SimpleQueue()
-    listener = threading.Thread(target=_listen, args=(steps, on_step), daemon=True)
-    listener.start()
-    workers = min(workers or os.cpu_count() or 1, len(jobs_arguments))
-    try:
-        with ProcessPoolExecutor(workers, mp_context=context, initializer=_begin, initargs=(steps,)) as pool:
-            jobs = [pool.submit(function, *a) for a in jobs_arguments]
-            try:
-                for job in as_completed(jobs):
-                    yield job.result()
-            except BaseException:
-                pool.shutdown(wait=False, cancel_futures=True)
-                raise
-    except BrokenProcessPool as error:
-        raise ChildProcessError(
-            "A worker was killed, perhaps for want of memory; try fewer at a time (workers)."
-        ) from error
-    finally:
-        # A worker that was killed while it told a step still holds the queue: then there is nobody to wake.
-        threading.Thread(target=steps.put, args=(False,), daemon=True).start()
-        listener.join(timeout=2.0)
-
-
-def _listen(steps: multiprocessing.SimpleQueue, on_step: Callable[[], object] | None) -> None:
-    while steps.get():
-        if on_step is not None:
-            on_step()
-
-
-def _begin(steps: multiprocessing.SimpleQueue) -> None:
-    """A worker keeps to one core: the others have theirs."""
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end_with_parent() -> None:
-    """A killed parent cannot stop its workers: they would write beside those of the next run, or wait for ever."""
-    multiprocessing.parent_process().join()
-    os._exit(1)

@@ -1,21 +1,20 @@
-"""``python3 -m lib run``: the notebooks one after the other, and the report growing beside them."""
+"""``python3 -m lib run``: the notebooks one after the other, and the report that grows beside them."""
 
 from __future__ import annotations
 
 import argparse
 import contextlib
 import datetime
-import json
-import os
 import shutil
+import signal
 import sys
 import threading
 import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from lib import paths
-from lib import provenance as records
+from lib import files, paths
+from lib.provenance import commit, machine
 from lib.workbench import collection, pages
 from lib.workbench.execution import Failure, execute
 from lib.workbench.index import index_html
@@ -24,35 +23,52 @@ from lib.workbench.parameters import (
     choose_notebooks,
     declared_parameters,
     parse_parameters,
+    positive,
     title_of,
 )
 
 __all__ = ["main", "run"]
 
 PROFILES = ("quick", "paper")
+#: Keeps room on the disk to write the last state of a run when the disk is full.
+_ROOM = ".room"
 
 
 def main(argv: Sequence[str]) -> int:
-    """Parse the command line and run; 0 if every notebook came to its end, 1 if one failed, 2 for a misspelt command."""
-    parser = argparse.ArgumentParser(prog="python3 -m lib run", description=__doc__.split(":", 1)[1].strip())
+    """Parse the command line and run.
+
+    Returns
+    -------
+    int
+        0 if every notebook came to its end, 1 if one failed, 2 for a command that cannot run, 128 + n for signal n.
+    """
+    parser = argparse.ArgumentParser(
+        prog="python3 -m lib run", description="Execute the notebooks and write their report into runs/<date>-<profile>/."
+    )
     parser.add_argument("notebooks", nargs="*", metavar="NOTEBOOK", help="path, name or number (default: all)")
     parser.add_argument("--profile", choices=PROFILES, default="quick", help="quick: minutes; paper: the paper's sizes")
     parser.add_argument("-p", dest="pairs", nargs=2, action="append", default=[], metavar=("NAME", "VALUE"),
                         help="a parameter of the notebooks that declare it")  # fmt: skip
-    parser.add_argument(
-        "--cell-timeout", type=float, metavar="S", help="longest time of one cell (default: 900 for quick)"
-    )
-    parser.add_argument(
-        "--runs", type=Path, default=paths.RUNS, metavar="FOLDER", help="where the run's folder appears"
-    )
+    parser.add_argument("--cell-timeout", type=positive, metavar="S",
+                        help="longest time of one cell (default: 900 for quick)")  # fmt: skip
+    parser.add_argument("--runs", type=Path, default=paths.RUNS, metavar="FOLDER", help="where the run's folder appears")
     options = parser.parse_args(argv)
     timeout = options.cell_timeout or (900.0 if options.profile == "quick" else None)
+    received = []
+
+    def stop(number, frame):
+        received.append(number)
+        raise KeyboardInterrupt
+
+    for name in ("SIGTERM", "SIGHUP"):  # as Ctrl-C: the report then says that the run was stopped
+        if hasattr(signal, name):
+            signal.signal(getattr(signal, name), stop)
     try:
         result = run(options.notebooks, options.profile, options.pairs, cell_timeout_s=timeout, runs=options.runs)
-    except UsageError as error:
+    except (UsageError, OSError) as error:
         print(f"python3 -m lib run: {error}", file=sys.stderr)
         return 2
-    return {"complete": 0, "failed": 1, "stopped": 130}[result["state"]]
+    return {"complete": 0, "failed": 1, "stopped": 128 + (received or [signal.SIGINT])[0]}[result["state"]]
 
 
 def run(
@@ -64,9 +80,9 @@ def run(
     runs: Path = paths.RUNS,
     notebooks: Path = paths.NOTEBOOKS,
 ) -> dict:
-    """Execute notebooks into a new folder of `runs`; a failing one is told and the others still run.
+    """Execute notebooks into a new folder of `runs`; the others still run when one fails.
 
-    Everything is written as it comes about, so that a run that is killed leaves a readable report of what it got to.
+    Everything is written at once, so that a run that is killed leaves a readable report of what it had reached.
 
     Returns
     -------
@@ -77,6 +93,8 @@ def run(
     ------
     UsageError
         Before anything runs: for an unknown notebook or parameter, or a value of the wrong type.
+    OSError
+        If the report cannot be written; its state is "failed" if that can still be written.
     """
     chosen = choose_notebooks(names, notebooks)
     values = parse_parameters(pairs, chosen)
@@ -97,7 +115,11 @@ def run(
         report.finish()
     except KeyboardInterrupt:
         report.finish("stopped")
-        print("\nStopped.")
+        with contextlib.suppress(OSError):  # the terminal may have gone
+            print("\nStopped.")
+    except OSError:
+        report.finish("failed")
+        raise
     for entry in report.content["notebooks"]:
         if entry["state"] == "failed":
             failure = entry["failure"]
@@ -120,8 +142,8 @@ class _Report:
             "parameters": given,
             "started": datetime.datetime.now().astimezone().isoformat(timespec="seconds"),
             "seconds": 0.0,
-            "commit": records.commit(),
-            "machine": records.machine(),
+            "commit": commit(),
+            "machine": machine(),
             "versions": collection.versions(),
             "notebooks": [
                 {"name": book.stem, "title": title_of(book), "state": "pending", "seconds": None, "failure": None,
@@ -132,6 +154,7 @@ class _Report:
             "figures": [],
         }  # fmt: skip
         (folder / "figures").mkdir()
+        (folder / _ROOM).write_bytes(bytes(1 << 20))
         self.write()
 
     def executed(self, book: Path) -> Path:
@@ -146,8 +169,11 @@ class _Report:
         entry, executed = self._entry(book), self.executed(book)
         entry.update(state="failed" if failure else "complete", seconds=round(seconds, 2))
         entry["failure"] = failure.as_dict() if failure else None
-        if executed.is_file():
+        try:
             self.content["metrics"] += [{"notebook": book.stem, **m} for m in collection.metrics_of(executed)]
+        except (OSError, ValueError):  # there is none, or a full disk has cut it off
+            executed.unlink(missing_ok=True)
+        else:
             for figure in collection.figures_of(executed):
                 self._add_figure(book, figure)
             self._write_page(book, entry)
@@ -159,18 +185,19 @@ class _Report:
         for entry in self.content["notebooks"]:
             if entry["state"] == "running":
                 entry["state"] = "pending"
+        (self.folder / _ROOM).unlink(missing_ok=True)
         self.write()
 
     def write(self) -> None:
         self.content["seconds"] = round(time.monotonic() - self.start, 2)
-        _write(self.folder / "metrics.json", json.dumps(self.content, indent=1, ensure_ascii=False) + "\n")
-        _write(self.folder / "index.html", index_html(self.content))
+        files.write_json(self.folder / "metrics.json", self.content)
+        files.write_text(self.folder / "index.html", index_html(self.content))
 
     def _add_figure(self, book: Path, figure: collection.NamedFigure) -> None:
         file = f"figures/{figure.name}.png"
         if any(other["file"] == file for other in self.content["figures"]):
             file = f"figures/{book.stem}.{figure.name}.png"
-        (self.folder / file).write_bytes(figure.png)
+        files.write_bytes(self.folder / file, figure.png)
         self.content["figures"].append(
             {"notebook": book.stem, "name": figure.name, "file": file, "caption": figure.caption}
         )
@@ -192,7 +219,7 @@ class _Report:
             import plotly
 
             shutil.copy(Path(plotly.__file__).parent / "package_data" / pages.PLOTLY_FILE, self.folder)
-        _write(self.folder / f"{book.stem}.html", text)
+        files.write_text(self.folder / f"{book.stem}.html", text)
         entry.update(page=f"{book.stem}.html", executed=book.name)
 
     def _entry(self, book: Path) -> dict:
@@ -250,10 +277,3 @@ def _new_folder(runs: Path, profile: str) -> Path:
             folder.mkdir()
             return folder
         number += 1
-
-
-def _write(path: Path, text: str) -> None:
-    """Whole or not at all."""
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(text, encoding="utf-8")
-    os.replace(partial, path)

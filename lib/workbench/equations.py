@@ -7,7 +7,7 @@ import html
 import re
 
 import ziamath
-from latex2mathml.converter import convert as mathml
+from ziamath.tex import tex2mml
 
 __all__ = ["svg"]
 
@@ -35,7 +35,7 @@ def svg(tex: str, *, display: bool, size_px: float = 17.0) -> str:
     for pattern, replacement in _REWRITES:
         text = pattern.sub(replacement, text)
     try:
-        if re.search(r"\\|&#x0005C;", mathml(text)):
+        if re.search(r"\\|&#x0005C;", tex2mml(text)):
             raise ValueError("a command that the converter does not know")
         drawn = ziamath.Latex(text, size=size_px, inline=not display)
         picture = drawn.svg()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import html
 import json
 import re
@@ -10,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import nbformat
+from jinja2 import Environment, FileSystemLoader
 from nbconvert.filters.ansi import ansi2html
 from nbconvert.filters.markdown_mistune import IPythonRenderer, MarkdownWithMath
 from pygments import highlight
@@ -17,9 +17,8 @@ from pygments.formatters import HtmlFormatter
 from pygments.lexers import PythonLexer
 
 from lib.workbench import equations
-from lib.workbench.style import PAGE_CSS
 
-__all__ = ["PLOTLY_FILE", "markdown_html", "page"]
+__all__ = ["PLOTLY_FILE", "markdown_html", "page", "render"]
 
 #: plotly's script lies once beside the pages that show a 3D view.
 PLOTLY_FILE = "plotly.min.js"
@@ -43,12 +42,26 @@ class _Renderer(IPythonRenderer):
         return equations.svg(f"\\begin{{{name}}}{body}\\end{{{name}}}", display=True)
 
 
-def markdown_html(source: str, *, folder: Path = Path(), attachments: dict | None = None) -> str:
-    """Markdown with TeX as HTML; pictures it names, relative to `folder`, are embedded."""
+def markdown_html(source: str, *, folder: Path = Path(), attachments: dict | None = None, trusted: bool = True) -> str:
+    """Markdown with TeX as HTML; pictures it names, relative to `folder`, are embedded.
+
+    HTML in text that is not `trusted`, such as a caption that names a recording, is escaped.
+    """
     renderer = _Renderer(
-        escape=False, embed_images=True, path=str(folder), attachments=attachments or {}, exclude_anchor_links=True
+        escape=not trusted,
+        allow_harmful_protocols=trusted,
+        embed_images=True,
+        path=str(folder),
+        attachments=attachments or {},
+        exclude_anchor_links=True,
     )
     return MarkdownWithMath(renderer=renderer).render(source)
+
+
+def render(template: str, **values: object) -> str:
+    """A page from a file of ``templates/``; it escapes every value that it does not call safe."""
+    folder = Path(__file__).with_name("templates")
+    return Environment(loader=FileSystemLoader(folder), autoescape=True).get_template(template).render(values)
 
 
 def page(
@@ -65,22 +78,16 @@ def page(
     """
     notebook = nbformat.read(executed, as_version=4)
     widgets = notebook.metadata.get("widgets", {}).get(WIDGET_STATE, {}).get("state", {})
-    body = "\n".join(_cell(cell, folder, widgets) for cell in notebook.cells)
-    script = f'<script src="{PLOTLY_FILE}"></script>' if 'class="plotly-view"' in body else ""
-    back = f'<a href="{previous[0]}">&larr; {html.escape(previous[1])}</a>' if previous else "<span></span>"
-    on = f'<a href="{following[0]}">{html.escape(following[1])} &rarr;</a>' if following else "<span></span>"
-    return f"""<!DOCTYPE html>
-<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{html.escape(title)} - microstereo</title>
-<style>{PAGE_CSS}
-{HtmlFormatter(style="friendly").get_style_defs(".code")}</style>{script}</head>
-<body><nav><a class="home" href="index.html">microstereo</a>{back}{on}</nav>
-<main>
-{body}
-</main>
-<nav class="foot">{back}<a href="index.html">Report of this run</a>{on}</nav>
-</body></html>
-"""
+    return render(
+        "page.html",
+        title=title,
+        body="\n".join(_cell(cell, folder, widgets) for cell in notebook.cells),
+        previous=previous,
+        following=following,
+        code_css=HtmlFormatter(style="friendly").get_style_defs(".code"),
+        plotly='class="plotly-view"',
+        plotly_file=PLOTLY_FILE,
+    )
 
 
 def _cell(cell, folder: Path, widgets: dict) -> str:
@@ -116,7 +123,7 @@ def _rich(data: dict, widgets: dict, metadata: dict) -> str:
     if WIDGET_MIME in data:
         return _widget(data[WIDGET_MIME]["model_id"], widgets)
     if PLOTLY_MIME in data:
-        figure = json.dumps({key: data[PLOTLY_MIME].get(key, {}) for key in ("data", "layout")}).replace("</", "<\\/")
+        figure = json.dumps({key: data[PLOTLY_MIME].get(key, {}) for key in ("data", "layout")}).replace("<", "\\u003c")
         return (
             '<div class="plotly-view"></div><script>(f => Plotly.newPlot('
             "document.currentScript.previousElementSibling, f.data, f.layout, {responsive: true}))"
@@ -132,7 +139,7 @@ def _rich(data: dict, widgets: dict, metadata: dict) -> str:
             encoded = data[mime].replace("\n", "")
             return f'<img src="data:image/{kind};base64,{encoded}" alt="{alt}">'
     if "text/markdown" in data:
-        return markdown_html(data["text/markdown"])
+        return markdown_html(data["text/markdown"], trusted=False)
     if "text/latex" in data:
         return equations.svg(data["text/latex"].strip("$ \n"), display=True)
     return f"<pre>{html.escape(data.get('text/plain', ''))}</pre>"
@@ -154,8 +161,3 @@ def _held_outputs(model_id: str, widgets: dict) -> Iterator[dict]:
 def _settled(text: str) -> str:
     """A terminal's view of text with carriage returns: of a progress bar only its last state."""
     return "\n".join(line.rstrip("\r").rsplit("\r", 1)[-1] for line in re.sub(r"\x1b\[A", "", text).split("\n"))
-
-
-def data_uri(png: bytes) -> str:
-    """A PNG to put into an img tag."""
-    return "data:image/png;base64," + base64.b64encode(png).decode("ascii")

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -16,7 +18,7 @@ import pytest
 from lib import paths
 from lib.workbench import command
 from lib.workbench.command import main, run
-from lib.workbench.execution import execute
+from lib.workbench.execution import Failure, execute
 from lib.workbench.parameters import UsageError, choose_notebooks
 
 GOOD = [
@@ -139,14 +141,73 @@ def test_every_link_leads_somewhere(finished):
             assert (folder / link).is_file(), (file.name, link)
 
 
-def test_exit_codes(books, tmp_path, monkeypatch, capsys):
+@pytest.fixture
+def without_kernels(books, monkeypatch):
+    """Notebooks that end as soon as they begin: what is tested is the command around them."""
     monkeypatch.setattr(command, "choose_notebooks", lambda names, folder: choose_notebooks(names, books))
-    assert main(["00", "--runs", str(tmp_path)]) == 1
+    monkeypatch.setattr(command, "execute", lambda book, output, values, **options: shutil.copy(book, output) and None)
+    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM))}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+def state_of(runs: Path) -> dict:
+    (folder,) = runs.iterdir()
+    assert {file.name for file in folder.iterdir()} >= {"metrics.json", "index.html"} and not (folder / ".room").exists()
+    return json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
+
+
+def test_exit_codes(without_kernels, tmp_path, monkeypatch, capsys):
+    assert main(["03", "--runs", str(tmp_path / "good")]) == 0
+    monkeypatch.setattr(command, "execute", lambda *_, **__: Failure("error", 3, "ZeroDivisionError: division by zero"))
+    assert main(["00", "--runs", str(tmp_path / "bad")]) == 1
     assert "FAILED 00_error: error in cell 3: ZeroDivisionError: division by zero" in capsys.readouterr().err
-    assert main(["03", "--runs", str(tmp_path), "-p", "sede", "1"]) == 2
-    assert "unknown parameter: sede" in capsys.readouterr().err
-    assert main(["07", "--runs", str(tmp_path)]) == 2
-    assert "unknown notebook: 07" in capsys.readouterr().err
+    for words, text in [(["03", "-p", "sede", "1"], "unknown parameter: sede"), (["07"], "unknown notebook: 07"),
+                        (["03", "--runs", __file__], "test_run.py")]:  # fmt: skip
+        assert main(["--runs", str(tmp_path / "none"), *words]) == 2
+        said = capsys.readouterr().err
+        assert text in said and said.count("\n") == 1
+    with pytest.raises(SystemExit):
+        main(["--cell-timeout", "nan"])
+    assert "nan is not a number of seconds above 0" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no such signals")
+@pytest.mark.parametrize(("name", "code"), [("SIGTERM", 143), ("SIGHUP", 129), ("SIGINT", 130)])
+def test_a_signal_leaves_the_state_stopped(without_kernels, tmp_path, monkeypatch, name, code):
+    def killed(*_, **__):
+        os.kill(os.getpid(), getattr(signal, name))
+        time.sleep(10)
+
+    monkeypatch.setattr(command, "execute", killed)
+    assert main(["03", "--runs", str(tmp_path)]) == code
+    content = state_of(tmp_path)
+    assert content["state"] == "stopped" and content["notebooks"][0]["state"] == "pending"
+
+
+def test_a_full_disk_is_told_and_leaves_the_state_failed(without_kernels, tmp_path, monkeypatch, capsys):
+    """The executed notebook is cut off; then nothing can be written until room is made."""
+    write_bytes = command.files.write_bytes
+
+    def full(path, data):
+        if full.now and (path.parent / ".room").exists():
+            raise OSError(errno.ENOSPC, "No space left on device", str(path))
+        write_bytes(path, data)
+
+    def cut_off(book, output, values, **options):
+        output.write_text('{"cells": [', encoding="utf-8")
+        full.now = True
+        return Failure("error", 1, "OSError: No space left on device")
+
+    full.now = False
+    monkeypatch.setattr(command.files, "write_bytes", full)
+    monkeypatch.setattr(command, "execute", cut_off)
+    assert main(["03", "--runs", str(tmp_path)]) == 2
+    said = capsys.readouterr().err
+    assert "No space left on device" in said and said.count("\n") == 1
+    content = state_of(tmp_path)
+    assert content["state"] == "failed" and "No space left" in content["notebooks"][0]["failure"]["message"]
 
 
 def test_a_killed_run_leaves_a_report_and_the_next_its_own(write_notebook, tmp_path):
