@@ -1,7 +1,7 @@
 """Calibration of affine and near-affine cameras from a robot's kinematics, and how good it is (paper Sec. IV-A)."""
 
-from lib.calibration.advice import Advice, advise, box_grid, next_position, next_positions
-from lib.calibration.affine import Moments, affine_minimum, dlt, estimate_noise, paper_variances
+from lib.calibration.advice import Advice, advise, box_grid, next_positions
+from lib.calibration.affine import Moments, affine_minimum, dlt, paper_variances
 from lib.calibration.calibration import Calibration, LandmarkOffsets
 from lib.calibration.estimate import calibrate
 from lib.calibration.export import write_opencv, write_ros
@@ -16,6 +16,6 @@ from lib.calibration.timing import TimeOffset, estimate_time_offset
 __all__ = [
     "LADDER", "Advice", "Calibration", "Comparison", "LandmarkOffsets", "Moments", "OnlineCalibration", "Optics", "Pivot",
     "Rung", "TimeOffset", "ToolOffsets", "advise", "affine_minimum", "box_grid", "calibrate", "compare_models", "dlt",
-    "estimate_noise", "estimate_time_offset", "next_position", "next_positions", "optics", "paper_variances",
+    "estimate_time_offset", "next_positions", "optics", "paper_variances",
     "pivot_calibration", "report", "tool_axes", "tool_offsets", "with_offsets", "write_opencv", "write_ros",
 ]  # fmt: skip

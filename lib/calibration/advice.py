@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from lib.calibration.calibration import Calibration
 from lib.geometry import finite_points, points
 
-__all__ = ["Advice", "advise", "box_grid", "next_position", "next_positions"]
+__all__ = ["Advice", "advise", "box_grid", "next_positions"]
 
 
 @dataclass(frozen=True)
@@ -74,15 +74,6 @@ def next_positions(calibration: Calibration, candidates_mm: ArrayLike, count: in
     return np.array(chosen), np.array(gains)
 
 
-def next_position(calibration: Calibration, low_mm: ArrayLike, high_mm: ArrayLike) -> tuple[np.ndarray, float]:
-    """The most helpful position of a reachable box (3,), and its gain.
-
-    Leverage is a convex function of the position, so over a box it is largest at a corner.
-    """
-    positions, gains = next_positions(calibration, box_grid(low_mm, high_mm, steps=2))
-    return positions[0], float(gains[0])
-
-
 def advise(
     calibration: Calibration, low_mm: ArrayLike, high_mm: ArrayLike, workspace_mm: ArrayLike | None = None
 ) -> Advice:
@@ -101,7 +92,8 @@ def advise(
     # Per point, the direction in which calibration adds most to what one detection leaves uncertain anyway.
     ratio = np.sqrt(np.linalg.eigvals(np.linalg.solve(both - alone, alone)).real.max(axis=1).max())
     depth_um = 1e3 * float(calibration.depth_sd_mm(grid).max())
-    position, gain = next_position(calibration, low_mm, high_mm)
+    # Leverage is a convex function of the position, so over a box it is largest at a corner.
+    (position,), (gain,) = next_positions(calibration, box_grid(low_mm, high_mm, steps=2))
     added = np.sqrt(1 + ratio**2) - 1
     enough = bool(added < 0.10)
     text = (
@@ -109,4 +101,4 @@ def advise(
         f"over the workspace: {'enough data.' if enough else 'not enough data.'} "
         f"The next correspondence helps most at ({position[0]:.2f}, {position[1]:.2f}, {position[2]:.2f}) mm."
     )
-    return Advice(enough, float(ratio), depth_um, position, gain, text)
+    return Advice(enough, float(ratio), depth_um, position, float(gain), text)

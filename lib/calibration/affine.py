@@ -18,7 +18,7 @@ from lib.calibration.checks import check_spread
 from lib.cameras import AffineCamera
 from lib.geometry import finite_points
 
-__all__ = ["AffineMinimum", "Moments", "affine_minimum", "dlt", "estimate_noise", "paper_variances", "regress"]
+__all__ = ["AffineMinimum", "Moments", "affine_minimum", "distances2", "dlt", "estimate_noise", "paper_variances", "regress"]
 
 
 def dlt(x_mm: ArrayLike, u: ArrayLike) -> AffineCamera:
@@ -32,8 +32,8 @@ def dlt(x_mm: ArrayLike, u: ArrayLike) -> AffineCamera:
     Examples
     --------
     >>> x = np.vstack([np.zeros(3), np.eye(3)])
-    >>> dlt(x, AffineCamera([[100, 0, 8, 960], [0, 100, 0, 540]]).project(x)).matrix.round(6).tolist()
-    [[100.0, 0.0, 8.0, 960.0], [0.0, 100.0, 0.0, 540.0]]
+    >>> dlt(x, AffineCamera([[100, 1, 8, 960], [2, 100, 3, 540]]).project(x)).matrix.round(6).tolist()
+    [[100.0, 1.0, 8.0, 960.0], [2.0, 100.0, 3.0, 540.0]]
     """
     x, u = finite_points(x_mm, 3, "x_mm"), finite_points(u, 2, "u")
     check_spread(x, u)
@@ -116,6 +116,12 @@ def paper_variances(sigma_u_px: float, sigma_x_mm: float) -> tuple[float, float]
     sigma_x stands for the point's.  The result depends on the unit of length, here mm.
     """
     return 1.0 + sigma_u_px, sigma_x_mm
+
+
+def distances2(r: np.ndarray, A: np.ndarray, sigma_u_px: float, sigma_x_mm: float, floor_px: float = 0.0) -> np.ndarray:
+    """Squared Mahalanobis distances (n,) of residuals r (n, m) of cameras A (m, 3); `floor_px` is their rounding."""
+    S = (sigma_u_px**2 + floor_px**2) * np.eye(len(A)) + sigma_x_mm**2 * A @ A.T
+    return np.einsum("ni,ij,nj->n", r, np.linalg.inv(S), r)
 
 
 def estimate_noise(

@@ -34,11 +34,6 @@ class LandmarkOffsets:
         """(k, d) of the offsets."""
         return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
 
-    @property
-    def learnt(self) -> np.ndarray:
-        """(k, d): 1 where the data determine an offset, 0 where only the prior speaks."""
-        return 1.0 - (self.standard_deviation / self.prior_sd) ** 2
-
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
@@ -46,31 +41,24 @@ class Calibration:
 
     Attributes
     ----------
-    cameras:
-        One or two; affine unless the model has 1/distance or radial distortion.
-    rig:
-        The stereo pair, None for one camera.
+    cameras, rig:
+        One or two cameras, affine unless the model has 1/distance or radial distortion; the stereo pair, None for one.
     inliers:
         (n,) bool, the rows used, one entry for each row given.
     cost:
         The energy at the minimum over the inliers (Eq. 3 as printed for ``paper``, else half the chi-square).
-    covariance:
-        (8 cameras, 8 cameras) of the entries of the matrices M, row by row, left first; px^2, px^2/mm, px^2/mm^2.
-    parameter_covariance:
+    covariance, parameter_covariance:
+        (8 cameras, 8 cameras) of the entries of the matrices M, row by row, left first, in px^2, px^2/mm, px^2/mm^2; and
         (p, p) of the model's own parameters.
     sigma_u_px, sigma_x_mm:
         Noise levels, given or estimated.  Where the detector's covariances weigh the rows, sigma_u_px is their RMS.
-    residuals_px:
-        (n, 2 cameras) u - project(x), robot error included; NaN in rows that were not usable.
-    model, weighting:
+    model, weighting, image_size_px:
         As asked for.
-    x_mm, y_px:
-        (n, 3) and (n, 2 cameras), the data, moved by the offsets where these were estimated; NaN in rows that are not
-        usable: a landmark that is missing, or a tool with shut jaws where offsets in its axes are estimated.
+    x_mm, y_px, residuals_px:
+        (n, 3), (n, 2 cameras) and u - project(x), robot error included.  The data are moved by the offsets where these were
+        estimated.  NaN in rows that are not usable: a landmark is missing, or a tool with shut jaws has no axes.
     covariance_px2:
         Of the pixels: None, (1, m, m), or (n, m, m) with m = 2 cameras.
-    image_size_px:
-        (width, height), None where not given.
     plan, minimum:
         The parsed model and its fit to the inliers.
     offsets:
@@ -125,11 +113,6 @@ class Calibration:
             if "1/distance" in name:
                 return float(self.minimum.state.rho[0]), float(np.sqrt(self.parameter_covariance[i, i]))
         return 0.0, 0.0
-
-    @cached_property
-    def standard_deviations(self) -> dict[str, float]:
-        """Standard deviation of every parameter by name; that of a log zoom is a relative zoom."""
-        return dict(zip(self.parameter_names, np.sqrt(np.diag(self.parameter_covariance)).tolist(), strict=True))
 
     def resections(self) -> tuple[Resection, ...]:
         """K, R, t (paper Eq. 5) of each camera, or of the affine camera that touches a near-affine one."""

@@ -16,23 +16,11 @@ __all__ = ["write_opencv", "write_ros"]
 
 
 def write_opencv(camera: AffineCamera | NearAffineCamera, path: str | Path, image_size_px: tuple[int, int]) -> None:
-    """A file for `cv2.FileStorage` (.yml, .yaml, .xml or .json by its suffix).
+    """A file for `cv2.FileStorage`; its suffix, .yml, .yaml, .xml or .json, says the format (another is a ValueError).
 
     It holds `projection_matrix` (3 x 4, millimetres of the robot frame to pixels, the last row of an affine camera is
     0 0 0 1), `image_width`, `image_height`, `unit_of_points` and `radial_per_px2`.
 
-    Parameters
-    ----------
-    image_size_px:
-        (width, height).
-
-    Raises
-    ------
-    ValueError
-        For another suffix.
-
-    Examples
-    --------
     >>> import tempfile
     >>> file = Path(tempfile.mkdtemp()) / "left.yml"
     >>> write_opencv(AffineCamera([[100, 0, 5, 960], [0, 100, 0, 540]]), file, (1920, 1080))
@@ -58,19 +46,9 @@ def write_ros(
 ) -> None:
     """ROS CameraInfo YAML (camera_info_manager).  P carries the whole camera, millimetres of the robot frame to pixels.
 
-    K and R are identities and D is zero, since an affine camera has no pinhole K: only P has a meaning.
-
-    Parameters
-    ----------
-    image_size_px:
-        (width, height).
-    name:
-        Of the camera: letters, digits and underscores, as ROS wants it.
-
-    Raises
-    ------
-    ValueError
-        For another name, or for radial distortion, which D cannot state without a focal length.
+    K and R are identities and D is zero, since an affine camera has no pinhole K: only P has a meaning.  A ValueError
+    refuses a `name` of anything but letters, digits and underscores, and radial distortion, which D cannot state without a
+    focal length.
     """
     if not re.fullmatch(r"[A-Za-z0-9_]+", name):
         raise ValueError(f"name: ROS takes letters, digits and underscores, got {name!r}.")

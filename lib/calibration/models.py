@@ -41,13 +41,7 @@ class Model:
 
     @classmethod
     def parse(cls, name: str, cameras: int) -> Model:
-        """The model called `name`.
-
-        Raises
-        ------
-        ValueError
-            For an unknown name; the message lists the known ones.
-        """
+        """The model called `name`; a ValueError for an unknown one lists the known ones."""
         base, *options = ("zero_skew+distance" if name == "near_affine" else str(name)).split("+")
         known = base in BASES and all(o in OPTIONS for o in options) and len(set(options)) == len(options)
         if not known or {"distance", "distances"} <= set(options):
@@ -94,10 +88,8 @@ class State:
 
     Attributes
     ----------
-    A:
-        (cameras, 2, 3).
-    offset:
-        o (cameras, 2), the pixel of the reference point.
+    A, offset:
+        (cameras, 2, 3), and o (cameras, 2), the pixel of the reference point.
     rho, radial:
         (cameras,) 1/mm and 1/px^2.
     rotation, zoom:

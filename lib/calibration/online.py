@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lib.calibration.affine import Moments, affine_minimum
+from lib.calibration.affine import Moments, affine_minimum, distances2
 from lib.calibration.robust import consensus, gate
 from lib.cameras import AffineCamera, StereoRig
 from lib.correspondences import Correspondences
@@ -68,27 +68,18 @@ class OnlineCalibration:
     def add(
         self, data: Correspondences | ArrayLike, u_left: ArrayLike | None = None, u_right: ArrayLike | None = None
     ) -> np.ndarray:
-        """Fold in the rows of a frame; incomplete rows, and rows judged wrong, are left out.
+        """Fold in the rows of a frame, and return which were used (n,): the complete ones that are not judged wrong.
 
-        Parameters
-        ----------
-        data:
-            `Correspondences`; or positions (n, 3) mm with `u_left` and `u_right` (n, 2) px, NaN where missing.
-
-        Returns
-        -------
-        (n,) bool, the rows used.
+        `data` is Correspondences; or positions (n, 3) mm, with `u_left` and `u_right` (n, 2) px, NaN where missing.
         """
-        complete = None
+        complete = True
         if isinstance(data, Correspondences):
             data, u_left, u_right, complete = data.x_mm, data.u_left, data.u_right, data.is_complete
         x = points(data, 3, "x_mm")
         y = np.hstack([points(u_left, 2, "u_left"), points(u_right, 2, "u_right")])
         if len(x) != len(y):
             raise ValueError(f"x_mm, u: {len(x)} and {len(y)} rows; correspondences go row by row.")
-        used = np.isfinite(x).all(axis=1) & np.isfinite(y).all(axis=1)
-        if complete is not None:
-            used &= complete
+        used = complete & np.isfinite(np.hstack([x, y])).all(axis=1)
         if not used.any():
             return used
         right = self._start(x[used], y[used]) if self._first is not None else self._fold(x[used], y[used])
@@ -124,21 +115,14 @@ class OnlineCalibration:
         d = x - self.moments.mean[4:]
         inverse = np.linalg.inv(self.moments.scatter[4:, 4:])
         leverage = 1.0 / self.moments.weight + np.einsum("ni,ij,nj->n", d, inverse, d)
-        S = self.sigma_u_px**2 * np.eye(4) + self.sigma_x_mm**2 * A @ A.T
-        right = np.einsum("ni,ij,nj->n", r, np.linalg.inv(S), r) / (1.0 + leverage) < gate(100, 4)
+        right = distances2(r, A, self.sigma_u_px, self.sigma_x_mm) / (1.0 + leverage) < gate(100, 4)
         self.moments = self.moments.faded(self.forgetting)
         if right.any():
             self.moments = self.moments.merged(Moments.of(x[right], y[right]))
         return right
 
     def solve(self) -> StereoRig:
-        """The rig of the rows so far.
-
-        Raises
-        ------
-        ValueError
-            While the rows do not span a volume.
-        """
+        """The rig of the rows so far; a ValueError while they do not span a volume."""
         if not self.ready:
             raise ValueError("OnlineCalibration: the rows so far do not span a volume; add frames at other positions.")
         matrix = self._solve()
@@ -150,10 +134,8 @@ class OnlineCalibration:
         rig = self.solve()
         S = self.sigma_u_px**2 * np.eye(4) + self.sigma_x_mm**2 * rig.linear @ rig.linear.T
         mean, n = self.moments.mean[4:], self.moments.weight
-        HtH = np.zeros((4, 4))
-        HtH[:3, :3] = self.moments.scatter[4:, 4:] + n * np.outer(mean, mean)
-        HtH[:3, 3] = HtH[3, :3] = n * mean
-        HtH[3, 3] = n
+        HtH = n * np.outer(np.append(mean, 1.0), np.append(mean, 1.0))
+        HtH[:3, :3] += self.moments.scatter[4:, 4:]
         return np.kron(S, np.linalg.inv(HtH))
 
     def _spans(self, moments: Moments) -> bool:

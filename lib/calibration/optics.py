@@ -22,10 +22,8 @@ class Optics:
     mirrored:
         "no", "left or right" (one channel has an odd number of reflections), "both", or "unknown": two affine cameras
         mirrored alike look like unmirrored ones on the other side of the scene, only perspective can tell.
-    convergence_rad:
-        Angle between the viewing directions (of the unmirrored pair).
-    zoom_px_per_mm:
-        (cameras,) geometric mean zoom.
+    convergence_rad, zoom_px_per_mm:
+        Angle between the viewing directions (of the unmirrored pair), and the geometric mean zoom of each camera.
     roll_rad:
         Rotation of the right image's content relative to the left's, x towards y.
     robot_from_microscope:
@@ -41,12 +39,9 @@ class Optics:
 
 
 def optics(calibration: Calibration) -> Optics:
-    """Judge both channels together; a single affine camera cannot tell a mirror (a flip only turns its unseen third row).
+    """Judge both channels together.
 
-    Raises
-    ------
-    ValueError
-        For a single camera.
+    A single affine camera cannot tell a mirror (a flip only turns its unseen third row): a ValueError.
     """
     rig = calibration.rig
     if rig is None:

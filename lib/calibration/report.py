@@ -13,14 +13,9 @@ __all__ = ["report", "verdicts"]
 
 
 def report(calibration: Calibration, *, robot_accuracy_mm: float | None = None, longest: int = 10) -> str:
-    """Several lines of text.
+    """Several lines of text, with at most `longest` outliers, largest residual first.
 
-    Parameters
-    ----------
-    robot_accuracy_mm:
-        As the robot's maker states it (`Recording.robot_accuracy_mm`), to compare the estimated noise with.
-    longest:
-        Outliers listed at most, largest residual first.
+    `robot_accuracy_mm`, as its maker states it (`Recording.robot_accuracy_mm`), is compared with the estimated noise.
     """
     c = calibration
     rows, used, outliers = len(c.inliers), int(c.inliers.sum()), np.flatnonzero(c.usable & ~c.inliers)

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.special import gammainccinv, gammaincinv
 from scipy.stats import f as f_distribution
 
-from lib.calibration.affine import Moments, affine_minimum, estimate_noise, regress
+from lib.calibration.affine import Moments, affine_minimum, distances2, estimate_noise, regress
 
 __all__ = ["consensus", "gate"]
 
@@ -41,21 +41,11 @@ def consensus(
     sigma_x_mm: float | None = None,
     samples: int = 300,
 ) -> np.ndarray:
-    """Rows (n,) bool that agree on one pair of affine cameras.
+    """Rows (n,) bool of x (n, 3) mm and y (n, m) px that agree on one pair of affine cameras.
 
-    Parameters
-    ----------
-    x, y:
-        (n, 3) mm and (n, m) px.
-    threshold_px:
-        Largest reprojection distance of a row in any image; None measures the noise and decides by it.
-    sigma_x_mm:
-        Robot accuracy: samples whose smallest singular value is below five times it are not used.
-
-    Raises
-    ------
-    ValueError
-        Where no affine camera explains at least half the rows (with a threshold: at least eight, and a tenth).
+    `threshold_px` is the largest reprojection distance of a row in any image; None measures the noise and decides by it.
+    Samples thinner than five times the robot's accuracy `sigma_x_mm` are not used.  A ValueError says that no affine
+    camera explains enough rows: a quarter of them, with a threshold a tenth, and eight.
     """
     n, m = y.shape
     if n < 8:
@@ -138,33 +128,25 @@ def _by_growth(x: np.ndarray, y: np.ndarray, distance2: np.ndarray) -> np.ndarra
     (Atkinson and Riani, "Robust diagnostic regression analysis", 2000: the forward search).
     """
     n, m = y.shape
-    size = (n + 5) // 2
+    H, size = np.column_stack([x, np.ones(n)]), (n + 5) // 2
     keep = np.argsort(distance2)[:size]
     for _ in range(10):  # concentrate: the rows nearest to their own fit
-        r = y - np.column_stack([x, np.ones(n)]) @ regress(x[keep], y[keep]).T
-        new = np.argsort((r**2).sum(axis=1))[:size]
-        if set(new) == set(keep):
+        keep, before = np.argsort(((y - H @ regress(x[keep], y[keep]).T) ** 2).sum(axis=1))[:size], keep
+        if set(keep) == set(before):
             break
-        keep = new
-    while True:
-        H = np.column_stack([x, np.ones(n)])
+    while len(keep) < n:
         M = regress(x[keep], y[keep])
         r = y - H @ M.T
-        freedom = len(keep) - 4
-        sigma_u, sigma_x = estimate_noise(r[keep], M[:, :3], 4 * m)
-        S = (sigma_u**2 + (1e-11 * np.abs(y).max()) ** 2) * np.eye(m) + sigma_x**2 * M[:, :3] @ M[:, :3].T
+        sigmas = estimate_noise(r[keep], M[:, :3], 4 * m)
         # A row outside the fit is predicted with the fit's own uncertainty.
         leverage = np.einsum("ni,ij,nj->n", H, np.linalg.inv(H[keep].T @ H[keep]), H)
-        distance2 = np.einsum("ni,ij,nj->n", r, np.linalg.inv(S), r) / (1.0 + leverage)
+        distance2 = distances2(r, M[:, :3], *sigmas, 1e-11 * np.abs(y).max()) / (1.0 + leverage)
         distance2[keep] = -1.0
-        order = np.argsort(distance2)
-        bound = m * f_distribution.isf(FALSE_ALARM / n, m, max(m * freedom // 2, 1))
-        if len(keep) == n or distance2[order[len(keep)]] > bound:
+        order, freedom = np.argsort(distance2), m * (len(keep) - 4) // 2
+        if distance2[order[len(keep)]] > m * f_distribution.isf(FALSE_ALARM / n, m, max(freedom, 1)):
             break
         keep = order[: len(keep) + 1]
-    inside = np.zeros(n, dtype=bool)
-    inside[keep] = True
-    return inside
+    return np.isin(np.arange(n), keep)
 
 
 def _by_noise(x: np.ndarray, y: np.ndarray, keep: np.ndarray) -> np.ndarray:
@@ -176,11 +158,9 @@ def _by_noise(x: np.ndarray, y: np.ndarray, keep: np.ndarray) -> np.ndarray:
             break
         fitted = affine_minimum(Moments.of(x[keep], y[keep]), 1.0, 0.0).matrix
         r = y - x @ fitted[:, :3].T - fitted[:, 3]
-        sigma_u, sigma_x = estimate_noise(r[keep], fitted[:, :3], 4 * m)
+        sigmas = estimate_noise(r[keep], fitted[:, :3], 4 * m)
         # Rounding sets the floor for data without noise.
-        floor = (1e-11 * np.abs(y).max()) ** 2
-        S = (sigma_u**2 + floor) * np.eye(m) + sigma_x**2 * fitted[:, :3] @ fitted[:, :3].T
-        distance2 = np.einsum("ni,ij,nj->n", r, np.linalg.inv(S), r)
+        distance2 = distances2(r, fitted[:, :3], *sigmas, 1e-11 * np.abs(y).max())
         # Heavy tails or a model error widen the bound: the median of the distance is known.
         distance2 /= max(1.0, np.median(distance2[keep]) / _chi2_quantile(0.5, m))
         new = distance2 < bound

@@ -19,16 +19,9 @@ _GRID = 41  # trial offsets of the coarse search
 
 @dataclass(frozen=True, eq=False)
 class TimeOffset:
-    """t_robot = t_video + offset_s.
+    """t_robot = t_video + offset_s, with its standard deviation, and the reprojection RMS (distance in an image) there.
 
-    Attributes
-    ----------
-    offset_s, sd_s:
-        The offset and its standard deviation.
-    rms_px:
-        Reprojection RMS there (distance in an image).
-    trial_s, trial_rms_px:
-        Offsets of the coarse search and the RMS at each.
+    The coarse search tried the offsets `trial_s` and found `trial_rms_px`.
     """
 
     offset_s: float
@@ -56,30 +49,29 @@ class _Path:
     def __init__(self, time: np.ndarray, x: np.ndarray, smooth_s: float) -> None:
         known = np.isfinite(x).all(axis=1)
         time, x = time[known], x[known]
-        self.pieces: list[tuple[float, float, BSpline]] = []
-        if len(time) < 4:
-            return
-        step = float(np.median(np.diff(time)))
+        step = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
         every = max(4, int(np.ceil(smooth_s / step)))
         # The motion is smooth within `smooth_s`, so a dropped sample is bridged; a longer silence is not.
-        for part in np.split(np.arange(len(time)), 1 + np.flatnonzero(np.diff(time) > max(smooth_s, 2.5 * step))):
-            if len(part) >= 4:
-                t = time[part]
-                inner = t[every : len(t) - every : every]
-                knots = np.concatenate([np.full(4, t[0]), inner, np.full(4, t[-1])])
-                self.pieces.append((t[0], t[-1], make_lsq_spline(t, x[part], knots, k=3)))
+        gaps = np.flatnonzero(np.diff(time) > max(smooth_s, 2.5 * step))
+        self.pieces: list[BSpline] = []
+        for t, part in zip(np.split(time, gaps + 1), np.split(x, gaps + 1), strict=True):
+            if len(t) >= 4:
+                knots = np.concatenate([np.full(4, t[0]), t[every : len(t) - every : every], np.full(4, t[-1])])
+                self.pieces.append(make_lsq_spline(t, part, knots, k=3))
 
     def covers(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
         """(n,) bool: one piece holds the whole interval."""
-        inside = [(low >= first) & (high <= last) for first, last, _ in self.pieces]
-        return np.any(inside, axis=0) if inside else np.zeros(len(low), dtype=bool)
+        inside = np.zeros(len(low), dtype=bool)
+        for piece in self.pieces:
+            inside |= (low >= piece.t[0]) & (high <= piece.t[-1])
+        return inside
 
     def at(self, time: np.ndarray, derivative: int = 0) -> np.ndarray:
         """(n, 3) mm, or mm/s, at times that the pieces cover."""
         x = np.full((len(time), 3), np.nan)
-        for first, last, spline in self.pieces:
-            rows = (time >= first) & (time <= last)
-            x[rows] = spline(time[rows], derivative)
+        for piece in self.pieces:
+            rows = (time >= piece.t[0]) & (time <= piece.t[-1])
+            x[rows] = piece(time[rows], derivative)
         return x
 
 
@@ -98,8 +90,7 @@ def estimate_time_offset(
     Parameters
     ----------
     data:
-        `Correspondences` with their times, or (time_s (n,), u) with one array a camera, (n, 2) or (n, k, 2) px.  Rows with a
-        missing landmark are left out.
+        `Correspondences`, or (time_s (n,), u) with one array a camera, (n, 2) or (n, k, 2) px, NaN where missing.
     kinematics:
         `lib.recordings.Kinematics`, or (time_s (m,), x_mm (m, 3) or (m, k, 3)), denser than the motion is fast.  NaN where
         the robot is silent: rows that fall into a gap of more than `smooth_s` are left out.
@@ -115,7 +106,7 @@ def estimate_time_offset(
         of the search.
     """
     time, landmark, y = _rows(data)
-    paths, span = _paths(kinematics, smooth_s)
+    paths = _paths(kinematics, smooth_s)
     if landmark.max(initial=0) >= len(paths):
         raise ValueError(f"u: {landmark.max() + 1} landmarks, the kinematics have {len(paths)}.")
     known = np.isfinite(y).all(axis=1) & np.isfinite(time)
@@ -124,8 +115,8 @@ def estimate_time_offset(
         known[rows] = path.covers(time[rows] + start_s - search_s, time[rows] + start_s + search_s)
     if len(np.unique(time[known])) < 8:
         raise ValueError(
-            f"data: {len(np.unique(time[known]))} frames lie inside the kinematics ({span[0]:.3f} to {span[1]:.3f} s) by "
-            f"search_s = {search_s} s, away from gaps; 8 are needed."
+            f"data: {len(np.unique(time[known]))} frames lie inside the kinematics by search_s = {search_s} s, away from "
+            "gaps; 8 are needed."
         )
     time, landmark, y = time[known], landmark[known], y[known]
     m = y.shape[1]
@@ -182,8 +173,7 @@ def _rows(data: Correspondences | tuple) -> tuple[np.ndarray, np.ndarray, np.nda
     return np.repeat(time, k), np.tile(np.arange(k), len(time)), np.concatenate(u, axis=2).reshape(len(time) * k, -1)
 
 
-def _paths(kinematics: Kinematics | tuple, smooth_s: float) -> tuple[list[_Path], tuple[float, float]]:
-    """A path for each landmark, and the first and last time."""
+def _paths(kinematics: Kinematics | tuple, smooth_s: float) -> list[_Path]:
     given = kinematics if isinstance(kinematics, tuple) else (kinematics.time_s, kinematics.x_mm)
     time, x = (np.asarray(values, dtype=np.float64) for values in given)
     if x.ndim == 2:
@@ -194,4 +184,4 @@ def _paths(kinematics: Kinematics | tuple, smooth_s: float) -> tuple[list[_Path]
         )
     if len(time) < 4 or not np.isfinite(time).all() or (np.diff(time) <= 0).any():
         raise ValueError("kinematics: times must be finite and increase, and at least four samples are needed.")
-    return [_Path(time, x[:, k], smooth_s) for k in range(x.shape[1])], (time[0], time[-1])
+    return [_Path(time, x[:, k], smooth_s) for k in range(x.shape[1])]

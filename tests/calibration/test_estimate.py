@@ -11,9 +11,9 @@ from lib.calibration import (
     calibrate,
     compare_models,
     dlt,
-    estimate_noise,
     paper_variances,
 )
+from lib.calibration.affine import estimate_noise
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
 from tests.calibration.rigs import data, near_rig
 
@@ -218,8 +218,8 @@ def test_outliers_in_both_detectors_at_once():
 
 
 def test_gaussian_data_keep_every_row():
-    kept = [calibrate(c.x_mm, [c.u_left, c.u_right]).inliers.all() for seed in range(40) for c in [data(100, seed)]]
-    assert sum(kept) >= 39
+    kept = [calibrate(c.x_mm, [c.u_left, c.u_right]).inliers.all() for seed in range(25) for c in [data(100, seed)]]
+    assert sum(kept) >= 24
 
 
 def test_perspective_is_not_mistaken_for_outliers():
@@ -252,7 +252,7 @@ def test_covariance_covers_the_truth():
     distances = {m: [] for m in ("affine", "zero_skew", "square+distance")}
     rng = np.random.default_rng(0)
     base = reference_rig()
-    for seed in range(70):
+    for seed in range(50):
         c = data(60, seed)
         for model, values in distances.items():
             rig = near_rig() if "distance" in model else base
@@ -270,7 +270,7 @@ def test_covariance_covers_the_truth():
             w, V = np.linalg.eigh(covariance)
             values.append(((V[:, -rank:].T @ error) ** 2 / w[-rank:]).sum() / rank)
     for model, values in distances.items():
-        assert np.mean(values) == pytest.approx(1, abs=0.13), model
+        assert np.mean(values) == pytest.approx(1, abs=0.15), model
 
 
 def test_affine_covariance_is_the_cramer_rao_bound():
@@ -288,14 +288,14 @@ def test_estimates_scatter_as_the_bound_and_their_own_covariances_say():
     H = np.column_stack([x, np.ones(100)])
     bound = np.kron(1.5**2 * np.eye(4) + 1e-4 * rig.linear @ rig.linear.T, np.linalg.inv(H.T @ H))
     truth = np.concatenate([rig.left.matrix.ravel(), rig.right.matrix.ravel()])
-    errors, claimed, rejected, runs = [], [], [], 250
+    errors, claimed, rejected, runs = [], [], [], 160
     for run in range(runs):
         noisy = x + rng.normal(0, 0.01, x.shape)
         u = [p + rng.normal(0, 1.5, p.shape) for p in rig.project(x)]
         found = calibrate(noisy, u, model="affine", ransac_px=np.inf)
         errors.append(np.concatenate([camera.matrix.ravel() for camera in found.cameras]) - truth)
         claimed.append(errors[-1] @ np.linalg.solve(found.covariance, errors[-1]))
-        if run < 80:
+        if run < 60:
             models = ("common_zoom", "square", "zero_skew", "affine")
             rungs = compare_models(noisy, u, models=models, sigma_u_px=1.5, sigma_x_mm=0.01, ransac_px=np.inf).rungs
             rejected += [rung.p_value < 0.05 for rung in rungs if rung.against]
@@ -338,7 +338,7 @@ def test_paper_weighting_reports_the_sandwich():
     c = data(200, 3, half_size_mm=(4, 3, 0.3))
     errors, claims = [], []
     rng = np.random.default_rng(0)
-    for _ in range(100):
+    for _ in range(80):
         x = c.true_x_mm + rng.normal(0, 0.01, (200, 3))
         u = [p + rng.normal(0, 1.5, p.shape) for p in c.true_rig.project(c.true_x_mm)]
         found = calibrate(

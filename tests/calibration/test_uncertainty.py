@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lib.calibration import advise, box_grid, calibrate, dlt, next_position, next_positions, optics, report
+from lib.calibration import advise, box_grid, calibrate, dlt, next_positions, optics, report
 from lib.cameras import NearAffineCamera
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig, simulate_correspondences
 
@@ -87,7 +87,8 @@ def test_depth_map_grows_away_from_the_data():
 def test_advised_position_is_the_best_of_the_box(model):
     _, found = made(20, model=model, half_size_mm=(2, 1, 1))
     low, high = ROBOT_FROM_MICROSCOPE.t - 5, ROBOT_FROM_MICROSCOPE.t + 5
-    position, gain = next_position(found, low, high)
+    advice = advise(found, low, high)
+    position, gain = advice.next_position_mm, advice.gain
     everywhere = box_grid(low, high, steps=7)
     best, gains = next_positions(found, everywhere, 1)
     np.testing.assert_allclose(position, best[0])
@@ -98,7 +99,7 @@ def test_advised_position_is_the_best_of_the_box(model):
 
 def test_predicted_gain_is_the_gain():
     c, found = made(30, half_size_mm=(2, 1, 1), sigma_x_mm=1e-9)
-    x_new, gain = next_position(found, ROBOT_FROM_MICROSCOPE.t - 5, ROBOT_FROM_MICROSCOPE.t + 5)
+    (x_new,), (gain,) = next_positions(found, box_grid(ROBOT_FROM_MICROSCOPE.t - 5, ROBOT_FROM_MICROSCOPE.t + 5, steps=2))
     u_new = c.true_rig.project(x_new[None])
     again = calibrate(
         np.vstack([c.x_mm, x_new]), [np.vstack(p) for p in zip((c.u_left, c.u_right), u_new, strict=True)],
