@@ -1,16 +1,13 @@
 """Augmentation with kornia: image and landmarks move together, landmarks that leave the frame become absent.
 
-The paper's is rotation within 30 degrees and zoom 0.75 to 1.25.  `best` adds shifts, mirroring (which swaps the tips:
-tip_1 is the left one, see `lib.simulator.forceps`) and what a microscope does to an image: gain, colour, defocus,
-noise, glints, things in front of the tool.  Left out on purpose: kornia's elastic, thin-plate and fisheye transforms
-move the image and not the points, and its motion blur shifts content unless its direction is 0.
-
-Random numbers come from a `numpy.random.Generator` given with every batch, so a resumed training repeats itself.
+Kornia's elastic, thin-plate and fisheye transforms are left out: they move the image and not the points.  Its motion blur
+shifts content unless its direction is 0.  Random numbers come from a generator given with every batch, so that a resumed
+training repeats itself.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import kornia.augmentation as K
 import numpy as np
@@ -37,16 +34,13 @@ class Batch:
 
     @property
     def weight(self) -> Tensor:
-        """(n, 3): 0 masks the loss of unlabelled landmarks.
-
-        A landmark known to be out of the frame has weight 1 and an empty heatmap: absence is trained.
-        """
+        """(n, 3): 0 for unlabelled landmarks, which have no loss; 1 also for absent ones, whose empty heatmap is trained."""
         unlabelled = torch.isnan(self.u).any(-1) & (self.visibility > 0)
         return (~unlabelled).to(self.images.dtype)
 
     @property
     def peak(self) -> Tensor:
-        """(n, 3) height of the target: 1 visible, `OCCLUDED_PEAK` occluded (where it must be, yet not seen), 0 absent."""
+        """(n, 3) height of the target: 1 visible, `OCCLUDED_PEAK` occluded, 0 absent."""
         heights = torch.tensor([0.0, OCCLUDED_PEAK, 1.0], dtype=self.images.dtype, device=self.visibility.device)
         return heights[self.visibility.long()]
 
@@ -57,7 +51,7 @@ class Batch:
 
 @dataclass(frozen=True)
 class Augmentation:
-    """Ranges of the random transforms; 0 or False switches one off.
+    """Ranges of the random transforms; 0 or False switches one off.  The defaults are the paper's.
 
     Attributes
     ----------
@@ -69,10 +63,8 @@ class Augmentation:
         Part of the image's size, either way.
     mirror:
         Flip top and bottom every second time, and swap the tips.
-    photometric:
-        Strength of the changes of light and optics, 0 to 1.
-    photometric_share:
-        Part of a batch's images, its first ones, that these changes are made to.
+    photometric, photometric_share:
+        Strength of the changes of light and optics, 0 to 1, and the share of a batch that they are made to.
     """
 
     rotation_deg: float = 30.0
@@ -85,10 +77,9 @@ class Augmentation:
     def __post_init__(self) -> None:
         if not 0 < self.zoom[0] <= self.zoom[1]:
             raise ValueError(f"zoom: expected 0 < smallest <= largest, got {self.zoom}.")
-        if not 0 <= self.photometric <= 1:
-            raise ValueError(f"photometric: must lie between 0 and 1, got {self.photometric}.")
-        if not 0 <= self.photometric_share <= 1:
-            raise ValueError(f"photometric_share: must lie between 0 and 1, got {self.photometric_share}.")
+        for name in ("photometric", "photometric_share"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"{name}: must lie between 0 and 1, got {getattr(self, name)}.")
 
     def __call__(self, batch: Batch, rng: np.random.Generator) -> Batch:
         """The batch transformed; the caller's is left alone."""
@@ -165,15 +156,12 @@ def leave_frame(u: Tensor, visibility: Tensor, image_size: tuple[int, int]) -> T
     return torch.where(outside, 0, visibility)
 
 
-#: Presets: the paper's, and the one that trains the shipped detector's whole-frame and window networks.
+_STILL = Augmentation(0.0, (1.0, 1.0))  # windows are rotated and zoomed where they are cut out
+#: The paper's, that of the shipped detector's first stage, and those of its other stages.
 AUGMENTATIONS = {
-    "none": Augmentation(0.0, (1.0, 1.0)),
+    "none": _STILL,
     "paper": Augmentation(),
     "best": Augmentation(180.0, (0.7, 1.3), shift=0.15, mirror=True, photometric=1.0),
-    "windows": Augmentation(
-        0.0, (1.0, 1.0), mirror=True, photometric=1.0, photometric_share=0.25
-    ),  # placed by `lib.landmarks.windows`
-    "closeups": Augmentation(
-        0.0, (1.0, 1.0), photometric=1.0, photometric_share=0.25
-    ),  # tip_2 is mirrored there, nothing at random
+    "windows": replace(_STILL, mirror=True, photometric=1.0, photometric_share=0.25),
+    "closeups": replace(_STILL, photometric=1.0, photometric_share=0.25),  # closeups of tip_2 are mirrored already
 }

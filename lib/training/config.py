@@ -20,8 +20,6 @@ class TrainingConfig:
 
     Attributes
     ----------
-    steps, batch_size:
-        Number of optimiser steps, and images in each.
     optimiser, learning_rate, schedule:
         ``"rmsprop"`` (alpha 0.99, no momentum, as the paper prints) or ``"adamw"``; ``"constant"`` or ``"cosine"``, the
         latter after a warm-up.
@@ -35,8 +33,6 @@ class TrainingConfig:
         Width of the target Gaussians in pixels of the network's input.
     position_weight_per_px:
         Weight of `lib.training.losses.position_loss` beside the l2 loss of the heatmaps; the paper has the latter alone (0).
-    validate_every:
-        Steps between two validations.
     seed:
         Decides the first weights and every batch.
 
@@ -67,11 +63,8 @@ class TrainingConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name, choices in (
-            ("optimiser", ("rmsprop", "adamw")),
-            ("schedule", ("constant", "cosine")),
-            ("precision", ("fp32", "bf16")),
-        ):
+        known = {"optimiser": ("rmsprop", "adamw"), "schedule": ("constant", "cosine"), "precision": ("fp32", "bf16")}
+        for name, choices in known.items():
             if getattr(self, name) not in choices:
                 raise ValueError(f"{name}: expected one of {', '.join(choices)}, got {getattr(self, name)!r}.")
         if min(self.steps, self.batch_size, self.validate_every) < 1:
@@ -100,13 +93,7 @@ class TrainingConfig:
 PRESETS = {
     "paper": TrainingConfig(),
     "best": TrainingConfig(
-        augmentation=AUGMENTATIONS["best"],
-        batch_size=12,
-        optimiser="adamw",
-        learning_rate=2e-3,
-        schedule="cosine",
-        ema=0.998,
-        clip=1.0,
-        precision="bf16",
+        augmentation=AUGMENTATIONS["best"], batch_size=12, optimiser="adamw", learning_rate=2e-3, schedule="cosine",
+        ema=0.998, clip=1.0, precision="bf16",
     ),
 }

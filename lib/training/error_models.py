@@ -28,20 +28,10 @@ TRACKED_SHIFT_PX = 8.0
 
 @dataclass(frozen=True)
 class Seen:
-    """Peaks that a stage decoded, and their errors, in pixels of the stage's input.
+    """Peaks of `landmark` (m,) that a stage decoded: `features` (m, 3, 4) as `features_of` gives them, and `errors` (m, 2).
 
-    Attributes
-    ----------
-    features:
-        (m, 3, 4), as `features_of` gives them.
-    errors:
-        (m, 2), NaN without a label.
-    tolerance:
-        (m,): a landmark is correct below this error.
-    landmark:
-        (m,) 0 base, 1 tip_1, 2 tip_2.
-    moved:
-        (m, 2), in closeups: the whole correction.
+    All in pixels of the stage's input.  Errors are NaN without a label; below `tolerance` (m,) a landmark is correct.
+    `moved` (m, 2) is the whole correction of a closeup.
     """
 
     features: np.ndarray
@@ -179,18 +169,14 @@ def fit_error_models(detector: Detector, images: Iterable[LabelledImage], *, pro
         if not parts:
             raise ValueError("images: the detector finds nothing in them to calibrate on; give other images.")
         seen = Seen.joined(parts)
-        gross = {
-            "frame": 6 * GROSS_PX,
-            "tool": 2 * GROSS_PX / detector.tool_reduction,
-            "window": GROSS_PX,
-        }.get(stage, CLOSEUP_REACH_PX * min(CLOSEUP_ZOOM))
+        gross = {"frame": 6 * GROSS_PX, "tool": 2 * GROSS_PX / detector.tool_reduction, "window": GROSS_PX}
+        gross_px = gross.get(stage, CLOSEUP_REACH_PX * min(CLOSEUP_ZOOM))
         gain, bias = np.ones((3, 2)), np.zeros((3, 2))
         if stage in CLOSE:
             # While tracking, the place where a landmark is expected is an old one, which is evidence of nothing.
-            gain, bias = seen.gain(gross, [1.0] if stage == "tracking" else np.linspace(0, 1, 51))
-            left = seen.errors + (gain[seen.landmark] - 1) * seen.moved - bias[seen.landmark]
-            seen = replace(seen, errors=left)
-        fit = seen.fit(gross)
+            gain, bias = seen.gain(gross_px, [1.0] if stage == "tracking" else np.linspace(0, 1, 51))
+            seen = replace(seen, errors=seen.errors + (gain[seen.landmark] - 1) * seen.moved - bias[seen.landmark])
+        fit = seen.fit(gross_px)
         fit = ErrorModel(fit.log_variance, fit.logit, gain, bias)
         detector = detector.with_error_models(**{stage: fit})
         if stage == "frame":  # the landmarks that the next stage starts from

@@ -20,20 +20,16 @@ __all__ = ["Evaluation", "evaluate", "evaluate_recording"]
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Detections beside their labels.
+    """Detections in n images beside their labels.
 
     Attributes
     ----------
-    landmarks:
-        Detections in n images.
     u_true:
         (n, 3, 2) labels in view, NaN elsewhere.
     visibility:
         (n, 3) 0, 1, 2, and -1 where nothing is labelled.
     length_px:
         (n,) the tool's length, the unit of PCK, also where a tip is out of the frame.
-    names:
-        (n,) name of each image, such as ``"left 12"``.
     """
 
     landmarks: Landmarks

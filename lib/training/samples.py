@@ -15,18 +15,9 @@ __all__ = ["LabelledImage", "Mixed", "Samples", "Source", "labelled_images"]
 
 
 class LabelledImage(NamedTuple):
-    """One image with its landmarks in the order base, tip_1, tip_2.
+    """An image (h, w, 3) uint8 RGB and its landmarks base, tip_1, tip_2: u (3, 2) px and visibility (3,).
 
-    Attributes
-    ----------
-    name:
-        Such as ``"left 12"``.
-    image:
-        (h, w, 3) uint8 RGB.
-    u:
-        (3, 2) px.
-    visibility:
-        (3,): 2 visible, 1 hidden, 0 not in the frame.  NaN in `u` where this is not 0 = unlabelled.
+    Visibility is 2 visible, 1 hidden, 0 not in the frame.  A landmark that is NaN in `u` and not 0 here is unlabelled.
     """
 
     name: str
@@ -67,26 +58,15 @@ class Source(Protocol):
 
     def draw(self, index: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Image (h, w, 3) uint8, landmarks (3, 2) px, visibility (3,)."""
-        ...
 
     @property
     def fingerprint(self) -> str:
         """Identifies the data."""
-        ...
 
 
 @dataclass(frozen=True)
 class Samples:
-    """Labelled images in memory; a `Source`.
-
-    Attributes
-    ----------
-    images:
-        (n, h, w, 3) uint8 RGB.
-    u:
-        (n, 3, 2) px; NaN = unlabelled.
-    visibility:
-        (n, 3): 2 visible, 1 hidden, 0 not in the frame.
+    """Labelled images in memory, (n, h, w, 3) uint8 RGB, with u (n, 3, 2) and visibility (n, 3) as in `LabelledImage`.
 
     Raises
     ------
@@ -104,10 +84,9 @@ class Samples:
             raise ValueError("images: an empty data set; give at least one labelled image.")
         if self.images.ndim != 4 or self.images.shape[-1] != 3 or self.images.dtype != np.uint8:
             raise ValueError(f"images: expected (n, h, w, 3) uint8, got {self.images.shape} {self.images.dtype}.")
-        if self.u.shape != (n, 3, 2) or self.visibility.shape != (n, 3):
-            raise ValueError(
-                f"u and visibility: expected ({n}, 3, 2) and ({n}, 3), got {self.u.shape} and {self.visibility.shape}."
-            )
+        shapes = self.u.shape, self.visibility.shape
+        if shapes != ((n, 3, 2), (n, 3)):
+            raise ValueError(f"u and visibility: expected ({n}, 3, 2) and ({n}, 3), got {shapes[0]} and {shapes[1]}.")
         if not (np.isfinite(self.u).all(2) & (self.visibility == 2)).any():
             raise ValueError("u: all landmarks of all images are missing; there is nothing to learn.")
 

@@ -31,15 +31,7 @@ _CROPS = ("crops", "crop_u", "crop_visibility", "crop_landmark")
 
 @dataclass(frozen=True)
 class _Cut:
-    """Windows that are cut out of stored crops.
-
-    Attributes
-    ----------
-    crops, u, visibility:
-        (n, h, w, 3) uint8, labels (n, 3, 2) in crop pixels, and (n, 3).
-    landmark:
-        (n,) which landmark each window shows.
-    """
+    """Windows cut out of crops (n, h, w, 3) uint8 with their labels; each shows one `landmark` (n,)."""
 
     crops: np.ndarray
     u: np.ndarray
@@ -62,16 +54,10 @@ class _Cut:
 
 @dataclass(frozen=True)
 class WindowSource(_Cut):
-    """Upright windows round landmarks, or, where `landmark` is `TOOL`, round the middle of the tool.
+    """Upright windows of `size` px round landmarks, or, where `landmark` is `TOOL`, round the middle of the tool.
 
-    Attributes
-    ----------
-    size:
-        Side of the windows in px.
-    shift_px, turn_rad:
-        Standard deviations of the error of place and direction; a tenth of the windows has three times as much.
-    zoom:
-        Range of magnification.
+    `shift_px` and `turn_rad` are standard deviations of the error of place and direction; a tenth of the windows has three
+    times as much.  `zoom` is the range of magnification.
     """
 
     size: int = 128
@@ -113,8 +99,6 @@ class CloseupSource(_Cut):
 
     Attributes
     ----------
-    size:
-        Side of the closeups in px.
     shifts_px, shift_shares:
         Standard deviations of the error of place, and the share of closeups that has each.
     turn_rad:

@@ -16,14 +16,17 @@ from lib.workbench.results import Table
 from notebooks.figures.style import COLOURS, figure
 
 __all__ = [
+    "PAPER_ABLATION",
     "ablation_bars",
     "curve",
     "depth_groups",
     "engine_bars",
     "few_labels_curves",
+    "groups",
     "label_noise_cost",
     "label_noise_pairs",
     "mean_and_error",
+    "real_tests",
     "recorded",
     "resolution_curves",
     "shipped_curve",
@@ -146,6 +149,17 @@ def label_noise_pairs(table: Table) -> Figure:
     ax.set(xlim=(-0.4, 1.4), ylabel="median error, px", title=f"Cost of label noise: {cost} px")
     ax.set_ylim(0, 1.25 * medians.max())
     return fig
+
+
+def real_tests(table: Table) -> dict[str, Table]:
+    """The rows of each kind of test on real frames, named as `landmarks.real_curves` takes them."""
+    tests: dict[str, list[dict]] = {}
+    for row in table.rows:
+        on = "second" if row["train_on"] == row["test_on"] else row["test_on"]
+        how = "simulated frames only" if row["train_on"] == "simulated" else f"first half to {on}"
+        sequence = row["test_on"] if row["train_on"] == "simulated" else row["train_on"]
+        tests.setdefault(f"{sequence}: {how}", []).append(row)
+    return {name: Table(rows) for name, rows in tests.items()}
 
 
 def _text_table(header: Sequence[str], rows: Sequence[Sequence[str]], *, width_in: float, first: float) -> Figure:
