@@ -88,7 +88,7 @@ class Seen:
 
         logit = minimize(cost, np.array([-4.0, 0.0, 8.0, 0.0]), jac=True, method="L-BFGS-B").x
         log_variance = np.array([variance(0), variance(1)])
-        rows = ErrorModel(tuple(map(tuple, log_variance.tolist()))).coefficients[self.landmark[use]]
+        rows = ErrorModel(log_variance).coefficients[self.landmark[use]]
         normalised = (squared / np.exp((rows * features[:, :2]).sum(-1))).sum(1)
         for own, columns in ((~tip[:, 0], np.s_[:1]), (tip[:, 0], np.s_[1:3])):
             if own.any():
