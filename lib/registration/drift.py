@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import deque
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -23,10 +25,8 @@ class DriftMonitor:
     ----------
     rig:
         As calibrated or last registered.
-    covariance_px2:
-        Of (u_left, u_right): a number, (2, 2) or (4, 4).
-    sigma_x_mm:
-        Standard deviation of the robot's report, per coordinate.
+    covariance_px2, sigma_x_mm:
+        Noise: of (u_left, u_right), a number, (2, 2) or (4, 4) px^2; and of the robot's report, per coordinate.
     slack, threshold, cap:
         Score that still counts as no change, half of the shift that should be noticed; alarm level; and largest score
         of one frame, below threshold + slack so that a single bad detection raises no alarm.  With the defaults a false
@@ -35,7 +35,7 @@ class DriftMonitor:
     Attributes
     ----------
     statistic, history:
-        S after the last frame; (chi2, degrees of freedom, S) of every frame.
+        S after the last frame; (chi2, degrees of freedom, S) of the last 1000 frames.
 
     Raises
     ------
@@ -65,7 +65,7 @@ class DriftMonitor:
             raise ValueError("slack, threshold, cap, sigma_x_mm: need 0 < slack < cap, threshold > 0, sigma_x_mm >= 0.")
         self.covariance_px2, self.sigma_x_mm = pair_covariance(covariance_px2, 1), sigma_x_mm
         self.slack, self.threshold, self.cap = slack, threshold, cap
-        self.history: list[tuple[float, int, float]] = []
+        self.history: deque[tuple[float, int, float]] = deque(maxlen=1000)
         self.reset(rig)
 
     def reset(self, rig: StereoRig) -> None:

@@ -8,6 +8,7 @@ J is the derivative of the projection.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Literal
@@ -18,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from lib.cameras import AffineCamera, NearAffineCamera, StereoRig
 from lib.correspondences import Correspondences
-from lib.geometry import RigidTransform, align_rotation, pair_covariance
+from lib.geometry import RigidTransform, pair_covariance
 from lib.least_squares import minimise
 from lib.registration.rigid import Registration, check_spread, motion_jacobian, register, sandwich
 
@@ -41,17 +42,16 @@ def register_images(
 ) -> Registration:
     """The motion of a rig whose cameras moved together, by maximum likelihood in the images.
 
-    Minimises sum r^T C^-1 r over the six parameters of the motion, r = u - rig.project(motion^-1 x) and
-    C = covariance_px2 + sigma_x^2 A A^T, by damped Gauss-Newton steps from the solution of Eq. (7).
+    Minimises sum r^T C^-1 r over the six parameters of the motion, with r = u - rig.project(motion^-1 x) and
+    C = covariance_px2 + sigma_x^2 A A^T, by damped Gauss-Newton steps.
 
     Parameters
     ----------
     rig:
         Calibrated before the motion; affine or near-affine cameras.
-    data:
-        Correspondences after the motion; or x_mm (n, 3), the landmarks as the robot reports them now.
-    u_left, u_right:
-        (n, 2) px as detected now, beside x_mm.  NaN in one image: the other still counts.  NaN in x_mm: the row does not.
+    data, u_left, u_right:
+        Correspondences after the motion; or (n, 3) mm as the robot reports the landmarks now, and (n, 2) px as they are
+        detected.  If one image misses a landmark, the other still counts.
     covariance_px2:
         Of (u_left, u_right): a number, (2, 2), (4, 4) or (n, 4, 4).  None: that of the correspondences; without one,
         equal and unknown, estimated from the residuals.
@@ -70,6 +70,14 @@ def register_images(
     ------
     ValueError
         For shapes that do not pair up, or landmarks that leave the motion open.
+
+    Examples
+    --------
+    >>> from lib.cameras import AffineCamera
+    >>> rig = StereoRig(*(AffineCamera([[99, 0, z, 900], [0, 99, 0, 500]]) for z in (9, -9)))
+    >>> x = np.array([[0.0, 0, 0], [3, 0, 0], [0, 3, 0], [0, 0, 1]])
+    >>> register_images(rig, x + [0.2, 0.1, 0.5], *rig.project(x)).transform.t.round(6).tolist()
+    [0.2, 0.1, 0.5]
     """
     return _register_both(rig, _Observed.of(rig, data, u_left, u_right, covariance_px2, sigma_x_mm), loss)
 
@@ -110,9 +118,9 @@ def identify_motion(
 ) -> MovedCameras:
     """Which cameras moved, and how: the hypothesis with the smallest Bayesian information criterion.
 
-    The hypotheses are: neither camera moved (0 parameters), the left or the right alone (5), both together (6), each by
-    its own motion (10).  If the cameras moved apart, triangulated points are no rigid copy of the true ones, so Eq. (7)
-    has no exact solution; the images have.  A near-affine camera alone has 6 parameters.
+    The hypotheses are: neither camera moved (0 parameters), the left or the right alone (5; 6 if it is near-affine), both
+    together (6), each by its own motion.  If the cameras moved apart, triangulated points are no rigid copy of the true
+    ones, so Eq. (7) has no exact solution; the images have.
 
     Arguments and errors are those of `register_images`.  The noise must be known, by `covariance_px2` or from the
     correspondences: it decides whether a hypothesis explains the data.
@@ -134,7 +142,7 @@ def identify_motion(
     rigs, bic = {}, {}
     for name, (*motions, parameters) in hypotheses.items():
         rigs[name] = rig.moved(*(stay if motion is None else motion.transform for motion in motions))
-        energy, _ = _evaluate(rigs[name], observed, stay, loss)
+        energy, _ = _evaluate(rigs[name], observed, loss, stay)
         bic[name] = 2 * energy + parameters * np.log(2 * observed.seen.sum())
     best = min(bic, key=bic.__getitem__)
     return MovedCameras(rigs[best], best, *hypotheses[best][:2], bic)
@@ -186,24 +194,16 @@ def _register_both(rig: StereoRig, data: _Observed, loss: Loss) -> Registration:
     gated = both & (distance <= (3.5 * 1.4826 * np.median(distance[both]) if both.any() else 0.0))
     starts = [RigidTransform.identity()]
     for rows, kind in ((both, "squared"), (gated, "norm"))[: 1 if loss == "squared" else 2]:
-        if rows.sum() >= 3 and np.linalg.matrix_rank(data.x[rows] - data.x[rows].mean(axis=0), tol=1e-6) >= 2:
+        with suppress(ValueError):  # too few landmarks in both images, or on a line
             starts.append(register(points.x_mm[rows], data.x[rows], loss=kind).transform)
     return _fit(rig, data, starts, loss, 6)
 
 
 def _register_one(rig: StereoRig, data: _Observed, side: int, loss: Loss) -> Registration:
-    camera, here = (rig.left, rig.right)[side], data.seen[:, side]
-    check_spread(data.x[here], f"x_mm (rows seen by the {('left', 'right')[side]} camera)")
-    # A motion from free least-squares camera rows: the nearest rotation, then the shift in the image plane.
-    x, y, back = data.x[here], data.y[here, 2 * side : 2 * side + 2], np.linalg.pinv(camera.linear)
-    centre_x, centre_y = x.mean(axis=0), y.mean(axis=0)
-    free = np.linalg.lstsq(x - centre_x, y - centre_y, rcond=1e-3)[0].T
-    normal = np.cross(*free)
-    normal /= max(float(np.linalg.norm(normal)), 1e-12)
-    S = align_rotation(back @ free + np.outer(camera.viewing_direction, normal))
-    shift = back @ (centre_y - camera.offset_px - camera.linear @ S @ centre_x)
-    starts = [RigidTransform.identity(), RigidTransform(S, shift).inverse()]
-    return _fit(rig, replace(data, seen=data.seen & (np.arange(2) == side)), starts, loss, _parameters(camera))
+    check_spread(data.x[data.seen[:, side]], f"x_mm (rows seen by the {('left', 'right')[side]} camera)")
+    data, parameters = replace(data, seen=data.seen & (np.arange(2) == side)), _parameters((rig.left, rig.right)[side])
+    squared = _fit(rig, data, [RigidTransform.identity()], "squared", parameters)
+    return squared if loss == "squared" else _fit(rig, data, [squared.transform], loss, parameters)
 
 
 def _parameters(camera: AffineCamera | NearAffineCamera) -> int:
@@ -212,67 +212,72 @@ def _parameters(camera: AffineCamera | NearAffineCamera) -> int:
 
 
 def _evaluate(
-    rig: StereoRig, data: _Observed, stale: RigidTransform, loss: Loss, scale2: float = 1.0
-) -> tuple[float, tuple[np.ndarray, np.ndarray]]:
-    """Negative log likelihood but for a constant; residuals (n, 4) and chi-squares (n,) of the rows."""
+    rig: StereoRig, data: _Observed, loss: Loss, stale: RigidTransform
+) -> tuple[float, tuple[np.ndarray, ...]]:
+    """Negative log likelihood but for a constant; residuals (n, 4), chi-squares (n,) and weights (n,) of the rows."""
     try:
         residual = data.y - np.hstack(rig.project(stale.apply(data.x)))
     except ValueError:  # the landmarks would lie behind a near-affine camera
-        return np.inf, (np.empty(0), np.empty(0))
-    distance2 = np.einsum("ni,nij,nj->n", residual, data.information, residual) / scale2
-    cost = distance2 if loss == "squared" else (_FREEDOM + data.dimension) * np.log1p(distance2 / _FREEDOM)
-    return 0.5 * float(cost.sum()), (residual, distance2)
+        return np.inf, ()
+    distance2 = np.einsum("ni,nij,nj->n", residual, data.information, residual)
+    if loss == "squared":
+        return 0.5 * float(distance2.sum()), (residual, distance2, np.ones(len(distance2)))
+    heavy = _FREEDOM + data.dimension
+    cost = 0.5 * float((heavy * np.log1p(distance2 / _FREEDOM)).sum())
+    return cost, (residual, distance2, heavy / (_FREEDOM + distance2))
 
 
 def _fit(rig: StereoRig, data: _Observed, starts: list[RigidTransform], loss: Loss, parameters: int) -> Registration:
     """The minimum near the best start; an unknown noise level is estimated in turn with the motion."""
     if loss not in ("squared", "robust"):
         raise ValueError(f"loss: 'squared' or 'robust', got {loss!r}.")
-    stale = min((start.inverse() for start in starts), key=lambda stale: _evaluate(rig, data, stale, loss)[0])
-    # Rotations are about the centre of the data in the stale frame, where they do not mix with translations.
-    centre, dimension = stale.apply(data.x[data.dimension > 0]).mean(axis=0), data.dimension
+    stale = min((start.inverse() for start in starts), key=lambda stale: _evaluate(rig, data, loss, stale)[0])
+    found = _minimum(rig, data, stale, loss, parameters)
+    for _ in range(0 if data.scale_known else 1 if loss == "squared" else 10):
+        distance2, dimension = found.residuals[data.dimension > 0] ** 2, data.dimension[data.dimension > 0]
+        mean = distance2.sum() / max(dimension.sum() - parameters, 1)
+        # The median of chi^2 with 2 and 4 degrees of freedom is 1.386 and 3.357.
+        scale2 = mean if loss == "squared" else np.median(distance2 / np.where(dimension > 2, 3.357, 1.386))
+        data = replace(data, covariance=data.covariance * max(float(scale2), 1e-18))
+        found = _minimum(rig, data, found.transform.inverse(), loss, parameters)
+        if abs(scale2 - 1.0) < 1e-6:
+            break
+    return found
 
-    def gradients(stale: RigidTransform, work: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, ...]:
-        """Information (6, 6); of each row gradient (n, 6) and weight (n,)."""
-        residual, distance2 = work
-        weights = np.ones(len(data.x)) if loss == "squared" else (_FREEDOM + dimension) / (_FREEDOM + distance2)
+
+def _minimum(rig: StereoRig, data: _Observed, stale: RigidTransform, loss: Loss, parameters: int) -> Registration:
+    # Rotations are about the centre of the data in the stale frame, where they do not mix with translations.
+    used, centre = data.dimension > 0, stale.apply(data.x[data.dimension > 0]).mean(axis=0)
+
+    def gradients(stale: RigidTransform, work: tuple[np.ndarray, ...]) -> tuple[np.ndarray, np.ndarray]:
+        """Information (6, 6), and the gradient (n, 6) of each row."""
+        residual, _, weights = work
         x = stale.apply(data.x)
         J = rig.jacobian(x) @ motion_jacobian(x - centre)
-        JtW = np.swapaxes(J, 1, 2) @ (data.information * (weights / scale2)[:, None, None])
-        return (JtW @ J).sum(axis=0), np.einsum("nij,nj->ni", JtW, residual), weights
+        JtW = np.swapaxes(J, 1, 2) @ (data.information * weights[:, None, None])
+        return (JtW @ J).sum(axis=0), np.einsum("nij,nj->ni", JtW, residual)
 
-    def normal_equations(stale: RigidTransform, work: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        information, gradient, _ = gradients(stale, work)
+    def normal_equations(stale: RigidTransform, work: tuple[np.ndarray, ...]) -> tuple[np.ndarray, np.ndarray]:
+        information, gradient = gradients(stale, work)
         return information, gradient.sum(axis=0)
 
     def move(stale: RigidTransform, step: np.ndarray) -> RigidTransform:
         turn = Rotation.from_rotvec(step[:3]).as_matrix()
         return RigidTransform(turn @ stale.R, turn @ (stale.t - centre) + centre + step[3:])
 
-    scale2 = 1.0
-    for _ in range(1 if data.scale_known else 20):
-        if not data.scale_known:
-            _, (_, distance2) = _evaluate(rig, data, stale, loss)
-            # The median of chi^2 with 2 and 4 degrees of freedom is 1.386 and 3.357.
-            median = np.median((distance2 / np.where(dimension > 2, 3.357, 1.386))[dimension > 0])
-            mean = distance2.sum() / max(dimension.sum() - parameters, 1)
-            before, scale2 = scale2, max(float(mean if loss == "squared" else median), 1e-18)
-            if abs(scale2 - before) <= 1e-6 * before:
-                break
-        evaluate = partial(_evaluate, rig, data, loss=loss, scale2=scale2)
-        stale = minimise(stale, evaluate, normal_equations, move, rank=parameters).state
-    energy, work = _evaluate(rig, data, stale, loss, scale2)
-    information, gradient, weights = gradients(stale, work)
+    found = minimise(stale, partial(_evaluate, rig, data, loss), normal_equations, move, rank=parameters)
+    _, distance2, weights = found.work
+    information, gradient = gradients(found.state, found.work)
     if np.linalg.matrix_rank(information, tol=_OPEN * np.trace(information), hermitian=True) < parameters:
         raise ValueError("x_mm, u_left, u_right: these landmarks leave the motion open. Add frames in other positions.")
     covariance = np.linalg.pinv(information, rcond=_OPEN, hermitian=True)
     if loss == "robust":
         # The weights fall with the residual, which bends the loss less than the weights alone say.  Where nothing fits,
         # the sum may curve the wrong way: then the weights alone.
-        flatter = information - gradient.T @ (gradient * (2.0 / (_FREEDOM + dimension))[:, None])
+        flatter = information - gradient.T @ (gradient * (2.0 / (_FREEDOM + data.dimension))[:, None])
         bent = np.linalg.eigvalsh(flatter)[-parameters] <= _OPEN * np.trace(information)
-        covariance = sandwich(information if bent else flatter, gradient[dimension > 0], parameters)
-    motion = stale.inverse()
+        covariance = sandwich(information if bent else flatter, gradient[used], parameters)
+    motion = found.state.inverse()
     turn = np.kron(np.eye(2), motion.R)
-    distance, weights = np.where(dimension > 0, (np.sqrt(work[1] * scale2), weights), [[np.nan], [0.0]])
-    return Registration(motion, turn @ covariance @ turn.T, motion.apply(centre), distance, weights, 2 * energy)
+    distance, weights = np.where(used, (np.sqrt(distance2), weights), [[np.nan], [0.0]])
+    return Registration(motion, turn @ covariance @ turn.T, motion.apply(centre), distance, weights, 2 * found.energy)

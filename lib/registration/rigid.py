@@ -30,8 +30,7 @@ class Registration:
     centre_mm:
         (3,) centre of the data in the target frame.  About it rotation and translation are nearly independent.
     residuals:
-        (n,) one a row: the norm in mm (`register`), or the Mahalanobis distance (`register_images`; px where the noise
-        is unknown).  NaN for a row that was not used.
+        (n,) one a row: the norm in mm (`register`) or the Mahalanobis distance (`register_images`); NaN = not used.
     weights:
         (n,) what each row counted in the last step, 1 = fully.
     cost:
@@ -105,11 +104,11 @@ def register(
 
     Examples
     --------
-    >>> x = np.array([[0.0, 0, 0], [4, 0, 0], [0, 3, 0], [0, 0, 2]])
-    >>> y = x + [0.5, 0, -1]
-    >>> y[3] += 10.0  # one gross error of four points
+    >>> x = np.array([[0.0, 0, 0], [4, 0, 0], [0, 3, 0], [0, 0, 2], [3, 3, 0], [2, 0, 1]])
+    >>> y = x + [0.5, 0.25, -1]
+    >>> y[3] += 10.0  # a gross error
     >>> register(x, y).transform.t.round(6).tolist()
-    [0.5, 0.0, -1.0]
+    [0.5, 0.25, -1.0]
     """
     x, y = finite_points(x_source, 3, "x_source"), finite_points(x_target, 3, "x_target")
     if len(x) != len(y):
