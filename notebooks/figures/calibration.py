@@ -105,7 +105,7 @@ def when_affine_wins(table: Table) -> Figure:
     page, axes = figure(1, 4, width_in=14, height_in=3.6, sharey=True)
     depths = sorted(set(table.columns["half_depth_mm"]), reverse=True)
     for ax, (key, title) in zip(axes, measures.items(), strict=True):
-        for depth, colour in zip(depths, ("ours", "warning", "paper"), strict=False):
+        for depth, colour in zip(depths, ("ours", "paper", "warning"), strict=False):
             c = table.where(half_depth_mm=depth).columns
             ax.plot(c["n_rows"], c[f"ratio_{key}"], "o-", color=COLOURS[colour], label=f"sweep of +-{depth:g} mm")
         ax.axhline(1, color="black", linewidth=0.8)

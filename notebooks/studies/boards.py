@@ -46,22 +46,22 @@ class BoardError:
     robot_um: float
 
 
-def render_boards(count: int = 4, *, inverse_distance_per_mm: float = 0.0, seed: int = 0) -> list[SeenBoard]:
-    """Render boards of 0.5 mm squares under the reference microscope and find their corners to sub-pixel.
+def render_boards(count: int = 4, microscope: Microscope | None = None, *, seed: int = 0) -> list[SeenBoard]:
+    """Render boards of 0.5 mm squares under a microscope and find their corners to sub-pixel.
 
     Parameters
     ----------
     count:
         Poses, drawn within the field and depth of field; boards that OpenCV does not find are left out.
-    inverse_distance_per_mm:
-        One over the working distance of the microscope; 0 is affine.
+    microscope:
+        None is the reference microscope.
 
     Raises
     ------
     ValueError
         If no board is found at all.
     """
-    rng, microscope = np.random.default_rng(seed), Microscope(inverse_distance_per_mm=inverse_distance_per_mm)
+    rng, microscope = np.random.default_rng(seed), microscope or Microscope()
     boards = []
     for pose in checkerboard_poses(count, rng):
         board = Checkerboard(pose)

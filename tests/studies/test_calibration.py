@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import cv2
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
@@ -13,15 +14,17 @@ from lib.calibration import calibrate
 from lib.correspondences import of_recording
 from lib.geometry import RigidTransform
 from lib.recordings import Recording
+from lib.simulator import Microscope
 from lib.simulator.rig import reference_rig, simulate_correspondences
 from lib.workbench import results
+from notebooks.figures import calibration as figures
 from notebooks.studies import boards, dvrk, sweeps
 from notebooks.studies.cameras import perspective_dlt, triangulate_perspective
 
 
 def test_repeated_calibrations_scatter_as_reported(run_study):
-    found, _ = run_study("bound_and_coverage", n_rows=60, runs=40)
-    assert found["variance_over_bound"] == pytest.approx(1, abs=0.25)
+    found, _ = run_study("bound_and_coverage", n_rows=60, runs=25)
+    assert found["variance_over_bound"] == pytest.approx(1, abs=0.3)
     assert 12 < found["mahalanobis"] < 20 and found["coverage_95_percent"] > 80
     assert max(found[f"{model}_rejected_percent"] for model in ("zero_skew", "square", "common_zoom")) < 15
 
@@ -188,10 +191,11 @@ def board(rig):
 
 
 def test_true_cameras_find_the_checkerboard_flat_square_and_in_place():
-    (seen,) = boards.render_boards(1)
-    found = boards.measure(reference_rig(), [seen])
+    microscope = Microscope(pixels_per_mm=(50.0, 49.0), image_size_px=(960, 540))
+    (seen,) = boards.render_boards(1, microscope)
+    found = boards.measure(microscope.rig(boards.ROBOT_FROM_MICROSCOPE), [seen])
     assert len(seen.corners_mm) == 13 * 9
-    assert found.aligned_um < 3 and found.robot_um < 3
+    assert found.aligned_um < 6 and found.robot_um < 6
 
 
 def test_recorded_checkerboards_stay_within_their_limits():
@@ -201,6 +205,28 @@ def test_recorded_checkerboards_stay_within_their_limits():
     for estimator in ("plain", "covariances", "recommended"):
         for key, limit in (("aligned_um", 6), ("robot_um", 12)):
             assert np.sqrt(np.mean(near.columns[f"zero_skew_{estimator}_{key}"] ** 2)) <= limit
+
+
+def test_figures_draw_the_recorded_tables():
+    table = {name: results.read(name) for name in (
+        "affine_or_perspective", "shallow_sweep", "working_distance", "bound_and_coverage", "advice", "calibration_resolution",
+        "checkerboard",
+    )}  # fmt: skip
+    detector = results.read("detected_calibration")
+    drawn = [
+        figures.noise_errors(table["affine_or_perspective"].where(n_rows=75, half_depth_mm=1.5)),
+        figures.when_affine_wins(table["affine_or_perspective"].where(sigma_u_px=1.5)),
+        figures.shallow_bias(table["shallow_sweep"]),
+        figures.working_distance(table["working_distance"]),
+        figures.coverage(table["bound_and_coverage"]),
+        figures.advice_curves(table["advice"], 12),
+        figures.resolutions(table["calibration_resolution"]),
+        figures.checkerboards(table["checkerboard"]),
+        figures.estimators(detector, detector),
+    ]
+    for page in drawn:
+        assert all(ax.has_data() for ax in page.axes)
+    plt.close("all")
 
 
 def spheres_image():
