@@ -208,10 +208,7 @@ def test_recorded_checkerboards_stay_within_their_limits():
 
 
 def test_figures_draw_the_recorded_tables():
-    table = {name: results.read(name) for name in (
-        "affine_or_perspective", "shallow_sweep", "working_distance", "bound_and_coverage", "advice", "calibration_resolution",
-        "checkerboard",
-    )}  # fmt: skip
+    table = {path.stem: results.read(path.stem) for path in paths.RESULTS.glob("*.csv")}
     detector = results.read("detected_calibration")
     drawn = [
         figures.noise_errors(table["affine_or_perspective"].where(n_rows=75, half_depth_mm=1.5)),
