@@ -9,18 +9,15 @@ from lib.simulator.microscope import Microscope
 from lib.simulator.motion import Motion
 from lib.simulator.recording import Design, Reports, simulate
 from lib.simulator.render import View, render_pair, render_view
-from lib.simulator.scenes import Checkerboard, Relief
 from lib.simulator.window import Window
 
 __all__ = [
-    "Checkerboard",
     "Design",
     "Eye",
     "Forceps",
     "Microscope",
     "Motion",
     "Pose",
-    "Relief",
     "Reports",
     "View",
     "Window",

@@ -1,8 +1,8 @@
-"""Training images: everything varies per image - eye, tool, pose, light, optics, glints, noise.
+"""Training images: eye, tool, pose, light, optics, glints and noise are drawn anew for every image.
 
-One view, not a pair, and only what the network sees: a window of the full-HD image round the tool (`crop_px`), or
-the whole field at a reduced size (`size_px`).  Eyes of `RESERVED_SEEDS` and tools with jaws of `RESERVED_JAW_MM` are
-never drawn: recordings made for tests use them, so no test frame shows an eye or a tool trained on.
+An image is one view, not a pair, and shows only what the network sees: a window of the full-HD image around the tool
+(`crop_px`), or the whole field at a reduced size (`size_px`).  Eyes of `RESERVED_SEEDS` and tools with jaws of
+`RESERVED_JAW_MM` are never drawn.  Test recordings use them, so no test frame shows an eye or a tool of the training.
 """
 
 from __future__ import annotations
@@ -49,16 +49,11 @@ _TEXTURE_PX = 1536
 def random_eye(rng: np.random.Generator, textures: Sequence[int] = TEXTURE_SEEDS) -> Eye:
     """An eye of the training population: shape, folds, gloss, and one of `textures`."""
     return Eye(
-        seed=int(textures[rng.integers(len(textures))]),
-        radius_mm=9.3,
-        depth_mm=rng.uniform(1.2, 3.2),
-        fold_mm=rng.uniform(0.02, 0.18),
-        tilt_rad=rng.uniform(0.0, 0.08),
-        centre_z_mm=rng.uniform(0.4, 1.8),
-        texture_px=_TEXTURE_PX,
-        gloss=float(rng.choice([0.0, 1.0], p=[0.08, 0.92]) * rng.uniform(0.3, 2.2)),
+        seed=int(textures[rng.integers(len(textures))]), radius_mm=9.3, texture_px=_TEXTURE_PX,
+        depth_mm=rng.uniform(1.2, 3.2), fold_mm=rng.uniform(0.02, 0.18), tilt_rad=rng.uniform(0.0, 0.08),
+        centre_z_mm=rng.uniform(0.4, 1.8), gloss=float(rng.choice([0.0, 1.0], p=[0.08, 0.92]) * rng.uniform(0.3, 2.2)),
         turn_rad=float(rng.uniform(-np.pi, np.pi)),
-    )
+    )  # fmt: skip
 
 
 def random_forceps(rng: np.random.Generator, seed: int | None = None) -> Forceps:
@@ -66,18 +61,13 @@ def random_forceps(rng: np.random.Generator, seed: int | None = None) -> Forceps
     low, high = RESERVED_JAW_MM
     length = rng.uniform(2.0, 4.0 - (high - low))
     return Forceps(
-        shaft_radius_mm=rng.uniform(0.22, 0.38),
-        jaw_length_mm=float(length + (high - low) * (length >= low)),
-        jaw_radius_mm=rng.uniform(0.07, 0.19),
-        tip_radius_mm=rng.uniform(0.003, 0.006),
-        taper=rng.uniform(0.5, 0.95),
-        bow_mm=rng.uniform(0.02, 0.38),
-        bend_mm=rng.uniform(-0.1, 0.35),
+        shaft_radius_mm=rng.uniform(0.22, 0.38), jaw_length_mm=float(length + (high - low) * (length >= low)),
+        jaw_radius_mm=rng.uniform(0.07, 0.19), tip_radius_mm=rng.uniform(0.003, 0.006), taper=rng.uniform(0.5, 0.95),
+        bow_mm=rng.uniform(0.02, 0.38), bend_mm=rng.uniform(-0.1, 0.35),
         hook_mm=rng.choice([0.0, 1.0]) * rng.uniform(0.02, 0.12),
-        brightness=rng.uniform(0.18, 0.85),
-        brushed=rng.uniform(0.0, 0.45),
+        brightness=rng.uniform(0.18, 0.85), brushed=rng.uniform(0.0, 0.45),
         seed=int(rng.integers(RESERVED_SEEDS.stop, 2**31)) if seed is None else seed,
-    )
+    )  # fmt: skip
 
 
 def reserved_forceps(rng: np.random.Generator, seed: int) -> Forceps:
@@ -113,21 +103,14 @@ def random_microscope(rng: np.random.Generator) -> Microscope:
     tint = np.exp(rng.normal(0, [0.16, 0.10, 0.20]))
     gain = tuple(float(v) for v in tint / tint.mean())
     return Microscope(
-        depth_of_field_mm=float(np.exp(rng.uniform(np.log(1.8), np.log(6.0)))),
-        focus_z_mm=rng.normal(0, 0.6),
-        psf_px=rng.uniform(0.5, 1.5),
-        exposure_s=rng.uniform(0.002, 0.02),
-        readout_s=0.0,
+        depth_of_field_mm=float(np.exp(rng.uniform(np.log(1.8), np.log(6.0)))), focus_z_mm=rng.normal(0, 0.6),
+        psf_px=rng.uniform(0.5, 1.5), exposure_s=rng.uniform(0.002, 0.02), readout_s=0.0,
         light_slope=tuple(float(v) for v in rng.uniform(-0.9, 0.9, 2)),
-        spot_mm=tuple(float(v) for v in rng.normal(0, 2.5, 2)),
-        spot_radius_mm=rng.uniform(4.5, 14.0),
-        brightness=float(np.exp(rng.normal(-0.1, 0.38))),
-        vignetting=rng.uniform(0.0, 0.7),
-        gain=(gain, gain),
-        full_well=float(np.exp(rng.uniform(np.log(1500), np.log(20000)))),
-        read_noise=rng.uniform(2, 20),
+        spot_mm=tuple(float(v) for v in rng.normal(0, 2.5, 2)), spot_radius_mm=rng.uniform(4.5, 14.0),
+        brightness=float(np.exp(rng.normal(-0.1, 0.38))), vignetting=rng.uniform(0.0, 0.7), gain=(gain, gain),
+        full_well=float(np.exp(rng.uniform(np.log(1500), np.log(20000)))), read_noise=rng.uniform(2, 20),
         jpeg_quality=int(rng.integers(60, 98)),
-    )
+    )  # fmt: skip
 
 
 def sample(
@@ -140,20 +123,18 @@ def sample(
     zoom: tuple[float, float] = (0.85, 1.18),
     textures: Sequence[int] = TEXTURE_SEEDS,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """One training image with its landmarks.
+    """One training image with its landmarks; `rng` decides everything.
 
     Parameters
     ----------
-    rng:
-        Decides everything.
     crop_px:
         Side of a square window of the full-resolution image that holds the jaws somewhere.
     size_px:
-        (w, h) of the whole field shrunk to this size.  Without either the frame is full HD.
+        (w, h) of the whole field shrunk to this size.  Without either size the image is the full-HD field.
     around:
         The landmark that a window holds, 0 base, 1 or 2 a tip; None = the jaws' centre.
     jitter:
-        How far that may lie from the window's centre, as a share of its side.
+        How far it may lie from the window's centre, as a share of the window's side.
     zoom:
         Range of the magnification, relative to 100 px per mm.
     textures:
@@ -161,8 +142,8 @@ def sample(
 
     Returns
     -------
-    image (h, w, 3) uint8 RGB; u (3, 2) px of base, tip_1, tip_2, also where outside; visibility (3,): 0 outside,
-    1 hidden, 2 visible.
+    image (h, w, 3) uint8 RGB; u (3, 2) px of base, tip_1, tip_2, also if outside; visibility (3,): 0 outside, 1 hidden,
+    2 visible.
 
     Raises
     ------

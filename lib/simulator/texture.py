@@ -12,6 +12,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from lib.recordings import read_image
+
 __all__ = ["EXTENT_MM", "GAMMA", "fundus_texture", "photograph_texture", "smooth_noise"]
 
 #: Side of the square of the eye that a texture covers.
@@ -90,7 +92,7 @@ def fundus_texture(seed: int, size_px: int = 2048, rim_mm: float = 9.3) -> np.nd
     Parameters
     ----------
     rim_mm:
-        Where the retina ends and sclera begins, on average.
+        Mean radius at which the retina ends and the sclera begins.
     """
     rng = np.random.default_rng([seed, 7])
     axis = (np.arange(size_px, dtype=np.float32) + 0.5) * (EXTENT_MM / size_px) - EXTENT_MM / 2
@@ -149,14 +151,12 @@ def photograph_texture(path: str | Path, size_px: int = 2048) -> np.ndarray:
     Raises
     ------
     FileNotFoundError, ValueError
-        If there is no such file, or OpenCV cannot read it.
+        If there is no such file, or it is no image.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"texture: {path}: no such file; give the path of a photograph.")
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR_RGB)
-    if image is None:
-        raise ValueError(f"texture: {path}: not a picture that OpenCV reads; give a PNG or JPEG.")
+    try:
+        image = read_image(Path(path))
+    except (OSError, ValueError) as error:
+        raise type(error)(f"texture: {error} Give the path of a PNG or JPEG.") from None
     side = min(image.shape[:2])
     top, left = (image.shape[0] - side) // 2, (image.shape[1] - side) // 2
     texture = cv2.resize(image[top : top + side, left : left + side], (size_px, size_px), interpolation=cv2.INTER_AREA)

@@ -9,10 +9,10 @@ import numpy as np
 
 from lib.cameras import StereoRig
 from lib.geometry import align_rotation
-from lib.simulator import Checkerboard, Microscope, render_pair
+from lib.simulator import Microscope, render_pair
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE
-from lib.simulator.scenes import checkerboard_poses
 from notebooks.studies.cameras import rms
+from notebooks.studies.scenes import Checkerboard, checkerboard_poses
 
 __all__ = ["BoardError", "SeenBoard", "measure", "render_boards"]
 

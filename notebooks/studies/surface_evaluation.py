@@ -19,7 +19,6 @@ from lib.simulator.eye import Scene
 from lib.simulator.microscope import Microscope
 from lib.simulator.render import render_pair
 from lib.simulator.rig import IMAGE_SIZE_PX, ROBOT_FROM_MICROSCOPE
-from lib.simulator.scenes import OBJECTS, Relief
 from lib.simulator.window import surface_grid
 from lib.surface.bspline import BSplineSurface
 from lib.surface.reconstruct import Reconstruction, reconstruct
@@ -30,6 +29,7 @@ from notebooks.studies.matching_evaluation import (
     score_against_disparity,
     sparsification,
 )
+from notebooks.studies.scenes import OBJECTS, Relief
 from notebooks.studies.sphere import Sphere, fit_sphere
 
 __all__ = [

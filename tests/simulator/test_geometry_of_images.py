@@ -14,11 +14,11 @@ from lib.simulator.forceps import MAX_PITCH_RAD, MAX_ROLL_RAD
 from lib.simulator.population import random_forceps, random_pose
 from lib.simulator.raster import rasterise
 from lib.simulator.render import render_view
-from lib.simulator.scenes import Checkerboard, Relief, checkerboard_poses
 from lib.simulator.texture import smooth_noise
 from lib.simulator.window import Window, surface_grid
 from notebooks.figures.data import ray_cast_depth
 from notebooks.figures.effects import PLAIN
+from notebooks.studies.scenes import Checkerboard, Relief, checkerboard_poses
 
 IDENTITY = RigidTransform.identity()
 RIG = PLAIN.rig(IDENTITY)

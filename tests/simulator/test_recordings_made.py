@@ -11,20 +11,19 @@ from lib.cameras import StereoRig
 from lib.geometry import RigidTransform
 from lib.recordings import Recording
 from lib.simulator import (
-    Checkerboard,
     Design,
     Eye,
     Forceps,
     Microscope,
     Motion,
     Pose,
-    Relief,
     Reports,
     render_pair,
     simulate,
 )
 from lib.simulator.population import RESERVED_JAW_MM, RESERVED_SEEDS, TEXTURE_SEEDS, random_forceps, sample
 from notebooks.studies.realism import STATISTICS, image_statistics, landmark_window
+from notebooks.studies.scenes import Checkerboard, Relief
 
 SMALL = Microscope(pixels_per_mm=(17.0, 16.5), image_size_px=(320, 180), readout_s=0.0)
 EYE = Eye(seed=5, texture_px=256)

@@ -1,4 +1,4 @@
-"""Scenes besides the eye: a checkerboard in any pose, and everyday objects of about 1 cm."""
+"""Scenes for studies: a checkerboard in any pose, and everyday objects of about 1 cm."""
 
 from __future__ import annotations
 
