@@ -6,7 +6,7 @@ from lib.calibration.calibration import Calibration, LandmarkOffsets
 from lib.calibration.estimate import calibrate
 from lib.calibration.export import write_opencv, write_ros
 from lib.calibration.ladder import LADDER, Comparison, Rung, compare_models
-from lib.calibration.offsets import tool_axes, with_offsets
+from lib.calibration.offsets import with_offsets
 from lib.calibration.online import OnlineCalibration
 from lib.calibration.optics import Optics, optics
 from lib.calibration.pivot import Pivot, ToolOffsets, pivot_calibration, tool_offsets
@@ -17,5 +17,5 @@ __all__ = [
     "LADDER", "Advice", "Calibration", "Comparison", "LandmarkOffsets", "Moments", "OnlineCalibration", "Optics", "Pivot",
     "Rung", "TimeOffset", "ToolOffsets", "advise", "affine_minimum", "box_grid", "calibrate", "compare_models", "dlt",
     "estimate_time_offset", "next_positions", "optics", "paper_variances",
-    "pivot_calibration", "report", "tool_axes", "tool_offsets", "with_offsets", "write_opencv", "write_ros",
+    "pivot_calibration", "report", "tool_offsets", "with_offsets", "write_opencv", "write_ros",
 ]  # fmt: skip

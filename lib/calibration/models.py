@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 from lib.cameras import AffineCamera, NearAffineCamera, radial_derivative
 from lib.least_squares import minimise
 
-__all__ = ["Fit", "Model", "State", "fit", "settle"]
+__all__ = ["Fit", "Model", "State", "fit"]
 
 BASES = ("affine", "zero_skew", "square", "common_zoom")
 OPTIONS = ("distance", "distances", "radial")

@@ -22,8 +22,8 @@ class Optics:
     mirrored:
         "no", "left or right" (one channel has an odd number of reflections), "both", or "unknown": two affine cameras
         mirrored alike look like unmirrored ones on the other side of the scene, only perspective can tell.
-    convergence_rad, zoom_px_per_mm:
-        Angle between the viewing directions (of the unmirrored pair), and the geometric mean zoom of each camera.
+    convergence_rad:
+        Angle between the viewing directions (of the unmirrored pair).
     roll_rad:
         Rotation of the right image's content relative to the left's, x towards y.
     robot_from_microscope:
@@ -33,7 +33,6 @@ class Optics:
 
     mirrored: str
     convergence_rad: float
-    zoom_px_per_mm: np.ndarray
     roll_rad: float
     robot_from_microscope: RigidTransform
 
@@ -68,7 +67,6 @@ def optics(calibration: Calibration) -> Optics:
     x = x - (x @ z) * z
     x /= np.linalg.norm(x)
     y = np.cross(z, x)
-    zoom = np.array([np.abs(np.linalg.det(c.linear @ c.linear.T)) ** 0.25 for c in (rig.left, rig.right)])
     roll = float(np.arctan2(-rows[1][0] @ rows[0][1], rows[1][0] @ rows[0][0]))
     if calibration.image_size_px is not None:
         centre = (np.asarray(calibration.image_size_px, dtype=float) - 1) / 2
@@ -77,7 +75,7 @@ def optics(calibration: Calibration) -> Optics:
     origin = rig.triangulate(centre[None], centre[None]).x_mm[0]
     pose = RigidTransform(np.column_stack([x, y, z]), origin)
     angle = float(np.arccos(np.clip(abs(cosine), -1, 1)))
-    return Optics(mirrored, angle, zoom, roll, pose)
+    return Optics(mirrored, angle, roll, pose)
 
 
 def _depth_sign(camera: object, calibration: Calibration) -> float:

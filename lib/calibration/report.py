@@ -44,7 +44,11 @@ def report(calibration: Calibration, *, robot_accuracy_mm: float | None = None, 
         o = optics(c)
         x = c.x_mm[c.inliers]
         alone, both = 1e3 * np.median(c.depth_sd_mm(x)), 1e3 * np.median(c.depth_sd_mm(x, detection=True))
-        lines.append(f"  head          convergence {np.rad2deg(o.convergence_rad):.2f} deg, mirrored: {o.mirrored}")
+        at = ", ".join(f"{value:.1f}" for value in o.robot_from_microscope.t)
+        lines.append(
+            f"  head          convergence {np.rad2deg(o.convergence_rad):.2f} deg, right image rolled by "
+            f"{np.rad2deg(o.roll_rad):.2f} deg, mirrored: {o.mirrored}; the images' centre is ({at}) mm"
+        )
         lines.append(f"  depth         {both:.0f} um sd of one detected point, of which the calibration {alone:.1f} um")
     if c.offsets is not None:
         scale, unit = (1e3, "um along, across, normal") if c.offsets.offset.shape[1] == 3 else (1.0, "px, left and right")

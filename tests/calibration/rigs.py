@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lib.calibration import tool_axes
+from lib.calibration.offsets import tool_axes
 from lib.cameras import NearAffineCamera, StereoRig
 from lib.correspondences import Correspondences
 from lib.geometry import RigidTransform

@@ -14,6 +14,7 @@ from lib.calibration import (
     paper_variances,
 )
 from lib.calibration.affine import estimate_noise
+from lib.correspondences import Correspondences
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
 from tests.calibration.rigs import data, near_rig
 
@@ -245,6 +246,29 @@ def test_detector_covariances_weigh_their_points():
             if given is not None:
                 assert found.sigma_x_mm == pytest.approx(0.01, rel=0.35)
     assert np.std(errors["with"]) < 0.75 * np.std(errors["without"])
+
+
+def test_correspondences_bring_their_covariances_and_gaps():
+    c, rng = data(80, 2), np.random.default_rng(2)
+    covariance = rng.uniform(0.5, 3, (80, 2, 1, 1)) * np.eye(2)
+    u = [c.u_left, c.u_right]
+    rows = Correspondences.of_points(c.x_mm, *u, covariance_px2=covariance)
+    each = calibrate(c.x_mm, u, covariance_px2=[covariance[:, 0], covariance[:, 1]])
+    for name in ("cost", "sigma_x_mm", "covariance", "inliers", "residuals_px"):
+        np.testing.assert_array_equal(getattr(calibrate(rows), name), getattr(each, name))
+    plain = calibrate(c.x_mm, u, sigma_u_px=1.5)
+    assert calibrate(rows, sigma_u_px=1.5).cost == plain.cost
+    unknown = covariance.copy()
+    unknown[3] = np.nan
+    assert calibrate(Correspondences.of_points(c.x_mm, *u, covariance_px2=unknown)).covariance_px2 is None
+    missing = u[0].copy()
+    missing[[3, 50]] = np.nan
+    found = calibrate(Correspondences.of_points(c.x_mm, missing, u[1], covariance_px2=unknown))
+    assert found.covariance_px2.shape == (80, 4, 4) and found.inliers.sum() == 78
+    assert found.chi_square[1] == 4 * 78 - 14 and np.isfinite(found.press_rms_px)
+    keep = np.isfinite(missing).all(axis=1)
+    own = [covariance[keep, 0], covariance[keep, 1]]
+    assert found.cost == calibrate(c.x_mm[keep], [u[0][keep], u[1][keep]], covariance_px2=own).cost
 
 
 def test_covariance_covers_the_truth():

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lib.calibration import calibrate, tool_axes
-from lib.calibration.offsets import estimate_offsets
+from lib.calibration import calibrate
+from lib.calibration.offsets import estimate_offsets, tool_axes
 from lib.geometry import RigidTransform
 from lib.simulator.rig import IMAGE_SIZE_PX
 from tests.calibration.rigs import LANDMARKS_MM, OFFSETS_MM, tool_sweep

@@ -7,7 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from lib.calibration import calibrate, tool_axes
+from lib.calibration import calibrate
+from lib.calibration.offsets import tool_axes
 from lib.cameras import AffineCamera, StereoRig
 from lib.correspondences import pair_with_robot
 from lib.geometry import RigidTransform
