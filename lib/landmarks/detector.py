@@ -7,7 +7,7 @@ last measures it in a closeup.  The first stage alone, at full resolution, is th
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -38,14 +38,11 @@ from lib.landmarks.windows import (
 )
 from lib.parallel import single_threaded_torch
 
-__all__ = ["CLOSE", "CODE_VERSION", "MISSING_BELOW", "TRACKED_FROM", "Detector", "Landmarks"]
+__all__ = ["CLOSE", "MISSING_BELOW", "TRACKED_FROM", "Detector", "Landmarks"]
 
 FORMAT = "microstereo.detector"
 #: The fields that a weights file keeps as plain values.
 _SETTINGS = ("reduction", "tool_reduction", "window_px", "mirror", "method")
-#: Version of the code between weights and landmarks (windows, decoding, what counts as missing).  Every change that moves
-#: landmarks raises it, so that stored detections are computed again.
-CODE_VERSION = 4
 #: A landmark with a lower confidence counts as missing: NaN, confidence 0.
 MISSING_BELOW = 0.05
 #: A landmark with a lower confidence gets no closeup and is not followed from frame to frame.
@@ -145,6 +142,7 @@ class Detector:
     closeup_network: OffsetNetwork | None = None
     mirror: bool = False
     engine: str = "torch"
+    _run: dict[str, Callable[[Tensor], list[Tensor]]] = field(init=False, repr=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.reduction < 1 or self.reduction != int(self.reduction):
@@ -153,9 +151,8 @@ class Detector:
             raise ValueError("closeup_network: looks at what a window_network has found; give one.")
         if self.mirror and self.window_network and self.window_px % self.window_network.stride:
             raise ValueError(f"mirror: needs window_px to be a multiple of the stride, got {self.window_px}.")
-        mirror = {"window": self.mirror}
-        run = {k: accelerated(network, self.engine, mirror=mirror.get(k, False)) for k, network in self.networks.items()}
-        object.__setattr__(self, "_run", run)
+        for name, network in self.networks.items():
+            self._run[name] = accelerated(network, self.engine, mirror=self.mirror and name == "window")
 
     @property
     def networks(self) -> dict[str, StackedHourglass | OffsetNetwork]:
@@ -189,11 +186,13 @@ class Detector:
         if not path.suffix and not path.is_file():
             path = paths.MODELS / f"{path.name}.safetensors"
         tensors, metadata = read_checkpoint(path, FORMAT)
+        lacking = {"networks", "calibration", "provenance", *_SETTINGS} - metadata.keys()
+        if lacking:
+            text = ", ".join(sorted(lacking))
+            raise ValueError(f"{path}: its metadata lack {text}; get the file again, or make it with Detector.save.")
+        configs = metadata["networks"].items()
+        networks = {f"{name}_network": load_network(path, config, tensors, f"{name}.") for name, config in configs}
         try:
-            networks = {
-                f"{stage}_network": load_network(path, config, tensors, f"{stage}.")
-                for stage, config in metadata["networks"].items()
-            }
             detector = cls(
                 **networks,
                 **{name: metadata[name] for name in _SETTINGS},
@@ -201,8 +200,8 @@ class Detector:
                 metadata=metadata["provenance"],
                 engine=engine or default_engine(),
             )
-        except (KeyError, TypeError) as error:
-            raise ValueError(f"{path}: incomplete ({error}); get the file again, or make it with Detector.save.") from error
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{path}: {error}") from error
         detector._check_complete(path)
         return detector
 

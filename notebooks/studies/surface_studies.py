@@ -19,8 +19,7 @@ import numpy as np
 
 from lib import paths
 from lib.calibration import calibrate
-from lib.landmarks import Detector
-from lib.landmarks.stereo import detect
+from lib.landmarks import Detector, detect
 from lib.matching import RECTIFIED, match
 from lib.provenance import Provenance, read_records, write_record
 from lib.recordings import Recording
@@ -82,10 +81,10 @@ def calibrated(options: argparse.Namespace) -> dict:
     for seed in range(FIRST_SEED, FIRST_SEED + options.recordings):
         recording = _recording(seed)
         found = detect(recording, detector)
-        seen, truth = found.correspondences(), recording.truth
+        seen, truth = found.complete, recording.truth
         pixels = [seen.u_left, seen.u_right]
         plain = calibrate(seen.x_mm, pixels)
-        own = calibrate(seen.x_mm, pixels, covariance_px2=seen.covariance_px2)
+        own = calibrate(seen.x_mm, pixels, covariance_px2=seen.pair_covariance_px2)
         rigs = {
             "true cameras": truth.rig,
             "calibrated": plain.rig,
@@ -94,7 +93,7 @@ def calibrated(options: argparse.Namespace) -> dict:
         }
         errors: dict[str, dict[str, list]] = {}
         for k in RECONSTRUCTED:
-            pair, u = recording.frames[k], (found.left.u[k], found.right.u[k])
+            pair, u = recording.frames[k], (found.grid("u_left")[k], found.grid("u_right")[k])
             lattice = tuple(np.arange(0, side, 12) for side in pair.left.shape[1::-1])
             x_true = truth.surface(np.stack(np.meshgrid(*lattice), axis=-1).reshape(-1, 2).astype(float))
             for name, rig in rigs.items():
@@ -105,7 +104,7 @@ def calibrated(options: argparse.Namespace) -> dict:
                     rms = evaluation.aligned_rms_um(error, x_true.reshape(error.shape), visible)
                     for alignment, value in rms.items():
                         errors.setdefault(f"{name}, {setting}", {}).setdefault(alignment, []).append(value)
-        offsets = [side.u - u for side, u in ((found.left, truth.u_left), (found.right, truth.u_right))]
+        offsets = [found.grid("u_left") - truth.u_left, found.grid("u_right") - truth.u_right]
         result[recording.folder.name] = {
             "correspondences": len(seen),
             "inliers": plain.inliers.mean(),

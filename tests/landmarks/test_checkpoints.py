@@ -1,0 +1,103 @@
+"""Weights files: damaged, incomplete and foreign ones are named with the cure."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from lib.landmarks import Detector
+from lib.landmarks.checkpoints import read_checkpoint, write_checkpoint
+from lib.landmarks.detector import FORMAT
+from lib.landmarks.error_model import ErrorModel
+from lib.landmarks.network import HourglassConfig, StackedHourglass
+
+
+def untrained(reduction=2):
+    networks = [StackedHourglass(HourglassConfig(4, 1, 1)) for _ in range(2)]
+    models = {name: ErrorModel(logit=(5.0, 0.0, 0.0, 0.0)) for name in ("frame", "window")}
+    return Detector(networks[0], reduction, networks[1], window_px=64, error_models=models)
+
+
+def test_missing_corrupt_and_foreign_files_are_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"nothing\.safetensors"):
+        Detector.load(tmp_path / "nothing.safetensors")
+    corrupt = tmp_path / "corrupt.safetensors"
+    untrained().save(corrupt)
+    corrupt.write_bytes(corrupt.read_bytes()[:-100])
+    with pytest.raises(ValueError, match=r"corrupt\.safetensors: corrupt"):
+        Detector.load(corrupt)
+    corrupt.write_bytes(b"PK\x03\x04 a pickle, perhaps")
+    with pytest.raises(ValueError, match=r"corrupt\.safetensors: corrupt"):
+        Detector.load(corrupt)
+    foreign = tmp_path / "foreign.safetensors"
+    save_file({"layer": torch.zeros(3)}, foreign)
+    with pytest.raises(ValueError, match=r"foreign\.safetensors: holds 'foreign weights'.*get the file again"):
+        Detector.load(foreign)
+
+
+@pytest.mark.parametrize("where", ["metadata", "tensors"])
+def test_a_flipped_bit_is_noticed_wherever_it_is(where, tmp_path):
+    path = tmp_path / "weights.safetensors"
+    untrained().save(path)
+    content = bytearray(path.read_bytes())
+    header = int.from_bytes(content[:8], "little")
+    # In the metadata: a digit of the error model, so that the header can still be read.
+    at = content.index(b"[5.0") + 1 if where == "metadata" else (8 + header + len(content)) // 2
+    content[at] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=r"weights\.safetensors: damaged.*get the file again"):
+        Detector.load(path)
+
+
+def test_missing_metadata_error_models_and_checksums_are_named(tmp_path):
+    whole, path = tmp_path / "whole.safetensors", tmp_path / "weights.safetensors"
+    detector = untrained()
+    detector.save(whole)
+    tensors, metadata = read_checkpoint(whole, FORMAT)
+    for lacking in ("networks", "reduction", "calibration", "provenance"):
+        write_checkpoint(path, tensors, {name: value for name, value in metadata.items() if name != lacking})
+        with pytest.raises(ValueError, match=rf"weights\.safetensors: its metadata lack {lacking}; get the file again"):
+            Detector.load(path)
+    write_checkpoint(path, tensors, metadata | {"calibration": {"frame": metadata["calibration"]["frame"]}})
+    with pytest.raises(ValueError, match=r"weights\.safetensors: no error model for window.*train assemble"):
+        Detector.load(path)
+    with pytest.raises(ValueError, match="no error model for frame, window"):
+        replace(detector, error_models={}).save(whole)
+    save_file(tensors, path, {name: json.dumps(value) for name, value in metadata.items()})
+    with pytest.raises(ValueError, match=r"weights\.safetensors: damaged, its SHA-256 checksum is missing"):
+        Detector.load(path)
+
+
+def test_a_full_disk_leaves_the_old_file(tmp_path, monkeypatch):
+    path = tmp_path / "weights.safetensors"
+    untrained().save(path)
+    before = path.read_bytes()
+    monkeypatch.setattr(Path, "write_bytes", lambda self, data: (_ for _ in ()).throw(OSError(28, "No space left")))
+    with pytest.raises(OSError, match=r"weights\.safetensors: not saved \(No space left"):
+        untrained(reduction=4).save(path)
+    assert [file.name for file in tmp_path.iterdir()] == ["weights.safetensors"] and path.read_bytes() == before
+
+
+def test_weights_of_another_network_are_named(tmp_path):
+    path = tmp_path / "weights.safetensors"
+    network = StackedHourglass(HourglassConfig(8, 1))
+    metadata = {
+        "format": "microstereo.detector", "networks": {"frame": {"features": 16}}, "reduction": 1, "window_px": 64,
+        "tool_reduction": 5, "mirror": False, "method": "paper", "calibration": {}, "provenance": {},
+    }  # fmt: skip
+    write_checkpoint(path, {f"frame.{k}": v for k, v in network.state_dict().items()}, metadata)
+    with pytest.raises(ValueError, match=r"weights\.safetensors: its weights do not fit"):
+        Detector.load(path)
+
+
+def test_an_error_model_of_another_version_is_named(tmp_path):
+    path = tmp_path / "weights.safetensors"
+    untrained().save(path)
+    tensors, metadata = read_checkpoint(path, FORMAT)
+    old = [[[0.0] * 4, [0.0] * 4], [1.0] * 4]
+    write_checkpoint(path, tensors, metadata | {"calibration": {"frame": old, "window": old}})
+    with pytest.raises(ValueError, match=r"weights\.safetensors: .*log_variance: expected \(2, 6\), got \(2, 4\); fit anew"):
+        Detector.load(path)

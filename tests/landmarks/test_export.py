@@ -1,0 +1,152 @@
+"""ONNX files hold network, decoding and error model; together they are the detector."""
+
+import importlib.util
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+
+from lib.landmarks import Detector, Landmarks
+from lib.landmarks import export as module
+from lib.landmarks.engines import openvino
+from lib.landmarks.error_model import ErrorModel
+from lib.landmarks.export import LARGEST, export
+from lib.landmarks.images import as_tensor
+from lib.landmarks.network import HourglassConfig, OffsetConfig, OffsetNetwork, StackedHourglass
+from lib.parallel import single_threaded_torch
+
+pytestmark = pytest.mark.skipif(
+    not (importlib.util.find_spec("onnx") and importlib.util.find_spec("openvino")), reason="onnx or OpenVINO is missing"
+)
+SURE = ErrorModel(((-0.1, 0.4, 0.5, 0.0, -0.2, 0.1), (0.3, 0.1, -0.2, 0.0, 0.1, 0.0)), (3.0, 0.0, 2.0, -0.3))
+
+
+@cache
+def compiled(content: bytes):
+    core = openvino().Core()
+    return core.compile_model(core.read_model(content), "CPU", {"INFERENCE_PRECISION_HINT": "f32"})
+
+
+def run_onnx(path, images: np.ndarray) -> tuple[np.ndarray, ...]:
+    """`lib.landmarks.export.run_onnx`, which compiles a file only once."""
+    found = compiled(path.read_bytes())(images)
+    return found["u"], found["covariance"], found["confidence"]
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    monkeypatch.setattr(module, "run_onnx", run_onnx)
+
+
+@pytest.fixture(scope="module")
+def small():
+    """A detector of every stage with small networks that are not trained, and two frames."""
+    torch.manual_seed(0)
+    networks = [StackedHourglass(HourglassConfig(8, 1, 2)).eval() for _ in range(3)]
+    closeup = OffsetNetwork(OffsetConfig(4, 32)).eval()
+    for head in [*(network.heads[0] for network in networks), closeup.head[-1]]:
+        torch.nn.init.normal_(head.weight, std=0.1)
+    models = dict.fromkeys(("frame", "tool", "window"), SURE)
+    models |= dict.fromkeys(("closeup", "tracking"), replace(SURE, gain=((0.5, 0.8),) * 3, bias=((0.2, -0.1),) * 3))
+    detector = Detector(
+        networks[0], 2, networks[1], networks[2], 2, 64, "paper", models, closeup_network=closeup, mirror=True
+    )
+    return detector, np.random.default_rng(0).integers(0, 256, (2, 120, 160, 3), dtype=np.uint8)
+
+
+def rgb(images: np.ndarray) -> np.ndarray:
+    """(n, 3, h, w) in [0, 1], the input of a stage."""
+    return as_tensor(images).contiguous().numpy()
+
+
+def check_every_stage(detector: Detector, images: np.ndarray, folder) -> None:
+    """The detector put together from its ONNX files, as the export's docstring says: the same landmarks."""
+    written = export(detector, folder, images)
+    stages = ("frame", "tool", "window", "closeup", "tracking")
+    assert {file.name for file in folder.iterdir()} == {f"{stage}.onnx" for stage in stages}
+    assert all(difference <= LARGEST["px"] for _, difference in written.values())
+    images = images[:2]  # another number of images than the export saw
+    found = Landmarks(*run_onnx(folder / "frame.onnx", rgb(detector.reduced(images))))
+    finder = replace(detector, window_network=None, closeup_network=None, mirror=False)
+    np.testing.assert_allclose(found.u, replace(finder, tool_network=None)(images).u, atol=0.02)
+    windows, matrices, which = detector.windows(images, found.u, "tool")
+    u, covariance, confidence = run_onnx(folder / "tool.onnx", rgb(windows))
+    back = np.linalg.inv(matrices[:, None, :, :2])
+    u = (back @ (u - matrices[:, None, :, 2])[..., None])[..., 0]
+    expected = finder(images)
+    np.testing.assert_allclose(u, expected.u[which], atol=5 * LARGEST["px"])  # the stage's pixels are larger
+    np.testing.assert_allclose(back @ covariance @ back.mT, expected.covariance[which], rtol=2e-2, atol=1e-3)
+    np.testing.assert_allclose(confidence, expected.confidence[which], atol=LARGEST["of confidence"])
+    looks = {
+        "window": replace(detector, closeup_network=None),
+        "closeup": detector,
+        "tracking": lambda images: detector.refine(images, expected, "tracking"),
+    }
+    for stage, reference in looks.items():
+        windows, matrices, which = detector.windows(images, expected.u, stage)
+        own = tuple(np.arange(len(which))), tuple(which[:, 1])  # of each window its own landmark
+        u, covariance, confidence = (part[own] for part in run_onnx(folder / f"{stage}.onnx", rgb(windows)))
+        back = np.linalg.inv(matrices[:, :, :2])
+        expected, (image, landmark) = reference(images), which.T
+        assert len(which)
+        u = (back @ (u - matrices[:, :, 2])[..., None])[..., 0]
+        np.testing.assert_allclose(u, expected.u[image, landmark], atol=LARGEST["px"])
+        turned = back @ covariance @ back.mT
+        np.testing.assert_allclose(turned, expected.covariance[image, landmark], rtol=2e-2, atol=1e-3)
+        if stage != "closeup":  # there the windows' confidence is kept
+            np.testing.assert_allclose(confidence, expected.confidence[image, landmark], atol=LARGEST["of confidence"])
+
+
+def test_every_exported_stage_is_that_of_the_detector(small, tmp_path, quick):
+    detector, images = small
+    with single_threaded_torch():  # the same bits every time: a last digit can move a window by OpenCV's 1/32 px
+        check_every_stage(detector, np.concatenate([images, images[:1]]), tmp_path)
+
+
+@pytest.mark.slow
+def test_every_exported_stage_of_the_shipped_detector_is_its_own(shipped, tmp_path, quick):
+    check_every_stage(Detector.load(engine="torch"), shipped.images[:4], tmp_path)
+
+
+def test_the_first_stage_that_ships_is_exported_with_its_gaussian_fit(shipped, tmp_path, quick):
+    whole = Detector.load(engine="torch")
+    detector = Detector(whole.frame_network, whole.reduction, error_models=whole.error_models)
+    path, difference = export(detector, tmp_path, shipped.images[:2])["frame"]
+    assert difference <= LARGEST["px"]
+    u, covariance, confidence = run_onnx(path, rgb(detector.reduced(shipped.images[2:3])))  # another number of images
+    expected = detector(shipped.images[2:3])
+    seen = expected.confidence > 0
+    assert seen.any()
+    np.testing.assert_allclose(u[seen], expected.u[seen], atol=LARGEST["px"])
+    np.testing.assert_allclose(confidence[seen], expected.confidence[seen], atol=LARGEST["of confidence"])
+    np.testing.assert_allclose(covariance[seen], expected.covariance[seen], rtol=2e-2, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("part", "change", "unit"),
+    [(0, lambda v: v + 0.02, "px"), (1, lambda v: v * 1.1, "of variance"), (2, lambda v: v + 0.01, "of confidence")],
+)
+def test_an_export_that_differs_is_not_written(small, tmp_path, monkeypatch, part, change, unit):
+    detector = Detector(small[0].frame_network, 4, method="paper", error_models={"frame": SURE})
+    right = module.run_onnx
+
+    def wrong(*arguments):
+        return tuple(change(v) if i == part else v for i, v in enumerate(right(*arguments)))
+
+    monkeypatch.setattr(module, "run_onnx", wrong)
+    with pytest.raises(ValueError, match=f"frame: ONNX and torch differ by .* {unit}"):
+        export(detector, tmp_path, small[1])
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_missing_package_is_one_line_with_the_cure(small, tmp_path, monkeypatch, capsys):
+    from lib.training.command import main as training_main
+
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "onnx" else find(name))
+    with pytest.raises(ValueError, match=r"needs the package onnx, which is not installed here; `pip install onnx`"):
+        export(small[0], tmp_path, small[1])
+    assert training_main(["export", "--onnx", str(tmp_path)]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
