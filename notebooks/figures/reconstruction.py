@@ -19,7 +19,8 @@ from matplotlib.ticker import LogLocator
 from lib.cameras import StereoRig
 from lib.matching import Matches
 from lib.matching.pyramid import PATCH
-from lib.surface import BSplineSurface, Mesh
+from lib.surface import BSplineSurface, Mesh, ToolDistance
+from lib.workbench.results import Table
 from notebooks.figures.interactive import explore
 from notebooks.figures.style import COLOURS, LANDMARK_COLOURS, figure, show_image
 from notebooks.studies.matching_evaluation import DisparityScore
@@ -38,7 +39,6 @@ __all__ = [
     "error_budget",
     "error_maps",
     "held_out_curve",
-    "iso_depth",
     "match_fields",
     "mesh_still",
     "mesh_view",
@@ -55,6 +55,7 @@ __all__ = [
     "sparsification",
     "stereo_pair",
     "table",
+    "tool_over_surface",
 ]
 
 _SIGNED = "RdBu_r"
@@ -114,16 +115,19 @@ class ResponseMap:
         return (-0.5 - half, width * self.stride_px - 0.5 - half, height * self.stride_px - 0.5 - half, -0.5 - half)
 
 
-def response_map(responses: torch.Tensor, level: int, u_left: np.ndarray, *, cell_px: int = 2) -> ResponseMap:
+def response_map(
+    responses: torch.Tensor, level: int, u_left: np.ndarray, *, cell_px: int = 2, stride_px: int | None = None
+) -> ResponseMap:
     """The map of the patch nearest to the left pixel u_left (2,), of the responses (gy, gx, h, w) of one level.
 
-    Atomic patches tile the image; the centres of the larger ones lie on the corners of the atomic patches.
+    `stride_px` is the distance of neighbouring places; None is that of an unpooled map.  Atomic patches tile the image; the
+    centres of the larger ones lie on the corners of the atomic patches.
     """
     width = PATCH * cell_px
     at = (u_left + 0.5) / width - (0.5 if level == 0 else 0.0)
     x, y = np.clip(np.rint(at).astype(int), 0, np.array(responses.shape[1::-1]) - 1)
     centre = (np.array([x, y]) + (0.5 if level == 0 else 0.0)) * width - 0.5
-    return ResponseMap(centre, width << level, responses[y, x].numpy(), cell_px << level)
+    return ResponseMap(centre, width << level, responses[y, x].numpy(), stride_px or cell_px << level)
 
 
 def response_pyramid(left: np.ndarray, right: np.ndarray, maps: list[ResponseMap]) -> Figure:
@@ -341,17 +345,6 @@ def error_maps(maps_um: dict[str, np.ndarray], *, limit_um: float | None = None,
     return page
 
 
-def iso_depth(axes: Axes, image: np.ndarray, depth_mm: np.ndarray, *, step_mm: float = 0.1, title: str = "") -> Axes:
-    """Lines of equal depth (h, w) mm over the image; NaN is left blank."""
-    show_image(axes, image, title)
-    step = max(1, image.shape[1] // 320)
-    shown = depth_mm[::step, ::step]
-    x, y = np.arange(0, image.shape[1], step), np.arange(0, image.shape[0], step)
-    levels = np.arange(np.floor(np.nanmin(shown) / step_mm), np.nanmax(shown) / step_mm + 1) * step_mm
-    axes.contour(x, y, np.ma.masked_invalid(shown), levels=levels, cmap="viridis_r", linewidths=1.1)
-    return axes
-
-
 def mesh_still(axes: Axes, surface_mm: np.ndarray, image: np.ndarray, *, zoom: float = 1.12) -> Axes:
     """A still of the surface (h, w, 3) mm with the image (h, w, 3) as its skin, on a 3D axes; depth drawn twofold."""
     light = LightSource(azdeg=300, altdeg=50)
@@ -482,63 +475,93 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]], *, width_in: flo
     return page
 
 
-def recorded_table(recorded: Mapping[str, dict]) -> Figure:
-    """What `python3 -m notebooks.studies.surface_studies` recorded: surface errors with true and with calibrated cameras."""
-    result = {name: entry["result"] for name, entry in recorded.items()}
-    eyes = result.get("eyes", {})
-    rows = [
-        [f"{len(eyes) - 1} eyes, true cameras, {name}", f"{rms:.1f}", "", ""]
-        for name, rms in eyes.get("mean", {}).items()
-    ]
-    for name, grids in result.get("objects", {}).items():
-        rows += [
-            [f"{name}, true cameras, {grid} control points", f"{e['rms']:.1f}", "", ""] for grid, e in grids.items()
-        ]
-    for name, rms in result.get("calibrated", {}).get("mean surface_rms_um", {}).items():
-        rows.append([f"75 frames: {name}", *(f"{rms[key]:.1f}" for key in ("robot frame", "rigid", "affine"))])
+def recorded_table(recorded: Mapping[str, Table]) -> Figure:
+    """Recorded surface errors with true cameras (`surfaces`) and with calibrated ones (`calibrated_surfaces`)."""
+    rows = []
+    for row in recorded["surfaces"].rows if "surfaces" in recorded else ():
+        columns = {"surface_rms_um": "", "surface_fine_rms_um": ", 40 x 40"}
+        columns |= {"surface_fast_rms_um": ", fast", "sphere_rms_um": ", sphere"}
+        for name, label in columns.items():
+            if np.isfinite(row.get(name, np.nan)):
+                rows.append([f"{row['scene']}, true cameras{label}", f"{row[name]:.1f}", "", ""])
+    calibrated = recorded.get("calibrated_surfaces")
+    for name in ("true", "plain", "plain_refined", "recommended", "recommended_refined") if calibrated else ():
+        for setting in ("quality", "fast"):
+            found = calibrated.where(setting=setting).columns
+            if f"{name}_robot_frame_um" in found:
+                means = (np.mean(found[f"{name}_{key}_um"]) for key in ("robot_frame", "rigid", "affine"))
+                label = f"75 frames, {setting}: {name.replace('_', ', ')} cameras"
+                rows.append([label, *(f"{mean:.1f}" for mean in means)])
     page = table(["surface", "RMS (um)", "rigid motion taken out", "affine map taken out"], rows, width_in=13)
     page.axes[0].tables[0].auto_set_column_width(range(4))
     return page
 
 
-def recorded_speeds(recorded: Mapping[str, dict]) -> Figure:
-    """What `python3 -m notebooks.studies.surface_studies` recorded: how fast, and how good beside it.
+def recorded_speeds(recorded: Mapping[str, Table]) -> Figure:
+    """Recorded CPU and wall seconds, and errors, of `l1_solver`, `reconstruction_speed` and `matching`.
 
     CPU seconds hold on a busy machine, wall seconds on an idle one.
     """
-    result = {name: entry["result"] for name, entry in recorded.items()}
     rows = [
         [
-            f"Eq. 6, {size}",
-            f"{e['cpu_seconds']:.3f}",
+            f"Eq. 6, {e['control']:.0f} x {e['control']:.0f}, n = {e['n_points']:.0f}",
+            f"{e['cpu_s']:.3f}",
             "",
             f"objective {abs(e['relative_difference']):.0e} from CLARABEL's",
-            f"CLARABEL {e['clarabel_cpu_seconds']:.2f} s, {e['clarabel_over_ours']:.0f} times ours",
+            f"CLARABEL {e['clarabel_cpu_s']:.2f} s, {e['clarabel_over_ours']:.0f} times ours",
         ]
-        for size, e in result.get("solver", {}).items()
+        for e in (recorded["l1_solver"].rows if "l1_solver" in recorded else ())
     ]
     rows += [
         [
-            f"full-HD pair, {setting}",
-            f"{e['cpu_seconds']:.2f}",
-            f"{e['total']:.2f}",
+            f"full-HD pair, {e['setting']}, {'depth' if e['depth_only'] else 'three splines'}",
+            f"{e['cpu_s']:.2f}",
+            f"{e['total_s']:.2f}",
             f"{e['surface_rms_um']:.1f} um RMS",
-            f"{e['matches']} matches; {e['match']:.2f} s to match, {e['surface']:.2f} s to fit",
+            f"{e['points']:.0f} points; {e['match_s']:.2f} s to match, {e['surface_s']:.2f} s to fit",
         ]
-        for setting, e in result.get("pair", {}).items()
+        for e in (recorded["reconstruction_speed"].rows if "reconstruction_speed" in recorded else ())
     ]
     rows += [
         [
-            f"motorcycle, {method}",
-            f"{e['cpu_seconds']:.2f}",
-            f"{e['seconds']:.2f}",
-            f"median {e['all_median_px']:.2f} px, {100 * e['all_above_2']:.1f} % above 2 px",
-            f"{e['matches']} matches; where flat {e['flat_median_px']:.2f} px, {100 * e['flat_above_2']:.1f} %",
+            f"{e['scene']}, {e['method']}, {e['width_px']:.0f} px",
+            f"{e['cpu_s']:.2f}",
+            f"{e['wall_s']:.2f}",
+            f"median {e['all_median_px']:.2f} px, {e['all_above_2px_percent']:.1f} % above 2 px",
+            f"{e['matches']:.0f} matches; where flat {e['flat_median_px']:.2f} px, {e['flat_above_2px_percent']:.1f} %",
         ]
-        for method, e in result.get("motorcycle", {}).items()
+        for e in (recorded["matching"].rows if "matching" in recorded else ())
+        if e["width_px"] and np.isfinite(e.get("all_median_px", np.nan))
     ]
-    page = table(["measured", "CPU (s)", "wall (s)", "error", "beside it"], rows, width_in=13)
+    page = table(["measured", "CPU (s)", "wall (s)", "error", "details"], rows, width_in=13)
     page.axes[0].tables[0].auto_set_column_width(range(5))
+    return page
+
+
+def tool_over_surface(
+    image: np.ndarray, surface: BSplineSurface, rig: StereoRig, x_tool_mm: np.ndarray, distance: ToolDistance
+) -> Figure:
+    """The image around the tool, and a section through the surface along the row of tip_1 with the landmarks (3, 3) mm."""
+    page, (left, right) = figure(1, 2, width_in=13, height_in=3.8, width_ratios=(1, 1.4))
+    show_image(left, image, "Left image")
+    u = rig.left.project(x_tool_mm)
+    row = float(np.nanmean(u[1:, 1])) if np.isfinite(u[1:, 1]).any() else image.shape[0] / 2
+    columns = np.arange(0, image.shape[1], 8.0)
+    view, mm_per_px = rig.left.viewing_direction, 1 / np.linalg.norm(rig.left.linear[0])
+    depth = surface(np.column_stack([columns, np.full_like(columns, row)])) @ view
+    left.axhline(row, color=COLOURS["baseline"], ls=":")
+    right.plot(columns * mm_per_px, depth, color=COLOURS["ours"], label="surface along the dotted row")
+    for k, (name, colour) in enumerate(LANDMARK_COLOURS.items()):
+        if not np.isfinite(u[k]).all():
+            continue
+        at, along = x_tool_mm[k] @ view, distance.along_view_mm[k]
+        label = f"{name}: {along:.2f} mm along the view" if np.isfinite(along) else f"{name}: beyond the surface"
+        left.plot(*u[k], "o", color=colour, markeredgecolor="black")
+        right.plot([u[k, 0] * mm_per_px] * 2, [at, at + along], color=colour, lw=1.5)
+        right.plot(u[k, 0] * mm_per_px, at, "o", color=colour, markeredgecolor="black", label=label)
+    right.set(xlabel="along the image row (mm)", ylabel="depth along the view (mm)")
+    right.invert_yaxis()
+    right.legend(fontsize=8)
     return page
 
 

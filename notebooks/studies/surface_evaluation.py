@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import cache, partial
 from pathlib import Path
 
 import cv2
@@ -15,13 +16,13 @@ from lib.cameras import AffineCamera, StereoRig
 from lib.geometry import RigidTransform
 from lib.matching import RECTIFIED, Matches, match
 from lib.simulator.dataset import TEST_SEQUENCES, sequence_design, sequence_name
-from lib.simulator.eye import Scene
+from lib.simulator.eye import Eye, Scene
+from lib.simulator.forceps import Forceps, Pose
 from lib.simulator.microscope import Microscope
 from lib.simulator.render import render_pair
 from lib.simulator.rig import IMAGE_SIZE_PX, ROBOT_FROM_MICROSCOPE
 from lib.simulator.window import surface_grid
-from lib.surface.bspline import BSplineSurface
-from lib.surface.reconstruct import Reconstruction, reconstruct
+from lib.surface import BSplineSurface, Reconstruction, reconstruct
 from notebooks.studies.matching_evaluation import (
     CONFIDENCES,
     DisparityScore,
@@ -33,6 +34,7 @@ from notebooks.studies.scenes import OBJECTS, Relief
 from notebooks.studies.sphere import Sphere, fit_sphere
 
 __all__ = [
+    "DOMAIN",
     "Case",
     "RealPair",
     "SimulatedPair",
@@ -42,14 +44,19 @@ __all__ = [
     "confidence_curves",
     "error_variants",
     "eyes",
+    "full_hd_pair",
     "objects",
     "real_pair",
+    "retina_points",
     "rms_um",
     "simulated_pair",
     "surface_error_mm",
     "surface_on_rays",
     "wrong_matches",
 ]
+
+#: Of `retina_points`: a full-HD image, px.
+DOMAIN = (0.0, 0.0, 1920.0, 1080.0)
 
 TruthSurface = Callable[[np.ndarray], np.ndarray]
 
@@ -159,6 +166,28 @@ def objects(*, shrink: int = 1) -> Iterator[SimulatedPair]:
     )
     for index, name in enumerate(OBJECTS):
         yield simulated_pair(name, Relief(name), microscope, seed=index, eye=False)
+
+
+def retina_points(n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Left pixels (n, 2) in `DOMAIN` and points (n, 3) mm of a bowl under the reference rig, 10 % outliers."""
+    rng = np.random.default_rng(seed)
+    u = rng.uniform(DOMAIN[:2], DOMAIN[2:], (n, 2))
+    x, y = ((u - (960, 540)) / 100).T
+    depth = np.sqrt(144 - x**2 - y**2) - 12 + 0.1 * np.sin(x) * np.cos(1.3 * y)
+    found = np.column_stack([x, y, depth]) + rng.normal(size=(n, 3)) * (0.005, 0.005, 0.06)
+    wild = rng.random(n) < 0.1
+    found[wild, 2] += rng.uniform(-2, 2, wild.sum())
+    return u, ROBOT_FROM_MICROSCOPE.apply(found)
+
+
+@cache
+def full_hd_pair() -> tuple:
+    """(left, right, rig, truth) of a simulated eye with forceps and glints under the reference rig."""
+    microscope = Microscope()
+    eye, pose = Eye(seed=9001), Pose(base_mm=(1.5, 0.5, -1.0), azimuth_rad=2.8)
+    left, right = render_pair(eye, microscope, forceps=Forceps(), pose=pose, rng=np.random.default_rng(1))
+    rig = microscope.rig()
+    return left, right, rig, partial(surface_on_rays, rig.left, eye.height)
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,9 +8,9 @@ import pytest
 
 from lib import paths
 from lib.geometry import RigidTransform
-from lib.matching import glint_mask, match
+from lib.matching import RECTIFIED, glint_mask, match
 from lib.simulator.rig import IMAGE_SIZE_PX, reference_rig
-from notebooks.studies import surface_speed as speed
+from notebooks.studies import surface_evaluation as evaluation
 
 
 def full_hd_pair():
@@ -59,18 +59,14 @@ def test_full_hd(benchmark, full_hd, method, setting):
 @pytest.mark.parametrize("width_px", [512, 1024])
 @pytest.mark.parametrize("method", ["band", "sgbm", "dis", "deepmatching"])
 def test_motorcycle(benchmark, method, width_px):
-    """Seconds and errors; ``python3 -m notebooks.studies.surface_studies motorcycle`` records them.
-
-    The benchmark's own table times the whole measurement, all rounds; a pair's seconds are in `extra_info`.
-    """
+    """The study `matching` scores the same matches."""
     folder = paths.real_data("stereo_pairs")
     if folder is None:
         pytest.skip(paths.missing_data_line("stereo_pairs"))
-    if method == "deepmatching" and width_px > 512:
+    free = method == "deepmatching"
+    if free and width_px > 512:
         pytest.skip("free DeepMatching grows with the fourth power of the width")
-    rounds = 0 if method == "deepmatching" else 5
-    benchmark.extra_info |= benchmark.pedantic(
-        speed.motorcycle, (folder / "motorcycle", method, width_px), {"rounds": rounds}
-    )
-    print(f"\nmotorcycle, {width_px} px, {method}: {benchmark.extra_info}")
-    assert benchmark.extra_info["matches"] > 2000
+    pair = evaluation.real_pair(folder / "motorcycle").left_part(width_px, width_px * 3 // 4)
+    options = {"method": method} | ({} if free else {"rig": RECTIFIED})
+    matches = benchmark.pedantic(match, (pair.left, pair.right), options, rounds=1 if free else 5)
+    assert len(matches) > 2000
