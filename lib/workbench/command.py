@@ -8,10 +8,12 @@ import datetime
 import shutil
 import signal
 import sys
-import threading
 import time
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
+
+from tqdm import tqdm
 
 from lib import files, paths
 from lib.provenance import commit, machine
@@ -103,15 +105,18 @@ def run(
             values[book].setdefault("profile", profile)
     report = _Report(_new_folder(runs, profile), chosen, profile, dict(pairs))
     width = max(len(book.stem) for book in chosen)
+    live = sys.stderr.isatty()
     try:
         for number, book in enumerate(chosen, start=1):
-            with _Progress(f"[{number}/{len(chosen)}] {book.stem:<{width}}") as progress:
-                report.begin(book)
+            label, start = f"[{number}/{len(chosen)}] {book.stem:<{width}}", time.monotonic()
+            report.begin(book)
+            with tqdm(desc=label, unit="cell", leave=False, disable=not live) as bar:
                 failure = execute(
-                    book, report.executed(book), values[book], cell_timeout_s=cell_timeout_s, on_cell=progress.cell
+                    book, report.executed(book), values[book], cell_timeout_s=cell_timeout_s, on_cell=partial(_advance, bar)
                 )
-                report.end(book, failure, progress.seconds)
-                progress.done("failed" if failure else "done")
+            seconds = time.monotonic() - start
+            report.end(book, failure, seconds)
+            print(f"{label}  {seconds:6.1f} s  {'failed' if failure else 'done'}", flush=True)
         report.finish()
     except KeyboardInterrupt:
         report.finish("stopped")
@@ -121,9 +126,8 @@ def run(
         report.finish("failed")
         raise
     for entry in report.content["notebooks"]:
-        if entry["state"] == "failed":
-            failure = entry["failure"]
-            print(f"FAILED {entry['name']}: {Failure(**failure)}", file=sys.stderr)
+        if entry["failure"]:
+            print(f"FAILED {entry['name']}: {Failure(**entry['failure'])}", file=sys.stderr)
     print(f"\nReport: {report.folder / 'index.html'}")
     return report.content
 
@@ -203,18 +207,12 @@ class _Report:
         )
 
     def _write_page(self, book: Path, entry: dict) -> None:
+        pages_of = [None, *((f"{other['name']}.html", other["title"]) for other in self.content["notebooks"]), None]
         place = self.notebooks.index(book)
-        neighbours = [
-            (f"{self.notebooks[i].stem}.html", self.content["notebooks"][i]["title"]) if 0 <= i < len(self.notebooks)
-            else None for i in (place - 1, place + 1)
-        ]  # fmt: skip
         text = pages.page(
-            self.executed(book),
-            title=entry["title"],
-            folder=book.parent,
-            previous=neighbours[0],
-            following=neighbours[1],
-        )
+            self.executed(book), title=entry["title"], folder=book.parent,
+            previous=pages_of[place], following=pages_of[place + 2],
+        )  # fmt: skip
         if pages.PLOTLY_FILE in text and not (self.folder / pages.PLOTLY_FILE).exists():
             import plotly
 
@@ -226,44 +224,9 @@ class _Report:
         return self.content["notebooks"][self.notebooks.index(book)]
 
 
-class _Progress:
-    """One line a notebook: on a terminal it counts cells and seconds, elsewhere it says now and then how far it is."""
-
-    def __init__(self, label: str):
-        self.label, self.now = label, ""
-        self.start = time.monotonic()
-        self.live = sys.stdout.isatty()
-        self.stop = threading.Event()
-        self.thread = threading.Thread(target=self._tell, daemon=True)
-
-    @property
-    def seconds(self) -> float:
-        return time.monotonic() - self.start
-
-    def __enter__(self) -> _Progress:
-        self.thread.start()
-        return self
-
-    def __exit__(self, *_) -> None:
-        self.stop.set()
-        self.thread.join()
-
-    def cell(self, number: int, of: int) -> None:
-        self.now = f"cell {number}/{of}"
-
-    def done(self, how: str) -> None:
-        self.__exit__()
-        end = "\r\033[K" if self.live else ""
-        print(f"{end}{self.label}  {self.seconds:6.1f} s  {how}", flush=True)
-
-    def _tell(self) -> None:
-        while not self.stop.wait(0.2 if self.live else 20.0):
-            if self.live:
-                width = shutil.get_terminal_size().columns - 1
-                line = f"{self.label}  {self.seconds:6.1f} s  {self.now}"
-                print(f"\r\033[K{line[:width]}", end="", flush=True)
-            else:
-                print(f"{self.label}  {self.seconds:6.1f} s  {self.now}", flush=True)
+def _advance(bar: tqdm, cell: int, n_cells: int) -> None:
+    bar.total, bar.n = n_cells, cell
+    bar.refresh()
 
 
 def _new_folder(runs: Path, profile: str) -> Path:

@@ -147,7 +147,7 @@ def sweep(
         for values in itertools.product(*grid.values())
     ]
     profile = {"profile": "quick"} if "profile" in declared_parameters(book) else {}
-    folder = runs / "sweeps" / f"{book.stem}-{_code_digest(book)}"
+    folder = runs.resolve() / "sweeps" / f"{book.stem}-{_code_digest(book)}"
     folder.mkdir(parents=True, exist_ok=True)
     words = ["sweep", name, *itertools.chain(*(("-p", key, ",".join(values)) for key, values in grid.items()))]
     provenance = Provenance(shlex.join(["python3", "-m", "lib", *words]))
@@ -200,8 +200,8 @@ def run_point(executed: Path, book: Path, values: dict, cell_timeout_s: float | 
         notebook = nbformat.read(partial, as_version=4)
         notebook.metadata["microstereo"] = {"machine": machine()}
         nbformat.write(notebook, partial)
-    log.unlink(missing_ok=True)
-    failed.unlink(missing_ok=True)
+    for left in (log, failed, *executed.parent.glob(f"{executed.stem}.*.partial.ipynb")):  # of attempts before
+        left.unlink(missing_ok=True)
 
 
 def column_name(metric: str, unit: str) -> str:

@@ -68,7 +68,7 @@ def test_an_error_is_told_with_its_cell(finished):
 def test_a_timeout_is_detected(write_notebook, tmp_path):
     """papermill calls the cell completed."""
     slow = write_notebook(tmp_path, "00_slow", "import time; time.sleep(300)")
-    failure = execute(slow, tmp_path / "executed.ipynb", {}, cell_timeout_s=3)
+    failure = execute(slow, tmp_path / "executed.ipynb", {}, cell_timeout_s=1)
     assert failure.kind == "timeout" and failure.cell == 3
 
 
@@ -210,29 +210,32 @@ def test_a_full_disk_is_told_and_leaves_the_state_failed(without_kernels, tmp_pa
     assert content["state"] == "failed" and "No space left" in content["notebooks"][0]["failure"]["message"]
 
 
-def test_a_killed_run_leaves_a_report_and_the_next_its_own(write_notebook, tmp_path):
-    books = tmp_path / "books"
-    books.mkdir()
-    write_notebook(books, "00_quick", "1 + 1")
-    write_notebook(books, "01_slow", "import time; time.sleep(60 if seed == 0 else 0)")
-    runs = tmp_path / "runs"
-    code = "import sys; from pathlib import Path; from lib.workbench.command import run; "
-    code += "run(runs=Path(sys.argv[1]), notebooks=Path(sys.argv[2]))"
-    process = subprocess.Popen(
-        [sys.executable, "-c", code, str(runs), str(books)], cwd=paths.ROOT, stdout=subprocess.DEVNULL
-    )
+def test_a_killed_run_leaves_a_report_and_the_next_its_own(books, without_kernels, tmp_path):
+    """kill -9 while the second of two notebooks runs."""
+    code = """
+import shutil, sys, time
+from pathlib import Path
+from lib.workbench import command
+
+def execute(book, output, values, **options):
+    time.sleep(60 if book.stem == "02_dead" else 0)
+    shutil.copy(book, output)
+
+command.execute = execute
+command.run(["00", "02"], runs=Path(sys.argv[1]), notebooks=Path(sys.argv[2]))
+"""
+    words = [sys.executable, "-c", code, str(tmp_path), str(books)]
+    process = subprocess.Popen(words, cwd=paths.ROOT, stdout=subprocess.DEVNULL)
     states: list[str] = []
-    for _ in range(1800):
-        time.sleep(0.1)
-        for file in runs.glob("*/metrics.json"):
+    while states != ["complete", "running"]:
+        assert process.poll() is None
+        time.sleep(0.05)
+        for file in tmp_path.glob("*/metrics.json"):
             states = [book["state"] for book in json.loads(file.read_text(encoding="utf-8"))["notebooks"]]
-        if states == ["complete", "running"]:
-            break
-    os.kill(process.pid, signal.SIGKILL if os.name != "nt" else signal.SIGTERM)
+    process.kill()
     process.wait()
-    assert states == ["complete", "running"]
-    assert run(["00"], runs=runs, notebooks=books)["state"] == "complete"
-    first, second = sorted(runs.iterdir(), key=lambda folder: len(folder.name))
+    assert run(["00"], runs=tmp_path, notebooks=books)["state"] == "complete"
+    first, second = sorted(tmp_path.iterdir(), key=lambda folder: len(folder.name))
     assert second.name == f"{first.name}-2"
     assert json.loads((first / "metrics.json").read_text(encoding="utf-8"))["state"] == "running"
-    assert "00_quick.html" in (first / "index.html").read_text(encoding="utf-8")
+    assert "00_error.html" in (first / "index.html").read_text(encoding="utf-8")
