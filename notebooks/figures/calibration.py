@@ -209,28 +209,13 @@ def advice_view(
     plane = robot_from_microscope.apply(np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]))
     depth = 1e3 * calibration.depth_sd_mm(plane).reshape(x.shape)
     extent = (-half_size_mm[0], half_size_mm[0], -half_size_mm[1], half_size_mm[1])
-    # One scale whatever the slider says, so that the colours tell of progress.
+    # One colour scale for all positions of the slider, so that pictures can be compared.
     norm = LogNorm(*DEPTH_SCALE_UM, clip=True)
     image = ax.imshow(depth, extent=extent, origin="lower", cmap="viridis_r", norm=norm, aspect="equal")
     used, advised = (robot_from_microscope.inverse().apply(p) for p in (calibration.x_mm, advised_mm[None]))
-    ax.plot(
-        *used[:, :2].T,
-        "o",
-        color="white",
-        markersize=4,
-        markeredgecolor="black",
-        label="correspondences",
-        clip_on=False,
-    )
-    ax.plot(
-        *advised[:, :2].T,
-        "*",
-        color=COLOURS["warning"],
-        markersize=18,
-        markeredgecolor="black",
-        label="go here next",
-        clip_on=False,
-    )
+    style = {"markeredgecolor": "black", "clip_on": False}
+    ax.plot(*used[:, :2].T, "o", color="white", markersize=4, label="correspondences", **style)
+    ax.plot(*advised[:, :2].T, "*", color=COLOURS["warning"], markersize=18, label="go here next", **style)
     _plain_log(page.colorbar(image, ax=ax, label="depth sd from calibration (um)").ax.yaxis)
     ax.set(xlabel="x (mm)", ylabel="y (mm)")
     ax.set_title(f"{len(used)} correspondences: {depth.mean():.0f} um mean, {depth.max():.0f} um worst", pad=14)
@@ -288,22 +273,14 @@ def residuals(calibration: Calibration) -> Figure:
 def frame_residuals(image: np.ndarray, detected: np.ndarray, predicted: np.ndarray, title: str) -> Figure:
     """One frame: detections (3, 2) and where the calibrated camera puts the robot's landmarks, with a magnified view."""
     page, axes = figure(1, 2, width_in=13, height_in=4.2, width_ratios=[1.6, 1])
-    middle, half = (
-        np.nanmean(detected, axis=0),
-        max(90.0, 0.7 * float(np.nanmax(np.nanmax(detected, 0) - np.nanmin(detected, 0)))),
-    )
+    middle = np.nanmean(detected, axis=0)
+    half = max(90.0, 0.7 * float(np.nanmax(np.nanmax(detected, 0) - np.nanmin(detected, 0))))
     for ax in axes:
         show_image(ax, image, title if ax is axes[0] else "Magnified")
         size = 5 if ax is axes[0] else 11
         for name, d, p in zip(LANDMARK_COLOURS, detected, predicted, strict=True):
-            ax.plot(
-                *d,
-                "o",
-                color=LANDMARK_COLOURS[name],
-                markersize=size,
-                markeredgecolor="black",
-                label=f"{name} detected",
-            )
+            style = {"color": LANDMARK_COLOURS[name], "markersize": size, "markeredgecolor": "black"}
+            ax.plot(*d, "o", label=f"{name} detected", **style)
             ax.plot(*p, "+", color="white", markersize=1.6 * size, markeredgewidth=2)
     axes[1].set(xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] + half, middle[1] - half))
     axes[0].plot([], [], "+", color="white", markersize=9, markeredgewidth=2, label="robot, projected")

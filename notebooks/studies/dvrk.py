@@ -74,8 +74,8 @@ def read_robot_frames(folder: str | Path) -> RobotFrames:
 def find_spheres(image: np.ndarray) -> np.ndarray | None:
     """The two red spheres of an RGB image, upper first: (2, 3) of x, y, radius in px; None if not both are there.
 
-    A red region gives the rough circle; the outline is then the steepest fall of redness along 180 rays, found to a
-    fraction of a pixel, and the circle the robust fit to it, blind to where the shaft, highlights or tape cross the outline.
+    A red region gives a rough circle.  Along 180 rays the steepest fall of redness gives the outline to sub-pixel.
+    A robust fit of a circle ignores the parts where the shaft, highlights or tape cross the outline.
     """
     channels = image.astype(np.float32)
     redness = channels[:, :, 0] - np.maximum(channels[:, :, 1], channels[:, :, 2])
@@ -165,7 +165,7 @@ def calibrate_sphere(
     image_size_px: tuple[int, int],
     along_shaft_mm: float | None = None,
 ) -> SphereFit:
-    """Camera and length l of one sphere, and honest leave-one-out residuals: everything is estimated anew without the frame.
+    """Camera and length l of one sphere, and leave-one-out residuals: both are estimated anew without each frame.
 
     Parameters
     ----------
