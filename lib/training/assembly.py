@@ -34,21 +34,9 @@ def assemble(
 ) -> Detector:
     """Join the stages of a training folder, fit their error models, write the weights file `out` and its card.
 
-    The numbers on the card are of error models fitted on half of the validation frames, measured on the other half; then
-    all of them fit the file's own.
-
-    Parameters
-    ----------
-    recordings:
-        Labelled recordings that the error models are fitted on too: typical frames, where the validation frames vary more
-        than those of any microscope.  Nothing was trained on either.
-    notes:
-        Lines for the card: what the checkpoints do not record about the trainings.
-
-    Raises
-    ------
-    FileNotFoundError, ValueError
-        If a stage or the validation frames are missing.
+    The numbers on the card are of error models fitted on half of the validation frames and measured on the other half; the
+    file's own are fitted on all of them, and on labelled `recordings`: typical frames, where the validation frames vary
+    more than those of any microscope.  `notes` are lines for the card.  A missing stage or shard raises `FileNotFoundError`.
     """
     folder, out = Path(folder), Path(out)
     stages = {stage: load_training(folder / stage / "last.safetensors") for stage in STAGES}

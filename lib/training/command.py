@@ -142,17 +142,16 @@ def main_evaluate(argv: list[str] | None = None) -> int:
 def _evaluate(a: argparse.Namespace) -> None:
     result = evaluate_recording(Detector.load(a.weights), a.recording, every=a.every, progress=True)
     rows = {"all": result.scores} | result.by_landmark() | result.by_visibility()
-    print(f"{'':10}{'PCK@0.01':>10}{'PCK@0.05':>10}{'PCK@0.10':>10}{'median px':>11}{'95 % px':>9}{'missed':>8}{'labels':>8}")
-    for name, s in rows.items():
-        print(
-            f"{name:10}{s.pck_0_01:10.1f}{s.pck_0_05:10.1f}{s.pck_0_10:10.1f}{s.median_px:11.2f}{s.p95_px:9.2f}"
-            f"{s.missed:8d}{s.labels:8d}"
-        )
-    s = result.scores
-    print(f"normalised squared error {s.nees:.2f} (2 is right), {s.coverage_95:.1f} % inside the 95 % ellipse")
-    print(f"bias {s.bias_px[0]:+.2f}, {s.bias_px[1]:+.2f} px")
-    detection = ", ".join(f"{name.replace('_', ' ')} {value:.1f} %" for name, value in result.detection().items())
-    print(f"detections with a confidence above 0.5: {detection}")
+    shown = {
+        "PCK@0.01": "pck_0_01", "PCK@0.05": "pck_0_05", "PCK@0.10": "pck_0_10", "median px": "median_px", "95 % px": "p95_px",
+        "NEES (2)": "nees", "in 95 % ellipse": "coverage_95", "missed": "missed", "labels": "labels",
+    }  # fmt: skip
+    print(" " * 10 + "".join(f"{title:>16}" for title in shown))
+    for name, scores in rows.items():
+        print(f"{name:10}" + "".join(f"{getattr(scores, field):>16.6g}" for field in shown.values()))
+    print("bias {:+.2f}, {:+.2f} px".format(*result.scores.bias_px))
+    for name, value in result.detection().items():
+        print(f"{name.replace('_', ' ')}, confidence above 0.5: {value:.1f} %")
     if a.json:
         write_json(a.json, {name: asdict(s) for name, s in rows.items()})
 

@@ -144,11 +144,7 @@ def evaluate(
 
 
 def evaluate_recording(
-    detector: Callable[[np.ndarray], Landmarks],
-    recording: Recording | str | Path,
-    *,
-    every: int = 1,
-    progress: bool = False,
+    detector: Callable[[np.ndarray], Landmarks], recording: Recording | str | Path, *, every: int = 1, progress: bool = False
 ) -> Evaluation:
     """`evaluate` on both cameras' images of a recording, every `every`-th frame."""
     recording = recording if isinstance(recording, Recording) else Recording.open(recording)

@@ -35,6 +35,8 @@ from lib.training.samples import Samples, Source
 __all__ = ["FORMAT", "Training", "average", "draw_batch", "load_training", "train", "validate"]
 
 FORMAT = "microstereo.training"
+#: What a checkpoint keeps of a `Run` beside its tensors.
+_STATE = ("step", "seconds", "log", "loss_sum", "since")
 
 
 @dataclass(frozen=True)
@@ -90,17 +92,10 @@ def validate(
     labels = np.where(seen[..., None], samples.u, np.nan)
     scores = score(u, labels, length_px=tool_length_px(samples.u))
     spread = np.nanmean(np.nanstd(np.where(seen[..., None], u, np.nan), 0)) / np.nanmean(np.nanstd(labels, 0))
-    result = {
-        "validation_loss": float(np.mean(losses)),
-        "pck_0.05": scores.pck_0_05,
-        "pck_0.10": scores.pck_0_10,
-        "median_px": scores.median_px,
-        "p95_px": scores.p95_px,
-        "peak": float(np.nanmean(np.concatenate(heights))),
-        "spread": float(spread),
-    }
-    if isinstance(network, OffsetNetwork):
-        del result["peak"]
+    result = {"validation_loss": float(np.mean(losses)), "pck_0.05": scores.pck_0_05, "pck_0.10": scores.pck_0_10}
+    result |= {"median_px": scores.median_px, "p95_px": scores.p95_px, "spread": float(spread)}
+    if not isinstance(network, OffsetNetwork):
+        result["peak"] = float(np.nanmean(np.concatenate(heights)))
     return result
 
 
@@ -190,17 +185,8 @@ class Run:
             tensors |= {f"average.{k}": v for k, v in self.average.state_dict().items()}
         for i, values in self.optimiser.state_dict()["state"].items():
             tensors |= {f"optimiser.{i}.{k}": torch.as_tensor(v) for k, v in values.items()}
-        metadata = {
-            "format": FORMAT,
-            "config": asdict(self.config),
-            "step": self.step,
-            "seconds": self.seconds,
-            "log": self.log,
-            "loss_sum": self.loss_sum,
-            "since": self.since,
-            "provenance": provenance,
-        }
-        write_checkpoint(path, tensors, metadata)
+        state = {name: getattr(self, name) for name in _STATE}
+        write_checkpoint(path, tensors, {"format": FORMAT, "config": asdict(self.config), "provenance": provenance} | state)
 
     def restore(self, path: Path, provenance: dict[str, object]) -> None:
         """Continue from a checkpoint; `provenance` is completed by what it was begun from."""
@@ -208,16 +194,14 @@ class Run:
         changed = self.config.changed(metadata["config"])
         kept = metadata["provenance"]
         processes = kept.get("processes", 1)
-        if changed:
-            raise ValueError(f"{path}: belongs to a training with another {', '.join(changed)}; use another folder.")
-        if kept["data"] != provenance["data"]:
-            raise ValueError(f"{path}: was trained on other data (fingerprint differs); use another folder.")
-        if provenance.get("initial") not in (None, kept.get("initial")):
-            raise ValueError(f"{path}: was begun from other weights; give those as `initial`, or use another folder.")
-        if processes != self.world:  # the batches, and so the result, would be others
-            raise ValueError(
-                f"{path}: was begun by {processes} process(es), now {self.world}; start as many, or use another folder."
-            )
+        for differs, how in (
+            (changed, f"belongs to a training with another {', '.join(changed)}"),
+            (kept["data"] != provenance["data"], "was trained on other data (fingerprint differs)"),
+            (provenance.get("initial") not in (None, kept.get("initial")), "was begun from other weights"),
+            (processes != self.world, f"was begun by {processes} process(es), now {self.world}; start as many"),
+        ):
+            if differs:
+                raise ValueError(f"{path}: {how}, or use another folder.")
         provenance |= {key: kept[key] for key in ("initial", "before", "metrics") if key in kept}
         self.network.load_state_dict(_part(tensors, "network."))
         if self.average is not None:
@@ -227,8 +211,8 @@ class Run:
             i, _, key = name.partition(".")
             state.setdefault(int(i), {})[key] = value
         self.optimiser.load_state_dict(self.optimiser.state_dict() | {"state": state})
-        self.step, self.seconds, self.log = metadata["step"], metadata["seconds"], metadata["log"]
-        self.loss_sum, self.since = metadata["loss_sum"], metadata["since"]
+        for name in _STATE:
+            setattr(self, name, metadata[name])
 
 
 def train(
@@ -257,23 +241,15 @@ def train(
     Raises
     ------
     ValueError
-        For an empty data set, an `initial` training of another network, or a folder that holds another training, one of
-        other data, or one that began from other weights.
+        For an empty data set, an `initial` training of another network, or a folder that holds another training.
     """
     if len(source) == 0 or len(validation) == 0:
         raise ValueError("source and validation: must not be empty; give labelled images.")
     if initial is not None and initial.network.config != config.network:
-        raise ValueError(
-            f"initial: is a network {initial.network.config}, the configuration asks for {config.network}; make them equal."
-        )
+        raise ValueError(f"initial: is a network {initial.network.config}, not {config.network} as the configuration asks.")
     run = Run(config, initial.network if initial is not None else None)
-    provenance: dict[str, object] = {
-        "data": source.fingerprint,
-        "images": len(source),
-        "commit": commit_id(),
-        "machine": machine(),
-        "torch": torch.__version__,
-    }
+    provenance: dict[str, object] = {"data": source.fingerprint, "images": len(source), "torch": torch.__version__}
+    provenance |= {"commit": commit_id(), "machine": machine()}
     if run.world > 1:
         provenance["processes"] = run.world
     if initial is not None:
@@ -314,13 +290,7 @@ def train(
 
 
 def load_training(path: str | Path) -> Training:
-    """The network of a training's checkpoint, finished or not.
-
-    Raises
-    ------
-    FileNotFoundError, ValueError
-        Naming the file.
-    """
+    """The network of a training's checkpoint, finished or not."""
     tensors, metadata = read_checkpoint(path, FORMAT)
     prefix = "average." if any(name.startswith("average.") for name in tensors) else "network."
     network = load_network(path, metadata["config"]["network"], _part(tensors, prefix)).eval()

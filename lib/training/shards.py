@@ -54,14 +54,9 @@ def generate(
 
     A shard depends on its kind and number alone.
 
-    Parameters
-    ----------
-    kind:
-        ``"training"`` and ``"validation"`` hold 16 frames each.  ``"windows"`` and ``"closeups"`` hold 512 and 2048 crops
-        round a landmark, each of an eye and a tool of its own: twenty and forty times as many scenes a second, since only
-        the crops are rendered.
-    workers:
-        Processes that share the work, by default one a core.
+    Shards of kind ``"training"`` and ``"validation"`` hold 16 frames each.  ``"windows"`` and ``"closeups"`` hold 512 and
+    2048 crops round a landmark, each of an eye and a tool of its own: twenty and forty times as many scenes a second, since
+    only the crops are rendered.  `workers` processes share the work, by default one a core.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -152,13 +147,7 @@ def _read(path: Path, names: tuple[str, ...]) -> list[np.ndarray]:
 def read_shards(
     folder: str | Path, kinds: tuple[str, ...], names: tuple[str, ...], first: int | None = None
 ) -> list[np.ndarray]:
-    """Arrays of the (first) shards of some kinds, joined over the shards.
-
-    Raises
-    ------
-    FileNotFoundError, ValueError
-        If there is no shard, one is corrupt, or their images have several sizes.
-    """
+    """Arrays of the (first) shards of some kinds, joined; an error names a missing, corrupt or differently sized shard."""
     found = [path for kind in kinds for path in sorted(Path(folder).glob(f"{kind}_*.npz"))][:first]
     if not found:
         raise FileNotFoundError(f"{folder}: no shard {kinds[0]}_*.npz; make some with `python3 -m lib train generate`.")

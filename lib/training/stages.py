@@ -30,8 +30,6 @@ _SHARD = 64
 def stage_config(stage: str, *, preset: str = "best", features: int | None = None, stacks: int = 2) -> TrainingConfig:
     """How a stage of the shipped detector is trained.
 
-    Examples
-    --------
     >>> stage_config("tool").network.features
     48
     """
@@ -46,13 +44,7 @@ def stage_config(stage: str, *, preset: str = "best", features: int | None = Non
 
 
 def stage_data(stage: str, folder: str | Path, *, closeups: str = "closeups") -> tuple[Source, Samples]:
-    """Training data and validation samples of a stage from a folder of shards; `closeups` are cut from shards of this kind.
-
-    Raises
-    ------
-    FileNotFoundError, ValueError
-        If a shard is missing or corrupt.
-    """
+    """Training data and validation samples of a stage, from a folder of shards; closeups from shards of kind `closeups`."""
     if stage == "frame":
         return frame_samples(folder), frame_samples(folder, validation=True)
     if stage == "tool":

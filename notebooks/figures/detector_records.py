@@ -119,7 +119,7 @@ def few_labels_curves(table: Table) -> Figure:
         mean, error = np.array(list(by_frames.values())).T
         bars = 2 * np.nan_to_num(error)
         ax.errorbar(list(by_frames), mean, yerr=bars, color=colour, marker="o", ms=6, capsize=4, label=labels[start])
-    for row in table.where(frames=0).rows:
+    for row in table.where(frames=0, start="shipped").rows:
         ax.axhline(row["pck_0.05_percent"], color=COLOURS["baseline"], ls="--", label="shipped weights as they are")
     ax.set(xscale="log", ylim=(0, 101), xlabel="labelled frames", ylabel="PCK@0.05, %", title="How many labels?")
     counts = sorted(set(trained.columns["frames"].tolist()))

@@ -1,7 +1,17 @@
 import pytest
+import torch
 
 from lib.training.shards import write_frames
 from tests.toys import toy_images, toy_samples
+
+
+@pytest.fixture(scope="session", autouse=True)
+def one_thread():
+    """Networks as small as these gain nothing from a second thread, and wait for it on a busy machine."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
 
 
 @pytest.fixture(scope="session")
