@@ -125,13 +125,9 @@ def distances2(r: np.ndarray, A: np.ndarray, sigma_u_px: float, sigma_x_mm: floa
 
 
 def estimate_noise(
-    residuals: np.ndarray,
-    A: np.ndarray,
-    parameters: int,
-    *,
-    sigma_u_px: float | None = None,
-    sigma_x_mm: float | None = None,
-) -> tuple[float, float]:
+    residuals: np.ndarray, A: np.ndarray, parameters: int, *,
+    sigma_u_px: float | None = None, sigma_x_mm: float | None = None,
+) -> tuple[float, float]:  # fmt: skip
     """sigma_u and sigma_x from residuals (n, m) whose covariance is sigma_u^2 I + sigma_x^2 A A^T.
 
     Along the epipolar direction (n^T A = 0) the robot's error cannot show, so the residual there is sigma_u alone; the

@@ -174,19 +174,9 @@ def _spread_out(found: Calibration, usable: np.ndarray) -> Calibration:
 
 
 def _calibrate(
-    x: np.ndarray,
-    y: np.ndarray,
-    noise: np.ndarray | None,
-    *,
-    model: str,
-    weighting: str,
-    sigma_u_px: float | None,
-    sigma_x_mm: float | None,
-    ransac_px: float | None,
-    seed: int,
-    image_size_px: tuple[int, int] | None,
-    checks: bool,
-) -> Calibration:
+    x: np.ndarray, y: np.ndarray, noise: np.ndarray | None, *, model: str, weighting: str, sigma_u_px: float | None,
+    sigma_x_mm: float | None, ransac_px: float | None, seed: int, image_size_px: tuple[int, int] | None, checks: bool,
+) -> Calibration:  # fmt: skip
     """`calibrate` of complete rows x (n, 3) and y (n, m) with their covariances, (1, m, m) or (n, m, m)."""
     n, m = y.shape
     plan = Model.parse(model, m // 2)
@@ -242,35 +232,17 @@ def _calibrate(
         zoom = np.sqrt(np.abs(np.linalg.det(cameras[0].linear @ cameras[0].linear.T)) ** 0.5)
         check_order(rig.linear, np.hypot(sigma_u / zoom, sigma_x) / (spread * np.sqrt(inliers.sum() / 2)))
     return Calibration(
-        cameras=cameras,
-        rig=rig,
-        inliers=inliers,
-        cost=minimum.cost,
-        covariance=G @ parameter_covariance @ G.T,
-        parameter_covariance=parameter_covariance,
-        sigma_u_px=sigma_u,
-        sigma_x_mm=sigma_x,
-        residuals_px=residuals,
-        model=model,
-        weighting=weighting,
-        x_mm=x,
-        y_px=y,
-        covariance_px2=noise,
-        image_size_px=None if image_size_px is None else tuple(image_size_px),
-        plan=plan,
-        minimum=minimum,
-    )
+        cameras=cameras, rig=rig, inliers=inliers, cost=minimum.cost, covariance=G @ parameter_covariance @ G.T,
+        parameter_covariance=parameter_covariance, sigma_u_px=sigma_u, sigma_x_mm=sigma_x, residuals_px=residuals,
+        model=model, weighting=weighting, x_mm=x, y_px=y, covariance_px2=noise,
+        image_size_px=None if image_size_px is None else tuple(image_size_px), plan=plan, minimum=minimum,
+    )  # fmt: skip
 
 
 def _minimise(
-    plan: Model,
-    x: np.ndarray,
-    y: np.ndarray,
-    noise: np.ndarray | None,
-    weighting: str,
-    known: dict[str, float | None],
-    centre: np.ndarray | None,
-) -> tuple[Fit, tuple[float, float], tuple[np.ndarray, float]]:
+    plan: Model, x: np.ndarray, y: np.ndarray, noise: np.ndarray | None, weighting: str,
+    known: dict[str, float | None], centre: np.ndarray | None,
+) -> tuple[Fit, tuple[float, float], tuple[np.ndarray, float]]:  # fmt: skip
     """The minimum over inliers, the noise levels (sigma_u, sigma_x), and the variances that weighed it."""
     m = y.shape[1]
     moments = Moments.of(x, y)

@@ -70,14 +70,9 @@ def with_offsets(data: Correspondences, offsets: LandmarkOffsets | None) -> Corr
 
 
 def estimate_offsets(
-    fit: Callable[[np.ndarray, np.ndarray], Calibration],
-    x: np.ndarray,
-    y: np.ndarray,
-    landmark: np.ndarray,
-    axes: np.ndarray | None,
-    prior_sd: float | None = None,
-    iterations: int = 20,
-) -> Calibration:
+    fit: Callable[[np.ndarray, np.ndarray], Calibration], x: np.ndarray, y: np.ndarray, landmark: np.ndarray,
+    axes: np.ndarray | None, prior_sd: float | None = None, iterations: int = 20,
+) -> Calibration:  # fmt: skip
     """The calibration with one constant offset a landmark, in the tool's axes (n, 3, 3) or (axes=None) in the images.
 
     Gauss-Newton on the offsets with the cameras eliminated: every step is a whole calibration `fit` of positions (n, 3) and

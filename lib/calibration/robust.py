@@ -33,14 +33,9 @@ def _chi2_quantile(probability: float, freedom: int) -> float:
 
 
 def consensus(
-    x: np.ndarray,
-    y: np.ndarray,
-    threshold_px: float | None,
-    rng: np.random.Generator,
-    *,
-    sigma_x_mm: float | None = None,
-    samples: int = 300,
-) -> np.ndarray:
+    x: np.ndarray, y: np.ndarray, threshold_px: float | None, rng: np.random.Generator, *,
+    sigma_x_mm: float | None = None, samples: int = 300,
+) -> np.ndarray:  # fmt: skip
     """Rows (n,) bool of x (n, 3) mm and y (n, m) px that agree on one pair of affine cameras.
 
     `threshold_px` is the largest reprojection distance of a row in any image; None measures the noise and decides by it.
