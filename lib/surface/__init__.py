@@ -1,10 +1,10 @@
 """Robust bicubic B-spline surfaces from semi-dense stereo points (paper Sec. IV-B).
 
-`fit_surface` solves Eq. (6); what it returns evaluates position, normal, curvature, uncertainty and the distance of a
+`fit_surface` solves Eq. (6); what it returns evaluates position, normal, uncertainty and the distance of a
 tool.  `surface_mesh`, `depth_map` and the `save_` functions take it to other programs.
 """
 
-from lib.surface.bspline import BSplineSurface, Curvature, ToolDistance
+from lib.surface.bspline import BSplineSurface, ToolDistance
 from lib.surface.export import (
     Mesh,
     depth_map,
@@ -24,7 +24,6 @@ from lib.surface.reconstruct import EPIPOLAR_SIGMAS, Reconstruction, epipolar_in
 __all__ = [
     "EPIPOLAR_SIGMAS",
     "BSplineSurface",
-    "Curvature",
     "Mesh",
     "Reconstruction",
     "SplineGrid",

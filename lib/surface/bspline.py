@@ -1,39 +1,21 @@
-"""Surfaces R^2 -> R^3 as bicubic B-splines: position, normal, curvature, uncertainty, distance of a tool (Sec. IV-B).
+"""Surfaces R^2 -> R^3 as bicubic B-splines: position, normal, uncertainty, distance of a tool (Sec. IV-B).
 
 The parameter is the left image point u = (x, y) px.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from lib.cameras import AffineCamera
-from lib.geometry import RigidTransform, points
+from lib.geometry import points
 from lib.surface.fit import SurfaceFit
 from lib.surface.grid import SplineGrid, cubic_basis
 
-__all__ = ["BSplineSurface", "Curvature", "ToolDistance"]
-
-
-@dataclass(frozen=True)
-class Curvature:
-    """Principal curvatures (n,) per mm, `minimum` <= `maximum`; positive where the surface is a bowl to the camera."""
-
-    minimum: np.ndarray
-    maximum: np.ndarray
-
-    @property
-    def mean(self) -> np.ndarray:
-        """Mean curvature (n,) per mm."""
-        return (self.minimum + self.maximum) / 2
-
-    @property
-    def gaussian(self) -> np.ndarray:
-        """Gaussian curvature (n,) per mm^2."""
-        return self.minimum * self.maximum
+__all__ = ["BSplineSurface", "ToolDistance"]
 
 
 @dataclass(frozen=True)
@@ -117,18 +99,6 @@ class BSplineSurface:
         normal = np.cross(self.derivative(u, (0, 1)), self.derivative(u, (1, 0)))
         return normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
-    def curvature(self, u: ArrayLike) -> Curvature:
-        """Principal curvatures from the first and second fundamental forms (do Carmo, Sec. 3-3), analytic."""
-        d_x, d_y = self.derivative(u, (1, 0)), self.derivative(u, (0, 1))
-        normal = np.cross(d_y, d_x)
-        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        E, F, G = (np.einsum("nk,nk->n", a, b) for a, b in ((d_x, d_x), (d_x, d_y), (d_y, d_y)))
-        L, M, N = (np.einsum("nk,nk->n", self.derivative(u, order), normal) for order in ((2, 0), (1, 1), (0, 2)))
-        area = E * G - F * F
-        mean = (E * N - 2 * F * M + G * L) / (2 * area)
-        spread = np.sqrt(np.maximum(mean**2 - (L * N - M * M) / area, 0.0))
-        return Curvature(mean - spread, mean + spread)
-
     def bending_energy(self) -> float:
         """Integral of |d^2 Psi / du^2|^2 over the domain in mm^2 / px^2, the regulariser of paper Eq. (6)."""
         coefficients = self.grid.flatten(self.control_points_mm)
@@ -185,14 +155,6 @@ class BSplineSurface:
         ok = ~beyond
         along_normal[ok] = np.einsum("nk,nk->n", x[ok] - nearest[ok], self.normal(u[ok]))
         return ToolDistance(along_view, along_normal, nearest, u)
-
-    def transformed(self, target_from_source: RigidTransform) -> BSplineSurface:
-        """The surface in another frame: a rigid motion of the control points is a rigid motion of the surface.
-
-        The fit's report stays with the original.
-        """
-        moved = target_from_source.apply(self.control_points_mm.reshape(-1, 3)).reshape(self.control_points_mm.shape)
-        return replace(self, control_points_mm=moved, fit=None)
 
     @property
     def objective(self) -> float:

@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lib.cameras import AffineCamera
-from lib.geometry import points
+from lib.geometry import finite_points
 from lib.surface.bspline import BSplineSurface
 from lib.surface.fit import SurfaceFit
 from lib.surface.grid import SplineGrid
-from lib.surface.solver import L1Problem, L1Solution, interior_point, least_squares, reweighted
+from lib.surface.solver import L1Problem, L1Solution, interior_point, least_squares
 
 __all__ = ["REJECT_MEDIANS", "fit_surface", "held_out_errors"]
 
@@ -39,7 +39,6 @@ def fit_surface(
     control: tuple[int, int] = (20, 20),
     smoothness: float | None = None,
     reject_mm: float | None = None,
-    weights: ArrayLike | None = None,
     covariance_mm2: ArrayLike | None = None,
     camera: AffineCamera | None = None,
     method: Literal["interior_point", "least_squares"] = "interior_point",
@@ -66,9 +65,6 @@ def fit_surface(
     reject_mm:
         Bound on the L1 norm of a point's residual.  None is `REJECT_MEDIANS` times the median L1 norm at the first
         fit; infinity keeps all.
-    weights:
-        (n,) factors of the points' norms, at least 0; points of weight 0, such as those outside the field of view or
-        under a glint, are not used, and may be NaN.
     covariance_mm2:
         Covariance of the points, (3, 3) or (n, 3, 3).  Eq. (6) is then taken in whitened coordinates: along the
         principal axes of the mean covariance, each residual divided by its own standard deviation, the bending of an
@@ -83,8 +79,8 @@ def fit_surface(
     tolerance:
         Duality gap at which the solver stops, relative to the objective.
     quick:
-        Choose the smoothness with five Newton steps a fit and fewer held-out points (1000), and reject points at a fit
-        by reweighted least squares, within a percent of the minimum; only the final fit is solved to `tolerance`.
+        Choose the smoothness and reject points at fits of five Newton steps, within some percent of the minimum, and with
+        fewer held-out points (1000); only the final fit is solved to `tolerance`.
 
     Raises
     ------
@@ -92,7 +88,7 @@ def fit_surface(
         For shapes or counts that do not fit, NaN, negative smoothness, points that do not determine a surface: fewer
         in the domain than a quarter of the control points, or than 16.
     """
-    data = _prepared(u, x_mm, domain, control, weights, covariance_mm2, camera)
+    data = _prepared(u, x_mm, domain, control, covariance_mm2, camera)
     if smoothness is not None:
         smoothness = _checked_smoothness(smoothness)
     if reject_mm is not None and not reject_mm > 0:
@@ -121,7 +117,7 @@ def fit_surface(
 
     rough = quick and method != "least_squares"
     exact = partial(solver, tolerance=tolerance)
-    problem, solution, surface = solve(used, reweighted if rough else exact)
+    problem, solution, surface = solve(used, _searcher(method, quick) if rough else exact)
     norm = np.abs(residuals(surface)).sum(axis=1)
     if reject_mm is None:
         reject_mm = REJECT_MEDIANS * float(np.median(norm[used]))
@@ -159,7 +155,6 @@ def held_out_errors(
     *,
     domain: tuple[float, float, float, float],
     control: tuple[int, int] = (20, 20),
-    weights: ArrayLike | None = None,
     covariance_mm2: ArrayLike | None = None,
     camera: AffineCamera | None = None,
     method: Literal["interior_point", "least_squares"] = "interior_point",
@@ -168,14 +163,14 @@ def held_out_errors(
 
     `fit_surface` chooses by it; the other arguments are as there.
     """
-    data = _prepared(u, x_mm, domain, control, weights, covariance_mm2, camera)
+    data = _prepared(u, x_mm, domain, control, covariance_mm2, camera)
     error = _HeldOut(data, _searcher(method), _FOLDS)
     return np.array([error(_checked_smoothness(mu)) for mu in np.atleast_1d(smoothness)])
 
 
 @dataclass(frozen=True)
 class _Data:
-    """Checked arguments of a fit: n points with k outputs, `used` (n,) of them in the domain and with weight."""
+    """Checked arguments of a fit: n points with k outputs, `used` (n,) of them in the domain."""
 
     grid: SplineGrid
     u: np.ndarray
@@ -192,17 +187,17 @@ def _prepared(
     x_mm: ArrayLike,
     domain: tuple[float, float, float, float],
     control: tuple[int, int],
-    weights: ArrayLike | None,
     covariance_mm2: ArrayLike | None,
     camera: AffineCamera | None,
 ) -> _Data:
     grid = SplineGrid(domain, control)
-    u, x, weights = _checked(u, x_mm, weights)
-    used = (weights > 0) & grid.inside(u)
+    u, x = finite_points(u, 2, "u"), finite_points(x_mm, 3, "x_mm")
+    if len(u) != len(x):
+        raise ValueError(f"u, x_mm: {len(u)} image points and {len(x)} points; they come in pairs.")
+    used = grid.inside(u)
     _check_enough(u[used], len(u), grid)
-    axes, values, norms = _outputs(x, weights, covariance_mm2, camera)
-    stiffness = norms[used].sum(axis=0) / weights[used].sum()
-    return _Data(grid, u, x, used, axes, values, norms, stiffness)
+    axes, values, norms = _outputs(x, covariance_mm2, camera)
+    return _Data(grid, u, x, used, axes, values, norms, norms[used].mean(axis=0))
 
 
 def _checked_smoothness(smoothness: float) -> float:
@@ -218,23 +213,6 @@ def _searcher(method: str, quick: bool = False) -> Callable[..., L1Solution]:
     return partial(interior_point, max_iterations=5) if quick else partial(interior_point, tolerance=1e-3)
 
 
-def _checked(u: ArrayLike, x_mm: ArrayLike, weights: ArrayLike | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    u, x = points(u, 2, "u"), points(x_mm, 3, "x_mm")
-    if len(u) != len(x):
-        raise ValueError(f"u, x_mm: {len(u)} image points and {len(x)} points; they come in pairs.")
-    weights = np.ones(len(u)) if weights is None else np.asarray(weights, dtype=np.float64)
-    if weights.shape != (len(u),) or not (np.isfinite(weights) & (weights >= 0)).all():
-        raise ValueError(f"weights: expected ({len(u)},) numbers >= 0, got shape {weights.shape}.")
-    for values, name in ((u, "u"), (x, "x_mm")):
-        bad = np.flatnonzero(~np.isfinite(values).all(axis=1) & (weights > 0))
-        if bad.size:
-            raise ValueError(
-                f"{name}: {bad.size} of {len(values)} rows are not finite (the first is row {bad[0]}). Drop them, or "
-                "give them weight 0."
-            )
-    return u, x, weights
-
-
 def _least(grid: SplineGrid) -> int:
     return max(16, grid.size // 4)
 
@@ -242,7 +220,7 @@ def _least(grid: SplineGrid) -> int:
 def _check_enough(u: np.ndarray, n_given: int, grid: SplineGrid) -> None:
     if len(u) < _least(grid):
         raise ValueError(
-            f"u: {len(u)} of {n_given} points lie in the domain with weight, and a grid of {grid.control[0]} x "
+            f"u: {len(u)} of {n_given} points lie in the domain, and a grid of {grid.control[0]} x "
             f"{grid.control[1]} control points needs {_least(grid)} or more. Match more points, give fewer control "
             "points, or check that domain and u are both px of the left image."
         )
@@ -252,7 +230,7 @@ def _check_enough(u: np.ndarray, n_given: int, grid: SplineGrid) -> None:
 
 
 def _outputs(
-    x: np.ndarray, weights: np.ndarray, covariance_mm2: ArrayLike | None, camera: AffineCamera | None
+    x: np.ndarray, covariance_mm2: ArrayLike | None, camera: AffineCamera | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(axes (k, 3), values (n, k) = x along them, weights (n, k) of their absolute residuals)."""
     if camera is not None and not isinstance(camera, AffineCamera):
@@ -263,21 +241,18 @@ def _outputs(
     n = len(x)
     axes = np.eye(3) if camera is None else camera.viewing_direction[None]
     if covariance_mm2 is None:
-        return axes, x @ axes.T, np.repeat(weights[:, None], len(axes), axis=1)
+        return axes, x @ axes.T, np.ones((n, len(axes)))
     covariance = np.asarray(covariance_mm2, dtype=np.float64)
     if covariance.shape not in {(3, 3), (n, 3, 3)}:
         raise ValueError(f"covariance_mm2: expected (3, 3) or ({n}, 3, 3), got {covariance.shape}.")
     covariance = np.broadcast_to(covariance, (n, 3, 3))
-    used = weights > 0
-    if camera is None:
-        mean = covariance[used].mean(axis=0)
-        axes = np.linalg.eigh(mean)[1].T if np.isfinite(mean).all() else axes
+    if camera is None and np.isfinite(covariance).all():
+        axes = np.linalg.eigh(covariance.mean(axis=0))[1].T
     variance = np.einsum("ki,nij,kj->nk", axes, covariance, axes)
-    if not (np.isfinite(variance[used]) & (variance[used] > 0)).all():
-        raise ValueError("covariance_mm2: must be finite and positive definite for every point that has weight.")
-    inverse_sigma = np.zeros(variance.shape)
-    inverse_sigma[used] = variance[used] ** -0.5
-    return axes, x @ axes.T, weights[:, None] * inverse_sigma / inverse_sigma[used].mean()
+    if not (np.isfinite(variance) & (variance > 0)).all():
+        raise ValueError("covariance_mm2: must be finite and positive definite for every point.")
+    inverse_sigma = variance**-0.5
+    return axes, x @ axes.T, inverse_sigma / inverse_sigma.mean()
 
 
 def _rays(u: np.ndarray, camera: AffineCamera) -> np.ndarray:

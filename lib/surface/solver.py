@@ -19,7 +19,7 @@ from threadpoolctl import ThreadpoolController
 
 from lib.surface.grid import SplineGrid, cubic_basis
 
-__all__ = ["UNHELD", "L1Problem", "L1Solution", "interior_point", "least_squares", "reweighted"]
+__all__ = ["UNHELD", "L1Problem", "L1Solution", "interior_point", "least_squares"]
 
 UNHELD = (
     "smoothness: too small to hold the control points that have no data near them; increase it, or use fewer control "
@@ -324,49 +324,6 @@ def _cholesky(band: np.ndarray) -> np.ndarray | None:
     """Lower factor of a banded matrix, which is overwritten; None where it is not positive definite in double precision."""
     factor, info = dpbtrf(band, lower=1, overwrite_ab=1)
     return None if info else factor
-
-
-def reweighted(
-    problem: L1Problem,
-    x: np.ndarray,
-    mu: float | np.ndarray,
-    weights: np.ndarray | None = None,
-    *,
-    tolerance: float = 5e-3,
-    max_iterations: int = 12,
-) -> L1Solution:
-    """Iteratively reweighted least squares: within about a percent of the minimum, in a third of the time.
-
-    A residual counts as r^2 / (2 max(|r|, half the median)), so it is Huber's estimate that it comes near.  It stops
-    when a step takes less than `tolerance` off the objective, and proves nothing: `duality_gap` is NaN.
-    """
-    w = np.ones_like(x) if weights is None else weights
-    k = x.shape[1]
-    coefficients, objective, dual = np.empty((problem.grid.size, k)), np.full(k, np.inf), np.empty_like(x)
-    B, B_T, R = problem.design, problem.design_T, problem.bending
-    steps = 0
-    for j, mu_j in enumerate(np.broadcast_to(mu, k)):
-        w_j = np.ascontiguousarray(w[:, j])
-        centre = w_j @ x[:, j] / w_j.sum()
-        x_j = x[:, j] - centre
-        size = np.full(len(x), max(np.abs(x_j).max(), np.finfo(float).tiny))
-        for iteration in range(1, max_iterations + 1):
-            steps = max(steps, iteration)
-            D = w_j / size
-            with _one_blas_thread():
-                factor = _cholesky(problem.normal_band(D, 2 * mu_j))
-                if factor is None:
-                    raise ValueError(UNHELD)
-                c = _solve(factor, B_T @ (D * x_j))
-            residual = B @ c - x_j
-            dual[:, j] = D * residual
-            size = np.abs(residual)
-            before, objective[j] = objective[j], w_j @ size + mu_j * (c @ (R @ c))
-            if objective[j] >= (1.0 - tolerance) * before:
-                break
-            size = np.maximum(size, max(np.median(size) / 2, np.finfo(float).tiny))
-        coefficients[:, j] = c + centre
-    return L1Solution(coefficients, objective, np.full(k, np.nan), dual, steps)
 
 
 def least_squares(
