@@ -175,17 +175,13 @@ def _read_header(path: Path) -> dict:
         raise ValueError(f"{path}: not valid TOML ({error}). Save it as UTF-8 text.") from None
     kinds = _REQUIRED | {key: type(value) for key, value in (_DEFAULTS | _FIXED).items()}
     if unknown := sorted(set(content) - set(kinds)):
-        raise ValueError(
-            f"{path}: unknown key {', '.join(unknown)}. Known: {', '.join(kinds)}; own notes go in [details]."
-        )
+        known = f"Known: {', '.join(kinds)}; own notes go in [details]"
+        raise ValueError(f"{path}: unknown key {', '.join(unknown)}. {known}.")
     if missing := sorted(set(_REQUIRED) - set(content)):
         raise ValueError(f"{path}: {', '.join(missing)} is missing.")
     for key, value in content.items():
-        if kinds[key] is float:
-            valid = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
-        else:
-            valid = isinstance(value, kinds[key])
-        if not valid:
+        number = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+        if not (number if kinds[key] is float else isinstance(value, kinds[key])):
             raise ValueError(f"{path}: {key} = {value!r} should be a {kinds[key].__name__}.")
     for key, unit in content.get("units", {}).items():
         if UNITS.get(key) != unit:
@@ -193,19 +189,14 @@ def _read_header(path: Path) -> dict:
     header = {key: value for key, value in (_DEFAULTS | content).items() if key not in _FIXED}
     size, fps, readout_s = header["image_size_px"], header["fps"], header["readout_s"]
     whole = len(size) == 2 and all(isinstance(v, int) and not isinstance(v, bool) and v > 1 for v in size)
+    accuracy_mm, names = header["robot_accuracy_mm"], content.get("skeleton", list(LANDMARKS))
     for valid, problem in (
         (content.get("format", FORMAT) == FORMAT, f"format = {content.get('format')!r}, expected {FORMAT!r}"),
-        (
-            content.get("skeleton", list(LANDMARKS)) == list(LANDMARKS),
-            f"skeleton = {content.get('skeleton')}, expected {list(LANDMARKS)} in this order",
-        ),
+        (names == list(LANDMARKS), f"skeleton = {names}, expected {list(LANDMARKS)} in this order"),
         (whole, f"image_size_px = {size} should be [width, height] in whole pixels"),
         (fps > 0, f"fps = {fps} must be positive"),
         (fps <= 0 or 0 <= readout_s <= 1.001 / fps, f"readout_s = {readout_s} must lie between 0 and one frame"),
-        (
-            0 <= header["robot_accuracy_mm"] < 1,
-            f"robot_accuracy_mm = {header['robot_accuracy_mm']} is not plausible in mm (10 um is 0.010)",
-        ),
+        (0 <= accuracy_mm < 1, f"robot_accuracy_mm = {accuracy_mm} is not plausible in mm (10 um is 0.010)"),
     ):
         if not valid:
             raise ValueError(f"{path}: {problem}.")
@@ -240,10 +231,8 @@ def _read_kinematics(path: Path) -> Kinematics:
     empty = np.isnan(x)
     partial = np.flatnonzero((empty.any(axis=2) & ~empty.all(axis=2)).any(axis=1))
     if partial.size:
-        raise ValueError(
-            f"{path}, line {partial[0] + 2}: a landmark has some coordinates only; leave all three cells of a dropped "
-            "landmark empty."
-        )
+        cure = "leave all three cells of a dropped landmark empty"
+        raise ValueError(f"{path}, line {partial[0] + 2}: a landmark has some coordinates only; {cure}.")
     reach = np.linalg.norm(x[:, 1:] - x[:, :1], axis=2)
     if not np.isfinite(reach).any():
         raise ValueError(f"{path}: no row holds the base and a tip; the kinematics are empty.")

@@ -74,10 +74,8 @@ def _number(cell: str, path: Path, line: int, name: str) -> float:
     except ValueError:
         value = math.inf
     if text and not math.isfinite(value):
-        raise ValueError(
-            f"{path}, line {line}, column {name}: {text!r} is not a finite number. Leave the cell empty where a "
-            "value is missing."
-        )
+        place = f"{path}, line {line}, column {name}"
+        raise ValueError(f"{place}: {text!r} is not a finite number. Leave the cell of a missing value empty.")
     return value
 
 

@@ -79,17 +79,10 @@ class RecordingWriter:
         self.folder = self.target.with_name(f"{self.target.name}.{os.getpid()}-{os.urandom(3).hex()}.partial")
         self.fps, self.image_size_px = float(fps), (int(image_size_px[0]), int(image_size_px[1]))
         self._suffix, self._quality = suffix, int(jpeg_quality)
-        self._header = {
-            "format": FORMAT,
-            "name": name,
-            "description": description,
-            "fps": self.fps,
-            "image_size_px": list(self.image_size_px),
-            "skeleton": list(LANDMARKS),
-            "robot_accuracy_mm": float(robot_accuracy_mm),
-            "readout_s": float(readout_s),
-            "offset_s": float(offset_s),
-        }
+        self._header = {"format": FORMAT, "name": name, "description": description, "fps": self.fps}
+        self._header |= {"image_size_px": list(self.image_size_px), "skeleton": list(LANDMARKS)}
+        self._header["robot_accuracy_mm"] = float(robot_accuracy_mm)
+        self._header |= {"readout_s": float(readout_s), "offset_s": float(offset_s)}
         self._details = dict(details or {})
         self._time_s: list[float] = []
         self._kinematics: list[np.ndarray] = []

@@ -113,9 +113,9 @@ def simulate_correspondences(
 
     Example
     -------
-    >>> sweep = simulate_correspondences(50, rng=np.random.default_rng(0))
-    >>> len(sweep), float(np.std(sweep.true_rig.left.project(sweep.true_x_mm) - sweep.u_left).round(1))
-    (50, 1.5)
+    >>> sweep = simulate_correspondences(500, rng=np.random.default_rng(0), sigma_u_px=2.0)
+    >>> len(sweep.complete), float(np.std(sweep.true_rig.left.project(sweep.true_x_mm) - sweep.u_left).round(1))
+    (500, 2.0)
     """
     rig = rig or reference_rig(robot_from_microscope=robot_from_microscope)
     true_x = robot_from_microscope.apply(rng.uniform(-1, 1, (n, 3)) * half_size_mm)
