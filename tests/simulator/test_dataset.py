@@ -1,7 +1,5 @@
 """The data set's command: progress, parallel work, resuming after a kill, the same files for the same seed."""
 
-import contextlib
-import io
 import re
 import shutil
 import subprocess
@@ -13,27 +11,29 @@ import numpy as np
 import pytest
 
 from lib import paths
+from lib.parallel import Finished
 from lib.recordings import Recording
 from lib.simulator.dataset import main, make_dataset, sequence_design, sequence_name
 from notebooks.figures.data import landmark_counts
 
-OPTIONS = {"n_pairs": 2, "duration_s": 4.0, "shrink": 16}  # 120 x 67 px
-WORDS = ["--pairs", "2", "--duration", "4", "--shrink", "16"]
+OPTIONS = {"n_pairs": 2, "duration_s": 1.0, "shrink": 16}  # 120 x 67 px
+WORDS = ["--pairs", "2", "--duration", "1", "--shrink", "16"]
 NAMES = {sequence_name(k) for k in range(10)}
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory):
-    """Two pairs of each sequence, by two processes, and what the command said; treated as read-only."""
-    folder, said = tmp_path_factory.mktemp("dataset") / "made", (io.StringIO(), io.StringIO())
-    with contextlib.redirect_stdout(said[0]), contextlib.redirect_stderr(said[1]):
-        assert main(["--folder", str(folder), "--workers", "2", *WORDS]) == 0
-    return folder, said[0].getvalue(), said[1].getvalue()
+def one_by_one(function, jobs, **options):
+    for path, arguments in jobs.items():
+        yield Finished(path, function(path, *arguments))
 
 
 @pytest.fixture(scope="module")
-def made(run):
-    return run[0]
+def made(tmp_path_factory):
+    """Two pairs of each sequence, made in this process; treated as read-only."""
+    folder = tmp_path_factory.mktemp("dataset") / "made"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("lib.simulator.dataset.run_jobs", one_by_one)
+        assert make_dataset(folder, **OPTIONS) == [folder / sequence_name(k) for k in range(10)]
+    return folder
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -53,7 +53,7 @@ def test_splits_by_eye_and_tool(made):
     assert counts["base"]["visible"] > 20 and "in_glint" in counts["tip_1"]
 
 
-def test_a_killed_run_resumes_to_the_same_files(made, tmp_path):
+def test_a_killed_run_resumes_to_the_same_files(made, tmp_path, capfd):
     """kill -9 in the middle, once the workers are at it; another number of workers finishes the rest."""
     folder = tmp_path / "killed"
     command = [sys.executable, "-m", "lib", "simulate", "--folder", str(folder), *WORDS]
@@ -68,16 +68,13 @@ def test_a_killed_run_resumes_to_the_same_files(made, tmp_path):
     kept = finished(folder)
     assert kept < NAMES
     before = {name: (folder / name).stat().st_mtime_ns for name in kept}
-    make_dataset(folder, workers=1, **OPTIONS)
+    assert main(["--folder", str(folder), "--workers", "1", *WORDS]) == 0
     assert finished(folder) == NAMES and not any(folder.glob("*.partial"))
     assert {name: (folder / name).stat().st_mtime_ns for name in kept} == before
     assert contents(folder) == contents(made)
-
-
-def test_progress_is_counted_in_pairs_with_the_remaining_time(run):
-    _, out, err = run
-    assert "20 of 20 stereo pairs to make" in out and "s a pair" in out
-    assert re.search(r"20/20 \[\d\d:\d\d<\d\d:\d\d", err)
+    said = capfd.readouterr()  # progress is counted in pairs, with the remaining time
+    assert f"{20 - 2 * len(kept)} of 20 stereo pairs to make" in said.out and "s a pair" in said.out
+    assert re.search(r"20/20 \[\d\d:\d\d<\d\d:\d\d", said.err)
 
 
 def test_sequences_depend_on_seed_and_index_alone():

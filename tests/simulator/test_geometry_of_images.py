@@ -15,6 +15,7 @@ from lib.simulator.population import random_forceps, random_pose
 from lib.simulator.raster import rasterise
 from lib.simulator.render import render_view
 from lib.simulator.texture import smooth_noise
+from lib.simulator.tool import tool_in_view
 from lib.simulator.window import Window, surface_grid
 from notebooks.figures.data import ray_cast_depth
 from notebooks.figures.effects import PLAIN
@@ -49,7 +50,7 @@ def window(camera: AffineCamera, u: np.ndarray, size: int) -> Window:
 
 
 def tip_distances(rng: np.random.Generator, n: int, min_pitch_rad: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """Distance (2 n,) px of each tip from the edge of its jaw on a grid of 1/16 px, and what the renderer's view says
+    """Distance (2 n,) px of each tip from the edge of its jaw on a grid of 1/16 px, and what the renderer says
     of its visibility; poses all over the range that `Pose` allows, from `min_pitch_rad`."""
     factor, size, distances, visibilities = 16, 16, [], []
     for i in range(n):
@@ -64,7 +65,7 @@ def tip_distances(rng: np.random.Generator, n: int, min_pitch_rad: float = 0.0) 
         for k in (1, 2):
             tip = forceps.landmarks(pose)[k]
             shown = window(whole, whole.project(tip)[0], size)
-            view = render_view(Plane(4.0), PLAIN, shown, forceps=forceps, pose=pose, factor=3)
+            view = tool_in_view(shown, forceps, pose, None, factor=3)
             R, zoom = shown.camera.resect().R, shown.camera.resect().K[0, 0]
             seen = np.column_stack([shown.camera.project(centres) / zoom, centres @ R[2]])
             raster = rasterise(seen, radii, chains, zoom=zoom, size_px=(size, size), factor=factor)

@@ -76,7 +76,7 @@ def test_truth_says_which_landmarks_saturated_light_touches(tmp_path):
                 assert told[k, landmark] == ((bright_channels >= 2).any() or mask[near][..., 1].any())
     assert 0 < np.mean([truth.in_glint_left, truth.in_glint_right]) < 1
     matt = replace(design, eye=replace(EYE, gloss=0.0), microscope=replace(SMALL, brightness=0.2))
-    dim = simulate(tmp_path / "dim", matt, **options)
+    dim = simulate(tmp_path / "dim", matt, **(options | {"n_frames": 2}))
     assert not dim.truth.in_glint_left.any()
     table = dim.truth.folder / "landmarks.csv"
     table.write_text("\n".join(",".join(line.split(",")[:28]) for line in table.read_text().splitlines()) + "\n")
@@ -100,9 +100,9 @@ def test_surface_truth_is_seen_at_its_pixels(made):
 
 
 def test_the_same_seed_gives_the_same_files(made, tmp_path):
-    design = Design(EYE, microscope=SMALL, motion="surgeon", duration_s=4.0)
+    design = Design(EYE, microscope=SMALL, motion="surgeon", duration_s=2.0)
     folders = [
-        simulate(tmp_path / folder, design, seed=seed, name="r", n_frames=2, progress=False).folder
+        simulate(tmp_path / folder, design, seed=seed, name="r", n_frames=1, progress=False).folder
         for folder, seed in (("a", 1), ("b", 1), ("c", 2))
     ]
     files = [{p.relative_to(f): p.read_bytes() for p in sorted(f.rglob("*.[jc]*")) if p.is_file()} for f in folders]
@@ -123,7 +123,7 @@ def test_tremor_is_physiological():
     forceps = Forceps()
     still = Motion(forceps, EYE, kind="surgeon", seed=3, tremor_mm=0.0)
     shaky = Motion(forceps, EYE, kind="surgeon", seed=3, tremor_mm=0.15)
-    time = np.arange(0, 5, 1 / 200)
+    time = np.arange(0, 4, 1 / 200)
     tremor = np.array([np.subtract(shaky.pose(t).base_mm, still.pose(t).base_mm) for t in time])
     assert 0.1 < np.ptp(tremor[:, 0]) < 0.2
     spectrum = np.abs(np.fft.rfft(tremor[:, 0] * np.hanning(len(time)))) ** 2
