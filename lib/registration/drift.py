@@ -32,15 +32,8 @@ class DriftMonitor:
         of one frame, below threshold + slack so that a single bad detection raises no alarm.  With the defaults a false
         alarm comes less than once in a million frames, once in ten thousand where the noise is 10 % larger than stated.
 
-    Attributes
-    ----------
-    statistic, history:
-        S after the last frame; (chi2, degrees of freedom, S) of the last 1000 frames.
-
-    Raises
-    ------
-    ValueError
-        For a covariance that is not positive definite, a negative sigma_x_mm, or levels that make no test.
+    `statistic` is S after the last frame, `history` has (chi2, degrees of freedom, S) of the last 1000 frames.  A
+    covariance that is not positive definite raises a ValueError: it would hide every drift.
 
     Examples
     --------
@@ -71,11 +64,6 @@ class DriftMonitor:
     def reset(self, rig: StereoRig) -> None:
         """Go on with another rig, from a clean slate; `history` stays."""
         self.rig, self.statistic = rig, 0.0
-
-    @property
-    def alarm(self) -> bool:
-        """True while the statistic is above the threshold."""
-        return self.statistic > self.threshold
 
     def update(
         self,
@@ -111,4 +99,4 @@ class DriftMonitor:
             score = (np.cbrt(chi2 / freedom) - (1.0 - spread)) / np.sqrt(spread)
             self.statistic = max(0.0, self.statistic + min(score, self.cap) - self.slack)
         self.history.append((chi2, freedom, self.statistic))
-        return self.alarm
+        return self.statistic > self.threshold

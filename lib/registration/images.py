@@ -1,9 +1,8 @@
 """Registration in the images: maximum likelihood, for both cameras together or each camera alone.
 
-Triangulation stretches pixel noise along the viewing direction, and Eq. (7) weighs that direction like the others.
-Aligning the projections weighs every pixel by its own noise, and uses landmarks that only one camera sees.  With
-S = motion^-1, moved cameras see u = project(S x).  A small rotation and shift of S x change u by J [-[S x]_x, I], where
-J is the derivative of the projection.
+Triangulation stretches pixel noise along the viewing direction, and Eq. (7) weighs that direction like the others.  In
+the images every pixel is weighed by its own noise, and landmarks that only one camera sees count.  With S = motion^-1,
+moved cameras see u = project(S x); a small rotation and shift of S x change u by J [-[S x]_x, I], J = du / dx.
 """
 
 from __future__ import annotations
@@ -42,6 +41,7 @@ def register_images(
 ) -> Registration:
     """The motion of a rig whose cameras moved together, by maximum likelihood in the images.
 
+    Like ``register(triangulated, x_mm)`` it takes points of the stale rig to the robot frame.
     Minimises sum r^T C^-1 r over the six parameters of the motion, with r = u - rig.project(motion^-1 x) and
     C = covariance_px2 + sigma_x^2 A A^T, by damped Gauss-Newton steps.
 
@@ -60,11 +60,6 @@ def register_images(
     loss:
         "robust" assumes heavy tails (Student t with 4 degrees of freedom), so that gross detection errors lose
         their weight.
-
-    Returns
-    -------
-    Registration
-        `transform` is the motion: stale rig's frame to robot frame, as with ``register(triangulated, x_mm)``.
 
     Raises
     ------
@@ -86,17 +81,10 @@ def register_images(
 class MovedCameras:
     """Which cameras moved, and the rig as it is now.
 
-    Attributes
-    ----------
-    rig:
-        Projections as they are now.
-    moved:
-        "none", "together", "left", "right" or "apart".
-    left, right:
-        Motion of each camera (the same one for "together"), None for one that stayed.  An affine camera alone does not
-        show the shift along its viewing direction: that is left at zero, and its variance here is zero.
-    bic:
-        Bayesian information criterion of each hypothesis; the smallest is chosen.
+    `moved` is "none", "together", "left", "right" or "apart", and `rig` has the projections as they are now.  `left` and
+    `right` are the motions of the cameras (the same one for "together"), None for one that stayed.  An affine camera
+    alone does not show the shift along its viewing direction: that is left at zero, and its variance is zero.  `bic` is
+    the Bayesian information criterion of each hypothesis; the smallest is chosen.
     """
 
     rig: StereoRig
@@ -114,7 +102,6 @@ def identify_motion(
     *,
     covariance_px2: ArrayLike | None = None,
     sigma_x_mm: float = 0.0,
-    loss: Loss = "robust",
 ) -> MovedCameras:
     """Which cameras moved, and how: the hypothesis with the smallest Bayesian information criterion.
 
@@ -122,14 +109,14 @@ def identify_motion(
     together (6), each by its own motion.  If the cameras moved apart, triangulated points are no rigid copy of the true
     ones, so Eq. (7) has no exact solution; the images have.
 
-    Arguments and errors are those of `register_images`.  The noise must be known, by `covariance_px2` or from the
-    correspondences: it decides whether a hypothesis explains the data.
+    Arguments and errors are those of `register_images`, and the loss is robust.  The noise must be known, by
+    `covariance_px2` or from the correspondences: it decides whether a hypothesis explains the data.
     """
     observed = _Observed.of(rig, data, u_left, u_right, covariance_px2, sigma_x_mm)
     if not observed.scale_known:
         raise ValueError("covariance_px2: give the noise of the detections; it decides which hypothesis explains them.")
-    together = _register_both(rig, observed, loss)
-    left, right = (_register_one(rig, observed, side, loss) for side in (0, 1))
+    together = _register_both(rig, observed, "robust")
+    left, right = (_register_one(rig, observed, side) for side in (0, 1))
     n_left, n_right = (_parameters(camera) for camera in (rig.left, rig.right))
     hypotheses = {
         "none": (None, None, 0),
@@ -138,11 +125,10 @@ def identify_motion(
         "right": (None, right, n_right),
         "apart": (left, right, n_left + n_right),
     }
-    stay = RigidTransform.identity()
-    rigs, bic = {}, {}
+    stay, rigs, bic = RigidTransform.identity(), {}, {}
     for name, (*motions, parameters) in hypotheses.items():
         rigs[name] = rig.moved(*(stay if motion is None else motion.transform for motion in motions))
-        energy, _ = _evaluate(rigs[name], observed, loss, stay)
+        energy, _ = _evaluate(rigs[name], observed, "robust", stay)
         bic[name] = 2 * energy + parameters * np.log(2 * observed.seen.sum())
     best = min(bic, key=bic.__getitem__)
     return MovedCameras(rigs[best], best, *hypotheses[best][:2], bic)
@@ -189,21 +175,18 @@ class _Observed:
 def _register_both(rig: StereoRig, data: _Observed, loss: Loss) -> Registration:
     points = rig.triangulate(data.y[:, :2], data.y[:, 2:])
     both = data.seen.all(axis=1) & np.isfinite(points.x_mm).all(axis=1)
-    # No motion of the whole rig breaks the epipolar constraint, but wrong detections do.
-    distance = np.abs(points.epipolar_px)
-    gated = both & (distance <= (3.5 * 1.4826 * np.median(distance[both]) if both.any() else 0.0))
     starts = [RigidTransform.identity()]
-    for rows, kind in ((both, "squared"), (gated, "norm"))[: 1 if loss == "squared" else 2]:
+    for kind in ("squared",) if loss == "squared" else ("squared", "norm"):
         with suppress(ValueError):  # too few landmarks in both images, or on a line
-            starts.append(register(points.x_mm[rows], data.x[rows], loss=kind).transform)
+            starts.append(register(points.x_mm[both], data.x[both], loss=kind).transform)
     return _fit(rig, data, starts, loss, 6)
 
 
-def _register_one(rig: StereoRig, data: _Observed, side: int, loss: Loss) -> Registration:
+def _register_one(rig: StereoRig, data: _Observed, side: int) -> Registration:
     check_spread(data.x[data.seen[:, side]], f"x_mm (rows seen by the {('left', 'right')[side]} camera)")
     data, parameters = replace(data, seen=data.seen & (np.arange(2) == side)), _parameters((rig.left, rig.right)[side])
     squared = _fit(rig, data, [RigidTransform.identity()], "squared", parameters)
-    return squared if loss == "squared" else _fit(rig, data, [squared.transform], loss, parameters)
+    return _fit(rig, data, [squared.transform], "robust", parameters)
 
 
 def _parameters(camera: AffineCamera | NearAffineCamera) -> int:
@@ -220,11 +203,11 @@ def _evaluate(
     except ValueError:  # the landmarks would lie behind a near-affine camera
         return np.inf, ()
     distance2 = np.einsum("ni,nij,nj->n", residual, data.information, residual)
-    if loss == "squared":
-        return 0.5 * float(distance2.sum()), (residual, distance2, np.ones(len(distance2)))
-    heavy = _FREEDOM + data.dimension
-    cost = 0.5 * float((heavy * np.log1p(distance2 / _FREEDOM)).sum())
-    return cost, (residual, distance2, heavy / (_FREEDOM + distance2))
+    cost, weights = distance2, np.ones(len(distance2))
+    if loss == "robust":
+        cost = (_FREEDOM + data.dimension) * np.log1p(distance2 / _FREEDOM)
+        weights = (_FREEDOM + data.dimension) / (_FREEDOM + distance2)
+    return 0.5 * float(cost.sum()), (residual, distance2, weights)
 
 
 def _fit(rig: StereoRig, data: _Observed, starts: list[RigidTransform], loss: Loss, parameters: int) -> Registration:
@@ -233,15 +216,13 @@ def _fit(rig: StereoRig, data: _Observed, starts: list[RigidTransform], loss: Lo
         raise ValueError(f"loss: 'squared' or 'robust', got {loss!r}.")
     stale = min((start.inverse() for start in starts), key=lambda stale: _evaluate(rig, data, loss, stale)[0])
     found = _minimum(rig, data, stale, loss, parameters)
-    for _ in range(0 if data.scale_known else 1 if loss == "squared" else 10):
+    for _ in range(0 if data.scale_known else 1 if loss == "squared" else 5):
         distance2, dimension = found.residuals[data.dimension > 0] ** 2, data.dimension[data.dimension > 0]
         mean = distance2.sum() / max(dimension.sum() - parameters, 1)
         # The median of chi^2 with 2 and 4 degrees of freedom is 1.386 and 3.357.
         scale2 = mean if loss == "squared" else np.median(distance2 / np.where(dimension > 2, 3.357, 1.386))
         data = replace(data, covariance=data.covariance * max(float(scale2), 1e-18))
         found = _minimum(rig, data, found.transform.inverse(), loss, parameters)
-        if abs(scale2 - 1.0) < 1e-6:
-            break
     return found
 
 
@@ -250,30 +231,28 @@ def _minimum(rig: StereoRig, data: _Observed, stale: RigidTransform, loss: Loss,
     used, centre = data.dimension > 0, stale.apply(data.x[data.dimension > 0]).mean(axis=0)
 
     def gradients(stale: RigidTransform, work: tuple[np.ndarray, ...]) -> tuple[np.ndarray, np.ndarray]:
-        """Information (6, 6), and the gradient (n, 6) of each row."""
-        residual, _, weights = work
-        x = stale.apply(data.x)
+        """Of each row: information (n, 6, 6) and gradient (n, 6)."""
+        x, (residual, _, weights) = stale.apply(data.x), work
         J = rig.jacobian(x) @ motion_jacobian(x - centre)
         JtW = np.swapaxes(J, 1, 2) @ (data.information * weights[:, None, None])
-        return (JtW @ J).sum(axis=0), np.einsum("nij,nj->ni", JtW, residual)
+        return JtW @ J, np.einsum("nij,nj->ni", JtW, residual)
 
-    def normal_equations(stale: RigidTransform, work: tuple[np.ndarray, ...]) -> tuple[np.ndarray, np.ndarray]:
-        information, gradient = gradients(stale, work)
-        return information, gradient.sum(axis=0)
+    def normal_equations(*at) -> tuple[np.ndarray, np.ndarray]:
+        return tuple(rows.sum(axis=0) for rows in gradients(*at))
 
     def move(stale: RigidTransform, step: np.ndarray) -> RigidTransform:
         turn = Rotation.from_rotvec(step[:3]).as_matrix()
         return RigidTransform(turn @ stale.R, turn @ (stale.t - centre) + centre + step[3:])
 
     found = minimise(stale, partial(_evaluate, rig, data, loss), normal_equations, move, rank=parameters)
-    _, distance2, weights = found.work
-    information, gradient = gradients(found.state, found.work)
+    information, (_, distance2, weights) = found.information, found.work
     if np.linalg.matrix_rank(information, tol=_OPEN * np.trace(information), hermitian=True) < parameters:
         raise ValueError("x_mm, u_left, u_right: these landmarks leave the motion open. Add frames in other positions.")
     covariance = np.linalg.pinv(information, rcond=_OPEN, hermitian=True)
     if loss == "robust":
         # The weights fall with the residual, which bends the loss less than the weights alone say.  Where nothing fits,
         # the sum may curve the wrong way: then the weights alone.
+        _, gradient = gradients(found.state, found.work)
         flatter = information - gradient.T @ (gradient * (2.0 / (_FREEDOM + data.dimension))[:, None])
         bent = np.linalg.eigvalsh(flatter)[-parameters] <= _OPEN * np.trace(information)
         covariance = sandwich(information if bent else flatter, gradient[used], parameters)

@@ -20,21 +20,14 @@ _ITERATIONS = 300
 class Registration:
     """An estimated rigid motion and its uncertainty.
 
-    Attributes
-    ----------
-    transform:
-        target_from_source: the motion of the cameras in robot coordinates, if the source is what the stale rig sees.
-    covariance:
-        (6, 6) of a small error of the transform, (rotation in rad, translation in mm), both in the target frame, the
-        rotation about `centre_mm`: a registered point p is off by omega x (p - centre) + tau.
-    centre_mm:
-        (3,) centre of the data in the target frame.  About it rotation and translation are nearly independent.
-    residuals:
-        (n,) one a row: the norm in mm (`register`) or the Mahalanobis distance (`register_images`); NaN = not used.
-    weights:
-        (n,) what each row counted in the last step, 1 = fully.
-    cost:
-        The minimum reached, in the estimator's own terms.
+    `transform` is target_from_source: the motion of the cameras in robot coordinates, if the source is what the stale
+    rig sees.  `covariance` (6, 6) is that of a small error of the transform, (rotation omega in rad, translation tau in
+    mm), both in the target frame and about `centre_mm` (3,), the centre of the data: a registered point p is off by
+    omega x (p - centre) + tau.  About the centre rotation and translation are nearly independent.
+
+    `residuals` (n,) has the norm of each row in mm (`register`) or its Mahalanobis distance (`register_images`), NaN
+    where it was not used.  `weights` (n,) says what each row counted in the last step, 1 = fully.  `cost` is the minimum
+    reached, in the estimator's own terms.
     """
 
     transform: RigidTransform
@@ -76,9 +69,7 @@ def check_spread(x: np.ndarray, name: str) -> None:
         raise ValueError(f"{name}: the points lie on one line or coincide; the rotation about it is open. Add frames.")
 
 
-def register(
-    x_source: ArrayLike, x_target: ArrayLike, *, loss: Literal["norm", "squared"] = "norm", seed: int = 0
-) -> Registration:
+def register(x_source: ArrayLike, x_target: ArrayLike, *, loss: Literal["norm", "squared"] = "norm") -> Registration:
     """The rigid transform that takes `x_source` to `x_target`, point by point (paper Eq. 7).
 
     Parameters
@@ -88,8 +79,6 @@ def register(
     loss:
         "norm" minimises sum |R x + t - y|, Eq. (7) as printed: robust, solved by iteratively reweighted least squares
         from several starts.  "squared" minimises the sum of squares, in closed form (Kabsch 1976).
-    seed:
-        Draws the minimal triples that further starts come from.
 
     Returns
     -------
@@ -119,11 +108,7 @@ def register(
     check_spread(y, "x_target")
     centre_x, centre_y = x.mean(axis=0), y.mean(axis=0)
     x0, y0 = x - centre_x, y - centre_y
-    if loss == "norm":
-        R, t = _sum_of_norms(x0, y0, np.random.default_rng(seed))
-    else:
-        R, t = _kabsch(x0, y0, np.ones((1, len(x))))
-    R, t = R[0], t[0]
+    (R,), (t,) = _kabsch(x0, y0, np.ones((1, len(x)))) if loss == "squared" else _sum_of_norms(x0, y0)
     residual = x0 @ R.T + t - y0
     norm = np.linalg.norm(residual, axis=1)
     median = float(np.median(norm))
@@ -145,13 +130,11 @@ def _kabsch(x: np.ndarray, y: np.ndarray, weights: np.ndarray) -> tuple[np.ndarr
     return R, mean_y - np.einsum("sij,sj->si", R, mean_x)
 
 
-def _sum_of_norms(x: np.ndarray, y: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def _sum_of_norms(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Weiszfeld's iteration with a rotation in it, from the least-squares start and from minimal triples."""
-    starts = np.zeros((1 + _STARTS, len(x)))
-    starts[0] = 1.0
-    for row in starts[1:]:
-        row[rng.choice(len(x), 3, replace=False)] = 1.0
-    R, t = _kabsch(x, y, starts)
+    rng = np.random.default_rng(0)
+    triples = [np.isin(np.arange(len(x)), rng.choice(len(x), 3, replace=False)) for _ in range(_STARTS)]
+    R, t = _kabsch(x, y, np.array([np.ones(len(x)), *triples]))
     floor = 1e-12 * max(1.0, float(np.abs(y).max()))
 
     def norms() -> np.ndarray:

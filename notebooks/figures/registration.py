@@ -114,16 +114,16 @@ def _plain_log_ticks(ax) -> None:
     ax.set_yticks(ticks, [f"{t:g}" for t in ticks])
 
 
-def icp_chart(shift_mm: Sequence[float], error_um: Mapping[str, np.ndarray], spacing_mm: float) -> Figure:
+def icp_chart(shift_mm: Sequence[float], error_um: Mapping[str, np.ndarray]) -> Figure:
     """Errors (trials, k) of each method against the size of the motion, its median as a line."""
     page, ax = figure(1, 1, width_in=8, height_in=3.8)
     for (name, errors), colour in zip(error_um.items(), (COLOURS["ours"], COLOURS["paper"]), strict=True):
         ax.plot(np.broadcast_to(shift_mm, errors.shape).ravel(), errors.ravel(), ".", color=colour, alpha=0.3)
         ax.plot(shift_mm, np.median(errors, axis=0), "o-", color=colour, markersize=5, label=name)
-    ax.axvline(spacing_mm, color=COLOURS["warning"], linestyle=":", label="median distance of neighbouring points")
     ax.set(xscale="log", yscale="log", xlabel="shift of the microscope in mm", ylabel="translation error in um")
     ax.set_xticks(shift_mm, [f"{shift:g}" for shift in shift_mm])
     ax.minorticks_off()
+    _plain_log_ticks(ax)
     ax.legend()
     return page
 
