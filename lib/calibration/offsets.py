@@ -48,8 +48,12 @@ def tool_axes(x_mm: ArrayLike) -> np.ndarray:
 
 
 def rows_axes(data: Correspondences) -> np.ndarray:
-    """`tool_axes` of each row's frame (n, 3, 3), from where the robot reports the frame's landmarks."""
-    if len(data) == 0 or data.landmark.max() > 2:
+    """`tool_axes` of each row's frame (n, 3, 3), from where the robot reports the frame's landmarks.
+
+    NaN too where rows repeat a frame's landmark: recordings joined under the same frame numbers do not tell which is which.
+    """
+    rows = np.column_stack([data.frame, data.landmark])
+    if len(data) == 0 or data.landmark.max() > 2 or len(np.unique(rows, axis=0)) < len(rows):
         return np.full((len(data), 3, 3), np.nan)
     return tool_axes(data.grid("x_mm"))[np.unique(data.frame, return_inverse=True)[1]]
 

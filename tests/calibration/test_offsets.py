@@ -7,6 +7,7 @@ import pytest
 
 from lib.calibration import calibrate
 from lib.calibration.offsets import estimate_offsets, tool_axes
+from lib.correspondences import Correspondences
 from lib.geometry import RigidTransform
 from lib.simulator.rig import IMAGE_SIZE_PX
 from tests.calibration.rigs import LANDMARKS_MM, OFFSETS_MM, tool_sweep
@@ -131,6 +132,10 @@ def test_offsets_that_the_data_cannot_tell_are_refused():
     data, _, _ = tool_sweep(0, frames=20)
     with pytest.raises(ValueError, match="open jaws"):
         calibrate(data.subset(data.landmark < 2), offsets="tool")
+    twice = Correspondences.join([data, tool_sweep(1, frames=20)[0]])  # the same frame numbers: whose axes are they?
+    with pytest.raises(ValueError, match="0 rows have the tool's axes"):
+        calibrate(twice, offsets="tool")
+    assert calibrate(twice).offsets is None
     with pytest.raises(ValueError, match="which landmark"):
         calibrate(data.x_mm, [data.u_left, data.u_right], offsets=True)
     with pytest.raises(ValueError, match="u: give"):
