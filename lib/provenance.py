@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import datetime
 import functools
-import json
 import os
 import platform
 import subprocess
@@ -14,9 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
-from lib import files, paths
+from lib import paths
 
-__all__ = ["Provenance", "commit", "commit_id", "machine", "plain", "read_records", "write_record"]
+__all__ = ["Provenance", "commit", "commit_id", "machine", "plain"]
 
 
 #: What decides a result: these files of the repository, and not the results that are being written.
@@ -71,7 +70,7 @@ class Provenance:
     cpu_s: float = field(default_factory=lambda: _cpu_s())
 
     def so_far(self) -> dict[str, object]:
-        """The entries of a record that is written now; CPU seconds are those of finished child processes too."""
+        """What is known now, as `lib.workbench.results.write` takes it; CPU seconds count finished child processes too."""
         return {
             "command": self.command,
             "commit": self.commit,
@@ -80,47 +79,6 @@ class Provenance:
             "seconds": time.perf_counter() - self.wall_s,
             "cpu_seconds": _cpu_s() - self.cpu_s,
         }
-
-
-def write_record(
-    path: Path, name: str, result: dict, provenance: Provenance, *, budget: dict | None = None, **more: object
-) -> dict:
-    """Put one named record into a results file, whole or not at all; the others in it stay as they are.
-
-    The file is read just before it is written, since another study may be running.
-
-    Parameters
-    ----------
-    budget:
-        What the study was allowed to cost, where it has such a limit.
-    more:
-        Further entries of the record, beside its seconds.
-
-    Returns
-    -------
-    The record as `read_records` gives it.
-    """
-    given = {"result": result} | ({} if budget is None else {"budget": budget})
-    record = plain(given | provenance.so_far() | more)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    files.write_json(path, read_records(path) | {name: record})
-    return record
-
-
-def read_records(path: Path) -> dict[str, dict]:
-    """Records of a results file by name; empty where there is no file.
-
-    Raises
-    ------
-    ValueError
-        If the file is no JSON.
-    """
-    if not path.is_file():
-        return {}
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except json.JSONDecodeError as error:
-        raise ValueError(f"{path}: no JSON ({error}); restore or delete the file.") from error
 
 
 def plain(value: object) -> object:
