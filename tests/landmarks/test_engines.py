@@ -17,7 +17,7 @@ needs_openvino = pytest.mark.skipif(not importlib.util.find_spec("openvino"), re
 @needs_openvino
 def test_openvino_gives_the_heatmaps_of_torch():
     torch.manual_seed(0)
-    network = StackedHourglass(HourglassConfig(8, 2, 2)).eval()
+    network = StackedHourglass(HourglassConfig(4, 2, 1)).eval()
     for head in network.heads:
         torch.nn.init.normal_(head.weight)
     fast = OpenVinoNetwork(network, precision="f32")
@@ -47,7 +47,7 @@ def test_an_offset_network_says_the_same_with_either_engine(engine):
 @pytest.mark.parametrize("engine", ["torch", pytest.param("openvino", marks=needs_openvino)])
 def test_the_mean_with_the_mirror_image_does_not_know_left_from_right(engine):
     torch.manual_seed(0)
-    network = StackedHourglass(HourglassConfig(8, 1, 2)).eval()
+    network = StackedHourglass(HourglassConfig(4, 1, 1)).eval()
     for head in network.heads:
         torch.nn.init.normal_(head.weight)
     images = torch.rand(2, 3, 48, 64)
@@ -58,8 +58,8 @@ def test_the_mean_with_the_mirror_image_does_not_know_left_from_right(engine):
     close = {"atol": 0.02 * float(seen.abs().max())}  # bfloat16 where the processor has it
     assert torch.allclose(turned, seen.flip(-2)[:, [0, 2, 1]], **close)
     assert not torch.allclose(seen, single, **close)
-    windows = np.random.default_rng(0).integers(0, 256, (3, 128, 128, 3), dtype=np.uint8)
-    plain = Detector(network, window_network=network, engine=engine)
+    windows = np.random.default_rng(0).integers(0, 256, (3, 64, 64, 3), dtype=np.uint8)
+    plain = Detector(network, window_network=network, window_px=64, engine=engine)
     both = replace(plain, mirror=True)
     assert not torch.allclose(both.outputs(windows, "window"), plain.outputs(windows, "window"), **close)
     with pytest.raises(ValueError, match="mirror: needs window_px"):
