@@ -142,28 +142,22 @@ class Recording:
         kinematics = _read_kinematics(folder / "kinematics.csv")
         robot_time = frames.time_s + header["offset_s"]
         if robot_time[-1] < kinematics.time_s[0] or robot_time[0] > kinematics.time_s[-1]:
+            seen, told = ("{:.3f} to {:.3f} s".format(*time[[0, -1]]) for time in (robot_time, kinematics.time_s))
             raise ValueError(
-                f"{folder}: the frames ({robot_time[0]:.3f} to {robot_time[-1]:.3f} s, robot clock) and kinematics.csv "
-                f"({kinematics.time_s[0]:.3f} to {kinematics.time_s[-1]:.3f} s) do not overlap; check time_s (seconds) "
-                "and offset_s."
+                f"{folder}: the frames ({seen}, robot clock) and kinematics.csv ({told}) do not overlap; check time_s "
+                "(seconds) and offset_s."
             )
         path = folder / "annotations.json"
         annotations = read_coco(path, len(frames), size) if path.exists() else None
         truth = Truth.read(folder / "truth", len(frames)) if (folder / "truth").is_dir() else None
         return cls(folder=folder, frames=frames, kinematics=kinematics, annotations=annotations, truth=truth, **header)
 
-    def landmarks_at(self, index: int, u: ArrayLike | None = None) -> np.ndarray:  # interim
-        return self.landmarks_mm(None if u is None else np.broadcast_to(u, (len(self), 3, 2)))[index]
-
-    def landmarks_mm(self, u: ArrayLike | None = None) -> np.ndarray:
+    def landmarks_mm(self) -> np.ndarray:
         """The robot's landmarks (n, 3, 3) mm at the frames' times, NaN where the robot says nothing.
 
         `lib.correspondences.of_recording` gives them at the instants at which the landmarks' image rows were read.
         """
-        time = self.frames.time_s + self.offset_s
-        if u is not None:  # interim
-            time = time[:, None] + self.readout_s * np.nan_to_num(u[..., 1] / (self.image_size_px[1] - 1) - 0.5)
-        return self.kinematics.at(time)
+        return self.kinematics.at(self.frames.time_s + self.offset_s)
 
 
 def _read_header(path: Path) -> dict:
@@ -237,9 +231,8 @@ def _read_kinematics(path: Path) -> Kinematics:
     if not np.isfinite(reach).any():
         raise ValueError(f"{path}: no row holds the base and a tip; the kinematics are empty.")
     reach_mm = float(np.nanmedian(reach))
-    if not _PLAUSIBLE_TOOL_MM[0] <= reach_mm <= _PLAUSIBLE_TOOL_MM[1]:
-        raise ValueError(
-            f"{path}: the median distance from base to tip is {reach_mm:.4g}, not plausible in mm "
-            f"({_PLAUSIBLE_TOOL_MM[0]} to {_PLAUSIBLE_TOOL_MM[1]}). Metres or micrometres? Convert to mm."
-        )
+    low, high = _PLAUSIBLE_TOOL_MM
+    if not low <= reach_mm <= high:
+        what = f"the median distance from base to tip is {reach_mm:.4g}, not plausible in mm ({low} to {high})"
+        raise ValueError(f"{path}: {what}. Metres or micrometres? Convert to mm.")
     return Kinematics(table[:, 0], x)

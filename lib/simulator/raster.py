@@ -1,8 +1,8 @@
 """Exact orthographic rasterisation of round cones: the tool's depth, normals and parts.
 
-A round cone is the convex hull of two balls.  Along a ray its front is min over s of
-f(s) = z(s) - sqrt(Q(s)), where Q(s) = r(s)^2 - |w - s c|^2 is quadratic and f convex, so the minimum is a
-closed form and no mesh is needed.  The shaft is a cylinder that ends flat.
+A round cone is the convex hull of two balls.  Along a ray its front is the minimum over s of f(s) = z(s) - sqrt(Q(s)) with
+Q(s) = r(s)^2 - |w - s c|^2.  Q is quadratic and f convex, so the minimum has a closed form and no mesh is needed.  The shaft
+is a cylinder that ends flat.
 """
 
 from __future__ import annotations
@@ -119,13 +119,8 @@ def rasterise(
     k, s = index[rows, columns], parameter[rows, columns][:, None]
     span = centres[1:] - centres[:-1]
     length = np.linalg.norm(span, axis=1)
-    surface = np.column_stack(
-        [
-            ((columns + 0.5) * step - 0.5 + x0) / zoom,
-            ((rows + 0.5) * step - 0.5 + y0) / zoom,
-            depth[rows, columns],
-        ]
-    )
+    x, y = ((columns + 0.5) * step - 0.5 + x0) / zoom, ((rows + 0.5) * step - 0.5 + y0) / zoom
+    surface = np.column_stack([x, y, depth[rows, columns]])
     out = (surface - centres[k] - s * span[k]).astype(np.float32)
     normal = out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-9)
     tangent = (span / np.maximum(length, 1e-9)[:, None]).astype(np.float32)[k]

@@ -149,13 +149,8 @@ def simulate(
     time_s = np.arange(n_frames) * step / microscope.fps
     rig = microscope.rig(RigidTransform.identity())
     moved_at, moved_rig = n_frames, rig
-    details = {
-        "simulated": True,
-        "seed": seed,
-        "frame_step": step,
-        "depth_of_field_mm": microscope.depth_of_field_mm,
-        "exposure_s": microscope.exposure_s,
-    }
+    details = {"simulated": True, "seed": seed, "frame_step": step}
+    details |= {"depth_of_field_mm": microscope.depth_of_field_mm, "exposure_s": microscope.exposure_s}
     if microscope.inverse_distance_per_mm:
         details["inverse_distance_per_mm"] = microscope.inverse_distance_per_mm
     if design.camera_motion is not None:
@@ -167,19 +162,11 @@ def simulate(
     u, visibility = np.empty((2, n_frames, 3, 2)), np.empty((2, n_frames, 3), int)
     in_glint, landmarks = np.zeros((2, n_frames, 3), bool), np.empty((n_frames, 3, 3))
     with RecordingWriter(
-        folder,
-        name=name or folder.name,
-        fps=microscope.fps,
-        image_size_px=microscope.image_size_px,
-        description=description,
-        readout_s=microscope.readout_s,
-        offset_s=reports.offset_s,
-        robot_accuracy_mm=reports.robot_accuracy_mm,
-        details=details,
-        suffix=".png" if microscope.jpeg_quality is None else ".jpg",
-        jpeg_quality=microscope.jpeg_quality or 90,
-        overwrite=overwrite,
-    ) as writer:
+        folder, name=name or folder.name, description=description, details=details, overwrite=overwrite,
+        fps=microscope.fps, image_size_px=microscope.image_size_px, readout_s=microscope.readout_s,
+        offset_s=reports.offset_s, robot_accuracy_mm=reports.robot_accuracy_mm,
+        suffix=".png" if microscope.jpeg_quality is None else ".jpg", jpeg_quality=microscope.jpeg_quality or 90,
+    ) as writer:  # fmt: skip
         for k in tqdm(range(n_frames), desc=f"Simulating {folder.name}", unit="pair", disable=progress is not True):
             pose, noise = motion.pose(time_s[k]), np.random.default_rng([seed, 107, k])
             views = render_pair(

@@ -43,7 +43,7 @@ def reference_rig(
     inverse_distance_per_mm:
         One over the working distance; 0 makes the cameras affine, anything else near-affine.
     robot_from_microscope:
-        Identity gives the rig in the microscope frame.
+        Where the microscope stands; the identity gives the rig in the microscope frame.
 
     Raises
     ------
