@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import cv2
 import matplotlib.pyplot as plt
+import nbformat
 import numpy as np
 import pytest
 
@@ -16,7 +17,7 @@ from lib.geometry import RigidTransform
 from lib.recordings import Recording
 from lib.simulator import Microscope
 from lib.simulator.rig import reference_rig, simulate_correspondences
-from lib.workbench import results
+from lib.workbench import report, results
 from notebooks.figures import calibration as figures
 from notebooks.studies import boards, dvrk, sweeps
 from notebooks.studies.cameras import perspective_dlt, triangulate_perspective
@@ -224,6 +225,33 @@ def test_figures_draw_the_recorded_tables():
     for page in drawn:
         assert all(ax.has_data() for ax in page.axes)
     plt.close("all")
+
+
+def test_notebook_03_takes_a_recording_with_a_gap_and_without_truth(recording, tmp_path, monkeypatch):
+    for entry in recording.folder.iterdir():
+        if entry.name not in ("truth", "kinematics.csv"):
+            (tmp_path / entry.name).symlink_to(entry)
+    head, *samples = (recording.folder / "kinematics.csv").read_text().splitlines()
+    blank = int(np.searchsorted(recording.kinematics.time_s, recording.frames.time_s[3] + recording.offset_s))
+    samples[blank] = samples[blank].split(",")[0] + 9 * ","
+    (tmp_path / "kinematics.csv").write_text("\n".join([head, *samples]) + "\n")
+    rows = of_recording(Recording.open(tmp_path), recording.truth.u_left, recording.truth.u_right)
+    assert np.isnan(rows.x_mm).any()
+    metrics = {}
+    monkeypatch.setattr("lib.landmarks.detect", lambda *_: rows)
+    monkeypatch.setattr("lib.landmarks.Detector.load", lambda: None)
+    monkeypatch.setattr(report, "record", lambda name, value, *_, **__: metrics.__setitem__(name, value))
+    monkeypatch.setattr(report, "show", lambda page, *_: plt.close(page))
+    variables = {}
+    for cell in nbformat.read(paths.NOTEBOOKS / "03_affine_calibration.ipynb", as_version=4).cells:
+        if cell.id in {
+            f"03-{n}"
+            for n in ("parameters", "imports", "images", "images-judge", "images-figures", "offsets", "export")
+        }:
+            exec(compile(cell.source.replace("%matplotlib inline", ""), cell.id, "exec"), variables)
+            variables["recording"] = str(tmp_path)
+    assert metrics["calibration_reprojection_px"] < 1.5 and "calibration_error_um" not in metrics
+    assert variables["difference_um"] < 1
 
 
 def spheres_image():
