@@ -32,23 +32,14 @@ _VELOCITY_S = 0.05
 class Correspondences:
     """Rows of one landmark in one stereo frame, with NaN where the robot is silent or an image does not show it.
 
-    Attributes
-    ----------
-    x_mm:
-        (n, 3) as the robot reports, robot frame.
-    u_left, u_right:
-        (n, 2) px.
-    covariance_px2:
-        (n, 2, 2, 2): of the left and of the right pixel; NaN = unknown.
-    confidence:
-        (n, 2) of left and right; 0 where missing, 1 for labels.
-    frame, landmark:
-        (n,) number of the frame in its recording, and of the landmark (0 base, 1 tip_1, 2 tip_2).
-    time_s:
-        (n,) video clock: the mean of the instants at which the two images' rows of the landmark were read.
+    Attributes:
+        x_mm: (n, 3) as the robot reports, robot frame.
+        u_left, u_right: (n, 2) px.
+        covariance_px2: (n, 2, 2, 2): of the left and of the right pixel; NaN = unknown.
+        confidence: (n, 2) of left and right; 0 where missing, 1 for labels.
+        frame, landmark: (n,) number of the frame in its recording, and of the landmark (0 base, 1 tip_1, 2 tip_2).
+        time_s: (n,) video clock: the mean of the instants at which the two images' rows of the landmark were read.
 
-    Examples
-    --------
     >>> c = Correspondences.of_points([[0, 0, 0], [1, 0, 0]], [[5, 5], [105, 5]], [[9, 5], [np.nan, np.nan]])
     >>> len(c), len(c.complete), c.seen.tolist()
     (2, 1, [[True, True], [True, False]])
@@ -191,39 +182,25 @@ def pair_with_robot(
     images show a landmark at two instants.  The position is taken at their mean, and each pixel is moved to that
     instant by the landmark's velocity.  A landmark seen in one image alone is taken at that image's instant.
 
-    Parameters
-    ----------
-    u_left, u_right:
-        (m, k, 2) px, NaN = not seen.
-    position:
-        Robot times (j, k) in s -> (j, k, 3) mm, NaN where the robot is silent: `lib.recordings.Kinematics.at`.
-    time_s:
-        (m,) times of the frames, video clock.
-    height_px:
-        Rows of an image.
-    readout_s:
-        Time from the first to the last row; 0 is a global shutter.
-    offset_s:
-        t_robot = t_video + offset_s.
-    covariance_px2, confidence:
-        (m, k, 2, 2, 2) and (m, k, 2), left and right; as in `Correspondences.of_points` where not given.
-    frame:
-        (m,) numbers of the frames; 0 to m - 1 where not given.
-    linear:
-        (4, 3) px per mm, left and right, that turns velocities into pixels; None = fitted to these rows.
+    Args:
+        u_left, u_right: (m, k, 2) px, NaN = not seen.
+        position: Robot times (j, k) in s -> (j, k, 3) mm, NaN where the robot is silent:
+            `lib.recordings.Kinematics.at`.
+        time_s: (m,) times of the frames, video clock.
+        height_px: Rows of an image.
+        readout_s: Time from the first to the last row; 0 is a global shutter.
+        offset_s: t_robot = t_video + offset_s.
+        covariance_px2, confidence: (m, k, 2, 2, 2) and (m, k, 2), left and right; as in `Correspondences.of_points`
+            where not given.
+        frame: (m,) numbers of the frames; 0 to m - 1 where not given.
+        linear: (4, 3) px per mm, left and right, that turns velocities into pixels; None = fitted to these rows.
 
-    Returns
-    -------
-    Correspondences
-        m * k rows, frame by frame.
+    Returns:
+        Correspondences: m * k rows, frame by frame.
 
-    Raises
-    ------
-    ValueError
-        For wrong shapes, or a read-out time or height that make no shutter.
+    Raises:
+        ValueError: For wrong shapes, or a read-out time or height that make no shutter.
 
-    Examples
-    --------
     A landmark moves down at 10 mm/s; at 100 px/mm a shutter of 20 ms sees it in the first and the last row, 20 ms apart:
 
     >>> def position(time_s):
@@ -285,12 +262,9 @@ def of_recording(
 ) -> Correspondences:
     """`pair_with_robot` with the clocks, shutter and kinematics of a `lib.recordings.Recording`.
 
-    Parameters
-    ----------
-    u_left, u_right, covariance_px2, confidence, linear:
-        Of the frames chosen, as in `pair_with_robot`.
-    frames:
-        Which frames of the recording these are; None = all.
+    Args:
+        u_left, u_right, covariance_px2, confidence, linear: Of the frames chosen, as in `pair_with_robot`.
+        frames: Which frames of the recording these are; None = all.
     """
     chosen = np.arange(len(recording.frames))[slice(None) if frames is None else frames]
     return pair_with_robot(

@@ -19,13 +19,9 @@ def whole(path: str | Path) -> Iterator[Path]:
     The partial file keeps the suffix, since many writers choose the format by it.  On any error (a full disk above all)
     it is removed and the file that was there stays.
 
-    Raises
-    ------
-    OSError
-        If nothing was written, or the disk is full.
+    Raises:
+        OSError: If nothing was written, or the disk is full.
 
-    Examples
-    --------
     >>> import tempfile
     >>> target = Path(tempfile.mkdtemp()) / "points.csv"
     >>> with whole(target) as partial:
@@ -58,10 +54,8 @@ def write_bytes(path: str | Path, data: bytes) -> None:
 def write_json(path: str | Path, value: object) -> None:
     """Write `value` as readable JSON.
 
-    Raises
-    ------
-    ValueError
-        For NaN and infinity, for which JSON has no word; give None.
+    Raises:
+        ValueError: For NaN and infinity, for which JSON has no word; give None.
     """
     write_text(path, json.dumps(value, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
 
@@ -69,10 +63,8 @@ def write_json(path: str | Path, value: object) -> None:
 def digest(*files: str | Path, length: int = 12) -> str:
     """The first `length` hexadecimal digits of the SHA-256 of the files' contents, one after the other.
 
-    Raises
-    ------
-    FileNotFoundError
-        Naming the file.
+    Raises:
+        FileNotFoundError: Naming the file.
     """
     total = hashlib.sha256()
     for path in files:

@@ -27,10 +27,8 @@ __all__ = [
 def points(values: ArrayLike, dimension: int, name: str) -> np.ndarray:
     """`values` as a float64 array (n, dimension); NaN passes.
 
-    Raises
-    ------
-    ValueError
-        If the shape is not (n, dimension) or a single (dimension,) point; `name` is the argument named.
+    Raises:
+        ValueError: If the shape is not (n, dimension) or a single (dimension,) point; `name` is the argument named.
     """
     array = np.asarray(values, dtype=np.float64)
     if array.ndim == 1 and array.shape == (dimension,):
@@ -46,10 +44,8 @@ def points(values: ArrayLike, dimension: int, name: str) -> np.ndarray:
 def finite_points(values: ArrayLike, dimension: int, name: str) -> np.ndarray:
     """`points`, with NaN and infinity refused.
 
-    Raises
-    ------
-    ValueError
-        Also if a row is not finite; the message counts the rows and names the first.
+    Raises:
+        ValueError: Also if a row is not finite; the message counts the rows and names the first.
     """
     array = points(values, dimension, name)
     bad = np.flatnonzero(~np.isfinite(array).all(axis=1))
@@ -64,22 +60,15 @@ def finite_points(values: ArrayLike, dimension: int, name: str) -> np.ndarray:
 def pair_covariance(covariance_px2: ArrayLike | Sequence[ArrayLike] | None, n: int, images: int = 2) -> np.ndarray:
     """Covariance of the stacked pixels (u_left, u_right) of n matches: (1, 4, 4) where all share it, else (n, 4, 4).
 
-    Parameters
-    ----------
-    covariance_px2:
-        px^2: a number (the variance of each coordinate), (2, 2) for every image, (4, 4) for the pair, (n, 4, 4) one a
-        match, (n, 2, 2, 2) one a match and image, or a list of one (n, 2, 2) an image.  None is 1 px^2.  NaN passes, for
-        landmarks that are not seen.
-    images:
-        2, or 1 for a single camera; then (2, 2) and (n, 2, 2) take the place of (4, 4) and (n, 4, 4).
+    Args:
+        covariance_px2: px^2: a number (the variance of each coordinate), (2, 2) for every image, (4, 4) for the pair,
+            (n, 4, 4) one a match, (n, 2, 2, 2) one a match and image, or a list of one (n, 2, 2) an image.  None is 1
+            px^2.  NaN passes, for landmarks that are not seen.
+        images: 2, or 1 for a single camera; then (2, 2) and (n, 2, 2) take the place of (4, 4) and (n, 4, 4).
 
-    Raises
-    ------
-    ValueError
-        For another shape, or a finite matrix that is not positive definite.
+    Raises:
+        ValueError: For another shape, or a finite matrix that is not positive definite.
 
-    Examples
-    --------
     >>> pair_covariance(4.0, 10)[0].diagonal()
     array([4., 4., 4., 4.])
     """
@@ -119,8 +108,6 @@ def align_rotation(moment: ArrayLike) -> np.ndarray:
     With moment = sum y x^T of two centred sets of points it is the least-squares alignment y = R x (Kabsch, 1976; Umeyama,
     1991).
 
-    Examples
-    --------
     >>> R = RigidTransform.from_rotation_vector((0.1, -0.2, 0.3)).R
     >>> x = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]])
     >>> bool(np.allclose(align_rotation((x @ R.T).T @ x), R))
@@ -135,12 +122,9 @@ def align_rotation(moment: ArrayLike) -> np.ndarray:
 class RigidTransform:
     """x_target = R @ x_source + t, named ``target_from_source``.
 
-    Attributes
-    ----------
-    R:
-        Rotation (3, 3), orthonormal with determinant +1.
-    t:
-        Translation (3,) in mm.
+    Attributes:
+        R: Rotation (3, 3), orthonormal with determinant +1.
+        t: Translation (3,) in mm.
     """
 
     R: np.ndarray

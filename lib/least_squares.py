@@ -18,14 +18,10 @@ __all__ = ["Minimum", "minimise"]
 class Minimum:
     """Where the energy is least.
 
-    Attributes
-    ----------
-    state, energy, work:
-        As the caller's functions made them at the minimum.
-    information:
-        (p, p) Gauss-Newton Hessian there.
-    iterations, converged:
-        Steps taken; False where they ran out.
+    Attributes:
+        state, energy, work: As the caller's functions made them at the minimum.
+        information: (p, p) Gauss-Newton Hessian there.
+        iterations, converged: Steps taken; False where they ran out.
     """
 
     state: Any
@@ -48,31 +44,20 @@ def minimise(
 ) -> Minimum:
     """Minimum of an energy by damped Gauss-Newton steps; no step raises the energy.
 
-    Parameters
-    ----------
-    start:
-        The first state, of any type.
-    evaluate:
-        state -> (energy, work), or None where the state is not allowed; `work` is what `normal_equations` needs.
-    normal_equations:
-        (state, work) -> (information (p, p), gradient (p,)): the Gauss-Newton Hessian of the energy and the direction
-        J^T W r in which the energy falls.
-    move:
-        (state, step (p,)) -> the state after an increment.
-    rank:
-        Number of directions that the data determine; steps leave the others alone.  None is all p.
-    iterations:
-        Most steps.
-    tolerance:
-        Relative decrease of the energy below which it is at its minimum.
+    Args:
+        start: The first state, of any type.
+        evaluate: state -> (energy, work), or None where the state is not allowed; `work` is what `normal_equations`
+            needs.
+        normal_equations: (state, work) -> (information (p, p), gradient (p,)): the Gauss-Newton Hessian of the energy
+            and the direction J^T W r in which the energy falls.
+        move: (state, step (p,)) -> the state after an increment.
+        rank: Number of directions that the data determine; steps leave the others alone.  None is all p.
+        iterations: Most steps.
+        tolerance: Relative decrease of the energy below which it is at its minimum.
 
-    Raises
-    ------
-    ValueError
-        If the start is not allowed.
+    Raises:
+        ValueError: If the start is not allowed.
 
-    Examples
-    --------
     The x where exp(x) = 2:
 
     >>> def evaluate(x):

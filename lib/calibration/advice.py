@@ -17,18 +17,15 @@ __all__ = ["Advice", "advise", "box_grid", "next_positions"]
 class Advice:
     """What to do.
 
-    Attributes
-    ----------
-    enough:
-        True where the calibration's own error adds less than a tenth to a triangulated point's, everywhere asked.
-    worst_ratio:
-        Largest sd of a triangulated point from calibration, in units of the sd of one detection, over the workspace.
-    worst_depth_um:
-        Largest depth sd from the calibration alone, over the workspace.
-    next_position_mm, gain:
-        (3,) the reachable position whose correspondence helps most, and the log det of the information that it adds.
-    text:
-        The same in a sentence.
+    Attributes:
+        enough: True where the calibration's own error adds less than a tenth to a triangulated point's, everywhere
+            asked.
+        worst_ratio: Largest sd of a triangulated point from calibration, in units of the sd of one detection, over the
+            workspace.
+        worst_depth_um: Largest depth sd from the calibration alone, over the workspace.
+        next_position_mm, gain: (3,) the reachable position whose correspondence helps most, and the log det of the
+            information that it adds.
+        text: The same in a sentence.
     """
 
     enough: bool
@@ -79,12 +76,10 @@ def advise(
 ) -> Advice:
     """Judge a stereo calibration over a workspace, and say where to move next.
 
-    Parameters
-    ----------
-    low_mm, high_mm:
-        Corners of the box that the tool can reach in view of both cameras, robot frame; an empty box is a ValueError.
-    workspace_mm:
-        (n, 3) points that will be reconstructed; None is a grid over the box.
+    Args:
+        low_mm, high_mm: Corners of the box that the tool can reach in view of both cameras, robot frame; an empty box
+            is a ValueError.
+        workspace_mm: (n, 3) points that will be reconstructed; None is a grid over the box.
     """
     grid = box_grid(low_mm, high_mm) if workspace_mm is None else points(workspace_mm, 3, "workspace_mm")
     alone = calibration.point_covariance(grid, detection=False)

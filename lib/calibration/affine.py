@@ -24,13 +24,10 @@ __all__ = ["AffineMinimum", "Moments", "affine_minimum", "distances2", "dlt", "e
 def dlt(x_mm: ArrayLike, u: ArrayLike) -> AffineCamera:
     """Affine direct linear transform of one camera: least squares of u = M [x; 1] (paper Eq. 4).
 
-    Parameters
-    ----------
-    x_mm, u:
-        (n, 3) points in the robot frame and their (n, 2) pixels, n >= 4, finite, not coplanar (else a ValueError).
+    Args:
+        x_mm, u: (n, 3) points in the robot frame and their (n, 2) pixels, n >= 4, finite, not coplanar (else a
+            ValueError).
 
-    Examples
-    --------
     >>> x = np.vstack([np.zeros(3), np.eye(3)])
     >>> dlt(x, AffineCamera([[100, 1, 8, 960], [2, 100, 3, 540]]).project(x)).matrix.round(6).tolist()
     [[100.0, 1.0, 8.0, 960.0], [2.0, 100.0, 3.0, 540.0]]

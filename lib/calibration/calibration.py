@@ -39,30 +39,22 @@ class LandmarkOffsets:
 class Calibration:
     """Cameras, and how well they are known; `lib.calibration.calibrate` makes it.
 
-    Attributes
-    ----------
-    cameras, rig:
-        One or two cameras, affine unless the model has 1/distance or radial distortion; the stereo pair, None for one.
-    inliers:
-        (n,) bool, the rows used, one entry for each row given.
-    cost:
-        The energy at the minimum over the inliers (Eq. 3 as printed for ``paper``, else half the chi-square).
-    covariance, parameter_covariance:
-        (8 cameras, 8 cameras) of the entries of the matrices M, row by row, left first, in px^2, px^2/mm, px^2/mm^2; and
-        (p, p) of the model's own parameters.
-    sigma_u_px, sigma_x_mm:
-        Noise levels, given or estimated.  Where the detector's covariances weigh the rows, sigma_u_px is their RMS.
-    model, weighting, image_size_px:
-        As asked for.
-    x_mm, y_px, residuals_px:
-        (n, 3), (n, 2 cameras) and u - project(x), robot error included.  The data are moved by the offsets where these were
-        estimated.  NaN in rows that are not usable: a landmark is missing, or a tool with shut jaws has no axes.
-    covariance_px2:
-        Of the pixels: None, (1, m, m), or (n, m, m) with m = 2 cameras.
-    plan, minimum:
-        The parsed model and its fit to the inliers.
-    offsets:
-        Constant offsets of the landmarks, None where they were not estimated.
+    Attributes:
+        cameras, rig: One or two cameras, affine unless the model has 1/distance or radial distortion; the stereo pair,
+            None for one.
+        inliers: (n,) bool, the rows used, one entry for each row given.
+        cost: The energy at the minimum over the inliers (Eq. 3 as printed for ``paper``, else half the chi-square).
+        covariance, parameter_covariance: (8 cameras, 8 cameras) of the entries of the matrices M, row by row, left
+            first, in px^2, px^2/mm, px^2/mm^2; and (p, p) of the model's own parameters.
+        sigma_u_px, sigma_x_mm: Noise levels, given or estimated.  Where the detector's covariances weigh the rows,
+            sigma_u_px is their RMS.
+        model, weighting, image_size_px: As asked for.
+        x_mm, y_px, residuals_px: (n, 3), (n, 2 cameras) and u - project(x), robot error included.  The data are moved
+            by the offsets where these were estimated.  NaN in rows that are not usable: a landmark is missing, or a
+            tool with shut jaws has no axes.
+        covariance_px2: Of the pixels: None, (1, m, m), or (n, m, m) with m = 2 cameras.
+        plan, minimum: The parsed model and its fit to the inliers.
+        offsets: Constant offsets of the landmarks, None where they were not estimated.
     """
 
     cameras: tuple[AffineCamera | NearAffineCamera, ...]

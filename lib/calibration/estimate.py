@@ -51,47 +51,34 @@ def calibrate(
 ) -> Calibration:
     """Cameras from robot positions and their detections: outliers out, then the exact minimum of Eq. (3).
 
-    Parameters
-    ----------
-    data, u:
-        `Correspondences` alone, whose incomplete rows are left out and whose covariances weigh the rows where every complete
-        row has one; or (n, 3) mm positions in the robot frame and [u_left, u_right] or [u], (n, 2) px each.
-    offsets:
-        Constant offsets of the landmarks along with the cameras (`lib.calibration.offsets`).  "tool" or True: in the tool's
-        axes, from frames in which the robot reports three landmarks of open jaws; "image": in the images, for a detector that
-        is off by some pixels whatever the tool does; False: none.  None: "tool" where at least 24 rows and half of all allow
-        it, else none.
-    offset_prior_sd:
-        Standard deviation of an offset's coordinate, mm or px; None = chosen by the data.
-    model:
-        "affine", "zero_skew" (the paper's), "square", "common_zoom"; with "+distance" (one 1/distance) or "+distances"
-        (one a camera), and "+radial".  "near_affine" is "zero_skew+distance".
-    weighting:
-        "likelihood": Gaussian noise, inverse variances, exact projection.  "paper": Eq. (3) as printed, with weights
-        1/sigma and a reprojection term of unit weight (its result depends on the unit of length).
-    sigma_u_px, sigma_x_mm:
-        Noise of a pixel coordinate and of a robot coordinate; None = estimated from the data.
-    covariance_px2:
-        The detector's own covariance in place of sigma_u, in any form of `lib.geometry.pair_covariance`.
-    ransac_px:
-        Largest reprojection distance of an inlier in any image; None measures the noise and drops rows that Gaussian
-        noise would not produce once in 10 000 data sets; infinity keeps all rows.
-    seed:
-        Of the random samples.
-    image_size_px:
-        (width, height); its centre is the principal point of near-affine models (else the middle of the detections is).
-    checks:
-        False skips the plausibility checks: units, repeated rows, swapped cameras, pixels outside the image.
+    Args:
+        data, u: `Correspondences` alone, whose incomplete rows are left out and whose covariances weigh the rows where
+            every complete row has one; or (n, 3) mm positions in the robot frame and [u_left, u_right] or [u], (n, 2)
+            px each.
+        offsets: Constant offsets of the landmarks along with the cameras (`lib.calibration.offsets`).  "tool" or True:
+            in the tool's axes, from frames in which the robot reports three landmarks of open jaws; "image": in the
+            images, for a detector that is off by some pixels whatever the tool does; False: none.  None: "tool" where
+            at least 24 rows and half of all allow it, else none.
+        offset_prior_sd: Standard deviation of an offset's coordinate, mm or px; None = chosen by the data.
+        model: "affine", "zero_skew" (the paper's), "square", "common_zoom"; with "+distance" (one 1/distance) or
+            "+distances" (one a camera), and "+radial".  "near_affine" is "zero_skew+distance".
+        weighting: "likelihood": Gaussian noise, inverse variances, exact projection.  "paper": Eq. (3) as printed, with
+            weights 1/sigma and a reprojection term of unit weight (its result depends on the unit of length).
+        sigma_u_px, sigma_x_mm: Noise of a pixel coordinate and of a robot coordinate; None = estimated from the data.
+        covariance_px2: The detector's own covariance in place of sigma_u, in any form of
+            `lib.geometry.pair_covariance`.
+        ransac_px: Largest reprojection distance of an inlier in any image; None measures the noise and drops rows that
+            Gaussian noise would not produce once in 10 000 data sets; infinity keeps all rows.
+        seed: Of the random samples.
+        image_size_px: (width, height); its centre is the principal point of near-affine models (else the middle of the
+            detections is).
+        checks: False skips the plausibility checks: units, repeated rows, swapped cameras, pixels outside the image.
 
-    Raises
-    ------
-    ValueError
-        For NaN rows, fewer than four points, coplanar or collinear points, wrong units, repeated rows, detections that stand
-        still or are the same in both images, swapped cameras, no consensus, an unknown model or weighting, offsets that the
-        data cannot tell.
+    Raises:
+        ValueError: For NaN rows, fewer than four points, coplanar or collinear points, wrong units, repeated rows,
+            detections that stand still or are the same in both images, swapped cameras, no consensus, an unknown model
+            or weighting, offsets that the data cannot tell.
 
-    Examples
-    --------
     >>> from lib.cameras import AffineCamera
     >>> rng = np.random.default_rng(0)
     >>> left, right = AffineCamera([[99, 0, -9, 900], [0, 99, 0, 500]]), AffineCamera([[99, 0, 9, 900], [0, 99, 0, 500]])

@@ -36,18 +36,13 @@ LADDER = tuple(_FREER)
 class Rung:
     """One model on the data.
 
-    Attributes
-    ----------
-    model, parameters:
-        Its name and number of parameters.
-    chi_square:
-        Twice the energy at the common noise levels.
-    bic:
-        chi_square + parameters ln(number of pixel coordinates); the least is the choice.
-    against, p_value:
-        The freer model it is nested in, and the probability of a larger likelihood ratio if the constraint is true.
-    calibration:
-        The fit.
+    Attributes:
+        model, parameters: Its name and number of parameters.
+        chi_square: Twice the energy at the common noise levels.
+        bic: chi_square + parameters ln(number of pixel coordinates); the least is the choice.
+        against, p_value: The freer model it is nested in, and the probability of a larger likelihood ratio if the
+            constraint is true.
+        calibration: The fit.
     """
 
     model: str
@@ -98,15 +93,10 @@ def compare_models(
     model error shows as chi-square instead of hiding in larger noise.  Of a single camera the models that tie two cameras are
     left out.
 
-    Parameters
-    ----------
-    data, u, options:
-        As in `calibrate`, with its errors.
-    models:
-        Names of the models.
+    Args:
+        data, u, options: As in `calibrate`, with its errors.
+        models: Names of the models.
 
-    Examples
-    --------
     >>> from lib.simulator.rig import simulate_correspondences
     >>> c = simulate_correspondences(100, rng=np.random.default_rng(0))
     >>> compare_models(c.x_mm, [c.u_left, c.u_right], models=("common_zoom", "square", "affine")).best.model

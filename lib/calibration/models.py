@@ -86,16 +86,12 @@ class Model:
 class State:
     """Cameras about a reference point: u = c + v (1 + k |v|^2), v = (A (x - x0) + o - c) / (1 + rho r3.(x - x0)).
 
-    Attributes
-    ----------
-    A, offset:
-        (cameras, 2, 3), and o (cameras, 2), the pixel of the reference point.
-    rho, radial:
-        (cameras,) 1/mm and 1/px^2.
-    rotation, zoom:
-        (cameras, 3, 3) and (cameras, 2) of a structured base, A = diag(zoom) rotation[:2]; None for the affine base.
-    reference, centre:
-        x0 (3,) mm and c (cameras, 2) px, fixed.
+    Attributes:
+        A, offset: (cameras, 2, 3), and o (cameras, 2), the pixel of the reference point.
+        rho, radial: (cameras,) 1/mm and 1/px^2.
+        rotation, zoom: (cameras, 3, 3) and (cameras, 2) of a structured base, A = diag(zoom) rotation[:2]; None for the
+            affine base.
+        reference, centre: x0 (3,) mm and c (cameras, 2) px, fixed.
     """
 
     A: np.ndarray

@@ -23,22 +23,15 @@ class OnlineCalibration:
     The first rows are kept and judged together, so a gross error among them does not decide which later rows are right.  From
     then on a row is judged by the rig of those before it.
 
-    Parameters
-    ----------
-    sigma_u_px, sigma_x_mm:
-        Noise levels; they weigh the terms and judge the rows.
-    forgetting:
-        Weight that remains of the past after each `add`, in (0, 1]; 1 forgets nothing.
+    Args:
+        sigma_u_px, sigma_x_mm: Noise levels; they weigh the terms and judge the rows.
+        forgetting: Weight that remains of the past after each `add`, in (0, 1]; 1 forgets nothing.
 
-    Attributes
-    ----------
-    moments:
-        Of the rows used, None before they agree on a rig.
-    rejected_share:
-        Of the newest rows (about 100), how many were judged wrong.  Near 1, the cameras moved or the noise levels are wrong.
+    Attributes:
+        moments: Of the rows used, None before they agree on a rig.
+        rejected_share: Of the newest rows (about 100), how many were judged wrong.  Near 1, the cameras moved or the
+            noise levels are wrong.
 
-    Examples
-    --------
     >>> rng, A = np.random.default_rng(0), np.array([[99.0, 0, 9], [0, 99, 0], [99, 0, -9], [0, 99, 0]])
     >>> online = OnlineCalibration()
     >>> for _ in range(20):

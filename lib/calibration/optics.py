@@ -17,18 +17,13 @@ __all__ = ["Optics", "optics"]
 class Optics:
     """The pair as a piece of optics.
 
-    Attributes
-    ----------
-    mirrored:
-        "no", "left or right" (one channel has an odd number of reflections), "both", or "unknown": two affine cameras
-        mirrored alike look like unmirrored ones on the other side of the scene, only perspective can tell.
-    convergence_rad:
-        Angle between the viewing directions (of the unmirrored pair).
-    roll_rad:
-        Rotation of the right image's content relative to the left's, x towards y.
-    robot_from_microscope:
-        Pose of the stereo head: x right in the mean image, z along the mean viewing direction, origin where the
-        image centres' rays come closest.
+    Attributes:
+        mirrored: "no", "left or right" (one channel has an odd number of reflections), "both", or "unknown": two affine
+            cameras mirrored alike look like unmirrored ones on the other side of the scene, only perspective can tell.
+        convergence_rad: Angle between the viewing directions (of the unmirrored pair).
+        roll_rad: Rotation of the right image's content relative to the left's, x towards y.
+        robot_from_microscope: Pose of the stereo head: x right in the mean image, z along the mean viewing direction,
+            origin where the image centres' rays come closest.
     """
 
     mirrored: str

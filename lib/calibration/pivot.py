@@ -45,13 +45,9 @@ class ToolOffsets:
 def pivot_calibration(robot_from_tool: Sequence[RigidTransform]) -> Pivot:
     """Classical pivot calibration: the tip rests in one point while the tool turns, R_i p + t_i = c.
 
-    Raises
-    ------
-    ValueError
-        For fewer than three poses, rotations about one axis only, or a tip that did not rest.
+    Raises:
+        ValueError: For fewer than three poses, rotations about one axis only, or a tip that did not rest.
 
-    Examples
-    --------
     >>> R = [RigidTransform.from_rotation_vector(v).R for v in ((0, 0, 0), (0.4, 0, 0), (0, 0.4, 0), (-0.3, 0.2, 0))]
     >>> tip, rest = np.array([2.0, 1.0, 12.0]), np.array([5.0, 5.0, 5.0])
     >>> pivot_calibration([RigidTransform(r, rest - r @ tip) for r in R]).offset_mm.round(6).tolist()
@@ -81,17 +77,12 @@ def tool_offsets(
     Bilinear in the cameras and the offsets.  Gauss-Newton on both, started from the lifted problem that is linear
     in (A, A (x) p, o).
 
-    Parameters
-    ----------
-    robot_from_tool:
-        n poses, the tool turned about at least two axes.
-    u:
-        One array a camera, (n, k, 2) px; NaN = missing.
+    Args:
+        robot_from_tool: n poses, the tool turned about at least two axes.
+        u: One array a camera, (n, k, 2) px; NaN = missing.
 
-    Raises
-    ------
-    ValueError
-        For too few poses, motion that does not determine the offsets, or shapes that do not match.
+    Raises:
+        ValueError: For too few poses, motion that does not determine the offsets, or shapes that do not match.
     """
     R, t = _poses(robot_from_tool)
     images = [np.asarray(pixels, dtype=np.float64) for pixels in u]

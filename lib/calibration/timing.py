@@ -87,23 +87,16 @@ def estimate_time_offset(
 
     A coarse search, then Gauss-Newton: with v the velocity, y = A x(t) + o + (A v) offset is linear in the offset.
 
-    Parameters
-    ----------
-    data:
-        `Correspondences`, or (time_s (n,), u) with one array a camera, (n, 2) or (n, k, 2) px, NaN where missing.
-    kinematics:
-        `lib.recordings.Kinematics`, or (time_s (m,), x_mm (m, 3) or (m, k, 3)), denser than the motion is fast.  NaN where
-        the robot is silent: rows that fall into a gap of more than `smooth_s` are left out.
-    start_s, search_s:
-        Middle and half width of the search.
-    smooth_s:
-        Time within which the motion is smooth: the kinematics' noise is averaged over it.
+    Args:
+        data: `Correspondences`, or (time_s (n,), u) with one array a camera, (n, 2) or (n, k, 2) px, NaN where missing.
+        kinematics: `lib.recordings.Kinematics`, or (time_s (m,), x_mm (m, 3) or (m, k, 3)), denser than the motion is
+            fast.  NaN where the robot is silent: rows that fall into a gap of more than `smooth_s` are left out.
+        start_s, search_s: Middle and half width of the search.
+        smooth_s: Time within which the motion is smooth: the kinematics' noise is averaged over it.
 
-    Raises
-    ------
-    ValueError
-        For wrong shapes, fewer than eight instants inside the kinematics, a tool that stands still, or an offset at the end
-        of the search.
+    Raises:
+        ValueError: For wrong shapes, fewer than eight instants inside the kinematics, a tool that stands still, or an
+            offset at the end of the search.
     """
     time, landmark, y = _rows(data)
     paths = _paths(kinematics, smooth_s)

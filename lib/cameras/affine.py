@@ -31,17 +31,12 @@ class Camera(Protocol):
 class Resection:
     """M = K [r1 t1; r2 t2] (paper Eq. 5): intrinsics and pose, all but the shift along the optical axis.
 
-    Attributes
-    ----------
-    K:
-        (2, 2) upper triangular [[alpha_x, skew], [0, alpha_y]], px per mm.
-    R:
-        (3, 3) rotation camera_from_robot; its third row is the viewing direction, away from the camera.
-    t:
-        (2,) mm, so that u = K (R[:2] @ x + t).
-    mirrored:
-        True where the caller's `mirrored` hint says the optics flip the image, so that R's third row was
-        turned round.  One affine camera alone cannot tell (a reflection only flips the unseen third row).
+    Attributes:
+        K: (2, 2) upper triangular [[alpha_x, skew], [0, alpha_y]], px per mm.
+        R: (3, 3) rotation camera_from_robot; its third row is the viewing direction, away from the camera.
+        t: (2,) mm, so that u = K (R[:2] @ x + t).
+        mirrored: True where the caller's `mirrored` hint says the optics flip the image, so that R's third row was
+            turned round.  One affine camera alone cannot tell (a reflection only flips the unseen third row).
     """
 
     K: np.ndarray
@@ -114,11 +109,9 @@ class AffineCamera:
     def resect(self, *, mirrored: bool = False) -> Resection:
         """K, R and t of the camera by RQ factorisation (paper Eq. 5).
 
-        Parameters
-        ----------
-        mirrored:
-            True for optics that flip the image (an odd number of reflections).  R then maps to the
-            unflipped camera frame whose third axis still points away from the camera.
+        Args:
+            mirrored: True for optics that flip the image (an odd number of reflections).  R then maps to the unflipped
+                camera frame whose third axis still points away from the camera.
         """
         a_x, a_y = self.linear
         alpha_y = np.linalg.norm(a_y)

@@ -23,18 +23,12 @@ class NearAffineCamera:
     distance along r3 from the camera to the plane through the reference point.  A mirrored image shows as a
     negative 1/d, since reflection turns the direction r3 that M implies round.
 
-    Attributes
-    ----------
-    matrix:
-        M (2, 4), the affine camera that touches this one in the plane r3.(x - reference) = 0.
-    inverse_distance_per_mm:
-        1/d.
-    centre_px:
-        c, the principal point (2,), towards which distant points shrink.
-    reference_mm:
-        A point (3,) of the plane where the two touch; the origin unless given.
-    radial_per_px2:
-        k of radial distortion about c: the pixel above moves by k |u - c|^2 (u - c).
+    Attributes:
+        matrix: M (2, 4), the affine camera that touches this one in the plane r3.(x - reference) = 0.
+        inverse_distance_per_mm: 1/d.
+        centre_px: c, the principal point (2,), towards which distant points shrink.
+        reference_mm: A point (3,) of the plane where the two touch; the origin unless given.
+        radial_per_px2: k of radial distortion about c: the pixel above moves by k |u - c|^2 (u - c).
     """
 
     matrix: np.ndarray
@@ -89,10 +83,8 @@ class NearAffineCamera:
     def project(self, x: ArrayLike) -> np.ndarray:
         """Pixels (n, 2) of points (n, 3) in mm; NaN rows stay NaN.
 
-        Raises
-        ------
-        ValueError
-            If a point lies behind the camera.
+        Raises:
+            ValueError: If a point lies behind the camera.
         """
         x = points(x, 3, "x")
         v = (x @ self.linear.T + self.offset_px - self.centre_px) / self._ratio_in_front(x)[:, None]
@@ -138,10 +130,8 @@ class NearAffineCamera:
     def from_projection_matrix(cls, matrix: ArrayLike, radial_per_px2: float = 0.0) -> NearAffineCamera:
         """The camera of a homogeneous P (3, 4), scaled as `projection_matrix` writes it.
 
-        Raises
-        ------
-        ValueError
-            If P is affine (the third row's first three entries vanish) or not finite.
+        Raises:
+            ValueError: If P is affine (the third row's first three entries vanish) or not finite.
         """
         P = np.array(matrix, dtype=np.float64)
         if P.shape != (3, 4) or not np.isfinite(P).all():

@@ -56,8 +56,6 @@ def camera_from_dict(content: dict) -> AffineCamera | NearAffineCamera:
 class StereoRig:
     """Two calibrated cameras that share the frame of their points (the robot's, unless a name says otherwise).
 
-    Examples
-    --------
     >>> left = AffineCamera([[100, 0, 0, 960], [0, 100, 0, 540]])
     >>> right = AffineCamera([[100, 0, 11, 960], [0, 100, 0, 540]])
     >>> rig = StereoRig(left, right)
@@ -136,17 +134,12 @@ class StereoRig:
 
         So does a match that only a point behind a near-affine camera would explain.
 
-        Parameters
-        ----------
-        u_left, u_right:
-            (n, 2) px.
-        covariance_px2:
-            Of the matches, in any form that `lib.geometry.pair_covariance` takes; None is 1 px^2.
+        Args:
+            u_left, u_right: (n, 2) px.
+            covariance_px2: Of the matches, in any form that `lib.geometry.pair_covariance` takes; None is 1 px^2.
 
-        Returns
-        -------
-        Points
-            With the covariance of each point from the noise of its match.
+        Returns:
+            Points: With the covariance of each point from the noise of its match.
         """
         if self.is_affine and (covariance_px2 is None or np.ndim(covariance_px2) == 0):
             return self._triangulate_isotropic(u_left, u_right, 1.0 if covariance_px2 is None else covariance_px2)
@@ -191,10 +184,8 @@ class StereoRig:
     def load(cls, path: str | Path) -> StereoRig:
         """Read what `save` wrote.
 
-        Raises
-        ------
-        FileNotFoundError, ValueError
-            Naming the file.
+        Raises:
+            FileNotFoundError, ValueError: Naming the file.
         """
         path = Path(path)
         if not path.is_file():

@@ -36,12 +36,10 @@ def best_linear(A: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.n
 def triangulate_near_affine(cameras: _Pair, y: np.ndarray, covariance: np.ndarray, steps: int = 2) -> Points:
     """Linear for each point (the projection's denominator multiplied out), then Gauss-Newton steps on the pixels.
 
-    Parameters
-    ----------
-    y:
-        (n, 4) left and right pixels; NaN rows stay NaN, and so does a match that only a point behind a camera explains.
-    covariance:
-        (1, 4, 4) or (n, 4, 4), as `lib.geometry.pair_covariance` gives it.
+    Args:
+        y: (n, 4) left and right pixels; NaN rows stay NaN, and so does a match that only a point behind a camera
+            explains.
+        covariance: (1, 4, 4) or (n, 4, 4), as `lib.geometry.pair_covariance` gives it.
     """
     n = len(y)
     x, covariance_mm2, epipolar = np.full((n, 3), np.nan), np.full((n, 3, 3), np.nan), np.full(n, np.nan)
