@@ -29,18 +29,10 @@ Masks = tuple[np.ndarray | None, np.ndarray | None]
 
 @dataclass(frozen=True)
 class Setting:
-    """How finely the band is searched.
+    """How finely the band is searched."""
 
-    Attributes
-    ----------
-    max_pixels:
-        The canvas is shrunk to so many, if it has more.
-    refine_margin:
-        Cells around a patch that take part in its sub-pixel step.
-    """
-
-    max_pixels: int
-    refine_margin: int = 0
+    max_pixels: int  # the canvas is shrunk to so many, if it has more
+    refine_margin: int = 0  # cells around a patch that take part in its sub-pixel step
 
 
 SETTINGS = {"fast": Setting(max_pixels=400_000), "quality": Setting(max_pixels=3_000_000, refine_margin=1)}
@@ -69,28 +61,13 @@ SIGMA_HALF = 0.06
 
 @dataclass(frozen=True, eq=False)
 class Search:
-    """Where to look for matches.
-
-    Attributes
-    ----------
-    rectification:
-        Of the canvas that the images are matched on.
-    scale:
-        Canvas pixels per left pixel.
-    range_px:
-        (low, high) displacement along the line, canvas pixels.
-    off_line_px:
-        Median displacement off the line that the coarse matches found, canvas pixels; 0 below half a left pixel, where
-        resampling for it costs more than it gains.
-    n_found:
-        Coarse matches found.
-    """
+    """Where to look for matches."""
 
     rectification: Rectification
-    scale: float
-    range_px: tuple[float, float]
-    off_line_px: float
-    n_found: int
+    scale: float  # canvas pixels per left pixel
+    range_px: tuple[float, float]  # (low, high) displacement along the line, canvas pixels
+    off_line_px: float  # median displacement off the line; 0 below half a left pixel, where resampling gains nothing
+    n_found: int  # coarse matches found
 
 
 def plan_search(

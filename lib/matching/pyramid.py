@@ -31,21 +31,11 @@ BORDER_POWER = 0.9
 
 @dataclass(frozen=True)
 class Pyramid:
-    """Responses of the patches of all sizes.
+    """Responses of the patches of all sizes."""
 
-    Attributes
-    ----------
-    pools:
-        Per level the maxima along x, and along x and y.  Of level 0 only the latter, after the power.
-    responses:
-        Levels 1 to top.
-    shifted:
-        Whether the last two axes are places (else displacements).
-    """
-
-    pools: list[tuple[torch.Tensor | None, torch.Tensor]]
-    responses: list[torch.Tensor]
-    shifted: bool
+    pools: list[tuple[torch.Tensor | None, torch.Tensor]]  # maxima along x, and along both; of level 0 the latter
+    responses: list[torch.Tensor]  # levels 1 to top
+    shifted: bool  # whether the last two axes are places (else displacements)
 
 
 def n_levels(gy: int, gx: int) -> int:

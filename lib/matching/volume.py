@@ -22,27 +22,13 @@ ROWS = 8
 
 @dataclass(frozen=True)
 class VolumeMatches:
-    """Matches on the lattice, in cells of the pooled descriptor grid.
+    """Matches on the lattice, in cells of the pooled descriptor grid."""
 
-    Attributes
-    ----------
-    patch:
-        (n, 2) int, (gx, gy) of the 4 x 4 cell patch.
-    cell:
-        (n, 2) int, (dx, dy) displacement in whole cells.
-    displacement:
-        (n, 2) float, the same at the vertex of a parabola through the response and its neighbours.
-    peaked:
-        (n,) bool, whether the response has an interior peak along x.
-    reciprocal:
-        (n,) bool, whether no other patch fits the same place of the right image better.
-    """
-
-    patch: np.ndarray
-    cell: np.ndarray
-    displacement: np.ndarray
-    peaked: np.ndarray
-    reciprocal: np.ndarray
+    patch: np.ndarray  # (n, 2) int, (gx, gy) of the 4 x 4 cell patch
+    cell: np.ndarray  # (n, 2) int, (dx, dy) displacement in whole cells
+    displacement: np.ndarray  # (n, 2), the same at the vertex of a parabola through the response and its neighbours
+    peaked: np.ndarray  # (n,) bool, whether the response has an interior peak along x
+    reciprocal: np.ndarray  # (n,) bool, whether no other patch fits the same place of the right image better
 
     def keep(self, chosen: np.ndarray) -> VolumeMatches:
         """The matches of a mask (n,) or of indices."""
