@@ -27,7 +27,7 @@ def test_cpu_seconds_count_finished_child_processes():
     provenance = Provenance("a study with workers")
     work = "import time\nwhile time.process_time() < 0.3: pass"
     subprocess.run([sys.executable, "-c", work], check=True)
-    assert provenance.so_far()["cpu_seconds"] >= 0.3 or os.name == "nt"
+    assert provenance.so_far()["cpu_seconds"] >= 0.25 or os.name == "nt"
 
 
 def test_missing_numbers_become_null():
