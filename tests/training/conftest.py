@@ -1,6 +1,12 @@
+from dataclasses import replace
+
 import pytest
 import torch
 
+from lib.landmarks.network import HourglassConfig
+from lib.training.augmentation import Augmentation
+from lib.training.config import PRESETS
+from lib.training.loop import train
 from lib.training.shards import write_frames
 from tests.toys import toy_images, toy_samples
 
@@ -18,6 +24,16 @@ def one_thread():
 def toy():
     """`toy(n, seed=0, size=(h, w))` -> Samples."""
     return toy_samples
+
+
+@pytest.fixture(scope="session")
+def trained():
+    """A training on toys that is long enough to find them."""
+    config = replace(
+        PRESETS["best"], network=HourglassConfig(12, 1, 2), augmentation=Augmentation(10.0, (0.9, 1.1)), steps=60,
+        batch_size=6, ema=0.9, learning_rate=4e-3, validate_every=20, precision="fp32",
+    )  # fmt: skip
+    return train(config, toy_samples(60), toy_samples(12, seed=1), progress=False)
 
 
 @pytest.fixture(scope="session")

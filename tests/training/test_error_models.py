@@ -9,25 +9,17 @@ import torch
 from lib.landmarks import Detector, metrics
 from lib.landmarks import detector as detectors
 from lib.landmarks.error_model import ErrorModel
-from lib.landmarks.network import HourglassConfig, OffsetConfig, OffsetNetwork
+from lib.landmarks.network import OffsetConfig, OffsetNetwork
 from lib.training import error_models
-from lib.training.augmentation import Augmentation
-from lib.training.config import PRESETS
 from lib.training.error_models import Seen, fit_error_models
 from lib.training.evaluation import evaluate
-from lib.training.loop import train
-from tests.toys import toy_images, toy_samples
+from tests.toys import toy_images
 
 
 @pytest.fixture(scope="module")
-def small():
-    """A whole-frame detector trained for a moment on toys, and toys it has not seen."""
-    config = replace(
-        PRESETS["best"], network=HourglassConfig(12, 1, 2), augmentation=Augmentation(10.0, (0.9, 1.1)), steps=50,
-        batch_size=6, ema=0.9, learning_rate=4e-3, validate_every=50, precision="fp32",
-    )  # fmt: skip
-    network = train(config, toy_samples(60), toy_samples(4, seed=2), progress=False).network
-    return Detector(network, error_models={"frame": ErrorModel(logit=(5.0, 0.0, 0.0, 0.0))}), toy_images(40, seed=5)
+def small(trained):
+    """A whole-frame detector, and toys that it has not seen."""
+    return Detector(trained.network, error_models={"frame": ErrorModel(logit=(5.0, 0.0, 0.0, 0.0))}), toy_images(40, seed=5)
 
 
 def test_calibration_makes_covariances_and_confidence_true(small):
@@ -74,7 +66,7 @@ def test_closeups_that_know_nothing_do_no_harm(small, monkeypatch):
     closeup = OffsetNetwork(OffsetConfig(4, 32)).eval()
     torch.nn.init.normal_(closeup.head[-1].weight, std=0.5)
     full = replace(detector, window_network=detector.frame_network, window_px=64, closeup_network=closeup)
-    frames = frames[:14]
+    frames = frames[:12]
     once = fit_error_models(full, frames)
     assert set(once.error_models) == {"frame", "window", "closeup", "tracking"}
     gain = np.array(once.error_models["closeup"].gain)

@@ -1,5 +1,6 @@
 import errno
 import os
+import socket
 import subprocess
 import sys
 from dataclasses import replace
@@ -32,17 +33,8 @@ def same(a, b):
     return all(torch.equal(x, y) for x, y in zip(a.state_dict().values(), b.state_dict().values(), strict=True))
 
 
-def test_training_lowers_the_loss_and_finds_the_landmarks(toy):
-    config = replace(
-        PRESETS["best"],
-        network=HourglassConfig(12, 1, 2),
-        augmentation=Augmentation(15.0, (0.9, 1.1)),
-        steps=60,
-        batch_size=6,
-        validate_every=20,
-        precision="fp32",
-    )
-    log = train(config, toy(60), toy(12, seed=1), progress=False).log
+def test_training_lowers_the_loss_and_finds_the_landmarks(trained):
+    log = trained.log
     assert log[-1]["loss"] < 0.6 * log[0]["loss"]
     assert log[-1]["validation_loss"] < log[0]["validation_loss"]
     assert log[-1]["pck_0.10"] > max(30, log[0]["pck_0.10"])
@@ -186,27 +178,31 @@ def test_bad_configurations_are_named(changes):
 
 
 def test_two_processes_train_one_network(toy, tmp_path):
-    """torchrun on two CPU processes: other batches, the same weights, a falling loss, one log."""
-    script = tmp_path / "two.py"
-    script.write_text(
-        "import os, sys, torch\n"
-        f"sys.path[:0] = [{str(Path(__file__).parents[2])!r}]\n"
-        "from dataclasses import replace\n"
-        "from tests.toys import toy_samples\n"
-        "from lib.landmarks.network import HourglassConfig\n"
-        "from lib.training.config import PRESETS\n"
-        "from lib.training.loop import train\n"
-        "torch.set_num_threads(1)\n"
-        "config = replace(PRESETS['best'], network=HourglassConfig(6, 1, 2), steps=12, batch_size=2,\n"
-        "                 validate_every=4, precision='fp32', learning_rate=4e-3)\n"
-        "done = train(config, toy_samples(20), toy_samples(4, 1), sys.argv[1], progress=False)\n"
-        "torch.save((done.network.state_dict(), done.log), f'{sys.argv[1]}/rank{os.environ[\"RANK\"]}.pt')\n"
-    )
+    """Two CPU processes as torchrun starts them: other batches, the same weights, a falling loss, one log."""
+    script = """
+import os, sys, torch
+from dataclasses import replace
+from lib.landmarks.network import HourglassConfig
+from lib.training.config import PRESETS
+from lib.training.loop import train
+from tests.toys import toy_samples
+torch.set_num_threads(1)
+config = replace(PRESETS['best'], network=HourglassConfig(6, 1, 2), steps=12, batch_size=2,
+                 validate_every=4, precision='fp32', learning_rate=4e-3)
+done = train(config, toy_samples(20), toy_samples(4, 1), sys.argv[1], progress=False)
+torch.save((done.network.state_dict(), done.log), f'{sys.argv[1]}/rank{os.environ["RANK"]}.pt')
+"""
     out = tmp_path / "out"
-    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", str(script), out]
-    environment = os.environ | {"OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
-    done = subprocess.run(list(map(str, command)), capture_output=True, text=True, timeout=240, env=environment)
-    assert done.returncode == 0, done.stderr[-2000:]
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = str(free.getsockname()[1])
+    environment = os.environ | {
+        "OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": "", "WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1",
+        "MASTER_PORT": port, "PYTHONPATH": str(Path(__file__).parents[2]),
+    }  # fmt: skip
+    command = [sys.executable, "-c", script, str(out)]
+    running = [subprocess.Popen(command, env=environment | {"RANK": str(rank)}) for rank in (0, 1)]
+    assert [process.wait(timeout=240) for process in running] == [0, 0]
     (a, log), (b, _) = (torch.load(out / f"rank{rank}.pt") for rank in (0, 1))
     assert all(torch.equal(a[name], b[name]) for name in a)
     assert log[-1]["loss"] < log[0]["loss"]
