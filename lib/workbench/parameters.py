@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import ast
 import contextlib
+import functools
 import logging
 import math
 import re
@@ -144,6 +145,14 @@ def _value(name: str, text: str, kind: str) -> object:
 
 
 def _inspect(notebook: Path) -> dict[str, dict]:
+    if not notebook.is_file():
+        raise UsageError(f"{notebook}: no such notebook.")
+    return _inspect_version(notebook, notebook.stat().st_mtime_ns)
+
+
+@functools.lru_cache(maxsize=64)
+def _inspect_version(notebook: Path, changed_ns: int) -> dict[str, dict]:
+    """Once for each version of the file: a sweep asks for every point of its grid."""
     import papermill
 
     logging.getLogger("papermill").setLevel(logging.ERROR)  # no word about notebooks without a parameters cell

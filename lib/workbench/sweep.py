@@ -49,6 +49,7 @@ Other machines: any Dask cluster whose workers have this environment and see thi
   .venv/bin/dask scheduler                                 prints its address
   .venv/bin/dask worker ADDRESS --nthreads 1 --nworkers 8  on each machine
   python3 -m lib sweep NOTEBOOK --scheduler ADDRESS
+A Dask scheduler runs what anybody sends who reaches its port: keep it inside your own network.
 
 SLURM: start the scheduler and its workers with .venv/bin/python on the login node, in the folder of the workbench:
   from dask_jobqueue import SLURMCluster
