@@ -1,1 +1,1 @@
-"""Training of the landmark detector: samples, augmentation, losses, the loop, evaluation and assembly."""
+"""Training of the landmark detector: data, augmentation, losses, the loop, its stages, evaluation, error models, assembly."""
