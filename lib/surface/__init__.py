@@ -16,7 +16,7 @@ from lib.surface.export import (
     surface_mesh,
 )
 from lib.surface.fit import SurfaceFit
-from lib.surface.fitting import fit_surface, held_out_errors
+from lib.surface.fitting import fit_surface
 from lib.surface.grid import SplineGrid
 from lib.surface.joint import refine_rig
 from lib.surface.reconstruct import EPIPOLAR_SIGMAS, Reconstruction, epipolar_inliers, reconstruct
@@ -32,7 +32,6 @@ __all__ = [
     "depth_map",
     "epipolar_inliers",
     "fit_surface",
-    "held_out_errors",
     "open3d",
     "reconstruct",
     "refine_rig",

@@ -17,7 +17,7 @@ from lib.surface.fit import SurfaceFit
 from lib.surface.grid import SplineGrid
 from lib.surface.solver import L1Problem, L1Solution, interior_point, least_squares
 
-__all__ = ["REJECT_MEDIANS", "fit_surface", "held_out_errors"]
+__all__ = ["REJECT_MEDIANS", "fit_surface"]
 
 #: Default rejection: points whose L1 norm exceeds this many times the median.  Gaussian noise along one axis puts
 #: 0.1 % of its points beyond it.
@@ -146,26 +146,6 @@ def fit_surface(
         residual=problem.design @ solution.coefficients - data.values[inliers],
     )
     return BSplineSurface(grid, surface.control_points_mm, fit)
-
-
-def held_out_errors(
-    u: ArrayLike,
-    x_mm: ArrayLike,
-    smoothness: ArrayLike,
-    *,
-    domain: tuple[float, float, float, float],
-    control: tuple[int, int] = (20, 20),
-    covariance_mm2: ArrayLike | None = None,
-    camera: AffineCamera | None = None,
-    method: Literal["interior_point", "least_squares"] = "interior_point",
-) -> np.ndarray:
-    """Mean L1 error (k,) mm of points kept out of the fit at each smoothness (k,), over all folds.
-
-    `fit_surface` chooses by it; the other arguments are as there.
-    """
-    data = _prepared(u, x_mm, domain, control, covariance_mm2, camera)
-    error = _HeldOut(data, _searcher(method), _FOLDS)
-    return np.array([error(_checked_smoothness(mu)) for mu in np.atleast_1d(smoothness)])
 
 
 @dataclass(frozen=True)
