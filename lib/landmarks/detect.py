@@ -21,6 +21,9 @@ def detect(
 ) -> Correspondences:
     """Run the detector over a recording, one stereo frame at a time (a full-HD pair takes 12 MB).
 
+    Returns three rows a frame (base, tip_1, tip_2), each with the robot's position at its instant, and NaN where a landmark
+    is missing.  `Correspondences.complete` keeps the rows that both cameras and the robot saw.
+
     Parameters
     ----------
     detector:
@@ -29,11 +32,6 @@ def detect(
         Which frames; None is all.
     track:
         Follow the landmarks from frame to frame (`Detector.track`): several times faster where frames follow each other.
-
-    Returns
-    -------
-    Three rows a frame (base, tip_1, tip_2), each with the robot's position at its instant; NaN where a landmark is missing.
-    `Correspondences.complete` keeps the rows that both cameras and the robot saw.
 
     >>> from lib import paths
     >>> found = detect(Recording.open(paths.SHIPPED_RECORDING), frames=slice(0, 2))

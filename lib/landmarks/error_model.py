@@ -32,8 +32,6 @@ class ErrorModel:
         (3, 2) for base, tip_1 and tip_2 along x and y, closeups only.  A closeup's correction is scaled by the gain that
         minimises the validation error; the bias is the mean error that this leaves, in the closeup's pixels.
 
-    Examples
-    --------
     >>> ErrorModel().coefficients.shape
     (3, 2, 4)
     """

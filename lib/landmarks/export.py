@@ -70,21 +70,10 @@ def export(
 ) -> dict[str, tuple[Path, float]]:
     """Write every stage as ``STAGE.onnx`` into `folder`, if it agrees with torch.
 
-    Parameters
-    ----------
-    examples:
-        Frames (n, h, w, 3) uint8 with the tool in view, on which the stages are compared; None = of the recording that
-        ships.  The exported first stage takes frames of this size.
-
-    Returns
-    -------
-    File of each stage, and its largest difference from torch in px, over landmarks that torch finds.
-
-    Raises
-    ------
-    ValueError
-        If a stage differs by more than `LARGEST` (its file is not written), nothing is found in `examples`, or a package
-        is missing.
+    The stages are compared on `examples`, frames (n, h, w, 3) uint8 with the tool in view; None = of the recording that
+    ships.  The exported first stage takes frames of this size.  Returns the file of each stage, and its largest difference
+    from torch in px, over landmarks that torch finds.  Raises `ValueError` if a stage differs by more than `LARGEST` (its
+    file is not written), nothing is found in `examples`, or a package is missing.
     """
     for package in ("onnx", "openvino"):  # one writes the files, the other runs them for the comparison
         if not importlib.util.find_spec(package):

@@ -30,8 +30,6 @@ def render(u: Tensor, image_size: tuple[int, int], stride: int, sigma_px: float 
     Takes points u (n, k, 2) px of an input of size (h, w), and returns heatmaps (n, k, ceil(h / stride), ceil(w / stride)).
     A point that is NaN gives an empty heatmap.
 
-    Examples
-    --------
     >>> heatmaps = render(torch.tensor([[[5.5, 9.5]]]), (16, 32), 4)
     >>> heatmaps.shape, heatmaps[0, 0, 2, 1].item()
     (torch.Size([1, 1, 4, 8]), 1.0)
@@ -253,20 +251,11 @@ DECODERS = tuple(_DECODERS)
 def decode(heatmaps: Tensor, stride: int, *, method: str = "gauss_newton", sigma_px: float = SIGMA_PX) -> Peaks:
     """The peak of every heatmap (n, k, h, w) of `stride` input pixels per cell, in pixels of the network's input.
 
-    Parameters
-    ----------
-    method:
-        ``"argmax"``: the highest cell.  ``"paper"``: centroid of the disc of 3 sigma around it, Eq. (1) divided by the
-        sum of p (as printed it is divided by the disc's area, see `disc_as_printed`).  ``"dark"``: Zhang et al. 2020.
-        ``"kornia"``: spatial expectation in a window.  ``"gauss_newton"``: Gaussian fit, with covariance.
+    The methods are ``"argmax"``: the highest cell; ``"paper"``: the centroid of the disc of 3 sigma around it, Eq. (1)
+    divided by the sum of p (as printed it is divided by the disc's area, see `disc_as_printed`); ``"dark"``: Zhang et al.
+    2020; ``"kornia"``: the spatial expectation in a window; ``"gauss_newton"``: a Gaussian fit, with covariance.
+    Raises `ValueError` for an unknown method and for heatmaps of another shape or not finite.
 
-    Raises
-    ------
-    ValueError
-        For an unknown method, heatmaps that are not (n, k, h, w), or not finite.
-
-    Examples
-    --------
     >>> heatmaps = render(torch.tensor([[[20.3, 12.8]]], dtype=torch.float64), (64, 64), 4)
     >>> decode(heatmaps, 4).u.round(decimals=3).tolist()
     [[[20.3, 12.8]]]

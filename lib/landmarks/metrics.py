@@ -44,18 +44,9 @@ def tool_length_px(u_true: ArrayLike) -> np.ndarray:
 def pck(u: ArrayLike, u_true: ArrayLike, threshold: ArrayLike = PCK_THRESHOLDS, *, length_px: ArrayLike | None = None):
     """Percentage of correct keypoints (paper Sec. V-B): nearer to the label than `threshold` times the tool's length.
 
-    Parameters
-    ----------
-    u, u_true:
-        (n, 3, 2) px; a missing detection counts as wrong, a missing label is not counted.
-    threshold:
-        A number or (t,).
-    length_px:
-        (n,) tool lengths; None = from the labels.  Frames without one are not counted.
-
-    Returns
-    -------
-    Percent, a float or (t,) as `threshold`; NaN where no label counts.
+    Takes detections and labels (n, 3, 2) px.  A missing detection counts as wrong, a missing label is not counted.
+    `length_px` (n,) are the tool's lengths, None = from the labels; frames without one are not counted.
+    Returns percent, a float or (t,) as `threshold`; NaN where no label counts.
 
     >>> u_true = np.array([[[0.0, 0.0], [100.0, 0.0], [0.0, 100.0]]])
     >>> pck(u_true + [[[3, 0], [6, 0], [0, 0]]], u_true, [0.02, 0.05, 0.1]).round(1).tolist()

@@ -39,8 +39,6 @@ class HourglassConfig:
     decoder, skips, residual:
         The parts that the ablation adds one by one.  Without a decoder the heatmaps have stride 4 * 2**depth.
 
-    Examples
-    --------
     >>> HourglassConfig().stride, HourglassConfig(**ABLATION["encoder"]).stride
     (4, 64)
     """
@@ -147,8 +145,6 @@ class StackedHourglass(_Network):
     and bottom, and returns one (n, 3, ceil(h / stride), ceil(w / stride)) heatmap tensor per stack, the final one last.
     It raises `ValueError` if the images do not have three channels.
 
-    Examples
-    --------
     >>> heatmaps = StackedHourglass(HourglassConfig(features=8))(torch.zeros(1, 3, 60, 100))
     >>> len(heatmaps), heatmaps[-1].shape
     (2, torch.Size([1, 3, 15, 25]))
@@ -247,8 +243,6 @@ class OffsetNetwork(_Network):
     tensor (n, 4): the offset along x and y in pixels, and the logarithms of the scales of its errors in pixels, limited to
     -6 to 5.  It raises `ValueError` if the images have another size.
 
-    Examples
-    --------
     >>> OffsetNetwork(OffsetConfig(features=8)).eval()(torch.zeros(2, 3, 64, 64))[0].shape
     torch.Size([2, 4])
     """
