@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-__all__ = ["DECODERS", "SIGMA_PX", "Peaks", "decode", "disc_as_printed", "render", "sigma_cells"]
+__all__ = ["DECODERS", "SIGMA_PX", "Peaks", "decode", "render", "sigma_cells"]
 
 #: Standard deviation of the targets (paper Sec. V-B), px of the network's input.
 SIGMA_PX = 5.0
@@ -110,32 +110,15 @@ def _decode_argmax(heatmaps: Tensor, sigma: float) -> tuple[Tensor, ...]:
     return _plain(cell.to(heatmaps.dtype), value)
 
 
-def _disc(heatmaps: Tensor, sigma: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Argmax cell, its value, the disc's weights (n, k, p) and offsets (p, 2): Delta and p_k of Eq. (1)."""
+def _decode_disc(heatmaps: Tensor, sigma: float) -> tuple[Tensor, ...]:
+    """The mean of Eq. (1) over its disc Delta, weighted by p."""
     cell, value = _argmax(heatmaps)
     p, offsets, inside = _patches(heatmaps, cell, int(3 * sigma))
     # A regressed activation can be negative, a probability cannot.
     weights = p.clamp_min(0) * inside * (offsets.square().sum(-1) <= (3 * sigma) ** 2)
-    return cell.to(heatmaps.dtype), value, weights, offsets
-
-
-def _decode_disc(heatmaps: Tensor, sigma: float) -> tuple[Tensor, ...]:
-    cell, value, weights, offsets = _disc(heatmaps, sigma)
     total = weights.sum(-1, keepdim=True)
-    return _plain(cell + (weights @ offsets) / total.clamp_min(torch.finfo(total.dtype).tiny), value)
-
-
-def disc_as_printed(heatmaps: Tensor, stride: int, sigma_px: float = SIGMA_PX) -> Tensor:
-    """Eq. (1) as printed: the sum of (u_max + Delta) p over |Delta|, (n, k, 2) px.  For comparison only: it is no mean.
-
-    A unit Gaussian sums to about 2 pi sigma^2 and the disc of 3 sigma has 9 pi sigma^2 cells, so the printed form
-    shrinks every coordinate to about 0.22 of its value.
-    """
-    sigma = sigma_cells(stride, sigma_px)
-    cell, _, weights, offsets = _disc(heatmaps, sigma)
-    area = (offsets.square().sum(-1) <= (3 * sigma) ** 2).sum()
-    at = _pixels(cell[..., None, :] + offsets, stride)
-    return (weights[..., None] * at).sum(-2) / area
+    mean = (weights @ offsets) / total.clamp_min(torch.finfo(total.dtype).tiny)
+    return _plain(cell.to(heatmaps.dtype) + mean, value)
 
 
 def _decode_kornia(heatmaps: Tensor, sigma: float) -> tuple[Tensor, ...]:
@@ -252,7 +235,7 @@ def decode(heatmaps: Tensor, stride: int, *, method: str = "gauss_newton", sigma
     """The peak of every heatmap (n, k, h, w) of `stride` input pixels per cell, in pixels of the network's input.
 
     The methods are ``"argmax"``: the highest cell; ``"paper"``: the centroid of the disc of 3 sigma around it, Eq. (1)
-    divided by the sum of p (as printed it is divided by the disc's area, see `disc_as_printed`); ``"dark"``: Zhang et al.
+    divided by the sum of p (as printed it is divided by the disc's area, which is no mean); ``"dark"``: Zhang et al.
     2020; ``"kornia"``: the spatial expectation in a window; ``"gauss_newton"``: a Gaussian fit, with covariance.
     Raises `ValueError` for an unknown method and for heatmaps of another shape or not finite.
 

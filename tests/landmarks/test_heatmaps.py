@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lib.geometry import image_from_cell
-from lib.landmarks.heatmaps import DECODERS, decode, disc_as_printed, render, sigma_cells
+from lib.landmarks.heatmaps import DECODERS, decode, render, sigma_cells
 
 
 def points(n, seed=0, low=20, high=108):
@@ -89,13 +89,15 @@ def test_flat_and_tiny_heatmaps_decode_to_something_finite():
             assert torch.isfinite(decode(torch.zeros(shape), 4, method=method).u).all()
 
 
-def test_printed_equation_is_no_mean():
-    """The paper's Eq. (1) divides by the area of the disc, not by the sum of p."""
+def test_equation_1_needs_the_sum_of_p():
+    """The paper's Eq. (1) divides by the area of the disc, not by the sum of p; then it is no mean."""
     heatmap = render(torch.tensor([[[48.2, 47.7]]], dtype=torch.float64), (96, 96), 1)
-    printed = disc_as_printed(heatmap, 1)[0, 0]
-    normalised = decode(heatmap, 1, method="paper").u[0, 0]
-    assert np.allclose(printed, (10.56, 10.45), atol=0.01)
+    normalised = decode(heatmap, 1, method="paper").u[0, 0].numpy()
     assert np.allclose(normalised, (48.19, 47.72), atol=0.01)
+    y, x = np.mgrid[:96, :96]
+    disc = (x - 48) ** 2 + (y - 48) ** 2 <= 15**2
+    printed = [(v * heatmap[0, 0].numpy())[disc].sum() / disc.sum() for v in (x, y)]
+    assert np.allclose(printed, (10.56, 10.45), atol=0.01)
 
 
 def test_batches_decode_as_single_heatmaps_do():
