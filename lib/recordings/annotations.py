@@ -20,12 +20,10 @@ _SIDES = ("left", "right")
 class Annotations:
     """Annotated landmarks of n frames, in the order base, tip_1, tip_2.
 
-    Attributes
-    ----------
-    u_left, u_right:
-        (n, 3, 2) px, NaN where not labelled.
-    visibility_left, visibility_right:
-        (n, 3) int as in COCO: 0 not labelled, 1 labelled but hidden, 2 visible.  None = 2 wherever there is a label.
+    Attributes:
+        u_left, u_right: (n, 3, 2) px, NaN where not labelled.
+        visibility_left, visibility_right: (n, 3) int as in COCO: 0 not labelled, 1 labelled but hidden, 2 visible.
+            None = 2 wherever there is a label.
     """
 
     u_left: np.ndarray
@@ -49,10 +47,8 @@ def read_coco(path: Path, n_frames: int, image_size_px: tuple[int, int]) -> Anno
     The names in the category order the keypoints, so any order in the file will do; other keypoints are ignored.
     Integer coordinates are pixel centres.
 
-    Raises
-    ------
-    FileNotFoundError, ValueError
-        Naming the file and the entry.
+    Raises:
+        FileNotFoundError, ValueError: Naming the file and the entry.
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file.")

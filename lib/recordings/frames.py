@@ -34,11 +34,9 @@ class StereoFrame:
 def read_image(path: Path, image_size_px: tuple[int, int] | None = None) -> np.ndarray:
     """An image file as (h, w, 3) uint8 RGB; its pixels as they are stored, whatever EXIF says.
 
-    Raises
-    ------
-    FileNotFoundError, ValueError
-        If there is no such file, it cannot be decoded, a part of it is lost, or its size is not `image_size_px`
-        (width, height).
+    Raises:
+        FileNotFoundError, ValueError: If there is no such file, it cannot be decoded, a part of it is lost, or its size
+            is not `image_size_px` (width, height).
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such image.")
@@ -167,10 +165,8 @@ class Frames(Sequence[StereoFrame]):
 
     A slice is again `Frames` and decodes nothing.
 
-    Attributes
-    ----------
-    time_s:
-        (n,) video clock, strictly increasing.
+    Attributes:
+        time_s: (n,) video clock, strictly increasing.
     """
 
     def __init__(self, left: ImageFolder | Video, right: ImageFolder | Video, time_s: np.ndarray) -> None:

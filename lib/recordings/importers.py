@@ -17,14 +17,10 @@ __all__ = ["MonocularSequence", "import_retinal_microsurgery"]
 class MonocularSequence:
     """Labelled frames of one camera, no kinematics.
 
-    Attributes
-    ----------
-    frame_numbers:
-        (n,) int, the numbers in the original video; `paths` are their n image files.
-    u:
-        (n, 3, 2) px of base, tip_1, tip_2; NaN where not visible.
-    image_size_px:
-        (width, height).
+    Attributes:
+        frame_numbers: (n,) int, the numbers in the original video; `paths` are their n image files.
+        u: (n, 3, 2) px of base, tip_1, tip_2; NaN where not visible.
+        image_size_px: (width, height).
     """
 
     name: str
@@ -44,17 +40,13 @@ class MonocularSequence:
 def import_retinal_microsurgery(folder: str | Path) -> list[MonocularSequence]:
     """The Retinal Microsurgery sequences (Sznitman et al., MICCAI 2012): in-vivo frames with tool landmarks.
 
-    Parameters
-    ----------
-    folder:
-        Holds ``seq1/``, ``seq2/``, ...: images named by frame number and ``landmarks.csv`` (frame, then x and y of
-        shaft, base, tip_1, tip_2 in whole pixels, empty = not visible).  Its tip_1 is the right one, seen from base to
-        tips; the result has the left one first, as every recording here.
+    Args:
+        folder: Holds ``seq1/``, ``seq2/``, ...: images named by frame number and ``landmarks.csv`` (frame, then x and y
+            of shaft, base, tip_1, tip_2 in whole pixels, empty = not visible).  Its tip_1 is the right one, seen from
+            base to tips; the result has the left one first, as every recording here.
 
-    Raises
-    ------
-    FileNotFoundError, ValueError
-        Naming the file.
+    Raises:
+        FileNotFoundError, ValueError: Naming the file.
     """
     folder = Path(folder)
     tables = sorted(folder.glob("*/landmarks.csv"))

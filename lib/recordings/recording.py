@@ -32,15 +32,10 @@ _FIXED = {"format": FORMAT, "units": UNITS, "skeleton": list(LANDMARKS)}
 class Kinematics:
     """The robot's report of the landmarks.
 
-    Attributes
-    ----------
-    time_s:
-        (m,) robot clock, strictly increasing.
-    x_mm:
-        (m, 3, 3) base, tip_1, tip_2 in the robot frame; NaN where a sample was dropped.
+    Attributes:
+        time_s: (m,) robot clock, strictly increasing.
+        x_mm: (m, 3, 3) base, tip_1, tip_2 in the robot frame; NaN where a sample was dropped.
 
-    Example
-    -------
     >>> report = Kinematics(np.array([0.0, 1.0]), np.zeros((2, 3, 3)) + np.array([[[0]], [[4]]]))
     >>> report.at([0.25, 2.0])[:, 0, 0].tolist()
     [1.0, nan]
@@ -77,20 +72,13 @@ class Kinematics:
 class Recording:
     """A validated recording; `Recording.open` makes one.
 
-    Attributes
-    ----------
-    image_size_px:
-        (width, height).
-    readout_s:
-        Time from the first to the last row of a rolling shutter; 0 is a global shutter.
-    offset_s:
-        t_robot = t_video + offset_s.
-    robot_accuracy_mm:
-        Standard deviation of the robot's report, per coordinate.
-    details:
-        Own notes of whoever wrote the recording.
-    annotations, truth:
-        None where the recording has none.
+    Attributes:
+        image_size_px: (width, height).
+        readout_s: Time from the first to the last row of a rolling shutter; 0 is a global shutter.
+        offset_s: t_robot = t_video + offset_s.
+        robot_accuracy_mm: Standard deviation of the robot's report, per coordinate.
+        details: Own notes of whoever wrote the recording.
+        annotations, truth: None where the recording has none.
     """
 
     folder: Path
@@ -116,13 +104,9 @@ class Recording:
 
         Sizes, counts, headers and ends of all images are checked here; pixels are decoded when asked for.
 
-        Raises
-        ------
-        FileNotFoundError, ValueError
-            Naming the file (and line) and the cure.
+        Raises:
+            FileNotFoundError, ValueError: Naming the file (and line) and the cure.
 
-        Example
-        -------
         >>> from lib import paths
         >>> recording = Recording.open(paths.SHIPPED_RECORDING)
         >>> recording.frames[0].left.shape, recording.landmarks_mm().shape

@@ -30,13 +30,10 @@ def read_table(path: Path, names: Sequence[str], optional: Sequence[str] = ()) -
 
     A file has all of the optional columns or none of them; then they are NaN.
 
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        For text that is not UTF-8; a missing, unknown or repeated column; a short or long row; a cell that is not a
-        finite number ("nan" included: a missing value is an empty cell).  The text names file and line.
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: For text that is not UTF-8; a missing, unknown or repeated column; a short or long row; a cell that
+            is not a finite number ("nan" included: a missing value is an empty cell).  The text names file and line.
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file.")

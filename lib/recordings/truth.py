@@ -31,20 +31,14 @@ _GLINT_COLUMNS = columns(["left_in_glint", "right_in_glint"])
 class Truth:
     """What a simulator knows.  For evaluation only: no estimator may see it.
 
-    Attributes
-    ----------
-    rig:
-        The exact cameras, affine or near-affine.
-    landmarks_mm:
-        (n, 3, 3) exact landmarks at the frames' times, robot frame.
-    u_left, u_right:
-        (n, 3, 2) exact px.
-    visibility_left, visibility_right:
-        (n, 3) int: 0 outside the image, 1 hidden, 2 visible.
-    folder:
-        truth/, for further files of a simulator.
-    in_glint_left, in_glint_right:
-        (n, 3) bool, whether saturated light lies on the landmark or right beside it; None if the recording does not say.
+    Attributes:
+        rig: The exact cameras, affine or near-affine.
+        landmarks_mm: (n, 3, 3) exact landmarks at the frames' times, robot frame.
+        u_left, u_right: (n, 3, 2) exact px.
+        visibility_left, visibility_right: (n, 3) int: 0 outside the image, 1 hidden, 2 visible.
+        folder: truth/, for further files of a simulator.
+        in_glint_left, in_glint_right: (n, 3) bool, whether saturated light lies on the landmark or right beside it;
+            None if the recording does not say.
     """
 
     rig: StereoRig

@@ -26,26 +26,17 @@ __all__ = ["RecordingWriter"]
 class RecordingWriter:
     """Context manager that writes a recording beside its final place and moves it there when it is valid.
 
-    Parameters
-    ----------
-    folder:
-        Where the recording appears.  Until then its files lie beside it, in a folder that ends with ``.partial``.
-    image_size_px:
-        (width, height).
-    details:
-        Own notes (numbers and text), kept in ``[details]`` of recording.toml.
-    suffix, jpeg_quality:
-        ".jpg" or ".png", and the quality of a JPEG.
-    overwrite:
-        Replace a recording of that name.  A folder that is no recording is never replaced.
+    Args:
+        folder: Where the recording appears.  Until then its files lie beside it, in a folder that ends with
+            ``.partial``.
+        image_size_px: (width, height).
+        details: Own notes (numbers and text), kept in ``[details]`` of recording.toml.
+        suffix, jpeg_quality: ".jpg" or ".png", and the quality of a JPEG.
+        overwrite: Replace a recording of that name.  A folder that is no recording is never replaced.
 
-    Raises
-    ------
-    FileExistsError
-        If `folder` exists and `overwrite` is False, or if it is not a recording.
+    Raises:
+        FileExistsError: If `folder` exists and `overwrite` is False, or if it is not a recording.
 
-    Example
-    -------
     >>> import tempfile
     >>> tool_mm = np.array([[0, 0, 0], [4, 1, 0], [4, -1, 0]])
     >>> image = np.zeros((48, 64, 3), np.uint8)

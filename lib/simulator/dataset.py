@@ -99,19 +99,13 @@ def make_dataset(
 
     A sequence appears whole or not at all: after a kill, the finished ones are kept and the others are made.
 
-    Parameters
-    ----------
-    n_pairs, duration_s:
-        Length of each sequence.
-    workers:
-        Processes; None = one a core.
-    shrink:
-        Makes images and textures this many times smaller, for a quick look.
+    Args:
+        n_pairs, duration_s: Length of each sequence.
+        workers: Processes; None = one a core.
+        shrink: Makes images and textures this many times smaller, for a quick look.
 
-    Raises
-    ------
-    ValueError
-        If the folder holds a data set of another seed or size, or a damaged sequence.
+    Raises:
+        ValueError: If the folder holds a data set of another seed or size, or a damaged sequence.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)

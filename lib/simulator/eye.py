@@ -40,26 +40,16 @@ class Scene(Protocol):
 class Eye:
     """An open-sky eye: a soft bowl with folds and tilt, the cut rim at the border of the field.
 
-    Attributes
-    ----------
-    seed:
-        Draws the folds, the tilt and the procedural texture.
-    radius_mm:
-        Radius of the cut rim.
-    depth_mm:
-        Depth of the deepest point below the rim.
-    fold_mm:
-        Amplitude of the folds of the collapsed retina.
-    tilt_rad:
-        Standard deviation of the tilt about x and y.
-    centre_z_mm:
-        Height of the deepest point; 0 is the focal plane, positive is deeper.
-    texture_path:
-        A photograph that replaces the procedural fundus.
-    gloss:
-        Strength of the reflection of the wet surface; 0 switches it off.
-    turn_rad:
-        Rotation of the texture on the surface, so that one texture serves many eyes.
+    Attributes:
+        seed: Draws the folds, the tilt and the procedural texture.
+        radius_mm: Radius of the cut rim.
+        depth_mm: Depth of the deepest point below the rim.
+        fold_mm: Amplitude of the folds of the collapsed retina.
+        tilt_rad: Standard deviation of the tilt about x and y.
+        centre_z_mm: Height of the deepest point; 0 is the focal plane, positive is deeper.
+        texture_path: A photograph that replaces the procedural fundus.
+        gloss: Strength of the reflection of the wet surface; 0 switches it off.
+        turn_rad: Rotation of the texture on the surface, so that one texture serves many eyes.
     """
 
     seed: int = 0

@@ -26,18 +26,12 @@ MAX_PITCH_RAD = np.deg2rad(60.0)
 class Pose:
     """Where the tool is, in the microscope frame.
 
-    Attributes
-    ----------
-    base_mm:
-        The base (3,).
-    azimuth_rad:
-        Direction from base to tips in the image plane, measured from x (right) towards y (down).
-    pitch_rad:
-        Angle by which the tips dip below the base, into the eye; 0 is parallel to the image.
-    roll_rad:
-        Rotation about the shaft; at 0 both jaws are equally deep.
-    opening_mm:
-        Distance between the tips.
+    Attributes:
+        base_mm: The base (3,).
+        azimuth_rad: Direction from base to tips in the image plane, measured from x (right) towards y (down).
+        pitch_rad: Angle by which the tips dip below the base, into the eye; 0 is parallel to the image.
+        roll_rad: Rotation about the shaft; at 0 both jaws are equally deep.
+        opening_mm: Distance between the tips.
     """
 
     base_mm: tuple[float, float, float] = (0.0, 0.0, -1.0)
@@ -71,24 +65,15 @@ class Pose:
 class Forceps:
     """The design of a forceps; lengths in mm.
 
-    Attributes
-    ----------
-    shaft_radius_mm:
-        Radius of the shaft; 0.3 is the usual 23 gauge, 0.6 mm thick.
-    jaw_length_mm:
-        Distance along the shaft's axis from the base to the tips of the closed tool.
-    jaw_radius_mm, tip_radius_mm:
-        Radius of a jaw at the base and at its end; a power law connects the two.
-    taper:
-        Exponent of the power law.  1 is a cone; below 1 the jaw stays thick until close to the tip.
-    bow_mm:
-        Distance by which each jaw arches outwards in the middle when the tips touch.
-    bend_mm:
-        Distance by which both tips bend out of the plane of the jaws, towards the retina.
-    hook_mm:
-        Distance by which the last fifth of each jaw turns inwards.
-    brightness, brushed:
-        Reflectance of the metal, and contrast of its brush marks.
+    Attributes:
+        shaft_radius_mm: Radius of the shaft; 0.3 is the usual 23 gauge, 0.6 mm thick.
+        jaw_length_mm: Distance along the shaft's axis from the base to the tips of the closed tool.
+        jaw_radius_mm, tip_radius_mm: Radius of a jaw at the base and at its end; a power law connects the two.
+        taper: Exponent of the power law.  1 is a cone; below 1 the jaw stays thick until close to the tip.
+        bow_mm: Distance by which each jaw arches outwards in the middle when the tips touch.
+        bend_mm: Distance by which both tips bend out of the plane of the jaws, towards the retina.
+        hook_mm: Distance by which the last fifth of each jaw turns inwards.
+        brightness, brushed: Reflectance of the metal, and contrast of its brush marks.
     """
 
     shaft_radius_mm: float = 0.30
@@ -148,9 +133,7 @@ class Forceps:
     def nodes(self, pose: Pose, shaft_step_mm: float = 1.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The tool as chains of round cones, in the microscope frame.
 
-        Returns
-        -------
-        (n, 3) centres, (n,) radii in mm, (n,) chain of each node: 0 shaft (far end first), 1 and 2 the jaws.
+        Returns: (n, 3) centres, (n,) radii in mm, (n,) chain of each node: 0 shaft (far end first), 1 and 2 the jaws.
         """
         k = max(2, round(self.shaft_length_mm / shaft_step_mm) + 1)
         shaft = np.column_stack([np.linspace(-self.shaft_length_mm, 0, k), np.zeros(k), np.zeros(k)])

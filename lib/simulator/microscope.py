@@ -18,31 +18,22 @@ __all__ = ["Microscope"]
 class Microscope:
     """Optics and sensor.  Two values in a tuple are (left, right); three are (red, green, blue).
 
-    Attributes
-    ----------
-    pixels_per_mm, image_rotation_rad, convergence_rad, image_size_px:
-        Geometry, as in `reference_rig`.
-    depth_of_field_mm:
-        Total range of depth around `focus_z_mm` within which defocus is at most one pixel (standard deviation at
-        100 px per mm); infinity switches defocus off.
-    psf_px:
-        Standard deviation of the point spread in focus.
-    exposure_s, readout_s:
-        Exposure of a row, and the time between the exposures of the first and the last row (rolling shutter).
-    light_slope:
-        Obliqueness of the light (x, y): a shadow moves by this many mm on the retina per mm of height.
-    spot_mm, spot_radius_mm:
-        Where the coaxial light is brightest, and its Gaussian radius.
-    brightness, vignetting, gain:
-        Exposure (1 is well exposed), relative loss at the corners, and the colour gains of each eye.
-    full_well, read_noise:
-        Electrons at full scale (shot noise), and read noise in electrons; an infinite `full_well` switches noise off.
-    jpeg_quality:
-        Quality of stored images, 0 to 100; None stores them without loss.
-    inverse_distance_per_mm:
-        One over the working distance; 0 is affine.
-    fps:
-        Frame rate of the video.
+    Attributes:
+        pixels_per_mm, image_rotation_rad, convergence_rad, image_size_px: Geometry, as in `reference_rig`.
+        depth_of_field_mm: Total range of depth around `focus_z_mm` within which defocus is at most one pixel (standard
+            deviation at 100 px per mm); infinity switches defocus off.
+        psf_px: Standard deviation of the point spread in focus.
+        exposure_s, readout_s: Exposure of a row, and the time between the exposures of the first and the last row
+            (rolling shutter).
+        light_slope: Obliqueness of the light (x, y): a shadow moves by this many mm on the retina per mm of height.
+        spot_mm, spot_radius_mm: Where the coaxial light is brightest, and its Gaussian radius.
+        brightness, vignetting, gain: Exposure (1 is well exposed), relative loss at the corners, and the colour gains
+            of each eye.
+        full_well, read_noise: Electrons at full scale (shot noise), and read noise in electrons; an infinite
+            `full_well` switches noise off.
+        jpeg_quality: Quality of stored images, 0 to 100; None stores them without loss.
+        inverse_distance_per_mm: One over the working distance; 0 is affine.
+        fps: Frame rate of the video.
     """
 
     pixels_per_mm: tuple[float, float] = (100.0, 98.0)

@@ -23,19 +23,14 @@ _CLEARANCE_MM = 0.12  # between a tip and the retina
 class Motion:
     """A smooth trajectory through random waypoints, the same for the same seed.
 
-    Attributes
-    ----------
-    kind:
-        "sweep": the jaws scan the field at several depths while they turn and open.  "surgeon": descend, grasp, peel,
-        pause, release, then the same elsewhere.  "both": a sweep for two thirds of the time, then a surgeon.
-    duration_s:
-        Duration of the whole trajectory; a shorter one is faster.
-    depths_mm:
-        Depths at which the tips sweep, z in the microscope frame; the tips stay above the retina.
-    half_field_mm:
-        Half extents (x, y) of the area that the jaws' centre covers.
-    tremor_mm:
-        Peak-to-peak amplitude of the physiological tremor (8 to 12 Hz) in the surgeon's part; 0 switches it off.
+    Attributes:
+        kind: "sweep": the jaws scan the field at several depths while they turn and open.  "surgeon": descend, grasp,
+            peel, pause, release, then the same elsewhere.  "both": a sweep for two thirds of the time, then a surgeon.
+        duration_s: Duration of the whole trajectory; a shorter one is faster.
+        depths_mm: Depths at which the tips sweep, z in the microscope frame; the tips stay above the retina.
+        half_field_mm: Half extents (x, y) of the area that the jaws' centre covers.
+        tremor_mm: Peak-to-peak amplitude of the physiological tremor (8 to 12 Hz) in the surgeon's part; 0 switches it
+            off.
     """
 
     forceps: Forceps

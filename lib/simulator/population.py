@@ -125,30 +125,19 @@ def sample(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """One training image with its landmarks; `rng` decides everything.
 
-    Parameters
-    ----------
-    crop_px:
-        Side of a square window of the full-resolution image that holds the jaws somewhere.
-    size_px:
-        (w, h) of the whole field shrunk to this size.  Without either size the image is the full-HD field.
-    around:
-        The landmark that a window holds, 0 base, 1 or 2 a tip; None = the jaws' centre.
-    jitter:
-        How far it may lie from the window's centre, as a share of the window's side.
-    zoom:
-        Range of the magnification, relative to 100 px per mm.
-    textures:
-        Seeds of the fundus textures to draw from; each takes a second to make and then stays in memory.
+    Args:
+        crop_px: Side of a square window of the full-resolution image that holds the jaws somewhere.
+        size_px: (w, h) of the whole field shrunk to this size.  Without either size the image is the full-HD field.
+        around: The landmark that a window holds, 0 base, 1 or 2 a tip; None = the jaws' centre.
+        jitter: How far it may lie from the window's centre, as a share of the window's side.
+        zoom: Range of the magnification, relative to 100 px per mm.
+        textures: Seeds of the fundus textures to draw from; each takes a second to make and then stays in memory.
 
-    Returns
-    -------
-    image (h, w, 3) uint8 RGB; u (3, 2) px of base, tip_1, tip_2, also if outside; visibility (3,): 0 outside, 1 hidden,
-    2 visible.
+    Returns: image (h, w, 3) uint8 RGB; u (3, 2) px of base, tip_1, tip_2, also if outside; visibility (3,): 0 outside,
+        1 hidden, 2 visible.
 
-    Raises
-    ------
-    ValueError
-        If both sizes are given, or one is too small.
+    Raises:
+        ValueError: If both sizes are given, or one is too small.
     """
     if crop_px is not None and size_px is not None:
         raise ValueError("crop_px, size_px: give one, a window at full resolution or the field at a reduced one.")

@@ -18,22 +18,14 @@ __all__ = ["ToolRaster", "rasterise"]
 class ToolRaster:
     """What a camera sees of the tool, on a grid `factor` times finer than the image, over a box of it.
 
-    Attributes
-    ----------
-    origin_px:
-        (x, y), the image pixel whose first sample is the raster's first.
-    factor:
-        Samples per pixel and axis; sample k of pixel i is at i + (k + 0.5) / factor - 0.5.
-    depth_mm:
-        (h, w) float32 along the viewing direction, infinity where there is no tool.
-    part:
-        (h, w) uint8: 0 none, 1 shaft, 2 jaw 1, 3 jaw 2.
-    hit:
-        (rows, columns), (n,) each, of the samples with tool; the following are theirs.
-    normal, tangent:
-        (n, 3) float32 in the camera frame (z away from the camera); the tangent runs along the part.
-    along_mm:
-        (n,) float32, position along the part, for brush marks.
+    Attributes:
+        origin_px: (x, y), the image pixel whose first sample is the raster's first.
+        factor: Samples per pixel and axis; sample k of pixel i is at i + (k + 0.5) / factor - 0.5.
+        depth_mm: (h, w) float32 along the viewing direction, infinity where there is no tool.
+        part: (h, w) uint8: 0 none, 1 shaft, 2 jaw 1, 3 jaw 2.
+        hit: (rows, columns), (n,) each, of the samples with tool; the following are theirs.
+        normal, tangent: (n, 3) float32 in the camera frame (z away from the camera); the tangent runs along the part.
+        along_mm: (n,) float32, position along the part, for brush marks.
     """
 
     origin_px: tuple[int, int]
@@ -57,16 +49,12 @@ def rasterise(
 ) -> ToolRaster | None:
     """Rasterise chains of round cones; None where nothing is in view.
 
-    Parameters
-    ----------
-    centres:
-        (n, 3) camera frame: x, y so that pixel = zoom * (x, y), and depth.
-    radii, chains:
-        (n,) mm, and the chain each node belongs to; consecutive nodes of a chain are joined.  Chain 0 ends flat.
-    zoom:
-        px per mm.
-    size_px:
-        (w, h) of the image.
+    Args:
+        centres: (n, 3) camera frame: x, y so that pixel = zoom * (x, y), and depth.
+        radii, chains: (n,) mm, and the chain each node belongs to; consecutive nodes of a chain are joined.  Chain 0
+            ends flat.
+        zoom: px per mm.
+        size_px: (w, h) of the image.
     """
     width, height = size_px
     pixel, reach = centres[:, :2] * zoom, radii * zoom + 1.5

@@ -34,18 +34,12 @@ _CLIPPED = 250  # of 255
 class Reports:
     """What robot and annotator report, and how well.
 
-    Attributes
-    ----------
-    robot_from_microscope:
-        Where the microscope stands; the recording is in the robot frame.
-    robot_accuracy_mm:
-        Standard deviation of the kinematics, per coordinate.
-    offset_s:
-        t_robot = t_video + offset_s.
-    dropout:
-        Share of kinematic samples without values.
-    click_px:
-        Standard deviation of the annotations, per coordinate.
+    Attributes:
+        robot_from_microscope: Where the microscope stands; the recording is in the robot frame.
+        robot_accuracy_mm: Standard deviation of the kinematics, per coordinate.
+        offset_s: t_robot = t_video + offset_s.
+        dropout: Share of kinematic samples without values.
+        click_px: Standard deviation of the annotations, per coordinate.
     """
 
     robot_from_microscope: RigidTransform = ROBOT_FROM_MICROSCOPE
@@ -63,20 +57,15 @@ class Reports:
 class Design:
     """What a simulated recording shows, and through what.
 
-    Attributes
-    ----------
-    eye, forceps:
-        Scene and tool.  None = chosen by the recording's seed, from designs that
-        `lib.simulator.population.sample` never draws.
-    microscope:
-        Optics, light and sensor.
-    motion, duration_s:
-        "sweep" (calibration), "surgeon" or "both"; None = 30 s for a sweep, 18 s for a surgeon, 45 s for both.
-    reports:
-        Robot and annotator.
-    camera_motion:
-        (frame, microscope_after_from_before): from that frame on the microscope has moved over eye and robot.  The
-        truth's rig is the one before; ``truth/moved_rig.json`` holds the one after.
+    Attributes:
+        eye, forceps: Scene and tool.  None = chosen by the recording's seed, from designs that
+            `lib.simulator.population.sample` never draws.
+        microscope: Optics, light and sensor.
+        motion, duration_s: "sweep" (calibration), "surgeon" or "both"; None = 30 s for a sweep, 18 s for a surgeon, 45
+            s for both.
+        reports: Robot and annotator.
+        camera_motion: (frame, microscope_after_from_before): from that frame on the microscope has moved over eye and
+            robot.  The truth's rig is the one before; ``truth/moved_rig.json`` holds the one after.
     """
 
     eye: Scene | None = None
@@ -105,30 +94,18 @@ def simulate(
     The frames are spread over the motion: the video keeps every k-th frame, as the times in frames.csv say.
     The same arguments give the same files.
 
-    Parameters
-    ----------
-    design:
-        What the recording shows; None = the default microscope, an eye and a tool chosen by `seed`.
-    seed:
-        Drives every random source.
-    name, description:
-        Of recording.toml; None = the folder's name.
-    masks:
-        Also write ``truth/masks``: tool and glints of every frame (PNG, red and green channel).
-    progress:
-        Whether to show a bar, or a function to call after every pair.
-    overwrite:
-        Replace a recording of that name.
+    Args:
+        design: What the recording shows; None = the default microscope, an eye and a tool chosen by `seed`.
+        seed: Drives every random source.
+        name, description: Of recording.toml; None = the folder's name.
+        masks: Also write ``truth/masks``: tool and glints of every frame (PNG, red and green channel).
+        progress: Whether to show a bar, or a function to call after every pair.
+        overwrite: Replace a recording of that name.
 
-    Raises
-    ------
-    ValueError
-        If a parameter is out of range.
-    FileExistsError
-        If the folder exists and `overwrite` is False.
+    Raises:
+        ValueError: If a parameter is out of range.
+        FileExistsError: If the folder exists and `overwrite` is False.
 
-    Example
-    -------
     >>> import tempfile
     >>> microscope = Microscope(pixels_per_mm=(4.0, 4.0), image_size_px=(80, 60))
     >>> design = Design(Eye(texture_px=64), microscope=microscope, motion="sweep")

@@ -33,18 +33,13 @@ _BUMP_MM, _BUMP_PX = 10.0, 1024
 class View:
     """One camera's image and its truth.
 
-    Attributes
-    ----------
-    image:
-        (h, w, 3) uint8 RGB.
-    u:
-        Landmarks base, tip_1, tip_2 (3, 2) px as imaged, rolling shutter included; NaN without a tool.
-    visibility:
-        (3,) COCO: 0 outside the image, 1 hidden by the tool, 2 visible.
-    surface_mm:
-        (h, w) float32, the scene's z in the microscope frame, or None if not asked for.
-    tool_mask, glint_mask:
-        (h, w) uint8: share of the pixel that the sharp tool covers (255 is all), and 255 where a glint saturates it.
+    Attributes:
+        image: (h, w, 3) uint8 RGB.
+        u: Landmarks base, tip_1, tip_2 (3, 2) px as imaged, rolling shutter included; NaN without a tool.
+        visibility: (3,) COCO: 0 outside the image, 1 hidden by the tool, 2 visible.
+        surface_mm: (h, w) float32, the scene's z in the microscope frame, or None if not asked for.
+        tool_mask, glint_mask: (h, w) uint8: share of the pixel that the sharp tool covers (255 is all), and 255 where a
+            glint saturates it.
     """
 
     image: np.ndarray
@@ -79,25 +74,15 @@ def render_view(
 ) -> View:
     """What a camera sees in a window of its image.
 
-    Parameters
-    ----------
-    scene, microscope, window:
-        All in the microscope frame.
-    side:
-        0 left, 1 right: which colour gains apply.
-    forceps, pose:
-        The tool at the time of the image, or None.
-    later:
-        (pose, seconds later): the tool's motion, for rolling shutter and motion blur.
-    rng:
-        Draws the sensor noise; None renders without noise.
-    factor:
-        Samples per pixel and axis of the tool's edges.
-    surface:
-        Whether to return the depth of every pixel too.
+    Args:
+        scene, microscope, window: All in the microscope frame.
+        side: 0 left, 1 right: which colour gains apply.
+        forceps, pose: The tool at the time of the image, or None.
+        later: (pose, seconds later): the tool's motion, for rolling shutter and motion blur.
+        rng: Draws the sensor noise; None renders without noise.
+        factor: Samples per pixel and axis of the tool's edges.
+        surface: Whether to return the depth of every pixel too.
 
-    Example
-    -------
     >>> from lib.simulator import Eye, Microscope, Window
     >>> from lib.geometry import RigidTransform
     >>> microscope = Microscope(pixels_per_mm=(4.0, 4.0), image_size_px=(80, 60))
@@ -182,17 +167,12 @@ def render_pair(
 ) -> tuple[View, View]:
     """The left and right view of one moment.
 
-    Parameters
-    ----------
-    rig:
-        Cameras in the microscope frame; None takes those of the microscope.
-    forceps, pose, factor, options:
-        As for `render_view`.
+    Args:
+        rig: Cameras in the microscope frame; None takes those of the microscope.
+        forceps, pose, factor, options: As for `render_view`.
 
-    Raises
-    ------
-    ValueError
-        If the tool is entirely outside the field of both cameras.
+    Raises:
+        ValueError: If the tool is entirely outside the field of both cameras.
     """
     rig = rig or microscope.rig(RigidTransform.identity())
     size = microscope.image_size_px

@@ -34,24 +34,15 @@ def reference_rig(
 ) -> StereoRig:
     """The rig that the simulator models by default: 10 um a pixel, 6.5 degrees between the axes.
 
-    Parameters
-    ----------
-    pixels_per_mm, image_rotation_rad:
-        Zoom and in-plane rotation, (left, right), independent of each other.
-    convergence_rad:
-        Angle between the two viewing directions.
-    inverse_distance_per_mm:
-        One over the working distance; 0 makes the cameras affine, anything else near-affine.
-    robot_from_microscope:
-        Where the microscope stands; the identity gives the rig in the microscope frame.
+    Args:
+        pixels_per_mm, image_rotation_rad: Zoom and in-plane rotation, (left, right), independent of each other.
+        convergence_rad: Angle between the two viewing directions.
+        inverse_distance_per_mm: One over the working distance; 0 makes the cameras affine, anything else near-affine.
+        robot_from_microscope: Where the microscope stands; the identity gives the rig in the microscope frame.
 
-    Raises
-    ------
-    ValueError
-        For a zoom or convergence that is not positive.
+    Raises:
+        ValueError: For a zoom or convergence that is not positive.
 
-    Example
-    -------
     >>> bool(reference_rig().is_affine), bool(reference_rig(inverse_distance_per_mm=1 / 150).is_affine)
     (True, False)
     """
@@ -101,18 +92,12 @@ def simulate_correspondences(
 ) -> SimulatedSweep:
     """Landmark positions spread over the field and the depth of field, as the rig sees them and the robot reports them.
 
-    Parameters
-    ----------
-    n:
-        Number of correspondences.
-    half_size_mm:
-        Half extents (3,) of the box of positions in the microscope frame; the default fills the image.
-    sigma_u_px, sigma_x_mm:
-        Standard deviation per coordinate of detections and of the robot's report.  The rows do not
-        state it.
+    Args:
+        n: Number of correspondences.
+        half_size_mm: Half extents (3,) of the box of positions in the microscope frame; the default fills the image.
+        sigma_u_px, sigma_x_mm: Standard deviation per coordinate of detections and of the robot's report.  The rows do
+            not state it.
 
-    Example
-    -------
     >>> sweep = simulate_correspondences(500, rng=np.random.default_rng(0), sigma_u_px=2.0)
     >>> len(sweep.complete), float(np.std(sweep.true_rig.left.project(sweep.true_x_mm) - sweep.u_left).round(1))
     (500, 2.0)

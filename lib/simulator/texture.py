@@ -89,10 +89,8 @@ def _draw(branches: list[tuple[np.ndarray, np.ndarray]], size_px: int, share: fl
 def fundus_texture(seed: int, size_px: int = 2048, rim_mm: float = 9.3) -> np.ndarray:
     """Reflectance of a fundus, (size_px, size_px, 3) uint8 RGB, read-only; `seed` decides everything.
 
-    Parameters
-    ----------
-    rim_mm:
-        Mean radius at which the retina ends and the sclera begins.
+    Args:
+        rim_mm: Mean radius at which the retina ends and the sclera begins.
     """
     rng = np.random.default_rng([seed, 7])
     axis = (np.arange(size_px, dtype=np.float32) + 0.5) * (EXTENT_MM / size_px) - EXTENT_MM / 2
@@ -148,10 +146,8 @@ def fundus_texture(seed: int, size_px: int = 2048, rim_mm: float = 9.3) -> np.nd
 def photograph_texture(path: str | Path, size_px: int = 2048) -> np.ndarray:
     """Any photograph as a texture: its central square stretched over the retina.
 
-    Raises
-    ------
-    FileNotFoundError, ValueError
-        If there is no such file, or it is no image.
+    Raises:
+        FileNotFoundError, ValueError: If there is no such file, or it is no image.
     """
     try:
         image = read_image(Path(path))

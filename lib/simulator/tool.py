@@ -20,18 +20,12 @@ __all__ = ["ToolInView", "compose", "shadow", "tool_in_view"]
 class ToolInView:
     """The tool in the camera frame of a window (pixel = zoom * (x, y)), each point when its own row is exposed.
 
-    Attributes
-    ----------
-    window, forceps:
-        Which camera sees which tool.
-    landmarks:
-        (3, 3) mm.
-    centres, radii, chains:
-        The round cones as `Forceps.nodes` gives them.
-    velocity:
-        Mean velocity (2,) of the tips in the image plane, mm/s.
-    raster:
-        What the camera sees of the tool, or None where nothing is in view.
+    Attributes:
+        window, forceps: Which camera sees which tool.
+        landmarks: (3, 3) mm.
+        centres, radii, chains: The round cones as `Forceps.nodes` gives them.
+        velocity: Mean velocity (2,) of the tips in the image plane, mm/s.
+        raster: What the camera sees of the tool, or None where nothing is in view.
     """
 
     window: Window
@@ -97,14 +91,11 @@ def tool_in_view(
 ) -> ToolInView:
     """The tool as the window's camera sees it.
 
-    Parameters
-    ----------
-    later:
-        (pose, seconds later): the tool's motion during the read-out, or None for a tool at rest.
-    readout_s:
-        Time from the first to the last row of the whole image; the middle row is exposed at the time of `pose`.
-    factor:
-        Samples per pixel and axis of the tool's edges.
+    Args:
+        later: (pose, seconds later): the tool's motion during the read-out, or None for a tool at rest.
+        readout_s: Time from the first to the last row of the whole image; the middle row is exposed at the time of
+            `pose`.
+        factor: Samples per pixel and axis of the tool's edges.
     """
     centres, radii, chains = forceps.nodes(pose)
     points = np.vstack([forceps.landmarks(pose), centres])

@@ -21,15 +21,11 @@ __all__ = ["Grid", "Window", "intersect", "surface_grid"]
 class Window:
     """What part of a camera's image is rendered.
 
-    Attributes
-    ----------
-    camera:
-        Maps the microscope frame to pixels of the window; square pixels without skew.
-    size_px:
-        (w, h) of the window.
-    field_px, origin_px:
-        (w, h) of the whole image, and the whole image's pixel that is the window's first: vignetting and rolling shutter
-        depend on them.  None is a window that is the whole image.
+    Attributes:
+        camera: Maps the microscope frame to pixels of the window; square pixels without skew.
+        size_px: (w, h) of the window.
+        field_px, origin_px: (w, h) of the whole image, and the whole image's pixel that is the window's first:
+            vignetting and rolling shutter depend on them.  None is a window that is the whole image.
     """
 
     camera: AffineCamera | NearAffineCamera
