@@ -244,9 +244,8 @@ def _minimum(rig: StereoRig, data: _Observed, stale: RigidTransform, loss: Loss,
         turn = Rotation.from_rotvec(step[:3]).as_matrix()
         return RigidTransform(turn @ stale.R, turn @ (stale.t - centre) + centre + step[3:])
 
-    found = minimise(
-        stale, partial(_evaluate, rig, data, loss), normal_equations, move, rank=parameters, tolerance=1e-11
-    )
+    evaluate = partial(_evaluate, rig, data, loss)
+    found = minimise(stale, evaluate, normal_equations, move, rank=parameters, tolerance=1e-11)
     information, (_, distance2, weights) = found.information, found.work
     if np.linalg.matrix_rank(information, tol=_OPEN * np.trace(information), hermitian=True) < parameters:
         raise ValueError("x_mm, u_left, u_right: these landmarks leave the motion open. Add frames in other positions.")
