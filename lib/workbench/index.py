@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import re
+
 from lib.workbench.execution import Failure
 from lib.workbench.pages import markdown_html, render
 from lib.workbench.report import format_value, unit_text
 
 __all__ = ["index_html"]
 
+#: The note of a number that was read from a record and not computed in the run.
+_RECORDED = re.compile(r"(.*, )?recorded\b")
 _STATES = {
     "complete": "complete",
     "running": "running",
@@ -41,6 +45,7 @@ def index_html(run: dict) -> str:
         facts=facts,
         titles={book["name"]: book["title"] for book in run["notebooks"]},
         pages={book["name"]: book["page"] for book in run["notebooks"]},
+        recorded=lambda metric: bool(_RECORDED.match(metric["note"])),
         reason=lambda failure: str(Failure(**failure)),
         words=lambda metric: metric["name"].removesuffix(f"_{metric['unit']}").replace("_", " "),
         with_unit=lambda value, unit: f"{format_value(value)} {unit_text(unit)}".rstrip(),

@@ -52,3 +52,12 @@ def test_html_in_untrusted_markdown_is_escaped():
     assert "<script" not in markdown_html(f"**{SCRIPT}** [x](javascript:alert(1))", trusted=False)
     assert "javascript:" not in markdown_html("[x](javascript:alert(1))", trusted=False)
     assert "<em>" in markdown_html("<em>by the author</em>")
+
+
+def test_recorded_numbers_have_a_column_of_their_own():
+    run = run_with("eye")
+    run["metrics"].append(run["metrics"][0] | {"name": "c_px", "value": 7.0, "note": "RMS, recorded, 4 seeds"})
+    rows = re.findall(r"<tr><td>(?:a|c)<small>.*?</tr>", index_html(run), re.DOTALL)
+    cells = [re.findall(r"<td[^>]*>([^<]*)", row)[1:4] for row in rows]
+    assert cells == [["2 px", "1.5 px", ""], ["2 px", "", "7 px"]]
+    assert index_html(run).count('class="number recorded">7 px') == 2
