@@ -53,18 +53,13 @@ class Batch:
 class Augmentation:
     """Ranges of the random transforms; 0 or False switches one off.  The defaults are the paper's.
 
-    Attributes
-    ----------
-    rotation_deg:
-        Up to this angle either way, about the image's centre.
-    zoom:
-        Factor, drawn uniformly from this range.
-    shift:
-        Part of the image's size, either way.
-    mirror:
-        Flip top and bottom every second time, and swap the tips.
-    photometric, photometric_share:
-        Strength of the changes of light and optics, 0 to 1, and the share of a batch that they are made to.
+    Attributes:
+        rotation_deg: Up to this angle either way, about the image's centre.
+        zoom: Factor, drawn uniformly from this range.
+        shift: Part of the image's size, either way.
+        mirror: Flip top and bottom every second time, and swap the tips.
+        photometric, photometric_share: Strength of the changes of light and optics, 0 to 1, and the share of a batch
+            that they are made to.
     """
 
     rotation_deg: float = 30.0

@@ -18,31 +18,20 @@ __all__ = ["PRESETS", "TrainingConfig"]
 class TrainingConfig:
     """All options of a training except its data.
 
-    Attributes
-    ----------
-    optimiser, learning_rate, schedule:
-        ``"rmsprop"`` (alpha 0.99, no momentum, as the paper prints) or ``"adamw"``; ``"constant"`` or ``"cosine"``, the
-        latter after a warm-up.
-    ema:
-        Decay of the moving average of the weights, which is validated and returned; 0 = the weights themselves.
-    clip:
-        Largest norm of the gradient; 0 = unlimited.
-    precision:
-        ``"fp32"``, or ``"bf16"`` mixed precision; the loss is always float32.
-    sigma_px:
-        Width of the target Gaussians in pixels of the network's input.
-    position_weight_per_px:
-        Weight of `lib.training.losses.position_loss` beside the l2 loss of the heatmaps; the paper has the latter alone (0).
-    seed:
-        Decides the first weights and every batch.
+    Attributes:
+        optimiser, learning_rate, schedule: ``"rmsprop"`` (alpha 0.99, no momentum, as the paper prints) or ``"adamw"``;
+            ``"constant"`` or ``"cosine"``, the latter after a warm-up.
+        ema: Decay of the moving average of the weights, which is validated and returned; 0 = the weights themselves.
+        clip: Largest norm of the gradient; 0 = unlimited.
+        precision: ``"fp32"``, or ``"bf16"`` mixed precision; the loss is always float32.
+        sigma_px: Width of the target Gaussians in pixels of the network's input.
+        position_weight_per_px: Weight of `lib.training.losses.position_loss` beside the l2 loss of the heatmaps; the
+            paper has the latter alone (0).
+        seed: Decides the first weights and every batch.
 
-    Raises
-    ------
-    ValueError
-        For an unknown choice, or a number below 1 where at least 1 is needed.
+    Raises:
+        ValueError: For an unknown choice, or a number below 1 where at least 1 is needed.
 
-    Examples
-    --------
     >>> TrainingConfig(steps=1000, learning_rate=1e-3, schedule="cosine").rate(500)
     0.000505
     """

@@ -52,10 +52,8 @@ class Seen:
         longer tails than a Gaussian: with a mean normalised squared error of 2 more than 5 % lie outside the 95 % ellipses,
         and ellipses that hold 95 % make it less than 2.  The constants are set halfway, for the base and for the tips.
 
-        Raises
-        ------
-        ValueError
-            For fewer than 20 landmarks.
+        Raises:
+            ValueError: For fewer than 20 landmarks.
         """
         size = np.linalg.norm(self.errors, axis=1)
         use = np.isfinite(size) & (size < gross_px)
@@ -138,16 +136,12 @@ def fit_error_models(detector: Detector, images: Iterable[LabelledImage], *, pro
     in full.  Tracking is fitted on the same images, the tool displaced by `TRACKED_SHIFT_PX`, every fourth time by five
     times as much.
 
-    Parameters
-    ----------
-    images:
-        Easy and hard ones, since confidence is learnt from failures, and of many tools, since errors within a recording
-        correlate because they share one tool.
+    Args:
+        images: Easy and hard ones, since confidence is learnt from failures, and of many tools, since errors within a
+            recording correlate because they share one tool.
 
-    Raises
-    ------
-    ValueError
-        If too few landmarks are found in them.
+    Raises:
+        ValueError: If too few landmarks are found in them.
     """
     images = list(images)
     # A closeup is fitted by what it sees itself, not by what an earlier gain leaves of that.

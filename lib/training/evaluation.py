@@ -22,14 +22,10 @@ __all__ = ["Evaluation", "evaluate", "evaluate_recording"]
 class Evaluation:
     """Detections in n images beside their labels.
 
-    Attributes
-    ----------
-    u_true:
-        (n, 3, 2) labels in view, NaN elsewhere.
-    visibility:
-        (n, 3) 0, 1, 2, and -1 where nothing is labelled.
-    length_px:
-        (n,) the tool's length, the unit of PCK, also where a tip is out of the frame.
+    Attributes:
+        u_true: (n, 3, 2) labels in view, NaN elsewhere.
+        visibility: (n, 3) 0, 1, 2, and -1 where nothing is labelled.
+        length_px: (n,) the tool's length, the unit of PCK, also where a tip is out of the frame.
     """
 
     landmarks: Landmarks
@@ -112,18 +108,12 @@ def evaluate(
 ) -> Evaluation:
     """Run a detector over labelled images.
 
-    Parameters
-    ----------
-    detector:
-        A `lib.landmarks.Detector`, or any function from images (n, h, w, 3) to their `Landmarks`.
+    Args:
+        detector: A `lib.landmarks.Detector`, or any function from images (n, h, w, 3) to their `Landmarks`.
 
-    Raises
-    ------
-    ValueError
-        If there is no image.
+    Raises:
+        ValueError: If there is no image.
 
-    Examples
-    --------
     >>> from lib import paths
     >>> from lib.landmarks import Detector
     >>> first = next(labelled_images(Recording.open(paths.SHIPPED_RECORDING)))

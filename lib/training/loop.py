@@ -227,21 +227,15 @@ def train(
 ) -> Training:
     """Train a network; an interrupted training in `folder` is resumed.
 
-    Parameters
-    ----------
-    source, validation:
-        Training and held-out images; validation is never trained on.
-    folder:
-        Keeps ``last.safetensors`` (weights, average, optimiser, step, log); None keeps nothing.
-    initial:
-        Start from the weights of this training, for fine-tuning; its provenance is kept under ``before``.
-    max_seconds:
-        Stop (resumably) after this long.
+    Args:
+        source, validation: Training and held-out images; validation is never trained on.
+        folder: Keeps ``last.safetensors`` (weights, average, optimiser, step, log); None keeps nothing.
+        initial: Start from the weights of this training, for fine-tuning; its provenance is kept under ``before``.
+        max_seconds: Stop (resumably) after this long.
 
-    Raises
-    ------
-    ValueError
-        For an empty data set, an `initial` training of another network, or a folder that holds another training.
+    Raises:
+        ValueError: For an empty data set, an `initial` training of another network, or a folder that holds another
+            training.
     """
     if len(source) == 0 or len(validation) == 0:
         raise ValueError("source and validation: must not be empty; give labelled images.")

@@ -22,8 +22,6 @@ def heatmap_loss(outputs: Sequence[Tensor], batch: Batch, stride: int, sigma_px:
     It is the sum over cells divided by pi sigma^2 (the sum of a squared Gaussian of peak 1), the mean over the landmarks
     that count, and the mean over stacks (intermediate supervision).
 
-    Examples
-    --------
     >>> batch = Batch(torch.zeros(1, 3, 96, 96), torch.full((1, 3, 2), 47.5), torch.full((1, 3), 2))
     >>> round(heatmap_loss([torch.zeros(1, 3, 24, 24)], batch, stride=4).item(), 2)
     1.0

@@ -34,10 +34,8 @@ class LabelledImage(NamedTuple):
 def labelled_images(recording: Recording, *, every: int = 1) -> Iterator[LabelledImage]:
     """Left and right images of every `every`-th frame with their labels: the exact truth if simulated, else annotations.
 
-    Raises
-    ------
-    ValueError
-        If the recording has neither.
+    Raises:
+        ValueError: If the recording has neither.
     """
     labels = recording.truth or recording.annotations
     if labels is None:
@@ -68,10 +66,8 @@ class Source(Protocol):
 class Samples:
     """Labelled images in memory, (n, h, w, 3) uint8 RGB, with u (n, 3, 2) and visibility (n, 3) as in `LabelledImage`.
 
-    Raises
-    ------
-    ValueError
-        For an empty set, arrays of other shapes, or no visible landmark at all.
+    Raises:
+        ValueError: For an empty set, arrays of other shapes, or no visible landmark at all.
     """
 
     images: np.ndarray

@@ -69,21 +69,15 @@ def finetune(
 ) -> Detector:
     """Train all stages of a detector further on labelled frames, then fit its error models on held-out ones.
 
-    Parameters
-    ----------
-    images, held_out:
-        Full-resolution images of one size; images without a labelled base and tip are left out.  Consecutive frames are
-        alike, so hold out whole recordings, or the end of one.
-    folder:
-        Keeps the frames as shards and the checkpoints, from which the same call continues.
-    simulated:
-        Folder of `generate`'s shards; half of what is drawn then comes from there, so that the networks do not forget
-        tools and eyes that the labelled frames do not show.
+    Args:
+        images, held_out: Full-resolution images of one size; images without a labelled base and tip are left out.
+            Consecutive frames are alike, so hold out whole recordings, or the end of one.
+        folder: Keeps the frames as shards and the checkpoints, from which the same call continues.
+        simulated: Folder of `generate`'s shards; half of what is drawn then comes from there, so that the networks do
+            not forget tools and eyes that the labelled frames do not show.
 
-    Raises
-    ------
-    ValueError
-        If there is no usable image, or fewer than 20 landmarks are found in the held-out ones.
+    Raises:
+        ValueError: If there is no usable image, or fewer than 20 landmarks are found in the held-out ones.
     """
     folder = Path(folder)
     data = folder / "data"

@@ -97,19 +97,14 @@ class CloseupSource(_Cut):
 
     Stretching and shearing an image keeps its labels true and makes many tools of one.
 
-    Attributes
-    ----------
-    shifts_px, shift_shares:
-        Standard deviations of the error of place, and the share of closeups that has each.
-    turn_rad:
-        Standard deviation of the error of direction.
-    alone:
-        Share of closeups whose direction is that to one tip, as if the other one were missing.
-    stretch, shear:
-        Standard deviations of the logarithms of two stretches, along and across the tool, and of the shear.
-    motion_px:
-        Standard deviation along x and y of the movement, in closeup pixels, that blurs half of the closeups: a tool under way
-        moves more often than the simulator's.
+    Attributes:
+        shifts_px, shift_shares: Standard deviations of the error of place, and the share of closeups that has each.
+        turn_rad: Standard deviation of the error of direction.
+        alone: Share of closeups whose direction is that to one tip, as if the other one were missing.
+        stretch, shear: Standard deviations of the logarithms of two stretches, along and across the tool, and of the
+            shear.
+        motion_px: Standard deviation along x and y of the movement, in closeup pixels, that blurs half of the closeups:
+            a tool under way moves more often than the simulator's.
     """
 
     size: int = 64
