@@ -24,19 +24,18 @@ def detect(
     Returns three rows a frame (base, tip_1, tip_2), each with the robot's position at its instant, and NaN where a landmark
     is missing.  `Correspondences.complete` keeps the rows that both cameras and the robot saw.
 
-    Parameters
-    ----------
-    detector:
-        None is the one that ships.
-    frames:
-        Which frames; None is all.
-    track:
-        Follow the landmarks from frame to frame (`Detector.track`): several times faster where frames follow each other.
+    Args:
+        detector:
+            None is the one that ships.
+        frames:
+            Which frames; None is all.
+        track:
+            Follow the landmarks from frame to frame (`Detector.track`): several times faster where frames follow each other.
 
-    >>> from lib import paths
-    >>> found = detect(Recording.open(paths.SHIPPED_RECORDING), frames=slice(0, 2))
-    >>> len(found), found.x_mm.shape, found.covariance_px2.shape
-    (6, (6, 3), (6, 2, 2, 2))
+        >>> from lib import paths
+        >>> found = detect(Recording.open(paths.SHIPPED_RECORDING), frames=slice(0, 2))
+        >>> len(found), found.x_mm.shape, found.covariance_px2.shape
+        (6, (6, 3), (6, 2, 2, 2))
     """
     detector = detector or Detector.load()
     chosen = np.arange(len(recording.frames))[slice(None) if frames is None else frames]

@@ -55,19 +55,18 @@ CLOSE = ("closeup", "tracking")
 class Landmarks:
     """Detections in n images; the order is base, tip_1, tip_2.
 
-    Attributes
-    ----------
-    u:
-        (n, 3, 2) px, NaN where missing.
-    covariance:
-        (n, 3, 2, 2) px^2, NaN where missing.
-    confidence:
-        (n, 3), the probability that the landmark is in view and `u` lies within 5 % of the tool's length of it; 0 where
-        missing.
+    Attributes:
+        u:
+            (n, 3, 2) px, NaN where missing.
+        covariance:
+            (n, 3, 2, 2) px^2, NaN where missing.
+        confidence:
+            (n, 3), the probability that the landmark is in view and `u` lies within 5 % of the tool's length of it; 0 where
+            missing.
 
-    >>> found = Landmarks.none(2)
-    >>> len(found), len(found[:1]), found.u.shape
-    (2, 1, (2, 3, 2))
+        >>> found = Landmarks.none(2)
+        >>> len(found), len(found[:1]), found.u.shape
+        (2, 1, (2, 3, 2))
     """
 
     u: np.ndarray
@@ -107,27 +106,26 @@ class Landmarks:
 class Detector:
     """Finds the landmarks in frames of any size and number; one detector serves both cameras.
 
-    Attributes
-    ----------
-    frame_network, reduction:
-        The first stage, which sees the frame with one pixel for `reduction` image pixels, an integer.
-    window_network:
-        The third stage, which sees one upright window of `window_px` for each landmark; None = no such stage.
-    tool_network, tool_reduction:
-        The second stage, which sees one window of `window_px` round the tool, reduced likewise; None = no such stage.
-    closeup_network:
-        The last stage, which predicts where in a closeup the landmark lies; None = no such stage.
-    error_models:
-        One for each stage: ``"frame"``, ``"tool"``, ``"window"``, ``"closeup"``, and ``"tracking"`` for the closeups that
-        follow a landmark from frame to frame.
-    mirror:
-        The windows' network also sees the mirror image of every window, and the mean counts: twice the work.
-    engine:
-        What runs the networks, one of `lib.landmarks.engines.ENGINES`; the weights are the same.
+    Attributes:
+        frame_network, reduction:
+            The first stage, which sees the frame with one pixel for `reduction` image pixels, an integer.
+        window_network:
+            The third stage, which sees one upright window of `window_px` for each landmark; None = no such stage.
+        tool_network, tool_reduction:
+            The second stage, which sees one window of `window_px` round the tool, reduced likewise; None = no such stage.
+        closeup_network:
+            The last stage, which predicts where in a closeup the landmark lies; None = no such stage.
+        error_models:
+            One for each stage: ``"frame"``, ``"tool"``, ``"window"``, ``"closeup"``, and ``"tracking"`` for the closeups that
+            follow a landmark from frame to frame.
+        mirror:
+            The windows' network also sees the mirror image of every window, and the mean counts: twice the work.
+        engine:
+            What runs the networks, one of `lib.landmarks.engines.ENGINES`; the weights are the same.
 
-    >>> found = Detector.load(engine="torch")(np.zeros((1, 270, 480, 3), np.uint8))
-    >>> found.u.shape, bool((found.confidence < 0.5).all())
-    ((1, 3, 2), True)
+        >>> found = Detector.load(engine="torch")(np.zeros((1, 270, 480, 3), np.uint8))
+        >>> found.u.shape, bool((found.confidence < 0.5).all())
+        ((1, 3, 2), True)
     """
 
     frame_network: StackedHourglass
@@ -177,10 +175,9 @@ class Detector:
 
         `engine` runs its networks; None is the fastest that is installed (`lib.landmarks.engines`).
 
-        Raises
-        ------
-        FileNotFoundError, ValueError
-            If the file is missing, damaged, incomplete, or no detector; the text names the file and the cure.
+        Raises:
+            FileNotFoundError, ValueError: If the file is missing, damaged, incomplete, or no detector; the text names
+                the file and the cure.
         """
         path = Path(path_or_name or "default")
         if not path.suffix and not path.is_file():
@@ -333,7 +330,8 @@ class Detector:
 
     def stage_peaks(self, images: np.ndarray, u: ArrayLike, stage: str) -> tuple[Peaks, np.ndarray, np.ndarray]:
         """Peaks (m, 1) of a stage after the first in its windows' pixels, window_from_image (m, 2, 3), and which (m, 2)
-        image and landmark each is."""
+        image and landmark each is.
+        """
         windows, matrices, which = self.windows(images, u, stage)
         if not len(which):
             return Peaks.none(), matrices, np.zeros((0, 2), int)

@@ -22,18 +22,17 @@ class ErrorModel:
     of the peak's features (`features_of`), and so is the logit of the confidence.  The two tips, mirror images of each
     other, have equal coefficients.
 
-    Attributes
-    ----------
-    log_variance:
-        (2, 6): for x and y the constants of base, tip_1 and tip_2, and the slopes of the other three features.
-    logit:
-        (4,).
-    gain, bias:
-        (3, 2) for base, tip_1 and tip_2 along x and y, closeups only.  A closeup's correction is scaled by the gain that
-        minimises the validation error; the bias is the mean error that this leaves, in the closeup's pixels.
+    Attributes:
+        log_variance:
+            (2, 6): for x and y the constants of base, tip_1 and tip_2, and the slopes of the other three features.
+        logit:
+            (4,).
+        gain, bias:
+            (3, 2) for base, tip_1 and tip_2 along x and y, closeups only.  A closeup's correction is scaled by the gain that
+            minimises the validation error; the bias is the mean error that this leaves, in the closeup's pixels.
 
-    >>> ErrorModel().coefficients.shape
-    (3, 2, 4)
+        >>> ErrorModel().coefficients.shape
+        (3, 2, 4)
     """
 
     log_variance: tuple[tuple[float, ...], ...] = ((0.0, 0.0, 0.0, 1.0, 0.0, 0.0),) * 2

@@ -53,16 +53,11 @@ def _pixels(u_cell: Tensor, stride: int) -> Tensor:
 class Peaks:
     """The peak that a decoder finds in each heatmap.
 
-    Attributes
-    ----------
-    u:
-        (n, k, 2) px of the network's input.
-    value:
-        (n, k) height of the peak; that of the target is 1.
-    width:
-        (n, k) sigma of the peak over that of the target; 1 where the decoder does not fit it.
-    covariance:
-        (n, k, 2, 2) px^2, from the fit's residual; NaN where the decoder has none.
+    Attributes:
+        u: (n, k, 2) px of the network's input.
+        value: (n, k) height of the peak; that of the target is 1.
+        width: (n, k) sigma of the peak over that of the target; 1 where the decoder does not fit it.
+        covariance: (n, k, 2, 2) px^2, from the fit's residual; NaN where the decoder has none.
     """
 
     u: Tensor

@@ -28,19 +28,18 @@ STEM_STRIDE = 4
 class HourglassConfig:
     """Configuration of a `StackedHourglass`.
 
-    Attributes
-    ----------
-    features:
-        Channels of the hourglass, an even number.  The paper does not state it; notebook 02 derives that it is below 256.
-    stacks:
-        Hourglasses in a row, each supervised.
-    depth:
-        Halvings inside an hourglass; 4 makes inputs a multiple of 4 * 2**4 = 64.
-    decoder, skips, residual:
-        The parts that the ablation adds one by one.  Without a decoder the heatmaps have stride 4 * 2**depth.
+    Attributes:
+        features:
+            Channels of the hourglass, an even number.  The paper does not state it; notebook 02 derives that it is below 256.
+        stacks:
+            Hourglasses in a row, each supervised.
+        depth:
+            Halvings inside an hourglass; 4 makes inputs a multiple of 4 * 2**4 = 64.
+        decoder, skips, residual:
+            The parts that the ablation adds one by one.  Without a decoder the heatmaps have stride 4 * 2**depth.
 
-    >>> HourglassConfig().stride, HourglassConfig(**ABLATION["encoder"]).stride
-    (4, 64)
+        >>> HourglassConfig().stride, HourglassConfig(**ABLATION["encoder"]).stride
+        (4, 64)
     """
 
     features: int = 64
@@ -203,12 +202,9 @@ class StackedHourglass(_Network):
 class OffsetConfig:
     """Configuration of an `OffsetNetwork`.
 
-    Attributes
-    ----------
-    features:
-        Channels at half the closeup's resolution; there are more at lower resolutions.
-    size_px:
-        Side of the closeups, a multiple of 16.
+    Attributes:
+        features: Channels at half the closeup's resolution; there are more at lower resolutions.
+        size_px: Side of the closeups, a multiple of 16.
     """
 
     features: int = 32

@@ -60,7 +60,8 @@ def window_from_image(centre: ArrayLike, angle_rad: ArrayLike, size: int, zoom: 
 
 def closeup_from_image(centre: ArrayLike, angle_rad: ArrayLike, size: int, landmark: ArrayLike) -> np.ndarray:
     """Matrices (..., 2, 3) like `window_from_image`, of `CLOSEUP_ZOOM`, mirrored for tip_2, and centred behind `centre`
-    (..., 2), where the landmark (...) is thought to lie; `angle_rad` is (...)."""
+    (..., 2), where the landmark (...) is thought to lie; `angle_rad` is (...).
+    """
     landmark, angle = np.asarray(landmark), np.asarray(angle_rad, dtype=np.float64)
     behind = np.array(CLOSEUP_BEHIND_PX)[landmark][..., None] * np.stack([np.cos(angle), np.sin(angle)], -1)
     matrix = window_from_image(np.asarray(centre) - behind, angle, size, np.array(CLOSEUP_ZOOM)[landmark])

@@ -44,58 +44,41 @@ def match(
 ) -> Matches:
     """Match the two images of a stereo pair.
 
-    Parameters
-    ----------
-    left, right:
-        (h, w, 3) uint8 RGB or (h, w) uint8 grey; sizes may differ.
-    method:
-        "deepmatching": free DeepMatching, integer positions, as published; a rig is only used for `epipolar_px`.
-        "band": DeepMatching along the epipolar lines, sub-pixel; needs a rig.
-        "sgbm", "dis": OpenCV's, on rectified canvases; without a rig the pair is taken as rectified.
-        A callable `f(left, right, (low, high)) -> (disparity, confidence)` of rectified grey uint8 images (h, w),
-        x_right = x_left - disparity, not finite = none: the slot for learned matchers.  A third array (h, w) bool, where
-        it returns one, is its own check of the way back.
-        None is "band" with a rig, else "deepmatching".
-    rig:
-        Calibrated rig, or `RECTIFIED` for a pair whose rows correspond (depth is then disparity in px).
-    mask_left, mask_right:
-        (h, w) bool, True = ignore (see `glint_mask`, `tool_mask`).
-    depth_range_mm:
-        (near, far): the values of d.x to search, where d is the left camera's `viewing_direction` and x a point in
-        the rig's frame (so the sign and the origin are those of the rig's frame along d).  None = found by a coarse
-        pass.  Only used with a rig.
-    setting:
-        "quality" searches at full resolution (up to 3 Mpx), "fast" at up to 0.4 Mpx.  Not for "deepmatching".
-    min_score:
-        Matches with a lower score are dropped.  None is 0.5 for "band", whose score falls with the predicted standard
-        deviation (half of the wrong matches and few of the right ones lie below), and 0 for the others.
-    downscale:
-        DeepMatching only: descriptors are pooled by 2^downscale; None is the smallest from 1 that fits the budget.
-    budget_bytes:
-        Memory that DeepMatching may take.  It is predicted before anything is allocated; what does not fit is refused.
-    max_epipolar_px:
-        Every method that searches along the rig's epipolar lines refuses a rig whose lines lie farther than this from
-        what free coarse matches say.
-    reciprocal:
-        Drop matches whose way back from the right image leads elsewhere (occlusions, above all).  False keeps them;
-        `Matches.reciprocal` says which.
-    device:
-        torch device of free DeepMatching, such as "cuda".
+    Args:
+        left, right: (h, w, 3) uint8 RGB or (h, w) uint8 grey; sizes may differ.
+        method: "deepmatching": free DeepMatching, integer positions, as published; a rig is only used for
+            `epipolar_px`. "band": DeepMatching along the epipolar lines, sub-pixel; needs a rig. "sgbm", "dis":
+            OpenCV's, on rectified canvases; without a rig the pair is taken as rectified. A callable `f(left, right,
+            (low, high)) -> (disparity, confidence)` of rectified grey uint8 images (h, w), x_right = x_left -
+            disparity, not finite = none: the slot for learned matchers.  A third array (h, w) bool, where it returns
+            one, is its own check of the way back. None is "band" with a rig, else "deepmatching".
+        rig: Calibrated rig, or `RECTIFIED` for a pair whose rows correspond (depth is then disparity in px).
+        mask_left, mask_right: (h, w) bool, True = ignore (see `glint_mask`, `tool_mask`).
+        depth_range_mm: (near, far): the values of d.x to search, where d is the left camera's `viewing_direction` and x
+            a point in the rig's frame (so the sign and the origin are those of the rig's frame along d).  None = found
+            by a coarse pass.  Only used with a rig.
+        setting: "quality" searches at full resolution (up to 3 Mpx), "fast" at up to 0.4 Mpx.  Not for "deepmatching".
+        min_score: Matches with a lower score are dropped.  None is 0.5 for "band", whose score falls with the predicted
+            standard deviation (half of the wrong matches and few of the right ones lie below), and 0 for the others.
+        downscale: DeepMatching only: descriptors are pooled by 2^downscale; None is the smallest from 1 that fits the
+            budget.
+        budget_bytes: Memory that DeepMatching may take.  It is predicted before anything is allocated; what does not
+            fit is refused.
+        max_epipolar_px: Every method that searches along the rig's epipolar lines refuses a rig whose lines lie farther
+            than this from what free coarse matches say.
+        reciprocal: Drop matches whose way back from the right image leads elsewhere (occlusions, above all).  False
+            keeps them; `Matches.reciprocal` says which.
+        device: torch device of free DeepMatching, such as "cuda".
 
-    Returns
-    -------
-    Matches
-        Possibly none, where there is no texture.  Of three confidences the score is usually the best detector of wrong
-        matches, but SGBM has none (always 1); the peak ratio and the reciprocal check mean the same for every method.
+    Returns:
+        Matches: Possibly none, where there is no texture.  Of three confidences the score is usually the best detector
+            of wrong matches, but SGBM has none (always 1); the peak ratio and the reciprocal check mean the same for
+            every method.
 
-    Raises
-    ------
-    ValueError
-        For images of a wrong type or shape, masks of a wrong shape or that leave nothing, an unknown method or
-        setting, too small a budget, or a rig that does not fit the images (with the epipolar error).
+    Raises:
+        ValueError: For images of a wrong type or shape, masks of a wrong shape or that leave nothing, an unknown method
+            or setting, too small a budget, or a rig that does not fit the images (with the epipolar error).
 
-    Example
-    -------
     >>> noise = np.random.default_rng(0).integers(0, 255, (48, 64), dtype=np.uint8)
     >>> matches = match(noise, np.roll(noise, 4, axis=1))
     >>> np.median(matches.u_right - matches.u_left, axis=0).tolist()

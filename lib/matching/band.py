@@ -80,10 +80,8 @@ def plan_search(
 ) -> Search:
     """Choose the canvas, check the rig by coarse matches, and find the range of depth where it is not given.
 
-    Raises
-    ------
-    ValueError
-        If the rig does not fit the images, or both cameras see nothing in the depth range.
+    Raises:
+        ValueError: If the rig does not fit the images, or both cameras see nothing in the depth range.
     """
     shapes = images[0].shape, images[1].shape
     whole = rectify(rig, *shapes)
@@ -116,7 +114,8 @@ def plan_search(
 
 def _coarse_displacement(images: Images, masks: Masks, rig: StereoRig, whole: Rectification) -> tuple[np.ndarray, int]:
     """Displacements (n, 2) along and off the line, in pixels of the canvas `whole`, of small images matched in a wide
-    window; only of matches with support.  And the number of matches with and without."""
+    window; only of matches with support.  And the number of matches with and without.
+    """
     scale = min(1.0, COARSE_WIDTH_PX / max(whole.size_px))
     rectification = rectify(rig, images[0].shape, images[1].shape, scale=scale)
     reach = int(np.ceil(COARSE_REACH * rectification.size_px[0] / CELL_PX))
@@ -203,10 +202,8 @@ def match_band(
 ) -> Matches:
     """Matches of a calibrated pair; arguments as in `lib.matching.match`, images (h, w) uint8 grey.
 
-    Raises
-    ------
-    ValueError
-        As `plan_search`, and if the search would need more memory than the budget.
+    Raises:
+        ValueError: As `plan_search`, and if the search would need more memory than the budget.
     """
     search = plan_search(images, masks, rig, setting, depth_range_mm, max_epipolar_px)
     if not search.n_found and depth_range_mm is None:

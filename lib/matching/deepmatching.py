@@ -90,7 +90,8 @@ def _correlation_maps(patches: torch.Tensor, windows: torch.Tensor) -> torch.Ten
 
 def _match_grids(left: torch.Tensor, right: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, np.ndarray, torch.Tensor]:
     """Best corner (gy, gx, 2) (x, y) of each patch of two descriptor grids, its score and peak ratio (gy, gx), and
-    whether no other patch fits the same place of the right grid better (gy, gx)."""
+    whether no other patch fits the same place of the right grid better (gy, gx).
+    """
     patches, windows = _patches(left), _windows(right)
     (gy, gx), (n_y, n_x) = patches.shape[:2], windows.shape[:2]
 

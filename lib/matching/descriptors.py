@@ -30,10 +30,8 @@ MIN_SEEN = 0.5
 def as_gray(image: ArrayLike, name: str) -> np.ndarray:
     """A grey uint8 image (h, w) of an RGB (h, w, 3) or grey (h, w) uint8 image.
 
-    Raises
-    ------
-    ValueError
-        For any other shape or type, or an image below 16 x 16 px; `name` is the argument named.
+    Raises:
+        ValueError: For any other shape or type, or an image below 16 x 16 px; `name` is the argument named.
     """
     image = np.asarray(image)
     if image.dtype != np.uint8:
@@ -57,19 +55,13 @@ def pixel_descriptors(gray: np.ndarray, downscale: int = 1, *, valid: np.ndarray
     The image is smoothed, its gradient projected on eight directions and rectified, smoothed, squashed by
     2 / (1 + exp(-0.2 x)) - 1 (so that contrast matters little), smoothed again; a constant ninth channel ends it.
 
-    Parameters
-    ----------
-    gray:
-        (h, w) float32 or uint8, 0..255.
-    downscale:
-        Binary logarithm of the pooling.
-    valid:
-        (h, w) bool; descriptors of cells with any invalid pixel are zero, and so say nothing.
+    Args:
+        gray: (h, w) float32 or uint8, 0..255.
+        downscale: Binary logarithm of the pooling.
+        valid: (h, w) bool; descriptors of cells with any invalid pixel are zero, and so say nothing.
 
-    Returns
-    -------
-    np.ndarray
-        (h >> downscale, w >> downscale, 9) float32.  The centre of cell 0 lies at (2^downscale - 1) / 2 px.
+    Returns:
+        np.ndarray: (h >> downscale, w >> downscale, 9) float32.  The centre of cell 0 lies at (2^downscale - 1) / 2 px.
     """
     stride = 1 << downscale
     rows, columns = gray.shape[0] // stride, gray.shape[1] // stride

@@ -14,14 +14,10 @@ def glint_mask(image: ArrayLike, *, level: int = 245, grow_px: int = 5) -> np.nd
 
     A glint moves with the viewpoint, not with the surface, so a match on one has the depth of a mirror image.
 
-    Parameters
-    ----------
-    image:
-        (h, w, 3) RGB or (h, w), uint8.
-    level:
-        Smallest value of the darkest channel.
-    grow_px:
-        Margin for the halo around the saturated core.
+    Args:
+        image: (h, w, 3) RGB or (h, w), uint8.
+        level: Smallest value of the darkest channel.
+        grow_px: Margin for the halo around the saturated core.
     """
     image = np.asarray(image)
     if image.dtype != np.uint8 or image.ndim not in (2, 3):
@@ -38,17 +34,12 @@ def tool_mask(
 ) -> np.ndarray:
     """The forceps, from its three landmarks: both jaws, and the shaft continued beyond the base.
 
-    Parameters
-    ----------
-    shape:
-        (h, w) of the image.
-    u_landmarks:
-        (3, 2) px: base, tip_1, tip_2; NaN = missing.  A jaw without its tip is left out; without the base, or with
-        both tips missing, the mask is empty.
-    width_px:
-        Full width of jaws and shaft, with margin; None is 0.45 of the mean jaw length.
-    shaft_px:
-        How far the shaft reaches behind the base, away from the tips; None is beyond the image.
+    Args:
+        shape: (h, w) of the image.
+        u_landmarks: (3, 2) px: base, tip_1, tip_2; NaN = missing.  A jaw without its tip is left out; without the base,
+            or with both tips missing, the mask is empty.
+        width_px: Full width of jaws and shaft, with margin; None is 0.45 of the mean jaw length.
+        shaft_px: How far the shaft reaches behind the base, away from the tips; None is beyond the image.
     """
     u = np.asarray(u_landmarks, dtype=np.float64)
     if u.shape != (3, 2):
@@ -77,10 +68,8 @@ def tool_mask(
 def checked_mask(mask: ArrayLike, shape: tuple[int, int], name: str) -> np.ndarray:
     """A mask as an array.
 
-    Raises
-    ------
-    ValueError
-        If it is not bool (h, w) of this shape, or leaves nothing; `name` is the argument named.
+    Raises:
+        ValueError: If it is not bool (h, w) of this shape, or leaves nothing; `name` is the argument named.
     """
     mask = np.asarray(mask)
     if mask.shape != shape or mask.dtype != bool:

@@ -171,17 +171,12 @@ def peak_ratio(maps: torch.Tensor, row: torch.Tensor, column: torch.Tensor) -> n
 
     The peak ratio of Hu and Mordohai (PAMI 2012), for responses, which are large where a place fits.
 
-    Parameters
-    ----------
-    maps:
-        (m, rows, columns) responses, 0 where nothing is seen; overwritten.
-    row, column:
-        (m,) int, where the match lies; the cells next to it count as the match.
+    Args:
+        maps: (m, rows, columns) responses, 0 where nothing is seen; overwritten.
+        row, column: (m,) int, where the match lies; the cells next to it count as the match.
 
-    Returns
-    -------
-    np.ndarray
-        (m,); infinite where nothing else responds, NaN where there is no place for a rival.
+    Returns:
+        np.ndarray: (m,); infinite where nothing else responds, NaN where there is no place for a rival.
     """
     step = torch.arange(-1, 2, device=maps.device)
     rows = (row[:, None, None] + step[:, None]).clamp(0, maps.shape[1] - 1)

@@ -29,17 +29,13 @@ RECTIFIED = StereoRig(
 class Rectification:
     """A canvas that covers the left image and on which both images share their rows.
 
-    Attributes
-    ----------
-    left_from_canvas, right_from_canvas:
-        (2, 3) affine maps from canvas to image pixels, pixel centres on integers.  The right one holds at
-        `reference_depth_mm`.
-    size_px:
-        (width, height) of the canvas.
-    displacement_px_per_mm:
-        A point dz deeper than the reference appears on the right canvas shifted by this times dz along +x.
-    reference_depth_mm:
-        Depth d.x along the left viewing direction d at which the displacement is 0.
+    Attributes:
+        left_from_canvas, right_from_canvas: (2, 3) affine maps from canvas to image pixels, pixel centres on integers.
+            The right one holds at `reference_depth_mm`.
+        size_px: (width, height) of the canvas.
+        displacement_px_per_mm: A point dz deeper than the reference appears on the right canvas shifted by this times
+            dz along +x.
+        reference_depth_mm: Depth d.x along the left viewing direction d at which the displacement is 0.
     """
 
     left_from_canvas: np.ndarray
@@ -61,10 +57,8 @@ class Rectification:
     def search_range_px(self, depth_range_mm: tuple[float, float], shape_right: tuple[int, int]) -> tuple[float, float]:
         """(low, high) displacements of a range of depth, as far as both cameras can see it in a right image (h, w).
 
-        Raises
-        ------
-        ValueError
-            If they see nothing of it; the message says what depths they see.
+        Raises:
+            ValueError: If they see nothing of it; the message says what depths they see.
         """
         low, high = self.displacement_range_px(depth_range_mm)
         height, width = shape_right
@@ -95,10 +89,8 @@ def rectify(
 
     Of near-affine cameras it is that of the affine cameras which touch them.
 
-    Raises
-    ------
-    ValueError
-        If the rig's two cameras look along the same direction (no depth can be seen).
+    Raises:
+        ValueError: If the rig's two cameras look along the same direction (no depth can be seen).
     """
     A_l, A_r = rig.left.linear, rig.right.linear
     H = A_r @ np.linalg.pinv(A_l)
@@ -138,19 +130,13 @@ def warp(
 ) -> tuple[np.ndarray, np.ndarray]:
     """An image (h, w), float32 or uint8, on a canvas; anti-aliased where the canvas is coarser.
 
-    Parameters
-    ----------
-    image_from_canvas:
-        (2, 3).
-    size_px, shift_px:
-        (width, height) of the part of the canvas, which starts at canvas pixel `shift_px`.
-    mask:
-        (h, w) bool, True = ignore.
+    Args:
+        image_from_canvas: (2, 3).
+        size_px, shift_px: (width, height) of the part of the canvas, which starts at canvas pixel `shift_px`.
+        mask: (h, w) bool, True = ignore.
 
-    Returns
-    -------
-    (gray, valid)
-        (height, width) float32, borders continued; and bool, False outside the image and where masked.
+    Returns:
+        (gray, valid): (height, width) float32, borders continued; and bool, False outside the image and where masked.
     """
     linear = image_from_canvas[:, :2]
     offset = image_from_canvas[:, 2] + linear @ np.asarray(shift_px, dtype=np.float64)

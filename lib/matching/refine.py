@@ -53,21 +53,15 @@ def refine(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Refine matches of whole cells.
 
-    Parameters
-    ----------
-    left, right:
-        (h, w, C) float32 descriptor grids.
-    start_left, start_right:
-        (n, 2) int, (x, y) cells where the matching 4 x 4 patches start.
-    margin:
-        Cells added to the patch on every side: steadier on smooth surfaces, worse at depth edges.
+    Args:
+        left, right: (h, w, C) float32 descriptor grids.
+        start_left, start_right: (n, 2) int, (x, y) cells where the matching 4 x 4 patches start.
+        margin: Cells added to the patch on every side: steadier on smooth surfaces, worse at depth edges.
 
-    Returns
-    -------
-    (step, sigma)
-        (n, 2) cells to add to the right (x, y), at most 1 either way: x on the line, and y as a step that may leave
-        the line finds it.  And their standard deviations (n, 2) if the descriptors' residuals were independent: the
-        shape of the uncertainty, not yet its scale.
+    Returns:
+        (step, sigma): (n, 2) cells to add to the right (x, y), at most 1 either way: x on the line, and y as a step
+            that may leave the line finds it.  And their standard deviations (n, 2) if the descriptors' residuals were
+            independent: the shape of the uncertainty, not yet its scale.
     """
     pad = margin + REACH
     left, right = (np.pad(grid, ((margin + 1, margin + 1), (pad, pad), (0, 0))) for grid in (left, right))

@@ -43,17 +43,13 @@ def predicted_bytes(gy: int, gx: int, n: int, v: int) -> int:
 def correlation_volume(left: torch.Tensor, right: torch.Tensor, v: int) -> torch.Tensor:
     """Cosine of every 4 x 4 patch of the left grid with its displaced windows in the right one.
 
-    Parameters
-    ----------
-    left:
-        (4 gy, 4 gx, C) descriptors, contiguous.
-    right:
-        (4 gy + 2 v, 4 gx + n - 1, C): the left grid with v more rows on either side, and the reach of n displacements.
+    Args:
+        left: (4 gy, 4 gx, C) descriptors, contiguous.
+        right: (4 gy + 2 v, 4 gx + n - 1, C): the left grid with v more rows on either side, and the reach of n
+            displacements.
 
-    Returns
-    -------
-    torch.Tensor
-        (gy, gx, 2 v + 1, n).
+    Returns:
+        torch.Tensor: (gy, gx, 2 v + 1, n).
     """
     height, width, channels = left.shape
     gy, gx, n = height // PATCH, width // PATCH, right.shape[1] - width + 1
@@ -104,14 +100,10 @@ def correlation_volume(left: torch.Tensor, right: torch.Tensor, v: int) -> torch
 def match_volume(volume: torch.Tensor, low: int, *, reciprocal: bool = True) -> VolumeMatches:
     """The best displacement of each patch: bottom-up, top-down, reciprocal check, sub-cell peak.
 
-    Parameters
-    ----------
-    volume:
-        (gy, gx, 2 v + 1, n) from `correlation_volume`.
-    low:
-        Its first displacement along x, cells.
-    reciprocal:
-        False keeps the matches that fail the reciprocal check too.
+    Args:
+        volume: (gy, gx, 2 v + 1, n) from `correlation_volume`.
+        low: Its first displacement along x, cells.
+        reciprocal: False keeps the matches that fail the reciprocal check too.
     """
     gy, gx, rows, n = volume.shape
     v = rows // 2

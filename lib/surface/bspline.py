@@ -22,14 +22,10 @@ __all__ = ["BSplineSurface", "ToolDistance"]
 class ToolDistance:
     """Distance of points to a surface; positive on the camera's side of it, NaN outside the domain.
 
-    Attributes
-    ----------
-    along_view_mm:
-        (n,) to the surface point that the camera sees behind the tool.
-    along_normal_mm:
-        (n,) to the nearest surface point.
-    nearest_mm, nearest_u:
-        That nearest point (n, 3) and its parameter (n, 2).
+    Attributes:
+        along_view_mm: (n,) to the surface point that the camera sees behind the tool.
+        along_normal_mm: (n,) to the nearest surface point.
+        nearest_mm, nearest_u: That nearest point (n, 3) and its parameter (n, 2).
     """
 
     along_view_mm: np.ndarray
@@ -42,15 +38,11 @@ class ToolDistance:
 class BSplineSurface:
     """x = Psi(u), a bicubic B-spline from left image points (px) to points (mm, the frame of the fitted points).
 
-    Attributes
-    ----------
-    grid:
-        Domain and number of control points.
-    control_points_mm:
-        (n_y, n_x, 3).
-    fit:
-        How it was found: data term, smoothness, inliers, certificate (`SurfaceFit`); None for a
-        surface that was not fitted.
+    Attributes:
+        grid: Domain and number of control points.
+        control_points_mm: (n_y, n_x, 3).
+        fit: How it was found: data term, smoothness, inliers, certificate (`SurfaceFit`); None for a surface that was
+            not fitted.
     """
 
     grid: SplineGrid
@@ -107,10 +99,8 @@ class BSplineSurface:
     def covariance(self, u: ArrayLike) -> np.ndarray:
         """Covariance (n, 3, 3) mm^2 of Psi(u) from the scatter of the fitted points; see `SurfaceFit.covariance`.
 
-        Raises
-        ------
-        ValueError
-            For a surface that was not fitted.
+        Raises:
+            ValueError: For a surface that was not fitted.
         """
         if self.fit is None:
             raise ValueError("covariance: this surface was not fitted to points, so its uncertainty is not known.")
@@ -119,14 +109,10 @@ class BSplineSurface:
     def distance(self, x_mm: ArrayLike, camera: AffineCamera, *, iterations: int = 20) -> ToolDistance:
         """Distance of points, such as tool tips, to the surface along the view and along the surface's normal.
 
-        Parameters
-        ----------
-        x_mm:
-            (n, 3) in the frame of the surface; NaN rows stay NaN.
-        camera:
-            The left camera, whose image parametrises the surface.
-        iterations:
-            Gauss-Newton steps towards the nearest point; each stays inside the domain.
+        Args:
+            x_mm: (n, 3) in the frame of the surface; NaN rows stay NaN.
+            camera: The left camera, whose image parametrises the surface.
+            iterations: Gauss-Newton steps towards the nearest point; each stays inside the domain.
         """
         x = points(x_mm, 3, "x_mm")
         start = camera.project(x)

@@ -35,10 +35,8 @@ __all__ = [
 def open3d() -> ModuleType:
     """The module open3d.
 
-    Raises
-    ------
-    ImportError
-        Where it or its system libraries are missing, in one line that says what to install.
+    Raises:
+        ImportError: Where it or its system libraries are missing, in one line that says what to install.
     """
     try:
         import open3d
@@ -53,16 +51,11 @@ def open3d() -> ModuleType:
 class Mesh:
     """Triangles of a surface.
 
-    Attributes
-    ----------
-    vertices_mm, normals:
-        (n, 3), and unit vectors (n, 3) towards the camera.
-    faces:
-        (m, 3) int32, counter-clockwise as the camera sees them.
-    u:
-        (n, 2) px of the left image, the texture coordinates.
-    texture:
-        (h, w, 3) uint8 RGB left image, or None.
+    Attributes:
+        vertices_mm, normals: (n, 3), and unit vectors (n, 3) towards the camera.
+        faces: (m, 3) int32, counter-clockwise as the camera sees them.
+        u: (n, 2) px of the left image, the texture coordinates.
+        texture: (h, w, 3) uint8 RGB left image, or None.
     """
 
     vertices_mm: np.ndarray
@@ -86,19 +79,13 @@ def surface_mesh(
 ) -> Mesh:
     """Triangles over the surface's domain.
 
-    Parameters
-    ----------
-    step_px:
-        Distance of neighbouring vertices in the left image, at most.
-    image:
-        (h, w, 3) uint8 RGB left image for the texture.
-    mask:
-        (h, w) bool, True where the surface is to be shown; None is everywhere.
+    Args:
+        step_px: Distance of neighbouring vertices in the left image, at most.
+        image: (h, w, 3) uint8 RGB left image for the texture.
+        mask: (h, w) bool, True where the surface is to be shown; None is everywhere.
 
-    Raises
-    ------
-    ValueError
-        For a step that is not positive, or a mask that leaves no triangle.
+    Raises:
+        ValueError: For a step that is not positive, or a mask that leaves no triangle.
     """
     if not step_px > 0:
         raise ValueError(f"step_px: must be positive, got {step_px}.")
@@ -122,12 +109,9 @@ def surface_mesh(
 def save_mesh(mesh: Mesh, path: str | Path) -> Path:
     """Write a mesh as binary glTF (.glb) with its texture inside, in metres, the unit of glTF.
 
-    Raises
-    ------
-    ValueError
-        For another suffix.
-    ImportError, OSError
-        Where Open3D does not load, or cannot write the file.
+    Raises:
+        ValueError: For another suffix.
+        ImportError, OSError: Where Open3D does not load, or cannot write the file.
     """
     path = _suffixed(path, ".glb")
     o3d = open3d()
@@ -158,12 +142,9 @@ def save_points(
 ) -> Path:
     """Write points (n, 3) mm as a binary PLY, with colours (n, 3) uint8 RGB and normals (n, 3) where given.
 
-    Raises
-    ------
-    ValueError
-        For NaN, counts that differ, or another suffix.
-    ImportError, OSError
-        Where Open3D does not load, or cannot write the file.
+    Raises:
+        ValueError: For NaN, counts that differ, or another suffix.
+        ImportError, OSError: Where Open3D does not load, or cannot write the file.
     """
     path = _suffixed(path, ".ply")
     x = finite_points(x_mm, 3, "x_mm")

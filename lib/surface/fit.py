@@ -19,32 +19,21 @@ __all__ = ["SurfaceFit"]
 class SurfaceFit:
     """How a surface was found.
 
-    Attributes
-    ----------
-    objective:
-        Eq. (6) over the final inliers: sum of (weighted) L1 norms in mm plus `smoothness` times the bending energy in
-        mm^2 / px^2.  With point covariances the norms are whitened, with a camera they are depths.
-    duality_gap:
-        Proven bound, in the unit of the objective, on its distance from the minimum.
-    smoothness:
-        mu of Eq. (6), px^2 / mm: given, or chosen by held-out error.
-    reject_mm:
-        Bound on the L1 norm of a point's residual that was applied, after the first fit.
-    inliers:
-        (n,) points that the final fit used.
-    residual_mm:
-        (n, 3) Psi(u) - x of every given point at the final surface; NaN where u lies outside.
-    iterations:
-        Newton steps of the final solve.
-    held_out:
-        (m, 2) candidates of the smoothness and their mean held-out L1 error (mm), where it was chosen; else (0, 2).
-    axes:
-        (k, 3) orthonormal directions along which the L1 norm was taken: the axes of the frame for the plain fit.
-    method:
-        The solver.
-    problem, penalty, weights, residual:
-        What was solved last, over the inliers: the points on their grid, mu (k,) of each output along `axes`, factors
-        (n, k) of the absolute residuals, and the residuals (n, k).
+    Attributes:
+        objective: Eq. (6) over the final inliers: sum of (weighted) L1 norms in mm plus `smoothness` times the bending
+            energy in mm^2 / px^2.  With point covariances the norms are whitened, with a camera they are depths.
+        duality_gap: Proven bound, in the unit of the objective, on its distance from the minimum.
+        smoothness: mu of Eq. (6), px^2 / mm: given, or chosen by held-out error.
+        reject_mm: Bound on the L1 norm of a point's residual that was applied, after the first fit.
+        inliers: (n,) points that the final fit used.
+        residual_mm: (n, 3) Psi(u) - x of every given point at the final surface; NaN where u lies outside.
+        iterations: Newton steps of the final solve.
+        held_out: (m, 2) candidates of the smoothness and their mean held-out L1 error (mm), where it was chosen; else
+            (0, 2).
+        axes: (k, 3) orthonormal directions along which the L1 norm was taken: the axes of the frame for the plain fit.
+        method: The solver.
+        problem, penalty, weights, residual: What was solved last, over the inliers: the points on their grid, mu (k,)
+            of each output along `axes`, factors (n, k) of the absolute residuals, and the residuals (n, k).
     """
 
     objective: float
@@ -73,10 +62,8 @@ class SurfaceFit:
         would.  Outputs correlate as the signs of their residuals do.  What all points share, such as the error of the
         calibration, is not in it.
 
-        Raises
-        ------
-        ValueError
-            For a fit by least squares, to which this does not apply.
+        Raises:
+            ValueError: For a fit by least squares, to which this does not apply.
         """
         if self.method == "least_squares":
             raise ValueError("covariance: of the L1 fit; fit with method 'interior_point'.")

@@ -49,44 +49,31 @@ def fit_surface(
 
     Points whose L1 norm exceeds `reject_mm` at this surface are dropped and it is fitted once more, as in the paper.
 
-    Parameters
-    ----------
-    u:
-        (n, 2) left image points, px.  Points outside the domain are not used.
-    x_mm:
-        (n, 3) points, mm.
-    domain:
-        (x0, y0, x1, y1) px that the surface covers.
-    control:
-        (n_x, n_y) control points.
-    smoothness:
-        mu >= 0, px^2 / mm.  None chooses it by the mean L1 error of held-out points: of three deterministic folds,
-        which do not depend on the order of the points, as many as hold 1500 points.
-    reject_mm:
-        Bound on the L1 norm of a point's residual.  None is `REJECT_MEDIANS` times the median L1 norm at the first
-        fit; infinity keeps all.
-    covariance_mm2:
-        Covariance of the points, (3, 3) or (n, 3, 3).  Eq. (6) is then taken in whitened coordinates: along the
-        principal axes of the mean covariance, each residual divided by its own standard deviation, the bending of an
-        axis by a typical one (and the whole multiplied by the mean, so that it stays in mm).  Triangulated points are
-        ten times worse along the view than across it.  None is the paper's plain norm.
-    camera:
-        The left camera, affine.  Its ray through u is then exact, Psi(u) = ray(u) + s(u) d, and only the depth s along the
-        viewing direction d is fitted, to d.x: one spline in the place of three.  Give `u` as matched in the image.
-    method:
-        "interior_point".  "least_squares" replaces the L1 norms by squares (mu is then in px^2), the baseline that
-        outliers ruin.
-    tolerance:
-        Duality gap at which the solver stops, relative to the objective.
-    quick:
-        Choose the smoothness and reject points at fits of five Newton steps, within some percent of the minimum, and with
-        fewer held-out points (1000); only the final fit is solved to `tolerance`.
+    Args:
+        u: (n, 2) left image points, px.  Points outside the domain are not used.
+        x_mm: (n, 3) points, mm.
+        domain: (x0, y0, x1, y1) px that the surface covers.
+        control: (n_x, n_y) control points.
+        smoothness: mu >= 0, px^2 / mm.  None chooses it by the mean L1 error of held-out points: of three deterministic
+            folds, which do not depend on the order of the points, as many as hold 1500 points.
+        reject_mm: Bound on the L1 norm of a point's residual.  None is `REJECT_MEDIANS` times the median L1 norm at the
+            first fit; infinity keeps all.
+        covariance_mm2: Covariance of the points, (3, 3) or (n, 3, 3).  Eq. (6) is then taken in whitened coordinates:
+            along the principal axes of the mean covariance, each residual divided by its own standard deviation, the
+            bending of an axis by a typical one (and the whole multiplied by the mean, so that it stays in mm).
+            Triangulated points are ten times worse along the view than across it.  None is the paper's plain norm.
+        camera: The left camera, affine.  Its ray through u is then exact, Psi(u) = ray(u) + s(u) d, and only the depth
+            s along the viewing direction d is fitted, to d.x: one spline in the place of three.  Give `u` as matched in
+            the image.
+        method: "interior_point".  "least_squares" replaces the L1 norms by squares (mu is then in px^2), the baseline
+            that outliers ruin.
+        tolerance: Duality gap at which the solver stops, relative to the objective.
+        quick: Choose the smoothness and reject points at fits of five Newton steps, within some percent of the minimum,
+            and with fewer held-out points (1000); only the final fit is solved to `tolerance`.
 
-    Raises
-    ------
-    ValueError
-        For shapes or counts that do not fit, NaN, negative smoothness, points that do not determine a surface: fewer
-        in the domain than a quarter of the control points, or than 16.
+    Raises:
+        ValueError: For shapes or counts that do not fit, NaN, negative smoothness, points that do not determine a
+            surface: fewer in the domain than a quarter of the control points, or than 16.
     """
     data = _prepared(u, x_mm, domain, control, covariance_mm2, camera)
     if smoothness is not None:

@@ -50,12 +50,9 @@ class SplineGrid:
     Coefficients are flat vectors (n_x n_y,) whose fast axis is the shorter side of the grid: this makes every matrix
     of the fit as narrow-banded as can be.
 
-    Attributes
-    ----------
-    domain:
-        (x0, y0, x1, y1) px.
-    control:
-        (n_x, n_y), each at least 4.
+    Attributes:
+        domain: (x0, y0, x1, y1) px.
+        control: (n_x, n_y), each at least 4.
     """
 
     domain: tuple[float, float, float, float]

@@ -31,19 +31,13 @@ def refine_rig(rig: StereoRig, covariance: np.ndarray, matches: Matches) -> Ster
 
     The cameras move only along directions that the calibration leaves uncertain, so few or poor matches change little.
 
-    Parameters
-    ----------
-    rig:
-        A calibrated affine pair.
-    covariance:
-        (16, 16) of the entries of its matrices, row by row, left first (`Calibration.covariance`).
-    matches:
-        Of `lib.matching.match` with this rig, best of the static scene with the tool masked.
+    Args:
+        rig: A calibrated affine pair.
+        covariance: (16, 16) of the entries of its matrices, row by row, left first (`Calibration.covariance`).
+        matches: Of `lib.matching.match` with this rig, best of the static scene with the tool masked.
 
-    Raises
-    ------
-    ValueError
-        If the rig is not affine, or the covariance has another shape.
+    Raises:
+        ValueError: If the rig is not affine, or the covariance has another shape.
     """
     if rig is None or not rig.is_affine:
         raise ValueError("rig: only an affine stereo pair can be refined; reconstruct with refine=False.")

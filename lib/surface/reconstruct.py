@@ -31,22 +31,15 @@ EPIPOLAR_SIGMAS = 2.0
 class Reconstruction:
     """What one stereo pair gave.
 
-    Attributes
-    ----------
-    surface:
-        Fitted to `points` over the left image points `u`.
-    points:
-        The triangulated points, with their covariances.
-    matches:
-        The matches that passed the epipolar filter, one a point.
-    n_matches:
-        Number of matches before the filter.
-    mask_left:
-        (h, w) bool, True where tool or glints hid the surface.
-    rig:
-        The cameras that made the points: as given, or refined by the matches.
-    seconds:
-        Wall clock of each stage: "mask", "refine" (only where the rig was refined), "match", "triangulate", "surface".
+    Attributes:
+        surface: Fitted to `points` over the left image points `u`.
+        points: The triangulated points, with their covariances.
+        matches: The matches that passed the epipolar filter, one a point.
+        n_matches: Number of matches before the filter.
+        mask_left: (h, w) bool, True where tool or glints hid the surface.
+        rig: The cameras that made the points: as given, or refined by the matches.
+        seconds: Wall clock of each stage: "mask", "refine" (only where the rig was refined), "match", "triangulate",
+            "surface".
     """
 
     surface: BSplineSurface
@@ -97,51 +90,34 @@ def reconstruct(
 ) -> Reconstruction:
     """Reconstruct the surface that a calibrated stereo pair shows.
 
-    Parameters
-    ----------
-    left, right:
-        (h, w, 3) uint8 RGB.
-    rig:
-        The cameras, or the calibration that found them.
-    setting:
-        "quality", or "fast" for several pairs a second: coarser matching (see `lib.matching.match`), an approximate
-        choice of smoothness, and `depth_only`.
-    method:
-        The matcher; see `lib.matching.match`.
-    refine:
-        Correct the epipolar geometry of the rig by a first, fast matching (`refine_rig`).  This needs the covariance of
-        the rig, so `rig` must be a calibration of an affine pair.  None refines where that covariance is known.
-    u_landmarks:
-        Landmarks of the tool, (3, 2) px left and right, to mask the tool; NaN = missing.
-    mask_left, mask_right:
-        (h, w) bool, True = ignore, beside glints and tool.
-    epipolar_sigmas:
-        Matches farther from their epipolar line than this many of their own standard deviations are dropped.
-    domain:
-        (x0, y0, x1, y1) px that the surface covers.  None takes it from the matches.
-    percentiles:
-        (low, high) of the matches' coordinates that bound the domain where `domain` is None: (0, 100) covers all
-        matches, (1, 99) leaves out the rim, where few matches hold the surface.
-    control, reject_mm:
-        As for `fit_surface`.
-    smoothness:
-        As for `fit_surface`.  An online system gives the smoothness that an earlier frame chose
-        (`Reconstruction.surface.fit.smoothness`), which saves the search.
-    depth_only:
-        Fit one spline, the depth along the rays of the left camera, in place of three.  It needs an affine left camera.
-        None is True in the fast setting with an affine rig.
-    seconds:
-        A dictionary that is filled with the seconds of each stage as it ends.  After an error its last key is the stage
-        that failed.
+    Args:
+        left, right: (h, w, 3) uint8 RGB.
+        rig: The cameras, or the calibration that found them.
+        setting: "quality", or "fast" for several pairs a second: coarser matching (see `lib.matching.match`), an
+            approximate choice of smoothness, and `depth_only`.
+        method: The matcher; see `lib.matching.match`.
+        refine: Correct the epipolar geometry of the rig by a first, fast matching (`refine_rig`).  This needs the
+            covariance of the rig, so `rig` must be a calibration of an affine pair.  None refines where that covariance
+            is known.
+        u_landmarks: Landmarks of the tool, (3, 2) px left and right, to mask the tool; NaN = missing.
+        mask_left, mask_right: (h, w) bool, True = ignore, beside glints and tool.
+        epipolar_sigmas: Matches farther from their epipolar line than this many of their own standard deviations are
+            dropped.
+        domain: (x0, y0, x1, y1) px that the surface covers.  None takes it from the matches.
+        percentiles: (low, high) of the matches' coordinates that bound the domain where `domain` is None: (0, 100)
+            covers all matches, (1, 99) leaves out the rim, where few matches hold the surface.
+        control, reject_mm: As for `fit_surface`.
+        smoothness: As for `fit_surface`.  An online system gives the smoothness that an earlier frame chose
+            (`Reconstruction.surface.fit.smoothness`), which saves the search.
+        depth_only: Fit one spline, the depth along the rays of the left camera, in place of three.  It needs an affine
+            left camera. None is True in the fast setting with an affine rig.
+        seconds: A dictionary that is filled with the seconds of each stage as it ends.  After an error its last key is
+            the stage that failed.
 
-    Raises
-    ------
-    ValueError
-        As `match` and `fit_surface` do: unfit images, a rig that does not fit them, too few matches; and for
-        `refine=True` without a covariance.
+    Raises:
+        ValueError: As `match` and `fit_surface` do: unfit images, a rig that does not fit them, too few matches; and
+            for `refine=True` without a covariance.
 
-    Example
-    -------
     >>> from lib import paths
     >>> from lib.recordings import Recording
     >>> recording = Recording.open(paths.SHIPPED_RECORDING)

@@ -32,12 +32,9 @@ _CACHED = 1 << 12  # points whose products stay in the cache
 class L1Problem:
     """Points on a spline grid, with everything of the Newton matrix that does not change between iterations.
 
-    Parameters
-    ----------
-    grid:
-        Where the coefficients lie.
-    u:
-        (n, 2) px, all inside the domain.
+    Args:
+        grid: Where the coefficients lie.
+        u: (n, 2) px, all inside the domain.
     """
 
     def __init__(self, grid: SplineGrid, u: np.ndarray) -> None:
@@ -147,18 +144,12 @@ class L1Problem:
 class L1Solution:
     """Minimum of sum_i w_i |b_i.c - x_i| + mu c.R.c for each of k outputs, and its proof.
 
-    Attributes
-    ----------
-    coefficients:
-        c (size, k).
-    objective:
-        (k,) the sum above at c.
-    duality_gap:
-        (k,) bound on how far the objective lies above the minimum, from a dual feasible point.
-    dual:
-        y (n, k), |y_i| <= w_i: the pull of each point on the surface.
-    iterations:
-        Newton steps taken.
+    Attributes:
+        coefficients: c (size, k).
+        objective: (k,) the sum above at c.
+        duality_gap: (k,) bound on how far the objective lies above the minimum, from a dual feasible point.
+        dual: y (n, k), |y_i| <= w_i: the pull of each point on the surface.
+        iterations: Newton steps taken.
     """
 
     coefficients: np.ndarray
@@ -182,21 +173,14 @@ def interior_point(
     The residual is split, b.c - x = p - q with p, q >= 0; the dual variable y of the split lies in [-w, w], with slacks
     w - y for p and w + y for q.
 
-    Parameters
-    ----------
-    x:
-        (n, k) data of k outputs.
-    mu:
-        Weight of the bending energy, at least 0; a number, or (k,) one an output.
-    weights:
-        w (n, k) > 0; None is 1.
-    tolerance:
-        Stop when the duality gap is below this fraction of the objective.
+    Args:
+        x: (n, k) data of k outputs.
+        mu: Weight of the bending energy, at least 0; a number, or (k,) one an output.
+        weights: w (n, k) > 0; None is 1.
+        tolerance: Stop when the duality gap is below this fraction of the objective.
 
-    Raises
-    ------
-    ValueError
-        If the data do not determine the coefficients (a control point without data, at mu = 0).
+    Raises:
+        ValueError: If the data do not determine the coefficients (a control point without data, at mu = 0).
     """
     weights = np.ones_like(x) if weights is None else weights
     order, sorted_problem = problem.by_cells
