@@ -50,22 +50,17 @@ class Detector(Protocol):
 class Settings:
     """What a user may change.
 
-    Attributes
-    ----------
-    calibration_frames:
-        Complete frames before the first calibration, and frames after which it is not repeated.  In between it is
-        repeated whenever a quarter more frames are at hand; after that each frame updates its moments.
-    registration_frames:
-        Frames of the tool after the cameras moved before the first registration (the paper's 3), and frames after which
-        it is not refined.
-    give_up_frames:
-        Frames without a convincing registration after which the rig is calibrated afresh (someone turned the zoom).
-    surface_every:
-        Reconstruct the surface in every n-th frame.
-    setting:
-        "fast" or "quality", as `lib.surface.reconstruct` has it.
-    control:
-        Control points of the surface (n_x, n_y).
+    Attributes:
+        calibration_frames: Complete frames before the first calibration, and frames after which it is not repeated.  In
+            between it is repeated whenever a quarter more frames are at hand; after that each frame updates its
+            moments.
+        registration_frames: Frames of the tool after the cameras moved before the first registration (the paper's 3),
+            and frames after which it is not refined.
+        give_up_frames: Frames without a convincing registration after which the rig is calibrated afresh (someone
+            turned the zoom).
+        surface_every: Reconstruct the surface in every n-th frame.
+        setting: "fast" or "quality", as `lib.surface.reconstruct` has it.
+        control: Control points of the surface (n_x, n_y).
     """
 
     calibration_frames: tuple[int, int] = (8, 60)
@@ -96,28 +91,18 @@ def _nothing() -> Correspondences:
 class FrameResult:
     """What one frame told.  Arrays are NaN, objects None, where a stage did not run or failed.
 
-    Attributes
-    ----------
-    index:
-        Number of the frame since the start.
-    state:
-        "calibrating" (no rig yet), "tracking", or "moved" (the cameras moved and are not registered yet).
-    landmarks:
-        Base, tip_1 and tip_2: where the detector saw them and where the robot reports them.
-    x_tool_mm:
-        (3, 3) landmarks as the cameras triangulate them.
-    rig:
-        In force after this frame.
-    reconstruction, reconstructed_at:
-        The newest surface and its points, and the number of the frame that they are from.
-    distance_mm:
-        (3,) from each landmark to the surface along the view; positive = above it.
-    drift:
-        Statistic of the drift monitor, in units of its alarm threshold.
-    motion:
-        The registration made in this frame, if one was.
-    seconds, failures:
-        By stage: wall-clock seconds of what ran, reason of what failed.
+    Attributes:
+        index: Number of the frame since the start.
+        state: "calibrating" (no rig yet), "tracking", or "moved" (the cameras moved and are not registered yet).
+        landmarks: Base, tip_1 and tip_2: where the detector saw them and where the robot reports them.
+        x_tool_mm: (3, 3) landmarks as the cameras triangulate them.
+        rig: In force after this frame.
+        reconstruction, reconstructed_at: The newest surface and its points, and the number of the frame that they are
+            from.
+        distance_mm: (3,) from each landmark to the surface along the view; positive = above it.
+        drift: Statistic of the drift monitor, in units of its alarm threshold.
+        motion: The registration made in this frame, if one was.
+        seconds, failures: By stage: wall-clock seconds of what ran, reason of what failed.
     """
 
     index: int
@@ -164,25 +149,17 @@ class OnlinePipeline:
     A frame never ends the run: a stage that fails leaves its reason in the result, and the others go on as far as they
     can.
 
-    Parameters
-    ----------
-    detector:
-        Images (2, h, w, 3) uint8 RGB to landmarks.
-    rig:
-        A rig or a calibration to start from, which is kept until the cameras move; None calibrates from the first frames.
-    noise_px:
-        Standard deviation of a landmark's residual per coordinate, for a `rig` that is no calibration.
-    calibrate, reconstruct:
-        Replace `lib.calibration.calibrate` and `lib.surface.reconstruct`.
+    Args:
+        detector: Images (2, h, w, 3) uint8 RGB to landmarks.
+        rig: A rig or a calibration to start from, which is kept until the cameras move; None calibrates from the first
+            frames.
+        noise_px: Standard deviation of a landmark's residual per coordinate, for a `rig` that is no calibration.
+        calibrate, reconstruct: Replace `lib.calibration.calibrate` and `lib.surface.reconstruct`.
 
-    Attributes
-    ----------
-    rig:
-        In force now, None before the first calibration.
-    calibration:
-        That `rig` comes from, None for a rig that was given.
-    state:
-        As in `FrameResult`.
+    Attributes:
+        rig: In force now, None before the first calibration.
+        calibration: That `rig` comes from, None for a rig that was given.
+        state: As in `FrameResult`.
     """
 
     def __init__(
@@ -208,15 +185,12 @@ class OnlinePipeline:
     def step(self, left: np.ndarray, right: np.ndarray, kinematics: ArrayLike | Callable | None = None) -> FrameResult:
         """Take in one stereo frame.
 
-        Parameters
-        ----------
-        left, right:
-            (h, w, 3) uint8 RGB.
-        kinematics:
-            (3, 3) mm, base, tip_1, tip_2 in the robot frame at the time of the frame; NaN or None where the robot said
-            nothing.  Or a function that pairs the detections with the robot's positions at the instants at which their
-            rows were read, given as to `lib.correspondences.pair_with_robot`, and returns the frame's Correspondences:
-            ``partial(of_recording, recording, frames=[index])``.
+        Args:
+            left, right: (h, w, 3) uint8 RGB.
+            kinematics: (3, 3) mm, base, tip_1, tip_2 in the robot frame at the time of the frame; NaN or None where the
+                robot said nothing.  Or a function that pairs the detections with the robot's positions at the instants
+                at which their rows were read, given as to `lib.correspondences.pair_with_robot`, and returns the
+                frame's Correspondences: ``partial(of_recording, recording, frames=[index])``.
         """
         self._index += 1
         result, accepted = FrameResult(self._index), []

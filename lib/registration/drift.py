@@ -21,22 +21,19 @@ class DriftMonitor:
     turned to a standard normal score z (Wilson and Hilferty 1931), so that frames with missing landmarks count alike,
     and S <- max(0, S + min(z, cap) - slack).  S above `threshold` says that the cameras moved.
 
-    Parameters
-    ----------
-    rig:
-        As calibrated or last registered.
-    covariance_px2, sigma_x_mm:
-        Noise: of (u_left, u_right), a number, (2, 2) or (4, 4) px^2; and of the robot's report, per coordinate.
-    slack, threshold, cap:
-        Score that still counts as no change, half of the shift that should be noticed; alarm level; and largest score
-        of one frame, below threshold + slack so that a single bad detection raises no alarm.  With the defaults a false
-        alarm comes less than once in a million frames, once in ten thousand where the noise is 10 % larger than stated.
+    Args:
+        rig:
+            As calibrated or last registered.
+        covariance_px2, sigma_x_mm:
+            Noise: of (u_left, u_right), a number, (2, 2) or (4, 4) px^2; and of the robot's report, per coordinate.
+        slack, threshold, cap:
+            Score that still counts as no change, half of the shift that should be noticed; alarm level; and largest score
+            of one frame, below threshold + slack so that a single bad detection raises no alarm.  With the defaults a false
+            alarm comes less than once in a million frames, once in ten thousand where the noise is 10 % larger than stated.
 
-    `statistic` is S after the last frame, `history` has (chi2, degrees of freedom, S) of the last 1000 frames.  A
-    covariance that is not positive definite raises a ValueError: it would hide every drift.
+        `statistic` is S after the last frame, `history` has (chi2, degrees of freedom, S) of the last 1000 frames.  A
+        covariance that is not positive definite raises a ValueError: it would hide every drift.
 
-    Examples
-    --------
     >>> from lib.cameras import AffineCamera
     >>> camera = AffineCamera([[100, 0, 0, 0], [0, 100, 0, 0]])
     >>> monitor = DriftMonitor(StereoRig(camera, camera), covariance_px2=1.0)
@@ -74,13 +71,11 @@ class DriftMonitor:
     ) -> bool:
         """Take in one frame; True = the cameras have moved.
 
-        Parameters
-        ----------
-        data, u_left, u_right:
-            The frame's Correspondences; or x_mm (k, 3) and pixels (k, 2).  Incomplete rows are left out.
-        covariance_px2:
-            (k, 4, 4) of the residuals of this frame, if it is known better than in general: where the rig itself is
-            uncertain, far from the landmarks that it was calibrated with.
+        Args:
+            data, u_left, u_right: The frame's Correspondences; or x_mm (k, 3) and pixels (k, 2).  Incomplete rows are
+                left out.
+            covariance_px2: (k, 4, 4) of the residuals of this frame, if it is known better than in general: where the
+                rig itself is uncertain, far from the landmarks that it was calibrated with.
         """
         data = data if isinstance(data, Correspondences) else Correspondences.of_points(data, u_left, u_right)
         if covariance_px2 is None:

@@ -45,29 +45,19 @@ def register_images(
     Minimises sum r^T C^-1 r over the six parameters of the motion, with r = u - rig.project(motion^-1 x) and
     C = covariance_px2 + sigma_x^2 A A^T, by damped Gauss-Newton steps.
 
-    Parameters
-    ----------
-    rig:
-        Calibrated before the motion; affine or near-affine cameras.
-    data, u_left, u_right:
-        Correspondences after the motion; or (n, 3) mm as the robot reports the landmarks now, and (n, 2) px as they are
-        detected.  If one image misses a landmark, the other still counts.
-    covariance_px2:
-        Of (u_left, u_right): a number, (2, 2), (4, 4) or (n, 4, 4).  None: that of the correspondences; without one,
-        equal and unknown, estimated from the residuals.
-    sigma_x_mm:
-        Standard deviation of the robot's report, per coordinate.
-    loss:
-        "robust" assumes heavy tails (Student t with 4 degrees of freedom), so that gross detection errors lose
-        their weight.
+    Args:
+        rig: Calibrated before the motion; affine or near-affine cameras.
+        data, u_left, u_right: Correspondences after the motion; or (n, 3) mm as the robot reports the landmarks now,
+            and (n, 2) px as they are detected.  If one image misses a landmark, the other still counts.
+        covariance_px2: Of (u_left, u_right): a number, (2, 2), (4, 4) or (n, 4, 4).  None: that of the correspondences;
+            without one, equal and unknown, estimated from the residuals.
+        sigma_x_mm: Standard deviation of the robot's report, per coordinate.
+        loss: "robust" assumes heavy tails (Student t with 4 degrees of freedom), so that gross detection errors lose
+            their weight.
 
-    Raises
-    ------
-    ValueError
-        For shapes that do not pair up, or landmarks that leave the motion open.
+    Raises:
+        ValueError: For shapes that do not pair up, or landmarks that leave the motion open.
 
-    Examples
-    --------
     >>> from lib.cameras import AffineCamera
     >>> rig = StereoRig(*(AffineCamera([[99, 0, z, 900], [0, 99, 0, 500]]) for z in (9, -9)))
     >>> x = np.array([[0.0, 0, 0], [3, 0, 0], [0, 3, 0], [0, 0, 1]])

@@ -72,27 +72,19 @@ def check_spread(x: np.ndarray, name: str) -> None:
 def register(x_source: ArrayLike, x_target: ArrayLike, *, loss: Literal["norm", "squared"] = "norm") -> Registration:
     """The rigid transform that takes `x_source` to `x_target`, point by point (paper Eq. 7).
 
-    Parameters
-    ----------
-    x_source, x_target:
-        (n, 3) mm, n >= 3; in the paper the triangulated landmarks and the robot's report of them.
-    loss:
-        "norm" minimises sum |R x + t - y|, Eq. (7) as printed: robust, solved by iteratively reweighted least squares
-        from several starts.  "squared" minimises the sum of squares, in closed form (Kabsch 1976).
+    Args:
+        x_source, x_target: (n, 3) mm, n >= 3; in the paper the triangulated landmarks and the robot's report of them.
+        loss: "norm" minimises sum |R x + t - y|, Eq. (7) as printed: robust, solved by iteratively reweighted least
+            squares from several starts.  "squared" minimises the sum of squares, in closed form (Kabsch 1976).
 
-    Returns
-    -------
-    Registration
-        With the sandwich covariance of an M-estimator (Huber 1967).  It assumes neither Gaussian nor isotropic noise
-        but many points: below about ten it says little.  Standard deviations of the norm are good to about 30 %.
+    Returns:
+        Registration: With the sandwich covariance of an M-estimator (Huber 1967).  It assumes neither Gaussian nor
+            isotropic noise but many points: below about ten it says little.  Standard deviations of the norm are good
+            to about 30 %.
 
-    Raises
-    ------
-    ValueError
-        For rows that do not pair up, NaN, fewer than three points, or points on a line.
+    Raises:
+        ValueError: For rows that do not pair up, NaN, fewer than three points, or points on a line.
 
-    Examples
-    --------
     >>> x = np.array([[0.0, 0, 0], [4, 0, 0], [0, 3, 0], [0, 0, 2], [3, 3, 0], [2, 0, 1]])
     >>> y = x + [0.5, 0.25, -1]
     >>> y[3] += 10.0  # a gross error
