@@ -51,17 +51,13 @@ def python_of(venv: Path) -> Path:
 def ensure(root: Path = ROOT, torch: str | None = None) -> Path:
     """The interpreter of a complete ``.venv``, made, repaired or brought up to date first where need be.
 
-    Parameters
-    ----------
-    root:
-        Folder of environment.toml; ``.venv`` lies in it.
-    torch:
-        ``"cpu"`` or ``"cuda"``; None keeps the build that is installed, or picks by whether there is an NVIDIA GPU.
+    Args:
+        root: Folder of environment.toml; ``.venv`` lies in it.
+        torch: ``"cpu"`` or ``"cuda"``; None keeps the build that is installed, or picks by whether there is an NVIDIA
+            GPU.
 
-    Raises
-    ------
-    Problem
-        If it cannot be made: no venv module, too little disk, no network.
+    Raises:
+        Problem: If it cannot be made: no venv module, too little disk, no network.
     """
     venv = root / ".venv"
     if not _is_ready(root, torch):
@@ -251,10 +247,8 @@ def _write_site_files(root: Path, venv: Path) -> None:
 def missing_libraries(libraries: dict[str, str]) -> str:
     """One line about the system libraries that Open3D needs and this Linux lacks; "" if there is nothing to say.
 
-    Parameters
-    ----------
-    libraries:
-        Shared object -> Debian package.
+    Args:
+        libraries: Shared object -> Debian package.
     """
     lacks = [package for name, package in libraries.items() if not _loads(name)] if sys.platform == "linux" else []
     if not lacks:

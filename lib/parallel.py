@@ -47,24 +47,16 @@ def run_jobs(
     A job whose worker process was killed is given to another worker, three times at most.  Closing the iterator drops
     the jobs that have not begun.
 
-    Parameters
-    ----------
-    function:
-        Importable (not a closure).  It makes `path` whole or not at all, as `lib.files.whole` does.
-    workers:
-        Processes on this machine, at most one a job; None is one a core.
-    scheduler:
-        Address of a running Dask scheduler, such as ``"tcp://10.0.0.1:8786"``, instead of processes on this machine.
-        Its workers need this environment and the same folders.
-    title, unit, progress:
-        Of the progress bar.
-    steps:
-        Parts of a job that it reports by `step`; 0 counts whole jobs.
+    Args:
+        function: Importable (not a closure).  It makes `path` whole or not at all, as `lib.files.whole` does.
+        workers: Processes on this machine, at most one a job; None is one a core.
+        scheduler: Address of a running Dask scheduler, such as ``"tcp://10.0.0.1:8786"``, instead of processes on this
+            machine. Its workers need this environment and the same folders.
+        title, unit, progress: Of the progress bar.
+        steps: Parts of a job that it reports by `step`; 0 counts whole jobs.
 
-    Raises
-    ------
-    ConnectionError
-        If no scheduler answers at the address.
+    Raises:
+        ConnectionError: If no scheduler answers at the address.
     """
     missing = {path: arguments for path, arguments in jobs.items() if not path.exists()}
     a_job = max(steps, 1)

@@ -37,10 +37,8 @@ def real_data(name: str) -> Path | None:
     Real recordings do not ship.  The environment variable ``MICROSTEREO_DATA`` names the folder that holds
     them, one folder a data set (`data/README.md` says where a user gets each).
 
-    Parameters
-    ----------
-    name:
-        Folder of the data set, such as ``"retinal_microsurgery"``.
+    Args:
+        name: Folder of the data set, such as ``"retinal_microsurgery"``.
     """
     root = os.environ.get(REAL_DATA_VARIABLE)
     if not root:

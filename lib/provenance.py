@@ -58,10 +58,8 @@ def machine() -> dict:
 class Provenance:
     """Made when a measurement starts: its command, the commit whose code runs, and the clocks.
 
-    Attributes
-    ----------
-    command:
-        What a user types to measure the same anew.
+    Attributes:
+        command: What a user types to measure the same anew.
     """
 
     command: str

@@ -39,10 +39,9 @@ _ROOM = ".room"
 def main(argv: Sequence[str]) -> int:
     """Parse the command line and run.
 
-    Returns
-    -------
-    int
-        0 if every notebook came to its end, 1 if one failed, 2 for a command that cannot run, 128 + n for signal n.
+    Returns:
+        int: 0 if every notebook came to its end, 1 if one failed, 2 for a command that cannot run, 128 + n for signal
+            n.
     """
     parser = argparse.ArgumentParser(
         prog="python3 -m lib run", description="Execute the notebooks and write their report into runs/<date>-<profile>/."
@@ -86,17 +85,12 @@ def run(
 
     Everything is written at once, so that a run that is killed leaves a readable report of what it had reached.
 
-    Returns
-    -------
-    dict
-        The content of the run's metrics.json.
+    Returns:
+        dict: The content of the run's metrics.json.
 
-    Raises
-    ------
-    UsageError
-        Before anything runs: for an unknown notebook or parameter, or a value of the wrong type.
-    OSError
-        If the report cannot be written; its state is "failed" if that can still be written.
+    Raises:
+        UsageError: Before anything runs: for an unknown notebook or parameter, or a value of the wrong type.
+        OSError: If the report cannot be written; its state is "failed" if that can still be written.
     """
     chosen = choose_notebooks(names, notebooks)
     values = parse_parameters(pairs, chosen)

@@ -51,12 +51,9 @@ def execute(
 ) -> Failure | None:
     """Execute `notebook` into `output` (written after each cell); None if every cell came to its end.
 
-    Parameters
-    ----------
-    cell_timeout_s:
-        The longest that one cell may take; None is without end.
-    on_cell:
-        Called with the cell that starts (from 1) and the number of cells.
+    Args:
+        cell_timeout_s: The longest that one cell may take; None is without end.
+        on_cell: Called with the cell that starts (from 1) and the number of cells.
     """
     import papermill
     from papermill.exceptions import PapermillExecutionError

@@ -23,10 +23,8 @@ _STATES = {
 def index_html(run: dict) -> str:
     """The page of a run; every text in it is escaped.
 
-    Parameters
-    ----------
-    run:
-        The content of metrics.json.
+    Args:
+        run: The content of metrics.json.
     """
     done = sum(book["state"] in ("complete", "failed") for book in run["notebooks"])
     facts = {

@@ -69,12 +69,9 @@ def page(
 ) -> str:
     """The HTML of an executed notebook.
 
-    Parameters
-    ----------
-    folder:
-        Where the notebook's source lies: what its relative pictures are relative to.
-    previous, following:
-        (file, title) of the neighbouring pages.
+    Args:
+        folder: Where the notebook's source lies: what its relative pictures are relative to.
+        previous, following: (file, title) of the neighbouring pages.
     """
     notebook = nbformat.read(executed, as_version=4)
     widgets = notebook.metadata.get("widgets", {}).get(WIDGET_STATE, {}).get("state", {})

@@ -34,10 +34,8 @@ def choose_notebooks(names: Sequence[str] = (), folder: Path = paths.NOTEBOOKS) 
 
     A name is a path, a file's name, its stem, or the leading number (``03``); studies are found by stem too.
 
-    Raises
-    ------
-    UsageError
-        If a name fits none; the text lists what there is.
+    Raises:
+        UsageError: If a name fits none; the text lists what there is.
     """
     shipped = sorted(folder.glob("[0-9]*.ipynb"))
     if not names:
@@ -72,8 +70,6 @@ def declared_grid(notebook: Path) -> dict[str, list[str]]:
 def split_values(text: str) -> list[str]:
     """The values of ``75, 300`` or ``[1, 2], [3]``, as texts.
 
-    Examples
-    --------
     >>> split_values("[1, 2], band")
     ['[1, 2]', 'band']
     """
@@ -83,10 +79,8 @@ def split_values(text: str) -> list[str]:
 def parse_parameters(pairs: Sequence[tuple[str, str]], notebooks: Sequence[Path]) -> dict[Path, dict]:
     """What each notebook is given: the pairs that it declares, as values of the declared type.
 
-    Raises
-    ------
-    UsageError
-        If no chosen notebook declares a name, or a text does not fit the declared type.
+    Raises:
+        UsageError: If no chosen notebook declares a name, or a text does not fit the declared type.
     """
     declared = {notebook: declared_parameters(notebook) for notebook in notebooks}
     known = {name for names in declared.values() for name in names}
@@ -102,10 +96,8 @@ def parse_parameters(pairs: Sequence[tuple[str, str]], notebooks: Sequence[Path]
 def positive(text: str) -> float:
     """A number of seconds on a command line.
 
-    Raises
-    ------
-    argparse.ArgumentTypeError
-        For anything but a finite number above 0.
+    Raises:
+        argparse.ArgumentTypeError: For anything but a finite number above 0.
     """
     with contextlib.suppress(ValueError):
         if 0 < float(text) < math.inf:

@@ -34,24 +34,16 @@ _NAME = re.compile(r"[a-z][a-z0-9_.]*")
 def record(name: str, value: float, unit: str, *, paper: float | None = None, note: str = "") -> None:
     """State one figure: shown as a small row, and collected into the run's ``metrics.json``.
 
-    Parameters
-    ----------
-    name:
-        Lower-case snake case that starts with the stage, such as ``"calibration_reprojection_px"``.
-        Recording a name again in the same notebook replaces its value.
-    value:
-        A number; NaN and infinity are stored as null (JSON has no word for them).
-    unit:
-        ``"px"``, ``"mm"``, ``"um"``, ``"s"``, ``"%"``, ...; ``""`` for a pure number.
-    paper:
-        The paper's value in the same unit, where it states one.
-    note:
-        What a reader must know to judge the figure: the data, the number of samples.
+    Args:
+        name: Lower-case snake case that starts with the stage, such as ``"calibration_reprojection_px"``. Recording a
+            name again in the same notebook replaces its value.
+        value: A number; NaN and infinity are stored as null (JSON has no word for them).
+        unit: ``"px"``, ``"mm"``, ``"um"``, ``"s"``, ``"%"``, ...; ``""`` for a pure number.
+        paper: The paper's value in the same unit, where it states one.
+        note: What a reader must know to judge the figure: the data, the number of samples.
 
-    Raises
-    ------
-    ValueError
-        For a name that is not snake case, or a value that is not a number.
+    Raises:
+        ValueError: For a name that is not snake case, or a value that is not a number.
     """
     metric = {
         "name": _checked_name(name),
@@ -71,12 +63,9 @@ def record(name: str, value: float, unit: str, *, paper: float | None = None, no
 def show(figure: Figure, name: str, caption: str) -> None:
     """Display a matplotlib figure as a PNG with its caption, named for the run's ``figures/``, and close it.
 
-    Parameters
-    ----------
-    name:
-        Lower-case snake case that starts with the stage; the file's name in ``figures/``.
-    caption:
-        One line: what the reader sees, and what to look at.
+    Args:
+        name: Lower-case snake case that starts with the stage; the file's name in ``figures/``.
+        caption: One line: what the reader sees, and what to look at.
     """
     import matplotlib.pyplot as plt
 

@@ -27,15 +27,10 @@ __all__ = ["Table", "csv_text", "read", "write"]
 class Table:
     """Rows with the same named columns, and where they come from.
 
-    Attributes
-    ----------
-    rows:
-        One dict a row: numbers, truth values, texts; NaN where a number is missing.
-    provenance:
-        Command, commit, machine and date of the runs; empty if unknown.
+    Attributes:
+        rows: One dict a row: numbers, truth values, texts; NaN where a number is missing.
+        provenance: Command, commit, machine and date of the runs; empty if unknown.
 
-    Examples
-    --------
     >>> table = Table([{"noise_px": 0.5, "error_um": 12.0}, {"noise_px": 1.0, "error_um": 24.0}])
     >>> table.columns["error_um"]
     array([12., 24.])
@@ -64,10 +59,8 @@ class Table:
     def where(self, **equal: object) -> Table:
         """The rows whose entries equal those given, such as ``table.where(method="band", seed=0)``.
 
-        Raises
-        ------
-        ValueError
-            For a name that is no column.
+        Raises:
+            ValueError: For a name that is no column.
         """
         for name in equal:
             if name not in self.columns:
@@ -79,10 +72,8 @@ class Table:
 def read(name: str, folder: Path = paths.RESULTS) -> Table | None:
     """The recorded table `name`; None if there is none.
 
-    Raises
-    ------
-    ValueError
-        If one of its files is damaged; the text names it.
+    Raises:
+        ValueError: If one of its files is damaged; the text names it.
     """
     table, origin = folder / f"{name}.csv", folder / f"{name}.json"
     if not table.is_file():
@@ -104,12 +95,9 @@ def read(name: str, folder: Path = paths.RESULTS) -> Table | None:
 def write(name: str, rows: Iterable[Mapping], provenance: Mapping, folder: Path = paths.RESULTS) -> Path:
     """Write the table `name` with its provenance; returns the CSV file.
 
-    Parameters
-    ----------
-    rows:
-        One mapping a row; None and NaN become empty entries, numbers keep six digits.
-    provenance:
-        As `lib.provenance.Provenance.so_far` gives it.
+    Args:
+        rows: One mapping a row; None and NaN become empty entries, numbers keep six digits.
+        provenance: As `lib.provenance.Provenance.so_far` gives it.
     """
     folder.mkdir(parents=True, exist_ok=True)
     files.write_text(folder / f"{name}.csv", csv_text(rows))
@@ -120,8 +108,6 @@ def write(name: str, rows: Iterable[Mapping], provenance: Mapping, folder: Path 
 def csv_text(rows: Iterable[Mapping]) -> str:
     """Rows as CSV; the columns stand in the order in which they first appear.
 
-    Examples
-    --------
     >>> print(csv_text([{"seed": 0, "error_um": 1 / 3}, {"seed": 1, "error_um": None}]), end="")
     seed,error_um
     0,0.333333

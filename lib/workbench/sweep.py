@@ -119,24 +119,16 @@ def sweep(
 
     Runs that an earlier sweep with the same notebook and the same code finished are kept; failed ones run again.
 
-    Parameters
-    ----------
-    grid:
-        Values as texts for each parameter; none takes the grid that the notebook declares.
-    workers, scheduler:
-        As in `lib.parallel.run_jobs`.
-    record:
-        Also write the table to the folder `recorded`, if no run failed.
+    Args:
+        grid: Values as texts for each parameter; none takes the grid that the notebook declares.
+        workers, scheduler: As in `lib.parallel.run_jobs`.
+        record: Also write the table to the folder `recorded`, if no run failed.
 
-    Returns
-    -------
-    tuple
-        ``results.csv`` (a row a run: its parameters, then its metrics), and what failed at which point.
+    Returns:
+        tuple: ``results.csv`` (a row a run: its parameters, then its metrics), and what failed at which point.
 
-    Raises
-    ------
-    UsageError
-        For an unknown notebook or parameter, a value of the wrong type, or a parameter without values.
+    Raises:
+        UsageError: For an unknown notebook or parameter, a value of the wrong type, or a parameter without values.
     """
     chosen = choose_notebooks([name], notebooks)
     grid = grid or declared_grid(chosen[0])
@@ -181,10 +173,8 @@ class RunFailed(RuntimeError):
 def run_point(executed: Path, book: Path, values: dict, cell_timeout_s: float | None) -> None:
     """In a worker: one run of the notebook into `executed`, or into a log and a failed notebook beside it.
 
-    Raises
-    ------
-    RunFailed
-        With the cell and its error.
+    Raises:
+        RunFailed: With the cell and its error.
     """
     log, failed = executed.with_suffix(".log"), executed.with_suffix(".failed.ipynb")
     with files.whole(executed) as partial:
@@ -208,8 +198,6 @@ def run_point(executed: Path, book: Path, values: dict, cell_timeout_s: float | 
 def column_name(metric: str, unit: str) -> str:
     """The column of a metric: its name, which ends in its unit.
 
-    Examples
-    --------
     >>> column_name("depth_error", "um"), column_name("depth_error_um", "um"), column_name("pck_0.05", "%")
     ('depth_error_um', 'depth_error_um', 'pck_0.05_percent')
     """
