@@ -197,8 +197,9 @@ def _make_venv(venv: Path) -> None:
 def _install(venv: Path, what: str, arguments: list[str], lock_file, *, uv: str | None = None) -> None:
     """Install into the environment with pip, or with uv where it is given, and tell the seconds that it takes."""
     python = str(python_of(venv))
-    pip = [python, "-m", "pip", "install", "--disable-pip-version-check", "--no-input", "--no-compile", "--quiet"]
-    command = [uv, "pip", "install", "--quiet", "--python", python] if uv else pip
+    pip = [python, "-m", "pip", "install", "--disable-pip-version-check", "--no-input", "--quiet"]
+    # Compiled once here: every kernel and worker then starts in seconds, also where Python may not write bytecode.
+    command = [uv, "pip", "install", "--quiet", "--compile-bytecode", "--python", python] if uv else pip
     keep_lock = {} if os.name == "nt" else {"pass_fds": [lock_file.fileno()]}
     start, live = time.monotonic(), sys.stdout.isatty()
     with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as log:
