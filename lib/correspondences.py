@@ -6,17 +6,13 @@ landmarks: the detector, a person who labels, or the simulator (paper Eq. 2).
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from lib.geometry import pair_covariance, points
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 __all__ = ["LANDMARKS", "MIN_CONFIDENCE", "Correspondences", "of_recording", "pair_with_robot"]
 
@@ -55,8 +51,8 @@ class Correspondences:
     time_s: np.ndarray
 
     def __post_init__(self) -> None:
-        n = len(np.atleast_1d(self.frame))
-        for name, tail in _SHAPES.items():
+        n, tails = len(np.atleast_1d(self.frame)), ((3,), (2,), (2,), (2, 2, 2), (2,), (), (), ())
+        for name, tail in zip((field.name for field in fields(Correspondences)), tails, strict=True):
             dtype = np.int64 if name in ("frame", "landmark") else np.float64
             array = np.asarray(getattr(self, name), dtype=dtype)
             if array.shape != (n, *tail):
@@ -68,17 +64,10 @@ class Correspondences:
 
     @classmethod
     def of_points(
-        cls,
-        x_mm: ArrayLike,
-        u_left: ArrayLike,
-        u_right: ArrayLike,
-        *,
-        covariance_px2: ArrayLike | None = None,
-        confidence: ArrayLike | None = None,
-        frame: ArrayLike | None = None,
-        landmark: ArrayLike | None = None,
-        time_s: ArrayLike | None = None,
-    ) -> Correspondences:
+        cls, x_mm: ArrayLike, u_left: ArrayLike, u_right: ArrayLike, *,
+        covariance_px2: ArrayLike | None = None, confidence: ArrayLike | None = None, frame: ArrayLike | None = None,
+        landmark: ArrayLike | None = None, time_s: ArrayLike | None = None,
+    ) -> Correspondences:  # fmt: skip
         """From plain arrays of n rows; what is not given is unknown (covariance, time) or certain (confidence 1).
 
         Without `frame` every row is a frame of its own, of landmark 0.
@@ -87,17 +76,13 @@ class Correspondences:
         n = len(x)
         if not n == len(left) == len(right):
             raise ValueError(f"x_mm, u_left, u_right: {n}, {len(left)} and {len(right)} rows; give one of each a landmark.")
-        seen = np.stack([np.isfinite(left).all(axis=1), np.isfinite(right).all(axis=1)], axis=-1)
+        if confidence is None:
+            confidence = np.isfinite([left, right]).all(axis=2).T
         return cls(
-            x,
-            left,
-            right,
-            np.full((n, 2, 2, 2), np.nan) if covariance_px2 is None else covariance_px2,
-            seen.astype(np.float64) if confidence is None else confidence,
-            np.arange(n) if frame is None else frame,
-            np.zeros(n, dtype=np.int64) if landmark is None else landmark,
+            x, left, right, np.full((n, 2, 2, 2), np.nan) if covariance_px2 is None else covariance_px2, confidence,
+            np.arange(n) if frame is None else frame, np.zeros(n) if landmark is None else landmark,
             np.full(n, np.nan) if time_s is None else time_s,
-        )
+        )  # fmt: skip
 
     @classmethod
     def join(cls, parts: Iterable[Correspondences]) -> Correspondences:
@@ -108,8 +93,7 @@ class Correspondences:
     @property
     def seen(self) -> np.ndarray:
         """(n, 2) bool: the left and the right image show the landmark, with `MIN_CONFIDENCE` or more."""
-        finite = np.stack([np.isfinite(self.u_left).all(axis=1), np.isfinite(self.u_right).all(axis=1)], axis=-1)
-        return finite & (self.confidence >= MIN_CONFIDENCE)
+        return np.isfinite([self.u_left, self.u_right]).all(axis=2).T & (self.confidence >= MIN_CONFIDENCE)
 
     @property
     def is_complete(self) -> np.ndarray:
@@ -150,32 +134,11 @@ class Correspondences:
         return table
 
 
-_SHAPES = {
-    "x_mm": (3,),
-    "u_left": (2,),
-    "u_right": (2,),
-    "covariance_px2": (2, 2, 2),
-    "confidence": (2,),
-    "frame": (),
-    "landmark": (),
-    "time_s": (),
-}
-
-
 def pair_with_robot(
-    u_left: ArrayLike,
-    u_right: ArrayLike,
-    *,
-    position: Callable[[np.ndarray], np.ndarray],
-    time_s: ArrayLike,
-    height_px: int,
-    readout_s: float = 0.0,
-    offset_s: float = 0.0,
-    covariance_px2: ArrayLike | None = None,
-    confidence: ArrayLike | None = None,
-    frame: ArrayLike | None = None,
-    linear: np.ndarray | None = None,
-) -> Correspondences:
+    u_left: ArrayLike, u_right: ArrayLike, *, position: Callable[[np.ndarray], np.ndarray], time_s: ArrayLike,
+    height_px: int, readout_s: float = 0.0, offset_s: float = 0.0, covariance_px2: ArrayLike | None = None,
+    confidence: ArrayLike | None = None, frame: ArrayLike | None = None, linear: np.ndarray | None = None,
+) -> Correspondences:  # fmt: skip
     """Landmarks of m stereo frames with the robot's positions at the instants at which their image rows were read.
 
     A rolling shutter reads the middle row at the frame's time and the last row half `readout_s` later, so the two
@@ -184,15 +147,13 @@ def pair_with_robot(
 
     Args:
         u_left, u_right: (m, k, 2) px, NaN = not seen.
-        position: Robot times (j, k) in s -> (j, k, 3) mm, NaN where the robot is silent:
-            `lib.recordings.Kinematics.at`.
+        position: Robot times (j, k) in s -> (j, k, 3) mm, NaN where it is silent: `lib.recordings.Kinematics.at`.
         time_s: (m,) times of the frames, video clock.
         height_px: Rows of an image.
         readout_s: Time from the first to the last row; 0 is a global shutter.
         offset_s: t_robot = t_video + offset_s.
-        covariance_px2, confidence: (m, k, 2, 2, 2) and (m, k, 2), left and right; as in `Correspondences.of_points`
-            where not given.
-        frame: (m,) numbers of the frames; 0 to m - 1 where not given.
+        covariance_px2, confidence: (m, k, 2, 2, 2) and (m, k, 2), left and right; None as in `Correspondences.of_points`.
+        frame: (m,) numbers of the frames; None = 0 to m - 1.
         linear: (4, 3) px per mm, left and right, that turns velocities into pixels; None = fitted to these rows.
 
     Returns:
@@ -214,8 +175,7 @@ def pair_with_robot(
         raise ValueError(f"readout_s, height_px: {readout_s} and {height_px} make no shutter.")
     time, y = np.asarray(time_s, dtype=np.float64), np.stack([u_left, u_right], axis=2).astype(np.float64)
     if time.ndim != 1 or y.ndim != 4 or y.shape[0] != len(time) or y.shape[3] != 2:
-        shapes = f"{np.shape(u_left)}, {np.shape(u_right)}"
-        raise ValueError(f"u_left, u_right: expected ({len(time)}, k, 2) px, got {shapes}.")
+        raise ValueError(f"u_left, u_right: expected ({time.size}, k, 2) px, got {np.shape(u_left)}, {np.shape(u_right)}.")
     m, k = y.shape[:2]
     delay = readout_s * (y[..., 1] / (height_px - 1) - 0.5)  # (m, k, 2), NaN where not seen
     n_seen = np.isfinite(delay).sum(axis=2)
@@ -233,53 +193,30 @@ def pair_with_robot(
             linear = np.vstack([_affine(x.reshape(-1, 3), y[:, :, c].reshape(-1, 2)) for c in (0, 1)])
         shift = np.nan_to_num(delay - mean_delay[..., None])
         y = y - shift[..., None] * np.einsum("cij,mkj->mkci", np.reshape(linear, (2, 2, 3)), velocity)
-    numbers = np.arange(m) if frame is None else np.asarray(frame)
-
-    def rows(values: ArrayLike | None, *shape: int) -> np.ndarray | None:
-        return None if values is None else np.asarray(values, dtype=np.float64).reshape(m * k, *shape)
-
     return Correspondences.of_points(
-        x.reshape(-1, 3),
-        y[:, :, 0].reshape(-1, 2),
-        y[:, :, 1].reshape(-1, 2),
-        covariance_px2=rows(covariance_px2, 2, 2, 2),
-        confidence=rows(confidence, 2),
-        frame=np.repeat(numbers, k),
-        landmark=np.tile(np.arange(k), m),
+        x.reshape(-1, 3), y[:, :, 0].reshape(-1, 2), y[:, :, 1].reshape(-1, 2),
+        covariance_px2=None if covariance_px2 is None else np.reshape(covariance_px2, (m * k, 2, 2, 2)),
+        confidence=None if confidence is None else np.reshape(confidence, (m * k, 2)),
+        frame=np.repeat(np.arange(m) if frame is None else frame, k), landmark=np.tile(np.arange(k), m),
         time_s=row_time.ravel(),
-    )
+    )  # fmt: skip
 
 
 def of_recording(
-    recording: object,
-    u_left: ArrayLike,
-    u_right: ArrayLike,
-    *,
-    covariance_px2: ArrayLike | None = None,
-    confidence: ArrayLike | None = None,
-    frames: Sequence[int] | slice | None = None,
-    linear: np.ndarray | None = None,
-) -> Correspondences:
+    recording: object, u_left: ArrayLike, u_right: ArrayLike, *, frames: Sequence[int] | slice | None = None,
+    **known: ArrayLike | None,
+) -> Correspondences:  # fmt: skip
     """`pair_with_robot` with the clocks, shutter and kinematics of a `lib.recordings.Recording`.
 
     Args:
-        u_left, u_right, covariance_px2, confidence, linear: Of the frames chosen, as in `pair_with_robot`.
+        u_left, u_right, known: Landmarks of the frames chosen; and covariance_px2, confidence, linear, as there.
         frames: Which frames of the recording these are; None = all.
     """
     chosen = np.arange(len(recording.frames))[slice(None) if frames is None else frames]
     return pair_with_robot(
-        u_left,
-        u_right,
-        position=recording.kinematics.at,
-        time_s=recording.frames.time_s[chosen],
-        height_px=recording.image_size_px[1],
-        readout_s=recording.readout_s,
-        offset_s=recording.offset_s,
-        covariance_px2=covariance_px2,
-        confidence=confidence,
-        frame=chosen,
-        linear=linear,
-    )
+        u_left, u_right, position=recording.kinematics.at, time_s=recording.frames.time_s[chosen], frame=chosen,
+        height_px=recording.image_size_px[1], readout_s=recording.readout_s, offset_s=recording.offset_s, **known,
+    )  # fmt: skip
 
 
 def _affine(x: np.ndarray, u: np.ndarray, rounds: int = 10) -> np.ndarray:

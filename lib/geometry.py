@@ -14,14 +14,8 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 __all__ = [
-    "RigidTransform",
-    "align_rotation",
-    "cell_from_image",
-    "finite_points",
-    "image_from_cell",
-    "pair_covariance",
-    "points",
-]
+    "RigidTransform", "align_rotation", "cell_from_image", "finite_points", "image_from_cell", "pair_covariance", "points",
+]  # fmt: skip
 
 
 def points(values: ArrayLike, dimension: int, name: str) -> np.ndarray:
@@ -31,13 +25,10 @@ def points(values: ArrayLike, dimension: int, name: str) -> np.ndarray:
         ValueError: If the shape is not (n, dimension) or a single (dimension,) point; `name` is the argument named.
     """
     array = np.asarray(values, dtype=np.float64)
-    if array.ndim == 1 and array.shape == (dimension,):
+    if array.shape == (dimension,):
         array = array[None]
     if array.ndim != 2 or array.shape[1] != dimension:
-        raise ValueError(
-            f"{name}: expected an array of shape (n, {dimension}), got {array.shape}. "
-            f"Give one point a row, {dimension} coordinates each."
-        )
+        raise ValueError(f"{name}: expected one point a row, (n, {dimension}), got {array.shape}.")
     return array
 
 
@@ -61,9 +52,9 @@ def pair_covariance(covariance_px2: ArrayLike | Sequence[ArrayLike] | None, n: i
     """Covariance of the stacked pixels (u_left, u_right) of n matches: (1, 4, 4) where all share it, else (n, 4, 4).
 
     Args:
-        covariance_px2: px^2: a number (the variance of each coordinate), (2, 2) for every image, (4, 4) for the pair,
-            (n, 4, 4) one a match, (n, 2, 2, 2) one a match and image, or a list of one (n, 2, 2) an image.  None is 1
-            px^2.  NaN passes, for landmarks that are not seen.
+        covariance_px2: A number (the variance of each coordinate), (2, 2) for every image, (4, 4) for the pair, (n, 4, 4)
+            one a match, (n, 2, 2, 2) one a match and image, or a list of one (n, 2, 2) an image.  None is 1 px^2.  NaN
+            passes, for landmarks that are not seen.
         images: 2, or 1 for a single camera; then (2, 2) and (n, 2, 2) take the place of (4, 4) and (n, 4, 4).
 
     Raises:
@@ -84,10 +75,8 @@ def pair_covariance(covariance_px2: ArrayLike | Sequence[ArrayLike] | None, n: i
         covariance = np.zeros((n, m, m))
         for i in range(images):
             covariance[:, 2 * i : 2 * i + 2, 2 * i : 2 * i + 2] = given[:, i]
-    elif given.shape == (m, m):
-        covariance = given[None]
-    elif given.shape == (n, m, m):
-        covariance = given
+    elif given.shape in ((m, m), (n, m, m)):
+        covariance = given.reshape(-1, m, m)
     else:
         raise ValueError(
             f"covariance_px2: expected a number, (2, 2), ({m}, {m}), ({n}, {m}, {m}), ({n}, {images}, 2, 2) or a list of "
@@ -120,29 +109,22 @@ def align_rotation(moment: ArrayLike) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class RigidTransform:
-    """x_target = R @ x_source + t, named ``target_from_source``.
-
-    Attributes:
-        R: Rotation (3, 3), orthonormal with determinant +1.
-        t: Translation (3,) in mm.
-    """
+    """x_target = R @ x_source + t, named ``target_from_source``: rotation R (3, 3) and translation t (3,) in mm."""
 
     R: np.ndarray
     t: np.ndarray
 
     def __post_init__(self) -> None:
-        R = np.array(self.R, dtype=np.float64)
-        t = np.array(self.t, dtype=np.float64)
+        R, t = np.array(self.R, dtype=np.float64), np.array(self.t, dtype=np.float64)
         if R.shape != (3, 3) or t.shape != (3,):
             raise ValueError(f"RigidTransform: R must be (3, 3) and t (3,), got {R.shape} and {t.shape}.")
         if not (np.isfinite(R).all() and np.isfinite(t).all()):
             raise ValueError("RigidTransform: R and t must be finite.")
         if not np.allclose(R @ R.T, np.eye(3), atol=1e-6) or np.linalg.det(R) < 0:
             raise ValueError("RigidTransform: R is not a rotation (orthonormal, determinant +1).")
-        R.setflags(write=False)
-        t.setflags(write=False)
-        object.__setattr__(self, "R", R)
-        object.__setattr__(self, "t", t)
+        for name, array in (("R", R), ("t", t)):
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
 
     @classmethod
     def identity(cls) -> RigidTransform:
@@ -170,11 +152,6 @@ class RigidTransform:
         return RigidTransform(self.R @ other.R, self.R @ other.t + self.t)
 
     @property
-    def rotation_vector_rad(self) -> np.ndarray:
-        """Axis times angle, (3,)."""
-        return Rotation.from_matrix(self.R).as_rotvec()
-
-    @property
     def euler_rad(self) -> np.ndarray:
         """Angles (3,) about the fixed axes x, y, z, in this order (the paper's Phi_X, Phi_Y, Phi_Z)."""
         return Rotation.from_matrix(self.R).as_euler("xyz")
@@ -188,8 +165,7 @@ class RigidTransform:
 def image_from_cell(u_cell: ArrayLike, stride: ArrayLike) -> np.ndarray:
     """Pixels of the finer grid from cells of the coarser: u = s * u_cell + (s - 1) / 2, per axis.
 
-    Integer coordinates are centres on both grids, so the centre of cell 0 lies at (s - 1) / 2.  `stride` is
-    a number, or (s_x, s_y) where a resize is anisotropic; it need not be an integer.
+    Integer coordinates are centres on both grids.  `stride` is a number, not always an integer, or (s_x, s_y).
     """
     s = np.asarray(stride, dtype=np.float64)
     return s * np.asarray(u_cell, dtype=np.float64) + (s - 1.0) / 2.0

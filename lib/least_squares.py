@@ -16,12 +16,9 @@ __all__ = ["Minimum", "minimise"]
 
 @dataclass(frozen=True, eq=False)
 class Minimum:
-    """Where the energy is least.
+    """Where the energy is least: `state`, `energy` and `work` as the caller's functions made them.
 
-    Attributes:
-        state, energy, work: As the caller's functions made them at the minimum.
-        information: (p, p) Gauss-Newton Hessian there.
-        iterations, converged: Steps taken; False where they ran out.
+    `information` (p, p) is the Gauss-Newton Hessian there; `converged` is False where the `iterations` ran out.
     """
 
     state: Any
@@ -33,27 +30,20 @@ class Minimum:
 
 
 def minimise(
-    start: Any,
-    evaluate: Callable[[Any], tuple[float, Any] | None],
-    normal_equations: Callable[[Any, Any], tuple[np.ndarray, np.ndarray]],
-    move: Callable[[Any, np.ndarray], Any],
-    *,
-    rank: int | None = None,
-    iterations: int = 60,
-    tolerance: float = 1e-13,
-) -> Minimum:
+    start: Any, evaluate: Callable[[Any], tuple[float, Any] | None],
+    normal_equations: Callable[[Any, Any], tuple[np.ndarray, np.ndarray]], move: Callable[[Any, np.ndarray], Any], *,
+    rank: int | None = None, iterations: int = 60, tolerance: float = 1e-13,
+) -> Minimum:  # fmt: skip
     """Minimum of an energy by damped Gauss-Newton steps; no step raises the energy.
 
     Args:
         start: The first state, of any type.
-        evaluate: state -> (energy, work), or None where the state is not allowed; `work` is what `normal_equations`
-            needs.
+        evaluate: state -> (energy, work), None where the state is not allowed; `work` is for `normal_equations`.
         normal_equations: (state, work) -> (information (p, p), gradient (p,)): the Gauss-Newton Hessian of the energy
             and the direction J^T W r in which the energy falls.
         move: (state, step (p,)) -> the state after an increment.
         rank: Number of directions that the data determine; steps leave the others alone.  None is all p.
-        iterations: Most steps.
-        tolerance: Relative decrease of the energy below which it is at its minimum.
+        iterations, tolerance: Most steps, and the relative decrease of the energy below which it is at its minimum.
 
     Raises:
         ValueError: If the start is not allowed.

@@ -2,18 +2,9 @@
 
 from lib.cameras.affine import AffineCamera, Camera, Resection
 from lib.cameras.near_affine import NearAffineCamera, radial_derivative
-from lib.cameras.rig import StereoRig, camera_from_dict, camera_to_dict
+from lib.cameras.rig import StereoRig
 from lib.cameras.triangulation import Points, best_linear
 
 __all__ = [
-    "AffineCamera",
-    "Camera",
-    "NearAffineCamera",
-    "Points",
-    "Resection",
-    "StereoRig",
-    "best_linear",
-    "camera_from_dict",
-    "camera_to_dict",
-    "radial_derivative",
-]
+    "AffineCamera", "Camera", "NearAffineCamera", "Points", "Resection", "StereoRig", "best_linear", "radial_derivative",
+]  # fmt: skip

@@ -6,25 +6,16 @@ An affine camera maps a point x (mm, robot frame unless said otherwise) to the p
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol, runtime_checkable
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from lib.geometry import RigidTransform, points
 
-__all__ = ["AffineCamera", "Camera", "Resection", "checked_matrix"]
-
-
-@runtime_checkable
-class Camera(Protocol):
-    """Anything that projects points (n, 3) in mm to pixels (n, 2)."""
-
-    def project(self, x: ArrayLike) -> np.ndarray: ...
-
-    def jacobian(self, x: ArrayLike) -> np.ndarray: ...
+__all__ = ["AffineCamera", "Camera", "Resection"]
 
 
 @dataclass(frozen=True)
@@ -45,27 +36,24 @@ class Resection:
     mirrored: bool = False
 
 
-def checked_matrix(values: ArrayLike) -> np.ndarray:
-    """An affine camera's matrix (2, 4), read-only; ValueError unless it is finite and of rank 2."""
-    matrix = np.array(values, dtype=np.float64)
-    if matrix.shape != (2, 4):
-        raise ValueError(f"matrix: an affine camera is (2, 4), got {matrix.shape}.")
-    if not np.isfinite(matrix).all():
-        raise ValueError("matrix: an affine camera must be finite.")
-    if np.linalg.svd(matrix[:, :3], compute_uv=False)[1] <= 1e-9 * np.abs(matrix[:, :3]).max():
-        raise ValueError("matrix: its linear part has rank below 2, so it sees a line, not a plane.")
-    matrix.setflags(write=False)
-    return matrix
-
-
 @dataclass(frozen=True, eq=False)
-class AffineCamera:
-    """u = matrix @ [x; 1], matrix (2, 4) in px per mm and px."""
+class Camera:
+    """What every camera has: the matrix (2, 4), px per mm and px, of the affine camera that it is or that touches it.
+
+    A model adds `project`, `jacobian` and `projection_matrix`.  A ValueError refuses a matrix that is not finite or whose
+    linear part has rank below 2.
+    """
 
     matrix: np.ndarray
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "matrix", checked_matrix(self.matrix))
+        matrix = np.array(self.matrix, dtype=np.float64)
+        if matrix.shape != (2, 4) or not np.isfinite(matrix).all():
+            raise ValueError(f"matrix: an affine camera is (2, 4) and finite, got {matrix}.")
+        if np.linalg.svd(matrix[:, :3], compute_uv=False)[1] <= 1e-9 * np.abs(matrix[:, :3]).max():
+            raise ValueError("matrix: its linear part has rank below 2, so it sees a line, not a plane.")
+        matrix.setflags(write=False)
+        object.__setattr__(self, "matrix", matrix)
 
     @property
     def linear(self) -> np.ndarray:
@@ -74,14 +62,28 @@ class AffineCamera:
 
     @property
     def offset_px(self) -> np.ndarray:
-        """Pixel (2,) of the robot frame's origin."""
+        """The matrix's last column (2,)."""
         return self.matrix[:, 3]
 
     @cached_property
     def viewing_direction(self) -> np.ndarray:
-        """Unit vector (3,) along which points share a pixel, away from the camera (unmirrored optics)."""
+        """Unit vector (3,) along which points share a pixel of `matrix`, away from the camera (unmirrored optics)."""
         direction = np.cross(self.matrix[0, :3], self.matrix[1, :3])
         return direction / np.linalg.norm(direction)
+
+    def moved(self, motion: RigidTransform) -> Self:
+        """The camera after a rigid motion of itself: it sees motion.apply(x) where it saw x.
+
+        >>> camera = AffineCamera([[100, 0, 0, 960], [0, 100, 0, 540]])
+        >>> camera.moved(RigidTransform(np.eye(3), [1, 0, 0])).project([1, 0, 0]).tolist()
+        [[960.0, 540.0]]
+        """
+        back = motion.inverse()
+        return replace(self, matrix=np.column_stack([self.linear @ back.R, self.linear @ back.t + self.offset_px]))
+
+
+class AffineCamera(Camera):
+    """u = matrix @ [x; 1], matrix (2, 4) in px per mm and px."""
 
     def project(self, x: ArrayLike) -> np.ndarray:
         """Pixels (n, 2) of points (n, 3) in mm; NaN rows stay NaN."""
@@ -95,16 +97,6 @@ class AffineCamera:
     def projection_matrix(self) -> np.ndarray:
         """Homogeneous P (3, 4); an affine camera's last row is (0, 0, 0, 1)."""
         return np.vstack([self.matrix, [0.0, 0.0, 0.0, 1.0]])
-
-    def moved(self, motion: RigidTransform) -> AffineCamera:
-        """The camera after a rigid motion of itself: it sees motion.apply(x) where it saw x.
-
-        >>> camera = AffineCamera([[100, 0, 0, 960], [0, 100, 0, 540]])
-        >>> camera.moved(RigidTransform(np.eye(3), [1, 0, 0])).project([1, 0, 0]).tolist()
-        [[960.0, 540.0]]
-        """
-        back = motion.inverse()
-        return AffineCamera(np.column_stack([self.linear @ back.R, self.linear @ back.t + self.offset_px]))
 
     def resect(self, *, mirrored: bool = False) -> Resection:
         """K, R and t of the camera by RQ factorisation (paper Eq. 5).

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lib.cameras.affine import AffineCamera, checked_matrix
+from lib.cameras.affine import AffineCamera, Camera
 from lib.geometry import RigidTransform, points
 
 __all__ = ["NearAffineCamera", "radial_derivative"]
 
 
 @dataclass(frozen=True, eq=False)
-class NearAffineCamera:
+class NearAffineCamera(Camera):
     """A camera at a finite working distance d, one parameter beyond affine: u = c + (M [x; 1] - c) / D.
 
     D = 1 + r3.(x - reference) / d.  Affine is 1/d = 0, a regular point, so 1/d can be estimated and tested where
@@ -31,14 +30,13 @@ class NearAffineCamera:
         radial_per_px2: k of radial distortion about c: the pixel above moves by k |u - c|^2 (u - c).
     """
 
-    matrix: np.ndarray
     inverse_distance_per_mm: float
     centre_px: np.ndarray
     reference_mm: np.ndarray = (0.0, 0.0, 0.0)
     radial_per_px2: float = 0.0
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "matrix", checked_matrix(self.matrix))
+        super().__post_init__()
         for name, size in (("centre_px", 2), ("reference_mm", 3)):
             vector = np.array(getattr(self, name), dtype=np.float64)
             if vector.shape != (size,) or not np.isfinite(vector).all():
@@ -55,30 +53,17 @@ class NearAffineCamera:
         """The affine camera that touches this one in the reference plane."""
         return AffineCamera(self.matrix)
 
-    @property
-    def linear(self) -> np.ndarray:
-        """A, (2, 3) px per mm in the reference plane."""
-        return self.matrix[:, :3]
-
-    @property
-    def offset_px(self) -> np.ndarray:
-        """M's last column (2,)."""
-        return self.matrix[:, 3]
-
-    @cached_property
-    def viewing_direction(self) -> np.ndarray:
-        """r3, unit (3,)."""
-        return self.affine.viewing_direction
-
     def depth_ratio(self, x: np.ndarray) -> np.ndarray:
         """D (n,) of points (n, 3) mm: distance along the view over d; zero or less behind the camera."""
         return 1.0 + self.inverse_distance_per_mm * ((x - self.reference_mm) @ self.viewing_direction)
 
-    def _ratio_in_front(self, x: np.ndarray) -> np.ndarray:
-        ratio = self.depth_ratio(x)
+    def _undistorted(self, x: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+        """Pixels (n, 2) relative to the centre and before distortion, and D (n, 1)."""
+        x = points(x, 3, "x")
+        ratio = self.depth_ratio(x)[:, None]
         if (ratio <= 0).any():
             raise ValueError("x: a point lies behind the camera; check the units (mm) and the frame.")
-        return ratio
+        return (x @ self.linear.T + self.offset_px - self.centre_px) / ratio, ratio
 
     def project(self, x: ArrayLike) -> np.ndarray:
         """Pixels (n, 2) of points (n, 3) in mm; NaN rows stay NaN.
@@ -86,15 +71,12 @@ class NearAffineCamera:
         Raises:
             ValueError: If a point lies behind the camera.
         """
-        x = points(x, 3, "x")
-        v = (x @ self.linear.T + self.offset_px - self.centre_px) / self._ratio_in_front(x)[:, None]
+        v = self._undistorted(x)[0]
         return self.centre_px + v * (1.0 + self.radial_per_px2 * (v**2).sum(axis=1, keepdims=True))
 
     def jacobian(self, x: ArrayLike) -> np.ndarray:
         """Derivative of `project`, (n, 2, 3) px per mm."""
-        x = points(x, 3, "x")
-        ratio = self._ratio_in_front(x)[:, None]
-        v = (x @ self.linear.T + self.offset_px - self.centre_px) / ratio
+        v, ratio = self._undistorted(x)
         J = (self.linear - self.inverse_distance_per_mm * v[:, :, None] * self.viewing_direction) / ratio[:, :, None]
         return radial_derivative(v, self.radial_per_px2) @ J if self.radial_per_px2 else J
 
@@ -121,30 +103,8 @@ class NearAffineCamera:
         return np.vstack([self.matrix + np.outer(self.centre_px, last - [0, 0, 0, 1]), last])
 
     def moved(self, motion: RigidTransform) -> NearAffineCamera:
-        """The camera after a rigid motion of itself: it sees motion.apply(x) where it saw x."""
-        back = motion.inverse()
-        matrix = np.column_stack([self.linear @ back.R, self.linear @ back.t + self.offset_px])
-        return replace(self, matrix=matrix, reference_mm=motion.apply(self.reference_mm))
-
-    @classmethod
-    def from_projection_matrix(cls, matrix: ArrayLike, radial_per_px2: float = 0.0) -> NearAffineCamera:
-        """The camera of a homogeneous P (3, 4), scaled as `projection_matrix` writes it.
-
-        Raises:
-            ValueError: If P is affine (the third row's first three entries vanish) or not finite.
-        """
-        P = np.array(matrix, dtype=np.float64)
-        if P.shape != (3, 4) or not np.isfinite(P).all():
-            raise ValueError("matrix: a projection matrix is (3, 4) and finite.")
-        depth = P[2, :3]
-        size = np.linalg.norm(depth)
-        if size == 0:
-            raise ValueError("matrix: its last row is (0, 0, 0, w), an affine camera; use AffineCamera.")
-        reference = (1.0 - P[2, 3]) * depth / size**2
-        centre = P[:2, :3] @ depth / size**2
-        M = P[:2] - np.outer(centre, P[2] - [0, 0, 0, 1])
-        sign = np.sign(np.cross(M[0, :3], M[1, :3]) @ depth)
-        return cls(M, sign * size, centre, reference, radial_per_px2)
+        """As of an affine camera, and the reference point moves along."""
+        return replace(super().moved(motion), reference_mm=motion.apply(self.reference_mm))
 
 
 def radial_derivative(v: np.ndarray, k: float) -> np.ndarray:

@@ -7,49 +7,23 @@ epipolar residual, so triangulation and epipolar geometry are one small constant
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lib.cameras.affine import AffineCamera
+from lib.cameras.affine import AffineCamera, Camera
 from lib.cameras.near_affine import NearAffineCamera
 from lib.cameras.triangulation import Points, best_linear, triangulate_near_affine
 from lib.files import write_json
 from lib.geometry import RigidTransform, pair_covariance, points
 
-__all__ = ["StereoRig", "camera_from_dict", "camera_to_dict"]
+__all__ = ["StereoRig"]
 
 FORMAT = "microstereo.stereo_rig"
 UNITS = {"point": "mm", "image": "px"}
-
-
-def camera_to_dict(camera: AffineCamera | NearAffineCamera) -> dict:
-    """Plain numbers of a camera, for JSON."""
-    content = {"matrix": camera.matrix.tolist()}
-    if isinstance(camera, NearAffineCamera):
-        content |= {
-            "inverse_distance_per_mm": camera.inverse_distance_per_mm,
-            "centre_px": camera.centre_px.tolist(),
-            "reference_mm": camera.reference_mm.tolist(),
-            "radial_per_px2": camera.radial_per_px2,
-        }
-    return content
-
-
-def camera_from_dict(content: dict) -> AffineCamera | NearAffineCamera:
-    """The inverse of `camera_to_dict`; KeyError or ValueError where an entry is missing or wrong."""
-    if "inverse_distance_per_mm" not in content:
-        return AffineCamera(content["matrix"])
-    return NearAffineCamera(
-        content["matrix"],
-        content["inverse_distance_per_mm"],
-        content["centre_px"],
-        content.get("reference_mm", (0.0, 0.0, 0.0)),
-        content.get("radial_per_px2", 0.0),
-    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,8 +38,8 @@ class StereoRig:
     ([[1.0, 2.0, 0.5]], [0.0])
     """
 
-    left: AffineCamera | NearAffineCamera
-    right: AffineCamera | NearAffineCamera
+    left: Camera
+    right: Camera
 
     @cached_property
     def is_affine(self) -> bool:
@@ -127,7 +101,7 @@ class StereoRig:
         """
         if not self.is_affine:
             return self.triangulate(u_left, u_right).epipolar_px
-        return (self._stack(u_left, u_right) - self.offset_px) @ self.epipolar_normal
+        return (np.hstack(_matches(u_left, u_right)) - self.offset_px) @ self.epipolar_normal
 
     def triangulate(self, u_left: ArrayLike, u_right: ArrayLike, covariance_px2: ArrayLike | None = None) -> Points:
         """Maximum-likelihood points of matches; NaN rows stay NaN.
@@ -143,7 +117,7 @@ class StereoRig:
         """
         if self.is_affine and (covariance_px2 is None or np.ndim(covariance_px2) == 0):
             return self._triangulate_isotropic(u_left, u_right, 1.0 if covariance_px2 is None else covariance_px2)
-        y = self._stack(u_left, u_right)
+        y = np.hstack(_matches(u_left, u_right))
         covariance = pair_covariance(covariance_px2, len(y))
         if not self.is_affine:
             return triangulate_near_affine((self.left, self.right), y, covariance)
@@ -177,8 +151,11 @@ class StereoRig:
 
     def save(self, path: str | Path) -> None:
         """Write the rig as JSON (matrices, units); the file appears whole or not at all."""
-        cameras = {"left": camera_to_dict(self.left), "right": camera_to_dict(self.right)}
-        write_json(path, {"format": FORMAT, "units": UNITS} | cameras)
+
+        def numbers(camera: Camera) -> dict:
+            return {field.name: np.asarray(getattr(camera, field.name)).tolist() for field in fields(camera)}
+
+        write_json(path, {"format": FORMAT, "units": UNITS, "left": numbers(self.left), "right": numbers(self.right)})
 
     @classmethod
     def load(cls, path: str | Path) -> StereoRig:
@@ -195,15 +172,15 @@ class StereoRig:
             for key, expected in (("format", FORMAT), ("units", UNITS)):
                 if content.get(key, expected) != expected:
                     raise ValueError(f"{key} is {content[key]!r}, expected {expected!r}")
-            return cls(camera_from_dict(content["left"]), camera_from_dict(content["right"]))
+            left, right = (
+                (NearAffineCamera if "inverse_distance_per_mm" in numbers else AffineCamera)(**numbers)
+                for numbers in (content["left"], content["right"])
+            )
+            return cls(left, right)
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise ValueError(
                 f"{path}: not a stereo rig written by StereoRig.save ({type(error).__name__}: {error})."
             ) from None
-
-    @staticmethod
-    def _stack(u_left: ArrayLike, u_right: ArrayLike) -> np.ndarray:
-        return np.hstack(_matches(u_left, u_right))
 
 
 def _matches(u_left: ArrayLike, u_right: ArrayLike) -> tuple[np.ndarray, np.ndarray]:

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lib.cameras.affine import AffineCamera
+from lib.cameras.affine import Camera
 from lib.cameras.near_affine import NearAffineCamera
 
 __all__ = ["Points", "best_linear", "triangulate_near_affine"]
 
-_Pair = tuple[AffineCamera | NearAffineCamera, AffineCamera | NearAffineCamera]
+_Pair = tuple[Camera, Camera]
 #: Points at a time: few enough for their arrays to stay in the processor's cache.
 _BLOCK = 8192
 

@@ -56,7 +56,7 @@ def assert_same(estimate: RigidTransform, truth: RigidTransform, tolerance: floa
 def mahalanobis2(fit: Registration, truth: RigidTransform) -> float:
     """Squared error in units of the claimed covariance; its mean is 6 if the claim is right."""
     error = fit.transform.compose(truth.inverse())
-    twist = np.concatenate([error.rotation_vector_rad, error.apply(fit.centre_mm) - fit.centre_mm])
+    twist = np.concatenate([Rotation.from_matrix(error.R).as_rotvec(), error.apply(fit.centre_mm) - fit.centre_mm])
     return float(twist @ np.linalg.solve(fit.covariance, twist))
 
 
@@ -126,7 +126,7 @@ def test_mirrored_points_are_not_matched_by_a_reflection():
         (np.random.default_rng(0).normal(size=(4, 3)), np.ones((4, 3)), "x_target: the points lie on one line"),
         (np.full((4, 3), np.nan), np.zeros((4, 3)), "x_source: 4 of 4 rows are not finite"),
         (np.eye(3), np.eye(4)[:, :3], "3 and 4 points"),
-        (np.eye(4), np.eye(4), r"x_source: expected an array of shape \(n, 3\)"),
+        (np.eye(4), np.eye(4), r"x_source: expected one point a row, \(n, 3\)"),
     ],
 )
 def test_bad_point_sets(source, target, text):
