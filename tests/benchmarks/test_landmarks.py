@@ -12,8 +12,9 @@ import torch
 from lib.landmarks import Detector, Landmarks
 from lib.landmarks.engines import ENGINES, default_engine
 from lib.landmarks.error_model import ErrorModel
-from lib.landmarks.heatmaps import DECODERS, decode, render
+from lib.landmarks.heatmaps import render
 from lib.landmarks.network import HourglassConfig, StackedHourglass
+from notebooks.studies.decoders import DECODERS, positions
 
 PAPER_HZ = {(1080, 1920): 35, (480, 854): 77, (480, 640): 95, (256, 448): 140}
 
@@ -57,4 +58,4 @@ def test_decoders(benchmark, method):
     """Six heatmaps of a full-HD pair at stride 4."""
     u = torch.rand(2, 3, 2) * 900 + 60
     heatmaps = render(u, (1080, 1920), 4)
-    benchmark.pedantic(decode, (heatmaps, 4), {"method": method}, rounds=10, warmup_rounds=2)
+    benchmark.pedantic(positions, (heatmaps, 4, method), rounds=10, warmup_rounds=2)
