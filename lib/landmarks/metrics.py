@@ -8,7 +8,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.stats import chi2
 
-__all__ = ["PCK_THRESHOLDS", "Scores", "calibration_error", "coverage", "errors_px", "nees", "pck", "reliability", "score"]
+__all__ = [
+    "GROSS_PX", "PCK_THRESHOLDS", "Scores", "calibration_error", "coverage", "errors_px", "nees", "pck", "reliability",
+    "score",
+]  # fmt: skip
 
 #: The paper's range of thresholds, as parts of the tool's length.
 PCK_THRESHOLDS = np.linspace(0.001, 0.2, 200)

@@ -21,16 +21,9 @@ from lib.training.windows import TOOL_REDUCTION
 
 __all__ = ["assemble", "card"]
 
-#: This many images of each recording, spread over it, go into the fit of the error models.
-_IMAGES = 16
-
 
 def assemble(
-    folder: str | Path,
-    data: str | Path,
-    out: str | Path,
-    recordings: Sequence[str | Path] = (),
-    notes: Sequence[str] = (),
+    folder: str | Path, data: str | Path, out: str | Path, recordings: Sequence[Path] = (), notes: Sequence[str] = ()
 ) -> Detector:
     """Join the stages of a training folder, fit their error models, write the weights file `out` and its card.
 
@@ -38,14 +31,14 @@ def assemble(
     file's own are fitted on all of them, and on labelled `recordings`: typical frames, where the validation frames vary
     more than those of any microscope.  `notes` are lines for the card.  A missing stage or shard raises `FileNotFoundError`.
     """
-    folder, out = Path(folder), Path(out)
-    stages = {stage: load_training(folder / stage / "last.safetensors") for stage in STAGES}
+    out = Path(out)
+    stages = {stage: load_training(Path(folder) / stage / "last.safetensors") for stage in STAGES}
     frames = list(validation_images(data))
     if not frames:
         raise FileNotFoundError(f"{data}: no validation shard; make some with `python3 -m lib train generate`.")
-    opened = [Recording.open(path) for path in recordings]
-    every = [max(1, 2 * len(recording.frames) // _IMAGES) for recording in opened]
-    typical = [image for r, n in zip(opened, every, strict=True) for image in labelled_images(r, every=n)]
+    typical = []
+    for recording in map(Recording.open, recordings):  # 16 images of each, spread over it
+        typical += labelled_images(recording, every=max(1, len(recording.frames) // 8))
     networks = {f"{stage}_network": training.network for stage, training in stages.items()}
     detector = Detector(**networks, reduction=REDUCTION, tool_reduction=TOOL_REDUCTION, mirror=True)
     held_out = evaluate(fit_error_models(detector, frames[::2] + typical), frames[1::2])
@@ -59,7 +52,7 @@ def assemble(
         "stages": {name: {key: training.provenance.get(key) for key in keys} for name, training in stages.items()},
         "validation_frames": len(frames),
         "recorded_frames": len(typical),
-        "recordings": len(opened),
+        "recordings": len(recordings),
         "notes": list(notes),
         "metrics": asdict(held_out.scores)
         | {
@@ -76,37 +69,25 @@ def assemble(
     return detector
 
 
-def _history(provenance: dict) -> list[dict]:
-    """A training and those it was fine-tuned from, the first one first."""
+def _trainings(provenance: dict) -> list[dict]:
+    """A training and those that it was fine-tuned from, the first one first."""
     before = provenance.get("before")
-    return [*(_history(before) if before else []), provenance]
+    return [*(_trainings(before) if before else []), provenance]
 
 
 def card(detector: Detector, path: Path) -> str:
     """The model card (Markdown) of a weights file, from its metadata."""
     p = detector.metadata
     m, trainings = p["metrics"], []
-    for stage, last in p["stages"].items():
-        for t in _history(last):
-            config, processes = t["config"], t.get("processes") or 1
-            kind = "hourglass, {stacks} x {features}" if "stacks" in config["network"] else "offset network, {features}"
-            cells = (
-                f"{stage} ({kind.format(**config['network'])} features)",
-                t["images"],
-                f"{config['optimiser']} {config['learning_rate']:g} {config['schedule']}, {config['precision']}",
-                f"{t['steps']} x {config['batch_size']} x {processes}",
-                f"{config.get('position_weight_per_px', 0):g}",
-                f"{t['seconds'] * processes / 3600:.2f}",
-                f"`{t['data']}`",
-                f"`{t['commit']}`",
-            )
-            trainings.append("| " + " | ".join(map(str, cells)) + " |")
-    seen = {
-        f"precision and recall, confidence above 0.5, {name.replace('_', ' ')}": "{:.1f} %, {:.1f} %".format(
-            *(m["detection"][f"{name}_{measure}"] for measure in ("precision", "recall"))
+    for stage, t in [(stage, t) for stage, last in p["stages"].items() for t in _trainings(last)]:
+        config, processes = t["config"], t.get("processes") or 1
+        kind = "hourglass, {stacks} x {features}" if "stacks" in config["network"] else "offset network, {features}"
+        trainings.append(
+            f"| {stage} ({kind.format(**config['network'])} features) | {t['images']} "
+            f"| {config['optimiser']} {config['learning_rate']:g} {config['schedule']}, {config['precision']} "
+            f"| {t['steps']} x {config['batch_size']} x {processes} | {config.get('position_weight_per_px', 0):g} "
+            f"| {t['seconds'] * processes / 3600:.2f} | `{t['data']}` | `{t['commit']}` |"
         )
-        for name in ("in_view", "visible")
-    }
     numbers = {
         "PCK@0.01, 0.05, 0.10": f"{m['pck_0_01']:.1f}, {m['pck_0_05']:.1f}, {m['pck_0_10']:.1f} %",
         "error, median and 95th percentile": f"{m['median_px']:.2f} px, {m['p95_px']:.2f} px",
@@ -115,12 +96,9 @@ def card(detector: Detector, path: Path) -> str:
         "normalised squared error below 20 px (2 is right)": f"{m['nees']:.2f}",
         "inside the 95 % ellipse, errors below 20 px": f"{m['coverage_95']:.1f} %",
         "calibration error of the confidence": f"{m['confidence_calibration_error']:.3f}",
-        **seen,
+        **{f"{k.replace('_', ' ')}, confidence above 0.5": f"{v:.1f} %" for k, v in m["detection"].items()},
         "missed, gross (above 20 px), all labels": f"{m['missed']}, {m['gross']}, {m['labels']}",
     }
-    fitted = f"{p['validation_frames']} validation frames"
-    if p.get("recordings"):
-        fitted += f" and {p['recorded_frames']} frames of {p['recordings']} simulated recordings"
     return f"""\
 # {path.name}
 
@@ -132,7 +110,8 @@ Notebook 02 explains the stages.
 |---|---|---|---|---|---|---|---|
 {chr(10).join(trainings)}
 
-Each training of a stage starts from the one before. The error models (covariance, confidence) are fitted on {fitted}.
+Each training of a stage starts from the one before. The error models (covariance, confidence) are fitted on
+{p["validation_frames"]} validation frames and {p["recorded_frames"]} frames of {p["recordings"]} simulated recordings.
 The numbers below are of error models fitted on half of the validation frames and measured on the other half
 ({p["validation_frames"] // 2} full-HD images that no network was trained on).
 

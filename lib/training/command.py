@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
-
-import torch
 
 from lib import paths
 from lib.files import write_json
@@ -16,7 +13,7 @@ from lib.landmarks import Detector
 from lib.recordings import Recording
 from lib.training.assembly import assemble
 from lib.training.config import PRESETS
-from lib.training.evaluation import evaluate, evaluate_recording
+from lib.training.evaluation import evaluate
 from lib.training.loop import load_training, train
 from lib.training.samples import labelled_images
 from lib.training.shards import generate
@@ -50,47 +47,35 @@ def main(argv: list[str] | None = None) -> int:
     add("--rate", type=float, help="learning rate (default: the preset's)")
     add("--position-weight", type=float, default=0.04, help="window: of the position loss, per px")
     add("--features", type=int, help="channels (default: the shipped detector's)")
-    add("--stacks", type=int, default=2)
     add("--seed", type=int, default=0)
     add("--initial", type=Path, help="checkpoint (of a stage) or weights file (finetune) to start from")
     add("--every", type=int, default=1, help="finetune: use every N-th frame")
     add("--note", action="append", default=[], help="assemble: a line for the card; may be repeated")
     add("--onnx", type=Path, default=paths.CACHE / "onnx", help="export: folder of the ONNX files")
-    add("--threads", type=int, default=0, help="torch threads (default: torch's choice)")
     a = parser.parse_args(argv)
-    if a.threads:
-        torch.set_num_threads(a.threads)
     if a.recordings and a.what not in ("finetune", "assemble"):
         parser.error(f"{a.what}: takes no recordings.")
-    others = {"generate": _generate, "finetune": _finetune, "assemble": _assemble, "export": _export}
-    return _guarded(others.get(a.what, _train), a)
+    if a.what == "generate":
+        shards = {"validation": max(3, a.shards // 15), "training": a.shards, "windows": a.windows, "closeups": a.closeups}
+        for kind, count in shards.items():
+            generate(a.data, kind, count, workers=a.workers)
+    elif a.what == "finetune":
+        _finetune(a)
+    elif a.what == "assemble":
+        assemble(a.folder, a.data, a.out or paths.MODELS / "default.safetensors", a.recordings, a.note)
+    elif a.what == "export":
+        from lib.landmarks.export import export  # needs onnx, which nothing else does
 
-
-def _guarded(action: Callable[[argparse.Namespace], None], arguments: argparse.Namespace) -> int:
-    try:
-        action(arguments)
-    except KeyboardInterrupt:
-        print("\nStopped; the same command continues from the last checkpoint.", file=sys.stderr)
-        return 130
-    except (ValueError, OSError) as error:
-        print(error, file=sys.stderr)
-        return 2
+        for stage, (path, difference) in export(Detector.load(a.out), a.onnx).items():
+            print(f"{stage}: {path}, at most {difference:.2g} px from torch")
+    else:
+        _train(a)
     return 0
 
 
-def _generate(a: argparse.Namespace) -> None:
-    shards = {"validation": max(3, a.shards // 15), "training": a.shards, "windows": a.windows, "closeups": a.closeups}
-    for kind, count in shards.items():
-        generate(a.data, kind, count, workers=a.workers)
-
-
 def _train(a: argparse.Namespace) -> None:
-    config = replace(
-        stage_config(a.what, preset=a.preset, features=a.features, stacks=a.stacks),
-        steps=a.steps, seed=a.seed, validate_every=200,
-    )  # fmt: skip
-    if a.rate:
-        config = replace(config, learning_rate=a.rate)
+    config = stage_config(a.what, preset=a.preset, features=a.features)
+    config = replace(config, steps=a.steps, seed=a.seed, validate_every=200, learning_rate=a.rate or config.learning_rate)
     if a.what == "window":
         config = replace(config, position_weight_per_px=a.position_weight)
     initial = load_training(a.initial) if a.initial else None
@@ -113,34 +98,19 @@ def _finetune(a: argparse.Namespace) -> None:
         print(f"{name}: PCK@0.05 {scores.pck_0_05:.1f} %, median error {scores.median_px:.2f} px on held-out images")
 
 
-def _assemble(a: argparse.Namespace) -> None:
-    assemble(a.folder, a.data, a.out or paths.MODELS / "default.safetensors", a.recordings, a.note)
-
-
-def _export(a: argparse.Namespace) -> None:
-    from lib.landmarks.export import export  # needs onnx, which nothing else does
-
-    for stage, (path, difference) in export(Detector.load(a.out), a.onnx).items():
-        print(f"{stage}: {path}, at most {difference:.2g} px from torch")
-
-
 def main_evaluate(argv: list[str] | None = None) -> int:
     """`python3 -m lib evaluate`: scores of a detector on a labelled recording, printed and, on request, written as JSON."""
-    parser = argparse.ArgumentParser(
-        prog="python3 -m lib evaluate", description=main_evaluate.__doc__.split(": ", 1)[1]
-    )
+    description = main_evaluate.__doc__.split(": ", 1)[1]
+    parser = argparse.ArgumentParser(prog="python3 -m lib evaluate", description=description)
     parser.add_argument("recording", type=Path, help="folder of a recording with truth/ or annotations.json")
     parser.add_argument("--weights", help="weights file or name in data/models (default: the shipped ones)")
     parser.add_argument("--every", type=int, default=1, help="evaluate every N-th frame")
     parser.add_argument("--json", type=Path, help="write the scores here")
-    arguments = parser.parse_args(argv)
-    if arguments.every < 1:
+    a = parser.parse_args(argv)
+    if a.every < 1:
         parser.error("--every: must be at least 1.")
-    return _guarded(_evaluate, arguments)
-
-
-def _evaluate(a: argparse.Namespace) -> None:
-    result = evaluate_recording(Detector.load(a.weights), a.recording, every=a.every, progress=True)
+    images = labelled_images(Recording.open(a.recording), every=a.every)
+    result = evaluate(Detector.load(a.weights), images, progress=True)
     rows = {"all": result.scores} | result.by_landmark() | result.by_visibility()
     shown = {
         "PCK@0.01": "pck_0_01", "PCK@0.05": "pck_0_05", "PCK@0.10": "pck_0_10", "median px": "median_px", "95 % px": "p95_px",
@@ -154,6 +124,7 @@ def _evaluate(a: argparse.Namespace) -> None:
         print(f"{name.replace('_', ' ')}, confidence above 0.5: {value:.1f} %")
     if a.json:
         write_json(a.json, {name: asdict(s) for name, s in rows.items()})
+    return 0
 
 
 if __name__ == "__main__":  # for torchrun

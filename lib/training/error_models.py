@@ -14,14 +14,12 @@ from tqdm.auto import tqdm
 from lib.geometry import image_from_cell
 from lib.landmarks.detector import CLOSE, TRACKED_FROM, Detector, Landmarks
 from lib.landmarks.error_model import ErrorModel, features_of
-from lib.landmarks.metrics import tool_length_px
+from lib.landmarks.metrics import GROSS_PX, tool_length_px
 from lib.landmarks.windows import CLOSEUP_REACH_PX, CLOSEUP_ZOOM, expected_in_closeup, map_points
 from lib.training.samples import LabelledImage
 
-__all__ = ["GROSS_PX", "TRACKED_SHIFT_PX", "Seen", "fit_error_models", "seen_by"]
+__all__ = ["TRACKED_SHIFT_PX", "Seen", "fit_error_models", "seen_by"]
 
-#: Errors beyond this are gross: no covariance describes them.
-GROSS_PX = 20.0
 #: What a tool of 2 mm/s moves between two frames at 25 Hz.
 TRACKED_SHIFT_PX = 8.0
 
@@ -146,19 +144,18 @@ def fit_error_models(detector: Detector, images: Iterable[LabelledImage], *, pro
     images = list(images)
     # A closeup is fitted by what it sees itself, not by what an earlier gain leaves of that.
     detector = replace(detector, error_models={k: v for k, v in detector.error_models.items() if k not in CLOSE})
-    rough: list[Landmarks] = []
+    rough: list[Landmarks | None] = [None] * len(images)
     rng = np.random.default_rng(0)
     for stage in detector.stages:
         parts = []
-        for i, labelled in enumerate(tqdm(images, disable=not progress, unit="image", desc=stage)):
-            start = rough[i] if stage != "frame" else None
+        for labelled, start in zip(tqdm(images, disable=not progress, unit="image", desc=stage), rough, strict=True):
             if stage in CLOSE and not (start.confidence >= TRACKED_FROM).all():
                 continue  # nothing is tracked from such an image
             if stage == "tracking":  # a tool that jumps now and then, which tracking has to notice
                 moved_px = TRACKED_SHIFT_PX * (5 if rng.random() < 0.25 else 1)
                 start = replace(start, u=start.u + rng.normal(0, moved_px / np.sqrt(2), (1, 1, 2)))
                 start = detector.refine(labelled.image[None], start, stage)
-            parts.append(seen_by(detector, stage, labelled, start.u if start is not None else None))
+            parts.append(seen_by(detector, stage, labelled, start.u if start else None))
         parts = [part for part in parts if len(part.landmark)]
         if not parts:
             raise ValueError("images: the detector finds nothing in them to calibrate on; give other images.")
@@ -170,9 +167,7 @@ def fit_error_models(detector: Detector, images: Iterable[LabelledImage], *, pro
             # While tracking, the place where a landmark is expected is an old one, which is evidence of nothing.
             gain, bias = seen.gain(gross_px, [1.0] if stage == "tracking" else np.linspace(0, 1, 51))
             seen = replace(seen, errors=seen.errors + (gain[seen.landmark] - 1) * seen.moved - bias[seen.landmark])
-        fit = seen.fit(gross_px)
-        fit = ErrorModel(fit.log_variance, fit.logit, gain, bias)
-        detector = detector.with_error_models(**{stage: fit})
+        detector = detector.with_error_models(**{stage: replace(seen.fit(gross_px), gain=gain, bias=bias)})
         if stage == "frame":  # the landmarks that the next stage starts from
             rough = [detector.coarse(part.image[None]) for part in images]
         elif stage != "tracking":

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from tqdm.auto import tqdm
@@ -12,10 +11,9 @@ from tqdm.auto import tqdm
 from lib.correspondences import LANDMARKS
 from lib.landmarks import Landmarks
 from lib.landmarks.metrics import Scores, calibration_error, errors_px, pck, score, tool_length_px
-from lib.recordings import Recording
-from lib.training.samples import LabelledImage, labelled_images
+from lib.training.samples import LabelledImage
 
-__all__ = ["Evaluation", "evaluate", "evaluate_recording"]
+__all__ = ["Evaluation", "evaluate"]
 
 
 @dataclass(frozen=True)
@@ -64,14 +62,12 @@ class Evaluation:
 
     def by(self, groups: Mapping[str, np.ndarray | bool]) -> dict[str, Scores]:
         """Scores of groups of landmarks, each a mask that fits (n, 3); groups without a label are left out."""
-        masks = {name: np.broadcast_to(mask, self.visibility.shape) for name, mask in groups.items()}
-        labels = {name: np.where(mask[..., None], self.u_true, np.nan) for name, mask in masks.items()}
-        found = self.landmarks
-        return {
-            name: score(found.u, u, found.covariance, length_px=self.length_px)
-            for name, u in labels.items()
-            if np.isfinite(u).any()
-        }
+        found, result = self.landmarks, {}
+        for name, mask in groups.items():
+            u = np.where(np.broadcast_to(mask, self.visibility.shape)[..., None], self.u_true, np.nan)
+            if np.isfinite(u).any():
+                result[name] = score(found.u, u, found.covariance, length_px=self.length_px)
+        return result
 
     def by_landmark(self) -> dict[str, Scores]:
         """Scores of base, tip_1, tip_2."""
@@ -106,7 +102,7 @@ class Evaluation:
 def evaluate(
     detector: Callable[[np.ndarray], Landmarks], images: Iterable[LabelledImage], *, progress: bool = False
 ) -> Evaluation:
-    """Run a detector over labelled images.
+    """Run a detector over labelled images, such as `lib.training.samples.labelled_images` of a recording.
 
     Args:
         detector: A `lib.landmarks.Detector`, or any function from images (n, h, w, 3) to their `Landmarks`.
@@ -114,28 +110,15 @@ def evaluate(
     Raises:
         ValueError: If there is no image.
 
-    >>> from lib import paths
-    >>> from lib.landmarks import Detector
-    >>> first = next(labelled_images(Recording.open(paths.SHIPPED_RECORDING)))
-    >>> bool(evaluate(Detector.load(), [first]).scores.median_px < 3)
-    True
+    >>> missed = LabelledImage("dark", np.zeros((90, 90, 3), np.uint8), np.full((3, 2), 30.0), np.full(3, 2))
+    >>> evaluate(lambda images: Landmarks.none(len(images)), [missed]).scores.missed
+    3
     """
-    names, found, labels, visibility, length = [], [], [], [], []
+    parts = []
     for labelled in tqdm(images, disable=not progress, unit="image"):
-        names.append(labelled.name)
-        found.append(detector(labelled.image[None]))
-        labels.append(labelled.in_view)
         unknown = ~np.isfinite(labelled.u).all(1) & (labelled.visibility > 0)
-        visibility.append(np.where(unknown, -1, labelled.visibility))
-        length.append(tool_length_px(np.asarray(labelled.u, dtype=float)[None])[0])
-    if not names:
+        labels = labelled.in_view[None], np.where(unknown, -1, labelled.visibility)[None], tool_length_px(labelled.u[None])
+        parts.append(Evaluation(detector(labelled.image[None]), *labels, [labelled.name]))
+    if not parts:
         raise ValueError("images: no labelled image to evaluate on.")
-    return Evaluation(Landmarks.join(found), np.stack(labels), np.stack(visibility), np.array(length), names)
-
-
-def evaluate_recording(
-    detector: Callable[[np.ndarray], Landmarks], recording: Recording | str | Path, *, every: int = 1, progress: bool = False
-) -> Evaluation:
-    """`evaluate` on both cameras' images of a recording, every `every`-th frame."""
-    recording = recording if isinstance(recording, Recording) else Recording.open(recording)
-    return evaluate(detector, labelled_images(recording, every=every), progress=progress)
+    return Evaluation.joined(parts)

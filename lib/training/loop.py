@@ -7,7 +7,6 @@ equals one that was not, bit for bit on the CPU: the number of the step is the w
 from __future__ import annotations
 
 import copy
-import hashlib
 import os
 import time
 from collections.abc import Sequence
@@ -20,7 +19,7 @@ import torch.distributed as dist
 from torch import Tensor, nn
 from tqdm.auto import tqdm
 
-from lib.landmarks.checkpoints import load_network, read_checkpoint, write_checkpoint
+from lib.landmarks.checkpoints import checksum, load_network, read_checkpoint, write_checkpoint
 from lib.landmarks.error_model import closeup_peaks
 from lib.landmarks.heatmaps import decode
 from lib.landmarks.images import as_tensor
@@ -50,7 +49,7 @@ class Training:
 
 def draw_batch(source: Source, config: TrainingConfig, step: int, rank: int = 0) -> Batch:
     """The augmented batch of a step; `rank` is the number of the process among those that train together."""
-    rng = np.random.default_rng([config.seed, step, rank] if rank else [config.seed, step])
+    rng = np.random.default_rng([config.seed, step, *([rank] if rank else [])])
     indices = rng.choice(len(source), config.batch_size, replace=len(source) < config.batch_size)
     images, u, visibility = map(np.stack, zip(*(source.draw(int(i), rng) for i in indices), strict=True))
     return config.augmentation(_batch(images, u, visibility), rng)
@@ -63,9 +62,7 @@ def _batch(images: np.ndarray, u: np.ndarray, visibility: np.ndarray) -> Batch:
 
 
 @torch.no_grad()
-def validate(
-    network: StackedHourglass | OffsetNetwork, samples: Samples, config: TrainingConfig, *, batch: int = 16
-) -> dict[str, float]:
+def validate(network: StackedHourglass | OffsetNetwork, samples: Samples, config: TrainingConfig) -> dict[str, float]:
     """Loss, PCK and median error on held-out images, and two signs of a collapsed network.
 
     `peak` is the mean height of the heatmaps of visible landmarks; 1 is right.  `spread` is the standard deviation of the
@@ -74,37 +71,27 @@ def validate(
     """
     network.eval()
     device = next(network.parameters()).device
-    losses, found, heights, visible = [], [], [], []
-    for start in range(0, len(samples), batch):
-        part = slice(start, start + batch)
+    losses, found, labels = [], [], []
+    for start in range(0, len(samples), 16):
+        part = slice(start, start + 16)
         labelled = _batch(samples.images[part], samples.u[part], samples.visibility[part])
         outputs = [output.cpu() for output in network(labelled.images.to(device))]
         losses.append(loss_of(network, outputs, labelled, config, position=False).item())
         if isinstance(network, OffsetNetwork):
-            peaks = closeup_peaks(outputs[-1], labelled.images.shape[-1])
+            found.append(closeup_peaks(outputs[-1], labelled.images.shape[-1]))
         else:
-            peaks = decode(outputs[-1], network.stride, sigma_px=config.sigma_px)
-        found.append(peaks.u.expand(-1, 3, -1).numpy())
-        seen = (labelled.visibility == 2) & torch.isfinite(labelled.u).all(-1)
-        heights.append(torch.where(seen, peaks.value, torch.nan).numpy())
-        visible.append(seen.numpy())
-    u, seen = np.concatenate(found).astype(float), np.concatenate(visible)
-    labels = np.where(seen[..., None], samples.u, np.nan)
-    scores = score(u, labels, length_px=tool_length_px(samples.u))
-    spread = np.nanmean(np.nanstd(np.where(seen[..., None], u, np.nan), 0)) / np.nanmean(np.nanstd(labels, 0))
+            found.append(decode(outputs[-1], network.stride, sigma_px=config.sigma_px))
+        labels.append(torch.where((labelled.visibility == 2)[..., None], labelled.u, torch.nan))
+    true = torch.cat(labels).double().numpy()
+    seen = np.isfinite(true).all(-1)
+    u = torch.cat([peaks.u for peaks in found]).expand(-1, 3, -1).double().numpy()
+    scores = score(u, true, length_px=tool_length_px(samples.u))
+    spread = np.nanmean(np.nanstd(np.where(seen[..., None], u, np.nan), 0)) / np.nanmean(np.nanstd(true, 0))
     result = {"validation_loss": float(np.mean(losses)), "pck_0.05": scores.pck_0_05, "pck_0.10": scores.pck_0_10}
     result |= {"median_px": scores.median_px, "p95_px": scores.p95_px, "spread": float(spread)}
     if not isinstance(network, OffsetNetwork):
-        result["peak"] = float(np.nanmean(np.concatenate(heights)))
+        result["peak"] = float(torch.cat([peaks.value for peaks in found]).numpy()[seen].mean())
     return result
-
-
-def _processes() -> tuple[int, int]:
-    """Rank of this process, and how many train together; torchrun starts them and tells each by its environment."""
-    world = int(os.environ.get("WORLD_SIZE", "1"))
-    if world > 1 and not dist.is_initialized():
-        dist.init_process_group("nccl" if torch.cuda.is_available() else "gloo")
-    return (dist.get_rank(), world) if world > 1 else (0, 1)
 
 
 def average(tensors: Sequence[Tensor], world: int) -> None:
@@ -124,12 +111,18 @@ class Run:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(config.seed)
             self.network = copy.deepcopy(initial) if initial is not None else network_of(config.network)
-        self.rank, self.world = _processes()
+        # torchrun starts the processes that train together, and tells each by its environment how many they are.
+        self.rank, self.world = 0, int(os.environ.get("WORLD_SIZE", "1"))
+        if self.world > 1:
+            if not dist.is_initialized():
+                dist.init_process_group("nccl" if torch.cuda.is_available() else "gloo")
+            self.rank = dist.get_rank()
         self.device = torch.device("cpu")
         if torch.cuda.is_available():
             self.device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")) if self.world > 1 else 0)
         self.network.to(self.device, memory_format=torch.channels_last)
         self.average = copy.deepcopy(self.network) if config.ema else None
+        self.usable = self.average or self.network
         parameters = self.network.parameters()
         if config.optimiser == "rmsprop":
             self.optimiser: torch.optim.Optimizer = torch.optim.RMSprop(parameters, config.learning_rate, alpha=0.99)
@@ -137,10 +130,6 @@ class Run:
             self.optimiser = torch.optim.AdamW(parameters, config.learning_rate, weight_decay=1e-4)
         self.step, self.seconds, self.log = 0, 0.0, []
         self.loss_sum, self.since = 0.0, 0  # since the last validation
-
-    @property
-    def usable(self) -> StackedHourglass | OffsetNetwork:
-        return self.average if self.average is not None else self.network
 
     def advance(self, batch: Batch) -> None:
         """One step."""
@@ -163,11 +152,9 @@ class Run:
         if self.average is not None:
             # A young average must not remember the random start.
             decay = min(self.config.ema, (1 + self.step) / (10 + self.step))
-            with torch.no_grad():
-                for mean, value in zip(
-                    self.average.state_dict().values(), self.network.state_dict().values(), strict=True
-                ):
-                    mean.lerp_(value, 1 - decay) if mean.is_floating_point() else mean.copy_(value)
+            means, values = (network.state_dict().values() for network in (self.average, self.network))
+            for mean, value in zip(means, values, strict=True):
+                mean.lerp_(value, 1 - decay) if mean.is_floating_point() else mean.copy_(value)
         self.step += 1
         self.loss_sum, self.since = self.loss_sum + loss.item(), self.since + 1
 
@@ -191,8 +178,7 @@ class Run:
     def restore(self, path: Path, provenance: dict[str, object]) -> None:
         """Continue from a checkpoint; `provenance` is completed by what it was begun from."""
         tensors, metadata = read_checkpoint(path, FORMAT)
-        changed = self.config.changed(metadata["config"])
-        kept = metadata["provenance"]
+        changed, kept = self.config.changed(metadata["config"]), metadata["provenance"]
         processes = kept.get("processes", 1)
         for differs, how in (
             (changed, f"belongs to a training with another {', '.join(changed)}"),
@@ -237,17 +223,15 @@ def train(
         ValueError: For an empty data set, an `initial` training of another network, or a folder that holds another
             training.
     """
-    if len(source) == 0 or len(validation) == 0:
-        raise ValueError("source and validation: must not be empty; give labelled images.")
+    if not len(source):
+        raise ValueError("source: must not be empty; give labelled images.")
     if initial is not None and initial.network.config != config.network:
         raise ValueError(f"initial: is a network {initial.network.config}, not {config.network} as the configuration asks.")
     run = Run(config, initial.network if initial is not None else None)
     provenance: dict[str, object] = {"data": source.fingerprint, "images": len(source), "torch": torch.__version__}
-    provenance |= {"commit": commit_id(), "machine": machine()}
-    if run.world > 1:
-        provenance["processes"] = run.world
+    provenance |= {"commit": commit_id(), "machine": machine(), "processes": run.world}
     if initial is not None:
-        provenance |= {"before": initial.provenance, "initial": _weights_fingerprint(initial.network)}
+        provenance |= {"before": initial.provenance, "initial": checksum(initial.network.state_dict(), {})[:16]}
     last = None
     if folder is not None:
         last = Path(folder) / "last.safetensors"
@@ -255,30 +239,25 @@ def train(
         if last.exists():
             run.restore(last, provenance)
     keeps = last is not None and run.rank == 0
-    began, before = time.perf_counter(), run.seconds
+    began, before, stop = time.perf_counter(), run.seconds, False
     quiet = not progress or run.rank > 0
     with tqdm(total=config.steps, initial=run.step, disable=quiet, unit="step", mininterval=1.0) as bar:
-        stop = False
         while run.step < config.steps and not stop:
             run.advance(draw_batch(source, config, run.step, run.rank))
             bar.update()
             run.seconds = before + time.perf_counter() - began
             stop = run.agreed(max_seconds is not None and time.perf_counter() - began > max_seconds)
             due = run.step % config.validate_every == 0 or run.step == config.steps
-            if not (due or stop):
-                continue
-            if keeps and not due:  # without the validation below, which an uninterrupted run does not have
+            if stop and keeps and not due:  # without the validation below, which an uninterrupted run does not have
                 run.save(last, provenance)
-            row = {"step": run.step, "seconds": round(run.seconds, 1), "loss": run.loss_sum / run.since}
-            row |= validate(run.usable, validation, config)
-            run.log.append(row)
-            bar.set_postfix(loss=f"{row['loss']:.3f}", pck=f"{row['pck_0.05']:.1f}", median=f"{row['median_px']:.2f}px")
-            if not due:
-                continue
-            run.loss_sum, run.since = 0.0, 0
-            provenance["metrics"] = row
-            if keeps:
-                run.save(last, provenance)
+            if stop or due:
+                row = {"step": run.step, "seconds": round(run.seconds, 1), "loss": run.loss_sum / run.since}
+                run.log.append(row | validate(run.usable, validation, config))
+                bar.set_postfix({name: f"{run.log[-1][name]:.3g}" for name in ("loss", "pck_0.05", "median_px")})
+            if due:
+                run.loss_sum, run.since, provenance["metrics"] = 0.0, 0, run.log[-1]
+                if keeps:
+                    run.save(last, provenance)
     provenance |= {"metrics": run.log[-1] if run.log else {}, "seconds": run.seconds, "steps": run.step}
     return Training(copy.deepcopy(run.usable).cpu().eval(), run.log, provenance)
 
@@ -287,17 +266,10 @@ def load_training(path: str | Path) -> Training:
     """The network of a training's checkpoint, finished or not."""
     tensors, metadata = read_checkpoint(path, FORMAT)
     prefix = "average." if any(name.startswith("average.") for name in tensors) else "network."
-    network = load_network(path, metadata["config"]["network"], _part(tensors, prefix)).eval()
+    network = load_network(path, metadata["config"]["network"], tensors, prefix).eval()
     more = {"steps": metadata["step"], "seconds": metadata["seconds"], "config": metadata["config"]}
     return Training(network, metadata["log"], metadata["provenance"] | more)
 
 
 def _part(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
     return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
-
-
-def _weights_fingerprint(network: nn.Module) -> str:
-    digest = hashlib.sha256()
-    for tensor in network.state_dict().values():
-        digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
-    return digest.hexdigest()[:16]

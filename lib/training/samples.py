@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from dataclasses import dataclass, fields
+from typing import NamedTuple
 
 import numpy as np
 
@@ -49,21 +49,30 @@ def labelled_images(recording: Recording, *, every: int = 1) -> Iterator[Labelle
             yield LabelledImage(f"{side} {i}", image, u, visibility)
 
 
-class Source(Protocol):
-    """Labelled images of one size that training draws from."""
+class Source:
+    """Labelled images of one size that training draws from: a data class whose first field has one entry an image."""
 
-    def __len__(self) -> int: ...
+    def __len__(self) -> int:
+        return len(getattr(self, fields(self)[0].name))
 
     def draw(self, index: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Image (h, w, 3) uint8, landmarks (3, 2) px, visibility (3,)."""
+        raise NotImplementedError
 
     @property
     def fingerprint(self) -> str:
-        """Identifies the data."""
+        """Of all fields: the images, their labels, and how images are drawn from them."""
+        digest = hashlib.sha256()
+        for value in (getattr(self, field.name) for field in fields(self)):
+            if isinstance(value, np.ndarray):
+                digest.update(np.ascontiguousarray(value[:, ::7, ::7] if value.ndim == 4 else value))
+            else:
+                digest.update((value.fingerprint if isinstance(value, Source) else repr(value)).encode())
+        return digest.hexdigest()[:16]
 
 
 @dataclass(frozen=True)
-class Samples:
+class Samples(Source):
     """Labelled images in memory, (n, h, w, 3) uint8 RGB, with u (n, 3, 2) and visibility (n, 3) as in `LabelledImage`.
 
     Raises:
@@ -93,35 +102,20 @@ class Samples:
         images, u, visibility = zip(*(source.draw(i, rng) for i in range(len(source))), strict=True)
         return cls(np.stack(images), np.stack(u), np.stack(visibility))
 
-    def __len__(self) -> int:
-        return len(self.images)
-
     def draw(self, index: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         return self.images[index], self.u[index], self.visibility[index]
 
-    @property
-    def fingerprint(self) -> str:
-        digest = hashlib.sha256(np.ascontiguousarray(self.images[:, ::7, ::7]).tobytes())
-        digest.update(np.nan_to_num(self.u, nan=-1.0).tobytes())
-        digest.update(np.asarray(self.visibility, dtype=np.int64).tobytes())
-        return digest.hexdigest()[:16]
-
 
 @dataclass(frozen=True)
-class Mixed:
-    """Images of one source, and of another in `share` of the draws, so that a network does not forget the latter."""
+class Mixed(Source):
+    """Images of one source, and of another in half of the draws, so that a network does not forget the latter."""
 
     own: Source
     other: Source
-    share: float = 0.5
 
     def __len__(self) -> int:
         return len(self.own) + len(self.other)
 
     def draw(self, index: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        part = self.other if rng.random() < self.share else self.own
+        part = self.other if rng.random() < 0.5 else self.own
         return part.draw(index % len(part), rng)
-
-    @property
-    def fingerprint(self) -> str:
-        return f"{self.own.fingerprint} {self.other.fingerprint} {self.share}"

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import zipfile
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import cv2
@@ -24,15 +24,9 @@ from lib.simulator.population import TEXTURE_SEEDS, VALIDATION_TEXTURE_SEEDS, sa
 from lib.training.samples import LabelledImage, Samples
 
 __all__ = [
-    "BLOCK_PX",
-    "REDUCTION",
-    "STORED_REDUCTION",
-    "frame_samples",
-    "generate",
-    "read_shards",
-    "validation_images",
+    "BLOCK_PX", "REDUCTION", "STORED_REDUCTION", "frame_samples", "generate", "read_shards", "validation_images",
     "write_frames",
-]
+]  # fmt: skip
 
 #: Of the stored frames, and of the first stage's input.
 STORED_REDUCTION, REDUCTION = 5, 8
@@ -47,22 +41,17 @@ CROPS = {"windows": (CROP_PX, 512), "closeups": (128, 2048)}
 BLOCK_PX = 16
 
 
-def generate(
-    folder: str | Path, kind: str, shards: int, *, workers: int | None = None, progress: bool = True
-) -> None:
+def generate(folder: str | Path, kind: str, shards: int, *, workers: int | None = None, progress: bool = True) -> None:
     """Write the first `shards` shards of a kind into `folder`, except those that exist.
 
-    A shard depends on its kind and number alone.
-
-    Shards of kind ``"training"`` and ``"validation"`` hold 16 frames each.  ``"windows"`` and ``"closeups"`` hold 512 and
-    2048 crops round a landmark, each of an eye and a tool of its own: twenty and forty times as many scenes a second, since
-    only the crops are rendered.  `workers` processes share the work, by default one a core.
+    A shard depends on its kind and number alone.  ``"training"`` and ``"validation"`` hold 16 frames each.  ``"windows"``
+    and ``"closeups"`` hold 512 and 2048 crops round a landmark, each of an eye and a tool of its own: twenty and forty
+    times as many scenes a second, since only the crops are rendered.  `workers` processes share the work (None: all cores).
     """
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    jobs = {folder / f"{kind}_{i:04d}.npz": (kind, i) for i in range(shards)}
-    title = f"Simulating {kind}"
-    for done in run_jobs(make_shard, jobs, workers=workers, title=title, unit="shard", progress=progress):
+    Path(folder).mkdir(parents=True, exist_ok=True)
+    jobs = {Path(folder) / f"{kind}_{i:04d}.npz": (kind, i) for i in range(shards)}
+    settings = {"title": f"Simulating {kind}", "unit": "shard", "progress": progress}
+    for done in run_jobs(make_shard, jobs, workers=workers, **settings):
         if done.error:
             raise done.error
 
@@ -79,19 +68,13 @@ def make_shard(path: Path, kind: str, index: int) -> None:
 
 
 def _write_crops(path: Path, rng: np.random.Generator, side_px: int, n: int) -> None:
-    crops = np.empty((n, side_px, side_px, 3), np.uint8)
-    crop_u, crop_visibility = np.empty((n, 3, 2)), np.empty((n, 3), int)
-    crop_landmark = rng.integers(3, size=n)
-    for i, k in enumerate(crop_landmark):
-        while True:
-            rendered_px = side_px + BLOCK_PX
-            image, u, visibility = sample(rng, crop_px=rendered_px, around=k, jitter=BLOCK_PX / 2 / rendered_px)
-            if visibility[k]:
-                break
-        crops[i], crop_u[i] = _crop(image, u, k, side_px)  # the landmark is not in the middle where the field ends
-        crop_visibility[i] = visibility
-    landmark = crop_landmark.astype(np.int64)
-    _write(path, crops=crops, crop_u=crop_u, crop_visibility=crop_visibility, crop_landmark=landmark)
+    crops, u, seen = np.empty((n, side_px, side_px, 3), np.uint8), np.empty((n, 3, 2)), np.zeros((n, 3), int)
+    landmark, rendered_px = rng.integers(3, size=n), side_px + BLOCK_PX
+    for i, k in enumerate(landmark):
+        while not seen[i, k]:
+            image, at, seen[i] = sample(rng, crop_px=rendered_px, around=k, jitter=BLOCK_PX / 2 / rendered_px)
+        crops[i], u[i] = _crop(image, at, k, side_px)  # the landmark is not in the middle where the field ends
+    _write(path, crops=crops, crop_u=u, crop_visibility=seen, crop_landmark=landmark)
 
 
 def _crop(image: np.ndarray, u: np.ndarray, k: int, side_px: int) -> tuple[np.ndarray, np.ndarray]:
@@ -102,32 +85,27 @@ def _crop(image: np.ndarray, u: np.ndarray, k: int, side_px: int) -> tuple[np.nd
 
 def write_frames(path: Path, images: Iterable[LabelledImage], *, keep_frames: bool) -> None:
     """Write one shard of full-resolution labelled images of one size; with the images themselves if `keep_frames`."""
-    frames, labels, seen, crops, crop_u, of_crop, jpegs = [], [], [], [], [], [], []
+    frames, labels, seen, crops, crop_u, crop_of, jpegs = [], [], [], [], [], [], []
     for _, image, u, visibility in images:
         h, w = image.shape[:2]
         frames.append(cv2.resize(image, (w // STORED_REDUCTION, h // STORED_REDUCTION), interpolation=cv2.INTER_AREA))
         labels.append(u)
         seen.append(visibility)
         for k in np.flatnonzero((visibility > 0) & np.isfinite(u).all(1)):
-            for part, value in zip((crops, crop_u), _crop(image, u, k, CROP_PX), strict=True):
-                part.append(value)
-            of_crop.append((len(frames) - 1, k))
+            crop, at = _crop(image, u, k, CROP_PX)
+            crops.append(crop)
+            crop_u.append(at)
+            crop_of.append((len(frames) - 1, k))
         if keep_frames:
-            quality = [cv2.IMWRITE_JPEG_QUALITY, 95]
-            jpegs.append(cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), quality)[1].ravel())
-    frame, landmark = np.array(of_crop, dtype=int).reshape(-1, 2).T
+            bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
+            jpegs.append(cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].ravel())
+    frame, landmark = np.array(crop_of, dtype=int).reshape(-1, 2).T
     _write(
-        path,
-        frames=np.stack(frames),
-        u=np.stack(labels),
-        visibility=np.stack(seen),
-        crops=np.array(crops, np.uint8).reshape(-1, CROP_PX, CROP_PX, 3),
-        crop_u=np.array(crop_u).reshape(-1, 3, 2),
-        crop_visibility=np.stack(seen)[frame],
-        crop_landmark=landmark,
-        jpegs=np.concatenate(jpegs) if jpegs else np.zeros(0, np.uint8),
-        jpeg_ends=np.cumsum([j.size for j in jpegs]),
-    )
+        path, frames=np.stack(frames), u=np.stack(labels), visibility=np.stack(seen),
+        crops=np.array(crops, np.uint8).reshape(-1, CROP_PX, CROP_PX, 3), crop_u=np.array(crop_u).reshape(-1, 3, 2),
+        crop_visibility=np.stack(seen)[frame], crop_landmark=landmark,
+        jpegs=np.concatenate([np.zeros(0, np.uint8), *jpegs]), jpeg_ends=np.cumsum([j.size for j in jpegs]),
+    )  # fmt: skip
 
 
 def _write(path: Path, **arrays: np.ndarray) -> None:
@@ -135,8 +113,7 @@ def _write(path: Path, **arrays: np.ndarray) -> None:
         np.savez(file, **arrays)
 
 
-def _read(path: Path, names: tuple[str, ...]) -> list[np.ndarray]:
-    """Arrays of one shard."""
+def _read(path: Path, names: Sequence[str]) -> list[np.ndarray]:
     try:
         with np.load(path, allow_pickle=False) as shard:
             return [shard[name] for name in names]
@@ -144,9 +121,7 @@ def _read(path: Path, names: tuple[str, ...]) -> list[np.ndarray]:
         raise ValueError(f"{path}: corrupt; delete it and generate it again ({error}).") from error
 
 
-def read_shards(
-    folder: str | Path, kinds: tuple[str, ...], names: tuple[str, ...], first: int | None = None
-) -> list[np.ndarray]:
+def read_shards(folder: str | Path, kinds: Sequence[str], names: Sequence[str], first: int | None = None) -> list[np.ndarray]:
     """Arrays of the (first) shards of some kinds, joined; an error names a missing, corrupt or differently sized shard."""
     found = [path for kind in kinds for path in sorted(Path(folder).glob(f"{kind}_*.npz"))][:first]
     if not found:
@@ -162,12 +137,12 @@ def read_shards(
 
 def _joined(parts: list[np.ndarray]) -> np.ndarray:
     """Concatenated; each part is released as soon as it is copied, so that gigabytes are never held twice."""
-    result = np.empty((sum(len(part) for part in parts), *parts[0].shape[1:]), parts[0].dtype)
-    end = len(result)
+    end = sum(map(len, parts))
+    result = np.empty((end, *parts[0].shape[1:]), parts[0].dtype)
     while parts:
         part = parts.pop()
-        result[end - len(part) : end] = part
         end -= len(part)
+        result[end : end + len(part)] = part
     return result
 
 
@@ -175,7 +150,7 @@ def frame_samples(folder: str | Path, *, validation: bool = False) -> Samples:
     """Whole frames at the first stage's resolution; shards keep more, so that it can be chosen later."""
     kind = "validation" if validation else "training"
     frames, u, visibility = read_shards(folder, (kind,), ("frames", "u", "visibility"))
-    size = (frames.shape[2] * STORED_REDUCTION // REDUCTION, frames.shape[1] * STORED_REDUCTION // REDUCTION)
+    size = [side * STORED_REDUCTION // REDUCTION for side in frames.shape[2:0:-1]]
     frames = np.stack([cv2.resize(frame, size, interpolation=cv2.INTER_AREA) for frame in frames])
     return Samples(frames, cell_from_image(u, REDUCTION), visibility)
 

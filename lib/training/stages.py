@@ -27,7 +27,7 @@ STAGES = {"frame": 32, "tool": 48, "window": 96, "closeup": 32}
 _SHARD = 64
 
 
-def stage_config(stage: str, *, preset: str = "best", features: int | None = None, stacks: int = 2) -> TrainingConfig:
+def stage_config(stage: str, *, preset: str = "best", features: int | None = None) -> TrainingConfig:
     """How a stage of the shipped detector is trained.
 
     >>> stage_config("tool").network.features
@@ -38,8 +38,8 @@ def stage_config(stage: str, *, preset: str = "best", features: int | None = Non
         augmentation = AUGMENTATIONS["closeups"]
         return replace(config, network=OffsetConfig(features), augmentation=augmentation, batch_size=64, clip=2.0)
     if stage == "frame":
-        return replace(config, network=HourglassConfig(features, stacks, depth=3), batch_size=8, ema=0.995)
-    config = replace(config, network=HourglassConfig(features, stacks), augmentation=AUGMENTATIONS["windows"])
+        return replace(config, network=HourglassConfig(features, depth=3), batch_size=8, ema=0.995)
+    config = replace(config, network=HourglassConfig(features), augmentation=AUGMENTATIONS["windows"])
     return replace(config, ema=0.995) if stage == "tool" else replace(config, position_weight_per_px=0.04)
 
 
@@ -47,13 +47,11 @@ def stage_data(stage: str, folder: str | Path, *, closeups: str = "closeups") ->
     """Training data and validation samples of a stage, from a folder of shards; closeups from shards of kind `closeups`."""
     if stage == "frame":
         return frame_samples(folder), frame_samples(folder, validation=True)
-    if stage == "tool":
-        load = WindowSource.load_tools
-        return load(folder), Samples.drawn(load(folder, validation=True))
+    load = {"tool": WindowSource.load_tools, "window": WindowSource.load, "closeup": CloseupSource.load}[stage]
+    source = load(folder, kind=closeups) if stage == "closeup" else load(folder)
     if stage == "window":  # the simulator varies the magnification itself
-        source = replace(WindowSource.load(folder), zoom=(0.9, 1.1))
-        return source, Samples.drawn(WindowSource.load(folder, validation=True))
-    return CloseupSource.load(folder, kind=closeups), Samples.drawn(CloseupSource.load(folder, validation=True))
+        source = replace(source, zoom=(0.9, 1.1))
+    return source, Samples.drawn(load(folder, validation=True))
 
 
 def finetune(
@@ -79,8 +77,7 @@ def finetune(
     Raises:
         ValueError: If there is no usable image, or fewer than 20 landmarks are found in the held-out ones.
     """
-    folder = Path(folder)
-    data = folder / "data"
+    data = Path(folder) / "data"
     data.mkdir(parents=True, exist_ok=True)
     for kind, part in (("training", images), ("validation", held_out)):
         usable = [labelled for labelled in part if np.isfinite(direction_rad(labelled.u[None])).all()]
@@ -93,12 +90,10 @@ def finetune(
         source, validation = stage_data(stage, data, closeups="training")
         if simulated is not None:
             source = Mixed(source, stage_data(stage, simulated)[0])
-        config = replace(
-            stage_config(stage), network=network.config, steps=steps, learning_rate=3e-4, seed=seed,
-            batch_size=min(stage_config(stage).batch_size, len(source)), validate_every=max(1, steps // 5),
-        )  # fmt: skip
+        config = replace(stage_config(stage), network=network.config, steps=steps, learning_rate=3e-4, seed=seed)
+        config = replace(config, batch_size=min(config.batch_size, len(source)), validate_every=max(1, steps // 5))
         start = Training(network, [], {"shipped": detector.metadata.get("commit")})
-        done = train(config, source, validation, folder / stage, initial=start, progress=progress)
+        done = train(config, source, validation, Path(folder) / stage, initial=start, progress=progress)
         networks[f"{stage}_network"] = done.network
     fitted_on = [*validation_images(data), *(validation_images(simulated) if simulated is not None else ())]
     return fit_error_models(replace(detector, **networks), fitted_on, progress=progress)

@@ -2,24 +2,16 @@
 
 from __future__ import annotations
 
-import hashlib
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from lib.geometry import cell_from_image
-from lib.landmarks.windows import (
-    CLOSEUP_REACH_PX,
-    closeup_from_image,
-    cut,
-    direction_rad,
-    map_points,
-    tool_centre,
-    window_from_image,
-)
+from lib.landmarks import windows
 from lib.simulator.optics import motion_kernel
+from lib.training.samples import Source
 from lib.training.shards import BLOCK_PX, STORED_REDUCTION, read_shards
 
 __all__ = ["TOOL", "TOOL_REDUCTION", "CloseupSource", "WindowSource"]
@@ -30,26 +22,13 @@ _CROPS = ("crops", "crop_u", "crop_visibility", "crop_landmark")
 
 
 @dataclass(frozen=True)
-class _Cut:
+class _Cut(Source):
     """Windows cut out of crops (n, h, w, 3) uint8 with their labels; each shows one `landmark` (n,)."""
 
     crops: np.ndarray
     u: np.ndarray
     visibility: np.ndarray
     landmark: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.crops)
-
-    @property
-    def fingerprint(self) -> str:
-        """Of the images, their labels, and how windows are drawn from them."""
-        digest = hashlib.sha256(np.ascontiguousarray(self.crops[:, ::17, ::17]).tobytes())
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if field.name != "crops":
-                digest.update(value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode())
-        return digest.hexdigest()[:16]
 
 
 @dataclass(frozen=True)
@@ -76,19 +55,18 @@ class WindowSource(_Cut):
         """Windows round the whole tool at `TOOL_REDUCTION`, for the middle stage."""
         kind = "validation" if validation else "training"
         frames, u, visibility = read_shards(folder, (kind,), ("frames", "u", "visibility"), shards)
-        which = np.full(len(frames), TOOL)
-        u = cell_from_image(u, TOOL_REDUCTION)
-        return cls(frames, u, visibility, which, shift_px=8.0, turn_rad=0.2, zoom=(0.75, 1.3))
+        labels = cell_from_image(u, TOOL_REDUCTION), visibility, np.full(len(u), TOOL)
+        return cls(frames, *labels, shift_px=8.0, turn_rad=0.2, zoom=(0.75, 1.3))
 
     def draw(self, index: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         u = self.u[index]
         worse = 3.0 if rng.random() < 0.1 else 1.0
         limit = 0.3 * self.size
-        at = tool_centre(u[None])[0] if self.landmark[index] == TOOL else u[self.landmark[index]]
+        at = windows.tool_centre(u[None])[0] if self.landmark[index] == TOOL else u[self.landmark[index]]
         centre = at + np.clip(rng.normal(0, worse * self.shift_px, 2), -limit, limit)
-        angle = direction_rad(u[None])[0] + np.clip(rng.normal(0, worse * self.turn_rad), -0.6, 0.6)
-        matrix = window_from_image(centre, angle, self.size, rng.uniform(*self.zoom))
-        return cut(self.crops[index], matrix, self.size), map_points(matrix, u), self.visibility[index]
+        angle = windows.direction_rad(u[None])[0] + np.clip(rng.normal(0, worse * self.turn_rad), -0.6, 0.6)
+        matrix = windows.window_from_image(centre, angle, self.size, rng.uniform(*self.zoom))
+        return windows.cut(self.crops[index], matrix, self.size), windows.map_points(matrix, u), self.visibility[index]
 
 
 @dataclass(frozen=True)
@@ -101,10 +79,8 @@ class CloseupSource(_Cut):
         shifts_px, shift_shares: Standard deviations of the error of place, and the share of closeups that has each.
         turn_rad: Standard deviation of the error of direction.
         alone: Share of closeups whose direction is that to one tip, as if the other one were missing.
-        stretch, shear: Standard deviations of the logarithms of two stretches, along and across the tool, and of the
-            shear.
-        motion_px: Standard deviation along x and y of the movement, in closeup pixels, that blurs half of the closeups:
-            a tool under way moves more often than the simulator's.
+        stretch, shear: Standard deviations of the logarithms of two stretches, along and across the tool, and of the shear.
+        motion_px: Standard deviation of the movement that blurs half of the closeups, in their pixels along x and y.
     """
 
     size: int = 64
@@ -133,18 +109,18 @@ class CloseupSource(_Cut):
         h, w = (side - BLOCK_PX for side in self.crops.shape[1:3])
         crop, u = self.crops[index, y : y + h, x : x + w], self.u[index] - (x, y)
         shift = rng.normal(0, self.shifts_px[rng.choice(len(self.shifts_px), p=self.shift_shares)], 2)
-        centre = u[k] + shift * min(1.0, CLOSEUP_REACH_PX / max(np.linalg.norm(shift), 1e-9))
+        centre = u[k] + shift * min(1.0, windows.CLOSEUP_REACH_PX / max(np.linalg.norm(shift), 1e-9))
         known = u.copy()
         if rng.random() < self.alone:
             known[rng.choice([j for j in (1, 2) if j != k])] = np.nan
-        angle = direction_rad(known[None])[0] + rng.normal(0, self.turn_rad)
-        matrix = closeup_from_image(centre, angle, self.size, k)
+        angle = windows.direction_rad(known[None])[0] + rng.normal(0, self.turn_rad)
+        matrix = windows.closeup_from_image(centre, angle, self.size, k)
         along, across = np.exp(rng.normal(0, self.stretch, 2))
         deform = np.array([[along, 0.0], [rng.normal(0, self.shear), across]])
         middle = (self.size - 1) / 2
         matrix = np.column_stack([deform @ matrix[:, :2], deform @ (matrix[:, 2] - middle) + middle])
-        image = cut(crop, matrix, self.size, border=cv2.BORDER_REPLICATE)
+        image = windows.cut(crop, matrix, self.size, border=cv2.BORDER_REPLICATE)
         kernel = motion_kernel(rng.normal(0, self.motion_px, 2)) if self.motion_px and rng.random() < 0.5 else None
         if kernel is not None:  # centred, so the landmark stays
             image = cv2.filter2D(image, -1, kernel)
-        return image, map_points(matrix, u), np.where(np.arange(3) == k, 2, 0)
+        return image, windows.map_points(matrix, u), np.where(np.arange(3) == k, 2, 0)

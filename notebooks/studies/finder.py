@@ -22,7 +22,7 @@ from lib.training.augmentation import Augmentation
 from lib.training.config import PRESETS, TrainingConfig
 from lib.training.evaluation import Evaluation, evaluate
 from lib.training.loop import Training, train
-from lib.training.samples import LabelledImage, Mixed, Samples
+from lib.training.samples import LabelledImage, Mixed, Samples, Source
 from lib.training.shards import REDUCTION
 
 __all__ = [
@@ -52,7 +52,7 @@ def real_samples(sequence: MonocularSequence, first: int, end: int) -> Samples:
 
 
 @dataclass(frozen=True)
-class Crops:
+class Crops(Source):
     """Squares of `size` px out of larger images, three of four round the tool and the others anywhere."""
 
     samples: Samples
@@ -61,9 +61,6 @@ class Crops:
     def __post_init__(self) -> None:
         if min(self.samples.images.shape[1:3]) < self.size:
             raise ValueError(f"size: {self.size} px do not fit images of {self.samples.images.shape[2:0:-1]} px.")
-
-    def __len__(self) -> int:
-        return len(self.samples)
 
     def draw(self, index: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         image, u, visibility = self.samples.draw(index, rng)
@@ -74,10 +71,6 @@ class Crops:
         centre = u[known].mean(axis=0) + shift if near else rng.uniform((0, 0), (w, h))
         x, y = np.clip(np.round(centre - self.size / 2), 0, (w - self.size, h - self.size)).astype(int)
         return image[y : y + self.size, x : x + self.size], u - (x, y), visibility
-
-    @property
-    def fingerprint(self) -> str:
-        return f"{self.samples.fingerprint} {self.size}"
 
 
 def real_config(steps: int, *, batch: int = 12, seed: int = 0) -> TrainingConfig:

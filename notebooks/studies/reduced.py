@@ -21,8 +21,9 @@ from lib.files import write_json
 from lib.geometry import cell_from_image, image_from_cell
 from lib.landmarks import Detector, Landmarks
 from lib.landmarks.error_model import ErrorModel
+from lib.landmarks.metrics import GROSS_PX
 from lib.landmarks.network import StackedHourglass
-from lib.training.error_models import GROSS_PX, Seen, seen_by
+from lib.training.error_models import Seen, seen_by
 from lib.training.loop import load_training
 from lib.training.samples import LabelledImage
 from lib.training.windows import WindowSource

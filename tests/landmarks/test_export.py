@@ -143,11 +143,11 @@ def test_an_export_that_differs_is_not_written(small, tmp_path, monkeypatch):
 
 
 def test_a_missing_package_is_one_line_with_the_cure(small, tmp_path, monkeypatch, capsys):
-    from lib.training.command import main as training_main
+    from lib.__main__ import COMMANDS
 
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "onnx" else find(name))
     with pytest.raises(ValueError, match=r"needs the package onnx, which is not installed here; `pip install onnx`"):
         export(small[0], tmp_path, small[1])
-    assert training_main(["export", "--onnx", str(tmp_path)]) == 2
+    assert COMMANDS["train"](["export", "--onnx", str(tmp_path)]) == 2
     assert capsys.readouterr().err.count("\n") == 1

@@ -7,19 +7,20 @@ import pytest
 import torch
 
 from lib import paths
+from lib.__main__ import COMMANDS
 from lib.landmarks import Detector
 from lib.landmarks.network import HourglassConfig, StackedHourglass
 from lib.training import stages
 from lib.training.assembly import card
-from lib.training.command import main, main_evaluate
+from lib.training.command import main_evaluate
 from lib.training.loop import load_training
 from tests.toys import toy_images
 
 
 def test_the_train_command_names_what_is_missing(tmp_path, capsys):
-    assert main(["frame", "--data", str(tmp_path), "--folder", str(tmp_path)]) == 2
+    assert COMMANDS["train"](["frame", "--data", str(tmp_path), "--folder", str(tmp_path)]) == 2
     assert "no shard" in capsys.readouterr().err
-    assert main(["assemble", "--data", str(tmp_path), "--folder", str(tmp_path)]) == 2
+    assert COMMANDS["train"](["assemble", "--data", str(tmp_path), "--folder", str(tmp_path)]) == 2
     assert "last.safetensors" in capsys.readouterr().err
 
 
@@ -34,7 +35,7 @@ def test_the_evaluate_command(tmp_path, capsys, monkeypatch):
     assert main_evaluate([str(paths.SHIPPED_RECORDING), "--every", "20", "--json", str(out)]) == 0
     assert "PCK@0.05" in capsys.readouterr().out
     assert set(json.loads(out.read_text())) >= {"all", "base", "tip_1", "tip_2"}
-    assert main_evaluate([str(tmp_path)]) == 2
+    assert COMMANDS["evaluate"]([str(tmp_path)]) == 2
 
 
 def test_the_card_beside_the_shipped_weights_is_theirs():
@@ -66,5 +67,5 @@ def test_stages_are_fine_tuned_on_labelled_frames(tmp_path, monkeypatch):
 
 
 def test_fine_tuning_needs_recordings_and_a_file(capsys):
-    assert main(["finetune"]) == 2
+    assert COMMANDS["train"](["finetune"]) == 2
     assert "--out" in capsys.readouterr().err
