@@ -23,15 +23,5 @@ from lib.recordings.recording import Kinematics, Recording
 from lib.recordings.truth import Truth
 from lib.recordings.writer import RecordingWriter
 
-__all__ = [
-    "Annotations",
-    "Frames",
-    "Kinematics",
-    "MonocularSequence",
-    "Recording",
-    "RecordingWriter",
-    "StereoFrame",
-    "Truth",
-    "import_retinal_microsurgery",
-    "read_image",
-]
+__all__ = ["Annotations", "Frames", "Kinematics", "MonocularSequence", "Recording", "RecordingWriter", "StereoFrame"]
+__all__ += ["Truth", "import_retinal_microsurgery", "read_image"]

@@ -61,9 +61,8 @@ def read_coco(path: Path, n_frames: int, image_size_px: tuple[int, int]) -> Anno
             for a in content["annotations"]
         ]
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise ValueError(
-            f"{path}: not COCO keypoints ({type(error).__name__}: {error}). Export the annotations again."
-        ) from None
+        what = f"not COCO keypoints ({type(error).__name__}: {error})"
+        raise ValueError(f"{path}: {what}. Export the annotations again.") from None
     width, height = image_size_px
     u = np.full((2, n_frames, len(LANDMARKS), 2), np.nan)
     visibility = np.zeros((2, n_frames, len(LANDMARKS)), dtype=np.int64)
@@ -75,10 +74,8 @@ def read_coco(path: Path, n_frames: int, image_size_px: tuple[int, int]) -> Anno
             raise ValueError(f"{path}: category {category_id} has keypoints {names}; {list(LANDMARKS)} are needed.")
         file = PurePosixPath(image)
         if file.parent.name not in _SIDES or not file.stem.isdecimal() or int(file.stem) >= n_frames:
-            raise ValueError(
-                f"{path}: image {image!r} is not a frame of this recording (left/000000.jpg to "
-                f"right/{n_frames - 1:06d}.jpg)."
-            )
+            known = f"left/000000.jpg to right/{n_frames - 1:06d}.jpg"
+            raise ValueError(f"{path}: image {image!r} is not a frame of this recording ({known}).")
         side, frame = _SIDES.index(file.parent.name), int(file.stem)
         if (side, frame) in seen:
             raise ValueError(f"{path}: image {file} is annotated twice; a frame has one tool.")

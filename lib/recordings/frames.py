@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import itertools
 import warnings
-from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import cv2
@@ -172,30 +171,27 @@ class Frames(Sequence[StereoFrame]):
     def __init__(self, left: ImageFolder | Video, right: ImageFolder | Video, time_s: np.ndarray) -> None:
         self.time_s = np.array(time_s, dtype=np.float64)
         self.time_s.setflags(write=False)
-        self._sides = (left, right)
-        self._indices = range(len(self.time_s))
-        self._cache: OrderedDict[int, StereoFrame] = OrderedDict()
+        self._numbers = range(len(time_s))
+
+        @lru_cache(_CACHED_PAIRS)  # shared by all slices
+        def read(number: int) -> StereoFrame:
+            images = left.read(number), right.read(number)
+            for image in images:
+                image.setflags(write=False)
+            return StereoFrame(*images, float(time_s[number]))
+
+        self._read = read
 
     def __len__(self) -> int:
-        return len(self._indices)
+        return len(self._numbers)
 
     def __getitem__(self, index: int | slice) -> StereoFrame | Frames:
         if isinstance(index, slice):
             part = object.__new__(Frames)
-            part.time_s, part._sides, part._indices = self.time_s[index], self._sides, self._indices[index]
-            part._cache = self._cache  # keyed by the frame's number on disk
+            part.time_s, part._numbers, part._read = self.time_s[index], self._numbers[index], self._read
             return part
         try:
-            number, time_s = self._indices[index], float(self.time_s[index])
+            number = self._numbers[index]
         except IndexError:
             raise IndexError(f"frame {index}: the recording has {len(self)} frames.") from None
-        if number in self._cache:
-            self._cache.move_to_end(number)
-            return self._cache[number]
-        left, right = (side.read(number) for side in self._sides)
-        left.setflags(write=False)
-        right.setflags(write=False)
-        self._cache[number] = frame = StereoFrame(left, right, time_s)
-        for old in list(itertools.islice(self._cache, max(0, len(self._cache) - _CACHED_PAIRS))):
-            del self._cache[old]
-        return frame
+        return self._read(number)

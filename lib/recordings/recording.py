@@ -21,8 +21,6 @@ __all__ = ["FORMAT", "KINEMATICS_COLUMNS", "UNITS", "Kinematics", "Recording"]
 FORMAT = "microstereo.recording"
 UNITS = {"length": "mm", "image": "px", "time": "s"}
 KINEMATICS_COLUMNS = ["time_s", *columns(["x_mm", "y_mm", "z_mm"])]
-# A forceps jaw or shaft in mm; metres and micrometres fall far outside.
-_PLAUSIBLE_TOOL_MM = (0.1, 100.0)
 _REQUIRED = {"name": str, "fps": float, "image_size_px": list}
 _DEFAULTS = {"description": "", "readout_s": 0.0, "offset_s": 0.0, "robot_accuracy_mm": 0.010, "details": {}}
 _FIXED = {"format": FORMAT, "units": UNITS, "skeleton": list(LANDMARKS)}
@@ -54,18 +52,11 @@ class Kinematics:
             time = np.repeat(time[:, None], len(LANDMARKS), axis=1)
         if time.ndim != 2 or time.shape[1] != len(LANDMARKS):
             raise ValueError(f"time_s: expected (n,) or (n, 3), got {time.shape}.")
-        after = np.clip(np.searchsorted(self.time_s, time, side="right"), 1, max(len(self.time_s) - 1, 1))
-        before = np.minimum(after - 1, len(self.time_s) - 1)
-        after = np.minimum(after, len(self.time_s) - 1)
-        span = self.time_s[after] - self.time_s[before]
-        weight = np.where(span > 0, (time - self.time_s[before]) / np.where(span > 0, span, 1.0), 0.0)[..., None]
-        landmark = np.arange(len(LANDMARKS))
-        first, second = self.x_mm[before, landmark], self.x_mm[after, landmark]
-        # A weight of exactly 0 or 1 must not mix in a dropped neighbour.
-        x = np.where(weight == 0, first, np.where(weight == 1, second, (1 - weight) * first + weight * second))
-        with np.errstate(invalid="ignore"):
-            inside = (time >= self.time_s[0]) & (time <= self.time_s[-1])
-        return np.where(inside[..., None], x, np.nan)
+        x = np.empty((*time.shape, 3))
+        for landmark, axis in np.ndindex(len(LANDMARKS), 3):  # exactly on a sample, a dropped neighbour has no effect
+            report = self.time_s, self.x_mm[:, landmark, axis]
+            x[:, landmark, axis] = np.interp(time[:, landmark], *report, left=np.nan, right=np.nan)
+        return x
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,10 +118,8 @@ class Recording:
         robot_time = frames.time_s + header["offset_s"]
         if robot_time[-1] < kinematics.time_s[0] or robot_time[0] > kinematics.time_s[-1]:
             seen, told = ("{:.3f} to {:.3f} s".format(*time[[0, -1]]) for time in (robot_time, kinematics.time_s))
-            raise ValueError(
-                f"{folder}: the frames ({seen}, robot clock) and kinematics.csv ({told}) do not overlap; check time_s "
-                "(seconds) and offset_s."
-            )
+            what = f"the frames ({seen}, robot clock) and kinematics.csv ({told}) do not overlap"
+            raise ValueError(f"{folder}: {what}; check time_s (seconds) and offset_s.")
         path = folder / "annotations.json"
         annotations = read_coco(path, len(frames), size) if path.exists() else None
         truth = Truth.read(folder / "truth", len(frames)) if (folder / "truth").is_dir() else None
@@ -185,17 +174,13 @@ def _read_header(path: Path) -> dict:
 def _read_times(path: Path, n: int, fps: float) -> np.ndarray:
     if not path.exists():
         return np.arange(n) / fps
-    table = read_table(path, ["frame", "time_s"])
-    if len(table) != n or not np.array_equal(table[:, 0], np.arange(n)):
-        raise ValueError(f"{path}: expected one row for each of the {n} frames, 0 to {n - 1}; got {len(table)}.")
+    table = read_table(path, ["frame", "time_s"], n_frames=n)
     _check_increasing(path, table[:, 1])
     return table[:, 1]
 
 
 def _check_increasing(path: Path, time_s: np.ndarray) -> None:
-    bad = np.flatnonzero(~np.isfinite(time_s))
-    if not bad.size:
-        bad = np.flatnonzero(np.diff(time_s) <= 0) + 1
+    bad = np.flatnonzero(~(np.diff(time_s, prepend=-np.inf) > 0))
     if bad.size:
         raise ValueError(f"{path}, line {bad[0] + 2}: time_s must be a number larger than the row before.")
 
@@ -215,8 +200,7 @@ def _read_kinematics(path: Path) -> Kinematics:
     if not np.isfinite(reach).any():
         raise ValueError(f"{path}: no row holds the base and a tip; the kinematics are empty.")
     reach_mm = float(np.nanmedian(reach))
-    low, high = _PLAUSIBLE_TOOL_MM
-    if not low <= reach_mm <= high:
-        what = f"the median distance from base to tip is {reach_mm:.4g}, not plausible in mm ({low} to {high})"
+    if not 0.1 <= reach_mm <= 100:  # a jaw or shaft in metres or micrometres falls far outside
+        what = f"the median distance from base to tip is {reach_mm:.4g}, not plausible in mm (0.1 to 100)"
         raise ValueError(f"{path}: {what}. Metres or micrometres? Convert to mm.")
     return Kinematics(table[:, 0], x)

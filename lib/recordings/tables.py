@@ -25,15 +25,18 @@ def columns(axes: Sequence[str]) -> list[str]:
     return [f"{landmark}_{axis}" for landmark in LANDMARKS for axis in axes]
 
 
-def read_table(path: Path, names: Sequence[str], optional: Sequence[str] = ()) -> np.ndarray:
+def read_table(
+    path: Path, names: Sequence[str], optional: Sequence[str] = (), *, n_frames: int | None = None
+) -> np.ndarray:
     """The columns `names`, then `optional`, of a CSV file as (rows, columns) float64; an empty cell is NaN.
 
-    A file has all of the optional columns or none of them; then they are NaN.
+    A file has all of the optional columns or none of them; then they are NaN.  With `n_frames` the first column must
+    number the frames from 0.
 
     Raises:
         FileNotFoundError: If there is no such file.
-        ValueError: For text that is not UTF-8; a missing, unknown or repeated column; a short or long row; a cell that
-            is not a finite number ("nan" included: a missing value is an empty cell).  The text names file and line.
+        ValueError: For text that is not UTF-8; a missing, unknown or repeated column; a short, long or missing row; a
+            cell that is not a finite number ("nan" included: a missing value is an empty cell).  Names file and line.
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file.")
@@ -61,6 +64,9 @@ def read_table(path: Path, names: Sequence[str], optional: Sequence[str] = ()) -
         raise ValueError(f"{path}, line {reader.line_num}: not CSV ({error}). Export the table again.") from None
     table = np.full((len(rows), len(names) + len(optional)), np.nan)
     table[:, : len(wanted)] = np.array(rows, dtype=np.float64).reshape(len(rows), len(wanted))
+    if n_frames is not None and not np.array_equal(table[:, 0], np.arange(n_frames)):
+        what = f"expected one row for each of the {n_frames} frames, 0 to {n_frames - 1}"
+        raise ValueError(f"{path}: {what}; got {len(table)}.")
     return table
 
 

@@ -55,9 +55,7 @@ class Truth:
     def read(cls, folder: Path, n: int) -> Truth:
         """The truth of `n` frames; errors name the file."""
         path = folder / "landmarks.csv"
-        table = read_table(path, _COLUMNS, optional=_GLINT_COLUMNS)
-        if len(table) != n or not np.array_equal(table[:, 0], np.arange(n)):
-            raise ValueError(f"{path}: expected one row for each of the {n} frames, got {len(table)}.")
+        table = read_table(path, _COLUMNS, optional=_GLINT_COLUMNS, n_frames=n)
         u, visibility = np.split(table[:, 10:28].reshape(n, 3, 2, 3), [2], axis=-1)
         visibility = np.nan_to_num(visibility[..., 0]).astype(np.int64)
         glints = table[:, 28:].reshape(n, 3, 2)

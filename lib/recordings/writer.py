@@ -48,28 +48,18 @@ class RecordingWriter:
     """
 
     def __init__(
-        self,
-        folder: str | Path,
-        *,
-        name: str,
-        fps: float,
-        image_size_px: tuple[int, int],
-        description: str = "",
-        readout_s: float = 0.0,
-        offset_s: float = 0.0,
-        robot_accuracy_mm: float = 0.010,
+        self, folder: str | Path, *, name: str, fps: float, image_size_px: tuple[int, int], description: str = "",
+        readout_s: float = 0.0, offset_s: float = 0.0, robot_accuracy_mm: float = 0.010,
         details: Mapping[str, float | int | str] | None = None,
-        suffix: str = ".jpg",
-        jpeg_quality: int = 90,
-        overwrite: bool = False,
-    ) -> None:
+        suffix: str = ".jpg", jpeg_quality: int = 90, overwrite: bool = False,
+    ) -> None:  # fmt: skip
         if suffix not in {".jpg", ".png"}:
             raise ValueError(f"suffix: '.jpg' or '.png', got {suffix!r}.")
         self.target, self._overwrite = Path(folder), overwrite
         self._check_target()
         self.folder = self.target.with_name(f"{self.target.name}.{os.getpid()}-{os.urandom(3).hex()}.partial")
         self.fps, self.image_size_px = float(fps), (int(image_size_px[0]), int(image_size_px[1]))
-        self._suffix, self._quality = suffix, int(jpeg_quality)
+        self._suffix, self._options = suffix, [cv2.IMWRITE_JPEG_QUALITY, int(jpeg_quality)] if suffix == ".jpg" else []
         self._header = {"format": FORMAT, "name": name, "description": description, "fps": self.fps}
         self._header |= {"image_size_px": list(self.image_size_px), "skeleton": list(LANDMARKS)}
         self._header["robot_accuracy_mm"] = float(robot_accuracy_mm)
@@ -108,11 +98,10 @@ class RecordingWriter:
         """Append a stereo pair, (h, w, 3) uint8 RGB each; `time_s` on the video clock, None = uniform at fps."""
         index = len(self._time_s)
         shape = (self.image_size_px[1], self.image_size_px[0], 3)
-        options = [cv2.IMWRITE_JPEG_QUALITY, self._quality] if self._suffix == ".jpg" else []
         for side, image in (("left", left), ("right", right)):
             if image.shape != shape or image.dtype != np.uint8:
                 raise ValueError(f"{side}: expected {shape} uint8 RGB, got {image.shape} {image.dtype}.")
-            ok, data = cv2.imencode(self._suffix, cv2.cvtColor(image, cv2.COLOR_RGB2BGR), options)
+            ok, data = cv2.imencode(self._suffix, cv2.cvtColor(image, cv2.COLOR_RGB2BGR), self._options)
             if not ok:
                 raise ValueError(f"{side}: the image could not be encoded as {self._suffix}.")
             write_bytes(self.folder / side / f"{index:06d}{self._suffix}", data.tobytes())

@@ -11,17 +11,5 @@ from lib.simulator.recording import Design, Reports, simulate
 from lib.simulator.render import View, render_pair, render_view
 from lib.simulator.window import Window
 
-__all__ = [
-    "Design",
-    "Eye",
-    "Forceps",
-    "Microscope",
-    "Motion",
-    "Pose",
-    "Reports",
-    "View",
-    "Window",
-    "render_pair",
-    "render_view",
-    "simulate",
-]
+__all__ = ["Design", "Eye", "Forceps", "Microscope", "Motion", "Pose", "Reports", "View", "Window"]
+__all__ += ["render_pair", "render_view", "simulate"]

@@ -87,14 +87,8 @@ def _make_sequence(folder: Path, seed: int, index: int, n_pairs: int, duration_s
 
 
 def make_dataset(
-    folder: Path,
-    *,
-    seed: int = 0,
-    n_pairs: int = 80,
-    duration_s: float = 60.0,
-    workers: int | None = None,
-    shrink: int = 1,
-) -> list[Path]:
+    folder: Path, *, seed: int = 0, n_pairs: int = 80, duration_s: float = 60.0, workers: int | None = None, shrink: int = 1
+) -> list[Path]:  # fmt: skip
     """Make the sequences that are missing in `folder`, in parallel; the files depend on seed and size alone.
 
     A sequence appears whole or not at all: after a kill, the finished ones are kept and the others are made.
@@ -107,14 +101,12 @@ def make_dataset(
     Raises:
         ValueError: If the folder holds a data set of another seed or size, or a damaged sequence.
     """
-    folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    stamp = folder / "dataset.json"
-    description = {"seed": seed, "pairs_a_sequence": n_pairs, "duration_s": duration_s, "shrink": shrink}
-    if stamp.is_file() and _read_stamp(stamp) != description:
-        found = " ".join(stamp.read_text(encoding="utf-8", errors="replace").split())
-        raise ValueError(f"{folder}: holds another data set ({found}); delete it or choose another folder.")
-    files.write_json(stamp, description)
+    stamp, size = folder / "dataset.json", {"pairs_a_sequence": n_pairs, "duration_s": duration_s, "shrink": shrink}
+    text = json.dumps({"seed": seed, **size}, indent=1) + "\n"
+    if stamp.is_file() and (found := stamp.read_text(encoding="utf-8", errors="replace").split()) != text.split():
+        raise ValueError(f"{folder}: holds another data set ({' '.join(found)}); delete it or choose another folder.")
+    files.write_text(stamp, text)
     _missing(folder)  # names a damaged sequence
     for leftover in folder.glob("t*_??.*.partial"):
         shutil.rmtree(leftover)  # of a run that was killed
@@ -125,37 +117,24 @@ def make_dataset(
     return list(jobs)
 
 
-def _read_stamp(path: Path) -> object:
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except ValueError:
-        return None
-
-
 def _missing(folder: Path) -> list[int]:
     """The sequences that `folder` does not hold; what it holds must open as a recording."""
-    missing = []
-    for index in _SEQUENCES:
-        sequence = folder / sequence_name(index)
-        if not sequence.exists():
-            missing.append(index)
-            continue
+    made = {index: folder / sequence_name(index) for index in _SEQUENCES if (folder / sequence_name(index)).exists()}
+    for sequence in made.values():
         try:
             Recording.open(sequence)
         except (ValueError, OSError) as error:
             raise ValueError(f"{sequence}: damaged ({error}). Delete the folder and it is made anew.") from error
-    return missing
+    return [index for index in _SEQUENCES if index not in made]
 
 
 def seconds_a_pair(shrink: int) -> float:
     """CPU seconds of a stereo pair of the data set on this machine, measured on two pairs; the eye's texture excluded."""
-    eye = Eye(seed=_SHIPPED_SEED, texture_px=max(Eye.texture_px // shrink, 64))
-    size, zoom = Microscope.image_size_px, Microscope.pixels_per_mm
-    microscope = Microscope(image_size_px=tuple(v // shrink for v in size), pixels_per_mm=tuple(v / shrink for v in zoom))
-    eye.texture  # noqa: B018 - once an eye, not once a pair
+    design = sequence_design(0, TEST_SEQUENCES[0], shrink=shrink, duration_s=1.5)
+    design.eye.texture  # noqa: B018 - once an eye, not once a pair
     with tempfile.TemporaryDirectory() as folder:
         start = time.process_time()
-        simulate(Path(folder) / "pairs", Design(eye, microscope=microscope, duration_s=1.5), n_frames=2, progress=False)
+        simulate(Path(folder) / "pairs", design, n_frames=2, progress=False)
         return (time.process_time() - start) / 2
 
 
@@ -176,17 +155,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments.seed < 0 or not 0 < arguments.duration < float("inf"):
         parser.error("--seed must not be negative, --duration must be positive and finite.")
     try:
-        if not arguments.shipped:
-            return _run(arguments)
-        recording = make_shipped_recording()
-        print(f"{recording.folder}: {len(recording)} pairs.")
-        return 0
+        if arguments.shipped:
+            recording = make_shipped_recording()
+            print(f"{recording.folder}: {len(recording)} pairs.")
+        else:
+            _run(arguments)
     except (ValueError, OSError) as error:
         print(error, file=sys.stderr)
         return 1
+    return 0
 
 
-def _run(arguments: argparse.Namespace) -> int:
+def _run(arguments: argparse.Namespace) -> None:
     pairs, shrink = arguments.pairs, arguments.shrink
     folder = arguments.folder or paths.CACHE / f"dataset-{arguments.seed}"
     left = len(_missing(folder)) * pairs
@@ -197,13 +177,9 @@ def _run(arguments: argparse.Namespace) -> int:
         f"{workers} idle core{'s' if workers > 1 else ''}, {left * _MB_PER_PAIR / shrink**2 / 1000:.2f} GB.",
         flush=True,
     )
-    if arguments.dry_run:
-        return 0
-    start = time.perf_counter()
-    make_dataset(
-        folder, seed=arguments.seed, n_pairs=pairs, duration_s=arguments.duration, workers=workers, shrink=shrink
-    )
-    seconds = time.perf_counter() - start
-    if left:
-        print(f"{left} pairs in {seconds / 60:.1f} min, {seconds / left:.2f} s a pair.")
-    return 0
+    if not arguments.dry_run:
+        start, length = time.perf_counter(), {"n_pairs": pairs, "duration_s": arguments.duration}
+        make_dataset(folder, seed=arguments.seed, workers=workers, shrink=shrink, **length)
+        seconds = time.perf_counter() - start
+        if left:
+            print(f"{left} pairs in {seconds / 60:.1f} min, {seconds / left:.2f} s a pair.")

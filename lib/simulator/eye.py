@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 
@@ -26,12 +26,8 @@ class Scene(Protocol):
     """
 
     gloss: float
-
-    @property
-    def texture(self) -> np.ndarray: ...
-
-    @property
-    def extent_mm(self) -> float: ...
+    extent_mm: float
+    texture: np.ndarray
 
     def height(self, x: np.ndarray, y: np.ndarray) -> np.ndarray: ...
 
@@ -52,6 +48,7 @@ class Eye:
         turn_rad: Rotation of the texture on the surface, so that one texture serves many eyes.
     """
 
+    extent_mm: ClassVar[float] = EXTENT_MM
     seed: int = 0
     radius_mm: float = 9.3
     depth_mm: float = 2.2
@@ -70,11 +67,6 @@ class Eye:
         check(self, "tilt_rad", lambda v: 0 <= v <= 0.3, "must lie between 0 and 0.3")
         not_negative(self, "gloss")
         check(self, "texture_px", lambda v: v >= 64, "must be at least 64")
-
-    @property
-    def extent_mm(self) -> float:
-        """Side of the textured square."""
-        return EXTENT_MM
 
     @property
     def texture_from_surface(self) -> np.ndarray:

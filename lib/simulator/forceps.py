@@ -97,51 +97,42 @@ class Forceps:
         check(self, "tip_radius_mm", lambda v: v <= 0.02, "beyond 0.02 a tip is no point to measure")
         check(self, "brightness", lambda v: 0 < v <= 1, "must lie between 0 and 1")
 
-    def jaw(self, side: int, opening_mm: float, n: int = 15) -> tuple[np.ndarray, np.ndarray]:
+    def _jaw(self, side: int, opening_mm: float) -> tuple[np.ndarray, np.ndarray]:
         """Centreline (n, 3) in the tool frame and radii (n,), from the base to the tip; `side` +1 is jaw 1.
 
         The last centre lies one tip radius before the landmark, so that the landmark is the jaw's end.
         """
-        s = 1 - (1 - np.linspace(0, 1, n)) ** 1.4  # denser towards the tip
+        s = 1 - (1 - np.linspace(0, 1, 15)) ** 1.4  # denser towards the tip
         half = max(opening_mm / 2, self.tip_radius_mm)
         root = 0.45 * self.jaw_radius_mm
         y = root * (1 - s) ** 2 + self.bow_mm * np.sin(np.pi * s) ** 1.2
         y += self.hook_mm * np.clip((s - 0.6) / 0.2, 0, 1) * np.clip((1 - s) / 0.2, 0, 1)
         y += half * s**1.5
-        z = -self.bend_mm * s**2
         # Opening the jaws turns them, it does not stretch them.
         x = s * np.sqrt(max(self.jaw_length_mm**2 - max(half - self.tip_radius_mm, 0) ** 2, 1e-6))
-        line = np.column_stack([x, side * y, z])
+        line = np.column_stack([x, side * y, -self.bend_mm * s**2])
         radii = self.tip_radius_mm + (self.jaw_radius_mm - self.tip_radius_mm) * (1 - s) ** self.taper
         end = line[-1] - line[-2]
         line[-1] -= self.tip_radius_mm * end / np.linalg.norm(end)
         return line, radii
 
-    def landmarks_in_tool(self, opening_mm: float) -> np.ndarray:
-        """base, tip_1, tip_2 (3, 3) in the tool frame."""
-        points = [np.zeros(3)]
-        for side in (+1, -1):
-            line, radii = self.jaw(side, opening_mm)
-            direction = line[-1] - line[-2]
-            points.append(line[-1] + radii[-1] * direction / np.linalg.norm(direction))
-        return np.array(points)
-
     def landmarks(self, pose: Pose) -> np.ndarray:
         """base, tip_1, tip_2 (3, 3) mm in the microscope frame."""
-        return self.landmarks_in_tool(pose.opening_mm) @ pose.microscope_from_tool.T + np.asarray(pose.base_mm)
+        points = [np.zeros(3)]
+        for side in (+1, -1):
+            line, radii = self._jaw(side, pose.opening_mm)
+            direction = line[-1] - line[-2]
+            points.append(line[-1] + radii[-1] * direction / np.linalg.norm(direction))
+        return np.array(points) @ pose.microscope_from_tool.T + np.asarray(pose.base_mm)
 
-    def nodes(self, pose: Pose, shaft_step_mm: float = 1.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def nodes(self, pose: Pose) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The tool as chains of round cones, in the microscope frame.
 
         Returns: (n, 3) centres, (n,) radii in mm, (n,) chain of each node: 0 shaft (far end first), 1 and 2 the jaws.
         """
-        k = max(2, round(self.shaft_length_mm / shaft_step_mm) + 1)
+        k = max(2, round(self.shaft_length_mm) + 1)
         shaft = np.column_stack([np.linspace(-self.shaft_length_mm, 0, k), np.zeros(k), np.zeros(k)])
-        lines, radii, chains = [shaft], [np.full(k, self.shaft_radius_mm)], [np.zeros(k, int)]
-        for chain, side in ((1, +1), (2, -1)):
-            line, radius = self.jaw(side, pose.opening_mm)
-            lines.append(line)
-            radii.append(radius)
-            chains.append(np.full(len(line), chain))
+        parts = [(shaft, np.full(k, self.shaft_radius_mm)), *(self._jaw(side, pose.opening_mm) for side in (+1, -1))]
+        lines, radii = zip(*parts, strict=True)
         centres = np.vstack(lines) @ pose.microscope_from_tool.T + np.asarray(pose.base_mm)
-        return centres, np.concatenate(radii), np.concatenate(chains)
+        return centres, np.concatenate(radii), np.repeat(np.arange(3), [len(line) for line in lines])

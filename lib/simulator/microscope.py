@@ -6,12 +6,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lib.cameras import StereoRig
+from lib.cameras import AffineCamera, NearAffineCamera, StereoRig
 from lib.geometry import RigidTransform
 from lib.simulator.limits import check, not_negative, positive
-from lib.simulator.rig import IMAGE_SIZE_PX, ROBOT_FROM_MICROSCOPE, reference_rig
 
-__all__ = ["Microscope"]
+__all__ = ["IMAGE_SIZE_PX", "ROBOT_FROM_MICROSCOPE", "Microscope"]
+
+IMAGE_SIZE_PX = (1920, 1080)
+
+#: Where the reference microscope stands over the reference robot: any general pose would do.
+ROBOT_FROM_MICROSCOPE = RigidTransform.from_rotation_vector((0.15, 2.90, -0.25), (12.0, -7.0, 35.0))
 
 
 @dataclass(frozen=True)
@@ -19,7 +23,8 @@ class Microscope:
     """Optics and sensor.  Two values in a tuple are (left, right); three are (red, green, blue).
 
     Attributes:
-        pixels_per_mm, image_rotation_rad, convergence_rad, image_size_px: Geometry, as in `reference_rig`.
+        pixels_per_mm, image_rotation_rad: Zoom and in-plane rotation, independent of each other.
+        convergence_rad: Angle between the two viewing directions.
         depth_of_field_mm: Total range of depth around `focus_z_mm` within which defocus is at most one pixel (standard
             deviation at 100 px per mm); infinity switches defocus off.
         psf_px: Standard deviation of the point spread in focus.
@@ -66,18 +71,23 @@ class Microscope:
         positive(self, "spot_radius_mm fps")
         check(self, "jpeg_quality", lambda v: v is None or 0 <= v <= 100, "must lie between 0 and 100 or be None")
         check(self, "inverse_distance_per_mm", lambda v: -0.05 < v < 0.05, "the working distance must exceed 20 mm")
-        self.rig(RigidTransform.identity())  # refuses a zoom or convergence that is no rig
+        check(self, "pixels_per_mm", lambda v: min(v) > 0, "must be positive")
+        check(self, "convergence_rad", lambda v: 0 < v < np.pi / 2, "must lie between 0 and pi/2")
 
     def rig(self, robot_from_microscope: RigidTransform = ROBOT_FROM_MICROSCOPE) -> StereoRig:
         """The true cameras, affine or near-affine; `RigidTransform.identity()` gives them in the microscope frame."""
-        return reference_rig(
-            pixels_per_mm=self.pixels_per_mm,
-            image_rotation_rad=self.image_rotation_rad,
-            convergence_rad=self.convergence_rad,
-            image_size_px=self.image_size_px,
-            inverse_distance_per_mm=self.inverse_distance_per_mm,
-            robot_from_microscope=robot_from_microscope,
-        )
+        centre_px = (np.array(self.image_size_px) - 1) / 2
+        cameras = []
+        for side, zoom, roll in zip((+1, -1), self.pixels_per_mm, self.image_rotation_rad, strict=True):
+            # The left camera stands at negative x and looks towards positive x.
+            tilt = RigidTransform.from_rotation_vector((0.0, -side * self.convergence_rad / 2, 0.0))
+            spin = RigidTransform.from_rotation_vector((0.0, 0.0, roll))
+            camera_from_robot = spin.compose(tilt).compose(robot_from_microscope.inverse())
+            matrix = zoom * np.column_stack([camera_from_robot.R[:2], camera_from_robot.t[:2]])
+            matrix[:, 3] += centre_px
+            near = self.inverse_distance_per_mm, centre_px, robot_from_microscope.t
+            cameras.append(NearAffineCamera(matrix, *near) if near[0] else AffineCamera(matrix))
+        return StereoRig(*cameras)
 
     def defocus_px(self, z_mm: np.ndarray) -> np.ndarray:
         """Standard deviation of the defocus at depth z, at 100 px per mm: 1 px at the ends of the depth of field."""

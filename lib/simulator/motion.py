@@ -61,16 +61,12 @@ class Motion:
             points = self._sweep(rng, side)
             pace = np.linalg.norm(np.diff(np.array(points)[:, :3], axis=0), axis=1) + 0.8  # mm, plus time to turn
             times = np.concatenate([[0], np.cumsum(pace)]) / pace.sum() * sweep_end
-            parts.append((0.0, self._through(points, times)))
+            parts.append((0.0, PchipInterpolator(times, np.array(points))))
         if sweep_end < self.duration_s:
             points, shares = self._surgeon(rng, side)
             times = np.concatenate([[0], np.cumsum(shares)]) / np.sum(shares) * (self.duration_s - sweep_end)
-            parts.append((sweep_end, self._through(points, sweep_end + times)))
+            parts.append((sweep_end, PchipInterpolator(sweep_end + times, np.array(points))))
         return tuple(parts)
-
-    @staticmethod
-    def _through(points: list[list[float]], times: np.ndarray) -> PchipInterpolator:
-        return PchipInterpolator(times, np.array(points), axis=0, extrapolate=True)
 
     def _sweep(self, rng: np.random.Generator, side: float) -> list[list[float]]:
         half_x, half_y = self.half_field_mm
@@ -87,18 +83,14 @@ class Motion:
 
     def _surgeon(self, rng: np.random.Generator, side: float) -> tuple[list[list[float]], list[float]]:
         half_x, half_y = 0.7 * np.array(self.half_field_mm)
-        points: list[list[float]] = []
-        shares: list[float] = []
+        points, shares = [], []
         for _ in range(max(1, round(self.duration_s * (0.34 if self.kind == "both" else 1.0) / 9))):
             x, y = rng.uniform(-half_x, half_x), rng.uniform(-half_y, half_y)
             ground = float(self.scene.height(np.array(x), np.array(y)))
-            turn = np.array(
-                [side + rng.normal(0, 0.3), rng.uniform(0.25, 0.6), np.clip(rng.normal(0, 0.25), -0.8, 0.8)]
-            )
+            turn = np.array([side + rng.normal(0, 0.3), rng.uniform(0.25, 0.6), np.clip(rng.normal(0, 0.25), -0.8, 0.8)])
             wide, shut = 0.35 * self.forceps.jaw_length_mm, 0.03
-            peel = rng.uniform(0.8, 2.2) * np.array([np.cos(side + np.pi), np.sin(side + np.pi)]) + rng.normal(
-                0, 0.4, 2
-            )
+            peel = rng.uniform(0.8, 2.2) * np.array([np.cos(side + np.pi), np.sin(side + np.pi)])
+            peel += rng.normal(0, 0.4, 2)
             path = [
                 ((0, 0), 2.2, wide * 0.6, 1.6),  # come near
                 ((0, 0), 0.5, wide, 1.0),  # open and descend
@@ -121,9 +113,8 @@ class Motion:
         time = float(np.clip(time_s, 0, self.duration_s))
         start, path = [part for part in self._parts if part[0] <= time][-1]
         x, y, z, azimuth, pitch, roll, opening = path(time)
-        pose = Pose(
-            (0.0, 0.0, 0.0), azimuth, max(pitch, 0.0), np.clip(roll, -MAX_ROLL_RAD, MAX_ROLL_RAD), max(opening, 0)
-        )
+        roll = np.clip(roll, -MAX_ROLL_RAD, MAX_ROLL_RAD)
+        pose = Pose((0.0, 0.0, 0.0), azimuth, max(pitch, 0.0), roll, max(opening, 0))
         base, *tips = self.forceps.landmarks(pose)
         lowest = max(tip[2] for tip in tips)
         centre = (base + np.mean(tips, axis=0)) / 2
@@ -131,17 +122,9 @@ class Motion:
         for tip in tips:
             ground = float(self.scene.height(np.array(tip[0] + moved[0]), np.array(tip[1] + moved[1])))
             moved[2] = min(moved[2], ground - _CLEARANCE_MM - tip[2])
-        surgeon = (self.kind != "sweep" and start > 0) or self.kind == "surgeon"
-        if surgeon and self.tremor_mm:
-            moved += self._tremor(time)
+        if self.kind == "surgeon" or start > 0:
+            rng = np.random.default_rng([self.seed, 29])
+            frequency, phase = rng.uniform(8, 12, (3, 3)), rng.uniform(0, 2 * np.pi, (3, 3))
+            size = self.tremor_mm / 2 * np.array([0.75, 0.75, 0.4])[:, None] * np.array([0.6, 0.3, 0.2])
+            moved += (size * np.sin(2 * np.pi * frequency * time + phase)).sum(axis=1)
         return pose.moved(base_mm=tuple(float(v) for v in moved))
-
-    def _tremor(self, time: float) -> np.ndarray:
-        rng = np.random.default_rng([self.seed, 29])
-        frequency, phase = rng.uniform(8, 12, (3, 3)), rng.uniform(0, 2 * np.pi, (3, 3))
-        size = self.tremor_mm / 2 * np.array([0.75, 0.75, 0.4])[:, None] * np.array([0.6, 0.3, 0.2])
-        return (size * np.sin(2 * np.pi * frequency * time + phase)).sum(axis=1)
-
-    def later(self, time_s: float, step_s: float = 1e-3) -> tuple[Pose, float]:
-        """The pose `step_s` later and `step_s` itself: the renderer's argument `later`."""
-        return self.pose(time_s + step_s), step_s

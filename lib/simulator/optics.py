@@ -50,9 +50,7 @@ def motion_kernel(shift_px: np.ndarray) -> np.ndarray | None:
     return kernel / kernel.sum()
 
 
-def develop(
-    linear: np.ndarray, microscope: Microscope, gain: np.ndarray, rng: np.random.Generator | None
-) -> np.ndarray:
+def develop(linear: np.ndarray, microscope: Microscope, gain: np.ndarray, rng: np.random.Generator | None) -> np.ndarray:
     """The 8-bit image of linear light (h, w, 3) float32, which is overwritten; without `rng` no sensor noise."""
     linear *= gain.astype(np.float32)
     if rng is not None and np.isfinite(microscope.full_well):

@@ -17,23 +17,12 @@ from lib.cameras import AffineCamera
 from lib.geometry import RigidTransform
 from lib.simulator.eye import Eye
 from lib.simulator.forceps import Forceps, Pose
-from lib.simulator.microscope import Microscope
+from lib.simulator.microscope import IMAGE_SIZE_PX, Microscope
 from lib.simulator.render import render_view
-from lib.simulator.rig import IMAGE_SIZE_PX
 from lib.simulator.window import Window
 
-__all__ = [
-    "RESERVED_JAW_MM",
-    "RESERVED_SEEDS",
-    "TEXTURE_SEEDS",
-    "VALIDATION_TEXTURE_SEEDS",
-    "random_eye",
-    "random_forceps",
-    "random_microscope",
-    "random_pose",
-    "reserved_forceps",
-    "sample",
-]
+__all__ = ["RESERVED_JAW_MM", "RESERVED_SEEDS", "TEXTURE_SEEDS", "VALIDATION_TEXTURE_SEEDS"]
+__all__ += ["random_eye", "random_forceps", "random_microscope", "random_pose", "reserved_forceps", "sample"]
 
 #: Eyes (and the textures and brush marks that go with them) that training never draws.
 RESERVED_SEEDS = range(0, 10_000)
@@ -73,26 +62,21 @@ def random_forceps(rng: np.random.Generator, seed: int | None = None) -> Forceps
 def reserved_forceps(rng: np.random.Generator, seed: int) -> Forceps:
     """A design that training never draws; `seed`, one of `RESERVED_SEEDS`, makes its brush marks."""
     return replace(
-        random_forceps(rng, seed),
-        shaft_radius_mm=0.30,
-        jaw_length_mm=float(rng.uniform(*RESERVED_JAW_MM)),
-        jaw_radius_mm=float(rng.uniform(0.10, 0.15)),
-        brightness=float(rng.uniform(0.45, 0.65)),
-    )
+        random_forceps(rng, seed), shaft_radius_mm=0.30, jaw_length_mm=float(rng.uniform(*RESERVED_JAW_MM)),
+        jaw_radius_mm=float(rng.uniform(0.10, 0.15)), brightness=float(rng.uniform(0.45, 0.65)),
+    )  # fmt: skip
 
 
 def random_pose(rng: np.random.Generator, forceps: Forceps, surface_z_mm: float = 0.8) -> Pose:
     """A pose whose jaws lie in the field, between the retina and 3 mm above it, the shaft coming from anywhere."""
-    width, height = IMAGE_SIZE_PX
     azimuth = rng.uniform(-np.pi, np.pi)
     # The tips, not the base, fill the field; one time in ten they leave it a little.
     reach = 1.03 if rng.random() < 0.1 else 0.93
-    tips = np.array([rng.uniform(-1, 1) * width / 200, rng.uniform(-1, 1) * height / 200]) * reach
+    tips = rng.uniform(-1, 1, 2) * IMAGE_SIZE_PX / 200 * reach
     pitch = rng.uniform(0.08, 0.75)
-    direction = np.array([np.cos(azimuth), np.sin(azimuth)])
     flat = forceps.jaw_length_mm * np.cos(pitch)
-    tip_z = surface_z_mm - rng.exponential(0.9)
-    base = [*(tips - flat * direction), max(tip_z, -2.5) - forceps.jaw_length_mm * np.sin(pitch)]
+    tip_z = max(surface_z_mm - rng.exponential(0.9), -2.5)
+    base = [*(tips - flat * np.array([np.cos(azimuth), np.sin(azimuth)])), tip_z - forceps.jaw_length_mm * np.sin(pitch)]
     opening = 0.0 if rng.random() < 0.12 else rng.uniform(0.05, 0.55) * forceps.jaw_length_mm
     roll = np.clip(rng.normal(0, 0.4), -0.95, 0.95)
     return Pose(tuple(float(v) for v in base), azimuth, pitch, float(roll), opening)
@@ -114,15 +98,9 @@ def random_microscope(rng: np.random.Generator) -> Microscope:
 
 
 def sample(
-    rng: np.random.Generator,
-    *,
-    crop_px: int | None = None,
-    size_px: tuple[int, int] | None = None,
-    around: int | None = None,
-    jitter: float = 0.35,
-    zoom: tuple[float, float] = (0.85, 1.18),
-    textures: Sequence[int] = TEXTURE_SEEDS,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    rng: np.random.Generator, *, crop_px: int | None = None, size_px: tuple[int, int] | None = None,
+    around: int | None = None, jitter: float = 0.35, textures: Sequence[int] = TEXTURE_SEEDS,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
     """One training image with its landmarks; `rng` decides everything.
 
     Args:
@@ -130,7 +108,6 @@ def sample(
         size_px: (w, h) of the whole field shrunk to this size.  Without either size the image is the full-HD field.
         around: The landmark that a window holds, 0 base, 1 or 2 a tip; None = the jaws' centre.
         jitter: How far it may lie from the window's centre, as a share of the window's side.
-        zoom: Range of the magnification, relative to 100 px per mm.
         textures: Seeds of the fundus textures to draw from; each takes a second to make and then stays in memory.
 
     Returns: image (h, w, 3) uint8 RGB; u (3, 2) px of base, tip_1, tip_2, also if outside; visibility (3,): 0 outside,
@@ -145,40 +122,31 @@ def sample(
         raise ValueError(f"crop_px, size_px: must be at least 32, got {crop_px}, {size_px}.")
     eye, forceps, microscope = random_eye(rng, textures), random_forceps(rng), random_microscope(rng)
     pose = random_pose(rng, forceps, eye.centre_z_mm - 0.35 * eye.depth_mm)
-    magnification = 100.0 * rng.uniform(*zoom)
+    magnification = 100.0 * rng.uniform(0.85, 1.18)  # px per mm
     side = rng.choice([-1, 1])
     tilt = RigidTransform.from_rotation_vector((rng.normal(0, 0.01), -side * 0.057 + rng.normal(0, 0.01), 0.0))
     spin = RigidTransform.from_rotation_vector((0.0, 0.0, rng.normal(0, 0.05)))
-    R = spin.compose(tilt).R
     field = np.array(IMAGE_SIZE_PX)
-    camera = AffineCamera(np.column_stack([magnification * R[:2], (field - 1) / 2]))
-    origin = np.zeros(2)
-    size, whole = IMAGE_SIZE_PX, IMAGE_SIZE_PX
+    camera = AffineCamera(np.column_stack([magnification * spin.compose(tilt).R[:2], (field - 1) / 2]))
     if crop_px is not None:
         landmarks = camera.project(forceps.landmarks(pose))
         held = landmarks.mean(axis=0) if around is None else landmarks[around]
         origin = held - (crop_px - 1) / 2 + rng.uniform(-jitter, jitter, 2) * crop_px
         origin = np.round(np.clip(origin, 0, np.maximum(field - crop_px, 0)))
-        size = (crop_px, crop_px)
-        camera = AffineCamera(np.column_stack([camera.linear, camera.offset_px - origin]))
-    elif size_px is not None:
-        ratio = np.array(size_px) / field
-        if abs(ratio[0] / ratio[1] - 1) > 1e-6:
-            # The renderer's pixels are square: fill the width and stretch the rows afterwards.
-            square = (size_px[0], round(size_px[0] * field[1] / field[0]))
-        else:
-            square = tuple(size_px)
-        shrink = square[0] / field[0]
+        window = Window.around(camera, origin + crop_px / 2, (crop_px, crop_px), IMAGE_SIZE_PX)
+    else:
+        # The renderer's pixels are square: fill the width and stretch the rows afterwards.
+        size_px = size_px or IMAGE_SIZE_PX
+        shrink = size_px[0] / field[0]
         camera = AffineCamera(np.column_stack([camera.linear * shrink, (camera.offset_px + 0.5) * shrink - 0.5]))
-        size = whole = square
+        window = Window(camera, (size_px[0], round(field[1] * size_px[0] / field[0])))
         microscope = replace(microscope, psf_px=max(0.45, microscope.psf_px * shrink))
     speed = rng.normal(0, 2.0, 3) * (rng.random() < 0.5)
     later = (pose.moved(base_mm=tuple(np.asarray(pose.base_mm) + 1e-3 * speed)), 1e-3)
-    window = Window(camera, size, field_px=whole, origin_px=tuple(origin))
     view = render_view(eye, microscope, window, forceps=forceps, pose=pose, later=later, rng=rng)
     image, u = view.image, view.u
-    if size_px is not None and tuple(size_px) != size:
-        factor = np.array(size_px) / size
+    if size_px is not None and tuple(size_px) != window.size_px:
+        factor = np.array(size_px) / window.size_px
         image = cv2.resize(image, size_px, interpolation=cv2.INTER_AREA if factor[1] < 1 else cv2.INTER_LINEAR)
         u = (u + 0.5) * factor - 0.5
     encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, microscope.jpeg_quality])[1]

@@ -39,13 +39,7 @@ class ToolRaster:
 
 
 def rasterise(
-    centres: np.ndarray,
-    radii: np.ndarray,
-    chains: np.ndarray,
-    *,
-    zoom: float,
-    size_px: tuple[int, int],
-    factor: int = 2,
+    centres: np.ndarray, radii: np.ndarray, chains: np.ndarray, *, zoom: float, size_px: tuple[int, int], factor: int = 2
 ) -> ToolRaster | None:
     """Rasterise chains of round cones; None where nothing is in view.
 
@@ -92,14 +86,12 @@ def rasterise(
         s -= B
         s /= A
         flat = chains[k] == 0 and (k + 2 >= len(chains) or chains[k + 2] != 0)
-        past = s > 1 if flat else None
+        past = flat & (s > 1)
         np.clip(s, 0, 1, out=s)
         Q = (A * s + 2 * B) * s + C
         z = np.float32(a[2]) + s * np.float32(dz) - np.sqrt(np.maximum(Q, 0))
         view = np.s_[(ly - y0) * factor : (hy - y0) * factor, (lx - x0) * factor : (hx - x0) * factor]
-        closer = (Q > 0) & (z < depth[view])
-        if past is not None:
-            closer &= ~past
+        closer = (Q > 0) & (z < depth[view]) & ~past
         np.copyto(depth[view], z, where=closer)
         np.copyto(parameter[view], s, where=closer)
         np.copyto(index[view], np.int16(k), where=closer)

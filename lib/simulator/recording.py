@@ -6,21 +6,18 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import cv2
 import numpy as np
 from tqdm.auto import tqdm
 
-from lib import files
 from lib.geometry import RigidTransform
 from lib.recordings import Recording, RecordingWriter, Truth
 from lib.simulator.eye import Eye, Scene
 from lib.simulator.forceps import Forceps
 from lib.simulator.limits import check, not_negative
-from lib.simulator.microscope import Microscope
+from lib.simulator.microscope import ROBOT_FROM_MICROSCOPE, Microscope
 from lib.simulator.motion import DURATIONS_S, Motion
 from lib.simulator.population import RESERVED_SEEDS, reserved_forceps
 from lib.simulator.render import View, render_pair
-from lib.simulator.rig import ROBOT_FROM_MICROSCOPE
 from lib.simulator.window import surface_grid
 
 __all__ = ["Design", "Reports", "simulate"]
@@ -78,17 +75,9 @@ class Design:
 
 
 def simulate(
-    folder: str | Path,
-    design: Design | None = None,
-    *,
-    seed: int = 0,
-    n_frames: int = 40,
-    name: str | None = None,
-    description: str = "",
-    masks: bool = False,
-    progress: bool | Callable[[], object] = True,
-    overwrite: bool = False,
-) -> Recording:
+    folder: str | Path, design: Design | None = None, *, seed: int = 0, n_frames: int = 40, name: str | None = None,
+    description: str = "", progress: bool | Callable[[], object] = True, overwrite: bool = False,
+) -> Recording:  # fmt: skip
     """Simulate a recording and write it to `folder`, which appears whole or not at all.
 
     The frames are spread over the motion: the video keeps every k-th frame, as the times in frames.csv say.
@@ -98,7 +87,6 @@ def simulate(
         design: What the recording shows; None = the default microscope, an eye and a tool chosen by `seed`.
         seed: Drives every random source.
         name, description: Of recording.toml; None = the folder's name.
-        masks: Also write ``truth/masks``: tool and glints of every frame (PNG, red and green channel).
         progress: Whether to show a bar, or a function to call after every pair.
         overwrite: Replace a recording of that name.
 
@@ -118,8 +106,7 @@ def simulate(
     folder, design = Path(folder), design or Design()
     microscope, reports = design.microscope, design.reports
     eye = design.eye if design.eye is not None else Eye(seed=RESERVED_SEEDS[seed % len(RESERVED_SEEDS)])
-    tool_rng = np.random.default_rng([seed, 103])
-    forceps = design.forceps or reserved_forceps(tool_rng, seed=seed % len(RESERVED_SEEDS))
+    forceps = design.forceps or reserved_forceps(np.random.default_rng([seed, 103]), seed % len(RESERVED_SEEDS))
     duration_s = DURATIONS_S.get(design.motion, 30.0) if design.duration_s is None else design.duration_s
     motion = Motion(forceps, eye, kind=design.motion, seed=seed, duration_s=duration_s)
     step = max(1, int(motion.duration_s * microscope.fps / n_frames))
@@ -148,29 +135,27 @@ def simulate(
             pose, noise = motion.pose(time_s[k]), np.random.default_rng([seed, 107, k])
             views = render_pair(
                 eye, microscope, rig=rig if k < moved_at else moved_rig,
-                forceps=forceps, pose=pose, later=motion.later(time_s[k]), rng=noise,
+                forceps=forceps, pose=pose, later=(motion.pose(time_s[k] + 1e-3), 1e-3), rng=noise,
             )  # fmt: skip
             writer.add(views[0].image, views[1].image, time_s[k])
             landmarks[k] = forceps.landmarks(pose)
             for side, view in enumerate(views):
                 u[side, k], visibility[side, k], in_glint[side, k] = view.u, view.visibility, _in_glint(view)
-                if masks:
-                    _write_masks(writer.truth_folder / "masks" / ("left", "right")[side] / f"{k:06d}.png", view)
             if callable(progress):
                 progress()
         rng, robot_from_microscope = np.random.default_rng([seed, 101]), reports.robot_from_microscope
         count = int(np.ceil(time_s[-1] * _KINEMATICS_HZ)) + 1 + 2 * _KINEMATICS_MARGIN
         sample_s = (np.arange(count) - _KINEMATICS_MARGIN) / _KINEMATICS_HZ
-        truth = np.array([forceps.landmarks(motion.pose(t)) for t in sample_s])
-        reported = robot_from_microscope.apply(truth) + rng.normal(0, reports.robot_accuracy_mm, truth.shape)
+        reported = robot_from_microscope.apply(np.array([forceps.landmarks(motion.pose(t)) for t in sample_s]))
+        reported += rng.normal(0, reports.robot_accuracy_mm, reported.shape)
         reported[rng.random(count) < reports.dropout] = np.nan
         writer.kinematics(sample_s + reports.offset_s, reported)
         clicked = np.where(visibility[..., None] == 2, u + rng.normal(0, reports.click_px, u.shape), np.nan)
         writer.annotations(*clicked, *np.where(visibility == 2, 2, 0))
         x_px, y_px, surface_mm = surface_grid(eye, rig.left, microscope.image_size_px)
-        surface = x_px, y_px, robot_from_microscope.apply(surface_mm)
         rig_in_robot, x_mm = microscope.rig(robot_from_microscope), robot_from_microscope.apply(landmarks)
-        Truth(rig_in_robot, x_mm, *u, *visibility, writer.truth_folder, *in_glint).write(surface)
+        truth = Truth(rig_in_robot, x_mm, *u, *visibility, writer.truth_folder, *in_glint)
+        truth.write((x_px, y_px, robot_from_microscope.apply(surface_mm)))
         if design.camera_motion is not None:
             before = robot_from_microscope.compose(after_from_before.inverse())
             microscope.rig(before).save(writer.truth_folder / "moved_rig.json")
@@ -189,9 +174,3 @@ def _in_glint(view: View) -> np.ndarray:
         clipped = np.sort(view.image[row, column], axis=2)[..., 1] >= _CLIPPED
         found[k] = clipped.any() or view.glint_mask[row, column].any()
     return found
-
-
-def _write_masks(path: Path, view: View) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    masks = np.dstack([np.zeros_like(view.tool_mask), view.glint_mask, view.tool_mask])
-    files.write_bytes(path, cv2.imencode(".png", masks)[1].tobytes())

@@ -54,24 +54,14 @@ class View:
 def _bumps(seed: int) -> np.ndarray:
     """Slopes (n, n, 2) float32 of the wet film's ripples, over a square of `_BUMP_MM` that tiles by reflection."""
     rng = np.random.default_rng([seed, 5])
-    return np.stack(
-        [smooth_noise(rng, _BUMP_PX, 5, 2) + 0.2 * smooth_noise(rng, _BUMP_PX, 50) for _ in range(2)], axis=-1
-    )
+    return np.dstack([smooth_noise(rng, _BUMP_PX, 5, 2) + 0.2 * smooth_noise(rng, _BUMP_PX, 50) for _ in range(2)])
 
 
 def render_view(
-    scene: Scene,
-    microscope: Microscope,
-    window: Window,
-    *,
-    side: int = 0,
-    forceps: Forceps | None = None,
-    pose: Pose | None = None,
-    later: tuple[Pose, float] | None = None,
-    rng: np.random.Generator | None = None,
-    factor: int = 2,
-    surface: bool = False,
-) -> View:
+    scene: Scene, microscope: Microscope, window: Window, *, side: int = 0,
+    forceps: Forceps | None = None, pose: Pose | None = None, later: tuple[Pose, float] | None = None,
+    rng: np.random.Generator | None = None, factor: int = 2, surface: bool = False,
+) -> View:  # fmt: skip
     """What a camera sees in a window of its image.
 
     Args:
@@ -90,7 +80,6 @@ def render_view(
     >>> render_view(Eye(texture_px=64), microscope, Window(left, (80, 60))).image.shape
     (60, 80, 3)
     """
-    width, height = window.size_px
     grid = Grid(window.size_px, getattr(scene, "step_px", _STEP_PX))
     x, y, z = intersect(scene, window, grid.u)
     has_tool = forceps is not None and pose is not None
@@ -101,9 +90,8 @@ def render_view(
     slope_y = (scene.height(x, y + eps) - scene.height(x, y - eps)) / (2 * eps)
     light_x, light_y = np.multiply(microscope.light_slope, 0.35)
     lambert = (1 - light_x * slope_x - light_y * slope_y) / np.sqrt(1 + slope_x**2 + slope_y**2)
-    spot = np.exp(
-        -((x - microscope.spot_mm[0]) ** 2 + (y - microscope.spot_mm[1]) ** 2) / (2 * microscope.spot_radius_mm**2)
-    )
+    spot2 = (x - microscope.spot_mm[0]) ** 2 + (y - microscope.spot_mm[1]) ** 2
+    spot = np.exp(-spot2 / (2 * microscope.spot_radius_mm**2))
     light = microscope.brightness * 1.45 * np.clip(lambert, 0.05, None) * (0.25 + 0.75 * spot)
     if has_tool:
         light = light * shadow(x, y, z, forceps, pose, microscope.light_slope)
@@ -114,7 +102,7 @@ def render_view(
     albedo = cv2.remap(scene.texture, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     linear = cv2.LUT(albedo, _LINEAR)
     linear *= grid.full(light)[..., None]
-    glint_mask = np.zeros((height, width), np.uint8)
+    glint_mask, tool_mask = np.zeros((2, *linear.shape[:2]), np.uint8)
     if scene.gloss > 0:
         # A film mirrors the lamp where its normal halves the directions of light and view.
         R = window.R
@@ -140,7 +128,6 @@ def render_view(
     linear = blur_by_depth(linear, sigma, grid)
 
     u, visibility = np.full((3, 2), np.nan), np.zeros(3, int)
-    tool_mask = np.zeros((height, width), np.uint8)
     if has_tool:
         tool = tool_in_view(window, forceps, pose, later, readout_s=microscope.readout_s, factor=factor)
         u, visibility = tool.u, tool.visibility
@@ -156,15 +143,9 @@ def render_view(
 
 
 def render_pair(
-    scene: Scene,
-    microscope: Microscope,
-    *,
-    rig: StereoRig | None = None,
-    forceps: Forceps | None = None,
-    pose: Pose | None = None,
-    factor: int = 3,
-    **options: object,
-) -> tuple[View, View]:
+    scene: Scene, microscope: Microscope, *, rig: StereoRig | None = None,
+    forceps: Forceps | None = None, pose: Pose | None = None, factor: int = 3, **options: object,
+) -> tuple[View, View]:  # fmt: skip
     """The left and right view of one moment.
 
     Args:
@@ -179,14 +160,11 @@ def render_pair(
     if forceps is not None and pose is not None:
         landmarks = forceps.landmarks(pose)
         if not any(((u > -0.5) & (u < np.array(size) - 0.5)).all(axis=1).any() for u in rig.project(landmarks)):
-            raise ValueError(
-                f"pose: the tool is outside the field; its base is at {np.round(pose.base_mm, 2).tolist()} mm, move it "
-                "towards the origin of the microscope frame."
-            )
+            base = f"its base is at {np.round(pose.base_mm, 2).tolist()} mm"
+            raise ValueError(f"pose: the tool is outside the field; {base}, move it towards the microscope frame's origin.")
+    options |= {"forceps": forceps, "pose": pose, "factor": factor}
     left, right = (
-        render_view(
-            scene, microscope, Window(camera, size), side=side, forceps=forceps, pose=pose, factor=factor, **options
-        )
+        render_view(scene, microscope, Window(camera, size), side=side, **options)
         for side, camera in enumerate((rig.left, rig.right))
     )
     return left, right

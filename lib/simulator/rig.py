@@ -11,60 +11,25 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lib.cameras import AffineCamera, NearAffineCamera, StereoRig
+from lib.cameras import StereoRig
 from lib.correspondences import Correspondences
 from lib.geometry import RigidTransform
+from lib.simulator.microscope import IMAGE_SIZE_PX, ROBOT_FROM_MICROSCOPE, Microscope
 
 __all__ = ["IMAGE_SIZE_PX", "ROBOT_FROM_MICROSCOPE", "SimulatedSweep", "reference_rig", "simulate_correspondences"]
 
-IMAGE_SIZE_PX = (1920, 1080)
 
-#: Where the reference microscope stands over the reference robot: any general pose would do.
-ROBOT_FROM_MICROSCOPE = RigidTransform.from_rotation_vector((0.15, 2.90, -0.25), (12.0, -7.0, 35.0))
-
-
-def reference_rig(
-    *,
-    pixels_per_mm: tuple[float, float] = (100.0, 98.0),
-    image_rotation_rad: tuple[float, float] = (0.020, -0.015),
-    convergence_rad: float = np.deg2rad(6.5),
-    image_size_px: tuple[int, int] = IMAGE_SIZE_PX,
-    inverse_distance_per_mm: float = 0.0,
-    robot_from_microscope: RigidTransform = ROBOT_FROM_MICROSCOPE,
-) -> StereoRig:
+def reference_rig(*, robot_from_microscope: RigidTransform = ROBOT_FROM_MICROSCOPE, **geometry: object) -> StereoRig:
     """The rig that the simulator models by default: 10 um a pixel, 6.5 degrees between the axes.
 
     Args:
-        pixels_per_mm, image_rotation_rad: Zoom and in-plane rotation, (left, right), independent of each other.
-        convergence_rad: Angle between the two viewing directions.
-        inverse_distance_per_mm: One over the working distance; 0 makes the cameras affine, anything else near-affine.
         robot_from_microscope: Where the microscope stands; the identity gives the rig in the microscope frame.
-
-    Raises:
-        ValueError: For a zoom or convergence that is not positive.
+        geometry: Attributes of `Microscope` such as pixels_per_mm, image_size_px, inverse_distance_per_mm.
 
     >>> bool(reference_rig().is_affine), bool(reference_rig(inverse_distance_per_mm=1 / 150).is_affine)
     (True, False)
     """
-    if min(pixels_per_mm) <= 0:
-        raise ValueError(f"pixels_per_mm: must be positive, got {pixels_per_mm}.")
-    if not 0 < convergence_rad < np.pi / 2:
-        raise ValueError(f"convergence_rad: must lie between 0 and pi/2, got {convergence_rad}.")
-    centre_px = (np.array(image_size_px) - 1) / 2
-    microscope_from_robot = robot_from_microscope.inverse()
-    cameras = []
-    for side, zoom, roll in zip((+1, -1), pixels_per_mm, image_rotation_rad, strict=True):
-        # The left camera stands at negative x and looks towards positive x.
-        tilt = RigidTransform.from_rotation_vector((0.0, -side * convergence_rad / 2, 0.0))
-        spin = RigidTransform.from_rotation_vector((0.0, 0.0, roll))
-        camera_from_robot = spin.compose(tilt).compose(microscope_from_robot)
-        linear = zoom * camera_from_robot.R[:2]
-        matrix = np.column_stack([linear, zoom * camera_from_robot.t[:2] + centre_px])
-        if inverse_distance_per_mm:
-            cameras.append(NearAffineCamera(matrix, inverse_distance_per_mm, centre_px, robot_from_microscope.t))
-        else:
-            cameras.append(AffineCamera(matrix))
-    return StereoRig(*cameras)
+    return Microscope(**geometry).rig(robot_from_microscope)
 
 
 @dataclass(frozen=True, eq=False)

@@ -50,8 +50,7 @@ def _vessel_tree(rng: np.random.Generator, disc_mm: np.ndarray, kind: str) -> li
         stack.append((disc_mm + rng.normal(0, 0.08, 2), heading, caliber * rng.uniform(0.8, 1.15), bend))
     while stack and len(branches) < 60:
         point, heading, width, bend = stack.pop()
-        line, widths, wiggle, step = [point], [width], 0.0, 0.12
-        since = 0.0
+        line, widths, wiggle, step, since = [point], [width], 0.0, 0.12, 0.0
         while width > 0.02 and np.abs(point).max() < EXTENT_MM / 2:
             wiggle = 0.8 * wiggle + rng.normal(0, 0.03)
             outwards = np.arctan2(*(point - disc_mm)[::-1])
@@ -87,11 +86,7 @@ def _draw(branches: list[tuple[np.ndarray, np.ndarray]], size_px: int, share: fl
 
 @lru_cache(maxsize=128)
 def fundus_texture(seed: int, size_px: int = 2048, rim_mm: float = 9.3) -> np.ndarray:
-    """Reflectance of a fundus, (size_px, size_px, 3) uint8 RGB, read-only; `seed` decides everything.
-
-    Args:
-        rim_mm: Mean radius at which the retina ends and the sclera begins.
-    """
+    """Reflectance of a fundus, (size_px, size_px, 3) uint8 RGB, read-only, whose retina ends `rim_mm` from the centre."""
     rng = np.random.default_rng([seed, 7])
     axis = (np.arange(size_px, dtype=np.float32) + 0.5) * (EXTENT_MM / size_px) - EXTENT_MM / 2
     x, y = np.meshgrid(axis, axis)
@@ -103,9 +98,8 @@ def fundus_texture(seed: int, size_px: int = 2048, rim_mm: float = 9.3) -> np.nd
     # Pigment is log-normal; choroidal vessels show as a pale net through it.
     density = 0.14 * smooth_noise(rng, size_px, 5, 3) + 0.06 * smooth_noise(rng, size_px, 60, 3, 0.7)
     density += 0.08 * smooth_noise(rng, size_px, 420, 2, 0.9)
-    net = np.exp(-((smooth_noise(rng, size_px, 22, 2) / 0.35) ** 2)) + 0.6 * np.exp(
-        -((smooth_noise(rng, size_px, 40, 2) / 0.3) ** 2)
-    )
+    net = np.exp(-((smooth_noise(rng, size_px, 22, 2) / 0.35) ** 2))
+    net += 0.6 * np.exp(-((smooth_noise(rng, size_px, 40, 2) / 0.3) ** 2))
     density -= rng.uniform(0.10, 0.34) * net * (0.6 + 0.4 * np.tanh(smooth_noise(rng, size_px, 3)))
     density += 0.35 * np.exp(-((x - macula[0]) ** 2 + (y - macula[1]) ** 2) / (2 * 0.8**2))
 

@@ -81,14 +81,8 @@ class ToolInView:
 
 
 def tool_in_view(
-    window: Window,
-    forceps: Forceps,
-    pose: Pose,
-    later: tuple[Pose, float] | None,
-    *,
-    readout_s: float = 0.0,
-    factor: int = 2,
-) -> ToolInView:
+    window: Window, forceps: Forceps, pose: Pose, later: tuple[Pose, float] | None, *, readout_s: float = 0.0, factor: int = 2
+) -> ToolInView:  # fmt: skip
     """The tool as the window's camera sees it.
 
     Args:
@@ -106,8 +100,7 @@ def tool_in_view(
     seen, _ = window.seen(points)
     for _ in range(3):  # two steps reach 1e-3 px
         row = seen[:, 1] * window.zoom + window.origin_px[1]
-        delay = readout_s * (row / max(window.field_px[1] - 1, 1) - 0.5)
-        delay = np.clip(delay, -readout_s, readout_s)
+        delay = readout_s * np.clip(row / max(window.field_px[1] - 1, 1) - 0.5, -1, 1)
         seen, shrink = window.seen(points + speed * delay[:, None])
     centres, radii = seen[3:], radii * shrink[3:]
     raster = rasterise(centres, radii, chains, zoom=window.zoom, size_px=window.size_px, factor=factor)
@@ -154,9 +147,8 @@ def compose(linear: np.ndarray, tool_mask: np.ndarray, tool: ToolInView, microsc
     layer = cv2.copyMakeBorder(layer, *pad, cv2.BORDER_CONSTANT, value=0)
     z = np.where(alpha > 0.01, depth, np.nan)  # depth along the axis is z of the microscope frame to a few um
     if np.isfinite(microscope.depth_of_field_mm):
-        spread = cv2.blur(np.nan_to_num(z) * (alpha > 0.01), (25, 25)) / np.maximum(
-            cv2.blur((alpha > 0.01).astype(np.float32), (25, 25)), 1e-3
-        )
+        covered = cv2.blur((alpha > 0.01).astype(np.float32), (25, 25))
+        spread = cv2.blur(np.nan_to_num(z) * (alpha > 0.01), (25, 25)) / np.maximum(covered, 1e-3)
         defocus_px = microscope.defocus_px(np.where(np.isfinite(z), z, spread))
         sigma = np.hypot(microscope.psf_px, window.zoom / 100.0 * defocus_px)
         sigma = cv2.copyMakeBorder(sigma.astype(np.float32), *pad, cv2.BORDER_REPLICATE)

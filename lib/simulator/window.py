@@ -40,12 +40,9 @@ class Window:
 
     @classmethod
     def around(
-        cls,
-        camera: AffineCamera | NearAffineCamera,
-        u: np.ndarray,
-        size_px: tuple[int, int],
+        cls, camera: AffineCamera | NearAffineCamera, u: np.ndarray, size_px: tuple[int, int],
         field_px: tuple[int, int] | None = None,
-    ) -> Window:
+    ) -> Window:  # fmt: skip
         """The window of `size_px` around pixel `u` (2,) of a camera whose whole image has `field_px`."""
         origin = np.round(np.asarray(u) - np.array(size_px) / 2)
         moved = {"matrix": camera.matrix - [[0, 0, 0, origin[0]], [0, 0, 0, origin[1]]]}
@@ -105,10 +102,8 @@ def intersect(scene: Scene, window: Window, u: tuple[np.ndarray, np.ndarray]) ->
     """(x, y, z) mm of the scene at pixels u = (columns, rows).  On an eye each step divides the error by about 30."""
     z = np.zeros_like(u[0])
     for _ in range(40):
-        updated = scene.height(*window.rays(u, z))
-        done = np.abs(updated - z).max() < 1e-6
-        z = updated
-        if done:
+        before, z = z, scene.height(*window.rays(u, z))
+        if np.abs(z - before).max() < 1e-6:
             break
     return *window.rays(u, z), z
 
@@ -134,9 +129,7 @@ class Grid:
     def __init__(self, size_px: tuple[int, int], step: int) -> None:
         width, height = size_px
         self.rows, self.columns = _interpolation(height, step), _interpolation(width, step)
-        self.u = np.meshgrid(
-            (np.arange(self.columns.shape[1]) - 1.0) * step, (np.arange(self.rows.shape[1]) - 1.0) * step
-        )
+        self.u = np.meshgrid(*((np.arange(weights.shape[1]) - 1.0) * step for weights in (self.columns, self.rows)))
 
     def full(self, values: np.ndarray) -> np.ndarray:
         """(h, w) float32 from values on the coarse grid; exact to 1e-6 of a value of order one."""

@@ -118,7 +118,7 @@ def test_cache_is_small(written):
     first = whole[0]
     for _ in range(3):
         list(whole)
-    assert len(whole._cache) <= 4
+    assert whole._read.cache_info().maxsize <= 4
     np.testing.assert_array_equal(whole[0].left, first.left)
 
 

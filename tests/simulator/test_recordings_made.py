@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -10,17 +9,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from lib.cameras import StereoRig
 from lib.geometry import RigidTransform
 from lib.recordings import Recording
-from lib.simulator import (
-    Design,
-    Eye,
-    Forceps,
-    Microscope,
-    Motion,
-    Pose,
-    Reports,
-    render_pair,
-    simulate,
-)
+from lib.simulator import Design, Eye, Forceps, Microscope, Motion, Pose, Reports, render_pair, simulate
+from lib.simulator import recording as recording_module
 from lib.simulator.population import RESERVED_JAW_MM, RESERVED_SEEDS, TEXTURE_SEEDS, random_forceps, sample
 from notebooks.studies.realism import STATISTICS, image_statistics, landmark_window
 from notebooks.studies.scenes import Checkerboard, Relief
@@ -35,7 +25,7 @@ def made(tmp_path_factory):
     bump = RigidTransform.from_rotation_vector((0.0, 0.0, 0.02), (0.3, 0.1, 0.0))
     reports = Reports(offset_s=0.03, dropout=0.2)
     design = Design(EYE, microscope=SMALL, duration_s=8.0, reports=reports, camera_motion=(3, bump))
-    return simulate(folder, design, seed=4, n_frames=5, masks=True, progress=False)
+    return simulate(folder, design, seed=4, n_frames=5, progress=False)
 
 
 def test_a_recording_agrees_with_its_truth(made):
@@ -52,28 +42,29 @@ def test_a_recording_agrees_with_its_truth(made):
     labelled = made.annotations.visibility_left == 2
     assert labelled.mean() > 0.5
     assert np.abs(made.annotations.u_left - truth.u_left)[labelled].max() < 5
-    assert len(list((made.folder / "truth" / "masks" / "left").iterdir())) == 5
 
 
-def test_truth_says_which_landmarks_saturated_light_touches(tmp_path):
-    """Against the images and masks on disk; a recording of before, without these columns, still opens."""
-    options = {"seed": 6, "n_frames": 6, "progress": False, "masks": True}
+def test_truth_says_which_landmarks_saturated_light_touches(tmp_path, monkeypatch):
+    """Against the images on disk and the renderer's masks; a recording without these columns opens, too."""
+    pairs, options = [], {"seed": 6, "n_frames": 6, "progress": False}
+    render = recording_module.render_pair
+    monkeypatch.setattr(recording_module, "render_pair", lambda *a, **k: pairs.append(render(*a, **k)) or pairs[-1])
     bright = replace(SMALL, brightness=1.6, jpeg_quality=None)
     design = Design(replace(EYE, gloss=2.0), microscope=bright, motion="surgeon", duration_s=4.0)
     recording = simulate(tmp_path / "bright", design, **options)
     truth = recording.truth
-    for side in ("left", "right"):
+    for number, side in enumerate(("left", "right")):
         u, visibility, told = (getattr(truth, f"{name}_{side}") for name in ("u", "visibility", "in_glint"))
         assert told.dtype == bool and told.shape == (6, 3)
         for k, frame in enumerate(recording.frames):
-            mask = cv2.imread(str(truth.folder / "masks" / side / f"{k:06d}.png"))
+            glints = pairs[k][number].glint_mask
             for landmark in range(3):
                 x, y = np.round(u[k, landmark]).astype(int)
                 if not visibility[k, landmark] or not (3 <= x < 317 and 3 <= y < 177):
                     continue
                 near = np.s_[y - 3 : y + 4, x - 3 : x + 4]
                 bright_channels = (getattr(frame, side)[near] >= 250).sum(axis=2)
-                assert told[k, landmark] == ((bright_channels >= 2).any() or mask[near][..., 1].any())
+                assert told[k, landmark] == ((bright_channels >= 2).any() or glints[near].any())
     assert 0 < np.mean([truth.in_glint_left, truth.in_glint_right]) < 1
     matt = replace(design, eye=replace(EYE, gloss=0.0), microscope=replace(SMALL, brightness=0.2))
     dim = simulate(tmp_path / "dim", matt, **(options | {"n_frames": 2}))
