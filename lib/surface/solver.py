@@ -7,8 +7,6 @@ and returns the duality gap as proof.
 
 from __future__ import annotations
 
-import itertools
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cache, cached_property
 
@@ -26,7 +24,6 @@ UNHELD = (
     "points."
 )
 _PAIRS = np.triu_indices(4)
-_CACHED = 1 << 12  # points whose products stay in the cache
 
 
 class L1Problem:
@@ -38,7 +35,7 @@ class L1Problem:
     """
 
     def __init__(self, grid: SplineGrid, u: np.ndarray) -> None:
-        self.grid, self.u = grid, u
+        self.grid, self.u, self.bending = grid, u, grid.bending
 
     @cached_property
     def design(self) -> sparse.csr_matrix:
@@ -50,11 +47,6 @@ class L1Problem:
         """B', stored by rows too: products with it then run through the points in order."""
         return self.design.T.tocsr()
 
-    @property
-    def bending(self) -> sparse.csr_matrix:
-        """R (size, size)."""
-        return self.grid.bending
-
     @cached_property
     def by_cells(self) -> tuple[np.ndarray, L1Problem]:
         """Order (n,) of the points by cells, and the problem in that order: neighbours in space are so in memory."""
@@ -62,82 +54,48 @@ class L1Problem:
         return order, L1Problem(self.grid, self.u[order])
 
     def normal_band(self, weights: np.ndarray, stiffness: float = 0.0) -> np.ndarray:
-        """B' diag(weights) B + stiffness R for weights (n,), as a lower band (bandwidth + 1, size).
-
-        A cell's 16 x 16 block is a sum over its points of products of basis functions that separate in x and y, so it
-        is one small matrix product of the 10 distinct products along x with the 10 along y.
-        """
-        slot, (along_x, along_y), layers, scatter = self._blocks
-        n_blocks, size, _ = along_x.shape
-        packed = np.zeros((n_blocks, size, 1))
+        """B' diag(weights) B + stiffness R for weights (n,), as a lower band (bandwidth + 1, size)."""
+        slot, along_x, along_y, scatter, bending = self._blocks
+        packed = np.zeros((len(along_x), along_x.shape[1], 1))
         packed.ravel()[slot] = weights
-        sums = np.empty(1 + 100 * n_blocks)
-        sums[0] = stiffness
-        blocks = sums[1:].reshape(n_blocks, 10, 10)
-        step = max(1, _CACHED // size)
-        for first in range(0, n_blocks, step):
-            part = slice(first, first + step)
-            np.matmul(along_y[part].transpose(0, 2, 1), packed[part] * along_x[part], out=blocks[part])
-        n_cells = layers[0][1]
-        for first, last in layers[1:]:
-            blocks[: last - first] += blocks[first:last]
+        band = scatter @ np.matmul(along_y, packed * along_x).ravel() + stiffness * bending
         # Columns of the band are contiguous, as LAPACK wants them.
-        band = scatter @ sums[: 1 + 100 * n_cells]
-        return band.reshape(self.grid.size, self.grid.bandwidth + 1).T
+        return band.reshape(self.grid.size, -1).T
 
     @cached_property
-    def _blocks(self) -> tuple[np.ndarray, list[np.ndarray], list[tuple[int, int]], sparse.csc_matrix]:
-        """The points in their cells, in blocks of equal size so that the cells' sums are batched products.
+    def _blocks(self) -> tuple[np.ndarray, ...]:
+        """The points by cells, in blocks of equal size so that the cells' sums are batched products.
 
-        The fullest cells come first, and the blocks in layers (every cell's first block, then the second ones, ...), so
-        that a layer adds to the first cells only.
+        A cell's 16 x 16 block sums over its points products of basis functions that separate in x and y: of the 10
+        distinct products along x with the 10 along y.  Last come the matrix that adds these sums to the band, and the
+        bending energy as a band.
         """
-        grid, u = self.grid, self.u
-        cell, t = grid.locate(u)
-        cell_id, inverse, counts = np.unique(cell @ (1, grid.cells[0]), return_inverse=True, return_counts=True)
-        order = np.argsort(-counts, kind="stable")
-        place = np.empty_like(order)
-        place[order] = np.arange(len(order))
-        cell_id, inverse, counts = cell_id[order], place[inverse], counts[order]
-        size = int(np.clip(-(-len(u) // len(counts)), 4, 64))
-        cells_in_layer = [int((counts > layer * size).sum()) for layer in range(-(-int(counts[0]) // size))]
-        starts = np.concatenate([[0], np.cumsum(cells_in_layer)])
-        layers = list(itertools.pairwise(starts.tolist()))
-        rank = np.empty(len(u), dtype=np.intp)
-        rank[np.argsort(inverse, kind="stable")] = np.arange(len(u)) - np.repeat(np.cumsum(counts) - counts, counts)
-        slot = (starts[rank // size] + inverse) * size + rank % size
-        along = []
-        for axis in (0, 1):
-            basis = cubic_basis(t[:, axis])
-            products = np.zeros((starts[-1], size, 10))
-            products.reshape(-1, 10)[slot] = basis[:, _PAIRS[0]] * basis[:, _PAIRS[1]]
-            along.append(products)
-
-        # Where each of the 10 x 10 products of a cell goes in the band, the same in every cell but for a shift; before
-        # them, as the first column, the bending energy.
-        step_x, step_y = grid.stride
-        i_x, i_y = (axis.ravel() for axis in np.meshgrid(np.arange(4), np.arange(4)))
-        local = i_x * step_x + i_y * step_y
-        lower_a, lower_b = np.nonzero(local[:, None] >= local[None, :])
+        grid, height = self.grid, self.grid.bandwidth + 1
+        cell, t = grid.locate(self.u)
+        corner, inverse, counts = np.unique(cell @ grid.stride, return_inverse=True, return_counts=True)
+        size = int(np.clip(-(-len(t) // len(counts)), 4, 64))
+        n_blocks = -(-counts // size)
+        starts = np.cumsum(n_blocks) - n_blocks
+        slot = np.empty(len(t), dtype=np.intp)
+        rank = np.arange(len(t)) - np.repeat(np.cumsum(counts) - counts, counts)
+        slot[np.argsort(inverse, kind="stable")] = np.repeat(starts, counts) * size + rank
+        along = np.zeros((2, n_blocks.sum() * size, 10))
+        along[:, slot] = (cubic_basis(t)[..., _PAIRS[0]] * cubic_basis(t)[..., _PAIRS[1]]).swapaxes(0, 1)
+        along_x, along_y = along.reshape(2, -1, size, 10)
+        j, i = np.indices((4, 4)).reshape(2, -1)
+        local = np.column_stack([i, j]) @ grid.stride
+        a, b = np.nonzero(local[:, None] >= local)
         pair = np.zeros((4, 4), dtype=np.intp)
         pair[_PAIRS] = pair[_PAIRS[::-1]] = np.arange(10)
-        source = pair[i_y[lower_a], i_y[lower_b]] * 10 + pair[i_x[lower_a], i_x[lower_b]]
-        by_source = np.argsort(source, kind="stable")
-        height = grid.bandwidth + 1
-        goal = (local[lower_b] * height + local[lower_a] - local[lower_b])[by_source]
-        first = (cell_id % grid.cells[0]) * step_x + (cell_id // grid.cells[0]) * step_y
-        rows = (first * height)[:, None] + goal
-        bending = sparse.tril(grid.bending).tocoo()
-        ends = np.arange(len(cell_id))[:, None] * len(goal) + np.cumsum(np.bincount(source, minlength=100))
-        scatter = sparse.csc_matrix(
-            (
-                np.append(bending.data, np.ones(rows.size)),
-                np.append(bending.col * height + bending.row - bending.col, rows).astype(np.int32),
-                np.append([0, bending.nnz], bending.nnz + ends).astype(np.int32),
-            ),
-            shape=(height * grid.size, 1 + ends.size),
-        )
-        return slot, along, layers, scatter
+        source = pair[j[a], j[b]] * 10 + pair[i[a], i[b]]
+        corner = np.repeat(corner, n_blocks)
+        place = (corner[:, None] + local[b]) * height + local[a] - local[b]
+        column = np.arange(len(corner))[:, None] * 100 + source
+        entries = np.ones(place.size), (place.ravel(), column.ravel())
+        scatter = sparse.csc_matrix(entries, shape=(height * grid.size, 100 * len(corner)))
+        lower = sparse.tril(self.bending).tocoo()
+        bending = np.bincount(lower.col * height + lower.row - lower.col, lower.data, minlength=height * grid.size)
+        return slot, along_x, along_y.transpose(0, 2, 1), scatter, bending
 
 
 @dataclass(frozen=True)
@@ -183,21 +141,15 @@ def interior_point(
         ValueError: If the data do not determine the coefficients (a control point without data, at mu = 0).
     """
     weights = np.ones_like(x) if weights is None else weights
-    order, sorted_problem = problem.by_cells
-    columns = zip(x[order].T, np.broadcast_to(mu, x.shape[1]), weights[order].T, strict=True)
-    with _one_blas_thread():
-        outputs = [
-            _interior_point(
-                sorted_problem, np.ascontiguousarray(x_k), mu_k, np.ascontiguousarray(w_k), tolerance, max_iterations
-            )
-            for x_k, mu_k, w_k in columns
-        ]
+    order, by_cells = problem.by_cells
+    columns = zip(x.T[:, order], np.broadcast_to(mu, x.shape[1]), weights.T[:, order], strict=True)
+    # Narrow bands gain nothing from more threads, and where cores are busy these wait for each other.
+    with _blas().limit(limits=1, user_api="blas"):
+        outputs = [_interior_point(by_cells, *column, tolerance, max_iterations) for column in columns]
     coefficients, objective, gap, dual, iterations = zip(*outputs, strict=True)
-    unsorted_dual = np.empty_like(x)
-    unsorted_dual[order] = np.stack(dual, axis=1)
-    return L1Solution(
-        np.stack(coefficients, axis=1), np.array(objective), np.array(gap), unsorted_dual, max(iterations)
-    )
+    unsorted = np.empty_like(x)
+    unsorted[order] = np.stack(dual, axis=1)
+    return L1Solution(np.stack(coefficients, 1), np.array(objective), np.array(gap), unsorted, max(iterations))
 
 
 def _interior_point(
@@ -288,11 +240,6 @@ def _interior_point(
 @cache
 def _blas() -> ThreadpoolController:
     return ThreadpoolController()
-
-
-def _one_blas_thread() -> AbstractContextManager:
-    """BLAS on one thread: narrow bands gain nothing from more, and where cores are busy they wait for each other."""
-    return _blas().limit(limits=1, user_api="blas")
 
 
 def _step_length(*pairs: tuple[np.ndarray, np.ndarray]) -> float:
