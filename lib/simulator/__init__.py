@@ -7,9 +7,9 @@ from lib.simulator.eye import Eye
 from lib.simulator.forceps import Forceps, Pose
 from lib.simulator.microscope import Microscope
 from lib.simulator.motion import Motion
-from lib.simulator.recording import Design, Reports, simulate
+from lib.simulator.recording import Design, simulate
 from lib.simulator.render import View, render_pair, render_view
 from lib.simulator.window import Window
 
-__all__ = ["Design", "Eye", "Forceps", "Microscope", "Motion", "Pose", "Reports", "View", "Window"]
+__all__ = ["Design", "Eye", "Forceps", "Microscope", "Motion", "Pose", "View", "Window"]
 __all__ += ["render_pair", "render_view", "simulate"]

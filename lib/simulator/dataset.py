@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import json
 import shutil
-import sys
 import tempfile
 import time
 from collections.abc import Sequence
@@ -24,7 +23,7 @@ from lib.recordings import Recording
 from lib.simulator.eye import Eye
 from lib.simulator.microscope import Microscope
 from lib.simulator.population import RESERVED_SEEDS, random_forceps, reserved_forceps
-from lib.simulator.recording import Design, Reports, simulate
+from lib.simulator.recording import Design, simulate
 
 __all__ = ["TEST_SEQUENCES", "TRAIN_SEQUENCES", "main", "make_dataset", "seconds_a_pair", "sequence_design", "sequence_name"]
 
@@ -39,11 +38,11 @@ def sequence_name(index: int) -> str:
     return f"{'train' if index in TRAIN_SEQUENCES else 'test'}_{index:02d}"
 
 
-def make_shipped_recording(folder: Path = paths.SHIPPED_RECORDING) -> Recording:
+def _make_shipped_recording() -> Recording:
     """The recording that ships: an eye and a tool never trained on, in a calibration sweep and then with a surgeon."""
     description = "Calibration sweep at several depths, then approach, grasp and peel. Made by lib.simulator."
     return simulate(
-        folder, Design(microscope=Microscope(jpeg_quality=88)), seed=_SHIPPED_SEED, n_frames=34,
+        paths.SHIPPED_RECORDING, Design(microscope=Microscope(jpeg_quality=88)), seed=_SHIPPED_SEED, n_frames=34,
         name="Open-sky eye, simulated", description=description, overwrite=True,
     )  # fmt: skip
 
@@ -74,8 +73,8 @@ def sequence_design(seed: int, index: int, *, shrink: int = 1, duration_s: float
         light_slope=tuple(float(v) for v in rng.uniform(-0.5, 0.5, 2)),
         spot_mm=tuple(float(v) for v in rng.normal(0, 1.2, 2)), brightness=float(rng.uniform(0.8, 1.15)), gain=gain,
     )  # fmt: skip
-    reports = Reports(offset_s=float(np.round(rng.uniform(-0.05, 0.05), 4)), dropout=0.01)
-    return Design(eye, forceps, microscope, duration_s=duration_s, reports=reports)
+    offset_s = float(np.round(rng.uniform(-0.05, 0.05), 4))
+    return Design(eye, forceps, microscope, duration_s=duration_s, offset_s=offset_s, dropout=0.01)
 
 
 def _make_sequence(folder: Path, seed: int, index: int, n_pairs: int, duration_s: float, shrink: int) -> None:
@@ -138,7 +137,7 @@ def seconds_a_pair(shrink: int) -> float:
         return (time.process_time() - start) / 2
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main(argv: Sequence[str] | None = None) -> None:
     """`python3 -m lib simulate`: see the module's text."""
     parser = argparse.ArgumentParser(prog="python3 -m lib simulate", description=__doc__.splitlines()[0])
     parser.add_argument("--folder", type=Path, help="where (default: data/cache/dataset-SEED)")
@@ -154,19 +153,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.error("--pairs, --workers and --shrink must be at least 1.")
     if arguments.seed < 0 or not 0 < arguments.duration < float("inf"):
         parser.error("--seed must not be negative, --duration must be positive and finite.")
-    try:
-        if arguments.shipped:
-            recording = make_shipped_recording()
-            print(f"{recording.folder}: {len(recording)} pairs.")
-        else:
-            _run(arguments)
-    except (ValueError, OSError) as error:
-        print(error, file=sys.stderr)
-        return 1
-    return 0
-
-
-def _run(arguments: argparse.Namespace) -> None:
+    if arguments.shipped:
+        recording = _make_shipped_recording()
+        print(f"{recording.folder}: {len(recording)} pairs.")
+        return
     pairs, shrink = arguments.pairs, arguments.shrink
     folder = arguments.folder or paths.CACHE / f"dataset-{arguments.seed}"
     left = len(_missing(folder)) * pairs

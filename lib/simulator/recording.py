@@ -20,7 +20,7 @@ from lib.simulator.population import RESERVED_SEEDS, reserved_forceps
 from lib.simulator.render import View, render_pair
 from lib.simulator.window import surface_grid
 
-__all__ = ["Design", "Reports", "simulate"]
+__all__ = ["Design", "simulate"]
 
 _KINEMATICS_HZ, _KINEMATICS_MARGIN = 100.0, 5  # samples before the first and after the last frame
 _GLINT_REACH_PX = 3  # a detector looks at a landmark's surroundings, not at one pixel
@@ -28,18 +28,26 @@ _CLIPPED = 250  # of 255
 
 
 @dataclass(frozen=True)
-class Reports:
-    """What robot and annotator report, and how well.
+class Design:
+    """What a simulated recording shows, through what, and what robot and annotator report of it.
 
     Attributes:
-        robot_from_microscope: Where the microscope stands; the recording is in the robot frame.
+        eye, forceps: Scene and tool.  None = chosen by the recording's seed, from designs that
+            `lib.simulator.population.sample` never draws.
+        microscope: Optics, light and sensor.
+        motion, duration_s: "sweep" (calibration), "surgeon" or "both"; None = 30 s for a sweep, 18 s for a surgeon, 45
+            s for both.
         robot_accuracy_mm: Standard deviation of the kinematics, per coordinate.
         offset_s: t_robot = t_video + offset_s.
         dropout: Share of kinematic samples without values.
         click_px: Standard deviation of the annotations, per coordinate.
     """
 
-    robot_from_microscope: RigidTransform = ROBOT_FROM_MICROSCOPE
+    eye: Scene | None = None
+    forceps: Forceps | None = None
+    microscope: Microscope = field(default_factory=Microscope)
+    motion: str = "both"
+    duration_s: float | None = None
     robot_accuracy_mm: float = 0.010
     offset_s: float = 0.0
     dropout: float = 0.0
@@ -48,30 +56,6 @@ class Reports:
     def __post_init__(self) -> None:
         not_negative(self, "robot_accuracy_mm click_px")
         check(self, "dropout", lambda v: 0 <= v < 1, "a share, at least 0 and below 1")
-
-
-@dataclass(frozen=True)
-class Design:
-    """What a simulated recording shows, and through what.
-
-    Attributes:
-        eye, forceps: Scene and tool.  None = chosen by the recording's seed, from designs that
-            `lib.simulator.population.sample` never draws.
-        microscope: Optics, light and sensor.
-        motion, duration_s: "sweep" (calibration), "surgeon" or "both"; None = 30 s for a sweep, 18 s for a surgeon, 45
-            s for both.
-        reports: Robot and annotator.
-        camera_motion: (frame, microscope_after_from_before): from that frame on the microscope has moved over eye and
-            robot.  The truth's rig is the one before; ``truth/moved_rig.json`` holds the one after.
-    """
-
-    eye: Scene | None = None
-    forceps: Forceps | None = None
-    microscope: Microscope = field(default_factory=Microscope)
-    motion: str = "both"
-    duration_s: float | None = None
-    reports: Reports = field(default_factory=Reports)
-    camera_motion: tuple[int, RigidTransform] | None = None
 
 
 def simulate(
@@ -104,7 +88,7 @@ def simulate(
     if n_frames < 1:
         raise ValueError(f"n_frames: must be at least 1, got {n_frames}.")
     folder, design = Path(folder), design or Design()
-    microscope, reports = design.microscope, design.reports
+    microscope = design.microscope
     eye = design.eye if design.eye is not None else Eye(seed=RESERVED_SEEDS[seed % len(RESERVED_SEEDS)])
     forceps = design.forceps or reserved_forceps(np.random.default_rng([seed, 103]), seed % len(RESERVED_SEEDS))
     duration_s = DURATIONS_S.get(design.motion, 30.0) if design.duration_s is None else design.duration_s
@@ -112,53 +96,41 @@ def simulate(
     step = max(1, int(motion.duration_s * microscope.fps / n_frames))
     time_s = np.arange(n_frames) * step / microscope.fps
     rig = microscope.rig(RigidTransform.identity())
-    moved_at, moved_rig = n_frames, rig
     details = {"simulated": True, "seed": seed, "frame_step": step}
     details |= {"depth_of_field_mm": microscope.depth_of_field_mm, "exposure_s": microscope.exposure_s}
     if microscope.inverse_distance_per_mm:
         details["inverse_distance_per_mm"] = microscope.inverse_distance_per_mm
-    if design.camera_motion is not None:
-        moved_at, after_from_before = design.camera_motion
-        if not 0 < moved_at < n_frames:
-            raise ValueError(f"camera_motion: the frame must lie between 1 and {n_frames - 1}, got {moved_at}.")
-        moved_rig = rig.moved(after_from_before.inverse())
-        details["camera_moved_at_frame"] = moved_at
     u, visibility = np.empty((2, n_frames, 3, 2)), np.empty((2, n_frames, 3), int)
     in_glint, landmarks = np.zeros((2, n_frames, 3), bool), np.empty((n_frames, 3, 3))
     with RecordingWriter(
         folder, name=name or folder.name, description=description, details=details, overwrite=overwrite,
         fps=microscope.fps, image_size_px=microscope.image_size_px, readout_s=microscope.readout_s,
-        offset_s=reports.offset_s, robot_accuracy_mm=reports.robot_accuracy_mm,
+        offset_s=design.offset_s, robot_accuracy_mm=design.robot_accuracy_mm,
         suffix=".png" if microscope.jpeg_quality is None else ".jpg", jpeg_quality=microscope.jpeg_quality or 90,
     ) as writer:  # fmt: skip
         for k in tqdm(range(n_frames), desc=f"Simulating {folder.name}", unit="pair", disable=progress is not True):
             pose, noise = motion.pose(time_s[k]), np.random.default_rng([seed, 107, k])
             views = render_pair(
-                eye, microscope, rig=rig if k < moved_at else moved_rig,
-                forceps=forceps, pose=pose, later=(motion.pose(time_s[k] + 1e-3), 1e-3), rng=noise,
-            )  # fmt: skip
+                eye, microscope, forceps=forceps, pose=pose, later=(motion.pose(time_s[k] + 1e-3), 1e-3), rng=noise
+            )
             writer.add(views[0].image, views[1].image, time_s[k])
             landmarks[k] = forceps.landmarks(pose)
             for side, view in enumerate(views):
                 u[side, k], visibility[side, k], in_glint[side, k] = view.u, view.visibility, _in_glint(view)
             if callable(progress):
                 progress()
-        rng, robot_from_microscope = np.random.default_rng([seed, 101]), reports.robot_from_microscope
+        rng, to_robot = np.random.default_rng([seed, 101]), ROBOT_FROM_MICROSCOPE.apply
         count = int(np.ceil(time_s[-1] * _KINEMATICS_HZ)) + 1 + 2 * _KINEMATICS_MARGIN
         sample_s = (np.arange(count) - _KINEMATICS_MARGIN) / _KINEMATICS_HZ
-        reported = robot_from_microscope.apply(np.array([forceps.landmarks(motion.pose(t)) for t in sample_s]))
-        reported += rng.normal(0, reports.robot_accuracy_mm, reported.shape)
-        reported[rng.random(count) < reports.dropout] = np.nan
-        writer.kinematics(sample_s + reports.offset_s, reported)
-        clicked = np.where(visibility[..., None] == 2, u + rng.normal(0, reports.click_px, u.shape), np.nan)
+        reported = to_robot(np.array([forceps.landmarks(motion.pose(t)) for t in sample_s]))
+        reported += rng.normal(0, design.robot_accuracy_mm, reported.shape)
+        reported[rng.random(count) < design.dropout] = np.nan
+        writer.kinematics(sample_s + design.offset_s, reported)
+        clicked = np.where(visibility[..., None] == 2, u + rng.normal(0, design.click_px, u.shape), np.nan)
         writer.annotations(*clicked, *np.where(visibility == 2, 2, 0))
         x_px, y_px, surface_mm = surface_grid(eye, rig.left, microscope.image_size_px)
-        rig_in_robot, x_mm = microscope.rig(robot_from_microscope), robot_from_microscope.apply(landmarks)
-        truth = Truth(rig_in_robot, x_mm, *u, *visibility, writer.truth_folder, *in_glint)
-        truth.write((x_px, y_px, robot_from_microscope.apply(surface_mm)))
-        if design.camera_motion is not None:
-            before = robot_from_microscope.compose(after_from_before.inverse())
-            microscope.rig(before).save(writer.truth_folder / "moved_rig.json")
+        truth = Truth(microscope.rig(), to_robot(landmarks), *u, *visibility, writer.truth_folder, *in_glint)
+        truth.write((x_px, y_px, to_robot(surface_mm)))
     return Recording.open(folder)
 
 
