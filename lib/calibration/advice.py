@@ -18,14 +18,10 @@ class Advice:
     """What to do.
 
     Attributes:
-        enough: True where the calibration's own error adds less than a tenth to a triangulated point's, everywhere
-            asked.
-        worst_ratio: Largest sd of a triangulated point from calibration, in units of the sd of one detection, over the
-            workspace.
-        worst_depth_um: Largest depth sd from the calibration alone, over the workspace.
-        next_position_mm, gain: (3,) the reachable position whose correspondence helps most, and the log det of the
-            information that it adds.
-        text: The same in a sentence.
+        enough: True where calibration adds less than a tenth to the error of every triangulated point asked for.
+        worst_ratio, worst_depth_um: Largest sd of these points from calibration alone: over that from one detection, and
+            in depth.
+        next_position_mm, gain: The reachable position (3,) that helps most, and the log det of the information it adds.
     """
 
     enough: bool
@@ -33,7 +29,6 @@ class Advice:
     worst_depth_um: float
     next_position_mm: np.ndarray
     gain: float
-    text: str
 
 
 def box_grid(low_mm: ArrayLike, high_mm: ArrayLike, steps: int = 5) -> np.ndarray:
@@ -50,10 +45,9 @@ def box_grid(low_mm: ArrayLike, high_mm: ArrayLike, steps: int = 5) -> np.ndarra
 
 
 def next_positions(calibration: Calibration, candidates_mm: ArrayLike, count: int = 1) -> tuple[np.ndarray, np.ndarray]:
-    """The `count` positions, chosen one after another, whose correspondences raise det(information) most.
+    """Positions (count, 3) mm, chosen one after another, whose correspondences raise det(information) most; and log gains.
 
-    det(H^T H + h h^T) = det(H^T H)(1 + leverage), so for the affine model this is the largest leverage; after each choice
-    the covariance is updated, so the positions differ.  Returns positions (count, 3) mm and the log det that each gains.
+    det(H^T H + h h^T) = det(H^T H)(1 + leverage), so for the affine model this is the largest leverage.
     """
     x = finite_points(candidates_mm, 3, "candidates_mm")
     J, S = calibration.derivatives(x)[1], calibration.row_covariance(x)
@@ -77,23 +71,14 @@ def advise(
     """Judge a stereo calibration over a workspace, and say where to move next.
 
     Args:
-        low_mm, high_mm: Corners of the box that the tool can reach in view of both cameras, robot frame; an empty box
-            is a ValueError.
+        low_mm, high_mm: Corners of the box that the tool can reach in view of both cameras; a ValueError where empty.
         workspace_mm: (n, 3) points that will be reconstructed; None is a grid over the box.
     """
     grid = box_grid(low_mm, high_mm) if workspace_mm is None else points(workspace_mm, 3, "workspace_mm")
-    alone = calibration.point_covariance(grid, detection=False)
-    both = calibration.point_covariance(grid)
+    alone, both = (calibration.point_covariance(grid, detection=detection) for detection in (False, True))
     # Per point, the direction in which calibration adds most to what one detection leaves uncertain anyway.
     ratio = np.sqrt(np.linalg.eigvals(np.linalg.solve(both - alone, alone)).real.max(axis=1).max())
     depth_um = 1e3 * float(calibration.depth_sd_mm(grid).max())
     # Leverage is a convex function of the position, so over a box it is largest at a corner.
     (position,), (gain,) = next_positions(calibration, box_grid(low_mm, high_mm, steps=2))
-    added = np.sqrt(1 + ratio**2) - 1
-    enough = bool(added < 0.10)
-    text = (
-        f"Calibration error adds at most {100 * added:.0f} % to a triangulated point's and {depth_um:.0f} um of depth "
-        f"over the workspace: {'enough data.' if enough else 'not enough data.'} "
-        f"The next correspondence helps most at ({position[0]:.2f}, {position[1]:.2f}, {position[2]:.2f}) mm."
-    )
-    return Advice(enough, float(ratio), depth_um, position, float(gain), text)
+    return Advice(bool(np.sqrt(1 + ratio**2) < 1.10), float(ratio), depth_um, position, float(gain))

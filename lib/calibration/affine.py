@@ -14,9 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lib.calibration.checks import check_spread
+from lib.calibration.checks import check_spread, stacked_rows
 from lib.cameras import AffineCamera
-from lib.geometry import finite_points
 
 __all__ = ["AffineMinimum", "Moments", "affine_minimum", "distances2", "dlt", "estimate_noise", "paper_variances", "regress"]
 
@@ -25,16 +24,15 @@ def dlt(x_mm: ArrayLike, u: ArrayLike) -> AffineCamera:
     """Affine direct linear transform of one camera: least squares of u = M [x; 1] (paper Eq. 4).
 
     Args:
-        x_mm, u: (n, 3) points in the robot frame and their (n, 2) pixels, n >= 4, finite, not coplanar (else a
-            ValueError).
+        x_mm, u: (n, 3) points in the robot frame and (n, 2) pixels, n >= 4, finite, not coplanar (else a ValueError).
 
     >>> x = np.vstack([np.zeros(3), np.eye(3)])
     >>> dlt(x, AffineCamera([[100, 1, 8, 960], [2, 100, 3, 540]]).project(x)).matrix.round(6).tolist()
     [[100.0, 1.0, 8.0, 960.0], [2.0, 100.0, 3.0, 540.0]]
     """
-    x, u = finite_points(x_mm, 3, "x_mm"), finite_points(u, 2, "u")
-    check_spread(x, u)
-    return AffineCamera(regress(x, u))
+    x, y = stacked_rows(x_mm, [u])
+    check_spread(x)
+    return AffineCamera(regress(x, y))
 
 
 def regress(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -46,10 +44,7 @@ def regress(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Moments:
-    """All that the affine problem needs to know of its data, z = (y, x) with the pixels first.
-
-    `weight` is the number of points, `mean` (m + 3,) and `scatter` (m + 3, m + 3) the sum of (z - mean)(z - mean)^T.
-    """
+    """All that the affine problem needs of z = (pixels, points): number, mean (m + 3,) and sum of (z - mean)(z - mean)^T."""
 
     weight: float
     mean: np.ndarray
@@ -89,8 +84,7 @@ def affine_minimum(moments: Moments, variance_u: float, variance_x: float) -> Af
     subspace, so the three leading eigenvectors of their scatter solve it: no initial value, no iteration.
     The variances are in px^2 and mm^2; variance_x = 0 is plain least squares (DLT).
     """
-    m = len(moments.mean) - 3
-    scatter = moments.scatter
+    m, scatter = len(moments.mean) - 3, moments.scatter
     smallest = np.linalg.eigvalsh(scatter[m:, m:])[0] / moments.weight
     if variance_x <= 1e-14 * smallest:
         A = np.linalg.solve(scatter[m:, m:], scatter[m:, :m]).T
@@ -127,10 +121,9 @@ def estimate_noise(
 ) -> tuple[float, float]:  # fmt: skip
     """sigma_u and sigma_x from residuals (n, m) whose covariance is sigma_u^2 I + sigma_x^2 A A^T.
 
-    Along the epipolar direction (n^T A = 0) the robot's error cannot show, so the residual there is sigma_u alone; the
-    other directions add sigma_x.  Maximum likelihood by Fisher scoring over the eigenvectors of A A^T.  A single camera
-    has no epipolar direction: unless one level is given, everything is attributed to the pixels.  `parameters` is the
-    number of fitted ones, for the degrees of freedom; a level that is given is kept.
+    Along the epipolar direction (n^T A = 0) only sigma_u shows; the other directions add sigma_x.  Maximum likelihood by
+    Fisher scoring over the eigenvectors of A A^T.  A single camera has no epipolar direction: unless one level is given,
+    all is put down to the pixels.  `parameters` is the number of fitted ones; a level that is given is kept.
     """
     n, m = residuals.shape
     known = [np.nan if sigma is None else float(sigma) for sigma in (sigma_u_px, sigma_x_mm)]

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from lib.calibration.models import Fit, Model
-from lib.cameras import AffineCamera, NearAffineCamera, Points, Resection, StereoRig
+from lib.cameras import AffineCamera, Camera, Points, Resection, StereoRig
 from lib.geometry import points
 
 __all__ = ["Calibration", "LandmarkOffsets"]
@@ -19,9 +19,10 @@ __all__ = ["Calibration", "LandmarkOffsets"]
 class LandmarkOffsets:
     """Where the landmarks are seen, relative to where the robot reports them.
 
-    `offset` is (k, 3) mm in the tool's axes (along, across, normal), or (k, m) px in the images, and `covariance` (k, d, d)
-    that of each landmark's.  `prior_sd` is that of a coordinate before the data, given or chosen by the evidence; `p_value`
-    the probability of offsets as large as the data show if there are none (score test).
+    Attributes:
+        offset, covariance: (k, 3) mm in the tool's axes (along, across, normal), or (k, m) px; (k, d, d) of each landmark.
+        prior_sd: Of a coordinate before the data, given or chosen by the evidence.
+        p_value: Probability of offsets as large as the data show if there are none (score test).
     """
 
     offset: np.ndarray
@@ -40,24 +41,21 @@ class Calibration:
     """Cameras, and how well they are known; `lib.calibration.calibrate` makes it.
 
     Attributes:
-        cameras, rig: One or two cameras, affine unless the model has 1/distance or radial distortion; the stereo pair,
-            None for one.
+        cameras, rig: One or two, near-affine if the model has 1/distance or radial distortion; the pair, None for one.
         inliers: (n,) bool, the rows used, one entry for each row given.
-        cost: The energy at the minimum over the inliers (Eq. 3 as printed for ``paper``, else half the chi-square).
+        cost: The energy over the inliers (Eq. 3 as printed for ``paper``, else half the chi-square).
         covariance, parameter_covariance: (8 cameras, 8 cameras) of the entries of the matrices M, row by row, left
             first, in px^2, px^2/mm, px^2/mm^2; and (p, p) of the model's own parameters.
-        sigma_u_px, sigma_x_mm: Noise levels, given or estimated.  Where the detector's covariances weigh the rows,
-            sigma_u_px is their RMS.
+        sigma_u_px, sigma_x_mm: Noise levels, given or estimated; the RMS of the detector's covariances where given.
         model, weighting, image_size_px: As asked for.
-        x_mm, y_px, residuals_px: (n, 3), (n, 2 cameras) and u - project(x), robot error included.  The data are moved
-            by the offsets where these were estimated.  NaN in rows that are not usable: a landmark is missing, or a
-            tool with shut jaws has no axes.
-        covariance_px2: Of the pixels: None, (1, m, m), or (n, m, m) with m = 2 cameras.
+        x_mm, y_px, residuals_px: (n, 3), (n, m) and u - project(x), m = 2 cameras, robot error included; moved by the
+            offsets.  NaN in rows that are not usable: a landmark is missing, or a tool with shut jaws has no axes.
+        covariance_px2: Of the pixels: None, (1, m, m), or (n, m, m).
         plan, minimum: The parsed model and its fit to the inliers.
         offsets: Constant offsets of the landmarks, None where they were not estimated.
     """
 
-    cameras: tuple[AffineCamera | NearAffineCamera, ...]
+    cameras: tuple[Camera, ...]
     rig: StereoRig | None
     inliers: np.ndarray
     cost: float
@@ -80,6 +78,13 @@ class Calibration:
     def parameter_names(self) -> list[str]:
         """Names of the model's parameters, with units."""
         return self.plan.parameter_names
+
+    @property
+    def pair(self) -> StereoRig:
+        """`rig`; a ValueError for a single camera."""
+        if self.rig is None:
+            raise ValueError("calibration: this needs a stereo pair, not a single camera; calibrate with [u_left, u_right].")
+        return self.rig
 
     @property
     def usable(self) -> np.ndarray:
@@ -110,8 +115,6 @@ class Calibration:
         """K, R, t (paper Eq. 5) of each camera, or of the affine camera that touches a near-affine one."""
         return tuple(AffineCamera(camera.matrix).resect() for camera in self.cameras)
 
-    # ---- linearised ------------------------------------------------------------------------------------------------
-
     @property
     def noise_px2(self) -> np.ndarray:
         """(m, m) covariance assumed for a new detection of the pair."""
@@ -137,46 +140,22 @@ class Calibration:
         weight = np.linalg.inv(noise + self.sigma_x_mm**2 * J @ np.swapaxes(J, 1, 2))
         return J_x, J_c @ self.plan.selection, weight, self.minimum.residuals
 
-    def with_parameter_covariance(self, covariance: np.ndarray, offsets: LandmarkOffsets) -> Calibration:
-        """The same cameras with the uncertainty of the landmarks' offsets in theirs."""
-        G = self.minimum.state.matrix_jacobian() @ self.plan.selection
-        return replace(self, parameter_covariance=covariance, covariance=G @ covariance @ G.T, offsets=offsets)
-
-    # ---- uncertainty -----------------------------------------------------------------------------------------------
-
     def projection_covariance(self, x_mm: ArrayLike) -> np.ndarray:
         """(n, m, m) px^2 covariance of the projections of exact points, from the calibration's uncertainty alone."""
         J = self.derivatives(x_mm)[1]
         return J @ self.parameter_covariance @ np.swapaxes(J, 1, 2)
 
-    def leverage(self, x_mm: ArrayLike) -> np.ndarray:
-        """(n,) how much a point's projection depends on the calibration: its covariance in units of one row's noise.
-
-        For the affine model it is h^T (H^T H)^-1 h with h = [x; 1], and averages 4/n over the data.
-        """
-        S = self.row_covariance(x_mm)
-        return np.trace(np.linalg.solve(S, self.projection_covariance(x_mm)), axis1=1, axis2=2) / S.shape[-1]
-
     def point_covariance(self, x_mm: ArrayLike, *, detection: bool = True) -> np.ndarray:
-        """(n, 3, 3) mm^2 covariance of triangulated points, with the calibration's own uncertainty.
-
-        Without `detection` the noise of the detections is left out: what more calibration data could still remove.
-        """
-        if self.rig is None:
-            raise ValueError("point_covariance: needs a stereo pair; calibrate with [u_left, u_right].")
-        J = self.rig.jacobian(x_mm)
+        """(n, 3, 3) mm^2 of triangulated points, from the calibration's own uncertainty and (`detection`) the detections'."""
+        J = self.pair.jacobian(x_mm)
         weight = np.linalg.inv(self.noise_px2)
         gain = np.linalg.solve(np.swapaxes(J, 1, 2) @ weight @ J, np.swapaxes(J, 1, 2) @ weight)
-        noise = self.projection_covariance(x_mm)
-        if detection:
-            noise = noise + self.noise_px2
+        noise = self.projection_covariance(x_mm) + (self.noise_px2 if detection else 0.0)
         return gain @ noise @ np.swapaxes(gain, 1, 2)
 
     def triangulate(self, u_left: ArrayLike, u_right: ArrayLike, covariance_px2: ArrayLike | None = None) -> Points:
         """`StereoRig.triangulate`, with the calibration's uncertainty in the covariance and sigma_u_px as the default."""
-        if self.rig is None:
-            raise ValueError("triangulate: needs a stereo pair; calibrate with [u_left, u_right].")
-        found = self.rig.triangulate(u_left, u_right, self.noise_px2 if covariance_px2 is None else covariance_px2)
+        found = self.pair.triangulate(u_left, u_right, self.noise_px2 if covariance_px2 is None else covariance_px2)
         known = np.isfinite(found.x_mm).all(axis=1)
         covariance = found.covariance_mm2.copy()
         covariance[known] += self.point_covariance(found.x_mm[known], detection=False)
@@ -190,10 +169,7 @@ class Calibration:
 
     @cached_property
     def leave_one_out_px(self) -> np.ndarray:
-        """(inliers, m) residual of each inlier to the cameras fitted without it, in closed form.
-
-        It is (I - L)^-1 r with L the row's own share of its prediction: r / (1 - leverage) for affine models, exact for DLT.
-        """
+        """(inliers, m) residual of each inlier to the cameras fitted without it: r / (1 - leverage), exact for DLT."""
         _, J, weight, r = self.system
         own = J @ self.parameter_covariance @ np.swapaxes(J, 1, 2) @ weight
         return np.linalg.solve(np.eye(own.shape[1]) - own, r[:, :, None])[:, :, 0]

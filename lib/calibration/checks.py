@@ -23,9 +23,8 @@ def stacked_rows(x_mm: ArrayLike, u: Sequence[ArrayLike]) -> tuple[np.ndarray, n
     u = [u] if isinstance(u, np.ndarray) and u.ndim == 2 else list(u)
     if len(u) not in (1, 2):
         raise ValueError(f"u: expected [u_left, u_right] or [u], got {len(u)} arrays.")
-    names = ["u_left", "u_right"] if len(u) == 2 else ["u"]
-    y = [points(pixels, 2, name) for pixels, name in zip(u, names, strict=True)]
-    for pixels, name in zip(y, names, strict=True):
+    y = [points(pixels, 2, name) for pixels, name in zip(u, _names(len(u)), strict=True)]
+    for pixels, name in zip(y, _names(len(u)), strict=True):
         if len(pixels) != len(x):
             raise ValueError(f"{name}: {len(pixels)} points, x_mm has {len(x)}; correspondences go row by row.")
         finite_points(pixels, 2, name)
@@ -34,25 +33,24 @@ def stacked_rows(x_mm: ArrayLike, u: Sequence[ArrayLike]) -> tuple[np.ndarray, n
     return x, np.hstack(y)
 
 
-def check_spread(x: np.ndarray, u: np.ndarray, sigma_x_mm: float = 0.0) -> None:
-    """Refuse fewer than four points, and coplanar or collinear ones, but for a thickness of twice the robot's accuracy."""
-    if len(x) != len(u):
-        raise ValueError(f"x_mm, u: {len(x)} and {len(u)} points; correspondences go row by row.")
-    if len(x) < 4:
-        raise ValueError(f"x_mm: {len(x)} points; an affine camera needs at least 4, not in one plane.")
+def _names(cameras: int) -> list[str]:
+    return ["u_left", "u_right"] if cameras == 2 else ["u"]
+
+
+def check_spread(x: np.ndarray, sigma_x_mm: float = 0.0) -> None:
+    """Refuse coplanar or collinear points, but for a thickness of twice the robot's accuracy."""
     extent = np.sqrt(np.maximum(np.linalg.eigvalsh(np.cov(x.T, bias=True))[::-1], 0.0))
     least = max(1e-6 * extent[0], 2.0 * sigma_x_mm)
     if extent[0] <= least:
         raise ValueError(f"x_mm: the points hardly move (RMS {extent[0]:.3g} mm); move the tool through the volume.")
-    if extent[1] <= least:
-        raise ValueError(
-            f"x_mm: the points are collinear (RMS {extent[1]:.3g} mm off their line); move the tool in all three directions."
-        )
-    if extent[2] <= least:
-        raise ValueError(
-            f"x_mm: the points are coplanar (RMS {extent[2]:.3g} mm off their plane, robot accuracy {sigma_x_mm:.3g} mm); "
-            "cover a few depths as well."
-        )
+    for size, shape, cure in (
+        (extent[1], "collinear", "move the tool in all three directions"),
+        (extent[2], "coplanar", "cover a few depths as well"),
+    ):
+        if size <= least:
+            raise ValueError(
+                f"x_mm: the points are {shape} (RMS {size:.3g} mm away, robot accuracy {sigma_x_mm:.3g} mm); {cure}."
+            )
 
 
 def check_units(x: np.ndarray, y: np.ndarray) -> None:
@@ -67,14 +65,10 @@ def check_units(x: np.ndarray, y: np.ndarray) -> None:
         return  # no motion at all: `check_spread` says so
     zoom, (low, high) = extent(y) / size, PLAUSIBLE_PX_PER_MM
     if zoom > high:
-        raise ValueError(
-            f"x_mm: the images show {zoom:.3g} px per mm, finer than light resolves; "
-            "the points look like metres: multiply them by 1000."
-        )
+        raise ValueError(f"x_mm: {zoom:.3g} px per mm is finer than light resolves; multiply metres by 1000.")
     if zoom < low:
         raise ValueError(
-            f"x_mm: the images show {zoom:.3g} px per mm, coarser than any camera over a tool (or the tool hardly moves in "
-            "the image); the points look like micrometres: divide them by 1000."
+            f"x_mm: {zoom:.3g} px per mm is coarser than any camera over a tool; divide micrometres by 1000 (or move it)."
         )
 
 
@@ -83,28 +77,22 @@ def check_duplicates(x: np.ndarray, y: np.ndarray) -> None:
     repeated = len(x) - len(np.unique(np.hstack([x, y]), axis=0))
     if repeated:
         raise ValueError(
-            f"x_mm, u: {repeated} of {len(x)} rows repeat another row exactly (a frozen video or frames read twice); "
-            "drop the duplicated frames."
+            f"x_mm, u: {repeated} of {len(x)} rows repeat another row exactly; drop frames frozen or read twice."
         )
 
 
 def check_images(y: np.ndarray, image_size_px: tuple[int, int] | None = None) -> None:
     """Refuse pixels (n, m) that stand still or on a line in a camera, are the same in both, or leave the image."""
-    names = ["u_left", "u_right"] if y.shape[1] == 4 else ["u"]
+    names = _names(y.shape[1] // 2)
     for name, u in zip(names, np.split(y, len(names), axis=1), strict=True):
         size = np.linalg.svd(u - u.mean(axis=0), compute_uv=False)
         if size[1] <= 1e-9 * np.abs(u).max() * np.sqrt(len(u)):
             raise ValueError(f"{name}: the detections stand still or lie on one line; is this the moving tool?")
         if image_size_px is not None:
             limit = np.asarray(image_size_px, dtype=float)
-            outside, swapped = (
-                ((v < -0.1 * limit) | (v > 1.1 * limit)).any(axis=1).mean() for v in (u, u[:, ::-1])
-            )
+            outside, swapped = (((v < -0.1 * limit) | (v > 1.1 * limit)).any(axis=1).mean() for v in (u, u[:, ::-1]))
             if outside > 0.1 and swapped < 0.5 * outside:
-                raise ValueError(
-                    f"{name}: {100 * outside:.0f} % of the pixels lie outside the image of {image_size_px[0]} x "
-                    f"{image_size_px[1]}; give (x, y), x to the right, not (row, column)."
-                )
+                raise ValueError(f"{name}: {100 * outside:.0f} % lie outside the image; give (x, y), not (row, column).")
     if len(names) == 2 and (y[:, :2] == y[:, 2:]).all(axis=1).mean() > 0.5:
         raise ValueError("u_right: the same pixels as u_left; give the right camera's own detections.")
 
@@ -112,8 +100,8 @@ def check_images(y: np.ndarray, image_size_px: tuple[int, int] | None = None) ->
 def check_order(A: np.ndarray, sd_rad: float) -> None:
     """Refuse a stereo head A (4, 3) whose left camera stands on the right, where the geometry leaves no doubt.
 
-    Judged only where the two images are alike in rotation (30 degrees), the axes converge by 1 to 30 degrees, the baseline
-    runs along the image rows, and its sign is five standard deviations `sd_rad` of the convergence from zero.
+    That is where the images are alike in rotation (30 degrees), the axes converge by 1 to 30 degrees, the baseline runs
+    along the image rows, and its sign is five standard deviations `sd_rad` of the convergence from zero.
     """
     a, b, c, d = A / np.linalg.norm(A, axis=1, keepdims=True)
     left, right = np.cross(a, b), np.cross(c, d)
@@ -124,7 +112,6 @@ def check_order(A: np.ndarray, sd_rad: float) -> None:
     along, across = (left - right) @ (a + c) / 2, (left - right) @ (b + d) / 2
     if np.deg2rad(1) < np.hypot(along, across) < np.deg2rad(30) and along < -max(3.0 * abs(across), 5.0 * sd_rad):
         raise ValueError(
-            "u: the cameras are swapped, the one called left stands on the right by "
-            f"{np.rad2deg(-along):.1f} degrees; exchange u_left and u_right (or both images are mirrored: flip them). "
-            "checks=False takes them as they are."
+            f"u: the cameras are swapped, left stands on the right by {np.rad2deg(-along):.1f} degrees; exchange u_left and "
+            "u_right (or flip both images, if they are mirrored).  checks=False takes them as they are."
         )

@@ -4,22 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lib.calibration import checks as refuse
 from lib.calibration.affine import Moments, affine_minimum, estimate_noise, paper_variances
 from lib.calibration.calibration import Calibration
-from lib.calibration.checks import (
-    ROBOT_ACCURACY_MM,
-    check_duplicates,
-    check_images,
-    check_order,
-    check_spread,
-    check_units,
-    stacked_rows,
-)
 from lib.calibration.models import Fit, Model, State, fit
 from lib.calibration.offsets import estimate_offsets, rows_axes
 from lib.calibration.robust import consensus, gate
@@ -34,44 +27,32 @@ _OFFSET_ROWS = 24
 
 
 def calibrate(
-    data: Correspondences | ArrayLike,
-    u: Sequence[ArrayLike] | None = None,
-    *,
-    offsets: bool | Literal["tool", "image"] | None = None,
-    offset_prior_sd: float | None = None,
-    model: str = "zero_skew",
-    weighting: str = "likelihood",
-    sigma_u_px: float | None = None,
-    sigma_x_mm: float | None = None,
-    covariance_px2: ArrayLike | Sequence[ArrayLike] | None = None,
-    ransac_px: float | None = None,
-    seed: int = 0,
-    image_size_px: tuple[int, int] | None = None,
-    checks: bool = True,
-) -> Calibration:
+    data: Correspondences | ArrayLike, u: Sequence[ArrayLike] | None = None, *,
+    offsets: bool | Literal["tool", "image"] | None = None, offset_prior_sd: float | None = None,
+    model: str = "zero_skew", weighting: str = "likelihood", sigma_u_px: float | None = None,
+    sigma_x_mm: float | None = None, covariance_px2: ArrayLike | Sequence[ArrayLike] | None = None,
+    ransac_px: float | None = None, seed: int = 0, image_size_px: tuple[int, int] | None = None, checks: bool = True,
+) -> Calibration:  # fmt: skip
     """Cameras from robot positions and their detections: outliers out, then the exact minimum of Eq. (3).
 
     Args:
-        data, u: `Correspondences` alone, whose incomplete rows are left out and whose covariances weigh the rows where
-            every complete row has one; or (n, 3) mm positions in the robot frame and [u_left, u_right] or [u], (n, 2)
-            px each.
-        offsets: Constant offsets of the landmarks along with the cameras (`lib.calibration.offsets`).  "tool" or True:
-            in the tool's axes, from frames in which the robot reports three landmarks of open jaws; "image": in the
-            images, for a detector that is off by some pixels whatever the tool does; False: none.  None: "tool" where
-            at least 24 rows and half of all allow it, else none.
+        data, u: `Correspondences` alone (incomplete rows are left out; covariances weigh the rows where all complete
+            ones have them); or (n, 3) mm positions in the robot frame and [u_left, u_right] or [u], (n, 2) px each.
+        offsets: Constant offsets of the landmarks (`lib.calibration.offsets`).  "tool" or True: in the tool's axes, from
+            frames in which the robot reports three landmarks of open jaws; "image": in the images, for a detector that
+            is off by some pixels whatever the tool does; False: none.  None: "tool" where at least 24 rows and half of
+            all allow it, else none.
         offset_prior_sd: Standard deviation of an offset's coordinate, mm or px; None = chosen by the data.
         model: "affine", "zero_skew" (the paper's), "square", "common_zoom"; with "+distance" (one 1/distance) or
             "+distances" (one a camera), and "+radial".  "near_affine" is "zero_skew+distance".
         weighting: "likelihood": Gaussian noise, inverse variances, exact projection.  "paper": Eq. (3) as printed, with
             weights 1/sigma and a reprojection term of unit weight (its result depends on the unit of length).
         sigma_u_px, sigma_x_mm: Noise of a pixel coordinate and of a robot coordinate; None = estimated from the data.
-        covariance_px2: The detector's own covariance in place of sigma_u, in any form of
-            `lib.geometry.pair_covariance`.
+        covariance_px2: The detector's covariance in place of sigma_u, in any form of `lib.geometry.pair_covariance`.
         ransac_px: Largest reprojection distance of an inlier in any image; None measures the noise and drops rows that
             Gaussian noise would not produce once in 10 000 data sets; infinity keeps all rows.
         seed: Of the random samples.
-        image_size_px: (width, height); its centre is the principal point of near-affine models (else the middle of the
-            detections is).
+        image_size_px: (width, height); the principal point of near-affine models is its centre, else the detections'.
         checks: False skips the plausibility checks: units, repeated rows, swapped cameras, pixels outside the image.
 
     Raises:
@@ -92,7 +73,7 @@ def calibrate(
             raise ValueError("u: Correspondences have their own pixels; leave u out.")
         usable, axes = _usable_rows(data, offsets, weighting)
         rows = data.subset(usable)
-        x, y = stacked_rows(rows.x_mm, [rows.u_left, rows.u_right])
+        x, y = refuse.stacked_rows(rows.x_mm, [rows.u_left, rows.u_right])
         if covariance_px2 is not None:
             noise = pair_covariance(covariance_px2, len(data))
             noise = noise[usable] if len(noise) > 1 else noise
@@ -104,18 +85,15 @@ def calibrate(
             raise ValueError("u: give [u_left, u_right] with plain positions, or Correspondences alone.")
         if offsets or offset_prior_sd is not None:
             raise ValueError("offsets: they need to know which landmark a row is; give Correspondences.of_points(...).")
-        x, y = stacked_rows(data, u)
+        x, y = refuse.stacked_rows(data, u)
         usable, axes = None, None
         noise = None if covariance_px2 is None else pair_covariance(covariance_px2, len(x), y.shape[1] // 2)
     if offset_prior_sd is not None and not offset_prior_sd > 0:
         raise ValueError(f"offset_prior_sd: must be positive, got {offset_prior_sd}.")
-
-    def fitted(x: np.ndarray, y: np.ndarray) -> Calibration:
-        return _calibrate(
-            x, y, noise, model=model, weighting=weighting, sigma_u_px=sigma_u_px, sigma_x_mm=sigma_x_mm,
-            ransac_px=ransac_px, seed=seed, image_size_px=image_size_px, checks=checks,
-        )  # fmt: skip
-
+    fitted = partial(
+        _calibrate, noise=noise, model=model, weighting=weighting, known={"sigma_u_px": sigma_u_px, "sigma_x_mm": sigma_x_mm},
+        ransac_px=ransac_px, seed=seed, image_size_px=image_size_px, checks=checks,
+    )  # fmt: skip
     if axes is None and offsets != "image":
         found = fitted(x, y)
     else:
@@ -136,13 +114,11 @@ def _usable_rows(
         return usable, None
     axes = rows_axes(data)
     open_jaws = usable & np.isfinite(axes).all(axis=(1, 2))
-    if offsets is None and open_jaws.sum() < max(_OFFSET_ROWS, 0.5 * usable.sum()):
+    count = open_jaws.sum()
+    if offsets is None and count < max(_OFFSET_ROWS, 0.5 * usable.sum()):
         return usable, None
-    if open_jaws.sum() < 4:
-        raise ValueError(
-            f"offsets: {open_jaws.sum()} rows have the tool's axes; the robot must report three landmarks a frame, with "
-            "open jaws."
-        )
+    if count < 4:
+        raise ValueError(f"offsets: {count} rows have the tool's axes; the robot must report landmarks with open jaws.")
     return open_jaws, axes[open_jaws]
 
 
@@ -161,19 +137,17 @@ def _spread_out(found: Calibration, usable: np.ndarray) -> Calibration:
 
 
 def _calibrate(
-    x: np.ndarray, y: np.ndarray, noise: np.ndarray | None, *, model: str, weighting: str, sigma_u_px: float | None,
-    sigma_x_mm: float | None, ransac_px: float | None, seed: int, image_size_px: tuple[int, int] | None, checks: bool,
+    x: np.ndarray, y: np.ndarray, *, noise: np.ndarray | None, model: str, weighting: str,
+    known: dict[str, float | None], ransac_px: float | None, seed: int, image_size_px: tuple[int, int] | None, checks: bool,
 ) -> Calibration:  # fmt: skip
     """`calibrate` of complete rows x (n, 3) and y (n, m) with their covariances, (1, m, m) or (n, m, m)."""
     n, m = y.shape
     plan = Model.parse(model, m // 2)
     if weighting not in ("likelihood", "paper"):
         raise ValueError(f"weighting: expected 'likelihood' or 'paper', got {weighting!r}.")
-    for name, value in (("sigma_u_px", sigma_u_px), ("sigma_x_mm", sigma_x_mm), ("ransac_px", ransac_px)):
-        if value is not None and not value >= 0:
-            raise ValueError(f"{name}: must not be negative, got {value}.")
-    if sigma_u_px == 0:
-        raise ValueError("sigma_u_px: must be positive; None estimates it.")
+    for name, value in (*known.items(), ("ransac_px", ransac_px)):
+        if value is not None and not (value > 0 or (value == 0 and name != "sigma_u_px")):
+            raise ValueError(f"{name}: must not be negative, nor sigma_u_px zero, got {value}; None estimates it.")
     if y.size < len(plan.parameter_names):
         raise ValueError(f"x_mm: {n} points are too few for the {len(plan.parameter_names)} parameters of '{model}'.")
     if noise is not None and not np.isfinite(noise).all():
@@ -181,19 +155,17 @@ def _calibrate(
     if weighting == "paper" and noise is not None and len(noise) > 1:
         raise ValueError("weighting: the paper's energy has one sigma_u; give sigma_u_px, or weighting='likelihood'.")
     if checks:
-        check_duplicates(x, y)
-        check_units(x, y)
-    assumed_x = 0.0 if not checks else ROBOT_ACCURACY_MM if sigma_x_mm is None else sigma_x_mm
-    check_spread(x, y, assumed_x)
-    check_images(y, image_size_px if checks else None)
-    if ransac_px == np.inf:
-        inliers = np.ones(n, dtype=bool)
-    else:
+        refuse.check_duplicates(x, y)
+        refuse.check_units(x, y)
+    sigma_x_mm = known["sigma_x_mm"]
+    assumed_x = 0.0 if not checks else refuse.ROBOT_ACCURACY_MM if sigma_x_mm is None else sigma_x_mm
+    refuse.check_spread(x, assumed_x)
+    refuse.check_images(y, image_size_px if checks else None)
+    inliers = np.ones(n, dtype=bool)
+    if ransac_px != np.inf:
         inliers = consensus(x, y, ransac_px, np.random.default_rng(seed), sigma_x_mm=sigma_x_mm)
-    check_spread(x[inliers], y[inliers], assumed_x)
+    refuse.check_spread(x[inliers], assumed_x)
     centre = (np.asarray(image_size_px, dtype=float) - 1) / 2 if image_size_px is not None else None
-
-    known = {"sigma_u_px": sigma_u_px, "sigma_x_mm": sigma_x_mm}
     for _ in range(4):
         rows_noise = noise if noise is None or len(noise) == 1 else noise[inliers]
         minimum, (sigma_u, sigma_x), variances = _minimise(plan, x[inliers], y[inliers], rows_noise, weighting, known, centre)
@@ -217,7 +189,7 @@ def _calibrate(
     if checks and rig is not None:
         spread = np.sqrt(np.linalg.eigvalsh(np.cov(x[inliers].T))[0])
         zoom = np.sqrt(np.abs(np.linalg.det(cameras[0].linear @ cameras[0].linear.T)) ** 0.5)
-        check_order(rig.linear, np.hypot(sigma_u / zoom, sigma_x) / (spread * np.sqrt(inliers.sum() / 2)))
+        refuse.check_order(rig.linear, np.hypot(sigma_u / zoom, sigma_x) / (spread * np.sqrt(inliers.sum() / 2)))
     return Calibration(
         cameras=cameras, rig=rig, inliers=inliers, cost=minimum.cost, covariance=G @ parameter_covariance @ G.T,
         parameter_covariance=parameter_covariance, sigma_u_px=sigma_u, sigma_x_mm=sigma_x, residuals_px=residuals,

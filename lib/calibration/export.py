@@ -9,19 +9,20 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from lib.cameras import AffineCamera, NearAffineCamera
+from lib.cameras import Camera
 from lib.files import whole, write_text
 
 __all__ = ["write_opencv", "write_ros"]
 
 
-def write_opencv(camera: AffineCamera | NearAffineCamera, path: str | Path, image_size_px: tuple[int, int]) -> None:
+def write_opencv(camera: Camera, path: str | Path, image_size_px: tuple[int, int]) -> None:
     """A file for `cv2.FileStorage`; its suffix, .yml, .yaml, .xml or .json, says the format (another is a ValueError).
 
     It holds `projection_matrix` (3 x 4, millimetres of the robot frame to pixels, the last row of an affine camera is
     0 0 0 1), `image_width`, `image_height`, `unit_of_points` and `radial_per_px2`.
 
     >>> import tempfile
+    >>> from lib.cameras import AffineCamera
     >>> file = Path(tempfile.mkdtemp()) / "left.yml"
     >>> write_opencv(AffineCamera([[100, 0, 5, 960], [0, 100, 0, 540]]), file, (1920, 1080))
     >>> storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_READ)
@@ -41,14 +42,11 @@ def write_opencv(camera: AffineCamera | NearAffineCamera, path: str | Path, imag
         storage.release()
 
 
-def write_ros(
-    camera: AffineCamera | NearAffineCamera, path: str | Path, image_size_px: tuple[int, int], name: str = "camera"
-) -> None:
+def write_ros(camera: Camera, path: str | Path, image_size_px: tuple[int, int], name: str = "camera") -> None:
     """ROS CameraInfo YAML (camera_info_manager).  P carries the whole camera, millimetres of the robot frame to pixels.
 
-    K and R are identities and D is zero, since an affine camera has no pinhole K: only P has a meaning.  A ValueError
-    refuses a `name` of anything but letters, digits and underscores, and radial distortion, which D cannot state without a
-    focal length.
+    K and R are identities and D is zero: only P has a meaning.  A ValueError refuses a `name` of anything but letters, digits
+    and underscores, and radial distortion, which D cannot state without a focal length.
     """
     if not re.fullmatch(r"[A-Za-z0-9_]+", name):
         raise ValueError(f"name: ROS takes letters, digits and underscores, got {name!r}.")
@@ -59,15 +57,11 @@ def write_ros(
         return {"rows": values.shape[0], "cols": values.shape[1], "data": values.ravel().tolist()}
 
     content = {
-        "image_width": int(image_size_px[0]),
-        "image_height": int(image_size_px[1]),
-        "camera_name": name,
-        "camera_matrix": matrix(np.eye(3)),
-        "distortion_model": "plumb_bob",
-        "distortion_coefficients": matrix(np.zeros((1, 5))),
-        "rectification_matrix": matrix(np.eye(3)),
+        "image_width": int(image_size_px[0]), "image_height": int(image_size_px[1]), "camera_name": name,
+        "camera_matrix": matrix(np.eye(3)), "distortion_model": "plumb_bob",
+        "distortion_coefficients": matrix(np.zeros((1, 5))), "rectification_matrix": matrix(np.eye(3)),
         "projection_matrix": matrix(camera.projection_matrix),
-    }
+    }  # fmt: skip
     lines = ["# u = P [x; 1] dehomogenised, x in mm in the robot frame; an affine camera's last row is 0 0 0 1: use P alone."]
     # JSON values are YAML values.
     write_text(path, "\n".join([*lines, *(f"{key}: {json.dumps(value)}" for key, value in content.items())]) + "\n")

@@ -19,30 +19,20 @@ __all__ = ["LADDER", "Comparison", "Rung", "compare_models"]
 #: Each model's next freer one, whose likelihood-ratio test asks whether the constraint between them holds; from the stiffest
 #: to the freest.  A pair's cameras have their own zoom, so `common_zoom` is the first to fall.
 _FREER = {
-    "common_zoom": "square",
-    "square": "zero_skew",
-    "zero_skew": "affine",
-    "affine": "affine+distance",
-    "square+distance": "zero_skew+distance",
-    "zero_skew+distance": "zero_skew+distances",
-    "zero_skew+distances": None,
-    "affine+distance": None,
-    "zero_skew+distance+radial": None,
-}
+    "common_zoom": "square", "square": "zero_skew", "zero_skew": "affine", "affine": "affine+distance",
+    "square+distance": "zero_skew+distance", "zero_skew+distance": "zero_skew+distances", "zero_skew+distances": None,
+    "affine+distance": None, "zero_skew+distance+radial": None,
+}  # fmt: skip
 LADDER = tuple(_FREER)
 
 
 @dataclass(frozen=True)
 class Rung:
-    """One model on the data.
+    """One model on the data: its name, its number of `parameters` and the fit.
 
     Attributes:
-        model, parameters: Its name and number of parameters.
-        chi_square: Twice the energy at the common noise levels.
-        bic: chi_square + parameters ln(number of pixel coordinates); the least is the choice.
-        against, p_value: The freer model it is nested in, and the probability of a larger likelihood ratio if the
-            constraint is true.
-        calibration: The fit.
+        chi_square, bic: Twice the energy at the common noise levels; plus parameters ln(number of pixel coordinates).
+        against, p_value: The freer model it is nested in; probability of a larger likelihood ratio if nothing is lost.
     """
 
     model: str
@@ -73,29 +63,21 @@ class Comparison:
     def __str__(self) -> str:
         lines = [f"{'model':28s} {'par':>4s} {'chi2':>10s} {'BIC - best':>10s} {'p(constraint)':>14s}"]
         for rung in self.rungs:
-            p = "" if rung.against is None else f"{rung.p_value:.3g}"
-            mark = " <- chosen" if rung is self.best else ""
+            p, mark = "" if rung.against is None else f"{rung.p_value:.3g}", " <- chosen" if rung is self.best else ""
             above = rung.bic - self.best.bic
             lines.append(f"{rung.model:28s} {rung.parameters:4d} {rung.chi_square:10.1f} {above:10.1f} {p:>14s}{mark}")
         return "\n".join(lines)
 
 
 def compare_models(
-    data: Correspondences | ArrayLike,
-    u: Sequence[ArrayLike] | None = None,
-    *,
-    models: Sequence[str] = LADDER,
+    data: Correspondences | ArrayLike, u: Sequence[ArrayLike] | None = None, *, models: Sequence[str] = LADDER,
     **options: object,
-) -> Comparison:
+) -> Comparison:  # fmt: skip
     """Fit every model on the same rows with the same noise levels, and compare.
 
-    The rows, their offsets and, where not given, the noise levels are those of the freest model (most parameters), so a
-    model error shows as chi-square instead of hiding in larger noise.  Of a single camera the models that tie two cameras are
-    left out.
-
-    Args:
-        data, u, options: As in `calibrate`, with its errors.
-        models: Names of the models.
+    Rows, offsets and noise levels are those of the freest model (most parameters), so a model error shows as chi-square
+    instead of hiding in larger noise.  `data`, `u`, `options` and errors are those of `calibrate`; of a single camera the
+    models that tie two cameras are left out.
 
     >>> from lib.simulator.rig import simulate_correspondences
     >>> c = simulate_correspondences(100, rng=np.random.default_rng(0))
@@ -105,9 +87,8 @@ def compare_models(
     cameras = 1 if u is not None and len(u) == 1 else 2
     if cameras == 1:
         models = [m for m in models if m != "common_zoom" and "distances" not in m]
-    freest = calibrate(
-        data, u, model=max(models, key=lambda m: len(Model.parse(m, cameras).parameter_names)), **options
-    )
+    most = max(models, key=lambda m: len(Model.parse(m, cameras).parameter_names))
+    freest = calibrate(data, u, model=most, **options)
     rows, covariance = freest.inliers, freest.covariance_px2
     x, pixels = freest.x_mm[rows], np.split(freest.y_px[rows], cameras, axis=1)
     same = {
@@ -117,11 +98,10 @@ def compare_models(
     fits = {m: calibrate(x, pixels, model=m, ransac_px=np.inf, checks=False, **same) for m in models}
     rungs = []
     for m, c in fits.items():
-        k, value, freer = len(c.parameter_names), 2.0 * c.cost, _FREER.get(m)
-        if freer in fits:
+        k, value, freer, p = len(c.parameter_names), 2.0 * c.cost, _FREER.get(m), np.nan
+        freer = freer if freer in fits else None
+        if freer is not None:
             gain, more = value - 2.0 * fits[freer].cost, len(fits[freer].parameter_names) - k
             p = float(chi2.sf(max(gain, 0.0), more))
-        else:
-            freer, p = None, np.nan
         rungs.append(Rung(m, k, value, value + k * float(np.log(x.shape[0] * 2 * cameras)), freer, p, c))
     return Comparison(rungs, freest.sigma_u_px, freest.sigma_x_mm)

@@ -21,7 +21,7 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from lib.cameras import AffineCamera, NearAffineCamera, radial_derivative
+from lib.cameras import AffineCamera, Camera, NearAffineCamera, radial_derivative
 from lib.least_squares import minimise
 
 __all__ = ["Fit", "Model", "State", "fit"]
@@ -60,8 +60,7 @@ class Model:
     @cached_property
     def selection(self) -> np.ndarray:
         """(increments of all cameras, parameters), zeros and ones."""
-        names = self._increment_names
-        return np.array([[float(name == parameter) for parameter in self.parameter_names] for name in names])
+        return np.array([[float(name == free) for free in self.parameter_names] for name in self._increment_names])
 
     @cached_property
     def parameter_names(self) -> list[str]:
@@ -89,8 +88,7 @@ class State:
     Attributes:
         A, offset: (cameras, 2, 3), and o (cameras, 2), the pixel of the reference point.
         rho, radial: (cameras,) 1/mm and 1/px^2.
-        rotation, zoom: (cameras, 3, 3) and (cameras, 2) of a structured base, A = diag(zoom) rotation[:2]; None for the
-            affine base.
+        rotation, zoom: (cameras, 3, 3) and (cameras, 2), A = diag(zoom) rotation[:2]; None for the affine base.
         reference, centre: x0 (3,) mm and c (cameras, 2) px, fixed.
     """
 
@@ -135,7 +133,7 @@ class State:
         zoom = self.zoom * np.exp(d[:, 3:5])
         return replace(self, A=zoom[:, :, None] * rotation[:, :2], rotation=rotation, zoom=zoom, **common)
 
-    def cameras(self, model: Model) -> tuple[AffineCamera | NearAffineCamera, ...]:
+    def cameras(self, model: Model) -> tuple[Camera, ...]:
         """The cameras of the public interface."""
         found = []
         for A, o, rho, k, c in zip(self.A, self.offset, self.rho, self.radial, self.centre, strict=True):
@@ -143,9 +141,7 @@ class State:
             found.append(AffineCamera(M) if model.is_affine else NearAffineCamera(M, rho, c, self.reference, k))
         return tuple(found)
 
-    def evaluate(
-        self, x: np.ndarray, *, derivatives: bool = True
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def evaluate(self, x: np.ndarray, *, derivatives: bool = True) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Pixels y (n, m), dy/dx (n, m, 3) and dy/d(all increments) (n, m, cameras k) at x - x0 = `x` (n, 3)."""
         n, c = len(x), len(self.A)
         k = 10 if self.rotation is None else 9
@@ -153,13 +149,12 @@ class State:
         for i in range(c):
             rows = slice(2 * i, 2 * i + 2)
             A, centre = self.A[i], self.centre[i]
-            q = x @ A.T + (self.offset[i] - centre)
             normal = np.cross(A[0], A[1])
             size = np.linalg.norm(normal)
             r_3 = normal / size
             depth = x @ r_3
             ratio = (1.0 + self.rho[i] * depth)[:, None]
-            v = q / ratio
+            v = (x @ A.T + (self.offset[i] - centre)) / ratio
             dv_dx = (A - self.rho[i] * v[:, :, None] * r_3) / ratio[:, :, None]
             bend = radial_derivative(v, self.radial[i]) if self.radial[i] else None
             square = (v**2).sum(axis=1, keepdims=True)
@@ -171,8 +166,7 @@ class State:
             if self.rotation is None:
                 # d r3 = (I - r3 r3^T) (da1 x a2 + a1 x da2) / |a1 x a2|; v x (d q) = rho x.(d r3) v
                 flat = (x - depth[:, None] * r_3) / size
-                dv[:, 0, 0:3] = x
-                dv[:, 1, 3:6] = x
+                dv[:, 0, 0:3] = dv[:, 1, 3:6] = x
                 tilt = np.hstack([np.cross(A[1], flat), np.cross(flat, A[0])])  # x.(d r3) per entry of A
                 dv[:, :, :6] -= self.rho[i] * v[:, :, None] * tilt[:, None, :]
             else:
@@ -236,14 +230,11 @@ def settle(
     return 0.5 * float((r * white).sum()), r, points, weight
 
 
-def fit(
-    model: Model, start: State, x: np.ndarray, y: np.ndarray, noise: np.ndarray, variance_x: float
-) -> Fit:
+def fit(model: Model, start: State, x: np.ndarray, y: np.ndarray, noise: np.ndarray, variance_x: float) -> Fit:
     """Minimum of 1/2 sum (y - f(x~))^T noise^-1 (y - f(x~)) + |x~ - x|^2 / variance_x by Levenberg-Marquardt.
 
-    Every point is eliminated exactly (its normal equations are 3 x 3), which leaves residuals of covariance
-    S = noise + variance_x J J^T and a system in the camera parameters alone.  x (n, 3) is in mm relative to the state's
-    reference, y (n, m) in px, and noise (1, m, m) or (n, m, m) in px^2.
+    Every point is eliminated exactly, which leaves residuals of covariance S = noise + variance_x J J^T and a system in the
+    camera parameters alone.  x (n, 3) is in mm from the state's reference, y (n, m) in px, noise (1 or n, m, m) in px^2.
     """
     T = model.selection
 

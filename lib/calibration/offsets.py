@@ -1,10 +1,9 @@
 """Constant offsets of the landmarks, estimated along with the cameras.
 
-A designer chooses a landmark on the tool.  What a detector (or a person) marks may lie some hundredths of a millimetre
-beside it, always in the same direction of the tool, and such an error does not average out.  With the robot's landmark k at
-x and the tool's axes R, the marked point is x + R d_k.  The data cannot tell all of the nine numbers d from a shift of the
-cameras, so they have a Gaussian prior of zero mean, whose width the data choose (empirical Bayes).  What the data cannot
-tell stays in the covariance.
+What a detector marks may lie some hundredths of a millimetre beside the landmark, always in the same direction of the tool,
+and such an error does not average out.  With the robot's landmark k at x and the tool's axes R, the marked point is
+x + R d_k.  The data cannot tell all nine numbers d from a shift of the cameras, so they have a Gaussian prior of zero mean,
+whose width the data choose (empirical Bayes).  What the data cannot tell stays in the covariance.
 """
 
 from __future__ import annotations
@@ -39,8 +38,7 @@ def tool_axes(x_mm: ArrayLike) -> np.ndarray:
     along = x[:, 1:].mean(axis=1) - x[:, 0]
     length = np.linalg.norm(along, axis=1, keepdims=True)
     with np.errstate(invalid="ignore", divide="ignore"):
-        along = along / length
-        across = x[:, 2] - x[:, 1]
+        along, across = along / length, x[:, 2] - x[:, 1]
         across = across - (across * along).sum(axis=1, keepdims=True) * along
         width = np.linalg.norm(across, axis=1, keepdims=True)
         across = np.where(width > 0.05 * length, across / width, np.nan)
@@ -48,10 +46,7 @@ def tool_axes(x_mm: ArrayLike) -> np.ndarray:
 
 
 def rows_axes(data: Correspondences) -> np.ndarray:
-    """`tool_axes` of each row's frame (n, 3, 3), from where the robot reports the frame's landmarks.
-
-    NaN too where rows repeat a frame's landmark: recordings joined under the same frame numbers do not tell which is which.
-    """
+    """`tool_axes` (n, 3, 3) of each row's frame; NaN too where recordings joined under the same frame numbers repeat rows."""
     rows = np.column_stack([data.frame, data.landmark])
     if len(data) == 0 or data.landmark.max() > 2 or len(np.unique(rows, axis=0)) < len(rows):
         return np.full((len(data), 3, 3), np.nan)
@@ -61,8 +56,7 @@ def rows_axes(data: Correspondences) -> np.ndarray:
 def with_offsets(data: Correspondences, offsets: LandmarkOffsets | None) -> Correspondences:
     """The rows with their landmarks where the detector sees them, as far as `Calibration.offsets` has learnt it.
 
-    Positions move by offsets in the tool's axes, where the robot reports open jaws; pixels by offsets in the images.  None
-    changes nothing.
+    Offsets in the tool's axes move positions, where the jaws are open; offsets in the images move pixels; None nothing.
     """
     if offsets is None:
         return data
@@ -80,13 +74,12 @@ def estimate_offsets(
     """The calibration with one constant offset a landmark, in the tool's axes (n, 3, 3) or (axes=None) in the images.
 
     Gauss-Newton on the offsets with the cameras eliminated: every step is a whole calibration `fit` of positions (n, 3) and
-    pixels (n, m), and one Schur complement.  Where too few steps are allowed, a `RuntimeWarning` says so.  Without `prior_sd`
-    it is the one that makes the data most probable, between 0.1 and 300 um, or 0.01 and 30 px; without sign of an offset it
-    is the least, which leaves the landmarks where they are.
+    pixels (n, m), and one Schur complement; a `RuntimeWarning` where `iterations` are too few.  Without `prior_sd` it is the
+    one that makes the data most probable, between 0.1 and 300 um, or 0.01 and 30 px.
     """
-    size, m = (3 if axes is not None else y.shape[1]), y.shape[1]
-    offset = np.zeros((int(landmark.max()) + 1, size))
-    p_value = np.nan
+    m = y.shape[1]
+    size = m if axes is None else 3
+    offset, p_value = np.zeros((int(landmark.max()) + 1, size)), np.nan
     for _ in range(iterations):
         shift = offset[landmark]
         found = fit(x, y - shift) if axes is None else fit(x + np.einsum("nij,nj->ni", axes, shift), y)
@@ -95,15 +88,13 @@ def estimate_offsets(
         J_o = J_x @ axes[rows] if axes is not None else np.broadcast_to(np.eye(m), (rows.sum(), m, m))
         J = (J_o[:, :, None] * (landmark[rows][:, None] == np.arange(len(offset)))[:, None, :, None]).reshape(len(r), m, -1)
         WJ = weight @ J
-        H_cc = np.einsum("nip,niq->pq", J_c, weight @ J_c)
         H_co = np.einsum("nip,niq->pq", J_c, WJ)
-        explained = np.linalg.solve(H_cc, H_co)
+        explained = np.linalg.solve(np.einsum("nip,niq->pq", J_c, weight @ J_c), H_co)
         information = np.einsum("nip,niq->pq", J, WJ) - H_co.T @ explained
         gradient = np.einsum("nip,ni->p", WJ, r)
         if np.isnan(p_value):
-            least = 1e-4 if axes is not None else 1e-2
-            p_value = _score_test(information, gradient, 500 * least)
-            prior_sd = prior_sd or _most_probable(information, gradient, least * np.geomspace(1, 3000, 60))
+            chosen_sd, p_value = _evidence(information, gradient, 1e-4 if axes is not None else 1e-2)
+            prior_sd = prior_sd or chosen_sd
         covariance = np.linalg.inv(information + np.eye(offset.size) / prior_sd**2)
         step = covariance @ (gradient - offset.ravel() / prior_sd**2)
         offset = offset + step.reshape(offset.shape)
@@ -113,29 +104,24 @@ def estimate_offsets(
         warnings.warn(
             f"offsets: they still move by up to {np.abs(step).max():.2g} {'px' if axes is None else 'mm'} after {iterations} "
             "steps; look at the outliers (`ransac_px`), which may differ from step to step.",
-            RuntimeWarning,
-            stacklevel=3,
-        )
+            RuntimeWarning, stacklevel=3,
+        )  # fmt: skip
     blocks = np.stack([covariance[j : j + size, j : j + size] for j in range(0, offset.size, size)])
-    return found.with_parameter_covariance(
-        found.parameter_covariance + explained @ covariance @ explained.T,
-        LandmarkOffsets(offset, blocks, prior_sd, p_value),
-    )
+    known = found.parameter_covariance + explained @ covariance @ explained.T
+    G = found.minimum.state.matrix_jacobian() @ found.plan.selection
+    learnt = LandmarkOffsets(offset, blocks, prior_sd, p_value)
+    return replace(found, parameter_covariance=known, covariance=G @ known @ G.T, offsets=learnt)
 
 
-def _most_probable(information: np.ndarray, gradient: np.ndarray, candidates: np.ndarray) -> float:
-    """The prior's standard deviation of greatest evidence, the offsets integrated out."""
+def _evidence(information: np.ndarray, gradient: np.ndarray, least: float) -> tuple[float, float]:
+    """The prior's standard deviation, `least` to 3000 times that, of greatest evidence (the offsets integrated out).
+
+    And the p-value of no offsets, in the directions that the data know better than to 500 times `least`.
+    """
     values, vectors = np.linalg.eigh(information)
-    values, along = np.maximum(values, 0.0), (vectors.T @ gradient) ** 2
-    inflation = 1.0 + candidates[:, None] ** 2 * values
+    along, candidates = (vectors.T @ gradient) ** 2, least * np.geomspace(1, 3000, 60)
+    inflation = 1.0 + candidates[:, None] ** 2 * np.maximum(values, 0.0)
     evidence = (along * candidates[:, None] ** 2 / inflation - np.log(inflation)).sum(axis=1)
-    return float(candidates[np.argmax(evidence)])
-
-
-def _score_test(information: np.ndarray, gradient: np.ndarray, largest: float) -> float:
-    """p-value of no offsets, in the directions that the data know better than to `largest`."""
-    values, vectors = np.linalg.eigh(information)
-    known = values * largest**2 > 1.0
-    if not known.any():
-        return 1.0
-    return float(chi2.sf(((vectors.T @ gradient)[known] ** 2 / values[known]).sum(), known.sum()))
+    known = values * (500 * least) ** 2 > 1.0
+    p_value = float(chi2.sf((along[known] / values[known]).sum(), known.sum())) if known.any() else 1.0
+    return float(candidates[np.argmax(evidence)]), p_value

@@ -20,8 +20,7 @@ _MOST_ROWS = 240  # kept until then
 class OnlineCalibration:
     """The affine minimum of all rows so far, older ones weighed down, in constant time and memory.
 
-    The first rows are kept and judged together, so a gross error among them does not decide which later rows are right.  From
-    then on a row is judged by the rig of those before it.
+    The first rows are kept and judged together; from then on a row is judged by the rig of those before it.
 
     Args:
         sigma_u_px, sigma_x_mm: Noise levels; they weigh the terms and judge the rows.
@@ -29,8 +28,7 @@ class OnlineCalibration:
 
     Attributes:
         moments: Of the rows used, None before they agree on a rig.
-        rejected_share: Of the newest rows (about 100), how many were judged wrong.  Near 1, the cameras moved or the
-            noise levels are wrong.
+        rejected_share: Of about the 100 newest rows; near 1 where the cameras moved or the noise levels are wrong.
 
     >>> rng, A = np.random.default_rng(0), np.array([[99.0, 0, 9], [0, 99, 0], [99, 0, -9], [0, 99, 0]])
     >>> online = OnlineCalibration()
@@ -50,7 +48,6 @@ class OnlineCalibration:
         self.sigma_u_px, self.sigma_x_mm, self.forgetting = sigma_u_px, sigma_x_mm, forgetting
         self.moments: Moments | None = None
         self.rejected_share = 0.0
-        self._matrix: np.ndarray | None = None
         self._first: np.ndarray | None = np.empty((0, 7))  # rows (x, y) until they agree on a rig
 
     @property
@@ -79,14 +76,12 @@ class OnlineCalibration:
         for fine in right:
             self.rejected_share += 0.01 * (float(not fine) - self.rejected_share)
         used[used] = right
-        self._matrix = None
         return used
 
     def _start(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Judge all rows so far together."""
         self._first = np.vstack([self._first, np.hstack([x, y])])
-        keep = np.ones(len(self._first), dtype=bool)
-        first_x, first_y = self._first[:, :3], self._first[:, 3:]
+        first_x, first_y, keep = self._first[:, :3], self._first[:, 3:], np.ones(len(self._first), dtype=bool)
         if len(keep) >= 8 and self._spans(Moments.of(first_x, first_y)):
             try:
                 keep = consensus(first_x, first_y, None, np.random.default_rng(0), sigma_x_mm=self.sigma_x_mm)
@@ -101,13 +96,11 @@ class OnlineCalibration:
 
     def _fold(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Judge the rows by the rig of those before, and add them to the moments."""
-        matrix = self._solve()
-        A = matrix[:, :3]
-        r = y - x @ A.T - matrix[:, 3]
+        matrix = affine_minimum(self.moments, self.sigma_u_px**2, self.sigma_x_mm**2).matrix
+        A, r = matrix[:, :3], y - x @ matrix[:, :3].T - matrix[:, 3]
         # A new row's residual also has the calibration's own uncertainty: (1 + leverage) S.
         d = x - self.moments.mean[4:]
-        inverse = np.linalg.inv(self.moments.scatter[4:, 4:])
-        leverage = 1.0 / self.moments.weight + np.einsum("ni,ij,nj->n", d, inverse, d)
+        leverage = 1.0 / self.moments.weight + np.einsum("ni,ij,nj->n", d, np.linalg.inv(self.moments.scatter[4:, 4:]), d)
         right = distances2(r, A, self.sigma_u_px, self.sigma_x_mm) / (1.0 + leverage) < gate(100, 4)
         self.moments = self.moments.faded(self.forgetting)
         if right.any():
@@ -118,7 +111,7 @@ class OnlineCalibration:
         """The rig of the rows so far; a ValueError while they do not span a volume."""
         if not self.ready:
             raise ValueError("OnlineCalibration: the rows so far do not span a volume; add frames at other positions.")
-        matrix = self._solve()
+        matrix = affine_minimum(self.moments, self.sigma_u_px**2, self.sigma_x_mm**2).matrix
         return StereoRig(AffineCamera(matrix[:2]), AffineCamera(matrix[2:]))
 
     @property
@@ -126,16 +119,11 @@ class OnlineCalibration:
         """(16, 16) of the matrices' entries, left row by row, then right: S (x) (H^T H)^-1."""
         rig = self.solve()
         S = self.sigma_u_px**2 * np.eye(4) + self.sigma_x_mm**2 * rig.linear @ rig.linear.T
-        mean, n = self.moments.mean[4:], self.moments.weight
-        HtH = n * np.outer(np.append(mean, 1.0), np.append(mean, 1.0))
+        h = np.append(self.moments.mean[4:], 1.0)
+        HtH = self.moments.weight * np.outer(h, h)
         HtH[:3, :3] += self.moments.scatter[4:, 4:]
         return np.kron(S, np.linalg.inv(HtH))
 
     def _spans(self, moments: Moments) -> bool:
         thickness = np.sqrt(max(np.linalg.eigvalsh(moments.scatter[-3:, -3:])[0], 0.0) / moments.weight)
         return bool(thickness > max(5.0 * self.sigma_x_mm, 1e-9))
-
-    def _solve(self) -> np.ndarray:
-        if self._matrix is None:
-            self._matrix = affine_minimum(self.moments, self.sigma_u_px**2, self.sigma_x_mm**2).matrix
-        return self._matrix

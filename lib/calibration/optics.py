@@ -18,8 +18,8 @@ class Optics:
     """The pair as a piece of optics.
 
     Attributes:
-        mirrored: "no", "left or right" (one channel has an odd number of reflections), "both", or "unknown": two affine
-            cameras mirrored alike look like unmirrored ones on the other side of the scene, only perspective can tell.
+        mirrored: "no"; "left", "right", "left or right" (an odd number of reflections in one channel); "both"; "unknown":
+            only perspective can tell two cameras mirrored alike from unmirrored ones on the other side of the scene.
         convergence_rad: Angle between the viewing directions (of the unmirrored pair).
         roll_rad: Rotation of the right image's content relative to the left's, x towards y.
         robot_from_microscope: Pose of the stereo head: x right in the mean image, z along the mean viewing direction,
@@ -33,29 +33,18 @@ class Optics:
 
 
 def optics(calibration: Calibration) -> Optics:
-    """Judge both channels together.
-
-    A single affine camera cannot tell a mirror (a flip only turns its unseen third row): a ValueError.
-    """
-    rig = calibration.rig
-    if rig is None:
-        raise ValueError("optics: a single camera cannot tell mirrored optics; calibrate with [u_left, u_right].")
+    """Judge both channels together; a ValueError for a single camera, which cannot tell a mirror."""
+    rig = calibration.pair
     directions = np.stack([rig.left.viewing_direction, rig.right.viewing_direction])
     cosine = float(directions[0] @ directions[1])
     signs = np.sign([_depth_sign(camera, calibration) for camera in (rig.left, rig.right)])
     if cosine < 0:
-        mirrored = "left or right"
-        if signs.any() and signs.sum() == 0:
-            mirrored = "left" if signs[0] < 0 else "right"
-    elif signs.any():
-        mirrored = "both" if signs.sum() < 0 else "no"
-    else:
-        mirrored = "unknown"
-    if cosine < 0:
+        one = "left" if signs[0] < 0 else "right"
+        mirrored = one if signs.any() and signs.sum() == 0 else "left or right"
         directions[1] *= -1
-    if mirrored == "both" or (mirrored == "left"):
-        directions *= -1
-    z = directions.sum(axis=0)
+    else:
+        mirrored = ("both" if signs.sum() < 0 else "no") if signs.any() else "unknown"
+    z = directions.sum(axis=0) * (-1.0 if mirrored in ("both", "left") else 1.0)
     z /= np.linalg.norm(z)
     rows = [camera.linear / np.linalg.norm(camera.linear, axis=1, keepdims=True) for camera in (rig.left, rig.right)]
     x = rows[0][0] if mirrored != "left" else rows[1][0]
@@ -68,9 +57,8 @@ def optics(calibration: Calibration) -> Optics:
     else:
         centre = calibration.y_px[calibration.inliers].reshape(-1, 2, 2).mean(axis=(0, 1))
     origin = rig.triangulate(centre[None], centre[None]).x_mm[0]
-    pose = RigidTransform(np.column_stack([x, y, z]), origin)
     angle = float(np.arccos(np.clip(abs(cosine), -1, 1)))
-    return Optics(mirrored, angle, roll, pose)
+    return Optics(mirrored, angle, roll, RigidTransform(np.column_stack([x, y, z]), origin))
 
 
 def _depth_sign(camera: object, calibration: Calibration) -> float:

@@ -61,21 +61,15 @@ def pivot_calibration(robot_from_tool: Sequence[RigidTransform]) -> Pivot:
     covariance = float(r @ r) / max(3 * n - 6, 1) * np.linalg.inv(design.T @ design)
     rms, spread = float(np.sqrt((r**2).sum() / n)), float(np.sqrt(((t - t.mean(axis=0)) ** 2).sum() / n))
     if rms > max(0.25 * spread, 0.05):
-        raise ValueError(
-            f"robot_from_tool: the tip did not rest in one point ({rms:.2f} mm RMS about the best one); hold it in a divot, "
-            "or use tool_offsets, which takes any motion with images."
-        )
+        raise ValueError(f"robot_from_tool: the tip did not rest ({rms:.2f} mm RMS): hold it in a divot or use tool_offsets.")
     _check_determined(covariance[:3, :3])
     return Pivot(solution[:3], solution[3:], covariance, rms)
 
 
-def tool_offsets(
-    robot_from_tool: Sequence[RigidTransform], u: Sequence[ArrayLike], *, iterations: int = 100
-) -> ToolOffsets:
+def tool_offsets(robot_from_tool: Sequence[RigidTransform], u: Sequence[ArrayLike], iterations: int = 100) -> ToolOffsets:
     """Landmark offsets and affine cameras together, from poses and images: y = A (R_i p_k + t_i) + o.
 
-    Bilinear in the cameras and the offsets.  Gauss-Newton on both, started from the lifted problem that is linear
-    in (A, A (x) p, o).
+    Gauss-Newton on both, started from the lifted problem that is linear in (A, A (x) p, o).
 
     Args:
         robot_from_tool: n poses, the tool turned about at least two axes.
@@ -118,13 +112,11 @@ def tool_offsets(
 
 
 def _poses(robot_from_tool: Sequence[RigidTransform]) -> tuple[np.ndarray, np.ndarray]:
-    poses = list(robot_from_tool)
-    if len(poses) < 3:
-        raise ValueError(f"robot_from_tool: {len(poses)} poses; at least three with different rotations are needed.")
-    R, t = np.stack([p.R for p in poses]), np.stack([p.t for p in poses])
+    if len(robot_from_tool) < 3:
+        raise ValueError(f"robot_from_tool: {len(robot_from_tool)} poses; three with different rotations are needed.")
+    R, t = np.stack([p.R for p in robot_from_tool]), np.stack([p.t for p in robot_from_tool])
     # A landmark is seen only through rotations that move it: two different axes at least.
-    turned = (R - R.mean(axis=0)).reshape(-1, 3)
-    if np.linalg.svd(turned, compute_uv=False)[2] < _TURN * np.sqrt(len(R)):
+    if np.linalg.svd((R - R.mean(axis=0)).reshape(-1, 3), compute_uv=False)[2] < _TURN * np.sqrt(len(R)):
         raise ValueError("robot_from_tool: the tool hardly turns, or about one axis only; rotate it about two axes.")
     return R, t
 

@@ -17,9 +17,8 @@ def report(calibration: Calibration, *, robot_accuracy_mm: float | None = None, 
 
     `robot_accuracy_mm`, as its maker states it (`Recording.robot_accuracy_mm`), is compared with the estimated noise.
     """
-    c = calibration
-    rows, used, outliers = len(c.inliers), int(c.inliers.sum()), np.flatnonzero(c.usable & ~c.inliers)
-    usable = int(c.usable.sum())
+    c, outliers = calibration, np.flatnonzero(calibration.usable & ~calibration.inliers)
+    rows, used, usable = len(c.inliers), int(c.inliers.sum()), int(c.usable.sum())
     value, freedom = c.chi_square
     left_out = "" if usable == rows else f", {rows - usable} without a detection, position or axes"
     lines = [
@@ -29,21 +28,17 @@ def report(calibration: Calibration, *, robot_accuracy_mm: float | None = None, 
         f"  reprojection  {c.reprojection_rms_px:.2f} px RMS, {c.press_rms_px:.2f} px cross-validated (leave one out)",
         f"  chi-square    {value:.0f} for {freedom} degrees of freedom",
     ]
-    names = ["left", "right"] if len(c.cameras) == 2 else ["camera"]
-    for name, resection in zip(names, c.resections(), strict=True):
-        K = resection.K
-        lines.append(
-            f"  {name:12s}  zoom {K[0, 0]:.3f} x {K[1, 1]:.3f} px/mm, skew {K[0, 1]:.3f} px/mm, "
-            f"offset ({resection.t[0]:.3f}, {resection.t[1]:.3f}) mm"
-        )
+    for name, resection in zip(["left", "right"] if c.rig else ["camera"], c.resections(), strict=True):
+        (zoom_x, skew), (_, zoom_y) = resection.K
+        at = ", ".join(f"{value:.3f}" for value in resection.t)
+        lines.append(f"  {name:12s}  zoom {zoom_x:.3f} x {zoom_y:.3f} px/mm, skew {skew:.3f} px/mm, offset ({at}) mm")
     distance, sd = c.inverse_distance_per_mm
     if sd > 0:
         far = "not distinguishable from affine" if abs(distance) < 3 * sd else f"working distance {1 / distance:.0f} mm"
         lines.append(f"  1/distance    {distance:.5f} +- {sd:.5f} per mm: {far}")
     if c.rig is not None:
-        o = optics(c)
-        x = c.x_mm[c.inliers]
-        alone, both = 1e3 * np.median(c.depth_sd_mm(x)), 1e3 * np.median(c.depth_sd_mm(x, detection=True))
+        o, x = optics(c), c.x_mm[c.inliers]
+        alone, both = (1e3 * np.median(c.depth_sd_mm(x, detection=detection)) for detection in (False, True))
         at = ", ".join(f"{value:.1f}" for value in o.robot_from_microscope.t)
         lines.append(
             f"  head          convergence {np.rad2deg(o.convergence_rad):.2f} deg, right image rolled by "
@@ -68,8 +63,7 @@ def report(calibration: Calibration, *, robot_accuracy_mm: float | None = None, 
 
 def verdicts(calibration: Calibration, robot_accuracy_mm: float | None = None) -> list[tuple[bool, str]]:
     """(fine, sentence) for each question a user should ask."""
-    c = calibration
-    used, usable = int(c.inliers.sum()), int(c.usable.sum())
+    c, used, usable = calibration, int(calibration.inliers.sum()), int(calibration.usable.sum())
     value, freedom = c.chi_square
     found = [
         (used >= 50, f"{used} correspondences" + ("" if used >= 50 else "; 50 or more make the noise estimate firm")),
@@ -77,46 +71,40 @@ def verdicts(calibration: Calibration, robot_accuracy_mm: float | None = None) -
     ]
     if freedom > 0:
         fits = chi2.sf(value, freedom) > 1e-3
-        found.append(
-            (fits, "residuals are as large as the noise levels say" if fits else "residuals exceed the noise levels")
-        )
+        text = "residuals are as large as the noise levels say" if fits else "residuals exceed the noise levels"
+        found.append((fits, text))
     if robot_accuracy_mm is not None:
         fine = c.sigma_x_mm <= 2.0 * robot_accuracy_mm
         text = f"robot noise {1e3 * c.sigma_x_mm:.1f} um, its stated accuracy is {1e3 * robot_accuracy_mm:.1f} um"
         found.append((fine, text if fine else text + ": check the time offset"))
     x = c.x_mm[c.inliers]
     extent = np.sqrt(np.linalg.eigvalsh(np.cov(x.T))[::-1])
-    deep = extent[2] > 10 * max(c.sigma_x_mm, 0.001)
-    found.append((deep, f"volume covered: RMS {extent[0]:.2f} x {extent[1]:.2f} x {extent[2]:.2f} mm"))
-    straight = _curvature(c) > 1e-3
+    text = f"volume covered: RMS {extent[0]:.2f} x {extent[1]:.2f} x {extent[2]:.2f} mm"
+    found.append((extent[2] > 10 * max(c.sigma_x_mm, 0.001), text))
+    straight = _curvature(x, c.system[3]) > 1e-3
     curved = "residuals are curved: try model='near_affine' (finite working distance)"
     found.append((straight, "residuals show no curvature (the camera model fits)" if straight else curved))
     if c.rig is not None:
         depth_mm = float(np.median(c.depth_sd_mm(x, detection=True)))
-        known = f"depth of one detected point known to {1e3 * depth_mm:.0f} um"
+        text = f"depth of one detected point known to {1e3 * depth_mm:.0f} um"
         seen = depth_mm < extent[0]
-        found.append((seen, known if seen else known + ": the two views hardly differ (the same camera twice?)"))
+        found.append((seen, text if seen else text + ": the two views hardly differ (the same camera twice?)"))
         mirrored = optics(c).mirrored
         found.append((mirrored in ("no", "unknown"), f"mirrored optics: {mirrored}"))
     return found
 
 
-def _curvature(c: Calibration) -> float:
-    """p-value of the six quadratic terms of the position in the residuals (an F-like chi-square test).
+def _curvature(x: np.ndarray, r: np.ndarray) -> float:
+    """p-value of the six quadratic terms of x (n, 3) in the residuals r (n, m) (an F-like chi-square test).
 
     The fit takes any linear trend out of the residuals; a quadratic one means a wrong camera model.
     """
-    x = c.x_mm[c.inliers] - c.x_mm[c.inliers].mean(axis=0)
-    r = c.system[3]
-    if len(x) < 30:
-        return 1.0
-    x = x / x.std(axis=0)
-    i, j = np.triu_indices(3)
-    linear = np.column_stack([x, np.ones(len(x))])
-    Q = np.linalg.qr(np.column_stack([linear, x[:, i] * x[:, j]]))[0][:, 4:]
     S = r.T @ r / len(r)
-    if np.trace(S) < 1e-12:
+    if len(x) < 30 or np.trace(S) < 1e-12:
         return 1.0
+    x = (x - x.mean(axis=0)) / x.std(axis=0)
+    i, j = np.triu_indices(3)
+    Q = np.linalg.qr(np.column_stack([x, np.ones(len(x)), x[:, i] * x[:, j]]))[0][:, 4:]
     projected = Q.T @ r
     S = S - projected.T @ projected / len(r)
     statistic = float(np.einsum("ki,ij,kj->", projected, np.linalg.pinv(S), projected))

@@ -1,13 +1,14 @@
 """Joint stereo RANSAC with local optimisation: which rows are correspondences at all.
 
-Samples of four points give both cameras at once; each camera keeps its own best sample (an error of one camera's
-detector must not cost the other's), and a row counts only where both agree.  Local optimisation refits on the rows kept
-until they no longer change (Chum, Matas and Kittler, "Locally optimized RANSAC", 2003).  Without a threshold samples are
-ranked by their median residual (Rousseeuw's least median of squares), the noise is measured on the rows kept, and a row
-is dropped where its residual would appear once in 10 000 data sets (chi-square, Bonferroni).
+Samples of four points give both cameras at once; each camera keeps its own best sample, and a row counts only where both
+agree.  Local optimisation refits on the rows kept until they no longer change (Chum, Matas and Kittler, "Locally optimized
+RANSAC", 2003).  Without a threshold samples are ranked by their median residual (Rousseeuw's least median of squares), the
+noise is measured on the rows kept, and a row is dropped where its residual would appear once in 10 000 data sets.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import numpy as np
 from scipy.special import gammainccinv, gammaincinv
@@ -62,7 +63,12 @@ def consensus(
     fits = np.hstack([M[b][:, 2 * c : 2 * c + 2] for c, b in enumerate(best)])
     distance2 = ((y - H @ fits) ** 2).reshape(n, m // 2, 2).sum(axis=2)
     if threshold_px is not None:
-        keep = _by_threshold(x, y, H, (distance2 < threshold_px**2).all(axis=1), threshold_px)
+
+        def near(keep: np.ndarray) -> np.ndarray:
+            r = y - H @ regress(x[keep], y[keep]).T
+            return ((r**2).reshape(n, -1, 2).sum(axis=2) < threshold_px**2).all(axis=1)
+
+        keep = _settled(near, (distance2 < threshold_px**2).all(axis=1), 5)
         enough = max(8, n // 10)
     elif n < _FEW:
         keep = _by_growth(x, y, distance2.max(axis=1))
@@ -78,11 +84,11 @@ def consensus(
             f"u: only {int(keep.sum())} of {n} rows agree on affine cameras; check that x_mm and u belong together "
             "(frames, order of landmarks, time offset), or raise ransac_px."
         )
-    residual = y[keep] - H[keep] @ regress(x[keep], y[keep]).T
-    if np.sqrt((residual**2).mean()) > 0.25 * np.sqrt(y[keep].var(axis=0).mean()):
+    rms = np.sqrt(((y[keep] - H[keep] @ regress(x[keep], y[keep]).T) ** 2).mean())
+    if rms > 0.25 * np.sqrt(y[keep].var(axis=0).mean()):
         raise ValueError(
-            "u: no consensus, all rows look like outliers: the best affine cameras leave "
-            f"{np.sqrt((residual**2).mean()):.3g} px RMS; check that x_mm and u belong together."
+            f"u: no consensus, all rows look like outliers: the best affine cameras leave {rms:.3g} px RMS; check that x_mm "
+            "and u belong together."
         )
     return keep
 
@@ -91,28 +97,24 @@ def _samples(x: np.ndarray, count: int, rng: np.random.Generator, least: float) 
     """Sets (count, 4) of rows whose four points span a volume."""
     n = len(x)
     thickness = np.sqrt(np.linalg.eigvalsh(x.T @ x / n)[0])
-    sets = (
-        np.argpartition(rng.random((3 * count, n)), 4, axis=1)[:, :4] if n < 40 else rng.integers(0, n, (3 * count, 4))
-    )
-    corners = x[sets]
-    corners = corners - corners.mean(axis=1, keepdims=True)
+    sets = np.argpartition(rng.random((3 * count, n)), 4, axis=1)[:, :4] if n < 40 else rng.integers(0, n, (3 * count, 4))
+    corners = x[sets] - x[sets].mean(axis=1, keepdims=True)
     smallest = np.sqrt(np.maximum(np.linalg.eigvalsh(np.swapaxes(corners, 1, 2) @ corners)[:, 0], 0.0))
     good = sets[smallest > max(least, 0.3 * thickness)]
     if len(good) < 20:  # thin data: take the best there are
-        good = sets[np.argsort(-smallest)[:count]]
-        good = good[smallest[np.argsort(-smallest)[: len(good)]] > 1e-9 * thickness]
+        best = np.argsort(-smallest)[:count]
+        good = sets[best[smallest[best] > 1e-9 * thickness]]
     return good[:count]
 
 
-def _by_threshold(x: np.ndarray, y: np.ndarray, H: np.ndarray, keep: np.ndarray, threshold_px: float) -> np.ndarray:
-    for _ in range(10):
-        if keep.sum() < 5:
+def _settled(judge: Callable[[np.ndarray], np.ndarray], keep: np.ndarray, fewest: int, rounds: int = 10) -> np.ndarray:
+    """The rows (n,) bool that `judge` keeps, refitted to them until they no longer change."""
+    for _ in range(rounds):
+        if keep.sum() < fewest:
             break
-        distance2 = ((y - H @ regress(x[keep], y[keep]).T) ** 2).reshape(len(y), -1, 2).sum(axis=2)
-        new = (distance2 < threshold_px**2).all(axis=1)
-        if (new == keep).all():
+        keep, before = judge(keep), keep
+        if (keep == before).all():
             break
-        keep = new
     return keep
 
 
@@ -146,20 +148,16 @@ def _by_growth(x: np.ndarray, y: np.ndarray, distance2: np.ndarray) -> np.ndarra
 
 def _by_noise(x: np.ndarray, y: np.ndarray, keep: np.ndarray) -> np.ndarray:
     n, m = y.shape
-    limit = gate(n, m)
-    # A first cut at 99 % and a last at the gate: the noise is measured on a set that is not yet contaminated.
-    for bound in (*(_chi2_quantile(0.99, m),) * 3, *(limit,) * 10):
-        if keep.sum() < 6:
-            break
+
+    def distance2(keep: np.ndarray) -> np.ndarray:
         fitted = affine_minimum(Moments.of(x[keep], y[keep]), 1.0, 0.0).matrix
         r = y - x @ fitted[:, :3].T - fitted[:, 3]
         sigmas = estimate_noise(r[keep], fitted[:, :3], 4 * m)
         # Rounding sets the floor for data without noise.
-        distance2 = distances2(r, fitted[:, :3], *sigmas, 1e-11 * np.abs(y).max())
+        found = distances2(r, fitted[:, :3], *sigmas, 1e-11 * np.abs(y).max())
         # Heavy tails or a model error widen the bound: the median of the distance is known.
-        distance2 /= max(1.0, np.median(distance2[keep]) / _chi2_quantile(0.5, m))
-        new = distance2 < bound
-        if bound == limit and (new == keep).all():
-            break
-        keep = new
-    return keep
+        return found / max(1.0, np.median(found[keep]) / _chi2_quantile(0.5, m))
+
+    # A first cut at 99 % and a last at the gate: the noise is measured on a set that is not yet contaminated.
+    keep = _settled(lambda keep: distance2(keep) < _chi2_quantile(0.99, m), keep, 6, rounds=3)
+    return _settled(lambda keep: distance2(keep) < gate(n, m), keep, 6)

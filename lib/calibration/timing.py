@@ -19,10 +19,7 @@ _GRID = 41  # trial offsets of the coarse search
 
 @dataclass(frozen=True, eq=False)
 class TimeOffset:
-    """t_robot = t_video + offset_s, with its standard deviation, and the reprojection RMS (distance in an image) there.
-
-    The coarse search tried the offsets `trial_s` and found `trial_rms_px`.
-    """
+    """t_robot = t_video + offset_s, its sd, and the reprojection RMS there and at the offsets `trial_s` tried first."""
 
     offset_s: float
     sd_s: float
@@ -30,20 +27,11 @@ class TimeOffset:
     trial_s: np.ndarray
     trial_rms_px: np.ndarray
 
-    @property
-    def significant(self) -> bool:
-        """True where the offset differs from zero by more than three standard deviations."""
-        return abs(self.offset_s) > 3.0 * self.sd_s
-
-    def __str__(self) -> str:
-        return f"video to robot: {1e3 * self.offset_s:.2f} +- {1e3 * self.sd_s:.2f} ms"
-
 
 class _Path:
-    """One landmark's motion as smoothing splines, a piece for each stretch without a gap.
+    """One landmark's motion as least-squares cubic splines with a knot every `smooth_s`, a piece a stretch without a gap.
 
-    The derivative of an interpolating spline is mostly encoder noise at 100 Hz, and noise in the velocity biases whatever is
-    regressed on it.  The pieces are least-squares cubics with a knot every `smooth_s`.
+    The derivative of an interpolating spline is mostly encoder noise at 100 Hz, which biases what is regressed on it.
     """
 
     def __init__(self, time: np.ndarray, x: np.ndarray, smooth_s: float) -> None:
@@ -76,13 +64,9 @@ class _Path:
 
 
 def estimate_time_offset(
-    data: Correspondences | tuple[ArrayLike, list[ArrayLike]],
-    kinematics: Kinematics | tuple[ArrayLike, ArrayLike],
-    *,
-    start_s: float = 0.0,
-    search_s: float = 0.2,
-    smooth_s: float = 0.1,
-) -> TimeOffset:
+    data: Correspondences | tuple[ArrayLike, list[ArrayLike]], kinematics: Kinematics | tuple[ArrayLike, ArrayLike], *,
+    start_s: float = 0.0, search_s: float = 0.2, smooth_s: float = 0.1,
+) -> TimeOffset:  # fmt: skip
     """Offset of the clocks: the shift of the kinematics that lets affine cameras explain the video best.
 
     A coarse search, then Gauss-Newton: with v the velocity, y = A x(t) + o + (A v) offset is linear in the offset.
@@ -95,8 +79,8 @@ def estimate_time_offset(
         smooth_s: Time within which the motion is smooth: the kinematics' noise is averaged over it.
 
     Raises:
-        ValueError: For wrong shapes, fewer than eight instants inside the kinematics, a tool that stands still, or an
-            offset at the end of the search.
+        ValueError: For wrong shapes, fewer than eight instants inside the kinematics, a tool at rest, or an offset at the
+            end of the search.
     """
     time, landmark, y = _rows(data)
     paths = _paths(kinematics, smooth_s)
@@ -106,13 +90,10 @@ def estimate_time_offset(
     for k, path in enumerate(paths):
         rows = known & (landmark == k)
         known[rows] = path.covers(time[rows] + start_s - search_s, time[rows] + start_s + search_s)
-    if len(np.unique(time[known])) < 8:
-        raise ValueError(
-            f"data: {len(np.unique(time[known]))} frames lie inside the kinematics by search_s = {search_s} s, away from "
-            "gaps; 8 are needed."
-        )
     time, landmark, y = time[known], landmark[known], y[known]
-    m = y.shape[1]
+    n, m = len(np.unique(time)), y.shape[1]
+    if n < 8:
+        raise ValueError(f"data: {n} frames lie inside the kinematics by search_s = {search_s} s, away from gaps; give 8.")
 
     def at(offset: float, derivative: int = 0) -> np.ndarray:
         x = np.empty((len(time), 3))
@@ -126,12 +107,12 @@ def estimate_time_offset(
     def step_and_sd(offset: float) -> tuple[float, float]:
         x, v = at(offset), at(offset, 1)
         matrix = affine_minimum(Moments.of(x, y), 1.0, 0.0).matrix
-        r = y - x @ matrix[:, :3].T - matrix[:, 3]
-        sigma_u, sigma_x = estimate_noise(r, matrix[:, :3], 4 * m)
-        W = np.linalg.inv(sigma_u**2 * np.eye(m) + sigma_x**2 * matrix[:, :3] @ matrix[:, :3].T)
+        A, r = matrix[:, :3], y - x @ matrix[:, :3].T - matrix[:, 3]
+        sigma_u, sigma_x = estimate_noise(r, A, 4 * m)
+        W = np.linalg.inv(sigma_u**2 * np.eye(m) + sigma_x**2 * A @ A.T)
         # Sweep [x, 1] out of the velocity's image: the cameras are fitted along with the offset.
         H = np.column_stack([x - x.mean(axis=0), np.ones(len(x))])
-        image = (v - H @ np.linalg.lstsq(H, v, rcond=None)[0]) @ matrix[:, :3].T
+        image = (v - H @ np.linalg.lstsq(H, v, rcond=None)[0]) @ A.T
         information = np.einsum("ni,ij,nj->", image, W, image)
         if information <= 0:
             raise ValueError("kinematics: the tool moves at no varying speed; the offset cannot be seen.")
@@ -147,9 +128,7 @@ def estimate_time_offset(
         if abs(step) < 1e-7:
             break
     if offset in (low, high):
-        raise ValueError(
-            f"search_s: the best offset, {offset:.3f} s, lies at the end of the search; widen search_s or move start_s."
-        )
+        raise ValueError(f"search_s: {offset:.3f} s, lies at the end of the search; widen search_s or move start_s.")
     return TimeOffset(offset, sd, rms(offset), trial, misfit)
 
 
@@ -172,9 +151,7 @@ def _paths(kinematics: Kinematics | tuple, smooth_s: float) -> list[_Path]:
     if x.ndim == 2:
         x = x[:, None]
     if time.ndim != 1 or x.ndim != 3 or x.shape[2] != 3 or len(x) != len(time):
-        raise ValueError(
-            f"kinematics: expected times (m,) and positions (m, k, 3) or (m, 3), got {time.shape}, {x.shape}."
-        )
+        raise ValueError(f"kinematics: expected times (m,) and positions (m, k, 3) or (m, 3), got {time.shape}, {x.shape}.")
     if len(time) < 4 or not np.isfinite(time).all() or (np.diff(time) <= 0).any():
         raise ValueError("kinematics: times must be finite and increase, and at least four samples are needed.")
     return [_Path(time, x[:, k], smooth_s) for k in range(x.shape[1])]

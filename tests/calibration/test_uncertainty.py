@@ -13,12 +13,18 @@ def made(n=150, seed=0, model="affine", **options):
     return c, calibrate(c.x_mm, [c.u_left, c.u_right], model=model, ransac_px=np.inf, image_size_px=(1920, 1080))
 
 
+def leverage(found, x_mm):
+    """(n,) covariance of a point's projection, in units of one row's noise."""
+    S = found.row_covariance(x_mm)
+    return np.trace(np.linalg.solve(S, found.projection_covariance(x_mm)), axis1=1, axis2=2) / S.shape[-1]
+
+
 def test_leverage_is_that_of_regression():
     c, found = made()
     H = np.column_stack([c.true_x_mm, np.ones(150)])
     expected = np.einsum("ni,ij,nj->n", H, np.linalg.inv(H.T @ H), H)
-    np.testing.assert_allclose(found.leverage(c.true_x_mm), expected, rtol=0.02)
-    assert found.leverage(c.x_mm).mean() == pytest.approx(4 / 150, rel=0.02)
+    np.testing.assert_allclose(leverage(found, c.true_x_mm), expected, rtol=0.02)
+    assert leverage(found, c.x_mm).mean() == pytest.approx(4 / 150, rel=0.02)
 
 
 def test_leave_one_out_is_what_refitting_without_the_row_gives():
@@ -94,7 +100,7 @@ def test_advised_position_is_the_best_of_the_box(model):
     np.testing.assert_allclose(position, best[0])
     assert gain == pytest.approx(gains[0])
     if model == "affine":
-        np.testing.assert_allclose(position, everywhere[found.leverage(everywhere).argmax()])
+        np.testing.assert_allclose(position, everywhere[leverage(found, everywhere).argmax()])
 
 
 def test_predicted_gain_is_the_gain():
@@ -135,7 +141,6 @@ def test_advice_says_when_the_data_are_enough():
     many = advise(made(800)[1], low, high)
     assert not few.enough and many.enough
     assert few.worst_ratio > 3 * many.worst_ratio and few.worst_depth_um > 3 * many.worst_depth_um
-    assert "not enough" in few.text and "enough data" in many.text
     with pytest.raises(ValueError, match="high_mm"):
         advise(made(20)[1], high, low)
 
