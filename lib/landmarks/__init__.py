@@ -1,6 +1,5 @@
 """Landmarks of the forceps in an image: base, tip_1, tip_2, with covariance and confidence (paper Sec. III)."""
 
-from lib.landmarks.detect import detect
-from lib.landmarks.detector import Detector, Landmarks
+from lib.landmarks.detector import Detector, Landmarks, detect
 
 __all__ = ["Detector", "Landmarks", "detect"]

@@ -11,9 +11,9 @@ from safetensors.torch import save as safetensors_bytes
 from torch import Tensor, uint8
 
 from lib import files
-from lib.landmarks.network import OffsetNetwork, StackedHourglass, config_of, network_of
+from lib.landmarks.network import HourglassConfig, OffsetConfig, OffsetNetwork, StackedHourglass, network_of
 
-__all__ = ["load_network", "read_checkpoint", "write_checkpoint"]
+__all__ = ["checksum", "load_network", "read_checkpoint", "write_checkpoint"]
 
 _CURE = "get the file again, or train one with `python3 -m lib train`."
 
@@ -45,14 +45,14 @@ def write_checkpoint(path: str | Path, tensors: dict[str, Tensor], metadata: dic
     try:
         files.write_bytes(path, safetensors_bytes(tensors, metadata=texts))
     except OSError as error:
-        text = f"{path}: not saved ({error.strerror}); an earlier file there is unharmed"
-        raise OSError(error.errno, text) from error
+        raise OSError(error.errno, f"{path}: not saved ({error.strerror}); an earlier file there is unharmed") from error
 
 
 def read_checkpoint(path: str | Path, kind: str) -> tuple[dict[str, Tensor], dict[str, object]]:
     """Tensors and metadata of a file that `write_checkpoint` wrote with ``metadata["format"] == kind``.
 
-    Raises `FileNotFoundError` if there is none, `ValueError` if it is damaged, has no checksum, or holds something else.
+    Raises:
+        FileNotFoundError, ValueError: If there is none; if it is damaged, has no checksum, or holds something else.
     """
     path = Path(path)
     if not path.is_file():
@@ -75,9 +75,9 @@ def load_network(
     path: str | Path, config: dict, tensors: dict[str, Tensor], prefix: str = ""
 ) -> StackedHourglass | OffsetNetwork:
     """A network from its configuration and those tensors of a file whose names begin with `prefix`; errors name the file."""
-    own = {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
     try:
-        network = network_of(config_of(config))
+        network = network_of((OffsetConfig if "size_px" in config else HourglassConfig)(**config))
+        own = {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
         network.load_state_dict(own)
     except (TypeError, RuntimeError, ValueError) as error:
         text = str(error).splitlines()[0]

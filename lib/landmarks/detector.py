@@ -17,28 +17,21 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
+from tqdm.auto import tqdm
 
 from lib import paths
+from lib.correspondences import Correspondences, of_recording
 from lib.geometry import image_from_cell
 from lib.landmarks.checkpoints import load_network, read_checkpoint, write_checkpoint
 from lib.landmarks.engines import accelerated, default_engine
 from lib.landmarks.error_model import ErrorModel, closeup_peaks, corrected, covariance_and_confidence
 from lib.landmarks.heatmaps import Peaks, decode
-from lib.landmarks.images import as_tensor, as_uint8
-from lib.landmarks.network import OffsetNetwork, StackedHourglass
-from lib.landmarks.windows import (
-    CLOSEUP_REACH_PX,
-    CLOSEUP_ZOOM,
-    closeup_from_image,
-    cut,
-    direction_rad,
-    expected_in_closeup,
-    tool_centre,
-    window_from_image,
-)
+from lib.landmarks.network import OffsetNetwork, StackedHourglass, as_tensor, as_uint8
+from lib.landmarks.windows import closeup_from_image, cut, direction_rad, tool_centre, window_from_image
 from lib.parallel import single_threaded_torch
+from lib.recordings import Recording
 
-__all__ = ["CLOSE", "MISSING_BELOW", "TRACKED_FROM", "Detector", "Landmarks"]
+__all__ = ["CLOSE", "MISSING_BELOW", "TRACKED_FROM", "Detector", "Landmarks", "detect"]
 
 FORMAT = "microstereo.detector"
 #: The fields that a weights file keeps as plain values.
@@ -56,13 +49,10 @@ class Landmarks:
     """Detections in n images; the order is base, tip_1, tip_2.
 
     Attributes:
-        u:
-            (n, 3, 2) px, NaN where missing.
-        covariance:
-            (n, 3, 2, 2) px^2, NaN where missing.
-        confidence:
-            (n, 3), the probability that the landmark is in view and `u` lies within 5 % of the tool's length of it; 0 where
-            missing.
+        u: (n, 3, 2) px, NaN where missing.
+        covariance: (n, 3, 2, 2) px^2, NaN where missing.
+        confidence: (n, 3), the probability that the landmark is in view and `u` lies within 5 % of the tool's length of it;
+            0 where missing.
 
         >>> found = Landmarks.none(2)
         >>> len(found), len(found[:1]), found.u.shape
@@ -107,21 +97,15 @@ class Detector:
     """Finds the landmarks in frames of any size and number; one detector serves both cameras.
 
     Attributes:
-        frame_network, reduction:
-            The first stage, which sees the frame with one pixel for `reduction` image pixels, an integer.
-        window_network:
-            The third stage, which sees one upright window of `window_px` for each landmark; None = no such stage.
-        tool_network, tool_reduction:
-            The second stage, which sees one window of `window_px` round the tool, reduced likewise; None = no such stage.
-        closeup_network:
-            The last stage, which predicts where in a closeup the landmark lies; None = no such stage.
-        error_models:
-            One for each stage: ``"frame"``, ``"tool"``, ``"window"``, ``"closeup"``, and ``"tracking"`` for the closeups that
-            follow a landmark from frame to frame.
-        mirror:
-            The windows' network also sees the mirror image of every window, and the mean counts: twice the work.
-        engine:
-            What runs the networks, one of `lib.landmarks.engines.ENGINES`; the weights are the same.
+        frame_network, reduction: The first stage, which sees the frame reduced by `reduction`, an integer.
+        window_network: The third stage, which sees one upright window of `window_px` for each landmark; None = no such stage.
+        tool_network, tool_reduction: The second stage, which sees one window of `window_px` round the tool, reduced likewise;
+            None = no such stage.
+        closeup_network: The last stage, which predicts where in a closeup the landmark lies; None = no such stage.
+        error_models: One for each stage: ``"frame"``, ``"tool"``, ``"window"``, ``"closeup"``, and ``"tracking"`` for the
+            closeups that follow a landmark from frame to frame.
+        mirror: The windows' network also sees the mirror image of every window, and the mean counts: twice the work.
+        engine: What runs the networks, one of `lib.landmarks.engines.ENGINES`; the weights are the same.
 
         >>> found = Detector.load(engine="torch")(np.zeros((1, 270, 480, 3), np.uint8))
         >>> found.u.shape, bool((found.confidence < 0.5).all())
@@ -337,11 +321,8 @@ class Detector:
             return Peaks.none(), matrices, np.zeros((0, 2), int)
         outputs = self.outputs(windows, stage)
         if stage in CLOSE:
-            size, k = windows.shape[1], which[:, 1]
-            fit, reach = self.error_models.get(stage, ErrorModel()), CLOSEUP_REACH_PX * np.array(CLOSEUP_ZOOM)
-            parts = (expected_in_closeup(size, k), np.array(fit.gain)[k], np.array(fit.bias)[k], reach[k])
-            rows = (torch.from_numpy(part)[:, None].float() for part in parts)
-            return corrected(closeup_peaks(outputs, size), *rows), matrices, which
+            size, fit = windows.shape[1], self.error_models.get(stage, ErrorModel())
+            return corrected(closeup_peaks(outputs, size), fit, size, which[:, 1:]), matrices, which
         if stage == "tool":  # one window holds all three landmarks
             which = np.stack([np.repeat(which, 3), np.tile(np.arange(3), len(which))], axis=1)
             matrices, heatmaps = np.repeat(matrices, 3, axis=0), outputs.flatten(0, 1)[:, None]
@@ -362,6 +343,44 @@ class Detector:
     def _measured(self, peaks: Peaks, stage: str, scale: int, landmark: np.ndarray | slice = np.s_[:]) -> Landmarks:
         """Peaks in pixels of a network's input as landmarks in image pixels; `landmark` says which each peak is."""
         fit = self.error_models.get(stage, ErrorModel())
-        rows = (torch.as_tensor(row, dtype=torch.float64) for row in (fit.coefficients[landmark], fit.logit))
-        covariance, confidence = covariance_and_confidence(peaks.double(), scale, *rows)
+        covariance, confidence = covariance_and_confidence(peaks.double(), scale, fit, landmark)
         return Landmarks(image_from_cell(peaks.u.numpy(), scale), covariance.numpy(), confidence.numpy())
+
+
+def detect(
+    recording: Recording,
+    detector: Detector | None = None,
+    *,
+    frames: slice | np.ndarray | None = None,
+    track: bool = False,
+) -> Correspondences:
+    """Run the detector over a recording, one stereo frame at a time (a full-HD pair takes 12 MB).
+
+    Returns three rows a frame (base, tip_1, tip_2), each with the robot's position at its instant, and NaN where a landmark
+    is missing.  `Correspondences.complete` keeps the rows that both cameras and the robot saw.
+
+    Args:
+        detector: None is the one that ships.
+        frames: Which frames; None is all.
+        track: Follow the landmarks from frame to frame (`Detector.track`): several times faster if frames follow each other.
+
+        >>> from lib import paths
+        >>> found = detect(Recording.open(paths.SHIPPED_RECORDING), frames=slice(0, 2))
+        >>> len(found), found.x_mm.shape, found.covariance_px2.shape
+        (6, (6, 3), (6, 2, 2, 2))
+    """
+    detector = detector or Detector.load()
+    chosen = np.arange(len(recording.frames))[slice(None) if frames is None else frames]
+    if not chosen.size:
+        raise ValueError(f"frames: none of the {len(recording.frames)} frames of the recording; choose at least one.")
+    found = []
+    for i in tqdm(chosen, desc="landmarks", unit="pair", leave=False):
+        frame = recording.frames[int(i)]
+        pair = np.stack([frame.left, frame.right])
+        found.append(detector.track(pair, found[-1]) if track and found else detector(pair))
+    u, covariance, confidence = (
+        np.stack([getattr(pair, name) for pair in found], axis=1) for name in ("u", "covariance", "confidence")
+    )
+    return of_recording(
+        recording, *u, covariance_px2=np.moveaxis(covariance, 0, 2), confidence=np.moveaxis(confidence, 0, 2), frames=chosen
+    )

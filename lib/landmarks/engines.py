@@ -6,18 +6,19 @@ OpenVINO computes in bfloat16 where the processor has units for it, else in floa
 
 from __future__ import annotations
 
-import hashlib
 import importlib.util
 import sys
 import threading
 import warnings
-from collections import OrderedDict
 from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from lib.landmarks.checkpoints import checksum
 from lib.landmarks.network import OffsetNetwork, StackedHourglass
 
 __all__ = ["ENGINES", "LastOutput", "OpenVinoNetwork", "accelerated", "default_engine", "openvino"]
@@ -26,10 +27,6 @@ __all__ = ["ENGINES", "LastOutput", "OpenVinoNetwork", "accelerated", "default_e
 ENGINES = ("torch", "openvino", "openvino float32")
 #: How many images are run at once; fewer are filled up to the next of these.
 BATCHES = (1, 2, 3, 6)
-
-#: Compiled networks by weights, input shape and threads: copies of a detector share them.
-_COMPILED: OrderedDict[tuple, object] = OrderedDict()
-_KEPT = 16
 _lock = threading.Lock()
 
 
@@ -55,7 +52,8 @@ def accelerated(
 ) -> Callable[[Tensor], list[Tensor]]:
     """The network for inference: called with images (n, 3, h, w), its last output is that of `LastOutput`.
 
-    Raises `ValueError` for an unknown engine, or one that is not installed.
+    Raises:
+        ValueError: For an unknown engine, or one that is not installed.
     """
     if engine not in ENGINES:
         raise ValueError(f"engine: {engine!r} is none; choose one of {', '.join(ENGINES)}.")
@@ -85,6 +83,7 @@ class LastOutput(nn.Module):
         return (seen + mirrored.flip(-2)[:, [0, 2, 1]]) / 2
 
 
+@dataclass(frozen=True)
 class OpenVinoNetwork:
     """A network run by OpenVINO with as many threads as torch has, a few images at once.
 
@@ -92,46 +91,38 @@ class OpenVinoNetwork:
     of six windows takes two thirds of the time of six windows alone.
     """
 
-    def __init__(
-        self, network: StackedHourglass | OffsetNetwork, *, mirror: bool = False, precision: str | None = None
-    ):
-        self._network, self._mirror, self._precision = network, mirror, precision
-        self._threads = torch.get_num_threads()
-        digest = hashlib.sha256(repr(network.config).encode())
-        for value in network.state_dict().values():
-            digest.update(np.ascontiguousarray(value.numpy()).tobytes())
-        self._digest = digest.hexdigest()
+    network: StackedHourglass | OffsetNetwork = field(compare=False)
+    mirror: bool = False
+    precision: str | None = None
+    threads: int = field(default_factory=torch.get_num_threads)
+    digest: str = field(init=False)
+
+    def __post_init__(self) -> None:
+        digest = checksum(self.network.state_dict(), {"config": repr(self.network.config)})
+        object.__setattr__(self, "digest", digest)
 
     def __call__(self, images: Tensor) -> list[Tensor]:
         x = np.ascontiguousarray(images.numpy())
         if x.ndim != 4 or x.shape[1] != 3:
-            return self._network(images)  # raises what is wrong
+            return self.network(images)  # raises what is wrong
         found = []
         with _lock:  # a request is shared
             for part in np.array_split(x, range(BATCHES[-1], len(x), BATCHES[-1])):
                 n = next(size for size in BATCHES if size >= len(part))
                 full = np.concatenate([part, np.zeros((n - len(part), *x.shape[1:]), np.float32)])
-                request = self._request(full.shape)
-                found.append(request.infer({0: full})[0][: len(part)].copy())
+                found.append(_request(self, full.shape).infer({0: full})[0][: len(part)].copy())
         return [torch.from_numpy(np.concatenate(found))]
 
-    def _request(self, shape: tuple[int, ...]) -> object:
-        key = (self._digest, self._mirror, shape, self._threads, self._precision)
-        if key not in _COMPILED:
-            _COMPILED[key] = self._compile(shape)
-            while len(_COMPILED) > _KEPT:
-                _COMPILED.popitem(last=False)
-        _COMPILED.move_to_end(key)
-        return _COMPILED[key]
 
-    def _compile(self, shape: tuple[int, ...]) -> object:
-        ov = openvino()
-        module = LastOutput(self._network, mirror=self._mirror).eval()
-        with torch.no_grad(), warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # tracing fixes the shape, as it shall
-            traced = torch.jit.freeze(torch.jit.trace(module, torch.zeros(shape), check_trace=False))
-            model = ov.convert_model(traced, input=[(list(shape), np.float32)])  # of a trace it is much quicker
-        options = {"PERFORMANCE_HINT": "LATENCY", "NUM_STREAMS": 1, "INFERENCE_NUM_THREADS": self._threads}
-        if self._precision:
-            options["INFERENCE_PRECISION_HINT"] = self._precision
-        return ov.Core().compile_model(model, "CPU", options).create_infer_request()
+@lru_cache(maxsize=16)  # copies of a detector share what is compiled: equal weights, equal key
+def _request(compiled: OpenVinoNetwork, shape: tuple[int, ...]) -> object:
+    ov = openvino()
+    module = LastOutput(compiled.network, mirror=compiled.mirror).eval()
+    with torch.no_grad(), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # tracing fixes the shape, as it shall
+        traced = torch.jit.freeze(torch.jit.trace(module, torch.zeros(shape), check_trace=False))
+        model = ov.convert_model(traced, input=[(list(shape), np.float32)])  # of a trace it is much quicker
+    options = {"PERFORMANCE_HINT": "LATENCY", "NUM_STREAMS": 1, "INFERENCE_NUM_THREADS": compiled.threads}
+    if compiled.precision:
+        options["INFERENCE_PRECISION_HINT"] = compiled.precision
+    return ov.Core().compile_model(model, "CPU", options).create_infer_request()

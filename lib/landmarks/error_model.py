@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from lib.landmarks.heatmaps import Peaks
+from lib.landmarks.windows import CLOSEUP_REACH_PX, CLOSEUP_ZOOM, expected_in_closeup
 
 __all__ = ["ErrorModel", "closeup_peaks", "corrected", "covariance_and_confidence", "features_of"]
 
@@ -23,13 +24,10 @@ class ErrorModel:
     other, have equal coefficients.
 
     Attributes:
-        log_variance:
-            (2, 6): for x and y the constants of base, tip_1 and tip_2, and the slopes of the other three features.
-        logit:
-            (4,).
-        gain, bias:
-            (3, 2) for base, tip_1 and tip_2 along x and y, closeups only.  A closeup's correction is scaled by the gain that
-            minimises the validation error; the bias is the mean error that this leaves, in the closeup's pixels.
+        log_variance: (2, 6): for x and y the constants of base, tip_1 and tip_2, and the slopes of the other three features.
+        logit: (4,).
+        gain, bias: (3, 2) for base, tip_1 and tip_2 along x and y, closeups only.  A closeup's correction is scaled by the
+            gain that minimises the validation error; the bias is the mean error that this leaves, in the closeup's pixels.
 
         >>> ErrorModel().coefficients.shape
         (3, 2, 4)
@@ -69,13 +67,11 @@ def features_of(peaks: Peaks, scale: float) -> Tensor:
 
 
 def covariance_and_confidence(
-    peaks: Peaks, scale: float, log_variance: Tensor, logit: Tensor
+    peaks: Peaks, scale: float, fit: ErrorModel, landmark: np.ndarray | slice = np.s_[:]
 ) -> tuple[Tensor, Tensor]:
-    """Covariance (..., 2, 2) px^2 and confidence (...) of peaks; torch can trace it.
-
-    `log_variance` (..., 2, 4) are the `ErrorModel.coefficients` of each peak's landmark, `logit` is (4,).
-    """
+    """Covariance (..., 2, 2) px^2 and confidence (...) of peaks; `landmark` says which each is.  Torch can trace it."""
     features = features_of(peaks, scale)
+    log_variance, logit = (torch.tensor(row, dtype=features.dtype) for row in (fit.coefficients[landmark], fit.logit))
     variance = (features[..., :2, :] * log_variance).sum(-1).clamp(-12, 12).exp()
     confidence = torch.sigmoid((features[..., 2, :] * logit).sum(-1))
     return variance[..., None] * torch.eye(2, dtype=variance.dtype), confidence
@@ -92,12 +88,15 @@ def closeup_peaks(found: Tensor, size_px: int) -> Peaks:
     return Peaks(u, one, one, variance[..., None] * torch.eye(2, dtype=variance.dtype))
 
 
-def corrected(peaks: Peaks, expected: Tensor, gain: Tensor, bias: Tensor, reach: Tensor) -> Peaks:
-    """Closeups' peaks moved from where the landmark was `expected` by `gain` times the correction, less the bias.
+def corrected(peaks: Peaks, fit: ErrorModel, size_px: int, landmark: np.ndarray) -> Peaks:
+    """Closeups' peaks (n, k) moved from where `landmark` (n, k) was expected by the gain times the correction, less the bias.
 
-    All three are (n, k, 2) or one for all.  A peak further away than `reach` (n, k) closeup pixels gets the value 0: the
-    network was not trained for such distances and sees something else.  Torch can trace it.
+    A peak further away than `CLOSEUP_REACH_PX` gets the value 0: the network was not trained for such distances and sees
+    something else.  Torch can trace it.
     """
+    reach = CLOSEUP_REACH_PX * np.array(CLOSEUP_ZOOM)
+    parts = (expected_in_closeup(size_px, landmark), *(np.array(part)[landmark] for part in (fit.gain, fit.bias, reach)))
+    expected, gain, bias, reach = (torch.tensor(part, dtype=peaks.u.dtype) for part in parts)
     move = peaks.u - expected
     near = (move.square().sum(-1) < reach.square()).to(move.dtype)
     return replace(peaks, u=expected + gain * move - bias, value=peaks.value * near)

@@ -24,8 +24,7 @@ from lib.landmarks.detector import CLOSE, MISSING_BELOW, Detector
 from lib.landmarks.engines import LastOutput, openvino
 from lib.landmarks.error_model import ErrorModel, closeup_peaks, corrected, covariance_and_confidence
 from lib.landmarks.heatmaps import Peaks, decode
-from lib.landmarks.images import as_tensor
-from lib.landmarks.windows import CLOSEUP_REACH_PX, CLOSEUP_ZOOM, expected_in_closeup
+from lib.landmarks.network import as_tensor
 from lib.recordings import Recording
 
 __all__ = ["LARGEST", "StageWithDecoding", "export", "run_onnx"]
@@ -39,29 +38,22 @@ class StageWithDecoding(nn.Module):
 
     def __init__(self, detector: Detector, stage: str):
         super().__init__()
-        self.closeup = stage in CLOSE
-        network = detector.networks["closeup" if self.closeup else stage]
+        network = detector.networks["closeup" if stage in CLOSE else stage]
         self.network = LastOutput(network, mirror=detector.mirror and stage == "window")
-        self.stride, self.method = None if self.closeup else network.stride, detector.method
+        self.config, self.closeup, self.method = network.config, stage in CLOSE, detector.method
         self.scale = detector.reduction if stage == "frame" else 1
-        fit = detector.error_models.get(stage, ErrorModel())
-        buffers = {"log_variance": fit.coefficients, "logit": fit.logit, "gain": fit.gain, "bias": fit.bias}
-        if self.closeup:
-            buffers["expected"] = expected_in_closeup(network.config.size_px, np.arange(3))
-            buffers["reach"] = CLOSEUP_REACH_PX * np.array(CLOSEUP_ZOOM)
-        for name, value in buffers.items():
-            self.register_buffer(name, torch.tensor(value, dtype=torch.float32))
+        self.fit = detector.error_models.get(stage, ErrorModel())
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         seen = self.network(images)
         if self.closeup:
             # The graph does not know which landmark a closeup shows, so it corrects it as each of the three.
-            one = closeup_peaks(seen, images.shape[-1])
-            three = (part.repeat(1, 3, *[1] * (part.ndim - 2)) for part in (one.u, one.value, one.width, one.covariance))
-            peaks = corrected(Peaks(*three), self.expected, self.gain, self.bias, self.reach)
+            one = closeup_peaks(seen, self.config.size_px)
+            three = Peaks(*(part.expand(-1, 3, *part.shape[2:]) for part in vars(one).values()))
+            peaks = corrected(three, self.fit, self.config.size_px, np.arange(3))
         else:
-            peaks = decode(seen, self.stride, method=self.method)
-        covariance, confidence = covariance_and_confidence(peaks, self.scale, self.log_variance, self.logit)
+            peaks = decode(seen, self.config.stride, method=self.method)
+        covariance, confidence = covariance_and_confidence(peaks, self.scale, self.fit)
         return peaks.u * self.scale + (self.scale - 1) / 2, covariance, confidence
 
 
@@ -70,16 +62,19 @@ def export(
 ) -> dict[str, tuple[Path, float]]:
     """Write every stage as ``STAGE.onnx`` into `folder`, if it agrees with torch.
 
-    The stages are compared on `examples`, frames (n, h, w, 3) uint8 with the tool in view; None = of the recording that
-    ships.  The exported first stage takes frames of this size.  Returns the file of each stage, and its largest difference
-    from torch in px, over landmarks that torch finds.  Raises `ValueError` if a stage differs by more than `LARGEST` (its
-    file is not written), nothing is found in `examples`, or a package is missing.
+    Returns the file of each stage, and its largest difference from torch in px, over landmarks that torch finds.
+
+    Args:
+        examples: Frames (n, h, w, 3) uint8 with the tool in view, on which the stages are compared; None = of the recording
+            that ships.  The exported first stage takes frames of this size.
+
+    Raises:
+        ValueError: If a stage differs by more than `LARGEST` (its file is not written), nothing is found in `examples`, or
+            a package is missing.
     """
     for package in ("onnx", "openvino"):  # one writes the files, the other runs them for the comparison
         if not importlib.util.find_spec(package):
-            raise ValueError(
-                f"export: needs the package {package}, which is not installed here; `pip install {package}`."
-            )
+            raise ValueError(f"export: needs the package {package}, which is not installed here; `pip install {package}`.")
     if examples is None:
         frames = Recording.open(paths.SHIPPED_RECORDING).frames
         examples = np.stack([image for i in (0, len(frames) // 2) for image in (frames[i].left, frames[i].right)])
@@ -135,7 +130,5 @@ def _difference(module: nn.Module, images: Tensor, path: Path, stage: str) -> fl
     }
     for unit, value in differences.items():
         if not value <= LARGEST[unit]:
-            raise ValueError(
-                f"{stage}: ONNX and torch differ by {value:.3g} {unit}, more than {LARGEST[unit]}; not exported."
-            )
+            raise ValueError(f"{stage}: ONNX and torch differ by {value:.3g} {unit}, above {LARGEST[unit]}; not exported.")
     return float(differences["px"])

@@ -136,14 +136,14 @@ def _gauss_newton(
     step_limit = torch.tensor([0.7 * sigma, 0.7 * sigma, 0.4, 1.0, 1.0], dtype=torch.float64, device=p.device)
     for _ in range(iterations):
         residual, jacobian = model(theta)
-        normal = jacobian.mT @ jacobian + 1e-6 * eye
-        step = _solve(normal, jacobian.mT @ residual[..., None])[..., 0]
+        transposed = jacobian.transpose(-1, -2)  # ONNX does not know .mT
+        step = _solve(transposed @ jacobian + 1e-6 * eye, transposed @ residual[..., None])[..., 0]
         theta = theta + torch.maximum(torch.minimum(step, step_limit), -step_limit)
         theta = torch.cat([theta[..., :2], theta[..., 2:3].clamp(0.3, 3.0), theta[..., 3:]], -1)
     residual, jacobian = model(theta)
     variance = residual.square().sum(-1) / (weight.sum(-1) - 5).clamp_min(1) + 1e-8
-    unit = eye[:, :2].expand(*jacobian.shape[:-2], 5, 2)
-    covariance = variance[..., None, None] * _solve(jacobian.mT @ jacobian + 1e-6 * eye, unit)[..., :2, :]
+    normal, unit = jacobian.transpose(-1, -2) @ jacobian + 1e-6 * eye, eye[:, :2].expand(*jacobian.shape[:-2], 5, 2)
+    covariance = variance[..., None, None] * _solve(normal, unit)[..., :2, :]
     width = theta[..., 2]
     near = (theta[..., :2].square().sum(-1) <= reach**2) & (width > 0.4) & (width < 2.5)
     good = near & (theta.abs() < torch.inf).all(-1) & (theta[..., 3] > 0)  # NaN is not below infinity

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.stats import chi2
 
-__all__ = [
-    "GROSS_PX", "PCK_THRESHOLDS", "Scores", "calibration_error", "coverage", "errors_px", "nees", "pck", "reliability",
-    "score",
-]  # fmt: skip
+__all__ = ["GROSS_PX", "PCK_THRESHOLDS", "Scores", "calibration_error", "errors_px", "nees", "pck", "reliability", "score"]
 
 #: The paper's range of thresholds, as parts of the tool's length.
 PCK_THRESHOLDS = np.linspace(0.001, 0.2, 200)
@@ -74,13 +71,6 @@ def nees(u: ArrayLike, u_true: ArrayLike, covariance: ArrayLike) -> np.ndarray:
     return value
 
 
-def coverage(values: ArrayLike, probability: float = 0.95) -> float:
-    """Percent of `nees` values inside the ellipse that should hold `probability` of them."""
-    values = np.asarray(values)
-    values = values[np.isfinite(values)]
-    return 100.0 * float((values <= chi2.ppf(probability, 2)).mean()) if values.size else np.nan
-
-
 def reliability(confidence: ArrayLike, correct: ArrayLike, bins: int = 10) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Mean confidence, fraction correct and count per bin of confidence, (bins,) each; NaN for empty bins."""
     confidence, correct = np.ravel(confidence).astype(float), np.ravel(correct).astype(float)
@@ -103,7 +93,7 @@ class Scores:
 
     `median_px` and `p95_px` are over detected landmarks with a label.  `missed` counts labels without a detection, which
     PCK counts as wrong; `gross` counts errors beyond `GROSS_PX`, which `bias_px`, `nees` (the mean) and `coverage_95` leave
-    out.
+    out.  `coverage_95` is the percentage inside the ellipse that should hold 95 %.
     """
 
     pck_0_01: float
@@ -118,10 +108,6 @@ class Scores:
     labels: int
     missed: int
     gross: int
-
-    def as_dict(self) -> dict[str, object]:
-        """For JSON."""
-        return asdict(self)
 
 
 def score(u: ArrayLike, u_true: ArrayLike, covariance: ArrayLike | None = None, *, length_px=None) -> Scores:
@@ -141,7 +127,7 @@ def score(u: ArrayLike, u_true: ArrayLike, covariance: ArrayLike | None = None, 
         p95_px=float(p95),
         bias_px=(float(x), float(y)),
         nees=float(squared.mean()) if squared.size else np.nan,
-        coverage_95=coverage(squared),
+        coverage_95=100.0 * float((squared <= chi2.ppf(0.95, 2)).mean()) if squared.size else np.nan,
         labels=int((~np.isnan(error)).sum()),
         missed=int(np.isinf(error).sum()),
         gross=int((found >= GROSS_PX).sum()),

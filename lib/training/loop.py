@@ -22,9 +22,8 @@ from tqdm.auto import tqdm
 from lib.landmarks.checkpoints import checksum, load_network, read_checkpoint, write_checkpoint
 from lib.landmarks.error_model import closeup_peaks
 from lib.landmarks.heatmaps import decode
-from lib.landmarks.images import as_tensor
 from lib.landmarks.metrics import score, tool_length_px
-from lib.landmarks.network import OffsetNetwork, StackedHourglass, network_of
+from lib.landmarks.network import OffsetNetwork, StackedHourglass, as_tensor, network_of
 from lib.provenance import commit_id, machine
 from lib.training.augmentation import Batch, leave_frame
 from lib.training.config import TrainingConfig

@@ -7,8 +7,7 @@ import torch
 from lib.landmarks import Detector, Landmarks
 from lib.landmarks.error_model import ErrorModel, features_of
 from lib.landmarks.heatmaps import Peaks
-from lib.landmarks.images import as_tensor
-from lib.landmarks.network import HourglassConfig, OffsetConfig, OffsetNetwork, StackedHourglass
+from lib.landmarks.network import HourglassConfig, OffsetConfig, OffsetNetwork, StackedHourglass, as_tensor
 from lib.landmarks.windows import (
     CLOSEUP_BEHIND_PX,
     CLOSEUP_ZOOM,

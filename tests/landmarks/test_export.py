@@ -13,8 +13,7 @@ from lib.landmarks import export as module
 from lib.landmarks.engines import openvino
 from lib.landmarks.error_model import ErrorModel
 from lib.landmarks.export import LARGEST, export
-from lib.landmarks.images import as_tensor
-from lib.landmarks.network import HourglassConfig, OffsetConfig, OffsetNetwork, StackedHourglass
+from lib.landmarks.network import HourglassConfig, OffsetConfig, OffsetNetwork, StackedHourglass, as_tensor
 from lib.parallel import single_threaded_torch
 
 pytestmark = pytest.mark.skipif(

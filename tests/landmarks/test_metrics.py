@@ -1,3 +1,6 @@
+import json
+from dataclasses import asdict
+
 import numpy as np
 import pytest
 
@@ -45,7 +48,9 @@ def test_nees_and_coverage_of_true_covariances():
     u = (L @ rng.normal(0, 1, (3000, 3, 2, 1)))[..., 0]
     values = metrics.nees(u, truth, L @ L.mT)
     assert values.mean() == pytest.approx(2, abs=0.06)
-    assert metrics.coverage(values) == pytest.approx(95, abs=0.7)
+    scores = metrics.score(u, truth, L @ L.mT, length_px=np.full(3000, 100.0))
+    assert scores.gross == 0 and scores.nees == pytest.approx(values.mean())
+    assert scores.coverage_95 == pytest.approx(95, abs=0.7)
     assert metrics.nees(u, truth, 4 * L @ L.mT).mean() == pytest.approx(0.5, abs=0.02)
 
 
@@ -61,9 +66,7 @@ def test_confidence_that_is_true_has_no_calibration_error():
 
 
 def test_scores_are_json():
-    import json
-
-    json.dumps(metrics.score(frames(), frames(), np.broadcast_to(np.eye(2), (4, 3, 2, 2))).as_dict())
+    json.dumps(asdict(metrics.score(frames(), frames(), np.broadcast_to(np.eye(2), (4, 3, 2, 2)))))
 
 
 def test_shapes_are_named():
