@@ -35,18 +35,12 @@ class Batch:
     @property
     def weight(self) -> Tensor:
         """(n, 3): 0 for unlabelled landmarks, which have no loss; 1 also for absent ones, whose empty heatmap is trained."""
-        unlabelled = torch.isnan(self.u).any(-1) & (self.visibility > 0)
-        return (~unlabelled).to(self.images.dtype)
+        return (~torch.isnan(self.u).any(-1) | (self.visibility == 0)).to(self.images.dtype)
 
     @property
     def peak(self) -> Tensor:
         """(n, 3) height of the target: 1 visible, `OCCLUDED_PEAK` occluded, 0 absent."""
-        heights = torch.tensor([0.0, OCCLUDED_PEAK, 1.0], dtype=self.images.dtype, device=self.visibility.device)
-        return heights[self.visibility.long()]
-
-    def to(self, device: torch.device) -> Batch:
-        """The batch on another device."""
-        return Batch(self.images.to(device), self.u.to(device), self.visibility.to(device))
+        return self.images.new_tensor([0.0, OCCLUDED_PEAK, 1.0])[self.visibility.long()]
 
 
 @dataclass(frozen=True)
@@ -58,8 +52,7 @@ class Augmentation:
         zoom: Factor, drawn uniformly from this range.
         shift: Part of the image's size, either way.
         mirror: Flip top and bottom every second time, and swap the tips.
-        photometric, photometric_share: Strength of the changes of light and optics, 0 to 1, and the share of a batch
-            that they are made to.
+        photometric, photometric_share: Strength (0 to 1) of the changes of light and optics; part of a batch that has them.
     """
 
     rotation_deg: float = 30.0
@@ -81,30 +74,24 @@ class Augmentation:
         changed = round(self.photometric_share * len(batch.u)) if self.photometric else 0
         with torch.random.fork_rng(devices=[]):  # kornia draws from torch's global generator
             torch.manual_seed(int(rng.integers(2**63)))
-            images, u = self._geometric(batch.images, batch.u)
+            images, u, visibility = batch.images, batch.u.clone(), batch.visibility.clone()
+            if self.rotation_deg or self.shift or self.zoom != (1.0, 1.0):
+                shift = (self.shift, self.shift) if self.shift else None
+                affine = K.RandomAffine(self.rotation_deg, translate=shift, scale=self.zoom, padding_mode="border", p=1.0)
+                both = K.AugmentationSequential(affine, data_keys=["input", "keypoints"])
+                images, u = both(images, u.to(images.dtype))  # NaN points stay NaN
             if changed:
                 images = torch.cat([self.light()(images[:changed]).clamp(0, 1), images[changed:]])
-        u, visibility = u.clone(), batch.visibility.clone()
         if self.mirror:
-            flip = torch.from_numpy(rng.random(len(u)) < 0.5)
-            h = images.shape[-2]
-            images = torch.where(flip[:, None, None, None], images.flip(-2), images)
-            mirrored = torch.stack([u[..., 0], (h - 1) - u[..., 1]], -1)[:, [0, 2, 1]]
-            u = torch.where(flip[:, None, None], mirrored, u)
-            visibility = torch.where(flip[:, None], visibility[:, [0, 2, 1]], visibility)
+            flip = np.flatnonzero(rng.random(len(u)) < 0.5)
+            images = images.index_copy(0, torch.from_numpy(flip), images[flip].flip(-2))
+            u[flip, :, 1] = images.shape[-2] - 1 - u[flip, :, 1]
+            u[flip], visibility[flip] = u[flip][:, [0, 2, 1]], visibility[flip][:, [0, 2, 1]]
         if changed:
-            part = slice(changed)
-            covered, visibility[part] = self._occluders(images[part], u[part], visibility[part], rng)
+            covered, visibility[:changed] = self._occluders(images[:changed], u[:changed], visibility[:changed], rng)
             images = torch.cat([covered, images[changed:]])
+        u = u.to(batch.u.dtype)
         return Batch(images, u, leave_frame(u, visibility, images.shape[-2:]))
-
-    def _geometric(self, images: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
-        shift = (self.shift, self.shift) if self.shift else None
-        if self.rotation_deg == 0 and self.zoom == (1.0, 1.0) and shift is None:
-            return images, u
-        affine = K.RandomAffine(self.rotation_deg, translate=shift, scale=self.zoom, padding_mode="border", p=1.0)
-        moved, points = K.AugmentationSequential(affine, data_keys=["input", "keypoints"])(images, u.to(images.dtype))
-        return moved, points.to(u.dtype)  # NaN points stay NaN
 
     def light(self) -> K.ImageSequential:
         """The changes of light, focus and sensor."""

@@ -11,13 +11,12 @@ from lib import paths
 from lib.files import write_json
 from lib.landmarks import Detector
 from lib.recordings import Recording
-from lib.training.assembly import assemble
 from lib.training.config import PRESETS
 from lib.training.evaluation import evaluate
 from lib.training.loop import load_training, train
 from lib.training.samples import labelled_images
 from lib.training.shards import generate
-from lib.training.stages import STAGES, finetune, stage_config, stage_data
+from lib.training.stages import STAGES, assemble, finetune, stage_config, stage_data
 
 __all__ = ["main", "main_evaluate"]
 
@@ -69,17 +68,13 @@ def main(argv: list[str] | None = None) -> int:
         for stage, (path, difference) in export(Detector.load(a.out), a.onnx).items():
             print(f"{stage}: {path}, at most {difference:.2g} px from torch")
     else:
-        _train(a)
+        config = stage_config(a.what, preset=a.preset, features=a.features)
+        config = replace(config, steps=a.steps, seed=a.seed, validate_every=200, learning_rate=a.rate or config.learning_rate)
+        if a.what == "window":
+            config = replace(config, position_weight_per_px=a.position_weight)
+        initial = load_training(a.initial) if a.initial else None
+        print(train(config, *stage_data(a.what, a.data), a.folder / a.what, initial=initial).provenance["metrics"])
     return 0
-
-
-def _train(a: argparse.Namespace) -> None:
-    config = stage_config(a.what, preset=a.preset, features=a.features)
-    config = replace(config, steps=a.steps, seed=a.seed, validate_every=200, learning_rate=a.rate or config.learning_rate)
-    if a.what == "window":
-        config = replace(config, position_weight_per_px=a.position_weight)
-    initial = load_training(a.initial) if a.initial else None
-    print(train(config, *stage_data(a.what, a.data), a.folder / a.what, initial=initial).provenance["metrics"])
 
 
 def _finetune(a: argparse.Namespace) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 
 from lib.landmarks.heatmaps import SIGMA_PX
@@ -19,14 +18,13 @@ class TrainingConfig:
     """All options of a training except its data.
 
     Attributes:
-        optimiser, learning_rate, schedule: ``"rmsprop"`` (alpha 0.99, no momentum, as the paper prints) or ``"adamw"``;
-            ``"constant"`` or ``"cosine"``, the latter after a warm-up.
+        optimiser: ``"rmsprop"`` (alpha 0.99, no momentum, as the paper prints) or ``"adamw"``.
+        schedule: Of the learning rate: ``"constant"``, or ``"cosine"`` after a warm-up.
         ema: Decay of the moving average of the weights, which is validated and returned; 0 = the weights themselves.
         clip: Largest norm of the gradient; 0 = unlimited.
         precision: ``"fp32"``, or ``"bf16"`` mixed precision; the loss is always float32.
         sigma_px: Width of the target Gaussians in pixels of the network's input.
-        position_weight_per_px: Weight of `lib.training.losses.position_loss` beside the l2 loss of the heatmaps; the
-            paper has the latter alone (0).
+        position_weight_per_px: Weight of `position_loss` beside the l2 loss of the heatmaps; 0 as in the paper.
         seed: Decides the first weights and every batch.
 
     Raises:
@@ -66,16 +64,14 @@ class TrainingConfig:
         warm = min(1.0, (step + 1) / max(1, min(100, self.steps // 10)))
         return self.learning_rate * warm * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * step / self.steps)))
 
-    def changed(self, stored: Mapping[str, object]) -> list[str]:
+    def changed(self, stored: dict[str, object]) -> list[str]:
         """Names of the options whose values differ in a checkpoint's configuration; what it does not name has its default.
 
         `validate_every` may differ between two sittings of one training.
         """
-        own, default = (json.loads(json.dumps(asdict(config))) for config in (self, TrainingConfig()))
-        for part in ("network", "augmentation"):
-            default[part] = json.loads(json.dumps(asdict(type(getattr(self, part))()))) | dict(stored.get(part, {}))
-        other = default | {name: value for name, value in stored.items() if name not in ("network", "augmentation")}
-        return [name for name in other if name != "validate_every" and own.get(name) != other[name]]
+        own, other = (json.loads(json.dumps(asdict(c))) for c in (self, TrainingConfig(type(self.network)())))
+        other |= stored | {part: other[part] | stored.get(part, {}) for part in ("network", "augmentation")}
+        return [name for name, value in other.items() if name != "validate_every" and own.get(name) != value]
 
 
 #: `paper`: as printed. `best`: trains the shipped networks.

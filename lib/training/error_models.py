@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import product
 
 import numpy as np
 from scipy.optimize import minimize
+from scipy.special import expit
 from scipy.stats import chi2
 from tqdm.auto import tqdm
 
@@ -60,29 +61,20 @@ class Seen:
         features, squared = self.features[use], self.errors[use] ** 2
         tip = self.landmark[use, None] > 0
 
-        def variance(axis: int) -> tuple[float, ...]:
+        def variance(axis: int) -> np.ndarray:
             x = np.column_stack([~tip, tip, features[:, axis, 1:]]).astype(float)
+            start = [np.log(max(squared[:, axis].mean(), 1e-6))] * 2 + [0.0] * 3
 
-            def deviance(beta: np.ndarray) -> tuple[float, np.ndarray]:
-                log_variance = x @ beta
-                ratio = squared[:, axis] * np.exp(-log_variance)
-                slopes = 1e-3 * np.array([0.0, 0.0, 1.0, 1.0, 1.0])
-                value = (log_variance + ratio).mean() + slopes @ beta**2
-                return value, x.T @ (1 - ratio) / len(x) + 2 * slopes * beta
+            def deviance(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+                ratio = squared[:, axis] * np.exp(-z)
+                return z + ratio, 1 - ratio
 
-            start = np.array([np.log(max(squared[:, axis].mean(), 1e-6))] * 2 + [0.0] * 3)
-            base, tips, *slopes = map(float, minimize(deviance, start, jac=True, method="L-BFGS-B").x)
-            return (base, tips, tips, *slopes)
+            return _coefficients(deviance, x, start)[[0, 1, 1, 2, 3, 4]]
 
-        y, both = (size <= self.tolerance).astype(float), self.features[:, 2]
-
-        def cost(beta: np.ndarray) -> tuple[float, np.ndarray]:
-            z = both @ beta
-            ridge = 1e-3 * np.array([0.0, 1.0, 1.0, 1.0])
-            p = 1 / (1 + np.exp(-z))
-            return (np.logaddexp(0, z) - y * z).mean() + ridge @ beta**2, both.T @ (p - y) / len(y) + 2 * ridge * beta
-
-        logit = minimize(cost, np.array([-4.0, 0.0, 8.0, 0.0]), jac=True, method="L-BFGS-B").x
+        correct = size <= self.tolerance
+        logit = _coefficients(
+            lambda z: (np.logaddexp(0, z) - correct * z, expit(z) - correct), self.features[:, 2], [-4.0, 0.0, 8.0, 0.0]
+        )
         log_variance = np.array([variance(0), variance(1)])
         rows = ErrorModel(log_variance).coefficients[self.landmark[use]]
         normalised = (squared / np.exp((rows * features[:, :2]).sum(-1))).sum(1)
@@ -104,6 +96,17 @@ class Seen:
                 i = np.abs(left - centre[:, None]).mean(1).argmin()
                 best[k, axis], bias[k, axis] = gains[i], centre[i]
         return best, bias
+
+
+def _coefficients(loss: Callable[[np.ndarray], tuple], x: np.ndarray, start: Sequence[float]) -> np.ndarray:
+    """Those that minimise the mean of a loss of ``x @ beta``, given with its slope; the last three are kept small."""
+    ridge = 1e-3 * (np.arange(len(start)) >= len(start) - 3)
+
+    def penalised(beta: np.ndarray) -> tuple[float, np.ndarray]:
+        value, slope = loss(x @ beta)
+        return value.mean() + ridge @ beta**2, x.T @ slope / len(x) + 2 * ridge * beta
+
+    return minimize(penalised, start, jac=True, method="L-BFGS-B").x
 
 
 def seen_by(detector: Detector, stage: str, labelled: LabelledImage, rough: np.ndarray) -> Seen:

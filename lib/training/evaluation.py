@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from itertools import chain
 
 import numpy as np
 from tqdm.auto import tqdm
@@ -35,9 +36,8 @@ class Evaluation:
     @classmethod
     def joined(cls, parts: Iterable[Evaluation]) -> Evaluation:
         """Several evaluations as one."""
-        parts = list(parts)
-        arrays = (np.concatenate([getattr(e, name) for e in parts]) for name in ("u_true", "visibility", "length_px"))
-        return cls(Landmarks.join([e.landmarks for e in parts]), *arrays, [name for e in parts for name in e.names])
+        found, *arrays, names = zip(*([getattr(e, field.name) for field in fields(cls)] for e in parts), strict=True)
+        return cls(Landmarks.join(found), *map(np.concatenate, arrays), list(chain(*names)))
 
     @property
     def scores(self) -> Scores:
@@ -77,17 +77,16 @@ class Evaluation:
         """Scores of visible and of hidden landmarks."""
         return self.by({"visible": self.visibility == 2, "occluded": self.visibility == 1})
 
-    def detection(self, min_confidence: float = 0.5) -> dict[str, float]:
-        """Precision and recall of detections above `min_confidence`, in percent.
+    def detection(self) -> dict[str, float]:
+        """Precision and recall of detections with a confidence above 0.5, in percent.
 
         ``"in_view"``: the landmark lies in the frame, hidden or not.  ``"visible"``: it is not hidden either.
         """
-        detected = (self.landmarks.confidence >= min_confidence) & (self.visibility >= 0)
+        detected = (self.landmarks.confidence >= 0.5) & (self.visibility >= 0)
         result: dict[str, float] = {}
         for name, there in (("in_view", self.visibility > 0), ("visible", self.visibility == 2)):
-            hit = int((detected & there).sum())
-            result[f"{name}_precision"] = 100 * hit / int(detected.sum()) if detected.any() else np.nan
-            result[f"{name}_recall"] = 100 * hit / int(there.sum()) if there.any() else np.nan
+            for measure, among in (("precision", detected), ("recall", there)):
+                result[f"{name}_{measure}"] = 100 * float((detected & there)[among].mean()) if among.any() else np.nan
         return result
 
     def curve(self, thresholds: np.ndarray) -> np.ndarray:

@@ -75,21 +75,20 @@ def validate(network: StackedHourglass | OffsetNetwork, samples: Samples, config
         part = slice(start, start + 16)
         labelled = _batch(samples.images[part], samples.u[part], samples.visibility[part])
         outputs = [output.cpu() for output in network(labelled.images.to(device))]
-        losses.append(loss_of(network, outputs, labelled, config, position=False).item())
+        losses.append(loss_of(network, outputs, labelled, config).item())
         if isinstance(network, OffsetNetwork):
             found.append(closeup_peaks(outputs[-1], labelled.images.shape[-1]))
         else:
             found.append(decode(outputs[-1], network.stride, sigma_px=config.sigma_px))
         labels.append(torch.where((labelled.visibility == 2)[..., None], labelled.u, torch.nan))
-    true = torch.cat(labels).double().numpy()
-    seen = np.isfinite(true).all(-1)
+    true, seen = torch.cat(labels).double().numpy(), torch.cat(labels).isfinite().all(-1)
     u = torch.cat([peaks.u for peaks in found]).expand(-1, 3, -1).double().numpy()
     scores = score(u, true, length_px=tool_length_px(samples.u))
     spread = np.nanmean(np.nanstd(np.where(seen[..., None], u, np.nan), 0)) / np.nanmean(np.nanstd(true, 0))
     result = {"validation_loss": float(np.mean(losses)), "pck_0.05": scores.pck_0_05, "pck_0.10": scores.pck_0_10}
     result |= {"median_px": scores.median_px, "p95_px": scores.p95_px, "spread": float(spread)}
     if not isinstance(network, OffsetNetwork):
-        result["peak"] = float(torch.cat([peaks.value for peaks in found]).numpy()[seen].mean())
+        result["peak"] = torch.cat([peaks.value for peaks in found])[seen].mean().item()
     return result
 
 
@@ -116,9 +115,8 @@ class Run:
             if not dist.is_initialized():
                 dist.init_process_group("nccl" if torch.cuda.is_available() else "gloo")
             self.rank = dist.get_rank()
-        self.device = torch.device("cpu")
-        if torch.cuda.is_available():
-            self.device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")) if self.world > 1 else 0)
+        gpu = f"cuda:{os.environ.get('LOCAL_RANK', '0') if self.world > 1 else 0}"
+        self.device = torch.device(gpu if torch.cuda.is_available() else "cpu")
         self.network.to(self.device, memory_format=torch.channels_last)
         self.average = copy.deepcopy(self.network) if config.ema else None
         self.usable = self.average or self.network
@@ -127,15 +125,13 @@ class Run:
             self.optimiser: torch.optim.Optimizer = torch.optim.RMSprop(parameters, config.learning_rate, alpha=0.99)
         else:
             self.optimiser = torch.optim.AdamW(parameters, config.learning_rate, weight_decay=1e-4)
-        self.step, self.seconds, self.log = 0, 0.0, []
-        self.loss_sum, self.since = 0.0, 0  # since the last validation
+        self.step, self.seconds, self.log, self.loss_sum, self.since = 0, 0.0, [], 0.0, 0  # both since the last validation
 
     def advance(self, batch: Batch) -> None:
         """One step."""
         self.network.train()
-        for group in self.optimiser.param_groups:
-            group["lr"] = self.config.rate(self.step)
-        batch = batch.to(self.device)
+        self.optimiser.param_groups[0]["lr"] = self.config.rate(self.step)
+        batch = Batch(*(part.to(self.device) for part in (batch.images, batch.u, batch.visibility)))
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.config.precision == "bf16"):
             outputs = self.network(batch.images.contiguous(memory_format=torch.channels_last))
         loss = loss_of(self.network, outputs, batch, self.config)
@@ -191,25 +187,17 @@ class Run:
         self.network.load_state_dict(_part(tensors, "network."))
         if self.average is not None:
             self.average.load_state_dict(_part(tensors, "average."))
-        state: dict[int, dict[str, Tensor]] = {}
-        for name, value in _part(tensors, "optimiser.").items():
-            i, _, key = name.partition(".")
-            state.setdefault(int(i), {})[key] = value
+        parts = ((i, _part(tensors, f"optimiser.{i}.")) for i, _ in enumerate(self.network.parameters()))
+        state = {i: part for i, part in parts if part}
         self.optimiser.load_state_dict(self.optimiser.state_dict() | {"state": state})
         for name in _STATE:
             setattr(self, name, metadata[name])
 
 
 def train(
-    config: TrainingConfig,
-    source: Source,
-    validation: Samples,
-    folder: str | Path | None = None,
-    *,
-    initial: Training | None = None,
-    max_seconds: float | None = None,
-    progress: bool = True,
-) -> Training:
+    config: TrainingConfig, source: Source, validation: Samples, folder: str | Path | None = None, *,
+    initial: Training | None = None, max_seconds: float | None = None, progress: bool = True,
+) -> Training:  # fmt: skip
     """Train a network; an interrupted training in `folder` is resumed.
 
     Args:
@@ -219,8 +207,7 @@ def train(
         max_seconds: Stop (resumably) after this long.
 
     Raises:
-        ValueError: For an empty data set, an `initial` training of another network, or a folder that holds another
-            training.
+        ValueError: For an empty data set, an `initial` of another network, or a folder that holds another training.
     """
     if not len(source):
         raise ValueError("source: must not be empty; give labelled images.")
@@ -231,9 +218,8 @@ def train(
     provenance |= {"commit": commit_id(), "machine": machine(), "processes": run.world}
     if initial is not None:
         provenance |= {"before": initial.provenance, "initial": checksum(initial.network.state_dict(), {})[:16]}
-    last = None
-    if folder is not None:
-        last = Path(folder) / "last.safetensors"
+    last = Path(folder) / "last.safetensors" if folder is not None else None
+    if last is not None:
         last.parent.mkdir(parents=True, exist_ok=True)
         if last.exists():
             run.restore(last, provenance)

@@ -27,9 +27,8 @@ def heatmap_loss(outputs: Sequence[Tensor], batch: Batch, stride: int, sigma_px:
     1.0
     """
     target = render(batch.u.float(), tuple(batch.images.shape[-2:]), stride, sigma_px) * batch.peak[..., None, None]
-    weight = batch.weight
-    scale = math.pi * sigma_cells(stride, sigma_px) ** 2 * weight.sum().clamp_min(1)
-    losses = [((output.float() - target).square().sum((-2, -1)) * weight).sum() / scale for output in outputs]
+    scale = math.pi * sigma_cells(stride, sigma_px) ** 2 * batch.weight.sum().clamp_min(1)
+    losses = [((output.float() - target).square().sum((-2, -1)) * batch.weight).sum() / scale for output in outputs]
     return torch.stack(losses).mean()
 
 
@@ -47,16 +46,14 @@ def position_loss(outputs: Sequence[Tensor], batch: Batch, stride: int, sigma_px
     inside = ((u > 2 * sigma_px) & (u < u.new_tensor(size[::-1]) - 1 - 2 * sigma_px)).all(-1)  # NaN is not inside
     weight = (inside & (batch.visibility == 2)).float()
     target = render(u, size, stride, sigma_px)
-    rows, columns = (
-        stride * torch.arange(n, dtype=u.dtype, device=u.device) + (stride - 1) / 2 for n in target.shape[-2:]
-    )
+    rows, columns = (stride * torch.arange(n, device=u.device) + (stride - 1) / 2 for n in target.shape[-2:])
     least = 0.25 * math.pi * sigma_cells(stride, sigma_px) ** 2
     losses = []
     for output in outputs:
         product = output.float() * target
-        sums = [product.sum(-2) @ columns, product.sum(-1) @ rows]
         total = product.sum((-2, -1))
-        moved = torch.stack(sums, -1) - total[..., None] * torch.nan_to_num(u)
+        sums = torch.stack([product.sum(-2) @ columns, product.sum(-1) @ rows], -1)
+        moved = sums - total[..., None] * torch.nan_to_num(u)
         there = weight * (total > least)
         distance = ((2 * moved / total.clamp_min(least)[..., None]).square().sum(-1) + 0.04).sqrt() - 0.2
         losses.append((distance * there).sum() / weight.sum().clamp_min(1))
@@ -79,13 +76,11 @@ def offset_loss(outputs: Sequence[Tensor], batch: Batch) -> Tensor:
     return ((log_scale + distance * (-log_scale).exp()).sum(1) * there).sum() / there.sum().clamp_min(1)
 
 
-def loss_of(
-    network: nn.Module, outputs: Sequence[Tensor], batch: Batch, config: TrainingConfig, *, position: bool = True
-) -> Tensor:
-    """The loss that a configuration asks for; without its position loss where `position` is False."""
+def loss_of(network: nn.Module, outputs: Sequence[Tensor], batch: Batch, config: TrainingConfig) -> Tensor:
+    """The loss that a configuration asks for; of a network that is validated without its position loss."""
     if isinstance(network, OffsetNetwork):
         return offset_loss(outputs, batch)
     loss = heatmap_loss(outputs, batch, network.stride, config.sigma_px)
-    if config.position_weight_per_px and position:
+    if config.position_weight_per_px and network.training:
         loss = loss + config.position_weight_per_px * position_loss(outputs, batch, network.stride, config.sigma_px)
     return loss

@@ -85,25 +85,18 @@ def _crop(image: np.ndarray, u: np.ndarray, k: int, side_px: int) -> tuple[np.nd
 
 def write_frames(path: Path, images: Iterable[LabelledImage], *, keep_frames: bool) -> None:
     """Write one shard of full-resolution labelled images of one size; with the images themselves if `keep_frames`."""
-    frames, labels, seen, crops, crop_u, crop_of, jpegs = [], [], [], [], [], [], []
-    for _, image, u, visibility in images:
-        h, w = image.shape[:2]
-        frames.append(cv2.resize(image, (w // STORED_REDUCTION, h // STORED_REDUCTION), interpolation=cv2.INTER_AREA))
-        labels.append(u)
-        seen.append(visibility)
-        for k in np.flatnonzero((visibility > 0) & np.isfinite(u).all(1)):
-            crop, at = _crop(image, u, k, CROP_PX)
-            crops.append(crop)
-            crop_u.append(at)
-            crop_of.append((len(frames) - 1, k))
-        if keep_frames:
-            bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
-            jpegs.append(cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].ravel())
-    frame, landmark = np.array(crop_of, dtype=int).reshape(-1, 2).T
+    images, r = list(images), STORED_REDUCTION
+    sizes = [(image.shape[1] // r, image.shape[0] // r) for _, image, _, _ in images]
+    frames = [cv2.resize(part.image, size, interpolation=cv2.INTER_AREA) for part, size in zip(images, sizes, strict=True)]
+    u, seen = np.stack([part.u for part in images]), np.stack([part.visibility for part in images])
+    frame, landmark = np.nonzero((seen > 0) & np.isfinite(u).all(2))
+    crops = [_crop(images[i].image, u[i], k, CROP_PX) for i, k in zip(frame, landmark, strict=True)]
+    kept = [cv2.cvtColor(part.image, cv2.COLOR_RGB2BGR) for part in images if keep_frames]
+    jpegs = [cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].ravel() for image in kept]
     _write(
-        path, frames=np.stack(frames), u=np.stack(labels), visibility=np.stack(seen),
-        crops=np.array(crops, np.uint8).reshape(-1, CROP_PX, CROP_PX, 3), crop_u=np.array(crop_u).reshape(-1, 3, 2),
-        crop_visibility=np.stack(seen)[frame], crop_landmark=landmark,
+        path, frames=np.stack(frames), u=u, visibility=seen,
+        crops=np.array([crop for crop, _ in crops], np.uint8).reshape(-1, CROP_PX, CROP_PX, 3),
+        crop_u=np.array([at for _, at in crops]).reshape(-1, 3, 2), crop_visibility=seen[frame], crop_landmark=landmark,
         jpegs=np.concatenate([np.zeros(0, np.uint8), *jpegs]), jpeg_ends=np.cumsum([j.size for j in jpegs]),
     )  # fmt: skip
 

@@ -1,30 +1,33 @@
-"""The detector's stages in training: what each learns from, how, and all of them together on a user's labelled frames."""
+"""The detector's stages: what each learns from, and how; fine-tuning on a user's labelled frames; the shipped detector."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import replace
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 
+from lib.files import write_text
 from lib.landmarks import Detector
 from lib.landmarks.network import HourglassConfig, OffsetConfig
 from lib.landmarks.windows import direction_rad
+from lib.provenance import commit_id, machine
+from lib.recordings import Recording
 from lib.training.augmentation import AUGMENTATIONS
 from lib.training.config import PRESETS, TrainingConfig
 from lib.training.error_models import fit_error_models
-from lib.training.loop import Training, train
-from lib.training.samples import LabelledImage, Mixed, Samples, Source
-from lib.training.shards import frame_samples, validation_images, write_frames
-from lib.training.windows import CloseupSource, WindowSource
+from lib.training.evaluation import evaluate
+from lib.training.loop import Training, load_training, train
+from lib.training.samples import LabelledImage, Mixed, Samples, Source, labelled_images
+from lib.training.shards import REDUCTION, frame_samples, validation_images, write_frames
+from lib.training.windows import TOOL_REDUCTION, CloseupSource, WindowSource
 
-__all__ = ["STAGES", "finetune", "stage_config", "stage_data"]
+__all__ = ["STAGES", "assemble", "card", "finetune", "stage_config", "stage_data"]
 
 #: The stages in the order of their use, and the channels of the shipped networks.
 STAGES = {"frame": 32, "tool": 48, "window": 96, "closeup": 32}
-#: Images in a shard of labelled frames.
-_SHARD = 64
 
 
 def stage_config(stage: str, *, preset: str = "best", features: int | None = None) -> TrainingConfig:
@@ -55,16 +58,9 @@ def stage_data(stage: str, folder: str | Path, *, closeups: str = "closeups") ->
 
 
 def finetune(
-    detector: Detector,
-    images: Iterable[LabelledImage],
-    held_out: Iterable[LabelledImage],
-    folder: str | Path,
-    *,
-    simulated: str | Path | None = None,
-    steps: int = 500,
-    seed: int = 0,
-    progress: bool = True,
-) -> Detector:
+    detector: Detector, images: Iterable[LabelledImage], held_out: Iterable[LabelledImage], folder: str | Path, *,
+    simulated: str | Path | None = None, steps: int = 500, seed: int = 0, progress: bool = True,
+) -> Detector:  # fmt: skip
     """Train all stages of a detector further on labelled frames, then fit its error models on held-out ones.
 
     Args:
@@ -83,8 +79,8 @@ def finetune(
         usable = [labelled for labelled in part if np.isfinite(direction_rad(labelled.u[None])).all()]
         if not usable:
             raise ValueError(f"{kind} images: none has a labelled base and tip; label some.")
-        for i in range(0, len(usable), _SHARD):
-            write_frames(data / f"{kind}_{i // _SHARD:04d}.npz", usable[i : i + _SHARD], keep_frames=kind == "validation")
+        for i in range(0, len(usable), 64):
+            write_frames(data / f"{kind}_{i // 64:04d}.npz", usable[i : i + 64], keep_frames=kind == "validation")
     networks = {}
     for stage, network in detector.networks.items():
         source, validation = stage_data(stage, data, closeups="training")
@@ -97,3 +93,107 @@ def finetune(
         networks[f"{stage}_network"] = done.network
     fitted_on = [*validation_images(data), *(validation_images(simulated) if simulated is not None else ())]
     return fit_error_models(replace(detector, **networks), fitted_on, progress=progress)
+
+
+def assemble(
+    folder: str | Path, data: str | Path, out: str | Path, recordings: Sequence[Path] = (), notes: Sequence[str] = ()
+) -> Detector:
+    """Join the stages of a training folder, fit their error models, write the weights file `out` and its card.
+
+    The numbers on the card are of error models fitted on half of the validation frames and measured on the other half; the
+    file's own are fitted on all of them, and on labelled `recordings`: typical frames, where the validation frames vary
+    more than those of any microscope.  `notes` are lines for the card.  A missing stage or shard raises `FileNotFoundError`.
+    """
+    out = Path(out)
+    stages = {stage: load_training(Path(folder) / stage / "last.safetensors") for stage in STAGES}
+    frames = list(validation_images(data))
+    if not frames:
+        raise FileNotFoundError(f"{data}: no validation shard; make some with `python3 -m lib train generate`.")
+    typical = []
+    for recording in map(Recording.open, recordings):  # 16 images of each, spread over it
+        typical += labelled_images(recording, every=max(1, len(recording.frames) // 8))
+    networks = {f"{stage}_network": training.network for stage, training in stages.items()}
+    detector = Detector(**networks, reduction=REDUCTION, tool_reduction=TOOL_REDUCTION, mirror=True)
+    held_out = evaluate(fit_error_models(detector, frames[::2] + typical), frames[1::2])
+    detector = fit_error_models(detector, frames + typical)
+    keys = ("data", "images", "commit", "steps", "seconds", "processes", "machine", "config", "metrics", "before")
+    by_visibility = {k: {"labels": v.labels, "median_px": v.median_px} for k, v in held_out.by_visibility().items()}
+    provenance = {
+        "trained_on": "simulated frames only (lib.simulator.population); no eye or tool of a shipped recording",
+        "commit": commit_id(),
+        "machine": machine(),
+        "stages": {name: {key: training.provenance.get(key) for key in keys} for name, training in stages.items()},
+        "validation_frames": len(frames),
+        "recorded_frames": len(typical),
+        "recordings": len(recordings),
+        "notes": list(notes),
+        "metrics": {
+            **asdict(held_out.scores),
+            "confidence_calibration_error": held_out.confidence_error,
+            "detection": held_out.detection(),
+            "by_visibility": by_visibility,
+            "by_landmark_median_px": {k: v.median_px for k, v in held_out.by_landmark().items()},
+        },
+    }
+    detector = replace(detector, metadata=json.loads(json.dumps(provenance, default=float)))
+    out.parent.mkdir(parents=True, exist_ok=True)
+    detector.save(out)
+    write_text(out.with_name("README.md"), card(detector, out))
+    return detector
+
+
+def _trainings(provenance: dict) -> list[dict]:
+    """A training and those that it was fine-tuned from, the first one first."""
+    before = provenance.get("before")
+    return [*(_trainings(before) if before else []), provenance]
+
+
+def card(detector: Detector, path: Path) -> str:
+    """The model card (Markdown) of a weights file, from its metadata."""
+    p = detector.metadata
+    m, trainings = p["metrics"], []
+    for stage, t in [(stage, t) for stage, last in p["stages"].items() for t in _trainings(last)]:
+        config, processes = t["config"], t.get("processes") or 1
+        kind = "hourglass, {stacks} x {features}" if "stacks" in config["network"] else "offset network, {features}"
+        trainings.append(
+            f"| {stage} ({kind.format(**config['network'])} features) | {t['images']} "
+            f"| {config['optimiser']} {config['learning_rate']:g} {config['schedule']}, {config['precision']} "
+            f"| {t['steps']} x {config['batch_size']} x {processes} | {config.get('position_weight_per_px', 0):g} "
+            f"| {t['seconds'] * processes / 3600:.2f} | `{t['data']}` | `{t['commit']}` |"
+        )
+    numbers = {
+        "PCK@0.01, 0.05, 0.10": f"{m['pck_0_01']:.1f}, {m['pck_0_05']:.1f}, {m['pck_0_10']:.1f} %",
+        "error, median and 95th percentile": f"{m['median_px']:.2f} px, {m['p95_px']:.2f} px",
+        **{f"median error, {k}": f"{v:.2f} px" for k, v in m["by_landmark_median_px"].items()},
+        **{f"median error, {k}": f"{v['median_px']:.2f} px, {v['labels']} labels" for k, v in m["by_visibility"].items()},
+        "normalised squared error below 20 px (2 is right)": f"{m['nees']:.2f}",
+        "inside the 95 % ellipse, errors below 20 px": f"{m['coverage_95']:.1f} %",
+        "calibration error of the confidence": f"{m['confidence_calibration_error']:.3f}",
+        **{f"{k.replace('_', ' ')}, confidence above 0.5": f"{v:.1f} %" for k, v in m["detection"].items()},
+        "missed, gross (above 20 px), all labels": f"{m['missed']}, {m['gross']}, {m['labels']}",
+    }
+    return f"""\
+# {path.name}
+
+Weights of the landmark detector: base, tip_1 and tip_2 of the forceps in microscope images. Trained on {p["trained_on"]}.
+{path.stat().st_size / 1e6:.1f} MB, safetensors; configuration, error models and the numbers below are inside.
+Notebook 02 explains the stages.
+
+| stage | images | optimiser | steps x batch x processes | position loss, per px | hours x processes | data | commit |
+|---|---|---|---|---|---|---|---|
+{chr(10).join(trainings)}
+
+Each training of a stage starts from the one before. The error models (covariance, confidence) are fitted on
+{p["validation_frames"]} validation frames and {p["recorded_frames"]} frames of {p["recordings"]} simulated recordings.
+The numbers below are of error models fitted on half of the validation frames and measured on the other half
+({p["validation_frames"] // 2} full-HD images that no network was trained on).
+
+| held-out frames | |
+|---|---|
+{chr(10).join(f"| {name} | {value} |" for name, value in numbers.items())}
+
+Made by `python3 -m lib train generate`, `frame`, `tool`, `window`, `closeup` and `assemble`, on {p["machine"]["processor"]},
+{p["machine"]["cores"]} cores, {p["machine"]["gpu"] or "no GPU"}.
+
+{chr(10).join(f"- {note}" for note in p["notes"])}
+"""

@@ -11,7 +11,6 @@ from lib.__main__ import COMMANDS
 from lib.landmarks import Detector
 from lib.landmarks.network import HourglassConfig, StackedHourglass
 from lib.training import stages
-from lib.training.assembly import card
 from lib.training.command import main_evaluate
 from lib.training.loop import load_training
 from tests.toys import toy_images
@@ -40,7 +39,7 @@ def test_the_evaluate_command(tmp_path, capsys, monkeypatch):
 
 def test_the_card_beside_the_shipped_weights_is_theirs():
     path = paths.MODELS / "default.safetensors"
-    assert card(Detector.load(), path) == path.with_name("README.md").read_text(encoding="utf-8")
+    assert stages.card(Detector.load(engine="torch"), path) == path.with_name("README.md").read_text(encoding="utf-8")
 
 
 def test_stages_are_fine_tuned_on_labelled_frames(tmp_path, monkeypatch):

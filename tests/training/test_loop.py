@@ -1,8 +1,7 @@
 import errno
+import multiprocessing
 import os
 import socket
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,6 +17,7 @@ from lib.training.config import PRESETS, TrainingConfig
 from lib.training.loop import load_training, train
 from lib.training.losses import heatmap_loss, offset_loss, position_loss
 from lib.training.samples import Samples
+from tests.toys import toy_samples
 
 SMALL = replace(
     PRESETS["best"],
@@ -27,6 +27,10 @@ SMALL = replace(
     batch_size=2,
     validate_every=2,
 )
+TOGETHER = replace(
+    PRESETS["best"], network=HourglassConfig(6, 1, 2), steps=12, batch_size=2, validate_every=4, precision="fp32",
+    learning_rate=4e-3,
+)  # fmt: skip
 
 
 def same(a, b):
@@ -177,45 +181,37 @@ def test_bad_configurations_are_named(changes):
         TrainingConfig(**changes)
 
 
-def test_two_processes_train_one_network(toy, tmp_path):
-    """Two CPU processes as torchrun starts them: other batches, the same weights, a falling loss, one log."""
-    script = """
-import os, sys, torch
-from dataclasses import replace
-from lib.landmarks.network import HourglassConfig
-from lib.training.config import PRESETS
-from lib.training.loop import train
-from tests.toys import toy_samples
-torch.set_num_threads(1)
-config = replace(PRESETS['best'], network=HourglassConfig(6, 1, 2), steps=12, batch_size=2,
-                 validate_every=4, precision='fp32', learning_rate=4e-3)
-done = train(config, toy_samples(20), toy_samples(4, 1), sys.argv[1], progress=False)
-torch.save((done.network.state_dict(), done.log), f'{sys.argv[1]}/rank{os.environ["RANK"]}.pt')
-"""
-    out = tmp_path / "out"
+def one_of_two(rank: int, port: int, out: Path) -> None:
+    """A process as torchrun starts it."""
+    os.environ |= {"WORLD_SIZE": "2", "RANK": str(rank), "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
+    torch.set_num_threads(1)
+    done = train(TOGETHER, toy_samples(20), toy_samples(4, 1), out, progress=False)
+    torch.save((done.network.state_dict(), done.log), out / f"rank{rank}.pt")
+
+
+def test_two_processes_train_one_network(tmp_path, monkeypatch):
+    """Two CPU processes: other batches, the same weights, a falling loss, one log."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
-        port = str(free.getsockname()[1])
-    environment = os.environ | {
-        "OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": "", "WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1",
-        "MASTER_PORT": port, "PYTHONPATH": str(Path(__file__).parents[2]),
-    }  # fmt: skip
-    command = [sys.executable, "-c", script, str(out)]
-    running = [subprocess.Popen(command, env=environment | {"RANK": str(rank)}) for rank in (0, 1)]
-    assert [process.wait(timeout=240) for process in running] == [0, 0]
-    (a, log), (b, _) = (torch.load(out / f"rank{rank}.pt") for rank in (0, 1))
+        port = free.getsockname()[1]
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
+    # A fork imports nothing anew; but not of a process that has used a GPU.
+    context = multiprocessing.get_context("spawn" if torch.cuda.is_available() else "fork")
+    running = [context.Process(target=one_of_two, args=(rank, port, tmp_path)) for rank in (0, 1)]
+    for process in running:
+        process.start()
+    for process in running:
+        process.join(timeout=240)
+    assert [process.exitcode for process in running] == [0, 0]
+    (a, log), (b, _) = (torch.load(tmp_path / f"rank{rank}.pt") for rank in (0, 1))
     assert all(torch.equal(a[name], b[name]) for name in a)
     assert log[-1]["loss"] < log[0]["loss"]
-    alone = load_training(out / "last.safetensors")
+    alone = load_training(tmp_path / "last.safetensors")
     assert alone.provenance["processes"] == 2
     assert [row["step"] for row in alone.log] == [4, 8, 12]
     assert all(torch.equal(a[name], value) for name, value in alone.network.state_dict().items())
-    config = replace(
-        PRESETS["best"], network=HourglassConfig(6, 1, 2), steps=12, batch_size=2, validate_every=4, precision="fp32",
-        learning_rate=4e-3,
-    )  # fmt: skip
     with pytest.raises(ValueError, match=r"begun by 2 process\(es\), now 1; start as many"):
-        train(config, toy(20), toy(4, 1), out, progress=False)
+        train(TOGETHER, toy_samples(20), toy_samples(4, 1), tmp_path, progress=False)
 
 
 def test_averaging_over_processes_is_a_batch_of_all(monkeypatch, toy):
