@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lib.cameras import StereoRig
-from lib.matching.band import SETTINGS, match_band
+from lib.matching.band import MAX_PIXELS, match_band
 from lib.matching.deepmatching import match_free
 from lib.matching.descriptors import as_gray
 from lib.matching.masks import checked_mask, glint_mask, tool_mask
@@ -89,37 +89,30 @@ def match(
         None if mask is None else checked_mask(mask, image.shape, name)
         for mask, image, name in zip((mask_left, mask_right), images, ("mask_left", "mask_right"), strict=True)
     )
-    if setting not in SETTINGS:
-        raise ValueError(f"setting: expected one of {sorted(SETTINGS)}, got {setting!r}.")
+    if setting not in MAX_PIXELS:
+        raise ValueError(f"setting: expected one of {sorted(MAX_PIXELS)}, got {setting!r}.")
     if depth_range_mm is not None:
         depth_range_mm = tuple(float(z) for z in depth_range_mm)
         if len(depth_range_mm) != 2 or not np.isfinite(depth_range_mm).all() or depth_range_mm[0] >= depth_range_mm[1]:
             raise ValueError(f"depth_range_mm: expected (near, far) with near < far, got {depth_range_mm}.")
     if method is None:
         method = "deepmatching" if rig is None else "band"
-    along_lines = {
-        "depth_range_mm": depth_range_mm,
-        "setting": SETTINGS[setting],
-        "max_epipolar_px": max_epipolar_px,
-        "reciprocal": reciprocal,
-    }
+    where = (setting, depth_range_mm, max_epipolar_px)
     if method == "deepmatching":
         options = {"downscale": downscale, "budget_bytes": budget_bytes, "device": device}
         matches = match_free(images, masks, reciprocal=reciprocal, **options)
     elif method == "band":
         if rig is None:
             raise ValueError("rig: method 'band' needs a calibrated rig, or RECTIFIED for a rectified pair.")
-        matches = match_band(images, masks, rig, budget_bytes=budget_bytes, **along_lines)
+        matches = match_band(images, masks, rig, where, budget_bytes=budget_bytes, reciprocal=reciprocal)
     elif callable(method) or method in ("sgbm", "dis"):
-        matches = match_with(method, images, masks, RECTIFIED if rig is None else rig, **along_lines)
+        matches = match_with(method, images, masks, rig or RECTIFIED, where, reciprocal=reciprocal)
     else:
         raise ValueError(f"method: expected 'deepmatching', 'band', 'sgbm', 'dis' or a callable, got {method!r}.")
-    inside = np.ones(len(matches), bool)
-    for u, image in ((matches.u_left, images[0]), (matches.u_right, images[1])):
-        inside &= ((u >= 0) & (u <= np.array(image.shape[::-1]) - 1)).all(axis=1)
-    if min_score is None:
-        min_score = 0.5 if method == "band" else 0.0
-    matches = matches.keep(inside & (matches.score >= min_score))
+    u = np.hstack([matches.u_left, matches.u_right])
+    inside = ((u >= 0) & (u <= np.subtract((*images[0].shape[::-1], *images[1].shape[::-1]), 1))).all(axis=1)
+    least = (0.5 if method == "band" else 0.0) if min_score is None else min_score
+    matches = matches.keep(inside & (matches.score >= least))
     if rig is None or not len(matches):
         return matches
     distance = np.abs(rig.epipolar_distance(matches.u_left, matches.u_right))

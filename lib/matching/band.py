@@ -21,21 +21,19 @@ from lib.matching.result import SIGMA_LEFT_PX, Matches
 from lib.matching.volume import VolumeMatches, correlation_volume, match_volume, predicted_bytes
 from lib.parallel import single_threaded_torch
 
-__all__ = ["SETTINGS", "Search", "Setting", "match_band", "plan_search"]
+__all__ = ["MAX_PIXELS", "Search", "match_band", "plan_search"]
 
 Images = tuple[np.ndarray, np.ndarray]
 Masks = tuple[np.ndarray | None, np.ndarray | None]
 
 
-@dataclass(frozen=True)
-class Setting:
-    """How finely the band is searched."""
+#: The setting of a search, the depth range in mm (None = found), and the largest misfit of the rig in px: see `match`.
+Where = tuple[str, tuple[float, float] | None, float]
 
-    max_pixels: int  # the canvas is shrunk to so many, if it has more
-    refine_margin: int = 0  # cells around a patch that take part in its sub-pixel step
-
-
-SETTINGS = {"fast": Setting(max_pixels=400_000), "quality": Setting(max_pixels=3_000_000, refine_margin=1)}
+#: The canvas is shrunk to so many pixels, if it has more.
+MAX_PIXELS = {"fast": 400_000, "quality": 3_000_000}
+#: Cells around a patch that take part in its sub-pixel step.
+REFINE_MARGIN = {"fast": 0, "quality": 1}
 
 #: Binary logarithm of the pooling of the descriptors, and the width of a cell in canvas pixels.
 DOWNSCALE = 1
@@ -70,23 +68,17 @@ class Search:
     n_found: int  # coarse matches found
 
 
-def plan_search(
-    images: Images,
-    masks: Masks,
-    rig: StereoRig,
-    setting: Setting,
-    depth_range_mm: tuple[float, float] | None,
-    max_epipolar_px: float,
-) -> Search:
+def plan_search(images: Images, masks: Masks, rig: StereoRig, where: Where) -> Search:
     """Choose the canvas, check the rig by coarse matches, and find the range of depth where it is not given.
 
     Raises:
         ValueError: If the rig does not fit the images, or both cameras see nothing in the depth range.
     """
+    setting, depth_range_mm, max_epipolar_px = where
     shapes = images[0].shape, images[1].shape
     whole = rectify(rig, *shapes)
     width, height = whole.size_px
-    scale = min(1.0, float(np.sqrt(setting.max_pixels / (width * height))))
+    scale = min(1.0, float(np.sqrt(MAX_PIXELS[setting] / (width * height))))
     rectification = rectify(rig, *shapes, scale=scale)
     displacement, n_found = _coarse_displacement(images, masks, rig, whole)
     off_line_px, range_px = 0.0, (-COARSE_REACH * width, COARSE_REACH * width)
@@ -143,17 +135,16 @@ def _descriptors(
     width, height = (side // step * step for side in rectification.size_px)
     margin_y = off_line * CELL_PX
 
-    def one(side: int) -> np.ndarray:
-        if side == 0:
-            target, size, shift = rectification.left_from_canvas, (width, height), (0, 0)
-        else:
-            target = rectification.right_from_canvas
-            size, shift = (width + (high - low) * CELL_PX, height + 2 * margin_y), (low * CELL_PX, off_line_px - margin_y)
-        gray, valid = warp(images[side], target, size, shift_px=shift, mask=masks[side])
+    wide = width + (high - low) * CELL_PX, height + 2 * margin_y
+
+    def one(image: np.ndarray, mask: np.ndarray | None, target: np.ndarray, size: tuple, shift: tuple) -> np.ndarray:
+        gray, valid = warp(image, target, size, shift_px=shift, mask=mask)
         return pixel_descriptors(gray, DOWNSCALE, valid=valid)
 
+    targets = rectification.left_from_canvas, rectification.right_from_canvas
+    shifts = (0, 0), (low * CELL_PX, off_line_px - margin_y)
     with ThreadPoolExecutor(2) as executor:
-        return list(executor.map(one, (0, 1)))
+        return list(executor.map(one, images, masks, targets, ((width, height), wide), shifts))
 
 
 def _match(
@@ -181,32 +172,21 @@ def _supported(matches: VolumeMatches, tolerance: float = 1.5) -> np.ndarray:
     x, y = matches.patch.T + 1
     field[y, x] = matches.displacement
     support = np.zeros(len(x), int)
-    for dy in (-1, 0, 1):
-        for dx in (-1, 0, 1):
-            if dy or dx:
-                apart = np.abs(field[y + dy, x + dx] - matches.displacement).max(axis=1, initial=0)
-                support += apart <= tolerance
-    return support >= 3
+    for dy, dx in np.ndindex(3, 3):
+        support += np.abs(field[y + dy - 1, x + dx - 1] - matches.displacement).max(axis=1, initial=0) <= tolerance
+    return support > 3  # each match supports itself
 
 
 def match_band(
-    images: Images,
-    masks: Masks,
-    rig: StereoRig,
-    *,
-    depth_range_mm: tuple[float, float] | None,
-    setting: Setting,
-    max_epipolar_px: float,
-    budget_bytes: int,
-    reciprocal: bool,
+    images: Images, masks: Masks, rig: StereoRig, where: Where, *, budget_bytes: int, reciprocal: bool
 ) -> Matches:
     """Matches of a calibrated pair; arguments as in `lib.matching.match`, images (h, w) uint8 grey.
 
     Raises:
         ValueError: As `plan_search`, and if the search would need more memory than the budget.
     """
-    search = plan_search(images, masks, rig, setting, depth_range_mm, max_epipolar_px)
-    if not search.n_found and depth_range_mm is None:
+    search = plan_search(images, masks, rig, where)
+    if not search.n_found and where[1] is None:
         return Matches(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros((0, 4, 4)), method="band")
     rectification = search.rectification
     low, high = (int(np.floor(search.range_px[0] / CELL_PX)) - 1, int(np.ceil(search.range_px[1] / CELL_PX)) + 1)
@@ -223,7 +203,7 @@ def match_band(
     # The match lies on the line, at the best whole cell, and one step of `refine` from there.
     start = found.patch * PATCH
     on_line = start + np.column_stack([found.cell[:, 0] - low, np.full(len(start), OFF_LINE)])
-    step, sigma = refine(left, right, start, on_line, margin=setting.refine_margin)
+    step, sigma = refine(left, right, start, on_line, margin=REFINE_MARGIN[where[0]])
     displacement = step + np.column_stack([found.cell[:, 0], np.zeros(len(step))])
     canvas = (start + PATCH / 2) * float(CELL_PX) - 0.5
     deviation = np.hypot(SIGMA_GAIN * sigma, SIGMA_FLOOR) * CELL_PX

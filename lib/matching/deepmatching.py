@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from lib.matching.descriptors import CHANNELS, patch_quality, pixel_descriptors
-from lib.matching.pyramid import PATCH, POWER, bottom_up, n_levels, peak_ratio, pool, top_down, unpool
+from lib.matching.pyramid import PATCH, POWER, bottom_up, n_levels, peak_ratio, pool, top_down, unit_patches, unpool
 from lib.matching.result import SIGMA_LEFT_PX, Matches
 
 __all__ = ["atomic_maps", "match_free", "predicted_bytes"]
@@ -36,37 +36,16 @@ def predicted_bytes(shape_left: tuple[int, int], shape_right: tuple[int, int], *
     return 4 * (windows + pooled + max(levels + 2 * pooled, pooled + 5 * chunk))
 
 
-def _patches(grid: torch.Tensor) -> torch.Tensor:
-    """(gy, gx, 16 C) unit descriptors of the atomic patches of a grid (h, w, C)."""
-    gy, gx = grid.shape[0] // PATCH, grid.shape[1] // PATCH
-    cells = grid[: gy * PATCH, : gx * PATCH].reshape(gy, PATCH, gx, PATCH, -1)
-    patches = cells.permute(0, 2, 1, 3, 4).reshape(gy, gx, -1)
-    return patches / patches.norm(dim=2, keepdim=True).clamp_min(1e-12)
-
-
 def _windows(grid: torch.Tensor) -> torch.Tensor:
     """(h + 1, w + 1, 16 C) unit descriptors of the windows around every cell corner, zero outside the grid."""
-    height, width, channels = grid.shape
-    pad = PATCH // 2
-    padded = grid.new_zeros(height + PATCH, width + PATCH, channels)
-    padded[pad : pad + height, pad : pad + width] = grid
-    windows = grid.new_empty(height + 1, width + 1, PATCH, PATCH, channels)
-    for r in range(PATCH):
-        for c in range(PATCH):
-            windows[:, :, r, c] = padded[r : r + height + 1, c : c + width + 1]
-    windows = windows.reshape(height + 1, width + 1, -1)
+    padded = torch.nn.functional.pad(grid, (0, 0, *[PATCH // 2] * 4))
+    windows = padded.unfold(0, PATCH, 1).unfold(1, PATCH, 1).permute(0, 1, 3, 4, 2).flatten(2)
     return windows.div_(windows.norm(dim=2, keepdim=True).clamp_min(1e-12))
-
-
-def _inside(n: int) -> torch.Tensor:
-    """Which cells (n, 4) of the windows around the n corners of an axis lie inside the image."""
-    cell = torch.arange(n)[:, None] + torch.arange(PATCH) - PATCH // 2
-    return (cell >= 0) & (cell < n - 1)
 
 
 def atomic_maps(left: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
     """Correlation (gy, gx, h + 1, w + 1) of every atomic patch of a grid (H, W, C) with every place of another (h, w, C)."""
-    return _correlation_maps(_patches(left), _windows(right))
+    return _correlation_maps(unit_patches(left), _windows(right))
 
 
 def _correlation_maps(patches: torch.Tensor, windows: torch.Tensor) -> torch.Tensor:
@@ -78,7 +57,8 @@ def _correlation_maps(patches: torch.Tensor, windows: torch.Tensor) -> torch.Ten
     maps = torch.matmul(patches.reshape(-1, depth), windows.reshape(-1, depth).T)
     maps = maps.reshape(*patches.shape[:2], n_y, n_x)
     energy = patches.reshape(*patches.shape[:2], PATCH, PATCH, -1).square().sum(dim=4)
-    rows, columns = (_inside(n).to(maps) for n in (n_y, n_x))
+    cells = [torch.arange(n)[:, None] + torch.arange(PATCH) - PATCH // 2 for n in (n_y, n_x)]
+    rows, columns = (((0 <= cell) & (cell < len(cell) - 1)).to(maps) for cell in cells)
     for y in (0, 1, n_y - 2, n_y - 1):
         seen = torch.einsum("ijrc,r,xc->ijx", energy, rows[y], columns)
         maps[:, :, y] /= seen.sqrt().clamp_min(1e-6)
@@ -92,7 +72,7 @@ def _match_grids(left: torch.Tensor, right: torch.Tensor) -> tuple[torch.Tensor,
     """Best corner (gy, gx, 2) (x, y) of each patch of two descriptor grids, its score and peak ratio (gy, gx), and
     whether no other patch fits the same place of the right grid better (gy, gx).
     """
-    patches, windows = _patches(left), _windows(right)
+    patches, windows = unit_patches(left), _windows(right)
     (gy, gx), (n_y, n_x) = patches.shape[:2], windows.shape[:2]
 
     def chunks() -> Iterator[tuple[slice, torch.Tensor]]:
@@ -153,8 +133,7 @@ def match_free(
     corner, best, passed = corner.cpu().numpy(), best.cpu().numpy().astype(np.float64), passed.cpu().numpy()
     target = np.clip(corner, 0, np.array(right.shape[1::-1]) - 1)
     kept = np.isfinite(best) & patch_quality(left) & (right[target[..., 1], target[..., 0], CHANNELS - 1] > 0)
-    if reciprocal:
-        kept &= passed
+    kept &= passed | (not reciprocal)
     y, x = np.nonzero(kept)
     # A corner c of the grid lies at c * stride - 1/2 px where pixel centres are integers.
     u_left = (np.column_stack([x, y]) * PATCH + PATCH // 2) * float(stride) - 0.5
@@ -163,12 +142,5 @@ def match_free(
     variance = stride**2 / 12 + 0.25 * stride**2 / 4
     covariance = np.tile(np.diag([SIGMA_LEFT_PX**2] * 2 + [variance] * 2), (len(u_left), 1, 1))
     score = np.clip(best[kept] / (n_levels(*best.shape) + 1), 0, 1)
-    return Matches(
-        u_left,
-        u_right,
-        score,
-        covariance,
-        peak_ratio=ratio[kept],
-        reciprocal=passed[kept],
-        method="deepmatching",
-    )
+    told = {"peak_ratio": ratio[kept], "reciprocal": passed[kept]}
+    return Matches(u_left, u_right, score, covariance, **told, method="deepmatching")

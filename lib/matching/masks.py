@@ -52,14 +52,11 @@ def tool_mask(
     lengths = np.linalg.norm(tips - base, axis=1)
     thickness = max(1, round(0.45 * lengths.mean() if width_px is None else width_px))
     backwards = base - tips.mean(axis=0)
-    size = np.linalg.norm(backwards)
     reach = np.hypot(height, width) + np.abs(base).max() if shaft_px is None else shaft_px
-    ends = [*tips]
-    if size > 0:
-        ends.append(base + backwards / size * reach)
+    back = base + backwards / max(np.linalg.norm(backwards), 1e-300) * reach
     shift = 4  # fractional bits of OpenCV's line drawing
     limit = 2 ** (30 - shift) / 8
-    for end in ends:
+    for end in (*tips, back):
         a, b = (tuple(int(v) for v in np.clip(np.rint(p * 2**shift), -limit, limit)) for p in (base, end))
         cv2.line(mask, a, b, 1, thickness, cv2.LINE_8, shift)
     return mask.astype(bool)

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from lib.cameras import StereoRig
-from lib.matching.band import COARSE_REACH, Images, Masks, Setting, plan_search
+from lib.matching.band import COARSE_REACH, Images, Masks, Where, plan_search
 from lib.matching.descriptors import patch_quality, pixel_descriptors
 from lib.matching.pyramid import PATCH, peak_ratio
 from lib.matching.rectification import warp
@@ -79,24 +79,16 @@ def _dis(left: np.ndarray, right: np.ndarray, range_px: tuple[float, float]) -> 
 
 
 def match_with(
-    function: DisparityFunction | str,
-    images: Images,
-    masks: Masks,
-    rig: StereoRig,
-    *,
-    depth_range_mm: tuple[float, float] | None,
-    setting: Setting,
-    max_epipolar_px: float,
-    reciprocal: bool,
+    function: DisparityFunction | str, images: Images, masks: Masks, rig: StereoRig, where: Where, *, reciprocal: bool
 ) -> Matches:
     """Rectify by the rig, call a disparity function, and sample its result on a lattice.
 
     Arguments as in `lib.matching.match`, images (h, w) uint8 grey.
     """
-    known = {"sgbm": partial(_sgbm, checked=reciprocal), "dis": _dis}
-    name = function if isinstance(function, str) else getattr(function, "__name__", "callable")
-    call = known[function] if isinstance(function, str) else function
-    search = plan_search(images, masks, rig, setting, depth_range_mm, max_epipolar_px)
+    named = isinstance(function, str)
+    call = {"sgbm": partial(_sgbm, checked=reciprocal), "dis": _dis}[function] if named else function
+    name = function if named else getattr(function, "__name__", "callable")
+    search = plan_search(images, masks, rig, where)
     rectification, (low, high) = search.rectification, search.range_px
 
     # Matchers only find what lies in both images, so the canvas is widened by the reach of the search.
@@ -119,9 +111,7 @@ def match_with(
         np.arange(reach + LATTICE_PX // 2, reach + width // LATTICE_PX * LATTICE_PX, LATTICE_PX),
         np.arange(LATTICE_PX // 2, height // LATTICE_PX * LATTICE_PX, LATTICE_PX),
     )
-    kept = valid_left[y, x] & np.isfinite(disparity[y, x])
-    if reciprocal:
-        kept &= passed[y, x]
+    kept = valid_left[y, x] & np.isfinite(disparity[y, x]) & (passed[y, x] | (not reciprocal))
     x, y = x[kept], y[kept]
     d = disparity[y, x].astype(np.float64)
     target = np.rint(x - d).astype(np.intp)

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-__all__ = ["PATCH", "POWER", "Pyramid", "bottom_up", "gather", "n_levels", "peak_ratio", "pool", "top_down", "unpool"]
+__all__ = ["PATCH", "POWER", "Pyramid", "bottom_up", "gather", "n_levels", "peak_ratio", "pool", "top_down", "unit_patches", "unpool"]
 
 PATCH = 4
 POWER = 1.4
@@ -36,6 +36,14 @@ class Pyramid:
     pools: list[tuple[torch.Tensor | None, torch.Tensor]]  # maxima along x, and along both; of level 0 the latter
     responses: list[torch.Tensor]  # levels 1 to top
     shifted: bool  # whether the last two axes are places (else displacements)
+
+
+def unit_patches(grid: torch.Tensor) -> torch.Tensor:
+    """(gy, gx, 16 C) unit descriptors of the atomic patches of a grid (h, w, C)."""
+    gy, gx = grid.shape[0] // PATCH, grid.shape[1] // PATCH
+    cells = grid[: gy * PATCH, : gx * PATCH].reshape(gy, PATCH, gx, PATCH, -1)
+    patches = cells.permute(0, 2, 1, 3, 4).reshape(gy, gx, -1)
+    return patches / patches.norm(dim=2, keepdim=True).clamp_min(1e-12)
 
 
 def n_levels(gy: int, gx: int) -> int:

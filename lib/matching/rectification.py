@@ -19,10 +19,7 @@ __all__ = ["RECTIFIED", "Rectification", "rectify", "warp"]
 
 #: The rig of an already rectified pair: x = (x_left, y, disparity) px instead of mm, u_right = (x - disparity, y).
 #: Depth is then disparity (nearer is larger), so `depth_range_mm` is the range of disparity in px.
-RECTIFIED = StereoRig(
-    AffineCamera(np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0]])),
-    AffineCamera(np.array([[1.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0]])),
-)
+RECTIFIED = StereoRig(AffineCamera([[1, 0, 0, 0], [0, 1, 0, 0]]), AffineCamera([[1, 0, -1, 0], [0, 1, 0, 0]]))
 
 
 @dataclass(frozen=True, eq=False)

@@ -42,10 +42,9 @@ class Matches:
     method: str = field(default="", kw_only=True)
 
     def __post_init__(self) -> None:
-        if self.peak_ratio is None:
-            object.__setattr__(self, "peak_ratio", np.full(len(self.u_left), np.nan))
-        if self.reciprocal is None:
-            object.__setattr__(self, "reciprocal", np.ones(len(self.u_left), dtype=bool))
+        for name, unknown in (("peak_ratio", np.nan), ("reciprocal", True)):
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, np.full(len(self), unknown))
 
     def __len__(self) -> int:
         return len(self.u_left)

@@ -12,7 +12,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 import torch
 
-from lib.matching.pyramid import PATCH, POWER, bottom_up, n_levels, pool, top_down, unpool
+from lib.matching.pyramid import PATCH, POWER, bottom_up, n_levels, pool, top_down, unit_patches, unpool
 
 __all__ = ["VolumeMatches", "correlation_volume", "match_volume", "predicted_bytes"]
 
@@ -54,9 +54,7 @@ def correlation_volume(left: torch.Tensor, right: torch.Tensor, v: int) -> torch
     height, width, channels = left.shape
     gy, gx, n = height // PATCH, width // PATCH, right.shape[1] - width + 1
     depth = PATCH * PATCH * channels
-    patches = left.reshape(gy, PATCH, gx, PATCH, channels).permute(0, 2, 1, 3, 4).reshape(gy, gx, depth)
-    patches = patches / patches.norm(dim=2, keepdim=True).clamp_min(1e-12)
-
+    patches = unit_patches(left)
     n_x, n_y = right.shape[1] - PATCH + 1, right.shape[0] - PATCH + 1
     energy = right.square().sum(dim=2)
     energy = sum(energy[:, c : c + n_x] for c in range(PATCH))

@@ -15,19 +15,16 @@ from lib.surface.export import (
     save_points,
     surface_mesh,
 )
-from lib.surface.fit import SurfaceFit
 from lib.surface.fitting import fit_surface
 from lib.surface.grid import SplineGrid
 from lib.surface.joint import refine_rig
-from lib.surface.reconstruct import EPIPOLAR_SIGMAS, Reconstruction, epipolar_inliers, reconstruct
+from lib.surface.reconstruct import Reconstruction, epipolar_inliers, reconstruct
 
 __all__ = [
-    "EPIPOLAR_SIGMAS",
     "BSplineSurface",
     "Mesh",
     "Reconstruction",
     "SplineGrid",
-    "SurfaceFit",
     "ToolDistance",
     "depth_map",
     "epipolar_inliers",

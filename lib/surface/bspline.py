@@ -71,30 +71,21 @@ class BSplineSurface:
 
     def on_grid(self, x_px: ArrayLike, y_px: ArrayLike) -> np.ndarray:
         """Points (len(y), len(x), 3) on the lattice of columns `x_px` and rows `y_px`: fast for whole images."""
-        bases, outside = [], []
+        bases = []
         axes = zip((x_px, y_px), self.grid.domain[:2], self.grid.cell_px, self.grid.control, strict=True)
         for values, low, cell, n in axes:
             position = (np.asarray(values, dtype=np.float64) - low) / cell
             index = np.clip(np.floor(np.nan_to_num(position)), 0, n - 4).astype(np.intp)
             basis = np.zeros((len(position), n))
-            basis[np.arange(len(position))[:, None], index[:, None] + np.arange(4)] = cubic_basis(position - index)
+            np.put_along_axis(basis, index[:, None] + np.arange(4), cubic_basis(position - index), axis=1)
+            basis[~((position >= 0) & (position <= n - 3))] = np.nan
             bases.append(basis)
-            outside.append(~((position >= 0) & (position <= n - 3)))
-        rows = np.tensordot(bases[1], self.control_points_mm, axes=(1, 0))
-        result = np.matmul(bases[0], rows)
-        result[outside[1]] = np.nan
-        result[:, outside[0]] = np.nan
-        return result
+        return np.matmul(bases[0], np.tensordot(bases[1], self.control_points_mm, axes=(1, 0)))
 
     def normal(self, u: ArrayLike) -> np.ndarray:
         """Unit normals (n, 3), towards the camera (for an unmirrored camera in a right-handed frame)."""
         normal = np.cross(self.derivative(u, (0, 1)), self.derivative(u, (1, 0)))
         return normal / np.linalg.norm(normal, axis=1, keepdims=True)
-
-    def bending_energy(self) -> float:
-        """Integral of |d^2 Psi / du^2|^2 over the domain in mm^2 / px^2, the regulariser of paper Eq. (6)."""
-        coefficients = self.grid.flatten(self.control_points_mm)
-        return float(np.sum(coefficients * (self.grid.bending @ coefficients)))
 
     def covariance(self, u: ArrayLike) -> np.ndarray:
         """Covariance (n, 3, 3) mm^2 of Psi(u) from the scatter of the fitted points; see `SurfaceFit.covariance`.
@@ -133,21 +124,8 @@ class BSplineSurface:
             u[seen] = np.clip(u[seen] + step, low, high)
             if not step.size or np.abs(step).max() < 1e-9:
                 break
-        nearest = self(u)
         # At the domain's border the nearest point may lie beyond it: then there is none to name.
-        beyond = ~np.isfinite(along_view)
-        nearest[beyond], u[beyond] = np.nan, np.nan
-        along_normal = np.full(len(x), np.nan)
-        ok = ~beyond
-        along_normal[ok] = np.einsum("nk,nk->n", x[ok] - nearest[ok], self.normal(u[ok]))
+        u[~np.isfinite(along_view)] = np.nan
+        nearest = self(u)
+        along_normal = np.einsum("nk,nk->n", x - nearest, self.normal(u))
         return ToolDistance(along_view, along_normal, nearest, u)
-
-    @property
-    def objective(self) -> float:
-        """Eq. (6) at this surface over the final inliers, in mm and px (NaN for a surface that was not fitted)."""
-        return self.fit.objective if self.fit else float("nan")
-
-    @property
-    def inliers(self) -> np.ndarray | None:
-        """Which of the given points (n,) the final fit used."""
-        return self.fit.inliers if self.fit else None

@@ -7,10 +7,9 @@ from functools import cached_property
 
 import numpy as np
 from scipy.linalg import cho_solve_banded
-from scipy.linalg.lapack import dpbtrf
 
 from lib.surface.grid import SplineGrid
-from lib.surface.solver import UNHELD, L1Problem
+from lib.surface.solver import UNHELD, L1Problem, cholesky
 
 __all__ = ["SurfaceFit"]
 
@@ -89,9 +88,8 @@ class SurfaceFit:
             # The surface meets some points exactly; only the others show the scatter, half of them within their median.
             free = size[size > 1e-3 * size.mean()]
             density = 0.25 / max(np.median(free), np.finfo(float).tiny) if len(free) else np.inf
-            band = self.problem.normal_band(2 * density * weights**2, 2 * mu)
-            factor, info = dpbtrf(band, lower=1, overwrite_ab=1)
-            if info or not np.isfinite(density):
+            factor = cholesky(self.problem.normal_band(2 * density * weights**2, 2 * mu))
+            if factor is None or not np.isfinite(density):
                 raise ValueError(UNHELD)
             posterior.append((factor, density))
         return posterior
@@ -110,8 +108,7 @@ class SurfaceFit:
     @cached_property
     def _correlation(self) -> np.ndarray:
         signs = np.sign(self.residual)
-        product = signs.T @ signs
-        norm = np.sqrt(np.maximum(np.diag(product), 1.0))
-        correlation = product / np.outer(norm, norm)
+        norm = np.sqrt(np.maximum((signs**2).sum(axis=0), 1.0))
+        correlation = signs.T @ signs / np.outer(norm, norm)
         np.fill_diagonal(correlation, 1.0)
         return correlation

@@ -23,7 +23,6 @@ __all__ = ["REJECT_MEDIANS", "fit_surface"]
 #: 0.1 % of its points beyond it.
 REJECT_MEDIANS = 5.0
 
-_SOLVERS = {"interior_point": interior_point, "least_squares": least_squares}
 _FOLDS = 3
 _ENOUGH_HELD_OUT = 1500  # points in the folds that are tried: more only cost time
 _QUICK_HELD_OUT = 1000
@@ -75,42 +74,54 @@ def fit_surface(
         ValueError: For shapes or counts that do not fit, NaN, negative smoothness, points that do not determine a
             surface: fewer in the domain than a quarter of the control points, or than 16.
     """
-    data = _prepared(u, x_mm, domain, control, covariance_mm2, camera)
-    if smoothness is not None:
-        smoothness = _checked_smoothness(smoothness)
+    grid = SplineGrid(domain, control)
+    u, x = finite_points(u, 2, "u"), finite_points(x_mm, 3, "x_mm")
+    if len(u) != len(x):
+        raise ValueError(f"u, x_mm: {len(u)} image points and {len(x)} points; they come in pairs.")
+    used = grid.inside(u)
+    least = max(16, grid.size // 4)
+    _check_enough(u[used], len(u), least, grid)
+    axes, values, norms = _outputs(x, covariance_mm2, camera)
+    data = _Data(grid, u, used, values, norms, norms[used].mean(axis=0))
+    if smoothness is not None and not (np.isfinite(smoothness) and smoothness >= 0):
+        raise ValueError(f"smoothness: mu must be a number >= 0 px^2/mm, or None to choose it; got {smoothness}.")
     if reject_mm is not None and not reject_mm > 0:
         raise ValueError(f"reject_mm: a bound in mm above 0, infinity, or None; got {reject_mm}.")
-    if method not in _SOLVERS:
-        raise ValueError(f"method: one of {sorted(_SOLVERS)}, got {method!r}.")
-    solver, grid, x, axes, used = _SOLVERS[method], data.grid, data.x, data.axes, data.used
+    if method not in ("interior_point", "least_squares"):
+        raise ValueError(f"method: 'interior_point' or 'least_squares', got {method!r}.")
+    rough = quick and method != "least_squares"
+    if method == "least_squares":
+        exact = search = least_squares
+    else:
+        exact = partial(interior_point, tolerance=tolerance)
+        # As near the minimum as the choice of the smoothness needs.
+        search = partial(interior_point, max_iterations=5) if quick else partial(interior_point, tolerance=1e-3)
     held_out = np.empty((0, 2))
     if smoothness is None:
-        enough = _QUICK_HELD_OUT if quick else _ENOUGH_HELD_OUT
-        smoothness, held_out = _choose_smoothness(data, _searcher(method, quick), enough)
+        smoothness, held_out = _choose_smoothness(data, search, _QUICK_HELD_OUT if quick else _ENOUGH_HELD_OUT)
     mu = smoothness * data.stiffness
 
     def solve(chosen: np.ndarray, solver: Callable[..., L1Solution]) -> tuple[L1Problem, L1Solution, BSplineSurface]:
-        problem = L1Problem(grid, data.u[chosen])
-        solution = solver(problem, data.values[chosen], mu, data.norms[chosen])
+        problem = L1Problem(grid, u[chosen])
+        solution = solver(problem, values[chosen], mu, norms[chosen])
         control_points = grid.unflatten(solution.coefficients) @ axes
         if camera is not None:
-            control_points = control_points + _rays(grid.sites.reshape(-1, 2), camera).reshape(control_points.shape)
+            # The point of each ray that lies in the plane through the origin across the view.
+            control_points = control_points + (grid.sites - camera.offset_px) @ np.linalg.pinv(camera.linear).T
         return problem, solution, BSplineSurface(grid, control_points)
 
     def residuals(surface: BSplineSurface) -> np.ndarray:
         # With a camera only the depth is fitted, so only it can be wrong.
-        difference = surface(data.u) - x
+        difference = surface(u) - x
         return difference if camera is None else (difference @ axes.T) @ axes
 
-    rough = quick and method != "least_squares"
-    exact = partial(solver, tolerance=tolerance)
-    problem, solution, surface = solve(used, _searcher(method, quick) if rough else exact)
+    problem, solution, surface = solve(used, search if rough else exact)
     norm = np.abs(residuals(surface)).sum(axis=1)
     if reject_mm is None:
         reject_mm = REJECT_MEDIANS * float(np.median(norm[used]))
     inliers = used & (np.nan_to_num(norm, nan=np.inf) <= reject_mm)
     if rough or (inliers != used).any():
-        if inliers.sum() < _least(grid):
+        if inliers.sum() < least:
             raise ValueError(
                 f"reject_mm: only {inliers.sum()} of {used.sum()} points lie within {reject_mm:.4g} mm of the surface; "
                 "increase it."
@@ -129,66 +140,29 @@ def fit_surface(
         method=method,
         problem=problem,
         penalty=mu,
-        weights=data.norms[inliers],
-        residual=problem.design @ solution.coefficients - data.values[inliers],
+        weights=norms[inliers],
+        residual=problem.design @ solution.coefficients - values[inliers],
     )
     return BSplineSurface(grid, surface.control_points_mm, fit)
 
 
 @dataclass(frozen=True)
 class _Data:
-    """Checked arguments of a fit: n points with k outputs, `used` (n,) of them in the domain."""
+    """What is fitted: n points with k outputs."""
 
     grid: SplineGrid
     u: np.ndarray
-    x: np.ndarray
-    used: np.ndarray
-    axes: np.ndarray  # (k, 3)
-    values: np.ndarray  # (n, k), x along the axes
+    used: np.ndarray  # (n,), inside the domain
+    values: np.ndarray  # (n, k), the points along the axes
     norms: np.ndarray  # (n, k), factors of the absolute residuals
     stiffness: np.ndarray  # (k,), factors of the bending energy: 1, or its whitening
 
 
-def _prepared(
-    u: ArrayLike,
-    x_mm: ArrayLike,
-    domain: tuple[float, float, float, float],
-    control: tuple[int, int],
-    covariance_mm2: ArrayLike | None,
-    camera: AffineCamera | None,
-) -> _Data:
-    grid = SplineGrid(domain, control)
-    u, x = finite_points(u, 2, "u"), finite_points(x_mm, 3, "x_mm")
-    if len(u) != len(x):
-        raise ValueError(f"u, x_mm: {len(u)} image points and {len(x)} points; they come in pairs.")
-    used = grid.inside(u)
-    _check_enough(u[used], len(u), grid)
-    axes, values, norms = _outputs(x, covariance_mm2, camera)
-    return _Data(grid, u, x, used, axes, values, norms, norms[used].mean(axis=0))
-
-
-def _checked_smoothness(smoothness: float) -> float:
-    if not (np.isfinite(smoothness) and smoothness >= 0):
-        raise ValueError(f"smoothness: mu must be a number >= 0 px^2/mm, or None to choose it; got {smoothness}.")
-    return float(smoothness)
-
-
-def _searcher(method: str, quick: bool = False) -> Callable[..., L1Solution]:
-    """The solver that smoothness is chosen with: as near the minimum as the choice needs."""
-    if method == "least_squares":
-        return least_squares
-    return partial(interior_point, max_iterations=5) if quick else partial(interior_point, tolerance=1e-3)
-
-
-def _least(grid: SplineGrid) -> int:
-    return max(16, grid.size // 4)
-
-
-def _check_enough(u: np.ndarray, n_given: int, grid: SplineGrid) -> None:
-    if len(u) < _least(grid):
+def _check_enough(u: np.ndarray, n_given: int, least: int, grid: SplineGrid) -> None:
+    if len(u) < least:
         raise ValueError(
             f"u: {len(u)} of {n_given} points lie in the domain, and a grid of {grid.control[0]} x "
-            f"{grid.control[1]} control points needs {_least(grid)} or more. Match more points, give fewer control "
+            f"{grid.control[1]} control points needs {least} or more. Match more points, give fewer control "
             "points, or check that domain and u are both px of the left image."
         )
     spread = np.linalg.svd(u - u.mean(axis=0), compute_uv=False)
@@ -222,57 +196,39 @@ def _outputs(
     return axes, x @ axes.T, inverse_sigma / inverse_sigma.mean()
 
 
-def _rays(u: np.ndarray, camera: AffineCamera) -> np.ndarray:
-    """The point (n, 3) of each pixel's ray that lies in the plane through the origin across the view."""
-    return (u - camera.offset_px) @ np.linalg.pinv(camera.linear).T
-
-
-class _HeldOut:
-    """Mean L1 error, in mm, of points kept out of the fit, as a function of mu.
-
-    It is in mm also where the fit is whitened: else the axes across the view, which are all but linear in u and so like
-    any smoothness, would outvote the depth.
-    """
-
-    def __init__(self, data: _Data, solver: Callable[..., L1Solution], folds: int) -> None:
-        self.data, self.solver = data, solver
-        u, values = data.u[data.used], data.values[data.used]
-        order = np.lexsort((*values.T, u[:, 0], u[:, 1]))
-        fold = np.empty(len(u), dtype=np.intp)
-        fold[order] = np.arange(len(u)) % _FOLDS
-        rows = np.flatnonzero(data.used)
-        self.parts = [
-            (L1Problem(data.grid, u[fold != f]), rows[fold != f], data.grid.design(u[fold == f]), rows[fold == f])
-            for f in range(folds)
-        ]
-
-    def __call__(self, mu: float) -> float:
-        data, total, count = self.data, 0.0, 0
-        for problem, train, design, test in self.parts:
-            scaled = mu * data.stiffness * len(train) / data.used.sum()
-            solution = self.solver(problem, data.values[train], scaled, data.norms[train])
-            error = np.abs(design @ solution.coefficients - data.values[test])
-            total += float((data.norms[test] / data.stiffness * error).sum())
-            count += len(test)
-        return total / count
-
-
 def _choose_smoothness(data: _Data, solver: Callable[..., L1Solution], enough: int) -> tuple[float, np.ndarray]:
     """The smoothness of least held-out error, and the candidates tried with their errors (m, 2).
+
+    The error is the mean L1 error, in mm, of points kept out of the fit.  It is in mm also where the fit is whitened: else
+    the axes across the view, which are all but linear in u and so like any smoothness, would outvote the depth.
 
     It walks down a ladder of half decades to the lowest rung, then takes the parabola through it and its neighbours.
     """
     n = int(data.used.sum())
-    held_out = _HeldOut(data, solver, min(_FOLDS, -(-enough * _FOLDS // n)))
+    u, values = data.u[data.used], data.values[data.used]
+    order = np.lexsort((*values.T, u[:, 0], u[:, 1]))
+    fold = np.empty(n, dtype=np.intp)
+    fold[order] = np.arange(n) % _FOLDS
+    rows = np.flatnonzero(data.used)
+    parts = [
+        (L1Problem(data.grid, u[fold != f]), rows[fold != f], data.grid.design(u[fold == f]), rows[fold == f])
+        for f in range(min(_FOLDS, -(-enough * _FOLDS // n)))
+    ]
     # In the middle of what surfaces have needed; any start leads to the same end.
-    values = data.values[data.used]
     spread = np.median(np.abs(values - np.median(values, axis=0)))
     unit = 0.001 / _LADDER * n * float(np.prod(data.grid.cell_px)) / max(spread, 1e-9)
     errors: dict[int, float] = {}
 
     def error(step: int) -> float:
         if step not in errors:
-            errors[step] = held_out(unit * _LADDER**step)
+            total, count = 0.0, 0
+            for problem, train, design, test in parts:
+                scaled = unit * _LADDER**step * data.stiffness * len(train) / n
+                solution = solver(problem, data.values[train], scaled, data.norms[train])
+                apart = np.abs(design @ solution.coefficients - data.values[test])
+                total += float((data.norms[test] / data.stiffness * apart).sum())
+                count += len(test)
+            errors[step] = total / count
         return errors[step]
 
     best, direction = (0, 1) if error(1) < error(0) else (0, -1)

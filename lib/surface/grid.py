@@ -81,8 +81,7 @@ class SplineGrid:
     @property
     def cell_px(self) -> np.ndarray:
         """Width and height (2,) of a cell."""
-        x0, y0, x1, y1 = self.domain
-        return np.array([x1 - x0, y1 - y0]) / self.cells
+        return np.subtract(self.domain[2:], self.domain[:2]) / self.cells
 
     @property
     def stride(self) -> tuple[int, int]:
@@ -97,8 +96,7 @@ class SplineGrid:
 
     def inside(self, u: np.ndarray) -> np.ndarray:
         """Which of the points (n, 2) lie in the domain, borders included; NaN does not."""
-        x0, y0, x1, y1 = self.domain
-        return (u[:, 0] >= x0) & (u[:, 0] <= x1) & (u[:, 1] >= y0) & (u[:, 1] <= y1)
+        return ((u >= self.domain[:2]) & (u <= self.domain[2:])).all(axis=1)
 
     def locate(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Cell (n, 2) int of each point, and its place (n, 2) in that cell, in [0, 1] for points inside."""
@@ -142,14 +140,10 @@ class SplineGrid:
     def unflatten(self, coefficients: np.ndarray) -> np.ndarray:
         """Control points (n_y, n_x, k) of coefficients (size, k)."""
         n_x, n_y = self.control
-        if self.stride[0] == 1:
-            return coefficients.reshape(n_y, n_x, -1)
-        return coefficients.reshape(n_x, n_y, -1).swapaxes(0, 1)
+        return coefficients.reshape(n_y, n_x, -1) if n_x <= n_y else coefficients.reshape(n_x, n_y, -1).swapaxes(0, 1)
 
     @property
     def sites(self) -> np.ndarray:
         """Image points (n_y, n_x, 2) of the control points: f(sites) as control points reproduce a linear f exactly."""
-        (n_x, n_y), cell = self.control, self.cell_px
-        x = self.domain[0] + (np.arange(n_x) - 1) * cell[0]
-        y = self.domain[1] + (np.arange(n_y) - 1) * cell[1]
-        return np.stack(np.meshgrid(x, y), axis=-1)
+        index = np.stack(np.meshgrid(*map(np.arange, self.control)), axis=-1)
+        return self.domain[:2] + (index - 1) * self.cell_px

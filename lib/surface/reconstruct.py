@@ -142,13 +142,18 @@ def reconstruct(
     fast = setting == "fast"
 
     with _timed(seconds, "mask"):
-        masks = _masks((left, right), u_landmarks, (mask_left, mask_right))
-    options = {"mask_left": masks[0], "mask_right": masks[1]}
+        with ThreadPoolExecutor(2) as pool:
+            masks = dict(zip(("mask_left", "mask_right"), pool.map(glint_mask, (left, right)), strict=True))
+        for side, (name, given) in enumerate((("mask_left", mask_left), ("mask_right", mask_right))):
+            if u_landmarks is not None:
+                masks[name] |= tool_mask(masks[name].shape, u_landmarks[side])
+            if given is not None:
+                masks[name] |= checked_mask(given, masks[name].shape, name)
     if refine:
         with _timed(seconds, "refine"):
-            rig = refine_rig(rig, covariance, match(left, right, rig=rig, setting="fast", **options))
+            rig = refine_rig(rig, covariance, match(left, right, rig=rig, setting="fast", **masks))
     with _timed(seconds, "match"):
-        found = match(left, right, rig=rig, method=method, setting=setting, **options)
+        found = match(left, right, rig=rig, method=method, setting=setting, **masks)
     with _timed(seconds, "triangulate"):
         matches = found.keep(epipolar_inliers(rig, found, sigmas=epipolar_sigmas))
         points = rig.triangulate(matches.u_left, matches.u_right, matches.covariance_px2)
@@ -170,7 +175,7 @@ def reconstruct(
             tolerance=1e-4 if fast else 1e-8,
             quick=fast,
         )
-    return Reconstruction(surface, points, matches, len(found), masks[0], rig, dict(seconds))
+    return Reconstruction(surface, points, matches, len(found), masks["mask_left"], rig, dict(seconds))
 
 
 @contextmanager
@@ -181,19 +186,3 @@ def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
     finally:
         seconds.pop(stage, None)  # so that the stage stands last
         seconds[stage] = time.perf_counter() - start
-
-
-def _masks(
-    images: tuple[np.ndarray, np.ndarray],
-    u_landmarks: tuple[ArrayLike, ArrayLike] | None,
-    given: tuple[np.ndarray | None, np.ndarray | None],
-) -> list[np.ndarray]:
-    """What hides the surface in each image, (h, w) bool: glints, the tool, and what the caller masks."""
-    with ThreadPoolExecutor(2) as pool:
-        masks = list(pool.map(glint_mask, images))
-    for side, (mask, more) in enumerate(zip(masks, given, strict=True)):
-        if u_landmarks is not None:
-            mask |= tool_mask(mask.shape, u_landmarks[side])
-        if more is not None:
-            mask |= checked_mask(more, mask.shape, ("mask_left", "mask_right")[side])
-    return masks

@@ -17,7 +17,7 @@ from threadpoolctl import ThreadpoolController
 
 from lib.surface.grid import SplineGrid, cubic_basis
 
-__all__ = ["UNHELD", "L1Problem", "L1Solution", "interior_point", "least_squares"]
+__all__ = ["UNHELD", "L1Problem", "L1Solution", "cholesky", "interior_point", "least_squares"]
 
 UNHELD = (
     "smoothness: too small to hold the control points that have no data near them; increase it, or use fewer control "
@@ -163,10 +163,10 @@ def _interior_point(
 
     # A least-squares spline starts it, and its residuals give the unit of length.
     unit = max(np.abs(x).max(), np.finfo(float).tiny)
-    factor = _cholesky(problem.normal_band(w, 2 * mu / unit))
+    factor = cholesky(problem.normal_band(w, 2 * mu / unit))
     if factor is None:
         raise ValueError(UNHELD)
-    c = _solve(factor, B_T @ (w * x))
+    c = dpbtrs(factor, B_T @ (w * x), lower=1)[0]
     residual = B @ c - x
     scale = max(w @ np.abs(residual) / total, 1e-12 * unit)
     x, c, residual = x / scale, c / scale, residual / scale
@@ -201,9 +201,7 @@ def _interior_point(
                 break
         p_over, q_over = p / slack_p, q / slack_q
         D = 1.0 / (p_over + q_over)
-        factor = None
-        if iteration < max_iterations:
-            factor = _cholesky(problem.normal_band(D, bend))
+        factor = cholesky(problem.normal_band(D, bend)) if iteration < max_iterations else None
         if factor is None:  # no more steps, or the limit of double precision: the gap says how near we are
             objective, gap = certificate()
             break
@@ -211,7 +209,7 @@ def _interior_point(
         def newton(pull, D=D, factor=factor, y=y, bending_pull=bending_pull):
             """Newton step (dc, dy) that closes the dual residual, with D (B dc + pull) = dy."""
             pull = D * pull
-            dc = _solve(factor, -bending_pull - B_T @ (y + pull))
+            dc = dpbtrs(factor, -bending_pull - B_T @ (y + pull), lower=1)[0]
             dy = D * (B @ dc)
             dy += pull
             return dc, dy
@@ -229,7 +227,9 @@ def _interior_point(
         goal_p, goal_q = (target - bent_p) / slack_p, (target - bent_q) / slack_q
         dc, dy = newton(p - q - goal_p + goal_q)
         dp, dq = goal_p - p + p_over * dy, goal_q - q - q_over * dy
-        alpha = (1.0 - np.clip(centrality, 1e-3, 5e-3)) * _step_length((p, dp), (q, dq), (slack_p, -dy), (slack_q, dy))
+        shrinking = ((p, dp), (q, dq), (slack_p, -dy), (slack_q, dy))
+        longest = 1.0 / max(1.0, *(-np.min(step / value) for value, step in shrinking))  # up to 1 that keeps all positive
+        alpha = (1.0 - np.clip(centrality, 1e-3, 5e-3)) * longest
         c, p, q = c + alpha * dc, p + alpha * dp, q + alpha * dq
         slack_p, slack_q = slack_p - alpha * dy, slack_q + alpha * dy
         dual_residual *= 1.0 - alpha
@@ -237,46 +237,27 @@ def _interior_point(
     return c * scale + centre, objective * scale, gap * scale, y, iteration
 
 
-@cache
-def _blas() -> ThreadpoolController:
-    return ThreadpoolController()
+_blas = cache(ThreadpoolController)
 
 
-def _step_length(*pairs: tuple[np.ndarray, np.ndarray]) -> float:
-    """Longest step up to 1 along d that keeps every v in the pairs (v, d) positive."""
-    return 1.0 / max(1.0, *(-np.min(d / v) for v, d in pairs))
-
-
-def _solve(factor: np.ndarray, rhs: np.ndarray) -> np.ndarray:
-    return dpbtrs(factor, rhs, lower=1)[0]
-
-
-def _cholesky(band: np.ndarray) -> np.ndarray | None:
+def cholesky(band: np.ndarray) -> np.ndarray | None:
     """Lower factor of a banded matrix, which is overwritten; None where it is not positive definite in double precision."""
     factor, info = dpbtrf(band, lower=1, overwrite_ab=1)
     return None if info else factor
 
 
-def least_squares(
-    problem: L1Problem,
-    x: np.ndarray,
-    mu: float | np.ndarray,
-    weights: np.ndarray | None = None,
-    *,
-    tolerance: float = 0.0,
-) -> L1Solution:
+def least_squares(problem: L1Problem, x: np.ndarray, mu: float | np.ndarray, w: np.ndarray) -> L1Solution:
     """The baseline that the L1 norm is there to beat: sum_i (w_i (b_i.c - x_i))^2 + mu c.R.c, in closed form.
 
-    `tolerance` is not used; `dual` is the gradient of the data term.
+    `dual` is the gradient of the data term.
     """
     k = x.shape[1]
-    w = np.ones_like(x) if weights is None else weights
     coefficients = np.empty((problem.grid.size, k))
     for j, mu_j in enumerate(np.broadcast_to(mu, k)):
-        factor = _cholesky(problem.normal_band(w[:, j] ** 2, mu_j))
+        factor = cholesky(problem.normal_band(w[:, j] ** 2, mu_j))
         if factor is None:
             raise ValueError(UNHELD)
-        coefficients[:, j] = _solve(factor, problem.design_T @ (w[:, j] ** 2 * x[:, j]))
+        coefficients[:, j] = dpbtrs(factor, problem.design_T @ (w[:, j] ** 2 * x[:, j]), lower=1)[0]
     residual = problem.design @ coefficients - x
     energy = (coefficients * (problem.bending @ coefficients)).sum(axis=0)
     objective = ((w * residual) ** 2).sum(axis=0) + mu * energy

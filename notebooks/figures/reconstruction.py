@@ -575,7 +575,7 @@ def case_table(found: Sequence[Case]) -> Figure:
         rows.append(
             [
                 one.pair.name,
-                f"{one.found.surface.inliers.sum()}",
+                f"{one.found.surface.fit.inliers.sum()}",
                 f"{one.rms_um:.1f}",
                 f"{np.sqrt(np.nanmean(depth**2)):.1f}",
                 f"{one.sphere_rms_um:.0f}" if sphere else "",

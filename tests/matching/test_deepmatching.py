@@ -171,7 +171,7 @@ def test_memory_is_predicted():
         "from lib.matching.deepmatching import predicted_bytes\n"
         "def peak():\n"
         "    return int(open('/proc/self/status').read().split('VmHWM:')[1].split()[0]) * 1024\n"
-        "image = np.random.default_rng(0).integers(0, 255, (200, 240), dtype=np.uint8)\n"
+        "image = np.random.default_rng(0).integers(0, 255, (160, 192), dtype=np.uint8)\n"
         "match(image[:64, :64], image[:64, :64])\n"
         "before = peak()\n"
         "match(image, image, downscale=1)\n"

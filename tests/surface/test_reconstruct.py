@@ -113,7 +113,7 @@ def window(x: int, y: int, size: int) -> np.ndarray:
 @pytest.mark.parametrize(
     ("change", "named"),
     [
-        ({"mask_left": window(300, 160, 40)}, "u: .* points lie in the domain .* control points"),
+        ({"mask_left": window(300, 160, 40)}, "u: .* points lie in the domain, .* control points"),
         ({"mask_left": np.ones((5, 5), dtype=bool)}, "mask_left: expected a bool array"),
         ({"mask_right": np.zeros((360, 640))}, "mask_right: expected a bool array"),
         ({"setting": "best"}, "setting"),
