@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-__all__ = ["PATCH", "POWER", "Pyramid", "bottom_up", "gather", "n_levels", "peak_ratio", "pool", "top_down", "unit_patches", "unpool"]
+__all__ = ["PATCH", "POWER", "bottom_up", "gather", "n_levels", "peak_ratio", "pool", "top_down", "unit_patches", "unpool"]
 
 PATCH = 4
 POWER = 1.4
