@@ -109,13 +109,11 @@ def write_coco(path: Path, annotations: Annotations, image_size_px: tuple[int, i
             v = np.where(inside, visibility, 0)
             if not v.any():
                 continue
-            labelled = u[v > 0]
-            low, size = labelled.min(axis=0), np.ptp(labelled, axis=0)
+            low, size = u[v > 0].min(axis=0), np.ptp(u[v > 0], axis=0)
             xy = np.where((v > 0)[:, None], u, 0.0).round(3)
             entry = {"id": len(entries) + 1, "image_id": identity, "category_id": 1}
-            entry["keypoints"] = [n for (x, y), w in zip(xy, v, strict=True) for n in (float(x), float(y), int(w))]
-            entry["num_keypoints"] = int((v > 0).sum())
-            entry["bbox"] = [round(float(value), 3) for value in (*low, *size)]
+            entry["keypoints"] = [n for (x, y), w in zip(xy.tolist(), v.tolist(), strict=True) for n in (x, y, w)]
+            entry |= {"num_keypoints": int((v > 0).sum()), "bbox": [round(float(value), 3) for value in (*low, *size)]}
             entries.append(entry | {"area": round(float(size.prod()), 3), "iscrowd": 0})
     category = {"id": 1, "name": "forceps", "keypoints": list(LANDMARKS), "skeleton": [[1, 2], [1, 3]]}
     info = {"description": "Tool landmarks; integer coordinates are pixel centres."}

@@ -17,8 +17,7 @@ __all__ = ["Frames", "StereoFrame", "open_side", "read_image"]
 _SUFFIXES = (".jpg", ".jpeg", ".png")
 _CACHED_PAIRS = 4
 _EXIF_ORIENTATION = 0x0112
-#: A disk sector: what a crash or a bad copy replaces by zeros.
-_LOST_BYTES = 512
+_LOST_BYTES = 512  # a disk sector: what a crash or a bad copy replaces by zeros
 
 
 @dataclass(frozen=True)

@@ -113,7 +113,10 @@ class Recording:
             raise ValueError(f"{folder}: {len(left)} left and {len(right)} right frames; they come in pairs.")
         if not len(left):
             raise ValueError(f"{folder}: the recording is empty; it has no frame.")
-        frames = Frames(left, right, _read_times(folder / "frames.csv", len(left), header["fps"]))
+        time_s, path = np.arange(len(left)) / header["fps"], folder / "frames.csv"
+        if path.exists():
+            time_s = _increasing(path, read_table(path, ["frame", "time_s"], n_frames=len(left))[:, 1])
+        frames = Frames(left, right, time_s)
         kinematics = _read_kinematics(folder / "kinematics.csv")
         robot_time = frames.time_s + header["offset_s"]
         if robot_time[-1] < kinematics.time_s[0] or robot_time[0] > kinematics.time_s[-1]:
@@ -171,26 +174,18 @@ def _read_header(path: Path) -> dict:
     return header | {"image_size_px": tuple(size)}
 
 
-def _read_times(path: Path, n: int, fps: float) -> np.ndarray:
-    if not path.exists():
-        return np.arange(n) / fps
-    table = read_table(path, ["frame", "time_s"], n_frames=n)
-    _check_increasing(path, table[:, 1])
-    return table[:, 1]
-
-
-def _check_increasing(path: Path, time_s: np.ndarray) -> None:
+def _increasing(path: Path, time_s: np.ndarray) -> np.ndarray:
     bad = np.flatnonzero(~(np.diff(time_s, prepend=-np.inf) > 0))
     if bad.size:
         raise ValueError(f"{path}, line {bad[0] + 2}: time_s must be a number larger than the row before.")
+    return time_s
 
 
 def _read_kinematics(path: Path) -> Kinematics:
     table = read_table(path, KINEMATICS_COLUMNS)
     if not len(table):
         raise ValueError(f"{path}: the table is empty; the robot's landmarks are needed.")
-    _check_increasing(path, table[:, 0])
-    x = table[:, 1:].reshape(-1, len(LANDMARKS), 3)
+    time_s, x = _increasing(path, table[:, 0]), table[:, 1:].reshape(-1, len(LANDMARKS), 3)
     empty = np.isnan(x)
     partial = np.flatnonzero((empty.any(axis=2) & ~empty.all(axis=2)).any(axis=1))
     if partial.size:
@@ -203,4 +198,4 @@ def _read_kinematics(path: Path) -> Kinematics:
     if not 0.1 <= reach_mm <= 100:  # a jaw or shaft in metres or micrometres falls far outside
         what = f"the median distance from base to tip is {reach_mm:.4g}, not plausible in mm (0.1 to 100)"
         raise ValueError(f"{path}: {what}. Metres or micrometres? Convert to mm.")
-    return Kinematics(table[:, 0], x)
+    return Kinematics(time_s, x)

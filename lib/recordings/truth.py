@@ -18,13 +18,9 @@ from lib.recordings.tables import columns, read_table, write_table
 
 __all__ = ["Truth"]
 
-_COLUMNS = [
-    "frame",
-    *columns(["x_mm", "y_mm", "z_mm"]),
-    *columns(["left_x_px", "left_y_px", "left_visibility", "right_x_px", "right_y_px", "right_visibility"]),
-]
-#: Optional, after the others.
-_GLINT_COLUMNS = columns(["left_in_glint", "right_in_glint"])
+_COLUMNS = ["frame", *columns(["x_mm", "y_mm", "z_mm"])]
+_COLUMNS += columns(["left_x_px", "left_y_px", "left_visibility", "right_x_px", "right_y_px", "right_visibility"])
+_GLINT_COLUMNS = columns(["left_in_glint", "right_in_glint"])  # optional, after the others
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,12 +73,11 @@ class Truth:
         image[..., :2] = np.stack([self.u_left, self.u_right], axis=2)
         image[..., 2] = np.stack([self.visibility_left, self.visibility_right], axis=2)
         table = np.column_stack([np.arange(n), np.reshape(self.landmarks_mm, (n, 9)), image.reshape(n, 18)])
-        names, decimals = _COLUMNS, [0] + [7] * 9 + [5, 5, 0] * 6
         if self.in_glint_left is not None:
             glints = np.stack([self.in_glint_left, self.in_glint_right], axis=-1).astype(bool)
             table = np.column_stack([table, glints.reshape(n, 6)])
-            names, decimals = [*names, *_GLINT_COLUMNS], decimals + [0] * 6
-        write_table(self.folder / "landmarks.csv", names, table, decimals)
+        names, decimals = [*_COLUMNS, *_GLINT_COLUMNS], [0] + [7] * 9 + [5, 5, 0] * 6 + [0] * 6
+        write_table(self.folder / "landmarks.csv", names[: table.shape[1]], table, decimals[: table.shape[1]])
         if surface is not None:
             x_px, y_px, x_mm = (np.asarray(values) for values in surface)
             with files.whole(self.folder / "surface.npz") as partial:

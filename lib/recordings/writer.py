@@ -27,8 +27,7 @@ class RecordingWriter:
     """Context manager that writes a recording beside its final place and moves it there when it is valid.
 
     Args:
-        folder: Where the recording appears.  Until then its files lie beside it, in a folder that ends with
-            ``.partial``.
+        folder: Where the recording appears.  Until then its files lie beside it, in a folder ending with ``.partial``.
         image_size_px: (width, height).
         details: Own notes (numbers and text), kept in ``[details]`` of recording.toml.
         suffix, jpeg_quality: ".jpg" or ".png", and the quality of a JPEG.
@@ -62,8 +61,8 @@ class RecordingWriter:
         self._suffix, self._options = suffix, [cv2.IMWRITE_JPEG_QUALITY, int(jpeg_quality)] if suffix == ".jpg" else []
         self._header = {"format": FORMAT, "name": name, "description": description, "fps": self.fps}
         self._header |= {"image_size_px": list(self.image_size_px), "skeleton": list(LANDMARKS)}
-        self._header["robot_accuracy_mm"] = float(robot_accuracy_mm)
-        self._header |= {"readout_s": float(readout_s), "offset_s": float(offset_s)}
+        times = {"readout_s": float(readout_s), "offset_s": float(offset_s)}
+        self._header |= {"robot_accuracy_mm": float(robot_accuracy_mm), **times}
         self._details = dict(details or {})
         self._time_s: list[float] = []
         self._kinematics: list[np.ndarray] = []
@@ -101,16 +100,13 @@ class RecordingWriter:
         for side, image in (("left", left), ("right", right)):
             if image.shape != shape or image.dtype != np.uint8:
                 raise ValueError(f"{side}: expected {shape} uint8 RGB, got {image.shape} {image.dtype}.")
-            ok, data = cv2.imencode(self._suffix, cv2.cvtColor(image, cv2.COLOR_RGB2BGR), self._options)
-            if not ok:
-                raise ValueError(f"{side}: the image could not be encoded as {self._suffix}.")
+            data = cv2.imencode(self._suffix, cv2.cvtColor(image, cv2.COLOR_RGB2BGR), self._options)[1]
             write_bytes(self.folder / side / f"{index:06d}{self._suffix}", data.tobytes())
         self._time_s.append(index / self.fps if time_s is None else float(time_s))
 
     def kinematics(self, time_s: ArrayLike, x_mm: ArrayLike) -> None:
         """Append samples: robot times (m,) and landmarks (m, 3, 3) mm, NaN where a landmark was dropped."""
-        time = np.atleast_1d(np.asarray(time_s, dtype=np.float64))
-        x = np.asarray(x_mm, dtype=np.float64)
+        time, x = np.array(time_s, np.float64, ndmin=1), np.asarray(x_mm, np.float64)
         if x.shape != (len(time), len(LANDMARKS), 3):
             raise ValueError(f"x_mm: expected ({len(time)}, 3, 3), got {x.shape}.")
         self._kinematics.append(np.column_stack([time, x.reshape(len(time), 9)]))

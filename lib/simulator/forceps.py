@@ -9,7 +9,7 @@ to 60 degrees, so that this holds in every image.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -55,10 +55,6 @@ class Pose:
         upright = np.diag([1.0, -1.0, -1.0])
         turn = Rotation.from_euler("ZY", [self.azimuth_rad, -self.pitch_rad]).as_matrix()
         return turn @ upright @ Rotation.from_euler("x", self.roll_rad).as_matrix()
-
-    def moved(self, **changes: object) -> Pose:
-        """A copy with some attributes changed."""
-        return replace(self, **changes)
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ ROBOT_FROM_MICROSCOPE = RigidTransform.from_rotation_vector((0.15, 2.90, -0.25),
 
 @dataclass(frozen=True)
 class Microscope:
-    """Optics and sensor.  Two values in a tuple are (left, right); three are (red, green, blue).
+    """Geometry, optics and sensor.  Two values in a tuple are (left, right); three are (red, green, blue).
 
     Attributes:
         pixels_per_mm, image_rotation_rad: Zoom and in-plane rotation, independent of each other.
@@ -28,14 +28,11 @@ class Microscope:
         depth_of_field_mm: Total range of depth around `focus_z_mm` within which defocus is at most one pixel (standard
             deviation at 100 px per mm); infinity switches defocus off.
         psf_px: Standard deviation of the point spread in focus.
-        exposure_s, readout_s: Exposure of a row, and the time between the exposures of the first and the last row
-            (rolling shutter).
+        exposure_s, readout_s: Exposure of a row, and the time from the first to the last row of a rolling shutter.
         light_slope: Obliqueness of the light (x, y): a shadow moves by this many mm on the retina per mm of height.
         spot_mm, spot_radius_mm: Where the coaxial light is brightest, and its Gaussian radius.
-        brightness, vignetting, gain: Exposure (1 is well exposed), relative loss at the corners, and the colour gains
-            of each eye.
-        full_well, read_noise: Electrons at full scale (shot noise), and read noise in electrons; an infinite
-            `full_well` switches noise off.
+        brightness, vignetting, gain: Exposure (1 is good), relative loss at the corners, colour gains of each camera.
+        full_well, read_noise: Electrons at full scale (infinity switches noise off), and of the read noise.
         jpeg_quality: Quality of stored images, 0 to 100; None stores them without loss.
         inverse_distance_per_mm: One over the working distance; 0 is affine.
         fps: Frame rate of the video.

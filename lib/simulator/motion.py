@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -10,13 +10,15 @@ from scipy.interpolate import PchipInterpolator
 
 from lib.simulator.eye import Scene
 from lib.simulator.forceps import MAX_ROLL_RAD, Forceps, Pose
-from lib.simulator.limits import check, not_negative, positive
+from lib.simulator.limits import not_negative, positive
 
 __all__ = ["DURATIONS_S", "Motion"]
 
 #: Kinds of motion, and how long each takes by default.
 DURATIONS_S = {"sweep": 30.0, "surgeon": 18.0, "both": 45.0}
 _CLEARANCE_MM = 0.12  # between a tip and the retina
+_DEPTHS_MM = (-1.5, -0.7, 0.1, 0.9)  # at which the tips sweep, z in the microscope frame
+_HALF_FIELD_MM = np.array([6.8, 3.4])  # of the area that the jaws' centre covers
 
 
 @dataclass(frozen=True)
@@ -27,10 +29,7 @@ class Motion:
         kind: "sweep": the jaws scan the field at several depths while they turn and open.  "surgeon": descend, grasp,
             peel, pause, release, then the same elsewhere.  "both": a sweep for two thirds of the time, then a surgeon.
         duration_s: Duration of the whole trajectory; a shorter one is faster.
-        depths_mm: Depths at which the tips sweep, z in the microscope frame; the tips stay above the retina.
-        half_field_mm: Half extents (x, y) of the area that the jaws' centre covers.
-        tremor_mm: Peak-to-peak amplitude of the physiological tremor (8 to 12 Hz) in the surgeon's part; 0 switches it
-            off.
+        tremor_mm: Peak-to-peak amplitude of the physiological tremor (8 to 12 Hz) in the surgeon's part.
     """
 
     forceps: Forceps
@@ -38,16 +37,12 @@ class Motion:
     kind: str = "sweep"
     seed: int = 0
     duration_s: float = 30.0
-    depths_mm: tuple[float, ...] = (-1.5, -0.7, 0.1, 0.9)
-    half_field_mm: tuple[float, float] = (6.8, 3.4)
     tremor_mm: float = 0.15
 
     def __post_init__(self) -> None:
         if self.kind not in DURATIONS_S:
             raise ValueError(f"motion: unknown kind {self.kind!r}; one of {', '.join(DURATIONS_S)}.")
         positive(self, "duration_s")
-        check(self, "depths_mm", len, "at least one height to sweep through")
-        check(self, "half_field_mm", lambda v: min(v) > 0, "must be positive")
         not_negative(self, "tremor_mm")
 
     @cached_property
@@ -69,9 +64,9 @@ class Motion:
         return tuple(parts)
 
     def _sweep(self, rng: np.random.Generator, side: float) -> list[list[float]]:
-        half_x, half_y = self.half_field_mm
+        half_x, half_y = _HALF_FIELD_MM
         points = []
-        for layer, z in enumerate(rng.permutation(self.depths_mm)):
+        for layer, z in enumerate(rng.permutation(_DEPTHS_MM)):
             rows = np.array([-0.85, 0.0, 0.85]) * (1 if layer % 2 else -1)
             for k, row in enumerate(rows):
                 for column in np.array([-0.9, -0.3, 0.3, 0.9]) * (1 if k % 2 else -1):
@@ -82,7 +77,7 @@ class Motion:
         return points
 
     def _surgeon(self, rng: np.random.Generator, side: float) -> tuple[list[list[float]], list[float]]:
-        half_x, half_y = 0.7 * np.array(self.half_field_mm)
+        half_x, half_y = 0.7 * _HALF_FIELD_MM
         points, shares = [], []
         for _ in range(max(1, round(self.duration_s * (0.34 if self.kind == "both" else 1.0) / 9))):
             x, y = rng.uniform(-half_x, half_x), rng.uniform(-half_y, half_y)
@@ -127,4 +122,4 @@ class Motion:
             frequency, phase = rng.uniform(8, 12, (3, 3)), rng.uniform(0, 2 * np.pi, (3, 3))
             size = self.tremor_mm / 2 * np.array([0.75, 0.75, 0.4])[:, None] * np.array([0.6, 0.3, 0.2])
             moved += (size * np.sin(2 * np.pi * frequency * time + phase)).sum(axis=1)
-        return pose.moved(base_mm=tuple(float(v) for v in moved))
+        return replace(pose, base_mm=tuple(float(v) for v in moved))

@@ -1,15 +1,13 @@
-"""From linear light to an image: blur by depth and by motion, then sensor noise, gamma and 8 bits."""
+"""Blur of linear light by depth and by motion."""
 
 from __future__ import annotations
 
 import cv2
 import numpy as np
 
-from lib.simulator.microscope import Microscope
-from lib.simulator.texture import GAMMA
 from lib.simulator.window import Grid
 
-__all__ = ["blur", "blur_by_depth", "develop", "motion_kernel"]
+__all__ = ["blur", "blur_by_depth", "motion_kernel"]
 
 
 def blur(image: np.ndarray, sigma_px: float) -> np.ndarray:
@@ -48,17 +46,3 @@ def motion_kernel(shift_px: np.ndarray) -> np.ndarray | None:
         fy, fx = y - i, x - j
         kernel[i : i + 2, j : j + 2] += np.outer([1 - fy, fy], [1 - fx, fx])
     return kernel / kernel.sum()
-
-
-def develop(linear: np.ndarray, microscope: Microscope, gain: np.ndarray, rng: np.random.Generator | None) -> np.ndarray:
-    """The 8-bit image of linear light (h, w, 3) float32, which is overwritten; without `rng` no sensor noise."""
-    linear *= gain.astype(np.float32)
-    if rng is not None and np.isfinite(microscope.full_well):
-        variance = np.clip(linear, 0, 1.2) * np.float32(1 / microscope.full_well)
-        variance += np.float32((microscope.read_noise / microscope.full_well) ** 2)
-        np.sqrt(variance, out=variance)
-        variance *= rng.standard_normal(linear.shape, dtype=np.float32)
-        linear += variance
-    np.clip(linear, 0, 1, out=linear)
-    cv2.pow(linear, 1 / GAMMA, linear)
-    return cv2.convertScaleAbs(linear, alpha=255)

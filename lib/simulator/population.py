@@ -142,7 +142,7 @@ def sample(
         window = Window(camera, (size_px[0], round(field[1] * size_px[0] / field[0])))
         microscope = replace(microscope, psf_px=max(0.45, microscope.psf_px * shrink))
     speed = rng.normal(0, 2.0, 3) * (rng.random() < 0.5)
-    later = (pose.moved(base_mm=tuple(np.asarray(pose.base_mm) + 1e-3 * speed)), 1e-3)
+    later = (replace(pose, base_mm=tuple(np.asarray(pose.base_mm) + 1e-3 * speed)), 1e-3)
     view = render_view(eye, microscope, window, forceps=forceps, pose=pose, later=later, rng=rng)
     image, u = view.image, view.u
     if size_px is not None and tuple(size_px) != window.size_px:

@@ -32,11 +32,9 @@ class Design:
     """What a simulated recording shows, through what, and what robot and annotator report of it.
 
     Attributes:
-        eye, forceps: Scene and tool.  None = chosen by the recording's seed, from designs that
-            `lib.simulator.population.sample` never draws.
+        eye, forceps: Scene and tool.  None = chosen by the recording's seed, from designs that no training sees.
         microscope: Optics, light and sensor.
-        motion, duration_s: "sweep" (calibration), "surgeon" or "both"; None = 30 s for a sweep, 18 s for a surgeon, 45
-            s for both.
+        motion, duration_s: "sweep" (calibration), "surgeon" or "both"; None = 30, 18 or 45 s.
         robot_accuracy_mm: Standard deviation of the kinematics, per coordinate.
         offset_s: t_robot = t_video + offset_s.
         dropout: Share of kinematic samples without values.

@@ -17,7 +17,7 @@ from lib.geometry import RigidTransform
 from lib.simulator.eye import Scene
 from lib.simulator.forceps import Forceps, Pose
 from lib.simulator.microscope import Microscope
-from lib.simulator.optics import blur_by_depth, develop
+from lib.simulator.optics import blur_by_depth
 from lib.simulator.texture import GAMMA, smooth_noise
 from lib.simulator.tool import compose, shadow, tool_in_view
 from lib.simulator.window import Grid, Window, intersect
@@ -109,9 +109,8 @@ def render_view(
         view_x, view_y = -R[2, 0] / R[2, 2], -R[2, 1] / R[2, 2]
         want_x, want_y = (light_x + view_x) / 2, (light_y + view_y) / 2
         film_x, film_y = grid.full(-0.6 * slope_x + want_x), grid.full(-0.6 * slope_y + want_y)
-        to_bump = np.float32(_BUMP_PX / _BUMP_MM / to_texture)
-        bumps = _bumps(getattr(scene, "seed", 0))
-        bump = cv2.remap(bumps, map_x * to_bump, map_y * to_bump, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+        place = (axis * np.float32(_BUMP_PX / _BUMP_MM / to_texture) for axis in (map_x, map_y))
+        bump = cv2.remap(_bumps(getattr(scene, "seed", 0)), *place, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
         bump *= np.float32(0.13)
         film_x += bump[..., 0]
         film_y += bump[..., 1]
@@ -137,9 +136,18 @@ def render_view(
     centre = (field - 1) / 2 - window.origin_px
     radius2 = ((grid.u[0] - centre[0]) ** 2 + (grid.u[1] - centre[1]) ** 2) / (np.hypot(*field) / 2) ** 2
     linear *= grid.full(1 - microscope.vignetting * radius2)[..., None]
-    image = develop(linear, microscope, np.array(microscope.gain[side]), rng)
+    linear *= np.array(microscope.gain[side], np.float32)
+    if rng is not None and np.isfinite(microscope.full_well):
+        variance = np.clip(linear, 0, 1.2) * np.float32(1 / microscope.full_well)
+        variance += np.float32((microscope.read_noise / microscope.full_well) ** 2)
+        np.sqrt(variance, out=variance)
+        variance *= rng.standard_normal(linear.shape, dtype=np.float32)
+        linear += variance
+    np.clip(linear, 0, 1, out=linear)
+    cv2.pow(linear, 1 / GAMMA, linear)
     glint_mask[tool_mask > 0] = 0
-    return View(image, u, visibility, grid.full(z) if surface else None, tool_mask, glint_mask)
+    image, surface_mm = cv2.convertScaleAbs(linear, alpha=255), grid.full(z) if surface else None
+    return View(image, u, visibility, surface_mm, tool_mask, glint_mask)
 
 
 def render_pair(
@@ -163,8 +171,5 @@ def render_pair(
             base = f"its base is at {np.round(pose.base_mm, 2).tolist()} mm"
             raise ValueError(f"pose: the tool is outside the field; {base}, move it towards the microscope frame's origin.")
     options |= {"forceps": forceps, "pose": pose, "factor": factor}
-    left, right = (
-        render_view(scene, microscope, Window(camera, size), side=side, **options)
-        for side, camera in enumerate((rig.left, rig.right))
-    )
-    return left, right
+    windows = Window(rig.left, size), Window(rig.right, size)
+    return tuple(render_view(scene, microscope, window, side=k, **options) for k, window in enumerate(windows))

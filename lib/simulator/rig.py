@@ -46,22 +46,15 @@ class SimulatedSweep(Correspondences):
 
 
 def simulate_correspondences(
-    n: int,
-    *,
-    rng: np.random.Generator,
-    rig: StereoRig | None = None,
-    half_size_mm: tuple[float, float, float] = (8.0, 4.5, 1.5),
-    sigma_u_px: float = 1.5,
-    sigma_x_mm: float = 0.010,
+    n: int, *, rng: np.random.Generator, rig: StereoRig | None = None,
+    half_size_mm: tuple[float, float, float] = (8.0, 4.5, 1.5), sigma_u_px: float = 1.5, sigma_x_mm: float = 0.010,
     robot_from_microscope: RigidTransform = ROBOT_FROM_MICROSCOPE,
-) -> SimulatedSweep:
-    """Landmark positions spread over the field and the depth of field, as the rig sees them and the robot reports them.
+) -> SimulatedSweep:  # fmt: skip
+    """`n` positions spread over the field and the depth of field, as the rig sees them and the robot reports them.
 
     Args:
-        n: Number of correspondences.
         half_size_mm: Half extents (3,) of the box of positions in the microscope frame; the default fills the image.
-        sigma_u_px, sigma_x_mm: Standard deviation per coordinate of detections and of the robot's report.  The rows do
-            not state it.
+        sigma_u_px, sigma_x_mm: Standard deviation per coordinate of detections and reports.  The rows do not state it.
 
     >>> sweep = simulate_correspondences(500, rng=np.random.default_rng(0), sigma_u_px=2.0)
     >>> len(sweep.complete), float(np.std(sweep.true_rig.left.project(sweep.true_x_mm) - sweep.u_left).round(1))

@@ -1,4 +1,9 @@
-"""The tool in an image: where the camera sees it, what hides its landmarks, its metal and its shadow."""
+"""The tool in an image: its depth and normals, what hides its landmarks, its metal and its shadow.
+
+The tool is rasterised exactly, as round cones in orthographic view.  A round cone is the convex hull of two balls.  Along
+a ray its front is the minimum over s of f(s) = z(s) - sqrt(Q(s)) with Q(s) = r(s)^2 - |w - s c|^2.  Q is quadratic and f
+convex, so the minimum has a closed form and no mesh is needed.  The shaft is a cylinder that ends flat.
+"""
 
 from __future__ import annotations
 
@@ -10,10 +15,102 @@ import numpy as np
 from lib.simulator.forceps import Forceps, Pose
 from lib.simulator.microscope import Microscope
 from lib.simulator.optics import blur, blur_by_depth, motion_kernel
-from lib.simulator.raster import ToolRaster, rasterise
 from lib.simulator.window import Window
 
-__all__ = ["ToolInView", "compose", "shadow", "tool_in_view"]
+__all__ = ["ToolInView", "ToolRaster", "compose", "rasterise", "shadow", "tool_in_view"]
+
+
+@dataclass(frozen=True)
+class ToolRaster:
+    """What a camera sees of the tool, on a grid `factor` times finer than the image, over a box of it.
+
+    Attributes:
+        origin_px: (x, y), the image pixel whose first sample is the raster's first.
+        factor: Samples per pixel and axis; sample k of pixel i is at i + (k + 0.5) / factor - 0.5.
+        depth_mm: (h, w) float32 along the viewing direction, infinity where there is no tool.
+        part: (h, w) uint8: 0 none, 1 shaft, 2 jaw 1, 3 jaw 2.
+        hit: (rows, columns), (n,) each, of the samples with tool; the following are theirs.
+        normal, tangent: (n, 3) float32 in the camera frame (z away from the camera); the tangent runs along the part.
+        along_mm: (n,) float32, position along the part, for brush marks.
+    """
+
+    origin_px: tuple[int, int]
+    factor: int
+    depth_mm: np.ndarray
+    part: np.ndarray
+    hit: tuple[np.ndarray, np.ndarray]
+    normal: np.ndarray
+    tangent: np.ndarray
+    along_mm: np.ndarray
+
+
+def rasterise(
+    centres: np.ndarray, radii: np.ndarray, chains: np.ndarray, *, zoom: float, size_px: tuple[int, int], factor: int = 2
+) -> ToolRaster | None:
+    """Rasterise chains of round cones; None where nothing is in view.
+
+    Args:
+        centres: (n, 3) camera frame: x, y so that pixel = zoom * (x, y), and depth.
+        radii, chains: (n,) mm, and the chain each node belongs to; consecutive nodes of a chain are joined.  Chain 0
+            ends flat.
+        zoom: px per mm.
+        size_px: (w, h) of the image.
+    """
+    pixel, reach = centres[:, :2] * zoom, radii * zoom + 1.5
+    joined = np.flatnonzero(chains[1:] == chains[:-1])
+    low, high = np.floor(pixel - reach[:, None]), np.ceil(pixel + reach[:, None]) + 1
+    low = np.maximum(np.minimum(low[joined], low[joined + 1]), 0).astype(int)
+    high = np.minimum(np.maximum(high[joined], high[joined + 1]), size_px).astype(int)
+    seen = (high > low).all(axis=1)
+    if not seen.any():
+        return None
+    joined, low, high = joined[seen], low[seen], high[seen]
+    x0, y0 = low.min(axis=0)
+    x1, y1 = high.max(axis=0)
+    shape = ((y1 - y0) * factor, (x1 - x0) * factor)
+    depth = np.full(shape, np.inf, np.float32)
+    parameter = np.zeros(shape, np.float32)
+    index = np.full(shape, -1, np.int16)
+    for k, (lx, ly), (hx, hy) in zip(joined, low, high, strict=True):
+        a, b = centres[k], centres[k + 1]
+        r, dr = radii[k], radii[k + 1] - radii[k]
+        c, dz = b[:2] - a[:2], b[2] - a[2]
+        A = dr * dr - c @ c
+        if A > -1e-9:  # one ball hides the other
+            continue
+        # Relative to the node and small, so single precision is exact to nanometres.
+        wx = (((np.arange((hx - lx) * factor) + 0.5) / factor - 0.5 + lx) / zoom - a[0]).astype(np.float32)
+        wy = (((np.arange((hy - ly) * factor) + 0.5) / factor - 0.5 + ly) / zoom - a[1]).astype(np.float32)
+        A, gain = np.float32(A), np.float32(dz / np.sqrt(dz * dz - A))
+        B = np.add.outer((r * dr + wy * c[1]).astype(np.float32), (wx * c[0]).astype(np.float32))
+        C = np.subtract.outer((r * r - wy * wy).astype(np.float32), wx * wx)
+        s = np.sqrt(np.maximum(B * B - A * C, 0))
+        s *= gain
+        s -= B
+        s /= A
+        flat = chains[k] == 0 and (k + 2 >= len(chains) or chains[k + 2] != 0)
+        past = flat & (s > 1)
+        np.clip(s, 0, 1, out=s)
+        Q = (A * s + 2 * B) * s + C
+        z = np.float32(a[2]) + s * np.float32(dz) - np.sqrt(np.maximum(Q, 0))
+        view = np.s_[(ly - y0) * factor : (hy - y0) * factor, (lx - x0) * factor : (hx - x0) * factor]
+        closer = (Q > 0) & (z < depth[view]) & ~past
+        np.copyto(depth[view], z, where=closer)
+        np.copyto(parameter[view], s, where=closer)
+        np.copyto(index[view], np.int16(k), where=closer)
+    rows, columns = np.nonzero(index >= 0)
+    k, s = index[rows, columns], parameter[rows, columns][:, None]
+    span = centres[1:] - centres[:-1]
+    length = np.linalg.norm(span, axis=1)
+    x, y = (((sample + 0.5) * np.float32(1.0 / factor) - 0.5 + first) / zoom for sample, first in ((columns, x0), (rows, y0)))
+    surface = np.column_stack([x, y, depth[rows, columns]])
+    out = (surface - centres[k] - s * span[k]).astype(np.float32)
+    normal = out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-9)
+    tangent = (span / np.maximum(length, 1e-9)[:, None]).astype(np.float32)[k]
+    along = (np.concatenate([[0], np.cumsum(length)])[k] + s[:, 0] * length[k]).astype(np.float32)
+    part = np.zeros(shape, np.uint8)
+    part[rows, columns] = chains[k] + 1
+    return ToolRaster((int(x0), int(y0)), factor, depth, part, (rows, columns), normal, tangent, along)
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,11 +167,9 @@ class ToolInView:
         shifted = self.centres[jaw] - np.append(corner / zoom, 0)
         one_chain = np.ones(jaw.sum(), int)
         raster = rasterise(shifted, self.radii[jaw], one_chain, zoom=zoom, size_px=(side, side), factor=factor)
-        if raster is None:
-            return False
         covered = np.zeros((side * factor, side * factor), bool)
-        (x0, y0), (height, width) = raster.origin_px, raster.part.shape
-        covered[y0 * factor : y0 * factor + height, x0 * factor : x0 * factor + width] = raster.part > 0
+        if raster is not None:
+            covered[tuple(raster.hit + factor * np.array(raster.origin_px[::-1])[:, None])] = True
         sample = (np.arange(side * factor) + 0.5) / factor - 0.5
         near = np.add.outer((sample - (u - corner)[1]) ** 2, (sample - (u - corner)[0]) ** 2) < reach_px**2
         return bool(covered[near].all())
@@ -83,12 +178,11 @@ class ToolInView:
 def tool_in_view(
     window: Window, forceps: Forceps, pose: Pose, later: tuple[Pose, float] | None, *, readout_s: float = 0.0, factor: int = 2
 ) -> ToolInView:  # fmt: skip
-    """The tool as the window's camera sees it.
+    """The tool as the window's camera sees it; `pose` holds when the middle row of the whole image is exposed.
 
     Args:
         later: (pose, seconds later): the tool's motion during the read-out, or None for a tool at rest.
-        readout_s: Time from the first to the last row of the whole image; the middle row is exposed at the time of
-            `pose`.
+        readout_s: Time from the first to the last row of the whole image.
         factor: Samples per pixel and axis of the tool's edges.
     """
     centres, radii, chains = forceps.nodes(pose)
@@ -195,5 +289,5 @@ def _at_image_resolution(raster: ToolRaster, metal: np.ndarray) -> tuple[np.ndar
         return np.bincount(pixel, weights, height * width).reshape(height, width).astype(np.float32)
 
     samples, count = raster.factor**2, total()
-    colour = np.dstack([total(metal[:, channel]) for channel in range(3)]) / samples
+    colour = np.dstack([total(channel) for channel in metal.T]) / samples
     return colour, count / samples, total(raster.depth_mm[rows, columns]) / np.maximum(count, 1)

@@ -116,10 +116,8 @@ def _interpolation(size: int, step: int) -> np.ndarray:
     first = np.clip(np.floor(position).astype(int) - 1, 0, n - 4)
     t = position - first  # in 1..2
     weights = np.zeros((size, n))
-    row = np.arange(size)
     for j in range(4):
-        others = [k for k in range(4) if k != j]
-        weights[row, first + j] = np.prod([(t - k) / (j - k) for k in others], axis=0)
+        weights[np.arange(size), first + j] = np.prod([(t - k) / (j - k) for k in range(4) if k != j], axis=0)
     return weights.astype(np.float32)
 
 
@@ -127,8 +125,7 @@ class Grid:
     """The coarse grid of an image (`u`, its pixels) and the way back to full resolution (`full`)."""
 
     def __init__(self, size_px: tuple[int, int], step: int) -> None:
-        width, height = size_px
-        self.rows, self.columns = _interpolation(height, step), _interpolation(width, step)
+        self.columns, self.rows = (_interpolation(side, step) for side in size_px)
         self.u = np.meshgrid(*((np.arange(weights.shape[1]) - 1.0) * step for weights in (self.columns, self.rows)))
 
     def full(self, values: np.ndarray) -> np.ndarray:
@@ -144,8 +141,6 @@ def surface_grid(
 
     Linear interpolation between grid points is right to 1 um for eyes at the default step.
     """
-    width, height = size_px
-    x_px = np.append(np.arange(0, width - 1, step_px), width - 1).astype(float)
-    y_px = np.append(np.arange(0, height - 1, step_px), height - 1).astype(float)
+    x_px, y_px = (np.append(np.arange(0, side - 1, step_px), side - 1).astype(float) for side in size_px)
     points = intersect(scene, Window(camera, size_px), tuple(np.meshgrid(x_px, y_px)))
     return x_px, y_px, np.stack(points, axis=-1)

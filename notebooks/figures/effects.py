@@ -48,7 +48,7 @@ def render_window(
     rig = microscope.rig(RigidTransform.identity())
     centre = rig.left.project(forceps.landmarks(pose)).mean(axis=0)
     window = Window.around((rig.left, rig.right)[side], centre, size_px, microscope.image_size_px)
-    later = (pose.moved(base_mm=tuple(np.asarray(pose.base_mm) + 1e-3 * np.asarray(velocity_mm_s))), 1e-3)
+    later = (replace(pose, base_mm=tuple(np.asarray(pose.base_mm) + 1e-3 * np.asarray(velocity_mm_s))), 1e-3)
     rng = np.random.default_rng(seed)
     view = render_view(
         eye, microscope, window, side=side, forceps=forceps, pose=pose, later=later, rng=rng, factor=3

@@ -12,10 +12,9 @@ from lib.geometry import RigidTransform
 from lib.simulator import Eye, Forceps, Microscope, Pose, render_pair
 from lib.simulator.forceps import MAX_PITCH_RAD, MAX_ROLL_RAD
 from lib.simulator.population import random_forceps, random_pose
-from lib.simulator.raster import rasterise
 from lib.simulator.render import render_view
 from lib.simulator.texture import smooth_noise
-from lib.simulator.tool import tool_in_view
+from lib.simulator.tool import rasterise, tool_in_view
 from lib.simulator.window import Window, surface_grid
 from notebooks.figures.data import ray_cast_depth
 from notebooks.figures.effects import PLAIN
@@ -55,7 +54,8 @@ def tip_distances(rng: np.random.Generator, n: int, min_pitch_rad: float = 0.0) 
     factor, size, distances, visibilities = 16, 16, [], []
     for i in range(n):
         forceps = random_forceps(rng)
-        pose = random_pose(rng, forceps).moved(
+        pose = replace(
+            random_pose(rng, forceps),
             pitch_rad=rng.uniform(min_pitch_rad, MAX_PITCH_RAD),
             roll_rad=rng.uniform(-MAX_ROLL_RAD, MAX_ROLL_RAD),
             opening_mm=rng.uniform(0.0, 0.55) * forceps.jaw_length_mm,
@@ -96,7 +96,8 @@ def test_base_is_midway_between_the_edges_of_the_shaft():
     seen = 0
     for i in range(40):
         forceps = random_forceps(rng)
-        pose = random_pose(rng, forceps).moved(
+        pose = replace(
+            random_pose(rng, forceps),
             pitch_rad=rng.uniform(0, MAX_PITCH_RAD), roll_rad=rng.uniform(-MAX_ROLL_RAD, MAX_ROLL_RAD)
         )
         whole = (RIG.left, RIG.right)[i % 2]
@@ -209,7 +210,7 @@ def test_rolling_shutter_moves_the_tool_by_what_its_speed_predicts():
     forceps = Forceps()
     pose = Pose((0.0, 0.0, -1.0), azimuth_rad=np.pi / 2, pitch_rad=0.2)
     speed = 30.0  # mm/s along x
-    later = (pose.moved(base_mm=(speed * 1e-3, 0.0, -1.0)), 1e-3)
+    later = (replace(pose, base_mm=(speed * 1e-3, 0.0, -1.0)), 1e-3)
     camera = RIG.left
     centre = camera.project(np.array(pose.base_mm))[0]
     shown = Window.around(camera, centre, (300, 300), PLAIN.image_size_px)
@@ -276,7 +277,7 @@ def test_tip_1_is_left_of_the_shaft_in_both_images():
     rng = np.random.default_rng(5)
     for _ in range(200):
         forceps = random_forceps(rng)
-        pose = random_pose(rng, forceps).moved(opening_mm=0.5)
+        pose = replace(random_pose(rng, forceps), opening_mm=0.5)
         for camera in (RIG.left, RIG.right):
             base, tip_1, tip_2 = camera.project(forceps.landmarks(pose))
             ahead = (tip_1 + tip_2) / 2 - base
