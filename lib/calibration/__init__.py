@@ -1,6 +1,6 @@
 """Calibration of affine and near-affine cameras from a robot's kinematics, and how good it is (paper Sec. IV-A)."""
 
-from lib.calibration.advice import Advice, advise, box_grid, next_positions
+from lib.calibration.advice import added_error, box_grid, next_positions
 from lib.calibration.affine import Moments, affine_minimum, dlt, paper_variances
 from lib.calibration.calibration import Calibration, LandmarkOffsets
 from lib.calibration.estimate import calibrate
@@ -14,8 +14,8 @@ from lib.calibration.report import report
 from lib.calibration.timing import TimeOffset, estimate_time_offset
 
 __all__ = [
-    "LADDER", "Advice", "Calibration", "Comparison", "LandmarkOffsets", "Moments", "OnlineCalibration", "Optics", "Pivot",
-    "Rung", "TimeOffset", "ToolOffsets", "advise", "affine_minimum", "box_grid", "calibrate", "compare_models", "dlt",
+    "LADDER", "Calibration", "Comparison", "LandmarkOffsets", "Moments", "OnlineCalibration", "Optics", "Pivot", "Rung",
+    "TimeOffset", "ToolOffsets", "added_error", "affine_minimum", "box_grid", "calibrate", "compare_models", "dlt",
     "estimate_time_offset", "next_positions", "optics", "paper_variances",
     "pivot_calibration", "report", "tool_offsets", "with_offsets", "write_opencv", "write_ros",
 ]  # fmt: skip

@@ -2,33 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import ArrayLike
 
 from lib.calibration.calibration import Calibration
-from lib.geometry import finite_points, points
+from lib.geometry import finite_points
 
-__all__ = ["Advice", "advise", "box_grid", "next_positions"]
-
-
-@dataclass(frozen=True)
-class Advice:
-    """What to do.
-
-    Attributes:
-        enough: True where calibration adds less than a tenth to the error of every triangulated point asked for.
-        worst_ratio, worst_depth_um: Largest sd of these points from calibration alone: over that from one detection, and
-            in depth.
-        next_position_mm, gain: The reachable position (3,) that helps most, and the log det of the information it adds.
-    """
-
-    enough: bool
-    worst_ratio: float
-    worst_depth_um: float
-    next_position_mm: np.ndarray
-    gain: float
+__all__ = ["added_error", "box_grid", "next_positions"]
 
 
 def box_grid(low_mm: ArrayLike, high_mm: ArrayLike, steps: int = 5) -> np.ndarray:
@@ -47,7 +27,8 @@ def box_grid(low_mm: ArrayLike, high_mm: ArrayLike, steps: int = 5) -> np.ndarra
 def next_positions(calibration: Calibration, candidates_mm: ArrayLike, count: int = 1) -> tuple[np.ndarray, np.ndarray]:
     """Positions (count, 3) mm, chosen one after another, whose correspondences raise det(information) most; and log gains.
 
-    det(H^T H + h h^T) = det(H^T H)(1 + leverage), so for the affine model this is the largest leverage.
+    det(H^T H + h h^T) = det(H^T H)(1 + leverage), so for the affine model this is the largest leverage: a convex function of
+    the position, so of a box a corner is best.
     """
     x = finite_points(candidates_mm, 3, "candidates_mm")
     J, S = calibration.derivatives(x)[1], calibration.row_covariance(x)
@@ -65,20 +46,11 @@ def next_positions(calibration: Calibration, candidates_mm: ArrayLike, count: in
     return np.array(chosen), np.array(gains)
 
 
-def advise(
-    calibration: Calibration, low_mm: ArrayLike, high_mm: ArrayLike, workspace_mm: ArrayLike | None = None
-) -> Advice:
-    """Judge a stereo calibration over a workspace, and say where to move next.
+def added_error(calibration: Calibration, x_mm: ArrayLike) -> np.ndarray:
+    """(n,) share that calibration adds to the error of a point triangulated at x (n, 3), in its worst direction.
 
-    Args:
-        low_mm, high_mm: Corners of the box that the tool can reach in view of both cameras; a ValueError where empty.
-        workspace_mm: (n, 3) points that will be reconstructed; None is a grid over the box.
+    Below 0.1 over the workspace the data are enough; else `next_positions` says where the tool should go.
     """
-    grid = box_grid(low_mm, high_mm) if workspace_mm is None else points(workspace_mm, 3, "workspace_mm")
-    alone, both = (calibration.point_covariance(grid, detection=detection) for detection in (False, True))
-    # Per point, the direction in which calibration adds most to what one detection leaves uncertain anyway.
-    ratio = np.sqrt(np.linalg.eigvals(np.linalg.solve(both - alone, alone)).real.max(axis=1).max())
-    depth_um = 1e3 * float(calibration.depth_sd_mm(grid).max())
-    # Leverage is a convex function of the position, so over a box it is largest at a corner.
-    (position,), (gain,) = next_positions(calibration, box_grid(low_mm, high_mm, steps=2))
-    return Advice(bool(np.sqrt(1 + ratio**2) < 1.10), float(ratio), depth_um, position, float(gain))
+    alone, both = (calibration.point_covariance(x_mm, detection=detection) for detection in (False, True))
+    ratio2 = np.linalg.eigvals(np.linalg.solve(both - alone, alone)).real.max(axis=1)
+    return np.sqrt(1.0 + ratio2) - 1.0

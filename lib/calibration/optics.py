@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from lib.calibration.calibration import Calibration
-from lib.cameras import NearAffineCamera
 from lib.geometry import RigidTransform
 
 __all__ = ["Optics", "optics"]
@@ -37,7 +36,9 @@ def optics(calibration: Calibration) -> Optics:
     rig = calibration.pair
     directions = np.stack([rig.left.viewing_direction, rig.right.viewing_direction])
     cosine = float(directions[0] @ directions[1])
-    signs = np.sign([_depth_sign(camera, calibration) for camera in (rig.left, rig.right)])
+    # Where perspective is seen at three standard deviations; negative = mirrored.
+    distance, sd = calibration.inverse_distance_per_mm
+    signs = np.sign([getattr(c, "inverse_distance_per_mm", 0.0) * (abs(distance) >= 3 * sd) for c in calibration.cameras])
     if cosine < 0:
         one = "left" if signs[0] < 0 else "right"
         mirrored = one if signs.any() and signs.sum() == 0 else "left or right"
@@ -59,11 +60,3 @@ def optics(calibration: Calibration) -> Optics:
     origin = rig.triangulate(centre[None], centre[None]).x_mm[0]
     angle = float(np.arccos(np.clip(abs(cosine), -1, 1)))
     return Optics(mirrored, angle, roll, RigidTransform(np.column_stack([x, y, z]), origin))
-
-
-def _depth_sign(camera: object, calibration: Calibration) -> float:
-    """+1 or -1 where perspective is seen at three standard deviations (negative = mirrored), else 0."""
-    value, sd = calibration.inverse_distance_per_mm
-    if not isinstance(camera, NearAffineCamera) or abs(value) < 3 * sd:
-        return 0.0
-    return float(np.sign(camera.inverse_distance_per_mm))

@@ -120,7 +120,7 @@ class StereoRig:
         y = np.hstack(_matches(u_left, u_right))
         covariance = pair_covariance(covariance_px2, len(y))
         if not self.is_affine:
-            return triangulate_near_affine((self.left, self.right), y, covariance)
+            return triangulate_near_affine((self.left, self.right), y, covariance, self.epipolar_normal)
         y = y - self.offset_px
         gain, covariance_mm2 = best_linear(self.linear, covariance)
         x = y @ gain[0].T if len(gain) == 1 else np.einsum("nij,nj->ni", gain, y)

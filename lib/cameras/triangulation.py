@@ -33,13 +33,16 @@ def best_linear(A: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.n
     return covariance_mm2 @ np.swapaxes(weight_A, -1, -2), covariance_mm2
 
 
-def triangulate_near_affine(cameras: _Pair, y: np.ndarray, covariance: np.ndarray, steps: int = 2) -> Points:
+def triangulate_near_affine(
+    cameras: _Pair, y: np.ndarray, covariance: np.ndarray, affine_normal: np.ndarray, steps: int = 2
+) -> Points:
     """Linear for each point (the projection's denominator multiplied out), then Gauss-Newton steps on the pixels.
 
     Args:
         y: (n, 4) left and right pixels; NaN rows stay NaN, and so does a match that only a point behind a camera
             explains.
         covariance: (1, 4, 4) or (n, 4, 4), as `lib.geometry.pair_covariance` gives it.
+        affine_normal: (4,) of the pair of affine cameras, which says the sign of the epipolar residuals.
     """
     n = len(y)
     x, covariance_mm2, epipolar = np.full((n, 3), np.nan), np.full((n, 3, 3), np.nan), np.full(n, np.nan)
@@ -55,7 +58,7 @@ def triangulate_near_affine(cameras: _Pair, y: np.ndarray, covariance: np.ndarra
         J, r, ahead = _linearised(cameras, found, y[rows])
         in_front &= ahead
         x[rows[in_front]], covariance_mm2[rows[in_front]] = found[in_front], _step(J, r, W)[1][in_front]
-        normal = _null_vector(J, np.linalg.svd(np.vstack([camera.linear for camera in cameras]))[0][:, 3])
+        normal = _null_vector(J, affine_normal)
         epipolar[rows[in_front]] = np.einsum("ni,ni->n", normal, r)[in_front]
     return Points(x, covariance_mm2, epipolar)
 
@@ -113,5 +116,4 @@ def _null_vector(J: np.ndarray, affine: np.ndarray) -> np.ndarray:
         minor = a[p] * (b[q] * c[r] - b[r] * c[q]) - a[q] * (b[p] * c[r] - b[r] * c[p])
         minors.append((minor + a[r] * (b[p] * c[q] - b[q] * c[p])) * (-1) ** i)
     normal = np.stack(minors, axis=1)
-    affine = affine * (1.0 if affine[np.argmax(np.abs(affine))] > 0 else -1.0)
     return normal * (np.sign(normal @ affine) / np.linalg.norm(normal, axis=1))[:, None]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lib.calibration import advise, box_grid, calibrate, dlt, next_positions, optics, report
+from lib.calibration import added_error, box_grid, calibrate, dlt, next_positions, optics, report
 from lib.cameras import NearAffineCamera
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig, simulate_correspondences
 
@@ -93,8 +93,7 @@ def test_depth_map_grows_away_from_the_data():
 def test_advised_position_is_the_best_of_the_box(model):
     _, found = made(20, model=model, half_size_mm=(2, 1, 1))
     low, high = ROBOT_FROM_MICROSCOPE.t - 5, ROBOT_FROM_MICROSCOPE.t + 5
-    advice = advise(found, low, high)
-    position, gain = advice.next_position_mm, advice.gain
+    (position,), (gain,) = next_positions(found, box_grid(low, high, steps=2))
     everywhere = box_grid(low, high, steps=7)
     best, gains = next_positions(found, everywhere, 1)
     np.testing.assert_allclose(position, best[0])
@@ -135,14 +134,15 @@ def test_advice_halves_the_data():
     assert better >= 9 and rig is not None
 
 
-def test_advice_says_when_the_data_are_enough():
-    low, high = ROBOT_FROM_MICROSCOPE.t - 3, ROBOT_FROM_MICROSCOPE.t + 3
-    few = advise(made(8)[1], low, high)
-    many = advise(made(800)[1], low, high)
-    assert not few.enough and many.enough
-    assert few.worst_ratio > 3 * many.worst_ratio and few.worst_depth_um > 3 * many.worst_depth_um
+def test_the_data_are_enough_when_calibration_adds_little():
+    grid = box_grid(ROBOT_FROM_MICROSCOPE.t - 3, ROBOT_FROM_MICROSCOPE.t + 3)
+    few, many = (made(n)[1] for n in (8, 800))
+    added = [added_error(found, grid).max() for found in (few, many)]
+    assert added[0] > 0.1 > added[1]
+    ratio = np.sqrt((1 + np.array(added)) ** 2 - 1)
+    assert ratio[0] > 3 * ratio[1] and few.depth_sd_mm(grid).max() > 3 * many.depth_sd_mm(grid).max()
     with pytest.raises(ValueError, match="high_mm"):
-        advise(made(20)[1], high, low)
+        box_grid(ROBOT_FROM_MICROSCOPE.t + 3, ROBOT_FROM_MICROSCOPE.t - 3)
 
 
 def test_report_says_what_is_wrong():
