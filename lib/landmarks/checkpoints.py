@@ -11,7 +11,7 @@ from safetensors.torch import save as safetensors_bytes
 from torch import Tensor, uint8
 
 from lib import files
-from lib.landmarks.network import HourglassConfig, OffsetConfig, OffsetNetwork, StackedHourglass, network_of
+from lib.landmarks.network import HourglassConfig, Network, OffsetConfig, network_of
 
 __all__ = ["checksum", "load_network", "read_checkpoint", "write_checkpoint"]
 
@@ -71,9 +71,7 @@ def read_checkpoint(path: str | Path, kind: str) -> tuple[dict[str, Tensor], dic
     return tensors, metadata
 
 
-def load_network(
-    path: str | Path, config: dict, tensors: dict[str, Tensor], prefix: str = ""
-) -> StackedHourglass | OffsetNetwork:
+def load_network(path: str | Path, config: dict, tensors: dict[str, Tensor], prefix: str = "") -> Network:
     """A network from its configuration and those tensors of a file whose names begin with `prefix`; errors name the file."""
     try:
         network = network_of((OffsetConfig if "size_px" in config else HourglassConfig)(**config))

@@ -26,8 +26,8 @@ from lib.landmarks.checkpoints import load_network, read_checkpoint, write_check
 from lib.landmarks.engines import accelerated, default_engine
 from lib.landmarks.error_model import ErrorModel, closeup_peaks, corrected, covariance_and_confidence
 from lib.landmarks.heatmaps import Peaks, decode
-from lib.landmarks.network import OffsetNetwork, StackedHourglass, as_tensor, as_uint8
-from lib.landmarks.windows import closeup_from_image, cut, direction_rad, tool_centre, window_from_image
+from lib.landmarks.network import Network, OffsetNetwork, StackedHourglass, as_tensor, as_uint8
+from lib.landmarks.windows import closeup_from_image, cut, tool_pose, window_from_image
 from lib.parallel import single_threaded_torch
 from lib.recordings import Recording
 
@@ -137,7 +137,7 @@ class Detector:
             self._run[name] = accelerated(network, self.engine, mirror=self.mirror and name == "window")
 
     @property
-    def networks(self) -> dict[str, StackedHourglass | OffsetNetwork]:
+    def networks(self) -> dict[str, Network]:
         """The networks by stage, in the order of their use."""
         stages = {name: getattr(self, f"{name}_network") for name in ("frame", "tool", "window", "closeup")}
         return {name: network for name, network in stages.items() if network is not None}
@@ -160,8 +160,7 @@ class Detector:
         `engine` runs its networks; None is the fastest that is installed (`lib.landmarks.engines`).
 
         Raises:
-            FileNotFoundError, ValueError: If the file is missing, damaged, incomplete, or no detector; the text names
-                the file and the cure.
+            FileNotFoundError, ValueError: If the file is missing, damaged, incomplete, or no detector.
         """
         path = Path(path_or_name or "default")
         if not path.suffix and not path.is_file():
@@ -294,11 +293,11 @@ class Detector:
         shows, or which image (m,) for ``"tool"``.  A tool without base or tips and a missing landmark have no window.
         """
         u = np.asarray(u, dtype=np.float64)
-        angle = direction_rad(u)
+        centre, angle = tool_pose(u)
         size = self.window_px if stage in ("tool", "window") else self.closeup_network.config.size_px
         if stage == "tool":
             image = which = np.flatnonzero(np.isfinite(angle))
-            matrices = window_from_image(tool_centre(u[which]), angle[which], size, 1 / self.tool_reduction)
+            matrices = window_from_image(centre[which], angle[which], size, 1 / self.tool_reduction)
         else:
             which = np.argwhere(np.isfinite(u).all(2) & np.isfinite(angle)[:, None])
             image, landmark = which.T
@@ -318,7 +317,8 @@ class Detector:
         """
         windows, matrices, which = self.windows(images, u, stage)
         if not len(which):
-            return Peaks.none(), matrices, np.zeros((0, 2), int)
+            none = Peaks(*(torch.zeros(0, 1, *shape) for shape in ((2,), (), (), (2, 2))))
+            return none, matrices, np.zeros((0, 2), int)
         outputs = self.outputs(windows, stage)
         if stage in CLOSE:
             size, fit = windows.shape[1], self.error_models.get(stage, ErrorModel())
@@ -348,11 +348,7 @@ class Detector:
 
 
 def detect(
-    recording: Recording,
-    detector: Detector | None = None,
-    *,
-    frames: slice | np.ndarray | None = None,
-    track: bool = False,
+    recording: Recording, detector: Detector | None = None, *, frames: slice | np.ndarray | None = None, track: bool = False
 ) -> Correspondences:
     """Run the detector over a recording, one stereo frame at a time (a full-HD pair takes 12 MB).
 

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from lib.landmarks.checkpoints import checksum
-from lib.landmarks.network import OffsetNetwork, StackedHourglass
+from lib.landmarks.network import Network
 
 __all__ = ["ENGINES", "LastOutput", "OpenVinoNetwork", "accelerated", "default_engine", "openvino"]
 
@@ -47,9 +47,7 @@ def default_engine() -> str:
     return "openvino" if importlib.util.find_spec("openvino") else "torch"
 
 
-def accelerated(
-    network: StackedHourglass | OffsetNetwork, engine: str, *, mirror: bool = False
-) -> Callable[[Tensor], list[Tensor]]:
+def accelerated(network: Network, engine: str, *, mirror: bool = False) -> Callable[[Tensor], list[Tensor]]:
     """The network for inference: called with images (n, 3, h, w), its last output is that of `LastOutput`.
 
     Raises:
@@ -72,7 +70,7 @@ class LastOutput(nn.Module):
     left one), and returns the mean of both.  The height must be a multiple of the stride, so that the cells coincide.
     """
 
-    def __init__(self, network: StackedHourglass | OffsetNetwork, *, mirror: bool = False):
+    def __init__(self, network: Network, *, mirror: bool = False):
         super().__init__()
         self.network, self.mirror = network.fused().to(memory_format=torch.contiguous_format), mirror
 
@@ -91,7 +89,7 @@ class OpenVinoNetwork:
     of six windows takes two thirds of the time of six windows alone.
     """
 
-    network: StackedHourglass | OffsetNetwork = field(compare=False)
+    network: Network = field(compare=False)
     mirror: bool = False
     precision: str | None = None
     threads: int = field(default_factory=torch.get_num_threads)

@@ -60,12 +60,6 @@ class Peaks:
     width: Tensor
     covariance: Tensor
 
-    @classmethod
-    def none(cls) -> Peaks:
-        """No peaks, (0, 1)."""
-        empty = torch.zeros((0, 1))
-        return cls(torch.zeros((0, 1, 2)), empty, empty, torch.zeros((0, 1, 2, 2)))
-
     def double(self) -> Peaks:
         """The same in float64."""
         return Peaks(self.u.double(), self.value.double(), self.width.double(), self.covariance.double())

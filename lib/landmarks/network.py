@@ -22,8 +22,7 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 from lib.correspondences import LANDMARKS
 
 __all__ = [
-    "ABLATION", "HourglassConfig", "OffsetConfig", "OffsetNetwork", "StackedHourglass", "as_tensor",
-    "as_uint8", "network_of",
+    "HourglassConfig", "Network", "OffsetConfig", "OffsetNetwork", "StackedHourglass", "as_tensor", "as_uint8", "network_of",
 ]  # fmt: skip
 
 STEM_STRIDE = 4
@@ -34,16 +33,13 @@ class HourglassConfig:
     """Configuration of a `StackedHourglass`.
 
     Attributes:
-        features:
-            Channels of the hourglass, an even number.  The paper does not state it; notebook 02 derives that it is below 256.
-        stacks:
-            Hourglasses in a row, each supervised.
-        depth:
-            Halvings inside an hourglass; 4 makes inputs a multiple of 4 * 2**4 = 64.
-        decoder, skips, residual:
-            The parts that the ablation adds one by one.  Without a decoder the heatmaps have stride 4 * 2**depth.
+        features: Channels of the hourglass, an even number.  The paper does not state it; notebook 02 finds it below 256.
+        stacks: Hourglasses in a row, each supervised.
+        depth: Halvings inside an hourglass; 4 makes inputs a multiple of 4 * 2**4 = 64.
+        decoder, skips, residual: The parts that the ablation adds one by one.  Without a decoder the heatmaps have stride
+            4 * 2**depth.
 
-        >>> HourglassConfig().stride, HourglassConfig(**ABLATION["encoder"]).stride
+        >>> HourglassConfig().stride, HourglassConfig(stacks=1, decoder=False, skips=False).stride
         (4, 64)
     """
 
@@ -75,23 +71,17 @@ class HourglassConfig:
         return STEM_STRIDE * 2**self.depth
 
 
-#: The five columns of the paper's ablation table, in its order.
-ABLATION: dict[str, dict[str, int | bool]] = {
-    "encoder": {"stacks": 1, "decoder": False, "skips": False, "residual": False},
-    "+ decoder": {"stacks": 1, "decoder": True, "skips": False, "residual": False},
-    "+ skips": {"stacks": 1, "decoder": True, "skips": True, "residual": False},
-    "+ stack": {"stacks": 2, "decoder": True, "skips": True, "residual": False},
-    "+ residual": {"stacks": 2, "decoder": True, "skips": True, "residual": True},
-}
-
-
 def _conv(inputs: int, outputs: int, kernel: int, *, stride: int = 1, relu: bool = True) -> nn.Sequential:
     convolution = nn.Conv2d(inputs, outputs, kernel, stride, padding=kernel // 2, bias=False)
     layers = [convolution, nn.BatchNorm2d(outputs)]
     return nn.Sequential(*layers, nn.ReLU(inplace=True)) if relu else nn.Sequential(*layers)
 
 
-class _Network(nn.Module):
+class Network(nn.Module):
+    """What the networks share: a configuration, and a form for inference."""
+
+    config: HourglassConfig | OffsetConfig
+
     def fused(self) -> Self:
         """A copy for inference: batch normalisation folded into the convolutions, channels last (same outputs)."""
         network = copy.deepcopy(self).eval()
@@ -106,21 +96,32 @@ class _Network(nn.Module):
 
 
 class _Block(nn.Module):
-    """A box of the paper's figure: a bottleneck residual module (He et al. 2016), or a plain 3 x 3 convolution."""
+    """A body and what skips it, if anything does."""
 
-    def __init__(self, inputs: int, outputs: int, residual: bool):
+    def __init__(self, body: nn.Module, skip: nn.Module | None = None):
         super().__init__()
-        if residual:
-            middle = max(outputs // 2, 1)
-            self.body = nn.Sequential(
-                _conv(inputs, middle, 1), _conv(middle, middle, 3), _conv(middle, outputs, 1, relu=False)
-            )
-            self.skip = nn.Identity() if inputs == outputs else _conv(inputs, outputs, 1, relu=False)
-        else:
-            self.body, self.skip = _conv(inputs, outputs, 3), None
+        self.body, self.skip = body, skip
 
     def forward(self, x: Tensor) -> Tensor:
         return self.body(x) if self.skip is None else F.relu(self.body(x) + self.skip(x))
+
+
+def _box(inputs: int, outputs: int, residual: bool) -> _Block:
+    """A box of the paper's figure: a bottleneck residual module (He et al. 2016), or a plain 3 x 3 convolution."""
+    if not residual:
+        return _Block(_conv(inputs, outputs, 3))
+    middle = max(outputs // 2, 1)
+    body = nn.Sequential(_conv(inputs, middle, 1), _conv(middle, middle, 3), _conv(middle, outputs, 1, relu=False))
+    return _Block(body, nn.Identity() if inputs == outputs else _conv(inputs, outputs, 1, relu=False))
+
+
+def _residual(inputs: int, outputs: int, halve: bool = False) -> _Block:
+    """Two 3 x 3 convolutions and their skip connection (He et al. 2016); `halve` halves the resolution."""
+    body = nn.Sequential(_conv(inputs, outputs, 3, stride=2 if halve else 1), _conv(outputs, outputs, 3, relu=False))
+    if inputs == outputs and not halve:
+        return _Block(body, nn.Identity())
+    pool = nn.AvgPool2d(2) if halve else nn.Identity()
+    return _Block(body, nn.Sequential(pool, _conv(inputs, outputs, 1, relu=False)))
 
 
 class _Hourglass(nn.Module):
@@ -129,10 +130,10 @@ class _Hourglass(nn.Module):
     def __init__(self, config: HourglassConfig, depth: int):
         super().__init__()
         f, residual = config.features, config.residual
-        self.skip = _Block(f, f, residual) if config.skips else None
-        self.down = _Block(f, f, residual)
-        self.inner = _Hourglass(config, depth - 1) if depth > 1 else _Block(f, f, residual)
-        self.up = _Block(f, f, residual) if config.decoder else None
+        self.skip = _box(f, f, residual) if config.skips else None
+        self.down = _box(f, f, residual)
+        self.inner = _Hourglass(config, depth - 1) if depth > 1 else _box(f, f, residual)
+        self.up = _box(f, f, residual) if config.decoder else None
 
     def forward(self, x: Tensor) -> Tensor:
         y = self.inner(self.down(F.max_pool2d(x, 2)))
@@ -142,7 +143,7 @@ class _Hourglass(nn.Module):
         return y if self.skip is None else y + self.skip(x)
 
 
-class StackedHourglass(_Network):
+class StackedHourglass(Network):
     """Images to landmark heatmaps.
 
     ``forward(images)`` takes float images (n, 3, h, w) in [0, 1], RGB, of any size, pads them with zeros at the right
@@ -157,19 +158,20 @@ class StackedHourglass(_Network):
     def __init__(self, config: HourglassConfig | None = None):
         super().__init__()
         self.config = config = config or HourglassConfig()
+        self.stride = config.stride
         f, half, residual = config.features, config.features // 2, config.residual
         self.stem = nn.Sequential(
             nn.Conv2d(3, half, 6, stride=2, padding=2, bias=False),  # even kernel: centred between pixels 2i and 2i + 1
             nn.BatchNorm2d(half),
             nn.ReLU(inplace=True),
-            _Block(half, half, residual),
+            _box(half, half, residual),
             nn.MaxPool2d(2),
-            _Block(half, f, residual),
-            _Block(f, f, residual),
+            _box(half, f, residual),
+            _box(f, f, residual),
         )
         stacks = range(config.stacks)
         self.hourglasses = nn.ModuleList([_Hourglass(config, config.depth) for _ in stacks])
-        self.features = nn.ModuleList([nn.Sequential(_Block(f, f, residual), _conv(f, f, 1)) for _ in stacks])
+        self.features = nn.ModuleList([nn.Sequential(_box(f, f, residual), _conv(f, f, 1)) for _ in stacks])
         self.heads = nn.ModuleList([nn.Conv2d(f, len(LANDMARKS), 1) for _ in stacks])
         between = stacks[:-1]
         self.merge_features = nn.ModuleList([nn.Conv2d(f, f, 1) for _ in between])
@@ -177,11 +179,6 @@ class StackedHourglass(_Network):
         for head in self.heads:  # targets are almost everywhere 0: start there
             nn.init.normal_(head.weight, std=1e-3)
             nn.init.zeros_(head.bias)
-
-    @property
-    def stride(self) -> int:
-        """Input pixels per heatmap cell."""
-        return self.config.stride
 
     def forward(self, images: Tensor) -> list[Tensor]:
         if images.ndim != 4 or images.shape[1] != 3:
@@ -222,22 +219,7 @@ class OffsetConfig:
             raise ValueError(f"size_px: must be a multiple of 16, got {self.size_px}.")
 
 
-class _Residual(nn.Module):
-    """Two 3 x 3 convolutions and their skip connection (He et al. 2016); `halve` halves the resolution."""
-
-    def __init__(self, inputs: int, outputs: int, halve: bool = False):
-        super().__init__()
-        first = _conv(inputs, outputs, 3, stride=2 if halve else 1)
-        self.body = nn.Sequential(first, _conv(outputs, outputs, 3, relu=False))
-        pool = nn.AvgPool2d(2) if halve else nn.Identity()
-        same = inputs == outputs and not halve
-        self.skip = nn.Identity() if same else nn.Sequential(pool, _conv(inputs, outputs, 1, relu=False))
-
-    def forward(self, x: Tensor) -> Tensor:
-        return F.relu(self.body(x) + self.skip(x))
-
-
-class OffsetNetwork(_Network):
+class OffsetNetwork(Network):
     """Closeups to the offset of their landmark from the centre, and the scale of its error.
 
     ``forward(images)`` takes float images (n, 3, s, s) in [0, 1], RGB, and returns, as the hourglass does, a list, of one
@@ -254,12 +236,12 @@ class OffsetNetwork(_Network):
         f = config.features
         self.body = nn.Sequential(
             _conv(3, f, 5, stride=2),
-            _Residual(f, f),
-            _Residual(f, 2 * f, halve=True),
-            _Residual(2 * f, 2 * f),
-            _Residual(2 * f, 3 * f, halve=True),
-            _Residual(3 * f, 3 * f),
-            _Residual(3 * f, 4 * f, halve=True),
+            _residual(f, f),
+            _residual(f, 2 * f, halve=True),
+            _residual(2 * f, 2 * f),
+            _residual(2 * f, 3 * f, halve=True),
+            _residual(3 * f, 3 * f),
+            _residual(3 * f, 4 * f, halve=True),
         )
         # Fully connected, because a mean over the closeup would lose where something is seen.
         self.head = nn.Sequential(
@@ -276,7 +258,7 @@ class OffsetNetwork(_Network):
         return [torch.cat([y[:, :2] * (size / 8), y[:, 2:].clamp(-6, 5)], dim=1)]
 
 
-def network_of(config: HourglassConfig | OffsetConfig) -> StackedHourglass | OffsetNetwork:
+def network_of(config: HourglassConfig | OffsetConfig) -> Network:
     """A new network of a configuration."""
     return OffsetNetwork(config) if isinstance(config, OffsetConfig) else StackedHourglass(config)
 

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 __all__ = [
-    "CLOSEUP_BEHIND_PX", "CLOSEUP_REACH_PX", "CLOSEUP_ZOOM", "closeup_from_image", "cut", "direction_rad",
-    "expected_in_closeup", "map_points", "tool_centre", "window_from_image",
+    "CLOSEUP_BEHIND_PX", "CLOSEUP_REACH_PX", "CLOSEUP_ZOOM", "closeup_from_image", "cut", "expected_in_closeup",
+    "map_points", "tool_pose", "window_from_image",
 ]  # fmt: skip
 
 #: Closeup pixels per image pixel, of base, tip_1 and tip_2: the base shows between the edges of the shaft.
@@ -24,29 +24,19 @@ CLOSEUP_BEHIND_PX = (0.0, 18.0, 18.0)
 CLOSEUP_REACH_PX = 20.0
 
 
-def _base_and_tip(u: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-    """Base and mean of the known tips, (n, 2) each; NaN where unknown."""
+def tool_pose(u: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    """Middle (n, 2) between the base and the mean of the known tips, and the direction (n,) from base to tips in rad.
+
+    The angle runs from x towards y.  Both are NaN without a base or without a tip.
+
+    >>> tool_pose([[[0, 0], [10, 0], [0, 10]]])[1].round(3)
+    array([0.785])
+    """
     u = np.asarray(u, dtype=np.float64)
     known = np.isfinite(u[:, 1:]).all(axis=2)
     tip = np.where(known[..., None], u[:, 1:], 0).sum(1) / np.maximum(known.sum(1), 1)[:, None]
-    return u[:, 0], np.where(known.any(1)[:, None], tip, np.nan)
-
-
-def direction_rad(u: ArrayLike) -> np.ndarray:
-    """Angle (n,) from the base to the mean of the known tips, from x towards y; NaN without a base or without a tip.
-
-    >>> direction_rad([[[0, 0], [10, 0], [0, 10]]]).round(3)
-    array([0.785])
-    """
-    base, tip = _base_and_tip(u)
-    d = tip - base
-    return np.arctan2(d[:, 1], d[:, 0])
-
-
-def tool_centre(u: ArrayLike) -> np.ndarray:
-    """Halfway (n, 2) between the base and the mean of the known tips; NaN without a base or without a tip."""
-    base, tip = _base_and_tip(u)
-    return (base + tip) / 2
+    base, tip = u[:, 0], np.where(known.any(1)[:, None], tip, np.nan)
+    return (base + tip) / 2, np.arctan2(*(tip - base).T[::-1])
 
 
 def window_from_image(centre: ArrayLike, angle_rad: ArrayLike, size: int, zoom: ArrayLike = 1.0) -> np.ndarray:

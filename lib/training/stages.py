@@ -12,7 +12,7 @@ import numpy as np
 from lib.files import write_text
 from lib.landmarks import Detector
 from lib.landmarks.network import HourglassConfig, OffsetConfig
-from lib.landmarks.windows import direction_rad
+from lib.landmarks.windows import tool_pose
 from lib.provenance import commit_id, machine
 from lib.recordings import Recording
 from lib.training.augmentation import AUGMENTATIONS
@@ -76,7 +76,7 @@ def finetune(
     data = Path(folder) / "data"
     data.mkdir(parents=True, exist_ok=True)
     for kind, part in (("training", images), ("validation", held_out)):
-        usable = [labelled for labelled in part if np.isfinite(direction_rad(labelled.u[None])).all()]
+        usable = [labelled for labelled in part if np.isfinite(tool_pose(labelled.u[None])[1]).all()]
         if not usable:
             raise ValueError(f"{kind} images: none has a labelled base and tip; label some.")
         for i in range(0, len(usable), 64):

@@ -62,9 +62,10 @@ class WindowSource(_Cut):
         u = self.u[index]
         worse = 3.0 if rng.random() < 0.1 else 1.0
         limit = 0.3 * self.size
-        at = windows.tool_centre(u[None])[0] if self.landmark[index] == TOOL else u[self.landmark[index]]
+        (middle,), (direction,) = windows.tool_pose(u[None])
+        at = middle if self.landmark[index] == TOOL else u[self.landmark[index]]
         centre = at + np.clip(rng.normal(0, worse * self.shift_px, 2), -limit, limit)
-        angle = windows.direction_rad(u[None])[0] + np.clip(rng.normal(0, worse * self.turn_rad), -0.6, 0.6)
+        angle = direction + np.clip(rng.normal(0, worse * self.turn_rad), -0.6, 0.6)
         matrix = windows.window_from_image(centre, angle, self.size, rng.uniform(*self.zoom))
         return windows.cut(self.crops[index], matrix, self.size), windows.map_points(matrix, u), self.visibility[index]
 
@@ -113,7 +114,7 @@ class CloseupSource(_Cut):
         known = u.copy()
         if rng.random() < self.alone:
             known[rng.choice([j for j in (1, 2) if j != k])] = np.nan
-        angle = windows.direction_rad(known[None])[0] + rng.normal(0, self.turn_rad)
+        angle = windows.tool_pose(known[None])[1][0] + rng.normal(0, self.turn_rad)
         matrix = windows.closeup_from_image(centre, angle, self.size, k)
         along, across = np.exp(rng.normal(0, self.stretch, 2))
         deform = np.array([[along, 0.0], [rng.normal(0, self.shear), across]])

@@ -20,8 +20,16 @@ from lib.training.shards import make_shard
 from lib.training.windows import TOOL, TOOL_REDUCTION, WindowSource
 from lib.workbench import report
 
-__all__ = ["CURVE", "record_scores", "simulated", "small_config", "tool_windows"]
+__all__ = ["ABLATION", "CURVE", "record_scores", "simulated", "small_config", "tool_windows"]
 
+#: The five columns of the paper's ablation table, in its order.
+ABLATION: dict[str, dict[str, int | bool]] = {
+    "encoder": {"stacks": 1, "decoder": False, "skips": False, "residual": False},
+    "+ decoder": {"stacks": 1, "decoder": True, "skips": False, "residual": False},
+    "+ skips": {"stacks": 1, "decoder": True, "skips": True, "residual": False},
+    "+ stack": {"stacks": 2, "decoder": True, "skips": True, "residual": False},
+    "+ residual": {"stacks": 2, "decoder": True, "skips": True, "residual": True},
+}
 #: Thresholds of recorded PCK curves, fractions of the tool's length.
 CURVE = (0.001, 0.002, 0.005, 0.01, 0.015, 0.02, 0.03, 0.04, 0.05, 0.06, 0.08, 0.1, 0.12, 0.15, 0.2)
 

@@ -13,8 +13,8 @@ from lib.landmarks.windows import (
     CLOSEUP_ZOOM,
     closeup_from_image,
     cut,
-    direction_rad,
     map_points,
+    tool_pose,
     window_from_image,
 )
 
@@ -85,7 +85,7 @@ def test_windows_point_right_and_are_measured_exactly():
     image = np.zeros((h, w, 3), np.uint8)
     for p in u[0]:
         image = np.maximum(image, (255 * np.exp(-((x - p[0]) ** 2 + (y - p[1]) ** 2) / 32))[..., None].astype(np.uint8))
-    angle = direction_rad(u)
+    angle = tool_pose(u)[1]
     tips = u[0, 1:].mean(0) - u[0, 0]
     assert angle[0] == pytest.approx(np.arctan2(tips[1], tips[0]))
     for k in range(3):
@@ -103,7 +103,7 @@ def test_windows_point_right_and_are_measured_exactly():
 
 def test_direction_needs_a_base_and_a_tip():
     u = np.array([[[0, 0], [5, 5], [np.nan] * 2], [[np.nan] * 2, [1, 1], [2, 2]], [[0, 0], [np.nan] * 2, [np.nan] * 2]])
-    angle = direction_rad(u)
+    angle = tool_pose(u)[1]
     assert angle[0] == pytest.approx(np.pi / 4)
     assert np.isnan(angle[1:]).all()
 
@@ -149,7 +149,7 @@ def test_a_closeup_moves_what_the_windows_found_and_keeps_its_confidence(images)
     seen = np.isfinite(before.u).all(axis=2)
     assert seen.all()
     np.testing.assert_array_equal(after.confidence, before.confidence)
-    angle = direction_rad(before.u)
+    angle = tool_pose(before.u)[1]
     for i, k in np.argwhere(seen):
         zoom, side = CLOSEUP_ZOOM[k], -1 if k == 2 else 1
         c, s = np.cos(angle[i]), np.sin(angle[i])

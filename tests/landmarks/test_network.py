@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 import torch
 
-from lib.landmarks.network import ABLATION, HourglassConfig, OffsetConfig, OffsetNetwork, StackedHourglass
+from lib.landmarks.network import HourglassConfig, OffsetConfig, OffsetNetwork, StackedHourglass
+from notebooks.studies.training import ABLATION
 
 
 @pytest.mark.parametrize("name", ABLATION)
