@@ -88,8 +88,7 @@ class Augmentation:
             u[flip, :, 1] = images.shape[-2] - 1 - u[flip, :, 1]
             u[flip], visibility[flip] = u[flip][:, [0, 2, 1]], visibility[flip][:, [0, 2, 1]]
         if changed:
-            covered, visibility[:changed] = self._occluders(images[:changed], u[:changed], visibility[:changed], rng)
-            images = torch.cat([covered, images[changed:]])
+            self._occlude(images[:changed], u[:changed], visibility[:changed], rng)
         u = u.to(batch.u.dtype)
         return Batch(images, u, leave_frame(u, visibility, images.shape[-2:]))
 
@@ -105,30 +104,23 @@ class Augmentation:
             K.RandomGaussianNoise(0.0, 0.03 * s, p=0.5),
         )
 
-    def _occluders(self, images: Tensor, u: Tensor, visibility: Tensor, rng: np.random.Generator):
-        """Glints (bright discs) and things in front (smooth dark or coloured ellipses); what they cover is occluded."""
-        images, visibility = images.clone(), visibility.clone()
-        n, _, h, w = images.shape
-        y, x = torch.meshgrid(torch.arange(h), torch.arange(w), indexing="ij")
-        for i in range(n):
+    def _occlude(self, images: Tensor, u: Tensor, visibility: Tensor, rng: np.random.Generator) -> None:
+        """Add glints (bright discs) and things in front (smooth ellipses), in place; what the latter cover is occluded."""
+        h, w = images.shape[-2:]
+        pixels = torch.stack(torch.meshgrid(torch.arange(w), torch.arange(h), indexing="xy"), -1).double()
+        for i in range(len(images)):
             if rng.random() < 0.3 * self.photometric:
                 centre, radius = rng.uniform((0, 0), (w, h)), rng.uniform(1.0, 0.03 * h + 2)
-                glow = torch.exp(-0.5 * ((x - centre[0]) ** 2 + (y - centre[1]) ** 2) / radius**2)
+                glow = torch.exp(-0.5 * (pixels - torch.from_numpy(centre)).square().sum(-1) / radius**2)
                 images[i] = (images[i] + rng.uniform(0.4, 1.0) * glow).clamp(0, 1)
             if rng.random() < 0.15 * self.photometric:
-                centre, axes = rng.uniform((0, 0), (w, h)), rng.uniform(0.03, 0.12, 2) * h
-                angle = rng.uniform(0, np.pi)
-                c, s = np.cos(angle), np.sin(angle)
-                d = ((c * (x - centre[0]) + s * (y - centre[1])) / axes[0]) ** 2
-                d = d + ((c * (y - centre[1]) - s * (x - centre[0])) / axes[1]) ** 2
-                cover = torch.sigmoid((1 - d) * 6)
-                colour = torch.tensor(rng.uniform(0.02, 0.8) * rng.uniform(0.5, 1.0, 3), dtype=images.dtype)
+                centre, axes, angle = rng.uniform((0, 0), (w, h)), rng.uniform(0.03, 0.12, 2) * h, rng.uniform(0, np.pi)
+                turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]) / axes
+                from_centre = ((at - torch.from_numpy(centre)) @ torch.from_numpy(turn) for at in (pixels, u[i].double()))
+                cover, covered = (torch.sigmoid(6 * (1 - part.square().sum(-1))) for part in from_centre)
+                colour = torch.from_numpy(rng.uniform(0.02, 0.8) * rng.uniform(0.5, 1.0, 3))
                 images[i] = images[i] * (1 - cover) + colour[:, None, None] * cover
-                at = torch.nan_to_num(u[i], nan=-1.0).round().long()
-                inside = (at >= 0).all(-1) & (at[:, 0] < w) & (at[:, 1] < h)
-                covered = cover[at[:, 1].clamp(0, h - 1), at[:, 0].clamp(0, w - 1)] > 0.3
-                visibility[i] = torch.where(inside & covered & (visibility[i] == VISIBLE), OCCLUDED, visibility[i])
-        return images, visibility
+                visibility[i] = torch.where((covered > 0.3) & (visibility[i] == VISIBLE), OCCLUDED, visibility[i])
 
 
 def leave_frame(u: Tensor, visibility: Tensor, image_size: tuple[int, int]) -> Tensor:

@@ -24,16 +24,11 @@ __all__ = ["main", "main_evaluate"]
 def main(argv: list[str] | None = None) -> int:
     """`python3 -m lib train`: simulate training data, train or fine-tune the detector's stages (resuming), assemble them."""
     parser = argparse.ArgumentParser(prog="python3 -m lib train", description=main.__doc__.split(": ", 1)[1])
-    actions = {
-        "generate": "simulate the training data",
-        **{stage: f"train the {stage} stage" for stage in STAGES},
-        "finetune": "train all stages further on labelled recordings",
-        "assemble": "join the trained stages into a detector with its model card",
-        "export": "write its stages as ONNX",
-    }
-    parser.add_argument("what", choices=actions, help="; ".join(f"{name}: {text}" for name, text in actions.items()))
-    parser.add_argument("recordings", nargs="*", type=Path, help="labelled recordings; finetune holds out the end of each")
     add = parser.add_argument
+    add("what", choices=["generate", *STAGES, "finetune", "assemble", "export"],
+        help="generate: simulate the training data; frame, tool, window, closeup: train this stage; finetune: train all "
+        "further on labelled recordings; assemble: join them into a detector with its card; export: write ONNX")  # fmt: skip
+    add("recordings", nargs="*", type=Path, help="labelled recordings; finetune holds out the end of each")
     add("--data", type=Path, default=paths.CACHE / "landmarks", help="folder of the simulated shards")
     add("--folder", type=Path, default=paths.CACHE / "training", help="checkpoints, one folder a stage")
     add("--out", type=Path, help="finetune, assemble: weights file to write; export: the one to read (default: shipped)")

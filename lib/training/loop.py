@@ -50,8 +50,8 @@ def draw_batch(source: Source, config: TrainingConfig, step: int, rank: int = 0)
     """The augmented batch of a step; `rank` is the number of the process among those that train together."""
     rng = np.random.default_rng([config.seed, step, *([rank] if rank else [])])
     indices = rng.choice(len(source), config.batch_size, replace=len(source) < config.batch_size)
-    images, u, visibility = map(np.stack, zip(*(source.draw(int(i), rng) for i in indices), strict=True))
-    return config.augmentation(_batch(images, u, visibility), rng)
+    drawn = map(np.stack, zip(*(source.draw(int(i), rng) for i in indices), strict=True))
+    return config.augmentation(_batch(*drawn), rng)
 
 
 def _batch(images: np.ndarray, u: np.ndarray, visibility: np.ndarray) -> Batch:
@@ -153,14 +153,6 @@ class Run:
         self.step += 1
         self.loss_sum, self.since = self.loss_sum + loss.item(), self.since + 1
 
-    def agreed(self, stop: bool) -> bool:
-        """What the first process decides: clocks differ, and all must stop together."""
-        if self.world == 1:
-            return stop
-        flag = torch.tensor(float(stop), device=self.device)
-        dist.broadcast(flag, 0)
-        return bool(flag)
-
     def save(self, path: Path, provenance: dict[str, object]) -> None:
         tensors = {f"network.{k}": v for k, v in self.network.state_dict().items()}
         if self.average is not None:
@@ -225,13 +217,16 @@ def train(
             run.restore(last, provenance)
     keeps = last is not None and run.rank == 0
     began, before, stop = time.perf_counter(), run.seconds, False
-    quiet = not progress or run.rank > 0
-    with tqdm(total=config.steps, initial=run.step, disable=quiet, unit="step", mininterval=1.0) as bar:
+    with tqdm(total=config.steps, initial=run.step, disable=not progress or run.rank > 0, unit="step") as bar:
         while run.step < config.steps and not stop:
             run.advance(draw_batch(source, config, run.step, run.rank))
             bar.update()
             run.seconds = before + time.perf_counter() - began
-            stop = run.agreed(max_seconds is not None and time.perf_counter() - began > max_seconds)
+            stop = max_seconds is not None and time.perf_counter() - began > max_seconds
+            if run.world > 1:  # clocks differ, and all must stop together
+                flag = torch.tensor(float(stop), device=run.device)
+                dist.broadcast(flag, 0)
+                stop = bool(flag)
             due = run.step % config.validate_every == 0 or run.step == config.steps
             if stop and keeps and not due:  # without the validation below, which an uninterrupted run does not have
                 run.save(last, provenance)

@@ -99,8 +99,7 @@ class Samples(Source):
     def drawn(cls, source: Source, seed: int = 0) -> Samples:
         """One image drawn for each entry of `source`: validation samples."""
         rng = np.random.default_rng(seed)
-        images, u, visibility = zip(*(source.draw(i, rng) for i in range(len(source))), strict=True)
-        return cls(np.stack(images), np.stack(u), np.stack(visibility))
+        return cls(*map(np.stack, zip(*(source.draw(i, rng) for i in range(len(source))), strict=True)))
 
     def draw(self, index: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         return self.images[index], self.u[index], self.visibility[index]

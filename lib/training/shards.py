@@ -50,8 +50,7 @@ def generate(folder: str | Path, kind: str, shards: int, *, workers: int | None 
     """
     Path(folder).mkdir(parents=True, exist_ok=True)
     jobs = {Path(folder) / f"{kind}_{i:04d}.npz": (kind, i) for i in range(shards)}
-    settings = {"title": f"Simulating {kind}", "unit": "shard", "progress": progress}
-    for done in run_jobs(make_shard, jobs, workers=workers, **settings):
+    for done in run_jobs(make_shard, jobs, workers=workers, title=f"Simulating {kind}", unit="shard", progress=progress):
         if done.error:
             raise done.error
 
@@ -74,7 +73,8 @@ def _write_crops(path: Path, rng: np.random.Generator, side_px: int, n: int) -> 
         while not seen[i, k]:
             image, at, seen[i] = sample(rng, crop_px=rendered_px, around=k, jitter=BLOCK_PX / 2 / rendered_px)
         crops[i], u[i] = _crop(image, at, k, side_px)  # the landmark is not in the middle where the field ends
-    _write(path, crops=crops, crop_u=u, crop_visibility=seen, crop_landmark=landmark)
+    with whole(path) as partial:
+        np.savez(partial, crops=crops, crop_u=u, crop_visibility=seen, crop_landmark=landmark)
 
 
 def _crop(image: np.ndarray, u: np.ndarray, k: int, side_px: int) -> tuple[np.ndarray, np.ndarray]:
@@ -93,17 +93,13 @@ def write_frames(path: Path, images: Iterable[LabelledImage], *, keep_frames: bo
     crops = [_crop(images[i].image, u[i], k, CROP_PX) for i, k in zip(frame, landmark, strict=True)]
     kept = [cv2.cvtColor(part.image, cv2.COLOR_RGB2BGR) for part in images if keep_frames]
     jpegs = [cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].ravel() for image in kept]
-    _write(
-        path, frames=np.stack(frames), u=u, visibility=seen,
-        crops=np.array([crop for crop, _ in crops], np.uint8).reshape(-1, CROP_PX, CROP_PX, 3),
-        crop_u=np.array([at for _, at in crops]).reshape(-1, 3, 2), crop_visibility=seen[frame], crop_landmark=landmark,
-        jpegs=np.concatenate([np.zeros(0, np.uint8), *jpegs]), jpeg_ends=np.cumsum([j.size for j in jpegs]),
-    )  # fmt: skip
-
-
-def _write(path: Path, **arrays: np.ndarray) -> None:
-    with whole(path) as partial, partial.open("wb") as file:
-        np.savez(file, **arrays)
+    with whole(path) as partial:
+        np.savez(
+            partial, frames=np.stack(frames), u=u, visibility=seen,
+            crops=np.array([crop for crop, _ in crops], np.uint8).reshape(-1, CROP_PX, CROP_PX, 3),
+            crop_u=np.array([at for _, at in crops]).reshape(-1, 3, 2), crop_visibility=seen[frame], crop_landmark=landmark,
+            jpegs=np.concatenate([np.zeros(0, np.uint8), *jpegs]), jpeg_ends=np.cumsum([j.size for j in jpegs]),
+        )  # fmt: skip
 
 
 def _read(path: Path, names: Sequence[str]) -> list[np.ndarray]:

@@ -38,8 +38,8 @@ def stage_config(stage: str, *, preset: str = "best", features: int | None = Non
     """
     config, features = PRESETS[preset], features or STAGES[stage]
     if stage == "closeup":
-        augmentation = AUGMENTATIONS["closeups"]
-        return replace(config, network=OffsetConfig(features), augmentation=augmentation, batch_size=64, clip=2.0)
+        config = replace(config, augmentation=AUGMENTATIONS["closeups"])
+        return replace(config, network=OffsetConfig(features), batch_size=64, clip=2.0)
     if stage == "frame":
         return replace(config, network=HourglassConfig(features, depth=3), batch_size=8, ema=0.995)
     config = replace(config, network=HourglassConfig(features), augmentation=AUGMENTATIONS["windows"])

@@ -1,9 +1,10 @@
 from dataclasses import replace
 
 import pytest
-import torch
+from threadpoolctl import threadpool_limits
 
 from lib.landmarks.network import HourglassConfig
+from lib.parallel import single_threaded_torch
 from lib.training.augmentation import Augmentation
 from lib.training.config import PRESETS
 from lib.training.loop import train
@@ -13,11 +14,9 @@ from tests.toys import toy_images, toy_samples
 
 @pytest.fixture(scope="session", autouse=True)
 def one_thread():
-    """Networks as small as these gain nothing from a second thread, and wait for it on a busy machine."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
+    """Networks and fits as small as these gain nothing from a second thread, and wait for it on a busy machine."""
+    with single_threaded_torch(), threadpool_limits(1):
+        yield
 
 
 @pytest.fixture(scope="session")
