@@ -104,10 +104,8 @@ class State:
     @classmethod
     def start(cls, model: Model, matrix: np.ndarray, reference: np.ndarray, centre: np.ndarray) -> State:
         """From affine cameras, `matrix` (2 cameras, 4), brought to the model's base."""
-        c = model.cameras
-        A = matrix[:, :3].reshape(c, 2, 3)
-        offset = (matrix[:, :3] @ reference + matrix[:, 3]).reshape(c, 2)
-        zeros = np.zeros(c)
+        c, zeros = model.cameras, np.zeros(model.cameras)
+        A, offset = matrix[:, :3].reshape(c, 2, 3), (matrix[:, :3] @ reference + matrix[:, 3]).reshape(c, 2)
         if model.base == "affine":
             return cls(A, offset, zeros, zeros, None, None, reference, centre)
         rotation, zoom = np.empty((c, 3, 3)), np.empty((c, 2))

@@ -49,10 +49,8 @@ class _Path:
 
     def covers(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
         """(n,) bool: one piece holds the whole interval."""
-        inside = np.zeros(len(low), dtype=bool)
-        for piece in self.pieces:
-            inside |= (low >= piece.t[0]) & (high <= piece.t[-1])
-        return inside
+        inside = [(low >= piece.t[0]) & (high <= piece.t[-1]) for piece in self.pieces]
+        return np.any([np.zeros(len(low), dtype=bool), *inside], axis=0)
 
     def at(self, time: np.ndarray, derivative: int = 0) -> np.ndarray:
         """(n, 3) mm, or mm/s, at times that the pieces cover."""
@@ -148,8 +146,7 @@ def _rows(data: Correspondences | tuple) -> tuple[np.ndarray, np.ndarray, np.nda
 def _paths(kinematics: Kinematics | tuple, smooth_s: float) -> list[_Path]:
     given = kinematics if isinstance(kinematics, tuple) else (kinematics.time_s, kinematics.x_mm)
     time, x = (np.asarray(values, dtype=np.float64) for values in given)
-    if x.ndim == 2:
-        x = x[:, None]
+    x = x[:, None] if x.ndim == 2 else x
     if time.ndim != 1 or x.ndim != 3 or x.shape[2] != 3 or len(x) != len(time):
         raise ValueError(f"kinematics: expected times (m,) and positions (m, k, 3) or (m, 3), got {time.shape}, {x.shape}.")
     if len(time) < 4 or not np.isfinite(time).all() or (np.diff(time) <= 0).any():

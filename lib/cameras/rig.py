@@ -70,11 +70,8 @@ class StereoRig:
         """
         if not self.is_affine:
             P, Q = self.left.projection_matrix, self.right.projection_matrix
-            F = np.empty((3, 3))
-            for i in range(3):
-                for j in range(3):
-                    rows = np.vstack([np.delete(P, j, axis=0), np.delete(Q, i, axis=0)])
-                    F[i, j] = (-1) ** (i + j) * np.linalg.det(rows)
+            pairs = [[np.vstack([np.delete(P, j, axis=0), np.delete(Q, i, axis=0)]) for j in range(3)] for i in range(3)]
+            F = np.linalg.det(pairs) * [[1, -1, 1], [-1, 1, -1], [1, -1, 1]]
             return F / np.linalg.norm(F)
         n, e = self.epipolar_normal, -self.epipolar_normal @ self.offset_px
         return np.array([[0.0, 0.0, n[2]], [0.0, 0.0, n[3]], [n[0], n[1], e]])

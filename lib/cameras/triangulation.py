@@ -67,9 +67,7 @@ def _linear(cameras: _Pair, y: np.ndarray) -> np.ndarray:
     """x (n, 3) from P_i [x; 1] - u_i P_3 [x; 1] = 0 for undistorted pixels."""
     rows, right_hand = [], []
     for camera, u in zip(cameras, (y[:, :2], y[:, 2:]), strict=True):
-        P = camera.projection_matrix
-        if isinstance(camera, NearAffineCamera):
-            u = camera.undistort(u)
+        P, u = camera.projection_matrix, camera.undistort(u) if isinstance(camera, NearAffineCamera) else u
         rows.append(P[:2, :3] - u[:, :, None] * P[2, :3])
         right_hand.append(u * P[2, 3] - P[:2, 3])
     return _step(np.concatenate(rows, axis=1), np.concatenate(right_hand, axis=1), np.eye(4))[0]
@@ -77,10 +75,7 @@ def _linear(cameras: _Pair, y: np.ndarray) -> np.ndarray:
 
 def _linearised(cameras: _Pair, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Jacobian (n, 4, 3), residuals (n, 4), and which points lie before both cameras; the others stand at the centre."""
-    in_front = np.ones(len(x), dtype=bool)
-    for camera in cameras:
-        if isinstance(camera, NearAffineCamera):
-            in_front &= camera.depth_ratio(x) > 0
+    in_front = np.all([camera.depth_ratio(x) > 0 for camera in cameras if isinstance(camera, NearAffineCamera)], axis=0)
     safe = np.where(in_front[:, None], x, getattr(cameras[0], "reference_mm", np.zeros(3)))
     J = np.concatenate([camera.jacobian(safe) for camera in cameras], axis=1)
     return J, y - np.hstack([camera.project(safe) for camera in cameras]), in_front
