@@ -56,10 +56,8 @@ def read_coco(path: Path, n_frames: int, image_size_px: tuple[int, int]) -> Anno
         content = json.loads(path.read_text(encoding="utf-8"))
         categories = {c["id"]: list(c["keypoints"]) for c in content["categories"] if "keypoints" in c}
         images = {image["id"]: str(image["file_name"]) for image in content["images"]}
-        entries = [
-            (images.get(a["image_id"]), categories.get(a["category_id"]), a["keypoints"], a["image_id"], a["category_id"])
-            for a in content["annotations"]
-        ]
+        found = content["annotations"]
+        entries = [(images.get(a["image_id"]), categories.get(a["category_id"]), a["keypoints"], a) for a in found]
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         what = f"not COCO keypoints ({type(error).__name__}: {error})"
         raise ValueError(f"{path}: {what}. Export the annotations again.") from None
@@ -67,11 +65,12 @@ def read_coco(path: Path, n_frames: int, image_size_px: tuple[int, int]) -> Anno
     u = np.full((2, n_frames, len(LANDMARKS), 2), np.nan)
     visibility = np.zeros((2, n_frames, len(LANDMARKS)), dtype=np.int64)
     seen = set()
-    for image, names, keypoints, image_id, category_id in entries:
+    for image, names, keypoints, entry in entries:
+        where = f"image {entry['image_id']}, category {entry['category_id']}"
         if names is None or image is None:
-            raise ValueError(f"{path}: an annotation names image {image_id}, category {category_id}; no such entry.")
+            raise ValueError(f"{path}: an annotation names {where}; no such entry.")
         if not set(LANDMARKS) <= set(names):
-            raise ValueError(f"{path}: category {category_id} has keypoints {names}; {list(LANDMARKS)} are needed.")
+            raise ValueError(f"{path}: {where} has keypoints {names}; {list(LANDMARKS)} are needed.")
         file = PurePosixPath(image)
         if file.parent.name not in _SIDES or not file.stem.isdecimal() or int(file.stem) >= n_frames:
             known = f"left/000000.jpg to right/{n_frames - 1:06d}.jpg"
@@ -116,6 +115,5 @@ def write_coco(path: Path, annotations: Annotations, image_size_px: tuple[int, i
             entry |= {"num_keypoints": int((v > 0).sum()), "bbox": [round(float(value), 3) for value in (*low, *size)]}
             entries.append(entry | {"area": round(float(size.prod()), 3), "iscrowd": 0})
     category = {"id": 1, "name": "forceps", "keypoints": list(LANDMARKS), "skeleton": [[1, 2], [1, 3]]}
-    info = {"description": "Tool landmarks; integer coordinates are pixel centres."}
-    content = {"info": info, "categories": [category], "images": images, "annotations": entries}
-    write_text(path, json.dumps(content, allow_nan=False) + "\n")
+    content = {"info": {"description": "Tool landmarks; integer coordinates are pixel centres."}, "categories": [category]}
+    write_text(path, json.dumps(content | {"images": images, "annotations": entries}, allow_nan=False) + "\n")

@@ -15,8 +15,6 @@ from PIL import Image
 __all__ = ["Frames", "StereoFrame", "open_side", "read_image"]
 
 _SUFFIXES = (".jpg", ".jpeg", ".png")
-_CACHED_PAIRS = 4
-_EXIF_ORIENTATION = 0x0112
 _LOST_BYTES = 512  # a disk sector: what a crash or a bad copy replaces by zeros
 
 
@@ -96,7 +94,7 @@ class ImageFolder:
         try:
             with warnings.catch_warnings(action="ignore"), Image.open(path) as image:  # reads the header only
                 size = image.size
-                orientation = image.getexif().get(_EXIF_ORIENTATION, 1) if image.format == "JPEG" else 1
+                orientation = image.getexif().get(0x0112, 1) if image.format == "JPEG" else 1
         except (OSError, SyntaxError, ValueError):
             raise ValueError(f"{path}: the image is corrupt; its header cannot be read. Export it again.") from None
         except Image.DecompressionBombError as error:
@@ -172,7 +170,7 @@ class Frames(Sequence[StereoFrame]):
         self.time_s.setflags(write=False)
         self._numbers = range(len(time_s))
 
-        @lru_cache(_CACHED_PAIRS)  # shared by all slices
+        @lru_cache(4)  # shared by all slices
         def read(number: int) -> StereoFrame:
             images = left.read(number), right.read(number)
             for image in images:

@@ -25,9 +25,7 @@ def columns(axes: Sequence[str]) -> list[str]:
     return [f"{landmark}_{axis}" for landmark in LANDMARKS for axis in axes]
 
 
-def read_table(
-    path: Path, names: Sequence[str], optional: Sequence[str] = (), *, n_frames: int | None = None
-) -> np.ndarray:
+def read_table(path: Path, names: Sequence[str], optional: Sequence[str] = (), n_frames: int | None = None) -> np.ndarray:
     """The columns `names`, then `optional`, of a CSV file as (rows, columns) float64; an empty cell is NaN.
 
     A file has all of the optional columns or none of them; then they are NaN.  With `n_frames` the first column must

@@ -29,22 +29,12 @@ __all__ = ["TEST_SEQUENCES", "TRAIN_SEQUENCES", "main", "make_dataset", "seconds
 
 TRAIN_SEQUENCES, TEST_SEQUENCES = range(0, 7), range(7, 10)
 _SEQUENCES = (*TRAIN_SEQUENCES, *TEST_SEQUENCES)
-_SHIPPED_SEED = 27
 _MB_PER_PAIR = 0.62
 
 
 def sequence_name(index: int) -> str:
     """Folder of a sequence: ``train_00`` to ``test_09``."""
     return f"{'train' if index in TRAIN_SEQUENCES else 'test'}_{index:02d}"
-
-
-def _make_shipped_recording() -> Recording:
-    """The recording that ships: an eye and a tool never trained on, in a calibration sweep and then with a surgeon."""
-    description = "Calibration sweep at several depths, then approach, grasp and peel. Made by lib.simulator."
-    return simulate(
-        paths.SHIPPED_RECORDING, Design(microscope=Microscope(jpeg_quality=88)), seed=_SHIPPED_SEED, n_frames=34,
-        name="Open-sky eye, simulated", description=description, overwrite=True,
-    )  # fmt: skip
 
 
 def sequence_design(seed: int, index: int, *, shrink: int = 1, duration_s: float = 60.0) -> Design:
@@ -153,8 +143,12 @@ def main(argv: Sequence[str] | None = None) -> None:
         parser.error("--pairs, --workers and --shrink must be at least 1.")
     if arguments.seed < 0 or not 0 < arguments.duration < float("inf"):
         parser.error("--seed must not be negative, --duration must be positive and finite.")
-    if arguments.shipped:
-        recording = _make_shipped_recording()
+    if arguments.shipped:  # an eye and a tool never trained on, in a calibration sweep and then with a surgeon
+        recording = simulate(
+            paths.SHIPPED_RECORDING, Design(microscope=Microscope(jpeg_quality=88)), seed=27, n_frames=34,
+            name="Open-sky eye, simulated", overwrite=True,
+            description="Calibration sweep at several depths, then approach, grasp and peel. Made by lib.simulator.",
+        )  # fmt: skip
         print(f"{recording.folder}: {len(recording)} pairs.")
         return
     pairs, shrink = arguments.pairs, arguments.shrink

@@ -73,8 +73,7 @@ class Microscope:
 
     def rig(self, robot_from_microscope: RigidTransform = ROBOT_FROM_MICROSCOPE) -> StereoRig:
         """The true cameras, affine or near-affine; `RigidTransform.identity()` gives them in the microscope frame."""
-        centre_px = (np.array(self.image_size_px) - 1) / 2
-        cameras = []
+        cameras, centre_px = [], (np.array(self.image_size_px) - 1) / 2
         for side, zoom, roll in zip((+1, -1), self.pixels_per_mm, self.image_rotation_rad, strict=True):
             # The left camera stands at negative x and looks towards positive x.
             tilt = RigidTransform.from_rotation_vector((0.0, -side * self.convergence_rad / 2, 0.0))

@@ -54,21 +54,20 @@ class Motion:
         parts = []
         if sweep_end > 0:
             points = self._sweep(rng, side)
-            pace = np.linalg.norm(np.diff(np.array(points)[:, :3], axis=0), axis=1) + 0.8  # mm, plus time to turn
+            pace = np.linalg.norm(np.diff(points, axis=0)[:, :3], axis=1) + 0.8  # mm, plus time to turn
             times = np.concatenate([[0], np.cumsum(pace)]) / pace.sum() * sweep_end
-            parts.append((0.0, PchipInterpolator(times, np.array(points))))
+            parts.append((0.0, PchipInterpolator(times, points)))
         if sweep_end < self.duration_s:
             points, shares = self._surgeon(rng, side)
             times = np.concatenate([[0], np.cumsum(shares)]) / np.sum(shares) * (self.duration_s - sweep_end)
-            parts.append((sweep_end, PchipInterpolator(sweep_end + times, np.array(points))))
+            parts.append((sweep_end, PchipInterpolator(sweep_end + times, points)))
         return tuple(parts)
 
     def _sweep(self, rng: np.random.Generator, side: float) -> list[list[float]]:
         half_x, half_y = _HALF_FIELD_MM
         points = []
         for layer, z in enumerate(rng.permutation(_DEPTHS_MM)):
-            rows = np.array([-0.85, 0.0, 0.85]) * (1 if layer % 2 else -1)
-            for k, row in enumerate(rows):
+            for k, row in enumerate(np.array([-0.85, 0.0, 0.85]) * (1 if layer % 2 else -1)):
                 for column in np.array([-0.9, -0.3, 0.3, 0.9]) * (1 if k % 2 else -1):
                     x, y = column * half_x + rng.normal(0, 0.5), row * half_y + rng.normal(0, 0.35)
                     turn = [side + rng.normal(0, 0.45), rng.uniform(0.12, 0.6), np.clip(rng.normal(0, 0.3), -0.9, 0.9)]

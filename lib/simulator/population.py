@@ -1,8 +1,7 @@
 """Training images: eye, tool, pose, light, optics, glints and noise are drawn anew for every image.
 
-An image is one view, not a pair, and shows only what the network sees: a window of the full-HD image around the tool
-(`crop_px`), or the whole field at a reduced size (`size_px`).  Eyes of `RESERVED_SEEDS` and tools with jaws of
-`RESERVED_JAW_MM` are never drawn.  Test recordings use them, so no test frame shows an eye or a tool of the training.
+Eyes of `RESERVED_SEEDS` and tools with jaws of `RESERVED_JAW_MM` are never drawn.  Test recordings use them, so no test
+frame shows an eye or a tool of the training.
 """
 
 from __future__ import annotations
@@ -101,7 +100,7 @@ def sample(
     rng: np.random.Generator, *, crop_px: int | None = None, size_px: tuple[int, int] | None = None,
     around: int | None = None, jitter: float = 0.35, textures: Sequence[int] = TEXTURE_SEEDS,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
-    """One training image with its landmarks; `rng` decides everything.
+    """One view, not a pair, with its landmarks; `rng` decides everything.
 
     Args:
         crop_px: Side of a square window of the full-resolution image that holds the jaws somewhere.

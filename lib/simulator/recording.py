@@ -24,7 +24,6 @@ __all__ = ["Design", "simulate"]
 
 _KINEMATICS_HZ, _KINEMATICS_MARGIN = 100.0, 5  # samples before the first and after the last frame
 _GLINT_REACH_PX = 3  # a detector looks at a landmark's surroundings, not at one pixel
-_CLIPPED = 250  # of 255
 
 
 @dataclass(frozen=True)
@@ -93,7 +92,6 @@ def simulate(
     motion = Motion(forceps, eye, kind=design.motion, seed=seed, duration_s=duration_s)
     step = max(1, int(motion.duration_s * microscope.fps / n_frames))
     time_s = np.arange(n_frames) * step / microscope.fps
-    rig = microscope.rig(RigidTransform.identity())
     details = {"simulated": True, "seed": seed, "frame_step": step}
     details |= {"depth_of_field_mm": microscope.depth_of_field_mm, "exposure_s": microscope.exposure_s}
     if microscope.inverse_distance_per_mm:
@@ -126,7 +124,7 @@ def simulate(
         writer.kinematics(sample_s + design.offset_s, reported)
         clicked = np.where(visibility[..., None] == 2, u + rng.normal(0, design.click_px, u.shape), np.nan)
         writer.annotations(*clicked, *np.where(visibility == 2, 2, 0))
-        x_px, y_px, surface_mm = surface_grid(eye, rig.left, microscope.image_size_px)
+        x_px, y_px, surface_mm = surface_grid(eye, microscope.rig(RigidTransform.identity()).left, microscope.image_size_px)
         truth = Truth(microscope.rig(), to_robot(landmarks), *u, *visibility, writer.truth_folder, *in_glint)
         truth.write((x_px, y_px, to_robot(surface_mm)))
     return Recording.open(folder)
@@ -141,6 +139,6 @@ def _in_glint(view: View) -> np.ndarray:
     found = np.zeros(3, bool)
     for k in np.flatnonzero(view.visibility):
         column, row = (slice(max(c - _GLINT_REACH_PX, 0), c + _GLINT_REACH_PX + 1) for c in np.round(view.u[k]).astype(int))
-        clipped = np.sort(view.image[row, column], axis=2)[..., 1] >= _CLIPPED
+        clipped = np.sort(view.image[row, column], axis=2)[..., 1] >= 250  # of 255
         found[k] = clipped.any() or view.glint_mask[row, column].any()
     return found

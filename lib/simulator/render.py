@@ -17,14 +17,12 @@ from lib.geometry import RigidTransform
 from lib.simulator.eye import Scene
 from lib.simulator.forceps import Forceps, Pose
 from lib.simulator.microscope import Microscope
-from lib.simulator.optics import blur_by_depth
 from lib.simulator.texture import GAMMA, smooth_noise
 from lib.simulator.tool import compose, shadow, tool_in_view
-from lib.simulator.window import Grid, Window, intersect
+from lib.simulator.window import Grid, Window, blur_by_depth, intersect
 
 __all__ = ["View", "render_pair", "render_view"]
 
-_STEP_PX = 8  # of the coarse grid
 _LINEAR = (np.arange(256, dtype=np.float32) / 255) ** GAMMA
 _BUMP_MM, _BUMP_PX = 10.0, 1024
 
@@ -80,7 +78,7 @@ def render_view(
     >>> render_view(Eye(texture_px=64), microscope, Window(left, (80, 60))).image.shape
     (60, 80, 3)
     """
-    grid = Grid(window.size_px, getattr(scene, "step_px", _STEP_PX))
+    grid = Grid(window.size_px, getattr(scene, "step_px", 8))
     x, y, z = intersect(scene, window, grid.u)
     has_tool = forceps is not None and pose is not None
 

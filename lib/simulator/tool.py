@@ -14,8 +14,7 @@ import numpy as np
 
 from lib.simulator.forceps import Forceps, Pose
 from lib.simulator.microscope import Microscope
-from lib.simulator.optics import blur, blur_by_depth, motion_kernel
-from lib.simulator.window import Window
+from lib.simulator.window import Window, blur, blur_by_depth, motion_kernel
 
 __all__ = ["ToolInView", "ToolRaster", "compose", "rasterise", "shadow", "tool_in_view"]
 
@@ -165,8 +164,7 @@ class ToolInView:
         u, jaw, zoom = self.u[k], self.chains == k, self.window.zoom
         corner = np.round(u) - 2
         shifted = self.centres[jaw] - np.append(corner / zoom, 0)
-        one_chain = np.ones(jaw.sum(), int)
-        raster = rasterise(shifted, self.radii[jaw], one_chain, zoom=zoom, size_px=(side, side), factor=factor)
+        raster = rasterise(shifted, self.radii[jaw], self.chains[jaw], zoom=zoom, size_px=(side, side), factor=factor)
         covered = np.zeros((side * factor, side * factor), bool)
         if raster is not None:
             covered[tuple(raster.hit + factor * np.array(raster.origin_px[::-1])[:, None])] = True
@@ -236,8 +234,7 @@ def compose(linear: np.ndarray, tool_mask: np.ndarray, tool: ToolInView, microsc
     tool_mask[y0 : y0 + height, x0 : x0 + width] = np.round(255 * alpha)
     layer = np.dstack([colour, alpha])
     # Beyond the image's border the tool goes on; elsewhere there is nothing beyond the layer.
-    sides = [y0, linear.shape[0] - y0 - height, x0, linear.shape[1] - x0 - width]
-    pad = [min(margin, side) for side in sides]
+    pad = np.minimum(margin, [y0, linear.shape[0] - y0 - height, x0, linear.shape[1] - x0 - width]).tolist()
     layer = cv2.copyMakeBorder(layer, *pad, cv2.BORDER_CONSTANT, value=0)
     z = np.where(alpha > 0.01, depth, np.nan)  # depth along the axis is z of the microscope frame to a few um
     if np.isfinite(microscope.depth_of_field_mm):

@@ -1,4 +1,4 @@
-"""A window of a camera's image: its frame, the rays of its pixels, and the scene that they meet.
+"""A window of a camera's image: its frame, the rays of its pixels, the scene that they meet, and blur.
 
 Rays that are parallel, or nearly, meet the smooth height field after a few fixed-point steps.  This is done on a coarse
 grid of pixels; cubic interpolation then gives every pixel with fourth-order accuracy.
@@ -9,12 +9,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
+import cv2
 import numpy as np
 
 from lib.cameras import AffineCamera, NearAffineCamera
 from lib.simulator.eye import Scene
 
-__all__ = ["Grid", "Window", "intersect", "surface_grid"]
+__all__ = ["Grid", "Window", "blur", "blur_by_depth", "intersect", "motion_kernel", "surface_grid"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,3 +145,41 @@ def surface_grid(
     x_px, y_px = (np.append(np.arange(0, side - 1, step_px), side - 1).astype(float) for side in size_px)
     points = intersect(scene, Window(camera, size_px), tuple(np.meshgrid(x_px, y_px)))
     return x_px, y_px, np.stack(points, axis=-1)
+
+
+def blur(image: np.ndarray, sigma_px: float) -> np.ndarray:
+    """Gaussian blur; a width too small to see leaves the image as it is."""
+    return cv2.GaussianBlur(image, (0, 0), sigma_px) if sigma_px > 0.15 else image
+
+
+def blur_by_depth(image: np.ndarray, sigma_px: np.ndarray, grid: Grid | None = None) -> np.ndarray:
+    """Gaussian blur whose width varies slowly over the image: a blend, linear in variance, of up to three blurs.
+
+    `sigma_px` is given on the coarse grid, or for every pixel where `grid` is None.
+    """
+    low, high = float(sigma_px.min()), float(sigma_px.max())
+    if high - low < 0.15:
+        return blur(image, (low + high) / 2)
+    levels = np.linspace(low, high, 3 if high - low > 0.8 else 2)
+    stack = [blur(image, level) for level in levels]
+    result = stack[0]
+    for k in range(1, len(levels)):
+        share = (sigma_px**2 - levels[k - 1] ** 2) / (levels[k] ** 2 - levels[k - 1] ** 2)
+        share = np.clip(grid.full(share) if grid else share, 0, 1).astype(np.float32)[..., None]
+        result = result + share * (stack[k] - result)
+    return result
+
+
+def motion_kernel(shift_px: np.ndarray) -> np.ndarray | None:
+    """A centred box along the movement (2,) px during the exposure, or None if it is too short to see."""
+    length = float(np.hypot(*shift_px))
+    if length < 0.3:
+        return None
+    half = int(np.ceil(length / 2)) + 1
+    kernel = np.zeros((2 * half + 1,) * 2, np.float32)
+    for t in np.linspace(-0.5, 0.5, 4 * half + 1):
+        x, y = t * shift_px + half
+        i, j = int(np.floor(y)), int(np.floor(x))
+        fy, fx = y - i, x - j
+        kernel[i : i + 2, j : j + 2] += np.outer([1 - fy, fy], [1 - fx, fx])
+    return kernel / kernel.sum()

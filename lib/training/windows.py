@@ -10,7 +10,7 @@ import numpy as np
 
 from lib.geometry import cell_from_image
 from lib.landmarks import windows
-from lib.simulator.optics import motion_kernel
+from lib.simulator.window import motion_kernel
 from lib.training.samples import Source
 from lib.training.shards import BLOCK_PX, STORED_REDUCTION, read_shards
 
