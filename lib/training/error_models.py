@@ -159,8 +159,7 @@ def fit_error_models(detector: Detector, images: Iterable[LabelledImage], *, pro
                 start = replace(start, u=start.u + rng.normal(0, moved_px / np.sqrt(2), (1, 1, 2)))
                 start = detector.refine(labelled.image[None], start, stage)
             parts.append(seen_by(detector, stage, labelled, start.u if start else None))
-        parts = [part for part in parts if len(part.landmark)]
-        if not parts:
+        if not any(len(part.landmark) for part in parts):
             raise ValueError("images: the detector finds nothing in them to calibrate on; give other images.")
         seen = Seen.joined(parts)
         gross = {"frame": 6 * GROSS_PX, "tool": 2 * GROSS_PX / detector.tool_reduction, "window": GROSS_PX}

@@ -78,10 +78,7 @@ class Evaluation:
         return self.by({"visible": self.visibility == 2, "occluded": self.visibility == 1})
 
     def detection(self) -> dict[str, float]:
-        """Precision and recall of detections with a confidence above 0.5, in percent.
-
-        ``"in_view"``: the landmark lies in the frame, hidden or not.  ``"visible"``: it is not hidden either.
-        """
+        """Percent precision and recall, above confidence 0.5, of landmarks in the frame, and of those not hidden there."""
         detected = (self.landmarks.confidence >= 0.5) & (self.visibility >= 0)
         result: dict[str, float] = {}
         for name, there in (("in_view", self.visibility > 0), ("visible", self.visibility == 2)):

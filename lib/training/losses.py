@@ -80,7 +80,5 @@ def loss_of(network: nn.Module, outputs: Sequence[Tensor], batch: Batch, config:
     """The loss that a configuration asks for; of a network that is validated without its position loss."""
     if isinstance(network, OffsetNetwork):
         return offset_loss(outputs, batch)
-    loss = heatmap_loss(outputs, batch, network.stride, config.sigma_px)
-    if config.position_weight_per_px and network.training:
-        loss = loss + config.position_weight_per_px * position_loss(outputs, batch, network.stride, config.sigma_px)
-    return loss
+    given, weight = (outputs, batch, network.stride, config.sigma_px), config.position_weight_per_px
+    return heatmap_loss(*given) + (weight * position_loss(*given) if weight and network.training else 0)

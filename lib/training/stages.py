@@ -89,8 +89,8 @@ def finetune(
         config = replace(stage_config(stage), network=network.config, steps=steps, learning_rate=3e-4, seed=seed)
         config = replace(config, batch_size=min(config.batch_size, len(source)), validate_every=max(1, steps // 5))
         start = Training(network, [], {"shipped": detector.metadata.get("commit")})
-        done = train(config, source, validation, Path(folder) / stage, initial=start, progress=progress)
-        networks[f"{stage}_network"] = done.network
+        tuned = train(config, source, validation, Path(folder) / stage, initial=start, progress=progress)
+        networks[f"{stage}_network"] = tuned.network
     fitted_on = [*validation_images(data), *(validation_images(simulated) if simulated is not None else ())]
     return fit_error_models(replace(detector, **networks), fitted_on, progress=progress)
 
