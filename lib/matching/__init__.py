@@ -58,22 +58,17 @@ def match(
             a point in the rig's frame (so the sign and the origin are those of the rig's frame along d).  None = found
             by a coarse pass.  Only used with a rig.
         setting: "quality" searches at full resolution (up to 3 Mpx), "fast" at up to 0.4 Mpx.  Not for "deepmatching".
-        min_score: Matches with a lower score are dropped.  None is 0.5 for "band", whose score falls with the predicted
-            standard deviation (half of the wrong matches and few of the right ones lie below), and 0 for the others.
-        downscale: DeepMatching only: descriptors are pooled by 2^downscale; None is the smallest from 1 that fits the
-            budget.
-        budget_bytes: Memory that DeepMatching may take.  It is predicted before anything is allocated; what does not
-            fit is refused.
-        max_epipolar_px: Every method that searches along the rig's epipolar lines refuses a rig whose lines lie farther
-            than this from what free coarse matches say.
-        reciprocal: Drop matches whose way back from the right image leads elsewhere (occlusions, above all).  False
-            keeps them; `Matches.reciprocal` says which.
+        min_score: Matches with a lower score are dropped.  None is 0.5 for "band" (half of the wrong matches and few of
+            the right ones lie below), and 0 for the others.
+        downscale: DeepMatching only: pools descriptors by 2^downscale; None is the smallest from 1 that fits the budget.
+        budget_bytes: Memory that DeepMatching may take; a search predicted to need more is refused.
+        max_epipolar_px: A rig whose epipolar lines lie farther than this from free coarse matches is refused.
+        reciprocal: Drop matches whose way back from the right image leads elsewhere (occlusions, above all).
         device: torch device of free DeepMatching, such as "cuda".
 
     Returns:
-        Matches: Possibly none, where there is no texture.  Of three confidences the score is usually the best detector
-            of wrong matches, but SGBM has none (always 1); the peak ratio and the reciprocal check mean the same for
-            every method.
+        Matches: Possibly none.  Of its three confidences the score is usually the best, but SGBM has none (always 1);
+            the peak ratio and the reciprocal check mean the same for every method.
 
     Raises:
         ValueError: For images of a wrong type or shape, masks of a wrong shape or that leave nothing, an unknown method

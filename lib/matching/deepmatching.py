@@ -60,8 +60,7 @@ def _correlation_maps(patches: torch.Tensor, windows: torch.Tensor) -> torch.Ten
     cells = [torch.arange(n)[:, None] + torch.arange(PATCH) - PATCH // 2 for n in (n_y, n_x)]
     rows, columns = (((0 <= cell) & (cell < len(cell) - 1)).to(maps) for cell in cells)
     for y in (0, 1, n_y - 2, n_y - 1):
-        seen = torch.einsum("ijrc,r,xc->ijx", energy, rows[y], columns)
-        maps[:, :, y] /= seen.sqrt().clamp_min(1e-6)
+        maps[:, :, y] /= torch.einsum("ijrc,r,xc->ijx", energy, rows[y], columns).sqrt().clamp_min(1e-6)
     for x in (0, 1, n_x - 2, n_x - 1):
         seen = torch.einsum("ijrc,c->ij", energy, columns[x])
         maps[:, :, 2:-2, x] /= seen.sqrt().clamp_min(1e-6)[..., None]
@@ -130,7 +129,7 @@ def match_free(
         for image, mask in zip(images, masks, strict=True)
     )
     corner, best, ratio, passed = _match_grids(*(torch.from_numpy(grid).to(device) for grid in (left, right)))
-    corner, best, passed = corner.cpu().numpy(), best.cpu().numpy().astype(np.float64), passed.cpu().numpy()
+    corner, best, passed = (array.cpu().numpy() for array in (corner, best.double(), passed))
     target = np.clip(corner, 0, np.array(right.shape[1::-1]) - 1)
     kept = np.isfinite(best) & patch_quality(left) & (right[target[..., 1], target[..., 0], CHANNELS - 1] > 0)
     kept &= passed | (not reciprocal)

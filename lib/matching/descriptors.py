@@ -71,12 +71,8 @@ def pixel_descriptors(gray: np.ndarray, downscale: int = 1, *, valid: np.ndarray
     for first in range(0, rows, strip):
         last = min(first + strip, rows)
         top = max(0, first * stride - REACH_PX)
-        _describe(
-            gray[top : min(len(gray), last * stride + REACH_PX), :],
-            slice(first * stride - top, last * stride - top),
-            stride,
-            descriptors[first:last],
-        )
+        inner = slice(first * stride - top, last * stride - top)
+        _describe(gray[top : last * stride + REACH_PX], inner, stride, descriptors[first:last])
     if valid is not None:
         seen = valid[: rows * stride, : columns * stride].view(np.uint8) * np.uint8(255)
         descriptors[cv2.resize(seen, (columns, rows), interpolation=cv2.INTER_AREA) < 255] = 0.0

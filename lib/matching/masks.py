@@ -44,15 +44,14 @@ def tool_mask(
     u = np.asarray(u_landmarks, dtype=np.float64)
     if u.shape != (3, 2):
         raise ValueError(f"u_landmarks: expected (3, 2) px, base, tip_1, tip_2, got {u.shape}.")
-    height, width = shape[:2]
-    mask = np.zeros((height, width), np.uint8)
+    mask = np.zeros(shape[:2], np.uint8)
     base, tips = u[0], u[1:][np.isfinite(u[1:]).all(axis=1)]
     if not np.isfinite(base).all() or not len(tips):
         return mask.astype(bool)
     lengths = np.linalg.norm(tips - base, axis=1)
     thickness = max(1, round(0.45 * lengths.mean() if width_px is None else width_px))
     backwards = base - tips.mean(axis=0)
-    reach = np.hypot(height, width) + np.abs(base).max() if shaft_px is None else shaft_px
+    reach = np.hypot(*shape[:2]) + np.abs(base).max() if shaft_px is None else shaft_px
     back = base + backwards / max(np.linalg.norm(backwards), 1e-300) * reach
     shift = 4  # fractional bits of OpenCV's line drawing
     limit = 2 ** (30 - shift) / 8

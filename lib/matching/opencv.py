@@ -33,9 +33,7 @@ CELL_PX = LATTICE_PX // PATCH
 SIGMA_PX = 0.2
 
 
-def _sgbm(
-    left: np.ndarray, right: np.ndarray, range_px: tuple[float, float], *, checked: bool
-) -> tuple[np.ndarray, ...]:
+def _sgbm(left: np.ndarray, right: np.ndarray, range_px: tuple, *, checked: bool) -> tuple[np.ndarray, ...]:
     """Semi-global block matching (Hirschmueller, PAMI 2008), HH mode; states no confidence.
 
     `checked` leaves out what fails the left-right check; else a second run says which these are.
@@ -65,7 +63,7 @@ def _sgbm(
     return found, np.isfinite(found).astype(float), passed
 
 
-def _dis(left: np.ndarray, right: np.ndarray, range_px: tuple[float, float]) -> tuple[np.ndarray, ...]:
+def _dis(left: np.ndarray, right: np.ndarray, range_px: tuple) -> tuple[np.ndarray, ...]:
     """Dense inverse search (Kroeger et al., ECCV 2016), forward and backward; confidence from their difference."""
     dis = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     # DIS sees only small motion well: start it at the middle of the range.

@@ -43,7 +43,7 @@ class Rectification:
 
     def displacement_range_px(self, depth_range_mm: tuple[float, float]) -> tuple[float, float]:
         """(low, high) displacement on the canvas of a range of depth."""
-        ends = (np.asarray(depth_range_mm, dtype=np.float64) - self.reference_depth_mm) * self.displacement_px_per_mm
+        ends = np.subtract(depth_range_mm, self.reference_depth_mm) * self.displacement_px_per_mm
         return float(ends.min()), float(ends.max())
 
     def depth_range_mm(self, displacement_range_px: tuple[float, float]) -> tuple[float, float]:
@@ -58,8 +58,7 @@ class Rectification:
             ValueError: If they see nothing of it; the message says what depths they see.
         """
         low, high = self.displacement_range_px(depth_range_mm)
-        height, width = shape_right
-        corners = np.array([[0, 0], [width - 1, 0], [0, height - 1], [width - 1, height - 1]], dtype=np.float64)
+        corners = np.array(list(np.ndindex(2, 2))) * np.subtract(shape_right[::-1], 1)
         x = np.linalg.solve(self.right_from_canvas[:, :2], (corners - self.right_from_canvas[:, 2]).T)[0]
         visible = float(x.min() - self.size_px[0]), float(x.max())
         if high < visible[0] or low > visible[1]:
@@ -98,8 +97,7 @@ def rectify(
     direction = shift / np.linalg.norm(shift) * (1.0 if shift[0] >= 0 else -1.0)
     Q = np.array([direction, [-direction[1], direction[0]]])
 
-    height, width = shape_left
-    corners = np.array([[-0.5, -0.5], [width - 0.5, -0.5], [-0.5, height - 0.5], [width - 0.5, height - 0.5]]) @ Q.T
+    corners = (np.array(list(np.ndindex(2, 2))) * shape_left[::-1] - 0.5) @ Q.T
     origin = corners.min(axis=0)
     size = tuple(int(n) for n in np.ceil((corners.max(axis=0) - origin) * scale - 1e-6))
     # canvas = scale (Q u - origin) - 1/2, so that with Q = 1 and scale 1 the canvas is the left image.

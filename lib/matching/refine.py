@@ -38,14 +38,9 @@ def _cut(grid: np.ndarray, x: np.ndarray, y: np.ndarray, margin: int) -> np.ndar
 def _derivatives(windows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Along x, to fourth order, and along y, (n, s, s, C)."""
     middle = windows[:, 1:-1]
-    along = middle[:, :, 3:-1] - middle[:, :, 1:-3]
-    far = middle[:, :, 4:] - middle[:, :, :-4]
-    along *= np.float32(8 / 12)
-    far *= np.float32(1 / 12)
-    along -= far
+    near, far = middle[:, :, 3:-1] - middle[:, :, 1:-3], middle[:, :, 4:] - middle[:, :, :-4]
     across = windows[:, 2:, REACH:-REACH] - windows[:, :-2, REACH:-REACH]
-    across *= np.float32(1 / 2)
-    return along, across
+    return near * np.float32(8 / 12) - far * np.float32(1 / 12), across * np.float32(1 / 2)
 
 
 def refine(
@@ -77,11 +72,7 @@ def refine(
         f, g = (np.ascontiguousarray(a[:, 1:-1, REACH:-REACH]).reshape(len(a), -1) for a in (f, g))
         energy = np.einsum("ij,ij->i", g, g)
         scale = np.sqrt(np.einsum("ij,ij->i", f, f) / np.maximum(energy, 1e-12))[:, None]
-        for mine, other in zip(*slopes, strict=True):
-            other *= scale
-            mine += other
-            mine *= np.float32(0.5)
-        w, across = slopes[0]
+        w, across = ((mine + other * scale) * np.float32(0.5) for mine, other in zip(*slopes, strict=True))
         f -= g * scale
         information = np.maximum(np.einsum("ij,ij->i", w, w), 1e-12)
         projection = np.einsum("ij,ij->i", w, f)

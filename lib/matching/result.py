@@ -22,9 +22,8 @@ class Matches:
         score: (n,) confidence in [0, 1]; larger is surer.  Comparable within one call, not between methods.
         covariance_px2: (n, 4, 4) covariance of (u_left, u_right).  A match says where in the right image lies what is
             seen at `u_left`, so nearly all of the noise stands in the right block.
-        peak_ratio: (n,) response of the descriptors at the match over the best response elsewhere among the places
-            searched; at 1 and below another place fits as well.  Infinite where nothing else responds, NaN where there
-            was no other place.
+        peak_ratio: (n,) response at the match over the best one elsewhere; at 1 and below another place fits as well.
+            Infinite where nothing else responds, NaN where there was no other place.
         reciprocal: (n,) bool, whether the way back from the right image leads to the same left patch (DeepMatching,
             band), or to within a pixel (SGBM, DIS).  `match` drops the others unless told otherwise.
         epipolar_px: Median over the matches of the absolute distance from the rig's epipolar constraint (as in

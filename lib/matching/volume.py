@@ -62,17 +62,12 @@ def correlation_volume(left: torch.Tensor, right: torch.Tensor, v: int) -> torch
     inverse_norm = torch.where(energy > 1e-12, energy.clamp_min(1e-12).rsqrt(), 0.0).contiguous()
 
     volume = right.new_empty(gy, gx, 2 * v + 1, n)
-    block = max(4, min(gx, n // 2))
-    row = PATCH * channels
+    block, row = max(4, min(gx, n // 2)), PATCH * channels
     column = (PATCH * ROWS + 2 * v) * row
     turned = right.transpose(0, 1)
 
     def correlate(top: int) -> None:
-        """Fill one chunk of lattice rows.
-
-        Windows are laid out as (x, y, 4 cells of the row): any window is then `depth` contiguous numbers, so that BLAS
-        reads it in place.
-        """
+        """Fill one chunk of lattice rows, from windows laid out as (x, y, 4 cells of the row): any is then contiguous."""
         k = min(ROWS, gy - top)
         rows = slice(PATCH * top, PATCH * (top + k) + 2 * v)
         strip = right.new_empty(n_x, column // row, row)
@@ -85,9 +80,8 @@ def correlation_volume(left: torch.Tensor, right: torch.Tensor, v: int) -> torch
                 view = strip.as_strided((k, windows, depth), (PATCH * row, column, 1), PATCH * start * column + j * row)
                 product = torch.bmm(patches[top : top + k, start : start + b], view.transpose(1, 2))
                 skewed = product.as_strided((k, b, n), (b * windows, windows + PATCH, 1))
-                scale = inverse_norm.as_strided(
-                    (k, b, n), (PATCH * n_x, PATCH, 1), (PATCH * top + j) * n_x + PATCH * start
-                )
+                first = (PATCH * top + j) * n_x + PATCH * start
+                scale = inverse_norm.as_strided((k, b, n), (PATCH * n_x, PATCH, 1), first)
                 torch.mul(skewed, scale, out=volume[top : top + k, start : start + b, j])
 
     with ThreadPoolExecutor(2) as executor:
@@ -98,10 +92,7 @@ def correlation_volume(left: torch.Tensor, right: torch.Tensor, v: int) -> torch
 def match_volume(volume: torch.Tensor, low: int, *, reciprocal: bool = True) -> VolumeMatches:
     """The best displacement of each patch: bottom-up, top-down, reciprocal check, sub-cell peak.
 
-    Args:
-        volume: (gy, gx, 2 v + 1, n) from `correlation_volume`.
-        low: Its first displacement along x, cells.
-        reciprocal: False keeps the matches that fail the reciprocal check too.
+    `low` is the volume's first displacement along x, cells; without `reciprocal` that check drops nothing.
     """
     gy, gx, rows, n = volume.shape
     v = rows // 2

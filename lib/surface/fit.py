@@ -19,16 +19,14 @@ class SurfaceFit:
     """How a surface was found.
 
     Attributes:
-        objective: Eq. (6) over the final inliers: sum of (weighted) L1 norms in mm plus `smoothness` times the bending
-            energy in mm^2 / px^2.  With point covariances the norms are whitened, with a camera they are depths.
+        objective: Eq. (6) over the final inliers.  With point covariances the norms are whitened, with a camera depths.
         duality_gap: Proven bound, in the unit of the objective, on its distance from the minimum.
         smoothness: mu of Eq. (6), px^2 / mm: given, or chosen by held-out error.
         reject_mm: Bound on the L1 norm of a point's residual that was applied, after the first fit.
         inliers: (n,) points that the final fit used.
         residual_mm: (n, 3) Psi(u) - x of every given point at the final surface; NaN where u lies outside.
         iterations: Newton steps of the final solve.
-        held_out: (m, 2) candidates of the smoothness and their mean held-out L1 error (mm), where it was chosen; else
-            (0, 2).
+        held_out: (m, 2) candidates of the smoothness and their mean held-out L1 error (mm); (0, 2) where it was given.
         axes: (k, 3) orthonormal directions along which the L1 norm was taken: the axes of the frame for the plain fit.
         method: The solver.
         problem, penalty, weights, residual: What was solved last, over the inliers: the points on their grid, mu (k,)

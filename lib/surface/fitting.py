@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from typing import Literal
 
@@ -53,22 +52,20 @@ def fit_surface(
         x_mm: (n, 3) points, mm.
         domain: (x0, y0, x1, y1) px that the surface covers.
         control: (n_x, n_y) control points.
-        smoothness: mu >= 0, px^2 / mm.  None chooses it by the mean L1 error of held-out points: of three deterministic
-            folds, which do not depend on the order of the points, as many as hold 1500 points.
+        smoothness: mu >= 0, px^2 / mm.  None chooses it by the mean L1 error of held-out points, whatever their order.
         reject_mm: Bound on the L1 norm of a point's residual.  None is `REJECT_MEDIANS` times the median L1 norm at the
             first fit; infinity keeps all.
         covariance_mm2: Covariance of the points, (3, 3) or (n, 3, 3).  Eq. (6) is then taken in whitened coordinates:
-            along the principal axes of the mean covariance, each residual divided by its own standard deviation, the
-            bending of an axis by a typical one (and the whole multiplied by the mean, so that it stays in mm).
-            Triangulated points are ten times worse along the view than across it.  None is the paper's plain norm.
+            along the principal axes of the mean covariance, each residual divided by its own standard deviation (and
+            the whole multiplied by the mean, so that it stays in mm).  None is the paper's plain norm.
         camera: The left camera, affine.  Its ray through u is then exact, Psi(u) = ray(u) + s(u) d, and only the depth
             s along the viewing direction d is fitted, to d.x: one spline in the place of three.  Give `u` as matched in
             the image.
         method: "interior_point".  "least_squares" replaces the L1 norms by squares (mu is then in px^2), the baseline
             that outliers ruin.
         tolerance: Duality gap at which the solver stops, relative to the objective.
-        quick: Choose the smoothness and reject points at fits of five Newton steps, within some percent of the minimum,
-            and with fewer held-out points (1000); only the final fit is solved to `tolerance`.
+        quick: Choose the smoothness and reject points at fits of five Newton steps, within some percent of the minimum;
+            only the final fit is solved to `tolerance`.
 
     Raises:
         ValueError: For shapes or counts that do not fit, NaN, negative smoothness, points that do not determine a
@@ -80,9 +77,16 @@ def fit_surface(
         raise ValueError(f"u, x_mm: {len(u)} image points and {len(x)} points; they come in pairs.")
     used = grid.inside(u)
     least = max(16, grid.size // 4)
-    _check_enough(u[used], len(u), least, grid)
+    if used.sum() < least:
+        raise ValueError(
+            f"u: {used.sum()} of {len(u)} points lie in the domain, and a grid of {grid.control[0]} x {grid.control[1]} "
+            f"control points needs {least} or more. Match more points, give fewer control points, or check that domain "
+            "and u are both px of the left image."
+        )
+    spread = np.linalg.svd(u[used] - u[used].mean(axis=0), compute_uv=False)
+    if spread[1] < 1e-6 * spread[0]:
+        raise ValueError("u: the points lie on one line of the image, which does not determine a surface.")
     axes, values, norms = _outputs(x, covariance_mm2, camera)
-    data = _Data(grid, u, used, values, norms, norms[used].mean(axis=0))
     if smoothness is not None and not (np.isfinite(smoothness) and smoothness >= 0):
         raise ValueError(f"smoothness: mu must be a number >= 0 px^2/mm, or None to choose it; got {smoothness}.")
     if reject_mm is not None and not reject_mm > 0:
@@ -98,8 +102,9 @@ def fit_surface(
         search = partial(interior_point, max_iterations=5) if quick else partial(interior_point, tolerance=1e-3)
     held_out = np.empty((0, 2))
     if smoothness is None:
-        smoothness, held_out = _choose_smoothness(data, search, _QUICK_HELD_OUT if quick else _ENOUGH_HELD_OUT)
-    mu = smoothness * data.stiffness
+        enough = _QUICK_HELD_OUT if quick else _ENOUGH_HELD_OUT
+        smoothness, held_out = _choose_smoothness(grid, u[used], values[used], norms[used], search, enough)
+    mu = smoothness * norms[used].mean(axis=0)
 
     def solve(chosen: np.ndarray, solver: Callable[..., L1Solution]) -> tuple[L1Problem, L1Solution, BSplineSurface]:
         problem = L1Problem(grid, u[chosen])
@@ -146,30 +151,6 @@ def fit_surface(
     return BSplineSurface(grid, surface.control_points_mm, fit)
 
 
-@dataclass(frozen=True)
-class _Data:
-    """What is fitted: n points with k outputs."""
-
-    grid: SplineGrid
-    u: np.ndarray
-    used: np.ndarray  # (n,), inside the domain
-    values: np.ndarray  # (n, k), the points along the axes
-    norms: np.ndarray  # (n, k), factors of the absolute residuals
-    stiffness: np.ndarray  # (k,), factors of the bending energy: 1, or its whitening
-
-
-def _check_enough(u: np.ndarray, n_given: int, least: int, grid: SplineGrid) -> None:
-    if len(u) < least:
-        raise ValueError(
-            f"u: {len(u)} of {n_given} points lie in the domain, and a grid of {grid.control[0]} x "
-            f"{grid.control[1]} control points needs {least} or more. Match more points, give fewer control "
-            "points, or check that domain and u are both px of the left image."
-        )
-    spread = np.linalg.svd(u - u.mean(axis=0), compute_uv=False)
-    if spread[1] < 1e-6 * spread[0]:
-        raise ValueError("u: the points lie on one line of the image, which does not determine a surface.")
-
-
 def _outputs(
     x: np.ndarray, covariance_mm2: ArrayLike | None, camera: AffineCamera | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -196,7 +177,9 @@ def _outputs(
     return axes, x @ axes.T, inverse_sigma / inverse_sigma.mean()
 
 
-def _choose_smoothness(data: _Data, solver: Callable[..., L1Solution], enough: int) -> tuple[float, np.ndarray]:
+def _choose_smoothness(
+    grid: SplineGrid, u: np.ndarray, values: np.ndarray, norms: np.ndarray, solver: Callable[..., L1Solution], enough: int
+) -> tuple[float, np.ndarray]:
     """The smoothness of least held-out error, and the candidates tried with their errors (m, 2).
 
     The error is the mean L1 error, in mm, of points kept out of the fit.  It is in mm also where the fit is whitened: else
@@ -204,30 +187,27 @@ def _choose_smoothness(data: _Data, solver: Callable[..., L1Solution], enough: i
 
     It walks down a ladder of half decades to the lowest rung, then takes the parabola through it and its neighbours.
     """
-    n = int(data.used.sum())
-    u, values = data.u[data.used], data.values[data.used]
+    n, stiffness = len(u), norms.mean(axis=0)
     order = np.lexsort((*values.T, u[:, 0], u[:, 1]))
     fold = np.empty(n, dtype=np.intp)
     fold[order] = np.arange(n) % _FOLDS
-    rows = np.flatnonzero(data.used)
     parts = [
-        (L1Problem(data.grid, u[fold != f]), rows[fold != f], data.grid.design(u[fold == f]), rows[fold == f])
+        (L1Problem(grid, u[fold != f]), fold != f, grid.design(u[fold == f]), fold == f)
         for f in range(min(_FOLDS, -(-enough * _FOLDS // n)))
     ]
     # In the middle of what surfaces have needed; any start leads to the same end.
     spread = np.median(np.abs(values - np.median(values, axis=0)))
-    unit = 0.001 / _LADDER * n * float(np.prod(data.grid.cell_px)) / max(spread, 1e-9)
+    unit = 0.001 / _LADDER * n * float(np.prod(grid.cell_px)) / max(spread, 1e-9)
     errors: dict[int, float] = {}
 
     def error(step: int) -> float:
         if step not in errors:
             total, count = 0.0, 0
             for problem, train, design, test in parts:
-                scaled = unit * _LADDER**step * data.stiffness * len(train) / n
-                solution = solver(problem, data.values[train], scaled, data.norms[train])
-                apart = np.abs(design @ solution.coefficients - data.values[test])
-                total += float((data.norms[test] / data.stiffness * apart).sum())
-                count += len(test)
+                scaled = unit * _LADDER**step * stiffness * train.sum() / n
+                apart = np.abs(design @ solver(problem, values[train], scaled, norms[train]).coefficients - values[test])
+                total += float((norms[test] / stiffness * apart).sum())
+                count += test.sum()
             errors[step] = total / count
         return errors[step]
 

@@ -96,23 +96,19 @@ def reconstruct(
         setting: "quality", or "fast" for several pairs a second: coarser matching (see `lib.matching.match`), an
             approximate choice of smoothness, and `depth_only`.
         method: The matcher; see `lib.matching.match`.
-        refine: Correct the epipolar geometry of the rig by a first, fast matching (`refine_rig`).  This needs the
-            covariance of the rig, so `rig` must be a calibration of an affine pair.  None refines where that covariance
-            is known.
+        refine: Correct the epipolar geometry of the rig by a first, fast matching (`refine_rig`); `rig` must then be a
+            calibration of an affine pair.  None refines where it is.
         u_landmarks: Landmarks of the tool, (3, 2) px left and right, to mask the tool; NaN = missing.
         mask_left, mask_right: (h, w) bool, True = ignore, beside glints and tool.
-        epipolar_sigmas: Matches farther from their epipolar line than this many of their own standard deviations are
-            dropped.
+        epipolar_sigmas: As `sigmas` of `epipolar_inliers`.
         domain: (x0, y0, x1, y1) px that the surface covers.  None takes it from the matches.
         percentiles: (low, high) of the matches' coordinates that bound the domain where `domain` is None: (0, 100)
             covers all matches, (1, 99) leaves out the rim, where few matches hold the surface.
         control, reject_mm: As for `fit_surface`.
-        smoothness: As for `fit_surface`.  An online system gives the smoothness that an earlier frame chose
-            (`Reconstruction.surface.fit.smoothness`), which saves the search.
+        smoothness: As for `fit_surface`; that of an earlier frame (`Reconstruction.surface.fit.smoothness`) saves time.
         depth_only: Fit one spline, the depth along the rays of the left camera, in place of three.  It needs an affine
             left camera. None is True in the fast setting with an affine rig.
-        seconds: A dictionary that is filled with the seconds of each stage as it ends.  After an error its last key is
-            the stage that failed.
+        seconds: A dictionary that gets the seconds of each stage as it ends, also of the stage that fails.
 
     Raises:
         ValueError: As `match` and `fit_surface` do: unfit images, a rig that does not fit them, too few matches; and
