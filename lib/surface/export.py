@@ -128,8 +128,10 @@ def save_mesh(mesh: Mesh, path: str | Path) -> Path:
         written.material.set_default_properties()
         written.material.material_name = "defaultLit"
         written.material.texture_maps["albedo"] = o3d.t.geometry.Image(tensor(mesh.texture))
-    # The header of a GLB states the length of the file.
-    is_whole = lambda data: len(data) > 12 and int.from_bytes(data[8:12], "little") == len(data)
+
+    def is_whole(data: bytes) -> bool:  # the header of a GLB states the length of the file
+        return len(data) > 12 and int.from_bytes(data[8:12], "little") == len(data)
+
     _write(path, lambda name: o3d.t.io.write_triangle_mesh(name, written), is_whole)
     return path
 

@@ -1,7 +1,8 @@
 """Refine a calibrated rig by the epipolar geometry of dense matches.
 
 A calibration from a few hundred landmarks leaves its epipolar lines off by some tenths of a pixel, and matches along
-them slide on oblique edges.  But each match also measures its own distance from the line.  With true cameras (A*, t*) and n the unit normal of the calibrated rig, n.A = 0, that distance is
+them slide on oblique edges.  But each match also measures its own distance from the line.  With true cameras (A*, t*)
+and n the unit normal of the calibrated rig, n.A = 0, that distance is
 
     r = n.(y - t) = n.((A* - A) x + (t* - t)) + noise.
 
