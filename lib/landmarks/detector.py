@@ -167,8 +167,7 @@ class Detector:
             path = paths.MODELS / f"{path.name}.safetensors"
         tensors, metadata = read_checkpoint(path, FORMAT)
         lacking = {"networks", "calibration", "provenance", *_SETTINGS} - metadata.keys()
-        if lacking:
-            text = ", ".join(sorted(lacking))
+        if text := ", ".join(sorted(lacking)):
             raise ValueError(f"{path}: its metadata lack {text}; get the file again, or make it with Detector.save.")
         configs = metadata["networks"].items()
         networks = {f"{name}_network": load_network(path, config, tensors, f"{name}.") for name, config in configs}
@@ -317,8 +316,7 @@ class Detector:
         """
         windows, matrices, which = self.windows(images, u, stage)
         if not len(which):
-            none = Peaks(*(torch.zeros(0, 1, *shape) for shape in ((2,), (), (), (2, 2))))
-            return none, matrices, np.zeros((0, 2), int)
+            return Peaks(*(torch.zeros(0, 1, *s) for s in ((2,), (), (), (2, 2)))), matrices, np.zeros((0, 2), int)
         outputs = self.outputs(windows, stage)
         if stage in CLOSE:
             size, fit = windows.shape[1], self.error_models.get(stage, ErrorModel())

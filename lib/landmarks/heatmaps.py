@@ -34,9 +34,7 @@ def render(u: Tensor, image_size: tuple[int, int], stride: int, sigma_px: float 
     >>> heatmaps.shape, heatmaps[0, 0, 2, 1].item()
     (torch.Size([1, 1, 4, 8]), 1.0)
     """
-    h, w = image_size
-    rows = torch.arange(-(-h // stride), dtype=u.dtype, device=u.device)
-    columns = torch.arange(-(-w // stride), dtype=u.dtype, device=u.device)
+    rows, columns = (torch.arange(-(-side // stride), dtype=u.dtype, device=u.device) for side in image_size)
     cells = (u - (stride - 1) / 2) / stride
     scale = -0.5 / sigma_cells(stride, sigma_px) ** 2
     along_x = torch.exp(scale * (columns - cells[..., :1]) ** 2)

@@ -72,8 +72,7 @@ class HourglassConfig:
 
 
 def _conv(inputs: int, outputs: int, kernel: int, *, stride: int = 1, relu: bool = True) -> nn.Sequential:
-    convolution = nn.Conv2d(inputs, outputs, kernel, stride, padding=kernel // 2, bias=False)
-    layers = [convolution, nn.BatchNorm2d(outputs)]
+    layers = [nn.Conv2d(inputs, outputs, kernel, stride, padding=kernel // 2, bias=False), nn.BatchNorm2d(outputs)]
     return nn.Sequential(*layers, nn.ReLU(inplace=True)) if relu else nn.Sequential(*layers)
 
 
@@ -85,9 +84,7 @@ class Network(nn.Module):
     def fused(self) -> Self:
         """A copy for inference: batch normalisation folded into the convolutions, channels last (same outputs)."""
         network = copy.deepcopy(self).eval()
-        for module in list(network.modules()):
-            if not isinstance(module, nn.Sequential):
-                continue
+        for module in [part for part in network.modules() if isinstance(part, nn.Sequential)]:
             for i in range(len(module) - 1):
                 if isinstance(module[i], nn.Conv2d) and isinstance(module[i + 1], nn.BatchNorm2d):
                     module[i] = fuse_conv_bn_eval(module[i], module[i + 1])

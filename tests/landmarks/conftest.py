@@ -27,12 +27,20 @@ class Shipped:
         return Landmarks.join([detector(self.images[i : i + 2]) for i in range(0, len(self.images), 2)])
 
     @cached_property
+    def torch(self) -> Detector:
+        return Detector.load(engine="torch")
+
+    @cached_property
+    def default(self) -> Detector:
+        return Detector.load()
+
+    @cached_property
     def by_torch(self) -> Landmarks:
-        return self.found(Detector.load(engine="torch"))
+        return self.found(self.torch)
 
     @cached_property
     def by_default(self) -> Landmarks:
-        return self.found(Detector.load())
+        return self.found(self.default)
 
 
 @pytest.fixture(scope="session")

@@ -106,11 +106,11 @@ def test_every_exported_stage_is_that_of_the_detector(small, tmp_path, quick):
 
 @pytest.mark.slow
 def test_every_exported_stage_of_the_shipped_detector_is_its_own(shipped, tmp_path, quick):
-    check_every_stage(Detector.load(engine="torch"), shipped.images[:4], tmp_path)
+    check_every_stage(shipped.torch, shipped.images[:4], tmp_path)
 
 
 def test_the_first_stage_that_ships_is_exported_with_its_gaussian_fit(shipped, tmp_path, quick):
-    whole = Detector.load(engine="torch")
+    whole = shipped.torch
     detector = Detector(whole.frame_network, whole.reduction, error_models=whole.error_models)
     path, difference = export(detector, tmp_path, shipped.images[:2])["frame"]
     assert difference <= LARGEST["px"]

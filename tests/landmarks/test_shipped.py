@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from lib import paths
-from lib.landmarks import Detector, Landmarks
+from lib.landmarks import Landmarks
 from lib.landmarks.engines import default_engine
 from lib.landmarks.metrics import errors_px, pck, tool_length_px
 
@@ -15,7 +15,7 @@ SHIPPED_WEIGHTS = paths.MODELS / "default.safetensors"
 
 def test_the_file_is_small_and_says_where_it_comes_from(shipped):
     assert SHIPPED_WEIGHTS.stat().st_size < 16e6
-    metadata = Detector.load(engine="torch").metadata
+    metadata = shipped.torch.metadata
     assert {"trained_on", "commit", "stages", "metrics"} <= set(metadata)
     assert json.dumps(metadata)
 
@@ -35,13 +35,13 @@ def test_the_default_engine_agrees_with_torch(shipped):
     assert np.nanmedian(np.linalg.norm(fast.u - slow.u, axis=2)) < 0.1
     length = tool_length_px(shipped.u)
     assert abs(pck(fast.u, shipped.u, 0.05, length_px=length) - pck(slow.u, shipped.u, 0.05, length_px=length)) <= 0.5
-    assert Detector.load().engine == default_engine()
+    assert shipped.default.engine == default_engine()
 
 
 def test_tracking_agrees_with_whole_frames(shipped):
     whole = shipped.by_default[:2]
     moved = Landmarks(whole.u + 4.0, whole.covariance, whole.confidence)
-    tracked = Detector.load().track(shipped.images[:2], moved)
+    tracked = shipped.default.track(shipped.images[:2], moved)
     both = (whole.confidence > 0.5) & (tracked.confidence > 0.5)
     assert both.any()
     assert np.median(np.linalg.norm(tracked.u - whole.u, axis=2)[both]) < 0.5
@@ -49,5 +49,5 @@ def test_tracking_agrees_with_whole_frames(shipped):
 
 def test_an_empty_field_has_no_landmarks(shipped):
     ground = np.random.default_rng(0).integers(90, 140, (27, 48, 3), dtype=np.uint8)
-    found = Detector.load(engine="torch")(cv2.resize(ground, (1920, 1080))[None])
+    found = shipped.torch(cv2.resize(ground, (1920, 1080))[None])
     assert (found.confidence < 0.5).all()
