@@ -4,10 +4,9 @@ This is the one type that calibration, clocks, registration, drift and the onlin
 landmarks: the detector, a person who labels, or the simulator (paper Eq. 2).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, fields
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -67,7 +66,7 @@ class Correspondences:
         cls, x_mm: ArrayLike, u_left: ArrayLike, u_right: ArrayLike, *,
         covariance_px2: ArrayLike | None = None, confidence: ArrayLike | None = None, frame: ArrayLike | None = None,
         landmark: ArrayLike | None = None, time_s: ArrayLike | None = None,
-    ) -> Correspondences:  # fmt: skip
+    ) -> Self:  # fmt: skip
         """From plain arrays of n rows; what is not given is unknown (covariance, time) or certain (confidence 1).
 
         Without `frame` every row is a frame of its own, of landmark 0.
@@ -85,7 +84,7 @@ class Correspondences:
         )  # fmt: skip
 
     @classmethod
-    def join(cls, parts: Iterable[Correspondences]) -> Correspondences:
+    def join(cls, parts: Iterable[Self]) -> Self:
         """The rows of several, in their order."""
         parts = list(parts)
         return cls(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)))
@@ -101,7 +100,7 @@ class Correspondences:
         return self.seen.all(axis=1) & np.isfinite(self.x_mm).all(axis=1)
 
     @property
-    def complete(self) -> Correspondences:
+    def complete(self) -> Self:
         """The rows that are complete."""
         return self.subset(self.is_complete)
 
@@ -110,12 +109,12 @@ class Correspondences:
         """(n, 4, 4) of (u_left, u_right); the two images' errors are independent."""
         return pair_covariance(self.covariance_px2, len(self))
 
-    def subset(self, rows: slice | ArrayLike) -> Correspondences:
+    def subset(self, rows: slice | ArrayLike) -> Self:
         """The rows that a slice, a mask or an array of indices names."""
         rows = rows if isinstance(rows, slice) else np.asarray(rows)
         return type(self)(*(getattr(self, f.name)[rows] for f in fields(self)))
 
-    def of_frames(self, frames: ArrayLike) -> Correspondences:
+    def of_frames(self, frames: ArrayLike) -> Self:
         """The rows of these frames."""
         return self.subset(np.isin(self.frame, np.atleast_1d(frames)))
 

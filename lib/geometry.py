@@ -4,10 +4,9 @@ Conventions: points are rows, (n, 3) millimetres or (n, 2) pixels (x right, y do
 pixel centres); a transform is named ``target_from_source``; angles are radians.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -127,12 +126,12 @@ class RigidTransform:
             object.__setattr__(self, name, array)
 
     @classmethod
-    def identity(cls) -> RigidTransform:
+    def identity(cls) -> Self:
         """The transform that moves nothing."""
         return cls(np.eye(3), np.zeros(3))
 
     @classmethod
-    def from_rotation_vector(cls, rotation_rad: ArrayLike, t_mm: ArrayLike = (0.0, 0.0, 0.0)) -> RigidTransform:
+    def from_rotation_vector(cls, rotation_rad: ArrayLike, t_mm: ArrayLike = (0.0, 0.0, 0.0)) -> Self:
         """Rotation by the angle |rotation_rad| about its direction, then translation by t_mm."""
         return cls(Rotation.from_rotvec(np.asarray(rotation_rad, dtype=float)).as_matrix(), np.asarray(t_mm))
 
@@ -143,11 +142,11 @@ class RigidTransform:
             raise ValueError(f"x: expected 3 coordinates in the last axis, got shape {array.shape}.")
         return array @ self.R.T + self.t
 
-    def inverse(self) -> RigidTransform:
+    def inverse(self) -> Self:
         """source_from_target."""
         return RigidTransform(self.R.T, -self.R.T @ self.t)
 
-    def compose(self, other: RigidTransform) -> RigidTransform:
+    def compose(self, other: Self) -> Self:
         """``a_from_b.compose(b_from_c)`` is ``a_from_c``: `other` is applied first."""
         return RigidTransform(self.R @ other.R, self.R @ other.t + self.t)
 

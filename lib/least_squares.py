@@ -3,8 +3,6 @@
 Nocedal and Wright, "Numerical Optimization", 2006, Sec. 10.3.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any

@@ -3,8 +3,6 @@
 A job makes one file or folder.  What exists is not made again, so that work that was stopped goes on where it was.
 """
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import os

@@ -1,7 +1,5 @@
 """Where things lie: the one place that knows the folders of the workbench."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

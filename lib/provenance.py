@@ -1,7 +1,5 @@
 """Provenance of a result: command, commit, machine, date, wall seconds and CPU seconds."""
 
-from __future__ import annotations
-
 import datetime
 import functools
 import os

@@ -1,7 +1,5 @@
 """Is this data enough, and where should the tool go next."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

@@ -6,10 +6,8 @@ So E depends on the data only through their second moments, and its global minim
 (errors-in-variables, total least squares; Golub and Van Loan, "An analysis of the total least squares problem", 1980).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -51,21 +49,21 @@ class Moments:
     scatter: np.ndarray
 
     @classmethod
-    def of(cls, x: np.ndarray, y: np.ndarray) -> Moments:
+    def of(cls, x: np.ndarray, y: np.ndarray) -> Self:
         """Moments of points x (n, 3) and stacked pixels y (n, m)."""
         z = np.hstack([y, x])
         mean = z.mean(axis=0)
         z -= mean
         return cls(float(len(z)), mean, z.T @ z)
 
-    def merged(self, other: Moments) -> Moments:
+    def merged(self, other: Self) -> Self:
         """Moments of both sets together (Chan, Golub and LeVeque's update)."""
         weight = self.weight + other.weight
         step = other.mean - self.mean
         scatter = self.scatter + other.scatter + np.outer(step, step) * (self.weight * other.weight / weight)
         return Moments(weight, self.mean + step * (other.weight / weight), scatter)
 
-    def faded(self, factor: float) -> Moments:
+    def faded(self, factor: float) -> Self:
         """The same points at `factor` times their weight."""
         return Moments(self.weight * factor, self.mean, self.scatter * factor)
 

@@ -1,7 +1,5 @@
 """`Calibration`: cameras, and how well they are known."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 

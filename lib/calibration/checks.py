@@ -1,7 +1,5 @@
 """What is refused before any fit: each check raises a ValueError with the reason and the cure."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """`calibrate`: from correspondences to cameras with their covariance."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial

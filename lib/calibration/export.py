@@ -1,7 +1,5 @@
 """Cameras for other programs: OpenCV YAML and ROS CameraInfo, one camera a file.  `StereoRig.save` writes JSON."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Which model do the data ask for: likelihood-ratio tests and BIC over the ladder."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

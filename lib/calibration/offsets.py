@@ -6,8 +6,6 @@ x + R d_k.  The data cannot tell all nine numbers d from a shift of the cameras,
 whose width the data choose (empirical Bayes).  What the data cannot tell stays in the covariance.
 """
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Calibration frame by frame: fold new rows into the moments, let old ones fade, solve again."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

@@ -1,7 +1,5 @@
 """What the pair's geometry tells of its optics: mirrored channels, convergence, zoom, and where the microscope stands."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Tool offsets: where a landmark sits in the tool's own frame, for robots that report a pose and no landmarks."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """A calibration in words: numbers with units, plain verdicts, the list of outliers."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.stats import chi2
 

@@ -6,8 +6,6 @@ RANSAC", 2003).  Without a threshold samples are ranked by their median residual
 noise is measured on the rows kept, and a row is dropped where its residual would appear once in 10 000 data sets.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The offset between the clocks of video and robot."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -4,8 +4,6 @@ An affine camera maps a point x (mm, robot frame unless said otherwise) to the p
 (paper Sec. IV-A).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Self

@@ -1,8 +1,7 @@
 """Cameras at a finite working distance: one parameter beyond affine."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -102,7 +101,7 @@ class NearAffineCamera(Camera):
         last[3] = 1.0 - last[:3] @ self.reference_mm
         return np.vstack([self.matrix + np.outer(self.centre_px, last - [0, 0, 0, 1]), last])
 
-    def moved(self, motion: RigidTransform) -> NearAffineCamera:
+    def moved(self, motion: RigidTransform) -> Self:
         """As of an affine camera, and the reference point moves along."""
         return replace(super().moved(motion), reference_mm=motion.apply(self.reference_mm))
 

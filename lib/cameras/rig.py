@@ -4,12 +4,11 @@ Two affine cameras stack to y = A x + t with y = (u_left, u_right), A (4, 3): fo
 epipolar residual, so triangulation and epipolar geometry are one small constant matrix.
 """
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -76,7 +75,7 @@ class StereoRig:
         n, e = self.epipolar_normal, -self.epipolar_normal @ self.offset_px
         return np.array([[0.0, 0.0, n[2]], [0.0, 0.0, n[3]], [n[0], n[1], e]])
 
-    def moved(self, left: RigidTransform, right: RigidTransform | None = None) -> StereoRig:
+    def moved(self, left: RigidTransform, right: RigidTransform | None = None) -> Self:
         """The rig after its cameras moved in the frame of their points, both alike or each by its own motion."""
         return StereoRig(self.left.moved(left), self.right.moved(left if right is None else right))
 
@@ -155,7 +154,7 @@ class StereoRig:
         write_json(path, {"format": FORMAT, "units": UNITS, "left": numbers(self.left), "right": numbers(self.right)})
 
     @classmethod
-    def load(cls, path: str | Path) -> StereoRig:
+    def load(cls, path: str | Path) -> Self:
         """Read what `save` wrote.
 
         Raises:

@@ -1,7 +1,5 @@
 """Triangulation of matches: one constant matrix for affine pairs, Gauss-Newton on the pixels for near-affine ones."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -9,8 +9,6 @@ on each frame is reconstructed, and the landmarks show whether the cameras stand
 frames of the tool tell which camera moved and how (Sec. IV-C).
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Landmark annotations as COCO keypoints, both cameras in one file."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath

@@ -1,12 +1,11 @@
 """The stereo frames of a recording: folders of images or two videos, decoded when asked for."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import Self
 
 import cv2
 import numpy as np
@@ -182,7 +181,7 @@ class Frames(Sequence[StereoFrame]):
     def __len__(self) -> int:
         return len(self._numbers)
 
-    def __getitem__(self, index: int | slice) -> StereoFrame | Frames:
+    def __getitem__(self, index: int | slice) -> StereoFrame | Self:
         if isinstance(index, slice):
             part = object.__new__(Frames)
             part.time_s, part._numbers, part._read = self.time_s[index], self._numbers[index], self._read

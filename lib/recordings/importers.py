@@ -1,7 +1,5 @@
 """Public data sets in formats of their own."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

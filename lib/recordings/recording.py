@@ -1,11 +1,10 @@
 """Reading a recording: everything is validated when it is opened, frames are decoded when asked for."""
 
-from __future__ import annotations
-
 import math
 import tomllib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -90,7 +89,7 @@ class Recording:
         return len(self.frames)
 
     @classmethod
-    def open(cls, folder: str | Path) -> Recording:
+    def open(cls, folder: str | Path) -> Self:
         """Open and validate a recording.
 
         Sizes, counts, headers and ends of all images are checked here; pixels are decoded when asked for.

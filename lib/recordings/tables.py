@@ -1,7 +1,5 @@
 """Numeric CSV tables whose errors name file and line, and the column names of landmark tables."""
 
-from __future__ import annotations
-
 import csv
 import io
 import math

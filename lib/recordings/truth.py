@@ -1,11 +1,10 @@
 """What a simulator knows about a recording: the cameras, the landmarks and the surface, exactly."""
 
-from __future__ import annotations
-
 import zipfile
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -48,7 +47,7 @@ class Truth:
     in_glint_right: np.ndarray | None = None
 
     @classmethod
-    def read(cls, folder: Path, n: int) -> Truth:
+    def read(cls, folder: Path, n: int) -> Self:
         """The truth of `n` frames; errors name the file."""
         path = folder / "landmarks.csv"
         table = read_table(path, _COLUMNS, optional=_GLINT_COLUMNS, n_frames=n)

@@ -1,7 +1,5 @@
 """Writing a recording: the folder appears whole and valid, or not at all."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -9,6 +7,7 @@ import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
+from typing import Self
 
 import cv2
 import numpy as np
@@ -74,7 +73,7 @@ class RecordingWriter:
         if self.target.exists() and not (self.target / "recording.toml").is_file():
             raise FileExistsError(f"{self.target}: is not a recording and is left alone; choose another name.")
 
-    def __enter__(self) -> RecordingWriter:
+    def __enter__(self) -> Self:
         for side in ("left", "right"):
             (self.folder / side).mkdir(parents=True)
         return self

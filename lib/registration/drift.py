@@ -1,7 +1,5 @@
 """Has the microscope been moved?  A cumulative sum of how badly the calibrated rig explains each frame."""
 
-from __future__ import annotations
-
 from collections import deque
 
 import numpy as np

@@ -5,12 +5,10 @@ the images every pixel is weighed by its own noise, and landmarks that only one 
 moved cameras see u = project(S x); a small rotation and shift of S x change u by J [-[S x]_x, I], J = du / dx.
 """
 
-from __future__ import annotations
-
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Literal
+from typing import Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -135,7 +133,7 @@ class _Observed:
     scale_known: bool
 
     @classmethod
-    def of(cls, rig, data, u_left, u_right, covariance_px2, sigma_x_mm) -> _Observed:
+    def of(cls, rig, data, u_left, u_right, covariance_px2, sigma_x_mm) -> Self:
         data = data if isinstance(data, Correspondences) else Correspondences.of_points(data, u_left, u_right)
         if not sigma_x_mm >= 0:
             raise ValueError(f"sigma_x_mm: must not be negative, got {sigma_x_mm}.")

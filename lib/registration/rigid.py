@@ -1,7 +1,5 @@
 """Rigid registration of point sets: the sum of norms of Eq. (7), and the sum of squared norms."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

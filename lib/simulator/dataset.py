@@ -5,8 +5,6 @@ python3 -m lib simulate --dry-run          # says how long it takes and how many
 python3 -m lib simulate --shipped          # makes data/open_sky_eye anew
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import shutil

@@ -1,7 +1,5 @@
 """The eye: a smooth height field z(x, y) in the microscope frame with a texture on it; and what any scene must offer."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path

@@ -7,8 +7,6 @@ image that is not mirrored, tip_1 lies left of the direction from base to tips. 
 to 60 degrees, so that this holds in every image.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

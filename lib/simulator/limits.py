@@ -1,7 +1,5 @@
 """Checks of settings: each rule is one line that names the setting, the rule and the value that broke it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 __all__ = ["check", "not_negative", "positive"]

@@ -1,7 +1,5 @@
 """The stereo microscope: geometry of its two cameras, focus, light, shutter and sensor."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Motion of the tool: calibration sweeps that fill a volume, and a surgeon's approach, grasp and peel."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cached_property
 

@@ -4,8 +4,6 @@ Eyes of `RESERVED_SEEDS` and tools with jaws of `RESERVED_JAW_MM` are never draw
 frame shows an eye or a tool of the training.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

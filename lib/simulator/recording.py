@@ -1,7 +1,5 @@
 """Whole recordings with known truth, in the format of `lib.recordings`."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -4,8 +4,6 @@ Everything is computed in linear light.  The optics follow in the order of a rea
 vignetting, sensor noise, gamma.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 

@@ -4,8 +4,6 @@ Microscope frame: origin at the centre of the field on the focal plane, x right 
 image, z away from the cameras (into the eye), millimetres.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields
 
 import numpy as np

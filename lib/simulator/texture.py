@@ -4,8 +4,6 @@ A texture is an image of reflectance, (n, n, 3) uint8 RGB with display gamma, sq
 row and column run along y and x of the microscope frame.
 """
 
-from __future__ import annotations
-
 from functools import lru_cache
 from pathlib import Path
 

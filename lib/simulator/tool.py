@@ -5,8 +5,6 @@ a ray its front is the minimum over s of f(s) = z(s) - sqrt(Q(s)) with Q(s) = r(
 convex, so the minimum has a closed form and no mesh is needed.  The shaft is a cylinder that ends flat.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

@@ -4,10 +4,9 @@ Rays that are parallel, or nearly, meet the smooth height field after a few fixe
 grid of pixels; cubic interpolation then gives every pixel with fourth-order accuracy.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from typing import Self
 
 import cv2
 import numpy as np
@@ -43,7 +42,7 @@ class Window:
     def around(
         cls, camera: AffineCamera | NearAffineCamera, u: np.ndarray, size_px: tuple[int, int],
         field_px: tuple[int, int] | None = None,
-    ) -> Window:  # fmt: skip
+    ) -> Self:  # fmt: skip
         """The window of `size_px` around pixel `u` (2,) of a camera whose whole image has `field_px`."""
         origin = np.round(np.asarray(u) - np.array(size_px) / 2)
         moved = {"matrix": camera.matrix - [[0, 0, 0, origin[0]], [0, 0, 0, origin[1]]]}

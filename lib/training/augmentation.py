@@ -5,8 +5,6 @@ shifts content unless its direction is 0.  Random numbers come from a generator 
 training repeats itself.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import kornia.augmentation as K

@@ -1,7 +1,5 @@
 """``python3 -m lib train`` and ``python3 -m lib evaluate``."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from dataclasses import asdict, replace

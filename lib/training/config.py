@@ -1,7 +1,5 @@
 """What decides a training: network, augmentation, optimiser, schedule; and the presets."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import asdict, dataclass, field

@@ -1,10 +1,9 @@
 """Fitting what makes covariance and confidence true: the error model of each stage, on validation images."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import product
+from typing import Self
 
 import numpy as np
 from scipy.optimize import minimize
@@ -40,7 +39,7 @@ class Seen:
     moved: np.ndarray
 
     @classmethod
-    def joined(cls, parts: Sequence[Seen]) -> Seen:
+    def joined(cls, parts: Sequence[Self]) -> Self:
         """One after the other."""
         return cls(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(cls)))
 

@@ -1,10 +1,9 @@
 """Scores of a detector on labelled images."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields
 from itertools import chain
+from typing import Self
 
 import numpy as np
 from tqdm.auto import tqdm
@@ -34,7 +33,7 @@ class Evaluation:
     names: list[str]
 
     @classmethod
-    def joined(cls, parts: Iterable[Evaluation]) -> Evaluation:
+    def joined(cls, parts: Iterable[Self]) -> Self:
         """Several evaluations as one."""
         found, *arrays, names = zip(*([getattr(e, field.name) for field in fields(cls)] for e in parts), strict=True)
         return cls(Landmarks.join(found), *map(np.concatenate, arrays), list(chain(*names)))

@@ -4,8 +4,6 @@ All randomness of step t comes from a generator seeded with (seed, t).  A run th
 equals one that was not, bit for bit on the CPU: the number of the step is the whole state of the generators.
 """
 
-from __future__ import annotations
-
 import copy
 import os
 import time

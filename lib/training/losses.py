@@ -1,7 +1,5 @@
 """Losses: l2 of heatmaps, distance of their peaks, likelihood of offsets."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

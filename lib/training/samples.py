@@ -1,11 +1,9 @@
 """Labelled images: one by one from a recording, in memory, and mixed."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -96,7 +94,7 @@ class Samples(Source):
             raise ValueError("u: all landmarks of all images are missing; there is nothing to learn.")
 
     @classmethod
-    def drawn(cls, source: Source, seed: int = 0) -> Samples:
+    def drawn(cls, source: Source, seed: int = 0) -> Self:
         """One image drawn for each entry of `source`: validation samples."""
         rng = np.random.default_rng(seed)
         return cls(*map(np.stack, zip(*(source.draw(i, rng) for i in range(len(source))), strict=True)))

@@ -6,8 +6,6 @@ shards keep the full frame as JPEG too.  Shards of windows and of closeups hold 
 Shards are written whole or not at all, so that `generate` can be stopped at any time and continues where it stopped.
 """
 
-from __future__ import annotations
-
 import zipfile
 import zlib
 from collections.abc import Iterable, Iterator, Sequence

@@ -1,7 +1,5 @@
 """The detector's stages: what each learns from, and how; fine-tuning on a user's labelled frames; the shipped detector."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, replace

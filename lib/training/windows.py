@@ -1,9 +1,8 @@
 """What the later stages train on: upright windows and closeups, placed as badly as the stage before places them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Self
 
 import cv2
 import numpy as np
@@ -45,13 +44,13 @@ class WindowSource(_Cut):
     zoom: tuple[float, float] = (0.85, 1.2)
 
     @classmethod
-    def load(cls, folder: str | Path, *, validation: bool = False, shards: int | None = None) -> WindowSource:
+    def load(cls, folder: str | Path, *, validation: bool = False, shards: int | None = None) -> Self:
         """From the shards of a folder, those of windows alone included; or from its first `shards` of frames."""
         kinds = ("validation",) if validation else ("training", "windows")[: 1 if shards else 2]
         return cls(*read_shards(folder, kinds, _CROPS, shards))
 
     @classmethod
-    def load_tools(cls, folder: str | Path, *, validation: bool = False, shards: int | None = None) -> WindowSource:
+    def load_tools(cls, folder: str | Path, *, validation: bool = False, shards: int | None = None) -> Self:
         """Windows round the whole tool at `TOOL_REDUCTION`, for the middle stage."""
         kind = "validation" if validation else "training"
         frames, u, visibility = read_shards(folder, (kind,), ("frames", "u", "visibility"), shards)
@@ -94,7 +93,7 @@ class CloseupSource(_Cut):
     motion_px: float = 1.7
 
     @classmethod
-    def load(cls, folder: str | Path, *, validation: bool = False, kind: str = "closeups") -> CloseupSource:
+    def load(cls, folder: str | Path, *, validation: bool = False, kind: str = "closeups") -> Self:
         """From a folder's shards of a kind; for validation from its whole frames, neither stretched nor blurred."""
         parts = read_shards(folder, ("validation" if validation else kind,), _CROPS)
         seen = parts[2][np.arange(len(parts[3])), parts[3]] == 2

@@ -1,7 +1,5 @@
 """Reads metrics and figures back from executed notebooks, and the versions of what ran them."""
 
-from __future__ import annotations
-
 import base64
 import platform
 from collections.abc import Iterator

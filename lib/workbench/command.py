@@ -1,7 +1,5 @@
 """``python3 -m lib run``: the notebooks one after the other, and the report that grows beside them."""
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import datetime

@@ -1,7 +1,5 @@
 """TeX to SVG, so that a page shows its equations with neither network, nor scripts, nor fonts."""
 
-from __future__ import annotations
-
 import functools
 import html
 import re

@@ -1,7 +1,5 @@
 """Executes one notebook with papermill and judges by its outputs whether it went well."""
 
-from __future__ import annotations
-
 import logging
 import os
 import re

@@ -1,7 +1,5 @@
 """``index.html``: what a run found, the paper's numbers beside its own, and the way to every page."""
 
-from __future__ import annotations
-
 import re
 
 from lib.workbench.execution import Failure

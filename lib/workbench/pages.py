@@ -1,7 +1,5 @@
 """One HTML page of an executed notebook: a single file that opens without network, equations and all."""
 
-from __future__ import annotations
-
 import html
 import json
 import re

@@ -1,7 +1,5 @@
 """Which notebooks run, and with which values of their parameters; all of it is checked before anything runs."""
 
-from __future__ import annotations
-
 import argparse
 import ast
 import contextlib

@@ -1,7 +1,5 @@
 """A plot for each metric of a sweep."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

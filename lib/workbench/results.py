@@ -4,8 +4,6 @@ A table is two files: ``NAME.csv`` (a row a run; units stand in the names of the
 provenance: command, commit, machine, date).
 """
 
-from __future__ import annotations
-
 import csv
 import io
 import json
@@ -14,6 +12,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 
@@ -56,7 +55,7 @@ class Table:
                 found[name] = np.array([math.nan if value in (None, "") else value for value in values])
         return found
 
-    def where(self, **equal: object) -> Table:
+    def where(self, **equal: object) -> Self:
         """The rows whose entries equal those given, such as ``table.where(method="band", seed=0)``.
 
         Raises:

@@ -3,8 +3,6 @@
 Each point of the grid is one run of the notebook, each run one row of the table.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextvars
 import hashlib
