@@ -45,8 +45,6 @@ DOCUMENTED = {"_asdict", "_exit", "_fields", "_replace"}
 #: Names that are called by what they are named: by Python, or by the command line.
 CALLED_BY_OTHERS = {"main", *(function for _, function in FUNCTIONS.values())}
 
-rooms_unfinished = pytest.mark.xfail(reason="the rooms of lib are being rebuilt", strict=False)
-
 
 @cache
 def tree(file: Path) -> ast.Module:
@@ -87,7 +85,6 @@ def room(module: str) -> str:
 # --- size
 
 
-@rooms_unfinished
 def test_lib_is_small():
     lines = {file: len(file.read_text(encoding="utf-8").splitlines()) for file in FILES}
     assert sum(lines.values()) <= 15_000
@@ -158,7 +155,6 @@ def _made(node: ast.AST) -> Iterator[str]:
 # --- names
 
 
-@rooms_unfinished
 def test_every_public_name_is_used():
     """By lib, by a notebook, or by a text that tells users to."""
     used: dict[str, int] = {}
@@ -218,7 +214,6 @@ def test_what_is_offered_exists():
 # --- packages
 
 
-@rooms_unfinished
 def test_every_package_that_is_imported_is_pinned():
     """By environment.toml itself, not only by what something else happens to need."""
     settings = manifest()

@@ -1,7 +1,5 @@
 """Weights on disk: safetensors files with JSON metadata and a checksum of both."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from pathlib import Path

@@ -5,12 +5,11 @@ landmarks in one upright window round the tool.  The third finds each landmark i
 last measures it in a closeup.  The first stage alone, at full resolution, is the paper's detector (Sec. III).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import Self
 
 import cv2
 import numpy as np
@@ -66,20 +65,20 @@ class Landmarks:
     def __len__(self) -> int:
         return len(self.u)
 
-    def __getitem__(self, index: slice | np.ndarray) -> Landmarks:
+    def __getitem__(self, index: slice | np.ndarray) -> Self:
         return Landmarks(self.u[index], self.covariance[index], self.confidence[index])
 
     @classmethod
-    def none(cls, n: int) -> Landmarks:
+    def none(cls, n: int) -> Self:
         """Nothing found in n images."""
         return cls(np.full((n, 3, 2), np.nan), np.full((n, 3, 2, 2), np.nan), np.zeros((n, 3)))
 
     @classmethod
-    def join(cls, parts: Sequence[Landmarks]) -> Landmarks:
+    def join(cls, parts: Sequence[Self]) -> Self:
         """The landmarks of several sets of images, one after the other."""
         return cls(*(np.concatenate([getattr(p, name) for p in parts]) for name in ("u", "covariance", "confidence")))
 
-    def without_unsure(self) -> Landmarks:
+    def without_unsure(self) -> Self:
         """NaN and confidence 0 for every landmark below `MISSING_BELOW`."""
         missing = ~(self.confidence >= MISSING_BELOW)
         return Landmarks(
@@ -88,7 +87,7 @@ class Landmarks:
             np.where(missing, 0.0, self.confidence),
         )
 
-    def _put(self, rows: np.ndarray, values: Landmarks) -> None:
+    def _put(self, rows: np.ndarray, values: Self) -> None:
         self.u[rows], self.covariance[rows], self.confidence[rows] = values.u, values.covariance, values.confidence
 
 
@@ -147,14 +146,14 @@ class Detector:
         """The stages, each with an error model: the networks, and tracking, which uses the closeups' network."""
         return [*self.networks, *(["tracking"] if self.closeup_network else [])]
 
-    def with_error_models(self, **models: ErrorModel) -> Detector:
+    def with_error_models(self, **models: ErrorModel) -> Self:
         """A copy with the error models of some stages (``frame=``, ``window=``, ...) replaced."""
         return replace(self, error_models={**self.error_models, **models})
 
     # Files
 
     @classmethod
-    def load(cls, path_or_name: str | Path | None = None, *, engine: str | None = None) -> Detector:
+    def load(cls, path_or_name: str | Path | None = None, *, engine: str | None = None) -> Self:
         """A detector from a weights file, or from a name in ``data/models``; None is the one that ships.
 
         `engine` runs its networks; None is the fastest that is installed (`lib.landmarks.engines`).

@@ -4,8 +4,6 @@ OpenVINO computes in bfloat16 where the processor has units for it, else in floa
 0.01 of their height.  The recorded table of the detector's speed compares the two.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import sys
 import threading

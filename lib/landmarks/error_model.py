@@ -1,7 +1,5 @@
 """From peaks to covariance and confidence: the error model that is fitted on validation images."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

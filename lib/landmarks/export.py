@@ -7,8 +7,6 @@ stages ``window``, ``closeup`` and ``tracking`` see a window of one landmark, an
 the frame before.  These two share a network and differ in their error models.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import tempfile
 import warnings

@@ -4,9 +4,8 @@ Cells and pixels obey the half-pixel rule of `lib.geometry`: cell c of a heatmap
 s * c + (s - 1) / 2.  Sigma is in pixels of the network's input whatever the stride.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
+from typing import Self
 
 import torch
 from torch import Tensor
@@ -58,7 +57,7 @@ class Peaks:
     width: Tensor
     covariance: Tensor
 
-    def double(self) -> Peaks:
+    def double(self) -> Self:
         """The same in float64."""
         return Peaks(self.u.double(), self.value.double(), self.width.double(), self.covariance.double())
 

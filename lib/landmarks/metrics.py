@@ -1,7 +1,5 @@
 """How good detections are: PCK, errors in pixels, and whether covariance and confidence are true."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

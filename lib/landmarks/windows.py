@@ -5,8 +5,6 @@ tip_1, the left tip as seen along the tool, lies above.  So the network sees one
 image.  Closeups are reduced a little, and mirrored for tip_2, so that both tips look alike.
 """
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike

@@ -6,8 +6,6 @@ matches = match(left, right, rig=RECTIFIED)              # a rectified pair: row
 points = rig.triangulate(matches.u_left, matches.u_right, matches.covariance_px2)
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -4,8 +4,6 @@ A coarse pass on small images, free to leave the epipolar line, tells whether th
 the scene lies.  The fine pass searches only the band that is left.
 """
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ Of the atomic patches only the pooled maps are stored.  Their full maps are four
 where the paths arrive at them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

@@ -4,8 +4,6 @@ Source: Weinzaepfel, Revaud, Harchaoui, Schmid, DeepFlow (ICCV 2013); Revaud et 
 Deformable Dense Matching (IJCV 2016), Sec. 3.1.
 """
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike

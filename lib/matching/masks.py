@@ -1,7 +1,5 @@
 """Masks of what a matcher should ignore: (h, w) bool, True = ignore."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike

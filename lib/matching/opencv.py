@@ -1,7 +1,5 @@
 """Other matchers under the same interface: OpenCV's SGBM and DIS, and any callable, on rectified canvases."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 

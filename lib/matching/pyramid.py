@@ -14,8 +14,6 @@ last two axes are either places in the right image (`shifted`: a child lies one 
 displacements, in which a child stays where its parent is.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 

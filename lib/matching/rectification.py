@@ -6,8 +6,6 @@ left one up to a shift along H^-1 e that is linear in depth.  There is no singul
 perspective cameras, as long as the two viewing directions differ.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

@@ -7,8 +7,6 @@ w.(f - g) / w.w.  It is exact to second order and has no bias at zero, unlike th
 three correlations, which stays as the starting point for `VolumeMatches`.
 """
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np

@@ -1,8 +1,7 @@
 """What every matcher returns."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
+from typing import Self
 
 import numpy as np
 
@@ -52,7 +51,7 @@ class Matches:
         """Standard deviation (n,) px of each match along a direction (4,) of (u_left, u_right)."""
         return np.sqrt(np.einsum("i,nij,j->n", direction, self.covariance_px2, direction))
 
-    def keep(self, chosen: np.ndarray) -> Matches:
+    def keep(self, chosen: np.ndarray) -> Self:
         """The matches of a mask (n,) or of indices."""
         names = ("u_left", "u_right", "score", "covariance_px2", "peak_ratio", "reciprocal")
         return replace(self, **{name: getattr(self, name)[chosen] for name in names})

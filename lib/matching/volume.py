@@ -4,10 +4,9 @@ A volume holds (gy, gx, 2 v + 1, n) responses: lattice of patches, rows off the 
 In displacement coordinates the shifts between a patch and its children vanish, so both passes are slices only.
 """
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
+from typing import Self
 
 import numpy as np
 import torch
@@ -30,7 +29,7 @@ class VolumeMatches:
     peaked: np.ndarray  # (n,) bool, whether the response has an interior peak along x
     reciprocal: np.ndarray  # (n,) bool, whether no other patch fits the same place of the right image better
 
-    def keep(self, chosen: np.ndarray) -> VolumeMatches:
+    def keep(self, chosen: np.ndarray) -> Self:
         """The matches of a mask (n,) or of indices."""
         return VolumeMatches(*(getattr(self, field.name)[chosen] for field in fields(self)))
 

@@ -3,8 +3,6 @@
 The parameter is the left image point u = (x, y) px.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -4,8 +4,6 @@ Open3D writes meshes and point clouds, and removes outliers.  It is imported her
 needs system libraries.  Files appear whole or not at all.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """How a surface was found, and how sure it is."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from functools import cached_property
 

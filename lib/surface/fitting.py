@@ -1,7 +1,5 @@
 """Robust surface fit: data, smoothness, rejection and uncertainty around the solver (paper Sec. IV-B, Eq. 6)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 from typing import Literal

@@ -4,8 +4,6 @@ A grid of ``control = (n_x, n_y)`` control points covers the domain (x0, y0, x1,
 so the control points reach one cell beyond it on each side.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 

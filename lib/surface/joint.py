@@ -11,8 +11,6 @@ error, and the covariance of the calibration carries them over to all sixteen en
 Kalman filter whose prior is the calibration.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from lib.cameras import AffineCamera, StereoRig

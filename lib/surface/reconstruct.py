@@ -3,8 +3,6 @@
 This is the one way from two images to a surface; the notebooks and the online system both take it.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor

@@ -5,10 +5,9 @@ narrow band of the spline's own grid.  `interior_point` walks to its exact minim
 and returns the duality gap as proof.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cache, cached_property
+from typing import Self
 
 import numpy as np
 from scipy import sparse
@@ -48,7 +47,7 @@ class L1Problem:
         return self.design.T.tocsr()
 
     @cached_property
-    def by_cells(self) -> tuple[np.ndarray, L1Problem]:
+    def by_cells(self) -> tuple[np.ndarray, Self]:
         """Order (n,) of the points by cells, and the problem in that order: neighbours in space are so in memory."""
         order = np.argsort(self.grid.locate(self.u)[0] @ self.grid.stride, kind="stable")
         return order, L1Problem(self.grid, self.u[order])
