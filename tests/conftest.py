@@ -6,7 +6,7 @@ import os
 import shutil
 
 for _variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
-    os.environ.setdefault(_variable, "2")  # before numpy and torch are imported
+    os.environ.setdefault(_variable, "1")  # before numpy and torch are imported; every core has tests of its own
 os.environ.setdefault("MPLBACKEND", "Agg")
 os.environ.setdefault("OPEN3D_DISABLE_WEB_VISUALIZER", "true")
 
