@@ -32,7 +32,7 @@ _NAME = re.compile(r"[a-z][a-z0-9_.]*")
 
 
 def record(name: str, value: float, unit: str, *, paper: float | None = None, note: str = "") -> None:
-    """State one figure: shown as a small row, and collected into the run's ``metrics.json``.
+    """State one number: shown as a small row, and collected into the run's ``metrics.json``.
 
     Args:
         name: Lower-case snake case that starts with the stage, such as ``"calibration_reprojection_px"``. Recording a
@@ -40,7 +40,7 @@ def record(name: str, value: float, unit: str, *, paper: float | None = None, no
         value: A number; NaN and infinity are stored as null (JSON has no word for them).
         unit: ``"px"``, ``"mm"``, ``"um"``, ``"s"``, ``"%"``, ...; ``""`` for a pure number.
         paper: The paper's value in the same unit, where it states one.
-        note: What a reader must know to judge the figure: the data, the number of samples.
+        note: What a reader must know to judge the number: the data, the number of samples.
 
     Raises:
         ValueError: For a name that is not snake case, or a value that is not a number.

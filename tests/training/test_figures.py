@@ -132,6 +132,11 @@ def test_every_recorded_table_can_be_drawn(name):
     assert records.recorded(table).startswith("Recorded 20")
 
 
+def test_the_recorded_speeds_stand_side_by_side_in_each_engine():
+    for networks in records.speed_rows(results.read("engines_and_speed")).values():
+        assert {"coarse to fine", "the same while tracking", "paper's network"} <= set(networks)
+
+
 def test_real_curves_have_a_panel_for_each_kind_of_test():
     thresholds = np.linspace(0.05, 0.5, 10)
     names = []
