@@ -11,18 +11,7 @@ from pathlib import Path
 import pytest
 
 from lib import files, parallel
-
-
-def children(pid: int) -> list[int]:
-    """Processes whose parent is `pid`."""
-    found = []
-    for stat in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            if int(stat.read_text().rpartition(")")[2].split()[1]) == pid:
-                found.append(int(stat.parent.name))
-        except OSError:
-            continue
-    return found
+from tests.processes import children
 
 
 def test_jobs_survive_a_lost_worker_and_run_once(tmp_path):

@@ -21,6 +21,7 @@ from lib.workbench import sweep as sweeping
 from lib.workbench.parameters import UsageError, split_values
 from lib.workbench.plots import save_plots
 from lib.workbench.sweep import main, sweep
+from tests.processes import children
 
 PARAMETERS = """\
 seed: int = 0  # of the noise; grid: 0, 1
@@ -164,14 +165,3 @@ def test_sixty_runs_outlive_a_killed_worker_and_an_external_cluster_agrees(write
     assert len(finished("external")) == 60
     (external,) = (tmp_path / "external").glob("sweeps/*/results.csv")
     assert external.read_text() == table.read_text()
-
-
-def children(pid: int) -> list[int]:
-    found = []
-    for stat in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            if int(stat.read_text().rpartition(")")[2].split()[1]) == pid:
-                found.append(int(stat.parent.name))
-        except OSError:
-            continue
-    return found
