@@ -16,10 +16,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from matplotlib.figure import (
-        Figure,  # at run time it would slow every notebook's start
-    )
+if TYPE_CHECKING:  # at run time it would slow every notebook's start
+    from matplotlib.figure import Figure
 
 __all__ = ["FIGURE_METADATA", "METRIC_MIME", "format_value", "record", "show", "timed", "unit_text"]
 
