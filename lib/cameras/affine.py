@@ -6,14 +6,14 @@ An affine camera maps a point x (mm, robot frame unless said otherwise) to the p
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Self
+from typing import Protocol, Self, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from lib.geometry import RigidTransform, points
 
-__all__ = ["AffineCamera", "Camera", "Resection"]
+__all__ = ["AffineCamera", "Camera", "MatrixCamera", "Resection"]
 
 
 @dataclass(frozen=True)
@@ -34,9 +34,22 @@ class Resection:
     mirrored: bool = False
 
 
+@runtime_checkable
+class Camera(Protocol):
+    """Anything that projects points.
+
+    >>> isinstance(AffineCamera([[100, 0, 0, 960], [0, 100, 0, 540]]), Camera)
+    True
+    """
+
+    def project(self, x: ArrayLike) -> np.ndarray:
+        """Pixels (n, 2) of points (n, 3) in mm."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
-class Camera:
-    """What every camera has: the matrix (2, 4), px per mm and px, of the affine camera that it is or that touches it.
+class MatrixCamera:
+    """What our cameras share: the matrix (2, 4), px per mm and px, of the affine camera that it is or that touches it.
 
     A model adds `project`, `jacobian` and `projection_matrix`.  A ValueError refuses a matrix that is not finite or whose
     linear part has rank below 2.
@@ -80,7 +93,7 @@ class Camera:
         return replace(self, matrix=np.column_stack([self.linear @ back.R, self.linear @ back.t + self.offset_px]))
 
 
-class AffineCamera(Camera):
+class AffineCamera(MatrixCamera):
     """u = matrix @ [x; 1], matrix (2, 4) in px per mm and px."""
 
     def project(self, x: ArrayLike) -> np.ndarray:

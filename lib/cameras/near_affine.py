@@ -6,14 +6,14 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lib.cameras.affine import AffineCamera, Camera
+from lib.cameras.affine import AffineCamera, MatrixCamera
 from lib.geometry import RigidTransform, points
 
 __all__ = ["NearAffineCamera", "radial_derivative"]
 
 
 @dataclass(frozen=True, eq=False)
-class NearAffineCamera(Camera):
+class NearAffineCamera(MatrixCamera):
     """A camera at a finite working distance d, one parameter beyond affine: u = c + (M [x; 1] - c) / D.
 
     D = 1 + r3.(x - reference) / d.  Affine is 1/d = 0, a regular point, so 1/d can be estimated and tested where

@@ -13,7 +13,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lib.cameras.affine import AffineCamera, Camera
+from lib.cameras.affine import AffineCamera, MatrixCamera
 from lib.cameras.near_affine import NearAffineCamera
 from lib.cameras.triangulation import Points, best_linear, triangulate_near_affine
 from lib.files import write_json
@@ -37,8 +37,8 @@ class StereoRig:
     ([[1.0, 2.0, 0.5]], [0.0])
     """
 
-    left: Camera
-    right: Camera
+    left: MatrixCamera
+    right: MatrixCamera
 
     @cached_property
     def is_affine(self) -> bool:
@@ -148,7 +148,7 @@ class StereoRig:
     def save(self, path: str | Path) -> None:
         """Write the rig as JSON (matrices, units); the file appears whole or not at all."""
 
-        def numbers(camera: Camera) -> dict:
+        def numbers(camera: MatrixCamera) -> dict:
             return {field.name: np.asarray(getattr(camera, field.name)).tolist() for field in fields(camera)}
 
         write_json(path, {"format": FORMAT, "units": UNITS, "left": numbers(self.left), "right": numbers(self.right)})

@@ -4,12 +4,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lib.cameras.affine import Camera
+from lib.cameras.affine import MatrixCamera
 from lib.cameras.near_affine import NearAffineCamera
 
 __all__ = ["Points", "best_linear", "triangulate_near_affine"]
 
-_Pair = tuple[Camera, Camera]
+_Pair = tuple[MatrixCamera, MatrixCamera]
 #: Points at a time: few enough for their arrays to stay in the processor's cache.
 _BLOCK = 8192
 

@@ -55,6 +55,16 @@ class BSplineSurface:
         control_points.setflags(write=False)
         object.__setattr__(self, "control_points_mm", control_points)
 
+    @property
+    def objective(self) -> float:
+        """Eq. (6) at this surface over the final inliers, in mm and px; NaN for a surface that was not fitted."""
+        return self.fit.objective if self.fit else float("nan")
+
+    @property
+    def inliers(self) -> np.ndarray | None:
+        """(n,) bool: the points that the final fit used; None for a surface that was not fitted."""
+        return self.fit.inliers if self.fit else None
+
     def __call__(self, u: ArrayLike) -> np.ndarray:
         """Points (n, 3) mm at image points (n, 2) px; NaN outside the domain."""
         return self.derivative(u, (0, 0))
