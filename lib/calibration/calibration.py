@@ -40,7 +40,7 @@ class Calibration:
 
     Attributes:
         cameras, rig: One or two, near-affine if the model has 1/distance or radial distortion; the pair, None for one.
-        inliers: (n,) bool, the rows used, one entry for each row given.
+        view_inliers: (n, cameras) bool, the views used, one row for each row given.
         cost: The energy over the inliers (Eq. 3 as printed for ``paper``, else half the chi-square).
         covariance, parameter_covariance: (8 cameras, 8 cameras) of the entries of the matrices M, row by row, left
             first, in px^2, px^2/mm, px^2/mm^2; and (p, p) of the model's own parameters.
@@ -55,7 +55,7 @@ class Calibration:
 
     cameras: tuple[Camera, ...]
     rig: StereoRig | None
-    inliers: np.ndarray
+    view_inliers: np.ndarray
     cost: float
     covariance: np.ndarray
     parameter_covariance: np.ndarray
@@ -83,6 +83,11 @@ class Calibration:
         if self.rig is None:
             raise ValueError("calibration: this needs a stereo pair, not a single camera; calibrate with [u_left, u_right].")
         return self.rig
+
+    @property
+    def inliers(self) -> np.ndarray:
+        """(n,) bool: the rows used in at least one view."""
+        return self.view_inliers.any(axis=1)
 
     @property
     def usable(self) -> np.ndarray:

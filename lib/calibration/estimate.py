@@ -131,7 +131,7 @@ def _spread_out(found: Calibration, usable: np.ndarray) -> Calibration:
     names = ["residuals_px", "x_mm", "y_px"]
     if found.covariance_px2 is not None and len(found.covariance_px2) > 1:
         names.append("covariance_px2")
-    return replace(found, inliers=full(found.inliers, False), **{n: full(getattr(found, n), np.nan) for n in names})
+    return replace(found, view_inliers=full(found.view_inliers, False), **{n: full(getattr(found, n), np.nan) for n in names})
 
 
 def _calibrate(
@@ -189,7 +189,8 @@ def _calibrate(
         zoom = np.sqrt(np.abs(np.linalg.det(cameras[0].linear @ cameras[0].linear.T)) ** 0.5)
         refuse.check_order(rig.linear, np.hypot(sigma_u / zoom, sigma_x) / (spread * np.sqrt(inliers.sum() / 2)))
     return Calibration(
-        cameras=cameras, rig=rig, inliers=inliers, cost=minimum.cost, covariance=G @ parameter_covariance @ G.T,
+        cameras=cameras, rig=rig, view_inliers=np.repeat(inliers[:, None], m // 2, axis=1), cost=minimum.cost,
+        covariance=G @ parameter_covariance @ G.T,
         parameter_covariance=parameter_covariance, sigma_u_px=sigma_u, sigma_x_mm=sigma_x, residuals_px=residuals,
         model=model, weighting=weighting, x_mm=x, y_px=y, covariance_px2=noise,
         image_size_px=None if image_size_px is None else tuple(image_size_px), plan=plan, minimum=minimum,

@@ -14,11 +14,15 @@ from scipy.stats import f as f_distribution
 
 from lib.calibration.affine import Moments, affine_minimum, distances2, estimate_noise, regress
 
-__all__ = ["consensus", "gate"]
+__all__ = ["NoConsensusError", "consensus", "gate"]
 
 FALSE_ALARM = 1e-4
 _ROWS_RANKED = 500
 _FEW = 25  # rows, below which the noise of the best sample is no measure
+
+
+class NoConsensusError(ValueError):
+    """The rows agree on no camera, or on two that compete; the text says which, how many rows, and the cure."""
 
 
 def gate(n: int, m: int) -> float:
@@ -38,7 +42,7 @@ def consensus(
     """Rows (n,) bool of x (n, 3) mm and y (n, m) px that agree on one pair of affine cameras.
 
     `threshold_px` is the largest reprojection distance of a row in any image; None measures the noise and decides by it.
-    Samples thinner than five times the robot's accuracy `sigma_x_mm` are not used.  A ValueError says that no affine
+    Samples thinner than five times the robot's accuracy `sigma_x_mm` are not used.  A `NoConsensusError` says that no affine
     camera explains enough rows: a quarter of them, with a threshold a tenth, and eight.
     """
     n, m = y.shape
@@ -78,13 +82,13 @@ def consensus(
         keep = _by_noise(x, y, keep)
         enough = max(8, int(0.25 * n))
     if keep.sum() < enough:
-        raise ValueError(
+        raise NoConsensusError(
             f"u: only {int(keep.sum())} of {n} rows agree on affine cameras; check that x_mm and u belong together "
             "(frames, order of landmarks, time offset), or raise ransac_px."
         )
     rms = np.sqrt(((y[keep] - H[keep] @ regress(x[keep], y[keep]).T) ** 2).mean())
     if rms > 0.25 * np.sqrt(y[keep].var(axis=0).mean()):
-        raise ValueError(
+        raise NoConsensusError(
             f"u: no consensus, all rows look like outliers: the best affine cameras leave {rms:.3g} px RMS; check that x_mm "
             "and u belong together."
         )
