@@ -9,9 +9,9 @@ from pathlib import Path
 
 import nbformat
 
-from lib.workbench.report import FIGURE_METADATA, METRIC_MIME
+from lib.workbench.report import FIGURE_METADATA, METRIC_MIME, STOP_METADATA
 
-__all__ = ["NamedFigure", "figures_of", "metrics_of", "outputs", "versions"]
+__all__ = ["NamedFigure", "figures_of", "left_out_of", "metrics_of", "outputs", "versions"]
 
 #: Packages whose version can change a figure.
 _TOLD = ("numpy", "scipy", "torch", "kornia", "opencv-python-headless", "open3d-cpu", "open3d", "cvxpy", "clarabel")
@@ -34,6 +34,11 @@ def metrics_of(executed: Path) -> list[dict]:
         if metric:
             metrics[metric["name"]] = {key: metric[key] for key in ("name", "value", "unit", "paper", "note")}
     return list(metrics.values())
+
+
+def left_out_of(executed: Path) -> str | None:
+    """Why `report.stop` ended the notebook before its last cell; None if it did not."""
+    return next((o["metadata"][STOP_METADATA] for o in outputs(executed) if STOP_METADATA in o.get("metadata", {})), None)
 
 
 def figures_of(executed: Path) -> list[NamedFigure]:

@@ -143,7 +143,7 @@ class _Report:
             "versions": collection.versions(),
             "notebooks": [
                 {"name": book.stem, "title": title_of(book), "state": "pending", "seconds": None, "failure": None,
-                 "page": None, "executed": None}
+                 "page": None, "executed": None, "left_out": None}
                 for book in notebooks
             ],
             "metrics": [],
@@ -166,6 +166,7 @@ class _Report:
         entry.update(state="failed" if failure else "complete", seconds=round(seconds, 2))
         entry["failure"] = failure.as_dict() if failure else None
         try:
+            entry["left_out"] = collection.left_out_of(executed)
             self.content["metrics"] += [{"notebook": book.stem, **m} for m in collection.metrics_of(executed)]
         except (OSError, ValueError):  # there is none, or a full disk has cut it off
             executed.unlink(missing_ok=True)

@@ -88,7 +88,10 @@ def execute(
 
 
 def failure_of(executed: Path, cell_timeout_s: float | None = None) -> Failure | None:
-    """Judge an executed notebook by its outputs: papermill calls a cell that was timed out completed."""
+    """Judge an executed notebook by its outputs: papermill calls a cell that was timed out completed.
+
+    A notebook that `report.stop` ended went well.
+    """
     cells = [cell for cell in nbformat.read(executed, as_version=4).cells if not _is_added(cell)]
     for number, cell in enumerate(cells, start=1):
         if cell.cell_type != "code" or "raises-exception" in cell.metadata.get("tags", []):
@@ -97,6 +100,8 @@ def failure_of(executed: Path, cell_timeout_s: float | None = None) -> Failure |
         for output in cell.outputs:
             if output.output_type != "error":
                 continue
+            if output.ename == "SystemExit" and not output.evalue:
+                return None  # `report.stop`
             if output.ename == "KeyboardInterrupt" and cell_timeout_s and _seconds(status) >= cell_timeout_s:
                 return Failure("timeout", number, _longer_than(cell_timeout_s))
             return Failure("error", number, f"{output.ename}: {_ANSI.sub('', output.evalue)}")

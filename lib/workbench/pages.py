@@ -15,6 +15,7 @@ from pygments.formatters import HtmlFormatter
 from pygments.lexers import PythonLexer
 
 from lib.workbench import equations
+from lib.workbench.report import STOP_METADATA
 
 __all__ = ["PLOTLY_FILE", "markdown_html", "page", "render"]
 
@@ -76,13 +77,21 @@ def page(
     return render(
         "page.html",
         title=title,
-        body="\n".join(_cell(cell, folder, widgets) for cell in notebook.cells),
+        body="\n".join(_cell(cell, folder, widgets) for cell in _until_stop(notebook.cells)),
         previous=previous,
         following=following,
         code_css=HtmlFormatter(style="friendly").get_style_defs(".code"),
         plotly='class="plotly-view"',
         plotly_file=PLOTLY_FILE,
     )
+
+
+def _until_stop(cells: list) -> Iterator:
+    """The cells up to the one in which `report.stop` ended the notebook."""
+    for cell in cells:
+        yield cell
+        if any(STOP_METADATA in output.get("metadata", {}) for output in cell.get("outputs", [])):
+            return
 
 
 def _cell(cell, folder: Path, widgets: dict) -> str:
@@ -108,7 +117,8 @@ def _outputs(outputs: list, widgets: dict) -> Iterator[str]:
             if text.strip():
                 yield f'<pre class="{output["name"]}">{ansi2html(text)}</pre>'
         elif output["output_type"] == "error":
-            yield f'<pre class="error">{ansi2html(chr(10).join(output["traceback"]))}</pre>'
+            if output["traceback"]:
+                yield f'<pre class="error">{ansi2html(chr(10).join(output["traceback"]))}</pre>'
         else:
             yield _rich(output["data"], widgets, output.get("metadata", {}))
 

@@ -14,19 +14,32 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
 if TYPE_CHECKING:  # at run time it would slow every notebook's start
     from matplotlib.figure import Figure
 
-__all__ = ["FIGURE_METADATA", "METRIC_MIME", "format_value", "record", "show", "timed", "unit_text"]
+__all__ = ["FIGURE_METADATA", "METRIC_MIME", "STOP_METADATA", "format_value", "record", "show", "stop", "timed", "unit_text"]
 
 #: Mime type of a metric in a notebook's outputs; the JSON holds name, value, unit, paper, note.
 METRIC_MIME = "application/vnd.microstereo.metric+json"
 #: Key of the output metadata that names a figure: {"name": ..., "caption": ...}.
 FIGURE_METADATA = "microstereo_figure"
 
+#: Key of the output metadata that says why a notebook ended before its last cell.
+STOP_METADATA = "microstereo_stop"
+
 _NAME = re.compile(r"[a-z][a-z0-9_.]*")
+
+
+class _End(Exception):
+    """Ends a notebook without a traceback."""
+
+    def _render_traceback_(self) -> list[str]:
+        return []
+
+
+_End.__name__ = "SystemExit"  # papermill and JupyterLab know an error of this name, without a value, as an end in good order
 
 
 def record(name: str, value: float, unit: str, *, paper: float | None = None, note: str = "") -> None:
@@ -93,6 +106,17 @@ def timed(stage: str) -> Iterator[None]:
     start = time.perf_counter()
     yield
     record(name, round(time.perf_counter() - start, 4), "s")
+
+
+def stop(reason: str) -> NoReturn:
+    """End the notebook in good order: the report counts it as complete, says why, and leaves the cells that follow out.
+
+    Args:
+        reason: Full sentences: what is left out, why, and what to do.
+    """
+    line = f'<p style="border-left:4px solid #999;padding:.5em 1em">{html.escape(reason)}</p>'
+    _publish({"text/html": line, "text/plain": reason}, reason, {STOP_METADATA: reason})
+    raise _End
 
 
 def format_value(value: float | None) -> str:

@@ -14,6 +14,7 @@ def run_with(text: str) -> dict:
     """The content of a metrics.json with `text` in every place that data can reach."""
     failure = {"kind": "error", "cell": 3, "message": f"ValueError: recording.toml: unknown key {text!r}"}
     book = {"name": "01_data", "title": text, "seconds": 1.0, "page": "01_data.html", "executed": "01_data.ipynb"}
+    book["left_out"] = text
     return {
         "state": "failed",
         "profile": "quick",

@@ -41,6 +41,12 @@ def test_show_closes_the_figure(capsys):
     assert capsys.readouterr().out == "Figure a_picture: What it shows.\n"
 
 
+def test_stop_says_why_and_ends(capsys):
+    with pytest.raises(Exception, match="^$") as ended:
+        report.stop("Nothing was detected.")
+    assert type(ended.value).__name__ == "SystemExit" and capsys.readouterr().out == "Nothing was detected.\n"
+
+
 def test_timed_records_seconds_and_nothing_for_an_error(capsys):
     with report.timed("calibration"):
         pass

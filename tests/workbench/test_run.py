@@ -32,6 +32,8 @@ GOOD = [
     "import ipywidgets\nipywidgets.interactive(lambda k: print('k is', k), k=3)",
 ]
 
+ENDED = ["from lib.workbench import report\nreport.stop('No distances, because <i>nothing</i> was detected.')", "1 / 0"]
+
 
 @pytest.fixture(scope="module")
 def books(write_notebook, tmp_path_factory) -> Path:
@@ -39,6 +41,7 @@ def books(write_notebook, tmp_path_factory) -> Path:
     write_notebook(folder, "00_error", "1 / 0", "print('never')", title="It fails")
     write_notebook(folder, "02_dead", "import os; os.kill(os.getpid(), 9)")
     write_notebook(folder, "03_good", *GOOD, title="It <works>")
+    write_notebook(folder, "04_ended", *ENDED)
     return folder
 
 
@@ -79,7 +82,7 @@ def test_a_dead_kernel_is_told(finished):
 def test_the_others_still_run(finished):
     content, _ = finished
     assert content["state"] == "failed"
-    assert [book["state"] for book in content["notebooks"]] == ["failed", "failed", "complete"]
+    assert [book["state"] for book in content["notebooks"]] == ["failed", "failed", "complete", "complete"]
 
 
 def test_a_notebook_that_is_no_json_fails_before_anything_runs(tmp_path):
@@ -87,6 +90,16 @@ def test_a_notebook_that_is_no_json_fails_before_anything_runs(tmp_path):
     with pytest.raises(UsageError, match="00_torn.ipynb: not a notebook"):
         run(runs=tmp_path / "runs", notebooks=tmp_path)
     assert not (tmp_path / "runs").exists()
+
+
+def test_a_notebook_that_stops_itself_is_complete_and_says_why(finished):
+    content, folder = finished
+    (entry,) = (book for book in content["notebooks"] if book["name"] == "04_ended")
+    assert entry["state"] == "complete" and entry["left_out"] == "No distances, because <i>nothing</i> was detected."
+    page = (folder / entry["page"]).read_text(encoding="utf-8")
+    assert "because &lt;i&gt;nothing" in page and "error" not in page.split("</style>")[-1]
+    assert '<span class="mi">1</span> <span class="o">/' not in page, "what was left out is not shown"
+    assert "because &lt;i&gt;nothing" in (folder / "index.html").read_text(encoding="utf-8")
 
 
 # --- what a run leaves
