@@ -4,7 +4,7 @@ This is the one way from two images to a surface; the notebooks and the online s
 """
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -72,7 +72,7 @@ def reconstruct(
     rig: StereoRig | Calibration,
     *,
     setting: str = "quality",
-    method: str | None = None,
+    method: str | Callable | None = None,
     refine: bool | None = None,
     u_landmarks: tuple[ArrayLike, ArrayLike] | None = None,
     mask_left: np.ndarray | None = None,
