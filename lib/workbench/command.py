@@ -121,6 +121,9 @@ def run(
         if entry["failure"]:
             print(f"FAILED {entry['name']}: {Failure(**entry['failure'])}", file=sys.stderr)
     print(f"\nReport: {report.folder / 'index.html'}")
+    if report.content["verdict"]:
+        names = ", ".join(dict.fromkeys(reason["name"].replace("_", " ") for reason in report.content["reasons"]))
+        print(f"Verdict: {report.content['verdict']}" + (f" ({names})" if names else ""))
     return report.content
 
 
@@ -143,9 +146,11 @@ class _Report:
             "versions": collection.versions(),
             "notebooks": [
                 {"name": book.stem, "title": title_of(book), "state": "pending", "seconds": None, "failure": None,
-                 "page": None, "executed": None, "left_out": None}
+                 "page": None, "executed": None, "left_out": None, "verdict": None, "reasons": []}
                 for book in notebooks
             ],
+            "verdict": None,
+            "reasons": [],
             "metrics": [],
             "figures": [],
         }  # fmt: skip
@@ -167,6 +172,8 @@ class _Report:
         entry["failure"] = failure.as_dict() if failure else None
         try:
             entry["left_out"] = collection.left_out_of(executed)
+            entry.update(collection.verdict_of(executed) or {})
+            self.content.update(collection.joined(self.content["notebooks"]) or {})
             self.content["metrics"] += [{"notebook": book.stem, **m} for m in collection.metrics_of(executed)]
         except (OSError, ValueError):  # there is none, or a full disk has cut it off
             executed.unlink(missing_ok=True)
@@ -203,7 +210,7 @@ class _Report:
         pages_of = [None, *((f"{other['name']}.html", other["title"]) for other in self.content["notebooks"]), None]
         place = self.notebooks.index(book)
         text = pages.page(
-            self.executed(book), title=entry["title"], folder=book.parent,
+            self.executed(book), title=entry["title"], folder=book.parent, verdict=entry,
             previous=pages_of[place], following=pages_of[place + 2],
         )  # fmt: skip
         if pages.PLOTLY_FILE in text and not (self.folder / pages.PLOTLY_FILE).exists():

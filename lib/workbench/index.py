@@ -4,7 +4,7 @@ import re
 
 from lib.workbench.execution import Failure
 from lib.workbench.pages import markdown_html, render
-from lib.workbench.report import format_value, unit_text
+from lib.workbench.report import VERDICT_COLOURS, format_value, unit_text, verdict_html
 
 __all__ = ["index_html"]
 
@@ -38,6 +38,8 @@ def index_html(run: dict) -> str:
         "index.html",
         run=run,
         states=_STATES,
+        verdict=verdict_html(run) if run["verdict"] else "",
+        colours=VERDICT_COLOURS,
         facts=facts,
         titles={book["name"]: book["title"] for book in run["notebooks"]},
         pages={book["name"]: book["page"] for book in run["notebooks"]},

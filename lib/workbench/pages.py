@@ -15,7 +15,7 @@ from pygments.formatters import HtmlFormatter
 from pygments.lexers import PythonLexer
 
 from lib.workbench import equations
-from lib.workbench.report import STOP_METADATA
+from lib.workbench.report import STOP_METADATA, verdict_html
 
 __all__ = ["PLOTLY_FILE", "markdown_html", "page", "render"]
 
@@ -64,12 +64,14 @@ def render(template: str, **values: object) -> str:
 
 
 def page(
-    executed: Path, *, title: str, folder: Path, previous: tuple[str, str] | None, following: tuple[str, str] | None
-) -> str:
+    executed: Path, *, title: str, folder: Path, verdict: dict, previous: tuple[str, str] | None,
+    following: tuple[str, str] | None,
+) -> str:  # fmt: skip
     """The HTML of an executed notebook.
 
     Args:
         folder: Where the notebook's source lies: what its relative pictures are relative to.
+        verdict: `verdict` (None: it stated none) and `reasons`, shown on top.
         previous, following: (file, title) of the neighbouring pages.
     """
     notebook = nbformat.read(executed, as_version=4)
@@ -78,6 +80,7 @@ def page(
         "page.html",
         title=title,
         body="\n".join(_cell(cell, folder, widgets) for cell in _until_stop(notebook.cells)),
+        verdict=verdict_html(verdict) if verdict["verdict"] else "",
         previous=previous,
         following=following,
         code_css=HtmlFormatter(style="friendly").get_style_defs(".code"),

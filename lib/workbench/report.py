@@ -1,7 +1,7 @@
-"""What a notebook states: metrics and named figures that the main job collects from the executed notebook.
+"""What a notebook states: metrics, figures and verdicts that the main job collects from the executed notebook.
 
-Both travel inside the notebook's outputs (a metric as JSON under its own mime type, a figure as a PNG that knows
-its name), so an executed notebook alone is the record of what it found.  Outside Jupyter they print one line.
+They travel inside the notebook's outputs (metrics and verdicts as JSON under mime types of their own, a figure as a PNG
+that knows its name), so an executed notebook alone is the record of what it found.  Outside Jupyter they print one line.
 """
 
 from __future__ import annotations
@@ -14,15 +14,22 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, NoReturn, Protocol
 
 if TYPE_CHECKING:  # at run time it would slow every notebook's start
     from matplotlib.figure import Figure
 
-__all__ = ["FIGURE_METADATA", "METRIC_MIME", "STOP_METADATA", "format_value", "record", "show", "stop", "timed", "unit_text"]
+__all__ = [
+    "FIGURE_METADATA", "METRIC_MIME", "STOP_METADATA", "VERDICT_COLOURS", "VERDICT_MIME", "format_value", "record", "show",
+    "stop", "timed", "unit_text", "verdict", "verdict_html",
+]  # fmt: skip
 
 #: Mime type of a metric in a notebook's outputs; the JSON holds name, value, unit, paper, note.
 METRIC_MIME = "application/vnd.microstereo.metric+json"
+#: Mime type of a verdict; the JSON is that of `lib.trust.Verdict`.
+VERDICT_MIME = "application/vnd.microstereo.verdict+json"
+#: The colour of each verdict, from the best to the worst.
+VERDICT_COLOURS = {"trustworthy": "#067647", "doubtful": "#b54708", "not trustworthy": "#b42318"}
 #: Key of the output metadata that names a figure: {"name": ..., "caption": ...}.
 FIGURE_METADATA = "microstereo_figure"
 
@@ -40,6 +47,12 @@ class _End(Exception):
 
 
 _End.__name__ = "SystemExit"  # papermill and JupyterLab know an error of this name, without a value, as an end in good order
+
+
+class Judged(Protocol):
+    """What `verdict` takes: `lib.trust.Verdict`."""
+
+    def to_json(self) -> dict: ...
 
 
 def record(name: str, value: float, unit: str, *, paper: float | None = None, note: str = "") -> None:
@@ -69,6 +82,29 @@ def record(name: str, value: float, unit: str, *, paper: float | None = None, no
     if note:
         text += f"  # {note}"
     _publish({METRIC_MIME: metric, "text/html": _row_html(metric), "text/plain": text}, text)
+
+
+def verdict(found: Judged) -> None:
+    """State a verdict (`lib.trust.Verdict`): shown as a badge with its reasons, here and on top of the notebook's page.
+
+    The main job joins what several cells and notebooks state; the worst counts.
+    """
+    content = found.to_json()
+    _publish({VERDICT_MIME: content, "text/html": verdict_html(content), "text/plain": str(found)}, str(found))
+
+
+def verdict_html(content: dict) -> str:
+    """A badge with its reasons, every text escaped; `content` has `verdict` and `reasons`."""
+    level, reasons = content["verdict"], content["reasons"]
+    colour = VERDICT_COLOURS[level]
+    badge = f'<b style="background:{colour};color:#fff;border-radius:1em;padding:.15em .8em">{html.escape(level)}</b>'
+    lines = "".join(
+        f'<li style="margin:.3em 0"><b style="color:{VERDICT_COLOURS[r["level"]]}">{html.escape(r["name"].replace("_", " "))}'
+        f"</b>: {html.escape(r['text'])} <i>{html.escape(r['cure'])}</i></li>"
+        for r in reasons
+    )
+    lines = f'<ul style="margin:.5em 0 0">{lines}</ul>' if lines else ""
+    return f'<div class="verdict" style="border-left:4px solid {colour};padding:.5em 1em;margin:.8em 0">{badge}{lines}</div>'
 
 
 def show(figure: Figure, name: str, caption: str) -> None:

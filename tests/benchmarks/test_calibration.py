@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lib.calibration import Moments, OnlineCalibration, affine_minimum, calibrate, report
+from lib.calibration import Moments, OnlineCalibration, affine_minimum, calibrate
 from lib.simulator.rig import simulate_correspondences
+from lib.trust import report
 
 
 def stacked(n):

@@ -1,9 +1,9 @@
-"""Leverage, leave-one-out, covariance of points, advice, report, optics."""
+"""Leverage, leave-one-out, covariance of points, advice, optics."""
 
 import numpy as np
 import pytest
 
-from lib.calibration import added_error, box_grid, calibrate, dlt, next_positions, optics, report
+from lib.calibration import added_error, box_grid, calibrate, dlt, next_positions, optics
 from lib.cameras import NearAffineCamera
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig, simulate_correspondences
 
@@ -143,24 +143,6 @@ def test_the_data_are_enough_when_calibration_adds_little():
     assert ratio[0] > 3 * ratio[1] and few.depth_sd_mm(grid).max() > 3 * many.depth_sd_mm(grid).max()
     with pytest.raises(ValueError, match="high_mm"):
         box_grid(ROBOT_FROM_MICROSCOPE.t + 3, ROBOT_FROM_MICROSCOPE.t - 3)
-
-
-def test_report_says_what_is_wrong():
-    c, found = made(100, model="zero_skew")
-    text = report(found)
-    assert "LOOK" not in text and "px/mm" in text and "Outliers" not in text
-    u_left = c.u_left.copy()
-    u_left[[3, 50]] += 400
-    text = report(calibrate(c.x_mm, [u_left, c.u_right]))
-    assert "2 outliers" in text and "    50:" in text
-    rig = reference_rig()
-    near = [NearAffineCamera(k.matrix, 1 / 80, (959.5, 539.5), ROBOT_FROM_MICROSCOPE.t) for k in (rig.left, rig.right)]
-    u = [k.project(c.true_x_mm) + np.random.default_rng(0).normal(size=(100, 2)) for k in near]
-    assert "curved" in report(calibrate(c.true_x_mm, u))
-    assert "working distance" in report(calibrate(c.true_x_mm, u, model="near_affine"))
-    assert "camera" in report(calibrate(c.x_mm, [c.u_left]))
-    twice = [c.u_left, c.u_left + np.random.default_rng(0).normal(size=(100, 2))]
-    assert "hardly differ" in report(calibrate(c.x_mm, twice))
 
 
 def test_optics_of_the_reference_rig():

@@ -14,7 +14,7 @@ def run_with(text: str) -> dict:
     """The content of a metrics.json with `text` in every place that data can reach."""
     failure = {"kind": "error", "cell": 3, "message": f"ValueError: recording.toml: unknown key {text!r}"}
     book = {"name": "01_data", "title": text, "seconds": 1.0, "page": "01_data.html", "executed": "01_data.ipynb"}
-    book["left_out"] = text
+    book |= {"left_out": text, "verdict": "doubtful"}
     return {
         "state": "failed",
         "profile": "quick",
@@ -24,6 +24,8 @@ def run_with(text: str) -> dict:
         "commit": {"id": "0123456789abcdef", "modified": True},
         "machine": {"system": text, "processor": text, "cores": 2, "memory_gb": 8.0, "gpu": text},
         "versions": {"python": text},
+        "verdict": "doubtful",
+        "reasons": [{"name": text, "level": "doubtful", "text": text, "cure": text}],
         "notebooks": [book | {"state": "failed", "failure": failure}, book | {"state": "pending", "failure": None}],
         "metrics": [
             {"notebook": "01_data", "name": "a_px", "value": 1.5, "unit": "px", "paper": 2.0, "note": text},

@@ -28,6 +28,9 @@ GOOD = [
     "fig, ax = plt.subplots(figsize=(2, 1)); ax.plot([1, 2])\n"
     'report.show(fig, "calibration_residuals", "Small everywhere.")',
     'with report.timed("calibration"): pass\nprint(profile)',
+    'from lib.trust import Reason, Verdict\n'
+    'report.verdict(Verdict((Reason("clock", "not trustworthy", "183 ms > 1 ms", "Give <offset_s>."),)))',
+    'report.verdict(Verdict())',
     "import plotly.graph_objects as go\ngo.Figure(go.Scatter(x=[1], y=[2]))",
     "import ipywidgets\nipywidgets.interactive(lambda k: print('k is', k), k=3)",
 ]
@@ -108,7 +111,7 @@ def test_a_notebook_that_stops_itself_is_complete_and_says_why(finished):
 def test_metrics_follow_the_schema(finished):
     content, _ = finished
     assert set(content) == {"format", "version", "state", "profile", "parameters", "started", "seconds", "commit",
-                            "machine", "versions", "notebooks", "metrics", "figures"}  # fmt: skip
+                            "machine", "versions", "verdict", "reasons", "notebooks", "metrics", "figures"}  # fmt: skip
     assert content["format"] == "microstereo.metrics" and content["parameters"] == {"seed": "3"}
     assert content["metrics"][0] == {
         "notebook": "03_good", "name": "calibration_reprojection_px", "value": 4.5, "unit": "px", "paper": 2.0,
@@ -118,6 +121,17 @@ def test_metrics_follow_the_schema(finished):
     assert content["metrics"][1]["value"] is None
     assert content["machine"]["cores"] >= 1 and content["versions"]["python"]
     assert sum(book["seconds"] for book in content["notebooks"]) <= content["seconds"]
+
+
+def test_verdicts_are_joined(finished):
+    content, folder = finished
+    good, reason = content["notebooks"][2], content["reasons"][0]
+    assert good["verdict"] == content["verdict"] == "not trustworthy" and content["notebooks"][0]["verdict"] is None
+    assert reason == {"name": "clock", "level": "not trustworthy", "text": "183 ms > 1 ms", "cure": "Give <offset_s>."}
+    for page in ("index.html", "03_good.html"):
+        text = (folder / page).read_text(encoding="utf-8")
+        start, place = text.index("<main>"), text.index("183 ms &gt; 1 ms")
+        assert place - start < 3000 and "Give <offset_s>" not in text
 
 
 def test_figures_are_files(finished):

@@ -1,0 +1,22 @@
+"""The calibration in words, the verdict on top."""
+
+import numpy as np
+
+from lib.calibration import calibrate
+from lib.simulator.rig import simulate_correspondences
+from lib.trust import report
+
+
+def test_the_report_begins_with_the_verdict():
+    c = simulate_correspondences(100, rng=np.random.default_rng(0))
+    text = report(calibrate(c.x_mm, [c.u_left, c.u_right]), robot_accuracy_mm=0.01)
+    assert text.startswith("Verdict: trustworthy\nCalibration: model") and "px/mm" in text and "Outliers" not in text
+    assert "volume" in text and "camera" in report(calibrate(c.x_mm, [c.u_left]))
+
+
+def test_outliers_are_listed():
+    c = simulate_correspondences(100, rng=np.random.default_rng(0))
+    u_left = c.u_left.copy()
+    u_left[[3, 50]] += 400
+    text = report(calibrate(c.x_mm, [u_left, c.u_right]))
+    assert "2 outliers" in text and "    50:" in text
