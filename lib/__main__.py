@@ -24,6 +24,10 @@ python3 -m lib COMMAND [options]        (in the folder of the workbench)
   bench [...] benchmarks; what follows goes to pytest
   sweep NOTEBOOK [-p NAME VALUE,VALUE,...] [--workers N | --scheduler ADDRESS] [--record]
               one notebook over a grid of parameters, on Dask; a table and a plot of each metric
+  import SOURCE --map MAPPING.toml [--guess | --out RECORDING]
+              a recording from videos, a robot's log and labels, as the mapping says
+  detect, calibrate, reconstruct, register RECORDING [--out FOLDER]
+              landmarks, cameras, surface and registration into files for other programs
   simulate, train, evaluate [...]
               make recordings and data sets; train the landmark detector; measure it (--help says more)
   setup       only make the environment (each command does it when it is needed)
@@ -140,6 +144,7 @@ def ruff_options() -> list[str]:
 #: Command -> the function that it calls, and its module.
 FUNCTIONS = {
     "run": ("lib.workbench.command", "main"),
+    **{name: ("lib.commands", f"main_{name}") for name in ("import", "detect", "calibrate", "reconstruct", "register")},
     "sweep": ("lib.workbench.sweep", "main"),
     "simulate": ("lib.simulator.dataset", "main"),
     "train": ("lib.training.command", "main"),

@@ -40,6 +40,8 @@ MAY_IMPORT = {
     "training": SEEN | {"landmarks", "calibration", "matching", "registration", "surface", "simulator"},
     "online": SEEN | {"landmarks", "calibration", "matching", "registration", "surface", "trust", "training"},
     "adapt": SEEN | {"landmarks", "calibration", "matching", "registration", "surface", "trust", "training"},
+    "importing": SEEN | {"landmarks", "calibration"},  # it finds clock offsets and tools
+    "commands": SEEN | {"landmarks", "calibration", "matching", "registration", "surface", "trust", "importing"},
     "workbench": BASE,
 }
 #: Attributes of others that start with an underscore and are documented.

@@ -9,13 +9,13 @@ from lib.calibration.ladder import LADDER, Comparison, Rung, compare_models
 from lib.calibration.offsets import with_offsets
 from lib.calibration.online import OnlineCalibration
 from lib.calibration.optics import Optics, optics
-from lib.calibration.pivot import Pivot, ToolOffsets, pivot_calibration, tool_offsets
+from lib.calibration.pivot import Pivot, Tool, ToolOffsets, pivot_calibration, tool_offsets
 from lib.calibration.robust import NoConsensusError
 from lib.calibration.timing import TimeOffset, estimate_time_offset
 
 __all__ = [
     "LADDER", "Calibration", "Comparison", "LandmarkOffsets", "Moments", "NoConsensusError", "OnlineCalibration", "Optics",
-    "Pivot", "Rung", "TimeOffset", "ToolOffsets", "added_error", "affine_minimum", "box_grid", "calibrate",
+    "Pivot", "Rung", "TimeOffset", "Tool", "ToolOffsets", "added_error", "affine_minimum", "box_grid", "calibrate",
     "compare_models", "dlt", "estimate_time_offset", "next_positions", "optics", "paper_variances",
     "pivot_calibration", "tool_offsets", "with_offsets", "write_opencv", "write_ros",
 ]  # fmt: skip

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -10,9 +11,10 @@ from lib.calibration.affine import Moments, affine_minimum
 from lib.cameras import AffineCamera
 from lib.geometry import RigidTransform
 
-__all__ = ["Pivot", "ToolOffsets", "pivot_calibration", "tool_offsets"]
+__all__ = ["Pivot", "Tool", "ToolOffsets", "pivot_calibration", "tool_offsets"]
 
 _TURN = 0.02  # least RMS turn (rad) about a second axis: 10 um of the robot's noise then leave 0.5 mm / sqrt(poses)
+_OPENING = 0.03  # least range of half the opening (rad): 100 um at the end of a jaw of 3 mm
 _LARGEST_SD_MM = 1.0  # of an offset's coordinate; beyond it the motion determines nothing
 
 
@@ -27,17 +29,54 @@ class Pivot:
 
 
 @dataclass(frozen=True, eq=False)
-class ToolOffsets:
-    """Landmarks in the tool frame, `offset_mm` (k, 3), their covariance (k, 3, 3) mm^2, and the cameras found with them."""
+class Tool:
+    """Landmarks in the tool frame, of a tool whose jaws may open: offset + sin(o / 2) sine + (1 - cos(o / 2)) versine.
+
+    Here o is the full angle between the jaws.
+
+    Attributes:
+        offset_mm: (k, 3) where the landmarks are when the jaws are closed.
+        sine_mm, versine_mm: (k, 3) how they turn as the jaws open; 0 for a fixed landmark.
+    """
 
     offset_mm: np.ndarray
+    sine_mm: np.ndarray
+    versine_mm: np.ndarray
+
+    @classmethod
+    def hinged(
+        cls, offset_mm: ArrayLike, turning: ArrayLike, point_mm: ArrayLike, axis: ArrayLike, jaw_mm: ArrayLike
+    ) -> Self:
+        """From a hinge: an axis through a point, and the vector from there to the tips of the closed jaws.
+
+        `turning` (k,) is 1 for a landmark that turns with the axis, -1 against it, 0 for one at its `offset_mm` (k, 3).
+
+        >>> tool = Tool.hinged(np.zeros((3, 3)), [0, 1, -1], [0, 0, 0], [0, 0, 1], [3, 0, 0])
+        >>> tool.positions_mm([RigidTransform.identity()], [np.pi / 3])[0].round(2).tolist()
+        [[0.0, 0.0, 0.0], [2.6, 1.5, 0.0], [2.6, -1.5, 0.0]]
+        """
+        side = np.asarray(turning, np.float64)[:, None]
+        axis, jaw = np.asarray(axis, np.float64), np.asarray(jaw_mm, np.float64)
+        if not np.linalg.norm(np.cross(axis, jaw)) > 1e-6:
+            raise ValueError("axis, jaw_mm: the jaw lies along the axis, or one of them is zero; no opening would move it.")
+        axis = axis / np.linalg.norm(axis)
+        offset = np.where(side == 0, offset_mm, np.asarray(point_mm, np.float64) + jaw)
+        return cls(offset, side * np.cross(axis, jaw), -np.abs(side) * (jaw - axis * (axis @ jaw)))
+
+    def positions_mm(self, robot_from_tool: Sequence[RigidTransform], opening_rad: ArrayLike | None = None) -> np.ndarray:
+        """(n, k, 3) landmark positions in the robot frame at the poses: what `calibrate` and a recording want."""
+        half = np.zeros(len(robot_from_tool)) if opening_rad is None else np.asarray(opening_rad, np.float64) / 2
+        turn = np.sin(half)[:, None, None] * self.sine_mm + (1 - np.cos(half))[:, None, None] * self.versine_mm
+        return np.stack([pose.apply(x) for pose, x in zip(robot_from_tool, self.offset_mm + turn, strict=True)])
+
+
+@dataclass(frozen=True, eq=False)
+class ToolOffsets(Tool):
+    """A tool that was estimated: with the covariance of `offset_mm`, (k, 3, 3) mm^2, and the cameras found with it."""
+
     covariance_mm2: np.ndarray
     cameras: tuple[AffineCamera, ...]
     rms_px: float
-
-    def positions_mm(self, robot_from_tool: Sequence[RigidTransform]) -> np.ndarray:
-        """(n, k, 3) landmark positions in the robot frame at the poses: what `calibrate` and a recording want."""
-        return np.stack([pose.apply(self.offset_mm) for pose in robot_from_tool])
 
 
 def pivot_calibration(robot_from_tool: Sequence[RigidTransform]) -> Pivot:
@@ -64,17 +103,23 @@ def pivot_calibration(robot_from_tool: Sequence[RigidTransform]) -> Pivot:
     return Pivot(solution[:3], solution[3:], covariance, rms)
 
 
-def tool_offsets(robot_from_tool: Sequence[RigidTransform], u: Sequence[ArrayLike], iterations: int = 100) -> ToolOffsets:
+def tool_offsets(
+    robot_from_tool: Sequence[RigidTransform], u: Sequence[ArrayLike], iterations: int = 100, *,
+    opening_rad: ArrayLike | None = None, turning: ArrayLike | None = None,
+) -> ToolOffsets:  # fmt: skip
     """Landmark offsets and affine cameras together, from poses and images: y = A (R_i p_k + t_i) + o.
 
-    Gauss-Newton on both, started from the lifted problem that is linear in (A, A (x) p, o).
+    Gauss-Newton on both, started from the lifted problem that is linear in (A, A (x) p, o).  A landmark on a jaw that opens
+    has p_k = offset + sin(o_i / 2) sine + (1 - cos(o_i / 2)) versine, which is linear too, wherever its hinge lies.
 
     Args:
         robot_from_tool: n poses, the tool turned about at least two axes.
         u: One array a camera, (n, k, 2) px; NaN = missing.
+        opening_rad: (n,) full angle between the jaws; None is a tool without a hinge.
+        turning: (k,) not 0 for landmarks on a jaw; None is all but the first.
 
     Raises:
-        ValueError: For too few poses, motion that does not determine the offsets, or shapes that do not match.
+        ValueError: For too few poses, motion that does not determine the offsets or the hinge, or shapes that do not match.
     """
     R, t = _poses(robot_from_tool)
     images = [np.asarray(pixels, dtype=np.float64) for pixels in u]
@@ -82,31 +127,47 @@ def tool_offsets(robot_from_tool: Sequence[RigidTransform], u: Sequence[ArrayLik
         raise ValueError(f"u: expected ({len(R)}, k, 2) pixels a camera, got {[i.shape for i in images]}.")
     y = np.concatenate(images, axis=2)
     k, m = y.shape[1:]
-    frame, landmark = np.nonzero(np.isfinite(y).all(axis=2))
+    half = None if opening_rad is None else np.asarray(opening_rad, np.float64) / 2
+    known = np.isfinite(y).all(axis=2) & (True if half is None else np.isfinite(half)[:, None])
+    frame, landmark = np.nonzero(known)
     pixels, R, t = y[frame, landmark], R[frame], t[frame]
-    if pixels.size < 4 * m + 3 * k:
-        raise ValueError(f"u: {len(pixels)} detections are too few for {k} offsets and the cameras.")
-    own = landmark[:, None] == np.arange(k)
+    own = (landmark[:, None] == np.arange(k)).astype(np.float64)
+    on_jaw = np.arange(k) > 0 if turning is None else np.asarray(turning) != 0
+    if half is not None:
+        _check_opening(half[frame[on_jaw[landmark]]])
+        jaw = own[:, on_jaw]
+        own = np.hstack([own, np.sin(half[frame])[:, None] * jaw, (1 - np.cos(half[frame]))[:, None] * jaw])
+    q = own.shape[1]
+    if pixels.size < 4 * m + 3 * q:
+        raise ValueError(f"u: {len(pixels)} detections are too few for {q} vectors of the tool and the cameras.")
     scale = t.std()
     offset = _lifted_start(R, t / scale, pixels, own) * scale
     for _ in range(iterations):
-        x = np.einsum("nij,nj->ni", R, offset[landmark]) + t
+        x = np.einsum("nij,nj->ni", R, own @ offset) + t
         matrix = affine_minimum(Moments.of(x, pixels), 1.0, 0.0).matrix
         r = pixels - x @ matrix[:, :3].T - matrix[:, 3]
         # Variable projection (Kaufman): the cameras are linear, so their columns are swept out of the offsets'.
-        J = ((matrix[:, :3] @ R)[:, :, None] * own[:, None, :, None]).reshape(len(x), m, 3 * k)
+        J = ((matrix[:, :3] @ R)[:, :, None] * own[:, None, :, None]).reshape(len(x), m, 3 * q)
         Q = np.linalg.qr(np.column_stack([x - x.mean(axis=0), np.ones(len(x))]))[0]
         J -= np.tensordot(Q, np.tensordot(Q.T, J, axes=1), axes=1)
-        flat = J.reshape(-1, 3 * k)
+        flat = J.reshape(-1, 3 * q)
         step = np.linalg.lstsq(flat, r.ravel(), rcond=None)[0]
-        offset = offset + step.reshape(k, 3)
+        offset = offset + step.reshape(q, 3)
         if np.abs(step).max() < 1e-9 * scale:
             break
-    covariance = float((r**2).sum()) / max(r.size - 4 * m - 3 * k, 1) * np.linalg.inv(flat.T @ flat)
-    blocks = np.stack([covariance[j : j + 3, j : j + 3] for j in range(0, 3 * k, 3)])
-    _check_determined(blocks)
+    information = flat.T @ flat
+    if np.linalg.cond(information) > 1e13:
+        raise ValueError("robot_from_tool: the motion leaves an offset open by any amount; turn the tool about two axes.")
+    variance = float((r**2).sum()) / max(r.size - 4 * m - 3 * q, 1)
+    covariance = (variance * np.linalg.inv(information)).reshape(q, 3, q, 3)
+    # What counts is how sure a landmark is at each opening that occurs: a vector of little effect may be vague.
+    _check_determined(np.einsum("na,aibj,nb->nij", own, covariance, own))
+    blocks = covariance[np.arange(k), :, np.arange(k)]
+    sine, versine = np.zeros((2, k, 3))
+    if half is not None:
+        sine[on_jaw], versine[on_jaw] = np.split(offset[k:], 2)
     cameras = tuple(AffineCamera(matrix[2 * c : 2 * c + 2]) for c in range(m // 2))
-    return ToolOffsets(offset, blocks, cameras, float(np.sqrt((r**2).sum() / (len(r) * m / 2))))
+    return ToolOffsets(offset[:k], sine, versine, blocks, cameras, float(np.sqrt((r**2).sum() / (len(r) * m / 2))))
 
 
 def _poses(robot_from_tool: Sequence[RigidTransform]) -> tuple[np.ndarray, np.ndarray]:
@@ -128,8 +189,20 @@ def _check_determined(covariance_mm2: np.ndarray) -> None:
         )
 
 
+def _check_opening(half_rad: np.ndarray) -> None:
+    span = float(np.ptp(half_rad)) if half_rad.size else 0.0
+    if span < _OPENING:
+        raise ValueError(
+            f"opening_rad: the jaws open by {2 * span:.2g} rad only, which leaves the hinge open; open and close them, or "
+            "leave the opening out."
+        )
+
+
 def _lifted_start(R: np.ndarray, t: np.ndarray, y: np.ndarray, own: np.ndarray) -> np.ndarray:
-    """Offsets (k, 3) from the linear problem in A, B_k = A (x) p_k and o, whose rank is restored by least squares."""
+    """Vectors (k, 3) of the tool, `own` (n, k) of each in a row, from the linear problem in A, B_k = A (x) p_k and o.
+
+    The rank of B_k is restored by least squares.
+    """
     n, k = own.shape
     lifted = (own[:, :, None] * R.reshape(n, 1, 9)).reshape(n, 9 * k)
     solution = np.linalg.lstsq(np.hstack([t, np.ones((n, 1)), lifted]), y, rcond=1e-6)[0]

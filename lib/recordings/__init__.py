@@ -3,7 +3,7 @@
 A recording is a folder of plain files that a lab can write from any program::
 
     recording/
-      recording.toml     name, fps, image_size_px, units, skeleton, robot_accuracy_mm, readout_s, offset_s
+      recording.toml     name, fps, image_size_px, units, skeleton, robot_accuracy_mm, readout_s, offset_s, bit_depth
       frames.csv         frame, time_s: only where frames are not uniform in time
       left/ right/       000000.jpg (or .png) ..., or left.mp4 and right.mp4
       kinematics.csv     time_s, base_x_mm, base_y_mm, base_z_mm, tip_1_x_mm, ...: robot clock, robot frame
@@ -17,11 +17,11 @@ A rolling shutter reads row y at readout_s * (y / (height - 1) - 1/2) after that
 """
 
 from lib.recordings.annotations import Annotations
-from lib.recordings.frames import Frames, StereoFrame, read_image
+from lib.recordings.frames import Frames, StereoFrame, read_image, to_8_bits
 from lib.recordings.importers import MonocularSequence, import_retinal_microsurgery
 from lib.recordings.recording import Kinematics, Recording
 from lib.recordings.truth import Truth
 from lib.recordings.writer import RecordingWriter
 
 __all__ = ["Annotations", "Frames", "Kinematics", "MonocularSequence", "Recording", "RecordingWriter", "StereoFrame"]
-__all__ += ["Truth", "import_retinal_microsurgery", "read_image"]
+__all__ += ["Truth", "import_retinal_microsurgery", "read_image", "to_8_bits"]

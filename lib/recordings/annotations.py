@@ -1,6 +1,7 @@
 """Landmark annotations as COCO keypoints, both cameras in one file."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
@@ -16,11 +17,11 @@ _SIDES = ("left", "right")
 
 @dataclass(frozen=True)
 class Annotations:
-    """Annotated landmarks of n frames, in the order base, tip_1, tip_2.
+    """Annotated landmarks of n frames, in the recording's order: base, tip_1, tip_2 of a forceps.
 
     Attributes:
-        u_left, u_right: (n, 3, 2) px, NaN where not labelled.
-        visibility_left, visibility_right: (n, 3) int as in COCO: 0 not labelled, 1 labelled but hidden, 2 visible.
+        u_left, u_right: (n, k, 2) px, NaN where not labelled.
+        visibility_left, visibility_right: (n, k) int as in COCO: 0 not labelled, 1 labelled but hidden, 2 visible.
             None = 2 wherever there is a label.
     """
 
@@ -33,13 +34,15 @@ class Annotations:
         for side in _SIDES:
             u, v = np.asarray(getattr(self, f"u_{side}"), np.float64), getattr(self, f"visibility_{side}")
             v = np.full(u.shape[:2], 2) if v is None else np.asarray(v)
-            if u.ndim != 3 or u.shape[1:] != (len(LANDMARKS), 2) or v.shape != u.shape[:2]:
-                raise ValueError(f"u_{side}: expected (n, 3, 2) with visibility (n, 3), got {u.shape} and {v.shape}.")
+            if u.ndim != 3 or u.shape[2] != 2 or v.shape != u.shape[:2] or u.shape != np.shape(self.u_left):
+                raise ValueError(f"u_{side}: expected (n, k, 2) with visibility (n, k), got {u.shape} and {v.shape}.")
             object.__setattr__(self, f"u_{side}", u)
             object.__setattr__(self, f"visibility_{side}", np.where(np.isfinite(u).all(axis=2), v, 0).astype(np.int64))
 
 
-def read_coco(path: Path, n_frames: int, image_size_px: tuple[int, int]) -> Annotations:
+def read_coco(
+    path: Path, n_frames: int, image_size_px: tuple[int, int], landmarks: Sequence[str] = LANDMARKS
+) -> Annotations:
     """Read COCO keypoints whose image names are ``left/000012.jpg`` and the like.
 
     The names in the category order the keypoints, so any order in the file will do; other keypoints are ignored.
@@ -60,15 +63,15 @@ def read_coco(path: Path, n_frames: int, image_size_px: tuple[int, int]) -> Anno
         what = f"not COCO keypoints ({type(error).__name__}: {error})"
         raise ValueError(f"{path}: {what}. Export the annotations again.") from None
     width, height = image_size_px
-    u = np.full((2, n_frames, len(LANDMARKS), 2), np.nan)
-    visibility = np.zeros((2, n_frames, len(LANDMARKS)), dtype=np.int64)
+    u = np.full((2, n_frames, len(landmarks), 2), np.nan)
+    visibility = np.zeros((2, n_frames, len(landmarks)), dtype=np.int64)
     seen = set()
     for image, names, keypoints, entry in entries:
         where = f"image {entry['image_id']}, category {entry['category_id']}"
         if names is None or image is None:
             raise ValueError(f"{path}: an annotation names {where}; no such entry.")
-        if not set(LANDMARKS) <= set(names):
-            raise ValueError(f"{path}: {where} has keypoints {names}; {list(LANDMARKS)} are needed.")
+        if not set(landmarks) <= set(names):
+            raise ValueError(f"{path}: {where} has keypoints {names}; {list(landmarks)} are needed.")
         file = PurePosixPath(image)
         if file.parent.name not in _SIDES or not file.stem.isdecimal() or int(file.stem) >= n_frames:
             known = f"left/000000.jpg to right/{n_frames - 1:06d}.jpg"
@@ -81,7 +84,7 @@ def read_coco(path: Path, n_frames: int, image_size_px: tuple[int, int]) -> Anno
             values = np.array(keypoints, dtype=np.float64).reshape(len(names), 3)
         except (ValueError, TypeError):
             raise ValueError(f"{path}: image {file}: keypoints must be x, y, visibility for each name.") from None
-        x, y, v = values[[names.index(landmark) for landmark in LANDMARKS]].T
+        x, y, v = values[[names.index(landmark) for landmark in landmarks]].T
         if not np.isin(v, (0, 1, 2)).all():
             raise ValueError(f"{path}: image {file}: visibility is 0, 1 or 2.")
         inside = (x >= -0.5) & (x <= width - 0.5) & (y >= -0.5) & (y <= height - 0.5)
@@ -92,7 +95,9 @@ def read_coco(path: Path, n_frames: int, image_size_px: tuple[int, int]) -> Anno
     return Annotations(u[0], u[1], visibility[0], visibility[1])
 
 
-def write_coco(path: Path, annotations: Annotations, image_size_px: tuple[int, int], suffix: str) -> None:
+def write_coco(
+    path: Path, annotations: Annotations, image_size_px: tuple[int, int], suffix: str, landmarks: Sequence[str] = LANDMARKS
+) -> None:
     """Write `annotations`; points that are NaN or outside the image are written as not labelled."""
     width, height = image_size_px
     images, entries = [], []
@@ -112,6 +117,7 @@ def write_coco(path: Path, annotations: Annotations, image_size_px: tuple[int, i
             entry["keypoints"] = [n for (x, y), w in zip(xy.tolist(), v.tolist(), strict=True) for n in (x, y, w)]
             entry |= {"num_keypoints": int((v > 0).sum()), "bbox": [round(float(value), 3) for value in (*low, *size)]}
             entries.append(entry | {"area": round(float(size.prod()), 3), "iscrowd": 0})
-    category = {"id": 1, "name": "forceps", "keypoints": list(LANDMARKS), "skeleton": [[1, 2], [1, 3]]}
+    edges = [[1, k] for k in range(2, len(landmarks) + 1)]
+    category = {"id": 1, "name": "forceps" if len(edges) == 2 else "tool", "keypoints": list(landmarks), "skeleton": edges}
     content = {"info": {"description": "Tool landmarks; integer coordinates are pixel centres."}, "categories": [category]}
     write_text(path, json.dumps(content | {"images": images, "annotations": entries}, allow_nan=False) + "\n")

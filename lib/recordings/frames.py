@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from PIL import Image
 
-__all__ = ["Frames", "StereoFrame", "open_side", "read_image"]
+__all__ = ["Frames", "StereoFrame", "open_side", "read_image", "to_8_bits"]
 
 _SUFFIXES = (".jpg", ".jpeg", ".png")
 _LOST_BYTES = 512  # a disk sector: what a crash or a bad copy replaces by zeros
@@ -26,12 +26,19 @@ class StereoFrame:
     time_s: float
 
 
-def read_image(path: Path, image_size_px: tuple[int, int] | None = None) -> np.ndarray:
-    """An image file as (h, w, 3) uint8 RGB; its pixels as they are stored, whatever EXIF says.
+def read_image(
+    path: Path, image_size_px: tuple[int, int] | None = None, bit_depth: int = 0, as_stored: bool = False
+) -> np.ndarray:
+    """An image file, colour or grey, as (h, w, 3) uint8 RGB; its pixels as they are stored, whatever EXIF says.
+
+    Args:
+        image_size_px: (width, height) that it must have.
+        bit_depth: Of frames of 16 bits, as in `to_8_bits`.
+        as_stored: Leave 16 bits as uint16.
 
     Raises:
         FileNotFoundError, ValueError: If there is no such file, it cannot be decoded, a part of it is lost, or its size
-            is not `image_size_px` (width, height).
+            is another.
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such image.")
@@ -39,14 +46,31 @@ def read_image(path: Path, image_size_px: tuple[int, int] | None = None) -> np.n
     if bytes(_LOST_BYTES) in data and not _may_hold_zeros(data):
         raise ValueError(f"{path}: the image is corrupt; a block of zeros stands in its middle. Export it again.")
     try:
-        flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
+        flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
     except cv2.error:  # more pixels than OpenCV allows
         image = None
     if image is None:
         raise ValueError(f"{path}: the image is corrupt; it cannot be decoded. Export it again.")
     _check_size(path, (image.shape[1], image.shape[0]), image_size_px)
-    return image
+    return image if as_stored else to_8_bits(image, bit_depth, path)
+
+
+def to_8_bits(image: np.ndarray, bit_depth: int | None, path: Path) -> np.ndarray:
+    """An image (h, w, 3) as uint8: the `bit_depth` bits that a 16-bit image uses become 0 to 255.
+
+    >>> to_8_bits(np.full((1, 1, 3), 4095, np.uint16), 12, Path("dark.png")).max()
+    np.uint8(255)
+    """
+    if image.dtype == np.uint8:
+        return image
+    if image.dtype != np.uint16:
+        raise ValueError(f"{path}: pixels of type {image.dtype}; images of 8 or 16 bits work. Export it again.")
+    if not bit_depth or image.max() >= 1 << bit_depth:
+        told = f"more than bit_depth = {bit_depth} holds" if bit_depth else "and recording.toml states no bit_depth"
+        raise ValueError(f"{path}: 16-bit values up to {image.max()}, {told}. State what the camera uses, such as 12.")
+    table = np.rint(np.arange(1 << bit_depth) * (255 / ((1 << bit_depth) - 1))).astype(np.uint8)
+    return table[image]
 
 
 def _may_hold_zeros(data: bytes) -> bool:
@@ -76,8 +100,8 @@ def _check_size(path: Path, size: tuple[int, int], expected: tuple[int, int] | N
 class ImageFolder:
     """Images numbered from 0 without a gap; the header and the end of every file are checked at once."""
 
-    def __init__(self, folder: Path, image_size_px: tuple[int, int]) -> None:
-        self.image_size_px = image_size_px
+    def __init__(self, folder: Path, image_size_px: tuple[int, int], bit_depth: int = 0) -> None:
+        self.image_size_px, self._bit_depth = image_size_px, bit_depth
         self.paths = sorted(p for p in folder.iterdir() if p.suffix.lower() in _SUFFIXES)
         for index, path in enumerate(self.paths):
             if not path.stem.isdecimal():
@@ -112,7 +136,7 @@ class ImageFolder:
         return len(self.paths)
 
     def read(self, index: int) -> np.ndarray:
-        return read_image(self.paths[index], self.image_size_px)
+        return read_image(self.paths[index], self.image_size_px, self._bit_depth)
 
 
 class Video:
@@ -143,15 +167,15 @@ class Video:
         return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
-def open_side(folder: Path, side: str, image_size_px: tuple[int, int]) -> ImageFolder | Video:
-    """The frames of one camera (`side` is "left" or "right") of a recording's folder."""
+def open_side(folder: Path, side: str, image_size_px: tuple[int, int], bit_depth: int) -> ImageFolder | Video:
+    """The frames of one camera (`side` is "left" or "right") of a recording's folder; `bit_depth` as in `to_8_bits`."""
     images, video = folder / side, folder / f"{side}.mp4"
     if images.is_dir() and video.is_file():
         raise ValueError(f"{folder}: both {side}/ and {side}.mp4; keep one.")
     if video.is_file():
         return Video(video, image_size_px)
     if images.is_dir():
-        return ImageFolder(images, image_size_px)
+        return ImageFolder(images, image_size_px, bit_depth)
     raise FileNotFoundError(f"{folder}: no {side}/ folder of images and no {side}.mp4.")
 
 

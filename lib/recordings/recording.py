@@ -1,7 +1,9 @@
 """Reading a recording: everything is validated when it is opened, frames are decoded when asked for."""
 
 import math
+import re
 import tomllib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
@@ -15,14 +17,19 @@ from lib.recordings.frames import Frames, open_side
 from lib.recordings.tables import columns, read_table
 from lib.recordings.truth import Truth
 
-__all__ = ["FORMAT", "KINEMATICS_COLUMNS", "UNITS", "Kinematics", "Recording"]
+__all__ = ["FORMAT", "UNITS", "Kinematics", "Recording", "kinematics_columns"]
 
 FORMAT = "microstereo.recording"
 UNITS = {"length": "mm", "image": "px", "time": "s"}
-KINEMATICS_COLUMNS = ["time_s", *columns(["x_mm", "y_mm", "z_mm"])]
 _REQUIRED = {"name": str, "fps": float, "image_size_px": list}
 _DEFAULTS = {"description": "", "readout_s": 0.0, "offset_s": 0.0, "robot_accuracy_mm": 0.010, "details": {}}
-_FIXED = {"format": FORMAT, "units": UNITS, "skeleton": list(LANDMARKS)}
+_DEFAULTS |= {"skeleton": list(LANDMARKS), "bit_depth": 0}
+_FIXED = {"format": FORMAT, "units": UNITS}
+
+
+def kinematics_columns(landmarks: Sequence[str] = LANDMARKS) -> list[str]:
+    """The header of kinematics.csv."""
+    return ["time_s", *columns(["x_mm", "y_mm", "z_mm"], landmarks)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +38,7 @@ class Kinematics:
 
     Attributes:
         time_s: (m,) robot clock, strictly increasing.
-        x_mm: (m, 3, 3) base, tip_1, tip_2 in the robot frame; NaN where a sample was dropped.
+        x_mm: (m, k, 3) the landmarks in the robot frame, base, tip_1, tip_2 of a forceps; NaN where a sample was dropped.
 
     >>> report = Kinematics(np.array([0.0, 1.0]), np.zeros((2, 3, 3)) + np.array([[[0]], [[4]]]))
     >>> report.at([0.25, 2.0])[:, 0, 0].tolist()
@@ -42,17 +49,17 @@ class Kinematics:
     x_mm: np.ndarray
 
     def at(self, time_s: ArrayLike) -> np.ndarray:
-        """Landmarks (n, 3, 3) mm at robot times (n,), or (n, 3) for a time of each landmark; linear between samples.
+        """Landmarks (n, k, 3) mm at robot times (n,), or (n, k) for a time of each landmark; linear between samples.
 
         NaN before the first sample, after the last, and beside a dropped one.
         """
-        time = np.asarray(time_s, dtype=np.float64)
+        time, k = np.asarray(time_s, dtype=np.float64), self.x_mm.shape[1]
         if time.ndim == 1:
-            time = np.repeat(time[:, None], len(LANDMARKS), axis=1)
-        if time.ndim != 2 or time.shape[1] != len(LANDMARKS):
-            raise ValueError(f"time_s: expected (n,) or (n, 3), got {time.shape}.")
+            time = np.repeat(time[:, None], k, axis=1)
+        if time.ndim != 2 or time.shape[1] != k:
+            raise ValueError(f"time_s: expected (n,) or (n, {k}), got {time.shape}.")
         x = np.empty((*time.shape, 3))
-        for landmark, axis in np.ndindex(len(LANDMARKS), 3):  # exactly on a sample, a dropped neighbour has no effect
+        for landmark, axis in np.ndindex(k, 3):  # exactly on a sample, a dropped neighbour has no effect
             report = self.time_s, self.x_mm[:, landmark, axis]
             x[:, landmark, axis] = np.interp(time[:, landmark], *report, left=np.nan, right=np.nan)
         return x
@@ -64,6 +71,8 @@ class Recording:
 
     Attributes:
         image_size_px: (width, height).
+        skeleton: Names of the 2 to 8 landmarks; the detector knows those of a forceps.
+        bit_depth: How many bits frames of 16 bits use; 0 for frames of 8 bits.
         readout_s: Time from the first to the last row of a rolling shutter; 0 is a global shutter.
         offset_s: t_robot = t_video + offset_s.
         robot_accuracy_mm: Standard deviation of the robot's report, per coordinate.
@@ -76,6 +85,8 @@ class Recording:
     description: str
     fps: float
     image_size_px: tuple[int, int]
+    skeleton: tuple[str, ...]
+    bit_depth: int
     readout_s: float
     offset_s: float
     robot_accuracy_mm: float
@@ -106,8 +117,8 @@ class Recording:
         if not folder.is_dir():
             raise FileNotFoundError(f"{folder}: no such recording folder.")
         header = _read_header(folder / "recording.toml")
-        size = header["image_size_px"]
-        left, right = (open_side(folder, side, size) for side in ("left", "right"))
+        size, skeleton = header["image_size_px"], header["skeleton"]
+        left, right = (open_side(folder, side, size, header["bit_depth"]) for side in ("left", "right"))
         if len(left) != len(right):
             raise ValueError(f"{folder}: {len(left)} left and {len(right)} right frames; they come in pairs.")
         if not len(left):
@@ -116,19 +127,19 @@ class Recording:
         if path.exists():
             time_s = _increasing(path, read_table(path, ["frame", "time_s"], n_frames=len(left))[:, 1])
         frames = Frames(left, right, time_s)
-        kinematics = _read_kinematics(folder / "kinematics.csv")
+        kinematics = _read_kinematics(folder / "kinematics.csv", skeleton)
         robot_time = frames.time_s + header["offset_s"]
         if robot_time[-1] < kinematics.time_s[0] or robot_time[0] > kinematics.time_s[-1]:
             seen, told = ("{:.3f} to {:.3f} s".format(*time[[0, -1]]) for time in (robot_time, kinematics.time_s))
             what = f"the frames ({seen}, robot clock) and kinematics.csv ({told}) do not overlap"
             raise ValueError(f"{folder}: {what}; check time_s (seconds) and offset_s.")
         path = folder / "annotations.json"
-        annotations = read_coco(path, len(frames), size) if path.exists() else None
+        annotations = read_coco(path, len(frames), size, skeleton) if path.exists() else None
         truth = Truth.read(folder / "truth", len(frames)) if (folder / "truth").is_dir() else None
         return cls(folder=folder, frames=frames, kinematics=kinematics, annotations=annotations, truth=truth, **header)
 
     def landmarks_mm(self) -> np.ndarray:
-        """The robot's landmarks (n, 3, 3) mm at the frames' times, NaN where the robot says nothing.
+        """The robot's landmarks (n, k, 3) mm at the frames' times, NaN where the robot says nothing.
 
         `lib.correspondences.of_recording` gives them at the instants at which the landmarks' image rows were read.
         """
@@ -158,10 +169,13 @@ def _read_header(path: Path) -> dict:
     header = {key: value for key, value in (_DEFAULTS | content).items() if key not in _FIXED}
     size, fps, readout_s = header["image_size_px"], header["fps"], header["readout_s"]
     whole = len(size) == 2 and all(isinstance(v, int) and not isinstance(v, bool) and v > 1 for v in size)
-    accuracy_mm, names = header["robot_accuracy_mm"], content.get("skeleton", list(LANDMARKS))
+    accuracy_mm, names, bits = header["robot_accuracy_mm"], header["skeleton"], header["bit_depth"]
+    named = [name for name in names if isinstance(name, str) and re.fullmatch(r"[A-Za-z]\w{0,31}", name, re.ASCII)]
     for valid, problem in (
         (content.get("format", FORMAT) == FORMAT, f"format = {content.get('format')!r}, expected {FORMAT!r}"),
-        (names == list(LANDMARKS), f"skeleton = {names}, expected {list(LANDMARKS)} in this order"),
+        (names == named and 2 <= len(set(names)) == len(names) <= 8, f"skeleton = {names}: 2 to 8 names, such as tip_1"),
+        (set(named) != set(LANDMARKS) or names == list(LANDMARKS), f"skeleton = {names}: a forceps has {list(LANDMARKS)}"),
+        (bits == 0 or 8 <= bits <= 16, f"bit_depth = {bits} should be 8 to 16, or 0 for frames of 8 bits"),
         (whole, f"image_size_px = {size} should be [width, height] in whole pixels"),
         (fps > 0, f"fps = {fps} must be positive"),
         (fps <= 0 or 0 <= readout_s <= 1.001 / fps, f"readout_s = {readout_s} must lie between 0 and one frame"),
@@ -170,7 +184,7 @@ def _read_header(path: Path) -> dict:
         if not valid:
             raise ValueError(f"{path}: {problem}.")
     header = {key: float(value) if kinds[key] is float else value for key, value in header.items()}
-    return header | {"image_size_px": tuple(size)}
+    return header | {"image_size_px": tuple(size), "skeleton": tuple(names)}
 
 
 def _increasing(path: Path, time_s: np.ndarray) -> np.ndarray:
@@ -180,11 +194,11 @@ def _increasing(path: Path, time_s: np.ndarray) -> np.ndarray:
     return time_s
 
 
-def _read_kinematics(path: Path) -> Kinematics:
-    table = read_table(path, KINEMATICS_COLUMNS)
+def _read_kinematics(path: Path, landmarks: Sequence[str]) -> Kinematics:
+    table = read_table(path, kinematics_columns(landmarks))
     if not len(table):
         raise ValueError(f"{path}: the table is empty; the robot's landmarks are needed.")
-    time_s, x = _increasing(path, table[:, 0]), table[:, 1:].reshape(-1, len(LANDMARKS), 3)
+    time_s, x = _increasing(path, table[:, 0]), table[:, 1:].reshape(-1, len(landmarks), 3)
     empty = np.isnan(x)
     partial = np.flatnonzero((empty.any(axis=2) & ~empty.all(axis=2)).any(axis=1))
     if partial.size:
@@ -192,9 +206,9 @@ def _read_kinematics(path: Path) -> Kinematics:
         raise ValueError(f"{path}, line {partial[0] + 2}: a landmark has some coordinates only; {cure}.")
     reach = np.linalg.norm(x[:, 1:] - x[:, :1], axis=2)
     if not np.isfinite(reach).any():
-        raise ValueError(f"{path}: no row holds the base and a tip; the kinematics are empty.")
+        raise ValueError(f"{path}: no row holds {landmarks[0]} and another landmark; the kinematics are empty.")
     reach_mm = float(np.nanmedian(reach))
     if not 0.1 <= reach_mm <= 100:  # a jaw or shaft in metres or micrometres falls far outside
-        what = f"the median distance from base to tip is {reach_mm:.4g}, not plausible in mm (0.1 to 100)"
+        what = f"the median distance from {landmarks[0]} to the others is {reach_mm:.4g}, not plausible in mm (0.1 to 100)"
         raise ValueError(f"{path}: {what}. Metres or micrometres? Convert to mm.")
     return Kinematics(time_s, x)

@@ -14,13 +14,13 @@ from lib.files import write_text
 __all__ = ["columns", "read_table", "write_table"]
 
 
-def columns(axes: Sequence[str]) -> list[str]:
+def columns(axes: Sequence[str], landmarks: Sequence[str] = LANDMARKS) -> list[str]:
     """Column names, landmark by landmark.
 
     >>> columns(["x_mm"])
     ['base_x_mm', 'tip_1_x_mm', 'tip_2_x_mm']
     """
-    return [f"{landmark}_{axis}" for landmark in LANDMARKS for axis in axes]
+    return [f"{landmark}_{axis}" for landmark in landmarks for axis in axes]
 
 
 def read_table(path: Path, names: Sequence[str], optional: Sequence[str] = (), n_frames: int | None = None) -> np.ndarray:

@@ -4,7 +4,7 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from lib.correspondences import LANDMARKS
 from lib.files import write_bytes, write_text
 from lib.recordings.annotations import Annotations, write_coco
-from lib.recordings.recording import FORMAT, KINEMATICS_COLUMNS, UNITS, Recording
+from lib.recordings.recording import FORMAT, UNITS, Recording, kinematics_columns
 from lib.recordings.tables import write_table
 
 __all__ = ["RecordingWriter"]
@@ -28,6 +28,7 @@ class RecordingWriter:
     Args:
         folder: Where the recording appears.  Until then its files lie beside it, in a folder ending with ``.partial``.
         image_size_px: (width, height).
+        skeleton: Names of the landmarks.
         details: Own notes (numbers and text), kept in ``[details]`` of recording.toml.
         suffix, jpeg_quality: ".jpg" or ".png", and the quality of a JPEG.
         overwrite: Replace a recording of that name.  A folder that is no recording is never replaced.
@@ -48,7 +49,7 @@ class RecordingWriter:
     def __init__(
         self, folder: str | Path, *, name: str, fps: float, image_size_px: tuple[int, int], description: str = "",
         readout_s: float = 0.0, offset_s: float = 0.0, robot_accuracy_mm: float = 0.010,
-        details: Mapping[str, float | int | str] | None = None,
+        skeleton: Sequence[str] = LANDMARKS, details: Mapping[str, float | int | str] | None = None,
         suffix: str = ".jpg", jpeg_quality: int = 90, overwrite: bool = False,
     ) -> None:  # fmt: skip
         if suffix not in {".jpg", ".png"}:
@@ -59,7 +60,7 @@ class RecordingWriter:
         self.fps, self.image_size_px = float(fps), (int(image_size_px[0]), int(image_size_px[1]))
         self._suffix, self._options = suffix, [cv2.IMWRITE_JPEG_QUALITY, int(jpeg_quality)] if suffix == ".jpg" else []
         self._header = {"format": FORMAT, "name": name, "description": description, "fps": self.fps}
-        self._header |= {"image_size_px": list(self.image_size_px), "skeleton": list(LANDMARKS)}
+        self._header |= {"image_size_px": list(self.image_size_px), "skeleton": list(skeleton)}
         times = {"readout_s": float(readout_s), "offset_s": float(offset_s)}
         self._header |= {"robot_accuracy_mm": float(robot_accuracy_mm), **times}
         self._details = dict(details or {})
@@ -104,17 +105,23 @@ class RecordingWriter:
         self._time_s.append(index / self.fps if time_s is None else float(time_s))
 
     def kinematics(self, time_s: ArrayLike, x_mm: ArrayLike) -> None:
-        """Append samples: robot times (m,) and landmarks (m, 3, 3) mm, NaN where a landmark was dropped."""
+        """Append samples: robot times (m,) and landmarks (m, k, 3) mm, NaN where a landmark was dropped."""
         time, x = np.array(time_s, np.float64, ndmin=1), np.asarray(x_mm, np.float64)
-        if x.shape != (len(time), len(LANDMARKS), 3):
-            raise ValueError(f"x_mm: expected ({len(time)}, 3, 3), got {x.shape}.")
-        self._kinematics.append(np.column_stack([time, x.reshape(len(time), 9)]))
+        k = len(self._header["skeleton"])
+        if x.shape != (len(time), k, 3):
+            raise ValueError(f"x_mm: expected ({len(time)}, {k}, 3), got {x.shape}.")
+        self._kinematics.append(np.column_stack([time, x.reshape(len(time), 3 * k)]))
 
     def annotations(self, *u_and_visibility: ArrayLike) -> None:
         """Landmarks of all frames: `u_left`, `u_right` and their visibility, as in `Annotations`."""
         self._annotations = Annotations(*u_and_visibility)
 
-    def _finish(self) -> None:
+    def offset(self, offset_s: float) -> None:
+        """Set t_robot = t_video + offset_s, where it is found after `draft`."""
+        self._header["offset_s"] = float(offset_s)
+
+    def draft(self) -> Recording:
+        """The recording as it is so far, valid or a ValueError; it lies in a folder that is removed if anything fails."""
         lines = [_toml(key, value) for key, value in self._header.items()]
         for table, values in (("units", UNITS), ("details", self._details)):
             lines += ["", f"[{table}]"] if values else []
@@ -126,10 +133,15 @@ class RecordingWriter:
             write_table(self.folder / "frames.csv", ["frame", "time_s"], table, [0, 7])
         if self._kinematics:
             table = np.vstack(self._kinematics)
-            write_table(self.folder / "kinematics.csv", KINEMATICS_COLUMNS, table, [7] + [6] * 9)
+            names = kinematics_columns(self._header["skeleton"])
+            write_table(self.folder / "kinematics.csv", names, table, [7] + [6] * (len(names) - 1))
         if self._annotations is not None:
-            write_coco(self.folder / "annotations.json", self._annotations, self.image_size_px, self._suffix)
-        Recording.open(self.folder)  # what is not valid must not appear
+            path, names = self.folder / "annotations.json", self._header["skeleton"]
+            write_coco(path, self._annotations, self.image_size_px, self._suffix, names)
+        return Recording.open(self.folder)
+
+    def _finish(self) -> None:
+        self.draft()  # what is not valid must not appear
         self._check_target()
         old = self.folder.with_suffix(".replaced")
         if self.target.exists():

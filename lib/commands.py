@@ -1,0 +1,219 @@
+"""``python3 -m lib import | detect | calibrate | reconstruct | register``: the stages for who does not write Python.
+
+Each prints what it did and ends on the verdict of `lib.trust`.  Exit codes: 0; 2 bad input, nothing written; 3 the verdict
+is "not trustworthy", so no file that follows from the calibration is written (--force writes it).
+"""
+
+import argparse
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from lib import files, paths
+from lib.calibration import Calibration, write_opencv, write_ros
+from lib.cameras import StereoRig
+from lib.correspondences import LANDMARKS, Correspondences, of_recording
+from lib.importing import guess_mapping, import_recording
+from lib.landmarks import Detector, detect
+from lib.matching.rectification import rectify
+from lib.recordings import Recording
+from lib.registration import register_images
+from lib.surface import depth_map, reconstruct, save_depth_map, save_mesh, save_points, surface_mesh
+from lib.trust import LEVELS, Reason, Verdict, assess, report
+
+__all__ = ["main_calibrate", "main_detect", "main_import", "main_reconstruct", "main_register"]
+
+
+def main_import(argv: list[str]) -> int:
+    """`python3 -m lib import`: write a recording from videos, a robot's log and labels, as a mapping file describes them."""
+    parser = argparse.ArgumentParser(prog="python3 -m lib import", description=main_import.__doc__.split(": ", 1)[1])
+    parser.add_argument("source", type=Path, help="folder of your files; it is never changed")
+    parser.add_argument("--map", type=Path, required=True, help="the mapping file (data/README.md lists its keys)")
+    parser.add_argument("--guess", action="store_true", help="write a first mapping from the files, and stop")
+    parser.add_argument("--out", type=Path, help="the recording to write")
+    parser.add_argument("--overwrite", action="store_true", help="replace a recording of that name")
+    a = parser.parse_args(argv)
+    if a.guess:
+        if a.map.exists():
+            raise FileExistsError(f"{a.map}: exists already; choose another name, or remove it.")
+        text = guess_mapping(a.source)
+        files.write_text(a.map, text)
+        print(f"{text}\nWrote {a.map}. Look at each line, then: python3 -m lib import SOURCE --map {a.map} --out RECORDING")
+        return 0
+    if a.out is None:
+        parser.error("--out: name the recording to write.")
+    print("\n".join(import_recording(a.source, a.map, a.out, overwrite=a.overwrite)["did"]))
+    recording = Recording.open(a.out)
+    print(f"Wrote {a.out}. Next: python3 -m lib calibrate {a.out}")
+    if recording.annotations is not None:
+        print(assess(recording, _labelled(recording)).verdict)
+    return 0
+
+
+def main_detect(argv: list[str]) -> int:
+    """`python3 -m lib detect`: find the landmarks in every frame of a recording and write them to landmarks.csv."""
+    a, recording, out = _parsed("detect", main_detect, argv)
+    data = _data(a, recording)
+    _write_landmarks(out / "landmarks.csv", recording, data)
+    print(f"{int(data.seen.sum())} of {data.seen.size} landmarks found. Wrote {out / 'landmarks.csv'}.")
+    print(assess(recording, data).verdict)
+    return 0
+
+
+def main_calibrate(argv: list[str]) -> int:
+    """`python3 -m lib calibrate`: both cameras from landmarks and the robot; JSON, OpenCV YAML and ROS CameraInfo."""
+    a, recording, out = _parsed("calibrate", main_calibrate, argv)
+    calibration, verdict, data = _calibrated(a, recording)
+    if calibration is None or (verdict.is_red and not a.force):
+        return _refused(out, verdict)
+    print(report(calibration))
+    _write_landmarks(out / "landmarks.csv", recording, data)
+    _write_rig(out, calibration.rig, recording)
+    offsets = calibration.offsets
+    numbers = {"model": calibration.model, "sigma_u_px": calibration.sigma_u_px, "sigma_x_mm": calibration.sigma_x_mm}
+    numbers |= {"rows": int(calibration.inliers.size), "rows_used": int(calibration.inliers.sum())}
+    numbers |= {"parameters": calibration.parameter_names, "parameter_covariance": calibration.parameter_covariance.tolist()}
+    numbers |= {"landmark_offsets_mm": None if offsets is None else offsets.offset.tolist()}
+    return _done(out, "calibration", numbers, verdict)
+
+
+def main_reconstruct(argv: list[str]) -> int:
+    """`python3 -m lib reconstruct`: the surface that one stereo frame shows; GLB, PLY, a depth map, the rectified pair."""
+    a, recording, out = _parsed("reconstruct", main_reconstruct, argv, frame=True, rig=True)
+    rig, verdict, data = _calibrated(a, recording)
+    if rig is None or (verdict.is_red and not a.force):
+        return _refused(out, verdict)
+    frame, now = recording.frames[a.frame], data.of_frames(a.frame % len(recording))
+    tool = (now.u_left, now.u_right) if recording.skeleton == LANDMARKS and len(now) == len(LANDMARKS) else None
+    found = reconstruct(frame.left, frame.right, rig, setting=a.setting, u_landmarks=tool)
+    save_mesh(surface_mesh(found.surface, image=frame.left, mask=~found.mask_left), out / "surface.glb")
+    x, y = np.clip(np.rint(found.u).astype(int), 0, np.subtract(recording.image_size_px, 1)).T
+    save_points(out / "points.ply", found.points.x_mm, colours=frame.left[y, x])
+    if found.rig.is_affine:
+        save_depth_map(out / "depth.tiff", depth_map(found.surface, found.rig.left, recording.image_size_px))
+    _write_rectified(out, found.rig, frame.left, frame.right)
+    found.rig.save(out / "refined_rig.json")  # as the matches refined it
+    numbers = {"frame": a.frame % len(recording), "points": len(found.u), "matches": found.n_matches}
+    return _done(out, "reconstruction", numbers, verdict)
+
+
+def main_register(argv: list[str]) -> int:
+    """`python3 -m lib register`: where cameras that were calibrated before are now, after the microscope was moved."""
+    a, recording, out = _parsed("register", main_register, argv, rig=True, needs_rig=True)
+    data = _data(a, recording)
+    found = register_images(StereoRig.load(a.rig), data, sigma_x_mm=recording.robot_accuracy_mm, loss="robust")
+    moved = StereoRig.load(a.rig).moved(found.transform)
+    seen = data.complete
+    epipolar_px = float(np.median(np.abs(moved.epipolar_distance(seen.u_left, seen.u_right)))) if len(seen) else np.nan
+    error_mm = moved.triangulate(seen.u_left, seen.u_right).x_mm - seen.x_mm
+    _write_rig(out, moved, recording, "moved_")
+    numbers = {"rotation": found.transform.R.tolist(), "translation_mm": found.transform.t.tolist()}
+    numbers |= {"covariance": found.covariance.tolist(), "centre_mm": found.centre_mm.tolist()}
+    numbers |= {"median_epipolar_px": epipolar_px, "median_error_mm": float(np.median(np.linalg.norm(error_mm, axis=1)))}
+    sd = found.translation_sd_mm
+    shift_mm = np.linalg.norm(found.centre_mm - found.transform.inverse().apply(found.centre_mm))
+    print(f"The cameras moved by {shift_mm:.3f} mm at the tool, standard deviation {sd.max():.3f} mm.")
+    print(f"The tool is now {numbers['median_error_mm']:.3f} mm from where the robot reports it (median).")
+    return _done(out, "registration", numbers, assess(recording, data).verdict)
+
+
+def _parsed(
+    name: str, function: object, argv: list[str], *, frame: bool = False, rig: bool = False, needs_rig: bool = False
+) -> tuple[argparse.Namespace, Recording, Path]:
+    parser = argparse.ArgumentParser(prog=f"python3 -m lib {name}", description=function.__doc__.split(": ", 1)[1])
+    parser.add_argument("recording", type=Path, help="folder of a recording")
+    parser.add_argument("--out", type=Path, help="folder of the results (default: runs/NAME of the recording)")
+    add = parser.add_argument
+    add("--landmarks", choices=("detected", "annotations"), default="detected", help="where they come from")
+    add("--weights", help="weights file of the detector (default: the shipped ones)")
+    parser.add_argument("--every", type=int, default=1, help="take every N-th frame")
+    parser.add_argument("--force", action="store_true", help="write results whatever the verdict")
+    if frame:
+        parser.add_argument("--frame", type=int, default=0, help="number of the frame, from 0")
+        parser.add_argument("--setting", choices=("quality", "fast"), default="quality")
+    if rig:
+        parser.add_argument("--rig", type=Path, required=needs_rig, help="rig.json of an earlier calibration")
+    a = parser.parse_args(argv)
+    if a.every < 1:
+        parser.error("--every: must be at least 1.")
+    recording = Recording.open(a.recording)
+    if frame and not -len(recording) <= a.frame < len(recording):
+        parser.error(f"--frame: the recording has frames 0 to {len(recording) - 1}.")
+    out = a.out or paths.RUNS / a.recording.resolve().name
+    out.mkdir(parents=True, exist_ok=True)
+    return a, recording, out
+
+
+def _labelled(recording: Recording) -> Correspondences:
+    if recording.annotations is None:
+        raise ValueError(f"{recording.folder}: it has no annotations.json; label frames, or use --landmarks detected.")
+    return of_recording(recording, recording.annotations.u_left, recording.annotations.u_right)
+
+
+def _data(a: argparse.Namespace, recording: Recording) -> Correspondences:
+    chosen = np.arange(len(recording))[:: a.every]
+    if a.landmarks == "annotations":
+        return _labelled(recording).of_frames(chosen)
+    if recording.skeleton != LANDMARKS:
+        told = f"the detector knows {list(LANDMARKS)}, the recording has {list(recording.skeleton)}"
+        raise ValueError(f"{recording.folder}: {told}. Label frames and give --landmarks annotations.")
+    return detect(recording, Detector.load(a.weights), frames=chosen)
+
+
+def _calibrated(
+    a: argparse.Namespace, recording: Recording
+) -> tuple[Calibration | StereoRig | None, Verdict, Correspondences]:
+    """The calibration of a recording, or the rig that --rig names; the verdict; and the landmarks."""
+    data = _data(a, recording)
+    if getattr(a, "rig", None):
+        text = f"{a.rig} was not calibrated from this recording, and nothing here tests it."
+        cure = f"Run: python3 -m lib register {a.recording} --rig {a.rig}"
+        return StereoRig.load(a.rig), Verdict((Reason("rig_given", LEVELS[1], text, cure),)), data
+    assessed = assess(recording, data)
+    return assessed.calibration, assessed.verdict, data
+
+
+def _refused(out: Path, verdict: Verdict) -> int:
+    files.write_json(out / "verdict.json", verdict.to_json())
+    print(f"{verdict}\nNothing else was written; --force writes results whatever the verdict.")
+    return 3
+
+
+def _done(out: Path, name: str, numbers: dict, verdict: Verdict) -> int:
+    files.write_json(out / f"{name}.json", numbers | verdict.to_json())
+    print(f"Wrote {paths.shown(out)}: {', '.join(sorted(path.name for path in out.iterdir()))}\n{verdict}")
+    return 0
+
+
+def _write_landmarks(path: Path, recording: Recording, data: Correspondences) -> None:
+    names = ["frame", "landmark", "time_s", "x_mm", "y_mm", "z_mm"]
+    names += [f"{side}_{what}" for side in ("left", "right") for what in ("x_px", "y_px", "confidence", "sd_x_px", "sd_y_px")]
+    lines = [",".join(names)]
+    sd = np.sqrt(np.diagonal(data.covariance_px2, axis1=2, axis2=3))
+    for row in range(len(data)):
+        sides = [[*u[row], data.confidence[row, k], *sd[row, k]] for k, u in enumerate((data.u_left, data.u_right))]
+        numbers = [data.time_s[row], *data.x_mm[row], *np.concatenate(sides)]
+        cells = ["" if np.isnan(value) else f"{value:.6f}" for value in numbers]
+        lines.append(",".join([str(data.frame[row]), recording.skeleton[data.landmark[row]], *cells]))
+    files.write_text(path, "\n".join(lines) + "\n")
+
+
+def _write_rig(out: Path, rig: StereoRig, recording: Recording, prefix: str = "") -> None:
+    rig.save(out / f"{prefix}rig.json")
+    for side, camera in (("left", rig.left), ("right", rig.right)):
+        write_opencv(camera, out / f"{prefix}{side}.yml", recording.image_size_px)
+        if not getattr(camera, "radial_per_px2", 0.0):
+            write_ros(camera, out / f"{prefix}{side}_camera_info.yaml", recording.image_size_px, name=side)
+
+
+def _write_rectified(out: Path, rig: StereoRig, left: np.ndarray, right: np.ndarray) -> None:
+    """The pair with common rows, for any stereo network, and the matrices that lead back."""
+    maps = rectify(rig, left.shape[:2], right.shape[:2])
+    for side, image, matrix in (("left", left, maps.left_from_canvas), ("right", right, maps.right_from_canvas)):
+        warped = cv2.warpAffine(image, matrix, maps.size_px, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+        data = cv2.imencode(".png", cv2.cvtColor(warped, cv2.COLOR_RGB2BGR))[1]
+        files.write_bytes(out / f"rectified_{side}.png", data.tobytes())
+    numbers = {"left_from_canvas": maps.left_from_canvas.tolist(), "right_from_canvas": maps.right_from_canvas.tolist()}
+    numbers |= {"displacement_px_per_mm": maps.displacement_px_per_mm, "reference_depth_mm": maps.reference_depth_mm}
+    files.write_json(out / "rectification.json", numbers)

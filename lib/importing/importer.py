@@ -1,0 +1,212 @@
+"""From foreign files to a recording: everything is read and checked, then the recording appears whole."""
+
+from collections.abc import Sequence
+from decimal import Decimal
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from lib import files
+from lib.calibration import TimeOffset, Tool, estimate_time_offset, pivot_calibration, tool_offsets
+from lib.correspondences import of_recording
+from lib.geometry import RigidTransform
+from lib.importing.labels import read_labels
+from lib.importing.logs import RobotLog, increasing, read_robot, since
+from lib.importing.mapping import Mapping, read_mapping
+from lib.importing.video import StereoSource, open_stereo
+from lib.landmarks import detect
+from lib.recordings import Annotations, Recording, RecordingWriter
+
+__all__ = ["import_recording"]
+
+_LOG_STEP_S = 2e-5, 3.0  # of a robot's samples; beyond it the unit of time is another
+_CLOCK_FRAMES = 60  # that the detector looks at where there are no labels
+
+
+def import_recording(source: str | Path, mapping: str | Path | Mapping, out: str | Path, *, overwrite: bool = False) -> dict:
+    """Write the recording `out` from the files in the folder `source`; the same input gives the same bytes.
+
+    Args:
+        source: It is never changed.
+        mapping: The mapping file, or what `read_mapping` made of one.
+        overwrite: Replace a recording of that name.
+
+    Returns:
+        What it did, as it stands in import.json of the recording: "did" in plain sentences, "clock", "tool", and
+        the "sources" with their SHA-256.
+
+    Raises:
+        FileNotFoundError, FileExistsError, ValueError, OSError: Naming the file and the cure; then nothing is written.
+    """
+    folder, out = Path(source), Path(out)
+    if not folder.is_dir():
+        raise FileNotFoundError(f"{folder}: no such folder; SOURCE is the folder that holds the files of the mapping.")
+    if out.resolve().is_relative_to(folder.resolve()):
+        raise ValueError(f"{out}: lies in the source, which an import does not change; choose a place beside it.")
+    told = mapping if isinstance(mapping, Mapping) else read_mapping(mapping)
+    stereo = open_stereo(folder, told.video)
+    robot = read_robot(folder, told)
+    log = folder / told.robot.file
+    zeros = stereo_zero, robot_zero = _zero(stereo), increasing(robot.time, str(log), *_LOG_STEP_S)
+    given = 0.0 if told.robot.offset_s == "estimate" else told.robot.offset_s
+    one_dated = told.robot.offset_s == "estimate" and bool(stereo_zero) != bool(robot_zero)
+    offset_s = 0.0 if one_dated else float(stereo_zero + Decimal(str(given)) - robot_zero)
+    time_s, robot_s = since(stereo.time, stereo_zero), since(robot.time, robot_zero)
+    first = next(stereo.pairs())[0]
+    size = first.shape[1], first.shape[0]
+    labels = read_labels(folder, told.labels, stereo, told.landmarks, size) if told.labels else None
+    tool, tool_told = _tool(told, robot, robot_s, time_s + offset_s, labels)
+    fps = told.video.fps or (1 / float(np.median(np.diff(time_s))) if len(time_s) > 1 else 25.0)
+    fps = round(fps, 6) if told.video.fps is None else fps / told.video.every
+    with RecordingWriter(
+        out, name=told.name, description=told.description, fps=fps, image_size_px=size, readout_s=told.readout_s,
+        offset_s=offset_s, robot_accuracy_mm=told.robot_accuracy_mm, skeleton=told.landmarks, overwrite=overwrite,
+        suffix=f".{told.video.format}", jpeg_quality=told.video.jpeg_quality,
+    ) as writer:  # fmt: skip
+        for (left, right), t in zip(stereo.pairs(), time_s, strict=True):
+            writer.add(left, right, t)
+        writer.kinematics(robot_s, robot.x_mm if tool is None else _positions(tool, robot))
+        if labels is not None:
+            writer.annotations(labels.u_left, labels.u_right, labels.visibility_left, labels.visibility_right)
+        draft = writer.draft()
+        clock = _clock(draft, told.robot.search_s) if told.robot.offset_s == "estimate" else None
+        if clock:
+            writer.offset(clock.offset_s)
+            draft = writer.draft()
+        report = {"format": "microstereo.import", "did": _did(told, stereo, robot, draft, clock, zeros)}
+        report["clock"] = {"offset_s": round(clock.offset_s, 9), "sd_s": float(f"{clock.sd_s:.3g}")} if clock else None
+        report |= {"tool": tool_told, "mapping": told.model_dump(mode="json"), "sources": _sources(folder, told, stereo)}
+        files.write_json(writer.folder / "import.json", report)
+    return report
+
+
+def _zero(stereo: StereoSource) -> Decimal:
+    return Decimal(int(stereo.time[0])) if abs(stereo.time[0]) > 10**6 else Decimal(0)
+
+
+def _clock(draft: Recording, search_s: float) -> TimeOffset:
+    """The offset of the clocks, from the labels, or from the detector where there are none."""
+    labels = draft.annotations
+    if labels is None:
+        some = np.unique(np.linspace(0, len(draft) - 1, min(len(draft), _CLOCK_FRAMES)).astype(int))
+        data = detect(draft, frames=some)
+    else:
+        data = of_recording(draft, labels.u_left, labels.u_right)
+    try:
+        return estimate_time_offset(data, draft.kinematics, start_s=draft.offset_s, search_s=search_s)
+    except ValueError as error:
+        cure = "Or state offset_s, where t_robot = t_video + offset_s"
+        raise ValueError(f"robot.offset_s = 'estimate': {error} {cure}.") from None
+
+
+def _tool(
+    told: Mapping, robot: RobotLog, robot_s: np.ndarray, frames_s: np.ndarray, labels: Annotations | None
+) -> tuple[Tool | None, dict | None]:
+    """The landmarks in the tool frame of a robot that reports poses, and what is told of them."""
+    if robot.R is None:
+        return None, None
+    names, tool = told.landmarks, told.tool
+    turning = [tool.turning.get(name, 0) if robot.opening_rad is not None else 0 for name in names]
+    if tool.estimate:
+        if labels is None or told.robot.offset_s == "estimate":
+            raise ValueError("tool.estimate: it needs labels and a number as robot.offset_s; or give the tool's landmarks.")
+        poses, opening = _at(robot, robot_s, frames_s)
+        known = np.array([pose is not None for pose in poses])
+        u = [side[known] for side in (labels.u_left, labels.u_right)]
+        jaws = {} if opening is None else {"opening_rad": opening[known], "turning": turning}
+        found = tool_offsets([pose for pose in poses if pose], u, **jaws)
+        sd = np.sqrt(np.diagonal(found.covariance_mm2, axis1=1, axis2=2))
+        return found, _tool_told(names, found) | {"sd_mm": sd.round(4).tolist(), "rms_px": round(found.rms_px, 3)}
+    offset, sd = np.full((len(names), 3), np.nan), {}
+    for k, name in enumerate(names):
+        if name in tool.pivot_s:
+            low, high = tool.pivot_s[name]
+            rows = np.flatnonzero((robot_s >= low) & (robot_s <= high) & np.isfinite(robot.R).all(axis=(1, 2)))
+            pivot = pivot_calibration([RigidTransform(robot.R[i], robot.t_mm[i]) for i in rows])
+            offset[k], sd[name] = pivot.offset_mm, float(np.sqrt(np.trace(pivot.covariance_mm2[:3, :3]) / 3))
+        elif name in tool.landmarks_mm:
+            offset[k] = tool.landmarks_mm[name]
+    hinged = tool.hinge is not None and any(turning)
+    if lacks := [n for n, x, t in zip(names, offset, turning, strict=True) if np.isnan(x).any() and not (hinged and t)]:
+        cure = "give tool.landmarks_mm, tool.pivot_s, tool.hinge, or tool.estimate = true"
+        raise ValueError(f"robot.pose: the place of {', '.join(lacks)} in the tool frame is open; {cure}.")
+    if hinged:
+        made = Tool.hinged(np.nan_to_num(offset), turning, tool.hinge.point_mm, tool.hinge.axis, tool.hinge.jaw_mm)
+    else:
+        made = Tool(offset, np.zeros_like(offset), np.zeros_like(offset))
+    return made, _tool_told(names, made) | {"pivot_sd_mm": {name: round(value, 4) for name, value in sd.items()}}
+
+
+def _tool_told(names: Sequence[str], tool: Tool) -> dict:
+    kinds = {"offset_mm": tool.offset_mm, "sine_mm": tool.sine_mm, "versine_mm": tool.versine_mm}
+    return {kind: dict(zip(names, value.round(6).tolist(), strict=True)) for kind, value in kinds.items()}
+
+
+def _at(robot: RobotLog, robot_s: np.ndarray, time_s: np.ndarray) -> tuple[list[RigidTransform | None], np.ndarray | None]:
+    """The poses, None outside the log, and openings at robot times."""
+    known = np.isfinite(robot.R).all(axis=(1, 2)) & np.isfinite(robot.t_mm).all(axis=1)
+    s, inside = robot_s[known], (time_s >= robot_s[known][0]) & (time_s <= robot_s[known][-1])
+    turn = Slerp(s, Rotation.from_matrix(robot.R[known]))(np.clip(time_s, s[0], s[-1])).as_matrix()
+    shift = np.stack([np.interp(time_s, s, axis) for axis in robot.t_mm[known].T], axis=1)
+    poses = [RigidTransform(R, t) if i else None for R, t, i in zip(turn, shift, inside, strict=True)]
+    return poses, None if robot.opening_rad is None else np.interp(time_s, robot_s, robot.opening_rad)
+
+
+def _positions(tool: Tool, robot: RobotLog) -> np.ndarray:
+    known = np.isfinite(robot.R).all(axis=(1, 2)) & np.isfinite(robot.t_mm).all(axis=1)
+    poses = [RigidTransform(R, t) for R, t in zip(robot.R[known], robot.t_mm[known], strict=True)]
+    x = np.full((len(robot.R), len(tool.offset_mm), 3), np.nan)
+    x[known] = tool.positions_mm(poses, None if robot.opening_rad is None else robot.opening_rad[known])
+    x[np.isnan(x).any(axis=2)] = np.nan
+    return x
+
+
+def _did(
+    told: Mapping, stereo: StereoSource, robot: RobotLog, draft: Recording, clock: TimeOffset | None, zeros: Sequence[Decimal]
+) -> list[str]:
+    """What the import did, one plain sentence each."""
+    time_s, (width, height) = draft.frames.time_s, draft.image_size_px
+    step = np.diff(time_s) if len(time_s) > 1 else np.array([0.0])
+    said = [f"{len(draft)} stereo frames of {width} x {height} px over {np.ptp(time_s):.3f} s."]
+    if np.ptp(step) > 0.02 * np.median(step):
+        said.append(f"The frame rate varies: {step.min():.4f} to {step.max():.4f} s a frame; frames.csv holds each time.")
+    if stereo.dropped:
+        said.append(f"{stereo.dropped} frames without a partner of the other camera were left out.")
+    if stereo.bit_depth:
+        source = "as the mapping says" if told.video.bit_depth else "which hold the brightest value"
+        said.append(f"Frames of {stereo.bit_depth} bits, {source}, were scaled to 8 bits.")
+    pair = draft.frames[0]
+    if all(np.array_equal(image[..., 0], image[..., k]) for image in (pair.left, pair.right) for k in (1, 2)):
+        said.append("The frames are grey; the detector learnt on colour, so look at what it finds.")
+    x, kind = draft.kinematics.x_mm, "its landmarks" if robot.R is None else "the pose of its tool"
+    gaps = int(np.isnan(x[..., 0]).any(axis=1).sum())
+    said.append(f"{len(x)} samples of the robot, which reports {kind}; {gaps} have gaps.")
+    for what, zero in zip(("video", "robot"), zeros, strict=True):
+        if zero:
+            said.append(f"Times of the {what} count from {zero} s.")
+    if clock:
+        said.append(f"The clocks differ by {1e3 * clock.offset_s:.2f} ms, standard deviation {1e3 * clock.sd_s:.2f} ms.")
+    inside = np.isfinite(draft.landmarks_mm()).any(axis=(1, 2))
+    if not inside.all():
+        said.append(f"The robot is silent at {int((~inside).sum())} frames.")
+    if draft.annotations is None:
+        said.append("No labels.")
+    else:
+        seen = draft.annotations.visibility_left, draft.annotations.visibility_right
+        counts = [int((visibility > 0).any(axis=1).sum()) for visibility in seen]
+        said.append(f"Labels in {counts[0]} left and {counts[1]} right frames; the others are unlabelled, not empty.")
+    return said
+
+
+def _sources(folder: Path, told: Mapping, stereo: StereoSource) -> list[dict]:
+    """What was read, each with its SHA-256; of a folder or a pattern, that of all its files in their order."""
+    videos = (told.video.left, told.video.right) if told.video.layout == "two" else (told.video.file,)
+    names = {name: list(reel.files) for reel, name in zip(stereo.reels, videos, strict=True)}
+    others = [told.robot.file, told.video.table.file if told.video.table else ""]
+    others += [told.labels.file, told.labels.left, told.labels.right] if told.labels else []
+    for name in filter(None, others):
+        path = folder / name
+        path = path.parent if path.suffix in (".db3", ".mcap") else path
+        names[name] = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
+    return [{"file": name, "files": len(paths), "sha256": files.digest(*paths, length=64)} for name, paths in names.items()]

@@ -1,0 +1,250 @@
+"""Labelled landmarks from COCO, CVAT, Label Studio, DeepLabCut and SLEAP, as annotations of a recording's frames."""
+
+import csv
+import io
+import json
+import zipfile
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path, PurePosixPath
+from typing import NamedTuple
+from xml.etree import ElementTree
+
+import h5py
+import numpy as np
+
+from lib.importing.logs import decoded
+from lib.importing.mapping import Labels
+from lib.importing.video import StereoSource, last_number
+from lib.recordings import Annotations
+
+__all__ = ["READERS", "Label", "read_labels"]
+
+_LARGEST_BYTES = 1 << 29  # of a label file; a zip of a few kB may claim any size
+
+
+class Label(NamedTuple):
+    """One landmark: the image (its path, or the number of its frame), its name there, pixel and visibility (1 hidden)."""
+
+    image: str
+    name: str
+    x: float
+    y: float
+    visibility: int
+
+
+def read_labels(
+    folder: Path, labels: Labels, source: StereoSource, landmarks: Sequence[str], image_size_px: tuple[int, int]
+) -> Annotations:
+    """The labels of the frames that are imported; integer coordinates are pixel centres.
+
+    Labels of other frames are left out.  Where the source holds both views in one image, so may the labels.
+
+    Raises:
+        FileNotFoundError, ValueError: Naming the file, the image and the cure.
+    """
+    theirs = {labels.names.get(name, name): k for k, name in enumerate(landmarks)}
+    frame_of = [{int(f): n for n, f in enumerate(side)} for side in source.index.T]
+    numbers = [reel.stamps is None and {last_number(p): n for n, p in enumerate(reel.files)} for reel in source.reels]
+    width, height = image_size_px
+    u, v = np.full((2, len(source.time), len(landmarks), 2), np.nan), np.zeros((2, len(source.time), len(landmarks)), int)
+    known, count = set(), 0
+    files = [(labels.file, None)] if labels.file else [(f, s) for s, f in enumerate((labels.left, labels.right)) if f]
+    for file, given in files:
+        path = folder / file
+        for label in READERS[labels.kind](path):
+            count += 1
+            known.add(label.name)
+            if label.name not in theirs or not label.visibility:
+                continue
+            where = f"{path}: {label.image}, {label.name}"
+            xy = np.array([label.x, label.y]) - (0.5 if labels.pixel_origin == "corner" else 0.0)
+            if given is not None:
+                side = given
+            elif source.layout != "two" and not any(name in label.image for name in labels.sides):
+                axis, size = (0, width) if source.layout == "side_by_side" else (1, height)
+                half = int(xy[axis] > size - 0.5)
+                side, xy[axis] = half ^ source.exchanged, xy[axis] - half * size
+            else:
+                side = _side(label.image, labels.sides, where)
+            reel = side if source.layout == "two" else 0
+            if len(source.reels) == 2 and source.exchanged:
+                reel = 1 - reel
+            number = (last_number(label.image.replace("\\", "/")) or 0) - labels.first_frame
+            frame = frame_of[reel].get(numbers[reel].get(number) if numbers[reel] else number)
+            if frame is None:
+                continue
+            if not ((xy >= -0.5).all() and (xy <= np.array([width, height]) - 0.5).all()):
+                raise ValueError(f"{where}: ({xy[0]:.6g}, {xy[1]:.6g}) lies outside the image of {width} x {height} px.")
+            k = theirs[label.name]
+            if v[side, frame, k]:
+                raise ValueError(f"{where}: labelled twice; a frame has one tool. Keep one label.")
+            u[side, frame, k], v[side, frame, k] = xy, label.visibility
+    if missing := [name for name in theirs if name not in known]:
+        cure = f"labels.names gives their name for each of {list(landmarks)}"
+        raise ValueError(f"{path}: no label is called {missing[0]!r}; it has {sorted(known)}. {cure}.")
+    if not v.any():
+        cure = "Check labels.first_frame and the images' names"
+        raise ValueError(f"{path}: none of its {count} labels belongs to an imported frame. {cure}.")
+    return Annotations(u[0], u[1], v[0], v[1])
+
+
+def _side(image: str, sides: tuple[str, str], where: str) -> int:
+    found = [side for side, name in enumerate(sides) if name in image]
+    if len(found) != 1:
+        raise ValueError(f"{where}: the name tells no camera; labels.sides = {list(sides)} must tell one of two.")
+    return found[0]
+
+
+def _refused(read: Callable[[Path], Iterator[Label]], what: str) -> Callable[[Path], Iterator[Label]]:
+    """The reader, with one error for whatever a file of another kind makes of it."""
+
+    def checked(path: Path) -> Iterator[Label]:
+        if not path.exists():
+            raise FileNotFoundError(f"{path}: no such file; the mapping names it as labels.")
+        try:
+            yield from read(path)
+        except (KeyError, IndexError, TypeError, AttributeError, RecursionError, ElementTree.ParseError, OSError) as error:
+            raise ValueError(f"{path}: not {what} ({type(error).__name__}: {error}). Export the labels again.") from None
+        except ValueError as error:
+            text = str(error) if str(path) in str(error) else f"{path}: not {what} ({error}). Export the labels again."
+            raise ValueError(text) from None
+
+    return checked
+
+
+def _coco(path: Path) -> Iterator[Label]:
+    content = json.loads(decoded(path))
+    names = {category["id"]: category["keypoints"] for category in content["categories"] if "keypoints" in category}
+    images = {image["id"]: image["file_name"] for image in content["images"]}
+    for entry in content["annotations"]:
+        if entry["category_id"] not in names or entry["image_id"] not in images:
+            where = f"category {entry['category_id']}, image {entry['image_id']}"
+            raise ValueError(f"{path}: an annotation names {where}, which the file does not describe. Export it again.")
+        values = np.array(entry["keypoints"], np.float64).reshape(len(names[entry["category_id"]]), 3)
+        if not np.isin(values[:, 2], (0, 1, 2)).all():
+            raise ValueError(f"{path}: {images[entry['image_id']]}: visibility is 0, 1 or 2.")
+        for name, (x, y, v) in zip(names[entry["category_id"]], values, strict=True):
+            yield Label(images[entry["image_id"]], name, x, y, int(v))
+
+
+def _cvat(path: Path) -> Iterator[Label]:
+    text = _from_zip(path, "annotations.xml") if path.suffix.lower() == ".zip" else decoded(path)
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+        raise ValueError(f"{path}: the XML defines entities, which CVAT does not. Export it again.")
+    root = ElementTree.fromstring(text)
+    for image in root.iter("image"):
+        for points in image.iter("points"):
+            yield _cvat_point(image.get("name"), points.get("label"), points)
+    for track in root.iter("track"):  # of a video; a skeleton's points are nested and have labels of their own
+        for points in track.iter("points"):
+            parent = points.get("label") or track.get("label")
+            yield _cvat_point(points.get("frame") or "", parent, points)
+
+
+def _cvat_point(image: str, name: str, points: ElementTree.Element) -> Label:
+    if ";" in points.get("points"):
+        raise ValueError(f"label {name!r} of {image} has several points; label each landmark on its own")
+    x, y = map(float, points.get("points").split(","))
+    return Label(image, name, x, y, 0 if points.get("outside") == "1" else 1 if points.get("occluded") == "1" else 2)
+
+
+def _from_zip(path: Path, name: str) -> str:
+    try:
+        with zipfile.ZipFile(path) as archive:
+            for entry in archive.namelist():  # nothing is unpacked; such a file is still no export of a label tool
+                if entry.startswith("/") or ".." in PurePosixPath(entry.replace("\\", "/")).parts or ":" in entry:
+                    raise ValueError(f"{path}: it holds {entry!r}, which leads out of the folder. Export it again.")
+            if archive.getinfo(name).file_size > _LARGEST_BYTES:
+                raise ValueError(f"{path}: {name} unpacks to over {_LARGEST_BYTES >> 20} MB. Export fewer frames.")
+            return archive.read(name).decode("utf-8-sig")
+    except (zipfile.BadZipFile, NotImplementedError, RuntimeError) as error:
+        raise ValueError(f"{path}: not a readable zip file ({error}). Export it again.") from None
+
+
+def _label_studio(path: Path) -> Iterator[Label]:
+    for task in json.loads(decoded(path)):
+        data = task["data"]
+        image = next(str(value) for value in data.values() if isinstance(value, str))
+        for result in (r for annotation in task["annotations"][:1] for r in annotation["result"]):
+            if "keypointlabels" not in result["value"]:
+                continue
+            value, size = result["value"], (result["original_width"], result["original_height"])
+            if not (0 <= value["x"] <= 100 and 0 <= value["y"] <= 100):
+                raise ValueError(f"{path}: {image}: ({value['x']}, {value['y']}) should be in percent of the image.")
+            x, y = (value[axis] * length / 100 for axis, length in zip("xy", size, strict=True))
+            yield Label(image, value["keypointlabels"][0], x, y, 2)
+
+
+def _deeplabcut(path: Path) -> Iterator[Label]:
+    if path.is_dir():
+        found = sorted([*path.rglob("CollectedData*.csv")]) or sorted(path.rglob("CollectedData*.h5"))
+        if not found:
+            raise FileNotFoundError(f"{path}: no CollectedData_*.csv or .h5 in it; name the folder of the labelled frames.")
+        for file in found:
+            yield from _deeplabcut(file)
+        return
+    if path.suffix == ".h5":
+        header, images, values = _pandas_table(path)
+    else:
+        rows = [row for row in csv.reader(io.StringIO(decoded(path))) if row]
+        top = next(i for i, row in enumerate(rows) if row[0] == "coords")
+        n = next(i for i, cell in enumerate(rows[top]) if cell in ("x", "y"))
+        parts = next(row for row in rows[:top] if row[0] == "bodyparts")
+        header = list(zip(parts[n:], rows[top][n:], strict=True))
+        images = ["/".join(cell for cell in row[:n] if cell) for row in rows[top + 1 :]]
+        values = [[float(cell) if cell.strip() else np.nan for cell in row[n:]] for row in rows[top + 1 :]]
+    columns = {key: i for i, key in enumerate(header)}
+    for image, row in zip(images, values, strict=True):
+        for name in dict.fromkeys(name for name, _ in header):
+            x, y = row[columns[name, "x"]], row[columns[name, "y"]]
+            yield Label(image, name, x, y, 2 if np.isfinite([x, y]).all() else 0)
+
+
+def _pandas_table(path: Path) -> tuple[list[tuple[str, str]], list[str], np.ndarray]:
+    """(bodypart, coordinate) of each column, the images and the values of a table that pandas wrote in its fixed format."""
+    with h5py.File(path) as file:
+        group = next((g for g in file.values() if "block0_values" in g), None)
+        if group is None:
+            raise ValueError(f"{path}: not in the fixed format of pandas; use the CSV file that lies beside it.")
+
+        def axis(name: str) -> list[list[str]]:
+            def text(cell: object) -> str:
+                return cell.decode() if isinstance(cell, bytes) else str(cell)
+
+            if f"{name}_level0" not in group:
+                return [[text(cell)] for cell in group[name][:]]
+            levels = [k for k in range(9) if f"{name}_level{k}" in group]
+            named = [np.array([text(cell) for cell in group[f"{name}_level{k}"][:]]) for k in levels]
+            return np.stack([named[k][group[f"{name}_label{k}"][:]] for k in levels], axis=1).tolist()
+
+        header = [(row[-2], row[-1]) for row in axis("block0_items")]
+        return header, ["/".join(row) for row in axis("axis1")], group["block0_values"][:]
+
+
+def _sleap(path: Path) -> Iterator[Label]:
+    with h5py.File(path) as file:
+        metadata = json.loads(bytes(file["metadata"].attrs["json"]).decode())
+        order = [link["id"] for link in metadata["skeletons"][0]["nodes"]]
+        names = [metadata["nodes"][i]["name"] for i in order]
+        corner = 0.5 if file["metadata"].attrs.get("format_id", 2.0) < 1.1 else 0.0  # SLEAP counted from the corner once
+        videos = [str(json.loads(video)["backend"].get("filename", "")) for video in file["videos_json"][:]]
+        frames, instances, points = file["frames"][:], file["instances"][:], file["points"][:]
+        for frame in frames:
+            image = f"{videos[frame['video']]}/{frame['frame_idx']}"
+            for instance in instances[frame["instance_id_start"] : frame["instance_id_end"]]:
+                if instance["instance_type"] != 0:  # 1 is a prediction
+                    continue
+                for name, point in zip(names, points[instance["point_id_start"] : instance["point_id_end"]], strict=True):
+                    seen = np.isfinite([point["x"], point["y"]]).all()
+                    x, y = (float(point[axis]) - corner for axis in "xy")
+                    yield Label(image, name, x, y, 2 if seen and point["visible"] else int(seen))
+
+
+#: Kind of labels -> its reader.
+READERS = {
+    "coco": _refused(_coco, "COCO keypoints"),
+    "cvat": _refused(_cvat, "CVAT's XML, or a zip that holds annotations.xml"),
+    "label_studio": _refused(_label_studio, "JSON of Label Studio"),
+    "deeplabcut": _refused(_deeplabcut, "labels of DeepLabCut"),
+    "sleap": _refused(_sleap, "a .slp file of SLEAP"),
+}

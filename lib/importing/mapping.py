@@ -1,0 +1,187 @@
+"""The mapping file of an import: what lies where in the source, in which units, under which names."""
+
+import tomllib
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from lib.correspondences import LANDMARKS
+
+__all__ = ["Labels", "Mapping", "Pose", "Robot", "Table", "Tool", "Video", "read_mapping"]
+
+Vector = tuple[float, float, float]
+Columns = tuple[str, str, str]
+Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,31}$")]
+Text = Annotated[str, Field(pattern=r"^[^<>&\x00-\x1f\x7f]*$")]  # it goes into pages and terminals
+TimeUnit = Literal["s", "ms", "us", "ns", "iso"]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Table(_Section):
+    """A CSV file, or a ROS bag, and its column of times.  A bag's columns are called "/topic:field.of.the.message"."""
+
+    file: str
+    separator: Annotated[str, Field(min_length=1, max_length=1)] = ","
+    decimal: Literal[".", ","] = "."
+    time: str
+    time_unit: TimeUnit = "s"
+
+
+class Video(_Section):
+    """Where the frames are.  `left`, `right` are two videos or two patterns of image files; `file` holds both views."""
+
+    layout: Literal["two", "side_by_side", "top_bottom"]
+    left: str = ""
+    right: str = ""
+    file: str = ""
+    exchanged: bool = False
+    times: Literal["container", "names", "table", "fps"] = "container"
+    table: Table | None = None
+    name_unit: Literal["s", "ms", "us", "ns"] = "ns"
+    fps: Annotated[float, Field(gt=0)] | None = None
+    bit_depth: Annotated[int, Field(ge=8, le=16)] | None = None
+    every: Annotated[int, Field(ge=1)] = 1
+    start_s: float | None = None
+    end_s: float | None = None
+    format: Literal["jpg", "png"] = "jpg"
+    jpeg_quality: Annotated[int, Field(ge=50, le=100)] = 95
+
+    @model_validator(mode="after")
+    def _agree(self) -> Self:
+        wanted = ["left", "right"] if self.layout == "two" else ["file"]
+        wanted += {"table": ["table"], "fps": ["fps"]}.get(self.times, [])
+        if missing := [key for key in wanted if not getattr(self, key)]:
+            raise ValueError(f"layout {self.layout!r} with times {self.times!r} needs {' and '.join(missing)}")
+        return self
+
+
+class Pose(_Section):
+    """Columns of a robot that reports where its tool is and how far it opens, but no landmarks."""
+
+    position: Columns
+    rotation: Annotated[tuple[str, ...], Field(min_length=3, max_length=9)]
+    rotation_kind: Literal["quaternion_xyzw", "quaternion_wxyz", "rotation_vector_rad", "euler_xyz_deg", "matrix"]
+    gripper: str = ""
+    gripper_unit: Literal["rad", "deg", "mm"] = "rad"
+
+    @model_validator(mode="after")
+    def _agree(self) -> Self:
+        n = {"quaternion_xyzw": 4, "quaternion_wxyz": 4, "matrix": 9}.get(self.rotation_kind, 3)
+        if len(self.rotation) != n:
+            raise ValueError(f"{self.rotation_kind} has {n} columns, rotation names {len(self.rotation)}")
+        return self
+
+
+class Frame(_Section):
+    """robot_from_log, where the log is in another frame: rows of the rotation, and the translation in mm."""
+
+    rotation: tuple[Vector, Vector, Vector]
+    translation_mm: Vector
+
+
+class Robot(Table):
+    """The robot's log: `landmarks` names three columns for each landmark, or `pose` those of the tool."""
+
+    length_unit: Literal["m", "mm", "um"]
+    landmarks: dict[Name, Columns] | None = None
+    pose: Pose | None = None
+    offset_s: float | Literal["estimate"] = 0.0
+    search_s: Annotated[float, Field(gt=0)] = 0.5
+    frame: Frame | None = None
+
+    @model_validator(mode="after")
+    def _agree(self) -> Self:
+        if (self.landmarks is None) == (self.pose is None):
+            raise ValueError("give the columns either of the landmarks or of the pose")
+        return self
+
+
+class Hinge(_Section):
+    """Jaws that turn by half the opening each about `axis` through `point_mm`; `jaw_mm` leads from there to closed tips."""
+
+    point_mm: Vector
+    axis: Vector
+    jaw_mm: Vector
+
+
+class Tool(_Section):
+    """Landmarks in the tool frame: given, resting in one point for some seconds of the log, on a hinge, or estimated."""
+
+    landmarks_mm: dict[Name, Vector] = {}
+    pivot_s: dict[Name, tuple[float, float]] = {}
+    hinge: Hinge | None = None
+    turning: dict[Name, Literal[1, -1]] = {"tip_1": 1, "tip_2": -1}
+    jaw_length_mm: Annotated[float, Field(gt=0)] | None = None
+    estimate: bool = False
+
+
+class Labels(_Section):
+    """Labelled landmarks: one file for both cameras, or one each; `names` gives theirs for each of ours."""
+
+    kind: Literal["coco", "cvat", "label_studio", "deeplabcut", "sleap"]
+    file: str = ""
+    left: str = ""
+    right: str = ""
+    names: dict[Name, str] = {}
+    pixel_origin: Literal["centre", "corner"] = "centre"
+    first_frame: int = 0
+    sides: tuple[str, str] = ("left", "right")
+
+    @model_validator(mode="after")
+    def _agree(self) -> Self:
+        if bool(self.file) == bool(self.left or self.right):
+            raise ValueError("give either file, which holds both cameras, or left and right")
+        return self
+
+
+class Mapping(_Section):
+    """The whole file."""
+
+    name: Text
+    description: Text = ""
+    landmarks: Annotated[tuple[Name, ...], Field(min_length=2, max_length=8)] = LANDMARKS
+    robot_accuracy_mm: Annotated[float, Field(ge=0, lt=1)] = 0.010
+    readout_s: Annotated[float, Field(ge=0)] = 0.0
+    video: Video
+    robot: Robot
+    tool: Tool = Tool()
+    labels: Labels | None = None
+
+    @model_validator(mode="after")
+    def _agree(self) -> Self:
+        if len(set(self.landmarks)) < len(self.landmarks):
+            raise ValueError(f"landmarks {list(self.landmarks)} repeat a name")
+        told = {"robot.landmarks": self.robot.landmarks or {}, "labels.names": self.labels.names if self.labels else {}}
+        told |= {"tool.landmarks_mm": self.tool.landmarks_mm, "tool.pivot_s": self.tool.pivot_s}
+        for where, names in told.items():
+            if unknown := sorted(set(names) - set(self.landmarks)):
+                raise ValueError(f"{where} has {', '.join(unknown)}, which landmarks = {list(self.landmarks)} does not name")
+        if self.robot.landmarks and set(self.robot.landmarks) != set(self.landmarks):
+            raise ValueError(f"robot.landmarks lacks {', '.join(sorted(set(self.landmarks) - set(self.robot.landmarks)))}")
+        return self
+
+
+def read_mapping(path: str | Path) -> Mapping:
+    """Read and check a mapping file.
+
+    Raises:
+        FileNotFoundError, ValueError: Naming the file, the key, what it says and what it may say.
+    """
+    path = Path(path)
+    if not path.is_file():
+        cure = f"`python3 -m lib import SOURCE --guess --map {path.name}` writes one"
+        raise FileNotFoundError(f"{path}: no such mapping; {cure}.")
+    try:
+        return Mapping.model_validate(tomllib.loads(path.read_text(encoding="utf-8-sig")))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise ValueError(f"{path}: not valid TOML ({error}). Save it as UTF-8 text.") from None
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_context=False)[0]
+        key, told = ".".join(str(part) for part in first["loc"]) or "the mapping", repr(first["input"])
+        value = f" = {told}" if len(told) < 60 and first["type"] != "missing" else ""
+        text = first["msg"].removeprefix("Value error, ").removesuffix(".")
+        raise ValueError(f"{path}: {key}{value}: {text}. data/README.md lists the keys.") from None

@@ -1,0 +1,229 @@
+"""Stereo frames from videos of any codec and from image files, as 8-bit RGB with the true time of each."""
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from decimal import Decimal
+from pathlib import Path
+
+import av
+import numpy as np
+
+from lib.importing.logs import exact_seconds, increasing, read_columns
+from lib.importing.mapping import Video
+from lib.recordings import read_image, to_8_bits
+
+__all__ = ["IMAGES", "VIDEOS", "StereoSource", "last_number", "open_stereo"]
+
+IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
+VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".mpg", ".mpeg", ".webm", ".wmv", ".ts")
+_STEP_S = 1e-4, 60.0  # of frames; beyond it the unit of time is another
+_DEPTH_SAMPLES = 12
+
+
+def last_number(path: str | Path) -> int | None:
+    """The last whole number in a file's name, which numbers or dates it.
+
+    >>> last_number("cam0/frame_000012.png")
+    12
+    """
+    found = re.findall(r"\d+", Path(path).stem)
+    return int(found[-1]) if found else None
+
+
+class _Images:
+    """Image files in the order of the numbers in their names."""
+
+    def __init__(self, folder: Path, pattern: str) -> None:
+        found = [path for path in folder.glob(pattern) if path.suffix.lower() in IMAGES]
+        if not found:
+            raise FileNotFoundError(f"{folder / pattern}: no image ({', '.join(IMAGES)}) matches the mapping's pattern.")
+        if bad := [path for path in found if last_number(path) is None]:
+            raise ValueError(f"{min(bad)}: the name holds no number, so its place in time is open. Number the files.")
+        self.paths = sorted(found, key=lambda path: (last_number(path), path.name))
+        for one, other in zip(self.paths, self.paths[1:], strict=False):
+            if last_number(one) == last_number(other):
+                raise ValueError(f"{other}: numbered like {one.name}. Narrow the pattern, so that it names one camera.")
+        self.stamps, self.files = None, self.paths
+
+    def __len__(self) -> int:
+        return len(self.paths)
+
+    def read(self, wanted: np.ndarray) -> Iterator[np.ndarray]:
+        for index in wanted:
+            yield read_image(self.paths[index], as_stored=True)
+
+
+class _Film:
+    """A video file, decoded once from its start; times are those of its container."""
+
+    def __init__(self, path: Path) -> None:
+        if not path.is_file():
+            raise FileNotFoundError(f"{path}: no such video; the mapping names it.")
+        self.path, self.files = path, [path]
+        with self._open() as container:
+            stream = container.streams.video[0]
+            packets = [p for p in container.demux(stream) if p.size and not p.is_discard]
+            times = sorted(p.dts if any(q.pts is None for q in packets) else p.pts for p in packets)
+            told = stream.frames or len(times)
+            end_s = float((stream.duration or 0) * (stream.time_base or 0))
+            if not end_s and len(container.streams) == 1:
+                end_s = (container.duration or 0) / av.time_base
+        base = Decimal(stream.time_base.numerator) / Decimal(stream.time_base.denominator)
+        self.stamps = [Decimal(t) * base for t in times if t is not None]
+        step = float(self.stamps[-1] - self.stamps[0]) / max(len(times) - 1, 1) if self.stamps else 0.0
+        if len(self.stamps) != told or (end_s and float(self.stamps[-1]) + 2.5 * step + 0.2 < end_s):
+            raise ValueError(f"{path}: the video is cut off: {len(times)} frames of {told} ({end_s:.1f} s). Copy it again.")
+
+    def _open(self) -> av.container.InputContainer:
+        try:
+            container = av.open(str(self.path))
+        except (av.error.FFmpegError, ValueError) as error:
+            cure = "Copy it again, or convert it to H.264 in an .mp4 file"
+            raise ValueError(f"{self.path}: the video cannot be opened ({error}). {cure}.") from None
+        if not container.streams.video or container.streams.video[0].codec_context is None:
+            container.close()
+            raise ValueError(f"{self.path}: no video of a known codec in it. Convert it to H.264 in an .mp4 file.")
+        return container
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+    def read(self, wanted: np.ndarray) -> Iterator[np.ndarray]:
+        left = set(map(int, wanted))
+        with self._open() as container:
+            container.streams.video[0].thread_type = "AUTO"
+            frames, index = container.decode(video=0), -1
+            while left:
+                try:
+                    frame, index = next(frames), index + 1
+                except (StopIteration, av.error.FFmpegError):
+                    what = f"frame {index + 1} of {len(self)} cannot be decoded"
+                    raise ValueError(f"{self.path}: {what}. The video is damaged; copy or convert it again.") from None
+                if frame.is_corrupt:
+                    raise ValueError(f"{self.path}: frame {index} is damaged. Copy the video again.")
+                if index in left:
+                    left.remove(index)
+                    deep = max(c.bits for c in frame.format.components) == 16
+                    # Of 16 bits a camera may use 12; fewer bits the format itself states, and they are scaled by it.
+                    yield frame.to_ndarray(format="rgb48le" if deep else "rgb24")
+
+
+@dataclass(frozen=True, eq=False)
+class StereoSource:
+    """Pairs of frames.
+
+    Attributes:
+        reels: The left and the right source, or the one that holds both views.
+        layout, exchanged: As in the mapping.
+        index: (n, 2) which frame of each source makes a pair.
+        time: n exact times of the pairs.
+        bit_depth: What the brightest value of 16-bit frames is scaled by; None for 8-bit frames.
+        dropped: How many frames have no partner.
+    """
+
+    reels: tuple[_Images | _Film, ...]
+    layout: str
+    exchanged: bool
+    index: np.ndarray
+    time: list[Decimal]
+    bit_depth: int | None
+    dropped: int
+
+    def pairs(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Left and right images, (h, w, 3) uint8 RGB."""
+        for images in zip(*(reel.read(index) for reel, index in zip(self.reels, self.index.T, strict=False)), strict=True):
+            images = [to_8_bits(image, self.bit_depth, reel.files[0]) for image, reel in zip(images, self.reels, strict=True)]
+            yield self.split(*images)
+
+    def split(self, *images: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The two views of what the sources show at one instant."""
+        if self.layout != "two":
+            half = images[0].shape[1 if self.layout == "side_by_side" else 0] / 2
+            if half % 1:
+                size = f"{images[0].shape[1]} x {images[0].shape[0]} px"
+                raise ValueError(f"{self.reels[0].files[0]}: {size} have no two halves. Check layout.")
+            h = int(half)
+            images = (images[0][:, :h], images[0][:, h:]) if self.layout == "side_by_side" else (images[0][:h], images[0][h:])
+        if images[0].shape != images[1].shape:
+            sizes = " and ".join(f"{i.shape[1]} x {i.shape[0]} px" for i in images)
+            raise ValueError(f"{self.reels[-1].files[0]}: left and right frames differ in size ({sizes}); export both alike.")
+        return (images[1], images[0]) if self.exchanged else (images[0], images[1])
+
+
+def open_stereo(folder: Path, video: Video) -> StereoSource:
+    """Open the frames that a mapping describes; images are decoded when asked for.
+
+    Raises:
+        FileNotFoundError, ValueError: Naming the file and the cure.
+    """
+    names = [video.left, video.right] if video.layout == "two" else [video.file]
+    reels = tuple(_Film(folder / n) if Path(n).suffix.lower() in VIDEOS else _Images(folder, n) for n in names)
+    times = [_times(folder, video, reel) for reel in reels]
+    for reel, time in zip(reels, times, strict=True):
+        increasing(time, str(reel.files[0]), *_STEP_S)
+    index = _paired(folder, times)
+    kept = index[:: video.every]
+    time = [times[0][i] for i in kept[:, 0]]
+    low, high = (Decimal("-Infinity" if video.start_s is None else str(video.start_s)),
+                 Decimal("Infinity" if video.end_s is None else str(video.end_s)))  # fmt: skip
+    chosen = [i for i, t in enumerate(time) if low <= t - (times[0][0] if abs(times[0][0]) > 10**6 else 0) <= high]
+    if not chosen:
+        raise ValueError(f"{folder}: no frame lies between start_s and end_s; the video lasts {time[-1] - time[0]} s.")
+    kept, time = kept[chosen], [time[i] for i in chosen]
+    dropped = sum(map(len, times)) - len(reels) * len(index)
+    depth = video.bit_depth or _bit_depth(reels, kept)
+    return StereoSource(reels, video.layout, video.exchanged, kept, time, depth, dropped)
+
+
+def _times(folder: Path, video: Video, reel: _Images | _Film) -> list[Decimal]:
+    if video.times == "fps":
+        return [Decimal(i) / Decimal(str(video.fps)) for i in range(len(reel))]
+    if video.times == "names":
+        return [exact_seconds(str(last_number(p)), video.name_unit, str(p)) for p in _numbered(reel)]
+    if video.times == "table":
+        time = read_columns(folder / video.table.file, video.table, [])[0]
+        if len(time) != len(reel):
+            raise ValueError(f"{folder / video.table.file}: {len(time)} times for {len(reel)} frames of {reel.files[0]}.")
+        return time
+    if reel.stamps is None:
+        raise ValueError(f"{reel.files[0]}: image files carry no times; set video.times to fps, names or table.")
+    return reel.stamps
+
+
+def _numbered(reel: _Images | _Film) -> list[Path]:
+    if isinstance(reel, _Film):
+        raise ValueError(f"{reel.path}: a video's name dates no frames; set video.times to container, fps or table.")
+    return reel.paths
+
+
+def _paired(folder: Path, times: list[list[Decimal]]) -> np.ndarray:
+    """(n, 2) frames of both sources that lie nearest in time, at most half a frame apart."""
+    if len(times) == 1:
+        return np.repeat(np.arange(len(times[0]))[:, None], 2, axis=1)
+    zero = times[0][0]
+    left, right = (np.array([float(t - zero) for t in time]) for time in times)
+    nearest = np.abs(left[:, None] - right[np.clip(np.searchsorted(right, left)[:, None] + [-1, 0], 0, len(right) - 1)])
+    partner = np.clip(np.searchsorted(right, left) - 1 + nearest.argmin(axis=1), 0, len(right) - 1)
+    step = float(np.median(np.diff(left))) if len(left) > 1 else 1.0
+    good = nearest.min(axis=1) < 0.5 * step
+    index = np.column_stack([np.flatnonzero(good), partner[good]])
+    index = index[np.unique(index[:, 1], return_index=True)[1]]
+    if 2 * len(index) < min(len(left), len(right)):
+        what = f"only {len(index)} of {len(left)} left and {len(right)} right frames lie within half a frame of each other"
+        raise ValueError(f"{folder}: {what}. Left and right need one clock; with video.times = 'fps' frames pair by number.")
+    return index
+
+
+def _bit_depth(reels: tuple[_Images | _Film, ...], index: np.ndarray) -> int | None:
+    """The least of 8, 10, 12, 14, 16 bits that holds the brightest value of some 16-bit frames; None for 8-bit frames."""
+    some = index[np.unique(np.linspace(0, len(index) - 1, _DEPTH_SAMPLES).astype(int))]
+    brightest = 0
+    for reel, wanted in zip(reels, some.T, strict=False):
+        if isinstance(reel, _Film):
+            wanted = wanted[: max(1, len(wanted) // 4)]  # a video is decoded up to there
+        for image in reel.read(wanted):
+            if image.dtype == np.uint8:
+                return None
+            brightest = max(brightest, int(image.max()))
+    return next(bits for bits in (8, 10, 12, 14, 16) if brightest < 1 << bits)
