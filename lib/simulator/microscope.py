@@ -6,7 +6,9 @@ import numpy as np
 
 from lib.cameras import AffineCamera, NearAffineCamera, StereoRig
 from lib.geometry import RigidTransform
+from lib.simulator.lighting import Lighting
 from lib.simulator.limits import check, not_negative, positive
+from lib.simulator.video import Video
 
 __all__ = ["IMAGE_SIZE_PX", "ROBOT_FROM_MICROSCOPE", "Microscope"]
 
@@ -34,6 +36,7 @@ class Microscope:
         jpeg_quality: Quality of stored images, 0 to 100; None stores them without loss.
         inverse_distance_per_mm: One over the working distance; 0 is affine.
         fps: Frame rate of the video.
+        lighting, video: Light, and camera electronics, beyond what is above; None = the reference microscope's.
     """
 
     pixels_per_mm: tuple[float, float] = (100.0, 98.0)
@@ -56,6 +59,8 @@ class Microscope:
     jpeg_quality: int | None = 92
     inverse_distance_per_mm: float = 0.0
     fps: float = 25.0
+    lighting: Lighting | None = None
+    video: Video | None = None
 
     def __post_init__(self) -> None:
         if min(self.image_size_px) < 16:

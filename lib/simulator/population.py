@@ -1,11 +1,13 @@
-"""Training images: eye, tool, pose, light, optics, glints and noise are drawn anew for every image.
+"""Images for training, validation and tests: everything in them is drawn anew, from named families (`families.py`).
 
-Eyes of `RESERVED_SEEDS` and tools with jaws of `RESERVED_JAW_MM` are never drawn.  Test recordings use them, so no test
-frame shows an eye or a tool of the training.
+The narrow population, eyes and forceps of the reference rig, is a part of the training.  There, eyes of `RESERVED_SEEDS`
+and tools with jaws of `RESERVED_JAW_MM` are never drawn.  Test recordings use them, so no test frame shows an eye or a
+tool of the training.
 """
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -13,13 +15,22 @@ import numpy as np
 from lib.cameras import AffineCamera
 from lib.geometry import RigidTransform
 from lib.simulator.eye import Eye
+from lib.simulator.families import ASPECTS, FAR, SHIFTED, TRAINING
 from lib.simulator.forceps import Forceps, Pose
+from lib.simulator.ground import Ground
+from lib.simulator.instruments import Instrument
 from lib.simulator.microscope import IMAGE_SIZE_PX, Microscope
 from lib.simulator.render import render_view
+from lib.simulator.shapes import beside, random_object
+from lib.simulator.video import Video
 from lib.simulator.window import Window
 
-__all__ = ["RESERVED_JAW_MM", "RESERVED_SEEDS", "TEXTURE_SEEDS", "VALIDATION_TEXTURE_SEEDS"]
-__all__ += ["random_eye", "random_forceps", "random_microscope", "random_pose", "reserved_forceps", "sample"]
+__all__ = ["POPULATIONS", "RESERVED_JAW_MM", "RESERVED_SEEDS", "TEST_TEXTURE_SEEDS", "TEXTURE_SEEDS"]
+__all__ += ["VALIDATION_TEXTURE_SEEDS", "Setup", "random_eye", "random_forceps", "random_microscope", "random_pose"]
+__all__ += ["random_setup", "reserved_forceps", "sample"]
+
+#: What `sample` draws from, beside the families of `FAR`.
+POPULATIONS = ("training", "validation", "near", "empty")
 
 #: Eyes (and the textures and brush marks that go with them) that training never draws.
 RESERVED_SEEDS = range(0, 10_000)
@@ -27,9 +38,12 @@ RESERVED_SEEDS = range(0, 10_000)
 TEXTURE_SEEDS = range(10_000, 10_096)
 #: Textures of the eyes that validate a training: none of those it sees.
 VALIDATION_TEXTURE_SEEDS = range(10_096, 10_112)
+#: Textures of test images.
+TEST_TEXTURE_SEEDS = range(9_000, 9_016)
 #: Jaw lengths that training never draws: recordings for tests have tools of these.
 RESERVED_JAW_MM = (2.95, 3.15)
 _TEXTURE_PX = 1536
+_NARROW = 0.2  # share of the narrow population in training
 
 
 def random_eye(rng: np.random.Generator, textures: Sequence[int] = TEXTURE_SEEDS) -> Eye:
@@ -94,9 +108,115 @@ def random_microscope(rng: np.random.Generator) -> Microscope:
     )  # fmt: skip
 
 
+@dataclass(frozen=True, eq=False)
+class Setup:
+    """What one image shows, through what: a member of each family in `families` (aspect -> name).
+
+    `forceps` is None for a scene without any tool; `pose` then says where a window looks.
+    """
+
+    scene: Eye
+    forceps: Forceps | Instrument | None
+    microscope: Microscope
+    pose: Pose
+    families: dict[str, str]
+
+
+def random_setup(
+    rng: np.random.Generator, population: str = "training", *, textures: Sequence[int] | None = None,
+    without: Sequence[str] = (), photographs: str | Path | None = None,
+) -> Setup:  # fmt: skip
+    """Draw what an image shows; see `sample` for the arguments.
+
+    Raises:
+        ValueError: If the population or a family to leave out is unknown, or a whole aspect is left out.
+    """
+    choices = _choices(population, without)
+    if textures is None:
+        textures = {"training": TEXTURE_SEEDS, "empty": TEXTURE_SEEDS, "validation": VALIDATION_TEXTURE_SEEDS}.get(
+            population, TEST_TEXTURE_SEEDS
+        )
+    if population == "near" or (population == "training" and rng.random() < _NARROW):
+        eye, forceps, microscope = random_eye(rng, textures), random_forceps(rng), random_microscope(rng)
+        if population != "near":
+            eye = Ground(**{f.name: getattr(eye, f.name) for f in fields(Eye)})  # with ripples that stay in memory
+        pose = random_pose(rng, forceps, eye.centre_z_mm - 0.35 * eye.depth_mm)
+        names = dict(zip(ASPECTS, ("plain_jaws", "coaxial", "fundus", "clean"), strict=True))
+        return Setup(eye, forceps, microscope, pose, names)
+    if population == "validation":  # at least one aspect is of a family that training never draws
+        shifted = rng.random(len(ASPECTS)) < 0.35
+        shifted[rng.integers(len(ASPECTS))] = True
+        choices = {
+            aspect: SHIFTED[aspect] if new else known
+            for (aspect, known), new in zip(choices.items(), shifted, strict=True)
+        }  # fmt: skip
+    names = {aspect: str(rng.choice(list(known))) for aspect, known in choices.items()}
+    if "fundus" in choices["scene"] and rng.random() < 0.25:
+        names["scene"] = "fundus"
+    draw = {aspect: choices[aspect][name] for aspect, name in names.items()}
+    scene = draw["scene"](rng, textures)
+    if photographs is not None and rng.random() < 0.3:
+        files = sorted(p for p in Path(photographs).iterdir() if p.suffix.lower() in (".jpg", ".jpeg", ".png"))
+        if not files:
+            raise FileNotFoundError(f"photographs: no JPEG or PNG in {photographs}.")
+        scene = replace(scene, kind="photograph", texture_path=files[rng.integers(len(files))])
+    surface_z_mm = scene.centre_z_mm - 0.35 * scene.depth_mm
+    size = float(np.exp(rng.uniform(*np.log((0.2, 0.8) if names["light"] == "pupil" else (0.25, 1.5)))))
+    if population == "empty":
+        tool = random_object(rng, size) if rng.random() < 0.75 else None
+    elif names["tool"] == "plain_jaws" and rng.random() < 0.5:
+        plain = random_forceps(rng)
+        lengths = ("shaft_radius_mm", "jaw_length_mm", "jaw_radius_mm", "tip_radius_mm", "bow_mm", "bend_mm", "hook_mm")
+        tool = replace(plain, **{name: getattr(plain, name) * size for name in lengths})
+    else:
+        tool = draw["tool"](rng, size)
+    pose = _wide_pose(rng, tool.jaw_length_mm if tool else size, surface_z_mm)
+    if isinstance(tool, Instrument) and rng.random() < 0.3:
+        tool = beside(rng, tool, size, np.array(pose.base_mm), surface_z_mm)
+    length = tool.jaw_length_mm if tool else 3 * size
+    middle = np.array(pose.base_mm) + 0.5 * length * pose.microscope_from_tool[:, 0]
+    microscope = draw["light"](rng, random_microscope(rng), (middle, length, surface_z_mm))
+    settings = draw["optics"](rng)
+    if rng.random() < 0.35:  # two things are wrong with the camera
+        settings = choices["optics"][str(rng.choice(list(choices["optics"])))](rng) | settings
+    microscope = replace(
+        microscope, jpeg_quality=int(rng.integers(40, 98)), video=Video(**settings),
+        brightness=float(np.clip(microscope.brightness * np.exp(rng.normal(0, 0.25)), 0.15, 4.0)),
+    )  # fmt: skip
+    return Setup(scene, tool, microscope, pose, names)
+
+
+def _choices(population: str, without: Sequence[str]) -> dict[str, dict[str, Callable]]:
+    """Aspect -> families that a population draws, less those left out."""
+    if population not in (*POPULATIONS, *FAR):
+        raise ValueError(f"population: one of {', '.join((*POPULATIONS, *FAR))}, got {population!r}.")
+    unknown = set(without) - {name for known in TRAINING.values() for name in known}
+    if unknown:
+        raise ValueError(f"without: no such family in training: {', '.join(sorted(unknown))}.")
+    choices = {aspect: {n: draw for n, draw in known.items() if n not in without} for aspect, known in TRAINING.items()}
+    for aspect, known in choices.items():
+        if not known:
+            raise ValueError(f"without: leaves no family of {aspect}.")
+    return choices | {aspect: {population: draw} for aspect, draw in FAR.get(population, {}).items()}
+
+
+def _wide_pose(rng: np.random.Generator, length: float, surface_z_mm: float) -> Pose:
+    """As `random_pose`, with wider openings, steeper tools, and more of them partly outside the field."""
+    azimuth, pitch = rng.uniform(-np.pi, np.pi), rng.uniform(0.0, 1.0)
+    reach = 1.15 if rng.random() < 0.15 else 0.93
+    tips = rng.uniform(-1, 1, 2) * IMAGE_SIZE_PX / 200 * reach
+    tip_z = max(surface_z_mm - rng.exponential(0.9), -2.5)
+    flat = length * np.cos(pitch) * np.array([np.cos(azimuth), np.sin(azimuth)])
+    base = [*(tips - flat), tip_z - length * np.sin(pitch)]
+    opening = length * (rng.choice([0.0, 1.0], p=[0.15, 0.85]) * rng.uniform(0.05, 0.65 if rng.random() < 0.8 else 1.41))
+    roll = np.clip(rng.normal(0, 0.45), -1.0, 1.0)
+    return Pose(tuple(float(v) for v in base), azimuth, pitch, float(roll), float(opening))
+
+
 def sample(
     rng: np.random.Generator, *, crop_px: int | None = None, size_px: tuple[int, int] | None = None,
-    around: int | None = None, jitter: float = 0.35, textures: Sequence[int] = TEXTURE_SEEDS,
+    around: int | None = None, jitter: float = 0.35, textures: Sequence[int] | None = None, population: str = "training",
+    without: Sequence[str] = (), photographs: str | Path | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
     """One view, not a pair, with its landmarks; `rng` decides everything.
 
@@ -105,29 +225,35 @@ def sample(
         size_px: (w, h) of the whole field shrunk to this size.  Without either size the image is the full-HD field.
         around: The landmark that a window holds, 0 base, 1 or 2 a tip; None = the jaws' centre.
         jitter: How far it may lie from the window's centre, as a share of the window's side.
-        textures: Seeds of the fundus textures to draw from; each takes a second to make and then stays in memory.
+        textures: Seeds of the textures to draw from, kept in memory; None = those of the population.
+        population: "training"; "validation", with kinds beside those of training; "near", the reference rig's eyes and
+            forceps alone; "empty", scenes and objects without the tool; or a family of `FAR`, which training never draws.
+        without: Families of `TRAINING` to leave out.
+        photographs: A folder of JPEGs or PNGs that serve as scenes, too.
 
-    Returns: image (h, w, 3) uint8 RGB; u (3, 2) px of base, tip_1, tip_2, also if outside; visibility (3,): 0 outside,
-        1 hidden, 2 visible.
+    Returns: image (h, w, 3) uint8 RGB; u (3, 2) px of base, tip_1, tip_2, also if outside, NaN without the tool;
+        visibility (3,): 0 outside, 1 hidden, 2 visible.
 
     Raises:
-        ValueError: If both sizes are given, or one is too small.
+        ValueError: If both sizes are given, one is too small, or a name is unknown.
     """
     if crop_px is not None and size_px is not None:
         raise ValueError("crop_px, size_px: give one, a window at full resolution or the field at a reduced one.")
     if min(crop_px or 64, *(size_px or (64, 64))) < 32:
         raise ValueError(f"crop_px, size_px: must be at least 32, got {crop_px}, {size_px}.")
-    eye, forceps, microscope = random_eye(rng, textures), random_forceps(rng), random_microscope(rng)
-    pose = random_pose(rng, forceps, eye.centre_z_mm - 0.35 * eye.depth_mm)
+    drawn = random_setup(rng, population, textures=textures, without=without, photographs=photographs)
+    forceps, pose, microscope = drawn.forceps, drawn.pose, drawn.microscope
+    landmarks = np.full((3, 3), np.nan) if forceps is None else forceps.landmarks(pose)
     magnification = 100.0 * rng.uniform(0.85, 1.18)  # px per mm
     side = rng.choice([-1, 1])
     tilt = RigidTransform.from_rotation_vector((rng.normal(0, 0.01), -side * 0.057 + rng.normal(0, 0.01), 0.0))
     spin = RigidTransform.from_rotation_vector((0.0, 0.0, rng.normal(0, 0.05)))
     field = np.array(IMAGE_SIZE_PX)
     camera = AffineCamera(np.column_stack([magnification * spin.compose(tilt).R[:2], (field - 1) / 2]))
+    shrink = 1.0
     if crop_px is not None:
-        landmarks = camera.project(forceps.landmarks(pose))
-        held = landmarks.mean(axis=0) if around is None else landmarks[around]
+        seen = camera.project(landmarks if np.isfinite(landmarks).all() else np.array([pose.base_mm] * 3))
+        held = seen.mean(axis=0) if around is None else seen[around]
         origin = held - (crop_px - 1) / 2 + rng.uniform(-jitter, jitter, 2) * crop_px
         origin = np.round(np.clip(origin, 0, np.maximum(field - crop_px, 0)))
         window = Window.around(camera, origin + crop_px / 2, (crop_px, crop_px), IMAGE_SIZE_PX)
@@ -138,13 +264,41 @@ def sample(
         camera = AffineCamera(np.column_stack([camera.linear * shrink, (camera.offset_px + 0.5) * shrink - 0.5]))
         window = Window(camera, (size_px[0], round(field[1] * size_px[0] / field[0])))
         microscope = replace(microscope, psf_px=max(0.45, microscope.psf_px * shrink))
-    speed = rng.normal(0, 2.0, 3) * (rng.random() < 0.5)
-    later = (replace(pose, base_mm=tuple(np.asarray(pose.base_mm) + 1e-3 * speed)), 1e-3)
-    view = render_view(eye, microscope, window, forceps=forceps, pose=pose, later=later, rng=rng)
-    image, u = view.image, view.u
+    speed = rng.normal(0, 2.0 if population == "near" else rng.choice([2.0, 6.0]), 3) * (rng.random() < 0.5)
+    moved = replace(pose, base_mm=tuple(np.asarray(pose.base_mm) + 1e-3 * speed))
+    later = (moved, 1e-3) if np.isfinite(landmarks).all() else None
+    microscope, video = replace(microscope, video=None), microscope.video  # applied last, to the final size
+    view = render_view(drawn.scene, microscope, window, forceps=forceps, pose=pose, later=later, rng=rng)
+    image, u, visibility = view.image, view.u, view.visibility
     if size_px is not None and tuple(size_px) != window.size_px:
         factor = np.array(size_px) / window.size_px
         image = cv2.resize(image, size_px, interpolation=cv2.INTER_AREA if factor[1] < 1 else cv2.INTER_LINEAR)
         u = (u + 0.5) * factor - 0.5
+    if video is not None:
+        if crop_px is None and rng.random() < 0.3:
+            image, u, visibility = _distorted(image, u, visibility, rng.uniform(-0.25, 0.25))
+        image = video.shrunk(shrink)(image, rng)
     encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, microscope.jpeg_quality])[1]
-    return cv2.imdecode(encoded, cv2.IMREAD_COLOR), u, view.visibility
+    return cv2.imdecode(encoded, cv2.IMREAD_COLOR), u, visibility
+
+
+def _distorted(
+    image: np.ndarray, u: np.ndarray, visibility: np.ndarray, strength: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """An image through a lens with radial distortion, with its landmarks: `strength` is the relative change at the corner."""
+    size = np.array(image.shape[1::-1])
+    centre, reach2 = (size - 1) / 2, float(((size / 2) ** 2).sum())
+    columns, rows = np.meshgrid(np.arange(size[0]) - centre[0], np.arange(size[1]) - centre[1])
+    def grow(radius2: np.ndarray) -> np.ndarray:
+        """Where a pixel comes from, relative to where it goes: never from outside the image."""
+        return (1 + strength / reach2 * radius2) / (1 + max(strength, 0.0))
+
+    scale = grow(columns * columns + rows * rows)
+    maps = ((columns * scale + centre[0]).astype(np.float32), (rows * scale + centre[1]).astype(np.float32))
+    image = cv2.remap(image, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
+    before, after = u - centre, u - centre
+    for _ in range(30):
+        after = before / grow((after**2).sum(axis=1, keepdims=True))
+    u = after + centre
+    inside = ((u > -0.5) & (u < size - 0.5)).all(axis=1)
+    return image, u, np.where(inside, visibility, 0)

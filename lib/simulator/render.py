@@ -46,7 +46,7 @@ class View:
     glint_mask: np.ndarray
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=10)
 def _bumps(seed: int) -> np.ndarray:
     """Slopes (n, n, 2) float32 of the wet film's ripples, over a square of `_BUMP_MM` that tiles by reflection."""
     rng = np.random.default_rng([seed, 5])
@@ -88,16 +88,26 @@ def render_view(
     lambert = (1 - light_x * slope_x - light_y * slope_y) / np.sqrt(1 + slope_x**2 + slope_y**2)
     spot2 = (x - microscope.spot_mm[0]) ** 2 + (y - microscope.spot_mm[1]) ** 2
     spot = np.exp(-spot2 / (2 * microscope.spot_radius_mm**2))
-    light = microscope.brightness * 1.45 * np.clip(lambert, 0.05, None) * (0.25 + 0.75 * spot)
-    if has_tool:
-        light = light * shadow(x, y, z, forceps, pose, microscope.light_slope)
+    light = microscope.brightness * 1.45 * np.clip(lambert, 0.05, None)
+    lighting = microscope.lighting
+    if lighting is None:
+        light = light * (0.25 + 0.75 * spot)
+        if has_tool:
+            light = light * shadow(x, y, z, forceps, pose, microscope.light_slope)
+        light_full = grid.full(light)
+    else:  # lit discs and shadows with hard borders need every pixel
+        at = tuple(grid.full(axis) for axis in (x, y, z))
+        light_full = grid.full(light) * lighting.spot(at[0], at[1], microscope.spot_mm, microscope.spot_radius_mm)
+        if has_tool:
+            light_full *= lighting.shaded(at, forceps.nodes(pose), microscope.light_slope)
     to_texture = scene.texture.shape[0] / scene.extent_mm
     (a, b, c), (d, e, f) = getattr(scene, "texture_from_surface", np.eye(2, 3))
     map_x = grid.full((a * x + b * y + c + scene.extent_mm / 2) * to_texture - 0.5)
     map_y = grid.full((d * x + e * y + f + scene.extent_mm / 2) * to_texture - 0.5)
-    albedo = cv2.remap(scene.texture, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    border = getattr(scene, "border", cv2.BORDER_REPLICATE)
+    albedo = cv2.remap(scene.texture, map_x, map_y, cv2.INTER_LINEAR, borderMode=border)
     linear = cv2.LUT(albedo, _LINEAR)
-    linear *= grid.full(light)[..., None]
+    linear *= light_full[..., None]
     glint_mask, tool_mask = np.zeros((2, *linear.shape[:2]), np.uint8)
     if scene.gloss > 0:
         # A film mirrors the lamp where its normal halves the directions of light and view.
@@ -106,7 +116,8 @@ def render_view(
         want_x, want_y = (light_x + view_x) / 2, (light_y + view_y) / 2
         film_x, film_y = grid.full(-0.6 * slope_x + want_x), grid.full(-0.6 * slope_y + want_y)
         place = (axis * np.float32(_BUMP_PX / _BUMP_MM / to_texture) for axis in (map_x, map_y))
-        bump = cv2.remap(_bumps(getattr(scene, "seed", 0)), *place, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+        film = _bumps(getattr(scene, "film_seed", getattr(scene, "seed", 0)))
+        bump = cv2.remap(film, *place, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
         bump *= np.float32(0.13)
         film_x += bump[..., 0]
         film_y += bump[..., 1]
@@ -116,9 +127,11 @@ def render_view(
         mirror = cv2.exp(mirror * np.float32(-1 / (2 * 0.011**2)))
         mirror *= np.float32(2.2)
         mirror += np.float32(0.10) * sheen
-        mirror *= grid.full(scene.gloss * light)
+        mirror *= light_full * np.float32(scene.gloss) if lighting else grid.full(scene.gloss * light)
         glint_mask[mirror > 0.55] = 255
         linear += mirror[..., None]
+    if lighting is not None:
+        lighting.behind(linear, window)
     sigma = np.hypot(microscope.psf_px, window.zoom / 100.0 * microscope.defocus_px(z))  # stated at 100 px per mm
     linear = blur_by_depth(linear, sigma, grid)
 
@@ -126,8 +139,10 @@ def render_view(
     if has_tool:
         tool = tool_in_view(window, forceps, pose, later, readout_s=microscope.readout_s, factor=factor)
         u, visibility = tool.u, tool.visibility
-        if tool.raster is not None:
-            compose(linear, tool_mask, tool, microscope, (light_x, light_y))
+        if tool.raster is not None and tool.raster.hit[0].size:
+            compose(linear, tool_mask, tool, microscope, (light_x, light_y), float(np.mean(z)))
+    if lighting is not None:
+        visibility = lighting.in_front(linear, window, u, visibility)
     field = np.array(window.field_px)
     centre = (field - 1) / 2 - window.origin_px
     radius2 = ((grid.u[0] - centre[0]) ** 2 + (grid.u[1] - centre[1]) ** 2) / (np.hypot(*field) / 2) ** 2
@@ -143,6 +158,8 @@ def render_view(
     cv2.pow(linear, 1 / GAMMA, linear)
     glint_mask[tool_mask > 0] = 0
     image, surface_mm = cv2.convertScaleAbs(linear, alpha=255), grid.full(z) if surface else None
+    if microscope.video is not None:
+        image = microscope.video(image, rng)
     return View(image, u, visibility, surface_mm, tool_mask, glint_mask)
 
 

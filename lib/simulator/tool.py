@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from lib.simulator.forceps import Forceps, Pose
+from lib.simulator.instruments import Instrument, finished
 from lib.simulator.microscope import Microscope
 from lib.simulator.window import Window, blur, blur_by_depth, motion_kernel
 
@@ -123,7 +124,7 @@ class ToolInView:
     """
 
     window: Window
-    forceps: Forceps
+    forceps: Forceps | Instrument
     landmarks: np.ndarray
     centres: np.ndarray
     radii: np.ndarray
@@ -143,7 +144,8 @@ class ToolInView:
         inside = ((u > -0.5) & (u < np.array(self.window.size_px) - 0.5)).all(axis=1)
         found = np.where(inside, 2, 0)
         for k in np.flatnonzero(inside) if self.raster else ():
-            if self._behind_another_part(k) or (k > 0 and self._behind_its_jaw(k)):
+            blunt = getattr(self.forceps, "tip_depth_mm", 0.0) > 0.02
+            if self._behind_another_part(k) or (k > 0 and not blunt and self._behind_its_jaw(k)):
                 found[k] = 1
         return found
 
@@ -172,7 +174,8 @@ class ToolInView:
 
 
 def tool_in_view(
-    window: Window, forceps: Forceps, pose: Pose, later: tuple[Pose, float] | None, *, readout_s: float = 0.0, factor: int = 2
+    window: Window, forceps: Forceps | Instrument, pose: Pose, later: tuple[Pose, float] | None, *,
+    readout_s: float = 0.0, factor: int = 2,
 ) -> ToolInView:  # fmt: skip
     """The tool as the window's camera sees it; `pose` holds when the middle row of the whole image is exposed.
 
@@ -199,7 +202,7 @@ def tool_in_view(
 
 
 def shadow(
-    x: np.ndarray, y: np.ndarray, z: np.ndarray, forceps: Forceps, pose: Pose, slope: tuple[float, float]
+    x: np.ndarray, y: np.ndarray, z: np.ndarray, forceps: Forceps | Instrument, pose: Pose, slope: tuple[float, float]
 ) -> np.ndarray:
     """Share of the light that the tool leaves on surface points (x, y, z) mm, in the shape of x; `slope` is the light's."""
     centres, radii, chains = forceps.nodes(pose)
@@ -216,15 +219,25 @@ def shadow(
     return 1 - 0.62 * cv2.remap(near, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
 
 
-def compose(linear: np.ndarray, tool_mask: np.ndarray, tool: ToolInView, microscope: Microscope, light: tuple) -> None:
+def compose(
+    linear: np.ndarray, tool_mask: np.ndarray, tool: ToolInView, microscope: Microscope, light: tuple,
+    scene_z_mm: float,
+) -> None:  # fmt: skip
     """Lay the tool, blurred by its depth and motion, over the scene: `linear` (h, w, 3) and `tool_mask` change in place.
 
-    `light` is the direction of the lamp (x, y) in the microscope frame, per unit of height.
+    `light` is the direction of the lamp (x, y) in the microscope frame, per unit of height; the scene's mean depth is
+    `scene_z_mm`.
     """
     window, raster = tool.window, tool.raster
     lamp = np.array([*light, -1.0]) @ window.R.T
-    glow = linear[::16, ::16].reshape(-1, 3).mean(axis=0)
-    metal = _metal(raster, tool.forceps, lamp / np.linalg.norm(lamp), glow) * np.float32(1.15 * microscope.brightness)
+    lamp /= np.linalg.norm(lamp)
+    power = 1.15 * microscope.brightness * (microscope.lighting.tool if microscope.lighting else 1.0)
+    if isinstance(tool.forceps, Instrument):
+        clearance = max(scene_z_mm - float(raster.depth_mm[raster.hit].mean()), 0.3)
+        metal = finished(raster, tool.forceps, lamp, linear / max(power, 0.02), window.zoom, clearance) * np.float32(power)
+    else:
+        glow = linear[::16, ::16].reshape(-1, 3).mean(axis=0)
+        metal = _metal(raster, tool.forceps, lamp, glow) * np.float32(power)
     colour, alpha, depth = _at_image_resolution(raster, metal)
     shift = tool.velocity * window.zoom * microscope.exposure_s
     height, width = alpha.shape
@@ -252,7 +265,7 @@ def compose(linear: np.ndarray, tool_mask: np.ndarray, tool: ToolInView, microsc
     target += layer[..., :3]
 
 
-def _metal(raster: ToolRaster, forceps: Forceps, lamp: np.ndarray, glow: np.ndarray) -> np.ndarray:
+def _metal(raster: ToolRaster, forceps: Forceps | Instrument, lamp: np.ndarray, glow: np.ndarray) -> np.ndarray:
     """Linear colour (n, 3) of the raster's tool samples under the lamp (3,), with the retina's glow (3,) from below."""
     normal, tangent = raster.normal, raster.tangent
     facing = np.clip(-normal[:, 2], 0, 1)

@@ -116,8 +116,9 @@ def test_tremor_is_physiological():
 @pytest.mark.parametrize("size", [{"crop_px": 160}, {"size_px": (240, 135)}, {"size_px": (160, 120)}])
 def test_training_images(size, monkeypatch):
     monkeypatch.setattr("lib.simulator.population._TEXTURE_PX", 256)
-    image, u, visibility = sample(np.random.default_rng(1), textures=range(10_000, 10_001), **size)
-    again = sample(np.random.default_rng(1), textures=range(10_000, 10_001), **size)
+    options = size | {"textures": range(10_000, 10_001), "population": "near"}
+    image, u, visibility = sample(np.random.default_rng(1), **options)
+    again = sample(np.random.default_rng(1), **options)
     shape = (size["crop_px"],) * 2 if "crop_px" in size else size["size_px"][::-1]
     assert image.shape == (*shape, 3) and image.dtype == np.uint8 and image.std() > 5
     assert u.shape == (3, 2) and visibility.shape == (3,) and np.isfinite(u).all()
@@ -132,7 +133,8 @@ def test_training_windows_hold_the_landmark_asked_for(monkeypatch):
     monkeypatch.setattr("lib.simulator.population.random_pose", lambda *_: Pose(azimuth_rad=0.7))
     rng = np.random.default_rng(2)
     for around in (0, 1, 2):
-        _, u, _ = sample(rng, crop_px=160, around=around, jitter=0.0, textures=range(10_000, 10_001))
+        window = {"crop_px": 160, "around": around, "jitter": 0.0}
+        _, u, _ = sample(rng, textures=range(10_000, 10_001), population="near", **window)
         assert np.abs(u[around] - 79.5).max() <= 0.5
 
 

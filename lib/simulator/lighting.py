@@ -1,0 +1,157 @@
+"""Light and what disturbs it beyond the reference microscope: lit discs, pupils, glare, shadows, haze, things in front."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from lib.simulator.window import Grid, Window
+
+__all__ = ["Lighting", "Patch"]
+
+
+@dataclass(frozen=True)
+class Patch:
+    """A soft ellipse in a plane parallel to the image.
+
+    Attributes:
+        centre_mm: (x, y, z) in the microscope frame.
+        radii_mm, turn_rad: Half axes, and the direction of the first.
+        edge: Width of its border as a share of its radius.
+        wobble: Amplitude of the border's irregularity, as a share of its radius.
+        colour: Linear (3,).
+        role: "glare" adds light to the scene, behind the tool; "flare" adds it in front; "cover" hides what is behind;
+            "pupil" hides everything that is not in it.
+    """
+
+    centre_mm: tuple[float, float, float]
+    radii_mm: tuple[float, float]
+    colour: tuple[float, float, float]
+    role: str
+    turn_rad: float = 0.0
+    edge: float = 0.1
+    wobble: float = 0.0
+
+    def share(self, window: Window, u: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+        """How far the patch fills the pixels u = (columns, rows), 0 to 1."""
+        x, y = window.rays(u, np.float32(self.centre_mm[2]))
+        dx, dy = x - self.centre_mm[0], y - self.centre_mm[1]
+        cosine, sine = np.cos(self.turn_rad), np.sin(self.turn_rad)
+        p = (dx * cosine + dy * sine) / self.radii_mm[0]
+        q = (dy * cosine - dx * sine) / self.radii_mm[1]
+        radius = np.sqrt(p * p + q * q)
+        if self.wobble:
+            angle, phase = np.arctan2(q, p), 37.0 * self.turn_rad
+            ripple = np.sin(2 * angle + phase) + 0.7 * np.sin(3 * angle + 2 * phase) + 0.5 * np.sin(7 * angle + 3 * phase)
+            radius = radius * (1 + self.wobble * ripple)
+        return 1 / (1 + np.exp(np.clip((radius - 1) * (4 / max(self.edge, 1e-3)), -40, 40)))
+
+
+@dataclass(frozen=True)
+class Lighting:
+    """How a scene is lit, and what lies between it and the camera.
+
+    Attributes:
+        ambient: Share of the light that reaches the scene outside the spot.
+        spot_edge: None = the spot is a Gaussian of `Microscope.spot_radius_mm`; else a disc of that radius whose border has
+            this width as a share of the radius.
+        band_rad: The spot is a band in this direction rather than a disc.
+        tool: Light on the tool, as a share of that on the scene.
+        shadow, shadow_sigma_mm: Depth (0 to 1) and softness of the tool's shadow.
+        source_mm: A lamp near the scene casts the shadow; None = light from far, as `Microscope.light_slope` says.
+        patches: What lies on the scene or before it.
+        scatter: Share of the light that arrives blurred over `scatter_mm`.
+        haze: Light (3,) added everywhere.
+        tint_per_mm: (3, 2) relative change of each colour along x and y: lamps of two colours.
+    """
+
+    ambient: float = 0.25
+    spot_edge: float | None = None
+    band_rad: float | None = None
+    tool: float = 1.0
+    shadow: float = 0.62
+    shadow_sigma_mm: float = 0.11
+    source_mm: tuple[float, float, float] | None = None
+    patches: tuple[Patch, ...] = ()
+    scatter: float = 0.0
+    scatter_mm: float = 1.0
+    haze: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    tint_per_mm: tuple[tuple[float, float], ...] | None = None
+
+    def spot(self, x: np.ndarray, y: np.ndarray, middle_mm: tuple[float, float], radius_mm: float) -> np.ndarray:
+        """Light 0 to 1 at (x, y) mm of a scene, for a spot of this middle and radius."""
+        x, y = x - middle_mm[0], y - middle_mm[1]
+        if self.band_rad is not None:
+            distance = np.abs(y * np.cos(self.band_rad) - x * np.sin(self.band_rad)) / radius_mm
+        else:
+            distance = np.hypot(x, y) / radius_mm
+        if self.spot_edge is None:
+            lit = np.exp(-(distance**2) / 2)
+        else:
+            lit = 1 / (1 + np.exp(np.clip((distance - 1) * (4 / self.spot_edge), -40, 40)))
+        return self.ambient + (1 - self.ambient) * lit
+
+    def shaded(self, at: tuple[np.ndarray, ...], nodes: tuple[np.ndarray, ...], slope: tuple[float, float]) -> np.ndarray:
+        """Share of the light that a tool of `nodes` (centres, radii, chains) leaves on surface points at = (x, y, z)."""
+        (x, y, z), (centres, radii, chains) = at, nodes
+        scale, half = (40.0 if self.shadow_sigma_mm < 0.1 else 20.0), 14.0
+        if self.source_mm is None:
+            flat, grow = centres[:, :2] + np.multiply(slope, centres[:, 2:]), np.ones(len(radii))
+            columns, rows = x + slope[0] * z, y + slope[1] * z
+        else:
+            lamp, ground = np.array(self.source_mm), float(np.mean(z))
+            grow = (ground - lamp[2]) / np.maximum(centres[:, 2] - lamp[2], 0.3)
+            flat, columns, rows = lamp[:2] + (centres[:, :2] - lamp[:2]) * grow[:, None], x, y
+        mask = np.zeros((int(2 * half * scale),) * 2, np.uint8)
+        for k in np.flatnonzero(chains[1:] == chains[:-1]):
+            ends = np.clip(np.round((flat[k : k + 2] + half) * scale * 16), -(2**20), 2**20).astype(int)
+            thickness = int(np.clip((radii[k] * grow[k] + radii[k + 1] * grow[k + 1]) * scale, 1, 200))
+            cv2.line(mask, tuple(map(int, ends[0])), tuple(map(int, ends[1])), 255, thickness, cv2.LINE_AA, 4)
+        small = cv2.resize(mask, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) if self.shadow_sigma_mm > 0.3 else mask
+        scale *= small.shape[0] / mask.shape[0]
+        near = cv2.GaussianBlur(small, (0, 0), max(self.shadow_sigma_mm * scale, 0.4))
+        place = (((axis + half) * scale - 0.5).astype(np.float32) for axis in (columns, rows))
+        return 1 - self.shadow / 255 * cv2.remap(near, *place, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+
+    def behind(self, linear: np.ndarray, window: Window) -> None:
+        """Add to the scene (h, w, 3), in place, what lies behind the tool."""
+        for patch in self.patches:
+            if patch.role == "glare":
+                linear += _share(patch, window)[..., None] * np.float32(patch.colour)
+
+    def in_front(self, linear: np.ndarray, window: Window, u: np.ndarray, visibility: np.ndarray) -> np.ndarray:
+        """Lay what lies before the tool over the image (h, w, 3), in place; the landmarks' visibility (3,) after that."""
+        if self.tint_per_mm is not None:
+            grid = Grid(window.size_px, 8)
+            x, y = window.rays(grid.u, np.zeros_like(grid.u[0]))
+            for channel, (along_x, along_y) in enumerate(self.tint_per_mm):
+                linear[..., channel] *= grid.full(np.clip(1 + along_x * x + along_y * y, 0.1, 3.0))
+        if self.scatter:
+            small = cv2.resize(linear, None, fx=0.125, fy=0.125, interpolation=cv2.INTER_AREA)
+            small = cv2.GaussianBlur(small, (0, 0), max(self.scatter_mm * window.zoom / 8, 0.5))
+            linear *= 1 - self.scatter
+            linear += self.scatter * cv2.resize(small, linear.shape[1::-1], interpolation=cv2.INTER_LINEAR)
+        visibility = visibility.copy()
+        for patch in self.patches:
+            if patch.role == "glare":
+                continue
+            share = _share(patch, window)
+            if patch.role == "flare":
+                linear += share[..., None] * np.float32(patch.colour)
+                hides = share * max(patch.colour) > 1.0
+            else:
+                share = 1 - share if patch.role == "pupil" else share
+                linear *= 1 - share[..., None]
+                linear += share[..., None] * np.float32(patch.colour)
+                hides = share > 0.7
+            for k in np.flatnonzero(visibility == 2):
+                column, row = np.round(u[k]).astype(int)
+                visibility[k] = 1 if hides[row, column] else 2
+        linear += np.float32(self.haze)
+        return visibility
+
+
+def _share(patch: Patch, window: Window) -> np.ndarray:
+    """(h, w) float32 share of every pixel of a window."""
+    columns, rows = (np.arange(side, dtype=np.float32) for side in window.size_px)
+    return patch.share(window, tuple(np.meshgrid(columns, rows))).astype(np.float32)

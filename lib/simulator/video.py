@@ -1,0 +1,136 @@
+"""What a camera's electronics and its recorder do to an image: blur, colour, sharpening, noise, fields, compression."""
+
+from dataclasses import dataclass, replace
+from typing import Self
+
+import cv2
+import numpy as np
+
+__all__ = ["Video"]
+
+_IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+
+@dataclass(frozen=True)
+class Video:
+    """Applied to the finished image in this order; the defaults do nothing.  Lengths are px of the image.
+
+    Attributes:
+        defocus_px: Radius of the disc into which each point is blurred.
+        astigmatism: Stretch of that disc along the rows, 1 is round.
+        fringe_px: Distance (x, y) by which red and blue part from green.
+        colours: (3, 3) output from input colours: casts, permutations, grey.
+        contrast, black, gamma: Tone curve: black + (1 - black) * contrast * value ** gamma, clipped.
+        sharpening, sharpening_px: Strength and width of unsharp masking.
+        noise, noise_px, noise_grey: Standard deviation (share of full scale), correlation length, and the part of it that
+            is the same in all colours.
+        banding: Standard deviation of a brightness error that differs by row.
+        field_shift_px: Shift along x between odd and even rows.
+        resample: The image was stored this many times smaller.
+        mosaic: One colour a pixel, interpolated.
+        chroma: Colours are stored this many times coarser.
+        qualities: JPEG qualities of successive compressions.
+    """
+
+    defocus_px: float = 0.0
+    astigmatism: float = 1.0
+    fringe_px: tuple[float, float] = (0.0, 0.0)
+    colours: tuple[tuple[float, ...], ...] = _IDENTITY
+    contrast: float = 1.0
+    black: float = 0.0
+    gamma: float = 1.0
+    sharpening: float = 0.0
+    sharpening_px: float = 1.0
+    noise: float = 0.0
+    noise_px: float = 0.0
+    noise_grey: float = 0.5
+    banding: float = 0.0
+    field_shift_px: float = 0.0
+    resample: float = 1.0
+    mosaic: bool = False
+    chroma: int = 1
+    qualities: tuple[int, ...] = ()
+
+    def __call__(self, image: np.ndarray, rng: np.random.Generator | None) -> np.ndarray:
+        """The image (h, w, 3) uint8 RGB as recorded; without `rng` it has no noise."""
+        height, width = image.shape[:2]
+        if self.resample != 1.0:
+            size = max(round(width / self.resample), 16), max(round(height / self.resample), 16)
+            image = cv2.resize(image, size, interpolation=cv2.INTER_AREA if self.resample > 1 else cv2.INTER_CUBIC)
+        value = image.astype(np.float32) / 255
+        if self.defocus_px / self.resample > 0.4:
+            value = _disc_blur(value, self.defocus_px / self.resample, self.astigmatism)
+        if any(self.fringe_px):
+            for channel, sign in ((0, 1), (2, -1)):
+                shift = np.float32([[1, 0, sign * self.fringe_px[0]], [0, 1, sign * self.fringe_px[1]]])
+                plane = np.ascontiguousarray(value[..., channel])
+                value[..., channel] = cv2.warpAffine(plane, shift, plane.shape[::-1], borderMode=cv2.BORDER_REPLICATE)
+        if self.colours != _IDENTITY:
+            value = cv2.transform(value, np.float32(self.colours))
+        if self.gamma != 1.0:
+            np.clip(value, 0, None, out=value)
+            cv2.pow(value, self.gamma, value)
+        value = np.float32(self.black) + np.float32((1 - self.black) * self.contrast) * value
+        np.clip(value, 0, 1, out=value)
+        if rng is not None and self.noise:
+            value += self._noise(rng, value.shape)
+        if rng is not None and self.banding:
+            value += np.float32(self.banding) * rng.standard_normal((value.shape[0], 1, 1), dtype=np.float32)
+        if self.mosaic:
+            value = _mosaic(value)
+        if self.sharpening:
+            value += np.float32(self.sharpening) * (value - cv2.GaussianBlur(value, (0, 0), self.sharpening_px))
+        np.clip(value, 0, 1, out=value)
+        image = cv2.convertScaleAbs(value, alpha=255)
+        if self.field_shift_px:
+            for first, sign in ((0, -0.5), (1, 0.5)):
+                rows = np.ascontiguousarray(image[first::2])
+                shift = np.float32([[1, 0, sign * self.field_shift_px], [0, 1, 0]])
+                image[first::2] = cv2.warpAffine(rows, shift, rows.shape[1::-1], borderMode=cv2.BORDER_REPLICATE)
+        if self.chroma > 1:
+            ycc = cv2.cvtColor(image, cv2.COLOR_RGB2YCrCb)
+            size = max(image.shape[1] // self.chroma, 1), max(image.shape[0] // self.chroma, 1)
+            coarse = cv2.resize(ycc[..., 1:], size, interpolation=cv2.INTER_AREA)
+            ycc[..., 1:] = cv2.resize(coarse, image.shape[1::-1], interpolation=cv2.INTER_LINEAR)
+            image = cv2.cvtColor(ycc, cv2.COLOR_YCrCb2RGB)
+        for quality in self.qualities:
+            encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+            image = cv2.imdecode(encoded, cv2.IMREAD_COLOR)
+        if self.resample != 1.0:
+            image = cv2.resize(image, (width, height), interpolation=cv2.INTER_LINEAR)
+        return image
+
+    def shrunk(self, factor: float) -> Self:
+        """For an image of which every length is `factor` times as long; compression and noise stay."""
+        fringe = tuple(factor * shift for shift in self.fringe_px)
+        return replace(
+            self, defocus_px=factor * self.defocus_px, fringe_px=fringe, field_shift_px=factor * self.field_shift_px
+        )  # fmt: skip
+
+    def _noise(self, rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+        coloured = rng.standard_normal(shape, dtype=np.float32) * np.float32(1 - self.noise_grey)
+        coloured += rng.standard_normal((*shape[:2], 1), dtype=np.float32) * np.float32(self.noise_grey)
+        if self.noise_px > 0.3:
+            coloured = cv2.GaussianBlur(coloured, (0, 0), self.noise_px)
+        return coloured * np.float32(self.noise / max(float(coloured.std()), 1e-6))
+
+
+def _disc_blur(value: np.ndarray, radius: float, stretch: float) -> np.ndarray:
+    """The image with each point spread over a soft ellipse; wide ones at a lower resolution."""
+    step = 1 << int(np.clip(np.log2(radius / 3.0), 0, 4))
+    height, width = value.shape[:2]
+    small = cv2.resize(value, (-(-width // step), -(-height // step)), interpolation=cv2.INTER_AREA) if step > 1 else value
+    r = radius / step
+    half = int(np.ceil(r * max(stretch, 1 / stretch))) + 1
+    y, x = np.mgrid[-half : half + 1, -half : half + 1]
+    kernel = np.clip(r + 0.5 - np.sqrt((x / stretch) ** 2 + (y * stretch) ** 2), 0, 1).astype(np.float32)
+    small = cv2.filter2D(small, -1, kernel / kernel.sum(), borderType=cv2.BORDER_REPLICATE)
+    return cv2.resize(small, (width, height), interpolation=cv2.INTER_CUBIC) if step > 1 else small
+
+
+def _mosaic(value: np.ndarray) -> np.ndarray:
+    """Sampled through a colour filter of 2 x 2 pixels and interpolated."""
+    raw = np.clip(value[..., 1], 0, 1).copy()
+    raw[::2, ::2], raw[1::2, 1::2] = value[::2, ::2, 0], value[1::2, 1::2, 2]
+    raw = cv2.convertScaleAbs(raw, alpha=255)
+    return cv2.cvtColor(raw, cv2.COLOR_BayerBG2RGB).astype(np.float32) / 255
