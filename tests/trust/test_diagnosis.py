@@ -56,8 +56,8 @@ def test_a_clock_is_found_among_wrong_landmarks_and_without_the_log():
 
 
 def test_the_edge_of_the_search_is_stated():
-    late = take(offset_s=1.1, frames=30)
-    clock = next(h for h in found(late, log=False).hypotheses if h.name == "clock")
+    late = take(offset_s=1.1, frames=14)
+    clock = next(h for h in found(late).hypotheses if h.name == "clock")
     assert "edge of the search" in clock.text
 
 
