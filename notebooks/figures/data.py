@@ -51,7 +51,7 @@ def gallery(images: Mapping[str, np.ndarray], *, columns: int = 4, width_in: flo
 
 
 def contact_sheet(recording: Recording, indices: Sequence[int], *, columns: int = 4, shrink: int = 4) -> Figure:
-    """Left images of a recording with the annotated landmarks."""
+    """Left images of a recording, with the annotated landmarks where there are any."""
     rows = -(-len(indices) // columns)
     width, height = recording.image_size_px
     page, axes = figure(
@@ -62,7 +62,8 @@ def contact_sheet(recording: Recording, indices: Sequence[int], *, columns: int 
     for ax, k in zip(axes.flat, indices, strict=False):
         show_image(ax, recording.frames[k].left[::shrink, ::shrink], f"{recording.frames.time_s[k]:.1f} s")
         ax.title.set_fontsize(9)
-        for colour, u in zip(LANDMARK_COLOURS.values(), recording.annotations.u_left[k], strict=True):
+        labels = recording.annotations.u_left[k] if recording.annotations else ()
+        for colour, u in zip(LANDMARK_COLOURS.values(), labels, strict=False):
             ax.plot(*((u + 0.5) / shrink - 0.5), "o", color=colour, markersize=5, markeredgecolor="black")
     return page
 
@@ -131,19 +132,26 @@ def motion_page(motions: Mapping[str, Motion], *, samples: int = 1500) -> Figure
 
 
 def volume_page(recording: Recording) -> Figure:
-    """Where the landmarks were in the left image and in depth, and how far the jaws opened."""
+    """Where the landmarks were, from the labels of the left image (else the robot's x and y) and in depth; the opening jaws.
+
+    Depth is along the true view where it is known, else along the robot's z.
+    """
     page, axes = figure(1, 3, width_in=12, height_in=3.6)
-    x = recording.landmarks_mm()
-    u = recording.annotations.u_left
-    depth = recording.truth.rig.left.viewing_direction
+    x, labels, truth = recording.landmarks_mm(), recording.annotations, recording.truth
+    across = labels.u_left if labels else x[..., :2]
+    depth = truth.rig.left.viewing_direction if truth else np.array([0.0, 0.0, 1.0])
     for k, (name, colour) in enumerate(LANDMARK_COLOURS.items()):
-        axes[0].plot(*u[:, k].T, "o", color=colour, markeredgecolor="black", markersize=5, label=name)
-        z = x[:, k] @ depth
-        axes[1].hist(z - np.nanmean(x @ depth), bins=14, color=colour, alpha=0.7, edgecolor="black", linewidth=0.4)
-    width, height = recording.image_size_px
-    axes[0].set(xlim=(0, width), ylim=(height, 0), aspect="equal", title="Annotations, left image (px)")
+        axes[0].plot(*across[:, k].T, "o", color=colour, markeredgecolor="black", markersize=5, label=name)
+        z = (x[:, k] - np.nanmean(x, axis=(0, 1))) @ depth
+        axes[1].hist(z[np.isfinite(z)], bins=14, color=colour, alpha=0.7, edgecolor="black", linewidth=0.4)
+    if labels:
+        width, height = recording.image_size_px
+        axes[0].set(xlim=(0, width), ylim=(height, 0), title="Annotations, left image (px)")
+    else:
+        axes[0].set(xlabel="x (mm)", ylabel="y (mm)", title="The robot's report at the frames")
+    axes[0].set_aspect("equal")
     axes[0].legend(fontsize=8)
-    axes[1].set(xlabel="depth about its mean (mm)", title="Depths covered")
+    axes[1].set(xlabel=f"{'depth' if truth else 'z of the robot'} about its mean (mm)", title="Depths covered")
     axes[2].plot(recording.frames.time_s, np.linalg.norm(x[:, 1] - x[:, 2], axis=1), "o-", color=COLOURS["ours"])
     axes[2].set(xlabel="time (s)", ylabel="mm", title="Distance between the tips")
     return page

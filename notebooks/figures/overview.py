@@ -62,7 +62,7 @@ def pipeline_page(
     surface_mm, error_um:
         Points (h, w, 3) of the surface over a `pixel_grid`, robot frame, and its error (h, w); None without a truth.
     registration_um:
-        For each method, frames used (k,) and translation error (k,) in um.
+        For each method, frames used (k,) and translation error (k,) in um; empty without held-out frames.
     """
     page = plt.figure(figsize=(13, 7.4), layout="constrained", facecolor="white")
     grid = page.add_gridspec(2, 3)
@@ -103,6 +103,11 @@ def pipeline_page(
     ax.set_title(("5  Height" if error_um is None else "5  Error against the truth") + rms, **title)
 
     ax = page.add_subplot(grid[1, 2])
+    ax.set_title("6  A moved microscope, registered", **title)
+    if not registration_um:
+        ax.set_axis_off()
+        ax.text(0.0, 0.9, "Left out: the recording is too short\nto hold frames out.", va="top", transform=ax.transAxes)
+        return page
     for (method, (frames, error)), colour in zip(
         registration_um.items(), (COLOURS["paper"], COLOURS["ours"]), strict=False
     ):
@@ -111,7 +116,6 @@ def pipeline_page(
     ax.set(xlabel="frames of the tool", ylabel="translation error, um", yscale="log")
     ax.grid(True, color="#e6e6e6", linewidth=0.6)
     ax.legend(fontsize=8, frameon=False)
-    ax.set_title("6  A moved microscope, registered", **title)
     return page
 
 

@@ -108,7 +108,9 @@ def error_timeline(
         ax.plot([result.index for result in results], error, color=colour, marker=".", label=name)
     if bump_at is not None:
         ax.axvline(bump_at - 0.5, color=COLOURS["warning"], linestyle="--", label="bump")
-    ax.set(yscale="log", xlabel="frame", ylabel="um", title="Errors against the truth")
+    if any(np.isfinite(error).any() for error in errors_um.values()):
+        ax.set(yscale="log")
+    ax.set(xlabel="frame", ylabel="um", title="Errors against the truth")
     ax.legend(ncols=4)
     return page
 

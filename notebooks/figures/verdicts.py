@@ -1,0 +1,83 @@
+"""What stands before the numbers of a recording: may they be believed, and which frames can be held out."""
+
+from __future__ import annotations
+
+import textwrap
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from lib.calibration import Calibration, calibrate, with_offsets
+from lib.correspondences import Correspondences
+from lib.recordings import Recording
+from lib.trust import Assessment, Verdict
+from lib.workbench import report
+from notebooks.figures.overview import landmarks_on
+from notebooks.figures.style import figure, show_image
+
+__all__ = ["believed", "by_confidence", "half_and_rest", "sealed", "surest_and_least_sure", "whether_true"]
+
+#: Fewest rows of a calibration that is to be judged by held-out frames, and of those frames.
+_ROWS = (12, 3)
+
+
+def believed(assessed: Assessment, *, force: bool) -> Calibration:
+    """The calibration of a recording; without one, or on a red one unless `force`, the notebook ends here and says why."""
+    left_out = "So what follows from the cameras (surface, distance, registration) is not computed, and the rest of this"
+    left_out += " notebook is left out. The verdict above says why, and what to do."
+    if assessed.calibration is None:
+        report.stop(f"The cameras could not be calibrated from this recording. {left_out}")
+    if assessed.verdict.is_red and not force:
+        anyway = "With `-p force True` the notebook goes on in spite of it."
+        report.stop(f"The calibration of this recording is not trustworthy. {left_out} {anyway}")
+    return assessed.calibration
+
+
+def half_and_rest(data: Correspondences, chosen: np.ndarray) -> tuple[Calibration | None, Correspondences]:
+    """A calibration with the rows `chosen`, and the others with its offsets; None, with a line that says so, if too few."""
+    rows = data.subset(chosen), data.subset(~chosen)
+    try:
+        if any(len(part.complete) < least for part, least in zip(rows, _ROWS, strict=True)):
+            raise ValueError(f"a calibration needs {_ROWS[0]} landmarks seen in both images, its check {_ROWS[1]}.")
+        half = calibrate(rows[0])
+    except ValueError as error:
+        print(f"The recording is too short to hold out frames: {error}")
+        return None, rows[1]
+    return half, with_offsets(rows[1], half.offsets)
+
+
+def sealed(page: Figure, verdict: Verdict) -> Figure:
+    """A figure with the verdict on the recording's calibration above its title, and the worst reason with its cure."""
+    worst = verdict.reasons[0] if verdict.reasons else None
+    text = f"Calibration: {verdict.level}." + (f" {worst.text} {worst.cure}" if worst else "")
+    width = int(11 * page.get_figwidth())
+    lines = [*textwrap.wrap(text, width), *filter(None, [page.get_suptitle()])]
+    page.suptitle("\n".join(lines), x=0.01, ha="left", fontsize=10, color=report.VERDICT_COLOURS[verdict.level])
+    return page
+
+
+def whether_true(recording: Recording) -> str:
+    """One sentence: is there a truth that judges the numbers of this recording?"""
+    if recording.truth is None:
+        return "This recording has no truth. Its numbers are judged by held-out frames and by the verdict alone."
+    return "This recording is simulated. Its truth judges the numbers and computes none of them."
+
+
+def by_confidence(data: Correspondences) -> np.ndarray:
+    """Positions of the frames in `data`, the surest first, by the confidence of the weakest of their six detections."""
+    return np.argsort(-np.nan_to_num(data.grid("confidence").min(axis=(1, 2))), kind="stable")
+
+
+def surest_and_least_sure(recording: Recording, data: Correspondences) -> Figure:
+    """Six left images with their landmarks, evenly from the surest to the least sure; `data` holds all frames."""
+    order = by_confidence(data)
+    chosen = order[np.unique(np.linspace(0, len(order) - 1, 6).round().astype(int))]
+    width, height = recording.image_size_px
+    page, axes = figure(2, 3, width_in=12, height_in=8 * height / width + 1.2)
+    for ax in axes.flat:
+        ax.set_axis_off()
+    weakest = np.nan_to_num(data.grid("confidence").min(axis=(1, 2)))
+    for ax, k in zip(axes.flat, chosen, strict=False):
+        show_image(ax, recording.frames[int(k)].left, f"Frame {k}: weakest confidence {weakest[k]:.2f}")
+        landmarks_on(ax, data.grid("u_left")[k], label=False)
+    return page
