@@ -56,33 +56,46 @@ def import_recording(source: str | Path, mapping: str | Path | Mapping, out: str
     first = next(stereo.pairs())[0]
     size = first.shape[1], first.shape[0]
     labels = read_labels(folder, told.labels, stereo, told.landmarks, size) if told.labels else None
-    tool, tool_told = _tool(told, robot, robot_s, time_s + offset_s, labels)
+    frames_s = time_s + offset_s + (0.0 if labels is None else _delay(labels, told.readout_s, size[1]))
+    tool, tool_told = _tool(told, robot, robot_s, frames_s, labels)
     fps = told.video.fps or (1 / float(np.median(np.diff(time_s))) if len(time_s) > 1 else 25.0)
     fps = round(fps, 6) if told.video.fps is None else fps / told.video.every
-    with RecordingWriter(
+    writer = RecordingWriter(
         out, name=told.name, description=told.description, fps=fps, image_size_px=size, readout_s=told.readout_s,
         offset_s=offset_s, robot_accuracy_mm=told.robot_accuracy_mm, skeleton=told.landmarks, overwrite=overwrite,
         suffix=f".{told.video.format}", jpeg_quality=told.video.jpeg_quality,
-    ) as writer:  # fmt: skip
-        for (left, right), t in zip(stereo.pairs(), time_s, strict=True):
-            writer.add(left, right, t)
-        writer.kinematics(robot_s, robot.x_mm if tool is None else _positions(tool, robot))
-        if labels is not None:
-            writer.annotations(labels.u_left, labels.u_right, labels.visibility_left, labels.visibility_right)
-        draft = writer.draft()
-        clock = _clock(draft, told.robot.search_s) if told.robot.offset_s == "estimate" else None
-        if clock:
-            writer.offset(clock.offset_s)
+    )  # fmt: skip
+    try:
+        with writer:
+            for (left, right), t in zip(stereo.pairs(), time_s, strict=True):
+                writer.add(left, right, t)
+            writer.kinematics(robot_s, robot.x_mm if tool is None else _positions(tool, robot))
+            if labels is not None:
+                writer.annotations(labels.u_left, labels.u_right, labels.visibility_left, labels.visibility_right)
             draft = writer.draft()
-        report = {"format": "microstereo.import", "did": _did(told, stereo, robot, draft, clock, zeros)}
-        report["clock"] = {"offset_s": round(clock.offset_s, 9), "sd_s": float(f"{clock.sd_s:.3g}")} if clock else None
-        report |= {"tool": tool_told, "mapping": told.model_dump(mode="json"), "sources": _sources(folder, told, stereo)}
-        files.write_json(writer.folder / "import.json", report)
+            clock = _clock(draft, told.robot.search_s) if told.robot.offset_s == "estimate" else None
+            if clock:
+                writer.offset(clock.offset_s)
+                draft = writer.draft()
+            report = {"format": "microstereo.import", "did": _did(told, stereo, robot, draft, clock, zeros)}
+            report["clock"] = clock and {"offset_s": round(clock.offset_s, 9), "sd_s": float(f"{clock.sd_s:.3g}")}
+            report |= {"tool": tool_told, "mapping": told.model_dump(mode="json"), "sources": _sources(folder, told, stereo)}
+            files.write_json(writer.folder / "import.json", report)
+    except ValueError as error:  # of the unfinished recording, which is gone: its place says more
+        raise ValueError(str(error).replace(str(writer.folder), str(out))) from None
     return report
 
 
 def _zero(stereo: StereoSource) -> Decimal:
     return Decimal(int(stereo.time[0])) if abs(stereo.time[0]) > 10**6 else Decimal(0)
+
+
+def _delay(labels: Annotations, readout_s: float, height_px: int) -> np.ndarray:
+    """(n,) s from a frame's time to the mean instant at which the rows of its labels were read."""
+    y = np.hstack([labels.u_left[..., 1], labels.u_right[..., 1]])
+    middle = (height_px - 1) / 2
+    mean = np.nansum(y - middle, axis=1) / np.maximum(np.isfinite(y).sum(axis=1), 1)
+    return readout_s * mean / (height_px - 1)
 
 
 def _clock(draft: Recording, search_s: float) -> TimeOffset:

@@ -44,7 +44,7 @@ def read_labels(
     """
     theirs = {labels.names.get(name, name): k for k, name in enumerate(landmarks)}
     frame_of = [{int(f): n for n, f in enumerate(side)} for side in source.index.T]
-    numbers = [reel.stamps is None and {last_number(p): n for n, p in enumerate(reel.files)} for reel in source.reels]
+    numbers = [reel.numbers for reel in source.reels]
     width, height = image_size_px
     u, v = np.full((2, len(source.time), len(landmarks), 2), np.nan), np.zeros((2, len(source.time), len(landmarks)), int)
     known, count = set(), 0
@@ -69,8 +69,9 @@ def read_labels(
             reel = side if source.layout == "two" else 0
             if len(source.reels) == 2 and source.exchanged:
                 reel = 1 - reel
+            name = PurePosixPath(label.image.replace("\\", "/")).stem
             number = (last_number(label.image.replace("\\", "/")) or 0) - labels.first_frame
-            frame = frame_of[reel].get(numbers[reel].get(number) if numbers[reel] else number)
+            frame = frame_of[reel].get(numbers[reel].get(name, numbers[reel].get(number, number)))
             if frame is None:
                 continue
             if not ((xy >= -0.5).all() and (xy <= np.array([width, height]) - 0.5).all()):
@@ -85,6 +86,8 @@ def read_labels(
     if not v.any():
         cure = "Check labels.first_frame and the images' names"
         raise ValueError(f"{path}: none of its {count} labels belongs to an imported frame. {cure}.")
+    if np.nanmax(u) <= min(100, min(image_size_px) / 4):
+        raise ValueError(f"{path}: no label beyond {np.nanmax(u):.4g} px: fractions or per cent of the image? Export pixels.")
     return Annotations(u[0], u[1], v[0], v[1])
 
 
@@ -164,7 +167,7 @@ def _from_zip(path: Path, name: str) -> str:
 def _label_studio(path: Path) -> Iterator[Label]:
     for task in json.loads(decoded(path)):
         data = task["data"]
-        image = next(str(value) for value in data.values() if isinstance(value, str))
+        image = str(next(iter(data.values())))
         for result in (r for annotation in task["annotations"][:1] for r in annotation["result"]):
             if "keypointlabels" not in result["value"]:
                 continue
@@ -187,10 +190,10 @@ def _deeplabcut(path: Path) -> Iterator[Label]:
         header, images, values = _pandas_table(path)
     else:
         rows = [row for row in csv.reader(io.StringIO(decoded(path))) if row]
-        top = next(i for i, row in enumerate(rows) if row[0] == "coords")
-        n = next(i for i, cell in enumerate(rows[top]) if cell in ("x", "y"))
-        parts = next(row for row in rows[:top] if row[0] == "bodyparts")
-        header = list(zip(parts[n:], rows[top][n:], strict=True))
+        named = {row[0]: i for i, row in enumerate(rows[:8])}
+        top = named["coords"]
+        n = rows[top].index("x")
+        header = list(zip(rows[named["bodyparts"]][n:], rows[top][n:], strict=True))
         images = ["/".join(cell for cell in row[:n] if cell) for row in rows[top + 1 :]]
         values = [[float(cell) if cell.strip() else np.nan for cell in row[n:]] for row in rows[top + 1 :]]
     columns = {key: i for i, key in enumerate(header)}

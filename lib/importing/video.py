@@ -45,6 +45,9 @@ class _Images:
             if last_number(one) == last_number(other):
                 raise ValueError(f"{other}: numbered like {one.name}. Narrow the pattern, so that it names one camera.")
         self.stamps, self.files = None, self.paths
+        counted = last_number(self.paths[-1]) < 10 * len(self.paths) + 10**6  # else the numbers are times
+        self.numbers = {path.stem: n for n, path in enumerate(self.paths)}
+        self.numbers |= {last_number(path): n for n, path in enumerate(self.paths) if counted}
 
     def __len__(self) -> int:
         return len(self.paths)
@@ -60,7 +63,7 @@ class _Film:
     def __init__(self, path: Path) -> None:
         if not path.is_file():
             raise FileNotFoundError(f"{path}: no such video; the mapping names it.")
-        self.path, self.files = path, [path]
+        self.path, self.files, self.numbers = path, [path], {}
         with self._open() as container:
             stream = container.streams.video[0]
             packets = [p for p in container.demux(stream) if p.size and not p.is_discard]

@@ -1,0 +1,212 @@
+"""The shipped recording made foreign and imported again: the same landmarks, kinematics, clock and calibration."""
+
+import hashlib
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from lib.calibration import calibrate
+from lib.correspondences import of_recording
+from lib.geometry import RigidTransform
+from lib.importing import guess_mapping, import_recording, read_mapping
+from lib.recordings import Recording
+from tests.importing import foreign
+
+HINGE = (
+    "[tool]\nlandmarks_mm = { base = [0, 0, 0] }\n"
+    "hinge = { point_mm = [0, 0, 0], axis = [0, 0, 1], jaw_mm = [2.988, 0, 0] }\n"
+)
+FORMS = {
+    "side by side": (foreign.side_by_side, foreign.robot_csv, foreign.labels_coco),
+    "metres and semicolons": (foreign.images, foreign.robot_foreign_csv, foreign.labels_coco),
+    "pose only": (foreign.images, lambda folder, source: foreign.robot_poses(folder, source) + HINGE, foreign.labels_coco),
+    "ROS 2 bag": (foreign.images, foreign.robot_bag, foreign.labels_coco),
+    "ROS 1 bag": (foreign.images, lambda folder, source: foreign.robot_bag(folder, source, 1), foreign.labels_coco),
+    "DeepLabCut": (foreign.images, foreign.robot_csv, foreign.labels_deeplabcut),
+    "CVAT": (foreign.images, foreign.robot_csv, foreign.labels_cvat),
+    "Label Studio": (foreign.side_by_side, foreign.robot_csv, foreign.labels_label_studio),
+    "SLEAP": (foreign.images, foreign.robot_csv, foreign.labels_sleap),
+}
+
+
+@pytest.fixture(scope="module")
+def shipped():
+    return foreign.shipped()
+
+
+def source_of(tmp_path: Path, source: foreign.Shipped, *makers) -> tuple[Path, Path]:
+    """A folder of foreign files and the mapping beside it."""
+    folder, mapping = tmp_path / "my söurce", tmp_path / "map.toml"
+    folder.mkdir()
+    mapping.write_text('name = "eye"\nreadout_s = 0.015\n' + "".join(maker(folder, source) for maker in makers), "utf-8")
+    return folder, mapping
+
+
+def thinned(source: foreign.Shipped, every: int) -> foreign.Shipped:
+    return replace(source, robot_s=source.robot_s[::every], x_mm=source.x_mm[::every])
+
+
+def content(folder: Path) -> dict[str, str]:
+    return {str(p.relative_to(folder)): hashlib.sha256(p.read_bytes()).hexdigest() for p in folder.rglob("*") if p.is_file()}
+
+
+def rig_of(recording: Recording):
+    rows = of_recording(recording, recording.annotations.u_left, recording.annotations.u_right)
+    return calibrate(rows, image_size_px=recording.image_size_px).rig
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_foreign_form_comes_back(form, shipped, tmp_path):
+    shipped = shipped if form == "metres and semicolons" else thinned(shipped, 5)  # a clock needs the whole log
+    folder, mapping = source_of(tmp_path, shipped, *FORMS[form])
+    before = content(folder)
+    report = import_recording(folder, mapping, tmp_path / "eye")
+    assert content(folder) == before
+    recording = Recording.open(tmp_path / "eye")
+    np.testing.assert_allclose(recording.frames.time_s, shipped.time_s, atol=1e-6)
+    for side in ("left", "right"):  # NaN where the reduced image ends before the label
+        ours, theirs = (getattr(labels, f"u_{side}") for labels in (recording.annotations, shipped.labels))
+        np.testing.assert_allclose(ours, theirs, atol=0.05 / 8)  # 0.05 px of the full frame
+    expected = foreign.posed(shipped)[2] if form == "pose only" else shipped.x_mm
+    np.testing.assert_allclose(recording.kinematics.x_mm, expected, atol=1e-3)
+    if report["clock"]:
+        assert abs(report["clock"]["offset_s"] - foreign.CLOCK_S) < 5e-4
+        assert recording.offset_s == pytest.approx(report["clock"]["offset_s"])
+        assert report["clock"]["sd_s"] < 5e-4
+    robot_s = recording.kinematics.time_s - recording.offset_s
+    np.testing.assert_allclose(robot_s, shipped.robot_s, atol=5e-4)
+    if form != "pose only":  # its landmarks lie 5 um from the robot's, which are not quite those of a hinge
+        x = shipped.x_mm[::100].reshape(-1, 3)
+        plain = of_recording(recording, shipped.labels.u_left, shipped.labels.u_right)
+        expected = calibrate(plain, image_size_px=recording.image_size_px).rig.project(x)
+        np.testing.assert_allclose(rig_of(recording).project(x), expected, atol=0.01)
+    if form == "side by side":  # the halves are not exchanged, and lie where they lay
+        frame = recording.frames[3]
+        assert np.abs(frame.left.astype(float) - shipped.frames[3, 0]).mean() < 4
+        assert np.abs(frame.right.astype(float) - shipped.frames[3, 1]).mean() < 4
+
+
+def test_an_import_is_repeatable_and_says_what_it_did(shipped, tmp_path):
+    few = replace(thinned(shipped, 20), frames=shipped.frames[:6], time_s=shipped.time_s[:6])
+    folder, mapping = source_of(tmp_path, few, foreign.side_by_side, foreign.robot_csv)
+    first = import_recording(folder, mapping, tmp_path / "one")
+    assert import_recording(folder, mapping, tmp_path / "two") == first
+    assert content(tmp_path / "one") == content(tmp_path / "two")
+    assert json.loads((tmp_path / "one" / "import.json").read_text()) == first
+    log = next(entry for entry in first["sources"] if entry["file"] == "log.csv")
+    assert log["sha256"] == hashlib.sha256((folder / "log.csv").read_bytes()).hexdigest()
+    assert "No labels." in first["did"]
+
+
+def test_a_variable_frame_rate_keeps_its_times_and_lost_frames_leave_pairs(shipped, tmp_path):
+    time_s = np.array([0.0, 0.04, 0.08, 0.2, 0.24, 0.28])
+    folder, mapping = source_of(tmp_path, thinned(shipped, 20), foreign.robot_csv)
+    foreign.video(folder / "left.mkv", shipped.frames[:6, 0], time_s)
+    kept = [0, 1, 3, 4, 5]
+    foreign.video(folder / "right.mkv", shipped.frames[kept, 1], time_s[kept] + 0.003)
+    two = '[video]\nlayout = "two"\nleft = "left.mkv"\nright = "right.mkv"\n'
+    mapping.write_text(mapping.read_text("utf-8") + two, "utf-8")
+    report = import_recording(folder, mapping, tmp_path / "eye")
+    np.testing.assert_allclose(Recording.open(tmp_path / "eye").frames.time_s, time_s[kept], atol=1.1e-3)  # .mkv counts ms
+    assert any("1 frames without a partner" in line for line in report["did"])
+    assert any("frame rate varies" in line for line in report["did"])
+
+
+@pytest.mark.parametrize("form", ["png", "video"])
+def test_twelve_grey_bits_in_sixteen_are_not_black(form, shipped, tmp_path):
+    grey = (shipped.frames[:4].mean(axis=-1) * (4095 / 255)).astype(np.uint16)
+    folder, mapping = source_of(tmp_path, thinned(shipped, 20), foreign.robot_csv)
+    if form == "png":
+        for side, name in enumerate(("left", "right")):
+            for i, image in enumerate(grey[:, side]):
+                cv2.imwrite(str(folder / f"{name}_{i:04d}.png"), image)
+        video = '[video]\nlayout = "two"\nleft = "left_*.png"\nright = "right_*.png"\ntimes = "fps"\nfps = 25\n'
+    else:
+        both = np.concatenate([grey[:, 0], grey[:, 1]], axis=2)
+        foreign.video(folder / "grey.mkv", both, np.arange(4) / 25, "ffv1", "gray16le")
+        video = '[video]\nlayout = "side_by_side"\nfile = "grey.mkv"\nformat = "png"\n'
+    mapping.write_text(mapping.read_text("utf-8") + video, "utf-8")
+    report = import_recording(folder, mapping, tmp_path / "eye")
+    frame = Recording.open(tmp_path / "eye").frames[2]
+    assert np.abs(frame.left.mean(axis=-1) - shipped.frames[2, 0].mean(axis=-1)).mean() < 2
+    assert any("Frames of 12 bits" in line for line in report["did"])
+    assert any("grey" in line for line in report["did"])
+
+
+def test_other_landmarks_are_imported_and_calibrated(shipped, tmp_path):
+    """A probe with two points: the import, its annotations and the calibration know no forceps."""
+    two = lambda x: x[:, :2]  # noqa: E731
+    labels = replace(shipped.labels, u_left=two(shipped.labels.u_left), u_right=two(shipped.labels.u_right),
+                     visibility_left=None, visibility_right=None)  # fmt: skip
+    folder, mapping = source_of(tmp_path, shipped, foreign.images, foreign.robot_csv)
+    text = mapping.read_text("utf-8").replace("tip_1 =", "needle_tip =")
+    text = text.replace(', tip_2 = ["tip_2_x", "tip_2_y", "tip_2_z"]', "")
+    mapping.write_text('landmarks = ["base", "needle_tip"]\n' + text, "utf-8")
+    import_recording(folder, mapping, tmp_path / "eye")
+    recording = Recording.open(tmp_path / "eye")
+    assert recording.skeleton == ("base", "needle_tip") and recording.landmarks_mm().shape == (34, 2, 3)
+    rows = of_recording(recording, labels.u_left, labels.u_right)
+    found = calibrate(rows, image_size_px=recording.image_size_px)
+    assert found.inliers.sum() > 50 and found.reprojection_rms_px < 1
+
+
+def test_the_guess_needs_little_change(shipped, tmp_path):
+    folder, _ = source_of(tmp_path, shipped, foreign.side_by_side, foreign.robot_foreign_csv, foreign.labels_cvat)
+    text = guess_mapping(folder)
+    assert all("  # " in line for line in text.splitlines() if " = " in line)
+    path = tmp_path / "guess.toml"
+    path.write_text(text, "utf-8")
+    told = read_mapping(path)
+    assert (told.video.layout, told.robot.separator, told.robot.decimal) == ("side_by_side", ";", ",")
+    assert (told.robot.time_unit, told.robot.length_unit, told.labels.kind) == ("ms", "m", "cvat")
+    assert told.robot.landmarks["tip_1"] == ("Q x [m]", "Q y [m]", "Q z [m]")
+    assert set(told.labels.names.values()) == set(foreign.NAMES.values())
+    folder2 = tmp_path / "bag"
+    folder2.mkdir()
+    foreign.images(folder2, shipped), foreign.robot_bag(folder2, thinned(shipped, 80))
+    path.write_text(guess_mapping(folder2), "utf-8")
+    told = read_mapping(path)
+    assert told.robot.landmarks["base"] == ("/base:point.x", "/base:point.y", "/base:point.z")
+    assert (told.video.times, told.video.left) == ("names", "cam L/*.tiff")
+
+
+def test_jaws_are_estimated_from_poses_gripper_and_labels(shipped, tmp_path):
+    """The labels carry 1 px of noise in the full frame, 10 um."""
+    makers = foreign.images, foreign.robot_poses, lambda *_: "[tool]\nestimate = true\n", foreign.labels_coco
+    folder, mapping = source_of(tmp_path, shipped, *makers)
+    report = import_recording(folder, mapping, tmp_path / "eye")
+    error = Recording.open(tmp_path / "eye").kinematics.x_mm - foreign.posed(shipped)[2]
+    assert np.sqrt(np.mean(error**2)) < 0.02
+    assert np.max(report["tool"]["sd_mm"]) < 0.03
+
+
+def test_a_tip_that_rests_in_one_point_gives_its_place(tmp_path, shipped):
+    """`tool.pivot_s`: for some seconds of the log the tool turns about its tip."""
+    rng = np.random.default_rng(0)
+    tip, time = np.array([0.5, -0.2, 14.0]), np.arange(400) / 100
+    turns = [RigidTransform.from_rotation_vector(v) for v in rng.uniform(-0.4, 0.4, (400, 3))]
+    poses = [RigidTransform(p.R, [5, 5, 5] - p.R @ tip + 0.005 * rng.normal(size=3)) for p in turns]
+    for i in range(200, 400):  # then it moves
+        poses[i] = RigidTransform(turns[i].R, [i / 50, 0, 0])
+    values = np.array([[t, *p.t, *p.R.ravel()] for t, p in zip(time, poses, strict=True)])
+    folder, mapping = source_of(tmp_path, shipped)
+    header = "t,x,y,z," + ",".join(f"r{k}" for k in range(9))
+    np.savetxt(folder / "log.csv", values, "%.9f", ",", header=header, comments="")
+    foreign.video(folder / "left.mp4", shipped.frames[:5, 0], np.arange(5) / 25)
+    foreign.video(folder / "right.mp4", shipped.frames[:5, 1], np.arange(5) / 25)
+    rotation = ", ".join(f'"r{k}"' for k in range(9))
+    mapping.write_text(
+        'name = "rest"\nlandmarks = ["tip", "shaft"]\n[video]\nlayout = "two"\nleft = "left.mp4"\nright = "right.mp4"\n'
+        '[robot]\nfile = "log.csv"\ntime = "t"\nlength_unit = "mm"\n[robot.pose]\nposition = ["x", "y", "z"]\n'
+        f'rotation = [{rotation}]\nrotation_kind = "matrix"\n'
+        "[tool]\npivot_s = { tip = [0, 1.99] }\nlandmarks_mm = { shaft = [0, 0, 0] }\n"
+    )
+    report = import_recording(folder, mapping, tmp_path / "rest")
+    np.testing.assert_allclose(report["tool"]["offset_mm"]["tip"], tip, atol=0.01)
+    mapping.write_text(mapping.read_text().replace("[0, 1.99]", "[0, 0.01]"))
+    with pytest.raises(ValueError, match="poses"):
+        import_recording(folder, mapping, tmp_path / "short")
