@@ -14,10 +14,11 @@ from scipy.spatial.transform import Rotation
 
 from lib.simulator.limits import check, not_negative, positive
 
-__all__ = ["MAX_PITCH_RAD", "MAX_ROLL_RAD", "Forceps", "Pose"]
+__all__ = ["MAX_PITCH_RAD", "MAX_ROLL_RAD", "MAX_TIP_RADIUS_MM", "Forceps", "Pose"]
 
 MAX_ROLL_RAD = np.deg2rad(60.0)
 MAX_PITCH_RAD = np.deg2rad(60.0)
+MAX_TIP_RADIUS_MM = 0.02
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,8 @@ class Forceps:
         radii = self.tip_radius_mm, self.jaw_radius_mm, self.shaft_radius_mm
         if not radii[0] <= radii[1] <= radii[2]:
             raise ValueError(f"tip_radius_mm, jaw_radius_mm, shaft_radius_mm: must not decrease in this order, got {radii}.")
-        check(self, "tip_radius_mm", lambda v: v <= 0.02, "beyond 0.02 a tip is no point to measure")
+        rule = f"beyond {MAX_TIP_RADIUS_MM} a tip is no point to measure"
+        check(self, "tip_radius_mm", lambda v: v <= MAX_TIP_RADIUS_MM, rule)
         check(self, "brightness", lambda v: 0 < v <= 1, "must lie between 0 and 1")
 
     def _jaw(self, side: int, opening_mm: float) -> tuple[np.ndarray, np.ndarray]:

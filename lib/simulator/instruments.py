@@ -1,11 +1,11 @@
-"""Tools of any shape: a stepped shaft and two jaws made of round cones, each part with its own surface, and other objects.
+"""Tools of any shape: a shaft and two jaws made of round cones, each with a surface of its own, and other objects.
 
 An `Instrument` offers what the renderer and `Motion` need of a `Forceps`, in the same tool frame (see `forceps.py`).  The
 landmarks are defined once, for every tool.  base: the point on the shaft's axis where the jaws leave the shaft or its
-neck.  tip_1, tip_2: the farthest point of each jaw on its own centre line; of a loop or a spoon, its far end.
+neck.  tip_1, tip_2: the farthest point of each jaw on its own centre line; of a ring or a spoon, its far end.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -15,7 +15,6 @@ from lib.simulator.forceps import Pose
 __all__ = ["Finish", "Instrument", "Jaw", "finished"]
 
 _SHAFT_MM = 40.0
-_STEEL = (0.5, 0.5, 0.49)
 
 
 @dataclass(frozen=True)
@@ -29,7 +28,7 @@ class Finish:
         brushed: Contrast of marks along the part.
     """
 
-    colour: tuple[float, float, float] = _STEEL
+    colour: tuple[float, float, float] = (0.5, 0.5, 0.49)
     matt: float = 0.5
     mirror: float = 0.4
     shine: float = 0.6
@@ -57,8 +56,7 @@ class Jaw:
     def opened(self, side: int, opening_mm: float) -> np.ndarray:
         """Centres and tip (n + 1, 3) when the tips are about `opening_mm` apart; `side` is +1 for jaw 1."""
         points = np.vstack([self.line, self.tip])
-        reach = float(np.hypot(*self.tip[:2]))
-        angle = 2 * self.share * np.arcsin(np.clip(opening_mm / 2 / reach, 0.0, 0.71))
+        angle = 2 * self.share * np.arcsin(np.clip(opening_mm / 2 / np.hypot(*self.tip[:2]), 0.0, 0.71))
         angle = angle * np.clip(points[:, 0] / max(self.tip[0], 1e-3), 0, 1) ** self.flex
         x, y = points[:, 0], points[:, 1]
         cosine, sine = np.cos(angle), np.sin(angle)
@@ -70,27 +68,27 @@ class Instrument:
     """A tool of two jaws, or an object without landmarks.
 
     Attributes:
-        jaws: Two jaws; none = an object that has no landmarks.
+        jaws: Two jaws; of an object without landmarks, up to two parts that move with its shaft.
         profile: (k, 2) distance behind the base and radius, mm, from the base outwards: steps, necks and collars.
-        extra: More parts (n, 3) centres and (n,) radii each, such as a hook; they move with the shaft.
-        finishes: Of the shaft, and of the rest.
+        finishes: Of the shaft, and of the jaws.
         bend_per_mm: Curvature of the shaft.
         others: Objects that stand still beside it, each with its pose.
+        has_landmarks: False for an object that only resembles the tool.
         seed: Of the brush marks.
     """
 
-    jaws: tuple[Jaw, ...] = ()
+    jaws: tuple[Jaw, ...]
     profile: tuple[tuple[float, float], ...] = ((0.0, 0.3),)
-    extra: tuple[tuple[np.ndarray, np.ndarray], ...] = ()
-    finishes: tuple[Finish, Finish] = field(default=(Finish(), Finish()))
+    finishes: tuple[Finish, Finish] = (Finish(), Finish())
     bend_per_mm: float = 0.0
     others: tuple[tuple["Instrument", Pose], ...] = ()
+    has_landmarks: bool = True
     seed: int = 0
 
     @property
     def jaw_length_mm(self) -> float:
         """Mean distance from the base to the tips of the closed tool."""
-        return float(np.mean([np.hypot(*jaw.tip[:2]) for jaw in self.jaws])) if self.jaws else 1.0
+        return float(np.mean([np.hypot(*jaw.tip[:2]) for jaw in self.jaws] or [10 * self.shaft_radius_mm]))
 
     @property
     def shaft_radius_mm(self) -> float:
@@ -98,13 +96,13 @@ class Instrument:
         return self.profile[0][1]
 
     @property
-    def tip_depth_mm(self) -> float:
-        """How deep a tip may lie below its own jaw's surface and still count as visible: blunt jaws end in a ball."""
-        return max((2 * float(jaw.radii[-1]) for jaw in self.jaws), default=0.0)
+    def tip_radius_mm(self) -> float:
+        """Radius of the ball in which the blunter jaw ends."""
+        return max((float(jaw.radii[-1]) for jaw in self.jaws), default=0.0)
 
     def landmarks(self, pose: Pose) -> np.ndarray:
-        """base, tip_1, tip_2 (3, 3) mm in the microscope frame; NaN for an object without jaws."""
-        if not self.jaws:
+        """base, tip_1, tip_2 (3, 3) mm in the microscope frame; NaN for an object without landmarks."""
+        if not self.has_landmarks:
             return np.full((3, 3), np.nan)
         tips = [jaw.opened(side, pose.opening_mm)[-1] for jaw, side in zip(self.jaws, (1, -1), strict=True)]
         return np.array([np.zeros(3), *tips]) @ pose.microscope_from_tool.T + np.asarray(pose.base_mm)
@@ -112,39 +110,26 @@ class Instrument:
     def nodes(self, pose: Pose) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Centres (n, 3) in the microscope frame, radii (n,) mm and chains (n,) of the round cones, as `Forceps.nodes`.
 
-        Chain 0 is the shaft, 1 and 2 the jaws, the rest other parts and objects.
+        Chain 0 is the shaft, 1 and 2 the jaws; each other object has the next three numbers.
         """
-        parts = [(*part, chain) for chain, part in enumerate(self._parts(pose))]
-        for other, where in self.others:
-            for part in other._parts(where):
-                parts.append((*part, max(parts[-1][2], 2) + 1))
-        chains = np.concatenate([np.full(len(radii), chain) for _, radii, chain in parts])
-        return np.vstack([line for line, _, _ in parts]), np.concatenate([radii for _, radii, _ in parts]), chains
+        parts = [(3 * k + chain, *part) for k, one in enumerate([(self, pose), *self.others])
+                 for chain, part in enumerate(one[0].parts(one[1]))]  # fmt: skip
+        chains = np.concatenate([np.full(len(radii), chain) for chain, _, radii in parts])
+        return np.vstack([line for _, line, _ in parts]), np.concatenate([radii for _, _, radii in parts]), chains
 
-    def _parts(self, pose: Pose) -> list[tuple[np.ndarray, np.ndarray]]:
-        """(centres in the microscope frame, radii) of shaft, jaws and extra parts."""
+    def parts(self, pose: Pose) -> list[tuple[np.ndarray, np.ndarray]]:
+        """(centres in the microscope frame, radii) of the shaft and the jaws."""
         behind, radius = np.array(self.profile).T
         x = np.unique(np.concatenate([np.linspace(behind[-1], _SHAFT_MM, 20), behind]))[::-1]
-        r = np.interp(x, behind, radius)
-        parts = [(np.column_stack([-x, 0.5 * self.bend_per_mm * x * x, np.zeros(len(x))]), r)]
-        for jaw, side in zip(self.jaws, (1, -1), strict=False):
-            parts.append((jaw.opened(side, pose.opening_mm)[:-1], jaw.radii))
-        parts += self.extra
+        shaft = np.column_stack([-x, 0.5 * self.bend_per_mm * x * x, np.zeros(len(x))]), np.interp(x, behind, radius)
+        jaws = [(jaw.opened(side, pose.opening_mm)[:-1], jaw.radii) for jaw, side in zip(self.jaws, (1, -1), strict=False)]
         turn, base = pose.microscope_from_tool.T, np.asarray(pose.base_mm)
-        return [(line @ turn + base, r) for line, r in parts]
-
-    def finish_of(self, chain_count: int) -> list[Finish]:
-        """The finish of each chain."""
-        found = [self.finishes[0]] + [self.finishes[1]] * (2 * bool(self.jaws) + len(self.extra))
-        found += [self.finishes[1]] * max(3 - len(found), 0) if self.others else []
-        for other, _ in self.others:
-            found += [other.finishes[0]] + [other.finishes[1]] * (len(other.jaws) + len(other.extra))
-        return (found + [self.finishes[1]] * chain_count)[:chain_count]
+        return [(line @ turn + base, r) for line, r in [shaft, *jaws]]
 
 
 def finished(
     raster: object, tool: Instrument, lamp: np.ndarray, scene: np.ndarray, zoom: float, clearance_mm: float
-) -> np.ndarray:  # fmt: skip
+) -> np.ndarray:
     """Linear colour (n, 3) of the raster's tool samples under the lamp (3,), with `scene` (h, w, 3) mirrored in them.
 
     Args:
@@ -153,35 +138,30 @@ def finished(
     """
     normal, tangent = raster.normal, raster.tangent
     chain = raster.part[raster.hit].astype(int) - 1
-    finishes = tool.finish_of(int(chain.max(initial=0)) + 1)
-    matt, mirror, shine, sharpness, brushed = (
+    finishes = [f for one in (tool, *(other for other, _ in tool.others)) for f in (one.finishes[0], *[one.finishes[1]] * 2)]
+    matt, mirror, shine, sharpness, brushed, colour = (
         np.array([getattr(finish, name) for finish in finishes], np.float32)[chain]
-        for name in ("matt", "mirror", "shine", "sharpness", "brushed")
+        for name in ("matt", "mirror", "shine", "sharpness", "brushed", "colour")
     )
-    colour = np.array([finish.colour for finish in finishes], np.float32)[chain]
     lamp = lamp.astype(np.float32)
-    half = lamp - np.array([0, 0, 1.0], np.float32)
+    half = (lamp - [0, 0, 1]).astype(np.float32)
     half /= np.linalg.norm(half)
-    glint = np.clip(normal @ half, 0, 1) ** sharpness
-    along = tangent @ half
-    streak = np.sqrt(np.maximum(1 - along * along, 0)) ** (2 * sharpness) * np.clip(normal @ half, 0, 1) ** 4
+    to_half, along = np.clip(normal @ half, 0, 1), tangent @ half
+    streak = np.maximum(1 - along * along, 0) ** sharpness * to_half**4
     # The view ray (0, 0, 1), mirrored: where it goes down it meets the scene, where it goes up the room and the lamp.
     up = 2 * normal[:, 2] ** 2 - 1
-    side = -2 * normal[:, 2:] * normal[:, :2]
+    shift = -2 * normal[:, 2:] * normal[:, :2] * (zoom * clearance_mm / np.maximum(-up, 0.15))[:, None]
     sky = 0.08 + 0.75 / (1 + np.exp(-(up - 0.6) / 0.12))
     small = cv2.GaussianBlur(cv2.resize(scene, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA), (0, 0), 1.5)
-    shift = side * (zoom * clearance_mm / np.maximum(-up, 0.15))[:, None]
-    place = [(sample + 0.5) / raster.factor + first for sample, first in zip(raster.hit[::-1], raster.origin_px, strict=True)]
-    column, row = (np.clip((at + shift[:, i]) / 4, 0, small.shape[1 - i] - 1).astype(int) for i, at in enumerate(place))
-    field_seen = small[row, column]
-    down = np.clip(0.5 - 2.5 * up, 0, 1)[:, None]
-    seen = down * field_seen + (1 - down) * sky[:, None]
+    at = [(sample + 0.5) / raster.factor + first for sample, first in zip(raster.hit[::-1], raster.origin_px, strict=True)]
+    column, row = (np.clip((at[i] + shift[:, i]) / 4, 0, small.shape[1 - i] - 1).astype(int) for i in (0, 1))
+    below, down = small[row, column], np.clip(0.5 - 2.5 * up, 0, 1)[:, None]
     marks = np.random.default_rng([tool.seed, 3]).standard_normal((64, 128)).astype(np.float32)
     marks = cv2.GaussianBlur(marks, (0, 0), sigmaX=4, sigmaY=0.8)
-    marks /= marks.std()
     around = (normal[:, 0] * tangent[:, 1] - normal[:, 1] * tangent[:, 0]) * 31 + 32
-    brush = np.clip(1 + brushed * marks[around.astype(int) % 64, (raster.along_mm * 6).astype(int) % 128], 0.2, 2)
-    lambert = np.clip(normal @ lamp, 0, 1)
-    glow = field_seen * np.clip(0.4 - up, 0, 1.4)[:, None]
-    even = (matt * brush)[:, None] * ((0.12 + 0.9 * lambert)[:, None] + 0.3 * glow)
-    return colour * (even + (mirror * brush)[:, None] * seen) + (shine * (0.4 * glint + 0.8 * streak))[:, None]
+    marks = marks[around.astype(int) % 64, (raster.along_mm * 6).astype(int) % 128] / marks.std()
+    brush = np.clip(1 + brushed * marks, 0.2, 2)
+    even = (matt * brush)[:, None] * ((0.12 + 0.9 * np.clip(normal @ lamp, 0, 1))[:, None]
+                                      + 0.3 * np.clip(0.4 - up, 0, 1.4)[:, None] * below)  # fmt: skip
+    mirrored = (mirror * brush)[:, None] * (down * below + (1 - down) * sky[:, None])
+    return colour * (even + mirrored) + (shine * (0.4 * to_half**sharpness + 0.8 * streak))[:, None]

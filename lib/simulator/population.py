@@ -29,6 +29,8 @@ __all__ = ["POPULATIONS", "RESERVED_JAW_MM", "RESERVED_SEEDS", "TEST_TEXTURE_SEE
 __all__ += ["VALIDATION_TEXTURE_SEEDS", "Setup", "random_eye", "random_forceps", "random_microscope", "random_pose"]
 __all__ += ["random_setup", "reserved_forceps", "sample"]
 
+#: Families from which the far rung draws what is not far.
+_ORDINARY = {"light": ("coaxial", "oblique", "near_lamp", "glare"), "optics": ("clean", "grey", "cast")}
 #: What `sample` draws from, beside the families of `FAR`.
 POPULATIONS = ("training", "validation", "near", "empty")
 
@@ -43,7 +45,7 @@ TEST_TEXTURE_SEEDS = range(9_000, 9_016)
 #: Jaw lengths that training never draws: recordings for tests have tools of these.
 RESERVED_JAW_MM = (2.95, 3.15)
 _TEXTURE_PX = 1536
-_NARROW = 0.2  # share of the narrow population in training
+_NARROW, _NARROW_TEXTURES = 0.2, 32  # share of the narrow population in training, and its textures, kept in memory
 
 
 def random_eye(rng: np.random.Generator, textures: Sequence[int] = TEXTURE_SEEDS) -> Eye:
@@ -133,35 +135,32 @@ def random_setup(
     """
     choices = _choices(population, without)
     if textures is None:
-        textures = {"training": TEXTURE_SEEDS, "empty": TEXTURE_SEEDS, "validation": VALIDATION_TEXTURE_SEEDS}.get(
-            population, TEST_TEXTURE_SEEDS
-        )
+        drawn_by = {"training": TEXTURE_SEEDS, "empty": TEXTURE_SEEDS, "validation": VALIDATION_TEXTURE_SEEDS}
+        textures = drawn_by.get(population, TEST_TEXTURE_SEEDS)
     if population == "near" or (population == "training" and rng.random() < _NARROW):
-        eye, forceps, microscope = random_eye(rng, textures), random_forceps(rng), random_microscope(rng)
+        eye, forceps, microscope = random_eye(rng, textures[:_NARROW_TEXTURES]), random_forceps(rng), random_microscope(rng)
         if population != "near":
-            eye = Ground(**{f.name: getattr(eye, f.name) for f in fields(Eye)})  # with ripples that stay in memory
+            eye = Ground(**{f.name: getattr(eye, f.name) for f in fields(Eye)})  # whose film stays in memory
         pose = random_pose(rng, forceps, eye.centre_z_mm - 0.35 * eye.depth_mm)
         names = dict(zip(ASPECTS, ("plain_jaws", "coaxial", "fundus", "clean"), strict=True))
         return Setup(eye, forceps, microscope, pose, names)
     if population == "validation":  # at least one aspect is of a family that training never draws
         shifted = rng.random(len(ASPECTS)) < 0.35
         shifted[rng.integers(len(ASPECTS))] = True
-        choices = {
-            aspect: SHIFTED[aspect] if new else known
-            for (aspect, known), new in zip(choices.items(), shifted, strict=True)
-        }  # fmt: skip
+        choices |= {aspect: SHIFTED[aspect] for aspect, new in zip(ASPECTS, shifted, strict=True) if new}
     names = {aspect: str(rng.choice(list(known))) for aspect, known in choices.items()}
     if "fundus" in choices["scene"] and rng.random() < 0.25:
         names["scene"] = "fundus"
     draw = {aspect: choices[aspect][name] for aspect, name in names.items()}
     scene = draw["scene"](rng, textures)
     if photographs is not None and rng.random() < 0.3:
-        files = sorted(p for p in Path(photographs).iterdir() if p.suffix.lower() in (".jpg", ".jpeg", ".png"))
+        files = sorted(path for path in Path(photographs).iterdir() if path.suffix.lower() in (".jpg", ".jpeg", ".png"))
         if not files:
             raise FileNotFoundError(f"photographs: no JPEG or PNG in {photographs}.")
         scene = replace(scene, kind="photograph", texture_path=files[rng.integers(len(files))])
     surface_z_mm = scene.centre_z_mm - 0.35 * scene.depth_mm
-    size = float(np.exp(rng.uniform(*np.log((0.2, 0.8) if names["light"] == "pupil" else (0.25, 1.5)))))
+    sizes = (0.5, 1.3) if population in FAR else (0.2, 0.8) if names["light"] == "pupil" else (0.25, 1.5)
+    size = float(np.exp(rng.uniform(*np.log(sizes))))
     if population == "empty":
         tool = random_object(rng, size) if rng.random() < 0.75 else None
     elif names["tool"] == "plain_jaws" and rng.random() < 0.5:
@@ -170,19 +169,19 @@ def random_setup(
         tool = replace(plain, **{name: getattr(plain, name) * size for name in lengths})
     else:
         tool = draw["tool"](rng, size)
-    pose = _wide_pose(rng, tool.jaw_length_mm if tool else size, surface_z_mm)
+    length = tool.jaw_length_mm if tool else 3 * size
+    pose = _wide_pose(rng, length, surface_z_mm)
     if isinstance(tool, Instrument) and rng.random() < 0.3:
         tool = beside(rng, tool, size, np.array(pose.base_mm), surface_z_mm)
-    length = tool.jaw_length_mm if tool else 3 * size
     middle = np.array(pose.base_mm) + 0.5 * length * pose.microscope_from_tool[:, 0]
-    microscope = draw["light"](rng, random_microscope(rng), (middle, length, surface_z_mm))
+    # The exposure suits the scene more or less, as a camera's does.
+    exposed = np.exp(rng.normal(-1.4, 0.55)) / (1.45 * np.mean((scene.texture[::16, ::16] / 255.0) ** 2.2) + 0.02)
+    microscope = replace(random_microscope(rng), brightness=float(np.clip(exposed, 0.1, 5.0)))
+    microscope = draw["light"](rng, microscope, middle, length, surface_z_mm)
     settings = draw["optics"](rng)
     if rng.random() < 0.35:  # two things are wrong with the camera
         settings = choices["optics"][str(rng.choice(list(choices["optics"])))](rng) | settings
-    microscope = replace(
-        microscope, jpeg_quality=int(rng.integers(40, 98)), video=Video(**settings),
-        brightness=float(np.clip(microscope.brightness * np.exp(rng.normal(0, 0.25)), 0.15, 4.0)),
-    )  # fmt: skip
+    microscope = replace(microscope, jpeg_quality=int(rng.integers(40, 98)), video=Video(**settings))
     return Setup(scene, tool, microscope, pose, names)
 
 
@@ -197,6 +196,9 @@ def _choices(population: str, without: Sequence[str]) -> dict[str, dict[str, Cal
     for aspect, known in choices.items():
         if not known:
             raise ValueError(f"without: leaves no family of {aspect}.")
+    if population in FAR:  # one thing, or all, is new; the rest is what a lab would call ordinary
+        choices = {aspect: {n: draw for n, draw in known.items() if n in _ORDINARY.get(aspect, known)}
+                   for aspect, known in choices.items()}  # fmt: skip
     return choices | {aspect: {population: draw} for aspect, draw in FAR.get(population, {}).items()}
 
 

@@ -1,206 +1,112 @@
 """Families of tools, drawn at random: how jaws, shafts and surfaces are shaped, and objects that have no landmarks."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from lib.simulator.forceps import Pose
 from lib.simulator.instruments import Finish, Instrument, Jaw
 
-__all__ = ["FAR_TOOLS", "SHIFTED_TOOLS", "TOOLS", "beside", "random_object"]
+__all__ = ["TOOLS", "beside", "drawn", "random_object"]
+
+#: Family -> ranges of its jaws' shapes, the arguments of `_jaw`.
+_JAWS: dict[str, dict[str, Any]] = {
+    "plain_jaws": {"bow": (0.005, 0.13), "thick": (0.025, 0.06), "bend": (-0.05, 0.12), "flex": (0.2, 0.8)},
+    "needle_jaws": {"bow": (0, 0.05), "thick": (0.012, 0.03), "taper": (0.3, 1.2)},
+    "bowed_jaws": {"bow": (0.1, 0.38), "power": (0.6, 1.4), "skew": (0.7, 1.4), "thick": (0.015, 0.06), "flex": (0, 0.6)},
+    "looped_jaws": {"ring": (0.05, 0.16), "start": (0.3, 0.65), "thick": (0.008, 0.022), "flex": (0, 0.5)},
+    "spoon_jaws": {"cup": (0.02, 0.06), "start": (0.4, 0.75), "thick": (0.012, 0.03), "bow": (0, 0.15)},
+    "serrated_jaws": {"teeth": (0.5, 1.4), "start": (0.2, 0.6), "bow": (0.03, 0.12), "thick": (0.03, 0.06), "n": [12, 18]},
+    "blunt_jaws": {"thick": (0.03, 0.08), "end": (0.015, 0.05), "bow": (0, 0.12), "taper": (0.5, 1.5)},
+    "curved_jaws": {"bend": [(-0.55, -0.2), (0.2, 0.55)], "bow": (0, 0.15), "thick": (0.02, 0.05), "flex": (0, 0.6)},
+    "asymmetric_jaws": {"long": (0.65, 1.1), "bow": (0, 0.25), "thick": (0.015, 0.07), "end": (0.002, 0.02)},
+    "hooked_jaws": {"claw": (0.7, 1.5), "start": (0.65, 0.85), "thick": (0.02, 0.04), "flex": 0.0},
+    "angled_jaws": {"turn": [(-0.95, -0.45), (0.45, 0.95)], "start": (0.08, 0.3), "bow": (0.02, 0.12)},
+}
+_FINISHES: dict[str, dict[str, Any]] = {
+    "steel": {"level": (0.25, 0.65), "matt": (0.2, 0.8), "mirror": (0.3, 0.8), "shine": (0.1, 1.0)},
+    "mirror": {"level": (0.75, 0.92), "matt": (0.0, 0.15), "mirror": (0.8, 1.1), "shine": (0.5, 1.5)},
+    "matt": {"level": (0.2, 0.9), "matt": (0.8, 1.2), "mirror": (0, 0.08), "shine": (0, 0.15)},
+    "dark": {"level": (0.02, 0.1), "matt": (0.4, 1.0), "mirror": (0, 0.6), "shine": (0, 0.6)},
+    "coloured": {"level": (0.3, 0.9), "matt": (0.4, 1.1), "mirror": (0, 0.4), "shine": (0, 0.6), "hue": (0.1, 1.0)},
+}
+
+
+def drawn(rng: np.random.Generator, ranges: Mapping[str, Any]) -> dict[str, Any]:
+    """One value for each name.
+
+    (low, high) is a uniform range, (low, high, "log") a log-uniform one, a list a choice of these; else the value itself.
+
+    >>> drawn(np.random.default_rng(0), {"flex": 0.5, "n": [12]})
+    {'flex': 0.5, 'n': 12}
+    """
+
+    def one(value: Any) -> Any:
+        if isinstance(value, list):
+            return one(value[rng.integers(len(value))])
+        if isinstance(value, tuple):
+            low, high = value[:2]
+            return float(np.exp(rng.uniform(np.log(low), np.log(high))) if len(value) == 3 else rng.uniform(low, high))
+        return value
+
+    return {name: one(value) for name, value in ranges.items()}
 
 
 def _jaw(
-    rng: np.random.Generator, length: float, *, bow: float = 0.0, power: float = 1.1, skew: float = 1.0, root: float = 0.02,
-    bend: float = 0.0, thick: float = 0.04, end: float = 0.002, taper: float = 0.7, flex: float = 0.5, n: int = 14,
+    length: float, side: int, *, long: float = 1.0, bow: float = 0.0, power: float = 1.1, skew: float = 1.0,
+    bend: float = 0.0, thick: float = 0.04, end: float = 0.002, taper: float = 0.7, flex: float = 0.5, n: int = 14, start: float = 0.5,
+    cup: float = 0.0, teeth: float = 0.0, ring: float = 0.0, claw: float = 0.0, turn: float = 0.0,
 ) -> Jaw:  # fmt: skip
-    """A jaw that arches outwards by `bow`, bends out of its plane by `bend`, and thins from `thick` to `end`.
+    """A jaw; lengths are shares of `length`, angles rad.
 
-    All but the exponents are shares of `length`.
+    Args:
+        side: +1 for jaw 1, -1 for jaw 2.
+        long: Its own length.
+        bow, power, skew: How far it arches outwards, how evenly, and where most.
+        bend: How far it leaves the plane of the jaws.
+        thick, end, taper: Radii at both ends, and the exponent between.
+        n: Number of its cones.
+        start: Where a cup, teeth, a ring or a kink begins.
+        cup, teeth, ring: Radius that a cup adds, height of teeth in radii, and half width of a ring.
+        claw, turn: Angles of a kink: inwards, or both jaws to one side.
     """
     s = 1 - (1 - np.linspace(0, 1, n)) ** 1.3
-    radii = length * (end + (thick - end) * (1 - s) ** taper)
-    reach = length - radii[-1]
-    y = length * (root * (1 - s) ** 2 + bow * np.sin(np.pi * s**skew) ** power) + radii[-1]
-    return _ended(np.column_stack([reach * s, y, -bend * length * s**2]), radii, flex)
-
-
-def _ended(line: np.ndarray, radii: np.ndarray, flex: float) -> Jaw:
-    """The jaw whose tip lies one radius beyond the last centre."""
-    end = line[-1] - line[-2]
-    return Jaw(line, radii, line[-1] + radii[-1] * end / np.linalg.norm(end), flex)
-
-
-def _needle(rng: np.random.Generator, length: float) -> tuple[Jaw, Jaw]:
-    shape = {"bow": rng.uniform(0, 0.05), "thick": rng.uniform(0.012, 0.03), "taper": rng.uniform(0.3, 1.2)}
-    return _twins(rng, length, bend=rng.uniform(-0.1, 0.1), flex=rng.uniform(0, 1), **shape)
-
-
-def _twins(rng: np.random.Generator, length: float, **shape: float) -> tuple[Jaw, Jaw]:
-    """Two jaws that differ a little."""
-    return tuple(_jaw(rng, length, **{k: v * (1 + rng.normal(0, 0.03)) for k, v in shape.items()}) for _ in range(2))
-
-
-def _bowed(rng: np.random.Generator, length: float) -> tuple[Jaw, Jaw]:
-    return _twins(
-        rng, length, bow=rng.uniform(0.1, 0.38), power=rng.uniform(0.6, 1.4), skew=rng.uniform(0.7, 1.4),
-        thick=rng.uniform(0.015, 0.06), taper=rng.uniform(0.3, 1.0), bend=rng.uniform(-0.15, 0.15), flex=rng.uniform(0, 0.6),
-    )  # fmt: skip
-
-
-def _looped(rng: np.random.Generator, length: float) -> tuple[Jaw, Jaw]:
-    """Each jaw ends in a ring of wire."""
-    stem, wide = rng.uniform(0.3, 0.65), rng.uniform(0.05, 0.16)
-    wire, flex, tilt = rng.uniform(0.008, 0.022), rng.uniform(0, 0.5), rng.uniform(-0.9, 0.9)
-
-    def ring() -> Jaw:
-        long = (1 - stem) / 2 - wire / 2
+    beyond = np.clip((s - start) / (1 - start), 0, 1)
+    radii = end + (thick - end) * (1 - s) ** taper + cup * np.sin(np.pi / 2 * beyond) ** 1.5
+    x = s * (long - radii[-1])
+    y = 0.5 * thick * (1 - s) ** 2 + bow * np.sin(np.pi * s**skew) ** power + radii[-1] * s
+    if ring:
         angle = np.pi - np.linspace(0, 2 * np.pi, 19)
-        x = stem + long * (1 + np.cos(angle))
-        across = wide * np.sin(angle)
-        y, z = wire + wide * (1 + 0.0 * x) * np.cos(tilt) + across * np.cos(tilt), across * np.sin(tilt)
-        start = np.column_stack([np.linspace(0, stem, 6)[:-1], np.linspace(0.02, y[0], 6)[:-1], np.zeros(5)])
-        line = length * np.vstack([start, np.column_stack([x, y, z])])
-        far = length * np.array([stem + 2 * long + wire, y[0], 0.0])
-        return Jaw(line, np.full(len(line), wire * length), far, flex)
-
-    return ring(), ring()
-
-
-def _spoon(rng: np.random.Generator, length: float) -> tuple[Jaw, Jaw]:
-    """Thin stems that end in wide cups."""
-    thin, wide, start = rng.uniform(0.012, 0.03), rng.uniform(0.035, 0.08), rng.uniform(0.4, 0.75)
-    bow, bend, flex = rng.uniform(0, 0.15), rng.uniform(-0.1, 0.1), rng.uniform(0, 1)
-
-    def cup() -> Jaw:
-        s = np.linspace(0, 1, 16)
-        t = np.clip((s - start) / (1 - start), 0, 1)
-        radii = length * (thin + (wide - thin) * np.sin(np.pi / 2 * t) ** 1.5)
-        x = s * (length - radii[-1])
-        y = length * bow * np.sin(np.pi * s) + np.maximum(radii * t, 0.02 * length * (1 - s))
-        return _ended(np.column_stack([x, y, -bend * length * s**2]), radii, flex)
-
-    return cup(), cup()
-
-
-def _serrated(rng: np.random.Generator, length: float) -> tuple[Jaw, Jaw]:
-    """Teeth on the inner sides."""
-    plain = _jaw(
-        rng, length, bow=rng.uniform(0.03, 0.12), thick=rng.uniform(0.03, 0.06), end=rng.uniform(0.004, 0.015),
-        flex=rng.uniform(0, 0.5), n=int(rng.integers(12, 22)), bend=rng.uniform(-0.1, 0.1),
-    )  # fmt: skip
-    high, first, line, radii = rng.uniform(0.5, 1.4), rng.uniform(0.2, 0.6), [], []
-    for a, r, b in zip(plain.line, plain.radii, [*plain.line[1:], None], strict=True):
-        line.append(a)
-        radii.append(r)
-        if b is not None and a[0] > first * length and a[0] < 0.93 * length:
-            middle = (a + b) / 2
-            line += [middle, middle - [0, min(high * r + r, max(middle[1], 0) + 0.5 * r), 0], middle]
-            radii += [r, 0.25 * r, r]
-    jaw = replace(plain, line=np.array(line), radii=np.array(radii))
-    return jaw, jaw
-
-
-def _blunt(rng: np.random.Generator, length: float) -> tuple[Jaw, Jaw]:
-    """Thick jaws with round ends."""
-    thick = rng.uniform(0.03, 0.08)
-    return _twins(
-        rng, length, thick=thick, end=thick * rng.uniform(0.5, 1.0), bow=rng.uniform(0, 0.12), taper=rng.uniform(0.5, 1.5),
-        flex=rng.uniform(0, 0.8), root=thick, bend=rng.uniform(-0.15, 0.15),
-    )  # fmt: skip
-
-
-def _curved(rng: np.random.Generator, length: float) -> tuple[Jaw, Jaw]:
-    """Both jaws curve out of their plane."""
-    bend = rng.choice([-1, 1]) * rng.uniform(0.2, 0.55)
-    return _twins(
-        rng, length, bend=bend, bow=rng.uniform(0, 0.15), thick=rng.uniform(0.02, 0.05), taper=rng.uniform(0.4, 1.0),
-        flex=rng.uniform(0, 0.6),
-    )  # fmt: skip
-
-
-def _asymmetric(rng: np.random.Generator, length: float) -> tuple[Jaw, Jaw]:
-    """One jaw is longer, thicker or straighter than the other, and one may stand still."""
-    share = rng.choice([rng.uniform(0.3, 0.7), 0.0, 1.0])
-    jaws = [
-        _jaw(
-            rng, length * rng.uniform(0.7, 1.1), bow=rng.uniform(0, 0.25), thick=rng.uniform(0.015, 0.07),
-            end=rng.uniform(0.002, 0.02), taper=rng.uniform(0.3, 1.2), bend=rng.uniform(-0.15, 0.15),
-            flex=rng.uniform(0, 0.8),
-        )
-        for _ in range(2)
-    ]  # fmt: skip
-    return replace(jaws[0], share=share), replace(jaws[1], share=1 - share)
-
-
-def _plain(rng: np.random.Generator, length: float) -> tuple[Jaw, Jaw]:
-    """As the reference forceps."""
-    return _twins(
-        rng, length, bow=rng.uniform(0.005, 0.13), thick=rng.uniform(0.025, 0.06), taper=rng.uniform(0.4, 1.0),
-        bend=rng.uniform(-0.05, 0.12), flex=rng.uniform(0.2, 0.8),
-    )  # fmt: skip
-
-
-def _hooked(rng: np.random.Generator, length: float) -> tuple[Jaw, Jaw]:
-    """The last part of each jaw turns sharply inwards."""
-    turn, start = rng.uniform(0.7, 1.5), rng.uniform(0.65, 0.85)
-    thick, gap = rng.uniform(0.02, 0.04), (1 - start) * np.sin(turn)
-
-    def jaw() -> Jaw:
-        arm = np.column_stack([np.linspace(0, start, 8), np.linspace(0.03, gap + 0.01, 8), np.zeros(8)])
-        t = np.linspace(0, 1, 5)[1:, None] * (1 - start)
-        claw = arm[-1] + t * [np.cos(turn), -np.sin(turn), 0]
-        line = np.vstack([arm, claw]) * length
-        return _ended(line, length * np.interp(np.arange(len(line)), [0, 8, 11], [thick, 0.6 * thick, 0.004]), 0.0)
-
-    return jaw(), jaw()
-
-
-def _angled(rng: np.random.Generator, length: float) -> tuple[Jaw, Jaw]:
-    """Both jaws turn off sideways, to the same side, at an angle with the shaft."""
-    angle, start = rng.choice([-1, 1]) * rng.uniform(0.45, 0.95), rng.uniform(0.08, 0.3)
-    bow, thick, flex = rng.uniform(0.02, 0.12), rng.uniform(0.02, 0.05), rng.uniform(0, 0.4)
-    jaws = []
-    for side in (1, -1):
-        jaw = _jaw(rng, length, bow=bow, thick=thick, n=16)
-        beyond = np.clip(jaw.line[:, 0] - start * length, 0, None)
-        line = jaw.line.copy()
-        line[:, 0] -= beyond * (1 - np.cos(angle))
-        line[:, 1] += side * beyond * np.sin(angle)
-        jaws.append(_ended(line, jaw.radii, flex))
-    return tuple(jaws)
-
-
-Shape = Callable[[np.random.Generator, float], tuple[Jaw, Jaw]]
-_SHAPES: dict[str, Shape] = {
-    "plain_jaws": _plain, "needle_jaws": _needle, "bowed_jaws": _bowed, "looped_jaws": _looped, "spoon_jaws": _spoon,
-    "serrated_jaws": _serrated, "blunt_jaws": _blunt, "curved_jaws": _curved, "asymmetric_jaws": _asymmetric,
-}  # fmt: skip
+        stem, half = np.linspace(0, start, 6)[:-1], (long - start) / 2 - thick / 2
+        x = np.append(stem, start + half * (1 + np.cos(angle)))
+        y = np.append(stem / start * (ring + thick), ring + thick + ring * np.sin(angle))
+        line, radii = np.column_stack([x, y, -bend * x * x]), np.full(len(x), thick)
+        return Jaw(length * line, length * radii, length * np.array([long, ring + thick, -bend]), flex)
+    if claw or turn:
+        angle, far = (side * turn if turn else -claw), np.clip(x - start, 0, None)
+        x, y = x - far * (1 - np.cos(angle)), y + far * np.sin(angle) + (1 - start) * np.sin(claw) * np.clip(x / start, 0, 1)
+    line = np.column_stack([x, y, -bend * s**2])
+    last = line[-1] - line[-2]
+    tip = line[-1] + radii[-1] * last / np.linalg.norm(last)
+    if teeth:
+        middle = (line[1:] + line[:-1]) / 2
+        sharp = middle - np.column_stack([0 * s[1:], np.where(beyond[1:] > 0, (1 + teeth) * radii[1:], 0), 0 * s[1:]])
+        line = np.vstack([line[:1], np.stack([middle, sharp, middle, line[1:]], axis=1).reshape(-1, 3)])
+        radii = np.append(radii[0], np.stack([radii[1:], 0.3 * radii[1:], radii[1:], radii[1:]], axis=1))
+    return Jaw(length * line, length * radii, length * tip, flex)
 
 
 def _finish(rng: np.random.Generator) -> Finish:
-    """Steel, mirror, matt, dark, coloured or coated."""
-    kind = rng.choice(["steel", "mirror", "matt", "dark", "coloured"], p=[0.3, 0.15, 0.2, 0.2, 0.15])
-    tint = np.exp(rng.normal(0, 0.06, 3))
-    levels = {"steel": (0.25, 0.65), "mirror": (0.75, 0.92), "matt": (0.2, 0.9), "dark": (0.02, 0.1)}
-    colour = rng.uniform(*levels.get(kind, (0.3, 0.9))) * tint
-    if kind == "coloured":
-        colour = colour * rng.uniform(0.1, 1.0, 3)
-    values = {
-        "steel": {"matt": rng.uniform(0.2, 0.8), "mirror": rng.uniform(0.3, 0.8), "shine": rng.uniform(0.1, 1.0)},
-        "mirror": {"matt": rng.uniform(0.0, 0.15), "mirror": rng.uniform(0.8, 1.1), "shine": rng.uniform(0.5, 1.5)},
-        "matt": {"matt": rng.uniform(0.8, 1.2), "mirror": rng.uniform(0, 0.08), "shine": rng.uniform(0, 0.15)},
-        "dark": {"matt": rng.uniform(0.4, 1.0), "mirror": rng.uniform(0, 0.6), "shine": rng.uniform(0, 0.6)},
-        "coloured": {"matt": rng.uniform(0.4, 1.1), "mirror": rng.uniform(0, 0.4), "shine": rng.uniform(0, 0.6)},
-    }[kind]
-    sharpness = float(np.exp(rng.uniform(np.log(6), np.log(120))))
-    values |= {"sharpness": sharpness, "brushed": rng.uniform(0, 0.4)}
-    return Finish(tuple(float(v) for v in np.clip(colour, 0.01, 0.95)), **values)
+    value = drawn(rng, _FINISHES[rng.choice(list(_FINISHES), p=[0.3, 0.15, 0.2, 0.2, 0.15])])
+    colour = value.pop("level") * np.exp(rng.normal(0, 0.06, 3)) * rng.uniform(value.pop("hue", 1.0), 1.0, 3)
+    value |= drawn(rng, {"sharpness": (6, 120, "log"), "brushed": (0, 0.4)})
+    return Finish(tuple(float(v) for v in np.clip(colour, 0.01, 0.95)), **value)
 
 
 def _profile(rng: np.random.Generator, radius: float) -> tuple[tuple[float, float], ...]:
-    """A plain shaft, or one with steps, a neck, a collar or a taper."""
+    """A plain shaft, or one with a step, a taper, a sleeve at its end or a collar."""
     kind, a, b = rng.integers(6), radius * rng.uniform(0.5, 3), radius * rng.uniform(1, 8)
     wide = radius * rng.uniform(1.15, 1.8)
     return {
@@ -211,52 +117,50 @@ def _profile(rng: np.random.Generator, radius: float) -> tuple[tuple[float, floa
     }.get(int(kind), ((0.0, radius),))
 
 
-def _tool(shape: Shape) -> Callable[[np.random.Generator, float], Instrument]:
-    """A function of (rng, size): a tool of that shape with jaws of 2 to 4 mm times `size`."""
+def _tool(family: str) -> Callable[[np.random.Generator, float], Instrument]:
+    """A function of (rng, size): a tool of that family with jaws of 2 to 4 mm times `size`."""
 
     def draw(rng: np.random.Generator, size: float) -> Instrument:
         length = rng.uniform(2.0, 4.0) * size
-        jaws, shaft = shape(rng, length), _finish(rng)
-        thick = max(float(jaw.radii[0]) for jaw in jaws)
-        radius = max(length * float(np.exp(rng.uniform(np.log(0.045), np.log(0.17)))), 1.1 * thick)
+        common = {"taper": (0.3, 1.2), "flex": (0, 0.9), "bend": (-0.12, 0.12)} | _JAWS[family]
+        first = second = drawn(rng, common)
+        share = 0.5
+        if family == "asymmetric_jaws":
+            second, share = drawn(rng, common), float(rng.choice([rng.uniform(0.3, 0.7), 0.0, 1.0]))
+        jaws = (replace(_jaw(length, 1, **first), share=share), replace(_jaw(length, -1, **second), share=1 - share))
+        shaft = _finish(rng)
+        radius = length * drawn(rng, {"": (0.045, 0.17, "log")})[""]
+        radius = max(radius, 1.1 * max(float(jaw.radii[0]) for jaw in jaws))
         finishes = shaft, (_finish(rng) if rng.random() < 0.35 else shaft)
-        bend = rng.normal(0, 0.004) * (rng.random() < 0.3)
-        return Instrument(jaws, _profile(rng, radius), (), finishes, float(bend), seed=int(rng.integers(2**31)))
+        bend = float(rng.normal(0, 0.004) * (rng.random() < 0.3))
+        return Instrument(jaws, _profile(rng, radius), finishes, bend, seed=int(rng.integers(2**31)))
 
     return draw
 
 
-#: Families of tools that training draws; that validation draws beside them; that only far tests draw.
-TOOLS = {name: _tool(shape) for name, shape in _SHAPES.items()}
-SHIFTED_TOOLS = {"hooked_jaws": _tool(_hooked)}
-FAR_TOOLS = {"angled_jaws": _tool(_angled)}
+#: Families of tools: functions of (rng, size).
+TOOLS = {family: _tool(family) for family in _JAWS}
 
 
 def random_object(rng: np.random.Generator, size: float) -> Instrument:
     """A needle, light pipe, cannula, hook or scissors: it has none of the landmarks."""
     radius, kind = 0.3 * size * rng.uniform(0.6, 1.5), rng.choice(["needle", "pipe", "cannula", "hook", "scissors"])
-    profile, extra = ((0.0, radius),), []
+    long, profile, jaws = radius * rng.uniform(4, 12), ((0.0, radius),), ()
     if kind == "needle":
-        profile = ((0.0, 0.02 * radius), (radius * rng.uniform(4, 12), radius))
+        profile = ((0.0, 0.02 * radius), (long, radius))
     elif kind == "cannula":
-        long = radius * rng.uniform(6, 20)
         profile = ((0.0, 0.3 * radius), (long, 0.3 * radius), (long + 0.05, radius))
     elif kind == "hook":
-        t, curl = np.linspace(0, 1, 14)[:, None], rng.uniform(0.8, 3.0)
-        angle, long = np.cumsum(curl * 2 * t**2 / 7, axis=0), radius * rng.uniform(4, 9)
-        steps = np.hstack([np.cos(angle), np.sin(angle), 0 * t]) * long / 14
-        extra = [(np.cumsum(steps, axis=0), radius * np.linspace(0.35, 0.08, 14))]
+        jaws = (_jaw(long, 1, claw=-rng.uniform(1.0, 2.2), start=rng.uniform(0.4, 0.9), thick=0.3 * radius / long),)
     elif kind == "scissors":
-        turn, long = rng.choice([-1, 1]) * rng.uniform(0.3, 0.9), radius * rng.uniform(3, 6)
-        for open_rad in (0.0, rng.uniform(0.05, 0.35)):
-            t, angle = np.linspace(0, 1, 8)[:, None], turn + open_rad
-            extra.append((t * long * [np.cos(angle), np.sin(angle), 0.1], radius * np.linspace(0.75, 0.05, 8)))
+        blades = {"turn": rng.choice([-1, 1]) * rng.uniform(0.3, 0.9), "start": 0.02, "thick": 0.75 * radius / (0.6 * long)}
+        jaws = tuple(_jaw(0.6 * long, side, taper=1.0, **blades) for side in (1, -1))
     finish = _finish(rng)
-    return Instrument((), profile, tuple(extra), (finish, finish), seed=int(rng.integers(2**31)))
+    return Instrument(jaws, profile, (finish, finish), has_landmarks=False, seed=int(rng.integers(2**31)))
 
 
 def beside(rng: np.random.Generator, tool: Instrument, size: float, base_mm: np.ndarray, surface_z_mm: float) -> Instrument:
     """The tool with another object that stands still near `base_mm`."""
     place = (*(base_mm[:2] + rng.normal(0, 3.0, 2)), surface_z_mm - rng.uniform(0.2, 3.0))
-    pose = Pose(tuple(float(v) for v in place), rng.uniform(-np.pi, np.pi), rng.uniform(0.05, 0.9))
+    pose = Pose(tuple(float(v) for v in place), rng.uniform(-np.pi, np.pi), rng.uniform(0.05, 0.9), opening_mm=0.0)
     return replace(tool, others=((random_object(rng, size * rng.uniform(0.6, 1.6)), pose),))

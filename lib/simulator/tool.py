@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from lib.simulator.forceps import Forceps, Pose
+from lib.simulator.forceps import MAX_TIP_RADIUS_MM, Forceps, Pose
 from lib.simulator.instruments import Instrument, finished
 from lib.simulator.microscope import Microscope
 from lib.simulator.window import Window, blur, blur_by_depth, motion_kernel
@@ -144,8 +144,9 @@ class ToolInView:
         inside = ((u > -0.5) & (u < np.array(self.window.size_px) - 0.5)).all(axis=1)
         found = np.where(inside, 2, 0)
         for k in np.flatnonzero(inside) if self.raster else ():
-            blunt = getattr(self.forceps, "tip_depth_mm", 0.0) > 0.02
-            if self._behind_another_part(k) or (k > 0 and not blunt and self._behind_its_jaw(k)):
+            # A blunt jaw's tip lies inside its outline as soon as the jaw is not parallel to the image.
+            pointed = self.forceps.tip_radius_mm <= MAX_TIP_RADIUS_MM
+            if self._behind_another_part(k) or (k > 0 and pointed and self._behind_its_jaw(k)):
                 found[k] = 1
         return found
 

@@ -18,7 +18,7 @@ class Video:
     Attributes:
         defocus_px: Radius of the disc into which each point is blurred.
         astigmatism: Stretch of that disc along the rows, 1 is round.
-        fringe_px: Distance (x, y) by which red and blue part from green.
+        fringe_px: Distance by which red and blue part from green, to opposite sides.
         colours: (3, 3) output from input colours: casts, permutations, grey.
         contrast, black, gamma: Tone curve: black + (1 - black) * contrast * value ** gamma, clipped.
         sharpening, sharpening_px: Strength and width of unsharp masking.
@@ -29,12 +29,12 @@ class Video:
         resample: The image was stored this many times smaller.
         mosaic: One colour a pixel, interpolated.
         chroma: Colours are stored this many times coarser.
-        qualities: JPEG qualities of successive compressions.
+        quality: Of a JPEG compression; 100 is none.
     """
 
     defocus_px: float = 0.0
     astigmatism: float = 1.0
-    fringe_px: tuple[float, float] = (0.0, 0.0)
+    fringe_px: float = 0.0
     colours: tuple[tuple[float, ...], ...] = _IDENTITY
     contrast: float = 1.0
     black: float = 0.0
@@ -49,7 +49,7 @@ class Video:
     resample: float = 1.0
     mosaic: bool = False
     chroma: int = 1
-    qualities: tuple[int, ...] = ()
+    quality: float = 100
 
     def __call__(self, image: np.ndarray, rng: np.random.Generator | None) -> np.ndarray:
         """The image (h, w, 3) uint8 RGB as recorded; without `rng` it has no noise."""
@@ -60,11 +60,9 @@ class Video:
         value = image.astype(np.float32) / 255
         if self.defocus_px / self.resample > 0.4:
             value = _disc_blur(value, self.defocus_px / self.resample, self.astigmatism)
-        if any(self.fringe_px):
-            for channel, sign in ((0, 1), (2, -1)):
-                shift = np.float32([[1, 0, sign * self.fringe_px[0]], [0, 1, sign * self.fringe_px[1]]])
-                plane = np.ascontiguousarray(value[..., channel])
-                value[..., channel] = cv2.warpAffine(plane, shift, plane.shape[::-1], borderMode=cv2.BORDER_REPLICATE)
+        if self.fringe_px:
+            for channel, sign in ((0, 0.8), (2, -0.8)):
+                value[..., channel] = _shifted(value[..., channel], sign * self.fringe_px, 0.75 * sign * self.fringe_px)
         if self.colours != _IDENTITY:
             value = cv2.transform(value, np.float32(self.colours))
         if self.gamma != 1.0:
@@ -84,17 +82,15 @@ class Video:
         image = cv2.convertScaleAbs(value, alpha=255)
         if self.field_shift_px:
             for first, sign in ((0, -0.5), (1, 0.5)):
-                rows = np.ascontiguousarray(image[first::2])
-                shift = np.float32([[1, 0, sign * self.field_shift_px], [0, 1, 0]])
-                image[first::2] = cv2.warpAffine(rows, shift, rows.shape[1::-1], borderMode=cv2.BORDER_REPLICATE)
+                image[first::2] = _shifted(image[first::2], sign * self.field_shift_px, 0.0)
         if self.chroma > 1:
             ycc = cv2.cvtColor(image, cv2.COLOR_RGB2YCrCb)
             size = max(image.shape[1] // self.chroma, 1), max(image.shape[0] // self.chroma, 1)
             coarse = cv2.resize(ycc[..., 1:], size, interpolation=cv2.INTER_AREA)
             ycc[..., 1:] = cv2.resize(coarse, image.shape[1::-1], interpolation=cv2.INTER_LINEAR)
             image = cv2.cvtColor(ycc, cv2.COLOR_YCrCb2RGB)
-        for quality in self.qualities:
-            encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+        if self.quality < 100:
+            encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, int(self.quality)])[1]
             image = cv2.imdecode(encoded, cv2.IMREAD_COLOR)
         if self.resample != 1.0:
             image = cv2.resize(image, (width, height), interpolation=cv2.INTER_LINEAR)
@@ -102,10 +98,8 @@ class Video:
 
     def shrunk(self, factor: float) -> Self:
         """For an image of which every length is `factor` times as long; compression and noise stay."""
-        fringe = tuple(factor * shift for shift in self.fringe_px)
-        return replace(
-            self, defocus_px=factor * self.defocus_px, fringe_px=fringe, field_shift_px=factor * self.field_shift_px
-        )  # fmt: skip
+        lengths = ("defocus_px", "fringe_px", "field_shift_px")
+        return replace(self, **{name: factor * getattr(self, name) for name in lengths})
 
     def _noise(self, rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
         coloured = rng.standard_normal(shape, dtype=np.float32) * np.float32(1 - self.noise_grey)
@@ -113,6 +107,13 @@ class Video:
         if self.noise_px > 0.3:
             coloured = cv2.GaussianBlur(coloured, (0, 0), self.noise_px)
         return coloured * np.float32(self.noise / max(float(coloured.std()), 1e-6))
+
+
+def _shifted(image: np.ndarray, x: float, y: float) -> np.ndarray:
+    """The image moved by (x, y) px."""
+    source = np.ascontiguousarray(image)
+    move = np.float32([[1, 0, x], [0, 1, y]])
+    return cv2.warpAffine(source, move, source.shape[1::-1], borderMode=cv2.BORDER_REPLICATE)
 
 
 def _disc_blur(value: np.ndarray, radius: float, stretch: float) -> np.ndarray:
