@@ -56,8 +56,8 @@ def drawn(rng: np.random.Generator, ranges: Mapping[str, Any]) -> dict[str, Any]
 
 def _jaw(
     length: float, side: int, *, long: float = 1.0, bow: float = 0.0, power: float = 1.1, skew: float = 1.0,
-    bend: float = 0.0, thick: float = 0.04, end: float = 0.002, taper: float = 0.7, flex: float = 0.5, n: int = 14, start: float = 0.5,
-    cup: float = 0.0, teeth: float = 0.0, ring: float = 0.0, claw: float = 0.0, turn: float = 0.0,
+    bend: float = 0.0, thick: float = 0.04, end: float = 0.002, taper: float = 0.7, flex: float = 0.5, n: int = 14,
+    start: float = 0.5, cup: float = 0.0, teeth: float = 0.0, ring: float = 0.0, claw: float = 0.0, turn: float = 0.0,
 ) -> Jaw:  # fmt: skip
     """A jaw; lengths are shares of `length`, angles rad.
 
