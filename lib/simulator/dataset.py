@@ -3,6 +3,7 @@
 python3 -m lib simulate                    # data/cache/dataset-0; goes on where it stopped
 python3 -m lib simulate --dry-run          # says how long it takes and how many GB
 python3 -m lib simulate --shipped          # makes data/open_sky_eye anew
+python3 -m lib simulate --rung gauze       # one recording of a rung of shift: near, validation, or a far family
 """
 
 import argparse
@@ -11,6 +12,7 @@ import shutil
 import tempfile
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,11 +21,13 @@ from lib import files, paths
 from lib.parallel import cores, run_jobs, step
 from lib.recordings import Recording
 from lib.simulator.eye import Eye
+from lib.simulator.families import FAR
 from lib.simulator.microscope import Microscope
-from lib.simulator.population import RESERVED_SEEDS, random_forceps, reserved_forceps
+from lib.simulator.population import RESERVED_SEEDS, random_forceps, random_setup, reserved_forceps
 from lib.simulator.recording import Design, simulate
 
-__all__ = ["TEST_SEQUENCES", "TRAIN_SEQUENCES", "main", "make_dataset", "seconds_a_pair", "sequence_design", "sequence_name"]
+__all__ = ["TEST_SEQUENCES", "TRAIN_SEQUENCES", "main", "make_dataset", "rung_design", "seconds_a_pair", "sequence_design"]
+__all__ += ["sequence_name"]
 
 TRAIN_SEQUENCES, TEST_SEQUENCES = range(0, 7), range(7, 10)
 _SEQUENCES = (*TRAIN_SEQUENCES, *TEST_SEQUENCES)
@@ -63,6 +67,23 @@ def sequence_design(seed: int, index: int, *, shrink: int = 1, duration_s: float
     )  # fmt: skip
     offset_s = float(np.round(rng.uniform(-0.05, 0.05), 4))
     return Design(eye, forceps, microscope, duration_s=duration_s, offset_s=offset_s, dropout=0.01)
+
+
+def rung_design(rung: str, seed: int, *, shrink: int = 1) -> Design:
+    """What recording `seed` of a rung of shift shows: new eyes and tools, in stereo, as `sample` draws them singly.
+
+    Args:
+        rung: "near", the reference rig's families; "validation"; or one of `families.FAR`.
+        shrink: Makes images this many times smaller.
+    """
+    if rung == "near":  # seeds that no data set of the paper's size was ever made with
+        return sequence_design(1000 + seed, TEST_SEQUENCES[seed % len(TEST_SEQUENCES)], shrink=shrink)
+    rng = np.random.default_rng([seed, 307, *rung.encode()])
+    drawn, like = random_setup(rng, rung, centred=True), sequence_design(2000 + seed, TEST_SEQUENCES[0], shrink=shrink)
+    names = ("image_size_px", "pixels_per_mm", "image_rotation_rad", "readout_s")
+    rig = {name: getattr(like.microscope, name) for name in names}
+    camera = replace(drawn.microscope, video=drawn.microscope.video.shrunk(1 / shrink), **rig)
+    return replace(like, eye=drawn.scene, forceps=drawn.forceps, microscope=camera)
 
 
 def _make_sequence(folder: Path, seed: int, index: int, n_pairs: int, duration_s: float, shrink: int) -> None:
@@ -136,6 +157,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--shrink", type=int, default=1, help="images this many times smaller, for a quick look")
     parser.add_argument("--dry-run", action="store_true", help="only say how long it takes and how many GB")
     parser.add_argument("--shipped", action="store_true", help="make data/open_sky_eye anew instead")
+    parser.add_argument("--rung", choices=("near", "validation", *FAR), help="make one recording of a rung of shift instead")
     arguments = parser.parse_args(argv)
     if min(arguments.pairs, arguments.shrink, 1 if arguments.workers is None else arguments.workers) < 1:
         parser.error("--pairs, --workers and --shrink must be at least 1.")
@@ -150,6 +172,12 @@ def main(argv: Sequence[str] | None = None) -> None:
         print(f"{recording.folder}: {len(recording)} pairs.")
         return
     pairs, shrink = arguments.pairs, arguments.shrink
+    if arguments.rung:
+        folder = arguments.folder or paths.CACHE / "rungs" / f"{arguments.rung}-{arguments.seed}"
+        design = replace(rung_design(arguments.rung, arguments.seed, shrink=shrink), duration_s=arguments.duration)
+        recording = simulate(folder, design, seed=5000 + arguments.seed, n_frames=pairs)
+        print(f"{recording.folder}: {len(recording)} pairs.")
+        return
     folder = arguments.folder or paths.CACHE / f"dataset-{arguments.seed}"
     left = len(_missing(folder)) * pairs
     workers = min(arguments.workers or cores(), len(_SEQUENCES))

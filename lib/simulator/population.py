@@ -126,9 +126,9 @@ class Setup:
 
 def random_setup(
     rng: np.random.Generator, population: str = "training", *, textures: Sequence[int] | None = None,
-    without: Sequence[str] = (), photographs: str | Path | None = None,
+    without: Sequence[str] = (), photographs: str | Path | None = None, centred: bool = False,
 ) -> Setup:  # fmt: skip
-    """Draw what an image shows; see `sample` for the arguments.
+    """Draw what an image shows; see `sample` for the arguments.  `centred` puts the tool, and its light, in mid-field.
 
     Raises:
         ValueError: If the population or a family to leave out is unknown, or a whole aspect is left out.
@@ -170,7 +170,7 @@ def random_setup(
     else:
         tool = draw["tool"](rng, size)
     length = tool.jaw_length_mm if tool else 3 * size
-    pose = _wide_pose(rng, length, surface_z_mm)
+    pose = Pose((-length / 2, 0.0, -0.5)) if centred else _wide_pose(rng, length, surface_z_mm)
     if isinstance(tool, Instrument) and rng.random() < 0.3:
         tool = beside(rng, tool, size, np.array(pose.base_mm), surface_z_mm)
     middle = np.array(pose.base_mm) + 0.5 * length * pose.microscope_from_tool[:, 0]
