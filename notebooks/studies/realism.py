@@ -22,8 +22,10 @@ from lib.geometry import RigidTransform
 from lib.recordings import import_retinal_microsurgery, read_image
 from lib.simulator.eye import Eye
 from lib.simulator.forceps import Forceps, Pose
+from lib.simulator.ground import Ground
 from lib.simulator.microscope import Microscope
 from lib.simulator.render import render_view
+from lib.simulator.shapes import TOOLS
 from lib.simulator.texture import EXTENT_MM, fundus_texture
 from lib.simulator.window import Window
 
@@ -43,6 +45,7 @@ __all__ = [
     "profiles",
     "real_windows",
     "statistics_table",
+    "tool_windows",
 ]
 
 #: name -> what it is.
@@ -262,6 +265,27 @@ def in_vivo_window(
     image = np.clip(noisy, 0, 1) ** (1 / 2.2)
     image = image + lamp.sharpening * (image - cv2.GaussianBlur(image, (0, 0), 1.2))
     return np.round(255 * np.clip(image, 0, 1)).astype(np.uint8), (view.u + 0.5) / fine - 0.5
+
+
+def tool_windows(size_px: int = 360, seed: int = 5) -> dict[str, np.ndarray]:
+    """Each family of tools once, with its landmarks: a cross on the base, a ring round tip 1, a square round tip 2."""
+    rng, images = np.random.default_rng(seed), {}
+    microscope = Microscope(depth_of_field_mm=float("inf"), full_well=float("inf"), vignetting=0.0, gain=((1.0,) * 3,) * 2)
+    scene = Ground(kind="smooth", colours=((0.45, 0.45, 0.45), (0.55, 0.55, 0.55)), gloss=0.0, depth_mm=0.0)
+    camera = microscope.rig(RigidTransform.identity()).left
+    for family, draw in TOOLS.items():
+        tool = draw(rng, 0.8)
+        long = tool.jaw_length_mm
+        pose = Pose((-0.5 * long, 0.0, -1.5), 0.3, 0.15, 0.2, 0.5 * long)
+        window = Window.around(camera, camera.project(np.array([[0.0, 0.0, -1.5]]))[0], (size_px, size_px))
+        view = render_view(scene, microscope, window, forceps=tool, pose=pose, factor=4)
+        image = view.image.copy()
+        base, tip_1, tip_2 = (tuple(int(v) for v in np.round(u)) for u in view.u)
+        cv2.drawMarker(image, base, (220, 20, 20), cv2.MARKER_CROSS, 22, 2, cv2.LINE_AA)
+        cv2.circle(image, tip_1, 9, (0, 90, 220), 2, cv2.LINE_AA)
+        cv2.rectangle(image, (tip_2[0] - 8, tip_2[1] - 8), (tip_2[0] + 8, tip_2[1] + 8), (0, 130, 60), 2)
+        images[family.replace("_", " ")] = image
+    return images
 
 
 def statistics_table(windows: list[np.ndarray]) -> dict[str, np.ndarray]:

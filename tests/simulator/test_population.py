@@ -131,8 +131,9 @@ def test_what_lies_before_a_landmark_hides_it():
     "settings",
     [
         {}, {"defocus_px": 2.5}, {"defocus_px": 14.0}, {"sharpening": 1.5}, {"resample": 1.7}, {"chroma": 4},
-        {"mosaic": True}, {"field_shift_px": 2.0}, {"quality": 80}, {"fringe_px": 2.0}, {"defocus_px": 2.0, "astigmatism": 2.0},
-        {"colours": ((0, 1, 0), (0, 0, 1), (1, 0, 0))}, {"gamma": 1.4, "contrast": 0.8, "black": 0.1},
+        {"mosaic": True}, {"field_shift_px": 2.0}, {"quality": 80}, {"fringe_px": 2.0},
+        {"defocus_px": 2.0, "astigmatism": 2.0}, {"colours": ((0, 1, 0), (0, 0, 1), (1, 0, 0))},
+        {"gamma": 1.4, "contrast": 0.8, "black": 0.1},
     ],
 )  # fmt: skip
 def test_a_camera_does_not_move_what_it_shows(settings):
