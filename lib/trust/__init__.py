@@ -1,7 +1,11 @@
 """May the numbers of a recording be believed?  Verdicts, diagnoses, the detector's health, and the check of a recording."""
 
 from lib.trust.assessment import Assessment, assess
+from lib.trust.case import Hypothesis
+from lib.trust.diagnosis import Diagnosis, diagnose
 from lib.trust.report import report
 from lib.trust.verdict import LEVELS, Reason, Verdict, judge
 
-__all__ = ["LEVELS", "Assessment", "Reason", "Verdict", "assess", "judge", "report"]
+__all__ = [
+    "LEVELS", "Assessment", "Diagnosis", "Hypothesis", "Reason", "Verdict", "assess", "diagnose", "judge", "report",
+]  # fmt: skip

@@ -6,6 +6,7 @@ from lib.calibration import Calibration, calibrate
 from lib.correspondences import Correspondences
 from lib.landmarks import Detector, detect
 from lib.recordings import Recording
+from lib.trust.diagnosis import diagnose
 from lib.trust.verdict import Verdict, judge
 
 __all__ = ["Assessment", "assess"]
@@ -44,5 +45,9 @@ def assess(recording: Recording, data: Correspondences | None = None, *, detecto
         calibration = calibrate(data, image_size_px=recording.image_size_px)
     except ValueError as refused:
         error = refused
-    verdict = judge(data, calibration, robot_accuracy_mm=recording.robot_accuracy_mm, error=error)
-    return Assessment(data, calibration, verdict)
+    diagnosis = diagnose(
+        data, calibration, kinematics=recording.kinematics, readout_s=recording.readout_s,
+        image_size_px=recording.image_size_px,
+    )  # fmt: skip
+    verdict = judge(data, calibration, diagnosis=diagnosis, robot_accuracy_mm=recording.robot_accuracy_mm, error=error)
+    return Assessment(data, calibration, verdict, diagnosis)

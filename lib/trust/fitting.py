@@ -1,0 +1,255 @@
+"""Affine cameras under heavy-tailed noise, with additions: what a hypothesis about a recording's fault needs.
+
+Each image's residual of a row has a bivariate Student t density whose scale and degrees of freedom are fitted too, so that
+30 % of wrong landmarks hide nothing, and a hypothesis is compared with "nothing is wrong" by the likelihood.  Landmarks
+may have constant offsets in the tool's axes, with a prior, because detectors do.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Self
+
+import numpy as np
+
+from lib.calibration.offsets import rows_axes
+from lib.correspondences import Correspondences
+
+__all__ = ["Problem", "Robust", "Shape", "log_density"]
+
+#: Degrees of freedom tried; bivariate Cauchy to nearly Gaussian.
+_FREEDOM = np.array([0.7, 1.0, 2.0, 4.0, 10.0, 100.0])
+_LEAST_PX = 0.02  # smaller residuals are rounding
+_OFFSET_SD_MM = 0.03  # of what a detector marks beside a landmark
+_BLOCK = 8  # frames over which residuals may be correlated
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A bivariate t: scale s in px and degrees of freedom."""
+
+    scale: float
+    freedom: float
+
+    @classmethod
+    def of(cls, r2: np.ndarray, start: float, least: float) -> Self:
+        """Most probable for squared residuals (k,), with `least` degrees of freedom or more."""
+        best = None
+        for freedom in _FREEDOM[least <= _FREEDOM]:
+            s2 = start**2
+            for _ in range(4):
+                weight = (freedom + 2.0) / (freedom + r2 / s2)
+                s2 = max((weight * r2).mean() / 2.0, _LEAST_PX**2)
+            shape = cls(float(np.sqrt(s2)), float(freedom))
+            value = log_density(r2, shape).sum()
+            if best is None or value > best[0]:
+                best = value, shape
+        return best[1]
+
+
+def log_density(r2: np.ndarray, shape: Shape) -> np.ndarray:
+    """Log density of squared residuals.
+
+    >>> bool(np.isclose(log_density(np.zeros(1), Shape(1.0, 4.0))[0], -np.log(2 * np.pi)))
+    True
+    """
+    s2, freedom = shape.scale**2, shape.freedom
+    return -np.log(2.0 * np.pi * s2) - (freedom + 2.0) / 2.0 * np.log1p(r2 / (freedom * s2))
+
+
+@dataclass(frozen=True, eq=False)
+class Robust:
+    """A fit: cameras M (2, 2, 4) on centred positions, additions theta (k,) with covariance, `offsets` and
+    `offset_sd` of the landmarks (3, 3) and (3,) mm, residuals (n, 2, 2) px.
+
+    `likelihood` (n, 2) is the log density of each image's residual, 0 where it is not seen, `penalty` that of the offsets'
+    prior; `design` is by how much correlated rows overstate what they tell.
+    """
+
+    M: np.ndarray
+    theta: np.ndarray
+    covariance: np.ndarray
+    offsets: np.ndarray
+    offset_sd: np.ndarray
+    camera_covariance: np.ndarray
+    residuals: np.ndarray
+    shapes: tuple[Shape, ...]
+    likelihood: np.ndarray
+    penalty: float
+    design: float
+
+    @property
+    def total(self) -> float:
+        """Log likelihood with the prior of the offsets."""
+        return float(self.likelihood.sum() + self.penalty)
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Rows of a recording as the fits take them.
+
+    Attributes:
+        x: (n, 2, 3) mm, the robot's position for the left and for the right image, about `centre`.
+        y, seen: (n, 2, 2) px and (n, 2) bool.
+        noise: (n, 2) relative noise, from the detector's covariances; 1 on average.
+        axes: (n, 3, 3) of the tool, 0 where unknown.
+        frame, landmark, time: (n,); frames are counted from 0 in their order.
+        offset_sd: Of the landmarks' offsets before the data, mm.
+    """
+
+    x: np.ndarray
+    y: np.ndarray
+    seen: np.ndarray
+    noise: np.ndarray
+    axes: np.ndarray
+    frame: np.ndarray
+    landmark: np.ndarray
+    time: np.ndarray
+    centre: np.ndarray
+    offset_sd: float = _OFFSET_SD_MM
+
+    @classmethod
+    def of(cls, data: Correspondences) -> Self:
+        """The rows that the robot reports and an image shows."""
+        rows = np.isfinite(data.x_mm).all(axis=1) & data.seen.any(axis=1)
+        axes = np.nan_to_num(rows_axes(data))[rows]
+        data = data.subset(rows)
+        variance = np.trace(data.covariance_px2, axis1=2, axis2=3)
+        with np.errstate(all="ignore"):
+            noise = np.sqrt(variance / np.nanmedian(variance)) if np.isfinite(variance).any() else variance
+        noise = np.clip(np.where(np.isfinite(noise), noise, 1.0), 0.5, 4.0)
+        centre = np.median(data.x_mm, axis=0) if len(data) else np.zeros(3)
+        y = np.stack([data.u_left, data.u_right], axis=1)
+        x = np.repeat((data.x_mm - centre)[:, None], 2, axis=1)
+        frame = np.unique(data.frame, return_inverse=True)[1]
+        return cls(x, y, data.seen, noise, axes, frame, data.landmark, data.time_s, centre)
+
+    def __len__(self) -> int:
+        return len(self.x)
+
+    @cached_property
+    def used(self) -> np.ndarray:
+        """(n, 2) bool: the image shows the landmark and the robot reports it."""
+        return self.seen & np.isfinite(self.x).all(axis=2)
+
+    def moved(self, x: np.ndarray) -> Self:
+        """The same pixels at other positions; rows without one are not used."""
+        return replace(self, x=x)
+
+    def rows(self, rows: np.ndarray) -> Self:
+        """Some of the rows."""
+        own = {name: getattr(self, name)[rows] for name in ("x", "y", "seen", "noise", "axes", "frame", "landmark", "time")}
+        return replace(self, **own)
+
+    def fit(
+        self, columns: Callable[[np.ndarray], np.ndarray] | None = None, *, start: np.ndarray | None = None,
+        groups: np.ndarray | None = None, rounds: int = 40, seed: int = 0,
+    ) -> Robust:  # fmt: skip
+        """Most probable cameras, offsets and additions.
+
+        Args:
+            columns: Cameras M -> (n, 2, 2, k): change of the pixels by each addition.
+            start: Cameras to start from; None searches samples of four rows.
+            groups: (n,) number of the row's group; each has a noise of its own.
+            seed: Of the search.
+        """
+        starts = [start] if start is not None else self._starts(np.random.default_rng(seed))
+        fits = [self._descend(M, columns, groups, rounds if len(starts) == 1 else 8) for M in starts]
+        best = max(fits, key=lambda fit: fit.total)
+        return best if len(starts) == 1 else self._descend(best.M, columns, groups, rounds)
+
+    def _starts(self, rng: np.random.Generator, samples: int = 300) -> list[np.ndarray]:
+        """Cameras (2, 2, 4) of least squares, and of the samples of four rows that most rows are near to."""
+        squares, best = np.zeros((2, 2, 4)), np.zeros((2, 2, 4))
+        for view in range(2):
+            rows = np.flatnonzero(self.used[:, view])
+            if len(rows) < 4:
+                continue
+            H, y = np.column_stack([self.x[rows, view], np.ones(len(rows))]), self.y[rows, view]
+            squares[view] = np.linalg.lstsq(H, y, rcond=None)[0].T
+            sets = np.argsort(rng.random((samples, min(len(rows), 200))), axis=1)[:, :4]
+            if len(rows) > 200:
+                sets = rng.permutation(len(rows))[:200][sets]
+            volume = np.abs(np.linalg.det(H[sets]))
+            sets = sets[volume > 0.3 * np.median(volume) + 1e-12]
+            if not len(sets):
+                best[view] = squares[view]
+                continue
+            M = np.linalg.solve(H[sets], y[sets])
+            r2 = ((H @ M - y) ** 2).sum(axis=2)
+            s2 = np.maximum(np.quantile(r2, [0.2, 0.35, 0.5, 0.75], axis=1), _LEAST_PX**2)
+            score = (np.log(s2) + 1.5 * np.log1p(r2 / s2[:, :, None]).mean(axis=2)).min(axis=0)
+            best[view] = M[score.argmin()].T
+        return [squares, best]
+
+    def _design(self, M: np.ndarray, columns: Callable | None) -> np.ndarray:
+        """(n, 2, 2, p): derivatives by the 16 entries of M, 9 offsets (mm) and the additions."""
+        n = len(self)
+        D = np.zeros((n, 2, 2, 25))
+        for view in range(2):
+            for j in range(2):
+                first = 8 * view + 4 * j
+                D[:, view, j, first : first + 3], D[:, view, j, first + 3] = self.x[:, view], 1.0
+        image = np.einsum("cij,njk->ncik", M[:, :, :3], self.axes)
+        for k in range(3):
+            D[:, :, :, 16 + 3 * k : 19 + 3 * k] = image * (self.landmark == k)[:, None, None, None]
+        return D if columns is None else np.concatenate([D, columns(M)], axis=3)
+
+    def _descend(self, M: np.ndarray, columns: Callable | None, groups: np.ndarray | None, rounds: int) -> Robust:
+        used, y = self.used, np.where(self.used[:, :, None], self.y, 0.0)
+        group = np.zeros(len(self), dtype=int) if groups is None else groups
+        group = np.where(used, group[:, None], -1)
+        kinds = [g for g in range(group.max(initial=0) + 1) if (group == g).any()]
+        prior = np.zeros(25)
+        prior[16:] = self.offset_sd**-2
+        r = np.where(used[:, :, None], y - np.einsum("cij,ncj->nci", M[:, :, :3], self.x) - M[:, :, 3], 0.0)
+        r2 = (r**2).sum(axis=2) / self.noise**2
+        # Few rows a parameter: a density with a sharp peak would fit some of them exactly.
+        rich = 2 * used.sum() / (20 if columns is None else 20 + columns(M).shape[3])
+        least = 0.0 if rich > 10 else 2.0 if rich > 5 else 10.0
+        middle = {g: max(float(np.sqrt(np.median(r2[group == g]))), _LEAST_PX) for g in kinds}
+        shapes = {g: Shape.of(r2[group == g], middle[g], least) for g in kinds}
+        before = -np.inf
+        for _ in range(rounds):
+            weight = np.zeros(used.shape)
+            for g, shape in shapes.items():
+                rows = group == g
+                weight[rows] = (shape.freedom + 2.0) / (shape.freedom * shape.scale**2 + r2[rows])
+            weight /= self.noise**2
+            D = np.where(used[:, :, None, None], np.nan_to_num(self._design(M, columns)), 0.0)
+            J = (D * np.sqrt(weight)[:, :, None, None]).reshape(-1, D.shape[3])
+            information = J.T @ J + np.diag(np.append(prior, np.zeros(D.shape[3] - 25)))
+            gradient = J.T @ (y * np.sqrt(weight)[:, :, None]).reshape(-1)
+            scale = 1.0 / np.sqrt(np.diag(information) + 1e-12)
+            inverse = np.linalg.pinv(information * np.outer(scale, scale), rcond=1e-10, hermitian=True)
+            inverse *= np.outer(scale, scale)
+            beta = inverse @ gradient
+            M = beta[:16].reshape(2, 2, 4)
+            r = y - D @ beta
+            r2 = (r**2).sum(axis=2) / self.noise**2
+            shapes = {g: Shape.of(r2[group == g], shape.scale, least) for g, shape in shapes.items()}
+            likelihood = np.zeros(used.shape)
+            for g, shape in shapes.items():
+                likelihood[group == g] = log_density(r2[group == g], shape)
+            penalty = -0.5 * float(prior @ beta[:25] ** 2)
+            total = likelihood.sum() + penalty
+            if abs(total - before) < 1e-3:
+                break
+            before = total
+        likelihood = np.where(used, likelihood - 2.0 * np.log(self.noise), 0.0)
+        design = self._overcount(r * np.sqrt(weight)[:, :, None])
+        inverse = inverse * design
+        offset_sd = np.sqrt(np.diag(inverse)[16:25].reshape(3, 3).sum(axis=1))
+        return Robust(
+            M, beta[25:], inverse[25:, 25:], beta[16:25].reshape(3, 3), offset_sd, inverse[:16, :16], r,
+            tuple(shapes.values()), likelihood, penalty, design,
+        )  # fmt: skip
+
+    def _overcount(self, z: np.ndarray) -> float:
+        """Variance of the sums of weighted residuals z (n, 2, 2) over stretches of frames, over that of independent ones."""
+        frames = int(self.frame.max(initial=0)) + 1
+        stretch = self.frame // max(1, min(_BLOCK, frames // 6))
+        sums = np.zeros((int(stretch.max(initial=0)) + 1, 2))
+        np.add.at(sums, stretch, z.sum(axis=1))
+        alone = (z**2).sum(axis=(0, 1))
+        return float(max(1.0, ((sums**2).sum(axis=0) / np.maximum(alone, 1e-300)).mean()))

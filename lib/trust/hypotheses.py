@@ -1,0 +1,302 @@
+"""Hypotheses about landmarks, cameras and the robot: each is fitted, and says what it looks like and what mends it."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from lib.correspondences import LANDMARKS
+from lib.trust.case import SIDES, Case, Hypothesis
+from lib.trust.fitting import Robust
+
+__all__ = ["TESTS", "unexplained"]
+
+
+def _tip_order(case: Case) -> Iterator[Hypothesis]:
+    """Another landmark's position: tips exchanged in both images, in one, or the base taken for a tip."""
+    problem = case.problem
+    if problem.landmark.max() != 2:
+        return
+    table = case.by_frame(problem.x[:, 0])
+    for order, views in (
+        ((0, 2, 1), (0, 1)), ((0, 2, 1), (0,)), ((0, 2, 1), (1,)), ((1, 0, 2), (0, 1)), ((2, 1, 0), (0, 1)),
+        ((1, 2, 0), (0, 1)), ((2, 0, 1), (0, 1)),
+    ):  # fmt: skip
+        x, other = problem.x.copy(), table[problem.frame, np.array(order)[problem.landmark]]
+        for view in views:
+            x[:, view] = other
+        moved = problem.moved(x)
+        if moved.used.all(axis=1).sum() < 6:
+            continue
+        where = "both images" if len(views) == 2 else f"the {SIDES[views[0]]} image"
+        text = f"Where {where} show {', '.join(LANDMARKS)}, the robot means {', '.join(LANDMARKS[k] for k in order)}."
+        cure = f"Bring the columns of kinematics.csv, or the detections of {where}, into one order."
+        yield case.found("tip_order", moved.fit(seed=case.seed), 1, 1.0, 0.0, "", text, cure, on=moved)
+    swapped = table[:, [0, 2, 1]][problem.frame, problem.landmark]  # frame by frame: one bit each
+    fit, both = case.null, np.stack([problem.x[:, 0], swapped])
+    for _ in range(6):
+        r = problem.y - np.einsum("cij,tnj->tnci", fit.M[:, :, :3], both) - fit.M[:, :, 3]
+        own = case.nearest(r, fit)
+        moved = problem.moved(np.repeat(both[own[problem.frame], np.arange(len(problem))][:, None], 2, axis=1))
+        fit = moved.fit(start=fit.M, rounds=10)
+    text = f"The tips are exchanged in {100 * own.mean():.0f} % of the frames."
+    cure = "Tell the tips apart by the tool's roll, as the robot does; or train the detector with tips in the robot's order."
+    raw = fit.total - case.null.total - case.frames * np.log(2.0)
+    yield case.found("tip_order", fit, 1, 100 * own.mean(), 0.0, "%", text, cure, on=moved, raw=raw)
+
+
+def _finite_distance(case: Case) -> Iterator[Hypothesis]:
+    """A perspective that an affine camera has not."""
+    problem = case.problem
+    centre = (np.asarray(case.size, dtype=float) - 1) / 2 if case.size else np.nanmedian(problem.y, axis=(0, 1))
+
+    def columns(M: np.ndarray) -> np.ndarray:
+        normal = np.cross(M[:, 0, :3], M[:, 1, :3])
+        depth = np.einsum("ncj,cj->nc", problem.x, normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12))
+        pixel = np.einsum("cij,ncj->nci", M[:, :, :3], problem.x) + M[:, :, 3] - centre
+        return -(depth[:, :, None] * pixel)[..., None]
+
+    fit = problem.fit(columns, start=case.null.M)
+    value, sd = float(fit.theta[0]), float(np.sqrt(fit.covariance[0, 0]))
+    far = f"by a working distance of {1 / value:.0f} mm" if value > 0 else "the wrong way, as in a mirrored image"
+    text = f"The residuals are curved {far}: 1/distance is {value:.5f} +- {sd:.5f} per mm."
+    yield case.found("finite_distance", fit, 1, value, sd, "1/mm", text, "Calibrate with model='near_affine'.")
+
+
+def _landmark_offset(case: Case) -> Iterator[Hypothesis]:
+    """Landmarks that the robot reports far beside where they are seen, always in the tool's same direction."""
+    problem = case.problem
+    if not problem.axes.any():
+        return
+    free = replace(problem, offset_sd=1.0).fit(start=case.null.M)
+    size = np.linalg.norm(free.offsets, axis=1)
+    k = int(size.argmax())
+    if size[k] < 0.15:
+        return
+    along = ", ".join(f"{1e3 * v:.0f}" for v in free.offsets[k])
+    text = f"{LANDMARKS[k]} is seen {1e3 * size[k]:.0f} um beside the robot's report ({along} um in the tool's axes)."
+    cure = "Correct the tool's geometry in the robot's report; until then calibrate with offsets='tool'."
+    yield case.found("landmark_offset", free, 9, 1e3 * size[k], 1e3 * free.offset_sd[k], "um", text, cure)
+
+
+def _tool_bends(case: Case) -> Iterator[Hypothesis]:
+    """Tips that move by other amounts than the base."""
+    problem = case.problem
+    tips = (problem.landmark > 0).astype(float)
+    if not 0 < tips.mean() < 1:
+        return
+
+    def columns(M: np.ndarray) -> np.ndarray:
+        G = np.einsum("cij,nck,n->ncijk", M[:, :, :3], problem.x, tips)
+        return G.reshape(*G.shape[:3], 9)
+
+    fit = problem.fit(columns, start=case.null.M)
+    size = float(np.sqrt((fit.theta**2).sum() / 3.0))
+    text = f"The tips move by {100 * size:.1f} % more or less than the base: a tool that bends, or a wrong pivot or angle."
+    cure = "Check the tool's geometry and joint angles in the robot's report (lib.calibration.pivot_calibration)."
+    yield case.found("tool_bends", fit, 9, 100 * size, 100 * float(np.sqrt(np.trace(fit.covariance) / 3.0)), "%", text, cure)
+
+
+def _own_noise(case: Case, rows: np.ndarray) -> tuple[Robust, float]:
+    """The fit in which these rows have a noise of their own, and how many times larger their median residual is."""
+    fit = case.problem.fit(start=case.null.M, groups=rows.astype(int))
+    distance, used = np.linalg.norm(fit.residuals, axis=2), case.problem.used
+    inside, outside = distance[used & rows[:, None]], distance[used & ~rows[:, None]]
+    return fit, float(np.median(inside) / max(np.median(outside), 1e-3)) if inside.size and outside.size else 0.0
+
+
+def _bad_landmark(case: Case) -> Iterator[Hypothesis]:
+    for k in np.unique(case.problem.landmark[case.problem.landmark <= 2]):
+        rows = case.problem.landmark == k
+        fit, ratio = _own_noise(case, rows) if not rows.all() else (None, 0.0)
+        if ratio >= 3.0:
+            text = f"{LANDMARKS[k]} has residuals {ratio:.1f} times as large as the others."
+            cure = f"Look at the detections of {LANDMARKS[k]} and at its column in kinematics.csv, or calibrate without it."
+            yield case.found("bad_landmark", fit, 2, ratio, 0.0, "times", text, cure)
+
+
+def _bad_stretch(case: Case) -> Iterator[Hypothesis]:
+    """The stretch of frames in which residuals are largest (the largest sum of a score that is negative on average)."""
+    problem = case.problem
+    r2 = (case.null.residuals**2).sum(axis=2) / problem.noise**2
+    score = np.log1p(r2 / max(np.median(r2[problem.used]) / 1.4, 1e-6)) - 1.5
+    total = np.bincount(problem.frame, np.where(problem.used, score, 0.0).sum(axis=1), case.frames)
+    total = np.append(0.0, np.cumsum(total))
+    last = int((total - np.minimum.accumulate(total)).argmax())
+    first = int(total[: last + 1].argmin())
+    if not 2 <= last - first <= 0.6 * case.frames:
+        return
+    rows = (problem.frame >= first) & (problem.frame < last)
+    fit, ratio = _own_noise(case, rows)
+    if ratio >= 3.0:
+        when = "{:.2f} to {:.2f} s".format(*problem.time[rows][[0, -1]])
+        text = f"Frames {first} to {last - 1} of those seen ({when}) have residuals {ratio:.1f} times as large as the others."
+        cure = "Look at these frames and at the robot's log of this time, or leave them out (Correspondences.subset)."
+        yield case.found("bad_stretch", fit, 4, ratio, 0.0, "times", text, cure)
+
+
+def _camera_moved(case: Case) -> Iterator[Hypothesis]:
+    """Other cameras from one frame on, both or one."""
+    problem = case.problem
+    if case.frames < 8:
+        return
+    H = np.nan_to_num(np.concatenate([problem.x, np.ones((len(problem), 2, 1))], axis=2))
+
+    def columns(frame: int, views: tuple[int, ...]) -> np.ndarray:
+        G = np.zeros((len(problem), 2, 2, 8 * len(views)))
+        for first, view, j in ((8 * i + 4 * j, view, j) for i, view in enumerate(views) for j in range(2)):
+            G[:, view, j, first : first + 4] = H[:, view] * (problem.frame >= frame)[:, None]
+        return G
+
+    def fitted(frame: int, views: tuple[int, ...] = (0, 1), rounds: int = 40) -> Robust:
+        G = columns(frame, views)
+        return problem.fit(lambda M: G, start=case.null.M, rounds=rounds)
+
+    tried: dict[int, float] = {}
+
+    def gain(frame: int) -> float:
+        if frame not in tried:
+            tried[frame] = fitted(frame, rounds=8).total
+        return tried[frame]
+
+    frame, step = max(np.unique(np.linspace(0.12, 0.88, 9) * case.frames).astype(int), key=gain), max(case.frames // 20, 1)
+    while step:
+        new = max((f for f in (frame, frame - step, frame + step) if 2 <= f <= case.frames - 2), key=gain)
+        frame, step = new, step if new != frame else step // 2
+    for views in ((0, 1), (0,), (1,)):
+        fit = fitted(frame, views)
+        change = (columns(frame, views) @ fit.theta)[problem.frame >= frame][:, list(views)]
+        size = float(np.sqrt((change**2).sum(axis=2).mean()))
+        who = "Both cameras" if len(views) == 2 else f"The {SIDES[views[0]]} camera"
+        text = f"{who} moved at about frame {frame} of those seen: the images shift by {size:.1f} px."
+        cure = "Calibrate before and after on their own, or follow the move with lib.registration.register_images."
+        yield case.found("camera_moved", fit, 8 * len(views) + 3, size, 0.0, "px", text, cure)
+
+
+def _drift(case: Case) -> Iterator[Hypothesis]:
+    """Images that creep at a constant speed."""
+    time = case.problem.time
+    if not np.isfinite(time).all() or np.ptp(time) <= 0:
+        return
+    G = np.eye(4).reshape(1, 2, 2, 4) * ((time - time.mean()) / np.ptp(time))[:, None, None, None]
+    fit = case.problem.fit(lambda M: G, start=case.null.M)
+    size = float(np.linalg.norm(fit.theta.reshape(2, 2), axis=1).max())
+    text = f"The images creep by {size:.1f} px from the first frame to the last."
+    cure = "Fix the microscope, or calibrate a shorter part (Correspondences.of_frames)."
+    yield case.found("drift", fit, 4, size, float(np.sqrt(np.diag(fit.covariance).max())), "px", text, cure)
+
+
+def _frozen(case: Case) -> Iterator[Hypothesis]:
+    """Positions that stand still or run on a straight line to the last digit; pixels that repeat while the robot moves."""
+    problem = case.problem
+    if not np.isfinite(problem.time).all() or case.frames < 4:
+        return
+    x, y, time = (case.by_frame(v) for v in (problem.x[:, 0], problem.y.reshape(-1, 4), problem.time))
+    velocity = np.diff(x, axis=0) / np.diff(time, axis=0)[..., None]
+    change = _most(np.linalg.norm(np.diff(velocity, axis=0), axis=2))
+    step_x, step_y = (_most(np.linalg.norm(np.diff(v, axis=0), axis=2)) for v in (x, y))
+    straight = np.append((change >= 0) & (change < 2e-3), False)
+    straight = np.convolve(straight, np.ones(3), "same") == 3  # five frames on one line
+    straight = np.convolve(straight, np.ones(3), "same") > 0
+    for name, repeated, text, cure in (
+        (
+            "frozen_kinematics", (step_y > 0) & (straight | ((step_x >= 0) & (step_x < 1e-9))),
+            "the robot's positions stand still, or run on an exact straight line, while the tool moves in the images",
+            "Log the robot at every sample; where it was silent leave the cells blank, so that these frames are not used.",
+        ),
+        (
+            "frozen_video", (step_x > 1e-6) & (step_y >= 0) & (step_y < 0.15 * case.null.shapes[0].scale),
+            "the detections repeat those of the frame before while the robot moves",
+            "Drop images that the camera delivered twice, and give the others their own times in frames.csv.",
+        ),
+    ):  # fmt: skip
+        if repeated.mean() < 0.02 or repeated.all():
+            continue
+        if name == "frozen_video":  # each image belongs to the instant at which it was first seen
+            first = np.append(True, ~repeated)
+            source = np.maximum.accumulate(np.where(first, np.arange(case.frames), 0))[problem.frame]
+            first_x = x[source, np.minimum(problem.landmark, 2)]
+            fit = problem.moved(np.repeat(first_x[:, None], 2, axis=1)).fit(start=case.null.M)
+        else:
+            fit, _ = _own_noise(case, np.isin(problem.frame, np.flatnonzero(repeated) + 1))
+        share = 100.0 * float(repeated.mean())
+        found = case.found(name, fit, 2, share, 0.0, "%", f"In {share:.0f} % of the frames {text}.", cure)
+        certain = float(repeated.sum() * np.log(100.0))  # noise repeats no number
+        yield replace(found, gain=max(found.gain, 0.0) + certain, explained=max(found.explained, share / 100))
+
+
+def _most(sizes: np.ndarray) -> np.ndarray:
+    """(frames,) largest of (frames, landmarks), -1 where all are missing."""
+    return np.where(np.isfinite(sizes), sizes, -1.0).max(axis=1)
+
+
+def _rigid_tips(case: Case) -> Iterator[Hypothesis]:
+    """The robot reports tips at a fixed distance while the jaws open: one opening a frame, with a prior."""
+    problem, tips = case.problem, case.by_frame(case.problem.x[:, 0])
+    width = np.linalg.norm(tips[:, 2] - tips[:, 1], axis=1)
+    width = width[np.isfinite(width)]
+    if len(width) < 6 or width.std() > max(0.02 * width.mean(), 0.03):
+        return
+    side = np.select([problem.landmark == 1, problem.landmark == 2], [-1.0, 1.0], 0.0)
+    fit, sd = case.null, 0.2
+    for _ in range(8):
+        d = np.einsum("cij,nj->nci", fit.M[:, :, :3], problem.axes[:, :, 1]) * side[:, None, None]
+        weight = np.where(problem.used, 1.0 / (fit.shapes[0].scale ** 2 + (fit.residuals**2).sum(axis=2)), 0.0)[:, :, None]
+        seen = problem.y - np.einsum("cij,ncj->nci", fit.M[:, :, :3], problem.x) - fit.M[:, :, 3]
+        information = np.bincount(problem.frame, (weight * d * d).sum(axis=(1, 2)), case.frames)
+        opening = np.bincount(problem.frame, np.nansum(weight * d * seen, axis=(1, 2)), case.frames) / (information + sd**-2)
+        sd = max(float(np.sqrt((opening**2 + 1.0 / (information + sd**-2)).mean())), 1e-3)
+        moved = problem.moved(problem.x + (side * opening[problem.frame])[:, None, None] * problem.axes[:, None, :, 1])
+        fit = moved.fit(start=fit.M, rounds=10)
+    size = 2.0 * float(opening.std())
+    text = f"The robot reports tips {width.mean():.2f} mm apart, always; in the images this varies by {size:.2f} mm."
+    cure = "Log the opening of the jaws with the robot's pose, or calibrate with the base alone."
+    chosen = 0.5 * float((np.log1p(sd**2 * information) + (opening / sd) ** 2).sum())  # the openings integrated out
+    raw = fit.total - case.null.total - chosen
+    yield case.found("rigid_tips", fit, 1, size, 0.0, "mm", text, cure, raw=raw)
+
+
+def unexplained(case: Case, fit: Robust) -> list[Hypothesis]:
+    """Residuals that the best cause leaves: the two images disagree with each other (the detector) or with the robot."""
+    problem = case.problem
+    base = case.by_frame(problem.x[:, 0])[problem.frame, 0]
+    tools = np.einsum("cij,ncj->nci", fit.M[:, :, :3], problem.x - base[:, None])
+    reach = np.linalg.norm(tools, axis=2)[problem.landmark > 0]
+    if not np.isfinite(reach).any():
+        return []
+    length, distance = np.nanmedian(reach), np.linalg.norm(fit.residuals, axis=2)
+    share = float((distance[problem.used] > 0.05 * length).mean())
+    if share < 0.2:
+        return []
+    half = problem.used.sum() / 2.0
+    gain = half * (share * np.log(share / 0.05) + (1 - share) * np.log(max(1 - share, 1e-9) / 0.95))
+    both = problem.used.all(axis=1)
+    epipolar = _epipolar(problem.y[both].reshape(-1, 4))
+    if epipolar < 0.2 * np.median(distance[problem.used]):
+        missed = float(np.median(distance[problem.used]))
+        text = f"The images agree with each other within {epipolar:.1f} px and miss the robot by {missed:.0f} px (medians)."
+        cure = "The robot's report is not that of these frames: check times, units and columns of kinematics.csv."
+        size = 1e3 * missed / float(np.linalg.svd(fit.M[0, :, :3], compute_uv=False).mean())
+        return [Hypothesis("robot_noise", text, cure, size, 0.0, "um", share, float(gain))]
+    text = f"{100 * share:.0f} % of the landmarks lie more than 5 % of the tool's length from where a camera would see them."
+    cure = "The detector does not fit these pictures: look at its overlays, and adapt it (python3 -m lib adapt RECORDING)."
+    return [Hypothesis("detector_unfit", text, cure, 100 * share, 0.0, "%", share, float(gain))]
+
+
+def _epipolar(y: np.ndarray) -> float:
+    """Median epipolar distance of pixel pairs (n, 4), px: from the plane that most are near to, whatever the robot says."""
+    if len(y) < 12:
+        return np.inf
+    weight = np.ones(len(y))
+    for _ in range(30):
+        mean = np.average(y, axis=0, weights=weight)
+        normal = np.linalg.eigh((y - mean).T @ ((y - mean) * weight[:, None]))[1][:, 0]
+        distance2 = ((y - mean) @ normal) ** 2
+        weight = 1.0 / (np.median(distance2) + distance2 + 1e-9)
+    return float(np.sqrt(2.0 * np.median(distance2)))
+
+
+TESTS = (
+    _tip_order, _finite_distance, _landmark_offset, _tool_bends, _bad_landmark, _bad_stretch, _camera_moved, _drift, _frozen,
+    _rigid_tips,
+)  # fmt: skip

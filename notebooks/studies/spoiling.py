@@ -1,0 +1,413 @@
+"""Simulated recordings at the level of correspondences, good ones and spoiled ones, each with the truth that judges it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.interpolate import PchipInterpolator
+from scipy.spatial.transform import Rotation
+
+from lib.calibration import Calibration
+from lib.cameras import StereoRig
+from lib.correspondences import Correspondences, pair_with_robot
+from lib.geometry import RigidTransform
+from lib.recordings import Kinematics
+from lib.simulator import Microscope
+
+__all__ = ["GOOD", "SPOILED", "Take", "effect", "good", "spoiled"]
+
+#: First seed of the recordings on which thresholds are set, and of those that are judged once.
+SETS = {"setting": 0, "judging": 50_000}
+_SIZE = (1920, 1080)
+
+
+@dataclass(frozen=True, eq=False)
+class Take:
+    """A recording without its pictures: what a lab would have, and `truth`.
+
+    Attributes
+    ----------
+    name, strength, causes:
+        How it was spoiled ("" if it was not) and the names of hypotheses that are right.
+    data, kinematics, readout_s, image_size_px, robot_accuracy_mm:
+        What the lab has.
+    rigs, points_mm:
+        The true rigs (more than one if a camera moved) and (k, 3) test positions, in the true robot frame.
+    """
+
+    name: str
+    strength: str
+    causes: tuple[str, ...]
+    data: Correspondences
+    kinematics: Kinematics
+    readout_s: float
+    rigs: tuple[StereoRig, ...]
+    points_mm: np.ndarray
+    exchanged: bool = False
+    image_size_px: tuple[int, int] = _SIZE
+    robot_accuracy_mm: float = 0.010
+
+
+@dataclass(eq=False)
+class Scene:
+    """Everything that happens in a recording, to be spoiled before or after it is seen."""
+
+    rng: np.random.Generator
+    frames: int = 100
+    fps: float = 25.0
+    speed_mm_s: float = 3.0
+    noise_px: float = 1.2
+    tail: float = np.inf  # degrees of freedom of the detections' errors
+    memory: float = 0.0  # their correlation from frame to frame
+    bias_mm: float = 0.0  # constant offsets of the detected landmarks
+    missing: float = 0.0
+    outliers: float = 0.0
+    stated: bool = True  # the detector states covariances
+    robot_mm: float = 0.008
+    readout_s: float = 0.012
+    inverse_distance_per_mm: float = 0.0
+    opening_mm: tuple[float, float] = (0.3, 1.4)
+    convergence_deg: float | None = None
+    edit_pixels: list[Callable[[Scene, np.ndarray], np.ndarray]] = field(default_factory=list)
+    edit_report: list[Callable[[Scene, np.ndarray, np.ndarray], np.ndarray]] = field(default_factory=list)
+    stated_readout_s: float | None = None
+    offset_s: float = 0.0  # by which the stated clock is wrong
+    camera_late_s: tuple[float, float] = (0.0, 0.0)
+    rate: float = 1.0
+    move: tuple[float, RigidTransform] | None = None  # share of the frames before it, and the motion of the rig
+    drift_px: float = 0.0
+
+    def path(self) -> Callable[[np.ndarray], np.ndarray]:
+        """Times (...,) -> base, tip_1, tip_2 (..., 3, 3) mm in the microscope frame."""
+        rng, seconds = self.rng, self.frames / self.fps + 6.0
+        steps = int(np.ceil(seconds * self.speed_mm_s / 3.0)) + 4
+        knots = np.linspace(-3.0, seconds, steps) + rng.uniform(-0.25, 0.25, steps) * seconds / steps
+        where = rng.uniform(-1, 1, (steps, 3)) * [6.0, 3.0, 1.4]
+        turn = np.column_stack(
+            [rng.uniform(-np.pi, np.pi) + rng.normal(0, 0.4, steps), rng.uniform(0.12, 0.6, steps), rng.normal(0, 0.3, steps)]
+        )
+        curve = PchipInterpolator(knots, np.column_stack([where, turn, rng.uniform(*self.opening_mm, steps)]))
+        length = rng.uniform(2.2, 3.6)
+
+        def landmarks(time: np.ndarray) -> np.ndarray:
+            value = curve(np.asarray(time))
+            centre, (azimuth, pitch, roll), opening = value[..., :3], np.moveaxis(value[..., 3:6], -1, 0), value[..., 6]
+            axes = Rotation.from_euler("ZYX", np.stack([azimuth, -pitch, roll], axis=-1).reshape(-1, 3)).as_matrix()
+            axes = axes.reshape(*azimuth.shape, 3, 3)
+            reach = np.sqrt(length**2 - (opening / 2) ** 2)
+            own = np.zeros((*azimuth.shape, 3, 3))
+            own[..., 0, 0], own[..., 1, 0], own[..., 2, 0] = -reach / 2, reach / 2, reach / 2
+            own[..., 1, 1], own[..., 2, 1] = -opening / 2, opening / 2
+            return centre[..., None, :] + np.einsum("...ij,...kj->...ki", axes, own)
+
+        return landmarks
+
+    def take(self, name: str = "", strength: str = "", causes: tuple[str, ...] = ()) -> Take:
+        """Film it."""
+        rng = self.rng
+        pose = RigidTransform.from_rotation_vector(
+            Rotation.from_rotvec(rng.normal(0, 0.25, 3)).as_matrix() @ np.array([0.15, 2.90, -0.25]), rng.uniform(-30, 30, 3)
+        )
+        zoom = rng.uniform(85, 125)
+        microscope = Microscope(
+            pixels_per_mm=(zoom, zoom * rng.uniform(0.96, 1.04)), image_rotation_rad=tuple(rng.normal(0, 0.03, 2)),
+            convergence_rad=np.deg2rad(self.convergence_deg or rng.uniform(5, 10)),
+            inverse_distance_per_mm=self.inverse_distance_per_mm,
+        )  # fmt: skip
+        rig, landmarks = microscope.rig(pose), self.path()
+        rigs = (rig,) if self.move is None else (rig, rig.moved(self.move[1]))
+        time, height = np.arange(self.frames) / self.fps, _SIZE[1]
+
+        def see(view: int) -> np.ndarray:
+            row_time = np.repeat(time[:, None], 3, axis=1)
+            for _ in range(3):
+                at = np.stack([landmarks(row_time[:, k] - self.camera_late_s[view])[:, k] for k in range(3)], axis=1)
+                u = [np.reshape(r.project(pose.apply(at.reshape(-1, 3)))[view], (-1, 3, 2)) for r in rigs]
+                late = np.zeros(self.frames, bool) if self.move is None else time >= self.move[0] * time[-1]
+                u = np.where(late[:, None, None], u[-1], u[0])
+                row_time = time[:, None] + self.readout_s * (u[..., 1] / (height - 1) - 0.5)
+            return u + self.drift_px * (time / time[-1])[:, None, None] * [0.8, 0.6]
+
+        exact = np.stack([see(0), see(1)], axis=2)  # (m, 3, 2, 2)
+        spread = np.exp(rng.normal(0, 0.25, (1, 3, 1, 1))) * self.noise_px
+        noise = rng.normal(size=exact.shape)
+        for i in range(1, self.frames):
+            noise[i] = self.memory * noise[i - 1] + np.sqrt(1 - self.memory**2) * noise[i]
+        if np.isfinite(self.tail):
+            noise /= np.sqrt(rng.chisquare(self.tail, (*exact.shape[:3], 1)) / self.tail)
+        u = exact + spread * noise
+        if self.bias_mm:
+            x = landmarks(time)
+            along = x[:, 1:].mean(axis=1) - x[:, 0]
+            along /= np.linalg.norm(along, axis=1, keepdims=True)
+            shift = rng.normal(0, self.bias_mm, 3)[None, :, None] * along[:, None]
+            A = rig.linear @ pose.R
+            u = u + np.einsum("cij,mkj->mkci", A.reshape(2, 2, 3), shift)
+        wrong = rng.random(u.shape[:3]) < self.outliers
+        u[wrong] = rng.uniform(0, 1, (int(wrong.sum()), 2)) * _SIZE
+        u[rng.random(u.shape[:3]) < self.missing] = np.nan
+        for edit in self.edit_pixels:
+            u = edit(self, u)
+        robot = np.arange(-1.5, time[-1] + 1.5, 0.01)
+        report = pose.apply(landmarks(robot).reshape(-1, 3)).reshape(-1, 3, 3)
+        report = report + rng.normal(0, self.robot_mm, report.shape)
+        for edit in self.edit_report:
+            report = edit(self, robot, report)
+        kinematics = Kinematics(robot, report)
+        readout = self.readout_s if self.stated_readout_s is None else self.stated_readout_s
+        covariance = np.broadcast_to(np.eye(2), (*u.shape[:3], 2, 2)) * (spread**2)[..., None] if self.stated else None
+        data = pair_with_robot(
+            u[:, :, 0], u[:, :, 1], position=kinematics.at, time_s=time * self.rate, height_px=height, readout_s=readout,
+            offset_s=self.offset_s, covariance_px2=covariance,
+        )  # fmt: skip
+        points = pose.apply(rng.uniform(-1, 1, (60, 3)) * [6.0, 3.0, 1.2])
+        return Take(name, strength, causes, data, kinematics, readout, rigs, points)
+
+
+def effect(take: Take, calibration: Calibration, exchanged: bool = False) -> float:
+    """RMS 3D error of the calibration at the test positions over its stated standard deviation; the worst of the rigs."""
+    worst = 0.0
+    for rig in take.rigs:
+        u = rig.project(take.points_mm)
+        u = u[::-1] if exchanged else u
+        found = calibration.pair.triangulate(*u).x_mm
+        sd = np.sqrt(np.trace(calibration.point_covariance(take.points_mm, detection=False), axis1=1, axis2=2).mean())
+        worst = max(worst, float(np.sqrt(((found - take.points_mm) ** 2).sum(axis=1).mean()) / sd))
+    return worst
+
+
+# --- ways of spoiling: each takes a scene and a strength
+
+
+def _pixels(edit: Callable[[Scene, np.ndarray], np.ndarray]) -> Callable[[Scene], None]:
+    return lambda scene: scene.edit_pixels.append(edit)
+
+
+def _report(edit: Callable[[Scene, np.ndarray, np.ndarray], np.ndarray]) -> Callable[[Scene], None]:
+    return lambda scene: scene.edit_report.append(edit)
+
+
+def _set(**values: object) -> Callable[[Scene], None]:
+    def apply(scene: Scene) -> None:
+        for name, value in values.items():
+            setattr(scene, name, value)
+
+    return apply
+
+
+def _tips(views: tuple[int, ...], share: float) -> Callable[[Scene], None]:
+    def edit(scene: Scene, u: np.ndarray) -> np.ndarray:
+        frames, u = scene.rng.random(len(u)) < share, u.copy()
+        for view in views:
+            u[frames, 1:, view] = u[frames, 2:0:-1, view]
+        return u
+
+    return _pixels(edit)
+
+
+def _wrong(share: float, sizes: tuple[float, ...] = (35.0, 180.0)) -> Callable[[Scene], None]:
+    def edit(scene: Scene, u: np.ndarray) -> np.ndarray:
+        wrong = scene.rng.random(u.shape[:3]) < share
+        return u + wrong[..., None] * scene.rng.choice(sizes, (*u.shape[:3], 1)) * scene.rng.normal(size=u.shape)
+
+    return _pixels(edit)
+
+
+def _scale(factors: tuple[float, float, float]) -> Callable[[Scene], None]:
+    return _report(lambda scene, t, x: x * factors)
+
+
+def _rigid(scene: Scene, t: np.ndarray, x: np.ndarray) -> np.ndarray:
+    middle, across = x[:, 1:].mean(axis=1), x[:, 2] - x[:, 1]
+    across = across / np.linalg.norm(across, axis=1, keepdims=True) * np.mean(scene.opening_mm) / 2
+    return np.stack([x[:, 0], middle - across, middle + across], axis=1)
+
+
+def _rigid_tips(range_mm: float) -> Callable[[Scene], None]:
+    def apply(scene: Scene) -> None:
+        scene.opening_mm = (0.3, 0.3 + range_mm)
+        scene.edit_report.append(_rigid)
+
+    return apply
+
+
+def _offset(landmark: int, size_mm: float) -> Callable[[Scene], None]:
+    def edit(scene: Scene, t: np.ndarray, x: np.ndarray) -> np.ndarray:
+        along = x[:, 1:].mean(axis=1) - x[:, 0]
+        x = x.copy()
+        x[:, landmark] += size_mm * along / np.linalg.norm(along, axis=1, keepdims=True)
+        return x
+
+    return _report(edit)
+
+
+def _one_landmark(landmark: int, size_px: float, share: float) -> Callable[[Scene], None]:
+    def edit(scene: Scene, u: np.ndarray) -> np.ndarray:
+        u, wrong = u.copy(), scene.rng.random((len(u), 2, 1)) < share
+        u[:, landmark] += wrong * scene.rng.normal(0, size_px, (len(u), 2, 2))
+        return u
+
+    return _pixels(edit)
+
+
+def _stretch(share: float, size_px: float) -> Callable[[Scene], None]:
+    def edit(scene: Scene, u: np.ndarray) -> np.ndarray:
+        n, u = round(share * len(u)), u.copy()
+        first = scene.rng.integers(0, len(u) - n + 1)
+        u[first : first + n] += scene.rng.normal(0, size_px, (n, *u.shape[1:]))
+        return u
+
+    return _pixels(edit)
+
+
+def _frozen(share: float) -> Callable[[Scene], None]:
+    def edit(scene: Scene, t: np.ndarray, x: np.ndarray) -> np.ndarray:
+        seconds = scene.frames / scene.fps
+        first = scene.rng.uniform(0, (1 - share) * seconds)
+        rows = (t >= first) & (t < first + share * seconds)
+        x = x.copy()
+        x[rows] = x[np.flatnonzero(rows)[0]]
+        return x
+
+    return _report(edit)
+
+
+def _frozen_video(share: float) -> Callable[[Scene], None]:
+    def edit(scene: Scene, u: np.ndarray) -> np.ndarray:
+        u = u.copy()
+        for i in range(1, len(u)):
+            if scene.rng.random() < share:
+                u[i] = u[i - 1]
+        return u
+
+    return _pixels(edit)
+
+
+def _shuffled(window: int) -> Callable[[Scene], None]:
+    def edit(scene: Scene, u: np.ndarray) -> np.ndarray:
+        order = np.argsort(np.arange(len(u)) + scene.rng.uniform(0, window, len(u)))
+        return u[order]
+
+    return _pixels(edit)
+
+
+def _gap(share: float) -> Callable[[Scene], None]:
+    """The log lacks a stretch, and whoever wrote it joined the ends by a line."""
+
+    def edit(scene: Scene, t: np.ndarray, x: np.ndarray) -> np.ndarray:
+        seconds = scene.frames / scene.fps
+        first = scene.rng.uniform(0, (1 - share) * seconds)
+        rows = np.flatnonzero((t >= first) & (t < first + share * seconds))
+        part = np.linspace(0, 1, len(rows))[:, None, None]
+        x = x.copy()
+        x[rows] = (1 - part) * x[rows[0]] + part * x[rows[-1]]
+        return x
+
+    return _report(edit)
+
+
+def _bend(size: float) -> Callable[[Scene], None]:
+    """The tips lag behind the base by `size` of how far the tool is from the middle of the field."""
+
+    def edit(scene: Scene, t: np.ndarray, x: np.ndarray) -> np.ndarray:
+        x, middle = x.copy(), x.reshape(-1, 3).mean(axis=0)
+        x[:, 1:] -= size * (x[:, 1:].mean(axis=1, keepdims=True) - middle)
+        return x
+
+    return _report(edit)
+
+
+def _order(order: tuple[int, int, int]) -> Callable[[Scene], None]:
+    return _report(lambda scene, t, x: x[:, list(order)])
+
+
+def _move(degrees: float) -> Callable[[Scene], None]:
+    def apply(scene: Scene) -> None:
+        turn = scene.rng.normal(size=3)
+        turn *= np.deg2rad(degrees) / np.linalg.norm(turn)
+        shift = scene.rng.normal(0, 0.1 * degrees, 3)
+        scene.move = (float(scene.rng.uniform(0.3, 0.7)), RigidTransform.from_rotation_vector(turn, shift))
+
+    return apply
+
+
+def _late(view: int, seconds: float) -> Callable[[Scene], None]:
+    return _set(camera_late_s=(seconds, 0.0) if view == 0 else (0.0, seconds))
+
+
+_SWAP = _pixels(lambda scene, u: u[:, :, ::-1].copy())
+_REVERSE = _report(lambda scene, t, x: x[::-1].copy())
+
+#: (way, strength) -> (names of hypotheses that are right, how the scene is spoiled).
+SPOILED: dict[tuple[str, str], tuple[tuple[str, ...], Callable[[Scene], None]]] = {
+    **{("clock", f"{ms} ms"): (("clock",), _set(offset_s=ms / 1e3)) for ms in (-20, 183, 383)},
+    ("tips exchanged", "both images"): (("tip_order",), _tips((0, 1), 1.0)),
+    ("tips exchanged", "left image"): (("tip_order",), _tips((0,), 1.0)),
+    ("tips exchanged", "half of the frames"): (("tip_order",), _tips((0, 1), 0.5)),
+    **{("z scaled", f"{s}"): (("scaled_axis",), _scale((1, 1, s))) for s in (1.2, 0.5, 2.0)},
+    **{("rigid tips", f"{w} mm"): (("rigid_tips",), _rigid_tips(w)) for w in (0.5, 1.0, 2.0)},
+    **{("random detections", f"{s} px"): (("detector_unfit",), _wrong(1.0, (s,))) for s in (25.0, 50.0, 150.0)},
+    **{("detector partly wrong", f"{100 * s:.0f} %"): (("detector_unfit",), _wrong(s)) for s in (0.35, 0.5, 0.65)},
+    **{("read-out time left at 0", f"{1e3 * s:.0f} ms"): (("readout",), _set(readout_s=s, stated_readout_s=0.0))
+       for s in (0.010, 0.020, 0.035)},
+    **{("axis mirrored", "xyz"[a]): (("mirrored_axis",), _scale(tuple(1 - 2 * np.eye(3)[a]))) for a in range(3)},
+    ("eyes exchanged", ""): (("exchanged_eyes",), _SWAP),
+    **{("landmark offset", f"{s} mm"): (("landmark_offset",), _offset(k, s)) for k, s in enumerate((0.3, 0.5, 1.0))},
+    **{("finite distance", f"{d} mm"): (("finite_distance",), _set(inverse_distance_per_mm=1 / d)) for d in (300, 150, 75)},
+    **{("bad landmark", f"{s} px"): (("bad_landmark",), _one_landmark(k, s, 0.8)) for k, s in enumerate((10.0, 40.0, 150.0))},
+    **{("bad stretch", f"{s} px"): (("bad_stretch",), _stretch(0.25, s)) for s in (10.0, 40.0, 150.0)},
+    **{("camera moved", f"{d} degrees"): (("camera_moved",), _move(d)) for d in (0.3, 1.0, 5.0)},
+    **{("kinematics frozen", f"{100 * s:.0f} %"): (("frozen_kinematics",), _frozen(s)) for s in (0.1, 0.25, 0.5)},
+    ("left camera late", "40 ms"): (("camera_clock",), _late(0, 0.04)),
+    ("right camera late", "100 ms"): (("camera_clock",), _late(1, 0.1)),
+    ("images creep", "20 px"): (("drift",), _set(drift_px=20.0)),
+    ("frames twice", "30 %"): (("frozen_video",), _frozen_video(0.3)),
+    ("frames out of order", "within 6"): (("frame_order", "detector_unfit", "clock"), _shuffled(6)),
+    ("time runs backwards", ""): (("frame_order", "clock"), _REVERSE),
+    ("frame rate wrong", "25 for 30"): (("clock_rate", "clock"), _set(rate=1.2)),
+    ("log with a gap", "30 %"): (("bad_stretch", "frozen_kinematics"), _gap(0.3)),
+    ("tool bends", "3 %"): (("tool_bends",), _bend(0.03)),
+    ("tool bends", "10 %"): (("tool_bends",), _bend(0.10)),
+    ("base taken for a tip", ""): (("tip_order",), _order((1, 0, 2))),
+    ("robot noise", "100 um"): (("robot_noise",), _set(robot_mm=0.1)),
+}  # fmt: skip
+
+#: Good recordings: sizes, rigs, noise levels, detectors.
+GOOD: dict[str, dict[str, object]] = {
+    "as usual": {},
+    "6 frames": {"frames": 6, "speed_mm_s": 12.0, "fps": 5.0},
+    "12 frames": {"frames": 12, "fps": 5.0},
+    "30 frames": {"frames": 30},
+    "400 frames": {"frames": 400},
+    "precise detector": {"noise_px": 0.3},
+    "coarse detector": {"noise_px": 4.0},
+    "heavy tails": {"tail": 4.0},
+    "very heavy tails": {"tail": 2.5},
+    "correlated 0.8": {"memory": 0.8},
+    "correlated 0.5, heavy tails": {"memory": 0.5, "tail": 4.0},
+    "biased detector": {"bias_mm": 0.02},
+    "10 % outliers": {"outliers": 0.1},
+    "20 % missing": {"missing": 0.2},
+    "half missing, 200 frames": {"missing": 0.5, "frames": 200},
+    "no covariances": {"stated": False},
+    "slow": {"speed_mm_s": 1.5, "frames": 250},
+    "fast": {"speed_mm_s": 15.0},
+    "wide convergence": {"convergence_deg": 15.0},
+    "sparse frames": {"fps": 0.8, "frames": 60},
+}
+
+
+def good(kind: str = "setting", repeat: int = 0) -> Iterator[Take]:
+    """The good recordings of one set."""
+    for i, (name, options) in enumerate(GOOD.items()):
+        yield Scene(np.random.default_rng([SETS[kind], repeat, 1, i]), **options).take(name)
+
+
+def spoiled(kind: str = "setting", repeat: int = 0) -> Iterator[Take]:
+    """The spoiled recordings of one set."""
+    for i, ((way, strength), (causes, spoil)) in enumerate(SPOILED.items()):
+        scene = Scene(np.random.default_rng([SETS[kind], repeat, 2, i]))
+        spoil(scene)
+        yield scene.take(way, strength, causes)

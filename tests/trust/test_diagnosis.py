@@ -1,0 +1,68 @@
+"""Every fault is named, with its size; what is right is left in peace."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lib.trust import diagnose
+from notebooks.studies.spoiling import GOOD, SPOILED, Scene
+
+
+def take(way="", strength="", seed=7, **options):
+    scene = Scene(np.random.default_rng(seed), **{"frames": 50, "fps": 15.0} | options)
+    causes, spoil = SPOILED[way, strength] if way else ((), lambda scene: None)
+    spoil(scene)
+    return scene.take(way, strength, causes)
+
+
+def found(take, *, log=True):
+    return diagnose(
+        take.data, kinematics=take.kinematics if log else None, readout_s=take.readout_s, image_size_px=take.image_size_px
+    )
+
+
+@pytest.mark.parametrize("name", ["12 frames", "correlated 0.5, heavy tails"])
+def test_a_good_recording_has_no_fault(name):
+    assert found(take(**GOOD[name])).best is None
+
+
+@pytest.mark.parametrize(
+    ("way", "strength", "value"),
+    [
+        ("clock", "383 ms", -383.0), ("read-out time left at 0", "20 ms", 20.0),
+        ("tips exchanged", "left image", 1.0), ("z scaled", "2.0", 2.0), ("rigid tips", "1.0 mm", None),
+        ("axis mirrored", "z", None), ("eyes exchanged", "", None), ("finite distance", "150 mm", 1 / 150),
+        ("landmark offset", "1.0 mm", 1000.0), ("bad landmark", "40.0 px", None), ("bad stretch", "40.0 px", None),
+        ("camera moved", "1.0 degrees", None), ("detector partly wrong", "50 %", None),
+        ("kinematics frozen", "25 %", 22.0), ("left camera late", "40 ms", -40.0),
+    ],
+)  # fmt: skip
+def test_a_fault_is_named_with_its_size_and_its_cure(way, strength, value):
+    spoiled = take(way, strength)
+    best = found(spoiled).best
+    assert best is not None and best.name in spoiled.causes
+    assert best.gain > 12 and 0 < best.explained <= 1 and best.text.endswith(".") and best.cure.endswith(".")
+    if value is not None:
+        assert best.value == pytest.approx(value, abs=max(4 * best.sd, 0.1 * abs(value)))
+
+
+def test_a_clock_is_found_among_wrong_landmarks_and_without_the_log():
+    assert found(take("clock", "183 ms", outliers=0.3)).best.name == "clock"
+    best = found(take("clock", "-20 ms"), log=False).best
+    assert best.name == "clock" and best.value == pytest.approx(20, abs=5)
+
+
+def test_the_edge_of_the_search_is_stated():
+    late = take(offset_s=1.1, frames=14)
+    clock = next(h for h in found(late).hypotheses if h.name == "clock")
+    assert "edge of the search" in clock.text
+
+
+def test_too_little_to_say_anything():
+    usual = take(frames=6)
+    assert diagnose(usual.data.subset(slice(0, 4))).hypotheses == ()
+    nothing = replace(usual.data, confidence=np.zeros_like(usual.data.confidence))
+    assert diagnose(nothing).best.name == "detector_unfit"
