@@ -180,48 +180,22 @@ def _label_studio(path: Path) -> Iterator[Label]:
 
 def _deeplabcut(path: Path) -> Iterator[Label]:
     if path.is_dir():
-        found = sorted([*path.rglob("CollectedData*.csv")]) or sorted(path.rglob("CollectedData*.h5"))
-        if not found:
-            raise FileNotFoundError(f"{path}: no CollectedData_*.csv or .h5 in it; name the folder of the labelled frames.")
+        if not (found := sorted(path.rglob("CollectedData*.csv"))):
+            raise FileNotFoundError(f"{path}: no CollectedData_*.csv in it, which DeepLabCut writes beside each .h5.")
         for file in found:
             yield from _deeplabcut(file)
         return
-    if path.suffix == ".h5":
-        header, images, values = _pandas_table(path)
-    else:
-        rows = [row for row in csv.reader(io.StringIO(decoded(path))) if row]
-        named = {row[0]: i for i, row in enumerate(rows[:8])}
-        top = named["coords"]
-        n = rows[top].index("x")
-        header = list(zip(rows[named["bodyparts"]][n:], rows[top][n:], strict=True))
-        images = ["/".join(cell for cell in row[:n] if cell) for row in rows[top + 1 :]]
-        values = [[float(cell) if cell.strip() else np.nan for cell in row[n:]] for row in rows[top + 1 :]]
-    columns = {key: i for i, key in enumerate(header)}
-    for image, row in zip(images, values, strict=True):
-        for name in dict.fromkeys(name for name, _ in header):
-            x, y = row[columns[name, "x"]], row[columns[name, "y"]]
-            yield Label(image, name, x, y, 2 if np.isfinite([x, y]).all() else 0)
-
-
-def _pandas_table(path: Path) -> tuple[list[tuple[str, str]], list[str], np.ndarray]:
-    """(bodypart, coordinate) of each column, the images and the values of a table that pandas wrote in its fixed format."""
-    with h5py.File(path) as file:
-        group = next((g for g in file.values() if "block0_values" in g), None)
-        if group is None:
-            raise ValueError(f"{path}: not in the fixed format of pandas; use the CSV file that lies beside it.")
-
-        def axis(name: str) -> list[list[str]]:
-            def text(cell: object) -> str:
-                return cell.decode() if isinstance(cell, bytes) else str(cell)
-
-            if f"{name}_level0" not in group:
-                return [[text(cell)] for cell in group[name][:]]
-            levels = [k for k in range(9) if f"{name}_level{k}" in group]
-            named = [np.array([text(cell) for cell in group[f"{name}_level{k}"][:]]) for k in levels]
-            return np.stack([named[k][group[f"{name}_label{k}"][:]] for k in levels], axis=1).tolist()
-
-        header = [(row[-2], row[-1]) for row in axis("block0_items")]
-        return header, ["/".join(row) for row in axis("axis1")], group["block0_values"][:]
+    path = path.with_suffix(".csv")  # the same table, which DeepLabCut writes beside each .h5
+    rows = [row for row in csv.reader(io.StringIO(decoded(path))) if row]
+    named = {row[0]: i for i, row in enumerate(rows[:8])}
+    top = named["coords"]
+    n = rows[top].index("x")
+    column = {key: i for i, key in enumerate(zip(rows[named["bodyparts"]], rows[top], strict=True))}
+    for row in rows[top + 1 :]:
+        for name in dict.fromkeys(rows[named["bodyparts"]][n:]):
+            cells = [row[column[name, axis]].strip() for axis in "xy"]
+            x, y = (float(cell) if cell else np.nan for cell in cells)
+            yield Label("/".join(filter(None, row[:n])), name, x, y, 2 if np.isfinite([x, y]).all() else 0)
 
 
 def _sleap(path: Path) -> Iterator[Label]:

@@ -9,16 +9,19 @@ from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 import numpy as np
+from rosbags.highlevel import AnyReader, AnyReaderError
+from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
-from lib.importing.mapping import Mapping, Pose, Robot, Table
+from lib.importing.mapping import Mapping, Pose, Table
 
-__all__ = ["RobotLog", "decoded", "exact_seconds", "increasing", "read_columns", "read_robot", "since"]
+__all__ = ["RobotLog", "decoded", "exact_seconds", "increasing", "read_columns", "read_robot", "since", "topics_of"]
 
 _SECONDS = {"s": Decimal(1), "ms": Decimal("1e-3"), "us": Decimal("1e-6"), "ns": Decimal("1e-9")}
 _MILLIMETRES = {"m": 1e3, "mm": 1.0, "um": 1e-3}
 _EMPTY = {"", "nan", "NaN", "NAN", "null", "None", "NA"}
 _EPOCH_S = 1_000_000  # larger times count from a date: 100 ns would drown in a float
+_NOT_A_BAG = AnyReaderError, OSError, KeyError, AttributeError, AssertionError
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,11 +39,7 @@ class RobotLog:
 
 
 def decoded(path: Path) -> str:
-    """The text of a file that another program wrote.
-
-    Raises:
-        FileNotFoundError, ValueError: Where there is none, or it is not UTF-8 (UTF-16 is read by its byte order mark).
-    """
+    """The text of a file that another program wrote, UTF-8 or, as its first bytes say, UTF-16."""
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; the mapping names it.")
     data = path.read_bytes()
@@ -58,16 +57,16 @@ def exact_seconds(text: str, unit: str, where: str) -> Decimal:
     (Decimal('1700000000.123456789'), Decimal('1.5'))
     """
     try:
-        if unit != "iso":
-            value = Decimal(text.strip()) * _SECONDS[unit]
-            if value.is_finite():
-                return value
-            raise ValueError
-        date = datetime.fromisoformat(text.strip())
-        date -= datetime.fromtimestamp(0, UTC) if date.tzinfo else datetime(1970, 1, 1)
-        return Decimal(date.days * 86400 + date.seconds) + Decimal(date.microseconds) / 10**6
+        if unit == "iso":
+            date = datetime.fromisoformat(text.strip())
+            date -= datetime.fromtimestamp(0, UTC) if date.tzinfo else datetime(1970, 1, 1)
+            return Decimal(date.days * 86400 + date.seconds) + Decimal(date.microseconds).scaleb(-6)
+        value = Decimal(text.strip()) * _SECONDS[unit]
+        if value.is_finite():
+            return value
     except (ValueError, InvalidOperation):
-        raise ValueError(f"{where}: {text.strip()!r} is not a time in {unit}. Check time, time_unit and decimal.") from None
+        pass
+    raise ValueError(f"{where}: {text.strip()!r} is not a time in {unit}. Check time, time_unit and decimal.")
 
 
 def since(time: Iterable[Decimal], zero: Decimal) -> np.ndarray:
@@ -99,89 +98,92 @@ def read_columns(path: Path, table: Table, names: Iterable[str]) -> tuple[list[D
     Raises:
         FileNotFoundError, ValueError: Naming file, line and column.
     """
-    if path.suffix in (".bag", ".db3", ".mcap") or (path.is_dir() and (path / "metadata.yaml").is_file()):
-        return _read_bag(path.parent if path.suffix in (".db3", ".mcap") else path, table, list(names))
-    wanted, text = [table.time, *names], decoded(path)
-    lines = [(n, line) for n, line in enumerate(text.splitlines(), 1) if line.strip() and line.lstrip()[0] not in "#%"]
+    if path.suffix in (".bag", ".db3", ".mcap") or path.is_dir():
+        return _read_bag(path, table, list(names))
+    wanted = [table.time, *names]
+    numbered = enumerate(decoded(path).splitlines(), 1)
+    lines = [(n, line) for n, line in numbered if line.strip() and line.lstrip()[0] not in "#%"]
     rows = csv.reader(io.StringIO("\n".join(line for _, line in lines)), delimiter=table.separator)
     header = [cell.strip() for cell in next(rows, [])]
+    if len(lines) < 2:
+        raise ValueError(f"{path}: the table has no row. Export it again.")
     for name in wanted:
         if header.count(name) != 1:
             what = "two columns are" if name in header else "no column is"
-            cure = "Check separator and names" if len(header) > 1 else f"Check separator = {table.separator!r}"
-            raise ValueError(f"{path}, line {lines[0][0] if lines else 1}: {what} called {name!r}; it has {header}. {cure}.")
-    at = [header.index(name) for name in wanted]
-    time, values = [], np.full((max(len(lines) - 1, 0), len(at) - 1), np.nan)
+            cure = f"Check the names and separator = {table.separator!r}"
+            raise ValueError(f"{path}, line {lines[0][0]}: {what} called {name!r}; it has {header}. {cure}.")
+    at, time, values = [header.index(name) for name in wanted], [], []
     try:
-        for row, cells in enumerate(rows):
-            where = f"{path}, line {lines[min(row + 1, len(lines) - 1)][0]}"
+        for (n, _), cells in zip(lines[1:], rows, strict=False):
             if len(cells) != len(header):
                 what = f"{len(cells)} cells where the header has {len(header)}"
-                raise ValueError(f"{where}: {what}. Check separator and decimal.")
+                raise ValueError(f"{path}, line {n}: {what}. Check separator and decimal.")
             cells = [cells[i].strip().replace(table.decimal, ".") for i in at]
-            time.append(exact_seconds(cells[0], table.time_unit, f"{where}, column {table.time}"))
-            for k, cell in enumerate(cells[1:]):
-                if cell not in _EMPTY:
-                    values[row, k] = _number(cell, f"{where}, column {wanted[k + 1]}")
+            time.append(exact_seconds(cells[0], table.time_unit, f"{path}, line {n}, column {table.time}"))
+            values.append([_number(cell, path, n, name) for cell, name in zip(cells[1:], wanted[1:], strict=True)])
     except csv.Error as error:
         raise ValueError(f"{path}: not CSV ({error}). Export the table again.") from None
-    if not time:
-        raise ValueError(f"{path}: the table has no row. Export it again.")
-    return time, dict(zip(wanted[1:], values[: len(time)].T, strict=True))
+    return time, dict(zip(wanted[1:], np.array(values, np.float64).reshape(len(time), -1).T, strict=True))
 
 
-def _number(cell: str, where: str) -> float:
+def _number(cell: str, path: Path, line: int, name: str) -> float:
     try:
-        value = float(cell)
+        value = np.nan if cell in _EMPTY else float(cell)
     except ValueError:
         value = np.inf
-    if not np.isfinite(value):
-        raise ValueError(f"{where}: {cell!r} is not a finite number. Check decimal and separator, or leave the cell empty.")
+    if np.isinf(value):
+        cure = "Check decimal and separator, or leave the cell empty"
+        raise ValueError(f"{path}, line {line}, column {name}: {cell!r} is not a finite number. {cure}.")
     return value
 
 
-def _read_bag(path: Path, table: Table, names: list[str]) -> tuple[list[Decimal], dict[str, np.ndarray]]:
-    """Columns of a ROS 1 or 2 bag; columns of other topics than that of the time are interpolated at its times."""
-    from rosbags.highlevel import AnyReader, AnyReaderError
-    from rosbags.typesys import Stores, get_typestore
+def _bag(path: Path) -> AnyReader:
+    where = path.parent if path.suffix in (".db3", ".mcap") else path
+    return AnyReader([where], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
 
-    fields: dict[str, list[tuple[str, list[str]]]] = {}
-    for name in (table.time, *names):
-        topic, _, field = name.partition(":")
-        fields.setdefault(topic, []).append((name, field.split(".")))
-    found: dict[str, list] = {name: [] for name in (table.time, *names)}
-    stamps: dict[str, list[Decimal]] = {topic: [] for topic in fields}
+
+def topics_of(path: Path) -> dict[str, str]:
+    """The topics of a ROS 1 or 2 bag, and the kind of message of each, such as PoseStamped."""
     try:
-        with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
-            connections = [c for c in reader.connections if c.topic in fields]
-            if missing := sorted(set(fields) - {c.topic for c in connections}):
-                there = ", ".join(sorted({c.topic for c in reader.connections}))
-                raise ValueError(f"{path}: no topic is called {missing[0]!r}; it has {there}.")
-            for connection, received_ns, raw in reader.messages(connections=connections):
-                message = reader.deserialize(raw, connection.msgtype)
-                stamp = None
-                for name, parts in fields[connection.topic]:
-                    received = parts == ["received"]
-                    value = Decimal(received_ns).scaleb(-9) if received else _field(message, parts, f"{path}: {name}")
-                    stamp = value if isinstance(value, Decimal) else stamp
-                    found[name].append(value)
-                stamps[connection.topic].append(stamp if stamp is not None else _stamp(message, received_ns))
-    except (AnyReaderError, OSError, KeyError, AttributeError, AssertionError) as error:
+        with _bag(path) as reader:
+            return {c.topic: c.msgtype.split("/")[-1] for c in reader.connections}
+    except _NOT_A_BAG as error:
+        raise ValueError(f"{path}: the bag cannot be read ({error}). Record or convert it again.") from None
+
+
+def _read_bag(path: Path, table: Table, names: list[str]) -> tuple[list[Decimal], dict[str, np.ndarray]]:
+    """Columns of a bag; those of other topics than that of the time are interpolated at its times."""
+    found: dict[str, list] = {name: [] for name in (table.time, *names)}
+    stamps: dict[str, list[Decimal]] = {name.partition(":")[0]: [] for name in found}
+    if missing := sorted(set(stamps) - set(there := topics_of(path))):
+        raise ValueError(f"{path}: no topic is called {missing[0]!r}; it has {', '.join(sorted(there))}.")
+    try:
+        with _bag(path) as reader:
+            for c, received_ns, raw in reader.messages([c for c in reader.connections if c.topic in stamps]):
+                message, received = reader.deserialize(raw, c.msgtype), Decimal(received_ns).scaleb(-9)
+                header = getattr(message, "header", None)
+                stamps[c.topic].append(received if header is None else _field(header, "stamp", str(path)))
+                for name in found:
+                    topic, _, field = name.partition(":")
+                    if topic == c.topic:
+                        found[name].append(received if field == "received" else _field(message, field, f"{path}: {name}"))
+    except _NOT_A_BAG as error:
         raise ValueError(f"{path}: the bag cannot be read ({error}). Record or convert it again.") from None
     time = found[table.time]
     if not time or not isinstance(time[0], Decimal):
         raise ValueError(f"{path}: {table.time!r} is no time; name /topic:header.stamp or /topic:received.")
     columns, own = {}, table.time.partition(":")[0]
     for name in names:
-        topic, values = name.partition(":")[0], np.array(found[name], np.float64)
+        topic, columns[name] = name.partition(":")[0], np.array(found[name], np.float64)
         if topic != own:
-            values = np.interp(since(time, time[0]), since(stamps[topic], time[0]), values, left=np.nan, right=np.nan)
-        columns[name] = values
+            at, known = since(time, time[0]), since(stamps[topic], time[0])
+            columns[name] = np.interp(at, known, columns[name], left=np.nan, right=np.nan)
     return time, columns
 
 
-def _field(message: object, parts: list[str], where: str) -> float | Decimal:
-    for part in parts:
+def _field(message: object, field: str, where: str) -> float | Decimal:
+    """A number, or a stamp, of a message: "pose.position.x", "position[0]", "header.stamp"."""
+    for part in field.split("."):
         name, _, index = part.rstrip("]").partition("[")
         try:
             message = getattr(message, name)
@@ -197,12 +199,6 @@ def _field(message: object, parts: list[str], where: str) -> float | Decimal:
         raise ValueError(f"{where}: this field is no number; name one inside it.") from None
 
 
-def _stamp(message: object, received_ns: int) -> Decimal:
-    """The header's stamp, or the time of receipt where it has none."""
-    stamp = getattr(getattr(message, "header", None), "stamp", None)
-    return Decimal(received_ns).scaleb(-9) if stamp is None else Decimal(stamp.sec) + Decimal(stamp.nanosec).scaleb(-9)
-
-
 def read_robot(folder: Path, mapping: Mapping) -> RobotLog:
     """The robot's log in mm, seconds and radians, in the robot frame that the mapping asks for.
 
@@ -210,64 +206,61 @@ def read_robot(folder: Path, mapping: Mapping) -> RobotLog:
         FileNotFoundError, ValueError: As `read_columns`; for rotations that are none; for an implausible unit.
     """
     robot, pose = mapping.robot, mapping.robot.pose
-    path, scale = folder / robot.file, _MILLIMETRES[robot.length_unit]
+    path = folder / robot.file
     groups = [robot.landmarks[name] for name in mapping.landmarks] if pose is None else [pose.position]
     names = [name for group in groups for name in group]
     names += [] if pose is None else [*pose.rotation, *([pose.gripper] if pose.gripper else [])]
     time, columns = read_columns(path, robot, dict.fromkeys(names))
-    x = np.stack([np.stack([columns[name] for name in group], axis=-1) for group in groups], axis=1) * scale
+    x = np.stack([np.stack([columns[name] for name in group], axis=-1) for group in groups], axis=1)
+    x = x * _MILLIMETRES[robot.length_unit]
     x[np.isnan(x).any(axis=2)] = np.nan
-    turn, shift = (np.eye(3), np.zeros(3)) if robot.frame is None else map(np.array, _checked_frame(path, robot))
+    turn, shift = np.eye(3), np.zeros(3)
+    if robot.frame is not None:
+        turn, shift = np.array(robot.frame.rotation), np.array(robot.frame.translation_mm)
+        if np.abs(turn @ turn.T - np.eye(3)).max() > 1e-4 or np.linalg.det(turn) < 0:
+            raise ValueError("robot.frame.rotation: no rotation; its rows must be orthonormal and right-handed.")
     x = x @ turn.T + shift
-    spread_mm = float(np.linalg.norm(np.nanpercentile(x, 95, axis=0) - np.nanpercentile(x, 5, axis=0), axis=1).max())
+    spread_mm = float(np.linalg.norm(np.diff(np.nanpercentile(x, [5, 95], axis=0), axis=0), axis=2).max())
     if not 0.05 <= spread_mm <= 2000:
         what = f"with length_unit = {robot.length_unit!r} the tool moves over {spread_mm:.3g} mm"
         raise ValueError(f"{path}: {what}; 0.05 to 2000 mm is plausible. Check length_unit.")
     if pose is None:
         return RobotLog(time, x_mm=x)
-    R = turn @ _rotations(path, pose, columns)
-    return RobotLog(time, R=R, t_mm=x[:, 0], opening_rad=_opening(path, mapping, columns))
+    R = turn @ _rotations(path, pose, np.stack([columns[name] for name in pose.rotation], axis=-1))
+    return RobotLog(time, R=R, t_mm=x[:, 0], opening_rad=_opening(path, mapping, columns.get(pose.gripper)))
 
 
-def _opening(path: Path, mapping: Mapping, columns: dict[str, np.ndarray]) -> np.ndarray | None:
-    pose, length_mm = mapping.robot.pose, mapping.tool.jaw_length_mm
-    if not pose.gripper:
+def _opening(path: Path, mapping: Mapping, opening: np.ndarray | None) -> np.ndarray | None:
+    unit, length_mm = mapping.robot.pose.gripper_unit, mapping.tool.jaw_length_mm
+    if opening is None:
         return None
-    opening = columns[pose.gripper]
-    if pose.gripper_unit == "mm":
+    if unit == "mm":
         if length_mm is None or np.nanmax(np.abs(opening)) > 2 * length_mm:
             raise ValueError(f"{path}: a gripper in mm needs tool.jaw_length_mm, at least half the widest opening.")
         return 2 * np.arcsin(opening / (2 * length_mm))
-    opening = np.deg2rad(opening) if pose.gripper_unit == "deg" else opening
+    opening = np.deg2rad(opening) if unit == "deg" else opening
     if np.nanmax(np.abs(opening)) > np.pi:
         raise ValueError(f"{path}: the gripper opens to {np.nanmax(np.abs(opening)):.3g} rad. Check gripper_unit.")
     return opening
 
 
-def _rotations(path: Path, pose: Pose, columns: dict[str, np.ndarray]) -> np.ndarray:
-    values = np.stack([columns[name] for name in pose.rotation], axis=-1)
-    known = np.isfinite(values).all(axis=1)
+def _rotations(path: Path, pose: Pose, values: np.ndarray) -> np.ndarray:
+    kind, known = pose.rotation_kind, np.isfinite(values).all(axis=1)
     v, R = values[known], np.full((len(values), 3, 3), np.nan)
-    if pose.rotation_kind == "matrix":
-        found = v.reshape(-1, 3, 3)
-        valid = np.abs(found @ found.transpose(0, 2, 1) - np.eye(3)).max(initial=0) < 1e-2
-        valid = valid and (np.linalg.det(found) > 0).all()
-        found = Rotation.from_matrix(found).as_matrix() if valid else found
-    elif pose.rotation_kind.startswith("quaternion"):
+    if kind == "matrix":
+        m = v.reshape(-1, 3, 3)
+        valid = np.abs(m @ m.transpose(0, 2, 1) - np.eye(3)).max(initial=0) < 1e-2 and (np.linalg.det(m) > 0).all()
+    elif kind.startswith("quaternion"):
         valid = (np.abs(np.linalg.norm(v, axis=1) - 1) < 1e-2).all()
-        found = Rotation.from_quat(v, scalar_first=pose.rotation_kind.endswith("wxyz")).as_matrix() if valid else v
     else:
-        euler, largest = pose.rotation_kind == "euler_xyz_deg", np.abs(v).max(initial=0)
-        valid = largest <= (360 if euler else 2 * np.pi)
-        found = (Rotation.from_euler("xyz", v, degrees=True) if euler else Rotation.from_rotvec(v)).as_matrix()
+        valid = np.abs(v).max(initial=0) <= (360 if kind == "euler_xyz_deg" else 2 * np.pi)
     if not valid:
-        raise ValueError(f"{path}: columns {', '.join(pose.rotation)} are no {pose.rotation_kind}. Check rotation_kind.")
-    R[known] = found
+        raise ValueError(f"{path}: columns {', '.join(pose.rotation)} are no {kind}. Check rotation_kind.")
+    made = {
+        "matrix": lambda: Rotation.from_matrix(v.reshape(-1, 3, 3)),
+        "euler_xyz_deg": lambda: Rotation.from_euler("xyz", v, degrees=True),
+        "quaternion_xyzw": lambda: Rotation.from_quat(v), "quaternion_wxyz": lambda: Rotation.from_quat(v, scalar_first=True),
+        "rotation_vector_rad": lambda: Rotation.from_rotvec(v),
+    }  # fmt: skip
+    R[known] = made[kind]().as_matrix()
     return R
-
-
-def _checked_frame(path: Path, robot: Robot) -> tuple:
-    turn = np.array(robot.frame.rotation)
-    if np.abs(turn @ turn.T - np.eye(3)).max() > 1e-4 or np.linalg.det(turn) < 0:
-        raise ValueError(f"{path}: robot.frame.rotation is no rotation: its rows must be orthonormal and right-handed.")
-    return robot.frame.rotation, robot.frame.translation_mm

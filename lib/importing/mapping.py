@@ -45,7 +45,7 @@ class Video(_Section):
     fps: Annotated[float, Field(gt=0)] | None = None
     bit_depth: Annotated[int, Field(ge=8, le=16)] | None = None
     every: Annotated[int, Field(ge=1)] = 1
-    start_s: float | None = None
+    start_s: float | None = None  # after the first frame
     end_s: float | None = None
     format: Literal["jpg", "png"] = "jpg"
     jpeg_quality: Annotated[int, Field(ge=50, le=100)] = 95

@@ -66,14 +66,14 @@ class _Film:
         self.path, self.files, self.numbers = path, [path], {}
         with self._open() as container:
             stream = container.streams.video[0]
-            packets = [p for p in container.demux(stream) if p.size and not p.is_discard]
-            times = sorted(p.dts if any(q.pts is None for q in packets) else p.pts for p in packets)
+            times = [(p.pts, p.dts) for p in container.demux(stream) if p.size and not p.is_discard]
             told = stream.frames or len(times)
             end_s = float((stream.duration or 0) * (stream.time_base or 0))
             if not end_s and len(container.streams) == 1:
                 end_s = (container.duration or 0) / av.time_base
         base = Decimal(stream.time_base.numerator) / Decimal(stream.time_base.denominator)
-        self.stamps = [Decimal(t) * base for t in times if t is not None]
+        which = int(any(pts is None for pts, _ in times))  # .avi states the order of decoding only
+        self.stamps = [Decimal(t) * base for t in sorted(pair[which] for pair in times if pair[which] is not None)]
         step = float(self.stamps[-1] - self.stamps[0]) / max(len(times) - 1, 1) if self.stamps else 0.0
         if len(self.stamps) != told or (end_s and float(self.stamps[-1]) + 2.5 * step + 0.2 < end_s):
             raise ValueError(f"{path}: the video is cut off: {len(times)} frames of {told} ({end_s:.1f} s). Copy it again.")
@@ -137,10 +137,9 @@ class StereoSource:
         """Left and right images, (h, w, 3) uint8 RGB."""
         for images in zip(*(reel.read(index) for reel, index in zip(self.reels, self.index.T, strict=False)), strict=True):
             images = [to_8_bits(image, self.bit_depth, reel.files[0]) for image, reel in zip(images, self.reels, strict=True)]
-            yield self.split(*images)
+            yield self._split(*images)
 
-    def split(self, *images: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The two views of what the sources show at one instant."""
+    def _split(self, *images: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         if self.layout != "two":
             half = images[0].shape[1 if self.layout == "side_by_side" else 0] / 2
             if half % 1:
@@ -168,9 +167,8 @@ def open_stereo(folder: Path, video: Video) -> StereoSource:
     index = _paired(folder, times)
     kept = index[:: video.every]
     time = [times[0][i] for i in kept[:, 0]]
-    low, high = (Decimal("-Infinity" if video.start_s is None else str(video.start_s)),
-                 Decimal("Infinity" if video.end_s is None else str(video.end_s)))  # fmt: skip
-    chosen = [i for i, t in enumerate(time) if low <= t - (times[0][0] if abs(times[0][0]) > 10**6 else 0) <= high]
+    low, high = (-np.inf if video.start_s is None else video.start_s), (np.inf if video.end_s is None else video.end_s)
+    chosen = [i for i, t in enumerate(time) if low <= t - times[0][0] <= high]
     if not chosen:
         raise ValueError(f"{folder}: no frame lies between start_s and end_s; the video lasts {time[-1] - time[0]} s.")
     kept, time = kept[chosen], [time[i] for i in chosen]
@@ -182,22 +180,16 @@ def open_stereo(folder: Path, video: Video) -> StereoSource:
 def _times(folder: Path, video: Video, reel: _Images | _Film) -> list[Decimal]:
     if video.times == "fps":
         return [Decimal(i) / Decimal(str(video.fps)) for i in range(len(reel))]
-    if video.times == "names":
-        return [exact_seconds(str(last_number(p)), video.name_unit, str(p)) for p in _numbered(reel)]
+    if video.times == "names" and reel.stamps is None:
+        return [exact_seconds(str(last_number(p)), video.name_unit, str(p)) for p in reel.files]
     if video.times == "table":
         time = read_columns(folder / video.table.file, video.table, [])[0]
         if len(time) != len(reel):
             raise ValueError(f"{folder / video.table.file}: {len(time)} times for {len(reel)} frames of {reel.files[0]}.")
         return time
-    if reel.stamps is None:
-        raise ValueError(f"{reel.files[0]}: image files carry no times; set video.times to fps, names or table.")
+    if reel.stamps is None or video.times == "names":
+        raise ValueError(f"{reel.files[0]}: it carries no such times; set video.times to fps, table, names or container.")
     return reel.stamps
-
-
-def _numbered(reel: _Images | _Film) -> list[Path]:
-    if isinstance(reel, _Film):
-        raise ValueError(f"{reel.path}: a video's name dates no frames; set video.times to container, fps or table.")
-    return reel.paths
 
 
 def _paired(folder: Path, times: list[list[Decimal]]) -> np.ndarray:
