@@ -36,7 +36,7 @@ def guess_mapping(source: str | Path) -> str:
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder}: no such folder; SOURCE is the folder with your files.")
     paths = {p.relative_to(folder).as_posix(): p for p in sorted(folder.rglob("*")) if p.is_file()}
-    labels = {n: p for n, p in paths.items() if p.suffix in _LABELS and (p.suffix != ".csv" or p.stem.startswith("Collected"))}
+    labels = {n: p for n, p in paths.items() if p.suffix in set(_LABELS) - {".csv"} or p.stem.startswith("CollectedData")}
     robot, names = _robot(folder, {name: path for name, path in paths.items() if name not in labels})
     lines = [
         ("name", re.sub(r"[<>&]", "_", folder.resolve().name), "any text"),
@@ -139,7 +139,7 @@ def _bag(folder: Path, bags: list[str]) -> tuple[list[tuple], tuple[str, ...]]:
     points = [topic for topic, kind in kinds.items() if kind == "PointStamped"]
     poses = [topic for topic, kind in kinds.items() if kind == "PoseStamped"]
     if not poses and len(points) < 2:
-        raise ValueError(f"{folder / bags[0]}: no PoseStamped, no two PointStamped; it has {kinds}. Write the mapping by hand.")
+        raise ValueError(f"{folder / bags[0]}: no PoseStamped, no two PointStamped; it has {kinds}. Write it by hand.")
     clock = (points if len(points) > 1 else poses)[0]
     lines += [("time", f"{clock}:header.stamp", "a topic, and its field of times; or :received")]
     if len(points) > 1:
@@ -174,5 +174,6 @@ def _labels(paths: dict[str, Path]) -> list[tuple]:
                 where = "what (0, 0) is in the top left pixel: its centre, or its corner as CVAT and Label Studio draw"
                 lines = [("kind", kind, "coco, cvat, label_studio, deeplabcut or sleap"), ("file", file, "both cameras")]
                 lines += [("names", _matched(found)[1], "CHECK: their name of each landmark")]
-                return [*lines, ("pixel_origin", origin, where), ("first_frame", 0, "number of the first frame in the labels' image names")]
+                lines += [("pixel_origin", origin, where)]
+                return [*lines, ("first_frame", 0, "number of the first frame in the labels' image names")]
     return []

@@ -1,0 +1,93 @@
+"""detect, calibrate, reconstruct and register on the command line: the files they write, and when they write none."""
+
+import json
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from lib import commands, paths
+from lib.cameras import StereoRig
+from lib.recordings import Recording
+from tests.importing import foreign
+from tests.importing.test_import import source_of, thinned
+
+LABELS = ["--landmarks", "annotations"]
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory):
+    """The results of `calibrate` on the shipped recording's labels."""
+    folder = tmp_path_factory.mktemp("results")
+    assert commands.main_calibrate([str(paths.SHIPPED_RECORDING), *LABELS, "--out", str(folder)]) == 0
+    return folder
+
+
+def test_calibrate_writes_cameras_for_other_programs(out):
+    rig = StereoRig.load(out / "rig.json")
+    storage = cv2.FileStorage(str(out / "left.yml"), cv2.FILE_STORAGE_READ)
+    np.testing.assert_allclose(storage.getNode("projection_matrix").mat()[:2], rig.left.matrix)
+    assert "projection_matrix" in (out / "right_camera_info.yaml").read_text()
+    told = json.loads((out / "calibration.json").read_text())
+    assert told["verdict"] in ("trustworthy", "doubtful") and told["rows"] == 102
+    rows = (out / "landmarks.csv").read_text().splitlines()
+    assert len(rows) == 103 and rows[1].startswith("0,base,")
+
+
+def test_register_finds_the_cameras_where_they_are(out, tmp_path, capsys):
+    assert commands.main_register(
+        [str(paths.SHIPPED_RECORDING), *LABELS, "--rig", str(out / "rig.json"), "--out", str(tmp_path)]
+    ) == 0  # fmt: skip
+    told = json.loads((tmp_path / "registration.json").read_text())
+    np.testing.assert_allclose(told["rotation"], np.eye(3), atol=0.02)
+    assert told["median_epipolar_px"] < 2 and "Verdict:" in capsys.readouterr().out
+    assert StereoRig.load(tmp_path / "moved_rig.json").left.matrix.shape == (2, 4)
+
+
+def test_reconstruct_writes_surface_points_and_the_rectified_pair(out, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(commands, "save_mesh", lambda mesh, path: path.write_bytes(b"glTF"))  # Open3D needs system libraries
+    monkeypatch.setattr(commands, "save_points", lambda path, x_mm, colours: path.write_bytes(b"ply"))
+    argv = [str(paths.SHIPPED_RECORDING), *LABELS, "--setting", "fast", "--frame", "2", "--out", str(tmp_path)]
+    assert commands.main_reconstruct([*argv, "--rig", str(out / "rig.json")]) == 0
+    told = json.loads((tmp_path / "reconstruction.json").read_text())
+    assert told["frame"] == 2 and told["points"] > 500 and told["verdict"] == "doubtful"  # a rig that nothing here tests
+    left, right = (cv2.imread(str(tmp_path / f"rectified_{side}.png")) for side in ("left", "right"))
+    matrices = json.loads((tmp_path / "rectification.json").read_text())
+    assert left.shape == right.shape and np.shape(matrices["left_from_canvas"]) == (2, 3)
+    assert {"surface.glb", "points.ply", "depth.tiff"} <= {path.name for path in tmp_path.iterdir()}
+
+
+def test_a_red_verdict_writes_nothing_but_itself(tmp_path, capsys):
+    """Landmarks of other frames: no cameras explain them."""
+    whole = thinned(foreign.shipped(), 5)
+    labels = replace(whole.labels, u_left=whole.labels.u_left[::-1], visibility_left=whole.labels.visibility_left[::-1])
+    source = replace(whole, labels=labels)
+    makers = foreign.side_by_side, foreign.robot_csv, foreign.labels_coco
+    folder, mapping = source_of(tmp_path, source, *makers)
+    argv = [str(folder), "--map", str(mapping), "--out", str(tmp_path / "eye")]
+    assert commands.main_import(argv) == 0
+    assert "Verdict: not trustworthy" in capsys.readouterr().out
+    assert commands.main_calibrate([str(tmp_path / "eye"), *LABELS, "--out", str(tmp_path / "results")]) == 3
+    assert [path.name for path in (tmp_path / "results").iterdir()] == ["verdict.json"]
+
+
+def test_guess_writes_a_mapping_once(tmp_path, capsys):
+    folder, mapping = source_of(tmp_path, thinned(foreign.shipped(), 40), foreign.side_by_side, foreign.robot_csv)
+    path = tmp_path / "guessed.toml"
+    assert commands.main_import([str(folder), "--guess", "--map", str(path)]) == 0
+    assert path.read_text("utf-8") in capsys.readouterr().out
+    with pytest.raises(FileExistsError, match=r"guessed\.toml: exists already"):
+        commands.main_import([str(folder), "--guess", "--map", str(path)])
+    assert not any(folder.glob("*.toml")) and mapping.is_file()
+
+
+def test_detect_refuses_landmarks_that_the_detector_does_not_know(tmp_path):
+    recording = tmp_path / "probe"
+    folder, mapping = source_of(tmp_path, thinned(foreign.shipped(), 40), foreign.side_by_side, foreign.robot_csv)
+    text = mapping.read_text("utf-8").replace("tip_2 =", "elbow =")
+    mapping.write_text('landmarks = ["base", "tip_1", "elbow"]\n' + text, "utf-8")
+    commands.main_import([str(folder), "--map", str(mapping), "--out", str(recording)])
+    assert Recording.open(recording).skeleton == ("base", "tip_1", "elbow")
+    with pytest.raises(ValueError, match="give --landmarks annotations"):
+        commands.main_detect([str(recording), "--out", str(tmp_path)])
