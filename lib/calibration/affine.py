@@ -114,35 +114,46 @@ def distances2(r: np.ndarray, A: np.ndarray, sigma_u_px: float, sigma_x_mm: floa
 
 
 def estimate_noise(
-    residuals: np.ndarray, A: np.ndarray, parameters: int, *,
+    residuals: np.ndarray, A: np.ndarray, parameters: int, views: np.ndarray | None = None, *,
     sigma_u_px: float | None = None, sigma_x_mm: float | None = None,
 ) -> tuple[float, float]:  # fmt: skip
     """sigma_u and sigma_x from residuals (n, m) whose covariance is sigma_u^2 I + sigma_x^2 A A^T.
 
     Along the epipolar direction (n^T A = 0) only sigma_u shows; the other directions add sigma_x.  Maximum likelihood by
-    Fisher scoring over the eigenvectors of A A^T.  A single camera has no epipolar direction: unless one level is given,
-    all is put down to the pixels.  `parameters` is the number of fitted ones; a level that is given is kept.
+    Fisher scoring over the eigenvectors of A A^T, of the `views` (n, m / 2) bool that each row has (None = all).  Single
+    views have no epipolar direction: unless one level is given, all is put down to the pixels.  `parameters` is the
+    number of fitted ones; a level that is given is kept.
     """
     n, m = residuals.shape
+    kinds = [(np.ones(m, dtype=bool), residuals)]
+    if views is not None and not views.all():
+        code = views @ [1, 2][: m // 2]
+        kinds = [(np.repeat([k & 1, k & 2], 2)[:m] > 0, residuals[code == k]) for k in np.unique(code)]
+        kinds = [(kind, r[:, kind]) for kind, r in kinds]
+    count = float(sum(r.size for _, r in kinds))
     known = [np.nan if sigma is None else float(sigma) for sigma in (sigma_u_px, sigma_x_mm)]
-    free = np.isnan(known)
-    freedom = n - parameters / m
-    if freedom < 2 or not free.any():  # nothing to learn from: the weights that make plain least squares of the cameras
+    free, share = np.isnan(known), 1.0 - parameters / count
+    if share * count < 2 * m or not free.any():  # nothing to learn from: the weights that make plain least squares
         return tuple(np.where(free, [1.0, 0.0], known).tolist())
-    gain, directions = np.linalg.eigh(A @ A.T)
-    gain = np.maximum(gain, 0.0)
-    observed = ((residuals @ directions) ** 2).sum(axis=0) / freedom
+    gain, observed, freedom = [], [], []
+    for kind, r in kinds:
+        values, directions = np.linalg.eigh(A[kind] @ A[kind].T)
+        gain.append(np.maximum(values, 0.0))
+        observed.append(((r @ directions) ** 2).sum(axis=0) / (share * len(r)))
+        freedom.append(np.full(len(values), share * len(r)))
+    gain, observed, freedom = (np.concatenate(parts) for parts in (gain, observed, freedom))
     floor = 1e-18 + 1e-24 * gain.max()
-    if free.all() and m < 3:
-        return float(np.sqrt(max(observed.mean(), floor))), 0.0
+    if free.all() and not any(kind.sum() > 2 and len(r) >= 4 for kind, r in kinds):
+        return float(np.sqrt(max((freedom @ observed) / freedom.sum(), floor))), 0.0
     # A start that is right where either noise is negligible.
-    v = np.where(free, [max(observed[0], floor), 0.0], np.square(known))
+    least = gain <= gain.min() * (1.0 + 1e-9)
+    v = np.where(free, [max((freedom @ (observed * least)) / (freedom @ least), floor), 0.0], np.square(known))
     seen = gain > 1e-9 * gain.max()
     if free[1] and seen.any():
         v[1] = np.median(np.maximum(observed[seen] - v[0], 0.0) / gain[seen])
-    design = np.column_stack([np.ones(m), gain])
+    design = np.column_stack([np.ones(len(gain)), gain])
     for _ in range(50):
-        weight = 1.0 / np.maximum(design @ v, floor) ** 2
+        weight = freedom / np.maximum(design @ v, floor) ** 2
         root, scale = np.sqrt(weight), np.abs(design[:, free]).max(axis=0)
         target = observed - design[:, ~free] @ v[~free]
         new = v.copy()

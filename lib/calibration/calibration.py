@@ -6,7 +6,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lib.calibration.models import Fit, Model
+from lib.calibration.models import Fit, Model, precision
 from lib.cameras import AffineCamera, Camera, Points, Resection, StereoRig
 from lib.geometry import points
 
@@ -91,20 +91,20 @@ class Calibration:
 
     @property
     def usable(self) -> np.ndarray:
-        """(n,) bool: the rows that could be used; those that are no inliers are outliers."""
-        return np.isfinite(self.residuals_px).all(axis=1)
+        """(n,) bool: the rows that could be used in at least one view; those that are no inliers are outliers."""
+        return np.isfinite(self.residuals_px).any(axis=1)
 
     @property
     def reprojection_rms_px(self) -> float:
-        """RMS over inliers of the distance |u - project(x)| in an image."""
-        return float(np.sqrt((self.residuals_px[self.inliers] ** 2).sum() / (self.inliers.sum() * len(self.cameras))))
+        """RMS over the views used of the distance |u - project(x)| in an image."""
+        return self._rms(self.residuals_px[self.inliers])
 
     @property
     def chi_square(self) -> tuple[float, int]:
         """Twice the likelihood energy over the inliers and its degrees of freedom; the two are alike where all is well."""
         _, _, weight, r = self.system
         value = np.einsum("ni,nij,nj->", r, np.broadcast_to(weight, (len(r), *weight.shape[1:])), r)
-        return float(value), r.size - len(self.parameter_names)
+        return float(value), 2 * int(self.view_inliers.sum()) - len(self.parameter_names)
 
     @property
     def inverse_distance_per_mm(self) -> tuple[float, float]:
@@ -135,12 +135,17 @@ class Calibration:
 
     @cached_property
     def system(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Over the inliers: derivatives by points and parameters, inverse covariance of the residuals, residuals."""
+        """Over the inliers: derivatives by points and parameters, inverse covariance of the residuals, residuals.
+
+        The inverse covariance and the residuals are zero in views that are not used.
+        """
         _, J_x, J_c = self.minimum.state.evaluate(self.minimum.points)
         noise = self.noise_px2[None] if self.covariance_px2 is None else self.covariance_px2
         noise = noise if len(noise) == 1 else noise[self.inliers]
         J = J_x[:1] if self.plan.is_affine else J_x
-        weight = np.linalg.inv(noise + self.sigma_x_mm**2 * J @ np.swapaxes(J, 1, 2))
+        views, S = self.view_inliers[self.inliers], noise + self.sigma_x_mm**2 * J @ np.swapaxes(J, 1, 2)
+        views = views[:1] if len(S) == 1 and views.all() else views
+        weight = precision(np.broadcast_to(S, (len(views), *S.shape[1:])), views)
         return J_x, J_c @ self.plan.selection, weight, self.minimum.residuals
 
     def projection_covariance(self, x_mm: ArrayLike) -> np.ndarray:
@@ -172,12 +177,21 @@ class Calibration:
 
     @cached_property
     def leave_one_out_px(self) -> np.ndarray:
-        """(inliers, m) residual of each inlier to the cameras fitted without it: r / (1 - leverage), exact for DLT."""
+        """(inliers, m) residual of each inlier to the cameras fitted without it: r / (1 - leverage), exact for DLT.
+
+        NaN in views that are not used.
+        """
         _, J, weight, r = self.system
         own = J @ self.parameter_covariance @ np.swapaxes(J, 1, 2) @ weight
-        return np.linalg.solve(np.eye(own.shape[1]) - own, r[:, :, None])[:, :, 0]
+        r = np.linalg.solve(np.eye(own.shape[1]) - own, r[:, :, None])[:, :, 0]
+        return np.where(np.repeat(self.view_inliers[self.inliers], 2, axis=1), r, np.nan)
 
     @property
     def press_rms_px(self) -> float:
         """Cross-validated reprojection error: RMS distance in an image, each row predicted by the others."""
-        return float(np.sqrt((self.leave_one_out_px**2).sum() / (len(self.leave_one_out_px) * len(self.cameras))))
+        return self._rms(self.leave_one_out_px)
+
+    def _rms(self, r: np.ndarray) -> float:
+        """Of residuals (inliers, m) as distances in an image, over the views used."""
+        views = self.view_inliers[self.inliers]
+        return float(np.sqrt((r[np.repeat(views, 2, axis=1)] ** 2).sum() / views.sum()))

@@ -5,9 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lib.correspondences import Correspondences
 from lib.geometry import finite_points, points
 
-__all__ = ["check_duplicates", "check_images", "check_order", "check_spread", "check_units", "stacked_rows"]
+__all__ = ["check_duplicates", "check_images", "check_order", "check_spread", "check_units", "seen_rows", "stacked_rows"]
 
 #: Zoom (px per mm) between a room camera and the resolution of light; what lies outside has the wrong unit.
 PLAUSIBLE_PX_PER_MM = (0.2, 5000.0)
@@ -29,6 +30,14 @@ def stacked_rows(x_mm: ArrayLike, u: Sequence[ArrayLike]) -> tuple[np.ndarray, n
     if len(x) < 4:
         raise ValueError(f"x_mm: {len(x)} points; an affine camera needs at least 4, better 50, not in one plane.")
     return x, np.hstack(y)
+
+
+def seen_rows(rows: Correspondences) -> tuple[np.ndarray, np.ndarray]:
+    """x (n, 3) and stacked pixels y (n, 4) of rows with a position, NaN in the view that does not show the landmark."""
+    y = np.hstack([np.where(seen[:, None], u, np.nan) for seen, u in zip(rows.seen.T, (rows.u_left, rows.u_right), strict=True)])
+    if len(rows) < 4:
+        raise ValueError(f"data: {len(rows)} rows are seen; an affine camera needs at least 4, better 50, not in one plane.")
+    return rows.x_mm, y
 
 
 def _names(cameras: int) -> list[str]:
@@ -55,8 +64,8 @@ def check_units(x: np.ndarray, y: np.ndarray) -> None:
     """Refuse points whose implied zoom no camera has: metres or micrometres given as millimetres."""
 
     def extent(values: np.ndarray) -> float:  # robust: a few gross rows must not look like another unit
-        middle = np.median(np.abs(values - np.median(values, axis=0)), axis=0).max()
-        return float(middle or values.std(axis=0).max())
+        middle = np.nanmedian(np.abs(values - np.nanmedian(values, axis=0)), axis=0).max()
+        return float(middle or np.nanstd(values, axis=0).max())
 
     size = extent(x)
     if size <= 1e-9 * np.abs(x).max():
@@ -72,7 +81,7 @@ def check_units(x: np.ndarray, y: np.ndarray) -> None:
 
 def check_duplicates(x: np.ndarray, y: np.ndarray) -> None:
     """Refuse rows that repeat another row in every digit: they add no information and fake precision."""
-    repeated = len(x) - len(np.unique(np.hstack([x, y]), axis=0))
+    repeated = len(x) - len(np.unique(np.nan_to_num(np.hstack([x, y]), nan=-1e9), axis=0))
     if repeated:
         raise ValueError(
             f"x_mm, u: {repeated} of {len(x)} rows repeat another row exactly; drop frames frozen or read twice."
@@ -83,6 +92,9 @@ def check_images(y: np.ndarray, image_size_px: tuple[int, int] | None = None) ->
     """Refuse pixels (n, m) that stand still or on a line in a camera, are the same in both, or leave the image."""
     names = _names(y.shape[1] // 2)
     for name, u in zip(names, np.split(y, len(names), axis=1), strict=True):
+        u = u[np.isfinite(u).all(axis=1)]
+        if len(u) < 4:
+            raise ValueError(f"{name}: {len(u)} detections; an affine camera needs at least 4, better 50, not in one plane.")
         size = np.linalg.svd(u - u.mean(axis=0), compute_uv=False)
         if size[1] <= 1e-9 * np.abs(u).max() * np.sqrt(len(u)):
             raise ValueError(f"{name}: the detections stand still or lie on one line; is this the moving tool?")
@@ -91,7 +103,8 @@ def check_images(y: np.ndarray, image_size_px: tuple[int, int] | None = None) ->
             outside, swapped = (((v < -0.1 * limit) | (v > 1.1 * limit)).any(axis=1).mean() for v in (u, u[:, ::-1]))
             if outside > 0.1 and swapped < 0.5 * outside:
                 raise ValueError(f"{name}: {100 * outside:.0f} % lie outside the image; give (x, y), not (row, column).")
-    if len(names) == 2 and (y[:, :2] == y[:, 2:]).all(axis=1).mean() > 0.5:
+    both = y[np.isfinite(y).all(axis=1)]
+    if len(names) == 2 and len(both) and (both[:, :2] == both[:, 2:]).all(axis=1).mean() > 0.5:
         raise ValueError("u_right: the same pixels as u_left; give the right camera's own detections.")
 
 

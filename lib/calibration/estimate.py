@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lib.calibration import checks as refuse
-from lib.calibration.affine import Moments, affine_minimum, estimate_noise, paper_variances
+from lib.calibration.affine import Moments, affine_minimum, estimate_noise, paper_variances, regress
 from lib.calibration.calibration import Calibration
-from lib.calibration.models import Fit, Model, State, fit
+from lib.calibration.models import Fit, Model, State, fit, precision
 from lib.calibration.offsets import estimate_offsets, rows_axes
 from lib.calibration.robust import consensus, gate
 from lib.cameras import StereoRig
@@ -71,13 +71,14 @@ def calibrate(
             raise ValueError("u: Correspondences have their own pixels; leave u out.")
         usable, axes = _usable_rows(data, offsets, weighting)
         rows = data.subset(usable)
-        x, y = refuse.stacked_rows(rows.x_mm, [rows.u_left, rows.u_right])
+        x, y = refuse.seen_rows(rows)
         if covariance_px2 is not None:
             noise = pair_covariance(covariance_px2, len(data))
             noise = noise[usable] if len(noise) > 1 else noise
         else:
-            own = weighting == "likelihood" and sigma_u_px is None and np.isfinite(rows.covariance_px2).all()
-            noise = rows.pair_covariance_px2 if own else None
+            own = weighting == "likelihood" and sigma_u_px is None and np.isfinite(rows.covariance_px2[rows.seen]).all()
+            noise = np.where(rows.seen[:, :, None, None], rows.covariance_px2, np.eye(2)) if own else None
+            noise = None if noise is None else pair_covariance(noise, len(rows))
     else:
         if u is None:
             raise ValueError("u: give [u_left, u_right] with plain positions, or Correspondences alone.")
@@ -102,12 +103,12 @@ def calibrate(
 def _usable_rows(
     data: Correspondences, offsets: bool | str | None, weighting: str
 ) -> tuple[np.ndarray, np.ndarray | None]:
-    """Mask of the rows to calibrate with, and the tool's axes in them (None: no offsets in the tool's axes)."""
+    """Mask of the rows to calibrate with (seen in one view at least), and the tool's axes in them or None."""
     if offsets not in (None, False, True, "tool", "image"):
         raise ValueError(f"offsets: expected 'tool', 'image', True, False or None, got {offsets!r}.")
     if offsets and weighting != "likelihood":
         raise ValueError("weighting: offsets need the likelihood's weights.")
-    usable = data.is_complete
+    usable = data.seen.any(axis=1) & np.isfinite(data.x_mm).all(axis=1)
     if offsets not in (None, True, "tool") or weighting != "likelihood":
         return usable, None
     axes = rows_axes(data)
@@ -146,7 +147,7 @@ def _calibrate(
     for name, value in (*known.items(), ("ransac_px", ransac_px)):
         if value is not None and not (value > 0 or (value == 0 and name != "sigma_u_px")):
             raise ValueError(f"{name}: must not be negative, nor sigma_u_px zero, got {value}; None estimates it.")
-    if y.size < len(plan.parameter_names):
+    if np.isfinite(y).sum() < len(plan.parameter_names):
         raise ValueError(f"x_mm: {n} points are too few for the {len(plan.parameter_names)} parameters of '{model}'.")
     if noise is not None and not np.isfinite(noise).all():
         raise ValueError("covariance_px2: must be finite in every row.")
@@ -159,38 +160,44 @@ def _calibrate(
     assumed_x = 0.0 if not checks else refuse.ROBOT_ACCURACY_MM if sigma_x_mm is None else sigma_x_mm
     refuse.check_spread(x, assumed_x)
     refuse.check_images(y, image_size_px if checks else None)
-    inliers = np.ones(n, dtype=bool)
+    seen = np.isfinite(y).reshape(n, -1, 2).all(axis=2)
+    views = seen
     if ransac_px != np.inf:
-        inliers = consensus(x, y, ransac_px, np.random.default_rng(seed), sigma_x_mm=sigma_x_mm)
-    refuse.check_spread(x[inliers], assumed_x)
+        views, gates = consensus(x, y, ransac_px, np.random.default_rng(seed), sigma_x_mm=sigma_x_mm)
+    for rows in views.T:
+        refuse.check_spread(x[rows], assumed_x)
     centre = (np.asarray(image_size_px, dtype=float) - 1) / 2 if image_size_px is not None else None
     for _ in range(4):
+        inliers = views.any(axis=1)
         rows_noise = noise if noise is None or len(noise) == 1 else noise[inliers]
-        minimum, (sigma_u, sigma_x), variances = _minimise(plan, x[inliers], y[inliers], rows_noise, weighting, known, centre)
+        minimum, (sigma_u, sigma_x), variances = _minimise(
+            plan, x[inliers], y[inliers], views[inliers], rows_noise, weighting, known, centre
+        )
         state = minimum.state
         f, J, _ = state.evaluate(x - state.reference, derivatives=False)
         residuals = y - f
-        if ransac_px is not None or plan.is_affine:
+        if ransac_px is not None or (plan.is_affine and (noise is None or len(noise) == 1)):
             break
-        # A curved projection looked like outliers to the affine consensus: judge again by the model itself.
+        # What looks like an outlier to an affine camera and equal noise may be neither: judge again by the model itself.
         S = (sigma_u**2 * np.eye(m)[None] if noise is None else noise) + sigma_x**2 * J @ np.swapaxes(J, 1, 2)
-        new = np.einsum("ni,nij,nj->n", residuals, np.linalg.inv(S), residuals) < gate(n, m)
-        if (new == inliers).all() or new.sum() < inliers.sum():
+        S = np.stack([S[:, i : i + 2, i : i + 2] for i in range(0, m, 2)], axis=1)
+        r = residuals.reshape(n, -1, 2, 1)
+        new = (np.swapaxes(r, 2, 3) @ np.linalg.inv(S) @ r)[..., 0, 0] < gates  # NaN, not seen, is not below
+        if (new == views).all() or new.sum() < views.sum():
             break
-        inliers = new
+        views = new
 
     true = sigma_u**2 * np.eye(m)[None] if rows_noise is None else rows_noise
-    parameter_covariance = _parameter_covariance(plan, minimum, true, sigma_x, *variances)
+    parameter_covariance = _parameter_covariance(plan, minimum, true, sigma_x, *variances, views[inliers])
     G = state.matrix_jacobian() @ plan.selection
     cameras = state.cameras(plan)
     rig = StereoRig(*cameras) if len(cameras) == 2 else None
     if checks and rig is not None:
         spread = np.sqrt(np.linalg.eigvalsh(np.cov(x[inliers].T))[0])
         zoom = np.sqrt(np.abs(np.linalg.det(cameras[0].linear @ cameras[0].linear.T)) ** 0.5)
-        refuse.check_order(rig.linear, np.hypot(sigma_u / zoom, sigma_x) / (spread * np.sqrt(inliers.sum() / 2)))
+        refuse.check_order(rig.linear, np.hypot(sigma_u / zoom, sigma_x) / (spread * np.sqrt(views.sum(axis=0).min() / 2)))
     return Calibration(
-        cameras=cameras, rig=rig, view_inliers=np.repeat(inliers[:, None], m // 2, axis=1), cost=minimum.cost,
-        covariance=G @ parameter_covariance @ G.T,
+        cameras=cameras, rig=rig, view_inliers=views, cost=minimum.cost, covariance=G @ parameter_covariance @ G.T,
         parameter_covariance=parameter_covariance, sigma_u_px=sigma_u, sigma_x_mm=sigma_x, residuals_px=residuals,
         model=model, weighting=weighting, x_mm=x, y_px=y, covariance_px2=noise,
         image_size_px=None if image_size_px is None else tuple(image_size_px), plan=plan, minimum=minimum,
@@ -198,56 +205,60 @@ def _calibrate(
 
 
 def _minimise(
-    plan: Model, x: np.ndarray, y: np.ndarray, noise: np.ndarray | None, weighting: str,
+    plan: Model, x: np.ndarray, y: np.ndarray, views: np.ndarray, noise: np.ndarray | None, weighting: str,
     known: dict[str, float | None], centre: np.ndarray | None,
 ) -> tuple[Fit, tuple[float, float], tuple[np.ndarray, float]]:  # fmt: skip
-    """The minimum over inliers, the noise levels (sigma_u, sigma_x), and the variances that weighed it."""
-    m = y.shape[1]
-    moments = Moments.of(x, y)
-    reference = moments.mean[m:]
-    middles = np.tile(centre, (m // 2, 1)) if centre is not None else ((y.max(0) + y.min(0)) / 2).reshape(-1, 2)
-    start = affine_minimum(moments, 1.0, 0.0)
-    residuals, A, used = y - x @ start.matrix[:, :3].T - start.matrix[:, 3], start.matrix[:, :3], 4 * m
+    """The minimum over the views (n, cameras) bool, the noise levels (sigma_u, sigma_x), and the variances that weighed it."""
+    m, whole = y.shape[1], bool(views.all())
+    reference, used = x.mean(axis=0), np.repeat(views, 2, axis=1)
+    seen = np.where(used, y, np.nan)
+    middles = np.tile(centre, (m // 2, 1)) if centre is not None else (
+        (np.nanmax(seen, axis=0) + np.nanmin(seen, axis=0)) / 2
+    ).reshape(-1, 2)  # fmt: skip
+    start = np.vstack([regress(x[rows], y[rows, 2 * c : 2 * c + 2]) for c, rows in enumerate(views.T)])
+    residuals = np.where(used, y - x @ start[:, :3].T - start[:, 3], 0.0)
+    moments, A, parameters = Moments.of(x, y) if whole else None, start[:, :3], 4 * m
     levels, minimum = None, None
     for _ in range(3):
-        before, levels = levels, _levels(residuals, A, used, noise, known)
+        before, levels = levels, _levels(residuals, A, parameters, views, noise, known)
         if before is not None and np.allclose(before, levels, rtol=1e-3, atol=1e-12):
             levels = before
             break
         variance_u, variance_x = paper_variances(*levels) if weighting == "paper" else np.square(levels).tolist()
         weigh = variance_u * np.eye(m)[None] if noise is None or weighting == "paper" else noise
-        if len(weigh) == 1 and np.allclose(weigh[0], variance_u * np.eye(m), rtol=1e-12, atol=0):
-            start = affine_minimum(moments, variance_u, variance_x)
-        if minimum is None or (plan.is_affine and len(weigh) == 1):
-            state = State.start(plan, start.matrix, reference, middles)
+        if whole and len(weigh) == 1 and np.allclose(weigh[0], variance_u * np.eye(m), rtol=1e-12, atol=0):
+            start = affine_minimum(moments, variance_u, variance_x).matrix
+        if minimum is None or (plan.is_affine and whole and len(weigh) == 1):
+            state = State.start(plan, start, reference, middles)
         else:
             state = minimum.state
-        minimum = fit(plan, state, x - reference, y, weigh, variance_x)
+        minimum = fit(plan, state, x - reference, y, weigh, variance_x, views)
         if known["sigma_x_mm"] is not None and (noise is not None or known["sigma_u_px"] is not None):
             break
-        residuals, A, used = minimum.residuals, minimum.state.A.reshape(m, 3), len(plan.parameter_names)
+        residuals, A, parameters = minimum.residuals, minimum.state.A.reshape(m, 3), len(plan.parameter_names)
     return minimum, levels, (weigh, variance_x)
 
 
 def _levels(
-    residuals: np.ndarray, A: np.ndarray, parameters: int, noise: np.ndarray | None, known: dict[str, float | None]
-) -> tuple[float, float]:
+    residuals: np.ndarray, A: np.ndarray, parameters: int, views: np.ndarray, noise: np.ndarray | None,
+    known: dict[str, float | None],
+) -> tuple[float, float]:  # fmt: skip
     """(sigma_u, sigma_x): given, or estimated from the residuals; the detector's covariances replace sigma_u."""
     if noise is None:
-        return estimate_noise(residuals, A, parameters, **known)
+        return estimate_noise(residuals, A, parameters, views, **known)
     n, m = residuals.shape
     sigma_u = float(np.sqrt(np.trace(noise, axis1=1, axis2=2).mean() / m))
     if known["sigma_x_mm"] is not None:
         return sigma_u, float(known["sigma_x_mm"])
     # Maximum likelihood of one variance v in S_i = Sigma_i + v A A^T, by Fisher scoring.
     B, v = A @ A.T, 0.0
-    inflate = n / max(n - parameters / m, 1.0)
+    inflate = 1.0 / max(1.0 - 0.5 * parameters / views.sum(), 1.0 / n)
     for _ in range(50):
-        W = np.linalg.inv(noise + v * B)
+        W = precision(np.broadcast_to(noise + v * B, (n, m, m)), views)
         WB = W @ B
-        white = np.einsum("nij,nj->ni", np.broadcast_to(W, (n, m, m)), residuals)
-        score = inflate * np.einsum("ni,ij,nj->", white, B, white) - np.trace(WB, axis1=1, axis2=2).sum() * (n / len(W))
-        information = np.einsum("nij,nji->", WB, WB) * (n / len(W))
+        white = np.einsum("nij,nj->ni", W, residuals)
+        score = inflate * np.einsum("ni,ij,nj->", white, B, white) - np.trace(WB, axis1=1, axis2=2).sum()
+        information = np.einsum("nij,nji->", WB, WB)
         new = max(v + score / information, 0.0)
         if abs(new - v) <= 1e-9 * max(v, 1e-12):
             break
@@ -256,7 +267,7 @@ def _levels(
 
 
 def _parameter_covariance(
-    plan: Model, minimum: Fit, noise: np.ndarray, sigma_x: float, weigh: np.ndarray, variance_x: float
+    plan: Model, minimum: Fit, noise: np.ndarray, sigma_x: float, weigh: np.ndarray, variance_x: float, views: np.ndarray
 ) -> np.ndarray:
     """Inverse information; where the weights were not the noise's, the sandwich H^-1 G H^-1."""
     scale = 1.0 / np.sqrt(np.diag(minimum.information))
@@ -265,6 +276,6 @@ def _parameter_covariance(
         return inverse
     _, J_x, J_c = minimum.state.evaluate(minimum.points)
     outer = J_x @ np.swapaxes(J_x, 1, 2)
-    WJ = np.linalg.inv(weigh + variance_x * outer) @ J_c @ plan.selection
+    WJ = precision(weigh + variance_x * outer, views) @ J_c @ plan.selection
     meat = np.einsum("nip,nij,njq->pq", WJ, noise + sigma_x**2 * outer, WJ)
     return inverse @ meat @ inverse

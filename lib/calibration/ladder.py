@@ -89,8 +89,12 @@ def compare_models(
     freest = calibrate(data, u, model=most, **options)
     rows, covariance = freest.inliers, freest.covariance_px2
     x, pixels = freest.x_mm[rows], np.split(freest.y_px[rows], cameras, axis=1)
+    if cameras == 2:  # the views that the freest model uses, and no others
+        pixels = [np.where(used[:, None], u, np.nan) for used, u in zip(freest.view_inliers[rows].T, pixels, strict=True)]
+        x, pixels = Correspondences.of_points(x, *pixels), None
     same = {
         "sigma_u_px": freest.sigma_u_px, "sigma_x_mm": freest.sigma_x_mm, "image_size_px": freest.image_size_px,
+        "offsets": False if pixels is None else None,
         "covariance_px2": covariance if covariance is None or len(covariance) == 1 else covariance[rows],
     }  # fmt: skip
     fits = {m: calibrate(x, pixels, model=m, ransac_px=np.inf, checks=False, **same) for m in models}
@@ -101,5 +105,5 @@ def compare_models(
         if freer is not None:
             gain, more = value - 2.0 * fits[freer].cost, len(fits[freer].parameter_names) - k
             p = float(chi2.sf(max(gain, 0.0), more))
-        rungs.append(Rung(m, k, value, value + k * float(np.log(x.shape[0] * 2 * cameras)), freer, p, c))
+        rungs.append(Rung(m, k, value, value + k * float(np.log(2 * freest.view_inliers.sum())), freer, p, c))
     return Comparison(rungs, freest.sigma_u_px, freest.sigma_x_mm)

@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 from lib.cameras import AffineCamera, Camera, NearAffineCamera, radial_derivative
 from lib.least_squares import minimise
 
-__all__ = ["Fit", "Model", "State", "fit"]
+__all__ = ["Fit", "Model", "State", "fit", "precision"]
 
 BASES = ("affine", "zero_skew", "square", "common_zoom")
 OPTIONS = ("distance", "distances", "radial")
@@ -212,36 +212,57 @@ class Fit:
     converged: bool
 
 
+def precision(covariance: np.ndarray, views: np.ndarray) -> np.ndarray:
+    """Inverses (k, m, m) of covariances (k, m, m) of which only the `views` (k, cameras) bool are known; zero elsewhere.
+
+    It is the limit of the inverse where the covariance of the other views grows beyond all bounds.
+    """
+    if views.all():
+        return np.linalg.inv(covariance)
+    used = np.repeat(views, 2, axis=1)
+    both = used[:, :, None] & used[:, None, :]
+    return np.where(both, np.linalg.inv(np.where(both, covariance, np.eye(used.shape[1]))), 0.0)
+
+
 def settle(
-    state: State, x: np.ndarray, y: np.ndarray, noise: np.ndarray, variance_x: float, linear: bool
+    state: State, x: np.ndarray, y: np.ndarray, noise: np.ndarray, variance_x: float, views: np.ndarray, linear: bool
 ) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
-    """Best corrected points of a state: cost, linearised residuals, x~, S^-1."""
+    """Best corrected points of a state: cost, linearised residuals (zero in views not used), x~, S^-1."""
     points, rounds = x, 1 if linear or variance_x == 0 else 4
+    kinds, kind = views, slice(None)
+    if linear and len(noise) == 1:  # rows of equal covariance and equal views share one inverse
+        _, first, kind = np.unique(views @ [1, 2][: views.shape[1]], return_index=True, return_inverse=True)
+        kinds, kind = views[first], kind if len(first) > 1 else slice(None)
     for _ in range(rounds):
         f, J, _ = state.evaluate(points, derivatives=False)
         if linear:
             J = J[:1]
         r = y - f - np.einsum("nij,nj->ni", np.broadcast_to(J, (len(x), *J.shape[1:])), x - points)
-        weight = np.linalg.inv(noise + variance_x * J @ np.swapaxes(J, 1, 2))
+        covariance = noise + variance_x * J @ np.swapaxes(J, 1, 2)
+        weight = precision(np.broadcast_to(covariance, (len(kinds), *covariance.shape[1:])), kinds)[kind]
         white = (weight @ r[:, :, None])[:, :, 0]
         points = x + variance_x * (np.swapaxes(J, 1, 2) @ white[:, :, None])[:, :, 0]
-    return 0.5 * float((r * white).sum()), r, points, weight
+    return 0.5 * float((r * white).sum()), np.where(np.repeat(views, 2, axis=1), r, 0.0), points, weight
 
 
-def fit(model: Model, start: State, x: np.ndarray, y: np.ndarray, noise: np.ndarray, variance_x: float) -> Fit:
+def fit(
+    model: Model, start: State, x: np.ndarray, y: np.ndarray, noise: np.ndarray, variance_x: float, views: np.ndarray
+) -> Fit:
     """Minimum of 1/2 sum (y - f(x~))^T noise^-1 (y - f(x~)) + |x~ - x|^2 / variance_x by Levenberg-Marquardt.
 
     Every point is eliminated exactly, which leaves residuals of covariance S = noise + variance_x J J^T and a system in the
-    camera parameters alone.  x (n, 3) is in mm from the state's reference, y (n, m) in px, noise (1 or n, m, m) in px^2.
+    camera parameters alone.  x (n, 3) is in mm from the state's reference, y (n, m) in px, noise (1 or n, m, m) in px^2; only
+    the `views` (n, cameras) bool count.
     """
     T = model.selection
+    y = np.where(np.repeat(views, 2, axis=1), y, 0.0)
 
     def evaluate(state: State) -> tuple[float, tuple] | None:
         for A, rho in zip(state.A, state.rho, strict=True):
             normal = np.cross(A[0], A[1])
             if rho and (1.0 + rho * (x @ normal) / np.linalg.norm(normal)).min() <= 0.05:
                 return None  # a point lies behind the camera
-        cost, *work = settle(state, x, y, noise, variance_x, model.is_affine)
+        cost, *work = settle(state, x, y, noise, variance_x, views, model.is_affine)
         return (cost, work) if np.isfinite(cost) else None
 
     def normal_equations(state: State, work: tuple) -> tuple[np.ndarray, np.ndarray]:

@@ -13,6 +13,7 @@ __all__ = ["OnlineCalibration"]
 
 _START_ROWS = 30  # that must agree on a rig before single rows are judged by it
 _MOST_ROWS = 240  # kept until then
+_CHI2_4_MEDIAN = 3.357
 
 
 class OnlineCalibration:
@@ -82,7 +83,9 @@ class OnlineCalibration:
         first_x, first_y, keep = self._first[:, :3], self._first[:, 3:], np.ones(len(self._first), dtype=bool)
         if len(keep) >= 8 and self._spans(Moments.of(first_x, first_y)):
             try:
-                keep = consensus(first_x, first_y, None, np.random.default_rng(0), sigma_x_mm=self.sigma_x_mm)
+                keep = consensus(first_x, first_y, None, np.random.default_rng(0), sigma_x_mm=self.sigma_x_mm)[0].all(axis=1)
+                # Few rows may agree by chance, but not to the noise that is known.
+                keep &= bool(keep.any()) and np.median(self._distances2(first_x[keep], first_y[keep])) < 9.0 * _CHI2_4_MEDIAN
             except ValueError:  # nothing agrees yet
                 keep[:] = False
         self.moments = Moments.of(first_x[keep], first_y[keep]) if keep.any() else None
@@ -91,6 +94,11 @@ class OnlineCalibration:
         elif len(keep) > _MOST_ROWS:
             self._first = self._first[::2]
         return keep[-len(x) :]
+
+    def _distances2(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Squared Mahalanobis distances (n,) of rows to the rig that they agree on best."""
+        matrix = affine_minimum(Moments.of(x, y), self.sigma_u_px**2, self.sigma_x_mm**2).matrix
+        return distances2(y - x @ matrix[:, :3].T - matrix[:, 3], matrix[:, :3], self.sigma_u_px, self.sigma_x_mm)
 
     def _fold(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Judge the rows by the rig of those before, and add them to the moments."""

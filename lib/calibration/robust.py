@@ -1,24 +1,37 @@
-"""Joint stereo RANSAC with local optimisation: which rows are correspondences at all.
+"""Which detections agree on a camera at all: the tightest consensus that the data support, each camera alone.
 
-Samples of four points give both cameras at once; each camera keeps its own best sample, and a row counts only where both
-agree.  Local optimisation refits on the rows kept until they no longer change (Chum, Matas and Kittler, "Locally optimized
-RANSAC", 2003).  Without a threshold samples are ranked by their median residual (Rousseeuw's least median of squares), the
-noise is measured on the rows kept, and a row is dropped where its residual would appear once in 10 000 data sets.
+A detector that is lost is wrong in more than one way and at more than one scale, so no threshold is known beforehand.
+Samples of four points give affine cameras, ranked with the scale of every row marginalised (a sum of log distances).  The
+best start an expectation maximisation of three populations: right detections (Gaussian), wrong ones that have something to
+do with the tool (a Gaussian at least four times as wide), and any pixel (uniform).  Few rows cannot tell three populations
+apart; there the half that agrees best takes in one row after another (the forward search).  A camera without a
+consensus is refused, and so is one with two.
 """
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
-from scipy.special import gammainccinv, gammaincinv
+from scipy.special import gammainccinv
 from scipy.stats import f as f_distribution
 
-from lib.calibration.affine import Moments, affine_minimum, distances2, estimate_noise, regress
+from lib.calibration.affine import regress
 
 __all__ = ["NoConsensusError", "consensus", "gate"]
 
 FALSE_ALARM = 1e-4
-_ROWS_RANKED = 500
-_FEW = 25  # rows, below which the noise of the best sample is no measure
+_SAMPLES = (100, 300, 1000)  # tried one after another, until right ones are among them
+_ROWS_RANKED = 300
+_STARTS = 8  # samples that the expectation maximisation starts from
+_FEW = 25  # rows of a view, below which it goes by the forward search
+_MORE_THAN_CHANCE = 5.0  # log evidence: of clean data some rows agree better than all do by up to 4
+_LEAST_SHARE = 0.25  # of a view's rows, that must agree
+#: A wider population within this many scales of the right one is its heavy tail, else it is contamination.
+_CONTRAST = 8.0
+#: Largest noise, as a share of the extent of the pixels, where there are outliers that do not stand clearly apart; and where
+#: there are none.
+_LARGEST_NOISE = (0.01, 0.25)
+_NOT_APART = 0.2  # share of outliers from which on they must stand apart
 
 
 class NoConsensusError(ValueError):
@@ -30,83 +43,254 @@ def gate(n: int, m: int) -> float:
     return float(2.0 * gammainccinv(m / 2, FALSE_ALARM / n))
 
 
-def _chi2_quantile(probability: float, freedom: int) -> float:
-    """As scipy.stats.chi2.ppf, a hundred times faster."""
-    return float(2.0 * gammaincinv(freedom / 2, probability))
-
-
 def consensus(
-    x: np.ndarray, y: np.ndarray, threshold_px: float | None, rng: np.random.Generator, *,
-    sigma_x_mm: float | None = None, samples: int = 300,
-) -> np.ndarray:  # fmt: skip
-    """Rows (n,) bool of x (n, 3) mm and y (n, m) px that agree on one pair of affine cameras.
+    x: np.ndarray, y: np.ndarray, threshold_px: float | None, rng: np.random.Generator, *, sigma_x_mm: float | None = None
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """The views (n, cameras) bool of x (n, 3) mm and y (n, m) px, NaN = not seen, that agree on each affine camera.
 
-    `threshold_px` is the largest reprojection distance of a row in any image; None measures the noise and decides by it.
-    Samples thinner than five times the robot's accuracy `sigma_x_mm` are not used.  A `NoConsensusError` says that no affine
-    camera explains enough rows: a quarter of them, with a threshold a tenth, and eight.
+    And the squared Mahalanobis distances (cameras,) up to which a row is more probably right than wrong.  `threshold_px` is
+    the largest reprojection distance; None measures the noise and decides by it.  Samples thinner than five times the
+    robot's accuracy `sigma_x_mm` are not used.  A `NoConsensusError` says why a camera has none.
     """
-    n, m = y.shape
+    views = np.isfinite(y).reshape(len(y), -1, 2).all(axis=2)
+    names, gates = ["u_left", "u_right"] if views.shape[1] == 2 else ["u"], []
+    for c, name in enumerate(names):
+        rows = np.flatnonzero(views[:, c])
+        found = _one_camera(name, x[rows], y[rows, 2 * c : 2 * c + 2], threshold_px, rng, 5.0 * (sigma_x_mm or 0.0))
+        views[rows, c] = found.keep
+        gates.append(found.gate2)
+    return views, np.array(gates)
+
+
+class _Found(NamedTuple):
+    """The rows (n,) bool that agree on a camera `matrix` (2, 4), their noise, the next wider population's, the gate."""
+
+    keep: np.ndarray
+    matrix: np.ndarray
+    sigma_px: float
+    wider_px: float
+    gate2: float
+
+
+def _one_camera(
+    name: str, x: np.ndarray, u: np.ndarray, threshold_px: float | None, rng: np.random.Generator, least_mm: float
+) -> _Found:
+    """What agrees on a camera of x (n, 3) and u (n, 2); a NoConsensusError if there is no one camera."""
+    n = len(u)
     if n < 8:
-        return np.ones(n, dtype=bool)
-    x = x - x.mean(axis=0)
-    y_scale = float(y.std(axis=0).max())
-    sets = _samples(x, samples, rng, 5.0 * (sigma_x_mm or 0.0))
-    H = np.column_stack([x, np.ones(n)])
-    M = np.linalg.solve(H[sets], y[sets])  # (s, 4, m)
-    rows = np.arange(n) if n <= _ROWS_RANKED else rng.choice(n, _ROWS_RANKED, replace=False)
-    residuals = (H[rows] @ M.transpose(1, 0, 2).reshape(4, -1)).reshape(len(rows), len(sets), m // 2, 2)
-    residuals -= y[rows].reshape(len(rows), 1, m // 2, 2)
-    distance2 = np.einsum("rsck,rsck->csr", residuals, residuals)  # (cameras, samples, rows)
-    if threshold_px is None:
-        score = np.partition(distance2, len(rows) // 2, axis=2)[:, :, len(rows) // 2]
+        return _Found(np.ones(n, dtype=bool), regress(x, u), 0.0, np.inf, np.inf)
+    cure = (
+        "check that x_mm and u belong together (frames, order of landmarks, time offset) and that the detector knows this "
+        "tool"
+    )
+    if threshold_px is None and n < _FEW:
+        found, enough = _by_growth(x, u, _best_sample(x, u, rng, least_mm)), min(8, n - n // 4)
     else:
-        score = np.minimum(distance2, threshold_px**2).sum(axis=2)  # MSAC
-    best = score.argmin(axis=1)
-    fits = np.hstack([M[b][:, 2 * c : 2 * c + 2] for c, b in enumerate(best)])
-    distance2 = ((y - H @ fits) ** 2).reshape(n, m // 2, 2).sum(axis=2)
+        found = _tightest(x, u, threshold_px, rng, least_mm)
+        enough = max(8, int((_LEAST_SHARE if threshold_px is None else 0.1) * n))
+    count, extent = int(found.keep.sum()), float(np.sqrt(np.prod(_extent(u))))
+    if count < enough:
+        raise NoConsensusError(f"{name}: no consensus, only {count} of {n} rows agree on an affine camera; {cure}.")
+    apart = n - count <= _NOT_APART * n or found.wider_px >= _CONTRAST * found.sigma_px
+    if found.sigma_px > _LARGEST_NOISE[1 if apart else 0] * extent:
+        raise NoConsensusError(
+            f"{name}: no consensus, all rows look like outliers: the best affine camera leaves {found.sigma_px:.3g} px in "
+            f"{count} of {n} rows, and the others do not stand apart; {cure}."
+        )
+    rest, least = np.flatnonzero(~found.keep), max(10, 0.2 * n, 0.5 * count)
+    if threshold_px is None and len(rest) >= least:
+        other = _tightest(x[rest], u[rest], None, rng, least_mm)
+        second = rest[other.keep]
+        r = u[second] - x[second] @ found.matrix[:, :3].T - found.matrix[:, 3]
+        beside = np.sqrt((r**2).sum(axis=1).mean() / 2) > max(_CONTRAST * found.sigma_px, _LARGEST_NOISE[0] * extent)
+        if len(second) >= least and other.sigma_px <= 3.0 * found.sigma_px and beside:
+            raise NoConsensusError(_competing(name, np.flatnonzero(found.keep), second, n))
+    return found
+
+
+def _competing(name: str, first: np.ndarray, second: np.ndarray, n: int) -> str:
+    """What to say of two cameras, one that the rows `first` agree on, and one of the rows `second`."""
+    early, late = sorted((first, second), key=np.median)
+    cut = np.sort(np.concatenate([first, second]))[len(early)]
+    if (early < cut).mean() + (late >= cut).mean() > 1.8:
+        cure = f"rows up to {cut - 1} and the later ones: the camera moved or a clock jumped, calibrate each part alone"
+    else:
+        cure = "mixed over the recording: look for two tools, two clocks, or landmarks that are taken for one another"
+    return f"{name}: two consensuses compete, {len(first)} and {len(second)} of {n} rows agree on two cameras; {cure}."
+
+
+# --- few rows
+
+
+def _best_sample(x: np.ndarray, u: np.ndarray, rng: np.random.Generator, least_mm: float) -> np.ndarray:
+    """Squared distances (n,) to the camera of the sample with the least median of them."""
+    H = np.column_stack([x - x.mean(axis=0), np.ones(len(x))])
+    sets = _samples(H[:, :3], 300, rng, least_mm)
+    distance2 = _distances2(H, u, np.linalg.solve(H[sets], u[sets]))
+    return distance2[np.partition(distance2, len(x) // 2, axis=1)[:, len(x) // 2].argmin()]
+
+
+def _by_growth(x: np.ndarray, u: np.ndarray, distance2: np.ndarray) -> _Found:
+    """Few rows: from the half that agrees best, taking in the next best row as long as an F test lets it.
+
+    Of few rows some minimal sample always fits a few others by chance, so its residuals say too little about the noise
+    (Atkinson and Riani, "Robust diagnostic regression analysis", 2000).
+    """
+    n = len(u)
+    H, size = np.column_stack([x, np.ones(n)]), (n + 5) // 2
+    keep = np.argsort(distance2)[:size]
+    for _ in range(10):  # concentrate: the rows nearest to their own fit
+        keep, before = np.argsort(((u - H @ regress(x[keep], u[keep]).T) ** 2).sum(axis=1))[:size], keep
+        if set(keep) == set(before):
+            break
+    while len(keep) < n:
+        r = u - H @ regress(x[keep], u[keep]).T
+        freedom = 2 * (len(keep) - 4)
+        variance = (r[keep] ** 2).sum() / max(freedom, 1) + (1e-11 * np.abs(u).max()) ** 2
+        # A row outside the fit is predicted with the fit's own uncertainty.
+        leverage = np.einsum("ni,ij,nj->n", H, np.linalg.pinv(H[keep].T @ H[keep]), H)
+        distance2 = (r**2).sum(axis=1) / variance / (1.0 + leverage)
+        distance2[keep] = -1.0
+        order = np.argsort(distance2)
+        if distance2[order[len(keep)]] > 2.0 * f_distribution.isf(FALSE_ALARM / n, 2, max(freedom, 1)):
+            break
+        keep = order[: len(keep) + 1]
+    matrix = regress(x[keep], u[keep])
+    r = u[keep] - x[keep] @ matrix[:, :3].T - matrix[:, 3]
+    sigma = float(np.sqrt((r**2).sum() / max(r.size - 8, 2)))
+    return _Found(np.isin(np.arange(n), keep), matrix, sigma, np.inf, gate(n, 2))
+
+
+# --- many rows
+
+
+def _extent(u: np.ndarray) -> np.ndarray:
+    """(2,) width and height of the pixels, whatever one row in ten does."""
+    low, high = np.quantile(u, [0.1, 0.9], axis=0)
+    return np.maximum((high - low) / 0.8, 1e-9)
+
+
+def _samples(x: np.ndarray, count: int, rng: np.random.Generator, least_mm: float) -> np.ndarray:
+    """Sets (count, 4) of rows whose four points span a large volume."""
+    n = len(x)
+    sets = np.argpartition(rng.random((3 * count, n)), 4, axis=1)[:, :4] if n < 40 else rng.integers(0, n, (3 * count, 4))
+    a, b, c = np.swapaxes(x[sets[:, 1:]] - x[sets[:, :1]], 0, 1)
+    volume = np.abs(np.einsum("ni,ni->n", np.cross(a, b), c))
+    sets = sets[np.argsort(-volume)[:count]]
+    corners = x[sets] - x[sets].mean(axis=1, keepdims=True)
+    thick = np.sqrt(np.maximum(np.linalg.eigvalsh(np.swapaxes(corners, 1, 2) @ corners)[:, 0], 0.0))
+    fine = thick > max(least_mm, 1e-9 * np.abs(x).max())
+    return sets[fine] if fine.sum() >= 20 else sets[np.argsort(-thick)[:20]]
+
+
+def _distances2(H: np.ndarray, u: np.ndarray, M: np.ndarray) -> np.ndarray:
+    """Squared distances (k, n) of pixels u (n, 2) to the projections of H (n, 4) by cameras M (k, 4, 2)."""
+    r = (H @ M.transpose(1, 0, 2).reshape(4, -1)).reshape(len(H), len(M), 2) - u[:, None]
+    return np.einsum("nkc,nkc->kn", r, r)
+
+
+def _tightest(
+    x: np.ndarray, u: np.ndarray, threshold_px: float | None, rng: np.random.Generator, least_mm: float
+) -> _Found:
+    """The consensus of the camera that makes the rows most probable (or has most of them within `threshold_px`)."""
+    n, middle = len(u), np.median(u, axis=0)
+    u = u - middle
+    area = float(np.prod(_extent(u)))
+    H = np.column_stack([x - x.mean(axis=0), np.ones(n)])
+    some = np.arange(n) if n <= _ROWS_RANKED else rng.choice(n, _ROWS_RANKED, replace=False)
+    M, score, near2 = np.empty((0, 4, 2)), np.empty(0), np.empty(0)
+    for count in _SAMPLES:
+        sets = _samples(H[:, :3], count, rng, least_mm)
+        new = np.linalg.solve(H[sets], u[sets])
+        distance2 = _distances2(H[some], u[some], new)
+        if threshold_px is not None:
+            ranks = np.minimum(distance2, threshold_px**2).sum(axis=1)  # MSAC
+        else:
+            ranks = np.log(np.minimum(distance2, area / np.pi) + 1e-7 * area).sum(axis=1)
+        low = np.partition(distance2, min(max(6, int(0.15 * len(some))), len(some) - 1), axis=1)
+        low = low[:, min(max(6, int(0.15 * len(some))), len(some) - 1)]
+        M, score, near2 = (np.concatenate(pair) for pair in ((M, new), (score, ranks), (near2, low)))
+        best = np.argsort(score)[:_STARTS]
+        M, score, near2 = M[best], score[best], near2[best]
+        if threshold_px is None:
+            # Where half the rows and more agree with the best sample, right samples are many.
+            if (_distances2(H[some], u[some], M[:1])[0] < 16.0 * near2[0]).mean() > 0.5:
+                break
     if threshold_px is not None:
 
         def near(keep: np.ndarray) -> np.ndarray:
-            r = y - H @ regress(x[keep], y[keep]).T
-            return ((r**2).reshape(n, -1, 2).sum(axis=2) < threshold_px**2).all(axis=1)
+            return _distances2(H, u, regress(H[keep, :3], u[keep]).T[None])[0] < threshold_px**2
 
-        keep = _settled(near, (distance2 < threshold_px**2).all(axis=1), 5)
-        enough = max(8, n // 10)
-    elif n < _FEW:
-        keep = _by_growth(x, y, distance2.max(axis=1))
-        enough = min(8, n - n // 4)
-    else:
-        # The median of |r|^2 is 1.386 variances where the noise is Gaussian.
-        scale2 = np.median(distance2, axis=0) / _chi2_quantile(0.5, 2) + 1e-18 * y_scale**2
-        keep = (distance2 < _chi2_quantile(0.99, 2) * scale2).all(axis=1)
-        keep = _by_noise(x, y, keep)
-        enough = max(8, int(0.25 * n))
-    if keep.sum() < enough:
-        raise NoConsensusError(
-            f"u: only {int(keep.sum())} of {n} rows agree on affine cameras; check that x_mm and u belong together "
-            "(frames, order of landmarks, time offset), or raise ransac_px."
-        )
-    rms = np.sqrt(((y[keep] - H[keep] @ regress(x[keep], y[keep]).T) ** 2).mean())
-    if rms > 0.25 * np.sqrt(y[keep].var(axis=0).mean()):
-        raise NoConsensusError(
-            f"u: no consensus, all rows look like outliers: the best affine cameras leave {rms:.3g} px RMS; check that x_mm "
-            "and u belong together."
-        )
-    return keep
+        keep = _settled(near, _distances2(H, u, M[:1])[0] < threshold_px**2, 5)
+        return _Found(keep, regress(H[keep, :3], u[keep]) if keep.sum() > 3 else np.zeros((2, 4)), 0.0, np.inf, np.inf)
+    middle2 = np.median(_distances2(H[some], u[some], M), axis=1)
+    found = _mixture(H[some], u[some], np.concatenate([M, M]), np.sqrt(np.append(near2 / 8, middle2)), area, 8)
+    few = np.unique([*np.argsort(-found.evidence)[:3], found.share[:, 0].argmax()])
+    found = _mixture(H[some], u[some], found.M[few], found.sigma[few, 0], area, 50)
+    # That fewer rows agree better must be more than chance.
+    best, most = found.evidence.argmax(), found.share[:, 0].argmax()
+    best = best if found.evidence[best] > found.evidence[most] + _MORE_THAN_CHANCE else most
+    if len(some) < n:
+        found, best = _mixture(H, u, found.M[best : best + 1], found.sigma[best : best + 1, 0], area, 30), 0
+    sigma, wider, share = *(float(value) for value in found.sigma[best]), found.share[best]
+    gate2 = gate(n, 2)
+    if wider > _CONTRAST * sigma:  # contamination: a row is kept where it is more probably right than wrong
+        wrong = share[1] / wider**2 + 2.0 * np.pi * share[2] / area
+        gate2 = float(np.clip(2.0 * np.log(share[0] / sigma**2 / wrong), 4.0, gate2))
+    keep = _distances2(H, u, found.M[best : best + 1])[0] < gate2 * sigma**2
+    matrix = found.M[best].T.copy()
+    matrix[:, 3] += middle - matrix[:, :3] @ x.mean(axis=0)
+    return _Found(keep, matrix, sigma, wider, gate2)
 
 
-def _samples(x: np.ndarray, count: int, rng: np.random.Generator, least: float) -> np.ndarray:
-    """Sets (count, 4) of rows whose four points span a volume."""
-    n = len(x)
-    thickness = np.sqrt(np.linalg.eigvalsh(x.T @ x / n)[0])
-    sets = np.argpartition(rng.random((3 * count, n)), 4, axis=1)[:, :4] if n < 40 else rng.integers(0, n, (3 * count, 4))
-    corners = x[sets] - x[sets].mean(axis=1, keepdims=True)
-    smallest = np.sqrt(np.maximum(np.linalg.eigvalsh(np.swapaxes(corners, 1, 2) @ corners)[:, 0], 0.0))
-    good = sets[smallest > max(least, 0.3 * thickness)]
-    if len(good) < 20:  # thin data: take the best there are
-        best = np.argsort(-smallest)[:count]
-        good = sets[best[smallest[best] > 1e-9 * thickness]]
-    return good[:count]
+class _Mixtures(NamedTuple):
+    """k fits: cameras M (k, 4, 2), scales `sigma` (k, 2), shares (k, 3) of the populations, log `evidence` (k,).
+
+    The evidence is the likelihood with the cameras integrated out: a camera that a few rows fix to a hair by chance has
+    little of it.
+    """
+
+    M: np.ndarray
+    sigma: np.ndarray
+    share: np.ndarray
+    evidence: np.ndarray
+
+
+def _mixture(H: np.ndarray, u: np.ndarray, M: np.ndarray, sigma: np.ndarray, area: float, rounds: int) -> _Mixtures:
+    """Expectation maximisation of the three populations from k cameras M (k, 4, 2) and noise levels `sigma` (k,)."""
+    n, k, side = len(u), len(M), np.sqrt(area)
+    products = np.concatenate([(H[:, :, None] * H[:, None]).reshape(n, 16), (H[:, :, None] * u[:, None]).reshape(n, 8)], axis=1)
+    floor = 1e-7 * side
+    variance = np.stack([np.maximum(sigma, floor), np.maximum(6.0 * sigma, 0.017 * side)], axis=1) ** 2
+    share, before = np.tile([0.4, 0.3, 0.3], (k, 1)), -np.inf
+    distance2 = _distances2(H, u, M)
+    for i in range(rounds):
+        log = np.empty((3, k, n))
+        for j in (0, 1):
+            log[j] = np.log(share[:, j] / (2.0 * np.pi * variance[:, j]))[:, None] - distance2 / (2.0 * variance[:, j, None])
+        log[2] = np.log(share[:, 2] / area)[:, None]
+        top = log.max(axis=0)
+        p = np.exp(log - top)
+        total = p.sum(axis=0)
+        p /= total
+        likelihood = (top + np.log(total)).sum(axis=1)
+        if i > 5 and (likelihood - before < 1e-4).all():
+            break
+        before = likelihood
+        moments = (p[0] / variance[:, :1] + p[1] / variance[:, 1:]) @ products
+        G = moments[:, :16].reshape(k, 4, 4)
+        G = G + 1e-12 * np.trace(G, axis1=1, axis2=2)[:, None, None] * np.eye(4)
+        M = np.linalg.solve(G, moments[:, 16:].reshape(k, 4, 2))
+        distance2 = _distances2(H, u, M)
+        mass = p.sum(axis=2)
+        squares = np.einsum("jkn,kn->jk", p[:2], distance2)
+        # The camera's eight numbers are paid for by the pixels that weigh in it.
+        paid = 8.0 * mass[0] / (mass[0] + mass[1] * variance[:, 0] / variance[:, 1])
+        first = np.maximum(squares[0] / np.maximum(2.0 * mass[0] - paid, 1.0), floor**2)
+        second = np.clip(squares[1] / np.maximum(2.0 * mass[1], 1e-9), 16.0 * first, (0.1 * side + 4.0 * np.sqrt(first)) ** 2)
+        variance = np.stack([first, second], axis=1)
+        share = (mass.T + 1.0) / (n + 3)
+    return _Mixtures(M, np.sqrt(variance), share, likelihood - np.linalg.slogdet(G)[1])
 
 
 def _settled(judge: Callable[[np.ndarray], np.ndarray], keep: np.ndarray, fewest: int, rounds: int = 10) -> np.ndarray:
@@ -118,48 +302,3 @@ def _settled(judge: Callable[[np.ndarray], np.ndarray], keep: np.ndarray, fewest
         if (keep == before).all():
             break
     return keep
-
-
-def _by_growth(x: np.ndarray, y: np.ndarray, distance2: np.ndarray) -> np.ndarray:
-    """Few rows: from the half that agrees best, taking in the next best row as long as an F test lets it.
-
-    Of few rows some minimal sample always fits a few others by chance, so its residuals say too little about the noise
-    (Atkinson and Riani, "Robust diagnostic regression analysis", 2000: the forward search).
-    """
-    n, m = y.shape
-    H, size = np.column_stack([x, np.ones(n)]), (n + 5) // 2
-    keep = np.argsort(distance2)[:size]
-    for _ in range(10):  # concentrate: the rows nearest to their own fit
-        keep, before = np.argsort(((y - H @ regress(x[keep], y[keep]).T) ** 2).sum(axis=1))[:size], keep
-        if set(keep) == set(before):
-            break
-    while len(keep) < n:
-        M = regress(x[keep], y[keep])
-        r = y - H @ M.T
-        sigmas = estimate_noise(r[keep], M[:, :3], 4 * m)
-        # A row outside the fit is predicted with the fit's own uncertainty.
-        leverage = np.einsum("ni,ij,nj->n", H, np.linalg.inv(H[keep].T @ H[keep]), H)
-        distance2 = distances2(r, M[:, :3], *sigmas, 1e-11 * np.abs(y).max()) / (1.0 + leverage)
-        distance2[keep] = -1.0
-        order, freedom = np.argsort(distance2), m * (len(keep) - 4) // 2
-        if distance2[order[len(keep)]] > m * f_distribution.isf(FALSE_ALARM / n, m, max(freedom, 1)):
-            break
-        keep = order[: len(keep) + 1]
-    return np.isin(np.arange(n), keep)
-
-
-def _by_noise(x: np.ndarray, y: np.ndarray, keep: np.ndarray) -> np.ndarray:
-    n, m = y.shape
-
-    def distance2(keep: np.ndarray) -> np.ndarray:
-        fitted = affine_minimum(Moments.of(x[keep], y[keep]), 1.0, 0.0).matrix
-        r = y - x @ fitted[:, :3].T - fitted[:, 3]
-        sigmas = estimate_noise(r[keep], fitted[:, :3], 4 * m)
-        # Rounding sets the floor for data without noise.
-        found = distances2(r, fitted[:, :3], *sigmas, 1e-11 * np.abs(y).max())
-        # Heavy tails or a model error widen the bound: the median of the distance is known.
-        return found / max(1.0, np.median(found[keep]) / _chi2_quantile(0.5, m))
-
-    # A first cut at 99 % and a last at the gate: the noise is measured on a set that is not yet contaminated.
-    keep = _settled(lambda keep: distance2(keep) < _chi2_quantile(0.99, m), keep, 6, rounds=3)
-    return _settled(lambda keep: distance2(keep) < gate(n, m), keep, 6)

@@ -269,7 +269,9 @@ class OnlinePipeline:
         self._monitor = DriftMonitor(rig, covariance_px2=self._noise_px**2, sigma_x_mm=0.0)
         self._scale2 = 1.0
         if calibration is not None:
+            both = calibration.view_inliers[calibration.inliers].all(axis=1)
             _, _, weight, r = calibration.system
+            weight, r = weight if len(weight) == 1 else weight[both], r[both]
             scatter = (
                 np.median(np.einsum("ni,nij,nj->n", r, np.broadcast_to(weight, (len(r), 4, 4)), r)) / _CHI2_4_MEDIAN
             )
@@ -289,7 +291,7 @@ class OnlinePipeline:
         """Calibrate with all frames so far; after the last calibration let each frame update its moments."""
         if self.rig is not None and len(self._frames) > self.settings.calibration_frames[1]:
             if self._moments is None:
-                known, rows = self.calibration, self.calibration.inliers
+                known, rows = self.calibration, self.calibration.view_inliers.all(axis=1)
                 self._moments = OnlineCalibration(sigma_u_px=known.sigma_u_px, sigma_x_mm=known.sigma_x_mm)
                 self._moments.add(known.x_mm[rows], known.y_px[rows, :2], known.y_px[rows, 2:])
                 accepted = self._frames[self._calibrated :]

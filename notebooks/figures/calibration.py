@@ -245,18 +245,19 @@ def residuals(calibration: Calibration) -> Figure:
     """Residual arrows over each image, and their distribution beside the Gaussian of the same width."""
     c = len(calibration.cameras)
     page, axes = figure(1, c + 1, width_in=13, height_in=3.6)
-    good = calibration.inliers
-    outlier = calibration.usable & ~good
+    kept = []
     for i, side in enumerate(["Left", "Right"] if c == 2 else ["Camera"]):
         u, r = calibration.y_px[:, 2 * i : 2 * i + 2], calibration.residuals_px[:, 2 * i : 2 * i + 2]
-        ax = axes[i]
+        ax, good = axes[i], calibration.view_inliers[:, i]
+        outlier = np.isfinite(r).all(axis=1) & ~good
+        kept.append(r[good].ravel())
         ax.quiver(*u[good].T, *r[good].T, angles="xy", scale_units="xy", scale=0.04, color=COLOURS["ours"], width=0.003)
         ax.plot(*u[outlier].T, "x", color=COLOURS["paper"], label="outlier")
         ax.invert_yaxis()
         ax.set(aspect="equal", title=f"{side}: residuals, 25 times", xlabel="px")
         if outlier.any():
             ax.legend()
-    r = calibration.residuals_px[good].ravel()
+    r = np.concatenate(kept)
     span = np.linspace(-4 * r.std(), 4 * r.std(), 200)
     axes[-1].hist(r, bins=30, density=True, color=COLOURS["baseline"], label="residuals")
     axes[-1].plot(

@@ -139,7 +139,7 @@ def judge(calibration: Calibration, recording: Recording, rows: Correspondences)
     """
     exact = exact_pixels(recording, rows)
     known = rows.is_complete & np.isfinite(exact).all(axis=1)
-    rows, exact, good = rows.subset(known), exact[known], calibration.inliers[known]
+    rows, exact, good = rows.subset(known), exact[known], calibration.view_inliers[known].all(axis=1)
     rig = recording.truth.rig
     x = rig.triangulate(exact[:, :2], exact[:, 2:]).x_mm
     exact = np.hstack(rig.project(x))

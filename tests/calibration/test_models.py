@@ -96,7 +96,7 @@ def test_minimum_is_stationary(name):
     matrix = np.vstack([c.true_rig.left.matrix, c.true_rig.right.matrix])
     start = State.start(model, matrix, c.x_mm.mean(axis=0), np.tile([959.5, 539.5], (2, 1)))
     y = np.hstack([c.u_left, c.u_right])
-    data = (c.x_mm - c.x_mm.mean(axis=0), y, 2.25 * np.eye(4)[None], 1e-4)
+    data = (c.x_mm - c.x_mm.mean(axis=0), y, 2.25 * np.eye(4)[None], 1e-4, np.ones((60, 2), dtype=bool))
     found = fit(model, start, *data)
     assert found.converged
     sd = np.sqrt(np.diag(np.linalg.inv(found.information)))
