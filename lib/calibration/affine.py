@@ -124,7 +124,7 @@ def estimate_noise(
     views have no epipolar direction: unless one level is given, all is put down to the pixels.  `parameters` is the
     number of fitted ones; a level that is given is kept.
     """
-    n, m = residuals.shape
+    m = residuals.shape[1]
     kinds = [(np.ones(m, dtype=bool), residuals)]
     if views is not None and not views.all():
         code = views @ [1, 2][: m // 2]

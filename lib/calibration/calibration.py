@@ -44,12 +44,15 @@ class Calibration:
         cost: The energy over the inliers (Eq. 3 as printed for ``paper``, else half the chi-square).
         covariance, parameter_covariance: (8 cameras, 8 cameras) of the entries of the matrices M, row by row, left
             first, in px^2, px^2/mm, px^2/mm^2; and (p, p) of the model's own parameters.
-        sigma_u_px, sigma_x_mm: Noise levels, given or estimated; the RMS of the detector's covariances where given.
+        sigma_u_px, sigma_x_mm: Noise levels, given or estimated; the RMS of the detector's scaled covariances where given.
         model, weighting, image_size_px: As asked for.
         x_mm, y_px, residuals_px: (n, 3), (n, m) and u - project(x), m = 2 cameras, robot error included; moved by the
             offsets.  NaN in rows that are not usable: a landmark is missing, or a tool with shut jaws has no axes.
         covariance_px2: Of the pixels: None, (1, m, m), or (n, m, m).
         plan, minimum: The parsed model and its fit to the inliers.
+        effective_rows: As how many rows of independent errors the inliers count: fewer where a landmark's errors are alike
+            from frame to frame.  The covariances allow for that, and for a noise level that is estimated.
+        detector_scale: By how much more than it claims the detector errs, 1 or more; `covariance_px2` allows for that.
         offsets: Constant offsets of the landmarks, None where they were not estimated.
     """
 
@@ -70,6 +73,8 @@ class Calibration:
     image_size_px: tuple[int, int] | None
     plan: Model
     minimum: Fit
+    effective_rows: float
+    detector_scale: float
     offsets: LandmarkOffsets | None = None
 
     @property
@@ -182,7 +187,7 @@ class Calibration:
         NaN in views that are not used.
         """
         _, J, weight, r = self.system
-        own = J @ self.parameter_covariance @ np.swapaxes(J, 1, 2) @ weight
+        own = J @ np.linalg.inv(self.minimum.information) @ np.swapaxes(J, 1, 2) @ weight
         r = np.linalg.solve(np.eye(own.shape[1]) - own, r[:, :, None])[:, :, 0]
         return np.where(np.repeat(self.view_inliers[self.inliers], 2, axis=1), r, np.nan)
 

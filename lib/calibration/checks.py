@@ -34,7 +34,8 @@ def stacked_rows(x_mm: ArrayLike, u: Sequence[ArrayLike]) -> tuple[np.ndarray, n
 
 def seen_rows(rows: Correspondences) -> tuple[np.ndarray, np.ndarray]:
     """x (n, 3) and stacked pixels y (n, 4) of rows with a position, NaN in the view that does not show the landmark."""
-    y = np.hstack([np.where(seen[:, None], u, np.nan) for seen, u in zip(rows.seen.T, (rows.u_left, rows.u_right), strict=True)])
+    pixels = zip(rows.seen.T, (rows.u_left, rows.u_right), strict=True)
+    y = np.hstack([np.where(seen[:, None], u, np.nan) for seen, u in pixels])
     if len(rows) < 4:
         raise ValueError(f"data: {len(rows)} rows are seen; an affine camera needs at least 4, better 50, not in one plane.")
     return rows.x_mm, y

@@ -13,7 +13,8 @@ from lib.calibration.affine import Moments, affine_minimum, estimate_noise, pape
 from lib.calibration.calibration import Calibration
 from lib.calibration.models import Fit, Model, State, fit, precision
 from lib.calibration.offsets import estimate_offsets, rows_axes
-from lib.calibration.robust import consensus, gate
+from lib.calibration.robust import consensus
+from lib.calibration.scatter import sandwich
 from lib.cameras import StereoRig
 from lib.correspondences import Correspondences
 from lib.geometry import pair_covariance
@@ -46,7 +47,8 @@ def calibrate(
         weighting: "likelihood": Gaussian noise, inverse variances, exact projection.  "paper": Eq. (3) as printed, with
             weights 1/sigma and a reprojection term of unit weight (its result depends on the unit of length).
         sigma_u_px, sigma_x_mm: Noise of a pixel coordinate and of a robot coordinate; None = estimated from the data.
-        covariance_px2: The detector's covariance in place of sigma_u, in any form of `lib.geometry.pair_covariance`.
+        covariance_px2: The detector's covariance in place of sigma_u, in any form of `lib.geometry.pair_covariance`.  Where
+            the residuals are larger than it says it is scaled up (unless sigma_u_px is given, too).
         ransac_px: Largest reprojection distance of an inlier in any image; None measures the noise and drops rows that
             Gaussian noise would not produce once in 10 000 data sets; infinity keeps all rows.
         seed: Of the random samples.
@@ -95,8 +97,10 @@ def calibrate(
     )  # fmt: skip
     if axes is None and offsets != "image":
         found = fitted(x, y)
+        if weighting == "likelihood" and sigma_x_mm is None:
+            found = _scattered(found, None if usable is None else rows)
     else:
-        found = estimate_offsets(fitted, x, y, rows.landmark, axes, offset_prior_sd)
+        found = estimate_offsets(fitted, x, y, rows.landmark, axes, rows.frame, offset_prior_sd)
     return found if usable is None else _spread_out(found, usable)
 
 
@@ -119,6 +123,15 @@ def _usable_rows(
     if count < 4:
         raise ValueError(f"offsets: {count} rows have the tool's axes; the robot must report landmarks with open jaws.")
     return open_jaws, axes[open_jaws]
+
+
+def _scattered(found: Calibration, rows: Correspondences | None) -> Calibration:
+    """The calibration with the covariance that an estimated noise level and errors correlated in time ask for."""
+    _, J, weight, r = found.system
+    time = (None, None) if rows is None else (rows.frame[found.inliers], rows.landmark[found.inliers])
+    known, effective = sandwich(J, weight, r, *time, np.zeros((J.shape[2], J.shape[2])))
+    G = found.minimum.state.matrix_jacobian() @ found.plan.selection
+    return replace(found, parameter_covariance=known, covariance=G @ known @ G.T, effective_rows=effective)
 
 
 def _spread_out(found: Calibration, usable: np.ndarray) -> Calibration:
@@ -173,13 +186,14 @@ def _calibrate(
         minimum, (sigma_u, sigma_x), variances = _minimise(
             plan, x[inliers], y[inliers], views[inliers], rows_noise, weighting, known, centre
         )
+        scale = 1.0 if noise is None else sigma_u / _rms(rows_noise)
         state = minimum.state
         f, J, _ = state.evaluate(x - state.reference, derivatives=False)
         residuals = y - f
         if ransac_px is not None or (plan.is_affine and (noise is None or len(noise) == 1)):
             break
         # What looks like an outlier to an affine camera and equal noise may be neither: judge again by the model itself.
-        S = (sigma_u**2 * np.eye(m)[None] if noise is None else noise) + sigma_x**2 * J @ np.swapaxes(J, 1, 2)
+        S = (sigma_u**2 * np.eye(m)[None] if noise is None else scale**2 * noise) + sigma_x**2 * J @ np.swapaxes(J, 1, 2)
         S = np.stack([S[:, i : i + 2, i : i + 2] for i in range(0, m, 2)], axis=1)
         r = residuals.reshape(n, -1, 2, 1)
         new = (np.swapaxes(r, 2, 3) @ np.linalg.inv(S) @ r)[..., 0, 0] < gates  # NaN, not seen, is not below
@@ -187,7 +201,7 @@ def _calibrate(
             break
         views = new
 
-    true = sigma_u**2 * np.eye(m)[None] if rows_noise is None else rows_noise
+    true = sigma_u**2 * np.eye(m)[None] if rows_noise is None else scale**2 * rows_noise
     parameter_covariance = _parameter_covariance(plan, minimum, true, sigma_x, *variances, views[inliers])
     G = state.matrix_jacobian() @ plan.selection
     cameras = state.cameras(plan)
@@ -199,8 +213,10 @@ def _calibrate(
     return Calibration(
         cameras=cameras, rig=rig, view_inliers=views, cost=minimum.cost, covariance=G @ parameter_covariance @ G.T,
         parameter_covariance=parameter_covariance, sigma_u_px=sigma_u, sigma_x_mm=sigma_x, residuals_px=residuals,
-        model=model, weighting=weighting, x_mm=x, y_px=y, covariance_px2=noise,
+        model=model, weighting=weighting, x_mm=x, y_px=y,
+        covariance_px2=None if noise is None else scale**2 * noise, detector_scale=scale,
         image_size_px=None if image_size_px is None else tuple(image_size_px), plan=plan, minimum=minimum,
+        effective_rows=float(inliers.sum()),
     )  # fmt: skip
 
 
@@ -208,7 +224,7 @@ def _minimise(
     plan: Model, x: np.ndarray, y: np.ndarray, views: np.ndarray, noise: np.ndarray | None, weighting: str,
     known: dict[str, float | None], centre: np.ndarray | None,
 ) -> tuple[Fit, tuple[float, float], tuple[np.ndarray, float]]:  # fmt: skip
-    """The minimum over the views (n, cameras) bool, the noise levels (sigma_u, sigma_x), and the variances that weighed it."""
+    """The minimum over the views (n, cameras) bool, the noise levels (sigma_u, sigma_x), and the variances used."""
     m, whole = y.shape[1], bool(views.all())
     reference, used = x.mean(axis=0), np.repeat(views, 2, axis=1)
     seen = np.where(used, y, np.nan)
@@ -225,7 +241,9 @@ def _minimise(
             levels = before
             break
         variance_u, variance_x = paper_variances(*levels) if weighting == "paper" else np.square(levels).tolist()
-        weigh = variance_u * np.eye(m)[None] if noise is None or weighting == "paper" else noise
+        weigh = variance_u * np.eye(m)[None]
+        if noise is not None and weighting != "paper":
+            weigh = noise * (levels[0] / _rms(noise)) ** 2
         if whole and len(weigh) == 1 and np.allclose(weigh[0], variance_u * np.eye(m), rtol=1e-12, atol=0):
             start = affine_minimum(moments, variance_u, variance_x).matrix
         if minimum is None or (plan.is_affine and whole and len(weigh) == 1):
@@ -233,7 +251,7 @@ def _minimise(
         else:
             state = minimum.state
         minimum = fit(plan, state, x - reference, y, weigh, variance_x, views)
-        if known["sigma_x_mm"] is not None and (noise is not None or known["sigma_u_px"] is not None):
+        if known["sigma_x_mm"] is not None and known["sigma_u_px"] is not None:
             break
         residuals, A, parameters = minimum.residuals, minimum.state.A.reshape(m, 3), len(plan.parameter_names)
     return minimum, levels, (weigh, variance_x)
@@ -243,27 +261,45 @@ def _levels(
     residuals: np.ndarray, A: np.ndarray, parameters: int, views: np.ndarray, noise: np.ndarray | None,
     known: dict[str, float | None],
 ) -> tuple[float, float]:  # fmt: skip
-    """(sigma_u, sigma_x): given, or estimated from the residuals; the detector's covariances replace sigma_u."""
+    """(sigma_u, sigma_x): given, or estimated; with the detector's covariances sigma_u is their RMS, as scaled to fit."""
     if noise is None:
         return estimate_noise(residuals, A, parameters, views, **known)
     n, m = residuals.shape
-    sigma_u = float(np.sqrt(np.trace(noise, axis1=1, axis2=2).mean() / m))
-    if known["sigma_x_mm"] is not None:
-        return sigma_u, float(known["sigma_x_mm"])
-    # Maximum likelihood of one variance v in S_i = Sigma_i + v A A^T, by Fisher scoring.
-    B, v = A @ A.T, 0.0
+    claimed, free = _rms(noise), known["sigma_u_px"] is None
+    if known["sigma_x_mm"] is not None and not free:
+        return claimed, float(known["sigma_x_mm"])
+    # Maximum likelihood of k and v in S_i = k Sigma_i + v A A^T, by Fisher scoring.  A detector may err more than it claims.
+    parts = (np.broadcast_to(noise, (n, m, m)), np.broadcast_to(A @ A.T, (n, m, m)))
+    least = np.array([1.0, 0.0])
+    v = np.array([1.0, (known["sigma_x_mm"] or 0.0) ** 2])
+    open_ = np.array([free, known["sigma_x_mm"] is None])
     inflate = 1.0 / max(1.0 - 0.5 * parameters / views.sum(), 1.0 / n)
     for _ in range(50):
-        W = precision(np.broadcast_to(noise + v * B, (n, m, m)), views)
-        WB = W @ B
+        W = precision(v[0] * parts[0] + v[1] * parts[1], views)
+        WD = [W @ D for D in parts]
         white = np.einsum("nij,nj->ni", W, residuals)
-        score = inflate * np.einsum("ni,ij,nj->", white, B, white) - np.trace(WB, axis1=1, axis2=2).sum()
-        information = np.einsum("nij,nji->", WB, WB)
-        new = max(v + score / information, 0.0)
-        if abs(new - v) <= 1e-9 * max(v, 1e-12):
-            break
+        score = np.array([
+            inflate * np.einsum("ni,nij,nj->", white, D, white) - np.trace(own, axis1=1, axis2=2).sum()
+            for D, own in zip(parts, WD, strict=True)
+        ])  # fmt: skip
+        information = np.array([[np.einsum("nij,nji->", a, b) for b in WD] for a in WD])
+        new, moving = v.copy(), open_.copy()
+        while moving.any():
+            new[moving] = v[moving] + np.linalg.solve(information[np.ix_(moving, moving)], score[moving])
+            below = moving & (new < least)
+            if not below.any():
+                break
+            new[below], moving = least[below], moving & ~below
+        done = np.abs(new - v).max() <= 1e-9 * max(np.abs(v).max(), 1e-12) and abs(new[1] - v[1]) <= 1e-6 * max(v[1], 1e-12)
         v = new
-    return sigma_u, float(np.sqrt(new))
+        if done:
+            break
+    return float(claimed * np.sqrt(v[0])), float(np.sqrt(v[1]))
+
+
+def _rms(noise: np.ndarray) -> float:
+    """Standard deviation of a pixel coordinate that covariances (n, m, m) claim."""
+    return float(np.sqrt(np.trace(noise, axis1=1, axis2=2).mean() / noise.shape[1]))
 
 
 def _parameter_covariance(

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from scipy.stats import chi2
 
 from lib.calibration.calibration import Calibration, LandmarkOffsets
+from lib.calibration.scatter import sandwich
 from lib.correspondences import Correspondences
 
 __all__ = ["estimate_offsets", "rows_axes", "tool_axes", "with_offsets"]
@@ -67,7 +68,7 @@ def with_offsets(data: Correspondences, offsets: LandmarkOffsets | None) -> Corr
 
 def estimate_offsets(
     fit: Callable[[np.ndarray, np.ndarray], Calibration], x: np.ndarray, y: np.ndarray, landmark: np.ndarray,
-    axes: np.ndarray | None, prior_sd: float | None = None, iterations: int = 20,
+    axes: np.ndarray | None, frame: np.ndarray, prior_sd: float | None = None, iterations: int = 20,
 ) -> Calibration:  # fmt: skip
     """The calibration with one constant offset a landmark, in the tool's axes (n, 3, 3) or (axes=None) in the images.
 
@@ -104,11 +105,16 @@ def estimate_offsets(
             "steps; look at the outliers (`ransac_px`), which may differ from step to step.",
             RuntimeWarning, stacklevel=3,
         )  # fmt: skip
+    p = J_c.shape[2]
+    prior = np.diag(np.repeat([0.0, prior_sd**-2], [p, offset.size]))
+    full, effective = sandwich(np.concatenate([J_c, J], axis=2), weight, r, frame[rows], landmark[rows], prior)
+    known, covariance = full[:p, :p], full[p:, p:]
     blocks = np.stack([covariance[j : j + size, j : j + size] for j in range(0, offset.size, size)])
-    known = found.parameter_covariance + explained @ covariance @ explained.T
     G = found.minimum.state.matrix_jacobian() @ found.plan.selection
     learnt = LandmarkOffsets(offset, blocks, prior_sd, p_value)
-    return replace(found, parameter_covariance=known, covariance=G @ known @ G.T, offsets=learnt)
+    return replace(
+        found, parameter_covariance=known, covariance=G @ known @ G.T, effective_rows=effective, offsets=learnt
+    )
 
 
 def _evidence(information: np.ndarray, gradient: np.ndarray, least: float) -> tuple[float, float]:

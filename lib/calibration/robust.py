@@ -259,7 +259,8 @@ class _Mixtures(NamedTuple):
 def _mixture(H: np.ndarray, u: np.ndarray, M: np.ndarray, sigma: np.ndarray, area: float, rounds: int) -> _Mixtures:
     """Expectation maximisation of the three populations from k cameras M (k, 4, 2) and noise levels `sigma` (k,)."""
     n, k, side = len(u), len(M), np.sqrt(area)
-    products = np.concatenate([(H[:, :, None] * H[:, None]).reshape(n, 16), (H[:, :, None] * u[:, None]).reshape(n, 8)], axis=1)
+    products = [(H[:, :, None] * other[:, None]).reshape(n, -1) for other in (H, u)]
+    products = np.concatenate(products, axis=1)
     floor = 1e-7 * side
     variance = np.stack([np.maximum(sigma, floor), np.maximum(6.0 * sigma, 0.017 * side)], axis=1) ** 2
     share, before = np.tile([0.4, 0.3, 0.3], (k, 1)), -np.inf

@@ -19,7 +19,8 @@ def report(
         robot_accuracy_mm: As its maker states it (`Recording.robot_accuracy_mm`).
     """
     verdict = judge(None, calibration, robot_accuracy_mm=robot_accuracy_mm) if verdict is None else verdict
-    c, outliers = calibration, np.flatnonzero(calibration.usable & ~calibration.inliers)
+    c, seen = calibration, np.isfinite(calibration.residuals_px[:, ::2])
+    outliers = np.argwhere(seen & ~c.view_inliers)
     rows, used, usable = len(c.inliers), int(c.inliers.sum()), int(c.usable.sum())
     value, freedom = c.chi_square
     left_out = "" if usable == rows else f", {rows - usable} without a detection, position or axes"
@@ -27,7 +28,9 @@ def report(
     lines = [
         str(verdict),
         f"Calibration: model {c.model}, weighting {c.weighting}, {len(c.parameter_names)} parameters",
-        f"  rows          {used} of {rows} used, {len(outliers)} outliers ({100 * len(outliers) / usable:.0f} %){left_out}",
+        f"  rows          {used} of {rows} used{left_out}; they count as {c.effective_rows:.0f} independent ones",
+        f"  detections    {c.view_inliers.sum()} of {seen.sum()} used, {len(outliers)} outliers "
+        f"({100 * len(outliers) / seen.sum():.0f} %)",
         f"  noise         sigma_u {c.sigma_u_px:.2f} px, sigma_x {1e3 * c.sigma_x_mm:.1f} um",
         f"  reprojection  {c.reprojection_rms_px:.2f} px RMS, {c.press_rms_px:.2f} px cross-validated (leave one out)",
         f"  chi-square    {value:.0f} for {freedom} degrees of freedom",
@@ -58,7 +61,9 @@ def report(
             numbers = [f"{scale * v:.1f} +- {scale * s:.1f}" for v, s in zip(values, sds, strict=True)]
             lines.append(f"    {name:10s}  {', '.join(numbers)}")
     if outliers.size:
-        distance = np.linalg.norm(c.residuals_px[outliers].reshape(len(outliers), -1, 2), axis=2).max(axis=1)
-        lines.append(f"Outliers (row: largest residual of an image), {min(longest, outliers.size)} of {outliers.size}")
-        lines += [f"  {outliers[i]:6d}: {distance[i]:.1f} px" for i in np.argsort(-distance)[:longest]]
+        distance = np.linalg.norm(c.residuals_px.reshape(rows, -1, 2)[tuple(outliers.T)], axis=1)
+        lines.append(f"Outliers (row: residual), {min(longest, len(outliers))} of {len(outliers)}")
+        sides = ("left", "right") if c.rig else ("",)
+        worst = [(*outliers[i], distance[i]) for i in np.argsort(-distance)[:longest]]
+        lines += [f"  {row:6d}: {size:.1f} px {sides[side]}".rstrip() for row, side, size in worst]
     return "\n".join(lines)

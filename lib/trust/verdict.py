@@ -88,9 +88,9 @@ def judge(
     if calibration is None:
         return Verdict((Reason("refused", RED, str(error), "See the reasons of the detector and of the recording."),))
     c, found = calibration, []
-    rows, used = c.inliers.sum(), c.usable.sum()
+    rows, used = c.view_inliers.sum(), np.isfinite(c.residuals_px).sum() // 2
     if used and rows < 0.5 * used:
-        text = f"{rows} of {used} rows agree on the cameras; at least half should."
+        text = f"{rows} of {used} detections agree on the cameras; at least half should."
         found.append(Reason("minority", RED, text, "Look at the overlays: the detector may not know this tool."))
     claim = _claimed_px(c)
     if np.isfinite(claim) and c.reprojection_rms_px > 3.0 * claim:
@@ -108,4 +108,5 @@ def _claimed_px(c: Calibration) -> float:
         return np.nan
     rows = c.covariance_px2 if len(c.covariance_px2) == 1 else c.covariance_px2[c.inliers]
     variance = np.trace(rows, axis1=1, axis2=2).mean() / len(c.cameras)
-    return float(np.sqrt(variance + np.mean([(camera.linear**2).sum() for camera in c.cameras]) * 0.01**2))
+    zoom2 = np.mean([(camera.linear**2).sum() for camera in c.cameras])
+    return float(np.sqrt(variance / c.detector_scale**2 + zoom2 * 0.01**2))

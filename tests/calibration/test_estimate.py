@@ -215,7 +215,8 @@ def test_outliers_in_both_detectors_at_once():
     u_right = u_right.copy()
     u_right[bad_right] = rng.uniform(0, 1900, (bad_right.sum(), 2))
     found = calibrate(c.x_mm, [u_left, u_right])
-    for kept, wrong in zip(found.view_inliers.T, (bad, bad_right), strict=True):  # a landmark lost in one view counts in the other
+    # A landmark that is lost in one view counts in the other.
+    for kept, wrong in zip(found.view_inliers.T, (bad, bad_right), strict=True):
         assert (kept & ~wrong).sum() >= 0.97 * (~wrong).sum() and (kept & wrong).sum() <= 2
     assert found.sigma_u_px == pytest.approx(1.5, rel=0.15)
 
@@ -256,7 +257,7 @@ def test_correspondences_bring_their_covariances_and_gaps():
     u = [c.u_left, c.u_right]
     rows = Correspondences.of_points(c.x_mm, *u, covariance_px2=covariance)
     each = calibrate(c.x_mm, u, covariance_px2=[covariance[:, 0], covariance[:, 1]])
-    for name in ("cost", "sigma_x_mm", "covariance", "inliers", "residuals_px"):
+    for name in ("cost", "sigma_x_mm", "detector_scale", "view_inliers", "residuals_px"):
         np.testing.assert_array_equal(getattr(calibrate(rows), name), getattr(each, name))
     plain = calibrate(c.x_mm, u, sigma_u_px=1.5)
     assert calibrate(rows, sigma_u_px=1.5).cost == plain.cost

@@ -104,11 +104,13 @@ def test_advised_position_is_the_best_of_the_box(model):
 
 def test_predicted_gain_is_the_gain():
     c, found = made(30, half_size_mm=(2, 1, 1), sigma_x_mm=1e-9)
+    known = {"sigma_u_px": found.sigma_u_px, "sigma_x_mm": found.sigma_x_mm}
+    found = calibrate(c.x_mm, [c.u_left, c.u_right], model="affine", ransac_px=np.inf, **known)
     (x_new,), (gain,) = next_positions(found, box_grid(ROBOT_FROM_MICROSCOPE.t - 5, ROBOT_FROM_MICROSCOPE.t + 5, steps=2))
     u_new = c.true_rig.project(x_new[None])
     again = calibrate(
         np.vstack([c.x_mm, x_new]), [np.vstack(p) for p in zip((c.u_left, c.u_right), u_new, strict=True)],
-        model="affine", ransac_px=np.inf, sigma_u_px=found.sigma_u_px, sigma_x_mm=found.sigma_x_mm,
+        model="affine", ransac_px=np.inf, **known,
     )  # fmt: skip
     before, after = (np.linalg.slogdet(k.parameter_covariance)[1] for k in (found, again))
     assert before - after == pytest.approx(gain, rel=0.02)

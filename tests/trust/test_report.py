@@ -19,4 +19,4 @@ def test_outliers_are_listed():
     u_left = c.u_left.copy()
     u_left[[3, 50]] += 400
     text = report(calibrate(c.x_mm, [u_left, c.u_right]))
-    assert "2 outliers" in text and "    50:" in text
+    assert "2 outliers (1 %)" in text and "    50:" in text and "left" in text

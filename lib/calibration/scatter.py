@@ -1,0 +1,100 @@
+"""How far estimates scatter where the noise is estimated and neighbouring frames err alike.
+
+A detector that looks at the same tool in the same light repeats its errors, and so does a robot.  The errors of a landmark
+are taken for a first-order autoregression over the frames, whose correlation the residuals tell (restricted maximum
+likelihood, averaged over its posterior); the estimates stay as they are, their covariance becomes the sandwich
+H^-1 (J^T W R W J) H^-1 (Liang and Zeger, "Longitudinal data analysis using generalized linear models", 1986).
+"""
+
+import numpy as np
+from scipy.linalg import solve_triangular
+from scipy.special import chdtri, fdtri
+
+__all__ = ["sandwich"]
+
+_CORRELATIONS = np.array([0.0, 0.2, 0.4, 0.55, 0.7, 0.8, 0.88, 0.94, 0.97])
+_NONE = 0.5  # prior probability that the errors are independent
+_BLOCK = 48  # frames that are looked at together
+_MOST_BLOCKS = 4
+
+
+def sandwich(
+    J: np.ndarray, weight: np.ndarray, r: np.ndarray, frame: np.ndarray | None, landmark: np.ndarray | None,
+    prior: np.ndarray,
+) -> tuple[np.ndarray, float]:  # fmt: skip
+    """Covariance (p, p) of estimates from rows whose noise level is estimated, and as how many independent rows they count.
+
+    Args:
+        J, weight, r: (n, m, p) derivatives, (1 or n, m, m) inverse covariances, (n, m) residuals; zero where not seen.
+        frame, landmark: (n,) of the rows, whose errors may be correlated from frame to frame; None: they are independent.
+        prior: (p, p) information that does not come from the rows.
+    """
+    n, m, p = J.shape
+    seen = np.broadcast_to(np.diagonal(weight, axis1=1, axis2=2) > 0, (n, m))
+    # Half of the coordinates tell the noise along an axis: regions of a pair's pixels by F in place of chi-square.
+    freedom = max(0.5 * (seen.sum() - p), 3.0)
+    wider = 4.0 * fdtri(4, freedom, 0.95) / chdtri(4, 0.05)
+    values, vectors = np.linalg.eigh(weight)
+    root = (vectors * np.sqrt(np.maximum(values, 0.0))[:, None]) @ np.swapaxes(vectors, 1, 2)
+    K, e = root @ J, (root @ r[:, :, None])[:, :, 0]
+    information = np.einsum("nip,niq->pq", K, K)
+    scale = 1.0 / np.sqrt(np.diag(information + prior))
+    inverse = np.linalg.inv((information + prior) * np.outer(scale, scale)) * np.outer(scale, scale)
+    if frame is None:
+        return wider * inverse, float(n)
+    frames = np.unique(frame)
+    step = np.median(np.diff(frames)) if len(frames) > 1 else 1.0
+    groups = []  # rows of one landmark in one view, in the order of their frames
+    for k in np.unique(landmark):
+        for c in range(m // 2):
+            rows = np.flatnonzero((landmark == k) & seen[:, 2 * c])
+            rows = rows[np.argsort(frame[rows], kind="stable")]
+            groups.append((rows, slice(2 * c, 2 * c + 2), np.abs(np.subtract.outer(frame[rows], frame[rows])) / step))
+    chance, variance = _posterior(K, e, groups, inverse)
+    meat = np.zeros((p, p))
+    for rows, view, lag in groups:
+        R = np.einsum("t,tij->ij", chance * variance, _CORRELATIONS[:, None, None] ** lag) if len(rows) <= 600 else None
+        for i in (view.start, view.start + 1):
+            k = K[rows, i]
+            if R is not None:
+                meat += k.T @ (R @ k)
+            else:  # long recordings: what lies beyond a block is independent
+                for j in range(0, len(rows), 300):
+                    part = slice(j, j + 300)
+                    near = np.einsum("t,tij->ij", chance * variance, _CORRELATIONS[:, None, None] ** lag[part, part])
+                    meat += k[part].T @ near @ k[part]
+    covariance = inverse @ (meat + prior) @ inverse
+    ratio = np.linalg.slogdet(inverse * np.outer(1 / scale, 1 / scale))[1]
+    ratio -= np.linalg.slogdet(covariance * np.outer(1 / scale, 1 / scale))[1]
+    return wider * covariance, float(n * np.exp(min(ratio / p, 0.0)))
+
+
+def _posterior(K: np.ndarray, e: np.ndarray, groups: list[tuple], inverse: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Probability of each correlation, and the variance of the whitened residuals under it, 1 where they are independent."""
+    p, count, likelihood, variance = K.shape[2], 0, [], []
+    unit = np.linalg.cholesky(inverse)  # parameters in their own deviations
+    for correlation in _CORRELATIONS:
+        information, projected, square, log, count = np.zeros((p, p)), np.zeros(p), 0.0, 0.0, 0
+        for rows, view, lag in groups:
+            starts = np.arange(0, len(rows), _BLOCK)
+            for start in starts[:: max(1, len(starts) // _MOST_BLOCKS)]:
+                part = slice(start, start + _BLOCK)
+                L = np.linalg.cholesky(correlation ** lag[part, part] + 1e-9 * np.eye(len(rows[part])))
+                for i in (view.start, view.start + 1):
+                    white = solve_triangular(L, np.column_stack([K[rows[part], i], e[rows[part], i]]), lower=True)
+                    information += white[:, :p].T @ white[:, :p]
+                    projected += white[:, :p].T @ white[:, p]
+                    square += white[:, p] @ white[:, p]
+                    log += 2.0 * np.log(np.diag(L)).sum()
+                    count += len(L)
+        values, vectors = np.linalg.eigh(unit.T @ information @ unit)
+        values = np.maximum(values, 1e-12)
+        along = vectors.T @ (unit.T @ projected)
+        freedom = max(count - p, 1)
+        variance.append((square - (along**2 / values).sum()) / freedom)
+        likelihood.append(-0.5 * (log + np.log(values).sum() + freedom * np.log(max(variance[-1], 1e-300))))
+    chance = np.full(len(_CORRELATIONS), (1.0 - _NONE) / (len(_CORRELATIONS) - 1))
+    chance[0] = _NONE
+    chance = chance * np.exp(np.array(likelihood) - max(likelihood))
+    return chance / chance.sum(), np.array(variance) / max(variance[0], 1e-300)
+
