@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import ast
+import dataclasses
 import re
 from functools import cache
+from pathlib import Path
 
+import cv2
+import matplotlib.pyplot as plt
 import nbformat
+import numpy as np
 import pytest
 
-from lib import paths
-from lib.workbench import pages, results
+from lib import paths, trust
+from lib.landmarks import Detector, Landmarks
+from lib.recordings import Recording, RecordingWriter
+from lib.workbench import pages, report, results
 from lib.workbench.parameters import declared_grid, declared_parameters, parse_parameters
 
 WALK = sorted(paths.NOTEBOOKS.glob("*.ipynb"))
@@ -119,3 +126,131 @@ def test_equations_can_be_drawn(path):
 @each(WALK + STUDIES)
 def test_parameters_can_be_read_by_papermill(path):
     assert all(declared_parameters(path).values())
+
+
+# --- a recording that is not ours: six small frames, no truth, no labels, no position of the robot at one frame
+
+#: Cells that do not look at the recording, or look at the real detector's inside: left out here, `lib run` executes them.
+ELSEWHERE = {
+    "00": "",
+    "01": "01-(rig|effects|slider|pair|check|motion|format|scenes|training|realism|dataset).*",
+    "02": "02-(04|06|08|10|12|13|37|39|21|31|40|23|33|34)",
+    "03": "03-(data|persp|claim|energy|weights|fit|ladder|dist|uncert|elli|advice|clock|record|resol|board|factor|robot).*",
+    "04": "04-(desc|pyramid|top|match|fields|l1|smooth|cvxpy|surface-view|export|errors|gallery|recorded|scalar|real).*",
+    "05": "05-(one|ellipses|experiment|robust|icp|alone|drift).*",
+    "06": "06-slider",
+}
+#: Numbers that only a calibration that is believed may give.
+FOLLOWS = re.compile(
+    "overview_(height|triang|surf|regis)|surface_|tool_|reconstruction_(sigma|depth)|registration_error|pipeline_"
+)
+N_FRAMES, SHRINK, BLANK_FRAME = 6, 4, 2
+
+
+class Seer:
+    """Finds the landmarks where they are in the frame whose number stands in the image's corner."""
+
+    metadata, networks = {}, {}
+
+    def __init__(self, sighted: bool):
+        truth, rng = Recording.open(paths.SHIPPED_RECORDING).truth, np.random.default_rng(0)
+        exact = np.stack([truth.u_left, truth.u_right], axis=1)[:N_FRAMES]
+        self.u = (exact + 0.5) / SHRINK - 0.5 + rng.normal(0, 0.1, exact.shape)
+        self.sighted = sighted
+
+    def __call__(self, images: np.ndarray) -> Landmarks:
+        if not self.sighted:
+            return Landmarks.none(len(images))
+        frame = round(images[0, :8, :8].mean() / 20)
+        return Landmarks(self.u[frame], np.tile(0.01 * np.eye(2), (2, 3, 1, 1)), np.full((2, 3), 0.9))
+
+    def track(self, images: np.ndarray, previous: Landmarks) -> Landmarks:
+        return self(images)
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory) -> Path:
+    """The recording, from a sixteenth of the pixels of the one that ships."""
+    source = Recording.open(paths.SHIPPED_RECORDING)
+    size = tuple(side // SHRINK for side in source.image_size_px)
+    folder = tmp_path_factory.mktemp("recording") / "mine"
+    x, time_s = source.kinematics.x_mm.copy(), source.kinematics.time_s
+    x[np.abs(time_s - source.frames.time_s[BLANK_FRAME] - source.offset_s) < 0.05] = np.nan
+    header = {"name": "mine", "fps": source.fps, "image_size_px": size, "readout_s": source.readout_s}
+    with RecordingWriter(folder, **header, suffix=".png") as writer:
+        for number in range(N_FRAMES):
+            frame = source.frames[number]
+            pair = [cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (frame.left, frame.right)]
+            for image in pair:
+                image[:8, :8] = 20 * number
+            writer.add(*pair, time_s=frame.time_s)
+        writer.kinematics(time_s, x)
+    return folder
+
+
+class Stopped(Exception):
+    """In place of the end that `report.stop` makes."""
+
+
+class Run:
+    """A notebook's code run in this process: what it records and shows, and why it stopped."""
+
+    def __init__(self, number: str, recording: Path, monkeypatch, *, sighted: bool = True, **parameters):
+        self.metrics, self.captions, self.verdicts, self.left_out = {}, [], [], None
+        monkeypatch.setattr(Detector, "load", lambda *_, **__: Seer(sighted))
+        monkeypatch.setattr(report, "record", lambda name, value, unit, **_: self.metrics.update({name: value}))
+        for name, replacement in {"show": self.show, "verdict": self.verdicts.append, "stop": self.stop}.items():
+            monkeypatch.setattr(report, name, replacement)
+        names: dict = {"__name__": "notebook"}
+        (path,) = (path for path in WALK if path.stem.startswith(number))
+        for cell in code_cells(path):
+            if re.fullmatch(ELSEWHERE[number], cell.id):
+                continue
+            code = "\n".join(line for line in cell.source.splitlines() if not line.startswith("%"))
+            try:
+                exec(compile(code, cell.id, "exec"), names)
+            except Stopped as reason:
+                self.left_out = str(reason)
+                return
+            if cell.metadata.get("tags") == ["parameters"]:
+                names |= {"recording": str(recording)} | parameters
+
+    def show(self, page, name, caption):
+        page.canvas.draw()
+        plt.close(page)
+        self.captions.append(caption)
+
+    def stop(self, reason):
+        raise Stopped(reason)
+
+
+@pytest.mark.parametrize("number", ["00", "01", "03", "05", "06", pytest.param("04", marks=pytest.mark.slow)])
+def test_a_short_recording_without_truth_runs_and_no_caption_speaks_of_a_truth(number, small, monkeypatch):
+    run = Run(number, small, monkeypatch)
+    assert run.left_out is None and (run.captions or number == "05")
+    assert not [caption for caption in run.captions if re.search(r"\btru(e|th)\b", caption)]
+    assert len(run.verdicts) == (number != "01")
+    if number == "00":
+        assert np.isfinite(run.metrics["overview_height_um"]) and "overview_triangulation_um" not in run.metrics
+    if number == "01":
+        assert run.metrics["data_frames_without_kinematics"] == 1
+    if number == "06":
+        assert run.metrics["pipeline_frames_to_calibration"] <= N_FRAMES and "pipeline_push_error_um" not in run.metrics
+
+
+@pytest.mark.parametrize("number", ["00", "02", "03", "04", "05", "06"])
+def test_where_nothing_is_detected_a_notebook_says_so_and_states_no_number(number, small, monkeypatch):
+    run = Run(number, small, monkeypatch, sighted=False, force=True)
+    assert "left out" in run.left_out and run.verdicts[-1].is_red
+    assert not [name for name in run.metrics if FOLLOWS.match(name)]
+    assert number in ("03", "05", "06") or run.captions, "the frames are shown"
+
+
+@pytest.mark.parametrize("number", ["00", "05"])
+def test_a_red_calibration_gives_no_number_unless_forced(number, small, monkeypatch):
+    red = trust.Verdict((trust.Reason("residuals", trust.LEVELS[-1], "They are large.", "Look."),))
+    assess = trust.assess
+    monkeypatch.setattr(trust, "assess", lambda *a, **k: dataclasses.replace(assess(*a, **k), verdict=red))
+    run = Run(number, small, monkeypatch)
+    assert "not trustworthy" in run.left_out and not [name for name in run.metrics if FOLLOWS.match(name)]
+    assert Run(number, small, monkeypatch, force=True).left_out is None

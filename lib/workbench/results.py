@@ -8,7 +8,8 @@ import csv
 import io
 import json
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -19,7 +20,18 @@ import numpy as np
 from lib import files, paths
 from lib.provenance import plain
 
-__all__ = ["Table", "csv_text", "read", "write"]
+__all__ = ["Table", "csv_text", "read", "recorded", "write"]
+
+
+class _MissingColumn(ValueError, LookupError):
+    """A column that a table does not have."""
+
+
+class _Absent:
+    """Stands for a table that was never recorded: whatever is asked of it is missing."""
+
+    def __getattr__(self, name: str) -> object:
+        raise LookupError("all of it")
 
 
 @dataclass(frozen=True)
@@ -63,7 +75,7 @@ class Table:
         """
         for name in equal:
             if name not in self.columns:
-                raise ValueError(f"{name}: no such column; there are {', '.join(self.columns)}.")
+                raise _MissingColumn(f"{name}: no such column; there are {', '.join(self.columns)}.")
         rows = [row for row in self.rows if all(row.get(name) == value for name, value in equal.items())]
         return Table(rows, self.provenance)
 
@@ -89,6 +101,22 @@ def read(name: str, folder: Path = paths.RESULTS) -> Table | None:
             raise ValueError(f"{table}: row {number} does not have {len(reader.fieldnames or ())} entries; restore it.")
     kinds = {key: _kind([row[key] for row in rows]) for key in reader.fieldnames or ()}
     return Table([{key: kinds[key](text) for key, text in row.items()} for row in rows], provenance)
+
+
+@contextmanager
+def recorded(name: str, folder: Path = paths.RESULTS) -> Iterator[Table]:
+    """The recorded table `name` for a block of a notebook, which ends with one line where the table lacks what it needs.
+
+    >>> with recorded("never_swept") as table:
+    ...     print(table.columns["error_um"].mean())
+    Left out: the recorded table never_swept lacks all of it. `python3 -m lib sweep studies/never_swept --record` records it.
+    """
+    table = read(name, folder)
+    try:
+        yield _Absent() if table is None else table
+    except LookupError as lacking:
+        what = "a row" if isinstance(lacking, IndexError) else str(lacking)
+        print(f"Left out: the recorded table {name} lacks {what}. `python3 -m lib sweep studies/{name} --record` records it.")
 
 
 def write(name: str, rows: Iterable[Mapping], provenance: Mapping, folder: Path = paths.RESULTS) -> Path:

@@ -40,3 +40,15 @@ def test_what_is_missing_or_damaged(tmp_path):
     (tmp_path / "torn.json").write_text("{")
     with pytest.raises(ValueError, match=r"torn\.json: not JSON"):
         results.read("torn", tmp_path)
+
+
+@pytest.mark.parametrize("needs", [lambda t: t.columns["depth_um"], lambda t: t.where(depth_um=1), lambda t: t.rows[9]])
+def test_what_a_recorded_table_lacks_is_told_in_one_line(tmp_path, capsys, needs):
+    results.write("matching", ROWS, {}, tmp_path)
+    for name in ("matching", "never_swept"):
+        with results.recorded(name, tmp_path) as table:
+            needs(table)
+        out = capsys.readouterr().out
+        assert out.startswith(f"Left out: the recorded table {name} lacks ") and out.count("\n") == 1
+    with results.recorded("matching", tmp_path) as table:
+        assert len(table) == 3
