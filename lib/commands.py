@@ -64,9 +64,9 @@ def main_detect(argv: list[str]) -> int:
 def main_calibrate(argv: list[str]) -> int:
     """`python3 -m lib calibrate`: both cameras from landmarks and the robot; JSON, OpenCV YAML and ROS CameraInfo."""
     a, recording, out = _parsed("calibrate", main_calibrate, argv)
-    calibration, verdict, data = _calibrated(a, recording)
-    if calibration is None or (verdict.is_red and not a.force):
-        return _refused(out, verdict)
+    calibration, verdict, data = _calibrated(a, recording, out)
+    if calibration is None:
+        return 3
     print(report(calibration))
     _write_landmarks(out / "landmarks.csv", recording, data)
     _write_rig(out, calibration.rig, recording)
@@ -81,9 +81,9 @@ def main_calibrate(argv: list[str]) -> int:
 def main_reconstruct(argv: list[str]) -> int:
     """`python3 -m lib reconstruct`: the surface that one stereo frame shows; GLB, PLY, a depth map, the rectified pair."""
     a, recording, out = _parsed("reconstruct", main_reconstruct, argv, frame=True, rig=True)
-    rig, verdict, data = _calibrated(a, recording)
-    if rig is None or (verdict.is_red and not a.force):
-        return _refused(out, verdict)
+    rig, verdict, data = _calibrated(a, recording, out)
+    if rig is None:
+        return 3
     frame, now = recording.frames[a.frame], data.of_frames(a.frame % len(recording))
     tool = (now.u_left, now.u_right) if recording.skeleton == LANDMARKS and len(now) == len(LANDMARKS) else None
     found = reconstruct(frame.left, frame.right, rig, setting=a.setting, u_landmarks=tool)
@@ -162,22 +162,20 @@ def _data(a: argparse.Namespace, recording: Recording) -> Correspondences:
 
 
 def _calibrated(
-    a: argparse.Namespace, recording: Recording
+    a: argparse.Namespace, recording: Recording, out: Path
 ) -> tuple[Calibration | StereoRig | None, Verdict, Correspondences]:
-    """The calibration of a recording, or the rig that --rig names; the verdict; and the landmarks."""
+    """The calibration of a recording, None where it is refused, or the rig that --rig names; the verdict; the landmarks."""
     data = _data(a, recording)
     if getattr(a, "rig", None):
         text = f"{a.rig} was not calibrated from this recording, and nothing here tests it."
         cure = f"Run: python3 -m lib register {a.recording} --rig {a.rig}"
         return StereoRig.load(a.rig), Verdict((Reason("rig_given", LEVELS[1], text, cure),)), data
-    assessed = assess(recording, data)
-    return assessed.calibration, assessed.verdict, data
-
-
-def _refused(out: Path, verdict: Verdict) -> int:
-    files.write_json(out / "verdict.json", verdict.to_json())
-    print(f"{verdict}\nNothing else was written; --force writes results whatever the verdict.")
-    return 3
+    found = assess(recording, data)
+    if found.calibration is not None and (a.force or not found.verdict.is_red):
+        return found.calibration, found.verdict, data
+    files.write_json(out / "verdict.json", found.verdict.to_json())
+    print(f"{found.verdict}\nNothing else was written; --force writes the results of a calibration whatever the verdict.")
+    return None, found.verdict, data
 
 
 def _done(out: Path, name: str, numbers: dict, verdict: Verdict) -> int:

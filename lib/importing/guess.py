@@ -89,6 +89,7 @@ def _video(folder: Path, paths: dict[str, Path]) -> list[tuple]:
 def _robot(folder: Path, paths: dict[str, Path]) -> tuple[list[tuple], tuple[str, ...]]:
     tables = {name: path for name, path in paths.items() if path.suffix.lower() in (".csv", ".tsv", ".txt")}
     bags = [name for name, path in paths.items() if path.suffix in (".bag", ".db3", ".mcap")]
+    bags = [name.rpartition("/")[0] if (folder / name).with_name("metadata.yaml").exists() else name for name in bags]
     if bags or not tables:
         return _bag(folder, bags)
     name = max(tables, key=lambda name: tables[name].stat().st_size)

@@ -48,7 +48,7 @@ def import_recording(source: str | Path, mapping: str | Path | Mapping, out: str
     stereo = open_stereo(folder, told.video)
     robot = read_robot(folder, told)
     log = folder / told.robot.file
-    zeros = stereo_zero, robot_zero = _zero(stereo), increasing(robot.time, str(log), *_LOG_STEP_S)
+    zeros = stereo_zero, robot_zero = increasing(stereo.time, "", 0, np.inf), increasing(robot.time, str(log), *_LOG_STEP_S)
     given = 0.0 if told.robot.offset_s == "estimate" else told.robot.offset_s
     one_dated = told.robot.offset_s == "estimate" and bool(stereo_zero) != bool(robot_zero)
     offset_s = 0.0 if one_dated else float(stereo_zero + Decimal(str(given)) - robot_zero)
@@ -57,7 +57,7 @@ def import_recording(source: str | Path, mapping: str | Path | Mapping, out: str
     size = first.shape[1], first.shape[0]
     labels = read_labels(folder, told.labels, stereo, told.landmarks, size) if told.labels else None
     frames_s = time_s + offset_s + (0.0 if labels is None else _delay(labels, told.readout_s, size[1]))
-    tool, tool_told = _tool(told, robot, robot_s, frames_s, labels)
+    x_mm, tool_told = _landmarks(told, robot, robot_s, frames_s, labels, float(robot_zero))
     fps = told.video.fps or (1 / float(np.median(np.diff(time_s))) if len(time_s) > 1 else 25.0)
     fps = round(fps, 6) if told.video.fps is None else fps / told.video.every
     writer = RecordingWriter(
@@ -69,7 +69,7 @@ def import_recording(source: str | Path, mapping: str | Path | Mapping, out: str
         with writer:
             for (left, right), t in zip(stereo.pairs(), time_s, strict=True):
                 writer.add(left, right, t)
-            writer.kinematics(robot_s, robot.x_mm if tool is None else _positions(tool, robot))
+            writer.kinematics(robot_s, x_mm)
             if labels is not None:
                 writer.annotations(labels.u_left, labels.u_right, labels.visibility_left, labels.visibility_right)
             draft = writer.draft()
@@ -84,10 +84,6 @@ def import_recording(source: str | Path, mapping: str | Path | Mapping, out: str
     except ValueError as error:  # of the unfinished recording, which is gone: its place says more
         raise ValueError(str(error).replace(str(writer.folder), str(out))) from None
     return report
-
-
-def _zero(stereo: StereoSource) -> Decimal:
-    return Decimal(int(stereo.time[0])) if abs(stereo.time[0]) > 10**6 else Decimal(0)
 
 
 def _delay(labels: Annotations, readout_s: float, height_px: int) -> np.ndarray:
@@ -113,31 +109,45 @@ def _clock(draft: Recording, search_s: float) -> TimeOffset:
         raise ValueError(f"robot.offset_s = 'estimate': {error} {cure}.") from None
 
 
-def _tool(
-    told: Mapping, robot: RobotLog, robot_s: np.ndarray, frames_s: np.ndarray, labels: Annotations | None
-) -> tuple[Tool | None, dict | None]:
-    """The landmarks in the tool frame of a robot that reports poses, and what is told of them."""
+def _landmarks(
+    told: Mapping, robot: RobotLog, robot_s: np.ndarray, frames_s: np.ndarray, labels: Annotations | None, zero_s: float
+) -> tuple[np.ndarray, dict | None]:
+    """The robot's landmarks (m, k, 3) mm, and, where it reports poses, what is told of the tool."""
     if robot.R is None:
-        return None, None
+        return robot.x_mm, None
+    known, poses = robot.poses()
+    opening = None if robot.opening_rad is None else robot.opening_rad[known]
+    tool, sd = _tool(told, poses, robot_s[known], opening, frames_s, labels, zero_s)
+    x = np.full((len(known), len(told.landmarks), 3), np.nan)
+    x[known] = tool.positions_mm(poses, opening)
+    x[np.isnan(x).any(axis=2)] = np.nan
+    kinds = {"offset_mm": tool.offset_mm, "sine_mm": tool.sine_mm, "versine_mm": tool.versine_mm, "sd_mm": sd}
+    return x, {kind: dict(zip(told.landmarks, values.round(6).tolist(), strict=True)) for kind, values in kinds.items()}
+
+
+def _tool(
+    told: Mapping, poses: list[RigidTransform], robot_s: np.ndarray, opening: np.ndarray | None, frames_s: np.ndarray,
+    labels: Annotations | None, zero_s: float,
+) -> tuple[Tool, np.ndarray]:  # fmt: skip
+    """The landmarks in the tool frame, and the standard deviation (k, 3) of what was estimated."""
     names, tool = told.landmarks, told.tool
-    turning = [tool.turning.get(name, 0) if robot.opening_rad is not None else 0 for name in names]
+    turning = [tool.turning.get(name, 0) if opening is not None else 0 for name in names]
     if tool.estimate:
         if labels is None or told.robot.offset_s == "estimate":
             raise ValueError("tool.estimate: it needs labels and a number as robot.offset_s; or give the tool's landmarks.")
-        poses, opening = _at(robot, robot_s, frames_s)
-        known = np.array([pose is not None for pose in poses])
-        u = [side[known] for side in (labels.u_left, labels.u_right)]
-        jaws = {} if opening is None else {"opening_rad": opening[known], "turning": turning}
-        found = tool_offsets([pose for pose in poses if pose], u, **jaws)
-        sd = np.sqrt(np.diagonal(found.covariance_mm2, axis1=1, axis2=2))
-        return found, _tool_told(names, found) | {"sd_mm": sd.round(4).tolist(), "rms_px": round(found.rms_px, 3)}
-    offset, sd = np.full((len(names), 3), np.nan), {}
+        inside = (frames_s >= robot_s[0]) & (frames_s <= robot_s[-1])
+        at, u = frames_s[inside], [side[inside] for side in (labels.u_left, labels.u_right)]
+        turns = Slerp(robot_s, Rotation.from_matrix([pose.R for pose in poses]))(at).as_matrix()
+        shifts = np.stack([np.interp(at, robot_s, axis) for axis in np.transpose([pose.t for pose in poses])], axis=1)
+        jaws = {} if opening is None else {"opening_rad": np.interp(at, robot_s, opening), "turning": turning}
+        found = tool_offsets([RigidTransform(R, t) for R, t in zip(turns, shifts, strict=True)], u, **jaws)
+        return found, np.sqrt(np.diagonal(found.covariance_mm2, axis1=1, axis2=2))
+    offset, sd = np.full((len(names), 3), np.nan), np.zeros((len(names), 3))
     for k, name in enumerate(names):
         if name in tool.pivot_s:
-            low, high = tool.pivot_s[name]
-            rows = np.flatnonzero((robot_s >= low) & (robot_s <= high) & np.isfinite(robot.R).all(axis=(1, 2)))
-            pivot = pivot_calibration([RigidTransform(robot.R[i], robot.t_mm[i]) for i in rows])
-            offset[k], sd[name] = pivot.offset_mm, float(np.sqrt(np.trace(pivot.covariance_mm2[:3, :3]) / 3))
+            low, high = np.subtract(tool.pivot_s[name], zero_s)
+            pivot = pivot_calibration([pose for pose, t in zip(poses, robot_s, strict=True) if low <= t <= high])
+            offset[k], sd[k] = pivot.offset_mm, np.sqrt(np.diagonal(pivot.covariance_mm2)[:3])
         elif name in tool.landmarks_mm:
             offset[k] = tool.landmarks_mm[name]
     hinged = tool.hinge is not None and any(turning)
@@ -145,34 +155,8 @@ def _tool(
         cure = "give tool.landmarks_mm, tool.pivot_s, tool.hinge, or tool.estimate = true"
         raise ValueError(f"robot.pose: the place of {', '.join(lacks)} in the tool frame is open; {cure}.")
     if hinged:
-        made = Tool.hinged(np.nan_to_num(offset), turning, tool.hinge.point_mm, tool.hinge.axis, tool.hinge.jaw_mm)
-    else:
-        made = Tool(offset, np.zeros_like(offset), np.zeros_like(offset))
-    return made, _tool_told(names, made) | {"pivot_sd_mm": {name: round(value, 4) for name, value in sd.items()}}
-
-
-def _tool_told(names: Sequence[str], tool: Tool) -> dict:
-    kinds = {"offset_mm": tool.offset_mm, "sine_mm": tool.sine_mm, "versine_mm": tool.versine_mm}
-    return {kind: dict(zip(names, value.round(6).tolist(), strict=True)) for kind, value in kinds.items()}
-
-
-def _at(robot: RobotLog, robot_s: np.ndarray, time_s: np.ndarray) -> tuple[list[RigidTransform | None], np.ndarray | None]:
-    """The poses, None outside the log, and openings at robot times."""
-    known = np.isfinite(robot.R).all(axis=(1, 2)) & np.isfinite(robot.t_mm).all(axis=1)
-    s, inside = robot_s[known], (time_s >= robot_s[known][0]) & (time_s <= robot_s[known][-1])
-    turn = Slerp(s, Rotation.from_matrix(robot.R[known]))(np.clip(time_s, s[0], s[-1])).as_matrix()
-    shift = np.stack([np.interp(time_s, s, axis) for axis in robot.t_mm[known].T], axis=1)
-    poses = [RigidTransform(R, t) if i else None for R, t, i in zip(turn, shift, inside, strict=True)]
-    return poses, None if robot.opening_rad is None else np.interp(time_s, robot_s, robot.opening_rad)
-
-
-def _positions(tool: Tool, robot: RobotLog) -> np.ndarray:
-    known = np.isfinite(robot.R).all(axis=(1, 2)) & np.isfinite(robot.t_mm).all(axis=1)
-    poses = [RigidTransform(R, t) for R, t in zip(robot.R[known], robot.t_mm[known], strict=True)]
-    x = np.full((len(robot.R), len(tool.offset_mm), 3), np.nan)
-    x[known] = tool.positions_mm(poses, None if robot.opening_rad is None else robot.opening_rad[known])
-    x[np.isnan(x).any(axis=2)] = np.nan
-    return x
+        return Tool.hinged(np.nan_to_num(offset), turning, tool.hinge.point_mm, tool.hinge.axis, tool.hinge.jaw_mm), sd
+    return Tool(offset, np.zeros_like(offset), np.zeros_like(offset)), sd
 
 
 def _did(
@@ -195,9 +179,7 @@ def _did(
     x, kind = draft.kinematics.x_mm, "its landmarks" if robot.R is None else "the pose of its tool"
     gaps = int(np.isnan(x[..., 0]).any(axis=1).sum())
     said.append(f"{len(x)} samples of the robot, which reports {kind}; {gaps} have gaps.")
-    for what, zero in zip(("video", "robot"), zeros, strict=True):
-        if zero:
-            said.append(f"Times of the {what} count from {zero} s.")
+    said += [f"Times of the {what} count from {z} s." for what, z in zip(("video", "robot"), zeros, strict=True) if z]
     if clock:
         said.append(f"The clocks differ by {1e3 * clock.offset_s:.2f} ms, standard deviation {1e3 * clock.sd_s:.2f} ms.")
     inside = np.isfinite(draft.landmarks_mm()).any(axis=(1, 2))
@@ -220,6 +202,5 @@ def _sources(folder: Path, told: Mapping, stereo: StereoSource) -> list[dict]:
     others += [told.labels.file, told.labels.left, told.labels.right] if told.labels else []
     for name in filter(None, others):
         path = folder / name
-        path = path.parent if path.suffix in (".db3", ".mcap") else path
         names[name] = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
     return [{"file": name, "files": len(paths), "sha256": files.digest(*paths, length=64)} for name, paths in names.items()]

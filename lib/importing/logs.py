@@ -13,6 +13,7 @@ from rosbags.highlevel import AnyReader, AnyReaderError
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
+from lib.geometry import RigidTransform
 from lib.importing.mapping import Mapping, Pose, Table
 
 __all__ = ["RobotLog", "decoded", "exact_seconds", "increasing", "read_columns", "read_robot", "since", "topics_of"]
@@ -36,6 +37,11 @@ class RobotLog:
     R: np.ndarray | None = None
     t_mm: np.ndarray | None = None
     opening_rad: np.ndarray | None = None
+
+    def poses(self) -> tuple[np.ndarray, list[RigidTransform]]:
+        """Which samples (m,) bool hold a whole pose, and these poses."""
+        known = np.isfinite(self.R).all(axis=(1, 2)) & np.isfinite(self.t_mm).all(axis=1)
+        return known, [RigidTransform(R, t) for R, t in zip(self.R[known], self.t_mm[known], strict=True)]
 
 
 def decoded(path: Path) -> str:
@@ -137,15 +143,10 @@ def _number(cell: str, path: Path, line: int, name: str) -> float:
     return value
 
 
-def _bag(path: Path) -> AnyReader:
-    where = path.parent if path.suffix in (".db3", ".mcap") else path
-    return AnyReader([where], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
-
-
 def topics_of(path: Path) -> dict[str, str]:
     """The topics of a ROS 1 or 2 bag, and the kind of message of each, such as PoseStamped."""
     try:
-        with _bag(path) as reader:
+        with AnyReader([path]) as reader:
             return {c.topic: c.msgtype.split("/")[-1] for c in reader.connections}
     except _NOT_A_BAG as error:
         raise ValueError(f"{path}: the bag cannot be read ({error}). Record or convert it again.") from None
@@ -158,7 +159,7 @@ def _read_bag(path: Path, table: Table, names: list[str]) -> tuple[list[Decimal]
     if missing := sorted(set(stamps) - set(there := topics_of(path))):
         raise ValueError(f"{path}: no topic is called {missing[0]!r}; it has {', '.join(sorted(there))}.")
     try:
-        with _bag(path) as reader:
+        with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
             for c, received_ns, raw in reader.messages([c for c in reader.connections if c.topic in stamps]):
                 message, received = reader.deserialize(raw, c.msgtype), Decimal(received_ns).scaleb(-9)
                 header = getattr(message, "header", None)

@@ -52,8 +52,7 @@ class Video(_Section):
 
     @model_validator(mode="after")
     def _agree(self) -> Self:
-        wanted = ["left", "right"] if self.layout == "two" else ["file"]
-        wanted += {"table": ["table"], "fps": ["fps"]}.get(self.times, [])
+        wanted = [*(["left", "right"] if self.layout == "two" else ["file"]), *({self.times} & {"table", "fps"})]
         if missing := [key for key in wanted if not getattr(self, key)]:
             raise ValueError(f"layout {self.layout!r} with times {self.times!r} needs {' and '.join(missing)}")
         return self
@@ -153,15 +152,14 @@ class Mapping(_Section):
 
     @model_validator(mode="after")
     def _agree(self) -> Self:
-        if len(set(self.landmarks)) < len(self.landmarks):
+        ours, columns = set(self.landmarks), self.robot.landmarks
+        labels = self.labels.names if self.labels else {}
+        if len(ours) < len(self.landmarks):
             raise ValueError(f"landmarks {list(self.landmarks)} repeat a name")
-        told = {"robot.landmarks": self.robot.landmarks or {}, "labels.names": self.labels.names if self.labels else {}}
-        told |= {"tool.landmarks_mm": self.tool.landmarks_mm, "tool.pivot_s": self.tool.pivot_s}
-        for where, names in told.items():
-            if unknown := sorted(set(names) - set(self.landmarks)):
-                raise ValueError(f"{where} has {', '.join(unknown)}, which landmarks = {list(self.landmarks)} does not name")
-        if self.robot.landmarks and set(self.robot.landmarks) != set(self.landmarks):
-            raise ValueError(f"robot.landmarks lacks {', '.join(sorted(set(self.landmarks) - set(self.robot.landmarks)))}")
+        if unknown := sorted({*(columns or {}), *labels, *self.tool.landmarks_mm, *self.tool.pivot_s} - ours):
+            raise ValueError(f"landmarks = {list(self.landmarks)} lacks {', '.join(unknown)}, which another table names")
+        if missing := sorted(ours - set(columns or ours)):
+            raise ValueError(f"robot.landmarks lacks {', '.join(missing)}")
         return self
 
 
