@@ -32,19 +32,19 @@ class Patch:
     edge: float = 0.1
     wobble: float = 0.0
 
-    def share(self, window: Window, u: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-        """How far the patch fills the pixels u = (columns, rows), 0 to 1."""
+    def share(self, window: Window) -> np.ndarray:
+        """How far the patch fills each pixel of a window, (h, w) float32, 0 to 1."""
+        u = tuple(np.meshgrid(*(np.arange(side, dtype=np.float32) for side in window.size_px)))
         x, y = window.rays(u, np.float32(self.centre_mm[2]))
         dx, dy = x - self.centre_mm[0], y - self.centre_mm[1]
         cosine, sine = np.cos(self.turn_rad), np.sin(self.turn_rad)
-        p = (dx * cosine + dy * sine) / self.radii_mm[0]
-        q = (dy * cosine - dx * sine) / self.radii_mm[1]
+        p, q = (dx * cosine + dy * sine) / self.radii_mm[0], (dy * cosine - dx * sine) / self.radii_mm[1]
         radius = np.sqrt(p * p + q * q)
         if self.wobble:
             angle, phase = np.arctan2(q, p), 37.0 * self.turn_rad
-            ripple = np.sin(2 * angle + phase) + 0.7 * np.sin(3 * angle + 2 * phase) + 0.5 * np.sin(7 * angle + 3 * phase)
-            radius = radius * (1 + self.wobble * ripple)
-        return 1 / (1 + np.exp(np.clip((radius - 1) * (4 / max(self.edge, 1e-3)), -40, 40)))
+            waves = ((2, 1.0), (3, 0.7), (7, 0.5))
+            radius = radius * (1 + self.wobble * sum(size * np.sin(k * angle + k * phase) for k, size in waves))
+        return _inside(radius, self.edge).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -81,14 +81,9 @@ class Lighting:
     def spot(self, x: np.ndarray, y: np.ndarray, middle_mm: tuple[float, float], radius_mm: float) -> np.ndarray:
         """Light 0 to 1 at (x, y) mm of a scene, for a spot of this middle and radius."""
         x, y = x - middle_mm[0], y - middle_mm[1]
-        if self.band_rad is not None:
-            distance = np.abs(y * np.cos(self.band_rad) - x * np.sin(self.band_rad)) / radius_mm
-        else:
-            distance = np.hypot(x, y) / radius_mm
-        if self.spot_edge is None:
-            lit = np.exp(-(distance**2) / 2)
-        else:
-            lit = 1 / (1 + np.exp(np.clip((distance - 1) * (4 / self.spot_edge), -40, 40)))
+        turn = self.band_rad
+        distance = (np.hypot(x, y) if turn is None else np.abs(y * np.cos(turn) - x * np.sin(turn))) / radius_mm
+        lit = np.exp(-(distance**2) / 2) if self.spot_edge is None else _inside(distance, self.spot_edge)
         return self.ambient + (1 - self.ambient) * lit
 
     def shaded(self, at: tuple[np.ndarray, ...], nodes: tuple[np.ndarray, ...], slope: tuple[float, float]) -> np.ndarray:
@@ -117,7 +112,7 @@ class Lighting:
         """Add to the scene (h, w, 3), in place, what lies behind the tool."""
         for patch in self.patches:
             if patch.role == "glare":
-                linear += _share(patch, window)[..., None] * np.float32(patch.colour)
+                linear += patch.share(window)[..., None] * np.float32(patch.colour)
 
     def in_front(self, linear: np.ndarray, window: Window, u: np.ndarray, visibility: np.ndarray) -> np.ndarray:
         """Lay what lies before the tool over the image (h, w, 3), in place; the landmarks' visibility (3,) after that."""
@@ -135,7 +130,7 @@ class Lighting:
         for patch in self.patches:
             if patch.role == "glare":
                 continue
-            share = _share(patch, window)
+            share = patch.share(window)
             if patch.role == "flare":
                 linear += share[..., None] * np.float32(patch.colour)
                 hides = share * max(patch.colour) > 1.0
@@ -151,7 +146,6 @@ class Lighting:
         return visibility
 
 
-def _share(patch: Patch, window: Window) -> np.ndarray:
-    """(h, w) float32 share of every pixel of a window."""
-    columns, rows = (np.arange(side, dtype=np.float32) for side in window.size_px)
-    return patch.share(window, tuple(np.meshgrid(columns, rows))).astype(np.float32)
+def _inside(radius: np.ndarray, edge: float) -> np.ndarray:
+    """1 where the radius is below one and 0 beyond, with a border of width `edge`."""
+    return 1 / (1 + np.exp(np.clip((radius - 1) * (4 / max(edge, 1e-3)), -40, 40)))
