@@ -57,11 +57,16 @@ class Case:
         table[self.problem.frame[rows], self.problem.landmark[rows]] = values[rows]
         return table
 
-    def nearest(self, r: np.ndarray, fit: Robust) -> np.ndarray:
-        """(frames,) which of the residuals r (t, n, 2, 2) px suits each frame best."""
-        loss = np.nan_to_num(np.log1p((r**2).sum(axis=3) / fit.shapes[0].scale ** 2), nan=1e3)
-        loss = np.where(self.problem.used, loss, 0.0).sum(axis=2)
-        return np.array([np.bincount(self.problem.frame, row, self.frames) for row in loss]).argmin(axis=0)
+    def chosen(self, x: np.ndarray) -> tuple[Robust, Problem, np.ndarray]:
+        """Each frame with the positions among x (t, n, 3) that suit it best: the fit, its rows, the choices (frames,)."""
+        problem, fit = self.problem, self.null
+        for _ in range(5):
+            r2 = ((problem.y - np.einsum("cij,tnj->tnci", fit.M[:, :, :3], x) - fit.M[:, :, 3]) ** 2).sum(axis=3)
+            loss = np.where(problem.used, np.nan_to_num(np.log1p(r2 / fit.shapes[0].scale ** 2), nan=1e3), 0.0).sum(axis=2)
+            own = np.array([np.bincount(problem.frame, row, self.frames) for row in loss]).argmin(axis=0)
+            moved = problem.moved(np.repeat(x[own[problem.frame], np.arange(len(problem))][:, None], 2, axis=1))
+            fit = moved.fit(start=fit.M, rounds=10)
+        return fit, moved, own
 
     def found(
         self, name: str, fit: Robust, extra: float, value: float, sd: float, unit: str, text: str, cure: str, *,

@@ -136,13 +136,7 @@ def _frame_order(case: Case) -> Iterator[Hypothesis]:
     if not 0 < step <= 0.25:
         return
     shifts = step * np.arange(-8, 9)
-    fit, x = case.null, np.stack([case.track.moved(problem.x[:, 0], shift) for shift in shifts])
-    for _ in range(5):
-        r = problem.y - np.einsum("cij,tnj->tnci", fit.M[:, :, :3], x) - fit.M[:, :, 3]
-        own = case.nearest(r, fit)
-        at = x[own[problem.frame], np.arange(len(problem))]
-        moved = problem.moved(np.repeat(at[:, None], 2, axis=1))
-        fit = moved.fit(start=fit.M, rounds=10)
+    fit, moved, own = case.chosen(np.stack([case.track.moved(problem.x[:, 0], shift) for shift in shifts]))
     share = float((own != 8).mean())
     text = f"{100 * share:.0f} % of the frames fit another instant, within {1e3 * shifts[-1]:.0f} ms, better than their own."
     cure = "Sort the frames, and write each one's true time to frames.csv."

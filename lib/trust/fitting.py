@@ -32,10 +32,12 @@ class Shape:
     freedom: float
 
     @classmethod
-    def of(cls, r2: np.ndarray, start: float, least: float) -> Self:
-        """Most probable for squared residuals (k,), with `least` degrees of freedom or more."""
-        best = None
-        for freedom in _FREEDOM[least <= _FREEDOM]:
+    def of(cls, r2: np.ndarray, start: float, least: float, before: float | None = None) -> Self:
+        """Most probable for squared residuals (k,), with `least` degrees of freedom or more, not far from those `before`."""
+        best, tried = None, _FREEDOM[least <= _FREEDOM]
+        if before is not None:
+            tried = tried[np.abs(np.arange(len(tried)) - np.flatnonzero(tried == before)[0]) <= 1]
+        for freedom in tried:
             s2 = start**2
             for _ in range(4):
                 weight = (freedom + 2.0) / (freedom + r2 / s2)
@@ -227,7 +229,7 @@ class Problem:
             M = beta[:16].reshape(2, 2, 4)
             r = y - D @ beta
             r2 = (r**2).sum(axis=2) / self.noise**2
-            shapes = {g: Shape.of(r2[group == g], shape.scale, least) for g, shape in shapes.items()}
+            shapes = {g: Shape.of(r2[group == g], shape.scale, least, shape.freedom) for g, shape in shapes.items()}
             likelihood = np.zeros(used.shape)
             for g, shape in shapes.items():
                 likelihood[group == g] = log_density(r2[group == g], shape)

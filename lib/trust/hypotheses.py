@@ -29,16 +29,12 @@ def _tip_order(case: Case) -> Iterator[Hypothesis]:
         if moved.used.all(axis=1).sum() < 6:
             continue
         where = "both images" if len(views) == 2 else f"the {SIDES[views[0]]} image"
-        text = f"Where {where} show {', '.join(LANDMARKS)}, the robot means {', '.join(LANDMARKS[k] for k in order)}."
+        text = f"What {where} call {', '.join(LANDMARKS)} is {', '.join(LANDMARKS[k] for k in order)} for the robot."
+        text = text if len(views) == 2 else text.replace(" call ", " calls ")
         cure = f"Bring the columns of kinematics.csv, or the detections of {where}, into one order."
         yield case.found("tip_order", moved.fit(seed=case.seed), 1, 1.0, 0.0, "", text, cure, on=moved)
     swapped = table[:, [0, 2, 1]][problem.frame, problem.landmark]  # frame by frame: one bit each
-    fit, both = case.null, np.stack([problem.x[:, 0], swapped])
-    for _ in range(6):
-        r = problem.y - np.einsum("cij,tnj->tnci", fit.M[:, :, :3], both) - fit.M[:, :, 3]
-        own = case.nearest(r, fit)
-        moved = problem.moved(np.repeat(both[own[problem.frame], np.arange(len(problem))][:, None], 2, axis=1))
-        fit = moved.fit(start=fit.M, rounds=10)
+    fit, moved, own = case.chosen(np.stack([problem.x[:, 0], swapped]))
     text = f"The tips are exchanged in {100 * own.mean():.0f} % of the frames."
     cure = "Tell the tips apart by the tool's roll, as the robot does; or train the detector with tips in the robot's order."
     raw = fit.total - case.null.total - case.frames * np.log(2.0)

@@ -30,9 +30,10 @@ def optical_faults(problem: Problem, fit: Robust) -> Iterator[Hypothesis]:
 
 
 def _constraints(A: np.ndarray) -> np.ndarray:
-    """Skew of the left and right camera, log aspects: all 0 for square pixels."""
-    size = np.linalg.norm(A, axis=2)
-    return np.concatenate([(A[:, 0] * A[:, 1]).sum(axis=1) / size.prod(axis=1), np.log(size[:, 0] / size[:, 1])])
+    """(..., 4) skew of the left and right camera, log aspects, of A (..., 2, 2, 3): all 0 for square pixels."""
+    size = np.linalg.norm(A, axis=-1)
+    skew = (A[..., 0, :] * A[..., 1, :]).sum(axis=-1) / size.prod(axis=-1)
+    return np.concatenate([skew, np.log(size[..., 0] / size[..., 1])], axis=-1)
 
 
 def _scaled(A: np.ndarray, covariance: np.ndarray) -> Iterator[Hypothesis]:
@@ -40,24 +41,24 @@ def _scaled(A: np.ndarray, covariance: np.ndarray) -> Iterator[Hypothesis]:
     if abs(_constraints(A)[2:].mean()) > _RESIZED:
         tolerance[2:, 2:] += 1.0
 
-    def misfit(scale: np.ndarray) -> float:
-        def constraints(entries: np.ndarray) -> np.ndarray:
-            return _constraints(entries.reshape(2, 2, 3) * scale)
+    step = 1e-6 * np.abs(A).max()
+    near = step * np.eye(12).reshape(12, 2, 2, 3)
 
-        found, step = constraints(A.ravel()), 1e-6 * np.abs(A).max()
-        J = np.stack([(constraints(A.ravel() + step * e) - found) / step for e in np.eye(12)], axis=1)
+    def misfit(scale: np.ndarray) -> float:
+        found = _constraints(A * scale)
+        J = (_constraints((A + near) * scale) - found).T / step
         return float(found @ np.linalg.solve(J @ covariance @ J.T + tolerance, found))
 
     none = misfit(np.ones(3))
-    logs = np.log(12.0) * np.linspace(-1, 1, 241)
+    logs = np.log(12.0) * np.linspace(-1, 1, 161)
     for axis in range(3):
         values = np.array([misfit(np.exp(log * np.eye(3)[axis])) for log in logs])
         best = int(values.argmin())
-        log, step = logs[best], logs[1] - logs[0]
-        near = values[max(best - 1, 0) : best + 2]
-        bend = (near[0] - 2 * near[1] + near[2]) / step**2 if len(near) == 3 else 0.0
+        log, spacing = logs[best], logs[1] - logs[0]
+        three = values[max(best - 1, 0) : best + 2]
+        bend = (three[0] - 2 * three[1] + three[2]) / spacing**2 if len(three) == 3 else 0.0
         if bend > 0:
-            log += 0.5 * (near[0] - near[2]) / (near[0] - 2 * near[1] + near[2]) * step
+            log += 0.5 * (three[0] - three[2]) / bend / spacing
         sd = float(np.sqrt(2.0 / bend)) if bend > 0 else np.inf
         scale = float(np.exp(-log))  # A times s is plausible, so the robot's numbers are 1/s too small
         name, gain = "xyz"[axis], 0.5 * (none - values[best]) - 1.5

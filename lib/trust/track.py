@@ -1,7 +1,6 @@
 """The tool's path in time: where the robot says it was earlier or later, and how fast it moves."""
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
@@ -34,19 +33,16 @@ class Track:
                 known = np.isfinite(kinematics.x_mm[:, k]).all(axis=1)
                 paths.append((kinematics.time_s[known], kinematics.x_mm[known, k] - problem.centre))
             if min(len(t) for t, _ in paths) > 4:
-                return cls(paths, time + _shift(x, time, landmark, paths), landmark)
+                return cls([_smooth(*path) for path in paths], time + _shift(x, time, landmark, paths), landmark)
         paths = []
         for k in range(int(landmark.max()) + 1):
             rows = np.flatnonzero(landmark == k)
             rows = rows[np.unique(time[rows], return_index=True)[1]]
             paths.append((time[rows], x[rows]))
         steps = np.concatenate([np.diff(t) for t, _ in paths])
-        return cls(paths, time, landmark) if steps.size and np.median(steps) <= _LONGEST_S else None
-
-    @cached_property
-    def window_s(self) -> float:
-        """Half the time over which the path is averaged."""
-        return float(max(0.03, 1.5 * np.median(np.concatenate([np.diff(t) for t, _ in self.paths]))))
+        if not steps.size or np.median(steps) > _LONGEST_S:
+            return None
+        return cls([_smooth(*path) for path in paths], time, landmark)
 
     @property
     def span_s(self) -> float:
@@ -54,13 +50,7 @@ class Track:
         return float(max(t[-1] for t, _ in self.paths if len(t)) - min(t[0] for t, _ in self.paths if len(t)))
 
     def at(self, shift_s: float | np.ndarray) -> np.ndarray:
-        """(n, 3) positions `shift_s` later than the rows, averaged over some samples; NaN outside the path and in its gaps.
-
-        A path between noisy samples is less noisy than at them, which would favour shifts of half a sample.
-        """
-        return np.mean([self._at(shift_s + step) for step in self.window_s * np.linspace(-1, 1, 7)], axis=0)
-
-    def _at(self, shift_s: float | np.ndarray) -> np.ndarray:
+        """(n, 3) positions `shift_s` later than the rows; NaN outside the path and in its gaps."""
         time, x = self.start_s + shift_s, np.full((len(self.start_s), 3), np.nan)
         for k, (t, path) in enumerate(self.paths):
             rows = self.landmark == k
@@ -83,6 +73,16 @@ class Track:
         span = _HALF_S * (np.isfinite(after[:, :1]) * 1.0 + np.isfinite(before[:, :1]))
         step = np.where(np.isfinite(after), after, here) - np.where(np.isfinite(before), before, here)
         return step / np.where(span > 0, span, np.nan)
+
+
+def _smooth(time: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A path averaged over some samples: between noisy ones it is less noisy than at them, which would favour some shifts."""
+    if len(time) < 4:
+        return time, x
+    steps = max(0.03, 1.5 * np.median(np.diff(time))) * np.linspace(-1, 1, 7)
+    at = time[:, None] + steps
+    inside = (at[:, 0] >= time[0]) & (at[:, -1] <= time[-1])
+    return time[inside], np.stack([np.interp(at[inside], time, axis).mean(axis=1) for axis in x.T], axis=1)
 
 
 def _shift(x: np.ndarray, time: np.ndarray, landmark: np.ndarray, paths: list) -> float:

@@ -9,14 +9,15 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation
 
-from lib.calibration import Calibration
+from lib.calibration import calibrate
 from lib.cameras import StereoRig
 from lib.correspondences import Correspondences, pair_with_robot
 from lib.geometry import RigidTransform
 from lib.recordings import Kinematics
 from lib.simulator import Microscope
+from lib.trust import diagnose, judge
 
-__all__ = ["GOOD", "SPOILED", "Take", "effect", "good", "spoiled"]
+__all__ = ["GOOD", "SPOILED", "Result", "Scene", "Take", "examine", "takes"]
 
 #: First seed of the recordings on which thresholds are set, and of those that are judged once.
 SETS = {"setting": 0, "judging": 50_000}
@@ -45,7 +46,6 @@ class Take:
     readout_s: float
     rigs: tuple[StereoRig, ...]
     points_mm: np.ndarray
-    exchanged: bool = False
     image_size_px: tuple[int, int] = _SIZE
     robot_accuracy_mm: float = 0.010
 
@@ -166,16 +166,53 @@ class Scene:
         return Take(name, strength, causes, data, kinematics, readout, rigs, points)
 
 
-def effect(take: Take, calibration: Calibration, exchanged: bool = False) -> float:
-    """RMS 3D error of the calibration at the test positions over its stated standard deviation; the worst of the rigs."""
-    worst = 0.0
-    for rig in take.rigs:
-        u = rig.project(take.points_mm)
-        u = u[::-1] if exchanged else u
-        found = calibration.pair.triangulate(*u).x_mm
-        sd = np.sqrt(np.trace(calibration.point_covariance(take.points_mm, detection=False), axis1=1, axis2=2).mean())
-        worst = max(worst, float(np.sqrt(((found - take.points_mm) ** 2).sum(axis=1).mean()) / sd))
-    return worst
+@dataclass(frozen=True)
+class Result:
+    """What the workbench said of a take.
+
+    Attributes
+    ----------
+    effect:
+        RMS 3D error of the calibration at the test positions over its stated standard deviation, the worst of the rigs;
+        infinite where the calibration was refused.
+    level, named:
+        Of the verdict; and of the diagnosis, "" where it found nothing.
+    text:
+        What the diagnosis says.
+    """
+
+    take: Take
+    effect: float
+    level: str
+    named: str
+    text: str
+
+    @property
+    def right(self) -> bool:
+        """The cause was named, or nothing where there is none."""
+        return self.named in (self.take.causes or ("",))
+
+
+def examine(take: Take) -> Result:
+    """Calibrate, diagnose and judge, as `lib.trust.assess` does with a recording."""
+    calibration, error, effect = None, None, np.inf
+    try:
+        calibration = calibrate(take.data, image_size_px=take.image_size_px)
+    except ValueError as refused:
+        error = refused
+    if calibration is not None:
+        own = calibration.point_covariance(take.points_mm, detection=False)
+        sd = np.sqrt(np.trace(own, axis1=1, axis2=2).mean())
+        missed = [calibration.pair.triangulate(*rig.project(take.points_mm)).x_mm - take.points_mm for rig in take.rigs]
+        effect = max(float(np.sqrt((d**2).sum(axis=1).mean())) for d in missed) / sd
+    diagnosis = diagnose(
+        take.data, calibration, kinematics=take.kinematics, readout_s=take.readout_s, image_size_px=take.image_size_px
+    )
+    verdict = judge(
+        take.data, calibration, diagnosis=diagnosis, robot_accuracy_mm=take.robot_accuracy_mm, error=error
+    )
+    named = "" if diagnosis.best is None else diagnosis.best.name
+    return Result(take, effect, verdict.level, named, str(diagnosis))
 
 
 # --- ways of spoiling: each takes a scene and a strength
@@ -225,10 +262,10 @@ def _rigid(scene: Scene, t: np.ndarray, x: np.ndarray) -> np.ndarray:
     return np.stack([x[:, 0], middle - across, middle + across], axis=1)
 
 
-def _rigid_tips(range_mm: float) -> Callable[[Scene], None]:
+def _both(*ways: Callable[[Scene], None]) -> Callable[[Scene], None]:
     def apply(scene: Scene) -> None:
-        scene.opening_mm = (0.3, 0.3 + range_mm)
-        scene.edit_report.append(_rigid)
+        for way in ways:
+            way(scene)
 
     return apply
 
@@ -340,6 +377,20 @@ def _late(view: int, seconds: float) -> Callable[[Scene], None]:
 _SWAP = _pixels(lambda scene, u: u[:, :, ::-1].copy())
 _REVERSE = _report(lambda scene, t, x: x[::-1].copy())
 
+
+
+def _blank(scene: Scene, t: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """One per cent of the robot's samples are dropped."""
+    return np.where(scene.rng.random((len(x), 1, 1)) < 0.01, np.nan, x)
+
+
+def _spike(scene: Scene, t: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """One sample of the robot is 1.3 mm off."""
+    x = x.copy()
+    x[scene.rng.integers(200, len(x) - 200)] += 1.3
+    return x
+
+
 #: (way, strength) -> (names of hypotheses that are right, how the scene is spoiled).
 SPOILED: dict[tuple[str, str], tuple[tuple[str, ...], Callable[[Scene], None]]] = {
     **{("clock", f"{ms} ms"): (("clock",), _set(offset_s=ms / 1e3)) for ms in (-20, 183, 383)},
@@ -347,8 +398,12 @@ SPOILED: dict[tuple[str, str], tuple[tuple[str, ...], Callable[[Scene], None]]] 
     ("tips exchanged", "left image"): (("tip_order",), _tips((0,), 1.0)),
     ("tips exchanged", "half of the frames"): (("tip_order",), _tips((0, 1), 0.5)),
     **{("z scaled", f"{s}"): (("scaled_axis",), _scale((1, 1, s))) for s in (1.2, 0.5, 2.0)},
-    **{("rigid tips", f"{w} mm"): (("rigid_tips",), _rigid_tips(w)) for w in (0.5, 1.0, 2.0)},
+    **{("rigid tips", f"{w} mm"): (("rigid_tips",), _both(_set(opening_mm=(0.3, 0.3 + w)), _report(_rigid)))
+       for w in (0.5, 1.0, 2.0)},
     **{("random detections", f"{s} px"): (("detector_unfit",), _wrong(1.0, (s,))) for s in (25.0, 50.0, 150.0)},
+    **{("foreign pictures", f"{n} frames"): (("detector_unfit", ""), _both(_set(frames=n, fps=2.0), _wrong(0.5)))
+       for n in (2, 4, 6)},
+    ("no detection", ""): (("detector_unfit",), _pixels(lambda scene, u: np.full_like(u, np.nan))),
     **{("detector partly wrong", f"{100 * s:.0f} %"): (("detector_unfit",), _wrong(s)) for s in (0.35, 0.5, 0.65)},
     **{("read-out time left at 0", f"{1e3 * s:.0f} ms"): (("readout",), _set(readout_s=s, stated_readout_s=0.0))
        for s in (0.010, 0.020, 0.035)},
@@ -396,18 +451,16 @@ GOOD: dict[str, dict[str, object]] = {
     "fast": {"speed_mm_s": 15.0},
     "wide convergence": {"convergence_deg": 15.0},
     "sparse frames": {"fps": 0.8, "frames": 60},
+    "1 % of the log blank": {"edit_report": [_blank]},
+    "a spike in the log": {"edit_report": [_spike]},
 }
 
 
-def good(kind: str = "setting", repeat: int = 0) -> Iterator[Take]:
-    """The good recordings of one set."""
+def takes(recordings: str = "setting", seed: int = 0) -> Iterator[Take]:
+    """The good and then the spoiled recordings of one set; a `seed` is another draw of all rigs, tools, paths and noise."""
     for i, (name, options) in enumerate(GOOD.items()):
-        yield Scene(np.random.default_rng([SETS[kind], repeat, 1, i]), **options).take(name)
-
-
-def spoiled(kind: str = "setting", repeat: int = 0) -> Iterator[Take]:
-    """The spoiled recordings of one set."""
+        yield Scene(np.random.default_rng([SETS[recordings], seed, 1, i]), **options).take(name)
     for i, ((way, strength), (causes, spoil)) in enumerate(SPOILED.items()):
-        scene = Scene(np.random.default_rng([SETS[kind], repeat, 2, i]))
+        scene = Scene(np.random.default_rng([SETS[recordings], seed, 2, i]))
         spoil(scene)
         yield scene.take(way, strength, causes)
