@@ -20,8 +20,8 @@ from lib.trust.optics import optical_faults
 __all__ = ["Diagnosis", "diagnose"]
 
 #: Least gain and least share explained of a hypothesis that is named.
-LEAST_GAIN = 12.0
-LEAST_EXPLAINED = 0.04
+LEAST_GAIN = 6.0
+LEAST_EXPLAINED = 0.02
 _MOST_ROWS = 1200
 
 

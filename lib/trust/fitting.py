@@ -160,7 +160,7 @@ class Problem:
         best = max(fits, key=lambda fit: fit.total)
         return best if len(starts) == 1 else self._descend(best.M, columns, groups, rounds)
 
-    def _starts(self, rng: np.random.Generator, samples: int = 300) -> list[np.ndarray]:
+    def _starts(self, rng: np.random.Generator, samples: int = 150) -> list[np.ndarray]:
         """Cameras (2, 2, 4) of least squares, and of the samples of four rows that most rows are near to."""
         squares, best = np.zeros((2, 2, 4)), np.zeros((2, 2, 4))
         for view in range(2):
@@ -223,9 +223,8 @@ class Problem:
             information = J.T @ J + np.diag(np.append(prior, np.zeros(D.shape[3] - 25)))
             gradient = J.T @ (y * np.sqrt(weight)[:, :, None]).reshape(-1)
             scale = 1.0 / np.sqrt(np.diag(information) + 1e-12)
-            inverse = np.linalg.pinv(information * np.outer(scale, scale), rcond=1e-10, hermitian=True)
-            inverse *= np.outer(scale, scale)
-            beta = inverse @ gradient
+            information = information * np.outer(scale, scale) + 1e-10 * np.eye(len(scale))  # an unseen addition stays 0
+            beta = scale * np.linalg.solve(information, scale * gradient)
             M = beta[:16].reshape(2, 2, 4)
             r = y - D @ beta
             r2 = (r**2).sum(axis=2) / self.noise**2
@@ -235,12 +234,12 @@ class Problem:
                 likelihood[group == g] = log_density(r2[group == g], shape)
             penalty = -0.5 * float(prior @ beta[:25] ** 2)
             total = likelihood.sum() + penalty
-            if abs(total - before) < 1e-3:
+            if abs(total - before) < 0.02:
                 break
             before = total
         likelihood = np.where(used, likelihood - 2.0 * np.log(self.noise), 0.0)
         design = self._overcount(r * np.sqrt(weight)[:, :, None])
-        inverse = inverse * design
+        inverse = np.linalg.inv(information) * np.outer(scale, scale) * design
         offset_sd = np.sqrt(np.diag(inverse)[16:25].reshape(3, 3).sum(axis=1))
         return Robust(
             M, beta[25:], inverse[25:, 25:], beta[16:25].reshape(3, 3), offset_sd, inverse[:16, :16], r,

@@ -23,7 +23,8 @@ def optical_faults(problem: Problem, fit: Robust) -> Iterator[Hypothesis]:
     """Scaled axes, and a left camera that stands on the right."""
     rows = [8 * c + 4 * i + j for c in range(2) for i in range(2) for j in range(3)]
     A, covariance = fit.M[:, :, :3], fit.camera_covariance[np.ix_(rows, rows)]
-    if not np.isfinite(covariance).all() or min(np.linalg.svd(a, compute_uv=False)[1] for a in A) < 1e-6:
+    few = 2 * problem.used.sum() < 40
+    if few or not np.isfinite(covariance).all() or min(np.linalg.svd(a, compute_uv=False)[1] for a in A) < 1e-6:
         return
     yield from _scaled(A, covariance)
     yield from _reflected(problem, A, covariance)

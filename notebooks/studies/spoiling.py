@@ -456,11 +456,16 @@ GOOD: dict[str, dict[str, object]] = {
 }
 
 
-def takes(recordings: str = "setting", seed: int = 0) -> Iterator[Take]:
-    """The good and then the spoiled recordings of one set; a `seed` is another draw of all rigs, tools, paths and noise."""
+def takes(recordings: str = "setting", seed: int = 0, only: str = "") -> Iterator[Take]:
+    """The good and then the spoiled recordings of one set whose names contain `only`.
+
+    A `seed` is another draw of all rigs, tools, paths and noise.
+    """
     for i, (name, options) in enumerate(GOOD.items()):
-        yield Scene(np.random.default_rng([SETS[recordings], seed, 1, i]), **options).take(name)
+        if only in name:
+            yield Scene(np.random.default_rng([SETS[recordings], seed, 1, i]), **options).take(name)
     for i, ((way, strength), (causes, spoil)) in enumerate(SPOILED.items()):
-        scene = Scene(np.random.default_rng([SETS[recordings], seed, 2, i]))
-        spoil(scene)
-        yield scene.take(way, strength, causes)
+        if only in way:
+            scene = Scene(np.random.default_rng([SETS[recordings], seed, 2, i]))
+            spoil(scene)
+            yield scene.take(way, strength, causes)

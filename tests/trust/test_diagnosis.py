@@ -12,7 +12,7 @@ from notebooks.studies.spoiling import GOOD, SPOILED, Scene
 
 
 def take(way="", strength="", seed=7, **options):
-    scene = Scene(np.random.default_rng(seed), **{"frames": 50, "fps": 15.0} | options)
+    scene = Scene(np.random.default_rng(seed), **{"frames": 40, "fps": 15.0, "speed_mm_s": 6.0} | options)
     causes, spoil = SPOILED[way, strength] if way else ((), lambda scene: None)
     spoil(scene)
     return scene.take(way, strength, causes)
@@ -32,12 +32,12 @@ def test_a_good_recording_has_no_fault(name):
 @pytest.mark.parametrize(
     ("way", "strength", "value"),
     [
-        ("clock", "383 ms", -383.0), ("read-out time left at 0", "20 ms", 20.0),
-        ("tips exchanged", "left image", 1.0), ("z scaled", "2.0", 2.0), ("rigid tips", "1.0 mm", None),
+        ("read-out time left at 0", "20 ms", 20.0),
+        ("tips exchanged", "half of the frames", None), ("z scaled", "2.0", 2.0), ("rigid tips", "1.0 mm", None),
         ("axis mirrored", "z", None), ("eyes exchanged", "", None), ("finite distance", "150 mm", 1 / 150),
-        ("landmark offset", "1.0 mm", 1000.0), ("bad landmark", "40.0 px", None), ("bad stretch", "40.0 px", None),
+        ("landmark offset", "1.0 mm", 1000.0), ("bad stretch", "40.0 px", None),
         ("camera moved", "1.0 degrees", None), ("detector partly wrong", "50 %", None),
-        ("kinematics frozen", "25 %", 22.0), ("left camera late", "40 ms", -40.0),
+        ("kinematics frozen", "25 %", 24.0), ("left camera late", "40 ms", -40.0),
     ],
 )  # fmt: skip
 def test_a_fault_is_named_with_its_size_and_its_cure(way, strength, value):
@@ -50,7 +50,8 @@ def test_a_fault_is_named_with_its_size_and_its_cure(way, strength, value):
 
 
 def test_a_clock_is_found_among_wrong_landmarks_and_without_the_log():
-    assert found(take("clock", "183 ms", outliers=0.3)).best.name == "clock"
+    best = found(take("clock", "183 ms", outliers=0.3)).best
+    assert best.name == "clock" and best.value == pytest.approx(-183, abs=5)
     best = found(take("clock", "-20 ms"), log=False).best
     assert best.name == "clock" and best.value == pytest.approx(20, abs=5)
 
