@@ -1,4 +1,4 @@
-"""Has the microscope been moved?  A cumulative sum of how badly the calibrated rig explains each frame."""
+"""Has the microscope been moved?  Cumulative sums over what the calibrated rig leaves unexplained, frame by frame."""
 
 from collections import deque
 
@@ -11,26 +11,40 @@ from lib.geometry import pair_covariance
 
 __all__ = ["DriftMonitor"]
 
+#: What is watched: the mean residual of a frame's landmarks along the two directions of the images that a lateral shift
+#: moves, along the one that a shift in depth moves, and across the epipolar lines; and their chi-square.
+AXES = ("lateral", "lateral", "depth", "epipolar", "scatter")
+# Shift that counts as none, in standard deviations of a frame, and alarm level, of each axis.  Depth is seen worst, so
+# its test is the one for the smallest shifts.
+_SLACK = np.array([1.0, 1.0, 0.55, 1.0, 1.0])
+_LEVEL = np.array([5.2, 5.2, 7.0, 5.2, 7.5])
+_CAP = 0.75  # of the alarm level: most that one frame adds, so that a single bad frame raises no alarm
+_MEMORY = 1000  # frames that tell the noise
+_FEW = 40  # frames: with fewer the noise is taken for larger than they say, up to twice
+_WANDER = 25  # frames over which the noise may be correlated, whatever neighbouring frames say
+_SLOW = 300  # frames over which the bias is averaged
+_LARGEST_BIAS_PX = 0.5  # of a frame's mean; more is a drift
+
 
 class DriftMonitor:
-    """CUSUM test (Page 1954) on the chi-square of the landmarks' reprojection, frame by frame.
+    """CUSUM tests (Page 1954) on the residuals r = u - rig.project(x), one on each axis of `AXES` and to each side.
 
-    A frame's chi^2 sums r^T C^-1 r over its landmarks, r = u - rig.project(x), C = covariance + sigma_x^2 A A^T.  It is
-    turned to a standard normal score z (Wilson and Hilferty 1931), so that frames with missing landmarks count alike,
-    and S <- max(0, S + min(z, cap) - slack).  S above `threshold` says that the cameras moved.
+    The detector's error is biased and correlated in time, and its stated noise may be wrong.  So the bias is the slow
+    mean of the residuals, within half a pixel, and the noise is that of the residuals themselves: their long-run standard
+    deviation (Andrews 1991), which counts correlated frames for what they are worth.  A score z is the residual less its
+    bias in this unit, and S <- max(0, S + min(z, cap) - slack).
 
     Args:
-        rig:
-            As calibrated or last registered.
-        covariance_px2, sigma_x_mm:
-            Noise: of (u_left, u_right), a number, (2, 2) or (4, 4) px^2; and of the robot's report, per coordinate.
-        slack, threshold, cap:
-            Score that still counts as no change, half of the shift that should be noticed; alarm level; and largest score
-            of one frame, below threshold + slack so that a single bad detection raises no alarm.  With the defaults a false
-            alarm comes less than once in a million frames, once in ten thousand where the noise is 10 % larger than stated.
+        rig: As calibrated or last registered.
+        covariance_px2, sigma_x_mm: Noise to start from: of (u_left, u_right), a number, (2, 2) or (4, 4) px^2; and of the
+            robot's report, per coordinate.
 
-        `statistic` is S after the last frame, `history` has (chi2, degrees of freedom, S) of the last 1000 frames.  A
-        covariance that is not positive definite raises a ValueError: it would hide every drift.
+    Attributes:
+        statistic: Largest S after the last frame, in units of its alarm level; above 1 the cameras have moved.
+        axis: The axis of `AXES` that it stands on.
+        since: Frames since that S was last zero: about how long ago it began.
+        score: Largest score of the last frame alone, in standard deviations.
+        history: (chi2, degrees of freedom, statistic) of the last 1000 frames.
 
     >>> from lib.cameras import AffineCamera
     >>> camera = AffineCamera([[100, 0, 0, 0], [0, 100, 0, 0]])
@@ -39,26 +53,33 @@ class DriftMonitor:
     [False, False, True]
     """
 
-    def __init__(
-        self,
-        rig: StereoRig,
-        *,
-        covariance_px2: ArrayLike,
-        sigma_x_mm: float = 0.010,
-        slack: float = 1.0,
-        threshold: float = 8.0,
-        cap: float = 6.0,
-    ) -> None:
-        if not (0 < slack < cap and threshold > 0 and sigma_x_mm >= 0):
-            raise ValueError("slack, threshold, cap, sigma_x_mm: need 0 < slack < cap, threshold > 0, sigma_x_mm >= 0.")
+    threshold = 1.0
+
+    def __init__(self, rig: StereoRig, *, covariance_px2: ArrayLike, sigma_x_mm: float = 0.010) -> None:
+        if not sigma_x_mm >= 0:
+            raise ValueError(f"sigma_x_mm: must not be negative, got {sigma_x_mm}.")
         self.covariance_px2, self.sigma_x_mm = pair_covariance(covariance_px2, 1), sigma_x_mm
-        self.slack, self.threshold, self.cap = slack, threshold, cap
         self.history: deque[tuple[float, int, float]] = deque(maxlen=1000)
+        self._scores: deque[np.ndarray] = deque(maxlen=_MEMORY)
+        self._noise = np.full(len(AXES), 2.0)
         self.reset(rig)
 
     def reset(self, rig: StereoRig) -> None:
-        """Go on with another rig, from a clean slate; `history` stays."""
-        self.rig, self.statistic = rig, 0.0
+        """Go on with a rig that was registered anew, from a clean slate; the noise stays known."""
+        self._bias, self._seen = np.zeros(len(AXES)), 0
+        self.forget()
+        self.follow(rig)
+
+    def forget(self) -> None:
+        """Start the sums anew: what made them large is known."""
+        self._sums, self._runs = np.zeros((2, len(AXES))), np.zeros((2, len(AXES)), dtype=int)
+        self.statistic, self.axis, self.since, self.score = 0.0, "", 0, 0.0
+
+    def follow(self, rig: StereoRig) -> None:
+        """Go on with the same rig, known a little better."""
+        self.rig = rig
+        u, _, _ = np.linalg.svd(rig.linear)
+        self._axes = u.T
 
     def update(
         self,
@@ -85,11 +106,57 @@ class DriftMonitor:
         if not np.isfinite(covariance).all():
             raise ValueError("covariance_px2: must be finite for every landmark that both images show.")
         residual = np.hstack([data.u_left, data.u_right]) - np.hstack(self.rig.project(data.x_mm))
-        freedom = residual.size
-        chi2 = float((residual * np.linalg.solve(covariance, residual[:, :, None])[:, :, 0]).sum())
-        if freedom:
-            spread = 2.0 / (9.0 * freedom)
-            score = (np.cbrt(chi2 / freedom) - (1.0 - spread)) / np.sqrt(spread)
-            self.statistic = max(0.0, self.statistic + min(score, self.cap) - self.slack)
-        self.history.append((chi2, freedom, self.statistic))
+        chi2 = 0.0
+        if len(residual):
+            weight = np.linalg.inv(covariance)
+            weighted = np.einsum("nij,nj->ni", weight, residual)
+            chi2 = float((residual * weighted).sum())
+            mean_covariance = self._axes @ np.linalg.inv(weight.sum(axis=0)) @ self._axes.T
+            sd = np.sqrt(np.diag(mean_covariance))
+            mean = mean_covariance @ (self._axes @ weighted.sum(axis=0))
+            # Wilson and Hilferty 1931: a chi-square as a normal score, so that missing landmarks count alike.
+            spread = 2.0 / (9.0 * residual.size)
+            scatter = (np.cbrt(chi2 / residual.size) - (1.0 - spread)) / np.sqrt(spread)
+            self._add(np.append(mean / sd, scatter), np.append(_LARGEST_BIAS_PX / sd, _LARGEST_BIAS_PX / sd.min()))
+        self.history.append((chi2, residual.size, self.statistic))
         return self.statistic > self.threshold
+
+    def _add(self, value: np.ndarray, largest_bias: np.ndarray) -> None:
+        z = (value - np.clip(self._bias, -largest_bias, largest_bias)) / self._noise
+        # The bias of few frames is uncertain itself.
+        slack = _SLACK + 1.0 / np.sqrt(self._seen + 10.0)
+        signed = np.stack([z, -z])
+        signed[1, -1] = 0.0  # landmarks that scatter less than usual are no fault
+        self._sums = np.maximum(self._sums + np.minimum(signed, _CAP * _LEVEL) - slack, 0.0)
+        self._runs = np.where(self._sums > 0, self._runs + 1, 0)
+        ratio = self._sums / _LEVEL
+        side, axis = np.unravel_index(np.argmax(ratio), ratio.shape)
+        self.statistic, self.axis, self.since = float(ratio[side, axis]), AXES[axis], int(self._runs[side, axis])
+        self.score = float(np.abs(z).max())
+        # A frame that stands out tells of something else than noise and bias.
+        tame = self._bias + np.clip(value - self._bias, -3.0 * self._noise, 3.0 * self._noise)
+        self._scores.append(tame - self._bias)
+        self._seen += 1
+        self._bias = self._bias + (tame - self._bias) * max(1.0 / (self._seen + 10.0), 1.0 / _SLOW)
+        if self._seen % 10 == 0:
+            self._noise = _long_run_sd(np.array(self._scores))
+
+
+def _long_run_sd(values: np.ndarray) -> np.ndarray:
+    """(k,) of series (n, k): the standard deviation that independent frames would need for means to scatter as these do.
+
+    The autocovariances are summed under a triangle; its width is the one of Andrews' rule for a first-order process, or a
+    fixed one that also sees white noise on top of a slow wander, whichever gives more.
+    """
+    n = len(values)
+    d = values - values.mean(axis=0)
+    variance = (d**2).mean(axis=0)
+    rho = np.clip((d[1:] * d[:-1]).mean(axis=0) / np.maximum(variance, 1e-12), 0.0, 0.97)
+    andrews = np.minimum(1.1447 * (4.0 * rho**2 / (1.0 - rho**2) ** 2 * n) ** (1 / 3), n // 4)
+    widths = np.stack([andrews, np.full_like(andrews, min(_WANDER, n // 8))])
+    total = np.stack([variance, variance])
+    for lag in range(1, int(widths.max()) + 1):
+        share = np.maximum(1.0 - lag / (widths + 1.0), 0.0)
+        total += 2.0 * share * (d[lag:] * d[:-lag]).sum(axis=0) / n
+    few = 1.0 + 3.0 / (1.0 + (n / _FEW) ** 2)
+    return np.sqrt(few * np.maximum(total.max(axis=0), np.maximum(variance, 0.05)))
