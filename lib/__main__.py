@@ -28,6 +28,8 @@ python3 -m lib COMMAND [options]        (in the folder of the workbench)
               a recording from videos, a robot's log and labels, as the mapping says
   detect, calibrate, reconstruct, register RECORDING [--out FOLDER]
               landmarks, cameras, surface and registration into files for other programs
+  online RECORDING [--live] [--record FOLDER] [--video FILE.mp4]
+              the online system, frame by frame; --live gives the frames at their own times
   simulate, train, evaluate [...]
               make recordings and data sets; train the landmark detector; measure it (--help says more)
   setup       only make the environment (each command does it when it is needed)
@@ -147,6 +149,7 @@ FUNCTIONS = {
     **{name: ("lib.commands", f"main_{name}") for name in ("import", "detect", "calibrate", "reconstruct", "register")},
     "sweep": ("lib.workbench.sweep", "main"),
     "simulate": ("lib.simulator.dataset", "main"),
+    "online": ("lib.online.command", "main"),
     "train": ("lib.training.command", "main"),
     "evaluate": ("lib.training.command", "main_evaluate"),
 }

@@ -16,12 +16,12 @@ __all__ = ["DriftMonitor"]
 AXES = ("lateral", "lateral", "depth", "epipolar", "scatter")
 # Shift that counts as none, in standard deviations of a frame, and alarm level, of each axis.  Depth is seen worst, so
 # its test is the one for the smallest shifts.
-_SLACK = np.array([1.0, 1.0, 0.55, 1.0, 1.0])
-_LEVEL = np.array([5.2, 5.2, 7.0, 5.2, 7.5])
+_SLACK = np.array([1.0, 1.0, 0.5, 1.0, 1.0])
+_LEVEL = np.array([5.8, 5.8, 8.1, 5.8, 7.5])
 _CAP = 0.75  # of the alarm level: most that one frame adds, so that a single bad frame raises no alarm
 _MEMORY = 1000  # frames that tell the noise
 _FEW = 40  # frames: with fewer the noise is taken for larger than they say, up to twice
-_WANDER = 25  # frames over which the noise may be correlated, whatever neighbouring frames say
+_WANDER = 12  # frames over which the noise may be correlated, whatever neighbouring frames say
 _SLOW = 300  # frames over which the bias is averaged
 _LARGEST_BIAS_PX = 0.5  # of a frame's mean; more is a drift
 
@@ -63,6 +63,11 @@ class DriftMonitor:
         self._scores: deque[np.ndarray] = deque(maxlen=_MEMORY)
         self._noise = np.full(len(AXES), 2.0)
         self.reset(rig)
+
+    @property
+    def inflation(self) -> float:
+        """Variance of the mean of many frames over what the stated noise makes it, along the depth."""
+        return float(self._noise[2] ** 2)
 
     def reset(self, rig: StereoRig) -> None:
         """Go on with a rig that was registered anew, from a clean slate; the noise stays known."""

@@ -20,7 +20,7 @@ from lib.geometry import RigidTransform, pair_covariance
 from lib.least_squares import minimise
 from lib.registration.rigid import Registration, check_spread, motion_jacobian, register, sandwich
 
-__all__ = ["MovedCameras", "identify_motion", "register_images"]
+__all__ = ["MovedCameras", "identify_motion", "misfit", "register_images"]
 
 _FREEDOM = 4.0  # of the Student t that "robust" assumes: gross errors lose their weight, small ones keep it
 _OPEN = 1e-12  # relative curvature below which a direction is not determined
@@ -69,7 +69,7 @@ def register_images(
 class MovedCameras:
     """Which cameras moved, and the rig as it is now.
 
-    `moved` is "none", "together", "left", "right" or "apart", and `rig` has the projections as they are now.  `left` and
+    `moved` is "none", "shifted" (together, without turning), "together", "left", "right" or "apart", and `rig` has the projections as they are now.  `left` and
     `right` are the motions of the cameras (the same one for "together"), None for one that stayed.  An affine camera
     alone does not show the shift along its viewing direction: that is left at zero, and its variance is zero.  `bic` is
     the Bayesian information criterion of each hypothesis; the smallest is chosen.
@@ -94,7 +94,7 @@ def identify_motion(
     """Which cameras moved, and how: the hypothesis with the smallest Bayesian information criterion.
 
     The hypotheses are: neither camera moved (0 parameters), the left or the right alone (5; 6 if it is near-affine), both
-    together (6), each by its own motion.  If the cameras moved apart, triangulated points are no rigid copy of the true
+    together (6, or 3 if they only shifted), each by its own motion.  If the cameras moved apart, triangulated points are no rigid copy of the true
     ones, so Eq. (7) has no exact solution; the images have.
 
     Arguments and errors are those of `register_images`, and the loss is robust.  The noise must be known, by
@@ -103,11 +103,12 @@ def identify_motion(
     observed = _Observed.of(rig, data, u_left, u_right, covariance_px2, sigma_x_mm)
     if not observed.scale_known:
         raise ValueError("covariance_px2: give the noise of the detections; it decides which hypothesis explains them.")
-    together = _register_both(rig, observed, "robust")
+    together, shifted = _register_both(rig, observed, "robust"), _register_shift(rig, observed)
     left, right = (_register_one(rig, observed, side) for side in (0, 1))
     n_left, n_right = (_parameters(camera) for camera in (rig.left, rig.right))
     hypotheses = {
         "none": (None, None, 0),
+        "shifted": (shifted, shifted, 3),
         "together": (together, together, 6),
         "left": (left, None, n_left),
         "right": (None, right, n_right),
@@ -120,6 +121,18 @@ def identify_motion(
         bic[name] = 2 * energy + parameters * np.log(2 * observed.seen.sum())
     best = min(bic, key=bic.__getitem__)
     return MovedCameras(rigs[best], best, *hypotheses[best][:2], bic)
+
+
+def misfit(rig: StereoRig, data: Correspondences, *, covariance_px2: ArrayLike | None = None, parameters: float = 0) -> float:
+    """How badly a rig explains correspondences, as the Bayesian information criteria of `identify_motion` say it.
+
+    Args:
+        covariance_px2: As there.
+        parameters: Number of values that were fitted to these correspondences.
+    """
+    observed = _Observed.of(rig, data, None, None, covariance_px2, 0.0)
+    energy, _ = _evaluate(rig, observed, "robust", RigidTransform.identity())
+    return 2 * energy + parameters * np.log(2 * observed.seen.sum())
 
 
 @dataclass(frozen=True)
@@ -168,6 +181,26 @@ def _register_both(rig: StereoRig, data: _Observed, loss: Loss) -> Registration:
         with suppress(ValueError):  # too few landmarks in both images, or on a line
             starts.append(register(points.x_mm[both], data.x[both], loss=kind).transform)
     return _fit(rig, data, starts, loss, 6)
+
+
+def _register_shift(rig: StereoRig, data: _Observed) -> Registration:
+    """Both cameras, by the same translation."""
+    shift, used = np.zeros(3), data.dimension > 0
+    for _ in range(20):
+        stale = RigidTransform(np.eye(3), shift)
+        energy, (residual, distance2, weights) = _evaluate(rig, data, "robust", stale)
+        J = rig.jacobian(stale.apply(data.x))
+        JtW = np.swapaxes(J, 1, 2) @ (data.information * weights[:, None, None])
+        information, step = (JtW @ J).sum(axis=0), np.einsum("nij,nj->i", JtW, residual)
+        step = np.linalg.lstsq(information, step, rcond=_OPEN)[0]
+        shift = shift + step
+        if np.abs(step).max() < 1e-9:
+            break
+    covariance = np.zeros((6, 6))
+    covariance[3:, 3:] = np.linalg.pinv(information, rcond=_OPEN, hermitian=True)
+    distance, weights = np.where(used, (np.sqrt(distance2), weights), [[np.nan], [0.0]])
+    motion = RigidTransform(np.eye(3), -shift)
+    return Registration(motion, covariance, data.x[used].mean(axis=0), distance, weights, 2 * energy)
 
 
 def _register_one(rig: StereoRig, data: _Observed, side: int) -> Registration:

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
-from lib.online import STAGES, FrameResult
+from lib.online import STAGES, STATES, FrameResult
 from lib.recordings import StereoFrame
 from notebooks.figures.interactive import explore
 from notebooks.figures.overview import landmarks_on
@@ -18,7 +18,7 @@ from notebooks.figures.style import COLOURS, LANDMARK_COLOURS, figure, show_imag
 
 __all__ = ["dashboard", "error_timeline", "frame_browser", "stage_times", "timeline"]
 
-_STATE_COLOURS = {"calibrating": "#f0f0f0", "tracking": "white", "moved": "#fde3c8"}
+_STATE_COLOURS = dict(zip(STATES, ("#f0f0f0", "white", "#dceaf7", "#b0b0b0", "#f7eec2", "#fde3c8"), strict=True))
 _STAGE_COLOURS = dict(
     zip(STAGES, ("#0072B2", "#56B4E9", "#CC79A7", "#D55E00", "#E69F00", "#009E73", "#999999"), strict=True)
 )
@@ -54,9 +54,11 @@ def timeline(results: Sequence[FrameResult], *, bump_at: int | None = None) -> F
             axes[1].axvline(result.index, color=COLOURS["truth"], linewidth=1, alpha=0.6)
     axes[1].set(title="Drift statistic, alarm at 1 (green: the cameras were registered)", ylim=(0, 1.6))
     distance = np.array([result.distance_mm for result in results])
+    sd = np.array([result.distance_sd_mm for result in results])
     for k, (name, colour) in enumerate(LANDMARK_COLOURS.items()):
         axes[2].plot(index, distance[:, k], color=colour, marker=".", label=name)
-    axes[2].set(title="Distance of the tool to the surface, along the view, in mm", xlabel="frame")
+        axes[2].fill_between(index, distance[:, k] - 2 * sd[:, k], distance[:, k] + 2 * sd[:, k], color=colour, alpha=0.2)
+    axes[2].set(title="Distance of the tool to the surface along the view, in mm, with two standard deviations", xlabel="frame")
     axes[2].legend(loc="upper right", ncols=3)
     shown = {result.state for result in results}
     patches = [Patch(facecolor=_STATE_COLOURS[s], edgecolor="#cccccc", label=s) for s in _STATE_COLOURS if s in shown]

@@ -1,0 +1,152 @@
+"""Why do images and robot disagree?  Each cause fits a few numbers to the frames since; the likeliest wins."""
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lib.calibration.offsets import rows_axes
+from lib.cameras import AffineCamera, StereoRig
+from lib.correspondences import Correspondences
+from lib.registration import MovedCameras, identify_motion, misfit
+
+__all__ = ["CONVINCING", "Explanation", "explain"]
+
+#: Rows that a rig explains lose about 5.1 each, 8 log(1 + chi^2 / 4), with 1.7 times the noise 10.
+CONVINCING = 10.0
+_LATEST = 25  # frames by which a report may be late
+_VOLUME_MM = 0.2  # least extent of positions that tell a change of the optics
+_PLAIN = 10.0  # by how much less likely the motion of a camera must be than any other cause
+_OPEN = 40.0  # the same, for a tool that glides: a late report and a shift of the cameras then look alike at first
+_ROBUST = 12.0  # squared residual in standard deviations that begins to count less
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """The likeliest cause.
+
+    Attributes:
+        kind: "none", "moved", "optics", "exchanged", "clock", "slipped" or "open".
+        text: What happened, in a few words.
+        rig: That explains the landmarks; None where no rig does.
+        motion: For "moved".
+        loss: Of a row, the mean over the rows; see `CONVINCING`.
+    """
+
+    kind: str
+    text: str
+    rig: StereoRig | None = None
+    motion: MovedCameras | None = None
+    loss: float = float("nan")
+
+
+def explain(
+    rig: StereoRig, frames: Sequence[Correspondences], past: Sequence[Correspondences], covariance_px2: np.ndarray, *,
+    undecided: bool = True,
+) -> Explanation:  # fmt: skip
+    """The likeliest cause of what `frames` show, with the rig that was right before.
+
+    Args:
+        rig: In force before.
+        frames: Frames that disagree with it, 3 rows each, oldest first.
+        past: Some twenty frames up to the newest of `frames`, and those themselves.
+        covariance_px2: (n, 4, 4) of the complete rows' residuals.
+        undecided: More frames may come: answer "open" where a motion and a late report explain these about equally well.
+
+    Raises:
+        ValueError: If the landmarks leave every motion open.
+    """
+    data = Correspondences.join(frames).complete
+    noise = {"covariance_px2": covariance_px2}
+    motion = identify_motion(rig, data, **noise)
+    least = min(motion.bic.values())
+    found = Explanation("moved", _MOVES.get(motion.moved, motion.moved), motion.rig, motion)
+    if motion.moved == "none":
+        found = Explanation("none", "", rig, motion)
+    others: list[tuple[float, Explanation]] = []
+    swapped = replace(data, u_left=data.u_right, u_right=data.u_left)
+    others.append((misfit(rig, swapped, **noise), Explanation("exchanged", "the eyes are exchanged", rig)))
+    late = _lateness(rig, frames, past, covariance_px2)
+    if late is not None:
+        others.append(late)
+    axes = rows_axes(data)
+    if np.isfinite(axes).all():
+        offset = _offset(rig, data, axes, covariance_px2)
+        slipped = replace(data, x_mm=data.x_mm + axes @ offset)
+        text = f"the tool slipped by {np.linalg.norm(offset):.2f} mm"
+        others.append((misfit(rig, slipped, parameters=3, **noise), Explanation("slipped", text, rig)))
+    depth = np.linalg.svd(data.x_mm - data.x_mm.mean(axis=0), compute_uv=False)[-1] / np.sqrt(len(data))
+    if len(frames) >= 4 and rig.is_affine and depth > _VOLUME_MM:
+        with suppress(np.linalg.LinAlgError):
+            fresh = _refitted(data, covariance_px2)
+            zoom = [_zoom(new) / _zoom(old) for new, old in ((fresh.left, rig.left), (fresh.right, rig.right))]
+            text = f"the optics changed: zoom x {zoom[0]:.3f} left, x {zoom[1]:.3f} right"
+            others.append((misfit(fresh, data, parameters=16, **noise), Explanation("optics", text, fresh)))
+    best, other = min(others, key=lambda pair: pair[0])
+    penalty = {"slipped": 3, "optics": 16, "clock": 2}.get(other.kind, 0) * np.log(2.0 * 2.0 * len(data))
+    other = replace(other, loss=(best - penalty) / len(data))
+    if undecided and found.kind == "moved" and late is not None and late[0] - least <= _OPEN and best >= least - _PLAIN:
+        return Explanation("open", "the cameras moved or the report is late: not decided yet")
+    return other if best < least - _PLAIN else found
+
+
+_MOVES = {
+    "shifted": "both cameras shifted", "together": "both cameras moved together", "left": "the left camera moved",
+    "right": "the right camera moved", "apart": "the cameras moved apart",
+}  # fmt: skip
+
+
+def _lateness(rig, frames, past, covariance_px2) -> tuple[float, Explanation] | None:
+    """The delay between report and images that explains the frames best."""
+    number = {int(part.frame[0]): part for part in past}
+    best = None
+    for delay in [*range(-_LATEST, 0), *range(1, _LATEST + 1)]:
+        pairs = []
+        for part in frames:
+            seen, told = (part, number.get(int(part.frame[0]) + delay))
+            if delay > 0:  # the report is late: what it says now, the images showed before
+                seen, told = number.get(int(part.frame[0]) - delay), part
+            if seen is None or told is None:
+                break
+            pairs.append(replace(seen, x_mm=told.x_mm))
+        else:
+            data = Correspondences.join(pairs).complete
+            if len(data) < 0.7 * len(covariance_px2):
+                continue
+            noise = np.resize(covariance_px2, (len(data), 4, 4))
+            # Fewer rows must not make a delay likelier.
+            value = misfit(rig, data, covariance_px2=noise, parameters=2) * len(covariance_px2) / len(data)
+            if best is None or value < best[0]:
+                who = "robot's report is" if delay > 0 else "images are"
+                best = value, Explanation("clock", f"the {who} late by {abs(delay)} frames", rig)
+    return best
+
+
+def _offset(rig: StereoRig, data: Correspondences, axes: np.ndarray, covariance_px2: np.ndarray) -> np.ndarray:
+    """(3,) mm in the tool's axes by which all landmarks lie off the report, robustly."""
+    weight, offset = np.linalg.inv(covariance_px2), np.zeros(3)
+    y = np.hstack([data.u_left, data.u_right])
+    for _ in range(10):
+        x = data.x_mm + axes @ offset
+        r, J = y - np.hstack(rig.project(x)), rig.jacobian(x) @ axes
+        W = weight * (_ROBUST / (_ROBUST + np.einsum("ni,nij,nj->n", r, weight, r)))[:, None, None]
+        JtW = np.swapaxes(J, 1, 2) @ W
+        offset = offset + np.linalg.lstsq((JtW @ J).sum(axis=0), np.einsum("nij,nj->i", JtW, r), rcond=None)[0]
+    return offset
+
+
+def _refitted(data: Correspondences, covariance_px2: np.ndarray) -> StereoRig:
+    """Two affine cameras fitted to the rows, robustly."""
+    y, H = np.hstack([data.u_left, data.u_right]), np.column_stack([data.x_mm, np.ones(len(data))])
+    variance, weight = np.einsum("nii->n", covariance_px2) / 4.0, np.ones(len(data))
+    for _ in range(10):
+        root = np.sqrt(weight / variance)[:, None]
+        M = np.linalg.lstsq(root * H, root * y, rcond=None)[0].T
+        weight = _ROBUST / (_ROBUST + ((y - H @ M.T) ** 2).sum(axis=1) / variance)
+    return StereoRig(AffineCamera(M[:2]), AffineCamera(M[2:]))
+
+
+def _zoom(camera: AffineCamera) -> float:
+    """Pixels per mm, the mean of both directions."""
+    return float(np.sqrt(np.linalg.norm(np.cross(*camera.linear))))

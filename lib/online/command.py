@@ -1,0 +1,110 @@
+"""``python3 -m lib online RECORDING``."""
+
+import argparse
+import contextlib
+import resource
+import sys
+import time
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from lib.landmarks import Detector
+from lib.online.feeds import Live, recorded
+from lib.online.pipeline import OnlinePipeline
+from lib.online.record import Recorder
+from lib.online.result import FrameResult, Settings
+from lib.online.video import Dashboard, VideoFile
+from lib.recordings import Recording
+
+__all__ = ["Tally", "main"]
+
+
+@dataclass
+class Tally:
+    """What a run came to, in constant memory.
+
+    Attributes:
+        latency_s: From a frame's arrival to its distance, of the newest 100,000 frames.
+    """
+
+    frames: int = 0
+    surfaces: int = 0
+    dropped: int = 0
+    states: Counter = field(default_factory=Counter)
+    failures: Counter = field(default_factory=Counter)
+    latency_s: list[float] = field(default_factory=list)
+    start: float = field(default_factory=time.monotonic)
+    cpu_start: float = field(default_factory=time.process_time)
+    _newest: int = -1
+
+    def add(self, result: FrameResult, latency_s: float) -> None:
+        """Count a frame."""
+        self.frames += 1
+        self.dropped = result.dropped
+        if result.reconstructed_at is not None and result.reconstructed_at != self._newest:
+            self.surfaces, self._newest = self.surfaces + 1, result.reconstructed_at
+        self.states[result.state] += 1
+        self.failures.update(result.failures.keys())
+        if len(self.latency_s) < 100_000:
+            self.latency_s.append(latency_s)
+
+    def __str__(self) -> str:
+        spent, cpu = time.monotonic() - self.start, time.process_time() - self.cpu_start
+        median, late = 1e3 * np.quantile(self.latency_s or [np.nan], (0.5, 0.99))
+        memory_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        states = ", ".join(f"{state} {n}" for state, n in self.states.most_common())
+        failures = ", ".join(f"{name} {n}" for name, n in self.failures.most_common()) or "none"
+        return (
+            f"{self.frames} frames in {spent:.1f} s, {self.frames / spent:.1f} a second; processor {cpu / max(self.frames, 1):.3f} s "
+            f"a frame\n{self.surfaces} surfaces, {self.surfaces / spent:.1f} a second; {self.dropped} dropped\n"
+            f"latency from frame to distance: {median:.0f} ms median, {late:.0f} ms 99th percentile\n"
+            f"states: {states}\nfailures: {failures}\nmemory: at most {memory_mb:.0f} MB"
+        )
+
+
+def main(argv: list[str] | None = None) -> int:
+    """`python3 -m lib online`: run the online system over a recording, as fast as it goes or as if it were live."""
+    parser = argparse.ArgumentParser(prog="python3 -m lib online", description=main.__doc__.split(": ", 1)[1])
+    add = parser.add_argument
+    add("recording", type=Path)
+    add("--live", action="store_true", help="frames come at their own times and may be lost; surfaces in a process beside")
+    add("--record", type=Path, metavar="FOLDER", help="write inputs and outputs; FOLDER/input can be given again")
+    add("--video", type=Path, metavar="FILE.mp4", help="write what the system sees and says as a video")
+    add("--weights", type=Path, help="detector (default: the one that ships)")
+    add("--frames", type=int, help="only the first N frames")
+    add("--surface-every", type=int, default=1, help="ask for a surface in every N-th frame")
+    a = parser.parse_args(argv)
+    recording = Recording.open(a.recording)
+    settings = Settings(surface_every=a.surface_every, fps=recording.fps, robot_accuracy_mm=recording.robot_accuracy_mm)
+    detector = Detector.load(a.weights)
+    frames = recorded(recording, a.frames)
+    feed, recorder = Live(frames) if a.live else frames, None
+    with contextlib.ExitStack() as stack:
+        video = stack.enter_context(VideoFile(a.video, min(recording.fps, 25.0))) if a.video else None
+        if a.record:
+            recorder = Recorder(a.record, recording, patient=not a.live)
+            stack.callback(recorder.close)
+        pipeline = stack.enter_context(OnlinePipeline(detector, settings=settings, beside=a.live))
+        tally, page, state = Tally(), Dashboard(), ""
+        for arrival in feed:
+            start = arrival.arrived_s if a.live else time.monotonic()
+            result = pipeline.step(arrival.left, arrival.right, arrival.kinematics, time_s=arrival.time_s)
+            tally.add(result, time.monotonic() - start)
+            if (result.state, result.cause) != state:
+                state = (result.state, result.cause)
+                print(f"frame {result.index:6d} {result.time_s:9.2f} s: {result.state} {result.cause}".rstrip())
+            for name, why in result.failures.items():
+                print(f"frame {result.index:6d} {name}: {why}", file=sys.stderr)
+            if recorder:
+                recorder.add(arrival, result)
+            if video:
+                video.add(page.draw(arrival.left, arrival.right, result))
+    print(tally)
+    if a.live:
+        print(f"frames lost before they were seen: {feed.lost}")
+    if recorder:
+        print(recorder.failure or f"recorded in {recorder.folder}; images left out of the record: {recorder.left_out}")
+    return 0

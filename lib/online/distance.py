@@ -1,0 +1,120 @@
+"""From tip to retina: where each landmark is, how far from the surface, and how sure that is.
+
+A landmark lies where the robot reports it, plus a correction that changes slowly: a tool that slips, a robot that bends.
+A Kalman filter follows the correction: the robot's motion, which is known, drives the prediction, and each frame's
+triangulated landmarks measure it.  So the distances have the robot's small noise and not the detector's.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lib.cameras import StereoRig
+from lib.correspondences import LANDMARKS
+from lib.online.result import FrameResult, Settings
+from lib.online.tracker import RigTracker
+from lib.surface import Reconstruction
+
+__all__ = ["Surface", "TipDistance"]
+
+_WALK_MM = 0.005  # per square root of a second: how fast the correction may change
+_SMOOTH_S = 0.2  # over which the robot's velocity is averaged
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """A reconstruction, the number and time of its frame, and the seconds of its stages."""
+
+    reconstruction: Reconstruction | None
+    index: int
+    time_s: float
+    seconds: dict[str, float]
+    failure: tuple[str, str] | None = None
+
+
+class TipDistance:
+    """Follows the landmarks and measures their distance to the newest surface."""
+
+    def __init__(self, settings: Settings) -> None:
+        self.settings = settings
+        self.reset()
+        self._x, self._velocity, self._moved_s = None, np.zeros((3, 3)), float("nan")
+
+    def reset(self) -> None:
+        """Forget the correction: the cameras that measured it are not where they were."""
+        self._correction, self._time = np.zeros((len(LANDMARKS), 3)), float("nan")
+        self._covariance = np.tile(self.settings.slip_mm**2 * np.eye(3), (len(LANDMARKS), 1, 1))
+
+    def measure(self, result: FrameResult, tracker: RigTracker, x_mm: np.ndarray, surface: Surface | None) -> None:
+        """Set the result's distances, standard deviations, approach and alarm.
+
+        Args:
+            x_mm: (3, 3) that the robot reports, NaN where it is silent or not to be believed.
+            surface: The newest.
+        """
+        seen, covariance = self.triangulate(result, tracker)
+        robot = np.isfinite(x_mm).all(axis=1)
+        self._predict(result.time_s, x_mm)
+        if result.state == "tracking":
+            self._correct(seen - tracker.corrected(result.landmarks).x_mm, covariance * tracker.persistence)
+        position = np.where(robot[:, None], x_mm + self._correction, seen)
+        own = self._covariance + self.settings.robot_accuracy_mm**2 * np.eye(3)
+        covariance = np.where(robot[:, None, None], own, covariance)
+        if surface is None or result.time_s - surface.time_s > self.settings.stale_s:
+            return
+        result.approach_mm_s = self._distances(result, tracker.rig, position, covariance, surface, tracker)
+
+    @staticmethod
+    def triangulate(result: FrameResult, tracker: RigTracker) -> tuple[np.ndarray, np.ndarray]:
+        """Landmarks as the cameras see them (3, 3) mm, also into the result; their covariance from the detector (3, 3, 3)."""
+        data = result.landmarks
+        noise = tracker.detection_covariance(data)
+        found = tracker.rig.triangulate(data.u_left, data.u_right, noise)
+        result.x_tool_mm = found.x_mm
+        return found.x_mm, np.array(np.broadcast_to(found.covariance_mm2, (len(data), 3, 3)))
+
+    def _predict(self, time_s: float, x_mm: np.ndarray) -> None:
+        if np.isfinite(self._time) and time_s > self._time:
+            self._covariance = self._covariance + _WALK_MM**2 * (time_s - self._time) * np.eye(3)
+            self._covariance = np.minimum(self._covariance, 1.0)
+        self._time = time_s
+        if not np.isfinite(x_mm).all():
+            return
+        if self._x is not None and time_s > self._moved_s:
+            step_s = time_s - self._moved_s
+            gain = 1.0 - np.exp(-step_s / _SMOOTH_S)
+            self._velocity = self._velocity + gain * ((x_mm - self._x) / step_s - self._velocity)
+        self._x, self._moved_s = x_mm.copy(), time_s
+
+    def _correct(self, gap: np.ndarray, noise: np.ndarray) -> None:
+        for k in np.flatnonzero(np.isfinite(gap).all(axis=1) & np.isfinite(noise).all(axis=(1, 2))):
+            gain = self._covariance[k] @ np.linalg.inv(self._covariance[k] + noise[k])
+            self._correction[k] += gain @ (gap[k] - self._correction[k])
+            self._covariance[k] = (np.eye(3) - gain) @ self._covariance[k]
+
+    def _distances(
+        self, result: FrameResult, rig: StereoRig, x: np.ndarray, covariance: np.ndarray, at: Surface, tracker: RigTracker
+    ) -> np.ndarray:
+        """Fill in distances and their standard deviations; returns the speed of approach along the view (3,)."""
+        surface, camera = at.reconstruction.surface, at.reconstruction.rig.left
+        found, view = surface.distance(x, camera), camera.viewing_direction
+        result.distance_mm, result.normal_mm = found.along_view_mm, found.along_normal_mm
+        drift = self.settings.eye_mm_s * max(result.time_s - at.time_s, 0.0)
+        speed = np.full(len(x), np.nan)
+        rows = np.flatnonzero(np.isfinite(found.along_view_mm))
+        if not len(rows):
+            return speed
+        u = camera.project(x[rows])
+        slope = np.stack([surface.derivative(u, order) @ view for order in ((1, 0), (0, 1))], axis=1)
+        # How the distance along the view changes with the tip: the surface point behind it moves too.
+        towards = slope @ camera.linear - view
+        behind, nearest = surface.covariance(u), surface.covariance(found.nearest_u[rows])
+        normal = surface.normal(found.nearest_u[rows])
+        # The calibration puts the surface beside the robot's points, and not the tip.
+        shared = tracker.point_covariance(x[rows])
+        for sd, direction, own in ((result.distance_sd_mm, towards, behind), (result.normal_sd_mm, normal, nearest)):
+            along = np.broadcast_to(view, direction.shape) if direction is towards else normal
+            variance = np.einsum("ni,nij,nj->n", direction, covariance[rows] + shared, direction)
+            sd[rows] = np.sqrt(variance + np.einsum("ni,nij,nj->n", along, own, along) + drift**2)
+        speed[rows] = -np.einsum("ni,ni->n", towards, self._velocity[rows])
+        return speed

@@ -1,0 +1,168 @@
+"""What a user may change about the online system, and what it says about each frame."""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.stats import norm
+
+from lib.cameras import StereoRig
+from lib.correspondences import LANDMARKS, Correspondences
+from lib.registration import MovedCameras
+from lib.surface import Reconstruction
+
+__all__ = ["STAGES", "STATES", "FrameResult", "Settings"]
+
+#: The stages whose seconds and failures a `FrameResult` names, in their order.
+STAGES = ("detect", "calibrate", "register", "match", "triangulate", "surface", "distance")
+
+#: What each state means, and what follows for the distances.
+STATES = {
+    "calibrating": "there is no rig yet, or the optics changed; no distances",
+    "tracking": "images, robot and rig agree; distances from all three",
+    "unseen": "the eye is in view and the landmarks are not; distances from the robot's report, with a growing sd",
+    "blind": "an image is black, corrupt, or repeats the one before; no distances",
+    "robot": "the robot's report is missing, frozen or late, or the tool slipped; distances from the images",
+    "moved": "images and robot disagree and nothing explains it yet; no distances",
+}
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a user may change.
+
+    Attributes:
+        calibration_frames: Frames with landmarks before the first calibration, and frames after which it is not repeated.
+            In between it is repeated whenever a quarter more frames are at hand; after that each frame updates its
+            moments.
+        registration_frames: Frames of the tool after the cameras moved before the first registration (the paper's 3),
+            and frames after which it is not refined.
+        give_up_frames: Frames that no motion explains after which the rig is calibrated afresh.
+        surface_every: Reconstruct the surface in every n-th frame.
+        setting: "fast" or "quality", as `lib.surface.reconstruct` has it.
+        control: Control points of the surface (n_x, n_y).
+        fps: Frames a second, for frames that come without a time.
+        stale_s: Distances end where the surface, or the last sight of the landmarks, is older.
+        eye_mm_s: Speed at which the eye may move unseen; the distance's standard deviation grows by it with the surface's
+            age.
+        slip_mm: Standard deviation of how far the landmarks may lie off the robot's report, beside its own accuracy.
+        robot_accuracy_mm: Standard deviation of the robot's report, per coordinate.
+        alarm_mm, miss_rate: A tip is `too_close` where its distance may be below alarm_mm: a true one below it is missed
+            with this probability.  False alarms are as rare for tips farther away than alarm_mm and twice
+            `FrameResult.margin_mm`.
+    """
+
+    calibration_frames: tuple[int, int] = (8, 60)
+    registration_frames: tuple[int, int] = (3, 12)
+    give_up_frames: int = 8
+    surface_every: int = 1
+    setting: str = "fast"
+    control: tuple[int, int] = (16, 12)
+    fps: float = 25.0
+    stale_s: float = 5.0
+    eye_mm_s: float = 0.02
+    slip_mm: float = 0.010
+    robot_accuracy_mm: float = 0.010
+    alarm_mm: float = 0.2
+    miss_rate: float = 0.01
+
+    def __post_init__(self) -> None:
+        for name in ("calibration_frames", "registration_frames"):
+            first, last = getattr(self, name)
+            if not 2 <= first <= last:
+                raise ValueError(f"{name}: expected 2 <= first <= last, got {(first, last)}.")
+        if self.surface_every < 1 or self.give_up_frames < 1:
+            raise ValueError("surface_every, give_up_frames: must be at least 1.")
+        if not (self.fps > 0 and self.stale_s > 0 and min(self.eye_mm_s, self.slip_mm, self.robot_accuracy_mm) >= 0):
+            raise ValueError("fps, stale_s must be positive; eye_mm_s, slip_mm, robot_accuracy_mm must not be negative.")
+        if not 0 < self.miss_rate < 0.5:
+            raise ValueError(f"miss_rate: expected a probability below one half, got {self.miss_rate}.")
+
+
+def _nothing() -> Correspondences:
+    """The three landmarks, none of them seen or reported."""
+    missing = np.full((len(LANDMARKS), 2), np.nan)
+    return Correspondences.of_points(
+        np.full((len(LANDMARKS), 3), np.nan), missing, missing, landmark=range(len(LANDMARKS))
+    )
+
+
+def _unknown() -> np.ndarray:
+    return np.full(len(LANDMARKS), np.nan)
+
+
+@dataclass
+class FrameResult:
+    """What one frame told.  Arrays are NaN, objects None, where a stage did not run or failed.
+
+    Attributes:
+        index, time_s: Number of the frame since the start; its time, video clock.
+        state: One of `STATES`.
+        cause: Why the state is not "tracking", in a few words; "" where it is.
+        landmarks: Base, tip_1 and tip_2: where the detector saw them and where the robot reports them.
+        x_tool_mm: (3, 3) landmarks as the cameras triangulate them.
+        rig: In force after this frame.
+        reconstruction, reconstructed_at: The newest surface and its points, and the number of the frame that they are
+            from.
+        distance_mm, distance_sd_mm: (3,) from each landmark to the surface along the view, positive = above it, and its
+            standard deviation: detector, robot, calibration, surface and the surface's age.
+        normal_mm, normal_sd_mm: The same along the surface's normal.
+        approach_mm_s: (3,) speed at which the robot takes each landmark towards the surface, along the view.
+        too_close, margin_mm: (3,) alarm of `Settings.alarm_mm`, and how far above it the alarm already sounds.
+        rests_on: Time in s of the newest frame behind each of "landmarks", "robot", "rig" and "surface"; NaN = none.
+        drift: Statistic of the drift monitor, in units of its alarm threshold.
+        motion: The registration made in this frame, if one was.
+        dropped: Surfaces asked for and dropped so far, because a newer frame came first.
+        seconds, failures: By stage: wall-clock seconds of what ran, reason of what failed.  Failures of no stage are
+            "images", "robot" and "worker".
+    """
+
+    index: int
+    time_s: float = float("nan")
+    state: str = "calibrating"
+    cause: str = ""
+    landmarks: Correspondences = field(default_factory=_nothing)
+    x_tool_mm: np.ndarray = field(default_factory=lambda: np.full((3, 3), np.nan))
+    rig: StereoRig | None = None
+    reconstruction: Reconstruction | None = None
+    reconstructed_at: int | None = None
+    distance_mm: np.ndarray = field(default_factory=_unknown)
+    distance_sd_mm: np.ndarray = field(default_factory=_unknown)
+    normal_mm: np.ndarray = field(default_factory=_unknown)
+    normal_sd_mm: np.ndarray = field(default_factory=_unknown)
+    approach_mm_s: np.ndarray = field(default_factory=_unknown)
+    too_close: np.ndarray = field(default_factory=lambda: np.zeros(3, dtype=bool))
+    margin_mm: np.ndarray = field(default_factory=_unknown)
+    rests_on: dict[str, float] = field(default_factory=dict)
+    drift: float = 0.0
+    motion: MovedCameras | None = None
+    dropped: int = 0
+    seconds: dict[str, float] = field(default_factory=dict)
+    failures: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def reconstructed(self) -> bool:
+        """True where the surface is this frame's own."""
+        return self.reconstructed_at == self.index
+
+    def distance_at(self, time_s: float) -> np.ndarray:
+        """(3,) mm along the view at a later time, as the robot moves on: bridges the latency."""
+        return self.distance_mm - self.approach_mm_s * (time_s - self.time_s)
+
+    def watch(self, settings: Settings) -> None:
+        """Set the alarm of each tip from its distance."""
+        self.margin_mm = norm.isf(settings.miss_rate) * self.distance_sd_mm
+        self.too_close = self.distance_mm < settings.alarm_mm + self.margin_mm
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Time a stage, and note its failure in place of raising it."""
+        start = time.perf_counter()
+        try:
+            yield
+        except Exception as error:  # whatever a stage dies of: the next frame comes in 40 ms
+            self.failures[name] = f"{type(error).__name__}: {error}"
+        finally:
+            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start

@@ -1,0 +1,172 @@
+"""Where surfaces are made: in turn with the frames, or in a process beside them, the newest frame first."""
+
+import contextlib
+import multiprocessing
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from multiprocessing import shared_memory
+
+import numpy as np
+
+from lib.cameras import StereoRig
+from lib.online.distance import Surface
+from lib.surface import Reconstruction, reconstruct
+
+__all__ = ["Beside", "InTurn", "SurfaceJob"]
+
+_PARTS_OF_MATCHING = {"mask": "match", "refine": "match"}
+_CHECK_S = 2.0  # between two looks at whether an idle worker lives
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceJob:
+    """A stereo frame to reconstruct, and what `lib.surface.reconstruct` is told."""
+
+    left: np.ndarray
+    right: np.ndarray
+    rig: StereoRig
+    index: int
+    time_s: float
+    options: dict
+
+
+def make(job: SurfaceJob, reconstruct: Callable[..., Reconstruction] = reconstruct) -> Surface:
+    """The surface of a job, or why there is none."""
+    seconds: dict[str, float] = {}
+    try:
+        found, failure = reconstruct(job.left, job.right, job.rig, seconds=seconds, **job.options), None
+    except Exception as error:  # whatever it dies of: the next frame may have a surface
+        stage = next(reversed(seconds), "match")
+        found, failure = None, (_PARTS_OF_MATCHING.get(stage, stage), f"{type(error).__name__}: {error}")
+    spent: dict[str, float] = {}
+    for part, duration in seconds.items():
+        stage = _PARTS_OF_MATCHING.get(part, part)
+        spent[stage] = spent.get(stage, 0.0) + duration
+    return Surface(found, job.index, job.time_s, spent, failure)
+
+
+class InTurn:
+    """Makes each surface before the frame goes on: the same input gives the same output."""
+
+    def __init__(self, reconstruct: Callable[..., Reconstruction] = reconstruct) -> None:
+        self._reconstruct, self._done = reconstruct, []
+        self.dropped = 0
+
+    def submit(self, job: SurfaceJob) -> None:
+        """Take in a job."""
+        self._done.append(make(job, self._reconstruct))
+
+    def collect(self) -> tuple[list[Surface], str]:
+        """The surfaces made since the last call, oldest first, and what happened to the worker ("" = nothing)."""
+        done, self._done = self._done, []
+        return done, ""
+
+    def forget(self) -> None:
+        """Drop what is being made: its rig is not to be believed."""
+        self._done.clear()
+
+    def close(self) -> None:
+        """End."""
+
+
+class Beside:
+    """Makes surfaces in a process of its own.  One job is in work, one waits; a newer one takes its place.
+
+    A worker that dies is started again.  Images go through shared memory, results through a pipe.
+    """
+
+    def __init__(self) -> None:
+        self.dropped, self._waiting, self._in_work, self._stale = 0, None, False, False
+        self._memory: shared_memory.SharedMemory | None = None
+        self._start()
+
+    def _start(self) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._pipe, theirs = context.Pipe()
+        self._process = context.Process(target=_work, args=(theirs,), daemon=True, name="surface worker")
+        self._process.start()
+        theirs.close()
+        self._in_work = False
+
+    @property
+    def pid(self) -> int:
+        """Of the process."""
+        return self._process.pid
+
+    def submit(self, job: SurfaceJob) -> None:
+        """Take in a job; the one that waited is dropped."""
+        self.dropped += self._waiting is not None
+        self._waiting = job
+        self._send()
+
+    def _send(self) -> None:
+        job = self._waiting
+        if self._in_work or job is None:
+            return
+        size = job.left.nbytes + job.right.nbytes
+        if self._memory is None or self._memory.size < size:
+            self._free()
+            self._memory = shared_memory.SharedMemory(create=True, size=size)
+        pair = np.ndarray((2, *job.left.shape), np.uint8, self._memory.buf)
+        pair[0], pair[1] = job.left, job.right
+        with contextlib.suppress(OSError):  # a dead worker is found by `collect`
+            self._pipe.send((self._memory.name, pair.shape, job.rig, job.index, job.time_s, job.options))
+        self._waiting, self._in_work, self._stale = None, True, False
+
+    def collect(self) -> tuple[list[Surface], str]:
+        """As `InTurn.collect`; never waits."""
+        done, event = [], ""
+        try:
+            while self._pipe.poll():
+                surface = self._pipe.recv()
+                self._in_work = False
+                if not self._stale:
+                    done.append(surface)
+        except (EOFError, OSError):
+            pass  # found dead below
+        if not self._process.is_alive():
+            event = f"the surface worker ended (exit code {self._process.exitcode}) and was started again"
+            self._pipe.close()
+            self._start()
+        self._send()
+        return done, event
+
+    def forget(self) -> None:
+        """Drop what waits and what is in work."""
+        self.dropped += self._waiting is not None
+        self._waiting, self._stale = None, True
+
+    def wait(self, timeout_s: float) -> None:
+        """Until the job in work is done, the worker died, or the time is over."""
+        end = time.monotonic() + timeout_s
+        while self._in_work and self._process.is_alive() and not self._pipe.poll(0.02) and time.monotonic() < end:
+            pass
+
+    def _free(self) -> None:
+        if self._memory is not None:
+            self._memory.close()
+            self._memory.unlink()
+            self._memory = None
+
+    def close(self) -> None:
+        """End the process and free its memory."""
+        with contextlib.suppress(OSError):
+            self._pipe.send(None)
+        self._process.join(2.0)
+        if self._process.is_alive():
+            self._process.kill()
+            self._process.join()
+        self._pipe.close()
+        self._free()
+
+
+def _work(pipe: multiprocessing.connection.Connection) -> None:
+    """In the worker: jobs until None or until the other side is gone."""
+    with contextlib.suppress(EOFError, OSError, KeyboardInterrupt):
+        while (job := pipe.recv()) is not None:
+            name, shape, rig, index, time_s, options = job
+            memory = shared_memory.SharedMemory(name=name)
+            left, right = np.ndarray(shape, np.uint8, memory.buf).copy()
+            memory.close()
+            pipe.send(make(SurfaceJob(left, right, rig, index, time_s, options)))

@@ -1,0 +1,314 @@
+"""Which rig is in force?  Calibration from the first frames, watch over each frame, registration after a motion."""
+
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lib.calibration import Calibration, OnlineCalibration, with_offsets
+from lib.cameras import StereoRig
+from lib.correspondences import Correspondences
+from lib.online.causes import CONVINCING, explain
+from lib.online.result import FrameResult, Settings
+from lib.registration import DriftMonitor, MovedCameras
+from lib.trust import judge
+
+__all__ = ["RigTracker", "Seen"]
+
+_CHI2_4_MEDIAN = 3.357
+_STANDS_OUT = 8.0  # score of a single frame that is not to be believed
+_FAR_MM = 200.0  # of the robot's median position: no tool reaches that far
+_PAST = 40  # frames kept to find a late report
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Landmarks of a frame, and how to pair them with the robot by another rig, which moves pixels to one instant."""
+
+    data: Correspondences
+    pair: Callable[[StereoRig | None], Correspondences]
+
+
+class RigTracker:
+    """The rig in force, and whether images and robot still agree with it.
+
+    Attributes:
+        rig: In force, None before the first calibration.
+        calibration: That `rig` comes from, None for a rig that was given.
+        state, cause: As in `FrameResult`: "calibrating", "tracking", "moved" or "robot".
+        rests_on_s: Time of the newest frame that went into the rig.
+        doubted_since: Number of the first frame that disagreed, while the state is not "tracking".
+    """
+
+    def __init__(
+        self, rig: StereoRig | Calibration | None, *, noise_px: float, settings: Settings,
+        calibrate: Callable[..., Calibration],
+    ) -> None:  # fmt: skip
+        self.settings, self._calibrate = settings, calibrate
+        self._noise_px, self._given = noise_px, rig is not None
+        self._start_again([])
+        if isinstance(rig, StereoRig):
+            self._use(rig, None)
+        elif rig is not None:
+            self._use(rig.rig, rig)
+
+    def _start_again(self, frames: Sequence[Seen], cause: str = "") -> None:
+        """Without a rig: at first, and where the optics changed, not only the pose."""
+        self.rig, self.calibration, self.state, self.cause = None, None, "calibrating", cause
+        self._frames, self._tried, self._fitted = list(frames), 0, 0  # that the rig is calibrated with; how many of them
+        self._moments: OnlineCalibration | None = None  # take the frames after the last calibration
+        self._monitor: DriftMonitor | None = None
+        self._recent: deque[Seen] = deque(maxlen=_PAST)  # not yet taken in: the cameras may have moved meanwhile
+        self._doubtful: deque[int] = deque(maxlen=_PAST)  # numbers of frames that stood out alone
+        self._past: deque[Correspondences] = deque(maxlen=_PAST)
+        self._since: list[Seen] = []  # frames that tell where the cameras are now
+        self._before: StereoRig | None = None  # the rig before, while the frames since are being explained
+        self._motion: MovedCameras | None = None
+        self._motion_before: MovedCameras | None = None
+        self._waiting, self._held, self.rests_on_s, self.doubted_since = 0, False, float("nan"), None
+
+    def _use(self, rig: StereoRig, calibration: Calibration | None) -> None:
+        self.rig, self.calibration, self.state, self.cause = rig, calibration, "tracking", ""
+        if self._monitor is None:
+            self._monitor = DriftMonitor(rig, covariance_px2=self._noise_px**2, sigma_x_mm=0.0)
+        self._monitor.reset(rig)
+        self._scale2 = 1.0
+        if calibration is not None:
+            both = calibration.view_inliers[calibration.inliers].all(axis=1)
+            _, _, weight, r = calibration.system
+            weight, r = weight if len(weight) == 1 else weight[both], r[both]
+            scatter = (
+                np.median(np.einsum("ni,nij,nj->n", r, np.broadcast_to(weight, (len(r), 4, 4)), r)) / _CHI2_4_MEDIAN
+            )
+            # Corrected for the 16 parameters that the residuals have paid for, and the upper end of what so few allow.
+            self._scale2 = scatter / (1.0 - 16.0 / max(r.size, 17)) * (1.0 + 1.0 / np.sqrt(len(r))) ** 2
+
+    def take(self, result: FrameResult, frame: Seen) -> None:
+        """A frame with landmarks that both images and the robot know."""
+        self._past.append(frame.data)
+        accepted = [frame]
+        if self.rig is not None:
+            with result.stage("register"):
+                accepted = []
+                accepted = self._watch(result, frame)
+        if self._takes_in(accepted):
+            with result.stage("calibrate"):
+                self._improve(accepted)
+        if self.state == "tracking" and accepted:
+            self.rests_on_s = result.time_s
+
+    # --- calibration --------------------------------------------------------------------------------------------------
+
+    def _takes_in(self, accepted: list[Seen]) -> bool:
+        """As soon as possible, then whenever a quarter more frames are at hand; never again once the cameras moved."""
+        first, last = self.settings.calibration_frames
+        if self._given or self._motion is not None or self._moments is not None:
+            return self._moments is not None and bool(accepted) and self._motion is None
+        self._frames += accepted
+        n = len(self._frames)
+        if self.rig is None:
+            self._frames = self._frames[-2 * last :]
+            return n >= first and bool(accepted) and n >= self._tried + (1 if n < 2 * first else 3)
+        return n > last or n >= 1.25 * self._fitted
+
+    def _improve(self, accepted: list[Seen]) -> None:
+        """Calibrate with all frames so far; after the last calibration let each frame update its moments."""
+        if self.rig is not None and len(self._frames) > self.settings.calibration_frames[1]:
+            if self._moments is None:
+                known, rows = self.calibration, self.calibration.view_inliers.all(axis=1)
+                self._moments = OnlineCalibration(sigma_u_px=known.sigma_u_px, sigma_x_mm=known.sigma_x_mm)
+                self._moments.add(known.x_mm[rows], known.y_px[rows, :2], known.y_px[rows, 2:])
+                accepted = self._frames[self._fitted :]
+            for frame in accepted:
+                data = self.corrected(frame.data)
+                self._moments.add(data.x_mm, data.u_left, data.u_right)
+            if self._moments.ready:
+                self.rig = self._moments.solve()
+                self._monitor.follow(self.rig)
+            return
+        self._tried = len(self._frames)
+        found, kept = self._agreed()
+        verdict = judge(None, found, robot_accuracy_mm=self.settings.robot_accuracy_mm)
+        if verdict.is_red:
+            raise ValueError("; ".join(reason.text for reason in verdict.reasons))
+        self._frames, self._fitted = kept, len(kept)
+        self._use(found.rig, found)
+
+    def _agreed(self) -> tuple[Calibration, list[Seen]]:
+        """The calibration by most frames, and the frames that agree with it: a bad frame is outvoted, at any place."""
+        frames, first = self._frames, self.settings.calibration_frames[0]
+        base = np.array([np.nanmean(frame.data.x_mm, axis=0) for frame in frames])
+        near = np.linalg.norm(base - np.median(base, axis=0), axis=1) < _FAR_MM
+        frames = [frame for frame, fine in zip(frames, near, strict=True) if fine]
+        parts, refused = [frames], None
+        if len(frames) >= first + 2:
+            half = max(first, (len(frames) + 1) // 2)
+            parts += [frames[-half:], frames[:half]]
+        for part in parts:
+            try:
+                found = self._calibrate(Correspondences.join(frame.pair(self.rig) for frame in part))
+            except Exception as error:  # the reason that counts is that of all frames together
+                refused = refused or error
+                continue
+            size = len(part[0].data)
+            used = found.inliers.reshape(len(part), size).any(axis=1)
+            return found, [frame for frame, fine in zip(part, used, strict=True) if fine]
+        raise refused or ValueError("the robot's positions lie too far apart.")
+
+    # --- watch --------------------------------------------------------------------------------------------------------
+
+    def _watch(self, result: FrameResult, frame: Seen) -> list[Seen]:
+        """Do images and robot still agree?  If not, why not?  Returns frames that may improve the rig."""
+        if self.state != "tracking":
+            self._since.append(frame)
+            self._resolve(result)
+            return []
+        data, monitor = self.corrected(frame.data), self._monitor
+        alarm = monitor.update(data, covariance_px2=self._residual_covariance(data))
+        result.drift = monitor.statistic
+        self._recent.append(frame)
+        if alarm:
+            n = max(min(monitor.since, len(self._recent)), 1)
+            self._since = [*self._since, frame] if self._before is not None else list(self._recent)[-n:]
+            self.state, self.cause, self._waiting = "moved", f"images and robot disagree ({monitor.axis})", 0
+            self.doubted_since = int(self._since[0].data.frame[0])
+            if self._before is None:
+                self._before, self._motion_before = self.rig, self._motion
+            monitor.forget()
+            self._recent.clear()
+            self._resolve(result)
+            return []
+        if monitor.score > _STANDS_OUT:
+            self._doubtful.append(int(data.frame[0]))
+            result.state, result.cause = "moved", f"this frame alone stands out ({monitor.score:.0f} sd)"
+            result.failures["robot"] = f"images and robot disagree by {self._gap_mm(data):.2f} mm in this frame: rejected"
+            return []
+        if self._before is not None:  # registered, and made better
+            self._since.append(frame)
+            self._resolve(result)
+            return []
+        n = 0 if monitor.statistic < 0.25 else monitor.since
+        passed = [self._recent.popleft() for _ in range(len(self._recent) - n)]
+        return [frame for frame in passed if int(frame.data.frame[0]) not in self._doubtful]
+
+    def _gap_mm(self, data: Correspondences) -> float:
+        gap = self.rig.triangulate(data.u_left, data.u_right).x_mm - data.x_mm
+        return float(np.nanmedian(np.linalg.norm(gap, axis=1)))
+
+    def _resolve(self, result: FrameResult) -> None:
+        """Explain the frames since, by a motion or by another cause; convinced only if the newest frames agree."""
+        first, last = self.settings.registration_frames
+        self._since = self._since[-max(last, 30) :]
+        newest = [self.corrected(frame.data) for frame in self._since[-first:]]
+        if len(newest) < first:
+            return
+        if self._held and self._fits(self.rig, newest):
+            return self._settle()
+        if self._held and self._waiting % first:
+            self._waiting += 1  # as it was: look again in a moment
+            return None
+        frames = [self.corrected(frame.data) for frame in self._since]
+        joined = Correspondences.join(frames).complete
+        try:
+            past = [self.corrected(part) for part in self._past]
+            found = explain(self._before, frames, past, self._noise(joined), undecided=len(frames) < last)
+            shifted = found.kind in ("clock", "slipped", "exchanged")
+            if not (found.loss <= CONVINCING if shifted else found.kind == "open" or self._fits(found.rig, newest)):
+                raise ValueError("no cause explains the newest frames.")
+        except ValueError as error:
+            self.state, self._held = "moved", False
+            # The oldest may be from before, or from during the motion.
+            self._since, self._waiting = self._since[max(len(self._since) - 2 * first, 0) :], self._waiting + 1
+            self._since = self._since[1:] if len(self._since) >= 2 * first else self._since
+            self.cause = str(error)
+            if self._waiting > self.settings.give_up_frames:
+                self._given = False
+                self._start_again(self._since, "no cause explains the images; calibrating afresh")
+            raise
+        if found.kind == "open":
+            self.cause = found.text
+        elif shifted:
+            self.state, self.cause = "robot" if found.kind != "exchanged" else "moved", found.text
+            self._held, self._waiting, self.rig, self._motion = True, 1, self._before, self._motion_before
+            self._since, result.failures["robot"] = self._since[-first:][1:], found.text
+        elif found.kind == "optics":
+            self._given, self._monitor = False, None
+            self._start_again(self._since, found.text)
+            result.failures["register"] = found.text
+        elif found.kind == "none":
+            self.rig, self._motion = self._before, self._motion_before
+            self._settle()
+        else:
+            self.rig, self.state, self.cause, result.motion, self._motion = found.rig, "tracking", "", found.motion, found.motion
+            self._monitor.reset(found.rig)
+            self.rests_on_s, self.doubted_since = result.time_s, None
+            if len(self._since) >= last:
+                self._settle()
+        return None
+
+    def _settle(self) -> None:
+        """What happened is over, or known well enough."""
+        self.state, self.cause, self.doubted_since = "tracking", "", None
+        self._before, self._since, self._waiting, self._held = None, [], 0, False
+        self._monitor.follow(self.rig)
+        self._recent.clear()
+        self._monitor.forget()
+
+    def _fits(self, rig: StereoRig, frames: Sequence[Correspondences]) -> bool:
+        data = Correspondences.join(frames).complete
+        residual = np.hstack([data.u_left, data.u_right]) - np.hstack(rig.project(data.x_mm))
+        chi2 = np.einsum("ni,ni->n", residual, np.linalg.solve(self._noise(data), residual[:, :, None])[:, :, 0])
+        return bool(len(chi2) and 8.0 * np.log1p(chi2 / 4.0).mean() <= CONVINCING)
+
+    # --- noise --------------------------------------------------------------------------------------------------------
+
+    def corrected(self, data: Correspondences) -> Correspondences:
+        """With the landmarks where the detector sees them on the tool."""
+        return with_offsets(data, None if self.calibration is None else self.calibration.offsets)
+
+    @property
+    def persistence(self) -> float:
+        """Variance that the mean of many frames keeps, over that of independent ones; 1 before it is known."""
+        return 1.0 if self._monitor is None else max(1.0, self._monitor.inflation)
+
+    def detection_covariance(self, data: Correspondences) -> np.ndarray:
+        """(n, 4, 4) px^2 of detections alone."""
+        known, own = self.calibration, data.pair_covariance_px2
+        if known is None:
+            return np.tile(self._noise_px**2 * np.eye(4), (len(data), 1, 1))
+        if known.covariance_px2 is None:
+            own = np.broadcast_to(known.noise_px2, own.shape)
+        return self._scale2 * np.where(np.isfinite(own).all(axis=(1, 2), keepdims=True), own, known.noise_px2)
+
+    def point_covariance(self, x_mm: np.ndarray) -> np.ndarray:
+        """(n, 3, 3) mm^2: how far the rig may put points beside the robot's."""
+        covariance = np.zeros((len(x_mm), 3, 3))
+        if self.calibration is not None:
+            covariance += self.calibration.point_covariance(x_mm, detection=False)
+        if self._motion is not None:
+            moves = [motion for motion in (self._motion.left, self._motion.right) if motion is not None]
+            stale = [motion.covariance_at(motion.transform.inverse().apply(x_mm)) for motion in moves]
+            covariance += sum(stale) / len(moves) if moves else 0.0
+        return covariance
+
+    def _noise(self, data: Correspondences) -> np.ndarray:
+        """(n, 4, 4) px^2 of landmarks' residuals: of the detections, and of the robot's report."""
+        known = self.calibration
+        sigma_x = self.settings.robot_accuracy_mm if known is None else known.sigma_x_mm
+        A = (self._before or self.rig).linear
+        return self.detection_covariance(data) + self._scale2 * sigma_x**2 * A @ A.T
+
+    def _residual_covariance(self, data: Correspondences) -> np.ndarray:
+        """(n, 4, 4) px^2: the noise, and by how much the rig is uncertain where these landmarks are."""
+        covariance = self._noise(data)
+        moved = self._motion
+        left, right = (None, None) if moved is None else (moved.left, moved.right)
+        for motion, rows in ((left, slice(0, 2)), (right, slice(2, 4))):
+            stale = data.x_mm if motion is None else motion.transform.inverse().apply(data.x_mm)
+            if self.calibration is not None:
+                covariance[:, rows, rows] += self.calibration.projection_covariance(stale)[:, rows, rows]
+            if motion is not None:
+                A = self.rig.linear[rows]
+                covariance[:, rows, rows] += A @ motion.covariance_at(stale) @ A.T
+        return covariance

@@ -1,0 +1,119 @@
+"""The online system to watch: both views with landmarks, distances over time with their band, states, times of stages."""
+
+from collections import deque
+from pathlib import Path
+from typing import Self
+
+import cv2
+import numpy as np
+
+from lib.correspondences import LANDMARKS
+from lib.online.result import STAGES, STATES, FrameResult
+
+__all__ = ["Dashboard", "VideoFile"]
+
+_SIZE = (1280, 720)
+_COLOURS = {"base": (0, 114, 178), "tip_1": (230, 159, 0), "tip_2": (0, 158, 115)}
+_LIGHTS = dict(zip(STATES, ((120, 120, 120), (0, 170, 80), (90, 150, 230), (40, 40, 40), (240, 190, 60), (220, 60, 50)),
+                   strict=True))  # fmt: skip
+_FRAMES = 250  # that the curve shows
+_FONT = cv2.FONT_HERSHEY_SIMPLEX
+
+
+class Dashboard:
+    """Draws each frame as one image (720, 1280, 3) uint8 RGB; it remembers the newest distances."""
+
+    def __init__(self) -> None:
+        self._past: deque[FrameResult] = deque(maxlen=_FRAMES)
+
+    def draw(self, left: np.ndarray, right: np.ndarray, result: FrameResult) -> np.ndarray:
+        """The page of a frame."""
+        page = np.full((_SIZE[1], _SIZE[0], 3), 250, np.uint8)
+        for side, (image, u) in enumerate(((left, result.landmarks.u_left), (right, result.landmarks.u_right))):
+            self._view(page[:360, 640 * side : 640 * (side + 1)], image, u)
+        self._lights(page, result)
+        # Without reconstruction and rig: a few numbers are all that the curve needs.
+        past = FrameResult(result.index, result.time_s, result.state, distance_mm=result.distance_mm,
+                           distance_sd_mm=result.distance_sd_mm)  # fmt: skip
+        self._past.append(past)
+        self._curve(page[420:, :860])
+        self._times(page[420:, 880:], result)
+        return page
+
+    def _view(self, part: np.ndarray, image: np.ndarray, u: np.ndarray) -> None:
+        scale = min(part.shape[1] / image.shape[1], part.shape[0] / image.shape[0])
+        small = cv2.resize(image, (round(image.shape[1] * scale), round(image.shape[0] * scale)), interpolation=cv2.INTER_AREA)
+        small = np.ascontiguousarray(small)
+        for name, point in zip(LANDMARKS, u, strict=True):
+            if np.isfinite(point).all():
+                at = tuple(int(v) for v in np.round((point + 0.5) * scale - 0.5))
+                cv2.circle(small, at, 6, (255, 255, 255), 3, cv2.LINE_AA)
+                cv2.circle(small, at, 6, _COLOURS[name], 2, cv2.LINE_AA)
+        part[: small.shape[0], : small.shape[1]] = small
+
+    def _lights(self, page: np.ndarray, result: FrameResult) -> None:
+        for i, (state, colour) in enumerate(_LIGHTS.items()):
+            on, at = state == result.state, (30 + 150 * i, 390)
+            cv2.circle(page, at, 10, colour if on else (215, 215, 215), -1, cv2.LINE_AA)
+            _text(page, state, (at[0] + 16, at[1] + 5), (0, 0, 0) if on else (160, 160, 160))
+        _text(page, f"{result.time_s:8.2f} s  {result.cause}"[:44], (930, 395))
+
+    def _curve(self, part: np.ndarray) -> None:
+        known = np.array([r.distance_mm for r in self._past])
+        top = max(float(np.nanmax(known, initial=0.5, where=np.isfinite(known))), 0.5) * 1.15
+        height, width = part.shape[0] - 40, part.shape[1] - 70
+
+        def place(i: float, mm: float) -> tuple[int, int]:
+            return int(60 + i * width / _FRAMES), int(np.clip(10 + height * (1 - (mm + 0.1) / (top + 0.1)), 0, height + 20))
+
+        for mm in np.linspace(0, top, 5):
+            cv2.line(part, place(0, mm), place(_FRAMES, mm), (225, 225, 225), 1)
+            _text(part, f"{mm:.1f}", (15, place(0, mm)[1] + 4))
+        for k, name in enumerate(LANDMARKS):
+            for i, r in enumerate(self._past):
+                d, sd = r.distance_mm[k], r.distance_sd_mm[k]
+                if np.isfinite(d) and np.isfinite(sd):
+                    pale = tuple(int(200 + 0.2 * c) for c in _COLOURS[name])
+                    cv2.line(part, place(i, d - 2 * sd), place(i, d + 2 * sd), pale, 2)
+                    cv2.circle(part, place(i, d), 2, _COLOURS[name], -1, cv2.LINE_AA)
+            _text(part, name, (60 + 90 * k, part.shape[0] - 8), _COLOURS[name])
+        _text(part, "mm to the retina, with 2 sd", (360, part.shape[0] - 8))
+
+    def _times(self, part: np.ndarray, result: FrameResult) -> None:
+        for i, stage in enumerate(STAGES):
+            spent = 1e3 * result.seconds.get(stage, 0.0)
+            y = 22 + 26 * i
+            cv2.rectangle(part, (95, y - 11), (95 + int(min(spent, 250.0)), y + 2), (150, 190, 220), -1)
+            _text(part, stage, (0, y))
+            _text(part, f"{spent:.0f} ms", (100, y))
+        _text(part, f"surfaces dropped: {result.dropped}", (0, 22 + 26 * len(STAGES)))
+        for i, why in enumerate(f"{name}: {text}" for name, text in list(result.failures.items())[:3]):
+            _text(part, why[:58], (0, 48 + 26 * (len(STAGES) + i)), (190, 40, 30))
+
+
+def _text(image: np.ndarray, text: str, at: tuple[int, int], colour: tuple[int, ...] = (60, 60, 60)) -> None:
+    cv2.putText(image, text, at, _FONT, 0.45, colour, 1, cv2.LINE_AA)
+
+
+class VideoFile:
+    """An MP4 file of pages; a context manager.
+
+    Raises:
+        ValueError: If the file cannot be written.
+    """
+
+    def __init__(self, path: str | Path, fps: float) -> None:
+        self.path = Path(path)
+        self._writer = cv2.VideoWriter(str(self.path), cv2.VideoWriter_fourcc(*"mp4v"), fps, _SIZE)
+        if not self._writer.isOpened():
+            raise ValueError(f"{self.path}: the video cannot be written; does the folder exist, does it end with .mp4?")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def add(self, page: np.ndarray) -> None:
+        """A page of `Dashboard.draw`."""
+        self._writer.write(cv2.cvtColor(page, cv2.COLOR_RGB2BGR))
+
+    def __exit__(self, *error: object) -> None:
+        self._writer.release()

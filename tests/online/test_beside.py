@@ -1,0 +1,96 @@
+"""Surfaces in a process beside: newest first, stale dropped and counted, a killed worker started again; and the feeds."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import signal
+import time
+
+import numpy as np
+import pytest
+
+from lib import paths
+from lib.online.feeds import Arrival, Live, recorded
+from lib.online.surface_worker import Beside, SurfaceJob
+from lib.recordings import Recording
+
+
+@pytest.fixture(scope="module")
+def pair():
+    recording = Recording.open(paths.SHIPPED_RECORDING)
+    return recording.frames[0], recording.truth
+
+
+def job(pair, index: int) -> SurfaceJob:
+    frame, truth = pair
+    tool = truth.u_left[0], truth.u_right[0]
+    options = {"setting": "fast", "u_landmarks": tool, "control": (8, 6), "smoothness": 1e3}
+    return SurfaceJob(frame.left, frame.right, truth.rig, index, float(index), options)
+
+
+def test_newest_first_and_a_killed_worker_is_started_again(pair):
+    surfaces = Beside()
+    try:
+        for index in range(5):
+            surfaces.submit(job(pair, index))
+        assert surfaces.dropped == 3
+        done = []
+        for _ in range(2):
+            surfaces.wait(120)
+            done += surfaces.collect()[0]
+        assert [surface.index for surface in done] == [0, 4]
+        assert done[1].failure is None
+        assert set(done[1].seconds) == {"match", "triangulate", "surface"}
+        surfaces.submit(job(pair, 5))
+        os.kill(surfaces.pid, signal.SIGKILL)
+        events = []
+        for _ in range(100):
+            events.append(surfaces.collect()[1])
+            if events[-1]:
+                break
+            time.sleep(0.05)
+        assert "started again" in events[-1]
+        surfaces.submit(job(pair, 6))
+        surfaces.submit(job(pair, 7))
+        surfaces.forget()  # its rig is not to be believed: what is in work is not given back
+        surfaces.wait(120)
+        assert surfaces.collect() == ([], "")
+    finally:
+        surfaces.close()
+
+
+def arrivals(n: int, fps: float):
+    image = np.zeros((2, 2, 3), np.uint8)
+    return (Arrival(image, image, None, i / fps) for i in range(n))
+
+
+def test_live_frames_come_at_their_own_times_and_late_ones_are_lost():
+    start = time.monotonic()
+    got = [arrival.arrived_s - start for arrival in Live(arrivals(10, 50.0))]
+    assert len(got) == 10
+    assert np.diff(got).sum() >= 0.17
+    feed = Live(arrivals(40, 100.0))
+    slow = []
+    for arrival in feed:
+        slow.append(arrival.time_s)
+        time.sleep(0.05)
+    assert feed.lost == 40 - len(slow) > 10
+    assert slow == sorted(slow)
+    assert slow[-1] == 0.39  # the newest comes through
+
+
+def test_an_error_of_the_source_reaches_whoever_takes_the_frames():
+    def broken():
+        yield from arrivals(1, 25.0)
+        raise ValueError("left/000001.jpg: the image is corrupt.")
+
+    with pytest.raises(ValueError, match="corrupt"):
+        list(Live(broken()))
+
+
+def test_a_feed_can_be_left(pair):
+    assert len(list(itertools.islice(Live(arrivals(1000, 1000.0)), 3))) == 3
+    first = next(recorded(Recording.open(paths.SHIPPED_RECORDING)))
+    assert first.source == 0
+    np.testing.assert_array_equal(first.left, pair[0].left)

@@ -1,0 +1,239 @@
+"""Faults that a running system meets: each is named, none is measured through, and it recovers when the fault ends."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lib.online import Settings
+from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
+from tests.online.world import BLACK, RIG, SELDOM, World, make, rig_error_mm, run, shifted
+
+NOISE_PX = 0.6
+VIEW = ROBOT_FROM_MICROSCOPE.R[:, 2]
+
+
+def calibrated(world: World, n: int = 60):
+    pipeline = make(world, settings=SELDOM)
+    assert run(pipeline, world, n)[-1].state == "tracking"
+    return pipeline
+
+
+def measured(results):
+    return [np.isfinite(r.distance_mm).any() for r in results]
+
+
+def test_frozen_video_is_noticed_and_never_calibrated_with():
+    for seed in range(3):
+        world = World(seed, NOISE_PX)
+        pipeline = calibrated(world, 80)
+        before, images, found = pipeline.rig, world.images, world.detect(np.stack(world.images))
+        pipeline._detector = lambda _, found=found: replace(found)
+        pipeline.step(*images, world.advance())
+        rest = [pipeline.step(*images, world.advance()) for _ in range(60)]
+        assert all(r.state == "blind" and "frozen" in r.failures["images"] for r in rest)
+        assert not any(measured(rest))
+        pipeline._detector = world.detect
+        after = run(pipeline, world, 60)
+        assert all(r.state == "tracking" for r in after[10:])
+        assert rig_error_mm(pipeline.rig, world) < max(0.03, 1.5 * rig_error_mm(before, world))
+
+
+def test_one_frozen_eye():
+    world = World(1, NOISE_PX)
+    pipeline = calibrated(world)
+    left, _ = world.images
+    pipeline.step(left, world.images[1], world.advance())
+    first = world.detect(np.stack(world.images))
+    pipeline._detector = lambda _: replace(world.detect(_), u=np.stack([first.u[0], world.detect(_).u[1]]))
+    pipeline.step(left, world.images[1], world.advance())
+    assert pipeline.step(left, world.images[1], world.advance()).failures["images"].startswith("frozen video: the left")
+
+
+@pytest.mark.parametrize("order", ["doubled", "first frames"])
+def test_a_doubled_frame_does_not_block_the_calibration(order):
+    world = World(2, NOISE_PX)
+    pipeline, results = make(world, settings=SELDOM), []
+    double_at = 15 if order == "doubled" else 3
+    for i in range(40):
+        told, images = world.advance(), world.images
+        found = world.detect(np.stack(images))
+        pipeline._detector = lambda _, found=found: found
+        results += [pipeline.step(*images, told) for _ in range(1 + (i == double_at))]
+    assert "frozen video" in results[double_at + 1].failures["images"]
+    assert results[12].state == "tracking"
+    assert rig_error_mm(pipeline.rig, world) < 0.05
+
+
+@pytest.mark.parametrize("bad", ["robot far away", "absurd pixels", "robot off by 3 mm"])
+@pytest.mark.parametrize("at", [0, 2, 12])
+def test_one_bad_frame_never_blocks_the_calibration(bad, at):
+    world = World(3, NOISE_PX)
+    pipeline, results = make(world, settings=SELDOM), []
+    for i in range(40):
+        told = world.advance()
+        pipeline._detector = world.detect
+        if i == at and bad == "absurd pixels":
+            pipeline._detector = lambda images: replace(world.detect(images), u=1e5 * world.rng.normal(size=(2, 3, 2)))
+        elif i == at:
+            told = told + (99999.0 if bad == "robot far away" else np.array([3.0, -2.0, 1.0]))
+        results.append(pipeline.step(*world.images, told))
+    assert all(r.state == "tracking" for r in results[22:])
+    assert rig_error_mm(pipeline.rig, world) < 0.05
+
+
+def test_black_images_are_a_failure_and_nothing_stale_is_told():
+    world = World(4, NOISE_PX)
+    pipeline = calibrated(world)
+    world.depth_mm += 0.5  # the eye moves meanwhile
+    results = [pipeline.step(BLACK, BLACK, world.advance()) for _ in range(30)]
+    assert all(r.state == "blind" and "black" in r.failures["images"] for r in results)
+    assert not any(measured(results))
+    assert not any(r.too_close.any() for r in results)
+    last = results[-1]
+    assert last.rests_on["landmarks"] < last.time_s - 1.0
+    assert pipeline.step(world.images[0], BLACK, world.advance()).failures["images"].startswith("the right image is black")
+    after = run(pipeline, world, 21)
+    assert after[0].state == "tracking"
+    np.testing.assert_allclose(after[-1].distance_mm, world.true_distance_mm(), atol=0.1)
+
+
+def test_every_output_says_which_frames_it_rests_on():
+    world = World(5, NOISE_PX, still=True)
+    results = run(make(world, settings=Settings(surface_every=7), rig=RIG, noise_px=NOISE_PX), world, 60)
+    for r in results[20:]:
+        assert r.rests_on["landmarks"] == r.rests_on["robot"] == r.time_s
+        assert r.rests_on["surface"] == r.reconstructed_at / 25.0 <= r.time_s
+    sd = np.array([r.distance_sd_mm[0] for r in results[42:49]])
+    assert sd[-1] > sd[0]  # as the surface ages
+
+
+def test_an_old_surface_is_no_surface():
+    world = World(5, NOISE_PX)
+    results = run(make(world, settings=Settings(surface_every=10_000, stale_s=1.0), rig=RIG), world, 30)
+    assert measured(results) == [True] * 26 + [False] * 4
+
+
+def test_exchanged_eyes_are_named_and_come_back():
+    world = World(6, NOISE_PX)
+    pipeline = calibrated(world)
+
+    def exchanged(images):
+        found = world.detect(images)
+        return replace(found, u=found.u[::-1].copy())
+
+    pipeline._detector = exchanged
+    results = run(pipeline, world, 40)
+    assert not any(r.state == "tracking" for r in results[1:])
+    assert not any(measured(results))
+    assert any("eyes are exchanged" in r.cause for r in results[:8])
+    pipeline._detector = world.detect
+    after = run(pipeline, world, 30)
+    assert all(r.state == "tracking" for r in after[10:])
+    assert rig_error_mm(pipeline.rig, world) < 0.05
+
+
+@pytest.mark.parametrize("factor", [1.02, 0.9])
+def test_a_zoom_change_is_named_and_calibrated_afresh(factor):
+    world = World(7, NOISE_PX)
+    pipeline = calibrated(world)
+    zoom = 100.0 * factor
+    world.rig = reference_rig(pixels_per_mm=(zoom, zoom))
+    results = run(pipeline, world, 30)
+    assert any("the optics changed: zoom x" in r.cause for r in results[:10])
+    assert not any(np.isfinite(r.distance_mm).any() for r in results[2:6])
+    assert results[-1].state == "tracking"
+    assert rig_error_mm(pipeline.rig, world) < 0.06
+
+
+def test_late_kinematics_are_named_and_the_rig_is_kept():
+    world = World(8, NOISE_PX, smooth=True)
+    pipeline = calibrated(world, 100)
+    rig, told = pipeline.rig, [world.advance() for _ in range(5)]
+    results = []
+    for _ in range(40):
+        told.append(world.advance())
+        results.append(pipeline.step(*world.images, told.pop(0)))
+    assert any("late by 5 frames" in r.cause for r in results[:8])
+    assert not any(r.state == "tracking" for r in results[5:])
+    assert not any(r.motion for r in results)
+    assert pipeline.rig is rig
+    after = run(pipeline, world, 30)
+    assert all(r.state == "tracking" for r in after[10:])
+
+
+def test_frozen_kinematics_are_named_at_once():
+    world = World(9, NOISE_PX, smooth=True)
+    pipeline = calibrated(world, 100)
+    told = world.advance()
+    results = []
+    for _ in range(30):
+        results.append(pipeline.step(*world.images, told))
+        world.advance()
+    assert all("frozen" in r.failures["robot"] for r in results[6:])
+    assert all(r.state in ("robot", "moved") for r in results[6:])
+    after = run(pipeline, world, 20)
+    assert all(r.state == "tracking" for r in after[10:])
+
+
+@pytest.mark.parametrize("jump_mm", [1.3, 50.0, 1e5, np.nan])
+def test_a_spike_of_the_kinematics_is_rejected_and_logged(jump_mm):
+    world = World(10, NOISE_PX)
+    pipeline = calibrated(world)
+    before = rig_error_mm(pipeline.rig, world)
+    result = pipeline.step(*world.images, world.advance() + np.array([jump_mm, 0.0, 0.0]))
+    assert "robot" in result.failures
+    truth = world.true_distance_mm()
+    assert not np.isfinite(result.distance_mm).any() or np.abs(result.distance_mm - truth).max() < 0.3
+    after = run(pipeline, world, 12)
+    assert all(r.state == "tracking" for r in after)
+    assert not any(r.motion for r in after)
+    assert rig_error_mm(pipeline.rig, world) < 1.2 * before
+
+
+def test_a_tool_out_of_view_and_back():
+    world = World(11, NOISE_PX, still=True)
+    pipeline = make(world, rig=RIG, noise_px=NOISE_PX, settings=SELDOM)
+    run(pipeline, world, 60)
+    pipeline._detector = lambda images: replace(world.detect(images), u=np.full((2, 3, 2), np.nan), confidence=np.zeros((2, 3)))
+    results = run(pipeline, world, 50)
+    assert all(r.state == "unseen" for r in results)
+    sd = [r.distance_sd_mm[0] for r in results[1:]]
+    assert sd[-1] > sd[0]  # nothing confirms the robot's report
+    pipeline._detector = world.detect
+    assert run(pipeline, world, 1)[0].state == "tracking"
+
+
+def test_reordered_frames_are_left_out():
+    world = World(12, NOISE_PX)
+    pipeline = calibrated(world)
+    assert "older" in pipeline.step(*world.images, world.advance(), time_s=1.0).failures["images"]
+
+
+@pytest.mark.parametrize(("shift_mm", "within"), [(0.05 * VIEW, 22), (0.02 * ROBOT_FROM_MICROSCOPE.R[:, 0], 5)])
+def test_small_shifts_are_noticed(shift_mm, within):
+    delays = []
+    for seed in range(5):
+        world = World(20 + seed, NOISE_PX, smooth=True)
+        pipeline = make(world, rig=RIG, noise_px=NOISE_PX, settings=SELDOM)
+        assert not any(r.motion for r in run(pipeline, world, 200))
+        world.rig = shifted(RIG, shift_mm)
+        results = run(pipeline, world, 60)
+        delays.append(next((i + 1 for i, r in enumerate(results) if r.drift > 1), 99))
+    assert np.median(delays) <= within
+
+
+def test_memory_is_flat():
+    import tracemalloc
+
+    world = World(13, NOISE_PX, n=50)
+    pipeline = calibrated(world, 150)
+    tracemalloc.start()
+    run(pipeline, world, 50)
+    first = tracemalloc.get_traced_memory()[0]
+    run(pipeline, world, 200)
+    grown = tracemalloc.get_traced_memory()[0] - first
+    tracemalloc.stop()
+    assert grown < 200 * 400  # bytes; rings of notes fill up to their end

@@ -1,0 +1,106 @@
+"""What is recorded can be given again and gives the same, byte for byte; a full disk ends the record, not the run."""
+
+from __future__ import annotations
+
+import errno
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+
+from lib import paths
+from lib.online import OnlinePipeline, Settings, command, record
+from lib.online.feeds import recorded
+from lib.online.record import COLUMNS, Recorder
+from lib.online.video import Dashboard, VideoFile
+from lib.recordings import Recording
+from tests.online.world import World, make, run
+
+
+@pytest.fixture(scope="module")
+def shipped():
+    return Recording.open(paths.SHIPPED_RECORDING)
+
+
+class Looked:
+    """The detector's answers, looked up in the truth by the image."""
+
+    def __init__(self, truth) -> None:
+        self.truth, self.rng = truth, np.random.default_rng(0)
+        self.frame = -1
+
+    def __call__(self, images):
+        self.frame += 1
+        u = np.stack([self.truth.u_left[self.frame], self.truth.u_right[self.frame]])
+        u = u + 0.5 * self.rng.normal(size=u.shape)
+        return SimpleNamespace(u=u, covariance=np.tile(0.25 * np.eye(2), (2, 3, 1, 1)), confidence=np.ones((2, 3)))
+
+
+def write(recording, truth, folder, n=10):
+    recorder = Recorder(folder, recording)
+    pipeline = OnlinePipeline(Looked(truth), settings=Settings(surface_every=9, calibration_frames=(6, 60)))
+    for arrival in recorded(recording, n):
+        result = pipeline.step(arrival.left, arrival.right, arrival.kinematics, time_s=arrival.time_s)
+        recorder.add(arrival, result)
+    recorder.close()
+    return recorder
+
+
+def test_a_replay_gives_the_same_bytes(tmp_path, shipped):
+    write(shipped, shipped.truth, tmp_path / "first")
+    again = Recording.open(tmp_path / "first" / "input")
+    assert len(again) == 10
+    write(again, shipped.truth, tmp_path / "second")
+    first, second = ((tmp_path / name / "frames.csv").read_bytes() for name in ("first", "second"))
+    assert first == second
+    lines = first.decode().splitlines()
+    assert lines[0].split(",") == COLUMNS
+    assert len(lines) == 11
+    assert all(len(line.split(",")) == len(COLUMNS) for line in lines)
+    assert lines[-1].split(",")[2] == "tracking"
+    assert float(lines[-1].split(",")[COLUMNS.index("tip_1_distance_mm")]) > 0
+    with pytest.raises(FileExistsError, match="not empty"):
+        Recorder(tmp_path / "first", shipped)
+
+
+def test_a_full_disk_ends_the_recording_and_not_the_run(tmp_path, shipped, monkeypatch):
+    copies = []
+
+    def full(source, target):
+        copies.append(target)
+        if len(copies) > 10:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return target
+
+    monkeypatch.setattr(record.shutil, "copyfile", full)
+    recorder = write(shipped, shipped.truth, tmp_path / "full")
+    assert "ended after 4 frames" in recorder.failure
+    assert "No space left" in recorder.failure
+    assert len((tmp_path / "full" / "frames.csv").read_text().splitlines()) == 5
+
+
+def test_the_video_shows_every_state(tmp_path):
+    world = World()
+    results = run(make(world), world, 12)
+    page, image = Dashboard(), np.full((216, 384, 3), 90, np.uint8)
+    with VideoFile(tmp_path / "run.mp4", 25.0) as video:
+        for result in results:
+            drawn = page.draw(image, image, result)
+            assert drawn.shape == (720, 1280, 3)
+            video.add(drawn)
+    film = cv2.VideoCapture(str(tmp_path / "run.mp4"))
+    assert int(film.get(cv2.CAP_PROP_FRAME_COUNT)) == 12
+    with pytest.raises(ValueError, match="cannot be written"):
+        VideoFile(tmp_path / "no" / "run.mp4", 25.0)
+
+
+def test_the_command(tmp_path, shipped, monkeypatch, capsys):
+    monkeypatch.setattr(command.Detector, "load", lambda _: Looked(shipped.truth))
+    assert command.main([str(shipped.folder), "--frames", "9", "--surface-every", "8", "--record", str(tmp_path / "run"),
+                         "--video", str(tmp_path / "run.mp4")]) == 0  # fmt: skip
+    out = capsys.readouterr().out
+    assert "9 frames in" in out
+    assert "tracking" in out
+    assert (tmp_path / "run" / "frames.csv").is_file()
+    assert (tmp_path / "run.mp4").stat().st_size > 1000
