@@ -58,8 +58,9 @@ class Tally:
         states = ", ".join(f"{state} {n}" for state, n in self.states.most_common())
         failures = ", ".join(f"{name} {n}" for name, n in self.failures.most_common()) or "none"
         return (
-            f"{self.frames} frames in {spent:.1f} s, {self.frames / spent:.1f} a second; processor {cpu / max(self.frames, 1):.3f} s "
-            f"a frame\n{self.surfaces} surfaces, {self.surfaces / spent:.1f} a second; {self.dropped} dropped\n"
+            f"{self.frames} frames in {spent:.1f} s, {self.frames / spent:.1f} a second; "
+            f"processor {cpu / max(self.frames, 1):.3f} s a frame\n"
+            f"{self.surfaces} surfaces, {self.surfaces / spent:.1f} a second; {self.dropped} dropped\n"
             f"latency from frame to distance: {median:.0f} ms median, {late:.0f} ms 99th percentile\n"
             f"states: {states}\nfailures: {failures}\nmemory: at most {memory_mb:.0f} MB"
         )

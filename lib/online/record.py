@@ -115,10 +115,11 @@ def row(result: FrameResult) -> list[str]:
         result.drift,
     ]
     failures = "; ".join(f"{name}: {why}" for name, why in result.failures.items())
-    texts = [result.motion.moved if result.motion else "", str(-1 if result.reconstructed_at is None else result.reconstructed_at)]
+    surface = "" if result.reconstructed_at is None else str(result.reconstructed_at)
     return [
         str(result.index), repr(float(result.time_s)), result.state, _plain(result.cause),
-        *("" if np.isnan(value) else repr(float(value)) for value in numbers), *texts, _plain(failures),
+        *("" if np.isnan(value) else repr(float(value)) for value in numbers),
+        result.motion.moved if result.motion else "", surface, _plain(failures),
     ]  # fmt: skip
 
 

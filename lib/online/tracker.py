@@ -240,7 +240,8 @@ class RigTracker:
             self.rig, self._motion = self._before, self._motion_before
             self._settle()
         else:
-            self.rig, self.state, self.cause, result.motion, self._motion = found.rig, "tracking", "", found.motion, found.motion
+            self.rig, self.state, self.cause = found.rig, "tracking", ""
+            result.motion = self._motion = found.motion
             self._monitor.reset(found.rig)
             self.rests_on_s, self.doubted_since = result.time_s, None
             if len(self._since) >= last:

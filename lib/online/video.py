@@ -42,8 +42,8 @@ class Dashboard:
 
     def _view(self, part: np.ndarray, image: np.ndarray, u: np.ndarray) -> None:
         scale = min(part.shape[1] / image.shape[1], part.shape[0] / image.shape[0])
-        small = cv2.resize(image, (round(image.shape[1] * scale), round(image.shape[0] * scale)), interpolation=cv2.INTER_AREA)
-        small = np.ascontiguousarray(small)
+        size = round(image.shape[1] * scale), round(image.shape[0] * scale)
+        small = np.ascontiguousarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
         for name, point in zip(LANDMARKS, u, strict=True):
             if np.isfinite(point).all():
                 at = tuple(int(v) for v in np.round((point + 0.5) * scale - 0.5))

@@ -17,7 +17,7 @@ AXES = ("lateral", "lateral", "depth", "epipolar", "scatter")
 # Shift that counts as none, in standard deviations of a frame, and alarm level, of each axis.  Depth is seen worst, so
 # its test is the one for the smallest shifts.
 _SLACK = np.array([1.0, 1.0, 0.5, 1.0, 1.0])
-_LEVEL = np.array([5.8, 5.8, 8.1, 5.8, 7.5])
+_LEVEL = np.array([6.0, 6.0, 8.6, 6.0, 7.5])
 _CAP = 0.75  # of the alarm level: most that one frame adds, so that a single bad frame raises no alarm
 _MEMORY = 1000  # frames that tell the noise
 _FEW = 40  # frames: with fewer the noise is taken for larger than they say, up to twice

@@ -69,10 +69,11 @@ def register_images(
 class MovedCameras:
     """Which cameras moved, and the rig as it is now.
 
-    `moved` is "none", "shifted" (together, without turning), "together", "left", "right" or "apart", and `rig` has the projections as they are now.  `left` and
-    `right` are the motions of the cameras (the same one for "together"), None for one that stayed.  An affine camera
-    alone does not show the shift along its viewing direction: that is left at zero, and its variance is zero.  `bic` is
-    the Bayesian information criterion of each hypothesis; the smallest is chosen.
+    `moved` is "none", "shifted" (together, without turning), "together", "left", "right" or "apart", and `rig` has the
+    projections as they are now.  `left` and `right` are the motions of the cameras (the same one where they moved
+    together), None for one that stayed.  An affine camera alone does not show the shift along its viewing direction: that
+    is left at zero, and its variance is zero.  `bic` is the Bayesian information criterion of each hypothesis; the smallest
+    is chosen.
     """
 
     rig: StereoRig
@@ -94,8 +95,8 @@ def identify_motion(
     """Which cameras moved, and how: the hypothesis with the smallest Bayesian information criterion.
 
     The hypotheses are: neither camera moved (0 parameters), the left or the right alone (5; 6 if it is near-affine), both
-    together (6, or 3 if they only shifted), each by its own motion.  If the cameras moved apart, triangulated points are no rigid copy of the true
-    ones, so Eq. (7) has no exact solution; the images have.
+    together (6, or 3 if they only shifted), each by its own motion.  If the cameras moved apart, triangulated points are
+    no rigid copy of the true ones, so Eq. (7) has no exact solution; the images have.
 
     Arguments and errors are those of `register_images`, and the loss is robust.  The noise must be known, by
     `covariance_px2` or from the correspondences: it decides whether a hypothesis explains the data.

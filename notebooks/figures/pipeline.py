@@ -58,7 +58,7 @@ def timeline(results: Sequence[FrameResult], *, bump_at: int | None = None) -> F
     for k, (name, colour) in enumerate(LANDMARK_COLOURS.items()):
         axes[2].plot(index, distance[:, k], color=colour, marker=".", label=name)
         axes[2].fill_between(index, distance[:, k] - 2 * sd[:, k], distance[:, k] + 2 * sd[:, k], color=colour, alpha=0.2)
-    axes[2].set(title="Distance of the tool to the surface along the view, in mm, with two standard deviations", xlabel="frame")
+    axes[2].set(title="Distance of the tool to the surface along the view, in mm (band: 2 sd)", xlabel="frame")
     axes[2].legend(loc="upper right", ncols=3)
     shown = {result.state for result in results}
     patches = [Patch(facecolor=_STATE_COLOURS[s], edgecolor="#cccccc", label=s) for s in _STATE_COLOURS if s in shown]

@@ -26,7 +26,7 @@ def measured(results):
 
 
 def test_frozen_video_is_noticed_and_never_calibrated_with():
-    for seed in range(3):
+    for seed in range(2):
         world = World(seed, NOISE_PX)
         pipeline = calibrated(world, 80)
         before, images, found = pipeline.rig, world.images, world.detect(np.stack(world.images))
@@ -150,9 +150,9 @@ def test_a_zoom_change_is_named_and_calibrated_afresh(factor):
 
 def test_late_kinematics_are_named_and_the_rig_is_kept():
     world = World(8, NOISE_PX, smooth=True)
-    pipeline = calibrated(world, 100)
-    rig, told = pipeline.rig, [world.advance() for _ in range(5)]
-    results = []
+    pipeline = make(world, settings=SELDOM)
+    told = [result.landmarks.x_mm for result in run(pipeline, world, 100)[-5:]]
+    rig, results = pipeline.rig, []
     for _ in range(40):
         told.append(world.advance())
         results.append(pipeline.step(*world.images, told.pop(0)))
@@ -197,7 +197,8 @@ def test_a_tool_out_of_view_and_back():
     world = World(11, NOISE_PX, still=True)
     pipeline = make(world, rig=RIG, noise_px=NOISE_PX, settings=SELDOM)
     run(pipeline, world, 60)
-    pipeline._detector = lambda images: replace(world.detect(images), u=np.full((2, 3, 2), np.nan), confidence=np.zeros((2, 3)))
+    nothing = {"u": np.full((2, 3, 2), np.nan), "confidence": np.zeros((2, 3))}
+    pipeline._detector = lambda images: replace(world.detect(images), **nothing)
     results = run(pipeline, world, 50)
     assert all(r.state == "unseen" for r in results)
     sd = [r.distance_sd_mm[0] for r in results[1:]]
@@ -212,15 +213,16 @@ def test_reordered_frames_are_left_out():
     assert "older" in pipeline.step(*world.images, world.advance(), time_s=1.0).failures["images"]
 
 
-@pytest.mark.parametrize(("shift_mm", "within"), [(0.05 * VIEW, 22), (0.02 * ROBOT_FROM_MICROSCOPE.R[:, 0], 5)])
+@pytest.mark.parametrize(("shift_mm", "within"), [(0.05 * VIEW, 12), (0.02 * ROBOT_FROM_MICROSCOPE.R[:, 0], 4)])
 def test_small_shifts_are_noticed(shift_mm, within):
+    """With the noise that the shipped detector has along the depth."""
     delays = []
-    for seed in range(5):
-        world = World(20 + seed, NOISE_PX, smooth=True)
-        pipeline = make(world, rig=RIG, noise_px=NOISE_PX, settings=SELDOM)
-        assert not any(r.motion for r in run(pipeline, world, 200))
+    for seed in range(3):
+        world = World(20 + seed, 0.3, smooth=True)
+        pipeline = make(world, rig=RIG, noise_px=0.3, settings=SELDOM)
+        assert not any(r.motion for r in run(pipeline, world, 150))
         world.rig = shifted(RIG, shift_mm)
-        results = run(pipeline, world, 60)
+        results = run(pipeline, world, 30)
         delays.append(next((i + 1 for i, r in enumerate(results) if r.drift > 1), 99))
     assert np.median(delays) <= within
 
@@ -229,11 +231,15 @@ def test_memory_is_flat():
     import tracemalloc
 
     world = World(13, NOISE_PX, n=50)
-    pipeline = calibrated(world, 150)
+    pipeline = make(world, rig=RIG, noise_px=NOISE_PX, settings=SELDOM)
     tracemalloc.start()
-    run(pipeline, world, 50)
+    monitor = pipeline._tracker._monitor  # rings that are full do not grow
+    for _ in range(1000):
+        monitor.history.append((world.rng.normal(), 12, world.rng.normal()))
+        monitor._scores.append(world.rng.normal(size=5))
+    run(pipeline, world, 60)
     first = tracemalloc.get_traced_memory()[0]
-    run(pipeline, world, 200)
+    run(pipeline, world, 100)
     grown = tracemalloc.get_traced_memory()[0] - first
     tracemalloc.stop()
-    assert grown < 200 * 400  # bytes; rings of notes fill up to their end
+    assert grown < 100 * 50  # bytes

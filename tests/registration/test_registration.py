@@ -447,8 +447,8 @@ def test_missing_landmarks_do_not_count():
     before = monitor.statistic
     monitor.update(x, u_left * np.nan, u_right)
     assert monitor.history[-1] == (0.0, 0, before)
-    with pytest.raises(ValueError, match="slack"):
-        DriftMonitor(RIG, covariance_px2=1.0, slack=0)
+    with pytest.raises(ValueError, match="sigma_x_mm"):
+        DriftMonitor(RIG, covariance_px2=1.0, sigma_x_mm=-0.01)
 
 
 # --- the paper's experiment ------------------------------------------------------------------------------------------
