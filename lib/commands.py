@@ -122,18 +122,18 @@ def _parsed(
     name: str, function: object, argv: list[str], *, frame: bool = False, rig: bool = False, needs_rig: bool = False
 ) -> tuple[argparse.Namespace, Recording, Path]:
     parser = argparse.ArgumentParser(prog=f"python3 -m lib {name}", description=function.__doc__.split(": ", 1)[1])
-    parser.add_argument("recording", type=Path, help="folder of a recording")
-    parser.add_argument("--out", type=Path, help="folder of the results (default: runs/NAME of the recording)")
     add = parser.add_argument
+    add("recording", type=Path, help="folder of a recording")
+    add("--out", type=Path, help="folder of the results (default: runs/NAME of the recording)")
     add("--landmarks", choices=("detected", "annotations"), default="detected", help="where they come from")
     add("--weights", help="weights file of the detector (default: the shipped ones)")
-    parser.add_argument("--every", type=int, default=1, help="take every N-th frame")
-    parser.add_argument("--force", action="store_true", help="write results whatever the verdict")
+    add("--every", type=int, default=1, help="take every N-th frame")
+    add("--force", action="store_true", help="write results whatever the verdict")
     if frame:
-        parser.add_argument("--frame", type=int, default=0, help="number of the frame, from 0")
-        parser.add_argument("--setting", choices=("quality", "fast"), default="quality")
+        add("--frame", type=int, default=0, help="number of the frame, from 0")
+        add("--setting", choices=("quality", "fast"), default="quality")
     if rig:
-        parser.add_argument("--rig", type=Path, required=needs_rig, help="rig.json of an earlier calibration")
+        add("--rig", type=Path, required=needs_rig, help="rig.json of an earlier calibration")
     a = parser.parse_args(argv)
     if a.every < 1:
         parser.error("--every: must be at least 1.")
@@ -151,8 +151,8 @@ def _labelled(recording: Recording) -> Correspondences:
     return of_recording(recording, recording.annotations.u_left, recording.annotations.u_right)
 
 
-def _data(a: argparse.Namespace, recording: Recording) -> Correspondences:
-    chosen = np.arange(len(recording))[:: a.every]
+def _data(a: argparse.Namespace, recording: Recording, frames: np.ndarray | None = None) -> Correspondences:
+    chosen = np.arange(len(recording))[:: a.every] if frames is None else frames
     if a.landmarks == "annotations":
         return _labelled(recording).of_frames(chosen)
     if recording.skeleton != LANDMARKS:
@@ -165,8 +165,9 @@ def _calibrated(
     a: argparse.Namespace, recording: Recording, out: Path
 ) -> tuple[Calibration | StereoRig | None, Verdict, Correspondences]:
     """The calibration of a recording, None where it is refused, or the rig that --rig names; the verdict; the landmarks."""
-    data = _data(a, recording)
-    if getattr(a, "rig", None):
+    given = getattr(a, "rig", None)  # then only the frame's own landmarks are needed, to mask the tool
+    data = _data(a, recording, np.array([a.frame % len(recording)]) if given else None)
+    if given:
         text = f"{a.rig} was not calibrated from this recording, and nothing here tests it."
         cure = f"Run: python3 -m lib register {a.recording} --rig {a.rig}"
         return StereoRig.load(a.rig), Verdict((Reason("rig_given", LEVELS[1], text, cure),)), data

@@ -41,6 +41,7 @@ MAY_IMPORT = {
     "online": SEEN | {"landmarks", "calibration", "matching", "registration", "surface", "trust", "training"},
     "adapt": SEEN | {"landmarks", "calibration", "matching", "registration", "surface", "trust", "training"},
     "importing": SEEN | {"landmarks", "calibration"},  # it finds clock offsets and tools
+    # the stages on the command line, one after the other
     "commands": SEEN | {"landmarks", "calibration", "matching", "registration", "surface", "trust", "importing"},
     "workbench": BASE,
 }
