@@ -87,8 +87,8 @@ def _cover(rng: Rng, middle: np.ndarray, length: float, ground: float) -> list[P
     """Tissue, blood or a bubble that hides a part of the tool."""
     return [
         _patch(
-            rng, middle + np.append(rng.normal(0, 0.45, 2) * length, -rng.uniform(0.5, 2.0)), length * rng.uniform(0.15, 0.55),
-            _hue(rng, 0.6, rng.uniform(0.02, 0.6)), "cover", {"edge": (0.05, 0.8, "log")},
+            rng, middle + np.append(rng.normal(0, 0.45, 2) * length, -rng.uniform(0.5, 2.0)),
+            length * rng.uniform(0.15, 0.55), _hue(rng, 0.6, rng.uniform(0.02, 0.6)), "cover", {"edge": (0.05, 0.8, "log")},
         )
         for _ in range(rng.integers(2, 5))
     ]  # fmt: skip
