@@ -11,6 +11,8 @@ from lib.trust.fitting import Robust
 
 __all__ = ["TESTS", "unexplained"]
 
+_ROBOT_MM = 0.04  # a robot for eye surgery is better
+
 
 def _tip_order(case: Case) -> Iterator[Hypothesis]:
     """Another landmark's position: tips exchanged in both images, in one, or the base taken for a tip."""
@@ -261,19 +263,17 @@ def unexplained(case: Case, fit: Robust) -> list[Hypothesis]:
     if not np.isfinite(reach).any():
         return []
     length, distance = np.nanmedian(reach), np.linalg.norm(fit.residuals, axis=2)
+    missed, zoom = float(np.median(distance[problem.used])), float(np.linalg.svd(fit.M[0, :, :3], compute_uv=False).mean())
+    epipolar, half = _epipolar(problem.y[problem.used.all(axis=1)].reshape(-1, 4)), problem.used.sum() / 2.0
+    if epipolar < 0.25 * missed and missed > _ROBOT_MM * zoom:
+        text = f"The images agree with each other within {epipolar:.1f} px and miss the robot by {missed:.0f} px (medians)."
+        cure = "The robot's report is not that of these frames, or coarse: check times, units and columns of kinematics.csv."
+        explained, gain = 1.0 - (epipolar / missed) ** 2, half * float(np.log(missed / epipolar)) / fit.design
+        return [Hypothesis("robot_noise", text, cure, 1e3 * missed / zoom, 0.0, "um", explained, gain)]
     share = float((distance[problem.used] > 0.05 * length).mean())
     if share < 0.2:
         return []
-    half = problem.used.sum() / 2.0
     gain = half * (share * np.log(share / 0.05) + (1 - share) * np.log(max(1 - share, 1e-9) / 0.95))
-    both = problem.used.all(axis=1)
-    epipolar = _epipolar(problem.y[both].reshape(-1, 4))
-    if epipolar < 0.2 * np.median(distance[problem.used]):
-        missed = float(np.median(distance[problem.used]))
-        text = f"The images agree with each other within {epipolar:.1f} px and miss the robot by {missed:.0f} px (medians)."
-        cure = "The robot's report is not that of these frames: check times, units and columns of kinematics.csv."
-        size = 1e3 * missed / float(np.linalg.svd(fit.M[0, :, :3], compute_uv=False).mean())
-        return [Hypothesis("robot_noise", text, cure, size, 0.0, "um", share, float(gain))]
     text = f"{100 * share:.0f} % of the landmarks lie more than 5 % of the tool's length from where a camera would see them."
     cure = "The detector does not fit these pictures: look at its overlays, and adapt it (python3 -m lib adapt RECORDING)."
     return [Hypothesis("detector_unfit", text, cure, 100 * share, 0.0, "%", share, float(gain))]

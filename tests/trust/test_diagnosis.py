@@ -36,7 +36,7 @@ def test_a_good_recording_has_no_fault(name):
         ("tips exchanged", "half of the frames", None), ("z scaled", "2.0", 2.0), ("rigid tips", "1.0 mm", None),
         ("axis mirrored", "z", None), ("eyes exchanged", "", None), ("finite distance", "150 mm", 1 / 150),
         ("landmark offset", "1.0 mm", 1000.0), ("bad stretch", "40.0 px", None),
-        ("camera moved", "1.0 degrees", None), ("detector partly wrong", "50 %", None),
+        ("robot noise", "100 um", None), ("camera moved", "1.0 degrees", None), ("detector partly wrong", "50 %", None),
         ("kinematics frozen", "25 %", 24.0), ("left camera late", "40 ms", -40.0),
     ],
 )  # fmt: skip
