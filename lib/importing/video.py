@@ -67,9 +67,8 @@ class _Film:
         with self._open() as container:
             stream = container.streams.video[0]
             times = [(p.pts, p.dts) for p in container.demux(stream) if p.size and not p.is_discard]
-            told = stream.frames or len(times)
-            end_s = float((stream.duration or 0) * (stream.time_base or 0))
-            if not end_s and len(container.streams) == 1:
+            told, end_s = stream.frames or len(times), 0.0
+            if not stream.frames and len(container.streams) == 1:  # such as .mkv, which states its length alone
                 end_s = (container.duration or 0) / av.time_base
         base = Decimal(stream.time_base.numerator) / Decimal(stream.time_base.denominator)
         which = int(any(pts is None for pts, _ in times))  # .avi states the order of decoding only
