@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from lib.geometry import pair_covariance, points
 
-__all__ = ["LANDMARKS", "MIN_CONFIDENCE", "Correspondences", "of_recording", "pair_with_robot"]
+__all__ = ["LANDMARKS", "MIN_CONFIDENCE", "Correspondences", "NoDetectionError", "of_recording", "pair_with_robot"]
 
 #: The landmarks of the forceps, in the order of every array.
 LANDMARKS = ("base", "tip_1", "tip_2")
@@ -21,6 +21,10 @@ LANDMARKS = ("base", "tip_1", "tip_2")
 MIN_CONFIDENCE = 0.2
 #: Half the time over which a velocity is measured: long enough to average the robot's noise, short for its motion.
 _VELOCITY_S = 0.05
+
+
+class NoDetectionError(ValueError):
+    """Hardly any landmark was found in both images; the text counts them and says what to do."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,6 +107,23 @@ class Correspondences:
     def complete(self) -> Self:
         """The rows that are complete."""
         return self.subset(self.is_complete)
+
+    def check_detections(self, fewest: int = 4) -> None:
+        """Raise a `NoDetectionError` where fewer than `fewest` rows are seen in both images and known to the robot."""
+        if (usable := int(self.is_complete.sum())) >= fewest:
+            return
+        (left, right), both = self.seen.sum(axis=0), int(self.seen.all(axis=1).sum())
+        if both >= fewest:
+            raise NoDetectionError(
+                f"data: the robot reports a position for {usable} of the {both} landmarks that both images show; check "
+                "offset_s and the times of frames and kinematics (`python3 -m lib check RECORDING`)."
+            )
+        raise NoDetectionError(
+            f"data: the detector failed on {len(np.unique(self.frame))} frames: of {len(self)} landmarks it found {left} "
+            f"in left images, {right} in right ones, {both} in both. Do they show the tool, in colour, sharp, 200 to 400 "
+            "px from base to tip? `python3 -m lib check RECORDING` shows them; where tool or light is new, label 20 frames "
+            "and run `python3 -m lib adapt RECORDING`."
+        )
 
     @property
     def pair_covariance_px2(self) -> np.ndarray:

@@ -71,6 +71,7 @@ def calibrate(
     if isinstance(data, Correspondences):
         if u is not None:
             raise ValueError("u: Correspondences have their own pixels; leave u out.")
+        data.check_detections()
         usable, axes = _usable_rows(data, offsets, weighting)
         rows = data.subset(usable)
         x, y = refuse.seen_rows(rows)

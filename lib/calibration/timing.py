@@ -89,6 +89,8 @@ def estimate_time_offset(
     time, landmark, y = time[known], landmark[known], y[known]
     n, m = len(np.unique(time)), y.shape[1]
     if n < 8:
+        if isinstance(data, Correspondences):
+            data.check_detections()
         raise ValueError(f"data: {n} frames lie inside the kinematics by search_s = {search_s} s, away from gaps; give 8.")
 
     def at(offset: float, derivative: int = 0) -> np.ndarray:

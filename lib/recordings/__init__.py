@@ -17,11 +17,12 @@ A rolling shutter reads row y at readout_s * (y / (height - 1) - 1/2) after that
 """
 
 from lib.recordings.annotations import Annotations
+from lib.recordings.doubts import Doubt
 from lib.recordings.frames import Frames, StereoFrame, read_image, to_8_bits
 from lib.recordings.importers import MonocularSequence, import_retinal_microsurgery
 from lib.recordings.recording import Kinematics, Recording
 from lib.recordings.truth import Truth
 from lib.recordings.writer import RecordingWriter
 
-__all__ = ["Annotations", "Frames", "Kinematics", "MonocularSequence", "Recording", "RecordingWriter", "StereoFrame"]
+__all__ = ["Annotations", "Doubt", "Frames", "Kinematics", "MonocularSequence", "Recording", "RecordingWriter", "StereoFrame"]
 __all__ += ["Truth", "import_retinal_microsurgery", "read_image", "to_8_bits"]

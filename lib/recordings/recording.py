@@ -3,6 +3,7 @@
 import math
 import re
 import tomllib
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from lib.correspondences import LANDMARKS
 from lib.recordings.annotations import Annotations, read_coco
+from lib.recordings.doubts import Doubt, doubts
 from lib.recordings.frames import Frames, open_side
 from lib.recordings.tables import columns, read_table
 from lib.recordings.truth import Truth
@@ -20,6 +22,10 @@ from lib.recordings.truth import Truth
 __all__ = ["FORMAT", "UNITS", "Kinematics", "Recording", "kinematics_columns"]
 
 FORMAT = "microstereo.recording"
+#: A longer step between samples than this, and than ten usual ones, is a gap: nothing is interpolated in it.
+_GAP_S = 0.5
+#: A position farther from the origin than this is no millimetre.
+_FARTHEST_MM = 1e5
 UNITS = {"length": "mm", "image": "px", "time": "s"}
 _REQUIRED = {"name": str, "fps": float, "image_size_px": list}
 _DEFAULTS = {"description": "", "readout_s": 0.0, "offset_s": 0.0, "robot_accuracy_mm": 0.010, "details": {}}
@@ -51,7 +57,7 @@ class Kinematics:
     def at(self, time_s: ArrayLike) -> np.ndarray:
         """Landmarks (n, k, 3) mm at robot times (n,), or (n, k) for a time of each landmark; linear between samples.
 
-        NaN before the first sample, after the last, and beside a dropped one.
+        NaN before the first sample, after the last, beside a dropped one, and in a gap of half a second and ten samples.
         """
         time, k = np.asarray(time_s, dtype=np.float64), self.x_mm.shape[1]
         if time.ndim == 1:
@@ -62,6 +68,11 @@ class Kinematics:
         for landmark, axis in np.ndindex(k, 3):  # exactly on a sample, a dropped neighbour has no effect
             report = self.time_s, self.x_mm[:, landmark, axis]
             x[:, landmark, axis] = np.interp(time[:, landmark], *report, left=np.nan, right=np.nan)
+        if len(self.time_s) > 1:
+            step = np.diff(self.time_s)
+            before = np.clip(np.searchsorted(self.time_s, time, side="right") - 1, 0, len(step) - 1)
+            long = (step > max(_GAP_S, 10.0 * float(np.median(step))))[before]
+            x[long & (time != self.time_s[before]) & (time != self.time_s[before + 1])] = np.nan
         return x
 
 
@@ -100,10 +111,11 @@ class Recording:
         return len(self.frames)
 
     @classmethod
-    def open(cls, folder: str | Path) -> Self:
-        """Open and validate a recording.
+    def open(cls, folder: str | Path, *, truth: bool = True) -> Self:
+        """Open and validate a recording; what is suspicious (`doubts`) is a `UserWarning`.
 
-        Sizes, counts, headers and ends of all images are checked here; pixels are decoded when asked for.
+        Sizes, counts, headers and ends of all images are checked here; pixels are decoded when asked for.  With truth=False
+        the truth of a simulated recording is left alone.
 
         Raises:
             FileNotFoundError, ValueError: Naming the file (and line) and the cure.
@@ -135,8 +147,18 @@ class Recording:
             raise ValueError(f"{folder}: {what}; check time_s (seconds) and offset_s.")
         path = folder / "annotations.json"
         annotations = read_coco(path, len(frames), size, skeleton) if path.exists() else None
-        truth = Truth.read(folder / "truth", len(frames)) if (folder / "truth").is_dir() else None
-        return cls(folder=folder, frames=frames, kinematics=kinematics, annotations=annotations, truth=truth, **header)
+        known = Truth.read(folder / "truth", len(frames)) if truth and (folder / "truth").is_dir() else None
+        made = cls(folder=folder, frames=frames, kinematics=kinematics, annotations=annotations, truth=known, **header)
+        for doubt in made.doubts:
+            warnings.warn(f"{folder}: {doubt.text} {doubt.cure} `python3 -m lib check {folder}` says more.", stacklevel=2)
+        return made
+
+    @property
+    def doubts(self) -> list[Doubt]:
+        """What makes the recording suspicious though it can be read."""
+        reported = np.isfinite(self.landmarks_mm()).all(axis=2).any(axis=1)
+        robot_s = self.frames.time_s + self.offset_s
+        return list(doubts(robot_s, self.fps, self.kinematics.time_s, self.kinematics.x_mm, reported))
 
     def landmarks_mm(self) -> np.ndarray:
         """The robot's landmarks (n, k, 3) mm at the frames' times, NaN where the robot says nothing.
@@ -199,6 +221,8 @@ def _read_kinematics(path: Path, landmarks: Sequence[str]) -> Kinematics:
     if not len(table):
         raise ValueError(f"{path}: the table is empty; the robot's landmarks are needed.")
     time_s, x = _increasing(path, table[:, 0]), table[:, 1:].reshape(-1, len(landmarks), 3)
+    if (far := np.flatnonzero((np.abs(np.nan_to_num(x)) > _FARTHEST_MM).any(axis=(1, 2)))).size:
+        raise ValueError(f"{path}, line {far[0] + 2}: beyond {_FARTHEST_MM:g} mm; leave the cells of a wrong sample empty.")
     empty = np.isnan(x)
     partial = np.flatnonzero((empty.any(axis=2) & ~empty.all(axis=2)).any(axis=1))
     if partial.size:

@@ -1,6 +1,7 @@
-"""The health of the detector without labels: frames in which what it found contradicts itself, the other image or the robot.
+"""The health of the detector without labels: where what it found contradicts itself, the other image or the robot.
 
-Each part is one number a frame, relative to the tool's length in the image where that makes sense, and is divided by its limit.
+Each part is one number a landmark and frame, divided by its limit.  A network that does not know a picture answers anew when
+the picture is mirrored or shifted; one that knows it answers the same.
 """
 
 import warnings
@@ -12,17 +13,17 @@ import numpy as np
 from lib.calibration import Calibration, with_offsets
 from lib.correspondences import Correspondences
 from lib.recordings import Recording
+from lib.trust.epipolar import affine_epipolar
 
 __all__ = ["LIMITS", "Health", "health"]
 
-#: What a frame may show of each part; see `FALSE_ALARM_RATE`.
+#: What a landmark of a frame may show of each part; see `FALSE_ALARM_RATE`.
 LIMITS = {
-    "missing": 0.5,  # share of the six landmarks that are not seen
-    "looks": 0.02,  # the same frame mirrored and shifted: largest difference of a landmark, of the tool's length
-    "epipolar": 0.02,  # distance of left and right from one epipolar geometry, of the tool's length
-    "smoothness": 0.05,  # distance from halfway between the frames before and after, of the tool's length
-    "shape": 0.1,  # triangulated length of the tool, relative to the robot's
+    "looks": 0.02,  # the same frame mirrored and shifted: largest move of the landmark, of the tool's length
+    "epipolar": 0.03,  # distance of left and right from one epipolar geometry, of the tool's length
     "robot": 8.0,  # distance from where the robot says, in RMS residuals of the calibration (at least 1 px)
+    "smoothness": 0.05,  # the same less what the frames before and after have, of the tool's length
+    "shape": 0.2,  # triangulated length of the tool, relative to the robot's; of a frame, not of a landmark
 }
 #: Share of frames with right landmarks whose score exceeds 1.
 FALSE_ALARM_RATE = 0.02
@@ -34,31 +35,38 @@ _SHIFT_PX = (37, 21)
 
 @dataclass(frozen=True, eq=False)
 class Health:
-    """One number a frame, and what it is made of.
+    """What contradicts itself, for each landmark, and one number a frame.
 
     Attributes:
         frame: (m,) numbers of the frames.
-        parts: Name -> (m,), in units of its limit; NaN where a frame does not have it.
+        parts: Name -> (m, 3) in units of its limit, the worse of the two images; NaN where a landmark does not have it.
+        seen: (m, 3) bool: found in one image or both.
         false_alarm_rate: Share of frames with right landmarks whose score exceeds 1.
     """
 
     frame: np.ndarray
     parts: dict[str, np.ndarray]
+    seen: np.ndarray
     false_alarm_rate: float = FALSE_ALARM_RATE
 
     @property
     def score(self) -> np.ndarray:
-        """(m,) the worst part of each frame; above 1 the frame is not to be believed."""
-        return np.fmax.reduce(list(self.parts.values()))
+        """(m,) the worst part of the worst landmark; above 1 the frame is not to be believed, NaN where nothing is seen."""
+        return np.fmax.reduce([np.fmax.reduce(part, axis=1) for part in self.parts.values()])
+
+    @property
+    def bad(self) -> np.ndarray:
+        """(m, 3) bool: seen, and one of its own parts exceeds the limit."""
+        return self.seen & np.any([part > 1 for name, part in self.parts.items() if name != "shape"], axis=0)
 
     @property
     def unhealthy(self) -> float:
-        """Share of frames whose score exceeds 1."""
-        return float((self.score > 1).mean())
+        """Share of the landmarks seen that are bad; 1 where none is seen."""
+        return float(self.bad.sum() / self.seen.sum()) if self.seen.any() else 1.0
 
     @property
     def worst_part(self) -> str:
-        """The part that most frames fail."""
+        """The part that most landmarks fail."""
         return max(self.parts, key=lambda name: np.sum(self.parts[name] > 1))
 
 
@@ -84,22 +92,25 @@ def health(
     with warnings.catch_warnings(action="ignore"):  # means of what no frame shows
         length = np.nanmedian(np.linalg.norm(u[:, 1:] - u[:, :1], axis=-1))
         time = np.nanmean(data.grid("time_s"), axis=1)
-    found = {
-        "missing": np.isnan(u[..., 0]), "epipolar": _epipolar_px(u) / length, "smoothness": _bent_px(u, time) / length,
-    }  # fmt: skip
+    shape = u.shape[:3]
+    distance = affine_epipolar(np.concatenate([u[:, :, 0], u[:, :, 1]], axis=2).reshape(-1, 4))[0].reshape(shape[:2])
+    parts = {"epipolar": distance / length}
     if calibration is not None and calibration.rig is not None:
-        rig, moved = calibration.rig, with_offsets(data, calibration.offsets)
-        x = moved.grid("x_mm")
-        told = np.stack([camera.project(x.reshape(-1, 3)) for camera in (rig.left, rig.right)], axis=1)
-        distance = np.linalg.norm(u - told.reshape(u.shape), axis=-1)
-        found["robot"] = distance / max(calibration.reprojection_rms_px, 1.0)
+        rig, x = calibration.rig, with_offsets(data, calibration.offsets).grid("x_mm")
+        told = np.stack([camera.project(x.reshape(-1, 3)) for camera in (rig.left, rig.right)], axis=1).reshape(u.shape)
+        off = u - told
+        parts["robot"] = _worse(off) / max(calibration.reprojection_rms_px, 1.0)
+        parts["smoothness"] = _worse(_jump_px(off, time)) / length
         seen = rig.triangulate(u[:, :, 0].reshape(-1, 2), u[:, :, 1].reshape(-1, 2)).x_mm.reshape(x.shape)
-        found["shape"] = _tool_length(seen) / _tool_length(x) - 1.0
+        parts["shape"] = np.repeat(np.abs(_tool_length(seen) / _tool_length(x) - 1.0)[:, None], shape[1], axis=1)
     if detector is not None:
-        found["looks"] = _looks_px(recording, frame, u, detector, looks) / length
-    parts = {"missing": found.pop("missing").mean(axis=(1, 2))}
-    parts |= {name: np.fmax.reduce(np.abs(value).reshape(len(frame), -1), axis=1) for name, value in found.items()}
-    return Health(frame, {name: parts[name] / LIMITS[name] for name in LIMITS if name in parts})
+        parts["looks"] = _looks_px(recording, frame, u, detector, looks).max(axis=2) / length
+    return Health(frame, {n: parts[n] / LIMITS[n] for n in LIMITS if n in parts}, np.isfinite(u[..., 0]).any(axis=2))
+
+
+def _worse(off: np.ndarray) -> np.ndarray:
+    """(m, 3) the longer of the two images' vectors (m, 3, 2, 2)."""
+    return np.fmax.reduce(np.linalg.norm(off, axis=-1), axis=2)
 
 
 def _tool_length(x: np.ndarray) -> np.ndarray:
@@ -107,38 +118,17 @@ def _tool_length(x: np.ndarray) -> np.ndarray:
     return np.linalg.norm(x[:, 1:].mean(axis=1) - x[:, 0], axis=1)
 
 
-def _bent_px(u: np.ndarray, time_s: np.ndarray) -> np.ndarray:
-    """(m, 3, 2) distance from the straight line between the neighbours in time, NaN where these are far."""
-    bent = np.full(u.shape[:3], np.nan)
-    if len(u) > 2:
-        step = np.diff(time_s)
-        share = (step[:-1] / (step[:-1] + step[1:]))[:, None, None, None]
-        straight = (1 - share) * u[:-2] + share * u[2:]
-        near = np.maximum(step[:-1], step[1:]) <= _NEXT_S
-        bent[1:-1] = np.where(near[:, None, None], np.linalg.norm(u[1:-1] - straight, axis=-1), np.nan)
-    return bent
-
-
-def _epipolar_px(u: np.ndarray, samples: int = 300) -> np.ndarray:
-    """(m, 3) distance of landmarks from the affine epipolar geometry that most of them share; it knows nothing of the robot."""
-    y = u.reshape(-1, 4)
-    rows = np.flatnonzero(np.isfinite(y).all(axis=1))
-    if len(rows) < 12:
-        return np.full(u.shape[:2], np.nan)
-    rng = np.random.default_rng(0)
-    sets = y[rows][rng.integers(0, len(rows), (samples, 4))]
-    normal = np.linalg.svd(sets - sets.mean(axis=1, keepdims=True))[2][:, 3]
-    distance = np.abs((y[rows][None] - sets.mean(axis=1, keepdims=True)) @ normal[:, :, None])[..., 0]
-    best = distance[np.median(distance, axis=1).argmin()]
-    for _ in range(5):  # refit on the rows that agree
-        kept = y[rows][best <= 4.0 * max(np.median(best), 0.1)]
-        n = np.linalg.svd(kept - kept.mean(axis=0))[2][3]
-        best = np.abs((y[rows] - kept.mean(axis=0)) @ n)
-    return np.abs((y - kept.mean(axis=0)) @ n).reshape(u.shape[:2])
+def _jump_px(off: np.ndarray, time_s: np.ndarray) -> np.ndarray:
+    """(m, 3, 2, 2) differences from the median of a frame and its two neighbours, NaN where these are not close in time."""
+    jump = np.full(off.shape, np.nan)
+    if len(off) > 2:
+        near = (time_s[2:] - time_s[:-2] <= 2 * _NEXT_S)[:, None, None, None]
+        jump[1:-1] = np.where(near, off[1:-1] - np.median([off[:-2], off[1:-1], off[2:]], axis=0), np.nan)
+    return jump
 
 
 def _looks_px(recording: Recording, frame: np.ndarray, u: np.ndarray, detector: Callable, looks: int) -> np.ndarray:
-    """(m, 3, 2) how far a mirrored and a shifted look at the same image move a landmark; infinite where one finds nothing."""
+    """(m, 3, 2) px how far a mirrored and a shifted look move a landmark; infinite where they disagree that it is there."""
     moved = np.full(u.shape[:3], np.nan)
     for i in np.unique(np.linspace(0, len(frame) - 1, min(looks, len(frame))).round().astype(int)):
         pair = recording.frames[int(frame[i])]
@@ -148,5 +138,5 @@ def _looks_px(recording: Recording, frame: np.ndarray, u: np.ndarray, detector: 
         shifted = np.pad(images, ((0, 0), (_SHIFT_PX[1], 0), (_SHIFT_PX[0], 0), (0, 0)))
         again = detector(shifted[:, : images.shape[1], : images.shape[2]]).u - _SHIFT_PX
         distance = np.linalg.norm(np.stack([back, again]) - np.swapaxes(u[i], 0, 1), axis=-1).max(axis=0)
-        moved[i] = np.where(np.isnan(u[i, ..., 0]), np.nan, np.nan_to_num(distance, nan=np.inf).T)
+        moved[i] = np.where(np.isnan(u[i, ..., 0]), 0.0, np.nan_to_num(distance, nan=np.inf).T)
     return moved

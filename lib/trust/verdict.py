@@ -1,19 +1,50 @@
 """Verdicts: may a number of this recording be believed, why not, and what to do (all thresholds stand here)."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
 
-from lib.calibration import Calibration, optics
-from lib.correspondences import Correspondences
+from lib.calibration import Calibration, NoConsensusError, optics
+from lib.correspondences import Correspondences, NoDetectionError
+from lib.recordings import Doubt
+from lib.trust.diagnosis import Diagnosis
+from lib.trust.health import Health
 
-__all__ = ["LEVELS", "Reason", "Verdict", "judge"]
+__all__ = ["LEVELS", "LIMITS", "Reason", "Verdict", "judge"]
 
 #: From best to worst.
 LEVELS = ("trustworthy", "doubtful", "not trustworthy")
-DOUBTFUL, RED = LEVELS[1:]
+#: Check -> values at which a verdict becomes doubtful, and not trustworthy.
+LIMITS: dict[str, tuple[float, float]] = {
+    # RMS residual over what detector and robot claim.  Heavy tails (Student t, 4 degrees) reach 1.5; a clock 5 ms off 2.
+    "residuals": (1.7, 2.6),
+    # Cross-validated over fitted RMS, beyond what the leverages let expect.  Clean data of 6 rows reach 1.6.
+    "cross_validation": (2.0, 4.0),
+    # Share of the usable rows that agree on the cameras: a bare majority may be the wrong one.
+    "consensus": (0.75, 0.5),
+    # Frames with rows that agree.  Of 6 clean frames on the covariances are right; of 3 nothing checks anything.
+    "frames": (6, 4),
+    # Degrees between the viewing directions: a microscope's are 2 to 20 apart; beyond 45 no two of its eyes see one scene.
+    "convergence_low": (1.0, 0.3),
+    "convergence_high": (25.0, 45.0),
+    # Zoom of one camera over the other's, and along x over along y: optics of one microscope differ by some per cent.
+    "zoom_ratio": (1.3, 2.0),
+    "aspect": (1.08, 1.25),
+    # Standard deviations of a landmark's depth that the calibration adds to the detector's, at the edge of its own volume.
+    "coverage": (1.0, np.inf),
+    # Median epipolar distance of free matches, px, beyond three of its standard deviations: band matching fails from 6 px.
+    "epipolar": (1.5, 4.0),
+    # Share of the landmarks that contradict themselves, the other image or the robot.  10 % gross errors a view reach 0.2.
+    "health": (0.25, 0.5),
+    # Share of the residuals' variance that a named fault explains.
+    "diagnosis": (0.0, 0.5),
+}  # fmt: skip
+#: Pixel noise assumed where the detections claim none: that of labels set by hand.
+_LABEL_PX = 3.0
+_CHECK = "`python3 -m lib check RECORDING`"
+_OVERLAYS = f"Look at the overlays of {_CHECK}"
 
 
 @dataclass(frozen=True)
@@ -56,7 +87,7 @@ class Verdict:
     @property
     def is_red(self) -> bool:
         """True where no number that follows from the calibration should be stated."""
-        return self.level == RED
+        return self.level == LEVELS[2]
 
     @classmethod
     def join(cls, parts: Iterable[Self]) -> Self:
@@ -69,12 +100,13 @@ class Verdict:
         return {"verdict": self.level, "reasons": [vars(reason).copy() for reason in self.reasons]}
 
     def __str__(self) -> str:
-        return "\n".join([f"Verdict: {self.level}", *(f"  {r.level}: {r.text} {r.cure}" for r in self.reasons)])
+        return "\n".join([f"Verdict: {self.level}", *(f"  {r.level}: {r.name}: {r.text} {r.cure}" for r in self.reasons)])
 
 
 def judge(
-    data: Correspondences | None, calibration: Calibration | None, *, diagnosis: object = None, health: object = None,
-    epipolar_px: float | None = None, robot_accuracy_mm: float | None = None, error: Exception | None = None,
+    data: Correspondences | None, calibration: Calibration | None, *, diagnosis: Diagnosis | None = None,
+    health: Health | None = None, epipolar_px: float | None = None, robot_accuracy_mm: float | None = None,
+    error: Exception | None = None, doubts: Sequence[Doubt] = (),
 ) -> Verdict:  # fmt: skip
     """The verdict on a calibration from its own numbers and from witnesses.
 
@@ -83,30 +115,130 @@ def judge(
         calibration: None where it was refused; then `error` is the exception.
         diagnosis, health: Of `lib.trust.diagnose` and `lib.trust.health`, where made.
         epipolar_px: Median epipolar distance of matches between the two images, which know nothing of the tool.
-        robot_accuracy_mm: As its maker states it.
+        robot_accuracy_mm: As its maker states it; None is 10 um.
+        doubts: Of the recording (`lib.recordings.Recording.doubts`).
     """
+    found = []
+    if diagnosis is not None and diagnosis.best is not None:
+        best = diagnosis.best
+        text = f"{best.text} It explains {100 * best.explained:.0f} % of the residuals."
+        found += _above("diagnosis", best.explained, text, best.cure, best.name)
     if calibration is None:
-        return Verdict((Reason("refused", RED, str(error), "See the reasons of the detector and of the recording."),))
-    c, found = calibration, []
-    rows, used = c.view_inliers.sum(), np.isfinite(c.residuals_px).sum() // 2
-    if used and rows < 0.5 * used:
-        text = f"{rows} of {used} detections agree on the cameras; at least half should."
-        found.append(Reason("minority", RED, text, "Look at the overlays: the detector may not know this tool."))
-    claim = _claimed_px(c)
-    if np.isfinite(claim) and c.reprojection_rms_px > 3.0 * claim:
-        text = f"The residuals are {c.reprojection_rms_px:.1f} px RMS; detector and robot claim {claim:.1f} px."
-        found.append(Reason("residuals", RED, text, "Read the diagnosis: `lib.trust.diagnose(data, calibration)`."))
-    if c.rig is not None and not np.deg2rad(0.5) < optics(c).convergence_rad < np.deg2rad(45):
-        text = f"The cameras converge by {np.rad2deg(optics(c).convergence_rad):.1f} degrees; a stereo microscope by 2 to 20."
-        found.append(Reason("convergence", RED, text, "Check that x_mm and u belong together."))
-    return Verdict.join([Verdict(tuple(found))])
+        name = {NoDetectionError: "no_detection", NoConsensusError: "no_consensus"}.get(type(error), "refused")
+        found.append(Reason(name, LEVELS[2], f"There is no calibration: {error}", f"{_OVERLAYS}."))
+    else:
+        for check in _CHECKS:
+            found += check(data, calibration, 0.01 if robot_accuracy_mm is None else robot_accuracy_mm)
+        if epipolar_px is not None and np.isfinite(epipolar_px):
+            beyond, limit = max(epipolar_px - 3.0 * _epipolar_sd_px(calibration), 0.0), LIMITS["epipolar"][0]
+            text = f"Features of both images lie {epipolar_px:.1f} px (median) off the epipolar lines; {limit:g} are allowed."
+            cure = "Did a camera move, or are left and right not of one instant? Calibrate anew."
+            found += _above("epipolar", beyond, text, cure)
+    if health is not None:
+        text = f"{100 * health.unhealthy:.0f} % of the landmarks found contradict themselves, the other image or the robot"
+        text += f" (most often: {health.worst_part})."
+        cure = f"The detector may not know this tool or light. {_OVERLAYS}, then run `python3 -m lib adapt RECORDING`."
+        found += _above("health", health.unhealthy, text, cure, "detector_unfit")
+    found += [Reason(doubt.name, LEVELS[1], doubt.text, doubt.cure) for doubt in doubts]
+    return Verdict.join([Verdict((reason,)) for reason in found])
 
 
-def _claimed_px(c: Calibration) -> float:
-    """Reprojection RMS that the detector's covariances claim, the robot at 10 um."""
-    if c.covariance_px2 is None:
-        return np.nan
-    rows = c.covariance_px2 if len(c.covariance_px2) == 1 else c.covariance_px2[c.inliers]
-    variance = np.trace(rows, axis1=1, axis2=2).mean() / len(c.cameras)
-    zoom2 = np.mean([(camera.linear**2).sum() for camera in c.cameras])
-    return float(np.sqrt(variance / c.detector_scale**2 + zoom2 * 0.01**2))
+def _above(check: str, value: float, text: str, cure: str, name: str = "") -> list[Reason]:
+    """A reason where the value is beyond a limit of the check, on the side on which the second limit lies."""
+    doubtful, red = LIMITS[check]
+    sign = 1.0 if red > doubtful else -1.0
+    if not sign * value > sign * doubtful:
+        return []
+    return [Reason(name or check, LEVELS[2] if sign * value > sign * red else LEVELS[1], text, cure)]
+
+
+def _residuals(data: Correspondences | None, c: Calibration, robot_mm: float) -> Iterator[Reason]:
+    claim = _claimed_px(c, robot_mm)
+    text = f"The residuals are {c.reprojection_rms_px:.1f} px RMS; detector and robot claim {claim:.1f} px."
+    cure = f"Read the diagnosis of {_CHECK}: clock, axes, order of tips, detector."
+    yield from _above("residuals", c.reprojection_rms_px / claim, text, cure)
+
+
+def _claimed_px(c: Calibration, robot_mm: float) -> float:
+    """RMS distance in an image that the detections' covariances and the robot's accuracy let expect, averaged over views."""
+    views, used = len(c.cameras), c.inliers
+    variance = 2.0 * _LABEL_PX**2
+    if c.covariance_px2 is not None:
+        rows = c.covariance_px2 if len(c.covariance_px2) == 1 else c.covariance_px2[used]
+        variance = float(np.nanmean(np.trace(rows, axis1=1, axis2=2))) / views
+    gain = np.mean([(camera.jacobian(c.x_mm[used][:1]) ** 2).sum() for camera in c.cameras])
+    return float(np.sqrt(variance + gain * robot_mm**2))
+
+
+def _cross_validation(data: Correspondences | None, c: Calibration, robot_mm: float) -> Iterator[Reason]:
+    _, J, weight, _ = c.system
+    own = J @ c.parameter_covariance @ np.swapaxes(J, 1, 2) @ weight
+    # What leaving a row out does to clean data: its residual grows by (1 - leverage)^-1/2.
+    expected = np.sqrt(np.mean(np.trace(np.linalg.inv(np.eye(own.shape[1]) - own), axis1=1, axis2=2) / own.shape[1]))
+    ratio = c.press_rms_px / max(c.reprojection_rms_px * expected**2, 1e-9)
+    text = f"Rows left out are predicted with {c.press_rms_px:.3g} px, rows fitted with {c.reprojection_rms_px:.3g} px RMS."
+    cure = "A few rows decide everything: move the tool through the whole volume."
+    yield from _above("cross_validation", ratio, text, cure)
+
+
+def _consensus(data: Correspondences | None, c: Calibration, robot_mm: float) -> Iterator[Reason]:
+    usable = int(c.usable.sum())
+    share = c.view_inliers[c.usable].mean()
+    text = f"Only {100 * share:.0f} % of the {usable} rows agree on the cameras."
+    cure = f"{_OVERLAYS}: the other detections are wrong, or these are."
+    yield from _above("consensus", float(share), text, cure, "minority")
+
+
+def _frames(data: Correspondences | None, c: Calibration, robot_mm: float) -> Iterator[Reason]:
+    if data is None:
+        return
+    frames = len(np.unique(data.frame[c.inliers]))
+    text = f"{frames} frames have landmarks that agree; {LIMITS['frames'][0]:g} are needed, 30 are good."
+    yield from _above("frames", frames + 1e-9, text, "Record more frames, with the tool in other places.", "few_frames")
+
+
+def _geometry(data: Correspondences | None, c: Calibration, robot_mm: float) -> Iterator[Reason]:
+    zooms = np.array([np.diag(resection.K) for resection in c.resections()])
+    cure = "Check axes and units of the kinematics, the order of the tips, and which image is left."
+    aspect = float(np.exp(np.abs(np.log(zooms[:, 0] / zooms[:, 1])).max()))
+    text = f"A camera's zoom differs by a factor of {aspect:.2f} between x and y; pixels are square within some per cent."
+    yield from _above("aspect", aspect, text, cure, "implausible_optics")
+    if c.rig is None:
+        return
+    ratio = float(np.exp(np.abs(np.diff(np.log(zooms).mean(axis=1)))[0]))
+    text = f"One camera's zoom is {ratio:.2f} times the other's."
+    yield from _above("zoom_ratio", ratio, text, cure, "implausible_optics")
+    found, angle = optics(c), np.rad2deg(c.rig.convergence_rad)
+    text = f"The cameras converge by {min(angle, 180 - angle):.1f} degrees; a stereo microscope's by 2 to 20."
+    yield from _above("convergence_high", min(angle, 180 - angle), text, cure, "implausible_optics")
+    if angle < 90:
+        yield from _above("convergence_low", angle, text, "Are left and right two different cameras?", "implausible_optics")
+    if found.mirrored in ("left", "right", "left or right"):
+        text = f"One image is a mirror image ({found.mirrored}), or an axis of the kinematics is."
+        yield Reason("mirrored", LEVELS[1], text, "Flip that image when recording, or exchange the sign of the axis.")
+
+
+def _coverage(data: Correspondences | None, c: Calibration, robot_mm: float) -> Iterator[Reason]:
+    if c.rig is None:
+        return
+    x = c.x_mm[c.inliers]
+    along = np.linalg.svd(x - x.mean(axis=0))[2]
+    low, high = np.percentile((x - x.mean(axis=0)) @ along.T, [5, 95], axis=0)
+    corners = x.mean(axis=0) + np.stack(np.meshgrid(*np.stack([low, high]).T), axis=-1).reshape(-1, 3) @ along
+    alone, both = (c.depth_sd_mm(corners, detection=detection).max() for detection in (False, True))
+    added = alone / np.sqrt(max(both**2 - alone**2, 1e-12))
+    sizes = " x ".join(f"{value:.1f}" for value in high - low)
+    text = f"The tool covers {sizes} mm: the calibration itself leaves {1e3 * alone:.0f} um of depth open at its corners."
+    cure = "Move the tool through more depths and corners (`lib.calibration.next_positions`)."
+    yield from _above("coverage", float(added), text, cure)
+
+
+def _epipolar_sd_px(c: Calibration) -> float:
+    """Standard deviation of the epipolar distance at the middle of the data, from the calibration alone."""
+    n = c.pair.epipolar_normal
+    return float(np.sqrt(n @ c.projection_covariance(c.x_mm[c.inliers].mean(axis=0)[None])[0] @ n))
+
+
+_CHECKS: tuple[Callable[[Correspondences | None, Calibration, float], Iterable[Reason]], ...] = (
+    _residuals, _cross_validation, _consensus, _frames, _geometry, _coverage,
+)  # fmt: skip
