@@ -24,6 +24,8 @@ python3 -m lib COMMAND [options]        (in the folder of the workbench)
   bench [...] benchmarks; what follows goes to pytest
   sweep NOTEBOOK [-p NAME VALUE,VALUE,...] [--workers N | --scheduler ADDRESS] [--record]
               one notebook over a grid of parameters, on Dask; a table and a plot of each metric
+  check RECORDING [--out FOLDER]
+              is a recording fit for use, and if not, why: one page, check.html, and check.json
   import SOURCE --map MAPPING.toml [--guess | --out RECORDING]
               a recording from videos, a robot's log and labels, as the mapping says
   detect, calibrate, reconstruct, register RECORDING [--out FOLDER]
@@ -147,6 +149,7 @@ def ruff_options() -> list[str]:
 FUNCTIONS = {
     "run": ("lib.workbench.command", "main"),
     **{name: ("lib.commands", f"main_{name}") for name in ("import", "detect", "calibrate", "reconstruct", "register")},
+    "check": ("lib.trust.check", "main"),
     "sweep": ("lib.workbench.sweep", "main"),
     "simulate": ("lib.simulator.dataset", "main"),
     "online": ("lib.online.command", "main"),

@@ -150,7 +150,8 @@ class Recording:
         known = Truth.read(folder / "truth", len(frames)) if truth and (folder / "truth").is_dir() else None
         made = cls(folder=folder, frames=frames, kinematics=kinematics, annotations=annotations, truth=known, **header)
         for doubt in made.doubts:
-            warnings.warn(f"{folder}: {doubt.text} {doubt.cure} `python3 -m lib check {folder}` says more.", stacklevel=2)
+            place = re.sub(r"\.\d+-\w+\.partial$", "", str(folder))  # where `RecordingWriter` moves it
+            warnings.warn(f"{place}: {doubt.text} {doubt.cure} `python3 -m lib check {place}` says more.", stacklevel=2)
         return made
 
     @property

@@ -25,6 +25,8 @@ __all__ = ["RecordingWriter"]
 class RecordingWriter:
     """Context manager that writes a recording beside its final place and moves it there when it is valid.
 
+    `python3 -m lib check FOLDER` then says whether it is fit for use.
+
     Args:
         folder: Where the recording appears.  Until then its files lie beside it, in a folder ending with ``.partial``.
         image_size_px: (width, height).

@@ -3,9 +3,11 @@
 from lib.trust.assessment import Assessment, assess
 from lib.trust.case import Hypothesis
 from lib.trust.diagnosis import Diagnosis, diagnose
+from lib.trust.health import Health, health
 from lib.trust.report import report
 from lib.trust.verdict import LEVELS, Reason, Verdict, judge
 
 __all__ = [
-    "LEVELS", "Assessment", "Diagnosis", "Hypothesis", "Reason", "Verdict", "assess", "diagnose", "judge", "report",
+    "LEVELS", "Assessment", "Diagnosis", "Health", "Hypothesis", "Reason", "Verdict", "assess", "diagnose", "health", "judge",
+    "report",
 ]  # fmt: skip

@@ -66,8 +66,8 @@ class Health:
 
     @property
     def worst_part(self) -> str:
-        """The part that most landmarks fail."""
-        return max(self.parts, key=lambda name: np.sum(self.parts[name] > 1))
+        """The part that most landmarks fail (`shape` is of a frame)."""
+        return max((n for n in self.parts if n != "shape"), key=lambda name: np.sum(self.parts[name] > 1))
 
 
 def health(

@@ -20,6 +20,7 @@ from lib import paths
 from lib.cameras import NearAffineCamera
 from lib.correspondences import of_recording
 from lib.recordings import Kinematics, Recording, RecordingWriter, Truth, import_retinal_microsurgery, read_image
+from lib.recordings.doubts import doubts
 from lib.simulator.rig import reference_rig
 
 N, SIZE = 4, (64, 48)
@@ -605,3 +606,26 @@ def test_real_retinal_microsurgery():
         assert (np.nanmax(sequence.u, axis=(0, 1)) < [640, 480]).all()
         reach = np.linalg.norm(sequence.u[:, 1:].mean(axis=1) - sequence.u[:, 0], axis=1)
         assert 28 < np.nanmedian(reach) < 63  # the jaw's size that the data set states
+
+
+# --- what is suspicious is told at opening
+
+
+@pytest.mark.parametrize(("frames", "times", "jump", "name"), [
+    (34, np.arange(0, 43, 0.1), 0.0, "frame_times"),
+    (100, np.arange(0, 2, 0.01), 0.0, "little_overlap"),
+    (40, np.arange(-1, 4, 1.0), 0.0, "slow_log"),
+    (40, np.arange(-0.1, 2, 0.01), 500.0, "jump"),
+    (40, np.arange(-0.1, 2, 0.01), 0.0, None),
+])  # fmt: skip
+def test_doubts(frames, times, jump, name):
+    log = Kinematics(times, np.zeros((len(times), 3, 3)))
+    log.x_mm[2] += jump
+    at = np.arange(frames) / 25
+    found = list(doubts(at, 25.0, log.time_s, log.x_mm, np.isfinite(log.at(at)).all(axis=2).any(axis=1)))
+    assert [doubt.name for doubt in found] == ([name] if name else [])
+
+
+def test_nothing_is_interpolated_in_a_gap():
+    log = Kinematics(np.array([0.0, 0.01, 0.02, 3600.0, 3600.01]), np.zeros((5, 3, 3)))
+    assert np.isfinite(log.at([0.015, 0.02, 1800.0, 3600.0, 3600.005])[:, 0, 0]).tolist() == [True, True, False, True, True]

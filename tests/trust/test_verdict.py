@@ -1,8 +1,15 @@
 """Verdicts: levels, how they join, and that the workbench knows the same levels."""
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 
-from lib.trust import LEVELS, Reason, Verdict
+from lib.calibration import calibrate
+from lib.correspondences import Correspondences, NoDetectionError
+from lib.recordings import Doubt
+from lib.simulator.rig import simulate_correspondences
+from lib.trust import LEVELS, Health, Reason, Verdict, judge
 from lib.workbench.report import VERDICT_COLOURS
 
 CLOCK = Reason("clock", "not trustworthy", "183 ms", "Set offset_s.")
@@ -20,3 +27,56 @@ def test_the_worst_reason_decides_and_stands_first():
 
 def test_the_workbench_knows_the_same_levels():
     assert tuple(VERDICT_COLOURS) == LEVELS
+
+
+# --- what is judged
+
+
+def made(n, seed=0, claim_px=1.5, **options):
+    c = simulate_correspondences(n, rng=np.random.default_rng(seed), **options)
+    claimed = np.broadcast_to(claim_px**2 * np.eye(2), (n, 2, 2, 2))
+    return Correspondences.of_points(c.x_mm, c.u_left, c.u_right, covariance_px2=claimed)
+
+
+def names(data, **options):
+    calibration = calibrate(data, image_size_px=(1920, 1080))
+    return {reason.name: reason.level for reason in judge(data, calibration, **options).reasons}
+
+
+@pytest.mark.parametrize("n", [6, 8, 12, 40])
+def test_clean_data_of_any_size_are_never_red(n):
+    levels = [level for seed in range(15) for level in names(made(n, seed)).values()]
+    assert LEVELS[2] not in levels and (n < 12 or not levels)
+
+
+def test_residuals_beyond_the_claim_are_red():
+    assert names(made(60, claim_px=0.2), robot_accuracy_mm=0.001)["residuals"] == LEVELS[2]
+    assert names(made(60)) == {}
+
+
+def test_a_minority_and_few_frames_are_told():
+    data, rng = made(60), np.random.default_rng(1)
+    wrong = rng.random(60) < 0.35
+    u = np.where(wrong[:, None], rng.uniform(0, 1000, (60, 2)), data.u_left)
+    assert names(replace(data, u_left=u))["minority"] == LEVELS[1]
+    assert names(replace(made(12), frame=np.arange(12) // 4))["few_frames"] == LEVELS[2]
+
+
+def test_witnesses_count():
+    data = made(60)
+    assert names(data, epipolar_px=0.5) == {} and names(data, epipolar_px=20.0) == {"epipolar": LEVELS[2]}
+    bad = Health(np.arange(20), {"looks": np.full((20, 3), 3.0)}, np.ones((20, 3), bool))
+    assert names(data, health=bad) == {"detector_unfit": LEVELS[2]}
+    assert names(data, doubts=[Doubt("log_gap", "An hour.", "Look.")]) == {"log_gap": LEVELS[1]}
+
+
+def test_no_detection_is_one_message():
+    data = made(60)
+    nothing = replace(data, u_right=np.full((60, 2), np.nan))
+    text = r"detector failed on 60 frames: of 60 .* found 60 in left images, 0 in right"
+    with pytest.raises(NoDetectionError, match=text) as error:
+        calibrate(nothing)
+    verdict = judge(nothing, None, error=error.value)
+    assert [reason.name for reason in verdict.reasons] == ["no_detection"] and verdict.is_red
+    with pytest.raises(NoDetectionError, match="the robot reports a position for 0 of the 60 landmarks"):
+        calibrate(replace(data, x_mm=np.full((60, 3), np.nan)))

@@ -1,0 +1,232 @@
+"""``python3 -m lib check RECORDING``: what a recording holds, what is wrong with it, and what to do next, on one page."""
+
+import argparse
+import base64
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jinja2 import Environment, FileSystemLoader
+
+from lib import files, paths
+from lib.calibration import estimate_time_offset
+from lib.correspondences import LANDMARKS, Correspondences, of_recording
+from lib.landmarks import Detector, detect
+from lib.provenance import plain
+from lib.recordings import Recording
+from lib.trust.assessment import Assessment, assess
+from lib.trust.report import report
+
+__all__ = ["Check", "check", "main"]
+
+_COLOURS = np.array([[0, 114, 178], [230, 159, 0], [0, 158, 115]])  # of base, tip_1, tip_2, RGB
+_SHOWN = 3  # best frames, and worst
+_MOST_FRAMES = 60  # spread over the recording; more take longer and say little more
+_SHOWN_PX = 760  # width of one image of an overlay
+
+
+@dataclass(frozen=True, eq=False)
+class Check:
+    """What `check` found.
+
+    Attributes:
+        recording, assessment: What was checked, and its verdict.
+        facts: Question -> answer in words: what is in the folder, clock, read-out, order of the tips, offsets, detector.
+        next_step: What to do now.
+    """
+
+    recording: Recording
+    assessment: Assessment
+    facts: dict[str, str]
+    next_step: str
+
+    def to_json(self) -> dict:
+        """verdict, reasons, next_step, facts and the score of each frame, as in check.json."""
+        a = self.assessment
+        hypotheses = [{k: plain(v) for k, v in vars(h).items()} for h in a.diagnosis.hypotheses[:5]]
+        frames = {"frame": a.health.frame.tolist(), "score": plain(a.health.score.tolist())}
+        facts = {"recording": self.recording.name, **self.facts, "next_step": self.next_step}
+        numbers = {"epipolar_px": plain(a.epipolar_px), "unhealthy_share": a.health.unhealthy}
+        return a.verdict.to_json() | facts | numbers | {"diagnosis": hypotheses, "frames": frames}
+
+    def write(self, folder: str | Path) -> Path:
+        """Write check.html and check.json into `folder`; returns the page."""
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        files.write_json(folder / "check.json", self.to_json())
+        here = Environment(loader=FileSystemLoader(Path(__file__).parent), autoescape=True)
+        a = self.assessment
+        text = here.get_template("check.html").render(
+            recording=self.recording, verdict=a.verdict, facts=self.facts, next_step=self.next_step,
+            overlays=self._overlays(), coverage=_data_uri(self._coverage(), ".png"),
+            report="" if a.calibration is None else report(a.calibration, verdict=a.verdict),
+            hypotheses=[h for h in a.diagnosis.hypotheses if h.gain > 0][:5],
+        )  # fmt: skip
+        files.write_text(folder / "check.html", text)
+        return folder / "check.html"
+
+    def _overlays(self) -> list[tuple[str, str]]:
+        """(caption, picture) of the worst and the best frames."""
+        health = self.assessment.health
+        order = np.argsort(-np.nan_to_num(health.score, nan=np.inf), kind="stable")
+        chosen = list(dict.fromkeys([*order[:_SHOWN], *order[::-1][:_SHOWN]]))
+        found = []
+        for place, i in enumerate(chosen):
+            number, score = int(health.frame[i]), health.score[i]
+            parts = {name: part[i].max() for name, part in health.parts.items() if np.isfinite(part[i]).any()}
+            why = f"score {score:.2g}, most of it {max(parts, key=parts.get)}" if parts else "nothing was found"
+            kind = "worst" if place < _SHOWN and (score > 1 or np.isnan(score)) else "good" if score <= 1 else "bad"
+            found.append((f"Frame {number} ({kind}): {why}.", _data_uri(self._overlay(number), ".jpg")))
+        return found
+
+    def _overlay(self, number: int) -> np.ndarray:
+        """Left and right image with what was found (rings) and where the robot is seen by the calibration (crosses)."""
+        frame, rows, c = self.recording.frames[number], self.assessment.data.of_frames(number), self.assessment.calibration
+        told = (None, None) if c is None else c.pair.project(rows.x_mm)
+        images = []
+        views = ((frame.left, frame.right), (rows.u_left, rows.u_right), rows.seen.T, told)
+        for image, u, seen, robot in zip(*views, strict=True):
+            scale = _SHOWN_PX / image.shape[1]
+            picture = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+            for k, row in enumerate(rows.landmark):
+                colour = _COLOURS[row % 3].tolist()
+                if seen[k]:
+                    cv2.circle(picture, _whole(u[k] * scale), 9, (255, 255, 255), 3, cv2.LINE_AA)
+                    cv2.circle(picture, _whole(u[k] * scale), 9, colour, 2, cv2.LINE_AA)
+                if robot is not None and np.isfinite(robot[k]).all() and np.abs(robot[k]).max() < 1e5:
+                    cv2.drawMarker(picture, _whole(robot[k] * scale), (255, 255, 255), cv2.MARKER_CROSS, 18, 3, cv2.LINE_AA)
+                    cv2.drawMarker(picture, _whole(robot[k] * scale), colour, cv2.MARKER_CROSS, 18, 2, cv2.LINE_AA)
+            images.append(picture)
+        return np.hstack([images[0], np.full((len(images[0]), 6, 3), 255, np.uint8), images[1]])
+
+    def _coverage(self) -> np.ndarray:
+        """Where the tool was: over the left image, in depth, and in time with the score of each frame."""
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+
+        data, health = self.assessment.data, self.assessment.health
+        figure = Figure(figsize=(11, 3.2), layout="constrained")
+        canvas, (field, depth, time) = FigureCanvasAgg(figure), figure.subplots(1, 3)
+        for k, name in enumerate(LANDMARKS):
+            rows, colour = data.landmark == k, tuple(_COLOURS[k] / 255)
+            field.plot(*data.u_left[rows & data.seen[:, 0]].T, ".", ms=4, color=colour, label=name)
+            depth.plot(data.time_s[rows], data.x_mm[rows, 2], ".", ms=4, color=colour)
+        width, height = self.recording.image_size_px
+        field.set(xlim=(0, width), ylim=(height, 0), aspect="equal", title="left image (px)")
+        field.legend(fontsize=7)
+        depth.set(title="z in the robot frame (mm)", xlabel="time of the video (s)")
+        score = np.clip(np.nan_to_num(health.score, nan=1e3), 1e-2, 1e3)
+        time.semilogy(self.recording.frames.time_s[health.frame], score, "k.", ms=4)
+        time.axhline(1.0, color="#b42318", lw=1)
+        time.set(title="score of a frame (bad above 1)", xlabel="time of the video (s)")
+        canvas.draw()
+        return np.asarray(canvas.buffer_rgba())[..., :3]
+
+
+def check(recording: str | Path | Recording, *, detector: Callable | None = None, folder: str | Path | None = None) -> Check:
+    """Detect, calibrate, diagnose and judge a recording; its truth is never opened.
+
+    Args:
+        recording: Its folder, or the recording.
+        detector: None is the one that ships.
+        folder: Where check.html and check.json go; None writes nothing.
+
+    Raises:
+        FileNotFoundError, ValueError: If the folder is no recording that can be read.
+    """
+    found = recording if isinstance(recording, Recording) else Recording.open(recording, truth=False)
+    frames = np.unique(np.linspace(0, len(found) - 1, min(_MOST_FRAMES, len(found))).round().astype(int))
+    if found.skeleton != LANDMARKS:
+        detector, data = None, _labels(found)
+    else:
+        detector = detector or Detector.load()
+        data = detect(found, detector, frames=frames)
+    assessment = assess(found, data, detector=detector)
+    made = Check(found, assessment, _facts(found, assessment), _next_step(found, assessment))
+    if folder is not None:
+        made.write(folder)
+    return made
+
+
+def _labels(recording: Recording) -> Correspondences:
+    """The labels of a recording whose landmarks the detector does not know."""
+    marks = recording.annotations
+    if marks is None:
+        raise ValueError(f"{recording.folder}: the detector knows {', '.join(LANDMARKS)} only, and there are no annotations.")
+    return of_recording(recording, marks.u_left, marks.u_right)
+
+
+def _facts(recording: Recording, a: Assessment) -> dict[str, str]:
+    """Answers to what a user asks first."""
+    time, log, data, c = recording.frames.time_s, recording.kinematics.time_s, a.data, a.calibration
+    width, height = recording.image_size_px
+    facts = {
+        "folder": f"{len(recording)} stereo frames of {width} x {height} px over {np.ptp(time):.1f} s, {len(log)} samples of "
+        f"the robot over {np.ptp(log):.1f} s; robot accuracy {1e3 * recording.robot_accuracy_mm:.0f} um; "
+        f"{'labels' if recording.annotations is not None else 'no labels'}.",
+        "coverage": f"{len(a.health.frame)} frames looked at; {int(data.seen.all(axis=1).sum())} of {len(data)} landmarks "
+        f"found in both images, {int(data.is_complete.sum())} of them with a position of the robot.",
+    }
+    x = data.x_mm[data.is_complete]
+    if len(x):
+        facts["volume"] = "The tool was seen within {:.1f} x {:.1f} x {:.1f} mm.".format(*np.ptp(x, axis=0))
+    stated = f"offset_s = {recording.offset_s:g} s is stated"
+    try:
+        clock = estimate_time_offset(data, recording.kinematics, start_s=recording.offset_s)
+        change = f"{1e3 * (clock.offset_s - recording.offset_s):+.1f} +- {1e3 * clock.sd_s:.1f} ms"
+        facts["clock"] = f"{stated}; the data differ by {change}."
+    except ValueError as refused:
+        facts["clock"] = f"{stated}; the data cannot tell: {refused}"
+    best = a.diagnosis.best
+    told = {"readout": ("read-out", f"readout_s = {recording.readout_s:g} s"), "tip_order": ("tips", "base, tip_1, tip_2")}
+    for name, (title, what) in told.items():
+        doubt = best.text if best is not None and best.name == name else "nothing speaks against it."
+        facts[title] = f"{what} is stated; {doubt}"
+    if c is not None and c.offsets is not None and c.offsets.offset.shape[1] == 3:
+        offsets = zip(LANDMARKS, 1e3 * c.offsets.offset, strict=False)
+        parts = ["{}: {:+.0f}, {:+.0f}, {:+.0f} um".format(name, *value) for name, value in offsets]
+        facts["landmark offsets"] = "; ".join(parts) + " (along, across, normal)."
+    facts["detector"] = (
+        f"{100 * a.health.unhealthy:.0f} % of the landmarks found contradict themselves, the other image or the robot; "
+        f"{int((a.health.score > 1).sum())} of {len(a.health.frame)} frames have a score above 1 (of frames with right "
+        f"landmarks {100 * a.health.false_alarm_rate:.0f} %)."
+    )
+    if np.isfinite(a.epipolar_px):
+        facts["epipolar witness"] = f"Features of both images lie {a.epipolar_px:.2f} px (median) off the epipolar lines."
+    return facts
+
+
+def _next_step(recording: Recording, a: Assessment) -> str:
+    """The one thing to do now."""
+    where = paths.shown(recording.folder)
+    if a.verdict.level == "trustworthy":
+        return f"Use it: `python3 -m lib run -p recording {where}`."
+    if a.diagnosis.best is not None:
+        return a.diagnosis.best.cure
+    return a.verdict.reasons[0].cure
+
+
+def _whole(u: np.ndarray) -> tuple[int, int]:
+    return round(float(u[0])), round(float(u[1]))
+
+
+def _data_uri(image: np.ndarray, suffix: str) -> str:
+    """An RGB image as text that a page embeds."""
+    data = cv2.imencode(suffix, cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1]
+    return f"data:image/{'jpeg' if suffix == '.jpg' else 'png'};base64,{base64.b64encode(data.tobytes()).decode('ascii')}"
+
+
+def main(argv: list[str]) -> int:
+    """`python3 -m lib check`; exit code 0 for a finished check whatever the verdict, 2 where the folder cannot be read."""
+    parser = argparse.ArgumentParser(prog="python3 -m lib check", description="Is this recording fit for use; if not, why?")
+    parser.add_argument("recording", type=Path, help="the recording's folder")
+    parser.add_argument("--detector", metavar="FILE", help="weights (default: those that ship)")
+    parser.add_argument("--out", type=Path, metavar="FOLDER", help="of check.html and check.json (default: runs/check-NAME)")
+    a = parser.parse_args(argv)
+    detector = Detector.load(a.detector) if a.detector else None
+    found = check(a.recording, detector=detector)
+    page = found.write(a.out or paths.RUNS / f"check-{a.recording.resolve().name}")
+    print(f"{found.assessment.verdict}\nNext: {found.next_step}\nReport: {page}")
+    return 0

@@ -1,0 +1,69 @@
+"""`python3 -m lib check`, with stand-ins for the detector on a small recording."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+from lib.landmarks import Landmarks
+from lib.recordings import Recording
+from lib.simulator import Design, Eye, Microscope, simulate
+from lib.trust import check as module
+from lib.trust.check import check, main
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Ten frames of 192 x 108 px whose truth cannot be read."""
+    path = tmp_path_factory.mktemp("check") / "small"
+    microscope = Microscope(pixels_per_mm=(10.0, 10.0), image_size_px=(192, 108))
+    simulate(path, Design(Eye(texture_px=128), microscope=microscope, motion="sweep"), n_frames=10, progress=False)
+    return path
+
+
+@pytest.fixture(scope="module")
+def detector(folder):
+    """Knows each picture by heart; of any other it finds nothing."""
+    recording, rng, known = Recording.open(folder), np.random.default_rng(0), {}
+    for i, frame in enumerate(recording.frames):
+        for image, u in ((frame.left, recording.truth.u_left[i]), (frame.right, recording.truth.u_right[i])):
+            known[image.tobytes()] = u + rng.normal(0, 0.05, u.shape)
+    for file in (folder / "truth").iterdir():
+        file.write_bytes(b"")
+
+    def detect(images):
+        found = Landmarks.none(len(images))
+        for i, image in enumerate(images):
+            flipped, mirrored = known.get(image[:, ::-1].tobytes()), known.get(image.tobytes())
+            u = mirrored if flipped is None else (np.array([191, 0]) + [-1, 1] * flipped)[[0, 2, 1]]
+            if u is not None:
+                found.u[i], found.covariance[i], found.confidence[i] = u, 0.0025 * np.eye(2), 1.0
+        return found
+
+    return detect
+
+
+def test_a_check_is_a_page_and_a_json(folder, detector, tmp_path):
+    found = check(folder, detector=detector, folder=tmp_path)
+    content = json.loads((tmp_path / "check.json").read_text(encoding="utf-8"))
+    assert content["verdict"] == found.assessment.verdict.level and content["next_step"] == found.next_step
+    assert {"folder", "coverage", "clock", "read-out", "tips", "detector"} <= set(content)
+    assert len(content["frames"]["score"]) == 10
+    page = (tmp_path / "check.html").read_text(encoding="utf-8")
+    assert page.count("data:image/jpeg") == 6 and page.count("data:image/png") == 1
+    assert not re.search(r"(src|href)=.http", page)
+    assert found.recording.truth is None
+
+
+def test_nothing_found_is_said_once_and_the_command_ends_well(folder, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(module.Detector, "load", lambda *_: lambda images: Landmarks.none(len(images)))
+    assert main([str(folder), "--out", str(tmp_path)]) == 0
+    content = json.loads((tmp_path / "check.json").read_text(encoding="utf-8"))
+    assert content["verdict"] == "not trustworthy" and "no_detection" in [reason["name"] for reason in content["reasons"]]
+    assert "the detector failed on 10 frames" in capsys.readouterr().out
+
+
+def test_a_folder_that_is_no_recording(tmp_path):
+    with pytest.raises(FileNotFoundError, match="recording.toml"):
+        check(tmp_path)
