@@ -109,19 +109,20 @@ class Correspondences:
         return self.subset(self.is_complete)
 
     def check_detections(self, fewest: int = 4) -> None:
-        """Raise a `NoDetectionError` where fewer than `fewest` rows are seen in both images and known to the robot."""
-        if (usable := int(self.is_complete.sum())) >= fewest:
+        """Raise a `NoDetectionError` where an image shows fewer than `fewest` landmarks whose position the robot reports."""
+        usable = int((self.seen & np.isfinite(self.x_mm).all(axis=1)[:, None]).sum(axis=0).min())
+        if usable >= fewest:
             return
-        (left, right), both = self.seen.sum(axis=0), int(self.seen.all(axis=1).sum())
-        if both >= fewest:
+        left, right = self.seen.sum(axis=0)
+        if min(left, right) >= fewest:
             raise NoDetectionError(
-                f"data: the robot reports a position for {usable} of the {both} landmarks that both images show; check "
-                "offset_s and the times of frames and kinematics (`python3 -m lib check RECORDING`)."
+                f"data: the robot reports a position for {usable} of the {min(left, right)} landmarks that an image shows; "
+                "check offset_s and the times of frames and kinematics (`python3 -m lib check RECORDING`)."
             )
         raise NoDetectionError(
             f"data: the detector failed on {len(np.unique(self.frame))} frames: of {len(self)} landmarks it found {left} "
-            f"in left images, {right} in right ones, {both} in both. Do they show the tool, in colour, sharp, 200 to 400 "
-            "px from base to tip? `python3 -m lib check RECORDING` shows them; where tool or light is new, label 20 frames "
+            f"in left images and {right} in right ones. Do they show the tool, in colour, sharp, 200 to 400 px "
+            "from base to tip? `python3 -m lib check RECORDING` shows them; where tool or light is new, label 20 frames "
             "and run `python3 -m lib adapt RECORDING`."
         )
 

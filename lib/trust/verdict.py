@@ -26,6 +26,8 @@ LIMITS: dict[str, tuple[float, float]] = {
     "consensus": (0.75, 0.5),
     # Frames with rows that agree.  Of 6 clean frames on the covariances are right; of 3 nothing checks anything.
     "frames": (6, 4),
+    # Rows of independent errors: a pair has 14 parameters, four numbers a row.  Their estimate is too low where rows are few.
+    "rows": (6, 0),
     # Degrees between the viewing directions: a microscope's are 2 to 20 apart; beyond 45 no two of its eyes see one scene.
     "convergence_low": (1.0, 0.3),
     "convergence_high": (25.0, 45.0),
@@ -33,7 +35,7 @@ LIMITS: dict[str, tuple[float, float]] = {
     "zoom_ratio": (1.3, 2.0),
     "aspect": (1.08, 1.25),
     # Standard deviations of a landmark's depth that the calibration adds to the detector's, at the edge of its own volume.
-    "coverage": (1.0, np.inf),
+    "coverage": (1.5, np.inf),
     # Median epipolar distance of free matches, px, beyond three of its standard deviations: band matching fails from 6 px.
     "epipolar": (1.5, 4.0),
     # Share of the landmarks that contradict themselves, the other image or the robot.  10 % gross errors a view reach 0.2.
@@ -161,18 +163,17 @@ def _residuals(data: Correspondences | None, c: Calibration, robot_mm: float) ->
 
 def _claimed_px(c: Calibration, robot_mm: float) -> float:
     """RMS distance in an image that the detections' covariances and the robot's accuracy let expect, averaged over views."""
-    views, used = len(c.cameras), c.inliers
-    variance = 2.0 * _LABEL_PX**2
+    used, variance = c.inliers, 2.0 * _LABEL_PX**2
     if c.covariance_px2 is not None:
         rows = c.covariance_px2 if len(c.covariance_px2) == 1 else c.covariance_px2[used]
-        variance = float(np.nanmean(np.trace(rows, axis1=1, axis2=2))) / views
+        variance = 2.0 * float(np.nanmean(np.diagonal(rows, axis1=1, axis2=2))) / c.detector_scale**2
     gain = np.mean([(camera.jacobian(c.x_mm[used][:1]) ** 2).sum() for camera in c.cameras])
     return float(np.sqrt(variance + gain * robot_mm**2))
 
 
 def _cross_validation(data: Correspondences | None, c: Calibration, robot_mm: float) -> Iterator[Reason]:
     _, J, weight, _ = c.system
-    own = J @ c.parameter_covariance @ np.swapaxes(J, 1, 2) @ weight
+    own = J @ np.linalg.inv(c.minimum.information) @ np.swapaxes(J, 1, 2) @ weight
     # What leaving a row out does to clean data: its residual grows by (1 - leverage)^-1/2.
     expected = np.sqrt(np.mean(np.trace(np.linalg.inv(np.eye(own.shape[1]) - own), axis1=1, axis2=2) / own.shape[1]))
     ratio = c.press_rms_px / max(c.reprojection_rms_px * expected**2, 1e-9)
@@ -182,19 +183,22 @@ def _cross_validation(data: Correspondences | None, c: Calibration, robot_mm: fl
 
 
 def _consensus(data: Correspondences | None, c: Calibration, robot_mm: float) -> Iterator[Reason]:
-    usable = int(c.usable.sum())
-    share = c.view_inliers[c.usable].mean()
-    text = f"Only {100 * share:.0f} % of the {usable} rows agree on the cameras."
+    usable = int(np.isfinite(c.residuals_px).sum()) // 2
+    share = c.view_inliers.sum() / usable
+    text = f"Only {100 * share:.0f} % of the {usable} detections agree on the cameras."
     cure = f"{_OVERLAYS}: the other detections are wrong, or these are."
     yield from _above("consensus", float(share), text, cure, "minority")
 
 
-def _frames(data: Correspondences | None, c: Calibration, robot_mm: float) -> Iterator[Reason]:
+def _rows(data: Correspondences | None, c: Calibration, robot_mm: float) -> Iterator[Reason]:
+    cure = "Record more frames, with the tool in other places."
+    text = f"The rows that agree count as {c.effective_rows:.0f} of independent errors; {LIMITS['rows'][0]:g} are needed."
+    yield from _above("rows", c.effective_rows + 1e-9, text, cure, "few_rows")
     if data is None:
         return
     frames = len(np.unique(data.frame[c.inliers]))
     text = f"{frames} frames have landmarks that agree; {LIMITS['frames'][0]:g} are needed, 30 are good."
-    yield from _above("frames", frames + 1e-9, text, "Record more frames, with the tool in other places.", "few_frames")
+    yield from _above("frames", frames + 1e-9, text, cure, "few_frames")
 
 
 def _geometry(data: Correspondences | None, c: Calibration, robot_mm: float) -> Iterator[Reason]:
@@ -240,5 +244,5 @@ def _epipolar_sd_px(c: Calibration) -> float:
 
 
 _CHECKS: tuple[Callable[[Correspondences | None, Calibration, float], Iterable[Reason]], ...] = (
-    _residuals, _cross_validation, _consensus, _frames, _geometry, _coverage,
+    _residuals, _cross_validation, _consensus, _rows, _geometry, _coverage,
 )  # fmt: skip

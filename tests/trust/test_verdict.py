@@ -56,9 +56,9 @@ def test_residuals_beyond_the_claim_are_red():
 
 def test_a_minority_and_few_frames_are_told():
     data, rng = made(60), np.random.default_rng(1)
-    wrong = rng.random(60) < 0.35
-    u = np.where(wrong[:, None], rng.uniform(0, 1000, (60, 2)), data.u_left)
-    assert names(replace(data, u_left=u))["minority"] == LEVELS[1]
+    views = (data.u_left, data.u_right)
+    left, right = (np.where(rng.random((60, 1)) < 0.35, rng.uniform(0, 1000, (60, 2)), u) for u in views)
+    assert names(replace(data, u_left=left, u_right=right))["minority"] == LEVELS[1]
     assert names(replace(made(12), frame=np.arange(12) // 4))["few_frames"] == LEVELS[2]
 
 
@@ -73,7 +73,7 @@ def test_witnesses_count():
 def test_no_detection_is_one_message():
     data = made(60)
     nothing = replace(data, u_right=np.full((60, 2), np.nan))
-    text = r"detector failed on 60 frames: of 60 .* found 60 in left images, 0 in right"
+    text = r"detector failed on 60 frames: of 60 .* found 60 in left images and 0 in right"
     with pytest.raises(NoDetectionError, match=text) as error:
         calibrate(nothing)
     verdict = judge(nothing, None, error=error.value)
