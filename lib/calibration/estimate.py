@@ -34,9 +34,13 @@ def calibrate(
 ) -> Calibration:  # fmt: skip
     """Cameras from robot positions and their detections: outliers out, then the exact minimum of Eq. (3).
 
+    Each camera finds the tightest consensus of its own detections, so a landmark that is lost in one image counts in the
+    other.  Noise levels are estimated from what agrees.  The covariances allow for that and, with `Correspondences`, for
+    errors that last from frame to frame (`Calibration.effective_rows`).
+
     Args:
-        data, u: `Correspondences` alone (incomplete rows are left out; covariances weigh the rows where all complete
-            ones have them); or (n, 3) mm positions in the robot frame and [u_left, u_right] or [u], (n, 2) px each.
+        data, u: `Correspondences` alone (rows seen in one image count, too; covariances weigh the rows where all seen
+            landmarks have them); or (n, 3) mm positions in the robot frame and [u_left, u_right] or [u], (n, 2) px each.
         offsets: Constant offsets of the landmarks (`lib.calibration.offsets`).  "tool" or True: in the tool's axes, from
             frames in which the robot reports three landmarks of open jaws; "image": in the images, for a detector that
             is off by some pixels whatever the tool does; False: none.  None: "tool" where at least 24 rows and half of
@@ -49,15 +53,16 @@ def calibrate(
         sigma_u_px, sigma_x_mm: Noise of a pixel coordinate and of a robot coordinate; None = estimated from the data.
         covariance_px2: The detector's covariance in place of sigma_u, in any form of `lib.geometry.pair_covariance`.  Where
             the residuals are larger than it says it is scaled up (unless sigma_u_px is given, too).
-        ransac_px: Largest reprojection distance of an inlier in any image; None measures the noise and drops rows that
-            Gaussian noise would not produce once in 10 000 data sets; infinity keeps all rows.
+        ransac_px: Largest reprojection distance of a detection that is used; None measures the noise and drops what is more
+            probably wrong than right, or would not appear once in 10 000 data sets; infinity keeps all.
         seed: Of the random samples.
         image_size_px: (width, height); the principal point of near-affine models is its centre, else the detections'.
         checks: False skips the plausibility checks: units, repeated rows, swapped cameras, pixels outside the image.
 
     Raises:
-        ValueError: For NaN rows, fewer than four points, coplanar or collinear points, wrong units, repeated rows,
-            detections that stand still or are the same in both images, swapped cameras, no consensus, an unknown model
+        NoConsensusError: A ValueError, where a camera's detections agree on no camera, or on two that compete.
+        ValueError: For NaN in plain arrays, fewer than four points, coplanar or collinear points, wrong units, repeated rows,
+            detections that stand still or are the same in both images, swapped cameras, an unknown model
             or weighting, offsets that the data cannot tell.
 
     >>> from lib.cameras import AffineCamera
@@ -98,7 +103,7 @@ def calibrate(
     )  # fmt: skip
     if axes is None and offsets != "image":
         found = fitted(x, y)
-        if weighting == "likelihood" and sigma_x_mm is None:
+        if weighting == "likelihood" and None in (sigma_u_px, sigma_x_mm):
             found = _scattered(found, None if usable is None else rows)
     else:
         found = estimate_offsets(fitted, x, y, rows.landmark, axes, rows.frame, offset_prior_sd)
@@ -152,8 +157,12 @@ def _spread_out(found: Calibration, usable: np.ndarray) -> Calibration:
 def _calibrate(
     x: np.ndarray, y: np.ndarray, *, noise: np.ndarray | None, model: str, weighting: str,
     known: dict[str, float | None], ransac_px: float | None, seed: int, image_size_px: tuple[int, int] | None, checks: bool,
+    views: np.ndarray | None = None,
 ) -> Calibration:  # fmt: skip
-    """`calibrate` of complete rows x (n, 3) and y (n, m) with their covariances, (1, m, m) or (n, m, m)."""
+    """`calibrate` of rows x (n, 3) and y (n, m), NaN = not seen, with their covariances, (1, m, m) or (n, m, m).
+
+    `views` (n, cameras) bool are those to use; None finds them.
+    """
     n, m = y.shape
     plan = Model.parse(model, m // 2)
     if weighting not in ("likelihood", "paper"):
@@ -174,9 +183,10 @@ def _calibrate(
     assumed_x = 0.0 if not checks else refuse.ROBOT_ACCURACY_MM if sigma_x_mm is None else sigma_x_mm
     refuse.check_spread(x, assumed_x)
     refuse.check_images(y, image_size_px if checks else None)
-    seen = np.isfinite(y).reshape(n, -1, 2).all(axis=2)
-    views = seen
-    if ransac_px != np.inf:
+    final = views is not None or ransac_px is not None or (plan.is_affine and (noise is None or len(noise) == 1))
+    if views is None and ransac_px == np.inf:
+        views = np.isfinite(y).reshape(n, -1, 2).all(axis=2)
+    elif views is None:
         views, gates = consensus(x, y, ransac_px, np.random.default_rng(seed), sigma_x_mm=sigma_x_mm)
     for rows in views.T:
         refuse.check_spread(x[rows], assumed_x)
@@ -191,7 +201,7 @@ def _calibrate(
         state = minimum.state
         f, J, _ = state.evaluate(x - state.reference, derivatives=False)
         residuals = y - f
-        if ransac_px is not None or (plan.is_affine and (noise is None or len(noise) == 1)):
+        if final:
             break
         # What looks like an outlier to an affine camera and equal noise may be neither: judge again by the model itself.
         S = (sigma_u**2 * np.eye(m)[None] if noise is None else scale**2 * noise) + sigma_x**2 * J @ np.swapaxes(J, 1, 2)

@@ -67,21 +67,24 @@ def with_offsets(data: Correspondences, offsets: LandmarkOffsets | None) -> Corr
 
 
 def estimate_offsets(
-    fit: Callable[[np.ndarray, np.ndarray], Calibration], x: np.ndarray, y: np.ndarray, landmark: np.ndarray,
+    fit: Callable[..., Calibration], x: np.ndarray, y: np.ndarray, landmark: np.ndarray,
     axes: np.ndarray | None, frame: np.ndarray, prior_sd: float | None = None, iterations: int = 20,
 ) -> Calibration:  # fmt: skip
     """The calibration with one constant offset a landmark, in the tool's axes (n, 3, 3) or (axes=None) in the images.
 
     Gauss-Newton on the offsets with the cameras eliminated: every step is a whole calibration `fit` of positions (n, 3) and
-    pixels (n, m), and one Schur complement; a `RuntimeWarning` where `iterations` are too few.  Without `prior_sd` it is the
-    one that makes the data most probable, between 0.1 and 300 um, or 0.01 and 30 px.
+    pixels (n, m) with the `views` to use, and one Schur complement; a `RuntimeWarning` where `iterations` are too few.
+    Without `prior_sd` it is the one that makes the data most probable, between 0.1 and 300 um, or 0.01 and 30 px.
     """
     m = y.shape[1]
     size = m if axes is None else 3
     offset, p_value = np.zeros((int(landmark.max()) + 1, size)), np.nan
-    for _ in range(iterations):
+    views = None
+    for i in range(iterations):
         shift = offset[landmark]
-        found = fit(x, y - shift) if axes is None else fit(x + np.einsum("nij,nj->ni", axes, shift), y)
+        moved = (x, y - shift) if axes is None else (x + np.einsum("nij,nj->ni", axes, shift), y)
+        found = fit(*moved, views=views)
+        views = found.view_inliers if i >= 2 else None  # outliers that come and go from step to step would be no end
         rows = found.inliers
         J_x, J_c, weight, r = found.system
         J_o = J_x @ axes[rows] if axes is not None else np.broadcast_to(np.eye(m), (rows.sum(), m, m))
@@ -102,7 +105,7 @@ def estimate_offsets(
     else:
         warnings.warn(
             f"offsets: they still move by up to {np.abs(step).max():.2g} {'px' if axes is None else 'mm'} after {iterations} "
-            "steps; look at the outliers (`ransac_px`), which may differ from step to step.",
+            "steps; look at the outliers (`ransac_px`).",
             RuntimeWarning, stacklevel=3,
         )  # fmt: skip
     p = J_c.shape[2]

@@ -227,9 +227,10 @@ def _tightest(
     found = _mixture(H[some], u[some], np.concatenate([M, M]), np.sqrt(np.append(near2 / 8, middle2)), area, 8)
     few = np.unique([*np.argsort(-found.evidence)[:3], found.share[:, 0].argmax()])
     found = _mixture(H[some], u[some], found.M[few], found.sigma[few, 0], area, 50)
-    # That fewer rows agree better must be more than chance.
+    # Where a camera explains nearly all rows, that fewer agree better must be more than chance.
     best, most = found.evidence.argmax(), found.share[:, 0].argmax()
-    best = best if found.evidence[best] > found.evidence[most] + _MORE_THAN_CHANCE else most
+    if found.share[most, 0] > 1.0 - _NOT_APART and found.evidence[best] < found.evidence[most] + _MORE_THAN_CHANCE:
+        best = most
     if len(some) < n:
         found, best = _mixture(H, u, found.M[best : best + 1], found.sigma[best : best + 1, 0], area, 30), 0
     sigma, wider, share = *(float(value) for value in found.sigma[best]), found.share[best]

@@ -6,7 +6,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.interpolate import BSpline, make_lsq_spline
 
-from lib.calibration.affine import Moments, affine_minimum, estimate_noise
+from lib.calibration.affine import estimate_noise, regress
+from lib.calibration.models import precision
+from lib.calibration.robust import NoConsensusError, consensus
+from lib.calibration.scatter import sandwich
 from lib.correspondences import Correspondences
 from lib.recordings import Kinematics
 
@@ -17,7 +20,10 @@ _GRID = 41  # trial offsets of the coarse search
 
 @dataclass(frozen=True, eq=False)
 class TimeOffset:
-    """t_robot = t_video + offset_s, its sd, and the reprojection RMS there and at the offsets `trial_s` tried first."""
+    """t_robot = t_video + offset_s, its sd, and the reprojection RMS there and at the offsets `trial_s` tried first.
+
+    The RMS is that of the detections that agree at `offset_s`; the sd allows for errors that last from frame to frame.
+    """
 
     offset_s: float
     sd_s: float
@@ -65,7 +71,8 @@ def estimate_time_offset(
 ) -> TimeOffset:  # fmt: skip
     """Offset of the clocks: the shift of the kinematics that lets affine cameras explain the video best.
 
-    A coarse search, then Gauss-Newton: with v the velocity, y = A x(t) + o + (A v) offset is linear in the offset.
+    A coarse search by least absolute residuals, then Gauss-Newton over the detections that agree on cameras there: with v the
+    velocity, y = A x(t) + o + (A v) offset is linear in the offset.
 
     Args:
         data: `Correspondences`, or (time_s (n,), u) with one array a camera, (n, 2) or (n, k, 2) px, NaN where missing.
@@ -75,18 +82,18 @@ def estimate_time_offset(
         smooth_s: Time within which the motion is smooth: the kinematics' noise is averaged over it.
 
     Raises:
-        ValueError: For wrong shapes, fewer than eight instants inside the kinematics, a tool at rest, or an offset at the
-            end of the search.
+        ValueError: For wrong shapes, fewer than eight instants inside the kinematics, a tool at rest, no cameras that the
+            rows agree on (`NoConsensusError`), or an offset at the end of the search.
     """
-    time, landmark, y = _rows(data)
+    time, frame, landmark, y = _rows(data)
     paths = _paths(kinematics, smooth_s)
     if landmark.max(initial=0) >= len(paths):
         raise ValueError(f"u: {landmark.max() + 1} landmarks, the kinematics have {len(paths)}.")
-    known = np.isfinite(y).all(axis=1) & np.isfinite(time)
+    known = np.isfinite(y).any(axis=1) & np.isfinite(time)
     for k, path in enumerate(paths):
         rows = known & (landmark == k)
         known[rows] = path.covers(time[rows] + start_s - search_s, time[rows] + start_s + search_s)
-    time, landmark, y = time[known], landmark[known], y[known]
+    time, frame, landmark, y = time[known], frame[known], landmark[known], y[known]
     n, m = len(np.unique(time)), y.shape[1]
     if n < 8:
         if isinstance(data, Correspondences):
@@ -99,48 +106,86 @@ def estimate_time_offset(
             x[landmark == k] = path.at(time[landmark == k] + offset, derivative)
         return x
 
+    def fitted(offset: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Positions, cameras (m, 4) and residuals (n, m), zero where a view is not used."""
+        x = at(offset)
+        matrix = np.vstack([regress(x[rows], y[rows, 2 * c : 2 * c + 2]) for c, rows in enumerate(views.T)])
+        return x, matrix, np.where(used, y - x @ matrix[:, :3].T - matrix[:, 3], 0.0)
+
     def rms(offset: float) -> float:
-        return float(np.sqrt(4.0 * affine_minimum(Moments.of(at(offset), y), 1.0, 0.0).cost / y.size))
+        return float(np.sqrt((fitted(offset)[2] ** 2).sum() / views.sum()))
 
     def step_and_sd(offset: float) -> tuple[float, float]:
-        x, v = at(offset), at(offset, 1)
-        matrix = affine_minimum(Moments.of(x, y), 1.0, 0.0).matrix
-        A, r = matrix[:, :3], y - x @ matrix[:, :3].T - matrix[:, 3]
-        sigma_u, sigma_x = estimate_noise(r, A, 4 * m)
-        W = np.linalg.inv(sigma_u**2 * np.eye(m) + sigma_x**2 * A @ A.T)
+        (x, matrix, r), v = fitted(offset), at(offset, 1)
+        A = matrix[:, :3]
+        sigma_u, sigma_x = estimate_noise(r[views.any(axis=1)], A, 4 * m, views[views.any(axis=1)])
+        W = precision(np.broadcast_to(sigma_u**2 * np.eye(m) + sigma_x**2 * A @ A.T, (len(x), m, m)), views)
         # Sweep [x, 1] out of the velocity's image: the cameras are fitted along with the offset.
-        H = np.column_stack([x - x.mean(axis=0), np.ones(len(x))])
-        image = (v - H @ np.linalg.lstsq(H, v, rcond=None)[0]) @ A.T
-        information = np.einsum("ni,ij,nj->", image, W, image)
+        image = np.zeros_like(y)
+        for c, rows in enumerate(views.T):
+            swept = v[rows] - np.column_stack([x[rows], np.ones(rows.sum())]) @ regress(x[rows], v[rows]).T
+            image[rows, 2 * c : 2 * c + 2] = swept @ A[2 * c : 2 * c + 2].T
+        information = np.einsum("ni,nij,nj->", image, W, image)
         if information <= 0:
             raise ValueError("kinematics: the tool moves at no varying speed; the offset cannot be seen.")
-        return float(np.einsum("ni,ij,nj->", image, W, r) / information), float(information**-0.5)
+        variance = sandwich(image[:, :, None], W, r, frame, landmark, np.zeros((1, 1)))[0][0, 0]
+        return float(np.einsum("ni,nij,nj->", image, W, r) / information), float(np.sqrt(variance))
 
     low, high = start_s - search_s, start_s + search_s
     trial = np.linspace(low, high, _GRID)
-    misfit = np.array([rms(offset) for offset in trial])
-    offset = float(trial[misfit.argmin()])
-    for _ in range(20):
-        step, sd = step_and_sd(offset)
-        offset = float(np.clip(offset + step, low, high))
-        if abs(step) < 1e-7:
+    distance = np.array([_least_absolute(at(offset), y) for offset in trial])
+    typical = np.nanmedian(distance, axis=(1, 2)).min()
+    offset = float(trial[np.nansum(np.log1p((distance / max(typical, 1e-9)) ** 2), axis=(1, 2)).argmin()])
+    for _ in range(2):
+        try:
+            views = consensus(at(offset), y, None, np.random.default_rng(0))[0]
+        except NoConsensusError:
+            if trial[2] <= offset <= trial[-3]:
+                raise
+            offset = low if offset < start_s else high
             break
+        used = np.repeat(views, 2, axis=1)
+        misfit = np.array([rms(t) for t in trial])  # of right detections squares tell more than absolute values
+        offset = float(trial[misfit.argmin()])
+        for _ in range(20):
+            step, sd = step_and_sd(offset)
+            offset = float(np.clip(offset + step, low, high))
+            if abs(step) < 1e-7:
+                break
     if offset in (low, high):
         raise ValueError(f"search_s: {offset:.3f} s, lies at the end of the search; widen search_s or move start_s.")
     return TimeOffset(offset, sd, rms(offset), trial, misfit)
 
 
-def _rows(data: Correspondences | tuple) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Times (n,), landmarks (n,) and pixels (n, m), a row a landmark."""
+def _least_absolute(x: np.ndarray, y: np.ndarray, rounds: int = 6) -> np.ndarray:
+    """Distances (n, cameras) px of pixels y (n, m), NaN = not seen, to the cameras with the least sum of distances."""
+    H, found = np.column_stack([x - x.mean(axis=0), np.ones(len(x))]), []
+    for u in np.split(y, y.shape[1] // 2, axis=1):
+        seen = np.isfinite(u).all(axis=1)
+        G, u, distance = H[seen], u[seen], np.full(len(y), np.nan)
+        weight = np.ones((len(G), 1))
+        for _ in range(rounds):
+            r = u - G @ np.linalg.lstsq(G.T @ (weight * G), G.T @ (weight * u), rcond=None)[0]
+            size = np.linalg.norm(r, axis=1, keepdims=True)
+            weight = 1.0 / np.maximum(size, 0.1)
+        distance[seen] = size[:, 0]
+        found.append(distance)
+    return np.column_stack(found)
+
+
+def _rows(data: Correspondences | tuple) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Times (n,), frames (n,), landmarks (n,) and pixels (n, m), NaN = not seen, a row a landmark."""
     if isinstance(data, Correspondences):
-        seen = data.seen.all(axis=1)[:, None]
-        return data.time_s, data.landmark, np.where(seen, np.hstack([data.u_left, data.u_right]), np.nan)
+        y = np.where(np.repeat(data.seen, 2, axis=1), np.hstack([data.u_left, data.u_right]), np.nan)
+        return data.time_s, data.frame, data.landmark, y
     time, u = np.asarray(data[0], dtype=np.float64), [np.asarray(pixels, dtype=np.float64) for pixels in data[1]]
     u = [pixels[:, None] if pixels.ndim == 2 else pixels for pixels in u]
     if any(p.ndim != 3 or p.shape != (len(time), u[0].shape[1], 2) for p in u):
         raise ValueError(f"u: expected ({len(time)}, k, 2) pixels a camera, got {[p.shape for p in u]}.")
     k = u[0].shape[1]
-    return np.repeat(time, k), np.tile(np.arange(k), len(time)), np.concatenate(u, axis=2).reshape(len(time) * k, -1)
+    y = np.concatenate([np.where(np.isfinite(p).all(axis=2, keepdims=True), p, np.nan) for p in u], axis=2)
+    frame, landmark = np.divmod(np.arange(len(time) * k), k)
+    return np.repeat(time, k), frame, landmark, y.reshape(len(time) * k, -1)
 
 
 def _paths(kinematics: Kinematics | tuple, smooth_s: float) -> list[_Path]:

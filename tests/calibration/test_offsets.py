@@ -110,7 +110,8 @@ def test_too_few_steps_are_told():
     axes = np.repeat(tool_axes(data.grid("x_mm")), 3, axis=0)
     with pytest.warns(RuntimeWarning, match=r"offsets: they still move by up to .* mm after 1 steps"):
         estimate_offsets(
-            lambda x, y: calibrate(x, [y[:, :2], y[:, 2:]]), data.x_mm, y, data.landmark, axes, data.frame, iterations=1
+            lambda x, y, views: calibrate(x, [y[:, :2], y[:, 2:]]),
+            data.x_mm, y, data.landmark, axes, data.frame, iterations=1,
         )
 
 

@@ -50,9 +50,10 @@ def test_one_over_distance_removes_the_error_of_the_model(run_study):
 
 
 def test_outliers_are_found(run_study):
-    found, _ = run_study("gross_outliers", share=0.3, runs=2)
-    assert found["outliers_missed_percent"] < 1 and found["good_rows_kept_least_percent"] == 100
+    found, _ = run_study("gross_outliers", right=0.5, n_rows=60, runs=4)
+    assert found["median_over_right_rows"] < 1.5 and found["worst_over_right_rows"] < 4
     assert found["refused_percent"] == 0
+    assert run_study("gross_outliers", right=0.1, n_rows=60, runs=4)[0]["refused_percent"] == 100
 
 
 def test_general_solvers_reach_the_closed_form_minimum(run_study):
