@@ -77,7 +77,7 @@ class Check:
             number, score = int(health.frame[i]), health.score[i]
             parts = {name: part[i].max() for name, part in health.parts.items() if np.isfinite(part[i]).any()}
             why = f"score {score:.2g}, most of it {max(parts, key=parts.get)}" if parts else "nothing was found"
-            kind = "worst" if place < _SHOWN and (score > 1 or np.isnan(score)) else "good" if score <= 1 else "bad"
+            kind = "good" if score <= 1 else "among the worst" if place < _SHOWN else "bad"
             found.append((f"Frame {number} ({kind}): {why}.", _data_uri(self._overlay(number), ".jpg")))
         return found
 

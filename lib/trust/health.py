@@ -104,7 +104,7 @@ def health(
         seen = rig.triangulate(u[:, :, 0].reshape(-1, 2), u[:, :, 1].reshape(-1, 2)).x_mm.reshape(x.shape)
         parts["shape"] = np.repeat(np.abs(_tool_length(seen) / _tool_length(x) - 1.0)[:, None], shape[1], axis=1)
     if detector is not None:
-        parts["looks"] = _looks_px(recording, frame, u, detector, looks).max(axis=2) / length
+        parts["looks"] = np.fmax.reduce(_looks_px(recording, frame, u, detector, looks), axis=2) / length
     return Health(frame, {n: parts[n] / LIMITS[n] for n in LIMITS if n in parts}, np.isfinite(u[..., 0]).any(axis=2))
 
 
@@ -138,5 +138,5 @@ def _looks_px(recording: Recording, frame: np.ndarray, u: np.ndarray, detector: 
         shifted = np.pad(images, ((0, 0), (_SHIFT_PX[1], 0), (_SHIFT_PX[0], 0), (0, 0)))
         again = detector(shifted[:, : images.shape[1], : images.shape[2]]).u - _SHIFT_PX
         distance = np.linalg.norm(np.stack([back, again]) - np.swapaxes(u[i], 0, 1), axis=-1).max(axis=0)
-        moved[i] = np.where(np.isnan(u[i, ..., 0]), 0.0, np.nan_to_num(distance, nan=np.inf).T)
+        moved[i] = np.where(np.isnan(u[i, ..., 0]), np.nan, np.nan_to_num(distance, nan=np.inf).T)
     return moved

@@ -123,7 +123,9 @@ def run(
     print(f"\nReport: {report.folder / 'index.html'}")
     if report.content["verdict"]:
         names = ", ".join(dict.fromkeys(reason["name"].replace("_", " ") for reason in report.content["reasons"]))
-        print(f"Verdict: {report.content['verdict']}" + (f" ({names})" if names else ""))
+        folder = report.content["parameters"].get("recording") or paths.shown(paths.SHIPPED_RECORDING)
+        why = f" ({names}); `python3 -m lib check {folder}` says more" if names else ""
+        print(f"Verdict: {report.content['verdict']}{why}")
     return report.content
 
 

@@ -2,6 +2,7 @@
 
 import re
 
+from lib import paths
 from lib.workbench.execution import Failure
 from lib.workbench.pages import markdown_html, render
 from lib.workbench.report import VERDICT_COLOURS, format_value, unit_text, verdict_html
@@ -26,6 +27,7 @@ def index_html(run: dict) -> str:
     """
     done = sum(book["state"] in ("complete", "failed") for book in run["notebooks"])
     facts = {
+        "Recording": run["parameters"].get("recording") or f"{paths.shown(paths.SHIPPED_RECORDING)}, the one that ships",
         "Started": run["started"].replace("T", " ")[:16],
         "Profile": run["profile"],
         "Notebooks": f"{done} of {len(run['notebooks'])}",

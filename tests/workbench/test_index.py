@@ -46,6 +46,7 @@ def test_text_of_a_recording_is_never_html():
 def test_what_the_page_shows():
     page = index_html(run_with("eye"))
     assert "a notebook failed" in page and "01_data: error in cell 3: ValueError: recording.toml" in page
+    assert "<b>Recording</b>eye" in page
     assert "2 min 03 s" in page and "0123456789 + local changes" in page and "1 of 2" in page
     assert '<td class="number paper">2 px</td>' in page and '<td class="number ours">1.5 px</td>' in page
     assert "n/a" in page and "<svg " in page and "-p recording eye" in page
