@@ -54,7 +54,7 @@ def optics(calibration: Calibration) -> Optics:
     if calibration.image_size_px is not None:
         centre = (np.asarray(calibration.image_size_px, dtype=float) - 1) / 2
     else:
-        centre = calibration.y_px[calibration.inliers].reshape(-1, 2, 2).mean(axis=(0, 1))
+        centre = np.nanmean(calibration.y_px[calibration.inliers].reshape(-1, 2, 2), axis=(0, 1))
     origin = rig.triangulate(centre[None], centre[None]).x_mm[0]
     angle = float(np.arccos(np.clip(abs(cosine), -1, 1)))
     return Optics(mirrored, angle, roll, RigidTransform(np.column_stack([x, y, z]), origin))
