@@ -22,7 +22,7 @@ __all__ = ["NoConsensusError", "consensus", "gate"]
 FALSE_ALARM = 1e-4
 _SAMPLES = (100, 300, 1000)  # tried one after another, until right ones are among them
 _ROWS_RANKED = 300
-_STARTS = 8  # samples that the expectation maximisation starts from
+_STARTS = 12  # samples that the expectation maximisation starts from
 _FEW = 25  # rows of a view, below which it goes by the forward search
 _MORE_THAN_CHANCE = 5.0  # log evidence: of clean data some rows agree better than all do by up to 4
 _LEAST_SHARE = 0.25  # of a view's rows, that must agree
@@ -223,9 +223,13 @@ def _tightest(
 
         keep = _settled(near, _distances2(H, u, M[:1])[0] < threshold_px**2, 5)
         return _Found(keep, regress(H[keep, :3], u[keep]) if keep.sum() > 3 else np.zeros((2, 4)), 0.0, np.inf, np.inf)
-    middle2 = np.median(_distances2(H[some], u[some], M), axis=1)
-    found = _mixture(H[some], u[some], np.concatenate([M, M]), np.sqrt(np.append(near2 / 8, middle2)), area, 8)
-    few = np.unique([*np.argsort(-found.evidence)[:3], found.share[:, 0].argmax()])
+    middle2 = np.median(_distances2(H[some], u[some], M[:4]), axis=1)
+    found = _mixture(H[some], u[some], np.concatenate([M, M[:4]]), np.sqrt(np.append(near2 / 8, middle2)), area, 8)
+    # The best of each noise level, and the one with most rows: the others arrive where these do.
+    order = np.argsort(-found.evidence)
+    level = np.round(3.0 * np.log(found.sigma[order, 0]))
+    few = order[np.sort(np.unique(level, return_index=True)[1])][:5]
+    few = np.unique([*few, found.share[:, 0].argmax()])
     found = _mixture(H[some], u[some], found.M[few], found.sigma[few, 0], area, 50)
     # Where a camera explains nearly all rows, that fewer agree better must be more than chance.
     best, most = found.evidence.argmax(), found.share[:, 0].argmax()
