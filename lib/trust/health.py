@@ -25,8 +25,8 @@ LIMITS = {
     "smoothness": 0.05,  # the same less what the frames before and after have, of the tool's length
     "shape": 0.2,  # triangulated length of the tool, relative to the robot's; of a frame, not of a landmark
 }
-#: Share of frames with right landmarks (all within 5 % of the tool's length) whose score exceeds 1 if every part is at hand: 3 of
-#: 35 frames of three simulated recordings of the validation population, whose pictures are harder than most.
+#: Share of frames with right landmarks (all within 5 % of the tool's length) whose score exceeds 1 with every part at hand: 3
+#: of 35 frames of three simulated recordings of the validation population, whose pictures are harder than most.
 FALSE_ALARM_RATE = 0.09
 #: Frames further apart in time are not compared for smoothness.
 _NEXT_S = 0.15
