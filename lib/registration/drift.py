@@ -17,11 +17,11 @@ AXES = ("lateral", "lateral", "depth", "epipolar", "scatter")
 # Shift that counts as none, in standard deviations of a frame, and alarm level, of each axis.  Depth is seen worst, so
 # its test is the one for the smallest shifts.
 _SLACK = np.array([1.0, 1.0, 0.5, 1.0, 1.0])
-_LEVEL = np.array([6.0, 6.0, 8.6, 6.0, 7.5])
+_LEVEL = np.array([6.2, 6.2, 10.0, 6.2, 8.0])
 _CAP = 0.75  # of the alarm level: most that one frame adds, so that a single bad frame raises no alarm
 _MEMORY = 1000  # frames that tell the noise
 _FEW = 40  # frames: with fewer the noise is taken for larger than they say, up to twice
-_WANDER = 12  # frames over which the noise may be correlated, whatever neighbouring frames say
+_WANDER = 20  # frames over which the noise may be correlated, whatever neighbouring frames say
 _SLOW = 300  # frames over which the bias is averaged
 _LARGEST_BIAS_PX = 0.5  # of a frame's mean; more is a drift
 
