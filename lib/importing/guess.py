@@ -9,10 +9,11 @@ import av
 import numpy as np
 
 from lib.correspondences import LANDMARKS
-from lib.importing.labels import READERS
-from lib.importing.logs import decoded, read_columns, topics_of
+from lib.importing.labels import labels_of
+from lib.importing.logs import read_columns, topics_of
 from lib.importing.mapping import Table
 from lib.importing.video import IMAGES, VIDEOS, last_number
+from lib.recordings.tables import decoded
 
 __all__ = ["guess_mapping"]
 
@@ -93,7 +94,7 @@ def _robot(folder: Path, paths: dict[str, Path]) -> tuple[list[tuple], tuple[str
     if bags or not tables:
         return _bag(folder, bags)
     name = max(tables, key=lambda name: tables[name].stat().st_size)
-    rows = [line for line in decoded(tables[name]).splitlines() if line.strip() and line.lstrip()[0] not in "#%"]
+    rows = [line for line in decoded(tables[name], utf_16=True).splitlines() if line.strip() and line.lstrip()[0] not in "#%"]
     separator = max("\t;,|", key=rows[0].count)
     header = [cell.strip() for cell in rows[0].split(separator)]
     time = next((cell for cell in header if _TIME.search(cell)), header[0])
@@ -167,7 +168,7 @@ def _labels(paths: dict[str, Path]) -> list[tuple]:
     for file, path in paths.items():
         for kind in _LABELS[path.suffix] if path.suffix in _LABELS else []:
             try:
-                found = list(dict.fromkeys(label.name for label in READERS[kind](path)))
+                found = list(dict.fromkeys(label.name for label in labels_of(kind, path)))
             except (ValueError, OSError):
                 found = []
             if found:

@@ -1,23 +1,23 @@
 """Labelled landmarks from COCO, CVAT, Label Studio, DeepLabCut and SLEAP, as annotations of a recording's frames."""
 
-import csv
-import io
 import json
 import zipfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 from xml.etree import ElementTree
+from xml.etree.ElementTree import ParseError
 
 import h5py
 import numpy as np
 
-from lib.importing.logs import decoded
 from lib.importing.mapping import Labels
 from lib.importing.video import StereoSource, last_number
 from lib.recordings import Annotations
+from lib.recordings.annotations import coco_keypoints, inside
+from lib.recordings.tables import decoded, rows_of
 
-__all__ = ["READERS", "Label", "read_labels"]
+__all__ = ["Label", "labels_of", "read_labels"]
 
 _LARGEST_BYTES = 1 << 29  # of a label file; a zip of a few kB may claim any size
 
@@ -51,7 +51,7 @@ def read_labels(
     files = [(labels.file, None)] if labels.file else [(f, s) for s, f in enumerate((labels.left, labels.right)) if f]
     for file, given in files:
         path = folder / file
-        for label in READERS[labels.kind](path):
+        for label in labels_of(labels.kind, path):
             count += 1
             known.add(label.name)
             if label.name not in theirs or not label.visibility:
@@ -74,7 +74,7 @@ def read_labels(
             frame = frame_of[reel].get(numbers[reel].get(name, numbers[reel].get(number, number)))
             if frame is None:
                 continue
-            if not ((xy >= -0.5).all() and (xy <= np.array([width, height]) - 0.5).all()):
+            if not inside(xy, image_size_px):
                 raise ValueError(f"{where}: ({xy[0]:.6g}, {xy[1]:.6g}) lies outside the image of {width} x {height} px.")
             k = theirs[label.name]
             if v[side, frame, k]:
@@ -98,40 +98,27 @@ def _side(image: str, sides: tuple[str, str], where: str) -> int:
     return found[0]
 
 
-def _refused(read: Callable[[Path], Iterator[Label]], what: str) -> Callable[[Path], Iterator[Label]]:
-    """The reader, with one error for whatever a file of another kind makes of it."""
-
-    def checked(path: Path) -> Iterator[Label]:
-        if not path.exists():
-            raise FileNotFoundError(f"{path}: no such file; the mapping names it as labels.")
-        try:
-            yield from read(path)
-        except (KeyError, IndexError, TypeError, AttributeError, RecursionError, ElementTree.ParseError, OSError) as error:
-            raise ValueError(f"{path}: not {what} ({type(error).__name__}: {error}). Export the labels again.") from None
-        except ValueError as error:
-            text = str(error) if str(path) in str(error) else f"{path}: not {what} ({error}). Export the labels again."
-            raise ValueError(text) from None
-
-    return checked
+def labels_of(kind: str, path: Path) -> Iterator[Label]:
+    """The labels in a file, with one error for whatever a file of another kind makes of its reader."""
+    read, what = _READERS[kind]
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: no such file; the mapping names it as labels.")
+    try:
+        yield from read(path)
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError, ParseError, OSError) as error:
+        if isinstance(error, ValueError) and str(path) in str(error):
+            raise
+        raise ValueError(f"{path}: not {what} ({type(error).__name__}: {error}). Export the labels again.") from None
 
 
 def _coco(path: Path) -> Iterator[Label]:
-    content = json.loads(decoded(path))
-    names = {category["id"]: category["keypoints"] for category in content["categories"] if "keypoints" in category}
-    images = {image["id"]: image["file_name"] for image in content["images"]}
-    for entry in content["annotations"]:
-        if entry["category_id"] not in names or entry["image_id"] not in images:
-            where = f"category {entry['category_id']}, image {entry['image_id']}"
-            raise ValueError(f"{path}: an annotation names {where}, which the file does not describe. Export it again.")
-        values = np.array(entry["keypoints"], np.float64).reshape(len(names[entry["category_id"]]), 3)
-        if not np.isin(values[:, 2], (0, 1, 2)).all():
-            raise ValueError(f"{path}: {images[entry['image_id']]}: visibility is 0, 1 or 2.")
-        for name, (x, y, v) in zip(names[entry["category_id"]], values, strict=True):
-            yield Label(images[entry["image_id"]], name, x, y, int(v))
+    for image, names, values in coco_keypoints(path):
+        for name, (x, y, v) in zip(names, values, strict=True):
+            yield Label(image, name, x, y, int(v))
 
 
 def _cvat(path: Path) -> Iterator[Label]:
-    text = _from_zip(path, "annotations.xml") if path.suffix.lower() == ".zip" else decoded(path)
+    text = _from_zip(path, "annotations.xml") if path.suffix.lower() == ".zip" else decoded(path, utf_16=True)
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise ValueError(f"{path}: the XML defines entities, which CVAT does not. Export it again.")
     root = ElementTree.fromstring(text)
@@ -165,7 +152,7 @@ def _from_zip(path: Path, name: str) -> str:
 
 
 def _label_studio(path: Path) -> Iterator[Label]:
-    for task in json.loads(decoded(path)):
+    for task in json.loads(path.read_bytes()):
         data = task["data"]
         image = str(next(iter(data.values())))
         for result in (r for annotation in task["annotations"][:1] for r in annotation["result"]):
@@ -186,14 +173,14 @@ def _deeplabcut(path: Path) -> Iterator[Label]:
             yield from _deeplabcut(file)
         return
     path = path.with_suffix(".csv")  # the same table, which DeepLabCut writes beside each .h5
-    rows = [row for row in csv.reader(io.StringIO(decoded(path))) if row]
+    rows = [cells for _, cells in rows_of(path, decoded(path, utf_16=True))]
     named = {row[0]: i for i, row in enumerate(rows[:8])}
     top = named["coords"]
     n = rows[top].index("x")
     column = {key: i for i, key in enumerate(zip(rows[named["bodyparts"]], rows[top], strict=True))}
     for row in rows[top + 1 :]:
         for name in dict.fromkeys(rows[named["bodyparts"]][n:]):
-            cells = [row[column[name, axis]].strip() for axis in "xy"]
+            cells = [row[column[name, axis]] for axis in "xy"]
             x, y = (float(cell) if cell else np.nan for cell in cells)
             yield Label("/".join(filter(None, row[:n])), name, x, y, 2 if np.isfinite([x, y]).all() else 0)
 
@@ -217,11 +204,10 @@ def _sleap(path: Path) -> Iterator[Label]:
                     yield Label(image, name, x, y, 2 if seen and point["visible"] else int(seen))
 
 
-#: Kind of labels -> its reader.
-READERS = {
-    "coco": _refused(_coco, "COCO keypoints"),
-    "cvat": _refused(_cvat, "CVAT's XML, or a zip that holds annotations.xml"),
-    "label_studio": _refused(_label_studio, "JSON of Label Studio"),
-    "deeplabcut": _refused(_deeplabcut, "labels of DeepLabCut"),
-    "sleap": _refused(_sleap, "a .slp file of SLEAP"),
+_READERS = {
+    "coco": (_coco, "COCO keypoints"),
+    "cvat": (_cvat, "CVAT's XML, or a zip that holds annotations.xml"),
+    "label_studio": (_label_studio, "JSON of Label Studio"),
+    "deeplabcut": (_deeplabcut, "labels of DeepLabCut"),
+    "sleap": (_sleap, "a .slp file of SLEAP"),
 }

@@ -1,8 +1,7 @@
 """Tables of other programs: CSV of any dialect and ROS bags, with exact times; and what a robot's log says in mm and s."""
 
-import csv
-import io
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from decimal import Decimal, InvalidOperation
@@ -15,14 +14,14 @@ from scipy.spatial.transform import Rotation
 
 from lib.geometry import RigidTransform
 from lib.importing.mapping import Mapping, Pose, Table
+from lib.recordings.tables import decoded, number, rows_of
 
-__all__ = ["RobotLog", "decoded", "exact_seconds", "increasing", "read_columns", "read_robot", "since", "topics_of"]
+__all__ = ["RobotLog", "exact_seconds", "increasing", "read_columns", "read_robot", "since", "topics_of"]
 
 _SECONDS = {"s": Decimal(1), "ms": Decimal("1e-3"), "us": Decimal("1e-6"), "ns": Decimal("1e-9")}
 _MILLIMETRES = {"m": 1e3, "mm": 1.0, "um": 1e-3}
-_EMPTY = {"", "nan", "NaN", "NAN", "null", "None", "NA"}
+_EMPTY = {"nan", "NaN", "NAN", "null", "None", "NA"}
 _EPOCH_S = 1_000_000  # larger times count from a date: 100 ns would drown in a float
-_NOT_A_BAG = AnyReaderError, OSError, KeyError, AttributeError, AssertionError
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,18 +41,6 @@ class RobotLog:
         """Which samples (m,) bool hold a whole pose, and these poses."""
         known = np.isfinite(self.R).all(axis=(1, 2)) & np.isfinite(self.t_mm).all(axis=1)
         return known, [RigidTransform(R, t) for R, t in zip(self.R[known], self.t_mm[known], strict=True)]
-
-
-def decoded(path: Path) -> str:
-    """The text of a file that another program wrote, UTF-8 or, as its first bytes say, UTF-16."""
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file; the mapping names it.")
-    data = path.read_bytes()
-    try:
-        return data.decode("utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = data[: error.start].count(b"\n") + 1
-        raise ValueError(f"{path}, line {line}: the text is not UTF-8. Save the file as CSV in UTF-8.") from None
 
 
 def exact_seconds(text: str, unit: str, where: str) -> Decimal:
@@ -107,69 +94,56 @@ def read_columns(path: Path, table: Table, names: Iterable[str]) -> tuple[list[D
     if path.suffix in (".bag", ".db3", ".mcap") or path.is_dir():
         return _read_bag(path, table, list(names))
     wanted = [table.time, *names]
-    numbered = enumerate(decoded(path).splitlines(), 1)
-    lines = [(n, line) for n, line in numbered if line.strip() and line.lstrip()[0] not in "#%"]
-    rows = csv.reader(io.StringIO("\n".join(line for _, line in lines)), delimiter=table.separator)
-    header = [cell.strip() for cell in next(rows, [])]
-    if len(lines) < 2:
-        raise ValueError(f"{path}: the table has no row. Export it again.")
+    lines = ["" if line.lstrip()[:1] in ("#", "%") else line for line in decoded(path, utf_16=True).splitlines()]
+    rows = rows_of(path, "\n".join(lines), table.separator)
+    place, header = next(rows, (str(path), []))
     for name in wanted:
         if header.count(name) != 1:
             what = "two columns are" if name in header else "no column is"
             cure = f"Check the names and separator = {table.separator!r}"
-            raise ValueError(f"{path}, line {lines[0][0]}: {what} called {name!r}; it has {header}. {cure}.")
+            raise ValueError(f"{place}: {what} called {name!r}; it has {header}. {cure}.")
     at, time, values = [header.index(name) for name in wanted], [], []
-    try:
-        for (n, _), cells in zip(lines[1:], rows, strict=False):
-            if len(cells) != len(header):
-                what = f"{len(cells)} cells where the header has {len(header)}"
-                raise ValueError(f"{path}, line {n}: {what}. Check separator and decimal.")
-            cells = [cells[i].strip().replace(table.decimal, ".") for i in at]
-            time.append(exact_seconds(cells[0], table.time_unit, f"{path}, line {n}, column {table.time}"))
-            values.append([_number(cell, path, n, name) for cell, name in zip(cells[1:], wanted[1:], strict=True)])
-    except csv.Error as error:
-        raise ValueError(f"{path}: not CSV ({error}). Export the table again.") from None
+    for place, cells in rows:
+        cells = [cells[i].replace(table.decimal, ".") for i in at]
+        time.append(exact_seconds(cells[0], table.time_unit, f"{place}, column {table.time}"))
+        told = zip(cells[1:], wanted[1:], strict=True)
+        values.append([number("" if cell in _EMPTY else cell, place, name) for cell, name in told])
+    if not time:
+        raise ValueError(f"{path}: the table has no row. Export it again.")
     return time, dict(zip(wanted[1:], np.array(values, np.float64).reshape(len(time), -1).T, strict=True))
 
 
-def _number(cell: str, path: Path, line: int, name: str) -> float:
+@contextmanager
+def _bag(path: Path) -> Iterator[AnyReader]:
+    """A ROS 1 or 2 bag; whatever another file raises is one error."""
     try:
-        value = np.nan if cell in _EMPTY else float(cell)
-    except ValueError:
-        value = np.inf
-    if np.isinf(value):
-        cure = "Check decimal and separator, or leave the cell empty"
-        raise ValueError(f"{path}, line {line}, column {name}: {cell!r} is not a finite number. {cure}.")
-    return value
+        with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+            yield reader
+    except (AnyReaderError, OSError, KeyError, AttributeError, AssertionError) as error:
+        raise ValueError(f"{path}: the bag cannot be read ({error}). Record or convert it again.") from None
 
 
 def topics_of(path: Path) -> dict[str, str]:
     """The topics of a ROS 1 or 2 bag, and the kind of message of each, such as PoseStamped."""
-    try:
-        with AnyReader([path]) as reader:
-            return {c.topic: c.msgtype.split("/")[-1] for c in reader.connections}
-    except _NOT_A_BAG as error:
-        raise ValueError(f"{path}: the bag cannot be read ({error}). Record or convert it again.") from None
+    with _bag(path) as reader:
+        return {c.topic: c.msgtype.split("/")[-1] for c in reader.connections}
 
 
 def _read_bag(path: Path, table: Table, names: list[str]) -> tuple[list[Decimal], dict[str, np.ndarray]]:
     """Columns of a bag; those of other topics than that of the time are interpolated at its times."""
     found: dict[str, list] = {name: [] for name in (table.time, *names)}
     stamps: dict[str, list[Decimal]] = {name.partition(":")[0]: [] for name in found}
-    if missing := sorted(set(stamps) - set(there := topics_of(path))):
-        raise ValueError(f"{path}: no topic is called {missing[0]!r}; it has {', '.join(sorted(there))}.")
-    try:
-        with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
-            for c, received_ns, raw in reader.messages([c for c in reader.connections if c.topic in stamps]):
-                message, received = reader.deserialize(raw, c.msgtype), Decimal(received_ns).scaleb(-9)
-                header = getattr(message, "header", None)
-                stamps[c.topic].append(received if header is None else _field(header, "stamp", str(path)))
-                for name in found:
-                    topic, _, field = name.partition(":")
-                    if topic == c.topic:
-                        found[name].append(received if field == "received" else _field(message, field, f"{path}: {name}"))
-    except _NOT_A_BAG as error:
-        raise ValueError(f"{path}: the bag cannot be read ({error}). Record or convert it again.") from None
+    with _bag(path) as reader:
+        if missing := sorted(set(stamps) - (there := {c.topic for c in reader.connections})):
+            raise ValueError(f"{path}: no topic is called {missing[0]!r}; it has {', '.join(sorted(there))}.")
+        for c, received_ns, raw in reader.messages([c for c in reader.connections if c.topic in stamps]):
+            message, received = reader.deserialize(raw, c.msgtype), Decimal(received_ns).scaleb(-9)
+            header = getattr(message, "header", None)
+            stamps[c.topic].append(received if header is None else _field(header, "stamp", str(path)))
+            for name in found:
+                topic, _, field = name.partition(":")
+                if topic == c.topic:
+                    found[name].append(received if field == "received" else _field(message, field, f"{path}: {name}"))
     time = found[table.time]
     if not time or not isinstance(time[0], Decimal):
         raise ValueError(f"{path}: {table.time!r} is no time; name /topic:header.stamp or /topic:received.")

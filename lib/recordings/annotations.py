@@ -1,7 +1,7 @@
 """Landmark annotations as COCO keypoints, both cameras in one file."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
@@ -10,7 +10,7 @@ import numpy as np
 from lib.correspondences import LANDMARKS
 from lib.files import write_text
 
-__all__ = ["Annotations", "read_coco", "write_coco"]
+__all__ = ["Annotations", "coco_keypoints", "inside", "read_coco", "write_coco"]
 
 _SIDES = ("left", "right")
 
@@ -40,6 +40,41 @@ class Annotations:
             object.__setattr__(self, f"visibility_{side}", np.where(np.isfinite(u).all(axis=2), v, 0).astype(np.int64))
 
 
+def inside(u: np.ndarray, image_size_px: tuple[int, int]) -> np.ndarray:
+    """Which pixels (..., 2) lie in an image of (width, height); NaN does not."""
+    return ((u >= -0.5) & (u <= np.subtract(image_size_px, 0.5))).all(axis=-1)
+
+
+def coco_keypoints(path: Path) -> Iterator[tuple[str, list[str], np.ndarray]]:
+    """The image, the names (k,) and x, y, visibility (k, 3) of each annotation in a file of COCO keypoints.
+
+    Raises:
+        FileNotFoundError, ValueError: Naming the file and the entry.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file.")
+    try:
+        content = json.loads(path.read_bytes())
+        categories = {c["id"]: list(c["keypoints"]) for c in content["categories"] if "keypoints" in c}
+        images = {image["id"]: str(image["file_name"]) for image in content["images"]}
+        entries = [(a["image_id"], a["category_id"], a["keypoints"]) for a in content["annotations"]]
+        found = [(images.get(image), categories.get(category)) for image, category, _ in entries]
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        what = f"not COCO keypoints ({type(error).__name__}: {error})"
+        raise ValueError(f"{path}: {what}. Export the annotations again.") from None
+    for (image_id, category_id, keypoints), (image, names) in zip(entries, found, strict=True):
+        if names is None or image is None:
+            where = f"category {category_id}, image {image_id}"
+            raise ValueError(f"{path}: an annotation names {where}, which the file does not describe. Export it again.")
+        try:
+            values = np.array(keypoints, dtype=np.float64).reshape(len(names), 3)
+        except (ValueError, TypeError):
+            raise ValueError(f"{path}: image {image}: keypoints must be x, y, visibility for each name.") from None
+        if not np.isin(values[:, 2], (0, 1, 2)).all():
+            raise ValueError(f"{path}: image {image}: visibility is 0, 1 or 2.")
+        yield image, names, values
+
+
 def read_coco(
     path: Path, n_frames: int, image_size_px: tuple[int, int], landmarks: Sequence[str] = LANDMARKS
 ) -> Annotations:
@@ -51,47 +86,26 @@ def read_coco(
     Raises:
         FileNotFoundError, ValueError: Naming the file and the entry.
     """
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file.")
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        categories = {c["id"]: list(c["keypoints"]) for c in content["categories"] if "keypoints" in c}
-        images = {image["id"]: str(image["file_name"]) for image in content["images"]}
-        found = content["annotations"]
-        entries = [(images.get(a["image_id"]), categories.get(a["category_id"]), a["keypoints"], a) for a in found]
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        what = f"not COCO keypoints ({type(error).__name__}: {error})"
-        raise ValueError(f"{path}: {what}. Export the annotations again.") from None
     width, height = image_size_px
     u = np.full((2, n_frames, len(landmarks), 2), np.nan)
     visibility = np.zeros((2, n_frames, len(landmarks)), dtype=np.int64)
     seen = set()
-    for image, names, keypoints, entry in entries:
-        where = f"image {entry['image_id']}, category {entry['category_id']}"
-        if names is None or image is None:
-            raise ValueError(f"{path}: an annotation names {where}; no such entry.")
+    for image, names, values in coco_keypoints(path):
+        file, where = PurePosixPath(image), f"{path}: image {image}"
         if not set(landmarks) <= set(names):
-            raise ValueError(f"{path}: {where} has keypoints {names}; {list(landmarks)} are needed.")
-        file = PurePosixPath(image)
+            raise ValueError(f"{where} has keypoints {names}; {list(landmarks)} are needed.")
         if file.parent.name not in _SIDES or not file.stem.isdecimal() or int(file.stem) >= n_frames:
             known = f"left/000000.jpg to right/{n_frames - 1:06d}.jpg"
-            raise ValueError(f"{path}: image {image!r} is not a frame of this recording ({known}).")
-        side, frame = _SIDES.index(file.parent.name), int(file.stem)
-        if (side, frame) in seen:
-            raise ValueError(f"{path}: image {file} is annotated twice; a frame has one tool.")
-        seen.add((side, frame))
-        try:
-            values = np.array(keypoints, dtype=np.float64).reshape(len(names), 3)
-        except (ValueError, TypeError):
-            raise ValueError(f"{path}: image {file}: keypoints must be x, y, visibility for each name.") from None
-        x, y, v = values[[names.index(landmark) for landmark in landmarks]].T
-        if not np.isin(v, (0, 1, 2)).all():
-            raise ValueError(f"{path}: image {file}: visibility is 0, 1 or 2.")
-        inside = (x >= -0.5) & (x <= width - 0.5) & (y >= -0.5) & (y <= height - 0.5)
-        if not inside[v > 0].all():
-            raise ValueError(f"{path}: image {file}: a keypoint lies outside the image of {width} x {height} px.")
-        u[side, frame, v > 0] = np.column_stack([x, y])[v > 0]
-        visibility[side, frame] = v
+            raise ValueError(f"{where} is not a frame of this recording ({known}).")
+        side, frame = at = _SIDES.index(file.parent.name), int(file.stem)
+        if at in seen:
+            raise ValueError(f"{where} is annotated twice; a frame has one tool.")
+        seen.add(at)
+        xy, v = np.split(values[[names.index(landmark) for landmark in landmarks]], [2], axis=1)
+        labelled = v[:, 0] > 0
+        if not inside(xy[labelled], image_size_px).all():
+            raise ValueError(f"{where}: a keypoint lies outside the image of {width} x {height} px.")
+        u[side, frame, labelled], visibility[side, frame] = xy[labelled], v[:, 0]
     return Annotations(u[0], u[1], visibility[0], visibility[1])
 
 
@@ -106,9 +120,7 @@ def write_coco(
         for frame, (u, visibility) in enumerate(zip(us, visibilities, strict=True)):
             identity, file_name = len(images) + 1, f"{side}/{frame:06d}{suffix}"
             images.append({"id": identity, "file_name": file_name, "width": width, "height": height})
-            with np.errstate(invalid="ignore"):
-                inside = ((u >= -0.5) & (u <= np.array([width, height]) - 0.5)).all(axis=1)
-            v = np.where(inside, visibility, 0)
+            v = np.where(inside(u, image_size_px), visibility, 0)
             if not v.any():
                 continue
             low, size = u[v > 0].min(axis=0), np.ptp(u[v > 0], axis=0)

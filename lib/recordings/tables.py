@@ -1,9 +1,9 @@
-"""Numeric CSV tables whose errors name file and line, and the column names of landmark tables."""
+"""CSV tables whose errors name file and line, and the column names of landmark tables."""
 
 import csv
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +11,7 @@ import numpy as np
 from lib.correspondences import LANDMARKS
 from lib.files import write_text
 
-__all__ = ["columns", "read_table", "write_table"]
+__all__ = ["columns", "decoded", "number", "read_table", "rows_of", "write_table"]
 
 
 def columns(axes: Sequence[str], landmarks: Sequence[str] = LANDMARKS) -> list[str]:
@@ -21,6 +21,46 @@ def columns(axes: Sequence[str], landmarks: Sequence[str] = LANDMARKS) -> list[s
     ['base_x_mm', 'tip_1_x_mm', 'tip_2_x_mm']
     """
     return [f"{landmark}_{axis}" for landmark in landmarks for axis in axes]
+
+
+def decoded(path: Path, *, utf_16: bool = False) -> str:
+    """The text of a UTF-8 file, or also, where its first bytes say so, of a UTF-16 one."""
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file; check its name.")
+    data = path.read_bytes()
+    try:
+        return data.decode("utf-16" if utf_16 and data[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = data[: error.start].count(b"\n") + 1
+        raise ValueError(f"{path}, line {line}: the text is not UTF-8. Save the file as CSV in UTF-8.") from None
+
+
+def rows_of(path: Path, text: str, separator: str = ",") -> Iterator[tuple[str, list[str]]]:
+    """Place ("FILE, line N") and stripped cells of the header and of each row, all as long; blank lines are left out."""
+    reader, n = csv.reader(io.StringIO(text, newline=""), delimiter=separator), 0
+    try:
+        for cells in reader:
+            place, cells = f"{path}, line {reader.line_num}", [cell.strip() for cell in cells]
+            if cells in ([], [""]):
+                continue
+            n = n or len(cells)
+            if len(cells) != n:
+                raise ValueError(f"{place}: {len(cells)} cells where the header has {n}. Check separator and decimal.")
+            yield place, cells
+    except csv.Error as error:
+        raise ValueError(f"{path}, line {reader.line_num}: not CSV ({error}). Export the table again.") from None
+
+
+def number(cell: str, place: str, column: str) -> float:
+    """The finite number in a cell, NaN for an empty one."""
+    try:
+        value = float(cell) if cell else 0.0
+    except ValueError:
+        value = math.inf
+    if not math.isfinite(value):
+        cure = "Check the decimal mark; leave the cell of a missing value empty"
+        raise ValueError(f"{place}, column {column}: {cell!r} is not a finite number. {cure}.")
+    return value if cell else math.nan
 
 
 def read_table(path: Path, names: Sequence[str], optional: Sequence[str] = (), n_frames: int | None = None) -> np.ndarray:
@@ -34,48 +74,21 @@ def read_table(path: Path, names: Sequence[str], optional: Sequence[str] = (), n
         ValueError: For text that is not UTF-8; a missing, unknown or repeated column; a short, long or missing row; a
             cell that is not a finite number ("nan" included: a missing value is an empty cell).  Names file and line.
     """
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file.")
-    data = path.read_bytes()
-    try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = data[: error.start].count(b"\n") + 1
-        raise ValueError(f"{path}, line {line}: the text is not UTF-8. Save the file as CSV in UTF-8.") from None
-    reader, rows = csv.reader(io.StringIO(text, newline="")), []
-    try:
-        header = [cell.strip() for cell in next(reader, [])]
-        wanted = [*names, *optional] if set(header) & set(optional) else list(names)
-        if header != wanted:
-            missing = [name for name in wanted if name not in header]
-            unknown = [name for name in header if name not in wanted]
-            detail = [f"{what}: {', '.join(which)}" for what, which in (("missing", missing), ("unknown", unknown)) if which]
-            found = "; ".join(detail) or "order or repetition"
-            raise ValueError(f"{path}, line 1: wrong columns ({found}). Expected: {','.join(wanted)}.")
-        for row in filter(None, reader):
-            if len(row) != len(wanted):
-                raise ValueError(f"{path}, line {reader.line_num}: {len(row)} cells where the header has {len(wanted)}.")
-            rows.append([_number(cell, path, reader.line_num, name) for cell, name in zip(row, wanted, strict=True)])
-    except csv.Error as error:
-        raise ValueError(f"{path}, line {reader.line_num}: not CSV ({error}). Export the table again.") from None
-    table = np.full((len(rows), len(names) + len(optional)), np.nan)
-    table[:, : len(wanted)] = np.array(rows, dtype=np.float64).reshape(len(rows), len(wanted))
+    rows = rows_of(path, decoded(path))
+    header = next(rows, ("", []))[1]
+    wanted = [*names, *optional] if set(header) & set(optional) else list(names)
+    if header != wanted:
+        missing, unknown = ([n for n in one if n not in other] for one, other in ((wanted, header), (header, wanted)))
+        detail = [f"{what}: {', '.join(which)}" for what, which in (("missing", missing), ("unknown", unknown)) if which]
+        found = "; ".join(detail) or "order or repetition"
+        raise ValueError(f"{path}, line 1: wrong columns ({found}). Expected: {','.join(wanted)}.")
+    found = [[number(cell, place, name) for cell, name in zip(cells, wanted, strict=True)] for place, cells in rows]
+    table = np.full((len(found), len(names) + len(optional)), np.nan)
+    table[:, : len(wanted)] = np.array(found, dtype=np.float64).reshape(len(found), len(wanted))
     if n_frames is not None and not np.array_equal(table[:, 0], np.arange(n_frames)):
         what = f"expected one row for each of the {n_frames} frames, 0 to {n_frames - 1}"
         raise ValueError(f"{path}: {what}; got {len(table)}.")
     return table
-
-
-def _number(cell: str, path: Path, line: int, name: str) -> float:
-    text = cell.strip()
-    try:
-        value = float(text) if text else math.nan
-    except ValueError:
-        value = math.inf
-    if text and not math.isfinite(value):
-        place = f"{path}, line {line}, column {name}"
-        raise ValueError(f"{place}: {text!r} is not a finite number. Leave the cell of a missing value empty.")
-    return value
 
 
 def write_table(path: Path, names: Sequence[str], values: np.ndarray, decimals: Sequence[int]) -> None:

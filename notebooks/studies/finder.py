@@ -17,13 +17,13 @@ from lib.geometry import cell_from_image, image_from_cell
 from lib.landmarks import Detector
 from lib.landmarks.error_model import ErrorModel
 from lib.landmarks.metrics import pck, tool_length_px
-from lib.recordings import MonocularSequence
 from lib.training.augmentation import Augmentation
 from lib.training.config import PRESETS, TrainingConfig
 from lib.training.evaluation import Evaluation, evaluate
 from lib.training.loop import Training, train
 from lib.training.samples import LabelledImage, Mixed, Samples, Source
 from lib.training.shards import REDUCTION
+from notebooks.studies.retinal import MonocularSequence
 
 __all__ = [
     "Crops",

@@ -19,7 +19,7 @@ import numpy as np
 
 from lib.cameras import AffineCamera
 from lib.geometry import RigidTransform
-from lib.recordings import import_retinal_microsurgery, read_image
+from lib.recordings import read_image
 from lib.simulator.eye import Eye
 from lib.simulator.forceps import Forceps, Pose
 from lib.simulator.ground import Ground
@@ -28,6 +28,7 @@ from lib.simulator.render import render_view
 from lib.simulator.shapes import TOOLS
 from lib.simulator.texture import EXTENT_MM, fundus_texture
 from lib.simulator.window import Window
+from notebooks.studies.retinal import import_retinal_microsurgery
 
 __all__ = [
     "FUNDUS_SET_BY",

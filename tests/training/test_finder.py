@@ -11,9 +11,9 @@ from lib import paths
 from lib.landmarks import Detector
 from lib.landmarks.metrics import tool_length_px
 from lib.landmarks.network import HourglassConfig, StackedHourglass
-from lib.recordings import MonocularSequence, import_retinal_microsurgery
 from lib.training.samples import Mixed, Samples
 from notebooks.studies import finder
+from notebooks.studies.retinal import MonocularSequence, import_retinal_microsurgery
 
 RETINAL = paths.real_data("retinal_microsurgery")
 

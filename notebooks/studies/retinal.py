@@ -1,11 +1,11 @@
-"""Public data sets in formats of their own."""
+"""The Retinal Microsurgery sequences: real frames with clicked landmarks, of one camera and without kinematics."""
 
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from lib.recordings.frames import read_image
+from lib.recordings import read_image
 from lib.recordings.tables import columns, read_table
 
 __all__ = ["MonocularSequence", "import_retinal_microsurgery"]
