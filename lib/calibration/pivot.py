@@ -134,7 +134,10 @@ def tool_offsets(
     own = (landmark[:, None] == np.arange(k)).astype(np.float64)
     on_jaw = np.arange(k) > 0 if turning is None else np.asarray(turning) != 0
     if half is not None:
-        _check_opening(half[frame[on_jaw[landmark]]])
+        seen = half[frame[on_jaw[landmark]]]
+        if (span := float(np.ptp(seen)) if seen.size else 0.0) < _OPENING:
+            what = f"the jaws open by {2 * span:.2g} rad only, which leaves the hinge open"
+            raise ValueError(f"opening_rad: {what}; open and close them, or leave the opening out.")
         jaw = own[:, on_jaw]
         own = np.hstack([own, np.sin(half[frame])[:, None] * jaw, (1 - np.cos(half[frame]))[:, None] * jaw])
     q = own.shape[1]
@@ -186,15 +189,6 @@ def _check_determined(covariance_mm2: np.ndarray) -> None:
         raise ValueError(
             f"robot_from_tool: the motion leaves an offset open by {np.sqrt(np.abs(variance).max()):.2g} mm; turn the tool "
             "further, about two axes, or give more poses."
-        )
-
-
-def _check_opening(half_rad: np.ndarray) -> None:
-    span = float(np.ptp(half_rad)) if half_rad.size else 0.0
-    if span < _OPENING:
-        raise ValueError(
-            f"opening_rad: the jaws open by {2 * span:.2g} rad only, which leaves the hinge open; open and close them, or "
-            "leave the opening out."
         )
 
 

@@ -115,7 +115,8 @@ def _landmarks(
     """The robot's landmarks (m, k, 3) mm, and, where it reports poses, what is told of the tool."""
     if robot.R is None:
         return robot.x_mm, None
-    known, poses = robot.poses()
+    known = np.isfinite(robot.R).all(axis=(1, 2)) & np.isfinite(robot.t_mm).all(axis=1)
+    poses = [RigidTransform(R, t) for R, t in zip(robot.R[known], robot.t_mm[known], strict=True)]
     opening = None if robot.opening_rad is None else robot.opening_rad[known]
     tool, sd = _tool(told, poses, robot_s[known], opening, frames_s, labels, zero_s)
     x = np.full((len(known), len(told.landmarks), 3), np.nan)

@@ -5,6 +5,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from decimal import Decimal, InvalidOperation
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,6 @@ from rosbags.highlevel import AnyReader, AnyReaderError
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
-from lib.geometry import RigidTransform
 from lib.importing.mapping import Mapping, Pose, Table
 from lib.recordings.tables import decoded, number, rows_of
 
@@ -36,11 +36,6 @@ class RobotLog:
     R: np.ndarray | None = None
     t_mm: np.ndarray | None = None
     opening_rad: np.ndarray | None = None
-
-    def poses(self) -> tuple[np.ndarray, list[RigidTransform]]:
-        """Which samples (m,) bool hold a whole pose, and these poses."""
-        known = np.isfinite(self.R).all(axis=(1, 2)) & np.isfinite(self.t_mm).all(axis=1)
-        return known, [RigidTransform(R, t) for R, t in zip(self.R[known], self.t_mm[known], strict=True)]
 
 
 def exact_seconds(text: str, unit: str, where: str) -> Decimal:
@@ -189,12 +184,10 @@ def read_robot(folder: Path, mapping: Mapping) -> RobotLog:
     x = np.stack([np.stack([columns[name] for name in group], axis=-1) for group in groups], axis=1)
     x = x * _MILLIMETRES[robot.length_unit]
     x[np.isnan(x).any(axis=2)] = np.nan
-    turn, shift = np.eye(3), np.zeros(3)
-    if robot.frame is not None:
-        turn, shift = np.array(robot.frame.rotation), np.array(robot.frame.translation_mm)
-        if np.abs(turn @ turn.T - np.eye(3)).max() > 1e-4 or np.linalg.det(turn) < 0:
-            raise ValueError("robot.frame.rotation: no rotation; its rows must be orthonormal and right-handed.")
-    x = x @ turn.T + shift
+    turn = np.array(robot.frame.rotation)
+    if np.abs(turn @ turn.T - np.eye(3)).max() > 1e-4 or np.linalg.det(turn) < 0:
+        raise ValueError("robot.frame.rotation: no rotation; its rows must be orthonormal and right-handed.")
+    x = x @ turn.T + robot.frame.translation_mm
     spread_mm = float(np.linalg.norm(np.diff(np.nanpercentile(x, [5, 95], axis=0), axis=0), axis=2).max())
     if not 0.05 <= spread_mm <= 2000:
         what = f"with length_unit = {robot.length_unit!r} the tool moves over {spread_mm:.3g} mm"
@@ -202,13 +195,12 @@ def read_robot(folder: Path, mapping: Mapping) -> RobotLog:
     if pose is None:
         return RobotLog(time, x_mm=x)
     R = turn @ _rotations(path, pose, np.stack([columns[name] for name in pose.rotation], axis=-1))
-    return RobotLog(time, R=R, t_mm=x[:, 0], opening_rad=_opening(path, mapping, columns.get(pose.gripper)))
+    opening = _opening(path, mapping, columns[pose.gripper]) if pose.gripper else None
+    return RobotLog(time, R=R, t_mm=x[:, 0], opening_rad=opening)
 
 
-def _opening(path: Path, mapping: Mapping, opening: np.ndarray | None) -> np.ndarray | None:
+def _opening(path: Path, mapping: Mapping, opening: np.ndarray) -> np.ndarray:
     unit, length_mm = mapping.robot.pose.gripper_unit, mapping.tool.jaw_length_mm
-    if opening is None:
-        return None
     if unit == "mm":
         if length_mm is None or np.nanmax(np.abs(opening)) > 2 * length_mm:
             raise ValueError(f"{path}: a gripper in mm needs tool.jaw_length_mm, at least half the widest opening.")
@@ -220,22 +212,21 @@ def _opening(path: Path, mapping: Mapping, opening: np.ndarray | None) -> np.nda
 
 
 def _rotations(path: Path, pose: Pose, values: np.ndarray) -> np.ndarray:
+    """(m, 3, 3) from the columns (m, c) of a pose, NaN where a cell is empty."""
     kind, known = pose.rotation_kind, np.isfinite(values).all(axis=1)
     v, R = values[known], np.full((len(values), 3, 3), np.nan)
     if kind == "matrix":
-        m = v.reshape(-1, 3, 3)
-        valid = np.abs(m @ m.transpose(0, 2, 1) - np.eye(3)).max(initial=0) < 1e-2 and (np.linalg.det(m) > 0).all()
+        v = v.reshape(-1, 3, 3)
+        valid = np.abs(v @ v.transpose(0, 2, 1) - np.eye(3)).max(initial=0) < 1e-2 and (np.linalg.det(v) > 0).all()
+        made = Rotation.from_matrix
     elif kind.startswith("quaternion"):
         valid = (np.abs(np.linalg.norm(v, axis=1) - 1) < 1e-2).all()
+        made = partial(Rotation.from_quat, scalar_first=kind == "quaternion_wxyz")
     else:
-        valid = np.abs(v).max(initial=0) <= (360 if kind == "euler_xyz_deg" else 2 * np.pi)
+        degrees = kind == "euler_xyz_deg"
+        valid = np.abs(v).max(initial=0) <= (360 if degrees else 2 * np.pi)
+        made = partial(Rotation.from_euler, "xyz", degrees=True) if degrees else Rotation.from_rotvec
     if not valid:
         raise ValueError(f"{path}: columns {', '.join(pose.rotation)} are no {kind}. Check rotation_kind.")
-    made = {
-        "matrix": lambda: Rotation.from_matrix(v.reshape(-1, 3, 3)),
-        "euler_xyz_deg": lambda: Rotation.from_euler("xyz", v, degrees=True),
-        "quaternion_xyzw": lambda: Rotation.from_quat(v), "quaternion_wxyz": lambda: Rotation.from_quat(v, scalar_first=True),
-        "rotation_vector_rad": lambda: Rotation.from_rotvec(v),
-    }  # fmt: skip
-    R[known] = made[kind]().as_matrix()
+    R[known] = made(v).as_matrix()
     return R

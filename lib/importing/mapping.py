@@ -1,12 +1,12 @@
 """The mapping file of an import: what lies where in the source, in which units, under which names."""
 
-import tomllib
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from lib.correspondences import LANDMARKS
+from lib.recordings.tables import read_toml
 
 __all__ = ["Labels", "Mapping", "Pose", "Robot", "Table", "Tool", "Video", "read_mapping"]
 
@@ -78,8 +78,8 @@ class Pose(_Section):
 class Frame(_Section):
     """robot_from_log, where the log is in another frame: rows of the rotation, and the translation in mm."""
 
-    rotation: tuple[Vector, Vector, Vector]
-    translation_mm: Vector
+    rotation: tuple[Vector, Vector, Vector] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    translation_mm: Vector = (0.0, 0.0, 0.0)
 
 
 class Robot(Table):
@@ -90,7 +90,7 @@ class Robot(Table):
     pose: Pose | None = None
     offset_s: float | Literal["estimate"] = 0.0
     search_s: Annotated[float, Field(gt=0)] = 0.5
-    frame: Frame | None = None
+    frame: Frame = Frame()
 
     @model_validator(mode="after")
     def _agree(self) -> Self:
@@ -174,9 +174,7 @@ def read_mapping(path: str | Path) -> Mapping:
         cure = f"`python3 -m lib import SOURCE --guess --map {path.name}` writes one"
         raise FileNotFoundError(f"{path}: no such mapping; {cure}.")
     try:
-        return Mapping.model_validate(tomllib.loads(path.read_text(encoding="utf-8-sig")))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise ValueError(f"{path}: not valid TOML ({error}). Save it as UTF-8 text.") from None
+        return Mapping.model_validate(read_toml(path))
     except ValidationError as error:
         first = error.errors(include_url=False, include_context=False)[0]
         key, told = ".".join(str(part) for part in first["loc"]) or "the mapping", repr(first["input"])

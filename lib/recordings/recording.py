@@ -2,7 +2,6 @@
 
 import math
 import re
-import tomllib
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ from lib.correspondences import LANDMARKS
 from lib.recordings.annotations import Annotations, read_coco
 from lib.recordings.doubts import Doubt, doubts
 from lib.recordings.frames import Frames, open_side
-from lib.recordings.tables import columns, read_table
+from lib.recordings.tables import columns, read_table, read_toml, refuse
 from lib.recordings.truth import Truth
 
 __all__ = ["FORMAT", "UNITS", "Kinematics", "Recording", "kinematics_columns"]
@@ -26,6 +25,7 @@ FORMAT = "microstereo.recording"
 _GAP_S = 0.5
 #: A position farther from the origin than this is no millimetre.
 _FARTHEST_MM = 1e5
+_ORDER = "time_s must be a number larger than the row before"
 UNITS = {"length": "mm", "image": "px", "time": "s"}
 _REQUIRED = {"name": str, "fps": float, "image_size_px": list}
 _DEFAULTS = {"description": "", "readout_s": 0.0, "offset_s": 0.0, "robot_accuracy_mm": 0.010, "details": {}}
@@ -137,7 +137,8 @@ class Recording:
             raise ValueError(f"{folder}: the recording is empty; it has no frame.")
         time_s, path = np.arange(len(left)) / header["fps"], folder / "frames.csv"
         if path.exists():
-            time_s = _increasing(path, read_table(path, ["frame", "time_s"], n_frames=len(left))[:, 1])
+            time_s = read_table(path, ["frame", "time_s"], n_frames=len(left))[:, 1]
+            refuse(path, _not_increasing(time_s), _ORDER)
         frames = Frames(left, right, time_s)
         kinematics = _read_kinematics(folder / "kinematics.csv", skeleton)
         robot_time = frames.time_s + header["offset_s"]
@@ -172,10 +173,7 @@ class Recording:
 def _read_header(path: Path) -> dict:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; a recording starts with its recording.toml.")
-    try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise ValueError(f"{path}: not valid TOML ({error}). Save it as UTF-8 text.") from None
+    content = read_toml(path)
     kinds = _REQUIRED | {key: type(value) for key, value in (_DEFAULTS | _FIXED).items()}
     if unknown := sorted(set(content) - set(kinds)):
         known = f"Known: {', '.join(kinds)}; own notes go in [details]"
@@ -210,25 +208,20 @@ def _read_header(path: Path) -> dict:
     return header | {"image_size_px": tuple(size), "skeleton": tuple(names)}
 
 
-def _increasing(path: Path, time_s: np.ndarray) -> np.ndarray:
-    bad = np.flatnonzero(~(np.diff(time_s, prepend=-np.inf) > 0))
-    if bad.size:
-        raise ValueError(f"{path}, line {bad[0] + 2}: time_s must be a number larger than the row before.")
-    return time_s
+def _not_increasing(time_s: np.ndarray) -> np.ndarray:
+    return ~(np.diff(time_s, prepend=-np.inf) > 0)
 
 
 def _read_kinematics(path: Path, landmarks: Sequence[str]) -> Kinematics:
     table = read_table(path, kinematics_columns(landmarks))
     if not len(table):
         raise ValueError(f"{path}: the table is empty; the robot's landmarks are needed.")
-    time_s, x = _increasing(path, table[:, 0]), table[:, 1:].reshape(-1, len(landmarks), 3)
-    if (far := np.flatnonzero((np.abs(np.nan_to_num(x)) > _FARTHEST_MM).any(axis=(1, 2)))).size:
-        raise ValueError(f"{path}, line {far[0] + 2}: beyond {_FARTHEST_MM:g} mm; leave the cells of a wrong sample empty.")
-    empty = np.isnan(x)
-    partial = np.flatnonzero((empty.any(axis=2) & ~empty.all(axis=2)).any(axis=1))
-    if partial.size:
-        cure = "leave all three cells of a dropped landmark empty"
-        raise ValueError(f"{path}, line {partial[0] + 2}: a landmark has some coordinates only; {cure}.")
+    time_s, x = table[:, 0], table[:, 1:].reshape(-1, len(landmarks), 3)
+    empty, far = np.isnan(x), np.abs(np.nan_to_num(x)) > _FARTHEST_MM
+    refuse(path, _not_increasing(time_s), _ORDER)
+    refuse(path, far.any(axis=(1, 2)), f"beyond {_FARTHEST_MM:g} mm; leave the cells of a wrong sample empty")
+    problem = "a landmark has some coordinates only; leave all three cells of a dropped landmark empty"
+    refuse(path, (empty.any(axis=2) & ~empty.all(axis=2)).any(axis=1), problem)
     reach = np.linalg.norm(x[:, 1:] - x[:, :1], axis=2)
     if not np.isfinite(reach).any():
         raise ValueError(f"{path}: no row holds {landmarks[0]} and another landmark; the kinematics are empty.")

@@ -1,8 +1,9 @@
-"""CSV tables whose errors name file and line, and the column names of landmark tables."""
+"""TOML files and CSV tables whose errors name file and line, and the column names of landmark tables."""
 
 import csv
 import io
 import math
+import tomllib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import numpy as np
 from lib.correspondences import LANDMARKS
 from lib.files import write_text
 
-__all__ = ["columns", "decoded", "number", "read_table", "rows_of", "write_table"]
+__all__ = ["columns", "decoded", "number", "read_table", "read_toml", "refuse", "rows_of", "write_table"]
 
 
 def columns(axes: Sequence[str], landmarks: Sequence[str] = LANDMARKS) -> list[str]:
@@ -33,6 +34,14 @@ def decoded(path: Path, *, utf_16: bool = False) -> str:
     except UnicodeDecodeError as error:
         line = data[: error.start].count(b"\n") + 1
         raise ValueError(f"{path}, line {line}: the text is not UTF-8. Save the file as CSV in UTF-8.") from None
+
+
+def read_toml(path: Path) -> dict:
+    """The content of a TOML file."""
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise ValueError(f"{path}: not valid TOML ({error}). Save it as UTF-8 text.") from None
 
 
 def rows_of(path: Path, text: str, separator: str = ",") -> Iterator[tuple[str, list[str]]]:
@@ -70,9 +79,7 @@ def read_table(path: Path, names: Sequence[str], optional: Sequence[str] = (), n
     number the frames from 0.
 
     Raises:
-        FileNotFoundError: If there is no such file.
-        ValueError: For text that is not UTF-8; a missing, unknown or repeated column; a short, long or missing row; a
-            cell that is not a finite number ("nan" included: a missing value is an empty cell).  Names file and line.
+        FileNotFoundError, ValueError: Naming file and line; "nan" is refused too, since a missing value is an empty cell.
     """
     rows = rows_of(path, decoded(path))
     header = next(rows, ("", []))[1]
@@ -89,6 +96,12 @@ def read_table(path: Path, names: Sequence[str], optional: Sequence[str] = (), n
         what = f"expected one row for each of the {n_frames} frames, 0 to {n_frames - 1}"
         raise ValueError(f"{path}: {what}; got {len(table)}.")
     return table
+
+
+def refuse(path: Path, bad: np.ndarray, problem: str) -> None:
+    """Raise a ValueError that names the line of the first row (m,) that is `bad`, if there is one."""
+    if bad.any():
+        raise ValueError(f"{path}, line {int(bad.argmax()) + 2}: {problem}.")
 
 
 def write_table(path: Path, names: Sequence[str], values: np.ndarray, decimals: Sequence[int]) -> None:

@@ -18,16 +18,7 @@ from lib.files import whole, write_bytes
 from lib.geometry import finite_points
 from lib.surface.bspline import BSplineSurface
 
-__all__ = [
-    "Mesh",
-    "depth_map",
-    "open3d",
-    "remove_outliers",
-    "save_depth_map",
-    "save_mesh",
-    "save_points",
-    "surface_mesh",
-]
+__all__ = ["Mesh", "depth_map", "open3d", "remove_outliers", "save_depth_map", "save_mesh", "save_points", "surface_mesh"]
 
 
 def open3d() -> ModuleType:
@@ -134,10 +125,8 @@ def save_mesh(mesh: Mesh, path: str | Path) -> Path:
     return path
 
 
-def save_points(
-    path: str | Path, x_mm: ArrayLike, *, colours: np.ndarray | None = None, normals: ArrayLike | None = None
-) -> Path:
-    """Write points (n, 3) mm as a binary PLY, with colours (n, 3) uint8 RGB and normals (n, 3) where given.
+def save_points(path: str | Path, x_mm: ArrayLike, *, colours: np.ndarray | None = None) -> Path:
+    """Write points (n, 3) mm as a binary PLY, with colours (n, 3) uint8 RGB where given.
 
     Raises:
         ValueError: For NaN, counts that differ, or another suffix.
@@ -145,15 +134,12 @@ def save_points(
     """
     path = _suffixed(path, ".ply")
     x = finite_points(x_mm, 3, "x_mm")
-    for name, values in (("colours", colours), ("normals", normals)):
-        if values is not None and np.shape(values) != x.shape:
-            raise ValueError(f"{name}: expected one row a point, {x.shape}, got {np.shape(values)}.")
+    if colours is not None and np.shape(colours) != x.shape:
+        raise ValueError(f"colours: expected one row a point, {x.shape}, got {np.shape(colours)}.")
     o3d = open3d()
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(x))
     if colours is not None:
         cloud.colors = o3d.utility.Vector3dVector(np.asarray(colours, dtype=np.float64) / 255)
-    if normals is not None:
-        cloud.normals = o3d.utility.Vector3dVector(np.asarray(normals, dtype=np.float64))
     _write(path, lambda name: o3d.io.write_point_cloud(name, cloud), lambda data: len(data) >= x.nbytes)
     return path
 

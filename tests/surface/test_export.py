@@ -115,14 +115,13 @@ def test_without_open3d_one_line_says_what_to_install(monkeypatch, tmp_path):
     assert "\n" not in str(failure.value)
 
 
-def test_ply_comes_back_with_colours_and_normals(surface, image, bowl, tmp_path):
+def test_ply_comes_back_with_colours(surface, image, bowl, tmp_path):
     mesh = surface_mesh(surface, step_px=80, image=image)
-    path = save_points(tmp_path / "cloud.ply", mesh.vertices_mm, colours=mesh.colours, normals=mesh.normals)
+    path = save_points(tmp_path / "cloud.ply", mesh.vertices_mm, colours=mesh.colours)
     assert [p.name for p in tmp_path.iterdir()] == ["cloud.ply"]
     cloud = o3d.io.read_point_cloud(str(path))
     np.testing.assert_allclose(np.asarray(cloud.points), mesh.vertices_mm, atol=1e-6)
     np.testing.assert_array_equal(np.rint(np.asarray(cloud.colors) * 255), mesh.colours)
-    np.testing.assert_allclose(np.asarray(cloud.normals), mesh.normals, atol=1e-6)
 
 
 def test_depth_map_is_the_surface_along_the_view(surface, bowl, tmp_path):
