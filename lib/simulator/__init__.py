@@ -5,10 +5,10 @@ Everything here is in the microscope frame (see `rig.py`).  Only a recording tha
 
 from lib.simulator.eye import Eye
 from lib.simulator.forceps import Forceps, Pose
-from lib.simulator.microscope import Microscope
 from lib.simulator.motion import Motion
 from lib.simulator.recording import Design, simulate
 from lib.simulator.render import View, render_pair, render_view
+from lib.simulator.rig import Microscope
 from lib.simulator.window import Window
 
 __all__ = ["Design", "Eye", "Forceps", "Microscope", "Motion", "Pose", "View", "Window"]

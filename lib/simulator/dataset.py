@@ -22,9 +22,9 @@ from lib.parallel import cores, run_jobs, step
 from lib.recordings import Recording
 from lib.simulator.eye import Eye
 from lib.simulator.families import FAR
-from lib.simulator.microscope import Microscope
 from lib.simulator.population import RESERVED_SEEDS, random_forceps, random_setup, reserved_forceps
 from lib.simulator.recording import Design, simulate
+from lib.simulator.rig import Microscope
 
 __all__ = ["TEST_SEQUENCES", "TRAIN_SEQUENCES", "main", "make_dataset", "rung_design", "seconds_a_pair", "sequence_design"]
 __all__ += ["sequence_name"]

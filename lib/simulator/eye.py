@@ -1,16 +1,19 @@
-"""The eye: a smooth height field z(x, y) in the microscope frame with a texture on it; and what any scene must offer."""
+"""Scenes: smooth height fields z(x, y) in the microscope frame with a texture, of an eye's fundus or of anything."""
 
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import ClassVar, Protocol
 
+import cv2
 import numpy as np
 
 from lib.simulator.limits import check, not_negative, positive
-from lib.simulator.texture import EXTENT_MM, fundus_texture, photograph_texture
+from lib.simulator.texture import EXTENT_MM, GAMMA, fundus_texture, pattern, photograph_texture
 
-__all__ = ["Eye", "Scene"]
+__all__ = ["Eye", "Ground", "Scene"]
+
+_FUNDUS_PX, _FILMS = 1024, 8
 
 
 class Scene(Protocol):
@@ -99,3 +102,53 @@ class Eye:
         for wave_x, wave_y, phase, amplitude in folds:
             z = z + amplitude * (np.sin(wave_x * x + wave_y * y + phase) - np.sin(phase))
         return z
+
+
+@dataclass(frozen=True)
+class Ground(Eye):
+    """A surface with any texture.
+
+    Attributes:
+        kind: "fundus", or the name of a pattern (`lib.simulator.texture`).
+        size_mm: Side of the square that one texture covers; its mirror images cover the rest.
+        colours: Linear reflectances (k, 3), from dark to bright texture; none = a fundus in its own colours.
+        over, over_share: A second texture that is mixed with the first, and its share.
+    """
+
+    kind: str = "fundus"
+    size_mm: float = Eye.extent_mm
+    colours: tuple[tuple[float, float, float], ...] = ()
+    over: str | None = None
+    over_share: float = 0.4
+
+    @property
+    def extent_mm(self) -> float:
+        """As `Scene` wants it."""
+        return self.size_mm
+
+    @property
+    def border(self) -> int:
+        """What lies beyond the texture, in OpenCV's terms."""
+        return cv2.BORDER_REFLECT
+
+    @property
+    def film_seed(self) -> int:
+        """Seed of the wet film's ripples: few, as they are kept in memory."""
+        return self.seed % _FILMS
+
+    @cached_property
+    def texture(self) -> np.ndarray:
+        """Reflectance (n, n, 3) uint8 RGB."""
+        if self.kind == "fundus":
+            plain = fundus_texture(self.seed, _FUNDUS_PX, self.radius_mm)
+            if not self.colours:
+                return plain
+            plain = cv2.cvtColor(plain, cv2.COLOR_RGB2GRAY)
+        else:
+            plain = pattern(self.kind, self.seed)
+        if self.over is not None:
+            other = cv2.resize(pattern(self.over, self.seed + 1), plain.shape)
+            plain = cv2.addWeighted(plain, 1 - self.over_share, other, self.over_share, 0)
+        stops = np.linspace(0, 255, len(self.colours))
+        table = np.stack([np.interp(np.arange(256), stops, channel) for channel in np.transpose(self.colours)], axis=-1)
+        return cv2.LUT(cv2.merge([plain] * 3), np.uint8(255 * np.clip(table, 0, 1)[None] ** (1 / GAMMA)))

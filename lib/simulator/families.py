@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from lib.simulator.ground import Ground
+from lib.simulator.eye import Ground
 from lib.simulator.lighting import Lighting, Patch
-from lib.simulator.microscope import Microscope
+from lib.simulator.rig import Microscope
 from lib.simulator.shapes import TOOLS, drawn
 
 __all__ = ["ASPECTS", "FAR", "SHIFTED", "TRAINING"]

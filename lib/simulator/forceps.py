@@ -1,10 +1,10 @@
-"""The forceps: a shaft and two curved tapered jaws, as chains of round cones, and their landmarks.
+"""Tools as chains of round cones, with their landmarks: the reference forceps, and instruments of any shape.
 
 Tool frame: the origin is the base, x runs along the shaft towards the tips, y points towards jaw 1, z = x cross y.
-The base is the point on the shaft's axis where the shaft ends and the jaws begin.  tip_1 and tip_2 are the ends of the
-jaws.  Jaw 1 is the left jaw for an observer at the microscope who looks along the shaft towards the tips.  So in an
-image that is not mirrored, tip_1 lies left of the direction from base to tips.  `Pose` limits the roll about the shaft
-to 60 degrees, so that this holds in every image.
+base: the point on the shaft's axis where the jaws leave the shaft or its neck.  tip_1, tip_2: the farthest point of each
+jaw on its own centre line; of a ring or a spoon, its far end.  Jaw 1 is the left jaw for an observer at the microscope who
+looks along the shaft towards the tips.  So tip_1 lies left of the direction from base to tips in every image that is not
+mirrored: `Pose` limits the roll about the shaft to 60 degrees.
 """
 
 from dataclasses import dataclass
@@ -14,23 +14,23 @@ from scipy.spatial.transform import Rotation
 
 from lib.simulator.limits import check, not_negative, positive
 
-__all__ = ["MAX_PITCH_RAD", "MAX_ROLL_RAD", "MAX_TIP_RADIUS_MM", "Forceps", "Pose"]
+__all__ = ["MAX_PITCH_RAD", "MAX_ROLL_RAD", "MAX_TIP_RADIUS_MM", "Finish", "Forceps", "Instrument", "Jaw", "Nodes", "Pose"]
 
 MAX_ROLL_RAD = np.deg2rad(60.0)
 MAX_PITCH_RAD = np.deg2rad(60.0)
 MAX_TIP_RADIUS_MM = 0.02
+_SHAFT_MM = 40.0
+
+#: Round cones: centres (n, 3) in the microscope frame, radii (n,) mm, and the chain (n,) that each belongs to.
+Nodes = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True)
 class Pose:
-    """Where the tool is, in the microscope frame.
+    """Where the tool is, in the microscope frame: its base (3,), its direction, and the distance between its tips.
 
-    Attributes:
-        base_mm: The base (3,).
-        azimuth_rad: Direction from base to tips in the image plane, measured from x (right) towards y (down).
-        pitch_rad: Angle by which the tips dip below the base, into the eye; 0 is parallel to the image.
-        roll_rad: Rotation about the shaft; at 0 both jaws are equally deep.
-        opening_mm: Distance between the tips.
+    `azimuth_rad` is the direction from base to tips in the image plane, from x (right) towards y (down).  By `pitch_rad`
+    the tips dip below the base, into the eye.  `roll_rad` turns the tool about its shaft; at 0 both jaws are equally deep.
     """
 
     base_mm: tuple[float, float, float] = (0.0, 0.0, -1.0)
@@ -55,19 +55,22 @@ class Pose:
         turn = Rotation.from_euler("ZY", [self.azimuth_rad, -self.pitch_rad]).as_matrix()
         return turn @ upright @ Rotation.from_euler("x", self.roll_rad).as_matrix()
 
+    def place(self, points: np.ndarray) -> np.ndarray:
+        """Points (n, 3) of the tool frame in the microscope frame."""
+        return points @ self.microscope_from_tool.T + np.asarray(self.base_mm)
+
 
 @dataclass(frozen=True)
 class Forceps:
     """The design of a forceps; lengths in mm.
 
     Attributes:
-        shaft_radius_mm: Radius of the shaft; 0.3 is the usual 23 gauge, 0.6 mm thick.
-        jaw_length_mm: Distance along the shaft's axis from the base to the tips of the closed tool.
-        jaw_radius_mm, tip_radius_mm: Radius of a jaw at the base and at its end; a power law connects the two.
-        taper: Exponent of the power law.  1 is a cone; below 1 the jaw stays thick until close to the tip.
-        bow_mm: Distance by which each jaw arches outwards in the middle when the tips touch.
-        bend_mm: Distance by which both tips bend out of the plane of the jaws, towards the retina.
-        hook_mm: Distance by which the last fifth of each jaw turns inwards.
+        shaft_radius_mm: 0.3 is the usual 23 gauge, 0.6 mm thick.
+        jaw_length_mm: From the base to the tips of the closed tool, along the shaft's axis.
+        jaw_radius_mm, tip_radius_mm, taper: Radii of a jaw at its ends, and the exponent of the power law between; 1 is a
+            cone, below 1 the jaw stays thick until close to the tip.
+        bow_mm, bend_mm, hook_mm: How far each closed jaw arches outwards in its middle, both tips bend out of the jaws'
+            plane towards the retina, and the last fifth of a jaw turns inwards.
         brightness, brushed: Reflectance of the metal, and contrast of its brush marks.
     """
 
@@ -94,10 +97,7 @@ class Forceps:
         check(self, "brightness", lambda v: 0 < v <= 1, "must lie between 0 and 1")
 
     def _jaw(self, side: int, opening_mm: float) -> tuple[np.ndarray, np.ndarray]:
-        """Centreline (n, 3) in the tool frame and radii (n,), from the base to the tip; `side` +1 is jaw 1.
-
-        The last centre lies one tip radius before the landmark, so that the landmark is the jaw's end.
-        """
+        """Centreline (n, 3) in the tool frame, which ends one tip radius before the landmark, and radii (n,); +1 is jaw 1."""
         s = 1 - (1 - np.linspace(0, 1, 15)) ** 1.4  # denser towards the tip
         half = max(opening_mm / 2, self.tip_radius_mm)
         root = 0.45 * self.jaw_radius_mm
@@ -119,16 +119,111 @@ class Forceps:
             line, radii = self._jaw(side, pose.opening_mm)
             direction = line[-1] - line[-2]
             points.append(line[-1] + radii[-1] * direction / np.linalg.norm(direction))
-        return np.array(points) @ pose.microscope_from_tool.T + np.asarray(pose.base_mm)
+        return pose.place(np.array(points))
 
-    def nodes(self, pose: Pose) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The tool as chains of round cones, in the microscope frame.
-
-        Returns: (n, 3) centres, (n,) radii in mm, (n,) chain of each node: 0 shaft (far end first), 1 and 2 the jaws.
-        """
+    def nodes(self, pose: Pose) -> Nodes:
+        """The tool as chains of round cones: 0 is the shaft (far end first), 1 and 2 the jaws."""
         k = max(2, round(self.shaft_length_mm) + 1)
         shaft = np.column_stack([np.linspace(-self.shaft_length_mm, 0, k), np.zeros(k), np.zeros(k)])
         parts = [(shaft, np.full(k, self.shaft_radius_mm)), *(self._jaw(side, pose.opening_mm) for side in (+1, -1))]
         lines, radii = zip(*parts, strict=True)
-        centres = np.vstack(lines) @ pose.microscope_from_tool.T + np.asarray(pose.base_mm)
-        return centres, np.concatenate(radii), np.repeat(np.arange(3), [len(line) for line in lines])
+        return pose.place(np.vstack(lines)), np.concatenate(radii), np.repeat(np.arange(3), [len(line) for line in lines])
+
+
+@dataclass(frozen=True)
+class Finish:
+    """How a surface looks: `colour` is its linear reflectance (3,), 0.02 is black, 0.9 a mirror.
+
+    `matt` and `mirror` are the shares of it that scatter evenly, and that reflect the field and the sky.  `shine` and
+    `sharpness` are the strength of the lamp's highlight and its exponent, `brushed` the contrast of marks along the part.
+    """
+
+    colour: tuple[float, float, float] = (0.5, 0.5, 0.49)
+    matt: float = 0.5
+    mirror: float = 0.4
+    shine: float = 0.6
+    sharpness: float = 30.0
+    brushed: float = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Jaw:
+    """A closed jaw in the tool frame; y is the distance from the plane between the jaws, whichever jaw it is.
+
+    `line` (n, 3) and `radii` (n,) mm are its round cones, from the base; `tip` is the farthest point (3,) on its centre
+    line.  With `flex` 0 it turns about the base as one piece, with 1 it bends more and more towards the tip.  `share` is
+    the part of the opening that it takes.
+    """
+
+    line: np.ndarray
+    radii: np.ndarray
+    tip: np.ndarray
+    flex: float = 0.0
+    share: float = 0.5
+
+    def opened(self, side: int, opening_mm: float) -> np.ndarray:
+        """Centres and tip (n + 1, 3) when the tips are about `opening_mm` apart; `side` is +1 for jaw 1."""
+        points = np.vstack([self.line, self.tip])
+        angle = 2 * self.share * np.arcsin(np.clip(opening_mm / 2 / np.hypot(*self.tip[:2]), 0.0, 0.71))
+        angle = angle * np.clip(points[:, 0] / max(self.tip[0], 1e-3), 0, 1) ** self.flex
+        x, y = points[:, 0], points[:, 1]
+        cosine, sine = np.cos(angle), np.sin(angle)
+        return np.column_stack([cosine * x - sine * y, side * (sine * x + cosine * y), points[:, 2]])
+
+
+@dataclass(frozen=True, eq=False)
+class Instrument:
+    """A tool of two jaws, or an object without landmarks.
+
+    Attributes:
+        jaws: Two jaws; of an object without landmarks, up to two parts that move with its shaft.
+        profile: (k, 2) distance behind the base and radius, mm, from the base outwards: steps, necks and collars.
+        finishes: Of the shaft, and of the jaws.
+        bend_per_mm: Curvature of the shaft.
+        others: Objects that stand still beside it, each with its pose.
+    """
+
+    jaws: tuple[Jaw, ...]
+    profile: tuple[tuple[float, float], ...] = ((0.0, 0.3),)
+    finishes: tuple[Finish, Finish] = (Finish(), Finish())
+    bend_per_mm: float = 0.0
+    others: tuple[tuple["Instrument", Pose], ...] = ()
+    has_landmarks: bool = True
+    seed: int = 0
+
+    @property
+    def jaw_length_mm(self) -> float:
+        """Mean distance from the base to the tips of the closed tool."""
+        return float(np.mean([np.hypot(*jaw.tip[:2]) for jaw in self.jaws] or [10 * self.shaft_radius_mm]))
+
+    @property
+    def shaft_radius_mm(self) -> float:
+        """At the base."""
+        return self.profile[0][1]
+
+    @property
+    def tip_radius_mm(self) -> float:
+        """Radius of the ball in which the blunter jaw ends."""
+        return max((float(jaw.radii[-1]) for jaw in self.jaws), default=0.0)
+
+    def landmarks(self, pose: Pose) -> np.ndarray:
+        """base, tip_1, tip_2 (3, 3) mm in the microscope frame; NaN for an object without landmarks."""
+        if not self.has_landmarks:
+            return np.full((3, 3), np.nan)
+        tips = [jaw.opened(side, pose.opening_mm)[-1] for jaw, side in zip(self.jaws, (1, -1), strict=True)]
+        return pose.place(np.array([np.zeros(3), *tips]))
+
+    def nodes(self, pose: Pose) -> Nodes:
+        """As `Forceps.nodes`; the chains of each other object have the next three numbers."""
+        parts = [(3 * k + chain, *part) for k, one in enumerate([(self, pose), *self.others])
+                 for chain, part in enumerate(one[0].parts(one[1]))]  # fmt: skip
+        chains = np.concatenate([np.full(len(radii), chain) for chain, _, radii in parts])
+        return np.vstack([line for _, line, _ in parts]), np.concatenate([radii for _, _, radii in parts]), chains
+
+    def parts(self, pose: Pose) -> list[tuple[np.ndarray, np.ndarray]]:
+        """(centres in the microscope frame, radii) of the shaft and the jaws."""
+        behind, radius = np.array(self.profile).T
+        x = np.unique(np.concatenate([np.linspace(behind[-1], _SHAFT_MM, 20), behind]))[::-1]
+        shaft = np.column_stack([-x, 0.5 * self.bend_per_mm * x * x, np.zeros(len(x))]), np.interp(x, behind, radius)
+        jaws = [(jaw.opened(side, pose.opening_mm)[:-1], jaw.radii) for jaw, side in zip(self.jaws, (1, -1), strict=False)]
+        return [(pose.place(line), r) for line, r in [shaft, *jaws]]

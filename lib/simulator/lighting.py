@@ -5,23 +5,23 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from lib.simulator.forceps import Nodes
 from lib.simulator.window import Grid, Window
 
-__all__ = ["Lighting", "Patch"]
+__all__ = ["Lighting", "Patch", "plain_shadow"]
+
+_HALF_MM = 14.0  # of the square on which shadows fall
 
 
 @dataclass(frozen=True)
 class Patch:
-    """A soft ellipse in a plane parallel to the image.
+    """A soft ellipse of a linear colour (3,) in a plane parallel to the image, microscope frame.
 
     Attributes:
-        centre_mm: (x, y, z) in the microscope frame.
         radii_mm, turn_rad: Half axes, and the direction of the first.
-        edge: Width of its border as a share of its radius.
-        wobble: Amplitude of the border's irregularity, as a share of its radius.
-        colour: Linear (3,).
         role: "glare" adds light to the scene, behind the tool; "flare" adds it in front; "cover" hides what is behind;
             "pupil" hides everything that is not in it.
+        edge, wobble: Width of its border, and amplitude of the border's irregularity, as shares of its radius.
     """
 
     centre_mm: tuple[float, float, float]
@@ -52,16 +52,13 @@ class Lighting:
     """How a scene is lit, and what lies between it and the camera.
 
     Attributes:
-        ambient: Share of the light that reaches the scene outside the spot.
+        ambient, tool: Shares of the light that reach the scene outside the spot, and the tool.
         spot_edge: None = the spot is a Gaussian of `Microscope.spot_radius_mm`; else a disc of that radius whose border has
             this width as a share of the radius.
         band_rad: The spot is a band in this direction rather than a disc.
-        tool: Light on the tool, as a share of that on the scene.
         shadow, shadow_sigma_mm: Depth (0 to 1) and softness of the tool's shadow.
         source_mm: A lamp near the scene casts the shadow; None = light from far, as `Microscope.light_slope` says.
-        patches: What lies on the scene or before it.
-        scatter: Share of the light that arrives blurred over `scatter_mm`.
-        haze: Light (3,) added everywhere.
+        scatter, haze: Share of the light that arrives blurred over `scatter_mm`, and light (3,) added everywhere.
         tint_per_mm: (3, 2) relative change of each colour along x and y: lamps of two colours.
     """
 
@@ -86,10 +83,10 @@ class Lighting:
         lit = np.exp(-(distance**2) / 2) if self.spot_edge is None else _inside(distance, self.spot_edge)
         return self.ambient + (1 - self.ambient) * lit
 
-    def shaded(self, at: tuple[np.ndarray, ...], nodes: tuple[np.ndarray, ...], slope: tuple[float, float]) -> np.ndarray:
-        """Share of the light that a tool of `nodes` (centres, radii, chains) leaves on surface points at = (x, y, z)."""
+    def shaded(self, at: tuple[np.ndarray, ...], nodes: Nodes, slope: tuple[float, float]) -> np.ndarray:
+        """Share of the light that a tool leaves on surface points at = (x, y, z)."""
         (x, y, z), (centres, radii, chains) = at, nodes
-        scale, half = (40.0 if self.shadow_sigma_mm < 0.1 else 20.0), 14.0
+        scale = 40.0 if self.shadow_sigma_mm < 0.1 else 20.0
         if self.source_mm is None:
             flat, grow = centres[:, :2] + np.multiply(slope, centres[:, 2:]), np.ones(len(radii))
             columns, rows = x + slope[0] * z, y + slope[1] * z
@@ -97,15 +94,12 @@ class Lighting:
             lamp, ground = np.array(self.source_mm), float(np.mean(z))
             grow = (ground - lamp[2]) / np.maximum(centres[:, 2] - lamp[2], 0.3)
             flat, columns, rows = lamp[:2] + (centres[:, :2] - lamp[:2]) * grow[:, None], x, y
-        mask = np.zeros((int(2 * half * scale),) * 2, np.uint8)
-        for k in np.flatnonzero(chains[1:] == chains[:-1]):
-            ends = np.clip(np.round((flat[k : k + 2] + half) * scale * 16), -(2**20), 2**20).astype(int)
-            thickness = int(np.clip((radii[k] * grow[k] + radii[k + 1] * grow[k + 1]) * scale, 1, 200))
-            cv2.line(mask, tuple(map(int, ends[0])), tuple(map(int, ends[1])), 255, thickness, cv2.LINE_AA, 4)
+        wide = radii * grow
+        mask = _silhouette(flat, np.clip((wide[:-1] + wide[1:]) * scale, 1, 200), chains, scale)
         small = cv2.resize(mask, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) if self.shadow_sigma_mm > 0.3 else mask
         scale *= small.shape[0] / mask.shape[0]
         near = cv2.GaussianBlur(small, (0, 0), max(self.shadow_sigma_mm * scale, 0.4))
-        place = (((axis + half) * scale - 0.5).astype(np.float32) for axis in (columns, rows))
+        place = (((axis + _HALF_MM) * scale - 0.5).astype(np.float32) for axis in (columns, rows))
         return 1 - self.shadow / 255 * cv2.remap(near, *place, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
 
     def behind(self, linear: np.ndarray, window: Window) -> None:
@@ -144,6 +138,25 @@ class Lighting:
                 visibility[k] = 1 if hides[row, column] else 2
         linear += np.float32(self.haze)
         return visibility
+
+
+def plain_shadow(at: tuple[np.ndarray, ...], nodes: Nodes, slope: tuple[float, float]) -> np.ndarray:
+    """As `Lighting.shaded`, under the reference microscope's light; fine enough for a coarse grid of points."""
+    (x, y, z), (centres, radii, chains), scale = at, nodes, 20.0
+    flat = centres[:, :2] + np.multiply(slope, centres[:, 2:])
+    mask = _silhouette(flat, np.maximum(1, np.round((radii[:-1] + radii[1:]) * scale)), chains, scale)
+    near = cv2.GaussianBlur(mask, (0, 0), 2.2).astype(np.float32) / 255
+    place = (((axis + s * z + _HALF_MM) * scale).astype(np.float32) for axis, s in ((x, slope[0]), (y, slope[1])))
+    return 1 - 0.62 * cv2.remap(near, *place, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+
+
+def _silhouette(flat: np.ndarray, width_px: np.ndarray, chains: np.ndarray, scale: float) -> np.ndarray:
+    """Image uint8 of a tool's shadow from its nodes' shadows (n, 2) mm, `scale` px per mm; `width_px` is of each join."""
+    mask = np.zeros((int(2 * _HALF_MM * scale),) * 2, np.uint8)
+    ends = np.clip(np.round((flat + _HALF_MM) * scale * 16), -(2**20), 2**20).astype(int).tolist()
+    for k in np.flatnonzero(chains[1:] == chains[:-1]):
+        cv2.line(mask, ends[k], ends[k + 1], 255, int(width_px[k]), cv2.LINE_AA, 4)
+    return mask
 
 
 def _inside(radius: np.ndarray, edge: float) -> np.ndarray:

@@ -14,16 +14,14 @@ import numpy as np
 
 from lib.cameras import AffineCamera
 from lib.geometry import RigidTransform
-from lib.simulator.eye import Eye
+from lib.simulator.eye import Eye, Ground
 from lib.simulator.families import ASPECTS, FAR, SHIFTED, TRAINING
-from lib.simulator.forceps import Forceps, Pose
-from lib.simulator.ground import Ground
-from lib.simulator.instruments import Instrument
-from lib.simulator.microscope import IMAGE_SIZE_PX, Microscope
+from lib.simulator.forceps import Forceps, Instrument, Pose
 from lib.simulator.render import render_view
+from lib.simulator.rig import IMAGE_SIZE_PX, Microscope
 from lib.simulator.shapes import beside, random_object
 from lib.simulator.video import Video
-from lib.simulator.window import Window
+from lib.simulator.window import Window, in_image
 
 __all__ = ["POPULATIONS", "RESERVED_JAW_MM", "RESERVED_SEEDS", "TEST_TEXTURE_SEEDS", "TEXTURE_SEEDS"]
 __all__ += ["VALIDATION_TEXTURE_SEEDS", "Setup", "random_eye", "random_forceps", "random_microscope", "random_pose"]
@@ -302,5 +300,4 @@ def _distorted(
     for _ in range(30):
         after = before / grow((after**2).sum(axis=1, keepdims=True))
     u = after + centre
-    inside = ((u > -0.5) & (u < size - 0.5)).all(axis=1)
-    return image, u, np.where(inside, visibility, 0)
+    return image, u, np.where(in_image(u, size), visibility, 0)

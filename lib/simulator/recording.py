@@ -12,10 +12,10 @@ from lib.recordings import Recording, RecordingWriter, Truth
 from lib.simulator.eye import Eye, Scene
 from lib.simulator.forceps import Forceps
 from lib.simulator.limits import check, not_negative
-from lib.simulator.microscope import ROBOT_FROM_MICROSCOPE, Microscope
 from lib.simulator.motion import DURATIONS_S, Motion
 from lib.simulator.population import RESERVED_SEEDS, reserved_forceps
 from lib.simulator.render import View, render_pair
+from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, Microscope
 from lib.simulator.window import surface_grid
 
 __all__ = ["Design", "simulate"]

@@ -10,14 +10,14 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from lib.cameras import StereoRig
 from lib.geometry import RigidTransform
 from lib.simulator.eye import Scene
 from lib.simulator.forceps import Forceps, Pose
-from lib.simulator.microscope import Microscope
+from lib.simulator.lighting import plain_shadow
+from lib.simulator.rig import Microscope
 from lib.simulator.texture import GAMMA, smooth_noise
-from lib.simulator.tool import compose, shadow, tool_in_view
-from lib.simulator.window import Grid, Window, blur_by_depth, intersect
+from lib.simulator.tool import compose, tool_in_view
+from lib.simulator.window import Grid, Window, blur_by_depth, in_image, intersect
 
 __all__ = ["View", "render_pair", "render_view"]
 
@@ -27,15 +27,13 @@ _BUMP_MM, _BUMP_PX = 10.0, 1024
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One camera's image and its truth.
+    """One camera's image (h, w, 3) uint8 RGB and its truth.
 
     Attributes:
-        image: (h, w, 3) uint8 RGB.
         u: Landmarks base, tip_1, tip_2 (3, 2) px as imaged, rolling shutter included; NaN without a tool.
-        visibility: (3,) COCO: 0 outside the image, 1 hidden by the tool, 2 visible.
-        surface_mm: (h, w) float32, the scene's z in the microscope frame, or None if not asked for.
-        tool_mask, glint_mask: (h, w) uint8: share of the pixel that the sharp tool covers (255 is all), and 255 where a
-            glint saturates it.
+        visibility: (3,) COCO: 0 outside the image, 1 hidden, 2 visible.
+        surface_mm: (h, w), the scene's z in the microscope frame, or None if not asked for.
+        tool_mask, glint_mask: (h, w) uint8: how much of the pixel the sharp tool covers, and whether a glint saturates it.
     """
 
     image: np.ndarray
@@ -61,10 +59,8 @@ def render_view(
     """What a camera sees in a window of its image.
 
     Args:
-        scene, microscope, window: All in the microscope frame.
         side: 0 left, 1 right: which colour gains apply.
-        forceps, pose: The tool at the time of the image, or None.
-        later: (pose, seconds later): the tool's motion, for rolling shutter and motion blur.
+        forceps, pose, later: The tool at the time of the image, or None, and (pose, seconds later) for its motion.
         rng: Draws the sensor noise; None renders without noise.
         factor: Samples per pixel and axis of the tool's edges.
         surface: Whether to return the depth of every pixel too.
@@ -93,7 +89,7 @@ def render_view(
     if lighting is None:
         light = light * (0.25 + 0.75 * spot)
         if has_tool:
-            light = light * shadow(x, y, z, forceps, pose, microscope.light_slope)
+            light = light * plain_shadow((x, y, z), forceps.nodes(pose), microscope.light_slope)
         light_full = grid.full(light)
     else:  # lit discs and shadows with hard borders need every pixel
         at = tuple(grid.full(axis) for axis in (x, y, z))
@@ -164,23 +160,17 @@ def render_view(
 
 
 def render_pair(
-    scene: Scene, microscope: Microscope, *, rig: StereoRig | None = None,
-    forceps: Forceps | None = None, pose: Pose | None = None, factor: int = 3, **options: object,
+    scene: Scene, microscope: Microscope, *, forceps: Forceps | None = None, pose: Pose | None = None, factor: int = 3,
+    **options: object,
 ) -> tuple[View, View]:  # fmt: skip
-    """The left and right view of one moment.
-
-    Args:
-        rig: Cameras in the microscope frame; None takes those of the microscope.
-        forceps, pose, factor, options: As for `render_view`.
+    """The left and right view of one moment; arguments as for `render_view`.
 
     Raises:
         ValueError: If the tool is entirely outside the field of both cameras.
     """
-    rig = rig or microscope.rig(RigidTransform.identity())
-    size = microscope.image_size_px
+    rig, size = microscope.rig(RigidTransform.identity()), microscope.image_size_px
     if forceps is not None and pose is not None:
-        landmarks = forceps.landmarks(pose)
-        if not any(((u > -0.5) & (u < np.array(size) - 0.5)).all(axis=1).any() for u in rig.project(landmarks)):
+        if not any(in_image(u, size).any() for u in rig.project(forceps.landmarks(pose))):
             base = f"its base is at {np.round(pose.base_mm, 2).tolist()} mm"
             raise ValueError(f"pose: the tool is outside the field; {base}, move it towards the microscope frame's origin.")
     options |= {"forceps": forceps, "pose": pose, "factor": factor}

@@ -1,4 +1,4 @@
-"""The reference rig: two cameras of a stereo microscope over a robot, and correspondences as it sees them.
+"""The stereo microscope over the robot: its cameras, focus, light, shutter and sensor; and correspondences as it sees them.
 
 Microscope frame: origin at the centre of the field on the focal plane, x right and y down in the unrotated
 image, z away from the cameras (into the eye), millimetres.
@@ -9,20 +9,97 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lib.cameras import StereoRig
+from lib.cameras import AffineCamera, NearAffineCamera, StereoRig
 from lib.correspondences import Correspondences
 from lib.geometry import RigidTransform
-from lib.simulator.microscope import IMAGE_SIZE_PX, ROBOT_FROM_MICROSCOPE, Microscope
+from lib.simulator.lighting import Lighting
+from lib.simulator.limits import check, not_negative, positive
+from lib.simulator.video import Video
 
-__all__ = ["IMAGE_SIZE_PX", "ROBOT_FROM_MICROSCOPE", "SimulatedSweep", "reference_rig", "simulate_correspondences"]
+__all__ = ["IMAGE_SIZE_PX", "ROBOT_FROM_MICROSCOPE", "Microscope", "SimulatedSweep", "reference_rig"]
+__all__ += ["simulate_correspondences"]
+
+IMAGE_SIZE_PX = (1920, 1080)
+
+#: Where the reference microscope stands over the reference robot: any general pose would do.
+ROBOT_FROM_MICROSCOPE = RigidTransform.from_rotation_vector((0.15, 2.90, -0.25), (12.0, -7.0, 35.0))
+
+
+@dataclass(frozen=True)
+class Microscope:
+    """Geometry, optics and sensor.  Two values in a tuple are (left, right); three are (red, green, blue).
+
+    Attributes:
+        convergence_rad: Angle between the two viewing directions.
+        depth_of_field_mm: Total range of depth around `focus_z_mm` within which defocus is at most one pixel (standard
+            deviation at 100 px per mm); infinity switches defocus off.
+        psf_px: Standard deviation of the point spread in focus.
+        exposure_s, readout_s: Exposure of a row, and the time from the first to the last row of a rolling shutter.
+        light_slope: Obliqueness of the light (x, y): a shadow moves by this many mm on the retina per mm of height.
+        spot_mm, spot_radius_mm: Where the coaxial light is brightest, and its Gaussian radius.
+        brightness, vignetting, gain: Exposure (1 is good), relative loss at the corners, colour gains of each camera.
+        full_well, read_noise: Electrons at full scale (infinity switches noise off), and of the read noise.
+        jpeg_quality: Quality of stored images, 0 to 100; None stores them without loss.
+        inverse_distance_per_mm: One over the working distance; 0 is affine.
+        lighting, video: Light, and camera electronics, beyond what is above; None = the reference microscope's.
+    """
+
+    pixels_per_mm: tuple[float, float] = (100.0, 98.0)
+    image_rotation_rad: tuple[float, float] = (0.020, -0.015)
+    convergence_rad: float = float(np.deg2rad(6.5))
+    image_size_px: tuple[int, int] = IMAGE_SIZE_PX
+    depth_of_field_mm: float = 3.0
+    focus_z_mm: float = 0.0
+    psf_px: float = 0.75
+    exposure_s: float = 0.008
+    readout_s: float = 0.015
+    light_slope: tuple[float, float] = (0.35, -0.25)
+    spot_mm: tuple[float, float] = (0.8, -0.5)
+    spot_radius_mm: float = 8.5
+    brightness: float = 1.0
+    vignetting: float = 0.35
+    gain: tuple[tuple[float, float, float], tuple[float, float, float]] = ((1.0, 1.0, 1.0), (0.94, 1.0, 1.04))
+    full_well: float = 9000.0
+    read_noise: float = 9.0
+    jpeg_quality: int | None = 92
+    inverse_distance_per_mm: float = 0.0
+    fps: float = 25.0
+    lighting: Lighting | None = None
+    video: Video | None = None
+
+    def __post_init__(self) -> None:
+        if min(self.image_size_px) < 16:
+            raise ValueError(f"image_size_px: must be at least 16 x 16, got {self.image_size_px}.")
+        check(self, "depth_of_field_mm", lambda v: v > 0, "must be positive (infinity switches defocus off)")
+        not_negative(self, "psf_px exposure_s readout_s vignetting read_noise brightness")
+        check(self, "full_well", lambda v: v > 0, "must be positive (infinity switches noise off)")
+        positive(self, "spot_radius_mm fps")
+        check(self, "jpeg_quality", lambda v: v is None or 0 <= v <= 100, "must lie between 0 and 100 or be None")
+        check(self, "inverse_distance_per_mm", lambda v: -0.05 < v < 0.05, "the working distance must exceed 20 mm")
+        check(self, "pixels_per_mm", lambda v: min(v) > 0, "must be positive")
+        check(self, "convergence_rad", lambda v: 0 < v < np.pi / 2, "must lie between 0 and pi/2")
+
+    def rig(self, robot_from_microscope: RigidTransform = ROBOT_FROM_MICROSCOPE) -> StereoRig:
+        """The true cameras, affine or near-affine; `RigidTransform.identity()` gives them in the microscope frame."""
+        cameras, centre_px = [], (np.array(self.image_size_px) - 1) / 2
+        for side, zoom, roll in zip((+1, -1), self.pixels_per_mm, self.image_rotation_rad, strict=True):
+            # The left camera stands at negative x and looks towards positive x.
+            tilt = RigidTransform.from_rotation_vector((0.0, -side * self.convergence_rad / 2, 0.0))
+            spin = RigidTransform.from_rotation_vector((0.0, 0.0, roll))
+            camera_from_robot = spin.compose(tilt).compose(robot_from_microscope.inverse())
+            matrix = zoom * np.column_stack([camera_from_robot.R[:2], camera_from_robot.t[:2]])
+            matrix[:, 3] += centre_px
+            near = self.inverse_distance_per_mm, centre_px, robot_from_microscope.t
+            cameras.append(NearAffineCamera(matrix, *near) if near[0] else AffineCamera(matrix))
+        return StereoRig(*cameras)
+
+    def defocus_px(self, z_mm: np.ndarray) -> np.ndarray:
+        """Standard deviation of the defocus at depth z, at 100 px per mm: 1 px at the ends of the depth of field."""
+        return np.abs(np.asarray(z_mm) - self.focus_z_mm) / (self.depth_of_field_mm / 2)
 
 
 def reference_rig(*, robot_from_microscope: RigidTransform = ROBOT_FROM_MICROSCOPE, **geometry: object) -> StereoRig:
-    """The rig that the simulator models by default: 10 um a pixel, 6.5 degrees between the axes.
-
-    Args:
-        robot_from_microscope: Where the microscope stands; the identity gives the rig in the microscope frame.
-        geometry: Attributes of `Microscope` such as pixels_per_mm, image_size_px, inverse_distance_per_mm.
+    """The rig that the simulator models by default, 10 um a pixel; `geometry` are attributes of `Microscope` that differ.
 
     >>> bool(reference_rig().is_affine), bool(reference_rig(inverse_distance_per_mm=1 / 150).is_affine)
     (True, False)
@@ -39,8 +116,7 @@ class SimulatedSweep(Correspondences):
 
     def subset(self, rows: slice | ArrayLike) -> Correspondences:
         """The rows that a slice, a mask or an array of indices names, without the truth."""
-        plain = {f.name: getattr(self, f.name) for f in fields(Correspondences)}
-        return Correspondences(**plain).subset(rows)
+        return Correspondences(**{f.name: getattr(self, f.name) for f in fields(Correspondences)}).subset(rows)
 
 
 def simulate_correspondences(
@@ -48,11 +124,9 @@ def simulate_correspondences(
     half_size_mm: tuple[float, float, float] = (8.0, 4.5, 1.5), sigma_u_px: float = 1.5, sigma_x_mm: float = 0.010,
     robot_from_microscope: RigidTransform = ROBOT_FROM_MICROSCOPE,
 ) -> SimulatedSweep:  # fmt: skip
-    """`n` positions spread over the field and the depth of field, as the rig sees them and the robot reports them.
+    """`n` positions in a box around the microscope frame's origin, as the rig sees them and the robot reports them.
 
-    Args:
-        half_size_mm: Half extents (3,) of the box of positions in the microscope frame; the default fills the image.
-        sigma_u_px, sigma_x_mm: Standard deviation per coordinate of detections and reports.  The rows do not state it.
+    `sigma_u_px` and `sigma_x_mm` are the standard deviations per coordinate; the rows do not state them.
 
     >>> sweep = simulate_correspondences(500, rng=np.random.default_rng(0), sigma_u_px=2.0)
     >>> len(sweep.complete), float(np.std(sweep.true_rig.left.project(sweep.true_x_mm) - sweep.u_left).round(1))

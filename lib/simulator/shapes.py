@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from lib.simulator.forceps import Pose
-from lib.simulator.instruments import Finish, Instrument, Jaw
+from lib.simulator.forceps import Finish, Instrument, Jaw, Pose
 
 __all__ = ["TOOLS", "beside", "drawn", "random_object"]
 

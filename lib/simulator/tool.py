@@ -1,4 +1,4 @@
-"""The tool in an image: its depth and normals, what hides its landmarks, its metal and its shadow.
+"""The tool in an image: its depth and normals, what hides its landmarks, and its metal.
 
 The tool is rasterised exactly, as round cones in orthographic view.  A round cone is the convex hull of two balls.  Along
 a ray its front is the minimum over s of f(s) = z(s) - sqrt(Q(s)) with Q(s) = r(s)^2 - |w - s c|^2.  Q is quadratic and f
@@ -10,12 +10,11 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from lib.simulator.forceps import MAX_TIP_RADIUS_MM, Forceps, Pose
-from lib.simulator.instruments import Instrument, finished
-from lib.simulator.microscope import Microscope
-from lib.simulator.window import Window, blur, blur_by_depth, motion_kernel
+from lib.simulator.forceps import MAX_TIP_RADIUS_MM, Forceps, Instrument, Nodes, Pose
+from lib.simulator.rig import Microscope
+from lib.simulator.window import Window, blur, blur_by_depth, in_image, motion_kernel
 
-__all__ = ["ToolInView", "ToolRaster", "compose", "rasterise", "shadow", "tool_in_view"]
+__all__ = ["ToolInView", "ToolRaster", "compose", "rasterise", "tool_in_view"]
 
 
 @dataclass(frozen=True)
@@ -25,11 +24,10 @@ class ToolRaster:
     Attributes:
         origin_px: (x, y), the image pixel whose first sample is the raster's first.
         factor: Samples per pixel and axis; sample k of pixel i is at i + (k + 0.5) / factor - 0.5.
-        depth_mm: (h, w) float32 along the viewing direction, infinity where there is no tool.
-        part: (h, w) uint8: 0 none, 1 shaft, 2 jaw 1, 3 jaw 2.
+        depth_mm, part: (h, w) depth along the view, infinity without tool, and 0 none, 1 shaft, 2 jaw 1, 3 jaw 2.
         hit: (rows, columns), (n,) each, of the samples with tool; the following are theirs.
-        normal, tangent: (n, 3) float32 in the camera frame (z away from the camera); the tangent runs along the part.
-        along_mm: (n,) float32, position along the part, for brush marks.
+        normal, tangent: (n, 3) in the camera frame (z away from the camera); the tangent runs along the part.
+        along_mm: (n,) position along the part, for brush marks.
     """
 
     origin_px: tuple[int, int]
@@ -45,14 +43,9 @@ class ToolRaster:
 def rasterise(
     centres: np.ndarray, radii: np.ndarray, chains: np.ndarray, *, zoom: float, size_px: tuple[int, int], factor: int = 2
 ) -> ToolRaster | None:
-    """Rasterise chains of round cones; None where nothing is in view.
+    """Rasterise round cones, given as `Nodes` in the camera frame, for an image (w, h) whose pixel is `zoom` * (x, y) mm.
 
-    Args:
-        centres: (n, 3) camera frame: x, y so that pixel = zoom * (x, y), and depth.
-        radii, chains: (n,) mm, and the chain each node belongs to; consecutive nodes of a chain are joined.  Chain 0
-            ends flat.
-        zoom: px per mm.
-        size_px: (w, h) of the image.
+    Consecutive nodes of a chain are joined; chain 0 ends flat.  None where nothing is in view.
     """
     pixel, reach = centres[:, :2] * zoom, radii * zoom + 1.5
     joined = np.flatnonzero(chains[1:] == chains[:-1])
@@ -115,20 +108,14 @@ def rasterise(
 class ToolInView:
     """The tool in the camera frame of a window (pixel = zoom * (x, y)), each point when its own row is exposed.
 
-    Attributes:
-        window, forceps: Which camera sees which tool.
-        landmarks: (3, 3) mm.
-        centres, radii, chains: The round cones as `Forceps.nodes` gives them.
-        velocity: Mean velocity (2,) of the tips in the image plane, mm/s.
-        raster: What the camera sees of the tool, or None where nothing is in view.
+    `landmarks` are (3, 3) mm, `velocity` is the mean one (2,) of the tips in the image plane, mm/s.  `raster` is None where
+    nothing is in view.
     """
 
     window: Window
     forceps: Forceps | Instrument
     landmarks: np.ndarray
-    centres: np.ndarray
-    radii: np.ndarray
-    chains: np.ndarray
+    nodes: Nodes
     velocity: np.ndarray
     raster: ToolRaster | None
 
@@ -141,7 +128,7 @@ class ToolInView:
     def visibility(self) -> np.ndarray:
         """COCO visibility (3,) of the landmarks: 0 outside the window, 1 hidden by another part of the tool, 2 visible."""
         u = self.u
-        inside = ((u > -0.5) & (u < np.array(self.window.size_px) - 0.5)).all(axis=1)
+        inside = in_image(u, self.window.size_px)
         found = np.where(inside, 2, 0)
         for k in np.flatnonzero(inside) if self.raster else ():
             # A blunt jaw's tip lies inside its outline as soon as the jaw is not parallel to the image.
@@ -162,10 +149,11 @@ class ToolInView:
     def _behind_its_jaw(self, k: int) -> bool:
         """Whether a blunt jaw that points steeply away hides its own tip: the tip then lies inside the jaw's outline."""
         factor, reach_px, side = 16, 0.25, 5
-        u, jaw, zoom = self.u[k], self.chains == k, self.window.zoom
+        u, zoom = self.u[k], self.window.zoom
         corner = np.round(u) - 2
-        shifted = self.centres[jaw] - np.append(corner / zoom, 0)
-        raster = rasterise(shifted, self.radii[jaw], self.chains[jaw], zoom=zoom, size_px=(side, side), factor=factor)
+        centres, radii, chains = (part[self.nodes[2] == k] for part in self.nodes)
+        centres = centres - np.append(corner / zoom, 0)
+        raster = rasterise(centres, radii, chains, zoom=zoom, size_px=(side, side), factor=factor)
         covered = np.zeros((side * factor, side * factor), bool)
         if raster is not None:
             covered[tuple(raster.hit + factor * np.array(raster.origin_px[::-1])[:, None])] = True
@@ -180,10 +168,7 @@ def tool_in_view(
 ) -> ToolInView:  # fmt: skip
     """The tool as the window's camera sees it; `pose` holds when the middle row of the whole image is exposed.
 
-    Args:
-        later: (pose, seconds later): the tool's motion during the read-out, or None for a tool at rest.
-        readout_s: Time from the first to the last row of the whole image.
-        factor: Samples per pixel and axis of the tool's edges.
+    `later` (pose, seconds later) is its motion while the rows are read out, in `readout_s` for the whole image.
     """
     centres, radii, chains = forceps.nodes(pose)
     points = np.vstack([forceps.landmarks(pose), centres])
@@ -199,35 +184,15 @@ def tool_in_view(
     centres, radii = seen[3:], radii * shrink[3:]
     raster = rasterise(centres, radii, chains, zoom=window.zoom, size_px=window.size_px, factor=factor)
     velocity = speed[1:3].mean(axis=0) @ window.R[:2].T
-    return ToolInView(window, forceps, seen[:3], centres, radii, chains, velocity, raster)
-
-
-def shadow(
-    x: np.ndarray, y: np.ndarray, z: np.ndarray, forceps: Forceps | Instrument, pose: Pose, slope: tuple[float, float]
-) -> np.ndarray:
-    """Share of the light that the tool leaves on surface points (x, y, z) mm, in the shape of x; `slope` is the light's."""
-    centres, radii, chains = forceps.nodes(pose)
-    scale, half = 20.0, 14.0
-    flat = (centres[:, :2] + np.multiply(slope, centres[:, 2:]) + half) * scale
-    mask = np.zeros((int(2 * half * scale),) * 2, np.uint8)
-    for k in np.flatnonzero(chains[1:] == chains[:-1]):
-        thickness = max(1, round((radii[k] + radii[k + 1]) * scale))
-        ends = np.clip(np.round(flat[k : k + 2] * 16), -(2**20), 2**20).astype(int)
-        cv2.line(mask, tuple(map(int, ends[0])), tuple(map(int, ends[1])), 255, thickness, cv2.LINE_AA, 4)
-    near = cv2.GaussianBlur(mask, (0, 0), 2.2).astype(np.float32) / 255
-    columns = ((x + slope[0] * z + half) * scale).astype(np.float32)
-    rows = ((y + slope[1] * z + half) * scale).astype(np.float32)
-    return 1 - 0.62 * cv2.remap(near, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+    return ToolInView(window, forceps, seen[:3], (centres, radii, chains), velocity, raster)
 
 
 def compose(
-    linear: np.ndarray, tool_mask: np.ndarray, tool: ToolInView, microscope: Microscope, light: tuple,
-    scene_z_mm: float,
-) -> None:  # fmt: skip
+    linear: np.ndarray, tool_mask: np.ndarray, tool: ToolInView, microscope: Microscope, light: tuple, scene_z_mm: float
+) -> None:
     """Lay the tool, blurred by its depth and motion, over the scene: `linear` (h, w, 3) and `tool_mask` change in place.
 
-    `light` is the direction of the lamp (x, y) in the microscope frame, per unit of height; the scene's mean depth is
-    `scene_z_mm`.
+    `light` is the lamp's direction (x, y) per unit of height, in the microscope frame, `scene_z_mm` the scene's mean depth.
     """
     window, raster = tool.window, tool.raster
     lamp = np.array([*light, -1.0]) @ window.R.T
@@ -235,7 +200,7 @@ def compose(
     power = 1.15 * microscope.brightness * (microscope.lighting.tool if microscope.lighting else 1.0)
     if isinstance(tool.forceps, Instrument):
         clearance = max(scene_z_mm - float(raster.depth_mm[raster.hit].mean()), 0.3)
-        metal = finished(raster, tool.forceps, lamp, linear / max(power, 0.02), window.zoom, clearance) * np.float32(power)
+        metal = _finished(raster, tool.forceps, lamp, linear / max(power, 0.02), window.zoom, clearance) * np.float32(power)
     else:
         glow = linear[::16, ::16].reshape(-1, 3).mean(axis=0)
         metal = _metal(raster, tool.forceps, lamp, glow) * np.float32(power)
@@ -266,6 +231,13 @@ def compose(
     target += layer[..., :3]
 
 
+def _brush_marks(seed: int, n: int, sigma: float) -> np.ndarray:
+    """Marks (n, 128) of unit variance along a part: rows run around it."""
+    marks = np.random.default_rng([seed, 3]).standard_normal((n, 128)).astype(np.float32)
+    marks = cv2.GaussianBlur(marks, (0, 0), sigmaX=sigma, sigmaY=0.8)
+    return marks / marks.std()
+
+
 def _metal(raster: ToolRaster, forceps: Forceps | Instrument, lamp: np.ndarray, glow: np.ndarray) -> np.ndarray:
     """Linear colour (n, 3) of the raster's tool samples under the lamp (3,), with the retina's glow (3,) from below."""
     normal, tangent = raster.normal, raster.tangent
@@ -275,12 +247,9 @@ def _metal(raster: ToolRaster, forceps: Forceps | Instrument, lamp: np.ndarray, 
     half = (half / np.linalg.norm(half)).astype(np.float32)
     along = tangent @ half
     streak = np.sqrt(np.maximum(1 - along * along, 0)) ** 60 * np.clip(normal @ half, 0, 1) ** 6
-    marks = np.random.default_rng([forceps.seed, 3]).standard_normal((256, 128)).astype(np.float32)
-    marks = cv2.GaussianBlur(marks, (0, 0), sigmaX=5, sigmaY=0.8)
-    marks /= marks.std()
     around = np.arctan2(normal[:, 0] * tangent[:, 1] - normal[:, 1] * tangent[:, 0], facing)
     rows = ((around / np.pi + 1) * 128).astype(int) % 256
-    brush = 1 + forceps.brushed * marks[rows, (raster.along_mm * 6).astype(int) % 128]
+    brush = 1 + forceps.brushed * _brush_marks(forceps.seed, 256, 5)[rows, (raster.along_mm * 6).astype(int) % 128]
     lit = 1 / (1 + np.exp(-(up - 0.55) / 0.14))
     body = forceps.brightness * (0.10 + 0.50 * lit + 0.22 * np.clip(up + 0.2, 0, 1))
     grey = (body + 1.1 * forceps.brightness * streak) * np.clip(brush, 0.2, 2)
@@ -300,3 +269,36 @@ def _at_image_resolution(raster: ToolRaster, metal: np.ndarray) -> tuple[np.ndar
     samples, count = raster.factor**2, total()
     colour = np.dstack([total(channel) for channel in metal.T]) / samples
     return colour, count / samples, total(raster.depth_mm[rows, columns]) / np.maximum(count, 1)
+
+
+def _finished(
+    raster: ToolRaster, tool: Instrument, lamp: np.ndarray, scene: np.ndarray, zoom: float, clearance_mm: float
+) -> np.ndarray:
+    """As `_metal`, for any finish, with `scene` (h, w, 3), `clearance_mm` below the tool, mirrored in it."""
+    normal, tangent = raster.normal, raster.tangent
+    chain = raster.part[raster.hit].astype(int) - 1
+    finishes = [f for one in (tool, *(other for other, _ in tool.others)) for f in (one.finishes[0], *[one.finishes[1]] * 2)]
+    matt, mirror, shine, sharpness, brushed, colour = (
+        np.array([getattr(finish, name) for finish in finishes], np.float32)[chain]
+        for name in ("matt", "mirror", "shine", "sharpness", "brushed", "colour")
+    )
+    lamp = lamp.astype(np.float32)
+    half = (lamp - [0, 0, 1]).astype(np.float32)
+    half /= np.linalg.norm(half)
+    to_half, along = np.clip(normal @ half, 0, 1), tangent @ half
+    streak = np.maximum(1 - along * along, 0) ** sharpness * to_half**4
+    # The view ray (0, 0, 1), mirrored: where it goes down it meets the scene, where it goes up the room and the lamp.
+    up = 2 * normal[:, 2] ** 2 - 1
+    shift = -2 * normal[:, 2:] * normal[:, :2] * (zoom * clearance_mm / np.maximum(-up, 0.15))[:, None]
+    sky = 0.08 + 0.75 / (1 + np.exp(-(up - 0.6) / 0.12))
+    small = cv2.GaussianBlur(cv2.resize(scene, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA), (0, 0), 1.5)
+    at = [(sample + 0.5) / raster.factor + first for sample, first in zip(raster.hit[::-1], raster.origin_px, strict=True)]
+    column, row = (np.clip((at[i] + shift[:, i]) / 4, 0, small.shape[1 - i] - 1).astype(int) for i in (0, 1))
+    below, down = small[row, column], np.clip(0.5 - 2.5 * up, 0, 1)[:, None]
+    around = (normal[:, 0] * tangent[:, 1] - normal[:, 1] * tangent[:, 0]) * 31 + 32
+    marks = _brush_marks(tool.seed, 64, 4)[around.astype(int) % 64, (raster.along_mm * 6).astype(int) % 128]
+    brush = np.clip(1 + brushed * marks, 0.2, 2)
+    even = (matt * brush)[:, None] * ((0.12 + 0.9 * np.clip(normal @ lamp, 0, 1))[:, None]
+                                      + 0.3 * np.clip(0.4 - up, 0, 1.4)[:, None] * below)  # fmt: skip
+    mirrored = (mirror * brush)[:, None] * (down * below + (1 - down) * sky[:, None])
+    return colour * (even + mirrored) + (shine * (0.4 * to_half**sharpness + 0.8 * streak))[:, None]

@@ -6,7 +6,7 @@ from typing import Self
 import cv2
 import numpy as np
 
-__all__ = ["Video"]
+__all__ = ["Video", "compressed"]
 
 _IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
@@ -16,20 +16,16 @@ class Video:
     """Applied to the finished image in this order; the defaults do nothing.  Lengths are px of the image.
 
     Attributes:
-        defocus_px: Radius of the disc into which each point is blurred.
-        astigmatism: Stretch of that disc along the rows, 1 is round.
+        defocus_px, astigmatism: Radius of the disc into which each point is blurred, and its stretch along the rows.
         fringe_px: Distance by which red and blue part from green, to opposite sides.
         colours: (3, 3) output from input colours: casts, permutations, grey.
         contrast, black, gamma: Tone curve: black + (1 - black) * contrast * value ** gamma, clipped.
         sharpening, sharpening_px: Strength and width of unsharp masking.
-        noise, noise_px, noise_grey: Standard deviation (share of full scale), correlation length, and the part of it that
-            is the same in all colours.
+        noise, noise_px, noise_grey: Standard deviation (share of full scale), correlation length, share common to colours.
         banding: Standard deviation of a brightness error that differs by row.
         field_shift_px: Shift along x between odd and even rows.
-        resample: The image was stored this many times smaller.
-        mosaic: One colour a pixel, interpolated.
-        chroma: Colours are stored this many times coarser.
-        quality: Of a JPEG compression; 100 is none.
+        resample, chroma: The image, and its colours, were stored this many times smaller.
+        mosaic, quality: One colour a pixel, interpolated; and of a JPEG compression, 100 is none.
     """
 
     defocus_px: float = 0.0
@@ -90,8 +86,7 @@ class Video:
             ycc[..., 1:] = cv2.resize(coarse, image.shape[1::-1], interpolation=cv2.INTER_LINEAR)
             image = cv2.cvtColor(ycc, cv2.COLOR_YCrCb2RGB)
         if self.quality < 100:
-            encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, int(self.quality)])[1]
-            image = cv2.imdecode(encoded, cv2.IMREAD_COLOR)
+            image = compressed(image, int(self.quality))
         if self.resample != 1.0:
             image = cv2.resize(image, (width, height), interpolation=cv2.INTER_LINEAR)
         return image
@@ -107,6 +102,11 @@ class Video:
         if self.noise_px > 0.3:
             coloured = cv2.GaussianBlur(coloured, (0, 0), self.noise_px)
         return coloured * np.float32(self.noise / max(float(coloured.std()), 1e-6))
+
+
+def compressed(image: np.ndarray, quality: int) -> np.ndarray:
+    """The image after a JPEG file."""
+    return cv2.imdecode(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1], cv2.IMREAD_COLOR)
 
 
 def _shifted(image: np.ndarray, x: float, y: float) -> np.ndarray:

@@ -1,7 +1,6 @@
 """A window of a camera's image: its frame, the rays of its pixels, the scene that they meet, and blur.
 
-Rays that are parallel, or nearly, meet the smooth height field after a few fixed-point steps.  This is done on a coarse
-grid of pixels; cubic interpolation then gives every pixel with fourth-order accuracy.
+Rays meet the smooth height field after a few fixed-point steps, on a coarse grid of pixels; the rest is interpolated.
 """
 
 from dataclasses import dataclass, replace
@@ -14,21 +13,22 @@ import numpy as np
 from lib.cameras import AffineCamera, NearAffineCamera
 from lib.simulator.eye import Scene
 
-__all__ = ["Grid", "Window", "blur", "blur_by_depth", "intersect", "motion_kernel", "surface_grid"]
+__all__ = ["Grid", "Window", "blur", "blur_by_depth", "in_image", "intersect", "motion_kernel", "surface_grid"]
+
+
+_Camera = AffineCamera | NearAffineCamera
 
 
 @dataclass(frozen=True, eq=False)
 class Window:
     """What part of a camera's image is rendered.
 
-    Attributes:
-        camera: Maps the microscope frame to pixels of the window; square pixels without skew.
-        size_px: (w, h) of the window.
-        field_px, origin_px: (w, h) of the whole image, and the whole image's pixel that is the window's first:
-            vignetting and rolling shutter depend on them.  None is a window that is the whole image.
+    `camera` maps the microscope frame to pixels of the window, which are square.  `field_px` and `origin_px` are the size
+    (w, h) of the whole image (None = the window's), and its pixel that is the window's first: vignetting and rolling
+    shutter depend on them.
     """
 
-    camera: AffineCamera | NearAffineCamera
+    camera: _Camera
     size_px: tuple[int, int]
     field_px: tuple[int, int] | None = None
     origin_px: tuple[float, float] = (0.0, 0.0)
@@ -40,9 +40,8 @@ class Window:
 
     @classmethod
     def around(
-        cls, camera: AffineCamera | NearAffineCamera, u: np.ndarray, size_px: tuple[int, int],
-        field_px: tuple[int, int] | None = None,
-    ) -> Self:  # fmt: skip
+        cls, camera: _Camera, u: np.ndarray, size_px: tuple[int, int], field_px: tuple[int, int] | None = None
+    ) -> Self:
         """The window of `size_px` around pixel `u` (2,) of a camera whose whole image has `field_px`."""
         origin = np.round(np.asarray(u) - np.array(size_px) / 2)
         moved = {"matrix": camera.matrix - [[0, 0, 0, origin[0]], [0, 0, 0, origin[1]]]}
@@ -135,15 +134,20 @@ class Grid:
 
 
 def surface_grid(
-    scene: Scene, camera: AffineCamera | NearAffineCamera, size_px: tuple[int, int], step_px: int = 8
+    scene: Scene, camera: _Camera, size_px: tuple[int, int], step_px: int = 8
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The true surface: columns (a,) px, rows (b,) px and the points (b, a, 3) mm, microscope frame, seen there.
 
-    Linear interpolation between grid points is right to 1 um for eyes at the default step.
+    Linear interpolation between the points is right to 1 um for eyes at the default step.
     """
     x_px, y_px = (np.append(np.arange(0, side - 1, step_px), side - 1).astype(float) for side in size_px)
     points = intersect(scene, Window(camera, size_px), tuple(np.meshgrid(x_px, y_px)))
     return x_px, y_px, np.stack(points, axis=-1)
+
+
+def in_image(u: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
+    """Which of the points (n, 2) px lie on the pixels of an image of this size (w, h); NaN does not."""
+    return ((u > -0.5) & (u < np.array(size_px) - 0.5)).all(axis=1)
 
 
 def blur(image: np.ndarray, sigma_px: float) -> np.ndarray:
@@ -152,10 +156,7 @@ def blur(image: np.ndarray, sigma_px: float) -> np.ndarray:
 
 
 def blur_by_depth(image: np.ndarray, sigma_px: np.ndarray, grid: Grid | None = None) -> np.ndarray:
-    """Gaussian blur whose width varies slowly over the image: a blend, linear in variance, of up to three blurs.
-
-    `sigma_px` is given on the coarse grid, or for every pixel where `grid` is None.
-    """
+    """Gaussian blur of slowly varying width, given on `grid` or for every pixel: a blend of up to three, by variance."""
     low, high = float(sigma_px.min()), float(sigma_px.max())
     if high - low < 0.15:
         return blur(image, (low + high) / 2)

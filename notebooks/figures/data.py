@@ -12,8 +12,8 @@ from lib.cameras import StereoRig
 from lib.correspondences import LANDMARKS
 from lib.recordings import Recording
 from lib.simulator.eye import Scene
-from lib.simulator.microscope import Microscope
 from lib.simulator.motion import Motion
+from lib.simulator.rig import Microscope
 from lib.simulator.window import Window
 from notebooks.figures.style import COLOURS, LANDMARK_COLOURS, figure, show_image
 from notebooks.studies.realism import Profiles

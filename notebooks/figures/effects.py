@@ -10,8 +10,8 @@ import numpy as np
 from lib.geometry import RigidTransform
 from lib.simulator.eye import Eye
 from lib.simulator.forceps import Forceps, Pose
-from lib.simulator.microscope import Microscope
 from lib.simulator.render import View, render_view
+from lib.simulator.rig import Microscope
 from lib.simulator.window import Window
 
 __all__ = ["PLAIN", "effect_gallery", "render_window"]

@@ -18,9 +18,8 @@ from lib.matching import RECTIFIED, Matches, match
 from lib.simulator.dataset import TEST_SEQUENCES, sequence_design, sequence_name
 from lib.simulator.eye import Eye, Scene
 from lib.simulator.forceps import Forceps, Pose
-from lib.simulator.microscope import Microscope
 from lib.simulator.render import render_pair
-from lib.simulator.rig import IMAGE_SIZE_PX, ROBOT_FROM_MICROSCOPE
+from lib.simulator.rig import IMAGE_SIZE_PX, ROBOT_FROM_MICROSCOPE, Microscope
 from lib.simulator.window import surface_grid
 from lib.surface import BSplineSurface, Reconstruction, reconstruct
 from notebooks.studies.matching_evaluation import (

@@ -10,8 +10,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from lib.geometry import RigidTransform
 from lib.simulator import Microscope, Pose, render_view, simulate
 from lib.simulator.dataset import rung_design
+from lib.simulator.eye import Ground
 from lib.simulator.families import ASPECTS, FAR, SHIFTED, TRAINING
-from lib.simulator.ground import Ground
 from lib.simulator.lighting import Lighting, Patch
 from lib.simulator.population import POPULATIONS, random_setup, sample
 from lib.simulator.shapes import TOOLS, random_object
@@ -25,8 +25,8 @@ CAMERA = PLAIN.rig(RigidTransform.identity()).left
 
 @pytest.fixture(autouse=True)
 def small_textures(monkeypatch):
-    monkeypatch.setattr("lib.simulator.ground._SIDE_PX", 96)
-    monkeypatch.setattr("lib.simulator.ground._FUNDUS_PX", 96)
+    monkeypatch.setattr("lib.simulator.texture._SIDE_PX", 96)
+    monkeypatch.setattr("lib.simulator.eye._FUNDUS_PX", 96)
     monkeypatch.setattr("lib.simulator.population._TEXTURE_PX", 96)
 
 

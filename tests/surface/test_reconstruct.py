@@ -16,9 +16,8 @@ from lib.geometry import RigidTransform
 from lib.recordings import Recording
 from lib.simulator.eye import Eye
 from lib.simulator.forceps import Forceps, Pose
-from lib.simulator.microscope import Microscope
 from lib.simulator.render import render_pair
-from lib.simulator.rig import simulate_correspondences
+from lib.simulator.rig import Microscope, simulate_correspondences
 from lib.surface import BSplineSurface, SplineGrid, epipolar_inliers, reconstruct, surface_mesh
 from lib.workbench import results
 from notebooks.studies import surface_evaluation as evaluation
