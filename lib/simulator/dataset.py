@@ -72,9 +72,7 @@ def sequence_design(seed: int, index: int, *, shrink: int = 1, duration_s: float
 def rung_design(rung: str, seed: int, *, shrink: int = 1) -> Design:
     """What recording `seed` of a rung of shift shows: new eyes and tools, in stereo, as `sample` draws them singly.
 
-    Args:
-        rung: "near", the reference rig's families; "validation"; or one of `families.FAR`.
-        shrink: Makes images this many times smaller.
+    The rung is "near", the reference rig's families, "validation", or one of `families.FAR`.
     """
     if rung == "near":  # seeds that no data set of the paper's size was ever made with
         return sequence_design(1000 + seed, TEST_SEQUENCES[seed % len(TEST_SEQUENCES)], shrink=shrink)
@@ -97,14 +95,10 @@ def _make_sequence(folder: Path, seed: int, index: int, n_pairs: int, duration_s
 def make_dataset(
     folder: Path, *, seed: int = 0, n_pairs: int = 80, duration_s: float = 60.0, workers: int | None = None, shrink: int = 1
 ) -> list[Path]:  # fmt: skip
-    """Make the sequences that are missing in `folder`, in parallel; the files depend on seed and size alone.
+    """Make the sequences of `n_pairs` that are missing in `folder`, in parallel; files depend on seed and size alone.
 
-    A sequence appears whole or not at all: after a kill, the finished ones are kept and the others are made.
-
-    Args:
-        n_pairs, duration_s: Length of each sequence.
-        workers: Processes; None = one a core.
-        shrink: Makes images and textures this many times smaller, for a quick look.
+    A sequence appears whole or not at all: after a kill, the finished ones are kept and the others are made.  `workers` are
+    processes, None is one a core.  `shrink` makes images and textures this many times smaller, for a quick look.
 
     Raises:
         ValueError: If the folder holds a data set of another seed or size, or a damaged sequence.
@@ -163,19 +157,18 @@ def main(argv: Sequence[str] | None = None) -> None:
         parser.error("--pairs, --workers and --shrink must be at least 1.")
     if arguments.seed < 0 or not 0 < arguments.duration < float("inf"):
         parser.error("--seed must not be negative, --duration must be positive and finite.")
-    if arguments.shipped:  # an eye and a tool never trained on, in a calibration sweep and then with a surgeon
-        recording = simulate(
-            paths.SHIPPED_RECORDING, Design(microscope=Microscope(jpeg_quality=88)), seed=27, n_frames=34,
-            name="Open-sky eye, simulated", overwrite=True,
-            description="Calibration sweep at several depths, then approach, grasp and peel. Made by lib.simulator.",
-        )  # fmt: skip
-        print(f"{recording.folder}: {len(recording)} pairs.")
-        return
     pairs, shrink = arguments.pairs, arguments.shrink
-    if arguments.rung:
-        folder = arguments.folder or paths.CACHE / "rungs" / f"{arguments.rung}-{arguments.seed}"
-        design = replace(rung_design(arguments.rung, arguments.seed, shrink=shrink), duration_s=arguments.duration)
-        recording = simulate(folder, design, seed=5000 + arguments.seed, n_frames=pairs)
+    if arguments.shipped or arguments.rung:
+        if arguments.shipped:  # an eye and a tool never trained on, in a calibration sweep and then with a surgeon
+            recording = simulate(
+                paths.SHIPPED_RECORDING, Design(microscope=Microscope(jpeg_quality=88)), seed=27, n_frames=34,
+                name="Open-sky eye, simulated", overwrite=True,
+                description="Calibration sweep at several depths, then approach, grasp and peel. Made by lib.simulator.",
+            )  # fmt: skip
+        else:
+            folder = arguments.folder or paths.CACHE / "rungs" / f"{arguments.rung}-{arguments.seed}"
+            design = replace(rung_design(arguments.rung, arguments.seed, shrink=shrink), duration_s=arguments.duration)
+            recording = simulate(folder, design, seed=5000 + arguments.seed, n_frames=pairs)
         print(f"{recording.folder}: {len(recording)} pairs.")
         return
     folder = arguments.folder or paths.CACHE / f"dataset-{arguments.seed}"

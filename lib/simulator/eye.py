@@ -20,10 +20,9 @@ class Scene(Protocol):
     """What the renderer needs of a surface.  Lengths are mm in the microscope frame (z points into the eye).
 
     `height(x, y)` is the surface z.  `texture` is its reflectance (n, n, 3) uint8 over a square of side `extent_mm`
-    around the origin.  `gloss` is the strength of the wet film's mirror image; 0 is a matt surface.
-
-    Two attributes are optional.  `texture_from_surface` (2, 3) maps (x, y, 1) to the texture.  `step_px` is the spacing
-    of the pixels at which the surface is intersected (8 by default; a rough surface needs less).
+    around the origin.  `gloss` is the strength of the wet film's mirror image; 0 is a matt surface.  Optional are
+    `texture_from_surface` (2, 3), which maps (x, y, 1) to the texture, and `step_px`, the spacing of the pixels at which the
+    surface is intersected (8 by default; a rough surface needs less).
     """
 
     gloss: float
@@ -39,10 +38,8 @@ class Eye:
 
     Attributes:
         seed: Draws the folds, the tilt and the procedural texture.
-        radius_mm: Radius of the cut rim.
-        depth_mm: Depth of the deepest point below the rim.
-        fold_mm: Amplitude of the folds of the collapsed retina.
-        tilt_rad: Standard deviation of the tilt about x and y.
+        radius_mm, depth_mm: Radius of the cut rim, and how far the deepest point lies below it.
+        fold_mm, tilt_rad: Amplitude of the retina's folds, and standard deviation of the tilt about x and y.
         centre_z_mm: Height of the deepest point; 0 is the focal plane, positive is deeper.
         texture_path: A photograph that replaces the procedural fundus.
         gloss: Strength of the reflection of the wet surface; 0 switches it off.
@@ -106,7 +103,7 @@ class Eye:
 
 @dataclass(frozen=True)
 class Ground(Eye):
-    """A surface with any texture.
+    """A surface with any texture.  `border` is what lies beyond it, in OpenCV's terms.
 
     Attributes:
         kind: "fundus", or the name of a pattern (`lib.simulator.texture`).
@@ -115,6 +112,7 @@ class Ground(Eye):
         over, over_share: A second texture that is mixed with the first, and its share.
     """
 
+    border: ClassVar[int] = cv2.BORDER_REFLECT
     kind: str = "fundus"
     size_mm: float = Eye.extent_mm
     colours: tuple[tuple[float, float, float], ...] = ()
@@ -125,11 +123,6 @@ class Ground(Eye):
     def extent_mm(self) -> float:
         """As `Scene` wants it."""
         return self.size_mm
-
-    @property
-    def border(self) -> int:
-        """What lies beyond the texture, in OpenCV's terms."""
-        return cv2.BORDER_REFLECT
 
     @property
     def film_seed(self) -> int:

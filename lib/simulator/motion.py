@@ -26,7 +26,6 @@ class Motion:
     Attributes:
         kind: "sweep": the jaws scan the field at several depths while they turn and open.  "surgeon": descend, grasp,
             peel, pause, release, then the same elsewhere.  "both": a sweep for two thirds of the time, then a surgeon.
-        duration_s: Duration of the whole trajectory; a shorter one is faster.
         tremor_mm: Peak-to-peak amplitude of the physiological tremor (8 to 12 Hz) in the surgeon's part.
     """
 

@@ -7,7 +7,6 @@ tool of the training.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -20,12 +19,11 @@ from lib.simulator.forceps import Forceps, Instrument, Pose
 from lib.simulator.render import render_view
 from lib.simulator.rig import IMAGE_SIZE_PX, Microscope
 from lib.simulator.shapes import beside, random_object
-from lib.simulator.video import Video
+from lib.simulator.video import Video, compressed
 from lib.simulator.window import Window, in_image
 
-__all__ = ["POPULATIONS", "RESERVED_JAW_MM", "RESERVED_SEEDS", "TEST_TEXTURE_SEEDS", "TEXTURE_SEEDS"]
-__all__ += ["VALIDATION_TEXTURE_SEEDS", "Setup", "random_eye", "random_forceps", "random_microscope", "random_pose"]
-__all__ += ["random_setup", "reserved_forceps", "sample"]
+__all__ = ["POPULATIONS", "RESERVED_JAW_MM", "RESERVED_SEEDS", "TEXTURE_SEEDS", "VALIDATION_TEXTURE_SEEDS", "Setup"]
+__all__ += ["random_forceps", "random_pose", "random_setup", "reserved_forceps", "sample"]
 
 #: Families from which the far rung draws what is not far.
 _ORDINARY = {"light": ("coaxial", "oblique", "near_lamp", "glare"), "optics": ("clean", "grey", "cast")}
@@ -34,19 +32,16 @@ POPULATIONS = ("training", "validation", "near", "empty")
 
 #: Eyes (and the textures and brush marks that go with them) that training never draws.
 RESERVED_SEEDS = range(0, 10_000)
-#: Textures of the training eyes: few enough to stay in memory, each turned, tinted and shaped anew per image.
-TEXTURE_SEEDS = range(10_000, 10_096)
-#: Textures of the eyes that validate a training: none of those it sees.
-VALIDATION_TEXTURE_SEEDS = range(10_096, 10_112)
-#: Textures of test images.
-TEST_TEXTURE_SEEDS = range(9_000, 9_016)
+#: Textures of eyes that train (few enough to stay in memory, each turned, tinted and shaped anew), validate and test.
+TEXTURE_SEEDS, VALIDATION_TEXTURE_SEEDS = range(10_000, 10_096), range(10_096, 10_112)
+_TEST_TEXTURE_SEEDS = range(9_000, 9_016)
 #: Jaw lengths that training never draws: recordings for tests have tools of these.
 RESERVED_JAW_MM = (2.95, 3.15)
 _TEXTURE_PX = 1536
 _NARROW, _NARROW_TEXTURES = 0.2, 32  # share of the narrow population in training, and its textures, kept in memory
 
 
-def random_eye(rng: np.random.Generator, textures: Sequence[int] = TEXTURE_SEEDS) -> Eye:
+def _eye(rng: np.random.Generator, textures: Sequence[int] = TEXTURE_SEEDS) -> Eye:
     """An eye of the training population: shape, folds, gloss, and one of `textures`."""
     return Eye(
         seed=int(textures[rng.integers(len(textures))]), radius_mm=9.3, texture_px=_TEXTURE_PX,
@@ -80,20 +75,15 @@ def reserved_forceps(rng: np.random.Generator, seed: int) -> Forceps:
 
 def random_pose(rng: np.random.Generator, forceps: Forceps, surface_z_mm: float = 0.8) -> Pose:
     """A pose whose jaws lie in the field, between the retina and 3 mm above it, the shaft coming from anywhere."""
-    azimuth = rng.uniform(-np.pi, np.pi)
-    # The tips, not the base, fill the field; one time in ten they leave it a little.
-    reach = 1.03 if rng.random() < 0.1 else 0.93
-    tips = rng.uniform(-1, 1, 2) * IMAGE_SIZE_PX / 200 * reach
+    azimuth, length = rng.uniform(-np.pi, np.pi), forceps.jaw_length_mm
+    tips = _tips(rng, 1.03 if rng.random() < 0.1 else 0.93)
     pitch = rng.uniform(0.08, 0.75)
-    flat = forceps.jaw_length_mm * np.cos(pitch)
     tip_z = max(surface_z_mm - rng.exponential(0.9), -2.5)
-    base = [*(tips - flat * np.array([np.cos(azimuth), np.sin(azimuth)])), tip_z - forceps.jaw_length_mm * np.sin(pitch)]
-    opening = 0.0 if rng.random() < 0.12 else rng.uniform(0.05, 0.55) * forceps.jaw_length_mm
-    roll = np.clip(rng.normal(0, 0.4), -0.95, 0.95)
-    return Pose(tuple(float(v) for v in base), azimuth, pitch, float(roll), opening)
+    opening = 0.0 if rng.random() < 0.12 else rng.uniform(0.05, 0.55) * length
+    return _reaching(tips, tip_z, length, azimuth, pitch, np.clip(rng.normal(0, 0.4), -0.95, 0.95), opening)
 
 
-def random_microscope(rng: np.random.Generator) -> Microscope:
+def _microscope(rng: np.random.Generator) -> Microscope:
     """Light, optics and sensor of one image."""
     tint = np.exp(rng.normal(0, [0.16, 0.10, 0.20]))
     gain = tuple(float(v) for v in tint / tint.mean())
@@ -110,10 +100,7 @@ def random_microscope(rng: np.random.Generator) -> Microscope:
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """What one image shows, through what: a member of each family in `families` (aspect -> name).
-
-    `forceps` is None for a scene without any tool; `pose` then says where a window looks.
-    """
+    """What an image shows, through what, of which `families` (aspect -> name).  Without forceps a window looks at `pose`."""
 
     scene: Eye
     forceps: Forceps | Instrument | None
@@ -124,7 +111,7 @@ class Setup:
 
 def random_setup(
     rng: np.random.Generator, population: str = "training", *, textures: Sequence[int] | None = None,
-    without: Sequence[str] = (), photographs: str | Path | None = None, centred: bool = False,
+    without: Sequence[str] = (), centred: bool = False,
 ) -> Setup:  # fmt: skip
     """Draw what an image shows; see `sample` for the arguments.  `centred` puts the tool, and its light, in mid-field.
 
@@ -134,9 +121,9 @@ def random_setup(
     choices = _choices(population, without)
     if textures is None:
         drawn_by = {"training": TEXTURE_SEEDS, "empty": TEXTURE_SEEDS, "validation": VALIDATION_TEXTURE_SEEDS}
-        textures = drawn_by.get(population, TEST_TEXTURE_SEEDS)
+        textures = drawn_by.get(population, _TEST_TEXTURE_SEEDS)
     if population == "near" or (population == "training" and rng.random() < _NARROW):
-        eye, forceps, microscope = random_eye(rng, textures[:_NARROW_TEXTURES]), random_forceps(rng), random_microscope(rng)
+        eye, forceps, microscope = _eye(rng, textures[:_NARROW_TEXTURES]), random_forceps(rng), _microscope(rng)
         if population != "near":
             eye = Ground(**{f.name: getattr(eye, f.name) for f in fields(Eye)})  # whose film stays in memory
         pose = random_pose(rng, forceps, eye.centre_z_mm - 0.35 * eye.depth_mm)
@@ -151,11 +138,6 @@ def random_setup(
         names["scene"] = "fundus"
     draw = {aspect: choices[aspect][name] for aspect, name in names.items()}
     scene = draw["scene"](rng, textures)
-    if photographs is not None and rng.random() < 0.3:
-        files = sorted(path for path in Path(photographs).iterdir() if path.suffix.lower() in (".jpg", ".jpeg", ".png"))
-        if not files:
-            raise FileNotFoundError(f"photographs: no JPEG or PNG in {photographs}.")
-        scene = replace(scene, kind="photograph", texture_path=files[rng.integers(len(files))])
     surface_z_mm = scene.centre_z_mm - 0.35 * scene.depth_mm
     sizes = (0.5, 1.3) if population in FAR else (0.2, 0.8) if names["light"] == "pupil" else (0.25, 1.5)
     size = float(np.exp(rng.uniform(*np.log(sizes))))
@@ -174,7 +156,7 @@ def random_setup(
     middle = np.array(pose.base_mm) + 0.5 * length * pose.microscope_from_tool[:, 0]
     # The exposure suits the scene more or less, as a camera's does.
     exposed = np.exp(rng.normal(-1.4, 0.55)) / (1.45 * np.mean((scene.texture[::16, ::16] / 255.0) ** 2.2) + 0.02)
-    microscope = replace(random_microscope(rng), brightness=float(np.clip(exposed, 0.1, 5.0)))
+    microscope = replace(_microscope(rng), brightness=float(np.clip(exposed, 0.1, 5.0)))
     microscope = draw["light"](rng, microscope, middle, length, surface_z_mm)
     settings = draw["optics"](rng)
     if rng.random() < 0.35:  # two things are wrong with the camera
@@ -187,13 +169,11 @@ def _choices(population: str, without: Sequence[str]) -> dict[str, dict[str, Cal
     """Aspect -> families that a population draws, less those left out."""
     if population not in (*POPULATIONS, *FAR):
         raise ValueError(f"population: one of {', '.join((*POPULATIONS, *FAR))}, got {population!r}.")
-    unknown = set(without) - {name for known in TRAINING.values() for name in known}
-    if unknown:
+    if unknown := set(without) - {name for known in TRAINING.values() for name in known}:
         raise ValueError(f"without: no such family in training: {', '.join(sorted(unknown))}.")
     choices = {aspect: {n: draw for n, draw in known.items() if n not in without} for aspect, known in TRAINING.items()}
-    for aspect, known in choices.items():
-        if not known:
-            raise ValueError(f"without: leaves no family of {aspect}.")
+    if empty := [aspect for aspect, known in choices.items() if not known]:
+        raise ValueError(f"without: leaves no family of {', '.join(empty)}.")
     if population in FAR:  # one thing, or all, is new; the rest is what a lab would call ordinary
         choices = {aspect: {n: draw for n, draw in known.items() if n in _ORDINARY.get(aspect, known)}
                    for aspect, known in choices.items()}  # fmt: skip
@@ -203,33 +183,42 @@ def _choices(population: str, without: Sequence[str]) -> dict[str, dict[str, Cal
 def _wide_pose(rng: np.random.Generator, length: float, surface_z_mm: float) -> Pose:
     """As `random_pose`, with wider openings, steeper tools, and more of them partly outside the field."""
     azimuth, pitch = rng.uniform(-np.pi, np.pi), rng.uniform(0.0, 1.0)
-    reach = 1.15 if rng.random() < 0.15 else 0.93
-    tips = rng.uniform(-1, 1, 2) * IMAGE_SIZE_PX / 200 * reach
+    tips = _tips(rng, 1.15 if rng.random() < 0.15 else 0.93)
     tip_z = max(surface_z_mm - rng.exponential(0.9), -2.5)
+    opening = length * (rng.choice([0.0, 1.0], p=[0.15, 0.85]) * rng.uniform(0.05, 0.65 if rng.random() < 0.8 else 1.41))
+    return _reaching(tips, tip_z, length, azimuth, pitch, np.clip(rng.normal(0, 0.45), -1.0, 1.0), opening)
+
+
+def _tips(rng: np.random.Generator, reach: float) -> np.ndarray:
+    """Where the tips are, (2,) mm: anywhere in a field `reach` times as large, so that they fill it and not the base."""
+    return rng.uniform(-1, 1, 2) * IMAGE_SIZE_PX / 200 * reach
+
+
+def _reaching(
+    tips: np.ndarray, tip_z: float, length: float, azimuth: float, pitch: float, roll: float, opening: float
+) -> Pose:
+    """The pose in which a tool of this length has its tips there."""
     flat = length * np.cos(pitch) * np.array([np.cos(azimuth), np.sin(azimuth)])
     base = [*(tips - flat), tip_z - length * np.sin(pitch)]
-    opening = length * (rng.choice([0.0, 1.0], p=[0.15, 0.85]) * rng.uniform(0.05, 0.65 if rng.random() < 0.8 else 1.41))
-    roll = np.clip(rng.normal(0, 0.45), -1.0, 1.0)
     return Pose(tuple(float(v) for v in base), azimuth, pitch, float(roll), float(opening))
 
 
 def sample(
     rng: np.random.Generator, *, crop_px: int | None = None, size_px: tuple[int, int] | None = None,
     around: int | None = None, jitter: float = 0.35, textures: Sequence[int] | None = None, population: str = "training",
-    without: Sequence[str] = (), photographs: str | Path | None = None,
+    without: Sequence[str] = (),
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
     """One view, not a pair, with its landmarks; `rng` decides everything.
 
     Args:
         crop_px: Side of a square window of the full-resolution image that holds the jaws somewhere.
         size_px: (w, h) of the whole field shrunk to this size.  Without either size the image is the full-HD field.
-        around: The landmark that a window holds, 0 base, 1 or 2 a tip; None = the jaws' centre.
-        jitter: How far it may lie from the window's centre, as a share of the window's side.
+        around, jitter: The landmark that a window holds, 0 base, 1 or 2 a tip, None = the jaws' centre; and how far it may
+            lie from the window's centre, as a share of the window's side.
         textures: Seeds of the textures to draw from, kept in memory; None = those of the population.
         population: "training"; "validation", with kinds beside those of training; "near", the reference rig's eyes and
             forceps alone; "empty", scenes and objects without the tool; or a family of `FAR`, which training never draws.
         without: Families of `TRAINING` to leave out.
-        photographs: A folder of JPEGs or PNGs that serve as scenes, too.
 
     Returns: image (h, w, 3) uint8 RGB; u (3, 2) px of base, tip_1, tip_2, also if outside, NaN without the tool;
         visibility (3,): 0 outside, 1 hidden, 2 visible.
@@ -241,7 +230,7 @@ def sample(
         raise ValueError("crop_px, size_px: give one, a window at full resolution or the field at a reduced one.")
     if min(crop_px or 64, *(size_px or (64, 64))) < 32:
         raise ValueError(f"crop_px, size_px: must be at least 32, got {crop_px}, {size_px}.")
-    drawn = random_setup(rng, population, textures=textures, without=without, photographs=photographs)
+    drawn = random_setup(rng, population, textures=textures, without=without)
     forceps, pose, microscope = drawn.forceps, drawn.pose, drawn.microscope
     landmarks = np.full((3, 3), np.nan) if forceps is None else forceps.landmarks(pose)
     magnification = 100.0 * rng.uniform(0.85, 1.18)  # px per mm
@@ -278,13 +267,10 @@ def sample(
         if crop_px is None and rng.random() < 0.3:
             image, u, visibility = _distorted(image, u, visibility, rng.uniform(-0.25, 0.25))
         image = video.shrunk(shrink)(image, rng)
-    encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, microscope.jpeg_quality])[1]
-    return cv2.imdecode(encoded, cv2.IMREAD_COLOR), u, visibility
+    return compressed(image, microscope.jpeg_quality), u, visibility
 
 
-def _distorted(
-    image: np.ndarray, u: np.ndarray, visibility: np.ndarray, strength: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _distorted(image: np.ndarray, u: np.ndarray, visibility: np.ndarray, strength: float) -> tuple[np.ndarray, ...]:
     """An image through a lens with radial distortion, with its landmarks: `strength` is the relative change at the corner."""
     size = np.array(image.shape[1::-1])
     centre, reach2 = (size - 1) / 2, float(((size / 2) ** 2).sum())

@@ -29,13 +29,10 @@ class Design:
     """What a simulated recording shows, through what, and what robot and annotator report of it.
 
     Attributes:
-        eye, forceps: Scene and tool.  None = chosen by the recording's seed, from designs that no training sees.
-        microscope: Optics, light and sensor.
+        eye, forceps: None = chosen by the recording's seed, from designs that no training sees.
         motion, duration_s: "sweep" (calibration), "surgeon" or "both"; None = 30, 18 or 45 s.
-        robot_accuracy_mm: Standard deviation of the kinematics, per coordinate.
-        offset_s: t_robot = t_video + offset_s.
-        dropout: Share of kinematic samples without values.
-        click_px: Standard deviation of the annotations, per coordinate.
+        robot_accuracy_mm, click_px: Standard deviations of kinematics and annotations, per coordinate.
+        offset_s, dropout: t_robot = t_video + offset_s; and the share of kinematic samples without values.
     """
 
     eye: Scene | None = None
@@ -63,11 +60,9 @@ def simulate(
     The same arguments give the same files.
 
     Args:
-        design: What the recording shows; None = the default microscope, an eye and a tool chosen by `seed`.
         seed: Drives every random source.
         name, description: Of recording.toml; None = the folder's name.
         progress: Whether to show a bar, or a function to call after every pair.
-        overwrite: Replace a recording of that name.
 
     Raises:
         ValueError: If a parameter is out of range.
@@ -131,8 +126,8 @@ def simulate(
 def _in_glint(view: View) -> np.ndarray:
     """(3,) bool: whether saturated light lies within `_GLINT_REACH_PX` of a landmark in view.
 
-    This is either the wet surface's mirror image of the lamp, which never covers the tool itself but may surround a
-    tip, or a highlight of the metal: two of three channels at full scale, as one alone may be the colour of the light.
+    It is the wet surface's mirror image of the lamp, which may surround a tip but never covers the tool, or a highlight of
+    the metal: two of three channels at full scale, as one alone may be the colour of the light.
     """
     found = np.zeros(3, bool)
     for k in np.flatnonzero(view.visibility):

@@ -58,15 +58,12 @@ def _jaw(
     bend: float = 0.0, thick: float = 0.04, end: float = 0.002, taper: float = 0.7, flex: float = 0.5, n: int = 14,
     start: float = 0.5, cup: float = 0.0, teeth: float = 0.0, ring: float = 0.0, claw: float = 0.0, turn: float = 0.0,
 ) -> Jaw:  # fmt: skip
-    """A jaw; lengths are shares of `length`, angles rad.
+    """A jaw of `n` cones, on `side` +1 or -1; lengths are shares of `length`, angles rad.
 
     Args:
-        side: +1 for jaw 1, -1 for jaw 2.
-        long: Its own length.
+        long, bend: Its own length, and how far it leaves the plane of the jaws.
         bow, power, skew: How far it arches outwards, how evenly, and where most.
-        bend: How far it leaves the plane of the jaws.
         thick, end, taper: Radii at both ends, and the exponent between.
-        n: Number of its cones.
         start: Where a cup, teeth, a ring or a kink begins.
         cup, teeth, ring: Radius that a cup adds, height of teeth in radii, and half width of a ring.
         claw, turn: Angles of a kink: inwards, or both jaws to one side.

@@ -138,15 +138,8 @@ def fundus_texture(seed: int, size_px: int = 2048, rim_mm: float = 9.3) -> np.nd
 
 @lru_cache(maxsize=4)
 def photograph_texture(path: str | Path, size_px: int = 2048) -> np.ndarray:
-    """Any photograph as a texture: its central square stretched over the retina.
-
-    Raises:
-        FileNotFoundError, ValueError: If there is no such file, or it is no image.
-    """
-    try:
-        image = read_image(Path(path))
-    except (OSError, ValueError) as error:
-        raise type(error)(f"texture: {error} Give the path of a PNG or JPEG.") from None
+    """Any photograph as a texture: its central square stretched over the retina."""
+    image = read_image(Path(path))
     side = min(image.shape[:2])
     top, left = (image.shape[0] - side) // 2, (image.shape[1] - side) // 2
     texture = cv2.resize(image[top : top + side, left : left + side], (size_px, size_px), interpolation=cv2.INTER_AREA)

@@ -70,11 +70,9 @@ def test_a_family_can_be_left_out_and_wrong_names_are_told():
         ({"population": "everything"}, "population: one of training"),
         ({"without": ("angled_jaws",)}, "no such family in training: angled_jaws"),
         ({"without": tuple(TRAINING["light"])}, "no family of light"),
-        ({"photographs": "no/such/folder"}, "no/such/folder"),
     ):
-        with pytest.raises((ValueError, FileNotFoundError), match=said):
-            for seed in range(30):
-                random_setup(np.random.default_rng(seed), **({"textures": range(10_000, 10_001)} | options))
+        with pytest.raises(ValueError, match=said):
+            random_setup(np.random.default_rng(0), **({"textures": range(10_000, 10_001)} | options))
 
 
 @pytest.mark.parametrize("family", sorted(TOOLS))
