@@ -13,12 +13,16 @@ from numpy.typing import ArrayLike
 
 from lib.geometry import pair_covariance, points
 
-__all__ = ["LANDMARKS", "MIN_CONFIDENCE", "Correspondences", "NoDetectionError", "of_recording", "pair_with_robot"]
+__all__ = [
+    "LANDMARKS", "MIN_CONFIDENCE", "TRAIN_FURTHER", "Correspondences", "NoDetectionError", "of_recording", "pair_with_robot",
+]  # fmt: skip
 
 #: The landmarks of the forceps, in the order of every array.
 LANDMARKS = ("base", "tip_1", "tip_2")
 #: A detection of lower confidence counts as not seen.
 MIN_CONFIDENCE = 0.2
+#: The cure where a detector does not know the pictures.
+TRAIN_FURTHER = "label some frames and train it further: python3 -m lib train finetune RECORDING --out weights.safetensors"
 #: Half the time over which a velocity is measured: long enough to average the robot's noise, short for its motion.
 _VELOCITY_S = 0.05
 
@@ -122,8 +126,7 @@ class Correspondences:
         raise NoDetectionError(
             f"data: the detector failed on {len(np.unique(self.frame))} frames: of {len(self)} landmarks it found {left} "
             f"in left images and {right} in right ones. Do they show the tool, in colour, sharp, 200 to 400 px "
-            "from base to tip? `python3 -m lib check RECORDING` shows them; where tool or light is new, label 20 frames "
-            "and run `python3 -m lib adapt RECORDING`."
+            f"from base to tip? `python3 -m lib check RECORDING` shows them; where tool or light is new, {TRAIN_FURTHER}."
         )
 
     @property

@@ -181,14 +181,19 @@ class Calibration:
         return np.sqrt(np.einsum("i,nij,j->n", direction, self.point_covariance(x_mm, detection=detection), direction))
 
     @cached_property
+    def leverage(self) -> np.ndarray:
+        """(inliers, m, m): by how much each inlier's own pixels move its projection."""
+        _, J, weight, _ = self.system
+        return J @ np.linalg.inv(self.minimum.information) @ np.swapaxes(J, 1, 2) @ weight
+
+    @cached_property
     def leave_one_out_px(self) -> np.ndarray:
         """(inliers, m) residual of each inlier to the cameras fitted without it: r / (1 - leverage), exact for DLT.
 
         NaN in views that are not used.
         """
-        _, J, weight, r = self.system
-        own = J @ np.linalg.inv(self.minimum.information) @ np.swapaxes(J, 1, 2) @ weight
-        r = np.linalg.solve(np.eye(own.shape[1]) - own, r[:, :, None])[:, :, 0]
+        r = self.system[3]
+        r = np.linalg.solve(np.eye(r.shape[1]) - self.leverage, r[:, :, None])[:, :, 0]
         return np.where(np.repeat(self.view_inliers[self.inliers], 2, axis=1), r, np.nan)
 
     @property

@@ -8,7 +8,10 @@ from numpy.typing import ArrayLike
 from lib.correspondences import Correspondences
 from lib.geometry import finite_points, points
 
-__all__ = ["check_duplicates", "check_images", "check_order", "check_spread", "check_units", "seen_rows", "stacked_rows"]
+__all__ = [
+    "check_duplicates", "check_images", "check_order", "check_spread", "check_units", "eyes_exchanged", "seen_rows", "sides",
+    "stacked_rows",
+]  # fmt: skip
 
 #: Zoom (px per mm) between a room camera and the resolution of light; what lies outside has the wrong unit.
 PLAUSIBLE_PX_PER_MM = (0.2, 5000.0)
@@ -109,21 +112,34 @@ def check_images(y: np.ndarray, image_size_px: tuple[int, int] | None = None) ->
         raise ValueError("u_right: the same pixels as u_left; give the right camera's own detections.")
 
 
-def check_order(A: np.ndarray, sd_rad: float) -> None:
-    """Refuse a stereo head A (4, 3) whose left camera stands on the right, where the geometry leaves no doubt.
+def sides(A: np.ndarray) -> tuple[float, float]:
+    """Where the right camera of A (4, 3) stands, along and across the image rows: rad of the angle between the two views.
+
+    Cameras stand against their viewing directions, so the right camera lies along left - right.
+    """
+    a, b, c, d = A / np.linalg.norm(A, axis=1, keepdims=True)
+    left, right = np.cross(a, b), np.cross(c, d)
+    apart = left / np.linalg.norm(left) - right / np.linalg.norm(right)
+    return apart @ (a + c) / 2, apart @ (b + d) / 2
+
+
+def eyes_exchanged(A: np.ndarray, sd_rad: float) -> bool:
+    """True where the left camera of a stereo head A (4, 3) stands on the right, beyond doubt.
 
     That is where the images are alike in rotation (30 degrees), the axes converge by 1 to 30 degrees, the baseline runs
     along the image rows, and its sign is five standard deviations `sd_rad` of the convergence from zero.
     """
-    a, b, c, d = A / np.linalg.norm(A, axis=1, keepdims=True)
-    left, right = np.cross(a, b), np.cross(c, d)
-    left, right = left / np.linalg.norm(left), right / np.linalg.norm(right)
-    if a @ c < np.cos(np.deg2rad(30)) or b @ d < np.cos(np.deg2rad(30)):
-        return
-    # Cameras stand against their viewing directions, so the right camera lies along left - right.
-    along, across = (left - right) @ (a + c) / 2, (left - right) @ (b + d) / 2
-    if np.deg2rad(1) < np.hypot(along, across) < np.deg2rad(30) and along < -max(3.0 * abs(across), 5.0 * sd_rad):
+    rows = A / np.linalg.norm(A, axis=1, keepdims=True)
+    if (rows[:2] * rows[2:]).sum(axis=1).min() < np.cos(np.deg2rad(30)):
+        return False
+    along, across = sides(A)
+    return bool(np.deg2rad(1) < np.hypot(along, across) < np.deg2rad(30) and along < -max(3.0 * abs(across), 5.0 * sd_rad))
+
+
+def check_order(A: np.ndarray, sd_rad: float) -> None:
+    """Refuse a stereo head A (4, 3) whose eyes are exchanged."""
+    if eyes_exchanged(A, sd_rad):
         raise ValueError(
-            f"u: the cameras are swapped, left stands on the right by {np.rad2deg(-along):.1f} degrees; exchange u_left and "
-            "u_right (or flip both images, if they are mirrored).  checks=False takes them as they are."
+            f"u: the cameras are swapped, left stands on the right by {np.rad2deg(-sides(A)[0]):.1f} degrees; exchange "
+            "u_left and u_right (or flip both images, if they are mirrored).  checks=False takes them as they are."
         )

@@ -8,7 +8,6 @@ apart; there the half that agrees best takes in one row after another (the forwa
 consensus is refused, and so is one with two.
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -207,8 +206,8 @@ def _tightest(
             ranks = np.minimum(distance2, threshold_px**2).sum(axis=1)  # MSAC
         else:
             ranks = np.log(np.minimum(distance2, area / np.pi) + 1e-7 * area).sum(axis=1)
-        low = np.partition(distance2, min(max(6, int(0.15 * len(some))), len(some) - 1), axis=1)
-        low = low[:, min(max(6, int(0.15 * len(some))), len(some) - 1)]
+        rank = min(max(6, int(0.15 * len(some))), len(some) - 1)
+        low = np.partition(distance2, rank, axis=1)[:, rank]
         M, score, near2 = (np.concatenate(pair) for pair in ((M, new), (score, ranks), (near2, low)))
         best = np.argsort(score)[:_STARTS]
         M, score, near2 = M[best], score[best], near2[best]
@@ -217,11 +216,11 @@ def _tightest(
             if (_distances2(H[some], u[some], M[:1])[0] < 16.0 * near2[0]).mean() > 0.5:
                 break
     if threshold_px is not None:
-
-        def near(keep: np.ndarray) -> np.ndarray:
-            return _distances2(H, u, regress(H[keep, :3], u[keep]).T[None])[0] < threshold_px**2
-
-        keep = _settled(near, _distances2(H, u, M[:1])[0] < threshold_px**2, 5)
+        keep, before = _distances2(H, u, M[:1])[0] < threshold_px**2, None
+        for _ in range(10):  # refitted until the rows no longer change
+            if keep.sum() < 5 or np.array_equal(keep, before):
+                break
+            keep, before = _distances2(H, u, regress(H[keep, :3], u[keep]).T[None])[0] < threshold_px**2, keep
         return _Found(keep, regress(H[keep, :3], u[keep]) if keep.sum() > 3 else np.zeros((2, 4)), 0.0, np.inf, np.inf)
     middle2 = np.median(_distances2(H[some], u[some], M[:4]), axis=1)
     found = _mixture(H[some], u[some], np.concatenate([M, M[:4]]), np.sqrt(np.append(near2 / 8, middle2)), area, 8)
@@ -297,14 +296,3 @@ def _mixture(H: np.ndarray, u: np.ndarray, M: np.ndarray, sigma: np.ndarray, are
         variance = np.stack([first, second], axis=1)
         share = (mass.T + 1.0) / (n + 3)
     return _Mixtures(M, np.sqrt(variance), share, likelihood - np.linalg.slogdet(G)[1])
-
-
-def _settled(judge: Callable[[np.ndarray], np.ndarray], keep: np.ndarray, fewest: int, rounds: int = 10) -> np.ndarray:
-    """The rows (n,) bool that `judge` keeps, refitted to them until they no longer change."""
-    for _ in range(rounds):
-        if keep.sum() < fewest:
-            break
-        keep, before = judge(keep), keep
-        if (keep == before).all():
-            break
-    return keep

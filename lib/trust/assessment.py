@@ -1,20 +1,19 @@
-"""Everything that decides whether a recording's calibration may be believed, in one call."""
+"""Everything that decides whether a recording's calibration may be believed, in one call; and a calibration in words."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
-from lib.calibration import Calibration, calibrate
-from lib.correspondences import Correspondences
+from lib.calibration import Calibration, calibrate, optics
+from lib.correspondences import LANDMARKS, Correspondences
 from lib.landmarks import Detector, detect
 from lib.recordings import Recording
 from lib.trust.diagnosis import Diagnosis, diagnose
-from lib.trust.epipolar import feature_epipolar_px
-from lib.trust.health import Health, health
+from lib.trust.health import Health, feature_epipolar_px, health
 from lib.trust.verdict import Verdict, judge
 
-__all__ = ["Assessment", "assess"]
+__all__ = ["Assessment", "assess", "report"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,8 +37,7 @@ class Assessment:
 
 
 def assess(
-    recording: Recording, data: Correspondences | None = None, *, detector: Callable | None = None, looks: int = 12,
-    **options: object,
+    recording: Recording, data: Correspondences | None = None, *, detector: Callable | None = None, **options: object
 ) -> Assessment:  # fmt: skip
     """Calibrate, diagnose, look at the detector's health and at a witness, and judge.
 
@@ -47,7 +45,7 @@ def assess(
 
     Args:
         data: Its correspondences (detected, labelled); None runs the detector, the one that ships if none is given.
-        detector: The one that made `data`; with it `looks` frames are looked at again, mirrored and shifted.
+        detector: The one that made `data`; with it some frames are looked at again, mirrored and shifted.
         options: Of `lib.calibration.calibrate`, such as model="near_affine".
     """
     if data is None:
@@ -64,9 +62,69 @@ def assess(
         data, calibration, kinematics=recording.kinematics, readout_s=recording.readout_s,
         image_size_px=recording.image_size_px,
     )  # fmt: skip
-    found = health(recording, data, calibration, detector=detector, looks=looks)
+    found = health(recording, data, calibration, detector=detector)
     verdict = judge(
         data, calibration, diagnosis=diagnosis, health=found, epipolar_px=epipolar_px, error=error,
         robot_accuracy_mm=recording.robot_accuracy_mm, doubts=recording.doubts,
     )  # fmt: skip
     return Assessment(data, calibration, verdict, diagnosis, found, epipolar_px)
+
+
+def report(
+    calibration: Calibration, *, verdict: Verdict | None = None, robot_accuracy_mm: float | None = None, longest: int = 10
+) -> str:
+    """Several lines of text, with at most `longest` outliers, largest residual first.
+
+    Args:
+        verdict: Of `lib.trust.assess`; None judges by the calibration's own numbers alone.
+        robot_accuracy_mm: As its maker states it (`Recording.robot_accuracy_mm`).
+    """
+    verdict = judge(None, calibration, robot_accuracy_mm=robot_accuracy_mm) if verdict is None else verdict
+    c, seen = calibration, np.isfinite(calibration.residuals_px[:, ::2])
+    outliers = np.argwhere(seen & ~c.view_inliers)
+    rows, used, usable = len(c.inliers), int(c.inliers.sum()), int(c.usable.sum())
+    value, freedom = c.chi_square
+    left_out = "" if usable == rows else f", {rows - usable} without a detection, position or axes"
+    extent = np.sqrt(np.maximum(np.linalg.eigvalsh(np.cov(c.x_mm[c.inliers].T))[::-1], 0.0))
+    lines = [
+        str(verdict),
+        f"Calibration: model {c.model}, weighting {c.weighting}, {len(c.parameter_names)} parameters",
+        f"  rows          {used} of {rows} used{left_out}; they count as {c.effective_rows:.0f} independent ones",
+        f"  detections    {c.view_inliers.sum()} of {seen.sum()} used, {len(outliers)} outliers "
+        f"({100 * len(outliers) / seen.sum():.0f} %)",
+        f"  noise         sigma_u {c.sigma_u_px:.2f} px, sigma_x {1e3 * c.sigma_x_mm:.1f} um",
+        f"  reprojection  {c.reprojection_rms_px:.2f} px RMS, {c.press_rms_px:.2f} px cross-validated (leave one out)",
+        f"  chi-square    {value:.0f} for {freedom} degrees of freedom",
+        f"  volume        {extent[0]:.2f} x {extent[1]:.2f} x {extent[2]:.2f} mm RMS",
+    ]
+    for name, resection in zip(["left", "right"] if c.rig else ["camera"], c.resections(), strict=True):
+        (zoom_x, skew), (_, zoom_y) = resection.K
+        at = ", ".join(f"{value:.3f}" for value in resection.t)
+        lines.append(f"  {name:12s}  zoom {zoom_x:.3f} x {zoom_y:.3f} px/mm, skew {skew:.3f} px/mm, offset ({at}) mm")
+    distance, sd = c.inverse_distance_per_mm
+    if sd > 0:
+        far = "not distinguishable from affine" if abs(distance) < 3 * sd else f"working distance {1 / distance:.0f} mm"
+        lines.append(f"  1/distance    {distance:.5f} +- {sd:.5f} per mm: {far}")
+    if c.rig is not None:
+        o, x = optics(c), c.x_mm[c.inliers]
+        alone, both = (1e3 * np.median(c.depth_sd_mm(x, detection=detection)) for detection in (False, True))
+        at = ", ".join(f"{value:.1f}" for value in o.robot_from_microscope.t)
+        lines.append(
+            f"  head          convergence {np.rad2deg(o.convergence_rad):.2f} deg, right image rolled by "
+            f"{np.rad2deg(o.roll_rad):.2f} deg, mirrored: {o.mirrored}; the images' centre is ({at}) mm"
+        )
+        lines.append(f"  depth         {both:.0f} um sd of one detected point, of which the calibration {alone:.1f} um")
+    if c.offsets is not None:
+        scale, unit = (1e3, "um along, across, normal") if c.offsets.offset.shape[1] == 3 else (1.0, "px, left and right")
+        lines.append(f"  offsets       p = {c.offsets.p_value:.2g} without any; {unit}:")
+        for k, (values, sds) in enumerate(zip(c.offsets.offset, c.offsets.standard_deviation, strict=True)):
+            name = LANDMARKS[k] if k < len(LANDMARKS) else f"landmark {k}"
+            numbers = [f"{scale * v:.1f} +- {scale * s:.1f}" for v, s in zip(values, sds, strict=True)]
+            lines.append(f"    {name:10s}  {', '.join(numbers)}")
+    if outliers.size:
+        distance = np.linalg.norm(c.residuals_px.reshape(rows, -1, 2)[tuple(outliers.T)], axis=1)
+        lines.append(f"Outliers (row: residual), {min(longest, len(outliers))} of {len(outliers)}")
+        sides = ("left", "right") if c.rig else ("",)
+        worst = [(*outliers[i], distance[i]) for i in np.argsort(-distance)[:longest]]
+        lines += [f"  {row:6d}: {size:.1f} px {sides[side]}".rstrip() for row, side, size in worst]
+    return "\n".join(lines)

@@ -12,12 +12,12 @@ from jinja2 import Environment, FileSystemLoader
 
 from lib import files, paths
 from lib.calibration import estimate_time_offset
-from lib.correspondences import LANDMARKS, Correspondences, of_recording
+from lib.correspondences import LANDMARKS, of_recording
 from lib.landmarks import Detector, detect
 from lib.provenance import plain
 from lib.recordings import Recording
-from lib.trust.assessment import Assessment, assess
-from lib.trust.report import report
+from lib.trust.assessment import Assessment, assess, report
+from lib.trust.verdict import LEVELS
 
 __all__ = ["Check", "check", "main"]
 
@@ -91,13 +91,12 @@ class Check:
             scale = _SHOWN_PX / image.shape[1]
             picture = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
             for k, row in enumerate(rows.landmark):
-                colour = _COLOURS[row % 3].tolist()
-                if seen[k]:
-                    cv2.circle(picture, _whole(u[k] * scale), 9, (255, 255, 255), 3, cv2.LINE_AA)
-                    cv2.circle(picture, _whole(u[k] * scale), 9, colour, 2, cv2.LINE_AA)
-                if robot is not None and np.isfinite(robot[k]).all() and np.abs(robot[k]).max() < 1e5:
-                    cv2.drawMarker(picture, _whole(robot[k] * scale), (255, 255, 255), cv2.MARKER_CROSS, 18, 3, cv2.LINE_AA)
-                    cv2.drawMarker(picture, _whole(robot[k] * scale), colour, cv2.MARKER_CROSS, 18, 2, cv2.LINE_AA)
+                for colour, width in ((255, 255, 255), 3), (_COLOURS[row % 3].tolist(), 2):
+                    if seen[k]:
+                        cv2.circle(picture, np.rint(u[k] * scale).astype(int), 9, colour, width, cv2.LINE_AA)
+                    if robot is not None and np.abs(robot[k]).max() < 1e5:  # not NaN
+                        at = np.rint(robot[k] * scale).astype(int)
+                        cv2.drawMarker(picture, at, colour, cv2.MARKER_CROSS, 18, width, cv2.LINE_AA)
             images.append(picture)
         return np.hstack([images[0], np.full((len(images[0]), 6, 3), 255, np.uint8), images[1]])
 
@@ -138,24 +137,21 @@ def check(recording: str | Path | Recording, *, detector: Callable | None = None
     """
     found = recording if isinstance(recording, Recording) else Recording.open(recording, truth=False)
     frames = np.unique(np.linspace(0, len(found) - 1, min(_MOST_FRAMES, len(found))).round().astype(int))
-    if found.skeleton != LANDMARKS:
-        detector, data = None, _labels(found)
-    else:
+    if found.skeleton == LANDMARKS:
         detector = detector or Detector.load()
         data = detect(found, detector, frames=frames)
-    assessment = assess(found, data, detector=detector)
-    made = Check(found, assessment, _facts(found, assessment), _next_step(found, assessment))
+    elif (marks := found.annotations) is not None:
+        detector, data = None, of_recording(found, marks.u_left, marks.u_right)
+    else:
+        raise ValueError(f"{found.folder}: the detector knows {', '.join(LANDMARKS)} only, and there are no annotations.")
+    a = assess(found, data, detector=detector)
+    next_step = f"Use it: `python3 -m lib run -p recording {paths.shown(found.folder)}`."
+    if a.verdict.level != LEVELS[0]:
+        next_step = a.verdict.reasons[0].cure if a.diagnosis.best is None else a.diagnosis.best.cure
+    made = Check(found, a, _facts(found, a), next_step)
     if folder is not None:
         made.write(folder)
     return made
-
-
-def _labels(recording: Recording) -> Correspondences:
-    """The labels of a recording whose landmarks the detector does not know."""
-    marks = recording.annotations
-    if marks is None:
-        raise ValueError(f"{recording.folder}: the detector knows {', '.join(LANDMARKS)} only, and there are no annotations.")
-    return of_recording(recording, marks.u_left, marks.u_right)
 
 
 def _facts(recording: Recording, a: Assessment) -> dict[str, str]:
@@ -189,27 +185,12 @@ def _facts(recording: Recording, a: Assessment) -> dict[str, str]:
         parts = ["{}: {:+.0f}, {:+.0f}, {:+.0f} um".format(name, *value) for name, value in offsets]
         facts["landmark offsets"] = "; ".join(parts) + " (along, across, normal)."
     facts["detector"] = (
-        f"{100 * a.health.unhealthy:.0f} % of the landmarks found contradict themselves, the other image or the robot; "
-        f"{int((a.health.score > 1).sum())} of {len(a.health.frame)} frames have a score above 1 (of frames with right "
-        f"landmarks {100 * a.health.false_alarm_rate:.0f} %)."
+        f"{a.health.text}; {int((a.health.score > 1).sum())} of {len(a.health.frame)} frames have a score above 1 (of frames "
+        f"with right landmarks {100 * a.health.false_alarm_rate:.0f} %)."
     )
     if np.isfinite(a.epipolar_px):
         facts["epipolar witness"] = f"Features of both images lie {a.epipolar_px:.2f} px (median) off the epipolar lines."
     return facts
-
-
-def _next_step(recording: Recording, a: Assessment) -> str:
-    """The one thing to do now."""
-    where = paths.shown(recording.folder)
-    if a.verdict.level == "trustworthy":
-        return f"Use it: `python3 -m lib run -p recording {where}`."
-    if a.diagnosis.best is not None:
-        return a.diagnosis.best.cure
-    return a.verdict.reasons[0].cure
-
-
-def _whole(u: np.ndarray) -> tuple[int, int]:
-    return round(float(u[0])), round(float(u[1]))
 
 
 def _data_uri(image: np.ndarray, suffix: str) -> str:
@@ -225,8 +206,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--detector", metavar="FILE", help="weights (default: those that ship)")
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="of check.html and check.json (default: runs/check-NAME)")
     a = parser.parse_args(argv)
-    detector = Detector.load(a.detector) if a.detector else None
-    found = check(a.recording, detector=detector)
+    found = check(a.recording, detector=Detector.load(a.detector) if a.detector else None)
     page = found.write(a.out or paths.RUNS / f"check-{a.recording.resolve().name}")
     print(f"{found.assessment.verdict}\nNext: {found.next_step}\nReport: {page}")
     return 0

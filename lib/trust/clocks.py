@@ -14,15 +14,6 @@ __all__ = ["TIME_TESTS"]
 _RATES = (-1.0, 0.5, 24 / 30, 25 / 30, 24 / 25, 25 / 24, 30 / 25, 30 / 24, 2.0)
 
 
-def _at(case: Case, shift: float | np.ndarray, views: tuple[int, ...]) -> tuple[Problem, np.ndarray]:
-    """The rows with the robot's positions `shift` seconds later for some views, and their velocities (n, 2, 3)."""
-    x, velocity = case.problem.x.copy(), np.zeros_like(case.problem.x)
-    for view in views:
-        x[:, view], velocity[:, view] = case.track.moved(case.problem.x[:, view], shift), case.track.velocity(shift)
-    x[~np.isfinite(velocity)] = np.nan
-    return case.problem.moved(x), velocity
-
-
 def _image_of(direction: np.ndarray, *factors: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
     """Columns that move positions along `direction` (n, 2, 3) mm, times 1 and times each of `factors` (n,)."""
 
@@ -65,10 +56,14 @@ def _refined(
     case: Case, shift: float, views: tuple[int, ...], rate: float | None = None
 ) -> tuple[Robust, Problem, np.ndarray, np.ndarray] | None:
     """Gauss-Newton on the shift of the clock (and its rate): the fit, its rows, values and standard deviations."""
-    time = case.problem.time - np.median(case.problem.time)
+    time, views = case.problem.time - np.median(case.problem.time), list(views)
     value, M = np.array([shift] if rate is None else [shift, rate - 1.0]), None
     for _ in range(6):
-        problem, velocity = _at(case, value[0] + (0.0 if rate is None else value[1] * time), views)
+        later = value[0] + (0.0 if rate is None else value[1] * time)
+        x, velocity = case.problem.x.copy(), np.zeros_like(case.problem.x)
+        x[:, views] = case.track.moved(case.problem.x[:, 0], later)[:, None]
+        velocity[:, views] = case.track.velocity(later)[:, None]
+        problem = case.problem.moved(np.where(np.isfinite(velocity), x, np.nan))
         if problem.used.all(axis=1).sum() < 6:
             return None
         fit = problem.fit(_image_of(velocity, *([] if rate is None else [time])), start=M, seed=case.seed)

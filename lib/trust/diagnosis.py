@@ -9,13 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from lib.calibration import Calibration
-from lib.correspondences import Correspondences
+from lib.correspondences import TRAIN_FURTHER, Correspondences
 from lib.recordings import Kinematics
 from lib.trust.case import Case, Hypothesis
 from lib.trust.clocks import TIME_TESTS
 from lib.trust.fitting import Problem
 from lib.trust.hypotheses import TESTS, unexplained
-from lib.trust.optics import optical_faults
 
 __all__ = ["Diagnosis", "diagnose"]
 
@@ -69,10 +68,10 @@ def diagnose(
         if len(data) < 12:
             return Diagnosis()
         text = f"Only {problem.used.all(axis=1).sum()} of {len(data)} rows have both images and the robot's report."
-        cure = "The detector does not fit these pictures: look at its overlays, adapt it (python3 -m lib adapt RECORDING)."
+        cure = f"The detector does not fit these pictures: look at its overlays, {TRAIN_FURTHER}."
         return Diagnosis((Hypothesis("detector_unfit", text, cure, 100.0, 0.0, "%", 1.0, float(len(data))),))
     case = Case(problem, kinematics, readout_s, image_size_px, seed)
-    found = [h for test in (*TIME_TESTS, *TESTS) for h in test(case)] + list(optical_faults(problem, case.null))
+    found = [h for test in (*TIME_TESTS, *TESTS) for h in test(case)]
     found = sorted((h for h in found if np.isfinite(h.gain)), key=lambda h: -h.gain)
     best = Diagnosis(tuple(found)).best
     found += unexplained(case, case.null if best is None else case.fits.get(best.name, case.null))

@@ -2,16 +2,23 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 
-from lib.correspondences import LANDMARKS
+from lib.calibration.checks import eyes_exchanged, sides
+from lib.correspondences import LANDMARKS, TRAIN_FURTHER
 from lib.trust.case import SIDES, Case, Hypothesis
 from lib.trust.fitting import Robust
+from lib.trust.health import affine_epipolar
 
 __all__ = ["TESTS", "unexplained"]
 
 _ROBOT_MM = 0.04  # a robot for eye surgery is better
+#: Standard deviations of a camera's skew and log pixel aspect.
+_SKEW_SD, _ASPECT_SD = 0.002, 0.003
+#: A common log aspect above this is no lens: the images were resized, and their aspect is free.
+_RESIZED = 0.1
 
 
 def _tip_order(case: Case) -> Iterator[Hypothesis]:
@@ -24,15 +31,13 @@ def _tip_order(case: Case) -> Iterator[Hypothesis]:
         ((0, 2, 1), (0, 1)), ((0, 2, 1), (0,)), ((0, 2, 1), (1,)), ((1, 0, 2), (0, 1)), ((2, 1, 0), (0, 1)),
         ((1, 2, 0), (0, 1)), ((2, 0, 1), (0, 1)),
     ):  # fmt: skip
-        x, other = problem.x.copy(), table[problem.frame, np.array(order)[problem.landmark]]
-        for view in views:
-            x[:, view] = other
+        x = problem.x.copy()
+        x[:, list(views)] = table[problem.frame, np.array(order)[problem.landmark]][:, None]
         moved = problem.moved(x)
         if moved.used.all(axis=1).sum() < 6:
             continue
-        where = "both images" if len(views) == 2 else f"the {SIDES[views[0]]} image"
-        text = f"What {where} call {', '.join(LANDMARKS)} is {', '.join(LANDMARKS[k] for k in order)} for the robot."
-        text = text if len(views) == 2 else text.replace(" call ", " calls ")
+        where, call = ("both images", "call") if len(views) == 2 else (f"the {SIDES[views[0]]} image", "calls")
+        text = f"What {where} {call} {', '.join(LANDMARKS)} is {', '.join(LANDMARKS[k] for k in order)} for the robot."
         cure = f"Bring the columns of kinematics.csv, or the detections of {where}, into one order."
         yield case.found("tip_order", moved.fit(seed=case.seed), 1, 1.0, 0.0, "", text, cure, on=moved)
     swapped = table[:, [0, 2, 1]][problem.frame, problem.landmark]  # frame by frame: one bit each
@@ -150,12 +155,9 @@ def _camera_moved(case: Case) -> Iterator[Hypothesis]:
         G = columns(frame, views)
         return problem.fit(lambda M: G, start=case.null.M, rounds=rounds)
 
-    tried: dict[int, float] = {}
-
+    @cache
     def gain(frame: int) -> float:
-        if frame not in tried:
-            tried[frame] = fitted(frame, rounds=8).total
-        return tried[frame]
+        return fitted(frame, rounds=8).total
 
     frame, step = max(np.unique(np.linspace(0.12, 0.88, 9) * case.frames).astype(int), key=gain), max(case.frames // 20, 1)
     while step:
@@ -196,31 +198,26 @@ def _frozen(case: Case) -> Iterator[Hypothesis]:
     straight = np.append((change >= 0) & (change < 2e-3), False)
     straight = np.convolve(straight, np.ones(3), "same") == 3  # five frames on one line
     straight = np.convolve(straight, np.ones(3), "same") > 0
-    for name, repeated, text, cure in (
-        (
-            "frozen_kinematics", (step_y > 0) & (straight | ((step_x >= 0) & (step_x < 1e-9))),
-            "the robot's positions stand still, or run on an exact straight line, while the tool moves in the images",
-            "Log the robot at every sample; where it was silent leave the cells blank, so that these frames are not used.",
-        ),
-        (
-            "frozen_video", (step_x > 1e-6) & (step_y >= 0) & (step_y < 0.15 * case.null.shapes[0].scale),
-            "the detections repeat those of the frame before while the robot moves",
-            "Drop images that the camera delivered twice, and give the others their own times in frames.csv.",
-        ),
-    ):  # fmt: skip
-        if repeated.mean() < 0.02 or repeated.all():
-            continue
-        if name == "frozen_video":  # each image belongs to the instant at which it was first seen
-            first = np.append(True, ~repeated)
-            source = np.maximum.accumulate(np.where(first, np.arange(case.frames), 0))[problem.frame]
-            first_x = x[source, np.minimum(problem.landmark, 2)]
-            fit = problem.moved(np.repeat(first_x[:, None], 2, axis=1)).fit(start=case.null.M)
-        else:
-            fit, _ = _own_noise(case, np.isin(problem.frame, np.flatnonzero(repeated) + 1))
+
+    def certain(name: str, fit: Robust, repeated: np.ndarray, text: str, cure: str) -> Hypothesis:
         share = 100.0 * float(repeated.mean())
         found = case.found(name, fit, 2, share, 0.0, "%", f"In {share:.0f} % of the frames {text}.", cure)
-        certain = float(repeated.sum() * np.log(100.0))  # noise repeats no number
-        yield replace(found, gain=max(found.gain, 0.0) + certain, explained=max(found.explained, share / 100))
+        gain = max(found.gain, 0.0) + float(repeated.sum() * np.log(100.0))  # noise repeats no number
+        return replace(found, gain=gain, explained=max(found.explained, share / 100))
+
+    frozen = (step_y > 0) & (straight | ((step_x >= 0) & (step_x < 1e-9)))
+    if frozen.mean() >= 0.02 and not frozen.all():
+        text = "the robot's positions stand still, or run on an exact straight line, while the tool moves in the images"
+        cure = "Log the robot at every sample; where it was silent leave the cells blank, so that these frames are not used."
+        fit, _ = _own_noise(case, np.isin(problem.frame, np.flatnonzero(frozen) + 1))
+        yield certain("frozen_kinematics", fit, frozen, text, cure)
+    twice = (step_x > 1e-6) & (step_y >= 0) & (step_y < 0.15 * case.null.shapes[0].scale)
+    if twice.mean() >= 0.02 and not twice.all():  # each image belongs to the instant at which it was first seen
+        source = np.maximum.accumulate(np.where(np.append(True, ~twice), np.arange(case.frames), 0))[problem.frame]
+        fit = problem.moved(np.repeat(x[source, np.minimum(problem.landmark, 2)][:, None], 2, axis=1)).fit(start=case.null.M)
+        text = "the detections repeat those of the frame before while the robot moves"
+        cure = "Drop images that the camera delivered twice, and give the others their own times in frames.csv."
+        yield certain("frozen_video", fit, twice, text, cure)
 
 
 def _most(sizes: np.ndarray) -> np.ndarray:
@@ -254,6 +251,83 @@ def _rigid_tips(case: Case) -> Iterator[Hypothesis]:
     yield case.found("rigid_tips", fit, 1, size, 0.0, "mm", text, cure, raw=raw)
 
 
+def _linear(case: Case) -> tuple[np.ndarray, np.ndarray] | None:
+    """A (2, 2, 3) of the cameras and the covariance (12, 12) of its entries; None where the rows do not tell it."""
+    rows = [8 * c + 4 * i + j for c in range(2) for i in range(2) for j in range(3)]
+    A, covariance = case.null.M[:, :, :3], case.null.camera_covariance[np.ix_(rows, rows)]
+    few = 2 * case.problem.used.sum() < 40
+    if few or not np.isfinite(covariance).all() or min(np.linalg.svd(a, compute_uv=False)[1] for a in A) < 1e-6:
+        return None
+    return A, covariance
+
+
+def _constraints(A: np.ndarray) -> np.ndarray:
+    """(..., 4) skew of the left and right camera, log aspects, of A (..., 2, 2, 3): all 0 for square pixels."""
+    size = np.linalg.norm(A, axis=-1)
+    skew = (A[..., 0, :] * A[..., 1, :]).sum(axis=-1) / size.prod(axis=-1)
+    return np.concatenate([skew, np.log(size[..., 0] / size[..., 1])], axis=-1)
+
+
+def _scaled_axis(case: Case) -> Iterator[Hypothesis]:
+    """A robot axis of the wrong scale, which an affine camera absorbs: pixels would be neither square nor without skew."""
+    if (known := _linear(case)) is None:
+        return
+    A, covariance = known
+    tolerance = np.diag(np.square([_SKEW_SD, _SKEW_SD, _ASPECT_SD, _ASPECT_SD]))
+    if abs(_constraints(A)[2:].mean()) > _RESIZED:
+        tolerance[2:, 2:] += 1.0
+    step = 1e-6 * np.abs(A).max()
+    near = step * np.eye(12).reshape(12, 2, 2, 3)
+
+    def misfit(scale: np.ndarray) -> float:
+        found = _constraints(A * scale)
+        J = (_constraints((A + near) * scale) - found).T / step
+        return float(found @ np.linalg.solve(J @ covariance @ J.T + tolerance, found))
+
+    none = misfit(np.ones(3))
+    logs = np.log(12.0) * np.linspace(-1, 1, 161)
+    for axis in range(3):
+        values = np.array([misfit(np.exp(log * np.eye(3)[axis])) for log in logs])
+        best = int(values.argmin())
+        log, spacing = logs[best], logs[1] - logs[0]
+        three = values[max(best - 1, 0) : best + 2]
+        bend = (three[0] - 2 * three[1] + three[2]) / spacing**2 if len(three) == 3 else 0.0
+        if bend > 0:
+            log += 0.5 * (three[0] - three[2]) / bend / spacing
+        sd = float(np.sqrt(2.0 / bend)) if bend > 0 else np.inf
+        scale = float(np.exp(-log))  # A times s is plausible, so the robot's numbers are 1/s too small
+        name, gain = "xyz"[axis], 0.5 * (none - values[best]) - 1.5
+        text = f"The cameras' pixels are skewed or oblong, and square if the robot's {name} is divided by {1 / scale:.3f}."
+        cure = f"Check the units and the scale of the {name} columns of kinematics.csv."
+        explained = 1.0 - float(values[best]) / max(none, 1e-9)
+        yield Hypothesis("scaled_axis", text, cure, 1 / scale, sd / scale, "times", explained, float(gain))
+
+
+def _exchanged(case: Case) -> Iterator[Hypothesis]:
+    """A left camera that stands on the right: exchanged eyes, or a mirrored axis."""
+    if (known := _linear(case)) is None:
+        return
+    (A, covariance), problem = known, case.problem
+    side, step = sides(A.reshape(4, 3))[0], 1e-6 * np.abs(A).max()
+    J = np.array([(sides((A.ravel() + step * e).reshape(4, 3))[0] - side) / step for e in np.eye(12)])
+    sd = float(np.sqrt(J @ covariance @ J))
+    if not eyes_exchanged(A.reshape(4, 3), sd):
+        return
+    view = np.cross(A, np.roll(A, -1, axis=1))[:, 0].sum(axis=0)  # away from the cameras, if nothing is mirrored
+    tips, base = problem.landmark > 0, problem.landmark == 0
+    depth = [np.nanmedian(problem.x[rows, 0] @ view) if rows.any() else np.nan for rows in (tips, base)]
+    degrees = np.rad2deg(-side)
+    size = float(degrees), float(np.rad2deg(sd)), "degrees", 1.0, float(0.5 * (side / sd) ** 2)
+    where = f"The left camera stands on the right, by {degrees:.1f} degrees"
+    if depth[0] <= depth[1]:
+        text = f"{where}, and the tool points at the cameras: an axis of the robot is mirrored."
+        cure = "Use a right-handed robot frame: negate one axis, or exchange two, in kinematics.csv."
+        yield Hypothesis("mirrored_axis", text, cure, *size)
+    else:
+        text = f"{where}, and the tool points away from the cameras: the images of the two eyes are exchanged."
+        yield Hypothesis("exchanged_eyes", text, "Exchange the folders left/ and right/ (or u_left and u_right).", *size)
+
+
 def unexplained(case: Case, fit: Robust) -> list[Hypothesis]:
     """Residuals that the best cause leaves: the two images disagree with each other (the detector) or with the robot."""
     problem = case.problem
@@ -264,7 +338,8 @@ def unexplained(case: Case, fit: Robust) -> list[Hypothesis]:
         return []
     length, distance = np.nanmedian(reach), np.linalg.norm(fit.residuals, axis=2)
     missed, zoom = float(np.median(distance[problem.used])), float(np.linalg.svd(fit.M[0, :, :3], compute_uv=False).mean())
-    epipolar, half = _epipolar(problem.y[problem.used.all(axis=1)].reshape(-1, 4)), problem.used.sum() / 2.0
+    distances = affine_epipolar(problem.y[problem.used.all(axis=1)].reshape(-1, 4))[0]  # NaN of few, which is no witness
+    epipolar, half = float(np.sqrt(2.0) * np.median(distances)), problem.used.sum() / 2.0
     if epipolar < 0.25 * missed and missed > _ROBOT_MM * zoom:
         text = f"The images agree with each other within {epipolar:.1f} px and miss the robot by {missed:.0f} px (medians)."
         cure = "The robot's report is not that of these frames, or coarse: check times, units and columns of kinematics.csv."
@@ -275,24 +350,11 @@ def unexplained(case: Case, fit: Robust) -> list[Hypothesis]:
         return []
     gain = half * (share * np.log(share / 0.05) + (1 - share) * np.log(max(1 - share, 1e-9) / 0.95))
     text = f"{100 * share:.0f} % of the landmarks lie more than 5 % of the tool's length from where a camera would see them."
-    cure = "The detector does not fit these pictures: look at its overlays, and adapt it (python3 -m lib adapt RECORDING)."
+    cure = f"The detector does not fit these pictures: look at its overlays, {TRAIN_FURTHER}."
     return [Hypothesis("detector_unfit", text, cure, 100 * share, 0.0, "%", share, float(gain))]
-
-
-def _epipolar(y: np.ndarray) -> float:
-    """Median epipolar distance of pixel pairs (n, 4), px: from the plane that most are near to, whatever the robot says."""
-    if len(y) < 12:
-        return np.inf
-    weight = np.ones(len(y))
-    for _ in range(30):
-        mean = np.average(y, axis=0, weights=weight)
-        normal = np.linalg.eigh((y - mean).T @ ((y - mean) * weight[:, None]))[1][:, 0]
-        distance2 = ((y - mean) @ normal) ** 2
-        weight = 1.0 / (np.median(distance2) + distance2 + 1e-9)
-    return float(np.sqrt(2.0 * np.median(distance2)))
 
 
 TESTS = (
     _tip_order, _finite_distance, _landmark_offset, _tool_bends, _bad_landmark, _bad_stretch, _camera_moved, _drift, _frozen,
-    _rigid_tips,
+    _rigid_tips, _scaled_axis, _exchanged,
 )  # fmt: skip

@@ -1,13 +1,13 @@
 """Verdicts: may a number of this recording be believed, why not, and what to do (all thresholds stand here)."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
 
 from lib.calibration import Calibration, NoConsensusError, optics
-from lib.correspondences import Correspondences, NoDetectionError
+from lib.correspondences import TRAIN_FURTHER, Correspondences, NoDetectionError
 from lib.recordings import Doubt
 from lib.trust.diagnosis import Diagnosis
 from lib.trust.health import Health
@@ -34,6 +34,8 @@ LIMITS: dict[str, tuple[float, float]] = {
     # Zoom of one camera over the other's, and along x over along y: optics of one microscope differ by some per cent.
     "zoom_ratio": (1.3, 2.0),
     "aspect": (1.08, 1.25),
+    # One image is a mirror image (1) or not (0).
+    "mirrored": (0.5, np.inf),
     # Standard deviations of a landmark's depth that the calibration adds to the detector's, at the edge of its own volume.
     "coverage": (1.5, np.inf),
     # Median epipolar distance of free matches, px, beyond three of its standard deviations: band matching fails from 6 px.
@@ -120,32 +122,33 @@ def judge(
         robot_accuracy_mm: As its maker states it; None is 10 um.
         doubts: Of the recording (`lib.recordings.Recording.doubts`).
     """
-    found = []
-    if diagnosis is not None and diagnosis.best is not None:
-        best = diagnosis.best
+    found: list[Reason] = []
+    if diagnosis is not None and (best := diagnosis.best) is not None:
         text = f"{best.text} It explains {100 * best.explained:.0f} % of the residuals."
-        found += _above("diagnosis", best.explained, text, best.cure, best.name)
+        found += _reason("diagnosis", best.explained, text, best.cure, best.name)
     if calibration is None:
         name = {NoDetectionError: "no_detection", NoConsensusError: "no_consensus"}.get(type(error), "refused")
         found.append(Reason(name, LEVELS[2], f"There is no calibration: {error}", f"{_OVERLAYS}."))
     else:
-        for check in _CHECKS:
-            found += check(data, calibration, 0.01 if robot_accuracy_mm is None else robot_accuracy_mm)
+        robot_mm = 0.01 if robot_accuracy_mm is None else robot_accuracy_mm
+        for finding in (*_residuals(data, calibration, robot_mm), *_geometry(calibration)):
+            found += _reason(*finding)
         if epipolar_px is not None and np.isfinite(epipolar_px):
-            beyond, limit = max(epipolar_px - 3.0 * _epipolar_sd_px(calibration), 0.0), LIMITS["epipolar"][0]
-            text = f"Features of both images lie {epipolar_px:.1f} px (median) off the epipolar lines; {limit:g} are allowed."
+            n, middle = calibration.pair.epipolar_normal, calibration.x_mm[calibration.inliers].mean(axis=0)
+            sd = np.sqrt(n @ calibration.projection_covariance(middle[None])[0] @ n)
+            text = f"Features of both images lie {epipolar_px:.1f} px (median) off the epipolar lines; "
+            text += f"{LIMITS['epipolar'][0]:g} are allowed."
             cure = "Did a camera move, or are left and right not of one instant? Calibrate anew."
-            found += _above("epipolar", beyond, text, cure)
+            found += _reason("epipolar", max(epipolar_px - 3.0 * sd, 0.0), text, cure)
     if health is not None:
-        text = f"{100 * health.unhealthy:.0f} % of the landmarks found contradict themselves, the other image or the robot"
-        text += f" (most often: {health.worst_part})."
-        cure = f"The detector may not know this tool or light. {_OVERLAYS}, then run `python3 -m lib adapt RECORDING`."
-        found += _above("health", health.unhealthy, text, cure, "detector_unfit")
+        text = f"{health.text} (most often: {health.worst_part})."
+        cure = f"The detector may not know this tool or light. {_OVERLAYS}, then {TRAIN_FURTHER}."
+        found += _reason("health", health.unhealthy, text, cure, "detector_unfit")
     found += [Reason(doubt.name, LEVELS[1], doubt.text, doubt.cure) for doubt in doubts]
     return Verdict.join([Verdict((reason,)) for reason in found])
 
 
-def _above(check: str, value: float, text: str, cure: str, name: str = "") -> list[Reason]:
+def _reason(check: str, value: float, text: str, cure: str, name: str = "") -> list[Reason]:
     """A reason where the value is beyond a limit of the check, on the side on which the second limit lies."""
     doubtful, red = LIMITS[check]
     sign = 1.0 if red > doubtful else -1.0
@@ -154,95 +157,66 @@ def _above(check: str, value: float, text: str, cure: str, name: str = "") -> li
     return [Reason(name or check, LEVELS[2] if sign * value > sign * red else LEVELS[1], text, cure)]
 
 
-def _residuals(data: Correspondences | None, c: Calibration, robot_mm: float) -> Iterator[Reason]:
-    claim = _claimed_px(c, robot_mm)
-    text = f"The residuals are {c.reprojection_rms_px:.1f} px RMS; detector and robot claim {claim:.1f} px."
-    cure = f"Read the diagnosis of {_CHECK}: clock, axes, order of tips, detector."
-    yield from _above("residuals", c.reprojection_rms_px / claim, text, cure)
-
-
-def _claimed_px(c: Calibration, robot_mm: float) -> float:
-    """RMS distance in an image that the detections' covariances and the robot's accuracy let expect, averaged over views."""
+def _residuals(data: Correspondences | None, c: Calibration, robot_mm: float) -> Iterator[tuple]:
+    """What `_reason` takes: how large the residuals are, and how many rows they are of."""
     used, variance = c.inliers, 2.0 * _LABEL_PX**2
     if c.covariance_px2 is not None:
         rows = c.covariance_px2 if len(c.covariance_px2) == 1 else c.covariance_px2[used]
         variance = 2.0 * float(np.nanmean(np.diagonal(rows, axis1=1, axis2=2))) / c.detector_scale**2
     gain = np.mean([(camera.jacobian(c.x_mm[used][:1]) ** 2).sum() for camera in c.cameras])
-    return float(np.sqrt(variance + gain * robot_mm**2))
+    claim = float(np.sqrt(variance + gain * robot_mm**2))  # RMS distance in an image, averaged over views
+    text = f"The residuals are {c.reprojection_rms_px:.1f} px RMS; detector and robot claim {claim:.1f} px."
+    cure = f"Read the diagnosis of {_CHECK}: clock, axes, order of tips, detector."
+    yield "residuals", c.reprojection_rms_px / claim, text, cure
 
-
-def _cross_validation(data: Correspondences | None, c: Calibration, robot_mm: float) -> Iterator[Reason]:
-    _, J, weight, _ = c.system
-    own = J @ np.linalg.inv(c.minimum.information) @ np.swapaxes(J, 1, 2) @ weight
     # What leaving a row out does to clean data: its residual grows by (1 - leverage)^-1/2.
-    expected = np.sqrt(np.mean(np.trace(np.linalg.inv(np.eye(own.shape[1]) - own), axis1=1, axis2=2) / own.shape[1]))
+    m = c.leverage.shape[1]
+    expected = np.sqrt(np.mean(np.trace(np.linalg.inv(np.eye(m) - c.leverage), axis1=1, axis2=2) / m))
     ratio = c.press_rms_px / max(c.reprojection_rms_px * expected**2, 1e-9)
     text = f"Rows left out are predicted with {c.press_rms_px:.3g} px, rows fitted with {c.reprojection_rms_px:.3g} px RMS."
-    cure = "A few rows decide everything: move the tool through the whole volume."
-    yield from _above("cross_validation", ratio, text, cure)
+    yield "cross_validation", ratio, text, "A few rows decide everything: move the tool through the whole volume."
 
-
-def _consensus(data: Correspondences | None, c: Calibration, robot_mm: float) -> Iterator[Reason]:
     usable = int(np.isfinite(c.residuals_px).sum()) // 2
-    share = c.view_inliers.sum() / usable
+    share = float(c.view_inliers.sum() / usable)
     text = f"Only {100 * share:.0f} % of the {usable} detections agree on the cameras."
-    cure = f"{_OVERLAYS}: the other detections are wrong, or these are."
-    yield from _above("consensus", float(share), text, cure, "minority")
+    yield "consensus", share, text, f"{_OVERLAYS}: the other detections are wrong, or these are.", "minority"
 
-
-def _rows(data: Correspondences | None, c: Calibration, robot_mm: float) -> Iterator[Reason]:
     cure = "Record more frames, with the tool in other places."
     text = f"The rows that agree count as {c.effective_rows:.0f} of independent errors; {LIMITS['rows'][0]:g} are needed."
-    yield from _above("rows", c.effective_rows + 1e-9, text, cure, "few_rows")
-    if data is None:
-        return
-    frames = len(np.unique(data.frame[c.inliers]))
-    text = f"{frames} frames have landmarks that agree; {LIMITS['frames'][0]:g} are needed, 30 are good."
-    yield from _above("frames", frames + 1e-9, text, cure, "few_frames")
+    yield "rows", c.effective_rows + 1e-9, text, cure, "few_rows"
+    if data is not None:
+        frames = len(np.unique(data.frame[used]))
+        text = f"{frames} frames have landmarks that agree; {LIMITS['frames'][0]:g} are needed, 30 are good."
+        yield "frames", frames + 1e-9, text, cure, "few_frames"
 
 
-def _geometry(data: Correspondences | None, c: Calibration, robot_mm: float) -> Iterator[Reason]:
-    zooms = np.array([np.diag(resection.K) for resection in c.resections()])
+def _geometry(c: Calibration) -> Iterator[tuple]:
+    """What `_reason` takes: the optics that follow from the cameras, and the volume that the tool covered."""
+    zooms, name = np.array([np.diag(resection.K) for resection in c.resections()]), "implausible_optics"
     cure = "Check axes and units of the kinematics, the order of the tips, and which image is left."
     aspect = float(np.exp(np.abs(np.log(zooms[:, 0] / zooms[:, 1])).max()))
     text = f"A camera's zoom differs by a factor of {aspect:.2f} between x and y; pixels are square within some per cent."
-    yield from _above("aspect", aspect, text, cure, "implausible_optics")
+    yield "aspect", aspect, text, cure, name
     if c.rig is None:
         return
     ratio = float(np.exp(np.abs(np.diff(np.log(zooms).mean(axis=1)))[0]))
-    text = f"One camera's zoom is {ratio:.2f} times the other's."
-    yield from _above("zoom_ratio", ratio, text, cure, "implausible_optics")
-    found, angle = optics(c), np.rad2deg(c.rig.convergence_rad)
+    yield "zoom_ratio", ratio, f"One camera's zoom is {ratio:.2f} times the other's.", cure, name
+    angle = np.rad2deg(c.rig.convergence_rad)
     text = f"The cameras converge by {min(angle, 180 - angle):.1f} degrees; a stereo microscope's by 2 to 20."
-    yield from _above("convergence_high", min(angle, 180 - angle), text, cure, "implausible_optics")
+    yield "convergence_high", min(angle, 180 - angle), text, cure, name
     if angle < 90:
-        yield from _above("convergence_low", angle, text, "Are left and right two different cameras?", "implausible_optics")
-    if found.mirrored in ("left", "right", "left or right"):
-        text = f"One image is a mirror image ({found.mirrored}), or an axis of the kinematics is."
-        yield Reason("mirrored", LEVELS[1], text, "Flip that image when recording, or exchange the sign of the axis.")
+        yield "convergence_low", angle, text, "Are left and right two different cameras?", name
+    mirrored = optics(c).mirrored
+    text = f"One image is a mirror image ({mirrored}), or an axis of the kinematics is."
+    cure = "Flip that image when recording, or exchange the sign of the axis."
+    yield "mirrored", mirrored in ("left", "right", "left or right"), text, cure
 
-
-def _coverage(data: Correspondences | None, c: Calibration, robot_mm: float) -> Iterator[Reason]:
-    if c.rig is None:
-        return
     x = c.x_mm[c.inliers]
     along = np.linalg.svd(x - x.mean(axis=0))[2]
     low, high = np.percentile((x - x.mean(axis=0)) @ along.T, [5, 95], axis=0)
     corners = x.mean(axis=0) + np.stack(np.meshgrid(*np.stack([low, high]).T), axis=-1).reshape(-1, 3) @ along
     alone, both = (c.depth_sd_mm(corners, detection=detection).max() for detection in (False, True))
-    added = alone / np.sqrt(max(both**2 - alone**2, 1e-12))
     sizes = " x ".join(f"{value:.1f}" for value in high - low)
     text = f"The tool covers {sizes} mm: the calibration itself leaves {1e3 * alone:.0f} um of depth open at its corners."
     cure = "Move the tool through more depths and corners (`lib.calibration.next_positions`)."
-    yield from _above("coverage", float(added), text, cure)
-
-
-def _epipolar_sd_px(c: Calibration) -> float:
-    """Standard deviation of the epipolar distance at the middle of the data, from the calibration alone."""
-    n = c.pair.epipolar_normal
-    return float(np.sqrt(n @ c.projection_covariance(c.x_mm[c.inliers].mean(axis=0)[None])[0] @ n))
-
-
-_CHECKS: tuple[Callable[[Correspondences | None, Calibration, float], Iterable[Reason]], ...] = (
-    _residuals, _cross_validation, _consensus, _rows, _geometry, _coverage,
-)  # fmt: skip
+    yield "coverage", float(alone / np.sqrt(max(both**2 - alone**2, 1e-12))), text, cure

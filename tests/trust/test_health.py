@@ -8,7 +8,7 @@ from lib.calibration import calibrate
 from lib.correspondences import LANDMARKS, Correspondences
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
 from lib.trust import health
-from lib.trust.epipolar import affine_epipolar
+from lib.trust.health import affine_epipolar
 
 TOOL_MM = np.array([[0.0, 0.0, 0.0], [3.0, -0.5, 0.0], [3.0, 0.5, 0.0]])
 
