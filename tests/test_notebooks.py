@@ -148,7 +148,7 @@ N_FRAMES, SHRINK, BLANK_FRAME = 6, 4, 2
 
 
 class Seer:
-    """Finds the landmarks where they are in the frame whose number stands in the image's corner."""
+    """Finds the landmarks where they are in the frame whose number stands in the image's corner, mirrored or shifted too."""
 
     metadata, networks = {}, {}
 
@@ -161,8 +161,13 @@ class Seer:
     def __call__(self, images: np.ndarray) -> Landmarks:
         if not self.sighted:
             return Landmarks.none(len(images))
-        frame = round(images[0, :8, :8].mean() / 20)
-        return Landmarks(self.u[frame], np.tile(0.01 * np.eye(2), (2, 3, 1, 1)), np.full((2, 3), 0.9))
+        mirrored = images[0, :8, :8].std() > 0
+        image = images[0, :, ::-1] if mirrored else images[0]
+        y, x = (np.flatnonzero(image.any(axis=axes))[0] for axes in ((1, 2), (0, 2)))
+        u = self.u[round(image[y : y + 8, x : x + 8].mean() / 20) - 1] + (x, y)
+        if mirrored:
+            u = np.stack([images.shape[2] - 1 - u[..., 0], u[..., 1]], axis=-1)[:, [0, 2, 1]]
+        return Landmarks(u, np.tile(0.01 * np.eye(2), (2, 3, 1, 1)), np.full((2, 3), 0.9))
 
     def track(self, images: np.ndarray, previous: Landmarks) -> Landmarks:
         return self(images)
@@ -182,7 +187,7 @@ def small(tmp_path_factory) -> Path:
             frame = source.frames[number]
             pair = [cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (frame.left, frame.right)]
             for image in pair:
-                image[:8, :8] = 20 * number
+                image[:8, :8] = 20 * (number + 1)
             writer.add(*pair, time_s=frame.time_s)
         writer.kinematics(time_s, x)
     return folder
