@@ -144,7 +144,11 @@ def tool_offsets(
     if pixels.size < 4 * m + 3 * q:
         raise ValueError(f"u: {len(pixels)} detections are too few for {q} vectors of the tool and the cameras.")
     scale = t.std()
-    offset = _lifted_start(R, t / scale, pixels, own) * scale
+    # The start: the problem in A, B_k = A (x) p_k and o is linear; least squares restore the rank of B_k.
+    lifted = (own[:, :, None] * R.reshape(-1, 1, 9)).reshape(-1, 9 * q)
+    solution = np.linalg.lstsq(np.hstack([t / scale, np.ones((len(t), 1)), lifted]), pixels, rcond=1e-6)[0]
+    A, B = solution[:3].T, solution[4:].reshape(q, 3, 3, -1)  # B: vector, row of R (with A), column (with p), pixel
+    offset = np.einsum("kijm,mi->kj", B, A) / (A**2).sum() * scale
     for _ in range(iterations):
         x = np.einsum("nij,nj->ni", R, own @ offset) + t
         matrix = affine_minimum(Moments.of(x, pixels), 1.0, 0.0).matrix
@@ -190,16 +194,3 @@ def _check_determined(covariance_mm2: np.ndarray) -> None:
             f"robot_from_tool: the motion leaves an offset open by {np.sqrt(np.abs(variance).max()):.2g} mm; turn the tool "
             "further, about two axes, or give more poses."
         )
-
-
-def _lifted_start(R: np.ndarray, t: np.ndarray, y: np.ndarray, own: np.ndarray) -> np.ndarray:
-    """Vectors (k, 3) of the tool, `own` (n, k) of each in a row, from the linear problem in A, B_k = A (x) p_k and o.
-
-    The rank of B_k is restored by least squares.
-    """
-    n, k = own.shape
-    lifted = (own[:, :, None] * R.reshape(n, 1, 9)).reshape(n, 9 * k)
-    solution = np.linalg.lstsq(np.hstack([t, np.ones((n, 1)), lifted]), y, rcond=1e-6)[0]
-    A = solution[:3].T  # (m, 3)
-    B = solution[4:].reshape(k, 3, 3, -1)  # landmark, row of R (pairs with A), column of R (pairs with p), pixel
-    return np.einsum("kijm,mi->kj", B, A) / (A**2).sum()

@@ -118,10 +118,11 @@ def _robot(folder: Path, paths: dict[str, Path]) -> tuple[list[tuple], tuple[str
     unit = unit or next((u for u, scale in units.items() if _STEP_S[0] <= step * scale <= _STEP_S[1]), "s")
     lengths = [u for u, scale in (("mm", 1), ("m", 1e3), ("um", 1e-3)) if _REACH_MM[0] <= reach * scale <= _REACH_MM[1]]
     told = next((m[3].lower() for group in whole.values() if (m := _AXIS.match(group[0])) and m[3]), "")
-    lines = [("file", name, "the robot's log"), ("separator", separator, "between cells")]
-    lines += [("decimal", decimal, "decimal mark")]
-    lines += [("time", time, "column of the robot's times"), ("time_unit", unit, "s, ms, us, ns, or iso for dates")]
-    lines += [("length_unit", told or (lengths or ["mm"])[0], "m, mm or um" + ("" if told or lengths else "; CHECK"))]
+    lines = [
+        ("file", name, "the robot's log"), ("separator", separator, "between cells"), ("decimal", decimal, "decimal mark"),
+        ("time", time, "column of the robot's times"), ("time_unit", unit, "s, ms, us, ns, or iso for dates"),
+        ("length_unit", told or (lengths or ["mm"])[0], "m, mm or um" + ("" if told or lengths else "; CHECK")),
+    ]  # fmt: skip
     if all(quaternion) or len(whole) == 1:
         prefix = min(whole, key=lambda prefix: "pos" not in prefix.lower())
         pose = {"position": whole[prefix], "rotation": quaternion, "rotation_kind": "quaternion_xyzw"}

@@ -64,14 +64,15 @@ def read_labels(
                 axis, size = (0, width) if source.layout == "side_by_side" else (1, height)
                 half = int(xy[axis] > size - 0.5)
                 side, xy[axis] = half ^ source.exchanged, xy[axis] - half * size
+            elif [name in label.image for name in labels.sides].count(True) == 1:
+                side = int(labels.sides[1] in label.image)
             else:
-                side = _side(label.image, labels.sides, where)
-            reel = side if source.layout == "two" else 0
-            if len(source.reels) == 2 and source.exchanged:
-                reel = 1 - reel
-            name = PurePosixPath(label.image.replace("\\", "/")).stem
-            number = (last_number(label.image.replace("\\", "/")) or 0) - labels.first_frame
-            frame = frame_of[reel].get(numbers[reel].get(name, numbers[reel].get(number, number)))
+                cure = f"labels.sides = {list(labels.sides)} must tell one of two"
+                raise ValueError(f"{where}: the name tells no camera; {cure}.")
+            reel = side ^ source.exchanged if source.layout == "two" else 0
+            image = PurePosixPath(label.image.replace("\\", "/"))
+            number = (last_number(image) or 0) - labels.first_frame
+            frame = frame_of[reel].get(numbers[reel].get(image.stem, numbers[reel].get(number, number)))
             if frame is None:
                 continue
             if not inside(xy, image_size_px):
@@ -89,13 +90,6 @@ def read_labels(
     if np.nanmax(u) <= min(100, min(image_size_px) / 4):
         raise ValueError(f"{path}: no label beyond {np.nanmax(u):.4g} px: fractions or per cent of the image? Export pixels.")
     return Annotations(u[0], u[1], v[0], v[1])
-
-
-def _side(image: str, sides: tuple[str, str], where: str) -> int:
-    found = [side for side, name in enumerate(sides) if name in image]
-    if len(found) != 1:
-        raise ValueError(f"{where}: the name tells no camera; labels.sides = {list(sides)} must tell one of two.")
-    return found[0]
 
 
 def labels_of(kind: str, path: Path) -> Iterator[Label]:
@@ -122,20 +116,14 @@ def _cvat(path: Path) -> Iterator[Label]:
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise ValueError(f"{path}: the XML defines entities, which CVAT does not. Export it again.")
     root = ElementTree.fromstring(text)
-    for image in root.iter("image"):
-        for points in image.iter("points"):
-            yield _cvat_point(image.get("name"), points.get("label"), points)
-    for track in root.iter("track"):  # of a video; a skeleton's points are nested and have labels of their own
-        for points in track.iter("points"):
-            parent = points.get("label") or track.get("label")
-            yield _cvat_point(points.get("frame") or "", parent, points)
-
-
-def _cvat_point(image: str, name: str, points: ElementTree.Element) -> Label:
-    if ";" in points.get("points"):
-        raise ValueError(f"label {name!r} of {image} has several points; label each landmark on its own")
-    x, y = map(float, points.get("points").split(","))
-    return Label(image, name, x, y, 0 if points.get("outside") == "1" else 1 if points.get("occluded") == "1" else 2)
+    # A track is one landmark of a video; a skeleton's points are nested and have labels of their own.
+    for parent in (*root.iter("image"), *root.iter("track")):
+        for points in parent.iter("points"):
+            image, name = parent.get("name") or points.get("frame") or "", points.get("label") or parent.get("label")
+            if ";" in points.get("points"):
+                raise ValueError(f"label {name!r} of {image} has several points; label each landmark on its own")
+            x, y = map(float, points.get("points").split(","))
+            yield Label(image, name, x, y, 0 if points.get("outside") == "1" else 1 if points.get("occluded") == "1" else 2)
 
 
 def _from_zip(path: Path, name: str) -> str:

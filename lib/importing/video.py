@@ -4,12 +4,13 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from decimal import Decimal
-from pathlib import Path
+from pathlib import Path, PurePath
 
 import av
 import numpy as np
+from scipy.spatial import KDTree
 
-from lib.importing.logs import exact_seconds, increasing, read_columns
+from lib.importing.logs import exact_seconds, increasing, read_columns, since
 from lib.importing.mapping import Video
 from lib.recordings import read_image, to_8_bits
 
@@ -21,7 +22,7 @@ _STEP_S = 1e-4, 60.0  # of frames; beyond it the unit of time is another
 _DEPTH_SAMPLES = 12
 
 
-def last_number(path: str | Path) -> int | None:
+def last_number(path: str | PurePath) -> int | None:
     """The last whole number in a file's name, which numbers or dates it.
 
     >>> last_number("cam0/frame_000012.png")
@@ -195,12 +196,9 @@ def _paired(folder: Path, times: list[list[Decimal]]) -> np.ndarray:
     """(n, 2) frames of both sources that lie nearest in time, at most half a frame apart."""
     if len(times) == 1:
         return np.repeat(np.arange(len(times[0]))[:, None], 2, axis=1)
-    zero = times[0][0]
-    left, right = (np.array([float(t - zero) for t in time]) for time in times)
-    nearest = np.abs(left[:, None] - right[np.clip(np.searchsorted(right, left)[:, None] + [-1, 0], 0, len(right) - 1)])
-    partner = np.clip(np.searchsorted(right, left) - 1 + nearest.argmin(axis=1), 0, len(right) - 1)
-    step = float(np.median(np.diff(left))) if len(left) > 1 else 1.0
-    good = nearest.min(axis=1) < 0.5 * step
+    left, right = (since(time, times[0][0]) for time in times)
+    distance, partner = KDTree(right[:, None]).query(left[:, None])
+    good = distance < 0.5 * (float(np.median(np.diff(left))) if len(left) > 1 else 1.0)
     index = np.column_stack([np.flatnonzero(good), partner[good]])
     index = index[np.unique(index[:, 1], return_index=True)[1]]
     if 2 * len(index) < min(len(left), len(right)):

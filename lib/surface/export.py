@@ -1,7 +1,7 @@
 """Surfaces for other programs: textured meshes (GLB), point clouds (PLY), depth maps (TIFF).
 
-Open3D writes meshes and point clouds, and removes outliers.  It is imported here only, when it is first needed, since it
-needs system libraries.  Files appear whole or not at all.
+Open3D writes meshes and point clouds.  It is imported here only, when it is first needed, since it needs system
+libraries.  Files appear whole or not at all.
 """
 
 from collections.abc import Callable
@@ -18,21 +18,16 @@ from lib.files import whole, write_bytes
 from lib.geometry import finite_points
 from lib.surface.bspline import BSplineSurface
 
-__all__ = ["Mesh", "depth_map", "open3d", "remove_outliers", "save_depth_map", "save_mesh", "save_points", "surface_mesh"]
+__all__ = ["Mesh", "depth_map", "open3d", "save_depth_map", "save_mesh", "save_points", "surface_mesh"]
 
 
 def open3d() -> ModuleType:
-    """The module open3d.
-
-    Raises:
-        ImportError: Where it or its system libraries are missing, in one line that says what to install.
-    """
+    """The module open3d; an ImportError says in one line what to install where its system libraries are missing."""
     try:
         import open3d
     except (ImportError, OSError) as error:
-        raise ImportError(
-            f"Open3D does not load ({error}). On Debian and Ubuntu: apt-get install libegl1 libgl1 libusb-1.0-0"
-        ) from error
+        cure = "On Debian and Ubuntu: apt-get install libegl1 libgl1 libusb-1.0-0"
+        raise ImportError(f"Open3D does not load ({error}). {cure}") from error
     return open3d
 
 
@@ -142,22 +137,6 @@ def save_points(path: str | Path, x_mm: ArrayLike, *, colours: np.ndarray | None
         cloud.colors = o3d.utility.Vector3dVector(np.asarray(colours, dtype=np.float64) / 255)
     _write(path, lambda name: o3d.io.write_point_cloud(name, cloud), lambda data: len(data) >= x.nbytes)
     return path
-
-
-def remove_outliers(x_mm: ArrayLike, *, neighbours: int = 20, sigmas: float = 2.0) -> np.ndarray:
-    """Which points (n,) Open3D's statistical outlier removal keeps.
-
-    A point goes when its mean distance to its nearest `neighbours` exceeds the cloud's mean of it by `sigmas`
-    standard deviations.
-    """
-    x = finite_points(x_mm, 3, "x_mm")
-    if len(x) <= neighbours:
-        raise ValueError(f"neighbours: {neighbours} neighbours need more than {len(x)} points; ask for fewer.")
-    o3d = open3d()
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(x))
-    kept = np.zeros(len(x), dtype=bool)
-    kept[np.asarray(cloud.remove_statistical_outlier(neighbours, sigmas)[1], dtype=int)] = True
-    return kept
 
 
 def depth_map(surface: BSplineSurface, camera: AffineCamera, image_size_px: tuple[int, int]) -> np.ndarray:

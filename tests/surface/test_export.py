@@ -14,7 +14,6 @@ from scipy.spatial import KDTree
 from lib.surface import (
     depth_map,
     fit_surface,
-    remove_outliers,
     save_depth_map,
     save_mesh,
     save_points,
@@ -131,15 +130,6 @@ def test_depth_map_is_the_surface_along_the_view(surface, bowl, tmp_path):
     assert depth[400, 700] == pytest.approx(x @ bowl.rig.left.viewing_direction, abs=1e-5)
     path = save_depth_map(tmp_path / "depth.tiff", depth)
     np.testing.assert_array_equal(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), depth)
-
-
-def test_statistical_outlier_removal_drops_lone_points(bowl):
-    x = bowl.points.x_mm[~bowl.outlier]
-    lone = x[:5] - 3 * bowl.rig.left.viewing_direction
-    kept = remove_outliers(np.vstack([x, lone]))
-    assert not kept[-5:].any() and kept[:-5].mean() > 0.9
-    with pytest.raises(ValueError, match="neighbours"):
-        remove_outliers(x[:10])
 
 
 def test_bad_files_are_named_and_leave_nothing(surface, tmp_path):
