@@ -84,8 +84,9 @@ class OnlineCalibration:
         if len(keep) >= 8 and self._spans(Moments.of(first_x, first_y)):
             try:
                 keep = consensus(first_x, first_y, None, np.random.default_rng(0), sigma_x_mm=self.sigma_x_mm)[0].all(axis=1)
+                rows = first_x[keep], first_y[keep]
                 # Few rows may agree by chance, but not to the noise that is known.
-                keep &= bool(keep.any()) and np.median(self._distances2(first_x[keep], first_y[keep])) < 9.0 * _CHI2_4_MEDIAN
+                keep &= bool(keep.any()) and np.median(self._distances2(*rows)) < 9.0 * _CHI2_4_MEDIAN
             except ValueError:  # nothing agrees yet
                 keep[:] = False
         self.moments = Moments.of(first_x[keep], first_y[keep]) if keep.any() else None
@@ -95,19 +96,17 @@ class OnlineCalibration:
             self._first = self._first[::2]
         return keep[-len(x) :]
 
-    def _distances2(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Squared Mahalanobis distances (n,) of rows to the rig that they agree on best."""
-        matrix = affine_minimum(Moments.of(x, y), self.sigma_u_px**2, self.sigma_x_mm**2).matrix
+    def _distances2(self, x: np.ndarray, y: np.ndarray, moments: Moments | None = None) -> np.ndarray:
+        """Squared Mahalanobis distances (n,) of rows to the rig of `moments`, their own if None."""
+        matrix = affine_minimum(moments or Moments.of(x, y), self.sigma_u_px**2, self.sigma_x_mm**2).matrix
         return distances2(y - x @ matrix[:, :3].T - matrix[:, 3], matrix[:, :3], self.sigma_u_px, self.sigma_x_mm)
 
     def _fold(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Judge the rows by the rig of those before, and add them to the moments."""
-        matrix = affine_minimum(self.moments, self.sigma_u_px**2, self.sigma_x_mm**2).matrix
-        A, r = matrix[:, :3], y - x @ matrix[:, :3].T - matrix[:, 3]
         # A new row's residual also has the calibration's own uncertainty: (1 + leverage) S.
         d = x - self.moments.mean[4:]
         leverage = 1.0 / self.moments.weight + np.einsum("ni,ij,nj->n", d, np.linalg.inv(self.moments.scatter[4:, 4:]), d)
-        right = distances2(r, A, self.sigma_u_px, self.sigma_x_mm) / (1.0 + leverage) < gate(100, 4)
+        right = self._distances2(x, y, self.moments) / (1.0 + leverage) < gate(100, 4)
         self.moments = self.moments.faded(self.forgetting)
         if right.any():
             self.moments = self.moments.merged(Moments.of(x[right], y[right]))
