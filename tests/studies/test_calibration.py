@@ -53,7 +53,8 @@ def test_outliers_are_found(run_study):
     found, _ = run_study("gross_outliers", right=0.5, n_rows=60, runs=4)
     assert found["median_over_right_rows"] < 1.5 and found["worst_over_right_rows"] < 4
     assert found["refused_percent"] == 0
-    assert run_study("gross_outliers", right=0.1, n_rows=60, runs=4)[0]["refused_percent"] == 100
+    # The study's 40 runs refuse 95 % and more; ten runs may hold one that is not.
+    assert run_study("gross_outliers", right=0.1, n_rows=60, runs=10)[0]["refused_percent"] >= 90
 
 
 def test_general_solvers_reach_the_closed_form_minimum(run_study):
@@ -61,7 +62,7 @@ def test_general_solvers_reach_the_closed_form_minimum(run_study):
     solvers = [name for name in ("scipy", "ceres") if f"{name}_ms" in found]
     assert "scipy" in solvers
     for name in solvers:
-        assert -1e-9 < found[f"{name}_cost_above_closed_form"] < 1e-7 and found[f"{name}_difference_in_A"] < 1e-3
+        assert -1e-9 < found[f"{name}_cost_above_closed_form"] < 1e-7 and found[f"{name}_difference_in_matrix"] < 1e-3
 
 
 def test_advice_clocks_and_tools(run_study):
