@@ -42,7 +42,7 @@ def exact_seconds(text: str, unit: str, where: str) -> Decimal:
     """A time as exact seconds; "iso" dates without a zone count as UTC.
 
     >>> exact_seconds("1700000000123456789", "ns", "log.csv"), exact_seconds("1970-01-01T00:00:01.5", "iso", "log.csv")
-    (Decimal('1700000000.123456789'), Decimal('1.5'))
+    (Decimal('1700000000.123456789'), Decimal('1.500000'))
     """
     try:
         if unit == "iso":

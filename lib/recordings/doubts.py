@@ -9,7 +9,7 @@ __all__ = ["Doubt", "doubts"]
 
 #: A log is that many times longer than its video only by intent, or if the times of the frames are missing.
 _LONGER = 5.0
-_COVERED = 0.9  # share of frames with a position, below which log and video do not fit
+_COVERED = 0.75  # share of frames with a position, below which log and video do not fit
 _JUMP_MM = 20.0  # from one sample to the next; no surgical robot moves so
 _SLOW_S = 0.5  # between samples; robots report 10 to 1000 times a second
 
