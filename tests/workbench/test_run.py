@@ -208,7 +208,11 @@ def test_a_signal_leaves_the_state_stopped(without_kernels, tmp_path, monkeypatc
         time.sleep(10)
 
     monkeypatch.setattr(command, "execute", killed)
-    assert main(["03", "--runs", str(tmp_path)]) == code
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job inherits "ignore"
+    try:
+        assert main(["03", "--runs", str(tmp_path)]) == code
+    finally:
+        signal.signal(signal.SIGINT, before)
     content = state_of(tmp_path)
     assert content["state"] == "stopped" and content["notebooks"][0]["state"] == "pending"
 
