@@ -18,7 +18,7 @@ from lib.files import whole
 from lib.geometry import cell_from_image
 from lib.landmarks.windows import cut
 from lib.parallel import run_jobs
-from lib.simulator.population import TEXTURE_SEEDS, VALIDATION_TEXTURE_SEEDS, sample
+from lib.simulator.population import sample
 from lib.training.samples import LabelledImage, Samples
 
 __all__ = [
@@ -59,8 +59,8 @@ def make_shard(path: Path, kind: str, index: int) -> None:
     if kind in CROPS:
         _write_crops(path, rng, *CROPS[kind])
         return
-    textures = VALIDATION_TEXTURE_SEEDS if kind == "validation" else TEXTURE_SEEDS
-    frames = (LabelledImage(str(i), *sample(rng, textures=textures)) for i in range(FRAMES))
+    population = "validation" if kind == "validation" else "training"
+    frames = (LabelledImage(str(i), *sample(rng, population=population)) for i in range(FRAMES))
     write_frames(path, frames, keep_frames=kind == "validation")
 
 
