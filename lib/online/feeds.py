@@ -4,7 +4,8 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -53,7 +54,7 @@ class Live:
     """Any arrivals, each at its own time: who is busy then finds it in the queue, or lost.
 
     Args:
-        arrivals: Decoded ahead, in a thread.
+        arrivals: Decoded in a thread.
         waiting: Frames that wait at most; when another comes, the oldest is lost.
 
     Attributes:
@@ -61,56 +62,32 @@ class Live:
     """
 
     def __init__(self, arrivals: Iterator[Arrival], *, waiting: int = 2) -> None:
-        self.lost, self._waiting = 0, waiting
-        self._arrivals, self._ended = arrivals, threading.Event()
+        self.lost, self._waiting, self._arrivals = 0, waiting, arrivals
 
     def __iter__(self) -> Iterator[Arrival]:
-        ahead: queue.Queue = queue.Queue(8)
-        ready: queue.Queue = queue.Queue()
-        threads = [threading.Thread(target=work, daemon=True) for work in
-                   (partial(self._decode, ahead), partial(self._deliver, ahead, ready))]  # fmt: skip
+        ready, ended = queue.Queue(), threading.Event()
+        threading.Thread(target=self._deliver, args=(ready, ended), daemon=True).start()
         try:
-            for thread in threads:
-                thread.start()
             while (arrival := ready.get()) is not None:
                 if isinstance(arrival, Exception):
                     raise arrival
                 yield arrival
         finally:
-            self._ended.set()
+            ended.set()
 
-    def _decode(self, ahead: queue.Queue) -> None:
-        last: Arrival | Exception | None = None
+    def _deliver(self, ready: queue.Queue, ended: threading.Event) -> None:
+        start, last = None, None
         try:
             for arrival in self._arrivals:
-                self._put(ahead, arrival)
-                if self._ended.is_set():
-                    return
-        except Exception as error:  # told to whoever takes the frames
-            last = error
-        self._put(ahead, last)
-
-    def _put(self, ahead: queue.Queue, item: object) -> None:
-        while not self._ended.is_set():
-            try:
-                return ahead.put(item, timeout=0.1)
-            except queue.Full:
-                continue
-
-    def _deliver(self, ahead: queue.Queue, ready: queue.Queue) -> None:
-        start = None
-        while not self._ended.is_set():
-            arrival = ahead.get()
-            if isinstance(arrival, Arrival):
                 start = time.monotonic() - arrival.time_s if start is None else start
                 due = start + arrival.time_s
-                if self._ended.wait(max(due - time.monotonic(), 0.0)):
+                if ended.wait(max(due - time.monotonic(), 0.0)):
                     return
-                # On time, or as late as decoding was.
-                arrival = Arrival(**{**vars(arrival), "arrived_s": max(due, time.monotonic())})
                 while ready.qsize() >= self._waiting:
-                    ready.get()
-                    self.lost += 1
-            ready.put(arrival)
-            if not isinstance(arrival, Arrival):
-                return
+                    with suppress(queue.Empty):  # taken meanwhile
+                        ready.get_nowait()
+                        self.lost += 1
+                ready.put(replace(arrival, arrived_s=max(due, time.monotonic())))  # on time, or as late as decoding was
+        except Exception as error:  # told to whoever takes the frames
+            last = error
+        ready.put(last)

@@ -147,10 +147,6 @@ class FrameResult:
         """True where the surface is this frame's own."""
         return self.reconstructed_at == self.index
 
-    def distance_at(self, time_s: float) -> np.ndarray:
-        """(3,) mm along the view at a later time, as the robot moves on: bridges the latency."""
-        return self.distance_mm - self.approach_mm_s * (time_s - self.time_s)
-
     def watch(self, settings: Settings) -> None:
         """Set the alarm of each tip from its distance."""
         self.margin_mm = norm.isf(settings.miss_rate) * self.distance_sd_mm

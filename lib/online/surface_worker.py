@@ -16,7 +16,6 @@ from lib.surface import Reconstruction, reconstruct
 __all__ = ["Beside", "InTurn", "SurfaceJob"]
 
 _PARTS_OF_MATCHING = {"mask": "match", "refine": "match"}
-_CHECK_S = 2.0  # between two looks at whether an idle worker lives
 
 
 @dataclass(frozen=True, eq=False)
