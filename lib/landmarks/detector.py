@@ -1,8 +1,9 @@
 """The detector: images in, landmarks with covariance and confidence out.
 
-It works from coarse to fine.  The first stage finds the tool in the whole frame at low resolution.  The second names its
-landmarks in one upright window round the tool.  The third finds each landmark in a small window at full resolution.  The
-last measures it in a closeup.  The first stage alone, at full resolution, is the paper's detector (Sec. III).
+It works from coarse to fine.  The first stage finds the tool in the whole frame, shrunk to a fixed size.  The second names
+its landmarks in one upright window, scaled so that every tool has the same length in it; it looks twice, since the first
+look corrects direction and scale.  The last measures each landmark in a closeup.  The first stage alone, at full
+resolution, is the paper's detector (Sec. III).
 """
 
 from collections.abc import Callable, Sequence
@@ -23,10 +24,11 @@ from lib.correspondences import Correspondences, of_recording
 from lib.geometry import image_from_cell
 from lib.landmarks.checkpoints import load_network, read_checkpoint, write_checkpoint
 from lib.landmarks.engines import accelerated, default_engine
-from lib.landmarks.error_model import ErrorModel, closeup_peaks, corrected, covariance_and_confidence
+from lib.landmarks.error_model import ErrorModel, Rough, closeup_peaks, corrected, covariance_and_confidence
 from lib.landmarks.heatmaps import Peaks, decode
+from lib.landmarks.metrics import tool_length_px
 from lib.landmarks.network import Network, OffsetNetwork, StackedHourglass, as_tensor, as_uint8
-from lib.landmarks.windows import closeup_from_image, cut, tool_pose, window_from_image
+from lib.landmarks.windows import TOOL_PX, closeup_from_image, cut, map_points, tool_pose, tool_zoom, window_from_image
 from lib.parallel import single_threaded_torch
 from lib.recordings import Recording
 
@@ -34,13 +36,15 @@ __all__ = ["CLOSE", "MISSING_BELOW", "TRACKED_FROM", "Detector", "Landmarks", "d
 
 FORMAT = "microstereo.detector"
 #: The fields that a weights file keeps as plain values.
-_SETTINGS = ("reduction", "tool_reduction", "window_px", "mirror", "method")
+_SETTINGS = ("frame_px", "window_px", "mirror", "method")
 #: A landmark with a lower confidence counts as missing: NaN, confidence 0.
 MISSING_BELOW = 0.05
 #: A landmark with a lower confidence gets no closeup and is not followed from frame to frame.
 TRACKED_FROM = 0.5
-#: The stages that look at closeups: of what the windows found, and of what was found in the frame before.
-CLOSE = ("closeup", "tracking")
+#: The stages that look at closeups: twice of what the tool's window showed, and of what was found in the frame before.
+CLOSE = ("closeup", "closer", "tracking")
+#: Stages that use another stage's network.
+_NETWORK_OF = {"again": "tool", "closer": "closeup", "tracking": "closeup"}
 
 
 @dataclass(frozen=True)
@@ -96,14 +100,17 @@ class Detector:
     """Finds the landmarks in frames of any size and number; one detector serves both cameras.
 
     Attributes:
-        frame_network, reduction: The first stage, which sees the frame reduced by `reduction`, an integer.
-        window_network: The third stage, which sees one upright window of `window_px` for each landmark; None = no such stage.
-        tool_network, tool_reduction: The second stage, which sees one window of `window_px` round the tool, reduced likewise;
-            None = no such stage.
+        frame_network, frame_px: The first stage, which sees the frame resized so that its longer side is `frame_px`; None =
+            as it is.
+        window_network: A stage that sees one upright window of `window_px`, at full resolution, for each landmark; None = no
+            such stage.  The shipped detector has none.
+        tool_network: The second stage, which sees one window round the tool; None = no such stage.
         closeup_network: The last stage, which predicts where in a closeup the landmark lies; None = no such stage.
-        error_models: One for each stage: ``"frame"``, ``"tool"``, ``"window"``, ``"closeup"``, and ``"tracking"`` for the
-            closeups that follow a landmark from frame to frame.
-        mirror: The windows' network also sees the mirror image of every window, and the mean counts: twice the work.
+        error_models: One for each stage: ``"frame"``, ``"tool"`` and ``"again"`` for the two looks at the tool, ``"window"``,
+            ``"closeup"`` and ``"closer"`` for two closeups, the second where the first saw the landmark, and ``"tracking"``
+            for the closeups that follow a landmark from frame to frame.
+        mirror: The second look at the tool, and the windows' network, also see the mirror image, and the mean counts: where
+            the two disagree its peak is low.
         engine: What runs the networks, one of `lib.landmarks.engines.ENGINES`; the weights are the same.
 
         >>> found = Detector.load(engine="torch")(np.zeros((1, 270, 480, 3), np.uint8))
@@ -112,10 +119,9 @@ class Detector:
     """
 
     frame_network: StackedHourglass
-    reduction: int = 1
+    frame_px: int | None = None
     window_network: StackedHourglass | None = None
     tool_network: StackedHourglass | None = None
-    tool_reduction: int = 5
     window_px: int = 128
     method: str = "gauss_newton"
     error_models: dict[str, ErrorModel] = field(default_factory=dict)
@@ -126,14 +132,22 @@ class Detector:
     _run: dict[str, Callable[[Tensor], list[Tensor]]] = field(init=False, repr=False, default_factory=dict)
 
     def __post_init__(self) -> None:
-        if self.reduction < 1 or self.reduction != int(self.reduction):
-            raise ValueError(f"reduction: must be a positive integer, got {self.reduction}.")
-        if self.closeup_network and not self.window_network:
-            raise ValueError("closeup_network: looks at what a window_network has found; give one.")
+        if self.frame_px is not None and self.frame_px < 16:
+            raise ValueError(f"frame_px: must be at least 16 px, got {self.frame_px}.")
+        if self.closeup_network and not (self.window_network or self.tool_network):
+            raise ValueError("closeup_network: looks at what a tool_network or a window_network has found; give one.")
         if self.mirror and self.window_network and self.window_px % self.window_network.stride:
             raise ValueError(f"mirror: needs window_px to be a multiple of the stride, got {self.window_px}.")
-        for name, network in self.networks.items():
-            self._run[name] = accelerated(network, self.engine, mirror=self.mirror and name == "window")
+        for stage in self.stages:
+            self._run[stage] = accelerated(self.network_of(stage), self.engine, mirror=self.mirrors(stage))
+
+    def network_of(self, stage: str) -> Network:
+        """The network of a stage, which may be another stage's."""
+        return self.networks[_NETWORK_OF.get(stage, stage)]
+
+    def mirrors(self, stage: str) -> bool:
+        """Whether a stage also sees the mirror image."""
+        return self.mirror and stage in ("again", "window")
 
     @property
     def networks(self) -> dict[str, Network]:
@@ -143,8 +157,10 @@ class Detector:
 
     @property
     def stages(self) -> list[str]:
-        """The stages, each with an error model: the networks, and tracking, which uses the closeups' network."""
-        return [*self.networks, *(["tracking"] if self.closeup_network else [])]
+        """The stages in the order of their use, each with an error model; the last one, if any, is tracking."""
+        there = self.networks
+        names = ("frame", "tool", "again", "window", "closeup", "closer", "tracking")
+        return [name for name in names if _NETWORK_OF.get(name, name) in there]
 
     def with_error_models(self, **models: ErrorModel) -> Self:
         """A copy with the error models of some stages (``frame=``, ``window=``, ...) replaced."""
@@ -217,8 +233,8 @@ class Detector:
             for start in range(0, len(images), batch):
                 part = images[start : start + batch]
                 result = self.coarse(part)
-                for stage in list(self.networks)[1:]:
-                    result = self.refine(part, result, stage)
+                for stage in self.stages[1:]:
+                    result = self.refine(part, result, stage) if stage != "tracking" else result
                 found.append(result)
         return Landmarks.join(found)
 
@@ -230,7 +246,7 @@ class Detector:
         images = as_uint8(images)
         if len(previous) != len(images):
             raise ValueError(f"previous: holds {len(previous)} images, but images {len(images)}.")
-        if self.window_network is None:
+        if self.window_network is None and self.closeup_network is None:
             return self(images)
         usable = np.flatnonzero((previous.confidence >= min_confidence).all(1) & np.isfinite(previous.u).all((1, 2)))
         result = Landmarks.none(len(images))
@@ -249,38 +265,52 @@ class Detector:
 
     def _threads(self) -> AbstractContextManager[None]:
         """One thread for small windows, torch's own for whole frames."""
-        return nullcontext() if self.window_network is None else single_threaded_torch()
+        return single_threaded_torch() if len(self.networks) > 1 else nullcontext()
 
     def coarse(self, images: ArrayLike) -> Landmarks:
         """Landmarks by the first stage alone."""
-        return self._measured(self.frame_peaks(images), "frame", self.reduction).without_unsure()
+        stride = self.frame_stride(np.asarray(images))
+        found = self._measured(self.frame_peaks(images), None, "frame")
+        u, covariance = image_from_cell(found.u, stride), found.covariance * np.outer(stride, stride)
+        return Landmarks(u, covariance, found.confidence).without_unsure()
 
-    def refine(self, images: np.ndarray, rough: Landmarks, stage: str) -> Landmarks:
-        """Landmarks by a later stage, which looks where the `rough` ones lie; ``"tracking"`` is one too."""
-        peaks, matrices, which = self.stage_peaks(images, rough.u, stage)
+    def refine(self, images: np.ndarray, rough: Landmarks, stage: str, seen: tuple | None = None) -> Landmarks:
+        """Landmarks by a later stage, which looks where the `rough` ones lie; ``"tracking"`` is one too.
+
+        `seen` is what `stage_peaks` gave for them, if that is known.
+        """
+        peaks, matrices, which = seen or self.stage_peaks(images, rough.u, stage)
         result = Landmarks(rough.u.copy(), rough.covariance.copy(), rough.confidence.copy())
         if not len(which):
             return result
-        fine = self._measured(peaks, stage, 1, which[:, 1:])
+        fine = self._measured(peaks, self.rough_in_windows(rough, matrices, which, stage), stage, which[:, 1:])
         back = np.linalg.inv(matrices[:, :, :2])
         u = (back @ (fine.u[:, 0] - matrices[:, :, 2])[..., None])[..., 0]
         covariance = back @ fine.covariance[:, 0] @ back.mT
         confidence = fine.confidence[:, 0]
         if stage in CLOSE:
-            seen = peaks.value[:, 0].numpy() > 0
-            confidence = np.where(seen, confidence, 0.0)
-        if stage == "closeup":
-            # The windows decide whether the landmark is there; an unsure one stays where they saw it.
-            seen &= rough.confidence[which[:, 0], which[:, 1]] >= TRACKED_FROM
-            u, covariance, which = u[seen], covariance[seen], which[seen]
-        else:
-            result.confidence[which[:, 0], which[:, 1]] = confidence
+            near = peaks.value[:, 0].numpy() > 0
+            confidence = np.where(near, confidence, 0.0)
+        if stage in ("closeup", "closer"):
+            # The stage before decides whether the landmark is there; an unsure one stays where it was seen.
+            near &= rough.confidence[which[:, 0], which[:, 1]] >= TRACKED_FROM
+            u, covariance, confidence, which = u[near], covariance[near], confidence[near], which[near]
+        result.confidence[which[:, 0], which[:, 1]] = confidence
         i, k = which.T
         result.u[i, k], result.covariance[i, k] = u, covariance
         return result.without_unsure()
 
+    def rough_in_windows(self, rough: Landmarks, matrices: np.ndarray, which: np.ndarray, stage: str) -> Rough | None:
+        """What the stage before found, in the windows of this one; None where that is evidence of nothing."""
+        if stage == "tracking":
+            return None
+        i, own = which[:, 0], (np.arange(len(which)), which[:, 1])
+        parts = map_points(matrices[:, None], rough.u[i]), rough.confidence[i]
+        whole = Rough.of(*(torch.from_numpy(part) for part in parts))
+        return Rough(*(part[own][:, None] for part in vars(whole).values()))
+
     def frame_peaks(self, images: ArrayLike) -> Peaks:
-        """Peaks of the first stage, in pixels of its reduced input."""
+        """Peaks of the first stage, in pixels of its input."""
         heatmaps = self.outputs(self.reduced(as_uint8(images)), "frame")
         return decode(heatmaps, self.frame_network.stride, method=self.method)
 
@@ -288,26 +318,28 @@ class Detector:
         """The inputs of a stage after the first, round rough landmarks u (n, 3, 2).
 
         Returns windows (m, s, s, 3) uint8; window_from_image (m, 2, 3); and which (m, 2) image and landmark each window
-        shows, or which image (m,) for ``"tool"``.  A tool without base or tips and a missing landmark have no window.
+        shows, or which image (m,) for the looks at the tool.  A tool without base or tips and a missing landmark have no
+        window.
         """
         u = np.asarray(u, dtype=np.float64)
-        centre, angle = tool_pose(u)
-        size = self.window_px if stage in ("tool", "window") else self.closeup_network.config.size_px
-        if stage == "tool":
-            image = which = np.flatnonzero(np.isfinite(angle))
-            matrices = window_from_image(centre[which], angle[which], size, 1 / self.tool_reduction)
+        (centre, angle), length = tool_pose(u), np.maximum(tool_length_px(u), 1.0)
+        if stage in ("tool", "again"):
+            size, image = TOOL_PX, np.flatnonzero(np.isfinite(angle))
+            matrices, which = window_from_image(centre[image], angle[image], size, tool_zoom(length[image])), image
         else:
+            size = self.closeup_network.config.size_px if stage in CLOSE else self.window_px
             which = np.argwhere(np.isfinite(u).all(2) & np.isfinite(angle)[:, None])
             image, landmark = which.T
             place = u[image, landmark], angle[image], size
-            matrices = window_from_image(*place) if stage == "window" else closeup_from_image(*place, landmark)
+            window = stage == "window"
+            matrices = window_from_image(*place) if window else closeup_from_image(*place, landmark, length[image])
         windows = [cut(images[i], matrix, size) for i, matrix in zip(image, matrices, strict=True)]
         return np.stack(windows) if windows else np.zeros((0, size, size, 3), np.uint8), matrices, which
 
     def outputs(self, images: np.ndarray, stage: str) -> Tensor:
         """A stage's heatmaps (m, 3, h, w) of its input images (m, s, s, 3); of closeups the network's outputs (m, 4)."""
         with torch.inference_mode():
-            return self._run["closeup" if stage in CLOSE else stage](as_tensor(images))[-1]
+            return self._run[stage](as_tensor(images))[-1]
 
     def stage_peaks(self, images: np.ndarray, u: ArrayLike, stage: str) -> tuple[Peaks, np.ndarray, np.ndarray]:
         """Peaks (m, 1) of a stage after the first in its windows' pixels, window_from_image (m, 2, 3), and which (m, 2)
@@ -315,33 +347,37 @@ class Detector:
         """
         windows, matrices, which = self.windows(images, u, stage)
         if not len(which):
-            return Peaks(*(torch.zeros(0, 1, *s) for s in ((2,), (), (), (2, 2)))), matrices, np.zeros((0, 2), int)
+            return Peaks(*(torch.zeros(0, 1, *s) for s in ((2,), (), (), (2, 2), ()))), matrices, np.zeros((0, 2), int)
         outputs = self.outputs(windows, stage)
         if stage in CLOSE:
             size, fit = windows.shape[1], self.error_models.get(stage, ErrorModel())
             return corrected(closeup_peaks(outputs, size), fit, size, which[:, 1:]), matrices, which
-        if stage == "tool":  # one window holds all three landmarks
+        if stage in ("tool", "again"):  # one window holds all three landmarks
             which = np.stack([np.repeat(which, 3), np.tile(np.arange(3), len(which))], axis=1)
             matrices, heatmaps = np.repeat(matrices, 3, axis=0), outputs.flatten(0, 1)[:, None]
         else:
             heatmaps = outputs[torch.arange(len(which)), torch.from_numpy(which[:, 1])][:, None]
-        return decode(heatmaps, self.networks[stage].stride, method=self.method), matrices, which
+        return decode(heatmaps, self.network_of(stage).stride, method=self.method), matrices, which
+
+    def frame_stride(self, images: np.ndarray) -> np.ndarray:
+        """Image pixels per pixel of the first stage's input, along x and y."""
+        size = np.array(images.shape[2:0:-1])
+        return size / np.maximum(np.round(size * ((self.frame_px or size.max()) / size.max())), 1)
 
     def reduced(self, images: np.ndarray) -> np.ndarray:
-        """Images averaged over blocks of `reduction` pixels, black beyond the right and bottom border."""
-        r = self.reduction
-        if r == 1:
+        """Images (n, h, w, 3) as the first stage sees them: the longer side has `frame_px`."""
+        stride = self.frame_stride(images)
+        if (stride == 1).all():
             return images
-        h, w = images.shape[1:3]
-        images = np.pad(images, ((0, 0), (0, -h % r), (0, -w % r), (0, 0))) if h % r or w % r else images
-        size = (images.shape[2] // r, images.shape[1] // r)
-        return np.stack([cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in images])
+        size = tuple(int(v) for v in np.round(images.shape[2:0:-1] / stride))
+        how = cv2.INTER_AREA if stride.max() > 1 else cv2.INTER_LINEAR
+        return np.stack([cv2.resize(image, size, interpolation=how) for image in images])
 
-    def _measured(self, peaks: Peaks, stage: str, scale: int, landmark: np.ndarray | slice = np.s_[:]) -> Landmarks:
-        """Peaks in pixels of a network's input as landmarks in image pixels; `landmark` says which each peak is."""
+    def _measured(self, peaks: Peaks, rough: Rough | None, stage: str, landmark: np.ndarray | slice = np.s_[:]) -> Landmarks:
+        """Peaks as landmarks in pixels of the stage's input; `landmark` says which each peak is."""
         fit = self.error_models.get(stage, ErrorModel())
-        covariance, confidence = covariance_and_confidence(peaks.double(), scale, fit, landmark)
-        return Landmarks(image_from_cell(peaks.u.numpy(), scale), covariance.numpy(), confidence.numpy())
+        covariance, confidence = covariance_and_confidence(peaks.double(), rough, fit, landmark)
+        return Landmarks(peaks.u.numpy(), covariance.numpy(), confidence.numpy())
 
 
 def detect(

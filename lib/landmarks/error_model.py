@@ -1,6 +1,7 @@
 """From peaks to covariance and confidence: the error model that is fitted on validation images."""
 
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 import torch
@@ -9,7 +10,31 @@ from torch import Tensor
 from lib.landmarks.heatmaps import Peaks
 from lib.landmarks.windows import CLOSEUP_REACH_PX, CLOSEUP_ZOOM, expected_in_closeup
 
-__all__ = ["ErrorModel", "closeup_peaks", "corrected", "covariance_and_confidence", "features_of"]
+__all__ = ["FEATURES", "ErrorModel", "Rough", "closeup_peaks", "corrected", "covariance_and_confidence", "features_of"]
+
+#: How many features a peak has.
+FEATURES = 8
+
+
+@dataclass(frozen=True)
+class Rough:
+    """What the stage before found: agreement with it is evidence.
+
+    Attributes:
+        u: (n, k, 2) the landmark in pixels of this stage's input; NaN where it was not found.
+        logit, together: (n, k) logit of its confidence, and the mean over the three landmarks of the tool.
+    """
+
+    u: Tensor
+    logit: Tensor
+    together: Tensor
+
+    @classmethod
+    def of(cls, u: Tensor, confidence: Tensor) -> Self:
+        """From the tool's three landmarks u (n, 3, 2) and their confidence (n, 3).  Torch can trace it."""
+        confidence = confidence.clamp(1e-3, 0.999)
+        logit = (confidence / (1 - confidence)).log()
+        return cls(u, logit, logit.mean(-1, keepdim=True).expand_as(logit))
 
 
 @dataclass(frozen=True)
@@ -17,58 +42,72 @@ class ErrorModel:
     """The error model of one stage, fitted by `lib.training.error_models.fit_error_models`.
 
     The covariance of a peak is diagonal in the axes of the stage's input.  In an upright window these run along the tool
-    and across it, the directions in which errors differ most.  The logarithm of the variance in px^2 is a linear function
-    of the peak's features (`features_of`), and so is the logit of the confidence.  The two tips, mirror images of each
-    other, have equal coefficients.
+    and across it, the directions in which errors differ most.  The logarithm of the variance in px^2 of the stage's input is
+    a linear function of the peak's features (`features_of`), and so is the logit of the confidence.  The two tips, mirror
+    images of each other, have equal coefficients.
 
     Attributes:
-        log_variance: (2, 6): for x and y the constants of base, tip_1 and tip_2, and the slopes of the other three features.
-        logit: (4,).
+        log_variance: (2, 10): for x and y the constants of base, tip_1 and tip_2, and the slopes of the other features.
+        logit: (8,).
         gain, bias: (3, 2) for base, tip_1 and tip_2 along x and y, closeups only.  A closeup's correction is scaled by the
             gain that minimises the validation error; the bias is the mean error that this leaves, in the closeup's pixels.
 
         >>> ErrorModel().coefficients.shape
-        (3, 2, 4)
+        (3, 2, 8)
     """
 
-    log_variance: tuple[tuple[float, ...], ...] = ((0.0, 0.0, 0.0, 1.0, 0.0, 0.0),) * 2
-    logit: tuple[float, ...] = (-4.0, 0.0, 8.0, 0.0)
+    log_variance: tuple[tuple[float, ...], ...] = ((0.0, 0.0, 0.0, 1.0, *(FEATURES - 2) * (0.0,)),) * 2
+    logit: tuple[float, ...] = (-4.0, 0.0, 8.0, *(FEATURES - 3) * (0.0,))
     gain: tuple[tuple[float, ...], ...] = ((1.0, 1.0),) * 3
     bias: tuple[tuple[float, ...], ...] = ((0.0, 0.0),) * 3
 
     def __post_init__(self) -> None:
-        for name, shape in {"log_variance": (2, 6), "logit": (4,), "gain": (3, 2), "bias": (3, 2)}.items():
+        for name, shape in {"log_variance": (2, FEATURES + 2), "logit": (FEATURES,), "gain": (3, 2), "bias": (3, 2)}.items():
             value = np.array(getattr(self, name), dtype=np.float64)
+            if name in ("log_variance", "logit") and value.ndim == len(shape) and value.shape[-1] < shape[-1]:
+                missing = [(0, 0)] * (value.ndim - 1) + [(0, shape[-1] - value.shape[-1])]
+                value = np.pad(value, missing)  # slopes that are not given are 0
             if value.shape != shape:
                 raise ValueError(f"{name}: expected {shape}, got {value.shape}; fit anew (`python3 -m lib train assemble`).")
             object.__setattr__(self, name, tuple(map(tuple, value.tolist())) if value.ndim == 2 else tuple(value.tolist()))
 
     @property
     def coefficients(self) -> np.ndarray:
-        """(3, 2, 4): coefficients of the features in each landmark's log variance along x and y."""
+        """(3, 2, 8): coefficients of the features in each landmark's log variance along x and y."""
         rows = np.array(self.log_variance)
         return np.stack([np.column_stack([rows[:, k], rows[:, 3:]]) for k in range(3)])
 
 
-def features_of(peaks: Peaks, scale: float) -> Tensor:
-    """Features (..., 3, 4) of peaks whose pixels are `scale` image pixels: for x, for y, and for both together.
+def features_of(peaks: Peaks, rough: Rough | None = None) -> Tensor:
+    """Features (..., 3, 8) of peaks, in pixels of the stage's input: for x, for y, and for both together.
 
-    Each is 1, the log of the fit's variance in px^2, the height of the peak, and |log of its relative width|.
+    Each is 1, the log of the fit's variance, the height of the peak, |log of its relative width|, the height elsewhere, the
+    log of the distance from where the stage before saw it, and the two logits of `Rough`; the last three are 0 without it.
     """
-    covariance = peaks.covariance * scale**2
+    covariance = peaks.covariance
     covariance = torch.where(torch.isfinite(covariance), covariance, torch.eye(2, dtype=covariance.dtype))
     (xx, xy), (yx, yy) = (row.unbind(-1) for row in covariance.unbind(-2))
     both = (xx * yy - xy * yx).clamp_min(1e-12).sqrt()
     one, height, width = torch.ones_like(peaks.value), peaks.value.clamp(-0.5, 1.5), peaks.width.log().abs()
-    rows = [torch.stack([one, v.clamp(1e-4, 1e4).log(), height, width], -1) for v in (xx, yy, both)]
+    moved, logit, together = (torch.zeros_like(one),) * 3
+    if rough is not None:
+        distance = (peaks.u - rough.u.to(peaks.u.dtype)).square().sum(-1)
+        moved = torch.where(distance < 1e4, distance, torch.full_like(distance, 1e4)).sqrt()  # NaN is not below
+        moved = (1 + moved / 2).log()
+        logit, together = (part.to(one.dtype).clamp(-6, 6) for part in (rough.logit, rough.together))
+    shared = [height, width, peaks.rival.clamp(-0.5, 1.5), moved, logit, together]
+    rows = [torch.stack([one, v.clamp(1e-4, 1e4).log(), *shared], -1) for v in (xx, yy, both)]
     return torch.stack(rows, -2)
 
 
 def covariance_and_confidence(
-    peaks: Peaks, scale: float, fit: ErrorModel, landmark: np.ndarray | slice = np.s_[:]
+    peaks: Peaks, rough: Rough | None, fit: ErrorModel, landmark: np.ndarray | slice = np.s_[:]
 ) -> tuple[Tensor, Tensor]:
-    """Covariance (..., 2, 2) px^2 and confidence (...) of peaks; `landmark` says which each is.  Torch can trace it."""
-    features = features_of(peaks, scale)
+    """Covariance (..., 2, 2) px^2 of the stage's input and confidence (...) of peaks; `landmark` says which each is.
+
+    Torch can trace it.
+    """
+    features = features_of(peaks, rough)
     log_variance, logit = (torch.tensor(row, dtype=features.dtype) for row in (fit.coefficients[landmark], fit.logit))
     variance = (features[..., :2, :] * log_variance).sum(-1).clamp(-12, 12).exp()
     confidence = torch.sigmoid((features[..., 2, :] * logit).sum(-1))
@@ -83,7 +122,7 @@ def closeup_peaks(found: Tensor, size_px: int) -> Peaks:
     u = (size_px - 1) / 2 + found[:, None, :2]
     one = torch.ones_like(u[..., 0])
     variance = 2 * (2 * found[:, None, 2:]).exp()
-    return Peaks(u, one, one, variance[..., None] * torch.eye(2, dtype=variance.dtype))
+    return Peaks(u, one, one, variance[..., None] * torch.eye(2, dtype=variance.dtype), 0 * one)
 
 
 def corrected(peaks: Peaks, fit: ErrorModel, size_px: int, landmark: np.ndarray) -> Peaks:

@@ -1,10 +1,12 @@
 """The detector for other programs: each stage as ONNX with its decoding and error model inside, checked against torch.
 
 A stage takes its own input, RGB in [0, 1] of shape (n, 3, h, w), and gives what `Landmarks` holds: u (n, 3, 2) px,
-covariance (n, 3, 2, 2) px^2 and confidence (n, 3).  The first stage gives them in pixels of the unreduced frame.  The
-stages ``window``, ``closeup`` and ``tracking`` see a window of one landmark, and the caller takes that landmark's row.
-``closeup`` corrects confident landmarks of ``window`` and leaves their confidence; ``tracking`` corrects the landmarks of
-the frame before.  These two share a network and differ in their error models.
+covariance (n, 3, 2, 2) px^2 and confidence (n, 3).  The first stage gives them in pixels of the frame before it was
+resized.  The others but ``tracking`` also take ``rough_u`` (n, 3, 2), the landmarks that the stage before found, in pixels
+of their input, and ``rough_confidence`` (n, 3).  ``again`` is the second look of ``tool``.  The stages ``window``,
+``closeup`` and ``tracking`` see a window of one landmark, and the caller takes that landmark's row.  ``closeup`` corrects
+confident landmarks; ``tracking`` corrects the landmarks of the frame before.  Stages that share a network differ in their
+error models.
 """
 
 import importlib.util
@@ -20,9 +22,10 @@ from torch import Tensor, nn
 from lib import files, paths
 from lib.landmarks.detector import CLOSE, MISSING_BELOW, Detector
 from lib.landmarks.engines import LastOutput, openvino
-from lib.landmarks.error_model import ErrorModel, closeup_peaks, corrected, covariance_and_confidence
+from lib.landmarks.error_model import ErrorModel, Rough, closeup_peaks, corrected, covariance_and_confidence
 from lib.landmarks.heatmaps import Peaks, decode
 from lib.landmarks.network import as_tensor
+from lib.landmarks.windows import map_points
 from lib.recordings import Recording
 
 __all__ = ["LARGEST", "StageWithDecoding", "export", "run_onnx"]
@@ -34,15 +37,15 @@ LARGEST = {"px": 0.01, "of variance": 0.02, "of confidence": 0.001}
 class StageWithDecoding(nn.Module):
     """One stage of a detector from images to landmarks in one graph: network, decoder, error model."""
 
-    def __init__(self, detector: Detector, stage: str):
+    def __init__(self, detector: Detector, stage: str, stride: np.ndarray):
         super().__init__()
-        network = detector.networks["closeup" if stage in CLOSE else stage]
-        self.network = LastOutput(network, mirror=detector.mirror and stage == "window")
+        network = detector.network_of(stage)
+        self.network = LastOutput(network, mirror=detector.mirrors(stage))
         self.config, self.closeup, self.method = network.config, stage in CLOSE, detector.method
-        self.scale = detector.reduction if stage == "frame" else 1
+        self.stride = torch.tensor(stride if stage == "frame" else [1.0, 1.0])
         self.fit = detector.error_models.get(stage, ErrorModel())
 
-    def forward(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(self, images: Tensor, *rough: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         seen = self.network(images)
         if self.closeup:
             # The graph does not know which landmark a closeup shows, so it corrects it as each of the three.
@@ -51,8 +54,9 @@ class StageWithDecoding(nn.Module):
             peaks = corrected(three, self.fit, self.config.size_px, np.arange(3))
         else:
             peaks = decode(seen, self.config.stride, method=self.method)
-        covariance, confidence = covariance_and_confidence(peaks, self.scale, self.fit)
-        return peaks.u * self.scale + (self.scale - 1) / 2, covariance, confidence
+        covariance, confidence = covariance_and_confidence(peaks, Rough.of(*rough) if rough else None, self.fit)
+        stride = self.stride.to(peaks.u.dtype)
+        return peaks.u * stride + (stride - 1) / 2, covariance * (stride[:, None] * stride), confidence
 
 
 def export(
@@ -79,44 +83,52 @@ def export(
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     detector = replace(detector, engine="torch")
-    rough, result = detector(examples).u, {}
+    rough, result, stride = detector(examples), {}, detector.frame_stride(examples)
     for stage in detector.stages:
-        images = detector.reduced(examples) if stage == "frame" else detector.windows(examples, rough, stage)[0]
+        images, evidence = detector.reduced(examples), ()
+        if stage != "frame":
+            images, matrices, which = detector.windows(examples, rough.u, stage)
+            if stage != "tracking":
+                i = which[:, 0] if which.ndim == 2 else which
+                parts = map_points(matrices[:, None], rough.u[i]), rough.confidence[i]
+                evidence = tuple(torch.from_numpy(part).float() for part in parts)
         if not len(images):
             raise ValueError("examples: no tool was found in them, so nothing can be compared; give other frames.")
         x = as_tensor(images).contiguous()
-        module = StageWithDecoding(detector, stage).eval()
+        module = StageWithDecoding(detector, stage, stride).eval()
         with tempfile.TemporaryDirectory() as scratch:
             path = Path(scratch) / f"{stage}.onnx"
-            _write(module, x, path)
-            difference = _difference(module, x, path, stage)
+            _write(module, (x, *evidence), path)
+            difference = _difference(module, (x, *evidence), path, stage)
             files.write_bytes(folder / f"{stage}.onnx", path.read_bytes())
         result[stage] = folder / f"{stage}.onnx", difference
     return result
 
 
-def run_onnx(path: str | Path, images: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """u, covariance and confidence that an exported stage gives for images (n, 3, h, w) in [0, 1], in float32."""
+def run_onnx(path: str | Path, *inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """u, covariance and confidence that an exported stage gives, in float32, for images (n, 3, h, w) in [0, 1] and, if the
+    stage takes them, the rough landmarks and their confidence.
+    """
     core = openvino().Core()
-    found = core.compile_model(core.read_model(str(path)), "CPU", {"INFERENCE_PRECISION_HINT": "f32"})(images)
+    found = core.compile_model(core.read_model(str(path)), "CPU", {"INFERENCE_PRECISION_HINT": "f32"})(list(inputs))
     return found["u"], found["covariance"], found["confidence"]
 
 
-def _write(module: nn.Module, example: Tensor, path: Path) -> None:
-    names = ["u", "covariance", "confidence"]
+def _write(module: nn.Module, example: tuple[Tensor, ...], path: Path) -> None:
+    names, inputs = ["u", "covariance", "confidence"], ["images", "rough_u", "rough_confidence"][: len(example)]
     with torch.no_grad(), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # sizes are fixed by tracing, as they shall be
         torch.onnx.export(
-            module, (example,), str(path), dynamo=False, opset_version=18, input_names=["images"], output_names=names,
-            dynamic_axes={name: {0: "n"} for name in ["images", *names]},
+            module, example, str(path), dynamo=False, opset_version=18, input_names=inputs, output_names=names,
+            dynamic_axes={name: {0: "n"} for name in [*inputs, *names]},
         )  # fmt: skip
 
 
-def _difference(module: nn.Module, images: Tensor, path: Path, stage: str) -> float:
+def _difference(module: nn.Module, inputs: tuple[Tensor, ...], path: Path, stage: str) -> float:
     """The largest difference of ONNX from torch in px; `ValueError` if one exceeds `LARGEST`."""
-    u, covariance, confidence = run_onnx(path, images.numpy())
+    u, covariance, confidence = run_onnx(path, *(part.numpy() for part in inputs))
     with torch.inference_mode():
-        u_torch, covariance_torch, confidence_torch = (part.numpy() for part in module(images))
+        u_torch, covariance_torch, confidence_torch = (part.numpy() for part in module(*inputs))
     seen = confidence_torch >= MISSING_BELOW
     if not seen.any():
         raise ValueError(f"examples: the stage {stage!r} finds nothing in them; give other frames.")

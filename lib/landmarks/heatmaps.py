@@ -50,16 +50,18 @@ class Peaks:
         value: (n, k) height of the peak; that of the target is 1.
         width: (n, k) sigma of the peak over that of the target; 1 where the decoder does not fit it.
         covariance: (n, k, 2, 2) px^2, from the fit's residual; NaN where the decoder has none.
+        rival: (n, k) height of the heatmap elsewhere, that is more than 3 sigma away.
     """
 
     u: Tensor
     value: Tensor
     width: Tensor
     covariance: Tensor
+    rival: Tensor
 
     def double(self) -> Self:
         """The same in float64."""
-        return Peaks(self.u.double(), self.value.double(), self.width.double(), self.covariance.double())
+        return Peaks(*(part.double() for part in vars(self).values()))
 
 
 def _patches(heatmaps: Tensor, centre: Tensor, radius: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -169,5 +171,9 @@ def decode(heatmaps: Tensor, stride: int, *, method: str = "gauss_newton", sigma
     width, covariance = torch.ones_like(value), torch.full_like(u[..., None, :].expand(*u.shape, 2), torch.nan)
     if method == "gauss_newton":
         u, width, covariance = _gauss_newton(heatmaps, sigma, u, value)
+    h, w = heatmaps.shape[-2:]
+    rows, columns = (torch.arange(n, dtype=u.dtype, device=u.device) for n in (h, w))
+    far = (rows[:, None] - u[..., 1, None, None]) ** 2 + (columns - u[..., 0, None, None]) ** 2 > (3 * sigma) ** 2
+    rival = torch.where(far, heatmaps, torch.zeros_like(heatmaps)).flatten(-2).amax(-1)
     u_px = stride * u + (stride - 1) / 2  # as `lib.geometry.image_from_cell`
-    return Peaks(u_px.to(heatmaps.dtype), value, width.to(heatmaps.dtype), (covariance * stride**2).to(heatmaps.dtype))
+    return Peaks(*(part.to(heatmaps.dtype) for part in (u_px, value, width, covariance * stride**2, rival)))

@@ -261,16 +261,20 @@ def network_of(config: HourglassConfig | OffsetConfig) -> Network:
 
 
 def as_uint8(images: ArrayLike) -> np.ndarray:
-    """Images (n, h, w, 3), uint8 or float in [0, 1], as uint8; `ValueError` for another shape, type or range.
+    """Images (n, h, w, 3), or grey (n, h, w, 1), uint8 or float in [0, 1], as (n, h, w, 3) uint8.
+
+    Raises `ValueError` for another shape, type or range.
 
     >>> as_uint8(np.full((1, 2, 4, 3), 0.5)).max()
     np.uint8(128)
     """
     array = np.asarray(images)
+    if array.ndim == 4 and array.shape[-1] == 1:
+        array = np.repeat(array, 3, axis=-1)
     if array.ndim != 4 or array.shape[-1] != 3:
         raise ValueError(
-            f"images: expected (n, h, w, 3) RGB, got {array.shape}. "
-            "Add a first axis for one image; repeat a grey channel three times; drop an alpha channel."
+            f"images: expected (n, h, w, 3) RGB or (n, h, w, 1) grey, got {array.shape}. "
+            "Add a first axis for one image; drop an alpha channel."
         )
     if not array.size:
         raise ValueError(f"images: empty, {array.shape}; give at least one image.")

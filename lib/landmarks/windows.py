@@ -2,7 +2,8 @@
 
 The later stages of the detector see small windows.  Each is turned so that the direction from base to tips points right and
 tip_1, the left tip as seen along the tool, lies above.  So the network sees one pose whatever the tool's direction in the
-image.  Closeups are reduced a little, and mirrored for tip_2, so that both tips look alike.
+image.  The tool's window is scaled so that every tool fills the same share of it.  Closeups are reduced a little, and
+mirrored for tip_2, so that both tips look alike.
 """
 
 import cv2
@@ -10,9 +11,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 __all__ = [
-    "CLOSEUP_BEHIND_PX", "CLOSEUP_REACH_PX", "CLOSEUP_ZOOM", "closeup_from_image", "cut", "expected_in_closeup",
-    "map_points", "tool_pose", "window_from_image",
+    "CLOSEUP_BEHIND_PX", "CLOSEUP_REACH_PX", "CLOSEUP_ZOOM", "TOOL_PX", "closeup_from_image", "closeup_scale", "cut",
+    "expected_in_closeup", "map_points", "tool_pose", "tool_zoom", "window_from_image",
 ]  # fmt: skip
+
+#: Side of the tool's window, and the tool's length in it.
+TOOL_PX, _TOOL_LENGTH_PX = 128, 56.0
+#: Closeups of tools of these lengths, in image pixels, have one scale, which uses all of the image's resolution.
+_SAME_SCALE_PX = (165.0, 450.0)
 
 #: Closeup pixels per image pixel, of base, tip_1 and tip_2: the base shows between the edges of the shaft.
 CLOSEUP_ZOOM = (0.65, 0.85, 0.85)
@@ -37,22 +43,48 @@ def tool_pose(u: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     return (base + tip) / 2, np.arctan2(*(tip - base).T[::-1])
 
 
-def window_from_image(centre: ArrayLike, angle_rad: ArrayLike, size: int, zoom: ArrayLike = 1.0) -> np.ndarray:
-    """Matrices (..., 2, 3) that turn by -angle about `centre` (..., 2) and bring it to the middle of the window."""
+def tool_zoom(length_px: ArrayLike) -> np.ndarray:
+    """Pixels of the tool's window per image pixel, for tools of some lengths.
+
+    >>> float(tool_zoom(28.0))
+    2.0
+    """
+    return _TOOL_LENGTH_PX / np.asarray(length_px, dtype=np.float64)
+
+
+def closeup_scale(length_px: ArrayLike) -> np.ndarray:
+    """By how much closeups of tools of some lengths are magnified beyond `CLOSEUP_ZOOM`; never to less than half an image
+    pixel, since there is nothing more to see.
+
+    >>> closeup_scale([900, 300, 110, 20]).round(2).tolist()
+    [0.5, 1.0, 1.5, 2.35]
+    """
+    length = np.asarray(length_px, dtype=np.float64)
+    return np.minimum(np.clip(length, *_SAME_SCALE_PX) / length, 2 / max(CLOSEUP_ZOOM))
+
+
+def window_from_image(
+    centre: ArrayLike, angle_rad: ArrayLike, size: int | tuple[int, int], zoom: ArrayLike = 1.0
+) -> np.ndarray:
+    """Matrices (..., 2, 3) that turn by -angle about `centre` (..., 2) and bring it to the middle of the window, whose `size`
+    is its side or (w, h).
+    """
     centre, angle = np.asarray(centre, dtype=np.float64), np.asarray(angle_rad, dtype=np.float64)
     c, s = np.cos(angle) * zoom, np.sin(angle) * zoom
     linear = np.stack([np.stack([c, s], -1), np.stack([-s, c], -1)], -2)
-    shift = (size - 1) / 2 - (linear @ centre[..., None])
+    shift = ((np.array(np.broadcast_to(size, 2)) - 1) / 2)[:, None] - (linear @ centre[..., None])
     return np.concatenate([linear, shift], -1)
 
 
-def closeup_from_image(centre: ArrayLike, angle_rad: ArrayLike, size: int, landmark: ArrayLike) -> np.ndarray:
-    """Matrices (..., 2, 3) like `window_from_image`, of `CLOSEUP_ZOOM`, mirrored for tip_2, and centred behind `centre`
-    (..., 2), where the landmark (...) is thought to lie; `angle_rad` is (...).
+def closeup_from_image(
+    centre: ArrayLike, angle_rad: ArrayLike, size: int, landmark: ArrayLike, length_px: ArrayLike = 300.0
+) -> np.ndarray:
+    """Matrices (..., 2, 3) like `window_from_image`, of `CLOSEUP_ZOOM` times `closeup_scale`, mirrored for tip_2, and centred
+    behind `centre` (..., 2), where the landmark (...) is thought to lie; `angle_rad` and the tool's `length_px` are (...).
     """
-    landmark, angle = np.asarray(landmark), np.asarray(angle_rad, dtype=np.float64)
-    behind = np.array(CLOSEUP_BEHIND_PX)[landmark][..., None] * np.stack([np.cos(angle), np.sin(angle)], -1)
-    matrix = window_from_image(np.asarray(centre) - behind, angle, size, np.array(CLOSEUP_ZOOM)[landmark])
+    landmark, angle, scale = np.asarray(landmark), np.asarray(angle_rad, dtype=np.float64), closeup_scale(length_px)
+    behind = (np.array(CLOSEUP_BEHIND_PX)[landmark] / scale)[..., None] * np.stack([np.cos(angle), np.sin(angle)], -1)
+    matrix = window_from_image(np.asarray(centre) - behind, angle, size, np.array(CLOSEUP_ZOOM)[landmark] * scale)
     mirrored = np.asarray(landmark == 2)[..., None]
     matrix[..., 1, :] = np.where(mirrored, [0.0, 0.0, size - 1.0] - matrix[..., 1, :], matrix[..., 1, :])
     return matrix
@@ -71,5 +103,11 @@ def map_points(matrix: np.ndarray, u: ArrayLike) -> np.ndarray:
 
 
 def cut(image: np.ndarray, matrix: np.ndarray, size: int, *, border: int = cv2.BORDER_CONSTANT) -> np.ndarray:
-    """The window (size, size, 3) uint8 of an image; black, or what OpenCV's `border` says, where it leaves the image."""
-    return cv2.warpAffine(image, matrix, (size, size), flags=cv2.INTER_LINEAR, borderMode=border)
+    """The window (size, size, 3) uint8 of an image; black, or what OpenCV's `border` says, where it leaves the image.
+
+    A window at less than half the image's scale is the mean over blocks of a finer one, so that nothing aliases.
+    """
+    finer = int(np.clip(1 / np.sqrt(abs(np.linalg.det(matrix[:, :2]))), 1, 8))
+    matrix = finer * matrix + [0, 0, (finer - 1) / 2]
+    whole = cv2.warpAffine(image, matrix, (size * finer,) * 2, flags=cv2.INTER_LINEAR, borderMode=border)
+    return whole if finer == 1 else cv2.resize(whole, (size, size), interpolation=cv2.INTER_AREA)

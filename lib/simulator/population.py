@@ -22,7 +22,7 @@ from lib.simulator.shapes import beside, random_object
 from lib.simulator.video import Video, compressed
 from lib.simulator.window import Window, in_image
 
-__all__ = ["POPULATIONS", "RESERVED_JAW_MM", "RESERVED_SEEDS", "TEXTURE_SEEDS", "Setup"]
+__all__ = ["POPULATIONS", "RESERVED_JAW_MM", "RESERVED_SEEDS", "TEXTURE_SEEDS", "VALIDATION_TEXTURE_SEEDS", "Setup"]
 __all__ += ["random_forceps", "random_pose", "random_setup", "reserved_forceps", "sample"]
 
 #: Families from which the far rung draws what is not far.
@@ -33,7 +33,7 @@ POPULATIONS = ("training", "validation", "near", "empty")
 #: Eyes (and the textures and brush marks that go with them) that training never draws.
 RESERVED_SEEDS = range(0, 10_000)
 #: Textures of eyes that train (few enough to stay in memory, each turned, tinted and shaped anew), validate and test.
-TEXTURE_SEEDS, _VALIDATION_TEXTURE_SEEDS = range(10_000, 10_096), range(10_096, 10_112)
+TEXTURE_SEEDS, VALIDATION_TEXTURE_SEEDS = range(10_000, 10_096), range(10_096, 10_112)
 _TEST_TEXTURE_SEEDS = range(9_000, 9_016)
 #: Jaw lengths that training never draws: recordings for tests have tools of these.
 RESERVED_JAW_MM = (2.95, 3.15)
@@ -120,7 +120,7 @@ def random_setup(
     """
     choices = _choices(population, without)
     if textures is None:
-        drawn_by = {"training": TEXTURE_SEEDS, "empty": TEXTURE_SEEDS, "validation": _VALIDATION_TEXTURE_SEEDS}
+        drawn_by = {"training": TEXTURE_SEEDS, "empty": TEXTURE_SEEDS, "validation": VALIDATION_TEXTURE_SEEDS}
         textures = drawn_by.get(population, _TEST_TEXTURE_SEEDS)
     if population == "near" or (population == "training" and rng.random() < _NARROW):
         eye, forceps, microscope = _eye(rng, textures[:_NARROW_TEXTURES]), random_forceps(rng), _microscope(rng)

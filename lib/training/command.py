@@ -24,20 +24,22 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python3 -m lib train", description=main.__doc__.split(": ", 1)[1])
     add = parser.add_argument
     add("what", choices=["generate", *STAGES, "finetune", "assemble", "export"],
-        help="generate: simulate the training data; frame, tool, window, closeup: train this stage; finetune: train all "
+        help="generate: simulate the training data; frame, tool, closeup: train this stage; finetune: train all "
         "further on labelled recordings; assemble: join them into a detector with its card; export: write ONNX")  # fmt: skip
     add("recordings", nargs="*", type=Path, help="labelled recordings; finetune holds out the end of each")
     add("--data", type=Path, default=paths.CACHE / "landmarks", help="folder of the simulated shards")
     add("--folder", type=Path, default=paths.CACHE / "training", help="checkpoints, one folder a stage")
     add("--out", type=Path, help="finetune, assemble: weights file to write; export: the one to read (default: shipped)")
-    add("--shards", type=int, default=120, help="generate: training shards of 16 frames")
-    add("--windows", type=int, default=60, help="generate: shards of 512 windows round a landmark")
-    add("--closeups", type=int, default=24, help="generate: shards of 2048 closeups of a landmark")
+    add("--scenes", type=int, default=120, help="generate: shards of 64 small scenes")
+    add("--closeups", type=int, default=40, help="generate: shards of 1024 closeups of a landmark")
+    add("--held-out", type=int, default=24, help="generate: shards of 16 full scenes, for the doubt")
+    add("--shards", type=int, default=0, help="generate, for the studies: shards of 16 frames of the reference rig")
+    add("--windows", type=int, default=0, help="generate, for the studies: shards of 512 windows round a landmark")
     add("--workers", type=int, help="generate: processes (default: one a core)")
     add("--preset", choices=sorted(PRESETS), default="best")
     add("--steps", type=int, default=6000)
     add("--rate", type=float, help="learning rate (default: the preset's)")
-    add("--position-weight", type=float, default=0.04, help="window: of the position loss, per px")
+    add("--minutes", type=float, help="finetune: stop after so many")
     add("--features", type=int, help="channels (default: the shipped detector's)")
     add("--seed", type=int, default=0)
     add("--initial", type=Path, help="checkpoint (of a stage) or weights file (finetune) to start from")
@@ -48,7 +50,8 @@ def main(argv: list[str] | None = None) -> int:
     if a.recordings and a.what not in ("finetune", "assemble"):
         parser.error(f"{a.what}: takes no recordings.")
     if a.what == "generate":
-        shards = {"validation": max(3, a.shards // 15), "training": a.shards, "windows": a.windows, "closeups": a.closeups}
+        shards = {"held_out": a.held_out, "scenes": a.scenes, "closeups": a.closeups}
+        shards |= {"validation": max(3, a.shards // 15) if a.shards else 0, "training": a.shards, "windows": a.windows}
         for kind, count in shards.items():
             generate(a.data, kind, count, workers=a.workers)
     elif a.what == "finetune":
@@ -63,8 +66,6 @@ def main(argv: list[str] | None = None) -> int:
     else:
         config = stage_config(a.what, preset=a.preset, features=a.features)
         config = replace(config, steps=a.steps, seed=a.seed, validate_every=200, learning_rate=a.rate or config.learning_rate)
-        if a.what == "window":
-            config = replace(config, position_weight_per_px=a.position_weight)
         initial = load_training(a.initial) if a.initial else None
         print(train(config, *stage_data(a.what, a.data), a.folder / a.what, initial=initial).provenance["metrics"])
     return 0
@@ -79,8 +80,8 @@ def _finetune(a: argparse.Namespace) -> None:
         training += images[: 3 * len(images) // 4]
         held_out += images[3 * len(images) // 4 :]
     detector = Detector.load(a.initial)
-    simulated = a.data if any(a.data.glob("training_*.npz")) else None
-    tuned = finetune(detector, training, held_out, a.folder / "finetune", simulated=simulated, steps=a.steps, seed=a.seed)
+    how = {"simulated": a.data if any(a.data.glob("scenes_*.npz")) else None, "steps": a.steps, "minutes": a.minutes}
+    tuned = finetune(detector, training, held_out, a.folder / "finetune", seed=a.seed, **how)
     tuned.save(a.out)
     for name, scores in (("before", evaluate(detector, held_out).scores), ("after", evaluate(tuned, held_out).scores)):
         print(f"{name}: PCK@0.05 {scores.pck_0_05:.1f} %, median error {scores.median_px:.2f} px on held-out images")

@@ -11,25 +11,27 @@ from scipy.special import expit
 from scipy.stats import chi2
 from tqdm.auto import tqdm
 
-from lib.geometry import image_from_cell
+from lib.geometry import cell_from_image
 from lib.landmarks.detector import CLOSE, TRACKED_FROM, Detector, Landmarks
-from lib.landmarks.error_model import ErrorModel, features_of
+from lib.landmarks.error_model import FEATURES, ErrorModel, features_of
 from lib.landmarks.metrics import GROSS_PX, tool_length_px
 from lib.landmarks.windows import CLOSEUP_REACH_PX, CLOSEUP_ZOOM, expected_in_closeup, map_points
 from lib.training.samples import LabelledImage
 
 __all__ = ["TRACKED_SHIFT_PX", "Seen", "fit_error_models", "seen_by"]
 
-#: What a tool of 2 mm/s moves between two frames at 25 Hz.
-TRACKED_SHIFT_PX = 8.0
+#: What a tool of 2 mm/s moves between two frames at 25 Hz, and the tool's length at that scale.
+TRACKED_SHIFT_PX, _LENGTH_PX = 8.0, 300.0
+#: Larger errors, in pixels of a stage's input, are no part of what a covariance describes.
+_GROSS_PX = {"frame": GROSS_PX, "tool": 10.0, "again": 8.0, "window": GROSS_PX}
 
 
 @dataclass(frozen=True)
 class Seen:
-    """Peaks of `landmark` (m,) that a stage decoded: `features` (m, 3, 4) as `features_of` gives them, and `errors` (m, 2).
+    """Peaks of `landmark` (m,) that a stage decoded: `features` (m, 3, 8) as `features_of` gives them, and `errors` (m, 2).
 
     All in pixels of the stage's input.  Errors are NaN without a label; below `tolerance` (m,) a landmark is correct.
-    `moved` (m, 2) is the whole correction of a closeup.
+    `moved` (m, 2) is the whole correction of a closeup.  `known` (m,) is False where a landmark is there but unlabelled.
     """
 
     features: np.ndarray
@@ -37,6 +39,7 @@ class Seen:
     tolerance: np.ndarray
     landmark: np.ndarray
     moved: np.ndarray
+    known: np.ndarray
 
     @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:
@@ -62,17 +65,18 @@ class Seen:
 
         def variance(axis: int) -> np.ndarray:
             x = np.column_stack([~tip, tip, features[:, axis, 1:]]).astype(float)
-            start = [np.log(max(squared[:, axis].mean(), 1e-6))] * 2 + [0.0] * 3
+            start = [np.log(max(squared[:, axis].mean(), 1e-6))] * 2 + [0.0] * (FEATURES - 1)
 
             def deviance(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
                 ratio = squared[:, axis] * np.exp(-z)
                 return z + ratio, 1 - ratio
 
-            return _coefficients(deviance, x, start)[[0, 1, 1, 2, 3, 4]]
+            return _coefficients(deviance, x, start)[[0, 1, 1, *range(2, FEATURES + 1)]]
 
-        correct = size <= self.tolerance
+        correct = (size <= self.tolerance)[self.known]
+        start = np.array(ErrorModel().logit)
         logit = _coefficients(
-            lambda z: (np.logaddexp(0, z) - correct * z, expit(z) - correct), self.features[:, 2], [-4.0, 0.0, 8.0, 0.0]
+            lambda z: (np.logaddexp(0, z) - correct * z, expit(z) - correct), self.features[self.known, 2], start
         )
         log_variance = np.array([variance(0), variance(1)])
         rows = ErrorModel(log_variance).coefficients[self.landmark[use]]
@@ -98,8 +102,8 @@ class Seen:
 
 
 def _coefficients(loss: Callable[[np.ndarray], tuple], x: np.ndarray, start: Sequence[float]) -> np.ndarray:
-    """Those that minimise the mean of a loss of ``x @ beta``, given with its slope; the last three are kept small."""
-    ridge = 1e-3 * (np.arange(len(start)) >= len(start) - 3)
+    """Those that minimise the mean of a loss of ``x @ beta``, given with its slope; the slopes are kept small."""
+    ridge = 1e-2 * (np.arange(len(start)) > len(start) - FEATURES)
 
     def penalised(beta: np.ndarray) -> tuple[float, np.ndarray]:
         value, slope = loss(x @ beta)
@@ -108,25 +112,36 @@ def _coefficients(loss: Callable[[np.ndarray], tuple], x: np.ndarray, start: Seq
     return minimize(penalised, start, jac=True, method="L-BFGS-B").x
 
 
-def seen_by(detector: Detector, stage: str, labelled: LabelledImage, rough: np.ndarray) -> Seen:
-    """What a stage decodes in one image, given the landmarks `rough` (1, 3, 2) of the stage before, beside the labels."""
+def seen_by(
+    detector: Detector, stage: str, labelled: LabelledImage, rough: Landmarks | None, found: tuple | None = None
+) -> Seen:
+    """What a stage decodes in one image, given the landmarks `rough` of the stage before, beside the labels.
+
+    `found` is what `Detector.stage_peaks` gave, if that is known.
+    """
     labels, image = labelled.in_view, labelled.image[None]
-    tolerance = 0.05 * tool_length_px(np.asarray(labelled.u, dtype=float)[None])
+    # A stage that only says where the next one looks is right if that finds the landmark there.
+    share = 0.25 if stage in ("frame", "tool") and len(detector.networks) > 1 else 0.05
+    tolerance = share * tool_length_px(np.asarray(labelled.u, dtype=float)[None])
+    known = np.isfinite(labels).all(1) | (labelled.visibility == 0)
     if stage == "frame":
-        peaks = detector.frame_peaks(image)
-        feature = features_of(peaks.double(), detector.reduction)[0].numpy()
-        errors = image_from_cell(peaks.u[0].double().numpy(), detector.reduction) - labels
-        return Seen(feature, errors, np.repeat(tolerance, 3), np.arange(3), np.zeros((3, 2)))
-    peaks, matrices, which = detector.stage_peaks(image, rough, stage)
+        peaks, stride = detector.frame_peaks(image), detector.frame_stride(image)
+        errors = peaks.u[0].double().numpy() - cell_from_image(labels, stride)
+        tolerance = np.repeat(tolerance / stride.mean(), 3)
+        return Seen(features_of(peaks.double())[0].numpy(), errors, tolerance, np.arange(3), np.zeros((3, 2)), known)
+    peaks, matrices, which = found or detector.stage_peaks(image, rough.u, stage)
     landmark, at = which[:, 1], peaks.u[:, 0].double().numpy()
-    feature, moved = features_of(peaks.double(), 1)[:, 0].numpy(), np.zeros(at.shape)
+    features = features_of(peaks.double(), detector.rough_in_windows(rough, matrices, which, stage))
+    feature, moved = features[:, 0].numpy(), np.zeros(at.shape)
     keep = np.ones(len(at), bool)
     if stage in CLOSE:
         keep = peaks.value[:, 0].numpy() > 0
+        if stage != "tracking":  # of an unsure landmark nothing is changed
+            keep &= rough.confidence[which[:, 0], which[:, 1]] >= TRACKED_FROM
         moved = at - expected_in_closeup(detector.closeup_network.config.size_px, landmark)
     errors = at - map_points(matrices, labels[landmark])
     tolerance = tolerance * np.sqrt(np.abs(np.linalg.det(matrices[:, :, :2])))
-    return Seen(*(part[keep] for part in (feature, errors, tolerance, landmark, moved)))
+    return Seen(*(part[keep] for part in (feature, errors, tolerance, landmark, moved, known[landmark])))
 
 
 def fit_error_models(detector: Detector, images: Iterable[LabelledImage], *, progress: bool = False) -> Detector:
@@ -149,20 +164,20 @@ def fit_error_models(detector: Detector, images: Iterable[LabelledImage], *, pro
     rough: list[Landmarks | None] = [None] * len(images)
     rng = np.random.default_rng(0)
     for stage in detector.stages:
-        parts = []
+        parts, found = [], []
         for labelled, start in zip(tqdm(images, disable=not progress, unit="image", desc=stage), rough, strict=True):
-            if stage in CLOSE and not (start.confidence >= TRACKED_FROM).all():
-                continue  # nothing is tracked from such an image
             if stage == "tracking":  # a tool that jumps now and then, which tracking has to notice
-                moved_px = TRACKED_SHIFT_PX * (5 if rng.random() < 0.25 else 1)
+                if not (start.confidence >= TRACKED_FROM).all():
+                    continue  # nothing is tracked from such an image
+                moved_px = TRACKED_SHIFT_PX * (5 if rng.random() < 0.25 else 1) * tool_length_px(start.u) / _LENGTH_PX
                 start = replace(start, u=start.u + rng.normal(0, moved_px / np.sqrt(2), (1, 1, 2)))
                 start = detector.refine(labelled.image[None], start, stage)
-            parts.append(seen_by(detector, stage, labelled, start.u if start else None))
+            found.append(None if stage == "frame" else detector.stage_peaks(labelled.image[None], start.u, stage))
+            parts.append(seen_by(detector, stage, labelled, start, found[-1]))
         if not any(len(part.landmark) for part in parts):
             raise ValueError("images: the detector finds nothing in them to calibrate on; give other images.")
         seen = Seen.joined(parts)
-        gross = {"frame": 6 * GROSS_PX, "tool": 2 * GROSS_PX / detector.tool_reduction, "window": GROSS_PX}
-        gross_px = gross.get(stage, CLOSEUP_REACH_PX * min(CLOSEUP_ZOOM))
+        gross_px = _GROSS_PX.get(stage, CLOSEUP_REACH_PX * min(CLOSEUP_ZOOM))
         gain, bias = np.ones((3, 2)), np.zeros((3, 2))
         if stage in CLOSE:
             # While tracking, the place where a landmark is expected is an old one, which is evidence of nothing.
@@ -172,5 +187,7 @@ def fit_error_models(detector: Detector, images: Iterable[LabelledImage], *, pro
         if stage == "frame":  # the landmarks that the next stage starts from
             rough = [detector.coarse(part.image[None]) for part in images]
         elif stage != "tracking":
-            rough = [detector.refine(part.image[None], r, stage) for part, r in zip(images, rough, strict=True)]
+            known = [None] * len(images) if stage in CLOSE else found  # a closeup's correction depends on the gain
+            parts = zip(images, rough, known, strict=True)
+            rough = [detector.refine(labelled.image[None], start, stage, seen) for labelled, start, seen in parts]
     return detector

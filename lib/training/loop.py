@@ -7,7 +7,7 @@ equals one that was not, bit for bit on the CPU: the number of the step is the w
 import copy
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -33,6 +33,8 @@ __all__ = ["FORMAT", "Training", "average", "draw_batch", "load_training", "trai
 FORMAT = "microstereo.training"
 #: What a checkpoint keeps of a `Run` beside its tensors.
 _STATE = ("step", "seconds", "log", "loss_sum", "since")
+#: A killed training loses at most this much.
+_SAVE_EVERY_S = 50.0
 
 
 @dataclass(frozen=True)
@@ -186,7 +188,7 @@ class Run:
 
 def train(
     config: TrainingConfig, source: Source, validation: Samples, folder: str | Path | None = None, *,
-    initial: Training | None = None, max_seconds: float | None = None, progress: bool = True,
+    initial: Training | None = None, max_seconds: float | None = None, progress: bool | Callable[[float], None] = True,
 ) -> Training:  # fmt: skip
     """Train a network; an interrupted training in `folder` is resumed.
 
@@ -195,6 +197,7 @@ def train(
         folder: Keeps ``last.safetensors`` (weights, average, optimiser, step, log); None keeps nothing.
         initial: Start from the weights of this training, for fine-tuning; its provenance is kept under ``before``.
         max_seconds: Stop (resumably) after this long.
+        progress: Whether to show a bar, or a function that is called with the part that is done.
 
     Raises:
         ValueError: For an empty data set, an `initial` of another network, or a folder that holds another training.
@@ -214,11 +217,14 @@ def train(
         if last.exists():
             run.restore(last, provenance)
     keeps = last is not None and run.rank == 0
-    began, before, stop = time.perf_counter(), run.seconds, False
-    with tqdm(total=config.steps, initial=run.step, disable=not progress or run.rank > 0, unit="step") as bar:
+    began, before, stop, saved = time.perf_counter(), run.seconds, False, time.perf_counter()
+    with tqdm(total=config.steps, initial=run.step, disable=progress is not True or run.rank > 0, unit="step") as bar:
         while run.step < config.steps and not stop:
             run.advance(draw_batch(source, config, run.step, run.rank))
             bar.update()
+            if callable(progress):
+                spent = (time.perf_counter() - began) / max_seconds if max_seconds else 0.0
+                progress(min(1.0, max(run.step / config.steps, spent)))
             run.seconds = before + time.perf_counter() - began
             stop = max_seconds is not None and time.perf_counter() - began > max_seconds
             if run.world > 1:  # clocks differ, and all must stop together
@@ -226,8 +232,9 @@ def train(
                 dist.broadcast(flag, 0)
                 stop = bool(flag)
             due = run.step % config.validate_every == 0 or run.step == config.steps
-            if stop and keeps and not due:  # without the validation below, which an uninterrupted run does not have
-                run.save(last, provenance)
+            if (stop or time.perf_counter() - saved > _SAVE_EVERY_S) and keeps and not due:
+                run.save(last, provenance)  # without the validation below, which an uninterrupted run does not have
+                saved = time.perf_counter()
             if stop or due:
                 row = {"step": run.step, "seconds": round(run.seconds, 1), "loss": run.loss_sum / run.since}
                 run.log.append(row | validate(run.usable, validation, config))

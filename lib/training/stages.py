@@ -1,14 +1,17 @@
 """The detector's stages: what each learns from, and how; fine-tuning on a user's labelled frames; the shipped detector."""
 
 import json
-from collections.abc import Iterable, Sequence
+import time
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from lib.files import write_text
 from lib.landmarks import Detector
+from lib.landmarks.metrics import tool_length_px
 from lib.landmarks.network import HourglassConfig, OffsetConfig
 from lib.landmarks.windows import tool_pose
 from lib.provenance import commit_id, machine
@@ -19,13 +22,15 @@ from lib.training.error_models import fit_error_models
 from lib.training.evaluation import evaluate
 from lib.training.loop import Training, load_training, train
 from lib.training.samples import LabelledImage, Mixed, Samples, Source, labelled_images
-from lib.training.shards import REDUCTION, frame_samples, validation_images, write_frames
-from lib.training.windows import TOOL_REDUCTION, CloseupSource, WindowSource
+from lib.training.scenes import FRAME_PX, FrameSource, ToolSource
+from lib.training.shards import validation_images
+from lib.training.windows import CloseupSource
 
 __all__ = ["STAGES", "assemble", "card", "finetune", "stage_config", "stage_data"]
 
-#: The stages in the order of their use, and the channels of the shipped networks.
-STAGES = {"frame": 32, "tool": 48, "window": 96, "closeup": 32}
+#: The stages that are trained, in the order of their use, and the channels of the shipped networks.
+STAGES = {"frame": 32, "tool": 48, "closeup": 32}
+_SOURCES = {"frame": FrameSource, "tool": ToolSource, "closeup": CloseupSource}
 
 
 def stage_config(stage: str, *, preset: str = "best", features: int | None = None) -> TrainingConfig:
@@ -38,59 +43,73 @@ def stage_config(stage: str, *, preset: str = "best", features: int | None = Non
     if stage == "closeup":
         config = replace(config, augmentation=AUGMENTATIONS["closeups"])
         return replace(config, network=OffsetConfig(features), batch_size=64, clip=2.0)
+    config = replace(config, augmentation=AUGMENTATIONS["none"], ema=0.995)  # what is drawn is changed already
     if stage == "frame":
-        return replace(config, network=HourglassConfig(features, depth=3), batch_size=8, ema=0.995)
-    config = replace(config, network=HourglassConfig(features), augmentation=AUGMENTATIONS["windows"])
-    return replace(config, ema=0.995) if stage == "tool" else replace(config, position_weight_per_px=0.04)
+        return replace(config, network=HourglassConfig(features, depth=3), batch_size=8)
+    return replace(config, network=HourglassConfig(features))
 
 
-def stage_data(stage: str, folder: str | Path, *, closeups: str = "closeups") -> tuple[Source, Samples]:
-    """Training data and validation samples of a stage, from a folder of shards; closeups from shards of kind `closeups`."""
-    if stage == "frame":
-        return frame_samples(folder), frame_samples(folder, validation=True)
-    load = {"tool": WindowSource.load_tools, "window": WindowSource.load, "closeup": CloseupSource.load}[stage]
-    source = load(folder, kind=closeups) if stage == "closeup" else load(folder)
-    if stage == "window":  # the simulator varies the magnification itself
-        source = replace(source, zoom=(0.9, 1.1))
-    return source, Samples.drawn(load(folder, validation=True))
+def stage_data(stage: str, folder: str | Path) -> tuple[Source, Samples]:
+    """Training data and validation samples of a stage, from a folder of shards."""
+    return _SOURCES[stage].load(folder), _still(stage, validation_images(folder))
+
+
+def _still(stage: str, images: Iterable[LabelledImage]) -> Samples:
+    """What a stage sees of held-out images; of those with a tool in view, since the others have nothing to measure."""
+    shown = [one for one in images if (np.isfinite(one.u).all(1) & (one.visibility == 2)).any()]
+    return Samples.drawn(_SOURCES[stage].of(shown, still=True))
 
 
 def finetune(
-    detector: Detector, images: Iterable[LabelledImage], held_out: Iterable[LabelledImage], folder: str | Path, *,
-    simulated: str | Path | None = None, steps: int = 500, seed: int = 0, progress: bool = True,
+    detector: Detector, images: Sequence[LabelledImage], held_out: Sequence[LabelledImage], folder: str | Path, *,
+    simulated: str | Path | None = None, covariance_px2: np.ndarray | None = None, steps: int = 300,
+    minutes: float | None = None, seed: int = 0, progress: bool | Callable[[str, float], None] = True,
 ) -> Detector:  # fmt: skip
     """Train all stages of a detector further on labelled frames, then fit its error models on held-out ones.
 
     Args:
-        images, held_out: Full-resolution images of one size; images without a labelled base and tip are left out.
-            Consecutive frames are alike, so hold out whole recordings, or the end of one.
-        folder: Keeps the frames as shards and the checkpoints, from which the same call continues.
-        simulated: Folder of `generate`'s shards; half of what is drawn then comes from there, so that the networks do
-            not forget tools and eyes that the labelled frames do not show.
+        images, held_out: Images of any size.  Consecutive frames are alike, so hold out whole recordings, or the end of one.
+            Each needs a labelled base and a labelled tip; others are left out.
+        folder: Keeps the checkpoints, from which the same call continues.
+        simulated: Folder of `generate`'s shards; half of what is drawn then comes from there, and their held-out frames
+            help to fit the doubt, so that the networks do not forget tools and eyes that the labelled frames do not show.
+        covariance_px2: (n, 3, 2, 2) of the labels of `images`; None = exact.  A label counts half if its deviation is
+            2 % of the tool's length.
+        steps, minutes: Steps of each stage; training ends after `minutes`, each stage having had its share.
+        progress: Whether to show a bar, or a function that is called with the stage and the part done.
 
     Raises:
         ValueError: If there is no usable image, or fewer than 20 landmarks are found in the held-out ones.
     """
-    data = Path(folder) / "data"
-    data.mkdir(parents=True, exist_ok=True)
+    usable = []
     for kind, part in (("training", images), ("validation", held_out)):
-        usable = [labelled for labelled in part if np.isfinite(tool_pose(labelled.u[None])[1]).all()]
-        if not usable:
+        usable.append([i for i, labelled in enumerate(part) if np.isfinite(tool_pose(labelled.u[None])[1]).all()])
+        if not usable[-1]:
             raise ValueError(f"{kind} images: none has a labelled base and tip; label some.")
-        for i in range(0, len(usable), 64):
-            write_frames(data / f"{kind}_{i // 64:04d}.npz", usable[i : i + 64], keep_frames=kind == "validation")
-    networks = {}
-    for stage, network in detector.networks.items():
-        source, validation = stage_data(stage, data, closeups="training")
+    weight = np.ones((len(images), 3))
+    if covariance_px2 is not None:
+        length = tool_length_px(np.stack([labelled.u for labelled in images]))[:, None]
+        weight = 1 / (1 + np.trace(covariance_px2, axis1=-2, axis2=-1) / 2 / (0.02 * length) ** 2)
+    images, held_out = ([part[i] for i in rows] for part, rows in zip((images, held_out), usable, strict=True))
+    weight = weight[usable[0]]
+    networks, began = {}, time.perf_counter()
+    for number, (stage, network) in enumerate(detector.networks.items()):
+        source: Source = _SOURCES[stage].of(images, weight=weight)
         if simulated is not None:
-            source = Mixed(source, stage_data(stage, simulated)[0])
-        config = replace(stage_config(stage), network=network.config, steps=steps, learning_rate=3e-4, seed=seed)
-        config = replace(config, batch_size=min(config.batch_size, len(source)), validate_every=max(1, steps // 5))
+            source = Mixed(source, _SOURCES[stage].load(simulated))
+        config = replace(stage_config(stage), network=network.config, steps=steps, learning_rate=5e-4, ema=0.98, seed=seed)
+        config = replace(config, batch_size=min(config.batch_size, 24), validate_every=max(1, steps // 3))
         start = Training(network, [], {"shipped": detector.metadata.get("commit")})
-        tuned = train(config, source, validation, Path(folder) / stage, initial=start, progress=progress)
+        left = None
+        if minutes is not None:  # of what is left, a stage takes its share
+            left = (60 * minutes - (time.perf_counter() - began)) / (len(detector.networks) - number)
+        tuned = train(
+            config, source, _still(stage, held_out), Path(folder) / stage, initial=start, max_seconds=left,
+            progress=progress if isinstance(progress, bool) else partial(progress, stage),
+        )  # fmt: skip
         networks[f"{stage}_network"] = tuned.network
-    fitted_on = [*validation_images(data), *(validation_images(simulated) if simulated is not None else ())]
-    return fit_error_models(replace(detector, **networks), fitted_on, progress=progress)
+    fitted_on = [*held_out, *(validation_images(simulated) if simulated is not None else ())]
+    return fit_error_models(replace(detector, **networks), fitted_on, progress=progress is True)
 
 
 def assemble(
@@ -98,22 +117,21 @@ def assemble(
 ) -> Detector:
     """Join the stages of a training folder, fit their error models, write the weights file `out` and its card.
 
-    The numbers on the card are of error models fitted on half of the validation frames and measured on the other half; the
-    file's own are fitted on all of them, and on labelled `recordings`: typical frames, where the validation frames vary
-    more than those of any microscope.  `notes` are lines for the card.  A missing stage or shard raises `FileNotFoundError`.
+    The error models are fitted on half of the held-out scenes, and on labelled `recordings`, if any; the card's numbers are
+    measured on the other half.  `notes` are lines for the card.  A missing stage or shard raises `FileNotFoundError`.
     """
     out = Path(out)
     stages = {stage: load_training(Path(folder) / stage / "last.safetensors") for stage in STAGES}
     frames = list(validation_images(data))
     if not frames:
-        raise FileNotFoundError(f"{data}: no validation shard; make some with `python3 -m lib train generate`.")
+        raise FileNotFoundError(f"{data}: no shard held_out_*.npz; make some with `python3 -m lib train generate`.")
     typical = []
     for recording in map(Recording.open, recordings):  # 16 images of each, spread over it
         typical += labelled_images(recording, every=max(1, len(recording.frames) // 8))
     networks = {f"{stage}_network": training.network for stage, training in stages.items()}
-    detector = Detector(**networks, reduction=REDUCTION, tool_reduction=TOOL_REDUCTION, mirror=True)
-    held_out = evaluate(fit_error_models(detector, frames[::2] + typical), frames[1::2])
-    detector = fit_error_models(detector, frames + typical)
+    detector = Detector(**networks, frame_px=FRAME_PX[0], mirror=True)
+    detector = fit_error_models(detector, frames[::2] + typical, progress=True)
+    held_out = evaluate(detector, frames[1::2], progress=True)
     keys = ("data", "images", "commit", "steps", "seconds", "processes", "machine", "config", "metrics", "before")
     by_visibility = {k: {"labels": v.labels, "median_px": v.median_px} for k, v in held_out.by_visibility().items()}
     provenance = {
@@ -181,16 +199,16 @@ Notebook 02 explains the stages.
 |---|---|---|---|---|---|---|---|
 {chr(10).join(trainings)}
 
-Each training of a stage starts from the one before. The error models (covariance, confidence) are fitted on
-{p["validation_frames"]} validation frames and {p["recorded_frames"]} frames of {p["recordings"]} simulated recordings.
-The numbers below are of error models fitted on half of the validation frames and measured on the other half
-({p["validation_frames"] // 2} full-HD images that no network was trained on).
+Each training of a stage starts from the one before. The error models (covariance, confidence) are fitted on half of
+{p["validation_frames"]} held-out scenes, which have families of tools, light, ground and optics that training never draws and
+of which some show no tool, and on {p["recorded_frames"]} frames of {p["recordings"]} recordings. The numbers below are of the
+other half.
 
 | held-out frames | |
 |---|---|
 {chr(10).join(f"| {name} | {value} |" for name, value in numbers.items())}
 
-Made by `python3 -m lib train generate`, `frame`, `tool`, `window`, `closeup` and `assemble`, on {p["machine"]["processor"]},
+Made by `python3 -m lib train generate`, `frame`, `tool`, `closeup` and `assemble`, on {p["machine"]["processor"]},
 {p["machine"]["cores"]} cores, {p["machine"]["gpu"] or "no GPU"}.
 
 {chr(10).join(f"- {note}" for note in p["notes"])}

@@ -22,7 +22,6 @@ from lib.training.config import PRESETS, TrainingConfig
 from lib.training.evaluation import Evaluation, evaluate
 from lib.training.loop import Training, train
 from lib.training.samples import LabelledImage, Mixed, Samples, Source
-from lib.training.shards import REDUCTION
 from notebooks.studies.retinal import MonocularSequence
 
 __all__ = [
@@ -39,8 +38,8 @@ __all__ = [
 
 #: Of the crops that training sees.
 CROP_PX = 128
-#: Magnification that gives the tool (about 34 px) the length it has in the detector's own recordings (about 270 px).
-ZOOM = REDUCTION
+#: Magnification of real frames for the whole detector, which takes tools of any length.
+ZOOM = 1.0
 #: Every detection counts: on real frames confidence is not calibrated.
 _ALWAYS = ErrorModel(logit=(9.0, 0.0, 0.0, 0.0))
 
@@ -136,7 +135,7 @@ def finder_alone(detector: Detector, training: Training | None = None) -> Detect
         tool_network=None,
         window_network=None,
         closeup_network=None,
-        reduction=1,
+        frame_px=None,
         mirror=False,
         error_models={"frame": _ALWAYS},
     )

@@ -40,7 +40,7 @@ def test_coarse_to_fine(benchmark, mode, engine):
         pytest.skip("OpenVINO is not installed here")
     shipped = Detector.load(engine=engine)
     sure = ErrorModel(logit=(9.0, 0.0, 0.0, 0.0))
-    detector = shipped.with_error_models(frame=sure, tool=sure, window=sure, tracking=sure)
+    detector = shipped.with_error_models(frame=sure, tool=sure, again=sure, closeup=sure, tracking=sure)
     torch.nn.init.zeros_(detector.closeup_network.head[-1].weight)  # on noise it would lose the tool now and then
     detector = replace(detector)
     images = pair((1080, 1920))

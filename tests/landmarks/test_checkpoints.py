@@ -15,10 +15,10 @@ from lib.landmarks.error_model import ErrorModel
 from lib.landmarks.network import HourglassConfig, StackedHourglass
 
 
-def untrained(reduction=2):
+def untrained(frame_px=64):
     networks = [StackedHourglass(HourglassConfig(4, 1, 1)) for _ in range(2)]
     models = {name: ErrorModel(logit=(5.0, 0.0, 0.0, 0.0)) for name in ("frame", "window")}
-    return Detector(networks[0], reduction, networks[1], window_px=64, error_models=models)
+    return Detector(networks[0], frame_px, networks[1], window_px=64, error_models=models)
 
 
 def test_missing_corrupt_and_foreign_files_are_named(tmp_path):
@@ -57,7 +57,7 @@ def test_missing_metadata_error_models_and_checksums_are_named(tmp_path):
     detector = untrained()
     detector.save(whole)
     tensors, metadata = read_checkpoint(whole, FORMAT)
-    for lacking in ("networks", "reduction", "calibration", "provenance"):
+    for lacking in ("networks", "frame_px", "calibration", "provenance"):
         write_checkpoint(path, tensors, {name: value for name, value in metadata.items() if name != lacking})
         with pytest.raises(ValueError, match=rf"weights\.safetensors: its metadata lack {lacking}; get the file again"):
             Detector.load(path)
@@ -77,7 +77,7 @@ def test_a_full_disk_leaves_the_old_file(tmp_path, monkeypatch):
     before = path.read_bytes()
     monkeypatch.setattr(Path, "write_bytes", lambda self, data: (_ for _ in ()).throw(OSError(28, "No space left")))
     with pytest.raises(OSError, match=r"weights\.safetensors: not saved \(No space left"):
-        untrained(reduction=4).save(path)
+        untrained(frame_px=32).save(path)
     assert [file.name for file in tmp_path.iterdir()] == ["weights.safetensors"] and path.read_bytes() == before
 
 
@@ -85,8 +85,8 @@ def test_weights_of_another_network_are_named(tmp_path):
     path = tmp_path / "weights.safetensors"
     network = StackedHourglass(HourglassConfig(8, 1))
     metadata = {
-        "format": "microstereo.detector", "networks": {"frame": {"features": 16}}, "reduction": 1, "window_px": 64,
-        "tool_reduction": 5, "mirror": False, "method": "paper", "calibration": {}, "provenance": {},
+        "format": "microstereo.detector", "networks": {"frame": {"features": 16}}, "frame_px": None, "window_px": 64,
+        "mirror": False, "method": "paper", "calibration": {}, "provenance": {},
     }  # fmt: skip
     write_checkpoint(path, {f"frame.{k}": v for k, v in network.state_dict().items()}, metadata)
     with pytest.raises(ValueError, match=r"weights\.safetensors: its weights do not fit"):
@@ -97,7 +97,7 @@ def test_an_error_model_of_another_version_is_named(tmp_path):
     path = tmp_path / "weights.safetensors"
     untrained().save(path)
     tensors, metadata = read_checkpoint(path, FORMAT)
-    old = [[[0.0] * 4, [0.0] * 4], [1.0] * 4]
+    old = [[[0.0] * 14, [0.0] * 14], [1.0] * 4]
     write_checkpoint(path, tensors, metadata | {"calibration": {"frame": old, "window": old}})
-    with pytest.raises(ValueError, match=r"weights\.safetensors: .*log_variance: expected \(2, 6\), got \(2, 4\); fit anew"):
+    with pytest.raises(ValueError, match=r"safetensors: .*log_variance: expected \(2, 10\), got \(2, 14\); fit anew"):
         Detector.load(path)

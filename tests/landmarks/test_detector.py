@@ -4,15 +4,20 @@ import numpy as np
 import pytest
 import torch
 
+from lib.geometry import image_from_cell
 from lib.landmarks import Detector, Landmarks
-from lib.landmarks.error_model import ErrorModel, features_of
+from lib.landmarks.error_model import ErrorModel, Rough, features_of
 from lib.landmarks.heatmaps import Peaks
+from lib.landmarks.metrics import tool_length_px
 from lib.landmarks.network import HourglassConfig, OffsetConfig, OffsetNetwork, StackedHourglass, as_tensor
 from lib.landmarks.windows import (
     CLOSEUP_BEHIND_PX,
     CLOSEUP_ZOOM,
+    TOOL_PX,
     closeup_from_image,
+    closeup_scale,
     cut,
+    expected_in_closeup,
     map_points,
     tool_pose,
     window_from_image,
@@ -24,10 +29,10 @@ def sure():
     return {name: ErrorModel(logit=(5.0, 0.0, 0.0, 0.0)) for name in ("frame", "window")}
 
 
-def untrained(reduction=2):
+def untrained(frame_px=66):
     torch.manual_seed(0)
     networks = [StackedHourglass(HourglassConfig(8, 1)) for _ in range(2)]
-    return Detector(networks[0], reduction, networks[1], window_px=64, error_models=sure())
+    return Detector(networks[0], frame_px, networks[1], window_px=64, error_models=sure())
 
 
 @pytest.fixture(scope="module")
@@ -108,20 +113,79 @@ def test_direction_needs_a_base_and_a_tip():
     assert np.isnan(angle[1:]).all()
 
 
-def test_reduced_frames_keep_the_half_pixel_rule():
-    """A blob at u shrinks to cell_from_image(u): the rule of lib.geometry, here with the library's own resize."""
+@pytest.mark.parametrize("frame_px", [24, 37, 120, 200])
+def test_resized_frames_keep_the_half_pixel_rule(frame_px):
+    """A blob at u shrinks or grows to cell_from_image(u): the rule of lib.geometry, here with the library's own resize."""
     y, x = np.mgrid[:100, :120]
     image = (255 * np.exp(-((x - 61.7) ** 2 + (y - 44.1) ** 2) / 200)).astype(np.uint8)[..., None].repeat(3, 2)
-    small = untrained(5).reduced(image[None])[0, ..., 0].astype(float)
-    rows, columns = np.mgrid[:20, :24]
+    detector = untrained(frame_px)
+    small, stride = detector.reduced(image[None])[0, ..., 0].astype(float), detector.frame_stride(image[None])
+    assert max(small.shape) == frame_px
+    rows, columns = np.indices(small.shape)
     centre = np.array([(small * columns).sum(), (small * rows).sum()]) / small.sum()
-    assert np.allclose(5 * centre + 2, (61.7, 44.1), atol=0.1)
+    assert np.allclose(image_from_cell(centre, stride), (61.7, 44.1), atol=0.1)
+
+
+def test_a_finer_or_coarser_cut_keeps_its_place():
+    """What a window at any scale shows of a blob lies where its matrix says."""
+    y, x = np.mgrid[:200, :240]
+    image = (255 * np.exp(-((x - 110.3) ** 2 + (y - 92.6) ** 2) / 60)).astype(np.uint8)[..., None].repeat(3, 2)
+    for zoom in (0.2, 0.45, 1.0, 1.7):
+        matrix = window_from_image((112.0, 90.0), 0.4, 64, zoom)
+        seen = cut(image, matrix, 64)[..., 0].astype(float)
+        rows, columns = np.indices(seen.shape)
+        centre = np.array([(seen * columns).sum(), (seen * rows).sum()]) / seen.sum()
+        assert np.allclose(centre, map_points(matrix, np.array([110.3, 92.6])), atol=0.06)
+
+
+def test_every_tool_fills_the_same_share_of_its_window(images):
+    """And closeups are no finer than half an image pixel."""
+    tool = np.array([[[40.0, 40.0], [60.0, 36.0], [60.0, 44.0]]])
+    torch.manual_seed(0)
+    network = StackedHourglass(HourglassConfig(4, 1, 1))
+    detector = Detector(network, 64, tool_network=network, closeup_network=OffsetNetwork(OffsetConfig(4, 32)))
+    assert detector.stages == ["frame", "tool", "again", "closeup", "closer", "tracking"]
+    for scale in (0.5, 1.0, 3.0):
+        u = 40 + scale * (tool - 40)
+        windows, (matrix,), _ = detector.windows(images[:1], u, "tool")
+        assert windows.shape == (1, TOOL_PX, TOOL_PX, 3)
+        assert tool_length_px(map_points(matrix, u))[0] == pytest.approx(56.0)
+        _, matrices, which = detector.windows(images[:1], u, "closeup")
+        assert np.sqrt(np.abs(np.linalg.det(matrices[:, :, :2]))).max() <= 2.0 + 1e-9
+        at = map_points(matrices, u[0])
+        np.testing.assert_allclose(at, expected_in_closeup(32, which[:, 1]), atol=1e-9)
+
+
+def test_grey_images_are_taken(images):
+    grey = images[..., :1]
+    np.testing.assert_array_equal(untrained()(grey).u, untrained()(grey.repeat(3, axis=-1)).u)
+
+
+def test_what_the_stage_before_found_is_evidence(images):
+    """Features tell agreement with it, its confidence, and that of the whole tool; a second look has its own model."""
+    torch.manual_seed(0)
+    network = StackedHourglass(HourglassConfig(4, 1, 1)).eval()
+    detector = Detector(network, 64, tool_network=network)
+    u, spread = np.array([[[30.0, 50], [60, 40], [60, 60]]]), np.tile(np.eye(2), (1, 3, 1, 1))
+    rough = Landmarks(u, spread, np.array([[0.9, 0.5, 0.1]]))
+    peaks, matrices, which = detector.stage_peaks(images[:1], rough.u, "tool")
+    seen = detector.rough_in_windows(rough, matrices, which, "tool")
+    np.testing.assert_allclose(seen.logit[:, 0].numpy(), [np.log(9), 0, -np.log(9)], atol=1e-9)
+    np.testing.assert_allclose(seen.together.numpy(), 0, atol=1e-9)
+    features = features_of(peaks.double(), seen)
+    moved = np.linalg.norm(peaks.u[:, 0].numpy() - map_points(matrices, rough.u[0]), axis=1)
+    np.testing.assert_allclose(features[:, 0, 0, 5].numpy(), np.log1p(np.minimum(moved, 100) / 2), rtol=1e-4)
+    trusting = ErrorModel(logit=(*7 * (0.0,), 1.0))
+    found = detector.with_error_models(tool=trusting, again=ErrorModel(logit=(2.0,))).refine(images[:1], rough, "tool")
+    np.testing.assert_allclose(found.confidence, 0.5, atol=1e-9)
+    again = detector.with_error_models(again=ErrorModel(logit=(2.0,))).refine(images[:1], rough, "again")
+    np.testing.assert_allclose(again.confidence, 1 / (1 + np.exp(-2.0)))
 
 
 @pytest.mark.parametrize(
     ("bad", "text"),
     [
-        (np.zeros((1, 64, 64, 1), np.uint8), "grey channel"),
+        (np.zeros((1, 64, 64, 2), np.uint8), "grey"),
         (np.zeros((1, 64, 64, 4), np.uint8), "alpha"),
         (np.zeros((64, 64, 3), np.uint8), "first axis"),
         (np.full((1, 64, 64, 3), 200.0), r"must lie in \[0, 1\]"),
@@ -137,23 +201,24 @@ def test_bad_images_are_named(bad, text):
         as_tensor(bad)
 
 
-def test_a_closeup_moves_what_the_windows_found_and_keeps_its_confidence(images):
+def test_a_closeup_moves_what_the_stage_before_found(images):
     """An offset network that says "10 right of the middle, 2 below" puts each landmark there, turned back into the image."""
     closeup = OffsetNetwork(OffsetConfig(4, 32)).eval()
     size = closeup.config.size_px
     with torch.no_grad():
         closeup.head[-1].bias.copy_(torch.tensor([10 * 8 / size, 2 * 8 / size, -1.0, 0.5]))
     plain = untrained()
-    detector = replace(plain, closeup_network=closeup)
-    before, after = plain(images), detector(images)
+    sure_too = replace(ErrorModel(), logit=(5.0,))
+    detector = replace(plain, closeup_network=closeup).with_error_models(closeup=sure_too)
+    before = plain(images)
+    after = detector.refine(images, before, "closeup")
     seen = np.isfinite(before.u).all(axis=2)
     assert seen.all()
-    np.testing.assert_array_equal(after.confidence, before.confidence)
-    angle = tool_pose(before.u)[1]
+    angle, scale = tool_pose(before.u)[1], closeup_scale(tool_length_px(before.u))
     for i, k in np.argwhere(seen):
-        zoom, side = CLOSEUP_ZOOM[k], -1 if k == 2 else 1
+        zoom, side = CLOSEUP_ZOOM[k] * scale[i], -1 if k == 2 else 1
         c, s = np.cos(angle[i]), np.sin(angle[i])
-        ahead = 10.0 / zoom - CLOSEUP_BEHIND_PX[k]
+        ahead = 10.0 / zoom - CLOSEUP_BEHIND_PX[k] / scale[i]
         turn = np.array([[c, -s], [s, c]])
         moved = turn @ np.array([ahead, side * 2.0 / zoom])
         np.testing.assert_allclose(after.u[i, k] - before.u[i, k], moved, atol=1e-3)
@@ -161,7 +226,7 @@ def test_a_closeup_moves_what_the_windows_found_and_keeps_its_confidence(images)
         np.testing.assert_allclose(after.covariance[i, k], spread, rtol=1e-3)
     with torch.no_grad():
         closeup.head[-1].bias[0] = 40 * 8 / size  # further than a closeup is believed
-    np.testing.assert_array_equal(replace(plain, closeup_network=closeup)(images).u, before.u)
+    np.testing.assert_array_equal(replace(detector, closeup_network=closeup).refine(images, before, "closeup").u, before.u)
 
 
 def test_tracking_looks_twice_at_closeups_and_knows_when_it_lost_the_tool(images, monkeypatch):
@@ -187,7 +252,7 @@ def test_tracking_looks_twice_at_closeups_and_knows_when_it_lost_the_tool(images
 def test_closeups_and_what_is_believed_of_them_are_saved(tmp_path, images):
     fit = ErrorModel(gain=((0.5, 0.25),) * 3, bias=((0.1, -0.1),) * 3)
     detector = replace(untrained(), closeup_network=OffsetNetwork(OffsetConfig(4, 32)).eval())
-    detector = detector.with_error_models(closeup=fit, tracking=ErrorModel())
+    detector = detector.with_error_models(closeup=fit, closer=fit, tracking=ErrorModel())
     detector.save(tmp_path / "weights.safetensors")
     loaded = Detector.load(tmp_path / "weights.safetensors", engine="torch")
     assert loaded.closeup_network.config == OffsetConfig(4, 32)
@@ -217,5 +282,6 @@ def test_tracking_needs_as_many_landmarks_as_images(images):
 
 def test_features_are_finite_for_any_peak():
     variance = torch.tensor([0.0, 1e9, torch.nan])[:, None, None] * torch.eye(2)
-    peaks = Peaks(torch.zeros(3, 2), torch.tensor([-3.0, 5.0, 1.0]), torch.tensor([0.4, 3.0, 1.0]), variance)
-    assert torch.isfinite(features_of(peaks, 2.0)).all()
+    peaks = Peaks(torch.zeros(3, 2), torch.tensor([-3.0, 5.0, 1.0]), torch.tensor([0.4, 3.0, 1.0]), variance, torch.zeros(3))
+    rough = Rough.of(torch.full((3, 2), torch.nan), torch.tensor([0.0, 0.5, 1.0]))
+    assert torch.isfinite(features_of(peaks, rough)).all()

@@ -14,12 +14,16 @@ from lib.landmarks.engines import openvino
 from lib.landmarks.error_model import ErrorModel
 from lib.landmarks.export import LARGEST, export
 from lib.landmarks.network import HourglassConfig, OffsetConfig, OffsetNetwork, StackedHourglass, as_tensor
+from lib.landmarks.windows import map_points
 from lib.parallel import single_threaded_torch
 
 pytestmark = pytest.mark.skipif(
     not (importlib.util.find_spec("onnx") and importlib.util.find_spec("openvino")), reason="onnx or OpenVINO is missing"
 )
-SURE = ErrorModel(((-0.1, 0.4, 0.5, 0.0, -0.2, 0.1), (0.3, 0.1, -0.2, 0.0, 0.1, 0.0)), (3.0, 0.0, 2.0, -0.3))
+SURE = ErrorModel(
+    ((-0.1, 0.4, 0.5, 0.0, -0.2, 0.1, 0.1, 0.2, 0.0, 0.1), (0.3, 0.1, -0.2, 0.0, 0.1, 0.0, 0.0, 0.3, -0.1, 0.0)),
+    (3.0, 0.0, 2.0, -0.3, -0.5, 0.05, 0.1, 0.1),
+)
 
 
 @cache
@@ -28,9 +32,9 @@ def compiled(content: bytes):
     return core.compile_model(core.read_model(content), "CPU", {"INFERENCE_PRECISION_HINT": "f32"})
 
 
-def run_onnx(path, images: np.ndarray) -> tuple[np.ndarray, ...]:
+def run_onnx(path, *inputs: np.ndarray) -> tuple[np.ndarray, ...]:
     """`lib.landmarks.export.run_onnx`, which compiles a file only once."""
-    found = compiled(path.read_bytes())(images)
+    found = compiled(path.read_bytes())(list(inputs))
     return found["u"], found["covariance"], found["confidence"]
 
 
@@ -47,11 +51,9 @@ def small():
     closeup = OffsetNetwork(OffsetConfig(4, 32)).eval()
     for head in [*(network.heads[0] for network in networks), closeup.head[-1]]:
         torch.nn.init.normal_(head.weight, std=0.1)
-    models = dict.fromkeys(("frame", "tool", "window"), SURE)
+    models = dict.fromkeys(("frame", "tool", "again", "window"), SURE)
     models |= dict.fromkeys(("closeup", "tracking"), replace(SURE, gain=((0.5, 0.8),) * 3, bias=((0.2, -0.1),) * 3))
-    detector = Detector(
-        networks[0], 2, networks[1], networks[2], 2, 64, "paper", models, closeup_network=closeup, mirror=True
-    )
+    detector = Detector(networks[0], 80, networks[1], networks[2], 64, "paper", models, closeup_network=closeup, mirror=True)
     return detector, np.random.default_rng(0).integers(0, 256, (2, 120, 160, 3), dtype=np.uint8)
 
 
@@ -63,39 +65,29 @@ def rgb(images: np.ndarray) -> np.ndarray:
 def check_every_stage(detector: Detector, images: np.ndarray, folder) -> None:
     """The detector put together from its ONNX files, as the export's docstring says: the same landmarks."""
     written = export(detector, folder, images)
-    stages = ("frame", "tool", "window", "closeup", "tracking")
-    assert {file.name for file in folder.iterdir()} == {f"{stage}.onnx" for stage in stages}
+    assert {file.name for file in folder.iterdir()} == {f"{stage}.onnx" for stage in detector.stages}
     assert all(difference <= LARGEST["px"] for _, difference in written.values())
     images = images[:2]  # another number of images than the export saw
     found = Landmarks(*run_onnx(folder / "frame.onnx", rgb(detector.reduced(images))))
-    finder = replace(detector, window_network=None, closeup_network=None, mirror=False)
-    np.testing.assert_allclose(found.u, replace(finder, tool_network=None)(images).u, atol=0.02)
-    windows, matrices, which = detector.windows(images, found.u, "tool")
-    u, covariance, confidence = run_onnx(folder / "tool.onnx", rgb(windows))
-    back = np.linalg.inv(matrices[:, None, :, :2])
-    u = (back @ (u - matrices[:, None, :, 2])[..., None])[..., 0]
-    expected = finder(images)
-    np.testing.assert_allclose(u, expected.u[which], atol=5 * LARGEST["px"])  # the stage's pixels are larger
-    np.testing.assert_allclose(back @ covariance @ back.mT, expected.covariance[which], rtol=2e-2, atol=1e-3)
-    np.testing.assert_allclose(confidence, expected.confidence[which], atol=LARGEST["of confidence"])
-    looks = {
-        "window": replace(detector, closeup_network=None),
-        "closeup": detector,
-        "tracking": lambda images: detector.refine(images, expected, "tracking"),
-    }
-    for stage, reference in looks.items():
-        windows, matrices, which = detector.windows(images, expected.u, stage)
-        own = tuple(np.arange(len(which))), tuple(which[:, 1])  # of each window its own landmark
-        u, covariance, confidence = (part[own] for part in run_onnx(folder / f"{stage}.onnx", rgb(windows)))
-        back = np.linalg.inv(matrices[:, :, :2])
-        expected, (image, landmark) = reference(images), which.T
+    rough = detector.coarse(images)
+    np.testing.assert_allclose(found.u, rough.u, atol=0.02)
+    for stage in detector.stages[1:]:
+        expected = detector.refine(images, rough, stage)
+        windows, matrices, which = detector.windows(images, rough.u, stage)
         assert len(which)
-        u = (back @ (u - matrices[:, :, 2])[..., None])[..., 0]
-        np.testing.assert_allclose(u, expected.u[image, landmark], atol=LARGEST["px"])
-        turned = back @ covariance @ back.mT
-        np.testing.assert_allclose(turned, expected.covariance[image, landmark], rtol=2e-2, atol=1e-3)
-        if stage != "closeup":  # there the windows' confidence is kept
-            np.testing.assert_allclose(confidence, expected.confidence[image, landmark], atol=LARGEST["of confidence"])
+        image = which if which.ndim == 1 else which[:, 0]
+        evidence = map_points(matrices[:, None], rough.u[image]), rough.confidence[image]
+        evidence = () if stage == "tracking" else tuple(part.astype(np.float32) for part in evidence)
+        u, covariance, confidence = run_onnx(folder / f"{stage}.onnx", rgb(windows), *evidence)
+        back = np.linalg.inv(matrices[:, None, :, :2])
+        u = (back @ (u - matrices[:, None, :, 2])[..., None])[..., 0]
+        # Of each window its own landmark, or all three.
+        own = (np.arange(len(which)), which[:, 1]) if which.ndim == 2 else np.s_[:]
+        true = expected[image]
+        np.testing.assert_allclose(u[own], true.u[own], atol=5 * LARGEST["px"])  # a stage's pixels may be larger
+        np.testing.assert_allclose((back @ covariance @ back.mT)[own], true.covariance[own], rtol=3e-2, atol=1e-3)
+        np.testing.assert_allclose(confidence[own], true.confidence[own], atol=2 * LARGEST["of confidence"])
+        rough = expected
 
 
 def test_every_exported_stage_is_that_of_the_detector(small, tmp_path, quick):
@@ -111,7 +103,7 @@ def test_every_exported_stage_of_the_shipped_detector_is_its_own(shipped, tmp_pa
 
 def test_the_first_stage_that_ships_is_exported_with_its_gaussian_fit(shipped, tmp_path, quick):
     whole = shipped.torch
-    detector = Detector(whole.frame_network, whole.reduction, error_models=whole.error_models)
+    detector = Detector(whole.frame_network, whole.frame_px, error_models=whole.error_models)
     path, difference = export(detector, tmp_path, shipped.images[:2])["frame"]
     assert difference <= LARGEST["px"]
     u, covariance, confidence = run_onnx(path, rgb(detector.reduced(shipped.images[2:3])))  # another number of images
@@ -124,7 +116,7 @@ def test_the_first_stage_that_ships_is_exported_with_its_gaussian_fit(shipped, t
 
 
 def test_an_export_that_differs_is_not_written(small, tmp_path, monkeypatch):
-    detector = Detector(small[0].frame_network, 4, method="paper", error_models={"frame": SURE})
+    detector = Detector(small[0].frame_network, 40, method="paper", error_models={"frame": SURE})
     written = export(detector, tmp_path, small[1])["frame"][0]
     content = written.read_bytes()
     written.unlink()
@@ -132,8 +124,8 @@ def test_an_export_that_differs_is_not_written(small, tmp_path, monkeypatch):
     changes = {"px": (0, 1.0, 0.02), "of variance": (1, 1.1, 0.0), "of confidence": (2, 1.0, 0.01)}
     for unit, (part, factor, shift) in changes.items():
 
-        def wrong(path, images, changed=part, factor=factor, shift=shift):
-            return tuple(factor * v + shift if i == changed else v for i, v in enumerate(run_onnx(path, images)))
+        def wrong(path, *inputs, changed=part, factor=factor, shift=shift):
+            return tuple(factor * v + shift if i == changed else v for i, v in enumerate(run_onnx(path, *inputs)))
 
         monkeypatch.setattr(module, "run_onnx", wrong)
         with pytest.raises(ValueError, match=f"frame: ONNX and torch differ by .* {unit}"):

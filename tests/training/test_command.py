@@ -9,7 +9,7 @@ import torch
 from lib import paths
 from lib.__main__ import COMMANDS
 from lib.landmarks import Detector
-from lib.landmarks.network import HourglassConfig, StackedHourglass
+from lib.landmarks.network import HourglassConfig, OffsetConfig, OffsetNetwork, StackedHourglass
 from lib.training import stages
 from lib.training.command import main_evaluate
 from lib.training.loop import load_training
@@ -45,24 +45,36 @@ def test_the_card_beside_the_shipped_weights_is_theirs():
 def test_stages_are_fine_tuned_on_labelled_frames(tmp_path, monkeypatch):
     """Every stage of a small detector learns, one step each, and resumes; images without a labelled base are left out."""
     torch.manual_seed(0)
-    images = toy_images(8, size=(540, 960))
+    images = toy_images(8, size=(270, 480))
     images[0] = images[0]._replace(u=np.full((3, 2), np.nan))
-    hourglass = StackedHourglass(HourglassConfig(4, 1, 2))
-    detector = Detector(hourglass, reduction=8, tool_network=hourglass, window_network=hourglass)
-    fitted_on = []
+    hourglass, closeup = StackedHourglass(HourglassConfig(4, 1, 2)), OffsetNetwork(OffsetConfig(4, 64))
+    detector = Detector(hourglass, 96, tool_network=hourglass, closeup_network=closeup)
+    fitted_on, done = [], []
     monkeypatch.setattr(stages, "fit_error_models", lambda d, held_out, progress: fitted_on.append(held_out) or d)
-    options = {"steps": 1, "progress": False}
-    tuned = stages.finetune(detector, images[:6], images[6:], tmp_path, **options)
+    options = {"steps": 1, "progress": lambda stage, part: done.append((stage, part))}
+    covariance = np.tile(np.array([0.0, 1.0, 1e9])[:, None, None] * np.eye(2), (6, 1, 1, 1))  # the second tip is not believed
+    tuned = stages.finetune(detector, images[:6], images[6:], tmp_path, covariance_px2=covariance, **options)
+    assert done == [("frame", 1.0), ("tool", 1.0), ("closeup", 1.0)]
     for stage, network in tuned.networks.items():
         provenance = load_training(tmp_path / stage / "last.safetensors").provenance
-        assert provenance["steps"] == 1 and provenance["images"] == (15 if stage == "window" else 5)
-        assert any((a != b).any() for a, b in zip(network.parameters(), hourglass.parameters(), strict=True))
-    again = stages.finetune(detector, images[:6], images[6:], tmp_path, **options)
-    for a, b in zip(again.window_network.parameters(), tuned.window_network.parameters(), strict=True):
+        assert provenance["steps"] == 1 and provenance["images"] == (15 if stage == "closeup" else 5)
+        before = detector.networks[stage].parameters()
+        assert any((a != b).any() for a, b in zip(network.parameters(), before, strict=True))
+    again = stages.finetune(detector, images[:6], images[6:], tmp_path, covariance_px2=covariance, **options)
+    for a, b in zip(again.tool_network.parameters(), tuned.tool_network.parameters(), strict=True):
         assert torch.equal(a, b)
     assert [len(held_out) for held_out in fitted_on] == [2, 2]
     with pytest.raises(ValueError, match="none has a labelled base and tip"):
         stages.finetune(detector, images[:1], images[6:], tmp_path / "none", **options)
+
+
+def test_time_ends_fine_tuning(tmp_path, monkeypatch):
+    torch.manual_seed(0)
+    images = toy_images(4, size=(135, 240))
+    monkeypatch.setattr(stages, "fit_error_models", lambda d, held_out, progress: d)
+    detector = Detector(StackedHourglass(HourglassConfig(4, 1, 2)), 96)
+    stages.finetune(detector, images[:2], images[2:], tmp_path, steps=10**6, minutes=1e-4, progress=False)
+    assert load_training(tmp_path / "frame" / "last.safetensors").provenance["steps"] < 100
 
 
 def test_fine_tuning_needs_recordings_and_a_file(capsys):

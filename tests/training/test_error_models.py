@@ -8,7 +8,7 @@ import torch
 
 from lib.landmarks import Detector, metrics
 from lib.landmarks import detector as detectors
-from lib.landmarks.error_model import ErrorModel
+from lib.landmarks.error_model import FEATURES, ErrorModel
 from lib.landmarks.network import OffsetConfig, OffsetNetwork
 from lib.training import error_models
 from lib.training.error_models import Seen, fit_error_models
@@ -37,7 +37,9 @@ def test_fitted_variance_of_known_errors():
     """Errors drawn with a variance that depends on feature, base or tip, and axis: the fit finds all three, and NEES is 2."""
     rng = np.random.default_rng(0)
     features = np.stack(
-        [np.ones((6000, 3)), rng.normal(0, 1, (6000, 3)), rng.uniform(0.2, 1, (6000, 3)), np.zeros((6000, 3))], 2
+        [np.ones((6000, 3)), rng.normal(0, 1, (6000, 3)), rng.uniform(0.2, 1, (6000, 3))]
+        + [np.zeros((6000, 3))] * (FEATURES - 3),
+        2,
     )
     landmark = rng.integers(3, size=6000)
     along = 0.3 + 0.8 * features[:, 0, 1] + np.array([-0.6, 0.3, 0.3])[landmark]
@@ -45,7 +47,7 @@ def test_fitted_variance_of_known_errors():
     sigma = np.exp(np.column_stack([along, across]) / 2)
     errors = rng.normal(0, 1, (6000, 2)) * sigma
     correct = np.linalg.norm(errors, axis=1) < 2
-    fit = Seen(features, errors, np.full(6000, 2.0), landmark, np.zeros((6000, 2))).fit(1e9)
+    fit = Seen(features, errors, np.full(6000, 2.0), landmark, np.zeros((6000, 2)), np.ones(6000, bool)).fit(1e9)
     coefficients = fit.coefficients
     assert coefficients[:, :, 1] == pytest.approx(np.tile([0.8, 0.2], (3, 1)), abs=0.05)
     assert coefficients[1:, :, 0] - coefficients[0, :, 0] == pytest.approx(np.array([[0.9, 0], [0.9, 0]]), abs=0.1)
@@ -68,7 +70,7 @@ def test_closeups_that_know_nothing_do_no_harm(small, monkeypatch):
     full = replace(detector, window_network=detector.frame_network, window_px=64, closeup_network=closeup)
     frames = frames[:10]
     once = fit_error_models(full, frames)
-    assert set(once.error_models) == {"frame", "window", "closeup", "tracking"}
+    assert set(once.error_models) == {"frame", "window", "closeup", "closer", "tracking"}
     gain = np.array(once.error_models["closeup"].gain)
     assert ((gain >= 0) & (gain <= 1)).all()
     assert once.error_models["tracking"].gain == ((1.0, 1.0),) * 3
@@ -86,7 +88,7 @@ def test_as_much_of_a_correction_is_believed_as_helps():
     truth = gain[landmark] * moved - bias[landmark] + rng.laplace(0, 0.05, (3000, 2))  # from where it was expected
     errors = moved - truth
     errors[:20], errors[20:40] = 50.0, np.nan
-    seen = Seen(np.ones((3000, 3, 4)), errors, np.ones(3000), landmark, moved)
+    seen = Seen(np.ones((3000, 3, FEATURES)), errors, np.ones(3000), landmark, moved, np.ones(3000, bool))
     found, off = seen.gain(20.0, np.linspace(0, 1, 51))
     np.testing.assert_allclose(found, gain, atol=0.021)
     np.testing.assert_allclose(off, bias, atol=0.02)

@@ -176,7 +176,7 @@ def test_the_loss_figure_takes_what_it_is_given():
 def test_closeups_show_what_was_expected_seen_and_believed():
     at = torch.tensor([[[20.0, 12.0]], [[16.0, 16.0]]])
     one = torch.ones(2, 1)
-    peaks = Peaks(at, one, one, torch.eye(2).expand(2, 1, 2, 2))
+    peaks = Peaks(at, one, one, torch.eye(2).expand(2, 1, 2, 2), 0 * one)
     expected = np.full((2, 2), 16.0)
     kept = replace(peaks, u=(at + 16) / 2)
     figure = plots.closeups(np.zeros((2, 32, 32, 3), np.uint8), expected, peaks, kept, ["base", "tip_1"])

@@ -30,7 +30,7 @@ def sequence(tmp_path, toy) -> MonocularSequence:
 
 @pytest.fixture
 def detector() -> Detector:
-    return Detector(StackedHourglass(HourglassConfig(4, 1, 2)), reduction=8)
+    return Detector(StackedHourglass(HourglassConfig(4, 1, 2)), frame_px=60)
 
 
 def side(u: np.ndarray) -> np.ndarray:
@@ -96,7 +96,7 @@ def test_only_the_first_half_is_trained_on(sequence, toy, detector, tmp_path, mo
     quick = finder.train_on_first_half(sequence, detector, None, finder.quick_config(1))
     assert quick.provenance["images"] == 4  # no simulated frame
     tuned = finder.finder_alone(detector, trained)
-    assert tuned.reduction == 1 and list(tuned.networks) == ["frame"]
+    assert tuned.frame_px is None and list(tuned.networks) == ["frame"]
 
 
 def test_evaluation_is_of_the_second_half(sequence, detector, toy):

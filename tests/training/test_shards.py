@@ -32,7 +32,7 @@ def test_shards_hold_what_the_stages_see(tmp_path, toy_shards):
     tools = WindowSource.load_tools(tmp_path)
     assert len(tools) == 2
     assert len(Samples.drawn(windows)) == 6
-    _, image, u, _ = next(iter(shards.validation_images(tmp_path)))
+    _, image, u, _ = next(iter(shards.validation_images(tmp_path, "validation")))
     assert image.shape == (540, 960, 3)
     assert np.allclose(u, images[0].u)
 
@@ -40,7 +40,7 @@ def test_shards_hold_what_the_stages_see(tmp_path, toy_shards):
 def test_shards_of_windows_alone_are_centred_on_their_landmark(tmp_path, toy_shards, monkeypatch):
     """A stand-in for the simulator, whose landmark lies off the centre where the field ends, and is now and then unseen."""
 
-    def off_centre(rng, *, crop_px, around, jitter):
+    def off_centre(rng, *, crop_px, around, jitter, textures, population):
         image, u = np.zeros((crop_px, crop_px, 3), np.uint8), rng.uniform(60, 200, (3, 2))
         x, y = np.round(u[around]).astype(int)
         image[y, x] = 255
@@ -70,7 +70,7 @@ def test_where_a_landmark_lies_in_its_jpeg_blocks_does_not_tell_its_place(monkey
     """A stand-in for the simulator that asks where the landmark will lie in the image that is compressed."""
     places = []
 
-    def sample(rng, *, crop_px, around, jitter):
+    def sample(rng, *, crop_px, around, jitter, textures, population):
         u = (crop_px - 1) / 2 - np.round(rng.uniform(-jitter, jitter, (3, 2)) * crop_px)
         places.append(u[around])
         return np.zeros((crop_px, crop_px, 3), np.uint8), u, np.full(3, 2)
@@ -100,7 +100,7 @@ def test_closeups_are_stretched_with_their_landmark(tmp_path):
     visibility = np.full((30, 3), 2)
     visibility[4, 1] = 1  # hidden: not trained on
     np.savez(tmp_path / "closeups_0000.npz", crop_visibility=visibility, **arrays)
-    source = CloseupSource.load(tmp_path)
+    source = replace(CloseupSource.load(tmp_path), disguise=0.0)
     assert len(source) == 29
     for i in range(len(source)):
         image, at, seen = source.draw(i, rng)
@@ -134,4 +134,4 @@ def test_missing_and_corrupt_shards_are_named(tmp_path):
         with pytest.raises(ValueError, match=r"training_0000\.npz: corrupt"):
             shards.frame_samples(tmp_path)
         with pytest.raises(ValueError, match=r"validation_0000\.npz: corrupt"):
-            list(shards.validation_images(tmp_path))
+            list(shards.validation_images(tmp_path, "validation"))

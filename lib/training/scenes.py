@@ -1,0 +1,133 @@
+"""Whole frames of any size, kept small, and what the first two stages see of them."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
+
+import cv2
+import numpy as np
+
+from lib.landmarks import windows
+from lib.landmarks.metrics import tool_length_px
+from lib.training.appearance import disguised
+from lib.training.samples import LabelledImage, Source
+from lib.training.shards import SCENE_PX, packed, read_scenes
+
+__all__ = ["FrameSource", "SceneSource", "ToolSource"]
+
+#: The first stage sees frames whose longer side is shrunk to this, here with (width, height) of the input.  It is trained on
+#: parts of them, which costs a third, since a frame is mostly background.
+FRAME_PX, PART_PX = (320, 192), (160, 128)
+#: Shorter tools are no target, they have no loss.
+SHORTEST_PX = 5.0
+#: Nor are tools in an image whose grey values spread less.
+FLAT = 5.0
+
+
+@dataclass(frozen=True)
+class SceneSource(Source):
+    """Frames as JPEG, one after the other, that end at `ends` (n,), with u (n, 3, 2) in their pixels and visibility (n, 3).
+
+    Frames without a tool are among them: all landmarks have visibility 0.  `disguise` is the share of the
+    draws whose appearance is changed, `weight` (n, 3) that of the draws in which a label counts.
+    """
+
+    ends: np.ndarray
+    jpegs: np.ndarray
+    u: np.ndarray
+    visibility: np.ndarray
+    disguise: float = 0.5
+    weight: np.ndarray | None = None
+
+    @classmethod
+    def load(cls, folder: str | Path) -> Self:
+        """From the shards of a folder."""
+        return cls(*read_scenes(folder))
+
+    @classmethod
+    def of(cls, images: Iterable[LabelledImage], *, still: bool = False, weight: np.ndarray | None = None) -> Self:
+        """From labelled images of any size; `still` shows each as the detector sees it, for validation."""
+        return cls(*packed(images, SCENE_PX), disguise=0.0 if still else 0.5, weight=weight)
+
+    def frame(self, index: int) -> np.ndarray:
+        """The frame (h, w, 3) uint8 RGB."""
+        start = self.ends[index - 1] if index else 0
+        return cv2.cvtColor(cv2.imdecode(self.jpegs[start : self.ends[index]], cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+
+    def _drawn(self, index: int, matrix: np.ndarray, size: tuple[int, int], rng: np.random.Generator):
+        """The frame seen through a matrix, disguised or not; landmarks too small to see have no loss."""
+        image, visibility = self.frame(index), self.visibility[index]
+        scale = np.sqrt(abs(np.linalg.det(matrix[:, :2])))
+        if scale < 0.8:  # interpolation alone would alias
+            image = cv2.GaussianBlur(image, (0, 0), 0.45 * np.sqrt(1 / scale**2 - 1))
+        fill = image.mean((0, 1)) * rng.uniform(0.5, 1.2) if self.disguise and rng.random() < 0.35 else np.zeros(3)
+        image = cv2.warpAffine(image, matrix, size, flags=cv2.INTER_LINEAR, borderValue=fill.tolist())
+        u, length = windows.map_points(matrix, self.u[index]), scale * self.length_px(index)
+        if rng.random() < self.disguise:
+            image, u, visibility = disguised(image, u, visibility, rng, length if np.isfinite(length) else 40.0)
+        if length < SHORTEST_PX or image.std() < FLAT:
+            u = np.where((visibility > 0)[:, None], np.nan, u)
+        if self.weight is not None:
+            u = np.where((rng.random(3) > self.weight[index])[:, None], np.nan, u)
+        return image, u, visibility
+
+    def length_px(self, index: int) -> float:
+        """The tool's length in the stored frame; NaN without a tool."""
+        there = self.visibility[index].any()
+        return float(tool_length_px(self.u[index][None])[0]) if there else np.nan
+
+
+class FrameSource(SceneSource):
+    """Frames turned, zoomed, shifted and mirrored, as the first stage sees them; a sixth show no landmark."""
+
+    def draw(self, index: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        frame = self.frame(index)
+        fit, length = FRAME_PX[0] / max(frame.shape[:2]), self.length_px(index)
+        middle = (np.array(frame.shape[1::-1]) - 1) / 2
+        if not self.disguise:  # as `Detector` sees it
+            return self._drawn(index, windows.window_from_image(middle, 0.0, FRAME_PX, fit), FRAME_PX, rng)
+        zoom = np.clip(fit * np.exp(rng.normal(0, 0.3)), 0.4 * fit, None)
+        if np.isfinite(length):
+            zoom = np.clip(zoom, 7 / length, 85 / length)
+            far = rng.random() < 0.25
+            spread = (1.5 if far else 0.4) * np.array(PART_PX) / zoom
+            middle = np.nanmean(self.u[index], axis=0) + rng.uniform(-1, 1, 2) * spread
+        else:
+            middle = rng.uniform((0, 0), frame.shape[1::-1])
+        turn = rng.uniform(-np.pi, np.pi) if rng.random() < 0.5 else np.pi * rng.integers(2) + rng.normal(0, 0.2)
+        matrix = windows.window_from_image(middle, turn, PART_PX, zoom)
+        return _mirrored(*self._drawn(index, matrix, PART_PX, rng), rng)
+
+
+class ToolSource(SceneSource):
+    """Upright windows of `windows.TOOL_PX` round the tool, placed, turned and scaled as badly as the stage before does.
+
+    A tenth lie elsewhere in the frame and hold no landmark.
+    """
+
+    def draw(self, index: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        u, size = self.u[index], windows.TOOL_PX
+        (centre,), (angle,) = windows.tool_pose(u[None])
+        length = self.length_px(index)
+        if not np.isfinite(angle + length) or (self.disguise and rng.random() < 0.1):
+            zoom, frame = np.exp(rng.uniform(np.log(0.4), np.log(2.5))), self.frame(index)
+            centre, angle = rng.uniform((0, 0), frame.shape[1::-1]), rng.uniform(-np.pi, np.pi)
+            matrix = windows.window_from_image(centre, angle, size, zoom)
+            image, at, visibility = self._drawn(index, matrix, (size, size), rng)
+            inside = ((at > -0.5) & (at < size - 0.5)).all(1) & (visibility > 0)
+            return image, np.where(inside[:, None], np.nan, at), visibility  # another scale or direction is no example
+        worse = 3.0 if rng.random() < 0.15 else 1.0
+        zoom = windows.tool_zoom(length) * np.exp(np.clip(rng.normal(0, 0.12 * worse), -0.6, 0.6))
+        centre = centre + np.clip(rng.normal(0, 7 * worse, 2), -30, 30) / zoom
+        angle = angle + np.clip(rng.normal(0, 0.12 * worse), -0.7, 0.7)
+        matrix = windows.window_from_image(centre, angle, size, zoom)
+        return _mirrored(*self._drawn(index, matrix, (size, size), rng), rng if self.disguise else None)
+
+
+def _mirrored(image, u, visibility, rng: np.random.Generator | None):
+    """Top and bottom exchanged every second time; the tips are too."""
+    if rng is None or rng.random() < 0.5:
+        return image, u, visibility
+    u = np.column_stack([u[:, 0], image.shape[0] - 1 - u[:, 1]])[[0, 2, 1]]
+    return np.ascontiguousarray(image[::-1]), u, visibility[[0, 2, 1]]
