@@ -36,6 +36,7 @@ class HourglassConfig:
         features: Channels of the hourglass, an even number.  The paper does not state it; notebook 02 finds it below 256.
         stacks: Hourglasses in a row, each supervised.
         depth: Halvings inside an hourglass; 4 makes inputs a multiple of 4 * 2**4 = 64.
+        growth: By how much the channels multiply with each halving; 1 as in the paper.
         decoder, skips, residual: The parts that the ablation adds one by one.  Without a decoder the heatmaps have stride
             4 * 2**depth.
 
@@ -46,6 +47,7 @@ class HourglassConfig:
     features: int = 64
     stacks: int = 2
     depth: int = 4
+    growth: float = 1.0
     decoder: bool = True
     skips: bool = True
     residual: bool = True
@@ -55,6 +57,8 @@ class HourglassConfig:
             raise ValueError(f"features: must be an even number of at least 2, got {self.features}.")
         if self.stacks < 1 or self.depth < 1:
             raise ValueError(f"stacks and depth: must be at least 1, got {self.stacks} and {self.depth}.")
+        if self.growth < 1 or (self.growth > 1 and not self.decoder):
+            raise ValueError(f"growth: must be 1, or more with a decoder, got {self.growth}.")
         if self.skips and not self.decoder:
             raise ValueError("skips: skip connections end in the decoder; set decoder=True or skips=False.")
         if self.stacks > 1 and not self.decoder:
@@ -124,13 +128,13 @@ def _residual(inputs: int, outputs: int, halve: bool = False) -> _Block:
 class _Hourglass(nn.Module):
     """Halve, process (recursively), double, and add what the skip connection kept."""
 
-    def __init__(self, config: HourglassConfig, depth: int):
+    def __init__(self, config: HourglassConfig, depth: int, f: int):
         super().__init__()
-        f, residual = config.features, config.residual
+        residual, below = config.residual, 2 * round(f * config.growth / 2)
         self.skip = _box(f, f, residual) if config.skips else None
-        self.down = _box(f, f, residual)
-        self.inner = _Hourglass(config, depth - 1) if depth > 1 else _box(f, f, residual)
-        self.up = _box(f, f, residual) if config.decoder else None
+        self.down = _box(f, below, residual)
+        self.inner = _Hourglass(config, depth - 1, below) if depth > 1 else _box(below, below, residual)
+        self.up = _box(below, f, residual) if config.decoder else None
 
     def forward(self, x: Tensor) -> Tensor:
         y = self.inner(self.down(F.max_pool2d(x, 2)))
@@ -167,7 +171,7 @@ class StackedHourglass(Network):
             _box(f, f, residual),
         )
         stacks = range(config.stacks)
-        self.hourglasses = nn.ModuleList([_Hourglass(config, config.depth) for _ in stacks])
+        self.hourglasses = nn.ModuleList([_Hourglass(config, config.depth, f) for _ in stacks])
         self.features = nn.ModuleList([nn.Sequential(_box(f, f, residual), _conv(f, f, 1)) for _ in stacks])
         self.heads = nn.ModuleList([nn.Conv2d(f, len(LANDMARKS), 1) for _ in stacks])
         between = stacks[:-1]
