@@ -15,7 +15,10 @@ from numpy.typing import ArrayLike
 from lib.calibration.checks import check_spread, stacked_rows
 from lib.cameras import AffineCamera
 
-__all__ = ["AffineMinimum", "Moments", "affine_minimum", "distances2", "dlt", "estimate_noise", "paper_variances", "regress"]
+__all__ = [
+    "AffineMinimum", "Moments", "affine_minimum", "distances2", "dlt", "estimate_noise", "noise_rms_px", "paper_variances",
+    "regress",
+]  # fmt: skip
 
 
 def dlt(x_mm: ArrayLike, u: ArrayLike) -> AffineCamera:
@@ -35,7 +38,7 @@ def dlt(x_mm: ArrayLike, u: ArrayLike) -> AffineCamera:
 
 def regress(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """[A, t] (m, 4) of the least-squares fit y = A x + t, on centred and scaled points."""
-    mean, scale = x.mean(axis=0), x.std()
+    mean, scale = x.mean(axis=0), x.std() or 1.0
     A = np.linalg.lstsq((x - mean) / scale, y - y.mean(axis=0), rcond=None)[0].T / scale
     return np.column_stack([A, y.mean(axis=0) - A @ mean])
 
@@ -114,56 +117,68 @@ def distances2(r: np.ndarray, A: np.ndarray, sigma_u_px: float, sigma_x_mm: floa
 
 
 def estimate_noise(
-    residuals: np.ndarray, A: np.ndarray, parameters: int, views: np.ndarray | None = None, *,
-    sigma_u_px: float | None = None, sigma_x_mm: float | None = None,
+    residuals: np.ndarray, A: np.ndarray, parameters: int, views: np.ndarray | None = None,
+    claimed_px2: np.ndarray | None = None, *, sigma_u_px: float | None = None, sigma_x_mm: float | None = None,
 ) -> tuple[float, float]:  # fmt: skip
     """sigma_u and sigma_x from residuals (n, m) whose covariance is sigma_u^2 I + sigma_x^2 A A^T.
 
     Along the epipolar direction (n^T A = 0) only sigma_u shows; the other directions add sigma_x.  Maximum likelihood by
     Fisher scoring over the eigenvectors of A A^T, of the `views` (n, m / 2) bool that each row has (None = all).  Single
     views have no epipolar direction: unless one level is given, all is put down to the pixels.  `parameters` is the
-    number of fitted ones; a level that is given is kept.
+    number of fitted ones; a level that is given is kept.  With the covariances (1 or n, m, m) that a detector claims in
+    place of I, they are scaled up where it errs more, never down, and sigma_u is the RMS of the scaled ones.
     """
-    m = residuals.shape[1]
-    kinds = [(np.ones(m, dtype=bool), residuals)]
-    if views is not None and not views.all():
-        code = views @ [1, 2][: m // 2]
-        kinds = [(np.repeat([k & 1, k & 2], 2)[:m] > 0, residuals[code == k]) for k in np.unique(code)]
-        kinds = [(kind, r[:, kind]) for kind, r in kinds]
-    count = float(sum(r.size for _, r in kinds))
-    known = [np.nan if sigma is None else float(sigma) for sigma in (sigma_u_px, sigma_x_mm)]
+    n, m = residuals.shape
+    code = np.full(n, 3) if views is None else views @ [1, 2][: m // 2]
+    claimed = np.eye(m)[None] if claimed_px2 is None else claimed_px2
+    unit, least = noise_rms_px(claimed), np.array([0.0 if claimed_px2 is None else 1.0, 0.0])
+    count = 2.0 * ((code & 1).sum() + (code >> 1).sum() * (m > 2))
+    known = np.array([np.nan if sigma is None else float(sigma) for sigma in (sigma_u_px, sigma_x_mm)])
+    if claimed_px2 is not None and sigma_u_px is not None:
+        known[0] = unit
     free, share = np.isnan(known), 1.0 - parameters / count
     if share * count < 2 * m or not free.any():  # nothing to learn from: the weights that make plain least squares
-        return tuple(np.where(free, [1.0, 0.0], known).tolist())
+        return tuple(np.where(free, [unit, 0.0], known).tolist())
     gain, observed, freedom = [], [], []
-    for kind, r in kinds:
-        values, directions = np.linalg.eigh(A[kind] @ A[kind].T)
-        gain.append(np.maximum(values, 0.0))
-        observed.append(((r @ directions) ** 2).sum(axis=0) / (share * len(r)))
-        freedom.append(np.full(len(values), share * len(r)))
+    for kind in np.unique(code):
+        own, rows = np.repeat([kind & 1, kind & 2], 2)[:m] > 0, code == kind
+        root = np.linalg.cholesky((claimed if len(claimed) == 1 else claimed[rows])[:, own][:, :, own])
+        white = np.linalg.solve(root, np.broadcast_to(A[own], (len(root), own.sum(), 3)))
+        values, directions = np.linalg.eigh(white @ np.swapaxes(white, 1, 2))
+        z = np.linalg.solve(root, residuals[rows][:, own, None])
+        square = np.square(np.swapaxes(directions, 1, 2) @ z)[:, :, 0] / share
+        square, weight = (square, share) if len(root) > 1 else (square.mean(axis=0), share * rows.sum())
+        gain.append(np.maximum(values, 0.0).ravel())
+        observed.append(square.ravel())
+        freedom.append(np.full(square.size, weight))
     gain, observed, freedom = (np.concatenate(parts) for parts in (gain, observed, freedom))
     floor = 1e-18 + 1e-24 * gain.max()
-    if free.all() and not any(kind.sum() > 2 and len(r) >= 4 for kind, r in kinds):
-        return float(np.sqrt(max((freedom @ observed) / freedom.sum(), floor))), 0.0
+    least[0] = max(least[0], floor)
+    if free.all() and not (np.bincount(code, minlength=4)[3] >= 4 and m > 2):
+        return float(unit * np.sqrt(max((freedom @ observed) / freedom.sum(), least[0]))), 0.0
     # A start that is right where either noise is negligible.
-    least = gain <= gain.min() * (1.0 + 1e-9)
-    v = np.where(free, [max((freedom @ (observed * least)) / (freedom @ least), floor), 0.0], np.square(known))
-    seen = gain > 1e-9 * gain.max()
-    if free[1] and seen.any():
-        v[1] = np.median(np.maximum(observed[seen] - v[0], 0.0) / gain[seen])
+    flat = gain <= max(gain.min() * (1.0 + 1e-9), 1e-9 * gain.max())
+    v = np.where(free, [max((freedom @ (observed * flat)) / (freedom @ flat), least[0]), 0.0], (known / [unit, 1.0]) ** 2)
+    if free[1] and not flat.all():
+        v[1] = np.median(np.maximum(observed[~flat] - v[0], 0.0) / gain[~flat])
     design = np.column_stack([np.ones(len(gain)), gain])
     for _ in range(50):
-        weight = freedom / np.maximum(design @ v, floor) ** 2
-        root, scale = np.sqrt(weight), np.abs(design[:, free]).max(axis=0)
-        target = observed - design[:, ~free] @ v[~free]
-        new = v.copy()
-        new[free] = np.linalg.lstsq(design[:, free] / scale * root[:, None], target * root, rcond=None)[0] / scale
-        if new[1] < 0 and free[1]:  # the bound v_x >= 0 binds
-            new[1] = 0.0
-            if free[0]:
-                new[0] = (weight @ observed) / weight.sum()
-        new[0] = max(new[0], floor) if free[0] else v[0]
+        root = np.sqrt(freedom) / np.maximum(design @ v, floor)
+        new, open_ = v.copy(), free.copy()
+        while open_.any():
+            scale = design[:, open_].max(axis=0)
+            target = (observed - design[:, ~open_] @ new[~open_]) * root
+            new[open_] = np.linalg.lstsq(design[:, open_] / scale * root[:, None], target, rcond=None)[0] / scale
+            below = np.flatnonzero(open_ & (new < least))
+            if not below.size:
+                break
+            new[below[-1]], open_[below[-1]] = least[below[-1]], False  # a bound binds, the robot's first
         if np.allclose(new, v, rtol=1e-10, atol=0.0):
             break
         v = new
-    return float(np.sqrt(new[0])), float(np.sqrt(new[1]))
+    return float(unit * np.sqrt(new[0])), float(np.sqrt(new[1]))
+
+
+def noise_rms_px(covariance_px2: np.ndarray) -> float:
+    """Standard deviation of a pixel coordinate that covariances (n, m, m) claim."""
+    return float(np.sqrt(np.trace(covariance_px2, axis1=1, axis2=2).mean() / covariance_px2.shape[1]))

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lib.calibration import checks as refuse
-from lib.calibration.affine import Moments, affine_minimum, estimate_noise, paper_variances, regress
+from lib.calibration.affine import Moments, affine_minimum, estimate_noise, noise_rms_px, paper_variances, regress
 from lib.calibration.calibration import Calibration
 from lib.calibration.models import Fit, Model, State, fit, precision
 from lib.calibration.offsets import estimate_offsets, rows_axes
@@ -197,7 +197,7 @@ def _calibrate(
         minimum, (sigma_u, sigma_x), variances = _minimise(
             plan, x[inliers], y[inliers], views[inliers], rows_noise, weighting, known, centre
         )
-        scale = 1.0 if noise is None else sigma_u / _rms(rows_noise)
+        scale = 1.0 if noise is None else sigma_u / noise_rms_px(rows_noise)
         state = minimum.state
         f, J, _ = state.evaluate(x - state.reference, derivatives=False)
         residuals = y - f
@@ -247,14 +247,14 @@ def _minimise(
     moments, A, parameters = Moments.of(x, y) if whole else None, start[:, :3], 4 * m
     levels, minimum = None, None
     for _ in range(3):
-        before, levels = levels, _levels(residuals, A, parameters, views, noise, known)
+        before, levels = levels, estimate_noise(residuals, A, parameters, views, noise, **known)
         if before is not None and np.allclose(before, levels, rtol=1e-3, atol=1e-12):
             levels = before
             break
         variance_u, variance_x = paper_variances(*levels) if weighting == "paper" else np.square(levels).tolist()
         weigh = variance_u * np.eye(m)[None]
         if noise is not None and weighting != "paper":
-            weigh = noise * (levels[0] / _rms(noise)) ** 2
+            weigh = noise * (levels[0] / noise_rms_px(noise)) ** 2
         if whole and len(weigh) == 1 and np.allclose(weigh[0], variance_u * np.eye(m), rtol=1e-12, atol=0):
             start = affine_minimum(moments, variance_u, variance_x).matrix
         if minimum is None or (plan.is_affine and whole and len(weigh) == 1):
@@ -266,51 +266,6 @@ def _minimise(
             break
         residuals, A, parameters = minimum.residuals, minimum.state.A.reshape(m, 3), len(plan.parameter_names)
     return minimum, levels, (weigh, variance_x)
-
-
-def _levels(
-    residuals: np.ndarray, A: np.ndarray, parameters: int, views: np.ndarray, noise: np.ndarray | None,
-    known: dict[str, float | None],
-) -> tuple[float, float]:  # fmt: skip
-    """(sigma_u, sigma_x): given, or estimated; with the detector's covariances sigma_u is their RMS, as scaled to fit."""
-    if noise is None:
-        return estimate_noise(residuals, A, parameters, views, **known)
-    n, m = residuals.shape
-    claimed, free = _rms(noise), known["sigma_u_px"] is None
-    if known["sigma_x_mm"] is not None and not free:
-        return claimed, float(known["sigma_x_mm"])
-    # Maximum likelihood of k and v in S_i = k Sigma_i + v A A^T, by Fisher scoring.  A detector may err more than it claims.
-    parts = (np.broadcast_to(noise, (n, m, m)), np.broadcast_to(A @ A.T, (n, m, m)))
-    least = np.array([1.0, 0.0])
-    v = np.array([1.0, (known["sigma_x_mm"] or 0.0) ** 2])
-    open_ = np.array([free, known["sigma_x_mm"] is None])
-    inflate = 1.0 / max(1.0 - 0.5 * parameters / views.sum(), 1.0 / n)
-    for _ in range(50):
-        W = precision(v[0] * parts[0] + v[1] * parts[1], views)
-        WD = [W @ D for D in parts]
-        white = np.einsum("nij,nj->ni", W, residuals)
-        score = np.array([
-            inflate * np.einsum("ni,nij,nj->", white, D, white) - np.trace(own, axis1=1, axis2=2).sum()
-            for D, own in zip(parts, WD, strict=True)
-        ])  # fmt: skip
-        information = np.array([[np.einsum("nij,nji->", a, b) for b in WD] for a in WD])
-        new, moving = v.copy(), open_.copy()
-        while moving.any():
-            new[moving] = v[moving] + np.linalg.solve(information[np.ix_(moving, moving)], score[moving])
-            below = moving & (new < least)
-            if not below.any():
-                break
-            new[below], moving = least[below], moving & ~below
-        done = np.abs(new - v).max() <= 1e-9 * max(np.abs(v).max(), 1e-12) and abs(new[1] - v[1]) <= 1e-6 * max(v[1], 1e-12)
-        v = new
-        if done:
-            break
-    return float(claimed * np.sqrt(v[0])), float(np.sqrt(v[1]))
-
-
-def _rms(noise: np.ndarray) -> float:
-    """Standard deviation of a pixel coordinate that covariances (n, m, m) claim."""
-    return float(np.sqrt(np.trace(noise, axis1=1, axis2=2).mean() / noise.shape[1]))
 
 
 def _parameter_covariance(

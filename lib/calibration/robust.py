@@ -16,7 +16,7 @@ from scipy.stats import f as f_distribution
 
 from lib.calibration.affine import regress
 
-__all__ = ["NoConsensusError", "consensus", "gate"]
+__all__ = ["NoConsensusError", "consensus", "gate", "tightest_sample"]
 
 FALSE_ALARM = 1e-4
 _SAMPLES = (100, 300, 1000)  # tried one after another, until right ones are among them
@@ -188,6 +188,19 @@ def _distances2(H: np.ndarray, u: np.ndarray, M: np.ndarray) -> np.ndarray:
     return np.einsum("nkc,nkc->kn", r, r)
 
 
+def _scale_free(distance2: np.ndarray, area: float) -> np.ndarray:
+    """Rank (k,) of cameras by squared distances (k, n): the least sum of logs, so that no noise level is assumed."""
+    return np.log(np.minimum(distance2, area / np.pi) + 1e-7 * area).sum(axis=1)
+
+
+def tightest_sample(x: np.ndarray, u: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """The camera (2, 4) through four of the points x (n, 3) mm that most pixels u (n, 2) are near to."""
+    H = np.column_stack([x, np.ones(len(x))])
+    sets = _samples(x, 150, rng, 0.0)
+    M = np.linalg.pinv(H[sets]) @ u[sets]
+    return M[_scale_free(_distances2(H, u, M), float(np.prod(_extent(u)))).argmin()].T
+
+
 def _tightest(
     x: np.ndarray, u: np.ndarray, threshold_px: float | None, rng: np.random.Generator, least_mm: float
 ) -> _Found:
@@ -205,7 +218,7 @@ def _tightest(
         if threshold_px is not None:
             ranks = np.minimum(distance2, threshold_px**2).sum(axis=1)  # MSAC
         else:
-            ranks = np.log(np.minimum(distance2, area / np.pi) + 1e-7 * area).sum(axis=1)
+            ranks = _scale_free(distance2, area)
         rank = min(max(6, int(0.15 * len(some))), len(some) - 1)
         low = np.partition(distance2, rank, axis=1)[:, rank]
         M, score, near2 = (np.concatenate(pair) for pair in ((M, new), (score, ranks), (near2, low)))

@@ -1,5 +1,6 @@
 """The offset between the clocks of video and robot."""
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +14,7 @@ from lib.calibration.scatter import sandwich
 from lib.correspondences import Correspondences
 from lib.recordings import Kinematics
 
-__all__ = ["TimeOffset", "estimate_time_offset"]
+__all__ = ["Paths", "TimeOffset", "estimate_time_offset", "shift_misfits"]
 
 _GRID = 41  # trial offsets of the coarse search
 
@@ -32,36 +33,57 @@ class TimeOffset:
     trial_rms_px: np.ndarray
 
 
-class _Path:
-    """One landmark's motion as least-squares cubic splines with a knot every `smooth_s`, a piece a stretch without a gap.
+class Paths:
+    """The landmarks' motion as least-squares cubic splines with a knot every `smooth_s`, a piece a stretch without a gap.
 
     The derivative of an interpolating spline is mostly encoder noise at 100 Hz, which biases what is regressed on it.
+
+    Args:
+        samples: Of each landmark, times (m,) s, and positions (m, 3) mm, NaN where the robot is silent.
+
+    >>> time = np.linspace(0, 1, 101)
+    >>> paths = Paths([(time, np.outer(time, [1.0, 2.0, 3.0]))])
+    >>> paths.at(np.zeros(2, int), np.array([0.5, 9.0])).round(6).tolist()
+    [[0.5, 1.0, 1.5], [nan, nan, nan]]
     """
 
-    def __init__(self, time: np.ndarray, x: np.ndarray, smooth_s: float) -> None:
+    def __init__(self, samples: Iterable[tuple[np.ndarray, np.ndarray]], smooth_s: float = 0.1) -> None:
+        self.pieces = [list(self._splines(time, x, smooth_s)) for time, x in samples]
+
+    @staticmethod
+    def _splines(time: np.ndarray, x: np.ndarray, smooth_s: float) -> Iterator[BSpline]:
         known = np.isfinite(x).all(axis=1)
         time, x = time[known], x[known]
         step = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
-        every = max(4, int(np.ceil(smooth_s / step)))
+        every = max(2, int(np.ceil(smooth_s / step)))
         # The motion is smooth within `smooth_s`, so a dropped sample is bridged; a longer silence is not.
         gaps = np.flatnonzero(np.diff(time) > max(smooth_s, 2.5 * step))
-        self.pieces: list[BSpline] = []
         for t, part in zip(np.split(time, gaps + 1), np.split(x, gaps + 1), strict=True):
             if len(t) >= 4:
                 knots = np.concatenate([np.full(4, t[0]), t[every : len(t) - every : every], np.full(4, t[-1])])
-                self.pieces.append(make_lsq_spline(t, part, knots, k=3))
+                yield make_lsq_spline(t, part, knots, k=3)
 
-    def covers(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        """(n,) bool: one piece holds the whole interval."""
-        inside = [(low >= piece.t[0]) & (high <= piece.t[-1]) for piece in self.pieces]
-        return np.any([np.zeros(len(low), dtype=bool), *inside], axis=0)
+    @property
+    def span_s(self) -> float:
+        """From the first to the last instant known."""
+        ends = np.array([[piece.t[0], piece.t[-1]] for pieces in self.pieces for piece in pieces])
+        return float(np.ptp(ends)) if len(ends) else 0.0
 
-    def at(self, time: np.ndarray, derivative: int = 0) -> np.ndarray:
-        """(n, 3) mm, or mm/s, at times that the pieces cover."""
+    def covers(self, landmark: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        """(n,) bool: one piece of the row's landmark holds the whole interval."""
+        inside = np.zeros(len(landmark), dtype=bool)
+        for k, pieces in enumerate(self.pieces):
+            for piece in pieces:
+                inside |= (landmark == k) & (low >= piece.t[0]) & (high <= piece.t[-1])
+        return inside
+
+    def at(self, landmark: np.ndarray, time: np.ndarray, derivative: int = 0) -> np.ndarray:
+        """(n, 3) mm, or mm/s, of each row's landmark; NaN where no piece covers its time."""
         x = np.full((len(time), 3), np.nan)
-        for piece in self.pieces:
-            rows = (time >= piece.t[0]) & (time <= piece.t[-1])
-            x[rows] = piece(time[rows], derivative)
+        for k, pieces in enumerate(self.pieces):
+            for piece in pieces:
+                rows = (landmark == k) & (time >= piece.t[0]) & (time <= piece.t[-1])
+                x[rows] = piece(time[rows], derivative)
         return x
 
 
@@ -71,7 +93,7 @@ def estimate_time_offset(
 ) -> TimeOffset:  # fmt: skip
     """Offset of the clocks: the shift of the kinematics that lets affine cameras explain the video best.
 
-    A coarse search by least absolute residuals, then Gauss-Newton over the detections that agree on cameras there: with v the
+    A coarse search by Cauchy's misfit, then Gauss-Newton over the detections that agree on cameras there: with v the
     velocity, y = A x(t) + o + (A v) offset is linear in the offset.
 
     Args:
@@ -87,12 +109,10 @@ def estimate_time_offset(
     """
     time, frame, landmark, y = _rows(data)
     paths = _paths(kinematics, smooth_s)
-    if landmark.max(initial=0) >= len(paths):
-        raise ValueError(f"u: {landmark.max() + 1} landmarks, the kinematics have {len(paths)}.")
+    if landmark.max(initial=0) >= len(paths.pieces):
+        raise ValueError(f"u: {landmark.max() + 1} landmarks, the kinematics have {len(paths.pieces)}.")
     known = np.isfinite(y).any(axis=1) & np.isfinite(time)
-    for k, path in enumerate(paths):
-        rows = known & (landmark == k)
-        known[rows] = path.covers(time[rows] + start_s - search_s, time[rows] + start_s + search_s)
+    known &= paths.covers(landmark, time + start_s - search_s, time + start_s + search_s)
     time, frame, landmark, y = time[known], frame[known], landmark[known], y[known]
     n, m = len(np.unique(time)), y.shape[1]
     if n < 8:
@@ -101,10 +121,7 @@ def estimate_time_offset(
         raise ValueError(f"data: {n} frames lie inside the kinematics by search_s = {search_s} s, away from gaps; give 8.")
 
     def at(offset: float, derivative: int = 0) -> np.ndarray:
-        x = np.empty((len(time), 3))
-        for k, path in enumerate(paths):
-            x[landmark == k] = path.at(time[landmark == k] + offset, derivative)
-        return x
+        return paths.at(landmark, time + offset, derivative)
 
     def fitted(offset: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Positions, cameras (m, 4) and residuals (n, m), zero where a view is not used."""
@@ -133,9 +150,8 @@ def estimate_time_offset(
 
     low, high = start_s - search_s, start_s + search_s
     trial = np.linspace(low, high, _GRID)
-    distance = np.array([_least_absolute(at(offset), y) for offset in trial])
-    typical = np.nanmedian(distance, axis=(1, 2)).min()
-    offset = float(trial[np.nansum(np.log1p((distance / max(typical, 1e-9)) ** 2), axis=(1, 2)).argmin()])
+    misfit = shift_misfits(np.stack([at(offset) for offset in trial]), y).sum(axis=1)
+    offset = float(trial[misfit.argmin()])
     for _ in range(2):
         try:
             views = consensus(at(offset), y, None, np.random.default_rng(0))[0]
@@ -157,20 +173,27 @@ def estimate_time_offset(
     return TimeOffset(offset, sd, rms(offset), trial, misfit)
 
 
-def _least_absolute(x: np.ndarray, y: np.ndarray, rounds: int = 6) -> np.ndarray:
-    """Distances (n, cameras) px of pixels y (n, m), NaN = not seen, to the cameras with the least sum of distances."""
-    H, found = np.column_stack([x - x.mean(axis=0), np.ones(len(x))]), []
-    for u in np.split(y, y.shape[1] // 2, axis=1):
+def shift_misfits(x: np.ndarray, y: np.ndarray, least_share: float = 0.6) -> np.ndarray:
+    """Misfit (t, cameras) of pixels y (n, m), NaN = not seen, to the cameras that suit each trial's positions x (t, n, 3).
+
+    The mean negative log of a bivariate Cauchy density whose scale is the median residual: right detections decide, however
+    many others there are.  Infinite where fewer than `least_share` of the rows, or than eight, have a position.
+    """
+    found = np.full((len(x), y.shape[1] // 2), np.inf)
+    for c, u in enumerate(np.split(y, found.shape[1], axis=1)):
         seen = np.isfinite(u).all(axis=1)
-        G, u, distance = H[seen], u[seen], np.full(len(y), np.nan)
-        weight = np.ones((len(G), 1))
-        for _ in range(rounds):
-            r = u - G @ np.linalg.lstsq(G.T @ (weight * G), G.T @ (weight * u), rcond=None)[0]
-            size = np.linalg.norm(r, axis=1, keepdims=True)
-            weight = 1.0 / np.maximum(size, 0.1)
-        distance[seen] = size[:, 0]
-        found.append(distance)
-    return np.column_stack(found)
+        used = np.isfinite(x[:, seen]).all(axis=2)
+        good = used.sum(axis=1) >= max(8, least_share * seen.sum())
+        used = used[good]
+        H = np.where(used[:, :, None], np.concatenate([x[good][:, seen], np.ones((*used.shape, 1))], axis=2), 0.0)
+        u, weight = u[seen], used.astype(float)
+        for _ in range(10 if good.any() else 0):
+            WH = (H * weight[:, :, None]).transpose(0, 2, 1)
+            r2 = ((u - H @ (np.linalg.pinv(WH @ H, hermitian=True) @ (WH @ u))) ** 2).sum(axis=2)
+            s2 = np.maximum(np.nanmedian(np.where(used, r2, np.nan), axis=1, keepdims=True), 1e-4)
+            weight = np.where(used, 1.0 / (s2 + r2), 0.0)
+            found[good, c] = np.log(s2[:, 0]) + 1.5 * np.average(np.log1p(r2 / s2), axis=1, weights=used)
+    return found
 
 
 def _rows(data: Correspondences | tuple) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -188,7 +211,7 @@ def _rows(data: Correspondences | tuple) -> tuple[np.ndarray, np.ndarray, np.nda
     return np.repeat(time, k), frame, landmark, y.reshape(len(time) * k, -1)
 
 
-def _paths(kinematics: Kinematics | tuple, smooth_s: float) -> list[_Path]:
+def _paths(kinematics: Kinematics | tuple, smooth_s: float) -> Paths:
     given = kinematics if isinstance(kinematics, tuple) else (kinematics.time_s, kinematics.x_mm)
     time, x = (np.asarray(values, dtype=np.float64) for values in given)
     x = x[:, None] if x.ndim == 2 else x
@@ -196,4 +219,4 @@ def _paths(kinematics: Kinematics | tuple, smooth_s: float) -> list[_Path]:
         raise ValueError(f"kinematics: expected times (m,) and positions (m, k, 3) or (m, 3), got {time.shape}, {x.shape}.")
     if len(time) < 4 or not np.isfinite(time).all() or (np.diff(time) <= 0).any():
         raise ValueError("kinematics: times must be finite and increase, and at least four samples are needed.")
-    return [_Path(time, x[:, k], smooth_s) for k in range(x.shape[1])]
+    return Paths([(time, x[:, k]) for k in range(x.shape[1])], smooth_s)

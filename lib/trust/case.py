@@ -1,19 +1,18 @@
 """A recording as its hypotheses see it: the rows, the tool's path in time, and how evidence is weighed."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Self
 
 import numpy as np
 
+from lib.calibration.timing import Paths
 from lib.recordings import Kinematics
 from lib.trust.fitting import Problem, Robust
 
 __all__ = ["SIDES", "Case", "Hypothesis"]
 
 SIDES = ("left", "right")
-_LONGEST_S = 0.25  # between samples, over which a path is interpolated
-_HALF_S = 0.05  # half the time over which a velocity is measured
+_LONGEST_S = 0.25  # between frames, whose own positions stand for the robot's log
 _PARAMETERS = 20  # of two affine cameras, and about as many of the nine offsets as data tell
 
 
@@ -39,101 +38,49 @@ class Hypothesis:
     gain: float
 
 
-@dataclass(frozen=True, eq=False)
-class Track:
-    """A path of each landmark: times (m,) s and positions (m, 3) mm; `start_s` (n,) is where on it the rows lie."""
-
-    paths: list[tuple[np.ndarray, np.ndarray]]
-    start_s: np.ndarray
-    landmark: np.ndarray
-
-    @classmethod
-    def of(cls, problem: Problem, kinematics: Kinematics | None) -> Self | None:
-        """From the robot's samples, else from the rows themselves; None where they are too far apart or have no time."""
-        time, landmark, x = problem.time, problem.landmark, problem.x[:, 0]
-        if not np.isfinite(time).all() or len(problem) == 0:
-            return None
-        if kinematics is not None and landmark.max() < kinematics.x_mm.shape[1]:
-            log = np.swapaxes(kinematics.x_mm, 0, 1) - problem.centre
-            known = np.isfinite(log).all(axis=2)
-            paths = [(kinematics.time_s[rows], own[rows]) for own, rows in zip(log, known, strict=True)]
-            if known.sum(axis=1).min() > 4:
-                return cls([_smooth(*path) for path in paths], time + _shift(x, time, landmark, paths), landmark)
-        each = [np.flatnonzero(landmark == k) for k in range(int(landmark.max()) + 1)]
-        each = [rows[np.unique(time[rows], return_index=True)[1]] for rows in each]
-        paths = [(time[rows], x[rows]) for rows in each]
-        steps = np.concatenate([np.diff(t) for t, _ in paths])
-        if not steps.size or np.median(steps) > _LONGEST_S:
-            return None
-        return cls([_smooth(*path) for path in paths], time, landmark)
-
-    @property
-    def span_s(self) -> float:
-        """From the first to the last sample."""
-        return float(max(t[-1] for t, _ in self.paths if len(t)) - min(t[0] for t, _ in self.paths if len(t)))
-
-    def at(self, shift_s: float | np.ndarray) -> np.ndarray:
-        """(n, 3) positions `shift_s` later than the rows; NaN outside the path and in its gaps."""
-        time, x = self.start_s + shift_s, np.full((len(self.start_s), 3), np.nan)
-        for k, (t, path) in enumerate(self.paths):
-            rows = self.landmark == k
-            if len(t) < 2 or not rows.any():
-                continue
-            gap = np.diff(t) > _LONGEST_S
-            inside = ~gap[np.clip(np.searchsorted(t, time[rows]) - 1, 0, len(gap) - 1)]
-            for axis in range(3):
-                x[rows, axis] = np.interp(time[rows], t, path[:, axis], left=np.nan, right=np.nan)
-            x[np.flatnonzero(rows)[~inside]] = np.nan
-        return x
-
-    def moved(self, x: np.ndarray, shift_s: float | np.ndarray) -> np.ndarray:
-        """Positions x (n, 3) of the rows, as they were `shift_s` later."""
-        return x + (self.at(shift_s) - self.at(0.0))
-
-    def velocity(self, shift_s: float | np.ndarray = 0.0) -> np.ndarray:
-        """(n, 3) mm/s."""
-        here, after, before = self.at(shift_s), self.at(shift_s + _HALF_S), self.at(shift_s - _HALF_S)
-        span = _HALF_S * (np.isfinite(after[:, :1]) * 1.0 + np.isfinite(before[:, :1]))
-        step = np.where(np.isfinite(after), after, here) - np.where(np.isfinite(before), before, here)
-        return step / np.where(span > 0, span, np.nan)
-
-
-def _smooth(time: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A path averaged over some samples: between noisy ones it is less noisy than at them, which would favour some shifts."""
-    if len(time) < 4:
-        return time, x
-    steps = max(0.03, 1.5 * np.median(np.diff(time))) * np.linspace(-1, 1, 7)
-    at = time[:, None] + steps
-    inside = (at[:, 0] >= time[0]) & (at[:, -1] <= time[-1])
-    return time[inside], np.stack([np.interp(at[inside], time, axis).mean(axis=1) for axis in x.T], axis=1)
-
-
-def _shift(x: np.ndarray, time: np.ndarray, landmark: np.ndarray, paths: list) -> float:
-    """Time on the paths minus time of the rows: where the path comes nearest to a row's position, by the median."""
-    found = []
-    for i in np.unique(np.linspace(0, len(x) - 1, 40).astype(int)):
-        t, path = paths[landmark[i]]
-        a, b = path[:-1], path[1:]
-        length2 = ((b - a) ** 2).sum(axis=1)
-        part = np.clip(((x[i] - a) * (b - a)).sum(axis=1) / np.maximum(length2, 1e-18), 0.0, 1.0)
-        j = ((a + part[:, None] * (b - a) - x[i]) ** 2).sum(axis=1).argmin()
-        found.append(t[j] + part[j] * (t[j + 1] - t[j]) - time[i])
-    return float(np.median(found))
-
-
 class Case:
-    """The rows, the fit `null` of "nothing is wrong", the best fit of each hypothesis, and what the hypotheses share."""
+    """The rows, the fit `null` of "nothing is wrong", the best fit of each hypothesis, and what the hypotheses share.
+
+    Args:
+        kinematics, offset_s: The robot's log, and its clock minus that of the rows; None takes the rows' own positions,
+            where the frames follow each other closely enough.
+        readout_s, size: Of the shutter, and (width, height) of the images, None if unknown.
+
+    Attributes:
+        paths: Of the landmarks in time, None where nothing tells them.
+        frames: Their number.
+    """
 
     def __init__(
-        self, problem: Problem, kinematics: Kinematics | None, readout_s: float, size: tuple[int, int] | None, seed: int
-    ) -> None:
-        self.problem, self.kinematics, self.readout_s, self.size, self.seed = problem, kinematics, readout_s, size, seed
+        self, problem: Problem, kinematics: Kinematics | None, offset_s: float, readout_s: float,
+        size: tuple[int, int] | None, seed: int,
+    ) -> None:  # fmt: skip
+        self.problem, self.readout_s, self.size, self.seed = problem, readout_s, size, seed
         self.null, self.fits = problem.fit(seed=seed), {}
         self.frames = int(problem.frame.max()) + 1
+        self.paths, self._clock_s = None, offset_s
+        time, landmark, x = problem.time, problem.landmark, problem.x[:, 0]
+        if not np.isfinite(time).all():
+            return
+        if kinematics is not None and landmark.max() < kinematics.x_mm.shape[1]:
+            log = np.swapaxes(kinematics.x_mm, 0, 1) - problem.centre
+            self.paths = Paths((kinematics.time_s, own) for own in log)
+        if self.paths is None or not all(self.paths.pieces):
+            each = [np.flatnonzero(landmark == k) for k in range(int(landmark.max()) + 1)]
+            each = [rows[np.unique(time[rows], return_index=True)[1]] for rows in each]
+            steps = np.concatenate([np.diff(time[rows]) for rows in each])
+            near = steps.size and np.median(steps) <= _LONGEST_S
+            self.paths, self._clock_s = Paths((time[rows], x[rows]) for rows in each) if near else None, 0.0
 
-    @cached_property
-    def track(self) -> Track | None:
-        return Track.of(self.problem, self.kinematics)
+    def moved(self, shift_s: float | np.ndarray) -> np.ndarray:
+        """(n, 3) mm: the positions of the rows as they were `shift_s` later; NaN where nothing tells."""
+        now = self.problem.time + self._clock_s
+        landmark = self.problem.landmark
+        return self.problem.x[:, 0] + self.paths.at(landmark, now + shift_s) - self.paths.at(landmark, now)
+
+    def velocity(self, shift_s: float | np.ndarray = 0.0) -> np.ndarray:
+        """(n, 3) mm/s of the rows, `shift_s` later."""
+        return self.paths.at(self.problem.landmark, self.problem.time + self._clock_s + shift_s, 1)
 
     def by_frame(self, values: np.ndarray) -> np.ndarray:
         """Values (n, ...) of the rows as (frames, 3, ...), NaN where a landmark is missing."""
@@ -152,8 +99,16 @@ class Case:
             fit = moved.fit(start=fit.M, rounds=10)
         return fit, moved, own
 
+    def linear(
+        self, columns: np.ndarray | Callable[[np.ndarray], np.ndarray], on: Problem | None = None
+    ) -> tuple[Robust, float, float]:
+        """The fit with `columns` (n, 2, 2, k) added to the pixels (or cameras -> columns): length and sd of the additions."""
+        fit = (on or self.problem).fit(columns if callable(columns) else lambda M: columns, start=self.null.M)
+        length = float(np.linalg.norm(fit.theta))
+        return fit, float(fit.theta[0]) if fit.theta.size == 1 else length, float(np.sqrt(np.trace(fit.covariance)))
+
     def found(
-        self, name: str, fit: Robust, extra: float, value: float, sd: float, unit: str, text: str, cure: str, *,
+        self, name: str, fit: Robust, extra: float, size: tuple[float, float, str], text: str, cure: str, *,
         on: Problem | None = None, raw: float | None = None,
     ) -> Hypothesis:  # fmt: skip
         """With the evidence of its fit, which has `extra` parameters more than "nothing is wrong" on the rows of `on`."""
@@ -169,5 +124,6 @@ class Case:
             gain = left * (raw / n - 0.5 * np.log(freedom / left)) - 0.5 * extra * np.log(freedom)
         if name not in self.fits or fit.total > self.fits[name].total:
             self.fits[name] = fit
+        value, sd, unit = size
         explained = 1.0 - np.exp(-2.0 * max(raw, 0.0) / n)
         return Hypothesis(name, text, cure, float(value), float(sd), unit, float(explained), float(gain))

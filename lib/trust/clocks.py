@@ -1,10 +1,11 @@
 """Hypotheses about time: clocks, frame rates, the order of the frames, and the shutter."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 
+from lib.calibration.timing import shift_misfits
 from lib.trust.case import SIDES, Case, Hypothesis
 from lib.trust.fitting import Problem, Robust
 
@@ -12,25 +13,14 @@ __all__ = ["TIME_TESTS"]
 
 #: Frame rates by which a wrong one may be stated, as ratios; -1 is time backwards.
 _RATES = (-1.0, 0.5, 24 / 30, 25 / 30, 24 / 25, 25 / 24, 30 / 25, 30 / 24, 2.0)
-
-
-def _image_of(direction: np.ndarray, *factors: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    """Columns that move positions along `direction` (n, 2, 3) mm, times 1 and times each of `factors` (n,)."""
-
-    def columns(M: np.ndarray) -> np.ndarray:
-        image = np.einsum("cij,ncj->nci", M[:, :, :3], direction)
-        return np.stack([image, *(image * f[:, None, None] for f in factors)], axis=3)
-
-    return columns
+_ROWS = 400  # of the coarse search
 
 
 def _clock(case: Case) -> Iterator[Hypothesis]:
     """The robot's positions of another instant, for both cameras or for one."""
-    if case.track is None:
-        return
-    trial, misfit = _scan(case, min(1.0, 0.4 * case.track.span_s))
-    if np.abs(trial[np.argmin(misfit.sum(axis=1))]) > 0.9 * trial[-1] and case.track.span_s > 4.0:
-        trial, misfit = _scan(case, 0.4 * min(case.track.span_s, 12.0))
+    trial, misfit = _scan(case, min(1.0, 0.4 * case.paths.span_s))
+    if np.abs(trial[np.argmin(misfit.sum(axis=1))]) > 0.9 * trial[-1] and case.paths.span_s > 4.0:
+        trial, misfit = _scan(case, 0.4 * min(case.paths.span_s, 12.0))
     now = len(trial) // 2
     for name, views, score in (
         ("clock", (0, 1), misfit.sum(axis=1)), ("camera_clock", (0,), misfit[:, 0] + misfit[now, 1]),
@@ -49,7 +39,7 @@ def _clock(case: Case) -> Iterator[Hypothesis]:
         else:
             text = f"The {SIDES[views[0]]} camera alone shows the tool {text} later than the frame's time."
             cure = f"Trigger both cameras together, or pair each right image with the left one of its instant ({text})."
-        yield case.found(name, fit, 1, 1e3 * value, 1e3 * sd, "ms", text, cure, on=problem)
+        yield case.found(name, fit, 1, (1e3 * value, 1e3 * sd, "ms"), text, cure, on=problem)
 
 
 def _refined(
@@ -57,16 +47,19 @@ def _refined(
 ) -> tuple[Robust, Problem, np.ndarray, np.ndarray] | None:
     """Gauss-Newton on the shift of the clock (and its rate): the fit, its rows, values and standard deviations."""
     time, views = case.problem.time - np.median(case.problem.time), list(views)
+    powers = np.ones((1, len(time))) if rate is None else np.stack([np.ones(len(time)), time])
     value, M = np.array([shift] if rate is None else [shift, rate - 1.0]), None
     for _ in range(6):
-        later = value[0] + (0.0 if rate is None else value[1] * time)
+        later = value @ powers
         x, velocity = case.problem.x.copy(), np.zeros_like(case.problem.x)
-        x[:, views] = case.track.moved(case.problem.x[:, 0], later)[:, None]
-        velocity[:, views] = case.track.velocity(later)[:, None]
+        x[:, views] = case.moved(later)[:, None]
+        velocity[:, views] = case.velocity(later)[:, None]
         problem = case.problem.moved(np.where(np.isfinite(velocity), x, np.nan))
         if problem.used.all(axis=1).sum() < 6:
             return None
-        fit = problem.fit(_image_of(velocity, *([] if rate is None else [time])), start=M, seed=case.seed)
+        fit = problem.fit(
+            lambda M, v=velocity: np.einsum("cij,ncj,kn->ncik", M[:, :, :3], v, powers), start=M, seed=case.seed
+        )
         M, sd = fit.M, np.sqrt(np.diag(fit.covariance))
         if (np.abs(fit.theta) < 0.1 * sd).all():
             break
@@ -75,35 +68,20 @@ def _refined(
 
 
 def _scan(case: Case, half_s: float, rate: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
-    """Trial shifts (t,) and the mean Cauchy misfit (t, 2) of each camera alone; inf where few rows have a position."""
+    """Trial shifts (t,) and their misfit (t, 2) in each camera alone."""
     problem, trial = case.problem, np.linspace(-half_s, half_s, 2 * int(np.clip(half_s / 0.02, 5, 60)) + 1)
-    chosen = np.unique(np.linspace(0, len(problem) - 1, 400).astype(int))
+    chosen = np.unique(np.linspace(0, len(problem) - 1, _ROWS).astype(int))
     later = (rate - 1.0) * (problem.time - np.median(problem.time))
-    x = np.stack([case.track.moved(problem.x[:, 0], shift + later)[chosen] for shift in trial])
-    misfit = np.full((len(trial), 2), np.inf)
-    for view in range(2):
-        used = problem.used[chosen, view] & np.isfinite(x).all(axis=2)
-        good = (count := used.sum(axis=1)) >= max(8, 0.6 * problem.used[chosen, view].sum())
-        if not good.any():
-            continue
-        used = used[good]
-        H = np.where(used[:, :, None], np.concatenate([x[good], np.ones((*used.shape, 1))], axis=2), 0.0)
-        y, weight = np.where(problem.used[chosen, view][:, None], problem.y[chosen, view], 0.0), used.astype(float)
-        for _ in range(10):
-            WH = (H * weight[:, :, None]).transpose(0, 2, 1)
-            r2 = np.where(used, ((y - H @ (np.linalg.pinv(WH @ H, hermitian=True) @ (WH @ y))) ** 2).sum(axis=2), np.nan)
-            s2 = np.maximum(np.nanmedian(r2, axis=1, keepdims=True), 1e-4)
-            weight = np.where(used, 1.0 / (s2 + np.nan_to_num(r2)), 0.0)
-        misfit[good, view] = np.log(s2[:, 0]) + np.nansum(1.5 * np.log1p(r2 / s2), axis=1) / count[good]
-    return trial, misfit
+    y = np.where(problem.used[:, :, None], problem.y, np.nan)[chosen].reshape(-1, 4)
+    return trial, shift_misfits(np.stack([case.moved(shift + later)[chosen] for shift in trial]), y)
 
 
 def _clock_rate(case: Case) -> Iterator[Hypothesis]:
     """A wrong frame rate, or frames in reverse; sought only where the residuals are large."""
     scale = min(fit.shapes[0].scale for fit in (case.null, *case.fits.values()))
-    if case.track is None or scale < 0.03 * case.problem.y[case.problem.used].std(axis=0).max():
+    if scale < 0.03 * case.problem.y[case.problem.used].std(axis=0).max():
         return
-    scans = {rate: _scan(case, 0.2 * case.track.span_s, rate) for rate in _RATES}
+    scans = {rate: _scan(case, 0.2 * case.paths.span_s, rate) for rate in _RATES}
     rate = min(scans, key=lambda r: scans[r][1].sum(axis=1).min())
     trial, misfit = scans[rate]
     score = misfit.sum(axis=1)
@@ -113,47 +91,42 @@ def _clock_rate(case: Case) -> Iterator[Hypothesis]:
     fit, problem, (_, value), (_, sd) = fitted
     if rate < 0:
         text, cure = "The images fit the robot's path run backwards.", "Sort the frames by time."
-        yield case.found("frame_order", fit, 4, 0.0, 0.0, "", text, cure, on=problem)
-        return
-    if abs(value) < max(5.0 * sd, 1e-3):
-        return
-    text = f"The video's time runs {1 + value:.4f} +- {sd:.4f} times too slowly for the robot's."
-    cure = f"Multiply fps in recording.toml by {1 / (1 + value):.4f}, or write the frames' true times to frames.csv."
-    yield case.found("clock_rate", fit, 4, 1 + value, sd, "times", text, cure, on=problem)
+        yield case.found("frame_order", fit, 4, (0.0, 0.0, ""), text, cure, on=problem)
+    elif abs(value) >= max(5.0 * sd, 1e-3):
+        text = f"The video's time runs {1 + value:.4f} +- {sd:.4f} times too slowly for the robot's."
+        cure = f"Multiply fps in recording.toml by {1 / (1 + value):.4f}, or write the frames' true times to frames.csv."
+        yield case.found("clock_rate", fit, 4, (1 + value, sd, "times"), text, cure, on=problem)
 
 
 def _frame_order(case: Case) -> Iterator[Hypothesis]:
     """Each frame at an instant of its own near its stated one."""
-    if case.track is None or case.frames < 8:
-        return
-    problem = case.problem
-    step = np.median(np.diff(np.unique(case.by_frame(problem.time)[:, 0]))) if np.isfinite(problem.time).all() else np.nan
-    if not 0 < step <= 0.25:
+    step = np.median(np.diff(np.sort(np.nanmin(case.by_frame(case.problem.time), axis=1))))
+    if case.frames < 8 or not 0 < step <= 0.25:
         return
     shifts = step * np.arange(-8, 9)
-    fit, moved, own = case.chosen(np.stack([case.track.moved(problem.x[:, 0], shift) for shift in shifts]))
+    fit, moved, own = case.chosen(np.stack([case.moved(shift) for shift in shifts]))
     share = float((own != 8).mean())
     text = f"{100 * share:.0f} % of the frames fit another instant, within {1e3 * shifts[-1]:.0f} ms, better than their own."
     cure = "Sort the frames, and write each one's true time to frames.csv."
     counts = np.bincount(own, minlength=len(shifts)) / case.frames
     chosen = -case.frames * float((counts * np.log(np.maximum(counts, 1e-9))).sum())  # what the choices may cost
     raw = fit.total - case.null.total - chosen
-    yield case.found("frame_order", fit, len(shifts), 100 * share, 0.0, "%", text, cure, on=moved, raw=raw)
+    yield case.found("frame_order", fit, len(shifts), (100 * share, 0.0, "%"), text, cure, on=moved, raw=raw)
 
 
 def _readout(case: Case) -> Iterator[Hypothesis]:
     """A rolling shutter of another read-out time."""
-    if case.track is None or case.size is None:
+    if case.size is None:
         return
     row = np.clip(case.problem.y[:, :, 1:] / (case.size[1] - 1) - 0.5, -0.6, 0.6)
-    velocity = case.track.velocity()
+    velocity = case.velocity()
     known = replace(case.problem, seen=case.problem.used & np.isfinite(velocity).all(axis=1)[:, None])
-    fit = known.fit(_image_of(velocity[:, None] * row), start=case.null.M)
-    value, sd = float(fit.theta[0]), float(np.sqrt(fit.covariance[0, 0]))
+    fit, value, sd = case.linear(lambda M: np.einsum("cij,ncj->nci", M[:, :, :3], velocity[:, None] * row)[..., None], known)
     off = f"{1e3 * value:.1f} +- {1e3 * sd:.1f} ms"
     text = f"The residuals grow from row to row with the tool's velocity: the read-out time is off by {off}."
     cure = f"Set readout_s = {max(case.readout_s + value, 0.0):.4f} in recording.toml."
-    yield case.found("readout", fit, 1, 1e3 * value, 1e3 * sd, "ms", text, cure, on=known)
+    yield case.found("readout", fit, 1, (1e3 * value, 1e3 * sd, "ms"), text, cure, on=known)
 
 
+#: They need the tool's path in time (`Case.paths`).
 TIME_TESTS = (_clock, _clock_rate, _frame_order, _readout)

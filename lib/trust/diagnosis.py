@@ -41,7 +41,7 @@ class Diagnosis:
 
 def diagnose(
     data: Correspondences, calibration: Calibration | None = None, *, kinematics: Kinematics | None = None,
-    readout_s: float = 0.0, image_size_px: tuple[int, int] | None = None, seed: int = 0,
+    offset_s: float = 0.0, readout_s: float = 0.0, image_size_px: tuple[int, int] | None = None, seed: int = 0,
 ) -> Diagnosis:  # fmt: skip
     """Fit every hypothesis about what could be wrong, and rank them.
 
@@ -50,7 +50,7 @@ def diagnose(
         calibration: Where there is one: its image size is used if none is given.
         kinematics: The robot's log, which tells where the tool was a little earlier or later.  Without it the rows' own
             positions do, where the frames follow each other within 0.25 s.
-        readout_s, image_size_px: As the recording states them; without a size nothing is said of the read-out time.
+        offset_s, readout_s, image_size_px: As the recording states them; without a size nothing is said of the read-out time.
         seed: Of the random samples.
 
     >>> from lib.simulator.rig import simulate_correspondences
@@ -70,8 +70,8 @@ def diagnose(
         text = f"Only {problem.used.all(axis=1).sum()} of {len(data)} rows have both images and the robot's report."
         cure = f"The detector does not fit these pictures: look at its overlays, {TRAIN_FURTHER}."
         return Diagnosis((Hypothesis("detector_unfit", text, cure, 100.0, 0.0, "%", 1.0, float(len(data))),))
-    case = Case(problem, kinematics, readout_s, image_size_px, seed)
-    found = [h for test in (*TIME_TESTS, *TESTS) for h in test(case)]
+    case = Case(problem, kinematics, offset_s, readout_s, image_size_px, seed)
+    found = [h for test in (*(TIME_TESTS if case.paths else ()), *TESTS) for h in test(case)]
     found = sorted((h for h in found if np.isfinite(h.gain)), key=lambda h: -h.gain)
     best = Diagnosis(tuple(found)).best
     found += unexplained(case, case.null if best is None else case.fits.get(best.name, case.null))

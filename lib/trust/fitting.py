@@ -12,7 +12,9 @@ from typing import Self
 
 import numpy as np
 
+from lib.calibration.affine import regress
 from lib.calibration.offsets import rows_axes
+from lib.calibration.robust import tightest_sample
 from lib.correspondences import Correspondences
 
 __all__ = ["Problem", "Robust", "Shape", "log_density"]
@@ -160,29 +162,14 @@ class Problem:
         best = max(fits, key=lambda fit: fit.total)
         return best if len(starts) == 1 else self._descend(best.M, columns, groups, rounds)
 
-    def _starts(self, rng: np.random.Generator, samples: int = 150) -> list[np.ndarray]:
-        """Cameras (2, 2, 4) of least squares, and of the samples of four rows that most rows are near to."""
-        squares, best = np.zeros((2, 2, 4)), np.zeros((2, 2, 4))
-        for view in range(2):
-            rows = np.flatnonzero(self.used[:, view])
-            if len(rows) < 4:
-                continue
-            H, y = np.column_stack([self.x[rows, view], np.ones(len(rows))]), self.y[rows, view]
-            squares[view] = np.linalg.lstsq(H, y, rcond=None)[0].T
-            sets = np.argsort(rng.random((samples, min(len(rows), 200))), axis=1)[:, :4]
-            if len(rows) > 200:
-                sets = rng.permutation(len(rows))[:200][sets]
-            volume = np.abs(np.linalg.det(H[sets]))
-            sets = sets[volume > 0.3 * np.median(volume) + 1e-12]
-            if not len(sets):
-                best[view] = squares[view]
-                continue
-            M = np.linalg.solve(H[sets], y[sets])
-            r2 = ((H @ M - y) ** 2).sum(axis=2)
-            s2 = np.maximum(np.quantile(r2, [0.2, 0.35, 0.5, 0.75], axis=1), _LEAST_PX**2)
-            score = (np.log(s2) + 1.5 * np.log1p(r2 / s2[:, :, None]).mean(axis=2)).min(axis=0)
-            best[view] = M[score.argmin()].T
-        return [squares, best]
+    def _starts(self, rng: np.random.Generator) -> np.ndarray:
+        """Cameras (2, 2, 2, 4) of least squares, and of the samples of four rows that most rows are near to."""
+        found = np.zeros((2, 2, 2, 4))
+        for view, rows in enumerate(self.used.T):
+            if rows.sum() >= 4:
+                x, y = self.x[rows, view], self.y[rows, view]
+                found[:, view] = regress(x, y), tightest_sample(x, y, rng)
+        return found
 
     def _design(self, M: np.ndarray, columns: Callable | None) -> np.ndarray:
         """(n, 2, 2, p): derivatives by the 16 entries of M, 9 offsets (mm) and the additions."""

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 
@@ -39,13 +38,13 @@ def _tip_order(case: Case) -> Iterator[Hypothesis]:
         where, call = ("both images", "call") if len(views) == 2 else (f"the {SIDES[views[0]]} image", "calls")
         text = f"What {where} {call} {', '.join(LANDMARKS)} is {', '.join(LANDMARKS[k] for k in order)} for the robot."
         cure = f"Bring the columns of kinematics.csv, or the detections of {where}, into one order."
-        yield case.found("tip_order", moved.fit(seed=case.seed), 1, 1.0, 0.0, "", text, cure, on=moved)
+        yield case.found("tip_order", moved.fit(seed=case.seed), 1, (1.0, 0.0, ""), text, cure, on=moved)
     swapped = table[:, [0, 2, 1]][problem.frame, problem.landmark]  # frame by frame: one bit each
     fit, moved, own = case.chosen(np.stack([problem.x[:, 0], swapped]))
     text = f"The tips are exchanged in {100 * own.mean():.0f} % of the frames."
     cure = "Tell the tips apart by the tool's roll, as the robot does; or train the detector with tips in the robot's order."
     raw = fit.total - case.null.total - case.frames * np.log(2.0)
-    yield case.found("tip_order", fit, 1, 100 * own.mean(), 0.0, "%", text, cure, on=moved, raw=raw)
+    yield case.found("tip_order", fit, 1, (100 * own.mean(), 0.0, "%"), text, cure, on=moved, raw=raw)
 
 
 def _finite_distance(case: Case) -> Iterator[Hypothesis]:
@@ -59,45 +58,45 @@ def _finite_distance(case: Case) -> Iterator[Hypothesis]:
         pixel = np.einsum("cij,ncj->nci", M[:, :, :3], problem.x) + M[:, :, 3] - centre
         return -(depth[:, :, None] * pixel)[..., None]
 
-    fit = problem.fit(columns, start=case.null.M)
-    value, sd = float(fit.theta[0]), float(np.sqrt(fit.covariance[0, 0]))
+    fit, value, sd = case.linear(columns)
     far = f"by a working distance of {1 / value:.0f} mm" if value > 0 else "the wrong way, as in a mirrored image"
     text = f"The residuals are curved {far}: 1/distance is {value:.5f} +- {sd:.5f} per mm."
-    yield case.found("finite_distance", fit, 1, value, sd, "1/mm", text, "Calibrate with model='near_affine'.")
+    yield case.found("finite_distance", fit, 1, (value, sd, "1/mm"), text, "Calibrate with model='near_affine'.")
 
 
 def _landmark_offset(case: Case) -> Iterator[Hypothesis]:
     """Landmarks that the robot reports far beside where they are seen, always in the tool's same direction."""
-    problem = case.problem
-    if not problem.axes.any():
-        return
-    free = replace(problem, offset_sd=1.0).fit(start=case.null.M)
-    size = np.linalg.norm(free.offsets, axis=1)
+    free = replace(case.problem, offset_sd=1.0).fit(start=case.null.M)
+    size = 1e3 * np.linalg.norm(free.offsets, axis=1)
     k = int(size.argmax())
-    if size[k] < 0.15:
-        return
-    along = ", ".join(f"{1e3 * v:.0f}" for v in free.offsets[k])
-    text = f"{LANDMARKS[k]} is seen {1e3 * size[k]:.0f} um beside the robot's report ({along} um in the tool's axes)."
-    cure = "Correct the tool's geometry in the robot's report; until then calibrate with offsets='tool'."
-    yield case.found("landmark_offset", free, 9, 1e3 * size[k], 1e3 * free.offset_sd[k], "um", text, cure)
+    if size[k] >= 150:
+        along = ", ".join(f"{1e3 * v:.0f}" for v in free.offsets[k])
+        text = f"{LANDMARKS[k]} is seen {size[k]:.0f} um beside the robot's report ({along} um in the tool's axes)."
+        cure = "Correct the tool's geometry in the robot's report; until then calibrate with offsets='tool'."
+        yield case.found("landmark_offset", free, 9, (size[k], 1e3 * free.offset_sd[k], "um"), text, cure)
 
 
 def _tool_bends(case: Case) -> Iterator[Hypothesis]:
     """Tips that move by other amounts than the base."""
-    problem = case.problem
-    tips = (problem.landmark > 0).astype(float)
-    if not 0 < tips.mean() < 1:
-        return
+    tips = (case.problem.landmark > 0).astype(float)
+    if 0 < tips.mean() < 1:
+        x = case.problem.x * tips[:, None, None]
+        fit, *size = case.linear(lambda M: np.einsum("cij,nck->ncijk", M[:, :, :3], x).reshape(*x.shape[:2], 2, 9))
+        size = 100 / np.sqrt(3.0) * np.array(size)
+        text = f"The tips move by {size[0]:.1f} % more or less than the base: a tool that bends, or a wrong pivot or angle."
+        cure = "Check the tool's geometry and joint angles in the robot's report (lib.calibration.pivot_calibration)."
+        yield case.found("tool_bends", fit, 9, (*size, "%"), text, cure)
 
-    def columns(M: np.ndarray) -> np.ndarray:
-        G = np.einsum("cij,nck,n->ncijk", M[:, :, :3], problem.x, tips)
-        return G.reshape(*G.shape[:3], 9)
 
-    fit = problem.fit(columns, start=case.null.M)
-    size = float(np.sqrt((fit.theta**2).sum() / 3.0))
-    text = f"The tips move by {100 * size:.1f} % more or less than the base: a tool that bends, or a wrong pivot or angle."
-    cure = "Check the tool's geometry and joint angles in the robot's report (lib.calibration.pivot_calibration)."
-    yield case.found("tool_bends", fit, 9, 100 * size, 100 * float(np.sqrt(np.trace(fit.covariance) / 3.0)), "%", text, cure)
+def _drift(case: Case) -> Iterator[Hypothesis]:
+    """Images that creep at a constant speed."""
+    time = case.problem.time
+    if np.isfinite(time).all() and np.ptp(time) > 0:
+        G = np.eye(4).reshape(1, 2, 2, 4) * ((time - time.mean()) / np.ptp(time))[:, None, None, None]
+        fit, *size = case.linear(G)
+        text = f"The images creep by {size[0] / np.sqrt(2.0):.1f} px from the first frame to the last."
+        cure = "Fix the microscope, or calibrate a shorter part (Correspondences.of_frames)."
+        yield case.found("drift", fit, 4, (*(np.array(size) / np.sqrt(2.0)), "px"), text, cure)
 
 
 def _own_noise(case: Case, rows: np.ndarray) -> tuple[Robust, float]:
@@ -108,82 +107,61 @@ def _own_noise(case: Case, rows: np.ndarray) -> tuple[Robust, float]:
     return fit, float(np.median(inside) / max(np.median(outside), 1e-3)) if inside.size and outside.size else 0.0
 
 
-def _bad_landmark(case: Case) -> Iterator[Hypothesis]:
-    for k in np.unique(case.problem.landmark[case.problem.landmark <= 2]):
-        rows = case.problem.landmark == k
-        fit, ratio = _own_noise(case, rows) if not rows.all() else (None, 0.0)
-        if ratio >= 3.0:
-            text = f"{LANDMARKS[k]} has residuals {ratio:.1f} times as large as the others."
-            cure = f"Look at the detections of {LANDMARKS[k]} and at its column in kinematics.csv, or calibrate without it."
-            yield case.found("bad_landmark", fit, 2, ratio, 0.0, "times", text, cure)
-
-
-def _bad_stretch(case: Case) -> Iterator[Hypothesis]:
-    """The stretch of frames in which residuals are largest (the largest sum of a score that is negative on average)."""
-    problem = case.problem
+def _bad_part(case: Case) -> Iterator[Hypothesis]:
+    """One landmark, or the stretch of frames of largest residuals (the largest sum of a score, negative on average)."""
+    problem, parts = case.problem, []
+    for k in np.unique(problem.landmark[problem.landmark <= 2]):
+        cure = f"Look at the detections of {LANDMARKS[k]} and at its column in kinematics.csv, or calibrate without it."
+        parts.append(("bad_landmark", problem.landmark == k, 2, f"{LANDMARKS[k]} has", cure))
     r2 = (case.null.residuals**2).sum(axis=2) / problem.noise**2
     score = np.log1p(r2 / max(np.median(r2[problem.used]) / 1.4, 1e-6)) - 1.5
     total = np.bincount(problem.frame, np.where(problem.used, score, 0.0).sum(axis=1), case.frames)
     total = np.append(0.0, np.cumsum(total))
     last = int((total - np.minimum.accumulate(total)).argmax())
     first = int(total[: last + 1].argmin())
-    if not 2 <= last - first <= 0.6 * case.frames:
-        return
-    rows = (problem.frame >= first) & (problem.frame < last)
-    fit, ratio = _own_noise(case, rows)
-    if ratio >= 3.0:
+    if 2 <= last - first <= 0.6 * case.frames:
+        rows = (problem.frame >= first) & (problem.frame < last)
         when = "{:.2f} to {:.2f} s".format(*problem.time[rows][[0, -1]])
-        text = f"Frames {first} to {last - 1} of those seen ({when}) have residuals {ratio:.1f} times as large as the others."
         cure = "Look at these frames and at the robot's log of this time, or leave them out (Correspondences.subset)."
-        yield case.found("bad_stretch", fit, 4, ratio, 0.0, "times", text, cure)
+        parts.append(("bad_stretch", rows, 4, f"Frames {first} to {last - 1} of those seen ({when}) have", cure))
+    for name, rows, extra, what, cure in parts:
+        fit, ratio = _own_noise(case, rows) if not rows.all() else (None, 0.0)
+        if ratio >= 3.0:
+            text = f"{what} residuals {ratio:.1f} times as large as the others."
+            yield case.found(name, fit, extra, (ratio, 0.0, "times"), text, cure)
 
 
 def _camera_moved(case: Case) -> Iterator[Hypothesis]:
     """Other cameras from one frame on, both or one."""
-    problem = case.problem
+    problem, fit = case.problem, case.null
     if case.frames < 8:
         return
     H = np.nan_to_num(np.concatenate([problem.x, np.ones((len(problem), 2, 1))], axis=2))
+    z = np.concatenate([H, fit.residuals], axis=2)
 
-    def columns(frame: int, views: tuple[int, ...]) -> np.ndarray:
-        G = np.zeros((len(problem), 2, 2, 8 * len(views)))
-        for first, view, j in ((8 * i + 4 * j, view, j) for i, view in enumerate(views) for j in range(2)):
-            G[:, view, j, first : first + 4] = H[:, view] * (problem.frame >= frame)[:, None]
-        return G
+    def columns(views: tuple[int, ...]) -> np.ndarray:
+        late = H * (problem.frame >= frame)[:, None, None]
+        return np.einsum("nck,cv,ij->ncivjk", late, np.eye(2)[:, views], np.eye(2)).reshape(*H.shape[:2], 2, -1)
 
-    def fitted(frame: int, views: tuple[int, ...] = (0, 1), rounds: int = 40) -> Robust:
-        G = columns(frame, views)
-        return problem.fit(lambda M: G, start=case.null.M, rounds=rounds)
-
-    @cache
-    def gain(frame: int) -> float:
-        return fitted(frame, rounds=8).total
-
-    frame, step = max(np.unique(np.linspace(0.12, 0.88, 9) * case.frames).astype(int), key=gain), max(case.frames // 20, 1)
-    while step:
-        new = max((f for f in (frame, frame - step, frame + step) if 2 <= f <= case.frames - 2), key=gain)
-        frame, step = new, step if new != frame else step // 2
+    for _ in range(2):  # the frame that parts the rows best, under the weights of the fit so far
+        weight = np.where(problem.used, 1.0 / (fit.shapes[0].scale ** 2 + (fit.residuals**2).sum(axis=2)), 0.0)
+        moments = np.zeros((case.frames, 2, 6, 6))
+        np.add.at(moments, problem.frame, np.einsum("nc,nci,ncj->ncij", weight, z, z))
+        early, left = np.cumsum(moments, axis=0)[1:-2], 0.0
+        for part in (early, moments.sum(axis=0) - early):
+            G = part[..., :4, :4] + 1e-9 * np.trace(part, axis1=2, axis2=3)[..., None, None] * np.eye(4) + 1e-12 * np.eye(4)
+            open_ = part[..., 4:, 4:] - part[..., 4:, :4] @ np.linalg.solve(G, part[..., :4, 4:])
+            left = left + np.trace(open_, axis1=2, axis2=3).sum(axis=1)
+        frame = int(left.argmin()) + 2
+        fit = case.linear(columns((0, 1)))[0]
     for views in ((0, 1), (0,), (1,)):
-        fit = fitted(frame, views)
-        change = (columns(frame, views) @ fit.theta)[problem.frame >= frame][:, list(views)]
+        fit = case.linear(columns(views))[0] if len(views) < 2 else fit
+        change = (columns(views) @ fit.theta)[problem.frame >= frame][:, list(views)]
         size = float(np.sqrt((change**2).sum(axis=2).mean()))
         who = "Both cameras" if len(views) == 2 else f"The {SIDES[views[0]]} camera"
         text = f"{who} moved at about frame {frame} of those seen: the images shift by {size:.1f} px."
         cure = "Calibrate before and after on their own, or follow the move with lib.registration.register_images."
-        yield case.found("camera_moved", fit, 8 * len(views) + 3, size, 0.0, "px", text, cure)
-
-
-def _drift(case: Case) -> Iterator[Hypothesis]:
-    """Images that creep at a constant speed."""
-    time = case.problem.time
-    if not np.isfinite(time).all() or np.ptp(time) <= 0:
-        return
-    G = np.eye(4).reshape(1, 2, 2, 4) * ((time - time.mean()) / np.ptp(time))[:, None, None, None]
-    fit = case.problem.fit(lambda M: G, start=case.null.M)
-    size = float(np.linalg.norm(fit.theta.reshape(2, 2), axis=1).max())
-    text = f"The images creep by {size:.1f} px from the first frame to the last."
-    cure = "Fix the microscope, or calibrate a shorter part (Correspondences.of_frames)."
-    yield case.found("drift", fit, 4, size, float(np.sqrt(np.diag(fit.covariance).max())), "px", text, cure)
+        yield case.found("camera_moved", fit, 8 * len(views) + 3, (size, 0.0, "px"), text, cure)
 
 
 def _frozen(case: Case) -> Iterator[Hypothesis]:
@@ -201,7 +179,7 @@ def _frozen(case: Case) -> Iterator[Hypothesis]:
 
     def certain(name: str, fit: Robust, repeated: np.ndarray, text: str, cure: str) -> Hypothesis:
         share = 100.0 * float(repeated.mean())
-        found = case.found(name, fit, 2, share, 0.0, "%", f"In {share:.0f} % of the frames {text}.", cure)
+        found = case.found(name, fit, 2, (share, 0.0, "%"), f"In {share:.0f} % of the frames {text}.", cure)
         gain = max(found.gain, 0.0) + float(repeated.sum() * np.log(100.0))  # noise repeats no number
         return replace(found, gain=gain, explained=max(found.explained, share / 100))
 
@@ -248,7 +226,7 @@ def _rigid_tips(case: Case) -> Iterator[Hypothesis]:
     cure = "Log the opening of the jaws with the robot's pose, or calibrate with the base alone."
     chosen = 0.5 * float((np.log1p(sd**2 * information) + (opening / sd) ** 2).sum())  # the openings integrated out
     raw = fit.total - case.null.total - chosen
-    yield case.found("rigid_tips", fit, 1, size, 0.0, "mm", text, cure, raw=raw)
+    yield case.found("rigid_tips", fit, 1, (size, 0.0, "mm"), text, cure, raw=raw)
 
 
 def _linear(case: Case) -> tuple[np.ndarray, np.ndarray] | None:
@@ -276,31 +254,24 @@ def _scaled_axis(case: Case) -> Iterator[Hypothesis]:
     tolerance = np.diag(np.square([_SKEW_SD, _SKEW_SD, _ASPECT_SD, _ASPECT_SD]))
     if abs(_constraints(A)[2:].mean()) > _RESIZED:
         tolerance[2:, 2:] += 1.0
-    step = 1e-6 * np.abs(A).max()
-    near = step * np.eye(12).reshape(12, 2, 2, 3)
-
-    def misfit(scale: np.ndarray) -> float:
-        found = _constraints(A * scale)
-        J = (_constraints((A + near) * scale) - found).T / step
-        return float(found @ np.linalg.solve(J @ covariance @ J.T + tolerance, found))
-
-    none = misfit(np.ones(3))
-    logs = np.log(12.0) * np.linspace(-1, 1, 161)
-    for axis in range(3):
-        values = np.array([misfit(np.exp(log * np.eye(3)[axis])) for log in logs])
-        best = int(values.argmin())
-        log, spacing = logs[best], logs[1] - logs[0]
-        three = values[max(best - 1, 0) : best + 2]
-        bend = (three[0] - 2 * three[1] + three[2]) / spacing**2 if len(three) == 3 else 0.0
-        if bend > 0:
-            log += 0.5 * (three[0] - three[2]) / bend / spacing
-        sd = float(np.sqrt(2.0 / bend)) if bend > 0 else np.inf
-        scale = float(np.exp(-log))  # A times s is plausible, so the robot's numbers are 1/s too small
-        name, gain = "xyz"[axis], 0.5 * (none - values[best]) - 1.5
-        text = f"The cameras' pixels are skewed or oblong, and square if the robot's {name} is divided by {1 / scale:.3f}."
+    near, spacing = 1e-6 * np.abs(A).max() * np.eye(12).reshape(12, 2, 2, 3), np.log(12.0) / 80
+    logs = spacing * np.arange(-80, 81)
+    scales = np.exp(logs[:, None] * np.eye(3)[:, None])[:, :, None, None, None]  # (axes, logs, 1, 1, 1, 3)
+    seen = _constraints(A * scales)
+    J = (_constraints((A + near) * scales) - seen) / near.max()
+    S = np.einsum("abik,ij,abjl->abkl", J, covariance, J) + tolerance
+    misfit = (seen @ np.linalg.solve(S, np.swapaxes(seen, 2, 3)))[..., 0, 0]
+    none = float(misfit[0, 80])
+    for name, values in zip("xyz", misfit, strict=True):
+        best = int(values[1:-1].argmin()) + 1
+        before, least, after = values[best - 1 : best + 2]
+        bend = max(float(before - 2 * least + after) / spacing**2, 1e-9)
+        log = logs[best] + np.clip(0.5 * (before - after) / bend / spacing, -spacing, spacing)
+        scale, sd = float(np.exp(log)), float(np.sqrt(2.0 / bend))  # A times s is plausible: the numbers are s too large
+        text = f"The cameras' pixels are skewed or oblong, and square if the robot's {name} is divided by {scale:.3f}."
         cure = f"Check the units and the scale of the {name} columns of kinematics.csv."
-        explained = 1.0 - float(values[best]) / max(none, 1e-9)
-        yield Hypothesis("scaled_axis", text, cure, 1 / scale, sd / scale, "times", explained, float(gain))
+        explained, gain = 1.0 - float(least) / max(none, 1e-9), float(0.5 * (none - least) - 1.5)
+        yield Hypothesis("scaled_axis", text, cure, scale, sd * scale, "times", explained, gain)
 
 
 def _exchanged(case: Case) -> Iterator[Hypothesis]:
@@ -355,6 +326,6 @@ def unexplained(case: Case, fit: Robust) -> list[Hypothesis]:
 
 
 TESTS = (
-    _tip_order, _finite_distance, _landmark_offset, _tool_bends, _bad_landmark, _bad_stretch, _camera_moved, _drift, _frozen,
-    _rigid_tips, _scaled_axis, _exchanged,
+    _tip_order, _finite_distance, _landmark_offset, _tool_bends, _drift, _bad_part, _camera_moved, _frozen, _rigid_tips,
+    _scaled_axis, _exchanged,
 )  # fmt: skip

@@ -32,7 +32,7 @@ class Take:
     ----------
     name, strength, causes:
         How it was spoiled ("" if it was not) and the names of hypotheses that are right.
-    data, kinematics, readout_s, image_size_px, robot_accuracy_mm:
+    data, kinematics, offset_s, readout_s, image_size_px, robot_accuracy_mm:
         What the lab has.
     rigs, points_mm:
         The true rigs (more than one if a camera moved) and (k, 3) test positions, in the true robot frame.
@@ -43,6 +43,7 @@ class Take:
     causes: tuple[str, ...]
     data: Correspondences
     kinematics: Kinematics
+    offset_s: float
     readout_s: float
     rigs: tuple[StereoRig, ...]
     points_mm: np.ndarray
@@ -163,7 +164,7 @@ class Scene:
             offset_s=self.offset_s, covariance_px2=covariance,
         )  # fmt: skip
         points = pose.apply(rng.uniform(-1, 1, (60, 3)) * [6.0, 3.0, 1.2])
-        return Take(name, strength, causes, data, kinematics, readout, rigs, points)
+        return Take(name, strength, causes, data, kinematics, self.offset_s, readout, rigs, points)
 
 
 @dataclass(frozen=True)
@@ -206,8 +207,9 @@ def examine(take: Take) -> Result:
         missed = [calibration.pair.triangulate(*rig.project(take.points_mm)).x_mm - take.points_mm for rig in take.rigs]
         effect = max(float(np.sqrt((d**2).sum(axis=1).mean())) for d in missed) / sd
     diagnosis = diagnose(
-        take.data, calibration, kinematics=take.kinematics, readout_s=take.readout_s, image_size_px=take.image_size_px
-    )
+        take.data, calibration, kinematics=take.kinematics, offset_s=take.offset_s, readout_s=take.readout_s,
+        image_size_px=take.image_size_px,
+    )  # fmt: skip
     verdict = judge(
         take.data, calibration, diagnosis=diagnosis, robot_accuracy_mm=take.robot_accuracy_mm, error=error
     )

@@ -20,8 +20,9 @@ def take(way="", strength="", seed=7, **options):
 
 def found(take, *, log=True):
     return diagnose(
-        take.data, kinematics=take.kinematics if log else None, readout_s=take.readout_s, image_size_px=take.image_size_px
-    )
+        take.data, kinematics=take.kinematics if log else None, offset_s=take.offset_s, readout_s=take.readout_s,
+        image_size_px=take.image_size_px,
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("name", ["12 frames", "correlated 0.5, heavy tails"])
