@@ -97,7 +97,7 @@ def _become(command: list[str]) -> int:
 
 def test(argv: list[str]) -> int:
     style = subprocess.call([sys.executable, "-m", "ruff", "check", "--output-format=concise", *ruff_options(), ROOT])
-    return _pytest(["--numprocesses=auto", "--dist=loadfile", *argv]) or style
+    return _pytest(["--numprocesses=auto", "--dist=loadfile", "-p", "no:dash", *argv]) or style
 
 
 def bench(argv: list[str]) -> int:

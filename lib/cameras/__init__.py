@@ -2,8 +2,7 @@
 
 from lib.cameras.affine import AffineCamera, Camera, Resection
 from lib.cameras.near_affine import NearAffineCamera, radial_derivative
-from lib.cameras.rig import StereoRig
-from lib.cameras.triangulation import Points, best_linear
+from lib.cameras.rig import Points, StereoRig, best_linear
 
 __all__ = [
     "AffineCamera", "Camera", "NearAffineCamera", "Points", "Resection", "StereoRig", "best_linear", "radial_derivative",

@@ -79,7 +79,8 @@ class MatrixCamera:
     @cached_property
     def viewing_direction(self) -> np.ndarray:
         """Unit vector (3,) along which points share a pixel of `matrix`, away from the camera (unmirrored optics)."""
-        direction = np.cross(self.matrix[0, :3], self.matrix[1, :3])
+        (a, b, c), (d, e, f) = self.linear.tolist()
+        direction = np.array([b * f - c * e, c * d - a * f, a * e - b * d])
         return direction / np.linalg.norm(direction)
 
     def moved(self, motion: RigidTransform) -> Self:

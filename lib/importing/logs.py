@@ -9,8 +9,6 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from rosbags.highlevel import AnyReader, AnyReaderError
-from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 from lib.importing.mapping import Mapping, Pose, Table
@@ -109,8 +107,11 @@ def read_columns(path: Path, table: Table, names: Iterable[str]) -> tuple[list[D
 
 
 @contextmanager
-def _bag(path: Path) -> Iterator[AnyReader]:
-    """A ROS 1 or 2 bag; whatever another file raises is one error."""
+def _bag(path: Path) -> Iterator:
+    """The reader of a ROS 1 or 2 bag; whatever another file raises is one error."""
+    from rosbags.highlevel import AnyReader, AnyReaderError  # not at the top: half a second that few imports need
+    from rosbags.typesys import Stores, get_typestore
+
     try:
         with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
             yield reader

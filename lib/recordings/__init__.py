@@ -7,9 +7,8 @@ A rolling shutter reads row y at readout_s * (y / (height - 1) - 1/2) after that
 """
 
 from lib.recordings.annotations import Annotations
-from lib.recordings.doubts import Doubt
 from lib.recordings.frames import Frames, StereoFrame, read_image, to_8_bits
-from lib.recordings.recording import Kinematics, Recording
+from lib.recordings.recording import Doubt, Kinematics, Recording
 from lib.recordings.truth import Truth
 from lib.recordings.writer import RecordingWriter
 

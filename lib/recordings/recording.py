@@ -3,22 +3,21 @@
 import math
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from lib.correspondences import LANDMARKS
 from lib.recordings.annotations import Annotations, read_coco
-from lib.recordings.doubts import Doubt, doubts
 from lib.recordings.frames import Frames, open_side
 from lib.recordings.tables import columns, read_table, read_toml, refuse
 from lib.recordings.truth import Truth
 
-__all__ = ["FORMAT", "UNITS", "Kinematics", "Recording", "kinematics_columns"]
+__all__ = ["FORMAT", "UNITS", "Doubt", "Kinematics", "Recording", "doubts", "kinematics_columns"]
 
 FORMAT = "microstereo.recording"
 #: A longer step between samples than this, and than ten usual ones, is a gap: nothing is interpolated in it.
@@ -31,6 +30,22 @@ _REQUIRED = {"name": str, "fps": float, "image_size_px": list}
 _DEFAULTS = {"description": "", "readout_s": 0.0, "offset_s": 0.0, "robot_accuracy_mm": 0.010, "details": {}}
 _DEFAULTS |= {"skeleton": list(LANDMARKS), "bit_depth": 0}
 _FIXED = {"format": FORMAT, "units": UNITS}
+#: A log is that many times longer than its video only by intent, or if the times of the frames are missing.
+_LONGER = 5.0
+_COVERED = 0.75  # share of frames with a position, below which log and video do not fit
+_JUMP_MM = 20.0  # from one sample to the next; no surgical robot moves so
+_SLOW_S = 0.5  # between samples; robots report 10 to 1000 times a second
+
+
+class Doubt(NamedTuple):
+    """What makes a recording suspicious though it can be read (clocks, gaps, jumps).
+
+    A name in snake case, plain words with the numbers, and what to do.
+    """
+
+    name: str
+    text: str
+    cure: str
 
 
 def kinematics_columns(landmarks: Sequence[str] = LANDMARKS) -> list[str]:
@@ -230,3 +245,28 @@ def _read_kinematics(path: Path, landmarks: Sequence[str]) -> Kinematics:
         what = f"the median distance from {landmarks[0]} to the others is {reach_mm:.4g}, not plausible in mm (0.1 to 100)"
         raise ValueError(f"{path}: {what}. Metres or micrometres? Convert to mm.")
     return Kinematics(time_s, x)
+
+
+def doubts(frame_s: np.ndarray, fps: float, log_s: np.ndarray, x_mm: np.ndarray, reported: np.ndarray) -> Iterator[Doubt]:
+    """Judge times of the frames (n,) on the robot's clock, the log's times (m,), its positions (m, k, 3), and in which frames
+    (n,) the robot reports any landmark.
+    """
+    span, logged = float(np.ptp(frame_s)), float(np.ptp(log_s))
+    uniform = np.allclose(np.diff(frame_s) * fps, 1.0, rtol=1e-3)
+    if uniform and logged > _LONGER * (span + 1.0 / fps) and logged > 2.0:
+        text = f"{len(frame_s)} frames at {fps:g} fps last {span:.1f} s, but the robot's log {logged:.1f} s."
+        yield Doubt("frame_times", text, "If frames were left out, write their times to frames.csv (frame, time_s).")
+    if reported.mean() < _COVERED:
+        text = f"The robot reports a position in {reported.sum()} of {len(frame_s)} frames; log and video hardly overlap."
+        yield Doubt("little_overlap", text, "Check offset_s and the time_s columns; export the log of the whole video.")
+    if len(log_s) < 2:
+        return
+    step = np.diff(log_s)
+    if np.median(step) > _SLOW_S:
+        text = f"The robot's log has a sample every {np.median(step):.3g} s."
+        yield Doubt("slow_log", text, "Is time_s in milliseconds? Give seconds, and ten samples a second or more.")
+    jump = np.nan_to_num(np.linalg.norm(np.diff(x_mm, axis=0), axis=2)).max(axis=1)
+    if (jump > _JUMP_MM).any():
+        k = int(jump.argmax())
+        text = f"In kinematics.csv a landmark jumps by {jump[k]:.0f} mm at {log_s[k + 1]:.3f} s (line {k + 3})."
+        yield Doubt("jump", text, "Leave the cells of a wrong sample empty.")

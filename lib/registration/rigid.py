@@ -54,7 +54,8 @@ class Registration:
 def motion_jacobian(offset: np.ndarray) -> np.ndarray:
     """(n, 3, 6): how points at `offset` (n, 3) from the centre of rotation move with (omega, tau)."""
     jacobian = np.broadcast_to(np.eye(3, 6, 3), (len(offset), 3, 6)).copy()
-    jacobian[:, :, :3] = np.swapaxes(np.cross(np.eye(3), offset[:, None]), 1, 2)
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        jacobian[:, i, j], jacobian[:, j, i] = offset[:, k], -offset[:, k]
     return jacobian
 
 

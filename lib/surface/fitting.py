@@ -9,8 +9,7 @@ from numpy.typing import ArrayLike
 
 from lib.cameras import AffineCamera
 from lib.geometry import finite_points
-from lib.surface.bspline import BSplineSurface
-from lib.surface.fit import SurfaceFit
+from lib.surface.bspline import BSplineSurface, SurfaceFit
 from lib.surface.grid import SplineGrid
 from lib.surface.solver import L1Problem, L1Solution, interior_point, least_squares
 

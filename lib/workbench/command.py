@@ -15,9 +15,8 @@ from tqdm import tqdm
 
 from lib import files, paths
 from lib.provenance import commit, machine
-from lib.workbench import collection, pages
+from lib.workbench import execution, pages
 from lib.workbench.execution import Failure, execute
-from lib.workbench.index import index_html
 from lib.workbench.parameters import (
     UsageError,
     choose_notebooks,
@@ -145,7 +144,7 @@ class _Report:
             "seconds": 0.0,
             "commit": commit(),
             "machine": machine(),
-            "versions": collection.versions(),
+            "versions": execution.versions(),
             "notebooks": [
                 {"name": book.stem, "title": title_of(book), "state": "pending", "seconds": None, "failure": None,
                  "page": None, "executed": None, "left_out": None, "verdict": None, "reasons": []}
@@ -173,14 +172,14 @@ class _Report:
         entry.update(state="failed" if failure else "complete", seconds=round(seconds, 2))
         entry["failure"] = failure.as_dict() if failure else None
         try:
-            entry["left_out"] = collection.left_out_of(executed)
-            entry.update(collection.verdict_of(executed) or {})
-            self.content.update(collection.joined(self.content["notebooks"]) or {})
-            self.content["metrics"] += [{"notebook": book.stem, **m} for m in collection.metrics_of(executed)]
+            entry["left_out"] = execution.left_out_of(executed)
+            entry.update(execution.verdict_of(executed) or {})
+            self.content.update(execution.joined(self.content["notebooks"]) or {})
+            self.content["metrics"] += [{"notebook": book.stem, **m} for m in execution.metrics_of(executed)]
         except (OSError, ValueError):  # there is none, or a full disk has cut it off
             executed.unlink(missing_ok=True)
         else:
-            for figure in collection.figures_of(executed):
+            for figure in execution.figures_of(executed):
                 self._add_figure(book, figure)
             self._write_page(book, entry)
         self.write()
@@ -197,9 +196,9 @@ class _Report:
     def write(self) -> None:
         self.content["seconds"] = round(time.monotonic() - self.start, 2)
         files.write_json(self.folder / "metrics.json", self.content)
-        files.write_text(self.folder / "index.html", index_html(self.content))
+        files.write_text(self.folder / "index.html", pages.index_html(self.content))
 
-    def _add_figure(self, book: Path, figure: collection.NamedFigure) -> None:
+    def _add_figure(self, book: Path, figure: execution.NamedFigure) -> None:
         file = f"figures/{figure.name}.png"
         if any(other["file"] == file for other in self.content["figures"]):
             file = f"figures/{book.stem}.{figure.name}.png"

@@ -1,5 +1,6 @@
-"""One HTML page of an executed notebook: a single file that opens without network, equations and all."""
+"""The pages of a run: ``index.html``, and one page of each notebook.  They open without network, equations and all."""
 
+import functools
 import html
 import json
 import re
@@ -14,10 +15,11 @@ from pygments import highlight
 from pygments.formatters import HtmlFormatter
 from pygments.lexers import PythonLexer
 
-from lib.workbench import equations
-from lib.workbench.report import STOP_METADATA, verdict_html
+from lib import paths
+from lib.workbench.execution import Failure
+from lib.workbench.report import STOP_METADATA, VERDICT_COLOURS, format_value, unit_text, verdict_html
 
-__all__ = ["PLOTLY_FILE", "markdown_html", "page", "render"]
+__all__ = ["PLOTLY_FILE", "equation_svg", "index_html", "markdown_html", "page"]
 
 #: plotly's script lies once beside the pages that show a 3D view.
 PLOTLY_FILE = "plotly.min.js"
@@ -25,20 +27,65 @@ PLOTLY_MIME = "application/vnd.plotly.v1+json"
 WIDGET_MIME = "application/vnd.jupyter.widget-view+json"
 WIDGET_STATE = "application/vnd.jupyter.widget-state+json"
 
+#: What the converter does not know, in its own words.
+_REWRITES = [
+    (re.compile(r"\\operatorname\*\{([^{}]*)\}_\{([^{}]*)\}"), r"\\underset{\2}{\\mathrm{\1}}\\,"),
+    (re.compile(r"\\operatorname\*\{([^{}]*)\}_(\w)"), r"\\underset{\2}{\\mathrm{\1}}\\,"),
+    (re.compile(r"\\operatorname\*?\{([^{}]*)\}"), r"\\mathrm{\1}\\,"),
+    (re.compile(r"\\(begin|end)\{(aligned|gathered|align|equation)\}"), r"\\\1{align*}"),
+    (re.compile(r"\\math(bb|cal|bf|rm|sf)\s+(\w)"), r"\\math\1{\2}"),
+    (re.compile(r"\\[bB]igg?l\s*\\(?:[lr]?Vert(?![A-Za-z])|\|)"), r"\\left\\lVert "),
+    (re.compile(r"\\[bB]igg?r\s*\\(?:[lr]?Vert(?![A-Za-z])|\|)"), r"\\right\\rVert "),
+    (re.compile(r"\\[bB]igg?\s*\\(?:[lr]?Vert(?![A-Za-z])|\|)"), r"\\Vert "),
+    (re.compile(r"\\tag\{([^{}]*)\}"), r"\\qquad\\mathrm{(\1)}"),
+]
+#: The note of a number that was read from a record and not computed in the run.
+_RECORDED = re.compile(r"(.*, )?recorded\b")
+_STATES = {
+    "complete": "complete",
+    "running": "running",
+    "failed": "a notebook failed",
+    "stopped": "stopped before its end",
+}
 _IMAGES = {"image/png": "png", "image/jpeg": "jpeg", "image/gif": "gif"}
+
+
+@functools.lru_cache(maxsize=4096)
+def equation_svg(tex: str, *, display: bool, size_px: float = 17.0) -> str:
+    """An equation as inline SVG in HTML, on the line of the text; its TeX is the alternative text.
+
+    TeX that the converter cannot read is shown as it is.
+    """
+    import ziamath  # not at the top: it takes half a second, and few commands need it
+    from ziamath.tex import tex2mml
+
+    text = tex.strip()
+    for pattern, replacement in _REWRITES:
+        text = pattern.sub(replacement, text)
+    try:
+        if re.search(r"\\|&#x0005C;", tex2mml(text)):
+            raise ValueError("a command that the converter does not know")
+        drawn = ziamath.Latex(text, size=size_px, inline=not display)
+        picture = drawn.svg()
+    except Exception:  # whatever the converter stumbles over: the reader still gets the TeX
+        return f'<code class="tex">{html.escape(tex)}</code>'
+    label = html.escape(" ".join(tex.split()), quote=True)
+    style = "" if display else f' style="vertical-align:{drawn.getyofst():.2f}px"'
+    picture = picture.replace("<svg ", f'<svg role="img" aria-label="{label}"{style} ', 1)
+    return f'<div class="equation">{picture}</div>' if display else picture
 
 
 class _Renderer(IPythonRenderer):
     """Markdown as JupyterLab shows it, equations drawn."""
 
     def block_math(self, body: str) -> str:
-        return equations.svg(body, display=True)
+        return equation_svg(body, display=True)
 
     def inline_math(self, body: str) -> str:
-        return equations.svg(body, display=False)
+        return equation_svg(body, display=False)
 
     def latex_environment(self, name: str, body: str) -> str:
-        return equations.svg(f"\\begin{{{name}}}{body}\\end{{{name}}}", display=True)
+        return equation_svg(f"\\begin{{{name}}}{body}\\end{{{name}}}", display=True)
 
 
 def markdown_html(source: str, *, folder: Path = Path(), attachments: dict | None = None, trusted: bool = True) -> str:
@@ -57,7 +104,7 @@ def markdown_html(source: str, *, folder: Path = Path(), attachments: dict | Non
     return MarkdownWithMath(renderer=renderer).render(source)
 
 
-def render(template: str, **values: object) -> str:
+def _render(template: str, **values: object) -> str:
     """A page from a file of ``templates/``; it escapes every value that it does not call safe."""
     folder = Path(__file__).with_name("templates")
     return Environment(loader=FileSystemLoader(folder), autoescape=True).get_template(template).render(values)
@@ -76,7 +123,7 @@ def page(
     """
     notebook = nbformat.read(executed, as_version=4)
     widgets = notebook.metadata.get("widgets", {}).get(WIDGET_STATE, {}).get("state", {})
-    return render(
+    return _render(
         "page.html",
         title=title,
         body="\n".join(_cell(cell, folder, widgets) for cell in _until_stop(notebook.cells)),
@@ -149,7 +196,7 @@ def _rich(data: dict, widgets: dict, metadata: dict) -> str:
     if "text/markdown" in data:
         return markdown_html(data["text/markdown"], trusted=False)
     if "text/latex" in data:
-        return equations.svg(data["text/latex"].strip("$ \n"), display=True)
+        return equation_svg(data["text/latex"].strip("$ \n"), display=True)
     return f"<pre>{html.escape(data.get('text/plain', ''))}</pre>"
 
 
@@ -169,3 +216,44 @@ def _held_outputs(model_id: str, widgets: dict) -> Iterator[dict]:
 def _settled(text: str) -> str:
     """A terminal's view of text with carriage returns: of a progress bar only its last state."""
     return "\n".join(line.rstrip("\r").rsplit("\r", 1)[-1] for line in re.sub(r"\x1b\[A", "", text).split("\n"))
+
+
+def index_html(run: dict) -> str:
+    """The page of a run; every text in it is escaped.
+
+    Args:
+        run: The content of metrics.json.
+    """
+    done = sum(book["state"] in ("complete", "failed") for book in run["notebooks"])
+    facts = {
+        "Recording": run["parameters"].get("recording") or f"{paths.shown(paths.SHIPPED_RECORDING)}, the one that ships",
+        "Started": run["started"].replace("T", " ")[:16],
+        "Profile": run["profile"],
+        "Notebooks": f"{done} of {len(run['notebooks'])}",
+        "Time": _duration(run["seconds"]),
+        "Machine": f"{run['machine']['cores']} cores, {run['machine']['gpu'] or 'no GPU'}",
+    }
+    if run["commit"]:
+        facts["Commit"] = run["commit"]["id"][:10] + (" + local changes" if run["commit"]["modified"] else "")
+    return _render(
+        "index.html",
+        run=run,
+        states=_STATES,
+        verdict=verdict_html(run) if run["verdict"] else "",
+        colours=VERDICT_COLOURS,
+        facts=facts,
+        titles={book["name"]: book["title"] for book in run["notebooks"]},
+        pages={book["name"]: book["page"] for book in run["notebooks"]},
+        recorded=lambda metric: bool(_RECORDED.match(metric["note"])),
+        reason=lambda failure: str(Failure(**failure)),
+        words=lambda metric: metric["name"].removesuffix(f"_{metric['unit']}").replace("_", " "),
+        with_unit=lambda value, unit: f"{format_value(value)} {unit_text(unit)}".rstrip(),
+        duration=_duration,
+        markdown=markdown_html,
+    )
+
+
+def _duration(seconds: float | None) -> str:
+    if seconds is None:
+        return ""
+    return f"{seconds:.0f} s" if seconds < 100 else f"{int(seconds) // 60} min {int(seconds) % 60:02d} s"

@@ -16,11 +16,13 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import nbformat
+import numpy as np
+from matplotlib.figure import Figure
 
 from lib import files, paths
 from lib.parallel import run_jobs
 from lib.provenance import Provenance, machine
-from lib.workbench import collection, results
+from lib.workbench import execution, results
 from lib.workbench.execution import execute
 from lib.workbench.parameters import (
     UsageError,
@@ -31,9 +33,8 @@ from lib.workbench.parameters import (
     positive,
     split_values,
 )
-from lib.workbench.plots import save_plots
 
-__all__ = ["column_name", "main", "sweep"]
+__all__ = ["column_name", "main", "save_plots", "sweep"]
 
 _EPILOG = """\
 examples:
@@ -164,6 +165,43 @@ def sweep(
     return table, failures
 
 
+def save_plots(rows: Sequence[dict], parameters: Sequence[str], folder: Path) -> list[Path]:
+    """Write ``METRIC.png`` for each column of numbers that is no parameter.
+
+    The horizontal axis is the first parameter with several values; the others but `seed` make lines.  A line joins
+    medians over what is left, such as seeds; dots are the runs.
+    """
+    table = results.Table(list(rows))
+    varied = [name for name in parameters if len({str(row[name]) for row in rows}) > 1]
+    axis = next((name for name in varied if name != "seed"), "seed" if "seed" in varied else None)
+    if axis is None:
+        return []
+    lines = [name for name in varied if name not in (axis, "seed")]
+    written = []
+    for metric, values in table.columns.items():
+        if metric in parameters or isinstance(values, list) or not np.isfinite(values).any():
+            continue
+        figure = Figure(figsize=(6.4, 4.0), layout="constrained")
+        ax = figure.subplots()
+        groups: dict[str, dict] = {}
+        for row, value in zip(rows, values, strict=True):
+            label = ", ".join(f"{name} = {row[name]}" for name in lines)
+            x = row[axis] if isinstance(row[axis], int | float) else str(row[axis])
+            groups.setdefault(label, {}).setdefault(x, []).append(value)
+        for label, points in groups.items():
+            (line,) = ax.plot(points.keys(), [np.nanmedian(v) if np.isfinite(v).any() else np.nan for v in points.values()],
+                              "-", label=label)  # fmt: skip
+            ax.plot([x for x, v in points.items() for _ in v], [y for v in points.values() for y in v], ".",
+                    color=line.get_color())  # fmt: skip
+        ax.set(xlabel=axis, ylabel=metric)
+        if lines:
+            ax.legend(fontsize="small")
+        with files.whole(folder / f"{metric}.png") as partial:
+            figure.savefig(partial, dpi=150)
+        written.append(folder / f"{metric}.png")
+    return written
+
+
 class RunFailed(RuntimeError):
     """A run of the notebook failed; its log is written."""
 
@@ -182,7 +220,7 @@ def run_point(executed: Path, book: Path, values: dict, cell_timeout_s: float | 
             text = [f"{book.name} with {_label(values)}", str(failure)]
             if partial.exists():
                 shutil.copy(partial, failed)
-                for output in collection.outputs(failed):
+                for output in execution.outputs(failed):
                     text.append(output.get("text") or "\n".join(output.get("traceback", [])))
             files.write_text(log, "\n".join(text) + "\n")
             raise RunFailed(str(failure))
@@ -204,7 +242,7 @@ def column_name(metric: str, unit: str) -> str:
 
 
 def _row(executed: Path, point: dict) -> dict:
-    metrics = {column_name(m["name"], m["unit"]): m["value"] for m in collection.metrics_of(executed)}
+    metrics = {column_name(m["name"], m["unit"]): m["value"] for m in execution.metrics_of(executed)}
     return {**point, **metrics}
 
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
+from lib.matching.band import refine
 from lib.matching.pyramid import peak_ratio
-from lib.matching.refine import refine
 from lib.matching.volume import correlation_volume, match_volume
 
 

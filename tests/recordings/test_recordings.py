@@ -19,7 +19,7 @@ from PIL import Image
 from lib.cameras import NearAffineCamera
 from lib.correspondences import of_recording
 from lib.recordings import Kinematics, Recording, RecordingWriter, Truth, read_image
-from lib.recordings.doubts import doubts
+from lib.recordings.recording import doubts
 from lib.simulator.rig import reference_rig
 
 N, SIZE = 4, (64, 48)

@@ -20,7 +20,13 @@ from lib.surface import (
     surface_mesh,
 )
 
-o3d = pytest.importorskip("open3d", exc_type=(ImportError, OSError), reason="Open3D's system libraries are missing")
+
+@pytest.fixture(scope="module", autouse=True)
+def _open3d():
+    """Imported by the one process that runs these tests: it takes seconds."""
+    global o3d
+    missing = "Open3D's system libraries are missing"
+    o3d = pytest.importorskip("open3d", exc_type=(ImportError, OSError), reason=missing)
 
 
 @pytest.fixture(scope="module")

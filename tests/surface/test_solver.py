@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 
 from lib.surface import SplineGrid
 from lib.surface.solver import L1Problem, interior_point
-from notebooks.studies.l1_reference import cvxpy_reference
 
 DOMAIN = (0.0, 0.0, 640.0, 480.0)
 
@@ -28,6 +27,8 @@ def noisy_points(n: int, seed: int = 0, outliers: float = 0.1) -> tuple[np.ndarr
 @pytest.mark.parametrize("control", [(20, 20), (9, 14)])
 @pytest.mark.parametrize("n", [150, 2000])
 def test_reaches_the_minimum_of_clarabel(control, n):
+    from notebooks.studies.l1_reference import cvxpy_reference  # cvxpy takes a second to import
+
     u, x = noisy_points(n)
     problem = L1Problem(SplineGrid(DOMAIN, control), u)
     weights = np.random.default_rng(1).uniform(0.2, 2.0, x.shape)

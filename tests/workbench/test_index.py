@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import re
 
-from lib.workbench.index import index_html
-from lib.workbench.pages import markdown_html
+from lib.workbench.pages import index_html, markdown_html
 
 SCRIPT = "<script>alert(1)</script>"
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from lib.workbench import equations
-from lib.workbench.pages import markdown_html
+from lib.workbench.pages import equation_svg, markdown_html
 
 TEX = [
     r"\begin{aligned} a &= b \\ c &= d \end{aligned}",
@@ -17,12 +16,12 @@ TEX = [
 
 @pytest.mark.parametrize("tex", TEX)
 def test_equations_are_drawn(tex):
-    drawn = equations.svg(tex, display=True)
+    drawn = equation_svg(tex, display=True)
     assert drawn.startswith('<div class="equation"><svg ') and 'role="img"' in drawn
 
 
 def test_tex_that_cannot_be_drawn_is_shown():
-    assert equations.svg(r"\unheard{x} < 1", display=False) == r'<code class="tex">\unheard{x} &lt; 1</code>'
+    assert equation_svg(r"\unheard{x} < 1", display=False) == r'<code class="tex">\unheard{x} &lt; 1</code>'
 
 
 def test_markdown_keeps_code_and_dollars_apart():

@@ -19,8 +19,7 @@ from lib.provenance import commit
 from lib.workbench import results
 from lib.workbench import sweep as sweeping
 from lib.workbench.parameters import UsageError, split_values
-from lib.workbench.plots import save_plots
-from lib.workbench.sweep import main, sweep
+from lib.workbench.sweep import main, save_plots, sweep
 from tests.processes import children
 
 PARAMETERS = """\
