@@ -84,6 +84,10 @@ class _Renderer(IPythonRenderer):
     def inline_math(self, body: str) -> str:
         return equation_svg(body, display=False)
 
+    def block_html(self, html: str) -> str:
+        # Without a picture to embed it stays as it is: a parser would close a tag that a later block closes.
+        return super().block_html(html) if "<img" in html else super(IPythonRenderer, self).block_html(html)
+
     def latex_environment(self, name: str, body: str) -> str:
         return equation_svg(f"\\begin{{{name}}}{body}\\end{{{name}}}", display=True)
 
@@ -154,6 +158,8 @@ def _cell(cell, folder: Path, widgets: dict) -> str:
     if cell.cell_type != "code":
         return f"<pre>{html.escape(cell.source)}</pre>"
     code = highlight(cell.source, PythonLexer(), HtmlFormatter(cssclass="code"))
+    if cell.metadata.get("jupyter", {}).get("source_hidden"):
+        code = f"<details><summary>Code</summary>{code}</details>"
     if "injected-parameters" in tags:
         code = f'<div class="given">Values given to this run{code}</div>'
     outputs = "".join(_outputs(cell.outputs, widgets))

@@ -20,8 +20,8 @@ if TYPE_CHECKING:  # at run time it would slow every notebook's start
     from matplotlib.figure import Figure
 
 __all__ = [
-    "FIGURE_METADATA", "METRIC_MIME", "STOP_METADATA", "VERDICT_COLOURS", "VERDICT_MIME", "format_value", "record", "show",
-    "stop", "timed", "unit_text", "verdict", "verdict_html",
+    "FIGURE_METADATA", "METRIC_MIME", "RECORDED", "STOP_METADATA", "VERDICT_COLOURS", "VERDICT_MIME", "format_value",
+    "record", "show", "stop", "timed", "unit_text", "verdict", "verdict_html",
 ]  # fmt: skip
 
 #: Mime type of a metric in a notebook's outputs; the JSON holds name, value, unit, paper, note.
@@ -35,6 +35,8 @@ FIGURE_METADATA = "microstereo_figure"
 
 #: Key of the output metadata that says why a notebook ended before its last cell.
 STOP_METADATA = "microstereo_stop"
+#: Name -> value of the metrics that this kernel recorded; None where a value could not be computed.
+RECORDED: dict[str, float | None] = {}
 
 _NAME = re.compile(r"[a-z][a-z0-9_.]*")
 
@@ -76,6 +78,7 @@ def record(name: str, value: float, unit: str, *, paper: float | None = None, no
         "paper": None if paper is None else _number(paper, "paper"),
         "note": note,
     }
+    RECORDED[name] = metric["value"]
     text = f"{name} = {format_value(metric['value'])} {unit}".rstrip()
     if paper is not None:
         text += f" (paper: {format_value(metric['paper'])} {unit})".replace(" )", ")")

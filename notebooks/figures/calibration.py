@@ -20,6 +20,7 @@ from notebooks.studies.dvrk import RobotFrames, SphereFit
 __all__ = [
     "advice_curves",
     "advice_view",
+    "against_truth",
     "checkerboards",
     "correspondences",
     "coverage",
@@ -30,6 +31,7 @@ __all__ = [
     "ladder",
     "noise_errors",
     "offsets",
+    "residual_field",
     "residuals",
     "resolutions",
     "robot_frames",
@@ -489,4 +491,35 @@ def robot_frames(frames: RobotFrames, rows: Sequence[int], fits: Mapping[str, Se
     for name, colour in colours.items():
         axes[0].plot([], [], color=colour, label=f"{name}, 40 times")
     axes[0].legend(loc="lower right", fontsize=8, labelcolor="white", facecolor="black", framealpha=0.6)
+    return page
+
+
+def against_truth(values: np.ndarray, cameras: Mapping[str, np.ndarray], true: np.ndarray) -> Figure:
+    """The seven eigenvalues of Eq. (3), and the errors of the entries of A (4, 3) of some stacked cameras (4, 4)."""
+    page, (left, right) = figure(1, 2, width_in=11, height_in=3.4)
+    order = np.arange(1, 8)
+    colours = [COLOURS["baseline"]] * 4 + [COLOURS["ours"]] * 3
+    left.bar(order, values, color=colours)
+    left.set(yscale="log", xlabel="eigenvalue", ylabel="squared standard deviations", title="Four of noise, three of motion")
+    left.set_xticks(order)
+    for shift, (name, matrix), colour in zip((-0.2, 0.2), cameras.items(), ("paper", "ours"), strict=True):
+        right.bar(np.arange(12) + shift, (matrix - true)[:, :3].ravel(), 0.4, color=COLOURS[colour], label=name)
+    right.set_xticks([1, 4, 7, 10], ["left x", "left y", "right x", "right y"])
+    for border in (2.5, 5.5, 8.5):
+        right.axvline(border, color="#cccccc", linewidth=0.8)
+    right.axhline(0, color="black", linewidth=0.8)
+    right.set(ylabel="found less true (px/mm)", title="Errors of A, three entries a pixel coordinate")
+    right.legend(loc="best", fontsize=9)
+    return page
+
+
+def residual_field(u: np.ndarray, residual_px: np.ndarray, title: str) -> Figure:
+    """Residuals (n, 2) at pixels (n, 2) as arrows, stretched to be seen; the title gives their size."""
+    page, ax = figure(width_in=7.5, height_in=4.6)
+    largest = float(np.linalg.norm(residual_px, axis=1).max())
+    scale = 80.0 / max(largest, 1e-9)
+    ax.quiver(*u.T, *(scale * residual_px.T), color=COLOURS["paper"], angles="xy", scale_units="xy", scale=1, width=0.002)
+    ax.plot(*u.T, ".", color=COLOURS["ours"], markersize=3)
+    ax.set(aspect="equal", xlabel="x (px)", ylabel="y (px)", title=f"{title}: up to {largest:.2f} px left, arrows x {scale:.3g}")
+    ax.invert_yaxis()
     return page

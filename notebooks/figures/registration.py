@@ -14,7 +14,7 @@ from lib.registration import DriftMonitor
 from notebooks.figures.style import COLOURS, figure
 from notebooks.studies.moved_cameras import MotionErrors
 
-__all__ = ["drift_chart", "error_curves", "hypotheses", "icp_chart", "moved_tool", "noise_ellipses"]
+__all__ = ["drift_chart", "error_curves", "hypotheses", "icp_chart", "moved_tool", "noise_ellipses", "weights_view"]
 
 #: Fewer trials have no quartiles worth drawing.
 _FEW = 30
@@ -95,7 +95,7 @@ def error_curves(errors: Mapping[str, MotionErrors], *, paper_um: float | None =
     shared = [value for error in errors.values() for value in error.euler_rms_deg.ravel()]
     for k, ax in enumerate(axes):
         ax.set(xscale="log", yscale="log", xlabel="frames")
-        ax.set_xticks(ticks, [str(t) for t in ticks])
+        ax.set_xticks(ticks, [str(t) if t in (1, 2, 3, 5, 10) else "" for t in ticks])
         ax.minorticks_off()
         if k:
             ax.set_title(f"Rotation $\\Phi_{'XYZ'[k - 1]}$ in degrees")
@@ -186,6 +186,21 @@ def hypotheses(bic: Mapping[str, float], error_um: Mapping[str, float]) -> Figur
     axes[1].set(xlabel="RMS triangulation error in um", title="What it costs to be wrong")
     for ax in axes:
         ax.grid(axis="y", visible=False)
+    return page
+
+
+def weights_view(
+    error_um: Mapping[str, np.ndarray], weights: Mapping[str, np.ndarray], share: float
+) -> Figure:
+    """What each loss leaves at the landmarks of a tool, and the weight that it gives to each of them."""
+    page, axes = figure(1, 2, width_in=9, height_in=3.2)
+    looks = {"squared": ("squared norms", "paper"), "norm": ("sum of norms, Eq. (7)", "ours")}
+    for loss, (name, colour) in looks.items():
+        axes[0].plot(np.sort(error_um[loss]), color=COLOURS[colour], label=name)
+        axes[1].plot(np.sort(weights[loss])[::-1], ".-", color=COLOURS[colour], label=name)
+    axes[0].set(yscale="log", ylim=(5, 5e4), xlabel="landmark, sorted", ylabel="um", title="Left after registration")
+    axes[1].set(ylim=(-0.05, 1.1), xlabel="landmark, sorted", title=f"Weights; {100 * share:.0f} % of detections wrong")
+    axes[0].legend(loc="upper left")
     return page
 
 

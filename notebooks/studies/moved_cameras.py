@@ -84,6 +84,7 @@ def tool_frames(
     half_size_mm: tuple[float, float, float] = (5.0, 3.0, 1.2),
     jaw_mm: tuple[float, float] = (2.0, 4.0),
     opening_rad: tuple[float, float] = (0.05, 0.40),
+    outliers: float = 0.0,
 ) -> SimulatedSweep:
     """A forceps in n poses of the field, seen by `rig` and reported by the robot: 3 n rows.
 
@@ -97,6 +98,8 @@ def tool_frames(
         Length of the jaws, drawn once: one tool.
     opening_rad:
         Angle between the jaws, drawn for each frame.
+    outliers:
+        Share of detections replaced by a random pixel up to 100 px away.
     """
     rig = rig or reference_rig()
     jaw = rng.uniform(*jaw_mm)
@@ -111,8 +114,12 @@ def tool_frames(
     base = rng.uniform(-1, 1, (n, 3)) * half_size_mm
     x = ROBOT_FROM_MICROSCOPE.apply(np.einsum("nij,nkj->nki", turn, shape) + base[:, None]).reshape(-1, 3)
     u_left, u_right = (u + rng.normal(0, sigma_u_px, u.shape) for u in rig.project(x))
+    x_reported = x + rng.normal(0, sigma_x_mm, x.shape)
+    for u in (u_left, u_right):
+        bad = rng.random(len(u)) < outliers
+        u[bad] += rng.uniform(-100, 100, (int(bad.sum()), 2))
     rows = Correspondences.of_points(
-        x + rng.normal(0, sigma_x_mm, x.shape),
+        x_reported,
         u_left,
         u_right,
         frame=np.repeat(np.arange(n), len(LANDMARKS)),
@@ -170,10 +177,7 @@ def simulated_errors(
     errors = _no_errors(estimators, n_frames, trials)
     for trial in range(trials):
         motion = random_motion(rng)
-        data = tool_frames(max(n_frames), rng=rng, rig=rig.moved(motion), **options)
-        for u in (data.u_left, data.u_right):
-            bad = rng.random(len(u)) < outliers
-            u[bad] += rng.uniform(-100, 100, (int(bad.sum()), 2))
+        data = tool_frames(max(n_frames), rng=rng, rig=rig.moved(motion), outliers=outliers, **options)
         for j, n in enumerate(n_frames):
             _estimate(errors, (trial, j), estimators, rig, data.of_frames(np.arange(n)), motion, centre_mm)
     return errors

@@ -1,0 +1,69 @@
+"""What a course needs beside its cells: their results against the library's, and conclusions that the run's numbers support."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+
+import numpy as np
+from IPython.display import Markdown
+from numpy.typing import ArrayLike
+
+from lib.workbench import report
+
+__all__ = ["agree", "filled", "holds", "learnt", "metrics_named"]
+
+_NUMBER = re.compile(r"\{([a-z][a-z0-9_.]*?)(:[^{}]*)?\}")
+
+
+def agree(what: str, here: ArrayLike, library: ArrayLike, *, within: float, unit: str = "") -> None:
+    """Print by how much a cell's own result differs from the library's; AssertionError if by more than `within`."""
+    gap = float(np.max(np.abs(np.asarray(here, dtype=float) - np.asarray(library, dtype=float))))
+    line = f"{what}: this cell and lib differ by {gap:.1e} {unit}".rstrip() + f"; up to {within:g} is rounding."
+    assert gap <= within, line  # a NaN fails too
+    print(line)
+
+
+def metrics_named(text: str) -> list[str]:
+    """The metrics that a conclusion or its condition names, ``{name}`` or ``{name:.1f}``.
+
+    >>> metrics_named("{surface_rms_um:.1f} um, a {surface_rms_sphere_prior_um:.0f}th")
+    ['surface_rms_um', 'surface_rms_sphere_prior_um']
+    """
+    return [name for name, _ in _NUMBER.findall(text)]
+
+
+def filled(text: str, values: Mapping[str, float]) -> str:
+    """The text with the metrics' values in place of their names.
+
+    >>> filled("{surface_rms_um:.1f} um", {"surface_rms_um": 8.66})
+    '8.7 um'
+    """
+    return _NUMBER.sub(lambda found: format(values[found[1]], (found[2] or ":.3g")[1:]), text)
+
+
+def holds(condition: str, values: Mapping[str, float]) -> bool:
+    """Whether a condition on metrics is true.
+
+    >>> holds("2 * {a_um} < {b_um}", {"a_um": 1.0, "b_um": 3.0})
+    True
+    """
+    return bool(eval(_NUMBER.sub(lambda found: repr(float(values[found[1]])), condition), {"__builtins__": {}}))
+
+
+def learnt(claims: Mapping[str, str]) -> Markdown:
+    """Conclusions, each with the condition on this run's metrics that supports it; one that fails says so.
+
+    Args:
+        claims: Text -> condition; both name metrics as ``{name}``, which `report.record` stated before.  A conclusion
+            whose metrics were not measured (no truth, no real data) is left out and counted.
+    """
+    known = {name: value for name, value in report.RECORDED.items() if value is not None}
+    told = {text: condition for text, condition in claims.items() if {*metrics_named(text + condition)} <= set(known)}
+    lines = []
+    for text, condition in told.items():
+        doubt = "" if holds(condition, known) else "**Not in this run:** "
+        lines.append(f"- {doubt}{filled(text, known)}")
+    if len(told) < len(claims):
+        lines.append(f"- {len(claims) - len(told)} conclusions need numbers that this run did not measure.")
+    return Markdown("\n".join(lines))
