@@ -143,8 +143,10 @@ def claims(path: Path) -> dict[str, str]:
 @each(WALK)
 def test_conclusions_take_their_numbers_from_the_run(path):
     source = "\n".join(cell.source for cell in cells(path) if "record" in tags(cell))
-    stems = [re.sub(r"\{[^}]*\}", "(.*)", name.replace(".", r"\.")) for name in re.findall(r'f?"([a-z][a-z0-9_.{}]*)"', source)]
-    stems += [rf"seconds_{name}" for cell in cells(path) for name in re.findall(r'report\.timed\(f?"([a-z0-9_]+)"', cell.source)]
+    names = re.findall(r'f?"([a-z][a-z0-9_.{}]*)"', source)
+    stems = [re.sub(r"\{[^}]*\}", "(.*)", name.replace(".", r"\.")) for name in names]
+    timed = [re.findall(r'report\.timed\(f?"([a-z0-9_]+)"', cell.source) for cell in cells(path)]
+    stems += [f"seconds_{name}" for found in timed for name in found]
     for text, condition in claims(path).items():
         for name in course.metrics_named(text + condition):
             assert any(re.fullmatch(stem, name) for stem in stems), f"{name} is not recorded here"
@@ -177,7 +179,8 @@ def test_a_difference_is_refused_and_a_claim_that_fails_says_so(monkeypatch):
     with pytest.raises(AssertionError):
         course.agree("x", [np.nan], [0.0], within=1.0)
     monkeypatch.setattr(report, "RECORDED", {"a_um": 3.0, "b_um": 1.0, "c_um": None})
-    page = course.learnt({"Wide: {a_um:.0f} um.": "{a_um} > 2", "Small: {b_um:.0f} um.": "{b_um} > 2", "{c_um}": "{c_um} > 0"}).data
+    told = {"Wide: {a_um:.0f} um.": "{a_um} > 2", "Small: {b_um:.0f} um.": "{b_um} > 2", "{c_um}": "{c_um} > 0"}
+    page = course.learnt(told).data
     assert page.splitlines()[0] == "- Wide: 3 um." and "**Not in this run:** Small" in page and "1 conclusions need" in page
 
 

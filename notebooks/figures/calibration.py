@@ -500,7 +500,8 @@ def against_truth(values: np.ndarray, cameras: Mapping[str, np.ndarray], true: n
     order = np.arange(1, 8)
     colours = [COLOURS["baseline"]] * 4 + [COLOURS["ours"]] * 3
     left.bar(order, values, color=colours)
-    left.set(yscale="log", xlabel="eigenvalue", ylabel="squared standard deviations", title="Four of noise, three of motion")
+    left.set(yscale="log", xlabel="eigenvalue", ylabel="squared standard deviations")
+    left.set_title("Four of noise, three of motion")
     left.set_xticks(order)
     for shift, (name, matrix), colour in zip((-0.2, 0.2), cameras.items(), ("paper", "ours"), strict=True):
         right.bar(np.arange(12) + shift, (matrix - true)[:, :3].ravel(), 0.4, color=COLOURS[colour], label=name)
@@ -520,6 +521,7 @@ def residual_field(u: np.ndarray, residual_px: np.ndarray, title: str) -> Figure
     scale = 80.0 / max(largest, 1e-9)
     ax.quiver(*u.T, *(scale * residual_px.T), color=COLOURS["paper"], angles="xy", scale_units="xy", scale=1, width=0.002)
     ax.plot(*u.T, ".", color=COLOURS["ours"], markersize=3)
-    ax.set(aspect="equal", xlabel="x (px)", ylabel="y (px)", title=f"{title}: up to {largest:.2f} px left, arrows x {scale:.3g}")
+    ax.set(aspect="equal", xlabel="x (px)", ylabel="y (px)")
+    ax.set_title(f"{title}: up to {largest:.2f} px left, arrows x {scale:.3g}")
     ax.invert_yaxis()
     return page

@@ -1,4 +1,4 @@
-"""What a course needs beside its cells: their results against the library's, and conclusions that the run's numbers support."""
+"""For a course: a cell's result against the library's, and conclusions that the run's numbers support."""
 
 from __future__ import annotations
 
