@@ -2,8 +2,8 @@
 
 It works from coarse to fine.  The first stage finds the tool in the whole frame, shrunk to a fixed size.  The second names
 its landmarks in one upright window, scaled so that every tool has the same length in it; it looks twice, since the first
-look corrects direction and scale.  The last measures each landmark in a closeup.  The first stage alone, at full
-resolution, is the paper's detector (Sec. III).
+look corrects direction and scale.  Where the first stage is unsure, the second one decides between several places.  The
+last measures each landmark in a closeup.  The first stage alone, at full resolution, is the paper's detector (Sec. III).
 """
 
 from collections.abc import Callable, Sequence
@@ -28,6 +28,7 @@ from lib.landmarks.error_model import ErrorModel, Rough, closeup_peaks, correcte
 from lib.landmarks.heatmaps import Peaks, decode
 from lib.landmarks.metrics import tool_length_px
 from lib.landmarks.network import Network, OffsetNetwork, StackedHourglass, as_tensor, as_uint8
+from lib.landmarks.search import PEAKS, best_tools, without_peak
 from lib.landmarks.windows import TOOL_PX, closeup_from_image, cut, map_points, tool_pose, tool_zoom, window_from_image
 from lib.parallel import single_threaded_torch
 from lib.recordings import Recording
@@ -43,6 +44,9 @@ MISSING_BELOW = 0.05
 TRACKED_FROM = 0.5
 #: The stages that look at closeups: twice of what the tool's window showed, and of what was found in the frame before.
 CLOSE = ("closeup", "closer", "tracking")
+#: Where the first stage is less sure than this of a landmark, other places are looked at: this many tools, made of peaks at
+#: these scales of the first stage's input.
+_SURE, _CANDIDATES, _SCALES = 0.8, 5, (1.0, 1.5)
 #: Stages that use another stage's network.
 _NETWORK_OF = {"again": "tool", "closer": "closeup", "tracking": "closeup"}
 
@@ -232,7 +236,7 @@ class Detector:
         with self._threads():
             for start in range(0, len(images), batch):
                 part = images[start : start + batch]
-                result = self.coarse(part)
+                result = self.searched(part, self.coarse(part))
                 for stage in self.stages[1:]:
                     result = self.refine(part, result, stage) if stage != "tracking" else result
                 found.append(result)
@@ -269,10 +273,41 @@ class Detector:
 
     def coarse(self, images: ArrayLike) -> Landmarks:
         """Landmarks by the first stage alone."""
-        stride = self.frame_stride(np.asarray(images))
-        found = self._measured(self.frame_peaks(images), None, "frame")
-        u, covariance = image_from_cell(found.u, stride), found.covariance * np.outer(stride, stride)
-        return Landmarks(u, covariance, found.confidence).without_unsure()
+        return self._in_image(self.frame_peaks(images), self.frame_stride(np.asarray(images))).without_unsure()
+
+    def _in_image(self, peaks: Peaks, stride: np.ndarray) -> Landmarks:
+        """Peaks of the first stage as landmarks of the image."""
+        found = self._measured(peaks, None, "frame")
+        return Landmarks(image_from_cell(found.u, stride), found.covariance * np.outer(stride, stride), found.confidence)
+
+    def searched(self, images: np.ndarray, rough: Landmarks) -> Landmarks:
+        """What later stages start from: `rough`, or, where that is unsure, the tool that its window shows best.
+
+        Candidates are `rough` and tools made of the highest peaks that the first stage sees at two scales.
+        """
+        result = Landmarks.join([rough])  # a copy
+        for i in np.flatnonzero((rough.confidence < _SURE).any(1)) if self.tool_network else ():
+            image = images[i : i + 1]
+            candidates = Landmarks.join([rough[i : i + 1], self._candidates(image)])
+            shown = candidates
+            for stage in ("tool", "again"):
+                shown = self.refine(np.broadcast_to(image, (len(shown), *image.shape[1:])), shown, stage)
+            result._put(np.array([i]), candidates[[shown.confidence.mean(1).argmax()]])
+        return result
+
+    def _candidates(self, image: np.ndarray) -> Landmarks:
+        """Tools (m, 3, 2) that one image (1, h, w, 3) may show."""
+        peaks, found = [], []
+        for scale in _SCALES:
+            stride, heatmaps = self.frame_stride(image, scale), self.outputs(self.reduced(image, scale), "frame")
+            for _ in range(PEAKS):
+                peaks.append(decode(heatmaps, self.frame_network.stride, method=self.method))
+                found.append(self._in_image(peaks[-1], stride))
+                heatmaps = without_peak(heatmaps, peaks[-1].u, self.frame_network.stride)
+        every = Landmarks.join(found)
+        which = best_tools(every.u, torch.cat([part.value for part in peaks]).numpy(), _CANDIDATES)
+        at = which, np.arange(3)
+        return Landmarks(every.u[at], every.covariance[at], every.confidence[at])
 
     def refine(self, images: np.ndarray, rough: Landmarks, stage: str, seen: tuple | None = None) -> Landmarks:
         """Landmarks by a later stage, which looks where the `rough` ones lie; ``"tracking"`` is one too.
@@ -359,14 +394,14 @@ class Detector:
             heatmaps = outputs[torch.arange(len(which)), torch.from_numpy(which[:, 1])][:, None]
         return decode(heatmaps, self.network_of(stage).stride, method=self.method), matrices, which
 
-    def frame_stride(self, images: np.ndarray) -> np.ndarray:
-        """Image pixels per pixel of the first stage's input, along x and y."""
+    def frame_stride(self, images: np.ndarray, scale: float = 1.0) -> np.ndarray:
+        """Image pixels per pixel of the first stage's input, along x and y; `scale` enlarges that."""
         size = np.array(images.shape[2:0:-1])
-        return size / np.maximum(np.round(size * ((self.frame_px or size.max()) / size.max())), 1)
+        return size / np.maximum(np.round(size * (scale * (self.frame_px or size.max()) / size.max())), 1)
 
-    def reduced(self, images: np.ndarray) -> np.ndarray:
-        """Images (n, h, w, 3) as the first stage sees them: the longer side has `frame_px`."""
-        stride = self.frame_stride(images)
+    def reduced(self, images: np.ndarray, scale: float = 1.0) -> np.ndarray:
+        """Images (n, h, w, 3) as the first stage sees them: the longer side has `scale` times `frame_px`."""
+        stride = self.frame_stride(images, scale)
         if (stride == 1).all():
             return images
         size = tuple(int(v) for v in np.round(images.shape[2:0:-1] / stride))

@@ -163,7 +163,13 @@ def fit_error_models(detector: Detector, images: Iterable[LabelledImage], *, pro
     detector = replace(detector, error_models={k: v for k, v in detector.error_models.items() if k not in CLOSE})
     rough: list[Landmarks | None] = [None] * len(images)
     rng = np.random.default_rng(0)
-    for stage in detector.stages:
+    stages = detector.stages
+    if "tool" in stages:  # once more, since what the search chooses from many places is another population
+        stages[3:3] = ["tool", "again"]
+    for number, stage in enumerate(stages):
+        if number == 3 and stage == "tool":
+            starts = (detector.coarse(part.image[None]) for part in images)
+            rough = [detector.searched(part.image[None], start) for part, start in zip(images, starts, strict=True)]
         parts, found = [], []
         for labelled, start in zip(tqdm(images, disable=not progress, unit="image", desc=stage), rough, strict=True):
             if stage == "tracking":  # a tool that jumps now and then, which tracking has to notice

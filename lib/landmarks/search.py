@@ -1,0 +1,50 @@
+"""Where else the tool may lie, if the first stage is unsure: its highest peaks, at two scales, put together to tools."""
+
+from itertools import product
+
+import numpy as np
+import torch
+
+from lib.landmarks.heatmaps import SIGMA_PX, sigma_cells
+
+__all__ = ["PEAKS", "best_tools", "without_peak"]
+
+#: Peaks that are taken from each heatmap.
+PEAKS = 2
+#: Two tools are the same if their landmarks differ by less than this share of the length, in the mean.
+_SAME = 0.25
+
+
+def without_peak(heatmaps: torch.Tensor, u: torch.Tensor, stride: int) -> torch.Tensor:
+    """Heatmaps (n, k, h, w) with nothing within 3 sigma of u (n, k, 2), in pixels of the network's input."""
+    rows, columns = (torch.arange(side, dtype=u.dtype) for side in heatmaps.shape[-2:])
+    x, y = (((u - (stride - 1) / 2) / stride)[..., None, None]).unbind(2)
+    near = (columns - x) ** 2 + (rows[:, None] - y) ** 2 < (3 * sigma_cells(stride, SIGMA_PX)) ** 2
+    return heatmaps.masked_fill(near, -1.0)
+
+
+def best_tools(u: np.ndarray, height: np.ndarray, n: int) -> np.ndarray:
+    """The `n` likeliest tools that peaks u (k, 3, 2) px of heights (k, 3) make: (m, 3), the peak of each landmark.
+
+    A tool is likely if its peaks are high, its jaws are about equally long and no further apart than they are long, and
+    tip_1 lies on the left as seen along the tool.  Tools that look alike count once.
+
+    >>> u = np.array([[[0, 0], [9, -2], [90, 2]], [[0, 1], [80, 9], [9, 2]]])
+    >>> best_tools(u, np.array([[1.0, 1.0, 0.8], [0.2, 0.7, 0.5]]), 1)
+    array([[0, 0, 1]])
+    """
+    which = np.array(list(product(range(len(u)), repeat=3)))
+    tools, score = u[which, np.arange(3)], np.log(np.clip(height[which, np.arange(3)], 0.02, 1)).sum(1)
+    base, one, two = (tools[:, k] for k in range(3))
+    jaws = np.stack([np.linalg.norm(one - base, axis=1), np.linalg.norm(two - base, axis=1)]) + 1.0
+    length, ahead = jaws.mean(0), (one + two) / 2 - base
+    score -= 2 * np.abs(np.log(jaws[0] / jaws[1])) + 2 * np.clip(np.linalg.norm(one - two, axis=1) / length - 1, 0, None)
+    score -= ahead[:, 0] * (one - two)[:, 1] > ahead[:, 1] * (one - two)[:, 0]
+    chosen: list[int] = []
+    for i in np.argsort(-score, kind="stable"):
+        apart = np.linalg.norm(tools[chosen] - tools[i], axis=2).mean(1) if chosen else np.ones(0)
+        if (apart > _SAME * length[chosen]).all():
+            chosen.append(int(i))
+        if len(chosen) == n:
+            break
+    return which[chosen]

@@ -1,0 +1,47 @@
+"""The search for the tool where the first stage is unsure."""
+
+import numpy as np
+import torch
+
+from lib.landmarks import Detector
+from lib.landmarks.detector import Landmarks
+from lib.landmarks.heatmaps import decode, render
+from lib.landmarks.network import HourglassConfig, StackedHourglass
+from lib.landmarks.search import best_tools, without_peak
+
+TOOL = np.array([[40.0, 50.0], [80.0, 40.0], [80.0, 60.0]])
+
+
+def test_the_second_peak_is_found_once_the_first_is_taken_out():
+    heatmaps = render(torch.tensor([[[20.0, 30.0]]]), (64, 96), 4) + 0.6 * render(torch.tensor([[[70.0, 33.0]]]), (64, 96), 4)
+    second = decode(without_peak(heatmaps, decode(heatmaps, 4).u, 4), 4)
+    assert np.allclose(second.u, [70, 33], atol=0.1) and abs(second.value.item() - 0.6) < 0.1
+
+
+def test_a_tool_needs_equal_jaws_and_the_tips_on_their_sides():
+    wrong = np.array([[300.0, 200.0], [85.0, 61.0], [400.0, 60.0]])  # each a little higher than the true peak
+    u, height = np.stack([wrong, TOOL]), np.stack([np.full(3, 0.6), np.full(3, 0.5)])
+    assert best_tools(u, height, 1).tolist() == [[1, 1, 1]]
+    mirrored = np.stack([TOOL[[0, 2, 1]], TOOL])
+    ((_, one, two),) = mirrored[best_tools(mirrored, np.full((2, 3), 0.5), 1), np.arange(3)]
+    assert one[1] <= two[1]
+    assert len(best_tools(np.stack([TOOL, TOOL + 0.5]), np.full((2, 3), 0.5), 5)) <= 2  # tools that look alike count once
+
+
+def test_an_unsure_image_starts_from_the_tool_that_its_window_shows_best(monkeypatch):
+    network = StackedHourglass(HourglassConfig(features=8, stacks=1))
+    detector = Detector(network, tool_network=network)
+
+    def landmarks(u: np.ndarray, confidence: float) -> Landmarks:
+        return Landmarks(u, np.tile(np.eye(2), (*u.shape[:2], 1, 1)), np.full(u.shape[:2], confidence))
+
+    rough = Landmarks.join([landmarks(TOOL[None], 0.9), landmarks(TOOL[None] + 200, 0.3)])
+    monkeypatch.setattr(Detector, "_candidates", lambda *_: landmarks(np.stack([TOOL + 90, TOOL]), 0.1))
+
+    def refine(self, images, shown, stage):
+        near = np.linalg.norm(shown.u - TOOL, axis=2) < 20
+        return Landmarks(shown.u, shown.covariance, np.where(near, 0.8, 0.2))
+
+    monkeypatch.setattr(Detector, "refine", refine)
+    found = detector.searched(np.zeros((2, 64, 96, 3), np.uint8), rough)
+    assert np.array_equal(found.u, np.stack([TOOL, TOOL])) and found.confidence[:, 0].tolist() == [0.9, 0.1]
