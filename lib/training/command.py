@@ -33,8 +33,6 @@ def main(argv: list[str] | None = None) -> int:
     add("--scenes", type=int, default=120, help="generate: shards of 64 small scenes")
     add("--closeups", type=int, default=40, help="generate: shards of 1024 closeups of a landmark")
     add("--held-out", type=int, default=24, help="generate: shards of 16 full scenes, for the doubt")
-    add("--shards", type=int, default=0, help="generate, for the studies: shards of 16 frames of the reference rig")
-    add("--windows", type=int, default=0, help="generate, for the studies: shards of 512 windows round a landmark")
     add("--workers", type=int, help="generate: processes (default: one a core)")
     add("--preset", choices=sorted(PRESETS), default="best")
     add("--steps", type=int, default=6000)
@@ -51,7 +49,6 @@ def main(argv: list[str] | None = None) -> int:
         parser.error(f"{a.what}: takes no recordings.")
     if a.what == "generate":
         shards = {"held_out": a.held_out, "scenes": a.scenes, "closeups": a.closeups}
-        shards |= {"validation": max(3, a.shards // 15) if a.shards else 0, "training": a.shards, "windows": a.windows}
         for kind, count in shards.items():
             generate(a.data, kind, count, workers=a.workers)
     elif a.what == "finetune":

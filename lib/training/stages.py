@@ -43,10 +43,10 @@ def stage_config(stage: str, *, preset: str = "best", features: int | None = Non
     if stage == "closeup":
         config = replace(config, augmentation=AUGMENTATIONS["closeups"])
         return replace(config, network=OffsetConfig(features), batch_size=64, clip=2.0)
-    config = replace(config, augmentation=AUGMENTATIONS["none"], ema=0.995)  # what is drawn is changed already
+    config = replace(config, augmentation=AUGMENTATIONS["none"], ema=0.998)  # what is drawn is changed already
     if stage == "frame":
-        return replace(config, network=HourglassConfig(features, depth=3), batch_size=8)
-    return replace(config, network=HourglassConfig(features))
+        return replace(config, network=HourglassConfig(features, depth=3, growth=1.75), batch_size=16)
+    return replace(config, network=HourglassConfig(features, growth=1.4))
 
 
 def stage_data(stage: str, folder: str | Path) -> tuple[Source, Samples]:

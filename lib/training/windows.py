@@ -1,4 +1,4 @@
-"""What the later stages train on: upright windows and closeups, placed as badly as the stage before places them."""
+"""What the last stage trains on: upright closeups, placed as badly as the stage before places them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -8,74 +8,22 @@ from typing import Self
 import cv2
 import numpy as np
 
-from lib.geometry import cell_from_image
 from lib.landmarks import windows
 from lib.landmarks.metrics import tool_length_px
 from lib.simulator.window import motion_kernel
 from lib.training.appearance import disguised
 from lib.training.samples import LabelledImage, Source
-from lib.training.shards import BLOCK_PX, CLOSEUP_CROP_PX, STORED_REDUCTION, cropped, read_shards
+from lib.training.shards import BLOCK_PX, CLOSEUP_CROP_PX, read_shards, square_round
 
-__all__ = ["TOOL", "TOOL_REDUCTION", "CloseupSource", "WindowSource"]
+__all__ = ["CloseupSource"]
 
-#: Reduction of the studies' windows round the tool, and the landmark index that means the whole tool.
-TOOL_REDUCTION, TOOL = STORED_REDUCTION, 3
 _CROPS = ("crops", "crop_u", "crop_visibility", "crop_landmark")
 #: A closeup shows a part of the tool: blur and things in front are drawn as for a tool of this length.
 _DISGUISE_PX = 40.0
 
 
 @dataclass(frozen=True)
-class _Cut(Source):
-    """Windows cut out of crops (n, h, w, 3) uint8 with their labels; each shows one `landmark` (n,)."""
-
-    crops: np.ndarray
-    u: np.ndarray
-    visibility: np.ndarray
-    landmark: np.ndarray
-
-
-@dataclass(frozen=True)
-class WindowSource(_Cut):
-    """Upright windows of `size` px round landmarks, or, where `landmark` is `TOOL`, round the middle of the tool.
-
-    `shift_px` and `turn_rad` are standard deviations of the error of place and direction; a tenth of the windows has three
-    times as much.  `zoom` is the range of magnification.
-    """
-
-    size: int = 128
-    shift_px: float = 6.0
-    turn_rad: float = 0.08
-    zoom: tuple[float, float] = (0.85, 1.2)
-
-    @classmethod
-    def load(cls, folder: str | Path, *, validation: bool = False, shards: int | None = None) -> Self:
-        """From the shards of a folder, those of windows alone included; or from its first `shards` of frames."""
-        kinds = ("validation",) if validation else ("training", "windows")[: 1 if shards else 2]
-        return cls(*read_shards(folder, kinds, _CROPS, shards))
-
-    @classmethod
-    def load_tools(cls, folder: str | Path, *, validation: bool = False, shards: int | None = None) -> Self:
-        """Windows round the whole tool at `TOOL_REDUCTION`."""
-        kind = "validation" if validation else "training"
-        frames, u, visibility = read_shards(folder, (kind,), ("frames", "u", "visibility"), shards)
-        labels = cell_from_image(u, TOOL_REDUCTION), visibility, np.full(len(u), TOOL)
-        return cls(frames, *labels, shift_px=8.0, turn_rad=0.2, zoom=(0.75, 1.3))
-
-    def draw(self, index: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        u = self.u[index]
-        worse = 3.0 if rng.random() < 0.1 else 1.0
-        limit = 0.3 * self.size
-        (middle,), (direction,) = windows.tool_pose(u[None])
-        at = middle if self.landmark[index] == TOOL else u[self.landmark[index]]
-        centre = at + np.clip(rng.normal(0, worse * self.shift_px, 2), -limit, limit)
-        angle = direction + np.clip(rng.normal(0, worse * self.turn_rad), -0.6, 0.6)
-        matrix = windows.window_from_image(centre, angle, self.size, rng.uniform(*self.zoom))
-        return windows.cut(self.crops[index], matrix, self.size), windows.map_points(matrix, u), self.visibility[index]
-
-
-@dataclass(frozen=True)
-class CloseupSource(_Cut):
+class CloseupSource(Source):
     """Closeups of visible landmarks, displaced as the stage before or the frame before may place them, of stretched tools.
 
     Stretching and shearing an image keeps its labels true and makes many tools of one.
@@ -91,6 +39,10 @@ class CloseupSource(_Cut):
         weight: (n,) share of the draws in which a label counts.
     """
 
+    crops: np.ndarray
+    u: np.ndarray
+    visibility: np.ndarray
+    landmark: np.ndarray
     size: int = 64
     shifts_px: tuple[float, ...] = (2.0, 4.0, 8.0)
     shift_shares: tuple[float, ...] = (0.5, 0.25, 0.25)
@@ -116,7 +68,7 @@ class CloseupSource(_Cut):
         which = [(i, k) for i, labelled in enumerate(images) for k in np.flatnonzero(_sharp(labelled))]
         if not which:
             raise ValueError("images: no visible landmark of a tool with base and tip; label some.")
-        parts = (cropped(images[i], k, CLOSEUP_CROP_PX) for i, k in which)
+        parts = ((*square_round(images[i].image, images[i].u, k, CLOSEUP_CROP_PX), images[i].visibility, k) for i, k in which)
         weight = None if weight is None else np.array([weight[i, k] for i, k in which])
         source = cls(*map(np.array, zip(*parts, strict=True)), weight=weight)
         return source if not still else replace(source, stretch=0.0, shear=0.0, motion_px=0.0, disguise=0.0)

@@ -26,7 +26,7 @@ from lib.landmarks.network import StackedHourglass
 from lib.training.error_models import Seen, seen_by
 from lib.training.loop import load_training
 from lib.training.samples import LabelledImage
-from lib.training.windows import WindowSource
+from notebooks.studies.windows import WindowSource
 
 __all__ = ["FIELD_PX", "RESOLUTIONS", "ReducedDetector", "load_resolution", "resolution_windows", "window_side_px"]
 

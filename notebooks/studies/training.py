@@ -4,23 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
 
-from lib import paths
 from lib.geometry import cell_from_image
 from lib.landmarks.network import HourglassConfig
 from lib.training.augmentation import AUGMENTATIONS
 from lib.training.config import PRESETS, TrainingConfig
 from lib.training.evaluation import Evaluation
 from lib.training.samples import LabelledImage, Samples
-from lib.training.shards import make_shard
-from lib.training.windows import TOOL, TOOL_REDUCTION, WindowSource
 from lib.workbench import report
+from notebooks.studies.windows import TOOL, TOOL_REDUCTION, WindowSource
 
-__all__ = ["ABLATION", "CURVE", "record_scores", "simulated", "small_config", "tool_windows"]
+__all__ = ["ABLATION", "CURVE", "record_scores", "small_config", "tool_windows"]
 
 #: The five columns of the paper's ablation table, in its order.
 ABLATION: dict[str, dict[str, int | bool]] = {
@@ -32,18 +29,6 @@ ABLATION: dict[str, dict[str, int | bool]] = {
 }
 #: Thresholds of recorded PCK curves, fractions of the tool's length.
 CURVE = (0.001, 0.002, 0.005, 0.01, 0.015, 0.02, 0.03, 0.04, 0.05, 0.06, 0.08, 0.1, 0.12, 0.15, 0.2)
-
-
-def simulated(shards: int, validation: int = 3) -> Path:
-    """The folder of the simulated frames, in which at least so many shards of 16 frames exist; missing ones are made."""
-    folder = paths.CACHE / "landmarks"
-    folder.mkdir(parents=True, exist_ok=True)
-    for kind, n in (("training", shards), ("validation", validation)):
-        for i in range(n):
-            path = folder / f"{kind}_{i:04d}.npz"
-            if not path.exists():
-                make_shard(path, kind, i)
-    return folder
 
 
 def small_config(network: HourglassConfig, steps: int, seed: int) -> TrainingConfig:

@@ -8,7 +8,7 @@ from lib.parallel import single_threaded_torch
 from lib.training.augmentation import Augmentation
 from lib.training.config import PRESETS
 from lib.training.loop import train
-from lib.training.shards import write_frames
+from notebooks.studies.windows import write_frames
 from tests.toys import toy_images, toy_samples
 
 

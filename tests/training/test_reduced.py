@@ -6,7 +6,6 @@ import pytest
 
 from lib.landmarks import Detector, Landmarks
 from lib.landmarks.network import HourglassConfig, StackedHourglass
-from lib.training.windows import WindowSource
 from notebooks.studies.reduced import (
     FIELD_PX,
     RESOLUTIONS,
@@ -15,6 +14,7 @@ from notebooks.studies.reduced import (
     resolution_windows,
     window_side_px,
 )
+from notebooks.studies.windows import WindowSource
 
 
 @pytest.mark.parametrize("name", RESOLUTIONS)

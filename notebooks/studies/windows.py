@@ -1,0 +1,131 @@
+"""Data of the studies that train on the reference rig: shards of frames, and upright windows cut from them.
+
+A shard keeps each frame at a fifth of its resolution and a crop round each landmark; validation shards keep the frames too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from lib import paths
+from lib.files import whole
+from lib.geometry import cell_from_image
+from lib.landmarks import windows
+from lib.simulator.population import TEXTURE_SEEDS, VALIDATION_TEXTURE_SEEDS, sample
+from lib.training.samples import LabelledImage, Samples, Source
+from lib.training.shards import packed, read_shards, square_round
+
+__all__ = [
+    "REDUCTION",
+    "STORED_REDUCTION",
+    "TOOL",
+    "TOOL_REDUCTION",
+    "WindowSource",
+    "frame_samples",
+    "simulated",
+    "write_frames",
+]
+
+#: Of the stored frames, and of the frames that `frame_samples` gives.
+STORED_REDUCTION, REDUCTION = 5, 8
+#: Reduction of the windows round the tool, and the landmark index that means the whole tool.
+TOOL_REDUCTION, TOOL = STORED_REDUCTION, 3
+CROP_PX = 288
+FRAMES = 16
+#: Seeds of each kind of shard.
+_SEEDS = {"training": 0, "validation": 1}
+
+
+def simulated(shards: int, validation: int = 3) -> Path:
+    """The folder of the simulated frames, in which at least so many shards of 16 frames exist; missing ones are made."""
+    folder = paths.CACHE / "landmarks"
+    folder.mkdir(parents=True, exist_ok=True)
+    for kind, n in (("training", shards), ("validation", validation)):
+        textures = VALIDATION_TEXTURE_SEEDS if kind == "validation" else TEXTURE_SEEDS
+        for i in range(n):
+            path, rng = folder / f"{kind}_{i:04d}.npz", np.random.default_rng([_SEEDS[kind], i])
+            if not path.exists():
+                frames = (LabelledImage(str(k), *sample(rng, textures=textures, population="near")) for k in range(FRAMES))
+                write_frames(path, frames, keep_frames=kind == "validation")
+    return folder
+
+
+def write_frames(path: Path, images: Iterable[LabelledImage], *, keep_frames: bool) -> None:
+    """Write one shard of full-resolution labelled images of one size; with the images themselves if `keep_frames`."""
+    images, r = list(images), STORED_REDUCTION
+    sizes = [(image.shape[1] // r, image.shape[0] // r) for _, image, _, _ in images]
+    frames = [cv2.resize(part.image, size, interpolation=cv2.INTER_AREA) for part, size in zip(images, sizes, strict=True)]
+    u, seen = np.stack([part.u for part in images]), np.stack([part.visibility for part in images])
+    frame, landmark = np.nonzero((seen > 0) & np.isfinite(u).all(2))
+    crops = [square_round(images[i].image, u[i], k, CROP_PX) for i, k in zip(frame, landmark, strict=True)]
+    ends, jpegs = packed(images)[:2] if keep_frames else (np.zeros(0, int), np.zeros(0, np.uint8))
+    with whole(path) as partial:
+        np.savez(
+            partial,
+            frames=np.stack(frames),
+            u=u,
+            visibility=seen,
+            crops=np.array([crop for crop, _ in crops], np.uint8).reshape(-1, CROP_PX, CROP_PX, 3),
+            crop_u=np.array([at for _, at in crops]).reshape(-1, 3, 2),
+            crop_visibility=seen[frame],
+            crop_landmark=landmark,
+            jpegs=jpegs,
+            jpeg_ends=ends,
+        )
+
+
+def frame_samples(folder: str | Path) -> Samples:
+    """Whole frames, an eighth of their size; shards keep more, so that it can be chosen later."""
+    frames, u, visibility = read_shards(folder, ("training",), ("frames", "u", "visibility"))
+    size = [side * STORED_REDUCTION // REDUCTION for side in frames.shape[2:0:-1]]
+    frames = np.stack([cv2.resize(frame, size, interpolation=cv2.INTER_AREA) for frame in frames])
+    return Samples(frames, cell_from_image(u, REDUCTION), visibility)
+
+
+@dataclass(frozen=True)
+class WindowSource(Source):
+    """Upright windows of `size` px, cut out of crops (n, h, w, 3) uint8 with their labels.
+
+    Each is cut round its `landmark` (n,), or, where that is `TOOL`, round the middle of the tool.  `shift_px` and `turn_rad`
+    are standard deviations of the error of place and direction; a tenth of the windows has three times as much.  `zoom` is
+    the range of magnification.
+    """
+
+    crops: np.ndarray
+    u: np.ndarray
+    visibility: np.ndarray
+    landmark: np.ndarray
+    size: int = 128
+    shift_px: float = 6.0
+    turn_rad: float = 0.08
+    zoom: tuple[float, float] = (0.85, 1.2)
+
+    @classmethod
+    def load(cls, folder: str | Path, *, validation: bool = False, shards: int | None = None) -> WindowSource:
+        """From the (first) shards of a folder."""
+        names = "crops", "crop_u", "crop_visibility", "crop_landmark"
+        return cls(*read_shards(folder, ("validation" if validation else "training",), names, shards))
+
+    @classmethod
+    def load_tools(cls, folder: str | Path, *, validation: bool = False, shards: int | None = None) -> WindowSource:
+        """Windows round the whole tool at `TOOL_REDUCTION`."""
+        kind = "validation" if validation else "training"
+        frames, u, visibility = read_shards(folder, (kind,), ("frames", "u", "visibility"), shards)
+        labels = cell_from_image(u, TOOL_REDUCTION), visibility, np.full(len(u), TOOL)
+        return cls(frames, *labels, shift_px=8.0, turn_rad=0.2, zoom=(0.75, 1.3))
+
+    def draw(self, index: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        u = self.u[index]
+        worse = 3.0 if rng.random() < 0.1 else 1.0
+        limit = 0.3 * self.size
+        (middle,), (direction,) = windows.tool_pose(u[None])
+        at = middle if self.landmark[index] == TOOL else u[self.landmark[index]]
+        centre = at + np.clip(rng.normal(0, worse * self.shift_px, 2), -limit, limit)
+        angle = direction + np.clip(rng.normal(0, worse * self.turn_rad), -0.6, 0.6)
+        matrix = windows.window_from_image(centre, angle, self.size, rng.uniform(*self.zoom))
+        return windows.cut(self.crops[index], matrix, self.size), windows.map_points(matrix, u), self.visibility[index]
