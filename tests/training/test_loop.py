@@ -314,6 +314,8 @@ def test_offset_loss_is_the_laplace_likelihood_of_the_own_landmark():
     assert found.grad[0, 3].item() == pytest.approx(1 - np.hypot(4.0, 0.1) / 2)
     absent = Batch(batch.images[1:], u[1:], batch.visibility[1:])
     assert offset_loss([found[1:]], absent).item() == 0.0
+    unlabelled = Batch(batch.images[:1], torch.full_like(batch.u[:1], torch.nan), batch.visibility[:1])
+    assert offset_loss([found[:1]], unlabelled).item() == 0.0
 
 
 def test_an_offset_network_learns_where_a_dot_is_and_how_well_it_knows(tmp_path):
