@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import os
 import shutil
-import sys
 
 for _variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_variable, "1")  # before numpy and torch are imported; every core has tests of its own
 os.environ.setdefault("MPLBACKEND", "Agg")
 os.environ.setdefault("OPEN3D_DISABLE_WEB_VISUALIZER", "true")
-#: nbformat's validator would build this grammar in every process, for 2 s; nothing here checks such addresses.
-sys.modules["rfc3987_syntax"] = None
 
 import hypothesis
 import pytest
+
+import lib.workbench  # noqa: F401 - before nbformat: it spares each process seconds
 
 hypothesis.settings.register_profile("microstereo", derandomize=True, deadline=None, max_examples=50, database=None)
 hypothesis.settings.load_profile("microstereo")

@@ -9,9 +9,9 @@ import numpy as np
 from lib.calibration.offsets import rows_axes
 from lib.cameras import AffineCamera, StereoRig
 from lib.correspondences import Correspondences
-from lib.registration import MovedCameras, identify_motion, misfit
+from lib.registration import MovedCameras, identify_motion
 
-__all__ = ["CONVINCING", "Explanation", "explain"]
+__all__ = ["CONVINCING", "Explanation", "explain", "misfit"]
 
 #: Rows that a rig explains lose about 5.1 each, 8 log(1 + chi^2 / 4), with 1.7 times the noise 10.
 CONVINCING = 10.0
@@ -58,15 +58,14 @@ def explain(
         ValueError: If the landmarks leave every motion open.
     """
     data = Correspondences.join(frames).complete
-    noise = {"covariance_px2": covariance_px2}
-    motion = identify_motion(rig, data, **noise)
+    motion = identify_motion(rig, data, covariance_px2=covariance_px2)
     least = min(motion.bic.values())
     found = Explanation("moved", _MOVES.get(motion.moved, motion.moved), motion.rig, motion)
     if motion.moved == "none":
         found = Explanation("none", "", rig, motion)
     others: list[tuple[float, Explanation]] = []
     swapped = replace(data, u_left=data.u_right, u_right=data.u_left)
-    others.append((misfit(rig, swapped, **noise), Explanation("exchanged", "the eyes are exchanged", rig)))
+    others.append((misfit(rig, swapped, covariance_px2), Explanation("exchanged", "the eyes are exchanged", rig)))
     late = _lateness(rig, frames, past, covariance_px2)
     if late is not None:
         others.append(late)
@@ -75,20 +74,35 @@ def explain(
         offset = _offset(rig, data, axes, covariance_px2)
         slipped = replace(data, x_mm=data.x_mm + axes @ offset)
         text = f"the tool slipped by {np.linalg.norm(offset):.2f} mm"
-        others.append((misfit(rig, slipped, parameters=3, **noise), Explanation("slipped", text, rig)))
+        others.append((misfit(rig, slipped, covariance_px2, 3), Explanation("slipped", text, rig)))
     depth = np.linalg.svd(data.x_mm - data.x_mm.mean(axis=0), compute_uv=False)[-1] / np.sqrt(len(data))
     if len(frames) >= 4 and rig.is_affine and depth > _VOLUME_MM:
         with suppress(np.linalg.LinAlgError):
             fresh = _refitted(data, covariance_px2)
             zoom = [_zoom(new) / _zoom(old) for new, old in ((fresh.left, rig.left), (fresh.right, rig.right))]
             text = f"the optics changed: zoom x {zoom[0]:.3f} left, x {zoom[1]:.3f} right"
-            others.append((misfit(fresh, data, parameters=16, **noise), Explanation("optics", text, fresh)))
+            others.append((misfit(fresh, data, covariance_px2, 16), Explanation("optics", text, fresh)))
     best, other = min(others, key=lambda pair: pair[0])
     penalty = {"slipped": 3, "optics": 16, "clock": 2}.get(other.kind, 0) * np.log(2.0 * 2.0 * len(data))
     other = replace(other, loss=(best - penalty) / len(data))
     if undecided and found.kind == "moved" and late is not None and late[0] - least <= _OPEN and best >= least - _PLAIN:
         return Explanation("open", "the cameras moved or the report is late: not decided yet")
     return other if best < least - _PLAIN else found
+
+
+def misfit(rig: StereoRig, data: Correspondences, covariance_px2: np.ndarray, parameters: int = 0) -> float:
+    """How badly a rig explains complete rows, as the information criteria of `identify_motion` say it.
+
+    Args:
+        covariance_px2: (n, 4, 4) of the rows' residuals.
+        parameters: Number of values that were fitted to these rows.
+    """
+    try:
+        residual = np.hstack([data.u_left, data.u_right]) - np.hstack(rig.project(data.x_mm))
+    except ValueError:  # behind a near-affine camera
+        return np.inf
+    chi2 = np.einsum("ni,ni->n", residual, np.linalg.solve(covariance_px2, residual[:, :, None])[:, :, 0])
+    return float(8.0 * np.log1p(chi2 / 4.0).sum() + parameters * np.log(4.0 * len(data)))
 
 
 _MOVES = {
@@ -116,7 +130,7 @@ def _lateness(rig, frames, past, covariance_px2) -> tuple[float, Explanation] | 
                 continue
             noise = np.resize(covariance_px2, (len(data), 4, 4))
             # Fewer rows must not make a delay likelier.
-            value = misfit(rig, data, covariance_px2=noise, parameters=2) * len(covariance_px2) / len(data)
+            value = misfit(rig, data, noise, 2) * len(covariance_px2) / len(data)
             if best is None or value < best[0]:
                 who = "robot's report is" if delay > 0 else "images are"
                 best = value, Explanation("clock", f"the {who} late by {abs(delay)} frames", rig)

@@ -9,7 +9,7 @@ import numpy as np
 from lib.calibration import Calibration, OnlineCalibration, with_offsets
 from lib.cameras import StereoRig
 from lib.correspondences import Correspondences
-from lib.online.causes import CONVINCING, explain
+from lib.online.causes import CONVINCING, explain, misfit
 from lib.online.result import FrameResult, Settings
 from lib.registration import DriftMonitor, MovedCameras
 from lib.trust import judge
@@ -258,9 +258,7 @@ class RigTracker:
 
     def _fits(self, rig: StereoRig, frames: Sequence[Correspondences]) -> bool:
         data = Correspondences.join(frames).complete
-        residual = np.hstack([data.u_left, data.u_right]) - np.hstack(rig.project(data.x_mm))
-        chi2 = np.einsum("ni,ni->n", residual, np.linalg.solve(self._noise(data), residual[:, :, None])[:, :, 0])
-        return bool(len(chi2) and 8.0 * np.log1p(chi2 / 4.0).mean() <= CONVINCING)
+        return bool(len(data) and misfit(rig, data, self._noise(data)) <= CONVINCING * len(data))
 
     # --- noise --------------------------------------------------------------------------------------------------------
 

@@ -6,7 +6,7 @@ to the robot frame, and ``rig.moved(motion)`` is the rig as it is now.
 """
 
 from lib.registration.drift import DriftMonitor
-from lib.registration.images import MovedCameras, identify_motion, misfit, register_images
+from lib.registration.images import MovedCameras, identify_motion, register_images
 from lib.registration.rigid import Registration, register
 
-__all__ = ["DriftMonitor", "MovedCameras", "Registration", "identify_motion", "misfit", "register", "register_images"]
+__all__ = ["DriftMonitor", "MovedCameras", "Registration", "identify_motion", "register", "register_images"]

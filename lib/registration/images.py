@@ -20,7 +20,7 @@ from lib.geometry import RigidTransform, pair_covariance
 from lib.least_squares import minimise
 from lib.registration.rigid import Registration, check_spread, motion_jacobian, register, sandwich
 
-__all__ = ["MovedCameras", "identify_motion", "misfit", "register_images"]
+__all__ = ["MovedCameras", "identify_motion", "register_images"]
 
 _FREEDOM = 4.0  # of the Student t that "robust" assumes: gross errors lose their weight, small ones keep it
 _OPEN = 1e-12  # relative curvature below which a direction is not determined
@@ -104,7 +104,8 @@ def identify_motion(
     observed = _Observed.of(rig, data, u_left, u_right, covariance_px2, sigma_x_mm)
     if not observed.scale_known:
         raise ValueError("covariance_px2: give the noise of the detections; it decides which hypothesis explains them.")
-    together, shifted = _register_both(rig, observed, "robust"), _register_shift(rig, observed)
+    together = _register_both(rig, observed, "robust")
+    shifted = _fit(rig, observed, [RigidTransform.identity()], "robust", 3)
     left, right = (_register_one(rig, observed, side) for side in (0, 1))
     n_left, n_right = (_parameters(camera) for camera in (rig.left, rig.right))
     hypotheses = {
@@ -122,18 +123,6 @@ def identify_motion(
         bic[name] = 2 * energy + parameters * np.log(2 * observed.seen.sum())
     best = min(bic, key=bic.__getitem__)
     return MovedCameras(rigs[best], best, *hypotheses[best][:2], bic)
-
-
-def misfit(rig: StereoRig, data: Correspondences, *, covariance_px2: ArrayLike | None = None, parameters: float = 0) -> float:
-    """How badly a rig explains correspondences, as the Bayesian information criteria of `identify_motion` say it.
-
-    Args:
-        covariance_px2: As there.
-        parameters: Number of values that were fitted to these correspondences.
-    """
-    observed = _Observed.of(rig, data, None, None, covariance_px2, 0.0)
-    energy, _ = _evaluate(rig, observed, "robust", RigidTransform.identity())
-    return 2 * energy + parameters * np.log(2 * observed.seen.sum())
 
 
 @dataclass(frozen=True)
@@ -184,26 +173,6 @@ def _register_both(rig: StereoRig, data: _Observed, loss: Loss) -> Registration:
     return _fit(rig, data, starts, loss, 6)
 
 
-def _register_shift(rig: StereoRig, data: _Observed) -> Registration:
-    """Both cameras, by the same translation."""
-    shift, used = np.zeros(3), data.dimension > 0
-    for _ in range(20):
-        stale = RigidTransform(np.eye(3), shift)
-        energy, (residual, distance2, weights) = _evaluate(rig, data, "robust", stale)
-        J = rig.jacobian(stale.apply(data.x))
-        JtW = np.swapaxes(J, 1, 2) @ (data.information * weights[:, None, None])
-        information, step = (JtW @ J).sum(axis=0), np.einsum("nij,nj->i", JtW, residual)
-        step = np.linalg.lstsq(information, step, rcond=_OPEN)[0]
-        shift = shift + step
-        if np.abs(step).max() < 1e-9:
-            break
-    covariance = np.zeros((6, 6))
-    covariance[3:, 3:] = np.linalg.pinv(information, rcond=_OPEN, hermitian=True)
-    distance, weights = np.where(used, (np.sqrt(distance2), weights), [[np.nan], [0.0]])
-    motion = RigidTransform(np.eye(3), -shift)
-    return Registration(motion, covariance, data.x[used].mean(axis=0), distance, weights, 2 * energy)
-
-
 def _register_one(rig: StereoRig, data: _Observed, side: int) -> Registration:
     check_spread(data.x[data.seen[:, side]], f"x_mm (rows seen by the {('left', 'right')[side]} camera)")
     data, parameters = replace(data, seen=data.seen & (np.arange(2) == side)), _parameters((rig.left, rig.right)[side])
@@ -233,7 +202,7 @@ def _evaluate(
 
 
 def _fit(rig: StereoRig, data: _Observed, starts: list[RigidTransform], loss: Loss, parameters: int) -> Registration:
-    """The minimum near the best start; an unknown noise level is estimated in turn with the motion."""
+    """The minimum near the best start, of 6 parameters, 5, or 3: without turning; an unknown noise level is estimated too."""
     if loss not in ("squared", "robust"):
         raise ValueError(f"loss: 'squared' or 'robust', got {loss!r}.")
     stale = min((start.inverse() for start in starts), key=lambda stale: _evaluate(rig, data, loss, stale)[0])
@@ -251,11 +220,12 @@ def _fit(rig: StereoRig, data: _Observed, starts: list[RigidTransform], loss: Lo
 def _minimum(rig: StereoRig, data: _Observed, stale: RigidTransform, loss: Loss, parameters: int) -> Registration:
     # Rotations are about the centre of the data in the stale frame, where they do not mix with translations.
     used, centre = data.dimension > 0, stale.apply(data.x[data.dimension > 0]).mean(axis=0)
+    free = np.repeat([parameters > 3, True], 3)
 
     def gradients(stale: RigidTransform, work: tuple[np.ndarray, ...]) -> tuple[np.ndarray, np.ndarray]:
         """Of each row: information (n, 6, 6) and gradient (n, 6)."""
         x, (residual, _, weights) = stale.apply(data.x), work
-        J = rig.jacobian(x) @ motion_jacobian(x - centre)
+        J = rig.jacobian(x) @ (motion_jacobian(x - centre) * free)
         JtW = np.swapaxes(J, 1, 2) @ (data.information * weights[:, None, None])
         return JtW @ J, np.einsum("nij,nj->ni", JtW, residual)
 

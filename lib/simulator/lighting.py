@@ -8,7 +8,7 @@ import numpy as np
 from lib.simulator.forceps import Nodes
 from lib.simulator.window import Grid, Window
 
-__all__ = ["Lighting", "Patch", "plain_shadow"]
+__all__ = ["Lighting", "Patch"]
 
 _HALF_MM = 14.0  # of the square on which shadows fall
 
@@ -49,7 +49,7 @@ class Patch:
 
 @dataclass(frozen=True)
 class Lighting:
-    """How a scene is lit, and what lies between it and the camera.
+    """How a scene is lit, and what lies between it and the camera; the defaults are the reference microscope's light.
 
     Attributes:
         ambient, tool: Shares of the light that reach the scene outside the spot, and the tool.
@@ -74,6 +74,11 @@ class Lighting:
     scatter_mm: float = 1.0
     haze: tuple[float, float, float] = (0.0, 0.0, 0.0)
     tint_per_mm: tuple[tuple[float, float], ...] | None = None
+
+    @property
+    def is_sharp(self) -> bool:
+        """Whether borders of light or shadow are too narrow for a coarse grid of pixels."""
+        return self.spot_edge is not None or self.shadow_sigma_mm < 0.1
 
     def spot(self, x: np.ndarray, y: np.ndarray, middle_mm: tuple[float, float], radius_mm: float) -> np.ndarray:
         """Light 0 to 1 at (x, y) mm of a scene, for a spot of this middle and radius."""
@@ -136,18 +141,9 @@ class Lighting:
             for k in np.flatnonzero(visibility == 2):
                 column, row = np.round(u[k]).astype(int)
                 visibility[k] = 1 if hides[row, column] else 2
-        linear += np.float32(self.haze)
+        if any(self.haze):
+            linear += np.float32(self.haze)
         return visibility
-
-
-def plain_shadow(at: tuple[np.ndarray, ...], nodes: Nodes, slope: tuple[float, float]) -> np.ndarray:
-    """As `Lighting.shaded`, under the reference microscope's light; fine enough for a coarse grid of points."""
-    (x, y, z), (centres, radii, chains), scale = at, nodes, 20.0
-    flat = centres[:, :2] + np.multiply(slope, centres[:, 2:])
-    mask = _silhouette(flat, np.maximum(1, np.round((radii[:-1] + radii[1:]) * scale)), chains, scale)
-    near = cv2.GaussianBlur(mask, (0, 0), 2.2).astype(np.float32) / 255
-    place = (((axis + s * z + _HALF_MM) * scale).astype(np.float32) for axis, s in ((x, slope[0]), (y, slope[1])))
-    return 1 - 0.62 * cv2.remap(near, *place, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
 
 
 def _silhouette(flat: np.ndarray, width_px: np.ndarray, chains: np.ndarray, scale: float) -> np.ndarray:

@@ -13,7 +13,6 @@ import numpy as np
 from lib.geometry import RigidTransform
 from lib.simulator.eye import Scene
 from lib.simulator.forceps import Forceps, Pose
-from lib.simulator.lighting import plain_shadow
 from lib.simulator.rig import Microscope
 from lib.simulator.texture import GAMMA, smooth_noise
 from lib.simulator.tool import compose, tool_in_view
@@ -76,26 +75,21 @@ def render_view(
     x, y, z = intersect(scene, window, grid.u)
     has_tool = forceps is not None and pose is not None
 
-    # The scene's light varies smoothly: the coarse grid is enough.
+    # The slope and mostly the light vary smoothly: the coarse grid is enough.
     eps = 1e-3
     slope_x = (scene.height(x + eps, y) - scene.height(x - eps, y)) / (2 * eps)
     slope_y = (scene.height(x, y + eps) - scene.height(x, y - eps)) / (2 * eps)
     light_x, light_y = np.multiply(microscope.light_slope, 0.35)
     lambert = (1 - light_x * slope_x - light_y * slope_y) / np.sqrt(1 + slope_x**2 + slope_y**2)
-    spot2 = (x - microscope.spot_mm[0]) ** 2 + (y - microscope.spot_mm[1]) ** 2
-    spot = np.exp(-spot2 / (2 * microscope.spot_radius_mm**2))
     light = microscope.brightness * 1.45 * np.clip(lambert, 0.05, None)
-    lighting = microscope.lighting
-    if lighting is None:
-        light = light * (0.25 + 0.75 * spot)
-        if has_tool:
-            light = light * plain_shadow((x, y, z), forceps.nodes(pose), microscope.light_slope)
-        light_full = grid.full(light)
-    else:  # lit discs and shadows with hard borders need every pixel
-        at = tuple(grid.full(axis) for axis in (x, y, z))
-        light_full = grid.full(light) * lighting.spot(at[0], at[1], microscope.spot_mm, microscope.spot_radius_mm)
-        if has_tool:
-            light_full *= lighting.shaded(at, forceps.nodes(pose), microscope.light_slope)
+    lighting, at, onward = microscope.lighting, (x, y, z), grid.full
+    if lighting.is_sharp:  # lit discs and shadows with hard borders need every pixel
+        light, *at = (grid.full(values) for values in (light, x, y, z))
+        onward = np.asarray
+    light = light * lighting.spot(at[0], at[1], microscope.spot_mm, microscope.spot_radius_mm)
+    if has_tool:
+        light = light * lighting.shaded(at, forceps.nodes(pose), microscope.light_slope)
+    light = onward(light)
     to_texture = scene.texture.shape[0] / scene.extent_mm
     (a, b, c), (d, e, f) = getattr(scene, "texture_from_surface", np.eye(2, 3))
     map_x = grid.full((a * x + b * y + c + scene.extent_mm / 2) * to_texture - 0.5)
@@ -103,7 +97,7 @@ def render_view(
     border = getattr(scene, "border", cv2.BORDER_REPLICATE)
     albedo = cv2.remap(scene.texture, map_x, map_y, cv2.INTER_LINEAR, borderMode=border)
     linear = cv2.LUT(albedo, _LINEAR)
-    linear *= light_full[..., None]
+    linear *= light[..., None]
     glint_mask, tool_mask = np.zeros((2, *linear.shape[:2]), np.uint8)
     if scene.gloss > 0:
         # A film mirrors the lamp where its normal halves the directions of light and view.
@@ -123,11 +117,10 @@ def render_view(
         mirror = cv2.exp(mirror * np.float32(-1 / (2 * 0.011**2)))
         mirror *= np.float32(2.2)
         mirror += np.float32(0.10) * sheen
-        mirror *= light_full * np.float32(scene.gloss) if lighting else grid.full(scene.gloss * light)
+        mirror *= light * np.float32(scene.gloss)
         glint_mask[mirror > 0.55] = 255
         linear += mirror[..., None]
-    if lighting is not None:
-        lighting.behind(linear, window)
+    lighting.behind(linear, window)
     sigma = np.hypot(microscope.psf_px, window.zoom / 100.0 * microscope.defocus_px(z))  # stated at 100 px per mm
     linear = blur_by_depth(linear, sigma, grid)
 
@@ -137,8 +130,7 @@ def render_view(
         u, visibility = tool.u, tool.visibility
         if tool.raster is not None and tool.raster.hit[0].size:
             compose(linear, tool_mask, tool, microscope, (light_x, light_y), float(np.mean(z)))
-    if lighting is not None:
-        visibility = lighting.in_front(linear, window, u, visibility)
+    visibility = lighting.in_front(linear, window, u, visibility)
     field = np.array(window.field_px)
     centre = (field - 1) / 2 - window.origin_px
     radius2 = ((grid.u[0] - centre[0]) ** 2 + (grid.u[1] - centre[1]) ** 2) / (np.hypot(*field) / 2) ** 2

@@ -20,6 +20,7 @@ __all__ = ["IMAGE_SIZE_PX", "ROBOT_FROM_MICROSCOPE", "Microscope", "SimulatedSwe
 __all__ += ["simulate_correspondences"]
 
 IMAGE_SIZE_PX = (1920, 1080)
+_PLAIN = Lighting()
 
 #: Where the reference microscope stands over the reference robot: any general pose would do.
 ROBOT_FROM_MICROSCOPE = RigidTransform.from_rotation_vector((0.15, 2.90, -0.25), (12.0, -7.0, 35.0))
@@ -41,7 +42,7 @@ class Microscope:
         full_well, read_noise: Electrons at full scale (infinity switches noise off), and of the read noise.
         jpeg_quality: Quality of stored images, 0 to 100; None stores them without loss.
         inverse_distance_per_mm: One over the working distance; 0 is affine.
-        lighting, video: Light, and camera electronics, beyond what is above; None = the reference microscope's.
+        lighting, video: Light, and camera electronics, beyond what is above; None = no electronics.
     """
 
     pixels_per_mm: tuple[float, float] = (100.0, 98.0)
@@ -64,7 +65,7 @@ class Microscope:
     jpeg_quality: int | None = 92
     inverse_distance_per_mm: float = 0.0
     fps: float = 25.0
-    lighting: Lighting | None = None
+    lighting: Lighting = _PLAIN
     video: Video | None = None
 
     def __post_init__(self) -> None:

@@ -197,7 +197,7 @@ def compose(
     window, raster = tool.window, tool.raster
     lamp = np.array([*light, -1.0]) @ window.R.T
     lamp /= np.linalg.norm(lamp)
-    power = 1.15 * microscope.brightness * (microscope.lighting.tool if microscope.lighting else 1.0)
+    power = 1.15 * microscope.brightness * microscope.lighting.tool
     if isinstance(tool.forceps, Instrument):
         clearance = max(scene_z_mm - float(raster.depth_mm[raster.hit].mean()), 0.3)
         metal = _finished(raster, tool.forceps, lamp, linear / max(power, 0.02), window.zoom, clearance) * np.float32(power)

@@ -32,7 +32,6 @@ class SurfaceFit:
         iterations: Newton steps of the final solve.
         held_out: (m, 2) candidates of the smoothness and their mean held-out L1 error (mm); (0, 2) where it was given.
         axes: (k, 3) orthonormal directions along which the L1 norm was taken: the axes of the frame for the plain fit.
-        method: The solver.
         problem, penalty, weights, residual: What was solved last, over the inliers: the points on their grid, mu (k,)
             of each output along `axes`, factors (n, k) of the absolute residuals, and the residuals (n, k).
     """
@@ -46,7 +45,6 @@ class SurfaceFit:
     iterations: int
     held_out: np.ndarray
     axes: np.ndarray
-    method: str
     problem: L1Problem = field(repr=False)
     penalty: np.ndarray = field(repr=False)
     weights: np.ndarray = field(repr=False)
@@ -62,12 +60,7 @@ class SurfaceFit:
         error; C is inflated by how much more the signs of residuals in a quarter of a cell agree than independent ones
         would.  Outputs correlate as the signs of their residuals do.  What all points share, such as the error of the
         calibration, is not in it.
-
-        Raises:
-            ValueError: For a fit by least squares, to which this does not apply.
         """
-        if self.method == "least_squares":
-            raise ValueError("covariance: of the L1 fit; fit with method 'interior_point'.")
         result = np.full((len(u), 3, 3), np.nan)
         inside = np.flatnonzero(grid.inside(u))
         for part in np.array_split(inside, max(1, len(inside) // 2048)):

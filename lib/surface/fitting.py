@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from functools import partial
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,7 +10,7 @@ from lib.cameras import AffineCamera
 from lib.geometry import finite_points
 from lib.surface.bspline import BSplineSurface, SurfaceFit
 from lib.surface.grid import SplineGrid
-from lib.surface.solver import L1Problem, L1Solution, interior_point, least_squares
+from lib.surface.solver import L1Problem, L1Solution, interior_point
 
 __all__ = ["REJECT_MEDIANS", "fit_surface"]
 
@@ -36,7 +35,7 @@ def fit_surface(
     reject_mm: float | None = None,
     covariance_mm2: ArrayLike | None = None,
     camera: AffineCamera | None = None,
-    method: Literal["interior_point", "least_squares"] = "interior_point",
+    solver: Callable[..., L1Solution] = interior_point,
     tolerance: float = 1e-8,
     quick: bool = False,
 ) -> BSplineSurface:
@@ -58,8 +57,7 @@ def fit_surface(
         camera: The left camera, affine.  Its ray through u is then exact, Psi(u) = ray(u) + s(u) d, and only the depth
             s along the viewing direction d is fitted, to d.x: one spline in the place of three.  Give `u` as matched in
             the image.
-        method: "interior_point".  "least_squares" replaces the L1 norms by squares (mu is then in px^2), the baseline
-            that outliers ruin.
+        solver: Takes the place of `lib.surface.solver.interior_point`, for comparisons.
         tolerance: Duality gap at which the solver stops, relative to the objective.
         quick: Choose the smoothness and reject points at fits of five Newton steps, within some percent of the minimum;
             only the final fit is solved to `tolerance`.
@@ -88,15 +86,11 @@ def fit_surface(
         raise ValueError(f"smoothness: mu must be a number >= 0 px^2/mm, or None to choose it; got {smoothness}.")
     if reject_mm is not None and not reject_mm > 0:
         raise ValueError(f"reject_mm: a bound in mm above 0, infinity, or None; got {reject_mm}.")
-    if method not in ("interior_point", "least_squares"):
-        raise ValueError(f"method: 'interior_point' or 'least_squares', got {method!r}.")
-    rough = quick and method != "least_squares"
-    if method == "least_squares":
-        exact = search = least_squares
-    else:
-        exact = partial(interior_point, tolerance=tolerance)
+    exact = search = solver
+    if solver is interior_point:
+        exact = partial(solver, tolerance=tolerance)
         # As near the minimum as the choice of the smoothness needs.
-        search = partial(interior_point, max_iterations=5) if quick else partial(interior_point, tolerance=1e-3)
+        search = partial(solver, max_iterations=5) if quick else partial(solver, tolerance=1e-3)
     held_out = np.empty((0, 2))
     if smoothness is None:
         enough = _QUICK_HELD_OUT if quick else _ENOUGH_HELD_OUT
@@ -117,12 +111,12 @@ def fit_surface(
         difference = surface(u) - x
         return difference if camera is None else (difference @ axes.T) @ axes
 
-    problem, solution, surface = solve(used, search if rough else exact)
+    problem, solution, surface = solve(used, search if quick else exact)
     norm = np.abs(residuals(surface)).sum(axis=1)
     if reject_mm is None:
         reject_mm = REJECT_MEDIANS * float(np.median(norm[used]))
     inliers = used & (np.nan_to_num(norm, nan=np.inf) <= reject_mm)
-    if rough or (inliers != used).any():
+    if quick or (inliers != used).any():
         if inliers.sum() < least:
             raise ValueError(
                 f"reject_mm: only {inliers.sum()} of {used.sum()} points lie within {reject_mm:.4g} mm of the surface; "
@@ -139,7 +133,6 @@ def fit_surface(
         iterations=solution.iterations,
         held_out=held_out,
         axes=axes,
-        method=method,
         problem=problem,
         penalty=mu,
         weights=norms[inliers],

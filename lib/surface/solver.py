@@ -16,7 +16,7 @@ from threadpoolctl import ThreadpoolController
 
 from lib.surface.grid import SplineGrid, cubic_basis
 
-__all__ = ["UNHELD", "L1Problem", "L1Solution", "cholesky", "interior_point", "least_squares"]
+__all__ = ["UNHELD", "L1Problem", "L1Solution", "cholesky", "interior_point"]
 
 UNHELD = (
     "smoothness: too small to hold the control points that have no data near them; increase it, or use fewer control "
@@ -243,21 +243,3 @@ def cholesky(band: np.ndarray) -> np.ndarray | None:
     """Lower factor of a banded matrix, which is overwritten; None where it is not positive definite in double precision."""
     factor, info = dpbtrf(band, lower=1, overwrite_ab=1)
     return None if info else factor
-
-
-def least_squares(problem: L1Problem, x: np.ndarray, mu: float | np.ndarray, w: np.ndarray) -> L1Solution:
-    """The baseline that the L1 norm is there to beat: sum_i (w_i (b_i.c - x_i))^2 + mu c.R.c, in closed form.
-
-    `dual` is the gradient of the data term.
-    """
-    k = x.shape[1]
-    coefficients = np.empty((problem.grid.size, k))
-    for j, mu_j in enumerate(np.broadcast_to(mu, k)):
-        factor = cholesky(problem.normal_band(w[:, j] ** 2, mu_j))
-        if factor is None:
-            raise ValueError(UNHELD)
-        coefficients[:, j] = dpbtrs(factor, problem.design_T @ (w[:, j] ** 2 * x[:, j]), lower=1)[0]
-    residual = problem.design @ coefficients - x
-    energy = (coefficients * (problem.bending @ coefficients)).sum(axis=0)
-    objective = ((w * residual) ** 2).sum(axis=0) + mu * energy
-    return L1Solution(coefficients, objective, np.zeros(k), 2 * w**2 * residual, 1)

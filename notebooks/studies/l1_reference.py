@@ -1,13 +1,14 @@
-"""Eq. (6) as the paper states it, for general solvers through cvxpy: the reference that notebook 04 and the tests use."""
+"""Rivals of the L1 solver that notebook 04 and the tests use: Eq. (6) as the paper states it, through cvxpy; and squares."""
 
 from __future__ import annotations
 
 import cvxpy as cp
 import numpy as np
+from scipy.linalg.lapack import dpbtrs
 
-from lib.surface.solver import L1Problem, L1Solution
+from lib.surface.solver import UNHELD, L1Problem, L1Solution, cholesky
 
-__all__ = ["cvxpy_reference"]
+__all__ = ["cvxpy_reference", "least_squares"]
 
 
 def cvxpy_reference(
@@ -49,3 +50,21 @@ def cvxpy_reference(
     fitted = problem.design @ coefficients - x
     objective = (w * np.abs(fitted)).sum(axis=0) + mu * (coefficients * (problem.bending @ coefficients)).sum(axis=0)
     return L1Solution(coefficients, objective, np.full(k, np.nan), dual, iterations), seconds
+
+
+def least_squares(problem: L1Problem, x: np.ndarray, mu: float | np.ndarray, w: np.ndarray) -> L1Solution:
+    """The baseline that the L1 norm is there to beat: sum_i (w_i (b_i.c - x_i))^2 + mu c.R.c, in closed form.
+
+    `dual` is the gradient of the data term.
+    """
+    k = x.shape[1]
+    coefficients = np.empty((problem.grid.size, k))
+    for j, mu_j in enumerate(np.broadcast_to(mu, k)):
+        factor = cholesky(problem.normal_band(w[:, j] ** 2, mu_j))
+        if factor is None:
+            raise ValueError(UNHELD)
+        coefficients[:, j] = dpbtrs(factor, problem.design_T @ (w[:, j] ** 2 * x[:, j]), lower=1)[0]
+    residual = problem.design @ coefficients - x
+    energy = (coefficients * (problem.bending @ coefficients)).sum(axis=0)
+    objective = ((w * residual) ** 2).sum(axis=0) + mu * energy
+    return L1Solution(coefficients, objective, np.zeros(k), 2 * w**2 * residual, 1)

@@ -6,6 +6,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
+from lib.trust import Reason, Verdict
 from lib.workbench import report
 
 
@@ -15,6 +16,17 @@ def test_record_prints_one_line(capsys):
     assert capsys.readouterr().out == (
         "calibration_reprojection_px = 1.235 px (paper: 2 px)  # 75 frames\nlandmark_pck = 99.5 %\n"
     )
+
+
+def test_a_verdict_of_trust_is_stated(monkeypatch):
+    published = []
+    monkeypatch.setattr(report, "_publish", lambda bundle, *_: published.append(bundle))
+    clock = {"name": "clock", "level": "not trustworthy", "text": "183 ms > 1 ms", "cure": "Give <offset_s>."}
+    report.verdict(Verdict((Reason(**clock),)))
+    report.verdict(Verdict())
+    assert published[0][report.VERDICT_MIME] == {"verdict": "not trustworthy", "reasons": [clock]}
+    assert "Give &lt;offset_s&gt;" in published[0]["text/html"]
+    assert published[1][report.VERDICT_MIME] == {"verdict": "trustworthy", "reasons": []}
 
 
 def test_record_takes_the_place_of_a_missing_number(capsys):

@@ -28,9 +28,10 @@ GOOD = [
     "fig, ax = plt.subplots(figsize=(2, 1)); ax.plot([1, 2])\n"
     'report.show(fig, "calibration_residuals", "Small everywhere.")',
     'with report.timed("calibration"): pass\nprint(profile)',
-    'from lib.trust import Reason, Verdict\n'
-    'report.verdict(Verdict((Reason("clock", "not trustworthy", "183 ms > 1 ms", "Give <offset_s>."),)))',
-    'report.verdict(Verdict())',
+    "from types import SimpleNamespace\n"  # as lib.trust.Verdict, which takes seconds to import
+    'clock = {"name": "clock", "level": "not trustworthy", "text": "183 ms > 1 ms", "cure": "Give <offset_s>."}\n'
+    'report.verdict(SimpleNamespace(to_json=lambda: {"verdict": "not trustworthy", "reasons": [clock]}))',
+    'report.verdict(SimpleNamespace(to_json=lambda: {"verdict": "trustworthy", "reasons": []}))',
     "import plotly.graph_objects as go\ngo.Figure(go.Scatter(x=[1], y=[2]))",
     "import ipywidgets\nipywidgets.interactive(lambda k: print('k is', k), k=3)",
 ]
