@@ -2,7 +2,6 @@
 
 import contextlib
 import multiprocessing
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from multiprocessing import shared_memory
@@ -88,11 +87,6 @@ class Beside:
         theirs.close()
         self._in_work = False
 
-    @property
-    def pid(self) -> int:
-        """Of the process."""
-        return self._process.pid
-
     def submit(self, job: SurfaceJob) -> None:
         """Take in a job; the one that waited is dropped."""
         self.dropped += self._waiting is not None
@@ -135,12 +129,6 @@ class Beside:
         """Drop what waits and what is in work."""
         self.dropped += self._waiting is not None
         self._waiting, self._stale = None, True
-
-    def wait(self, timeout_s: float) -> None:
-        """Until the job in work is done, the worker died, or the time is over."""
-        end = time.monotonic() + timeout_s
-        while self._in_work and self._process.is_alive() and not self._pipe.poll(0.02) and time.monotonic() < end:
-            pass
 
     def _free(self) -> None:
         if self._memory is not None:

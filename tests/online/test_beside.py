@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import multiprocessing
 import os
 import signal
 import time
@@ -29,33 +30,34 @@ def job(pair, index: int) -> SurfaceJob:
     return SurfaceJob(frame.left, frame.right, truth.rig, index, float(index), options)
 
 
+def news(surfaces: Beside) -> tuple[list[int], str]:
+    """The next surfaces' numbers, or what happened to the worker."""
+    for _ in range(6000):
+        done, event = surfaces.collect()
+        if done or event:
+            assert all(surface.failure is None for surface in done)
+            assert all(set(surface.seconds) == {"match", "triangulate", "surface"} for surface in done)
+            return [surface.index for surface in done], event
+        time.sleep(0.02)
+    raise TimeoutError
+
+
 def test_newest_first_and_a_killed_worker_is_started_again(pair):
     surfaces = Beside()
     try:
         for index in range(5):
             surfaces.submit(job(pair, index))
         assert surfaces.dropped == 3
-        done = []
-        for _ in range(2):
-            surfaces.wait(120)
-            done += surfaces.collect()[0]
-        assert [surface.index for surface in done] == [0, 4]
-        assert done[1].failure is None
-        assert set(done[1].seconds) == {"match", "triangulate", "surface"}
+        assert [news(surfaces), news(surfaces)] == [([0], ""), ([4], "")]
         surfaces.submit(job(pair, 5))
-        os.kill(surfaces.pid, signal.SIGKILL)
-        events = []
-        for _ in range(100):
-            events.append(surfaces.collect()[1])
-            if events[-1]:
-                break
-            time.sleep(0.05)
-        assert "started again" in events[-1]
+        (worker,) = (process for process in multiprocessing.active_children() if process.name == "surface worker")
+        os.kill(worker.pid, signal.SIGKILL)
+        assert "started again" in news(surfaces)[1]
         surfaces.submit(job(pair, 6))
         surfaces.submit(job(pair, 7))
         surfaces.forget()  # its rig is not to be believed: what is in work is not given back
-        surfaces.wait(120)
-        assert surfaces.collect() == ([], "")
+        surfaces.submit(job(pair, 8))
+        assert news(surfaces) == ([8], "")
     finally:
         surfaces.close()
 

@@ -4,23 +4,23 @@ from __future__ import annotations
 
 import gc
 import tracemalloc
+from copy import deepcopy
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
 
 from lib.online import Settings
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
-from tests.online.world import BLACK, RIG, SELDOM, World, make, rig_error_mm, run, shifted
+from tests.online.world import BLACK, RIG, SELDOM, World, make, rig_error_mm, run, shifted, started
 
 NOISE_PX = 0.6
 VIEW = ROBOT_FROM_MICROSCOPE.R[:, 2]
 
 
-def calibrated(world: World, n: int = 60):
-    pipeline = make(world, settings=SELDOM)
-    assert run(pipeline, world, n)[-1].state == "tracking"
-    return pipeline
+def calibrated(n: int = 60, **world):
+    return started(n, sigma_px=NOISE_PX, **world)[:2]
 
 
 def measured(results):
@@ -29,8 +29,7 @@ def measured(results):
 
 def test_frozen_video_is_noticed_and_never_calibrated_with():
     for seed in range(2):
-        world = World(seed, NOISE_PX)
-        pipeline = calibrated(world, 80)
+        world, pipeline = calibrated(80, seed=seed)
         before, images, found = pipeline.rig, world.images, world.detect(np.stack(world.images))
         pipeline._detector = lambda _, found=found: replace(found)
         pipeline.step(*images, world.advance())
@@ -44,8 +43,7 @@ def test_frozen_video_is_noticed_and_never_calibrated_with():
 
 
 def test_one_frozen_eye():
-    world = World(1, NOISE_PX)
-    pipeline = calibrated(world)
+    world, pipeline = calibrated()
     left, _ = world.images
     pipeline.step(left, world.images[1], world.advance())
     first = world.detect(np.stack(world.images))
@@ -87,8 +85,7 @@ def test_one_bad_frame_never_blocks_the_calibration(bad, at):
 
 
 def test_black_images_are_a_failure_and_nothing_stale_is_told():
-    world = World(4, NOISE_PX)
-    pipeline = calibrated(world)
+    world, pipeline = calibrated()
     world.depth_mm += 0.5  # the eye moves meanwhile
     results = [pipeline.step(BLACK, BLACK, world.advance()) for _ in range(30)]
     assert all(r.state == "blind" and "black" in r.failures["images"] for r in results)
@@ -119,8 +116,7 @@ def test_an_old_surface_is_no_surface():
 
 
 def test_exchanged_eyes_are_named_and_come_back():
-    world = World(6, NOISE_PX)
-    pipeline = calibrated(world)
+    world, pipeline = calibrated()
 
     def exchanged(images):
         found = world.detect(images)
@@ -139,8 +135,7 @@ def test_exchanged_eyes_are_named_and_come_back():
 
 @pytest.mark.parametrize("factor", [1.02, 0.9])
 def test_a_zoom_change_is_named_and_calibrated_afresh(factor):
-    world = World(7, NOISE_PX)
-    pipeline = calibrated(world)
+    world, pipeline = calibrated()
     zoom = 100.0 * factor
     world.rig = reference_rig(pixels_per_mm=(zoom, zoom))
     results = run(pipeline, world, 30)
@@ -151,9 +146,8 @@ def test_a_zoom_change_is_named_and_calibrated_afresh(factor):
 
 
 def test_late_kinematics_are_named_and_the_rig_is_kept():
-    world = World(8, NOISE_PX, smooth=True)
-    pipeline = make(world, settings=SELDOM)
-    told = [result.landmarks.x_mm for result in run(pipeline, world, 100)[-5:]]
+    world, pipeline, past = started(100, sigma_px=NOISE_PX, smooth=True)
+    told = [result.landmarks.x_mm for result in past[-5:]]
     rig, results = pipeline.rig, []
     for _ in range(40):
         told.append(world.advance())
@@ -167,8 +161,7 @@ def test_late_kinematics_are_named_and_the_rig_is_kept():
 
 
 def test_frozen_kinematics_are_named_at_once():
-    world = World(9, NOISE_PX, smooth=True)
-    pipeline = calibrated(world, 100)
+    world, pipeline = calibrated(100, smooth=True)
     told = world.advance()
     results = []
     for _ in range(30):
@@ -182,8 +175,7 @@ def test_frozen_kinematics_are_named_at_once():
 
 @pytest.mark.parametrize("jump_mm", [1.3, 50.0, 1e5, np.nan])
 def test_a_spike_of_the_kinematics_is_rejected_and_logged(jump_mm):
-    world = World(10, NOISE_PX)
-    pipeline = calibrated(world)
+    world, pipeline = calibrated()
     before = rig_error_mm(pipeline.rig, world)
     result = pipeline.step(*world.images, world.advance() + np.array([jump_mm, 0.0, 0.0]))
     assert "robot" in result.failures
@@ -210,9 +202,17 @@ def test_a_tool_out_of_view_and_back():
 
 
 def test_reordered_frames_are_left_out():
-    world = World(12, NOISE_PX)
-    pipeline = calibrated(world)
+    world, pipeline = calibrated()
     assert "older" in pipeline.step(*world.images, world.advance(), time_s=1.0).failures["images"]
+
+
+@cache
+def quiet(seed: int):
+    """A pipeline that saw 150 frames in which nothing happened, and said so."""
+    world = World(seed, 0.3, smooth=True)
+    pipeline = make(world, rig=RIG, noise_px=0.3, settings=SELDOM)
+    assert not any(r.motion for r in run(pipeline, world, 150))
+    return world, pipeline
 
 
 @pytest.mark.parametrize(("shift_mm", "within"), [(0.05 * VIEW, 12), (0.02 * ROBOT_FROM_MICROSCOPE.R[:, 0], 4)])
@@ -220,9 +220,7 @@ def test_small_shifts_are_noticed(shift_mm, within):
     """With the noise that the shipped detector has along the depth."""
     delays = []
     for seed in range(3):
-        world = World(20 + seed, 0.3, smooth=True)
-        pipeline = make(world, rig=RIG, noise_px=0.3, settings=SELDOM)
-        assert not any(r.motion for r in run(pipeline, world, 150))
+        world, pipeline = deepcopy(quiet(20 + seed))
         world.rig = shifted(RIG, shift_mm)
         results = run(pipeline, world, 30)
         delays.append(next((i + 1 for i, r in enumerate(results) if r.drift > 1), 99))

@@ -12,7 +12,7 @@ from lib.geometry import RigidTransform
 from lib.online import STAGES, Settings
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
 from notebooks.studies.moved_cameras import random_motion
-from tests.online.world import BLACK, CENTRE_MM, DEPTH_MM, RIG, SELDOM, World, make, rig_error_mm, run
+from tests.online.world import BLACK, CENTRE_MM, DEPTH_MM, RIG, SELDOM, World, make, rig_error_mm, run, started
 
 IMAGE = np.random.default_rng(0).integers(0, 255, BLACK.shape, dtype=np.uint8)
 
@@ -45,9 +45,7 @@ def test_nothing_unusual_raises_no_alarm():
 
 @pytest.mark.parametrize("moved", ["together", "left", "right", "apart"])
 def test_moved_cameras_are_noticed_and_registered(moved):
-    world = World(5)
-    pipeline = make(world, settings=SELDOM)
-    run(pipeline, world, 30)
+    world, pipeline, _ = started(30)
     stay = RigidTransform.identity()
     a, b = (random_motion(world.rng, centre_mm=CENTRE_MM, rotation_rad=0.05, translation_mm=0.4) for _ in range(2))
     pair = {"together": (a, a), "left": (a, stay), "right": (stay, b), "apart": (a, b)}[moved]
@@ -71,9 +69,7 @@ def test_moved_cameras_are_noticed_and_registered(moved):
 
 def test_changed_optics_are_calibrated_afresh():
     """No motion explains a turned zoom."""
-    world = World(6)
-    pipeline = make(world, settings=SELDOM)
-    run(pipeline, world, 30)
+    world, pipeline, _ = started(30)
     world.rig = reference_rig(pixels_per_mm=(150.0, 120.0))
     results = run(pipeline, world, 30)
     told = next(r.cause for r in results if "the optics changed" in r.cause)
@@ -114,9 +110,7 @@ def test_without_kinematics_the_rig_still_measures():
     ],
 )
 def test_bad_input_is_a_failed_frame(left, right, kinematics):
-    world = World()
-    pipeline = make(world)
-    run(pipeline, world, 10)
+    world, pipeline, _ = started(10)
     result = pipeline.step(left, right, kinematics)
     assert set(result.failures) == {"detect"}
     assert result.state in ("blind", "unseen")
@@ -324,9 +318,7 @@ def test_interrupts_are_not_swallowed():
 
 
 def test_a_calibration_may_be_given():
-    world = World()
-    learning = make(world, settings=SELDOM)
-    run(learning, world, 20)
+    world, learning, _ = started(20)
     pipeline = make(world, rig=learning.calibration)
     results = run(pipeline, world, 20)
     assert all(r.state == "tracking" and not r.failures for r in results)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
+from functools import cache
 from types import SimpleNamespace
 
 import numpy as np
@@ -102,6 +104,22 @@ def run(pipeline: OnlinePipeline, world: World, n: int) -> list[FrameResult]:
         told = world.advance()
         results.append(pipeline.step(*world.images, told))
     return results
+
+
+@cache
+def _started(seed: int, sigma_px: float, smooth: bool, n: int) -> tuple[World, OnlinePipeline, list[FrameResult]]:
+    world = World(seed, sigma_px, smooth=smooth)
+    pipeline = make(world, settings=SELDOM)
+    results = run(pipeline, world, n)
+    assert results[-1].state == "tracking"
+    return world, pipeline, results
+
+
+def started(
+    n: int = 60, *, seed: int = 5, sigma_px: float = 1.0, smooth: bool = False
+) -> tuple[World, OnlinePipeline, list[FrameResult]]:
+    """A world, a pipeline that calibrated itself in it, and its `n` results; made once, everybody gets a copy."""
+    return deepcopy(_started(seed, sigma_px, smooth, n))
 
 
 def rig_error_mm(rig: StereoRig, world: World) -> float:
