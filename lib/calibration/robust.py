@@ -30,7 +30,8 @@ _CONTRAST = 8.0
 #: Largest noise, as a share of the extent of the pixels, where there are outliers that do not stand clearly apart; and where
 #: there are none.
 _LARGEST_NOISE = (0.01, 0.25)
-_NOT_APART = 0.2  # share of outliers from which on they must stand apart
+_TAILS = 0.1  # share of outliers up to which they may be the tails of the noise; more must stand apart
+_NEARLY_ALL = 0.8  # share of the rows that a camera explains, of which a part may agree better by chance
 
 
 class NoConsensusError(ValueError):
@@ -90,7 +91,7 @@ def _one_camera(
     count, extent = int(found.keep.sum()), float(np.sqrt(np.prod(_extent(u))))
     if count < enough:
         raise NoConsensusError(f"{name}: no consensus, only {count} of {n} rows agree on an affine camera; {cure}.")
-    apart = n - count <= _NOT_APART * n or found.wider_px >= _CONTRAST * found.sigma_px
+    apart = n - count <= _TAILS * n or found.wider_px >= _CONTRAST * found.sigma_px
     if found.sigma_px > _LARGEST_NOISE[1 if apart else 0] * extent:
         raise NoConsensusError(
             f"{name}: no consensus, all rows look like outliers: the best affine camera leaves {found.sigma_px:.3g} px in "
@@ -245,7 +246,7 @@ def _tightest(
     found = _mixture(H[some], u[some], found.M[few], found.sigma[few, 0], area, 50)
     # Where a camera explains nearly all rows, that fewer agree better must be more than chance.
     best, most = found.evidence.argmax(), found.share[:, 0].argmax()
-    if found.share[most, 0] > 1.0 - _NOT_APART and found.evidence[best] < found.evidence[most] + _MORE_THAN_CHANCE:
+    if found.share[most, 0] > _NEARLY_ALL and found.evidence[best] < found.evidence[most] + _MORE_THAN_CHANCE:
         best = most
     if len(some) < n:
         found, best = _mixture(H, u, found.M[best : best + 1], found.sigma[best : best + 1, 0], area, 30), 0
