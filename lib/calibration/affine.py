@@ -142,12 +142,10 @@ def estimate_noise(
     gain, observed, freedom = [], [], []
     for kind in np.unique(code):
         own, rows = np.repeat([kind & 1, kind & 2], 2)[:m] > 0, code == kind
-        root = np.linalg.cholesky((claimed if len(claimed) == 1 else claimed[rows])[:, own][:, :, own])
-        white = np.linalg.solve(root, np.broadcast_to(A[own], (len(root), own.sum(), 3)))
-        values, directions = np.linalg.eigh(white @ np.swapaxes(white, 1, 2))
-        z = np.linalg.solve(root, residuals[rows][:, own, None])
-        square = np.square(np.swapaxes(directions, 1, 2) @ z)[:, :, 0] / share
-        square, weight = (square, share) if len(root) > 1 else (square.mean(axis=0), share * rows.sum())
+        white = np.linalg.inv(np.linalg.cholesky((claimed if len(claimed) == 1 else claimed[rows])[:, own][:, :, own]))
+        values, directions = np.linalg.eigh(white @ (A[own] @ A[own].T) @ np.swapaxes(white, 1, 2))
+        square = np.square(np.swapaxes(directions, 1, 2) @ white @ residuals[rows][:, own, None])[:, :, 0] / share
+        square, weight = (square, share) if len(white) > 1 else (square.mean(axis=0), share * rows.sum())
         gain.append(np.maximum(values, 0.0).ravel())
         observed.append(square.ravel())
         freedom.append(np.full(square.size, weight))

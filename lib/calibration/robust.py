@@ -293,7 +293,7 @@ def _mixture(H: np.ndarray, u: np.ndarray, M: np.ndarray, sigma: np.ndarray, are
         total = p.sum(axis=0)
         p /= total
         likelihood = (top + np.log(total)).sum(axis=1)
-        if i > 5 and (likelihood - before < 1e-4).all():
+        if i > 5 and (likelihood - before < 1e-3).all():
             break
         before = likelihood
         moments = (p[0] / variance[:, :1] + p[1] / variance[:, 1:]) @ products
