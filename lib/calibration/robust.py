@@ -246,7 +246,8 @@ def _tightest(
     found = _mixture(H[some], u[some], found.M[few], found.sigma[few, 0], area, 50)
     # Where a camera explains nearly all rows, that fewer agree better must be more than chance.
     best, most = found.evidence.argmax(), found.share[:, 0].argmax()
-    if found.share[most, 0] > _NEARLY_ALL and found.evidence[best] < found.evidence[most] + _MORE_THAN_CHANCE:
+    chance = found.evidence[best] < found.evidence[most] + _MORE_THAN_CHANCE or found.share[best, 0] < _LEAST_SHARE
+    if found.share[most, 0] > _NEARLY_ALL and chance:
         best = most
     if len(some) < n:
         found, best = _mixture(H, u, found.M[best : best + 1], found.sigma[best : best + 1, 0], area, 30), 0

@@ -62,6 +62,7 @@ class Scene:
     noise_px: float = 1.2
     tail: float = np.inf  # degrees of freedom of the detections' errors
     memory: float = 0.0  # their correlation from frame to frame
+    anisotropy: float = 1.0  # by how much larger they are along the rows of the image, with the same RMS
     bias_mm: float = 0.0  # constant offsets of the detected landmarks
     missing: float = 0.0
     outliers: float = 0.0
@@ -136,6 +137,7 @@ class Scene:
         noise = rng.normal(size=exact.shape)
         for i in range(1, self.frames):
             noise[i] = self.memory * noise[i - 1] + np.sqrt(1 - self.memory**2) * noise[i]
+        noise *= np.sqrt(2.0 / (1.0 + self.anisotropy**2)) * np.array([self.anisotropy, 1.0])
         if np.isfinite(self.tail):
             noise /= np.sqrt(rng.chisquare(self.tail, (*exact.shape[:3], 1)) / self.tail)
         u = exact + spread * noise
