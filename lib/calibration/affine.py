@@ -16,7 +16,7 @@ from lib.calibration.checks import check_spread, stacked_rows
 from lib.cameras import AffineCamera
 
 __all__ = [
-    "AffineMinimum", "Moments", "affine_minimum", "distances2", "dlt", "estimate_noise", "noise_rms_px", "paper_variances",
+    "AffineMinimum", "Moments", "affine_minimum", "dlt", "estimate_noise", "noise_rms_px", "paper_variances",
     "regress",
 ]  # fmt: skip
 
@@ -66,10 +66,6 @@ class Moments:
         scatter = self.scatter + other.scatter + np.outer(step, step) * (self.weight * other.weight / weight)
         return Moments(weight, self.mean + step * (other.weight / weight), scatter)
 
-    def faded(self, factor: float) -> Self:
-        """The same points at `factor` times their weight."""
-        return Moments(self.weight * factor, self.mean, self.scatter * factor)
-
 
 class AffineMinimum(NamedTuple):
     """The cameras [A, t] stacked as `matrix` (m, 4), and the energy `cost` there."""
@@ -108,12 +104,6 @@ def paper_variances(sigma_u_px: float, sigma_x_mm: float) -> tuple[float, float]
     sigma_x stands for the point's.  The result depends on the unit of length, here mm.
     """
     return 1.0 + sigma_u_px, sigma_x_mm
-
-
-def distances2(r: np.ndarray, A: np.ndarray, sigma_u_px: float, sigma_x_mm: float, floor_px: float = 0.0) -> np.ndarray:
-    """Squared Mahalanobis distances (n,) of residuals r (n, m) of cameras A (m, 3); `floor_px` is their rounding."""
-    S = (sigma_u_px**2 + floor_px**2) * np.eye(len(A)) + sigma_x_mm**2 * A @ A.T
-    return np.einsum("ni,ij,nj->n", r, np.linalg.inv(S), r)
 
 
 def estimate_noise(

@@ -116,14 +116,10 @@ class RigTracker:
         """Calibrate with all frames so far; after the last calibration let each frame update its moments."""
         if self.rig is not None and len(self._frames) > self.settings.calibration_frames[1]:
             if self._moments is None:
-                known, rows = self.calibration, self.calibration.view_inliers.all(axis=1)
-                self._moments = OnlineCalibration(sigma_u_px=known.sigma_u_px, sigma_x_mm=known.sigma_x_mm)
-                self._moments.add(known.x_mm[rows], known.y_px[rows, :2], known.y_px[rows, 2:])
+                self._moments = OnlineCalibration(self.calibration)
                 accepted = self._frames[self._fitted :]
-            for frame in accepted:
-                data = self.corrected(frame.data)
-                self._moments.add(data.x_mm, data.u_left, data.u_right)
-            if self._moments.ready:
+            used = [self._moments.add(self.corrected(frame.data)).any() for frame in accepted]
+            if any(used):
                 self.rig = self._moments.solve()
                 self._monitor.follow(self.rig)
             return

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from lib.calibration import Moments, OnlineCalibration, affine_minimum, calibrate
+from lib.correspondences import Correspondences
 from lib.simulator.rig import simulate_correspondences
 from lib.trust import report
 
@@ -34,11 +35,11 @@ def test_calibration_with_outliers_and_report(benchmark, model):
 
 def test_online_frame(benchmark):
     c, _ = stacked(3000)
-    online = OnlineCalibration(sigma_u_px=1.5, sigma_x_mm=0.010)
-    online.add(c.x_mm[:300], c.u_left[:300], c.u_right[:300])
+    online = OnlineCalibration(calibrate(c.x_mm[:300], [c.u_left[:300], c.u_right[:300]], model="affine"))
+    rows = Correspondences.of_points(c.x_mm[300:303], c.u_left[300:303], c.u_right[300:303])
 
     def frame():
-        online.add(c.x_mm[300:303], c.u_left[300:303], c.u_right[300:303])
+        online.add(rows)
         return online.solve()
 
     assert benchmark(frame).linear.shape == (4, 3)
