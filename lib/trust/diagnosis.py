@@ -59,11 +59,10 @@ def diagnose(
     """
     if image_size_px is None and calibration is not None:
         image_size_px = calibration.image_size_px
+    frames = np.unique(data.frame)
+    if len(data) > _MOST_ROWS:  # a part of the time: neighbours tell of clocks, and which part hardly matters
+        data = data.of_frames(frames[np.linspace(0, len(frames) - 1, int(len(frames) * _MOST_ROWS / len(data))).astype(int)])
     problem = Problem.of(data)
-    if len(problem) > _MOST_ROWS:  # a part of the time: neighbours tell of clocks, and which part hardly matters
-        frames = int(problem.frame.max()) + 1
-        kept = np.linspace(0, frames - 1, int(frames * _MOST_ROWS / len(problem))).astype(int)
-        problem = problem.rows(np.isin(problem.frame, kept))
     if problem.used.all(axis=1).sum() < 6:
         if len(data) < 12:
             return Diagnosis()

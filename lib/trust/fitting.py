@@ -140,11 +140,6 @@ class Problem:
         """The same pixels at other positions; rows without one are not used."""
         return replace(self, x=x)
 
-    def rows(self, rows: np.ndarray) -> Self:
-        """Some of the rows."""
-        own = {name: getattr(self, name)[rows] for name in ("x", "y", "seen", "noise", "axes", "frame", "landmark", "time")}
-        return replace(self, **own)
-
     def fit(
         self, columns: Callable[[np.ndarray], np.ndarray] | None = None, *, start: np.ndarray | None = None,
         groups: np.ndarray | None = None, rounds: int = 40, seed: int = 0,

@@ -1,12 +1,14 @@
 """The health of the detector without labels: where what it found contradicts itself, the other image or the robot.
 
 Each part is one number a landmark and frame, divided by its limit.  A network that does not know a picture answers anew when
-the picture is mirrored or shifted; one that knows it answers the same.
+the picture is mirrored or shifted; one that knows it answers the same.  And pictures whose colours and details are unlike
+those of the training are unfamiliar, whatever the answer.
 """
 
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -16,7 +18,7 @@ from lib.cameras import StereoRig
 from lib.correspondences import Correspondences
 from lib.recordings import Recording
 
-__all__ = ["LIMITS", "Health", "affine_epipolar", "feature_epipolar_px", "health"]
+__all__ = ["LIMITS", "Health", "affine_epipolar", "feature_epipolar_px", "health", "unfamiliar"]
 
 #: What a landmark of a frame may show of each part; see `FALSE_ALARM_RATE`.
 LIMITS = {
@@ -25,7 +27,17 @@ LIMITS = {
     "robot": 8.0,  # distance from where the robot says, in RMS residuals of the calibration (at least 1 px)
     "smoothness": 0.05,  # the same less what the frames before and after have, of the tool's length
     "shape": 0.2,  # triangulated length of the tool, relative to the robot's; of a frame, not of a landmark
+    # RMS of the picture's `looks` in standard deviations of the training's; of a frame.  2 % of 96 pictures of the validation
+    # population are beyond it.
+    "unfamiliar": 2.1,
 }
+#: Parts that are of a frame: they tell no wrong landmark.
+_OF_FRAMES = ("shape", "unfamiliar")
+#: Medians and standard deviations of `looks` over 288 pictures of the training population.
+_FAMILIAR = np.array([
+    [0.32, -0.23, -2.49, -2.54, -0.76, -1.80, -3.38, -2.91, -2.76], [0.32, 0.31, 0.82, 0.82, 0.47, 0.52, 0.66, 0.60, 0.59],
+])  # fmt: skip
+_WIDTH_PX = 240  # of a picture whose looks are taken
 #: Share of frames with right landmarks (all within 5 % of the tool's length) whose score exceeds 1 with every part at hand: 3
 #: of 35 frames of three simulated recordings of the validation population, whose pictures are harder than most.
 FALSE_ALARM_RATE = 0.09
@@ -63,7 +75,7 @@ class Health:
     @property
     def bad(self) -> np.ndarray:
         """(m, 3) bool: seen, and one of its own parts exceeds the limit."""
-        return self.seen & np.any([part > 1 for name, part in self.parts.items() if name != "shape"], axis=0)
+        return self.seen & np.any([part > 1 for name, part in self.parts.items() if name not in _OF_FRAMES], axis=0)
 
     @property
     def unhealthy(self) -> float:
@@ -72,8 +84,8 @@ class Health:
 
     @property
     def worst_part(self) -> str:
-        """The part that most landmarks fail (`shape` is of a frame)."""
-        return max((n for n in self.parts if n != "shape"), key=lambda name: np.sum(self.parts[name] > 1))
+        """The part that most landmarks fail of themselves."""
+        return max((n for n in self.parts if n not in _OF_FRAMES), key=lambda name: np.sum(self.parts[name] > 1))
 
     @property
     def text(self) -> str:
@@ -82,14 +94,15 @@ class Health:
 
 
 def health(
-    recording: Recording, data: Correspondences, calibration: Calibration | None = None, *,
-    detector: Callable | None = None, looks: int = 12,
+    recording: Recording | None, data: Correspondences, calibration: Calibration | None = None, *,
+    detector: Callable | None = None, looks: int = 12, pictures: int = 60,
 ) -> Health:  # fmt: skip
     """Compare what the detector found with everything that is known without labels.
 
     Args:
         data: Of `lib.landmarks.detect`, all frames or some.
         calibration: Made from `data`; None leaves out what needs cameras.
+        recording: None leaves out what needs its pictures, of which `pictures` are compared with those of the training.
         detector: Looks again at `looks` frames, mirrored and shifted; None leaves that out.
 
     Raises:
@@ -116,7 +129,31 @@ def health(
         parts["shape"] = np.repeat(np.abs(_tool_length(seen) / _tool_length(x) - 1.0)[:, None], shape[1], axis=1)
     if detector is not None:
         parts["looks"] = np.fmax.reduce(_looks_px(recording, frame, u, detector, looks), axis=2) / length
+    if recording is not None:
+        parts["unfamiliar"] = np.full(shape[:2], np.nan)
+        for i in _spread(len(frame), pictures):
+            parts["unfamiliar"][i] = unfamiliar(recording.frames[int(frame[i])].left)
     return Health(frame, {n: parts[n] / LIMITS[n] for n in LIMITS if n in parts}, np.isfinite(u[..., 0]).any(axis=2))
+
+
+def _spread(n: int, count: int) -> np.ndarray:
+    """At most `count` of n numbers, evenly."""
+    return np.unique(np.linspace(0, n - 1, min(count, n)).round().astype(int))
+
+
+def unfamiliar(image: np.ndarray) -> float:
+    """How unlike the pictures of the training an image (h, w, 3) uint8 RGB is: RMS over its looks, in their deviations.
+
+    Its looks are medians and spreads of its colours, its brightness, its contrast, and that of three sizes of detail.
+    """
+    size = _WIDTH_PX, max(8, round(_WIDTH_PX * image.shape[0] / image.shape[1]))
+    log = np.log(cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32) / 255 + 0.02)
+    grey, chroma = log.mean(axis=2), log[..., [0, 2]] - log[..., 1:2]
+    blurred = [grey, *(cv2.GaussianBlur(grey, (0, 0), sigma) for sigma in (1, 4, 16))]
+    detail = [np.std(fine - coarse) + 1e-3 for fine, coarse in pairwise(blurred)]
+    spread = np.log([*(chroma.std(axis=(0, 1)) + 3e-3), grey.std() + 1e-6, *detail])
+    looks = np.array([*np.median(chroma, axis=(0, 1)), *spread[:2], grey.mean(), *spread[2:]])
+    return float(np.sqrt((((looks - _FAMILIAR[0]) / _FAMILIAR[1]) ** 2).mean()))
 
 
 def _worse(off: np.ndarray) -> np.ndarray:
@@ -141,7 +178,7 @@ def _jump_px(off: np.ndarray, time_s: np.ndarray) -> np.ndarray:
 def _looks_px(recording: Recording, frame: np.ndarray, u: np.ndarray, detector: Callable, looks: int) -> np.ndarray:
     """(m, 3, 2) px how far a mirrored and a shifted look move a landmark; infinite where they disagree that it is there."""
     moved = np.full(u.shape[:3], np.nan)
-    for i in np.unique(np.linspace(0, len(frame) - 1, min(looks, len(frame))).round().astype(int)):
+    for i in _spread(len(frame), looks):
         pair = recording.frames[int(frame[i])]
         images = np.stack([pair.left, pair.right])
         mirrored = detector(images[:, :, ::-1])
@@ -182,7 +219,7 @@ def feature_epipolar_px(recording: Recording, rig: StereoRig, frames: int = 3) -
     Matches count that agree on some affine epipolar geometry, whichever it is.
     """
     sift, found = cv2.SIFT_create(2000), []
-    for i in np.unique(np.linspace(0, len(recording) - 1, frames).round().astype(int)):
+    for i in _spread(len(recording), frames):
         pair = recording.frames[int(i)]
         grey = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)[::_HALVED, ::_HALVED] for image in (pair.left, pair.right)]
         (left, a), (right, b) = (sift.detectAndCompute(image, None) for image in grey)

@@ -10,12 +10,14 @@ from matplotlib.figure import Figure
 from lib.calibration import Calibration, calibrate, with_offsets
 from lib.correspondences import Correspondences
 from lib.recordings import Recording
-from lib.trust import Assessment, Verdict
+from lib.trust import Assessment, Health, Verdict
 from lib.workbench import report
 from notebooks.figures.overview import landmarks_on
 from notebooks.figures.style import figure, show_image
 
-__all__ = ["believed", "by_confidence", "half_and_rest", "sealed", "surest_and_least_sure", "whether_true"]
+__all__ = [
+    "believed", "by_confidence", "half_and_rest", "health_chart", "sealed", "surest_and_least_sure", "whether_true",
+]  # fmt: skip
 
 #: Fewest rows of a calibration that is to be judged by held-out frames, and of those frames.
 _ROWS = (12, 3)
@@ -61,6 +63,19 @@ def whether_true(recording: Recording) -> str:
     if recording.truth is None:
         return "This recording has no truth. Its numbers are judged by held-out frames and by the verdict alone."
     return "This recording is simulated. Its truth judges the numbers and computes none of them."
+
+
+def health_chart(found: Health) -> Figure:
+    """One number a frame: the worst of what the frame's landmarks and its picture show against the detector."""
+    page, ax = figure(height_in=2.6)
+    score = np.clip(np.nan_to_num(found.score, nan=1e2), 1e-2, 1e2)
+    ax.semilogy(found.frame, score, "o", ms=4, color="#0072b2", label="worst part")
+    if "unfamiliar" in found.parts:
+        ax.semilogy(found.frame, found.parts["unfamiliar"][:, 0], "s", ms=3, color="#e69f00", label="unfamiliar picture")
+    ax.axhline(1.0, color="#b42318", lw=1)
+    ax.set(xlabel="frame", ylabel="score", title=f"Health of the detector: {found.text}")
+    ax.legend(loc="upper right", fontsize=8)
+    return page
 
 
 def by_confidence(data: Correspondences) -> np.ndarray:

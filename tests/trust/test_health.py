@@ -4,11 +4,13 @@ from types import SimpleNamespace
 
 import numpy as np
 
+from lib import paths
 from lib.calibration import calibrate
 from lib.correspondences import LANDMARKS, Correspondences
+from lib.recordings import Recording
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
 from lib.trust import health
-from lib.trust.health import affine_epipolar
+from lib.trust.health import LIMITS, affine_epipolar, unfamiliar
 
 TOOL_MM = np.array([[0.0, 0.0, 0.0], [3.0, -0.5, 0.0], [3.0, 0.5, 0.0]])
 
@@ -78,3 +80,10 @@ def test_epipolar_geometry_of_most_matches():
     distance, agree = affine_epipolar(y)
     assert np.median(distance[agree]) < 1.5 and agree.mean() > 0.6 and np.median(distance[wrong.ravel()]) > 10
     assert np.isnan(affine_epipolar(y[:8])[0]).all()
+
+
+def test_an_unlit_picture_and_a_chessboard_are_unfamiliar_and_the_shipped_recording_is_not():
+    frame = Recording.open(paths.SHIPPED_RECORDING).frames[3]
+    assert unfamiliar(frame.left) < LIMITS["unfamiliar"] and unfamiliar(frame.right) < LIMITS["unfamiliar"]
+    board = np.kron(np.indices((9, 16)).sum(axis=0) % 2, np.ones((120, 120)))[..., None] * np.full(3, 255)
+    assert min(unfamiliar(picture.astype(np.uint8)) for picture in (0 * board, board)) > LIMITS["unfamiliar"]
