@@ -7,10 +7,11 @@ A rolling shutter reads row y at readout_s * (y / (height - 1) - 1/2) after that
 """
 
 from lib.recordings.annotations import Annotations
+from lib.recordings.annotator import Annotator
 from lib.recordings.frames import Frames, StereoFrame, read_image, to_8_bits
 from lib.recordings.recording import Doubt, Kinematics, Recording
 from lib.recordings.truth import Truth
 from lib.recordings.writer import RecordingWriter
 
-__all__ = ["Annotations", "Doubt", "Frames", "Kinematics", "Recording", "RecordingWriter", "StereoFrame", "Truth"]
-__all__ += ["read_image", "to_8_bits"]
+__all__ = ["Annotations", "Annotator", "Doubt", "Frames", "Kinematics", "Recording", "RecordingWriter", "StereoFrame"]
+__all__ += ["Truth", "read_image", "to_8_bits"]

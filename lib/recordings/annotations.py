@@ -10,7 +10,7 @@ import numpy as np
 from lib.correspondences import LANDMARKS
 from lib.files import write_text
 
-__all__ = ["Annotations", "coco_keypoints", "inside", "read_coco", "write_coco"]
+__all__ = ["Annotations", "coco_keypoints", "inside", "mark_coco", "read_coco", "write_coco"]
 
 _SIDES = ("left", "right")
 
@@ -21,8 +21,8 @@ class Annotations:
 
     Attributes:
         u_left, u_right: (n, k, 2) px, NaN where not labelled.
-        visibility_left, visibility_right: (n, k) int as in COCO: 0 not labelled, 1 labelled but hidden, 2 visible.
-            None = 2 wherever there is a label.
+        visibility_left, visibility_right: (n, k) int as in COCO: 0 not labelled, 1 labelled but hidden, 2 visible; and -1
+            for a landmark that the image does not show.  None = 2 wherever there is a label.
     """
 
     u_left: np.ndarray
@@ -37,7 +37,8 @@ class Annotations:
             if u.ndim != 3 or u.shape[2] != 2 or v.shape != u.shape[:2] or u.shape != np.shape(self.u_left):
                 raise ValueError(f"u_{side}: expected (n, k, 2) with visibility (n, k), got {u.shape} and {v.shape}.")
             object.__setattr__(self, f"u_{side}", u)
-            object.__setattr__(self, f"visibility_{side}", np.where(np.isfinite(u).all(axis=2), v, 0).astype(np.int64))
+            v = np.where(np.isfinite(u).all(axis=2), v, np.minimum(v, 0)).astype(np.int64)
+            object.__setattr__(self, f"visibility_{side}", v)
 
 
 def inside(u: np.ndarray, image_size_px: tuple[int, int]) -> np.ndarray:
@@ -48,6 +49,8 @@ def inside(u: np.ndarray, image_size_px: tuple[int, int]) -> np.ndarray:
 def coco_keypoints(path: Path) -> Iterator[tuple[str, list[str], np.ndarray]]:
     """The image, the names (k,) and x, y, visibility (k, 3) of each annotation in a file of COCO keypoints.
 
+    COCO has no word for a landmark that an image does not show: an entry's own list ``absent`` names those of visibility -1.
+
     Raises:
         FileNotFoundError, ValueError: Naming the file and the entry.
     """
@@ -57,12 +60,13 @@ def coco_keypoints(path: Path) -> Iterator[tuple[str, list[str], np.ndarray]]:
         content = json.loads(path.read_bytes())
         categories = {c["id"]: list(c["keypoints"]) for c in content["categories"] if "keypoints" in c}
         images = {image["id"]: str(image["file_name"]) for image in content["images"]}
-        entries = [(a["image_id"], a["category_id"], a["keypoints"]) for a in content["annotations"]]
-        found = [(images.get(image), categories.get(category)) for image, category, _ in entries]
+        entries = [(a["image_id"], a["category_id"], a["keypoints"], a.get("absent", [])) for a in content["annotations"]]
+        found = [(images.get(image), categories.get(category)) for image, category, _, _ in entries]
+        absences = [set(absent) for *_, absent in entries]
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         what = f"not COCO keypoints ({type(error).__name__}: {error})"
         raise ValueError(f"{path}: {what}. Export the annotations again.") from None
-    for (image_id, category_id, keypoints), (image, names) in zip(entries, found, strict=True):
+    for (image_id, category_id, keypoints, _), (image, names), absent in zip(entries, found, absences, strict=True):
         if names is None or image is None:
             where = f"category {category_id}, image {image_id}"
             raise ValueError(f"{path}: an annotation names {where}, which the file does not describe. Export it again.")
@@ -72,6 +76,7 @@ def coco_keypoints(path: Path) -> Iterator[tuple[str, list[str], np.ndarray]]:
             raise ValueError(f"{path}: image {image}: keypoints must be x, y, visibility for each name.") from None
         if not np.isin(values[:, 2], (0, 1, 2)).all():
             raise ValueError(f"{path}: image {image}: visibility is 0, 1 or 2.")
+        values[[name in absent for name in names] & (values[:, 2] == 0), 2] = -1
         yield image, names, values
 
 
@@ -113,23 +118,65 @@ def write_coco(
     path: Path, annotations: Annotations, image_size_px: tuple[int, int], suffix: str, landmarks: Sequence[str] = LANDMARKS
 ) -> None:
     """Write `annotations`; points that are NaN or outside the image are written as not labelled."""
-    width, height = image_size_px
-    images, entries = [], []
+    content = _empty(landmarks)
+    images, entries = content["images"], content["annotations"]
     for side in _SIDES:
         us, visibilities = getattr(annotations, f"u_{side}"), getattr(annotations, f"visibility_{side}")
         for frame, (u, visibility) in enumerate(zip(us, visibilities, strict=True)):
-            identity, file_name = len(images) + 1, f"{side}/{frame:06d}{suffix}"
-            images.append({"id": identity, "file_name": file_name, "width": width, "height": height})
-            v = np.where(inside(u, image_size_px), visibility, 0)
-            if not v.any():
-                continue
-            low, size = u[v > 0].min(axis=0), np.ptp(u[v > 0], axis=0)
-            xy = np.where((v > 0)[:, None], u, 0.0).round(3)
-            entry = {"id": len(entries) + 1, "image_id": identity, "category_id": 1}
-            entry["keypoints"] = [n for (x, y), w in zip(xy.tolist(), v.tolist(), strict=True) for n in (x, y, w)]
-            entry |= {"num_keypoints": int((v > 0).sum()), "bbox": [round(float(value), 3) for value in (*low, *size)]}
-            entries.append(entry | {"area": round(float(size.prod()), 3), "iscrowd": 0})
+            images.append(_image(len(images) + 1, f"{side}/{frame:06d}{suffix}", image_size_px))
+            v = np.where(inside(u, image_size_px), visibility, np.minimum(visibility, 0))
+            if v.any():
+                entry = {"id": len(entries) + 1, "image_id": images[-1]["id"], "category_id": 1}
+                entries.append(_filled(entry, landmarks, landmarks, np.column_stack([u, v])))
+    write_text(path, json.dumps(content, allow_nan=False) + "\n")
+
+
+def mark_coco(
+    path: Path, image: str, image_size_px: tuple[int, int], landmarks: Sequence[str], values: np.ndarray
+) -> None:
+    """Set the landmarks of one image, x, y, visibility (k, 3), in a file of COCO keypoints, new where there is none.
+
+    All else in the file stays: other images, other keypoints, keys that are not ours.
+    """
+    content = json.loads(path.read_bytes()) if path.exists() else _empty(landmarks)
+    images, entries = content["images"], content["annotations"]
+    place = PurePosixPath(image).with_suffix("").parts
+    ids = [one["id"] for one in images if PurePosixPath(one["file_name"]).with_suffix("").parts[-2:] == place]
+    if not ids:
+        ids = [1 + max((one["id"] for one in images), default=0)]
+        images.append(_image(ids[0], image, image_size_px))
+    category = next((c for c in content["categories"] if set(landmarks) <= set(c.get("keypoints", ()))), None)
+    if category is None:
+        category = _empty(landmarks)["categories"][0] | {"id": 1 + max((c["id"] for c in content["categories"]), default=0)}
+        content["categories"].append(category)
+    at = next((k for k, one in enumerate(entries) if one["image_id"] in ids), len(entries))
+    if at == len(entries):
+        identity = 1 + max((one["id"] for one in entries), default=0)
+        entries.append({"id": identity, "image_id": ids[0], "category_id": category["id"]})
+    entries[at] = _filled(entries[at], category["keypoints"], landmarks, values)
+    write_text(path, json.dumps(content, allow_nan=False) + "\n")
+
+
+def _empty(landmarks: Sequence[str]) -> dict:
     edges = [[1, k] for k in range(2, len(landmarks) + 1)]
     category = {"id": 1, "name": "forceps" if len(edges) == 2 else "tool", "keypoints": list(landmarks), "skeleton": edges}
-    content = {"info": {"description": "Tool landmarks; integer coordinates are pixel centres."}, "categories": [category]}
-    write_text(path, json.dumps(content | {"images": images, "annotations": entries}, allow_nan=False) + "\n")
+    info = {"description": "Tool landmarks; integer coordinates are pixel centres."}
+    return {"info": info, "categories": [category], "images": [], "annotations": []}
+
+
+def _image(identity: int, file_name: str, image_size_px: tuple[int, int]) -> dict:
+    return {"id": identity, "file_name": file_name, "width": image_size_px[0], "height": image_size_px[1]}
+
+
+def _filled(entry: dict, names: Sequence[str], landmarks: Sequence[str], values: np.ndarray) -> dict:
+    """The entry of an image with x, y, visibility (k, 3) of `landmarks` in it; `names` are those of its keypoints."""
+    table = np.reshape(entry.get("keypoints", np.zeros(3 * len(names))), (-1, 3)).astype(np.float64)
+    table[[names.index(name) for name in landmarks]] = np.where(values[:, 2:] > 0, values, 0.0)
+    shown = table[table[:, 2] > 0, :2]
+    low, size = (shown.min(axis=0), np.ptp(shown, axis=0)) if len(shown) else np.zeros((2, 2))
+    entry["keypoints"] = [n for x, y, v in table.round(3).tolist() for n in (x, y, int(v))]
+    entry |= {"num_keypoints": len(shown), "bbox": [*low.round(3).tolist(), *size.round(3).tolist()]}
+    entry |= {"area": round(float(size.prod()), 3), "iscrowd": 0}
+    absent = {name for name, v in zip(landmarks, values[:, 2], strict=True) if v < 0}
+    absent |= set(entry.pop("absent", ())) - set(landmarks)
+    return entry | ({"absent": sorted(absent)} if absent else {})

@@ -42,8 +42,9 @@ def labelled_images(recording: Recording, *, every: int = 1) -> Iterator[Labelle
         frame = recording.frames[i]
         for side, image in (("left", frame.left), ("right", frame.right)):
             u, visibility = getattr(labels, f"u_{side}")[i], getattr(labels, f"visibility_{side}")[i]
-            if recording.truth is None:  # COCO's 0 is "not labelled", which does not say that the landmark is absent
-                u, visibility = np.where(visibility[:, None] > 0, u, np.nan), np.maximum(visibility, 1)
+            if recording.truth is None:  # COCO's 0 is "not labelled"; -1 says that the landmark is absent, which is 0 here
+                u = np.where(visibility[:, None] > 0, u, np.nan)
+                visibility = np.where(visibility < 0, 0, np.maximum(visibility, 1))
             yield LabelledImage(f"{side} {i}", image, u, visibility)
 
 

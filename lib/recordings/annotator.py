@@ -1,0 +1,237 @@
+"""The annotator: a person marks landmarks in both views, in JupyterLab, and each mark is in annotations.json at once.
+
+`Annotator` holds what is marked and suggested and answers the messages of its page, annotator.js, which draws.
+"""
+
+import os
+from functools import cached_property
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from lib.cameras import StereoRig
+from lib.correspondences import Correspondences, of_recording
+from lib.recordings.annotations import Annotations, inside, mark_coco, read_coco
+from lib.recordings.recording import Recording
+
+__all__ = ["Annotator"]
+
+_SIDES = ("left", "right")
+#: Depths of the viewing ray, mm about the tool, whose images make an epipolar line: a microscope's depth of field is 3 mm.
+_DEPTHS_MM = np.linspace(-20.0, 20.0, 9)
+_JPEG_QUALITY = 95
+
+
+class Annotator:
+    """Labels for a recording, set by hand: displayed in JupyterLab, a page with both views (press ? there for its keys).
+
+    Each change is written whole to annotations.json before the page shows it as saved, and leaves all else in the file as
+    it is; so a killed kernel loses nothing.
+
+    Args:
+        recording: With any set of landmarks.
+        rig: Cameras, if known.  They give the epipolar lines of left marks, and the robot's landmarks as suggestions.
+        detected: What the detector found (`lib.landmarks.detect`), with the robot's position of each landmark.  Both are
+            suggestions, and frames in which they disagree most come first.
+        usefulness: (n,) of the frames, the most useful first in place of that order.
+
+    >>> import shutil, tempfile
+    >>> from lib import paths
+    >>> folder = shutil.copytree(paths.SHIPPED_RECORDING, tempfile.mkdtemp() + "/mine")
+    >>> annotator = Annotator(Recording.open(folder, truth=False))
+    >>> annotator.mark("left", 3, "tip_2", (812.5, 640.0))
+    >>> Recording.open(folder).annotations.u_left[3, 2].tolist()
+    [812.5, 640.0]
+    """
+
+    def __init__(
+        self, recording: Recording, *, rig: StereoRig | None = None, detected: Correspondences | None = None,
+        usefulness: np.ndarray | None = None,
+    ) -> None:  # fmt: skip
+        self.recording = recording
+        self._path = recording.folder / "annotations.json"
+        self._undone, self._done, self._visited = [], [], set()
+        self._read()
+        self.know(rig=rig, detected=detected, usefulness=usefulness)
+
+    def know(
+        self, *, rig: StereoRig | None = None, detected: Correspondences | None = None, usefulness: np.ndarray | None = None
+    ) -> None:
+        """Take a rig, detections or an order of frames that came later; an open page shows them at once."""
+        n, names = len(self.recording), self.recording.skeleton
+        nothing = np.full((n, len(names), 2), np.nan)
+        rows = of_recording(self.recording, nothing, nothing) if detected is None else detected
+        self._rig, self._x_mm = rig, self.recording.landmarks_mm()
+        self._x_mm[rows.frame, rows.landmark] = rows.x_mm
+        self._suggested = {name: np.full((2, n, len(names), 2), np.nan) for name in ("robot", "detector")}
+        found = np.where(rows.seen.T[..., None], (rows.u_left, rows.u_right), np.nan)
+        self._suggested["detector"][:, rows.frame, rows.landmark] = found
+        if rig is not None:
+            self._suggested["robot"] = np.reshape(rig.project(self._x_mm.reshape(-1, 3)), (2, n, len(names), 2))
+        looked = np.isin(np.arange(n), detected.frame) if detected is not None else np.zeros(n, bool)
+        self.usefulness = self._disagreement(looked) if usefulness is None else np.asarray(usefulness, np.float64)
+        if self.usefulness.shape != (n,):
+            raise ValueError(f"usefulness: expected one number for each of {n} frames, got {self.usefulness.shape}.")
+        if "widget" in vars(self):
+            self.widget.send({"renew": True})
+
+    def _disagreement(self, looked: np.ndarray) -> np.ndarray:
+        """(n,) px: the farthest that detector and robot are apart in a frame; the tool's length where one was not found."""
+        robot, detector = self._suggested.values()
+        off = np.linalg.norm(robot - detector, axis=-1)
+        length = np.linalg.norm(robot[:, :, 1:] - robot[:, :, :1], axis=-1)
+        length = np.nanmedian(length) if np.isfinite(length).any() else 0.0
+        missed = inside(robot, self.recording.image_size_px) & ~np.isfinite(detector).all(axis=-1)
+        off = np.where(missed, length, np.nan_to_num(off)).max(axis=(0, 2))
+        return np.where(looked, off, 0.0)
+
+    def __repr__(self) -> str:
+        labelled = f"{int(self.complete.sum())} of {len(self.recording)} frames are labelled"
+        return f"Annotator of {self.recording.name}: {labelled}, in {self._path.name}."
+
+    @property
+    def complete(self) -> np.ndarray:
+        """(n,) bool: every landmark of both views has a mark."""
+        a = self._annotations
+        return (np.stack([a.visibility_left, a.visibility_right]) != 0).all(axis=(0, 2))
+
+    def mark(
+        self, side: str, frame: int, landmark: str, u: tuple[float, float] | None = None, visibility: int | None = None
+    ) -> None:
+        """Mark a landmark at pixel `u`, visible (2, the default) or hidden (1); without `u` absent (-1), or unmarked (0)."""
+        visibility = (-1 if u is None else 2) if visibility is None else visibility
+        self._change([(side, frame, self.recording.skeleton.index(landmark), *(u or (np.nan, np.nan)), visibility)])
+
+    def undo(self) -> int | None:
+        """Take the last change back; returns its frame, None where there is none."""
+        return self._replay(self._done, self._undone)
+
+    def redo(self) -> int | None:
+        """Make the change again that was taken back last."""
+        return self._replay(self._undone, self._done)
+
+    def next_frame(self, frame: int) -> int:
+        """The most useful frame that is not labelled, of those not yet visited; of equal ones the farthest from any label."""
+        self._visited.add(frame)
+        left = np.flatnonzero(~self.complete)
+        fresh = left[~np.isin(left, list(self._visited))]
+        if not len(fresh):
+            self._visited = {frame}
+            fresh = left[left != frame]
+        if not len(fresh):
+            return (frame + 1) % len(self.recording)
+        a = self._annotations
+        touched = np.flatnonzero((np.hstack([a.visibility_left, a.visibility_right]) != 0).any(axis=1))
+        gap = np.abs(fresh[:, None] - np.append(touched, frame)).min(axis=1)
+        return int(fresh[np.lexsort((gap, np.nan_to_num(self.usefulness[fresh])))[-1]])
+
+    def _read(self) -> None:
+        r = self.recording
+        nothing = np.full((len(r), len(r.skeleton), 2), np.nan)
+        found = read_coco(self._path, len(r), r.image_size_px, r.skeleton) if self._path.exists() else None
+        self._annotations = found or Annotations(nothing, nothing)
+
+    def _values(self, side: str, frame: int) -> np.ndarray:
+        """x, y, visibility (k, 3) of the landmarks of one image."""
+        a = self._annotations
+        return np.column_stack([getattr(a, f"u_{side}")[frame], getattr(a, f"visibility_{side}")[frame]])
+
+    def _change(self, changes: list[tuple]) -> None:
+        """Write changes (side, frame, number of the landmark, x, y, visibility) as one step that `undo` takes back."""
+        self._done.append(self._write(changes))
+        self._undone.clear()
+
+    def _replay(self, taken: list, given: list) -> int | None:
+        if not taken:
+            return None
+        given.append(self._write(taken[-1]))
+        return taken.pop()[0][1]
+
+    def _write(self, changes: list[tuple]) -> list[tuple]:
+        """Write changes to the file and return those that take them back."""
+        r, n = self.recording, len(self.recording)
+        for side, frame, landmark, x, y, v in changes:
+            if side not in _SIDES or not 0 <= frame < n or not 0 <= landmark < len(r.skeleton) or v not in (-1, 0, 1, 2):
+                raise ValueError(f"mark: {side!r}, frame {frame}, landmark {landmark}, visibility {v}: no such thing here.")
+            if v > 0 and not inside(np.array([x, y], np.float64), r.image_size_px):
+                raise ValueError(f"u: ({x}, {y}) lies outside the image of {r.image_size_px[0]} x {r.image_size_px[1]} px.")
+        self._read()  # what another program wrote meanwhile stays
+        images = {(side, frame): self._values(side, frame) for side, frame, *_ in changes}
+        before = [(side, frame, k, *images[side, frame][k]) for side, frame, k, *_ in changes]
+        for side, frame, k, x, y, v in changes:
+            images[side, frame][k] = (x, y, v) if v > 0 else (np.nan, np.nan, v)
+        for (side, frame), values in images.items():
+            files = sorted((r.folder / side).glob(f"{frame:06d}.*"))
+            name = f"{side}/{files[0].name if files else f'{frame:06d}.jpg'}"
+            mark_coco(self._path, name, r.image_size_px, r.skeleton, values)
+        self._read()
+        return before[::-1]
+
+    @cached_property
+    def widget(self) -> object:
+        """The page as an `anywidget`; displaying the annotator displays it."""
+        import anywidget  # late: whoever only reads recordings needs no Jupyter
+
+        class Page(anywidget.AnyWidget):
+            _esm = Path(__file__).with_name("annotator.js").read_text(encoding="utf-8")
+
+        page = Page()
+        page.on_msg(lambda _, message, buffers: page.send(*self.handle(message)))
+        return page
+
+    def _repr_mimebundle_(self, **options: object) -> object:
+        return self.widget._repr_mimebundle_(**options)
+
+    def handle(self, message: dict) -> tuple[dict, list[bytes]]:
+        """The answer to a message of the page, and images as JPEG: hello, show, next, mark, undo, redo."""
+        todo, frame, images = message["do"], int(message.get("frame") or 0), []
+        answer = {"id": message.get("id")}
+        try:
+            if todo == "hello":
+                r = self.recording
+                answer |= {"name": r.name, "landmarks": r.skeleton, "n": len(r), "size": r.image_size_px}
+                answer |= {"key": os.fspath(r.folder.resolve())}
+                frame = int(np.argmax(np.where(self.complete, -1.0, np.nan_to_num(self.usefulness))))
+            elif todo == "next":
+                frame = self.next_frame(frame)
+            elif todo == "mark":
+                self._change([tuple(mark) for mark in message["marks"]])
+            elif todo in ("undo", "redo"):
+                changed = self.undo() if todo == "undo" else self.redo()
+                frame = frame if changed is None else changed
+            if todo in ("hello", "next", "show"):
+                pair = self.recording.frames[frame]
+                images = [_jpeg(image) for image in (pair.left, pair.right)]
+            answer |= self._state(frame)
+        except (ValueError, OSError) as error:
+            answer["error"] = str(error)
+        return answer, images
+
+    def _state(self, frame: int) -> dict:
+        """What the page shows of a frame: marks, suggestions, epipolar lines, and how much is labelled."""
+        marks = [_plain(self._values(side, frame)) for side in _SIDES]
+        suggested = {name: _plain(u[:, frame]) for name, u in self._suggested.items()}
+        lines = [self._epipolar_line(u, frame) if v > 0 else None for *u, v in self._values("left", frame)]
+        told = {"frame": frame, "marks": marks, "lines": lines, "usefulness": float(self.usefulness[frame])}
+        return told | suggested | {"complete": self.complete.tolist(), "file": self._path.name}
+
+    def _epipolar_line(self, u_left: np.ndarray, frame: int) -> list | None:
+        """Right pixels of points on the viewing ray of a left pixel."""
+        if self._rig is None:
+            return None
+        left, near = self._rig.left, self._x_mm[np.isfinite(self._x_mm).all(axis=-1)]
+        x = (near.mean(axis=0) if len(near) else np.zeros(3)) + _DEPTHS_MM[:, None] * left.viewing_direction
+        for _ in range(4):  # Gauss-Newton; the first step is exact where the camera is affine
+            off = np.asarray(u_left) - left.project(x)
+            x = x + np.einsum("nij,nj->ni", np.linalg.pinv(left.jacobian(x)), off)
+        return _plain(self._rig.right.project(x))
+
+
+def _plain(values: np.ndarray) -> list:
+    """Nested lists with None for NaN."""
+    return np.where(np.isfinite(values), values.astype(object), None).tolist()
+
+
+def _jpeg(image: np.ndarray) -> bytes:
+    return cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes()
