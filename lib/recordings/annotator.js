@@ -56,7 +56,7 @@ const STYLE = `
 .ms-annotator .chip small { color: var(--soft); }
 .ms-annotator .strip { display: flex; height: 8px; background: var(--line); cursor: pointer; }
 .ms-annotator .strip div { flex: 1; min-width: 0; }
-.ms-annotator .state { padding: 1px 9px; border-radius: 10px; background: #2e7d3222; }
+.ms-annotator .state { min-height: 1.45em; padding: 1px 9px; border-radius: 10px; background: #2e7d3222; }
 .ms-annotator .state.bad { background: #b42318; color: #fff; font-weight: 600; }
 .ms-annotator .help { position: absolute; inset: 44px 12px auto auto; background: var(--paper); border: 1px solid var(--line);
   border-radius: 8px; padding: 10px 16px; box-shadow: 0 8px 30px #0005; z-index: 5; columns: 2; column-gap: 28px; max-width: 92%; }
@@ -89,6 +89,8 @@ function render({ model, el }) {
   const bottom = element("div", "bar", root);
   const chips = element("span", "bar", bottom);
   chips.style.padding = 0;
+  const legend = element("span", "", bottom, "\u25c7 robot  \u25a1 detector");
+  legend.style.color = "var(--soft)";
   element("div", "gap", bottom);
   for (const [text, key] of [["undo", "u"], ["next useful", "n"], ["tool", "t"], ["whole image", "0"], ["keys", "?"]]) {
     const button = element("button", "", bottom, text);
@@ -181,10 +183,14 @@ function render({ model, el }) {
     ask({ do: "mark", marks, frame: shown.frame });
     draw();
   }
-  function advance() {
-    if (shown.marks[active].some((one) => one[2] === 0)) landmark = open(active);
-    else if (shown.marks[1 - active].some((one) => one[2] === 0)) { active = 1 - active; landmark = open(active); }
+  function choose(index, k) { // the keyboard's cursor goes to where the landmark is, or is suggested
+    [active, landmark] = [index, k];
+    if ([shown.marks, shown.robot, shown.detector].some((u) => u[index][k][0] !== null)) views[index].cursor = null;
     draw();
+  }
+  function advance() {
+    if (shown.marks[active].some((one) => one[2] === 0)) choose(active, open(active));
+    else if (shown.marks[1 - active].some((one) => one[2] === 0)) choose(1 - active, open(1 - active));
   }
   function put(view, u) {
     const [width, height] = about.size, old = shown.marks[view.index][landmark];
@@ -227,7 +233,7 @@ function render({ model, el }) {
   const pixel = (view, s) => [s[0] / view.zoom + view.x - 0.5, s[1] / view.zoom + view.y - 0.5];
   function cursor(view) {
     if (!view.cursor) {
-      const from = [shown.robot, shown.detector, shown.marks].map((u) => u[view.index][landmark]).find((u) => u[0] !== null);
+      const from = [shown.marks, shown.robot, shown.detector].map((u) => u[view.index][landmark]).find((u) => u[0] !== null);
       view.cursor = from ? [from[0], from[1]] : pixel(view, [view.width / 2, view.height / 2]);
     }
     return view.cursor;
@@ -253,7 +259,7 @@ function render({ model, el }) {
       chip.lastChild.textContent = dots[k];
     });
     const done = shown.complete.filter(Boolean).length;
-    place.textContent = `frame ${shown.frame} of 0 to ${about.n - 1} \u00b7 ${done} labelled` +
+    place.textContent = `frame ${shown.frame} (0 to ${about.n - 1}) \u00b7 ${done} labelled` +
       (shown.usefulness > 0 ? ` \u00b7 detector and robot differ by ${shown.usefulness.toFixed(1)} px` : "");
     [...strip.children].forEach((cell, f) => {
       cell.style.background = f === shown.frame ? "#0072b2" : shown.complete[f] ? "#2e9d5b" : "";
@@ -271,6 +277,11 @@ function render({ model, el }) {
     return c;
   }
   function paintImage(view) {
+    const r = view.box.getBoundingClientRect(), scale = window.devicePixelRatio, ratio = Number.isInteger(scale) ? 1 : scale;
+    for (const canvas of [view.picture, view.overlay]) { // a browser draws from whole pixels, wherever the box begins
+      canvas.style.left = `${Math.round(r.left * ratio) / ratio - r.left}px`;
+      canvas.style.top = `${Math.round(r.top * ratio) / ratio - r.top}px`;
+    }
     const c = clear(view.picture);
     view.picture.style.filter = `contrast(${contrast}) brightness(${brightness})`;
     c.imageSmoothingEnabled = view.zoom < 3;
@@ -279,7 +290,7 @@ function render({ model, el }) {
   }
   function stroke(c, colour, width, dash = []) { // a dark seam keeps every colour readable on every picture
     c.setLineDash(dash);
-    for (const [style, wide] of [["#000a", width + 2], [colour, width]]) { c.strokeStyle = style; c.lineWidth = wide; c.stroke(); }
+    for (const [style, wide] of [["#0008", width + 1.6], [colour, width]]) { c.strokeStyle = style; c.lineWidth = wide; c.stroke(); }
   }
   function path(c, ...parts) {
     c.beginPath();
@@ -295,28 +306,29 @@ function render({ model, el }) {
       const s = line.map((u) => screen(view, u)), [a, b] = [s[0], s.at(-1)], far = 1e4 / (Math.hypot(b[0] - a[0], b[1] - a[1]) || 1);
       const along = [(b[0] - a[0]) * far, (b[1] - a[1]) * far];
       path(c, [[a[0] - along[0], a[1] - along[1]], ...s, [b[0] + along[0], b[1] + along[1]]]);
-      c.globalAlpha = k === landmark ? 1 : 0.45;
-      stroke(c, COLOURS[k], k === landmark ? 1.5 : 1);
+      c.globalAlpha = k === landmark ? 1 : 0.6;
+      stroke(c, COLOURS[k], 1.6);
       c.globalAlpha = 1;
     });
     if (suggestions) for (const name of ["detector", "robot"]) shown[name][view.index].forEach((u, k) => {
       if (u[0] === null || shown.marks[view.index][k][2] > 0) return;
-      const [x, y] = screen(view, u), r = 7;
+      const [x, y] = screen(view, u), r = name === "robot" ? 10 : 7;
       if (name === "robot") path(c, [[x - r, y], [x, y - r], [x + r, y], [x, y + r], [x - r, y]]);
       else path(c, [[x - r + 1, y - r + 1], [x + r - 1, y - r + 1], [x + r - 1, y + r - 1], [x - r + 1, y + r - 1], [x - r + 1, y - r + 1]]);
-      stroke(c, COLOURS[k], 1, [3, 2]);
+      stroke(c, COLOURS[k], 1.4);
     });
     shown.marks[view.index].forEach(([x, y, v], k) => {
       if (v <= 0) return;
       const s = screen(view, [x, y]);
-      path(c, ...cross(s, 3, 12));
-      stroke(c, COLOURS[k], k === landmark && current ? 2 : 1.5, v === 1 ? [3, 2] : []);
+      path(c, ...cross(s, 3, 13));
+      stroke(c, COLOURS[k], k === landmark && current ? 2.6 : 2, v === 1 ? [3, 2] : []);
       c.setLineDash([]);
       c.lineWidth = 3;
       c.strokeStyle = "#000b";
-      c.strokeText(about.landmarks[k], s[0] + 11, s[1] - 7);
+      const text = about.landmarks[k] + (v === 1 ? " (hidden)" : "");
+      c.strokeText(text, s[0] + 11, s[1] - 7);
       c.fillStyle = COLOURS[k];
-      c.fillText(about.landmarks[k] + (v === 1 ? " (hidden)" : ""), s[0] + 11, s[1] - 7);
+      c.fillText(text, s[0] + 11, s[1] - 7);
     });
     const absent = about.landmarks.filter((_, k) => shown.marks[view.index][k][2] === -1);
     if (absent.length) { c.fillStyle = "#fff"; c.fillText(`not in this image: ${absent.join(", ")}`, 10, view.height - 10); }
@@ -369,8 +381,8 @@ function render({ model, el }) {
     else if (!shown) return false;
     else if (moves[key]) move(moves[key][0] * step, moves[key][1] * step);
     else if (key === "Enter") put(view, cursor(view));
-    else if (key >= "1" && key <= String(about.landmarks.length)) { landmark = Number(key) - 1; view.cursor = null; }
-    else if (plain === "v") { active = 1 - active; landmark = open(active); }
+    else if (key >= "1" && key <= String(about.landmarks.length)) choose(active, Number(key) - 1);
+    else if (plain === "v") choose(1 - active, open(1 - active));
     else if (plain === "a" || plain === "d") accept(plain === "a" ? "robot" : "detector", shift);
     else if (plain === "h") {
       const [x, y, v] = shown.marks[active][landmark];
@@ -406,7 +418,7 @@ function render({ model, el }) {
   root.addEventListener("blur", draw);
   for (const view of views) {
     let from = null;
-    const at = (event) => { const r = view.box.getBoundingClientRect(); return [event.clientX - r.left, event.clientY - r.top]; };
+    const at = (event) => { const r = view.overlay.getBoundingClientRect(); return [event.clientX - r.left, event.clientY - r.top]; };
     view.box.addEventListener("pointerdown", (event) => {
       root.focus({ preventScroll: true });
       view.box.setPointerCapture(event.pointerId);
@@ -446,7 +458,7 @@ function render({ model, el }) {
       chip.append(name);
       element("kbd", "", chip, String(k + 1));
       element("small", "", chip);
-      chip.onclick = () => { landmark = k; root.focus(); draw(); };
+      chip.onclick = () => { choose(active, k); root.focus(); };
     });
     for (let f = 0; f < about.n; f++) element("div", "", strip);
     measure();
