@@ -6,6 +6,7 @@ from scipy.stats import chi2
 
 from lib.calibration import NoConsensusError, calibrate, estimate_time_offset
 from lib.correspondences import Correspondences
+from notebooks.studies.spoiling import Scene
 from tests.calibration.rigs import data, tool_sweep
 from tests.calibration.test_instruments import video
 
@@ -105,6 +106,12 @@ def test_regions_of_the_projections_hold_what_they_claim(kind):
         effective.append(found.effective_rows)
     assert 0.88 < np.mean(inside) <= 1.0
     assert np.median(effective) < 35 if kind == "lasting" else np.median(effective) > 40
+
+
+def test_rows_that_err_alike_for_some_frames_are_no_consensus_of_their_own():
+    for seed in range(20):
+        scene = Scene(np.random.default_rng([900, seed]), frames=12, fps=5.0, speed_mm_s=6.0, memory=0.8)
+        assert calibrate(scene.take().data, offsets=False).view_inliers.mean() > 0.6
 
 
 def test_the_clock_is_found_among_wrong_detections():
