@@ -48,7 +48,7 @@ def holds(condition: str, values: Mapping[str, float]) -> bool:
     >>> holds("2 * {a_um} < {b_um}", {"a_um": 1.0, "b_um": 3.0})
     True
     """
-    return bool(eval(_NUMBER.sub(lambda found: repr(float(values[found[1]])), condition), {"__builtins__": {}}))
+    return bool(eval(_NUMBER.sub(lambda found: repr(float(values[found[1]])), condition), {"__builtins__": {"abs": abs}}))
 
 
 def learnt(claims: Mapping[str, str]) -> Markdown:

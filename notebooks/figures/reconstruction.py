@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
+from IPython.display import HTML
 from ipywidgets import SelectionSlider, VBox
 from matplotlib.axes import Axes
 from matplotlib.colors import LightSource, PowerNorm
@@ -22,7 +23,7 @@ from lib.matching.pyramid import PATCH
 from lib.surface import BSplineSurface, Mesh, ToolDistance
 from lib.workbench.results import Table
 from notebooks.figures.interactive import explore
-from notebooks.figures.style import COLOURS, LANDMARK_COLOURS, figure, show_image
+from notebooks.figures.style import COLOURS, LANDMARK_COLOURS, figure, show_image, table
 from notebooks.studies.matching_evaluation import DisparityScore
 
 if TYPE_CHECKING:
@@ -36,12 +37,13 @@ __all__ = [
     "descriptor_channels",
     "disparity_errors",
     "epipolar_geometry",
+    "epipolar_line",
     "error_budget",
     "error_maps",
+    "growing",
     "held_out_curve",
     "match_fields",
     "mesh_still",
-    "mesh_view",
     "point_errors",
     "profiles",
     "reconstruction",
@@ -49,12 +51,13 @@ __all__ = [
     "recorded_table",
     "response_map",
     "response_pyramid",
+    "scene_view",
     "score_table",
     "smoothness_sections",
     "smoothness_slider",
     "sparsification",
+    "spline_1d",
     "stereo_pair",
-    "table",
     "tool_over_surface",
 ]
 
@@ -217,11 +220,11 @@ def profiles(
     *,
     title: str = "",
 ) -> Figure:
-    """A section through the surface: the depths of the points near it, and curves (depth mm, colour) by name."""
-    page, ax = figure(width_in=11, height_in=3.4)
+    """A section against a reference: points near it, and curves (um beyond the reference, colour) by name."""
+    page, ax = figure(width_in=9, height_in=3.6)
     _section(ax, position_mm, points, curves)
-    ax.set(ylabel="depth along the view (mm)", title=title)
-    ax.legend(loc="best", fontsize=8, ncols=2)
+    ax.set(ylabel="beyond the reference (um)", title=title)
+    page.legend(loc="outside lower center", fontsize=9, ncols=4)
     return page
 
 
@@ -258,7 +261,7 @@ def held_out_curve(
         true.grid(False)
         true.spines["right"].set_visible(True)
         handles = ax.get_legend_handles_labels()[0] + true.get_legend_handles_labels()[0]
-        ax.legend(handles=handles, fontsize=8, loc="upper center")
+        page.legend(handles=handles, fontsize=8, loc="outside lower center", ncols=3)
     else:
         ax.legend(fontsize=8)
     return page
@@ -320,7 +323,9 @@ def _relative_section(
     ax.set(xlabel="along the image row (mm)", ylim=(limit_um, -limit_um))
 
 
-def score_table(scores: dict[str, dict[str, tuple[Matches, DisparityScore, float]]]) -> Figure:
+def score_table(
+    scores: dict[str, dict[str, tuple[Matches, DisparityScore, float]]], caption: str
+) -> HTML:
     """Matchers on real pairs: matches, median error, share above 1 and 2 px, seconds."""
     header = ["pair", "method", "matches", "median (px)", "> 1 px", "> 2 px", "seconds"]
     rows = [
@@ -328,7 +333,7 @@ def score_table(scores: dict[str, dict[str, tuple[Matches, DisparityScore, float
         for pair, found in scores.items()
         for method, (m, s, seconds) in found.items()
     ]
-    return table(header, rows)
+    return table(header, rows, caption)
 
 
 def error_maps(maps_um: dict[str, np.ndarray], *, limit_um: float | None = None, signed: bool = True) -> Figure:
@@ -458,24 +463,7 @@ def sparsification(curves: dict[str, dict[str, tuple[float, np.ndarray]]], kept:
     return page
 
 
-def table(header: Sequence[str], rows: Sequence[Sequence[str]], *, width_in: float = 9.0) -> Figure:
-    """Rows of text under a header."""
-    page, ax = figure(width_in=width_in, height_in=0.32 * len(rows) + 0.6)
-    ax.axis("off")
-    drawn = ax.table(
-        [list(row) for row in rows] or [[""] * len(header)],
-        colLabels=list(header),
-        loc="center",
-        cellLoc="center",
-        edges="horizontal",
-    )
-    drawn.auto_set_font_size(False)
-    drawn.set_fontsize(10)
-    drawn.scale(1, 1.4)
-    return page
-
-
-def recorded_table(recorded: Mapping[str, Table]) -> Figure:
+def recorded_table(recorded: Mapping[str, Table], caption: str) -> HTML:
     """Recorded surface errors with true cameras (`surfaces`) and with calibrated ones (`calibrated_surfaces`)."""
     rows = []
     for row in recorded["surfaces"].rows if "surfaces" in recorded else ():
@@ -492,12 +480,10 @@ def recorded_table(recorded: Mapping[str, Table]) -> Figure:
                 means = (np.mean(found[f"{name}_{key}_um"]) for key in ("robot_frame", "rigid", "affine"))
                 label = f"75 frames, {setting}: {name.replace('_', ', ')} cameras"
                 rows.append([label, *(f"{mean:.1f}" for mean in means)])
-    page = table(["surface", "RMS (um)", "rigid motion taken out", "affine map taken out"], rows, width_in=13)
-    page.axes[0].tables[0].auto_set_column_width(range(4))
-    return page
+    return table(["surface", "RMS (um)", "rigid motion taken out", "affine map taken out"], rows, caption)
 
 
-def recorded_speeds(recorded: Mapping[str, Table]) -> Figure:
+def recorded_speeds(recorded: Mapping[str, Table], caption: str) -> HTML:
     """Recorded CPU and wall seconds, and errors, of `l1_solver`, `reconstruction_speed` and `matching`.
 
     CPU seconds hold on a busy machine, wall seconds on an idle one.
@@ -533,39 +519,43 @@ def recorded_speeds(recorded: Mapping[str, Table]) -> Figure:
         for e in (recorded["matching"].rows if "matching" in recorded else ())
         if e["width_px"] and np.isfinite(e.get("all_median_px", np.nan))
     ]
-    page = table(["measured", "CPU (s)", "wall (s)", "error", "details"], rows, width_in=13)
-    page.axes[0].tables[0].auto_set_column_width(range(5))
-    return page
+    return table(["measured", "CPU (s)", "wall (s)", "error", "details"], rows, caption)
 
 
 def tool_over_surface(
     image: np.ndarray, surface: BSplineSurface, rig: StereoRig, x_tool_mm: np.ndarray, distance: ToolDistance
 ) -> Figure:
-    """The image around the tool, and a section through the surface along the row of tip_1 with the landmarks (3, 3) mm."""
-    page, (left, right) = figure(1, 2, width_in=13, height_in=3.8, width_ratios=(1, 1.4))
-    show_image(left, image, "Left image")
-    u = rig.left.project(x_tool_mm)
-    row = float(np.nanmean(u[1:, 1])) if np.isfinite(u[1:, 1]).any() else image.shape[0] / 2
-    columns = np.arange(0, image.shape[1], 8.0)
-    view, mm_per_px = rig.left.viewing_direction, 1 / np.linalg.norm(rig.left.linear[0])
-    depth = surface(np.column_stack([columns, np.full_like(columns, row)])) @ view
-    left.axhline(row, color=COLOURS["baseline"], ls=":")
-    right.plot(columns * mm_per_px, depth, color=COLOURS["ours"], label="surface along the dotted row")
+    """The image, and a section through the surface along the tool, with the landmarks (3, 3) mm above it."""
+    page, (left, right) = figure(1, 2, width_in=11, height_in=3.8, width_ratios=(1, 1.3))
+    u, view, mm_per_px = rig.left.project(x_tool_mm), rig.left.viewing_direction, 1 / np.linalg.norm(rig.left.linear[0])
+    show_image(left, image, "Left image, and the section along the tool")
+    known = np.isfinite(u).all(axis=1)
+    if not known.any():
+        return page
+    tip = u[1:][known[1:]].mean(axis=0) if known[1:].any() else u[0]
+    along = tip - u[0] if known[0] and known[1:].any() else np.array([1.0, 0.0])
+    along = along / np.linalg.norm(along)
+    reach = np.arange(-4.0, 4.01, 0.05) / mm_per_px
+    line = tip + reach[:, None] * along
+    line = line[surface.grid.inside(line)]
+    left.plot(*line.T, color="white", lw=1, ls="--")
+    right.plot((line - tip) @ along * mm_per_px, surface(line) @ view, color=COLOURS["ours"], label="surface")
     for k, (name, colour) in enumerate(LANDMARK_COLOURS.items()):
-        if not np.isfinite(u[k]).all():
+        if not known[k]:
             continue
-        at, along = x_tool_mm[k] @ view, distance.along_view_mm[k]
-        label = f"{name}: {along:.2f} mm along the view" if np.isfinite(along) else f"{name}: beyond the surface"
+        at, far = x_tool_mm[k] @ view, distance.along_view_mm[k]
+        place = (u[k] - tip) @ along * mm_per_px
+        label = f"{name}: {1e3 * far:.0f} um above it" if np.isfinite(far) else f"{name}: beyond the surface"
         left.plot(*u[k], "o", color=colour, markeredgecolor="black")
-        right.plot([u[k, 0] * mm_per_px] * 2, [at, at + along], color=colour, lw=1.5)
-        right.plot(u[k, 0] * mm_per_px, at, "o", color=colour, markeredgecolor="black", label=label)
-    right.set(xlabel="along the image row (mm)", ylabel="depth along the view (mm)")
+        right.plot([place] * 2, [at, at + far], color=colour, lw=2)
+        right.plot(place, at, "o", color=colour, markeredgecolor="black", label=label)
+    right.set(xlabel="along the tool (mm)", ylabel="depth along the view (mm)", title="The distances that all this is for")
     right.invert_yaxis()
-    right.legend(fontsize=8)
+    right.legend(fontsize=9)
     return page
 
 
-def case_table(found: Sequence[Case]) -> Figure:
+def case_table(found: Sequence[Case], caption: str) -> HTML:
     """Surface error of simulated scenes, and of the sphere prior on eyes."""
     header = ["scene", "matches used", "surface RMS (um)", "depth RMS (um)", "sphere prior RMS (um)", "times better"]
     rows = []
@@ -582,24 +572,92 @@ def case_table(found: Sequence[Case]) -> Figure:
                 f"{one.sphere_rms_um / one.rms_um:.0f}" if sphere else "",
             ]
         )
-    return table(header, rows, width_in=11)
+    return table(header, rows, caption)
 
 
-def mesh_view(mesh: Mesh, *, height_px: int = 520) -> go.Figure:
-    """A plotly figure of the mesh that turns under the mouse in JupyterLab; no window, no renderer."""
+def scene_view(
+    mesh: Mesh, rig: StereoRig, x_tool_mm: np.ndarray, distance: ToolDistance, sd_um: float, *, height_px: int = 560
+) -> go.Figure:
+    """A plotly scene that turns under the mouse: surface, forceps (3, 3) mm, both cameras' rays, the tip's distance."""
     import plotly.graph_objects as go
 
     colours = [f"rgb({r},{g},{b})" for r, g, b in mesh.colours.tolist()]
-    x, y, z = np.round(mesh.vertices_mm, 4).T
     i, j, k = mesh.faces.T
-    view = go.Figure(go.Mesh3d(x=x, y=y, z=z, i=i, j=j, k=k, vertexcolor=colours, flatshading=False))
-    view.update_traces(lighting={"ambient": 0.65, "diffuse": 0.6, "specular": 0.05}, hoverinfo="x+y+z")
+    x, y, z = np.round(mesh.vertices_mm, 3).T
+    view = go.Figure(go.Mesh3d(x=x, y=y, z=z, i=i, j=j, k=k, vertexcolor=colours, flatshading=False, hoverinfo="x+y+z"))
+    view.update_traces(lighting={"ambient": 0.65, "diffuse": 0.6, "specular": 0.05})
+
+    def line(points: np.ndarray, name: str, colour: str, width: float, dash: str = "solid") -> None:
+        style = {"color": colour, "width": width, "dash": dash}
+        view.add_scatter3d(**dict(zip("xyz", points.T, strict=True)), mode="lines", name=name, line=style)
+
+    if np.isfinite(x_tool_mm).all():
+        base, *tips = x_tool_mm
+        behind = base + 2.5 * (base - np.mean(tips, axis=0)) / np.linalg.norm(base - np.mean(tips, axis=0))
+        line(np.array([behind, base]), "shaft", "#8a8f98", 16)
+        for name, tip in zip(("tip_1", "tip_2"), tips, strict=True):
+            line(np.array([base, tip]), f"jaw to {name}", LANDMARK_COLOURS[name], 9)
+        for name, camera in (("left", rig.left), ("right", rig.right)):
+            ray = tips[0] - np.array([[8.0], [0.0]]) * camera.viewing_direction
+            line(ray, f"ray of the {name} camera", COLOURS[name], 3, "dash")
+        if np.isfinite(distance.along_view_mm[1]):
+            below = tips[0] + distance.along_view_mm[1] * rig.left.viewing_direction
+            said = f"{1e3 * distance.along_view_mm[1]:.0f} um (sd {sd_um:.0f}) along the view"
+            line(np.array([tips[0], below]), said, "#111111", 8)
+    axes = {f"{axis}axis_title": f"{axis} (mm)" for axis in "xyz"}
+    up = dict(zip("xyz", (-rig.left.viewing_direction).tolist(), strict=True))
+    camera = {"up": up, "eye": {axis: 1.1 * value + 0.6 for axis, value in up.items()}}
     view.update_layout(
-        scene={"aspectmode": "data", "xaxis_title": "x (mm)", "yaxis_title": "y (mm)", "zaxis_title": "z (mm)"},
-        margin={"l": 0, "r": 0, "t": 0, "b": 0},
-        height=height_px,
-    )
+        scene={"aspectmode": "data", "camera": camera, **axes}, margin={"l": 0, "r": 0, "t": 0, "b": 0},
+        height=height_px, legend={"x": 0, "y": 1, "bgcolor": "rgba(255,255,255,0.7)"},
+    )  # fmt: skip
     return view
+
+
+def growing(responses: Mapping[str, np.ndarray]) -> Figure:
+    """Response maps of one patch at growing sizes, each in units of its peak."""
+    page, axes = figure(1, len(responses), width_in=3.6 * len(responses), height_in=2.9)
+    for ax, (name, response) in zip(axes, responses.items(), strict=True):
+        high = int((response > 0.8 * response.max()).sum())
+        show_image(ax, response / response.max(), f"{name}: {high} places above 80 %")
+        ax.images[0].set(cmap="magma", clim=(0, 1), interpolation="nearest")
+        row, column = np.unravel_index(response.argmax(), response.shape)
+        ax.plot(column, row, "+", color="cyan", markersize=14, markeredgewidth=2)
+    page.colorbar(axes[-1].images[0], ax=list(axes), label="response / peak", shrink=0.8)
+    return page
+
+
+def spline_1d(t: np.ndarray, data: np.ndarray, wrong: np.ndarray, curves: Mapping[str, np.ndarray]) -> Figure:
+    """Points of one dimension, the wrong ones as crosses, and curves through them."""
+    page, ax = figure(width_in=8, height_in=3.4)
+    ax.plot(t[~wrong], data[~wrong], ".", color=COLOURS["baseline"], label="points")
+    ax.plot(t[wrong], data[wrong], "x", color=COLOURS["warning"], label="wrong points")
+    for (name, curve), colour in zip(curves.items(), ("truth", "paper", "ours"), strict=True):
+        ax.plot(t, curve, color=COLOURS[colour], label=name)
+    ax.set(xlabel="t", ylabel="mm")
+    ax.legend(ncols=2)
+    return page
+
+
+def epipolar_line(left: np.ndarray, right: np.ndarray, rig: StereoRig, pixel: np.ndarray, matches: Matches) -> Figure:
+    """A pixel of the left image; its line in the right one with ticks of 500 um of depth; and the nearest match."""
+    n, e = rig.epipolar_normal, -rig.epipolar_normal @ rig.offset_px
+    along = np.array([n[3], -n[2]]) / np.hypot(n[2], n[3])
+    foot = -(n[:2] @ pixel + e) * n[2:] / (n[2:] @ n[2:])
+    near = int(np.argmin(np.linalg.norm(matches.u_left - pixel, axis=1)))
+    centre = foot + along * ((matches.u_right[near] - foot) @ along)
+    step = np.linalg.norm(rig.right.linear @ rig.left.viewing_direction) / 2  # px for 500 um of depth
+    page, axes = figure(1, 2, width_in=10, height_in=3.4)
+    show_image(axes[0], left, "Left: the pixel")
+    axes[0].plot(*pixel, "o", color="white", markeredgecolor="black", markersize=8)
+    show_image(axes[1], right, "Right: its line, around the nearest match")
+    ends = centre + np.array([[-400.0], [400.0]]) * along
+    axes[1].plot(*ends.T, color="cyan", lw=1.2)
+    ticks = centre + step * np.arange(-12, 13)[:, None] * along
+    axes[1].plot(*ticks.T, "|", color="cyan", markersize=7)
+    axes[1].plot(*matches.u_right[near], "o", color=COLOURS["warning"], markeredgecolor="black")
+    axes[1].set(xlim=(centre[0] - 120, centre[0] + 120), ylim=(centre[1] + 70, centre[1] - 70))
+    return page
 
 
 def error_budget(rms_um: dict[str, float], *, highlight: str | None = None, paper_um: float | None = None) -> Figure:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import html
+from collections.abc import Sequence
+
 import matplotlib.pyplot as plt
 import numpy as np
+from IPython.display import HTML
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-__all__ = ["COLOURS", "LANDMARK_COLOURS", "figure", "show_image"]
+__all__ = ["COLOURS", "LANDMARK_COLOURS", "figure", "show_image", "table"]
 
 #: Colour-blind safe (Okabe and Ito), named by what they mean here.
 COLOURS = {
@@ -58,3 +62,13 @@ def show_image(axes: Axes, image: np.ndarray, title: str = "") -> Axes:
     for spine in axes.spines.values():
         spine.set_visible(False)
     return axes
+
+
+def table(header: Sequence[str], rows: Sequence[Sequence[str]], caption: str) -> HTML:
+    """Rows of text under a header, as HTML: they can be searched, copied and read on a small screen."""
+    lines = [("th", header), *(("td", row) for row in rows)]
+    body = "".join(
+        f"<tr>{''.join(f'<{kind}>{html.escape(str(entry))}</{kind}>' for entry in row)}</tr>" for kind, row in lines
+    )
+    # Wide tables scroll by themselves and leave the page in its place.
+    return HTML(f'<div style="overflow-x:auto"><table><caption>{html.escape(caption)}</caption>{body}</table></div>')
