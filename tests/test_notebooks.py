@@ -135,8 +135,8 @@ ELSEWHERE = {
     "00": "",
     "01": "01-(rig|effects|slider|pair|check|motion|format|scenes|training|realism|dataset).*",
     "02": "02-(04|06|08|10|12|13|37|39|21|31|40|23|33|34)",
-    "03": "03-(data|dlt|resection|elimination|persp|claim|energy|weights|fit|ladder|dist|uncert|elli|advice|clock|record|resol|board|factor|robot).*",
-    "04": "04-(desc|pyr|top|two|epi|match|fields|l1|spline|eq6|smooth|cvxpy|surface-rec|export|err|gal|rec|sca|real|distance-sc).*",
+    "03": "03-(data|dlt|resec|elim|pers|claim|ener|weig|fit|lad|dist|uncert|elli|advice|clock|record|reso|boar|fac|robot).*",
+    "04": "04-(desc|pyr|top|two|epi|match|fields|l1|spli|eq6|smoo|cvxpy|surface-r|export|err|gal|rec|sca|real|distance-sc).*",
     "05": "05-(one|eq7|ellipses|experiment|robust|icp|alone|drift).*",
     "06": "06-slider",
 }
