@@ -23,7 +23,7 @@ from lib.workbench.parameters import declared_grid, declared_parameters, parse_p
 WALK = sorted(paths.NOTEBOOKS.glob("*.ipynb"))
 STUDIES = sorted(paths.NOTEBOOKS.glob("studies/*.ipynb"))
 ORDER = ["00_overview", "01_data", "02_landmark_detection", "03_affine_calibration", "04_stereo_reconstruction",
-         "05_registration", "06_online_pipeline"]  # fmt: skip
+         "05_registration", "06_online_pipeline", "07_your_own_recording"]  # fmt: skip
 
 
 def each(notebooks):
@@ -139,10 +139,12 @@ ELSEWHERE = {
     "04": "04-(desc|pyr|top|two|epi|match|fields|l1|spli|eq6|smoo|cvxpy|surface-r|export|err|gal|rec|sca|real|distance-sc).*",
     "05": "05-(one|eq7|ellipses|experiment|robust|icp|alone|drift).*",
     "06": "06-slider",
+    "07": "",
 }
 #: Numbers that only a calibration that is believed may give.
 FOLLOWS = re.compile(
-    "overview_(height|triang|surf|regis)|surface_|tool_|reconstruction_(sigma|depth)|registration_error|pipeline_"
+    "overview_(height|triang|surf|regis)|surface_|tool_|reconstruction_(sigma|depth)|registration_error|pipeline_|"
+    "own_(reprojection|held_out|surface|motion)"
 )
 N_FRAMES, SHRINK, BLANK_FRAME = 6, 4, 2
 
@@ -230,7 +232,7 @@ class Run:
         raise Stopped(reason)
 
 
-@pytest.mark.parametrize("number", ["00", "01", "03", "05", "06", pytest.param("04", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("number", ["00", "01", "03", "05", "06", "07", pytest.param("04", marks=pytest.mark.slow)])
 def test_a_short_recording_without_truth_runs_and_no_caption_speaks_of_a_truth(number, small, monkeypatch):
     run = Run(number, small, monkeypatch)
     assert run.left_out is None and (run.captions or number == "05")
@@ -242,9 +244,11 @@ def test_a_short_recording_without_truth_runs_and_no_caption_speaks_of_a_truth(n
         assert run.metrics["data_frames_without_kinematics"] == 1
     if number == "06":
         assert run.metrics["pipeline_frames_to_calibration"] <= N_FRAMES and "pipeline_push_error_um" not in run.metrics
+    if number == "07":
+        assert run.metrics["own_surface_points"] > 100 and "own_clock_offset_ms" not in run.metrics
 
 
-@pytest.mark.parametrize("number", ["00", "02", "03", "04", "05", "06"])
+@pytest.mark.parametrize("number", ["00", "02", "03", "04", "05", "06", "07"])
 def test_where_nothing_is_detected_a_notebook_says_so_and_states_no_number(number, small, monkeypatch):
     run = Run(number, small, monkeypatch, sighted=False, force=True)
     assert "left out" in run.left_out and run.verdicts[-1].is_red

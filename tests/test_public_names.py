@@ -26,6 +26,7 @@ ATTRIBUTES = {
     landmarks.Landmarks: "u covariance confidence",
     landmarks.Detector: "load track __call__",
     recordings.Recording: "open frames kinematics annotations truth",
+    recordings.Annotator: "mark know undo redo next_frame",
     online.OnlinePipeline: "step",
 }
 ARGUMENTS = {
