@@ -46,7 +46,7 @@ TRACKED_FROM = 0.5
 CLOSE = ("closeup", "closer", "tracking")
 #: Where the first stage is less sure than this of a landmark, other places are looked at: this many tools, made of peaks at
 #: these scales of the first stage's input.
-_SURE, _CANDIDATES, _SCALES = 0.8, 5, (1.0, 1.5)
+_SURE, _CANDIDATES, _SCALES = 0.5, 5, (1.0, 1.5)
 #: Stages that use another stage's network.
 _NETWORK_OF = {"again": "tool", "closer": "closeup", "tracking": "closeup"}
 
