@@ -19,7 +19,7 @@ from lib.recordings import Recording
 from lib.workbench import pages, report
 from notebooks.figures import course
 
-TAUGHT = ("03", "04", "05")
+TAUGHT = ("00", "03", "04", "05", "06")
 WALK = [path for path in sorted(paths.NOTEBOOKS.glob("*.ipynb")) if path.stem[:2] in TAUGHT]
 EQUATIONS = range(1, 8)  # of the paper
 #: Worked out in cells too, though the paper gives them no number.
