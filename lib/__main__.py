@@ -26,6 +26,8 @@ python3 -m lib COMMAND [options]        (in the folder of the workbench)
               one notebook over a grid of parameters, on Dask; a table and a plot of each metric
   check RECORDING [--out FOLDER]
               is a recording fit for use, and if not, why: one page, check.html, and check.json
+  adapt RECORDING [--labels FILE] [--minutes 20] [--out FOLDER]
+              let the robot teach the detector a new microscope, eye and tool
   import SOURCE --map MAPPING.toml [--guess | --out RECORDING]
               a recording from videos, a robot's log and labels, as the mapping says
   detect, calibrate, reconstruct, register RECORDING [--out FOLDER]
@@ -155,6 +157,7 @@ FUNCTIONS = {
     "online": ("lib.online.command", "main"),
     "train": ("lib.training.command", "main"),
     "evaluate": ("lib.training.command", "main_evaluate"),
+    "adapt": ("lib.adapt.report", "main"),
 }
 COMMANDS = {"test": test, "bench": bench, "lab": lab, **{name: _main_of(name, *FUNCTIONS[name]) for name in FUNCTIONS}}
 

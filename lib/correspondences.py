@@ -22,7 +22,7 @@ LANDMARKS = ("base", "tip_1", "tip_2")
 #: A detection of lower confidence counts as not seen.
 MIN_CONFIDENCE = 0.2
 #: The cure where a detector does not know the pictures.
-TRAIN_FURTHER = "label some frames and train it further: `python3 -m lib train finetune RECORDING --out weights.safetensors`"
+TRAIN_FURTHER = "let the robot teach it: `python3 -m lib adapt RECORDING`"
 #: Half the time over which a velocity is measured: long enough to average the robot's noise, short for its motion.
 _VELOCITY_S = 0.05
 

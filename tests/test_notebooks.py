@@ -23,7 +23,8 @@ from lib.workbench.parameters import declared_grid, declared_parameters, parse_p
 WALK = sorted(paths.NOTEBOOKS.glob("*.ipynb"))
 STUDIES = sorted(paths.NOTEBOOKS.glob("studies/*.ipynb"))
 ORDER = ["00_overview", "01_data", "02_landmark_detection", "03_affine_calibration", "04_stereo_reconstruction",
-         "05_registration", "06_online_pipeline", "07_your_own_recording"]  # fmt: skip
+         "05_registration", "06_online_pipeline", "07_your_own_recording",
+         "08_the_robot_labels"]  # fmt: skip
 
 
 def each(notebooks):

@@ -5,7 +5,18 @@ from dataclasses import fields, is_dataclass
 
 import pytest
 
-from lib import calibration, cameras, correspondences, geometry, landmarks, matching, online, recordings, registration
+from lib import (
+    adapt,
+    calibration,
+    cameras,
+    correspondences,
+    geometry,
+    landmarks,
+    matching,
+    online,
+    recordings,
+    registration,
+)
 from lib import surface as surfaces
 
 ATTRIBUTES = {
@@ -28,6 +39,7 @@ ATTRIBUTES = {
     recordings.Recording: "open frames kinematics annotations truth",
     recordings.Annotator: "mark know undo redo next_frame",
     online.OnlinePipeline: "step",
+    adapt.Adaptation: "detector calibration report improved",
 }
 ARGUMENTS = {
     calibration.dlt: "x_mm u",
@@ -39,6 +51,7 @@ ARGUMENTS = {
     surfaces.reconstruct: "left right rig",
     landmarks.Detector.load: "path_or_name",
     cameras.StereoRig.triangulate: "u_left u_right covariance_px2",
+    adapt.adapt: "recording detector labels minutes seed folder",
 }
 
 

@@ -2,6 +2,7 @@
 
 import json
 import time
+import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, replace
 from functools import partial
@@ -30,6 +31,8 @@ __all__ = ["STAGES", "assemble", "card", "finetune", "stage_config", "stage_data
 
 #: The stages that are trained, in the order of their use, and the channels of the shipped networks.
 STAGES = {"frame": 32, "tool": 48, "closeup": 32}
+#: Standard deviation of a label, as a share of the tool's length, at which a stage lets it count half.
+LABEL_SD = {"frame": 0.1, "tool": 0.04, "closeup": 0.02}
 _SOURCES = {"frame": FrameSource, "tool": ToolSource, "closeup": CloseupSource}
 
 
@@ -62,7 +65,7 @@ def _still(stage: str, images: Iterable[LabelledImage]) -> Samples:
 
 def finetune(
     detector: Detector, images: Sequence[LabelledImage], held_out: Sequence[LabelledImage], folder: str | Path, *,
-    simulated: str | Path | None = None, covariance_px2: np.ndarray | None = None, steps: int = 300,
+    simulated: str | Path | Sequence[LabelledImage] | None = None, covariance_px2: np.ndarray | None = None, steps: int = 300,
     minutes: float | None = None, seed: int = 0, progress: bool | Callable[[str, float], None] = True,
 ) -> Detector:  # fmt: skip
     """Train all stages of a detector further on labelled frames, then fit its error models on held-out ones.
@@ -73,30 +76,35 @@ def finetune(
         folder: Keeps the checkpoints, from which the same call continues.
         simulated: Folder of `generate`'s shards; half of what is drawn then comes from there, and their held-out frames
             help to fit the doubt, so that the networks do not forget tools and eyes that the labelled frames do not show.
+            Or full frames, of which every third helps to fit the doubt and the others to train.
         covariance_px2: (n, 3, 2, 2) of the labels of `images`; None = exact.  A label counts half if its deviation is
-            2 % of the tool's length.
+            `LABEL_SD` of the tool's length.
         steps, minutes: Steps of each stage; training ends after `minutes`, each stage having had its share.
         progress: Whether to show a bar, or a function that is called with the stage and the part done.
 
     Raises:
-        ValueError: If there is no usable image, or fewer than 20 landmarks are found in the held-out ones.
+        ValueError: If there is no usable image, or fewer than 20 landmarks are found in the held-out ones and the detector
+            has no error models yet; if it has, they stay, with a `RuntimeWarning`.
     """
     usable = []
     for kind, part in (("training", images), ("validation", held_out)):
         usable.append([i for i, labelled in enumerate(part) if np.isfinite(tool_pose(labelled.u[None])[1]).all()])
         if not usable[-1]:
             raise ValueError(f"{kind} images: none has a labelled base and tip; label some.")
-    weight = np.ones((len(images), 3))
+    variance = np.zeros((len(images), 3))  # of the labels, as a share of the tool's length
     if covariance_px2 is not None:
         length = tool_length_px(np.stack([labelled.u for labelled in images]))[:, None]
-        weight = 1 / (1 + np.trace(covariance_px2, axis1=-2, axis2=-1) / 2 / (0.02 * length) ** 2)
+        variance = np.trace(covariance_px2, axis1=-2, axis2=-1) / 2 / length**2
     images, held_out = ([part[i] for i in rows] for part, rows in zip((images, held_out), usable, strict=True))
-    weight = weight[usable[0]]
+    doubt_on = validation_images(simulated) if isinstance(simulated, str | Path) else (simulated or ())[::3]
     networks, began = {}, time.perf_counter()
     for number, (stage, network) in enumerate(detector.networks.items()):
+        weight = 1 / (1 + variance[usable[0]] / LABEL_SD[stage] ** 2)
         source: Source = _SOURCES[stage].of(images, weight=weight)
-        if simulated is not None:
+        if isinstance(simulated, str | Path):
             source = Mixed(source, _SOURCES[stage].load(simulated))
+        elif simulated:
+            source = Mixed(source, _SOURCES[stage].of([one for i, one in enumerate(simulated) if i % 3]))
         config = replace(stage_config(stage), network=network.config, steps=steps, learning_rate=5e-4, ema=0.98, seed=seed)
         config = replace(config, batch_size=min(config.batch_size, 24), validate_every=max(1, steps // 3))
         start = Training(network, [], {"shipped": detector.metadata.get("commit")})
@@ -108,8 +116,14 @@ def finetune(
             progress=progress if isinstance(progress, bool) else partial(progress, stage),
         )  # fmt: skip
         networks[f"{stage}_network"] = tuned.network
-    fitted_on = [*held_out, *(validation_images(simulated) if simulated is not None else ())]
-    return fit_error_models(replace(detector, **networks), fitted_on, progress=progress is True)
+    tuned = replace(detector, **networks)
+    try:
+        return fit_error_models(tuned, [*held_out, *doubt_on], progress=progress is True)
+    except ValueError as error:
+        if not set(tuned.stages) <= set(tuned.error_models):
+            raise
+        warnings.warn(f"the doubt stays as it was, held-out images do not suffice ({error})", RuntimeWarning, stacklevel=2)
+        return tuned
 
 
 def assemble(

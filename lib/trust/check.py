@@ -15,11 +15,11 @@ from lib.calibration import estimate_time_offset
 from lib.correspondences import LANDMARKS, of_recording
 from lib.landmarks import Detector, detect
 from lib.provenance import plain
-from lib.recordings import Recording
+from lib.recordings import Recording, StereoFrame
 from lib.trust.assessment import Assessment, assess, report
 from lib.trust.verdict import LEVELS
 
-__all__ = ["Check", "check", "main"]
+__all__ = ["Check", "check", "data_uri", "main", "overlay"]
 
 _COLOURS = np.array([[0, 114, 178], [230, 159, 0], [0, 158, 115]])  # of base, tip_1, tip_2, RGB
 _SHOWN = 3  # best frames, and worst
@@ -60,7 +60,7 @@ class Check:
         a = self.assessment
         text = here.get_template("check.html").render(
             recording=self.recording, verdict=a.verdict, facts=self.facts, next_step=self.next_step,
-            overlays=self._overlays(), coverage=_data_uri(self._coverage(), ".png"),
+            overlays=self._overlays(), coverage=data_uri(self._coverage(), ".png"),
             report="" if a.calibration is None else report(a.calibration, verdict=a.verdict),
             hypotheses=[h for h in a.diagnosis.hypotheses if h.gain > 0][:5],
         )  # fmt: skip
@@ -78,27 +78,14 @@ class Check:
             parts = {name: part[i].max() for name, part in health.parts.items() if np.isfinite(part[i]).any()}
             why = f"score {score:.2g}, most of it {max(parts, key=parts.get)}" if parts else "nothing was found"
             kind = "good" if score <= 1 else "among the worst" if place < _SHOWN else "bad"
-            found.append((f"Frame {number} ({kind}): {why}.", _data_uri(self._overlay(number), ".jpg")))
+            found.append((f"Frame {number} ({kind}): {why}.", data_uri(self._overlay(number), ".jpg")))
         return found
 
     def _overlay(self, number: int) -> np.ndarray:
         """Left and right image with what was found (rings) and where the robot is seen by the calibration (crosses)."""
-        frame, rows, c = self.recording.frames[number], self.assessment.data.of_frames(number), self.assessment.calibration
-        told = (None, None) if c is None else c.pair.project(rows.x_mm)
-        images = []
-        views = ((frame.left, frame.right), (rows.u_left, rows.u_right), rows.seen.T, told)
-        for image, u, seen, robot in zip(*views, strict=True):
-            scale = _SHOWN_PX / image.shape[1]
-            picture = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-            for k, row in enumerate(rows.landmark):
-                for colour, width in ((255, 255, 255), 3), (_COLOURS[row % 3].tolist(), 2):
-                    if seen[k]:
-                        cv2.circle(picture, np.rint(u[k] * scale).astype(int), 9, colour, width, cv2.LINE_AA)
-                    if robot is not None and np.abs(robot[k]).max() < 1e5:  # not NaN
-                        at = np.rint(robot[k] * scale).astype(int)
-                        cv2.drawMarker(picture, at, colour, cv2.MARKER_CROSS, 18, width, cv2.LINE_AA)
-            images.append(picture)
-        return np.hstack([images[0], np.full((len(images[0]), 6, 3), 255, np.uint8), images[1]])
+        rows, c = self.assessment.data.of_frames(number), self.assessment.calibration
+        seen = np.where(rows.seen.T[:, :, None], np.stack([rows.u_left, rows.u_right]), np.nan)
+        return overlay(self.recording.frames[number], seen, None if c is None else np.stack(c.pair.project(rows.x_mm)))
 
     def _coverage(self) -> np.ndarray:
         """Where the tool was: over the left image, in depth, and in time with the score of each frame."""
@@ -193,7 +180,24 @@ def _facts(recording: Recording, a: Assessment) -> dict[str, str]:
     return facts
 
 
-def _data_uri(image: np.ndarray, suffix: str) -> str:
+def overlay(frame: StereoFrame, seen: np.ndarray, told: np.ndarray | None, width_px: int = _SHOWN_PX) -> np.ndarray:
+    """Left and right image with rings at landmarks `seen` (2, 3, 2) px and crosses where the robot is `told` to be."""
+    images = []
+    for side, image in enumerate((frame.left, frame.right)):
+        scale = width_px / image.shape[1]
+        picture = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        for k in range(seen.shape[1]):
+            for colour, width in ((255, 255, 255), 3), (_COLOURS[k % 3].tolist(), 2):
+                if np.isfinite(seen[side, k]).all():
+                    cv2.circle(picture, np.rint(seen[side, k] * scale).astype(int), 9, colour, width, cv2.LINE_AA)
+                if told is not None and np.abs(told[side, k]).max() < 1e5:  # not NaN
+                    at = np.rint(told[side, k] * scale).astype(int)
+                    cv2.drawMarker(picture, at, colour, cv2.MARKER_CROSS, 18, width, cv2.LINE_AA)
+        images.append(picture)
+    return np.hstack([images[0], np.full((len(images[0]), 6, 3), 255, np.uint8), images[1]])
+
+
+def data_uri(image: np.ndarray, suffix: str) -> str:
     """An RGB image as text that a page embeds."""
     data = cv2.imencode(suffix, cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1]
     return f"data:image/{'jpeg' if suffix == '.jpg' else 'png'};base64,{base64.b64encode(data.tobytes()).decode('ascii')}"

@@ -18,7 +18,7 @@ from lib.cameras import StereoRig
 from lib.correspondences import Correspondences
 from lib.recordings import Recording
 
-__all__ = ["LIMITS", "Health", "affine_epipolar", "feature_epipolar_px", "health", "unfamiliar"]
+__all__ = ["LIMITS", "Health", "affine_epipolar", "feature_epipolar_px", "feature_matches", "health", "unfamiliar"]
 
 #: What a landmark of a frame may show of each part; see `FALSE_ALARM_RATE`.
 LIMITS = {
@@ -214,12 +214,17 @@ def affine_epipolar(y: np.ndarray, samples: int = 300) -> tuple[np.ndarray, np.n
 
 
 def feature_epipolar_px(recording: Recording, rig: StereoRig, frames: int = 3) -> float:
-    """Median epipolar distance under the rig of features matched freely between left and right; NaN where there are too few.
+    """Median epipolar distance under the rig of features matched freely between left and right; NaN if they are too few."""
+    y = feature_matches(recording, _spread(len(recording), frames))
+    return float(np.median(np.abs(rig.epipolar_distance(y[:, :2], y[:, 2:])))) if len(y) else np.nan
 
-    Matches count that agree on some affine epipolar geometry, whichever it is.
+
+def feature_matches(recording: Recording, frames: np.ndarray) -> np.ndarray:
+    """Features (n, 4) px matched freely between left and right, such that those of a frame agree on some affine epipolar
+    geometry, whichever it is.
     """
-    sift, found = cv2.SIFT_create(2000), []
-    for i in _spread(len(recording), frames):
+    sift, found = cv2.SIFT_create(2000), [np.zeros((0, 4))]
+    for i in frames:
         pair = recording.frames[int(i)]
         grey = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)[::_HALVED, ::_HALVED] for image in (pair.left, pair.right)]
         (left, a), (right, b) = (sift.detectAndCompute(image, None) for image in grey)
@@ -230,5 +235,5 @@ def feature_epipolar_px(recording: Recording, rig: StereoRig, frames: int = 3) -
         y = _HALVED * np.array([[*left[m.queryIdx].pt, *right[m.trainIdx].pt] for m in pairs]).reshape(-1, 4)
         agree = affine_epipolar(y)[1]
         if agree.sum() >= _FEWEST:
-            found.append(np.abs(rig.epipolar_distance(y[agree, :2], y[agree, 2:])))
-    return float(np.median(np.concatenate(found))) if found else np.nan
+            found.append(y[agree])
+    return np.concatenate(found)

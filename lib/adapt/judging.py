@@ -1,0 +1,89 @@
+"""How well detections agree with the robot, and left with right by an epipolar geometry that the robot has no part in."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lib.adapt.teacher import Seen, Teacher
+from lib.landmarks.metrics import tool_length_px
+from lib.recordings import Recording
+from lib.trust.health import affine_epipolar, feature_matches
+
+__all__ = ["Agreement", "agreement", "better", "epipolar_geometry", "epipolar_px", "frame_means"]
+
+#: Distances count up to this share of the tool's length, and so does a landmark that is missing.
+_CAP = 0.1
+_FEWEST = 60  # features of the eye, below which the detections' own geometry has to do
+
+
+@dataclass(frozen=True, eq=False)
+class Agreement:
+    """Distances (m, 2, 3) px of detections from the robot's landmarks, infinite where missing, NaN where not in the image.
+
+    `sigmas` are the same in units of their stated standard deviation (1 is right), `length_px` (m, 2, 1) the tool's lengths.
+    """
+
+    distance_px: np.ndarray
+    sigmas: np.ndarray
+    length_px: np.ndarray
+
+    @property
+    def relative(self) -> np.ndarray:
+        """(m,) mean of a frame's distances as shares of the tool's length, each at most a tenth."""
+        return frame_means(self.distance_px / self.length_px)
+
+    def summary(self) -> dict[str, float]:
+        """Numbers of the report; percent of the landmarks within a share of the tool's length."""
+        known = ~np.isnan(self.distance_px)
+        share, sigmas = (self.distance_px / self.length_px)[known], self.sigmas[np.isfinite(self.sigmas)]
+        found = {"median_px": float(np.median(self.distance_px[known])), "mean_share": float(np.nanmean(self.relative))}
+        found |= {"median_sigmas": float(np.median(sigmas)) if sigmas.size else np.nan}
+        return found | {f"within_{100 * t:g}_percent": 100 * float((share <= t).mean()) for t in (0.01, 0.05, 0.1)}
+
+
+def frame_means(share: np.ndarray) -> np.ndarray:
+    """(m,) means over the landmarks of (m, ...) shares of the tool's length, each at most a tenth; NaN does not count."""
+    share = np.minimum(share, _CAP).reshape(len(share), -1)
+    known = ~np.isnan(share)
+    return np.where(known.any(axis=1), np.where(known, share, 0).sum(axis=1) / np.maximum(known.sum(axis=1), 1), np.nan)
+
+
+def agreement(teacher: Teacher, seen: Seen) -> Agreement:
+    """Of some frames; those that the teacher refused do not count.  A `ValueError` if it labels none."""
+    u, covariance, shown = teacher.labels(seen.frame)
+    there = np.isfinite(u).all(axis=-1) & (shown > 0)
+    if not there.any():
+        raise ValueError(f"robot: it labels none of the {len(seen.frame)} frames that are kept for stopping or judging.")
+    off, S = seen.u - u, covariance + seen.covariance
+    S = np.where(np.isfinite(S), S, np.eye(2))
+    sigmas = np.sqrt((off[..., None, :] @ np.linalg.inv(S) @ off[..., None])[..., 0, 0] / 2)
+    distance = np.nan_to_num(np.linalg.norm(off, axis=-1), nan=np.inf)
+    length = tool_length_px(u.reshape(-1, 3, 2)).reshape(*u.shape[:2], 1)
+    return Agreement(*(np.where(there, part, np.nan) for part in (distance, sigmas)), length)
+
+
+def epipolar_geometry(recording: Recording, frames: np.ndarray, seen: Seen) -> tuple[np.ndarray, np.ndarray]:
+    """Middle and normal (4,) of an affine epipolar geometry: matches y (4,) fulfil normal . (y - middle) = 0.
+
+    Told by features of the eye that both images show; where they are too few, by what most of the detections `seen` share.
+    """
+    y = feature_matches(recording, frames)
+    agree = affine_epipolar(y)[1]
+    if agree.sum() < _FEWEST:
+        y = np.concatenate([seen.u[:, 0], seen.u[:, 1]], axis=-1).reshape(-1, 4)
+        agree = affine_epipolar(y)[1]
+    middle = y[agree].mean(axis=0)
+    return middle, np.linalg.svd(y[agree] - middle, full_matrices=False)[2][3]
+
+
+def epipolar_px(geometry: tuple[np.ndarray, np.ndarray], seen: Seen) -> np.ndarray:
+    """Distances (m, 3) px of left and right detections from a geometry, in pixels of one image; infinite where missing."""
+    middle, normal = geometry
+    y = np.concatenate([seen.u[:, 0], seen.u[:, 1]], axis=-1)
+    return np.nan_to_num(np.sqrt(2) * np.abs((y - middle) @ normal), nan=np.inf)
+
+
+def better(before: np.ndarray, after: np.ndarray) -> tuple[float, float]:
+    """Mean gain over frames (m,) and its standard deviation."""
+    gain = (before - after)[np.isfinite(before - after)]
+    return (float(gain.mean()), float(gain.std(ddof=1) / np.sqrt(len(gain)))) if len(gain) > 2 else (0.0, np.inf)

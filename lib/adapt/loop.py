@@ -1,0 +1,287 @@
+"""Detect, calibrate, project, train further, detect again: until frames that took no part agree no better."""
+
+import hashlib
+import json
+import sys
+import time
+import warnings
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from lib import files, paths
+from lib.adapt.judging import Agreement, agreement, better, epipolar_geometry, epipolar_px, frame_means
+from lib.adapt.teacher import RefusalError, Seen, Teacher, longest_still, look, stretches, teach
+from lib.calibration import Calibration
+from lib.landmarks import Detector
+from lib.landmarks.checkpoints import checksum
+from lib.provenance import Provenance, plain
+from lib.recordings import Recording
+from lib.recordings.annotations import read_coco
+from lib.training.samples import LabelledImage
+from lib.training.shards import generate, validation_images
+from lib.training.stages import finetune
+
+__all__ = ["STEPS", "Adaptation", "adapt", "simulated_like"]
+
+#: Most rounds of training, and most steps of a stage in one; the time ends most trainings.
+ROUNDS, STEPS = 3, 400
+#: Most stereo frames that are looked at, spread over the recording.
+_MOST_FRAMES = 96
+_SIMULATED_SHARDS = 3
+#: A round that brings the frames for stopping nearer to the robot by less than this share is the last.
+_LEAST_GAIN = 0.03
+#: Most rounds of closeups, placed by the robot, before anything is trained; they end where the labels move less than this.
+_GUIDED, _SETTLED_PX = 6, 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Adaptation:
+    """What `adapt` ended with.
+
+    Attributes:
+        detector: The adapted one if `improved`, else the one that was given.
+        calibration: From detections in the frames for learning; None where the recording could not teach.
+        report: What report.json holds: agreement with the robot and of left with right before and after, frames used and
+            refused, learning curve, the reason.
+        improved: Whether the frames for judging agree better, with the robot and between the two images.
+        frames: Numbers of the frames for learning, stopping and judging ("learn", "stop", "judge").
+        after, seen, told: In the frames for judging: agreement with the robot after, what the two detectors find, and the
+            robot's landmarks (m, 2, 3, 2) px.
+    """
+
+    detector: Callable
+    calibration: Calibration | None
+    report: dict
+    improved: bool
+    frames: dict[str, np.ndarray]
+    after: Agreement | None = None
+    seen: tuple[Seen, ...] = ()
+    told: np.ndarray | None = None
+
+
+def adapt(
+    recording: Recording | str | Path, detector: Detector | None = None, *, labels: str | Path | None = None,
+    minutes: float = 20.0, seed: int = 0, folder: str | Path | None = None, progress: bool = True,
+    tune: Callable[..., Detector] = finetune,
+) -> Adaptation:  # fmt: skip
+    """Let the robot of a recording teach the detector its landmarks; the truth of a simulated recording is never opened.
+
+    The frames are split into three stretches of time.  The first teaches, the second says when to stop, the third judges.
+
+    Args:
+        recording: With kinematics; the landmarks of a forceps.
+        detector: None is the one that ships.
+        labels: COCO keypoints like annotations.json; five labelled pairs are a start where the detector finds too little.
+        minutes: The training ends after so many; detection and judging add a little.
+        seed: Of everything that is drawn.
+        folder: Keeps what is done, from which the same call continues after a kill; None is runs/adapt-NAME.
+        progress: Whether to say on the error stream what is going on and how many minutes are left.
+        tune: Trains a detector further on labelled images, with the arguments of `lib.training.stages.finetune`.
+
+    Raises:
+        FileNotFoundError, ValueError: If the folder or the labels cannot be read.
+    """
+    if not isinstance(recording, Recording):
+        recording = Recording.open(recording, truth=False)
+    work = _Work(replace(recording, truth=None), detector or Detector.load(), labels, seed, folder, minutes, progress)
+    try:
+        return work.adapted(tune)
+    except RefusalError as refused:
+        work.report |= {"improved": False, "reason": str(refused)}
+        return Adaptation(work.detector, None, work.finished(), False, {})
+
+
+class _Work:
+    """The recording, the files that keep what is done, the time left, and the report as it grows."""
+
+    def __init__(
+        self, recording: Recording, detector: Callable, labels: str | Path | None, seed: int, folder: str | Path | None,
+        minutes: float, progress: bool,
+    ) -> None:  # fmt: skip
+        self.recording, self.detector, self.seed, self.progress = recording, detector, seed, progress
+        chosen = np.linspace(0, len(recording) - 1, min(_MOST_FRAMES, len(recording)))
+        self.frames = np.unique(chosen.round().astype(int))
+        self.labels, self.marked = None, np.zeros(0, int)
+        if labels is not None:
+            given = read_coco(Path(labels), len(recording), recording.image_size_px, recording.skeleton)
+            self.labels = np.stack([given.u_left, given.u_right], axis=1)
+            self.marked = np.flatnonzero(np.isfinite(self.labels).any(axis=(1, 2, 3)))
+            self.frames = np.union1d(self.frames, self.marked)
+        self.learns = isinstance(detector, Detector)  # a stand-in has no networks
+        tensors = {k: v for n in detector.networks.values() for k, v in n.state_dict().items()} if self.learns else {}
+        key = [str(recording.folder.resolve()), recording.kinematics.x_mm.tobytes(), self.frames.tobytes(), seed]
+        key += [checksum(tensors, {}), Path(labels).read_bytes() if labels is not None else b""]
+        self.folder = Path(folder or paths.RUNS / f"adapt-{recording.name}") / "work"
+        self.folder /= hashlib.sha256(repr(key).encode()).hexdigest()[:12]
+        self.folder.mkdir(parents=True, exist_ok=True)
+        state = self.folder / "state.json"
+        spent_s = json.loads(state.read_text(encoding="utf-8"))["seconds"] if state.is_file() else 0.0
+        self.began, self.minutes, self.provenance = time.perf_counter() - spent_s, minutes, Provenance("python3 -m lib adapt")
+        self.report: dict = {"recording": recording.name, "minutes": minutes, "seed": seed, "notes": [], "rounds": []}
+
+    @property
+    def left_s(self) -> float:
+        return 60 * self.minutes - (time.perf_counter() - self.began)
+
+    def say(self, text: str, done: float) -> None:
+        if self.progress:
+            line = f"\r{text}: {100 * done:3.0f} %, at most {max(self.left_s, 0) / 60:.1f} min of training left "
+            print(line, end="" if done < 1 else "\n", file=sys.stderr, flush=True)
+
+    def finished(self) -> dict:
+        """The report, with where and when it was made."""
+        return plain(self.report | self.provenance.so_far())
+
+    def look(self, name: str, detector: Callable, frames: np.ndarray, near: np.ndarray | None = None) -> Seen:
+        """`look`, or what an earlier call kept."""
+        path = self.folder / f"{name}.npz"
+        if not path.is_file():
+            show = lambda part: self.say(f"Looking ({name})", part)  # noqa: E731
+            found = look(self.recording, detector, frames, near=near, progress=show)
+            with files.whole(path) as partial, open(partial, "wb") as file:
+                np.savez(file, **found._asdict())
+        with np.load(path) as kept:
+            return Seen(*(kept[field] for field in Seen._fields))
+
+    def images(self, frames: np.ndarray, teacher: Teacher, seen: Seen | None) -> tuple[list[LabelledImage], np.ndarray]:
+        """Left and right images with their labels, those that have a base and a tip, and the labels' covariances."""
+        found, covariances = [], []
+        for number, *labels in zip(frames, *teacher.labels(frames, seen), strict=True):
+            frame = self.recording.frames[int(number)]
+            for side, u, covariance, visibility in zip(("left", "right"), *labels, strict=True):
+                known = np.isfinite(u).all(axis=1) & (visibility > 0)
+                if known[0] and known[1:].any():
+                    found.append(LabelledImage(f"{side} {number}", getattr(frame, side), u, visibility))
+                    covariances.append(np.nan_to_num(covariance, nan=1e6))
+        return found, np.array(covariances)
+
+    def adapted(self, tune: Callable[..., Detector]) -> Adaptation:
+        recording, detector, rounds = self.recording, self.detector, self.report["rounds"]
+        first = seen = self.look("before", detector, self.frames)
+        if self.labels is not None:
+            seen = seen.labelled(self.labels[seen.frame])
+        still, note = longest_still(recording, seen)
+        self.report["notes"] += [note] if note else []
+        parts = stretches(np.setdiff1d(still, self.marked), recording.frames.time_s)
+        learn = parts["learn"] = np.union1d(parts["learn"], self.marked)
+        self.report["frames"] = {name: len(part) for name, part in parts.items()}
+        try:
+            teacher = teach(recording, seen.of(learn))
+        except RefusalError:
+            if len(self.marked) < 5:
+                raise
+            teacher = teach(recording, seen.of(self.marked), from_labels=True)
+        self.report["start_share"] = teacher.right
+        closeups = self.learns and detector.closeup_network is not None
+        u = teacher.labels(learn)[0]
+        for k in range(_GUIDED if closeups else 0):  # closeups that nobody taught, near where the robot says
+            guided = self.look(f"guided {k}", detector, learn, u)
+            teacher = teach(recording, guided, opinion=guided, before=teacher)
+            u, last = teacher.labels(learn)[0], u
+            if np.nanmedian(np.linalg.norm(u - last, axis=-1)) < _SETTLED_PX:
+                break
+        self.report["refused_frames"] = teacher.refused
+        best, best_seen, stop = detector, first, agreement(teacher, first.of(parts["stop"])).summary()
+        rounds.append({"round": 0, "right": teacher.right} | stop)
+        some = learn[:: max(1, len(learn) // 8)]
+        simulated = simulated_like((recording.frames[int(i)].left for i in some), self.seed, self.progress)
+        for k in range(1, ROUNDS + 1):
+            if k > 1 and self.left_s < 6 * self.minutes:
+                break
+            tuned = self.round(k, best, teacher, parts, None if k == 1 else best_seen, simulated, tune)
+            seen = self.look(f"round {k}", tuned, self.frames)
+            opinion = self.look(f"opinion {k}", detector, learn, u) if closeups else None
+            try:
+                new = teach(recording, seen.of(learn), before=teacher, opinion=opinion)
+            except RefusalError as refused:
+                rounds.append({"round": k, "refused": str(refused)})
+                break
+            now = agreement(new, seen.of(parts["stop"])).summary()
+            rounds.append({"round": k, "right": new.right} | now)
+            if now["mean_share"] > (1 - _LEAST_GAIN) * stop["mean_share"]:
+                break
+            best, best_seen, teacher, stop = tuned, seen, new, now
+        return self.judged(parts, first, best, best_seen, teacher)
+
+    def round(
+        self, k: int, detector: Detector, teacher: Teacher, parts: dict[str, np.ndarray], seen: Seen | None,
+        simulated: list[LabelledImage], tune: Callable[..., Detector],
+    ) -> Detector:  # fmt: skip
+        """The detector trained further on what the teacher says of the frames for learning."""
+        path = self.folder / f"round {k}.safetensors"
+        if path.is_file():
+            return Detector.load(path)
+        doubt_on = parts["learn"][3::4]  # the errors of frames that were trained on say nothing of others
+        images, covariance = self.images(np.setdiff1d(parts["learn"], doubt_on), teacher, seen)
+        held_out, _ = self.images(np.union1d(doubt_on, parts["stop"]), teacher, seen)
+        if len(images) < 8 or len(held_out) < 4:
+            raise RefusalError(f"robot: it labels {len(images)} images to learn from and {len(held_out)} others; 8 and 4 do.")
+        with warnings.catch_warnings(record=True) as told:
+            tuned = tune(
+                detector, images, held_out, self.folder / f"round {k}", simulated=simulated, covariance_px2=covariance,
+                minutes=max(self.left_s / 60 * (0.5 if k < ROUNDS else 0.9), 0.05), steps=STEPS, seed=self.seed,
+                progress=lambda stage, done: self.say(f"Round {k}, {stage} stage", done),
+            )  # fmt: skip
+        self.report["notes"] += [f"Round {k}: {one.message}." for one in told if one.category is RuntimeWarning]
+        if self.learns:
+            tuned.save(path)
+        files.write_json(self.folder / "state.json", {"seconds": time.perf_counter() - self.began})
+        return tuned
+
+    def judged(
+        self, parts: dict[str, np.ndarray], first: Seen, best: Detector, best_seen: Seen, teacher: Teacher
+    ) -> Adaptation:
+        """Compare the detectors on the frames that took no part."""
+        seen = first.of(parts["judge"]), best_seen.of(parts["judge"])
+        agreements = [agreement(teacher, own) for own in seen]
+        geometry, length = epipolar_geometry(self.recording, parts["judge"], best_seen), agreements[0].length_px.mean(axis=1)
+        distances = [epipolar_px(geometry, own) for own in seen]
+        robot, robot_sd = better(*(own.relative for own in agreements))
+        eye, eye_sd = better(*(frame_means(own / length) for own in distances))
+        improved = best is not self.detector and robot > 2 * robot_sd and eye > 0
+        reasons = {
+            "no round of training brought the frames for stopping nearer to the robot": best is self.detector,
+            "on the frames for judging the gain is no larger than chance allows": not robot > 2 * robot_sd,
+            "left and right of the frames for judging do not agree better, in which the robot has no part": not eye > 0,
+            "the frames for judging agree better with the robot, and left with right": True,
+        }
+        self.report |= {
+            "improved": bool(improved), "reason": next(reason for reason, holds in reasons.items() if holds),
+            "judged": {
+                name: own.summary() | {"epipolar_px": float(np.median(distance))}
+                for name, own, distance in zip(("before", "after"), agreements, distances, strict=True)
+            },
+            "gain": {"robot": [robot, robot_sd], "epipolar": [eye, eye_sd]},
+            "offset_s": teacher.recording.offset_s, "clock_sd_s": teacher.clock_sd_s,
+            "landmark_offset_mm": teacher.offset_mm, "landmark_offset_sd_mm": teacher.offset_sd_mm,
+            "gauge": "An offset that all landmarks share and a shift of the cameras look alike: it is known no better than "
+            "these standard deviations say.",
+        }  # fmt: skip
+        if improved and self.learns:
+            best = replace(best, metadata=best.metadata | {"adapted": self.finished()})
+        return Adaptation(
+            best if improved else self.detector, teacher.calibration, self.finished(), bool(improved), parts, agreements[1],
+            seen, teacher.project(parts["judge"])[0],
+        )  # fmt: skip
+
+
+def simulated_like(images: Iterable[np.ndarray], seed: int, progress: bool) -> list[LabelledImage]:
+    """Simulated frames in the colours of some images, so that what others look like is not forgotten; kept in the cache."""
+    folder = paths.CACHE / "adapt" / "simulated"
+    generate(folder, "held_out", _SIMULATED_SHARDS, progress=progress)
+    rng, like, found = np.random.default_rng([seed, 1]), [], []
+    for image in images:
+        lab = cv2.cvtColor(np.ascontiguousarray(image[::4, ::4]), cv2.COLOR_RGB2LAB).reshape(-1, 3)
+        like.append((lab.mean(axis=0), lab.std(axis=0)))
+    for labelled in validation_images(folder):
+        lab = cv2.cvtColor(labelled.image, cv2.COLOR_RGB2LAB).astype(np.float32)
+        mean, sd = like[rng.integers(len(like))]
+        moved = (lab - lab.mean(axis=(0, 1))) * (sd / np.maximum(lab.std(axis=(0, 1)), 1.0)) + mean
+        part = np.float32(rng.uniform(0, 1))  # some keep their own colours
+        image = np.clip((1 - part) * lab + part * moved, 0, 255).astype(np.uint8)
+        found.append(labelled._replace(image=cv2.cvtColor(image, cv2.COLOR_LAB2RGB)))
+    return found

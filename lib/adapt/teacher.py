@@ -1,0 +1,360 @@
+"""From half-wrong detections to labels: cameras that the right ones agree on, and the robot's landmarks seen through them.
+
+The robot may be wrong, too.  What it says is refused where its log stands still, where the image shows the whole tool
+elsewhere, and altogether where a fault of clock, axes or tool explains what the images show.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import NamedTuple, Self
+
+import numpy as np
+
+from lib.calibration import Calibration, LandmarkOffsets, calibrate, estimate_time_offset
+from lib.calibration.offsets import tool_axes
+from lib.correspondences import MIN_CONFIDENCE, Correspondences, of_recording
+from lib.landmarks import Landmarks
+from lib.landmarks.metrics import tool_length_px
+from lib.recordings import Recording
+from lib.recordings.annotations import inside
+from lib.trust import LEVELS, diagnose, judge
+from lib.trust.fitting import Problem
+
+__all__ = ["RefusalError", "Seen", "Teacher", "longest_still", "look", "stretches", "teach"]
+
+#: Least share of the landmarks that must agree on the cameras.
+LEAST_RIGHT = 0.1
+#: Faults after which the robot is no teacher, and the least share of the residuals that they must explain.
+FAULTS = {
+    "clock", "camera_clock", "clock_rate", "frame_order", "tip_order", "tool_bends", "frozen_kinematics", "frozen_video",
+    "rigid_tips", "scaled_axis", "mirrored_axis", "exchanged_eyes", "drift",
+}  # fmt: skip
+_EXPLAINED = 0.15
+#: Residuals below this share of the tool's length hold no fault that matters, however well one explains them.
+_HARMLESS = 0.01
+#: Share of the frames in which the images may show the whole tool elsewhere than the robot.
+_CONTRADICTED = 0.2
+#: Standard deviation of a detector's own constant error, as a share of the tool's length: along, across, normal.  The base
+#: has no edge that ends along the shaft.  Measured on recordings of the validation population.
+_OWN_BIAS = 0.012 * np.array([[2.0, 1.0, 1.5], [1.0, 1.0, 1.5], [1.0, 1.0, 1.5]])
+#: Gain in log likelihood of a detection, by which cameras of their own for a part of the time must explain it better.
+_SURE_MOVE = 0.1
+_CLICK_PX = 1.5  # of labels set by hand
+_CONFIDENCES = (MIN_CONFIDENCE, 0.5, 0.8)
+_RECHECK = "`python3 -m lib check RECORDING` shows it"
+
+
+class RefusalError(ValueError):
+    """The recording cannot teach; the text says why, and what to do."""
+
+
+class Seen(NamedTuple):
+    """Landmarks of m stereo frames: u (m, 2, 3, 2) px, covariance (m, 2, 3, 2, 2), confidence (m, 2, 3)."""
+
+    frame: np.ndarray
+    u: np.ndarray
+    covariance: np.ndarray
+    confidence: np.ndarray
+
+    def rows(self, recording: Recording, least: float = 0.0) -> Correspondences:
+        """With the robot's positions; of a confidence below `least` nothing counts."""
+        known = {"covariance_px2": self.covariance, "confidence": np.where(self.confidence >= least, self.confidence, 0.0)}
+        known = {name: np.moveaxis(value, 1, 2) for name, value in known.items()}
+        return of_recording(recording, self.u[:, 0], self.u[:, 1], frames=self.frame, **known)
+
+    def of(self, frames: np.ndarray) -> Self:
+        """Those of some frames."""
+        return Seen(*(part[np.isin(self.frame, frames)] for part in self))
+
+    def labelled(self, u: np.ndarray) -> Self:
+        """With labels set by hand, u (m, 2, 3, 2), in place of what was found there; in other frames nothing else counts."""
+        known = np.isfinite(u).all(axis=-1)
+        covariance = np.where(known[..., None, None], _CLICK_PX**2 * np.eye(2), self.covariance)
+        return Seen(self.frame, np.where(known[..., None], u, self.u), covariance, np.where(known, 1.0, self.confidence))
+
+
+def look(
+    recording: Recording, detector: Callable, frames: np.ndarray, *, near: np.ndarray | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> Seen:  # fmt: skip
+    """What a detector finds in some frames; with `near` (m, 2, 3, 2) px its closeups alone, placed there."""
+    found = []
+    for i, number in enumerate(frames):
+        frame = recording.frames[int(number)]
+        pair = np.stack([frame.left, frame.right])
+        if near is None:
+            found.append(detector(pair))
+        else:
+            known = np.isfinite(near[i]).all(axis=-1)
+            rough = Landmarks(near[i], np.tile(np.eye(2), (2, 3, 1, 1)), known.astype(float))
+            for _ in range(2):  # the first closeup says where to look
+                rough = detector.refine(pair, rough, "tracking")
+            found.append(rough)
+        if progress is not None:
+            progress((i + 1) / len(frames))
+    return Seen(np.asarray(frames), *(np.stack([getattr(p, n) for p in found]) for n in ("u", "covariance", "confidence")))
+
+
+def stretches(frames: np.ndarray, time_s: np.ndarray) -> dict[str, np.ndarray]:
+    """Frames for learning, stopping and judging: three stretches of time with gaps of a frame and of 0.2 s between them.
+
+    >>> parts = stretches(np.arange(40), np.arange(40) / 5)
+    >>> [(int(part[0]), int(part[-1])) for part in parts.values()]
+    [(0, 24), (26, 30), (32, 39)]
+    """
+    n = len(frames)
+    if n < 12:
+        raise RefusalError(f"recording: {n} frames are too few to learn from and to judge by; record 30 and more.")
+    first, second = round(0.64 * n), round(0.79 * n)
+    parts = {"learn": frames[: first - 1], "stop": frames[first:second], "judge": frames[second + 1 :]}
+    for before, part in (("learn", "stop"), ("stop", "judge")):
+        late = time_s[parts[part]] - time_s[parts[before][-1]] >= min(0.2, 0.02 * np.ptp(time_s[frames]))
+        parts[part] = parts[part][late]
+    return parts
+
+
+def longest_still(recording: Recording, seen: Seen) -> tuple[np.ndarray, str]:
+    """The frames before or after the cameras moved, whichever are more, and what to say of it; all if they did not."""
+    rows, frames = seen.rows(_clock(recording, seen)[0]), seen.frame
+    problem = Problem.of(rows)
+    if problem.used.sum() < 60 or len(frames) < 24:
+        return frames, ""
+    count = len(frames)
+
+    @cache
+    def gain(cut: int) -> float:
+        parts = [Problem.of(rows.of_frames(part)) for part in (frames[:cut], frames[cut:])]
+        return sum(part.fit().total for part in parts) if min(part.used.sum() for part in parts) >= 16 else -np.inf
+
+    cut = max(np.unique(np.linspace(0.15, 0.85, 8) * count).astype(int), key=gain)
+    for step in (max(count // 16, 1), 1, 1):
+        cut = max((cut, cut - step, cut + step), key=gain)
+    # Cameras of their own have 16 numbers more, and the cut could lie anywhere.
+    if gain(cut) - problem.fit().total < 16 * np.log(problem.used.sum()) / 2 + 12 + _SURE_MOVE * problem.used.sum():
+        return frames, ""
+    kept = frames[:cut] if cut >= count - cut else frames[cut:]
+    return kept, (
+        f"The cameras moved at about frame {frames[cut]}: only frames {kept[0]} to {kept[-1]} are used."
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Teacher:
+    """The robot's landmarks, seen through calibrated cameras.
+
+    Attributes:
+        recording: With the clock's offset as the images show it.
+        calibration: Of the frames for learning.
+        clock_sd_s: Of the clock's offset.
+        offset_mm, offset_sd_mm: (3, 3) in the tool's axes: where the landmarks are, beside where the robot reports them.
+        refused: Frames in which the robot is not believed.
+        right: Share of the landmarks that agree on the cameras.
+    """
+
+    recording: Recording
+    calibration: Calibration
+    clock_sd_s: float
+    offset_mm: np.ndarray
+    offset_sd_mm: np.ndarray
+    refused: np.ndarray
+    right: float
+
+    def project(self, frames: np.ndarray, offset_mm: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Pixels (m, 2, 3, 2) of the robot's landmarks at the instants of their image rows, and covariances (m, 2, 3, 2, 2).
+
+        NaN where the robot is silent.  `offset_mm` is used in place of the teacher's own; the covariance is that of
+        calibration, robot, clock and offset.
+        """
+        r, c = self.recording, self.calibration
+        offset = self.offset_mm if offset_mm is None else offset_mm
+        time, height = np.repeat(r.frames.time_s[frames][:, None], 3, axis=1) + r.offset_s, r.image_size_px[1]
+        u, covariance = np.full((len(frames), 2, 3, 2), np.nan), np.full((len(frames), 2, 3, 2, 2), np.nan)
+        for side, camera in enumerate(c.cameras):
+            at = time
+            for _ in range(3 if r.readout_s else 1):
+                x = r.kinematics.at(at)
+                axes = np.nan_to_num(tool_axes(x))  # shut jaws have no axes, their offset stays unknown
+                x = x + np.einsum("mij,kj->mki", axes, offset)
+                u[:, side] = camera.project(x.reshape(-1, 3)).reshape(x.shape[:2] + (2,))
+                at = time + r.readout_s * np.nan_to_num(u[:, side, :, 1] / (height - 1) - 0.5).clip(-0.5, 0.5)
+            flat, view = np.nan_to_num(x).reshape(-1, 3), slice(2 * side, 2 * side + 2)
+            J = c.derivatives(flat)[0][:, view]
+            velocity = (r.kinematics.at(at + 0.02) - r.kinematics.at(at - 0.02)).reshape(-1, 3) / 0.04
+            moved = self.clock_sd_s * np.einsum("nij,nj->ni", J, np.nan_to_num(velocity))
+            spread = np.einsum("mij,kj,mlj->mkil", axes, self.offset_sd_mm**2, axes).reshape(-1, 3, 3)
+            spread = spread + max(r.robot_accuracy_mm, c.sigma_x_mm) ** 2 * np.eye(3)
+            S = c.projection_covariance(flat)[:, view, view] + J @ spread @ J.mT + moved[:, :, None] * moved[:, None]
+            covariance[:, side] = S.reshape(len(frames), 3, 2, 2)
+        return u, np.where(np.isfinite(u)[..., None], covariance, np.nan)
+
+    def labels(self, frames: np.ndarray, seen: Seen | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """u, covariance (as `project`) and visibility (m, 2, 3) of some frames; NaN where the robot is silent or refused.
+
+        Outside the image a landmark is 0, absent.  It is 1, hidden, where `seen`, of a detector that knows the tool, finds
+        the two others where they should be and this one not.
+        """
+        u, covariance = self.project(frames)
+        u = np.where(np.isin(frames, self.refused)[:, None, None, None], np.nan, u)
+        shown = np.where(inside(u, self.recording.image_size_px) | np.isnan(u[..., 0]), 2, 0)
+        if seen is not None:
+            part = seen.of(frames)
+            length = tool_length_px(u.reshape(-1, 3, 2)).reshape(u.shape[:2])[..., None]
+            right = (np.linalg.norm(part.u - u, axis=-1) < 0.05 * length) & (part.confidence >= MIN_CONFIDENCE)
+            shown = np.where(~right & (right.sum(axis=2, keepdims=True) == 2) & (shown == 2), 1, shown)
+        return u, covariance, shown
+
+
+def teach(
+    recording: Recording, seen: Seen, *, opinion: Seen | None = None, before: Teacher | None = None,
+    from_labels: bool = False,
+) -> Teacher:  # fmt: skip
+    """The robot as the teacher of what a detector has `seen` in the frames for learning.
+
+    Args:
+        opinion: Of closeups that were never taught by this robot.  They tell the landmarks' offsets; None: `seen` does.
+        before: The teacher of the round before: its clock is the start, and what it refused stays refused.
+        from_labels: `seen` are labels set by hand, of few frames.
+
+    Raises:
+        RefusalError: If fewer than a tenth of the landmarks agree on cameras, the cameras are no stereo microscope's, or the
+            robot contradicts the images.
+    """
+    frozen = _frozen(recording, seen.frame)
+    refused = frozen if before is None else np.union1d(frozen, before.refused)
+    used = seen.of(np.setdiff1d(seen.frame, refused))
+    if len(used.frame) < 5:
+        raise RefusalError(f"kinematics: they stand still in {len(refused)} of {len(seen.frame)} frames; check the log.")
+    recording, clock_sd_s = _clock(recording if before is None else before.recording, used)
+    calibration, right = _calibrated(recording, used, from_labels)
+    if not from_labels:
+        again, sd = _clock(recording, used, calibration)
+        if again is not recording:
+            recording, clock_sd_s = again, sd
+            calibration, right = _calibrated(recording, used, from_labels)
+    _check(recording, used, calibration, from_labels)
+    offset, sd = np.zeros((3, 3)), np.full((3, 3), 0.0 if calibration.offsets is not None else 0.1)
+    told = calibration.offsets
+    if opinion is not None:
+        try:
+            told = _fitted(recording, opinion.of(used.frame), 0.0).offsets
+        except ValueError:
+            told = None
+    if told is not None and told.offset.shape == (3, 3):
+        x = recording.landmarks_mm()
+        length = np.nanmedian(np.linalg.norm(x[:, 1:].mean(axis=1) - x[:, 0], axis=1))
+        offset, sd = _robots_share(told, (0.2 if from_labels else 1.0) * _OWN_BIAS * length)
+    elif before is not None:
+        offset, sd = before.offset_mm, before.offset_sd_mm
+    teacher = Teacher(recording, calibration, clock_sd_s, offset, sd, refused, right)
+    against = _contradicted(teacher, used)
+    if len(against) > max(_CONTRADICTED * len(used.frame), 2):
+        raise RefusalError(
+            f"robot: in {len(against)} of {len(used.frame)} frames the images show the whole tool elsewhere than the robot "
+            f"says: a frozen log, another clock, a moved microscope, or a tool that the robot does not hold; {_RECHECK}."
+        )
+    return replace(teacher, refused=np.union1d(refused, against))
+
+
+def _frozen(recording: Recording, frames: np.ndarray) -> np.ndarray:
+    """Frames at which the robot's log repeats itself to the last digit, or is silent."""
+    k = recording.kinematics
+    same = np.append(False, (np.diff(np.nan_to_num(k.x_mm.reshape(len(k.x_mm), -1)), axis=0) == 0).all(axis=1))
+    same = np.convolve(same, np.ones(3), "same") >= 2  # two in a row
+    nearest = np.abs(k.time_s[None] - (recording.frames.time_s[frames] + recording.offset_s)[:, None]).argmin(axis=1)
+    return np.asarray(frames)[same[nearest]]
+
+
+def _clock(recording: Recording, seen: Seen, calibration: Calibration | None = None) -> tuple[Recording, float]:
+    """The recording with the offset of the clocks that the images show, if they do, and its standard deviation."""
+    rows = seen.rows(recording)
+    if calibration is not None:  # of the rows that agree alone
+        rows = replace(rows, confidence=np.where(calibration.view_inliers, rows.confidence, 0.0))
+    if len(seen.frame) < 8:  # too few for that: the offset at which cameras explain the labels best
+        trial = recording.offset_s + np.linspace(-0.2, 0.2, 41)
+        misfit = [_fitted(replace(recording, offset_s=t), seen, 0.0).reprojection_rms_px for t in trial.tolist()]
+        return replace(recording, offset_s=float(trial[np.argmin(misfit)])), 0.01
+    for reach_s in (0.2, 1.0):
+        try:
+            found = estimate_time_offset(rows, recording.kinematics, start_s=recording.offset_s, search_s=reach_s)
+        except ValueError:
+            continue
+        if abs(found.offset_s - recording.offset_s) > 3 * found.sd_s and found.sd_s < 0.02:
+            return replace(recording, offset_s=found.offset_s), found.sd_s
+        return recording, min(found.sd_s, 0.01)
+    return recording, 0.005
+
+
+def _fitted(recording: Recording, seen: Seen, least: float) -> Calibration:
+    """Cameras of square pixels, which leave the landmarks' offsets the least room."""
+    return calibrate(seen.rows(recording, least), model="square", image_size_px=recording.image_size_px)
+
+
+def _calibrated(recording: Recording, seen: Seen, from_labels: bool) -> tuple[Calibration, float]:
+    """Cameras that the detections agree on, the confident ones if all do not, and the share of landmarks that agree."""
+    told = 6 * int(np.isfinite(recording.landmarks_mm()[seen.frame]).all(axis=(1, 2)).sum())
+    reason = "none was found"
+    for least in (0.0,) if from_labels else _CONFIDENCES:
+        try:
+            found = _fitted(recording, seen, least)
+        except ValueError as error:
+            reason = str(error)
+            continue
+        right = found.view_inliers.sum() / max(told, 1)
+        if right >= LEAST_RIGHT or from_labels:
+            return found, float(right)
+        reason = f"only {100 * right:.0f} % of the landmarks agree on cameras"
+    raise RefusalError(
+        f"detector: too few landmarks are right to start from ({reason}). Label 5 pairs of frames, far apart in place and "
+        "depth, and give them with --labels."
+    )
+
+
+def _check(recording: Recording, seen: Seen, calibration: Calibration, from_labels: bool) -> None:
+    """Refuse cameras that are no stereo microscope's, and a robot whose fault explains what the images show."""
+    red = [r for r in judge(None, calibration).reasons if r.level == LEVELS[2] and r.name == "implausible_optics"]
+    if red:
+        raise RefusalError(f"cameras: {red[0].text} {red[0].cure}")
+    length = np.nanmedian(tool_length_px(seen.u.reshape(-1, 3, 2)))
+    if from_labels or calibration.reprojection_rms_px < _HARMLESS * length:
+        return
+    rows = seen.rows(recording)
+    rows = replace(rows, confidence=np.where(calibration.view_inliers, rows.confidence, 0.0))
+    how = {"kinematics": recording.kinematics, "readout_s": recording.readout_s, "image_size_px": recording.image_size_px}
+    best = diagnose(rows, calibration, **how).best
+    if best is not None and best.name in FAULTS and best.explained >= _EXPLAINED:
+        raise RefusalError(f"robot: {best.text} {best.cure}")
+
+
+def _robots_share(found: LandmarkOffsets, own_sd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The part of the offsets (3, 3) that is the robot's, and its standard deviation; the rest is the detector's own.
+
+    Both have Gaussian priors: the detector's of `own_sd` (3, 3) mm, the robot's of the width that makes the nine numbers most
+    probable.  Offsets no larger than a detector's usual ones are taken for the detector's.
+    """
+    variance = own_sd**2 + found.standard_deviation**2
+    widths = np.append(0.0, np.geomspace(1e-3, 2.0, 80))[:, None, None]
+    total = widths**2 + variance
+    width = widths[(np.log(total) + found.offset**2 / total).sum(axis=(1, 2)).argmin(), 0, 0]
+    share = width**2 / (width**2 + variance)
+    return share * found.offset, np.sqrt(share * variance)
+
+
+def _contradicted(teacher: Teacher, seen: Seen) -> np.ndarray:
+    """Frames in which two landmarks and more are seen in both images, by one and the same distance off the robot's report."""
+    u, covariance = teacher.project(seen.frame, _free(teacher))
+    off = np.where((seen.confidence >= 0.5)[..., None], seen.u - u, np.nan)
+    length = tool_length_px(u.reshape(-1, 3, 2)).reshape(u.shape[:2])[..., None]
+    sd = np.sqrt(np.trace(covariance, axis1=-2, axis2=-1) / 2) + teacher.calibration.reprojection_rms_px
+    size = np.linalg.norm(off, axis=-1)
+    wrong = (size > 0.06 * length) & (size > 6 * sd)  # (m, 2, 3)
+    pairs = [(0, 1), (0, 2), (1, 2)]
+    alike = [np.linalg.norm(off[:, :, i] - off[:, :, j], axis=-1) < 0.3 * size[:, :, i] for i, j in pairs]
+    both = np.stack([wrong[:, :, i] & wrong[:, :, j] & same for (i, j), same in zip(pairs, alike, strict=True)], axis=-1)
+    return seen.frame[both.all(axis=1).any(axis=1)]
+
+
+def _free(teacher: Teacher) -> np.ndarray:
+    """Offsets (3, 3) mm with which the robot is seen where the detector sees the landmarks."""
+    offsets = teacher.calibration.offsets
+    return teacher.offset_mm if offsets is None or offsets.offset.shape != (3, 3) else offsets.offset

@@ -1,0 +1,222 @@
+"""The robot as a teacher: half-wrong detections are enough, and a robot that errs teaches nothing wrong."""
+
+import json
+
+import numpy as np
+import pytest
+
+from lib.adapt import RefusalError, adapt, labels_only, loop, report, teach
+from lib.adapt.judging import Agreement, better
+from lib.adapt.teacher import look, stretches
+from lib.landmarks import Detector, Landmarks
+from lib.recordings.annotations import Annotations, write_coco
+from tests.adapt.world import SIZE, StandIn, World, pupil
+
+
+@pytest.fixture(scope="module")
+def world():
+    return World()
+
+
+@pytest.fixture(scope="module")
+def recording(world, tmp_path_factory):
+    """The clocks differ by 40 ms, which recording.toml does not say."""
+    return world.record(tmp_path_factory.mktemp("lab") / "clock", clock_s=0.04)
+
+
+@pytest.fixture(autouse=True)
+def short(monkeypatch):
+    """One round, and no simulated frames."""
+    monkeypatch.setattr(loop, "ROUNDS", 1)
+    monkeypatch.setattr(loop, "simulated_like", lambda *_: [])
+
+
+def taught(recording, detector):
+    return teach(recording, look(recording, detector, np.arange(len(recording))))
+
+
+def label_errors(world, teacher, frames=None):
+    """Distances (m, 2, 3) px of the labels from the truth, and in units of their standard deviation."""
+    frames = np.arange(world.n) if frames is None else frames
+    u, covariance, _ = teacher.labels(frames)
+    off = u - world.u[frames]
+    sd = np.sqrt(np.trace(covariance, axis1=-2, axis2=-1) / 2)
+    return np.linalg.norm(off, axis=-1), np.linalg.norm(off, axis=-1) / sd / np.sqrt(2)
+
+
+def test_stretches_are_disjoint_in_time():
+    time_s = np.arange(200) / 25
+    parts = stretches(np.arange(200), time_s)
+    for before, after in (("learn", "stop"), ("stop", "judge")):
+        assert time_s[parts[after]].min() - time_s[parts[before]].max() > 0.15
+    assert min(map(len, parts.values())) >= 20
+    with pytest.raises(RefusalError, match="too few"):
+        stretches(np.arange(9), time_s)
+
+
+def test_half_wrong_detections_give_right_labels(world, recording):
+    teacher = taught(recording, StandIn(world.u, noise_px=2.0, wrong=0.5))
+    error, sigmas = label_errors(world, teacher)
+    assert np.median(error) < 1.6 and 0.3 < np.median(sigmas) < 2.0
+    assert teacher.recording.offset_s == pytest.approx(0.04, abs=0.01)
+    assert 0.4 < teacher.right < 0.65
+
+
+def test_offsets_of_the_robots_landmarks_are_learnt(world, tmp_path):
+    from lib.calibration.offsets import tool_axes
+
+    offset = np.array([[0.1, -0.15, 0.05], [-0.12, 0.1, 0.1], [0.15, 0.1, -0.08]])
+    off = world.record(tmp_path / "off", robot=lambda _, x: x + np.einsum("mij,kj->mki", np.nan_to_num(tool_axes(x)), offset))
+    teacher = taught(off, StandIn(world.u, noise_px=0.7, wrong=0.3))
+    assert np.median(label_errors(world, teacher)[0]) < 1.2
+    assert np.median(np.linalg.norm(teacher.project(np.arange(world.n), np.zeros((3, 3)))[0] - world.u, axis=-1)) > 2.0
+
+
+def test_a_small_constant_error_is_the_detectors_own(world, recording):
+    """A detector that marks the base 1.5 px too far back is not followed."""
+    biased = world.u.copy()
+    along = biased[:, :, 0] - biased[:, :, 1:].mean(axis=2)
+    biased[:, :, 0] += 1.5 * along / np.linalg.norm(along, axis=-1, keepdims=True)
+    teacher = taught(recording, StandIn(biased, noise_px=0.7, wrong=0.2))
+    assert np.median(label_errors(world, teacher)[0][:, :, 0]) < 1.0
+
+
+# --- five faults of the robot
+
+
+def frozen(time_s, x):
+    stands = (time_s > 5.0) & (time_s < 10.0)
+    return np.where(stands[:, None, None], x[np.argmax(stands)], x)
+
+
+def bent(time_s, x):
+    """The shaft bends by up to 0.5 mm, sideways, as the tool goes in."""
+    return x + np.array([0.0, 0.5, 0.0]) * ((x[..., 2:] - x[..., 2:].min()) / np.ptp(x[..., 2])) ** 2
+
+
+def other_tool(world):
+    """In a third of the frames the detector follows a tool that lies still in a corner."""
+    still = world.u[5] + [[[90.0, 60.0]], [[95.0, 60.0]]]
+    return {i: still for i in range(0, world.n, 3)}
+
+
+@pytest.mark.parametrize("fault", ["frozen", "rate", "bent", "moved", "other_tool"])
+def test_a_robot_that_errs_teaches_nothing_wrong(world, tmp_path, fault):
+    there, detector, how = world, None, {}
+    if fault == "moved":
+        there = World(moved_from=28)
+    elif fault == "rate":
+        how = {"rate": 1.15}
+    elif fault in ("frozen", "bent"):
+        how = {"robot": frozen if fault == "frozen" else bent}
+    detector = StandIn(there.u, wrong=0.3, elsewhere=other_tool(there) if fault == "other_tool" else {})
+    tune = pupil(there)
+    found = adapt(there.record(tmp_path / fault, **how), detector, folder=tmp_path / "out", progress=False, tune=tune)
+    for call in tune.calls:  # either nothing is taught, or what is taught is right
+        off = np.linalg.norm(call["off"], axis=-1)
+        assert np.nanmedian(off) < 1.5 and np.nanquantile(off, 0.9) < 4.0
+    if fault == "rate":
+        assert not found.improved and found.report["reason"]
+    if fault == "frozen":
+        assert set(range(12, 19)) <= set(found.report["refused_frames"])
+    if fault == "moved":
+        assert "moved" in found.report["notes"][0] and tune.calls
+
+
+# --- the loop
+
+
+def test_a_half_wrong_detector_is_improved(world, recording, tmp_path):
+    tune = pupil(world)
+    detector = StandIn(world.u, noise_px=2.0, wrong=0.4)
+    found = adapt(recording, detector, folder=tmp_path, progress=False, tune=tune)
+    assert found.improved and found.detector is not detector and found.calibration is not None
+    judged = found.report["judged"]
+    assert judged["after"]["median_px"] < 1.0 < judged["before"]["median_px"]
+    assert judged["after"]["epipolar_px"] < judged["before"]["epipolar_px"]
+    numbers = {name: set(part) for name, part in found.frames.items()}
+    assert not numbers["judge"] & numbers["learn"] and not numbers["judge"] & numbers["stop"]
+    assert all(int(one.name.split()[1]) in numbers["learn"] for call in tune.calls for one in call["images"])
+
+
+def test_a_good_detector_is_left_alone(world, recording, tmp_path):
+    detector = StandIn(world.u, noise_px=0.2)
+    found = adapt(recording, detector, folder=tmp_path, progress=False, tune=pupil(world))
+    assert not found.improved and found.detector is detector and found.report["reason"]
+
+
+def test_below_a_tenth_it_says_how_many_to_label(world, recording, tmp_path):
+    lost = StandIn(world.u, wrong=0.95)
+    found = adapt(recording, lost, folder=tmp_path, progress=False, tune=pupil(world))
+    assert not found.improved and "Label 5 pairs" in found.report["reason"]
+
+
+def test_five_labelled_pairs_are_a_start(world, recording, tmp_path, monkeypatch):
+    monkeypatch.setattr(loop, "ROUNDS", 3)  # five pairs do not tell the clock, the first round's detector does
+    u = np.full(world.u.shape, np.nan)
+    u[[1, 7, 13, 19, 24]] = world.u[[1, 7, 13, 19, 24]]
+    write_coco(tmp_path / "labels.json", Annotations(u[:, 0], u[:, 1]), SIZE, ".png")
+    tune = pupil(world)
+    lost = StandIn(world.u, wrong=0.97)
+    found = adapt(recording, lost, labels=tmp_path / "labels.json", folder=tmp_path, progress=False, tune=tune)
+    assert found.improved and np.nanmedian(np.linalg.norm(tune.calls[-1]["off"], axis=-1)) < 1.5
+
+
+def test_it_goes_on_after_a_kill(world, recording, tmp_path):
+    detector = StandIn(world.u, noise_px=2.0, wrong=0.4)
+
+    def killed(*_, **__):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        adapt(recording, detector, folder=tmp_path, progress=False, tune=killed)
+    asked = detector.asked
+    assert asked == world.n
+    again = adapt(recording, detector, folder=tmp_path, progress=False, tune=pupil(world))
+    assert again.improved and detector.asked == asked  # nothing was looked at twice
+
+
+def test_exit_codes_and_files(world, recording, tmp_path, monkeypatch, capsys):
+    detector, tune = StandIn(world.u, noise_px=2.0, wrong=0.4), pupil(world)
+    monkeypatch.setattr(Detector, "load", lambda *_, **__: detector)
+    monkeypatch.setattr(StandIn, "save", lambda self, path: path.write_bytes(b"weights"), raising=False)
+    monkeypatch.setattr(report, "adapt", lambda *a, **k: adapt(*a, **k, progress=False, tune=tune))
+    out = tmp_path / "better"
+    assert report.main([str(recording.folder), "--out", str(out), "--minutes", "1"]) == 0
+    content = json.loads((out / "report.json").read_text(encoding="utf-8"))
+    assert content["improved"] and (out / "weights.safetensors").exists() and (out / "weights.md").exists()
+    page = (out / "report.html").read_text(encoding="utf-8")
+    assert page.count("data:image/jpeg") == 3 and "http" not in page.replace("http-equiv", "")
+    monkeypatch.setattr(Detector, "load", lambda *_, **__: lambda images: Landmarks.none(len(images)))
+    assert report.main([str(recording.folder), "--out", str(tmp_path / "worse")]) == 3
+    assert not (tmp_path / "worse" / "weights.safetensors").exists()
+    assert "Left alone" in capsys.readouterr().out
+
+
+def test_labels_of_one_camera_do_without_a_robot(world, recording, tmp_path, monkeypatch):
+    monkeypatch.setattr(labels_only, "simulated_like", lambda *_: [])
+    u = np.where(np.arange(world.n)[:, None, None, None] % 2, np.nan, world.u)
+    write_coco(tmp_path / "labels.json", Annotations(u[:, 0], np.full_like(u[:, 1], np.nan)), SIZE, ".png")
+    tune = pupil(world)
+    found = labels_only.adapt_images(
+        recording.folder, tmp_path / "labels.json", StandIn(world.u, wrong=0.5), folder=tmp_path, progress=False,
+        tune=lambda detector, images, *rest, **how: tune(
+            detector, [one._replace(name=f"left {int(one.name[5:11])}") for one in images], *rest, **how),
+    )  # fmt: skip
+    assert found.improved and found.calibration is None
+    assert sum(found.report["frames"].values()) == 20 and found.report["judged"]["after"]["median_px"] < 0.5
+    with pytest.raises(ValueError, match="at least 10"):
+        labels_only.adapt_images(recording.folder, _few(tmp_path), StandIn(world.u), folder=tmp_path, tune=tune)
+
+
+def _few(folder):
+    u = np.full((2, 3, 2), 50.0)
+    write_coco(folder / "few.json", Annotations(u, u + 1), SIZE, ".png")
+    return folder / "few.json"
+
+
+def test_gain_is_judged_frame_by_frame():
+    gain, sd = better(np.array([0.05, 0.06, 0.04, np.nan]), np.array([0.01, 0.03, 0.01, 0.0]))
+    assert gain == pytest.approx(0.1 / 3) and 0 < sd < 0.01
+    missing = Agreement(np.full((1, 2, 3), np.inf), np.full((1, 2, 3), np.nan), np.full((1, 2, 1), 50.0))
+    assert missing.summary()["mean_share"] == pytest.approx(0.1)

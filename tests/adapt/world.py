@@ -1,0 +1,99 @@
+"""A lab without pictures: blank frames that carry their own number, and a stand-in for the detector that knows the rest."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from lib.cameras import StereoRig
+from lib.landmarks import Landmarks
+from lib.recordings import Recording, RecordingWriter
+from lib.simulator.eye import Eye
+from lib.simulator.forceps import Forceps
+from lib.simulator.motion import Motion
+from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
+
+SIZE = (480, 270)
+FPS, HZ = 2.0, 50.0
+
+
+@dataclass(eq=False)
+class World:
+    """What truly is: landmarks in the robot frame at any time, the rig, and where each frame shows them."""
+
+    n: int = 40
+    seed: int = 0
+    moved_from: int | None = None
+    rig: StereoRig = field(init=False)
+
+    def __post_init__(self):
+        self.rig = reference_rig(image_size_px=SIZE, pixels_per_mm=(25.0, 25.0))
+        self.tool = Forceps()
+        self.motion = Motion(self.tool, Eye(texture_px=64), kind="both", seed=self.seed, duration_s=self.n / FPS)
+        self.time_s = np.arange(self.n) / FPS
+        self.u = np.stack([self.project(i, t) for i, t in enumerate(self.time_s)])  # (n, 2, 3, 2)
+
+    def at(self, time_s):
+        """(m, 3, 3) mm."""
+        poses = [self.motion.pose(t) for t in np.clip(time_s, 0, None)]
+        return ROBOT_FROM_MICROSCOPE.apply(np.array([self.tool.landmarks(pose) for pose in poses]))
+
+    def project(self, i, time_s):
+        u = np.stack(self.rig.project(self.at([time_s])[0]))
+        if self.moved_from is not None and i >= self.moved_from:
+            u = 1.05 * u + [[[20.0, -12.0]], [[24.0, -12.0]]]
+        return u
+
+    def record(self, folder: Path, *, robot=lambda time_s, x: x, clock_s=0.0, rate=1.0, noise_mm=0.005) -> Recording:
+        """Write it; `robot` makes of the truth (m, 3, 3) what the log says."""
+        rng = np.random.default_rng([self.seed, 1])
+        sample_s = np.arange(-0.4, self.time_s[-1] + 0.4, 1 / HZ)
+        x = robot(sample_s, self.at(sample_s) + rng.normal(0, noise_mm, (len(sample_s), 3, 3)))
+        with RecordingWriter(folder, name=folder.name, fps=FPS, image_size_px=SIZE, suffix=".png") as writer:
+            for i, t in enumerate(self.time_s):
+                writer.add(*(np.full((*SIZE[::-1], 3), (i + 1, 60 * side + 20, 90), np.uint8) for side in (0, 1)), t)
+            writer.kinematics(rate * sample_s + clock_s, x)
+        return Recording.open(folder)
+
+
+@dataclass(eq=False)
+class StandIn:
+    """Finds what `u` (n, 2, 3, 2) says, with noise; a share of the landmarks, in some frames or all, is lost in the image.
+
+    `taught` counts how often something was asked of it.
+    """
+
+    u: np.ndarray
+    noise_px: float = 1.0
+    wrong: float = 0.0
+    elsewhere: dict[int, np.ndarray] = field(default_factory=dict)
+    seed: int = 0
+    asked: int = 0
+
+    def __call__(self, images):
+        found = Landmarks.none(len(images))
+        for j, image in enumerate(images):
+            i, side = int(image[0, 0, 0]) - 1, int(image[0, 0, 1] > 50)
+            rng = np.random.default_rng([self.seed, i, side])
+            u = self.elsewhere[i][side] if i in self.elsewhere else self.u[i, side]
+            lost = rng.random(3) < self.wrong
+            u = np.where(lost[:, None], rng.uniform((0, 0), SIZE, (3, 2)), u + rng.normal(0, self.noise_px, (3, 2)))
+            found.u[j], found.covariance[j] = u, self.noise_px**2 * np.eye(2)
+            found.confidence[j] = np.where(lost, 0.4, 0.9)
+        self.asked += 1
+        return found
+
+
+def pupil(world: World):
+    """A `tune` whose pupil finds the truth plus the mean error of the labels it was given, to 0.2 px: a lie is learnt."""
+    calls = []
+
+    def tune(detector, images, held_out, folder, *, covariance_px2, progress, **how):
+        number = {"left": 0, "right": 1}
+        where = [(int(one.name.split()[1]), number[one.name.split()[0]]) for one in images]
+        off = np.stack([one.u - world.u[i, side] for one, (i, side) in zip(images, where, strict=True)])
+        calls.append({"images": images, "off": off, "covariance": covariance_px2, **how})
+        return StandIn(world.u + np.nanmean(off, axis=0), noise_px=0.2)
+
+    tune.calls = calls
+    return tune
