@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lib import paths
+from lib import files, paths
 
 __all__ = ["Provenance", "commit", "commit_id", "machine", "plain"]
 
@@ -66,11 +66,15 @@ class Provenance:
     cpu_s: float = field(default_factory=lambda: _cpu_s())
 
     def so_far(self) -> dict[str, object]:
-        """What is known now, as `lib.workbench.results.write` takes it; CPU seconds count finished child processes too."""
+        """What is known now, as `lib.workbench.results.write` takes it.
+
+        CPU seconds count finished child processes too; `weights` is the digest of the detector that ships.
+        """
         return {
             "command": self.command,
             "commit": self.commit,
             "machine": machine(),
+            "weights": files.digest(paths.MODELS / "default.safetensors"),
             "date": datetime.date.today().isoformat(),
             "seconds": time.perf_counter() - self.wall_s,
             "cpu_seconds": _cpu_s() - self.cpu_s,

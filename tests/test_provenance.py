@@ -18,7 +18,7 @@ def test_what_a_measurement_tells_of_its_origin():
     provenance = Provenance("python3 -m lib something")
     sum(k * k for k in range(300_000))
     told = provenance.so_far()
-    assert set(told) == {"command", "commit", "machine", "date", "seconds", "cpu_seconds"}
+    assert set(told) == {"command", "commit", "machine", "weights", "date", "seconds", "cpu_seconds"}
     assert told["command"] == "python3 -m lib something" and told["date"] == datetime.date.today().isoformat()
     assert 0 < told["seconds"] < 60 and 0 <= told["cpu_seconds"] < 60
 

@@ -11,7 +11,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
+from lib import paths
 from lib.correspondences import LANDMARKS
+from lib.files import digest
 from lib.workbench.results import Table
 from notebooks.figures.style import COLOURS, figure
 
@@ -34,6 +36,7 @@ __all__ = [
     "speed_rows",
     "verdicts",
     "visibility_bars",
+    "weights",
 ]
 
 #: PCK@0.05 in percent of the five networks in the paper.
@@ -43,6 +46,12 @@ PAPER_ABLATION = {"encoder": 8.4, "+ decoder": 75.1, "+ skips": 95.2, "+ stack":
 def recorded(table: Table) -> str:
     """ "Recorded", and when: the beginning of a caption."""
     return f"Recorded {table.provenance.get('date', 'at an unknown date')}"
+
+
+def weights(table: Table) -> str:
+    """Whether a table was recorded with the detector that ships now."""
+    same = table.provenance.get("weights") == digest(paths.MODELS / "default.safetensors")
+    return "with the weights that ship" if same else "with other weights than those that ship now"
 
 
 def mean_and_error(values: Sequence[float]) -> tuple[float, float]:
