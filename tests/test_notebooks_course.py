@@ -68,13 +68,13 @@ def quiet(monkeypatch):
     monkeypatch.setattr(report, "record", lambda *_, **__: None)
 
 
-@pytest.mark.skipif(len(TAUGHT) < 7, reason="notebooks are being rewritten")
+@pytest.mark.skipif(len(TAUGHT) < 7, reason="the cells of notebooks 01 and 02 have no tags")
 def test_every_equation_and_every_step_has_its_cell():
     found = {tag for path in WALK for cell in worked_out(path) for tag in tags(cell)}
     assert {f"equation-{n}" for n in EQUATIONS} | METHOD <= found
 
 
-@pytest.mark.skipif(len(TAUGHT) < 7, reason="notebooks are being rewritten")
+@pytest.mark.skipif(len(TAUGHT) < 7, reason="the cells of notebooks 01 and 02 have no tags")
 def test_notebook_0_says_where_each_equation_is_worked_out():
     (path,) = (path for path in WALK if path.stem.startswith("00"))
     table = "\n".join(cell.source for cell in cells(path) if cell.id == "00-equations")

@@ -18,14 +18,14 @@ class OnlineCalibration:
         calibration: Where it starts: its rows that both images show, and its noise levels, which judge the new ones.
 
     >>> from lib.calibration import calibrate
-    >>> rng, A = np.random.default_rng(0), np.array([[99.0, 0, 9], [0, 99, 0], [99, 0, -9], [0, 99, 0]])
+    >>> rng, A = np.random.default_rng(0), np.array([[99.0, 0, -9], [0, 99, 0], [99, 0, 9], [0, 99, 0]])
     >>> x = rng.uniform(-4, 4, (60, 3))
     >>> y = x @ A.T + rng.normal(0, 1, (60, 4))
     >>> online = OnlineCalibration(calibrate(x[:30], [y[:30, :2], y[:30, 2:]]))
     >>> int(online.add(Correspondences.of_points(x[30:], y[30:, :2], y[30:, 2:])).sum())
     30
-    >>> online.solve().linear.round(0)[0].tolist()
-    [99.0, 0.0, 9.0]
+    >>> online.solve().linear[0].round().astype(int).tolist()
+    [99, 0, -9]
     """
 
     def __init__(self, calibration: Calibration) -> None:

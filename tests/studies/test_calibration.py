@@ -245,11 +245,9 @@ def test_notebook_03_takes_a_recording_with_a_gap_and_without_truth(recording, t
     monkeypatch.setattr(report, "record", lambda name, value, *_, **__: metrics.__setitem__(name, value))
     monkeypatch.setattr(report, "show", lambda page, *_: plt.close(page))
     variables = {}
+    names = "parameters", "imports", "images", "images-judge", "images-figures", "images-record", "offsets", "export"
     for cell in nbformat.read(paths.NOTEBOOKS / "03_affine_calibration.ipynb", as_version=4).cells:
-        if cell.id in {
-            f"03-{n}"
-            for n in ("parameters", "imports", "images", "images-judge", "images-figures", "offsets", "export")
-        }:
+        if cell.id.removeprefix("03-") in names:
             exec(compile(cell.source.replace("%matplotlib inline", ""), cell.id, "exec"), variables)
             variables["recording"] = str(tmp_path)
     assert metrics["calibration_reprojection_px"] < 1.5 and "calibration_error_um" not in metrics
