@@ -18,7 +18,7 @@ from lib.landmarks import Landmarks
 from lib.landmarks.metrics import tool_length_px
 from lib.recordings import Recording
 from lib.recordings.annotations import inside
-from lib.trust import LEVELS, diagnose, judge
+from lib.trust import LEVELS, Hypothesis, diagnose, judge
 from lib.trust.fitting import Problem
 
 __all__ = ["RefusalError", "Seen", "Teacher", "longest_still", "look", "stretches", "teach"]
@@ -232,7 +232,14 @@ def teach(
         if again is not recording:
             recording, clock_sd_s = again, sd
             calibration, right = _calibrated(recording, used, from_labels)
-    _check(recording, used, calibration, from_labels)
+    for _ in range(3):
+        fault = _fault(recording, used, calibration, from_labels)
+        if fault is None or fault.name != "clock":
+            break
+        recording, clock_sd_s = replace(recording, offset_s=recording.offset_s + 1e-3 * fault.value), 1e-3 * fault.sd
+        calibration, right = _calibrated(recording, used, from_labels)
+    if fault is not None:
+        raise RefusalError(f"robot: {fault.text} {fault.cure}")
     offset, sd = np.zeros((3, 3)), np.full((3, 3), 0.0 if calibration.offsets is not None else 0.1)
     told = calibration.offsets
     if opinion is not None:
@@ -310,20 +317,19 @@ def _calibrated(recording: Recording, seen: Seen, from_labels: bool) -> tuple[Ca
     )
 
 
-def _check(recording: Recording, seen: Seen, calibration: Calibration, from_labels: bool) -> None:
-    """Refuse cameras that are no stereo microscope's, and a robot whose fault explains what the images show."""
+def _fault(recording: Recording, seen: Seen, calibration: Calibration, from_labels: bool) -> Hypothesis | None:
+    """The robot's fault that explains what the images show, if there is one; cameras of no stereo microscope are refused."""
     red = [r for r in judge(None, calibration).reasons if r.level == LEVELS[2] and r.name == "implausible_optics"]
     if red:
         raise RefusalError(f"cameras: {red[0].text} {red[0].cure}")
     length = np.nanmedian(tool_length_px(seen.u.reshape(-1, 3, 2)))
     if from_labels or calibration.reprojection_rms_px < _HARMLESS * length:
-        return
+        return None
     rows = seen.rows(recording)
     rows = replace(rows, confidence=np.where(calibration.view_inliers, rows.confidence, 0.0))
     how = {"kinematics": recording.kinematics, "readout_s": recording.readout_s, "image_size_px": recording.image_size_px}
     best = diagnose(rows, calibration, **how).best
-    if best is not None and best.name in FAULTS and best.explained >= _EXPLAINED:
-        raise RefusalError(f"robot: {best.text} {best.cure}")
+    return best if best is not None and best.name in FAULTS and best.explained >= _EXPLAINED else None
 
 
 def _robots_share(found: LandmarkOffsets, own_sd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
