@@ -54,8 +54,7 @@ def adapt_images(
     work = Path(folder or paths.RUNS / f"adapt-{images.name}") / "work" / "labels"
     provenance = Provenance(f"python3 -m lib adapt {images.name} --labels {Path(labels).name}")
     simulated = simulated_like([one.image for one in parts["learn"]], seed, progress)
-    # A label set by hand is right to about 1.5 px.
-    covariance = np.tile(2.25 * np.eye(2), (first, 3, 1, 1))
+    covariance = np.tile(2.25 * np.eye(2), (first, 3, 1, 1))  # a label set by hand is right to about 1.5 px
     tuned = tune(
         detector, parts["learn"], parts["stop"], work, simulated=simulated, covariance_px2=covariance, minutes=minutes,
         steps=STEPS, seed=seed, progress=progress,

@@ -49,9 +49,7 @@ def _pictures(found: Adaptation, recording: Recording) -> list[tuple[str, str]]:
     order = np.argsort(found.after.relative)
     order = order[np.isfinite(found.after.relative[order])]
     pictures = []
-    for name, i in zip(("best", "median", "worst"), (0, len(order) // 2, -1), strict=True):
-        if not len(order):
-            break
+    for name, i in zip(("best", "median", "worst"), (0, len(order) // 2, -1), strict=True) if len(order) else ():
         number = int(found.frames["judge"][order[i]])
         rows = [overlay(recording.frames[number], own.u[order[i]], found.told[order[i]], 520) for own in found.seen]
         share = 100 * found.after.relative[order[i]]

@@ -42,7 +42,6 @@ _OWN_BIAS = 0.012 * np.array([[2.0, 1.0, 1.5], [1.0, 1.0, 1.5], [1.0, 1.0, 1.5]]
 _SURE_MOVE = 0.1
 _CLICK_PX = 1.5  # of labels set by hand
 _CONFIDENCES = (MIN_CONFIDENCE, 0.5, 0.8)
-_RECHECK = "`python3 -m lib check RECORDING` shows it"
 
 
 class RefusalError(ValueError):
@@ -258,7 +257,7 @@ def teach(
     if len(against) > max(_CONTRADICTED * len(used.frame), 2):
         raise RefusalError(
             f"robot: in {len(against)} of {len(used.frame)} frames the images show the whole tool elsewhere than the robot "
-            f"says: a frozen log, another clock, a moved microscope, or a tool that the robot does not hold; {_RECHECK}."
+            f"says: a frozen log, another clock, a moved microscope, or a tool that the robot does not hold; `python3 -m lib check` tells."
         )
     return replace(teacher, refused=np.union1d(refused, against))
 
