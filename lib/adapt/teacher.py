@@ -257,7 +257,7 @@ def teach(
     if len(against) > max(_CONTRADICTED * len(used.frame), 2):
         raise RefusalError(
             f"robot: in {len(against)} of {len(used.frame)} frames the images show the whole tool elsewhere than the robot "
-            f"says: a frozen log, another clock, a moved microscope, or a tool that the robot does not hold; `python3 -m lib check` tells."
+            f"says: a frozen log, another clock, a moved microscope, or a tool that the robot does not hold."
         )
     return replace(teacher, refused=np.union1d(refused, against))
 
