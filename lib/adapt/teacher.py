@@ -98,9 +98,9 @@ def look(
 def stretches(frames: np.ndarray, time_s: np.ndarray) -> dict[str, np.ndarray]:
     """Frames for learning, stopping and judging: three stretches of time with gaps of a frame and of 0.2 s between them.
 
-    >>> parts = stretches(np.arange(40), np.arange(40) / 5)
+    >>> parts = stretches(np.arange(40), np.arange(40) / 4)
     >>> [(int(part[0]), int(part[-1])) for part in parts.values()]
-    [(0, 24), (26, 30), (32, 39)]
+    [(0, 24), (26, 31), (33, 39)]
     """
     n = len(frames)
     if n < 12:
