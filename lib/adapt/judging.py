@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lib.adapt.teacher import Seen, Teacher
+from lib.adapt.teacher import RefusalError, Seen, Teacher
 from lib.landmarks.metrics import tool_length_px
 from lib.recordings import Recording
 from lib.trust.health import affine_epipolar, feature_matches
@@ -49,11 +49,11 @@ def frame_means(share: np.ndarray) -> np.ndarray:
 
 
 def agreement(teacher: Teacher, seen: Seen) -> Agreement:
-    """Of some frames; those that the teacher refused do not count.  A `ValueError` if it labels none."""
+    """Of some frames; those that the teacher refused do not count.  A `RefusalError` if it labels none."""
     u, covariance, shown = teacher.labels(seen.frame)
     there = np.isfinite(u).all(axis=-1) & (shown > 0)
     if not there.any():
-        raise ValueError(f"robot: it labels none of the {len(seen.frame)} frames that are kept for stopping or judging.")
+        raise RefusalError(f"robot: it labels none of the {len(seen.frame)} frames that are kept for stopping or judging.")
     off, S = seen.u - u, covariance + seen.covariance
     S = np.where(np.isfinite(S), S, np.eye(2))
     sigmas = np.sqrt((off[..., None, :] @ np.linalg.inv(S) @ off[..., None])[..., 0, 0] / 2)

@@ -133,9 +133,7 @@ def longest_still(recording: Recording, seen: Seen) -> tuple[np.ndarray, str]:
     if gain(cut) - problem.fit().total < 16 * np.log(problem.used.sum()) / 2 + 12 + _SURE_MOVE * problem.used.sum():
         return frames, ""
     kept = frames[:cut] if cut >= count - cut else frames[cut:]
-    return kept, (
-        f"The cameras moved at about frame {frames[cut]}: only frames {kept[0]} to {kept[-1]} are used."
-    )
+    return kept, f"The cameras moved at about frame {frames[cut]}: only frames {kept[0]} to {kept[-1]} are used."
 
 
 @dataclass(frozen=True, eq=False)

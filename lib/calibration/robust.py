@@ -179,7 +179,11 @@ def _samples(x: np.ndarray, count: int, rng: np.random.Generator, least_mm: floa
     sets = sets[np.argsort(-volume)[:count]]
     corners = x[sets] - x[sets].mean(axis=1, keepdims=True)
     thick = np.sqrt(np.maximum(np.linalg.eigvalsh(np.swapaxes(corners, 1, 2) @ corners)[:, 0], 0.0))
-    fine = thick > max(least_mm, 1e-9 * np.abs(x).max())
+    spans = thick > 1e-6 * np.abs(x).max()  # rounding leaves 1e-8
+    if not spans.any():
+        raise ValueError("x_mm: no four of the positions span a volume; move the tool through more places and depths.")
+    sets, thick = sets[spans], thick[spans]
+    fine = thick > least_mm
     return sets[fine] if fine.sum() >= 20 else sets[np.argsort(-thick)[:20]]
 
 

@@ -5,7 +5,7 @@ import contextlib
 import resource
 import sys
 import time
-from collections import Counter
+from collections import Counter, deque
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -35,7 +35,7 @@ class Tally:
     dropped: int = 0
     states: Counter = field(default_factory=Counter)
     failures: Counter = field(default_factory=Counter)
-    latency_s: list[float] = field(default_factory=list)
+    latency_s: deque[float] = field(default_factory=lambda: deque(maxlen=100_000))
     start: float = field(default_factory=time.monotonic)
     cpu_start: float = field(default_factory=time.process_time)
     _newest: int = -1
@@ -48,8 +48,7 @@ class Tally:
             self.surfaces, self._newest = self.surfaces + 1, result.reconstructed_at
         self.states[result.state] += 1
         self.failures.update(result.failures.keys())
-        if len(self.latency_s) < 100_000:
-            self.latency_s.append(latency_s)
+        self.latency_s.append(latency_s)
 
     def __str__(self) -> str:
         spent, cpu = time.monotonic() - self.start, time.process_time() - self.cpu_start

@@ -129,11 +129,10 @@ def leave_frame(u: Tensor, visibility: Tensor, image_size: tuple[int, int]) -> T
 
 
 _STILL = Augmentation(0.0, (1.0, 1.0))  # windows are rotated and zoomed where they are cut out
-#: The paper's, that of the shipped detector's first stage, and those of its other stages.
+#: None, where sources change what they draw; the paper's; a stronger one; and the one of closeups.
 AUGMENTATIONS = {
     "none": _STILL,
     "paper": Augmentation(),
     "best": Augmentation(180.0, (0.7, 1.3), shift=0.15, mirror=True, photometric=1.0),
-    "windows": replace(_STILL, mirror=True, photometric=1.0, photometric_share=0.25),
     "closeups": replace(_STILL, photometric=1.0, photometric_share=0.25),  # closeups of tip_2 are mirrored already
 }

@@ -123,3 +123,17 @@ def test_the_clock_is_found_among_wrong_detections():
         spoiled.append(pixels + wrong[:, None] * rng.normal(size=pixels.shape) * scale[:, None])
     found = estimate_time_offset((time, spoiled), robot)
     assert found.offset_s == pytest.approx(0.08, abs=2e-3) and found.sd_s < 1e-3 and found.rms_px < 4
+
+
+@pytest.mark.parametrize("places", [3, 4, 5, 8])
+def test_positions_that_repeat_calibrate_or_are_named(places):
+    """A robot that stops at a few places reports each many times; sets of four rows with a repeated one span nothing."""
+    rng = np.random.default_rng(places)
+    x = np.repeat(rng.uniform(-4, 4, (places, 3)), 20, axis=0)
+    y = x @ np.array([[99.0, 0, -9], [0, 99, 0], [99, 0, 9], [0, 99, 0]]).T + rng.normal(0, 1, (len(x), 4))
+    try:
+        found = calibrate(x, [y[:, :2], y[:, 2:]])
+    except ValueError as error:
+        assert places == 3 and "coplanar" in str(error)
+    else:
+        assert found.inliers.mean() > 0.95
