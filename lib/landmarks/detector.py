@@ -29,7 +29,16 @@ from lib.landmarks.heatmaps import Peaks, decode
 from lib.landmarks.metrics import tool_length_px
 from lib.landmarks.network import Network, OffsetNetwork, StackedHourglass, as_tensor, as_uint8
 from lib.landmarks.search import PEAKS, best_tools, without_peak
-from lib.landmarks.windows import TOOL_PX, closeup_from_image, cut, map_points, tool_pose, tool_zoom, window_from_image
+from lib.landmarks.windows import (
+    TOOL_PX,
+    closeup_from_image,
+    closeup_scale,
+    cut,
+    map_points,
+    tool_pose,
+    tool_zoom,
+    window_from_image,
+)
 from lib.parallel import single_threaded_torch
 from lib.recordings import Recording
 
@@ -47,6 +56,8 @@ CLOSE = ("closeup", "closer", "tracking")
 #: Where the first stage is less sure than this of a landmark, other places are looked at: this many tools, made of peaks at
 #: these scales of the first stage's input.
 _SURE, _CANDIDATES, _SCALES = 0.5, 5, (1.0, 1.5)
+#: A tracked landmark that moved farther, in closeups of scale 1, is looked at twice: nearer, one closeup measures as well.
+_SECOND_LOOK_PX = 4.0
 #: Stages that use another stage's network.
 _NETWORK_OF = {"again": "tool", "closer": "closeup", "tracking": "closeup"}
 
@@ -258,9 +269,11 @@ class Detector:
             with self._threads():
                 part = images if usable.size == len(images) else images[usable]  # a pair of frames takes 12 MB
                 near = previous[usable]
-                # The first closeup says where to look, the second measures.
-                for stage in ["window"] if self.closeup_network is None else ["tracking", "tracking"]:
-                    near = self.refine(part, near, stage)
+                stage = "window" if self.closeup_network is None else "tracking"
+                found = self.refine(part, near, stage)
+                if stage == "tracking" and _moved_px(near.u, found.u) > _SECOND_LOOK_PX:
+                    found = self.refine(part, found, stage)
+                near = found
                 result._put(usable, near)
         lost = np.flatnonzero((result.confidence < min_confidence).any(1))
         if lost.size:
@@ -413,6 +426,12 @@ class Detector:
         fit = self.error_models.get(stage, ErrorModel())
         covariance, confidence = covariance_and_confidence(peaks.double(), rough, fit, landmark)
         return Landmarks(peaks.u.numpy(), covariance.numpy(), confidence.numpy())
+
+
+def _moved_px(before: np.ndarray, after: np.ndarray) -> float:
+    """The longest way of a landmark (n, 3, 2), in image pixels of closeups of scale 1."""
+    scale = closeup_scale(np.maximum(tool_length_px(before), 1.0))[:, None]
+    return float(np.nanmax(np.linalg.norm(after - before, axis=2) * scale, initial=0.0))
 
 
 def detect(

@@ -60,7 +60,8 @@ def match(
             the right ones lie below), and 0 for the others.
         downscale: DeepMatching only: pools descriptors by 2^downscale; None is the smallest from 1 that fits the budget.
         budget_bytes: Memory that DeepMatching may take; a search predicted to need more is refused.
-        max_epipolar_px: A rig whose epipolar lines lie farther than this from free coarse matches is refused.
+        max_epipolar_px: A rig whose epipolar lines lie farther than this from free coarse matches is refused.  With
+            ``numpy.inf`` and a `depth_range_mm` there is no coarse pass: faster, for a rig that was checked before.
         reciprocal: Drop matches whose way back from the right image leads elsewhere (occlusions, above all).
         device: torch device of free DeepMatching, such as "cuda".
 

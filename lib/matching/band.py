@@ -89,6 +89,8 @@ def plan_search(images: Images, masks: Masks, rig: StereoRig, where: Where) -> S
     width, height = whole.size_px
     scale = min(1.0, float(np.sqrt(MAX_PIXELS[setting] / (width * height))))
     rectification = rectify(rig, *shapes, scale=scale)
+    if depth_range_mm is not None and np.isinf(max_epipolar_px):
+        return Search(rectification, scale, rectification.search_range_px(depth_range_mm, shapes[1]), 0.0, 0)
     displacement, n_found = _coarse_displacement(images, masks, rig, whole)
     off_line_px, range_px = 0.0, (-COARSE_REACH * width, COARSE_REACH * width)
     if len(displacement) >= MIN_SUPPORTED:
@@ -121,7 +123,7 @@ def _coarse_displacement(images: Images, masks: Masks, rig: StereoRig, whole: Re
     rectification = rectify(rig, images[0].shape, images[1].shape, scale=scale)
     reach = int(np.ceil(COARSE_REACH * rectification.size_px[0] / CELL_PX))
     left, right = _descriptors(images, masks, rectification, (-reach, reach), COARSE_OFF_LINE)
-    matches, _ = _match(left, right, -reach, COARSE_OFF_LINE)
+    matches, _ = _match(left, right, -reach, COARSE_OFF_LINE, rivals=False)
     chosen = matches.keep(_supported(matches))
     start = chosen.patch * PATCH
     step, _ = refine(left, right, start, start + chosen.cell - (-reach, -COARSE_OFF_LINE))
@@ -157,9 +159,11 @@ def _descriptors(
 
 
 def _match(
-    left: np.ndarray, right: np.ndarray, low: int, off_line: int, *, reciprocal: bool = True
-) -> tuple[VolumeMatches, np.ndarray]:
-    """Matches of two grids and their peak ratios (n,), without those on flat or mostly masked patches or without a peak."""
+    left: np.ndarray, right: np.ndarray, low: int, off_line: int, *, reciprocal: bool = True, rivals: bool = True
+) -> tuple[VolumeMatches, np.ndarray | None]:
+    """Matches of two grids, without those on flat or mostly masked patches or without a peak, and with `rivals` their peak
+    ratios (n,).
+    """
     with single_threaded_torch():
         volume = correlation_volume(torch.from_numpy(left), torch.from_numpy(right), off_line)
         matches = match_volume(volume, low, reciprocal=reciprocal)
@@ -169,6 +173,8 @@ def _match(
         [right[start[:, 1] + r, start[:, 0] + c, CHANNELS - 1] > 0 for r in range(PATCH) for c in range(PATCH)], axis=0
     )
     matches = matches.keep(patch_quality(left)[y, x] & (seen_right >= MIN_SEEN) & matches.peaked)
+    if not rivals:
+        return matches, None
     x, y = torch.from_numpy(matches.patch.T)
     along = torch.from_numpy(matches.cell[:, 0] - low)
     return matches, peak_ratio(volume[y, x].amax(dim=1, keepdim=True), torch.zeros_like(along), along)

@@ -1,5 +1,6 @@
 """Is a frame fit to be used?  What images and report tell by themselves, before any rig is asked."""
 
+import cv2
 import numpy as np
 
 from lib.correspondences import Correspondences
@@ -11,6 +12,11 @@ _DARK, _FLAT = 6.0, 1.5  # grey levels: an image that is darker on average, or v
 _REPEATED_PX = 0.3  # a detector finds the same landmarks in the same image within this
 _MOVED_PX = 5.0  # landmarks that all moved farther than this moved
 _FAR_MM = 300.0  # from where the robot was: beyond any tool's reach
+
+
+def _dark_or_flat(thumb: np.ndarray) -> bool:
+    mean, sd = cv2.meanStdDev(thumb)
+    return bool(mean.mean() < _DARK or sd.max() < _FLAT)
 
 
 class FrameChecks:
@@ -29,8 +35,7 @@ class FrameChecks:
             shapes = " and ".join(str(image.shape) for image in pair)
             raise ValueError(f"left, right: expected two (h, w, 3) uint8 images, got {shapes}.")
         thumbs = tuple(np.ascontiguousarray(image[::_STEP, ::_STEP]) for image in pair)
-        names = [name for name, thumb in zip(("left", "right"), thumbs, strict=True)
-                 if thumb.mean() < _DARK or thumb.std() < _FLAT]  # fmt: skip
+        names = [name for name, thumb in zip(("left", "right"), thumbs, strict=True) if _dark_or_flat(thumb)]
         self._same = [len(self._thumbs) == 2 and np.array_equal(a, b) for a, b in zip(thumbs, self._thumbs, strict=False)]
         self._same, self._thumbs = self._same or [False, False], thumbs
         late, self._time = time_s <= self._time, max(time_s, self._time)

@@ -108,7 +108,7 @@ class TipDistance:
         slope = np.stack([surface.derivative(u, order) @ view for order in ((1, 0), (0, 1))], axis=1)
         # How the distance along the view changes with the tip: the surface point behind it moves too.
         towards = slope @ camera.linear - view
-        behind, nearest = surface.covariance(u), surface.covariance(found.nearest_u[rows])
+        behind, nearest = np.split(surface.covariance(np.concatenate([u, found.nearest_u[rows]])), 2)
         normal = surface.normal(found.nearest_u[rows])
         # The calibration puts the surface beside the robot's points, and not the tip.
         shared = tracker.point_covariance(x[rows])

@@ -29,6 +29,9 @@ from lib.surface import Reconstruction, reconstruct
 __all__ = ["Detector", "OnlinePipeline"]
 
 
+_DEPTH_MARGIN_MM = 0.5  # how far an eye may move along the view from one surface to the next
+
+
 class Detector(Protocol):
     """`lib.landmarks.Detector`, or anything alike: `.u` (n, 3, 2), `.covariance`, `.confidence` of n images.
 
@@ -73,11 +76,14 @@ class OnlinePipeline:
         self._tracker = RigTracker(rig, noise_px=float(noise_px), settings=self.settings, calibrate=calibrate)
         self._checks, self._tips = FrameChecks(), TipDistance(self.settings)
         self._surface: Surface | None = None
+        self._pair: np.ndarray | None = None
         self._smoothness: float | None = None
+        self._asked = self._most_points = self._rig_since = 0  # surfaces; most points since the last search everywhere
         self._rests_on = dict.fromkeys(("landmarks", "robot"), float("nan"))
         self.surfaces = Beside() if beside else InTurn(reconstruct)
 
     def __enter__(self) -> Self:
+        self.surfaces.wait_ready()
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -126,11 +132,14 @@ class OnlinePipeline:
         data, seen = result.landmarks, not blind and bool(result.landmarks.seen.all(axis=1).any())
         for name, fresh in (("landmarks", seen), ("robot", not blind and np.isfinite(x_mm).any())):
             self._rests_on[name] = time_s if fresh else self._rests_on[name]
-        before, fit = tracker.rig, seen and not told and bool(data.is_complete.any())
+        before, calibration = tracker.rig, tracker.calibration
+        fit = seen and not told and bool(data.is_complete.any())
         if fit:
             tracker.take(result, frame)
         self._name_state(result, blind, told, seen)
         result.rig = tracker.rig
+        if tracker.calibration is not calibration or result.motion is not None:
+            self._rig_since = self._index
         if tracker.rig is not before and (result.motion is not None or tracker.rig is None):
             self._tips.reset()
         if tracker.rig is not None and seen:
@@ -166,7 +175,9 @@ class OnlinePipeline:
         result.cause = cause
 
     def _detect(self, left: np.ndarray, right: np.ndarray, kinematics: ArrayLike | Callable | None) -> Seen:
-        images, previous = np.stack([left, right]), self._seen
+        if self._pair is None or self._pair.shape[1:] != left.shape:
+            self._pair = np.empty((2, *left.shape), np.uint8)  # kept: fresh memory costs more than the copy
+        images, previous = np.stack([left, right], out=self._pair), self._seen
         self._seen = None  # whatever fails now, the next frame is searched as a whole
         follow = previous is not None and hasattr(self._detector, "track")
         found = self._detector.track(images, previous) if follow else self._detector(images)
@@ -192,6 +203,15 @@ class OnlinePipeline:
         data = Correspondences.of_points(x, *u, frame=index, landmark=range(len(LANDMARKS)), **stated)
         return Seen(data, lambda rig: data)
 
+    def _where_to_search(self) -> dict[str, Any]:
+        """Near the last surface; in every tenth frame, for a new rig, and where few points were found, everywhere."""
+        last, self._asked = self._surface, self._asked + 1
+        known = last is not None and last.index >= self._rig_since
+        if not known or self._asked % 10 == 0 or len(last.reconstruction.u) < 0.6 * self._most_points:
+            self._most_points = 0
+            return {}
+        return {"depth_range_mm": last.reconstruction.depth_range_mm(_DEPTH_MARGIN_MM), "max_epipolar_px": np.inf}
+
     def _follow_surface(self, result: FrameResult, left: np.ndarray, right: np.ndarray) -> None:
         """Ask for a surface of this frame, and take the newest that is there."""
         tracker = self._tracker
@@ -207,7 +227,7 @@ class OnlinePipeline:
                 "percentiles": (1, 99),
                 "control": self.settings.control,
                 "smoothness": self._smoothness,
-            }
+            } | self._where_to_search()
             self.surfaces.submit(SurfaceJob(left, right, tracker.rig, self._index, result.time_s, options))
         done, event = self.surfaces.collect()
         if event:
@@ -220,6 +240,7 @@ class OnlinePipeline:
             else:
                 # Chosen by held-out error once: the eye is the same in the next frame.
                 self._surface, self._smoothness = surface, surface.reconstruction.surface.fit.smoothness
+                self._most_points = max(self._most_points, len(surface.reconstruction.u))
         result.dropped = self.surfaces.dropped
         if self._surface is not None:
             result.reconstruction, result.reconstructed_at = self._surface.reconstruction, self._surface.index

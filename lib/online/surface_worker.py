@@ -2,6 +2,7 @@
 
 import contextlib
 import multiprocessing
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from multiprocessing import shared_memory
@@ -34,6 +35,7 @@ def make(job: SurfaceJob, reconstruct: Callable[..., Reconstruction] = reconstru
     seconds: dict[str, float] = {}
     try:
         found, failure = reconstruct(job.left, job.right, job.rig, seconds=seconds, **job.options), None
+        found.surface.covariance(found.u[:1])  # factorises once, so that no frame waits for it
     except Exception as error:  # whatever it dies of: the next frame may have a surface
         stage = next(reversed(seconds), "match")
         found, failure = None, (_PARTS_OF_MATCHING.get(stage, stage), f"{type(error).__name__}: {error}")
@@ -50,6 +52,9 @@ class InTurn:
     def __init__(self, reconstruct: Callable[..., Reconstruction] = reconstruct) -> None:
         self._reconstruct, self._done = reconstruct, []
         self.dropped = 0
+
+    def wait_ready(self) -> None:
+        """Nothing to wait for."""
 
     def submit(self, job: SurfaceJob) -> None:
         """Take in a job."""
@@ -87,6 +92,10 @@ class Beside:
         theirs.close()
         self._in_work = False
 
+    def wait_ready(self, timeout_s: float = 60.0) -> None:
+        """Until the process has started: before that it takes time from the frames."""
+        self._pipe.poll(timeout_s)
+
     def submit(self, job: SurfaceJob) -> None:
         """Take in a job; the one that waited is dropped."""
         self.dropped += self._waiting is not None
@@ -112,7 +121,8 @@ class Beside:
         done, event = [], ""
         try:
             while self._pipe.poll():
-                surface = self._pipe.recv()
+                if (surface := self._pipe.recv()) is None:  # it has started
+                    continue
                 self._in_work = False
                 if not self._stale:
                     done.append(surface)
@@ -149,7 +159,10 @@ class Beside:
 
 
 def _work(pipe: multiprocessing.connection.Connection) -> None:
-    """In the worker: jobs until None or until the other side is gone."""
+    """In the worker: jobs until None or until the other side is gone.  Landmarks come first, so it yields to them."""
+    with contextlib.suppress(AttributeError, OSError):  # not every system has priorities
+        os.nice(10)
+    pipe.send(None)
     with contextlib.suppress(EOFError, OSError, KeyboardInterrupt):
         while (job := pipe.recv()) is not None:
             name, shape, rig, index, time_s, options = job

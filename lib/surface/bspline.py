@@ -17,6 +17,13 @@ from lib.surface.solver import UNHELD, L1Problem, cholesky
 
 __all__ = ["BSplineSurface", "SurfaceFit", "ToolDistance"]
 
+#: Coefficients [order, power, j] of the four basis functions of a span, and of their derivatives.
+_POWERS = np.zeros((3, 4, 4))
+_POWERS[0] = np.array([[1, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]]) / 6
+_POWERS[1, :3] = _POWERS[0, 1:] * np.array([[1], [2], [3]])
+_POWERS[2, :2] = _POWERS[1, 1:3] * np.array([[1], [2]])
+_FEW = 256  # points: a sparse matrix costs more than it saves
+
 
 @dataclass(frozen=True, eq=False)
 class SurfaceFit:
@@ -167,8 +174,19 @@ class BSplineSurface:
         u = points(u, 2, "u")
         result = np.full((len(u), 3), np.nan)
         inside = self.grid.inside(u)
-        result[inside] = self.grid.design(u[inside], order) @ self.grid.flatten(self.control_points_mm)
+        if inside.sum() <= _FEW and max(order) <= 2:
+            result[inside] = self._jet(u[inside])[order[1], order[0]]
+        else:
+            result[inside] = self.grid.design(u[inside], order) @ self.grid.flatten(self.control_points_mm)
         return result
+
+    def _jet(self, u: np.ndarray) -> np.ndarray:
+        """Values and derivatives [q, p, n, 3] mm per px^(p+q), p along x and q along y up to 2, at few points inside."""
+        (cell, t), k = self.grid.locate(u), np.arange(4)
+        scale = self.grid.cell_px ** -np.arange(3.0)[:, None]
+        along = np.einsum("okj,nak->aonj", _POWERS, t[..., None] ** k) * scale.T[:, :, None, None]
+        near = self.control_points_mm[cell[:, 1, None, None] + k[:, None], cell[:, 0, None, None] + k]
+        return np.einsum("qnj,pnjk->qpnk", along[1], np.einsum("pni,njik->pnjk", along[0], near))
 
     def on_grid(self, x_px: ArrayLike, y_px: ArrayLike) -> np.ndarray:
         """Points (len(y), len(x), 3) on the lattice of columns `x_px` and rows `y_px`: fast for whole images."""
@@ -213,17 +231,18 @@ class BSplineSurface:
         u = np.clip(start, low, high)
         seen = np.isfinite(u).all(axis=1)
         for _ in range(iterations):
-            jacobian = np.stack([self.derivative(u[seen], (1, 0)), self.derivative(u[seen], (0, 1))], axis=2)
-            gap = x[seen] - self(u[seen])
+            jet = self._jet(u[seen])
+            jacobian = np.stack([jet[0, 1], jet[1, 0]], axis=2)
+            gap = x[seen] - jet[0, 0]
             normal = np.einsum("nki,nkj->nij", jacobian, jacobian)
             # Second-order term of the distance: keeps steps right where the tool is far above a curved surface.
-            second = [[self.derivative(u[seen], (2 - i - j, i + j)) for j in (0, 1)] for i in (0, 1)]
-            hessian = normal - np.einsum("ijnk,nk->nij", np.array(second), gap)
+            second = jet[[[0, 1], [1, 2]], [[2, 1], [1, 0]]]
+            hessian = normal - np.einsum("ijnk,nk->nij", second, gap)
             convex = (np.linalg.det(hessian) > 0) & (hessian[:, 0, 0] > 0)
             hessian[~convex] = normal[~convex]
             step = np.linalg.solve(hessian, np.einsum("nki,nk->ni", jacobian, gap)[..., None])[..., 0]
             u[seen] = np.clip(u[seen] + step, low, high)
-            if not step.size or np.abs(step).max() < 1e-9:
+            if not step.size or np.abs(step).max() < 1e-7:
                 break
         # At the domain's border the nearest point may lie beyond it: then there is none to name.
         u[~np.isfinite(along_view)] = np.nan

@@ -53,6 +53,11 @@ class Reconstruction:
         """Left image points (n, 2) px of `points`."""
         return self.matches.u_left
 
+    def depth_range_mm(self, margin_mm: float = 0.0) -> tuple[float, float]:
+        """(near, far) of nearly all points along the left camera's view, as `lib.matching.match` takes it, and a margin."""
+        low, high = np.percentile(self.points.x_mm @ self.rig.left.viewing_direction, (0.5, 99.5))
+        return float(low) - margin_mm, float(high) + margin_mm
+
 
 def epipolar_inliers(rig: StereoRig, matches: Matches, *, sigmas: float = EPIPOLAR_SIGMAS) -> np.ndarray:
     """Mask (n,) of the matches that lie on their epipolar lines, within `sigmas` of their own standard deviations.
@@ -84,6 +89,8 @@ def reconstruct(
     smoothness: float | None = None,
     reject_mm: float | None = None,
     depth_only: bool | None = None,
+    depth_range_mm: tuple[float, float] | None = None,
+    max_epipolar_px: float = 6.0,
     seconds: dict[str, float] | None = None,
 ) -> Reconstruction:
     """Reconstruct the surface that a calibrated stereo pair shows.
@@ -106,6 +113,8 @@ def reconstruct(
         smoothness: As for `fit_surface`; that of an earlier frame (`Reconstruction.surface.fit.smoothness`) saves time.
         depth_only: Fit one spline, the depth along the rays of the left camera, in place of three.  It needs an affine
             left camera. None is True in the fast setting with an affine rig.
+        depth_range_mm, max_epipolar_px: As for `lib.matching.match`; those of an earlier frame (`depth_range_mm` of its
+            result) save time.
         seconds: A dictionary that gets the seconds of each stage as it ends, also of the stage that fails.
 
     Raises:
@@ -147,7 +156,8 @@ def reconstruct(
         with _timed(seconds, "refine"):
             rig = refine_rig(rig, covariance, match(left, right, rig=rig, setting="fast", **masks))
     with _timed(seconds, "match"):
-        found = match(left, right, rig=rig, method=method, setting=setting, **masks)
+        where = {"depth_range_mm": depth_range_mm, "max_epipolar_px": max_epipolar_px}
+        found = match(left, right, rig=rig, method=method, setting=setting, **where, **masks)
     with _timed(seconds, "triangulate"):
         matches = found.keep(epipolar_inliers(rig, found, sigmas=epipolar_sigmas))
         points = rig.triangulate(matches.u_left, matches.u_right, matches.covariance_px2)

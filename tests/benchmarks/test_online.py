@@ -48,7 +48,7 @@ def test_rate(benchmark, feed):
     with OnlinePipeline(detector, rig=truth.rig, noise_px=0.6, settings=Settings(fps=FPS), beside=live) as pipeline:
         first = next(gliding(1, 2, seed=1))
         pipeline.step(first.left, first.right, first.kinematics, time_s=-1.0)  # warms up
-        arrivals = Live(gliding(n)) if live else gliding(n)
+        arrivals = Live(gliding(n)) if live else list(gliding(n))  # made before the clock starts
 
         def run():
             for arrival in arrivals:

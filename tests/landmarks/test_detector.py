@@ -229,7 +229,8 @@ def test_a_closeup_moves_what_the_stage_before_found(images):
     np.testing.assert_array_equal(replace(detector, closeup_network=closeup).refine(images, before, "closeup").u, before.u)
 
 
-def test_tracking_looks_twice_at_closeups_and_knows_when_it_lost_the_tool(images, monkeypatch):
+@pytest.mark.parametrize(("way_px", "looks_twice"), [(1.0, False), (5.0, True)])
+def test_tracking_looks_twice_where_the_tool_moved_far_and_knows_when_it_lost_it(images, monkeypatch, way_px, looks_twice):
     closeup = OffsetNetwork(OffsetConfig(4, 32)).eval()
     detector = replace(untrained(), closeup_network=closeup)
     looks = []
@@ -237,13 +238,16 @@ def test_tracking_looks_twice_at_closeups_and_knows_when_it_lost_the_tool(images
     def refined(self, part, rough, stage):
         looks.append(stage)
         return Landmarks(
-            rough.u + 1.0, rough.covariance, np.full((len(part), 3), 0.9 if rough.u[0, 0, 0] < 50 else 0.1)
+            rough.u + way_px / closeup_scale(length), rough.covariance,
+            np.full((len(part), 3), 0.9 if rough.u[0, 0, 0] < 50 else 0.1),
         )
 
     monkeypatch.setattr(Detector, "refine", refined)
     before = Landmarks(np.full((1, 3, 2), 20.0), np.tile(np.eye(2), (1, 3, 1, 1)), np.ones((1, 3)))
-    np.testing.assert_array_equal(detector.track(images[:1], before).u, before.u + 2)
-    assert looks == ["tracking", "tracking"]
+    length = np.maximum(tool_length_px(before.u), 1.0)
+    found = detector.track(images[:1], before).u
+    assert looks == ["tracking"] * (2 if looks_twice else 1)
+    np.testing.assert_allclose(found, before.u + len(looks) * way_px / closeup_scale(length))
     lost = replace(before, u=before.u + 40)
     monkeypatch.setattr(Detector, "__call__", lambda self, part: before)
     np.testing.assert_array_equal(detector.track(images[:1], lost).u, before.u)

@@ -59,7 +59,8 @@ class World:
         u_left, u_right = self.rig.project(ROBOT_FROM_MICROSCOPE.apply(plane))
         seconds |= {"mask": 0.01, "match": 0.02, "triangulate": 0.03, "surface": 0.04}
         points = rig.triangulate(u_left, u_right)
-        return SimpleNamespace(surface=Plane(u_left, points.x_mm), points=points, u=u_left, rig=rig)
+        plane = Plane(u_left, points.x_mm)
+        return SimpleNamespace(surface=plane, points=points, u=u_left, rig=rig, depth_range_mm=lambda margin: (-9.0, 9.0))
 
     def true_distance_mm(self) -> np.ndarray:
         """Along the view of the left camera."""
