@@ -13,6 +13,8 @@ RUNS = ROOT / "runs"
 SHIPPED_RECORDING = DATA / "open_sky_eye"
 
 REAL_DATA_VARIABLE = "MICROSTEREO_DATA"
+#: Names the folder in which the notebooks of one run share what each would else work out again.
+SHARED_VARIABLE = "MICROSTEREO_SHARED"
 
 
 def recording_folder(folder: str = "") -> Path:

@@ -5,7 +5,6 @@ from lib.calibration.affine import Moments, affine_minimum, dlt, paper_variances
 from lib.calibration.calibration import Calibration, LandmarkOffsets
 from lib.calibration.estimate import calibrate
 from lib.calibration.export import write_opencv, write_ros
-from lib.calibration.ladder import LADDER, Comparison, Rung, compare_models
 from lib.calibration.offsets import with_offsets
 from lib.calibration.online import OnlineCalibration
 from lib.calibration.optics import Optics, optics
@@ -14,8 +13,8 @@ from lib.calibration.robust import NoConsensusError
 from lib.calibration.timing import TimeOffset, estimate_time_offset
 
 __all__ = [
-    "LADDER", "Calibration", "Comparison", "LandmarkOffsets", "Moments", "NoConsensusError", "OnlineCalibration", "Optics",
-    "Pivot", "Rung", "TimeOffset", "Tool", "ToolOffsets", "added_error", "affine_minimum", "box_grid", "calibrate",
-    "compare_models", "dlt", "estimate_time_offset", "next_positions", "optics", "paper_variances",
-    "pivot_calibration", "tool_offsets", "with_offsets", "write_opencv", "write_ros",
+    "Calibration", "LandmarkOffsets", "Moments", "NoConsensusError", "OnlineCalibration", "Optics", "Pivot", "TimeOffset",
+    "Tool", "ToolOffsets", "added_error", "affine_minimum", "box_grid", "calibrate", "dlt", "estimate_time_offset",
+    "next_positions", "optics", "paper_variances", "pivot_calibration", "tool_offsets", "with_offsets", "write_opencv",
+    "write_ros",
 ]  # fmt: skip

@@ -1,5 +1,6 @@
 """Landmarks of the forceps in an image: base, tip_1, tip_2, with covariance and confidence (paper Sec. III)."""
 
 from lib.landmarks.detector import Detector, Landmarks, detect
+from lib.landmarks.shared import SharedDetector
 
-__all__ = ["Detector", "Landmarks", "detect"]
+__all__ = ["Detector", "Landmarks", "SharedDetector", "detect"]

@@ -22,7 +22,7 @@ from tqdm.auto import tqdm
 from lib import paths
 from lib.correspondences import Correspondences, of_recording
 from lib.geometry import image_from_cell
-from lib.landmarks.checkpoints import load_network, read_checkpoint, write_checkpoint
+from lib.landmarks.checkpoints import checksum, load_network, read_checkpoint, write_checkpoint
 from lib.landmarks.engines import accelerated, default_engine
 from lib.landmarks.error_model import ErrorModel, Rough, closeup_peaks, corrected, covariance_and_confidence
 from lib.landmarks.heatmaps import Peaks, decode
@@ -217,15 +217,24 @@ class Detector:
     def save(self, path: str | Path) -> None:
         """Write the detector as one safetensors file; `ValueError` if a stage has no error model."""
         self._check_complete(path)
+        write_checkpoint(path, *self._content())
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of all that decides what it finds: weights, settings, error models and engine."""
+        tensors, metadata = self._content()
+        return checksum(tensors, metadata | {"engine": self.engine})
+
+    def _content(self) -> tuple[dict[str, Tensor], dict[str, object]]:
+        """Tensors and metadata of the detector's file."""
         states = {stage: network.state_dict() for stage, network in self.networks.items()}
         tensors = {f"{stage}.{key}": value for stage, state in states.items() for key, value in state.items()}
-        metadata = {name: getattr(self, name) for name in _SETTINGS} | {
+        return tensors, {name: getattr(self, name) for name in _SETTINGS} | {
             "format": FORMAT,
             "networks": {stage: asdict(network.config) for stage, network in self.networks.items()},
             "calibration": {stage: list(asdict(fit).values()) for stage, fit in self.error_models.items()},
             "provenance": self.metadata,
         }
-        write_checkpoint(path, tensors, metadata)
 
     def _check_complete(self, path: str | Path) -> None:
         lacking = [stage for stage in self.stages if stage not in self.error_models]

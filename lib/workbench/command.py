@@ -3,11 +3,13 @@
 import argparse
 import contextlib
 import datetime
+import os
 import shutil
 import signal
 import sys
+import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -98,16 +100,18 @@ def run(
     width = max(len(book.stem) for book in chosen)
     live = sys.stderr.isatty()
     try:
-        for number, book in enumerate(chosen, start=1):
-            label, start = f"[{number}/{len(chosen)}] {book.stem:<{width}}", time.monotonic()
-            report.begin(book)
-            with tqdm(desc=label, unit="cell", leave=False, disable=not live) as bar:
-                failure = execute(
-                    book, report.executed(book), values[book], cell_timeout_s=cell_timeout_s, on_cell=partial(_advance, bar)
-                )
-            seconds = time.monotonic() - start
-            report.end(book, failure, seconds)
-            print(f"{label}  {seconds:6.1f} s  {'failed' if failure else 'done'}", flush=True)
+        with _shared_folder():
+            for number, book in enumerate(chosen, start=1):
+                label, start = f"[{number}/{len(chosen)}] {book.stem:<{width}}", time.monotonic()
+                report.begin(book)
+                with tqdm(desc=label, unit="cell", leave=False, disable=not live) as bar:
+                    on_cell = partial(_advance, bar)
+                    failure = execute(
+                        book, report.executed(book), values[book], cell_timeout_s=cell_timeout_s, on_cell=on_cell
+                    )
+                seconds = time.monotonic() - start
+                report.end(book, failure, seconds)
+                print(f"{label}  {seconds:6.1f} s  {'failed' if failure else 'done'}", flush=True)
         report.finish()
     except KeyboardInterrupt:
         report.finish("stopped")
@@ -126,6 +130,18 @@ def run(
         why = f" ({names}); `python3 -m lib check {folder}` says more" if names else ""
         print(f"Verdict: {report.content['verdict']}{why}")
     return report.content
+
+
+@contextlib.contextmanager
+def _shared_folder() -> Iterator[None]:
+    """While the notebooks run, a folder for what they share, named in the environment that their kernels inherit."""
+    paths.CACHE.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix="run-", dir=paths.CACHE, ignore_cleanup_errors=True) as folder:
+        os.environ[paths.SHARED_VARIABLE] = folder
+        try:
+            yield
+        finally:
+            del os.environ[paths.SHARED_VARIABLE]
 
 
 class _Report:

@@ -11,10 +11,10 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullFormatter
 
 from lib.calibration import Calibration, LandmarkOffsets, TimeOffset
-from lib.calibration.ladder import Comparison
 from lib.geometry import RigidTransform
 from lib.workbench.results import Table
 from notebooks.figures.style import COLOURS, LANDMARK_COLOURS, figure, show_image
+from notebooks.studies.camera_models import Comparison
 from notebooks.studies.dvrk import RobotFrames, SphereFit
 
 __all__ = [

@@ -9,13 +9,13 @@ from lib.calibration import (
     Moments,
     affine_minimum,
     calibrate,
-    compare_models,
     dlt,
     paper_variances,
 )
 from lib.calibration.affine import estimate_noise
 from lib.correspondences import Correspondences
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
+from notebooks.studies.camera_models import compare_models
 from tests.calibration.rigs import data, near_rig
 
 SIZE = (1920, 1080)

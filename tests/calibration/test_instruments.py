@@ -7,7 +7,6 @@ import pytest
 from lib.calibration import (
     OnlineCalibration,
     calibrate,
-    compare_models,
     estimate_time_offset,
     pivot_calibration,
     tool_offsets,
@@ -20,6 +19,7 @@ from lib.geometry import RigidTransform
 from lib.recordings import Kinematics
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig, simulate_correspondences
 from lib.trust import report
+from notebooks.studies.camera_models import compare_models
 from tests.calibration.rigs import data, tool_sweep
 
 

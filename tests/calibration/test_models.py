@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from lib.calibration import compare_models
 from lib.calibration.models import Model, State, fit, settle
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig, simulate_correspondences
+from notebooks.studies.camera_models import compare_models
 from tests.calibration.rigs import near_rig
 
 NAMES = [

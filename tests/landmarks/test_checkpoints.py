@@ -71,6 +71,22 @@ def test_missing_metadata_error_models_and_checksums_are_named(tmp_path):
         Detector.load(path)
 
 
+def test_the_digest_tells_everything_that_decides_what_a_detector_finds():
+    detector = untrained()
+    weights = detector.networks["window"].state_dict()
+    others = [
+        replace(detector, frame_px=32),
+        replace(detector, method="paper"),
+        replace(detector, engine="openvino"),
+        detector.with_error_models(window=ErrorModel(logit=(5.5, 0.0, 0.0, 0.0))),
+    ]
+    before = detector.digest
+    assert len({before, *(other.digest for other in others)}) == 5 and replace(detector).digest == before
+    with torch.no_grad():
+        next(iter(weights.values())).view(-1)[0] += 1e-6
+    assert detector.digest != before
+
+
 def test_a_full_disk_leaves_the_old_file(tmp_path, monkeypatch):
     path = tmp_path / "weights.safetensors"
     untrained().save(path)

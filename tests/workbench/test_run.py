@@ -218,6 +218,22 @@ def test_a_signal_leaves_the_state_stopped(without_kernels, tmp_path, monkeypatc
     assert content["state"] == "stopped" and content["notebooks"][0]["state"] == "pending"
 
 
+def test_the_notebooks_of_a_run_share_a_folder_that_goes_with_it(without_kernels, tmp_path, monkeypatch):
+    monkeypatch.setattr(paths, "CACHE", tmp_path / "cache")
+    named, execute = [], command.execute
+
+    def looked(*arguments, **options):
+        named.append(Path(os.environ[paths.SHARED_VARIABLE]))
+        assert list(named[-1].iterdir()) == [named[0] / "kept"] * (len(named) > 1)
+        (named[-1] / "kept").touch()
+        return execute(*arguments, **options)
+
+    monkeypatch.setattr(command, "execute", looked)
+    run(["03", "04"], runs=tmp_path / "runs")
+    assert len(named) == 2 and named[0] == named[1] and named[0].parent == tmp_path / "cache"
+    assert not named[0].exists() and paths.SHARED_VARIABLE not in os.environ
+
+
 def test_a_full_disk_is_told_and_leaves_the_state_failed(without_kernels, tmp_path, monkeypatch, capsys):
     """The executed notebook is cut off; then nothing can be written until room is made."""
     write_bytes = command.files.write_bytes

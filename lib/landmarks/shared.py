@@ -1,0 +1,70 @@
+"""Detections that the notebooks of one run share, so that no stereo pair is looked at twice."""
+
+import hashlib
+import os
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+
+from lib import files, paths
+from lib.landmarks.detector import Detector, Landmarks
+
+__all__ = ["SharedDetector"]
+
+
+class SharedDetector:
+    """A detector for `detect` and `assess` that reads what another notebook of the same run has found in the same images.
+
+    `python3 -m lib run` makes a folder for its notebooks, names it in the environment and removes it at its end; anywhere
+    else this is the detector itself.  A file's name is the digest of the images' pixels, the weights, the settings and the
+    engine.  Where a time is measured, call the detector itself.
+
+    Attributes:
+        seconds: What detecting took: here, and where it was read, there.
+        pairs, read: How many calls there were, and how many of them were read.
+
+        >>> detector = SharedDetector(lambda images: Landmarks.none(len(images)))
+        >>> len(detector(np.zeros((2, 8, 8, 3), np.uint8))), detector.pairs, detector.read
+        (2, 1, 0)
+    """
+
+    def __init__(self, detector: Detector | Callable[[np.ndarray], Landmarks] | None = None):
+        self.detector = detector or Detector.load()
+        self.seconds, self.pairs, self.read = 0.0, 0, 0
+        self._folder = os.environ.get(paths.SHARED_VARIABLE)
+        self._digest = self.detector.digest if self._folder else ""
+
+    def __call__(self, images: np.ndarray) -> Landmarks:
+        """Landmarks of a stereo pair (2, h, w, 3), uint8 RGB."""
+        self.pairs += 1
+        if not self._folder:
+            found, seconds = self._look(images)
+        else:
+            content = hashlib.sha256(f"{self._digest} {images.dtype} {images.shape}".encode())
+            content.update(np.ascontiguousarray(images))
+            file = Path(self._folder) / f"{content.hexdigest()}.npz"
+            if file.is_file():
+                self.read += 1
+                with np.load(file) as kept:
+                    found = Landmarks(kept["u"], kept["covariance"], kept["confidence"])
+                    seconds = float(kept["seconds"])
+            else:
+                found, seconds = self._look(images)
+                with suppress(OSError), files.whole(file) as partial:  # a full disk costs time, not the notebook
+                    np.savez(partial, **vars(found), seconds=seconds)
+        self.seconds += seconds
+        return found
+
+    def _look(self, images: np.ndarray) -> tuple[Landmarks, float]:
+        start = time.perf_counter()
+        return self.detector(images), time.perf_counter() - start
+
+    def __str__(self) -> str:
+        """Where the detections come from, in one sentence."""
+        if not self.read:
+            return f"Detected in {self.pairs} stereo pairs, {self.seconds:.1f} s."
+        seconds = f"finding them took {self.seconds:.1f} s"
+        return f"Detections in {self.read} of {self.pairs} stereo pairs were read from this run's cache; {seconds}."
