@@ -1,6 +1,5 @@
 """Calibration of affine and near-affine cameras from a robot's kinematics, and how good it is (paper Sec. IV-A)."""
 
-from lib.calibration.advice import added_error, box_grid, next_positions
 from lib.calibration.affine import Moments, affine_minimum, dlt, paper_variances
 from lib.calibration.calibration import Calibration, LandmarkOffsets
 from lib.calibration.estimate import calibrate
@@ -14,7 +13,7 @@ from lib.calibration.timing import TimeOffset, estimate_time_offset
 
 __all__ = [
     "Calibration", "LandmarkOffsets", "Moments", "NoConsensusError", "OnlineCalibration", "Optics", "Pivot", "TimeOffset",
-    "Tool", "ToolOffsets", "added_error", "affine_minimum", "box_grid", "calibrate", "dlt", "estimate_time_offset",
-    "next_positions", "optics", "paper_variances", "pivot_calibration", "tool_offsets", "with_offsets", "write_opencv",
+    "Tool", "ToolOffsets", "affine_minimum", "calibrate", "dlt", "estimate_time_offset",
+    "optics", "paper_variances", "pivot_calibration", "tool_offsets", "with_offsets", "write_opencv",
     "write_ros",
 ]  # fmt: skip

@@ -39,28 +39,22 @@ class SharedDetector:
 
     def __call__(self, images: np.ndarray) -> Landmarks:
         """Landmarks of a stereo pair (2, h, w, 3), uint8 RGB."""
-        self.pairs += 1
-        if not self._folder:
-            found, seconds = self._look(images)
-        else:
-            content = hashlib.sha256(f"{self._digest} {images.dtype} {images.shape}".encode())
-            content.update(np.ascontiguousarray(images))
-            file = Path(self._folder) / f"{content.hexdigest()}.npz"
+        self.pairs, file = self.pairs + 1, None
+        if self._folder:
+            content = f"{self._digest} {images.dtype} {images.shape}".encode() + images.tobytes()
+            file = Path(self._folder) / f"{hashlib.sha256(content).hexdigest()}.npz"
             if file.is_file():
-                self.read += 1
                 with np.load(file) as kept:
-                    found = Landmarks(kept["u"], kept["covariance"], kept["confidence"])
-                    seconds = float(kept["seconds"])
-            else:
-                found, seconds = self._look(images)
-                with suppress(OSError), files.whole(file) as partial:  # a full disk costs time, not the notebook
-                    np.savez(partial, **vars(found), seconds=seconds)
-        self.seconds += seconds
-        return found
-
-    def _look(self, images: np.ndarray) -> tuple[Landmarks, float]:
+                    self.read, self.seconds = self.read + 1, self.seconds + float(kept["seconds"])
+                    return Landmarks(kept["u"], kept["covariance"], kept["confidence"])
         start = time.perf_counter()
-        return self.detector(images), time.perf_counter() - start
+        found = self.detector(images)
+        seconds = time.perf_counter() - start
+        self.seconds += seconds
+        if file:
+            with suppress(OSError), files.whole(file) as partial:  # a full disk costs time, not the notebook
+                np.savez(partial, **vars(found), seconds=seconds)
+        return found
 
     def __str__(self) -> str:
         """Where the detections come from, in one sentence."""

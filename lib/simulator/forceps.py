@@ -82,13 +82,12 @@ class Forceps:
     bow_mm: float = 0.18
     bend_mm: float = 0.20
     hook_mm: float = 0.05
-    shaft_length_mm: float = 40.0
     brightness: float = 0.55
     brushed: float = 0.25
     seed: int = 0
 
     def __post_init__(self) -> None:
-        positive(self, "shaft_radius_mm jaw_length_mm jaw_radius_mm tip_radius_mm taper shaft_length_mm")
+        positive(self, "shaft_radius_mm jaw_length_mm jaw_radius_mm tip_radius_mm taper")
         radii = self.tip_radius_mm, self.jaw_radius_mm, self.shaft_radius_mm
         if not radii[0] <= radii[1] <= radii[2]:
             raise ValueError(f"tip_radius_mm, jaw_radius_mm, shaft_radius_mm: must not decrease in this order, got {radii}.")
@@ -123,8 +122,8 @@ class Forceps:
 
     def nodes(self, pose: Pose) -> Nodes:
         """The tool as chains of round cones: 0 is the shaft (far end first), 1 and 2 the jaws."""
-        k = max(2, round(self.shaft_length_mm) + 1)
-        shaft = np.column_stack([np.linspace(-self.shaft_length_mm, 0, k), np.zeros(k), np.zeros(k)])
+        k = round(_SHAFT_MM) + 1
+        shaft = np.column_stack([np.linspace(-_SHAFT_MM, 0, k), np.zeros(k), np.zeros(k)])
         parts = [(shaft, np.full(k, self.shaft_radius_mm)), *(self._jaw(side, pose.opening_mm) for side in (+1, -1))]
         lines, radii = zip(*parts, strict=True)
         return pose.place(np.vstack(lines)), np.concatenate(radii), np.repeat(np.arange(3), [len(line) for line in lines])

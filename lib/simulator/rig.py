@@ -1,23 +1,20 @@
-"""The stereo microscope over the robot: its cameras, focus, light, shutter and sensor; and correspondences as it sees them.
+"""The stereo microscope over the robot: its cameras, focus, light, shutter and sensor.
 
 Microscope frame: origin at the centre of the field on the focal plane, x right and y down in the unrotated
 image, z away from the cameras (into the eye), millimetres.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from lib.cameras import AffineCamera, NearAffineCamera, StereoRig
-from lib.correspondences import Correspondences
 from lib.geometry import RigidTransform
 from lib.simulator.lighting import Lighting
 from lib.simulator.limits import check, not_negative, positive
 from lib.simulator.video import Video
 
-__all__ = ["IMAGE_SIZE_PX", "ROBOT_FROM_MICROSCOPE", "Microscope", "SimulatedSweep", "reference_rig"]
-__all__ += ["simulate_correspondences"]
+__all__ = ["IMAGE_SIZE_PX", "ROBOT_FROM_MICROSCOPE", "Microscope", "reference_rig"]
 
 IMAGE_SIZE_PX = (1920, 1080)
 _PLAIN = Lighting()
@@ -106,36 +103,3 @@ def reference_rig(*, robot_from_microscope: RigidTransform = ROBOT_FROM_MICROSCO
     (True, False)
     """
     return Microscope(**geometry).rig(robot_from_microscope)
-
-
-@dataclass(frozen=True, eq=False)
-class SimulatedSweep(Correspondences):
-    """`Correspondences` with noise, and the truth beside them: `true_x_mm` (n, 3) and `true_rig`."""
-
-    true_x_mm: np.ndarray
-    true_rig: StereoRig
-
-    def subset(self, rows: slice | ArrayLike) -> Correspondences:
-        """The rows that a slice, a mask or an array of indices names, without the truth."""
-        return Correspondences(**{f.name: getattr(self, f.name) for f in fields(Correspondences)}).subset(rows)
-
-
-def simulate_correspondences(
-    n: int, *, rng: np.random.Generator, rig: StereoRig | None = None,
-    half_size_mm: tuple[float, float, float] = (8.0, 4.5, 1.5), sigma_u_px: float = 1.5, sigma_x_mm: float = 0.010,
-    robot_from_microscope: RigidTransform = ROBOT_FROM_MICROSCOPE,
-) -> SimulatedSweep:  # fmt: skip
-    """`n` positions in a box around the microscope frame's origin, as the rig sees them and the robot reports them.
-
-    `sigma_u_px` and `sigma_x_mm` are the standard deviations per coordinate; the rows do not state them.
-
-    >>> sweep = simulate_correspondences(500, rng=np.random.default_rng(0), sigma_u_px=2.0)
-    >>> len(sweep.complete), float(np.std(sweep.true_rig.left.project(sweep.true_x_mm) - sweep.u_left).round(1))
-    (500, 2.0)
-    """
-    rig = rig or reference_rig(robot_from_microscope=robot_from_microscope)
-    true_x = robot_from_microscope.apply(rng.uniform(-1, 1, (n, 3)) * half_size_mm)
-    u_left, u_right = (u + rng.normal(0, sigma_u_px, u.shape) for u in rig.project(true_x))
-    x = true_x + rng.normal(0, sigma_x_mm, (n, 3))
-    rows = Correspondences.of_points(x, u_left, u_right)
-    return SimulatedSweep(**vars(rows), true_x_mm=true_x, true_rig=rig)

@@ -53,8 +53,11 @@ def diagnose(
         offset_s, readout_s, image_size_px: As the recording states them; without a size nothing is said of the read-out time.
         seed: Of the random samples.
 
-    >>> from lib.simulator.rig import simulate_correspondences
-    >>> print(diagnose(simulate_correspondences(60, rng=np.random.default_rng(0))).best)
+    >>> from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
+    >>> rng = np.random.default_rng(0)
+    >>> x = ROBOT_FROM_MICROSCOPE.apply(rng.uniform(-4, 4, (60, 3)))
+    >>> u = [pixels + rng.normal(0, 1.5, pixels.shape) for pixels in reference_rig().project(x)]
+    >>> print(diagnose(Correspondences.of_points(x, *u)).best)
     None
     """
     if image_size_px is None and calibration is not None:

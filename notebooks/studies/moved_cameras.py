@@ -16,7 +16,8 @@ from lib.cameras import StereoRig
 from lib.correspondences import LANDMARKS, Correspondences
 from lib.geometry import RigidTransform
 from lib.registration import Registration, register
-from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, SimulatedSweep, reference_rig
+from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
+from notebooks.studies.simulated_rows import SimulatedSweep
 
 __all__ = [
     "Estimator",

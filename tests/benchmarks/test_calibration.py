@@ -7,8 +7,8 @@ import pytest
 
 from lib.calibration import Moments, OnlineCalibration, affine_minimum, calibrate
 from lib.correspondences import Correspondences
-from lib.simulator.rig import simulate_correspondences
 from lib.trust import report
+from notebooks.studies.simulated_rows import simulate_correspondences
 
 
 def stacked(n):

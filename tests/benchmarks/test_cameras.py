@@ -6,7 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from lib.simulator.rig import reference_rig, simulate_correspondences
+from lib.simulator.rig import reference_rig
+from notebooks.studies.simulated_rows import simulate_correspondences
 
 POINTS = 100_000
 

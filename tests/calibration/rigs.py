@@ -6,7 +6,8 @@ from lib.calibration.offsets import tool_axes
 from lib.cameras import NearAffineCamera, StereoRig
 from lib.correspondences import Correspondences
 from lib.geometry import RigidTransform
-from lib.simulator.rig import IMAGE_SIZE_PX, ROBOT_FROM_MICROSCOPE, reference_rig, simulate_correspondences
+from lib.simulator.rig import IMAGE_SIZE_PX, ROBOT_FROM_MICROSCOPE, reference_rig
+from notebooks.studies.simulated_rows import simulate_correspondences
 
 LANDMARKS_MM = np.array([[0.0, 0.0, 0.0], [3.0, -0.5, 0.1], [3.0, 0.5, 0.1]])
 OFFSETS_MM = np.array([[0.040, 0.0, -0.010], [-0.010, 0.004, 0.006], [0.012, -0.003, 0.002]])

@@ -17,9 +17,10 @@ from lib.cameras import AffineCamera, StereoRig
 from lib.correspondences import Correspondences, pair_with_robot
 from lib.geometry import RigidTransform
 from lib.recordings import Kinematics
-from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig, simulate_correspondences
+from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
 from lib.trust import report
 from notebooks.studies.camera_models import compare_models
+from notebooks.studies.simulated_rows import simulate_correspondences
 from tests.calibration.rigs import data, tool_sweep
 
 

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from lib.calibration.models import Model, State, fit, settle
-from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig, simulate_correspondences
+from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
 from notebooks.studies.camera_models import compare_models
+from notebooks.studies.simulated_rows import simulate_correspondences
 from tests.calibration.rigs import near_rig
 
 NAMES = [

@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 
-from lib.calibration import added_error, box_grid, calibrate, dlt, next_positions, optics
+from lib.calibration import calibrate, dlt, optics
 from lib.cameras import NearAffineCamera
-from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig, simulate_correspondences
+from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
+from notebooks.studies.positions import added_error, box_grid, next_positions
+from notebooks.studies.simulated_rows import simulate_correspondences
 
 
 def made(n=150, seed=0, model="affine", **options):

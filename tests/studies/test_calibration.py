@@ -16,11 +16,12 @@ from lib.correspondences import of_recording
 from lib.geometry import RigidTransform
 from lib.recordings import Recording
 from lib.simulator import Microscope
-from lib.simulator.rig import reference_rig, simulate_correspondences
+from lib.simulator.rig import reference_rig
 from lib.workbench import report, results
 from notebooks.figures import calibration as figures
 from notebooks.studies import boards, dvrk, sweeps
 from notebooks.studies.cameras import perspective_dlt, triangulate_perspective
+from notebooks.studies.simulated_rows import simulate_correspondences
 
 
 def test_repeated_calibrations_scatter_as_reported(run_study):

@@ -7,8 +7,9 @@ import pytest
 
 from lib.calibration import calibrate
 from lib.matching import Matches
-from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, simulate_correspondences
+from lib.simulator.rig import ROBOT_FROM_MICROSCOPE
 from lib.surface import refine_rig
+from notebooks.studies.simulated_rows import simulate_correspondences
 
 NOISE_PX = 0.3
 

@@ -17,10 +17,11 @@ from lib.recordings import Recording
 from lib.simulator.eye import Eye
 from lib.simulator.forceps import Forceps, Pose
 from lib.simulator.render import render_pair
-from lib.simulator.rig import Microscope, simulate_correspondences
+from lib.simulator.rig import Microscope
 from lib.surface import BSplineSurface, SplineGrid, epipolar_inliers, reconstruct, surface_mesh
 from lib.workbench import results
 from notebooks.studies import surface_evaluation as evaluation
+from notebooks.studies.simulated_rows import simulate_correspondences
 
 matplotlib.use("Agg")
 

@@ -3,8 +3,8 @@
 import numpy as np
 
 from lib.calibration import calibrate
-from lib.simulator.rig import simulate_correspondences
 from lib.trust import report
+from notebooks.studies.simulated_rows import simulate_correspondences
 
 
 def test_the_report_begins_with_the_verdict():

@@ -8,9 +8,9 @@ import pytest
 from lib.calibration import calibrate
 from lib.correspondences import Correspondences, NoDetectionError
 from lib.recordings import Doubt
-from lib.simulator.rig import simulate_correspondences
 from lib.trust import LEVELS, Health, Reason, Verdict, judge
 from lib.workbench.report import VERDICT_COLOURS
+from notebooks.studies.simulated_rows import simulate_correspondences
 
 CLOCK = Reason("clock", "not trustworthy", "183 ms", "Set offset_s.")
 FEW = Reason("few_frames", "doubtful", "5 frames", "Record more.")

@@ -1,9 +1,11 @@
 """Is this data enough, and where should the tool go next."""
 
+from __future__ import annotations
+
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lib.calibration.calibration import Calibration
+from lib.calibration import Calibration
 from lib.geometry import finite_points
 
 __all__ = ["added_error", "box_grid", "next_positions"]
@@ -11,9 +13,6 @@ __all__ = ["added_error", "box_grid", "next_positions"]
 
 def box_grid(low_mm: ArrayLike, high_mm: ArrayLike, steps: int = 5) -> np.ndarray:
     """(steps^3, 3) points of a box in the robot frame, its corners among them.
-
-    >>> box_grid([0, 0, 0], [1, 2, 3], steps=2)[-1].tolist()
-    [1.0, 2.0, 3.0]
     """
     low, high = finite_points(low_mm, 3, "low_mm")[0], finite_points(high_mm, 3, "high_mm")[0]
     if not (high > low).all():
