@@ -19,6 +19,8 @@ python3 -m lib COMMAND [options]        (in the folder of the workbench)
 
   run [NOTEBOOK ...] [--profile quick|paper] [-p NAME VALUE]
               work through the notebooks; the report appears in runs/<date>-<profile>/index.html
+  site [RUN] [--out FOLDER]
+              a static site of a run (default: the last complete one), such as for GitHub Pages
   test [...]  style and tests; what follows goes to pytest
   lab  [...]  open the notebooks in JupyterLab
   bench [...] benchmarks; what follows goes to pytest
@@ -150,6 +152,7 @@ def ruff_options() -> list[str]:
 #: Command -> the function that it calls, and its module.
 FUNCTIONS = {
     "run": ("lib.workbench.command", "main"),
+    "site": ("lib.workbench.command", "main_site"),
     **{name: ("lib.commands", f"main_{name}") for name in ("import", "detect", "calibrate", "reconstruct", "register")},
     "check": ("lib.trust.check", "main"),
     "sweep": ("lib.workbench.sweep", "main"),

@@ -88,7 +88,7 @@ class Chromium:
         port = folder / "DevToolsActivePort"
         wait(lambda: port.exists() and "\n" in port.read_text(), "Chromium starts", 120)
         self.base = f"http://127.0.0.1:{port.read_text().splitlines()[0]}"
-        self.websocket, self.count, self.socket = websocket, 0, None
+        self.websocket, self.count, self.socket, self.events = websocket, 0, None, []
 
     def goto(self, address: str, *, width: int = 1400, height: int = 760, scale: float = 1.0) -> None:
         """Open an address in a fresh tab of this size in CSS pixels, and this device scale factor."""
@@ -99,7 +99,9 @@ class Chromium:
         self.socket = self.websocket.create_connection(tab["webSocketDebuggerUrl"], timeout=120)
         size = {"width": width, "height": height, "deviceScaleFactor": scale, "mobile": False}
         self.call("Emulation.setDeviceMetricsOverride", **size)
-        self.call("Page.enable")
+        self.events.clear()
+        for domain in ("Page", "Runtime", "Log", "Network"):
+            self.call(f"{domain}.enable")
         self.call("Page.navigate", url=address)
 
     def close_tab(self) -> None:
@@ -116,6 +118,11 @@ class Chromium:
             if reply.get("id") == self.count:
                 assert "error" not in reply, reply
                 return reply["result"]
+            self.events.append(reply)
+
+    def told(self, method: str) -> list[dict]:
+        """The parameters of the events of this name since the page was opened."""
+        return [event["params"] for event in self.events if event.get("method") == method]
 
     def value(self, expression: str) -> object:
         reply = self.call("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)

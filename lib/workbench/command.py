@@ -17,7 +17,7 @@ from tqdm import tqdm
 
 from lib import files, paths
 from lib.provenance import commit, machine
-from lib.workbench import execution, pages
+from lib.workbench import execution, headlines, pages
 from lib.workbench.execution import Failure, execute
 from lib.workbench.parameters import (
     UsageError,
@@ -28,7 +28,7 @@ from lib.workbench.parameters import (
     title_of,
 )
 
-__all__ = ["main", "run"]
+__all__ = ["main", "main_site", "run"]
 
 PROFILES = ("quick", "paper")
 #: Keeps room on the disk to write the last state of a run when the disk is full.
@@ -69,6 +69,27 @@ def main(argv: Sequence[str]) -> int:
         print(f"python3 -m lib run: {error}", file=sys.stderr)
         return 2
     return {"complete": 0, "failed": 1, "stopped": 128 + (received or [signal.SIGINT])[0]}[result["state"]]
+
+
+def main_site(argv: Sequence[str]) -> int:
+    """Copy the pages of a run into a folder that a web server shows as it is; 2 if there is no such run."""
+    parser = argparse.ArgumentParser(
+        prog="python3 -m lib site", description="Make a static site of a run, such as for GitHub Pages."
+    )
+    parser.add_argument("run", nargs="?", type=Path, metavar="RUN", help="its folder (default: the last complete one)")
+    parser.add_argument("--out", type=Path, default=paths.ROOT / "site", metavar="FOLDER", help="a new folder")
+    options = parser.parse_args(argv)
+    chosen = options.run or next((folder for folder, _ in reversed(headlines.complete_runs(paths.RUNS))), paths.RUNS)
+    try:
+        if not (chosen / "index.html").is_file():
+            raise FileNotFoundError(f"{chosen}: no run with an index.html; `python3 -m lib run` makes one.")
+        shutil.copytree(chosen, options.out)
+        (options.out / ".nojekyll").touch()  # GitHub Pages then takes every file as it is
+    except OSError as error:
+        print(f"python3 -m lib site: {error}", file=sys.stderr)
+        return 2
+    print(f"Site: {options.out / 'index.html'}")
+    return 0
 
 
 def run(
@@ -170,7 +191,9 @@ class _Report:
             "reasons": [],
             "metrics": [],
             "figures": [],
+            "download": None,
         }  # fmt: skip
+        self.content["previous"] = headlines.previous_values(folder.parent, self.content)
         (folder / "figures").mkdir()
         (folder / _ROOM).write_bytes(bytes(1 << 20))
         self.write()
@@ -188,14 +211,15 @@ class _Report:
         entry.update(state="failed" if failure else "complete", seconds=round(seconds, 2))
         entry["failure"] = failure.as_dict() if failure else None
         try:
-            entry["left_out"] = execution.left_out_of(executed)
-            entry.update(execution.verdict_of(executed) or {})
-            self.content.update(execution.joined(self.content["notebooks"]) or {})
-            self.content["metrics"] += [{"notebook": book.stem, **m} for m in execution.metrics_of(executed)]
+            stated = execution.stated_in(executed)
         except (OSError, ValueError):  # there is none, or a full disk has cut it off
             executed.unlink(missing_ok=True)
         else:
-            for figure in execution.figures_of(executed):
+            entry["left_out"] = stated.left_out
+            entry.update(stated.verdict or {})
+            self.content.update(execution.joined(self.content["notebooks"]) or {})
+            self.content["metrics"] += [{"notebook": book.stem, **m} for m in stated.metrics]
+            for figure in stated.figures:
                 self._add_figure(book, figure)
             self._write_page(book, entry)
         self.write()
@@ -207,7 +231,15 @@ class _Report:
             if entry["state"] == "running":
                 entry["state"] = "pending"
         (self.folder / _ROOM).unlink(missing_ok=True)
+        if state != "stopped":
+            self.content["download"] = f"{self.folder.name}.zip"
         self.write()
+        if self.content["download"]:
+            try:
+                shutil.move(shutil.make_archive(str(self.folder), "zip", self.folder.parent, self.folder.name), self.folder)
+            except OSError:  # a disk without room for the copy
+                self.content["download"] = None
+                self.write()
 
     def write(self) -> None:
         self.content["seconds"] = round(time.monotonic() - self.start, 2)
@@ -215,10 +247,10 @@ class _Report:
         files.write_text(self.folder / "index.html", pages.index_html(self.content))
 
     def _add_figure(self, book: Path, figure: execution.NamedFigure) -> None:
-        file = f"figures/{figure.name}.png"
+        file = f"figures/{figure.name}{figure.suffix}"
         if any(other["file"] == file for other in self.content["figures"]):
-            file = f"figures/{book.stem}.{figure.name}.png"
-        files.write_bytes(self.folder / file, figure.png)
+            file = f"figures/{book.stem}.{figure.name}{figure.suffix}"
+        files.write_bytes(self.folder / file, figure.data)
         self.content["figures"].append(
             {"notebook": book.stem, "name": figure.name, "file": file, "caption": figure.caption}
         )

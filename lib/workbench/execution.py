@@ -15,8 +15,8 @@ from nbclient.exceptions import CellTimeoutError, DeadKernelError
 
 from lib.workbench.report import FIGURE_METADATA, METRIC_MIME, STOP_METADATA, VERDICT_COLOURS, VERDICT_MIME
 
-__all__ = ["Failure", "NamedFigure", "execute", "failure_of", "figures_of", "joined", "kernel_environment", "left_out_of",
-           "metrics_of", "outputs", "verdict_of", "versions"]  # fmt: skip
+__all__ = ["Failure", "NamedFigure", "Stated", "execute", "failure_of", "joined", "kernel_environment", "outputs",
+           "stated_in", "versions"]  # fmt: skip
 
 #: Packages whose version can change a figure.
 _TOLD = ("numpy", "scipy", "torch", "kornia", "opencv-python-headless", "open3d-cpu", "open3d", "cvxpy", "clarabel")
@@ -40,7 +40,9 @@ class Failure:
 
 
 def kernel_environment() -> None:
-    """Set the environment variables that kernels inherit: this interpreter's own kernel, and quiet libraries."""
+    """Set the environment variables that kernels inherit: this interpreter's own kernel, quiet libraries, and that what
+    they show becomes a page, where nobody answers."""
+    os.environ["MICROSTEREO_PAGE"] = "1"
     os.environ["JUPYTER_PREFER_ENV_PATH"] = "1"  # a kernel named python3 elsewhere on the machine must not win
     os.environ.pop("JUPYTER_PATH", None)
     os.environ["OPEN3D_DISABLE_WEB_VISUALIZER"] = "true"  # it hangs without a display
@@ -133,31 +135,39 @@ def _longer_than(seconds: float | None) -> str:
 
 @dataclass(frozen=True)
 class NamedFigure:
-    """A picture that a notebook showed through `lib.workbench.report.show`."""
+    """A picture that a notebook showed through `lib.workbench.report.show`; `suffix` is ".svg" or ".png"."""
 
     name: str
     caption: str
-    png: bytes
+    suffix: str
+    data: bytes
 
 
-def metrics_of(executed: Path) -> list[dict]:
-    """What the notebook recorded, in order; a name recorded twice counts with its last value."""
-    metrics: dict[str, dict] = {}
-    for output in outputs(executed):
-        metric = output.get("data", {}).get(METRIC_MIME)
-        if metric:
-            metrics[metric["name"]] = {key: metric[key] for key in ("name", "value", "unit", "paper", "note")}
-    return list(metrics.values())
+@dataclass(frozen=True)
+class Stated:
+    """What an executed notebook stated: of metrics and pictures with one name the last, in the order of the first."""
+
+    metrics: list[dict]  # each with its `cell`
+    figures: list[NamedFigure]
+    verdict: dict | None  # `verdict` and `reasons` of all that it stated, joined
+    left_out: str | None  # why `report.stop` ended it before its last cell
 
 
-def left_out_of(executed: Path) -> str | None:
-    """Why `report.stop` ended the notebook before its last cell; None if it did not."""
-    return next((o["metadata"][STOP_METADATA] for o in outputs(executed) if STOP_METADATA in o.get("metadata", {})), None)
-
-
-def verdict_of(executed: Path) -> dict | None:
-    """`verdict` and `reasons` that the notebook stated, joined; None if it stated none."""
-    return joined(output.get("data", {}).get(VERDICT_MIME) for output in outputs(executed))
+def stated_in(executed: Path) -> Stated:
+    """Read back what `lib.workbench.report` put into an executed notebook."""
+    metrics, figures, verdicts, left_out = {}, {}, [], None
+    for cell in nbformat.read(executed, as_version=4).cells:
+        for output in cell.get("outputs", []):
+            data, metadata = output.get("data", {}), output.get("metadata", {})
+            verdicts.append(data.get(VERDICT_MIME))
+            left_out = left_out or metadata.get(STOP_METADATA)
+            if metric := data.get(METRIC_MIME):
+                metrics[metric["name"]] = dict(metric) | {"cell": cell.get("id")}
+            if named := metadata.get(FIGURE_METADATA):
+                drawn = data.get("image/svg+xml")
+                content = drawn.encode() if drawn else base64.b64decode(data["image/png"])
+                figures[named["name"]] = NamedFigure(**named, suffix=".svg" if drawn else ".png", data=content)
+    return Stated(list(metrics.values()), list(figures.values()), joined(verdicts), left_out)
 
 
 def joined(verdicts: Iterable[dict | None]) -> dict | None:
@@ -171,17 +181,6 @@ def joined(verdicts: Iterable[dict | None]) -> dict | None:
         "verdict": max((verdict["verdict"] for verdict in found), key=rank),
         "reasons": sorted(reasons.values(), key=lambda reason: -rank(reason["level"])),
     }
-
-
-def figures_of(executed: Path) -> list[NamedFigure]:
-    """What the notebook showed, in order; of pictures with one name, the last."""
-    figures: dict[str, NamedFigure] = {}
-    for output in outputs(executed):
-        named = output.get("metadata", {}).get(FIGURE_METADATA)
-        if named:
-            png = base64.b64decode(output["data"]["image/png"])
-            figures[named["name"]] = NamedFigure(named["name"], named["caption"], png)
-    return list(figures.values())
 
 
 def versions() -> dict[str, str]:

@@ -1,31 +1,31 @@
 """The pages of a run: ``index.html``, and one page of each notebook.  They open without network, equations and all."""
 
-import functools
 import html
-import json
 import re
-from collections.abc import Iterator
+from functools import lru_cache, partial
 from pathlib import Path
 
 import nbformat
-from jinja2 import Environment, FileSystemLoader
-from nbconvert.filters.ansi import ansi2html
+from jinja2 import pass_context
+from jinja2.runtime import Context
+from nbconvert import HTMLExporter
 from nbconvert.filters.markdown_mistune import IPythonRenderer, MarkdownWithMath
-from pygments import highlight
-from pygments.formatters import HtmlFormatter
-from pygments.lexers import PythonLexer
 
 from lib import paths
 from lib.workbench.execution import Failure
-from lib.workbench.report import STOP_METADATA, VERDICT_COLOURS, format_value, unit_text, verdict_html
+from lib.workbench.headlines import headlines, is_recorded
+from lib.workbench.report import rendered, with_unit
 
 __all__ = ["PLOTLY_FILE", "equation_svg", "index_html", "markdown_html", "page"]
 
 #: plotly's script lies once beside the pages that show a 3D view.
 PLOTLY_FILE = "plotly.min.js"
-PLOTLY_MIME = "application/vnd.plotly.v1+json"
-WIDGET_MIME = "application/vnd.jupyter.widget-view+json"
-WIDGET_STATE = "application/vnd.jupyter.widget-state+json"
+_TEMPLATES = Path(__file__).with_name("templates")
+#: The forms of an output, from the one that a page shows best.
+_RICHEST_FIRST = ["application/vnd.plotly.v1+json", "text/html", "application/vnd.jupyter.widget-view+json", "image/svg+xml",
+                  "image/png", "image/jpeg", "text/markdown", "text/latex", "text/plain"]  # fmt: skip
+#: (level, anchor, text) of a heading that nbconvert has given an anchor.
+_HEADING = re.compile(r'<h([23]) id="([^"]+)">(.*?)<a class="anchor-link"', re.DOTALL)
 
 #: What the converter does not know, in its own words.
 _REWRITES = [
@@ -39,18 +39,9 @@ _REWRITES = [
     (re.compile(r"\\[bB]igg?\s*\\(?:[lr]?Vert(?![A-Za-z])|\|)"), r"\\Vert "),
     (re.compile(r"\\tag\{([^{}]*)\}"), r"\\qquad\\mathrm{(\1)}"),
 ]
-#: The note of a number that was read from a record and not computed in the run.
-_RECORDED = re.compile(r"(.*, )?recorded\b")
-_STATES = {
-    "complete": "complete",
-    "running": "running",
-    "failed": "a notebook failed",
-    "stopped": "stopped before its end",
-}
-_IMAGES = {"image/png": "png", "image/jpeg": "jpeg", "image/gif": "gif"}
 
 
-@functools.lru_cache(maxsize=4096)
+@lru_cache(maxsize=4096)
 def equation_svg(tex: str, *, display: bool, size_px: float = 17.0) -> str:
     """An equation as inline SVG in HTML, on the line of the text; its TeX is the alternative text.
 
@@ -103,15 +94,8 @@ def markdown_html(source: str, *, folder: Path = Path(), attachments: dict | Non
         embed_images=True,
         path=str(folder),
         attachments=attachments or {},
-        exclude_anchor_links=True,
     )
     return MarkdownWithMath(renderer=renderer).render(source)
-
-
-def _render(template: str, **values: object) -> str:
-    """A page from a file of ``templates/``; it escapes every value that it does not call safe."""
-    folder = Path(__file__).with_name("templates")
-    return Environment(loader=FileSystemLoader(folder), autoescape=True).get_template(template).render(values)
 
 
 def page(
@@ -125,103 +109,31 @@ def page(
         verdict: `verdict` (None: it stated none) and `reasons`, shown on top.
         previous, following: (file, title) of the neighbouring pages.
     """
-    notebook = nbformat.read(executed, as_version=4)
-    widgets = notebook.metadata.get("widgets", {}).get(WIDGET_STATE, {}).get("state", {})
-    return _render(
+
+    @pass_context
+    def prose(context: Context, source: str) -> str:
+        return markdown_html(source, folder=folder, attachments=context["cell"].get("attachments"))
+
+    untrusted = partial(markdown_html, trusted=False)
+    filters = {"markdown2html": prose, "untrusted_markdown": untrusted, "equation": equation_svg}
+    exporter = HTMLExporter(
+        template_name="notebook",
+        extra_template_basedirs=[str(_TEMPLATES)],
+        filters=filters,
+        preprocessors=["nbconvert.preprocessors.CoalesceStreamsPreprocessor"],  # of a progress bar only its last state
+    )
+    exporter.config.NbConvertBase.display_data_priority = _RICHEST_FIRST
+    body, _ = exporter.from_notebook_node(nbformat.read(executed, as_version=4))
+    return rendered(
         "page.html",
         title=title,
-        body="\n".join(_cell(cell, folder, widgets) for cell in _until_stop(notebook.cells)),
-        verdict=verdict_html(verdict) if verdict["verdict"] else "",
+        body=body,
+        contents=_HEADING.findall(body),
+        content=verdict,
         previous=previous,
         following=following,
-        code_css=HtmlFormatter(style="friendly").get_style_defs(".code"),
-        plotly='class="plotly-view"',
-        plotly_file=PLOTLY_FILE,
+        plotly_file=PLOTLY_FILE if 'class="plotly-view"' in body else None,
     )
-
-
-def _until_stop(cells: list) -> Iterator:
-    """The cells up to the one in which `report.stop` ended the notebook."""
-    for cell in cells:
-        yield cell
-        if any(STOP_METADATA in output.get("metadata", {}) for output in cell.get("outputs", [])):
-            return
-
-
-def _cell(cell, folder: Path, widgets: dict) -> str:
-    tags = set(cell.metadata.get("tags", []))
-    if "papermill-error-cell-tag" in tags or not cell.source.strip():
-        return ""
-    if cell.cell_type == "markdown":
-        prose = markdown_html(cell.source, folder=folder, attachments=cell.get("attachments"))
-        return f'<section class="prose">{prose}</section>'
-    if cell.cell_type != "code":
-        return f"<pre>{html.escape(cell.source)}</pre>"
-    code = highlight(cell.source, PythonLexer(), HtmlFormatter(cssclass="code"))
-    if cell.metadata.get("jupyter", {}).get("source_hidden"):
-        code = f"<details><summary>Code</summary>{code}</details>"
-    if "injected-parameters" in tags:
-        code = f'<div class="given">Values given to this run{code}</div>'
-    outputs = "".join(_outputs(cell.outputs, widgets))
-    return f'<section class="cell">{code}{f"<div class=output>{outputs}</div>" if outputs else ""}</section>'
-
-
-def _outputs(outputs: list, widgets: dict) -> Iterator[str]:
-    for output in outputs:
-        if output["output_type"] == "stream":
-            text = _settled(output["text"])
-            if text.strip():
-                yield f'<pre class="{output["name"]}">{ansi2html(text)}</pre>'
-        elif output["output_type"] == "error":
-            if output["traceback"]:
-                yield f'<pre class="error">{ansi2html(chr(10).join(output["traceback"]))}</pre>'
-        else:
-            yield _rich(output["data"], widgets, output.get("metadata", {}))
-
-
-def _rich(data: dict, widgets: dict, metadata: dict) -> str:
-    """The richest form of one output that needs no network."""
-    if WIDGET_MIME in data:
-        return _widget(data[WIDGET_MIME]["model_id"], widgets)
-    if PLOTLY_MIME in data:
-        figure = json.dumps({key: data[PLOTLY_MIME].get(key, {}) for key in ("data", "layout")}).replace("<", "\\u003c")
-        return (
-            '<div class="plotly-view"></div><script>(f => Plotly.newPlot('
-            "document.currentScript.previousElementSibling, f.data, f.layout, {responsive: true}))"
-            f"({figure})</script>"
-        )
-    if "text/html" in data:
-        return f'<div class="rich">{data["text/html"]}</div>'
-    if "image/svg+xml" in data:
-        return data["image/svg+xml"]
-    for mime, kind in _IMAGES.items():
-        if mime in data:
-            alt = html.escape(metadata.get(mime, {}).get("alt", ""), quote=True)
-            encoded = data[mime].replace("\n", "")
-            return f'<img src="data:image/{kind};base64,{encoded}" alt="{alt}">'
-    if "text/markdown" in data:
-        return markdown_html(data["text/markdown"], trusted=False)
-    if "text/latex" in data:
-        return equation_svg(data["text/latex"].strip("$ \n"), display=True)
-    return f"<pre>{html.escape(data.get('text/plain', ''))}</pre>"
-
-
-def _widget(model_id: str, widgets: dict) -> str:
-    """An interactive part as a page can show it: what its output area held, and where to find it alive."""
-    held = "".join(_outputs(list(_held_outputs(model_id, widgets)), widgets))
-    return f'<div class="interactive">{held}<p>Interactive: open the notebook in JupyterLab to move the controls.</p></div>'
-
-
-def _held_outputs(model_id: str, widgets: dict) -> Iterator[dict]:
-    state = widgets.get(model_id, {}).get("state", {})
-    yield from state.get("outputs", [])
-    for child in state.get("children", []):
-        yield from _held_outputs(child.removeprefix("IPY_MODEL_"), widgets)
-
-
-def _settled(text: str) -> str:
-    """A terminal's view of text with carriage returns: of a progress bar only its last state."""
-    return "\n".join(line.rstrip("\r").rsplit("\r", 1)[-1] for line in re.sub(r"\x1b\[A", "", text).split("\n"))
 
 
 def index_html(run: dict) -> str:
@@ -230,36 +142,16 @@ def index_html(run: dict) -> str:
     Args:
         run: The content of metrics.json.
     """
-    done = sum(book["state"] in ("complete", "failed") for book in run["notebooks"])
-    facts = {
-        "Recording": run["parameters"].get("recording") or f"{paths.shown(paths.SHIPPED_RECORDING)}, the one that ships",
-        "Started": run["started"].replace("T", " ")[:16],
-        "Profile": run["profile"],
-        "Notebooks": f"{done} of {len(run['notebooks'])}",
-        "Time": _duration(run["seconds"]),
-        "Machine": f"{run['machine']['cores']} cores, {run['machine']['gpu'] or 'no GPU'}",
-    }
-    if run["commit"]:
-        facts["Commit"] = run["commit"]["id"][:10] + (" + local changes" if run["commit"]["modified"] else "")
-    return _render(
+    rows, left_out = headlines(run)
+    return rendered(
         "index.html",
         run=run,
-        states=_STATES,
-        verdict=verdict_html(run) if run["verdict"] else "",
-        colours=VERDICT_COLOURS,
-        facts=facts,
-        titles={book["name"]: book["title"] for book in run["notebooks"]},
-        pages={book["name"]: book["page"] for book in run["notebooks"]},
-        recorded=lambda metric: bool(_RECORDED.match(metric["note"])),
+        headlines=rows,
+        left_out=left_out,
+        shipped=paths.shown(paths.SHIPPED_RECORDING),
+        books={book["name"]: book for book in run["notebooks"]},
+        is_recorded=is_recorded,
         reason=lambda failure: str(Failure(**failure)),
-        words=lambda metric: metric["name"].removesuffix(f"_{metric['unit']}").replace("_", " "),
-        with_unit=lambda value, unit: f"{format_value(value)} {unit_text(unit)}".rstrip(),
-        duration=_duration,
+        with_unit=with_unit,
         markdown=markdown_html,
     )
-
-
-def _duration(seconds: float | None) -> str:
-    if seconds is None:
-        return ""
-    return f"{seconds:.0f} s" if seconds < 100 else f"{int(seconds) // 60} min {int(seconds) % 60:02d} s"

@@ -6,7 +6,7 @@ that knows its name), so an executed notebook alone is the record of what it fou
 
 from __future__ import annotations
 
-import html
+import base64
 import io
 import math
 import re
@@ -14,14 +14,17 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn, Protocol
+
+from jinja2 import Environment, FileSystemLoader
 
 if TYPE_CHECKING:  # at run time it would slow every notebook's start
     from matplotlib.figure import Figure
 
 __all__ = [
     "FIGURE_METADATA", "METRIC_MIME", "RECORDED", "STOP_METADATA", "VERDICT_COLOURS", "VERDICT_MIME", "format_value",
-    "record", "show", "stop", "timed", "unit_text", "verdict", "verdict_html",
+    "record", "rendered", "show", "stop", "timed", "verdict", "with_unit",
 ]  # fmt: skip
 
 #: Mime type of a metric in a notebook's outputs; the JSON holds name, value, unit, paper, note.
@@ -32,6 +35,9 @@ VERDICT_MIME = "application/vnd.microstereo.verdict+json"
 VERDICT_COLOURS = {"trustworthy": "#067647", "doubtful": "#b54708", "not trustworthy": "#b42318"}
 #: Key of the output metadata that names a figure: {"name": ..., "caption": ...}.
 FIGURE_METADATA = "microstereo_figure"
+
+#: Longest SVG: the points of a large scatter are smaller as a PNG.
+_SVG_CHARACTERS = 200_000
 
 #: Key of the output metadata that says why a notebook ended before its last cell.
 STOP_METADATA = "microstereo_stop"
@@ -79,12 +85,10 @@ def record(name: str, value: float, unit: str, *, paper: float | None = None, no
         "note": note,
     }
     RECORDED[name] = metric["value"]
-    text = f"{name} = {format_value(metric['value'])} {unit}".rstrip()
-    if paper is not None:
-        text += f" (paper: {format_value(metric['paper'])} {unit})".replace(" )", ")")
-    if note:
-        text += f"  # {note}"
-    _publish({METRIC_MIME: metric, "text/html": _row_html(metric), "text/plain": text}, text)
+    here, theirs = with_unit(metric["value"], unit), "" if paper is None else with_unit(metric["paper"], unit)
+    text = f"{name} = {here}{f' (paper: {theirs})' if theirs else ''}{f'  # {note}' if note else ''}"
+    page = rendered("metric.html", name=name, value=here, paper=theirs, note=note)
+    _publish({METRIC_MIME: metric, "text/html": page, "text/plain": text}, text)
 
 
 def verdict(found: Judged) -> None:
@@ -92,26 +96,21 @@ def verdict(found: Judged) -> None:
 
     The main job joins what several cells and notebooks state; the worst counts.
     """
-    content = found.to_json()
-    _publish({VERDICT_MIME: content, "text/html": verdict_html(content), "text/plain": str(found)}, str(found))
+    content, text = found.to_json(), str(found)
+    _publish({VERDICT_MIME: content, "text/html": rendered("verdict.html", content=content), "text/plain": text}, text)
 
 
-def verdict_html(content: dict) -> str:
-    """A badge with its reasons, every text escaped; `content` has `verdict` and `reasons`."""
-    level, reasons = content["verdict"], content["reasons"]
-    colour = VERDICT_COLOURS[level]
-    badge = f'<b style="background:{colour};color:#fff;border-radius:1em;padding:.15em .8em">{html.escape(level)}</b>'
-    lines = "".join(
-        f'<li style="margin:.3em 0"><b style="color:{VERDICT_COLOURS[r["level"]]}">{html.escape(r["name"].replace("_", " "))}'
-        f"</b>: {html.escape(r['text'])} <i>{html.escape(r['cure'])}</i></li>"
-        for r in reasons
-    )
-    lines = f'<ul style="margin:.5em 0 0">{lines}</ul>' if lines else ""
-    return f'<div class="verdict" style="border-left:4px solid {colour};padding:.5em 1em;margin:.8em 0">{badge}{lines}</div>'
+def rendered(template: str, **values: object) -> str:
+    """HTML from a file of ``templates/``; it escapes every value that it does not call safe."""
+    folder = Path(__file__).with_name("templates")
+    made = Environment(loader=FileSystemLoader(folder), autoescape=True).get_template(template)
+    return made.render(values, colours=VERDICT_COLOURS)
 
 
 def show(figure: Figure, name: str, caption: str) -> None:
-    """Display a matplotlib figure as a PNG with its caption, named for the run's ``figures/``, and close it.
+    """Display a matplotlib figure with its caption, named for the run's ``figures/``, and close it.
+
+    It is an SVG where that is small, which what holds an image never is, and else a PNG.
 
     Args:
         name: Lower-case snake case that starts with the stage; the file's name in ``figures/``.
@@ -123,19 +122,26 @@ def show(figure: Figure, name: str, caption: str) -> None:
     text = f"Figure {name}: {caption}"
     try:
         if _in_notebook():
-            buffer = io.BytesIO()
-            figure.savefig(buffer, format="png")
-            _publish(
-                {"image/png": buffer.getvalue(), "text/plain": text},
-                text,
-                {FIGURE_METADATA: {"name": name, "caption": caption}, "image/png": {"alt": caption}},
-            )
-            style = "max-width:60em;margin:0 0 1.2em;color:#555;font-size:90%"
-            _publish({"text/html": f'<p style="{style}">{html.escape(caption)}</p>', "text/plain": caption}, caption)
+            mime, drawn = _drawn(figure)
+            named = {"name": name, "caption": caption}
+            _publish({mime: drawn, "text/plain": text}, text, {FIGURE_METADATA: named, mime: {"alt": caption}})
+            _publish({"text/html": rendered("caption.html", text=caption), "text/plain": caption}, caption)
         else:
             print(text)
     finally:
         plt.close(figure)
+
+
+def _drawn(figure: Figure) -> tuple[str, str]:
+    """Mime type and content of a figure: an SVG of up to `_SVG_CHARACTERS`, or a PNG in base64."""
+    if not any(axes.images for axes in figure.axes):
+        text = io.StringIO()
+        figure.savefig(text, format="svg")
+        if text.tell() <= _SVG_CHARACTERS:
+            return "image/svg+xml", text.getvalue()
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png")
+    return "image/png", base64.b64encode(buffer.getvalue()).decode("ascii")
 
 
 @contextmanager
@@ -153,8 +159,7 @@ def stop(reason: str) -> NoReturn:
     Args:
         reason: Full sentences: what is left out, why, and what to do.
     """
-    line = f'<p style="border-left:4px solid #999;padding:.5em 1em">{html.escape(reason)}</p>'
-    _publish({"text/html": line, "text/plain": reason}, reason, {STOP_METADATA: reason})
+    _publish({"text/html": rendered("caption.html", text=reason), "text/plain": reason}, reason, {STOP_METADATA: reason})
     raise _End
 
 
@@ -167,9 +172,13 @@ def format_value(value: float | None) -> str:
     return f"{value:.4g}" if 1e-4 <= abs(value) < 1e7 else f"{value:.3e}"
 
 
-def unit_text(unit: str) -> str:
-    """A unit as a reader expects it: micrometres with their sign."""
-    return {"um": "µm", "um^2": "µm²", "px^2": "px²", "mm^2": "mm²", "deg": "°"}.get(unit, unit)
+def with_unit(value: float | None, unit: str) -> str:
+    """A number and its unit as a reader expects them; micrometres are "um" in text, tables and figures alike.
+
+    >>> with_unit(12.3456, "um"), with_unit(2.0, "px^2"), with_unit(None, "")
+    ('12.35 um', '2 px²', 'n/a')
+    """
+    return f"{format_value(value)} {unit.replace('^2', '²')}".rstrip()
 
 
 def _checked_name(name: str) -> str:
@@ -187,19 +196,6 @@ def _number(value: float, argument: str) -> float | int | None:
     return number if math.isfinite(number) else None
 
 
-def _row_html(metric: dict) -> str:
-    unit = html.escape(unit_text(metric["unit"]))
-    cells = [
-        f"<code>{html.escape(metric['name'])}</code>",
-        f"<b>{format_value(metric['value'])}</b> {unit}",
-    ]
-    if metric["paper"] is not None:
-        cells.append(f'<span style="color:#b34a00">paper: {format_value(metric["paper"])} {unit}</span>')
-    if metric["note"]:
-        cells.append(f'<span style="color:#777">{html.escape(metric["note"])}</span>')
-    return f'<div style="font-size:90%;padding:1px 0">{" &ensp; ".join(cells)}</div>'
-
-
 def _in_notebook() -> bool:
     """True in a Jupyter kernel (not in plain Python, nor in terminal IPython)."""
     ipython = sys.modules.get("IPython")
@@ -213,8 +209,4 @@ def _publish(bundle: dict, line: str, metadata: dict | None = None) -> None:
         return
     from IPython.display import display
 
-    if "image/png" in bundle:
-        import base64
-
-        bundle = {**bundle, "image/png": base64.b64encode(bundle["image/png"]).decode("ascii")}
     display(bundle, metadata=metadata, raw=True)

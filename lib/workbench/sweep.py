@@ -36,36 +36,13 @@ from lib.workbench.parameters import (
 
 __all__ = ["column_name", "main", "save_plots", "sweep"]
 
-_EPILOG = """\
-examples:
-  python3 -m lib sweep studies/working_distance            the grid that its parameters name
-  python3 -m lib sweep 05 -p seed 0,1,2 -p sigma_u_px 0.5,1.0
-
-Runs appear in runs/sweeps/NOTEBOOK-DIGEST; the digest changes with the notebook and with lib/. Started again, the command
-runs what is missing.
-
-Other machines: any Dask cluster whose workers have this environment and see this folder.
-  .venv/bin/dask scheduler                                 prints its address
-  .venv/bin/dask worker ADDRESS --nthreads 1 --nworkers 8  on each machine
-  python3 -m lib sweep NOTEBOOK --scheduler ADDRESS
-A Dask scheduler runs what anybody sends who reaches its port: keep it inside your own network.
-
-SLURM: start the scheduler and its workers with .venv/bin/python on the login node, in the folder of the workbench:
-  from dask_jobqueue import SLURMCluster
-  cluster = SLURMCluster(cores=1, processes=1, memory="4GB", walltime="04:00:00", interface="ib0",
-                         worker_extra_args=["--lifetime", "230m"])
-  print(cluster.job_script())          # what each job runs
-  cluster.scale(jobs=40)
-  print(cluster.scheduler_address)     # give it to --scheduler; keep this Python open until the sweep ends
-"""
-
 
 def main(argv: Sequence[str]) -> int:
     """Parse the command line and sweep; 1 if a run failed, 2 for a command that cannot run."""
     parser = argparse.ArgumentParser(
         prog="python3 -m lib sweep",
         description="Run one notebook at every point of a grid of parameters and make a table of its metrics.",
-        epilog=_EPILOG,
+        epilog=(Path(__file__).with_name("templates") / "sweep.txt").read_text(encoding="utf-8"),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("notebook", metavar="NOTEBOOK", help="path, name or number, such as studies/NAME or 05")
@@ -242,7 +219,7 @@ def column_name(metric: str, unit: str) -> str:
 
 
 def _row(executed: Path, point: dict) -> dict:
-    metrics = {column_name(m["name"], m["unit"]): m["value"] for m in execution.metrics_of(executed)}
+    metrics = {column_name(m["name"], m["unit"]): m["value"] for m in execution.stated_in(executed).metrics}
     return {**point, **metrics}
 
 

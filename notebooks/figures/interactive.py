@@ -2,50 +2,162 @@
 
 from __future__ import annotations
 
+import base64
+import html
 import io
+import json
+import os
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import matplotlib.pyplot as plt
+import numpy as np
+from IPython.display import display
 from ipywidgets import HBox, Image, Layout, VBox
 from ipywidgets.widgets.widget_description import DescriptionWidget
+from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 
-__all__ = ["explore"]
+from notebooks.figures.style import figure
+
+if TYPE_CHECKING:
+    import plotly.graph_objects as go
+
+__all__ = ["explore", "show_scene", "still"]
 
 _DPI = 80
+#: About as many pictures travel to a page, each drawn in the run.
+_STILLS = 5
+
+
+class _Explorer(VBox):
+    """Controls over a picture; where a page is made, also pictures that the page's own sliders choose from."""
+
+    still_html = ""
+
+    def _repr_mimebundle_(self, **options: object) -> dict:
+        data = super()._repr_mimebundle_(**options)
+        return data | {"text/html": self.still_html} if self.still_html else data
 
 
 def explore(draw: Callable[..., Figure], **knobs: DescriptionWidget) -> VBox:
     """The figure `draw(name=value, ...)` below its controls, drawn anew when one of them changes.
 
-    Not `ipywidgets.interact`: an executing client that captures large outputs of a widget may wait for ever.
+    Not `ipywidgets.interact`: an executing client that captures large outputs of a widget may wait for ever.  In a run
+    that makes pages, a few values of each control are drawn too, so that the page's sliders work without a kernel.
 
-    Parameters
-    ----------
-    draw:
-        Makes a figure; it is closed here.
-    knobs:
-        For each argument of `draw` a widget with a value, such as an `IntSlider`.  A widget without a description is
-        described by the argument's name.
+    Args:
+        draw: Makes a figure; it is closed here.  The first line of its docstring says what the picture shows.
+        knobs: For each argument of `draw` a widget with a value, such as an `IntSlider`.  A widget without a
+            description is described by the argument's name.
     """
     for name, knob in knobs.items():
         knob.description = knob.description or name.replace("_", " ")
+    defaults = {name: knob.value for name, knob in knobs.items()}
 
-    def draw_png() -> tuple[bytes, int]:
+    def drawn(format: str = "png", **changed: object) -> tuple[bytes, int]:
         buffer = io.BytesIO()
-        page = draw(**{name: knob.value for name, knob in knobs.items()})
-        page.savefig(buffer, format="png", dpi=_DPI)
+        page = draw(**{name: knob.value for name, knob in knobs.items()} | changed)
+        page.savefig(buffer, format=format, dpi=_DPI)
         width = round(page.get_figwidth() * _DPI)
         plt.close(page)
         return buffer.getvalue(), width
 
-    value, width = draw_png()
+    value, width = drawn()
     # In its own size: stretched to the width of the cell it would be blurred.
     picture = Image(value=value, format="png", layout=Layout(width=f"{width}px", max_width="100%", height="auto"))
 
     def redraw(_: object) -> None:
-        picture.value = draw_png()[0]
+        picture.value = drawn()[0]
 
     for knob in knobs.values():
         knob.observe(redraw, names="value")
-    return VBox([HBox(list(knobs.values())), picture])
+    box = _Explorer([HBox(list(knobs.values())), picture])
+    if "MICROSTEREO_PAGE" in os.environ:
+        shows = (draw.__doc__ or draw.__name__.replace("_", " ").strip("<>")).strip().split("\n")[0]
+        box.still_html = _stills(shows, knobs, defaults, value, lambda **changed: drawn("webp", **changed)[0])
+    return box
+
+
+def _stills(
+    shows: str, knobs: dict[str, DescriptionWidget], defaults: dict[str, object], png: bytes, drawn: Callable[..., bytes]
+) -> str:
+    """Pictures of a few values of each control, the others at their defaults, and a slider a control to choose."""
+    pictures, sliders = [("default", "at the defaults", png)], []
+    for name, knob in knobs.items():
+        values = _some_values(knob, max(3, _STILLS // len(knobs)))
+        texts = [text for text, _ in values]
+        at = [value for _, value in values].index(defaults[name])
+        for k, (text, value) in enumerate(values):
+            if k != at:
+                pictures.append((f"{name}-{k}", f"{knob.description} {text}", drawn(**{name: value})))
+        sliders.append(
+            f'<label>{html.escape(knob.description)} <input type="range" disabled name="{name}" min="0"'
+            f' max="{len(values) - 1}" value="{at}" data-texts="{html.escape("|".join(texts))}">'
+            f"<output>{html.escape(texts[at])}</output></label>"
+        )
+    images = "".join(
+        f'<img data-at="{at}"{"" if at == "default" else " hidden"} alt="{html.escape(f"{shows} ({said})")}"'
+        f' src="data:image/{"png" if at == "default" else "webp"};base64,{base64.b64encode(data).decode("ascii")}">'
+        for at, said, data in pictures
+    )
+    told = "A few values of each control, the others at their defaults; in JupyterLab every value."
+    return f'<div class="explore">{"".join(sliders)}{images}<p class="interactive">{told}</p></div>'
+
+
+def _some_values(knob: DescriptionWidget, n: int) -> list[tuple[str, object]]:
+    """(text, value) of up to n values of a control over its range, its own among them, in order."""
+    if hasattr(knob, "options"):
+        found = [(str(text), value) for text, value in knob._options_full]
+        at = found.index(next(entry for entry in found if entry[1] == knob.value))
+    else:
+        low, high = np.array([knob.min, knob.max], dtype=float)
+        values = np.linspace(low, high, round((high - low) / knob.step) + 1)
+        values = knob.base**values if hasattr(knob, "base") else values
+        kind = int if isinstance(knob.value, int) else float
+        at = int(np.argmin(np.abs(values - knob.value)))
+        found = [(f"{value:.4g}", kind(round(value, 9))) for value in values]
+        found[at] = (f"{knob.value:.4g}", knob.value)
+    chosen = {round(k) for k in np.linspace(0, len(found) - 1, n)}
+    chosen = chosen - {min(chosen, key=lambda k: abs(k - at))} | {at}
+    return [found[k] for k in sorted(chosen)]
+
+
+def show_scene(view: go.Figure, caption: str) -> None:
+    """A plotly scene that turns under the mouse, with a picture of it for readers whose page runs no scripts."""
+    buffer = io.BytesIO()
+    page = still(view)
+    page.savefig(buffer, format="png")
+    plt.close(page)
+    bundle = {
+        "application/vnd.plotly.v1+json": json.loads(view.to_json()),
+        "image/png": base64.b64encode(buffer.getvalue()).decode("ascii"),
+        "text/plain": caption,
+    }
+    display(bundle, metadata={"image/png": {"alt": caption}}, raw=True)
+
+
+def still(view: go.Figure) -> Figure:
+    """The meshes and lines of a plotly scene from its own camera, as parallel rays see them."""
+    camera = view.layout.scene.camera
+    eye, up = (np.array([point.x, point.y, point.z], dtype=float) for point in (camera.eye, camera.up))
+    ahead = -eye / np.linalg.norm(eye)
+    right = np.cross(ahead, up) / np.linalg.norm(np.cross(ahead, up))
+    axes_of_page = np.stack([right, np.cross(right, ahead), -ahead], axis=1)
+    page, ax = figure(width_in=9, height_in=6)
+    for trace in view.data:
+        seen = np.column_stack([trace.x, trace.y, trace.z]).astype(float) @ axes_of_page  # x, y, towards the eye
+        if trace.type == "mesh3d":
+            faces = np.column_stack([trace.i, trace.j, trace.k])
+            faces = faces[np.argsort(seen[faces, 2].mean(axis=1))]  # the nearest last
+            rgb = np.array([json.loads(f"[{colour[4:-1]}]") for colour in trace.vertexcolor]) / 255
+            colours = rgb[faces].mean(axis=1)
+            ax.add_collection(PolyCollection(seen[faces, :2], facecolors=colours, edgecolors=colours, linewidths=0.3))
+        else:
+            style = "--" if trace.line.dash == "dash" else "-"
+            ax.plot(*seen.T[:2], style, color=trace.line.color, lw=0.6 * trace.line.width, label=trace.name)
+    ax.set_aspect("equal")
+    ax.autoscale_view()
+    ax.set_axis_off()
+    ax.legend(fontsize=8, loc="upper left")
+    return page

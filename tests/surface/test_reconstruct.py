@@ -252,11 +252,15 @@ def test_every_figure_draws(scene, result):
     for page in pages:
         page.canvas.draw()
         plt.close(page)
+    from notebooks.figures import interactive
+
     mesh = surface_mesh(surface, step_px=40, image=scene.left)
     tool = rig.left.viewing_direction * np.array([[-3.0], [-1.0], [-1.0]]) + surface(np.array([[200.0, 100.0]]))
     view = figures.scene_view(mesh, rig, tool, surface.distance(tool, rig.left), 20.0)
     assert len(view.data[0].x) == len(mesh.vertices_mm) and len(view.data[0].i) == len(mesh.faces)
     assert {"shaft", "jaw to tip_1", "ray of the left camera"} <= {line.name for line in view.data}
+    (axes,) = interactive.still(view).axes
+    assert len(axes.collections[0].get_paths()) == len(mesh.faces) and len(axes.lines) == len(view.data) - 1
     plt.close("all")
 
 

@@ -11,13 +11,14 @@ import signal
 import subprocess
 import sys
 import time
+import zipfile
 from pathlib import Path
 
 import pytest
 
 from lib import paths
 from lib.workbench import command
-from lib.workbench.command import main, run
+from lib.workbench.command import main, main_site, run
 from lib.workbench.execution import Failure, execute
 from lib.workbench.parameters import UsageError, choose_notebooks
 
@@ -25,15 +26,16 @@ GOOD = [
     "from lib.workbench import report\nimport matplotlib.pyplot as plt",
     'report.record("calibration_reprojection_px", 1.5 + seed, "px", paper=2.0, note="of <b>75</b> frames")\n'
     'report.record("landmark_pck", float("nan"), "%")',
-    "fig, ax = plt.subplots(figsize=(2, 1)); ax.plot([1, 2])\n"
-    'report.show(fig, "calibration_residuals", "Small everywhere.")',
+    "fig, ax = plt.subplots(figsize=(2, 1)); ax.imshow([[1, 2]])\n"
+    'report.show(fig, "calibration_residuals", "Small everywhere.")\n'
+    'fig, ax = plt.subplots(figsize=(2, 1)); ax.plot([1, 2]); report.show(fig, "calibration_line", "A line.")',
     'with report.timed("calibration"): pass\nprint(profile)',
     "from types import SimpleNamespace\n"  # as lib.trust.Verdict, which takes seconds to import
     'clock = {"name": "clock", "level": "not trustworthy", "text": "183 ms > 1 ms", "cure": "Give <offset_s>."}\n'
     'report.verdict(SimpleNamespace(to_json=lambda: {"verdict": "not trustworthy", "reasons": [clock]}))',
     'report.verdict(SimpleNamespace(to_json=lambda: {"verdict": "trustworthy", "reasons": []}))',
     "import plotly.graph_objects as go\ngo.Figure(go.Scatter(x=[1], y=[2]))",
-    "import ipywidgets\nipywidgets.interactive(lambda k: print('k is', k), k=3)",
+    "import ipywidgets\nipywidgets.IntSlider()",
 ]
 
 ENDED = ["from lib.workbench import report\nreport.stop('No distances, because <i>nothing</i> was detected.')", "1 / 0"]
@@ -112,11 +114,12 @@ def test_a_notebook_that_stops_itself_is_complete_and_says_why(finished):
 def test_metrics_follow_the_schema(finished):
     content, _ = finished
     assert set(content) == {"format", "version", "state", "profile", "parameters", "started", "seconds", "commit",
-                            "machine", "versions", "verdict", "reasons", "notebooks", "metrics", "figures"}  # fmt: skip
+                            "machine", "versions", "verdict", "reasons", "notebooks", "metrics", "figures", "previous",
+                            "download"}  # fmt: skip
     assert content["format"] == "microstereo.metrics" and content["parameters"] == {"seed": "3"}
     assert content["metrics"][0] == {
         "notebook": "03_good", "name": "calibration_reprojection_px", "value": 4.5, "unit": "px", "paper": 2.0,
-        "note": "of <b>75</b> frames",
+        "note": "of <b>75</b> frames", "cell": content["metrics"][0]["cell"],
     }  # fmt: skip
     assert [m["name"] for m in content["metrics"][1:]] == ["landmark_pck", "seconds_calibration"]
     assert content["metrics"][1]["value"] is None
@@ -131,13 +134,14 @@ def test_verdicts_are_joined(finished):
     assert reason == {"name": "clock", "level": "not trustworthy", "text": "183 ms > 1 ms", "cure": "Give <offset_s>."}
     for page in ("index.html", "03_good.html"):
         text = (folder / page).read_text(encoding="utf-8")
-        start, place = text.index("<main>"), text.index("183 ms &gt; 1 ms")
+        start, place = text.index("<main"), text.index("183 ms &gt; 1 ms")
         assert place - start < 3000 and "Give <offset_s>" not in text
 
 
 def test_figures_are_files(finished):
     content, folder = finished
-    (figure,) = content["figures"]
+    figure, line = content["figures"]
+    assert line["file"] == "figures/calibration_line.svg" and b"<svg" in (folder / line["file"]).read_bytes()
     assert figure["file"] == "figures/calibration_residuals.png" and figure["caption"] == "Small everywhere."
     assert (folder / figure["file"]).read_bytes().startswith(b"\x89PNG")
 
@@ -149,9 +153,12 @@ def test_pages_need_no_network_and_show_equations(finished):
         assert not re.search(r'(src|href)="(https?:)?//', text), file
         assert "$$" not in text
     good = (folder / "03_good.html").read_text(encoding="utf-8")
-    assert good.count("<svg ") == 2 and "arg\\,min" in good
-    assert "Small everywhere." in good and "Plotly.newPlot" in good and (folder / "plotly.min.js").is_file()
-    assert "k is 3" in good and "Interactive: open the notebook" in good
+    assert good.count("<svg ") == 2 and good.count("data:image/svg+xml") == 1 and "arg\\,min" in good
+    assert "Small everywhere." in good and "Plotly.newPlot" in good
+    assert "plotly-view" in good and (folder / "plotly.min.js").is_file()
+    assert "Interactive: open the notebook" in good
+    assert not re.search(r'alt=""|<img(?![^>]*alt=)', good) and 'alt="A line."' in good
+    assert f' id="{finished[0]["metrics"][0]["cell"]}"' in good
 
 
 def test_index_shows_paper_and_run_and_escapes_text(finished):
@@ -167,6 +174,25 @@ def test_every_link_leads_somewhere(finished):
     for file in folder.glob("*.html"):
         for link in re.findall(r'(?:href|src)="([^"#:]+)"', file.read_text(encoding="utf-8")):
             assert (folder / link).is_file(), (file.name, link)
+
+
+def test_everything_is_in_one_zip(finished):
+    content, folder = finished
+    with zipfile.ZipFile(folder / content["download"]) as archive:
+        names = {name.partition("/")[2] for name in archive.namelist()}
+    assert names >= {"index.html", "metrics.json", "03_good.html", "03_good.ipynb", "figures/calibration_residuals.png"}
+    assert not any(name.endswith(".zip") for name in names)
+
+
+def test_a_site_is_a_copy_that_needs_no_server_of_ours(finished, tmp_path, monkeypatch, capsys):
+    folder = finished[1]
+    assert main_site([str(folder), "--out", str(tmp_path / "site")]) == 0
+    assert (tmp_path / "site" / ".nojekyll").exists()
+    assert (tmp_path / "site" / "index.html").read_text() == (folder / "index.html").read_text()
+    assert main_site([str(folder), "--out", str(tmp_path / "site")]) == 2, "nothing is overwritten"
+    monkeypatch.setattr(command.paths, "RUNS", tmp_path / "none")
+    assert main_site(["--out", str(tmp_path / "other")]) == 2 and not (tmp_path / "other").exists()
+    assert "`python3 -m lib run` makes one" in capsys.readouterr().err
 
 
 @pytest.fixture
