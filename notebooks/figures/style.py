@@ -13,15 +13,15 @@ from matplotlib.figure import Figure
 
 __all__ = ["COLOURS", "LANDMARK_COLOURS", "figure", "show_image", "table"]
 
-#: Colour-blind safe (Okabe and Ito), named by what they mean here.
+#: Colour-blind safe (after Okabe and Ito), 3:1 and more on white, named by what they mean here.
 COLOURS = {
     "ours": "#0072B2",
     "paper": "#D55E00",
     "truth": "#009E73",
-    "baseline": "#999999",
+    "baseline": "#8A8A8A",
     "left": "#0072B2",
     "right": "#CC79A7",
-    "warning": "#E69F00",
+    "warning": "#C77700",
 }
 #: Legible on dark images and on white.
 LANDMARK_COLOURS = {"base": "#56B4E9", "tip_1": "#E69F00", "tip_2": "#CC79A7"}

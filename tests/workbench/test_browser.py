@@ -181,6 +181,7 @@ def test_a_view_has_a_still_where_no_script_runs(browser, folder):
 def test_numbers_are_found_by_their_words(browser, folder):
     open_page(browser, folder / "index.html", 1400)
     everything = browser.value("document.querySelectorAll('#all tbody tr').length")
-    browser.value("find.value = 'RECORDED'; find.dispatchEvent(new Event('input'))")
+    at = "document.getElementById('find')"
+    browser.value(f"{at}.value = 'RECORDED'; {at}.dispatchEvent(new Event('input'))")
     left = browser.value("[...document.querySelectorAll('#all tbody tr')].filter((r) => !r.hidden).length")
     assert 0 < left < everything
