@@ -63,10 +63,11 @@ def headlines(run: dict) -> tuple[list[dict], list[str]]:
     for line in tomllib.loads(text)["headline"]:
         live, record = metrics.get(line["name"]), None if own else metrics.get(line.get("recorded"))
         here = bool(live) and live["value"] is not None
-        if own and line.get("truth") and not here:
-            left_out.append(line["words"])
+        if own and (line.get("elsewhere") or (line.get("truth") and not here)):
+            left_out += [] if line.get("elsewhere") else [line["words"]]
             continue
         unit = line["unit"]
+        paper = (live or line).get("paper")
         before, book = run.get("previous", {}).get(line["name"]), books.get(line["notebook"], {"state": None})
         rows.append(
             line
@@ -75,7 +76,7 @@ def headlines(run: dict) -> tuple[list[dict], list[str]]:
                 "target": _range(*line["target"], unit),
                 "value": with_unit(live["value"], unit) if here else _MISSING.get(book["state"], f"needs {line['needs']}"),
                 "recorded": record and with_unit(record["value"], unit),
-                "paper": live and live["paper"] is not None and with_unit(live["paper"], unit),
+                "paper": paper is not None and with_unit(paper, unit),
                 "before": before is not None and with_unit(before, unit),
                 "from": live or record,
             }
