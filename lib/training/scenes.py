@@ -11,6 +11,7 @@ import numpy as np
 from lib.landmarks import windows
 from lib.landmarks.metrics import tool_length_px
 from lib.training.appearance import disguised
+from lib.training.drawings import drawn_ground, drawn_tool
 from lib.training.samples import LabelledImage, Source
 from lib.training.shards import SCENE_PX, packed, read_scenes
 
@@ -30,7 +31,8 @@ class SceneSource(Source):
     """Frames as JPEG, one after the other, that end at `ends` (n,), with u (n, 3, 2) in their pixels and visibility (n, 3).
 
     Frames without a tool are among them: all landmarks have visibility 0.  `disguise` is the share of the
-    draws whose appearance is changed, `weight` (n, 3) that of the draws in which a label counts.
+    draws whose appearance is changed, `drawn` that of the draws whose tool is a drawing (`drawings.py`), `weight` (n, 3)
+    that of the draws in which a label counts.
     """
 
     ends: np.ndarray
@@ -39,11 +41,12 @@ class SceneSource(Source):
     visibility: np.ndarray
     disguise: float = 0.5
     weight: np.ndarray | None = None
+    drawn: float = 0.0
 
     @classmethod
     def load(cls, folder: str | Path) -> Self:
-        """From the shards of a folder."""
-        return cls(*read_scenes(folder))
+        """From the shards of a folder, to train with."""
+        return cls(*read_scenes(folder), disguise=0.7, drawn=0.35)
 
     @classmethod
     def of(cls, images: Iterable[LabelledImage], *, still: bool = False, weight: np.ndarray | None = None) -> Self:
@@ -55,49 +58,58 @@ class SceneSource(Source):
         start = self.ends[index - 1] if index else 0
         return cv2.cvtColor(cv2.imdecode(self.jpegs[start : self.ends[index]], cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
 
-    def _drawn(self, index: int, matrix: np.ndarray, size: tuple[int, int], rng: np.random.Generator):
-        """The frame seen through a matrix, disguised or not; landmarks too small to see have no loss."""
-        image, visibility = self.frame(index), self.visibility[index]
+    def scene(self, index: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """The frame, or a drawn tool on a ground made of it, with landmarks (3, 2), visibility and weight (3,)."""
+        image = self.frame(index)
+        if self.drawn and rng.random() < self.drawn:
+            bare = not self.visibility[index].any() and rng.random() < 0.5
+            return *drawn_tool(image if bare else drawn_ground(image, rng), rng), np.ones(3)
+        weight = np.ones(3) if self.weight is None else self.weight[index]
+        return image, self.u[index], self.visibility[index], weight
+
+    def _seen(self, scene, matrix: np.ndarray, size: tuple[int, int], rng: np.random.Generator):
+        """A scene through a matrix, disguised or not; landmarks too small to see have no loss."""
+        image, u, visibility, weight = scene
         scale = np.sqrt(abs(np.linalg.det(matrix[:, :2])))
         if scale < 0.8:  # interpolation alone would alias
             image = cv2.GaussianBlur(image, (0, 0), 0.45 * np.sqrt(1 / scale**2 - 1))
         fill = image.mean((0, 1)) * rng.uniform(0.5, 1.2) if self.disguise and rng.random() < 0.35 else np.zeros(3)
         image = cv2.warpAffine(image, matrix, size, flags=cv2.INTER_LINEAR, borderValue=fill.tolist())
-        u, length = windows.map_points(matrix, self.u[index]), scale * self.length_px(index)
+        length = scale * _length_px(u, visibility)
+        u = windows.map_points(matrix, u)
         if rng.random() < self.disguise:
             image, u, visibility = disguised(image, u, visibility, rng, length if np.isfinite(length) else 40.0)
         if length < SHORTEST_PX or image.std() < FLAT:
             u = np.where((visibility > 0)[:, None], np.nan, u)
-        if self.weight is not None:
-            u = np.where((rng.random(3) > self.weight[index])[:, None], np.nan, u)
+        u = np.where((rng.random(3) > weight)[:, None], np.nan, u)
         return image, u, visibility
 
-    def length_px(self, index: int) -> float:
-        """The tool's length in the stored frame; NaN without a tool."""
-        there = self.visibility[index].any()
-        return float(tool_length_px(self.u[index][None])[0]) if there else np.nan
+
+def _length_px(u: np.ndarray, visibility: np.ndarray) -> float:
+    """The tool's length; NaN without a tool."""
+    return float(tool_length_px(u[None])[0]) if visibility.any() else np.nan
 
 
 class FrameSource(SceneSource):
     """Frames turned, zoomed, shifted and mirrored, as the first stage sees them; a sixth show no landmark."""
 
     def draw(self, index: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        frame = self.frame(index)
-        fit, length = FRAME_PX[0] / max(frame.shape[:2]), self.length_px(index)
+        frame, u, visibility, _ = scene = self.scene(index, rng)
+        fit, length = FRAME_PX[0] / max(frame.shape[:2]), _length_px(u, visibility)
         middle = (np.array(frame.shape[1::-1]) - 1) / 2
         if not self.disguise:  # as `Detector` sees it
-            return self._drawn(index, windows.window_from_image(middle, 0.0, FRAME_PX, fit), FRAME_PX, rng)
+            return self._seen(scene, windows.window_from_image(middle, 0.0, FRAME_PX, fit), FRAME_PX, rng)
         zoom = np.clip(fit * np.exp(rng.normal(0, 0.3)), 0.4 * fit, None)
         if np.isfinite(length):
             zoom = np.clip(zoom, 7 / length, 85 / length)
             far = rng.random() < 0.25
             spread = (1.5 if far else 0.4) * np.array(PART_PX) / zoom
-            middle = np.nanmean(self.u[index], axis=0) + rng.uniform(-1, 1, 2) * spread
+            middle = np.nanmean(u, axis=0) + rng.uniform(-1, 1, 2) * spread
         else:
             middle = rng.uniform((0, 0), frame.shape[1::-1])
         turn = rng.uniform(-np.pi, np.pi) if rng.random() < 0.5 else np.pi * rng.integers(2) + rng.normal(0, 0.2)
         matrix = windows.window_from_image(middle, turn, PART_PX, zoom)
-        return _mirrored(*self._drawn(index, matrix, PART_PX, rng), rng)
+        return _mirrored(*self._seen(scene, matrix, PART_PX, rng), rng)
 
 
 class ToolSource(SceneSource):
@@ -107,14 +119,15 @@ class ToolSource(SceneSource):
     """
 
     def draw(self, index: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        u, size = self.u[index], windows.TOOL_PX
+        frame, u, visibility, _ = scene = self.scene(index, rng)
+        size = windows.TOOL_PX
         (centre,), (angle,) = windows.tool_pose(u[None])
-        length = self.length_px(index)
+        length = _length_px(u, visibility)
         if not np.isfinite(angle + length) or (self.disguise and rng.random() < 0.1):
-            zoom, frame = np.exp(rng.uniform(np.log(0.4), np.log(2.5))), self.frame(index)
+            zoom = np.exp(rng.uniform(np.log(0.4), np.log(2.5)))
             centre, angle = rng.uniform((0, 0), frame.shape[1::-1]), rng.uniform(-np.pi, np.pi)
             matrix = windows.window_from_image(centre, angle, size, zoom)
-            image, at, visibility = self._drawn(index, matrix, (size, size), rng)
+            image, at, visibility = self._seen(scene, matrix, (size, size), rng)
             inside = ((at > -0.5) & (at < size - 0.5)).all(1) & (visibility > 0)
             return image, np.where(inside[:, None], np.nan, at), visibility  # another scale or direction is no example
         worse = 3.0 if rng.random() < 0.15 else 1.0
@@ -122,7 +135,7 @@ class ToolSource(SceneSource):
         centre = centre + np.clip(rng.normal(0, 7 * worse, 2), -30, 30) / zoom
         angle = angle + np.clip(rng.normal(0, 0.12 * worse), -0.7, 0.7)
         matrix = windows.window_from_image(centre, angle, size, zoom)
-        return _mirrored(*self._drawn(index, matrix, (size, size), rng), rng if self.disguise else None)
+        return _mirrored(*self._seen(scene, matrix, (size, size), rng), rng if self.disguise else None)
 
 
 def _mirrored(image, u, visibility, rng: np.random.Generator | None):

@@ -1,0 +1,174 @@
+"""Tools painted on an image: flat drawings of forceps of any outline, many a second.
+
+They are no pictures of a real tool.  What they share with real ones is what a landmark is: a straight shaft, two jaws that
+leave it at one point of its axis (the base), and the farthest point of each jaw's centre line (its tip).  Training on them,
+beside rendered scenes, makes the networks look for that and not for the shapes and metals that the simulator knows.
+"""
+
+import itertools
+
+import cv2
+import numpy as np
+
+__all__ = ["drawn_ground", "drawn_tool"]
+
+#: Centre line (n, 2) px and radius (n,) px.
+Part = tuple[np.ndarray, np.ndarray]
+
+_STRIPS = 6  # of different shades across a part, which make it look round
+
+
+def drawn_ground(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """An image (h, w, 3) uint8 as a ground without a tool: what is left of it is its large patches, under textures at random.
+
+    >>> drawn_ground(np.full((90, 160, 3), 90, np.uint8), np.random.default_rng(0)).shape
+    (90, 160, 3)
+    """
+    h, w = image.shape[:2]
+    cells = int(rng.integers(3, 9))
+    coarse = cv2.resize(image, (2 * cells, cells), interpolation=cv2.INTER_AREA)
+    if rng.random() < 0.5:
+        coarse = rng.permutation(coarse.reshape(-1, 3)).reshape(coarse.shape)
+    x = cv2.resize(coarse, (w, h), interpolation=cv2.INTER_CUBIC).astype(np.float32)
+    for _ in range(rng.integers(1, 5)):
+        fine = np.exp(rng.uniform(np.log(2), np.log(0.15 * w)))  # px a cell
+        stretch = np.exp(rng.normal(0, 0.5))
+        cells_xy = max(int(w / fine * stretch), 2), max(int(h / fine / stretch), 2)
+        noise = rng.standard_normal((cells_xy[1], cells_xy[0]), dtype=np.float32)
+        how = cv2.INTER_CUBIC if rng.random() < 0.8 else cv2.INTER_NEAREST
+        noise = cv2.resize(noise, (w, h), interpolation=how)
+        if rng.random() < 0.4:  # threads, vessels, cracks
+            noise = 1.5 * np.exp(-((noise / rng.uniform(0.1, 0.4)) ** 2)) * rng.choice([-1, 1])
+        if rng.random() < 0.5:
+            turned = cv2.getRotationMatrix2D((w / 2, h / 2), rng.uniform(0, 180), 1.3)
+            noise = cv2.warpAffine(noise, turned, (w, h), borderMode=cv2.BORDER_REFLECT)
+        x = x + noise[..., None] * (rng.uniform(2, 30) * rng.dirichlet((2, 2, 2)) * 2).astype(np.float32)
+    for _ in range(rng.integers(0, 5) if rng.random() < 0.5 else 0):  # patches with edges
+        corners = rng.uniform((0, 0), (w, h)) + rng.normal(0, rng.uniform(0.02, 0.2) * w, (int(rng.integers(3, 8)), 2))
+        cv2.fillPoly(x, [_fixed(corners)], rng.uniform(0, 220, 3).tolist(), cv2.LINE_AA, 4)
+    return np.clip(x, 0, 255).astype(np.uint8)
+
+
+def drawn_tool(image: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A forceps drawn on an image (h, w, 3) uint8: the image, landmarks (3, 2) px and their visibility (3,).
+
+    >>> image, u, visibility = drawn_tool(np.full((90, 160, 3), 90, np.uint8), np.random.default_rng(0))
+    >>> image.shape, u.shape
+    ((90, 160, 3), (3, 2))
+    """
+    h, w = image.shape[:2]
+    length = np.exp(rng.uniform(np.log(0.045), np.log(0.3))) * w
+    angle = rng.uniform(-np.pi, np.pi)
+    ahead = np.array([np.cos(angle), np.sin(angle)])
+    middle = rng.uniform((0.05 * w, 0.05 * h), (0.95 * w, 0.95 * h))
+    base = middle - 0.5 * length * ahead
+    opening = rng.choice([0.0, 1.0], p=[0.12, 0.88]) * rng.uniform(0.05, 1.1 if rng.random() < 0.8 else 1.6)
+    lean = rng.normal(0, 0.15) + (rng.choice([-1, 1]) * rng.uniform(0.3, 0.9) if rng.random() < 0.15 else 0.0)
+    shape = _jaw_shape(rng)
+    other = shape if rng.random() < 0.7 else _jaw_shape(rng)
+    u, parts = [base], []
+    thick = rng.uniform(0.025, 0.11) * length
+    shaft_radius = np.clip(rng.uniform(0.5, 2.6) * thick + 0.02 * length, 0.8, 0.3 * length)
+    for side, jaw in ((-1, shape), (1, other)):
+        aside = side * 0.4 * min(thick, shaft_radius)
+        parts.append(_jaw(jaw, side, angle + lean + side * opening / 2, length, thick, base, aside))
+        u.append(parts[-1][0][-1])
+    back = np.linspace(0, 1, 12)[:, None]
+    bent = rng.normal(0, 0.03) if rng.random() < 0.2 else 0.0
+    shaft = base - back * 1.6 * w * ahead + (bent * back**2) * 1.6 * w * np.array([-ahead[1], ahead[0]])
+    shaft += rng.uniform(0, 0.08) * length * ahead * (1 - back)  # how far it covers the jaws' roots
+    radius = shaft_radius * (1 + rng.uniform(-0.2, 1.2) * back[:, 0])
+    if rng.random() < 0.3:  # a sleeve
+        radius = np.where(np.arange(12) > rng.integers(1, 4), radius * rng.uniform(1.1, 2.0), radius)
+    if rng.random() < 0.3:  # rounded or conical end
+        radius[0] *= rng.uniform(0.2, 0.8)
+    parts.insert(int(rng.choice([0, 2])), (shaft, radius))
+    x = image.astype(np.float32)
+    if rng.random() < 0.6:
+        x = _shadowed(x, parts, length, rng)
+    x = _painted(x, parts, length, rng)
+    u = np.array(u)
+    if np.linalg.det(u[1:] - u[0]) < 0:  # the jaws cross: tip_1 is the left one
+        u = u[[0, 2, 1]]
+    inside = ((u > -0.5) & (u < np.array([w, h]) - 0.5)).all(1)
+    return np.clip(x, 0, 255).astype(np.uint8), u, np.where(inside, 2, 0)
+
+
+def _jaw_shape(rng: np.random.Generator) -> dict[str, float]:
+    """Bow outward, bend of all, hook, taper, end and swelling: of the unit of length."""
+    def some(share: float, value: float) -> float:
+        return value if rng.random() < share else 0.0
+
+    return {
+        "long": rng.uniform(0.75, 1.1), "bow": some(0.7, rng.uniform(-0.05, 0.35)), "power": rng.uniform(0.6, 1.8),
+        "bend": some(0.3, rng.normal(0, 0.3)), "hook": some(0.25, rng.uniform(0.02, 0.2)), "start": rng.uniform(0.5, 0.9),
+        "taper": rng.uniform(0.1, 1.0), "end": some(0.5, rng.uniform(0.1, 1.0)), "swell": some(0.25, rng.uniform(0.2, 1.5)),
+        "teeth": some(0.12, rng.uniform(0.1, 0.5)),
+    }  # fmt: skip
+
+
+def _jaw(
+    shape: dict[str, float], side: int, angle: float, length: float, thick: float, base: np.ndarray, aside: float
+) -> Part:
+    """Centre line (n, 2) px from the base to the tip, and radius (n,) px."""
+    s = np.linspace(0, 1, 24)
+    along, across = s * shape["long"], shape["bow"] * np.sin(np.pi * s ** shape["power"]) * side
+    across = across + shape["bend"] * s**2
+    across = across - side * shape["hook"] * np.clip((s - shape["start"]) / (1 - shape["start"]), 0, 1) ** 2
+    radius = thick * (1 - shape["taper"] * s) + shape["end"] * thick * np.clip(4 * s - 3, 0, 1)
+    radius = radius * (1 + shape["swell"] * np.exp(-(((s - 0.8) / 0.12) ** 2)))
+    radius = radius * (1 + shape["teeth"] * (np.arange(24) % 2) * (s > 0.4))
+    cos, sin = np.cos(angle), np.sin(angle)
+    line = length * (along[:, None] * [cos, sin] + across[:, None] * [-sin, cos])
+    line += (1 - s)[:, None] * aside * np.array([-sin, cos])  # the jaws leave the shaft beside each other
+    return base + line, np.maximum(radius, 0.35)
+
+
+def _outline(line: np.ndarray, radius: np.ndarray, low: float, high: float) -> np.ndarray:
+    """The polygon between two fractions (-1 to 1) of the radius beside a line."""
+    along = np.gradient(line, axis=0)
+    beside = np.column_stack([-along[:, 1], along[:, 0]]) / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
+    return np.vstack([line + low * radius[:, None] * beside, (line + high * radius[:, None] * beside)[::-1]])
+
+
+def _fixed(polygon: np.ndarray) -> np.ndarray:
+    return np.round(np.clip(polygon, -3e4, 3e4) * 16).astype(np.int32)
+
+
+def _shadowed(x: np.ndarray, parts: list[Part], length: float, rng: np.random.Generator) -> np.ndarray:
+    mask = np.zeros(x.shape[:2], np.float32)
+    offset = rng.normal(0, 0.6, 2) * length
+    grown = rng.uniform(0.8, 1.3)
+    for line, radius in parts:
+        cv2.fillPoly(mask, [_fixed(_outline(line + offset, grown * radius, -1, 1))], 1.0, cv2.LINE_AA, 4)
+    mask = cv2.GaussianBlur(mask, (0, 0), np.exp(rng.uniform(np.log(0.5), np.log(0.2 * length + 1))))
+    return x * (1 - np.float32(rng.uniform(0.2, 0.9)) * mask)[..., None]
+
+
+def _painted(x: np.ndarray, parts: list[Part], length: float, rng: np.random.Generator) -> np.ndarray:
+    h, w = x.shape[:2]
+    tone = np.exp(rng.uniform(np.log(12), np.log(230))) * np.exp(rng.normal(0, rng.choice([0.04, 0.3], p=[0.7, 0.3]), 3))
+    layer, mask = np.zeros_like(x), np.zeros((h, w), np.float32)
+    phase, round_, shine, where = rng.uniform(-1, 1), rng.uniform(0, 1), rng.uniform(0, 1.5), rng.uniform(-0.7, 0.7)
+    own = rng.random() < 0.5  # each part has its own shade
+    edges = np.linspace(-1, 1, _STRIPS + 1)
+    for line, radius in parts:
+        level = tone * (np.exp(rng.normal(0, 0.35)) if own else 1.0)
+        cv2.fillPoly(mask, [_fixed(_outline(line, radius, -1, 1))], 1.0, cv2.LINE_AA, 4)
+        for low, high in itertools.pairwise(edges):
+            q = (low + high) / 2
+            shade = 1 - round_ * (0.5 + 0.5 * phase * q) * abs(q - 0.3 * phase)
+            shade += shine * np.exp(-(((q - where) / 0.25) ** 2))
+            polygon = _outline(line, radius * 1.05, low - 0.02, high + 0.02)
+            cv2.fillPoly(layer, [_fixed(polygon)], (level * max(shade, 0.05)).tolist(), cv2.LINE_AA, 4)
+    if rng.random() < 0.6:  # light and reflections that change along it
+        cells = max(int(w / (rng.uniform(0.1, 1.0) * length)), 2)
+        field = cv2.resize(rng.random((cells, cells), dtype=np.float32), (w, h), interpolation=cv2.INTER_CUBIC)
+        layer = layer * (1 + rng.uniform(0.2, 1.0) * (2 * field - 1))[..., None]
+    if rng.random() < 0.4:  # mirrors the field
+        share = np.float32(rng.uniform(0.1, 0.7))
+        around = np.roll(cv2.flip(x, int(rng.integers(-1, 2))), tuple(rng.integers((h, w))), axis=(0, 1))
+        layer = layer * (1 - share) + share * around * rng.uniform(0.5, 1.5)
+    if rng.random() < 0.3:  # grain and scratches
+        layer = layer * (1 + rng.uniform(0.05, 0.3) * rng.standard_normal((h, w), dtype=np.float32))[..., None]
+    return x * (1 - mask[..., None]) + layer.astype(np.float32) * mask[..., None]

@@ -1,0 +1,45 @@
+"""Drawn tools: their landmarks lie where the drawing is, in the workbench's order."""
+
+import numpy as np
+
+from lib.training.drawings import drawn_ground, drawn_tool
+from lib.training.samples import LabelledImage
+from lib.training.scenes import FrameSource, ToolSource
+
+GROUND = np.full((180, 320, 3), 120, np.uint8)
+
+
+def test_landmarks_lie_on_the_drawing_and_tip_1_on_the_left_of_the_tool():
+    painted, order = [], []
+    for seed in range(40):
+        image, u, visibility = drawn_tool(GROUND, np.random.default_rng(seed))
+        changed = np.abs(image.astype(int) - GROUND).max(axis=2) > 6
+        for column, row in np.round(u[visibility == 2]).astype(int).clip(0, (319, 179)):
+            painted.append(changed[max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3].any())
+        one, two = u[1:] - u[0]
+        order.append(one[0] * two[1] - one[1] * two[0])
+        assert ((visibility == 2) == ((u > -0.5) & (u < (319.5, 179.5))).all(axis=1)).all()
+    assert np.mean(painted) > 0.9  # some have the colour of the ground
+    assert min(order) > -1e-6
+
+
+def test_the_seed_decides_everything_and_a_ground_keeps_no_tool():
+    first, again = (drawn_tool(GROUND, np.random.default_rng(3)) for _ in range(2))
+    for a, b in zip(first, again, strict=True):
+        np.testing.assert_array_equal(a, b)
+    with_tool = GROUND.copy()
+    with_tool[80:100, 100:220] = 0
+    grounds = [drawn_ground(with_tool, np.random.default_rng(seed)).astype(float) for seed in range(40)]
+    inside, around = (np.mean([ground[rows].mean() for ground in grounds]) for rows in (np.s_[85:95, 110:210], np.s_[60:80]))
+    assert abs(inside - around) < 40  # of the 120 by which the tool was darker
+
+
+def test_a_source_draws_tools_and_undrawn_frames_keep_their_labels():
+    u = np.array([[100.0, 90], [150, 80], [150, 100]])
+    images = [LabelledImage("a", GROUND, u, np.full(3, 2))]
+    for kind in (FrameSource, ToolSource):
+        plain = kind.of(images, weight=np.zeros((1, 3)))
+        drawn = kind(plain.ends, plain.jpegs, plain.u, plain.visibility, weight=np.zeros((1, 3)), drawn=1.0)
+        rng = np.random.default_rng(0)
+        assert not any(np.isfinite(plain.draw(0, rng)[1]).all(axis=1).any() for _ in range(5))  # weight 0: no label counts
+        assert any(np.isfinite(drawn.draw(0, rng)[1]).all() for _ in range(10))
