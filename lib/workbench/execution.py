@@ -83,6 +83,7 @@ def execute(
             kernel_name="python3",
             progress_bar=False,
             execution_timeout=cell_timeout_s,
+            start_timeout=600,  # of the kernel: a busy machine takes its time
             on_cell_start=on_cell_start,  # this and the next are for nbclient
             extra_arguments=["--IPKernelApp.log_level=50"],  # its warning of unencrypted TCP on every start
         )
