@@ -606,7 +606,7 @@ def scene_view(
             line(np.array([tips[0], below]), said, "#111111", 8)
     axes = {f"{axis}axis_title": f"{axis} (mm)" for axis in "xyz"}
     up = dict(zip("xyz", (-rig.left.viewing_direction).tolist(), strict=True))
-    camera = {"up": up, "eye": {axis: 1.1 * value + 0.6 for axis, value in up.items()}}
+    camera = {"up": up, "eye": {axis: 1.4 * value + 0.8 for axis, value in up.items()}}
     view.update_layout(
         scene={"aspectmode": "data", "camera": camera, **axes}, margin={"l": 0, "r": 0, "t": 0, "b": 0},
         height=height_px, legend={"x": 0, "y": 1, "bgcolor": "rgba(255,255,255,0.7)"},
