@@ -66,8 +66,7 @@ def headlines(run: dict) -> tuple[list[dict], list[str]]:
         if own and (line.get("elsewhere") or (line.get("truth") and not here)):
             left_out += [] if line.get("elsewhere") else [line["words"]]
             continue
-        unit = line["unit"]
-        paper = (live or line).get("paper")
+        unit, paper = line["unit"], (live or line).get("paper")
         before, book = run.get("previous", {}).get(line["name"]), books.get(line["notebook"], {"state": None})
         rows.append(
             line

@@ -115,11 +115,10 @@ def page(
         return markdown_html(source, folder=folder, attachments=context["cell"].get("attachments"))
 
     untrusted = partial(markdown_html, trusted=False)
-    filters = {"markdown2html": prose, "untrusted_markdown": untrusted, "equation": equation_svg}
     exporter = HTMLExporter(
         template_name="notebook",
         extra_template_basedirs=[str(_TEMPLATES)],
-        filters=filters,
+        filters={"markdown2html": prose, "untrusted_markdown": untrusted, "equation": equation_svg},
         preprocessors=["nbconvert.preprocessors.CoalesceStreamsPreprocessor"],  # of a progress bar only its last state
     )
     exporter.config.NbConvertBase.display_data_priority = _RICHEST_FIRST
