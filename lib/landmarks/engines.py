@@ -83,8 +83,8 @@ class LastOutput(nn.Module):
 class OpenVinoNetwork:
     """A network run by OpenVINO with as many threads as torch has, a few images at once.
 
-    It is compiled, in about a second, for each size of image that it meets and each number of them in `BATCHES`: a batch
-    of six windows takes two thirds of the time of six windows alone.
+    It is converted for each size of image that it meets, and compiled for each number of them in `BATCHES`: a batch of six
+    windows takes two thirds of the time of six windows alone.
     """
 
     network: Network = field(compare=False)
@@ -112,13 +112,19 @@ class OpenVinoNetwork:
 
 @lru_cache(maxsize=16)  # copies of a detector share what is compiled: equal weights, equal key
 def _request(compiled: OpenVinoNetwork, shape: tuple[int, ...]) -> object:
-    ov = openvino()
-    module = LastOutput(compiled.network, mirror=compiled.mirror).eval()
-    with torch.no_grad(), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # tracing fixes the shape, as it shall
-        traced = torch.jit.freeze(torch.jit.trace(module, torch.zeros(shape), check_trace=False))
-        model = ov.convert_model(traced, input=[(list(shape), np.float32)])  # of a trace it is much quicker
+    model = _converted(compiled, shape[1:]).clone()
+    model.reshape(list(shape))
     options = {"PERFORMANCE_HINT": "LATENCY", "NUM_STREAMS": 1, "INFERENCE_NUM_THREADS": compiled.threads}
     if compiled.precision:
         options["INFERENCE_PRECISION_HINT"] = compiled.precision
-    return ov.Core().compile_model(model, "CPU", options).create_infer_request()
+    return openvino().Core().compile_model(model, "CPU", options).create_infer_request()
+
+
+@lru_cache(maxsize=16)
+def _converted(compiled: OpenVinoNetwork, shape: tuple[int, ...]) -> object:
+    """The network as a model for a few images of one shape; it takes longer than to compile it for each number of them."""
+    module, shape = LastOutput(compiled.network, mirror=compiled.mirror).eval(), (2, *shape)
+    with torch.no_grad(), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # tracing fixes the shape, as it shall
+        traced = torch.jit.freeze(torch.jit.trace(module, torch.zeros(shape), check_trace=False))
+        return openvino().convert_model(traced, input=[(list(shape), np.float32)])  # of a trace it is much quicker
