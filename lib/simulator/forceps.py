@@ -8,6 +8,7 @@ mirrored: `Pose` limits the roll about the shaft to 60 degrees.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -47,7 +48,7 @@ class Pose:
         check(self, "roll_rad", lambda v: abs(v) <= MAX_ROLL_RAD, rule)
         not_negative(self, "opening_mm")
 
-    @property
+    @cached_property
     def microscope_from_tool(self) -> np.ndarray:
         """Rotation (3, 3): columns are the tool's x, y and z in the microscope frame."""
         # At azimuth 0 jaw 1 (tool y) points up in the image, -y; the tool's z then points out of the eye.

@@ -126,10 +126,26 @@ def test_a_robot_that_errs_teaches_nothing_wrong(world, tmp_path, fault):
 # --- the loop
 
 
-def test_a_half_wrong_detector_is_improved(world, recording, tmp_path):
-    tune = pupil(world)
-    detector = StandIn(world.u, noise_px=2.0, wrong=0.4)
-    found = adapt(recording, detector, folder=tmp_path, progress=False, tune=tune)
+@pytest.fixture(scope="module")
+def continued(world, recording, tmp_path_factory):
+    """(adaptation of a half-wrong detector that was killed in its training and went on, detector, what it taught)."""
+    folder = tmp_path_factory.mktemp("continued")
+    detector, tune = StandIn(world.u, noise_px=2.0, wrong=0.4), pupil(world)
+
+    def killed(*_, **__):
+        raise KeyboardInterrupt
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(loop, "ROUNDS", 1)
+        patch.setattr(loop, "simulated_like", lambda *_: [])
+        with pytest.raises(KeyboardInterrupt):
+            adapt(recording, detector, folder=folder, progress=False, tune=killed)
+        assert detector.asked == world.n
+        return adapt(recording, detector, folder=folder, progress=False, tune=tune), detector, tune
+
+
+def test_a_half_wrong_detector_is_improved(continued):
+    found, detector, tune = continued
     assert found.improved and found.detector is not detector and found.calibration is not None
     judged = found.report["judged"]
     assert judged["after"]["median_px"] < 1.0 < judged["before"]["median_px"]
@@ -162,18 +178,9 @@ def test_five_labelled_pairs_are_a_start(world, recording, tmp_path, monkeypatch
     assert found.improved and np.nanmedian(np.linalg.norm(tune.calls[-1]["off"], axis=-1)) < 1.5
 
 
-def test_it_goes_on_after_a_kill(world, recording, tmp_path):
-    detector = StandIn(world.u, noise_px=2.0, wrong=0.4)
-
-    def killed(*_, **__):
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        adapt(recording, detector, folder=tmp_path, progress=False, tune=killed)
-    asked = detector.asked
-    assert asked == world.n
-    again = adapt(recording, detector, folder=tmp_path, progress=False, tune=pupil(world))
-    assert again.improved and detector.asked == asked  # nothing was looked at twice
+def test_it_goes_on_after_a_kill(world, continued):
+    again, detector, _ = continued
+    assert again.improved and detector.asked == world.n  # nothing was looked at twice
 
 
 def test_exit_codes_and_files(world, recording, tmp_path, monkeypatch, capsys):

@@ -1,6 +1,7 @@
 """A lab without pictures: blank frames that carry their own number, and a stand-in for the detector that knows the rest."""
 
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,15 @@ from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
 
 SIZE = (480, 270)
 FPS, HZ = 2.0, 50.0
+TOOL = Forceps()
+
+
+@cache
+def true_landmarks_mm(n: int, seed: int, times: bytes) -> np.ndarray:
+    """(m, 3, 3) mm in the robot frame; worked out once, since every recording of a world asks for the same times."""
+    motion = Motion(TOOL, Eye(texture_px=64), kind="both", seed=seed, duration_s=n / FPS)
+    poses = [motion.pose(t) for t in np.clip(np.frombuffer(times), 0, None)]
+    return ROBOT_FROM_MICROSCOPE.apply(np.array([TOOL.landmarks(pose) for pose in poses]))
 
 
 @dataclass(eq=False)
@@ -28,18 +38,15 @@ class World:
 
     def __post_init__(self):
         self.rig = reference_rig(image_size_px=SIZE, pixels_per_mm=(25.0, 25.0))
-        self.tool = Forceps()
-        self.motion = Motion(self.tool, Eye(texture_px=64), kind="both", seed=self.seed, duration_s=self.n / FPS)
         self.time_s = np.arange(self.n) / FPS
-        self.u = np.stack([self.project(i, t) for i, t in enumerate(self.time_s)])  # (n, 2, 3, 2)
+        self.u = np.stack([self.project(i, x) for i, x in enumerate(self.at(self.time_s))])  # (n, 2, 3, 2)
 
     def at(self, time_s):
         """(m, 3, 3) mm."""
-        poses = [self.motion.pose(t) for t in np.clip(time_s, 0, None)]
-        return ROBOT_FROM_MICROSCOPE.apply(np.array([self.tool.landmarks(pose) for pose in poses]))
+        return true_landmarks_mm(self.n, self.seed, np.asarray(time_s, dtype=float).tobytes())
 
-    def project(self, i, time_s):
-        u = np.stack(self.rig.project(self.at([time_s])[0]))
+    def project(self, i, x_mm):
+        u = np.stack(self.rig.project(x_mm))
         if self.moved_from is not None and i >= self.moved_from:
             u = 1.05 * u + [[[20.0, -12.0]], [[24.0, -12.0]]]
         return u

@@ -23,13 +23,19 @@ DEPTH_MM = 1.5
 BLACK = np.zeros((24, 32, 3), np.uint8)
 
 
+@cache
+def _path_mm(n: int, seed: int) -> np.ndarray:
+    """(n, 3, 3) landmarks of a tool that jumps; worked out once for all worlds."""
+    return tool_frames(n, rng=np.random.default_rng(seed), sigma_x_mm=0.0).true_x_mm.reshape(-1, 3, 3)
+
+
 class World:
     """A tool that jumps from pose to pose; `smooth` lets it glide, as in a video."""
 
     def __init__(self, seed: int = 0, sigma_px: float = 1.0, *, smooth: bool = False, still: bool = False, n: int = 400):
         self.rng = np.random.default_rng(seed)
         self.rig, self.sigma_px, self.depth_mm = RIG, sigma_px, DEPTH_MM
-        x = tool_frames(n, rng=np.random.default_rng(seed + 1), sigma_x_mm=0.0).true_x_mm.reshape(-1, 3, 3)
+        x = _path_mm(n, seed + 1).copy()
         if smooth:
             t = np.arange(n)[:, None, None] / 25.0
             sway = np.array([3.0, 2.0, 0.8]) * np.sin(t * np.array([1.1, 1.7, 0.7]) + np.array([0.0, 1.0, 2.0]))
