@@ -101,7 +101,7 @@ def _become(command: list[str]) -> int:
 
 def test(argv: list[str]) -> int:
     style = subprocess.call([sys.executable, "-m", "ruff", "check", "--output-format=concise", *ruff_options(), ROOT])
-    return _pytest(["--numprocesses=auto", "--dist=loadfile", "-p", "no:dash", *argv]) or style
+    return _pytest(["--numprocesses=auto", "--dist=loadfile", "--no-loadscope-reorder", "-p", "no:dash", *argv]) or style
 
 
 def bench(argv: list[str]) -> int:

@@ -41,15 +41,11 @@ def real_data(name: str) -> Path | None:
         name: Folder of the data set, such as ``"retinal_microsurgery"``.
     """
     root = os.environ.get(REAL_DATA_VARIABLE)
-    if not root:
-        return None
-    folder = (ROOT / Path(root)).resolve() if not Path(root).is_absolute() else Path(root)
-    folder = folder / name
-    return folder if folder.is_dir() else None
+    folder = ROOT / root / name if root else None
+    return folder if folder and folder.is_dir() else None
 
 
 def missing_data_line(name: str) -> str:
     """The one line a notebook prints when a real data set is not at hand, and then goes on."""
-    return (
-        f"Skipped: the real data set '{name}' is not at hand; point {REAL_DATA_VARIABLE} at the folder that holds it."
-    )
+    cure = f"point {REAL_DATA_VARIABLE} at the folder that holds it"
+    return f"Skipped: the real data set '{name}' is not at hand; {cure}."

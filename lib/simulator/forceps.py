@@ -7,11 +7,10 @@ looks along the shaft towards the tips.  So tip_1 lies left of the direction fro
 mirrored: `Pose` limits the roll about the shaft to 60 degrees.
 """
 
+import math
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from lib.simulator.limits import check, not_negative, positive
 
@@ -21,6 +20,8 @@ MAX_ROLL_RAD = np.deg2rad(60.0)
 MAX_PITCH_RAD = np.deg2rad(60.0)
 MAX_TIP_RADIUS_MM = 0.02
 _SHAFT_MM = 40.0
+_ALONG = 1 - (1 - np.linspace(0, 1, 15)) ** 1.4  # a jaw of `Forceps`, denser towards the tip
+_BOW, _HOOK = np.sin(np.pi * _ALONG) ** 1.2, np.clip((_ALONG - 0.6) / 0.2, 0, 1) * np.clip((1 - _ALONG) / 0.2, 0, 1)
 
 #: Round cones: centres (n, 3) in the microscope frame, radii (n,) mm, and the chain (n,) that each belongs to.
 Nodes = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -48,13 +49,14 @@ class Pose:
         check(self, "roll_rad", lambda v: abs(v) <= MAX_ROLL_RAD, rule)
         not_negative(self, "opening_mm")
 
-    @cached_property
+    @property
     def microscope_from_tool(self) -> np.ndarray:
         """Rotation (3, 3): columns are the tool's x, y and z in the microscope frame."""
         # At azimuth 0 jaw 1 (tool y) points up in the image, -y; the tool's z then points out of the eye.
         upright = np.diag([1.0, -1.0, -1.0])
-        turn = Rotation.from_euler("ZY", [self.azimuth_rad, -self.pitch_rad]).as_matrix()
-        return turn @ upright @ Rotation.from_euler("x", self.roll_rad).as_matrix()
+        (a, b), (c, d), (e, f) = ((math.cos(v), math.sin(v)) for v in (self.azimuth_rad, self.pitch_rad, self.roll_rad))
+        turn = np.array([[a * c, -b, -a * d], [b * c, a, -b * d], [d, 0.0, c]])  # about z, then about y by -pitch
+        return turn @ upright @ np.array([[1.0, 0.0, 0.0], [0.0, e, -f], [0.0, f, e]])
 
     def place(self, points: np.ndarray) -> np.ndarray:
         """Points (n, 3) of the tool frame in the microscope frame."""
@@ -98,12 +100,8 @@ class Forceps:
 
     def _jaw(self, side: int, opening_mm: float) -> tuple[np.ndarray, np.ndarray]:
         """Centreline (n, 3) in the tool frame, which ends one tip radius before the landmark, and radii (n,); +1 is jaw 1."""
-        s = 1 - (1 - np.linspace(0, 1, 15)) ** 1.4  # denser towards the tip
-        half = max(opening_mm / 2, self.tip_radius_mm)
-        root = 0.45 * self.jaw_radius_mm
-        y = root * (1 - s) ** 2 + self.bow_mm * np.sin(np.pi * s) ** 1.2
-        y += self.hook_mm * np.clip((s - 0.6) / 0.2, 0, 1) * np.clip((1 - s) / 0.2, 0, 1)
-        y += half * s**1.5
+        s, half, root = _ALONG, max(opening_mm / 2, self.tip_radius_mm), 0.45 * self.jaw_radius_mm
+        y = root * (1 - s) ** 2 + self.bow_mm * _BOW + self.hook_mm * _HOOK + half * s**1.5
         # Opening the jaws turns them, it does not stretch them.
         x = s * np.sqrt(max(self.jaw_length_mm**2 - max(half - self.tip_radius_mm, 0) ** 2, 1e-6))
         line = np.column_stack([x, side * y, -self.bend_mm * s**2])
