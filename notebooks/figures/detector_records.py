@@ -32,7 +32,7 @@ __all__ = [
     "recorded",
     "resolution_curves",
     "shipped_curve",
-    "shipped_table",
+    "shipped_rows",
     "speed_rows",
     "verdicts",
     "visibility_bars",
@@ -171,26 +171,6 @@ def real_tests(table: Table) -> dict[str, Table]:
     return {name: Table(rows) for name, rows in tests.items()}
 
 
-def _text_table(header: Sequence[str], rows: Sequence[Sequence[str]], *, width_in: float, first: float) -> Figure:
-    """Rows of text under a bold header; the first column, `first` of the width, is left-aligned."""
-    fig, ax = figure(width_in=width_in, height_in=0.34 * (len(rows) + 1))
-    ax.axis("off")
-    rest = (1 - first) / (len(header) - 1)
-    drawn = ax.table(
-        [list(row) for row in rows], colLabels=list(header), edges="horizontal", cellLoc="center",
-        colWidths=[first] + [rest] * (len(header) - 1), bbox=(0, 0, 1, 1),
-    )  # fmt: skip
-    drawn.auto_set_font_size(False)
-    drawn.set_fontsize(12)
-    for (row, column), cell in drawn.get_celld().items():
-        cell.set_edgecolor(COLOURS["baseline"])
-        if row == 0:
-            cell.set_text_props(weight="bold")
-        if column == 0:
-            cell.set_text_props(ha="left")
-    return fig
-
-
 def shipped_curve(table: Table) -> Figure:
     """PCK of the shipped detector on the test sequences, whole frames and tracking; right, the top enlarged."""
     fig, axes = figure(1, 2, width_in=11, height_in=3.8)
@@ -214,8 +194,8 @@ def shipped_curve(table: Table) -> Figure:
     return fig
 
 
-def shipped_table(table: Table) -> Figure:
-    """Scores of the shipped detector: all whole frames, tracking, by landmark, by sequence."""
+def shipped_rows(table: Table) -> tuple[list[str], list[list[str]]]:
+    """Scores of the shipped detector, header and rows: all whole frames, tracking, by landmark, by sequence."""
     everything = {row["mode"]: row for row in table.where(recording="all").rows}
     rows = {f"all, {mode}": row for mode, row in everything.items()}
     whole = everything["whole frames"]
@@ -230,7 +210,7 @@ def shipped_table(table: Table) -> Figure:
         "in 95 % ellipse": ("coverage_95_percent", ".1f"),
     }
     cells = [[name, *(format(row[key], form) for key, form in columns.values())] for name, row in rows.items()]
-    return _text_table(["", *columns], cells, width_in=11.5, first=0.24)
+    return ["", *columns], cells
 
 
 def depth_groups(table: Table) -> dict[str, dict[str, SimpleNamespace]]:

@@ -25,10 +25,10 @@ __all__ = [
     "augmented",
     "decoder_errors",
     "detection",
+    "disc_page",
     "error_groups",
     "focus_distance_mm",
     "frame_explorer",
-    "half_within",
     "heatmap_grid",
     "landmark_dots",
     "learning_curves",
@@ -36,8 +36,6 @@ __all__ = [
     "network_page",
     "pck_curves",
     "printed_equation",
-    "real_curves",
-    "real_frames",
     "stages",
     "timing_bars",
     "uncertainty",
@@ -108,15 +106,41 @@ def heatmap_grid(image: np.ndarray, heatmaps: np.ndarray, u: np.ndarray, stride:
     return fig
 
 
-def printed_equation(heatmap: np.ndarray, truth: np.ndarray, points: Mapping[str, np.ndarray]) -> Figure:
-    """A heatmap (h, w) of stride 1 with what Eq. (1) gives, printed and normalised."""
-    fig, ax = figure(width_in=4.6, height_in=4.2)
-    show_image(ax, heatmap)
-    ax.images[0].set_cmap("inferno")
-    ax.scatter(*truth, marker="+", s=120, c="white", label="truth")
-    for (name, point), colour in zip(points.items(), (COLOURS["paper"], COLOURS["ours"]), strict=False):
-        ax.scatter(*point, s=110, facecolors="none", edgecolors=colour, linewidths=2, label=name)
-    ax.legend(loc="lower right", labelcolor="white")
+def printed_equation(truths: np.ndarray, printed: np.ndarray, normalised: np.ndarray, size: tuple[int, int]) -> Figure:
+    """Positions (n, 2) that both forms of Eq. (1) give for peaks at `truths` in an image of `size` (rows, columns)."""
+    fig, (a, b) = figure(1, 2, width_in=11, height_in=4.2, width_ratios=(1.15, 1))
+    for i, (truth, wrong, right) in enumerate(zip(truths, printed, normalised, strict=True)):
+        a.annotate("", wrong, truth, arrowprops={"arrowstyle": "-", "color": "#cccccc"})
+        a.plot(*truth, "+", color="black", ms=11, label="truth" if i == 0 else None)
+        a.plot(*wrong, "o", color=COLOURS["paper"], ms=5, label="as printed" if i == 0 else None)
+        a.plot(*right, "o", mfc="none", color=COLOURS["ours"], ms=9, mew=1.5, label="normalised" if i == 0 else None)
+    a.set(xlim=(-10, size[1]), ylim=(size[0], -10), aspect="equal", xlabel="x, px", ylabel="y, px", title="In the image")
+    a.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=3)
+    distance = np.linalg.norm(truths, axis=1)
+    for found, name, colour in ((printed, "as printed", "paper"), (normalised, "normalised", "ours")):
+        b.plot(distance, np.linalg.norm(found - truths, axis=1), "o", color=COLOURS[colour], label=name)
+    b.set(yscale="log", xlabel="distance from the origin, px", ylabel="error, px", title="Error")
+    b.yaxis.set_major_formatter("{x:g}")
+    b.legend(loc="center right")
+    return fig
+
+
+def disc_page(p: np.ndarray, truth: np.ndarray, found: Mapping[str, np.ndarray], radius: float) -> Figure:
+    """A heatmap (h, w) with the disc of Eq. (1) and the positions read from it, and a section through the peak's row."""
+    fig, (a, b) = figure(1, 2, width_in=9.5, height_in=3.6, width_ratios=(1, 1.3))
+    show_image(a, p, "heatmap")
+    a.images[0].set_cmap("inferno")
+    row, column = np.unravel_index(p.argmax(), p.shape)
+    a.add_patch(plt.Circle((column, row), radius, fill=False, ec="white", lw=1.5))
+    a.plot(*truth, "+", color="white", ms=14, mew=2)
+    b.plot(p[row], color=COLOURS["baseline"], label="heatmap")
+    b.axvspan(column - radius, column + radius, color="#e8f1f8", zorder=0, label="disc")
+    b.axvline(truth[0], color=COLOURS["truth"], lw=1.2, label="truth")
+    for (name, u), colour in zip(found.items(), ("paper", "ours"), strict=False):
+        a.plot(*u, "o", color=COLOURS[colour], ms=6)
+        b.axvline(u[0], color=COLOURS[colour], ls="--", label=f"{name}: {np.linalg.norm(u - truth):.2f} px off")
+    b.set(xlabel="x, px", title="the peak's row", xlim=(0, p.shape[1] - 1))
+    b.legend(fontsize=9)
     return fig
 
 
@@ -225,22 +249,6 @@ def worst_frames(images: Sequence[np.ndarray], evaluation: Evaluation, indices: 
     return fig
 
 
-def real_frames(images: Sequence[np.ndarray], evaluation: Evaluation, indices: Sequence[int]) -> Figure:
-    """Real frames with the detections (circles) and the clicked labels (crosses)."""
-    fig, axes = figure(1, len(images), width_in=11, height_in=11.6 / max(1, len(images)), squeeze=False)
-    for ax, image, i in zip(axes.flat, images, indices, strict=True):
-        error = evaluation.error_px[i] / evaluation.length_px[i]
-        show_image(ax, image, f"{evaluation.names[i]}: {100 * np.nanmax(error):.0f} % of the length off")
-        landmark_dots(ax, evaluation.landmarks.u[i], size=110)
-        ax.scatter(*evaluation.u_true[i].T, marker="+", s=110, c="white", linewidths=1.8)
-        both = np.concatenate([evaluation.u_true[i], evaluation.landmarks.u[i]])
-        low, high = np.nanmin(both, axis=0), np.nanmax(both, axis=0)
-        reach = 0.5 * (high - low).max() + evaluation.length_px[i]
-        x, y = (low + high) / 2
-        ax.set(xlim=(x - reach, x + reach), ylim=(y + reach, y - reach))
-    return fig
-
-
 def uncertainty(evaluation: Evaluation, squared: np.ndarray) -> Figure:
     """Do covariance and confidence mean what they say: distribution of the squared error, and reliability."""
     fig, (a, b) = figure(1, 2, width_in=11, height_in=3.4)
@@ -261,41 +269,6 @@ def uncertainty(evaluation: Evaluation, squared: np.ndarray) -> Figure:
     b.set(title="Reliability", xlabel="confidence", ylabel="fraction correct", xlim=(-0.02, 1.05), ylim=(-0.02, 1.05))
     b.legend()
     return fig
-
-
-def real_curves(thresholds: Sequence[float], curves: Mapping[str, Sequence[float]]) -> Figure:
-    """PCK on real frames, a panel a kind of test; names are "sequence: what was trained on and tested on"."""
-    panels: dict[str, dict[str, Sequence[float]]] = {}
-    for name, curve in curves.items():
-        sequence, how = name.split(": ", 1)
-        kind = "another sequence" if how.startswith("first half to ") and how != "first half to second" else how
-        label = f"{sequence} to {how.removeprefix('first half to ')}" if kind == "another sequence" else sequence
-        panels.setdefault(kind, {})[label] = curve
-    fig, axes = figure(1, max(1, len(panels)), width_in=11, height_in=3.5, sharey=True, squeeze=False)
-    for ax, (kind, rows) in zip(axes.flat, panels.items(), strict=False):
-        for (name, curve), colour in zip(
-            rows.items(), (COLOURS["ours"], COLOURS["paper"], COLOURS["truth"]), strict=False
-        ):
-            ax.plot(thresholds, curve, "o-", color=colour, ms=4, label=name)
-        ax.axvline(0.2, color=COLOURS["baseline"], lw=1)
-        ax.set(xlim=(0.05, 0.5), ylim=(0, 101), xlabel="threshold, part of the tool's length", title=kind)
-        ax.set_xticks([0.1, 0.2, 0.3, 0.4, 0.5])
-        ax.legend(loc="best")
-    axes.flat[0].set_ylabel("PCK, %")
-    return fig
-
-
-def half_within(thresholds: Sequence[float], curve: Sequence[float]) -> str:
-    """A PCK curve in words: the fraction of the tool's length within which half of all landmarks lie."""
-    curve = np.asarray(curve, dtype=float)
-    reached = np.flatnonzero(curve >= 50)
-    if not len(reached):
-        return f"not even half within {100 * thresholds[-1]:.0f} % of the tool's length"
-    end = reached[0]
-    if end == 0:
-        return f"half within less than {100 * thresholds[0]:.0f} % of the tool's length"
-    at = np.interp(50, curve[end - 1 : end + 1], thresholds[end - 1 : end + 1])
-    return f"half within {100 * at:.0f} % of the tool's length"
 
 
 def timing_bars(ms: Mapping[str, float], paper_hz: Mapping[str, float], *, title: str) -> Figure:

@@ -13,6 +13,7 @@ from lib.workbench import results
 from lib.workbench.results import Table
 from notebooks.figures import detector_records as records
 from notebooks.figures import landmarks as plots
+from notebooks.figures import shift
 
 
 @pytest.fixture(autouse=True)
@@ -45,13 +46,12 @@ def shipped():
 
 
 def test_the_shipped_table_has_a_row_for_each_landmark_and_sequence(shipped):
-    cells = records.shipped_table(shipped).axes[0].tables[0].get_celld()
-    rows = max(row for row, _ in cells)
-    names = [cells[row, 0].get_text().get_text() for row in range(1, rows + 1)]
+    header, rows = records.shipped_rows(shipped)
+    names = [row[0] for row in rows]
     assert names == ["all, whole frames", "all, tracking", "base", "tip_1", "tip_2", "test_07", "test_08"]
-    for row in range(1, rows + 1):
-        values = [cells[row, column].get_text().get_text() for column in range(1, 7)]
-        assert values == ["0.51" if row == 2 else "0.46", "2.34", "91.2", "98.8", "1.98", "94.4"]
+    for name, *values in rows:
+        assert len(header) == 7
+        assert values == ["0.51" if name == "all, tracking" else "0.46", "2.34", "91.2", "98.8", "1.98", "94.4"]
 
 
 def test_the_shipped_curve_shows_tracking_beside_whole_frames(shipped):
@@ -137,13 +137,22 @@ def test_the_recorded_speeds_stand_side_by_side_in_each_engine():
         assert {"coarse to fine", "the same while tracking", "paper's network"} <= set(networks)
 
 
+def test_recorded_rungs_have_a_bar_for_each_with_labels():
+    scored = {"pck_0.05_percent": 40.0, "pck_0.2_percent": 70.0, "sure_and_wrong_percent": 3.0}
+    table = Table([scored | {"rung": "near"}, scored | {"rung": "all_far", "pck_0.2_percent": 60.0}, {"rung": "noise"}])
+    found, wrong = shift.recorded_bars(table).axes
+    assert [label.get_text() for label in found.get_yticklabels()] == ["near", "all far"]
+    assert [bar.get_width() for bar in found.patches] == [40.0, 40.0, 70.0, 60.0]
+    assert [bar.get_width() for bar in wrong.patches] == [3.0, 3.0]
+
+
 def test_real_curves_have_a_panel_for_each_kind_of_test():
     thresholds = np.linspace(0.05, 0.5, 10)
     names = []
     for i in (1, 2):
         tests = ("first half to second", f"first half to seq{3 - i}", "simulated frames only")
         names += [f"seq{i}: {how}" for how in tests]
-    figure = plots.real_curves(thresholds, {name: np.linspace(i, 90 + i, 10) for i, name in enumerate(names)})
+    figure = shift.real_curves(thresholds, {name: np.linspace(i, 90 + i, 10) for i, name in enumerate(names)})
     panels = {ax.get_title(loc="left"): [t.get_text() for t in ax.get_legend().get_texts()] for ax in figure.axes}
     assert panels == {
         "first half to second": ["seq1", "seq2"],
@@ -154,9 +163,9 @@ def test_real_curves_have_a_panel_for_each_kind_of_test():
 
 def test_how_far_a_curve_is_in_words():
     thresholds = [0.1, 0.2, 0.3]
-    assert plots.half_within(thresholds, [30, 70, 90]) == "half within 15 % of the tool's length"
-    assert plots.half_within(thresholds, [60, 70, 90]) == "half within less than 10 % of the tool's length"
-    assert plots.half_within(thresholds, [1, 2, 3]) == "not even half within 30 % of the tool's length"
+    assert shift.half_within(thresholds, [30, 70, 90]) == "half within 15 % of the tool's length"
+    assert shift.half_within(thresholds, [60, 70, 90]) == "half within less than 10 % of the tool's length"
+    assert shift.half_within(thresholds, [1, 2, 3]) == "not even half within 30 % of the tool's length"
 
 
 def test_timing_stands_beside_the_papers():

@@ -1,0 +1,97 @@
+"""Figures of notebook 02 about shift: frames unlike those of the training, and real ones."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from lib.training.evaluation import Evaluation
+from lib.workbench.results import Table
+from notebooks.figures.landmarks import landmark_dots
+from notebooks.figures.style import COLOURS, figure, show_image
+
+__all__ = ["half_within", "real_curves", "recorded_bars", "rung_page"]
+
+
+def rung_page(
+    evaluation: Evaluation, images: Sequence[np.ndarray], order: Sequence[int] | None = None, *, columns: int = 6
+) -> Figure:
+    """Images round their tools, the largest error first or in the `order` given: circles are detections, crosses labels.
+
+    A title has the largest error in per cent of the tool's length, and the lowest confidence; red: sure and wrong.
+    """
+    order = evaluation.worst(len(images)) if order is None else order
+    rows = -(-len(order) // columns)
+    fig, axes = figure(rows, columns, width_in=12, height_in=(12 / columns + 0.35) * rows, squeeze=False)
+    for ax in axes.flat:
+        ax.set_axis_off()
+    for ax, i in zip(axes.flat, order, strict=False):
+        image, found, truth = images[i], evaluation.landmarks.u[i], evaluation.u_true[i]
+        error, confidence = evaluation.error_px[i] / evaluation.length_px[i], evaluation.landmarks.confidence[i]
+        known = ~np.isnan(error)
+        worst = "no label in view" if not known.any() else "missed" if np.isinf(error[known]).any() else None
+        worst = worst or f"{100 * error[known].max():.0f} % off"
+        show_image(ax, image)
+        landmark_dots(ax, found, size=60)
+        ax.scatter(*truth.T, marker="+", s=70, c="white", linewidths=1.4)
+        wrong = known & (confidence >= 0.9) & (error > 0.2)
+        ax.set_title(f"{evaluation.names[i]}\n{worst}, confidence {confidence.min():.2f}", fontsize=8)
+        ax.title.set_color(COLOURS["paper"] if wrong.any() else "black")
+        u = truth[np.isfinite(truth).all(axis=1)]
+        if len(u):
+            middle, reach = (u.min(axis=0) + u.max(axis=0)) / 2, 1.3 * max(evaluation.length_px[i], 20)
+            ax.set(xlim=(middle[0] - reach, middle[0] + reach), ylim=(middle[1] + reach, middle[1] - reach))
+    return fig
+
+
+def recorded_bars(table: Table) -> Figure:
+    """PCK of each rung of `notebooks/studies/rungs`, and what is sure and wrong; far and real families apart from near."""
+    rows = [row for row in table.rows if np.isfinite(row.get("pck_0.2_percent", np.nan))]
+    fig, (a, b) = figure(1, 2, width_in=11, height_in=0.3 * len(rows) + 1.2, sharey=True, width_ratios=(2, 1))
+    y = np.arange(len(rows))
+    for key, shift, colour, label in (("pck_0.05", -0.2, "ours", "PCK@0.05"), ("pck_0.2", 0.2, "right", "PCK@0.2")):
+        a.barh(y + shift, [row[f"{key}_percent"] for row in rows], 0.36, color=COLOURS[colour], label=label)
+    b.barh(y, [row["sure_and_wrong_percent"] for row in rows], 0.5, color=COLOURS["paper"])
+    a.set_yticks(y, [row["rung"].replace("_", " ") for row in rows])
+    a.invert_yaxis()
+    a.set(xlabel="%", xlim=(0, 101), title="Found")
+    b.set(xlabel="% of the sure ones", title="Sure and wrong")
+    a.legend(loc="lower left", bbox_to_anchor=(0, 1.06), ncols=2)
+    return fig
+
+
+def real_curves(thresholds: Sequence[float], curves: Mapping[str, Sequence[float]]) -> Figure:
+    """PCK on real frames, a panel a kind of test; names are "sequence: what was trained on and tested on"."""
+    panels: dict[str, dict[str, Sequence[float]]] = {}
+    for name, curve in curves.items():
+        sequence, how = name.split(": ", 1)
+        kind = "another sequence" if how.startswith("first half to ") and how != "first half to second" else how
+        label = f"{sequence} to {how.removeprefix('first half to ')}" if kind == "another sequence" else sequence
+        panels.setdefault(kind, {})[label] = curve
+    fig, axes = figure(1, max(1, len(panels)), width_in=11, height_in=3.5, sharey=True, squeeze=False)
+    for ax, (kind, rows) in zip(axes.flat, panels.items(), strict=False):
+        for (name, curve), colour in zip(
+            rows.items(), (COLOURS["ours"], COLOURS["paper"], COLOURS["truth"]), strict=False
+        ):
+            ax.plot(thresholds, curve, "o-", color=colour, ms=4, label=name)
+        ax.axvline(0.2, color=COLOURS["baseline"], lw=1)
+        ax.set(xlim=(0.05, 0.5), ylim=(0, 101), xlabel="threshold, part of the tool's length", title=kind)
+        ax.set_xticks([0.1, 0.2, 0.3, 0.4, 0.5])
+        ax.legend(loc="best")
+    axes.flat[0].set_ylabel("PCK, %")
+    return fig
+
+
+def half_within(thresholds: Sequence[float], curve: Sequence[float]) -> str:
+    """A PCK curve in words: the fraction of the tool's length within which half of all landmarks lie."""
+    curve = np.asarray(curve, dtype=float)
+    reached = np.flatnonzero(curve >= 50)
+    if not len(reached):
+        return f"not even half within {100 * thresholds[-1]:.0f} % of the tool's length"
+    end = reached[0]
+    if end == 0:
+        return f"half within less than {100 * thresholds[0]:.0f} % of the tool's length"
+    at = np.interp(50, curve[end - 1 : end + 1], thresholds[end - 1 : end + 1])
+    return f"half within {100 * at:.0f} % of the tool's length"
