@@ -22,7 +22,8 @@ def rung_page(
 
     A title has the largest error in per cent of the tool's length, and the lowest confidence; red: sure and wrong.
     """
-    order = evaluation.worst(len(images)) if order is None else order
+    relative = np.nan_to_num(evaluation.error_px / evaluation.length_px[:, None], nan=-1.0, posinf=1e9).max(axis=1)
+    order = np.argsort(-relative, kind="stable") if order is None else order
     rows = -(-len(order) // columns)
     fig, axes = figure(rows, columns, width_in=12, height_in=(12 / columns + 0.35) * rows, squeeze=False)
     for ax in axes.flat:

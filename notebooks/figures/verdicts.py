@@ -73,8 +73,11 @@ def health_chart(found: Health) -> Figure:
     if "unfamiliar" in found.parts:
         ax.semilogy(found.frame, found.parts["unfamiliar"][:, 0], "s", ms=3, color="#e69f00", label="unfamiliar picture")
     ax.axhline(1.0, color="#b42318", lw=1)
-    ax.set(xlabel="frame", ylabel="score", title=f"Health of the detector: {found.text}")
-    ax.legend(loc="upper right", fontsize=8)
+    ax.set(xlabel="frame", ylabel="score", ylim=(0.9 * score.min(), max(2.0, 1.2 * score.max())))
+    ax.set_title(f"Health of the detector: {found.text}", fontsize=10)
+    ax.yaxis.set_major_formatter("{x:g}")
+    ax.yaxis.set_minor_formatter("")
+    ax.legend(loc="upper right", fontsize=8, ncols=2, bbox_to_anchor=(1, 1.02))
     return page
 
 
