@@ -26,7 +26,7 @@ def rung_page(
     order = np.argsort(-relative, kind="stable") if order is None else order
     rows = -(-len(order) // columns)
     fig, axes = figure(rows, columns, width_in=12, height_in=(12 / columns + 0.35) * rows, squeeze=False)
-    for ax in axes.flat:
+    for ax in axes.flat[len(order) :]:
         ax.set_axis_off()
     for ax, i in zip(axes.flat, order, strict=False):
         image, found, truth = images[i], evaluation.landmarks.u[i], evaluation.u_true[i]
