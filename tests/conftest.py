@@ -18,7 +18,7 @@ import lib.workbench  # noqa: F401 - before nbformat: it spares each process sec
 
 #: The files that take longest, from about 25 to 8 s of the processor: they go first, so that no worker begins one last.
 LONGEST = (
-    "adapt/test_adapt.py", "test_notebooks.py", "online/test_faults.py", "landmarks/test_shipped.py",
+    "adapt/test_adapt.py", "test_notebooks.py", "online/test_faults.py", "landmarks/test_shipped.py", "test_readme.py",
     "test_notebooks_course.py", "landmarks/test_export.py", "online/test_pipeline.py", "training/test_loop.py",
     "simulator/test_dataset.py", "training/test_command.py", "workbench/test_sweep.py", "workbench/test_run.py",
     "studies/test_calibration.py", "training/test_error_models.py",
