@@ -32,7 +32,7 @@ def rung_page(
         image, found, truth = images[i], evaluation.landmarks.u[i], evaluation.u_true[i]
         error, confidence = evaluation.error_px[i] / evaluation.length_px[i], evaluation.landmarks.confidence[i]
         known = ~np.isnan(error)
-        worst = "no label in view" if not known.any() else "missed" if np.isinf(error[known]).any() else None
+        worst = "none in view" if not known.any() else "missed" if np.isinf(error[known]).any() else None
         worst = worst or f"{100 * error[known].max():.0f} % off"
         show_image(ax, image)
         landmark_dots(ax, found, size=60)
