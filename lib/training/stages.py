@@ -17,6 +17,7 @@ from lib.landmarks.network import HourglassConfig, OffsetConfig
 from lib.landmarks.windows import tool_pose
 from lib.provenance import commit_id, machine
 from lib.recordings import Recording
+from lib.simulator.population import VALIDATION_TEXTURE_SEEDS, sample
 from lib.training.augmentation import AUGMENTATIONS
 from lib.training.config import PRESETS, TrainingConfig
 from lib.training.error_models import fit_error_models
@@ -131,15 +132,19 @@ def assemble(
 ) -> Detector:
     """Join the stages of a training folder, fit their error models, write the weights file `out` and its card.
 
-    The error models are fitted on half of the held-out scenes, and on labelled `recordings`, if any; the card's numbers are
-    measured on the other half.  `notes` are lines for the card.  A missing stage or shard raises `FileNotFoundError`.
+    The error models are fitted on half of the held-out scenes, whose families are new, on half as many images of the
+    reference rig, and on labelled `recordings`, if any; the card's numbers are measured on the other half of the scenes.
+    `notes` are lines for the card.  A missing stage or shard raises `FileNotFoundError`.
     """
     out = Path(out)
     stages = {stage: load_training(Path(folder) / stage / "last.safetensors") for stage in STAGES}
     frames = list(validation_images(data))
     if not frames:
         raise FileNotFoundError(f"{data}: no shard held_out_*.npz; make some with `python3 -m lib train generate`.")
-    typical = []
+    rng = np.random.default_rng(len(frames))
+    near = {"population": "near", "textures": VALIDATION_TEXTURE_SEEDS}
+    typical = [LabelledImage(f"near {i}", *sample(rng, **near)) for i in range(len(frames) // 4)]
+    n_near = len(typical)
     for recording in map(Recording.open, recordings):  # 16 images of each, spread over it
         typical += labelled_images(recording, every=max(1, len(recording.frames) // 8))
     networks = {f"{stage}_network": training.network for stage, training in stages.items()}
@@ -154,7 +159,8 @@ def assemble(
         "machine": machine(),
         "stages": {name: {key: training.provenance.get(key) for key in keys} for name, training in stages.items()},
         "validation_frames": len(frames),
-        "recorded_frames": len(typical),
+        "near_frames": n_near,
+        "recorded_frames": len(typical) - n_near,
         "recordings": len(recordings),
         "notes": list(notes),
         "metrics": {
@@ -215,8 +221,8 @@ Notebook 02 explains the stages.
 
 Each training of a stage starts from the one before. The error models (covariance, confidence) are fitted on half of
 {p["validation_frames"]} held-out scenes, which have families of tools, light, ground and optics that training never draws and
-of which some show no tool, and on {p["recorded_frames"]} frames of {p["recordings"]} recordings. The numbers below are of the
-other half.
+of which some show no tool, on {p["near_frames"]} images of the reference rig, and on {p["recorded_frames"]} frames of
+{p["recordings"]} recordings. The numbers below are of the other half.
 
 | held-out frames | |
 |---|---|
