@@ -12,6 +12,7 @@ import numpy as np
 
 from lib.files import write_text
 from lib.landmarks import Detector
+from lib.landmarks.detector import CLOSE
 from lib.landmarks.metrics import tool_length_px
 from lib.landmarks.network import HourglassConfig, OffsetConfig
 from lib.landmarks.windows import tool_pose
@@ -132,8 +133,9 @@ def assemble(
 ) -> Detector:
     """Join the stages of a training folder, fit their error models, write the weights file `out` and its card.
 
-    The error models are fitted on half of the held-out scenes, whose families are new, on half as many images of the
-    reference rig, and on labelled `recordings`, if any; the card's numbers are measured on the other half of the scenes.
+    The error models are fitted on half of the held-out scenes, whose families are new, and on labelled `recordings`, if any;
+    those of the closeups also on half as many images of the reference rig, since their bias is not that of unfamiliar tools
+    alone.  The card's numbers are measured on the other half of the scenes.
     `notes` are lines for the card.  A missing stage or shard raises `FileNotFoundError`.
     """
     out = Path(out)
@@ -143,13 +145,15 @@ def assemble(
         raise FileNotFoundError(f"{data}: no shard held_out_*.npz; make some with `python3 -m lib train generate`.")
     rng = np.random.default_rng(len(frames))
     near = {"population": "near", "textures": VALIDATION_TEXTURE_SEEDS}
-    typical = [LabelledImage(f"near {i}", *sample(rng, **near)) for i in range(len(frames) // 4)]
-    n_near = len(typical)
+    near_by = [LabelledImage(f"near {i}", *sample(rng, **near)) for i in range(len(frames) // 4)]
+    typical = []
     for recording in map(Recording.open, recordings):  # 16 images of each, spread over it
         typical += labelled_images(recording, every=max(1, len(recording.frames) // 8))
     networks = {f"{stage}_network": training.network for stage, training in stages.items()}
     detector = Detector(**networks, frame_px=FRAME_PX[0], mirror=True)
     detector = fit_error_models(detector, frames[::2] + typical, progress=True)
+    with_near = fit_error_models(detector, frames[::2] + typical + near_by, progress=True).error_models
+    detector = detector.with_error_models(**{stage: with_near[stage] for stage in CLOSE})
     held_out = evaluate(detector, frames[1::2], progress=True)
     keys = ("data", "images", "commit", "steps", "seconds", "processes", "machine", "config", "metrics", "before")
     by_visibility = {k: {"labels": v.labels, "median_px": v.median_px} for k, v in held_out.by_visibility().items()}
@@ -159,8 +163,8 @@ def assemble(
         "machine": machine(),
         "stages": {name: {key: training.provenance.get(key) for key in keys} for name, training in stages.items()},
         "validation_frames": len(frames),
-        "near_frames": n_near,
-        "recorded_frames": len(typical) - n_near,
+        "near_frames": len(near_by),
+        "recorded_frames": len(typical),
         "recordings": len(recordings),
         "notes": list(notes),
         "metrics": {
@@ -221,8 +225,8 @@ Notebook 02 explains the stages.
 
 Each training of a stage starts from the one before. The error models (covariance, confidence) are fitted on half of
 {p["validation_frames"]} held-out scenes, which have families of tools, light, ground and optics that training never draws and
-of which some show no tool, on {p["near_frames"]} images of the reference rig, and on {p["recorded_frames"]} frames of
-{p["recordings"]} recordings. The numbers below are of the other half.
+of which some show no tool, and on {p["recorded_frames"]} frames of {p["recordings"]} recordings; those of the closeups also on
+{p["near_frames"]} images of the reference rig. The numbers below are of the other half.
 
 | held-out frames | |
 |---|---|
