@@ -114,7 +114,8 @@ def fit_surface(
     problem, solution, surface = solve(used, search if quick else exact)
     norm = np.abs(residuals(surface)).sum(axis=1)
     if reject_mm is None:
-        reject_mm = REJECT_MEDIANS * float(np.median(norm[used]))
+        # A very flexible surface meets most points exactly: what the solver leaves of them rejects nothing.
+        reject_mm = max(REJECT_MEDIANS * float(np.median(norm[used])), 1e-6)
     inliers = used & (np.nan_to_num(norm, nan=np.inf) <= reject_mm)
     if quick or (inliers != used).any():
         if inliers.sum() < least:

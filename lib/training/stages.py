@@ -225,8 +225,8 @@ Notebook 02 explains the stages.
 
 Each training of a stage starts from the one before. The error models (covariance, confidence) are fitted on half of
 {p["validation_frames"]} held-out scenes, which have families of tools, light, ground and optics that training never draws and
-of which some show no tool, and on {p["recorded_frames"]} frames of {p["recordings"]} recordings; those of the closeups also on
-{p["near_frames"]} images of the reference rig. The numbers below are of the other half.
+of which some show no tool, and on {p["recorded_frames"]} frames of {p["recordings"]} recordings; those of the closeups also
+on {p["near_frames"]} images of the reference rig. The numbers below are of the other half.
 
 | held-out frames | |
 |---|---|

@@ -235,3 +235,11 @@ def test_bad_input_is_named(bowl, change, named):
 def test_bad_spheres_are_named(x):
     with pytest.raises(ValueError, match="x_mm"):
         fit_sphere(x)
+
+
+def test_a_surface_that_meets_most_points_exactly_rejects_none_for_that():
+    rng = np.random.default_rng(0)
+    u = rng.uniform(0, 400, (125, 2))
+    x = np.column_stack([u / 100, rng.normal(0, 0.05, 125)])
+    surface = fit_surface(u, x, domain=(0, 0, 400, 400), smoothness=1e-8)
+    assert surface.fit.inliers.mean() > 0.9
