@@ -7,6 +7,7 @@ ROOT = Path(__file__).resolve().parent.parent
 NOTEBOOKS = ROOT / "notebooks"
 DATA = ROOT / "data"
 MODELS = DATA / "models"
+GALLERY = DATA / "gallery"
 RESULTS = DATA / "results"
 CACHE = DATA / "cache"
 RUNS = ROOT / "runs"

@@ -3,6 +3,7 @@
 import argparse
 import contextlib
 import datetime
+import json
 import os
 import shutil
 import signal
@@ -13,6 +14,7 @@ from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
+from PIL import Image
 from tqdm import tqdm
 
 from lib import files, paths
@@ -33,6 +35,8 @@ __all__ = ["main", "main_site", "run"]
 PROFILES = ("quick", "paper")
 #: Keeps room on the disk to write the last state of a run when the disk is full.
 _ROOM = ".room"
+#: The README's pictures.
+_GALLERY = "overview landmark_detection reconstruction_surface calibration_ellipsoids registration_errors_recorded".split()
 
 
 def main(argv: Sequence[str]) -> int:
@@ -78,11 +82,15 @@ def main_site(argv: Sequence[str]) -> int:
     )
     parser.add_argument("run", nargs="?", type=Path, metavar="RUN", help="its folder (default: the last complete one)")
     parser.add_argument("--out", type=Path, default=paths.ROOT / "site", metavar="FOLDER", help="a new folder")
+    parser.add_argument("--gallery", action="store_true", help="renew the README's pictures in data/gallery instead")
     options = parser.parse_args(argv)
     chosen = options.run or next((folder for folder, _ in reversed(headlines.complete_runs(paths.RUNS))), paths.RUNS)
     try:
         if not (chosen / "index.html").is_file():
             raise FileNotFoundError(f"{chosen}: no run with an index.html; `python3 -m lib run` makes one.")
+        if options.gallery:
+            renew_gallery(chosen)
+            return 0
         shutil.copytree(chosen, options.out)
         (options.out / ".nojekyll").touch()  # GitHub Pages then takes every file as it is
     except OSError as error:
@@ -90,6 +98,27 @@ def main_site(argv: Sequence[str]) -> int:
         return 2
     print(f"Site: {options.out / 'index.html'}")
     return 0
+
+
+def renew_gallery(run: Path) -> None:
+    """Take the README's pictures from a run's figures, and note the commit and the weights that made them.
+
+    Raises:
+        FileNotFoundError: If the run lacks one; then none is changed.
+    """
+    made_by, figures = json.loads((run / "metrics.json").read_text(encoding="utf-8")), run / "figures"
+    chosen = [next(iter(sorted(figures.glob(f"{name}.*"))), figures / name) for name in _GALLERY]
+    if lacking := [path.stem for path in chosen if not path.is_file()]:
+        raise FileNotFoundError(f"{figures}: no picture {', '.join(lacking)}; run all notebooks.")
+    for path in chosen:
+        if path.suffix == ".png":  # few colours, a fifth of the bytes
+            picture = Image.open(path).convert("RGB")
+            picture.thumbnail((1300, 1300))
+            picture.quantize(160).save(paths.GALLERY / path.name, optimize=True)
+        else:
+            shutil.copy(path, paths.GALLERY)
+    known = ("started", "commit", "machine", "weights")
+    files.write_json(paths.GALLERY / "made_by.json", {key: made_by[key] for key in known})
 
 
 def run(
@@ -181,6 +210,7 @@ class _Report:
             "seconds": 0.0,
             "commit": commit(),
             "machine": machine(),
+            "weights": files.digest(paths.MODELS / "default.safetensors"),
             "versions": execution.versions(),
             "notebooks": [
                 {"name": book.stem, "title": title_of(book), "state": "pending", "seconds": None, "failure": None,
