@@ -114,8 +114,8 @@ def test_a_notebook_that_stops_itself_is_complete_and_says_why(finished):
 def test_metrics_follow_the_schema(finished):
     content, _ = finished
     assert set(content) == {"format", "version", "state", "profile", "parameters", "started", "seconds", "commit",
-                            "machine", "versions", "verdict", "reasons", "notebooks", "metrics", "figures", "previous",
-                            "download"}  # fmt: skip
+                            "machine", "weights", "versions", "verdict", "reasons", "notebooks", "metrics", "figures",
+                            "previous", "download"}  # fmt: skip
     assert content["format"] == "microstereo.metrics" and content["parameters"] == {"seed": "3"}
     assert content["metrics"][0] == {
         "notebook": "03_good", "name": "calibration_reprojection_px", "value": 4.5, "unit": "px", "paper": 2.0,
