@@ -19,8 +19,8 @@ python3 -m lib COMMAND [options]        (in the folder of the workbench)
 
   run [NOTEBOOK ...] [--profile quick|paper] [-p NAME VALUE]
               work through the notebooks; the report appears in runs/<date>-<profile>/index.html
-  site [RUN] [--out FOLDER]
-              a static site of a run (default: the last complete one), such as for GitHub Pages
+  site [RUN] [--out FOLDER | --gallery]
+              a static site of a run (default: the last complete one), such as for GitHub Pages, or the README's pictures
   test [...]  style and tests; what follows goes to pytest
   lab  [...]  open the notebooks in JupyterLab
   bench [...] benchmarks; what follows goes to pytest

@@ -56,7 +56,8 @@ CLOSE = ("closeup", "closer", "tracking")
 #: Where the first stage is less sure than this of a landmark, other places are looked at: this many tools, made of peaks at
 #: these scales of the first stage's input.
 _SURE, _CANDIDATES, _SCALES = 0.5, 5, (1.0, 1.5)
-#: A tracked landmark that moved farther, in closeups of scale 1, is looked at twice: nearer, one closeup measures as well.
+#: A tracked landmark that moved farther than this, in closeups of scale 1, gets a second closeup.  After a shorter way one
+#: closeup is as exact, as validation images of other eyes and tools say.
 _SECOND_LOOK_PX = 4.0
 #: Stages that use another stage's network.
 _NETWORK_OF = {"again": "tool", "closer": "closeup", "tracking": "closeup"}
@@ -282,8 +283,7 @@ class Detector:
                 found = self.refine(part, near, stage)
                 if stage == "tracking" and _moved_px(near.u, found.u) > _SECOND_LOOK_PX:
                     found = self.refine(part, found, stage)
-                near = found
-                result._put(usable, near)
+                result._put(usable, found)
         lost = np.flatnonzero((result.confidence < min_confidence).any(1))
         if lost.size:
             result._put(lost, self(images[lost]))

@@ -35,7 +35,8 @@ _DEPTH_MARGIN_MM = 0.5  # how far an eye may move along the view from one surfac
 class Detector(Protocol):
     """`lib.landmarks.Detector`, or anything alike: `.u` (n, 3, 2), `.covariance`, `.confidence` of n images.
 
-    If it has a method `track(images, previous)`, frames after the first are given to that.
+    If it has a method `track(images, previous)`, frames after the first are given to that.  The memory of the images holds
+    the next frame later: a detector that keeps them needs a copy.
     """
 
     def __call__(self, images: np.ndarray) -> Any: ...
@@ -204,7 +205,7 @@ class OnlinePipeline:
         return Seen(data, lambda rig: data)
 
     def _where_to_search(self) -> dict[str, Any]:
-        """Near the last surface; in every tenth frame, for a new rig, and where few points were found, everywhere."""
+        """Where to match: near the last surface, but everywhere in every tenth frame, for a new rig, or after few points."""
         last, self._asked = self._surface, self._asked + 1
         known = last is not None and last.index >= self._rig_since
         if not known or self._asked % 10 == 0 or len(last.reconstruction.u) < 0.6 * self._most_points:

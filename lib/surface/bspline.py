@@ -17,11 +17,6 @@ from lib.surface.solver import UNHELD, L1Problem, cholesky
 
 __all__ = ["BSplineSurface", "SurfaceFit", "ToolDistance"]
 
-#: Coefficients [order, power, j] of the four basis functions of a span, and of their derivatives.
-_POWERS = np.zeros((3, 4, 4))
-_POWERS[0] = np.array([[1, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]]) / 6
-_POWERS[1, :3] = _POWERS[0, 1:] * np.array([[1], [2], [3]])
-_POWERS[2, :2] = _POWERS[1, 1:3] * np.array([[1], [2]])
 _FEW = 256  # points: a sparse matrix costs more than it saves
 
 
@@ -183,10 +178,9 @@ class BSplineSurface:
     def _jet(self, u: np.ndarray) -> np.ndarray:
         """Values and derivatives [q, p, n, 3] mm per px^(p+q), p along x and q along y up to 2, at few points inside."""
         (cell, t), k = self.grid.locate(u), np.arange(4)
-        scale = self.grid.cell_px ** -np.arange(3.0)[:, None]
-        along = np.einsum("okj,nak->aonj", _POWERS, t[..., None] ** k) * scale.T[:, :, None, None]
+        basis = np.stack([cubic_basis(t, order) / self.grid.cell_px[:, None] ** order for order in range(3)])
         near = self.control_points_mm[cell[:, 1, None, None] + k[:, None], cell[:, 0, None, None] + k]
-        return np.einsum("qnj,pnjk->qpnk", along[1], np.einsum("pni,njik->pnjk", along[0], near))
+        return np.einsum("qnj,pnjk->qpnk", basis[:, :, 1], np.einsum("pni,njik->pnjk", basis[:, :, 0], near))
 
     def on_grid(self, x_px: ArrayLike, y_px: ArrayLike) -> np.ndarray:
         """Points (len(y), len(x), 3) on the lattice of columns `x_px` and rows `y_px`: fast for whole images."""

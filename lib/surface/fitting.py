@@ -50,7 +50,7 @@ def fit_surface(
         control: (n_x, n_y) control points.
         smoothness: mu >= 0, px^2 / mm.  None chooses it by the mean L1 error of held-out points, whatever their order.
         reject_mm: Bound on the L1 norm of a point's residual.  None is `REJECT_MEDIANS` times the median L1 norm at the
-            first fit; infinity keeps all.
+            first fit, or as much as leaves points enough to fit; infinity keeps all.
         covariance_mm2: Covariance of the points, (3, 3) or (n, 3, 3).  Eq. (6) is then taken in whitened coordinates:
             along the principal axes of the mean covariance, each residual divided by its own standard deviation (and
             the whole multiplied by the mean, so that it stays in mm).  None is the paper's plain norm.

@@ -19,7 +19,7 @@ _STRIPS = 6  # of different shades across a part, which make it look round
 
 
 def drawn_ground(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """An image (h, w, 3) uint8 as a ground without a tool: what is left of it is its large patches, under textures at random.
+    """A ground without a tool, made of an image (h, w, 3) uint8: its large patches of colour, under random textures.
 
     >>> drawn_ground(np.full((90, 160, 3), 90, np.uint8), np.random.default_rng(0)).shape
     (90, 160, 3)

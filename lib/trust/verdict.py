@@ -218,5 +218,5 @@ def _geometry(c: Calibration) -> Iterator[tuple]:
     alone, both = (c.depth_sd_mm(corners, detection=detection).max() for detection in (False, True))
     sizes = " x ".join(f"{value:.1f}" for value in high - low)
     text = f"The tool covers {sizes} mm: the calibration itself leaves {1e3 * alone:.0f} um of depth open at its corners."
-    cure = "Move the tool through more depths and corners (`next_positions` in `notebooks/studies/positions.py`)."
+    cure = "Move the tool through more depths and corners; notebook 03 finds the positions that tell most."
     yield "coverage", float(alone / np.sqrt(max(both**2 - alone**2, 1e-12))), text, cure

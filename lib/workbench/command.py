@@ -35,8 +35,9 @@ __all__ = ["main", "main_site", "run"]
 PROFILES = ("quick", "paper")
 #: Keeps room on the disk to write the last state of a run when the disk is full.
 _ROOM = ".room"
-#: The README's pictures.
-_GALLERY = "overview landmark_detection reconstruction_surface calibration_ellipsoids registration_errors_recorded".split()
+#: Figures that the README shows.
+README_FIGURES = ("overview", "landmark_detection", "reconstruction_surface", "calibration_ellipsoids",
+                  "registration_errors_recorded")  # fmt: skip
 
 
 def main(argv: Sequence[str]) -> int:
@@ -101,22 +102,26 @@ def main_site(argv: Sequence[str]) -> int:
 
 
 def renew_gallery(run: Path) -> None:
-    """Take the README's pictures from a run's figures, and note the commit and the weights that made them.
+    """Take the README's pictures from the figures of a run of the shipped recording, and note what made them.
 
     Raises:
-        FileNotFoundError: If the run lacks one; then none is changed.
+        OSError: If the run lacks one or shows another recording; then none is changed.
     """
     made_by, figures = json.loads((run / "metrics.json").read_text(encoding="utf-8")), run / "figures"
-    chosen = [next(iter(sorted(figures.glob(f"{name}.*"))), figures / name) for name in _GALLERY]
+    chosen = [next(iter(sorted(figures.glob(f"{name}.*"))), figures / name) for name in README_FIGURES]
     if lacking := [path.stem for path in chosen if not path.is_file()]:
         raise FileNotFoundError(f"{figures}: no picture {', '.join(lacking)}; run all notebooks.")
+    if made_by["parameters"].get("recording") or "weights" not in made_by:
+        raise OSError(f"{run}: the README shows the recording that ships, by today's report; run all notebooks without -p.")
     for path in chosen:
-        if path.suffix == ".png":  # few colours, a fifth of the bytes
+        for old in paths.GALLERY.glob(f"{path.stem}.*"):
+            old.unlink()
+        if path.suffix == ".svg":
+            shutil.copy(path, paths.GALLERY)
+        else:  # a tenth of the PNG's bytes, all colours kept
             picture = Image.open(path).convert("RGB")
             picture.thumbnail((1300, 1300))
-            picture.quantize(160).save(paths.GALLERY / path.name, optimize=True)
-        else:
-            shutil.copy(path, paths.GALLERY)
+            picture.save(paths.GALLERY / f"{path.stem}.jpg", quality=88, subsampling=0)
     known = ("started", "commit", "machine", "weights")
     files.write_json(paths.GALLERY / "made_by.json", {key: made_by[key] for key in known})
 

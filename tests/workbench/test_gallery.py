@@ -15,7 +15,7 @@ def test_no_picture_of_the_readme_is_older_than_the_weights():
     made_by = json.loads((paths.GALLERY / "made_by.json").read_text(encoding="utf-8"))
     assert made_by["weights"] == files.digest(paths.MODELS / "default.safetensors"), "python3 -m lib site --gallery"
     shown = re.findall(r"data/gallery/(\w+)\.", (paths.ROOT / "README.md").read_text(encoding="utf-8"))
-    assert set(shown) == set(command._GALLERY)
+    assert set(shown) == set(command.README_FIGURES)
 
 
 def test_the_gallery_takes_a_runs_pictures_or_changes_nothing(tmp_path, monkeypatch, capsys):
@@ -23,20 +23,25 @@ def test_the_gallery_takes_a_runs_pictures_or_changes_nothing(tmp_path, monkeypa
     (run / "figures").mkdir(parents=True)
     gallery.mkdir()
     monkeypatch.setattr(paths, "GALLERY", gallery)
-    made_by = {"started": "today", "commit": None, "machine": {}, "weights": "abc", "more": 1}
+    made_by = {"started": "today", "commit": None, "machine": {}, "weights": "abc", "parameters": {}}
     files.write_json(run / "metrics.json", made_by)
     (run / "index.html").touch()
-    for name in command._GALLERY[1:]:
+    for name in command.README_FIGURES[1:]:
         cv2.imwrite(str(run / "figures" / f"{name}.png"), np.full((60, 2600, 3), 80, np.uint8))
     assert command.main_site([str(run), "--gallery"]) == 2
     assert "no picture overview" in capsys.readouterr().err and not list(gallery.iterdir())
     (run / "figures" / "overview.svg").write_text("<svg/>", encoding="utf-8")
+    (gallery / "overview.png").touch()
+    files.write_json(run / "metrics.json", made_by | {"parameters": {"recording": "mine"}})
+    assert command.main_site([str(run), "--gallery"]) == 2
+    assert "recording that ships" in capsys.readouterr().err and len(list(gallery.iterdir())) == 1
+    files.write_json(run / "metrics.json", made_by)
     assert command.main_site([str(run), "--gallery"]) == 0
-    assert cv2.imread(str(gallery / "landmark_detection.png")).shape == (30, 1300, 3)
-    assert (gallery / "overview.svg").is_file()
+    assert cv2.imread(str(gallery / "landmark_detection.jpg")).shape == (30, 1300, 3)
+    assert [path.name for path in gallery.glob("overview.*")] == ["overview.svg"]
     assert json.loads((gallery / "made_by.json").read_text(encoding="utf-8"))["weights"] == "abc"
 
 
-@pytest.mark.parametrize("name", command._GALLERY)
+@pytest.mark.parametrize("name", command.README_FIGURES)
 def test_every_picture_is_there_once(name):
     assert len(list(paths.GALLERY.glob(f"{name}.*"))) == 1
