@@ -30,16 +30,9 @@ class Finished:
 
 
 def run_jobs(
-    function: Callable[..., object],
-    jobs: Mapping[Path, tuple],
-    *,
-    workers: int | None = None,
-    scheduler: str | None = None,
-    title: str = "",
-    unit: str = "job",
-    steps: int = 0,
-    progress: bool = True,
-) -> Iterator[Finished]:
+    function: Callable[..., object], jobs: Mapping[Path, tuple], *, workers: int | None = None,
+    scheduler: str | None = None, title: str = "", unit: str = "job", steps: int = 0, progress: bool = True,
+) -> Iterator[Finished]:  # fmt: skip
     """Call ``function(path, *jobs[path])`` for every path that does not exist; yield each job as it finishes.
 
     A job whose worker process was killed is given to another worker, three times at most.  Closing the iterator drops
@@ -134,12 +127,10 @@ def _client(workers: int, scheduler: str | None):
             yield client
         return
     threads = max(1, cores() // workers)  # libraries read these when a worker, or its notebook's kernel, starts
-    limits = dict.fromkeys(
-        ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"), threads
-    )
+    libraries = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
     environment = dict(os.environ)
     settings = {
-        "distributed.nanny.pre-spawn-environ": limits,
+        "distributed.nanny.pre-spawn-environ": dict.fromkeys(libraries, threads),
         "distributed.worker.profile.enabled": False,
         "logging": {"distributed": "critical"},
     }

@@ -316,7 +316,7 @@ def _calibrated(recording: Recording, seen: Seen, from_labels: bool) -> tuple[Ca
 
 def _fault(recording: Recording, seen: Seen, calibration: Calibration, from_labels: bool) -> Hypothesis | None:
     """The robot's fault that explains what the images show, if there is one; cameras of no stereo microscope are refused."""
-    red = [r for r in judge(None, calibration).reasons if r.level == LEVELS[2] and r.name == "implausible_optics"]
+    red = [r for r in judge(None, calibration).reasons if r.level == LEVELS[2] and r.name in ("implausible_optics", "thin")]
     if red:
         raise RefusalError(f"cameras: {red[0].text} {red[0].cure}")
     length = np.nanmedian(tool_length_px(seen.u.reshape(-1, 3, 2)))

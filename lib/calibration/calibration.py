@@ -6,6 +6,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lib.calibration.checks import extents
 from lib.calibration.models import Fit, Model, precision
 from lib.cameras import AffineCamera, Camera, Points, Resection, StereoRig
 from lib.geometry import points
@@ -98,6 +99,11 @@ class Calibration:
     def usable(self) -> np.ndarray:
         """(n,) bool: the rows that could be used in at least one view; those that are no inliers are outliers."""
         return np.isfinite(self.residuals_px).any(axis=1)
+
+    @property
+    def extents_mm(self) -> np.ndarray:
+        """(3,) RMS extents of the inliers' positions, the largest first; the last is their thickness."""
+        return extents(self.x_mm[self.inliers])
 
     @property
     def reprojection_rms_px(self) -> float:

@@ -4,13 +4,14 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.special import chndtrix
 
 from lib.correspondences import Correspondences
 from lib.geometry import finite_points, points
 
 __all__ = [
-    "check_duplicates", "check_images", "check_order", "check_spread", "check_units", "eyes_exchanged", "seen_rows", "sides",
-    "stacked_rows",
+    "check_duplicates", "check_images", "check_order", "check_spread", "check_units", "extents", "eyes_exchanged",
+    "seen_rows", "sides", "stacked_rows",
 ]  # fmt: skip
 
 #: Zoom (px per mm) between a room camera and the resolution of light; what lies outside has the wrong unit.
@@ -49,9 +50,13 @@ def _names(cameras: int) -> list[str]:
 
 
 def check_spread(x: np.ndarray, sigma_x_mm: float = 0.0) -> None:
-    """Refuse coplanar or collinear points, but for a thickness of twice the robot's accuracy."""
-    extent = np.sqrt(np.maximum(np.linalg.eigvalsh(np.cov(x.T, bias=True))[::-1], 0.0))
-    least = max(1e-6 * extent[0], 2.0 * sigma_x_mm)
+    """Refuse points thinner than points that truly are twice as thick as the robot is accurate look in one draw of 1e9.
+
+    Few points may look thin by chance, so they pass and their covariance is large; `lib.trust` doubts what is thinner.
+    """
+    n, extent = len(x), extents(x)
+    chance = np.sqrt(chndtrix(1e-9, max(n - 3, 1), 4.0 * n) / n)  # the thickness has a non-central chi-square distribution
+    least = max(1e-6 * extent[0], chance * sigma_x_mm)
     if extent[0] <= least:
         raise ValueError(f"x_mm: the points hardly move (RMS {extent[0]:.3g} mm); move the tool through the volume.")
     for size, shape, cure in (
@@ -62,6 +67,11 @@ def check_spread(x: np.ndarray, sigma_x_mm: float = 0.0) -> None:
             raise ValueError(
                 f"x_mm: the points are {shape} (RMS {size:.3g} mm away, robot accuracy {sigma_x_mm:.3g} mm); {cure}."
             )
+
+
+def extents(x: np.ndarray) -> np.ndarray:
+    """(3,) RMS extents of points (n, 3) along their principal axes, the largest first; the last is their thickness."""
+    return np.sqrt(np.maximum(np.linalg.eigvalsh(np.cov(x.T, bias=True))[::-1], 0.0))
 
 
 def check_units(x: np.ndarray, y: np.ndarray) -> None:

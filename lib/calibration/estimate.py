@@ -218,7 +218,7 @@ def _calibrate(
     cameras = state.cameras(plan)
     rig = StereoRig(*cameras) if len(cameras) == 2 else None
     if checks and rig is not None:
-        spread = np.sqrt(np.linalg.eigvalsh(np.cov(x[inliers].T))[0])
+        spread = refuse.extents(x[inliers])[2]
         zoom = np.sqrt(np.abs(np.linalg.det(cameras[0].linear @ cameras[0].linear.T)) ** 0.5)
         refuse.check_order(rig.linear, np.hypot(sigma_u / zoom, sigma_x) / (spread * np.sqrt(views.sum(axis=0).min() / 2)))
     return Calibration(

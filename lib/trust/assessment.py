@@ -85,7 +85,6 @@ def report(
     rows, used, usable = len(c.inliers), int(c.inliers.sum()), int(c.usable.sum())
     value, freedom = c.chi_square
     left_out = "" if usable == rows else f", {rows - usable} without a detection, position or axes"
-    extent = np.sqrt(np.maximum(np.linalg.eigvalsh(np.cov(c.x_mm[c.inliers].T))[::-1], 0.0))
     lines = [
         str(verdict),
         f"Calibration: model {c.model}, weighting {c.weighting}, {len(c.parameter_names)} parameters",
@@ -95,7 +94,7 @@ def report(
         f"  noise         sigma_u {c.sigma_u_px:.2f} px, sigma_x {1e3 * c.sigma_x_mm:.1f} um",
         f"  reprojection  {c.reprojection_rms_px:.2f} px RMS, {c.press_rms_px:.2f} px cross-validated (leave one out)",
         f"  chi-square    {value:.0f} for {freedom} degrees of freedom",
-        f"  volume        {extent[0]:.2f} x {extent[1]:.2f} x {extent[2]:.2f} mm RMS",
+        "  volume        {:.2f} x {:.2f} x {:.2f} mm RMS".format(*c.extents_mm),
     ]
     for name, resection in zip(["left", "right"] if c.rig else ["camera"], c.resections(), strict=True):
         (zoom_x, skew), (_, zoom_y) = resection.K

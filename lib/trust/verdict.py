@@ -38,6 +38,8 @@ LIMITS: dict[str, tuple[float, float]] = {
     "mirrored": (0.5, np.inf),
     # Standard deviations of a landmark's depth that the calibration adds to the detector's, at the edge of its own volume.
     "coverage": (1.5, np.inf),
+    # RMS thickness of the tool's positions in standard deviations of the robot's: what is thinner may be its noise.
+    "thin": (4.0, 2.0),
     # Median epipolar distance of free matches, px, beyond three of its standard deviations: band matching fails from 6 px.
     "epipolar": (1.5, 4.0),
     # Share of the landmarks that contradict themselves, the other image or the robot.  10 % gross errors a view reach 0.2.
@@ -131,7 +133,7 @@ def judge(
         found.append(Reason(name, LEVELS[2], f"There is no calibration: {error}", f"{_OVERLAYS}."))
     else:
         robot_mm = 0.01 if robot_accuracy_mm is None else robot_accuracy_mm
-        for finding in (*_residuals(data, calibration, robot_mm), *_geometry(calibration)):
+        for finding in (*_residuals(data, calibration, robot_mm), *_geometry(calibration, robot_mm)):
             found += _reason(*finding)
         if epipolar_px is not None and np.isfinite(epipolar_px):
             n, middle = calibration.pair.epipolar_normal, calibration.x_mm[calibration.inliers].mean(axis=0)
@@ -190,7 +192,7 @@ def _residuals(data: Correspondences | None, c: Calibration, robot_mm: float) ->
         yield "frames", frames + 1e-9, text, cure, "few_frames"
 
 
-def _geometry(c: Calibration) -> Iterator[tuple]:
+def _geometry(c: Calibration, robot_mm: float) -> Iterator[tuple]:
     """What `_reason` takes: the optics that follow from the cameras, and the volume that the tool covered."""
     zooms, name = np.array([np.diag(resection.K) for resection in c.resections()]), "implausible_optics"
     cure = "Check axes and units of the kinematics, the order of the tips, and which image is left."
@@ -212,6 +214,8 @@ def _geometry(c: Calibration) -> Iterator[tuple]:
     yield "mirrored", mirrored in ("left", "right", "left or right"), text, cure
 
     x = c.x_mm[c.inliers]
+    text = f"The tool's positions lie {c.extents_mm[2]:.3f} mm (RMS) out of one plane; the robot errs by {robot_mm:.3f} mm."
+    yield "thin", c.extents_mm[2] / robot_mm, text, "Move the tool along the view as well, and record more frames."
     along = np.linalg.svd(x - x.mean(axis=0))[2]
     low, high = np.percentile((x - x.mean(axis=0)) @ along.T, [5, 95], axis=0)
     corners = x.mean(axis=0) + np.stack(np.meshgrid(*np.stack([low, high]).T), axis=-1).reshape(-1, 3) @ along

@@ -127,14 +127,9 @@ def renew_gallery(run: Path) -> None:
 
 
 def run(
-    names: Sequence[str] = (),
-    profile: str = "quick",
-    pairs: Sequence[tuple[str, str]] = (),
-    *,
-    cell_timeout_s: float | None = None,
-    runs: Path = paths.RUNS,
-    notebooks: Path = paths.NOTEBOOKS,
-) -> dict:
+    names: Sequence[str] = (), profile: str = "quick", pairs: Sequence[tuple[str, str]] = (), *,
+    cell_timeout_s: float | None = None, runs: Path = paths.RUNS, notebooks: Path = paths.NOTEBOOKS,
+) -> dict:  # fmt: skip
     """Execute notebooks into a new folder of `runs`; the others still run when one fails.
 
     Everything is written at once, so that a run that is killed leaves a readable report of what it had reached.
@@ -161,9 +156,8 @@ def run(
                 report.begin(book)
                 with tqdm(desc=label, unit="cell", leave=False, disable=not live) as bar:
                     on_cell = partial(_advance, bar)
-                    failure = execute(
-                        book, report.executed(book), values[book], cell_timeout_s=cell_timeout_s, on_cell=on_cell
-                    )
+                    executed, limit = report.executed(book), cell_timeout_s
+                    failure = execute(book, executed, values[book], cell_timeout_s=limit, on_cell=on_cell)
                 seconds = time.monotonic() - start
                 report.end(book, failure, seconds)
                 print(f"{label}  {seconds:6.1f} s  {'failed' if failure else 'done'}", flush=True)
@@ -286,9 +280,8 @@ class _Report:
         if any(other["file"] == file for other in self.content["figures"]):
             file = f"figures/{book.stem}.{figure.name}{figure.suffix}"
         files.write_bytes(self.folder / file, figure.data)
-        self.content["figures"].append(
-            {"notebook": book.stem, "name": figure.name, "file": file, "caption": figure.caption}
-        )
+        entry = {"notebook": book.stem, "name": figure.name, "file": file, "caption": figure.caption}
+        self.content["figures"].append(entry)
 
     def _write_page(self, book: Path, entry: dict) -> None:
         pages_of = [None, *((f"{other['name']}.html", other["title"]) for other in self.content["notebooks"]), None]

@@ -50,13 +50,9 @@ def kernel_environment() -> None:
 
 
 def execute(
-    notebook: Path,
-    output: Path,
-    parameters: dict,
-    *,
-    cell_timeout_s: float | None = None,
+    notebook: Path, output: Path, parameters: dict, *, cell_timeout_s: float | None = None,
     on_cell: Callable[[int, int], None] = lambda cell, n_cells: None,
-) -> Failure | None:
+) -> Failure | None:  # fmt: skip
     """Execute `notebook` into `output` (written after each cell); None if every cell came to its end.
 
     Args:
@@ -77,16 +73,12 @@ def execute(
     logging.getLogger("papermill").setLevel(logging.CRITICAL)  # what it says is told by the failure returned
     try:
         papermill.execute_notebook(
-            str(notebook),
-            str(output),
-            parameters,
-            kernel_name="python3",
-            progress_bar=False,
+            str(notebook), str(output), parameters, kernel_name="python3", progress_bar=False,
             execution_timeout=cell_timeout_s,
             start_timeout=600,  # of the kernel: a busy machine takes its time
             on_cell_start=on_cell_start,  # this and the next are for nbclient
             extra_arguments=["--IPKernelApp.log_level=50"],  # its warning of unencrypted TCP on every start
-        )
+        )  # fmt: skip
     except PapermillExecutionError:
         pass  # told by the outputs, below
     except CellTimeoutError:
@@ -113,7 +105,8 @@ def failure_of(executed: Path, cell_timeout_s: float | None = None) -> Failure |
                 continue
             if output.ename == "SystemExit" and not output.evalue:
                 return None  # `report.stop`
-            if output.ename == "KeyboardInterrupt" and cell_timeout_s and _seconds(status) >= cell_timeout_s:
+            seconds = float(status.get("duration") or 0.0)
+            if output.ename == "KeyboardInterrupt" and cell_timeout_s and seconds >= cell_timeout_s:
                 return Failure("timeout", number, _longer_than(cell_timeout_s))
             return Failure("error", number, f"{output.ename}: {_ANSI.sub('', output.evalue)}")
         if cell.source.strip() and status.get("status") not in (None, "completed"):
@@ -124,10 +117,6 @@ def failure_of(executed: Path, cell_timeout_s: float | None = None) -> Failure |
 def _is_added(cell) -> bool:
     """papermill's own cells (values given, error marks), which the author does not count."""
     return bool(_ADDED & set(cell.metadata.get("tags", [])))
-
-
-def _seconds(status: dict) -> float:
-    return float(status.get("duration") or 0.0)
 
 
 def _longer_than(seconds: float | None) -> str:

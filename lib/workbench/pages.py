@@ -89,12 +89,9 @@ def markdown_html(source: str, *, folder: Path = Path(), attachments: dict | Non
     HTML in text that is not `trusted`, such as a caption that names a recording, is escaped.
     """
     renderer = _Renderer(
-        escape=not trusted,
-        allow_harmful_protocols=trusted,
-        embed_images=True,
-        path=str(folder),
+        escape=not trusted, allow_harmful_protocols=trusted, embed_images=True, path=str(folder),
         attachments=attachments or {},
-    )
+    )  # fmt: skip
     return MarkdownWithMath(renderer=renderer).render(source)
 
 
@@ -124,15 +121,9 @@ def page(
     exporter.config.NbConvertBase.display_data_priority = _RICHEST_FIRST
     body, _ = exporter.from_notebook_node(nbformat.read(executed, as_version=4))
     return rendered(
-        "page.html",
-        title=title,
-        body=body,
-        contents=_HEADING.findall(body),
-        content=verdict,
-        previous=previous,
-        following=following,
-        plotly_file=PLOTLY_FILE if 'class="plotly-view"' in body else None,
-    )
+        "page.html", title=title, body=body, contents=_HEADING.findall(body), content=verdict, previous=previous,
+        following=following, plotly_file=PLOTLY_FILE if 'class="plotly-view"' in body else None,
+    )  # fmt: skip
 
 
 def index_html(run: dict) -> str:
@@ -143,14 +134,7 @@ def index_html(run: dict) -> str:
     """
     rows, left_out = headlines(run)
     return rendered(
-        "index.html",
-        run=run,
-        headlines=rows,
-        left_out=left_out,
-        shipped=paths.shown(paths.SHIPPED_RECORDING),
-        books={book["name"]: book for book in run["notebooks"]},
-        is_recorded=is_recorded,
-        reason=lambda failure: str(Failure(**failure)),
-        with_unit=with_unit,
-        markdown=markdown_html,
-    )
+        "index.html", run=run, headlines=rows, left_out=left_out, shipped=paths.shown(paths.SHIPPED_RECORDING),
+        books={book["name"]: book for book in run["notebooks"]}, is_recorded=is_recorded, with_unit=with_unit,
+        reason=lambda failure: str(Failure(**failure)), markdown=markdown_html,
+    )  # fmt: skip

@@ -58,15 +58,11 @@ def main(argv: Sequence[str]) -> int:
     if options.workers is not None and options.workers < 1:
         parser.error("--workers: at least 1.")
     try:
+        grid = {name: split_values(values) for name, values in options.pairs}
         table, failures = sweep(
-            options.notebook,
-            {name: split_values(values) for name, values in options.pairs},
-            workers=options.workers,
-            scheduler=options.scheduler,
-            record=options.record,
-            cell_timeout_s=options.cell_timeout,
-            runs=options.runs,
-        )
+            options.notebook, grid, workers=options.workers, scheduler=options.scheduler, record=options.record,
+            cell_timeout_s=options.cell_timeout, runs=options.runs,
+        )  # fmt: skip
     except (UsageError, OSError) as error:
         print(f"python3 -m lib sweep: {error}", file=sys.stderr)
         return 2
@@ -80,17 +76,10 @@ def main(argv: Sequence[str]) -> int:
 
 
 def sweep(
-    name: str,
-    grid: dict[str, list[str]] | None = None,
-    *,
-    workers: int | None = None,
-    scheduler: str | None = None,
-    record: bool = False,
-    cell_timeout_s: float | None = None,
-    runs: Path = paths.RUNS,
-    notebooks: Path = paths.NOTEBOOKS,
-    recorded: Path = paths.RESULTS,
-) -> tuple[Path, dict[str, str]]:
+    name: str, grid: dict[str, list[str]] | None = None, *, workers: int | None = None, scheduler: str | None = None,
+    record: bool = False, cell_timeout_s: float | None = None, runs: Path = paths.RUNS,
+    notebooks: Path = paths.NOTEBOOKS, recorded: Path = paths.RESULTS,
+) -> tuple[Path, dict[str, str]]:  # fmt: skip
     """Execute a notebook at every point of a grid on a Dask cluster.
 
     Runs that an earlier sweep with the same notebook and the same code finished are kept; failed ones run again.
@@ -111,10 +100,8 @@ def sweep(
     if len(chosen) != 1 or not all(grid.values()):
         raise UsageError("a sweep takes one notebook, and values for each parameter: -p NAME VALUE,VALUE,...")
     book = chosen[0]
-    points = [
-        parse_parameters(list(zip(grid, values, strict=True)), [book])[book]
-        for values in itertools.product(*grid.values())
-    ]
+    in_grid = [list(zip(grid, values, strict=True)) for values in itertools.product(*grid.values())]
+    points = [parse_parameters(pairs, [book])[book] for pairs in in_grid]
     profile = {"profile": "quick"} if "profile" in declared_parameters(book) else {}
     folder = runs.resolve() / "sweeps" / f"{book.stem}-{_code_digest(book)}"
     folder.mkdir(parents=True, exist_ok=True)

@@ -13,6 +13,7 @@ from lib.calibration import (
     paper_variances,
 )
 from lib.calibration.affine import estimate_noise
+from lib.calibration.checks import check_spread, extents
 from lib.correspondences import Correspondences
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
 from notebooks.studies.camera_models import compare_models
@@ -337,6 +338,24 @@ def test_few_clean_rows_are_never_refused_nor_dropped(n):
     for seed in range(12):
         c = data(n, 1000 * n + seed)
         assert calibrate(c.x_mm, [c.u_left, c.u_right], seed=seed).view_inliers.all()
+
+
+def test_few_clean_rows_are_not_taken_for_a_plane():
+    rng, thinnest = np.random.default_rng(0), np.inf
+    for _ in range(2000):
+        x = rng.uniform(-1, 1, (6, 3)) * rng.uniform([2, 1, 0.2], [8, 4.5, 2.0]) + rng.normal(0, 0.01, (6, 3))
+        check_spread(x, 0.01)
+        thinnest = min(thinnest, extents(x)[2])
+    assert thinnest < 0.02  # what the noise of the robot leaves of many rows
+
+
+@pytest.mark.parametrize("n", [25, 100, 1000])
+def test_a_plane_and_the_noise_of_the_robot_are_refused_where_rows_are_many(n):
+    rng = np.random.default_rng(n)
+    plane = rng.uniform(-4, 4, (n, 3)) * [1, 1, 0]
+    with pytest.raises(ValueError, match="coplanar"):
+        check_spread(plane + rng.normal(0, 0.01, (n, 3)), 0.01)
+    check_spread(plane + rng.normal(0, 0.03, (n, 3)), 0.01)
 
 
 @pytest.mark.parametrize(("n", "wrong"), [(8, 1), (10, 2), (16, 4), (24, 6)])

@@ -49,6 +49,21 @@ def test_clean_data_of_any_size_are_never_red(n):
     assert LEVELS[2] not in levels and (n < 12 or not levels)
 
 
+@pytest.mark.parametrize("half_depth_mm", [0.0, 0.01, 0.03])
+def test_few_clean_rows_in_a_plane_are_calibrated_and_never_trusted(half_depth_mm):
+    for seed in range(10):
+        data = made(6, seed, half_size_mm=(8.0, 4.5, half_depth_mm))
+        found = calibrate(data, image_size_px=(1920, 1080))
+        reasons = {reason.name: reason for reason in judge(data, found).reasons}
+        assert reasons["thin"].level == LEVELS[2 if found.extents_mm[2] < 0.02 else 1]
+        assert "out of one plane" in reasons["thin"].text and "along the view" in reasons["thin"].cure
+        test = simulate_correspondences(60, rng=np.random.default_rng(seed), sigma_u_px=0.0)
+        x = test.true_x_mm
+        error = found.pair.triangulate(*test.true_rig.project(x)).x_mm - x
+        own = found.point_covariance(x, detection=False)
+        assert (error**2).sum(axis=1).mean() < 16 * np.trace(own, axis1=1, axis2=2).mean()
+
+
 def test_residuals_beyond_the_claim_are_red():
     assert names(made(60, claim_px=0.2), robot_accuracy_mm=0.001)["residuals"] == LEVELS[2]
     assert names(made(60)) == {}
