@@ -21,7 +21,7 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from lib.cameras import AffineCamera, Camera, NearAffineCamera, radial_derivative
+from lib.cameras import AffineCamera, Camera, NearAffineCamera, normal_to, radial_derivative
 from lib.least_squares import minimise
 
 __all__ = ["Fit", "Model", "State", "fit", "precision"]
@@ -147,7 +147,7 @@ class State:
         for i in range(c):
             rows = slice(2 * i, 2 * i + 2)
             A, centre = self.A[i], self.centre[i]
-            normal = np.cross(A[0], A[1])
+            normal = normal_to(A)
             size = np.linalg.norm(normal)
             r_3 = normal / size
             depth = x @ r_3
@@ -259,8 +259,7 @@ def fit(
 
     def evaluate(state: State) -> tuple[float, tuple] | None:
         for A, rho in zip(state.A, state.rho, strict=True):
-            normal = np.cross(A[0], A[1])
-            if rho and (1.0 + rho * (x @ normal) / np.linalg.norm(normal)).min() <= 0.05:
+            if rho and (1.0 + rho * (x @ (normal := normal_to(A))) / np.linalg.norm(normal)).min() <= 0.05:
                 return None  # a point lies behind the camera
         cost, *work = settle(state, x, y, noise, variance_x, views, model.is_affine)
         return (cost, work) if np.isfinite(cost) else None

@@ -7,15 +7,12 @@ H^-1 (J^T W R W J) H^-1 (Liang and Zeger, "Longitudinal data analysis using gene
 """
 
 import numpy as np
-from scipy.linalg import solve_triangular
 from scipy.special import chdtri, fdtri
 
 __all__ = ["sandwich"]
 
 _CORRELATIONS = np.array([0.0, 0.2, 0.4, 0.55, 0.7, 0.8, 0.88, 0.94, 0.97])
 _NONE = 0.5  # prior probability that the errors are independent
-_BLOCK = 48  # frames that are looked at together
-_MOST_BLOCKS = 4
 
 
 def sandwich(
@@ -71,30 +68,26 @@ def sandwich(
 
 def _posterior(K: np.ndarray, e: np.ndarray, groups: list[tuple], inverse: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Probability of each correlation, and the variance of the whitened residuals under it, 1 where they are independent."""
-    p, count, likelihood, variance = K.shape[2], 0, [], []
+    p, likelihood, variance = K.shape[2], [], []
     unit = np.linalg.cholesky(inverse)  # parameters in their own deviations
+    both = np.concatenate([K, e[:, :, None]], axis=2)
+    series = [(both[rows][:, view], np.diagonal(lag, 1)[:, None, None]) for rows, view, lag in groups]
+    count = sum(values[..., 0].size for values, _ in series)
     for correlation in _CORRELATIONS:
-        information, projected, square, log, count = np.zeros((p, p)), np.zeros(p), 0.0, 0.0, 0
-        for rows, view, lag in groups:
-            starts = np.arange(0, len(rows), _BLOCK)
-            for start in starts[:: max(1, len(starts) // _MOST_BLOCKS)]:
-                part = slice(start, start + _BLOCK)
-                L = np.linalg.cholesky(correlation ** lag[part, part] + 1e-9 * np.eye(len(rows[part])))
-                for i in (view.start, view.start + 1):
-                    white = solve_triangular(L, np.column_stack([K[rows[part], i], e[rows[part], i]]), lower=True)
-                    information += white[:, :p].T @ white[:, :p]
-                    projected += white[:, :p].T @ white[:, p]
-                    square += white[:, p] @ white[:, p]
-                    log += 2.0 * np.log(np.diag(L)).sum()
-                    count += len(L)
-        values, vectors = np.linalg.eigh(unit.T @ information @ unit)
+        squares, log = np.zeros((p + 1, p + 1)), 0.0
+        for values, gap in series:  # an autoregression is white where each value has the one before taken off
+            kept = correlation**gap
+            sd = np.sqrt(np.maximum(1.0 - kept**2, 1e-9))
+            white = np.concatenate([values[:1], (values[1:] - kept * values[:-1]) / sd]).reshape(-1, p + 1)
+            squares += white.T @ white
+            log += 4.0 * np.log(sd).sum()
+        values, vectors = np.linalg.eigh(unit.T @ squares[:p, :p] @ unit)
         values = np.maximum(values, 1e-12)
-        along = vectors.T @ (unit.T @ projected)
+        along = vectors.T @ (unit.T @ squares[:p, p])
         freedom = max(count - p, 1)
-        variance.append((square - (along**2 / values).sum()) / freedom)
+        variance.append((squares[p, p] - (along**2 / values).sum()) / freedom)
         likelihood.append(-0.5 * (log + np.log(values).sum() + freedom * np.log(max(variance[-1], 1e-300))))
     chance = np.full(len(_CORRELATIONS), (1.0 - _NONE) / (len(_CORRELATIONS) - 1))
     chance[0] = _NONE
     chance = chance * np.exp(np.array(likelihood) - max(likelihood))
     return chance / chance.sum(), np.array(variance) / max(variance[0], 1e-300)
-

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from lib.geometry import RigidTransform, points
 
-__all__ = ["AffineCamera", "Camera", "MatrixCamera", "Resection"]
+__all__ = ["AffineCamera", "Camera", "MatrixCamera", "Resection", "normal_to"]
 
 
 @dataclass(frozen=True)
@@ -79,8 +79,7 @@ class MatrixCamera:
     @cached_property
     def viewing_direction(self) -> np.ndarray:
         """Unit vector (3,) along which points share a pixel of `matrix`, away from the camera (unmirrored optics)."""
-        (a, b, c), (d, e, f) = self.linear.tolist()
-        direction = np.array([b * f - c * e, c * d - a * f, a * e - b * d])
+        direction = normal_to(self.linear)
         return direction / np.linalg.norm(direction)
 
     def moved(self, motion: RigidTransform) -> Self:
@@ -92,6 +91,12 @@ class MatrixCamera:
         """
         back = motion.inverse()
         return replace(self, matrix=np.column_stack([self.linear @ back.R, self.linear @ back.t + self.offset_px]))
+
+
+def normal_to(A: np.ndarray) -> np.ndarray:
+    """Cross product (3,) of the two rows of A (2, 3); numpy's own is far slower for single vectors."""
+    (a, b, c), (d, e, f) = A.tolist()
+    return np.array([b * f - c * e, c * d - a * f, a * e - b * d])
 
 
 class AffineCamera(MatrixCamera):
