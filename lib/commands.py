@@ -5,6 +5,7 @@ is "not trustworthy", so no file that follows from the calibration is written (-
 """
 
 import argparse
+import shlex
 from pathlib import Path
 
 import cv2
@@ -39,13 +40,14 @@ def main_import(argv: list[str]) -> int:
             raise FileExistsError(f"{a.map}: exists already; choose another name, or remove it.")
         text = guess_mapping(a.source)
         files.write_text(a.map, text)
-        print(f"{text}\nWrote {a.map}. Look at each line, then: python3 -m lib import SOURCE --map {a.map} --out RECORDING")
+        again = shlex.join(["python3", "-m", "lib", "import", str(a.source), "--map", str(a.map), "--out", "my_recording"])
+        print(f"{text}\nWrote {a.map}. Look at each line that says CHECK, then: {again}")
         return 0
     if a.out is None:
         parser.error("--out: name the recording to write.")
     print("\n".join(import_recording(a.source, a.map, a.out, overwrite=a.overwrite)["did"]))
     recording = Recording.open(a.out)
-    print(f"Wrote {a.out}. Next: python3 -m lib calibrate {a.out}")
+    print(f"Wrote {a.out}. Next: {shlex.join(['python3', '-m', 'lib', 'check', str(a.out)])}")
     if recording.annotations is not None:
         print(assess(recording, _labelled(recording)).verdict)
     return 0
@@ -169,7 +171,7 @@ def _calibrated(
     data = _data(a, recording, np.array([a.frame % len(recording)]) if given else None)
     if given:
         text = f"{a.rig} was not calibrated from this recording, and nothing here tests it."
-        cure = f"Run: python3 -m lib register {a.recording} --rig {a.rig}"
+        cure = f"Run: {shlex.join(['python3', '-m', 'lib', 'register', str(a.recording), '--rig', str(a.rig)])}"
         return StereoRig.load(a.rig), Verdict((Reason("rig_given", LEVELS[1], text, cure),)), data
     found = assess(recording, data)
     if found.calibration is not None and (a.force or not found.verdict.is_red):

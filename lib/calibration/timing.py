@@ -17,6 +17,9 @@ from lib.recordings import Kinematics
 __all__ = ["Paths", "TimeOffset", "estimate_time_offset", "shift_misfits"]
 
 _GRID = 41  # trial offsets of the coarse search
+#: Of landmarks that a detector sees with an error of the tool's own: how much deeper than the median trial each camera's
+#: misfit must be, and the largest residual, as a share of the pixels' extent.
+_CLEAR, _NEAR = 1.0, 0.03
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,16 +153,21 @@ def estimate_time_offset(
 
     low, high = start_s - search_s, start_s + search_s
     trial = np.linspace(low, high, _GRID)
-    misfit = shift_misfits(np.stack([at(offset) for offset in trial]), y).sum(axis=1)
+    misfits = shift_misfits(np.stack([at(offset) for offset in trial]), y)
+    clear = (np.median(misfits, axis=0) - misfits.min(axis=0) > _CLEAR).all() and np.ptp(misfits.argmin(axis=0)) <= 2
+    misfit = misfits.sum(axis=1)
     offset = float(trial[misfit.argmin()])
     for _ in range(2):
         try:
             views = consensus(at(offset), y, None, np.random.default_rng(0))[0]
         except NoConsensusError:
-            if trial[2] <= offset <= trial[-3]:
+            if trial[2] <= offset <= trial[-3] and not clear:
                 raise
-            offset = low if offset < start_s else high
-            break
+            if not clear:
+                offset = low if offset < start_s else high
+                break
+            far_px = _NEAR * float(np.nanstd(y, axis=0).max() * np.sqrt(12))
+            views = consensus(at(offset), y, far_px, np.random.default_rng(0))[0]
         used = np.repeat(views, 2, axis=1)
         misfit = np.array([rms(t) for t in trial])  # of right detections squares tell more than absolute values
         offset = float(trial[misfit.argmin()])

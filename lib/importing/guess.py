@@ -1,6 +1,6 @@
 """A first mapping from the files of a folder, with a comment at each line; CHECK marks what only a person can know.
 
-Units that no column's name states are taken for seconds and millimetres; the import refuses implausible ones.
+Units that no column's name states are those in which the log's steps and motion are plausible.
 """
 
 import json
@@ -9,6 +9,7 @@ from collections import Counter
 from pathlib import Path
 
 import av
+import numpy as np
 
 from lib.correspondences import LANDMARKS
 from lib.importing.labels import labels_of
@@ -18,7 +19,7 @@ from lib.recordings.tables import decoded
 
 __all__ = ["guess_mapping"]
 
-_TIME = re.compile(r"(?i)^(t|sec|secs)$|time|stamp|^t[_ \[(]")
+_TIME = re.compile(r"(?i)^(t|sec|secs|s|ms|us|ns)$|time|stamp|^t[_ \[(]")
 _AXIS = re.compile(r"(?i)^(.*?)[ _.\-]?([xyz])[ _]?[\[(]?(mm|um|m)?[\])]?$")
 _UNIT = re.compile(r"(?i)(?:^|[ _\[(])(ns|us|ms|s)[\])]?$")
 _LABELS = {".slp": ["sleap"], ".csv": ["deeplabcut"], ".json": ["coco", "label_studio"], ".zip": ["cvat"], ".xml": ["cvat"]}
@@ -32,9 +33,10 @@ _TELLS = {
     "video.file": "both views",
     "video.left": "CHECK: the left camera",
     "video.right": "the right camera",
-    "video.times": "container, names (the numbers in the files' names), table or fps",
+    "video.times": "CHECK: container (.avi has a rate alone), names (the numbers in the files' names), table or fps",
     "video.name_unit": "of the numbers in the files' names",
     "video.fps": "CHECK: frames a second",
+    "video.table": "the times of the frames",
     "video.exchanged": "true exchanges the two cameras",
     "robot.file": "the robot's log",
     "robot.separator": "between cells",
@@ -44,8 +46,10 @@ _TELLS = {
     "robot.length_unit": "CHECK: m, mm or um",
     "robot.landmarks": "CHECK: columns, or fields, of each landmark",
     "robot.pose": "CHECK: columns, or fields, of the tool's pose, and of the full angle between its jaws",
-    "robot.offset_s": "t_robot = t_video + offset_s: seconds, or estimate to find it",
+    "robot.offset_s": "t_robot = t_video + offset_s: seconds, or estimate to find it, which tool.estimate does not allow",
     "tool.estimate": "from labels; or give landmarks_mm, pivot_s, hinge",
+    "tool.landmarks_mm": "CHECK: the joint of the jaws in the frame of the tool's pose, measured on the tool or its drawing",
+    "tool.hinge": "CHECK: that joint, its axis, and the way from it to the closed tips; 0 is refused",
     "labels.kind": "coco, cvat, label_studio, deeplabcut or sleap",
     "labels.file": "both cameras",
     "labels.names": "CHECK: their name of each landmark",
@@ -65,10 +69,17 @@ def guess_mapping(source: str | Path) -> str:
         raise FileNotFoundError(f"{folder}: no such folder; SOURCE is the folder with your files.")
     paths = {p.relative_to(folder).as_posix(): p for p in sorted(folder.rglob("*")) if p.is_file()}
     labels = {n: p for n, p in paths.items() if p.suffix in set(_LABELS) - {".csv"} or p.stem.startswith("CollectedData")}
-    robot = _robot(folder, {name: path for name, path in paths.items() if name not in labels}) | {"offset_s": "estimate"}
+    tables = {n: p for n, p in paths.items() if p.suffix.lower() in (".csv", ".tsv", ".txt") and n not in labels}
+    robot = _robot(folder, paths, tables)
+    estimate = "pose" in robot and bool(labels)
+    robot["offset_s"] = 0.0 if estimate else "estimate"
+    open_yet = {"point_mm": [0.0] * 3, "axis": [0.0, 1.0, 0.0], "jaw_mm": [0.0] * 3}
+    measured = {"landmarks_mm": {"base": [0.0] * 3}, "hinge": open_yet} if "pose" in robot else {}
+    tool = {"estimate": True} if estimate else measured
     told = {"name": re.sub(r"[<>&]", "_", folder.resolve().name), "landmarks": list(robot.get("landmarks", LANDMARKS))}
-    told |= {"robot_accuracy_mm": 0.01, "readout_s": 0.0, "video": _video(folder, paths), "robot": robot}
-    told |= {"tool": {"estimate": True} if "pose" in robot else {}, "labels": _labels(labels)}
+    video = _video(folder, paths, {n: p for n, p in tables.items() if n != robot["file"]})
+    told |= {"robot_accuracy_mm": 0.01, "readout_s": 0.0, "video": video, "robot": robot, "tool": tool}
+    told["labels"] = _labels(labels)
     text = "# What `python3 -m lib import` reads, guessed from the files.  Look at each line.\n"
     for key, value in told.items():
         table = key in ("video", "robot", "tool", "labels")
@@ -84,13 +95,14 @@ def _toml(value: object) -> str:
     return json.dumps(value, ensure_ascii=False)
 
 
-def _video(folder: Path, paths: dict[str, Path]) -> dict:
+def _video(folder: Path, paths: dict[str, Path], tables: dict[str, Path]) -> dict:
     films, images = ([n for n, path in paths.items() if path.suffix.lower() in kind] for kind in (VIDEOS, IMAGES))
     if len(films) == 1:
         with av.open(str(paths[films[0]])) as container:
             stream = container.streams.video[0]
             layout = "top_bottom" if stream.width < 1.1 * stream.height else "side_by_side"
-        return {"layout": layout, "file": films[0], "exchanged": False}
+            times = _frame_times(tables, stream.frames) or {"times": "container"}
+        return {"layout": layout, "file": films[0], **times, "exchanged": False}
     kinds = Counter((Path(name).parent / f"*{Path(name).suffix}").as_posix() for name in images)
     names = films or [pattern for pattern, _ in kinds.most_common(2)]
     if not names:
@@ -98,36 +110,72 @@ def _video(folder: Path, paths: dict[str, Path]) -> dict:
     names = names if len(names) > 1 else [names[0].replace("*", f"*{side}*") for side in ("left", "right")]
     left, right, *_ = sorted(names, key=lambda name: ("right" in name.lower(), name))
     digits = len(str(max((last_number(name) or 0 for name in images), default=0)))
-    times = {"times": "fps", "fps": 25.0}
-    if digits >= 10:
+    times = {"times": "container"}
+    if not films and digits >= 10:
         times = {"times": "names", "name_unit": {10: "s", 13: "ms", 16: "us"}.get(digits, "ns")}
-    return {"layout": "two", "left": left, "right": right, **({} if films else times), "exchanged": False}
+    elif not films:
+        times = _frame_times(tables, len(list(folder.glob(left)))) or {"times": "fps", "fps": 25.0}
+    return {"layout": "two", "left": left, "right": right, **times, "exchanged": False}
 
 
-def _robot(folder: Path, paths: dict[str, Path]) -> dict:
+def _frame_times(tables: dict[str, Path], frames: int) -> dict:
+    """The table that has a time for each frame, if there is one."""
+    for name, path in tables.items():
+        dialect, header, rows = _table(path)
+        if len(rows) == frames and any(map(_TIME.search, header)):
+            return {"times": "table", "table": {"file": name, **dialect, **_time(header, rows, dialect["decimal"])}}
+    return {}
+
+
+def _table(path: Path) -> tuple[dict, list[str], list[list[str]]]:
+    """Separator and decimal mark, the header, and the cells of each row."""
+    lines = [line for line in decoded(path, utf_16=True).splitlines() if line.strip() and line.lstrip()[0] not in "#%"]
+    separator = max("\t;,|", key=lines[0].count) if lines else ","
+    header, *rows = ([cell.strip() for cell in line.split(separator)] for line in lines or [""])
+    decimal = "," if separator != "," and rows and re.search(r"\d,\d", separator.join(rows[0])) else "."
+    return {"separator": separator, "decimal": decimal}, header, [row for row in rows if len(row) == len(header)]
+
+
+def _numbers(rows: list[list[str]], at: int, decimal: str) -> np.ndarray:
+    """The numbers of a column; of other text NaN."""
+    cells = [row[at].replace(decimal, ".") for row in rows[:: max(1, len(rows) // 2000)]]
+    return np.array([float(cell) if re.fullmatch(r"[-+\d.eE]+", cell) else np.nan for cell in cells])
+
+
+def _time(header: list[str], rows: list[list[str]], decimal: str) -> dict:
+    """The column of the times and their unit, by its name, or else by its steps: rows come 1 ms to 3 s apart."""
+    time = next((cell for cell in header if _TIME.search(cell)), header[0])
+    if rows and ":" in rows[0][header.index(time)]:
+        return {"time": time, "time_unit": "iso"}
+    if match := _UNIT.search(time):
+        return {"time": time, "time_unit": match[1].lower()}
+    step = np.nanmedian(np.diff(_numbers(rows[:100], header.index(time), decimal))) if len(rows) > 1 else 0.0
+    return {"time": time, "time_unit": "s" if step < 3 else "ms" if step < 3e3 else "us" if step < 3e6 else "ns"}
+
+
+def _robot(folder: Path, paths: dict[str, Path], tables: dict[str, Path]) -> dict:
     bags = [name for name, path in paths.items() if path.suffix in (".bag", ".db3", ".mcap")]
-    tables = [name for name, path in paths.items() if path.suffix.lower() in (".csv", ".tsv", ".txt")]
     if bags:
         return _bag(folder, bags[0].rpartition("/")[0] if (folder / bags[0]).with_name("metadata.yaml").exists() else bags[0])
     if not tables:
         raise FileNotFoundError(f"{folder}: no log of a robot in it (.csv, .tsv, .txt, or a ROS bag).")
-    name = max(tables, key=lambda name: paths[name].stat().st_size)
-    rows = [line for line in decoded(paths[name], utf_16=True).splitlines() if line.strip() and line.lstrip()[0] not in "#%"]
-    separator = max("\t;,|", key=rows[0].count)
-    header, first = ([cell.strip() for cell in row.split(separator)] for row in rows[:2])
-    time = next((cell for cell in header if _TIME.search(cell)), header[0])
-    unit = "iso" if ":" in first[header.index(time)] else match[1].lower() if (match := _UNIT.search(time)) else "s"
+    name = max(tables, key=lambda name: tables[name].stat().st_size)
+    dialect, header, rows = _table(tables[name])
+    time = _time(header, rows, dialect["decimal"])
     turn = [next((cell for cell in header if re.search(rf"(?i)q_?{axis}$", cell)), "") for axis in "xyzw"]
     groups: dict[str, dict[str, str]] = {}
     for cell in header:
-        if (match := _AXIS.match(cell)) and cell not in (*turn, time):
+        if (match := _AXIS.match(cell)) and cell not in (*turn, time["time"]):
             groups.setdefault(match[1], {})[match[2].lower()] = cell
     points = {prefix: [axes[axis] for axis in "xyz"] for prefix, axes in groups.items() if set(axes) == set("xyz")}
     if not points:
-        raise ValueError(f"{paths[name]}: no three columns end in x, y and z; it has {header}. Write the mapping by hand.")
-    length = next((match[3].lower() for point in points.values() if (match := _AXIS.match(point[0])) and match[3]), "mm")
-    decimal = "," if separator != "," and re.search(r"\d,\d", rows[1]) else "."
-    told = {"file": name, "separator": separator, "decimal": decimal, "time": time, "time_unit": unit, "length_unit": length}
+        raise ValueError(f"{tables[name]}: no three columns end in x, y and z; it has {header}. Write the mapping by hand.")
+    length = next((match[3].lower() for point in points.values() if (match := _AXIS.match(point[0])) and match[3]), "")
+    if not length:  # a tool moves over a millimetre to some centimetres
+        columns = (_numbers(rows, header.index(column), dialect["decimal"]) for column in next(iter(points.values())))
+        span = max(float(np.ptp(known)) if len(known := x[np.isfinite(x)]) else 1.0 for x in columns)
+        length = "m" if span < 0.3 else "um" if span > 2000 else "mm"
+    told = {"file": name, **dialect, **time, "length_unit": length}
     if len(points) > 1 and not all(turn):
         return told | {"landmarks": _matched(points)}
     pose = {"position": points[min(points, key=lambda prefix: "pos" not in prefix.lower())]}

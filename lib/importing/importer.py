@@ -8,8 +8,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from lib import files
-from lib.calibration import TimeOffset, Tool, estimate_time_offset, pivot_calibration, tool_offsets
-from lib.correspondences import of_recording
+from lib.calibration import NoConsensusError, TimeOffset, Tool, estimate_time_offset, pivot_calibration, tool_offsets
+from lib.correspondences import LANDMARKS, NoDetectionError, of_recording
 from lib.geometry import RigidTransform
 from lib.importing.labels import read_labels
 from lib.importing.logs import RobotLog, increasing, read_robot, since
@@ -74,11 +74,12 @@ def import_recording(source: str | Path, mapping: str | Path | Mapping, out: str
                 writer.annotations(labels.u_left, labels.u_right, labels.visibility_left, labels.visibility_right)
             draft = writer.draft()
             clock = _clock(draft, told.robot.search_s) if told.robot.offset_s == "estimate" else None
-            if clock:
+            if isinstance(clock, TimeOffset):
                 writer.offset(clock.offset_s)
                 draft = writer.draft()
             report = {"format": "microstereo.import", "did": _did(told, stereo, robot, draft, clock, zeros)}
-            report["clock"] = clock and {"offset_s": round(clock.offset_s, 9), "sd_s": float(f"{clock.sd_s:.3g}")}
+            found = isinstance(clock, TimeOffset)
+            report["clock"] = {"offset_s": round(clock.offset_s, 9), "sd_s": float(f"{clock.sd_s:.3g}")} if found else None
             report |= {"tool": tool_told, "mapping": told.model_dump(mode="json"), "sources": _sources(folder, told, stereo)}
             files.write_json(writer.folder / "import.json", report)
     except ValueError as error:  # of the unfinished recording, which is gone: its place says more
@@ -94,9 +95,11 @@ def _delay(labels: Annotations, readout_s: float, height_px: int) -> np.ndarray:
     return readout_s * mean / (height_px - 1)
 
 
-def _clock(draft: Recording, search_s: float) -> TimeOffset:
-    """The offset of the clocks, from the labels, or from the detector where there are none."""
+def _clock(draft: Recording, search_s: float) -> TimeOffset | str:
+    """The offset of the clocks, from labels or else the detector; or why a detector that knows no such tool finds none."""
     labels = draft.annotations
+    if labels is None and draft.skeleton != LANDMARKS:
+        return f"the detector knows {', '.join(LANDMARKS)} alone, and there are no labels"
     if labels is None:
         some = np.unique(np.linspace(0, len(draft) - 1, min(len(draft), _CLOCK_FRAMES)).astype(int))
         data = detect(draft, frames=some)
@@ -105,6 +108,8 @@ def _clock(draft: Recording, search_s: float) -> TimeOffset:
     try:
         return estimate_time_offset(data, draft.kinematics, start_s=draft.offset_s, search_s=search_s)
     except ValueError as error:
+        if labels is None and isinstance(error, NoConsensusError | NoDetectionError):
+            return str(error).removesuffix(".")
         cure = "Or state offset_s, where t_robot = t_video + offset_s"
         raise ValueError(f"robot.offset_s = 'estimate': {error} {cure}.") from None
 
@@ -161,7 +166,8 @@ def _tool(
 
 
 def _did(
-    told: Mapping, stereo: StereoSource, robot: RobotLog, draft: Recording, clock: TimeOffset | None, zeros: Sequence[Decimal]
+    told: Mapping, stereo: StereoSource, robot: RobotLog, draft: Recording, clock: TimeOffset | str | None,
+    zeros: Sequence[Decimal],
 ) -> list[str]:
     """What the import did, one plain sentence each."""
     time_s, (width, height) = draft.frames.time_s, draft.image_size_px
@@ -181,7 +187,10 @@ def _did(
     gaps = int(np.isnan(x[..., 0]).any(axis=1).sum())
     said.append(f"{len(x)} samples of the robot, which reports {kind}; {gaps} have gaps.")
     said += [f"Times of the {what} count from {z} s." for what, z in zip(("video", "robot"), zeros, strict=True) if z]
-    if clock:
+    if isinstance(clock, str):
+        cure = "offset_s is 0 in recording.toml; `check` and `adapt` look for it again"
+        said.append(f"The offset of the clocks was not found ({clock}): {cure}.")
+    elif clock:
         said.append(f"The clocks differ by {1e3 * clock.offset_s:.2f} ms, standard deviation {1e3 * clock.sd_s:.2f} ms.")
     inside = np.isfinite(draft.landmarks_mm()).any(axis=(1, 2))
     if not inside.all():

@@ -192,7 +192,7 @@ def read_robot(folder: Path, mapping: Mapping) -> RobotLog:
     spread_mm = float(np.linalg.norm(np.diff(np.nanpercentile(x, [5, 95], axis=0), axis=0), axis=2).max())
     if not 0.05 <= spread_mm <= 2000:
         what = f"with length_unit = {robot.length_unit!r} the tool moves over {spread_mm:.3g} mm"
-        raise ValueError(f"{path}: {what}; 0.05 to 2000 mm is plausible. Check length_unit.")
+        raise ValueError(f"{path}: {what}; 0.05 to 2000 mm is plausible. Check length_unit: m, mm or um.")
     if pose is None:
         return RobotLog(time, x_mm=x)
     R = turn @ _rotations(path, pose, np.stack([columns[name] for name in pose.rotation], axis=-1))

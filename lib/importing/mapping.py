@@ -106,6 +106,12 @@ class Hinge(_Section):
     axis: Vector
     jaw_mm: Vector
 
+    @model_validator(mode="after")
+    def _agree(self) -> Self:
+        if not any(self.axis) or not any(self.jaw_mm):
+            raise ValueError("axis and jaw_mm are directions, so they cannot be 0: measure them on the tool or its drawing")
+        return self
+
 
 class Tool(_Section):
     """Landmarks in the tool frame: given, resting in one point for some seconds of the log, on a hinge, or estimated."""
