@@ -9,7 +9,6 @@ import os
 import shutil
 import subprocess
 import sys
-import traceback
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -129,9 +128,7 @@ def _main_of(name: str, module: str, function: str):
             print("\nStopped; start again to go on.", file=sys.stderr)
             return 130
         except (OSError, ValueError) as error:
-            ours = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename.startswith(str(ROOT))]
-            where = f"{Path(ours[-1].filename).relative_to(ROOT)}, line {ours[-1].lineno}"
-            print(f"python3 -m lib {name}: {error} ({where})", file=sys.stderr)
+            print(f"python3 -m lib {name}: {error}", file=sys.stderr)
             return 2
 
     return command

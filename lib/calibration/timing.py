@@ -19,7 +19,7 @@ __all__ = ["Paths", "TimeOffset", "estimate_time_offset", "shift_misfits"]
 _GRID = 41  # trial offsets of the coarse search
 #: Of landmarks that a detector sees with an error of the tool's own: how much deeper than the median trial each camera's
 #: misfit must be, and the largest residual, as a share of the pixels' extent.
-_CLEAR, _NEAR = 1.0, 0.03
+_CLEAR, _NEAR = 0.4, 0.03
 
 
 @dataclass(frozen=True, eq=False)

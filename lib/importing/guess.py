@@ -5,6 +5,7 @@ Units that no column's name states are those in which the log's steps and motion
 
 import json
 import re
+import tomllib
 from collections import Counter
 from pathlib import Path
 
@@ -23,39 +24,6 @@ _TIME = re.compile(r"(?i)^(t|sec|secs|s|ms|us|ns)$|time|stamp|^t[_ \[(]")
 _AXIS = re.compile(r"(?i)^(.*?)[ _.\-]?([xyz])[ _]?[\[(]?(mm|um|m)?[\])]?$")
 _UNIT = re.compile(r"(?i)(?:^|[ _\[(])(ns|us|ms|s)[\])]?$")
 _LABELS = {".slp": ["sleap"], ".csv": ["deeplabcut"], ".json": ["coco", "label_studio"], ".zip": ["cvat"], ".xml": ["cvat"]}
-#: What the comment at each key says.
-_TELLS = {
-    "name": "any text",
-    "landmarks": "the landmarks' names here; the detector knows base, tip_1, tip_2 of a forceps",
-    "robot_accuracy_mm": "standard deviation of the robot's positions, each coordinate",
-    "readout_s": "rolling shutter: seconds from the first to the last row; 0 is a global shutter",
-    "video.layout": "CHECK: two (one video or one set of images a camera), side_by_side or top_bottom",
-    "video.file": "both views",
-    "video.left": "CHECK: the left camera",
-    "video.right": "the right camera",
-    "video.times": "CHECK: container (.avi has a rate alone), names (the numbers in the files' names), table or fps",
-    "video.name_unit": "of the numbers in the files' names",
-    "video.fps": "CHECK: frames a second",
-    "video.table": "the times of the frames",
-    "video.exchanged": "true exchanges the two cameras",
-    "robot.file": "the robot's log",
-    "robot.separator": "between cells",
-    "robot.decimal": "decimal mark",
-    "robot.time": "column of the robot's times; of a bag a topic and its field, or :received",
-    "robot.time_unit": "CHECK: s, ms, us, ns, or iso for dates",
-    "robot.length_unit": "CHECK: m, mm or um",
-    "robot.landmarks": "CHECK: columns, or fields, of each landmark",
-    "robot.pose": "CHECK: columns, or fields, of the tool's pose, and of the full angle between its jaws",
-    "robot.offset_s": "t_robot = t_video + offset_s: seconds, or estimate to find it, which tool.estimate does not allow",
-    "tool.estimate": "from labels; or give landmarks_mm, pivot_s, hinge",
-    "tool.landmarks_mm": "CHECK: the joint of the jaws in the frame of the tool's pose, measured on the tool or its drawing",
-    "tool.hinge": "CHECK: that joint, its axis, and the way from it to the closed tips; 0 is refused",
-    "labels.kind": "coco, cvat, label_studio, deeplabcut or sleap",
-    "labels.file": "both cameras",
-    "labels.names": "CHECK: their name of each landmark",
-    "labels.pixel_origin": "what (0, 0) is in the top left pixel: its centre, or its corner as CVAT and Label Studio draw",
-    "labels.first_frame": "number of the first frame in the labels' image names",
-}
 
 
 def guess_mapping(source: str | Path) -> str:
@@ -80,12 +48,13 @@ def guess_mapping(source: str | Path) -> str:
     video = _video(folder, paths, {n: p for n, p in tables.items() if n != robot["file"]})
     told |= {"robot_accuracy_mm": 0.01, "readout_s": 0.0, "video": video, "robot": robot, "tool": tool}
     told["labels"] = _labels(labels)
+    tells = tomllib.loads(Path(__file__).with_name("comments.toml").read_text(encoding="utf-8"))
     text = "# What `python3 -m lib import` reads, guessed from the files.  Look at each line.\n"
     for key, value in told.items():
         table = key in ("video", "robot", "tool", "labels")
         lines = {f"{key}.{inner}": entry for inner, entry in value.items()} if table else {key: value}
         text += f"\n[{key}]\n" if table and value else ""
-        text += "".join(f"{k.split('.')[-1]} = {_toml(v)}  # {_TELLS[k]}\n" for k, v in lines.items())
+        text += "".join(f"{k.split('.')[-1]} = {_toml(v)}  # {tells[k]}\n" for k, v in lines.items())
     return text
 
 

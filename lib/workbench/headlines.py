@@ -68,18 +68,15 @@ def headlines(run: dict) -> tuple[list[dict], list[str]]:
             continue
         unit, paper = line["unit"], (live or line).get("paper")
         before, book = run.get("previous", {}).get(line["name"]), books.get(line["notebook"], {"state": None})
-        rows.append(
-            line
-            | {
-                "light": _light(live["value"], line) if here else "missing",
-                "target": _range(*line["target"], unit),
-                "value": with_unit(live["value"], unit) if here else _MISSING.get(book["state"], f"needs {line['needs']}"),
-                "recorded": record and with_unit(record["value"], unit),
-                "paper": paper is not None and with_unit(paper, unit),
-                "before": before is not None and with_unit(before, unit),
-                "from": live or record,
-            }
-        )
+        rows.append(line | {
+            "light": _light(live["value"], line) if here else "missing",
+            "target": _range(*line["target"], unit),
+            "value": with_unit(live["value"], unit) if here else _MISSING.get(book["state"], f"needs {line['needs']}"),
+            "recorded": record and with_unit(record["value"], unit),
+            "paper": paper is not None and with_unit(paper, unit),
+            "before": before is not None and with_unit(before, unit),
+            "from": live or record,
+        })  # fmt: skip
     return rows[:8], left_out
 
 

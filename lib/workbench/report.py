@@ -77,13 +77,8 @@ def record(name: str, value: float, unit: str, *, paper: float | None = None, no
     Raises:
         ValueError: For a name that is not snake case, or a value that is not a number.
     """
-    metric = {
-        "name": _checked_name(name),
-        "value": _number(value, "value"),
-        "unit": unit,
-        "paper": None if paper is None else _number(paper, "paper"),
-        "note": note,
-    }
+    theirs = None if paper is None else _number(paper, "paper")
+    metric = {"name": _checked_name(name), "value": _number(value, "value"), "unit": unit, "paper": theirs, "note": note}
     RECORDED[name] = metric["value"]
     here, theirs = with_unit(metric["value"], unit), "" if paper is None else with_unit(metric["paper"], unit)
     text = f"{name} = {here}{f' (paper: {theirs})' if theirs else ''}{f'  # {note}' if note else ''}"

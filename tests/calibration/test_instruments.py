@@ -69,6 +69,20 @@ def test_time_offset_with_missing_detections_and_several_landmarks():
     assert found.offset_s == pytest.approx(-0.02, abs=1e-3)
 
 
+def test_time_offset_is_found_where_a_detector_sees_an_unknown_tool_elsewhere():
+    """Landmarks are off by 20 px in the axes of a turning tool, and a fifth is anywhere: no two cameras leave 1 %."""
+    (time, u), (robot_time, robot_x) = video(0.15, 4)
+    rng, n = np.random.default_rng(4), len(time)
+    turn = np.linspace(0, 9, n)[:, None, None] + np.array([0.0, 2.1, 4.2])[:, None]
+    off = 20 * np.concatenate([np.cos(turn), np.sin(turn)], axis=2)
+    u = [np.where(rng.random((n, 3, 1)) < 0.2, rng.uniform(0, 1000, (n, 3, 2)), p[:, None] + off) for p in u]
+    found = estimate_time_offset((time, u), (robot_time, np.repeat(robot_x[:, None], 3, axis=1)))
+    assert abs(found.offset_s - 0.15) < min(4 * found.sd_s, 0.01)
+    with pytest.raises(ValueError, match="no consensus"):
+        anywhere = [rng.uniform(0, 1000, p.shape) for p in u]
+        estimate_time_offset((time, anywhere), (robot_time, np.repeat(robot_x[:, None], 3, axis=1)))
+
+
 def test_time_offset_of_correspondences_with_gaps_in_the_kinematics():
     """One blank row is bridged; rows that fall into a longer silence are left out; a shutter's rows have their own times."""
     (time, u), (robot_time, robot_x) = video(0.03, 2, readout_s=0.03)

@@ -174,6 +174,45 @@ def test_the_guess_needs_little_change(shipped, tmp_path):
     assert (told.video.times, told.video.left) == ("names", "cam L/*.tiff")
 
 
+def test_the_guess_reads_units_and_frame_times_where_no_name_states_them(shipped, tmp_path):
+    few = replace(thinned(shipped, 80), frames=shipped.frames[:6], time_s=shipped.time_s[:6])
+    folder, path = source_of(tmp_path, few, foreign.side_by_side)
+    numbers = np.column_stack([1e3 * few.robot_s, few.x_mm.reshape(len(few.x_mm), 9) / 1e3])
+    rows = [";".join(f"{value:.7f}" for value in row) for row in numbers]
+    header = "stamp;" + ";".join(f"{name}.{axis}" for name in ("joint", "a", "b") for axis in "XYZ")
+    (folder / "log.csv").write_text("\n".join([header, *rows]).replace(".", ","), "utf-8")
+    (folder / "frames.txt").write_text("ms\n" + "\n".join(f"{1e3 * t:.2f}" for t in few.time_s), "utf-8")
+    path.write_text(guess_mapping(folder).replace(",X", ".X").replace(",Y", ".Y").replace(",Z", ".Z"), "utf-8")
+    told = read_mapping(path)
+    assert (told.robot.time_unit, told.robot.length_unit, told.robot.decimal) == ("ms", "m", ",")
+    assert (told.video.times, told.video.table.file, told.video.table.time_unit) == ("table", "frames.txt", "ms")
+    (folder / "log.csv").unlink()
+    foreign.robot_poses(folder, few)
+    path.write_text(guess_mapping(folder), "utf-8")
+    with pytest.raises(ValueError, match=r"tool\.hinge.*cannot be 0: measure them"):
+        read_mapping(path)
+    foreign.labels_coco(folder, few)
+    path.write_text(guess_mapping(folder), "utf-8")
+    told = read_mapping(path)
+    assert (told.tool.estimate, told.robot.offset_s) == (True, 0.0)
+
+
+def test_a_detector_that_knows_no_such_tool_leaves_the_clock_open(shipped, tmp_path, monkeypatch):
+    few = replace(thinned(shipped, 5), frames=shipped.frames[:10], time_s=shipped.time_s[:10])
+    folder, mapping = source_of(tmp_path, few, foreign.side_by_side, foreign.robot_csv)
+    mapping.write_text(mapping.read_text("utf-8").replace("[robot]\n", '[robot]\noffset_s = "estimate"\n'), "utf-8")
+    rng = np.random.default_rng(0)
+
+    def lost(recording, frames):
+        u = rng.uniform(0, recording.image_size_px, (2, len(frames), 3, 2))
+        return of_recording(recording, *u, frames=frames)
+
+    monkeypatch.setattr("lib.importing.importer.detect", lost)
+    report = import_recording(folder, mapping, tmp_path / "eye")
+    assert report["clock"] is None and Recording.open(tmp_path / "eye").offset_s == 0
+    assert any("offset of the clocks was not found" in line and "`check` and `adapt`" in line for line in report["did"])
+
+
 def test_jaws_are_estimated_from_poses_gripper_and_labels(shipped, tmp_path):
     """The labels carry 1 px of noise in the full frame, 10 um."""
     makers = foreign.images, foreign.robot_poses, lambda *_: "[tool]\nestimate = true\n", foreign.labels_coco
