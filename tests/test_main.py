@@ -62,7 +62,7 @@ def test_every_command_has_its_function(module, function):
 @pytest.mark.parametrize(
     ("error", "code", "text"),
     [
-        (ValueError("frames: 0; give at least 3."), 2, "python3 -m lib run: frames: 0; give at least 3. (tests"),
+        (ValueError("frames: 0; give at least 3."), 2, "python3 -m lib run: frames: 0; give at least 3."),
         (OSError(28, "No space left on device", "a.png"), 2, "No space left on device: 'a.png'"),
         (KeyboardInterrupt(), 130, "start again to go on"),
     ],

@@ -110,9 +110,7 @@ def calibrate(
     return found if usable is None else _spread_out(found, usable)
 
 
-def _usable_rows(
-    data: Correspondences, offsets: bool | str | None, weighting: str
-) -> tuple[np.ndarray, np.ndarray | None]:
+def _usable_rows(data: Correspondences, offsets: bool | str | None, weighting: str) -> tuple[np.ndarray, np.ndarray | None]:
     """Mask of the rows to calibrate with (seen in one view at least), and the tool's axes in them or None."""
     if offsets not in (None, False, True, "tool", "image"):
         raise ValueError(f"offsets: expected 'tool', 'image', True, False or None, got {offsets!r}.")

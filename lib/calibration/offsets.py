@@ -115,9 +115,7 @@ def estimate_offsets(
     blocks = np.stack([covariance[j : j + size, j : j + size] for j in range(0, offset.size, size)])
     G = found.minimum.state.matrix_jacobian() @ found.plan.selection
     learnt = LandmarkOffsets(offset, blocks, prior_sd, p_value)
-    return replace(
-        found, parameter_covariance=known, covariance=G @ known @ G.T, effective_rows=effective, offsets=learnt
-    )
+    return replace(found, parameter_covariance=known, covariance=G @ known @ G.T, effective_rows=effective, offsets=learnt)
 
 
 def _evidence(information: np.ndarray, gradient: np.ndarray, least: float) -> tuple[float, float]:

@@ -206,9 +206,7 @@ def tightest_sample(x: np.ndarray, u: np.ndarray, rng: np.random.Generator) -> n
     return M[_scale_free(_distances2(H, u, M), float(np.prod(_extent(u)))).argmin()].T
 
 
-def _tightest(
-    x: np.ndarray, u: np.ndarray, threshold_px: float | None, rng: np.random.Generator, least_mm: float
-) -> _Found:
+def _tightest(x: np.ndarray, u: np.ndarray, threshold_px: float | None, rng: np.random.Generator, least_mm: float) -> _Found:
     """The consensus of the camera that makes the rows most probable (or has most of them within `threshold_px`)."""
     n, middle = len(u), np.median(u, axis=0)
     u = u - middle

@@ -192,9 +192,7 @@ def _supported(matches: VolumeMatches, tolerance: float = 1.5) -> np.ndarray:
     return support > 3  # each match supports itself
 
 
-def match_band(
-    images: Images, masks: Masks, rig: StereoRig, where: Where, *, budget_bytes: int, reciprocal: bool
-) -> Matches:
+def match_band(images: Images, masks: Masks, rig: StereoRig, where: Where, *, budget_bytes: int, reciprocal: bool) -> Matches:
     """Matches of a calibrated pair; arguments as in `lib.matching.match`, images (h, w) uint8 grey.
 
     Raises:

@@ -82,9 +82,7 @@ def unpool(
     return _unpool_axis(maps, along_x, _unpool_axis(along_x, pooled, score, 2, start), 3, 0)
 
 
-def _unpool_axis(
-    maps: torch.Tensor, pooled: torch.Tensor, score: torch.Tensor, axis: int, start: int
-) -> torch.Tensor:
+def _unpool_axis(maps: torch.Tensor, pooled: torch.Tensor, score: torch.Tensor, axis: int, start: int) -> torch.Tensor:
     out = torch.full_like(maps, -torch.inf)
     for first in (start - 1, start, start + 1):
         skip = int(first < 0)

@@ -144,8 +144,7 @@ def _parabola(volume: torch.Tensor, place: tuple[torch.Tensor, ...], axis: int) 
     """Vertex (in [-0.5, 0.5]) of the response around its peak along one axis, 0 where it has no interior peak; has it?"""
     n, index = volume.shape[axis], place[axis]
     before, centre, after = (
-        volume[tuple((index + step).clamp(0, n - 1) if k == axis else i for k, i in enumerate(place))]
-        for step in (-1, 0, 1)
+        volume[tuple((index + step).clamp(0, n - 1) if k == axis else i for k, i in enumerate(place))] for step in (-1, 0, 1)
     )
     curvature = 2 * centre - before - after
     peaked = (index > 0) & (index < n - 1) & (centre >= before) & (centre >= after) & (curvature > 1e-9)

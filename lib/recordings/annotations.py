@@ -80,9 +80,7 @@ def coco_keypoints(path: Path) -> Iterator[tuple[str, list[str], np.ndarray]]:
         yield image, names, values
 
 
-def read_coco(
-    path: Path, n_frames: int, image_size_px: tuple[int, int], landmarks: Sequence[str] = LANDMARKS
-) -> Annotations:
+def read_coco(path: Path, n_frames: int, image_size_px: tuple[int, int], landmarks: Sequence[str] = LANDMARKS) -> Annotations:
     """Read COCO keypoints whose image names are ``left/000012.jpg`` and the like.
 
     The names in the category order the keypoints, so any order in the file will do; other keypoints are ignored.
@@ -131,9 +129,7 @@ def write_coco(
     write_text(path, json.dumps(content, allow_nan=False) + "\n")
 
 
-def mark_coco(
-    path: Path, image: str, image_size_px: tuple[int, int], landmarks: Sequence[str], values: np.ndarray
-) -> None:
+def mark_coco(path: Path, image: str, image_size_px: tuple[int, int], landmarks: Sequence[str], values: np.ndarray) -> None:
     """Set the landmarks of one image, x, y, visibility (k, 3), in a file of COCO keypoints, new where there is none.
 
     All else in the file stays: other images, other keypoints, keys that are not ours.

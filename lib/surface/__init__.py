@@ -5,15 +5,7 @@ tool.  `surface_mesh`, `depth_map` and the `save_` functions take it to other pr
 """
 
 from lib.surface.bspline import BSplineSurface, ToolDistance
-from lib.surface.export import (
-    Mesh,
-    depth_map,
-    open3d,
-    save_depth_map,
-    save_mesh,
-    save_points,
-    surface_mesh,
-)
+from lib.surface.export import Mesh, depth_map, open3d, save_depth_map, save_mesh, save_points, surface_mesh
 from lib.surface.fitting import fit_surface
 from lib.surface.grid import SplineGrid
 from lib.surface.joint import refine_rig

@@ -19,8 +19,7 @@ from lib.surface.grid import SplineGrid, cubic_basis
 __all__ = ["UNHELD", "L1Problem", "L1Solution", "cholesky", "interior_point"]
 
 UNHELD = (
-    "smoothness: too small to hold the control points that have no data near them; increase it, or use fewer control "
-    "points."
+    "smoothness: too small to hold the control points that have no data near them; increase it, or use fewer control points."
 )
 _PAIRS = np.triu_indices(4)
 

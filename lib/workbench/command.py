@@ -19,16 +19,9 @@ from tqdm import tqdm
 
 from lib import files, paths
 from lib.provenance import commit, machine
-from lib.workbench import execution, headlines, pages
+from lib.workbench import execution, headlines, pages, parameters
 from lib.workbench.execution import Failure, execute
-from lib.workbench.parameters import (
-    UsageError,
-    choose_notebooks,
-    declared_parameters,
-    parse_parameters,
-    positive,
-    title_of,
-)
+from lib.workbench.parameters import UsageError
 
 __all__ = ["main", "main_site", "run"]
 
@@ -54,7 +47,7 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("--profile", choices=PROFILES, default="quick", help="quick: minutes; paper: the paper's sizes")
     parser.add_argument("-p", dest="pairs", nargs=2, action="append", default=[], metavar=("NAME", "VALUE"),
                         help="a parameter of the notebooks that declare it")  # fmt: skip
-    parser.add_argument("--cell-timeout", type=positive, metavar="S",
+    parser.add_argument("--cell-timeout", type=parameters.positive, metavar="S",
                         help="longest time of one cell (default: 900 for quick)")  # fmt: skip
     parser.add_argument("--runs", type=Path, default=paths.RUNS, metavar="FOLDER", help="where the run's folder appears")
     options = parser.parse_args(argv)
@@ -141,10 +134,10 @@ def run(
         UsageError: Before anything runs: for an unknown notebook or parameter, or a value of the wrong type.
         OSError: If the report cannot be written; its state is "failed" if that can still be written.
     """
-    chosen = choose_notebooks(names, notebooks)
-    values = parse_parameters(pairs, chosen)
+    chosen = parameters.choose_notebooks(names, notebooks)
+    values = parameters.parse_parameters(pairs, chosen)
     for book in chosen:
-        if "profile" in declared_parameters(book):
+        if "profile" in parameters.declared_parameters(book):
             values[book].setdefault("profile", profile)
     report = _Report(_new_folder(runs, profile), chosen, profile, dict(pairs))
     width = max(len(book.stem) for book in chosen)
@@ -212,7 +205,7 @@ class _Report:
             "weights": files.digest(paths.MODELS / "default.safetensors"),
             "versions": execution.versions(),
             "notebooks": [
-                {"name": book.stem, "title": title_of(book), "state": "pending", "seconds": None, "failure": None,
+                {"name": book.stem, "title": parameters.title_of(book), "state": "pending", "seconds": None, "failure": None,
                  "page": None, "executed": None, "left_out": None, "verdict": None, "reasons": []}
                 for book in notebooks
             ],
