@@ -40,18 +40,10 @@ def _sgbm(left: np.ndarray, right: np.ndarray, range_px: tuple, *, checked: bool
 
     def disparity(tolerance_px: int) -> np.ndarray:
         sgbm = cv2.StereoSGBM_create(
-            minDisparity=low,
-            numDisparities=max(16, int(np.ceil((range_px[1] - low) / 16)) * 16),
-            blockSize=block,
-            P1=8 * block**2,
-            P2=32 * block**2,
-            disp12MaxDiff=tolerance_px,
-            preFilterCap=31,
-            uniquenessRatio=5,
-            speckleWindowSize=100,
-            speckleRange=2,
-            mode=cv2.STEREO_SGBM_MODE_HH,
-        )
+            minDisparity=low, numDisparities=max(16, int(np.ceil((range_px[1] - low) / 16)) * 16), blockSize=block,
+            P1=8 * block**2, P2=32 * block**2, disp12MaxDiff=tolerance_px, preFilterCap=31, uniquenessRatio=5,
+            speckleWindowSize=100, speckleRange=2, mode=cv2.STEREO_SGBM_MODE_HH,
+        )  # fmt: skip
         found = sgbm.compute(left, right).astype(np.float32) / 16
         return np.where(found < low, np.nan, found)
 

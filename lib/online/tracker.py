@@ -278,14 +278,15 @@ class RigTracker:
 
     def point_covariance(self, x_mm: np.ndarray) -> np.ndarray:
         """(n, 3, 3) mm^2: how far the rig may put points beside the robot's."""
-        covariance = np.zeros((len(x_mm), 3, 3))
-        if self.calibration is not None:
-            covariance += self.calibration.point_covariance(x_mm, detection=False)
-        if self._motion is not None:
-            moves = [motion for motion in (self._motion.left, self._motion.right) if motion is not None]
-            stale = [motion.covariance_at(motion.transform.inverse().apply(x_mm)) for motion in moves]
-            covariance += sum(stale) / len(moves) if moves else 0.0
-        return covariance
+        known = self.calibration
+        own = np.zeros((len(x_mm), 3, 3)) if known is None else known.point_covariance(x_mm, detection=False)
+        moves = [motion for motion in self._motions if motion is not None]
+        stale = [motion.covariance_at(motion.transform.inverse().apply(x_mm)) for motion in moves]
+        return own + sum(stale) / max(len(moves), 1)
+
+    @property
+    def _motions(self) -> tuple:
+        return (None, None) if self._motion is None else (self._motion.left, self._motion.right)
 
     def _noise(self, data: Correspondences) -> np.ndarray:
         """(n, 4, 4) px^2 of landmarks' residuals: of the detections, and of the robot's report."""
@@ -297,9 +298,7 @@ class RigTracker:
     def _residual_covariance(self, data: Correspondences) -> np.ndarray:
         """(n, 4, 4) px^2: the noise, and by how much the rig is uncertain where these landmarks are."""
         covariance = self._noise(data)
-        moved = self._motion
-        left, right = (None, None) if moved is None else (moved.left, moved.right)
-        for motion, rows in ((left, slice(0, 2)), (right, slice(2, 4))):
+        for motion, rows in zip(self._motions, (slice(0, 2), slice(2, 4)), strict=True):
             stale = data.x_mm if motion is None else motion.transform.inverse().apply(data.x_mm)
             if self.calibration is not None:
                 covariance[:, rows, rows] += self.calibration.projection_covariance(stale)[:, rows, rows]

@@ -14,16 +14,18 @@ __all__ = ["DriftMonitor"]
 #: What is watched: the mean residual of a frame's landmarks along the two directions of the images that a lateral shift
 #: moves, along the one that a shift in depth moves, and across the epipolar lines; and their chi-square.
 AXES = ("lateral", "lateral", "depth", "epipolar", "scatter")
-# Shift that counts as none, in standard deviations of a frame, and alarm level, of each axis.  Depth is seen worst, so
-# its test is the one for the smallest shifts.
-_SLACK = np.array([1.0, 1.0, 0.5, 1.0, 1.0])
-_LEVEL = np.array([6.2, 6.2, 10.0, 6.2, 8.0])
-_CAP = 0.75  # of the alarm level: most that one frame adds, so that a single bad frame raises no alarm
+_SHIFT_MM = (0.020, 0.020, 0.050)  # that is to be noticed, along the first three axes; half of it counts as none
+_SHIFT_SD = (1.0, 8.0)  # of a frame: least and largest shift that a test is made for; the other axes are tested for 2
+_FRAMES = 20_000  # between false alarms, at least
+# Most that one frame adds, of the alarm level: so that neither a single bad frame raises an alarm nor, across and along the
+# depth, a detector that is wrong alike for some frames.  That grows with the score between two bounds.
+_LEAST, _CAP, _BURST = 0.2, 0.55, (1.0, 1.0, 0.03, 0.03, 0.03)
 _MEMORY = 1000  # frames that tell the noise
 _FEW = 40  # frames: with fewer the noise is taken for larger than they say, up to twice
-_WANDER = 20  # frames over which the noise may be correlated, whatever neighbouring frames say
+_WANDER = 10  # frames over which the noise may be correlated, whatever neighbouring frames say
 _SLOW = 300  # frames over which the bias is averaged
 _LARGEST_BIAS_PX = 0.5  # of a frame's mean; more is a drift
+_FREEDOM = 4.0  # of the Student t of a landmark about the frame's mean: one wrong landmark moves the mean little
 
 
 class DriftMonitor:
@@ -32,7 +34,8 @@ class DriftMonitor:
     The detector's error is biased and correlated in time, and its stated noise may be wrong.  So the bias is the slow
     mean of the residuals, within half a pixel, and the noise is that of the residuals themselves: their long-run standard
     deviation (Andrews 1991), which counts correlated frames for what they are worth.  A score z is the residual less its
-    bias in this unit, and S <- max(0, S + min(z, cap) - slack).
+    bias in this unit.  With delta the shift to be noticed in the same unit, z adds to S the logarithm of how much likelier
+    the shift makes it, and the alarm level keeps false alarms `_FRAMES` frames apart (Siegmund 1985).
 
     Args:
         rig: As calibrated or last registered.
@@ -83,8 +86,8 @@ class DriftMonitor:
     def follow(self, rig: StereoRig) -> None:
         """Go on with the same rig, known a little better."""
         self.rig = rig
-        u, _, _ = np.linalg.svd(rig.linear)
-        self._axes = u.T
+        u, px_per_mm, _ = np.linalg.svd(rig.linear)
+        self._axes, self._shift_px = u.T, px_per_mm * _SHIFT_MM
 
     def update(
         self,
@@ -114,29 +117,29 @@ class DriftMonitor:
         chi2 = 0.0
         if len(residual):
             weight = np.linalg.inv(covariance)
-            weighted = np.einsum("nij,nj->ni", weight, residual)
-            chi2 = float((residual * weighted).sum())
-            mean_covariance = self._axes @ np.linalg.inv(weight.sum(axis=0)) @ self._axes.T
-            sd = np.sqrt(np.diag(mean_covariance))
-            mean = mean_covariance @ (self._axes @ weighted.sum(axis=0))
+            chi2 = float(np.einsum("ni,nij,nj->", residual, weight, residual))
+            sd = np.sqrt(np.diag(self._axes @ np.linalg.inv(weight.sum(axis=0)) @ self._axes.T))
             # Wilson and Hilferty 1931: a chi-square as a normal score, so that missing landmarks count alike.
             spread = 2.0 / (9.0 * residual.size)
             scatter = (np.cbrt(chi2 / residual.size) - (1.0 - spread)) / np.sqrt(spread)
-            self._add(np.append(mean / sd, scatter), np.append(_LARGEST_BIAS_PX / sd, _LARGEST_BIAS_PX / sd.min()))
+            self._add(np.append(self._axes @ _robust_mean(residual, weight) / sd, scatter), sd)
         self.history.append((chi2, residual.size, self.statistic))
         return self.statistic > self.threshold
 
-    def _add(self, value: np.ndarray, largest_bias: np.ndarray) -> None:
+    def _add(self, value: np.ndarray, sd: np.ndarray) -> None:
+        largest_bias = _LARGEST_BIAS_PX / np.append(sd, sd.min())
         z = (value - np.clip(self._bias, -largest_bias, largest_bias)) / self._noise
+        shift = np.append(np.clip(self._shift_px / (sd[:3] * self._noise[:3]), *_SHIFT_SD), (2.0, 2.0))
+        level = np.log(2 * len(AXES) * _FRAMES * shift**2 / 2.0) - 1.166 * shift
         # The bias of few frames is uncertain itself.
-        slack = _SLACK + 1.0 / np.sqrt(self._seen + 10.0)
+        slack = shift / 2.0 + 1.0 / np.sqrt(self._seen + 10.0)
         signed = np.stack([z, -z])
         signed[1, -1] = 0.0  # landmarks that scatter less than usual are no fault
-        self._sums = np.maximum(self._sums + np.minimum(signed, _CAP * _LEVEL) - slack, 0.0)
+        gain = np.minimum(shift * (signed - slack) / level, np.clip(_BURST * np.abs(z), _LEAST, _CAP))
+        self._sums = np.maximum(self._sums + gain, 0.0)
         self._runs = np.where(self._sums > 0, self._runs + 1, 0)
-        ratio = self._sums / _LEVEL
-        side, axis = np.unravel_index(np.argmax(ratio), ratio.shape)
-        self.statistic, self.axis, self.since = float(ratio[side, axis]), AXES[axis], int(self._runs[side, axis])
+        side, axis = np.unravel_index(np.argmax(self._sums), self._sums.shape)
+        self.statistic, self.axis, self.since = float(self._sums[side, axis]), AXES[axis], int(self._runs[side, axis])
         self.score = float(np.abs(z).max())
         # A frame that stands out tells of something else than noise and bias.
         tame = self._bias + np.clip(value - self._bias, -3.0 * self._noise, 3.0 * self._noise)
@@ -145,6 +148,15 @@ class DriftMonitor:
         self._bias = self._bias + (tame - self._bias) * max(1.0 / (self._seen + 10.0), 1.0 / _SLOW)
         if self._seen % 10 == 0:
             self._noise = _long_run_sd(np.array(self._scores))
+
+
+def _robust_mean(residual: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    share = np.ones(len(residual))
+    for _ in range(4):
+        total, pull = np.einsum("n,nij->ij", share, weight), np.einsum("n,nij,nj->i", share, weight, residual)
+        off = residual - (mean := np.linalg.solve(total, pull))
+        share = (_FREEDOM + 4.0) / (_FREEDOM + np.einsum("ni,nij,nj->n", off, weight, off))
+    return mean
 
 
 def _long_run_sd(values: np.ndarray) -> np.ndarray:
