@@ -78,19 +78,17 @@ class RigTracker:
             both = calibration.view_inliers[calibration.inliers].all(axis=1)
             _, _, weight, r = calibration.system
             weight, r = weight if len(weight) == 1 else weight[both], r[both]
-            scatter = (
-                np.median(np.einsum("ni,nij,nj->n", r, np.broadcast_to(weight, (len(r), 4, 4)), r)) / _CHI2_4_MEDIAN
-            )
+            chi2 = np.einsum("ni,nij,nj->n", r, np.broadcast_to(weight, (len(r), 4, 4)), r)
+            scatter = np.median(chi2) / _CHI2_4_MEDIAN
             # Corrected for the 16 parameters that the residuals have paid for, and the upper end of what so few allow.
             self._scale2 = scatter / (1.0 - 16.0 / max(r.size, 17)) * (1.0 + 1.0 / np.sqrt(len(r))) ** 2
 
     def take(self, result: FrameResult, frame: Seen) -> None:
         """A frame with landmarks that both images and the robot know."""
         self._past.append(frame.data)
-        accepted = [frame]
+        accepted = [frame] if self.rig is None else []
         if self.rig is not None:
             with result.stage("register"):
-                accepted = []
                 accepted = self._watch(result, frame)
         if self._takes_in(accepted):
             with result.stage("calibrate"):
@@ -147,8 +145,7 @@ class RigTracker:
             except Exception as error:  # the reason that counts is that of all frames together
                 refused = refused or error
                 continue
-            size = len(part[0].data)
-            used = found.inliers.reshape(len(part), size).any(axis=1)
+            used = found.inliers.reshape(len(part), -1).any(axis=1)
             return found, [frame for frame, fine in zip(part, used, strict=True) if fine]
         raise refused or ValueError("the robot's positions lie too far apart.")
 
