@@ -300,6 +300,5 @@ class RigTracker:
             if self.calibration is not None:
                 covariance[:, rows, rows] += self.calibration.projection_covariance(stale)[:, rows, rows]
             if motion is not None:
-                A = self.rig.linear[rows]
-                covariance[:, rows, rows] += A @ motion.covariance_at(stale) @ A.T
+                covariance[:, rows, rows] += self.rig.linear[rows] @ motion.covariance_at(stale) @ self.rig.linear[rows].T
         return covariance

@@ -133,8 +133,7 @@ class DriftMonitor:
         level = np.log(2 * len(AXES) * _FRAMES * shift**2 / 2.0) - 1.166 * shift
         # The bias of few frames is uncertain itself.
         slack = shift / 2.0 + 1.0 / np.sqrt(self._seen + 10.0)
-        signed = np.stack([z, -z])
-        signed[1, -1] = 0.0  # landmarks that scatter less than usual are no fault
+        signed = np.stack([z, -z * (1, 1, 1, 1, 0)])  # landmarks that scatter less than usual are no fault
         gain = np.minimum(shift * (signed - slack) / level, np.clip(_BURST * np.abs(z), _LEAST, _CAP))
         self._sums = np.maximum(self._sums + gain, 0.0)
         self._runs = np.where(self._sums > 0, self._runs + 1, 0)

@@ -23,6 +23,7 @@ from lib.registration.rigid import Registration, check_spread, motion_jacobian, 
 __all__ = ["MovedCameras", "identify_motion", "register_images"]
 
 _FREEDOM = 4.0  # of the Student t that "robust" assumes: gross errors lose their weight, small ones keep it
+_BELIEVED = 30  # rows that the stated noise is worth, beside the scatter of the residuals, in the covariance of "robust"
 _OPEN = 1e-12  # relative curvature below which a direction is not determined
 Loss = Literal["squared", "robust"]
 
@@ -248,7 +249,8 @@ def _minimum(rig: StereoRig, data: _Observed, stale: RigidTransform, loss: Loss,
         _, gradient = gradients(found.state, found.work)
         flatter = information - gradient.T @ (gradient * (2.0 / (_FREEDOM + data.dimension))[:, None])
         bent = np.linalg.eigvalsh(flatter)[-parameters] <= _OPEN * np.trace(information)
-        covariance = sandwich(information if bent else flatter, gradient[used], parameters)
+        own, n = sandwich(information if bent else flatter, gradient[used], parameters), used.sum()
+        covariance = (_BELIEVED * covariance + n * own) / (_BELIEVED + n)
     motion = found.state.inverse()
     turn = np.kron(np.eye(2), motion.R)
     distance, weights = np.where(used, (np.sqrt(distance2), weights), [[np.nan], [0.0]])

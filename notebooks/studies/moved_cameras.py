@@ -6,7 +6,7 @@ Notebooks 00, 05 and 06 and the study of registration share it.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -18,6 +18,7 @@ from lib.geometry import RigidTransform
 from lib.registration import Registration, register
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
 from notebooks.studies.simulated_rows import SimulatedSweep
+from notebooks.studies.tracked import TrackedErrors
 
 __all__ = [
     "Estimator",
@@ -53,11 +54,14 @@ class MotionErrors:
         (trials, k) of a point at the workspace.
     euler_rad:
         (trials, k, 3) about the robot's x, y, z axes.
+    stated_mm:
+        (trials, k) standard deviation of that translation, as the estimate states it.
     """
 
     n_frames: tuple[int, ...]
     translation_mm: np.ndarray
     euler_rad: np.ndarray
+    stated_mm: np.ndarray
 
     @property
     def trials(self) -> np.ndarray:
@@ -68,6 +72,11 @@ class MotionErrors:
     def translation_rms_um(self) -> np.ndarray:
         """(k,) root mean square over the trials."""
         return 1e3 * np.sqrt(np.nanmean(self.translation_mm**2, axis=0))
+
+    @property
+    def stated_rms_um(self) -> np.ndarray:
+        """(k,) root mean square over the trials of what the estimates state."""
+        return 1e3 * np.sqrt(np.nanmean(self.stated_mm**2, axis=0))
 
     @property
     def euler_rms_deg(self) -> np.ndarray:
@@ -86,6 +95,7 @@ def tool_frames(
     jaw_mm: tuple[float, float] = (2.0, 4.0),
     opening_rad: tuple[float, float] = (0.05, 0.40),
     outliers: float = 0.0,
+    errors: TrackedErrors | None = None,
 ) -> SimulatedSweep:
     """A forceps in n poses of the field, seen by `rig` and reported by the robot: 3 n rows.
 
@@ -101,6 +111,8 @@ def tool_frames(
         Angle between the jaws, drawn for each frame.
     outliers:
         Share of detections replaced by a random pixel up to 100 px away.
+    errors:
+        Of a detector, each frame's drawn from all of them, with the covariances that it stated; in place of `sigma_u_px`.
     """
     rig = rig or reference_rig()
     jaw = rng.uniform(*jaw_mm)
@@ -114,7 +126,13 @@ def tool_frames(
     turn = Rotation.from_euler("ZYX", np.stack([swing, -dip, roll], axis=1)).as_matrix()
     base = rng.uniform(-1, 1, (n, 3)) * half_size_mm
     x = ROBOT_FROM_MICROSCOPE.apply(np.einsum("nij,nkj->nki", turn, shape) + base[:, None]).reshape(-1, 3)
-    u_left, u_right = (u + rng.normal(0, sigma_u_px, u.shape) for u in rig.project(x))
+    covariance = None
+    if errors is None:
+        u_left, u_right = (u + rng.normal(0, sigma_u_px, u.shape) for u in rig.project(x))
+    else:
+        drawn = rng.choice(np.flatnonzero(np.isfinite(errors.error).all(axis=(1, 2, 3))), n)
+        u_left, u_right = np.array(rig.project(x)) + errors.error[drawn].reshape(-1, 2, 2).swapaxes(0, 1)
+        covariance = errors.covariance[drawn].reshape(-1, 2, 2, 2)
     x_reported = x + rng.normal(0, sigma_x_mm, x.shape)
     for u in (u_left, u_right):
         bad = rng.random(len(u)) < outliers
@@ -125,6 +143,7 @@ def tool_frames(
         u_right,
         frame=np.repeat(np.arange(n), len(LANDMARKS)),
         landmark=np.tile(np.arange(len(LANDMARKS)), n),
+        covariance_px2=covariance,
     )
     return SimulatedSweep(**vars(rows), true_x_mm=x, true_rig=rig)
 
@@ -218,20 +237,21 @@ def recorded_errors(
 
 def _no_errors(estimators: Mapping[str, Estimator], n_frames: Sequence[int], trials: int) -> dict[str, MotionErrors]:
     shape = (trials, len(n_frames))
-    empty = MotionErrors(tuple(int(n) for n in n_frames), np.full(shape, np.nan), np.full((*shape, 3), np.nan))
+    counts = tuple(int(n) for n in n_frames)
     return {
-        name: replace(empty, translation_mm=empty.translation_mm.copy(), euler_rad=empty.euler_rad.copy())
-        for name in estimators
+        name: MotionErrors(counts, *(np.full(s, np.nan) for s in (shape, (*shape, 3), shape))) for name in estimators
     }
 
 
 def _estimate(errors, at, estimators, rig, data, motion, centre_mm) -> None:
     for name, estimator in estimators.items():
         try:
-            found = estimator(rig, data).transform
+            found = estimator(rig, data)
         except ValueError:
             continue  # too few landmarks in these frames: the errors stay NaN
-        errors[name].translation_mm[at], errors[name].euler_rad[at] = motion_error(found, motion, centre_mm)
+        errors[name].translation_mm[at], errors[name].euler_rad[at] = motion_error(found.transform, motion, centre_mm)
+        (stated,) = found.covariance_at(found.transform.inverse().apply(centre_mm[None]))
+        errors[name].stated_mm[at] = np.sqrt(np.trace(stated))
 
 
 def pushed_images(
