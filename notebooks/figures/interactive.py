@@ -10,9 +10,10 @@ import os
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+import cv2
 import matplotlib.pyplot as plt
 import numpy as np
-from IPython.display import display
+from IPython.display import HTML, display
 from ipywidgets import HBox, Image, Layout, VBox
 from ipywidgets.widgets.widget_description import DescriptionWidget
 from matplotlib.collections import PolyCollection
@@ -23,11 +24,13 @@ from notebooks.figures.style import figure
 if TYPE_CHECKING:
     import plotly.graph_objects as go
 
-__all__ = ["explore", "show_scene", "still"]
+__all__ = ["epipolar_pointer", "explore", "show_scene", "still", "swipe"]
 
 _DPI = 80
 #: About as many pictures travel to a page, each drawn in the run.
 _STILLS = 5
+#: Widest image of a pair that moves by its own script.
+_WIDEST_PX = 960
 
 
 class _Explorer(VBox):
@@ -121,6 +124,60 @@ def _some_values(knob: DescriptionWidget, n: int) -> list[tuple[str, object]]:
     chosen = {round(k) for k in np.linspace(0, len(found) - 1, n)}
     chosen = chosen - {min(chosen, key=lambda k: abs(k - at))} | {at}
     return [found[k] for k in sorted(chosen)]
+
+
+def swipe(left: np.ndarray, right: np.ndarray, shows: str) -> HTML:
+    """The right image over the left one, with a border that a slider moves; without scripts it stays in the middle."""
+    over = "position:absolute;inset:0;width:100%;height:100%;max-width:none;margin:0"
+    shows = html.escape(shows)
+    return HTML(
+        f'<div class="swipe" style="--at:50%;max-width:{_WIDEST_PX}px"><div style="position:relative">'
+        f'<img alt="{shows}: the left image" src="{_embedded(left)}" style="display:block;width:100%;margin:0">'
+        f'<img alt="{shows}: the right image over it" src="{_embedded(right)}"'
+        f' style="{over};clip-path:inset(0 0 0 var(--at))">'
+        '<i style="position:absolute;top:0;bottom:0;left:var(--at);width:2px;background:#fff"></i></div>'
+        '<input type="range" value="50" step="0.5" aria-label="Border between the left and the right image"'
+        " style=\"width:100%;margin:4px 0\" oninput=\"this.parentNode.style.setProperty('--at', this.value + '%')\"></div>"
+    )
+
+
+def epipolar_pointer(left: np.ndarray, right: np.ndarray, F: np.ndarray, start_px: np.ndarray, shows: str) -> HTML:
+    """Two images; the right one shows the epipolar line of the left pixel under the pointer, without scripts of the first.
+
+    Args:
+        F: (3, 3), whose F @ [x, y, 1] is the line a x + b y + c = 0 in the right image.
+        start_px: (2,) the first pixel.
+    """
+    height, width = left.shape[:2]
+    a, b, c = F @ [*start_px, 1.0]
+    move = (
+        "const p = new DOMPoint(event.clientX, event.clientY).matrixTransform(this.getScreenCTM().inverse()),"
+        f" [a, b, c] = {json.dumps(F.tolist())}.map((r) => r[0] * p.x + r[1] * p.y + r[2]),"
+        " set = (e, o) => Object.entries(o).forEach(([k, v]) => e.setAttribute(k, v));"
+        " set(this.querySelector('circle'), { cx: p.x, cy: p.y });"
+        f" set(this.nextElementSibling.querySelector('line'), {{ y1: -c / b, y2: -(a * {width - 1} + c) / b }});"
+    )
+    box = f'viewBox="-0.5 -0.5 {width} {height}" role="img"'
+    image = f'<image x="-0.5" y="-0.5" width="{width}" height="{height}" href='
+    thick = width / 300
+    return HTML(
+        '<div class="epipolar" style="display:grid;grid-template-columns:repeat(auto-fit,minmax(280px,1fr));gap:8px">'
+        f'<svg {box} aria-label="{html.escape(shows)}: left" style="cursor:crosshair;touch-action:pan-y"'
+        f' onpointermove="{move}">{image}"{_embedded(left)}"/><circle cx="{start_px[0]:.1f}" cy="{start_px[1]:.1f}"'
+        f' r="{3 * thick:.1f}" fill="none" stroke="#fff" stroke-width="{thick:.1f}"/></svg>'
+        f'<svg {box} aria-label="{html.escape(shows)}: right">{image}"{_embedded(right)}"/>'
+        f'<line x1="0" x2="{width - 1}" y1="{-c / b:.2f}" y2="{-(a * (width - 1) + c) / b:.2f}" stroke="#0ff"'
+        f' stroke-width="{thick:.1f}"/></svg></div>'
+    )
+
+
+def _embedded(image: np.ndarray) -> str:
+    """An RGB image as the address that a page embeds, at most `_WIDEST_PX` wide."""
+    height, width = image.shape[:2]
+    if width > _WIDEST_PX:
+        image = cv2.resize(image, (_WIDEST_PX, round(height * _WIDEST_PX / width)), interpolation=cv2.INTER_AREA)
+    data = cv2.imencode(".webp", np.ascontiguousarray(image[..., ::-1]), [cv2.IMWRITE_WEBP_QUALITY, 80])[1]
+    return f"data:image/webp;base64,{base64.b64encode(data.tobytes()).decode('ascii')}"
 
 
 def show_scene(view: go.Figure, caption: str) -> None:

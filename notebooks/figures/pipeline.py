@@ -67,35 +67,30 @@ def timeline(results: Sequence[FrameResult], *, bump_at: int | None = None) -> F
 
 
 def stage_times(results: Sequence[FrameResult], *, paper_hz: float = 5.0) -> Figure:
-    """Left: time of the stages of each frame, stacked, and the paper's; right: their medians where a stage ran.
+    """A row for each stage and one for the whole frame: a dot for each frame that it ran in, its median as a bar and in ms.
 
-    A frame that takes far longer than the others (the first, which warms up) is cut off and its time written beside it.
+    The scale is logarithmic; the first two frames, which warm up, are rings.
     """
-    page, axes = figure(1, 2, width_in=12, height_in=4, width_ratios=[2.2, 1])
-    index = np.array([result.index for result in results])
-    below = np.zeros(len(results))
-    for stage in STAGES:
-        seconds = np.array([1e3 * result.seconds.get(stage, 0.0) for result in results])
-        axes[0].bar(index, seconds, bottom=below, color=_STAGE_COLOURS[stage], width=0.85, label=stage)
-        below += seconds
-    top = 1.3 * max(float(np.quantile(below, 0.95)), 1e3 / paper_hz)
-    axes[0].set_ylim(0, top)
-    for i in np.flatnonzero(below > top):
-        axes[0].text(index[i] + 0.6, 0.97 * top, f"{below[i] / 1e3:.1f} s", va="top", fontsize=8)
-    axes[0].axhline(1e3 / paper_hz, color="black", linestyle=":", label=f"paper, {paper_hz:g} Hz")
-    axes[0].set(xlabel="frame", ylabel="ms", title="Time of each frame, by stage")
-    axes[0].legend(fontsize=8, ncols=2)
-    medians = {
-        stage: 1e3 * float(np.median([r.seconds[stage] for r in results if stage in r.seconds]))
-        for stage in STAGES
-        if any(stage in r.seconds for r in results)
-    }
-    axes[1].barh(list(medians), list(medians.values()), color=[_STAGE_COLOURS[stage] for stage in medians])
-    for i, value in enumerate(medians.values()):
-        axes[1].text(value, i, f" {value:.0f}" if value >= 10 else f" {value:.1f}", va="center")
-    axes[1].set(xlim=(0, 1.3 * max(medians.values())), xlabel="ms", title="Median where it ran")
-    axes[1].invert_yaxis()
-    axes[1].grid(axis="y", visible=False)
+    rows = {stage: [(r.index, r.seconds[stage]) for r in results if stage in r.seconds] for stage in STAGES}
+    rows["whole frame"] = [(r.index, sum(r.seconds.get(stage, 0.0) for stage in STAGES)) for r in results]
+    rows = {name: np.array(found) for name, found in rows.items() if found}
+    page, ax = figure(width_in=10, height_in=0.5 * len(rows) + 1.1)
+    rng = np.random.default_rng(0)
+    for k, (name, found) in enumerate(rows.items()):
+        ms, warm = np.maximum(1e3 * found[:, 1], 0.05), found[:, 0] < results[0].index + 2
+        colour, y = _STAGE_COLOURS.get(name, "black"), k + rng.uniform(-0.22, 0.22, len(found))
+        ax.scatter(ms[~warm], y[~warm], s=16, color=colour, alpha=0.6, linewidths=0)
+        ax.scatter(ms[warm], y[warm], s=22, facecolors="none", edgecolors=colour)
+        median = float(np.median(ms))
+        ax.plot([median] * 2, [k - 0.38, k + 0.38], color="black", lw=2.2)
+        said = f"{median:.0f} ms" if median >= 10 else f"{median:.1f} ms"
+        ax.text(1.01, k, said, transform=ax.get_yaxis_transform(), va="center")
+    ax.axvline(1e3 / paper_hz, color=COLOURS["paper"], linestyle="--", label=f"paper, whole frame: {1e3 / paper_hz:.0f} ms")
+    ax.set_yticks(range(len(rows)), rows)
+    ax.set(xscale="log", xlabel="time of a frame (ms); bar and number: median", ylim=(len(rows) - 0.4, -0.6))
+    ax.xaxis.set_major_formatter("{x:g}")
+    ax.grid(axis="y", visible=False)
+    page.legend(loc="outside upper right")
     return page
 
 
@@ -173,4 +168,9 @@ def dashboard(left: np.ndarray, result: FrameResult) -> Figure:
 def frame_browser(frames: Sequence[StereoFrame], results: Sequence[FrameResult], *, start: int = 0) -> VBox:
     """A slider over the frames with their dashboards; without a browser it shows `start`."""
     slider = IntSlider(value=start, min=0, max=len(results) - 1, continuous_update=False)
-    return explore(lambda frame: dashboard(frames[frame].left, results[frame]), frame=slider)
+
+    def look(frame: int) -> Figure:
+        """A frame with what the pipeline found in it, and the surface with the tool above it."""
+        return dashboard(frames[frame].left, results[frame])
+
+    return explore(look, frame=slider)

@@ -12,10 +12,11 @@ import torch
 from IPython.display import HTML
 from ipywidgets import SelectionSlider, VBox
 from matplotlib.axes import Axes
-from matplotlib.colors import LightSource, PowerNorm
+from matplotlib.colors import LightSource, LogNorm, PowerNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import LogLocator
+from scipy.spatial import KDTree
 
 from lib.cameras import StereoRig
 from lib.matching import Matches
@@ -44,7 +45,9 @@ __all__ = [
     "held_out_curve",
     "match_fields",
     "mesh_still",
+    "neighbourhood",
     "point_errors",
+    "predicted_error",
     "profiles",
     "reconstruction",
     "recorded_speeds",
@@ -149,6 +152,26 @@ def response_pyramid(left: np.ndarray, right: np.ndarray, maps: list[ResponseMap
         bottom.plot(*level.peak_px, "+", color="cyan", markersize=14, markeredgewidth=2)
         bottom.set_title(f"{rivals} of {level.response.size} places\nabove 80 % of the peak", fontsize=9)
         bottom.set(xlim=(-0.5, right.shape[1] - 0.5), ylim=(right.shape[0] - 0.5, -0.5))
+    return page
+
+
+def neighbourhood(left: np.ndarray, right: np.ndarray, alone: ResponseMap, judged: ResponseMap) -> Figure:
+    """Left: a patch; then the right image with the places that fit it, alone and judged with its neighbourhood."""
+    page, axes = figure(1, 3, width_in=11, height_in=2.9)
+    show_image(axes[0], left, f"Left: one {alone.size_px} px patch")
+    corner = alone.centre_px - alone.size_px / 2
+    axes[0].add_patch(Rectangle(corner, alone.size_px, alone.size_px, fill=False, color="white", lw=2))
+    for ax, one, name in zip(axes[1:], (alone, judged), ("alone", "with its neighbourhood"), strict=True):
+        show_image(ax, 0.5 * _grey(right) + 110)
+        ax.images[0].set_clim(0, 255)
+        share = one.response / one.response.max()
+        y, x = np.nonzero(share > 0.5)
+        order = np.argsort(share[y, x])
+        u = np.stack([x, y])[:, order] * one.stride_px - 0.5
+        dots = ax.scatter(*u, c=share[y, x][order], s=14, marker="s", cmap="magma_r", vmin=0.5, vmax=1, linewidths=0)
+        ax.plot(*one.peak_px, "o", markersize=13, markerfacecolor="none", markeredgecolor=COLOURS["ours"], markeredgewidth=2)
+        ax.set_title(f"Right, {name}: {int((share > 0.8).sum())} places")
+    page.colorbar(dots, ax=axes[1:].tolist(), label="response / peak", shrink=0.8)
     return page
 
 
@@ -274,9 +297,10 @@ def smoothness_slider(
     points: tuple[np.ndarray, np.ndarray],
     reference: dict[str, tuple[np.ndarray, str]],
 ) -> VBox:
-    """A slider over sections of surfaces of growing smoothness (in JupyterLab; elsewhere nothing moves)."""
+    """A slider over sections of surfaces of growing smoothness."""
 
     def draw(mu: int) -> Figure:
+        """A section through the surface at one smoothness, beside the points and the chosen surface."""
         page, ax = figure(width_in=11, height_in=3.4)
         _relative_section(ax, mu, depths_mm, position_mm, points, reference)
         ax.set(title=f"mu = {smoothness[mu]:.2g} px²/mm", ylabel="depth beyond the chosen surface (um)")
@@ -347,6 +371,28 @@ def error_maps(maps_um: dict[str, np.ndarray], *, limit_um: float | None = None,
         ax.images[0].set(cmap=_SIGNED if signed else _ERROR, clim=(-limit_um if signed else 0, limit_um))
         ax.set_facecolor("#dddddd")
     page.colorbar(axes[0][-1].images[0], ax=axes[0].tolist(), label="depth error (um)" if signed else "um", shrink=0.85)
+    return page
+
+
+def predicted_error(sigma_um: np.ndarray, error_um: np.ndarray | None = None) -> Figure:
+    """Map (h, w) of the predicted standard deviation of the depth; and the RMS of the true error where it says so much."""
+    page, axes = figure(1, 2 if error_um is not None else 1, width_in=10, height_in=3.4, squeeze=False)
+    show_image(axes[0, 0], sigma_um, "Predicted standard deviation (um)")
+    axes[0, 0].images[0].set(cmap=_ERROR, clim=(0, float(np.nanpercentile(sigma_um, 99))))
+    axes[0, 0].set_facecolor("#dddddd")
+    page.colorbar(axes[0, 0].images[0], ax=axes[0, 0], label="um", shrink=0.8)
+    if error_um is None:
+        return page
+    known = np.isfinite(sigma_um) & np.isfinite(error_um)
+    sigma, error = sigma_um[known], error_um[known]
+    groups = np.array_split(np.argsort(sigma), min(8, max(1, len(sigma) // 20)))
+    x, rms = ([np.sqrt(np.mean(v[group] ** 2)) for group in groups] for v in (sigma, error))
+    axes[0, 1].plot(x, rms, "o-", color=COLOURS["ours"], label=f"RMS of {len(groups[0])} places each")
+    end = 1.1 * max(*x, *rms)
+    axes[0, 1].plot([0, end], [0, end], color=COLOURS["baseline"], ls="--", label="as predicted")
+    axes[0, 1].set(xlabel="predicted standard deviation (um)", ylabel="true depth error, RMS (um)", xlim=(0, 1.1 * max(x)))
+    axes[0, 1].set(title="Does it come true?", ylim=(0, end))
+    axes[0, 1].legend(fontsize=9)
     return page
 
 
@@ -681,6 +727,7 @@ def disparity_errors(
     truth_px: np.ndarray,
     errors_px: dict[str, tuple[np.ndarray, np.ndarray]],
     *,
+    low_px: float = 0.1,
     limit_px: float = 4.0,
 ) -> Figure:
     """A real image, its measured disparity (h, w), and for each matcher its points (n, 2) and errors (n,) px."""
@@ -691,13 +738,20 @@ def disparity_errors(
     show_image(panels[1], truth_px, "Measured disparity")
     panels[1].images[0].set_cmap("viridis")
     for ax, (name, (u, error)) in zip(panels[2:], errors_px.items(), strict=False):
-        show_image(ax, np.full_like(_grey(image), 235), f"{name}: median {np.median(np.abs(error)):.2f} px")
+        show_image(ax, np.full_like(_grey(image), 255), f"{name}: median {np.median(np.abs(error)):.2f} px")
         ax.images[0].set(cmap="gray", clim=(0, 255))
-        size = 5.0 if len(u) > 1500 else 9.0
-        dots = ax.scatter(*u.T, c=np.abs(error), s=size, cmap=_ERROR, vmin=0, vmax=limit_px, linewidths=0)
+        # Squares as wide as the lattice, so that the map has no holes but where nothing is scored.
+        step_px = float(np.median(KDTree(u).query(u, k=2)[0][:, 1])) if len(u) > 1 else 1.0
+        size_pt = 72 * 3.9 * step_px / image.shape[1]  # a panel is about 3.9 in wide
+        errors = np.clip(np.abs(error), low_px, limit_px)
+        colours = {"cmap": "YlGnBu", "norm": LogNorm(low_px, limit_px)}
+        dots = ax.scatter(*u.T, c=errors, s=size_pt**2, marker="s", linewidths=0, **colours)
     for ax in panels[2 + len(errors_px) :]:
         ax.axis("off")
-    page.colorbar(dots, ax=panels.tolist(), label="|error| (px)", shrink=0.75)
+    bar = page.colorbar(dots, ax=panels.tolist(), label="|error| (px), logarithmic", shrink=0.75)
+    ticks = [tick for tick in (0.1, 0.25, 0.5, 1, 2, 4) if low_px <= tick <= limit_px]
+    bar.set_ticks(ticks, labels=[f"{tick:g}" for tick in ticks])
+    bar.minorticks_off()
     return page
 
 

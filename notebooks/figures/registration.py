@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
@@ -76,7 +77,9 @@ def error_curves(errors: Mapping[str, MotionErrors], *, paper_um: float | None =
 
     Many trials have their quartiles as a band; fewer than `_FEW` are shown one by one.
     """
-    page, axes = figure(1, 4, width_in=14, height_in=4.0)
+    page = plt.figure(figsize=(10, 5.4), layout="constrained")
+    panels = page.subplot_mosaic([["shift", "X"], ["shift", "Y"], ["shift", "Z"]], width_ratios=(1.5, 1))
+    axes = list(panels.values())
     for name, error in errors.items():
         style = _style(name)
         n = np.array(error.n_frames)
@@ -94,11 +97,11 @@ def error_curves(errors: Mapping[str, MotionErrors], *, paper_um: float | None =
     ticks = list(next(iter(errors.values())).n_frames)
     shared = [value for error in errors.values() for value in error.euler_rms_deg.ravel()]
     for k, ax in enumerate(axes):
-        ax.set(xscale="log", yscale="log", xlabel="frames")
+        ax.set(xscale="log", yscale="log", xlabel="frames" if k in (0, 3) else "")
         ax.set_xticks(ticks, [str(t) if t in (1, 2, 3, 5, 10) else "" for t in ticks])
         ax.minorticks_off()
         if k:
-            ax.set_title(f"Rotation $\\Phi_{'XYZ'[k - 1]}$ in degrees")
+            ax.set_title(f"Rotation about {'xyz'[k - 1]}, in degrees")
             ax.set_ylim(0.8 * np.nanmin(shared), 1.25 * np.nanmax(shared))
         _plain_log_ticks(ax)
     axes[0].set_title("Translation in um")

@@ -31,6 +31,10 @@ CELLS = [
     "view = go.Figure(mesh).add_scatter3d(x=[0, 1], y=[0, 1], z=[0, 1], mode='lines', line={'color': '#000', 'width': 5})\n"
     "eye, up = {'x': 1, 'y': 1, 'z': 1}, {'x': 0, 'y': 0, 'z': 1}\n"
     "show_scene(view.update_layout(scene_camera={'eye': eye, 'up': up}), 'A body.')",
+    "import numpy as np\nfrom IPython.display import display\n"
+    "from notebooks.figures.interactive import epipolar_pointer, swipe\n"
+    "left = np.zeros((60, 100, 3), np.uint8)\nF = np.array([[0, 0, 0], [0, 0, 1], [0, -1, 0]])\n"
+    "display(swipe(left, left + 200, 'A pair'))\nepipolar_pointer(left, left, F, (50, 30), 'A pixel and its line')",
     "table(['a long name of a column'] * 9, [['1'] * 9], 'A wide table.')",
     "print('x' * 300)  # " + "a long comment " * 9,
 ]
@@ -146,6 +150,23 @@ def test_sliders_move_their_pictures(browser, folder):
                               f"{slider}.dispatchEvent(new Event('input'))")  # fmt: skip
                 after = browser.value(shown)
                 assert len(before) == len(after) == 1 and before != after, (page.name, box, knob)
+                moved += 1
+    assert moved or folder.name != "tiny"
+
+
+def test_a_pair_is_swiped_and_a_line_follows_the_pointer(browser, folder):
+    moved = 0
+    for page in pages(folder):
+        open_page(browser, page, 1400)
+        slide = "const i = at.querySelector('input'); i.value = 20; i.dispatchEvent(new Event('input'))"
+        point = "const s = at.querySelector('svg'), b = s.getBoundingClientRect(); s.dispatchEvent("
+        point += "new PointerEvent('pointermove', { clientX: b.x + 9, clientY: b.y + 9 }))"
+        parts = {"swipe": "getAttribute('style')", "epipolar": "querySelector('line').outerHTML"}
+        for (kind, part), change in zip(parts.items(), (slide, point), strict=True):
+            at = f"const at = document.querySelector('.{kind}');"
+            if browser.value(f"document.querySelector('.{kind}') !== null"):
+                before = browser.value(f"(() => {{ {at} return at.{part}; }})()")
+                assert browser.value(f"(() => {{ {at} {change}; return at.{part}; }})()") != before, (page.name, kind)
                 moved += 1
     assert moved or folder.name != "tiny"
 
