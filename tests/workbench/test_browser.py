@@ -10,7 +10,7 @@ import pytest
 from lib import paths
 from lib.workbench.command import run
 from lib.workbench.headlines import complete_runs
-from tests.browser import Chromium, wait
+from tests.browser import Chromium
 
 pytestmark = pytest.mark.slow
 
@@ -192,7 +192,7 @@ def test_a_view_has_a_still_where_no_script_runs(browser, folder):
         browser.goto("about:blank")
         browser.call("Emulation.setScriptExecutionDisabled", value=True)
         browser.call("Page.navigate", url=page.as_uri())
-        wait(lambda: browser.told("Page.loadEventFired"), page.name)
+        browser.until(f"document.readyState === 'complete' && location.href.startsWith('{page.as_uri()}')", page.name)
         shown = "[...document.querySelectorAll('noscript img')].filter((e) => e.getBoundingClientRect().width > 100).length"
         assert browser.value(shown) == views
         hidden = "[...document.querySelectorAll('.plotly-view')].every((e) => e.getBoundingClientRect().height === 0)"
