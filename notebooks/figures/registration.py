@@ -103,7 +103,7 @@ def error_curves(errors: Mapping[str, MotionErrors], *, paper_um: float | None =
         if k:
             ax.set_title(f"Rotation about {'xyz'[k - 1]}, in degrees")
             ax.set_ylim(0.8 * np.nanmin(shared), 1.25 * np.nanmax(shared))
-        _plain_log_ticks(ax)
+        _plain_log_ticks(ax, (1,) if k else (1, 2, 5))
     axes[0].set_title("Translation in um")
     page.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=5)
     if title:
@@ -111,9 +111,9 @@ def error_curves(errors: Mapping[str, MotionErrors], *, paper_um: float | None =
     return page
 
 
-def _plain_log_ticks(ax) -> None:
+def _plain_log_ticks(ax, digits: Sequence[int] = (1, 2, 5)) -> None:
     low, high = ax.get_ylim()
-    ticks = [m * 10.0**e for e in range(-4, 6) for m in (1, 2, 5) if low <= m * 10.0**e <= high]
+    ticks = [m * 10.0**e for e in range(-4, 6) for m in digits if low <= m * 10.0**e <= high]
     ax.set_yticks(ticks, [f"{t:g}" for t in ticks])
 
 
