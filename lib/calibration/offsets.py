@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from lib.calibration.calibration import Calibration, LandmarkOffsets
 from lib.calibration.scatter import sandwich
@@ -128,5 +128,5 @@ def _evidence(information: np.ndarray, gradient: np.ndarray, least: float) -> tu
     inflation = 1.0 + candidates[:, None] ** 2 * np.maximum(values, 0.0)
     evidence = (along * candidates[:, None] ** 2 / inflation - np.log(inflation)).sum(axis=1)
     known = values * (500 * least) ** 2 > 1.0
-    p_value = float(chi2.sf((along[known] / values[known]).sum(), known.sum())) if known.any() else 1.0
+    p_value = float(chdtrc(known.sum(), (along[known] / values[known]).sum())) if known.any() else 1.0
     return float(candidates[np.argmax(evidence)]), p_value

@@ -11,8 +11,7 @@ consensus is refused, and so is one with two.
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import gammainccinv
-from scipy.stats import f as f_distribution
+from scipy.special import fdtri, gammainccinv
 
 from lib.calibration.affine import regress
 
@@ -152,7 +151,7 @@ def _by_growth(x: np.ndarray, u: np.ndarray, distance2: np.ndarray) -> _Found:
         distance2 = (r**2).sum(axis=1) / variance / (1.0 + leverage)
         distance2[keep] = -1.0
         order = np.argsort(distance2)
-        if distance2[order[len(keep)]] > 2.0 * f_distribution.isf(FALSE_ALARM / n, 2, max(freedom, 1)):
+        if distance2[order[len(keep)]] > 2.0 * fdtri(2, max(freedom, 1), 1.0 - FALSE_ALARM / n):
             break
         keep = order[: len(keep) + 1]
     matrix = regress(x[keep], u[keep])

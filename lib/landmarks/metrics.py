@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 __all__ = ["GROSS_PX", "PCK_THRESHOLDS", "Scores", "calibration_error", "errors_px", "nees", "pck", "reliability", "score"]
 
@@ -125,7 +125,7 @@ def score(u: ArrayLike, u_true: ArrayLike, covariance: ArrayLike | None = None, 
         p95_px=float(p95),
         bias_px=(float(x), float(y)),
         nees=float(squared.mean()) if squared.size else np.nan,
-        coverage_95=100.0 * float((squared <= chi2.ppf(0.95, 2)).mean()) if squared.size else np.nan,
+        coverage_95=100.0 * float((squared <= chdtri(2, 0.05)).mean()) if squared.size else np.nan,
         labels=int((~np.isnan(error)).sum()),
         missed=int(np.isinf(error).sum()),
         gross=int((found >= GROSS_PX).sum()),

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from lib.cameras import StereoRig
 from lib.correspondences import LANDMARKS, Correspondences
@@ -149,7 +149,7 @@ class FrameResult:
 
     def watch(self, settings: Settings) -> None:
         """Set the alarm of each tip from its distance."""
-        self.margin_mm = norm.isf(settings.miss_rate) * self.distance_sd_mm
+        self.margin_mm = -ndtri(settings.miss_rate) * self.distance_sd_mm
         self.too_close = self.distance_mm < settings.alarm_mm + self.margin_mm
 
     @contextmanager

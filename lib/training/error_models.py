@@ -7,8 +7,7 @@ from typing import Self
 
 import numpy as np
 from scipy.optimize import minimize
-from scipy.special import expit
-from scipy.stats import chi2
+from scipy.special import chdtri, expit
 from tqdm.auto import tqdm
 
 from lib.geometry import cell_from_image
@@ -83,7 +82,7 @@ class Seen:
         normalised = (squared / np.exp((rows * features[:, :2]).sum(-1))).sum(1)
         for own, columns in ((~tip[:, 0], np.s_[:1]), (tip[:, 0], np.s_[1:3])):
             if own.any():
-                log_variance[:, columns] += 0.5 * np.log(np.quantile(normalised[own], 0.95) / chi2.ppf(0.95, 2))
+                log_variance[:, columns] += 0.5 * np.log(np.quantile(normalised[own], 0.95) / chdtri(2, 0.05))
         return ErrorModel(log_variance, logit)
 
     def gain(self, gross_px: float, gains: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
