@@ -5,7 +5,7 @@ landmarks: the detector, a person who labels, or the simulator (paper Eq. 2).
 """
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
@@ -25,6 +25,9 @@ MIN_CONFIDENCE = 0.2
 TRAIN_FURTHER = "let the robot teach it: `python3 -m lib adapt RECORDING`"
 #: Half the time over which a velocity is measured: long enough to average the robot's noise, short for its motion.
 _VELOCITY_S = 0.05
+#: What a row of each attribute of `Correspondences` is, in the order of its arguments.
+_SHAPES = {"x_mm": (3,), "u_left": (2,), "u_right": (2,), "covariance_px2": (2, 2, 2), "confidence": (2,), "frame": (),
+           "landmark": (), "time_s": ()}  # fmt: skip
 
 
 class NoDetectionError(ValueError):
@@ -58,8 +61,8 @@ class Correspondences:
     time_s: np.ndarray
 
     def __post_init__(self) -> None:
-        n, tails = len(np.atleast_1d(self.frame)), ((3,), (2,), (2,), (2, 2, 2), (2,), (), (), ())
-        for name, tail in zip((field.name for field in fields(Correspondences)), tails, strict=True):
+        n = len(np.atleast_1d(self.frame))
+        for name, tail in _SHAPES.items():
             dtype = np.int64 if name in ("frame", "landmark") else np.float64
             array = np.asarray(getattr(self, name), dtype=dtype)
             if array.shape != (n, *tail):
@@ -95,7 +98,7 @@ class Correspondences:
     def join(cls, parts: Iterable[Self]) -> Self:
         """The rows of several, in their order."""
         parts = list(parts)
-        return cls(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)))
+        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in _SHAPES))
 
     @property
     def seen(self) -> np.ndarray:
@@ -137,7 +140,7 @@ class Correspondences:
     def subset(self, rows: slice | ArrayLike) -> Self:
         """The rows that a slice, a mask or an array of indices names."""
         rows = rows if isinstance(rows, slice) else np.asarray(rows)
-        return type(self)(*(getattr(self, f.name)[rows] for f in fields(self)))
+        return type(self)(*(getattr(self, name)[rows] for name in _SHAPES))
 
     def of_frames(self, frames: ArrayLike) -> Self:
         """The rows of these frames."""
