@@ -43,13 +43,8 @@ def commit_id() -> str:
 def machine() -> dict:
     """System, processor, cores that this process may use, memory and GPU."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return {
-        "system": f"{platform.system()} {platform.release()}",
-        "processor": _processor(),
-        "cores": cores,
-        "memory_gb": _memory_gb(),
-        "gpu": _gpu(),
-    }
+    system = f"{platform.system()} {platform.release()}"
+    return {"system": system, "processor": _processor(), "cores": cores, "memory_gb": _memory_gb(), "gpu": _gpu()}
 
 
 @dataclass(frozen=True)

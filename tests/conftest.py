@@ -16,12 +16,13 @@ import pytest
 
 import lib.workbench  # noqa: F401 - before nbformat: it spares each process seconds
 
-#: The files that take longest, from about 25 to 8 s of the processor: they go first, so that no worker begins one last.
+#: The files that take longest, from about 20 to 4 s of the processor: they go first, so that no worker begins one last.
 LONGEST = (
-    "adapt/test_adapt.py", "test_notebooks.py", "online/test_faults.py", "landmarks/test_shipped.py", "test_readme.py",
-    "test_notebooks_course.py", "landmarks/test_export.py", "online/test_pipeline.py", "training/test_loop.py",
-    "simulator/test_dataset.py", "training/test_command.py", "workbench/test_sweep.py", "workbench/test_run.py",
-    "studies/test_calibration.py", "training/test_error_models.py",
+    "adapt/test_adapt.py", "training/test_loop.py", "online/test_faults.py", "test_notebooks.py",
+    "test_notebooks_course.py", "landmarks/test_shipped.py", "calibration/test_estimate.py", "online/test_pipeline.py",
+    "studies/test_calibration.py", "simulator/test_dataset.py", "workbench/test_run.py", "calibration/test_robust.py",
+    "landmarks/test_export.py", "importing/test_import.py", "test_readme.py", "landmarks/test_detector.py",
+    "workbench/test_sweep.py", "training/test_error_models.py", "training/test_command.py",
 )  # fmt: skip
 
 hypothesis.settings.register_profile("microstereo", derandomize=True, deadline=None, max_examples=50, database=None)

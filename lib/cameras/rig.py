@@ -186,9 +186,8 @@ class StereoRig:
             )
             return cls(left, right)
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-            raise ValueError(
-                f"{path}: not a stereo rig written by StereoRig.save ({type(error).__name__}: {error})."
-            ) from None
+            why = f"{type(error).__name__}: {error}"
+            raise ValueError(f"{path}: not a stereo rig written by StereoRig.save ({why}).") from None
 
 
 def _matches(u_left: ArrayLike, u_right: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
