@@ -189,7 +189,7 @@ def _calibrate(
     for rows in views.T:
         refuse.check_spread(x[rows], assumed_x)
     centre = (np.asarray(image_size_px, dtype=float) - 1) / 2 if image_size_px is not None else None
-    for _ in range(4):
+    for last in (False, False, False, True):
         inliers = views.any(axis=1)
         rows_noise = noise if noise is None or len(noise) == 1 else noise[inliers]
         minimum, (sigma_u, sigma_x), variances = _minimise(
@@ -206,7 +206,7 @@ def _calibrate(
         S = np.stack([S[:, i : i + 2, i : i + 2] for i in range(0, m, 2)], axis=1)
         r = residuals.reshape(n, -1, 2, 1)
         new = (np.swapaxes(r, 2, 3) @ np.linalg.inv(S) @ r)[..., 0, 0] < gates  # NaN, not seen, is not below
-        if (new == views).all() or new.sum() < views.sum():
+        if last or (new == views).all() or new.sum() < views.sum():  # those that the minimum is of
             break
         views = new
 
