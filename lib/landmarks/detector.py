@@ -42,20 +42,20 @@ from lib.landmarks.windows import (
 from lib.parallel import single_threaded_torch
 from lib.recordings import Recording
 
-__all__ = ["CLOSE", "MISSING_BELOW", "TRACKED_FROM", "Detector", "Landmarks", "detect"]
+__all__ = ["CLOSE", "CLOSEUP_FROM", "MISSING_BELOW", "TRACKED_FROM", "Detector", "Landmarks", "detect"]
 
 FORMAT = "microstereo.detector"
 #: The fields that a weights file keeps as plain values.
 _SETTINGS = ("frame_px", "window_px", "mirror", "method")
 #: A landmark with a lower confidence counts as missing: NaN, confidence 0.
 MISSING_BELOW = 0.05
-#: A landmark with a lower confidence gets no closeup and is not followed from frame to frame.
-TRACKED_FROM = 0.5
+#: A landmark with a lower confidence is not followed from frame to frame, and gets no closeup.
+TRACKED_FROM, CLOSEUP_FROM = 0.5, 0.25
 #: The stages that look at closeups: twice of what the tool's window showed, and of what was found in the frame before.
 CLOSE = ("closeup", "closer", "tracking")
 #: Where the first stage is less sure than this of a landmark, other places are looked at: this many tools, made of peaks at
-#: these scales of the first stage's input.
-_SURE, _CANDIDATES, _SCALES = 0.5, 5, (1.0, 1.5)
+#: these scales of the first stage's input, and the best of them again.
+_SURE, _CANDIDATES, _SCALES, _AGAIN = 0.5, 24, (0.75, 1.0, 1.5, 2.2), 6
 #: A tracked landmark that moved farther than this, in closeups of scale 1, gets a second closeup.  After a shorter way one
 #: closeup is as exact, as validation images of other eyes and tools say.
 _SECOND_LOOK_PX = 4.0
@@ -305,17 +305,28 @@ class Detector:
     def searched(self, images: np.ndarray, rough: Landmarks) -> Landmarks:
         """What later stages start from: `rough`, or, where that is unsure, the tool that its window shows best.
 
-        Candidates are `rough` and tools made of the highest peaks that the first stage sees at two scales.
+        Candidates are `rough` and tools made of the highest peaks that the first stage sees at several scales.  All are
+        looked at once, the best ones again; the highest peaks win, and their height is the confidence.
         """
         result = Landmarks.join([rough])  # a copy
         for i in np.flatnonzero((rough.confidence < _SURE).any(1)) if self.tool_network else ():
             image = images[i : i + 1]
             candidates = Landmarks.join([rough[i : i + 1], self._candidates(image)])
-            shown = candidates
-            for stage in ("tool", "again"):
-                shown = self.refine(np.broadcast_to(image, (len(shown), *image.shape[1:])), shown, stage)
-            result._put(np.array([i]), candidates[[shown.confidence.mean(1).argmax()]])
+            u, height = self._shown(image[0], candidates.u, "tool")
+            best = np.argsort(-height)[:_AGAIN]
+            _, height = self._shown(image[0], u[best], "again")
+            chosen = candidates[best[[height.argmax()]]]
+            result._put(np.array([i]), replace(chosen, confidence=np.full((1, 3), height.max())))
         return result
+
+    def _shown(self, image: np.ndarray, u: np.ndarray, stage: str) -> tuple[np.ndarray, np.ndarray]:
+        """Where the windows of tools u (n, 3, 2) in one image show the landmarks, and the mean height (n,) of the peaks."""
+        peaks, matrices, which = self.stage_peaks(np.broadcast_to(image, (len(u), *image.shape)), u, stage)
+        i, k = which.T
+        found, height = np.full(u.shape, np.nan), np.zeros(u.shape[:2])
+        found[i, k] = _through_inverse(matrices, peaks.u[:, 0].double().numpy())
+        height[i, k] = peaks.value[:, 0].numpy()
+        return found, np.exp(np.log(np.clip(height, 0.01, 1)).mean(1))
 
     def _candidates(self, image: np.ndarray) -> Landmarks:
         """Tools (m, 3, 2) that one image (1, h, w, 3) may show."""
@@ -341,8 +352,7 @@ class Detector:
         if not len(which):
             return result
         fine = self._measured(peaks, self.rough_in_windows(rough, matrices, which, stage), stage, which[:, 1:])
-        back = np.linalg.inv(matrices[:, :, :2])
-        u = (back @ (fine.u[:, 0] - matrices[:, :, 2])[..., None])[..., 0]
+        u, back = _through_inverse(matrices, fine.u[:, 0]), np.linalg.inv(matrices[:, :, :2])
         covariance = back @ fine.covariance[:, 0] @ back.mT
         confidence = fine.confidence[:, 0]
         if stage in CLOSE:
@@ -350,12 +360,12 @@ class Detector:
             confidence = np.where(near, confidence, 0.0)
         if stage in ("closeup", "closer"):
             # The stage before decides whether the landmark is there; an unsure one stays where it was seen.
-            near &= rough.confidence[which[:, 0], which[:, 1]] >= TRACKED_FROM
+            near &= rough.confidence[which[:, 0], which[:, 1]] >= CLOSEUP_FROM
             u, covariance, confidence, which = u[near], covariance[near], confidence[near], which[near]
         result.confidence[which[:, 0], which[:, 1]] = confidence
         i, k = which.T
         result.u[i, k], result.covariance[i, k] = u, covariance
-        return result.without_unsure()
+        return result if stage == "tool" else result.without_unsure()  # the second look may be surer
 
     def rough_in_windows(self, rough: Landmarks, matrices: np.ndarray, which: np.ndarray, stage: str) -> Rough | None:
         """What the stage before found, in the windows of this one; None where that is evidence of nothing."""
@@ -435,6 +445,11 @@ class Detector:
         fit = self.error_models.get(stage, ErrorModel())
         covariance, confidence = covariance_and_confidence(peaks.double(), rough, fit, landmark)
         return Landmarks(peaks.u.numpy(), covariance.numpy(), confidence.numpy())
+
+
+def _through_inverse(matrices: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """Points u (n, 2) of windows in the image, from the windows' matrices (n, 2, 3)."""
+    return np.linalg.solve(matrices[:, :, :2], (u - matrices[:, :, 2])[..., None])[..., 0]
 
 
 def _moved_px(before: np.ndarray, after: np.ndarray) -> float:

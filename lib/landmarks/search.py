@@ -1,4 +1,4 @@
-"""Where else the tool may lie, if the first stage is unsure: its highest peaks, at two scales, put together to tools."""
+"""Where else the tool may lie, if the first stage is unsure: its highest peaks, at several scales, put together to tools."""
 
 from itertools import product
 
@@ -10,7 +10,7 @@ from lib.landmarks.heatmaps import SIGMA_PX, sigma_cells
 __all__ = ["PEAKS", "best_tools", "without_peak"]
 
 #: Peaks that are taken from each heatmap.
-PEAKS = 2
+PEAKS = 4
 #: Two tools are the same if their landmarks differ by less than this share of the length, in the mean.
 _SAME = 0.25
 

@@ -11,7 +11,7 @@ from scipy.special import chdtri, expit
 from tqdm.auto import tqdm
 
 from lib.geometry import cell_from_image
-from lib.landmarks.detector import CLOSE, TRACKED_FROM, Detector, Landmarks
+from lib.landmarks.detector import CLOSE, CLOSEUP_FROM, TRACKED_FROM, Detector, Landmarks
 from lib.landmarks.error_model import FEATURES, ErrorModel, features_of
 from lib.landmarks.metrics import GROSS_PX, tool_length_px
 from lib.landmarks.windows import CLOSEUP_REACH_PX, CLOSEUP_ZOOM, expected_in_closeup, map_points
@@ -136,7 +136,7 @@ def seen_by(
     if stage in CLOSE:
         keep = peaks.value[:, 0].numpy() > 0
         if stage != "tracking":  # of an unsure landmark nothing is changed
-            keep &= rough.confidence[which[:, 0], which[:, 1]] >= TRACKED_FROM
+            keep &= rough.confidence[which[:, 0], which[:, 1]] >= CLOSEUP_FROM
         moved = at - expected_in_closeup(detector.closeup_network.config.size_px, landmark)
     errors = at - map_points(matrices, labels[landmark])
     tolerance = tolerance * np.sqrt(np.abs(np.linalg.det(matrices[:, :, :2])))
@@ -162,13 +162,7 @@ def fit_error_models(detector: Detector, images: Iterable[LabelledImage], *, pro
     detector = replace(detector, error_models={k: v for k, v in detector.error_models.items() if k not in CLOSE})
     rough: list[Landmarks | None] = [None] * len(images)
     rng = np.random.default_rng(0)
-    stages = detector.stages
-    if "tool" in stages:  # once more, since what the search chooses from many places is another population
-        stages[3:3] = ["tool", "again"]
-    for number, stage in enumerate(stages):
-        if number == 3 and stage == "tool":
-            starts = (detector.coarse(part.image[None]) for part in images)
-            rough = [detector.searched(part.image[None], start) for part, start in zip(images, starts, strict=True)]
+    for stage in detector.stages:
         parts, found = [], []
         for labelled, start in zip(tqdm(images, disable=not progress, unit="image", desc=stage), rough, strict=True):
             if stage == "tracking":  # a tool that jumps now and then, which tracking has to notice
@@ -190,7 +184,7 @@ def fit_error_models(detector: Detector, images: Iterable[LabelledImage], *, pro
             seen = replace(seen, errors=seen.errors + (gain[seen.landmark] - 1) * seen.moved - bias[seen.landmark])
         detector = detector.with_error_models(**{stage: replace(seen.fit(gross_px), gain=gain, bias=bias)})
         if stage == "frame":  # the landmarks that the next stage starts from
-            rough = [detector.coarse(part.image[None]) for part in images]
+            rough = [detector.searched(image, detector.coarse(image)) for image in (part.image[None] for part in images)]
         elif stage != "tracking":
             known = [None] * len(images) if stage in CLOSE else found  # a closeup's correction depends on the gain
             parts = zip(images, rough, known, strict=True)

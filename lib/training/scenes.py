@@ -24,6 +24,8 @@ FRAME_PX, PART_PX = (320, 192), (160, 128)
 SHORTEST_PX = 5.0
 #: Nor are tools in an image whose grey values spread less.
 FLAT = 5.0
+#: By how much a window is turned (rad), magnified (log) and shifted (its pixels) if it still shows the tool, and if not.
+_SHOWS, _SHOWS_NOT = ((0.0, 0.7), (0.0, 0.6), (0.0, 30.0)), ((1.0, np.pi), (0.8, 1.6), (60.0, 150.0))
 
 
 @dataclass(frozen=True)
@@ -99,7 +101,7 @@ class FrameSource(SceneSource):
         middle = (np.array(frame.shape[1::-1]) - 1) / 2
         if not self.disguise:  # as `Detector` sees it
             return self._seen(scene, windows.window_from_image(middle, 0.0, FRAME_PX, fit), FRAME_PX, rng)
-        zoom = np.clip(fit * np.exp(rng.normal(0, 0.3)), 0.4 * fit, None)
+        zoom = np.clip(fit * np.exp(rng.normal(0, 0.45)), 0.4 * fit, None)
         if np.isfinite(length):
             zoom = np.clip(zoom, 7 / length, 85 / length)
             far = rng.random() < 0.25
@@ -115,27 +117,42 @@ class FrameSource(SceneSource):
 class ToolSource(SceneSource):
     """Upright windows of `windows.TOOL_PX` round the tool, placed, turned and scaled as badly as the stage before does.
 
-    A tenth lie elsewhere in the frame and hold no landmark.
+    Three in ten show no tool that stands upright in its size: peaks must be low there, since they decide between places.
     """
 
     def draw(self, index: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        frame, u, visibility, _ = scene = self.scene(index, rng)
+        _, u, visibility, _ = scene = self.scene(index, rng)
         size = windows.TOOL_PX
         (centre,), (angle,) = windows.tool_pose(u[None])
         length = _length_px(u, visibility)
-        if not np.isfinite(angle + length) or (self.disguise and rng.random() < 0.1):
-            zoom = np.exp(rng.uniform(np.log(0.4), np.log(2.5)))
-            centre, angle = rng.uniform((0, 0), frame.shape[1::-1]), rng.uniform(-np.pi, np.pi)
-            matrix = windows.window_from_image(centre, angle, size, zoom)
-            image, at, visibility = self._seen(scene, matrix, (size, size), rng)
-            inside = ((at > -0.5) & (at < size - 0.5)).all(1) & (visibility > 0)
-            return image, np.where(inside[:, None], np.nan, at), visibility  # another scale or direction is no example
+        if not np.isfinite(angle + length) or (self.disguise and rng.random() < 0.3):
+            return self._elsewhere(scene, centre, angle, length, rng)
         worse = 3.0 if rng.random() < 0.15 else 1.0
         zoom = windows.tool_zoom(length) * np.exp(np.clip(rng.normal(0, 0.12 * worse), -0.6, 0.6))
         centre = centre + np.clip(rng.normal(0, 7 * worse, 2), -30, 30) / zoom
         angle = angle + np.clip(rng.normal(0, 0.12 * worse), -0.7, 0.7)
         matrix = windows.window_from_image(centre, angle, size, zoom)
         return _mirrored(*self._seen(scene, matrix, (size, size), rng), rng if self.disguise else None)
+
+    def _elsewhere(self, scene, centre: np.ndarray, angle: float, length: float, rng: np.random.Generator):
+        """A window anywhere, or one by the tool that is turned, of another scale or shifted too far."""
+        size, wrong = windows.TOOL_PX, np.zeros(3, bool)
+        if np.isfinite(angle + length) and rng.random() < 0.7 * scene[3].min():  # not by a doubtful label
+            wrong = rng.random(3) < 0.4
+            wrong[rng.integers(3)] = True
+            by = [rng.uniform(*(_SHOWS_NOT if bad else _SHOWS)[i]) for i, bad in enumerate(wrong)]
+            sign, way = rng.choice([-1, 1], 2), rng.uniform(-np.pi, np.pi)
+            angle, zoom = angle + sign[0] * by[0], windows.tool_zoom(length) * np.exp(sign[1] * by[1])
+            centre = centre + by[2] / zoom * np.array([np.cos(way), np.sin(way)])
+        else:
+            zoom = np.exp(rng.uniform(np.log(0.4), np.log(2.5)))
+            centre, angle = rng.uniform((0, 0), scene[0].shape[1::-1]), rng.uniform(-np.pi, np.pi)
+        matrix = windows.window_from_image(centre, angle, size, zoom)
+        image, at, visibility = self._seen(scene, matrix, (size, size), rng)
+        if wrong.any():
+            return image, np.full((3, 2), -float(size)), np.zeros(3, int)
+        inside = ((at > -0.5) & (at < size - 0.5)).all(1) & (visibility > 0)
+        return image, np.where(inside[:, None], np.nan, at), visibility  # another scale or direction is no example
 
 
 def _mirrored(image, u, visibility, rng: np.random.Generator | None):

@@ -38,10 +38,9 @@ def test_an_unsure_image_starts_from_the_tool_that_its_window_shows_best(monkeyp
     rough = Landmarks.join([landmarks(TOOL[None], 0.9), landmarks(TOOL[None] + 200, 0.3)])
     monkeypatch.setattr(Detector, "_candidates", lambda *_: landmarks(np.stack([TOOL + 90, TOOL]), 0.1))
 
-    def refine(self, images, shown, stage):
-        near = np.linalg.norm(shown.u - TOOL, axis=2) < 20
-        return Landmarks(shown.u, shown.covariance, np.where(near, 0.8, 0.2))
+    def shown(self, image, u, stage):
+        return u, np.where(np.linalg.norm(u - TOOL, axis=2).max(1) < 20, 0.8, 0.2)
 
-    monkeypatch.setattr(Detector, "refine", refine)
+    monkeypatch.setattr(Detector, "_shown", shown)
     found = detector.searched(np.zeros((2, 64, 96, 3), np.uint8), rough)
-    assert np.array_equal(found.u, np.stack([TOOL, TOOL])) and found.confidence[:, 0].tolist() == [0.9, 0.1]
+    assert np.array_equal(found.u, np.stack([TOOL, TOOL])) and found.confidence[:, 0].tolist() == [0.9, 0.8]

@@ -43,3 +43,14 @@ def test_a_source_draws_tools_and_undrawn_frames_keep_their_labels():
         rng = np.random.default_rng(0)
         assert not any(np.isfinite(plain.draw(0, rng)[1]).all(axis=1).any() for _ in range(5))  # weight 0: no label counts
         assert any(np.isfinite(drawn.draw(0, rng)[1]).all() for _ in range(10))
+
+
+def test_some_windows_show_that_a_tool_askew_too_small_or_aside_is_none():
+    u = np.array([[100.0, 90], [150, 80], [150, 100]])
+    source, rng = ToolSource.of([LabelledImage("a", GROUND, u, np.full(3, 2))]), np.random.default_rng(0)
+    draws = [source.draw(0, rng)[1:] for _ in range(300)]
+    none = np.array([(visibility == 0).all() and np.isfinite(at).all() for at, visibility in draws])
+    assert 0.1 < none.mean() < 0.3  # 0.3 * 0.7, and what else leaves the window
+    shown = np.stack([at for at, visibility in draws if (visibility > 0).all() and (abs(at - 63.5) < 64).all()])
+    ahead = shown[:, 1:].mean(1) - shown[:, 0]
+    assert (np.abs(np.arctan2(ahead[:, 1], ahead[:, 0])) < 0.75).all()

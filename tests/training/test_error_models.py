@@ -62,7 +62,8 @@ def test_fitted_variance_of_known_errors():
 def test_closeups_that_know_nothing_do_no_harm(small, monkeypatch):
     """The corrections of an untrained offset network are a constant, which is bias, or noise, which is not believed."""
     for module in (error_models, detectors):
-        monkeypatch.setattr(module, "TRACKED_FROM", 0.0)  # toys are too small to be sure of
+        for name in ("TRACKED_FROM", "CLOSEUP_FROM"):  # toys are too small to be sure of
+            monkeypatch.setattr(module, name, 0.0)
     detector, frames = small
     torch.manual_seed(0)
     closeup = OffsetNetwork(OffsetConfig(4, 32)).eval()
