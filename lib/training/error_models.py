@@ -143,7 +143,10 @@ def seen_by(
     return Seen(*(part[keep] for part in (feature, errors, tolerance, landmark, moved, known[landmark])))
 
 
-def fit_error_models(detector: Detector, images: Iterable[LabelledImage], *, progress: bool = False) -> Detector:
+def fit_error_models(
+    detector: Detector, images: Iterable[LabelledImage], *, closeups_also: Sequence[LabelledImage] = (),
+    progress: bool = False,
+) -> Detector:  # fmt: skip
     """The detector with the error model of every stage fitted on validation images, never trained on.
 
     A closeup's correction is scaled by the gain that minimises the validation error, and centred; while tracking it counts
@@ -153,11 +156,13 @@ def fit_error_models(detector: Detector, images: Iterable[LabelledImage], *, pro
     Args:
         images: Easy and hard ones, since confidence is learnt from failures, and of many tools, since errors within a
             recording correlate because they share one tool.
+        closeups_also: More images, for the stages that look at closeups.
 
     Raises:
         ValueError: If too few landmarks are found in them.
     """
     images = list(images)
+    n, images = len(images), [*images, *closeups_also]
     # A closeup is fitted by what it sees itself, not by what an earlier gain leaves of that.
     detector = replace(detector, error_models={k: v for k, v in detector.error_models.items() if k not in CLOSE})
     rough: list[Landmarks | None] = [None] * len(images)
@@ -175,7 +180,7 @@ def fit_error_models(detector: Detector, images: Iterable[LabelledImage], *, pro
             parts.append(seen_by(detector, stage, labelled, start, found[-1]))
         if not any(len(part.landmark) for part in parts):
             raise ValueError("images: the detector finds nothing in them to calibrate on; give other images.")
-        seen = Seen.joined(parts)
+        seen = Seen.joined(parts if stage in CLOSE else parts[:n])
         gross_px = _GROSS_PX.get(stage, CLOSEUP_REACH_PX * min(CLOSEUP_ZOOM))
         gain, bias = np.ones((3, 2)), np.zeros((3, 2))
         if stage in CLOSE:

@@ -12,7 +12,6 @@ import numpy as np
 
 from lib.files import write_text
 from lib.landmarks import Detector
-from lib.landmarks.detector import CLOSE
 from lib.landmarks.metrics import tool_length_px
 from lib.landmarks.network import HourglassConfig, OffsetConfig
 from lib.landmarks.windows import tool_pose
@@ -151,9 +150,7 @@ def assemble(
         typical += labelled_images(recording, every=max(1, len(recording.frames) // 8))
     networks = {f"{stage}_network": training.network for stage, training in stages.items()}
     detector = Detector(**networks, frame_px=FRAME_PX[0], mirror=True)
-    detector = fit_error_models(detector, frames[::2] + typical, progress=True)
-    with_near = fit_error_models(detector, frames[::2] + typical + near_by, progress=True).error_models
-    detector = detector.with_error_models(**{stage: with_near[stage] for stage in CLOSE})
+    detector = fit_error_models(detector, frames[::2] + typical, closeups_also=near_by, progress=True)
     held_out = evaluate(detector, frames[1::2], progress=True)
     keys = ("data", "images", "commit", "steps", "seconds", "processes", "machine", "config", "metrics", "before")
     by_visibility = {k: {"labels": v.labels, "median_px": v.median_px} for k, v in held_out.by_visibility().items()}
