@@ -306,7 +306,7 @@ class Detector:
         """What later stages start from: `rough`, or, where that is unsure, the tool that its window shows best.
 
         Candidates are `rough` and tools made of the highest peaks that the first stage sees at several scales.  All are
-        looked at once, the best ones again; the highest peaks win, and their height is the confidence.
+        looked at once, the best ones again.  The highest peaks win; their height is a confidence below `_SURE`.
         """
         result = Landmarks.join([rough])  # a copy
         for i in np.flatnonzero((rough.confidence < _SURE).any(1)) if self.tool_network else ():
@@ -316,7 +316,7 @@ class Detector:
             best = np.argsort(-height)[:_AGAIN]
             _, height = self._shown(image[0], u[best], "again")
             chosen = candidates[best[[height.argmax()]]]
-            result._put(np.array([i]), replace(chosen, confidence=np.full((1, 3), height.max())))
+            result._put(np.array([i]), replace(chosen, confidence=np.full((1, 3), _SURE * height.max())))
         return result
 
     def _shown(self, image: np.ndarray, u: np.ndarray, stage: str) -> tuple[np.ndarray, np.ndarray]:

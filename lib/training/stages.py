@@ -20,6 +20,7 @@ from lib.recordings import Recording
 from lib.simulator.population import VALIDATION_TEXTURE_SEEDS, sample
 from lib.training.augmentation import AUGMENTATIONS
 from lib.training.config import PRESETS, TrainingConfig
+from lib.training.drawings import drawn_ground
 from lib.training.error_models import fit_error_models
 from lib.training.evaluation import evaluate
 from lib.training.loop import Training, load_training, train
@@ -132,10 +133,10 @@ def assemble(
 ) -> Detector:
     """Join the stages of a training folder, fit their error models, write the weights file `out` and its card.
 
-    The error models are fitted on half of the held-out scenes, whose families are new, and on labelled `recordings`, if any;
-    those of the closeups also on half as many images of the reference rig, since their bias is not that of unfamiliar tools
-    alone.  The card's numbers are measured on the other half of the scenes.
-    `notes` are lines for the card.  A missing stage or shard raises `FileNotFoundError`.
+    The error models are fitted on half of the held-out scenes, whose families are new, on drawn grounds without a tool, and
+    on labelled `recordings`, if any; those of the closeups also on half as many images of the reference rig, since their bias
+    is not that of unfamiliar tools alone.  The card's numbers are measured on the other half of the scenes.  `notes` are
+    lines for the card.  A missing stage or shard raises `FileNotFoundError`.
     """
     out = Path(out)
     stages = {stage: load_training(Path(folder) / stage / "last.safetensors") for stage in STAGES}
@@ -144,13 +145,15 @@ def assemble(
         raise FileNotFoundError(f"{data}: no shard held_out_*.npz; make some with `python3 -m lib train generate`.")
     rng = np.random.default_rng(len(frames))
     near = {"population": "near", "textures": VALIDATION_TEXTURE_SEEDS}
+    without = np.full((3, 2), np.nan), np.zeros(3)
+    bare = [LabelledImage(f"bare {i}", drawn_ground(one.image, rng), *without) for i, one in enumerate(frames[::8])]
     near_by = [LabelledImage(f"near {i}", *sample(rng, **near)) for i in range(len(frames) // 4)]
     typical = []
     for recording in map(Recording.open, recordings):  # 16 images of each, spread over it
         typical += labelled_images(recording, every=max(1, len(recording.frames) // 8))
     networks = {f"{stage}_network": training.network for stage, training in stages.items()}
     detector = Detector(**networks, frame_px=FRAME_PX[0], mirror=True)
-    detector = fit_error_models(detector, frames[::2] + typical, closeups_also=near_by, progress=True)
+    detector = fit_error_models(detector, frames[::2] + bare + typical, closeups_also=near_by, progress=True)
     held_out = evaluate(detector, frames[1::2], progress=True)
     keys = ("data", "images", "commit", "steps", "seconds", "processes", "machine", "config", "metrics", "before")
     by_visibility = {k: {"labels": v.labels, "median_px": v.median_px} for k, v in held_out.by_visibility().items()}
@@ -160,6 +163,7 @@ def assemble(
         "machine": machine(),
         "stages": {name: {key: training.provenance.get(key) for key in keys} for name, training in stages.items()},
         "validation_frames": len(frames),
+        "bare_frames": len(bare),
         "near_frames": len(near_by),
         "recorded_frames": len(typical),
         "recordings": len(recordings),
@@ -222,8 +226,9 @@ Notebook 02 explains the stages.
 
 Each training of a stage starts from the one before. The error models (covariance, confidence) are fitted on half of
 {p["validation_frames"]} held-out scenes, which have families of tools, light, ground and optics that training never draws and
-of which some show no tool, and on {p["recorded_frames"]} frames of {p["recordings"]} recordings; those of the closeups also
-on {p["near_frames"]} images of the reference rig. The numbers below are of the other half.
+of which some show no tool, on {p["bare_frames"]} drawn grounds without one, and on {p["recorded_frames"]} frames of
+{p["recordings"]} recordings; those of the closeups also on {p["near_frames"]} images of the reference rig. The numbers below
+are of the other half.
 
 | held-out frames | |
 |---|---|
