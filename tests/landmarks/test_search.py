@@ -43,4 +43,4 @@ def test_an_unsure_image_starts_from_the_tool_that_its_window_shows_best(monkeyp
 
     monkeypatch.setattr(Detector, "_shown", shown)
     found = detector.searched(np.zeros((2, 64, 96, 3), np.uint8), rough)
-    assert np.array_equal(found.u, np.stack([TOOL, TOOL])) and found.confidence[:, 0].tolist() == [0.9, 0.8]
+    assert np.array_equal(found.u, np.stack([TOOL, TOOL])) and found.confidence[:, 0].tolist() == [0.9, 0.4]
