@@ -16,15 +16,14 @@ _SIZE = (1280, 720)
 _COLOURS = {"base": (0, 114, 178), "tip_1": (230, 159, 0), "tip_2": (0, 158, 115)}
 _LIGHTS = dict(zip(STATES, ((120, 120, 120), (0, 170, 80), (90, 150, 230), (40, 40, 40), (240, 190, 60), (220, 60, 50)),
                    strict=True))  # fmt: skip
-_FRAMES = 250  # that the curve shows
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
 class Dashboard:
-    """Draws each frame as one image (720, 1280, 3) uint8 RGB; it remembers the newest distances."""
+    """Draws each frame as one image (720, 1280, 3) uint8 RGB; its curve shows the distances of the newest `frames`."""
 
-    def __init__(self) -> None:
-        self._past: deque[FrameResult] = deque(maxlen=_FRAMES)
+    def __init__(self, frames: int = 250) -> None:
+        self._past: deque[FrameResult] = deque(maxlen=frames)
 
     def draw(self, left: np.ndarray, right: np.ndarray, result: FrameResult) -> np.ndarray:
         """The page of a frame."""
@@ -64,10 +63,11 @@ class Dashboard:
         height, width = part.shape[0] - 40, part.shape[1] - 70
 
         def place(i: float, mm: float) -> tuple[int, int]:
-            return int(60 + i * width / _FRAMES), int(np.clip(10 + height * (1 - (mm + 0.1) / (top + 0.1)), 0, height + 20))
+            row = np.clip(10 + height * (1 - (mm + 0.1) / (top + 0.1)), 0, height + 20)
+            return int(60 + i * width / self._past.maxlen), int(row)
 
         for mm in np.linspace(0, top, 5):
-            cv2.line(part, place(0, mm), place(_FRAMES, mm), (225, 225, 225), 1)
+            cv2.line(part, place(0, mm), place(self._past.maxlen, mm), (225, 225, 225), 1)
             _text(part, f"{mm:.1f}", (15, place(0, mm)[1] + 4))
         for k, name in enumerate(LANDMARKS):
             for i, r in enumerate(self._past):

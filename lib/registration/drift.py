@@ -22,7 +22,7 @@ _FRAMES = 20_000  # between false alarms, at least
 _LEAST, _CAP, _BURST = 0.2, 0.55, (1.0, 1.0, 0.03, 0.03, 0.03)
 _MEMORY = 1000  # frames that tell the noise
 _FEW = 40  # frames: with fewer the noise is taken for larger than they say, up to twice
-_WANDER = 10  # frames over which the noise may be correlated, whatever neighbouring frames say
+_WANDER = (4, 4, 10, 10, 10)  # frames over which correlated noise counts: about as many as an alarm takes
 _SLOW = 300  # frames over which the bias is averaged
 _LARGEST_BIAS_PX = 0.5  # of a frame's mean; more is a drift
 _FREEDOM = 4.0  # of the Student t of a landmark about the frame's mean: one wrong landmark moves the mean little
@@ -33,7 +33,7 @@ class DriftMonitor:
 
     The detector's error is biased and correlated in time, and its stated noise may be wrong.  So the bias is the slow
     mean of the residuals, within half a pixel, and the noise is that of the residuals themselves: their long-run standard
-    deviation (Andrews 1991), which counts correlated frames for what they are worth.  A score z is the residual less its
+    deviation, which counts correlated frames for what they are worth.  A score z is the residual less its
     bias in this unit.  With delta the shift to be noticed in the same unit, z adds to S the logarithm of how much likelier
     the shift makes it, and the alarm level keeps false alarms `_FRAMES` frames apart (Siegmund 1985).
 
@@ -161,18 +161,13 @@ def _robust_mean(residual: np.ndarray, weight: np.ndarray) -> np.ndarray:
 def _long_run_sd(values: np.ndarray) -> np.ndarray:
     """(k,) of series (n, k): the standard deviation that independent frames would need for means to scatter as these do.
 
-    The autocovariances are summed under a triangle; its width is the one of Andrews' rule for a first-order process, or a
-    fixed one that also sees white noise on top of a slow wander, whichever gives more.
+    The autocovariances are summed under a triangle (Bartlett), as far as a test of the axis adds up frames.
     """
     n = len(values)
     d = values - values.mean(axis=0)
     variance = (d**2).mean(axis=0)
-    rho = np.clip((d[1:] * d[:-1]).mean(axis=0) / np.maximum(variance, 1e-12), 0.0, 0.97)
-    andrews = np.minimum(1.1447 * (4.0 * rho**2 / (1.0 - rho**2) ** 2 * n) ** (1 / 3), n // 4)
-    widths = np.stack([andrews, np.full_like(andrews, min(_WANDER, n // 8))])
-    total = np.stack([variance, variance])
+    widths, total = np.minimum(_WANDER, n // 8), variance.copy()
     for lag in range(1, int(widths.max()) + 1):
-        share = np.maximum(1.0 - lag / (widths + 1.0), 0.0)
-        total += 2.0 * share * (d[lag:] * d[:-lag]).sum(axis=0) / n
+        total += 2.0 * np.maximum(1.0 - lag / (widths + 1.0), 0.0) * (d[lag:] * d[:-lag]).sum(axis=0) / n
     few = 1.0 + 3.0 / (1.0 + (n / _FEW) ** 2)
-    return np.sqrt(few * np.maximum(total.max(axis=0), np.maximum(variance, 0.05)))
+    return np.sqrt(few * np.maximum(total, np.maximum(variance, 0.05)))

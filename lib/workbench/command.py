@@ -30,7 +30,7 @@ PROFILES = ("quick", "paper")
 _ROOM = ".room"
 #: Figures that the README shows.
 README_FIGURES = ("overview", "landmark_detection", "reconstruction_surface", "calibration_ellipsoids",
-                  "registration_errors_recorded")  # fmt: skip
+                  "registration_errors_recorded", "pipeline_push")  # fmt: skip
 
 
 def main(argv: Sequence[str]) -> int:
@@ -111,8 +111,10 @@ def renew_gallery(run: Path) -> None:
             old.unlink()
         if path.suffix == ".svg":
             shutil.copy(path, paths.GALLERY)
+        elif getattr(picture := Image.open(path), "n_frames", 1) > 1:  # a film
+            picture.save(paths.GALLERY / f"{path.stem}.webp", save_all=True, quality=70)
         else:  # a tenth of the PNG's bytes, all colours kept
-            picture = Image.open(path).convert("RGB")
+            picture = picture.convert("RGB")
             picture.thumbnail((1300, 1300))
             picture.save(paths.GALLERY / f"{path.stem}.jpg", quality=88, subsampling=0)
     known = ("started", "commit", "machine", "weights")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -9,6 +10,7 @@ from ipywidgets import IntSlider, VBox
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
+from PIL import Image
 
 from lib.online import STAGES, STATES, FrameResult
 from lib.recordings import StereoFrame
@@ -16,12 +18,34 @@ from notebooks.figures.interactive import explore
 from notebooks.figures.overview import landmarks_on
 from notebooks.figures.style import COLOURS, LANDMARK_COLOURS, figure, show_image
 
-__all__ = ["dashboard", "error_timeline", "frame_browser", "stage_times", "timeline"]
+__all__ = ["Film", "dashboard", "error_timeline", "frame_browser", "stage_times", "timeline"]
 
 _STATE_COLOURS = dict(zip(STATES, ("#f0f0f0", "white", "#dceaf7", "#b0b0b0", "#f7eec2", "#fde3c8"), strict=True))
 _STAGE_COLOURS = dict(
     zip(STAGES, ("#0072B2", "#56B4E9", "#CC79A7", "#D55E00", "#E69F00", "#009E73", "#999999"), strict=True)
 )
+
+
+class Film(Figure):
+    """Pages (h, w, 3) uint8 one after the other: the PNG of this figure moves."""
+
+    def __init__(self, pages: Sequence[np.ndarray], *, seconds: float = 0.4) -> None:
+        height, width = pages[0].shape[:2]
+        super().__init__(figsize=(8.0, 8.0 * height / width), layout="constrained")
+        self._pages, self._seconds = pages, seconds
+        axes = self.add_subplot()
+        axes.axis("off")
+        self._shown = axes.imshow(pages[-1])
+
+    def savefig(self, file, **options) -> None:
+        """Write the pages as an animated PNG of few colours."""
+        drawn = []
+        for page in self._pages:
+            self._shown.set_data(page)
+            buffer = io.BytesIO()
+            super().savefig(buffer, format="png", dpi=100)
+            drawn.append(Image.open(buffer).convert("RGB").quantize(256, Image.Quantize.FASTOCTREE))
+        drawn[0].save(file, "PNG", save_all=True, append_images=drawn[1:], duration=round(1e3 * self._seconds))
 
 
 def _shade_states(ax, results: Sequence[FrameResult]) -> None:

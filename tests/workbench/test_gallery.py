@@ -6,6 +6,7 @@ import re
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from lib import files, paths
 from lib.workbench import command
@@ -28,6 +29,8 @@ def test_the_gallery_takes_a_runs_pictures_or_changes_nothing(tmp_path, monkeypa
     (run / "index.html").touch()
     for name in command.README_FIGURES[1:]:
         cv2.imwrite(str(run / "figures" / f"{name}.png"), np.full((60, 2600, 3), 80, np.uint8))
+    pages = [Image.fromarray(np.full((40, 60, 3), 80 * k, np.uint8)) for k in range(3)]
+    pages[0].save(run / "figures" / "pipeline_push.png", save_all=True, append_images=pages[1:])
     assert command.main_site([str(run), "--gallery"]) == 2
     assert "no picture overview" in capsys.readouterr().err and not list(gallery.iterdir())
     (run / "figures" / "overview.svg").write_text("<svg/>", encoding="utf-8")
@@ -38,6 +41,7 @@ def test_the_gallery_takes_a_runs_pictures_or_changes_nothing(tmp_path, monkeypa
     files.write_json(run / "metrics.json", made_by)
     assert command.main_site([str(run), "--gallery"]) == 0
     assert cv2.imread(str(gallery / "landmark_detection.jpg")).shape == (30, 1300, 3)
+    assert Image.open(gallery / "pipeline_push.webp").n_frames == 3
     assert [path.name for path in gallery.glob("overview.*")] == ["overview.svg"]
     assert json.loads((gallery / "made_by.json").read_text(encoding="utf-8"))["weights"] == "abc"
 
