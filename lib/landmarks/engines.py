@@ -83,8 +83,8 @@ class LastOutput(nn.Module):
 class OpenVinoNetwork:
     """A network run by OpenVINO with as many threads as torch has, a few images at once.
 
-    It is converted for each size of image that it meets, and compiled for each number of them in `BATCHES`: a batch of six
-    windows takes two thirds of the time of six windows alone.
+    It is converted once, and compiled for each size of image that it meets and each number of them in `BATCHES`: a batch of
+    six windows takes two thirds of the time of six windows alone.
     """
 
     network: Network = field(compare=False)
@@ -110,9 +110,9 @@ class OpenVinoNetwork:
         return [torch.from_numpy(np.concatenate(found))]
 
 
-@lru_cache(maxsize=16)  # copies of a detector share what is compiled: equal weights, equal key
+@lru_cache(maxsize=64)  # copies of a detector share what is compiled: equal weights, equal key
 def _request(compiled: OpenVinoNetwork, shape: tuple[int, ...]) -> object:
-    model = _converted(compiled, shape[1:]).clone()
+    model = _converted(compiled).clone()
     model.reshape(list(shape))
     options = {"PERFORMANCE_HINT": "LATENCY", "NUM_STREAMS": 1, "INFERENCE_NUM_THREADS": compiled.threads}
     if compiled.precision:
@@ -121,10 +121,11 @@ def _request(compiled: OpenVinoNetwork, shape: tuple[int, ...]) -> object:
 
 
 @lru_cache(maxsize=16)
-def _converted(compiled: OpenVinoNetwork, shape: tuple[int, ...]) -> object:
-    """The network as a model for a few images of one shape; it takes longer than to compile it for each number of them."""
-    module, shape = LastOutput(compiled.network, mirror=compiled.mirror).eval(), (2, *shape)
+def _converted(compiled: OpenVinoNetwork) -> object:
+    """The network as a model that can be reshaped; it takes longer than to compile it for each shape."""
+    shape = (2, 3, *2 * (getattr(compiled.network.config, "size_px", 128),))
+    module = LastOutput(compiled.network, mirror=compiled.mirror).eval()
     with torch.no_grad(), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # tracing fixes the shape, as it shall
+        warnings.simplefilter("ignore")  # tracing fixes the shape, which `reshape` changes
         traced = torch.jit.freeze(torch.jit.trace(module, torch.zeros(shape), check_trace=False))
         return openvino().convert_model(traced, input=[(list(shape), np.float32)])  # of a trace it is much quicker
