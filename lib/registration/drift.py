@@ -52,8 +52,8 @@ class DriftMonitor:
     >>> from lib.cameras import AffineCamera
     >>> camera = AffineCamera([[100, 0, 0, 0], [0, 100, 0, 0]])
     >>> monitor = DriftMonitor(StereoRig(camera, camera), covariance_px2=1.0)
-    >>> [monitor.update([[0, 0, 0]], [[u, 0]], [[u, 0]]) for u in (0.5, 9.0, 9.0, 9.0)]
-    [False, False, False, True]
+    >>> [monitor.update([[0, 0, 0]], [[u, 0]], [[u, 0]]) for u in (0.5, 9.0, 9.0, 9.0, 9.0)]
+    [False, False, False, False, True]
     """
 
     threshold = 1.0
