@@ -54,8 +54,8 @@ TRACKED_FROM, CLOSEUP_FROM = 0.5, 0.25
 #: The stages that look at closeups: twice of what the tool's window showed, and of what was found in the frame before.
 CLOSE = ("closeup", "closer", "tracking")
 #: Where the first stage is less sure than this of a landmark, other places are looked at: this many tools, made of peaks at
-#: these scales of the first stage's input, and the best of them again.
-_SURE, _CANDIDATES, _SCALES, _AGAIN = 0.5, 24, (0.75, 1.0, 1.5, 2.2), 6
+#: these scales of the first stage's input, and the best of them again; none where all peaks are lower than the last.
+_SURE, _CANDIDATES, _SCALES, _AGAIN, _NOTHING = 0.5, 24, (0.75, 1.0, 1.5, 2.2), 6, 0.01
 #: A tracked landmark that moved farther than this, in closeups of scale 1, gets a second closeup.  After a shorter way one
 #: closeup is as exact, as validation images of other eyes and tools say.
 _SECOND_LOOK_PX = 4.0
@@ -338,7 +338,8 @@ class Detector:
                 found.append(self._in_image(peaks[-1], stride))
                 heatmaps = without_peak(heatmaps, peaks[-1].u, self.frame_network.stride)
         every = Landmarks.join(found)
-        which = best_tools(every.u, torch.cat([part.value for part in peaks]).numpy(), _CANDIDATES)
+        height = torch.cat([part.value for part in peaks]).numpy()
+        which = best_tools(every.u, height, _CANDIDATES) if height.max() > _NOTHING else np.zeros((0, 3), int)
         at = which, np.arange(3)
         return Landmarks(every.u[at], every.covariance[at], every.confidence[at])
 

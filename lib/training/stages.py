@@ -145,8 +145,8 @@ def assemble(
         raise FileNotFoundError(f"{data}: no shard held_out_*.npz; make some with `python3 -m lib train generate`.")
     rng = np.random.default_rng(len(frames))
     near = {"population": "near", "textures": VALIDATION_TEXTURE_SEEDS}
-    without = np.full((3, 2), np.nan), np.zeros(3)
-    bare = [LabelledImage(f"bare {i}", drawn_ground(one.image, rng), *without) for i, one in enumerate(frames[::8])]
+    grounds = (drawn_ground(one.image, rng) for one in frames[::8])
+    bare = [LabelledImage(f"bare {i}", image, np.full((3, 2), np.nan), np.zeros(3)) for i, image in enumerate(grounds)]
     near_by = [LabelledImage(f"near {i}", *sample(rng, **near)) for i in range(len(frames) // 4)]
     typical = []
     for recording in map(Recording.open, recordings):  # 16 images of each, spread over it
