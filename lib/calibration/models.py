@@ -259,7 +259,8 @@ def fit(
 
     def evaluate(state: State) -> tuple[float, tuple] | None:
         for A, rho in zip(state.A, state.rho, strict=True):
-            if rho and (1.0 + rho * (x @ (normal := normal_to(A))) / np.linalg.norm(normal)).min() <= 0.05:
+            normal = normal_to(A)
+            if rho and (1.0 + rho * (x @ normal) / np.linalg.norm(normal)).min() <= 0.05:
                 return None  # a point lies behind the camera
         cost, *work = settle(state, x, y, noise, variance_x, views, model.is_affine)
         return (cost, work) if np.isfinite(cost) else None

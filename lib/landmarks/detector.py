@@ -49,13 +49,14 @@ FORMAT = "microstereo.detector"
 _SETTINGS = ("frame_px", "window_px", "mirror", "method")
 #: A landmark with a lower confidence counts as missing: NaN, confidence 0.
 MISSING_BELOW = 0.05
-#: A landmark with a lower confidence is not followed from frame to frame, and gets no closeup.
+#: Below the first confidence a landmark is not followed from frame to frame, below the second it gets no closeup.
 TRACKED_FROM, CLOSEUP_FROM = 0.5, 0.25
 #: The stages that look at closeups: twice of what the tool's window showed, and of what was found in the frame before.
 CLOSE = ("closeup", "closer", "tracking")
-#: Where the first stage is less sure than this of a landmark, other places are looked at: this many tools, made of peaks at
-#: these scales of the first stage's input, and the best of them again; none where all peaks are lower than the last.
-_SURE, _CANDIDATES, _SCALES, _AGAIN, _NOTHING = 0.5, 24, (0.75, 1.0, 1.5, 2.2), 6, 0.01
+#: Where the first stage is less sure than this of a landmark, its peaks at these scales of its input make candidates.
+_SURE, _SCALES = 0.5, (0.75, 1.0, 1.5, 2.2)
+#: So many candidates are looked at once, and so many of them twice; none where all peaks are lower than the third number.
+_CANDIDATES, _AGAIN, _NOTHING = 24, 6, 0.01
 #: A tracked landmark that moved farther than this, in closeups of scale 1, gets a second closeup.  After a shorter way one
 #: closeup is as exact, as validation images of other eyes and tools say.
 _SECOND_LOOK_PX = 4.0
@@ -320,7 +321,7 @@ class Detector:
         return result
 
     def _shown(self, image: np.ndarray, u: np.ndarray, stage: str) -> tuple[np.ndarray, np.ndarray]:
-        """Where the windows of tools u (n, 3, 2) in one image show the landmarks, and the mean height (n,) of the peaks."""
+        """Landmarks (n, 3, 2) that the windows of tools u show in one image, and their peaks' geometric mean height (n,)."""
         peaks, matrices, which = self.stage_peaks(np.broadcast_to(image, (len(u), *image.shape)), u, stage)
         i, k = which.T
         found, height = np.full(u.shape, np.nan), np.zeros(u.shape[:2])
@@ -363,9 +364,8 @@ class Detector:
             # The stage before decides whether the landmark is there; an unsure one stays where it was seen.
             near &= rough.confidence[which[:, 0], which[:, 1]] >= CLOSEUP_FROM
             u, covariance, confidence, which = u[near], covariance[near], confidence[near], which[near]
-        result.confidence[which[:, 0], which[:, 1]] = confidence
         i, k = which.T
-        result.u[i, k], result.covariance[i, k] = u, covariance
+        result.u[i, k], result.covariance[i, k], result.confidence[i, k] = u, covariance, confidence
         return result if stage == "tool" else result.without_unsure()  # the second look may be surer
 
     def rough_in_windows(self, rough: Landmarks, matrices: np.ndarray, which: np.ndarray, stage: str) -> Rough | None:

@@ -144,9 +144,8 @@ def seen_by(
 
 
 def fit_error_models(
-    detector: Detector, images: Iterable[LabelledImage], *, closeups_also: Sequence[LabelledImage] = (),
-    progress: bool = False,
-) -> Detector:  # fmt: skip
+    detector: Detector, images: Iterable[LabelledImage], *, for_closeups: Sequence[LabelledImage] = (), progress: bool = False
+) -> Detector:
     """The detector with the error model of every stage fitted on validation images, never trained on.
 
     A closeup's correction is scaled by the gain that minimises the validation error, and centred; while tracking it counts
@@ -156,13 +155,13 @@ def fit_error_models(
     Args:
         images: Easy and hard ones, since confidence is learnt from failures, and of many tools, since errors within a
             recording correlate because they share one tool.
-        closeups_also: More images, for the stages that look at closeups.
+        for_closeups: More images, for the stages that look at closeups alone.
 
     Raises:
         ValueError: If too few landmarks are found in them.
     """
     images = list(images)
-    n, images = len(images), [*images, *closeups_also]
+    n, images = len(images), [*images, *for_closeups]
     # A closeup is fitted by what it sees itself, not by what an earlier gain leaves of that.
     detector = replace(detector, error_models={k: v for k, v in detector.error_models.items() if k not in CLOSE})
     rough: list[Landmarks | None] = [None] * len(images)

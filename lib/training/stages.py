@@ -153,7 +153,7 @@ def assemble(
         typical += labelled_images(recording, every=max(1, len(recording.frames) // 8))
     networks = {f"{stage}_network": training.network for stage, training in stages.items()}
     detector = Detector(**networks, frame_px=FRAME_PX[0], mirror=True)
-    detector = fit_error_models(detector, frames[::2] + bare + typical, closeups_also=near_by, progress=True)
+    detector = fit_error_models(detector, frames[::2] + bare + typical, for_closeups=near_by, progress=True)
     held_out = evaluate(detector, frames[1::2], progress=True)
     keys = ("data", "images", "commit", "steps", "seconds", "processes", "machine", "config", "metrics", "before")
     by_visibility = {k: {"labels": v.labels, "median_px": v.median_px} for k, v in held_out.by_visibility().items()}
