@@ -50,14 +50,14 @@ def equation_svg(tex: str, *, display: bool, size_px: float = 17.0) -> str:
     import ziamath  # not at the top: it takes half a second, and few commands need it
     from ziamath.tex import tex2mml
 
-    text = tex.strip()
+    text = " ".join(tex.split())  # a line's end in \text is a space
     for pattern, replacement in _REWRITES:
         text = pattern.sub(replacement, text)
     try:
         if re.search(r"\\|&#x0005C;", tex2mml(text)):
             raise ValueError("a command that the converter does not know")
         drawn = ziamath.Latex(text, size=size_px, inline=not display)
-        picture = drawn.svg()
+        picture = drawn.svg().replace(' xmlns="http://www.w3.org/2000/svg"', "")  # in a heading it would become a prefix
     except Exception:  # whatever the converter stumbles over: the reader still gets the TeX
         return f'<code class="tex">{html.escape(tex)}</code>'
     label = html.escape(" ".join(tex.split()), quote=True)

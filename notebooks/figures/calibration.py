@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+import matplotlib.pyplot as plt
 import numpy as np
+from IPython.display import HTML
 from matplotlib.axis import Axis
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
@@ -14,6 +16,7 @@ from lib.calibration import Calibration, LandmarkOffsets, TimeOffset
 from lib.geometry import RigidTransform
 from lib.workbench.results import Table
 from notebooks.figures.style import COLOURS, LANDMARK_COLOURS, figure, show_image
+from notebooks.figures.style import table as html_table
 from notebooks.studies.camera_models import Comparison
 from notebooks.studies.dvrk import RobotFrames, SphereFit
 
@@ -29,6 +32,7 @@ __all__ = [
     "focal_lengths",
     "frame_residuals",
     "ladder",
+    "ladder_table",
     "noise_errors",
     "offsets",
     "residual_field",
@@ -50,25 +54,22 @@ DEPTH_SCALE_UM = (30.0, 2000.0)
 
 def correspondences(x_mm: np.ndarray, u_left: np.ndarray, u_right: np.ndarray, size_px: tuple[int, int]) -> Figure:
     """Robot positions (n, 3) in 3D and their detections in both images, coloured by depth along z of the robot."""
-    page, _ = figure(1, 3, width_in=13, height_in=3.8)
-    page.clear()
-    axes = page.add_subplot(1, 3, 1, projection="3d")
-    colour = x_mm[:, 2]
-    axes.scatter(*x_mm.T, c=colour, s=8)
+    page = plt.figure(figsize=(12, 7.2), layout="constrained")
+    grid = page.add_gridspec(2, 2, height_ratios=(1.1, 1))
+    axes = page.add_subplot(grid[0, :], projection="3d")
+    heights = x_mm[:, 2]
+    look = {"c": heights, "s": 12, "cmap": "plasma", "vmax": heights.max() + 0.2 * np.ptp(heights)}  # no pale yellow
+    axes.scatter(*x_mm.T, **look)
     axes.set(xlabel="x (mm)", ylabel="y (mm)", zlabel="z (mm)")
-    axes.set_title("Robot: where the landmarks were", y=0.92)
-    axes.set_box_aspect(np.ptp(x_mm, axis=0), zoom=0.8)
+    axes.set_title("Robot: where the landmarks were", loc="left")
+    axes.set_box_aspect(np.ptp(x_mm, axis=0), zoom=1.5)
     axes.locator_params(nbins=4)
     for i, (u, side) in enumerate(((u_left, "Left"), (u_right, "Right"))):
-        flat = page.add_subplot(1, 3, i + 2)
-        flat.scatter(*u.T, c=colour, s=8)
-        flat.set(
-            xlim=(0, size_px[0]),
-            ylim=(size_px[1], 0),
-            aspect="equal",
-            xlabel="x (px)",
-            title=f"{side} image: where they were seen",
-        )
+        flat = page.add_subplot(grid[1, i])
+        dots = flat.scatter(*u.T, **look)
+        flat.set(xlim=(0, size_px[0]), ylim=(size_px[1], 0), aspect="equal", xlabel="x (px)", ylabel="y (px)")
+        flat.set_title(f"{side} image: where they were seen")
+    page.colorbar(dots, ax=page.axes, label="height z (mm)", shrink=0.6)
     return page
 
 
@@ -126,7 +127,7 @@ def focal_lengths(found_px: np.ndarray, true_px: float) -> Figure:
     ax.hist(found_px, bins=bins, color=COLOURS["paper"], label="perspective DLT, decomposed")
     ax.axvline(true_px, color=COLOURS["truth"], linewidth=2.5, label="true focal length")
     ax.set(xscale="log", xlabel="focal length (px)", ylabel="runs", title="A far camera's focal length is noise")
-    ax.legend(loc="upper left")
+    page.legend(loc="outside lower center", ncols=2)
     return page
 
 
@@ -153,6 +154,16 @@ def shallow_bias(table: Table) -> Figure:
     _plain_log(ax.xaxis, c["half_depth_mm"])
     ax.legend(ncols=2)
     return page
+
+
+def ladder_table(comparison: Comparison, caption: str) -> HTML:
+    """The models of a ladder: parameters, chi-square, BIC above the best one's, p-value of the constraint."""
+    rows = [
+        [rung.model + (", chosen" if rung is comparison.best else ""), rung.parameters, f"{rung.chi_square:.1f}",
+         f"{rung.bic - comparison.best.bic:.1f}", "" if rung.against is None else f"{rung.p_value:.2g}"]
+        for rung in comparison.rungs
+    ]  # fmt: skip
+    return html_table(["model", "parameters", "chi-square", "BIC above the best", "p of its constraint"], rows, caption)
 
 
 def ladder(comparisons: Mapping[str, Comparison]) -> Figure:
@@ -324,7 +335,7 @@ def time_offset(found: TimeOffset, true_s: float) -> Figure:
         middle + 3 * sd,
         color=COLOURS["ours"],
         alpha=0.4,
-        label=f"estimate {middle:.2f} +- {sd:.2f} ms (3 sd shown)",
+        label=f"estimate {middle:.2f} +- {sd:.2f} ms\n(3 sd shown)",
     )
     ax.axvline(1e3 * true_s, color=COLOURS["truth"], linewidth=1, label=f"truth {1e3 * true_s:.0f} ms")
     ax.set(
@@ -332,7 +343,7 @@ def time_offset(found: TimeOffset, true_s: float) -> Figure:
         ylabel="reprojection RMS (px)",
         title="The clocks reveal themselves",
     )
-    ax.legend(loc="upper center")
+    ax.legend(loc="lower left")
     return page
 
 
@@ -409,12 +420,12 @@ def coverage(table: Table) -> Figure:
     axes[0].plot(c["n_rows"], c["coverage_95_percent"], "o-", color=COLOURS["ours"])
     axes[0].axhline(95, color=COLOURS["truth"], linewidth=1)
     axes[0].set(ylabel="%", title="Inside the reported 95 % region")
-    for key, name, colour in (
-        ("zero_skew", "zero skew", "ours"),
-        ("square", "square pixels", "paper"),
-        ("common_zoom", "common zoom", "warning"),
+    for key, name, colour, style in (
+        ("zero_skew", "zero skew", "ours", "o-"),
+        ("square", "square pixels", "paper", "s-"),
+        ("common_zoom", "common zoom", "right", "^-"),
     ):
-        axes[1].plot(c["n_rows"], c[f"{key}_rejected_percent"], "o-", color=COLOURS[colour], label=name)
+        axes[1].plot(c["n_rows"], c[f"{key}_rejected_percent"], style, color=COLOURS[colour], label=name)
     axes[1].axhline(5, color=COLOURS["truth"], linewidth=1)
     axes[1].set(ylabel="%", ylim=(0, None), title="True constraints rejected at 5 %")
     axes[1].legend(fontsize=8)
@@ -515,13 +526,19 @@ def against_truth(values: np.ndarray, cameras: Mapping[str, np.ndarray], true: n
 
 
 def residual_field(u: np.ndarray, residual_px: np.ndarray, title: str) -> Figure:
-    """Residuals (n, 2) at pixels (n, 2) as arrows, stretched to be seen; the title gives their size."""
-    page, ax = figure(width_in=7.5, height_in=4.6)
+    """Residuals (n, 2) at pixels (n, 2) as arrows, stretched to be seen; the title gives their size.
+
+    Points at several depths share a line of sight: one is drawn outwards, another inwards.
+    """
+    page, ax = figure(width_in=9, height_in=5.4)
     largest = float(np.linalg.norm(residual_px, axis=1).max())
     scale = 80.0 / max(largest, 1e-9)
     ax.quiver(*u.T, *(scale * residual_px.T), color=COLOURS["paper"], angles="xy", scale_units="xy", scale=1, width=0.002)
     ax.plot(*u.T, ".", color=COLOURS["ours"], markersize=3)
+    ax.plot([], [], ".", color=COLOURS["ours"], label="points, several depths above each other")
+    ax.plot([], [], "-", color=COLOURS["paper"], label="what is left of each")
     ax.set(aspect="equal", xlabel="x (px)", ylabel="y (px)")
+    page.legend(loc="outside lower center", ncols=2)
     ax.set_title(f"{title}: up to {largest:.2f} px left, arrows x {scale:.3g}")
     ax.invert_yaxis()
     return page

@@ -143,7 +143,7 @@ def volume_page(recording: Recording) -> Figure:
     for k, (name, colour) in enumerate(LANDMARK_COLOURS.items()):
         axes[0].plot(*across[:, k].T, "o", color=colour, markeredgecolor="black", markersize=5, label=name)
         z = (x[:, k] - np.nanmean(x, axis=(0, 1))) @ depth
-        axes[1].hist(z[np.isfinite(z)], bins=14, color=colour, alpha=0.7, edgecolor="black", linewidth=0.4)
+        axes[1].plot(z, np.full(len(z), k), "o", color=colour, alpha=0.6, markeredgecolor="black", markeredgewidth=0.4)
     if labels:
         width, height = recording.image_size_px
         axes[0].set(xlim=(0, width), ylim=(height, 0), title="Annotations, left image (px)")
@@ -152,6 +152,8 @@ def volume_page(recording: Recording) -> Figure:
     axes[0].set_aspect("equal")
     axes[0].legend(fontsize=8)
     axes[1].set(xlabel=f"{'depth' if truth else 'z of the robot'} about its mean (mm)", title="Depths covered")
+    axes[1].set_yticks(range(3), LANDMARK_COLOURS)
+    axes[1].set_ylim(2.6, -0.6)
     axes[2].plot(recording.frames.time_s, np.linalg.norm(x[:, 1] - x[:, 2], axis=1), "o-", color=COLOURS["ours"])
     axes[2].set(xlabel="time (s)", ylabel="mm", title="Distance between the tips")
     return page

@@ -66,8 +66,8 @@ def effect_gallery(eye: Eye, forceps: Forceps, pose: Pose) -> dict[str, np.ndarr
     default = Microscope()
     shots = {
         "Geometry, texture, shadow": (matt, PLAIN, {}),
-        "+ wet surface, left eye": (eye, PLAIN, {}),
-        "+ wet surface, right eye": (eye, PLAIN, {"side": 1}),
+        "+ wet surface, left camera": (eye, PLAIN, {}),
+        "+ wet surface, right camera": (eye, PLAIN, {"side": 1}),
         "Defocus, depth of field 1 mm": (matt, replace(PLAIN, depth_of_field_mm=1.0), {}),
         "Motion blur, 17 mm/s, 20 ms": (matt, replace(PLAIN, exposure_s=0.020), {"velocity_mm_s": fast}),
         "Rolling shutter, 120 mm/s": (matt, replace(PLAIN, readout_s=0.03), {"velocity_mm_s": (120.0, 0.0, 0.0)}),
@@ -78,7 +78,7 @@ def effect_gallery(eye: Eye, forceps: Forceps, pose: Pose) -> dict[str, np.ndarr
         ),
         "Shot and read noise": (matt, replace(PLAIN, full_well=150.0, read_noise=8.0), {}),
         "JPEG, quality 15": (matt, replace(PLAIN, jpeg_quality=15), {}),
-        "Colour of the other eye": (matt, replace(PLAIN, gain=((0.8, 1.0, 1.35),) * 2), {}),
+        "Colour of the other camera": (matt, replace(PLAIN, gain=((0.8, 1.0, 1.35),) * 2), {}),
         "All, default left": (eye, default, {}),
         "All, default right": (eye, default, {"side": 1}),
     }

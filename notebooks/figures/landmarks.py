@@ -90,18 +90,31 @@ def network_page(config: HourglassConfig, parameters: int) -> Figure:
     return fig
 
 
+def _pale(image: np.ndarray) -> np.ndarray:
+    """Light grey values of an image (h, w, 3), uint8 or in [0, 1], as a ground for what is laid over it."""
+    grey = image.mean(axis=2)
+    low, high = np.percentile(grey, (1, 99))
+    return np.repeat(0.45 + 0.5 * np.clip((grey - low) / max(high - low, 1e-9), 0, 1)[..., None], 3, axis=2)
+
+
+def _lay_over(ax: Axes, heatmap: np.ndarray, extent: tuple[float, float, float, float]) -> None:
+    """A heatmap in [0, 1] over an image: clear where it is 0."""
+    shown = np.clip(heatmap, 0, 1)
+    ax.imshow(shown, cmap="magma_r", alpha=np.minimum(1.6 * shown, 0.9), extent=extent, vmin=0, vmax=1)
+
+
 def heatmap_grid(image: np.ndarray, heatmaps: np.ndarray, u: np.ndarray, stride: int) -> Figure:
-    """One image with its three heatmaps (3, h, w) laid over it; `u` (3, 2) in image pixels."""
+    """One image with its three heatmaps (3, h, w), each in units of its peak, over it; `u` (3, 2) in image pixels."""
     fig, axes = figure(1, 4, width_in=10.5, height_in=2.9)
     show_image(axes[0], image, "image and landmarks")
     landmark_dots(axes[0], u, size=90)
     h, w = heatmaps.shape[1:]
     axes[0].set(xlim=(-0.5, image.shape[1] - 0.5), ylim=(image.shape[0] - 0.5, -0.5))
     extent = (-0.5, w * stride - 0.5, h * stride - 0.5, -0.5)
-    grey = image.mean(axis=2)
-    for ax, name, heatmap in zip(axes[1:], LANDMARK_COLOURS, heatmaps, strict=True):
-        show_image(ax, grey, name)
-        ax.imshow(heatmap, cmap="inferno", alpha=0.65, extent=extent, vmin=0, vmax=1)
+    for k, (ax, name, heatmap) in enumerate(zip(axes[1:], LANDMARK_COLOURS, heatmaps, strict=True)):
+        show_image(ax, _pale(image), f"{name}: peak {heatmap.max():.2f}")
+        _lay_over(ax, heatmap / heatmap.max(), extent)
+        landmark_dots(ax, np.where(np.arange(3)[:, None] == k, u, np.nan), size=90)
         ax.set(xlim=(-0.5, image.shape[1] - 0.5), ylim=(image.shape[0] - 0.5, -0.5))
     return fig
 
@@ -145,15 +158,14 @@ def disc_page(p: np.ndarray, truth: np.ndarray, found: Mapping[str, np.ndarray],
 
 
 def augmented(images: Sequence[np.ndarray], u: Sequence[np.ndarray], titles: Sequence[str]) -> Figure:
-    """Images (h, w, 3) in [0, 1] or uint8 with their landmarks."""
+    """Images (h, w, 3) in [0, 1] or uint8 with their landmarks; the first of a row has its title."""
     columns = min(6, len(images))
     rows = -(-len(images) // columns)
     fig, axes = figure(rows, columns, width_in=10, height_in=1.8 * rows, squeeze=False)
     for ax in axes.flat:
         ax.set_axis_off()
-    for ax, image, points, title in zip(axes.flat, images, u, titles, strict=False):
-        show_image(ax, image)
-        ax.set_title(title)
+    for k, (ax, image, points, title) in enumerate(zip(axes.flat, images, u, titles, strict=False)):
+        show_image(ax, image, title if k % columns == 0 else "")
         h, w = image.shape[:2]
         inside = ((points > -0.5) & (points < (w - 0.5, h - 0.5))).all(axis=1)
         landmark_dots(ax, np.where(inside[:, None], points, np.nan), size=40)
@@ -187,9 +199,9 @@ def pck_curves(
 ) -> Figure:
     """PCK in percent against the threshold, logarithmic: the strict end is where detectors differ."""
     fig, ax = figure(width_in=8, height_in=3.8)
-    colours = [COLOURS["ours"], COLOURS["truth"], COLOURS["right"], COLOURS["warning"], COLOURS["baseline"]]
-    for i, (name, curve) in enumerate(curves.items()):
-        ax.plot(thresholds, curve, color=colours[i % len(colours)], lw=2.4 if i == 0 else 1.4, label=name)
+    for name, curve in curves.items():
+        colour = LANDMARK_COLOURS.get(name, "black")
+        ax.plot(thresholds, curve, color=colour, lw=1.8 if name in LANDMARK_COLOURS else 2.6, label=name)
     if paper:
         ax.plot(0.05, 99.7, "D", color=COLOURS["paper"], label="paper, 1080p, PCK@0.05")
     ax.set(xscale="log", xlim=(thresholds[0], thresholds[-1]), ylim=(0, 101))
@@ -255,14 +267,14 @@ def uncertainty(evaluation: Evaluation, squared: np.ndarray) -> Figure:
     values = np.sort(squared[np.isfinite(squared)])
     grid = np.linspace(0, 12, 200)
     a.plot(grid, 100 * np.searchsorted(values, grid) / max(len(values), 1), color=COLOURS["ours"], label="detections")
-    a.plot(grid, 100 * chi2.cdf(grid, 2), color=COLOURS["truth"], ls="--", label="true covariances")
+    a.plot(grid, 100 * chi2.cdf(grid, 2), color=COLOURS["truth"], ls="--", label="if covariances are right")
     a.axvline(chi2.ppf(0.95, 2), color=COLOURS["baseline"], lw=1, label="95 % ellipse")
     a.set(title="Squared error over its covariance", xlabel="normalised squared error", ylabel="% below", ylim=(0, 101))
     a.legend()
     labelled = ~np.isnan(evaluation.error_px)
     mean, fraction, count = reliability(evaluation.landmarks.confidence[labelled], evaluation.correct[labelled])
     used = count > 0
-    b.plot([0, 1], [0, 1], color=COLOURS["truth"], ls="--", label="true confidence")
+    b.plot([0, 1], [0, 1], color=COLOURS["truth"], ls="--", label="if confidence is right")
     b.scatter(
         mean[used], fraction[used], s=20 + 3 * np.sqrt(count[used]) * 5, color=COLOURS["ours"], label="detections"
     )
@@ -357,8 +369,8 @@ def frame_explorer(
         ax.set_title(f"{name}: missed")
     for window, matrix, heatmap, k in zip(windows, matrices, heatmaps, seen, strict=False):
         ax, side = axes[1 + k], window.shape[0]
-        show_image(ax, window.mean(axis=2), f"{names[k]}: confidence {found.confidence[0, k]:.2f}")
-        ax.imshow(heatmap, cmap="inferno", alpha=0.45, extent=(-0.5, side - 0.5, side - 0.5, -0.5), vmin=0, vmax=1)
+        show_image(ax, _pale(window), f"{names[k]}: confidence {found.confidence[0, k]:.2f}")
+        _lay_over(ax, heatmap, (-0.5, side - 0.5, side - 0.5, -0.5))
         u = matrix[:, :2] @ found.u[0, k] + matrix[:, 2]
         covariance = matrix[:, :2] @ found.covariance[0, k] @ matrix[:, :2].T
         _ellipse(ax, u, covariance, LANDMARK_COLOURS[names[k]])
@@ -389,15 +401,11 @@ def closeups(windows: np.ndarray, expected: np.ndarray, seen: Peaks, kept: Peaks
 def decoder_errors(errors_px: Mapping[str, np.ndarray]) -> Figure:
     """Distribution of the error of several decoders on the same heatmaps."""
     fig, ax = figure(width_in=8, height_in=3.4)
-    colours = plt.get_cmap("viridis")(np.linspace(0, 0.9, len(errors_px)))
-    for colour, (name, error) in zip(colours, errors_px.items(), strict=True):
+    looks = zip(("baseline", "paper", "right", "truth", "ours"), ("-", "-", "--", "-.", "-"), strict=True)
+    for (colour, line), (name, error) in zip(looks, errors_px.items(), strict=False):
         error = np.sort(error[np.isfinite(error)])
-        ax.plot(
-            error,
-            100 * np.arange(1, len(error) + 1) / len(error),
-            color=colour,
-            label=f"{name}: {np.median(error):.2f} px",
-        )
+        share = 100 * np.arange(1, len(error) + 1) / len(error)
+        ax.plot(error, share, line, color=COLOURS[colour], label=f"{name.replace('_', '-')}: {np.median(error):.2f} px")
     ax.set(
         xscale="log",
         xlim=(0.05, 20),
@@ -419,10 +427,8 @@ def stages(image: np.ndarray, panels: Sequence[tuple[str, np.ndarray, np.ndarray
     show_image(axes[0], image[::3, ::3], "frame")
     landmark_dots(axes[0], (np.asarray(u) - 1) / 3)
     for ax, (title, seen, heatmap) in zip(axes[1:], panels, strict=True):
-        show_image(ax, seen.mean(axis=2), title)
+        show_image(ax, _pale(seen), title)
         h, w = seen.shape[:2]
-        cells_h, cells_w = heatmap.shape
-        extent = (-0.5, cells_w * w / cells_w - 0.5, cells_h * h / cells_h - 0.5, -0.5)
-        ax.imshow(np.clip(heatmap, 0, 1), cmap="inferno", alpha=0.6, extent=extent, vmin=0, vmax=1)
+        _lay_over(ax, heatmap, (-0.5, w - 0.5, h - 0.5, -0.5))
         ax.set(xlim=(-0.5, w - 0.5), ylim=(h - 0.5, -0.5))
     return fig

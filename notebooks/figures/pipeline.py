@@ -83,10 +83,10 @@ def timeline(results: Sequence[FrameResult], *, bump_at: int | None = None) -> F
         axes[2].plot(index, distance[:, k], color=colour, marker=".", label=name)
         axes[2].fill_between(index, distance[:, k] - 2 * sd[:, k], distance[:, k] + 2 * sd[:, k], color=colour, alpha=0.2)
     axes[2].set(title="Distance of the tool to the surface along the view, in mm (band: 2 sd)", xlabel="frame")
-    axes[2].legend(loc="upper right", ncols=3)
     shown = {result.state for result in results}
     patches = [Patch(facecolor=_STATE_COLOURS[s], edgecolor="#cccccc", label=s) for s in _STATE_COLOURS if s in shown]
-    page.legend(handles=patches, loc="outside lower center", ncols=3)
+    handles = axes[2].get_legend_handles_labels()[0] + patches
+    page.legend(handles=handles, loc="outside lower center", ncols=len(handles))  # outside: curves go everywhere
     return page
 
 
@@ -126,13 +126,15 @@ def error_timeline(
     _shade_states(ax, results)
     colours = (COLOURS["ours"], COLOURS["truth"], COLOURS["paper"], COLOURS["baseline"])
     for (name, error), colour in zip(errors_um.items(), colours, strict=False):
-        ax.plot([result.index for result in results], error, color=colour, marker=".", label=name)
+        known = np.isfinite(error)  # a surface is not made in every frame: the line goes on to the next
+        ax.plot(np.array([result.index for result in results])[known], error[known], color=colour, marker=".", label=name)
     if bump_at is not None:
-        ax.axvline(bump_at - 0.5, color=COLOURS["warning"], linestyle="--", label="bump")
+        ax.axvline(bump_at - 0.5, color=COLOURS["warning"], linestyle="--", label="push")
     if any(np.isfinite(error).any() for error in errors_um.values()):
         ax.set(yscale="log")
     ax.set(xlabel="frame", ylabel="um", title="Errors against the truth")
-    ax.legend(ncols=4)
+    ax.yaxis.set_major_formatter("{x:g}")
+    page.legend(loc="outside lower center", ncols=4)
     return page
 
 

@@ -81,16 +81,14 @@ def stereo_pair(left: np.ndarray, right: np.ndarray, u_tool: tuple[np.ndarray, n
 
 def descriptor_channels(image: np.ndarray, channels: np.ndarray) -> Figure:
     """An image and the pixel descriptor of DeepMatching on it, channels (h, w, c): one panel a gradient direction."""
-    count = min(channels.shape[2], 8)
-    page, axes = figure(2, 5, width_in=13, height_in=4.2)
-    merged = page.add_subplot(axes[0, 0].get_gridspec()[:, 0])
-    axes[0, 0].remove()
-    axes[1, 0].remove()
-    show_image(merged, image, "Image")
-    for k, ax in zip(range(count), axes[:, 1:].ravel(), strict=True):
-        show_image(ax, channels[..., k], f"Gradient towards {k * 45}°")
-        ax.images[0].set(cmap="inferno", clim=(0, np.quantile(channels[..., :8], 0.999)))
-        ax.title.set_fontsize(9)
+    page, axes = figure(3, 3, width_in=11, height_in=6.9)
+    limit = float(np.quantile(channels[..., :8], 0.999))
+    for k, ax in enumerate(np.delete(axes.ravel(), 4)):  # round the image as the compass has them: 0 is to the right
+        direction = (135, 90, 45, 180, 0, 225, 270, 315)[k]
+        show_image(ax, channels[..., direction // 45], f"rises towards {direction}°")
+        ax.images[0].set(cmap="magma_r", clim=(0, limit))
+    show_image(axes[1, 1], image, "the image")
+    page.colorbar(axes[0, 0].images[0], ax=axes, label="strength", shrink=0.5, aspect=30)
     return page
 
 
@@ -142,14 +140,16 @@ def response_pyramid(left: np.ndarray, right: np.ndarray, maps: list[ResponseMap
     for (top, bottom), level in zip(axes.T, maps, strict=True):
         show_image(top, left, f"{level.size_px} px patch")
         corner = level.centre_px - level.size_px / 2
-        top.add_patch(Rectangle(corner, level.size_px, level.size_px, fill=False, color=COLOURS["warning"], lw=2))
-        show_image(bottom, right)
+        for colour, line_width in (("black", 3.5), ("white", 1.8)):
+            box = Rectangle(corner, level.size_px, level.size_px, fill=False, color=colour, lw=line_width, clip_on=False)
+            top.add_patch(box)
+        show_image(bottom, np.full_like(right, 255))
         x0, x1, y1, y0 = level.extent_px
         # Contrast by rank within the map: the background of a flat correlation is high, the peak is what counts.
         shown = np.clip((level.response - np.median(level.response)) / np.ptp(level.response), 0, 1)
-        bottom.imshow(shown, extent=(x0, x1, y1, y0), cmap="inferno", alpha=0.85, norm=PowerNorm(0.8))
+        bottom.imshow(shown, extent=(x0, x1, y1, y0), cmap="magma_r", norm=PowerNorm(0.8))
         rivals = int((level.response > 0.8 * level.response.max()).sum()) - 1
-        bottom.plot(*level.peak_px, "+", color="cyan", markersize=14, markeredgewidth=2)
+        bottom.plot(*level.peak_px, "o", mfc="none", mec=COLOURS["ours"], markersize=13, markeredgewidth=2)
         bottom.set_title(f"{rivals} of {level.response.size} places\nabove 80 % of the peak", fontsize=9)
         bottom.set(xlim=(-0.5, right.shape[1] - 0.5), ylim=(right.shape[0] - 0.5, -0.5))
     return page
@@ -193,27 +193,30 @@ def epipolar_geometry(
     left: np.ndarray, right: np.ndarray, rig: StereoRig, u_left: np.ndarray, distance_px: np.ndarray, kept: np.ndarray
 ) -> Figure:
     """Left points (k, 2), their epipolar lines in the right image, and the distances (n,) of matches, kept or not."""
-    page, axes = figure(1, 3, width_in=14, height_in=2.9, width_ratios=(1, 1, 0.75))
-    show_image(axes[0], left, "Left: points")
-    show_image(axes[1], right, "Right: their epipolar lines are parallel")
-    width = right.shape[1]
-    for point, colour in zip(u_left, plt.colormaps["turbo"](np.linspace(0.1, 0.9, len(u_left))), strict=True):
-        axes[0].plot(*point, "o", color=colour, markeredgecolor="white", markersize=7)
+    height, width = right.shape[:2]
+    page = plt.figure(figsize=(12, 6.6 * height / width + 2.9), layout="constrained")
+    panels = page.subplot_mosaic([["left", "right"], ["filter", "filter"]], height_ratios=(6 * height / width, 2.4))
+    for name, image, title in (("left", left, "Left: points"), ("right", right, "Right: their lines are parallel")):
+        show_image(panels[name], image, title)
+        panels[name].set(xlim=(-0.5, image.shape[1] - 0.5), ylim=(image.shape[0] - 0.5, -0.5))
+    for k, point in enumerate(u_left):
+        colour = ("white", "cyan", "yellow")[k % 3]  # neighbours differ; all are legible on a retina
+        panels["left"].plot(*point, "o", color=colour, markeredgecolor="black", markersize=8)
         a, b, c = rig.fundamental @ [*point, 1.0]
         x = np.array([0.0, width - 1.0])
-        axes[1].plot(x, -(a * x + c) / b, color=colour)
-    for ax, image in zip(axes, (left, right), strict=False):
-        ax.set(xlim=(-0.5, image.shape[1] - 0.5), ylim=(image.shape[0] - 0.5, -0.5))
+        panels["right"].plot(x, -(a * x + c) / b, color=colour, lw=1.6)
+        panels["right"].text(0, -c / b, f"{k + 1} ", ha="right", va="center", fontsize=8)
+        panels["left"].annotate(f"{k + 1}", point, (6, 4), textcoords="offset points", color=colour, fontsize=9)
     span = float(np.abs(distance_px).max()) + 1e-6
-    axes[2].hist(
+    panels["filter"].hist(
         [distance_px[kept], distance_px[~kept]],
         bins=np.linspace(-span, span, 82),
         stacked=True,
         color=[COLOURS["ours"], COLOURS["warning"]],
-        label=[f"kept: {kept.mean():.0%}", "beyond their own sigmas"],
+        label=[f"kept: {kept.mean():.0%}", "dropped: beyond two of their own sigmas"],
     )
-    axes[2].set(xlabel="epipolar distance of matches (px)", ylabel="matches", title="The filter", yscale="log")
-    axes[2].legend(loc="upper right", fontsize=8)
+    panels["filter"].set(xlabel="distance of a match from its line (px)", ylabel="matches", title="The filter", yscale="log")
+    panels["filter"].legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=2, fontsize=9)
     return page
 
 
@@ -231,7 +234,7 @@ def point_errors(errors_mm: dict[str, np.ndarray], sigma_um: dict[str, float]) -
         ax.plot(x, gauss, color=COLOURS["paper"], label=f"predicted sigma {sigma_um[name]:.1f} um")
         ax.set(xlabel="error (um)", title=f"{name}: robust sigma {spread:.1f} um", yscale="log")
         ax.set_ylim(2e-3 / span, 3 * max(density.max(), gauss.max()))
-        ax.legend(loc="upper right", fontsize=8)
+        ax.legend(loc="upper left", fontsize=9)
     axes[0].set_ylabel("density per um")
     return page
 
@@ -300,10 +303,10 @@ def smoothness_slider(
     """A slider over sections of surfaces of growing smoothness."""
 
     def draw(mu: int) -> Figure:
-        """A section through the surface at one smoothness, beside the points and the chosen surface."""
+        """A section through the surface at one smoothness, beside the points."""
         page, ax = figure(width_in=11, height_in=3.4)
         _relative_section(ax, mu, depths_mm, position_mm, points, reference)
-        ax.set(title=f"mu = {smoothness[mu]:.2g} px²/mm", ylabel="depth beyond the chosen surface (um)")
+        ax.set(title=f"mu = {smoothness[mu]:.2g} px²/mm", ylabel="depth beyond a smooth bowl (um)")
         ax.legend(loc="upper right", fontsize=8, ncols=3)
         return page
 
@@ -318,12 +321,12 @@ def smoothness_sections(
     points: tuple[np.ndarray, np.ndarray],
     reference: dict[str, tuple[np.ndarray, str]],
 ) -> Figure:
-    """Sections of three of the surfaces, against the middle one: too rough, in the middle, too smooth."""
+    """Sections of three of the surfaces: too rough, in the middle, too smooth."""
     page, axes = figure(1, 3, width_in=14, height_in=3.1, sharey=True)
     for ax, step in zip(axes, (0, len(smoothness) // 2, -1), strict=True):
         _relative_section(ax, step, depths_mm, position_mm, points, reference)
         ax.set_title(f"mu = {smoothness[step]:.2g} px²/mm")
-    axes[0].set_ylabel("depth beyond the chosen surface (um)")
+    axes[0].set_ylabel("depth beyond a smooth bowl (um)")
     axes[0].legend(loc="best", fontsize=8)
     return page
 
@@ -337,13 +340,13 @@ def _relative_section(
     reference: dict[str, tuple[np.ndarray, str]],
     limit_um: float = 120.0,
 ) -> None:
-    """A section of which the middle one of the surfaces is taken out: a bowl of millimetres hides errors of microns."""
-    middle = depths_mm[len(depths_mm) // 2]
-    apart = 1e3 * (points[1] - np.interp(points[0], position_mm, middle))
+    """A section less a polynomial through the middle one of the surfaces: a bowl of millimetres hides micrometres."""
+    bowl = np.polynomial.Polynomial.fit(position_mm, depths_mm[len(depths_mm) // 2], 6)
+    apart = 1e3 * (points[1] - bowl(points[0]))
     ax.plot(points[0], apart, ".", color=COLOURS["baseline"], markersize=3, alpha=0.6, label="triangulated points")
     for name, (depth, colour) in (reference | {"surface": (depths_mm[step], "ours")}).items():
         width = 2.6 if colour == "truth" else 1.6
-        ax.plot(position_mm, 1e3 * (depth - middle), color=COLOURS[colour], label=name, lw=width)
+        ax.plot(position_mm, 1e3 * (depth - bowl(position_mm)), color=COLOURS[colour], label=name, lw=width)
     ax.set(xlabel="along the image row (mm)", ylim=(limit_um, -limit_um))
 
 
@@ -465,7 +468,10 @@ def cases(found: Sequence[Case], *, limit_um: float = 60.0) -> Figure:
     with_sphere = any(one.sphere_error_mm is not None for one in found)
     columns = 5 if with_sphere else 4
     page = plt.figure(figsize=(3.7 * columns, 2.55 * len(found)), layout="constrained")
-    maps = []
+    maps: dict[str, list[Axes]] = {"surface": [], "sphere prior": []}
+    spheres = [1e3 * one.sphere_error_mm[one.seen] for one in found if one.sphere_error_mm is not None]
+    wide_um = 50 * np.ceil(max((np.nanquantile(np.abs(off), 0.98) for off in spheres), default=limit_um) / 50)
+    limits_um = {"surface": limit_um, "sphere prior": wide_um}
     for row, one in enumerate(found):
         axes = [
             page.add_subplot(len(found), columns, row * columns + k + 1, projection="3d" if k == 2 else None)
@@ -487,10 +493,12 @@ def cases(found: Sequence[Case], *, limit_um: float = 60.0) -> Figure:
             if error is None:
                 continue
             show_image(ax, np.where(one.seen, 1e3 * error @ view, np.nan), f"{name}: {rms:.1f} um RMS")
-            ax.images[0].set(cmap=_SIGNED, clim=(-limit_um, limit_um))
+            ax.images[0].set(cmap=_SIGNED, clim=(-limits_um[name], limits_um[name]))
             ax.set_facecolor("#dddddd")
-            maps.append(ax)
-    page.colorbar(maps[0].images[0], ax=maps, label="depth error (um)", shrink=0.8)
+            maps[name].append(ax)
+    for name, panels in maps.items():
+        if panels:
+            page.colorbar(panels[0].images[0], ax=panels, label=f"depth error (um), {name}", shrink=0.8)
     return page
 
 
@@ -502,31 +510,38 @@ def sparsification(curves: dict[str, dict[str, tuple[float, np.ndarray]]], kept:
         for measure, (auc, share) in measures.items():
             label = f"{measure.replace('_', ' ')} (AUC {auc:.2f})"
             ax.plot(100 * kept, 100 * share, color=COLOURS[colours[measure]], label=label)
-        ax.axhline(100 * next(iter(measures.values()))[1][-1], color=COLOURS["baseline"], ls="--", label="told nothing")
-        ax.set(xlabel="surest matches kept (%)", title=name, ylim=(0, None))
-        ax.legend(fontsize=8)
+        nothing, highest = 100 * next(iter(measures.values()))[1][-1], max(share.max() for _, share in measures.values())
+        ax.axhline(nothing, color=COLOURS["baseline"], ls="--", label="told nothing")
+        ax.set(xlabel="surest matches kept (%)", title=name, ylim=(0, 1.5 * max(nothing, 100 * highest)))
+        ax.legend(fontsize=8, loc="upper right")
     axes[0, 0].set_ylabel("wrong by more than 2 px (%)")
     return page
 
 
 def recorded_table(recorded: Mapping[str, Table], caption: str) -> HTML:
     """Recorded surface errors with true cameras (`surfaces`) and with calibrated ones (`calibrated_surfaces`)."""
+    def numbers(values) -> list[str]:
+        return [f"{value:.1f}" if np.isfinite(value) else "" for value in values]
+
+    tables = []
+    if "surfaces" in recorded:
+        columns = {"surface_rms_um": "20 x 20", "surface_fine_rms_um": "40 x 40", "surface_fast_rms_um": "fast"}
+        columns |= {"sphere_rms_um": "sphere"}
+        rows = [[e["scene"], *numbers(e.get(key, np.nan) for key in columns)] for e in recorded["surfaces"].rows]
+        header = ["scene, true cameras", *(f"{name}, RMS (um)" for name in columns.values())]
+        tables.append(table(header, rows, f"{caption} True cameras.").data)
     rows = []
-    for row in recorded["surfaces"].rows if "surfaces" in recorded else ():
-        columns = {"surface_rms_um": "", "surface_fine_rms_um": ", 40 x 40"}
-        columns |= {"surface_fast_rms_um": ", fast", "sphere_rms_um": ", sphere"}
-        for name, label in columns.items():
-            if np.isfinite(row.get(name, np.nan)):
-                rows.append([f"{row['scene']}, true cameras{label}", f"{row[name]:.1f}", "", ""])
     calibrated = recorded.get("calibrated_surfaces")
     for name in ("true", "plain", "plain_refined", "recommended", "recommended_refined") if calibrated else ():
         for setting in ("quality", "fast"):
             found = calibrated.where(setting=setting).columns
             if f"{name}_robot_frame_um" in found:
                 means = (np.mean(found[f"{name}_{key}_um"]) for key in ("robot_frame", "rigid", "affine"))
-                label = f"75 frames, {setting}: {name.replace('_', ', ')} cameras"
-                rows.append([label, *(f"{mean:.1f}" for mean in means)])
-    return table(["surface", "RMS (um)", "rigid motion taken out", "affine map taken out"], rows, caption)
+                rows.append([f"{setting}: {name.replace('_', ', ')} cameras", *numbers(means)])
+    if rows:
+        header = ["75 frames", "RMS (um)", "rigid motion taken out", "affine map taken out"]
+        tables.append(table(header, rows, f"{caption} Cameras calibrated from 75 detected frames.").data)
+    return HTML("".join(tables))
 
 
 def recorded_speeds(recorded: Mapping[str, Table], caption: str) -> HTML:
@@ -571,10 +586,10 @@ def recorded_speeds(recorded: Mapping[str, Table], caption: str) -> HTML:
 def tool_over_surface(
     image: np.ndarray, surface: BSplineSurface, rig: StereoRig, x_tool_mm: np.ndarray, distance: ToolDistance
 ) -> Figure:
-    """The image, and a section through the surface along the tool, with the landmarks (3, 3) mm above it."""
+    """The image, and the heights of the landmarks (3, 3) mm above the surface, along the tool."""
     page, (left, right) = figure(1, 2, width_in=11, height_in=3.8, width_ratios=(1, 1.3))
-    u, view, mm_per_px = rig.left.project(x_tool_mm), rig.left.viewing_direction, 1 / np.linalg.norm(rig.left.linear[0])
-    show_image(left, image, "Left image, and the section along the tool")
+    u, mm_per_px = rig.left.project(x_tool_mm), 1 / np.linalg.norm(rig.left.linear[0])
+    show_image(left, image, "Left image, and the line along the tool")
     known = np.isfinite(u).all(axis=1)
     if not known.any():
         return page
@@ -585,18 +600,28 @@ def tool_over_surface(
     line = tip + reach[:, None] * along
     line = line[surface.grid.inside(line)]
     left.plot(*line.T, color="white", lw=1, ls="--")
-    right.plot((line - tip) @ along * mm_per_px, surface(line) @ view, color=COLOURS["ours"], label="surface")
+    along_mm = (line - tip) @ along * mm_per_px
+    height_mm = -surface(line) @ rig.left.viewing_direction
+    height_mm -= np.nanmin(height_mm)
+    right.plot(along_mm, height_mm, color="#a4502c", lw=2, label="surface")
+    right.fill_between(along_mm, height_mm, -0.3, color="#e9b08a", alpha=0.6, lw=0)
+    ends = []
     for k, (name, colour) in enumerate(LANDMARK_COLOURS.items()):
         if not known[k]:
             continue
-        at, far = x_tool_mm[k] @ view, distance.along_view_mm[k]
-        place = (u[k] - tip) @ along * mm_per_px
+        far, place = distance.along_view_mm[k], (u[k] - tip) @ along * mm_per_px
         label = f"{name}: {1e3 * far:.0f} um above it" if np.isfinite(far) else f"{name}: beyond the surface"
         left.plot(*u[k], "o", color=colour, markeredgecolor="black")
-        right.plot([place] * 2, [at, at + far], color=colour, lw=2)
-        right.plot(place, at, "o", color=colour, markeredgecolor="black", label=label)
-    right.set(xlabel="along the tool (mm)", ylabel="depth along the view (mm)", title="The distances that all this is for")
-    right.invert_yaxis()
+        # A landmark beside the line stands as far above it as it stands above the surface that it covers.
+        ground = np.interp(place, along_mm, height_mm)
+        nudge = (0.0, -0.09, 0.09)[k]  # the tips are about as far along: one must not hide the other
+        right.plot([place + nudge] * 2, [ground, ground + far], color=colour, lw=3)
+        right.plot(place + nudge, ground + far, "o", color=colour, markeredgecolor="black", zorder=3, label=label)
+        ends.append((place + nudge, ground + far))
+    for end in ends[1:] if known[0] else ():
+        right.plot(*zip(ends[0], end, strict=True), color=COLOURS["baseline"], lw=1.2, zorder=1)
+    right.set(xlabel="along the tool (mm)", ylabel="height (mm)", title="The distances that all this is for")
+    right.set_ylim(bottom=-0.3)
     right.legend(fontsize=9)
     return page
 
@@ -650,7 +675,7 @@ def scene_view(
             below = tips[0] + distance.along_view_mm[1] * rig.left.viewing_direction
             said = f"{1e3 * distance.along_view_mm[1]:.0f} um (sd {sd_um:.0f}) along the view"
             line(np.array([tips[0], below]), said, "#111111", 8)
-    axes = {f"{axis}axis_title": f"{axis} (mm)" for axis in "xyz"}
+    axes = {f"{axis}axis": {"title": f"{axis} (mm)", "nticks": 4 if axis == "z" else 6} for axis in "xyz"}
     up = dict(zip("xyz", (-rig.left.viewing_direction).tolist(), strict=True))
     camera = {"up": up, "eye": {axis: 1.4 * value + 0.8 for axis, value in up.items()}}
     view.update_layout(

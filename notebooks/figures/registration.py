@@ -45,30 +45,26 @@ def moved_tool(
     x_robot, x_stale, x_registered:
         (n, 3, 3) mm, n frames of base, tip_1, tip_2.
     """
-    page, axes = figure(1, 2, width_in=11, height_in=4.2)
     sets = (
-        ("robot", x_robot, COLOURS["truth"], 5.0),
+        ("robot", x_robot, COLOURS["truth"], 6.0),
         ("stale rig", x_stale, COLOURS["paper"], 1.4),
         ("registered", x_registered, COLOURS["ours"], 1.4),
     )
-    for ax, (i, j), title in zip(axes, ((0, 1), (0, 2)), ("From above", "From the side"), strict=True):
-        for label, x, colour, width in sets:
-            y = microscope_from_robot.apply(x)
-            for k, frame in enumerate(y):
+    seen = np.concatenate([microscope_from_robot.apply(x).reshape(-1, 3) for _, x, _, _ in sets])
+    low, high = seen.min(axis=0) - 0.4, seen.max(axis=0) + 0.4
+    width, _, depth = high - low
+    # Side by side at one scale: what is level on the left is level on the right.
+    page, axes = figure(1, 2, width_in=10, height_in=5.4, sharey=True, width_ratios=(width, depth))
+    for ax, i, title in zip(axes, (0, 2), ("From above", "From the side"), strict=True):
+        for label, x, colour, line_width in sets:
+            for k, frame in enumerate(microscope_from_robot.apply(x)):
                 jaws = frame[[1, 0, 2]]
-                ax.plot(
-                    jaws[:, i],
-                    jaws[:, j],
-                    "-o",
-                    color=colour,
-                    linewidth=width,
-                    markersize=3,
-                    alpha=0.45 if width > 2 else 1.0,
-                    label=label if k == 0 else None,
-                )
-        ax.set(xlabel="x in mm", ylabel=("y in mm", "depth z in mm")[j - 1], title=title, aspect="equal")
-        ax.invert_yaxis()
-    axes[0].legend()
+                style = {"color": colour, "linewidth": line_width, "markersize": 3.5, "alpha": 0.4 if line_width > 2 else 1}
+                ax.plot(jaws[:, i], jaws[:, 1], "-o", label=label if k == 0 else None, **style)
+        ax.set(title=title, aspect="equal", xlim=(low[i], high[i]), ylim=(high[1], low[1]))
+    axes[0].set(xlabel="x in mm", ylabel="y in mm")
+    axes[1].set(xlabel="depth z in mm")
+    page.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return page
 
 
@@ -157,7 +153,7 @@ def noise_ellipses(rig: StereoRig, sigma_px: float, microscope_from_robot: Rigid
 def drift_chart(monitors: Mapping[str, DriftMonitor], shift_at: int) -> Figure:
     """Left: chi-square of each frame; right: the cumulative sum with its alarm level."""
     page, axes = figure(1, 2, width_in=12, height_in=3.8)
-    colours = [COLOURS["baseline"], COLOURS["warning"], COLOURS["ours"], COLOURS["paper"]]
+    colours = [COLOURS["baseline"], COLOURS["right"], COLOURS["ours"], COLOURS["paper"]]
     top = 0.0
     for (name, monitor), colour in zip(monitors.items(), colours, strict=False):
         chi2, freedom, statistic = np.array(monitor.history).T
@@ -192,18 +188,22 @@ def hypotheses(bic: Mapping[str, float], error_um: Mapping[str, float]) -> Figur
     return page
 
 
-def weights_view(
-    error_um: Mapping[str, np.ndarray], weights: Mapping[str, np.ndarray], share: float
-) -> Figure:
-    """What each loss leaves at the landmarks of a tool, and the weight that it gives to each of them."""
-    page, axes = figure(1, 2, width_in=9, height_in=3.2)
+def weights_view(error_um: Mapping[str, np.ndarray], off_px: np.ndarray, weights: np.ndarray, title: str) -> Figure:
+    """Left: what each loss leaves at the landmarks of a tool; right: the weights (n,) that Eq. (7) gives to landmarks
+    whose detections are `off_px` (n,) wrong."""
+    page, (left, right) = figure(1, 2, width_in=11, height_in=3.6)
     looks = {"squared": ("squared norms", "paper"), "norm": ("sum of norms, Eq. (7)", "ours")}
     for loss, (name, colour) in looks.items():
-        axes[0].plot(np.sort(error_um[loss]), color=COLOURS[colour], label=name)
-        axes[1].plot(np.sort(weights[loss])[::-1], ".-", color=COLOURS[colour], label=name)
-    axes[0].set(yscale="log", ylim=(5, 5e4), xlabel="landmark, sorted", ylabel="um", title="Left after registration")
-    axes[1].set(ylim=(-0.05, 1.1), xlabel="landmark, sorted", title=f"Weights; {100 * share:.0f} % of detections wrong")
-    axes[0].legend(loc="upper left")
+        share = 100 * np.arange(1, len(error_um[loss]) + 1) / len(error_um[loss])
+        left.plot(np.sort(error_um[loss]), share, color=COLOURS[colour], label=name)
+    left.set(xscale="log", xlim=(5, 5e4), xlabel="left after registration (um)", ylabel="landmarks below (%)")
+    left.set_title(title)
+    left.legend(loc="lower right", fontsize=9)
+    right.plot(off_px, weights / weights.max(), "o", color=COLOURS["ours"], markersize=5, alpha=0.7)
+    right.set(xscale="log", xlim=(0.3, 200), xlabel="the worse of its two detections is off by (px)")
+    right.set(yscale="log", ylim=(1e-4, 2), ylabel="weight (largest 1)", title="Whom Eq. (7) believes")
+    for axis in (left.xaxis, right.xaxis, right.yaxis):
+        axis.set_major_formatter("{x:g}")
     return page
 
 

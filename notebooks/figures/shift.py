@@ -25,7 +25,7 @@ def rung_page(
     relative = np.nan_to_num(evaluation.error_px / evaluation.length_px[:, None], nan=-1.0, posinf=1e9).max(axis=1)
     order = np.argsort(-relative, kind="stable") if order is None else order
     rows = -(-len(order) // columns)
-    fig, axes = figure(rows, columns, width_in=12, height_in=(12 / columns + 0.35) * rows, squeeze=False)
+    fig, axes = figure(rows, columns, width_in=12, height_in=(12 / columns + 0.5) * rows, squeeze=False)
     for ax in axes.flat[len(order) :]:
         ax.set_axis_off()
     for ax, i in zip(axes.flat, order, strict=False):

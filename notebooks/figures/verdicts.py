@@ -6,6 +6,7 @@ import textwrap
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator
 
 from lib.calibration import Calibration, calibrate, with_offsets
 from lib.correspondences import Correspondences
@@ -74,10 +75,11 @@ def health_chart(found: Health) -> Figure:
         ax.semilogy(found.frame, found.parts["unfamiliar"][:, 0], "s", ms=3, color="#e69f00", label="unfamiliar picture")
     ax.axhline(1.0, color="#b42318", lw=1)
     ax.set(xlabel="frame", ylabel="score", ylim=(0.9 * score.min(), max(2.0, 1.2 * score.max())))
-    ax.set_title(f"Health of the detector: {found.text}", fontsize=10)
+    ax.set_title("\n".join(textwrap.wrap(f"Health of the detector: {found.text}", 100)), fontsize=10)
+    ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     ax.yaxis.set_major_formatter("{x:g}")
     ax.yaxis.set_minor_formatter("")
-    ax.legend(loc="upper right", fontsize=8, ncols=2, bbox_to_anchor=(1, 1.02))
+    page.legend(loc="outside lower center", fontsize=9, ncols=2)
     return page
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import pytest
 
 from lib import paths
 from lib.workbench.command import run
-from lib.workbench.headlines import complete_runs
+from lib.workbench.headlines import complete_runs, is_recorded
 from tests.browser import Chromium
 
 pytestmark = pytest.mark.slow
@@ -47,6 +48,8 @@ AUDIT = r"""(() => {
     if (!e.alt.trim()) wrong.push(`no alternative text: ${name(e)} ${e.src.slice(0, 60)}`);
     if (!e.hidden && e.complete && !e.naturalWidth) wrong.push(`broken picture: ${e.alt}`);
   }
+  for (const e of document.querySelectorAll("*"))
+    if (e.localName.includes(":")) wrong.push(`an element that no browser draws: ${name(e)}`);
   const ids = [...document.querySelectorAll("[id]")].map((e) => e.id);
   for (const e of document.querySelectorAll('a[href^="#"]'))
     if (!ids.includes(decodeURIComponent(e.hash.slice(1)))) wrong.push(`an anchor to nowhere: ${e.hash}`);
@@ -200,9 +203,14 @@ def test_a_view_has_a_still_where_no_script_runs(browser, folder):
 
 
 def test_numbers_are_found_by_their_words(browser, folder):
+    """A run of a few notebooks may hold no recorded number; then none is shown."""
     open_page(browser, folder / "index.html", 1400)
-    everything = browser.value("document.querySelectorAll('#all tbody tr').length")
-    at = "document.getElementById('find')"
-    browser.value(f"{at}.value = 'RECORDED'; {at}.dispatchEvent(new Event('input'))")
-    left = browser.value("[...document.querySelectorAll('#all tbody tr')].filter((r) => !r.hidden).length")
-    assert 0 < left < everything
+    metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))["metrics"]
+    at, rows = "document.getElementById('find')", "[...document.querySelectorAll('#all tbody tr')]"
+    assert browser.value(f"{rows}.length") == len(metrics)
+    for words in ("RECORDED", metrics[-1]["name"], f"{metrics[0]['unit']} {metrics[0]['notebook'][:2]}", "no such word"):
+        browser.value(f"{at}.value = '{words}'; {at}.dispatchEvent(new Event('input'))")
+        expected = browser.value(f"{rows}.filter((r) => {words.lower().split()}.every((w) => "
+                                 "r.textContent.toLowerCase().includes(w))).length")  # fmt: skip
+        assert browser.value(f"{rows}.filter((r) => !r.hidden).length") == expected
+        assert (expected == 0) == (words == "no such word" or (words == "RECORDED" and not any(map(is_recorded, metrics))))

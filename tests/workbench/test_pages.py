@@ -27,3 +27,12 @@ def test_tex_that_cannot_be_drawn_is_shown():
 def test_markdown_keeps_code_and_dollars_apart():
     html = markdown_html("Cost `$a$` and $x < y$.")
     assert "<code>$a$</code>" in html and html.count("<svg ") == 1 and "x &lt; y" in html
+
+
+def test_an_equation_in_a_heading_is_an_element_that_browsers_draw():
+    html = markdown_html(r"## Why the $\ell_1$ norm")
+    assert "<svg " in html and "xmlns" not in html and "ns0:" not in html
+
+
+def test_text_in_an_equation_keeps_its_words_apart_at_the_end_of_a_line():
+    assert equation_svg("\\text{one\ntwo}", display=False) == equation_svg(r"\text{one two}", display=False)
