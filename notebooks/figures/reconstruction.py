@@ -83,9 +83,9 @@ def descriptor_channels(image: np.ndarray, channels: np.ndarray) -> Figure:
     """An image and the pixel descriptor of DeepMatching on it, channels (h, w, c): one panel a gradient direction."""
     page, axes = figure(3, 3, width_in=11, height_in=6.9)
     limit = float(np.quantile(channels[..., :8], 0.999))
-    for k, ax in enumerate(np.delete(axes.ravel(), 4)):  # round the image as the compass has them: 0 is to the right
-        direction = (135, 90, 45, 180, 0, 225, 270, 315)[k]
-        show_image(ax, channels[..., direction // 45], f"rises towards {direction}°")
+    where = ("upper left", "top", "upper right", "left", "right", "lower left", "bottom", "lower right")
+    for ax, name, channel in zip(np.delete(axes.ravel(), 4), where, (5, 6, 7, 4, 0, 3, 2, 1), strict=True):
+        show_image(ax, channels[..., channel], f"brighter to the {name}")
         ax.images[0].set(cmap="magma_r", clim=(0, limit))
     show_image(axes[1, 1], image, "the image")
     page.colorbar(axes[0, 0].images[0], ax=axes, label="strength", shrink=0.5, aspect=30)
@@ -676,8 +676,9 @@ def scene_view(
             said = f"{1e3 * distance.along_view_mm[1]:.0f} um (sd {sd_um:.0f}) along the view"
             line(np.array([tips[0], below]), said, "#111111", 8)
     axes = {f"{axis}axis": {"title": f"{axis} (mm)", "nticks": 4 if axis == "z" else 6} for axis in "xyz"}
-    up = dict(zip("xyz", (-rig.left.viewing_direction).tolist(), strict=True))
-    camera = {"up": up, "eye": {axis: 1.4 * value + 0.8 for axis, value in up.items()}}
+    up, (right, down) = -rig.left.viewing_direction, _across(rig)
+    eye = 0.85 * up + 1.15 * down + 0.3 * right  # as one who sits in front of the image
+    camera = {name: dict(zip("xyz", v.tolist(), strict=True)) for name, v in (("up", up), ("eye", eye))}
     view.update_layout(
         scene={"aspectmode": "data", "camera": camera, **axes}, margin={"l": 0, "r": 0, "t": 0, "b": 0},
         height=height_px, legend={"x": 0, "y": 1, "bgcolor": "rgba(255,255,255,0.7)"},
