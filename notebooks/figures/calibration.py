@@ -15,7 +15,7 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullForma
 from lib.calibration import Calibration, LandmarkOffsets, TimeOffset
 from lib.geometry import RigidTransform
 from lib.workbench.results import Table
-from notebooks.figures.style import COLOURS, LANDMARK_COLOURS, figure, show_image
+from notebooks.figures.style import COLOURS, LANDMARK_COLOURS, ON_IMAGE, figure, show_image
 from notebooks.figures.style import table as html_table
 from notebooks.studies.camera_models import Comparison
 from notebooks.studies.dvrk import RobotFrames, SphereFit
@@ -298,7 +298,7 @@ def frame_residuals(image: np.ndarray, detected: np.ndarray, predicted: np.ndarr
             ax.plot(*p, "+", color="white", markersize=1.6 * size, markeredgewidth=2)
     axes[1].set(xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] + half, middle[1] - half))
     axes[0].plot([], [], "+", color="white", markersize=9, markeredgewidth=2, label="robot, projected")
-    axes[0].legend(loc="upper right", fontsize=8, labelcolor="white", facecolor="black", framealpha=0.6)
+    axes[0].legend(loc="upper right", fontsize=8, **ON_IMAGE)
     return page
 
 
@@ -501,7 +501,7 @@ def robot_frames(frames: RobotFrames, rows: Sequence[int], fits: Mapping[str, Se
                 )
     for name, colour in colours.items():
         axes[0].plot([], [], color=colour, label=f"{name}, 40 times")
-    axes[0].legend(loc="lower right", fontsize=8, labelcolor="white", facecolor="black", framealpha=0.6)
+    axes[0].legend(loc="lower right", fontsize=8, **ON_IMAGE)
     return page
 
 

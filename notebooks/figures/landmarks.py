@@ -19,7 +19,7 @@ from lib.landmarks.network import HourglassConfig
 from lib.recordings import Recording
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE
 from lib.training.evaluation import Evaluation
-from notebooks.figures.style import COLOURS, LANDMARK_COLOURS, figure, show_image
+from notebooks.figures.style import COLOURS, LANDMARK_COLOURS, ON_IMAGE, figure, show_image
 
 __all__ = [
     "augmented",
@@ -226,7 +226,7 @@ def detection(image: np.ndarray, evaluation: Evaluation, index: int, *, half_px:
     found, truth = evaluation.landmarks, evaluation.u_true[index]
     show_image(axes[0], image[::2, ::2], evaluation.names[index])
     landmark_dots(axes[0], found.u[index] / 2 - 0.25, label=True)
-    axes[0].legend(loc="lower left", labelcolor="white")
+    axes[0].legend(loc="lower left", **ON_IMAGE)
     h, w = image.shape[:2]
     for k, (ax, (name, colour)) in enumerate(zip(axes[1:], LANDMARK_COLOURS.items(), strict=True)):
         centre = found.u[index, k] if np.isfinite(found.u[index, k]).all() else truth[k]
@@ -394,7 +394,7 @@ def closeups(windows: np.ndarray, expected: np.ndarray, seen: Peaks, kept: Peaks
         size = 2 * np.sqrt(chi2.ppf(0.95, 2)) * deviation
         ax.add_patch(Ellipse(seen.u[i, 0].numpy(), *size, fill=False, ec="yellow", lw=2, label="closeup, 95 %"))
         ax.plot(*kept.u[i, 0].numpy(), "o", ms=7, color=COLOURS["ours"], label="corrected")
-    axes[1, 0].legend(loc="lower left")
+    axes[1, 0].legend(loc="lower left", fontsize=8, **ON_IMAGE)
     return fig
 
 

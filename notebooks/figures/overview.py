@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from lib.online import FrameResult
-from notebooks.figures.style import COLOURS, LANDMARK_COLOURS, figure, show_image
+from notebooks.figures.style import COLOURS, LANDMARK_COLOURS, ON_IMAGE, figure, show_image
 
 __all__ = ["frame_pair", "landmarks_on", "pipeline_page", "pixel_grid"]
 
@@ -21,7 +21,7 @@ def landmarks_on(axes: Axes, u: np.ndarray, *, label: bool = True) -> None:
         if np.isfinite(point).all():
             axes.plot(*point, "o", color=LANDMARK_COLOURS[name], markersize=5, markeredgecolor="black", label=name)
     if label and axes.get_legend_handles_labels()[0]:
-        axes.legend(loc="upper right", fontsize=8, labelcolor="white")
+        axes.legend(loc="upper right", fontsize=8, **ON_IMAGE)
 
 
 def frame_pair(left: np.ndarray, right: np.ndarray, u_left: np.ndarray, u_right: np.ndarray) -> Figure:

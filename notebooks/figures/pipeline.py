@@ -126,8 +126,12 @@ def error_timeline(
     _shade_states(ax, results)
     colours = (COLOURS["ours"], COLOURS["truth"], COLOURS["paper"], COLOURS["baseline"])
     for (name, error), colour in zip(errors_um.items(), colours, strict=False):
-        known = np.isfinite(error)  # a surface is not made in every frame: the line goes on to the next
-        ax.plot(np.array([result.index for result in results])[known], error[known], color=colour, marker=".", label=name)
+        known = np.flatnonzero(np.isfinite(error))
+        # A surface is made in every third frame: a line joins such neighbours, and is broken where more are missing.
+        breaks = np.flatnonzero(np.diff(known) > np.diff(known).min(initial=len(error))) + 1
+        for k, part in enumerate(np.split(known, breaks)):
+            index = [results[i].index for i in part]
+            ax.plot(index, error[part], color=colour, marker=".", label=name if k == 0 else None)
     if bump_at is not None:
         ax.axvline(bump_at - 0.5, color=COLOURS["warning"], linestyle="--", label="push")
     if any(np.isfinite(error).any() for error in errors_um.values()):

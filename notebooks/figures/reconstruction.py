@@ -24,7 +24,7 @@ from lib.matching.pyramid import PATCH
 from lib.surface import BSplineSurface, Mesh, ToolDistance
 from lib.workbench.results import Table
 from notebooks.figures.interactive import explore
-from notebooks.figures.style import COLOURS, LANDMARK_COLOURS, figure, show_image, table
+from notebooks.figures.style import COLOURS, LANDMARK_COLOURS, ON_IMAGE, figure, show_image, table
 from notebooks.studies.matching_evaluation import DisparityScore
 
 if TYPE_CHECKING:
@@ -75,7 +75,7 @@ def stereo_pair(left: np.ndarray, right: np.ndarray, u_tool: tuple[np.ndarray, n
         show_image(ax, image, side)
         for (name, colour), point in zip(LANDMARK_COLOURS.items(), u, strict=True):
             ax.plot(*point, "o", color=colour, markeredgecolor="black", label=name)
-        ax.legend(loc="upper right", fontsize=8)
+        ax.legend(loc="upper right", fontsize=8, **ON_IMAGE)
     return page
 
 
@@ -681,7 +681,7 @@ def scene_view(
     camera = {name: dict(zip("xyz", v.tolist(), strict=True)) for name, v in (("up", up), ("eye", eye))}
     view.update_layout(
         scene={"aspectmode": "data", "camera": camera, **axes}, margin={"l": 0, "r": 0, "t": 0, "b": 0},
-        height=height_px, legend={"x": 0, "y": 1, "bgcolor": "rgba(255,255,255,0.7)"},
+        height=height_px, legend={"orientation": "h", "x": 0, "y": 0, "yanchor": "top"},  # below: a small screen has no room
     )  # fmt: skip
     return view
 
@@ -692,9 +692,9 @@ def growing(responses: Mapping[str, np.ndarray]) -> Figure:
     for ax, (name, response) in zip(axes, responses.items(), strict=True):
         high = int((response > 0.8 * response.max()).sum())
         show_image(ax, response / response.max(), f"{name}: {high} places above 80 %")
-        ax.images[0].set(cmap="magma", clim=(0, 1), interpolation="nearest")
+        ax.images[0].set(cmap="magma_r", clim=(0, 1), interpolation="nearest")
         row, column = np.unravel_index(response.argmax(), response.shape)
-        ax.plot(column, row, "+", color="cyan", markersize=14, markeredgewidth=2)
+        ax.plot(column, row, "o", mfc="none", mec=COLOURS["ours"], markersize=13, markeredgewidth=2)
     page.colorbar(axes[-1].images[0], ax=list(axes), label="response / peak", shrink=0.8)
     return page
 

@@ -11,7 +11,7 @@ from IPython.display import HTML
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-__all__ = ["COLOURS", "LANDMARK_COLOURS", "figure", "show_image", "table"]
+__all__ = ["COLOURS", "LANDMARK_COLOURS", "ON_IMAGE", "figure", "show_image", "table"]
 
 #: Colour-blind safe (after Okabe and Ito), 3:1 and more on white, named by what they mean here.
 COLOURS = {
@@ -25,6 +25,8 @@ COLOURS = {
 }
 #: Legible on dark images and on white.
 LANDMARK_COLOURS = {"base": "#56B4E9", "tip_1": "#E69F00", "tip_2": "#CC79A7"}
+#: Of a legend that lies on an image.
+ON_IMAGE = {"labelcolor": "white", "frameon": True, "facecolor": "black", "framealpha": 0.55, "edgecolor": "none"}
 
 _RC = {
     "figure.dpi": 100,
