@@ -75,7 +75,7 @@ def health_chart(found: Health) -> Figure:
         ax.semilogy(found.frame, found.parts["unfamiliar"][:, 0], "s", ms=3, color="#e69f00", label="unfamiliar picture")
     ax.axhline(1.0, color="#b42318", lw=1)
     ax.set(xlabel="frame", ylabel="score", ylim=(0.9 * score.min(), max(2.0, 1.2 * score.max())))
-    ax.set_title("\n".join(textwrap.wrap(f"Health of the detector: {found.text}", 100)), fontsize=10)
+    ax.set_title("\n".join(textwrap.wrap(f"Health of the detector: {found.text}", 115)), fontsize=10)
     ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     ax.yaxis.set_major_formatter("{x:g}")
     ax.yaxis.set_minor_formatter("")
