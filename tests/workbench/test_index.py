@@ -55,8 +55,9 @@ def test_what_the_page_shows():
     assert "a notebook failed" in page and "01_data: error in cell 3: ValueError: recording.toml" in page
     assert "<b>Recording</b>eye" in page
     assert "2 min 03 s" in page and "0123456789 + local changes" in page and "1 of 2" in page
-    assert '<td class="number paper">2 px</td>' in page and '<td class="number ours">1.5 px</td>' in page
-    assert '<td class="number">1.25 px</td>' in page and 'href="01_data.html#01-a"' in page
+    for kind, name, value in ((" ours", "This run", 1.5), ("", "Previous run", 1.25), (" paper", "Paper", 2)):
+        assert f'<td class="number{kind}" data-of="{name}">{value} px</td>' in page
+    assert 'href="01_data.html#01-a"' in page
     assert "n/a" in page and "<svg " in page and "-p recording eye" in page
 
 
@@ -69,7 +70,7 @@ def test_html_in_untrusted_markdown_is_escaped():
 def test_recorded_numbers_have_a_column_of_their_own():
     run = run_with("eye")
     run["metrics"].append(run["metrics"][0] | {"name": "c_px", "value": 7.0, "note": "RMS, recorded, 4 seeds"})
-    rows = re.findall(r"<tr><td><code>(?:a|c)_<wbr>px</code>.*?</tr>", index_html(run), re.DOTALL)
+    rows = re.findall(r'<tr><td class="name"><code>(?:a|c)_<wbr>px</code>.*?</tr>', index_html(run), re.DOTALL)
     cells = [re.findall(r"<td[^>]*>([^<]*)</td>", row)[:4] for row in rows]
     assert cells == [["1.5 px", "1.25 px", "", "2 px"], ["", "", "7 px", "2 px"]]
 

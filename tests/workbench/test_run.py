@@ -163,7 +163,7 @@ def test_pages_need_no_network_and_show_equations(finished):
 
 def test_index_shows_paper_and_run_and_escapes_text(finished):
     text = (finished[1] / "index.html").read_text(encoding="utf-8")
-    assert '<td class="number paper">2 px</td>' in text and '<td class="number ours">4.5 px</td>' in text
+    assert 'data-of="Paper">2 px</td>' in text and 'data-of="This run">4.5 px</td>' in text
     assert "of &lt;b&gt;75&lt;/b&gt; frames" in text and "It &lt;works&gt;" in text
     assert "00_error: error in cell 3: ZeroDivisionError" in text
     assert "figures/calibration_residuals.png" in text
