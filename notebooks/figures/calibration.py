@@ -54,22 +54,22 @@ DEPTH_SCALE_UM = (30.0, 2000.0)
 
 def correspondences(x_mm: np.ndarray, u_left: np.ndarray, u_right: np.ndarray, size_px: tuple[int, int]) -> Figure:
     """Robot positions (n, 3) in 3D and their detections in both images, coloured by depth along z of the robot."""
-    page = plt.figure(figsize=(12, 7.2), layout="constrained")
-    grid = page.add_gridspec(2, 2, height_ratios=(1.1, 1))
-    axes = page.add_subplot(grid[0, :], projection="3d")
+    page = plt.figure(figsize=(12, 6.0), layout="constrained")
+    grid = page.add_gridspec(2, 2, width_ratios=(1.35, 1))
+    axes = page.add_subplot(grid[:, 0], projection="3d")
     heights = x_mm[:, 2]
     look = {"c": heights, "s": 12, "cmap": "plasma", "vmax": heights.max() + 0.2 * np.ptp(heights)}  # no pale yellow
     axes.scatter(*x_mm.T, **look)
     axes.set(xlabel="x (mm)", ylabel="y (mm)", zlabel="z (mm)")
     axes.set_title("Robot: where the landmarks were", loc="left")
-    axes.set_box_aspect(np.ptp(x_mm, axis=0), zoom=1.5)
+    axes.set_box_aspect(np.ptp(x_mm, axis=0), zoom=0.95)
     axes.locator_params(nbins=4)
     for i, (u, side) in enumerate(((u_left, "Left"), (u_right, "Right"))):
-        flat = page.add_subplot(grid[1, i])
+        flat = page.add_subplot(grid[i, 1])
         dots = flat.scatter(*u.T, **look)
-        flat.set(xlim=(0, size_px[0]), ylim=(size_px[1], 0), aspect="equal", xlabel="x (px)", ylabel="y (px)")
+        flat.set(xlim=(0, size_px[0]), ylim=(size_px[1], 0), aspect="equal", xlabel="x (px)" if i else "", ylabel="y (px)")
         flat.set_title(f"{side} image: where they were seen")
-    page.colorbar(dots, ax=page.axes, label="height z (mm)", shrink=0.6)
+    page.colorbar(dots, ax=page.axes, label="height z (mm)", shrink=0.7)
     return page
 
 
