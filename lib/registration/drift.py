@@ -11,18 +11,21 @@ from lib.geometry import pair_covariance
 
 __all__ = ["DriftMonitor"]
 
-#: What is watched: the mean residual of a frame's landmarks along the two directions of the images that a lateral shift
-#: moves, along the one that a shift in depth moves, and across the epipolar lines; and their chi-square.
-AXES = ("lateral", "lateral", "depth", "epipolar", "scatter")
-_SHIFT_MM = (0.020, 0.020, 0.050)  # that is to be noticed, along the first three axes; half of it counts as none
+#: What is watched: the mean residual of a frame's landmarks along the directions of the images that lateral shifts move,
+#: along the one that a shift in depth moves, and across the epipolar lines; and their chi-square.
+AXES = ("lateral", "lateral", "lateral", "lateral", "depth", "epipolar", "scatter")
+# Shifts of the tool that are to be noticed, along the principal directions of the rig; half of them counts as none.
+_SHIFT_MM = np.array([[20, 0, 0], [0, 20, 0], [14, 14, 0], [14, -14, 0], [0, 0, 50]]) / 1e3
 _SHIFT_SD = (1.0, 8.0)  # of a frame: least and largest shift that a test is made for; the other axes are tested for 2
 _FRAMES = 20_000  # between false alarms, at least
 # Most that one frame adds, of the alarm level: so that neither a single bad frame raises an alarm nor, across and along the
 # depth, a detector that is wrong alike for some frames.  That grows with the score between two bounds.
-_LEAST, _CAP, _BURST = 0.2, 0.55, (1.0, 1.0, 0.03, 0.03, 0.03)
+_LEAST, _CAP, _BURST = 0.2, 0.55, (1.0, 1.0, 1.0, 1.0, 0.1, 0.03, 0.03)
 _MEMORY = 1000  # frames that tell the noise
 _FEW = 40  # frames: with fewer the noise is taken for larger than they say, up to twice
-_WANDER = (4, 4, 10, 10, 10)  # frames over which correlated noise counts: about as many as an alarm takes
+_WANDER = (4, 4, 4, 4, 10, 10, 10)  # frames over which correlated noise counts: about as many as an alarm takes
+# By what that raises the variance, before the frames tell: as if so many frames had told it, for few say little of it.
+_RAISES, _RAISES_FRAMES = (1.2, 1.2, 1.2, 1.2, 1.0, 1.3, 1.3), 1500
 _SLOW = 300  # frames over which the bias is averaged
 _LARGEST_BIAS_PX = 0.5  # of a frame's mean; more is a drift
 _FREEDOM = 4.0  # of the Student t of a landmark about the frame's mean: one wrong landmark moves the mean little
@@ -48,6 +51,7 @@ class DriftMonitor:
         since: Frames since that S was last zero: about how long ago it began.
         score: Largest score of the last frame alone, in standard deviations.
         history: (chi2, degrees of freedom, statistic) of the last 1000 frames.
+        inflation: Variance of the mean of many frames over what the stated noise makes it, along the depth.
 
     >>> from lib.cameras import AffineCamera
     >>> camera = AffineCamera([[100, 0, 0, 0], [0, 100, 0, 0]])
@@ -64,13 +68,8 @@ class DriftMonitor:
         self.covariance_px2, self.sigma_x_mm = pair_covariance(covariance_px2, 1), sigma_x_mm
         self.history: deque[tuple[float, int, float]] = deque(maxlen=1000)
         self._scores: deque[np.ndarray] = deque(maxlen=_MEMORY)
-        self._noise = np.full(len(AXES), 2.0)
+        self._noise, self.inflation = np.full(len(AXES), 2.0), 4.0
         self.reset(rig)
-
-    @property
-    def inflation(self) -> float:
-        """Variance of the mean of many frames over what the stated noise makes it, along the depth."""
-        return float(self._noise[2] ** 2)
 
     def reset(self, rig: StereoRig) -> None:
         """Go on with a rig that was registered anew, from a clean slate; the noise stays known."""
@@ -87,15 +86,14 @@ class DriftMonitor:
         """Go on with the same rig, known a little better."""
         self.rig = rig
         u, px_per_mm, _ = np.linalg.svd(rig.linear)
-        self._axes, self._shift_px = u.T, px_per_mm * _SHIFT_MM
+        moves = u[:, :3] * np.maximum(px_per_mm, 1e-9) @ _SHIFT_MM.T  # cameras that look alike see no depth
+        self._shift_px = np.linalg.norm(moves, axis=0)
+        self._axes = np.vstack([(moves / self._shift_px).T, u[:, 3]])
 
     def update(
-        self,
-        data: Correspondences | ArrayLike,
-        u_left: ArrayLike | None = None,
-        u_right: ArrayLike | None = None,
+        self, data: Correspondences | ArrayLike, u_left: ArrayLike | None = None, u_right: ArrayLike | None = None,
         covariance_px2: ArrayLike | None = None,
-    ) -> bool:
+    ) -> bool:  # fmt: skip
         """Take in one frame; True = the cameras have moved.
 
         Args:
@@ -105,9 +103,8 @@ class DriftMonitor:
                 rig itself is uncertain, far from the landmarks that it was calibrated with.
         """
         data = data if isinstance(data, Correspondences) else Correspondences.of_points(data, u_left, u_right)
-        if covariance_px2 is None:
-            covariance = self.covariance_px2 + self.sigma_x_mm**2 * self.rig.linear @ self.rig.linear.T
-        else:
+        covariance = self.covariance_px2 + self.sigma_x_mm**2 * self.rig.linear @ self.rig.linear.T
+        if covariance_px2 is not None:
             covariance = pair_covariance(covariance_px2, len(data))
         used = data.is_complete
         covariance, data = np.broadcast_to(covariance, (len(used), 4, 4))[used], data.subset(used)
@@ -129,11 +126,11 @@ class DriftMonitor:
     def _add(self, value: np.ndarray, sd: np.ndarray) -> None:
         largest_bias = _LARGEST_BIAS_PX / np.append(sd, sd.min())
         z = (value - np.clip(self._bias, -largest_bias, largest_bias)) / self._noise
-        shift = np.append(np.clip(self._shift_px / (sd[:3] * self._noise[:3]), *_SHIFT_SD), (2.0, 2.0))
+        shift = np.append(np.clip(self._shift_px / (sd[:-1] * self._noise[:-2]), *_SHIFT_SD), (2.0, 2.0))
         level = np.log(2 * len(AXES) * _FRAMES * shift**2 / 2.0) - 1.166 * shift
         # The bias of few frames is uncertain itself.
         slack = shift / 2.0 + 1.0 / np.sqrt(self._seen + 10.0)
-        signed = np.stack([z, -z * (1, 1, 1, 1, 0)])  # landmarks that scatter less than usual are no fault
+        signed = np.stack([z, np.append(-z[:-1], 0.0)])  # landmarks that scatter less than usual are no fault
         gain = np.minimum(shift * (signed - slack) / level, np.clip(_BURST * np.abs(z), _LEAST, _CAP))
         self._sums = np.maximum(self._sums + gain, 0.0)
         self._runs = np.where(self._sums > 0, self._runs + 1, 0)
@@ -146,7 +143,8 @@ class DriftMonitor:
         self._seen += 1
         self._bias = self._bias + (tame - self._bias) * max(1.0 / (self._seen + 10.0), 1.0 / _SLOW)
         if self._seen % 10 == 0:
-            self._noise = _long_run_sd(np.array(self._scores))
+            self._noise = _long_run_sd(np.array(self._scores), _RAISES_FRAMES)
+            self.inflation = float(_long_run_sd(np.array(self._scores))[AXES.index("depth")] ** 2)
 
 
 def _robust_mean(residual: np.ndarray, weight: np.ndarray) -> np.ndarray:
@@ -158,10 +156,11 @@ def _robust_mean(residual: np.ndarray, weight: np.ndarray) -> np.ndarray:
     return mean
 
 
-def _long_run_sd(values: np.ndarray) -> np.ndarray:
+def _long_run_sd(values: np.ndarray, known: int = 0) -> np.ndarray:
     """(k,) of series (n, k): the standard deviation that independent frames would need for means to scatter as these do.
 
-    The autocovariances are summed under a triangle (Bartlett), as far as a test of the axis adds up frames.
+    The autocovariances are summed under a triangle (Bartlett), as far as a test of the axis adds up frames; `_RAISES` counts
+    for `known` frames beside them.
     """
     n = len(values)
     d = values - values.mean(axis=0)
@@ -169,5 +168,6 @@ def _long_run_sd(values: np.ndarray) -> np.ndarray:
     widths, total = np.minimum(_WANDER, n // 8), variance.copy()
     for lag in range(1, int(widths.max()) + 1):
         total += 2.0 * np.maximum(1.0 - lag / (widths + 1.0), 0.0) * (d[lag:] * d[:-lag]).sum(axis=0) / n
-    few = 1.0 + 3.0 / (1.0 + (n / _FEW) ** 2)
-    return np.sqrt(few * np.maximum(total, np.maximum(variance, 0.05)))
+    few, least = 1.0 + 3.0 / (1.0 + (n / _FEW) ** 2), np.maximum(variance, 0.05)
+    total = (n * total + known * np.array(_RAISES) * variance) / (n + known)
+    return np.sqrt(few * np.maximum(total, least))

@@ -23,21 +23,16 @@ from lib.registration.rigid import Registration, check_spread, motion_jacobian, 
 __all__ = ["MovedCameras", "identify_motion", "register_images"]
 
 _FREEDOM = 4.0  # of the Student t that "robust" assumes: gross errors lose their weight, small ones keep it
-_BELIEVED = 30  # rows that the stated noise is worth, beside the scatter of the residuals, in the covariance of "robust"
+_BELIEVED = 20  # rows that the stated noise is worth, beside the scatter of the residuals, in the covariance
+_WRONG = 16.0  # chi-square of an image's two pixels that is no noise: once in 3,000
 _OPEN = 1e-12  # relative curvature below which a direction is not determined
 Loss = Literal["squared", "robust"]
 
 
 def register_images(
-    rig: StereoRig,
-    data: Correspondences | ArrayLike,
-    u_left: ArrayLike | None = None,
-    u_right: ArrayLike | None = None,
-    *,
-    covariance_px2: ArrayLike | None = None,
-    sigma_x_mm: float = 0.0,
-    loss: Loss = "squared",
-) -> Registration:
+    rig: StereoRig, data: Correspondences | ArrayLike, u_left: ArrayLike | None = None, u_right: ArrayLike | None = None, *,
+    covariance_px2: ArrayLike | None = None, sigma_x_mm: float = 0.0, loss: Loss = "squared",
+) -> Registration:  # fmt: skip
     """The motion of a rig whose cameras moved together, by maximum likelihood in the images.
 
     Like ``register(triangulated, x_mm)`` it takes points of the stale rig to the robot frame.
@@ -85,14 +80,9 @@ class MovedCameras:
 
 
 def identify_motion(
-    rig: StereoRig,
-    data: Correspondences | ArrayLike,
-    u_left: ArrayLike | None = None,
-    u_right: ArrayLike | None = None,
-    *,
-    covariance_px2: ArrayLike | None = None,
-    sigma_x_mm: float = 0.0,
-) -> MovedCameras:
+    rig: StereoRig, data: Correspondences | ArrayLike, u_left: ArrayLike | None = None, u_right: ArrayLike | None = None, *,
+    covariance_px2: ArrayLike | None = None, sigma_x_mm: float = 0.0,
+) -> MovedCameras:  # fmt: skip
     """Which cameras moved, and how: the hypothesis with the smallest Bayesian information criterion.
 
     The hypotheses are: neither camera moved (0 parameters), the left or the right alone (5; 6 if it is near-affine), both
@@ -171,7 +161,20 @@ def _register_both(rig: StereoRig, data: _Observed, loss: Loss) -> Registration:
     for kind in ("squared",) if loss == "squared" else ("squared", "norm"):
         with suppress(ValueError):  # too few landmarks in both images, or on a line
             starts.append(register(points.x_mm[both], data.x[both], loss=kind).transform)
-    return _fit(rig, data, starts, loss, 6)
+    found = _fit(rig, data, starts, loss, 6)
+    if loss == "squared" or not data.scale_known:
+        return found
+    for _ in range(3):  # one image may be wrong and the other right
+        r = (data.y - np.hstack(rig.project(found.transform.inverse().apply(data.x)))).reshape(-1, 2, 2, 1)
+        own = np.stack([data.covariance[:, :2, :2], data.covariance[:, 2:, 2:]], axis=1)
+        seen = data.seen & ((np.swapaxes(r, 2, 3) @ np.linalg.solve(own, r))[..., 0, 0] < _WRONG)
+        if 2 * seen.sum() < data.seen.sum():  # then the motion is no motion together
+            return found
+        with suppress(ValueError):  # those left leave it open
+            found = _fit(rig, replace(data, seen=seen), [found.transform], loss, 6)
+    energy, (_, distance2, weights) = _evaluate(rig, data, loss, found.transform.inverse())
+    distance, weights = np.where(data.dimension > 0, (np.sqrt(distance2), weights), [[np.nan], [0.0]])
+    return replace(found, residuals=distance, weights=weights, cost=2 * energy)
 
 
 def _register_one(rig: StereoRig, data: _Observed, side: int) -> Registration:
@@ -243,14 +246,16 @@ def _minimum(rig: StereoRig, data: _Observed, stale: RigidTransform, loss: Loss,
     if np.linalg.matrix_rank(information, tol=_OPEN * np.trace(information), hermitian=True) < parameters:
         raise ValueError("x_mm, u_left, u_right: these landmarks leave the motion open. Add frames in other positions.")
     covariance = np.linalg.pinv(information, rcond=_OPEN, hermitian=True)
+    n, size = used.sum(), data.dimension.sum()
+    own = covariance * distance2.sum() / max(size - parameters, 1)
     if loss == "robust":
         # The weights fall with the residual, which bends the loss less than the weights alone say.  Where nothing fits,
         # the sum may curve the wrong way: then the weights alone.
         _, gradient = gradients(found.state, found.work)
         flatter = information - gradient.T @ (gradient * (2.0 / (_FREEDOM + data.dimension))[:, None])
         bent = np.linalg.eigvalsh(flatter)[-parameters] <= _OPEN * np.trace(information)
-        own, n = sandwich(information if bent else flatter, gradient[used], parameters), used.sum()
-        covariance = (_BELIEVED * covariance + n * own) / (_BELIEVED + n)
+        own = sandwich(information if bent else flatter, gradient[used], parameters * n / size)
+    covariance = (_BELIEVED * covariance + n * own) / (_BELIEVED + n)
     motion = found.state.inverse()
     turn = np.kron(np.eye(2), motion.R)
     distance, weights = np.where(used, (np.sqrt(distance2), weights), [[np.nan], [0.0]])

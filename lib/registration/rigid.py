@@ -158,7 +158,7 @@ def _covariance(offset: np.ndarray, residual: np.ndarray, smooth: float) -> np.n
     return sandwich(hessian, np.einsum("nki,nk->ni", jacobian, residual), 6)
 
 
-def sandwich(hessian: np.ndarray, gradient: np.ndarray, parameters: int) -> np.ndarray:
+def sandwich(hessian: np.ndarray, gradient: np.ndarray, parameters: float) -> np.ndarray:
     """Covariance of an M-estimator (Huber 1967) from its Hessian and each row's gradient (n, 6)."""
     n, bread = len(gradient), np.linalg.pinv(hessian, rcond=1e-12, hermitian=True)
     return bread @ (gradient.T @ gradient) @ bread * (n / max(n - parameters, 1))

@@ -26,19 +26,11 @@ _EXTENT = 8  # at most so many steps from the first candidate, either way
 
 
 def fit_surface(
-    u: ArrayLike,
-    x_mm: ArrayLike,
-    *,
-    domain: tuple[float, float, float, float],
-    control: tuple[int, int] = (20, 20),
-    smoothness: float | None = None,
-    reject_mm: float | None = None,
-    covariance_mm2: ArrayLike | None = None,
-    camera: AffineCamera | None = None,
-    solver: Callable[..., L1Solution] = interior_point,
-    tolerance: float = 1e-8,
+    u: ArrayLike, x_mm: ArrayLike, *, domain: tuple[float, float, float, float], control: tuple[int, int] = (20, 20),
+    smoothness: float | None = None, reject_mm: float | None = None, covariance_mm2: ArrayLike | None = None,
+    camera: AffineCamera | None = None, solver: Callable[..., L1Solution] = interior_point, tolerance: float = 1e-8,
     quick: bool = False,
-) -> BSplineSurface:
+) -> BSplineSurface:  # fmt: skip
     """The bicubic B-spline Psi that minimises paper Eq. (6), sum_i |Psi(u_i) - x_i|_1 + mu int |d^2 Psi / du^2|^2 du.
 
     Points whose L1 norm exceeds `reject_mm` at this surface are dropped and it is fitted once more, as in the paper.

@@ -116,14 +116,9 @@ class L1Solution:
 
 
 def interior_point(
-    problem: L1Problem,
-    x: np.ndarray,
-    mu: float | np.ndarray,
-    weights: np.ndarray | None = None,
-    *,
-    tolerance: float = 1e-9,
-    max_iterations: int = 60,
-) -> L1Solution:
+    problem: L1Problem, x: np.ndarray, mu: float | np.ndarray, weights: np.ndarray | None = None, *,
+    tolerance: float = 1e-9, max_iterations: int = 60,
+) -> L1Solution:  # fmt: skip
     """Primal-dual interior point method with Mehrotra's predictor and corrector (Nocedal and Wright, Sec. 16.6).
 
     The residual is split, b.c - x = p - q with p, q >= 0; the dual variable y of the split lies in [-w, w], with slacks

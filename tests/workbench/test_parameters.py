@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import json
+import re
 
+import papermill
 import pytest
 
+from lib import paths
 from lib.workbench.parameters import (
     UsageError,
     choose_notebooks,
@@ -76,3 +80,11 @@ def test_seconds_are_positive_numbers(text):
     assert positive("2.5") == 2.5
     with pytest.raises(argparse.ArgumentTypeError, match="not a number of seconds above 0"):
         positive(text)
+
+
+@pytest.mark.parametrize("notebook", sorted(paths.NOTEBOOKS.rglob("[!.]*.ipynb")), ids=lambda path: path.stem)
+def test_every_parameter_of_a_notebook_can_be_set(notebook):
+    """Papermill passes over a line whose comment it cannot read, such as one with an equals sign."""
+    cells = json.loads(notebook.read_text())["cells"]
+    source = "".join(next(cell for cell in cells if cell["cell_type"] == "code")["source"])
+    assert set(re.findall(r"^(\w+)\s*[:=]", source, re.M)) == set(papermill.inspect_notebook(str(notebook)))
