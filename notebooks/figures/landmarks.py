@@ -278,8 +278,11 @@ def uncertainty(evaluation: Evaluation, squared: np.ndarray) -> Figure:
     b.scatter(
         mean[used], fraction[used], s=20 + 3 * np.sqrt(count[used]) * 5, color=COLOURS["ours"], label="detections"
     )
-    b.set(title="Reliability", xlabel="confidence", ylabel="fraction correct", xlim=(-0.02, 1.05), ylim=(-0.02, 1.05))
-    b.legend()
+    for at, share, n in zip(mean[used], fraction[used], count[used], strict=True):
+        b.annotate(f"{n:.0f}", (at, share), (0, -16), textcoords="offset points", ha="center", fontsize=9)
+    low = max(min(mean[used].min(initial=1), fraction[used].min(initial=1)) - 0.15, -0.02)  # a good detector fills a corner
+    b.set(title="Reliability", xlabel="confidence", ylabel="fraction correct", xlim=(low, 1.03), ylim=(low, 1.03))
+    b.legend(loc="lower right")
     return fig
 
 

@@ -104,6 +104,8 @@ def pipeline_page(
 
     ax = page.add_subplot(grid[1, 2])
     ax.set_title("6  A moved microscope, registered", **title)
+    for panel in page.axes[:3]:
+        panel.set_anchor("NW")  # images and squares of one row begin at one height
     if not registration_um:
         ax.set_axis_off()
         ax.text(0.0, 0.9, "Left out: the recording is too short\nto hold frames out.", va="top", transform=ax.transAxes)

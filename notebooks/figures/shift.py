@@ -54,7 +54,9 @@ def recorded_bars(table: Table) -> Figure:
     y = np.arange(len(rows))
     for key, shift, colour, label in (("pck_0.05", -0.2, "ours", "PCK@0.05"), ("pck_0.2", 0.2, "right", "PCK@0.2")):
         a.barh(y + shift, [row[f"{key}_percent"] for row in rows], 0.36, color=COLOURS[colour], label=label)
-    b.barh(y, [row["sure_and_wrong_percent"] for row in rows], 0.5, color=COLOURS["paper"])
+    wrong = [row["sure_and_wrong_percent"] for row in rows]
+    b.bar_label(b.barh(y, wrong, 0.5, color=COLOURS["paper"]), fmt="%.0f", padding=3, fontsize=8)
+    b.set_xlim(0, 1.25 * max(4.0, np.nanmax(wrong)))
     a.set_yticks(y, [row["rung"].replace("_", " ") for row in rows])
     a.invert_yaxis()
     a.set(xlabel="%", xlim=(0, 101), title="Found")
