@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import importlib
 import json
 import os
@@ -31,6 +32,8 @@ python3 -m lib COMMAND [options]        (in the folder of the workbench)
               let the robot teach the detector a new microscope, eye and tool
   import SOURCE --map MAPPING.toml [--guess | --out RECORDING]
               a recording from videos, a robot's log and labels, as the mapping says
+  annotate RECORDING
+              label frames by hand, in JupyterLab
   detect, calibrate, reconstruct, register RECORDING [--out FOLDER]
               landmarks, cameras, surface and registration into files for other programs
   online RECORDING [--live] [--record FOLDER] [--video FILE.mp4]
@@ -123,6 +126,8 @@ def _main_of(name: str, module: str, function: str):
 
     def command(argv: list[str]) -> int:
         try:
+            if name in (*STAGES, "check", "adapt"):
+                _keep_detections()
             return getattr(importlib.import_module(module), function)(argv)
         except KeyboardInterrupt:
             print("\nStopped; start again to go on.", file=sys.stderr)
@@ -132,6 +137,16 @@ def _main_of(name: str, module: str, function: str):
             return 2
 
     return command
+
+
+def _keep_detections() -> None:
+    """Name the folder in which `SharedDetector` keeps what one command detects for the next; other code has another one."""
+    from lib import files, paths
+
+    folder = paths.CACHE / "detections" / files.digest(*sorted((ROOT / "lib" / "landmarks").glob("*.py")))
+    with contextlib.suppress(OSError):  # on a full disk each command detects for itself
+        folder.mkdir(parents=True, exist_ok=True)
+    os.environ.setdefault(paths.SHARED_VARIABLE, str(folder))
 
 
 def ruff_options() -> list[str]:
@@ -146,11 +161,12 @@ def ruff_options() -> list[str]:
     return ["--isolated", *(f"--config={key} = {toml(value)}" for key, value in manifest()["tool"]["ruff"].items())]
 
 
+STAGES = ("import", "annotate", "detect", "calibrate", "reconstruct", "register")
 #: Command -> the function that it calls, and its module.
 FUNCTIONS = {
     "run": ("lib.workbench.command", "main"),
     "site": ("lib.workbench.command", "main_site"),
-    **{name: ("lib.commands", f"main_{name}") for name in ("import", "detect", "calibrate", "reconstruct", "register")},
+    **{name: ("lib.commands", f"main_{name}") for name in STAGES},
     "check": ("lib.trust.check", "main"),
     "sweep": ("lib.workbench.sweep", "main"),
     "simulate": ("lib.simulator.dataset", "main"),

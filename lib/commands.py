@@ -5,7 +5,10 @@ is "not trustworthy", so no file that follows from the calibration is written (-
 """
 
 import argparse
+import json
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import cv2
@@ -16,14 +19,14 @@ from lib.calibration import Calibration, write_opencv, write_ros
 from lib.cameras import StereoRig
 from lib.correspondences import LANDMARKS, Correspondences, of_recording
 from lib.importing import guess_mapping, import_recording
-from lib.landmarks import Detector, detect
+from lib.landmarks import Detector, SharedDetector, detect
 from lib.matching.rectification import rectify
 from lib.recordings import Recording
 from lib.registration import register_images
 from lib.surface import depth_map, reconstruct, save_depth_map, save_mesh, save_points, surface_mesh
 from lib.trust import LEVELS, Reason, Verdict, assess, report
 
-__all__ = ["main_calibrate", "main_detect", "main_import", "main_reconstruct", "main_register"]
+__all__ = ["main_annotate", "main_calibrate", "main_detect", "main_import", "main_reconstruct", "main_register"]
 
 
 def main_import(argv: list[str]) -> int:
@@ -53,13 +56,26 @@ def main_import(argv: list[str]) -> int:
     return 0
 
 
+def main_annotate(argv: list[str]) -> int:
+    """`python3 -m lib annotate`: label frames by hand in JupyterLab, the most useful first; into annotations.json."""
+    parser = argparse.ArgumentParser(prog="python3 -m lib annotate", description=main_annotate.__doc__.split(": ", 1)[1])
+    parser.add_argument("recording", type=Path, help="folder of a recording")
+    folder = Recording.open(parser.parse_args(argv).recording, truth=False).folder.resolve()
+    page = paths.RUNS / f"annotate-{folder.name}.ipynb"
+    page.parent.mkdir(exist_ok=True)
+    text = json.dumps(json.dumps(str(folder))[1:-1])[1:-1]  # a Python string in JSON
+    files.write_text(page, (paths.ROOT / "lib" / "annotate.ipynb").read_text(encoding="utf-8").replace("RECORDING", text))
+    lab = [sys.executable, "-m", "lib", "lab", f"--LabApp.default_url=/lab/tree/{paths.RUNS.name}/{page.name}"]
+    return subprocess.call(lab, cwd=paths.ROOT)
+
+
 def main_detect(argv: list[str]) -> int:
     """`python3 -m lib detect`: find the landmarks in every frame of a recording and write them to landmarks.csv."""
     a, recording, out = _parsed("detect", main_detect, argv)
     data = _data(a, recording)
     _write_landmarks(out / "landmarks.csv", recording, data)
     print(f"{int(data.seen.sum())} of {data.seen.size} landmarks found. Wrote {out / 'landmarks.csv'}.")
-    print(assess(recording, data).verdict)
+    print(assess(recording, data, detector=a.detector).verdict)
     return 0
 
 
@@ -69,7 +85,7 @@ def main_calibrate(argv: list[str]) -> int:
     calibration, verdict, data = _calibrated(a, recording, out)
     if calibration is None:
         return 3
-    print(report(calibration))
+    print(report(calibration, verdict=verdict).removeprefix(f"{verdict}\n"))
     _write_landmarks(out / "landmarks.csv", recording, data)
     _write_rig(out, calibration.rig, recording)
     offsets = calibration.offsets
@@ -117,7 +133,7 @@ def main_register(argv: list[str]) -> int:
     shift_mm = np.linalg.norm(found.centre_mm - found.transform.inverse().apply(found.centre_mm))
     print(f"The cameras moved by {shift_mm:.3f} mm at the tool, standard deviation {sd.max():.3f} mm.")
     print(f"The tool is now {numbers['median_error_mm']:.3f} mm from where the robot reports it (median).")
-    return _done(out, "registration", numbers, assess(recording, data).verdict)
+    return _done(out, "registration", numbers, assess(recording, data, detector=a.detector).verdict)
 
 
 def _parsed(
@@ -129,7 +145,6 @@ def _parsed(
     add("--out", type=Path, help="folder of the results (default: runs/NAME of the recording)")
     add("--landmarks", choices=("detected", "annotations"), default="detected", help="where they come from")
     add("--weights", help="weights file of the detector (default: the shipped ones)")
-    add("--every", type=int, default=1, help="take every N-th frame")
     add("--force", action="store_true", help="write results whatever the verdict")
     if frame:
         add("--frame", type=int, default=0, help="number of the frame, from 0")
@@ -137,11 +152,10 @@ def _parsed(
     if rig:
         add("--rig", type=Path, required=needs_rig, help="rig.json of an earlier calibration")
     a = parser.parse_args(argv)
-    if a.every < 1:
-        parser.error("--every: must be at least 1.")
     recording = Recording.open(a.recording)
     if frame and not -len(recording) <= a.frame < len(recording):
         parser.error(f"--frame: the recording has frames 0 to {len(recording) - 1}.")
+    a.detector = None if a.landmarks == "annotations" else SharedDetector(Detector.load(a.weights))
     out = a.out or paths.RUNS / a.recording.resolve().name
     out.mkdir(parents=True, exist_ok=True)
     return a, recording, out
@@ -154,13 +168,12 @@ def _labelled(recording: Recording) -> Correspondences:
 
 
 def _data(a: argparse.Namespace, recording: Recording, frames: np.ndarray | None = None) -> Correspondences:
-    chosen = np.arange(len(recording))[:: a.every] if frames is None else frames
     if a.landmarks == "annotations":
-        return _labelled(recording).of_frames(chosen)
+        return _labelled(recording)
     if recording.skeleton != LANDMARKS:
         told = f"the detector knows {list(LANDMARKS)}, the recording has {list(recording.skeleton)}"
         raise ValueError(f"{recording.folder}: {told}. Label frames and give --landmarks annotations.")
-    return detect(recording, Detector.load(a.weights), frames=chosen)
+    return detect(recording, a.detector, frames=frames)
 
 
 def _calibrated(
@@ -173,7 +186,7 @@ def _calibrated(
         text = f"{a.rig} was not calibrated from this recording, and nothing here tests it."
         cure = f"Run: {shlex.join(['python3', '-m', 'lib', 'register', str(a.recording), '--rig', str(a.rig)])}"
         return StereoRig.load(a.rig), Verdict((Reason("rig_given", LEVELS[1], text, cure),)), data
-    found = assess(recording, data)
+    found = assess(recording, data, detector=a.detector)
     if found.calibration is not None and (a.force or not found.verdict.is_red):
         return found.calibration, found.verdict, data
     files.write_json(out / "verdict.json", found.verdict.to_json())

@@ -4,11 +4,13 @@ import json
 from dataclasses import replace
 
 import cv2
+import nbformat
 import numpy as np
 import pytest
 
 from lib import commands, paths
 from lib.cameras import StereoRig
+from lib.landmarks import Detector, Landmarks
 from lib.recordings import Recording
 from tests.importing import foreign
 from tests.importing.test_import import source_of, thinned
@@ -80,6 +82,26 @@ def test_guess_writes_a_mapping_once(tmp_path, capsys):
     with pytest.raises(FileExistsError, match=r"guessed\.toml: exists already"):
         commands.main_import([str(folder), "--guess", "--map", str(path)])
     assert not any(folder.glob("*.toml")) and mapping.is_file()
+
+
+def test_annotate_opens_a_page_that_runs(tmp_path, monkeypatch):
+    """Where the detector finds nothing, the page still lets one label."""
+    makers = foreign.side_by_side, foreign.robot_csv
+    folder, mapping = source_of(tmp_path, thinned(foreign.shipped(), 40), *makers)
+    recording = tmp_path / 'my "first" recording'
+    commands.main_import([str(folder), "--map", str(mapping), "--out", str(recording)])
+    opened = []
+    monkeypatch.setattr(commands.subprocess, "call", lambda argv, cwd: opened.append(argv[-1]) or 0)
+    monkeypatch.setattr(paths, "RUNS", tmp_path / "runs")
+    assert commands.main_annotate([str(recording)]) == 0
+    (page,) = (tmp_path / "runs").iterdir()
+    assert opened == [f"--LabApp.default_url=/lab/tree/runs/{page.name}"]
+    (cell,) = nbformat.read(page, as_version=4).cells
+    monkeypatch.setattr(Detector, "load", lambda *_: lambda images: Landmarks.none(len(images)))
+    names: dict = {}
+    exec(compile(cell.source, page.name, "exec"), names)
+    names["annotator"].mark("left", 2, "base", (20.0, 30.0))
+    assert Recording.open(recording).annotations.u_left[2, 0].tolist() == [20, 30]
 
 
 def test_detect_refuses_landmarks_that_the_detector_does_not_know(tmp_path):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ast
+import importlib
+import os
 from collections import namedtuple
 from pathlib import Path
 from types import SimpleNamespace
@@ -51,6 +53,18 @@ def test_an_unknown_torch_build_is_an_error(inside, capsys):
     with pytest.raises(SystemExit) as stop:
         command_line.main(["run", "--torch", "rocm"])
     assert stop.value.code == 2 and "invalid choice: 'rocm'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", ["check", "sweep"])
+def test_commands_that_detect_keep_their_detections_for_the_next_one(command, monkeypatch, tmp_path):
+    monkeypatch.setattr(paths, "CACHE", tmp_path)
+    monkeypatch.setenv(paths.SHARED_VARIABLE, "")
+    monkeypatch.delenv(paths.SHARED_VARIABLE)
+    module, function = command_line.FUNCTIONS[command]
+    monkeypatch.setattr(importlib.import_module(module), function, lambda argv: os.environ.get(paths.SHARED_VARIABLE))
+    folder = command_line.COMMANDS[command]([])
+    kept = [str(path) for path in tmp_path.glob("detections/*")]
+    assert kept == ([folder] if command == "check" else [])
 
 
 @pytest.mark.parametrize(("module", "function"), command_line.FUNCTIONS.values())

@@ -16,7 +16,7 @@ from lib import files, paths
 from lib.adapt.judging import Agreement, agreement, better, epipolar_geometry, epipolar_px, frame_means
 from lib.adapt.teacher import RefusalError, Seen, Teacher, longest_still, look, stretches, teach
 from lib.calibration import Calibration
-from lib.landmarks import Detector
+from lib.landmarks import Detector, SharedDetector
 from lib.landmarks.checkpoints import checksum
 from lib.provenance import Provenance, plain
 from lib.recordings import Recording
@@ -141,7 +141,8 @@ class _Work:
         path = self.folder / f"{name}.npz"
         if not path.is_file():
             show = lambda part: self.say(f"Looking ({name})", part)  # noqa: E731
-            found = look(self.recording, detector, frames, near=near, progress=show)
+            asked = SharedDetector(detector) if near is None and self.learns else detector
+            found = look(self.recording, asked, frames, near=near, progress=show)
             with files.whole(path) as partial, open(partial, "wb") as file:
                 np.savez(file, **found._asdict())
         with np.load(path) as kept:
@@ -180,7 +181,12 @@ class _Work:
         u = teacher.labels(learn)[0]
         for k in range(_GUIDED if closeups else 0):  # closeups that nobody taught, near where the robot says
             guided = self.look(f"guided {k}", detector, learn, u)
-            teacher = teach(recording, guided, opinion=guided, before=teacher)
+            try:
+                teacher = teach(recording, guided, opinion=guided, before=teacher)
+            except RefusalError:
+                if len(self.marked) < 5:
+                    raise
+                break  # closeups that do not know the tool correct nothing; labels set by hand do
             u, last = teacher.labels(learn)[0], u
             if np.nanmedian(np.linalg.norm(u - last, axis=-1)) < _SETTLED_PX:
                 break
@@ -244,7 +250,7 @@ class _Work:
         eye, eye_sd = better(*(frame_means(own / length) for own in distances))
         improved = best is not self.detector and robot > 2 * robot_sd and eye > 0
         reasons = {
-            "no round of training brought the frames for stopping nearer to the robot": best is self.detector,
+            "no round of training brought the frames for stopping nearer to the robot; give more --minutes or labels": best is self.detector,
             "on the frames for judging the gain is no larger than chance allows": not robot > 2 * robot_sd,
             "left and right of the frames for judging do not agree better, in which the robot has no part": not eye > 0,
             "the frames for judging agree better with the robot, and left with right": True,

@@ -1,10 +1,11 @@
 """``python3 -m lib adapt RECORDING``: weights, if the adaptation improved them, and one page that says what was done."""
 
 import argparse
+import shlex
 from pathlib import Path
 
 import numpy as np
-from jinja2 import Environment, FileSystemLoader
+from jinja2 import Environment, FileSystemLoader, select_autoescape
 
 from lib import files, paths
 from lib.adapt.labels_only import adapt_images
@@ -32,14 +33,14 @@ def write(found: Adaptation, folder: str | Path, recording: Recording | None = N
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
+    here = Environment(loader=FileSystemLoader(Path(__file__).parent), autoescape=select_autoescape())
     if found.improved:
         found.detector.save(folder / "weights.safetensors")
-        files.write_text(folder / "weights.md", _card(found.report))
+        card = here.get_template("weights.md").render(r=found.report, numbers=_NUMBERS)
+        files.write_text(folder / "weights.md", card)
     files.write_json(folder / "report.json", found.report)
     pictures = [] if recording is None or found.after is None else _pictures(found, recording)
-    here = Environment(loader=FileSystemLoader(Path(__file__).parent), autoescape=True)
-    shown = {"r": found.report, "numbers": _NUMBERS, "pictures": pictures, "curve": _curve(found.report)}
-    page = here.get_template("adapt.html").render(**shown)
+    page = here.get_template("adapt.html").render(r=found.report, numbers=_NUMBERS, pictures=pictures)
     files.write_text(folder / "report.html", page)
     return folder / "report.html"
 
@@ -56,35 +57,6 @@ def _pictures(found: Adaptation, recording: Recording) -> list[tuple[str, str]]:
         caption = f"Frame {number}, the {name} after: mean distance {share:.2f} % of the tool. Above before, below after."
         pictures.append((caption, data_uri(np.vstack(rows), ".jpg")))
     return pictures
-
-
-def _curve(report: dict) -> str:
-    """The learning curve as a picture; empty without rounds."""
-    rounds = [row for row in report.get("rounds", []) if row.get("mean_share") is not None]
-    if len(rounds) < 2:
-        return ""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(6, 2.6), layout="constrained")
-    canvas, axes = FigureCanvasAgg(figure), figure.subplots()
-    axes.plot([row["round"] for row in rounds], [100 * row["mean_share"] for row in rounds], "o-", color="#0072b2")
-    axes.set(xlabel="round of training", ylabel="distance, % of the tool", ylim=(0, None), xticks=range(len(rounds)))
-    axes.set_title("frames for stopping: mean distance from the robot, at most 10 %")
-    canvas.draw()
-    return data_uri(np.asarray(canvas.buffer_rgba())[..., :3], ".png")
-
-
-def _card(report: dict) -> str:
-    """The card of adapted weights (Markdown)."""
-    judged = report["judged"]
-    rows = [f"| {text} | {judged['before'].get(k)} | {judged['after'].get(k)} |" for k, text in _NUMBERS.items()]
-    return "\n".join([
-        "# weights.safetensors", "",
-        f"The landmark detector, adapted to the recording {report['recording']} by `{report['command']}`, {report['date']}.",
-        f"Frames: {report['frames']}. The numbers are of the frames for judging, which took no part.", "",
-        "| | before | after |", "|---|---|---|", *rows, "",
-    ])  # fmt: skip
 
 
 def main(argv: list[str]) -> int:
@@ -111,5 +83,13 @@ def main(argv: list[str]) -> int:
         recording = Recording.open(a.recording, truth=False)
         found = adapt(recording, detector, labels=a.labels, **how)
     page = write(found, out, recording)
-    print(f"{'Improved' if found.improved else 'Left alone'}: {found.report['reason']}.\nReport: {page}")
+    where = shlex.quote(paths.shown(a.recording))
+    reason = found.report["reason"].removesuffix(".").replace("RECORDING", where)
+    print(f"{'Improved' if found.improved else 'Left alone'}: {reason}.\nReport: {page}")
+    offset_s, sd_s = (found.report.get(name, np.nan) for name in ("offset_s", "clock_sd_s"))
+    if recording is not None and abs(offset_s - recording.offset_s) > 3 * sd_s:
+        cure = f"set offset_s = {offset_s:.4f} in {paths.shown(a.recording / 'recording.toml')}"
+        print(f"The clocks differ by {1e3 * offset_s:.1f} ms, standard deviation {1e3 * sd_s:.1f} ms: {cure}.")
+    if recording is not None and found.improved:
+        print(f"Next: python3 -m lib check {where} --weights {paths.shown(out)}/weights.safetensors, then calibrate.")
     return 0 if found.improved else 3

@@ -302,7 +302,7 @@ def _calibrated(recording: Recording, seen: Seen, from_labels: bool) -> tuple[Ca
         try:
             found = _fitted(recording, seen, least)
         except ValueError as error:
-            reason = str(error)
+            reason = str(error).partition(". ")[0].partition("; ")[0]  # their cures lead here
             continue
         right = found.view_inliers.sum() / max(told, 1)
         if right >= LEAST_RIGHT or from_labels:
@@ -310,7 +310,7 @@ def _calibrated(recording: Recording, seen: Seen, from_labels: bool) -> tuple[Ca
         reason = f"only {100 * right:.0f} % of the landmarks agree on cameras"
     raise RefusalError(
         f"detector: too few landmarks are right to start from ({reason}). Label 5 pairs of frames, far apart in place and "
-        "depth, and give them with --labels."
+        "depth (`python3 -m lib annotate RECORDING`), and give annotations.json with --labels."
     )
 
 

@@ -15,7 +15,7 @@ from lib.importing.labels import read_labels
 from lib.importing.logs import RobotLog, increasing, read_robot, since
 from lib.importing.mapping import Mapping, read_mapping
 from lib.importing.video import StereoSource, open_stereo
-from lib.landmarks import detect
+from lib.landmarks import SharedDetector, detect
 from lib.recordings import Annotations, Recording, RecordingWriter
 
 __all__ = ["import_recording"]
@@ -102,7 +102,7 @@ def _clock(draft: Recording, search_s: float) -> TimeOffset | str:
         return f"the detector knows {', '.join(LANDMARKS)} alone, and there are no labels"
     if labels is None:
         some = np.unique(np.linspace(0, len(draft) - 1, min(len(draft), _CLOCK_FRAMES)).astype(int))
-        data = detect(draft, frames=some)
+        data = detect(draft, SharedDetector(), frames=some)
     else:
         data = of_recording(draft, labels.u_left, labels.u_right)
     try:

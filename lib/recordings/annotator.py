@@ -34,7 +34,6 @@ class Annotator:
         rig: Cameras, if known.  They give the epipolar lines of left marks, and the robot's landmarks as suggestions.
         detected: What the detector found (`lib.landmarks.detect`), with the robot's position of each landmark.  Both are
             suggestions, and frames in which they disagree most come first.
-        usefulness: (n,) of the frames, the most useful first in place of that order.
 
     >>> import shutil, tempfile
     >>> from lib import paths
@@ -46,19 +45,16 @@ class Annotator:
     """
 
     def __init__(
-        self, recording: Recording, *, rig: StereoRig | None = None, detected: Correspondences | None = None,
-        usefulness: np.ndarray | None = None,
-    ) -> None:  # fmt: skip
+        self, recording: Recording, *, rig: StereoRig | None = None, detected: Correspondences | None = None
+    ) -> None:
         self.recording = recording
         self._path = recording.folder / "annotations.json"
         self._undone, self._done, self._visited = [], [], set()
         self._read()
-        self.know(rig=rig, detected=detected, usefulness=usefulness)
+        self.know(rig=rig, detected=detected)
 
-    def know(
-        self, *, rig: StereoRig | None = None, detected: Correspondences | None = None, usefulness: np.ndarray | None = None
-    ) -> None:
-        """Take a rig, detections or an order of frames that came later; an open page shows them at once."""
+    def know(self, *, rig: StereoRig | None = None, detected: Correspondences | None = None) -> None:
+        """Take a rig and detections that came later; an open page shows them at once."""
         n, names = len(self.recording), self.recording.skeleton
         nothing = np.full((n, len(names), 2), np.nan)
         rows = of_recording(self.recording, nothing, nothing) if detected is None else detected
@@ -70,9 +66,7 @@ class Annotator:
         if rig is not None:
             self._suggested["robot"] = np.reshape(rig.project(self._x_mm.reshape(-1, 3)), (2, n, len(names), 2))
         looked = np.isin(np.arange(n), detected.frame) if detected is not None else np.zeros(n, bool)
-        self.usefulness = self._disagreement(looked) if usefulness is None else np.asarray(usefulness, np.float64)
-        if self.usefulness.shape != (n,):
-            raise ValueError(f"usefulness: expected one number for each of {n} frames, got {self.usefulness.shape}.")
+        self.usefulness = self._disagreement(looked)
         if "widget" in vars(self):
             self.widget.send({"renew": True})
 

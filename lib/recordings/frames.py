@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Self
 
 import cv2
 import numpy as np
@@ -180,9 +179,7 @@ def open_side(folder: Path, side: str, image_size_px: tuple[int, int], bit_depth
 
 
 class Frames(Sequence[StereoFrame]):
-    """Stereo frames in order of time; decoded when indexed, the last few kept.
-
-    A slice is again `Frames` and decodes nothing.
+    """Stereo frames in order of time; decoded when indexed by a number, the last few kept.
 
     Attributes:
         time_s: (n,) video clock, strictly increasing.
@@ -191,9 +188,8 @@ class Frames(Sequence[StereoFrame]):
     def __init__(self, left: ImageFolder | Video, right: ImageFolder | Video, time_s: np.ndarray) -> None:
         self.time_s = np.array(time_s, dtype=np.float64)
         self.time_s.setflags(write=False)
-        self._numbers = range(len(time_s))
 
-        @lru_cache(4)  # shared by all slices
+        @lru_cache(4)
         def read(number: int) -> StereoFrame:
             images = left.read(number), right.read(number)
             for image in images:
@@ -203,15 +199,11 @@ class Frames(Sequence[StereoFrame]):
         self._read = read
 
     def __len__(self) -> int:
-        return len(self._numbers)
+        return len(self.time_s)
 
-    def __getitem__(self, index: int | slice) -> StereoFrame | Self:
-        if isinstance(index, slice):
-            part = object.__new__(Frames)
-            part.time_s, part._numbers, part._read = self.time_s[index], self._numbers[index], self._read
-            return part
+    def __getitem__(self, index: int) -> StereoFrame:
         try:
-            number = self._numbers[index]
+            number = range(len(self))[index]
         except IndexError:
             raise IndexError(f"frame {index}: the recording has {len(self)} frames.") from None
         return self._read(number)

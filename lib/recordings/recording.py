@@ -153,7 +153,7 @@ class Recording:
         time_s, path = np.arange(len(left)) / header["fps"], folder / "frames.csv"
         if path.exists():
             time_s = read_table(path, ["frame", "time_s"], n_frames=len(left))[:, 1]
-            refuse(path, _not_increasing(time_s), _ORDER)
+            refuse(path, ~(np.diff(time_s, prepend=-np.inf) > 0), _ORDER)
         frames = Frames(left, right, time_s)
         kinematics = _read_kinematics(folder / "kinematics.csv", skeleton)
         robot_time = frames.time_s + header["offset_s"]
@@ -223,17 +223,13 @@ def _read_header(path: Path) -> dict:
     return header | {"image_size_px": tuple(size), "skeleton": tuple(names)}
 
 
-def _not_increasing(time_s: np.ndarray) -> np.ndarray:
-    return ~(np.diff(time_s, prepend=-np.inf) > 0)
-
-
 def _read_kinematics(path: Path, landmarks: Sequence[str]) -> Kinematics:
     table = read_table(path, kinematics_columns(landmarks))
     if not len(table):
         raise ValueError(f"{path}: the table is empty; the robot's landmarks are needed.")
     time_s, x = table[:, 0], table[:, 1:].reshape(-1, len(landmarks), 3)
     empty, far = np.isnan(x), np.abs(np.nan_to_num(x)) > _FARTHEST_MM
-    refuse(path, _not_increasing(time_s), _ORDER)
+    refuse(path, ~(np.diff(time_s, prepend=-np.inf) > 0), _ORDER)
     refuse(path, far.any(axis=(1, 2)), f"beyond {_FARTHEST_MM:g} mm; leave the cells of a wrong sample empty")
     problem = "a landmark has some coordinates only; leave all three cells of a dropped landmark empty"
     refuse(path, (empty.any(axis=2) & ~empty.all(axis=2)).any(axis=1), problem)

@@ -1,10 +1,12 @@
 """Everything that decides whether a recording's calibration may be believed, in one call; and a calibration in words."""
 
+import shlex
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lib import paths
 from lib.calibration import Calibration, calibrate, optics
 from lib.correspondences import LANDMARKS, Correspondences
 from lib.landmarks import Detector, detect
@@ -67,13 +69,13 @@ def assess(
         data, calibration, diagnosis=diagnosis, health=found, epipolar_px=epipolar_px, error=error,
         robot_accuracy_mm=recording.robot_accuracy_mm, doubts=recording.doubts,
     )  # fmt: skip
-    return Assessment(data, calibration, verdict, diagnosis, found, epipolar_px)
+    where = shlex.quote(paths.shown(recording.folder))  # in the commands that cures name
+    told = [replace(r, **{k: getattr(r, k).replace("RECORDING", where) for k in ("text", "cure")}) for r in verdict.reasons]
+    return Assessment(data, calibration, Verdict(tuple(told)), diagnosis, found, epipolar_px)
 
 
-def report(
-    calibration: Calibration, *, verdict: Verdict | None = None, robot_accuracy_mm: float | None = None, longest: int = 10
-) -> str:
-    """Several lines of text, with at most `longest` outliers, largest residual first.
+def report(calibration: Calibration, *, verdict: Verdict | None = None, robot_accuracy_mm: float | None = None) -> str:
+    """Several lines of text, with at most ten outliers, largest residual first.
 
     Args:
         verdict: Of `lib.trust.assess`; None judges by the calibration's own numbers alone.
@@ -122,8 +124,8 @@ def report(
             lines.append(f"    {name:10s}  {', '.join(numbers)}")
     if outliers.size:
         distance = np.linalg.norm(c.residuals_px.reshape(rows, -1, 2)[tuple(outliers.T)], axis=1)
-        lines.append(f"Outliers (row: residual), {min(longest, len(outliers))} of {len(outliers)}")
         sides = ("left", "right") if c.rig else ("",)
-        worst = [(*outliers[i], distance[i]) for i in np.argsort(-distance)[:longest]]
+        worst = [(*outliers[i], distance[i]) for i in np.argsort(-distance)[:10]]
+        lines.append(f"Outliers (row: residual), {len(worst)} of {len(outliers)}")
         lines += [f"  {row:6d}: {size:.1f} px {sides[side]}".rstrip() for row, side, size in worst]
     return "\n".join(lines)

@@ -13,7 +13,7 @@ from jinja2 import Environment, FileSystemLoader
 from lib import files, paths
 from lib.calibration import estimate_time_offset
 from lib.correspondences import LANDMARKS, of_recording
-from lib.landmarks import Detector, detect
+from lib.landmarks import Detector, SharedDetector, detect
 from lib.provenance import plain
 from lib.recordings import Recording, StereoFrame
 from lib.trust.assessment import Assessment, assess, report
@@ -125,7 +125,7 @@ def check(recording: str | Path | Recording, *, detector: Callable | None = None
     found = recording if isinstance(recording, Recording) else Recording.open(recording, truth=False)
     frames = np.unique(np.linspace(0, len(found) - 1, min(_MOST_FRAMES, len(found))).round().astype(int))
     if found.skeleton == LANDMARKS:
-        detector = detector or Detector.load()
+        detector = SharedDetector(detector)
         data = detect(found, detector, frames=frames)
     elif (marks := found.annotations) is not None:
         detector, data = None, of_recording(found, marks.u_left, marks.u_right)
@@ -135,7 +135,7 @@ def check(recording: str | Path | Recording, *, detector: Callable | None = None
     next_step = f"Use it: `python3 -m lib run -p recording {paths.shown(found.folder)}`."
     if a.verdict.level != LEVELS[0]:
         next_step = a.verdict.reasons[0].cure if a.diagnosis.best is None else a.diagnosis.best.cure
-    made = Check(found, a, _facts(found, a), next_step)
+    made = Check(found, a, _facts(found, a), next_step.replace("RECORDING", paths.shown(found.folder)))
     if folder is not None:
         made.write(folder)
     return made
@@ -207,10 +207,10 @@ def main(argv: list[str]) -> int:
     """`python3 -m lib check`; exit code 0 for a finished check whatever the verdict, 2 where the folder cannot be read."""
     parser = argparse.ArgumentParser(prog="python3 -m lib check", description="Is this recording fit for use; if not, why?")
     parser.add_argument("recording", type=Path, help="the recording's folder")
-    parser.add_argument("--detector", metavar="FILE", help="weights (default: those that ship)")
+    parser.add_argument("--weights", metavar="FILE", help="of the detector (default: those that ship)")
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="of check.html and check.json (default: runs/check-NAME)")
     a = parser.parse_args(argv)
-    found = check(a.recording, detector=Detector.load(a.detector) if a.detector else None)
+    found = check(a.recording, detector=Detector.load(a.weights) if a.weights else None)
     page = found.write(a.out or paths.RUNS / f"check-{a.recording.resolve().name}")
     print(f"{found.assessment.verdict}\nNext: {found.next_step}\nReport: {page}")
     return 0

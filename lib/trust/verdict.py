@@ -130,7 +130,8 @@ def judge(
         found += _reason("diagnosis", best.explained, text, best.cure, best.name)
     if calibration is None:
         name = {NoDetectionError: "no_detection", NoConsensusError: "no_consensus"}.get(type(error), "refused")
-        found.append(Reason(name, LEVELS[2], f"There is no calibration: {error}", f"{_OVERLAYS}."))
+        cure = f"{_OVERLAYS}; where the detector errs, {TRAIN_FURTHER}."
+        found.append(Reason(name, LEVELS[2], f"There is no calibration: {error}", cure))
     else:
         robot_mm = 0.01 if robot_accuracy_mm is None else robot_accuracy_mm
         for finding in (*_residuals(data, calibration, robot_mm), *_geometry(calibration, robot_mm)):

@@ -164,7 +164,9 @@ def test_a_good_detector_is_left_alone(world, recording, tmp_path):
 def test_below_a_tenth_it_says_how_many_to_label(world, recording, tmp_path):
     lost = StandIn(world.u, wrong=0.95)
     found = adapt(recording, lost, folder=tmp_path, progress=False, tune=pupil(world))
-    assert not found.improved and "Label 5 pairs" in found.report["reason"]
+    reason = found.report["reason"]
+    assert not found.improved and "Label 5 pairs" in reason and "lib annotate RECORDING" in reason
+    assert "let the robot teach it" not in reason and len(reason) < 400
 
 
 def test_five_labelled_pairs_are_a_start(world, recording, tmp_path, monkeypatch):
@@ -176,6 +178,30 @@ def test_five_labelled_pairs_are_a_start(world, recording, tmp_path, monkeypatch
     lost = StandIn(world.u, wrong=0.97)
     found = adapt(recording, lost, labels=tmp_path / "labels.json", folder=tmp_path, progress=False, tune=tune)
     assert found.improved and np.nanmedian(np.linalg.norm(tune.calls[-1]["off"], axis=-1)) < 1.5
+
+
+def test_labels_teach_a_tool_that_no_closeup_knows(world, recording, tmp_path, monkeypatch):
+    class Lost(StandIn):
+        networks, closeup_network = {}, "some"
+        refine = staticmethod(lambda pair, rough, setting: Landmarks.none(2))
+
+    class ReachedError(Exception):
+        """Training starts."""
+
+    def tune(detector, images, *rest, **how):
+        for one in images:
+            side, i = one.name.split()
+            assert np.nanmedian(np.linalg.norm(one.u - world.u[int(i), int(side == "right")], axis=1)) < 3
+        raise ReachedError
+
+    monkeypatch.setattr(loop, "Detector", Lost)
+    u = np.full(world.u.shape, np.nan)
+    u[1:26:3] = world.u[1:26:3]
+    write_coco(tmp_path / "labels.json", Annotations(u[:, 0], u[:, 1]), SIZE, ".png")
+    how = {"progress": False, "tune": tune}
+    with pytest.raises(ReachedError):
+        adapt(recording, Lost(world.u, wrong=0.97), labels=tmp_path / "labels.json", folder=tmp_path / "labelled", **how)
+    assert not adapt(recording, Lost(world.u, wrong=0.97), folder=tmp_path / "none", **how).improved
 
 
 def test_it_goes_on_after_a_kill(world, continued):
@@ -194,6 +220,9 @@ def test_exit_codes_and_files(world, recording, tmp_path, monkeypatch, capsys):
     assert content["improved"] and (out / "weights.safetensors").exists() and (out / "weights.md").exists()
     page = (out / "report.html").read_text(encoding="utf-8")
     assert page.count("data:image/jpeg") == 3 and "http" not in page.replace("http-equiv", "")
+    assert "Learning curve" in page and "| within 5 %, % |" in (out / "weights.md").read_text(encoding="utf-8")
+    said = capsys.readouterr().out
+    assert f"set offset_s = {content['offset_s']:.4f} in " in said and "--weights" in said.splitlines()[-1]
     monkeypatch.setattr(Detector, "load", lambda *_, **__: lambda images: Landmarks.none(len(images)))
     assert report.main([str(recording.folder), "--out", str(tmp_path / "worse")]) == 3
     assert not (tmp_path / "worse" / "weights.safetensors").exists()

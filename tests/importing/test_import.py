@@ -203,7 +203,7 @@ def test_a_detector_that_knows_no_such_tool_leaves_the_clock_open(shipped, tmp_p
     mapping.write_text(mapping.read_text("utf-8").replace("[robot]\n", '[robot]\noffset_s = "estimate"\n'), "utf-8")
     rng = np.random.default_rng(0)
 
-    def lost(recording, frames):
+    def lost(recording, detector, frames):
         u = rng.uniform(0, recording.image_size_px, (2, len(frames), 3, 2))
         return of_recording(recording, *u, frames=frames)
 

@@ -191,10 +191,6 @@ def test_the_frames_in_which_detector_and_robot_disagree_most_come_first(folder)
     for _ in range(3):
         order.append(annotator.handle({"do": "next", "frame": order[-1]})[0]["frame"])
     assert order[:3] == [4, 1, 3]
-    annotator.know(usefulness=[0, 0, 5, 0, 0])
-    assert annotator.next_frame(0) == 2
-    with pytest.raises(ValueError, match="usefulness"):
-        annotator.know(usefulness=[1, 2])
 
 
 def test_labelled_frames_do_not_come_again_and_the_farthest_from_any_label_comes_first(folder):

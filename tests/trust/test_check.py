@@ -6,6 +6,7 @@ import re
 import numpy as np
 import pytest
 
+from lib import paths
 from lib.landmarks import Landmarks
 from lib.recordings import Recording
 from lib.simulator import Design, Eye, Microscope, simulate
@@ -61,7 +62,26 @@ def test_nothing_found_is_said_once_and_the_command_ends_well(folder, tmp_path, 
     assert main([str(folder), "--out", str(tmp_path)]) == 0
     content = json.loads((tmp_path / "check.json").read_text(encoding="utf-8"))
     assert content["verdict"] == "not trustworthy" and "no_detection" in [reason["name"] for reason in content["reasons"]]
-    assert "the detector failed on 10 frames" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "the detector failed on 10 frames" in said and f"lib adapt {folder}" in said and "RECORDING" not in said
+    assert f"lib adapt {folder}" in content["next_step"] or content["next_step"] in said
+
+
+def test_a_second_check_reads_what_the_first_has_detected(folder, detector, tmp_path, monkeypatch):
+    monkeypatch.setenv(paths.SHARED_VARIABLE, str(tmp_path))
+
+    class Counting:
+        digest, calls = "one", 0
+
+        def __call__(self, images):
+            self.calls += 1
+            return detector(images)
+
+    counting = Counting()
+    first = check(folder, detector=counting)
+    calls = counting.calls
+    again = check(folder, detector=counting)
+    assert counting.calls == calls >= 10 and again.to_json() == first.to_json()
 
 
 def test_a_folder_that_is_no_recording(tmp_path):
