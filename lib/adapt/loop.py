@@ -250,7 +250,7 @@ class _Work:
         eye, eye_sd = better(*(frame_means(own / length) for own in distances))
         improved = best is not self.detector and robot > 2 * robot_sd and eye > 0
         reasons = {
-            "no round brought the frames for stopping nearer to the robot; more --minutes or labels may": best is self.detector,
+            "no round brought the frames for stopping nearer to the robot; more --minutes may": best is self.detector,
             "on the frames for judging the gain is no larger than chance allows": not robot > 2 * robot_sd,
             "left and right of the frames for judging do not agree better, in which the robot has no part": not eye > 0,
             "the frames for judging agree better with the robot, and left with right": True,
