@@ -31,7 +31,7 @@ class Film(Figure):
 
     def __init__(self, pages: Sequence[np.ndarray], *, seconds: float = 0.4) -> None:
         height, width = pages[0].shape[:2]
-        super().__init__(figsize=(8.0, 8.0 * height / width), layout="constrained")
+        super().__init__(figsize=(10.0, 10.0 * height / width), layout="constrained")
         self._pages, self._seconds = pages, seconds
         axes = self.add_subplot()
         axes.axis("off")
