@@ -177,8 +177,8 @@ def learning_curves(logs: Mapping[str, list[dict[str, float]]]) -> Figure:
     fig, (a, b, c) = figure(1, 3, width_in=11, height_in=3.4)
     for (name, log), colour in zip(logs.items(), (COLOURS["ours"], COLOURS["paper"], COLOURS["truth"]), strict=False):
         step = [row["step"] for row in log]
-        a.plot(step, [row["loss"] for row in log], color=colour, label=f"{name}, training")
-        a.plot(step, [row["validation_loss"] for row in log], color=colour, ls="--", label="validation")
+        a.plot(step, [row["loss"] for row in log], color=colour, marker="o", ms=4, label=f"{name}, training")
+        a.plot(step, [row["validation_loss"] for row in log], color=colour, ls="--", marker="o", ms=4, label="validation")
         b.plot(step, [row["pck_0.10"] for row in log], color=colour, marker="o", ms=4, label="PCK@0.10")
         b.plot(step, [row["pck_0.05"] for row in log], color=colour, ls="--", marker="o", ms=4, label="PCK@0.05")
         c.plot(step, [row["median_px"] for row in log], color=colour, marker="o", ms=4, label=name)
