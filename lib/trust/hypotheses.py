@@ -72,7 +72,7 @@ def _landmark_offset(case: Case) -> Iterator[Hypothesis]:
     if size[k] >= 150:
         along = ", ".join(f"{1e3 * v:.0f}" for v in free.offsets[k])
         text = f"{LANDMARKS[k]} is seen {size[k]:.0f} um beside the robot's report ({along} um in the tool's axes)."
-        cure = "Correct the tool's geometry in the robot's report; until then `calibrate` learns and removes such offsets."
+        cure = "Correct the tool's geometry in the robot's report. --force goes on: `calibrate` removes such offsets."
         yield case.found("landmark_offset", free, 9, (size[k], 1e3 * free.offset_sd[k], "um"), text, cure)
 
 
