@@ -677,7 +677,7 @@ def scene_view(
             line(np.array([tips[0], below]), said, "#111111", 8)
     axes = {f"{axis}axis": {"title": f"{axis} (mm)", "nticks": 4 if axis == "z" else 6} for axis in "xyz"}
     up, (right, down) = -rig.left.viewing_direction, _across(rig)
-    eye = 0.85 * up + 1.15 * down + 0.3 * right  # as one who sits in front of the image
+    eye = 1.1 * up + 1.4 * down + 0.3 * right  # as one who sits in front of the image
     camera = {name: dict(zip("xyz", v.tolist(), strict=True)) for name, v in (("up", up), ("eye", eye))}
     view.update_layout(
         scene={"aspectmode": "data", "camera": camera, **axes}, margin={"l": 0, "r": 0, "t": 0, "b": 0},

@@ -1,6 +1,8 @@
 // What moves in a page: views in three dimensions, pictures with controls, and the table of contents on a small screen.
 for (const view of document.querySelectorAll(".plotly-view")) {
   const figure = JSON.parse(view.nextElementSibling.textContent);
+  const eye = figure.layout.scene?.camera?.eye ?? {};  // its height fixes the scale: a narrow view steps back
+  if (view.clientWidth < 620) Object.keys(eye).forEach((axis) => { eye[axis] *= 1.6; });
   Plotly.newPlot(view, figure.data, figure.layout, { responsive: true, displaylogo: false });
 }
 for (const box of document.querySelectorAll(".explore")) {
