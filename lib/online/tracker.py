@@ -158,7 +158,7 @@ class RigTracker:
             self._resolve(result)
             return []
         data, monitor = self.corrected(frame.data), self._monitor
-        alarm = monitor.update(data, covariance_px2=self._residual_covariance(data))
+        alarm = monitor.update(data, covariance_px2=self._noise(data), rig_px2=self._rig_covariance(data))
         result.drift = monitor.statistic
         self._recent.append(frame)
         if alarm:
@@ -276,10 +276,15 @@ class RigTracker:
     def point_covariance(self, x_mm: np.ndarray) -> np.ndarray:
         """(n, 3, 3) mm^2: how far the rig may put points beside the robot's."""
         known = self.calibration
-        own = np.zeros((len(x_mm), 3, 3)) if known is None else known.point_covariance(x_mm, detection=False)
+        own = np.zeros((len(x_mm), 3, 3))
+        if known is not None:
+            own += known.point_covariance(x_mm, detection=False) * self._remains(x_mm)
         moves = [motion for motion in self._motions if motion is not None]
         stale = [motion.covariance_at(motion.transform.inverse().apply(x_mm)) for motion in moves]
         return own + sum(stale) / max(len(moves), 1)
+
+    def _remains(self, x_mm: np.ndarray) -> np.ndarray:
+        return np.ones((1, 1, 1)) if self._moments is None else self._moments.remains(x_mm)[:, None, None]
 
     @property
     def _motions(self) -> tuple:
@@ -292,13 +297,14 @@ class RigTracker:
         A = (self._before or self.rig).linear
         return self.detection_covariance(data) + self._scale2 * sigma_x**2 * A @ A.T
 
-    def _residual_covariance(self, data: Correspondences) -> np.ndarray:
-        """(n, 4, 4) px^2: the noise, and by how much the rig is uncertain where these landmarks are."""
-        covariance = self._noise(data)
+    def _rig_covariance(self, data: Correspondences) -> np.ndarray:
+        """(n, 4, 4) px^2: by how much the rig is uncertain where these landmarks are."""
+        covariance = np.zeros((len(data), 4, 4))
         for motion, rows in zip(self._motions, (slice(0, 2), slice(2, 4)), strict=True):
             stale = data.x_mm if motion is None else motion.transform.inverse().apply(data.x_mm)
             if self.calibration is not None:
-                covariance[:, rows, rows] += self.calibration.projection_covariance(stale)[:, rows, rows]
+                own = self.calibration.projection_covariance(stale) * self._remains(stale)
+                covariance[:, rows, rows] += own[:, rows, rows]
             if motion is not None:
                 covariance[:, rows, rows] += self.rig.linear[rows] @ motion.covariance_at(stale) @ self.rig.linear[rows].T
         return covariance

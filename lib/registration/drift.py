@@ -14,8 +14,8 @@ __all__ = ["DriftMonitor"]
 #: What is watched: the mean residual of a frame's landmarks along the directions of the images that lateral shifts move,
 #: along the one that a shift in depth moves, and across the epipolar lines; and their chi-square.
 AXES = ("lateral", "lateral", "lateral", "lateral", "depth", "epipolar", "scatter")
-# Shifts of the tool that are to be noticed, along the principal directions of the rig; half of them counts as none.
-_SHIFT_MM = np.array([[20, 0, 0], [0, 20, 0], [14, 14, 0], [14, -14, 0], [0, 0, 50]]) / 1e3
+# Shifts of the tool that are tested for, along the principal directions of the rig; half of them counts as none.
+_SHIFT_MM = np.array([[20, 0, 0], [0, 20, 0], [14, 14, 0], [14, -14, 0], [0, 0, 40]]) / 1e3
 _SHIFT_SD = (1.0, 8.0)  # of a frame: least and largest shift that a test is made for; the other axes are tested for 2
 _FRAMES = 20_000  # between false alarms, at least
 # Most that one frame adds, of the alarm level: so that neither a single bad frame raises an alarm nor, across and along the
@@ -27,6 +27,7 @@ _WANDER = (4, 4, 4, 4, 10, 10, 10)  # frames over which correlated noise counts:
 # By what that raises the variance, before the frames tell: as if so many frames had told it, for few say little of it.
 _RAISES, _RAISES_FRAMES = (1.2, 1.2, 1.2, 1.2, 1.0, 1.3, 1.3), 1500
 _SLOW = 300  # frames over which the bias is averaged
+_UNCERTAIN = 0.7  # standard deviations of the rig that are no drift
 _LARGEST_BIAS_PX = 0.5  # of a frame's mean; more is a drift
 _FREEDOM = 4.0  # of the Student t of a landmark about the frame's mean: one wrong landmark moves the mean little
 
@@ -92,22 +93,24 @@ class DriftMonitor:
 
     def update(
         self, data: Correspondences | ArrayLike, u_left: ArrayLike | None = None, u_right: ArrayLike | None = None,
-        covariance_px2: ArrayLike | None = None,
+        covariance_px2: ArrayLike | None = None, rig_px2: ArrayLike | None = None,
     ) -> bool:  # fmt: skip
         """Take in one frame; True = the cameras have moved.
 
         Args:
             data, u_left, u_right: The frame's Correspondences; or x_mm (k, 3) and pixels (k, 2).  Incomplete rows are
                 left out.
-            covariance_px2: (k, 4, 4) of the residuals of this frame, if it is known better than in general: where the
-                rig itself is uncertain, far from the landmarks that it was calibrated with.
+            covariance_px2: (k, 4, 4) noise of this frame's residuals, if it is known better than in general.
+            rig_px2: (k, 4, 4) covariance of the rig's projections.  It is large far from the landmarks that the rig was
+                calibrated with, and frame after frame errs alike there, which is no drift.
         """
         data = data if isinstance(data, Correspondences) else Correspondences.of_points(data, u_left, u_right)
         covariance = self.covariance_px2 + self.sigma_x_mm**2 * self.rig.linear @ self.rig.linear.T
         if covariance_px2 is not None:
             covariance = pair_covariance(covariance_px2, len(data))
-        used = data.is_complete
-        covariance, data = np.broadcast_to(covariance, (len(used), 4, 4))[used], data.subset(used)
+        used, uncertain = data.is_complete, np.zeros((4, 4)) if rig_px2 is None else np.asarray(rig_px2)
+        covariance, uncertain = (np.broadcast_to(c, (len(used), 4, 4))[used] for c in (covariance, uncertain))
+        covariance, data = covariance + uncertain, data.subset(used)
         if not np.isfinite(covariance).all():
             raise ValueError("covariance_px2: must be finite for every landmark that both images show.")
         residual = np.hstack([data.u_left, data.u_right]) - np.hstack(self.rig.project(data.x_mm))
@@ -119,17 +122,18 @@ class DriftMonitor:
             # Wilson and Hilferty 1931: a chi-square as a normal score, so that missing landmarks count alike.
             spread = 2.0 / (9.0 * residual.size)
             scatter = (np.cbrt(chi2 / residual.size) - (1.0 - spread)) / np.sqrt(spread)
-            self._add(np.append(self._axes @ _robust_mean(residual, weight) / sd, scatter), sd)
+            rig_sd = np.sqrt(np.diag(self._axes @ uncertain.mean(axis=0) @ self._axes.T)) / sd
+            self._add(np.append(self._axes @ _robust_mean(residual, weight) / sd, scatter), sd, np.append(rig_sd, 0.0))
         self.history.append((chi2, residual.size, self.statistic))
         return self.statistic > self.threshold
 
-    def _add(self, value: np.ndarray, sd: np.ndarray) -> None:
+    def _add(self, value: np.ndarray, sd: np.ndarray, rig_sd: np.ndarray) -> None:
         largest_bias = _LARGEST_BIAS_PX / np.append(sd, sd.min())
         z = (value - np.clip(self._bias, -largest_bias, largest_bias)) / self._noise
         shift = np.append(np.clip(self._shift_px / (sd[:-1] * self._noise[:-2]), *_SHIFT_SD), (2.0, 2.0))
         level = np.log(2 * len(AXES) * _FRAMES * shift**2 / 2.0) - 1.166 * shift
-        # The bias of few frames is uncertain itself.
-        slack = shift / 2.0 + 1.0 / np.sqrt(self._seen + 10.0)
+        # The bias of few frames is uncertain itself, and so is the rig.
+        slack = shift / 2.0 + 1.0 / np.sqrt(self._seen + 10.0) + _UNCERTAIN * rig_sd / self._noise
         signed = np.stack([z, np.append(-z[:-1], 0.0)])  # landmarks that scatter less than usual are no fault
         gain = np.minimum(shift * (signed - slack) / level, np.clip(_BURST * np.abs(z), _LEAST, _CAP))
         self._sums = np.maximum(self._sums + gain, 0.0)
