@@ -24,22 +24,12 @@ __all__ = ["RECTIFIED", "DisparityFunction", "Matches", "checked_mask", "glint_m
 
 
 def match(
-    left: ArrayLike,
-    right: ArrayLike,
-    *,
-    method: str | DisparityFunction | None = None,
-    rig: StereoRig | None = None,
-    mask_left: ArrayLike | None = None,
-    mask_right: ArrayLike | None = None,
-    depth_range_mm: tuple[float, float] | None = None,
-    setting: str = "quality",
-    min_score: float | None = None,
-    downscale: int | None = None,
-    budget_bytes: int = 2 << 30,
-    max_epipolar_px: float = 6.0,
-    reciprocal: bool = True,
+    left: ArrayLike, right: ArrayLike, *, method: str | DisparityFunction | None = None, rig: StereoRig | None = None,
+    mask_left: ArrayLike | None = None, mask_right: ArrayLike | None = None,
+    depth_range_mm: tuple[float, float] | None = None, setting: str = "quality", min_score: float | None = None,
+    downscale: int | None = None, budget_bytes: int = 2 << 30, max_epipolar_px: float = 6.0, reciprocal: bool = True,
     device: str = "cpu",
-) -> Matches:
+) -> Matches:  # fmt: skip
     """Match the two images of a stereo pair.
 
     Args:

@@ -134,13 +134,9 @@ def _coarse_displacement(images: Images, masks: Masks, rig: StereoRig, whole: Re
 
 
 def _descriptors(
-    images: Images,
-    masks: Masks,
-    rectification: Rectification,
-    range_cells: tuple[int, int],
-    off_line: int,
+    images: Images, masks: Masks, rectification: Rectification, range_cells: tuple[int, int], off_line: int,
     off_line_px: float = 0.0,
-) -> list[np.ndarray]:
+) -> list[np.ndarray]:  # fmt: skip
     """Left grid (4 gy, 4 gx, 9), and the right grid with the margins that the search needs."""
     step, low, high = PATCH * CELL_PX, *range_cells
     width, height = (side // step * step for side in rectification.size_px)

@@ -100,14 +100,9 @@ def _match_grids(left: torch.Tensor, right: torch.Tensor) -> tuple[torch.Tensor,
 
 
 def match_free(
-    images: tuple[np.ndarray, np.ndarray],
-    masks: tuple[np.ndarray | None, np.ndarray | None],
-    *,
-    downscale: int | None,
-    budget_bytes: int,
-    reciprocal: bool,
-    device: str,
-) -> Matches:
+    images: tuple[np.ndarray, np.ndarray], masks: tuple[np.ndarray | None, np.ndarray | None], *, downscale: int | None,
+    budget_bytes: int, reciprocal: bool, device: str,
+) -> Matches:  # fmt: skip
     """DeepMatching without any calibration; arguments as in `lib.matching.match`, images (h, w) uint8 grey."""
     shapes = images[0].shape, images[1].shape
     largest = int(np.log2(min(shapes[0] + shapes[1]) / (2 * PATCH)))

@@ -114,13 +114,9 @@ def rectify(
 
 
 def warp(
-    gray: np.ndarray,
-    image_from_canvas: np.ndarray,
-    size_px: tuple[int, int],
-    *,
-    shift_px: tuple[float, float] = (0, 0),
+    gray: np.ndarray, image_from_canvas: np.ndarray, size_px: tuple[int, int], *, shift_px: tuple[float, float] = (0, 0),
     mask: np.ndarray | None = None,
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """An image (h, w), float32 or uint8, on a canvas; anti-aliased where the canvas is coarser.
 
     Args:

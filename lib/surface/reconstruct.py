@@ -72,27 +72,15 @@ def epipolar_inliers(rig: StereoRig, matches: Matches, *, sigmas: float = EPIPOL
 
 
 def reconstruct(
-    left: np.ndarray,
-    right: np.ndarray,
-    rig: StereoRig | Calibration,
-    *,
-    setting: str = "quality",
-    method: str | Callable | None = None,
-    refine: bool | None = None,
-    u_landmarks: tuple[ArrayLike, ArrayLike] | None = None,
-    mask_left: np.ndarray | None = None,
-    mask_right: np.ndarray | None = None,
-    epipolar_sigmas: float = EPIPOLAR_SIGMAS,
-    domain: tuple[float, float, float, float] | None = None,
-    percentiles: tuple[float, float] = (0.0, 100.0),
-    control: tuple[int, int] = (20, 20),
-    smoothness: float | None = None,
-    reject_mm: float | None = None,
-    depth_only: bool | None = None,
-    depth_range_mm: tuple[float, float] | None = None,
-    max_epipolar_px: float = 6.0,
+    left: np.ndarray, right: np.ndarray, rig: StereoRig | Calibration, *, setting: str = "quality",
+    method: str | Callable | None = None, refine: bool | None = None,
+    u_landmarks: tuple[ArrayLike, ArrayLike] | None = None, mask_left: np.ndarray | None = None,
+    mask_right: np.ndarray | None = None, epipolar_sigmas: float = EPIPOLAR_SIGMAS,
+    domain: tuple[float, float, float, float] | None = None, percentiles: tuple[float, float] = (0.0, 100.0),
+    control: tuple[int, int] = (20, 20), smoothness: float | None = None, reject_mm: float | None = None,
+    depth_only: bool | None = None, depth_range_mm: tuple[float, float] | None = None, max_epipolar_px: float = 6.0,
     seconds: dict[str, float] | None = None,
-) -> Reconstruction:
+) -> Reconstruction:  # fmt: skip
     """Reconstruct the surface that a calibrated stereo pair shows.
 
     Args:
