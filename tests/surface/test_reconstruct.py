@@ -218,7 +218,7 @@ def test_recorded_studies_are_tabled():
     timed = sum(bool(row["width_px"] and np.isfinite(row["all_median_px"])) for row in recorded["matching"].rows)
     assert table.count("<tr") == 1 + timed + sum(len(recorded[k]) for k in ("l1_solver", "reconstruction_speed"))
     empty = figures.recorded_table({}, "Errors."), figures.recorded_speeds({}, "Speeds.")
-    assert [page.data.count("<tr") for page in empty] == [1, 1]
+    assert not any("<td" in page.data for page in empty)
     assert figures.recorded_table(recorded, "Errors.").data.count("<tr") > 1
 
 
