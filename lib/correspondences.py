@@ -14,11 +14,14 @@ from numpy.typing import ArrayLike
 from lib.geometry import pair_covariance, points
 
 __all__ = [
-    "LANDMARKS", "MIN_CONFIDENCE", "TRAIN_FURTHER", "Correspondences", "NoDetectionError", "of_recording", "pair_with_robot",
+    "LANDMARKS", "LANDMARK_COLOURS", "MIN_CONFIDENCE", "TRAIN_FURTHER", "Correspondences", "NoDetectionError", "of_recording",
+    "pair_with_robot",
 ]  # fmt: skip
 
 #: The landmarks of the forceps, in the order of every array.
 LANDMARKS = ("base", "tip_1", "tip_2")
+#: RGB of each landmark in every picture (Okabe and Ito 2008, told apart by all eyes).
+LANDMARK_COLOURS = {"base": (86, 180, 233), "tip_1": (230, 159, 0), "tip_2": (204, 121, 167)}
 #: A detection of lower confidence counts as not seen.
 MIN_CONFIDENCE = 0.2
 #: The cure where a detector does not know the pictures.

@@ -62,16 +62,10 @@ class OnlinePipeline:
     """
 
     def __init__(
-        self,
-        detector: Detector,
-        *,
-        rig: StereoRig | Calibration | None = None,
-        noise_px: float = 1.5,
-        settings: Settings | None = None,
-        beside: bool = False,
-        calibrate: Callable[..., Calibration] = calibrate,
+        self, detector: Detector, *, rig: StereoRig | Calibration | None = None, noise_px: float = 1.5,
+        settings: Settings | None = None, beside: bool = False, calibrate: Callable[..., Calibration] = calibrate,
         reconstruct: Callable[..., Reconstruction] = reconstruct,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.settings, self.state = settings or Settings(), "calibrating"
         self._detector, self._seen, self._index = detector, None, -1
         self._tracker = RigTracker(rig, noise_px=float(noise_px), settings=self.settings, calibrate=calibrate)

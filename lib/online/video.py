@@ -7,13 +7,12 @@ from typing import Self
 import cv2
 import numpy as np
 
-from lib.correspondences import LANDMARKS
+from lib.correspondences import LANDMARK_COLOURS, LANDMARKS
 from lib.online.result import STAGES, STATES, FrameResult
 
 __all__ = ["Dashboard", "VideoFile"]
 
 _SIZE = (1280, 720)
-_COLOURS = {"base": (0, 114, 178), "tip_1": (230, 159, 0), "tip_2": (0, 158, 115)}
 _LIGHTS = dict(zip(STATES, ((120, 120, 120), (0, 170, 80), (90, 150, 230), (40, 40, 40), (240, 190, 60), (220, 60, 50)),
                    strict=True))  # fmt: skip
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
@@ -47,7 +46,7 @@ class Dashboard:
             if np.isfinite(point).all():
                 at = tuple(int(v) for v in np.round((point + 0.5) * scale - 0.5))
                 cv2.circle(small, at, 6, (255, 255, 255), 3, cv2.LINE_AA)
-                cv2.circle(small, at, 6, _COLOURS[name], 2, cv2.LINE_AA)
+                cv2.circle(small, at, 6, LANDMARK_COLOURS[name], 2, cv2.LINE_AA)
         part[: small.shape[0], : small.shape[1]] = small
 
     def _lights(self, page: np.ndarray, result: FrameResult) -> None:
@@ -73,10 +72,10 @@ class Dashboard:
             for i, r in enumerate(self._past):
                 d, sd = r.distance_mm[k], r.distance_sd_mm[k]
                 if np.isfinite(d) and np.isfinite(sd):
-                    pale = tuple(int(200 + 0.2 * c) for c in _COLOURS[name])
+                    pale = tuple(int(200 + 0.2 * c) for c in LANDMARK_COLOURS[name])
                     cv2.line(part, place(i, d - 2 * sd), place(i, d + 2 * sd), pale, 2)
-                    cv2.circle(part, place(i, d), 2, _COLOURS[name], -1, cv2.LINE_AA)
-            _text(part, name, (60 + 90 * k, part.shape[0] - 8), _COLOURS[name])
+                    cv2.circle(part, place(i, d), 2, LANDMARK_COLOURS[name], -1, cv2.LINE_AA)
+            _text(part, name, (60 + 90 * k, part.shape[0] - 8), tuple(0.6 * c for c in LANDMARK_COLOURS[name]))
         _text(part, "mm to the retina, with 2 sd", (360, part.shape[0] - 8))
 
     def _times(self, part: np.ndarray, result: FrameResult) -> None:

@@ -12,7 +12,7 @@ from jinja2 import Environment, FileSystemLoader
 
 from lib import files, paths
 from lib.calibration import estimate_time_offset
-from lib.correspondences import LANDMARKS, of_recording
+from lib.correspondences import LANDMARK_COLOURS, LANDMARKS, of_recording
 from lib.landmarks import Detector, SharedDetector, detect
 from lib.provenance import plain
 from lib.recordings import Recording, StereoFrame
@@ -21,7 +21,7 @@ from lib.trust.verdict import LEVELS
 
 __all__ = ["Check", "check", "data_uri", "main", "overlay"]
 
-_COLOURS = np.array([[0, 114, 178], [230, 159, 0], [0, 158, 115]])  # of base, tip_1, tip_2, RGB
+_COLOURS = np.array([*LANDMARK_COLOURS.values()])
 _SHOWN = 3  # best frames, and worst
 _MOST_FRAMES = 60  # spread over the recording; more take longer and say little more
 _SHOWN_PX = 760  # width of one image of an overlay

@@ -11,6 +11,8 @@ from IPython.display import HTML
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from lib import correspondences
+
 __all__ = ["COLOURS", "LANDMARK_COLOURS", "ON_IMAGE", "figure", "show_image", "table"]
 
 #: Colour-blind safe (after Okabe and Ito), 3:1 and more on white, named by what they mean here.
@@ -24,7 +26,7 @@ COLOURS = {
     "warning": "#C77700",
 }
 #: Legible on dark images and on white.
-LANDMARK_COLOURS = {"base": "#56B4E9", "tip_1": "#E69F00", "tip_2": "#CC79A7"}
+LANDMARK_COLOURS = {name: "#{:02X}{:02X}{:02X}".format(*colour) for name, colour in correspondences.LANDMARK_COLOURS.items()}
 #: Of a legend that lies on an image.
 ON_IMAGE = {"labelcolor": "white", "frameon": True, "facecolor": "black", "framealpha": 0.55, "edgecolor": "none"}
 
