@@ -126,7 +126,7 @@ def _main_of(name: str, module: str, function: str):
 
     def command(argv: list[str]) -> int:
         try:
-            if name in (*STAGES, "check", "adapt"):
+            if module in ("lib.commands", "lib.trust.check", "lib.adapt.report"):  # they detect in a recording
                 _keep_detections()
             return getattr(importlib.import_module(module), function)(argv)
         except KeyboardInterrupt:
@@ -161,12 +161,11 @@ def ruff_options() -> list[str]:
     return ["--isolated", *(f"--config={key} = {toml(value)}" for key, value in manifest()["tool"]["ruff"].items())]
 
 
-STAGES = ("import", "annotate", "detect", "calibrate", "reconstruct", "register")
 #: Command -> the function that it calls, and its module.
 FUNCTIONS = {
     "run": ("lib.workbench.command", "main"),
     "site": ("lib.workbench.command", "main_site"),
-    **{name: ("lib.commands", f"main_{name}") for name in STAGES},
+    **{name: ("lib.commands", f"main_{name}") for name in "import annotate detect calibrate reconstruct register".split()},
     "check": ("lib.trust.check", "main"),
     "sweep": ("lib.workbench.sweep", "main"),
     "simulate": ("lib.simulator.dataset", "main"),

@@ -91,5 +91,6 @@ def main(argv: list[str]) -> int:
         cure = f"set offset_s = {offset_s:.4f} in {paths.shown(a.recording / 'recording.toml')}"
         print(f"The clocks differ by {1e3 * offset_s:.1f} ms, standard deviation {1e3 * sd_s:.1f} ms: {cure}.")
     if recording is not None and found.improved:
-        print(f"Next: python3 -m lib check {where} --weights {paths.shown(out)}/weights.safetensors, then calibrate.")
+        weights = shlex.quote(paths.shown(out / "weights.safetensors"))
+        print(f"Next: python3 -m lib check {where} --weights {weights}, then calibrate with the same weights.")
     return 0 if found.improved else 3

@@ -299,12 +299,11 @@ class RigTracker:
 
     def _rig_covariance(self, data: Correspondences) -> np.ndarray:
         """(n, 4, 4) px^2: by how much the rig is uncertain where these landmarks are."""
-        covariance = np.zeros((len(data), 4, 4))
+        covariance, known = np.zeros((len(data), 4, 4)), self.calibration
         for motion, rows in zip(self._motions, (slice(0, 2), slice(2, 4)), strict=True):
             stale = data.x_mm if motion is None else motion.transform.inverse().apply(data.x_mm)
-            if self.calibration is not None:
-                own = self.calibration.projection_covariance(stale) * self._remains(stale)
-                covariance[:, rows, rows] += own[:, rows, rows]
+            if known is not None:
+                covariance[:, rows, rows] += (known.projection_covariance(stale) * self._remains(stale))[:, rows, rows]
             if motion is not None:
                 covariance[:, rows, rows] += self.rig.linear[rows] @ motion.covariance_at(stale) @ self.rig.linear[rows].T
         return covariance

@@ -2,6 +2,7 @@
 
 import argparse
 import base64
+import shlex
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -132,10 +133,10 @@ def check(recording: str | Path | Recording, *, detector: Callable | None = None
     else:
         raise ValueError(f"{found.folder}: the detector knows {', '.join(LANDMARKS)} only, and there are no annotations.")
     a = assess(found, data, detector=detector)
-    next_step = f"Use it: `python3 -m lib run -p recording {paths.shown(found.folder)}`."
+    next_step = "Use it: `python3 -m lib run -p recording RECORDING`."
     if a.verdict.level != LEVELS[0]:
         next_step = a.verdict.reasons[0].cure if a.diagnosis.best is None else a.diagnosis.best.cure
-    made = Check(found, a, _facts(found, a), next_step.replace("RECORDING", paths.shown(found.folder)))
+    made = Check(found, a, _facts(found, a), next_step.replace("RECORDING", shlex.quote(paths.shown(found.folder))))
     if folder is not None:
         made.write(folder)
     return made
