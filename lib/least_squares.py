@@ -9,7 +9,17 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["Minimum", "minimise"]
+__all__ = ["Minimum", "inverse", "minimise"]
+
+
+def inverse(information: np.ndarray) -> np.ndarray:
+    """Covariance (p, p) from the information of parameters whose units may differ widely.
+
+    >>> inverse(np.diag([4.0, 1e-8])).round(2).tolist()
+    [[0.25, 0.0], [0.0, 100000000.0]]
+    """
+    scale = 1.0 / np.sqrt(np.diag(information))
+    return np.linalg.inv(information * np.outer(scale, scale)) * np.outer(scale, scale)
 
 
 @dataclass(frozen=True, eq=False)

@@ -59,13 +59,6 @@ class Moments:
         z -= mean
         return cls(float(len(z)), mean, z.T @ z)
 
-    def merged(self, other: Self) -> Self:
-        """Moments of both sets together (Chan, Golub and LeVeque's update)."""
-        weight = self.weight + other.weight
-        step = other.mean - self.mean
-        scatter = self.scatter + other.scatter + np.outer(step, step) * (self.weight * other.weight / weight)
-        return Moments(weight, self.mean + step * (other.weight / weight), scatter)
-
 
 class AffineMinimum(NamedTuple):
     """The cameras [A, t] stacked as `matrix` (m, 4), and the energy `cost` there."""

@@ -18,6 +18,7 @@ from lib.calibration.scatter import sandwich
 from lib.cameras import StereoRig
 from lib.correspondences import Correspondences
 from lib.geometry import pair_covariance
+from lib.least_squares import inverse
 
 __all__ = ["calibrate"]
 
@@ -270,12 +271,11 @@ def _parameter_covariance(
     plan: Model, minimum: Fit, noise: np.ndarray, sigma_x: float, weigh: np.ndarray, variance_x: float, views: np.ndarray
 ) -> np.ndarray:
     """Inverse information; where the weights were not the noise's, the sandwich H^-1 G H^-1."""
-    scale = 1.0 / np.sqrt(np.diag(minimum.information))
-    inverse = np.linalg.inv(minimum.information * np.outer(scale, scale)) * np.outer(scale, scale)
+    known = inverse(minimum.information)
     if np.allclose(weigh, noise, rtol=1e-9, atol=0) and np.isclose(variance_x, sigma_x**2, rtol=1e-9, atol=0):
-        return inverse
+        return known
     _, J_x, J_c = minimum.state.evaluate(minimum.points)
     outer = J_x @ np.swapaxes(J_x, 1, 2)
     WJ = precision(weigh + variance_x * outer, views) @ J_c @ plan.selection
     meat = np.einsum("nip,nij,njq->pq", WJ, noise + sigma_x**2 * outer, WJ)
-    return inverse @ meat @ inverse
+    return known @ meat @ known

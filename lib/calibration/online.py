@@ -1,21 +1,26 @@
-"""A calibration that goes on: fold each new frame into the moments, and solve again in constant time and memory."""
+"""A calibration that goes on: each new frame moves it by one step, in constant time and memory."""
 
 import numpy as np
 
-from lib.calibration.affine import Moments, affine_minimum
 from lib.calibration.calibration import Calibration
+from lib.calibration.models import precision
 from lib.calibration.robust import gate
-from lib.cameras import AffineCamera, StereoRig
+from lib.cameras import StereoRig
 from lib.correspondences import Correspondences
+from lib.geometry import pair_covariance
+from lib.least_squares import inverse
 
 __all__ = ["OnlineCalibration"]
 
 
 class OnlineCalibration:
-    """The affine minimum of a calibration's rows and of all that came since.
+    """A calibration's minimum, moved by all rows that came since: an extended Kalman filter of the model's parameters.
+
+    It has the calibration's camera model, and its information from the calibration's rows; each new row counts by its own
+    covariance.  So it starts where the calibration ended.
 
     Args:
-        calibration: Where it starts: its rows that both images show, and its noise levels, which judge the new ones.
+        calibration: Where it starts; its noise levels judge the new rows.
 
     >>> from lib.calibration import calibrate
     >>> rng, A = np.random.default_rng(0), np.array([[99.0, 0, -9], [0, 99, 0], [99, 0, 9], [0, 99, 0]])
@@ -23,44 +28,50 @@ class OnlineCalibration:
     >>> y = x @ A.T + rng.normal(0, 1, (60, 4))
     >>> online = OnlineCalibration(calibrate(x[:30], [y[:30, :2], y[:30, 2:]]))
     >>> int(online.add(Correspondences.of_points(x[30:], y[30:, :2], y[30:, 2:])).sum())
-    30
+    60
     >>> online.solve().linear[0].round().astype(int).tolist()
     [99, 0, -9]
     """
 
     def __init__(self, calibration: Calibration) -> None:
-        self.sigma_u_px, self.sigma_x_mm = calibration.sigma_u_px, calibration.sigma_x_mm
-        rows = calibration.view_inliers.all(axis=1)
-        self.moments = self._first = Moments.of(calibration.x_mm[rows], calibration.y_px[rows])
+        self._calibration, self._state = calibration, calibration.minimum.state
+        self._information = calibration.minimum.information
+        self._covariance = self._first = inverse(self._information)
 
     def add(self, data: Correspondences) -> np.ndarray:
-        """Fold in the rows of a frame, and return which were used (n,): complete ones that the rig so far does not refuse."""
-        used = data.is_complete
-        x, y = data.x_mm[used], np.hstack([data.u_left, data.u_right])[used]
-        # A new row's residual also has the calibration's own uncertainty: (1 + leverage) S.
-        leverage = _leverage(self.moments, x)
-        A = self._matrix[:, :3]
-        r, S = y - x @ A.T - self._matrix[:, 3], self.sigma_u_px**2 * np.eye(4) + self.sigma_x_mm**2 * A @ A.T
-        right = np.einsum("ni,ij,nj->n", r, np.linalg.inv(S), r) / (1.0 + leverage) < gate(100, 4)
-        if right.any():
-            self.moments = self.moments.merged(Moments.of(x[right], y[right]))
-        used[used] = right
+        """Fold in the rows of a frame; returns the views (n, 2) bool that were used, those the rig so far does not refuse."""
+        known = self._calibration
+        used = data.seen & np.isfinite(data.x_mm).all(axis=1, keepdims=True)
+        seen = np.repeat(used, 2, axis=1)
+        y, J_x, J = self._evaluate(np.where(used.any(axis=1, keepdims=True), data.x_mm, self._state.reference))
+        r = np.where(seen, np.hstack([data.u_left, data.u_right]) - y, 0.0)
+        noise = np.broadcast_to(known.noise_px2, (len(data), 4, 4))
+        if known.covariance_px2 is not None and np.isfinite(data.covariance_px2[used]).all():
+            own = np.where(used[:, :, None, None], data.covariance_px2, np.eye(2))
+            noise = known.detector_scale**2 * pair_covariance(own, len(data))
+        S = noise + known.sigma_x_mm**2 * J_x @ J_x.mT
+        expected = S + J @ self._covariance @ J.mT  # the rig is uncertain itself
+        for side, view in enumerate((slice(0, 2), slice(2, 4))):
+            chi2 = np.einsum("ni,nij,nj->n", r[:, view], np.linalg.inv(expected[:, view, view]), r[:, view])
+            used[:, side] &= chi2 < gate(100, 2)
+        if used.any():
+            WJ = precision(S, used) @ J
+            self._information = self._information + np.einsum("nip,niq->pq", J, WJ)
+            self._covariance = inverse(self._information)
+            step = self._covariance @ np.einsum("nip,ni->p", WJ, r)
+            self._state = self._state.moved(known.plan.selection @ step)
         return used
 
     def remains(self, x_mm: np.ndarray) -> np.ndarray:
         """(n,) of the variance of the calibration's projections of x_mm (n, 3), what the rows since then have left."""
-        return _leverage(self.moments, x_mm) / _leverage(self._first, x_mm)
+        J = self._evaluate(x_mm)[2]
+        now, first = (np.einsum("nip,pq,niq->n", J, known, J) for known in (self._covariance, self._first))
+        return now / first
 
-    @property
-    def _matrix(self) -> np.ndarray:
-        return affine_minimum(self.moments, self.sigma_u_px**2, self.sigma_x_mm**2).matrix
+    def _evaluate(self, x_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        y, J_x, J_c = self._state.evaluate(x_mm - self._state.reference)
+        return y, J_x, J_c @ self._calibration.plan.selection
 
     def solve(self) -> StereoRig:
         """The rig of the rows so far."""
-        matrix = self._matrix
-        return StereoRig(AffineCamera(matrix[:2]), AffineCamera(matrix[2:]))
-
-
-def _leverage(moments: Moments, x_mm: np.ndarray) -> np.ndarray:
-    d = x_mm - moments.mean[4:]
-    return 1.0 / moments.weight + np.einsum("ni,ij,nj->n", d, np.linalg.inv(moments.scatter[4:, 4:]), d)
+        return StereoRig(*self._state.cameras(self._calibration.plan))

@@ -270,8 +270,9 @@ class RigTracker:
         if known is None:
             return np.tile(self._noise_px**2 * np.eye(4), (len(data), 1, 1))
         if known.covariance_px2 is None:
-            own = np.broadcast_to(known.noise_px2, own.shape)
-        return self._scale2 * np.where(np.isfinite(own).all(axis=(1, 2), keepdims=True), own, known.noise_px2)
+            own = np.full(own.shape, np.nan)
+        own = np.where(np.isfinite(own).all(axis=(1, 2), keepdims=True), known.detector_scale**2 * own, known.noise_px2)
+        return self._scale2 * own
 
     def point_covariance(self, x_mm: np.ndarray) -> np.ndarray:
         """(n, 3, 3) mm^2: how far the rig may put points beside the robot's."""

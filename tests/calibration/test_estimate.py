@@ -116,14 +116,6 @@ def test_constraints_hold_and_cost_grows_with_them():
     assert costs == sorted(costs)
 
 
-def test_moments_merge():
-    rng = np.random.default_rng(0)
-    x, y = rng.normal(size=(30, 3)) + 50, rng.normal(size=(30, 4)) * 7 + 900
-    whole, parts = Moments.of(x, y), Moments.of(x[:11], y[:11]).merged(Moments.of(x[11:], y[11:]))
-    assert parts.weight == whole.weight
-    np.testing.assert_allclose(parts.scatter, whole.scatter, rtol=1e-10, atol=1e-8)
-
-
 def test_minimum_is_stationary_and_below_least_squares():
     c = data(60, 6, sigma_x_mm=0.05, half_size_mm=(4, 3, 0.3))
     y = np.hstack([c.u_left, c.u_right])

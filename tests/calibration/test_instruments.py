@@ -131,20 +131,50 @@ def test_a_rolling_shutter_paired_row_by_row_calibrates_to_the_noise():
     assert without.reprojection_rms_px**2 - with_it.reprojection_rms_px**2 > 0.3**2
 
 
-def started(c, rows):
+def started(c, rows, **options):
     """An online calibration of these rows of data without errors in the noise levels."""
-    known = {"model": "affine", "sigma_u_px": 1.5, "sigma_x_mm": 0.01, "ransac_px": np.inf}
+    known = {"model": "affine", "sigma_u_px": 1.5, "sigma_x_mm": 0.01, "ransac_px": np.inf} | options
     return OnlineCalibration(calibrate(c.x_mm[rows], [c.u_left[rows], c.u_right[rows]], **known)), known
 
 
-def test_online_is_the_batch_minimum():
-    c = simulate_correspondences(90, rng=np.random.default_rng(0))
-    online, known = started(c, slice(0, 24))
-    rows = Correspondences.of_points(c.x_mm, c.u_left, c.u_right, frame=np.arange(90) // 3)
-    for frame in range(8, 30):
+@pytest.mark.parametrize("model", ["affine", "zero_skew", "near_affine"])
+def test_online_is_the_batch_minimum_within_a_small_part_of_its_doubt(model):
+    c = simulate_correspondences(120, rng=np.random.default_rng(0))
+    online, known = started(c, slice(0, 60), model=model)
+    rows = Correspondences.of_points(c.x_mm, c.u_left, c.u_right, frame=np.arange(120) // 3)
+    for frame in range(20, 40):
         assert online.add(rows.of_frames(frame)).all()
     batch = calibrate(c.x_mm, [c.u_left, c.u_right], **known)
-    np.testing.assert_allclose(online.solve().linear, batch.rig.linear, rtol=1e-8, atol=1e-6)
+    off = np.hstack(online.solve().project(c.x_mm)) - np.hstack(batch.rig.project(c.x_mm))
+    sd = np.sqrt(np.einsum("nii->ni", batch.projection_covariance(c.x_mm)))
+    assert np.abs(off / sd).max() < 0.1
+    assert type(online.solve().left) is type(batch.rig.left)
+    first = calibrate(c.x_mm[:60], [c.u_left[:60], c.u_right[:60]], **known)
+    parts = (np.einsum("nii->n", k.projection_covariance(c.x_mm)) for k in (batch, first))
+    np.testing.assert_allclose(online.remains(c.x_mm), np.divide(*parts), rtol=0.15)
+
+
+def test_online_starts_where_the_calibration_ended_and_weighs_rows_by_their_covariance():
+    c = data(300, 3)
+    rng, n = np.random.default_rng(4), len(c.x_mm)
+    poor = rng.random(n) < 0.3  # a third of the rows is poor, and says so
+    noise = np.where(poor, 12.0, 0.3)[:, None]
+    u = [camera.project(c.true_x_mm) + noise * rng.normal(size=(n, 2)) for camera in (c.true_rig.left, c.true_rig.right)]
+    covariance = np.broadcast_to((noise**2)[:, None, :, None] * np.eye(2), (n, 2, 2, 2))
+    rows = Correspondences.of_points(c.x_mm, *u, covariance_px2=covariance, frame=np.arange(n) // 3)
+    calibration = calibrate(rows.of_frames(range(50)), model="affine")
+    online = OnlineCalibration(calibration)
+    np.testing.assert_array_equal(online.solve().linear, calibration.rig.linear)
+
+    def error(rig):
+        return np.sqrt(np.mean((np.hstack(rig.project(c.true_x_mm)) - np.hstack(c.true_rig.project(c.true_x_mm))) ** 2))
+
+    errors = [error(calibration.rig)]
+    for frame in range(50, 100):
+        online.add(rows.of_frames(frame))
+        errors.append(error(online.solve()))
+    assert max(errors) < 1.5 * errors[0]
+    assert errors[-1] < 1.2 * error(calibrate(rows, model="affine").rig) + 0.01
 
 
 def test_online_drops_gaps_and_gross_errors():
@@ -156,7 +186,7 @@ def test_online_drops_gaps_and_gross_errors():
         u_left[0] = np.nan
         u_right[1] += 300 * (i % 10 == 0)
         used = online.add(Correspondences.of_points(c.x_mm[rows], u_left, u_right))
-        assert used.tolist() == [False, i % 10 > 0, True]
+        assert used.tolist() == [[False, True], [True, i % 10 > 0], [True, True]]
     assert np.abs(online.solve().left.project(c.true_x_mm) - c.true_rig.left.project(c.true_x_mm)).max() < 2.0
 
 
