@@ -28,7 +28,7 @@ from lib.training.stages import finetune
 __all__ = ["STEPS", "Adaptation", "adapt", "simulated_like"]
 
 #: Most rounds of training, and most steps of a stage in one; the time ends most trainings.
-ROUNDS, STEPS = 3, 400
+ROUNDS, STEPS = 3, 1200
 #: Most stereo frames that are looked at, spread over the recording.
 _MOST_FRAMES = 96
 _SIMULATED_SHARDS = 3
@@ -170,12 +170,16 @@ class _Work:
         parts = stretches(np.setdiff1d(still, self.marked), recording.frames.time_s)
         learn = parts["learn"] = np.union1d(parts["learn"], self.marked)
         self.report["frames"] = {name: len(part) for name, part in parts.items()}
-        try:
-            teacher = teach(recording, seen.of(learn))
-        except RefusalError:
-            if len(self.marked) < 5:
-                raise
-            teacher = teach(recording, seen.of(self.marked), from_labels=True)
+        teachers, refused = [], None
+        for part, by_hand in ((learn, False), (self.marked, True)):
+            if not by_hand or len(part) >= 5:
+                try:
+                    teachers.append(teach(recording, seen.of(part), from_labels=by_hand))
+                except RefusalError as error:
+                    refused = refused or error
+        if not teachers:
+            raise refused
+        teacher = min(teachers, key=lambda one: one.doubt_px(learn))
         self.report["start_share"] = teacher.right
         closeups = self.learns and detector.closeup_network is not None
         u = teacher.labels(learn)[0]
@@ -199,13 +203,17 @@ class _Work:
             if k > 1 and self.left_s < 6 * self.minutes:
                 break
             tuned = self.round(k, best, teacher, parts, None if k == 1 else best_seen, simulated, tune)
-            seen = self.look(f"round {k}", tuned, self.frames)
+            seen = told = self.look(f"round {k}", tuned, self.frames)
+            if self.labels is not None:
+                told = seen.labelled(self.labels[seen.frame])
             opinion = self.look(f"opinion {k}", detector, learn, u) if closeups else None
             try:
-                new = teach(recording, seen.of(learn), before=teacher, opinion=opinion)
+                new = teach(recording, told.of(learn), before=teacher, opinion=opinion)
             except RefusalError as refused:
-                rounds.append({"round": k, "refused": str(refused)})
-                break
+                if len(self.marked) < 5:
+                    rounds.append({"round": k, "refused": str(refused)})
+                    break
+                new = teacher  # what the labels say still holds
             now = agreement(new, seen.of(parts["stop"])).summary()
             rounds.append({"round": k, "right": new.right} | now)
             if now["mean_share"] > (1 - _LEAST_GAIN) * stop["mean_share"]:

@@ -236,14 +236,9 @@ class OffsetNetwork(Network):
         self.config = config = config or OffsetConfig()
         f = config.features
         self.body = nn.Sequential(
-            _conv(3, f, 5, stride=2),
-            _residual(f, f),
-            _residual(f, 2 * f, halve=True),
-            _residual(2 * f, 2 * f),
-            _residual(2 * f, 3 * f, halve=True),
-            _residual(3 * f, 3 * f),
-            _residual(3 * f, 4 * f, halve=True),
-        )
+            _conv(3, f, 5, stride=2), _residual(f, f), _residual(f, 2 * f, halve=True), _residual(2 * f, 2 * f),
+            _residual(2 * f, 3 * f, halve=True), _residual(3 * f, 3 * f), _residual(3 * f, 4 * f, halve=True),
+        )  # fmt: skip
         # Fully connected, because a mean over the closeup would lose where something is seen.
         self.head = nn.Sequential(
             nn.Flatten(), nn.Linear(4 * f * (config.size_px // 16) ** 2, 128), nn.ReLU(inplace=True), nn.Linear(128, 4)

@@ -35,8 +35,7 @@ class Settings:
 
     Attributes:
         calibration_frames: Frames with landmarks before the first calibration, and frames after which it is not repeated.
-            In between it is repeated whenever a quarter more frames are at hand; after that each frame updates its
-            moments.
+            In between it is repeated whenever a quarter more frames are at hand; after that each frame improves it.
         registration_frames: Frames of the tool after the cameras moved before the first registration (the paper's 3),
             and frames after which it is not refined.
         give_up_frames: Frames that no motion explains after which the rig is calibrated afresh.

@@ -57,7 +57,7 @@ class RigTracker:
         """Without a rig: at first, and where the optics changed, not only the pose."""
         self.rig, self.calibration, self.state, self.cause = None, None, "calibrating", cause
         self._frames, self._tried, self._fitted = list(frames), 0, 0  # that the rig is calibrated with; how many of them
-        self._moments: OnlineCalibration | None = None  # take the frames after the last calibration
+        self._online: OnlineCalibration | None = None  # take the frames after the last calibration
         self._monitor: DriftMonitor | None = None
         self._recent: deque[Seen] = deque(maxlen=_PAST)  # not yet taken in: the cameras may have moved meanwhile
         self._doubtful: deque[int] = deque(maxlen=_PAST)  # numbers of frames that stood out alone
@@ -101,8 +101,8 @@ class RigTracker:
     def _takes_in(self, accepted: list[Seen]) -> bool:
         """As soon as possible, then whenever a quarter more frames are at hand; never again once the cameras moved."""
         first, last = self.settings.calibration_frames
-        if self._given or self._motion is not None or self._moments is not None:
-            return self._moments is not None and bool(accepted) and self._motion is None
+        if self._given or self._motion is not None or self._online is not None:
+            return self._online is not None and bool(accepted) and self._motion is None
         self._frames += accepted
         n = len(self._frames)
         if self.rig is None:
@@ -111,14 +111,14 @@ class RigTracker:
         return n > last or n >= 1.25 * self._fitted
 
     def _improve(self, accepted: list[Seen]) -> None:
-        """Calibrate with all frames so far; after the last calibration let each frame update its moments."""
+        """Calibrate with all frames so far; after the last calibration let each frame improve it."""
         if self.rig is not None and len(self._frames) > self.settings.calibration_frames[1]:
-            if self._moments is None:
-                self._moments = OnlineCalibration(self.calibration)
+            if self._online is None:
+                self._online = OnlineCalibration(self.calibration)
                 accepted = self._frames[self._fitted :]
-            used = [self._moments.add(self.corrected(frame.data)).any() for frame in accepted]
+            used = [self._online.add(self.corrected(frame.data)).any() for frame in accepted]
             if any(used):
-                self.rig = self._moments.solve()
+                self.rig = self._online.solve()
                 self._monitor.follow(self.rig)
             return
         self._tried = len(self._frames)
@@ -285,7 +285,7 @@ class RigTracker:
         return own + sum(stale) / max(len(moves), 1)
 
     def _remains(self, x_mm: np.ndarray) -> np.ndarray:
-        return np.ones((1, 1, 1)) if self._moments is None else self._moments.remains(x_mm)[:, None, None]
+        return np.ones((1, 1, 1)) if self._online is None else self._online.remains(x_mm)[:, None, None]
 
     @property
     def _motions(self) -> tuple:

@@ -12,19 +12,6 @@ from lib.surface.joint import refine_rig
 from lib.surface.reconstruct import Reconstruction, epipolar_inliers, reconstruct
 
 __all__ = [
-    "BSplineSurface",
-    "Mesh",
-    "Reconstruction",
-    "SplineGrid",
-    "ToolDistance",
-    "depth_map",
-    "epipolar_inliers",
-    "fit_surface",
-    "open3d",
-    "reconstruct",
-    "refine_rig",
-    "save_depth_map",
-    "save_mesh",
-    "save_points",
-    "surface_mesh",
-]
+    "BSplineSurface", "Mesh", "Reconstruction", "SplineGrid", "ToolDistance", "depth_map", "epipolar_inliers", "fit_surface",
+    "open3d", "reconstruct", "refine_rig", "save_depth_map", "save_mesh", "save_points", "surface_mesh",
+]  # fmt: skip

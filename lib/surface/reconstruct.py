@@ -157,16 +157,9 @@ def reconstruct(
         if depth_only is None:
             depth_only = fast and rig.is_affine
         surface = fit_surface(
-            matches.u_left,
-            points.x_mm,
-            domain=domain,
-            control=control,
-            smoothness=smoothness,
-            reject_mm=reject_mm,
-            camera=rig.left if depth_only else None,
-            tolerance=1e-4 if fast else 1e-8,
-            quick=fast,
-        )
+            matches.u_left, points.x_mm, domain=domain, control=control, smoothness=smoothness, reject_mm=reject_mm,
+            camera=rig.left if depth_only else None, tolerance=1e-4 if fast else 1e-8, quick=fast,
+        )  # fmt: skip
     return Reconstruction(surface, points, matches, len(found), masks["mask_left"], rig, dict(seconds))
 
 

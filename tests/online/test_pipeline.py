@@ -220,7 +220,7 @@ def test_landmark_offsets_are_learnt_and_raise_no_alarm():
     assert all(r.state == "tracking" for r in results[10:])
 
 
-def test_after_the_last_calibration_each_frame_updates_the_moments():
+def test_after_the_last_calibration_each_frame_improves_it():
     world = World(1)
     calls = []
 
