@@ -66,7 +66,7 @@ def main(argv: list[str]) -> int:
     )
     add = parser.add_argument
     add("recording", type=Path, help="a recording; or a folder of images, which --labels names")
-    add("--labels", type=Path, metavar="FILE", help="COCO keypoints, as annotations.json: 5 labelled pairs are a start")
+    add("--labels", type=Path, metavar="FILE", help="COCO keypoints, as annotations.json: 10 labelled pairs are a good start")
     add("--minutes", type=float, default=20.0, help="of training (default: 20)")
     add("--out", type=Path, metavar="FOLDER", help="of weights, report.json and report.html (default: runs/adapt-NAME)")
     add("--weights", metavar="FILE", help="the detector to start from (default: the one that ships)")

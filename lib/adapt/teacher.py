@@ -42,6 +42,7 @@ _OWN_BIAS = 0.012 * np.array([[2.0, 1.0, 1.5], [1.0, 1.0, 1.5], [1.0, 1.0, 1.5]]
 _SURE_MOVE = 0.1
 _CLICK_PX = 1.5  # of labels set by hand
 _CONFIDENCES = (MIN_CONFIDENCE, 0.5, 0.8)
+_NEAR = 0.1  # share of the tool's length within which a detection is taken for right where the noise does not tell
 
 
 class RefusalError(ValueError):
@@ -293,28 +294,36 @@ def _clock(recording: Recording, seen: Seen, calibration: Calibration | None = N
     return recording, 0.005
 
 
-def _fitted(recording: Recording, seen: Seen, least: float) -> Calibration:
+def _fitted(recording: Recording, seen: Seen, least: float, ransac_px: float | None = None) -> Calibration:
     """Cameras of square pixels, which leave the landmarks' offsets the least room."""
-    return calibrate(seen.rows(recording, least), model="square", image_size_px=recording.image_size_px)
+    size = recording.image_size_px
+    return calibrate(seen.rows(recording, least), model="square", image_size_px=size, ransac_px=ransac_px)
 
 
 def _calibrated(recording: Recording, seen: Seen, from_labels: bool) -> tuple[Calibration, float]:
     """Cameras that the detections agree on, the confident ones if all do not, and the share of landmarks that agree."""
     told = 6 * int(np.isfinite(recording.landmarks_mm()[seen.frame]).all(axis=(1, 2)).sum())
-    reason = "none was found"
-    for least in (0.0,) if from_labels else _CONFIDENCES:
+    length, reason, poor = tool_length_px(seen.u.reshape(-1, 3, 2)), "none was found", None
+    near_px = _NEAR * float(np.median(length[np.isfinite(length)])) if np.isfinite(length).any() else 0.0
+    # Offsets of an unknown tool widen the errors of the right ones, until the wrong ones do not stand apart.
+    ways = [(0.0, None)] if from_labels else [*((least, None) for least in _CONFIDENCES), (MIN_CONFIDENCE, near_px)]
+    for least, ransac_px in ways:
         try:
-            found = _fitted(recording, seen, least)
+            found = _fitted(recording, seen, least, ransac_px)
         except ValueError as error:
-            reason = str(error).partition(". ")[0].partition("; ")[0]  # their cures lead here
+            reason = str(error).partition(". ")[0].partition("; ")[0] if ransac_px is None else reason  # the cures lead here
             continue
         right = found.view_inliers.sum() / max(told, 1)
-        if right >= LEAST_RIGHT or from_labels:
+        if from_labels or (right >= LEAST_RIGHT and found.reprojection_rms_px < near_px):
             return found, float(right)
+        if right >= LEAST_RIGHT:
+            poor = poor or (found, float(right))
         reason = f"only {100 * right:.0f} % of the landmarks agree on cameras"
+    if poor is not None:
+        return poor
     raise RefusalError(
-        f"detector: too few landmarks are right to start from ({reason}). Label 5 pairs of frames, far apart in place and "
-        "depth (`python3 -m lib annotate RECORDING`), and give annotations.json with --labels."
+        f"detector: too few landmarks are right to start from ({reason}). Label 10 pairs of frames (5 at least), far apart "
+        "in place and depth (`python3 -m lib annotate RECORDING`), and give annotations.json with --labels."
     )
 
 

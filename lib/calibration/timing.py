@@ -154,7 +154,7 @@ def estimate_time_offset(
     low, high = start_s - search_s, start_s + search_s
     trial = np.linspace(low, high, _GRID)
     misfits = shift_misfits(np.stack([at(offset) for offset in trial]), y)
-    clear = (np.median(misfits, axis=0) - misfits.min(axis=0) > _CLEAR).all() and np.ptp(misfits.argmin(axis=0)) <= 2
+    clear = (np.median(misfits, axis=0) > misfits.min(axis=0) + _CLEAR).all() and np.ptp(misfits.argmin(axis=0)) <= 2
     misfit = misfits.sum(axis=1)
     offset = float(trial[misfit.argmin()])
     for _ in range(2):

@@ -121,12 +121,8 @@ def score(u: ArrayLike, u_true: ArrayLike, covariance: ArrayLike | None = None, 
     return Scores(
         *pck(u, u_true, [0.01, 0.05, 0.10], length_px=length_px).tolist(),
         auc=float(np.trapezoid(curve, PCK_THRESHOLDS) / np.ptp(PCK_THRESHOLDS)),
-        median_px=float(median),
-        p95_px=float(p95),
-        bias_px=(float(x), float(y)),
+        median_px=float(median), p95_px=float(p95), bias_px=(float(x), float(y)),
         nees=float(squared.mean()) if squared.size else np.nan,
         coverage_95=100.0 * float((squared <= chdtri(2, 0.05)).mean()) if squared.size else np.nan,
-        labels=int((~np.isnan(error)).sum()),
-        missed=int(np.isinf(error).sum()),
-        gross=int((found >= GROSS_PX).sum()),
-    )
+        labels=int((~np.isnan(error)).sum()), missed=int(np.isinf(error).sum()), gross=int((found >= GROSS_PX).sum()),
+    )  # fmt: skip

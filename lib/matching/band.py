@@ -224,11 +224,8 @@ def match_band(images: Images, masks: Masks, rig: StereoRig, where: Where, *, bu
         rectification.u_left(canvas),
         rectification.u_right(canvas + displacement * CELL_PX + (0.0, search.off_line_px)),
         1 / (1 + (sigma[:, 0] / SIGMA_HALF) ** 4),
-        covariance,
-        peak_ratio=ratio,
-        reciprocal=found.reciprocal,
-        method="band",
-    )
+        covariance, peak_ratio=ratio, reciprocal=found.reciprocal, method="band",
+    )  # fmt: skip
 
 
 def _cut(grid: np.ndarray, x: np.ndarray, y: np.ndarray, margin: int) -> np.ndarray:

@@ -114,10 +114,8 @@ def match_with(
         rectification.u_right(canvas - np.column_stack([d, np.zeros(len(d))])),
         np.clip(confidence[y, x], 0.0, 1.0).astype(np.float64),
         np.tile(np.diag([SIGMA_LEFT_PX**2] * 2 + [sigma**2] * 2), (len(d), 1, 1)),
-        peak_ratio=ratio,
-        reciprocal=passed[y, x],
-        method=name,
-    )
+        peak_ratio=ratio, reciprocal=passed[y, x], method=name,
+    )  # fmt: skip
     return matches.keep(textured)
 
 
