@@ -313,7 +313,7 @@ def unexplained(case: Case, fit: Robust) -> list[Hypothesis]:
     epipolar, half = float(np.sqrt(2.0) * np.median(distances)), problem.used.sum() / 2.0
     if epipolar < 0.25 * missed and missed > _ROBOT_MM * zoom:
         text = f"The images agree with each other within {epipolar:.1f} px and miss the robot by {missed:.0f} px (medians)."
-        cure = "Check times, units and columns of kinematics.csv; or the detector errs alike in both images: see its overlays."
+        cure = "Check times, units, columns of kinematics.csv; or the detector errs alike in both images: see its overlays."
         explained, gain = 1.0 - (epipolar / missed) ** 2, half * float(np.log(missed / epipolar)) / fit.design
         return [Hypothesis("robot_noise", text, cure, 1e3 * missed / zoom, 0.0, "um", explained, gain)]
     share = float((distance[problem.used] > 0.05 * length).mean())
