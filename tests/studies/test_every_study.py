@@ -1,0 +1,44 @@
+"""Every study runs to its end, at its smallest: those that no other test of this folder runs."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+
+from lib import paths
+
+SMALLEST = {
+    "ablation": {"steps": 5, "shards": 2},
+    "calibrated_surfaces": {"n_frames": 30, "setting": "fast"},
+    "dataset": {"pairs": 1, "shrink": 4},
+    "engines_and_speed": {"repeats": 1},
+    "few_labels": {"steps": 100, "frames": 10},
+    "l1_solver": {"n_points": 2000, "control": 20},
+    "label_noise": {"steps": 100},
+    "matching": {"scene": "eye", "repeats": 1},
+    "noise_and_coverage": {"runs": 4},
+    "noticed_motion": {"recordings": 1, "before": 60, "after": 10, "scenes": 1},
+    "real_frames": {"train_on": "simulated"},
+    "real_robot": {},
+    "realism": {"windows": 8},
+    "reconstruction_speed": {},
+    "resolution": {"steps": 100},
+    "rungs": {"n": 2},
+    "shipped_detector": {"every": 12},
+    "surfaces": {"scene": "eye 200"},
+}
+
+
+def test_every_study_is_run_by_a_test():
+    run = {name for file in (paths.ROOT / "tests").glob("**/*.py") for name in re.findall(r'run_study\("(\w+)"', file.read_text())}
+    assert run | set(SMALLEST) == {notebook.stem for notebook in (paths.NOTEBOOKS / "studies").glob("*.ipynb")}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SMALLEST)
+def test_a_study_runs_to_its_end(run_study, name, capsys):
+    metrics, _ = run_study(name, **SMALLEST[name])
+    assert metrics or re.search(r"at hand|MICROSTEREO_DATA", capsys.readouterr().out)
+    assert not metrics or np.isfinite(list(metrics.values())).any()
