@@ -32,7 +32,8 @@ SMALLEST = {
 
 
 def test_every_study_is_run_by_a_test():
-    run = {name for file in (paths.ROOT / "tests").glob("**/*.py") for name in re.findall(r'run_study\("(\w+)"', file.read_text())}
+    files = (paths.ROOT / "tests").glob("**/*.py")
+    run = {name for file in files for name in re.findall(r'run_study\("(\w+)"', file.read_text(encoding="utf-8"))}
     assert run | set(SMALLEST) == {notebook.stem for notebook in (paths.NOTEBOOKS / "studies").glob("*.ipynb")}
 
 
