@@ -132,12 +132,10 @@ def match_volume(volume: torch.Tensor, low: int, *, reciprocal: bool = True) -> 
     vertex_y, _ = _parabola(volume, place, 2)
     cell = torch.stack([place[3] + low, place[2] - v], dim=1)
     return VolumeMatches(
-        patch=torch.stack([place[1], place[0]], dim=1).numpy(),
-        cell=cell.numpy(),
+        patch=torch.stack([place[1], place[0]], dim=1).numpy(), cell=cell.numpy(),
         displacement=(cell + torch.stack([vertex_x, vertex_y], dim=1).double()).numpy(),
-        peaked=peaked.numpy(),
-        reciprocal=passed[kept].numpy(),
-    )
+        peaked=peaked.numpy(), reciprocal=passed[kept].numpy(),
+    )  # fmt: skip
 
 
 def _parabola(volume: torch.Tensor, place: tuple[torch.Tensor, ...], axis: int) -> tuple[torch.Tensor, torch.Tensor]:
