@@ -17,7 +17,7 @@ class OnlineCalibration:
     """A calibration's minimum, moved by all rows that came since: an extended Kalman filter of the model's parameters.
 
     It has the calibration's camera model, and its information from the calibration's rows; each new row counts by its own
-    covariance.  So it starts where the calibration ended.
+    covariance, or the calibration's where it states none.  So it starts where the calibration ended.
 
     Args:
         calibration: Where it starts; its noise levels judge the new rows.
@@ -40,22 +40,28 @@ class OnlineCalibration:
 
     def add(self, data: Correspondences) -> np.ndarray:
         """Fold in the rows of a frame; returns the views (n, 2) bool that were used, those the rig so far does not refuse."""
-        known = self._calibration
+        known, variance_x = self._calibration, self._calibration.sigma_x_mm**2
         used = data.seen & np.isfinite(data.x_mm).all(axis=1, keepdims=True)
-        seen = np.repeat(used, 2, axis=1)
-        y, J_x, J = self._evaluate(np.where(used.any(axis=1, keepdims=True), data.x_mm, self._state.reference))
-        r = np.where(seen, np.hstack([data.u_left, data.u_right]) - y, 0.0)
-        noise = np.broadcast_to(known.noise_px2, (len(data), 4, 4))
-        if known.covariance_px2 is not None and np.isfinite(data.covariance_px2[used]).all():
+        pixels, noise = np.hstack([data.u_left, data.u_right]), np.broadcast_to(known.noise_px2, (len(data), 4, 4))
+        if known.covariance_px2 is not None:  # of rows that state none, the calibration's counts
             own = np.where(used[:, :, None, None], data.covariance_px2, np.eye(2))
-            noise = known.detector_scale**2 * pair_covariance(own, len(data))
-        S = noise + known.sigma_x_mm**2 * J_x @ J_x.mT
+            stated = np.isfinite(own).all(axis=(1, 2, 3))[:, None, None]
+            own = known.detector_scale**2 * pair_covariance(np.where(stated[..., None], own, np.eye(2)), len(data))
+            noise = np.where(stated, own, noise)
+        x = np.where(used.any(axis=1, keepdims=True), data.x_mm, self._state.reference)
+        y, J_x, J = self._evaluate(x)
+        r, S = np.where(np.repeat(used, 2, axis=1), pixels - y, 0.0), noise + variance_x * J_x @ J_x.mT
         expected = S + J @ self._covariance @ J.mT  # the rig is uncertain itself
         for side, view in enumerate((slice(0, 2), slice(2, 4))):
             chi2 = np.einsum("ni,nij,nj->n", r[:, view], np.linalg.inv(expected[:, view, view]), r[:, view])
             used[:, side] &= chi2 < gate(100, 2)
         if used.any():
-            WJ = precision(S, used) @ J
+            W = precision(S, used)
+            # The derivatives belong to the corrected points, as in `fit`: those of noisy ones would flatten the depth.
+            moved = variance_x * np.einsum("nij,nik,nk->nj", J_x, W, r)
+            y, J_x, J = self._evaluate(x + moved)
+            r = np.where(np.repeat(used, 2, axis=1), pixels - y + np.einsum("nij,nj->ni", J_x, moved), 0.0)
+            WJ = W @ J
             self._information = self._information + np.einsum("nip,niq->pq", J, WJ)
             self._covariance = inverse(self._information)
             step = self._covariance @ np.einsum("nip,ni->p", WJ, r)

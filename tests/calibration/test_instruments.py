@@ -154,6 +154,22 @@ def test_online_is_the_batch_minimum_within_a_small_part_of_its_doubt(model):
     np.testing.assert_allclose(online.remains(c.x_mm), np.divide(*parts), rtol=0.15)
 
 
+def test_an_inaccurate_robot_in_a_shallow_volume_does_not_flatten_the_depth():
+    c = data(1500, 5, sigma_x_mm=0.1, half_size_mm=(4, 3, 0.5))
+    online, known = started(c, slice(0, 150), sigma_x_mm=0.1)
+    for i in range(150, 1500, 3):
+        rows = slice(i, i + 3)
+        online.add(Correspondences.of_points(c.x_mm[rows], c.u_left[rows], c.u_right[rows]))
+    batch = calibrate(c.x_mm, [c.u_left, c.u_right], **known)
+
+    def disparity_px(rig):
+        return np.diff([camera.project(c.true_x_mm)[:, 0] for camera in (rig.left, rig.right)], axis=0)[0]
+
+    true = disparity_px(c.true_rig)
+    slopes = [np.polyfit(true, disparity_px(rig), 1)[0] for rig in (online.solve(), batch.rig)]
+    assert slopes[0] == pytest.approx(slopes[1], abs=0.003)
+
+
 def test_online_starts_where_the_calibration_ended_and_weighs_rows_by_their_covariance():
     c = data(300, 3)
     rng, n = np.random.default_rng(4), len(c.x_mm)
