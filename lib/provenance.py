@@ -66,14 +66,10 @@ class Provenance:
         CPU seconds count finished child processes too; `weights` is the digest of the detector that ships.
         """
         return {
-            "command": self.command,
-            "commit": self.commit,
-            "machine": machine(),
-            "weights": files.digest(paths.MODELS / "default.safetensors"),
-            "date": datetime.date.today().isoformat(),
-            "seconds": time.perf_counter() - self.wall_s,
-            "cpu_seconds": _cpu_s() - self.cpu_s,
-        }
+            "command": self.command, "commit": self.commit, "machine": machine(),
+            "weights": files.digest(paths.MODELS / "default.safetensors"), "date": datetime.date.today().isoformat(),
+            "seconds": time.perf_counter() - self.wall_s, "cpu_seconds": _cpu_s() - self.cpu_s,
+        }  # fmt: skip
 
 
 def plain(value: object) -> object:

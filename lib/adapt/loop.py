@@ -75,7 +75,7 @@ def adapt(
     Args:
         recording: With kinematics; the landmarks of a forceps.
         detector: None is the one that ships.
-        labels: COCO keypoints like annotations.json; five labelled pairs are a start where the detector finds too little.
+        labels: COCO keypoints like annotations.json; ten labelled pairs are a start where the detector finds too little.
         minutes: The training ends after so many; detection and judging add a little.
         seed: Of everything that is drawn.
         folder: Keeps what is done, from which the same call continues after a kill; None is runs/adapt-NAME.
@@ -113,7 +113,7 @@ class _Work:
             self.frames = np.union1d(self.frames, self.marked)
         self.learns = isinstance(detector, Detector)  # a stand-in has no networks
         tensors = {k: v for n in detector.networks.values() for k, v in n.state_dict().items()} if self.learns else {}
-        key = [str(recording.folder.resolve()), recording.kinematics.x_mm.tobytes(), self.frames.tobytes(), seed]
+        key = [str(recording.folder.resolve()), recording.kinematics.x_mm.tobytes(), self.frames.tobytes(), seed, STEPS]
         key += [checksum(tensors, {}), Path(labels).read_bytes() if labels is not None else b""]
         self.folder = Path(folder or paths.RUNS / f"adapt-{recording.name}") / "work"
         self.folder /= hashlib.sha256(repr(key).encode()).hexdigest()[:12]
@@ -135,6 +135,15 @@ class _Work:
     def finished(self) -> dict:
         """The report, with where and when it was made."""
         return plain(self.report | self.provenance.so_far())
+
+    def with_labels(self, seen: Seen) -> Seen:
+        """What was seen, with the labels set by hand in its place where there are some."""
+        return seen if self.labels is None else seen.labelled(self.labels[seen.frame])
+
+    def by_hand(self) -> Seen:
+        """The labels alone."""
+        shape = len(self.marked), 2, 3
+        return self.with_labels(Seen(self.marked, *(np.full((*shape, *n), np.nan) for n in ((2,), (2, 2))), np.zeros(shape)))
 
     def look(self, name: str, detector: Callable, frames: np.ndarray, near: np.ndarray | None = None) -> Seen:
         """`look`, or what an earlier call kept."""
@@ -163,22 +172,21 @@ class _Work:
     def adapted(self, tune: Callable[..., Detector]) -> Adaptation:
         recording, detector, rounds = self.recording, self.detector, self.report["rounds"]
         first = seen = self.look("before", detector, self.frames)
-        if self.labels is not None:
-            seen = seen.labelled(self.labels[seen.frame])
+        seen = self.with_labels(seen)
         still, note = longest_still(recording, seen)
         self.report["notes"] += [note] if note else []
         parts = stretches(np.setdiff1d(still, self.marked), recording.frames.time_s)
         learn = parts["learn"] = np.union1d(parts["learn"], self.marked)
         self.report["frames"] = {name: len(part) for name, part in parts.items()}
         teachers, refused = [], None
-        for part, by_hand in ((learn, False), (self.marked, True)):
-            if not by_hand or len(part) >= 5:
+        for part, by_hand in ((seen.of(learn), False), (self.by_hand(), True)):
+            if not by_hand or len(self.marked) >= 5:
                 try:
-                    teachers.append(teach(recording, seen.of(part), from_labels=by_hand))
-                except RefusalError as error:
-                    refused = refused or error
+                    teachers.append(teach(recording, part, from_labels=by_hand))
+                except ValueError as error:
+                    refused = error
         if not teachers:
-            raise refused
+            raise RefusalError(str(refused)) from refused
         teacher = min(teachers, key=lambda one: one.doubt_px(learn))
         self.report["start_share"] = teacher.right
         closeups = self.learns and detector.closeup_network is not None
@@ -186,7 +194,7 @@ class _Work:
         for k in range(_GUIDED if closeups else 0):  # closeups that nobody taught, near where the robot says
             guided = self.look(f"guided {k}", detector, learn, u)
             try:
-                teacher = teach(recording, guided, opinion=guided, before=teacher)
+                teacher = teach(recording, self.with_labels(guided), opinion=guided, before=teacher)
             except RefusalError:
                 if len(self.marked) < 5:
                     raise
@@ -203,19 +211,18 @@ class _Work:
             if k > 1 and self.left_s < 6 * self.minutes:
                 break
             tuned = self.round(k, best, teacher, parts, None if k == 1 else best_seen, simulated, tune)
-            seen = told = self.look(f"round {k}", tuned, self.frames)
-            if self.labels is not None:
-                told = seen.labelled(self.labels[seen.frame])
+            seen, said = self.look(f"round {k}", tuned, self.frames), {}
             opinion = self.look(f"opinion {k}", detector, learn, u) if closeups else None
             try:
-                new = teach(recording, told.of(learn), before=teacher, opinion=opinion)
+                new = teach(recording, self.with_labels(seen).of(learn), before=teacher, opinion=opinion)
             except RefusalError as refused:
+                said = {"refused": str(refused)}
                 if len(self.marked) < 5:
-                    rounds.append({"round": k, "refused": str(refused)})
+                    rounds.append({"round": k} | said)
                     break
                 new = teacher  # what the labels say still holds
             now = agreement(new, seen.of(parts["stop"])).summary()
-            rounds.append({"round": k, "right": new.right} | now)
+            rounds.append({"round": k, "right": new.right} | now | said)
             if now["mean_share"] > (1 - _LEAST_GAIN) * stop["mean_share"]:
                 break
             best, best_seen, teacher, stop = tuned, seen, new, now

@@ -42,7 +42,7 @@ _OWN_BIAS = 0.012 * np.array([[2.0, 1.0, 1.5], [1.0, 1.0, 1.5], [1.0, 1.0, 1.5]]
 _SURE_MOVE = 0.1
 _CLICK_PX = 1.5  # of labels set by hand
 _CONFIDENCES = (MIN_CONFIDENCE, 0.5, 0.8)
-_NEAR = 0.1  # share of the tool's length within which a detection is taken for right where the noise does not tell
+_NEAR = 0.1  # share of a short tool's length: as near a detection is taken for right where the noise does not tell
 
 
 class RefusalError(ValueError):
@@ -68,7 +68,7 @@ class Seen(NamedTuple):
         return Seen(*(part[np.isin(self.frame, frames)] for part in self))
 
     def labelled(self, u: np.ndarray) -> Self:
-        """With labels set by hand, u (m, 2, 3, 2), in place of what was found there; in other frames nothing else counts."""
+        """With labels set by hand, u (m, 2, 3, 2), in place of what was found there; what has none stays as it was found."""
         known = np.isfinite(u).all(axis=-1)
         covariance = np.where(known[..., None, None], _CLICK_PX**2 * np.eye(2), self.covariance)
         return Seen(self.frame, np.where(known[..., None], u, self.u), covariance, np.where(known, 1.0, self.confidence))
@@ -304,14 +304,17 @@ def _calibrated(recording: Recording, seen: Seen, from_labels: bool) -> tuple[Ca
     """Cameras that the detections agree on, the confident ones if all do not, and the share of landmarks that agree."""
     told = 6 * int(np.isfinite(recording.landmarks_mm()[seen.frame]).all(axis=(1, 2)).sum())
     length, reason, poor = tool_length_px(seen.u.reshape(-1, 3, 2)), "none was found", None
-    near_px = _NEAR * float(np.median(length[np.isfinite(length)])) if np.isfinite(length).any() else 0.0
+    near_px = _NEAR * float(np.quantile(length[np.isfinite(length)], 0.25)) if np.isfinite(length).any() else 0.0
     # Offsets of an unknown tool widen the errors of the right ones, until the wrong ones do not stand apart.
     ways = [(0.0, None)] if from_labels else [*((least, None) for least in _CONFIDENCES), (MIN_CONFIDENCE, near_px)]
     for least, ransac_px in ways:
+        if ransac_px is not None and "compete" in reason:
+            break  # two cameras, and nothing tells which is the robot's
         try:
             found = _fitted(recording, seen, least, ransac_px)
         except ValueError as error:
-            reason = str(error).partition(". ")[0].partition("; ")[0] if ransac_px is None else reason  # the cures lead here
+            if ransac_px is None and "compete" not in reason:
+                reason = str(error).partition(". ")[0].partition("; ")[0]  # their cures lead here
             continue
         right = found.view_inliers.sum() / max(told, 1)
         if from_labels or (right >= LEAST_RIGHT and found.reprojection_rms_px < near_px):

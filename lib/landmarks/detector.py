@@ -205,12 +205,10 @@ class Detector:
         networks = {f"{name}_network": load_network(path, config, tensors, f"{name}.") for name, config in configs}
         try:
             detector = cls(
-                **networks,
-                **{name: metadata[name] for name in _SETTINGS},
+                **networks, **{name: metadata[name] for name in _SETTINGS},
                 error_models={name: ErrorModel(*fit) for name, fit in metadata["calibration"].items()},
-                metadata=metadata["provenance"],
-                engine=engine or default_engine(),
-            )
+                metadata=metadata["provenance"], engine=engine or default_engine(),
+            )  # fmt: skip
         except (TypeError, ValueError) as error:
             raise ValueError(f"{path}: {error}") from error
         detector._check_complete(path)

@@ -100,13 +100,9 @@ def identify_motion(
     left, right = (_register_one(rig, observed, side) for side in (0, 1))
     n_left, n_right = (_parameters(camera) for camera in (rig.left, rig.right))
     hypotheses = {
-        "none": (None, None, 0),
-        "shifted": (shifted, shifted, 3),
-        "together": (together, together, 6),
-        "left": (left, None, n_left),
-        "right": (None, right, n_right),
-        "apart": (left, right, n_left + n_right),
-    }
+        "none": (None, None, 0), "shifted": (shifted, shifted, 3), "together": (together, together, 6),
+        "left": (left, None, n_left), "right": (None, right, n_right), "apart": (left, right, n_left + n_right),
+    }  # fmt: skip
     stay, rigs, bic = RigidTransform.identity(), {}, {}
     for name, (*motions, parameters) in hypotheses.items():
         rigs[name] = rig.moved(*(stay if motion is None else motion.transform for motion in motions))

@@ -159,23 +159,16 @@ def assemble(
     by_visibility = {k: {"labels": v.labels, "median_px": v.median_px} for k, v in held_out.by_visibility().items()}
     provenance = {
         "trained_on": "simulated frames only (lib.simulator.population); no eye or tool of a shipped recording",
-        "commit": commit_id(),
-        "machine": machine(),
+        "commit": commit_id(), "machine": machine(), "notes": list(notes),
         "stages": {name: {key: training.provenance.get(key) for key in keys} for name, training in stages.items()},
-        "validation_frames": len(frames),
-        "bare_frames": len(bare),
-        "near_frames": len(near_by),
-        "recorded_frames": len(typical),
-        "recordings": len(recordings),
-        "notes": list(notes),
-        "metrics": {
-            **asdict(held_out.scores),
-            "confidence_calibration_error": held_out.confidence_error,
-            "detection": held_out.detection(),
+        "validation_frames": len(frames), "bare_frames": len(bare), "near_frames": len(near_by),
+        "recorded_frames": len(typical), "recordings": len(recordings),
+        "metrics": asdict(held_out.scores) | {
+            "confidence_calibration_error": held_out.confidence_error, "detection": held_out.detection(),
             "by_visibility": by_visibility,
             "by_landmark_median_px": {k: v.median_px for k, v in held_out.by_landmark().items()},
         },
-    }
+    }  # fmt: skip
     detector = replace(detector, metadata=json.loads(json.dumps(provenance, default=float)))
     out.parent.mkdir(parents=True, exist_ok=True)
     detector.save(out)

@@ -224,6 +224,29 @@ def test_labels_teach_a_tool_that_no_closeup_knows(world, recording, tmp_path, m
     assert not adapt(recording, Lost(world.u, wrong=0.97), folder=tmp_path / "none", **how).improved
 
 
+def test_labels_of_one_eye_do_not_stop_a_detector_that_teaches_by_itself(world, recording, tmp_path):
+    u = np.full(world.u.shape, np.nan)
+    u[[1, 7, 13, 19, 24], 0] = world.u[[1, 7, 13, 19, 24], 0]
+    write_coco(tmp_path / "labels.json", Annotations(u[:, 0], u[:, 1]), SIZE, ".png")
+    detector, tune = StandIn(world.u, noise_px=2.0, wrong=0.4), pupil(world)
+    assert adapt(recording, detector, labels=tmp_path / "labels.json", folder=tmp_path, progress=False, tune=tune).improved
+    lost = adapt(recording, StandIn(world.u, wrong=0.97), labels=tmp_path / "labels.json", folder=tmp_path / "lost",
+                 progress=False, tune=tune)  # fmt: skip
+    assert not lost.improved and lost.report["reason"]
+
+
+@pytest.mark.parametrize("labelled", [range(1, 26, 3), [1, 7, 13, 19, 24]])
+def test_of_two_teachers_the_surer_teaches(world, recording, tmp_path, labelled):
+    """Nine frames of exact labels against a detector that errs by 3 px; five of them tell too little."""
+    u = np.full(world.u.shape, np.nan)
+    u[list(labelled)] = world.u[list(labelled)]
+    write_coco(tmp_path / "labels.json", Annotations(u[:, 0], u[:, 1]), SIZE, ".png")
+    tune = pupil(world)
+    detector = StandIn(world.u, noise_px=3.0, wrong=0.5)
+    found = adapt(recording, detector, labels=tmp_path / "labels.json", folder=tmp_path, progress=False, tune=tune)
+    assert found.improved and np.nanmedian(np.linalg.norm(tune.calls[0]["off"], axis=-1)) < 2.0
+
+
 def test_labels_outlast_a_round_that_finds_too_little(world, recording, tmp_path, monkeypatch):
     monkeypatch.setattr(loop, "ROUNDS", 3)
     u = np.full(world.u.shape, np.nan)

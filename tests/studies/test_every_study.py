@@ -29,6 +29,8 @@ SMALLEST = {
     "shipped_detector": {"every": 12},
     "surfaces": {"scene": "eye 200"},
 }
+NEED_DATA = {"matching", "real_frames", "real_robot", "realism", "rungs"}
+MAY_LACK = {"matching", "noticed_motion", "rungs"}  # numbers that a picture or a motion does not have
 
 
 def test_every_study_is_run_by_a_test():
@@ -41,5 +43,5 @@ def test_every_study_is_run_by_a_test():
 @pytest.mark.parametrize("name", SMALLEST)
 def test_a_study_runs_to_its_end(run_study, name, capsys):
     metrics, _ = run_study(name, **SMALLEST[name])
-    assert metrics or re.search(r"at hand|MICROSTEREO_DATA", capsys.readouterr().out)
-    assert not metrics or np.isfinite(list(metrics.values())).any()
+    assert metrics or (name in NEED_DATA and re.search(r"at hand|MICROSTEREO_DATA", capsys.readouterr().out))
+    assert np.isfinite(list(metrics.values())).all() or name in MAY_LACK
