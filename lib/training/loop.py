@@ -127,10 +127,10 @@ class Run:
             self.optimiser = torch.optim.AdamW(parameters, config.learning_rate, weight_decay=1e-4)
         self.step, self.seconds, self.log, self.loss_sum, self.since = 0, 0.0, [], 0.0, 0  # both since the last validation
 
-    def advance(self, batch: Batch, spent: float = 0.0) -> None:
-        """One step; `spent` is the part of the time that has passed, where the rate shall fall with it."""
+    def advance(self, batch: Batch) -> None:
+        """One step."""
         self.network.train()
-        self.optimiser.param_groups[0]["lr"] = self.config.rate(max(self.step, int(min(spent, 1.0) * self.config.steps)))
+        self.optimiser.param_groups[0]["lr"] = self.config.rate(self.step)
         batch = Batch(*(part.to(self.device) for part in (batch.images, batch.u, batch.visibility)))
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.config.precision == "bf16"):
             outputs = self.network(batch.images.contiguous(memory_format=torch.channels_last))
@@ -188,8 +188,7 @@ class Run:
 
 def train(
     config: TrainingConfig, source: Source, validation: Samples, folder: str | Path | None = None, *,
-    initial: Training | None = None, max_seconds: float | None = None, anneal: bool = False,
-    progress: bool | Callable[[float], None] = True,
+    initial: Training | None = None, max_seconds: float | None = None, progress: bool | Callable[[float], None] = True,
 ) -> Training:  # fmt: skip
     """Train a network; an interrupted training in `folder` is resumed.
 
@@ -198,7 +197,6 @@ def train(
         folder: Keeps ``last.safetensors`` (weights, average, optimiser, step, log); None keeps nothing.
         initial: Start from the weights of this training, for fine-tuning; its provenance is kept under ``before``.
         max_seconds: Stop (resumably) after this long.
-        anneal: By then the learning rate shall have fallen as it does by the last step: for trainings that time ends.
         progress: Whether to show a bar, or a function that is called with the part that is done.
 
     Raises:
@@ -219,16 +217,16 @@ def train(
         if last.exists():
             run.restore(last, provenance)
     keeps = last is not None and run.rank == 0
-    began, before, spent, stop, saved = time.perf_counter(), run.seconds, 0.0, False, time.perf_counter()
+    began, before, stop, saved = time.perf_counter(), run.seconds, False, time.perf_counter()
     with tqdm(total=config.steps, initial=run.step, disable=progress is not True or run.rank > 0, unit="step") as bar:
         while run.step < config.steps and not stop:
-            run.advance(draw_batch(source, config, run.step, run.rank), spent if anneal else 0.0)
+            run.advance(draw_batch(source, config, run.step, run.rank))
             bar.update()
-            run.seconds = before + time.perf_counter() - began
-            spent = (run.seconds - before) / max_seconds if max_seconds else 0.0
             if callable(progress):
+                spent = (time.perf_counter() - began) / max_seconds if max_seconds else 0.0
                 progress(min(1.0, max(run.step / config.steps, spent)))
-            stop = max_seconds is not None and run.seconds - before > max_seconds
+            run.seconds = before + time.perf_counter() - began
+            stop = max_seconds is not None and time.perf_counter() - began > max_seconds
             if run.world > 1:  # clocks differ, and all must stop together
                 flag = torch.tensor(float(stop), device=run.device)
                 dist.broadcast(flag, 0)

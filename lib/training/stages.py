@@ -114,7 +114,7 @@ def finetune(
         if minutes is not None:  # of what is left, a stage takes its share
             left = (60 * minutes - (time.perf_counter() - began)) / (len(detector.networks) - number)
         tuned = train(
-            config, source, _still(stage, held_out), Path(folder) / stage, initial=start, max_seconds=left, anneal=True,
+            config, source, _still(stage, held_out), Path(folder) / stage, initial=start, max_seconds=left,
             progress=progress if isinstance(progress, bool) else partial(progress, stage),
         )  # fmt: skip
         networks[f"{stage}_network"] = tuned.network

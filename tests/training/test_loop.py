@@ -116,22 +116,6 @@ def test_a_folder_of_another_training_or_data_is_refused(toy, tmp_path):
         train(config, toy(9), toy(4), tmp_path, progress=False)
 
 
-def test_the_rate_falls_with_the_time_where_time_ends_the_training(toy, monkeypatch):
-    rates, advance = [], loop.Run.advance
-
-    def watched(run, *some):
-        advance(run, *some)
-        rates.append(run.optimiser.param_groups[0]["lr"])
-
-    monkeypatch.setattr(loop.Run, "advance", watched)
-    config = replace(SMALL, steps=100_000, validate_every=100_000, schedule="cosine")
-    train(config, toy(8), toy(4), progress=False, max_seconds=1.0, anneal=True)
-    assert len(rates) > 3 and rates[-1] < 0.3 * max(rates)
-    rates.clear()
-    train(config, toy(8), toy(4), progress=False, max_seconds=0.3)
-    assert rates[-1] >= rates[0]  # still warming up: it goes on another time
-
-
 def test_disk_full_leaves_the_last_checkpoint(toy, tmp_path, monkeypatch):
     config = replace(SMALL, steps=4)
     path = tmp_path / "last.safetensors"
