@@ -55,13 +55,13 @@ class Live:
 
     Args:
         arrivals: Decoded in a thread.
-        waiting: Frames that wait at most; when another comes, the oldest is lost.
+        waiting: Frames that wait at most, for a pause of the machine; when another comes, the oldest is lost.
 
     Attributes:
         lost: Frames lost so far.
     """
 
-    def __init__(self, arrivals: Iterator[Arrival], *, waiting: int = 2) -> None:
+    def __init__(self, arrivals: Iterator[Arrival], *, waiting: int = 4) -> None:
         self.lost, self._waiting, self._arrivals = 0, waiting, arrivals
 
     def __iter__(self) -> Iterator[Arrival]:
