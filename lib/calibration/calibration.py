@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 from lib.calibration.checks import extents
 from lib.calibration.models import Fit, Model, precision
 from lib.cameras import AffineCamera, Camera, Points, Resection, StereoRig
+from lib.correspondences import Correspondences
 from lib.geometry import points
 
 __all__ = ["Calibration", "LandmarkOffsets"]
@@ -133,6 +134,12 @@ class Calibration:
     def noise_px2(self) -> np.ndarray:
         """(m, m) covariance assumed for a new detection of the pair."""
         return self.sigma_u_px**2 * np.eye(2 * len(self.cameras))
+
+    def detection_covariance(self, data: Correspondences) -> np.ndarray:
+        """(n, 4, 4) px^2 of new detections of the pair: as stated and scaled; `noise_px2` of rows that state none."""
+        own = data.pair_covariance_px2
+        stated = np.isfinite(own).all(axis=(1, 2), keepdims=True) & (self.covariance_px2 is not None)
+        return np.where(stated, self.detector_scale**2 * own, self.noise_px2)
 
     def derivatives(self, x_mm: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """Of the projections at x (n, 3): by the points (n, m, 3) and by the model's parameters (n, m, p)."""

@@ -7,7 +7,6 @@ from lib.calibration.models import precision
 from lib.calibration.robust import gate
 from lib.cameras import StereoRig
 from lib.correspondences import Correspondences
-from lib.geometry import pair_covariance
 from lib.least_squares import inverse
 
 __all__ = ["OnlineCalibration"]
@@ -42,12 +41,7 @@ class OnlineCalibration:
         """Fold in the rows of a frame; returns the views (n, 2) bool that were used, those the rig so far does not refuse."""
         known, variance_x = self._calibration, self._calibration.sigma_x_mm**2
         used = data.seen & np.isfinite(data.x_mm).all(axis=1, keepdims=True)
-        pixels, noise = np.hstack([data.u_left, data.u_right]), np.broadcast_to(known.noise_px2, (len(data), 4, 4))
-        if known.covariance_px2 is not None:  # of rows that state none, the calibration's counts
-            own = np.where(used[:, :, None, None], data.covariance_px2, np.eye(2))
-            stated = np.isfinite(own).all(axis=(1, 2, 3))[:, None, None]
-            own = known.detector_scale**2 * pair_covariance(np.where(stated[..., None], own, np.eye(2)), len(data))
-            noise = np.where(stated, own, noise)
+        pixels, noise = np.hstack([data.u_left, data.u_right]), known.detection_covariance(data)
         x = np.where(used.any(axis=1, keepdims=True), data.x_mm, self._state.reference)
         y, J_x, J = self._evaluate(x)
         r, S = np.where(np.repeat(used, 2, axis=1), pixels - y, 0.0), noise + variance_x * J_x @ J_x.mT

@@ -266,13 +266,9 @@ class RigTracker:
 
     def detection_covariance(self, data: Correspondences) -> np.ndarray:
         """(n, 4, 4) px^2 of detections alone."""
-        known, own = self.calibration, data.pair_covariance_px2
-        if known is None:
+        if self.calibration is None:
             return np.tile(self._noise_px**2 * np.eye(4), (len(data), 1, 1))
-        if known.covariance_px2 is None:
-            own = np.full(own.shape, np.nan)
-        own = np.where(np.isfinite(own).all(axis=(1, 2), keepdims=True), known.detector_scale**2 * own, known.noise_px2)
-        return self._scale2 * own
+        return self._scale2 * self.calibration.detection_covariance(data)
 
     def point_covariance(self, x_mm: np.ndarray) -> np.ndarray:
         """(n, 3, 3) mm^2: how far the rig may put points beside the robot's."""
