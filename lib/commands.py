@@ -105,9 +105,12 @@ def main_reconstruct(argv: list[str]) -> int:
     frame, now = recording.frames[a.frame], data.of_frames(a.frame % len(recording))
     tool = (now.u_left, now.u_right) if recording.skeleton == LANDMARKS and len(now) == len(LANDMARKS) else None
     found = reconstruct(frame.left, frame.right, rig, setting=a.setting, u_landmarks=tool)
-    save_mesh(surface_mesh(found.surface, image=frame.left, mask=~found.mask_left), out / "surface.glb")
     x, y = np.clip(np.rint(found.u).astype(int), 0, np.subtract(recording.image_size_px, 1)).T
-    save_points(out / "points.ply", found.points.x_mm, colours=frame.left[y, x])
+    try:
+        save_mesh(surface_mesh(found.surface, image=frame.left, mask=~found.mask_left), out / "surface.glb")
+        save_points(out / "points.ply", found.points.x_mm, colours=frame.left[y, x])
+    except ImportError as error:
+        print(f"Without surface.glb and points.ply: {error}")
     if found.rig.is_affine:
         save_depth_map(out / "depth.tiff", depth_map(found.surface, found.rig.left, recording.image_size_px))
     _write_rectified(out, found.rig, frame.left, frame.right)

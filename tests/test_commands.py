@@ -12,6 +12,7 @@ from lib import commands, paths
 from lib.cameras import StereoRig
 from lib.landmarks import Detector, Landmarks
 from lib.recordings import Recording
+from lib.surface import export
 from tests.importing import foreign
 from tests.importing.test_import import source_of, thinned
 
@@ -58,6 +59,19 @@ def test_reconstruct_writes_surface_points_and_the_rectified_pair(out, tmp_path,
     matrices = json.loads((tmp_path / "rectification.json").read_text())
     assert left.shape == right.shape and np.shape(matrices["left_from_canvas"]) == (2, 3)
     assert {"surface.glb", "points.ply", "depth.tiff"} <= {path.name for path in tmp_path.iterdir()}
+
+
+def test_reconstruct_without_open3d_writes_the_rest(out, tmp_path, monkeypatch, capsys):
+    def missing(*_, **__):
+        raise ImportError("Open3D does not load (libusb). On Debian and Ubuntu: apt-get install libusb-1.0-0")
+
+    monkeypatch.setattr(export, "open3d", missing)
+    argv = [str(paths.SHIPPED_RECORDING), *LABELS, "--setting", "fast", "--frame", "2", "--out", str(tmp_path)]
+    assert commands.main_reconstruct([*argv, "--rig", str(out / "rig.json")]) == 0
+    assert "Without surface.glb and points.ply: Open3D does not load" in capsys.readouterr().out
+    found = {path.name for path in tmp_path.iterdir()}
+    assert {"depth.tiff", "rectified_left.png", "refined_rig.json", "reconstruction.json"} <= found
+    assert not {"surface.glb", "points.ply"} & found
 
 
 def test_a_red_verdict_writes_nothing_but_itself(tmp_path, capsys):
