@@ -17,7 +17,6 @@ from lib.adapt.judging import Agreement, agreement, better, epipolar_geometry, e
 from lib.adapt.teacher import RefusalError, Seen, Teacher, longest_still, look, stretches, teach
 from lib.calibration import Calibration
 from lib.landmarks import Detector, SharedDetector
-from lib.landmarks.checkpoints import checksum
 from lib.provenance import Provenance, plain
 from lib.recordings import Recording
 from lib.recordings.annotations import read_coco
@@ -28,7 +27,7 @@ from lib.training.stages import finetune
 __all__ = ["STEPS", "Adaptation", "adapt", "simulated_like"]
 
 #: Most rounds of training, and most steps of a stage in one; the time ends most trainings.
-ROUNDS, STEPS = 3, 1200
+ROUNDS, STEPS = 3, 4000
 #: Most stereo frames that are looked at, spread over the recording.
 _MOST_FRAMES = 96
 _SIMULATED_SHARDS = 3
@@ -74,7 +73,7 @@ def adapt(
 
     Args:
         recording: With kinematics; the landmarks of a forceps.
-        detector: None is the one that ships.
+        detector: None is the one that ships, and training starts from "any_tool", whose closeups know more kinds of tools.
         labels: COCO keypoints like annotations.json; ten labelled pairs are a start where the detector finds too little.
         minutes: The training ends after so many; detection and judging add a little.
         seed: Of everything that is drawn.
@@ -87,7 +86,7 @@ def adapt(
     """
     if not isinstance(recording, Recording):
         recording = Recording.open(recording, truth=False)
-    work = _Work(replace(recording, truth=None), detector or Detector.load(), labels, seed, folder, minutes, progress)
+    work = _Work(replace(recording, truth=None), detector, labels, seed, folder, minutes, progress)
     try:
         return work.adapted(tune)
     except RefusalError as refused:
@@ -99,10 +98,11 @@ class _Work:
     """The recording, the files that keep what is done, the time left, and the report as it grows."""
 
     def __init__(
-        self, recording: Recording, detector: Callable, labels: str | Path | None, seed: int, folder: str | Path | None,
-        minutes: float, progress: bool,
+        self, recording: Recording, detector: Callable | None, labels: str | Path | None, seed: int,
+        folder: str | Path | None, minutes: float, progress: bool,
     ) -> None:  # fmt: skip
-        self.recording, self.detector, self.seed, self.progress = recording, detector, seed, progress
+        self.recording, self.seed, self.progress = recording, seed, progress
+        self.detector, self.start = detector or Detector.load(), detector or Detector.load("any_tool")
         chosen = np.linspace(0, len(recording) - 1, min(_MOST_FRAMES, len(recording)))
         self.frames = np.unique(chosen.round().astype(int))
         self.labels, self.marked = None, np.zeros(0, int)
@@ -111,10 +111,10 @@ class _Work:
             self.labels = np.stack([given.u_left, given.u_right], axis=1)
             self.marked = np.flatnonzero(np.isfinite(self.labels).any(axis=(1, 2, 3)))
             self.frames = np.union1d(self.frames, self.marked)
-        self.learns = isinstance(detector, Detector)  # a stand-in has no networks
-        tensors = {k: v for n in detector.networks.values() for k, v in n.state_dict().items()} if self.learns else {}
+        self.learns = isinstance(self.start, Detector)  # a stand-in has no networks
         key = [str(recording.folder.resolve()), recording.kinematics.x_mm.tobytes(), self.frames.tobytes(), seed, STEPS]
-        key += [checksum(tensors, {}), Path(labels).read_bytes() if labels is not None else b""]
+        key += [self.detector.digest, self.start.digest] if self.learns else []
+        key += [Path(labels).read_bytes() if labels is not None else b""]
         self.folder = Path(folder or paths.RUNS / f"adapt-{recording.name}") / "work"
         self.folder /= hashlib.sha256(repr(key).encode()).hexdigest()[:12]
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -170,9 +170,9 @@ class _Work:
         return found, np.array(covariances)
 
     def adapted(self, tune: Callable[..., Detector]) -> Adaptation:
-        recording, detector, rounds = self.recording, self.detector, self.report["rounds"]
-        first = seen = self.look("before", detector, self.frames)
-        seen = self.with_labels(seen)
+        recording, start, rounds = self.recording, self.start, self.report["rounds"]
+        first = self.look("before", start, self.frames)
+        seen = self.with_labels(first)
         still, note = longest_still(recording, seen)
         self.report["notes"] += [note] if note else []
         parts = stretches(np.setdiff1d(still, self.marked), recording.frames.time_s)
@@ -189,10 +189,10 @@ class _Work:
             raise RefusalError(str(refused)) from refused
         teacher = min(teachers, key=lambda one: one.doubt_px(learn))
         self.report["start_share"] = teacher.right
-        closeups = self.learns and detector.closeup_network is not None
+        closeups = self.learns and start.closeup_network is not None
         u = teacher.labels(learn)[0]
         for k in range(_GUIDED if closeups else 0):  # closeups that nobody taught, near where the robot says
-            guided = self.look(f"guided {k}", detector, learn, u)
+            guided = self.look(f"guided {k}", start, learn, u)
             try:
                 teacher = teach(recording, self.with_labels(guided), opinion=guided, before=teacher)
             except RefusalError:
@@ -203,16 +203,18 @@ class _Work:
             if np.nanmedian(np.linalg.norm(u - last, axis=-1)) < _SETTLED_PX:
                 break
         self.report["refused_frames"] = teacher.refused
-        best, best_seen, stop = detector, first, agreement(teacher, first.of(parts["stop"])).summary()
+        if self.detector is not start:
+            first = self.look("shipped", self.detector, np.union1d(parts["stop"], parts["judge"]))
+        best, best_seen, stop = self.detector, first, agreement(teacher, first.of(parts["stop"])).summary()
         rounds.append({"round": 0, "right": teacher.right} | stop)
         some = learn[:: max(1, len(learn) // 8)]
         simulated = simulated_like((recording.frames[int(i)].left for i in some), self.seed, self.progress)
         for k in range(1, ROUNDS + 1):
             if k > 1 and self.left_s < 6 * self.minutes:
                 break
-            tuned = self.round(k, best, teacher, parts, None if k == 1 else best_seen, simulated, tune)
+            tuned = self.round(k, start if k == 1 else best, teacher, parts, None if k == 1 else best_seen, simulated, tune)
             seen, said = self.look(f"round {k}", tuned, self.frames), {}
-            opinion = self.look(f"opinion {k}", detector, learn, u) if closeups else None
+            opinion = self.look(f"opinion {k}", start, learn, u) if closeups else None
             try:
                 new = teach(recording, self.with_labels(seen).of(learn), before=teacher, opinion=opinion)
             except RefusalError as refused:
@@ -241,11 +243,18 @@ class _Work:
         held_out, _ = self.images(np.union1d(doubt_on, parts["stop"]), teacher, seen)
         if len(images) < 8 or len(held_out) < 4:
             raise RefusalError(f"robot: it labels {len(images)} images to learn from and {len(held_out)} others; 8 and 4 do.")
+        parts_done: dict[str, float] = {}
+
+        def progress(stage: str, done: float) -> None:
+            parts_done[stage] = done
+            share = ", ".join(f"{name} {100 * part:.0f} %" for name, part in sorted(parts_done.items()))
+            self.say(f"Round {k} ({share})", min(sum(parts_done.values()) / len(detector.networks), 1.0))
+
         with warnings.catch_warnings(record=True) as told:
             tuned = tune(
                 detector, images, held_out, self.folder / f"round {k}", simulated=simulated, covariance_px2=covariance,
                 minutes=max(self.left_s / 60 * (0.5 if k < ROUNDS else 0.9), 0.05), steps=STEPS, seed=self.seed,
-                progress=lambda stage, done: self.say(f"Round {k}, {stage} stage", done),
+                progress=progress,
             )  # fmt: skip
         self.report["notes"] += [f"Round {k}: {one.message}." for one in told if one.category is RuntimeWarning]
         if self.learns:

@@ -74,14 +74,14 @@ def main(argv: list[str]) -> int:
     a = parser.parse_args(argv)
     if not 0 < a.minutes < 1e4:
         parser.error("--minutes: must be positive.")
-    out, detector = a.out or paths.RUNS / f"adapt-{a.recording.resolve().name}", Detector.load(a.weights)
+    out = a.out or paths.RUNS / f"adapt-{a.recording.resolve().name}"
     how = {"minutes": a.minutes, "seed": a.seed, "folder": out}
     recording = None
     if a.recording.is_dir() and not (a.recording / "recording.toml").exists() and a.labels is not None:
-        found = adapt_images(a.recording, a.labels, detector, **how)
+        found = adapt_images(a.recording, a.labels, Detector.load(a.weights), **how)
     else:
         recording = Recording.open(a.recording, truth=False)
-        found = adapt(recording, detector, labels=a.labels, **how)
+        found = adapt(recording, Detector.load(a.weights) if a.weights else None, labels=a.labels, **how)
     page = write(found, out, recording)
     where = shlex.quote(paths.shown(a.recording))
     reason = found.report["reason"].removesuffix(".").replace("RECORDING", where)

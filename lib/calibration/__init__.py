@@ -8,12 +8,12 @@ from lib.calibration.offsets import with_offsets
 from lib.calibration.online import OnlineCalibration
 from lib.calibration.optics import Optics, optics
 from lib.calibration.pivot import Pivot, Tool, ToolOffsets, pivot_calibration, tool_offsets
-from lib.calibration.robust import NoConsensusError
+from lib.calibration.robust import CompetingCamerasError, NoConsensusError
 from lib.calibration.timing import TimeOffset, estimate_time_offset
 
 __all__ = [
-    "Calibration", "LandmarkOffsets", "Moments", "NoConsensusError", "OnlineCalibration", "Optics", "Pivot", "TimeOffset",
-    "Tool", "ToolOffsets", "affine_minimum", "calibrate", "dlt", "estimate_time_offset",
+    "Calibration", "CompetingCamerasError", "LandmarkOffsets", "Moments", "NoConsensusError", "OnlineCalibration", "Optics",
+    "Pivot", "TimeOffset", "Tool", "ToolOffsets", "affine_minimum", "calibrate", "dlt", "estimate_time_offset",
     "optics", "paper_variances", "pivot_calibration", "tool_offsets", "with_offsets", "write_opencv",
     "write_ros",
 ]  # fmt: skip

@@ -37,6 +37,10 @@ class NoConsensusError(ValueError):
     """The rows agree on no camera, or on two that compete; the text says which, how many rows, and the cure."""
 
 
+class CompetingCamerasError(NoConsensusError):
+    """Some rows agree on one camera, and as many others on another one."""
+
+
 def gate(n: int, m: int) -> float:
     """Largest squared Mahalanobis distance of a row, exceeded once in 10 000 data sets of n rows, m pixels each."""
     return float(2.0 * gammainccinv(m / 2, FALSE_ALARM / n))
@@ -103,7 +107,7 @@ def _one_camera(
         r = u[second] - x[second] @ found.matrix[:, :3].T - found.matrix[:, 3]
         beside = np.sqrt((r**2).sum(axis=1).mean() / 2) > max(_CONTRAST * found.sigma_px, _LARGEST_NOISE[0] * extent)
         if len(second) >= least and other.sigma_px <= 3.0 * found.sigma_px and beside:
-            raise NoConsensusError(_competing(name, np.flatnonzero(found.keep), second, n))
+            raise CompetingCamerasError(_competing(name, np.flatnonzero(found.keep), second, n))
     return found
 
 

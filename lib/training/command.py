@@ -11,10 +11,10 @@ from lib.landmarks import Detector
 from lib.recordings import Recording
 from lib.training.config import PRESETS
 from lib.training.evaluation import evaluate
-from lib.training.loop import load_training, train
+from lib.training.loop import Training, load_training, train
 from lib.training.samples import labelled_images
 from lib.training.shards import generate
-from lib.training.stages import STAGES, assemble, finetune, stage_config, stage_data
+from lib.training.stages import STAGES, assemble, finetune, stage_config, stage_data, training_of
 
 __all__ = ["main", "main_evaluate"]
 
@@ -40,7 +40,7 @@ def main(argv: list[str] | None = None) -> int:
     add("--minutes", type=float, help="finetune: stop after so many")
     add("--features", type=int, help="channels (default: the shipped detector's)")
     add("--seed", type=int, default=0)
-    add("--initial", type=Path, help="checkpoint (of a stage) or weights file (finetune) to start from")
+    add("--initial", type=Path, help="a checkpoint of the stage, a weights file, or a name in data/models, to start from")
     add("--every", type=int, default=1, help="finetune: use every N-th frame")
     add("--note", action="append", default=[], help="assemble: a line for the card; may be repeated")
     add("--onnx", type=Path, default=paths.CACHE / "onnx", help="export: folder of the ONNX files")
@@ -54,7 +54,8 @@ def main(argv: list[str] | None = None) -> int:
     elif a.what == "finetune":
         _finetune(a)
     elif a.what == "assemble":
-        assemble(a.folder, a.data, a.out or paths.MODELS / "default.safetensors", a.recordings, a.note)
+        assemble(a.folder, a.data, a.out or paths.MODELS / "default.safetensors", a.recordings, a.note,
+                 Detector.load(a.initial) if a.initial else None)  # fmt: skip
     elif a.what == "export":
         from lib.landmarks.export import export  # needs onnx, which nothing else does
 
@@ -63,9 +64,16 @@ def main(argv: list[str] | None = None) -> int:
     else:
         config = stage_config(a.what, preset=a.preset, features=a.features)
         config = replace(config, steps=a.steps, seed=a.seed, validate_every=200, learning_rate=a.rate or config.learning_rate)
-        initial = load_training(a.initial) if a.initial else None
+        initial = _start(a.initial, a.what) if a.initial else None
         print(train(config, *stage_data(a.what, a.data), a.folder / a.what, initial=initial).provenance["metrics"])
     return 0
+
+
+def _start(path: Path, stage: str) -> Training:
+    try:
+        return load_training(path)
+    except (FileNotFoundError, ValueError):
+        return training_of(Detector.load(path), stage)
 
 
 def _finetune(a: argparse.Namespace) -> None:

@@ -29,7 +29,7 @@ __all__ = [
 #: Longest side of a stored whole scene.
 SCENE_PX = 512
 #: Seeds of each kind of shard.
-_SEEDS = {"closeups": 5, "scenes": 6, "held_out": 7}
+_SEEDS = {"closeups": (5, 77), "scenes": (6,), "held_out": (7,)}
 #: Side of the crops that closeups are cut from.
 CLOSEUP_CROP_PX = 160
 #: Closeups in a shard.
@@ -58,7 +58,7 @@ def generate(folder: str | Path, kind: str, shards: int, *, workers: int | None 
 
 def make_shard(path: Path, kind: str, index: int) -> None:
     """Simulate and write one shard."""
-    rng = np.random.default_rng([_SEEDS[kind], index])
+    rng = np.random.default_rng([*_SEEDS[kind], index])
     if kind == "closeups":
         _write_closeups(path, rng)
         return
@@ -83,8 +83,8 @@ def _write_closeups(path: Path, rng: np.random.Generator) -> None:
     landmark, rendered_px = rng.integers(3, size=n), side_px + BLOCK_PX
     for i, k in enumerate(landmark):
         while not seen[i, k]:
-            # Half are of the reference rig, where the last tenth of a pixel counts.
-            population = "training" if rng.random() < 0.5 else "near"
+            # A quarter is of the reference rig, where the last tenth of a pixel counts.
+            population = "near" if rng.random() < 0.25 else "training"
             how = {"around": k, "jitter": BLOCK_PX / 2 / rendered_px, "textures": TEXTURE_SEEDS, "population": population}
             image, at, seen[i] = sample(rng, crop_px=rendered_px, **how)
         crops[i], u[i] = square_round(image, at, k, side_px)  # the landmark is not in the middle where the field ends

@@ -1,20 +1,25 @@
 """The detector's stages: what each learns from, and how; fine-tuning on a user's labelled frames; the shipped detector."""
 
 import json
+import threading
 import time
 import warnings
 from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
+import torch
+from tqdm.auto import tqdm
 
 from lib.files import write_text
 from lib.landmarks import Detector
 from lib.landmarks.metrics import tool_length_px
-from lib.landmarks.network import HourglassConfig, OffsetConfig
+from lib.landmarks.network import HourglassConfig, Network, OffsetConfig
 from lib.landmarks.windows import tool_pose
+from lib.parallel import cores, single_threaded_torch
 from lib.provenance import commit_id, machine
 from lib.recordings import Recording
 from lib.simulator.population import VALIDATION_TEXTURE_SEEDS, sample
@@ -29,12 +34,14 @@ from lib.training.scenes import FRAME_PX, FrameSource, ToolSource
 from lib.training.shards import validation_images
 from lib.training.windows import CloseupSource
 
-__all__ = ["STAGES", "assemble", "card", "finetune", "stage_config", "stage_data"]
+__all__ = ["STAGES", "assemble", "card", "finetune", "stage_config", "stage_data", "training_of"]
 
 #: The stages that are trained, in the order of their use, and the channels of the shipped networks.
 STAGES = {"frame": 32, "tool": 48, "closeup": 32}
 #: Standard deviation of a label, as a share of the tool's length, at which a stage lets it count half.
 LABEL_SD = {"frame": 0.1, "tool": 0.04, "closeup": 0.02}
+#: How the time of a fine-tuning is shared.
+_TIME = {"frame": 2.0, "tool": 2.0, "window": 2.0, "closeup": 1.0}
 _SOURCES = {"frame": FrameSource, "tool": ToolSource, "closeup": CloseupSource}
 
 
@@ -99,25 +106,54 @@ def finetune(
         variance = np.trace(covariance_px2, axis1=-2, axis2=-1) / 2 / length**2
     images, held_out = ([part[i] for i in rows] for part, rows in zip((images, held_out), usable, strict=True))
     doubt_on = validation_images(simulated) if isinstance(simulated, str | Path) else (simulated or ())[::3]
-    networks, began = {}, time.perf_counter()
-    for number, (stage, network) in enumerate(detector.networks.items()):
-        weight = 1 / (1 + variance[usable[0]] / LABEL_SD[stage] ** 2)
-        source: Source = _SOURCES[stage].of(images, weight=weight)
-        if isinstance(simulated, str | Path):
-            source = Mixed(source, _SOURCES[stage].load(simulated))
-        elif simulated:
-            source = Mixed(source, _SOURCES[stage].of([one for i, one in enumerate(simulated) if i % 3]))
-        config = replace(stage_config(stage), network=network.config, steps=steps, learning_rate=5e-4, ema=0.98, seed=seed)
-        config = replace(config, batch_size=min(config.batch_size, 24), validate_every=max(1, steps // 3))
-        start = Training(network, [], {"shipped": detector.metadata.get("commit")})
-        left = None
-        if minutes is not None:  # of what is left, a stage takes its share
-            left = (60 * minutes - (time.perf_counter() - began)) / (len(detector.networks) - number)
-        tuned = train(
-            config, source, _still(stage, held_out), Path(folder) / stage, initial=start, max_seconds=left,
-            progress=progress if isinstance(progress, bool) else partial(progress, stage),
-        )  # fmt: skip
-        networks[f"{stage}_network"] = tuned.network
+    began, names, stopped, parts = time.perf_counter(), list(detector.networks), threading.Event(), {}
+    bar = tqdm(total=len(names), disable=progress is not True, unit="stage", bar_format="{desc}{percentage:3.0f} %|{bar}|")
+
+    def told(stage: str, part: float) -> None:
+        if stopped.is_set():
+            raise InterruptedError(f"{stage}: the training was interrupted.")
+        parts[stage] = part
+        bar.n = sum(parts.values())
+        bar.refresh()
+        if callable(progress):
+            progress(stage, part)
+
+    def trained(lane: list[str]) -> dict[str, Network]:
+        """The stages of a thread, one after the other; each has its share of the time."""
+        found = {}
+        for number, stage in enumerate(lane):
+            network = detector.networks[stage]
+            weight = 1 / (1 + variance[usable[0]] / LABEL_SD[stage] ** 2)
+            source: Source = _SOURCES[stage].of(images, weight=weight)
+            if isinstance(simulated, str | Path):
+                source = Mixed(source, _SOURCES[stage].load(simulated))
+            elif simulated:
+                source = Mixed(source, _SOURCES[stage].of([one for i, one in enumerate(simulated) if i % 3]))
+            config = replace(stage_config(stage), network=network.config, steps=steps, learning_rate=5e-4, ema=0.98, seed=seed)
+            config = replace(config, batch_size=min(config.batch_size, 24), validate_every=max(1, steps // 3))
+            start = Training(network, [], {"shipped": detector.metadata.get("commit")})
+            left = None
+            if minutes is not None:
+                share = _TIME[stage] / sum(_TIME[later] for later in lane[number:])
+                left = share * (60 * minutes - (time.perf_counter() - began))
+            found[f"{stage}_network"] = train(
+                config, source, _still(stage, held_out), Path(folder) / stage, initial=start, max_seconds=left,
+                progress=partial(told, stage),
+            ).network
+        return found
+
+    # A second thread of torch's own makes such small steps hardly faster, and far slower where the machine is busy.
+    threads = min(cores(), len(names))
+    lanes, networks = [*([name] for name in names[: threads - 1]), names[threads - 1 :]], {}
+    start = {"initializer": torch.set_num_threads, "initargs": (1,)}
+    with single_threaded_torch(), ThreadPoolExecutor(threads, **start) as pool:
+        try:
+            for found in [pool.submit(trained, lane) for lane in lanes]:
+                networks |= found.result()
+        except BaseException:
+            stopped.set()
+            raise
+    bar.close()
     tuned = replace(detector, **networks)
     try:
         return fit_error_models(tuned, [*held_out, *doubt_on], progress=progress is True)
@@ -128,18 +164,25 @@ def finetune(
         return tuned
 
 
+def training_of(detector: Detector, stage: str) -> Training:
+    """The network of a detector's stage, with what its metadata tell of its training."""
+    return Training(detector.networks[stage], [], detector.metadata.get("stages", {}).get(stage, {}))
+
+
 def assemble(
-    folder: str | Path, data: str | Path, out: str | Path, recordings: Sequence[Path] = (), notes: Sequence[str] = ()
-) -> Detector:
+    folder: str | Path, data: str | Path, out: str | Path, recordings: Sequence[Path] = (), notes: Sequence[str] = (),
+    initial: Detector | None = None,
+) -> Detector:  # fmt: skip
     """Join the stages of a training folder, fit their error models, write the weights file `out` and its card.
 
     The error models are fitted on half of the held-out scenes, whose families are new, on drawn grounds without a tool, and
     on labelled `recordings`, if any; those of the closeups also on half as many images of the reference rig, since their bias
     is not that of unfamiliar tools alone.  The card's numbers are measured on the other half of the scenes.  `notes` are
-    lines for the card.  A missing stage or shard raises `FileNotFoundError`.
+    lines for the card.  A stage that `folder` lacks is `initial`'s; without one, and without shards, a `FileNotFoundError`.
     """
     out = Path(out)
-    stages = {stage: load_training(Path(folder) / stage / "last.safetensors") for stage in STAGES}
+    trained = {stage: Path(folder) / stage / "last.safetensors" for stage in STAGES}
+    stages = {k: load_training(p) if p.exists() or not initial else training_of(initial, k) for k, p in trained.items()}
     frames = list(validation_images(data))
     if not frames:
         raise FileNotFoundError(f"{data}: no shard held_out_*.npz; make some with `python3 -m lib train generate`.")
@@ -172,7 +215,7 @@ def assemble(
     detector = replace(detector, metadata=json.loads(json.dumps(provenance, default=float)))
     out.parent.mkdir(parents=True, exist_ok=True)
     detector.save(out)
-    write_text(out.with_name("README.md"), card(detector, out))
+    write_text(out.with_name("README.md") if out.stem == "default" else out.with_suffix(".md"), card(detector, out))
     return detector
 
 
