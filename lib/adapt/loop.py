@@ -17,6 +17,7 @@ from lib.adapt.judging import Agreement, agreement, better, epipolar_geometry, e
 from lib.adapt.teacher import RefusalError, Seen, Teacher, longest_still, look, stretches, teach
 from lib.calibration import Calibration
 from lib.landmarks import Detector, SharedDetector
+from lib.landmarks.checkpoints import checksum
 from lib.provenance import Provenance, plain
 from lib.recordings import Recording
 from lib.recordings.annotations import read_coco
@@ -113,7 +114,7 @@ class _Work:
             self.frames = np.union1d(self.frames, self.marked)
         self.learns = isinstance(self.start, Detector)  # a stand-in has no networks
         key = [str(recording.folder.resolve()), recording.kinematics.x_mm.tobytes(), self.frames.tobytes(), seed, STEPS]
-        key += [self.detector.digest, self.start.digest] if self.learns else []
+        key += [checksum(network.state_dict(), {}) for network in self.start.networks.values()] if self.learns else []
         key += [Path(labels).read_bytes() if labels is not None else b""]
         self.folder = Path(folder or paths.RUNS / f"adapt-{recording.name}") / "work"
         self.folder /= hashlib.sha256(repr(key).encode()).hexdigest()[:12]

@@ -129,8 +129,9 @@ def finetune(
                 source = Mixed(source, _SOURCES[stage].load(simulated))
             elif simulated:
                 source = Mixed(source, _SOURCES[stage].of([one for i, one in enumerate(simulated) if i % 3]))
-            config = replace(stage_config(stage), network=network.config, steps=steps, learning_rate=5e-4, ema=0.98, seed=seed)
-            config = replace(config, batch_size=min(config.batch_size, 24), validate_every=max(1, steps // 3))
+            config = replace(stage_config(stage), network=network.config, steps=steps, seed=seed)
+            more = {"batch_size": min(config.batch_size, 24), "validate_every": max(1, steps // 3)}
+            config = replace(config, learning_rate=5e-4, ema=0.98, **more)
             start = Training(network, [], {"shipped": detector.metadata.get("commit")})
             left = None
             if minutes is not None:
