@@ -1,6 +1,7 @@
 """The commands `train` and `evaluate`, fine-tuning on labelled frames, and the model card."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from lib import paths
 from lib.__main__ import COMMANDS
 from lib.landmarks import Detector
 from lib.landmarks.network import HourglassConfig, OffsetConfig, OffsetNetwork, StackedHourglass
-from lib.training import stages
+from lib.training import command, stages
 from lib.training.command import main_evaluate
 from lib.training.loop import load_training
 from tests.toys import toy_images
@@ -37,9 +38,17 @@ def test_the_evaluate_command(tmp_path, capsys, monkeypatch):
     assert COMMANDS["evaluate"]([str(tmp_path)]) == 2
 
 
-def test_the_card_beside_the_shipped_weights_is_theirs():
-    path = paths.MODELS / "default.safetensors"
-    assert stages.card(Detector.load(engine="torch"), path) == path.with_name("README.md").read_text(encoding="utf-8")
+@pytest.mark.parametrize(("name", "beside"), [("default", "README.md"), ("any_tool", "any_tool.md")])
+def test_the_card_beside_shipped_weights_is_theirs(name, beside):
+    path = paths.MODELS / f"{name}.safetensors"
+    assert stages.card(Detector.load(name, engine="torch"), path) == path.with_name(beside).read_text(encoding="utf-8")
+
+
+def test_a_stage_begins_from_a_checkpoint_or_from_shipped_weights():
+    shipped = command._start(Path("default"), "closeup")
+    assert shipped.provenance == Detector.load(engine="torch").metadata["stages"]["closeup"]
+    with pytest.raises(FileNotFoundError, match="nowhere: no such weights file"):
+        command._start(Path("nowhere"), "closeup")
 
 
 def test_stages_are_fine_tuned_on_labelled_frames(tmp_path, monkeypatch):
