@@ -34,8 +34,8 @@ _MOST_FRAMES = 96
 _SIMULATED_SHARDS = 3
 #: A round that brings the frames for stopping nearer to the robot by less than this share is the last.
 _LEAST_GAIN = 0.03
-#: Most rounds of closeups, placed by the robot, before anything is trained; they end where the labels move less than this.
-_GUIDED, _SETTLED_PX = 6, 0.5
+#: Most rounds of closeups, placed by the robot, before anything is trained; they end where no landmark moves more than this.
+_GUIDED, _SETTLED_PX = 8, 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,7 +201,7 @@ class _Work:
                     raise
                 break  # closeups that do not know the tool correct nothing; labels set by hand do
             u, last = teacher.labels(learn)[0], u
-            if np.nanmedian(np.linalg.norm(u - last, axis=-1)) < _SETTLED_PX:
+            if np.nanmax(np.nanmedian(np.linalg.norm(u - last, axis=-1), axis=(0, 1))) < _SETTLED_PX:
                 break
         self.report["refused_frames"] = teacher.refused
         if self.detector is not start:

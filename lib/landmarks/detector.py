@@ -42,15 +42,15 @@ from lib.landmarks.windows import (
 from lib.parallel import single_threaded_torch
 from lib.recordings import Recording
 
-__all__ = ["CLOSE", "CLOSEUP_FROM", "MISSING_BELOW", "TRACKED_FROM", "Detector", "Landmarks", "detect"]
+__all__ = ["CLOSE", "MISSING_BELOW", "TRACKED_FROM", "Detector", "Landmarks", "detect"]
 
 FORMAT = "microstereo.detector"
 #: The fields that a weights file keeps as plain values.
-_SETTINGS = ("frame_px", "window_px", "mirror", "method")
+_SETTINGS = ("frame_px", "window_px", "mirror", "method", "closeup_from")
 #: A landmark with a lower confidence counts as missing: NaN, confidence 0.
 MISSING_BELOW = 0.05
-#: Below the first confidence a landmark is not followed from frame to frame, below the second it gets no closeup.
-TRACKED_FROM, CLOSEUP_FROM = 0.5, 0.25
+#: Below this confidence a landmark is not followed from frame to frame.
+TRACKED_FROM = 0.5
 #: The stages that look at closeups: twice of what the tool's window showed, and of what was found in the frame before.
 CLOSE = ("closeup", "closer", "tracking")
 #: Where the first stage is less sure than this of a landmark, its peaks at these scales of its input make candidates.
@@ -126,6 +126,7 @@ class Detector:
         error_models: One for each stage: ``"frame"``, ``"tool"`` and ``"again"`` for the two looks at the tool, ``"window"``,
             ``"closeup"`` and ``"closer"`` for two closeups, the second where the first saw the landmark, and ``"tracking"``
             for the closeups that follow a landmark from frame to frame.
+        closeup_from: Below this confidence a landmark gets no closeup.
         mirror: The second look at the tool, and the windows' network, also see the mirror image, and the mean counts: where
             the two disagree its peak is low.
         engine: What runs the networks, one of `lib.landmarks.engines.ENGINES`; the weights are the same.
@@ -145,6 +146,7 @@ class Detector:
     metadata: dict[str, object] = field(default_factory=dict)
     closeup_network: OffsetNetwork | None = None
     mirror: bool = False
+    closeup_from: float = 0.25
     engine: str = "torch"
     _run: dict[str, Callable[[Tensor], list[Tensor]]] = field(init=False, repr=False, default_factory=dict)
 
@@ -198,6 +200,7 @@ class Detector:
         if not path.suffix and not path.is_file():
             path = paths.MODELS / f"{path.name}.safetensors"
         tensors, metadata = read_checkpoint(path, FORMAT)
+        metadata = {"closeup_from": cls.closeup_from} | metadata
         lacking = {"networks", "calibration", "provenance", *_SETTINGS} - metadata.keys()
         if text := ", ".join(sorted(lacking)):
             raise ValueError(f"{path}: its metadata lack {text}; get the file again, or make it with Detector.save.")
@@ -360,7 +363,7 @@ class Detector:
             confidence = np.where(near, confidence, 0.0)
         if stage in ("closeup", "closer"):
             # The stage before decides whether the landmark is there; an unsure one stays where it was seen.
-            near &= rough.confidence[which[:, 0], which[:, 1]] >= CLOSEUP_FROM
+            near &= rough.confidence[which[:, 0], which[:, 1]] >= self.closeup_from
             u, covariance, confidence, which = u[near], covariance[near], confidence[near], which[near]
         i, k = which.T
         result.u[i, k], result.covariance[i, k], result.confidence[i, k] = u, covariance, confidence

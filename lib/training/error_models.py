@@ -11,7 +11,7 @@ from scipy.special import chdtri, expit
 from tqdm.auto import tqdm
 
 from lib.geometry import cell_from_image
-from lib.landmarks.detector import CLOSE, CLOSEUP_FROM, TRACKED_FROM, Detector, Landmarks
+from lib.landmarks.detector import CLOSE, TRACKED_FROM, Detector, Landmarks
 from lib.landmarks.error_model import FEATURES, ErrorModel, features_of
 from lib.landmarks.metrics import GROSS_PX, tool_length_px
 from lib.landmarks.windows import CLOSEUP_REACH_PX, CLOSEUP_ZOOM, expected_in_closeup, map_points
@@ -136,7 +136,7 @@ def seen_by(
     if stage in CLOSE:
         keep = peaks.value[:, 0].numpy() > 0
         if stage != "tracking":  # of an unsure landmark nothing is changed
-            keep &= rough.confidence[which[:, 0], which[:, 1]] >= CLOSEUP_FROM
+            keep &= rough.confidence[which[:, 0], which[:, 1]] >= detector.closeup_from
         moved = at - expected_in_closeup(detector.closeup_network.config.size_px, landmark)
     errors = at - map_points(matrices, labels[landmark])
     tolerance = tolerance * np.sqrt(np.abs(np.linalg.det(matrices[:, :, :2])))

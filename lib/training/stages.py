@@ -16,6 +16,7 @@ from tqdm.auto import tqdm
 
 from lib.files import write_text
 from lib.landmarks import Detector
+from lib.landmarks.detector import MISSING_BELOW
 from lib.landmarks.metrics import tool_length_px
 from lib.landmarks.network import HourglassConfig, Network, OffsetConfig
 from lib.landmarks.windows import tool_pose
@@ -155,14 +156,17 @@ def finetune(
             stopped.set()
             raise
     bar.close()
-    tuned = replace(detector, **networks)
+    tuned = replace(detector, **networks, closeup_from=MISSING_BELOW)
     try:
-        return fit_error_models(tuned, [*held_out, *doubt_on], progress=progress is True)
+        tuned = fit_error_models(tuned, [*held_out, *doubt_on], progress=progress is True)
     except ValueError as error:
         if not set(tuned.stages) <= set(tuned.error_models):
             raise
         warnings.warn(f"the doubt stays as it was, held-out images do not suffice ({error})", RuntimeWarning, stacklevel=2)
-        return tuned
+        return replace(tuned, closeup_from=detector.closeup_from)
+    # Whether unsure landmarks gain by closeups depends on how far from their training the networks look: held-out images say.
+    ways = (tuned, replace(tuned, closeup_from=detector.closeup_from))
+    return max(ways, key=lambda one: evaluate(one, held_out).scores.auc)
 
 
 def training_of(detector: Detector, stage: str) -> Training:

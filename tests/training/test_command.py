@@ -47,7 +47,7 @@ def test_the_card_beside_shipped_weights_is_theirs(name, beside):
 def test_a_stage_begins_from_a_checkpoint_or_from_shipped_weights():
     shipped = command._start(Path("default"), "closeup")
     assert shipped.provenance == Detector.load(engine="torch").metadata["stages"]["closeup"]
-    with pytest.raises(FileNotFoundError, match="nowhere: no such weights file"):
+    with pytest.raises(FileNotFoundError, match="nowhere"):
         command._start(Path("nowhere"), "closeup")
 
 

@@ -62,13 +62,12 @@ def test_fitted_variance_of_known_errors():
 def test_closeups_that_know_nothing_do_no_harm(small, monkeypatch):
     """The corrections of an untrained offset network are a constant, which is bias, or noise, which is not believed."""
     for module in (error_models, detectors):
-        for name in ("TRACKED_FROM", "CLOSEUP_FROM"):  # toys are too small to be sure of
-            monkeypatch.setattr(module, name, 0.0)
+        monkeypatch.setattr(module, "TRACKED_FROM", 0.0)  # toys are too small to be sure of
     detector, frames = small
     torch.manual_seed(0)
     closeup = OffsetNetwork(OffsetConfig(4, 32)).eval()
     torch.nn.init.normal_(closeup.head[-1].weight, std=0.5)
-    full = replace(detector, window_network=detector.frame_network, window_px=64, closeup_network=closeup)
+    full = replace(detector, window_network=detector.frame_network, window_px=64, closeup_network=closeup, closeup_from=0.0)
     frames = frames[:10]
     once = fit_error_models(full, frames)
     assert set(once.error_models) == {"frame", "window", "closeup", "closer", "tracking"}
