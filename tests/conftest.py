@@ -30,12 +30,10 @@ LONGEST = (
     "registration/test_registration.py", "surface/test_fitting.py", "training/test_command.py",
 )  # fmt: skip
 #: File -> the file whose worker runs it too: what takes seconds to make for one is there for the other.
-TOGETHER = {
-    "training/test_error_models.py": "training/test_loop.py",  # a trained network
-    "landmarks/test_export.py": "landmarks/test_shipped.py",  # the detector that ships, compiled
-    "test_readme.py": "landmarks/test_shipped.py",
-    "studies/test_registration.py": "landmarks/test_shipped.py",
-}
+TOGETHER = {"tests/training/test_error_models.py": "tests/training/test_loop.py"} | dict.fromkeys(  # a trained network
+    ("tests/landmarks/test_export.py", "tests/test_readme.py", "tests/studies/test_registration.py",
+     "lib/landmarks/detector.py"), "tests/landmarks/test_shipped.py",  # the detector that ships, compiled
+)  # fmt: skip
 
 hypothesis.settings.register_profile("microstereo", derandomize=True, deadline=None, max_examples=50, database=None)
 hypothesis.settings.load_profile("microstereo")
@@ -48,7 +46,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     order = {TESTS / name: rank for rank, name in enumerate(LONGEST)}
     assert all(path.is_file() for path in order), "LONGEST names a file that is gone"
-    assert all((TESTS / name).is_file() for pair in TOGETHER.items() for name in pair), "TOGETHER names a file that is gone"
+    gone = [name for pair in TOGETHER.items() for name in pair if not (TESTS.parent / name).is_file()]
+    assert not gone, "TOGETHER names files that are gone"
     items.sort(key=lambda item: order.get(item.path, len(order)))
     cuda = shutil.which("nvidia-smi") is not None and _torch_sees_cuda()
     for item in items:
@@ -67,7 +66,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> object | 
 
     class Scheduling(LoadFileScheduling):
         def _split_scope(self, nodeid: str) -> str:
-            file = super()._split_scope(nodeid).removeprefix("tests/")
+            file = super()._split_scope(nodeid)
             return TOGETHER.get(file, file)
 
     return Scheduling(config, log)
