@@ -118,7 +118,9 @@ def lab(argv: list[str]) -> int:
 
 
 def _pytest(argv: list[str]) -> int:
-    return subprocess.call([sys.executable, "-m", "pytest", "-c", ROOT / "environment.toml", f"--rootdir={ROOT}", *argv])
+    keep = {f"MALLOC_{name}_THRESHOLD_": str(1 << 30) for name in ("TRIM", "MMAP")}  # arrays take memory that is at hand
+    command = [sys.executable, "-m", "pytest", "-c", ROOT / "environment.toml", f"--rootdir={ROOT}", *argv]
+    return subprocess.call(command, env=keep | os.environ)
 
 
 def _main_of(name: str, module: str, function: str):

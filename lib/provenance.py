@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from lib import files, paths
+from lib.parallel import cores
 
 __all__ = ["Provenance", "commit", "commit_id", "machine", "plain"]
 
@@ -42,9 +43,8 @@ def commit_id() -> str:
 
 def machine() -> dict:
     """System, processor, cores that this process may use, memory and GPU."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     system = f"{platform.system()} {platform.release()}"
-    return {"system": system, "processor": _processor(), "cores": cores, "memory_gb": _memory_gb(), "gpu": _gpu()}
+    return {"system": system, "processor": _processor(), "cores": cores(), "memory_gb": _memory_gb(), "gpu": _gpu()}
 
 
 @dataclass(frozen=True)

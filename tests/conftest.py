@@ -10,19 +10,29 @@ for _variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_variable, "1")  # before numpy and torch are imported; every core has tests of its own
 os.environ.setdefault("MPLBACKEND", "Agg")
 os.environ.setdefault("OPEN3D_DISABLE_WEB_VISUALIZER", "true")
+os.fsync = lambda file: None  # what tests write need not outlast a crash of the machine
 
 import hypothesis
 import pytest
 
 import lib.workbench  # noqa: F401 - before nbformat: it spares each process seconds
 
-#: The files that take longest, from about 20 to 4 s of the processor: they go first, so that no worker begins one last.
+TESTS = Path(__file__).parent
+#: The files that take longest, from about 25 to 4 s of the processor: they go first, so that no worker begins one last.
 LONGEST = (
-    "adapt/test_adapt.py", "training/test_loop.py", "online/test_faults.py", "test_notebooks.py",
-    "test_notebooks_course.py", "landmarks/test_shipped.py", "calibration/test_estimate.py", "online/test_pipeline.py",
-    "studies/test_calibration.py", "simulator/test_dataset.py", "workbench/test_run.py", "calibration/test_robust.py",
-    "landmarks/test_export.py", "importing/test_import.py", "test_readme.py", "landmarks/test_detector.py",
-    "workbench/test_sweep.py", "training/test_error_models.py", "training/test_command.py",
+    "adapt/test_adapt.py", "landmarks/test_shipped.py", "training/test_loop.py", "online/test_faults.py",
+    "test_notebooks_course.py", "workbench/test_run.py", "simulator/test_dataset.py", "calibration/test_estimate.py",
+    "test_notebooks.py", "online/test_pipeline.py", "studies/test_calibration.py", "matching/test_stereo_pairs.py",
+    "test_readme.py", "landmarks/test_export.py", "studies/test_registration.py", "importing/test_import.py",
+    "calibration/test_robust.py", "landmarks/test_detector.py", "surface/test_reconstruct.py", "test_commands.py",
+    "training/test_error_models.py", "trust/test_diagnosis.py", "online/test_beside.py", "matching/test_match.py",
+    "calibration/test_instruments.py", "workbench/test_sweep.py", "simulator/test_geometry_of_images.py",
+    "registration/test_registration.py", "surface/test_fitting.py", "training/test_command.py",
+)  # fmt: skip
+#: File -> the file whose worker runs it too: what takes seconds to make for one is there for the other.
+TOGETHER = {"tests/training/test_error_models.py": "tests/training/test_loop.py"} | dict.fromkeys(  # a trained network
+    ("tests/landmarks/test_export.py", "tests/test_readme.py", "tests/studies/test_registration.py",
+     "lib/landmarks/detector.py"), "tests/landmarks/test_shipped.py",  # the detector that ships, compiled
 )  # fmt: skip
 
 hypothesis.settings.register_profile("microstereo", derandomize=True, deadline=None, max_examples=50, database=None)
@@ -34,8 +44,10 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    order = {Path(__file__).parent / name: rank for rank, name in enumerate(LONGEST)}
+    order = {TESTS / name: rank for rank, name in enumerate(LONGEST)}
     assert all(path.is_file() for path in order), "LONGEST names a file that is gone"
+    gone = [name for pair in TOGETHER.items() for name in pair if not (TESTS.parent / name).is_file()]
+    assert not gone, "TOGETHER names files that are gone"
     items.sort(key=lambda item: order.get(item.path, len(order)))
     cuda = shutil.which("nvidia-smi") is not None and _torch_sees_cuda()
     for item in items:
@@ -43,6 +55,21 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             item.add_marker(pytest.mark.skip(reason="slow: give --slow"))
         if "cuda" in item.keywords and not cuda:
             item.add_marker(pytest.mark.skip(reason="no NVIDIA GPU"))
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> object | None:
+    """Files go to workers as `TOGETHER` says; any other way of distribution is left to xdist."""
+    if config.getvalue("dist") != "loadfile":
+        return None
+    from xdist.scheduler import LoadFileScheduling
+
+    class Scheduling(LoadFileScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            file = super()._split_scope(nodeid)
+            return TOGETHER.get(file, file)
+
+    return Scheduling(config, log)
 
 
 def _torch_sees_cuda() -> bool:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 import re
+from copy import deepcopy
 from functools import cache
 from pathlib import Path
-from types import SimpleNamespace
+from types import FunctionType, ModuleType, SimpleNamespace
 
 import matplotlib.pyplot as plt
 import nbformat
@@ -52,15 +53,34 @@ def solutions(path: Path) -> list[str]:
 
 
 def begun(path: Path, until: str | None = None) -> dict:
-    """Names that a notebook's cells tagged "basis" make, up to the cell `until`."""
-    names: dict = {"__name__": "notebook"} | stand_ins(path.stem[:2])
-    for cell in cells(path):
-        if cell.id == until:
-            break
-        if tags(cell) & {"parameters", "basis"}:
-            source = "\n".join(line for line in cell.source.splitlines() if not line.startswith("%"))
-            exec(compile(source, cell.id, "exec"), names)
+    """Names that a notebook's cells tagged "basis" make, up to the cell `until`; nobody else has them."""
+    before = [cell.id for cell in cells(path)]
+    before = before if until is None else before[: before.index(until)]
+    basis = [cell for cell in cells(path) if tags(cell) & {"parameters", "basis"} and cell.id in before]
+    return own(made(path, len(basis)))
+
+
+@cache
+def made(path: Path, count: int) -> dict:
+    """Names that the first `count` of these cells make: each cell is executed once."""
+    if count == 0:
+        return {"__name__": "notebook"} | stand_ins(path.stem[:2])
+    names = own(made(path, count - 1))
+    cell = [cell for cell in cells(path) if tags(cell) & {"parameters", "basis"}][count - 1]
+    source = "\n".join(line for line in cell.source.splitlines() if not line.startswith("%"))
+    exec(compile(source, cell.id, "exec"), names)
     return names
+
+
+def own(names: dict) -> dict:
+    """A copy of everything but modules; the notebook's functions see the copies."""
+    same: dict = {}  # what two names share they share in the copy
+    found = {name: value if isinstance(value, ModuleType) else deepcopy(value, same) for name, value in names.items()}
+    for name, value in names.items():
+        if isinstance(value, FunctionType) and value.__globals__ is names:
+            found[name] = FunctionType(value.__code__, found, value.__name__, value.__defaults__, value.__closure__)
+            found[name].__kwdefaults__ = value.__kwdefaults__
+    return found
 
 
 @pytest.fixture(autouse=True)

@@ -142,6 +142,9 @@ class State:
     def evaluate(self, x: np.ndarray, *, derivatives: bool = True) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Pixels y (n, m), dy/dx (n, m, 3) and dy/d(all increments) (n, m, cameras k) at x - x0 = `x` (n, 3)."""
         n, c = len(x), len(self.A)
+        if not (derivatives or self.rho.any() or self.radial.any()):
+            A = self.A.reshape(-1, 3)
+            return x @ A.T + self.offset.ravel(), np.tile(A, (n, 1, 1)), np.zeros((n, 2 * c, 0))
         k = 10 if self.rotation is None else 9
         y, J_x, J_c = np.empty((n, 2 * c)), np.empty((n, 2 * c, 3)), np.zeros((n, 2 * c, k * c if derivatives else 0))
         for i in range(c):

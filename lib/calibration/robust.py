@@ -291,8 +291,8 @@ def _mixture(H: np.ndarray, u: np.ndarray, M: np.ndarray, sigma: np.ndarray, are
     distance2 = _distances2(H, u, M)
     for i in range(rounds):
         log = np.empty((3, k, n))
-        for j in (0, 1):
-            log[j] = np.log(share[:, j] / (2.0 * np.pi * variance[:, j]))[:, None] - distance2 / (2.0 * variance[:, j, None])
+        spread = variance.T[:, :, None]
+        log[:2] = np.log(share.T[:2, :, None] / (2.0 * np.pi * spread)) - distance2 / (2.0 * spread)
         log[2] = np.log(share[:, 2] / area)[:, None]
         top = log.max(axis=0)
         p = np.exp(log - top)
@@ -302,7 +302,7 @@ def _mixture(H: np.ndarray, u: np.ndarray, M: np.ndarray, sigma: np.ndarray, are
         if i > 5 and (likelihood - before < 1e-3).all():
             break
         before = likelihood
-        moments = (p[0] / variance[:, :1] + p[1] / variance[:, 1:]) @ products
+        moments = (p[:2] / spread).sum(axis=0) @ products
         G = moments[:, :16].reshape(k, 4, 4)
         G = G + 1e-12 * np.trace(G, axis1=1, axis2=2)[:, None, None] * np.eye(4)
         M = np.linalg.solve(G, moments[:, 16:].reshape(k, 4, 2))

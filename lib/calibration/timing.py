@@ -126,18 +126,13 @@ def estimate_time_offset(
     def at(offset: float, derivative: int = 0) -> np.ndarray:
         return paths.at(landmark, time + offset, derivative)
 
-    def fitted(offset: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Positions, cameras (m, 4) and residuals (n, m), zero where a view is not used."""
-        x = at(offset)
+    def linearised(offset: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """By how much each pixel moves with the offset (n, m), the weights (n, m, m), and the residuals (n, m); zero where
+        a view is not used.
+        """
+        x, v = at(offset), at(offset, 1)
         matrix = np.vstack([regress(x[rows], y[rows, 2 * c : 2 * c + 2]) for c, rows in enumerate(views.T)])
-        return x, matrix, np.where(used, y - x @ matrix[:, :3].T - matrix[:, 3], 0.0)
-
-    def rms(offset: float) -> float:
-        return float(np.sqrt((fitted(offset)[2] ** 2).sum() / views.sum()))
-
-    def step_and_sd(offset: float) -> tuple[float, float]:
-        (x, matrix, r), v = fitted(offset), at(offset, 1)
-        A = matrix[:, :3]
+        A, r = matrix[:, :3], np.where(used, y - x @ matrix[:, :3].T - matrix[:, 3], 0.0)
         sigma_u, sigma_x = estimate_noise(r[views.any(axis=1)], A, 4 * m, views[views.any(axis=1)])
         W = precision(np.broadcast_to(sigma_u**2 * np.eye(m) + sigma_x**2 * A @ A.T, (len(x), m, m)), views)
         # Sweep [x, 1] out of the velocity's image: the cameras are fitted along with the offset.
@@ -145,15 +140,12 @@ def estimate_time_offset(
         for c, rows in enumerate(views.T):
             swept = v[rows] - np.column_stack([x[rows], np.ones(rows.sum())]) @ regress(x[rows], v[rows]).T
             image[rows, 2 * c : 2 * c + 2] = swept @ A[2 * c : 2 * c + 2].T
-        information = np.einsum("ni,nij,nj->", image, W, image)
-        if information <= 0:
-            raise ValueError("kinematics: the tool moves at no varying speed; the offset cannot be seen.")
-        variance = sandwich(image[:, :, None], W, r, frame, landmark, np.zeros((1, 1)))[0][0, 0]
-        return float(np.einsum("ni,nij,nj->", image, W, r) / information), float(np.sqrt(variance))
+        return image, W, r
 
     low, high = start_s - search_s, start_s + search_s
     trial = np.linspace(low, high, _GRID)
-    misfits = shift_misfits(np.stack([at(offset) for offset in trial]), y)
+    x_mm = np.stack([at(offset) for offset in trial])
+    misfits = shift_misfits(x_mm, y)
     clear = (np.median(misfits, axis=0) > misfits.min(axis=0) + _CLEAR).all() and np.ptp(misfits.argmin(axis=0)) <= 2
     misfit = misfits.sum(axis=1)
     offset = float(trial[misfit.argmin()])
@@ -169,16 +161,31 @@ def estimate_time_offset(
             far_px = _NEAR * float(np.nanstd(y, axis=0).max() * np.sqrt(12))
             views = consensus(at(offset), y, far_px, np.random.default_rng(0))[0]
         used = np.repeat(views, 2, axis=1)
-        misfit = np.array([rms(t) for t in trial])  # of right detections squares tell more than absolute values
+        misfit = _rms_px(x_mm, y, views)  # of right detections squares tell more than absolute values
         offset = float(trial[misfit.argmin()])
         for _ in range(20):
-            step, sd = step_and_sd(offset)
+            image, W, r = linearised(offset)
+            information = np.einsum("ni,nij,nj->", image, W, image)
+            if information <= 0:
+                raise ValueError("kinematics: the tool moves at no varying speed; the offset cannot be seen.")
+            step = np.einsum("ni,nij,nj->", image, W, r) / information
             offset = float(np.clip(offset + step, low, high))
             if abs(step) < 1e-7:
                 break
     if offset in (low, high):
         raise ValueError(f"search_s: {offset:.3f} s, lies at the end of the search; widen search_s or move start_s.")
-    return TimeOffset(offset, sd, rms(offset), trial, misfit)
+    sd = float(np.sqrt(sandwich(image[:, :, None], W, r, frame, landmark, np.zeros((1, 1)))[0][0, 0]))
+    return TimeOffset(offset, sd, float(_rms_px(at(offset)[None], y, views)[0]), trial, misfit)
+
+
+def _rms_px(x: np.ndarray, y: np.ndarray, views: np.ndarray) -> np.ndarray:
+    """RMS (t,) of the views (n, cameras) of pixels y (n, m) about the least-squares cameras of positions x (t, n, 3)."""
+    squares = np.zeros(len(x))
+    for c, rows in enumerate(views.T):
+        own, u = (v - v.mean(axis=-2, keepdims=True) for v in (x[:, rows], y[rows, 2 * c : 2 * c + 2]))
+        A = np.linalg.pinv(own.mT @ own, hermitian=True) @ (own.mT @ u)
+        squares += ((u - own @ A) ** 2).sum(axis=(1, 2))
+    return np.sqrt(squares / views.sum())
 
 
 def shift_misfits(x: np.ndarray, y: np.ndarray, least_share: float = 0.6) -> np.ndarray:

@@ -264,13 +264,8 @@ def _inverse_3x3(N: np.ndarray) -> np.ndarray:
     """Inverses of symmetric matrices (n, 3, 3) by cofactors: several times faster than a stack of factorisations."""
     n = np.ascontiguousarray(np.moveaxis(N, 0, -1))
     a, b, c, d, e, f = n[0, 0], n[0, 1], n[0, 2], n[1, 1], n[1, 2], n[2, 2]
-    cofactor = np.array(
-        [
-            [d * f - e * e, c * e - b * f, b * e - c * d],
-            [c * e - b * f, a * f - c * c, b * c - a * e],
-            [b * e - c * d, b * c - a * e, a * d - b * b],
-        ]
-    )
+    p, q, r = c * e - b * f, b * e - c * d, b * c - a * e
+    cofactor = np.array([[d * f - e * e, p, q], [p, a * f - c * c, r], [q, r, a * d - b * b]])
     return np.moveaxis(cofactor / (a * cofactor[0, 0] + b * cofactor[0, 1] + c * cofactor[0, 2]), -1, 0)
 
 

@@ -20,6 +20,16 @@ TimeUnit = Literal["s", "ms", "us", "ns", "iso"]
 class _Section(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
+    def _problem(self) -> str:
+        """What is wrong with the keys together; "" where they agree."""
+        return ""
+
+    @model_validator(mode="after")
+    def _agree(self) -> Self:
+        if problem := self._problem():
+            raise ValueError(problem)
+        return self
+
 
 class Table(_Section):
     """A CSV file, or a ROS bag, and its column of times.  A bag's columns are called "/topic:field.of.the.message"."""
@@ -50,12 +60,10 @@ class Video(_Section):
     format: Literal["jpg", "png"] = "jpg"
     jpeg_quality: Annotated[int, Field(ge=50, le=100)] = 95
 
-    @model_validator(mode="after")
-    def _agree(self) -> Self:
+    def _problem(self) -> str:
         wanted = [*(["left", "right"] if self.layout == "two" else ["file"]), *({self.times} & {"table", "fps"})]
-        if missing := [key for key in wanted if not getattr(self, key)]:
-            raise ValueError(f"layout {self.layout!r} with times {self.times!r} needs {' and '.join(missing)}")
-        return self
+        missing = [key for key in wanted if not getattr(self, key)]
+        return f"layout {self.layout!r} with times {self.times!r} needs {' and '.join(missing)}" if missing else ""
 
 
 class Pose(_Section):
@@ -67,12 +75,10 @@ class Pose(_Section):
     gripper: str = ""
     gripper_unit: Literal["rad", "deg", "mm"] = "rad"
 
-    @model_validator(mode="after")
-    def _agree(self) -> Self:
+    def _problem(self) -> str:
         n = {"quaternion_xyzw": 4, "quaternion_wxyz": 4, "matrix": 9}.get(self.rotation_kind, 3)
-        if len(self.rotation) != n:
-            raise ValueError(f"{self.rotation_kind} has {n} columns, rotation names {len(self.rotation)}")
-        return self
+        told = len(self.rotation)
+        return f"{self.rotation_kind} has {n} columns, rotation names {told}" if told != n else ""
 
 
 class Frame(_Section):
@@ -92,11 +98,9 @@ class Robot(Table):
     search_s: Annotated[float, Field(gt=0)] = 0.5
     frame: Frame = Frame()
 
-    @model_validator(mode="after")
-    def _agree(self) -> Self:
-        if (self.landmarks is None) == (self.pose is None):
-            raise ValueError("give the columns either of the landmarks or of the pose")
-        return self
+    def _problem(self) -> str:
+        one = (self.landmarks is None) != (self.pose is None)
+        return "" if one else "give the columns either of the landmarks or of the pose"
 
 
 class Hinge(_Section):
@@ -106,11 +110,9 @@ class Hinge(_Section):
     axis: Vector
     jaw_mm: Vector
 
-    @model_validator(mode="after")
-    def _agree(self) -> Self:
-        if not any(self.axis) or not any(self.jaw_mm):
-            raise ValueError("axis and jaw_mm are directions, so they cannot be 0: measure them on the tool or its drawing")
-        return self
+    def _problem(self) -> str:
+        known = any(self.axis) and any(self.jaw_mm)
+        return "" if known else "axis and jaw_mm are directions, so they cannot be 0: measure them on the tool or its drawing"
 
 
 class Tool(_Section):
@@ -136,11 +138,9 @@ class Labels(_Section):
     first_frame: int = 0
     sides: tuple[str, str] = ("left", "right")
 
-    @model_validator(mode="after")
-    def _agree(self) -> Self:
-        if bool(self.file) == bool(self.left or self.right):
-            raise ValueError("give either file, which holds both cameras, or left and right")
-        return self
+    def _problem(self) -> str:
+        one = bool(self.file) != bool(self.left or self.right)
+        return "" if one else "give either file, which holds both cameras, or left and right"
 
 
 class Mapping(_Section):
@@ -156,17 +156,15 @@ class Mapping(_Section):
     tool: Tool = Tool()
     labels: Labels | None = None
 
-    @model_validator(mode="after")
-    def _agree(self) -> Self:
+    def _problem(self) -> str:
         ours, columns = set(self.landmarks), self.robot.landmarks
         labels = self.labels.names if self.labels else {}
         if len(ours) < len(self.landmarks):
-            raise ValueError(f"landmarks {list(self.landmarks)} repeat a name")
+            return f"landmarks {list(self.landmarks)} repeat a name"
         if unknown := sorted({*(columns or {}), *labels, *self.tool.landmarks_mm, *self.tool.pivot_s} - ours):
-            raise ValueError(f"landmarks = {list(self.landmarks)} lacks {', '.join(unknown)}, which another table names")
-        if missing := sorted(ours - set(columns or ours)):
-            raise ValueError(f"robot.landmarks lacks {', '.join(missing)}")
-        return self
+            return f"landmarks = {list(self.landmarks)} lacks {', '.join(unknown)}, which another table names"
+        missing = sorted(ours - set(columns or ours))
+        return f"robot.landmarks lacks {', '.join(missing)}" if missing else ""
 
 
 def read_mapping(path: str | Path) -> Mapping:

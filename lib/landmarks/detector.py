@@ -9,6 +9,7 @@ last measures each landmark in a closeup.  The first stage alone, at full resolu
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from typing import Self
 
@@ -157,8 +158,9 @@ class Detector:
             raise ValueError("closeup_network: looks at what a tool_network or a window_network has found; give one.")
         if self.mirror and self.window_network and self.window_px % self.window_network.stride:
             raise ValueError(f"mirror: needs window_px to be a multiple of the stride, got {self.window_px}.")
+        run = cache(accelerated)  # stages may share a network
         for stage in self.stages:
-            self._run[stage] = accelerated(self.network_of(stage), self.engine, mirror=self.mirrors(stage))
+            self._run[stage] = run(self.network_of(stage), self.engine, mirror=self.mirrors(stage))
 
     def network_of(self, stage: str) -> Network:
         """The network of a stage, which may be another stage's."""

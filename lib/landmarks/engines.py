@@ -9,13 +9,16 @@ import sys
 import threading
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cache, lru_cache
+from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from lib import files, paths
 from lib.landmarks.checkpoints import checksum
 from lib.landmarks.network import Network
 
@@ -57,8 +60,8 @@ def accelerated(network: Network, engine: str, *, mirror: bool = False) -> Calla
         if not importlib.util.find_spec("openvino"):
             raise ValueError("engine: openvino is not installed here; choose 'torch'.")
         return OpenVinoNetwork(network, mirror=mirror, precision="f32" if engine.endswith("float32") else None)
-    last = LastOutput(network, mirror=mirror).to(memory_format=torch.channels_last)
-    return lambda images: [last(images)]
+    last = cache(lambda: LastOutput(network, mirror=mirror).to(memory_format=torch.channels_last))  # made when it is needed
+    return lambda images: [last()(images)]
 
 
 class LastOutput(nn.Module):
@@ -122,10 +125,20 @@ def _request(compiled: OpenVinoNetwork, shape: tuple[int, ...]) -> object:
 
 @lru_cache(maxsize=16)
 def _converted(compiled: OpenVinoNetwork) -> object:
-    """The network as a model that can be reshaped; it takes longer than to compile it for each shape."""
+    """The network as a model that can be reshaped.  Converting takes seconds: the cache keeps it, a folder for this code."""
+    rests_on = __file__, Path(__file__).with_name("network.py"), paths.ROOT / "lib" / "environment.lock"
+    folder = paths.CACHE / "openvino" / files.digest(*rests_on)
+    kept = folder / f"{compiled.digest[:16]}{'-mirror' * compiled.mirror}.xml"
+    if kept.is_file():
+        return openvino().Core().read_model(kept)
     shape = (2, 3, *2 * (getattr(compiled.network.config, "size_px", 128),))
     module = LastOutput(compiled.network, mirror=compiled.mirror).eval()
     with torch.no_grad(), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # tracing fixes the shape, which `reshape` changes
         traced = torch.jit.freeze(torch.jit.trace(module, torch.zeros(shape), check_trace=False))
-        return openvino().convert_model(traced, input=[(list(shape), np.float32)])  # of a trace it is much quicker
+        model = openvino().convert_model(traced, input=[(list(shape), np.float32)])  # of a trace it is much quicker
+    with suppress(OSError, RuntimeError):  # a full disk costs time alone
+        folder.mkdir(parents=True, exist_ok=True)
+        with files.whole(kept) as graph, files.whole(kept.with_suffix(".bin")) as weights:  # the graph is there last
+            openvino().serialize(model, graph, weights)
+    return model

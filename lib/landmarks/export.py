@@ -59,9 +59,7 @@ class StageWithDecoding(nn.Module):
         return peaks.u * stride + (stride - 1) / 2, covariance * (stride[:, None] * stride), confidence
 
 
-def export(
-    detector: Detector, folder: str | Path, examples: np.ndarray | None = None
-) -> dict[str, tuple[Path, float]]:
+def export(detector: Detector, folder: str | Path, examples: np.ndarray | None = None) -> dict[str, tuple[Path, float]]:
     """Write every stage as ``STAGE.onnx`` into `folder`, if it agrees with torch.
 
     Returns the file of each stage, and its largest difference from torch in px, over landmarks that torch finds.

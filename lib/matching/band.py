@@ -106,13 +106,8 @@ def plan_search(images: Images, masks: Masks, rig: StereoRig, where: Where) -> S
         margin = 4 / min(1.0, COARSE_WIDTH_PX / max(whole.size_px))
         range_px = float(low - margin), float(high + margin)
     range_mm = whole.depth_range_mm(range_px) if depth_range_mm is None else depth_range_mm
-    return Search(
-        rectification,
-        scale,
-        rectification.search_range_px(range_mm, shapes[1]),
-        off_line_px * scale if abs(off_line_px) >= 0.5 else 0.0,
-        n_found,
-    )
+    off_line_px = off_line_px * scale if abs(off_line_px) >= 0.5 else 0.0
+    return Search(rectification, scale, rectification.search_range_px(range_mm, shapes[1]), off_line_px, n_found)
 
 
 def _coarse_displacement(images: Images, masks: Masks, rig: StereoRig, whole: Rectification) -> tuple[np.ndarray, int]:

@@ -16,7 +16,7 @@ from lib.matching.result import SIGMA_LEFT_PX, Matches
 __all__ = ["atomic_maps", "match_free", "predicted_bytes"]
 
 #: Bytes of the full maps of atomic patches that are held at once.
-CHUNK_BYTES = 96 << 20
+CHUNK_BYTES = 32 << 20
 
 
 def predicted_bytes(shape_left: tuple[int, int], shape_right: tuple[int, int], *, downscale: int = 1) -> int:

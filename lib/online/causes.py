@@ -113,27 +113,22 @@ _MOVES = {
 
 def _lateness(rig, frames, past, covariance_px2) -> tuple[float, Explanation] | None:
     """The delay between report and images that explains the frames best."""
-    number = {int(part.frame[0]): part for part in past}
-    best = None
+    number = {int(part.frame[0]): part for part in (*past, *frames)}
+    numbers, best = [int(part.frame[0]) for part in frames], None
     for delay in [*range(-_LATEST, 0), *range(1, _LATEST + 1)]:
-        pairs = []
-        for part in frames:
-            seen, told = (part, number.get(int(part.frame[0]) + delay))
-            if delay > 0:  # the report is late: what it says now, the images showed before
-                seen, told = number.get(int(part.frame[0]) - delay), part
-            if seen is None or told is None:
-                break
-            pairs.append(replace(seen, x_mm=told.x_mm))
-        else:
-            data = Correspondences.join(pairs).complete
-            if len(data) < 0.7 * len(covariance_px2):
-                continue
-            noise = np.resize(covariance_px2, (len(data), 4, 4))
-            # Fewer rows must not make a delay likelier.
-            value = misfit(rig, data, noise, 2) * len(covariance_px2) / len(data)
-            if best is None or value < best[0]:
-                who = "robot's report is" if delay > 0 else "images are"
-                best = value, Explanation("clock", f"the {who} late by {abs(delay)} frames", rig)
+        seen = [number.get(i - max(delay, 0)) for i in numbers]  # what a late report says now, the images showed before
+        told = [number.get(i + min(delay, 0)) for i in numbers]
+        if any(part is None for part in (*seen, *told)):
+            continue
+        data = replace(Correspondences.join(seen), x_mm=np.concatenate([part.x_mm for part in told])).complete
+        if len(data) < 0.7 * len(covariance_px2):
+            continue
+        noise = np.resize(covariance_px2, (len(data), 4, 4))
+        # Fewer rows must not make a delay likelier.
+        value = misfit(rig, data, noise, 2) * len(covariance_px2) / len(data)
+        if best is None or value < best[0]:
+            who = "robot's report is" if delay > 0 else "images are"
+            best = value, Explanation("clock", f"the {who} late by {abs(delay)} frames", rig)
     return best
 
 

@@ -184,9 +184,7 @@ class OnlinePipeline:
 
             def pair(rig: StereoRig | None) -> Correspondences:
                 linear = None if rig is None else rig.linear
-                rows = kinematics(
-                    u[:1], u[1:], linear=linear, **{name: values[None] for name, values in stated.items()}
-                )
+                rows = kinematics(u[:1], u[1:], linear=linear, **{name: values[None] for name, values in stated.items()})
                 if not isinstance(rows, Correspondences) or rows.landmark.tolist() != list(range(len(LANDMARKS))):
                     raise ValueError("kinematics: expected a function that returns the Correspondences of one frame.")
                 return replace(rows, frame=index)
@@ -216,13 +214,9 @@ class OnlinePipeline:
                 self._surface = None  # its cameras stood elsewhere
         due = self._index % self.settings.surface_every == 0
         if due and result.state in ("tracking", "unseen", "robot") and tracker.doubted_since is None:
-            options = {
-                "setting": self.settings.setting,
-                "u_landmarks": (result.landmarks.u_left, result.landmarks.u_right),
-                "percentiles": (1, 99),
-                "control": self.settings.control,
-                "smoothness": self._smoothness,
-            } | self._where_to_search()
+            tool = result.landmarks.u_left, result.landmarks.u_right
+            options = {"setting": self.settings.setting, "control": self.settings.control, "smoothness": self._smoothness}
+            options |= {"u_landmarks": tool, "percentiles": (1, 99)} | self._where_to_search()
             self.surfaces.submit(SurfaceJob(left, right, tracker.rig, self._index, result.time_s, options))
         done, event = self.surfaces.collect()
         if event:

@@ -83,9 +83,7 @@ class Settings:
 def _nothing() -> Correspondences:
     """The three landmarks, none of them seen or reported."""
     missing = np.full((len(LANDMARKS), 2), np.nan)
-    return Correspondences.of_points(
-        np.full((len(LANDMARKS), 3), np.nan), missing, missing, landmark=range(len(LANDMARKS))
-    )
+    return Correspondences.of_points(np.full((len(LANDMARKS), 3), np.nan), missing, missing, landmark=range(len(LANDMARKS)))
 
 
 def _unknown() -> np.ndarray:

@@ -185,9 +185,7 @@ def _parameters(camera: AffineCamera | NearAffineCamera) -> int:
     return 6 if getattr(camera, "inverse_distance_per_mm", 0.0) else 5
 
 
-def _evaluate(
-    rig: StereoRig, data: _Observed, loss: Loss, stale: RigidTransform
-) -> tuple[float, tuple[np.ndarray, ...]]:
+def _evaluate(rig: StereoRig, data: _Observed, loss: Loss, stale: RigidTransform) -> tuple[float, tuple[np.ndarray, ...]]:
     """Negative log likelihood but for a constant; residuals (n, 4), chi-squares (n,) and weights (n,) of the rows."""
     try:
         residual = data.y - np.hstack(rig.project(stale.apply(data.x)))

@@ -108,4 +108,3 @@ def _sharp(labelled: LabelledImage) -> np.ndarray:
     """(3,) bool: landmarks that a closeup can show, of tools with a direction."""
     there = np.isfinite(labelled.in_view).all(1) & (labelled.visibility == 2)
     return there & np.isfinite(windows.tool_pose(labelled.u[None])[1])
-

@@ -36,19 +36,15 @@ class Shape:
     @classmethod
     def of(cls, r2: np.ndarray, start: float, least: float, before: float | None = None) -> Self:
         """Most probable for squared residuals (k,), with `least` degrees of freedom or more, not far from those `before`."""
-        best, tried = None, _FREEDOM[least <= _FREEDOM]
+        tried = _FREEDOM[least <= _FREEDOM]
         if before is not None:
             tried = tried[np.abs(np.arange(len(tried)) - np.flatnonzero(tried == before)[0]) <= 1]
-        for freedom in tried:
-            s2 = start**2
-            for _ in range(4):
-                weight = (freedom + 2.0) / (freedom + r2 / s2)
-                s2 = max((weight * r2).mean() / 2.0, _LEAST_PX**2)
-            shape = cls(float(np.sqrt(s2)), float(freedom))
-            value = log_density(r2, shape).sum()
-            if best is None or value > best[0]:
-                best = value, shape
-        return best[1]
+        freedom, s2 = tried[:, None], np.full((len(tried), 1), start**2)
+        for _ in range(4):
+            weight = (freedom + 2.0) / (freedom + r2 / s2)
+            s2 = np.maximum((weight * r2).mean(axis=1, keepdims=True) / 2.0, _LEAST_PX**2)
+        best = log_density(r2, cls(np.sqrt(s2), freedom)).sum(axis=1).argmax()
+        return cls(float(np.sqrt(s2[best, 0])), float(tried[best]))
 
 
 def log_density(r2: np.ndarray, shape: Shape) -> np.ndarray:

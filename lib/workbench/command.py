@@ -195,15 +195,9 @@ class _Report:
         self.folder, self.notebooks = folder, list(notebooks)
         self.start = time.monotonic()
         self.content = {
-            "format": "microstereo.metrics",
-            "version": 1,
-            "state": "running",
-            "profile": profile,
-            "parameters": given,
-            "started": datetime.datetime.now().astimezone().isoformat(timespec="seconds"),
-            "seconds": 0.0,
-            "commit": commit(),
-            "machine": machine(),
+            "format": "microstereo.metrics", "version": 1, "state": "running", "profile": profile, "parameters": given,
+            "started": datetime.datetime.now().astimezone().isoformat(timespec="seconds"), "seconds": 0.0,
+            "commit": commit(), "machine": machine(),
             "weights": files.digest(paths.MODELS / "default.safetensors"),
             "versions": execution.versions(),
             "notebooks": [
@@ -211,11 +205,7 @@ class _Report:
                  "page": None, "executed": None, "left_out": None, "verdict": None, "reasons": []}
                 for book in notebooks
             ],
-            "verdict": None,
-            "reasons": [],
-            "metrics": [],
-            "figures": [],
-            "download": None,
+            "verdict": None, "reasons": [], "metrics": [], "figures": [], "download": None,
         }  # fmt: skip
         self.content["previous"] = headlines.previous_values(folder.parent, self.content)
         (folder / "figures").mkdir()

@@ -214,12 +214,9 @@ def _cost(executed: Iterable[Path]) -> dict:
     """What all runs of a table took, also those of an earlier call, and the machines that ran them."""
     kept = [nbformat.read(path, as_version=4).metadata for path in executed]
     machines = {json.dumps(metadata.microstereo.machine): metadata.microstereo.machine for metadata in kept}
-    return {
-        "machine": machines.popitem()[1] if len(machines) == 1 else list(machines.values()),
-        "runs": len(kept),
-        "seconds": sum(metadata.papermill.duration for metadata in kept),
-        "cpu_seconds": None,
-    }
+    where = machines.popitem()[1] if len(machines) == 1 else list(machines.values())
+    seconds = sum(metadata.papermill.duration for metadata in kept)
+    return {"machine": where, "runs": len(kept), "seconds": seconds, "cpu_seconds": None}
 
 
 def _code_digest(book: Path) -> str:

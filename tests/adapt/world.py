@@ -1,6 +1,6 @@
 """A lab without pictures: blank frames that carry their own number, and a stand-in for the detector that knows the rest."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 
@@ -60,7 +60,21 @@ class World:
             for i, t in enumerate(self.time_s):
                 writer.add(*(np.full((*SIZE[::-1], 3), (i + 1, 60 * side + 20, 90), np.uint8) for side in (0, 1)), t)
             writer.kinematics(rate * sample_s + clock_s, x)
-        return Recording.open(folder)
+        recording = Recording.open(folder)
+        return replace(recording, frames=Kept(recording.frames))
+
+
+class Kept:
+    """Frames that are read once: every stage looks at them anew."""
+
+    def __init__(self, frames):
+        self.time_s, self._read = frames.time_s, cache(frames.__getitem__)
+
+    def __len__(self):
+        return len(self.time_s)
+
+    def __getitem__(self, index):
+        return self._read(index)
 
 
 @dataclass(eq=False)

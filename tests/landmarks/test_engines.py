@@ -8,11 +8,19 @@ import numpy as np
 import pytest
 import torch
 
-from lib.landmarks import Detector
+from lib import paths
+from lib.landmarks import Detector, engines
 from lib.landmarks.engines import OpenVinoNetwork, accelerated, default_engine, openvino
 from lib.landmarks.network import HourglassConfig, OffsetConfig, OffsetNetwork, StackedHourglass
 
 needs_openvino = pytest.mark.skipif(not importlib.util.find_spec("openvino"), reason="OpenVINO is not installed here")
+
+
+@pytest.fixture(autouse=True)
+def no_model_kept(tmp_path, monkeypatch):
+    """By an earlier run: every network is converted here."""
+    monkeypatch.setattr(paths, "CACHE", tmp_path)
+
 
 @needs_openvino
 def test_openvino_gives_the_heatmaps_of_torch():
@@ -64,6 +72,17 @@ def test_the_mean_with_the_mirror_image_does_not_know_left_from_right(engine):
     assert not torch.allclose(both.outputs(windows, "window"), plain.outputs(windows, "window"), **close)
     with pytest.raises(ValueError, match="mirror: needs window_px"):
         Detector(network, window_network=network, window_px=126, mirror=True)
+
+
+@needs_openvino
+def test_a_converted_network_is_kept_and_read_again(tmp_path, monkeypatch):
+    for name in ("_converted", "_request"):  # what this process keeps
+        monkeypatch.setattr(engines, name, getattr(engines, name).__wrapped__)
+    network, images = OpenVinoNetwork(OffsetNetwork(OffsetConfig(4, 32)).eval()), torch.rand(3, 3, 32, 32)
+    first = network(images)[-1]
+    assert len(list(tmp_path.rglob("*.xml"))) == len(list(tmp_path.rglob("*.bin"))) == 1
+    monkeypatch.setattr(engines, "LastOutput", None)  # nothing is converted again
+    assert torch.equal(network(images)[-1], first)
 
 
 @needs_openvino
