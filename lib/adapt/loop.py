@@ -244,12 +244,12 @@ class _Work:
         held_out, _ = self.images(np.union1d(doubt_on, parts["stop"]), teacher, seen)
         if len(images) < 8 or len(held_out) < 4:
             raise RefusalError(f"robot: it labels {len(images)} images to learn from and {len(held_out)} others; 8 and 4 do.")
-        parts_done: dict[str, float] = {}
+        done = {}
 
-        def progress(stage: str, done: float) -> None:
-            parts_done[stage] = done
-            share = ", ".join(f"{name} {100 * part:.0f} %" for name, part in sorted(parts_done.items()))
-            self.say(f"Round {k} ({share})", min(sum(parts_done.values()) / len(detector.networks), 1.0))
+        def progress(stage: str, part: float) -> None:
+            done[stage] = part
+            shares = ", ".join(f"{name} {100 * one:.0f} %" for name, one in sorted(done.items()))
+            self.say(f"Round {k} ({shares})", min(sum(done.values()) / len(detector.networks), 1.0))
 
         with warnings.catch_warnings(record=True) as told:
             tuned = tune(

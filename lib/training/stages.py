@@ -41,8 +41,6 @@ __all__ = ["STAGES", "assemble", "card", "finetune", "stage_config", "stage_data
 STAGES = {"frame": 32, "tool": 48, "closeup": 32}
 #: Standard deviation of a label, as a share of the tool's length, at which a stage lets it count half.
 LABEL_SD = {"frame": 0.1, "tool": 0.04, "closeup": 0.02}
-#: How the time of a fine-tuning is shared.
-_TIME = {"frame": 2.0, "tool": 2.0, "window": 2.0, "closeup": 1.0}
 _SOURCES = {"frame": FrameSource, "tool": ToolSource, "closeup": CloseupSource}
 
 
@@ -107,55 +105,46 @@ def finetune(
         variance = np.trace(covariance_px2, axis1=-2, axis2=-1) / 2 / length**2
     images, held_out = ([part[i] for i in rows] for part, rows in zip((images, held_out), usable, strict=True))
     doubt_on = validation_images(simulated) if isinstance(simulated, str | Path) else (simulated or ())[::3]
-    began, names, stopped, parts = time.perf_counter(), list(detector.networks), threading.Event(), {}
-    bar = tqdm(total=len(names), disable=progress is not True, unit="stage", bar_format="{desc}{percentage:3.0f} %|{bar}|")
+    began, names, stopped = time.perf_counter(), list(detector.networks), threading.Event()
+    bars = {stage: tqdm(total=1.0, desc=stage, disable=progress is not True, bar_format="{l_bar}{bar}") for stage in names}
 
     def told(stage: str, part: float) -> None:
         if stopped.is_set():
             raise InterruptedError(f"{stage}: the training was interrupted.")
-        parts[stage] = part
-        bar.n = sum(parts.values())
-        bar.refresh()
+        bars[stage].update(part - bars[stage].n)
         if callable(progress):
             progress(stage, part)
 
     def trained(lane: list[str]) -> dict[str, Network]:
-        """The stages of a thread, one after the other; each has its share of the time."""
+        """The stages of a thread, one after the other; each has its share of the time, the closeups half of the others'."""
         found = {}
         for number, stage in enumerate(lane):
-            network = detector.networks[stage]
-            weight = 1 / (1 + variance[usable[0]] / LABEL_SD[stage] ** 2)
-            source: Source = _SOURCES[stage].of(images, weight=weight)
+            source: Source = _SOURCES[stage].of(images, weight=1 / (1 + variance[usable[0]] / LABEL_SD[stage] ** 2))
             if isinstance(simulated, str | Path):
                 source = Mixed(source, _SOURCES[stage].load(simulated))
             elif simulated:
                 source = Mixed(source, _SOURCES[stage].of([one for i, one in enumerate(simulated) if i % 3]))
-            config = replace(stage_config(stage), network=network.config, steps=steps, seed=seed)
-            more = {"batch_size": min(config.batch_size, 24), "validate_every": max(1, steps // 3)}
-            config = replace(config, learning_rate=5e-4, ema=0.98, **more)
-            start = Training(network, [], {"shipped": detector.metadata.get("commit")})
-            left = None
+            config = replace(stage_config(stage), network=detector.networks[stage].config, steps=steps, seed=seed)
+            size = min(config.batch_size, 24)
+            config = replace(config, learning_rate=5e-4, ema=0.98, batch_size=size, validate_every=max(1, steps // 3))
+            start, left = Training(detector.networks[stage], [], {"shipped": detector.metadata.get("commit")}), None
             if minutes is not None:
-                share = _TIME[stage] / sum(_TIME[later] for later in lane[number:])
-                left = share * (60 * minutes - (time.perf_counter() - began))
-            found[f"{stage}_network"] = train(
-                config, source, _still(stage, held_out), Path(folder) / stage, initial=start, max_seconds=left,
-                progress=partial(told, stage),
-            ).network
+                shares = [0.5 if later == "closeup" else 1.0 for later in lane[number:]]
+                left = shares[0] / sum(shares) * (60 * minutes - (time.perf_counter() - began))
+            where, how = (source, _still(stage, held_out), Path(folder) / stage), {"initial": start, "max_seconds": left}
+            found[f"{stage}_network"] = train(config, *where, progress=partial(told, stage), **how).network
         return found
 
     # A second thread of torch's own makes such small steps hardly faster, and far slower where the machine is busy.
-    threads = min(cores(), len(names))
-    lanes, networks = [*([name] for name in names[: threads - 1]), names[threads - 1 :]], {}
-    start = {"initializer": torch.set_num_threads, "initargs": (1,)}
-    with single_threaded_torch(), ThreadPoolExecutor(threads, **start) as pool:
+    threads, networks, own = min(cores(), len(names)), {}, {"initializer": torch.set_num_threads, "initargs": (1,)}
+    lanes = [*([name] for name in names[: threads - 1]), names[threads - 1 :]]
+    with single_threaded_torch(), ThreadPoolExecutor(threads, **own) as pool:
         try:
             for found in [pool.submit(trained, lane) for lane in lanes]:
                 networks |= found.result()
         except BaseException:
             stopped.set()
             raise
-    bar.close()
     tuned = replace(detector, **networks, closeup_from=MISSING_BELOW)
     try:
         tuned = fit_error_models(tuned, [*held_out, *doubt_on], progress=progress is True)
