@@ -69,7 +69,7 @@ def main(argv: list[str]) -> int:
     add("--labels", type=Path, metavar="FILE", help="COCO keypoints, as annotations.json: 10 labelled pairs are a good start")
     add("--minutes", type=float, default=20.0, help="of training (default: 20)")
     add("--out", type=Path, metavar="FOLDER", help="of weights, report.json and report.html (default: runs/adapt-NAME)")
-    add("--weights", metavar="FILE", help="the detector to start from (default: the one that ships)")
+    add("--weights", metavar="FILE", help="the detector to start from (default: any_tool; without a robot the shipped)")
     add("--seed", type=int, default=0)
     a = parser.parse_args(argv)
     if not 0 < a.minutes < 1e4:

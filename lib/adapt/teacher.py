@@ -38,6 +38,7 @@ _CONTRADICTED = 0.2
 #: Standard deviation of a detector's own constant error, as a share of the tool's length: along, across, normal.  The base
 #: has no edge that ends along the shaft.  Chosen by the closeups' errors in four recordings of unfamiliar tools and lights.
 _OWN_BIAS = 0.004 * np.array([[2.5, 1.0, 1.5], [1.2, 1.0, 1.5], [1.2, 1.0, 1.5]])
+_ODD = 0.2  # share of a large offset that may be the detector's all the same: some tools it knows far worse than others
 #: Gain in log likelihood of a detection, by which cameras of their own for a part of the time must explain it better.
 _SURE_MOVE = 0.1
 _CLICK_PX = 1.5  # of labels set by hand
@@ -357,7 +358,7 @@ def _robots_share(found: LandmarkOffsets, own_sd: np.ndarray) -> tuple[np.ndarra
     width = widths[(np.log(total) + found.offset**2 / total).sum(axis=(1, 2)).argmin(), 0, 0]
     # What the rig hides moves cameras and offsets together and leaves the labels where they are: no reason to believe less.
     share = width**2 / (width**2 + own_sd**2)
-    return share * found.offset, np.sqrt(share) * own_sd
+    return share * found.offset, np.hypot(np.sqrt(share) * own_sd, _ODD * share * found.offset)
 
 
 def _contradicted(teacher: Teacher, seen: Seen) -> np.ndarray:

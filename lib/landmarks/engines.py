@@ -130,7 +130,8 @@ def _converted(compiled: OpenVinoNetwork) -> object:
     folder = paths.CACHE / "openvino" / files.digest(*rests_on)
     kept = folder / f"{compiled.digest[:16]}{'-mirror' * compiled.mirror}.xml"
     if kept.is_file():
-        return openvino().Core().read_model(kept)
+        with suppress(RuntimeError):  # damaged: it is made anew
+            return openvino().Core().read_model(kept)
     shape = (2, 3, *2 * (getattr(compiled.network.config, "size_px", 128),))
     module = LastOutput(compiled.network, mirror=compiled.mirror).eval()
     with torch.no_grad(), warnings.catch_warnings():

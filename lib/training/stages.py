@@ -5,7 +5,7 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -140,7 +140,7 @@ def finetune(
     lanes = [*([name] for name in names[: threads - 1]), names[threads - 1 :]]
     with single_threaded_torch(), ThreadPoolExecutor(threads, **own) as pool:
         try:
-            for found in [pool.submit(trained, lane) for lane in lanes]:
+            for found in as_completed([pool.submit(trained, lane) for lane in lanes]):
                 networks |= found.result()
         except BaseException:
             stopped.set()
@@ -153,6 +153,8 @@ def finetune(
             raise
         warnings.warn(f"the doubt stays as it was, held-out images do not suffice ({error})", RuntimeWarning, stacklevel=2)
         return replace(tuned, closeup_from=detector.closeup_from)
+    if detector.closeup_network is None:
+        return tuned
     # Whether unsure landmarks gain by closeups depends on how far from their training the networks look: held-out images say.
     ways = (tuned, replace(tuned, closeup_from=detector.closeup_from))
     return max(ways, key=lambda one: evaluate(one, held_out).scores.auc)
@@ -160,6 +162,8 @@ def finetune(
 
 def training_of(detector: Detector, stage: str) -> Training:
     """The network of a detector's stage, with what its metadata tell of its training."""
+    if stage not in detector.networks:
+        raise ValueError(f"initial: has no {stage} stage; its stages are {', '.join(detector.networks)}.")
     return Training(detector.networks[stage], [], detector.metadata.get("stages", {}).get(stage, {}))
 
 
