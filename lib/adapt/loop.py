@@ -300,8 +300,8 @@ class _Work:
             "gain": {"robot": [robot, robot_sd], "epipolar": [eye, eye_sd]},
             "offset_s": teacher.recording.offset_s, "clock_sd_s": teacher.clock_sd_s,
             "landmark_offset_mm": teacher.offset_mm, "landmark_offset_sd_mm": teacher.offset_sd_mm,
-            "gauge": "An offset that all landmarks share and a shift of the cameras look alike: the standard deviations leave it "
-            "out. An offset of the robot and a constant error of the detector look alike, too; labels set by hand tell.",
+            "gauge": "An offset that all landmarks share and a shift of the cameras look alike: the deviations leave it out. "
+            "An offset of the robot and a constant error of the detector look alike, too; labels set by hand tell.",
         }  # fmt: skip
         if improved and self.learns:
             best = replace(best, metadata=best.metadata | {"adapted": self.finished()})
