@@ -23,6 +23,7 @@ from tqdm.auto import tqdm
 from lib import paths
 from lib.correspondences import Correspondences, of_recording
 from lib.geometry import image_from_cell
+from lib.landmarks import windows as view
 from lib.landmarks.checkpoints import checksum, load_network, read_checkpoint, write_checkpoint
 from lib.landmarks.engines import accelerated, default_engine
 from lib.landmarks.error_model import ErrorModel, Rough, closeup_peaks, corrected, covariance_and_confidence
@@ -30,16 +31,6 @@ from lib.landmarks.heatmaps import Peaks, decode
 from lib.landmarks.metrics import tool_length_px
 from lib.landmarks.network import Network, OffsetNetwork, StackedHourglass, as_tensor, as_uint8
 from lib.landmarks.search import PEAKS, best_tools, without_peak
-from lib.landmarks.windows import (
-    TOOL_PX,
-    closeup_from_image,
-    closeup_scale,
-    cut,
-    map_points,
-    tool_pose,
-    tool_zoom,
-    window_from_image,
-)
 from lib.parallel import single_threaded_torch
 from lib.recordings import Recording
 
@@ -203,6 +194,8 @@ class Detector:
             path = paths.MODELS / f"{path.name}.safetensors"
         tensors, metadata = read_checkpoint(path, FORMAT)
         metadata = {"closeup_from": cls.closeup_from} | metadata
+        if base := metadata.get("base"):
+            tensors = cls.load(base)._content()[0] | tensors
         lacking = {"networks", "calibration", "provenance", *_SETTINGS} - metadata.keys()
         if text := ", ".join(sorted(lacking)):
             raise ValueError(f"{path}: its metadata lack {text}; get the file again, or make it with Detector.save.")
@@ -219,10 +212,16 @@ class Detector:
         detector._check_complete(path)
         return detector
 
-    def save(self, path: str | Path) -> None:
-        """Write the detector as one safetensors file; `ValueError` if a stage has no error model."""
+    def save(self, path: str | Path, *, base: str | None = None) -> None:
+        """Write the detector as one safetensors file; what it shares with the weights named `base` stays in their file.
+
+        A `ValueError` if a stage has no error model.
+        """
         self._check_complete(path)
-        write_checkpoint(path, *self._content())
+        tensors, metadata = self._content()
+        theirs = Detector.load(base)._content()[0] if base else {}
+        own = {name: value for name, value in tensors.items() if name not in theirs or not torch.equal(value, theirs[name])}
+        write_checkpoint(path, own, metadata | ({"base": base} if base else {}))
 
     @property
     def digest(self) -> str:
@@ -376,7 +375,7 @@ class Detector:
         if stage == "tracking":
             return None
         i, own = which[:, 0], (np.arange(len(which)), which[:, 1])
-        parts = map_points(matrices[:, None], rough.u[i]), rough.confidence[i]
+        parts = view.map_points(matrices[:, None], rough.u[i]), rough.confidence[i]
         whole = Rough.of(*(torch.from_numpy(part) for part in parts))
         return Rough(*(part[own][:, None] for part in vars(whole).values()))
 
@@ -393,18 +392,18 @@ class Detector:
         window.
         """
         u = np.asarray(u, dtype=np.float64)
-        (centre, angle), length = tool_pose(u), np.maximum(tool_length_px(u), 1.0)
+        (centre, angle), length = view.tool_pose(u), np.maximum(tool_length_px(u), 1.0)
         if stage in ("tool", "again"):
-            size, image = TOOL_PX, np.flatnonzero(np.isfinite(angle))
-            matrices, which = window_from_image(centre[image], angle[image], size, tool_zoom(length[image])), image
+            size, image = view.TOOL_PX, np.flatnonzero(np.isfinite(angle))
+            matrices, which = view.window_from_image(centre[image], angle[image], size, view.tool_zoom(length[image])), image
         else:
             size = self.closeup_network.config.size_px if stage in CLOSE else self.window_px
             which = np.argwhere(np.isfinite(u).all(2) & np.isfinite(angle)[:, None])
             image, landmark = which.T
             place = u[image, landmark], angle[image], size
             window = stage == "window"
-            matrices = window_from_image(*place) if window else closeup_from_image(*place, landmark, length[image])
-        windows = [cut(images[i], matrix, size) for i, matrix in zip(image, matrices, strict=True)]
+            matrices = view.window_from_image(*place) if window else view.closeup_from_image(*place, landmark, length[image])
+        windows = [view.cut(images[i], matrix, size) for i, matrix in zip(image, matrices, strict=True)]
         return np.stack(windows) if windows else np.zeros((0, size, size, 3), np.uint8), matrices, which
 
     def outputs(self, images: np.ndarray, stage: str) -> Tensor:
@@ -458,7 +457,7 @@ def _through_inverse(matrices: np.ndarray, u: np.ndarray) -> np.ndarray:
 
 def _moved_px(before: np.ndarray, after: np.ndarray) -> float:
     """The longest way of a landmark (n, 3, 2), in image pixels of closeups of scale 1."""
-    scale = closeup_scale(np.maximum(tool_length_px(before), 1.0))[:, None]
+    scale = view.closeup_scale(np.maximum(tool_length_px(before), 1.0))[:, None]
     return float(np.nanmax(np.linalg.norm(after - before, axis=2) * scale, initial=0.0))
 
 
