@@ -83,8 +83,8 @@ def _write_closeups(path: Path, rng: np.random.Generator) -> None:
     landmark, rendered_px = rng.integers(3, size=n), side_px + BLOCK_PX
     for i, k in enumerate(landmark):
         while not seen[i, k]:
-            # A quarter is of the reference rig, where the last tenth of a pixel counts.
-            population = "near" if rng.random() < 0.25 else "training"
+            # A third is of the reference rig, where the last tenth of a pixel counts.
+            population = "near" if rng.random() < 1 / 3 else "training"
             how = {"around": k, "jitter": BLOCK_PX / 2 / rendered_px, "textures": TEXTURE_SEEDS, "population": population}
             image, at, seen[i] = sample(rng, crop_px=rendered_px, **how)
         crops[i], u[i] = square_round(image, at, k, side_px)  # the landmark is not in the middle where the field ends
