@@ -25,7 +25,7 @@ LANDMARK_COLOURS = {"base": (86, 180, 233), "tip_1": (230, 159, 0), "tip_2": (20
 #: A detection of lower confidence counts as not seen.
 MIN_CONFIDENCE = 0.2
 #: The cure where a detector does not know the pictures.
-TRAIN_FURTHER = "try `--weights any_tool`, or let the robot teach it: `python3 -m lib adapt RECORDING`"
+TRAIN_FURTHER = "let the robot teach it: `python3 -m lib adapt RECORDING`"
 #: Half the time over which a velocity is measured: long enough to average the robot's noise, short for its motion.
 _VELOCITY_S = 0.05
 #: What a row of each attribute of `Correspondences` is, in the order of its arguments.

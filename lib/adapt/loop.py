@@ -73,7 +73,7 @@ def adapt(
 
     Args:
         recording: With kinematics; the landmarks of a forceps.
-        detector: None is the one that ships, and training starts from "any_tool", whose closeups know more kinds of tools.
+        detector: Where the training starts; None is the one that ships.
         labels: COCO keypoints like annotations.json; ten labelled pairs are a start where the detector finds too little.
         minutes: The training ends after so many; detection and judging add a little.
         seed: Of everything that is drawn.
@@ -102,7 +102,7 @@ class _Work:
         folder: str | Path | None, minutes: float, progress: bool,
     ) -> None:  # fmt: skip
         self.recording, self.seed, self.progress = recording, seed, progress
-        self.detector, self.start = detector or Detector.load(), detector or Detector.load("any_tool")
+        self.detector = detector or Detector.load()
         self.minutes, self.saved_s = minutes, 0.0
         chosen = np.linspace(0, len(recording) - 1, min(_MOST_FRAMES, len(recording)))
         self.frames = np.unique(chosen.round().astype(int))
@@ -112,11 +112,10 @@ class _Work:
             self.labels = np.stack([given.u_left, given.u_right], axis=1)
             self.marked = np.flatnonzero(np.isfinite(self.labels).any(axis=(1, 2, 3)))
             self.frames = np.union1d(self.frames, self.marked)
-        self.learns = isinstance(self.start, Detector)  # a stand-in has no networks
+        self.learns = isinstance(self.detector, Detector)  # a stand-in has no networks
         key = [str(recording.folder.resolve()), recording.kinematics.x_mm.tobytes(), self.frames.tobytes(), seed, STEPS]
         key += [recording.offset_s, recording.readout_s, recording.frames.time_s.tobytes(), minutes]
-        key += [one.digest for one in (self.detector, self.start) if hasattr(one, "digest")]
-        key += [Path(labels).read_bytes() if labels is not None else b""]
+        key += [getattr(self.detector, "digest", ""), Path(labels).read_bytes() if labels is not None else b""]
         self.folder = Path(folder or paths.RUNS / f"adapt-{recording.name}") / "work"
         self.folder /= hashlib.sha256(repr(key).encode()).hexdigest()[:12]
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -172,7 +171,7 @@ class _Work:
         return found, np.array(covariances)
 
     def adapted(self, tune: Callable[..., Detector]) -> Adaptation:
-        recording, start, rounds = self.recording, self.start, self.report["rounds"]
+        recording, start, rounds = self.recording, self.detector, self.report["rounds"]
         first = self.look("before", start, self.frames)
         seen = self.with_labels(first)
         still, note = longest_still(recording, seen)
@@ -206,22 +205,13 @@ class _Work:
                 break
         self.report["refused_frames"] = teacher.refused
         best, best_seen, stop = start, first, agreement(teacher, first.of(parts["stop"])).summary()
-        if self.detector is not start:  # the better of the two is what training must surpass
-            shipped = self.look("shipped", self.detector, np.union1d(parts["stop"], parts["judge"]))
-            other = agreement(teacher, shipped.of(parts["stop"])).summary()
-            self.report["before"] = "any_tool"
-            if other["mean_share"] <= 1.1 * stop["mean_share"]:  # any_tool's own closeups told the labels' offsets
-                best, best_seen, stop, self.report["before"] = self.detector, shipped, other, "the detector that ships"
-            else:
-                self.report["notes"].append("Untrained, any_tool is nearer to the robot than the detector that ships.")
-        first, self.before = best_seen, best
         rounds.append({"round": 0, "right": teacher.right} | stop)
         some = learn[:: max(1, len(learn) // 8)]
         simulated = simulated_like((recording.frames[int(i)].left for i in some), self.seed, self.progress)
         for k in range(1, ROUNDS + 1):
             if k > 1 and self.left_s < 6 * self.minutes:
                 break
-            tuned = self.round(k, start if k == 1 else best, teacher, parts, None if k == 1 else best_seen, simulated, tune)
+            tuned = self.round(k, best, teacher, parts, None if k == 1 else best_seen, simulated, tune)
             seen, said = self.look(f"round {k}", tuned, self.frames), {}
             opinion = self.look(f"opinion {k}", start, learn, u) if closeups else None
             try:
@@ -284,9 +274,9 @@ class _Work:
         distances = [epipolar_px(geometry, own) for own in seen]
         robot, robot_sd = better(*(own.relative for own in agreements))
         eye, eye_sd = better(*(frame_means(own / length) for own in distances))
-        improved = best is not self.before and robot > 2 * robot_sd and eye > 0
+        improved = best is not self.detector and robot > 2 * robot_sd and eye > 0
         reasons = {
-            "no round brought the frames for stopping nearer to the robot; more --minutes may": best is self.before,
+            "no round brought the frames for stopping nearer to the robot; more --minutes may": best is self.detector,
             "on the frames for judging the gain is no larger than chance allows": not robot > 2 * robot_sd,
             "left and right of the frames for judging do not agree better, in which the robot has no part": not eye > 0,
             "the frames for judging agree better with the robot, and left with right": True,

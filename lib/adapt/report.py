@@ -69,7 +69,7 @@ def main(argv: list[str]) -> int:
     add("--labels", type=Path, metavar="FILE", help="COCO keypoints, as annotations.json: 10 labelled pairs are a good start")
     add("--minutes", type=float, default=20.0, help="of training (default: 20)")
     add("--out", type=Path, metavar="FOLDER", help="of weights, report.json and report.html (default: runs/adapt-NAME)")
-    add("--weights", metavar="FILE", help="the detector to start from (default: any_tool; without a robot the shipped)")
+    add("--weights", metavar="FILE", help="the detector to start from (default: the one that ships)")
     add("--seed", type=int, default=0)
     a = parser.parse_args(argv)
     if not 0 < a.minutes < 1e4:
@@ -81,7 +81,7 @@ def main(argv: list[str]) -> int:
         found = adapt_images(a.recording, a.labels, Detector.load(a.weights), **how)
     else:
         recording = Recording.open(a.recording, truth=False)
-        found = adapt(recording, Detector.load(a.weights) if a.weights else None, labels=a.labels, **how)
+        found = adapt(recording, Detector.load(a.weights), labels=a.labels, **how)
     page = write(found, out, recording)
     where = shlex.quote(paths.shown(a.recording))
     reason = found.report["reason"].removesuffix(".").replace("RECORDING", where)

@@ -194,8 +194,6 @@ class Detector:
             path = paths.MODELS / f"{path.name}.safetensors"
         tensors, metadata = read_checkpoint(path, FORMAT)
         metadata = {"closeup_from": cls.closeup_from} | metadata
-        if base := metadata.get("base"):
-            tensors = cls.load(base)._content()[0] | tensors
         lacking = {"networks", "calibration", "provenance", *_SETTINGS} - metadata.keys()
         if text := ", ".join(sorted(lacking)):
             raise ValueError(f"{path}: its metadata lack {text}; get the file again, or make it with Detector.save.")
@@ -212,16 +210,10 @@ class Detector:
         detector._check_complete(path)
         return detector
 
-    def save(self, path: str | Path, *, base: str | None = None) -> None:
-        """Write the detector as one safetensors file; what it shares with the weights named `base` stays in their file.
-
-        A `ValueError` if a stage has no error model.
-        """
+    def save(self, path: str | Path) -> None:
+        """Write the detector as one safetensors file; a `ValueError` if a stage has no error model."""
         self._check_complete(path)
-        tensors, metadata = self._content()
-        theirs = Detector.load(base)._content()[0] if base else {}
-        own = {name: value for name, value in tensors.items() if name not in theirs or not torch.equal(value, theirs[name])}
-        write_checkpoint(path, own, metadata | ({"base": base} if base else {}))
+        write_checkpoint(path, *self._content())
 
     @property
     def digest(self) -> str:

@@ -212,7 +212,7 @@ def assemble(
     }  # fmt: skip
     detector = replace(detector, metadata=json.loads(json.dumps(provenance, default=float)))
     out.parent.mkdir(parents=True, exist_ok=True)
-    detector.save(out, base="default" if initial else None)
+    detector.save(out)
     write_text(out.with_name("README.md") if out.stem == "default" else out.with_suffix(".md"), card(detector, out))
     return detector
 

@@ -25,12 +25,13 @@ SMALLEST = {
     "realism": {"windows": 8},
     "reconstruction_speed": {},
     "resolution": {"steps": 100},
+    "robot_labels": {"pairs": 14, "minutes": 0.1},
     "rungs": {"n": 2},
     "shipped_detector": {"every": 12},
     "surfaces": {"scene": "eye 200"},
 }
 NEED_DATA = {"matching", "real_frames", "real_robot", "realism", "rungs"}
-MAY_LACK = {"matching", "noticed_motion", "rungs"}  # numbers that a picture or a motion does not have
+MAY_LACK = {"matching", "noticed_motion", "robot_labels", "rungs"}  # numbers that a picture or a motion does not have
 
 
 def test_every_study_is_run_by_a_test():
