@@ -41,6 +41,8 @@ __all__ = ["STAGES", "assemble", "card", "finetune", "stage_config", "stage_data
 STAGES = {"frame": 32, "tool": 48, "closeup": 32}
 #: Standard deviation of a label, as a share of the tool's length, at which a stage lets it count half.
 LABEL_SD = {"frame": 0.1, "tool": 0.04, "closeup": 0.02}
+#: Fine-tuning's time for a stage, as a share of the tool's, whose windows decide what the closeups see.
+_SHARES = {"frame": 0.5, "closeup": 0.5}
 _SOURCES = {"frame": FrameSource, "tool": ToolSource, "closeup": CloseupSource}
 
 
@@ -116,7 +118,7 @@ def finetune(
             progress(stage, part)
 
     def trained(lane: list[str]) -> dict[str, Network]:
-        """The stages of a thread, one after the other; each has its share of the time, the closeups half of the others'."""
+        """The stages of a thread, one after the other, each for its share of the time."""
         found = {}
         for number, stage in enumerate(lane):
             source: Source = _SOURCES[stage].of(images, weight=1 / (1 + variance[usable[0]] / LABEL_SD[stage] ** 2))
@@ -129,7 +131,7 @@ def finetune(
             config = replace(config, learning_rate=5e-4, ema=0.98, batch_size=size, validate_every=max(1, steps // 3))
             start, left = Training(detector.networks[stage], [], {"shipped": detector.metadata.get("commit")}), None
             if minutes is not None:
-                shares = [0.5 if later == "closeup" else 1.0 for later in lane[number:]]
+                shares = [_SHARES.get(later, 1.0) for later in lane[number:]]
                 left = shares[0] / sum(shares) * (60 * minutes - (time.perf_counter() - began))
             where, how = (source, _still(stage, held_out), Path(folder) / stage), {"initial": start, "max_seconds": left}
             found[f"{stage}_network"] = train(config, *where, progress=partial(told, stage), **how).network
@@ -137,7 +139,7 @@ def finetune(
 
     # A second thread of torch's own makes such small steps hardly faster, and far slower where the machine is busy.
     threads, networks, own = min(cores(), len(names)), {}, {"initializer": torch.set_num_threads, "initargs": (1,)}
-    lanes = [*([name] for name in names[: threads - 1]), names[threads - 1 :]]
+    lanes = [names[first::threads] for first in range(threads)]  # two threads: frame and closeup beside tool
     with single_threaded_torch(), ThreadPoolExecutor(threads, **own) as pool:
         try:
             for found in as_completed([pool.submit(trained, lane) for lane in lanes]):
