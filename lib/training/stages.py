@@ -128,7 +128,7 @@ def finetune(
                 source = Mixed(source, _SOURCES[stage].of([one for i, one in enumerate(simulated) if i % 3]))
             config = replace(stage_config(stage), network=detector.networks[stage].config, steps=steps, seed=seed)
             size = min(config.batch_size, 24)
-            config = replace(config, learning_rate=5e-4, ema=0.98, batch_size=size, validate_every=max(1, steps // 3))
+            config = replace(config, learning_rate=5e-4, ema=0.995, batch_size=size, validate_every=max(1, steps // 3))
             start, left = Training(detector.networks[stage], [], {"shipped": detector.metadata.get("commit")}), None
             if minutes is not None:
                 shares = [_SHARES.get(later, 1.0) for later in lane[number:]]
