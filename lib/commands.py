@@ -88,12 +88,11 @@ def main_calibrate(argv: list[str]) -> int:
     print(report(calibration, verdict=verdict).removeprefix(f"{verdict}\n"))
     _write_landmarks(out / "landmarks.csv", recording, data)
     _write_rig(out, calibration.rig, recording)
-    offsets = calibration.offsets
     numbers = {"model": calibration.model, "sigma_u_px": calibration.sigma_u_px, "sigma_x_mm": calibration.sigma_x_mm}
     numbers |= {"rows": int(calibration.inliers.size), "rows_used": int(calibration.inliers.sum())}
     numbers |= {"parameters": calibration.parameter_names, "parameter_covariance": calibration.parameter_covariance.tolist()}
-    numbers |= {"landmark_offsets_mm": None if offsets is None else offsets.offset.tolist()}
-    return _done(out, "calibration", numbers, verdict)
+    numbers |= {"landmark_offsets_mm": calibration.offsets and calibration.offsets.offset.tolist()}
+    return _done(a, out, "calibration", numbers, verdict)
 
 
 def main_reconstruct(argv: list[str]) -> int:
@@ -116,7 +115,7 @@ def main_reconstruct(argv: list[str]) -> int:
     _write_rectified(out, found.rig, frame.left, frame.right)
     found.rig.save(out / "refined_rig.json")  # as the matches refined it
     numbers = {"frame": a.frame % len(recording), "points": len(found.u), "matches": found.n_matches}
-    return _done(out, "reconstruction", numbers, verdict)
+    return _done(a, out, "reconstruction", numbers, verdict)
 
 
 def main_register(argv: list[str]) -> int:
@@ -132,11 +131,10 @@ def main_register(argv: list[str]) -> int:
     numbers = {"rotation": found.transform.R.tolist(), "translation_mm": found.transform.t.tolist()}
     numbers |= {"covariance": found.covariance.tolist(), "centre_mm": found.centre_mm.tolist()}
     numbers |= {"median_epipolar_px": epipolar_px, "median_error_mm": float(np.median(np.linalg.norm(error_mm, axis=1)))}
-    sd = found.translation_sd_mm
     shift_mm = np.linalg.norm(found.centre_mm - found.transform.inverse().apply(found.centre_mm))
-    print(f"The cameras moved by {shift_mm:.3f} mm at the tool, standard deviation {sd.max():.3f} mm.")
+    print(f"The cameras moved by {shift_mm:.3f} mm at the tool, standard deviation {found.translation_sd_mm.max():.3f} mm.")
     print(f"The tool is now {numbers['median_error_mm']:.3f} mm from where the robot reports it (median).")
-    return _done(out, "registration", numbers, assess(recording, data, detector=a.detector).verdict)
+    return _done(a, out, "registration", numbers, assess(recording, data, detector=a.detector).verdict)
 
 
 def _parsed(
@@ -161,6 +159,7 @@ def _parsed(
     a.detector = None if a.landmarks == "annotations" else SharedDetector(Detector.load(a.weights))
     out = a.out or paths.RUNS / a.recording.resolve().name
     out.mkdir(parents=True, exist_ok=True)
+    a.earlier = {path: path.lstat().st_mtime_ns for path in out.iterdir()}
     return a, recording, out
 
 
@@ -193,13 +192,17 @@ def _calibrated(
     if found.calibration is not None and (a.force or not found.verdict.is_red):
         return found.calibration, found.verdict, data
     files.write_json(out / "verdict.json", found.verdict.to_json())
-    print(f"{found.verdict}\nNothing else was written; --force writes the results of a calibration whatever the verdict.")
+    force = "" if found.calibration is None else "; --force writes the results of a calibration whatever the verdict"
+    earlier = f" Results of an earlier run are in {paths.shown(out)}." if a.earlier.keys() - {out / "verdict.json"} else ""
+    print(f"{found.verdict}\nNothing else was written{force}.{earlier}")
     return None, found.verdict, data
 
 
-def _done(out: Path, name: str, numbers: dict, verdict: Verdict) -> int:
+def _done(a: argparse.Namespace, out: Path, name: str, numbers: dict, verdict: Verdict) -> int:
     files.write_json(out / f"{name}.json", numbers | verdict.to_json())
-    print(f"Wrote {paths.shown(out)}: {', '.join(sorted(path.name for path in out.iterdir()))}\n{verdict}")
+    (out / "verdict.json").unlink(missing_ok=True)  # of an earlier run that was refused
+    written = sorted(path.name for path in out.iterdir() if path.lstat().st_mtime_ns != a.earlier.get(path))
+    print(f"Wrote {paths.shown(out)}: {', '.join(written)}\n{verdict}")
     return 0
 
 

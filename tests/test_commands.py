@@ -39,12 +39,17 @@ def test_calibrate_writes_cameras_for_other_programs(out):
 
 
 def test_register_finds_the_cameras_where_they_are(out, tmp_path, capsys):
+    """What an earlier run left there is not said to be written now, and its refusal goes."""
+    for name in ("verdict.json", "rig.json"):
+        (tmp_path / name).write_text("{}")
     assert commands.main_register(
         [str(paths.SHIPPED_RECORDING), *LABELS, "--rig", str(out / "rig.json"), "--out", str(tmp_path)]
     ) == 0  # fmt: skip
     told = json.loads((tmp_path / "registration.json").read_text())
     np.testing.assert_allclose(told["rotation"], np.eye(3), atol=0.02)
-    assert told["median_epipolar_px"] < 2 and "Verdict:" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert told["median_epipolar_px"] < 2 and "Verdict:" in said and ": moved_left.yml, " in said
+    assert " rig.json" not in said and (tmp_path / "rig.json").exists() and not (tmp_path / "verdict.json").exists()
     assert StereoRig.load(tmp_path / "moved_rig.json").left.matrix.shape == (2, 4)
 
 
@@ -84,8 +89,12 @@ def test_a_red_verdict_writes_nothing_but_itself(tmp_path, capsys):
     argv = [str(folder), "--map", str(mapping), "--out", str(tmp_path / "eye")]
     assert commands.main_import(argv) == 0
     assert "Verdict: not trustworthy" in capsys.readouterr().out
-    assert commands.main_calibrate([str(tmp_path / "eye"), *LABELS, "--out", str(tmp_path / "results")]) == 3
-    assert [path.name for path in (tmp_path / "results").iterdir()] == ["verdict.json"]
+    results = tmp_path / "results"
+    results.mkdir(), (results / "rig.json").write_text("{}")
+    assert commands.main_calibrate([str(tmp_path / "eye"), *LABELS, "--out", str(results)]) == 3
+    assert {path.name for path in results.iterdir()} == {"verdict.json", "rig.json"}
+    said = capsys.readouterr().out
+    assert f"Nothing else was written. Results of an earlier run are in {results}." in said and "--force" not in said
 
 
 def test_guess_writes_a_mapping_once(tmp_path, capsys):

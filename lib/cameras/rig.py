@@ -94,8 +94,7 @@ class StereoRig:
     @cached_property
     def convergence_rad(self) -> float:
         """Angle between the two viewing directions."""
-        cosine = self.left.viewing_direction @ self.right.viewing_direction
-        return float(np.arccos(np.clip(cosine, -1.0, 1.0)))
+        return float(np.arccos(np.clip(self.left.viewing_direction @ self.right.viewing_direction, -1.0, 1.0)))
 
     def project(self, x: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """(u_left, u_right), (n, 2) px each, of points (n, 3) in mm."""

@@ -141,8 +141,7 @@ def _from_zip(path: Path, name: str) -> str:
 
 def _label_studio(path: Path) -> Iterator[Label]:
     for task in json.loads(path.read_bytes()):
-        data = task["data"]
-        image = str(next(iter(data.values())))
+        image = str(next(iter(task["data"].values())))
         for result in (r for annotation in task["annotations"][:1] for r in annotation["result"]):
             if "keypointlabels" not in result["value"]:
                 continue

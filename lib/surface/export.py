@@ -146,8 +146,7 @@ def depth_map(surface: BSplineSurface, camera: AffineCamera, image_size_px: tupl
     measure from.
     """
     width, height = image_size_px
-    x = surface.on_grid(np.arange(width), np.arange(height))
-    return (x @ camera.viewing_direction).astype(np.float32)
+    return (surface.on_grid(np.arange(width), np.arange(height)) @ camera.viewing_direction).astype(np.float32)
 
 
 def save_depth_map(path: str | Path, depth_mm: np.ndarray) -> Path:
