@@ -90,8 +90,7 @@ def import_recording(source: str | Path, mapping: str | Path | Mapping, out: str
 def _delay(labels: Annotations, readout_s: float, height_px: int) -> np.ndarray:
     """(n,) s from a frame's time to the mean instant at which the rows of its labels were read."""
     y = np.hstack([labels.u_left[..., 1], labels.u_right[..., 1]])
-    middle = (height_px - 1) / 2
-    mean = np.nansum(y - middle, axis=1) / np.maximum(np.isfinite(y).sum(axis=1), 1)
+    mean = np.nansum(y - (height_px - 1) / 2, axis=1) / np.maximum(np.isfinite(y).sum(axis=1), 1)
     return readout_s * mean / (height_px - 1)
 
 

@@ -173,13 +173,15 @@ def open_stereo(folder: Path, video: Video) -> StereoSource:
         raise ValueError(f"{folder}: no frame lies between start_s and end_s; the video lasts {time[-1] - time[0]} s.")
     kept, time = kept[chosen], [time[i] for i in chosen]
     dropped = sum(map(len, times)) - len(reels) * len(index)
-    depth = video.bit_depth or _bit_depth(reels, kept)
-    return StereoSource(reels, video.layout, video.exchanged, kept, time, depth, dropped)
+    return StereoSource(reels, video.layout, video.exchanged, kept, time, video.bit_depth or _bit_depth(reels, kept), dropped)
 
 
 def _times(folder: Path, video: Video, reel: _Images | _Film) -> list[Decimal]:
-    if video.times == "fps":
-        return [Decimal(i) / Decimal(str(video.fps)) for i in range(len(reel))]
+    if video.times == "fps":  # a gap in the numbers of images is a frame that is missing
+        steps = np.diff([number for number in reel.numbers if isinstance(number, int)])
+        usual = np.median(steps) if steps.size else 1
+        places = np.cumsum([0, *steps // usual]) if steps.size and not (steps % usual).any() else range(len(reel))
+        return [Decimal(int(place)) / Decimal(str(video.fps)) for place in places]
     if video.times == "names" and reel.stamps is None:
         return [exact_seconds(str(last_number(p)), video.name_unit, str(p)) for p in reel.files]
     if video.times == "table":

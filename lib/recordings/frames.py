@@ -68,8 +68,7 @@ def to_8_bits(image: np.ndarray, bit_depth: int | None, path: Path) -> np.ndarra
     if not bit_depth or image.max() >= 1 << bit_depth:
         told = f"more than bit_depth = {bit_depth} holds" if bit_depth else "and recording.toml states no bit_depth"
         raise ValueError(f"{path}: 16-bit values up to {image.max()}, {told}. State what the camera uses, such as 12.")
-    table = np.rint(np.arange(1 << bit_depth) * (255 / ((1 << bit_depth) - 1))).astype(np.uint8)
-    return table[image]
+    return np.rint(np.arange(1 << bit_depth) * (255 / ((1 << bit_depth) - 1))).astype(np.uint8)[image]
 
 
 def _may_hold_zeros(data: bytes) -> bool:

@@ -117,6 +117,21 @@ def test_a_variable_frame_rate_keeps_its_times_and_lost_frames_leave_pairs(shipp
     assert any("frame rate varies" in line for line in report["did"])
 
 
+def test_an_image_that_is_missing_leaves_its_partner_alone(shipped, tmp_path):
+    """Numbers count frames: later pairs neither move in time nor get another's image."""
+    folder, mapping = source_of(tmp_path, thinned(shipped, 20), foreign.robot_csv)
+    for k, name in enumerate(("left", "right")):
+        for i in (i for i in range(8) if (k, i) != (1, 3) and i != 5):
+            cv2.imwrite(str(folder / f"{name}_{10 * i}.png"), np.full((8, 8), 20 * i, np.uint8))
+    video = '[video]\nlayout = "two"\nleft = "left_*.png"\nright = "right_*.png"\ntimes = "fps"\nfps = 25\n'
+    mapping.write_text(mapping.read_text("utf-8") + video, "utf-8")
+    report = import_recording(folder, mapping, tmp_path / "eye")
+    frames = Recording.open(tmp_path / "eye").frames
+    assert (25 * frames.time_s).round().tolist() == [0, 1, 2, 4, 6, 7]
+    assert all(abs(image.mean() - 20 * 25 * f.time_s) < 3 for f in frames for image in (f.left, f.right))
+    assert any("1 frames without a partner" in line for line in report["did"])
+
+
 @pytest.mark.parametrize("form", ["png", "video"])
 def test_twelve_grey_bits_in_sixteen_are_not_black(form, shipped, tmp_path):
     grey = (shipped.frames[:4].mean(axis=-1) * (4095 / 255)).astype(np.uint16)
