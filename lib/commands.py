@@ -24,7 +24,8 @@ from lib.matching.rectification import rectify
 from lib.recordings import Recording
 from lib.registration import register_images
 from lib.surface import depth_map, reconstruct, save_depth_map, save_mesh, save_points, surface_mesh
-from lib.trust import LEVELS, Reason, Verdict, assess, report
+from lib.trust import LEVELS, Assessment, Reason, Verdict, assess, report
+from lib.trust.verdict import LIMITS
 
 __all__ = ["main_annotate", "main_calibrate", "main_detect", "main_import", "main_reconstruct", "main_register"]
 
@@ -134,7 +135,20 @@ def main_register(argv: list[str]) -> int:
     shift_mm = np.linalg.norm(found.centre_mm - found.transform.inverse().apply(found.centre_mm))
     print(f"The cameras moved by {shift_mm:.3f} mm at the tool, standard deviation {found.translation_sd_mm.max():.3f} mm.")
     print(f"The tool is now {numbers['median_error_mm']:.3f} mm from where the robot reports it (median).")
-    return _done(a, out, "registration", numbers, assess(recording, data, detector=a.detector).verdict)
+    found = assess(recording, data, detector=a.detector)
+    return _done(a, out, "registration", numbers, Verdict.join([_as_one(moved, found), found.verdict]))
+
+
+def _as_one(moved: StereoRig, found: Assessment) -> Verdict:
+    """Whether one motion of both cameras explains the landmarks about as well as cameras calibrated from them."""
+    if found.calibration is None:
+        return Verdict()
+    x_mm, seen = found.data.x_mm, np.stack([found.data.u_left, found.data.u_right])
+    now, anew = (np.nanmedian(np.linalg.norm(seen - rig.project(x_mm), axis=2)) for rig in (moved, found.calibration.pair))
+    level = LEVELS[np.searchsorted(LIMITS["residuals"], now / anew)]
+    text = f"The moved cameras miss the landmarks by {now:.1f} px (median), cameras calibrated from them by {anew:.1f} px."
+    cure = "Did one camera move alone, did zoom or focus change, is --rig of another microscope? Calibrate anew."
+    return Verdict(() if level == LEVELS[0] else (Reason("no_common_motion", level, text, cure),))
 
 
 def _parsed(

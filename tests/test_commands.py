@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import nbformat
@@ -10,6 +11,7 @@ import pytest
 
 from lib import commands, paths
 from lib.cameras import StereoRig
+from lib.correspondences import of_recording
 from lib.landmarks import Detector, Landmarks
 from lib.recordings import Recording
 from lib.surface import export
@@ -51,6 +53,18 @@ def test_register_finds_the_cameras_where_they_are(out, tmp_path, capsys):
     assert told["median_epipolar_px"] < 2 and "Verdict:" in said and ": moved_left.yml, " in said
     assert " rig.json" not in said and (tmp_path / "rig.json").exists() and not (tmp_path / "verdict.json").exists()
     assert StereoRig.load(tmp_path / "moved_rig.json").left.matrix.shape == (2, 4)
+
+
+def test_register_says_where_no_motion_explains_the_landmarks(out):
+    """A rig of another zoom, or of another microscope."""
+    rig = StereoRig.load(out / "rig.json")
+    other = StereoRig(*(replace(camera, matrix=1.1 * camera.matrix) for camera in (rig.left, rig.right)))
+    recording = Recording.open(paths.SHIPPED_RECORDING)
+    rows = of_recording(recording, recording.annotations.u_left, recording.annotations.u_right)
+    found = SimpleNamespace(data=rows, calibration=SimpleNamespace(pair=rig))
+    assert commands._as_one(rig, found).reasons == ()
+    (reason,) = commands._as_one(other, found).reasons
+    assert reason.name == "no_common_motion" and reason.level == "not trustworthy" and "--rig" in reason.cure
 
 
 def test_reconstruct_writes_surface_points_and_the_rectified_pair(out, tmp_path, monkeypatch, capsys):

@@ -85,8 +85,7 @@ def affine_minimum(moments: Moments, variance_u: float, variance_x: float) -> Af
         leading = vectors[:, m:]
         A = np.linalg.solve(leading[m:].T, leading[:m].T).T * np.sqrt(variance_u / variance_x)
         cost = 0.5 * values[:m].sum()
-    matrix = np.column_stack([A, moments.mean[:m] - A @ moments.mean[m:]])
-    return AffineMinimum(matrix, float(max(cost, 0.0)))
+    return AffineMinimum(np.column_stack([A, moments.mean[:m] - A @ moments.mean[m:]]), float(max(cost, 0.0)))
 
 
 def paper_variances(sigma_u_px: float, sigma_x_mm: float) -> tuple[float, float]:

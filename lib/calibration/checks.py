@@ -110,8 +110,7 @@ def check_images(y: np.ndarray, image_size_px: tuple[int, int] | None = None) ->
         u = u[np.isfinite(u).all(axis=1)]
         if len(u) < 4:
             raise ValueError(f"{name}: {len(u)} detections; an affine camera needs at least 4, better 50, not in one plane.")
-        size = np.linalg.svd(u - u.mean(axis=0), compute_uv=False)
-        if size[1] <= 1e-9 * np.abs(u).max() * np.sqrt(len(u)):
+        if np.linalg.svd(u - u.mean(axis=0), compute_uv=False)[1] <= 1e-9 * np.abs(u).max() * np.sqrt(len(u)):
             raise ValueError(f"{name}: the detections stand still or lie on one line; is this the moving tool?")
         if image_size_px is not None:
             limit = np.asarray(image_size_px, dtype=float)

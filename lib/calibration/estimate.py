@@ -277,5 +277,4 @@ def _parameter_covariance(
     _, J_x, J_c = minimum.state.evaluate(minimum.points)
     outer = J_x @ np.swapaxes(J_x, 1, 2)
     WJ = precision(weigh + variance_x * outer, views) @ J_c @ plan.selection
-    meat = np.einsum("nip,nij,njq->pq", WJ, noise + sigma_x**2 * outer, WJ)
-    return known @ meat @ known
+    return known @ np.einsum("nip,nij,njq->pq", WJ, noise + sigma_x**2 * outer, WJ) @ known

@@ -165,8 +165,7 @@ def tool_offsets(
     information = flat.T @ flat
     if np.linalg.cond(information) > 1e13:
         raise ValueError("robot_from_tool: the motion leaves an offset open by any amount; turn the tool about two axes.")
-    variance = float((r**2).sum()) / max(r.size - 4 * m - 3 * q, 1)
-    covariance = (variance * np.linalg.inv(information)).reshape(q, 3, q, 3)
+    covariance = float((r**2).sum()) / max(r.size - 4 * m - 3 * q, 1) * np.linalg.inv(information).reshape(q, 3, q, 3)
     # What counts is how sure a landmark is at each opening that occurs: a vector of little effect may be vague.
     _check_determined(np.einsum("na,aibj,nb->nij", own, covariance, own))
     blocks = covariance[np.arange(k), :, np.arange(k)]

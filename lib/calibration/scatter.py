@@ -29,8 +29,7 @@ def sandwich(
     n, m, p = J.shape
     seen = np.broadcast_to(np.diagonal(weight, axis1=1, axis2=2) > 0, (n, m))
     # Half of the coordinates tell the noise along an axis: regions of a pair's pixels by F in place of chi-square.
-    freedom = max(0.5 * (seen.sum() - p), 3.0)
-    wider = 4.0 * fdtri(4, freedom, 0.95) / chdtri(4, 0.05)
+    wider = 4.0 * fdtri(4, max(0.5 * (seen.sum() - p), 3.0), 0.95) / chdtri(4, 0.05)
     values, vectors = np.linalg.eigh(weight)
     root = (vectors * np.sqrt(np.maximum(values, 0.0))[:, None]) @ np.swapaxes(vectors, 1, 2)
     K, e = root @ J, (root @ r[:, :, None])[:, :, 0]

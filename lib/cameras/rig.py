@@ -229,8 +229,7 @@ def _triangulate_near_affine(
         J, r, ahead = _linearised(cameras, found, y[rows])
         in_front &= ahead
         x[rows[in_front]], covariance_mm2[rows[in_front]] = found[in_front], _step(J, r, W)[1][in_front]
-        normal = _null_vector(J, affine_normal)
-        epipolar[rows[in_front]] = np.einsum("ni,ni->n", normal, r)[in_front]
+        epipolar[rows[in_front]] = np.einsum("ni,ni->n", _null_vector(J, affine_normal), r)[in_front]
     return Points(x, covariance_mm2, epipolar)
 
 

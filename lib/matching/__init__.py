@@ -99,5 +99,4 @@ def match(
     matches = matches.keep(inside & (matches.score >= least))
     if rig is None or not len(matches):
         return matches
-    distance = np.abs(rig.epipolar_distance(matches.u_left, matches.u_right))
-    return replace(matches, epipolar_px=float(np.median(distance)))
+    return replace(matches, epipolar_px=float(np.median(np.abs(rig.epipolar_distance(matches.u_left, matches.u_right)))))

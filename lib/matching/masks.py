@@ -46,8 +46,7 @@ def tool_mask(
     base, tips = u[0], u[1:][np.isfinite(u[1:]).all(axis=1)]
     if not np.isfinite(base).all() or not len(tips):
         return mask.astype(bool)
-    lengths = np.linalg.norm(tips - base, axis=1)
-    thickness = max(1, round(0.45 * lengths.mean() if width_px is None else width_px))
+    thickness = max(1, round(0.45 * np.linalg.norm(tips - base, axis=1).mean() if width_px is None else width_px))
     backwards = base - tips.mean(axis=0)
     reach = np.hypot(*shape[:2]) + np.abs(base).max() if shaft_px is None else shaft_px
     back = base + backwards / max(np.linalg.norm(backwards), 1e-300) * reach

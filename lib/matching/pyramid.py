@@ -143,8 +143,7 @@ def bottom_up(pooled: torch.Tensor, levels: int, *, shifted: bool) -> Pyramid:
     """The pyramid over the pooled responses of the atomic patches, after the power; `levels` at most."""
     pools, responses = [(None, pooled)], []
     for level in range(1, levels + 1):
-        below = gather(pools[-1][1], 0, level, shifted=shifted)
-        responses.append(gather(below, 1, level, shifted=shifted).pow_(POWER))
+        responses.append(gather(gather(pools[-1][1], 0, level, shifted=shifted), 1, level, shifted=shifted).pow_(POWER))
         if level == levels or responses[-1].shape[2:].numel() == 1:
             break
         pools.append(pool(responses[-1], _start(responses[-1], shifted)))

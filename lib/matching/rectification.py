@@ -141,5 +141,4 @@ def warp(
     matrix, flags = np.column_stack([linear, offset]), cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     gray = gray.astype(np.float32, copy=False)
     out = cv2.warpAffine(gray, matrix, size_px, flags=flags, borderMode=cv2.BORDER_REPLICATE)
-    seen = cv2.warpAffine(seen, matrix, size_px, flags=flags, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
-    return out, seen == 255
+    return out, cv2.warpAffine(seen, matrix, size_px, flags=flags, borderMode=cv2.BORDER_CONSTANT, borderValue=0) == 255

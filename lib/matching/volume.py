@@ -97,8 +97,7 @@ def match_volume(volume: torch.Tensor, low: int, *, reciprocal: bool = True) -> 
     v = rows // 2
     along_x, pooled = pool(volume, v % 2)
     # The power is monotone, so it may follow the maximum, which is a quarter of the work.
-    levels = n_levels(gy, gx) if rows * n > 1 else 0
-    scores = top_down(bottom_up(pooled**POWER, levels, shifted=False))
+    scores = top_down(bottom_up(pooled**POWER, n_levels(gy, gx) if rows * n > 1 else 0, shifted=False))
 
     # The centre of a patch lies at cell 4 g + 2; its displaced copy falls into the bin (4 g + 2 + d) // 4, so
     # displacements in fours share a bin for every patch.

@@ -77,8 +77,7 @@ class Annotator:
         length = np.linalg.norm(robot[:, :, 1:] - robot[:, :, :1], axis=-1)
         length = np.nanmedian(length) if np.isfinite(length).any() else 0.0
         missed = inside(robot, self.recording.image_size_px) & ~np.isfinite(detector).all(axis=-1)
-        off = np.where(missed, length, np.nan_to_num(off)).max(axis=(0, 2))
-        return np.where(looked, off, 0.0)
+        return np.where(looked, np.where(missed, length, np.nan_to_num(off)).max(axis=(0, 2)), 0.0)
 
     def __repr__(self) -> str:
         labelled = f"{int(self.complete.sum())} of {len(self.recording)} frames are labelled"

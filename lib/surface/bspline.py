@@ -230,8 +230,7 @@ class BSplineSurface:
             gap = x[seen] - jet[0, 0]
             normal = np.einsum("nki,nkj->nij", jacobian, jacobian)
             # Second-order term of the distance: keeps steps right where the tool is far above a curved surface.
-            second = jet[[[0, 1], [1, 2]], [[2, 1], [1, 0]]]
-            hessian = normal - np.einsum("ijnk,nk->nij", second, gap)
+            hessian = normal - np.einsum("ijnk,nk->nij", jet[[[0, 1], [1, 2]], [[2, 1], [1, 0]]], gap)
             convex = (np.linalg.det(hessian) > 0) & (hessian[:, 0, 0] > 0)
             hessian[~convex] = normal[~convex]
             step = np.linalg.solve(hessian, np.einsum("nki,nk->ni", jacobian, gap)[..., None])[..., 0]
@@ -241,5 +240,4 @@ class BSplineSurface:
         # At the domain's border the nearest point may lie beyond it: then there is none to name.
         u[~np.isfinite(along_view)] = np.nan
         nearest = self(u)
-        along_normal = np.einsum("nk,nk->n", x - nearest, self.normal(u))
-        return ToolDistance(along_view, along_normal, nearest, u)
+        return ToolDistance(along_view, np.einsum("nk,nk->n", x - nearest, self.normal(u)), nearest, u)
