@@ -100,7 +100,7 @@ class ImageFolder:
 
     def __init__(self, folder: Path, image_size_px: tuple[int, int], bit_depth: int = 0) -> None:
         self.image_size_px, self._bit_depth = image_size_px, bit_depth
-        self.paths = sorted(p for p in folder.iterdir() if p.suffix.lower() in _SUFFIXES)
+        self.paths = sorted((p for p in folder.iterdir() if p.suffix.lower() in _SUFFIXES), key=lambda p: p.stem.zfill(9))
         for index, path in enumerate(self.paths):
             if not path.stem.isdecimal():
                 raise ValueError(f"{path}: frames are named by number, such as 000000{path.suffix}.")

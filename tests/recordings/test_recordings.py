@@ -554,6 +554,16 @@ def test_notes_of_any_name_and_value_are_read_back(tmp_path):
     assert Recording.open(tmp_path / "r").details == details
 
 
+def test_frames_count_without_leading_zeros(tmp_path):
+    with RecordingWriter(tmp_path / "r", name="r", fps=25, image_size_px=SIZE, suffix=".png") as writer:
+        for i in range(11):
+            writer.add(*[np.full((SIZE[1], SIZE[0], 3), 10 * i, np.uint8)] * 2)
+        writer.kinematics(np.arange(11) / 25, tool(11))
+    for path in (tmp_path / "r").glob("*/*.png"):
+        path.rename(path.with_stem(str(int(path.stem))))
+    assert [frame.left[0, 0, 0] for frame in Recording.open(tmp_path / "r").frames] == [*range(0, 110, 10)]
+
+
 def test_points_outside_the_image_are_written_as_not_labelled(tmp_path):
     u = np.full((1, 3, 2), 5.0)
     u[0, 0, 0] = 64.0
