@@ -10,6 +10,7 @@ import os
 import shutil
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -127,6 +128,7 @@ def _main_of(name: str, module: str, function: str):
     """The command `name`: a function of a module.  An error that a user can mend is told in one line, without a traceback."""
 
     def command(argv: list[str]) -> int:
+        warnings.formatwarning = lambda message, *_: f"Warning: {message}\n"  # a user has no use for the line of code
         try:
             if module in ("lib.commands", "lib.trust.check", "lib.adapt.report"):  # they detect in a recording
                 _keep_detections()

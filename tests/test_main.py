@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import importlib
 import os
+import warnings
 from collections import namedtuple
 from pathlib import Path
 from types import SimpleNamespace
@@ -89,6 +90,15 @@ def test_what_a_user_can_mend_is_told_in_one_line(inside, monkeypatch, capsys, e
     assert command_line.main(["run"]) == code
     said = capsys.readouterr().err
     assert text in said and len(said.strip().splitlines()) == 1
+
+
+def test_a_warning_is_told_without_the_line_of_code(inside, monkeypatch, capsys):
+    monkeypatch.setattr(warnings, "formatwarning", warnings.formatwarning)
+    monkeypatch.setattr(warnings, "showwarning", lambda *one: print(warnings.formatwarning(*one), end=""))
+    main = SimpleNamespace(main=lambda argv: warnings.warn("my eye: the log is short.", stacklevel=1))
+    monkeypatch.setattr(command_line.importlib, "import_module", lambda name: main)
+    assert command_line.main(["run"]) == 0
+    assert capsys.readouterr().out == "Warning: my eye: the log is short.\n"
 
 
 def test_a_problem_of_the_environment_is_told_without_traceback(monkeypatch, capsys):

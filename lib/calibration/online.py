@@ -58,8 +58,7 @@ class OnlineCalibration:
             WJ = W @ J
             self._information = self._information + np.einsum("nip,niq->pq", J, WJ)
             self._covariance = inverse(self._information)
-            step = self._covariance @ np.einsum("nip,ni->p", WJ, r)
-            self._state = self._state.moved(known.plan.selection @ step)
+            self._state = self._state.moved(known.plan.selection @ (self._covariance @ np.einsum("nip,ni->p", WJ, r)))
         return used
 
     def remains(self, x_mm: np.ndarray) -> np.ndarray:

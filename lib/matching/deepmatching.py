@@ -60,8 +60,7 @@ def _correlation_maps(patches: torch.Tensor, windows: torch.Tensor) -> torch.Ten
     for y in (0, 1, n_y - 2, n_y - 1):
         maps[:, :, y] /= torch.einsum("ijrc,r,xc->ijx", energy, rows[y], columns).sqrt().clamp_min(1e-6)
     for x in (0, 1, n_x - 2, n_x - 1):
-        seen = torch.einsum("ijrc,c->ij", energy, columns[x])
-        maps[:, :, 2:-2, x] /= seen.sqrt().clamp_min(1e-6)[..., None]
+        maps[:, :, 2:-2, x] /= torch.einsum("ijrc,c->ij", energy, columns[x]).sqrt().clamp_min(1e-6)[..., None]
     return maps
 
 

@@ -86,8 +86,7 @@ def _describe(gray: np.ndarray, rows: slice, stride: int, out: np.ndarray) -> No
     height, width = out.shape[:2]
     for k, projection in enumerate((dx, (dx + dy) * half, dy, (dy - dx) * half)):
         for opposite in (False, True):
-            positive = np.maximum(-projection if opposite else projection, 0.0)
-            squashed = _blur(positive)
+            squashed = _blur(np.maximum(-projection if opposite else projection, 0.0))
             squashed *= np.float32(SLOPE / 2)
             np.tanh(squashed, out=squashed)  # 2 / (1 + exp(-SLOPE x)) - 1
             channel = _blur(squashed)[rows, : width * stride]

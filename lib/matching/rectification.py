@@ -106,8 +106,7 @@ def rectify(
     # Depth zero may be far away: refer to the depth that brings the image centres together, moved by whole
     # canvas pixels so that an already rectified pair is not resampled.
     displacement = float(scale * direction @ shift)
-    canvas_centre = (np.array(size) - 1) / 2
-    gap = (np.array(shape_right[::-1]) - 1) / 2 - (right_linear @ canvas_centre + at_zero)
+    gap = (np.array(shape_right[::-1]) - 1) / 2 - (right_linear @ ((np.array(size) - 1) / 2) + at_zero)
     whole = np.rint(np.linalg.solve(right_linear, gap)[0])
     right = np.column_stack([right_linear, at_zero + right_linear @ np.array([whole, 0.0])])
     return Rectification(left, right, size, displacement, whole / displacement)

@@ -128,8 +128,7 @@ class OnlinePipeline:
         for name, fresh in (("landmarks", seen), ("robot", not blind and np.isfinite(x_mm).any())):
             self._rests_on[name] = time_s if fresh else self._rests_on[name]
         before, calibration = tracker.rig, tracker.calibration
-        fit = seen and not told and bool(data.is_complete.any())
-        if fit:
+        if seen and not told and data.is_complete.any():
             tracker.take(result, frame)
         self._name_state(result, blind, told, seen)
         result.rig = tracker.rig

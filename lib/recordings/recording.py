@@ -2,6 +2,7 @@
 
 import math
 import re
+import shlex
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -166,7 +167,7 @@ class Recording:
         known = Truth.read(folder / "truth", len(frames)) if truth and (folder / "truth").is_dir() else None
         made = cls(folder=folder, frames=frames, kinematics=kinematics, annotations=annotations, truth=known, **header)
         for doubt in made.doubts:
-            place = re.sub(r"\.\d+-\w+\.partial$", "", str(folder))  # where `RecordingWriter` moves it
+            place = shlex.quote(re.sub(r"\.\d+-\w+\.partial$", "", str(folder)))  # where `RecordingWriter` moves it
             warnings.warn(f"{place}: {doubt.text} {doubt.cure} `python3 -m lib check {place}` says more.", stacklevel=2)
         return made
 
