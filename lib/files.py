@@ -30,6 +30,8 @@ def whole(path: str | Path) -> Iterator[Path]:
     'x_mm'
     """
     path = Path(path)
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"{path}: there is no folder {path.parent}; make it, or name another.")
     partial = path.with_name(f"{path.stem}.{os.getpid()}.partial{path.suffix}")
     try:
         yield partial

@@ -21,6 +21,8 @@ def test_failed_write_leaves_the_old_file_and_no_partial(tmp_path):
         raise RuntimeError
     with pytest.raises(FileNotFoundError), files.whole(target):
         pass  # a writer that wrote nothing has failed
+    with pytest.raises(FileNotFoundError, match=r"a\.json: there is no folder .*nowhere; make it"):
+        files.write_json(tmp_path / "nowhere" / "a.json", 1)
     assert target.read_text() == '{\n "a": 1\n}\n' and [p.name for p in tmp_path.iterdir()] == ["rig.json"]
 
 
