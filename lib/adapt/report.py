@@ -38,6 +38,8 @@ def write(found: Adaptation, folder: str | Path, recording: Recording | None = N
         found.detector.save(folder / "weights.safetensors")
         card = here.get_template("weights.md").render(r=found.report, numbers=_NUMBERS)
         files.write_text(folder / "weights.md", card)
+    elif (folder / "weights.safetensors").exists():
+        found.report["notes"] = [*found.report["notes"], "weights.safetensors in this folder is of an earlier run."]
     files.write_json(folder / "report.json", found.report)
     pictures = [] if recording is None or found.after is None else _pictures(found, recording)
     page = here.get_template("adapt.html").render(r=found.report, numbers=_NUMBERS, pictures=pictures)
@@ -85,7 +87,7 @@ def main(argv: list[str]) -> int:
     page = write(found, out, recording)
     where = shlex.quote(paths.shown(a.recording))
     reason = found.report["reason"].removesuffix(".").replace("RECORDING", where)
-    print(f"{'Improved' if found.improved else 'Left alone'}: {reason}.\nReport: {page}")
+    print("\n".join([f"{'Improved' if found.improved else 'Left alone'}: {reason}.", *found.report["notes"], f"Report: {page}"]))
     offset_s, sd_s = (found.report.get(name, np.nan) for name in ("offset_s", "clock_sd_s"))
     if recording is not None and abs(offset_s - recording.offset_s) > 3 * sd_s:
         cure = f"set offset_s = {offset_s:.4f} in {paths.shown(a.recording / 'recording.toml')}"

@@ -77,6 +77,8 @@ def main(argv: list[str] | None = None) -> int:
     add("--frames", type=int, help="only the first N frames")
     add("--surface-every", type=int, default=1, help="ask for a surface in every N-th frame")
     a = parser.parse_args(argv)
+    if min(a.surface_every, 1 if a.frames is None else a.frames) < 1:
+        parser.error("--frames and --surface-every: must be at least 1.")
     recording = Recording.open(a.recording)
     settings = Settings(surface_every=a.surface_every, fps=recording.fps, robot_accuracy_mm=recording.robot_accuracy_mm)
     detector = Detector.load(a.weights)

@@ -103,6 +103,8 @@ def main_evaluate(argv: list[str] | None = None) -> int:
     a = parser.parse_args(argv)
     if a.every < 1:
         parser.error("--every: must be at least 1.")
+    if a.json and not a.json.parent.is_dir():
+        parser.error(f"--json: there is no folder {a.json.parent}; make it first.")
     images = labelled_images(Recording.open(a.recording), every=a.every)
     result = evaluate(Detector.load(a.weights), images, progress=True)
     rows = {"all": result.scores} | result.by_landmark() | result.by_visibility()

@@ -286,6 +286,8 @@ def test_exit_codes_and_files(world, recording, tmp_path, monkeypatch, capsys):
     assert report.main([str(recording.folder), "--out", str(tmp_path / "worse")]) == 3
     assert not (tmp_path / "worse" / "weights.safetensors").exists()
     assert "Left alone" in capsys.readouterr().out
+    assert report.main([str(recording.folder), "--out", str(out)]) == 3
+    assert "weights.safetensors in this folder is of an earlier run" in capsys.readouterr().out
 
 
 def test_labels_of_one_camera_do_without_a_robot(world, recording, tmp_path, monkeypatch):

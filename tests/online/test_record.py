@@ -104,3 +104,6 @@ def test_the_command(tmp_path, shipped, monkeypatch, capsys):
     assert "tracking" in out
     assert (tmp_path / "run" / "frames.csv").is_file()
     assert (tmp_path / "run.mp4").stat().st_size > 1000
+    with pytest.raises(SystemExit):
+        command.main([str(shipped.folder), "--frames", "0"])
+    assert "at least 1" in capsys.readouterr().err

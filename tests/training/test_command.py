@@ -36,6 +36,9 @@ def test_the_evaluate_command(tmp_path, capsys, monkeypatch):
     assert "PCK@0.05" in capsys.readouterr().out
     assert set(json.loads(out.read_text())) >= {"all", "base", "tip_1", "tip_2"}
     assert COMMANDS["evaluate"]([str(tmp_path)]) == 2
+    with pytest.raises(SystemExit):
+        main_evaluate([str(paths.SHIPPED_RECORDING), "--json", str(tmp_path / "nowhere" / "scores.json")])
+    assert "there is no folder" in capsys.readouterr().err
 
 
 def test_the_card_beside_the_shipped_weights_is_theirs():
