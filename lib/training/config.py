@@ -55,12 +55,13 @@ class TrainingConfig:
         if min(self.steps, self.batch_size, self.validate_every) < 1:
             raise ValueError("steps, batch_size, validate_every: must be at least 1.")
 
-    def rate(self, step: int) -> float:
-        """Learning rate of a step."""
+    def rate(self, step: int, spent: float = 0.0) -> float:
+        """Learning rate of a step; `spent` is the share of the time that has passed, if time ends the training."""
         if self.schedule == "constant":
             return self.learning_rate
         warm = min(1.0, (step + 1) / max(1, min(100, self.steps // 10)))
-        return self.learning_rate * warm * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * step / self.steps)))
+        done = max(step / self.steps, min(spent, 1.0))
+        return self.learning_rate * warm * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * done)))
 
     def changed(self, stored: dict[str, object]) -> list[str]:
         """Names of the options whose values differ in a checkpoint's configuration; what it does not name has its default.

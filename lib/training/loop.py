@@ -127,10 +127,10 @@ class Run:
             self.optimiser = torch.optim.AdamW(parameters, config.learning_rate, weight_decay=1e-4)
         self.step, self.seconds, self.log, self.loss_sum, self.since = 0, 0.0, [], 0.0, 0  # both since the last validation
 
-    def advance(self, batch: Batch) -> None:
-        """One step."""
+    def advance(self, batch: Batch, spent: float = 0.0) -> None:
+        """One step; `spent` as in `TrainingConfig.rate`."""
         self.network.train()
-        self.optimiser.param_groups[0]["lr"] = self.config.rate(self.step)
+        self.optimiser.param_groups[0]["lr"] = self.config.rate(self.step, spent)
         batch = Batch(*(part.to(self.device) for part in (batch.images, batch.u, batch.visibility)))
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.config.precision == "bf16"):
             outputs = self.network(batch.images.contiguous(memory_format=torch.channels_last))
@@ -196,7 +196,7 @@ def train(
         source, validation: Training and held-out images; validation is never trained on.
         folder: Keeps ``last.safetensors`` (weights, average, optimiser, step, log); None keeps nothing.
         initial: Start from the weights of this training, for fine-tuning; its provenance is kept under ``before``.
-        max_seconds: Stop (resumably) after this long.
+        max_seconds: Stop (resumably) after this long; a cosine schedule ends then.
         progress: Whether to show a bar, or a function that is called with the part that is done.
 
     Raises:
@@ -220,10 +220,10 @@ def train(
     began, before, stop, saved = time.perf_counter(), run.seconds, False, time.perf_counter()
     with tqdm(total=config.steps, initial=run.step, disable=progress is not True or run.rank > 0, unit="step") as bar:
         while run.step < config.steps and not stop:
-            run.advance(draw_batch(source, config, run.step, run.rank))
+            spent = (time.perf_counter() - began) / max_seconds if max_seconds else 0.0
+            run.advance(draw_batch(source, config, run.step, run.rank), spent)
             bar.update()
             if callable(progress):
-                spent = (time.perf_counter() - began) / max_seconds if max_seconds else 0.0
                 progress(min(1.0, max(run.step / config.steps, spent)))
             run.seconds = before + time.perf_counter() - began
             stop = max_seconds is not None and time.perf_counter() - began > max_seconds
