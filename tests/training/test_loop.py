@@ -175,6 +175,11 @@ def test_bad_data_is_named(toy):
         Samples(good.images, good.u[:1], good.visibility)
 
 
+def test_a_cosine_schedule_ends_with_the_time():
+    config = TrainingConfig(steps=1000, learning_rate=1.0, schedule="cosine")
+    assert config.rate(500, spent=0.2) == config.rate(500) > config.rate(500, spent=0.9) > config.rate(500, spent=5.0) > 0
+
+
 @pytest.mark.parametrize("changes", [{"optimiser": "sgd"}, {"schedule": "step"}, {"precision": "fp8"}, {"steps": 0}])
 def test_bad_configurations_are_named(changes):
     with pytest.raises(ValueError, match=next(iter(changes))):
