@@ -128,7 +128,10 @@ def _main_of(name: str, module: str, function: str):
     """The command `name`: a function of a module.  An error that a user can mend is told in one line, without a traceback."""
 
     def command(argv: list[str]) -> int:
-        warnings.formatwarning = lambda message, *_: f"Warning: {message}\n"  # a user has no use for the line of code
+        usual = warnings.formatwarning
+        warnings.formatwarning = lambda message, kind, *place, **line: (  # a user has no use for the line of code
+            f"Warning: {message}\n" if kind is UserWarning else usual(message, kind, *place, **line)
+        )
         try:
             if module in ("lib.commands", "lib.trust.check", "lib.adapt.report"):  # they detect in a recording
                 _keep_detections()

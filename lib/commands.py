@@ -29,6 +29,9 @@ from lib.trust.verdict import LIMITS
 
 __all__ = ["main_annotate", "main_calibrate", "main_detect", "main_import", "main_reconstruct", "main_register"]
 
+#: Fewer landmarks are fitted too well by cameras of their own to be compared with; errors below this say nothing.
+_FEWEST, _EXACT_PX = 24, 0.5
+
 
 def main_import(argv: list[str]) -> int:
     """`python3 -m lib import`: write a recording from videos, a robot's log and labels, as a mapping file describes them."""
@@ -126,26 +129,28 @@ def main_register(argv: list[str]) -> int:
     found = register_images(StereoRig.load(a.rig), data, sigma_x_mm=recording.robot_accuracy_mm, loss="robust")
     moved = StereoRig.load(a.rig).moved(found.transform)
     seen = data.complete
-    epipolar_px = float(np.median(np.abs(moved.epipolar_distance(seen.u_left, seen.u_right)))) if len(seen) else np.nan
-    error_mm = moved.triangulate(seen.u_left, seen.u_right).x_mm - seen.x_mm
+    epipolar_px = np.abs(moved.epipolar_distance(seen.u_left, seen.u_right))
+    error_mm = np.linalg.norm(moved.triangulate(seen.u_left, seen.u_right).x_mm - seen.x_mm, axis=1)
+    medians = [float(np.median(values)) if len(values) else None for values in (epipolar_px, error_mm)]
     _write_rig(out, moved, recording, "moved_")
     numbers = {"rotation": found.transform.R.tolist(), "translation_mm": found.transform.t.tolist()}
     numbers |= {"covariance": found.covariance.tolist(), "centre_mm": found.centre_mm.tolist()}
-    numbers |= {"median_epipolar_px": epipolar_px, "median_error_mm": float(np.median(np.linalg.norm(error_mm, axis=1)))}
+    numbers |= {"median_epipolar_px": medians[0], "median_error_mm": medians[1]}
     shift_mm = np.linalg.norm(found.centre_mm - found.transform.inverse().apply(found.centre_mm))
     print(f"The cameras moved by {shift_mm:.3f} mm at the tool, standard deviation {found.translation_sd_mm.max():.3f} mm.")
-    print(f"The tool is now {numbers['median_error_mm']:.3f} mm from where the robot reports it (median).")
+    if len(seen):
+        print(f"The tool is now {medians[1]:.3f} mm from where the robot reports it (median).")
     found = assess(recording, data, detector=a.detector)
     return _done(a, out, "registration", numbers, Verdict.join([_as_one(moved, found), found.verdict]))
 
 
 def _as_one(moved: StereoRig, found: Assessment) -> Verdict:
     """Whether one motion of both cameras explains the landmarks about as well as cameras calibrated from them."""
-    if found.calibration is None:
+    if found.calibration is None or len(found.data.complete) < _FEWEST:
         return Verdict()
     x_mm, seen = found.data.x_mm, np.stack([found.data.u_left, found.data.u_right])
     now, anew = (np.nanmedian(np.linalg.norm(seen - rig.project(x_mm), axis=2)) for rig in (moved, found.calibration.pair))
-    level = LEVELS[np.searchsorted(LIMITS["residuals"], now / anew)]
+    level = LEVELS[np.searchsorted(LIMITS["residuals"], now / max(anew, _EXACT_PX))]
     text = f"The moved cameras miss the landmarks by {now:.1f} px (median), cameras calibrated from them by {anew:.1f} px."
     cure = "Did one camera move alone, did zoom or focus change, is --rig of another microscope? Calibrate anew."
     return Verdict(() if level == LEVELS[0] else (Reason("no_common_motion", level, text, cure),))
@@ -204,6 +209,7 @@ def _calibrated(
         return StereoRig.load(a.rig), Verdict((Reason("rig_given", LEVELS[1], text, cure),)), data
     found = assess(recording, data, detector=a.detector)
     if found.calibration is not None and (a.force or not found.verdict.is_red):
+        (out / "verdict.json").unlink(missing_ok=True)  # of an earlier run that was refused
         return found.calibration, found.verdict, data
     files.write_json(out / "verdict.json", found.verdict.to_json())
     force = "" if found.calibration is None else "; --force writes the results of a calibration whatever the verdict"
@@ -214,7 +220,6 @@ def _calibrated(
 
 def _done(a: argparse.Namespace, out: Path, name: str, numbers: dict, verdict: Verdict) -> int:
     files.write_json(out / f"{name}.json", numbers | verdict.to_json())
-    (out / "verdict.json").unlink(missing_ok=True)  # of an earlier run that was refused
     written = sorted(path.name for path in out.iterdir() if path.lstat().st_mtime_ns != a.earlier.get(path))
     print(f"Wrote {paths.shown(out)}: {', '.join(written)}\n{verdict}")
     return 0

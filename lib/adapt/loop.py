@@ -190,9 +190,8 @@ class _Work:
             raise RefusalError(str(refused)) from refused
         teacher = min(teachers, key=lambda one: one.doubt_px(learn))
         self.report["start_share"] = teacher.right
-        closeups = self.learns and start.closeup_network is not None
-        u = teacher.labels(learn)[0]
-        for k in range(_GUIDED if closeups else 0):  # closeups that nobody taught, near where the robot says
+        u, guided = teacher.labels(learn)[0], None
+        for k in range(_GUIDED if self.learns and start.closeup_network else 0):  # untaught, near where the robot says
             guided = self.look(f"guided {k}", start, learn, u)
             try:
                 teacher = teach(recording, self.with_labels(guided), opinion=guided, before=teacher)
@@ -213,9 +212,8 @@ class _Work:
                 break
             tuned = self.round(k, best, teacher, parts, None if k == 1 else best_seen, simulated, tune)
             seen, said = self.look(f"round {k}", tuned, self.frames), {}
-            opinion = self.look(f"opinion {k}", start, learn, u) if closeups else None
             try:
-                new = teach(recording, self.with_labels(seen).of(learn), before=teacher, opinion=opinion)
+                new = teach(recording, self.with_labels(seen).of(learn), before=teacher, opinion=guided)
             except RefusalError as refused:
                 said = {"refused": str(refused)}
                 if len(self.marked) < 5:

@@ -87,7 +87,8 @@ def main(argv: list[str]) -> int:
     page = write(found, out, recording)
     where = shlex.quote(paths.shown(a.recording))
     reason = found.report["reason"].removesuffix(".").replace("RECORDING", where)
-    print("\n".join([f"{'Improved' if found.improved else 'Left alone'}: {reason}.", *found.report["notes"], f"Report: {page}"]))
+    reason = f"{'Improved' if found.improved else 'Left alone'}: {reason}."
+    print("\n".join([reason, *found.report["notes"], f"Report: {page}"]))
     offset_s, sd_s = (found.report.get(name, np.nan) for name in ("offset_s", "clock_sd_s"))
     if recording is not None and abs(offset_s - recording.offset_s) > 3 * sd_s:
         cure = f"set offset_s = {offset_s:.4f} in {paths.shown(a.recording / 'recording.toml')}"

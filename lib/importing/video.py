@@ -1,7 +1,7 @@
 """Stereo frames from videos of any codec and from image files, as 8-bit RGB with the true time of each."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path, PurePath
@@ -161,7 +161,8 @@ def open_stereo(folder: Path, video: Video) -> StereoSource:
     """
     names = [video.left, video.right] if video.layout == "two" else [video.file]
     reels = tuple(_Film(folder / n) if Path(n).suffix.lower() in VIDEOS else _Images(folder, n) for n in names)
-    times = [_times(folder, video, reel) for reel in reels]
+    places = _places(reels)
+    times = [_times(folder, video, reel, place) for reel, place in zip(reels, places, strict=True)]
     for reel, time in zip(reels, times, strict=True):
         increasing(time, str(reel.files[0]), *_STEP_S)
     index = _paired(folder, times)
@@ -176,11 +177,16 @@ def open_stereo(folder: Path, video: Video) -> StereoSource:
     return StereoSource(reels, video.layout, video.exchanged, kept, time, video.bit_depth or _bit_depth(reels, kept), dropped)
 
 
-def _times(folder: Path, video: Video, reel: _Images | _Film) -> list[Decimal]:
-    if video.times == "fps":  # a gap in the numbers of images is a frame that is missing
-        steps = np.diff([number for number in reel.numbers if isinstance(number, int)])
-        usual = np.median(steps) if steps.size else 1
-        places = np.cumsum([0, *steps // usual]) if steps.size and not (steps % usual).any() else range(len(reel))
+def _places(reels: Sequence[_Images | _Film]) -> list[np.ndarray]:
+    """Numbers from 0 of the frames: a gap in the numbers of images is a frame that is missing, if all steps tell that."""
+    steps = [np.diff([number for number in reel.numbers if isinstance(number, int)]) for reel in reels]
+    usual = max(np.median(np.concatenate(steps)) if any(map(len, steps)) else 1, 1)
+    told = all(len(own) + 1 == len(reel) and not (own % usual).any() for own, reel in zip(steps, reels, strict=True))
+    return [np.cumsum([0, *own // usual]) if told else np.arange(len(reel)) for own, reel in zip(steps, reels, strict=True)]
+
+
+def _times(folder: Path, video: Video, reel: _Images | _Film, places: np.ndarray) -> list[Decimal]:
+    if video.times == "fps":
         return [Decimal(int(place)) / Decimal(str(video.fps)) for place in places]
     if video.times == "names" and reel.stamps is None:
         return [exact_seconds(str(last_number(p)), video.name_unit, str(p)) for p in reel.files]

@@ -49,8 +49,7 @@ def _sgbm(left: np.ndarray, right: np.ndarray, range_px: tuple, *, checked: bool
 
     # OpenCV takes -1, no check, for 1; so the image's width stands for no check.
     found = disparity(1 if checked else left.shape[1])
-    passed = np.isfinite(found if checked else disparity(1))
-    return found, np.isfinite(found).astype(float), passed
+    return found, np.isfinite(found).astype(float), np.isfinite(found if checked else disparity(1))
 
 
 def _dis(left: np.ndarray, right: np.ndarray, range_px: tuple) -> tuple[np.ndarray, ...]:

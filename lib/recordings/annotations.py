@@ -136,8 +136,7 @@ def mark_coco(path: Path, image: str, image_size_px: tuple[int, int], landmarks:
     """
     content = json.loads(path.read_bytes()) if path.exists() else _empty(landmarks)
     images, entries = content["images"], content["annotations"]
-    place = PurePosixPath(image).with_suffix("").parts
-    ids = [one["id"] for one in images if PurePosixPath(one["file_name"]).with_suffix("").parts[-2:] == place]
+    ids = [one["id"] for one in images if _place(one["file_name"]) == _place(image)]
     if not ids:
         ids = [1 + max((one["id"] for one in images), default=0)]
         images.append(_image(ids[0], image, image_size_px))
@@ -151,6 +150,12 @@ def mark_coco(path: Path, image: str, image_size_px: tuple[int, int], landmarks:
         entries.append({"id": identity, "image_id": ids[0], "category_id": category["id"]})
     entries[at] = _filled(entries[at], category["keypoints"], landmarks, values)
     write_text(path, json.dumps(content, allow_nan=False) + "\n")
+
+
+def _place(file_name: str) -> tuple[str | int, ...]:
+    """Folder and number of an image: left/3.png and left/000003.jpg are the same."""
+    *folder, stem = PurePosixPath(file_name).with_suffix("").parts[-2:]
+    return (*folder, int(stem) if stem.isdecimal() else stem)
 
 
 def _empty(landmarks: Sequence[str]) -> dict:

@@ -155,7 +155,7 @@ class Annotator:
         for side, frame, k, x, y, v in changes:
             images[side, frame][k] = (x, y, v) if v > 0 else (np.nan, np.nan, v)
         for (side, frame), values in images.items():
-            files = sorted((r.folder / side).glob(f"{frame:06d}.*"))
+            files = sorted(p for p in (r.folder / side).glob(f"*{frame}.*") if p.stem.isdecimal() and int(p.stem) == frame)
             name = f"{side}/{files[0].name if files else f'{frame:06d}.jpg'}"
             mark_coco(self._path, name, r.image_size_px, r.skeleton, values)
         self._read()

@@ -133,5 +133,4 @@ def _mosaic(value: np.ndarray) -> np.ndarray:
     """Sampled through a colour filter of 2 x 2 pixels and interpolated."""
     raw = np.clip(value[..., 1], 0, 1).copy()
     raw[::2, ::2], raw[1::2, 1::2] = value[::2, ::2, 0], value[1::2, 1::2, 2]
-    raw = cv2.convertScaleAbs(raw, alpha=255)
-    return cv2.cvtColor(raw, cv2.COLOR_BayerBG2RGB).astype(np.float32) / 255
+    return cv2.cvtColor(cv2.convertScaleAbs(raw, alpha=255), cv2.COLOR_BayerBG2RGB).astype(np.float32) / 255

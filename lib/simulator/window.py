@@ -141,8 +141,7 @@ def surface_grid(
     Linear interpolation between the points is right to 1 um for eyes at the default step.
     """
     x_px, y_px = (np.append(np.arange(0, side - 1, step_px), side - 1).astype(float) for side in size_px)
-    points = intersect(scene, Window(camera, size_px), tuple(np.meshgrid(x_px, y_px)))
-    return x_px, y_px, np.stack(points, axis=-1)
+    return x_px, y_px, np.stack(intersect(scene, Window(camera, size_px), tuple(np.meshgrid(x_px, y_px))), axis=-1)
 
 
 def in_image(u: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:

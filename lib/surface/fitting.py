@@ -193,5 +193,4 @@ def _choose_smoothness(
         slope = (errors[best + 1] - errors[best - 1]) / 2
         curvature = errors[best + 1] - 2 * errors[best] + errors[best - 1]
         exponent -= float(np.clip(slope / max(curvature, 1e-300), -0.5, 0.5))
-    table = [(unit * _LADDER**step, errors[step]) for step in sorted(errors)]
-    return unit * _LADDER**exponent, np.array(table)
+    return unit * _LADDER**exponent, np.array([(unit * _LADDER**step, errors[step]) for step in sorted(errors)])

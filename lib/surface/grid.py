@@ -132,8 +132,7 @@ class SplineGrid:
 
     def flatten(self, control_points: np.ndarray) -> np.ndarray:
         """Coefficients (size, k) of control points (n_y, n_x, k)."""
-        array = control_points if self.stride[0] == 1 else control_points.swapaxes(0, 1)
-        return array.reshape(self.size, -1)
+        return (control_points if self.stride[0] == 1 else control_points.swapaxes(0, 1)).reshape(self.size, -1)
 
     def unflatten(self, coefficients: np.ndarray) -> np.ndarray:
         """Control points (n_y, n_x, k) of coefficients (size, k)."""

@@ -83,8 +83,7 @@ class SceneSource(Source):
             image, u, visibility = disguised(image, u, visibility, rng, length if np.isfinite(length) else 40.0)
         if length < SHORTEST_PX or image.std() < FLAT:
             u = np.where((visibility > 0)[:, None], np.nan, u)
-        u = np.where((rng.random(3) > weight)[:, None], np.nan, u)
-        return image, u, visibility
+        return image, np.where((rng.random(3) > weight)[:, None], np.nan, u), visibility
 
 
 def _length_px(u: np.ndarray, visibility: np.ndarray) -> float:

@@ -41,8 +41,6 @@ __all__ = ["STAGES", "assemble", "card", "finetune", "stage_config", "stage_data
 STAGES = {"frame": 32, "tool": 48, "closeup": 32}
 #: Standard deviation of a label, as a share of the tool's length, at which a stage lets it count half.
 LABEL_SD = {"frame": 0.1, "tool": 0.04, "closeup": 0.02}
-#: Fine-tuning's time for a stage, as a share of the tool's, whose windows decide what the closeups see.
-_SHARES = {"frame": 0.5, "closeup": 0.5}
 _SOURCES = {"frame": FrameSource, "tool": ToolSource, "closeup": CloseupSource}
 
 
@@ -118,7 +116,7 @@ def finetune(
             progress(stage, part)
 
     def trained(lane: list[str]) -> dict[str, Network]:
-        """The stages of a thread, one after the other, each for its share of the time."""
+        """The stages of a thread, one after the other, each for the same time."""
         found = {}
         for number, stage in enumerate(lane):
             source: Source = _SOURCES[stage].of(images, weight=1 / (1 + variance[usable[0]] / LABEL_SD[stage] ** 2))
@@ -131,8 +129,7 @@ def finetune(
             config = replace(config, learning_rate=5e-4, ema=0.995, batch_size=size, validate_every=max(1, steps // 3))
             start, left = Training(detector.networks[stage], [], {"shipped": detector.metadata.get("commit")}), None
             if minutes is not None:
-                shares = [_SHARES.get(later, 1.0) for later in lane[number:]]
-                left = shares[0] / sum(shares) * (60 * minutes - (time.perf_counter() - began))
+                left = (60 * minutes - (time.perf_counter() - began)) / (len(lane) - number)
             where, how = (source, _still(stage, held_out), Path(folder) / stage), {"initial": start, "max_seconds": left}
             found[f"{stage}_network"] = train(config, *where, progress=partial(told, stage), **how).network
         return found

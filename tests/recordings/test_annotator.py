@@ -53,6 +53,17 @@ def detected(recording, off_px=(), missed=()):
     return of_recording(recording, *u)
 
 
+def test_frames_without_leading_zeros_keep_their_names(folder):
+    Annotator(Recording.open(folder)).mark("left", 3, "base", (10.0, 20.0))
+    for path in folder.glob("*/*.png"):
+        path.rename(path.with_stem(str(int(path.stem))))
+    Annotator(Recording.open(folder)).mark("left", 3, "tip_1", (12.0, 20.0))  # the entry names left/000003.png
+    Annotator(Recording.open(folder)).mark("right", 3, "base", (10.0, 20.0))
+    told = json.loads((folder / "annotations.json").read_text(encoding="utf-8"))["images"]
+    assert [one["file_name"] for one in told] == ["left/000003.png", "right/3.png"]
+    assert labels(folder).visibility_left[3].tolist() == [2, 2, 0]
+
+
 def test_each_mark_is_in_the_file_at_once(folder):
     annotator = Annotator(Recording.open(folder))
     annotator.mark("left", 2, "base", (10.25, 20.5))
