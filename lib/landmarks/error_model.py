@@ -96,8 +96,7 @@ def features_of(peaks: Peaks, rough: Rough | None = None) -> Tensor:
         moved = (1 + moved / 2).log()
         logit, together = (part.to(one.dtype).clamp(-6, 6) for part in (rough.logit, rough.together))
     shared = [height, width, peaks.rival.clamp(-0.5, 1.5), moved, logit, together]
-    rows = [torch.stack([one, v.clamp(1e-4, 1e4).log(), *shared], -1) for v in (xx, yy, both)]
-    return torch.stack(rows, -2)
+    return torch.stack([torch.stack([one, v.clamp(1e-4, 1e4).log(), *shared], -1) for v in (xx, yy, both)], -2)
 
 
 def covariance_and_confidence(

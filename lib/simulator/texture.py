@@ -161,8 +161,7 @@ def _noise(rng: Rng, cells: int, octaves: int = 1, gain: float = 0.5) -> np.ndar
 
 def _soft(image: np.ndarray, sigma_px: float) -> np.ndarray:
     """Blurred, as shares of 255 if the image is uint8."""
-    scale = 255 if image.dtype == np.uint8 else 1
-    return cv2.GaussianBlur(image, (0, 0), sigma_px).astype(np.float32) / scale
+    return cv2.GaussianBlur(image, (0, 0), sigma_px).astype(np.float32) / (255 if image.dtype == np.uint8 else 1)
 
 
 def _membranes(rng: Rng) -> np.ndarray:

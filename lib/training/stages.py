@@ -16,7 +16,7 @@ from tqdm.auto import tqdm
 
 from lib.files import write_text
 from lib.landmarks import Detector
-from lib.landmarks.detector import MISSING_BELOW
+from lib.landmarks.detector import CLOSE, MISSING_BELOW
 from lib.landmarks.metrics import tool_length_px
 from lib.landmarks.network import HourglassConfig, Network, OffsetConfig
 from lib.landmarks.windows import tool_pose
@@ -154,9 +154,11 @@ def finetune(
         return replace(tuned, closeup_from=detector.closeup_from)
     if detector.closeup_network is None:
         return tuned
-    # Whether unsure landmarks gain by closeups depends on how far from their training the networks look: held-out images say.
-    ways = (tuned, replace(tuned, closeup_from=detector.closeup_from))
-    return max(ways, key=lambda one: evaluate(one, held_out).scores.auc)
+    # Held-out images say whether the closeups gained by a short training, and whether unsure landmarks gain by closeups.
+    before = {stage: detector.error_models[stage] for stage in CLOSE if stage in detector.error_models}
+    ways = [tuned, replace(tuned, closeup_network=detector.closeup_network, error_models=tuned.error_models | before)]
+    ways += [replace(one, closeup_from=detector.closeup_from) for one in ways]
+    return max(ways[:: 1 if before else 2], key=lambda one: evaluate(one, held_out).scores.auc)
 
 
 def training_of(detector: Detector, stage: str) -> Training:
