@@ -1,7 +1,9 @@
 """The commands `train` and `evaluate`, fine-tuning on labelled frames, and the model card."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +12,8 @@ import torch
 from lib import paths
 from lib.__main__ import COMMANDS
 from lib.landmarks import Detector
+from lib.landmarks.detector import CLOSE
+from lib.landmarks.error_model import ErrorModel
 from lib.landmarks.network import HourglassConfig, OffsetConfig, OffsetNetwork, StackedHourglass
 from lib.training import command, stages
 from lib.training.command import main_evaluate
@@ -75,6 +79,11 @@ def test_stages_are_fine_tuned_on_labelled_frames(tmp_path, monkeypatch):
     for a, b in zip(again.tool_network.parameters(), tuned.tool_network.parameters(), strict=True):
         assert torch.equal(a, b)
     assert [len(held_out) for held_out in fitted_on] == [2, 2]
+    auc = lambda d, _: SimpleNamespace(scores=SimpleNamespace(auc=float(d.closeup_network is closeup)))  # noqa: E731
+    monkeypatch.setattr(stages, "evaluate", auc)
+    before = replace(detector, error_models={stage: ErrorModel() for stage in CLOSE})
+    kept = stages.finetune(before, images[:6], images[6:], tmp_path, covariance_px2=covariance, **options)
+    assert kept.closeup_network is closeup and kept.tool_network is not hourglass  # held-out images prefer those from before
     with pytest.raises(ValueError, match="none has a labelled base and tip"):
         stages.finetune(detector, images[:1], images[6:], tmp_path / "none", **options)
 
