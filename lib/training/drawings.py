@@ -90,8 +90,7 @@ def drawn_tool(image: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray,
     u = np.array(u)
     if np.linalg.det(u[1:] - u[0]) < 0:  # the jaws cross: tip_1 is the left one
         u = u[[0, 2, 1]]
-    inside = ((u > -0.5) & (u < np.array([w, h]) - 0.5)).all(1)
-    return np.clip(x, 0, 255).astype(np.uint8), u, np.where(inside, 2, 0)
+    return np.clip(x, 0, 255).astype(np.uint8), u, np.where(((u > -0.5) & (u < np.array([w, h]) - 0.5)).all(1), 2, 0)
 
 
 def _jaw_shape(rng: np.random.Generator) -> dict[str, float]:

@@ -79,7 +79,9 @@ def test_stages_are_fine_tuned_on_labelled_frames(tmp_path, monkeypatch):
     for a, b in zip(again.tool_network.parameters(), tuned.tool_network.parameters(), strict=True):
         assert torch.equal(a, b)
     assert [len(held_out) for held_out in fitted_on] == [2, 2]
-    auc = lambda d, _: SimpleNamespace(scores=SimpleNamespace(auc=float(d.closeup_network is closeup)))  # noqa: E731
+    auc = lambda d, _: SimpleNamespace(  # noqa: E731
+        scores=SimpleNamespace(auc=50.0, pck_0_01=float(d.closeup_network is closeup))
+    )
     monkeypatch.setattr(stages, "evaluate", auc)
     before = replace(detector, error_models={stage: ErrorModel() for stage in CLOSE})
     kept = stages.finetune(before, images[:6], images[6:], tmp_path, covariance_px2=covariance, **options)
