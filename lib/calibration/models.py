@@ -49,8 +49,7 @@ class Model:
                 f"model: unknown model {name!r}; take one of {', '.join(BASES)} or near_affine, and add +distance or "
                 "+distances, +radial."
             )
-        distance = next((o for o in options if o != "radial"), None)
-        return cls(base, distance, "radial" in options, cameras)
+        return cls(base, next((o for o in options if o != "radial"), None), "radial" in options, cameras)
 
     @property
     def is_affine(self) -> bool:

@@ -154,8 +154,10 @@ def finetune(
         return replace(tuned, closeup_from=detector.closeup_from)
     if detector.closeup_network is None:
         return tuned
-    # Held-out images say whether the closeups gained by a short training, and whether unsure landmarks gain by closeups.
+    # Gain and bias of closeups stay: many exact labels told them, and few labels have a constant error of their own.
     before = {stage: detector.error_models[stage] for stage in CLOSE if stage in detector.error_models}
+    tuned = tuned.with_error_models(**{k: replace(tuned.error_models[k], gain=v.gain, bias=v.bias) for k, v in before.items()})
+    # Held-out images say whether the closeups gained by a short training, and whether unsure landmarks gain by closeups.
     ways = [tuned, replace(tuned, closeup_network=detector.closeup_network, error_models=tuned.error_models | before)]
     ways += [replace(one, closeup_from=detector.closeup_from) for one in ways]
     scores = {way: evaluate(way, held_out).scores for way in ways[:: 1 if before else 2]}

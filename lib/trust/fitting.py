@@ -230,5 +230,4 @@ class Problem:
         stretch = self.frame // max(1, min(_BLOCK, frames // 6))
         sums = np.zeros((int(stretch.max(initial=0)) + 1, 2))
         np.add.at(sums, stretch, z.sum(axis=1))
-        alone = (z**2).sum(axis=(0, 1))
-        return float(max(1.0, ((sums**2).sum(axis=0) / np.maximum(alone, 1e-300)).mean()))
+        return float(max(1.0, ((sums**2).sum(axis=0) / np.maximum((z**2).sum(axis=(0, 1)), 1e-300)).mean()))
