@@ -13,7 +13,7 @@ import numpy as np
 
 from lib.calibration import Calibration, CompetingCamerasError, LandmarkOffsets, calibrate, estimate_time_offset
 from lib.calibration.offsets import tool_axes
-from lib.correspondences import MIN_CONFIDENCE, Correspondences, of_recording
+from lib.correspondences import LANDMARKS, MIN_CONFIDENCE, Correspondences, of_recording
 from lib.landmarks import Landmarks
 from lib.landmarks.metrics import tool_length_px
 from lib.recordings import Recording
@@ -38,6 +38,9 @@ _CONTRADICTED = 0.2
 #: Standard deviation of a detector's own constant error, as a share of the tool's length: along, across, normal.  The base
 #: has no edge that ends along the shaft.  Chosen by the closeups' errors in four recordings of unfamiliar tools and lights.
 _OWN_BIAS = 0.004 * np.array([[2.5, 1.0, 1.5], [1.2, 1.0, 1.5], [1.2, 1.0, 1.5]])
+#: Larger offsets of a landmark, as a share of the tool's length, are another point of the tool.
+_LARGEST_OFFSET = 0.15
+_TURNED = 0.3  # error of an offset, as a share of it, where shut jaws borrow the tool's axes from another time
 _ODD = 0.2  # share of a large offset that may be the detector's all the same: some tools it knows far worse than others
 #: Gain in log likelihood of a detection, by which cameras of their own for a part of the time must explain it better.
 _SURE_MOVE = 0.1
@@ -149,6 +152,7 @@ class Teacher:
         offset_mm, offset_sd_mm: (3, 3) in the tool's axes: where the landmarks are, beside where the robot reports them.
         refused: Frames in which the robot is not believed.
         right: Share of the landmarks that agree on the cameras.
+        turns: As `LandmarkOffsets.turns`.
     """
 
     recording: Recording
@@ -158,6 +162,7 @@ class Teacher:
     offset_sd_mm: np.ndarray
     refused: np.ndarray
     right: float
+    turns: bool = False
 
     def project(self, frames: np.ndarray, offset_mm: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Pixels (m, 2, 3, 2) of the robot's landmarks at the instants of their image rows, and covariances (m, 2, 3, 2, 2).
@@ -167,13 +172,17 @@ class Teacher:
         """
         r, c = self.recording, self.calibration
         offset = self.offset_mm if offset_mm is None else offset_mm
+        turning = offset if self.turns else None
+        known_at, known = _known_axes(r, turning)
         time, height = np.repeat(r.frames.time_s[frames][:, None], 3, axis=1) + r.offset_s, r.image_size_px[1]
         u, covariance = np.full((len(frames), 2, 3, 2), np.nan), np.full((len(frames), 2, 3, 2, 2), np.nan)
         for side, camera in enumerate(c.cameras):
             at = time
             for _ in range(3 if r.readout_s else 1):
                 x = r.kinematics.at(at)
-                axes = np.nan_to_num(tool_axes(x))  # shut jaws have no axes, their offset stays unknown
+                axes = tool_axes(x, turning)
+                shut = ~np.isfinite(axes).all(axis=(1, 2))
+                axes[shut] = known[np.abs(known_at - at[shut, :1]).argmin(axis=1)]
                 x = x + np.einsum("mij,kj->mki", axes, offset)
                 u[:, side] = camera.project(x.reshape(-1, 3)).reshape(x.shape[:2] + (2,))
                 at = time + r.readout_s * np.nan_to_num(u[:, side, :, 1] / (height - 1) - 0.5).clip(-0.5, 0.5)
@@ -182,6 +191,7 @@ class Teacher:
             velocity = (r.kinematics.at(at + 0.02) - r.kinematics.at(at - 0.02)).reshape(-1, 3) / 0.04
             moved = self.clock_sd_s * np.einsum("nij,nj->ni", J, np.nan_to_num(velocity))
             spread = np.einsum("mij,kj,mlj->mkil", axes, self.offset_sd_mm**2, axes).reshape(-1, 3, 3)
+            spread += (_TURNED * shut[:, None] * np.linalg.norm(offset, axis=1)).reshape(-1, 1, 1) ** 2 * np.eye(3)
             spread = spread + max(r.robot_accuracy_mm, c.sigma_x_mm) ** 2 * np.eye(3)
             S = c.projection_covariance(flat)[:, view, view] + J @ spread @ J.mT + moved[:, :, None] * moved[:, None]
             covariance[:, side] = S.reshape(len(frames), 3, 2, 2)
@@ -253,10 +263,12 @@ def teach(
     if told is not None and told.offset.shape == (3, 3):
         x = recording.landmarks_mm()
         length = np.nanmedian(np.linalg.norm(x[:, 1:].mean(axis=1) - x[:, 0], axis=1))
+        _refuse_other_points(told.offset / length, from_labels)
         offset, sd = _robots_share(told, (0.2 if from_labels else 1.0) * _OWN_BIAS * length)
     elif before is not None:
         offset, sd = before.offset_mm, before.offset_sd_mm
-    teacher = Teacher(recording, calibration, clock_sd_s, offset, sd, refused, right)
+    turns = told.turns if told is not None else before is not None and before.turns
+    teacher = Teacher(recording, calibration, clock_sd_s, offset, sd, refused, right, turns)
     against = _contradicted(teacher, used)
     if len(against) > max(_CONTRADICTED * len(used.frame), 2):
         raise RefusalError(
@@ -264,6 +276,13 @@ def teach(
             f"says: a frozen log, another clock, a moved microscope, or a tool that the robot does not hold."
         )
     return replace(teacher, refused=np.union1d(refused, against))
+
+
+def _known_axes(recording: Recording, turning: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    """Times (m,) of the robot's samples in which the jaws are open, and the tool's axes (m, 3, 3); for want of any, zeros."""
+    axes = tool_axes(recording.kinematics.x_mm, turning)
+    known = np.isfinite(axes).all(axis=(1, 2))
+    return (recording.kinematics.time_s[known], axes[known]) if known.any() else (np.zeros(1), np.zeros((1, 3, 3)))
 
 
 def _frozen(recording: Recording, frames: np.ndarray) -> np.ndarray:
@@ -359,6 +378,18 @@ def _robots_share(found: LandmarkOffsets, own_sd: np.ndarray) -> tuple[np.ndarra
     # What the rig hides moves cameras and offsets together and leaves the labels where they are: no reason to believe less.
     share = width**2 / (width**2 + own_sd**2)
     return share * found.offset, np.hypot(np.sqrt(share) * own_sd, _ODD * share * found.offset)
+
+
+def _refuse_other_points(offset: np.ndarray, from_labels: bool) -> None:
+    """Refuse offsets (3, 3), as shares of the tool's length, that are too large for a robot: elbows of the jaws, say."""
+    size = np.linalg.norm(offset, axis=1)
+    if from_labels or size.max() < _LARGEST_OFFSET:
+        return
+    raise RefusalError(
+        f"detector: it sees {LANDMARKS[size.argmax()]} {100 * size.max():.0f} % of the tool's length away from where the robot "
+        "reports it. It takes another point for it, or the robot's tool has other dimensions. Label 10 pairs of frames, far "
+        "apart in place and depth (`python3 -m lib annotate RECORDING`), and give annotations.json with --labels."
+    )
 
 
 def _contradicted(teacher: Teacher, seen: Seen) -> np.ndarray:

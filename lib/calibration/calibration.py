@@ -23,12 +23,19 @@ class LandmarkOffsets:
         offset, covariance: (k, 3) mm in the tool's axes (along, across, normal), or (k, m) px; (k, d, d) of each landmark.
         prior_sd: Of a coordinate before the data, given or chosen by the evidence.
         p_value: Probability of offsets as large as the data show if there are none (score test).
+        turns: The axes are those of the landmarks where they are seen, not where the robot reports them.
     """
 
     offset: np.ndarray
     covariance: np.ndarray
     prior_sd: float
     p_value: float
+    turns: bool = False
+
+    @property
+    def turning(self) -> np.ndarray | None:
+        """The offset if it turns the axes, for `tool_axes`."""
+        return self.offset if self.turns else None
 
     @property
     def standard_deviation(self) -> np.ndarray:

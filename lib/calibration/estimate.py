@@ -1,6 +1,6 @@
 """`calibrate`: from correspondences to cameras with their covariance."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Literal
@@ -24,6 +24,8 @@ __all__ = ["calibrate"]
 
 #: Fewest rows with the tool's axes from which offsets are estimated unasked.
 _OFFSET_ROWS = 24
+#: Turned axes that move landmarks less than this are no question; others need so much log likelihood.
+_LEAST_TURN_MM, _LEAST_GAIN = 0.005, 10.0
 
 
 def calibrate(
@@ -108,6 +110,8 @@ def calibrate(
             found = _scattered(found, None if usable is None else rows)
     else:
         found = estimate_offsets(fitted, x, y, rows.landmark, axes, rows.frame, offset_prior_sd)
+        if axes is not None:
+            found = _turned(found, partial(estimate_offsets, fitted, x, y, rows.landmark), axes, rows, offset_prior_sd)
     return found if usable is None else _spread_out(found, usable)
 
 
@@ -128,6 +132,26 @@ def _usable_rows(data: Correspondences, offsets: bool | str | None, weighting: s
     if count < 4:
         raise ValueError(f"offsets: {count} rows have the tool's axes; the robot must report landmarks with open jaws.")
     return open_jaws, axes[open_jaws]
+
+
+def _turned(
+    found: Calibration, estimate: Callable[..., Calibration], axes: np.ndarray, rows: Correspondences, prior_sd: float | None
+) -> Calibration:
+    """The calibration with the axes of the moved landmarks, if these explain the detections better than the reported ones.
+
+    What a robot with a wrong tool reports is off in the axes of the true tool, and turns the axes of the reported one.
+    """
+    other = found
+    for _ in range(3):
+        offset = other.offsets.offset
+        turned = rows_axes(rows, offset)
+        turned = np.where(np.isfinite(turned), turned, axes)
+        if np.einsum("nij,nj->ni", turned - axes, offset[rows.landmark]).std() < _LEAST_TURN_MM:
+            return found
+        other = estimate(turned, rows.frame, prior_sd)
+    both = np.repeat(found.view_inliers & other.view_inliers, 2, axis=1)
+    gain = both.sum() * np.log(np.linalg.norm(found.residuals_px[both]) / np.linalg.norm(other.residuals_px[both]))
+    return found if gain < _LEAST_GAIN else replace(other, offsets=replace(other.offsets, turns=True))
 
 
 def _scattered(found: Calibration, rows: Correspondences | None) -> Calibration:

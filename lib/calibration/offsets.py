@@ -21,10 +21,11 @@ from lib.correspondences import Correspondences
 __all__ = ["estimate_offsets", "rows_axes", "tool_axes", "with_offsets"]
 
 
-def tool_axes(x_mm: ArrayLike) -> np.ndarray:
+def tool_axes(x_mm: ArrayLike, offset_mm: np.ndarray | None = None) -> np.ndarray:
     """Axes R (n, 3, 3) of a forceps from its landmarks (n, 3, 3) mm: columns along it, from tip to tip, and their normal.
 
-    NaN where the jaws are shut (tips closer than 5 % of the tool's length) or a landmark is missing.
+    With `offset_mm` (3, 3), those of the landmarks x + R d, moved in these very axes: offsets of the tips turn the line
+    between nearly shut jaws.  NaN where the jaws are shut (tips closer than 5 % of the tool's length) or a landmark is missing.
 
     >>> tool_axes([[[0, 0, 0], [3, -0.5, 0], [3, 0.5, 0]]])[0]
     array([[1., 0., 0.],
@@ -34,6 +35,11 @@ def tool_axes(x_mm: ArrayLike) -> np.ndarray:
     x = np.asarray(x_mm, dtype=np.float64)
     if x.ndim != 3 or x.shape[1:] != (3, 3):
         raise ValueError(f"x_mm: expected base, tip_1 and tip_2 (n, 3, 3), got {x.shape}.")
+    if offset_mm is not None:
+        axes = tool_axes(x)
+        for _ in range(20):
+            axes = tool_axes(x + np.einsum("nij,kj->nki", axes, offset_mm))
+        return axes
     along = x[:, 1:].mean(axis=1) - x[:, 0]
     length = np.linalg.norm(along, axis=1, keepdims=True)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -44,12 +50,12 @@ def tool_axes(x_mm: ArrayLike) -> np.ndarray:
     return np.stack([along, across, np.cross(along, across)], axis=2)
 
 
-def rows_axes(data: Correspondences) -> np.ndarray:
+def rows_axes(data: Correspondences, offset_mm: np.ndarray | None = None) -> np.ndarray:
     """`tool_axes` (n, 3, 3) of each row's frame; NaN too where recordings joined under the same frame numbers repeat rows."""
     rows = np.column_stack([data.frame, data.landmark])
     if len(data) == 0 or data.landmark.max() > 2 or len(np.unique(rows, axis=0)) < len(rows):
         return np.full((len(data), 3, 3), np.nan)
-    return tool_axes(data.grid("x_mm"))[np.unique(data.frame, return_inverse=True)[1]]
+    return tool_axes(data.grid("x_mm"), offset_mm)[np.unique(data.frame, return_inverse=True)[1]]
 
 
 def with_offsets(data: Correspondences, offsets: LandmarkOffsets | None) -> Correspondences:
@@ -62,7 +68,7 @@ def with_offsets(data: Correspondences, offsets: LandmarkOffsets | None) -> Corr
     shift = offsets.offset[data.landmark]
     if shift.shape[1] == 4:
         return replace(data, u_left=data.u_left - shift[:, :2], u_right=data.u_right - shift[:, 2:])
-    shift = np.einsum("nij,nj->ni", rows_axes(data), shift)
+    shift = np.einsum("nij,nj->ni", rows_axes(data, offsets.turning), shift)
     return replace(data, x_mm=data.x_mm + np.where(np.isfinite(shift), shift, 0.0))
 
 

@@ -20,7 +20,7 @@ class TrainingConfig:
         schedule: Of the learning rate: ``"constant"``, or ``"cosine"`` after a warm-up.
         ema: Decay of the moving average of the weights, which is validated and returned; 0 = the weights themselves.
         clip: Largest norm of the gradient; 0 = unlimited.
-        precision: ``"fp32"``, or ``"bf16"`` mixed precision; the loss is always float32.
+        precision: ``"fp32"``, or ``"bf16"``: mixed precision where the processor computes in it; the loss is always float32.
         sigma_px: Width of the target Gaussians in pixels of the network's input.
         position_weight_per_px: Weight of `position_loss` beside the l2 loss of the heatmaps; 0 as in the paper.
         seed: Decides the first weights and every batch.

@@ -77,10 +77,18 @@ def test_offsets_of_an_unknown_tool_do_not_hide_which_half_is_right(world, tmp_p
     from lib.calibration.offsets import tool_axes
 
     offset = np.random.default_rng(3).normal(size=(3, 3))
-    offset *= 0.4 / np.linalg.norm(offset, axis=1, keepdims=True)
+    offset *= 0.3 / np.linalg.norm(offset, axis=1, keepdims=True)
     off = world.record(tmp_path / "off", robot=lambda _, x: x + np.einsum("mij,kj->mki", np.nan_to_num(tool_axes(x)), offset))
     teacher = taught(off, Sure(world.u, noise_px=1.0, wrong=0.5))
     assert 0.3 < teacher.right < 0.6 and np.median(label_errors(world, teacher)[0]) < 1.5
+
+
+def test_a_detector_that_takes_elbows_for_tips_is_no_start(world, recording):
+    """It agrees with itself and with the robot, but for an offset that no robot has."""
+    elbows = world.u.copy()
+    elbows[:, :, 1:] += 0.25 * (elbows[:, :, :1] - elbows[:, :, 1:])
+    with pytest.raises(RefusalError, match="sees tip_.*another point.*Label 10 pairs"):
+        taught(recording, StandIn(elbows, noise_px=0.7, wrong=0.2))
 
 
 class Sure(StandIn):

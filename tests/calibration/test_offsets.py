@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lib.calibration import calibrate
+from lib.calibration import calibrate, with_offsets
 from lib.calibration.offsets import estimate_offsets, tool_axes
 from lib.correspondences import Correspondences
 from lib.geometry import RigidTransform
@@ -30,7 +30,7 @@ def test_axes_are_those_of_the_tool():
     ("model", "distance_mm", "runs"), [("zero_skew", np.inf, 5), ("affine", np.inf, 3), ("near_affine", 200.0, 2)]
 )
 def test_offsets_are_found_with_honest_deviations_and_the_cameras_lose_their_bias(model, distance_mm, runs):
-    normalised, with_offsets, without, claims = [], [], [], []
+    normalised, offset_errors, without, claims = [], [], [], []
     for seed in range(runs):
         data, rig, true = tool_sweep(seed, distance_mm=distance_mm)
         options = {"model": model, "image_size_px": IMAGE_SIZE_PX}
@@ -38,13 +38,30 @@ def test_offsets_are_found_with_honest_deviations_and_the_cameras_lose_their_bia
         assert found.offsets.p_value < 1e-6 and 0.008 < found.offsets.prior_sd < 0.04
         normalised.append((found.offsets.offset - OFFSETS_MM) / found.offsets.standard_deviation)
         exact = np.hstack(rig.project(true))
-        for fit, errors in ((found, with_offsets), (calibrate(data, offsets=False, **options), without)):
+        for fit, errors in ((found, offset_errors), (calibrate(data, offsets=False, **options), without)):
             errors.append(np.hstack(fit.rig.project(true)) - exact)
         # The cameras' claimed covariance has the offsets' uncertainty in it.
         claims.append(np.trace(found.projection_covariance(true), axis1=1, axis2=2).mean() / 4)
     assert np.sqrt(np.mean(np.square(normalised))) == pytest.approx(1, abs=0.3)
-    assert np.mean(np.square(with_offsets)) < 0.6 * np.mean(np.square(without))
-    assert np.mean(np.square(with_offsets)) / np.mean(claims) == pytest.approx(1, abs=0.6)
+    assert np.mean(np.square(offset_errors)) < 0.6 * np.mean(np.square(without))
+    assert np.mean(np.square(offset_errors)) / np.mean(claims) == pytest.approx(1, abs=0.6)
+
+
+@pytest.mark.parametrize("of_the_true_tool", [True, False])
+def test_large_offsets_turn_the_axes_of_nearly_shut_jaws(of_the_true_tool):
+    """A robot with a wrong tool is off in the axes of the true tool; a detector that errs is in those that are reported."""
+    rng, offset = np.random.default_rng(4), np.array([[0.02, 0.15, 0.13], [-0.09, -0.05, 0.17], [0.03, 0.0, -0.2]])
+    data, rig, _ = tool_sweep(4)
+    x = data.grid("x_mm")
+    x[:, 1:] += (x[:, 1:].mean(axis=1, keepdims=True) - x[:, 1:]) * rng.uniform(0, 0.7, (len(x), 1, 1))
+    moved = x + np.einsum("nij,kj->nki", tool_axes(x), offset)
+    seen, reported = (x, moved) if of_the_true_tool else (moved, x)
+    u = [p + rng.normal(0, 0.8, p.shape) for p in rig.project(seen.reshape(-1, 3))]
+    rows = Correspondences.of_points(reported.reshape(-1, 3), *u, frame=data.frame, landmark=data.landmark)
+    found = calibrate(rows)
+    assert found.offsets.turns == of_the_true_tool and found.reprojection_rms_px < 1.6
+    error = np.hstack(found.rig.project(with_offsets(rows, found.offsets).x_mm)) - np.hstack(rig.project(seen.reshape(-1, 3)))
+    assert np.quantile(np.abs(error), 0.95) < 1.2
 
 
 def test_without_offsets_none_are_claimed():
