@@ -28,6 +28,8 @@ __all__ = ["STEPS", "Adaptation", "adapt", "simulated_like"]
 
 #: Most rounds of training, and most steps of a stage in one; the time ends most trainings.
 ROUNDS, STEPS = 3, 4000
+#: Share of the time left that a round takes, and fewest frames for stopping to which the doubt is fitted, too.
+_ROUND_SHARE, _DOUBT_FRAMES = 0.7, 5
 #: Most stereo frames that are looked at, spread over the recording.
 _MOST_FRAMES = 96
 _SIMULATED_SHARDS = 3
@@ -235,7 +237,8 @@ class _Work:
         path = self.folder / f"round {k}.safetensors"
         if path.is_file():
             return Detector.load(path)
-        doubt_on = parts["learn"][3::4]  # the errors of frames that were trained on say nothing of others
+        few = len(parts["stop"]) < _DOUBT_FRAMES  # the errors of frames that were trained on say nothing of others
+        doubt_on = parts["learn"][3::4] if few else parts["learn"][:0]
         images, covariance = self.images(np.setdiff1d(parts["learn"], doubt_on), teacher, seen)
         held_out, _ = self.images(np.union1d(doubt_on, parts["stop"]), teacher, seen)
         if len(images) < 8 or len(held_out) < 4:
@@ -253,7 +256,7 @@ class _Work:
         with warnings.catch_warnings(record=True) as told:
             tuned = tune(
                 detector, images, held_out, self.folder / f"round {k}", simulated=simulated, covariance_px2=covariance,
-                minutes=max(self.left_s / 60 * (0.5 if k < ROUNDS else 0.9), 0.05), steps=STEPS, seed=self.seed,
+                minutes=max(self.left_s / 60 * (_ROUND_SHARE if k < ROUNDS else 0.9), 0.05), steps=STEPS, seed=self.seed,
                 progress=progress,
             )  # fmt: skip
         self.report["notes"] += [f"Round {k}: {one.message}." for one in told if one.category is RuntimeWarning]

@@ -24,8 +24,8 @@ __all__ = ["calibrate"]
 
 #: Fewest rows with the tool's axes from which offsets are estimated unasked.
 _OFFSET_ROWS = 24
-#: Turned axes that move landmarks less than this are no question; others need so much log likelihood.
-_LEAST_TURN_MM, _LEAST_GAIN = 0.005, 10.0
+#: Turned axes that move landmarks less than this are no question.
+_LEAST_TURN_MM = 0.005
 
 
 def calibrate(
@@ -150,8 +150,9 @@ def _turned(
             return found
         other = estimate(turned, rows.frame, prior_sd)
     both = np.repeat(found.view_inliers & other.view_inliers, 2, axis=1)
-    gain = both.sum() * np.log(np.linalg.norm(found.residuals_px[both]) / np.linalg.norm(other.residuals_px[both]))
-    return found if gain < _LEAST_GAIN else replace(other, offsets=replace(other.offsets, turns=True))
+    if np.linalg.norm(found.residuals_px[both]) <= np.linalg.norm(other.residuals_px[both]):
+        return found
+    return replace(other, offsets=replace(other.offsets, turns=True))
 
 
 def _scattered(found: Calibration, rows: Correspondences | None) -> Calibration:

@@ -106,14 +106,15 @@ class Samples(Source):
 
 @dataclass(frozen=True)
 class Mixed(Source):
-    """Images of one source, and of another in half of the draws, so that a network does not forget the latter."""
+    """Images of one source in a `share` of the draws, else of another, which a network must not forget."""
 
     own: Source
     other: Source
+    share: float = 0.5
 
     def __len__(self) -> int:
         return len(self.own) + len(self.other)
 
     def draw(self, index: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        part = self.other if rng.random() < 0.5 else self.own
+        part = self.own if rng.random() < self.share else self.other
         return part.draw(index % len(part), rng)

@@ -41,6 +41,8 @@ __all__ = ["STAGES", "assemble", "card", "finetune", "stage_config", "stage_data
 STAGES = {"frame": 32, "tool": 48, "closeup": 32}
 #: Standard deviation of a label, as a share of the tool's length, at which a stage lets it count half.
 LABEL_SD = {"frame": 0.1, "tool": 0.04, "closeup": 0.02}
+#: Of fine-tuning: share of the draws that are labelled frames, beside simulated ones, and of these in another guise.
+_OWN_SHARE, _OWN_DISGUISE = 0.75, 0.2
 _SOURCES = {"frame": FrameSource, "tool": ToolSource, "closeup": CloseupSource}
 
 
@@ -82,7 +84,7 @@ def finetune(
         images, held_out: Images of any size.  Consecutive frames are alike, so hold out whole recordings, or the end of one.
             Each needs a labelled base and a labelled tip; others are left out.
         folder: Keeps the checkpoints, from which the same call continues.
-        simulated: Folder of `generate`'s shards; half of what is drawn then comes from there, and their held-out frames
+        simulated: Folder of `generate`'s shards; a quarter of what is drawn then comes from there, and their held-out frames
             help to fit the doubt, so that the networks do not forget tools and eyes that the labelled frames do not show.
             Or full frames, of which every third helps to fit the doubt and the others to train.
         covariance_px2: (n, 3, 2, 2) of the labels of `images`; None = exact.  A label counts half if its deviation is
@@ -119,11 +121,13 @@ def finetune(
         """The stages of a thread, one after the other, each for the same time."""
         found = {}
         for number, stage in enumerate(lane):
-            source: Source = _SOURCES[stage].of(images, weight=1 / (1 + variance[usable[0]] / LABEL_SD[stage] ** 2))
+            own = _SOURCES[stage].of(images, weight=1 / (1 + variance[usable[0]] / LABEL_SD[stage] ** 2))
+            source: Source = replace(own, disguise=_OWN_DISGUISE)
             if isinstance(simulated, str | Path):
-                source = Mixed(source, _SOURCES[stage].load(simulated))
+                source = Mixed(source, _SOURCES[stage].load(simulated), _OWN_SHARE)
             elif simulated:
-                source = Mixed(source, _SOURCES[stage].of([one for i, one in enumerate(simulated) if i % 3]))
+                others = _SOURCES[stage].of([one for i, one in enumerate(simulated) if i % 3])
+                source = Mixed(source, others, _OWN_SHARE)
             config = replace(stage_config(stage), network=detector.networks[stage].config, steps=steps, seed=seed)
             size = min(config.batch_size, 24)
             config = replace(config, learning_rate=5e-4, ema=0.995, batch_size=size, validate_every=max(1, steps // 3))
