@@ -23,8 +23,8 @@ from lib.trust.fitting import Problem
 
 __all__ = ["RefusalError", "Seen", "Teacher", "longest_still", "look", "stretches", "teach"]
 
-#: Least share of the landmarks that must agree on the cameras.
-LEAST_RIGHT = 0.1
+#: Least share of the landmarks that must agree on the cameras, fewest in number, and the share that needs no other try.
+LEAST_RIGHT, _FEWEST_RIGHT, _CLEAR = 0.1, 30, 0.3
 #: Faults after which the robot is no teacher, and the least share of the residuals that they must explain.
 FAULTS = {
     "clock", "camera_clock", "clock_rate", "frame_order", "tip_order", "tool_bends", "frozen_kinematics", "frozen_video",
@@ -38,8 +38,7 @@ _CONTRADICTED = 0.2
 #: Standard deviation of a detector's own constant error, as a share of the tool's length: along, across, normal.  The base
 #: has no edge that ends along the shaft.  Chosen by the closeups' errors in four recordings of unfamiliar tools and lights.
 _OWN_BIAS = 0.004 * np.array([[2.5, 1.0, 1.5], [1.2, 1.0, 1.5], [1.2, 1.0, 1.5]])
-#: Larger offsets of a landmark, as a share of the tool's length, are another point of the tool.
-_LARGEST_OFFSET = 0.15
+_LARGEST_OFFSET = 0.15  # of a landmark, as a share of the tool's length; what is farther is another point of the tool
 _TURNED = 0.3  # error of an offset, as a share of it, where shut jaws borrow the tool's axes from another time
 _ODD = 0.2  # share of a large offset that may be the detector's all the same: some tools it knows far worse than others
 #: Gain in log likelihood of a detection, by which cameras of their own for a part of the time must explain it better.
@@ -47,6 +46,10 @@ _SURE_MOVE = 0.1
 _CLICK_PX = 1.5  # of labels set by hand
 _CONFIDENCES = (MIN_CONFIDENCE, 0.5, 0.8)
 _NEAR = 0.1  # share of a short tool's length: as near a detection is taken for right where the noise does not tell
+_LABEL = (
+    "Label 10 pairs of frames (5 at least), far apart in place and depth (`python3 -m lib annotate RECORDING`), and give "
+    "annotations.json with --labels."
+)
 
 
 class RefusalError(ValueError):
@@ -263,7 +266,12 @@ def teach(
     if told is not None and told.offset.shape == (3, 3):
         x = recording.landmarks_mm()
         length = np.nanmedian(np.linalg.norm(x[:, 1:].mean(axis=1) - x[:, 0], axis=1))
-        _refuse_other_points(told.offset / length, from_labels)
+        size = np.linalg.norm(told.offset, axis=1) / length
+        if size.max() > _LARGEST_OFFSET and not from_labels:
+            raise RefusalError(
+                f"detector: it sees {LANDMARKS[size.argmax()]} {100 * size.max():.0f} % of the tool's length from where the "
+                f"robot reports it. It takes another point for it, or the robot's tool has other dimensions. {_LABEL}"
+            )
         offset, sd = _robots_share(told, (0.2 if from_labels else 1.0) * _OWN_BIAS * length)
     elif before is not None:
         offset, sd = before.offset_mm, before.offset_sd_mm
@@ -323,7 +331,7 @@ def _fitted(recording: Recording, seen: Seen, least: float, ransac_px: float | N
 def _calibrated(recording: Recording, seen: Seen, from_labels: bool) -> tuple[Calibration, float]:
     """Cameras that the detections agree on, the confident ones if all do not, and the share of landmarks that agree."""
     told = 6 * int(np.isfinite(recording.landmarks_mm()[seen.frame]).all(axis=(1, 2)).sum())
-    length, reason, poor, competing = tool_length_px(seen.u.reshape(-1, 3, 2)), "none was found", None, False
+    length, reason, best, poor, competing = tool_length_px(seen.u.reshape(-1, 3, 2)), "none was found", None, None, False
     near_px = _NEAR * float(np.quantile(length[np.isfinite(length)], 0.25)) if np.isfinite(length).any() else 0.0
     # Offsets of an unknown tool widen the errors of the right ones, until the wrong ones do not stand apart.
     ways = [(0.0, None)] if from_labels else [*((least, None) for least in _CONFIDENCES), (MIN_CONFIDENCE, near_px)]
@@ -337,18 +345,20 @@ def _calibrated(recording: Recording, seen: Seen, from_labels: bool) -> tuple[Ca
                 reason = str(error).partition(". ")[0].partition("; ")[0]  # their cures lead here
             competing = competing or isinstance(error, CompetingCamerasError)
             continue
-        right = found.view_inliers.sum() / max(told, 1)
-        if from_labels or (right >= LEAST_RIGHT and found.reprojection_rms_px < near_px):
-            return found, float(right)
-        if right >= LEAST_RIGHT:
-            poor = poor or (found, float(right))
-        reason = f"only {100 * right:.0f} % of the landmarks agree on cameras"
-    if poor is not None:
-        return poor
-    raise RefusalError(
-        f"detector: too few landmarks are right to start from ({reason}). Label 10 pairs of frames (5 at least), far apart "
-        "in place and depth (`python3 -m lib annotate RECORDING`), and give annotations.json with --labels."
-    )
+        right = float(found.view_inliers.sum() / max(told, 1))
+        if from_labels:
+            return found, right
+        if found.view_inliers.sum() < max(LEAST_RIGHT * told, _FEWEST_RIGHT):
+            reason = f"only {100 * right:.0f} % of the landmarks agree on cameras"
+        elif found.reprojection_rms_px < near_px:
+            best = max(best or (found, right), (found, right), key=lambda one: one[1])
+            if right > _CLEAR:
+                break
+        else:
+            poor = poor or (found, right)
+    if best or poor:
+        return best or poor
+    raise RefusalError(f"detector: too few landmarks are right to start from ({reason}). {_LABEL}")
 
 
 def _fault(recording: Recording, seen: Seen, calibration: Calibration, from_labels: bool) -> Hypothesis | None:
@@ -378,18 +388,6 @@ def _robots_share(found: LandmarkOffsets, own_sd: np.ndarray) -> tuple[np.ndarra
     # What the rig hides moves cameras and offsets together and leaves the labels where they are: no reason to believe less.
     share = width**2 / (width**2 + own_sd**2)
     return share * found.offset, np.hypot(np.sqrt(share) * own_sd, _ODD * share * found.offset)
-
-
-def _refuse_other_points(offset: np.ndarray, from_labels: bool) -> None:
-    """Refuse offsets (3, 3), as shares of the tool's length, that are too large for a robot: elbows of the jaws, say."""
-    size = np.linalg.norm(offset, axis=1)
-    if from_labels or size.max() < _LARGEST_OFFSET:
-        return
-    raise RefusalError(
-        f"detector: it sees {LANDMARKS[size.argmax()]} {100 * size.max():.0f} % of the tool's length away from where the robot "
-        "reports it. It takes another point for it, or the robot's tool has other dimensions. Label 10 pairs of frames, far "
-        "apart in place and depth (`python3 -m lib annotate RECORDING`), and give annotations.json with --labels."
-    )
 
 
 def _contradicted(teacher: Teacher, seen: Seen) -> np.ndarray:

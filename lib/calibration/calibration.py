@@ -33,11 +33,6 @@ class LandmarkOffsets:
     turns: bool = False
 
     @property
-    def turning(self) -> np.ndarray | None:
-        """The offset if it turns the axes, for `tool_axes`."""
-        return self.offset if self.turns else None
-
-    @property
     def standard_deviation(self) -> np.ndarray:
         """(k, d) of the offsets."""
         return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))

@@ -24,8 +24,8 @@ __all__ = ["estimate_offsets", "rows_axes", "tool_axes", "with_offsets"]
 def tool_axes(x_mm: ArrayLike, offset_mm: np.ndarray | None = None) -> np.ndarray:
     """Axes R (n, 3, 3) of a forceps from its landmarks (n, 3, 3) mm: columns along it, from tip to tip, and their normal.
 
-    With `offset_mm` (3, 3), those of the landmarks x + R d, moved in these very axes: offsets of the tips turn the line
-    between nearly shut jaws.  NaN where the jaws are shut (tips closer than 5 % of the tool's length) or a landmark is missing.
+    With `offset_mm` (3, 3), those of the landmarks moved by it in these very axes, which turns those of nearly shut jaws.
+    NaN where the jaws are shut (tips closer than 5 % of the tool's length) or a landmark is missing.
 
     >>> tool_axes([[[0, 0, 0], [3, -0.5, 0], [3, 0.5, 0]]])[0]
     array([[1., 0., 0.],
@@ -68,7 +68,7 @@ def with_offsets(data: Correspondences, offsets: LandmarkOffsets | None) -> Corr
     shift = offsets.offset[data.landmark]
     if shift.shape[1] == 4:
         return replace(data, u_left=data.u_left - shift[:, :2], u_right=data.u_right - shift[:, 2:])
-    shift = np.einsum("nij,nj->ni", rows_axes(data, offsets.turning), shift)
+    shift = np.einsum("nij,nj->ni", rows_axes(data, offsets.offset if offsets.turns else None), shift)
     return replace(data, x_mm=data.x_mm + np.where(np.isfinite(shift), shift, 0.0))
 
 
