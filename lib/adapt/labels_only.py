@@ -1,5 +1,6 @@
 """Labels without a robot: labelled images of one camera teach, stop and judge."""
 
+import hashlib
 from collections.abc import Callable
 from pathlib import Path, PurePosixPath
 
@@ -51,7 +52,8 @@ def adapt_images(
     parts = {"learn": marked[:first], "stop": marked[first:second], "judge": marked[second:]}
     report = {"recording": images.name, "minutes": minutes, "seed": seed, "notes": [], "rounds": []}
     report |= {"frames": {name: len(part) for name, part in parts.items()}}
-    work = Path(folder or paths.RUNS / f"adapt-{images.name}") / "work" / f"labels {STEPS}"
+    key = [str(images.resolve()), Path(labels).read_bytes(), getattr(detector, "digest", ""), seed, minutes, STEPS]
+    work = Path(folder or paths.RUNS / f"adapt-{images.name}") / "work" / hashlib.sha256(repr(key).encode()).hexdigest()[:12]
     provenance = Provenance(f"python3 -m lib adapt {images.name} --labels {Path(labels).name}")
     simulated = simulated_like([one.image for one in parts["learn"]], seed, progress)
     covariance = np.tile(2.25 * np.eye(2), (first, 3, 1, 1))  # a label set by hand is right to about 1.5 px

@@ -351,7 +351,7 @@ def _calibrated(recording: Recording, seen: Seen, from_labels: bool) -> tuple[Ca
         if found.view_inliers.sum() < max(LEAST_RIGHT * told, _FEWEST_RIGHT):
             reason = f"only {100 * right:.0f} % of the landmarks agree on cameras"
         elif found.reprojection_rms_px < near_px:
-            best = max(best or (found, right), (found, right), key=lambda one: one[1])
+            best = best if best and right < 1.5 * best[1] else (found, right)
             if right > _CLEAR:
                 break
         else:

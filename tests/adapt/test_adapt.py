@@ -302,12 +302,17 @@ def test_labels_of_one_camera_do_without_a_robot(world, recording, tmp_path, mon
     monkeypatch.setattr(labels_only, "simulated_like", lambda *_: [])
     u = np.where(np.arange(world.n)[:, None, None, None] % 2, np.nan, world.u)
     write_coco(tmp_path / "labels.json", Annotations(u[:, 0], np.full_like(u[:, 1], np.nan)), SIZE, ".png")
-    tune = pupil(world)
-    found = labels_only.adapt_images(
-        recording.folder, tmp_path / "labels.json", StandIn(world.u, wrong=0.5), folder=tmp_path, progress=False,
-        tune=lambda detector, images, *rest, **how: tune(
-            detector, [one._replace(name=f"left {int(one.name[5:11])}") for one in images], *rest, **how),
-    )  # fmt: skip
+    tune, folders = pupil(world), []
+
+    def tuned(detector, images, held_out, folder, **how):
+        folders.append(folder)
+        return tune(detector, [one._replace(name=f"left {int(one.name[5:11])}") for one in images], held_out, folder, **how)
+
+    how = {"detector": StandIn(world.u, wrong=0.5), "folder": tmp_path, "progress": False, "tune": tuned}
+    found = labels_only.adapt_images(recording.folder, tmp_path / "labels.json", **how)
+    write_coco(tmp_path / "labels.json", Annotations(u[:, 0] + 0.5, np.full_like(u[:, 1], np.nan)), SIZE, ".png")
+    labels_only.adapt_images(recording.folder, tmp_path / "labels.json", **how)
+    assert folders[0] != folders[1]  # a training with other labels is no training to resume
     assert found.improved and found.calibration is None
     assert sum(found.report["frames"].values()) == 20 and found.report["judged"]["after"]["median_px"] < 0.5
     with pytest.raises(ValueError, match="at least 10"):
