@@ -29,7 +29,7 @@ __all__ = ["STEPS", "Adaptation", "adapt", "simulated_like"]
 #: Most rounds of training, and most steps of a stage in one; the time ends most trainings.
 ROUNDS, STEPS = 3, 4000
 #: Share of the time left that a round takes, and fewest frames for stopping to which the doubt is fitted, too.
-_ROUND_SHARE, _DOUBT_FRAMES = 0.7, 5
+_ROUND_SHARE, _DOUBT_FRAMES = 0.85, 5
 #: Most stereo frames that are looked at, spread over the recording.
 _MOST_FRAMES = 96
 _SIMULATED_SHARDS = 3

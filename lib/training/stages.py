@@ -43,6 +43,7 @@ STAGES = {"frame": 32, "tool": 48, "closeup": 32}
 LABEL_SD = {"frame": 0.1, "tool": 0.04, "closeup": 0.02}
 #: Of fine-tuning: share of the draws that are labelled frames, beside simulated ones, and of these in another guise.
 _OWN_SHARE, _OWN_DISGUISE = 0.75, 0.2
+_RATES = {"frame": 5e-4, "tool": 1e-3, "closeup": 5e-4}  # chosen on two simulated recordings of the validation families
 _SOURCES = {"frame": FrameSource, "tool": ToolSource, "closeup": CloseupSource}
 
 
@@ -129,8 +130,8 @@ def finetune(
                 others = _SOURCES[stage].of([one for i, one in enumerate(simulated) if i % 3])
                 source = Mixed(source, others, _OWN_SHARE)
             config = replace(stage_config(stage), network=detector.networks[stage].config, steps=steps, seed=seed)
-            size = min(config.batch_size, 24)
-            config = replace(config, learning_rate=5e-4, ema=0.995, batch_size=size, validate_every=max(1, steps // 3))
+            config = replace(config, batch_size=min(config.batch_size, 24), validate_every=max(1, steps // 3))
+            config = replace(config, learning_rate=_RATES[stage], ema=0.995)
             start, left = Training(detector.networks[stage], [], {"shipped": detector.metadata.get("commit")}), None
             if minutes is not None:
                 left = (60 * minutes - (time.perf_counter() - began)) / (len(lane) - number)
