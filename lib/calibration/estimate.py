@@ -24,8 +24,8 @@ __all__ = ["calibrate"]
 
 #: Fewest rows with the tool's axes from which offsets are estimated unasked.
 _OFFSET_ROWS = 24
-#: Turned axes that move landmarks less than this are no question.
-_LEAST_TURN_MM = 0.005
+#: Axes turn where offsets as large are so improbable without any, and if that moves landmarks by more than this.
+_SURE_OFFSETS, _LEAST_TURN_MM = 1e-3, 0.005
 
 
 def calibrate(
@@ -142,7 +142,7 @@ def _turned(
     What a robot with a wrong tool reports is off in the axes of the true tool, and turns the axes of the reported one.
     """
     other = found
-    for _ in range(3):
+    for _ in range(3 if found.offsets.p_value < _SURE_OFFSETS else 0):
         offset = other.offsets.offset
         turned = rows_axes(rows, offset)
         turned = np.where(np.isfinite(turned), turned, axes)

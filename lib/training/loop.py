@@ -127,7 +127,7 @@ class Run:
         if config.optimiser == "rmsprop":
             self.optimiser: torch.optim.Optimizer = torch.optim.RMSprop(parameters, config.learning_rate, alpha=0.99)
         else:
-            self.optimiser = torch.optim.AdamW(parameters, config.learning_rate, weight_decay=1e-4, fused=True)
+            self.optimiser = torch.optim.AdamW(parameters, config.learning_rate, weight_decay=1e-4)
         self.step, self.seconds, self.log, self.loss_sum, self.since = 0, 0.0, [], 0.0, 0  # both since the last validation
 
     def advance(self, batch: Batch, spent: float = 0.0) -> None:
