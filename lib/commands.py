@@ -96,6 +96,7 @@ def main_calibrate(argv: list[str]) -> int:
     numbers |= {"rows": int(calibration.inliers.size), "rows_used": int(calibration.inliers.sum())}
     numbers |= {"parameters": calibration.parameter_names, "parameter_covariance": calibration.parameter_covariance.tolist()}
     numbers |= {"landmark_offsets_mm": calibration.offsets and calibration.offsets.offset.tolist()}
+    numbers |= {"landmark_offsets_turn_axes": calibration.offsets and calibration.offsets.turns}
     return _done(a, out, "calibration", numbers, verdict)
 
 

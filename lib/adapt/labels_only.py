@@ -8,7 +8,7 @@ import numpy as np
 
 from lib import paths
 from lib.adapt.judging import better, frame_means
-from lib.adapt.loop import STEPS, Adaptation, simulated_like
+from lib.adapt.loop import RECIPE, STEPS, Adaptation, simulated_like
 from lib.correspondences import LANDMARKS
 from lib.landmarks import Detector
 from lib.provenance import Provenance, plain
@@ -27,7 +27,7 @@ def adapt_images(
 ) -> Adaptation:  # fmt: skip
     """Train the detector further on labelled images of one camera: `adapt` where there is no robot.
 
-    The first 70 % of them in the order of their names teach, the next fit the doubt, the last fifth judge.
+    The first 65 % of them in the order of their names teach, the next fit the doubt, the last fifth judge.
 
     Args:
         images: Folder to which the file names in `labels` belong.
@@ -52,7 +52,7 @@ def adapt_images(
     parts = {"learn": marked[:first], "stop": marked[first:second], "judge": marked[second:]}
     report = {"recording": images.name, "minutes": minutes, "seed": seed, "notes": [], "rounds": []}
     report |= {"frames": {name: len(part) for name, part in parts.items()}}
-    key = [str(images.resolve()), Path(labels).read_bytes(), getattr(detector, "digest", ""), seed, minutes, STEPS]
+    key = [str(images.resolve()), Path(labels).read_bytes(), getattr(detector, "digest", ""), seed, minutes, STEPS, RECIPE]
     work = Path(folder or paths.RUNS / f"adapt-{images.name}") / "work" / hashlib.sha256(repr(key).encode()).hexdigest()[:12]
     provenance = Provenance(f"python3 -m lib adapt {images.name} --labels {Path(labels).name}")
     simulated = simulated_like([one.image for one in parts["learn"]], seed, progress)

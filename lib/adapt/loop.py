@@ -24,12 +24,13 @@ from lib.training.samples import LabelledImage
 from lib.training.shards import generate, validation_images
 from lib.training.stages import finetune
 
-__all__ = ["STEPS", "Adaptation", "adapt", "simulated_like"]
+__all__ = ["RECIPE", "STEPS", "Adaptation", "adapt", "simulated_like"]
 
 #: Most rounds of training, and most steps of a stage in one; the time ends most trainings.
 ROUNDS, STEPS = 3, 4000
-#: Share of the time left that a round takes, and fewest frames for stopping to which the doubt is fitted, too.
-_ROUND_SHARE, _DOUBT_FRAMES = 0.85, 5
+RECIPE = 2  # raised where teaching or training changes: what an older one kept is not gone on with
+#: Share of the time left that a round takes, and fewest images for stopping to which alone the doubt is fitted.
+_ROUND_SHARE, _DOUBT_IMAGES = 0.85, 10
 #: Most stereo frames that are looked at, spread over the recording.
 _MOST_FRAMES = 96
 _SIMULATED_SHARDS = 3
@@ -116,7 +117,7 @@ class _Work:
             self.frames = np.union1d(self.frames, self.marked)
         self.learns = isinstance(self.detector, Detector)  # a stand-in has no networks
         key = [str(recording.folder.resolve()), recording.kinematics.x_mm.tobytes(), self.frames.tobytes(), seed, STEPS]
-        key += [recording.offset_s, recording.readout_s, recording.frames.time_s.tobytes(), minutes]
+        key += [RECIPE, recording.offset_s, recording.readout_s, recording.frames.time_s.tobytes(), minutes]
         key += [getattr(self.detector, "digest", ""), Path(labels).read_bytes() if labels is not None else b""]
         self.folder = Path(folder or paths.RUNS / f"adapt-{recording.name}") / "work"
         self.folder /= hashlib.sha256(repr(key).encode()).hexdigest()[:12]
@@ -237,10 +238,11 @@ class _Work:
         path = self.folder / f"round {k}.safetensors"
         if path.is_file():
             return Detector.load(path)
-        few = len(parts["stop"]) < _DOUBT_FRAMES  # the errors of frames that were trained on say nothing of others
-        doubt_on = parts["learn"][3::4] if few else parts["learn"][:0]
+        held_out, doubt_on = self.images(parts["stop"], teacher, seen)[0], parts["learn"][:0]
+        if len(held_out) < _DOUBT_IMAGES:  # the errors of frames that were trained on say nothing of others
+            doubt_on = parts["learn"][3::4]
+            held_out += self.images(doubt_on, teacher, seen)[0]
         images, covariance = self.images(np.setdiff1d(parts["learn"], doubt_on), teacher, seen)
-        held_out, _ = self.images(np.union1d(doubt_on, parts["stop"]), teacher, seen)
         if len(images) < 8 or len(held_out) < 4:
             raise RefusalError(f"robot: it labels {len(images)} images to learn from and {len(held_out)} others; 8 and 4 do.")
         done = {}
@@ -256,7 +258,7 @@ class _Work:
         with warnings.catch_warnings(record=True) as told:
             tuned = tune(
                 detector, images, held_out, self.folder / f"round {k}", simulated=simulated, covariance_px2=covariance,
-                minutes=max(self.left_s / 60 * (_ROUND_SHARE if k < ROUNDS else 0.9), 0.05), steps=STEPS, seed=self.seed,
+                minutes=max(self.left_s / 60 * _ROUND_SHARE, 0.05), steps=STEPS, seed=self.seed,
                 progress=progress,
             )  # fmt: skip
         self.report["notes"] += [f"Round {k}: {one.message}." for one in told if one.category is RuntimeWarning]
@@ -291,6 +293,7 @@ class _Work:
             "gain": {"robot": [robot, robot_sd], "epipolar": [eye, eye_sd]},
             "offset_s": teacher.recording.offset_s, "clock_sd_s": teacher.clock_sd_s,
             "landmark_offset_mm": teacher.offset_mm, "landmark_offset_sd_mm": teacher.offset_sd_mm,
+            "landmark_offset_turns_axes": teacher.turns,
             "gauge": "An offset that all landmarks share and a shift of the cameras look alike: the deviations leave it out. "
             "An offset of the robot and a constant error of the detector look alike, too; labels set by hand tell.",
         }  # fmt: skip

@@ -233,8 +233,8 @@ def teach(
         from_labels: `seen` are labels set by hand, of few frames.
 
     Raises:
-        RefusalError: If fewer than a tenth of the landmarks agree on cameras, the cameras are no stereo microscope's, or the
-            robot contradicts the images.
+        RefusalError: If fewer than a tenth of the landmarks, or 30, agree on cameras, the cameras are no stereo microscope's,
+            a landmark is seen more than 15 % of the tool's length off, or the robot contradicts the images.
     """
     frozen = _frozen(recording, seen.frame)
     refused = frozen if before is None else np.union1d(frozen, before.refused)
@@ -257,7 +257,7 @@ def teach(
     if fault is not None:
         raise RefusalError(f"robot: {fault.text} {fault.cure}")
     offset, sd = np.zeros((3, 3)), np.full((3, 3), 0.0 if calibration.offsets is not None else 0.1)
-    told = calibration.offsets
+    told, turns = calibration.offsets, False
     if opinion is not None:
         try:
             told = _fitted(recording, opinion.of(used.frame), 0.0).offsets
@@ -272,10 +272,9 @@ def teach(
                 f"detector: it sees {LANDMARKS[size.argmax()]} {100 * size.max():.0f} % of the tool's length from where the "
                 f"robot reports it. It takes another point for it, or the robot's tool has other dimensions. {_LABEL}"
             )
-        offset, sd = _robots_share(told, (0.2 if from_labels else 1.0) * _OWN_BIAS * length)
+        turns, (offset, sd) = told.turns, _robots_share(told, (0.2 if from_labels else 1.0) * _OWN_BIAS * length)
     elif before is not None:
-        offset, sd = before.offset_mm, before.offset_sd_mm
-    turns = told.turns if told is not None else before is not None and before.turns
+        offset, sd, turns = before.offset_mm, before.offset_sd_mm, before.turns
     teacher = Teacher(recording, calibration, clock_sd_s, offset, sd, refused, right, turns)
     against = _contradicted(teacher, used)
     if len(against) > max(_CONTRADICTED * len(used.frame), 2):
@@ -348,8 +347,8 @@ def _calibrated(recording: Recording, seen: Seen, from_labels: bool) -> tuple[Ca
         right = float(found.view_inliers.sum() / max(told, 1))
         if from_labels:
             return found, right
-        if found.view_inliers.sum() < max(LEAST_RIGHT * told, _FEWEST_RIGHT):
-            reason = f"only {100 * right:.0f} % of the landmarks agree on cameras"
+        if found.view_inliers.sum() < max(LEAST_RIGHT * told, min(_FEWEST_RIGHT, 0.5 * told)):
+            reason = f"only {100 * right:.0f} % of the landmarks agree on cameras, {found.view_inliers.sum()} in number"
         elif found.reprojection_rms_px < near_px:
             best = best if best and right < 1.5 * best[1] else (found, right)
             if right > _CLEAR:
@@ -392,7 +391,10 @@ def _robots_share(found: LandmarkOffsets, own_sd: np.ndarray) -> tuple[np.ndarra
 
 def _contradicted(teacher: Teacher, seen: Seen) -> np.ndarray:
     """Frames in which two landmarks and more are seen in both images, by one and the same distance off the robot's report."""
-    u, covariance = teacher.project(seen.frame, _free(teacher))
+    free = teacher.calibration.offsets
+    if free is not None and free.offset.shape == (3, 3):
+        teacher = replace(teacher, offset_mm=free.offset, turns=free.turns)
+    u, covariance = teacher.project(seen.frame)
     off = np.where((seen.confidence >= 0.5)[..., None], seen.u - u, np.nan)
     length = tool_length_px(u.reshape(-1, 3, 2)).reshape(u.shape[:2])[..., None]
     sd = np.sqrt(np.trace(covariance, axis1=-2, axis2=-1) / 2) + teacher.calibration.reprojection_rms_px
@@ -402,9 +404,3 @@ def _contradicted(teacher: Teacher, seen: Seen) -> np.ndarray:
     alike = [np.linalg.norm(off[:, :, i] - off[:, :, j], axis=-1) < 0.3 * size[:, :, i] for i, j in pairs]
     both = np.stack([wrong[:, :, i] & wrong[:, :, j] & same for (i, j), same in zip(pairs, alike, strict=True)], axis=-1)
     return seen.frame[both.all(axis=1).any(axis=1)]
-
-
-def _free(teacher: Teacher) -> np.ndarray:
-    """Offsets (3, 3) mm with which the robot is seen where the detector sees the landmarks."""
-    offsets = teacher.calibration.offsets
-    return teacher.offset_mm if offsets is None or offsets.offset.shape != (3, 3) else offsets.offset

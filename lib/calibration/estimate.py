@@ -45,7 +45,8 @@ def calibrate(
         data, u: `Correspondences` alone (rows seen in one image count, too; covariances weigh the rows where all seen
             landmarks have them); or (n, 3) mm positions in the robot frame and [u_left, u_right] or [u], (n, 2) px each.
         offsets: Constant offsets of the landmarks (`lib.calibration.offsets`).  "tool" or True: in the tool's axes, from
-            frames in which the robot reports three landmarks of open jaws; "image": in the images, for a detector that
+            frames in which the robot reports three landmarks of open jaws, or in those of the landmarks where they are
+            seen if these explain the detections better (`LandmarkOffsets.turns`); "image": in the images, for a detector that
             is off by some pixels whatever the tool does; False: none.  None: "tool" where at least 24 rows and half of
             all allow it, else none.
         offset_prior_sd: Standard deviation of an offset's coordinate, mm or px; None = chosen by the data.
@@ -109,9 +110,10 @@ def calibrate(
         if weighting == "likelihood" and None in (sigma_u_px, sigma_x_mm):
             found = _scattered(found, None if usable is None else rows)
     else:
-        found = estimate_offsets(fitted, x, y, rows.landmark, axes, rows.frame, offset_prior_sd)
+        estimate = partial(estimate_offsets, fitted, x, y, rows.landmark, frame=rows.frame, prior_sd=offset_prior_sd)
+        found = estimate(axes=axes)
         if axes is not None:
-            found = _turned(found, partial(estimate_offsets, fitted, x, y, rows.landmark), axes, rows, offset_prior_sd)
+            found = _turned(found, lambda a: estimate(axes=a), lambda o: rows_axes(data, o)[usable], axes, rows.landmark)
     return found if usable is None else _spread_out(found, usable)
 
 
@@ -135,22 +137,25 @@ def _usable_rows(data: Correspondences, offsets: bool | str | None, weighting: s
 
 
 def _turned(
-    found: Calibration, estimate: Callable[..., Calibration], axes: np.ndarray, rows: Correspondences, prior_sd: float | None
-) -> Calibration:
+    found: Calibration, estimate: Callable[[np.ndarray], Calibration], axes_of: Callable[[np.ndarray], np.ndarray],
+    axes: np.ndarray, landmark: np.ndarray,
+) -> Calibration:  # fmt: skip
     """The calibration with the axes of the moved landmarks, if these explain the detections better than the reported ones.
 
     What a robot with a wrong tool reports is off in the axes of the true tool, and turns the axes of the reported one.
     """
     other = found
     for _ in range(3 if found.offsets.p_value < _SURE_OFFSETS else 0):
-        offset = other.offsets.offset
-        turned = rows_axes(rows, offset)
-        turned = np.where(np.isfinite(turned), turned, axes)
-        if np.einsum("nij,nj->ni", turned - axes, offset[rows.landmark]).std() < _LEAST_TURN_MM:
+        turned = axes_of(other.offsets.offset)
+        if np.einsum("nij,nj->ni", turned - axes, other.offsets.offset[landmark]).std() < _LEAST_TURN_MM:
             return found
-        other = estimate(turned, rows.frame, prior_sd)
+        try:
+            other = estimate(turned)
+        except ValueError:  # no cameras fit them
+            return found
     both = np.repeat(found.view_inliers & other.view_inliers, 2, axis=1)
-    if np.linalg.norm(found.residuals_px[both]) <= np.linalg.norm(other.residuals_px[both]):
+    fewer = other.view_inliers.sum() < 0.98 * found.view_inliers.sum()
+    if fewer or np.linalg.norm(found.residuals_px[both]) <= np.linalg.norm(other.residuals_px[both]):
         return found
     return replace(other, offsets=replace(other.offsets, turns=True))
 

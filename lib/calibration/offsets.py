@@ -25,7 +25,7 @@ def tool_axes(x_mm: ArrayLike, offset_mm: np.ndarray | None = None) -> np.ndarra
     """Axes R (n, 3, 3) of a forceps from its landmarks (n, 3, 3) mm: columns along it, from tip to tip, and their normal.
 
     With `offset_mm` (3, 3), those of the landmarks moved by it in these very axes, which turns those of nearly shut jaws.
-    NaN where the jaws are shut (tips closer than 5 % of the tool's length) or a landmark is missing.
+    NaN where the jaws are shut (tips closer than 5 % of the tool's length), a landmark is missing, or no axes fulfil that.
 
     >>> tool_axes([[[0, 0, 0], [3, -0.5, 0], [3, 0.5, 0]]])[0]
     array([[1., 0., 0.],
@@ -35,27 +35,37 @@ def tool_axes(x_mm: ArrayLike, offset_mm: np.ndarray | None = None) -> np.ndarra
     x = np.asarray(x_mm, dtype=np.float64)
     if x.ndim != 3 or x.shape[1:] != (3, 3):
         raise ValueError(f"x_mm: expected base, tip_1 and tip_2 (n, 3, 3), got {x.shape}.")
-    if offset_mm is not None:
-        axes = tool_axes(x)
-        for _ in range(20):
-            axes = tool_axes(x + np.einsum("nij,kj->nki", axes, offset_mm))
-        return axes
-    along = x[:, 1:].mean(axis=1) - x[:, 0]
-    length = np.linalg.norm(along, axis=1, keepdims=True)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        along, across = along / length, x[:, 2] - x[:, 1]
-        across = across - (across * along).sum(axis=1, keepdims=True) * along
-        width = np.linalg.norm(across, axis=1, keepdims=True)
-        across = np.where(width > 0.05 * length, across / width, np.nan)
-    return np.stack([along, across, np.cross(along, across)], axis=2)
+    offset = np.zeros((3, 3)) if offset_mm is None else offset_mm
+    middle, apart, axes = offset[1:].mean(axis=0) - offset[0], offset[2] - offset[1], np.zeros((len(x), 3, 3))
+    for _ in range(1 if offset_mm is None else 10):  # of the direction along the tool; the turn about it is exact
+        along = x[:, 1:].mean(axis=1) - x[:, 0] + np.nan_to_num(axes) @ middle
+        length = np.linalg.norm(along, axis=1, keepdims=True)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            along, across = along / length, x[:, 2] - x[:, 1]
+            across = across - (across * along).sum(axis=1, keepdims=True) * along
+            width = np.linalg.norm(across, axis=1, keepdims=True)
+            across, sine = across / width, -apart[2] / width
+            cosine = np.sqrt(1 - sine**2)
+            is_open = apart[1] + cosine * width > 0.05 * length
+            across = np.where(is_open, cosine * across - sine * np.cross(along, across), np.nan)
+        axes = np.stack([along, across, np.cross(along, across)], axis=2)
+    return axes
 
 
 def rows_axes(data: Correspondences, offset_mm: np.ndarray | None = None) -> np.ndarray:
-    """`tool_axes` (n, 3, 3) of each row's frame; NaN too where recordings joined under the same frame numbers repeat rows."""
+    """`tool_axes` (n, 3, 3) of each row's frame; NaN too where recordings joined under the same frame numbers repeat rows.
+
+    Where the landmarks moved by `offset_mm`, of one to three landmarks, have no axes, those of the reported ones.
+    """
     rows = np.column_stack([data.frame, data.landmark])
     if len(data) == 0 or data.landmark.max() > 2 or len(np.unique(rows, axis=0)) < len(rows):
         return np.full((len(data), 3, 3), np.nan)
-    return tool_axes(data.grid("x_mm"), offset_mm)[np.unique(data.frame, return_inverse=True)[1]]
+    x = data.grid("x_mm")
+    axes = tool_axes(x)
+    if offset_mm is not None:
+        turned = tool_axes(x, np.pad(offset_mm, ((0, 3 - len(offset_mm)), (0, 0))))
+        axes = np.where(np.isfinite(turned), turned, axes)
+    return axes[np.unique(data.frame, return_inverse=True)[1]]
 
 
 def with_offsets(data: Correspondences, offsets: LandmarkOffsets | None) -> Correspondences:

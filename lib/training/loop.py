@@ -118,7 +118,7 @@ class Run:
         gpu = f"cuda:{os.environ.get('LOCAL_RANK', '0') if self.world > 1 else 0}"
         self.device = torch.device(gpu if torch.cuda.is_available() else "cpu")
         # A processor without such arithmetic imitates it, in eight times the time.
-        fast = self.device.type == "cuda" or torch.backends.cpu.get_cpu_capability().startswith("AVX512")
+        fast = self.device.type == "cuda" or torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported()
         self.mixed = config.precision == "bf16" and fast
         self.network.to(self.device, memory_format=torch.channels_last)
         self.average = copy.deepcopy(self.network) if config.ema else None
@@ -212,6 +212,7 @@ def train(
     run = Run(config, initial.network if initial is not None else None)
     provenance: dict[str, object] = {"data": source.fingerprint, "images": len(source), "torch": torch.__version__}
     provenance |= {"commit": commit_id(), "machine": machine(), "processes": run.world}
+    provenance["precision"] = "bf16" if run.mixed else "fp32"
     if initial is not None:
         provenance |= {"before": initial.provenance, "initial": checksum(initial.network.state_dict(), {})[:16]}
     last = Path(folder) / "last.safetensors" if folder is not None else None

@@ -205,7 +205,7 @@ def assemble(
     detector = Detector(**networks, frame_px=FRAME_PX[0], mirror=True)
     detector = fit_error_models(detector, frames[::2] + bare + typical, for_closeups=near_by, progress=True)
     held_out = evaluate(detector, frames[1::2], progress=True)
-    keys = ("data", "images", "commit", "steps", "seconds", "processes", "machine", "config", "metrics", "before")
+    keys = "data images commit steps seconds processes precision machine config metrics before".split()
     by_visibility = {k: {"labels": v.labels, "median_px": v.median_px} for k, v in held_out.by_visibility().items()}
     provenance = {
         "trained_on": "simulated frames only (lib.simulator.population); no eye or tool of a shipped recording",
@@ -237,11 +237,11 @@ def card(detector: Detector, path: Path) -> str:
     p = detector.metadata
     m, trainings = p["metrics"], []
     for stage, t in [(stage, t) for stage, last in p["stages"].items() for t in _trainings(last)]:
-        config, processes = t["config"], t.get("processes") or 1
+        config, processes, precision = t["config"], t.get("processes") or 1, t.get("precision") or t["config"]["precision"]
         kind = "hourglass, {stacks} x {features}" if "stacks" in config["network"] else "offset network, {features}"
         trainings.append(
             f"| {stage} ({kind.format(**config['network'])} features) | {t['images']} "
-            f"| {config['optimiser']} {config['learning_rate']:g} {config['schedule']}, {config['precision']} "
+            f"| {config['optimiser']} {config['learning_rate']:g} {config['schedule']}, {precision} "
             f"| {t['steps']} x {config['batch_size']} x {processes} | {config.get('position_weight_per_px', 0):g} "
             f"| {t['seconds'] * processes / 3600:.2f} | `{t['data']}` | `{t['commit']}` |"
         )

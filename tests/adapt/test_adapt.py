@@ -1,6 +1,7 @@
 """The robot as a teacher: half-wrong detections are enough, and a robot that errs teaches nothing wrong."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -81,6 +82,22 @@ def test_offsets_of_an_unknown_tool_do_not_hide_which_half_is_right(world, tmp_p
     off = world.record(tmp_path / "off", robot=lambda _, x: x + np.einsum("mij,kj->mki", np.nan_to_num(tool_axes(x)), offset))
     teacher = taught(off, Sure(world.u, noise_px=1.0, wrong=0.5))
     assert 0.3 < teacher.right < 0.6 and np.median(label_errors(world, teacher)[0]) < 1.5
+
+
+def test_shut_jaws_borrow_the_axes_of_another_time(world, recording):
+    """The offsets of their landmarks are known but for the turn about the shaft, and the covariance says so."""
+    teacher = taught(recording, StandIn(world.u, noise_px=0.7, wrong=0.2))
+    k, offset = recording.kinematics, np.array([[0.0, 0.0, 0.0], [-0.1, 0.1, 0.1], [-0.1, 0.1, 0.1]])
+    x = k.x_mm.copy()
+    last = k.time_s > np.median(k.time_s)
+    x[last, 1:] = x[last, 1:].mean(axis=1, keepdims=True)
+    shut = replace(teacher, recording=replace(recording, kinematics=replace(k, x_mm=x)), offset_mm=offset)
+    frames = np.arange(world.n)
+    late = recording.frames.time_s + teacher.recording.offset_s > np.median(k.time_s) + 0.1
+    (u, S), (plain, S0) = shut.project(frames), shut.project(frames, np.zeros((3, 3)))
+    moved, sd = np.linalg.norm(u - plain, axis=-1)[late], np.sqrt(np.trace(S - S0, axis1=-2, axis2=-1).clip(0) / 2)[late]
+    assert np.nanmin(moved[:, :, 1:]) > 1.0 and np.nanmax(moved[:, :, 0]) < 1e-6
+    assert np.nanmin(sd[:, :, 1:]) > 0.2 * np.nanmin(moved[:, :, 1:])
 
 
 def test_a_detector_that_takes_elbows_for_tips_is_no_start(world, recording):

@@ -26,6 +26,19 @@ def test_axes_are_those_of_the_tool():
         tool_axes(np.zeros((4, 2, 3)))
 
 
+@pytest.mark.parametrize("width_mm", [0.25, 0.4, 1.0])
+@pytest.mark.parametrize("side", [-1, 1])
+def test_axes_of_a_tool_that_is_reported_off(width_mm, side):
+    """Jaws that the robot reports wider or narrower, and turned, have the true tool's axes again."""
+    tool = np.array([[[0.0, 0.0, 0.0], [3.0, -width_mm / 2, 0.0], [3.0, width_mm / 2, 0.0]]])
+    offset = np.array([[0.02, 0.1, 0.0], [-0.1, 0.1 * side, 0.1], [0.1, -0.1 * side, -0.08]])
+    R = RigidTransform.from_rotation_vector((0.3, -1.2, 2.0), (5, 6, 7))
+    reported = R.apply((tool - offset).reshape(-1, 3)).reshape(1, 3, 3)
+    np.testing.assert_allclose(tool_axes(reported, offset)[0], R.R, atol=1e-6)
+    assert np.abs(tool_axes(reported)[0] - R.R).max() > 0.03
+    assert np.isnan(tool_axes(np.zeros((1, 3, 3)), offset)).any()
+
+
 @pytest.mark.parametrize(
     ("model", "distance_mm", "runs"), [("zero_skew", np.inf, 5), ("affine", np.inf, 3), ("near_affine", 200.0, 2)]
 )
@@ -47,20 +60,25 @@ def test_offsets_are_found_with_honest_deviations_and_the_cameras_lose_their_bia
     assert np.mean(np.square(offset_errors)) / np.mean(claims) == pytest.approx(1, abs=0.6)
 
 
-@pytest.mark.parametrize("of_the_true_tool", [True, False])
-def test_large_offsets_turn_the_axes_of_nearly_shut_jaws(of_the_true_tool):
+@pytest.mark.parametrize(("of_the_true_tool", "side"), [(True, 1), (True, -1), (False, 1)])
+def test_large_offsets_turn_the_axes_of_nearly_shut_jaws(of_the_true_tool, side):
     """A robot with a wrong tool is off in the axes of the true tool; a detector that errs is in those that are reported."""
     rng, offset = np.random.default_rng(4), np.array([[0.02, 0.15, 0.13], [-0.09, -0.05, 0.17], [0.03, 0.0, -0.2]])
+    offset[:, 1] *= side
     data, rig, _ = tool_sweep(4)
     x = data.grid("x_mm")
     x[:, 1:] += (x[:, 1:].mean(axis=1, keepdims=True) - x[:, 1:]) * rng.uniform(0, 0.7, (len(x), 1, 1))
     moved = x + np.einsum("nij,kj->nki", tool_axes(x), offset)
     seen, reported = (x, moved) if of_the_true_tool else (moved, x)
     u = [p + rng.normal(0, 0.8, p.shape) for p in rig.project(seen.reshape(-1, 3))]
+    for part in u:  # landmarks that neither image shows
+        part[rng.permutation(len(x) * 3)[: len(x) // 3]] = np.nan
+        part[::5] = np.nan
     rows = Correspondences.of_points(reported.reshape(-1, 3), *u, frame=data.frame, landmark=data.landmark)
     found = calibrate(rows)
     assert found.offsets.turns == of_the_true_tool and found.reprojection_rms_px < 1.6
-    error = np.hstack(found.rig.project(with_offsets(rows, found.offsets).x_mm)) - np.hstack(rig.project(seen.reshape(-1, 3)))
+    where = with_offsets(rows, found.offsets).x_mm
+    error = np.hstack(found.rig.project(where)) - np.hstack(rig.project(seen.reshape(-1, 3)))
     assert np.quantile(np.abs(error), 0.95) < 1.2
 
 
