@@ -118,8 +118,9 @@ class Run:
         gpu = f"cuda:{os.environ.get('LOCAL_RANK', '0') if self.world > 1 else 0}"
         self.device = torch.device(gpu if torch.cuda.is_available() else "cpu")
         # A processor without such arithmetic imitates it, in eight times the time.
-        fast = self.device.type == "cuda" or torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported()
-        self.mixed = config.precision == "bf16" and fast
+        has = torch.cpu.get_capabilities()
+        fast = self.device.type == "cuda" or has.get("avx512_bf16") or has.get("amx_bf16")
+        self.mixed = config.precision == "bf16" and bool(fast)
         self.network.to(self.device, memory_format=torch.channels_last)
         self.average = copy.deepcopy(self.network) if config.ema else None
         self.usable = self.average or self.network
