@@ -258,8 +258,7 @@ class _Work:
         with warnings.catch_warnings(record=True) as told:
             tuned = tune(
                 detector, images, held_out, self.folder / f"round {k}", simulated=simulated, covariance_px2=covariance,
-                minutes=max(self.left_s / 60 * _ROUND_SHARE, 0.05), steps=STEPS, seed=self.seed,
-                progress=progress,
+                minutes=max(self.left_s / 60 * _ROUND_SHARE, 0.05), steps=STEPS, seed=self.seed, progress=progress,
             )  # fmt: skip
         self.report["notes"] += [f"Round {k}: {one.message}." for one in told if one.category is RuntimeWarning]
         if self.learns:

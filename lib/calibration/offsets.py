@@ -75,7 +75,8 @@ def with_offsets(data: Correspondences, offsets: LandmarkOffsets | None) -> Corr
     """
     if offsets is None:
         return data
-    shift = offsets.offset[data.landmark]
+    unknown = max(data.landmark.max(initial=0) + 1 - len(offsets.offset), 0)  # landmarks that no image showed
+    shift = np.pad(offsets.offset, ((0, unknown), (0, 0)))[data.landmark]
     if shift.shape[1] == 4:
         return replace(data, u_left=data.u_left - shift[:, :2], u_right=data.u_right - shift[:, 2:])
     shift = np.einsum("nij,nj->ni", rows_axes(data, offsets.offset if offsets.turns else None), shift)

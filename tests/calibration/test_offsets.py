@@ -82,6 +82,14 @@ def test_large_offsets_turn_the_axes_of_nearly_shut_jaws(of_the_true_tool, side)
     assert np.quantile(np.abs(error), 0.95) < 1.2
 
 
+def test_a_tip_that_is_never_seen_does_not_hide_the_axes():
+    data, _, _ = tool_sweep(0)
+    seen = replace(data, confidence=np.where((data.landmark == 2)[:, None], 0.0, data.confidence))
+    found = calibrate(seen)
+    assert found.offsets.offset.shape == (2, 3) and found.offsets.p_value < 1e-3
+    assert np.isfinite(with_offsets(seen, found.offsets).x_mm).all()
+
+
 def test_without_offsets_none_are_claimed():
     p_values, priors = [], []
     for seed in range(6):
