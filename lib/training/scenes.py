@@ -10,8 +10,9 @@ import numpy as np
 
 from lib.landmarks import windows
 from lib.landmarks.metrics import tool_length_px
+from lib.simulator.window import in_image
 from lib.training.appearance import disguised
-from lib.training.drawings import drawn_ground, drawn_tool
+from lib.training.drawings import drawn_ground, drawn_object, drawn_tool
 from lib.training.samples import LabelledImage, Source
 from lib.training.shards import SCENE_PX, packed, read_scenes
 
@@ -24,6 +25,8 @@ FRAME_PX, PART_PX = (320, 192), (160, 128)
 SHORTEST_PX = 5.0
 #: Nor are tools in an image whose grey values spread less.
 FLAT = 5.0
+#: Share of the drawings that show a needle, cannula, rod or hook alone, and of the drawn tools beside which there is one.
+_OBJECTS, _BESIDE = 0.2, 0.15
 #: By how much a window is turned (rad), magnified (log) and shifted (its pixels) if it still shows the tool, and if not.
 _SHOWS, _SHOWS_NOT = ((0.0, 0.7), (0.0, 0.6), (0.0, 30.0)), ((1.0, np.pi), (0.8, 1.6), (60.0, 150.0))
 
@@ -65,7 +68,11 @@ class SceneSource(Source):
         image = self.frame(index)
         if self.drawn and rng.random() < self.drawn:
             bare = not self.visibility[index].any() and rng.random() < 0.5
-            return *drawn_tool(image if bare else drawn_ground(image, rng), rng), np.ones(3)
+            ground = image if bare else drawn_ground(image, rng)
+            if rng.random() < _OBJECTS:
+                return *drawn_object(ground, rng), np.zeros(3, int), np.ones(3)
+            ground = drawn_object(ground, rng)[0] if rng.random() < _BESIDE else ground
+            return *drawn_tool(ground, rng), np.ones(3)
         weight = np.ones(3) if self.weight is None else self.weight[index]
         return image, self.u[index], self.visibility[index], weight
 
@@ -123,7 +130,8 @@ class ToolSource(SceneSource):
         _, u, visibility, _ = scene = self.scene(index, rng)
         size = windows.TOOL_PX
         (centre,), (angle,) = windows.tool_pose(u[None])
-        length = _length_px(u, visibility)
+        like = not visibility.any() and in_image(u[:1], scene[0].shape[1::-1]).all()  # an object drawn where a tool would be
+        length = _length_px(u, np.ones(3)) if like else _length_px(u, visibility)
         if not np.isfinite(angle + length) or (self.disguise and rng.random() < 0.3):
             return self._elsewhere(scene, centre, angle, length, rng)
         worse = 3.0 if rng.random() < 0.15 else 1.0
