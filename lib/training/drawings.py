@@ -94,7 +94,8 @@ def drawn_object(image: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarra
     s, kind = np.linspace(0, 1, 24), rng.choice(["needle", "cannula", "rod", "hook"], p=[0.3, 0.35, 0.15, 0.2])
     wide = length * np.exp(rng.uniform(np.log(0.03), np.log(0.25)))
     thin = wide * rng.uniform(0.15, 0.7)
-    radius = {"needle": wide * (1 - s) ** rng.uniform(0.5, 1.2), "rod": wide + 0 * s}.get(kind, thin * (1 - 0.4 * rng.random() * s))
+    slender = thin * (1 - 0.4 * rng.random() * s)
+    radius = {"needle": wide * (1 - s) ** rng.uniform(0.5, 1.2), "rod": wide + 0 * s}.get(kind, slender)
     turn, start = rng.normal(0, 0.05), rng.uniform(0, 0.8)
     if kind == "hook":
         turn = rng.choice([-1, 1]) * rng.uniform(1.0, 2.4)
