@@ -28,7 +28,7 @@ __all__ = [
     "label_noise_cost",
     "label_noise_pairs",
     "mean_and_error",
-    "real_tests",
+    "most_labels",
     "recorded",
     "resolution_curves",
     "shipped_curve",
@@ -119,23 +119,26 @@ def resolution_curves(table: Table) -> Figure:
 
 
 def few_labels_curves(table: Table) -> Figure:
-    """PCK@0.05 against the number of labelled frames: means with two standard errors."""
-    fig, ax = figure(width_in=8, height_in=3.8)
-    trained = Table([row for row in table.rows if row["frames"]])
-    labels = {"shipped": "fine-tuned from the shipped weights", "scratch": "from scratch"}
-    for (start, rows), colour in zip(groups(trained, "start").items(), (COLOURS["ours"], COLOURS["paper"]), strict=True):
-        by_frames = {n: mean_and_error(part.columns["pck_0.05_percent"]) for n, part in groups(rows, "frames").items()}
-        mean, error = np.array(list(by_frames.values())).T
-        bars = 2 * np.nan_to_num(error)
-        ax.errorbar(list(by_frames), mean, yerr=bars, color=colour, marker="o", ms=6, capsize=4, label=labels[start])
-    for row in table.where(frames=0, start="shipped").rows:
-        ax.axhline(row["pck_0.05_percent"], color=COLOURS["baseline"], ls="--", label="shipped weights as they are")
-    ax.set(xscale="log", ylim=(0, 101), xlabel="labelled frames", ylabel="PCK@0.05, %", title="How many labels?")
-    counts = sorted(set(trained.columns["frames"].tolist()))
-    ax.set_xticks(counts, [f"{count:g}" for count in counts])
-    ax.minorticks_off()
-    ax.legend(title="bars: two standard errors")
+    """PCK@0.2 on real frames against the number of labelled ones: the same sequence, and the other one."""
+    fig, axes = figure(1, 2, width_in=10, height_in=3.6, sharey=True)
+    counts = sorted({row["frames"] for row in table.rows})
+    for (name, rows), colour in zip(groups(table, "sequence").items(), ("ours", "paper"), strict=False):
+        x, own = [counts.index(row["frames"]) for row in rows.rows], rows.columns["pck_0.20_percent"]
+        axes[0].plot(x, own, "o-", color=COLOURS[colour], label=f"{name}, second half")
+        axes[0].axhline(rows.rows[0]["clicks_pck_0.20_percent"], color=COLOURS[colour], ls=":", label="clicks allow")
+        axes[1].plot(x, rows.columns["elsewhere_pck_0.20_percent"], "o-", color=COLOURS[colour], label=f"labels of {name}")
+    for ax, title in zip(axes, ("the same sequence", "the other sequence"), strict=True):
+        ticks = ["all" if count > max(row["labelled"] for row in table.rows) else f"{count:g}" for count in counts]
+        ax.set_xticks(range(len(counts)), ticks)
+        ax.set(ylim=(0, 101), xlabel="labelled frames", title=title)
+        ax.legend(loc="best")
+    axes[0].set_ylabel("PCK@0.2, %")
     return fig
+
+
+def most_labels(table: Table) -> list[dict]:
+    """The row with the most labelled frames of each sequence."""
+    return [max(rows.rows, key=lambda row: row["labelled"]) for rows in groups(table, "sequence").values()]
 
 
 def label_noise_cost(table: Table) -> tuple[float, float]:
@@ -158,17 +161,6 @@ def label_noise_pairs(table: Table) -> Figure:
     ax.set(xlim=(-0.4, 1.4), ylabel="median error, px", title=f"Cost of label noise: {cost} px")
     ax.set_ylim(0, 1.25 * medians.max())
     return fig
-
-
-def real_tests(table: Table) -> dict[str, Table]:
-    """The rows of each kind of test on real frames, named as `landmarks.real_curves` takes them."""
-    tests: dict[str, list[dict]] = {}
-    for row in table.rows:
-        on = "second" if row["train_on"] == row["test_on"] else row["test_on"]
-        how = "simulated frames only" if row["train_on"] == "simulated" else f"first half to {on}"
-        sequence = row["test_on"] if row["train_on"] == "simulated" else row["train_on"]
-        tests.setdefault(f"{sequence}: {how}", []).append(row)
-    return {name: Table(rows) for name, rows in tests.items()}
 
 
 def shipped_curve(table: Table) -> Figure:

@@ -12,7 +12,7 @@ from lib.workbench.results import Table
 from notebooks.figures.landmarks import landmark_dots
 from notebooks.figures.style import COLOURS, figure, show_image
 
-__all__ = ["half_within", "real_curves", "recorded_bars", "rung_page"]
+__all__ = ["real_curves", "recorded_bars", "rung_page"]
 
 
 def rung_page(
@@ -66,35 +66,12 @@ def recorded_bars(table: Table) -> Figure:
 
 
 def real_curves(thresholds: Sequence[float], curves: Mapping[str, Sequence[float]]) -> Figure:
-    """PCK on real frames, a panel a kind of test; names are "sequence: what was trained on and tested on"."""
-    panels: dict[str, dict[str, Sequence[float]]] = {}
-    for name, curve in curves.items():
-        sequence, how = name.split(": ", 1)
-        kind = "another sequence" if how.startswith("first half to ") and how != "first half to second" else how
-        label = f"{sequence} to {how.removeprefix('first half to ')}" if kind == "another sequence" else sequence
-        panels.setdefault(kind, {})[label] = curve
-    fig, axes = figure(1, max(1, len(panels)), width_in=11, height_in=3.5, sharey=True, squeeze=False)
-    for ax, (kind, rows) in zip(axes.flat, panels.items(), strict=False):
-        for (name, curve), colour in zip(
-            rows.items(), (COLOURS["ours"], COLOURS["paper"], COLOURS["truth"]), strict=False
-        ):
-            ax.plot(thresholds, curve, "o-", color=colour, ms=4, label=name)
-        ax.axvline(0.2, color=COLOURS["baseline"], lw=1)
-        ax.set(xlim=(0.05, 0.5), ylim=(0, 101), xlabel="threshold, part of the tool's length", title=kind)
-        ax.set_xticks([0.1, 0.2, 0.3, 0.4, 0.5])
-        ax.legend(loc="best")
-    axes.flat[0].set_ylabel("PCK, %")
+    """PCK on real frames, a curve a detector."""
+    fig, ax = figure(width_in=7, height_in=3.5)
+    for (name, curve), colour in zip(curves.items(), ("paper", "ours", "truth"), strict=False):
+        ax.plot(thresholds, curve, "o-", color=COLOURS[colour], ms=4, label=name)
+    ax.axvline(0.2, color=COLOURS["baseline"], lw=1)
+    ax.set(xlim=(0.05, 0.5), ylim=(0, 101), title="Real frames")
+    ax.set(xlabel="threshold, part of the tool's length", ylabel="PCK, %")
+    ax.legend(loc="best")
     return fig
-
-
-def half_within(thresholds: Sequence[float], curve: Sequence[float]) -> str:
-    """A PCK curve in words: the fraction of the tool's length within which half of all landmarks lie."""
-    curve = np.asarray(curve, dtype=float)
-    reached = np.flatnonzero(curve >= 50)
-    if not len(reached):
-        return f"not even half within {100 * thresholds[-1]:.0f} % of the tool's length"
-    end = reached[0]
-    if end == 0:
-        return f"half within less than {100 * thresholds[0]:.0f} % of the tool's length"
-    at = np.interp(50, curve[end - 1 : end + 1], thresholds[end - 1 : end + 1])
-    return f"half within {100 * at:.0f} % of the tool's length"

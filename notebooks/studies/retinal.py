@@ -1,14 +1,17 @@
 """The Retinal Microsurgery sequences: real frames with clicked landmarks, of one camera and without kinematics."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from lib.landmarks.metrics import pck, tool_length_px
 from lib.recordings import read_image
 from lib.recordings.tables import columns, read_table
+from lib.training.samples import LabelledImage
 
-__all__ = ["MonocularSequence", "import_retinal_microsurgery"]
+__all__ = ["MonocularSequence", "import_retinal_microsurgery", "label_repeatability"]
 
 
 @dataclass(frozen=True)
@@ -33,6 +36,17 @@ class MonocularSequence:
     def image(self, index: int) -> np.ndarray:
         """Frame `index` as (h, w, 3) uint8 RGB."""
         return read_image(self.paths[index], self.image_size_px)
+
+    def labelled(self, *, second_half: bool | None = None, every: int = 1) -> Iterator[LabelledImage]:
+        """Every `every`-th frame that has a label: of all, of the first half or of the second.
+
+        Consecutive frames are alike, so halves in time are the honest split.
+        """
+        middle = len(self) // 2
+        for i in {None: range(len(self)), False: range(middle), True: range(middle, len(self))}[second_half][::every]:
+            seen = np.isfinite(self.u[i]).all(axis=1)
+            if seen.any():
+                yield LabelledImage(f"{self.name} {self.frame_numbers[i]}", self.image(i), self.u[i], np.where(seen, 2, 0))
 
 
 def import_retinal_microsurgery(folder: str | Path) -> list[MonocularSequence]:
@@ -65,3 +79,17 @@ def import_retinal_microsurgery(folder: str | Path) -> list[MonocularSequence]:
         first = read_image(images[0])
         sequences.append(MonocularSequence(path.parent.name, numbers, images, u, (first.shape[1], first.shape[0])))
     return sequences
+
+
+def label_repeatability(sequence: MonocularSequence, threshold: float = 0.2) -> float:
+    """PCK in percent that a detector without error would reach on the second half, since clicks jitter.
+
+    Each click is compared with the mean of those one frame before and after.  If all err alike that difference has 3/2 of
+    one click's variance, and is divided by the root of that.  Uneven motion of the tool adds to it.
+    """
+    middle = len(sequence) // 2
+    u, number = sequence.u[middle:], np.asarray(sequence.frame_numbers)[middle:]
+    consecutive = (np.diff(number[:-1]) == 1) & (np.diff(number[1:]) == 1)
+    click, between = u[1:-1], (u[:-2] + u[2:]) / 2
+    compared = np.where(consecutive[:, None, None] & np.isfinite(between), click, np.nan)
+    return float(pck(click + (between - click) / np.sqrt(1.5), compared, threshold, length_px=tool_length_px(click)))

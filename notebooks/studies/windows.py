@@ -17,22 +17,20 @@ from lib.files import whole
 from lib.geometry import cell_from_image
 from lib.landmarks import windows
 from lib.simulator.population import TEXTURE_SEEDS, VALIDATION_TEXTURE_SEEDS, sample
-from lib.training.samples import LabelledImage, Samples, Source
+from lib.training.samples import LabelledImage, Source
 from lib.training.shards import packed, read_shards, square_round
 
 __all__ = [
-    "REDUCTION",
     "STORED_REDUCTION",
     "TOOL",
     "TOOL_REDUCTION",
     "WindowSource",
-    "frame_samples",
     "simulated",
     "write_frames",
 ]
 
-#: Of the stored frames, and of the frames that `frame_samples` gives.
-STORED_REDUCTION, REDUCTION = 5, 8
+#: Of the stored frames.
+STORED_REDUCTION = 5
 #: Reduction of the windows round the tool, and the landmark index that means the whole tool.
 TOOL_REDUCTION, TOOL = STORED_REDUCTION, 3
 CROP_PX = 288
@@ -77,14 +75,6 @@ def write_frames(path: Path, images: Iterable[LabelledImage], *, keep_frames: bo
             jpegs=jpegs,
             jpeg_ends=ends,
         )
-
-
-def frame_samples(folder: str | Path) -> Samples:
-    """Whole frames, an eighth of their size; shards keep more, so that it can be chosen later."""
-    frames, u, visibility = read_shards(folder, ("training",), ("frames", "u", "visibility"))
-    size = [side * STORED_REDUCTION // REDUCTION for side in frames.shape[2:0:-1]]
-    frames = np.stack([cv2.resize(frame, size, interpolation=cv2.INTER_AREA) for frame in frames])
-    return Samples(frames, cell_from_image(u, REDUCTION), visibility)
 
 
 @dataclass(frozen=True)

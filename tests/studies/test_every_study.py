@@ -14,13 +14,12 @@ SMALLEST = {
     "calibrated_surfaces": {"n_frames": 30, "setting": "fast"},
     "dataset": {"pairs": 1, "shrink": 4},
     "engines_and_speed": {"repeats": 1},
-    "few_labels": {"steps": 100, "frames": 10},
+    "few_labels": {"frames": 5, "minutes": 0.1},
     "l1_solver": {"n_points": 2000, "control": 20},
     "label_noise": {"steps": 100},
     "matching": {"scene": "eye", "repeats": 1},
     "noise_and_coverage": {"runs": 4},
     "noticed_motion": {"recordings": 1, "before": 60, "after": 10, "scenes": 1},
-    "real_frames": {"train_on": "simulated"},
     "real_robot": {},
     "realism": {"windows": 8},
     "reconstruction_speed": {},
@@ -30,7 +29,7 @@ SMALLEST = {
     "shipped_detector": {"every": 12},
     "surfaces": {"scene": "eye 200"},
 }
-NEED_DATA = {"matching", "real_frames", "real_robot", "realism", "rungs"}
+NEED_DATA = {"few_labels", "matching", "real_robot", "realism", "rungs"}
 MAY_LACK = {"matching", "noticed_motion", "robot_labels", "rungs"}  # numbers that a picture or a motion does not have
 
 

@@ -73,17 +73,15 @@ def test_precision_and_recall_of_visibility():
     assert texts(records.visibility_bars({"easy": row, "hard": row})).count("97.25") == 8
 
 
-def test_few_labels_are_two_curves_with_error_bars():
-    rows = [{"start": "shipped", "frames": 0, "pck_0.05_percent": 88.0}]
-    for start, frames, values in (("shipped", 10, (90, 92, 94)), ("shipped", 100, (95, 95, 95)), ("scratch", 10, (20,))):
-        rows += [{"start": start, "frames": frames, "pck_0.05_percent": value} for value in values]
-    ax = records.few_labels_curves(Table(rows)).axes[0]
-    assert [bars.get_label() for bars in ax.containers] == ["fine-tuned from the shipped weights", "from scratch"]
-    tuned, scratch = (bars.lines for bars in ax.containers)
-    np.testing.assert_allclose(tuned[0].get_xydata(), [[10, 92], [100, 95]])
-    segment = tuned[2][0].get_segments()[0]
-    np.testing.assert_allclose(segment[:, 1], 92 + 2 * 2 / np.sqrt(3) * np.array([-1, 1]))
-    np.testing.assert_allclose(scratch[0].get_ydata(), [20])  # one seed has no standard error
+def test_few_labels_are_a_curve_for_each_sequence():
+    columns = {"frames": (0, 10, 1000), "labelled": (0, 10, 201), "pck_0.20_percent": (60, 80, 95)}
+    columns |= {"elsewhere_pck_0.20_percent": (40, 45, 50), "clicks_pck_0.20_percent": (96, 96, 96)}
+    rows = [dict(zip(columns, values, strict=True)) | {"sequence": "seq1"} for values in zip(*columns.values(), strict=True)]
+    own, other = records.few_labels_curves(Table(rows)).axes
+    np.testing.assert_allclose(own.lines[0].get_xydata(), [[0, 60], [1, 80], [2, 95]])
+    np.testing.assert_allclose(other.lines[0].get_ydata(), [40, 45, 50])
+    assert [label.get_text() for label in own.get_xticklabels()] == ["0", "10", "all"]
+    assert records.most_labels(Table(rows)) == [rows[2]]
 
 
 def test_the_cost_of_label_noise_is_that_of_pairs_of_a_seed():
@@ -146,26 +144,9 @@ def test_recorded_rungs_have_a_bar_for_each_with_labels():
     assert [bar.get_width() for bar in wrong.patches] == [3.0, 3.0]
 
 
-def test_real_curves_have_a_panel_for_each_kind_of_test():
-    thresholds = np.linspace(0.05, 0.5, 10)
-    names = []
-    for i in (1, 2):
-        tests = ("first half to second", f"first half to seq{3 - i}", "simulated frames only")
-        names += [f"seq{i}: {how}" for how in tests]
-    figure = shift.real_curves(thresholds, {name: np.linspace(i, 90 + i, 10) for i, name in enumerate(names)})
-    panels = {ax.get_title(loc="left"): [t.get_text() for t in ax.get_legend().get_texts()] for ax in figure.axes}
-    assert panels == {
-        "first half to second": ["seq1", "seq2"],
-        "another sequence": ["seq1 to seq2", "seq2 to seq1"],
-        "simulated frames only": ["seq1", "seq2"],
-    }
-
-
-def test_how_far_a_curve_is_in_words():
-    thresholds = [0.1, 0.2, 0.3]
-    assert shift.half_within(thresholds, [30, 70, 90]) == "half within 15 % of the tool's length"
-    assert shift.half_within(thresholds, [60, 70, 90]) == "half within less than 10 % of the tool's length"
-    assert shift.half_within(thresholds, [1, 2, 3]) == "not even half within 30 % of the tool's length"
+def test_real_curves_are_named_after_their_detectors():
+    (ax,) = shift.real_curves([0.1, 0.2], {"as shipped": [1, 2], "10 labelled frames": [3, 4]}).axes
+    assert [t.get_text() for t in ax.get_legend().get_texts()] == ["as shipped", "10 labelled frames"]
 
 
 def test_timing_stands_beside_the_papers():
