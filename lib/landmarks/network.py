@@ -39,8 +39,6 @@ class HourglassConfig:
         growth: By how much the channels multiply with each halving; 1 as in the paper.
         decoder, skips, residual: The parts that the ablation adds one by one.  Without a decoder the heatmaps have stride
             4 * 2**depth.
-        standardise: Whether each image is brought to the same mean of each channel and the same contrast first, so that light,
-            tint and exposure count little.
 
         >>> HourglassConfig().stride, HourglassConfig(stacks=1, decoder=False, skips=False).stride
         (4, 64)
@@ -53,7 +51,6 @@ class HourglassConfig:
     decoder: bool = True
     skips: bool = True
     residual: bool = True
-    standardise: bool = False
 
     def __post_init__(self) -> None:
         if self.features < 2 or self.features % 2:
@@ -147,12 +144,6 @@ class _Hourglass(nn.Module):
         return y if self.skip is None else y + self.skip(x)
 
 
-def _standardised(images: Tensor) -> Tensor:
-    """Images (n, 3, h, w) in which each channel has the mean 0.4, and all together the standard deviation 0.2, if any."""
-    centred = images - images.mean((2, 3), keepdim=True)
-    return 0.4 + 0.2 * centred / (centred.square().mean((1, 2, 3), keepdim=True).sqrt() + 0.02)
-
-
 class StackedHourglass(Network):
     """Images to landmark heatmaps.
 
@@ -196,8 +187,6 @@ class StackedHourglass(Network):
                 f"images: the network takes (n, 3, h, w) RGB, got {tuple(images.shape)}. "
                 "Repeat a grey channel three times; drop an alpha channel."
             )
-        if self.config.standardise:
-            images = _standardised(images)
         h, w = images.shape[-2:]
         multiple, stride = self.config.multiple, self.stride
         padded = F.pad(images, (0, -w % multiple, 0, -h % multiple))
