@@ -40,13 +40,14 @@ class MonocularSequence:
     def labelled(self, *, second_half: bool | None = None, every: int = 1) -> Iterator[LabelledImage]:
         """Every `every`-th frame that has a label: of all, of the first half or of the second.
 
+        A landmark without a click counts as unlabelled: nobody says whether it is hidden or outside.
         Consecutive frames are alike, so halves in time are the honest split.
         """
         middle = len(self) // 2
         for i in {None: range(len(self)), False: range(middle), True: range(middle, len(self))}[second_half][::every]:
             seen = np.isfinite(self.u[i]).all(axis=1)
             if seen.any():
-                yield LabelledImage(f"{self.name} {self.frame_numbers[i]}", self.image(i), self.u[i], np.where(seen, 2, 0))
+                yield LabelledImage(f"{self.name} {self.frame_numbers[i]}", self.image(i), self.u[i], np.where(seen, 2, 1))
 
 
 def import_retinal_microsurgery(folder: str | Path) -> list[MonocularSequence]:

@@ -108,6 +108,20 @@ def test_a_detector_that_takes_elbows_for_tips_is_no_start(world, recording):
         taught(recording, StandIn(elbows, noise_px=0.7, wrong=0.2))
 
 
+def test_few_landmarks_that_agree_are_no_consensus(world, recording):
+    """A third of sixty, more than a tenth: chance and one wrong habit bring as many together."""
+    with pytest.raises(RefusalError, match="in number"):
+        teach(recording, look(recording, StandIn(world.u, noise_px=0.7, wrong=0.65), np.arange(10)))
+
+
+def test_what_an_older_recipe_kept_is_not_gone_on_with(world, recording, tmp_path, monkeypatch):
+    hopeless = StandIn(world.u, noise_px=0.7, wrong=1.0)
+    for recipe in (1, 1, 2):
+        monkeypatch.setattr(loop, "RECIPE", recipe)
+        assert not adapt(recording, hopeless, folder=tmp_path, progress=False).improved
+    assert len(list((tmp_path / "work").iterdir())) == 2
+
+
 class Sure(StandIn):
     """Is sure of the lost landmarks, too."""
 
