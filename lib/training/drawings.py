@@ -100,7 +100,8 @@ def drawn_object(image: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarra
     if kind == "hook":
         turn = rng.choice([-1, 1]) * rng.uniform(1.0, 2.4)
     way = angle + turn * np.clip((s - start) / (1 - start), 0, 1)
-    line = base + length / len(s) * np.cumsum(np.column_stack([np.cos(way), np.sin(way)]), axis=0)
+    steps = np.column_stack([np.cos(way), np.sin(way)])
+    line = base + length / (len(s) - 1) * (np.cumsum(steps, axis=0) - steps[0])
     parts = [(line, np.maximum(radius, 0.35)), _shaft(base, angle, length, max(wide, 0.8), image.shape[1], rng)]
     return _put(image, parts, length, rng), np.stack([base, line[-1], line[-1]])
 
