@@ -25,8 +25,6 @@ FRAME_PX, PART_PX = (320, 192), (160, 128)
 SHORTEST_PX = 5.0
 #: Nor are tools in an image whose grey values spread less.
 FLAT = 5.0
-#: Share of the drawings that show a needle, cannula, rod or hook alone, and of the drawn tools beside which there is one.
-_OBJECTS, _BESIDE = 0.2, 0.15
 #: By how much a window is turned (rad), magnified (log) and shifted (its pixels) if it still shows the tool, and if not.
 _SHOWS, _SHOWS_NOT = ((0.0, 0.7), (0.0, 0.6), (0.0, 30.0)), ((1.0, np.pi), (0.8, 1.6), (60.0, 150.0))
 
@@ -35,9 +33,10 @@ _SHOWS, _SHOWS_NOT = ((0.0, 0.7), (0.0, 0.6), (0.0, 30.0)), ((1.0, np.pi), (0.8,
 class SceneSource(Source):
     """Frames as JPEG, one after the other, that end at `ends` (n,), with u (n, 3, 2) in their pixels and visibility (n, 3).
 
-    Frames without a tool are among them: all landmarks have visibility 0.  `disguise` is the share of the
-    draws whose appearance is changed, `drawn` that of the draws whose tool is a drawing (`drawings.py`), `weight` (n, 3)
-    that of the draws in which a label counts.
+    Frames without a tool are among them: all landmarks have visibility 0.  `disguise` is the share of the draws whose
+    appearance is changed, `drawn` that of the draws that are drawings (`drawings.py`), `weight` (n, 3) that of the draws in
+    which a label counts.  Of the drawings, `objects` is the share without a tool, `beside` that of tools beside which there
+    is an object.
     """
 
     ends: np.ndarray
@@ -47,6 +46,8 @@ class SceneSource(Source):
     disguise: float = 0.5
     weight: np.ndarray | None = None
     drawn: float = 0.0
+    objects: float = 0.2
+    beside: float = 0.15
 
     @classmethod
     def load(cls, folder: str | Path) -> Self:
@@ -64,14 +65,14 @@ class SceneSource(Source):
         return cv2.cvtColor(cv2.imdecode(self.jpegs[start : self.ends[index]], cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
 
     def scene(self, index: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """The frame, or a drawn tool on a ground made of it, with landmarks (3, 2), visibility and weight (3,)."""
+        """The frame, or a drawn tool or object on a ground made of it, with landmarks (3, 2), visibility and weight (3,)."""
         image = self.frame(index)
         if self.drawn and rng.random() < self.drawn:
             bare = not self.visibility[index].any() and rng.random() < 0.5
             ground = image if bare else drawn_ground(image, rng)
-            if rng.random() < _OBJECTS:
+            if rng.random() < self.objects:
                 return *drawn_object(ground, rng), np.zeros(3, int), np.ones(3)
-            ground = drawn_object(ground, rng)[0] if rng.random() < _BESIDE else ground
+            ground = drawn_object(ground, rng)[0] if rng.random() < self.beside else ground
             return *drawn_tool(ground, rng), np.ones(3)
         weight = np.ones(3) if self.weight is None else self.weight[index]
         return image, self.u[index], self.visibility[index], weight
@@ -99,7 +100,7 @@ def _length_px(u: np.ndarray, visibility: np.ndarray) -> float:
 
 
 class FrameSource(SceneSource):
-    """Frames turned, zoomed, shifted and mirrored, as the first stage sees them; a sixth show no landmark."""
+    """Frames turned, zoomed, shifted and mirrored, as the first stage sees them; a fifth show no landmark."""
 
     def draw(self, index: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         frame, u, visibility, _ = scene = self.scene(index, rng)
@@ -123,7 +124,7 @@ class FrameSource(SceneSource):
 class ToolSource(SceneSource):
     """Upright windows of `windows.TOOL_PX` round the tool, placed, turned and scaled as badly as the stage before does.
 
-    Three in ten show no tool that stands upright in its size: peaks must be low there, since they decide between places.
+    A third shows no tool that stands upright in its size: peaks must be low there, since they decide between places.
     """
 
     def draw(self, index: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

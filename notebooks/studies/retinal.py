@@ -38,7 +38,7 @@ class MonocularSequence:
         return read_image(self.paths[index], self.image_size_px)
 
     def labelled(self, *, second_half: bool | None = None, every: int = 1) -> Iterator[LabelledImage]:
-        """Every `every`-th frame that has a label: of all, of the first half or of the second.
+        """Of every `every`-th frame those that have a label: of all, of the first half or of the second.
 
         A landmark without a click counts as unlabelled: nobody says whether it is hidden or outside.
         Consecutive frames are alike, so halves in time are the honest split.

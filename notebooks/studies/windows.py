@@ -21,7 +21,6 @@ from lib.training.samples import LabelledImage, Source
 from lib.training.shards import packed, read_shards, square_round
 
 __all__ = [
-    "STORED_REDUCTION",
     "TOOL",
     "TOOL_REDUCTION",
     "WindowSource",

@@ -95,8 +95,11 @@ def test_time_ends_fine_tuning(tmp_path, monkeypatch):
     images = toy_images(4, size=(135, 240))
     monkeypatch.setattr(stages, "fit_error_models", lambda d, held_out, progress: d)
     detector = Detector(StackedHourglass(HourglassConfig(4, 1, 2)), 96)
-    stages.finetune(detector, images[:2], images[2:], tmp_path, steps=10**6, minutes=1e-4, progress=False)
-    assert load_training(tmp_path / "frame" / "last.safetensors").provenance["steps"] < 100
+    for folder, simulated in (("alone", None), ("mixed", toy_images(3, size=(135, 240)))):
+        how = {"simulated": simulated, "steps": 10**6, "minutes": 1e-4, "progress": False}
+        stages.finetune(detector, images[:2], images[2:], tmp_path / folder, **how)
+        trained = load_training(tmp_path / folder / "frame" / "last.safetensors").provenance
+        assert trained["steps"] < 100 and trained["images"] == (4 if simulated else 2)  # a third of them fits the doubt
 
 
 def test_a_stopped_fine_tuning_stops_all_stages(tmp_path, monkeypatch):

@@ -16,7 +16,7 @@ from lib.training.augmentation import Augmentation, Batch
 from lib.training.config import PRESETS, TrainingConfig
 from lib.training.loop import load_training, train
 from lib.training.losses import heatmap_loss, offset_loss, position_loss
-from lib.training.samples import Samples
+from lib.training.samples import Mixed, Samples
 from tests.toys import toy_samples
 
 SMALL = replace(
@@ -161,6 +161,15 @@ def test_unlabelled_landmarks_have_no_loss():
     output = render(u, (96, 128), 4)
     output[:, 2] = 5.0
     assert heatmap_loss([output], batch, 4) == 0
+
+
+def test_a_mixed_source_draws_the_share_that_it_says(toy):
+    dark, bright = toy(3, size=(64, 64)), toy(5, size=(64, 64))
+    dark = Samples(np.zeros_like(dark.images), dark.u, dark.visibility)
+    mixed, rng = Mixed(dark, replace(bright, images=np.full_like(bright.images, 255)), 0.75), np.random.default_rng(0)
+    drawn = [mixed.draw(i % len(mixed), rng)[0].mean() for i in range(400)]
+    assert len(mixed) == 8 and 0.7 < np.mean(np.array(drawn) == 0) < 0.8
+    assert mixed.fingerprint != replace(mixed, share=0.5).fingerprint != replace(mixed, own=mixed.other).fingerprint
 
 
 def test_bad_data_is_named(toy):
