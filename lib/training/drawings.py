@@ -3,7 +3,6 @@
 They are no pictures of a real tool.  What they share with real ones is what a landmark is: a straight shaft, two jaws that
 leave it at one point of its axis (the base), and the farthest point of each jaw's centre line (its tip).  Training on them,
 beside rendered scenes, makes the networks look for that and not for the shapes and metals that the simulator knows.
-Needles, cannulas, rods and hooks are drawn too: what looks like a shut forceps must not make the networks sure.
 """
 
 import itertools
@@ -11,7 +10,7 @@ import itertools
 import cv2
 import numpy as np
 
-__all__ = ["drawn_ground", "drawn_object", "drawn_tool"]
+__all__ = ["drawn_ground", "drawn_tool"]
 
 #: Centre line (n, 2) px and radius (n,) px.
 Part = tuple[np.ndarray, np.ndarray]
@@ -58,7 +57,11 @@ def drawn_tool(image: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray,
     ((90, 160, 3), (3, 2))
     """
     h, w = image.shape[:2]
-    base, angle, length = _place((h, w), rng)
+    length = np.exp(rng.uniform(np.log(0.045), np.log(0.3))) * w
+    angle = rng.uniform(-np.pi, np.pi)
+    ahead = np.array([np.cos(angle), np.sin(angle)])
+    middle = rng.uniform((0.05 * w, 0.05 * h), (0.95 * w, 0.95 * h))
+    base = middle - 0.5 * length * ahead
     opening = rng.choice([0.0, 1.0], p=[0.12, 0.88]) * rng.uniform(0.05, 1.1 if rng.random() < 0.8 else 1.6)
     lean = rng.normal(0, 0.15) + (rng.choice([-1, 1]) * rng.uniform(0.3, 0.9) if rng.random() < 0.15 else 0.0)
     shape = _jaw_shape(rng)
@@ -70,68 +73,24 @@ def drawn_tool(image: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray,
         aside = side * 0.4 * min(thick, shaft_radius)
         parts.append(_jaw(jaw, side, angle + lean + side * opening / 2, length, thick, base, aside))
         u.append(parts[-1][0][-1])
-    shaft, radius = _shaft(base, angle, length, shaft_radius, w, rng)
+    back = np.linspace(0, 1, 12)[:, None]
+    bent = rng.normal(0, 0.03) if rng.random() < 0.2 else 0.0
+    shaft = base - back * 1.6 * w * ahead + (bent * back**2) * 1.6 * w * np.array([-ahead[1], ahead[0]])
+    shaft += rng.uniform(0, 0.08) * length * ahead * (1 - back)  # how far it covers the jaws' roots
+    radius = shaft_radius * (1 + rng.uniform(-0.2, 1.2) * back[:, 0])
+    if rng.random() < 0.3:  # a sleeve
+        radius = np.where(np.arange(12) > rng.integers(1, 4), radius * rng.uniform(1.1, 2.0), radius)
     if rng.random() < 0.3:  # rounded or conical end
         radius[0] *= rng.uniform(0.2, 0.8)
     parts.insert(int(rng.choice([0, 2])), (shaft, radius))
-    x = _put(image, parts, length, rng)
-    u = np.array(u)
-    if np.linalg.det(u[1:] - u[0]) < 0:  # the jaws cross: tip_1 is the left one
-        u = u[[0, 2, 1]]
-    return x, u, np.where(((u > -0.5) & (u < np.array([w, h]) - 0.5)).all(1), 2, 0)
-
-
-def drawn_object(image: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """A needle, cannula, rod or hook drawn on an image (h, w, 3) uint8.
-
-    Returns the image, and (3, 2) px where a shut forceps of that outline would have its landmarks; the object has none.
-
-    >>> image, u = drawn_object(np.full((90, 160, 3), 90, np.uint8), np.random.default_rng(0))
-    >>> image.shape, u.shape
-    ((90, 160, 3), (3, 2))
-    """
-    base, angle, length = _place(image.shape[:2], rng)
-    s, kind = np.linspace(0, 1, 24), rng.choice(["needle", "cannula", "rod", "hook"], p=[0.3, 0.35, 0.15, 0.2])
-    wide = length * np.exp(rng.uniform(np.log(0.03), np.log(0.25)))
-    thin = wide * rng.uniform(0.15, 0.7)
-    slender = thin * (1 - 0.4 * rng.random() * s)
-    radius = {"needle": wide * (1 - s) ** rng.uniform(0.5, 1.2), "rod": wide + 0 * s}.get(kind, slender)
-    turn, start = rng.normal(0, 0.05), rng.uniform(0, 0.8)
-    if kind == "hook":
-        turn = rng.choice([-1, 1]) * rng.uniform(1.0, 2.4)
-    way = angle + turn * np.clip((s - start) / (1 - start), 0, 1)
-    steps = np.column_stack([np.cos(way), np.sin(way)])
-    line = base + length / (len(s) - 1) * (np.cumsum(steps, axis=0) - steps[0])
-    parts = [(line, np.maximum(radius, 0.35)), _shaft(base, angle, length, max(wide, 0.8), image.shape[1], rng)]
-    return _put(image, parts, length, rng), np.stack([base, line[-1], line[-1]])
-
-
-def _place(shape: tuple[int, int], rng: np.random.Generator) -> tuple[np.ndarray, float, float]:
-    """Base (2,) px, direction (rad) and length (px) of something anywhere in an image (h, w)."""
-    h, w = shape
-    length, angle = np.exp(rng.uniform(np.log(0.045), np.log(0.3))) * w, rng.uniform(-np.pi, np.pi)
-    middle = rng.uniform((0.05 * w, 0.05 * h), (0.95 * w, 0.95 * h))
-    return middle - 0.5 * length * np.array([np.cos(angle), np.sin(angle)]), angle, length
-
-
-def _shaft(base: np.ndarray, angle: float, length: float, radius: float, w: int, rng: np.random.Generator) -> Part:
-    """From the base back out of an image of width w: straight or slightly bent, plain or with a sleeve."""
-    back, ahead = np.linspace(0, 1, 12)[:, None], np.array([np.cos(angle), np.sin(angle)])
-    bent = rng.normal(0, 0.03) if rng.random() < 0.2 else 0.0
-    line = base - back * 1.6 * w * ahead + (bent * back**2) * 1.6 * w * np.array([-ahead[1], ahead[0]])
-    line += rng.uniform(0, 0.08) * length * ahead * (1 - back)  # how far it covers the jaws' roots
-    radii = radius * (1 + rng.uniform(-0.2, 1.2) * back[:, 0])
-    if rng.random() < 0.3:  # a sleeve
-        radii = np.where(np.arange(12) > rng.integers(1, 4), radii * rng.uniform(1.1, 2.0), radii)
-    return line, radii
-
-
-def _put(image: np.ndarray, parts: list[Part], length: float, rng: np.random.Generator) -> np.ndarray:
-    """The image (h, w, 3) uint8 with the parts painted on it, and mostly their shadow."""
     x = image.astype(np.float32)
     if rng.random() < 0.6:
         x = _shadowed(x, parts, length, rng)
-    return np.clip(_painted(x, parts, length, rng), 0, 255).astype(np.uint8)
+    x = _painted(x, parts, length, rng)
+    u = np.array(u)
+    if np.linalg.det(u[1:] - u[0]) < 0:  # the jaws cross: tip_1 is the left one
+        u = u[[0, 2, 1]]
+    return np.clip(x, 0, 255).astype(np.uint8), u, np.where(((u > -0.5) & (u < np.array([w, h]) - 0.5)).all(1), 2, 0)
 
 
 def _jaw_shape(rng: np.random.Generator) -> dict[str, float]:

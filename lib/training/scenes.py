@@ -10,9 +10,8 @@ import numpy as np
 
 from lib.landmarks import windows
 from lib.landmarks.metrics import tool_length_px
-from lib.simulator.window import in_image
 from lib.training.appearance import disguised
-from lib.training.drawings import drawn_ground, drawn_object, drawn_tool
+from lib.training.drawings import drawn_ground, drawn_tool
 from lib.training.samples import LabelledImage, Source
 from lib.training.shards import SCENE_PX, packed, read_scenes
 
@@ -33,10 +32,9 @@ _SHOWS, _SHOWS_NOT = ((0.0, 0.7), (0.0, 0.6), (0.0, 30.0)), ((1.0, np.pi), (0.8,
 class SceneSource(Source):
     """Frames as JPEG, one after the other, that end at `ends` (n,), with u (n, 3, 2) in their pixels and visibility (n, 3).
 
-    Frames without a tool are among them: all landmarks have visibility 0.  `disguise` is the share of the draws whose
-    appearance is changed, `drawn` that of the draws that are drawings (`drawings.py`), `weight` (n, 3) that of the draws in
-    which a label counts.  Of the drawings, `objects` is the share without a tool, `beside` that of tools beside which there
-    is an object.
+    Frames without a tool are among them: all landmarks have visibility 0.  `disguise` is the share of the
+    draws whose appearance is changed, `drawn` that of the draws whose tool is a drawing (`drawings.py`), `weight` (n, 3)
+    that of the draws in which a label counts.
     """
 
     ends: np.ndarray
@@ -46,8 +44,6 @@ class SceneSource(Source):
     disguise: float = 0.5
     weight: np.ndarray | None = None
     drawn: float = 0.0
-    objects: float = 0.2
-    beside: float = 0.15
 
     @classmethod
     def load(cls, folder: str | Path) -> Self:
@@ -65,15 +61,11 @@ class SceneSource(Source):
         return cv2.cvtColor(cv2.imdecode(self.jpegs[start : self.ends[index]], cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
 
     def scene(self, index: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """The frame, or a drawn tool or object on a ground made of it, with landmarks (3, 2), visibility and weight (3,)."""
+        """The frame, or a drawn tool on a ground made of it, with landmarks (3, 2), visibility and weight (3,)."""
         image = self.frame(index)
         if self.drawn and rng.random() < self.drawn:
             bare = not self.visibility[index].any() and rng.random() < 0.5
-            ground = image if bare else drawn_ground(image, rng)
-            if rng.random() < self.objects:
-                return *drawn_object(ground, rng), np.zeros(3, int), np.ones(3)
-            ground = drawn_object(ground, rng)[0] if rng.random() < self.beside else ground
-            return *drawn_tool(ground, rng), np.ones(3)
+            return *drawn_tool(image if bare else drawn_ground(image, rng), rng), np.ones(3)
         weight = np.ones(3) if self.weight is None else self.weight[index]
         return image, self.u[index], self.visibility[index], weight
 
@@ -100,7 +92,7 @@ def _length_px(u: np.ndarray, visibility: np.ndarray) -> float:
 
 
 class FrameSource(SceneSource):
-    """Frames turned, zoomed, shifted and mirrored, as the first stage sees them; a fifth show no landmark."""
+    """Frames turned, zoomed, shifted and mirrored, as the first stage sees them; a sixth show no landmark."""
 
     def draw(self, index: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         frame, u, visibility, _ = scene = self.scene(index, rng)
@@ -124,15 +116,14 @@ class FrameSource(SceneSource):
 class ToolSource(SceneSource):
     """Upright windows of `windows.TOOL_PX` round the tool, placed, turned and scaled as badly as the stage before does.
 
-    A third shows no tool that stands upright in its size: peaks must be low there, since they decide between places.
+    Three in ten show no tool that stands upright in its size: peaks must be low there, since they decide between places.
     """
 
     def draw(self, index: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         _, u, visibility, _ = scene = self.scene(index, rng)
         size = windows.TOOL_PX
         (centre,), (angle,) = windows.tool_pose(u[None])
-        like = not visibility.any() and in_image(u[:1], scene[0].shape[1::-1]).all()  # an object drawn where a tool would be
-        length = _length_px(u, np.ones(3)) if like else _length_px(u, visibility)
+        length = _length_px(u, visibility)
         if not np.isfinite(angle + length) or (self.disguise and rng.random() < 0.3):
             return self._elsewhere(scene, centre, angle, length, rng)
         worse = 3.0 if rng.random() < 0.15 else 1.0

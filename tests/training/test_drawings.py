@@ -1,11 +1,8 @@
-"""Drawn tools: their landmarks lie where the drawing is, in the workbench's order.  Drawn objects have none."""
+"""Drawn tools: their landmarks lie where the drawing is, in the workbench's order."""
 
-from dataclasses import replace
-
-import cv2
 import numpy as np
 
-from lib.training.drawings import drawn_ground, drawn_object, drawn_tool
+from lib.training.drawings import drawn_ground, drawn_tool
 from lib.training.samples import LabelledImage
 from lib.training.scenes import FrameSource, ToolSource
 
@@ -24,30 +21,6 @@ def test_landmarks_lie_on_the_drawing_and_tip_1_on_the_left_of_the_tool():
         assert ((visibility == 2) == ((u > -0.5) & (u < (319.5, 179.5))).all(axis=1)).all()
     assert np.mean(painted) > 0.9  # some have the colour of the ground
     assert min(order) > -1e-6
-
-
-def test_an_object_is_one_piece_from_its_shaft_to_its_end():
-    """A gap would tell it from a tool."""
-    whole = []
-    for seed in range(40):
-        image, u = drawn_object(GROUND, np.random.default_rng(seed))
-        changed = (np.abs(image.astype(int) - GROUND).max(axis=2) > 6).astype(np.uint8)
-        labels = cv2.connectedComponents(cv2.dilate(changed, np.ones((2, 2), np.uint8)))[1]
-        ends = np.round(u[:2]).astype(int)
-        if ((ends > 3) & (ends < (316, 176))).all():
-            base, tip = ([set(labels[y - 2 : y + 3, x - 2 : x + 3].ravel()) - {0}] for x, y in ends)
-            whole.append(bool(base[0] & tip[0]))
-    assert len(whole) > 20 and np.mean(whole) > 0.9
-
-
-def test_objects_teach_that_there_is_no_landmark_where_one_would_be():
-    images = [LabelledImage("a", GROUND, np.full((3, 2), np.nan), np.zeros(3, int))]
-    for kind in (FrameSource, ToolSource):
-        source, rng = replace(kind.of(images), drawn=1.0, objects=1.0), np.random.default_rng(0)
-        draws = [source.draw(0, rng) for _ in range(60)]
-        assert not any(visibility.any() for _, _, visibility in draws)
-        near = [np.isfinite(u).all() and ((u > 0) & (u < 127)).all() for _, u, _ in draws]
-        assert kind is FrameSource or np.mean(near) > 0.4  # upright windows of the stage's own scale
 
 
 def test_the_seed_decides_everything_and_a_ground_keeps_no_tool():
