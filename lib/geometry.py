@@ -151,11 +151,6 @@ class RigidTransform:
         return RigidTransform(self.R @ other.R, self.R @ other.t + self.t)
 
     @property
-    def euler_rad(self) -> np.ndarray:
-        """Angles (3,) about the fixed axes x, y, z, in this order (the paper's Phi_X, Phi_Y, Phi_Z)."""
-        return Rotation.from_matrix(self.R).as_euler("xyz")
-
-    @property
     def matrix(self) -> np.ndarray:
         """Homogeneous (4, 4)."""
         return np.vstack([np.column_stack([self.R, self.t]), [0.0, 0.0, 0.0, 1.0]])

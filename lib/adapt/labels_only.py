@@ -13,7 +13,7 @@ from lib.correspondences import LANDMARKS
 from lib.landmarks import Detector
 from lib.provenance import Provenance, plain
 from lib.recordings import read_image
-from lib.recordings.annotations import coco_keypoints
+from lib.recordings.annotations import CLICK_SD_PX, coco_keypoints
 from lib.training.evaluation import evaluate
 from lib.training.samples import LabelledImage
 from lib.training.stages import finetune
@@ -44,7 +44,7 @@ def adapt_images(
             raise ValueError(f"{labels}: image {name} has keypoints {names}; {list(LANDMARKS)} are needed.")
         xyv = values[[names.index(landmark) for landmark in LANDMARKS]]
         u = np.where(xyv[:, 2:] > 0, xyv[:, :2], np.nan)
-        marked.append(LabelledImage(name, read_image(images / name), u, np.maximum(xyv[:, 2].astype(int), 1)))
+        marked.append(LabelledImage(name, read_image(images / name), u, np.maximum(xyv[:, 2].astype(int), 1), CLICK_SD_PX))
     n = len(marked)
     if n < 10:
         raise ValueError(f"{labels}: {n} labelled images; label at least 10.")
@@ -56,10 +56,9 @@ def adapt_images(
     work = Path(folder or paths.RUNS / f"adapt-{images.name}") / "work" / hashlib.sha256(repr(key).encode()).hexdigest()[:12]
     provenance = Provenance(f"python3 -m lib adapt {images.name} --labels {Path(labels).name}")
     simulated = simulated_like([one.image for one in parts["learn"]], seed, progress)
-    covariance = np.tile(2.25 * np.eye(2), (first, 3, 1, 1))  # a label set by hand is right to about 1.5 px
     tuned = tune(
-        detector, parts["learn"], parts["stop"], work, simulated=simulated, covariance_px2=covariance, minutes=minutes,
-        steps=STEPS, seed=seed, progress=progress,
+        detector, parts["learn"], parts["stop"], work, simulated=simulated, minutes=minutes, steps=STEPS, seed=seed,
+        progress=progress,
     )  # fmt: skip
     before, after = (evaluate(one, parts["judge"]) for one in (detector, tuned))
     gain, sd = better(*(frame_means(found.error_px / found.length_px[:, None]) for found in (before, after)))

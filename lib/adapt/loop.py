@@ -4,7 +4,6 @@ import hashlib
 import json
 import sys
 import time
-import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -28,7 +27,7 @@ __all__ = ["RECIPE", "STEPS", "Adaptation", "adapt", "simulated_like"]
 
 #: Most rounds of training, and most steps of a stage in one; the time ends most trainings.
 ROUNDS, STEPS = 3, 4000
-RECIPE = 2  # raised where teaching or training changes: what an older one kept is not gone on with
+RECIPE = 3  # raised where teaching or training changes: what an older one kept is not gone on with
 #: Share of the time left that a round takes, and fewest images for stopping to which alone the doubt is fitted.
 _ROUND_SHARE, _DOUBT_IMAGES = 0.85, 10
 #: Most stereo frames that are looked at, spread over the recording.
@@ -161,17 +160,17 @@ class _Work:
         with np.load(path) as kept:
             return Seen(*(kept[field] for field in Seen._fields))
 
-    def images(self, frames: np.ndarray, teacher: Teacher, seen: Seen | None) -> tuple[list[LabelledImage], np.ndarray]:
-        """Left and right images with their labels, those that have a base and a tip, and the labels' covariances."""
-        found, covariances = [], []
+    def images(self, frames: np.ndarray, teacher: Teacher, seen: Seen | None) -> list[LabelledImage]:
+        """Left and right images with their labels, those that have a base and a tip."""
+        found = []
         for number, *labels in zip(frames, *teacher.labels(frames, seen), strict=True):
             frame = self.recording.frames[int(number)]
             for side, u, covariance, visibility in zip(("left", "right"), *labels, strict=True):
                 known = np.isfinite(u).all(axis=1) & (visibility > 0)
                 if known[0] and known[1:].any():
-                    found.append(LabelledImage(f"{side} {number}", getattr(frame, side), u, visibility))
-                    covariances.append(np.nan_to_num(covariance, nan=1e6))
-        return found, np.array(covariances)
+                    sd_px = np.sqrt(np.nan_to_num(np.trace(covariance, axis1=1, axis2=2), nan=1e6) / 2)
+                    found.append(LabelledImage(f"{side} {number}", getattr(frame, side), u, visibility, sd_px))
+        return found
 
     def adapted(self, tune: Callable[..., Detector]) -> Adaptation:
         recording, start, rounds = self.recording, self.detector, self.report["rounds"]
@@ -238,11 +237,11 @@ class _Work:
         path = self.folder / f"round {k}.safetensors"
         if path.is_file():
             return Detector.load(path)
-        held_out, doubt_on = self.images(parts["stop"], teacher, seen)[0], parts["learn"][:0]
+        held_out, doubt_on = self.images(parts["stop"], teacher, seen), parts["learn"][:0]
         if len(held_out) < _DOUBT_IMAGES:  # the errors of frames that were trained on say nothing of others
             doubt_on = parts["learn"][3::4]
-            held_out += self.images(doubt_on, teacher, seen)[0]
-        images, covariance = self.images(np.setdiff1d(parts["learn"], doubt_on), teacher, seen)
+            held_out += self.images(doubt_on, teacher, seen)
+        images = self.images(np.setdiff1d(parts["learn"], doubt_on), teacher, seen)
         if len(images) < 8 or len(held_out) < 4:
             raise RefusalError(f"robot: it labels {len(images)} images to learn from and {len(held_out)} others; 8 and 4 do.")
         done = {}
@@ -255,12 +254,10 @@ class _Work:
                 self.saved_s = time.perf_counter()
                 files.write_json(self.folder / "state.json", {"seconds": self.saved_s - self.began})
 
-        with warnings.catch_warnings(record=True) as told:
-            tuned = tune(
-                detector, images, held_out, self.folder / f"round {k}", simulated=simulated, covariance_px2=covariance,
-                minutes=max(self.left_s / 60 * _ROUND_SHARE, 0.05), steps=STEPS, seed=self.seed, progress=progress,
-            )  # fmt: skip
-        self.report["notes"] += [f"Round {k}: {one.message}." for one in told if one.category is RuntimeWarning]
+        tuned = tune(
+            detector, images, held_out, self.folder / f"round {k}", simulated=simulated, steps=STEPS, seed=self.seed,
+            minutes=max(self.left_s / 60 * _ROUND_SHARE, 0.05), progress=progress,
+        )  # fmt: skip
         if self.learns:
             tuned.save(path)
         files.write_json(self.folder / "state.json", {"seconds": time.perf_counter() - self.began})

@@ -17,7 +17,7 @@ from lib.correspondences import LANDMARKS, MIN_CONFIDENCE, Correspondences, of_r
 from lib.landmarks import Landmarks
 from lib.landmarks.metrics import tool_length_px
 from lib.recordings import Recording
-from lib.recordings.annotations import inside
+from lib.recordings.annotations import CLICK_SD_PX, inside
 from lib.trust import LEVELS, Hypothesis, diagnose, judge
 from lib.trust.fitting import Problem
 
@@ -43,7 +43,6 @@ _TURNED = 0.3  # error of an offset, as a share of it, where shut jaws borrow th
 _ODD = 0.2  # share of a large offset that may be the detector's all the same: some tools it knows far worse than others
 #: Gain in log likelihood of a detection, by which cameras of their own for a part of the time must explain it better.
 _SURE_MOVE = 0.1
-_CLICK_PX = 1.5  # of labels set by hand
 _CONFIDENCES = (MIN_CONFIDENCE, 0.5, 0.8)
 _NEAR = 0.1  # share of a short tool's length: as near a detection is taken for right where the noise does not tell
 _LABEL = (
@@ -77,7 +76,7 @@ class Seen(NamedTuple):
     def labelled(self, u: np.ndarray) -> Self:
         """With labels set by hand, u (m, 2, 3, 2), in place of what was found there; what has none stays as it was found."""
         known = np.isfinite(u).all(axis=-1)
-        covariance = np.where(known[..., None, None], _CLICK_PX**2 * np.eye(2), self.covariance)
+        covariance = np.where(known[..., None, None], CLICK_SD_PX**2 * np.eye(2), self.covariance)
         return Seen(self.frame, np.where(known[..., None], u, self.u), covariance, np.where(known, 1.0, self.confidence))
 
 

@@ -148,11 +148,6 @@ class Calibration:
         _, J_x, J_c = self.minimum.state.evaluate(points(x_mm, 3, "x_mm") - self.minimum.state.reference)
         return J_x, J_c @ self.plan.selection
 
-    def row_covariance(self, x_mm: ArrayLike) -> np.ndarray:
-        """(n, m, m) px^2 of a new row's residual at x: the noise of its detection and of the robot's report."""
-        J = self.derivatives(x_mm)[0]
-        return self.noise_px2 + self.sigma_x_mm**2 * J @ np.swapaxes(J, 1, 2)
-
     @cached_property
     def system(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Over the inliers: derivatives by points and parameters, inverse covariance of the residuals, residuals.

@@ -2,7 +2,7 @@
 
 It works from coarse to fine.  The first stage finds the tool in the whole frame, shrunk to a fixed size.  The second names
 its landmarks in one upright window, scaled so that every tool has the same length in it; it looks twice, since the first
-look corrects direction and scale.  Where the first stage is unsure, the second one decides between several places.  The
+look corrects direction and scale.  Where its window does not show the tool well, it decides between several places.  The
 last measures each landmark in a closeup.  The first stage alone, at full resolution, is the paper's detector (Sec. III).
 """
 
@@ -45,8 +45,9 @@ MISSING_BELOW = 0.05
 TRACKED_FROM = 0.5
 #: The stages that look at closeups: twice of what the tool's window showed, and of what was found in the frame before.
 CLOSE = ("closeup", "closer", "tracking")
-#: Where the first stage is less sure than this of a landmark, its peaks at these scales of its input make candidates.
-_SURE, _SCALES = 0.5, (0.75, 1.0, 1.5, 2.2)
+#: Where a window's peaks are lower than this (geometric mean), the first stage's peaks at these scales make candidates.
+_SHOWN, _SCALES = 0.75, (0.75, 1.0, 1.5, 2.2)
+_SURE = 0.5  # of the first stage; below it, or after a comparison, the height of the tool's peaks times this takes its place
 #: So many candidates are looked at once, and so many of them twice; none where all peaks are lower than the third number.
 _CANDIDATES, _AGAIN, _NOTHING = 24, 6, 0.01
 #: A tracked landmark that moved farther than this, in closeups of scale 1, gets a second closeup.  After a shorter way one
@@ -252,9 +253,12 @@ class Detector:
         with self._threads():
             for start in range(0, len(images), batch):
                 part = images[start : start + batch]
-                result = self.searched(part, self.coarse(part))
-                for stage in self.stages[1:]:
-                    result = self.refine(part, result, stage) if stage != "tracking" else result
+                rough = self.coarse(part)
+                seen = self.stage_peaks(part, rough.u, "tool") if self.tool_network else None
+                result = self.searched(part, rough, seen)
+                same = np.array_equal(result.u, rough.u, equal_nan=True)
+                for stage in [stage for stage in self.stages[1:] if stage != "tracking"]:
+                    result = self.refine(part, result, stage, seen if same and stage == "tool" else None)
                 found.append(result)
         return Landmarks.join(found)
 
@@ -297,28 +301,36 @@ class Detector:
         found = self._measured(peaks, None, "frame")
         return Landmarks(image_from_cell(found.u, stride), found.covariance * np.outer(stride, stride), found.confidence)
 
-    def searched(self, images: np.ndarray, rough: Landmarks) -> Landmarks:
-        """What later stages start from: `rough`, or, where that is unsure, the tool that its window shows best.
+    def searched(self, images: np.ndarray, rough: Landmarks, seen: tuple | None = None) -> Landmarks:
+        """What later stages start from: `rough`, or, where its window does not show it well, the tool whose window does best.
 
         Candidates are `rough` and tools made of the highest peaks that the first stage sees at several scales.  All are
-        looked at once, the best ones again.  The highest peaks win; their height is a confidence below `_SURE`.
+        looked at once, the best ones again.  The highest peaks win.  However sure the first stage is, the second one is
+        asked, since it has learnt what is no tool.  `seen` is what `stage_peaks` gave for `rough`, if that is known.
         """
+        if self.tool_network is None:
+            return rough
         result = Landmarks.join([rough])  # a copy
-        for i in np.flatnonzero((rough.confidence < _SURE).any(1)) if self.tool_network else ():
+        height = self._shown(seen or self.stage_peaks(images, rough.u, "tool"), len(images))[1]
+        searched = height < _SHOWN
+        for i in np.flatnonzero(searched):
             image = images[i : i + 1]
             candidates = Landmarks.join([rough[i : i + 1], self._candidates(image)])
-            u, height = self._shown(image[0], candidates.u, "tool")
-            best = np.argsort(-height)[:_AGAIN]
-            _, height = self._shown(image[0], u[best], "again")
-            chosen = candidates[best[[height.argmax()]]]
-            result._put(np.array([i]), replace(chosen, confidence=np.full((1, 3), _SURE * height.max())))
-        return result
+            looks = np.broadcast_to(image, (len(candidates), *image.shape[1:]))
+            u, once = self._shown(self.stage_peaks(looks, candidates.u, "tool"), len(looks))
+            best = np.argsort(-once)[:_AGAIN]
+            _, twice = self._shown(self.stage_peaks(looks[best], u[best], "again"), len(best))
+            result._put(np.array([i]), candidates[best[[twice.argmax()]]])
+            height[i] = twice.max()
+        unsure = searched | (rough.confidence < _SURE).any(1)
+        return replace(result, confidence=np.where(unsure[:, None], _SURE * height[:, None], rough.confidence))
 
-    def _shown(self, image: np.ndarray, u: np.ndarray, stage: str) -> tuple[np.ndarray, np.ndarray]:
-        """Landmarks (n, 3, 2) that the windows of tools u show in one image, and their peaks' geometric mean height (n,)."""
-        peaks, matrices, which = self.stage_peaks(np.broadcast_to(image, (len(u), *image.shape)), u, stage)
+    @staticmethod
+    def _shown(seen: tuple, n: int) -> tuple[np.ndarray, np.ndarray]:
+        """Landmarks (n, 3, 2) that windows of n tools show, and their peaks' geometric mean height (n,), by `stage_peaks`."""
+        peaks, matrices, which = seen
         i, k = which.T
-        found, height = np.full(u.shape, np.nan), np.zeros(u.shape[:2])
+        found, height = np.full((n, 3, 2), np.nan), np.zeros((n, 3))
         found[i, k] = _through_inverse(matrices, peaks.u[:, 0].double().numpy())
         height[i, k] = peaks.value[:, 0].numpy()
         return found, np.exp(np.log(np.clip(height, 0.01, 1)).mean(1))
@@ -355,8 +367,8 @@ class Detector:
             near = peaks.value[:, 0].numpy() > 0
             confidence = np.where(near, confidence, 0.0)
         if stage in ("closeup", "closer"):
-            # The stage before decides whether the landmark is there; an unsure one stays where it was seen.
-            near &= rough.confidence[which[:, 0], which[:, 1]] >= self.closeup_from
+            # The stage before decides whether the landmark is there; one that either is unsure of stays where it was seen.
+            near &= (rough.confidence[which[:, 0], which[:, 1]] >= self.closeup_from) & (confidence >= MISSING_BELOW)
             u, covariance, confidence, which = u[near], covariance[near], confidence[near], which[near]
         i, k = which.T
         result.u[i, k], result.covariance[i, k], result.confidence[i, k] = u, covariance, confidence

@@ -21,6 +21,10 @@ __all__ = ["TRACKED_SHIFT_PX", "Seen", "fit_error_models", "seen_by"]
 
 #: What a tool of 2 mm/s moves between two frames at 25 Hz, and the tool's length at that scale.
 TRACKED_SHIFT_PX, _LENGTH_PX = 8.0, 300.0
+#: Where the doubt is not fitted anew: at so many landmarks it costs a mean loss of 1 to change a coefficient by 1.  Chosen
+#: by the doubt's truth on held-out scenes after a fit on 20 others.
+_PRIOR = 20.0
+_INSIDE = chdtri(2, 0.05)  # squared length below which 95 % of a standard normal plane lie
 #: Larger errors, in pixels of a stage's input, are no part of what a covariance describes.
 _GROSS_PX = {"frame": GROSS_PX, "tool": 10.0, "again": 8.0, "window": GROSS_PX}
 
@@ -31,6 +35,7 @@ class Seen:
 
     All in pixels of the stage's input.  Errors are NaN without a label; below `tolerance` (m,) a landmark is correct.
     `moved` (m, 2) is the whole correction of a closeup.  `known` (m,) is False where a landmark is there but unlabelled.
+    `label_sd` (m,) is the labels' own standard deviation along each axis.
     """
 
     features: np.ndarray
@@ -39,50 +44,59 @@ class Seen:
     landmark: np.ndarray
     moved: np.ndarray
     known: np.ndarray
+    label_sd: np.ndarray
 
     @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:
         """One after the other."""
         return cls(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(cls)))
 
-    def fit(self, gross_px: float) -> ErrorModel:
+    def fit(self, gross_px: float, prior: ErrorModel | None = None) -> ErrorModel:
         """Maximum likelihood of the errors below `gross_px`, and a logistic regression of being correct.
 
-        Variances are log linear in the features; the tips, each other's mirror images, share all coefficients.  Errors have
-        longer tails than a Gaussian: with a mean normalised squared error of 2 more than 5 % lie outside the 95 % ellipses,
-        and ellipses that hold 95 % make it less than 2.  The constants are set halfway, for the base and for the tips.
+        An error is the detector's and the label's: the variance beyond the label's is fitted.  It is log linear in the
+        features; the tips, each other's mirror images, share all coefficients.  Few landmarks change the coefficients of a
+        `prior` little.  Errors have longer tails than a Gaussian: with a mean normalised squared error of 2 more than 5 % lie
+        outside the 95 % ellipses, and ellipses that hold 95 % make it less than 2.  The constants are set halfway, for the
+        base and for the tips.
 
         Raises:
-            ValueError: For fewer than 20 landmarks.
+            ValueError: For fewer than 20 landmarks and no prior.
         """
         size = np.linalg.norm(self.errors, axis=1)
         use = np.isfinite(size) & (size < gross_px)
         if use.sum() < 20:
+            if prior is not None:
+                return prior
             raise ValueError(f"images: only {use.sum()} landmarks to calibrate on; give at least 20.")
-        features, squared = self.features[use], self.errors[use] ** 2
+        features, squared, of_label = self.features[use], self.errors[use] ** 2, self.label_sd[use] ** 2
         tip = self.landmark[use, None] > 0
 
         def variance(axis: int) -> np.ndarray:
             x = np.column_stack([~tip, tip, features[:, axis, 1:]]).astype(float)
             start = [np.log(max(squared[:, axis].mean(), 1e-6))] * 2 + [0.0] * (FEATURES - 1)
+            if prior is not None:
+                start = np.array(prior.log_variance[axis])[[0, 1, *range(3, FEATURES + 2)]]
 
             def deviance(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-                ratio = squared[:, axis] * np.exp(-z)
-                return z + ratio, 1 - ratio
+                own = np.exp(z)
+                ratio = squared[:, axis] / (own + of_label)
+                return np.log(own + of_label) + ratio, (1 - ratio) * own / (own + of_label)
 
-            return _coefficients(deviance, x, start)[[0, 1, 1, *range(2, FEATURES + 1)]]
+            return _coefficients(deviance, x, start, prior is not None)[[0, 1, 1, *range(2, FEATURES + 1)]]
 
-        correct = (size <= self.tolerance)[self.known]
-        start = np.array(ErrorModel().logit)
+        correct = (size <= np.hypot(self.tolerance, np.sqrt(_INSIDE) * self.label_sd))[self.known]
+        start, of_correct = np.array((prior or ErrorModel()).logit), self.features[self.known, 2]
         logit = _coefficients(
-            lambda z: (np.logaddexp(0, z) - correct * z, expit(z) - correct), self.features[self.known, 2], start
+            lambda z: (np.logaddexp(0, z) - correct * z, expit(z) - correct), of_correct, start, prior is not None
         )
         log_variance = np.array([variance(0), variance(1)])
         rows = ErrorModel(log_variance).coefficients[self.landmark[use]]
-        normalised = (squared / np.exp((rows * features[:, :2]).sum(-1))).sum(1)
+        normalised = (squared / (np.exp((rows * features[:, :2]).sum(-1)) + of_label[:, None])).sum(1)
         for own, columns in ((~tip[:, 0], np.s_[:1]), (tip[:, 0], np.s_[1:3])):
             if own.any():
-                log_variance[:, columns] += 0.5 * np.log(np.quantile(normalised[own], 0.95) / chdtri(2, 0.05))
+                share = 0.5 if prior is None else 0.5 * own.sum() / (own.sum() + _PRIOR)
+                log_variance[:, columns] += share * np.log(np.quantile(normalised[own], 0.95) / _INSIDE)
         return ErrorModel(log_variance, logit)
 
     def gain(self, gross_px: float, gains: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
@@ -100,13 +114,14 @@ class Seen:
         return best, bias
 
 
-def _coefficients(loss: Callable[[np.ndarray], tuple], x: np.ndarray, start: Sequence[float]) -> np.ndarray:
-    """Those that minimise the mean of a loss of ``x @ beta``, given with its slope; the slopes are kept small."""
-    ridge = 1e-2 * (np.arange(len(start)) > len(start) - FEATURES)
+def _coefficients(loss: Callable[[np.ndarray], tuple], x: np.ndarray, start: np.ndarray, is_prior: bool) -> np.ndarray:
+    """Those that minimise the mean of a loss of ``x @ beta``, given with its slope; near `start`, or with small slopes."""
+    slopes, centre = np.arange(len(start)) > len(start) - FEATURES, np.asarray(start) if is_prior else np.zeros(len(start))
+    ridge = np.full(len(start), _PRIOR / max(len(x), 1)) if is_prior else 1e-2 * slopes
 
     def penalised(beta: np.ndarray) -> tuple[float, np.ndarray]:
         value, slope = loss(x @ beta)
-        return value.mean() + ridge @ beta**2, x.T @ slope / len(x) + 2 * ridge * beta
+        return value.mean() + ridge @ (beta - centre) ** 2, x.T @ slope / len(x) + 2 * ridge * (beta - centre)
 
     return minimize(penalised, start, jac=True, method="L-BFGS-B").x
 
@@ -121,13 +136,15 @@ def seen_by(
     labels, image = labelled.in_view, labelled.image[None]
     # A stage that only says where the next one looks is right if that finds the landmark there.
     share = 0.25 if stage in ("frame", "tool") and len(detector.networks) > 1 else 0.05
-    tolerance = share * tool_length_px(np.asarray(labelled.u, dtype=float)[None])
+    length = tool_length_px(np.asarray(labelled.u, dtype=float)[None])
+    tolerance, label_sd = np.repeat(share * length, 3), np.broadcast_to(labelled.sd_px, 3)
     known = np.isfinite(labels).all(1) | (labelled.visibility == 0)
     if stage == "frame":
         peaks, stride = detector.frame_peaks(image), detector.frame_stride(image)
         errors = peaks.u[0].double().numpy() - cell_from_image(labels, stride)
-        tolerance = np.repeat(tolerance / stride.mean(), 3)
-        return Seen(features_of(peaks.double())[0].numpy(), errors, tolerance, np.arange(3), np.zeros((3, 2)), known)
+        tolerance, label_sd = tolerance / stride.mean(), label_sd / stride.mean()
+        features, moved = features_of(peaks.double())[0].numpy(), np.zeros((3, 2))
+        return Seen(features, errors, tolerance, np.arange(3), moved, known, label_sd)
     peaks, matrices, which = found or detector.stage_peaks(image, rough.u, stage)
     landmark, at = which[:, 1], peaks.u[:, 0].double().numpy()
     features = features_of(peaks.double(), detector.rough_in_windows(rough, matrices, which, stage))
@@ -139,13 +156,30 @@ def seen_by(
             keep &= rough.confidence[which[:, 0], which[:, 1]] >= detector.closeup_from
         moved = at - expected_in_closeup(detector.closeup_network.config.size_px, landmark)
     errors = at - map_points(matrices, labels[landmark])
-    tolerance = tolerance * np.sqrt(np.abs(np.linalg.det(matrices[:, :, :2])))
-    return Seen(*(part[keep] for part in (feature, errors, tolerance, landmark, moved, known[landmark])))
+    zoom = np.sqrt(np.abs(np.linalg.det(matrices[:, :, :2])))
+    tolerance, label_sd = zoom * tolerance[landmark], zoom * label_sd[landmark]
+    return Seen(*(part[keep] for part in (feature, errors, tolerance, landmark, moved, known[landmark], label_sd)))
+
+
+def _fitted(stage: str, parts: Sequence[Seen], prior: ErrorModel | None) -> ErrorModel:
+    """The error model of a stage by what it saw; a `ValueError` if that is too little, and there is no prior."""
+    if not any(len(part.landmark) for part in parts):
+        if prior is not None:
+            return prior
+        raise ValueError("images: the detector finds nothing in them to calibrate on; give other images.")
+    seen, gross_px = Seen.joined(parts), _GROSS_PX.get(stage, CLOSEUP_REACH_PX * min(CLOSEUP_ZOOM))
+    if stage not in CLOSE:
+        return seen.fit(gross_px, prior)
+    # While tracking, the place where a landmark is expected is an old one, which is evidence of nothing.
+    gain, bias = seen.gain(gross_px, [1.0] if stage == "tracking" else np.linspace(0, 1, 51))
+    seen = replace(seen, errors=seen.errors + (gain[seen.landmark] - 1) * seen.moved - bias[seen.landmark])
+    return replace(seen.fit(gross_px, prior), gain=gain, bias=bias)
 
 
 def fit_error_models(
-    detector: Detector, images: Iterable[LabelledImage], *, for_closeups: Sequence[LabelledImage] = (), progress: bool = False
-) -> Detector:
+    detector: Detector, images: Iterable[LabelledImage], *, for_closeups: Sequence[LabelledImage] = (), anew: bool = True,
+    progress: bool = False,
+) -> Detector:  # fmt: skip
     """The detector with the error model of every stage fitted on validation images, never trained on.
 
     A closeup's correction is scaled by the gain that minimises the validation error, and centred; while tracking it counts
@@ -156,12 +190,13 @@ def fit_error_models(
         images: Easy and hard ones, since confidence is learnt from failures, and of many tools, since errors within a
             recording correlate because they share one tool.
         for_closeups: More images, for the stages that look at closeups alone.
+        anew: False begins from the models that the detector has, and changes them as far as so many images tell.
 
     Raises:
-        ValueError: If too few landmarks are found in them.
+        ValueError: If too few landmarks are found in them, and there is no model to begin from.
     """
     images = list(images)
-    n, images = len(images), [*images, *for_closeups]
+    n, images, before = len(images), [*images, *for_closeups], detector.error_models
     # A closeup is fitted by what it sees itself, not by what an earlier gain leaves of that.
     detector = replace(detector, error_models={k: v for k, v in detector.error_models.items() if k not in CLOSE})
     rough: list[Landmarks | None] = [None] * len(images)
@@ -177,16 +212,8 @@ def fit_error_models(
                 start = detector.refine(labelled.image[None], start, stage)
             found.append(None if stage == "frame" else detector.stage_peaks(labelled.image[None], start.u, stage))
             parts.append(seen_by(detector, stage, labelled, start, found[-1]))
-        if not any(len(part.landmark) for part in parts):
-            raise ValueError("images: the detector finds nothing in them to calibrate on; give other images.")
-        seen = Seen.joined(parts if stage in CLOSE else parts[:n])
-        gross_px = _GROSS_PX.get(stage, CLOSEUP_REACH_PX * min(CLOSEUP_ZOOM))
-        gain, bias = np.ones((3, 2)), np.zeros((3, 2))
-        if stage in CLOSE:
-            # While tracking, the place where a landmark is expected is an old one, which is evidence of nothing.
-            gain, bias = seen.gain(gross_px, [1.0] if stage == "tracking" else np.linspace(0, 1, 51))
-            seen = replace(seen, errors=seen.errors + (gain[seen.landmark] - 1) * seen.moved - bias[seen.landmark])
-        detector = detector.with_error_models(**{stage: replace(seen.fit(gross_px), gain=gain, bias=bias)})
+        fit = _fitted(stage, parts if stage in CLOSE else parts[:n], None if anew else before.get(stage))
+        detector = detector.with_error_models(**{stage: fit})
         if stage == "frame":  # the landmarks that the next stage starts from
             rough = [detector.searched(image, detector.coarse(image)) for image in (part.image[None] for part in images)]
         elif stage != "tracking":

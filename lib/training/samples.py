@@ -8,6 +8,7 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from lib.recordings import Recording
+from lib.recordings.annotations import CLICK_SD_PX
 
 __all__ = ["LabelledImage", "Mixed", "Samples", "Source", "labelled_images"]
 
@@ -16,12 +17,14 @@ class LabelledImage(NamedTuple):
     """An image (h, w, 3) uint8 RGB and its landmarks base, tip_1, tip_2: u (3, 2) px and visibility (3,).
 
     Visibility is 2 visible, 1 hidden, 0 not in the frame.  A landmark that is NaN in `u` and not 0 here is unlabelled.
+    `sd_px` (3,) or a number is the standard deviation of the labels along each axis.
     """
 
     name: str
     image: np.ndarray
     u: np.ndarray
     visibility: np.ndarray
+    sd_px: np.ndarray | float = 0.0
 
     @property
     def in_view(self) -> np.ndarray:
@@ -45,7 +48,7 @@ def labelled_images(recording: Recording, *, every: int = 1) -> Iterator[Labelle
             if recording.truth is None:  # COCO's 0 is "not labelled"; -1 says that the landmark is absent, which is 0 here
                 u = np.where(visibility[:, None] > 0, u, np.nan)
                 visibility = np.where(visibility < 0, 0, np.maximum(visibility, 1))
-            yield LabelledImage(f"{side} {i}", image, u, visibility)
+            yield LabelledImage(f"{side} {i}", image, u, visibility, 0.0 if recording.truth else CLICK_SD_PX)
 
 
 class Source:

@@ -136,7 +136,7 @@ def packed(images: Iterable[LabelledImage], long_side_px: int | None = None, qua
     long at most.
     """
     jpegs, points, seen = [], [], []
-    for _, image, u, visibility in images:
+    for _, image, u, visibility, _ in images:
         h, w = image.shape[:2]
         if long_side_px and max(h, w) > long_side_px:
             size = round(w * long_side_px / max(h, w)), round(h * long_side_px / max(h, w))

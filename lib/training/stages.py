@@ -3,7 +3,6 @@
 import json
 import threading
 import time
-import warnings
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import asdict, replace
@@ -76,37 +75,33 @@ def _still(stage: str, images: Iterable[LabelledImage]) -> Samples:
 
 def finetune(
     detector: Detector, images: Sequence[LabelledImage], held_out: Sequence[LabelledImage], folder: str | Path, *,
-    simulated: str | Path | Sequence[LabelledImage] | None = None, covariance_px2: np.ndarray | None = None, steps: int = 300,
-    minutes: float | None = None, seed: int = 0, progress: bool | Callable[[str, float], None] = True,
+    simulated: str | Path | Sequence[LabelledImage] | None = None, steps: int = 300, minutes: float | None = None,
+    seed: int = 0, progress: bool | Callable[[str, float], None] = True,
 ) -> Detector:  # fmt: skip
     """Train all stages of a detector further on labelled frames, then fit its error models on held-out ones.
 
     Args:
         images, held_out: Images of any size.  Consecutive frames are alike, so hold out whole recordings, or the end of one.
-            Each needs a labelled base and a labelled tip; others are left out.
+            Each needs a labelled base and a labelled tip; others are left out.  A label counts half if its deviation is
+            `LABEL_SD` of the tool's length.
         folder: Keeps the checkpoints, from which the same call continues.
         simulated: Folder of `generate`'s shards; a quarter of what is drawn then comes from there, and their held-out frames
             help to fit the doubt, so that the networks do not forget tools and eyes that the labelled frames do not show.
             Or full frames, of which every third helps to fit the doubt and the others to train.
-        covariance_px2: (n, 3, 2, 2) of the labels of `images`; None = exact.  A label counts half if its deviation is
-            `LABEL_SD` of the tool's length.
         steps, minutes: Steps of each stage; training ends after `minutes`, each stage having had its share.
         progress: Whether to show a bar, or a function that is called with the stage and the part done.
 
     Raises:
         ValueError: If there is no usable image, or fewer than 20 landmarks are found in the held-out ones and the detector
-            has no error models yet; if it has, they stay, with a `RuntimeWarning`.
+            has no error models yet.
     """
     usable = []
     for kind, part in (("training", images), ("validation", held_out)):
-        usable.append([i for i, labelled in enumerate(part) if np.isfinite(tool_pose(labelled.u[None])[1]).all()])
+        usable.append([labelled for labelled in part if np.isfinite(tool_pose(labelled.u[None])[1]).all()])
         if not usable[-1]:
             raise ValueError(f"{kind} images: none has a labelled base and tip; label some.")
-    variance = np.zeros((len(images), 3))  # of the labels, as a share of the tool's length
-    if covariance_px2 is not None:
-        length = tool_length_px(np.stack([labelled.u for labelled in images]))[:, None]
-        variance = np.trace(covariance_px2, axis1=-2, axis2=-1) / 2 / length**2
-    images, held_out = ([part[i] for i in rows] for part, rows in zip((images, held_out), usable, strict=True))
+    images, held_out = usable
+    relative_sd = np.stack([np.broadcast_to(one.sd_px, 3) / tool_length_px(one.u[None]) for one in images])
     doubt_on = validation_images(simulated) if isinstance(simulated, str | Path) else (simulated or ())[::3]
     began, names, stopped = time.perf_counter(), list(detector.networks), threading.Event()
     bars = {stage: tqdm(total=1.0, desc=stage, disable=progress is not True, bar_format="{l_bar}{bar}") for stage in names}
@@ -122,7 +117,7 @@ def finetune(
         """The stages of a thread, one after the other, each for the same time."""
         found = {}
         for number, stage in enumerate(lane):
-            own = _SOURCES[stage].of(images, weight=1 / (1 + variance[usable[0]] / LABEL_SD[stage] ** 2))
+            own = _SOURCES[stage].of(images, weight=1 / (1 + (relative_sd / LABEL_SD[stage]) ** 2))
             source: Source = replace(own, disguise=_OWN_DISGUISE)
             if isinstance(simulated, str | Path):
                 source = Mixed(source, _SOURCES[stage].load(simulated), _OWN_SHARE)
@@ -150,13 +145,7 @@ def finetune(
             stopped.set()
             raise
     tuned = replace(detector, **networks, closeup_from=MISSING_BELOW)
-    try:
-        tuned = fit_error_models(tuned, [*held_out, *doubt_on], progress=progress is True)
-    except ValueError as error:
-        if not set(tuned.stages) <= set(tuned.error_models):
-            raise
-        warnings.warn(f"the doubt stays as it was, held-out images do not suffice ({error})", RuntimeWarning, stacklevel=2)
-        return replace(tuned, closeup_from=detector.closeup_from)
+    tuned = fit_error_models(tuned, [*held_out, *doubt_on], anew=False, progress=progress is True)
     if detector.closeup_network is None:
         return tuned
     # Gain and bias of closeups stay: many exact labels told them, and few labels have a constant error of their own.

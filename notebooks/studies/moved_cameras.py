@@ -168,7 +168,8 @@ def motion_error(estimate: RigidTransform, truth: RigidTransform, centre_mm: np.
     which may be far away, it would only repeat the rotation error.
     """
     residual = estimate.compose(truth.inverse())
-    return float(np.linalg.norm(residual.apply(centre_mm) - centre_mm)), residual.euler_rad
+    angles = Rotation.from_matrix(residual.R).as_euler("xyz")  # the paper's Phi_X, Phi_Y, Phi_Z
+    return float(np.linalg.norm(residual.apply(centre_mm) - centre_mm)), angles
 
 
 def simulated_errors(

@@ -28,7 +28,8 @@ def next_positions(calibration: Calibration, candidates_mm: ArrayLike, count: in
     the position, so of a box a corner is best.
     """
     x = finite_points(candidates_mm, 3, "candidates_mm")
-    J, S = calibration.derivatives(x)[1], calibration.row_covariance(x)
+    J_x, J = calibration.derivatives(x)
+    S = calibration.noise_px2 + calibration.sigma_x_mm**2 * J_x @ J_x.mT  # of a new row's residual
     covariance = calibration.parameter_covariance
     chosen, gains = [], []
     for _ in range(count):

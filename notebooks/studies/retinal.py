@@ -8,6 +8,7 @@ import numpy as np
 
 from lib.landmarks.metrics import pck, tool_length_px
 from lib.recordings import read_image
+from lib.recordings.annotations import CLICK_SD_PX
 from lib.recordings.tables import columns, read_table
 from lib.training.samples import LabelledImage
 
@@ -47,7 +48,8 @@ class MonocularSequence:
         for i in {None: range(len(self)), False: range(middle), True: range(middle, len(self))}[second_half][::every]:
             seen = np.isfinite(self.u[i]).all(axis=1)
             if seen.any():
-                yield LabelledImage(f"{self.name} {self.frame_numbers[i]}", self.image(i), self.u[i], np.where(seen, 2, 1))
+                name, visibility = f"{self.name} {self.frame_numbers[i]}", np.where(seen, 2, 1)
+                yield LabelledImage(name, self.image(i), self.u[i], visibility, CLICK_SD_PX)
 
 
 def import_retinal_microsurgery(folder: str | Path) -> list[MonocularSequence]:

@@ -55,7 +55,7 @@ def simulated(shards: int, validation: int = 3) -> Path:
 def write_frames(path: Path, images: Iterable[LabelledImage], *, keep_frames: bool) -> None:
     """Write one shard of full-resolution labelled images of one size; with the images themselves if `keep_frames`."""
     images, r = list(images), STORED_REDUCTION
-    sizes = [(image.shape[1] // r, image.shape[0] // r) for _, image, _, _ in images]
+    sizes = [(image.shape[1] // r, image.shape[0] // r) for _, image, *_ in images]
     frames = [cv2.resize(part.image, size, interpolation=cv2.INTER_AREA) for part, size in zip(images, sizes, strict=True)]
     u, seen = np.stack([part.u for part in images]), np.stack([part.visibility for part in images])
     frame, landmark = np.nonzero((seen > 0) & np.isfinite(u).all(2))

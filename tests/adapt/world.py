@@ -109,11 +109,11 @@ def pupil(world: World):
     """A `tune` whose pupil finds the truth plus the mean error of the labels it was given, to 0.2 px: a lie is learnt."""
     calls = []
 
-    def tune(detector, images, held_out, folder, *, covariance_px2, progress, **how):
+    def tune(detector, images, held_out, folder, *, progress, **how):
         number = {"left": 0, "right": 1}
         where = [(int(one.name.split()[1]), number[one.name.split()[0]]) for one in images]
         off = np.stack([one.u - world.u[i, side] for one, (i, side) in zip(images, where, strict=True)])
-        calls.append({"images": images, "off": off, "covariance": covariance_px2, **how})
+        calls.append({"images": images, "off": off, **how})
         return StandIn(world.u + np.nanmean(off, axis=0), noise_px=0.2)
 
     tune.calls = calls

@@ -17,7 +17,8 @@ def made(n=150, seed=0, model="affine", **options):
 
 def leverage(found, x_mm):
     """(n,) covariance of a point's projection, in units of one row's noise."""
-    S = found.row_covariance(x_mm)
+    J = found.derivatives(x_mm)[0]
+    S = found.noise_px2 + found.sigma_x_mm**2 * J @ J.mT
     return np.trace(np.linalg.solve(S, found.projection_covariance(x_mm)), axis1=1, axis2=2) / S.shape[-1]
 
 

@@ -28,19 +28,21 @@ def test_a_tool_needs_equal_jaws_and_the_tips_on_their_sides():
     assert len(best_tools(np.stack([TOOL, TOOL + 0.5]), np.full((2, 3), 0.5), 5)) <= 2  # tools that look alike count once
 
 
-def test_an_unsure_image_starts_from_the_tool_that_its_window_shows_best(monkeypatch):
+def test_an_image_starts_from_the_tool_that_its_window_shows_best(monkeypatch):
     network = StackedHourglass(HourglassConfig(features=8, stacks=1))
     detector = Detector(network, tool_network=network)
 
     def landmarks(u: np.ndarray, confidence: float) -> Landmarks:
         return Landmarks(u, np.tile(np.eye(2), (*u.shape[:2], 1, 1)), np.full(u.shape[:2], confidence))
 
-    rough = Landmarks.join([landmarks(TOOL[None], 0.9), landmarks(TOOL[None] + 200, 0.3)])
+    sure_and_unsure = [landmarks(u[None], confidence) for u in (TOOL, TOOL + 200) for confidence in (0.9, 0.3)]
+    rough = Landmarks.join(sure_and_unsure)  # whether the first stage is sure of a wrong one does not matter
     monkeypatch.setattr(Detector, "_candidates", lambda *_: landmarks(np.stack([TOOL + 90, TOOL]), 0.1))
 
-    def shown(self, image, u, stage):
-        return u, np.where(np.linalg.norm(u - TOOL, axis=2).max(1) < 20, 0.8, 0.2)
+    def shown(seen, n):
+        return seen, np.where(np.linalg.norm(seen - TOOL, axis=2).max(1) < 20, 0.8, 0.2)
 
-    monkeypatch.setattr(Detector, "_shown", shown)
-    found = detector.searched(np.zeros((2, 64, 96, 3), np.uint8), rough)
-    assert np.array_equal(found.u, np.stack([TOOL, TOOL])) and found.confidence[:, 0].tolist() == [0.9, 0.4]
+    monkeypatch.setattr(Detector, "stage_peaks", lambda self, images, u, stage: u)
+    monkeypatch.setattr(Detector, "_shown", staticmethod(shown))
+    found = detector.searched(np.zeros((4, 64, 96, 3), np.uint8), rough)
+    assert np.array_equal(found.u, np.stack([TOOL] * 4)) and found.confidence[:, 0].tolist() == [0.9, 0.4, 0.4, 0.4]

@@ -65,17 +65,17 @@ def test_stages_are_fine_tuned_on_labelled_frames(tmp_path, monkeypatch):
     hourglass, closeup = StackedHourglass(HourglassConfig(4, 1, 2)), OffsetNetwork(OffsetConfig(4, 64))
     detector = Detector(hourglass, 96, tool_network=hourglass, closeup_network=closeup)
     fitted_on, done = [], []
-    monkeypatch.setattr(stages, "fit_error_models", lambda d, held_out, progress: fitted_on.append(held_out) or d)
+    monkeypatch.setattr(stages, "fit_error_models", lambda d, held_out, anew, progress: fitted_on.append(held_out) or d)
     options = {"steps": 1, "progress": lambda stage, part: done.append((stage, part))}
-    covariance = np.tile(np.array([0.0, 1.0, 1e9])[:, None, None] * np.eye(2), (6, 1, 1, 1))  # the second tip is not believed
-    tuned = stages.finetune(detector, images[:6], images[6:], tmp_path, covariance_px2=covariance, **options)
+    images[:6] = [one._replace(sd_px=np.array([0.0, 1.0, 3e4])) for one in images[:6]]  # the second tip is not believed
+    tuned = stages.finetune(detector, images[:6], images[6:], tmp_path, **options)
     assert sorted(done) == [("closeup", 1.0), ("frame", 1.0), ("tool", 1.0)]  # side by side
     for stage, network in tuned.networks.items():
         provenance = load_training(tmp_path / stage / "last.safetensors").provenance
         assert provenance["steps"] == 1 and provenance["images"] == (15 if stage == "closeup" else 5)
         before = detector.networks[stage].parameters()
         assert any((a != b).any() for a, b in zip(network.parameters(), before, strict=True))
-    again = stages.finetune(detector, images[:6], images[6:], tmp_path, covariance_px2=covariance, **options)
+    again = stages.finetune(detector, images[:6], images[6:], tmp_path, **options)
     for a, b in zip(again.tool_network.parameters(), tuned.tool_network.parameters(), strict=True):
         assert torch.equal(a, b)
     assert [len(held_out) for held_out in fitted_on] == [2, 2]
@@ -84,7 +84,7 @@ def test_stages_are_fine_tuned_on_labelled_frames(tmp_path, monkeypatch):
     )
     monkeypatch.setattr(stages, "evaluate", auc)
     before = replace(detector, error_models={stage: ErrorModel() for stage in CLOSE})
-    kept = stages.finetune(before, images[:6], images[6:], tmp_path, covariance_px2=covariance, **options)
+    kept = stages.finetune(before, images[:6], images[6:], tmp_path, **options)
     assert kept.closeup_network is closeup and kept.tool_network is not hourglass  # held-out images prefer those from before
     with pytest.raises(ValueError, match="none has a labelled base and tip"):
         stages.finetune(detector, images[:1], images[6:], tmp_path / "none", **options)
@@ -93,7 +93,7 @@ def test_stages_are_fine_tuned_on_labelled_frames(tmp_path, monkeypatch):
 def test_time_ends_fine_tuning(tmp_path, monkeypatch):
     torch.manual_seed(0)
     images = toy_images(4, size=(135, 240))
-    monkeypatch.setattr(stages, "fit_error_models", lambda d, held_out, progress: d)
+    monkeypatch.setattr(stages, "fit_error_models", lambda d, held_out, anew, progress: d)
     detector = Detector(StackedHourglass(HourglassConfig(4, 1, 2)), 96)
     for folder, simulated in (("alone", None), ("mixed", toy_images(3, size=(135, 240)))):
         how = {"simulated": simulated, "steps": 10**6, "minutes": 1e-4, "progress": False}
@@ -105,7 +105,7 @@ def test_time_ends_fine_tuning(tmp_path, monkeypatch):
 def test_a_stopped_fine_tuning_stops_all_stages(tmp_path, monkeypatch):
     torch.manual_seed(0)
     images = toy_images(4, size=(135, 240))
-    monkeypatch.setattr(stages, "fit_error_models", lambda d, held_out, progress: d)
+    monkeypatch.setattr(stages, "fit_error_models", lambda d, held_out, anew, progress: d)
     hourglass = StackedHourglass(HourglassConfig(4, 1, 2))
     detector = Detector(hourglass, 96, tool_network=hourglass)
 

@@ -47,7 +47,8 @@ def test_fitted_variance_of_known_errors():
     sigma = np.exp(np.column_stack([along, across]) / 2)
     errors = rng.normal(0, 1, (6000, 2)) * sigma
     correct = np.linalg.norm(errors, axis=1) < 2
-    fit = Seen(features, errors, np.full(6000, 2.0), landmark, np.zeros((6000, 2)), np.ones(6000, bool)).fit(1e9)
+    moved, known, exact = np.zeros((6000, 2)), np.ones(6000, bool), np.zeros(6000)
+    fit = Seen(features, errors, np.full(6000, 2.0), landmark, moved, known, exact).fit(1e9)
     coefficients = fit.coefficients
     assert coefficients[:, :, 1] == pytest.approx(np.tile([0.8, 0.2], (3, 1)), abs=0.05)
     assert coefficients[1:, :, 0] - coefficients[0, :, 0] == pytest.approx(np.array([[0.9, 0], [0.9, 0]]), abs=0.1)
@@ -57,6 +58,30 @@ def test_fitted_variance_of_known_errors():
         assert squared[own].mean(0) == pytest.approx([1, 1], abs=0.05)
     confidence = 1 / (1 + np.exp(-features[:, 2] @ np.array(fit.logit)))
     assert metrics.calibration_error(confidence, correct) < 0.05
+
+
+def test_what_labels_err_themselves_is_not_the_detectors():
+    """Half of the labels are clicks with three times the detector's error: its own variance and confidence are found."""
+    rng = np.random.default_rng(1)
+    features = np.concatenate([np.ones((8000, 3, 1)), np.zeros((8000, 3, FEATURES - 1))], axis=2)
+    label_sd, landmark = np.repeat([0.0, 1.5], 4000), rng.integers(3, size=8000)
+    own = rng.normal(0, 0.5, (8000, 2))
+    errors = own + rng.normal(0, 1, (8000, 2)) * label_sd[:, None]
+    fit = Seen(features, errors, np.full(8000, 1.0), landmark, np.zeros((8000, 2)), np.ones(8000, bool), label_sd).fit(1e9)
+    assert np.exp(fit.coefficients[:, :, 0]) == pytest.approx(np.full((3, 2), 0.25), rel=0.1)
+    correct = (np.linalg.norm(own, axis=1) < 1).mean()
+    assert 1 / (1 + np.exp(-fit.logit[0])) == pytest.approx(correct, abs=0.05)
+
+
+def test_few_landmarks_change_a_prior_little():
+    """Of errors twice as large as the prior says, thirty tell less than three thousand."""
+    prior, rng = ErrorModel(((0.0,) * (FEATURES + 2),) * 2, (1.0,) + (0.0,) * (FEATURES - 1)), np.random.default_rng(2)
+    features = np.concatenate([np.ones((3000, 3, 1)), np.zeros((3000, 3, FEATURES - 1))], axis=2)
+    errors, exact = 2 * rng.normal(size=(3000, 2)), np.zeros(3000)
+    seen = Seen(features, errors, exact + 2, rng.integers(3, size=3000), np.zeros((3000, 2)), exact == 0, exact)
+    few = Seen(*(getattr(seen, field)[:30] for field in Seen.__dataclass_fields__))
+    little, much = (np.exp(part.fit(1e9, prior).coefficients[:, :, 0]) for part in (few, seen))
+    assert (1 < little).all() and (little < 0.7 * much).all() and much == pytest.approx(np.full((3, 2), 4), rel=0.1)
 
 
 def test_closeups_that_know_nothing_do_no_harm(small, monkeypatch):
@@ -88,7 +113,7 @@ def test_as_much_of_a_correction_is_believed_as_helps():
     truth = gain[landmark] * moved - bias[landmark] + rng.laplace(0, 0.05, (3000, 2))  # from where it was expected
     errors = moved - truth
     errors[:20], errors[20:40] = 50.0, np.nan
-    seen = Seen(np.ones((3000, 3, FEATURES)), errors, np.ones(3000), landmark, moved, np.ones(3000, bool))
+    seen = Seen(np.ones((3000, 3, FEATURES)), errors, np.ones(3000), landmark, moved, np.ones(3000, bool), np.zeros(3000))
     found, off = seen.gain(20.0, np.linspace(0, 1, 51))
     np.testing.assert_allclose(found, gain, atol=0.021)
     np.testing.assert_allclose(off, bias, atol=0.02)
@@ -97,5 +122,7 @@ def test_as_much_of_a_correction_is_believed_as_helps():
 
 
 def test_too_few_landmarks_are_named(small):
+    few = small[1][:2]
     with pytest.raises(ValueError, match="to calibrate on"):
-        fit_error_models(small[0], small[1][:2])
+        fit_error_models(replace(small[0], error_models={}), few)
+    assert fit_error_models(small[0], few, anew=False).error_models == small[0].error_models  # they change nothing

@@ -23,6 +23,6 @@ def test_shards_hold_what_the_stages_see(tmp_path, toy_shards):
     tools = WindowSource.load_tools(tmp_path)
     assert len(tools) == 2
     assert len(Samples.drawn(windows)) == 6
-    _, image, u, _ = next(iter(validation_images(tmp_path, "validation")))
+    _, image, u, *_ = next(iter(validation_images(tmp_path, "validation")))
     assert image.shape == (540, 960, 3)
     assert np.allclose(u, images[0].u)
