@@ -190,7 +190,7 @@ class _Work:
                     refused = error
         if not teachers:
             raise RefusalError(str(refused)) from refused
-        teacher = min(teachers, key=lambda one: one.doubt_px(learn))
+        teacher = min(teachers, key=lambda one: np.nanmedian(np.trace(one.project(learn)[1], axis1=-2, axis2=-1)))
         self.report["start_share"] = teacher.right
         u, guided = teacher.labels(learn)[0], None
         for k in range(_GUIDED if self.learns and start.closeup_network else 0):  # untaught, near where the robot says
@@ -241,6 +241,8 @@ class _Work:
         if len(held_out) < _DOUBT_IMAGES:  # the errors of frames that were trained on say nothing of others
             doubt_on = parts["learn"][3::4]
             held_out += self.images(doubt_on, teacher, seen)
+        # The robot's labels err alike in all frames, and the networks learn that error: it is no noise of held-out labels.
+        held_out = [one._replace(sd_px=0.0) for one in held_out]
         images = self.images(np.setdiff1d(parts["learn"], doubt_on), teacher, seen)
         if len(images) < 8 or len(held_out) < 4:
             raise RefusalError(f"robot: it labels {len(images)} images to learn from and {len(held_out)} others; 8 and 4 do.")

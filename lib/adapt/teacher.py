@@ -199,10 +199,6 @@ class Teacher:
             covariance[:, side] = S.reshape(len(frames), 3, 2, 2)
         return u, np.where(np.isfinite(u)[..., None], covariance, np.nan)
 
-    def doubt_px(self, frames: np.ndarray) -> float:
-        """Median standard deviation of the landmarks in some frames."""
-        return float(np.sqrt(np.nanmedian(np.trace(self.project(frames)[1], axis1=-2, axis2=-1)) / 2))
-
     def labels(self, frames: np.ndarray, seen: Seen | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """u, covariance (as `project`) and visibility (m, 2, 3) of some frames; NaN where the robot is silent or refused.
 

@@ -47,7 +47,7 @@ TRACKED_FROM = 0.5
 CLOSE = ("closeup", "closer", "tracking")
 #: Where a window's peaks are lower than this (geometric mean), the first stage's peaks at these scales make candidates.
 _SHOWN, _SCALES = 0.75, (0.75, 1.0, 1.5, 2.2)
-_SURE = 0.5  # of the first stage; below it, or after a comparison, the height of the tool's peaks times this takes its place
+_SURE = 0.5  # a confidence of the first stage below this, or after a search, becomes this times the height of the peaks
 #: So many candidates are looked at once, and so many of them twice; none where all peaks are lower than the third number.
 _CANDIDATES, _AGAIN, _NOTHING = 24, 6, 0.01
 #: A tracked landmark that moved farther than this, in closeups of scale 1, gets a second closeup.  After a shorter way one
@@ -265,23 +265,21 @@ class Detector:
     def track(self, images: ArrayLike, previous: Landmarks, *, min_confidence: float = TRACKED_FROM) -> Landmarks:
         """Landmarks of images (n, h, w, 3) that follow those of `previous`, such as the next left and right image.
 
-        Only closeups (or windows) are looked at.  An image with a landmark below `min_confidence` is searched as a whole.
+        Only closeups are looked at.  An image with a landmark below `min_confidence` is searched as a whole.
         """
         images = as_uint8(images)
         if len(previous) != len(images):
             raise ValueError(f"previous: holds {len(previous)} images, but images {len(images)}.")
-        if self.window_network is None and self.closeup_network is None:
+        if self.closeup_network is None:
             return self(images)
         usable = np.flatnonzero((previous.confidence >= min_confidence).all(1) & np.isfinite(previous.u).all((1, 2)))
         result = Landmarks.none(len(images))
         if usable.size:
             with self._threads():
-                part = images if usable.size == len(images) else images[usable]  # a pair of frames takes 12 MB
-                near = previous[usable]
-                stage = "window" if self.closeup_network is None else "tracking"
-                found = self.refine(part, near, stage)
-                if stage == "tracking" and _moved_px(near.u, found.u) > _SECOND_LOOK_PX:
-                    found = self.refine(part, found, stage)
+                part, near = images if usable.size == len(images) else images[usable], previous[usable]  # a pair takes 12 MB
+                found = self.refine(part, near, "tracking")
+                if _moved_px(near.u, found.u) > _SECOND_LOOK_PX:
+                    found = self.refine(part, found, "tracking")
                 result._put(usable, found)
         lost = np.flatnonzero((result.confidence < min_confidence).any(1))
         if lost.size:
@@ -305,8 +303,8 @@ class Detector:
         """What later stages start from: `rough`, or, where its window does not show it well, the tool whose window does best.
 
         Candidates are `rough` and tools made of the highest peaks that the first stage sees at several scales.  All are
-        looked at once, the best ones again.  The highest peaks win.  However sure the first stage is, the second one is
-        asked, since it has learnt what is no tool.  `seen` is what `stage_peaks` gave for `rough`, if that is known.
+        looked at once, the best ones again; the highest peaks win.  The second stage decides, however sure the first one is:
+        it has learnt what is no tool.  `seen` is what `stage_peaks` gave for `rough`, if that is known.
         """
         if self.tool_network is None:
             return rough
@@ -358,7 +356,7 @@ class Detector:
         peaks, matrices, which = seen or self.stage_peaks(images, rough.u, stage)
         result = Landmarks(rough.u.copy(), rough.covariance.copy(), rough.confidence.copy())
         if not len(which):
-            return result
+            return result if stage == "tool" else result.without_unsure()
         fine = self._measured(peaks, self.rough_in_windows(rough, matrices, which, stage), stage, which[:, 1:])
         u, back = _through_inverse(matrices, fine.u[:, 0]), np.linalg.inv(matrices[:, :, :2])
         covariance = back @ fine.covariance[:, 0] @ back.mT
@@ -367,8 +365,10 @@ class Detector:
             near = peaks.value[:, 0].numpy() > 0
             confidence = np.where(near, confidence, 0.0)
         if stage in ("closeup", "closer"):
-            # The stage before decides whether the landmark is there; one that either is unsure of stays where it was seen.
-            near &= (rough.confidence[which[:, 0], which[:, 1]] >= self.closeup_from) & (confidence >= MISSING_BELOW)
+            # The stage before decides whether the landmark is there; if either is unsure, it stays where it was seen.
+            near &= rough.confidence[which[:, 0], which[:, 1]] >= self.closeup_from
+            result.confidence[tuple(which[near & (confidence < MISSING_BELOW)].T)] = MISSING_BELOW
+            near &= confidence >= MISSING_BELOW
             u, covariance, confidence, which = u[near], covariance[near], confidence[near], which[near]
         i, k = which.T
         result.u[i, k], result.covariance[i, k], result.confidence[i, k] = u, covariance, confidence

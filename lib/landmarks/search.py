@@ -1,4 +1,4 @@
-"""Where else the tool may lie, if the first stage is unsure: its highest peaks, at several scales, put together to tools."""
+"""Where else the tool may lie: the first stage's highest peaks, at several scales, put together to tools."""
 
 from itertools import product
 

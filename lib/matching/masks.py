@@ -27,9 +27,7 @@ def glint_mask(image: ArrayLike, *, level: int = 245, grow_px: int = 5) -> np.nd
     return core.astype(bool)
 
 
-def tool_mask(
-    shape: tuple[int, int], u_landmarks: ArrayLike, *, width_px: float | None = None, shaft_px: float | None = None
-) -> np.ndarray:
+def tool_mask(shape: tuple[int, int], u_landmarks: ArrayLike, *, width_px: float | None = None) -> np.ndarray:
     """The forceps, from its three landmarks: both jaws, and the shaft continued beyond the base.
 
     Args:
@@ -37,7 +35,6 @@ def tool_mask(
         u_landmarks: (3, 2) px: base, tip_1, tip_2; NaN = missing.  A jaw without its tip is left out; without the base,
             or with both tips missing, the mask is empty.
         width_px: Full width of jaws and shaft, with margin; None is 0.45 of the mean jaw length.
-        shaft_px: How far the shaft reaches behind the base, away from the tips; None is beyond the image.
     """
     u = np.asarray(u_landmarks, dtype=np.float64)
     if u.shape != (3, 2):
@@ -48,8 +45,7 @@ def tool_mask(
         return mask.astype(bool)
     thickness = max(1, round(0.45 * np.linalg.norm(tips - base, axis=1).mean() if width_px is None else width_px))
     backwards = base - tips.mean(axis=0)
-    reach = np.hypot(*shape[:2]) + np.abs(base).max() if shaft_px is None else shaft_px
-    back = base + backwards / max(np.linalg.norm(backwards), 1e-300) * reach
+    back = base + backwards / max(np.linalg.norm(backwards), 1e-300) * (np.hypot(*shape[:2]) + np.abs(base).max())
     shift = 4  # fractional bits of OpenCV's line drawing
     limit = 2 ** (30 - shift) / 8
     for end in (*tips, back):

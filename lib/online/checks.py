@@ -14,11 +14,6 @@ _MOVED_PX = 5.0  # landmarks that all moved farther than this moved
 _FAR_MM = 300.0  # from where the robot was: beyond any tool's reach
 
 
-def _dark_or_flat(thumb: np.ndarray) -> bool:
-    mean, sd = cv2.meanStdDev(thumb)
-    return bool(mean.mean() < _DARK or sd.max() < _FLAT)
-
-
 class FrameChecks:
     """Compares each frame with the ones before it."""
 
@@ -35,7 +30,8 @@ class FrameChecks:
             shapes = " and ".join(str(image.shape) for image in pair)
             raise ValueError(f"left, right: expected two (h, w, 3) uint8 images, got {shapes}.")
         thumbs = tuple(np.ascontiguousarray(image[::_STEP, ::_STEP]) for image in pair)
-        names = [name for name, thumb in zip(("left", "right"), thumbs, strict=True) if _dark_or_flat(thumb)]
+        looks = zip(("left", "right"), map(cv2.meanStdDev, thumbs), strict=True)
+        names = [name for name, (mean, sd) in looks if mean.mean() < _DARK or sd.max() < _FLAT]
         self._same = [len(self._thumbs) == 2 and np.array_equal(a, b) for a, b in zip(thumbs, self._thumbs, strict=False)]
         self._same, self._thumbs = self._same or [False, False], thumbs
         late, self._time = time_s <= self._time, max(time_s, self._time)

@@ -195,7 +195,8 @@ class Annotator:
                 frame = frame if changed is None else changed
             if todo in ("hello", "next", "show"):
                 pair = self.recording.frames[frame]
-                images = [_jpeg(image) for image in (pair.left, pair.right)]
+                how = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
+                images = [cv2.imencode(".jpg", one[..., ::-1], how)[1].tobytes() for one in (pair.left, pair.right)]
             answer |= self._state(frame)
         except (ValueError, OSError) as error:
             answer["error"] = str(error)
@@ -224,7 +225,3 @@ class Annotator:
 def _plain(values: np.ndarray) -> list:
     """Nested lists with None for NaN."""
     return np.where(np.isfinite(values), values.astype(object), None).tolist()
-
-
-def _jpeg(image: np.ndarray) -> bytes:
-    return cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes()

@@ -36,11 +36,6 @@ class Registration:
     cost: float
 
     @property
-    def rotation_sd_rad(self) -> np.ndarray:
-        """Standard deviation (3,) of the rotation about the target's x, y, z axes."""
-        return np.sqrt(np.diag(self.covariance)[:3])
-
-    @property
     def translation_sd_mm(self) -> np.ndarray:
         """Standard deviation (3,) of a registered point at `centre_mm`."""
         return np.sqrt(np.diag(self.covariance)[3:])

@@ -75,11 +75,6 @@ class Lighting:
     haze: tuple[float, float, float] = (0.0, 0.0, 0.0)
     tint_per_mm: tuple[tuple[float, float], ...] | None = None
 
-    @property
-    def is_sharp(self) -> bool:
-        """Whether borders of light or shadow are too narrow for a coarse grid of pixels."""
-        return self.spot_edge is not None or self.shadow_sigma_mm < 0.1
-
     def spot(self, x: np.ndarray, y: np.ndarray, middle_mm: tuple[float, float], radius_mm: float) -> np.ndarray:
         """Light 0 to 1 at (x, y) mm of a scene, for a spot of this middle and radius."""
         x, y = x - middle_mm[0], y - middle_mm[1]

@@ -83,7 +83,7 @@ def render_view(
     lambert = (1 - light_x * slope_x - light_y * slope_y) / np.sqrt(1 + slope_x**2 + slope_y**2)
     light = microscope.brightness * 1.45 * np.clip(lambert, 0.05, None)
     lighting, at, onward = microscope.lighting, (x, y, z), grid.full
-    if lighting.is_sharp:  # lit discs and shadows with hard borders need every pixel
+    if lighting.spot_edge is not None or lighting.shadow_sigma_mm < 0.1:  # hard borders need every pixel
         light, *at = (grid.full(values) for values in (light, x, y, z))
         onward = np.asarray
     light = light * lighting.spot(at[0], at[1], microscope.spot_mm, microscope.spot_radius_mm)

@@ -205,10 +205,6 @@ def _cells(rng: Rng, n: int) -> tuple[np.ndarray, np.ndarray]:
     return distance / distance.std(), label
 
 
-def _skin(rng: Rng) -> np.ndarray:
-    return _noise(rng, 60, 4, 0.7) + _noise(rng, 5) - rng.uniform(0.3, 1) * _cells(rng, int(rng.integers(300, 3000)))[0]
-
-
 def _brushed(rng: Rng) -> np.ndarray:
     marks = rng.standard_normal((_SIDE_PX, _SIDE_PX), dtype=np.float32)
     marks = cv2.GaussianBlur(marks, (0, 0), sigmaX=rng.uniform(20, 90), sigmaY=rng.uniform(0.6, 2.0))
@@ -244,6 +240,7 @@ _KINDS = {
     "grainy": lambda rng: _noise(rng, int(rng.integers(20, 200)), 4, rng.uniform(0.5, 0.95)) + 0.7 * _noise(rng, 4),
     "fibres": lambda rng: _lines(rng, int(rng.integers(60, 400)), (1, 6), 0.08, rng.uniform(0.1, 2)) + 0.1 * _noise(rng, 6),
     "paper": lambda rng: 0.3 * _lines(rng, 250, (1, 2), 0.15, 3.0) + 0.1 * (_noise(rng, 300, 2, 0.9) + _noise(rng, 6, 2)),
-    "membranes": _membranes, "blood": _blood, "vessels": _vessels, "skin": _skin, "brushed": _brushed, "dots": _dots,
-    "stones": _stones, "gauze": _gauze,
+    "membranes": _membranes, "blood": _blood, "vessels": _vessels, "skin": lambda rng: (
+        _noise(rng, 60, 4, 0.7) + _noise(rng, 5) - rng.uniform(0.3, 1) * _cells(rng, int(rng.integers(300, 3000)))[0]
+    ), "brushed": _brushed, "dots": _dots, "stones": _stones, "gauze": _gauze,
 }  # fmt: skip

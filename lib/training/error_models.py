@@ -7,7 +7,7 @@ from typing import Self
 
 import numpy as np
 from scipy.optimize import minimize
-from scipy.special import chdtri, expit
+from scipy.special import chdtri, chndtr, expit
 from tqdm.auto import tqdm
 
 from lib.geometry import cell_from_image
@@ -21,8 +21,7 @@ __all__ = ["TRACKED_SHIFT_PX", "Seen", "fit_error_models", "seen_by"]
 
 #: What a tool of 2 mm/s moves between two frames at 25 Hz, and the tool's length at that scale.
 TRACKED_SHIFT_PX, _LENGTH_PX = 8.0, 300.0
-#: Where the doubt is not fitted anew: at so many landmarks it costs a mean loss of 1 to change a coefficient by 1.  Chosen
-#: by the doubt's truth on held-out scenes after a fit on 20 others.
+#: Weight of a prior, in landmarks.  Chosen by how true the doubt is on held-out scenes after a fit on 20 others.
 _PRIOR = 20.0
 _INSIDE = chdtri(2, 0.05)  # squared length below which 95 % of a standard normal plane lie
 #: Larger errors, in pixels of a stage's input, are no part of what a covariance describes.
@@ -70,6 +69,7 @@ class Seen:
                 return prior
             raise ValueError(f"images: only {use.sum()} landmarks to calibrate on; give at least 20.")
         features, squared, of_label = self.features[use], self.errors[use] ** 2, self.label_sd[use] ** 2
+        of_label = of_label * min(1.0, 0.9 * squared.mean() / max(of_label.mean(), 1e-12))  # labels better than was said
         tip = self.landmark[use, None] > 0
 
         def variance(axis: int) -> np.ndarray:
@@ -85,19 +85,29 @@ class Seen:
 
             return _coefficients(deviance, x, start, prior is not None)[[0, 1, 1, *range(2, FEATURES + 1)]]
 
-        correct = (size <= np.hypot(self.tolerance, np.sqrt(_INSIDE) * self.label_sd))[self.known]
+        log_variance = np.array([variance(0), variance(1)])
+        rows = ErrorModel(log_variance).coefficients[self.landmark]
+        own = np.exp((rows * self.features[:, :2]).sum(-1))
+        correct = self._correct(own)[self.known]
         start, of_correct = np.array((prior or ErrorModel()).logit), self.features[self.known, 2]
         logit = _coefficients(
             lambda z: (np.logaddexp(0, z) - correct * z, expit(z) - correct), of_correct, start, prior is not None
         )
-        log_variance = np.array([variance(0), variance(1)])
-        rows = ErrorModel(log_variance).coefficients[self.landmark[use]]
-        normalised = (squared / (np.exp((rows * features[:, :2]).sum(-1)) + of_label[:, None])).sum(1)
-        for own, columns in ((~tip[:, 0], np.s_[:1]), (tip[:, 0], np.s_[1:3])):
-            if own.any():
-                share = 0.5 if prior is None else 0.5 * own.sum() / (own.sum() + _PRIOR)
-                log_variance[:, columns] += share * np.log(np.quantile(normalised[own], 0.95) / _INSIDE)
+        total = own[use] + of_label[:, None]
+        normalised, of_own = (squared / total).sum(1), own[use] / total
+        for group, columns in ((~tip[:, 0], np.s_[:1]), (tip[:, 0], np.s_[1:3])):
+            if group.any():
+                share = 0.5 * of_own[group].mean() * group.sum() / (group.sum() + (_PRIOR if prior is not None else 0))
+                log_variance[:, columns] += share * np.log(np.quantile(normalised[group], 0.95) / _INSIDE)
         return ErrorModel(log_variance, logit)
+
+    def _correct(self, own: np.ndarray) -> np.ndarray:
+        """(m,) probability that a landmark of variances `own` (m, 2) is correct, given where a label that errs is."""
+        of_label = np.maximum(self.label_sd[:, None] ** 2, 1e-9)
+        mean, variance = self.errors * own / (own + of_label), (own * of_label / (own + of_label)).mean(axis=1)
+        inside = chndtr(self.tolerance**2 / variance, 2, np.minimum((mean**2).sum(axis=1) / variance, 1e4))
+        exact = np.linalg.norm(self.errors, axis=1) <= self.tolerance
+        return np.where(self.label_sd > 0, np.nan_to_num(inside), exact)
 
     def gain(self, gross_px: float, gains: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
         """Gain (one of `gains`) and bias (3, 2) of base and tips along each axis that leave the smallest absolute errors."""
@@ -115,9 +125,12 @@ class Seen:
 
 
 def _coefficients(loss: Callable[[np.ndarray], tuple], x: np.ndarray, start: np.ndarray, is_prior: bool) -> np.ndarray:
-    """Those that minimise the mean of a loss of ``x @ beta``, given with its slope; near `start`, or with small slopes."""
-    slopes, centre = np.arange(len(start)) > len(start) - FEATURES, np.asarray(start) if is_prior else np.zeros(len(start))
-    ridge = np.full(len(start), _PRIOR / max(len(x), 1)) if is_prior else 1e-2 * slopes
+    """Those that minimise the mean of a loss of ``x @ beta``, given with its slope.
+
+    They are kept near `start` if that is a prior; else the slopes alone are kept small.
+    """
+    slopes, centre = np.arange(len(start)) > len(start) - FEATURES, np.where(is_prior, start, 0.0)
+    ridge = np.full(len(start), _PRIOR / len(x)) if is_prior else 1e-2 * slopes
 
     def penalised(beta: np.ndarray) -> tuple[float, np.ndarray]:
         value, slope = loss(x @ beta)
@@ -170,8 +183,10 @@ def _fitted(stage: str, parts: Sequence[Seen], prior: ErrorModel | None) -> Erro
     seen, gross_px = Seen.joined(parts), _GROSS_PX.get(stage, CLOSEUP_REACH_PX * min(CLOSEUP_ZOOM))
     if stage not in CLOSE:
         return seen.fit(gross_px, prior)
-    # While tracking, the place where a landmark is expected is an old one, which is evidence of nothing.
-    gain, bias = seen.gain(gross_px, [1.0] if stage == "tracking" else np.linspace(0, 1, 51))
+    # Many exact labels told a prior's gain and bias, and few labels have a constant error of their own.  While tracking, the
+    # place where a landmark is expected is an old one, which is evidence of nothing.
+    of_images = seen.gain(gross_px, [1.0] if stage == "tracking" else np.linspace(0, 1, 51))
+    gain, bias = of_images if prior is None else map(np.array, (prior.gain, prior.bias))
     seen = replace(seen, errors=seen.errors + (gain[seen.landmark] - 1) * seen.moved - bias[seen.landmark])
     return replace(seen.fit(gross_px, prior), gain=gain, bias=bias)
 

@@ -66,15 +66,13 @@ def make_shard(path: Path, kind: str, index: int) -> None:
     sizes = HELD_OUT_SIZES if kind == "held_out" else ((SCENE_PX, round(SCENE_PX * 9 / 16)),)
     textures = VALIDATION_TEXTURE_SEEDS if kind == "held_out" else TEXTURE_SEEDS
     populations = rng.choice(list(shares), n, p=list(shares.values()))
-    drawn = (_scene(rng, sizes[rng.integers(len(sizes))], str(population), textures) for population in populations)
+    drawn = (
+        LabelledImage(name, *sample(rng, size_px=sizes[rng.integers(len(sizes))], population=name, textures=textures))
+        for name in populations.tolist()
+    )
     ends, jpegs, u, visibility = packed(drawn)
     with whole(path) as partial:
         np.savez(partial, jpegs=jpegs, jpeg_ends=ends, u=u, visibility=visibility)
-
-
-def _scene(rng: np.random.Generator, size_px: tuple[int, int], population: str, textures: Sequence[int]) -> LabelledImage:
-    image, u, visibility = sample(rng, size_px=size_px, population=population, textures=textures)
-    return LabelledImage(population, image, u, visibility)
 
 
 def _write_closeups(path: Path, rng: np.random.Generator) -> None:

@@ -148,9 +148,7 @@ def finetune(
     tuned = fit_error_models(tuned, [*held_out, *doubt_on], anew=False, progress=progress is True)
     if detector.closeup_network is None:
         return tuned
-    # Gain and bias of closeups stay: many exact labels told them, and few labels have a constant error of their own.
     old = {stage: detector.error_models[stage] for stage in CLOSE if stage in detector.error_models}
-    tuned = tuned.with_error_models(**{k: replace(tuned.error_models[k], gain=v.gain, bias=v.bias) for k, v in old.items()})
     # Held-out images say whether the closeups gained by a short training, and whether unsure landmarks gain by closeups.
     ways = [tuned, replace(tuned, closeup_network=detector.closeup_network, error_models=tuned.error_models | old)]
     ways += [replace(one, closeup_from=detector.closeup_from) for one in ways]

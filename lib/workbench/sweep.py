@@ -107,7 +107,8 @@ def sweep(
     folder.mkdir(parents=True, exist_ok=True)
     words = ["sweep", name, *itertools.chain(*(("-p", key, ",".join(values)) for key, values in grid.items()))]
     provenance = Provenance(shlex.join(["python3", "-m", "lib", *words]))
-    of_file = {folder / f"{_label_digest(point)}.ipynb": point for point in points}
+    digests = (hashlib.sha256(json.dumps(one, sort_keys=True, default=str).encode()).hexdigest()[:12] for one in points)
+    of_file = {folder / f"{digest}.ipynb": point for digest, point in zip(digests, points, strict=True)}
     jobs = {executed: (book, profile | point, cell_timeout_s) for executed, point in of_file.items()}
     rows = {executed: _row(executed, point) for executed, point in of_file.items() if executed.exists()}
     failures: dict[str, str] = {}
@@ -223,10 +224,6 @@ def _code_digest(book: Path) -> str:
     """Names what decides the rows: the notebook, its neighbours' helpers, lib and the weights that ship."""
     code = [*book.parent.glob("*.py"), *(paths.ROOT / "lib").rglob("*.py"), *paths.MODELS.glob("*.safetensors")]
     return files.digest(book, *sorted(code), length=8)
-
-
-def _label_digest(point: dict) -> str:
-    return hashlib.sha256(json.dumps(point, sort_keys=True, default=str).encode()).hexdigest()[:12]
 
 
 def _label(point: dict) -> str:

@@ -104,7 +104,8 @@ class ReducedDetector:
         parts = []
         for i, labelled in enumerate(images):
             small, at, stride = self.reduced(labelled.image[None], rough.u[i : i + 1])
-            true = labelled._replace(image=small[0], u=cell_from_image(labelled.u, stride))
+            sd_px = np.asarray(labelled.sd_px) / stride.mean()
+            true = labelled._replace(image=small[0], u=cell_from_image(labelled.u, stride), sd_px=sd_px)
             parts.append(seen_by(self.last, "window", true, replace(rough[i : i + 1], u=at)))
         seen = Seen.joined([part for part in parts if len(part.landmark)])
         return replace(self, errors=seen.fit(GROSS_PX * window_side_px(self.size_px) / FIELD_PX))

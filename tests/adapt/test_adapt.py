@@ -237,6 +237,8 @@ def test_five_labelled_pairs_are_a_start(world, recording, tmp_path, monkeypatch
     lost = StandIn(world.u, wrong=0.97)
     found = adapt(recording, lost, labels=tmp_path / "labels.json", folder=tmp_path, progress=False, tune=tune)
     assert found.improved and np.nanmedian(np.linalg.norm(tune.calls[-1]["off"], axis=-1)) < 1.5
+    images, held_out = tune.calls[-1]["images"], tune.calls[-1]["held_out"]  # what all labels err alike is no noise of theirs
+    assert all((one.sd_px > 0).all() for one in images) and all(one.sd_px == 0 for one in held_out)
 
 
 def test_labels_teach_a_tool_that_no_closeup_knows(world, recording, tmp_path, monkeypatch):

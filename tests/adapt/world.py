@@ -113,7 +113,7 @@ def pupil(world: World):
         number = {"left": 0, "right": 1}
         where = [(int(one.name.split()[1]), number[one.name.split()[0]]) for one in images]
         off = np.stack([one.u - world.u[i, side] for one, (i, side) in zip(images, where, strict=True)])
-        calls.append({"images": images, "off": off, **how})
+        calls.append({"images": images, "off": off, "held_out": held_out, **how})
         return StandIn(world.u + np.nanmean(off, axis=0), noise_px=0.2)
 
     tune.calls = calls

@@ -6,6 +6,7 @@ import torch
 
 from lib.geometry import image_from_cell
 from lib.landmarks import Detector, Landmarks
+from lib.landmarks.detector import MISSING_BELOW
 from lib.landmarks.error_model import ErrorModel, Rough, features_of
 from lib.landmarks.heatmaps import Peaks
 from lib.landmarks.metrics import tool_length_px
@@ -224,6 +225,9 @@ def test_a_closeup_moves_what_the_stage_before_found(images):
         np.testing.assert_allclose(after.u[i, k] - before.u[i, k], moved, atol=1e-3)
         spread = turn @ np.diag([2 * np.exp(-2.0), 2 * np.exp(1.0)]) @ turn.T / zoom**2  # of Laplace distributions
         np.testing.assert_allclose(after.covariance[i, k], spread, rtol=1e-3)
+    unsure = detector.with_error_models(closeup=replace(ErrorModel(), logit=(-5.0,))).refine(images, before, "closeup")
+    np.testing.assert_array_equal(unsure.u, before.u)  # it says that nothing is there, so the landmark stays, and is doubted
+    assert (unsure.confidence == MISSING_BELOW).all()
     with torch.no_grad():
         closeup.head[-1].bias[0] = 40 * 8 / size  # further than a closeup is believed
     np.testing.assert_array_equal(replace(detector, closeup_network=closeup).refine(images, before, "closeup").u, before.u)

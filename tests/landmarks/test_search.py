@@ -1,4 +1,4 @@
-"""The search for the tool where the first stage is unsure."""
+"""The search for the tool where its window does not show it well."""
 
 import numpy as np
 import torch

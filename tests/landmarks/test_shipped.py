@@ -1,6 +1,7 @@
 """The weights that ship, on the recording that ships."""
 
 import json
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -47,7 +48,17 @@ def test_tracking_agrees_with_whole_frames(shipped):
     assert np.median(np.linalg.norm(tracked.u - whole.u, axis=2)[both]) < 0.5
 
 
-def test_an_empty_field_has_no_landmarks(shipped):
+def test_an_empty_field_has_no_landmarks_and_disturbs_no_other(shipped):
     ground = np.random.default_rng(0).integers(90, 140, (27, 48, 3), dtype=np.uint8)
-    found = shipped.torch(cv2.resize(ground, (1920, 1080))[None])
-    assert (found.confidence < 0.5).all()
+    both = np.stack([shipped.images[0], cv2.resize(ground, shipped.images.shape[2:0:-1])])
+    found = shipped.torch(both)
+    assert (found.confidence[1] < 0.5).all()
+    np.testing.assert_allclose(found.u[0], shipped.by_torch.u[0], atol=1e-3)  # one was searched, and the other was not
+    assert shipped.torch.searched(both, shipped.torch.coarse(both)).confidence[1].max() < 0.4
+
+
+def test_without_a_second_stage_nothing_is_searched(shipped):
+    alone, rough = replace(shipped.torch, tool_network=None, closeup_network=None), Landmarks.none(1)
+    assert alone.searched(shipped.images[:1], rough) is rough
+    lost = shipped.torch.searched(np.zeros((1, 90, 160, 3), np.uint8), rough)
+    assert np.isnan(lost.u).all() and (lost.confidence < 0.1).all()

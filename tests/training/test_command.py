@@ -18,6 +18,7 @@ from lib.landmarks.network import HourglassConfig, OffsetConfig, OffsetNetwork, 
 from lib.training import command, stages
 from lib.training.command import main_evaluate
 from lib.training.loop import load_training
+from lib.training.scenes import FrameSource
 from tests.toys import toy_images
 
 
@@ -68,6 +69,9 @@ def test_stages_are_fine_tuned_on_labelled_frames(tmp_path, monkeypatch):
     monkeypatch.setattr(stages, "fit_error_models", lambda d, held_out, anew, progress: fitted_on.append(held_out) or d)
     options = {"steps": 1, "progress": lambda stage, part: done.append((stage, part))}
     images[:6] = [one._replace(sd_px=np.array([0.0, 1.0, 3e4])) for one in images[:6]]  # the second tip is not believed
+    weights, of = [], FrameSource.of
+    noted = lambda found, **how: weights.append(how.get("weight")) or of(found, **how)  # noqa: E731
+    monkeypatch.setattr(FrameSource, "of", noted)
     tuned = stages.finetune(detector, images[:6], images[6:], tmp_path, **options)
     assert sorted(done) == [("closeup", 1.0), ("frame", 1.0), ("tool", 1.0)]  # side by side
     for stage, network in tuned.networks.items():
@@ -79,6 +83,7 @@ def test_stages_are_fine_tuned_on_labelled_frames(tmp_path, monkeypatch):
     for a, b in zip(again.tool_network.parameters(), tuned.tool_network.parameters(), strict=True):
         assert torch.equal(a, b)
     assert [len(held_out) for held_out in fitted_on] == [2, 2]
+    assert (weights[0][:, 0] == 1).all() and (weights[0][:, 2] < 1e-3).all()
     auc = lambda d, _: SimpleNamespace(  # noqa: E731
         scores=SimpleNamespace(auc=50.0, pck_0_01=float(d.closeup_network is closeup))
     )

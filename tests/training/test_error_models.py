@@ -61,24 +61,28 @@ def test_fitted_variance_of_known_errors():
 
 
 def test_what_labels_err_themselves_is_not_the_detectors():
-    """Half of the labels are clicks with three times the detector's error: its own variance and confidence are found."""
+    """Clicks with three times the detector's error, or as large: its own variance and confidence are found."""
     rng = np.random.default_rng(1)
     features = np.concatenate([np.ones((8000, 3, 1)), np.zeros((8000, 3, FEATURES - 1))], axis=2)
-    label_sd, landmark = np.repeat([0.0, 1.5], 4000), rng.integers(3, size=8000)
-    own = rng.normal(0, 0.5, (8000, 2))
-    errors = own + rng.normal(0, 1, (8000, 2)) * label_sd[:, None]
-    fit = Seen(features, errors, np.full(8000, 1.0), landmark, np.zeros((8000, 2)), np.ones(8000, bool), label_sd).fit(1e9)
-    assert np.exp(fit.coefficients[:, :, 0]) == pytest.approx(np.full((3, 2), 0.25), rel=0.1)
-    correct = (np.linalg.norm(own, axis=1) < 1).mean()
-    assert 1 / (1 + np.exp(-fit.logit[0])) == pytest.approx(correct, abs=0.05)
+    landmark, moved, known = rng.integers(3, size=8000), np.zeros((8000, 2)), np.ones(8000, bool)
+    for own_sd, click_sd, exact in ((0.5, 1.5, 4000), (1.5, 1.5, 0)):  # and how many labels are exact
+        label_sd = np.where(np.arange(8000) < exact, 0.0, click_sd)
+        own = rng.normal(0, own_sd, (8000, 2))
+        errors = own + rng.normal(0, 1, (8000, 2)) * label_sd[:, None]
+        fit = Seen(features, errors, np.ones(8000), landmark, moved, known, label_sd).fit(1e9)
+        assert np.exp(fit.coefficients[:, :, 0]) == pytest.approx(np.full((3, 2), own_sd**2), rel=0.15)
+        correct = (np.linalg.norm(own, axis=1) < 1).mean()
+        assert 1 / (1 + np.exp(-fit.logit[0])) == pytest.approx(correct, abs=0.02)
+    better = Seen(features, own / 5, np.ones(8000), landmark, moved, known, np.full(8000, 1.5)).fit(1e9)
+    assert (np.exp(better.coefficients[:, :, 0]) > 0.05 * 0.3**2).all()  # labels five times better than was said
 
 
 def test_few_landmarks_change_a_prior_little():
     """Of errors twice as large as the prior says, thirty tell less than three thousand."""
     prior, rng = ErrorModel(((0.0,) * (FEATURES + 2),) * 2, (1.0,) + (0.0,) * (FEATURES - 1)), np.random.default_rng(2)
     features = np.concatenate([np.ones((3000, 3, 1)), np.zeros((3000, 3, FEATURES - 1))], axis=2)
-    errors, exact = 2 * rng.normal(size=(3000, 2)), np.zeros(3000)
-    seen = Seen(features, errors, exact + 2, rng.integers(3, size=3000), np.zeros((3000, 2)), exact == 0, exact)
+    errors, landmark, moved = 2 * rng.normal(size=(3000, 2)), rng.integers(3, size=3000), np.zeros((3000, 2))
+    seen = Seen(features, errors, np.full(3000, 2.0), landmark, moved, np.ones(3000, bool), np.zeros(3000))
     few = Seen(*(getattr(seen, field)[:30] for field in Seen.__dataclass_fields__))
     little, much = (np.exp(part.fit(1e9, prior).coefficients[:, :, 0]) for part in (few, seen))
     assert (1 < little).all() and (little < 0.7 * much).all() and much == pytest.approx(np.full((3, 2), 4), rel=0.1)
