@@ -56,10 +56,8 @@ def adapt_images(
     work = Path(folder or paths.RUNS / f"adapt-{images.name}") / "work" / hashlib.sha256(repr(key).encode()).hexdigest()[:12]
     provenance = Provenance(f"python3 -m lib adapt {images.name} --labels {Path(labels).name}")
     simulated = simulated_like([one.image for one in parts["learn"]], seed, progress)
-    tuned = tune(
-        detector, parts["learn"], parts["stop"], work, simulated=simulated, minutes=minutes, steps=STEPS, seed=seed,
-        progress=progress,
-    )  # fmt: skip
+    how = {"minutes": minutes, "steps": STEPS, "seed": seed, "progress": progress}
+    tuned = tune(detector, parts["learn"], parts["stop"], work, simulated=simulated, **how)
     before, after = (evaluate(one, parts["judge"]) for one in (detector, tuned))
     gain, sd = better(*(frame_means(found.error_px / found.length_px[:, None]) for found in (before, after)))
     improved = bool(gain > 2 * sd)

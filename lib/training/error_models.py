@@ -106,8 +106,7 @@ class Seen:
         of_label = np.maximum(self.label_sd[:, None] ** 2, 1e-9)
         mean, variance = self.errors * own / (own + of_label), (own * of_label / (own + of_label)).mean(axis=1)
         inside = chndtr(self.tolerance**2 / variance, 2, np.minimum((mean**2).sum(axis=1) / variance, 1e4))
-        exact = np.linalg.norm(self.errors, axis=1) <= self.tolerance
-        return np.where(self.label_sd > 0, np.nan_to_num(inside), exact)
+        return np.where(self.label_sd > 0, np.nan_to_num(inside), np.linalg.norm(self.errors, axis=1) <= self.tolerance)
 
     def gain(self, gross_px: float, gains: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
         """Gain (one of `gains`) and bias (3, 2) of base and tips along each axis that leave the smallest absolute errors."""

@@ -24,12 +24,14 @@ class Evaluation:
         u_true: (n, 3, 2) labels in view, NaN elsewhere.
         visibility: (n, 3) 0, 1, 2, and -1 where nothing is labelled.
         length_px: (n,) the tool's length, the unit of PCK, also where a tip is out of the frame.
+        label_sd_px: (n, 3) of the labels; covariances are judged with it, since an error is the detector's and the label's.
     """
 
     landmarks: Landmarks
     u_true: np.ndarray
     visibility: np.ndarray
     length_px: np.ndarray
+    label_sd_px: np.ndarray
     names: list[str]
 
     @classmethod
@@ -62,10 +64,11 @@ class Evaluation:
     def by(self, groups: Mapping[str, np.ndarray | bool]) -> dict[str, Scores]:
         """Scores of groups of landmarks, each a mask that fits (n, 3); groups without a label are left out."""
         found, result = self.landmarks, {}
+        covariance = found.covariance + self.label_sd_px[..., None, None] ** 2 * np.eye(2)
         for name, mask in groups.items():
             u = np.where(np.broadcast_to(mask, self.visibility.shape)[..., None], self.u_true, np.nan)
             if np.isfinite(u).any():
-                result[name] = score(found.u, u, found.covariance, length_px=self.length_px)
+                result[name] = score(found.u, u, covariance, length_px=self.length_px)
         return result
 
     def by_landmark(self) -> dict[str, Scores]:
@@ -113,7 +116,8 @@ def evaluate(
     for labelled in tqdm(images, disable=not progress, unit="image"):
         unknown = ~np.isfinite(labelled.u).all(1) & (labelled.visibility > 0)
         labels = labelled.in_view[None], np.where(unknown, -1, labelled.visibility)[None], tool_length_px(labelled.u[None])
-        parts.append(Evaluation(detector(labelled.image[None]), *labels, [labelled.name]))
+        found, label_sd_px = detector(labelled.image[None]), np.broadcast_to(labelled.sd_px, (1, 3))
+        parts.append(Evaluation(found, *labels, label_sd_px, [labelled.name]))
     if not parts:
         raise ValueError("images: no labelled image to evaluate on.")
     return Evaluation.joined(parts)

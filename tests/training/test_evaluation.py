@@ -38,6 +38,12 @@ def test_scores_are_those_of_known_errors():
     assert twice.worst(1)[0] >= 6
 
 
+def test_what_labels_err_is_not_held_against_the_covariances():
+    result = evaluate(off_by(2.0), [image._replace(sd_px=np.array([0.0, 1.0, 1.0])) for image in IMAGES])
+    nees = {name: scores.nees for name, scores in result.by_landmark().items()}
+    assert nees == pytest.approx({"base": 4.0, "tip_1": 2.0, "tip_2": 2.0})
+
+
 def test_only_labels_in_view_count():
     image = IMAGES[0]
     result = evaluate(off_by(1.0), [image._replace(visibility=np.array([2, 2, 0]))])
