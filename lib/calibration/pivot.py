@@ -20,11 +20,12 @@ _LARGEST_SD_MM = 1.0  # of an offset's coordinate; beyond it the motion determin
 
 @dataclass(frozen=True, eq=False)
 class Pivot:
-    """`offset_mm` (3,) in the tool frame, the fixed `point_mm` (3,) in the robot frame, (6, 6) covariance of both."""
+    """`offset_mm` (3,) in the tool frame, the fixed `point_mm` (3,) in the robot frame, (6, 6) covariance of both, RMS."""
 
     offset_mm: np.ndarray
     point_mm: np.ndarray
     covariance_mm2: np.ndarray
+    rms_mm: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +100,7 @@ def pivot_calibration(robot_from_tool: Sequence[RigidTransform]) -> Pivot:
     if rms > max(0.25 * spread, 0.05):
         raise ValueError(f"robot_from_tool: the tip did not rest ({rms:.2f} mm RMS): hold it in a divot or use tool_offsets.")
     _check_determined(covariance[:3, :3])
-    return Pivot(solution[:3], solution[3:], covariance)
+    return Pivot(solution[:3], solution[3:], covariance, rms)
 
 
 def tool_offsets(

@@ -116,8 +116,7 @@ def evaluate(
     for labelled in tqdm(images, disable=not progress, unit="image"):
         unknown = ~np.isfinite(labelled.u).all(1) & (labelled.visibility > 0)
         labels = labelled.in_view[None], np.where(unknown, -1, labelled.visibility)[None], tool_length_px(labelled.u[None])
-        found, label_sd_px = detector(labelled.image[None]), np.broadcast_to(labelled.sd_px, (1, 3))
-        parts.append(Evaluation(found, *labels, label_sd_px, [labelled.name]))
+        parts.append(Evaluation(detector(labelled.image[None]), *labels, np.full((1, 3), labelled.sd_px), [labelled.name]))
     if not parts:
         raise ValueError("images: no labelled image to evaluate on.")
     return Evaluation.joined(parts)

@@ -78,7 +78,7 @@ def finetune(
     simulated: str | Path | Sequence[LabelledImage] | None = None, steps: int = 300, minutes: float | None = None,
     seed: int = 0, progress: bool | Callable[[str, float], None] = True,
 ) -> Detector:  # fmt: skip
-    """Train all stages of a detector further on labelled frames, then fit its error models on held-out ones.
+    """Train all stages of a detector further on labelled frames, then adjust its error models to held-out ones.
 
     Args:
         images, held_out: Images of any size.  Consecutive frames are alike, so hold out whole recordings, or the end of one.

@@ -247,6 +247,7 @@ def test_pivot_calibration():
     found = pivot_calibration(tool)
     np.testing.assert_allclose(found.offset_mm, tip, atol=0.01)
     np.testing.assert_allclose(found.point_mm, rest, atol=0.01)
+    assert found.rms_mm == pytest.approx(0.01 * np.sqrt(3), rel=0.1)
     error = np.concatenate([found.offset_mm - tip, found.point_mm - rest])
     assert error @ np.linalg.solve(found.covariance_mm2, error) < 22
 

@@ -503,3 +503,10 @@ def test_tool_frames_have_the_tools_size():
     assert 2 <= jaw[0, 0] <= 4
     for u in (frames.u_left, frames.u_right):
         assert ((u > -200) & (u < [2120, 1280])).all()
+
+
+def test_angles_of_a_motion_are_about_the_fixed_axes_in_the_order_x_y_z():
+    turns = [RigidTransform.from_rotation_vector(angle * np.eye(3)[i]) for i, angle in enumerate((0.1, -0.2, 0.3))]
+    combined = turns[2].compose(turns[1]).compose(turns[0])
+    angles = motion_error(combined, RigidTransform.identity(), np.zeros(3))[1]
+    np.testing.assert_allclose(angles, (0.1, -0.2, 0.3), atol=1e-14)
