@@ -13,7 +13,9 @@ from lib.landmarks.windows import CLOSEUP_REACH_PX, CLOSEUP_ZOOM, expected_in_cl
 __all__ = ["FEATURES", "ErrorModel", "Rough", "closeup_peaks", "corrected", "covariance_and_confidence", "features_of"]
 
 #: How many features a peak has.
-FEATURES = 8
+FEATURES = 9
+#: Jaws look shut where the tips are nearer to each other than about this share of the tool's length.
+_SHUT = 0.15
 
 
 @dataclass(frozen=True)
@@ -23,18 +25,23 @@ class Rough:
     Attributes:
         u: (n, k, 2) the landmark in pixels of this stage's input; NaN where it was not found.
         logit, together: (n, k) logit of its confidence, and the mean over the three landmarks of the tool.
+        shut: (n, k) how shut the jaws look: 1 where the tips coincide, 0 where they are apart or not both found.
     """
 
     u: Tensor
     logit: Tensor
     together: Tensor
+    shut: Tensor
 
     @classmethod
     def of(cls, u: Tensor, confidence: Tensor) -> Self:
         """From the tool's three landmarks u (n, 3, 2) and their confidence (n, 3).  Torch can trace it."""
         confidence = confidence.clamp(1e-3, 0.999)
         logit = (confidence / (1 - confidence)).log()
-        return cls(u, logit, logit.mean(-1, keepdim=True).expand_as(logit))
+        length = (u[..., 1:, :] - u[..., :1, :]).square().sum(-1).sqrt().mean(-1)
+        shut = (-(u[..., 1, :] - u[..., 2, :]).square().sum(-1) / (_SHUT * length) ** 2).exp()
+        shut = torch.where(shut >= 0, shut, torch.zeros_like(shut))  # NaN is not
+        return cls(u, logit, *(part.expand_as(logit) for part in (logit.mean(-1, keepdim=True), shut[..., None])))
 
 
 @dataclass(frozen=True)
@@ -47,13 +54,13 @@ class ErrorModel:
     images of each other, have equal coefficients.
 
     Attributes:
-        log_variance: (2, 10): for x and y the constants of base, tip_1 and tip_2, and the slopes of the other features.
-        logit: (8,).
+        log_variance: (2, 11): for x and y the constants of base, tip_1 and tip_2, and the slopes of the other features.
+        logit: (9,).
         gain, bias: (3, 2) for base, tip_1 and tip_2 along x and y, closeups only.  A closeup's correction is scaled by the
             gain that minimises the validation error; the bias is the mean error that this leaves, in the closeup's pixels.
 
         >>> ErrorModel().coefficients.shape
-        (3, 2, 8)
+        (3, 2, 9)
     """
 
     log_variance: tuple[tuple[float, ...], ...] = ((0.0, 0.0, 0.0, 1.0, *(FEATURES - 2) * (0.0,)),) * 2
@@ -73,29 +80,30 @@ class ErrorModel:
 
     @property
     def coefficients(self) -> np.ndarray:
-        """(3, 2, 8): coefficients of the features in each landmark's log variance along x and y."""
+        """(3, 2, 9): coefficients of the features in each landmark's log variance along x and y."""
         rows = np.array(self.log_variance)
         return np.stack([np.column_stack([rows[:, k], rows[:, 3:]]) for k in range(3)])
 
 
 def features_of(peaks: Peaks, rough: Rough | None = None) -> Tensor:
-    """Features (..., 3, 8) of peaks, in pixels of the stage's input: for x, for y, and for both together.
+    """Features (..., 3, 9) of peaks, in pixels of the stage's input: for x, for y, and for both together.
 
     Each is 1, the log of the fit's variance, the height of the peak, |log of its relative width|, the height elsewhere, the
-    log of the distance from where the stage before saw it, and the two logits of `Rough`; the last three are 0 without it.
+    log of the distance from where the stage before saw it, the two logits of `Rough`, and how shut the jaws look; the last
+    four are 0 without it.  A rod or a needle looks like a tool with shut jaws.
     """
     covariance = peaks.covariance
     covariance = torch.where(torch.isfinite(covariance), covariance, torch.eye(2, dtype=covariance.dtype))
     (xx, xy), (yx, yy) = (row.unbind(-1) for row in covariance.unbind(-2))
     both = (xx * yy - xy * yx).clamp_min(1e-12).sqrt()
     one, height, width = torch.ones_like(peaks.value), peaks.value.clamp(-0.5, 1.5), peaks.width.log().abs()
-    moved, logit, together = (torch.zeros_like(one),) * 3
+    moved, logit, together, shut = (torch.zeros_like(one),) * 4
     if rough is not None:
         distance = (peaks.u - rough.u.to(peaks.u.dtype)).square().sum(-1)
         moved = torch.where(distance < 1e4, distance, torch.full_like(distance, 1e4)).sqrt()  # NaN is not below
         moved = (1 + moved / 2).log()
-        logit, together = (part.to(one.dtype).clamp(-6, 6) for part in (rough.logit, rough.together))
-    shared = [height, width, peaks.rival.clamp(-0.5, 1.5), moved, logit, together]
+        logit, together, shut = (part.to(one.dtype).clamp(-6, 6) for part in (rough.logit, rough.together, rough.shut))
+    shared = [height, width, peaks.rival.clamp(-0.5, 1.5), moved, logit, together, shut]
     return torch.stack([torch.stack([one, v.clamp(1e-4, 1e4).log(), *shared], -1) for v in (xx, yy, both)], -2)
 
 

@@ -30,7 +30,7 @@ _GROSS_PX = {"frame": GROSS_PX, "tool": 10.0, "again": 8.0, "window": GROSS_PX}
 
 @dataclass(frozen=True)
 class Seen:
-    """Peaks of `landmark` (m,) that a stage decoded: `features` (m, 3, 8) as `features_of` gives them, and `errors` (m, 2).
+    """Peaks of `landmark` (m,) that a stage decoded: `features` (m, 3, 9) as `features_of` gives them, and `errors` (m, 2).
 
     All in pixels of the stage's input.  Errors are NaN without a label; below `tolerance` (m,) a landmark is correct.
     `moved` (m, 2) is the whole correction of a closeup.  `known` (m,) is False where a landmark is there but unlabelled.

@@ -293,3 +293,14 @@ def test_features_are_finite_for_any_peak():
     peaks = Peaks(torch.zeros(3, 2), torch.tensor([-3.0, 5.0, 1.0]), torch.tensor([0.4, 3.0, 1.0]), variance, torch.zeros(3))
     rough = Rough.of(torch.full((3, 2), torch.nan), torch.tensor([0.0, 0.5, 1.0]))
     assert torch.isfinite(features_of(peaks, rough)).all()
+
+
+def test_jaws_look_shut_where_the_tips_meet_and_not_where_one_is_missing():
+    base, apart = [0.0, 0.0], [[90.0, 40.0], [90.0, -40.0]]
+    tools = torch.tensor([[base, [100.0, 0.0], [100.0, 0.0]], [base, *apart], [base, [torch.nan] * 2, apart[1]]])
+    shut = Rough.of(tools, torch.full((3, 3), 0.7)).shut
+    assert shut.shape == (3, 3)
+    assert torch.equal(shut[:, 0], shut[:, 2])
+    assert shut[0, 0] == 1
+    assert shut[1, 0] < 1e-6
+    assert shut[2, 0] == 0
