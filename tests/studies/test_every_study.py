@@ -20,6 +20,7 @@ SMALLEST = {
     "matching": {"scene": "eye", "repeats": 1},
     "noise_and_coverage": {"runs": 4},
     "noticed_motion": {"recordings": 1, "before": 60, "after": 10, "scenes": 1},
+    "papers_network": {"minutes": 0.05, "every": 40},
     "real_robot": {},
     "realism": {"windows": 8},
     "reconstruction_speed": {},
