@@ -55,12 +55,12 @@ class ErrorModel:
 
     Attributes:
         log_variance: (2, 11): for x and y the constants of base, tip_1 and tip_2, and the slopes of the other features.
-        logit: (9,).
+        logit: (11,) likewise; 9 or fewer are one constant for all, and slopes.
         gain, bias: (3, 2) for base, tip_1 and tip_2 along x and y, closeups only.  A closeup's correction is scaled by the
             gain that minimises the validation error; the bias is the mean error that this leaves, in the closeup's pixels.
 
         >>> ErrorModel().coefficients.shape
-        (3, 2, 9)
+        (3, 3, 9)
     """
 
     log_variance: tuple[tuple[float, ...], ...] = ((0.0, 0.0, 0.0, 1.0, *(FEATURES - 2) * (0.0,)),) * 2
@@ -69,8 +69,11 @@ class ErrorModel:
     bias: tuple[tuple[float, ...], ...] = ((0.0, 0.0),) * 3
 
     def __post_init__(self) -> None:
-        for name, shape in {"log_variance": (2, FEATURES + 2), "logit": (FEATURES,), "gain": (3, 2), "bias": (3, 2)}.items():
+        shapes = {"log_variance": (2, FEATURES + 2), "logit": (FEATURES + 2,), "gain": (3, 2), "bias": (3, 2)}
+        for name, shape in shapes.items():
             value = np.array(getattr(self, name), dtype=np.float64)
+            if name == "logit" and 0 < value.size <= FEATURES:
+                value = np.concatenate([np.repeat(value[:1], 3), value[1:]])
             if name in ("log_variance", "logit") and value.ndim == len(shape) and value.shape[-1] < shape[-1]:
                 missing = [(0, 0)] * (value.ndim - 1) + [(0, shape[-1] - value.shape[-1])]
                 value = np.pad(value, missing)  # slopes that are not given are 0
@@ -80,8 +83,8 @@ class ErrorModel:
 
     @property
     def coefficients(self) -> np.ndarray:
-        """(3, 2, 9): coefficients of the features in each landmark's log variance along x and y."""
-        rows = np.array(self.log_variance)
+        """(3, 3, 9): coefficients of the features in each landmark's log variance along x and y, and in its logit."""
+        rows = np.array([*self.log_variance, self.logit])
         return np.stack([np.column_stack([rows[:, k], rows[:, 3:]]) for k in range(3)])
 
 
@@ -115,10 +118,9 @@ def covariance_and_confidence(
     Torch can trace it.
     """
     features = features_of(peaks, rough)
-    log_variance, logit = (torch.tensor(row, dtype=features.dtype) for row in (fit.coefficients[landmark], fit.logit))
-    variance = (features[..., :2, :] * log_variance).sum(-1).clamp(-12, 12).exp()
-    confidence = torch.sigmoid((features[..., 2, :] * logit).sum(-1))
-    return variance[..., None] * torch.eye(2, dtype=variance.dtype), confidence
+    value = (features * torch.tensor(fit.coefficients[landmark], dtype=features.dtype)).sum(-1)
+    variance = value[..., :2].clamp(-12, 12).exp()
+    return variance[..., None] * torch.eye(2, dtype=variance.dtype), torch.sigmoid(value[..., 2])
 
 
 def closeup_peaks(found: Tensor, size_px: int) -> Peaks:

@@ -23,6 +23,8 @@ __all__ = ["TRACKED_SHIFT_PX", "Seen", "fit_error_models", "seen_by"]
 TRACKED_SHIFT_PX, _LENGTH_PX = 8.0, 300.0
 #: Weight of a prior, in landmarks.  Chosen by how true the doubt is on held-out scenes after a fit on 20 others.
 _PRIOR = 20.0
+#: How strongly slopes are kept small: of the two log variances, and of the logit, chosen on held-out scenes.
+_RIDGE = (1e-2, 1e-2, 1e-3)
 _INSIDE = chdtri(2, 0.05)  # squared length below which 95 % of a standard normal plane lie
 #: Larger errors, in pixels of a stage's input, are no part of what a covariance describes.
 _GROSS_PX = {"frame": GROSS_PX, "tool": 10.0, "again": 8.0, "window": GROSS_PX}
@@ -68,34 +70,33 @@ class Seen:
             if prior is not None:
                 return prior
             raise ValueError(f"images: only {use.sum()} landmarks to calibrate on; give at least 20.")
-        features, squared, of_label = self.features[use], self.errors[use] ** 2, self.label_sd[use] ** 2
+        squared, of_label, tip = self.errors[use] ** 2, self.label_sd[use] ** 2, self.landmark > 0
         of_label = of_label * min(1.0, 0.9 * squared.mean() / max(of_label.mean(), 1e-12))  # labels better than was said
-        tip = self.landmark[use, None] > 0
+
+        def fitted(row: int, loss: Callable[[np.ndarray], tuple], among: np.ndarray, start: np.ndarray) -> np.ndarray:
+            x = np.column_stack([~tip, tip, self.features[:, row, 1:]])[among].astype(float)
+            one_tip = np.array(start)[[0, 1, *range(3, FEATURES + 2)]]
+            return _coefficients(loss, x, one_tip, prior is not None, _RIDGE[row])[[0, 1, 1, *range(2, FEATURES + 1)]]
 
         def variance(axis: int) -> np.ndarray:
-            x = np.column_stack([~tip, tip, features[:, axis, 1:]]).astype(float)
-            start = [np.log(max(squared[:, axis].mean(), 1e-6))] * 2 + [0.0] * (FEATURES - 1)
-            if prior is not None:
-                start = np.array(prior.log_variance[axis])[[0, 1, *range(3, FEATURES + 2)]]
-
             def deviance(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
                 own = np.exp(z)
                 ratio = squared[:, axis] / (own + of_label)
                 return np.log(own + of_label) + ratio, (1 - ratio) * own / (own + of_label)
 
-            return _coefficients(deviance, x, start, prior is not None)[[0, 1, 1, *range(2, FEATURES + 1)]]
+            start = [np.log(max(squared[:, axis].mean(), 1e-6))] * 3 + [0.0] * (FEATURES - 1)
+            return fitted(axis, deviance, use, start if prior is None else prior.log_variance[axis])
 
         log_variance = np.array([variance(0), variance(1)])
-        rows = ErrorModel(log_variance).coefficients[self.landmark]
+        rows = ErrorModel(log_variance).coefficients[self.landmark, :2]
         own = np.exp((rows * self.features[:, :2]).sum(-1))
         correct = self._correct(own)[self.known]
-        start, of_correct = np.array((prior or ErrorModel()).logit), self.features[self.known, 2]
-        logit = _coefficients(
-            lambda z: (np.logaddexp(0, z) - correct * z, expit(z) - correct), of_correct, start, prior is not None
+        logit = fitted(
+            2, lambda z: (np.logaddexp(0, z) - correct * z, expit(z) - correct), self.known, (prior or ErrorModel()).logit
         )
         total = own[use] + of_label[:, None]
         normalised, of_own = (squared / total).sum(1), own[use] / total
-        for group, columns in ((~tip[:, 0], np.s_[:1]), (tip[:, 0], np.s_[1:3])):
+        for group, columns in ((~tip[use], np.s_[:1]), (tip[use], np.s_[1:3])):
             if group.any():
                 share = 0.5 * of_own[group].mean() * group.sum() / (group.sum() + (_PRIOR if prior is not None else 0))
                 log_variance[:, columns] += share * np.log(np.quantile(normalised[group], 0.95) / _INSIDE)
@@ -123,13 +124,15 @@ class Seen:
         return best, bias
 
 
-def _coefficients(loss: Callable[[np.ndarray], tuple], x: np.ndarray, start: np.ndarray, is_prior: bool) -> np.ndarray:
+def _coefficients(
+    loss: Callable[[np.ndarray], tuple], x: np.ndarray, start: np.ndarray, is_prior: bool, small: float
+) -> np.ndarray:
     """Those that minimise the mean of a loss of ``x @ beta``, given with its slope.
 
-    They are kept near `start` if that is a prior; else the slopes alone are kept small.
+    They are kept near `start` if that is a prior; else the slopes alone are kept `small`.
     """
     slopes, centre = np.arange(len(start)) > len(start) - FEATURES, np.where(is_prior, start, 0.0)
-    ridge = np.full(len(start), _PRIOR / len(x)) if is_prior else 1e-2 * slopes
+    ridge = np.full(len(start), _PRIOR / len(x)) if is_prior else small * slopes
 
     def penalised(beta: np.ndarray) -> tuple[float, np.ndarray]:
         value, slope = loss(x @ beta)
@@ -203,7 +206,7 @@ def fit_error_models(
     Args:
         images: Easy and hard ones, since confidence is learnt from failures, and of many tools, since errors within a
             recording correlate because they share one tool.
-        for_closeups: More images, for the stages that look at closeups alone.
+        for_closeups: More images, for gain, bias and covariance of the stages that look at closeups, and for tracking.
         anew: False begins from the models that the detector has, and changes them as far as so many images tell.
 
     Raises:
@@ -226,6 +229,8 @@ def fit_error_models(
                 start = detector.refine(labelled.image[None], start, stage)
             found.append(None if stage == "frame" else detector.stage_peaks(labelled.image[None], start.u, stage))
             parts.append(seen_by(detector, stage, labelled, start, found[-1]))
+        if stage in ("closeup", "closer"):  # how often a landmark is right, the other images tell
+            parts[n:] = (replace(part, known=np.zeros_like(part.known)) for part in parts[n:])
         fit = _fitted(stage, parts if stage in CLOSE else parts[:n], None if anew else before.get(stage))
         detector = detector.with_error_models(**{stage: fit})
         if stage == "frame":  # the landmarks that the next stage starts from

@@ -29,6 +29,8 @@ __all__ = [
     "label_noise_pairs",
     "mean_and_error",
     "most_labels",
+    "papers_network_curves",
+    "papers_network_rows",
     "recorded",
     "resolution_curves",
     "shipped_curve",
@@ -103,19 +105,42 @@ def ablation_bars(table: Table) -> Figure:
     return fig
 
 
-def resolution_curves(table: Table) -> Figure:
-    """PCK against the threshold at the paper's four resolutions."""
+def resolution_curves(table: Table, title: str = "Resolution") -> Figure:
+    """PCK against the threshold at each resolution of the table."""
     fig, ax = figure(width_in=8, height_in=3.6)
     colours = [COLOURS["ours"], COLOURS["truth"], COLOURS["right"], COLOURS["warning"]]
     for (name, rows), colour in zip(groups(table, "resolution").items(), colours, strict=False):
         thresholds, pck = curve(rows)
         ax.plot(100 * thresholds, pck, color=colour, marker="o", ms=3, label=name)
-    ax.set(xscale="log", ylim=(0, 101), xlabel="threshold, % of the tool's length", ylabel="PCK, %", title="Resolution")
+    ax.set(xscale="log", ylim=(0, 101), xlabel="threshold, % of the tool's length", ylabel="PCK, %", title=title)
     ticks = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20)
     ax.set_xticks(ticks, [f"{t:g}" for t in ticks])
     ax.minorticks_off()
     ax.legend(loc="upper left")
     return fig
+
+
+def papers_network_curves(table: Table, shipped: Table) -> Figure:
+    """PCK against the threshold of the paper's network at each resolution, and of the shipped detector on the same sequences."""
+    fig = resolution_curves(table, "The paper's network")
+    rows = [row for row in shipped.where(mode="whole frames").rows if row["recording"].startswith("test_")]
+    thresholds, pck = curve(Table(rows))
+    fig.axes[0].plot(100 * thresholds, pck, "k--", label="shipped detector, full HD")
+    fig.axes[0].legend(loc="upper left")
+    return fig
+
+
+def papers_network_rows(table: Table) -> tuple[list[str], list[list[str]]]:
+    """How long the paper's network was trained and how good it became, header and rows."""
+    columns = {
+        "epochs": ("epochs_done", ".1f"),
+        "steps": ("steps", ".0f"),
+        "minutes": ("training_min", ".0f"),
+        **{f"PCK@{t}": (f"pck_{t:.3f}_percent", ".1f") for t in (0.01, 0.05, 0.1, 0.2)},
+        "median, px": ("median_px", ".1f"),
+    }
+    cells = [[row["resolution"], *(format(row[key], form) for key, form in columns.values())] for row in table.rows]
+    return ["resolution", *columns], cells
 
 
 def few_labels_curves(table: Table) -> Figure:

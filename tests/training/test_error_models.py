@@ -49,15 +49,16 @@ def test_fitted_variance_of_known_errors():
     correct = np.linalg.norm(errors, axis=1) < 2
     moved, known, exact = np.zeros((6000, 2)), np.ones(6000, bool), np.zeros(6000)
     fit = Seen(features, errors, np.full(6000, 2.0), landmark, moved, known, exact).fit(1e9)
-    coefficients = fit.coefficients
+    coefficients, of_logit = fit.coefficients[:, :2], fit.coefficients[:, 2]
     assert coefficients[:, :, 1] == pytest.approx(np.tile([0.8, 0.2], (3, 1)), abs=0.05)
     assert coefficients[1:, :, 0] - coefficients[0, :, 0] == pytest.approx(np.array([[0.9, 0], [0.9, 0]]), abs=0.1)
     log_variance = (coefficients[landmark] * features[:, :2]).sum(-1)
     squared = errors**2 / np.exp(log_variance)
     for own in (landmark == 0, landmark > 0):
         assert squared[own].mean(0) == pytest.approx([1, 1], abs=0.05)
-    confidence = 1 / (1 + np.exp(-features[:, 2] @ np.array(fit.logit)))
-    assert metrics.calibration_error(confidence, correct) < 0.05
+    confidence = 1 / (1 + np.exp(-(of_logit[landmark] * features[:, 2]).sum(1)))
+    for own in (landmark == 0, landmark > 0):
+        assert metrics.calibration_error(confidence[own], correct[own]) < 0.05
 
 
 def test_what_labels_err_themselves_is_not_the_detectors():
@@ -70,11 +71,24 @@ def test_what_labels_err_themselves_is_not_the_detectors():
         own = rng.normal(0, own_sd, (8000, 2))
         errors = own + rng.normal(0, 1, (8000, 2)) * label_sd[:, None]
         fit = Seen(features, errors, np.ones(8000), landmark, moved, known, label_sd).fit(1e9)
-        assert np.exp(fit.coefficients[:, :, 0]) == pytest.approx(np.full((3, 2), own_sd**2), rel=0.15)
+        assert np.exp(fit.coefficients[:, :2, 0]) == pytest.approx(np.full((3, 2), own_sd**2), rel=0.15)
         correct = (np.linalg.norm(own, axis=1) < 1).mean()
         assert 1 / (1 + np.exp(-fit.logit[0])) == pytest.approx(correct, abs=0.02)
     better = Seen(features, own / 5, np.ones(8000), landmark, moved, known, np.full(8000, 1.5)).fit(1e9)
-    assert (np.exp(better.coefficients[:, :, 0]) > 0.05 * 0.3**2).all()  # labels five times better than was said
+    assert (np.exp(better.coefficients[:, :2, 0]) > 0.05 * 0.3**2).all()  # labels five times better than was said
+
+
+def test_confidence_of_tips_has_a_constant_of_its_own():
+    """Bases that are mostly wrong beside tips that are mostly right, with equal features."""
+    rng = np.random.default_rng(3)
+    features = np.concatenate([np.ones((6000, 3, 1)), np.zeros((6000, 3, FEATURES - 1))], axis=2)
+    landmark = rng.integers(3, size=6000)
+    errors = rng.normal(0, np.where(landmark == 0, 2.0, 0.5)[:, None], (6000, 2))
+    exact = np.zeros((6000, 2)), np.ones(6000, bool), np.zeros(6000)
+    fit = Seen(features, errors, np.ones(6000), landmark, *exact).fit(1e9)
+    right = [(np.linalg.norm(errors[own], axis=1) <= 1).mean() for own in (landmark == 0, landmark > 0)]
+    assert 1 / (1 + np.exp(-fit.coefficients[:, 2, 0])) == pytest.approx([right[0], right[1], right[1]], abs=0.01)
+    assert ErrorModel(logit=(1.0, 2.0)).coefficients[:, 2, :2].tolist() == [[1.0, 2.0]] * 3  # one constant for all
 
 
 def test_few_landmarks_change_a_prior_little():
@@ -84,7 +98,7 @@ def test_few_landmarks_change_a_prior_little():
     errors, landmark, moved = 2 * rng.normal(size=(3000, 2)), rng.integers(3, size=3000), np.zeros((3000, 2))
     seen = Seen(features, errors, np.full(3000, 2.0), landmark, moved, np.ones(3000, bool), np.zeros(3000))
     few = Seen(*(getattr(seen, field)[:30] for field in Seen.__dataclass_fields__))
-    little, much = (np.exp(part.fit(1e9, prior).coefficients[:, :, 0]) for part in (few, seen))
+    little, much = (np.exp(part.fit(1e9, prior).coefficients[:, :2, 0]) for part in (few, seen))
     assert (1 < little).all() and (little < 0.7 * much).all() and much == pytest.approx(np.full((3, 2), 4), rel=0.1)
 
 
