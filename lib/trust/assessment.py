@@ -61,7 +61,7 @@ def assess(
     if calibration is not None:
         epipolar_px = feature_epipolar_px(recording, calibration.pair)
     diagnosis = diagnose(
-        data, calibration, kinematics=recording.kinematics, offset_s=recording.offset_s, readout_s=recording.readout_s,
+        data, kinematics=recording.kinematics, offset_s=recording.offset_s, readout_s=recording.readout_s,
         image_size_px=recording.image_size_px,
     )  # fmt: skip
     found = health(recording, data, calibration, detector=detector)

@@ -52,11 +52,10 @@ class Case:
     """
 
     def __init__(
-        self, problem: Problem, kinematics: Kinematics | None, offset_s: float, readout_s: float,
-        size: tuple[int, int] | None, seed: int,
-    ) -> None:  # fmt: skip
-        self.problem, self.readout_s, self.size, self.seed = problem, readout_s, size, seed
-        self.null, self.fits = problem.fit(seed=seed), {}
+        self, problem: Problem, kinematics: Kinematics | None, offset_s: float, readout_s: float, size: tuple[int, int] | None
+    ) -> None:
+        self.problem, self.readout_s, self.size = problem, readout_s, size
+        self.null, self.fits = problem.fit(), {}
         self.frames = int(problem.frame.max()) + 1
         self.paths, self._clock_s = None, offset_s
         time, landmark, x = problem.time, problem.landmark, problem.x[:, 0]
@@ -95,7 +94,7 @@ class Case:
             r2 = ((problem.y - np.einsum("cij,tnj->tnci", fit.M[:, :, :3], x) - fit.M[:, :, 3]) ** 2).sum(axis=3)
             loss = np.where(problem.used, np.nan_to_num(np.log1p(r2 / fit.shapes[0].scale ** 2), nan=1e3), 0.0).sum(axis=2)
             own = np.array([np.bincount(problem.frame, row, self.frames) for row in loss]).argmin(axis=0)
-            moved = problem.moved(np.repeat(x[own[problem.frame], np.arange(len(problem))][:, None], 2, axis=1))
+            moved = replace(problem, x=np.repeat(x[own[problem.frame], np.arange(len(problem))][:, None], 2, axis=1))
             fit = moved.fit(start=fit.M, rounds=10)
         return fit, moved, own
 

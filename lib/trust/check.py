@@ -18,6 +18,7 @@ from lib.landmarks import Detector, SharedDetector, detect
 from lib.provenance import plain
 from lib.recordings import Recording, StereoFrame
 from lib.trust.assessment import Assessment, assess, report
+from lib.trust.health import spread
 from lib.trust.verdict import LEVELS
 
 __all__ = ["Check", "check", "data_uri", "main", "overlay"]
@@ -70,23 +71,21 @@ class Check:
 
     def _overlays(self) -> list[tuple[str, str]]:
         """(caption, picture) of the worst and the best frames."""
-        health = self.assessment.health
+        health, data, c = self.assessment.health, self.assessment.data, self.assessment.calibration
         order = np.argsort(-np.nan_to_num(health.score, nan=np.inf), kind="stable")
         chosen = list(dict.fromkeys([*order[:_SHOWN], *order[::-1][:_SHOWN]]))
         found = []
         for place, i in enumerate(chosen):
             number, score = int(health.frame[i]), health.score[i]
+            rows = data.of_frames(number)
+            seen = np.where(rows.seen.T[:, :, None], np.stack([rows.u_left, rows.u_right]), np.nan)
+            told = None if c is None else np.stack(c.pair.project(rows.x_mm))
+            picture = data_uri(overlay(self.recording.frames[number], seen, told), ".jpg")
             parts = {name: part[i].max() for name, part in health.parts.items() if np.isfinite(part[i]).any()}
             why = f"score {score:.2g}, most of it {max(parts, key=parts.get)}" if parts else "nothing was found"
             kind = "good" if score <= 1 else "among the worst" if place < _SHOWN else "bad"
-            found.append((f"Frame {number} ({kind}): {why}.", data_uri(self._overlay(number), ".jpg")))
+            found.append((f"Frame {number} ({kind}): {why}.", picture))
         return found
-
-    def _overlay(self, number: int) -> np.ndarray:
-        """Left and right image with what was found (rings) and where the robot is seen by the calibration (crosses)."""
-        rows, c = self.assessment.data.of_frames(number), self.assessment.calibration
-        seen = np.where(rows.seen.T[:, :, None], np.stack([rows.u_left, rows.u_right]), np.nan)
-        return overlay(self.recording.frames[number], seen, None if c is None else np.stack(c.pair.project(rows.x_mm)))
 
     def _coverage(self) -> np.ndarray:
         """Where the tool was: over the left image, in depth, and in time with the score of each frame."""
@@ -112,22 +111,20 @@ class Check:
         return np.asarray(canvas.buffer_rgba())[..., :3]
 
 
-def check(recording: str | Path | Recording, *, detector: Callable | None = None, folder: str | Path | None = None) -> Check:
+def check(recording: str | Path | Recording, *, detector: Callable | None = None) -> Check:
     """Detect, calibrate, diagnose and judge a recording; its truth is never opened.
 
     Args:
         recording: Its folder, or the recording.
         detector: None is the one that ships.
-        folder: Where check.html and check.json go; None writes nothing.
 
     Raises:
         FileNotFoundError, ValueError: If the folder is no recording that can be read.
     """
     found = recording if isinstance(recording, Recording) else Recording.open(recording, truth=False)
-    frames = np.unique(np.linspace(0, len(found) - 1, min(_MOST_FRAMES, len(found))).round().astype(int))
     if found.skeleton == LANDMARKS:
         detector = SharedDetector(detector)
-        data = detect(found, detector, frames=frames)
+        data = detect(found, detector, frames=spread(len(found), _MOST_FRAMES))
     elif (marks := found.annotations) is not None:
         detector, data = None, of_recording(found, marks.u_left, marks.u_right)
     else:
@@ -136,10 +133,7 @@ def check(recording: str | Path | Recording, *, detector: Callable | None = None
     next_step = "Use it: `python3 -m lib run -p recording RECORDING`."
     if a.verdict.level != LEVELS[0]:
         next_step = a.verdict.reasons[0].cure if a.diagnosis.best is None else a.diagnosis.best.cure
-    made = Check(found, a, _facts(found, a), next_step.replace("RECORDING", shlex.quote(paths.shown(found.folder))))
-    if folder is not None:
-        made.write(folder)
-    return made
+    return Check(found, a, _facts(found, a), next_step.replace("RECORDING", shlex.quote(paths.shown(found.folder))))
 
 
 def _facts(recording: Recording, a: Assessment) -> dict[str, str]:

@@ -54,12 +54,10 @@ def _refined(
         x, velocity = case.problem.x.copy(), np.zeros_like(case.problem.x)
         x[:, views] = case.moved(later)[:, None]
         velocity[:, views] = case.velocity(later)[:, None]
-        problem = case.problem.moved(np.where(np.isfinite(velocity), x, np.nan))
+        problem = replace(case.problem, x=np.where(np.isfinite(velocity), x, np.nan))
         if problem.used.all(axis=1).sum() < 6:
             return None
-        fit = problem.fit(
-            lambda M, v=velocity: np.einsum("cij,ncj,kn->ncik", M[:, :, :3], v, powers), start=M, seed=case.seed
-        )
+        fit = problem.fit(lambda M, v=velocity: np.einsum("cij,ncj,kn->ncik", M[:, :, :3], v, powers), start=M)
         M, sd = fit.M, np.sqrt(np.diag(fit.covariance))
         if (np.abs(fit.theta) < 0.1 * sd).all():
             break

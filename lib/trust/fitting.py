@@ -6,7 +6,7 @@ may have constant offsets in the tool's axes, with a prior, because detectors do
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Self
 
@@ -17,7 +17,7 @@ from lib.calibration.offsets import rows_axes
 from lib.calibration.robust import tightest_sample
 from lib.correspondences import Correspondences
 
-__all__ = ["Problem", "Robust", "Shape", "log_density"]
+__all__ = ["Problem", "Robust"]
 
 #: Degrees of freedom tried; bivariate Cauchy to nearly Gaussian.
 _FREEDOM = np.array([0.7, 1.0, 2.0, 4.0, 10.0, 100.0])
@@ -43,18 +43,17 @@ class Shape:
         for _ in range(4):
             weight = (freedom + 2.0) / (freedom + r2 / s2)
             s2 = np.maximum((weight * r2).mean(axis=1, keepdims=True) / 2.0, _LEAST_PX**2)
-        best = log_density(r2, cls(np.sqrt(s2), freedom)).sum(axis=1).argmax()
+        best = cls(np.sqrt(s2), freedom).log_density(r2).sum(axis=1).argmax()
         return cls(float(np.sqrt(s2[best, 0])), float(tried[best]))
 
+    def log_density(self, r2: np.ndarray) -> np.ndarray:
+        """Of squared residuals.
 
-def log_density(r2: np.ndarray, shape: Shape) -> np.ndarray:
-    """Log density of squared residuals.
-
-    >>> bool(np.isclose(log_density(np.zeros(1), Shape(1.0, 4.0))[0], -np.log(2 * np.pi)))
-    True
-    """
-    s2, freedom = shape.scale**2, shape.freedom
-    return -np.log(2.0 * np.pi * s2) - (freedom + 2.0) / 2.0 * np.log1p(r2 / (freedom * s2))
+        >>> bool(np.isclose(Shape(1.0, 4.0).log_density(np.zeros(1))[0], -np.log(2 * np.pi)))
+        True
+        """
+        s2, freedom = self.scale**2, self.freedom
+        return -np.log(2.0 * np.pi * s2) - (freedom + 2.0) / 2.0 * np.log1p(r2 / (freedom * s2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,30 +131,26 @@ class Problem:
         """(n, 2) bool: the image shows the landmark and the robot reports it."""
         return self.seen & np.isfinite(self.x).all(axis=2)
 
-    def moved(self, x: np.ndarray) -> Self:
-        """The same pixels at other positions; rows without one are not used."""
-        return replace(self, x=x)
-
     def fit(
         self, columns: Callable[[np.ndarray], np.ndarray] | None = None, *, start: np.ndarray | None = None,
-        groups: np.ndarray | None = None, rounds: int = 40, seed: int = 0,
+        apart: np.ndarray | None = None, rounds: int = 40,
     ) -> Robust:  # fmt: skip
         """Most probable cameras, offsets and additions.
 
         Args:
             columns: Cameras M -> (n, 2, 2, k): change of the pixels by each addition.
             start: Cameras to start from; None searches samples of four rows.
-            groups: (n,) number of the row's group; each has a noise of its own.
-            seed: Of the search.
+            apart: (n,) bool: rows with a noise of their own.
         """
-        starts = [start] if start is not None else self._starts(np.random.default_rng(seed))
-        fits = [self._descend(M, columns, groups, rounds if len(starts) == 1 else 8) for M in starts]
-        best = max(fits, key=lambda fit: fit.total)
-        return best if len(starts) == 1 else self._descend(best.M, columns, groups, rounds)
+        apart = np.zeros(len(self), dtype=bool) if apart is None else apart
+        if start is None:
+            fits = [self._descend(M, columns, apart, 8) for M in self._starts()]
+            start = max(fits, key=lambda fit: fit.total).M
+        return self._descend(start, columns, apart, rounds)
 
-    def _starts(self, rng: np.random.Generator) -> np.ndarray:
+    def _starts(self) -> np.ndarray:
         """Cameras (2, 2, 2, 4) of least squares, and of the samples of four rows that most rows are near to."""
-        found = np.zeros((2, 2, 2, 4))
+        found, rng = np.zeros((2, 2, 2, 4)), np.random.default_rng(0)
         for view, rows in enumerate(self.used.T):
             if rows.sum() >= 4:
                 x, y = self.x[rows, view], self.y[rows, view]
@@ -175,11 +170,9 @@ class Problem:
             D[:, :, :, 16 + 3 * k : 19 + 3 * k] = image * (self.landmark == k)[:, None, None, None]
         return D if columns is None else np.concatenate([D, columns(M)], axis=3)
 
-    def _descend(self, M: np.ndarray, columns: Callable | None, groups: np.ndarray | None, rounds: int) -> Robust:
+    def _descend(self, M: np.ndarray, columns: Callable | None, apart: np.ndarray, rounds: int) -> Robust:
         used, y = self.used, np.where(self.used[:, :, None], self.y, 0.0)
-        group = np.zeros(len(self), dtype=int) if groups is None else groups
-        group = np.where(used, group[:, None], -1)
-        kinds = [g for g in range(group.max(initial=0) + 1) if (group == g).any()]
+        groups = [rows for rows in (used & ~apart[:, None], used & apart[:, None]) if rows.any()]
         prior = np.zeros(25)
         prior[16:] = self.offset_sd**-2
         r = np.where(used[:, :, None], y - np.einsum("cij,ncj->nci", M[:, :, :3], self.x) - M[:, :, 3], 0.0)
@@ -187,13 +180,11 @@ class Problem:
         # Few rows a parameter: a density with a sharp peak would fit some of them exactly.
         rich = 2 * used.sum() / (20 if columns is None else 20 + columns(M).shape[3])
         least = 0.0 if rich > 10 else 2.0 if rich > 5 else 10.0
-        middle = {g: max(float(np.sqrt(np.median(r2[group == g]))), _LEAST_PX) for g in kinds}
-        shapes = {g: Shape.of(r2[group == g], middle[g], least) for g in kinds}
+        shapes = [Shape.of(r2[rows], max(float(np.sqrt(np.median(r2[rows]))), _LEAST_PX), least) for rows in groups]
         before = -np.inf
         for _ in range(rounds):
             weight = np.zeros(used.shape)
-            for g, shape in shapes.items():
-                rows = group == g
+            for rows, shape in zip(groups, shapes, strict=True):
                 weight[rows] = (shape.freedom + 2.0) / (shape.freedom * shape.scale**2 + r2[rows])
             weight /= self.noise**2
             D = np.where(used[:, :, None, None], np.nan_to_num(self._design(M, columns)), 0.0)
@@ -206,10 +197,10 @@ class Problem:
             M = beta[:16].reshape(2, 2, 4)
             r = y - D @ beta
             r2 = (r**2).sum(axis=2) / self.noise**2
-            shapes = {g: Shape.of(r2[group == g], shape.scale, least, shape.freedom) for g, shape in shapes.items()}
             likelihood = np.zeros(used.shape)
-            for g, shape in shapes.items():
-                likelihood[group == g] = log_density(r2[group == g], shape)
+            for i, rows in enumerate(groups):
+                shapes[i] = Shape.of(r2[rows], shapes[i].scale, least, shapes[i].freedom)
+                likelihood[rows] = shapes[i].log_density(r2[rows])
             penalty = -0.5 * float(prior @ beta[:25] ** 2)
             total = likelihood.sum() + penalty
             if abs(total - before) < 0.02:
@@ -221,7 +212,7 @@ class Problem:
         offset_sd = np.sqrt(np.diag(inverse)[16:25].reshape(3, 3).sum(axis=1))
         return Robust(
             M, beta[25:], inverse[25:, 25:], beta[16:25].reshape(3, 3), offset_sd, inverse[:16, :16], r,
-            tuple(shapes.values()), likelihood, penalty, design,
+            tuple(shapes), likelihood, penalty, design,
         )  # fmt: skip
 
     def _overcount(self, z: np.ndarray) -> float:

@@ -18,9 +18,11 @@ from lib.cameras import StereoRig
 from lib.correspondences import Correspondences
 from lib.recordings import Recording
 
-__all__ = ["LIMITS", "Health", "affine_epipolar", "feature_epipolar_px", "feature_matches", "health", "unfamiliar"]
+__all__ = [
+    "LIMITS", "Health", "affine_epipolar", "feature_epipolar_px", "feature_matches", "health", "spread", "unfamiliar",
+]  # fmt: skip
 
-#: What a landmark of a frame may show of each part; see `FALSE_ALARM_RATE`.
+#: What a landmark of a frame may show of each part; see `Health.false_alarm_rate`.
 LIMITS = {
     "looks": 0.02,  # the same frame mirrored and shifted: largest move of the landmark, of the tool's length
     "epipolar": 0.03,  # distance of left and right from one epipolar geometry, of the tool's length
@@ -38,9 +40,7 @@ _FAMILIAR = np.array([
     [0.32, -0.23, -2.49, -2.54, -0.76, -1.80, -3.38, -2.91, -2.76], [0.32, 0.31, 0.82, 0.82, 0.47, 0.52, 0.66, 0.60, 0.59],
 ])  # fmt: skip
 _WIDTH_PX = 240  # of a picture whose looks are taken
-#: Upper bound of the share of frames with right landmarks (all within 5 % of the tool's length) whose score exceeds 1: 3 of
-#: 35 frames of three simulated recordings of the validation population without `unfamiliar`, and the 2 % that this may add.
-FALSE_ALARM_RATE = 0.11
+_LOOKS, _PICTURES = 12, 60  # frames looked at again; pictures compared with those of the training
 #: Frames further apart in time are not compared for smoothness.
 _NEXT_S = 0.15
 #: By how much a look is shifted, (x, y) px: no multiple of a network's stride.
@@ -59,13 +59,15 @@ class Health:
         frame: (m,) numbers of the frames.
         parts: Name -> (m, 3) in units of its limit, the worse of the two images; NaN where a landmark does not have it.
         seen: (m, 3) bool: found in one image or both.
-        false_alarm_rate: About how many of the frames with right landmarks have a score above 1, as a share.
+        false_alarm_rate: Upper bound of the share of frames with right landmarks (all within 5 % of the tool's length) whose
+            score exceeds 1: 3 of 35 frames of three simulated recordings of the validation population without `unfamiliar`,
+            and the 2 % that this may add.
     """
 
     frame: np.ndarray
     parts: dict[str, np.ndarray]
     seen: np.ndarray
-    false_alarm_rate: float = FALSE_ALARM_RATE
+    false_alarm_rate: float = 0.11
 
     @property
     def score(self) -> np.ndarray:
@@ -95,15 +97,15 @@ class Health:
 
 def health(
     recording: Recording | None, data: Correspondences, calibration: Calibration | None = None, *,
-    detector: Callable | None = None, looks: int = 12, pictures: int = 60,
+    detector: Callable | None = None,
 ) -> Health:  # fmt: skip
     """Compare what the detector found with everything that is known without labels.
 
     Args:
         data: Of `lib.landmarks.detect`, all frames or some.
         calibration: Made from `data`; None leaves out what needs cameras.
-        recording: None leaves out what needs its pictures, of which `pictures` are compared with those of the training.
-        detector: Looks again at `looks` frames, mirrored and shifted; None leaves that out.
+        recording: None leaves out what needs its pictures.
+        detector: Looks again at some frames, mirrored and shifted; None leaves that out.
 
     Raises:
         ValueError: If `data` holds no row.
@@ -128,15 +130,15 @@ def health(
         seen = rig.triangulate(u[:, :, 0].reshape(-1, 2), u[:, :, 1].reshape(-1, 2)).x_mm.reshape(x.shape)
         parts["shape"] = np.repeat(np.abs(_tool_length(seen) / _tool_length(x) - 1.0)[:, None], shape[1], axis=1)
     if detector is not None:
-        parts["looks"] = np.fmax.reduce(_looks_px(recording, frame, u, detector, looks), axis=2) / length
+        parts["looks"] = np.fmax.reduce(_looks_px(recording, frame, u, detector), axis=2) / length
     if recording is not None:
         parts["unfamiliar"] = np.full(shape[:2], np.nan)
-        for i in _spread(len(frame), pictures):
+        for i in spread(len(frame), _PICTURES):
             parts["unfamiliar"][i] = unfamiliar(recording.frames[int(frame[i])].left)
     return Health(frame, {n: parts[n] / LIMITS[n] for n in LIMITS if n in parts}, np.isfinite(u[..., 0]).any(axis=2))
 
 
-def _spread(n: int, count: int) -> np.ndarray:
+def spread(n: int, count: int) -> np.ndarray:
     """At most `count` of n numbers, evenly."""
     return np.unique(np.linspace(0, n - 1, min(count, n)).round().astype(int))
 
@@ -175,10 +177,10 @@ def _jump_px(off: np.ndarray, time_s: np.ndarray) -> np.ndarray:
     return jump
 
 
-def _looks_px(recording: Recording, frame: np.ndarray, u: np.ndarray, detector: Callable, looks: int) -> np.ndarray:
+def _looks_px(recording: Recording, frame: np.ndarray, u: np.ndarray, detector: Callable) -> np.ndarray:
     """(m, 3, 2) px how far a mirrored and a shifted look move a landmark; infinite where they disagree that it is there."""
     moved = np.full(u.shape[:3], np.nan)
-    for i in _spread(len(frame), looks):
+    for i in spread(len(frame), _LOOKS):
         pair = recording.frames[int(frame[i])]
         images = np.stack([pair.left, pair.right])
         mirrored = detector(images[:, :, ::-1])
@@ -190,7 +192,7 @@ def _looks_px(recording: Recording, frame: np.ndarray, u: np.ndarray, detector: 
     return moved
 
 
-def affine_epipolar(y: np.ndarray, samples: int = 300) -> tuple[np.ndarray, np.ndarray]:
+def affine_epipolar(y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Distances (n,) px of matches y (n, 4) from the affine epipolar geometry that most share, and which (n,) agree.
 
     Least median of squares, then a refit; NaN rows stay NaN, all of them are where fewer than 12 are known.
@@ -200,7 +202,7 @@ def affine_epipolar(y: np.ndarray, samples: int = 300) -> tuple[np.ndarray, np.n
     if len(rows) < 12:
         return found, agree
     known = y[rows]
-    sets = known[np.random.default_rng(0).integers(0, len(rows), (samples, 4))]
+    sets = known[np.random.default_rng(0).integers(0, len(rows), (300, 4))]
     middle = sets.mean(axis=1, keepdims=True)
     normal = np.linalg.svd(sets - middle)[2][:, 3]
     distance = np.abs(normal @ known.T - (middle[:, 0] * normal).sum(axis=1, keepdims=True))
@@ -213,9 +215,9 @@ def affine_epipolar(y: np.ndarray, samples: int = 300) -> tuple[np.ndarray, np.n
     return found, agree
 
 
-def feature_epipolar_px(recording: Recording, rig: StereoRig, frames: int = 3) -> float:
+def feature_epipolar_px(recording: Recording, rig: StereoRig) -> float:
     """Median epipolar distance under the rig of features matched freely between left and right; NaN if they are too few."""
-    y = feature_matches(recording, _spread(len(recording), frames))
+    y = feature_matches(recording, spread(len(recording), 3))
     return float(np.median(np.abs(rig.epipolar_distance(y[:, :2], y[:, 2:])))) if len(y) else np.nan
 
 

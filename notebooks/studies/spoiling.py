@@ -209,7 +209,7 @@ def examine(take: Take) -> Result:
         missed = [calibration.pair.triangulate(*rig.project(take.points_mm)).x_mm - take.points_mm for rig in take.rigs]
         effect = max(float(np.sqrt((d**2).sum(axis=1).mean())) for d in missed) / sd
     diagnosis = diagnose(
-        take.data, calibration, kinematics=take.kinematics, offset_s=take.offset_s, readout_s=take.readout_s,
+        take.data, kinematics=take.kinematics, offset_s=take.offset_s, readout_s=take.readout_s,
         image_size_px=take.image_size_px,
     )  # fmt: skip
     verdict = judge(

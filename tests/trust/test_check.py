@@ -46,7 +46,8 @@ def detector(folder):
 
 
 def test_a_check_is_a_page_and_a_json(folder, detector, tmp_path):
-    found = check(folder, detector=detector, folder=tmp_path)
+    found = check(folder, detector=detector)
+    assert found.write(tmp_path) == tmp_path / "check.html"
     content = json.loads((tmp_path / "check.json").read_text(encoding="utf-8"))
     assert content["verdict"] == found.assessment.verdict.level and content["next_step"] == found.next_step
     assert {"folder", "coverage", "clock", "read-out", "tips", "detector"} <= set(content)

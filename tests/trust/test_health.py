@@ -69,7 +69,7 @@ def test_a_detector_that_changes_its_mind_is_told():
         moved = u + (37, 21) if mirrored else np.stack([1919 - u[..., 0], u[..., 1]], axis=-1)[:, [0, 2, 1]]
         return SimpleNamespace(u=moved + (400.0 if i == 3 and mirrored else 0.0))
 
-    looks = health(recording, data, detector=fixed, looks=6).parts["looks"]
+    looks = health(recording, data, detector=fixed).parts["looks"]
     assert calls == [(2, 1080, 1920, 3)] * 12 and (looks[3] > 1).all() and (looks[[0, 1, 2, 4, 5]] < 1e-6).all()
     assert len(LANDMARKS) == looks.shape[1]
 
