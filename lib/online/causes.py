@@ -28,7 +28,7 @@ class Explanation:
 
     Attributes:
         kind: "none", "moved", "optics", "exchanged", "clock", "slipped" or "open".
-        text: What happened, in a few words.
+        text: What happened, in a few words, where it is no motion.
         rig: That explains the landmarks; None where no rig does.
         motion: For "moved".
         loss: Of a row, the mean over the rows; see `CONVINCING`.
@@ -60,12 +60,9 @@ def explain(
     data = Correspondences.join(frames).complete
     motion = identify_motion(rig, data, covariance_px2=covariance_px2)
     least = min(motion.bic.values())
-    found = Explanation("moved", _MOVES.get(motion.moved, motion.moved), motion.rig, motion)
-    if motion.moved == "none":
-        found = Explanation("none", "", rig, motion)
-    others: list[tuple[float, Explanation]] = []
+    found = Explanation("none", "", rig) if motion.moved == "none" else Explanation("moved", "", motion.rig, motion)
     swapped = replace(data, u_left=data.u_right, u_right=data.u_left)
-    others.append((misfit(rig, swapped, covariance_px2), Explanation("exchanged", "the eyes are exchanged", rig)))
+    others = [(misfit(rig, swapped, covariance_px2), Explanation("exchanged", "the eyes are exchanged", rig))]
     late = _lateness(rig, frames, past, covariance_px2)
     if late is not None:
         others.append(late)
@@ -103,12 +100,6 @@ def misfit(rig: StereoRig, data: Correspondences, covariance_px2: np.ndarray, pa
         return np.inf
     chi2 = np.einsum("ni,ni->n", residual, np.linalg.solve(covariance_px2, residual[:, :, None])[:, :, 0])
     return float(8.0 * np.log1p(chi2 / 4.0).sum() + parameters * np.log(4.0 * len(data)))
-
-
-_MOVES = {
-    "shifted": "both cameras shifted", "together": "both cameras moved together", "left": "the left camera moved",
-    "right": "the right camera moved", "apart": "the cameras moved apart",
-}  # fmt: skip
 
 
 def _lateness(rig, frames, past, covariance_px2) -> tuple[float, Explanation] | None:

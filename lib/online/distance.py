@@ -8,8 +8,8 @@ triangulated landmarks measure it.  So the distances have the robot's small nois
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import ndtri
 
-from lib.cameras import StereoRig
 from lib.correspondences import LANDMARKS
 from lib.online.result import FrameResult, Settings
 from lib.online.tracker import RigTracker
@@ -45,24 +45,47 @@ class TipDistance:
         self._correction, self._time = np.zeros((len(LANDMARKS), 3)), float("nan")
         self._covariance = np.tile(self.settings.slip_mm**2 * np.eye(3), (len(LANDMARKS), 1, 1))
 
-    def measure(self, result: FrameResult, tracker: RigTracker, x_mm: np.ndarray, surface: Surface | None) -> None:
+    def measure(self, result: FrameResult, tracker: RigTracker, x_mm: np.ndarray, at: Surface | None) -> None:
         """Set the result's distances, standard deviations, approach and alarm.
 
         Args:
             x_mm: (3, 3) that the robot reports, NaN where it is silent or not to be believed.
-            surface: The newest.
+            at: The newest surface.
         """
         seen, covariance = self.triangulate(result, tracker)
         robot = np.isfinite(x_mm).all(axis=1)
         self._predict(result.time_s, x_mm)
         if result.state == "tracking":
             self._correct(seen - tracker.corrected(result.landmarks).x_mm, covariance * tracker.persistence)
-        position = np.where(robot[:, None], x_mm + self._correction, seen)
+        x = np.where(robot[:, None], x_mm + self._correction, seen)
         own = self._covariance + self.settings.robot_accuracy_mm**2 * np.eye(3)
         covariance = np.where(robot[:, None, None], own, covariance)
-        if surface is None or result.time_s - surface.time_s > self.settings.stale_s:
+        if at is None or result.time_s - at.time_s > self.settings.stale_s:
             return
-        result.approach_mm_s = self._distances(result, tracker.rig, position, covariance, surface, tracker)
+        surface, camera = at.reconstruction.surface, at.reconstruction.rig.left
+        found, view = surface.distance(x, camera), camera.viewing_direction
+        result.distance_mm, result.normal_mm = found.along_view_mm, found.along_normal_mm
+        drift = self.settings.eye_mm_s * max(result.time_s - at.time_s, 0.0)
+        rows = np.flatnonzero(np.isfinite(found.along_view_mm))
+        if not len(rows):
+            return
+        u = camera.project(x[rows])
+        slope = np.stack([surface.derivative(u, order) @ view for order in ((1, 0), (0, 1))], axis=1)
+        # How the distance along the view changes with the tip: the surface point behind it moves too.
+        towards = slope @ camera.linear - view
+        behind, nearest = np.split(surface.covariance(np.concatenate([u, found.nearest_u[rows]])), 2)
+        normal = surface.normal(found.nearest_u[rows])
+        # The calibration puts the surface beside the robot's points, and not the tip.
+        tip = covariance[rows] + tracker.point_covariance(x[rows])
+        for sd, direction, along, own in (
+            (result.distance_sd_mm, towards, np.broadcast_to(view, towards.shape), behind),
+            (result.normal_sd_mm, normal, normal, nearest),
+        ):
+            variance = np.einsum("ni,nij,nj->n", direction, tip, direction)
+            sd[rows] = np.sqrt(variance + np.einsum("ni,nij,nj->n", along, own, along) + drift**2)
+        result.approach_mm_s[rows] = -np.einsum("ni,ni->n", towards, self._velocity[rows])
+        result.margin_mm = -ndtri(self.settings.miss_rate) * result.distance_sd_mm
+        result.too_close = result.distance_mm < self.settings.alarm_mm + result.margin_mm
 
     @staticmethod
     def triangulate(result: FrameResult, tracker: RigTracker) -> tuple[np.ndarray, np.ndarray]:
@@ -91,30 +114,3 @@ class TipDistance:
             gain = self._covariance[k] @ np.linalg.inv(self._covariance[k] + noise[k])
             self._correction[k] += gain @ (gap[k] - self._correction[k])
             self._covariance[k] = (np.eye(3) - gain) @ self._covariance[k]
-
-    def _distances(
-        self, result: FrameResult, rig: StereoRig, x: np.ndarray, covariance: np.ndarray, at: Surface, tracker: RigTracker
-    ) -> np.ndarray:
-        """Fill in distances and their standard deviations; returns the speed of approach along the view (3,)."""
-        surface, camera = at.reconstruction.surface, at.reconstruction.rig.left
-        found, view = surface.distance(x, camera), camera.viewing_direction
-        result.distance_mm, result.normal_mm = found.along_view_mm, found.along_normal_mm
-        drift = self.settings.eye_mm_s * max(result.time_s - at.time_s, 0.0)
-        speed = np.full(len(x), np.nan)
-        rows = np.flatnonzero(np.isfinite(found.along_view_mm))
-        if not len(rows):
-            return speed
-        u = camera.project(x[rows])
-        slope = np.stack([surface.derivative(u, order) @ view for order in ((1, 0), (0, 1))], axis=1)
-        # How the distance along the view changes with the tip: the surface point behind it moves too.
-        towards = slope @ camera.linear - view
-        behind, nearest = np.split(surface.covariance(np.concatenate([u, found.nearest_u[rows]])), 2)
-        normal = surface.normal(found.nearest_u[rows])
-        # The calibration puts the surface beside the robot's points, and not the tip.
-        shared = tracker.point_covariance(x[rows])
-        for sd, direction, own in ((result.distance_sd_mm, towards, behind), (result.normal_sd_mm, normal, nearest)):
-            along = np.broadcast_to(view, direction.shape) if direction is towards else normal
-            variance = np.einsum("ni,nij,nj->n", direction, covariance[rows] + shared, direction)
-            sd[rows] = np.sqrt(variance + np.einsum("ni,nij,nj->n", along, own, along) + drift**2)
-        speed[rows] = -np.einsum("ni,ni->n", towards, self._velocity[rows])
-        return speed

@@ -16,6 +16,8 @@ from lib.recordings import Recording
 
 __all__ = ["Arrival", "Live", "recorded"]
 
+_WAITING = 4  # frames at most, for a pause of the machine; when another comes, the oldest is lost
+
 
 @dataclass(frozen=True, eq=False)
 class Arrival:
@@ -55,14 +57,13 @@ class Live:
 
     Args:
         arrivals: Decoded in a thread.
-        waiting: Frames that wait at most, for a pause of the machine; when another comes, the oldest is lost.
 
     Attributes:
         lost: Frames lost so far.
     """
 
-    def __init__(self, arrivals: Iterator[Arrival], *, waiting: int = 4) -> None:
-        self.lost, self._waiting, self._arrivals = 0, waiting, arrivals
+    def __init__(self, arrivals: Iterator[Arrival]) -> None:
+        self.lost, self._arrivals = 0, arrivals
 
     def __iter__(self) -> Iterator[Arrival]:
         ready, ended = queue.Queue(), threading.Event()
@@ -83,7 +84,7 @@ class Live:
                 due = start + arrival.time_s
                 if ended.wait(max(due - time.monotonic(), 0.0)):
                     return
-                while ready.qsize() >= self._waiting:
+                while ready.qsize() >= _WAITING:
                     with suppress(queue.Empty):  # taken meanwhile
                         ready.get_nowait()
                         self.lost += 1

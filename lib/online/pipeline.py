@@ -11,7 +11,7 @@ frames of the tool tell which camera moved and how (Sec. IV-C), or what else is 
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, Protocol, Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,24 +22,13 @@ from lib.correspondences import LANDMARKS, MIN_CONFIDENCE, Correspondences
 from lib.online.checks import FrameChecks
 from lib.online.distance import Surface, TipDistance
 from lib.online.result import FrameResult, Settings
-from lib.online.surface_worker import Beside, InTurn, SurfaceJob
+from lib.online.surface_worker import Beside, SurfaceJob, make
 from lib.online.tracker import RigTracker, Seen
 from lib.surface import Reconstruction, reconstruct
 
-__all__ = ["Detector", "OnlinePipeline"]
-
+__all__ = ["OnlinePipeline"]
 
 _DEPTH_MARGIN_MM = 0.5  # how far an eye may move along the view from one surface to the next
-
-
-class Detector(Protocol):
-    """`lib.landmarks.Detector`, or anything alike: `.u` (n, 3, 2), `.covariance`, `.confidence` of n images.
-
-    If it has a method `track(images, previous)`, frames after the first are given to that.  The memory of the images holds
-    the next frame later: a detector that keeps them needs a copy.
-    """
-
-    def __call__(self, images: np.ndarray) -> Any: ...
 
 
 class OnlinePipeline:
@@ -49,7 +38,9 @@ class OnlinePipeline:
     can.  `lib.online.STATES` says what each state means and what follows from it.
 
     Args:
-        detector: Images (2, h, w, 3) uint8 RGB to landmarks.
+        detector: `lib.landmarks.Detector`, or anything alike: images (2, h, w, 3) uint8 RGB to `.u` (2, 3, 2), `.covariance`
+            and `.confidence`.  If it has a method `track(images, previous)`, frames after the first are given to that.  The
+            memory of the images holds the next frame later: a detector that keeps them needs a copy.
         rig: A rig or a calibration to start from, which is kept until the cameras move; None calibrates from the first
             frames.
         noise_px: Standard deviation of a landmark's residual per coordinate, for a `rig` that is no calibration.
@@ -62,7 +53,7 @@ class OnlinePipeline:
     """
 
     def __init__(
-        self, detector: Detector, *, rig: StereoRig | Calibration | None = None, noise_px: float = 1.5,
+        self, detector: Callable[[np.ndarray], Any], *, rig: StereoRig | Calibration | None = None, noise_px: float = 1.5,
         settings: Settings | None = None, beside: bool = False, calibrate: Callable[..., Calibration] = calibrate,
         reconstruct: Callable[..., Reconstruction] = reconstruct,
     ) -> None:  # fmt: skip
@@ -75,14 +66,16 @@ class OnlinePipeline:
         self._smoothness: float | None = None
         self._asked = self._most_points = self._rig_since = 0  # surfaces; most points since the last search everywhere
         self._rests_on = dict.fromkeys(("landmarks", "robot"), float("nan"))
-        self.surfaces = Beside() if beside else InTurn(reconstruct)
+        self._beside, self._reconstruct = Beside() if beside else None, reconstruct
 
     def __enter__(self) -> Self:
-        self.surfaces.wait_ready()
+        if self._beside:
+            self._beside.wait_ready()
         return self
 
     def __exit__(self, *error: object) -> None:
-        self.surfaces.close()
+        if self._beside:
+            self._beside.close()
 
     @property
     def rig(self) -> StereoRig | None:
@@ -146,7 +139,6 @@ class OnlinePipeline:
         if tracker.rig is not None and reading:
             with result.stage("distance"):
                 self._tips.measure(result, tracker, x_mm, self._surface)
-                result.watch(self.settings)
         surface_s = self._surface.time_s if self._surface else float("nan")
         result.rests_on = self._rests_on | {"rig": tracker.rests_on_s, "surface": surface_s}
         return result
@@ -208,18 +200,25 @@ class OnlinePipeline:
         """Ask for a surface of this frame, and take the newest that is there."""
         tracker = self._tracker
         if tracker.doubted_since is not None or tracker.rig is None:
-            self.surfaces.forget()
+            if self._beside:
+                self._beside.forget()
             if self._surface is not None and (tracker.rig is None or self._surface.index >= tracker.doubted_since):
                 self._surface = None  # its cameras stood elsewhere
-        due = self._index % self.settings.surface_every == 0
+        done, due = [], self._index % self.settings.surface_every == 0
         if due and result.state in ("tracking", "unseen", "robot") and tracker.doubted_since is None:
             tool = result.landmarks.u_left, result.landmarks.u_right
             options = {"setting": self.settings.setting, "control": self.settings.control, "smoothness": self._smoothness}
             options |= {"u_landmarks": tool, "percentiles": (1, 99)} | self._where_to_search()
-            self.surfaces.submit(SurfaceJob(left, right, tracker.rig, self._index, result.time_s, options))
-        done, event = self.surfaces.collect()
-        if event:
-            result.failures["worker"] = event
+            job = SurfaceJob(left, right, tracker.rig, self._index, result.time_s, options)
+            if self._beside:
+                self._beside.submit(job)
+            else:
+                done = [make(job, self._reconstruct)]
+        if self._beside:
+            done, event = self._beside.collect()
+            result.dropped = self._beside.dropped
+            if event:
+                result.failures["worker"] = event
         for surface in done:
             for stage, seconds in surface.seconds.items():
                 result.seconds[stage] = result.seconds.get(stage, 0.0) + seconds
@@ -229,6 +228,5 @@ class OnlinePipeline:
                 # Chosen by held-out error once: the eye is the same in the next frame.
                 self._surface, self._smoothness = surface, surface.reconstruction.surface.fit.smoothness
                 self._most_points = max(self._most_points, len(surface.reconstruction.u))
-        result.dropped = self.surfaces.dropped
         if self._surface is not None:
             result.reconstruction, result.reconstructed_at = self._surface.reconstruction, self._surface.index

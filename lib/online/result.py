@@ -6,7 +6,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.special import ndtri
 
 from lib.cameras import StereoRig
 from lib.correspondences import LANDMARKS, Correspondences
@@ -143,11 +142,6 @@ class FrameResult:
     def reconstructed(self) -> bool:
         """True where the surface is this frame's own."""
         return self.reconstructed_at == self.index
-
-    def watch(self, settings: Settings) -> None:
-        """Set the alarm of each tip from its distance."""
-        self.margin_mm = -ndtri(settings.miss_rate) * self.distance_sd_mm
-        self.too_close = self.distance_mm < settings.alarm_mm + self.margin_mm
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:

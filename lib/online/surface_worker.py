@@ -1,10 +1,10 @@
-"""Where surfaces are made: in turn with the frames, or in a process beside them, the newest frame first."""
+"""Surfaces of stereo frames, also in a process beside the frames, the newest first."""
 
 import contextlib
 import multiprocessing
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing import shared_memory
 
 import numpy as np
@@ -13,7 +13,7 @@ from lib.cameras import StereoRig
 from lib.online.distance import Surface
 from lib.surface import Reconstruction, reconstruct
 
-__all__ = ["Beside", "InTurn", "SurfaceJob"]
+__all__ = ["Beside", "SurfaceJob", "make"]
 
 _PARTS_OF_MATCHING = {"mask": "match", "refine": "match"}
 
@@ -46,33 +46,6 @@ def make(job: SurfaceJob, reconstruct: Callable[..., Reconstruction] = reconstru
     return Surface(found, job.index, job.time_s, spent, failure)
 
 
-class InTurn:
-    """Makes each surface before the frame goes on: the same input gives the same output."""
-
-    def __init__(self, reconstruct: Callable[..., Reconstruction] = reconstruct) -> None:
-        self._reconstruct, self._done = reconstruct, []
-        self.dropped = 0
-
-    def wait_ready(self) -> None:
-        """Nothing to wait for."""
-
-    def submit(self, job: SurfaceJob) -> None:
-        """Take in a job."""
-        self._done.append(make(job, self._reconstruct))
-
-    def collect(self) -> tuple[list[Surface], str]:
-        """The surfaces made since the last call, oldest first, and what happened to the worker ("" = nothing)."""
-        done, self._done = self._done, []
-        return done, ""
-
-    def forget(self) -> None:
-        """Drop what is being made: its rig is not to be believed."""
-        self._done.clear()
-
-    def close(self) -> None:
-        """End."""
-
-
 class Beside:
     """Makes surfaces in a process of its own.  One job is in work, one waits; a newer one takes its place.
 
@@ -92,9 +65,9 @@ class Beside:
         theirs.close()
         self._in_work = False
 
-    def wait_ready(self, timeout_s: float = 60.0) -> None:
+    def wait_ready(self) -> None:
         """Until the process has started: before that it takes time from the frames."""
-        self._pipe.poll(timeout_s)
+        self._pipe.poll(60.0)
 
     def submit(self, job: SurfaceJob) -> None:
         """Take in a job; the one that waited is dropped."""
@@ -113,11 +86,11 @@ class Beside:
         pair = np.ndarray((2, *job.left.shape), np.uint8, self._memory.buf)
         pair[0], pair[1] = job.left, job.right
         with contextlib.suppress(OSError):  # a dead worker is found by `collect`
-            self._pipe.send((self._memory.name, pair.shape, job.rig, job.index, job.time_s, job.options))
+            self._pipe.send((self._memory.name, pair.shape, replace(job, left=None, right=None)))
         self._waiting, self._in_work, self._stale = None, True, False
 
     def collect(self) -> tuple[list[Surface], str]:
-        """As `InTurn.collect`; never waits."""
+        """The surfaces made since the last call, and what happened to the worker ("" = nothing); never waits."""
         done, event = [], ""
         try:
             while self._pipe.poll():
@@ -136,7 +109,7 @@ class Beside:
         return done, event
 
     def forget(self) -> None:
-        """Drop what waits and what is in work."""
+        """Drop what waits and what is in work: its rig is not to be believed."""
         self.dropped += self._waiting is not None
         self._waiting, self._stale = None, True
 
@@ -164,9 +137,9 @@ def _work(pipe: multiprocessing.connection.Connection) -> None:
         os.nice(10)
     pipe.send(None)
     with contextlib.suppress(EOFError, OSError, KeyboardInterrupt):
-        while (job := pipe.recv()) is not None:
-            name, shape, rig, index, time_s, options = job
+        while (sent := pipe.recv()) is not None:
+            name, shape, job = sent
             memory = shared_memory.SharedMemory(name=name)
             left, right = np.ndarray(shape, np.uint8, memory.buf).copy()
             memory.close()
-            pipe.send(make(SurfaceJob(left, right, rig, index, time_s, options)))
+            pipe.send(make(replace(job, left=left, right=right)))

@@ -175,7 +175,9 @@ class RigTracker:
         if monitor.score > _STANDS_OUT:
             self._doubtful.append(int(data.frame[0]))
             result.state, result.cause = "moved", f"this frame alone stands out ({monitor.score:.0f} sd)"
-            result.failures["robot"] = f"images and robot disagree by {self._gap_mm(data):.2f} mm in this frame: rejected"
+            gap = self.rig.triangulate(data.u_left, data.u_right).x_mm - data.x_mm
+            off = f"{np.nanmedian(np.linalg.norm(gap, axis=1)):.2f} mm"
+            result.failures["robot"] = f"images and robot disagree by {off} in this frame: rejected"
             return []
         if self._before is not None:  # registered, and made better
             self._since.append(frame)
@@ -185,10 +187,6 @@ class RigTracker:
         passed = [self._recent.popleft() for _ in range(len(self._recent) - n)]
         return [frame for frame in passed if int(frame.data.frame[0]) not in self._doubtful]
 
-    def _gap_mm(self, data: Correspondences) -> float:
-        gap = self.rig.triangulate(data.u_left, data.u_right).x_mm - data.x_mm
-        return float(np.nanmedian(np.linalg.norm(gap, axis=1)))
-
     def _resolve(self, result: FrameResult) -> None:
         """Explain the frames since, by a motion or by another cause; convinced only if the newest frames agree."""
         first, last = self.settings.registration_frames
@@ -197,10 +195,11 @@ class RigTracker:
         if len(newest) < first:
             return
         if self._held and self._fits(self.rig, newest):
-            return self._settle()
+            self._settle()
+            return
         if self._held and self._waiting % first:
             self._waiting += 1  # as it was: look again in a moment
-            return None
+            return
         frames = [self.corrected(frame.data) for frame in self._since]
         joined = Correspondences.join(frames).complete
         try:
@@ -212,9 +211,7 @@ class RigTracker:
         except ValueError as error:
             self.state, self._held = "moved", False
             # The oldest may be from before, or from during the motion.
-            self._since, self._waiting = self._since[max(len(self._since) - 2 * first, 0) :], self._waiting + 1
-            self._since = self._since[1:] if len(self._since) >= 2 * first else self._since
-            self.cause = str(error)
+            self._since, self._waiting, self.cause = self._since[1 - 2 * first :], self._waiting + 1, str(error)
             if self._waiting > self.settings.give_up_frames:
                 self._given = False
                 self._start_again(self._since, "no cause explains the images; calibrating afresh")
@@ -224,9 +221,9 @@ class RigTracker:
         elif shifted:
             self.state, self.cause = "robot" if found.kind != "exchanged" else "moved", found.text
             self._held, self._waiting, self.rig, self._motion = True, 1, self._before, self._motion_before
-            self._since, result.failures["robot"] = self._since[-first:][1:], found.text
+            self._since, result.failures["robot"] = self._since[1 - first :], found.text
         elif found.kind == "optics":
-            self._given, self._monitor = False, None
+            self._given = False
             self._start_again(self._since, found.text)
             result.failures["register"] = found.text
         elif found.kind == "none":
@@ -239,7 +236,6 @@ class RigTracker:
             self.rests_on_s, self.doubted_since = result.time_s, None
             if len(self._since) >= last:
                 self._settle()
-        return None
 
     def _settle(self) -> None:
         """What happened is over, or known well enough."""

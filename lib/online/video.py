@@ -22,7 +22,7 @@ class Dashboard:
     """Draws each frame as one image (720, 1280, 3) uint8 RGB; its curve shows the distances of the newest `frames`."""
 
     def __init__(self, frames: int = 250) -> None:
-        self._past: deque[FrameResult] = deque(maxlen=frames)
+        self._past: deque[tuple[np.ndarray, np.ndarray]] = deque(maxlen=frames)  # distances and their standard deviations
 
     def draw(self, left: np.ndarray, right: np.ndarray, result: FrameResult) -> np.ndarray:
         """The page of a frame."""
@@ -30,10 +30,7 @@ class Dashboard:
         for side, (image, u) in enumerate(((left, result.landmarks.u_left), (right, result.landmarks.u_right))):
             self._view(page[:360, 640 * side : 640 * (side + 1)], image, u)
         self._lights(page, result)
-        # Without reconstruction and rig: a few numbers are all that the curve needs.
-        past = FrameResult(result.index, result.time_s, result.state, distance_mm=result.distance_mm,
-                           distance_sd_mm=result.distance_sd_mm)  # fmt: skip
-        self._past.append(past)
+        self._past.append((result.distance_mm, result.distance_sd_mm))
         self._curve(page[420:, :860])
         self._times(page[420:, 880:], result)
         return page
@@ -57,7 +54,7 @@ class Dashboard:
         _text(page, f"{result.time_s:8.2f} s  {result.cause}"[:44], (930, 395))
 
     def _curve(self, part: np.ndarray) -> None:
-        known = np.array([r.distance_mm for r in self._past])
+        known = np.array([distance for distance, _ in self._past])
         top = max(float(np.nanmax(known, initial=0.5, where=np.isfinite(known))), 0.5) * 1.15
         height, width = part.shape[0] - 40, part.shape[1] - 70
 
@@ -69,8 +66,8 @@ class Dashboard:
             cv2.line(part, place(0, mm), place(self._past.maxlen, mm), (225, 225, 225), 1)
             _text(part, f"{mm:.1f}", (15, place(0, mm)[1] + 4))
         for k, name in enumerate(LANDMARKS):
-            for i, r in enumerate(self._past):
-                d, sd = r.distance_mm[k], r.distance_sd_mm[k]
+            for i, past in enumerate(self._past):
+                d, sd = past[0][k], past[1][k]
                 if np.isfinite(d) and np.isfinite(sd):
                     pale = tuple(int(200 + 0.2 * c) for c in LANDMARK_COLOURS[name])
                     cv2.line(part, place(i, d - 2 * sd), place(i, d + 2 * sd), pale, 2)
