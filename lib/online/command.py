@@ -16,7 +16,7 @@ from lib.online.feeds import Live, recorded
 from lib.online.pipeline import OnlinePipeline
 from lib.online.record import Recorder
 from lib.online.result import FrameResult, Settings
-from lib.online.video import Dashboard, VideoFile
+from lib.online.video import Dashboard, video_file
 from lib.recordings import Recording
 
 __all__ = ["Tally", "main"]
@@ -30,7 +30,6 @@ class Tally:
         latency_s: From a frame's arrival to its distance, of the newest 100,000 frames.
     """
 
-    frames: int = 0
     surfaces: int = 0
     dropped: int = 0
     states: Counter = field(default_factory=Counter)
@@ -42,7 +41,6 @@ class Tally:
 
     def add(self, result: FrameResult, latency_s: float) -> None:
         """Count a frame."""
-        self.frames += 1
         self.dropped = result.dropped
         if result.reconstructed_at is not None and result.reconstructed_at != self._newest:
             self.surfaces, self._newest = self.surfaces + 1, result.reconstructed_at
@@ -51,14 +49,13 @@ class Tally:
         self.latency_s.append(latency_s)
 
     def __str__(self) -> str:
-        spent, cpu = time.monotonic() - self.start, time.process_time() - self.cpu_start
+        n, spent, cpu = self.states.total(), time.monotonic() - self.start, time.process_time() - self.cpu_start
         median, late = 1e3 * np.quantile(self.latency_s or [np.nan], (0.5, 0.99))
         memory_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
         states = ", ".join(f"{state} {n}" for state, n in self.states.most_common())
         failures = ", ".join(f"{name} {n}" for name, n in self.failures.most_common()) or "none"
         return (
-            f"{self.frames} frames in {spent:.1f} s, {self.frames / spent:.1f} a second; "
-            f"processor {cpu / max(self.frames, 1):.3f} s a frame\n"
+            f"{n} frames in {spent:.1f} s, {n / spent:.1f} a second; processor {cpu / max(n, 1):.3f} s a frame\n"
             f"{self.surfaces} surfaces, {self.surfaces / spent:.1f} a second; {self.dropped} dropped\n"
             f"latency from frame to distance: {median:.0f} ms median, {late:.0f} ms 99th percentile\n"
             f"states: {states}\nfailures: {failures}\nmemory: at most {memory_mb:.0f} MB"
@@ -85,7 +82,7 @@ def main(argv: list[str] | None = None) -> int:
     frames = recorded(recording, a.frames)
     feed, recorder = Live(frames) if a.live else frames, None
     with contextlib.ExitStack() as stack:
-        video = stack.enter_context(VideoFile(a.video, min(recording.fps, 25.0))) if a.video else None
+        show = stack.enter_context(video_file(a.video, min(recording.fps, 25.0))) if a.video else None
         if a.record:
             recorder = Recorder(a.record, recording, patient=not a.live)
             stack.callback(recorder.close)
@@ -102,8 +99,8 @@ def main(argv: list[str] | None = None) -> int:
                 print(f"frame {result.index:6d} {name}: {why}", file=sys.stderr)
             if recorder:
                 recorder.add(arrival, result)
-            if video:
-                video.add(page.draw(arrival.left, arrival.right, result))
+            if show:
+                show(page.draw(arrival.left, arrival.right, result))
     print(tally)
     if a.live:
         print(f"frames lost before they were seen: {feed.lost}")

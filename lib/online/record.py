@@ -15,15 +15,7 @@ from lib.recordings import Recording
 
 __all__ = ["Recorder"]
 
-_SOURCES = ("landmarks", "robot", "rig", "surface")
-_QUANTITIES = ("distance_mm", "distance_sd_mm", "normal_mm", "normal_sd_mm", "approach_mm_s")
-#: Of frames.csv.  Times of stages stand in seconds.csv, so that a replay gives the same frames.csv, byte for byte.
-COLUMNS = [
-    "frame", "time_s", "state", "cause", *(f"{name}_{what}" for what in _QUANTITIES for name in LANDMARKS),
-    *(f"{name}_too_close" for name in LANDMARKS),
-    *(f"{side}_{name}_{axis}_px" for side in ("left", "right") for name in LANDMARKS for axis in "xy"),
-    *(f"rests_on_{source}_s" for source in _SOURCES), "drift", "moved", "surface_frame", "failures",
-]  # fmt: skip
+_QUANTITIES = ("distance_mm", "distance_sd_mm", "normal_mm", "normal_sd_mm", "approach_mm_s", "too_close")
 
 
 class Recorder:
@@ -71,7 +63,7 @@ class Recorder:
     def _work(self) -> None:
         try:
             paths = [self.folder / "frames.csv", self.folder / "seconds.csv", self.folder / "input" / "frames.csv"]
-            heads = COLUMNS, ["frame", *STAGES], ["frame", "time_s"]
+            heads = row(FrameResult(0)), ["frame", *STAGES], ["frame", "time_s"]
             files = [path.open("w", encoding="utf-8", newline="\n") for path in paths]
             try:
                 for file, head in zip(files, heads, strict=True):
@@ -79,8 +71,8 @@ class Recorder:
                 while (item := self._queue.get()) is not None:
                     arrival, cells, seconds = item
                     self._write_images(arrival)
-                    files[0].write(",".join(cells) + "\n")
-                    files[1].write(",".join([cells[0], *(f"{value:.6f}" for value in seconds)]) + "\n")
+                    files[0].write(",".join(cells.values()) + "\n")
+                    files[1].write(",".join([cells["frame"], *(f"{value:.6f}" for value in seconds)]) + "\n")
                     files[2].write(f"{self._count},{float(arrival.time_s)!r}\n")
                     self._count += 1
                     for file in files:
@@ -105,22 +97,24 @@ class Recorder:
                 target.with_suffix(".png").write_bytes(data.tobytes())
 
 
-def row(result: FrameResult) -> list[str]:
-    """The cells of a frame in frames.csv; numbers as Python writes them, so that equal text is an equal number."""
-    numbers = [
-        *(value for what in _QUANTITIES for value in getattr(result, what)),
-        *result.too_close.astype(float),
-        *np.stack([result.landmarks.u_left, result.landmarks.u_right]).ravel(),
-        *(result.rests_on.get(source, np.nan) for source in _SOURCES),
-        result.drift,
-    ]
-    failures = "; ".join(f"{name}: {why}" for name, why in result.failures.items())
-    surface = "" if result.reconstructed_at is None else str(result.reconstructed_at)
-    return [
-        str(result.index), repr(float(result.time_s)), result.state, _plain(result.cause),
-        *("" if np.isnan(value) else repr(float(value)) for value in numbers),
-        result.motion.moved if result.motion else "", surface, _plain(failures),
-    ]  # fmt: skip
+def row(result: FrameResult) -> dict[str, str]:
+    """Column of frames.csv -> cell of a frame; numbers as Python writes them, so that equal text is an equal number.
+
+    Times of stages stand in seconds.csv, so that a replay gives the same frames.csv, byte for byte.
+    """
+    numbers = {f"{name}_{what}": getattr(result, what)[k] for what in _QUANTITIES for k, name in enumerate(LANDMARKS)}
+    for side, u in (("left", result.landmarks.u_left), ("right", result.landmarks.u_right)):
+        numbers |= {f"{side}_{name}_{axis}_px": u[k, i] for k, name in enumerate(LANDMARKS) for i, axis in enumerate("xy")}
+    numbers |= {f"rests_on_{name}_s": result.rests_on.get(name, np.nan) for name in ("landmarks", "robot", "rig", "surface")}
+    numbers["drift"] = result.drift
+    return {
+        "frame": str(result.index), "time_s": repr(float(result.time_s)),
+        "state": result.state, "cause": _plain(result.cause),
+        **{name: "" if np.isnan(value) else repr(float(value)) for name, value in numbers.items()},
+        "moved": result.motion.moved if result.motion else "",
+        "surface_frame": "" if result.reconstructed_at is None else str(result.reconstructed_at),
+        "failures": _plain("; ".join(f"{name}: {why}" for name, why in result.failures.items())),
+    }  # fmt: skip
 
 
 def _plain(text: str) -> str:

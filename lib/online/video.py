@@ -1,8 +1,9 @@
 """The online system to watch: both views with landmarks, distances over time with their band, states, times of stages."""
 
 from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Self
 
 import cv2
 import numpy as np
@@ -10,7 +11,7 @@ import numpy as np
 from lib.correspondences import LANDMARK_COLOURS, LANDMARKS
 from lib.online.result import STAGES, STATES, FrameResult
 
-__all__ = ["Dashboard", "VideoFile"]
+__all__ = ["Dashboard", "video_file"]
 
 _SIZE = (1280, 720)
 _LIGHTS = dict(zip(STATES, ((120, 120, 120), (0, 170, 80), (90, 150, 230), (40, 40, 40), (240, 190, 60), (220, 60, 50)),
@@ -91,25 +92,13 @@ def _text(image: np.ndarray, text: str, at: tuple[int, int], colour: tuple[int, 
     cv2.putText(image, text, at, _FONT, 0.45, colour, 1, cv2.LINE_AA)
 
 
-class VideoFile:
-    """An MP4 file of pages; a context manager.
-
-    Raises:
-        ValueError: If the file cannot be written.
-    """
-
-    def __init__(self, path: str | Path, fps: float) -> None:
-        self.path = Path(path)
-        self._writer = cv2.VideoWriter(str(self.path), cv2.VideoWriter_fourcc(*"mp4v"), fps, _SIZE)
-        if not self._writer.isOpened():
-            raise ValueError(f"{self.path}: the video cannot be written; does the folder exist, does it end with .mp4?")
-
-    def __enter__(self) -> Self:
-        return self
-
-    def add(self, page: np.ndarray) -> None:
-        """A page of `Dashboard.draw`."""
-        self._writer.write(cv2.cvtColor(page, cv2.COLOR_RGB2BGR))
-
-    def __exit__(self, *error: object) -> None:
-        self._writer.release()
+@contextmanager
+def video_file(path: str | Path, fps: float) -> Iterator[Callable[[np.ndarray], None]]:
+    """A function that adds a page of `Dashboard.draw` to an MP4 file; a ValueError if the file cannot be written."""
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), fps, _SIZE)
+    if not writer.isOpened():
+        raise ValueError(f"{path}: the video cannot be written; does the folder exist, does it end with .mp4?")
+    try:
+        yield lambda page: writer.write(cv2.cvtColor(page, cv2.COLOR_RGB2BGR))
+    finally:
+        writer.release()

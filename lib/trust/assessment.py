@@ -12,7 +12,7 @@ from lib.correspondences import LANDMARKS, Correspondences
 from lib.landmarks import Detector, detect
 from lib.recordings import Recording
 from lib.trust.diagnosis import Diagnosis, diagnose
-from lib.trust.health import Health, feature_epipolar_px, health
+from lib.trust.health import Health, feature_matches, health, spread
 from lib.trust.verdict import Verdict, judge
 
 __all__ = ["Assessment", "assess", "report"]
@@ -58,8 +58,8 @@ def assess(
         calibration = calibrate(data, image_size_px=recording.image_size_px, **options)
     except ValueError as refused:
         error = refused
-    if calibration is not None:
-        epipolar_px = feature_epipolar_px(recording, calibration.pair)
+    if calibration is not None and len(y := feature_matches(recording, spread(len(recording), 3))):
+        epipolar_px = float(np.median(np.abs(calibration.pair.epipolar_distance(y[:, :2], y[:, 2:]))))
     diagnosis = diagnose(
         data, kinematics=recording.kinematics, offset_s=recording.offset_s, readout_s=recording.readout_s,
         image_size_px=recording.image_size_px,

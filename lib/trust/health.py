@@ -14,13 +14,10 @@ import cv2
 import numpy as np
 
 from lib.calibration import Calibration, with_offsets
-from lib.cameras import StereoRig
 from lib.correspondences import Correspondences
 from lib.recordings import Recording
 
-__all__ = [
-    "LIMITS", "Health", "affine_epipolar", "feature_epipolar_px", "feature_matches", "health", "spread", "unfamiliar",
-]  # fmt: skip
+__all__ = ["LIMITS", "Health", "affine_epipolar", "feature_matches", "health", "spread", "unfamiliar"]
 
 #: What a landmark of a frame may show of each part; see `Health.false_alarm_rate`.
 LIMITS = {
@@ -213,12 +210,6 @@ def affine_epipolar(y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         best = np.abs((known - middle) @ np.linalg.svd(known[kept] - middle)[2][3])
     found[rows], agree[rows] = best, kept
     return found, agree
-
-
-def feature_epipolar_px(recording: Recording, rig: StereoRig) -> float:
-    """Median epipolar distance under the rig of features matched freely between left and right; NaN if they are too few."""
-    y = feature_matches(recording, spread(len(recording), 3))
-    return float(np.median(np.abs(rig.epipolar_distance(y[:, :2], y[:, 2:])))) if len(y) else np.nan
 
 
 def feature_matches(recording: Recording, frames: np.ndarray) -> np.ndarray:

@@ -148,7 +148,7 @@ def judge(
         cure = f"The detector may not know this tool or light. {_OVERLAYS}, then {TRAIN_FURTHER}."
         found += _reason("health", health.unhealthy, text, cure, "detector_unfit")
     found += [Reason(doubt.name, LEVELS[1], doubt.text, doubt.cure) for doubt in doubts]
-    return Verdict.join([Verdict((reason,)) for reason in found])
+    return Verdict.join([Verdict(tuple(found))])
 
 
 def _reason(check: str, value: float, text: str, cure: str, name: str = "") -> list[Reason]:

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from lib import paths
-from lib.online import OnlinePipeline, Settings, command, record
+from lib.online import FrameResult, OnlinePipeline, Settings, command, record
 from lib.online.feeds import recorded
-from lib.online.record import COLUMNS, Recorder
-from lib.online.video import Dashboard, VideoFile
+from lib.online.record import Recorder, row
+from lib.online.video import Dashboard, video_file
 from lib.recordings import Recording
 from tests.online.world import World, make, run
 
@@ -55,11 +55,13 @@ def test_a_replay_gives_the_same_bytes(tmp_path, shipped):
     first, second = ((tmp_path / name / "frames.csv").read_bytes() for name in ("first", "second"))
     assert first == second
     lines = first.decode().splitlines()
-    assert lines[0].split(",") == COLUMNS
+    columns = list(row(FrameResult(0)))
+    assert lines[0].split(",") == columns and columns[:5] == ["frame", "time_s", "state", "cause", "base_distance_mm"]
+    assert columns[-4:] == ["drift", "moved", "surface_frame", "failures"] and len(columns) == 4 + 18 + 12 + 4 + 4
     assert len(lines) == 11
-    assert all(len(line.split(",")) == len(COLUMNS) for line in lines)
+    assert all(len(line.split(",")) == len(columns) for line in lines)
     assert lines[-1].split(",")[2] == "tracking"
-    assert float(lines[-1].split(",")[COLUMNS.index("tip_1_distance_mm")]) > 0
+    assert float(lines[-1].split(",")[columns.index("tip_1_distance_mm")]) > 0
     with pytest.raises(FileExistsError, match="not empty"):
         Recorder(tmp_path / "first", shipped)
 
@@ -84,15 +86,16 @@ def test_the_video_shows_every_state(tmp_path):
     world = World()
     results = run(make(world), world, 12)
     page, image = Dashboard(), np.full((216, 384, 3), 90, np.uint8)
-    with VideoFile(tmp_path / "run.mp4", 25.0) as video:
+    with video_file(tmp_path / "run.mp4", 25.0) as show:
         for result in results:
             drawn = page.draw(image, image, result)
             assert drawn.shape == (720, 1280, 3)
-            video.add(drawn)
+            show(drawn)
     film = cv2.VideoCapture(str(tmp_path / "run.mp4"))
     assert int(film.get(cv2.CAP_PROP_FRAME_COUNT)) == 12
     with pytest.raises(ValueError, match="cannot be written"):
-        VideoFile(tmp_path / "no" / "run.mp4", 25.0)
+        with video_file(tmp_path / "no" / "run.mp4", 25.0):
+            pass
 
 
 def test_the_command(tmp_path, shipped, monkeypatch, capsys):
