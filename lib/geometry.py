@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 __all__ = [
     "RigidTransform", "align_rotation", "cell_from_image", "finite_points", "image_from_cell", "pair_covariance", "points",
+    "precision",
 ]  # fmt: skip
 
 
@@ -88,6 +89,22 @@ def pair_covariance(covariance_px2: ArrayLike | Sequence[ArrayLike] | None, n: i
     if (variance <= 0).any() or (excess >= 0).any():
         raise ValueError("covariance_px2: every covariance must be positive definite.")
     return covariance
+
+
+def precision(covariance: np.ndarray, views: np.ndarray) -> np.ndarray:
+    """Inverses (1 or n, m, m) of covariances (1 or n, m, m) of which only the `views` (n, m / 2) bool count; zero elsewhere.
+
+    It is the limit of the inverse where the covariance of the other views grows beyond all bounds.
+    """
+    if views.all():
+        return np.linalg.inv(covariance)
+    row = slice(None)
+    if len(covariance) == 1:  # rows that share the views share the inverse
+        _, first, row = np.unique(views @ [1, 2][: views.shape[1]], return_index=True, return_inverse=True)
+        views = views[first]
+    used = np.repeat(views, 2, axis=1)
+    both = used[:, :, None] & used[:, None, :]
+    return np.where(both, np.linalg.inv(np.where(both, covariance, np.eye(used.shape[1]))), 0.0)[row]
 
 
 def align_rotation(moment: ArrayLike) -> np.ndarray:

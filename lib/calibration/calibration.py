@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lib.calibration.checks import extents
-from lib.calibration.models import Fit, Model, precision
+from lib.calibration.models import Fit
 from lib.cameras import AffineCamera, Camera, Points, Resection, StereoRig
 from lib.correspondences import Correspondences
-from lib.geometry import points
+from lib.geometry import points, precision
 
 __all__ = ["Calibration", "LandmarkOffsets"]
 
@@ -43,29 +43,23 @@ class Calibration:
     """Cameras, and how well they are known; `lib.calibration.calibrate` makes it.
 
     Attributes:
-        cameras, rig: One or two, near-affine if the model has 1/distance or radial distortion; the pair, None for one.
+        minimum: The fit to the inliers.
+        parameter_covariance: (p, p) of the model's own parameters.
         view_inliers: (n, cameras) bool, the views used, one row for each row given.
-        cost: The energy over the inliers (Eq. 3 as printed for ``paper``, else half the chi-square).
-        covariance, parameter_covariance: (8 cameras, 8 cameras) of the entries of the matrices M, row by row, left
-            first, in px^2, px^2/mm, px^2/mm^2; and (p, p) of the model's own parameters.
         sigma_u_px, sigma_x_mm: Noise levels, given or estimated; the RMS of the detector's scaled covariances where given.
         model, weighting, image_size_px: As asked for.
         x_mm, y_px, residuals_px: (n, 3), (n, m) and u - project(x), m = 2 cameras, robot error included; moved by the
             offsets.  NaN in rows that are not usable: a landmark is missing, or a tool with shut jaws has no axes.
         covariance_px2: Of the pixels: None, (1, m, m), or (n, m, m).
-        plan, minimum: The parsed model and its fit to the inliers.
         effective_rows: As how many rows of independent errors the inliers count: fewer where a landmark's errors are alike
             from frame to frame.  The covariances allow for that, and for a noise level that is estimated.
         detector_scale: By how much more than it claims the detector errs, 1 or more; `covariance_px2` allows for that.
         offsets: Constant offsets of the landmarks, None where they were not estimated.
     """
 
-    cameras: tuple[Camera, ...]
-    rig: StereoRig | None
-    view_inliers: np.ndarray
-    cost: float
-    covariance: np.ndarray
+    minimum: Fit
     parameter_covariance: np.ndarray
+    view_inliers: np.ndarray
     sigma_u_px: float
     sigma_x_mm: float
     residuals_px: np.ndarray
@@ -75,8 +69,6 @@ class Calibration:
     y_px: np.ndarray
     covariance_px2: np.ndarray | None
     image_size_px: tuple[int, int] | None
-    plan: Model
-    minimum: Fit
     effective_rows: float
     detector_scale: float
     offsets: LandmarkOffsets | None = None
@@ -84,7 +76,17 @@ class Calibration:
     @property
     def parameter_names(self) -> list[str]:
         """Names of the model's parameters, with units."""
-        return self.plan.parameter_names
+        return self.minimum.state.model.parameter_names
+
+    @cached_property
+    def cameras(self) -> tuple[Camera, ...]:
+        """One or two, near-affine if the model has 1/distance or radial distortion."""
+        return self.minimum.state.cameras()
+
+    @cached_property
+    def rig(self) -> StereoRig | None:
+        """The pair of cameras; None for a single one."""
+        return StereoRig(*self.cameras) if len(self.cameras) == 2 else None
 
     @property
     def pair(self) -> StereoRig:
@@ -92,6 +94,17 @@ class Calibration:
         if self.rig is None:
             raise ValueError("calibration: this needs a stereo pair, not a single camera; calibrate with [u_left, u_right].")
         return self.rig
+
+    @property
+    def cost(self) -> float:
+        """The energy over the inliers (Eq. 3 as printed for ``paper``, else half the chi-square)."""
+        return self.minimum.cost
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """(8 cameras, 8 cameras) of the entries of the matrices M, row by row, left first, in px^2, px^2/mm, px^2/mm^2."""
+        G = self.minimum.state.matrix_jacobian()
+        return G @ self.parameter_covariance @ G.T
 
     @property
     def inliers(self) -> np.ndarray:
@@ -117,8 +130,7 @@ class Calibration:
     def chi_square(self) -> tuple[float, int]:
         """Twice the likelihood energy over the inliers and its degrees of freedom; the two are alike where all is well."""
         _, _, weight, r = self.system
-        value = np.einsum("ni,nij,nj->", r, np.broadcast_to(weight, (len(r), *weight.shape[1:])), r)
-        return float(value), 2 * int(self.view_inliers.sum()) - len(self.parameter_names)
+        return float((r[:, None] @ weight @ r[:, :, None]).sum()), 2 * int(self.view_inliers.sum()) - len(self.parameter_names)
 
     @property
     def inverse_distance_per_mm(self) -> tuple[float, float]:
@@ -145,8 +157,7 @@ class Calibration:
 
     def derivatives(self, x_mm: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """Of the projections at x (n, 3): by the points (n, m, 3) and by the model's parameters (n, m, p)."""
-        _, J_x, J_c = self.minimum.state.evaluate(points(x_mm, 3, "x_mm") - self.minimum.state.reference)
-        return J_x, J_c @ self.plan.selection
+        return self.minimum.state.evaluate(points(x_mm, 3, "x_mm"))[1:]
 
     @cached_property
     def system(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -155,13 +166,11 @@ class Calibration:
         The inverse covariance and the residuals are zero in views that are not used.
         """
         _, J_x, J_c = self.minimum.state.evaluate(self.minimum.points)
+        J = J_x[:1] if self.minimum.state.model.is_affine else J_x
         noise = self.noise_px2[None] if self.covariance_px2 is None else self.covariance_px2
         noise = noise if len(noise) == 1 else noise[self.inliers]
-        J = J_x[:1] if self.plan.is_affine else J_x
-        views, S = self.view_inliers[self.inliers], noise + self.sigma_x_mm**2 * J @ np.swapaxes(J, 1, 2)
-        views = views[:1] if len(S) == 1 and views.all() else views
-        weight = precision(np.broadcast_to(S, (len(views), *S.shape[1:])), views)
-        return J_x, J_c @ self.plan.selection, weight, self.minimum.residuals
+        weight = precision(noise + self.sigma_x_mm**2 * J @ J.mT, self.view_inliers[self.inliers])
+        return J_x, J_c, weight, self.minimum.residuals
 
     def projection_covariance(self, x_mm: ArrayLike) -> np.ndarray:
         """(n, m, m) px^2 covariance of the projections of exact points, from the calibration's uncertainty alone."""

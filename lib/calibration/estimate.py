@@ -11,13 +11,12 @@ from numpy.typing import ArrayLike
 from lib.calibration import checks as refuse
 from lib.calibration.affine import Moments, affine_minimum, estimate_noise, noise_rms_px, paper_variances, regress
 from lib.calibration.calibration import Calibration
-from lib.calibration.models import Fit, Model, State, fit, precision
+from lib.calibration.models import Fit, Model, State, fit
 from lib.calibration.offsets import estimate_offsets, rows_axes
 from lib.calibration.robust import consensus
 from lib.calibration.scatter import sandwich
-from lib.cameras import StereoRig
 from lib.correspondences import Correspondences
-from lib.geometry import pair_covariance
+from lib.geometry import pair_covariance, precision
 from lib.least_squares import inverse
 
 __all__ = ["calibrate"]
@@ -165,8 +164,7 @@ def _scattered(found: Calibration, rows: Correspondences | None) -> Calibration:
     _, J, weight, r = found.system
     time = (None, None) if rows is None else (rows.frame[found.inliers], rows.landmark[found.inliers])
     known, effective = sandwich(J, weight, r, *time, np.zeros((J.shape[2], J.shape[2])))
-    G = found.minimum.state.matrix_jacobian() @ found.plan.selection
-    return replace(found, parameter_covariance=known, covariance=G @ known @ G.T, effective_rows=effective)
+    return replace(found, parameter_covariance=known, effective_rows=effective)
 
 
 def _spread_out(found: Calibration, usable: np.ndarray) -> Calibration:
@@ -227,8 +225,7 @@ def _calibrate(
             plan, x[inliers], y[inliers], views[inliers], rows_noise, weighting, known, centre
         )
         scale = 1.0 if noise is None else sigma_u / noise_rms_px(rows_noise)
-        state = minimum.state
-        f, J, _ = state.evaluate(x - state.reference, derivatives=False)
+        f, J, _ = minimum.state.evaluate(x, derivatives=False)
         residuals = y - f
         if final:
             break
@@ -242,22 +239,19 @@ def _calibrate(
         views = new
 
     true = sigma_u**2 * np.eye(m)[None] if rows_noise is None else scale**2 * rows_noise
-    parameter_covariance = _parameter_covariance(plan, minimum, true, sigma_x, *variances, views[inliers])
-    G = state.matrix_jacobian() @ plan.selection
-    cameras = state.cameras(plan)
-    rig = StereoRig(*cameras) if len(cameras) == 2 else None
-    if checks and rig is not None:
-        spread = refuse.extents(x[inliers])[2]
-        zoom = np.sqrt(np.abs(np.linalg.det(cameras[0].linear @ cameras[0].linear.T)) ** 0.5)
-        refuse.check_order(rig.linear, np.hypot(sigma_u / zoom, sigma_x) / (spread * np.sqrt(views.sum(axis=0).min() / 2)))
-    return Calibration(
-        cameras=cameras, rig=rig, view_inliers=views, cost=minimum.cost, covariance=G @ parameter_covariance @ G.T,
-        parameter_covariance=parameter_covariance, sigma_u_px=sigma_u, sigma_x_mm=sigma_x, residuals_px=residuals,
-        model=model, weighting=weighting, x_mm=x, y_px=y,
-        covariance_px2=None if noise is None else scale**2 * noise, detector_scale=scale,
-        image_size_px=None if image_size_px is None else tuple(image_size_px), plan=plan, minimum=minimum,
-        effective_rows=float(inliers.sum()),
+    found = Calibration(
+        minimum=minimum, parameter_covariance=_parameter_covariance(minimum, true, sigma_x, *variances, views[inliers]),
+        view_inliers=views, sigma_u_px=sigma_u, sigma_x_mm=sigma_x, residuals_px=residuals, model=model,
+        weighting=weighting, x_mm=x, y_px=y, covariance_px2=None if noise is None else scale**2 * noise,
+        image_size_px=None if image_size_px is None else tuple(image_size_px), effective_rows=float(inliers.sum()),
+        detector_scale=scale,
     )  # fmt: skip
+    if found.rig is not None and checks:
+        spread, A = found.extents_mm[2], found.rig.left.linear
+        zoom = np.sqrt(np.abs(np.linalg.det(A @ A.T)) ** 0.5)
+        sd_rad = np.hypot(sigma_u / zoom, sigma_x) / (spread * np.sqrt(views.sum(axis=0).min() / 2))
+        refuse.check_order(found.rig.linear, sd_rad)
+    return found
 
 
 def _minimise(
@@ -290,7 +284,7 @@ def _minimise(
             state = State.start(plan, start, reference, middles)
         else:
             state = minimum.state
-        minimum = fit(plan, state, x - reference, y, weigh, variance_x, views)
+        minimum = fit(state, x, y, weigh, variance_x, views)
         if known["sigma_x_mm"] is not None and known["sigma_u_px"] is not None:
             break
         residuals, A, parameters = minimum.residuals, minimum.state.A.reshape(m, 3), len(plan.parameter_names)
@@ -298,13 +292,13 @@ def _minimise(
 
 
 def _parameter_covariance(
-    plan: Model, minimum: Fit, noise: np.ndarray, sigma_x: float, weigh: np.ndarray, variance_x: float, views: np.ndarray
+    minimum: Fit, noise: np.ndarray, sigma_x: float, weigh: np.ndarray, variance_x: float, views: np.ndarray
 ) -> np.ndarray:
     """Inverse information; where the weights were not the noise's, the sandwich H^-1 G H^-1."""
     known = inverse(minimum.information)
     if np.allclose(weigh, noise, rtol=1e-9, atol=0) and np.isclose(variance_x, sigma_x**2, rtol=1e-9, atol=0):
         return known
     _, J_x, J_c = minimum.state.evaluate(minimum.points)
-    outer = J_x @ np.swapaxes(J_x, 1, 2)
-    WJ = precision(weigh + variance_x * outer, views) @ J_c @ plan.selection
+    outer = J_x @ J_x.mT
+    WJ = precision(weigh + variance_x * outer, views) @ J_c
     return known @ np.einsum("nip,nij,njq->pq", WJ, noise + sigma_x**2 * outer, WJ) @ known

@@ -10,7 +10,7 @@ A model is a base and options joined by "+":
     +radial       one radial distortion coefficient a camera
 
 "near_affine" is short for "zero_skew+distance".  A state moves by increments; every model is a selection matrix
-from its own increments to the increments of its free parameters, so one set of derivatives serves all.
+from its free parameters to the increments of all cameras, so one set of derivatives serves all.
 """
 
 from __future__ import annotations
@@ -19,12 +19,14 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from lib.cameras import AffineCamera, Camera, NearAffineCamera, normal_to, radial_derivative
+from lib.geometry import precision
 from lib.least_squares import minimise
 
-__all__ = ["Fit", "Model", "State", "fit", "precision"]
+__all__ = ["Fit", "Model", "State", "fit"]
 
 BASES = ("affine", "zero_skew", "square", "common_zoom")
 OPTIONS = ("distance", "distances", "radial")
@@ -85,12 +87,14 @@ class State:
     """Cameras about a reference point: u = c + v (1 + k |v|^2), v = (A (x - x0) + o - c) / (1 + rho r3.(x - x0)).
 
     Attributes:
+        model: Whose parameters the state moves by and the derivatives are taken by.
         A, offset: (cameras, 2, 3), and o (cameras, 2), the pixel of the reference point.
         rho, radial: (cameras,) 1/mm and 1/px^2.
         rotation, zoom: (cameras, 3, 3) and (cameras, 2), A = diag(zoom) rotation[:2]; None for the affine base.
         reference, centre: x0 (3,) mm and c (cameras, 2) px, fixed.
     """
 
+    model: Model
     A: np.ndarray
     offset: np.ndarray
     rho: np.ndarray
@@ -106,7 +110,7 @@ class State:
         c, zeros = model.cameras, np.zeros(model.cameras)
         A, offset = matrix[:, :3].reshape(c, 2, 3), (matrix[:, :3] @ reference + matrix[:, 3]).reshape(c, 2)
         if model.base == "affine":
-            return cls(A, offset, zeros, zeros, None, None, reference, centre)
+            return cls(model, A, offset, zeros, zeros, None, None, reference, centre)
         rotation, zoom = np.empty((c, 3, 3)), np.empty((c, 2))
         for i in range(c):
             # Polar factors: the orthonormal rows nearest to A's, whichever axis the skew came from.
@@ -118,11 +122,12 @@ class State:
             zoom = np.repeat(zoom.mean(axis=1, keepdims=True), 2, axis=1)
         elif model.base == "common_zoom":
             zoom = np.full((c, 2), zoom.mean())
-        return cls(zoom[:, :, None] * rotation[:, :2], offset, zeros, zeros, rotation, zoom, reference, centre)
+        A = zoom[:, :, None] * rotation[:, :2]
+        return cls(model, A, offset, zeros, zeros, rotation, zoom, reference, centre)
 
-    def moved(self, increments: np.ndarray) -> State:
-        """The state after full increments (cameras * k,)."""
-        d = increments.reshape(len(self.A), -1)
+    def moved(self, step: np.ndarray) -> State:
+        """The state after a step (p,) of the model's parameters."""
+        d = (self.model.selection @ step).reshape(len(self.A), -1)
         common = {"rho": self.rho + d[:, -2], "radial": self.radial + d[:, -1], "offset": self.offset + d[:, -4:-2]}
         if self.rotation is None:
             return replace(self, A=self.A + d[:, :6].reshape(-1, 2, 3), **common)
@@ -130,22 +135,22 @@ class State:
         zoom = self.zoom * np.exp(d[:, 3:5])
         return replace(self, A=zoom[:, :, None] * rotation[:, :2], rotation=rotation, zoom=zoom, **common)
 
-    def cameras(self, model: Model) -> tuple[Camera, ...]:
+    def cameras(self) -> tuple[Camera, ...]:
         """The cameras of the public interface."""
         found = []
         for A, o, rho, k, c in zip(self.A, self.offset, self.rho, self.radial, self.centre, strict=True):
             M = np.column_stack([A, o - A @ self.reference])
-            found.append(AffineCamera(M) if model.is_affine else NearAffineCamera(M, rho, c, self.reference, k))
+            found.append(AffineCamera(M) if self.model.is_affine else NearAffineCamera(M, rho, c, self.reference, k))
         return tuple(found)
 
-    def evaluate(self, x: np.ndarray, *, derivatives: bool = True) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Pixels y (n, m), dy/dx (n, m, 3) and dy/d(all increments) (n, m, cameras k) at x - x0 = `x` (n, 3)."""
-        n, c = len(x), len(self.A)
+    def evaluate(self, x_mm: np.ndarray, *, derivatives: bool = True) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Pixels y (n, m) of points (n, 3) mm, dy/dx (n, m, 3) and the derivatives by the model's parameters (n, m, p)."""
+        x, n, c = x_mm - self.reference, len(x_mm), len(self.A)
         if not (derivatives or self.rho.any() or self.radial.any()):
             A = self.A.reshape(-1, 3)
-            return x @ A.T + self.offset.ravel(), np.tile(A, (n, 1, 1)), np.zeros((n, 2 * c, 0))
-        k = 10 if self.rotation is None else 9
-        y, J_x, J_c = np.empty((n, 2 * c)), np.empty((n, 2 * c, 3)), np.zeros((n, 2 * c, k * c if derivatives else 0))
+            return x @ A.T + self.offset.ravel(), np.tile(A, (n, 1, 1)), np.empty((n, 2 * c, 0))
+        k = len(self.model.selection) // c
+        y, J_x, J_c = np.empty((n, 2 * c)), np.empty((n, 2 * c, 3)), np.zeros((n, 2 * c, k * c))
         for i in range(c):
             rows = slice(2 * i, 2 * i + 2)
             A, centre = self.A[i], self.centre[i]
@@ -155,52 +160,48 @@ class State:
             depth = x @ r_3
             ratio = (1.0 + self.rho[i] * depth)[:, None]
             v = (x @ A.T + (self.offset[i] - centre)) / ratio
-            dv_dx = (A - self.rho[i] * v[:, :, None] * r_3) / ratio[:, :, None]
-            bend = radial_derivative(v, self.radial[i]) if self.radial[i] else None
+            bend = radial_derivative(v, self.radial[i])
             square = (v**2).sum(axis=1, keepdims=True)
             y[:, rows] = centre + v * (1.0 + self.radial[i] * square)
-            J_x[:, rows] = dv_dx if bend is None else bend @ dv_dx
+            J_x[:, rows] = bend @ ((A - self.rho[i] * v[:, :, None] * r_3) / ratio[:, :, None])
             if not derivatives:
                 continue
-            dv = np.zeros((n, 2, k))
-            if self.rotation is None:
-                # d r3 = (I - r3 r3^T) (da1 x a2 + a1 x da2) / |a1 x a2|; v x (d q) = rho x.(d r3) v
-                flat = (x - depth[:, None] * r_3) / size
-                dv[:, 0, 0:3] = dv[:, 1, 3:6] = x
-                tilt = np.hstack([np.cross(A[1], flat), np.cross(flat, A[0])])  # x.(d r3) per entry of A
-                dv[:, :, :6] -= self.rho[i] * v[:, :, None] * tilt[:, None, :]
-            else:
-                R, zoom = self.rotation[i], self.zoom[i]
-                p = x @ R.T  # camera axes; a left increment turns p by delta x p
-                dv[:, 0, 1], dv[:, 0, 2] = zoom[0] * p[:, 2], -zoom[0] * p[:, 1]
-                dv[:, 1, 0], dv[:, 1, 2] = -zoom[1] * p[:, 2], zoom[1] * p[:, 0]
-                dv[:, 0, 3], dv[:, 1, 4] = zoom[0] * p[:, 0], zoom[1] * p[:, 1]
-                turn = np.stack([p[:, 1], -p[:, 0], np.zeros(n)], axis=1)  # third component of delta x p
-                dv[:, :, :3] -= self.rho[i] * v[:, :, None] * turn[:, None, :]
-            dv[:, 0, k - 4] = dv[:, 1, k - 3] = 1.0
-            dv[:, :, k - 2] = -v * depth[:, None]
-            dv /= ratio[:, :, None]
-            if bend is not None:
-                dv = bend @ dv
-            dv[:, :, k - 1] = v * square
-            J_c[:, rows, i * k : (i + 1) * k] = dv
-        return y, J_x, J_c
+            # By the entries of A: d r3 = (I - r3 r3^T) (da1 x a2 + a1 x da2) / |a1 x a2|
+            dv = np.zeros((n, 2, 6))
+            flat = (x - depth[:, None] * r_3) / size
+            dv[:, 0, 0:3] = dv[:, 1, 3:6] = x
+            tilt = np.hstack([np.cross(A[1], flat), np.cross(flat, A[0])])  # x.(d r3)
+            dv -= self.rho[i] * v[:, :, None] * tilt[:, None, :]
+            offset, distance = np.broadcast_to(np.eye(2), (n, 2, 2)), -(v * depth[:, None])[:, :, None]
+            dv = bend @ (np.concatenate([dv @ self._entries(i).reshape(6, -1), offset, distance], axis=2) / ratio[:, :, None])
+            J_c[:, rows, i * k : (i + 1) * k] = np.concatenate([dv, (v * square)[:, :, None]], axis=2)
+        return y, J_x, J_c @ self.model.selection if derivatives else np.empty((n, 2 * c, 0))
+
+    def _entries(self, i: int) -> np.ndarray:
+        """Derivatives of the entries of A[i] by its own 6 or 5 increments, (2, 3, 6 or 5)."""
+        if self.rotation is None:
+            return np.eye(6).reshape(2, 3, 6)
+        result = np.zeros((2, 3, 5))
+        turned = np.cross(np.eye(3)[:, None], self.rotation[i].T).T  # a left increment turns R by delta x R
+        result[:, :, :3] = self.zoom[i][:, None, None] * turned[:2]
+        result[0, :, 3], result[1, :, 4] = self.A[i]
+        return result
 
     def matrix_jacobian(self) -> np.ndarray:
-        """Derivative of the matrices' entries (8 a camera, row by row, left first) by the full increments."""
-        c = len(self.A)
-        plain = replace(self, rho=np.zeros(c), radial=np.zeros(c), centre=np.zeros((c, 2)))
-        J = plain.evaluate(np.vstack([np.eye(3), np.zeros(3)]))[2]
-        k = J.shape[2] // c
-        J[:, :, [i * k + j for i in range(c) for j in (k - 2, k - 1)]] = 0.0
-        columns = J[:3] - J[3]
-        offset = J[3] - np.tensordot(self.reference, columns, axes=1)
-        return np.concatenate([columns, offset[None]]).transpose(1, 0, 2).reshape(8 * c, -1)
+        """Derivatives of the matrices' entries (8 a camera, row by row, left first) by the model's parameters."""
+        blocks = []
+        for i in range(len(self.A)):
+            entries = self._entries(i)
+            block = np.zeros((2, 4, entries.shape[2] + 4))
+            block[:, :3, :-4], block[:, 3, :-4] = entries, -self.reference @ entries
+            block[:, 3, -4:-2] = np.eye(2)
+            blocks.append(block.reshape(8, -1))
+        return block_diag(*blocks) @ self.model.selection
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """A minimum: the state, the energy `cost`, the corrected points x~ - x0 (n, 3), and what uncertainty needs.
+    """A minimum: the state, the energy `cost`, the corrected points x~ (n, 3), and what uncertainty needs.
 
     The `residuals` (n, m) px are linearised, y - f(x~) - J (x - x~), so that their covariance is Sigma + v_x J J^T;
     `information` (p, p) is the Gauss-Newton Hessian in the model's parameters.
@@ -214,66 +215,45 @@ class Fit:
     converged: bool
 
 
-def precision(covariance: np.ndarray, views: np.ndarray) -> np.ndarray:
-    """Inverses (k, m, m) of covariances (k, m, m) of which only the `views` (k, cameras) bool are known; zero elsewhere.
-
-    It is the limit of the inverse where the covariance of the other views grows beyond all bounds.
-    """
-    if views.all():
-        return np.linalg.inv(covariance)
-    used = np.repeat(views, 2, axis=1)
-    both = used[:, :, None] & used[:, None, :]
-    return np.where(both, np.linalg.inv(np.where(both, covariance, np.eye(used.shape[1]))), 0.0)
-
-
 def settle(
-    state: State, x: np.ndarray, y: np.ndarray, noise: np.ndarray, variance_x: float, views: np.ndarray, linear: bool
+    state: State, x: np.ndarray, y: np.ndarray, noise: np.ndarray, variance_x: float, views: np.ndarray
 ) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
     """Best corrected points of a state: cost, linearised residuals (zero in views not used), x~, S^-1."""
-    points, rounds = x, 1 if linear or variance_x == 0 else 4
-    kinds, kind = views, slice(None)
-    if linear and len(noise) == 1:  # rows of equal covariance and equal views share one inverse
-        _, first, kind = np.unique(views @ [1, 2][: views.shape[1]], return_index=True, return_inverse=True)
-        kinds, kind = views[first], kind if len(first) > 1 else slice(None)
-    for _ in range(rounds):
+    points, linear = x, state.model.is_affine
+    for _ in range(1 if linear or variance_x == 0 else 4):
         f, J, _ = state.evaluate(points, derivatives=False)
-        if linear:
-            J = J[:1]
-        r = y - f - np.einsum("nij,nj->ni", np.broadcast_to(J, (len(x), *J.shape[1:])), x - points)
-        covariance = noise + variance_x * J @ np.swapaxes(J, 1, 2)
-        weight = precision(np.broadcast_to(covariance, (len(kinds), *covariance.shape[1:])), kinds)[kind]
+        J = J[:1] if linear else J
+        r = y - f - ((x - points)[:, None] @ J.mT)[:, 0]
+        weight = precision(noise + variance_x * J @ J.mT, views)
         white = (weight @ r[:, :, None])[:, :, 0]
-        points = x + variance_x * (np.swapaxes(J, 1, 2) @ white[:, :, None])[:, :, 0]
+        points = x + variance_x * (white[:, None] @ J)[:, 0]
     return 0.5 * float((r * white).sum()), np.where(np.repeat(views, 2, axis=1), r, 0.0), points, weight
 
 
-def fit(
-    model: Model, start: State, x: np.ndarray, y: np.ndarray, noise: np.ndarray, variance_x: float, views: np.ndarray
-) -> Fit:
+def fit(start: State, x: np.ndarray, y: np.ndarray, noise: np.ndarray, variance_x: float, views: np.ndarray) -> Fit:
     """Minimum of 1/2 sum (y - f(x~))^T noise^-1 (y - f(x~)) + |x~ - x|^2 / variance_x by Levenberg-Marquardt.
 
     Every point is eliminated exactly, which leaves residuals of covariance S = noise + variance_x J J^T and a system in the
-    camera parameters alone.  x (n, 3) is in mm from the state's reference, y (n, m) in px, noise (1 or n, m, m) in px^2; only
-    the `views` (n, cameras) bool count.
+    camera parameters alone.  x (n, 3) is in mm, y (n, m) in px, noise (1 or n, m, m) in px^2; only the `views` (n, cameras)
+    bool count.
     """
-    T = model.selection
     y = np.where(np.repeat(views, 2, axis=1), y, 0.0)
 
     def evaluate(state: State) -> tuple[float, tuple] | None:
         for A, rho in zip(state.A, state.rho, strict=True):
             normal = normal_to(A)
-            if rho and (1.0 + rho * (x @ normal) / np.linalg.norm(normal)).min() <= 0.05:
+            if rho and (1.0 + rho * ((x - state.reference) @ normal) / np.linalg.norm(normal)).min() <= 0.05:
                 return None  # a point lies behind the camera
-        cost, *work = settle(state, x, y, noise, variance_x, views, model.is_affine)
+        cost, *work = settle(state, x, y, noise, variance_x, views)
         return (cost, work) if np.isfinite(cost) else None
 
     def normal_equations(state: State, work: tuple) -> tuple[np.ndarray, np.ndarray]:
         r, settled, weight = work
-        J = state.evaluate(settled)[2] @ T
-        WJ = (np.broadcast_to(weight, (len(x), *weight.shape[1:])) @ J).reshape(-1, J.shape[2])
+        J = state.evaluate(settled)[2]
+        WJ = (weight @ J).reshape(-1, J.shape[2])
         return J.reshape(WJ.shape).T @ WJ, WJ.T @ r.ravel()
 
     with np.errstate(all="ignore"):  # a first step may be far too long: its energy is not finite, and it is shortened
-        found = minimise(start, evaluate, normal_equations, lambda state, step: state.moved(T @ step))
+        found = minimise(start, evaluate, normal_equations, State.moved)
     r, settled, _ = found.work
     return Fit(found.state, found.energy, r, settled, found.information, found.converged)

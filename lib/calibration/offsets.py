@@ -130,9 +130,8 @@ def estimate_offsets(
     full, effective = sandwich(np.concatenate([J_c, J], axis=2), weight, r, frame[rows], landmark[rows], prior)
     known, covariance = full[:p, :p], full[p:, p:]
     blocks = np.stack([covariance[j : j + size, j : j + size] for j in range(0, offset.size, size)])
-    G = found.minimum.state.matrix_jacobian() @ found.plan.selection
     learnt = LandmarkOffsets(offset, blocks, prior_sd, p_value)
-    return replace(found, parameter_covariance=known, covariance=G @ known @ G.T, effective_rows=effective, offsets=learnt)
+    return replace(found, parameter_covariance=known, effective_rows=effective, offsets=learnt)
 
 
 def _evidence(information: np.ndarray, gradient: np.ndarray, least: float) -> tuple[float, float]:

@@ -3,10 +3,10 @@
 import numpy as np
 
 from lib.calibration.calibration import Calibration
-from lib.calibration.models import precision
 from lib.calibration.robust import gate
 from lib.cameras import StereoRig
 from lib.correspondences import Correspondences
+from lib.geometry import precision
 from lib.least_squares import inverse
 
 __all__ = ["OnlineCalibration"]
@@ -43,7 +43,7 @@ class OnlineCalibration:
         used = data.seen & np.isfinite(data.x_mm).all(axis=1, keepdims=True)
         pixels, noise = np.hstack([data.u_left, data.u_right]), known.detection_covariance(data)
         x = np.where(used.any(axis=1, keepdims=True), data.x_mm, self._state.reference)
-        y, J_x, J = self._evaluate(x)
+        y, J_x, J = self._state.evaluate(x)
         r, S = np.where(np.repeat(used, 2, axis=1), pixels - y, 0.0), noise + variance_x * J_x @ J_x.mT
         expected = S + J @ self._covariance @ J.mT  # the rig is uncertain itself
         for side, view in enumerate((slice(0, 2), slice(2, 4))):
@@ -53,24 +53,20 @@ class OnlineCalibration:
             W = precision(S, used)
             # The derivatives belong to the corrected points, as in `fit`: those of noisy ones would flatten the depth.
             moved = variance_x * np.einsum("nij,nik,nk->nj", J_x, W, r)
-            y, J_x, J = self._evaluate(x + moved)
+            y, J_x, J = self._state.evaluate(x + moved)
             r = np.where(np.repeat(used, 2, axis=1), pixels - y + np.einsum("nij,nj->ni", J_x, moved), 0.0)
             WJ = W @ J
             self._information = self._information + np.einsum("nip,niq->pq", J, WJ)
             self._covariance = inverse(self._information)
-            self._state = self._state.moved(known.plan.selection @ (self._covariance @ np.einsum("nip,ni->p", WJ, r)))
+            self._state = self._state.moved(self._covariance @ np.einsum("nip,ni->p", WJ, r))
         return used
 
     def remains(self, x_mm: np.ndarray) -> np.ndarray:
         """(n,) of the variance of the calibration's projections of x_mm (n, 3), what the rows since then have left."""
-        J = self._evaluate(x_mm)[2]
+        J = self._state.evaluate(x_mm)[2]
         now, first = (np.einsum("nip,pq,niq->n", J, known, J) for known in (self._covariance, self._first))
         return now / first
 
-    def _evaluate(self, x_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        y, J_x, J_c = self._state.evaluate(x_mm - self._state.reference)
-        return y, J_x, J_c @ self._calibration.plan.selection
-
     def solve(self) -> StereoRig:
         """The rig of the rows so far."""
-        return StereoRig(*self._state.cameras(self._calibration.plan))
+        return StereoRig(*self._state.cameras())

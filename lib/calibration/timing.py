@@ -8,10 +8,10 @@ from numpy.typing import ArrayLike
 from scipy.interpolate import BSpline, make_lsq_spline
 
 from lib.calibration.affine import estimate_noise, regress
-from lib.calibration.models import precision
 from lib.calibration.robust import NoConsensusError, consensus
 from lib.calibration.scatter import sandwich
 from lib.correspondences import Correspondences
+from lib.geometry import precision
 from lib.recordings import Kinematics
 
 __all__ = ["Paths", "TimeOffset", "estimate_time_offset", "shift_misfits"]
@@ -134,7 +134,7 @@ def estimate_time_offset(
         matrix = np.vstack([regress(x[rows], y[rows, 2 * c : 2 * c + 2]) for c, rows in enumerate(views.T)])
         A, r = matrix[:, :3], np.where(used, y - x @ matrix[:, :3].T - matrix[:, 3], 0.0)
         sigma_u, sigma_x = estimate_noise(r[views.any(axis=1)], A, 4 * m, views[views.any(axis=1)])
-        W = precision(np.broadcast_to(sigma_u**2 * np.eye(m) + sigma_x**2 * A @ A.T, (len(x), m, m)), views)
+        W = np.broadcast_to(precision((sigma_u**2 * np.eye(m) + sigma_x**2 * A @ A.T)[None], views), (len(x), m, m))
         # Sweep [x, 1] out of the velocity's image: the cameras are fitted along with the offset.
         image = np.zeros_like(y)
         for c, rows in enumerate(views.T):

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from lib.cameras import AffineCamera, NearAffineCamera, StereoRig
 from lib.correspondences import Correspondences
-from lib.geometry import RigidTransform, pair_covariance
+from lib.geometry import RigidTransform, pair_covariance, precision
 from lib.least_squares import minimise
 from lib.registration.rigid import Registration, check_spread, motion_jacobian, register, sandwich
 
@@ -140,9 +140,7 @@ class _Observed:
     @cached_property
     def information(self) -> np.ndarray:
         """(n, 4, 4): where one image counts, the inverse of that image's own covariance."""
-        known = np.repeat(self.seen, 2, axis=1)
-        mask = known[:, :, None] & known[:, None, :]
-        return np.linalg.inv(np.where(mask, self.covariance, np.eye(4))) * mask
+        return np.broadcast_to(precision(self.covariance, self.seen), (len(self.x), 4, 4))
 
     @cached_property
     def dimension(self) -> np.ndarray:

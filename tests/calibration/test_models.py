@@ -27,22 +27,18 @@ def state(model, seed=0):
     if model.base == "affine":
         scale[:6] = 3.0
     scale[-4:-2], scale[-2], scale[-1] = 20.0, 4e-3, 3e-9
-    return start.moved(
-        model.selection
-        @ (model.selection.T @ (np.tile(scale, model.cameras) * rng.normal(size=increments * model.cameras)))
-    )
+    return start.moved(model.selection.T @ (np.tile(scale, model.cameras) * rng.normal(size=increments * model.cameras)))
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_jacobians_are_finite_differences(name):
     model = Model.parse(name, 2)
     at = state(model)
-    x = np.random.default_rng(1).uniform(-1, 1, (9, 3)) * [6, 4, 2]
-    _, J_x, J_c = at.evaluate(x)
-    J = J_c @ model.selection
+    x = at.reference + np.random.default_rng(1).uniform(-1, 1, (9, 3)) * [6, 4, 2]
+    _, J_x, J = at.evaluate(x)
     for j, name_j in enumerate(model.parameter_names):
         step = 1e-11 if "radial" in name_j else 1e-6 if "1/distance" in name_j else 1e-5
-        move = model.selection[:, j] * step
+        move = np.eye(J.shape[2])[j] * step
         numeric = (at.moved(move).evaluate(x)[0] - at.moved(-move).evaluate(x)[0]) / (2 * step)
         np.testing.assert_allclose(
             J[:, :, j], numeric, rtol=1e-6, atol=1e-6 * np.abs(numeric).max() + 1e-4, err_msg=name_j
@@ -58,11 +54,11 @@ def test_matrix_jacobian_is_a_finite_difference(name):
     at = state(model)
 
     def entries(s):
-        return np.concatenate([camera.matrix.ravel() for camera in s.cameras(model)])
+        return np.concatenate([camera.matrix.ravel() for camera in s.cameras()])
 
-    G = at.matrix_jacobian() @ model.selection
+    G = at.matrix_jacobian()
     for j in range(G.shape[1]):
-        move = model.selection[:, j] * 1e-6
+        move = np.eye(G.shape[1])[j] * 1e-6
         numeric = (entries(at.moved(move)) - entries(at.moved(-move))) / 2e-6
         np.testing.assert_allclose(G[:, j], numeric, rtol=1e-5, atol=1e-3)
 
@@ -84,9 +80,9 @@ def test_parameters_are_counted(name, cameras, count):
 def test_state_and_camera_project_alike():
     model = Model.parse("zero_skew+distances+radial", 2)
     at = state(model)
-    x = np.random.default_rng(1).uniform(-3, 3, (9, 3))
+    x = at.reference + np.random.default_rng(1).uniform(-3, 3, (9, 3))
     y = at.evaluate(x)[0]
-    projected = np.hstack([camera.project(x + at.reference) for camera in at.cameras(model)])
+    projected = np.hstack([camera.project(x) for camera in at.cameras()])
     np.testing.assert_allclose(y, projected, atol=1e-8)
 
 
@@ -97,14 +93,14 @@ def test_minimum_is_stationary(name):
     matrix = np.vstack([c.true_rig.left.matrix, c.true_rig.right.matrix])
     start = State.start(model, matrix, c.x_mm.mean(axis=0), np.tile([959.5, 539.5], (2, 1)))
     y = np.hstack([c.u_left, c.u_right])
-    data = (c.x_mm - c.x_mm.mean(axis=0), y, 2.25 * np.eye(4)[None], 1e-4, np.ones((60, 2), dtype=bool))
-    found = fit(model, start, *data)
+    data = (c.x_mm, y, 2.25 * np.eye(4)[None], 1e-4, np.ones((60, 2), dtype=bool))
+    found = fit(start, *data)
     assert found.converged
     sd = np.sqrt(np.diag(np.linalg.inv(found.information)))
     for j, s in enumerate(sd):
         for sign in (-1, 1):
-            moved = found.state.moved(model.selection[:, j] * sign * 0.01 * s)
-            assert settle(moved, *data, model.is_affine)[0] >= found.cost
+            moved = found.state.moved(np.eye(len(sd))[j] * sign * 0.01 * s)
+            assert settle(moved, *data)[0] >= found.cost
 
 
 def seen(rig, seed, n=200):
