@@ -109,6 +109,11 @@ class Correspondences:
         return np.isfinite([self.u_left, self.u_right]).all(axis=2).T & (self.confidence >= MIN_CONFIDENCE)
 
     @property
+    def stacked_px(self) -> np.ndarray:
+        """(n, 4) px of (u_left, u_right), NaN where an image does not show the landmark."""
+        return np.where(np.repeat(self.seen, 2, axis=1), np.hstack([self.u_left, self.u_right]), np.nan)
+
+    @property
     def is_complete(self) -> np.ndarray:
         """(n,) bool: both images show the landmark and the robot reports it."""
         return self.seen.all(axis=1) & np.isfinite(self.x_mm).all(axis=1)

@@ -1,6 +1,6 @@
 """Calibration of affine and near-affine cameras from a robot's kinematics, and how good it is (paper Sec. IV-A)."""
 
-from lib.calibration.affine import Moments, affine_minimum, dlt, paper_variances
+from lib.calibration.affine import affine_minimum, dlt, paper_variances
 from lib.calibration.calibration import Calibration, LandmarkOffsets
 from lib.calibration.estimate import calibrate
 from lib.calibration.export import write_opencv, write_ros
@@ -12,8 +12,7 @@ from lib.calibration.robust import CompetingCamerasError, NoConsensusError
 from lib.calibration.timing import TimeOffset, estimate_time_offset
 
 __all__ = [
-    "Calibration", "CompetingCamerasError", "LandmarkOffsets", "Moments", "NoConsensusError", "OnlineCalibration", "Optics",
-    "Pivot", "TimeOffset", "Tool", "ToolOffsets", "affine_minimum", "calibrate", "dlt", "estimate_time_offset",
-    "optics", "paper_variances", "pivot_calibration", "tool_offsets", "with_offsets", "write_opencv",
-    "write_ros",
+    "Calibration", "CompetingCamerasError", "LandmarkOffsets", "NoConsensusError", "OnlineCalibration", "Optics", "Pivot",
+    "TimeOffset", "Tool", "ToolOffsets", "affine_minimum", "calibrate", "dlt", "estimate_time_offset", "optics",
+    "paper_variances", "pivot_calibration", "tool_offsets", "with_offsets", "write_opencv", "write_ros",
 ]  # fmt: skip

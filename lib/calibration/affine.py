@@ -1,4 +1,4 @@
-"""The affine stereo problem in closed form: moments, DLT, the global minimum of Eq. (3), noise levels.
+"""The affine stereo problem in closed form: DLT, the global minimum of Eq. (3), noise levels.
 
 With y = (u_left, u_right) stacked, y = A x + t + noise.  Minimising the paper's Eq. (3) over the corrected pixels
 and points leaves E = 1/2 sum r^T S^-1 r with r = y - A x - t and S = v_u I + v_x A A^T, the same S for every point.
@@ -6,18 +6,17 @@ So E depends on the data only through their second moments, and its global minim
 (errors-in-variables, total least squares; Golub and Van Loan, "An analysis of the total least squares problem", 1980).
 """
 
-from dataclasses import dataclass
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.optimize import nnls
 
 from lib.calibration.checks import check_spread, stacked_rows
 from lib.cameras import AffineCamera
 
 __all__ = [
-    "AffineMinimum", "Moments", "affine_minimum", "dlt", "estimate_noise", "noise_rms_px", "paper_variances",
-    "regress",
+    "AffineMinimum", "affine_minimum", "dlt", "estimate_noise", "noise_rms_px", "paper_variances", "regress",
 ]  # fmt: skip
 
 
@@ -43,23 +42,6 @@ def regress(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return np.column_stack([A, y.mean(axis=0) - A @ mean])
 
 
-@dataclass(frozen=True, eq=False)
-class Moments:
-    """All that the affine problem needs of z = (pixels, points): number, mean (m + 3,) and sum of (z - mean)(z - mean)^T."""
-
-    weight: float
-    mean: np.ndarray
-    scatter: np.ndarray
-
-    @classmethod
-    def of(cls, x: np.ndarray, y: np.ndarray) -> Self:
-        """Moments of points x (n, 3) and stacked pixels y (n, m)."""
-        z = np.hstack([y, x])
-        mean = z.mean(axis=0)
-        z -= mean
-        return cls(float(len(z)), mean, z.T @ z)
-
-
 class AffineMinimum(NamedTuple):
     """The cameras [A, t] stacked as `matrix` (m, 4), and the energy `cost` there."""
 
@@ -67,15 +49,19 @@ class AffineMinimum(NamedTuple):
     cost: float
 
 
-def affine_minimum(moments: Moments, variance_u: float, variance_x: float) -> AffineMinimum:
+def affine_minimum(x: np.ndarray, y: np.ndarray, variance_u: float, variance_x: float) -> AffineMinimum:
     """Global minimum of 1/2 sum |y - A x~ - t|^2 / variance_u + |x~ - x|^2 / variance_x over A, t and every x~.
 
+    Positions x (n, 3) are in mm, stacked pixels y (n, m) in px, the variances in px^2 and mm^2.
     With z = (y / sigma_u, x / sigma_x) centred, the energy is the squared distance of the z to a 3-dimensional
     subspace, so the three leading eigenvectors of their scatter solve it: no initial value, no iteration.
-    The variances are in px^2 and mm^2; variance_x = 0 is plain least squares (DLT).
+    variance_x = 0 is plain least squares (DLT).
     """
-    m, scatter = len(moments.mean) - 3, moments.scatter
-    smallest = np.linalg.eigvalsh(scatter[m:, m:])[0] / moments.weight
+    z, m = np.hstack([y, x]), y.shape[1]
+    mean = z.mean(axis=0)
+    z -= mean
+    scatter = z.T @ z
+    smallest = np.linalg.eigvalsh(scatter[m:, m:])[0] / len(x)
     if variance_x <= 1e-14 * smallest:
         A = np.linalg.solve(scatter[m:, m:], scatter[m:, :m]).T
         cost = 0.5 * np.trace(scatter[:m, :m] - A @ scatter[m:, :m]) / variance_u
@@ -85,7 +71,7 @@ def affine_minimum(moments: Moments, variance_u: float, variance_x: float) -> Af
         leading = vectors[:, m:]
         A = np.linalg.solve(leading[m:].T, leading[:m].T).T * np.sqrt(variance_u / variance_x)
         cost = 0.5 * values[:m].sum()
-    return AffineMinimum(np.column_stack([A, moments.mean[:m] - A @ moments.mean[m:]]), float(max(cost, 0.0)))
+    return AffineMinimum(np.column_stack([A, mean[:m] - A @ mean[m:]]), float(max(cost, 0.0)))
 
 
 def paper_variances(sigma_u_px: float, sigma_x_mm: float) -> tuple[float, float]:
@@ -144,15 +130,9 @@ def estimate_noise(
     design = np.column_stack([np.ones(len(gain)), gain])
     for _ in range(50):
         root = np.sqrt(freedom) / np.maximum(design @ v, floor)
-        new, open_ = v.copy(), free.copy()
-        while open_.any():
-            scale = design[:, open_].max(axis=0)
-            target = (observed - design[:, ~open_] @ new[~open_]) * root
-            new[open_] = np.linalg.lstsq(design[:, open_] / scale * root[:, None], target, rcond=None)[0] / scale
-            below = np.flatnonzero(open_ & (new < least))
-            if not below.size:
-                break
-            new[below[-1]], open_[below[-1]] = least[below[-1]], False  # a bound binds, the robot's first
+        new = np.where(free, least, v)
+        target, scale = (observed - design @ new) * root, design[:, free].max(axis=0)
+        new[free] += nnls(design[:, free] / scale * root[:, None], target)[0] / scale
         if np.allclose(new, v, rtol=1e-10, atol=0.0):
             break
         v = new

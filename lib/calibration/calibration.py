@@ -130,7 +130,8 @@ class Calibration:
     def chi_square(self) -> tuple[float, int]:
         """Twice the likelihood energy over the inliers and its degrees of freedom; the two are alike where all is well."""
         _, _, weight, r = self.system
-        return float((r[:, None] @ weight @ r[:, :, None]).sum()), 2 * int(self.view_inliers.sum()) - len(self.parameter_names)
+        value = float((r[:, None] @ weight @ r[:, :, None]).sum())
+        return value, 2 * int(self.view_inliers.sum()) - len(self.parameter_names)
 
     @property
     def inverse_distance_per_mm(self) -> tuple[float, float]:

@@ -6,12 +6,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import chndtrix
 
-from lib.correspondences import Correspondences
-from lib.geometry import finite_points, points
+from lib.geometry import finite_points
 
 __all__ = [
     "check_duplicates", "check_images", "check_order", "check_spread", "check_units", "extents", "eyes_exchanged",
-    "seen_rows", "sides", "stacked_rows",
+    "sides", "stacked_rows",
 ]  # fmt: skip
 
 #: Zoom (px per mm) between a room camera and the resolution of light; what lies outside has the wrong unit.
@@ -26,23 +25,13 @@ def stacked_rows(x_mm: ArrayLike, u: Sequence[ArrayLike]) -> tuple[np.ndarray, n
     u = [u] if isinstance(u, np.ndarray) and u.ndim == 2 else list(u)
     if len(u) not in (1, 2):
         raise ValueError(f"u: expected [u_left, u_right] or [u], got {len(u)} arrays.")
-    y = [points(pixels, 2, name) for pixels, name in zip(u, _names(len(u)), strict=True)]
+    y = [finite_points(pixels, 2, name) for pixels, name in zip(u, _names(len(u)), strict=True)]
     for pixels, name in zip(y, _names(len(u)), strict=True):
         if len(pixels) != len(x):
             raise ValueError(f"{name}: {len(pixels)} points, x_mm has {len(x)}; correspondences go row by row.")
-        finite_points(pixels, 2, name)
     if len(x) < 4:
         raise ValueError(f"x_mm: {len(x)} points; an affine camera needs at least 4, better 50, not in one plane.")
     return x, np.hstack(y)
-
-
-def seen_rows(rows: Correspondences) -> tuple[np.ndarray, np.ndarray]:
-    """x (n, 3) and stacked pixels y (n, 4) of rows with a position, NaN in the view that does not show the landmark."""
-    pixels = zip(rows.seen.T, (rows.u_left, rows.u_right), strict=True)
-    y = np.hstack([np.where(seen[:, None], u, np.nan) for seen, u in pixels])
-    if len(rows) < 4:
-        raise ValueError(f"data: {len(rows)} rows are seen; an affine camera needs at least 4, better 50, not in one plane.")
-    return rows.x_mm, y
 
 
 def _names(cameras: int) -> list[str]:

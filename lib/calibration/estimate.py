@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lib.calibration import checks as refuse
-from lib.calibration.affine import Moments, affine_minimum, estimate_noise, noise_rms_px, paper_variances, regress
+from lib.calibration.affine import affine_minimum, estimate_noise, noise_rms_px, paper_variances, regress
 from lib.calibration.calibration import Calibration
 from lib.calibration.models import Fit, Model, State, fit
 from lib.calibration.offsets import estimate_offsets, rows_axes
@@ -82,7 +82,7 @@ def calibrate(
         data.check_detections()
         usable, axes = _usable_rows(data, offsets, weighting)
         rows = data.subset(usable)
-        x, y = refuse.seen_rows(rows)
+        x, y = rows.x_mm, rows.stacked_px
         if covariance_px2 is not None:
             noise = pair_covariance(covariance_px2, len(data))
             noise = noise[usable] if len(noise) > 1 else noise
@@ -112,7 +112,7 @@ def calibrate(
         estimate = partial(estimate_offsets, fitted, x, y, rows.landmark, frame=rows.frame, prior_sd=offset_prior_sd)
         found = estimate(axes=axes)
         if axes is not None:
-            found = _turned(found, lambda a: estimate(axes=a), lambda o: rows_axes(data, o)[usable], axes, rows.landmark)
+            found = _turned(found, estimate, data, usable, axes)
     return found if usable is None else _spread_out(found, usable)
 
 
@@ -136,20 +136,20 @@ def _usable_rows(data: Correspondences, offsets: bool | str | None, weighting: s
 
 
 def _turned(
-    found: Calibration, estimate: Callable[[np.ndarray], Calibration], axes_of: Callable[[np.ndarray], np.ndarray],
-    axes: np.ndarray, landmark: np.ndarray,
-) -> Calibration:  # fmt: skip
+    found: Calibration, estimate: Callable[..., Calibration], data: Correspondences, usable: np.ndarray, axes: np.ndarray
+) -> Calibration:
     """The calibration with the axes of the moved landmarks, if these explain the detections better than the reported ones.
 
     What a robot with a wrong tool reports is off in the axes of the true tool, and turns the axes of the reported one.
     """
     other = found
     for _ in range(3 if found.offsets.p_value < _SURE_OFFSETS else 0):
-        turned = axes_of(other.offsets.offset)
-        if np.einsum("nij,nj->ni", turned - axes, other.offsets.offset[landmark]).std() < _LEAST_TURN_MM:
+        offset = other.offsets.offset
+        turned = rows_axes(data, offset)[usable]
+        if np.einsum("nij,nj->ni", turned - axes, offset[data.landmark[usable]]).std() < _LEAST_TURN_MM:
             return found
         try:
-            other = estimate(turned)
+            other = estimate(axes=turned)
         except ValueError:  # no cameras fit them
             return found
     both = np.repeat(found.view_inliers & other.view_inliers, 2, axis=1)
@@ -267,7 +267,7 @@ def _minimise(
     ).reshape(-1, 2)  # fmt: skip
     start = np.vstack([regress(x[rows], y[rows, 2 * c : 2 * c + 2]) for c, rows in enumerate(views.T)])
     residuals = np.where(used, y - x @ start[:, :3].T - start[:, 3], 0.0)
-    moments, A, parameters = Moments.of(x, y) if whole else None, start[:, :3], 4 * m
+    A, parameters = start[:, :3], 4 * m
     levels, minimum = None, None
     for _ in range(3):
         before, levels = levels, estimate_noise(residuals, A, parameters, views, noise, **known)
@@ -279,7 +279,7 @@ def _minimise(
         if noise is not None and weighting != "paper":
             weigh = noise * (levels[0] / noise_rms_px(noise)) ** 2
         if whole and len(weigh) == 1 and np.allclose(weigh[0], variance_u * np.eye(m), rtol=1e-12, atol=0):
-            start = affine_minimum(moments, variance_u, variance_x).matrix
+            start = affine_minimum(x, y, variance_u, variance_x).matrix
         if minimum is None or (plan.is_affine and whole and len(weigh) == 1):
             state = State.start(plan, start, reference, middles)
         else:

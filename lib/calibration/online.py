@@ -41,7 +41,7 @@ class OnlineCalibration:
         """Fold in the rows of a frame; returns the views (n, 2) bool that were used, those the rig so far does not refuse."""
         known, variance_x = self._calibration, self._calibration.sigma_x_mm**2
         used = data.seen & np.isfinite(data.x_mm).all(axis=1, keepdims=True)
-        pixels, noise = np.hstack([data.u_left, data.u_right]), known.detection_covariance(data)
+        pixels, noise = data.stacked_px, known.detection_covariance(data)
         x = np.where(used.any(axis=1, keepdims=True), data.x_mm, self._state.reference)
         y, J_x, J = self._state.evaluate(x)
         r, S = np.where(np.repeat(used, 2, axis=1), pixels - y, 0.0), noise + variance_x * J_x @ J_x.mT

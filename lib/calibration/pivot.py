@@ -7,7 +7,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lib.calibration.affine import Moments, affine_minimum
+from lib.calibration.affine import regress
 from lib.cameras import AffineCamera
 from lib.geometry import RigidTransform
 
@@ -104,7 +104,7 @@ def pivot_calibration(robot_from_tool: Sequence[RigidTransform]) -> Pivot:
 
 
 def tool_offsets(
-    robot_from_tool: Sequence[RigidTransform], u: Sequence[ArrayLike], iterations: int = 100, *,
+    robot_from_tool: Sequence[RigidTransform], u: Sequence[ArrayLike], *,
     opening_rad: ArrayLike | None = None, turning: ArrayLike | None = None,
 ) -> ToolOffsets:  # fmt: skip
     """Landmark offsets and affine cameras together, from poses and images: y = A (R_i p_k + t_i) + o.
@@ -149,9 +149,9 @@ def tool_offsets(
     solution = np.linalg.lstsq(np.hstack([t / scale, np.ones((len(t), 1)), lifted]), pixels, rcond=1e-6)[0]
     A, B = solution[:3].T, solution[4:].reshape(q, 3, 3, -1)  # B: vector, row of R (with A), column (with p), pixel
     offset = np.einsum("kijm,mi->kj", B, A) / (A**2).sum() * scale
-    for _ in range(iterations):
+    for _ in range(100):
         x = np.einsum("nij,nj->ni", R, own @ offset) + t
-        matrix = affine_minimum(Moments.of(x, pixels), 1.0, 0.0).matrix
+        matrix = regress(x, pixels)
         r = pixels - x @ matrix[:, :3].T - matrix[:, 3]
         # Variable projection (Kaufman): the cameras are linear, so their columns are swept out of the offsets'.
         J = ((matrix[:, :3] @ R)[:, :, None] * own[:, None, :, None]).reshape(len(x), m, 3 * q)

@@ -9,6 +9,8 @@ H^-1 (J^T W R W J) H^-1 (Liang and Zeger, "Longitudinal data analysis using gene
 import numpy as np
 from scipy.special import chdtri, fdtri
 
+from lib.least_squares import inverse
+
 __all__ = ["sandwich"]
 
 _CORRELATIONS = np.array([0.0, 0.2, 0.4, 0.55, 0.7, 0.8, 0.88, 0.94, 0.97])
@@ -33,11 +35,10 @@ def sandwich(
     values, vectors = np.linalg.eigh(weight)
     root = (vectors * np.sqrt(np.maximum(values, 0.0))[:, None]) @ np.swapaxes(vectors, 1, 2)
     K, e = root @ J, (root @ r[:, :, None])[:, :, 0]
-    information = np.einsum("nip,niq->pq", K, K)
-    scale = 1.0 / np.sqrt(np.diag(information + prior))
-    inverse = np.linalg.inv((information + prior) * np.outer(scale, scale)) * np.outer(scale, scale)
+    information = np.einsum("nip,niq->pq", K, K) + prior
+    known = inverse(information)
     if frame is None:
-        return wider * inverse, float(n)
+        return wider * known, float(n)
     frames = np.unique(frame)
     step = np.median(np.diff(frames)) if len(frames) > 1 else 1.0
     groups = []  # rows of one landmark in one view, in the order of their frames
@@ -46,29 +47,26 @@ def sandwich(
             rows = np.flatnonzero((landmark == k) & seen[:, 2 * c])
             rows = rows[np.argsort(frame[rows], kind="stable")]
             groups.append((rows, slice(2 * c, 2 * c + 2), np.abs(np.subtract.outer(frame[rows], frame[rows])) / step))
-    chance, variance = _posterior(K, e, groups, inverse)
-    meat = np.zeros((p, p))
+    chance, variance = _posterior(K, e, groups, known)
+    meat = prior.copy()
     for rows, view, lag in groups:
-        R = np.einsum("t,tij->ij", chance * variance, _CORRELATIONS[:, None, None] ** lag) if len(rows) <= 600 else None
-        for i in (view.start, view.start + 1):
-            k = K[rows, i]
-            if R is not None:
-                meat += k.T @ (R @ k)
-            else:  # long recordings: what lies beyond a block is independent
-                for j in range(0, len(rows), 300):
-                    part = slice(j, j + 300)
-                    near = np.einsum("t,tij->ij", chance * variance, _CORRELATIONS[:, None, None] ** lag[part, part])
-                    meat += k[part].T @ near @ k[part]
-    covariance = inverse @ (meat + prior) @ inverse
-    ratio = np.linalg.slogdet(inverse * np.outer(1 / scale, 1 / scale))[1]
-    ratio -= np.linalg.slogdet(covariance * np.outer(1 / scale, 1 / scale))[1]
-    return wider * covariance, float(n * np.exp(min(ratio / p, 0.0)))
+        block = 300 if len(rows) > 600 else 600  # long recordings: what lies beyond a block is independent
+        for first in range(0, len(rows), block):
+            part = slice(first, first + block)
+            R = np.einsum("t,tij->ij", chance * variance, _CORRELATIONS[:, None, None] ** lag[part, part])
+            for i in (view.start, view.start + 1):
+                k = K[rows[part], i]
+                meat += k.T @ R @ k
+    sd = np.sqrt(np.diag(known))
+    unit = np.outer(sd, sd)
+    ratio = np.linalg.slogdet(information * unit)[1] - np.linalg.slogdet(meat * unit)[1]
+    return wider * known @ meat @ known, float(n * np.exp(min(ratio / p, 0.0)))
 
 
-def _posterior(K: np.ndarray, e: np.ndarray, groups: list[tuple], inverse: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _posterior(K: np.ndarray, e: np.ndarray, groups: list[tuple], known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Probability of each correlation, and the variance of the whitened residuals under it, 1 where they are independent."""
     p, likelihood, variance = K.shape[2], [], []
-    unit = np.linalg.cholesky(inverse)  # parameters in their own deviations
+    unit = np.linalg.cholesky(known)  # parameters in their own deviations
     both = np.concatenate([K, e[:, :, None]], axis=2)
     series = [(both[rows][:, view], np.diagonal(lag, 1)[:, None, None]) for rows, view, lag in groups]
     count = sum(values[..., 0].size for values, _ in series)

@@ -214,8 +214,7 @@ def shift_misfits(x: np.ndarray, y: np.ndarray, least_share: float = 0.6) -> np.
 def _rows(data: Correspondences | tuple) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Times (n,), frames (n,), landmarks (n,) and pixels (n, m), NaN = not seen, a row a landmark."""
     if isinstance(data, Correspondences):
-        y = np.where(np.repeat(data.seen, 2, axis=1), np.hstack([data.u_left, data.u_right]), np.nan)
-        return data.time_s, data.frame, data.landmark, y
+        return data.time_s, data.frame, data.landmark, data.stacked_px
     time, u = np.asarray(data[0], dtype=np.float64), [np.asarray(pixels, dtype=np.float64) for pixels in data[1]]
     u = [pixels[:, None] if pixels.ndim == 2 else pixels for pixels in u]
     if any(p.ndim != 3 or p.shape != (len(time), u[0].shape[1], 2) for p in u):

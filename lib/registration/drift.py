@@ -61,8 +61,6 @@ class DriftMonitor:
     [False, False, False, False, True]
     """
 
-    threshold = 1.0
-
     def __init__(self, rig: StereoRig, *, covariance_px2: ArrayLike, sigma_x_mm: float = 0.010) -> None:
         if not sigma_x_mm >= 0:
             raise ValueError(f"sigma_x_mm: must not be negative, got {sigma_x_mm}.")
@@ -113,7 +111,7 @@ class DriftMonitor:
         covariance, data = covariance + uncertain, data.subset(used)
         if not np.isfinite(covariance).all():
             raise ValueError("covariance_px2: must be finite for every landmark that both images show.")
-        residual = np.hstack([data.u_left, data.u_right]) - np.hstack(self.rig.project(data.x_mm))
+        residual = data.stacked_px - np.hstack(self.rig.project(data.x_mm))
         chi2 = 0.0
         if len(residual):
             weight = np.linalg.inv(covariance)
@@ -125,7 +123,7 @@ class DriftMonitor:
             rig_sd = np.sqrt(np.diag(self._axes @ uncertain.mean(axis=0) @ self._axes.T)) / sd
             self._add(np.append(self._axes @ _robust_mean(residual, weight) / sd, scatter), sd, np.append(rig_sd, 0.0))
         self.history.append((chi2, residual.size, self.statistic))
-        return self.statistic > self.threshold
+        return self.statistic > 1.0
 
     def _add(self, value: np.ndarray, sd: np.ndarray, rig_sd: np.ndarray) -> None:
         largest_bias = _LARGEST_BIAS_PX / np.append(sd, sd.min())

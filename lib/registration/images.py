@@ -134,8 +134,7 @@ class _Observed:
         covariance = pair_covariance(covariance_px2, len(data)) + sigma_x_mm**2 * rig.linear @ rig.linear.T
         # Rows and images that do not count get no information; what stands in them must only be finite.
         x = np.where(seen.any(axis=1, keepdims=True), data.x_mm, data.x_mm[seen.any(axis=1)].mean(axis=0))
-        y = np.where(np.repeat(seen, 2, axis=1), np.hstack([data.u_left, data.u_right]), 0.0)
-        return cls(x, y, covariance, seen, covariance_px2 is not None)
+        return cls(x, np.nan_to_num(data.stacked_px), covariance, seen, covariance_px2 is not None)
 
     @cached_property
     def information(self) -> np.ndarray:

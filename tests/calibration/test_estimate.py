@@ -6,7 +6,6 @@ from scipy.optimize import least_squares
 from scipy.stats import chi2
 
 from lib.calibration import (
-    Moments,
     affine_minimum,
     calibrate,
     dlt,
@@ -119,8 +118,7 @@ def test_constraints_hold_and_cost_grows_with_them():
 def test_minimum_is_stationary_and_below_least_squares():
     c = data(60, 6, sigma_x_mm=0.05, half_size_mm=(4, 3, 0.3))
     y = np.hstack([c.u_left, c.u_right])
-    moments = Moments.of(c.x_mm, y)
-    best = affine_minimum(moments, 2.25, 0.0025)
+    best = affine_minimum(c.x_mm, y, 2.25, 0.0025)
 
     def energy(matrix):
         r = y - c.x_mm @ matrix[:, :3].T - matrix[:, 3]
@@ -128,7 +126,7 @@ def test_minimum_is_stationary_and_below_least_squares():
         return 0.5 * np.einsum("ni,ij,nj->", r, np.linalg.inv(S), r)
 
     assert energy(best.matrix) == pytest.approx(best.cost, rel=1e-9)
-    assert best.cost < energy(affine_minimum(moments, 1.0, 0.0).matrix)
+    assert best.cost < energy(affine_minimum(c.x_mm, y, 1.0, 0.0).matrix)
     rng = np.random.default_rng(0)
     for _ in range(50):
         assert energy(best.matrix + rng.normal(size=(4, 4)) * 1e-3) > best.cost
