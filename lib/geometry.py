@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 __all__ = [
     "RigidTransform", "align_rotation", "cell_from_image", "finite_points", "image_from_cell", "pair_covariance", "points",
-    "precision",
+    "precision", "view_distances2",
 ]  # fmt: skip
 
 
@@ -105,6 +105,13 @@ def precision(covariance: np.ndarray, views: np.ndarray) -> np.ndarray:
     used = np.repeat(views, 2, axis=1)
     both = used[:, :, None] & used[:, None, :]
     return np.where(both, np.linalg.inv(np.where(both, covariance, np.eye(used.shape[1]))), 0.0)[row]
+
+
+def view_distances2(residual: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """Squared Mahalanobis distances (n, m / 2) of residuals (n, m), each view's by its own block of covariances (n, m, m)."""
+    r = residual.reshape(len(residual), -1, 2, 1)
+    own = np.stack([covariance[:, i : i + 2, i : i + 2] for i in range(0, residual.shape[1], 2)], axis=1)
+    return (r.mT @ np.linalg.solve(own, r))[..., 0, 0]
 
 
 def align_rotation(moment: ArrayLike) -> np.ndarray:

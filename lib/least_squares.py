@@ -33,7 +33,6 @@ class Minimum:
     energy: float
     work: Any
     information: np.ndarray
-    iterations: int
     converged: bool
 
 
@@ -69,8 +68,8 @@ def minimise(
     first = evaluate(start)
     if first is None:
         raise ValueError("start: the energy is not defined there.")
-    state, (energy, work), damping, converged, steps = start, first, 0.0, False, 0
-    while steps < iterations and not converged:
+    state, (energy, work), damping, converged = start, first, 0.0, False
+    for _ in range(iterations):
         information, gradient = normal_equations(state, work)
         scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
         values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
@@ -88,8 +87,9 @@ def minimise(
         else:
             converged = True  # no step lowers the energy: the floor of rounding
             break
-        steps += 1
         decrease, floor = energy - new[0], tolerance * energy + 1e-22
         state, (energy, work), damping = trial, new, damping / 30.0 if damping > 1e-9 else 0.0
-        converged = 0.5 * gradient @ step <= floor and decrease <= floor
-    return Minimum(state, energy, work, normal_equations(state, work)[0], steps, bool(converged))
+        if 0.5 * gradient @ step <= floor and decrease <= floor:
+            converged = True
+            break
+    return Minimum(state, energy, work, normal_equations(state, work)[0], converged)

@@ -16,7 +16,7 @@ from lib.calibration.offsets import estimate_offsets, rows_axes
 from lib.calibration.robust import consensus
 from lib.calibration.scatter import sandwich
 from lib.correspondences import Correspondences
-from lib.geometry import pair_covariance, precision
+from lib.geometry import pair_covariance, precision, view_distances2
 from lib.least_squares import inverse
 
 __all__ = ["calibrate"]
@@ -217,12 +217,11 @@ def _calibrate(
         views, gates = consensus(x, y, ransac_px, np.random.default_rng(seed), sigma_x_mm=sigma_x_mm)
     for rows in views.T:
         refuse.check_spread(x[rows], assumed_x)
-    centre = (np.asarray(image_size_px, dtype=float) - 1) / 2 if image_size_px is not None else None
     for last in (False, False, False, True):
         inliers = views.any(axis=1)
         rows_noise = noise if noise is None or len(noise) == 1 else noise[inliers]
-        minimum, (sigma_u, sigma_x), variances = _minimise(
-            plan, x[inliers], y[inliers], views[inliers], rows_noise, weighting, known, centre
+        minimum, (sigma_u, sigma_x) = _minimise(
+            plan, x[inliers], y[inliers], views[inliers], rows_noise, weighting, known, image_size_px
         )
         scale = 1.0 if noise is None else sigma_u / noise_rms_px(rows_noise)
         f, J, _ = minimum.state.evaluate(x, derivatives=False)
@@ -230,17 +229,23 @@ def _calibrate(
         if final:
             break
         # What looks like an outlier to an affine camera and equal noise may be neither: judge again by the model itself.
-        S = (sigma_u**2 * np.eye(m)[None] if noise is None else scale**2 * noise) + sigma_x**2 * J @ np.swapaxes(J, 1, 2)
-        S = np.stack([S[:, i : i + 2, i : i + 2] for i in range(0, m, 2)], axis=1)
-        r = residuals.reshape(n, -1, 2, 1)
-        new = (np.swapaxes(r, 2, 3) @ np.linalg.inv(S) @ r)[..., 0, 0] < gates  # NaN, not seen, is not below
+        S = (sigma_u**2 * np.eye(m)[None] if noise is None else scale**2 * noise) + sigma_x**2 * J @ J.mT
+        new = view_distances2(residuals, S) < gates  # NaN, not seen, is not below
         if last or (new == views).all() or new.sum() < views.sum():  # those that the minimum is of
             break
         views = new
 
-    true = sigma_u**2 * np.eye(m)[None] if rows_noise is None else scale**2 * rows_noise
+    parameter_covariance = inverse(minimum.information)
+    if weighting == "paper":  # its weights are not the noise's: the sandwich H^-1 G H^-1
+        variance_u, variance_x = paper_variances(sigma_u, sigma_x)
+        true = sigma_u**2 * np.eye(m) if noise is None else scale**2 * noise
+        _, J_x, J_c = minimum.state.evaluate(minimum.points)
+        outer = J_x @ J_x.mT
+        WJ = precision(variance_u * np.eye(m) + variance_x * outer, views[inliers]) @ J_c
+        G = np.einsum("nip,nij,njq->pq", WJ, true + sigma_x**2 * outer, WJ)
+        parameter_covariance = parameter_covariance @ G @ parameter_covariance
     found = Calibration(
-        minimum=minimum, parameter_covariance=_parameter_covariance(minimum, true, sigma_x, *variances, views[inliers]),
+        minimum=minimum, parameter_covariance=parameter_covariance,
         view_inliers=views, sigma_u_px=sigma_u, sigma_x_mm=sigma_x, residuals_px=residuals, model=model,
         weighting=weighting, x_mm=x, y_px=y, covariance_px2=None if noise is None else scale**2 * noise,
         image_size_px=None if image_size_px is None else tuple(image_size_px), effective_rows=float(inliers.sum()),
@@ -256,15 +261,16 @@ def _calibrate(
 
 def _minimise(
     plan: Model, x: np.ndarray, y: np.ndarray, views: np.ndarray, noise: np.ndarray | None, weighting: str,
-    known: dict[str, float | None], centre: np.ndarray | None,
-) -> tuple[Fit, tuple[float, float], tuple[np.ndarray, float]]:  # fmt: skip
-    """The minimum over the views (n, cameras) bool, the noise levels (sigma_u, sigma_x), and the variances used."""
+    known: dict[str, float | None], image_size_px: tuple[int, int] | None,
+) -> tuple[Fit, tuple[float, float]]:  # fmt: skip
+    """The minimum over the views (n, cameras) bool, and the noise levels (sigma_u, sigma_x)."""
     m, whole = y.shape[1], bool(views.all())
-    reference, used = x.mean(axis=0), np.repeat(views, 2, axis=1)
-    seen = np.where(used, y, np.nan)
-    middles = np.tile(centre, (m // 2, 1)) if centre is not None else (
-        (np.nanmax(seen, axis=0) + np.nanmin(seen, axis=0)) / 2
-    ).reshape(-1, 2)  # fmt: skip
+    used = np.repeat(views, 2, axis=1)
+    if image_size_px is not None:
+        centre = np.tile((np.asarray(image_size_px, dtype=float) - 1) / 2, (m // 2, 1))
+    else:
+        seen = np.where(used, y, np.nan)
+        centre = ((np.nanmax(seen, axis=0) + np.nanmin(seen, axis=0)) / 2).reshape(-1, 2)
     start = np.vstack([regress(x[rows], y[rows, 2 * c : 2 * c + 2]) for c, rows in enumerate(views.T)])
     residuals = np.where(used, y - x @ start[:, :3].T - start[:, 3], 0.0)
     A, parameters = start[:, :3], 4 * m
@@ -281,24 +287,11 @@ def _minimise(
         if whole and len(weigh) == 1 and np.allclose(weigh[0], variance_u * np.eye(m), rtol=1e-12, atol=0):
             start = affine_minimum(x, y, variance_u, variance_x).matrix
         if minimum is None or (plan.is_affine and whole and len(weigh) == 1):
-            state = State.start(plan, start, reference, middles)
+            state = State.start(plan, start, x.mean(axis=0), centre)
         else:
             state = minimum.state
         minimum = fit(state, x, y, weigh, variance_x, views)
         if known["sigma_x_mm"] is not None and known["sigma_u_px"] is not None:
             break
         residuals, A, parameters = minimum.residuals, minimum.state.A.reshape(m, 3), len(plan.parameter_names)
-    return minimum, levels, (weigh, variance_x)
-
-
-def _parameter_covariance(
-    minimum: Fit, noise: np.ndarray, sigma_x: float, weigh: np.ndarray, variance_x: float, views: np.ndarray
-) -> np.ndarray:
-    """Inverse information; where the weights were not the noise's, the sandwich H^-1 G H^-1."""
-    known = inverse(minimum.information)
-    if np.allclose(weigh, noise, rtol=1e-9, atol=0) and np.isclose(variance_x, sigma_x**2, rtol=1e-9, atol=0):
-        return known
-    _, J_x, J_c = minimum.state.evaluate(minimum.points)
-    outer = J_x @ J_x.mT
-    WJ = precision(weigh + variance_x * outer, views) @ J_c
-    return known @ np.einsum("nip,nij,njq->pq", WJ, noise + sigma_x**2 * outer, WJ) @ known
+    return minimum, levels

@@ -6,7 +6,7 @@ from lib.calibration.calibration import Calibration
 from lib.calibration.robust import gate
 from lib.cameras import StereoRig
 from lib.correspondences import Correspondences
-from lib.geometry import precision
+from lib.geometry import precision, view_distances2
 from lib.least_squares import inverse
 
 __all__ = ["OnlineCalibration"]
@@ -46,9 +46,7 @@ class OnlineCalibration:
         y, J_x, J = self._state.evaluate(x)
         r, S = np.where(np.repeat(used, 2, axis=1), pixels - y, 0.0), noise + variance_x * J_x @ J_x.mT
         expected = S + J @ self._covariance @ J.mT  # the rig is uncertain itself
-        for side, view in enumerate((slice(0, 2), slice(2, 4))):
-            chi2 = np.einsum("ni,nij,nj->n", r[:, view], np.linalg.inv(expected[:, view, view]), r[:, view])
-            used[:, side] &= chi2 < gate(100, 2)
+        used &= view_distances2(r, expected) < gate(100, 2)
         if used.any():
             W = precision(S, used)
             # The derivatives belong to the corrected points, as in `fit`: those of noisy ones would flatten the depth.

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from lib.cameras import AffineCamera, NearAffineCamera, StereoRig
 from lib.correspondences import Correspondences
-from lib.geometry import RigidTransform, pair_covariance, precision
+from lib.geometry import RigidTransform, pair_covariance, precision, view_distances2
 from lib.least_squares import minimise
 from lib.registration.rigid import Registration, check_spread, motion_jacobian, register, sandwich
 
@@ -158,9 +158,8 @@ def _register_both(rig: StereoRig, data: _Observed, loss: Loss) -> Registration:
     if loss == "squared" or not data.scale_known:
         return found
     for _ in range(3):  # one image may be wrong and the other right
-        r = (data.y - np.hstack(rig.project(found.transform.inverse().apply(data.x)))).reshape(-1, 2, 2, 1)
-        own = np.stack([data.covariance[:, :2, :2], data.covariance[:, 2:, 2:]], axis=1)
-        seen = data.seen & ((np.swapaxes(r, 2, 3) @ np.linalg.solve(own, r))[..., 0, 0] < _WRONG)
+        residual = data.y - np.hstack(rig.project(found.transform.inverse().apply(data.x)))
+        seen = data.seen & (view_distances2(residual, data.covariance) < _WRONG)
         if 2 * seen.sum() < data.seen.sum():  # then the motion is no motion together
             return found
         with suppress(ValueError):  # those left leave it open

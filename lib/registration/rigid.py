@@ -100,9 +100,13 @@ def register(x_source: ArrayLike, x_target: ArrayLike, *, loss: Literal["norm", 
     median = float(np.median(norm))
     weights = np.ones(len(x)) if loss == "squared" else 1.0 / np.maximum(norm, max(1e-6 * median, 1e-12))
     centre = weights @ y0 / weights.sum()
-    # The norm has no curvature to measure at a point: take that of sqrt(r^2 + s^2) with s of the size of the residuals.
-    smooth = np.inf if loss == "squared" else max(0.4 * median, 1e-12)
-    covariance = _covariance(x0 @ R.T + t - centre, residual, smooth)
+    curvature, pull = np.broadcast_to(np.eye(3), (len(x), 3, 3)), residual
+    if loss == "norm":  # it has no curvature to measure at a point: take that of sqrt(r^2 + s^2), s of the residuals' size
+        length = np.hypot(norm, max(0.4 * median, 1e-12))[:, None]
+        direction, pull = residual / length, residual / np.maximum(norm, 1e-300)[:, None]
+        curvature = (curvature - direction[:, :, None] * direction[:, None, :]) / length[:, None]
+    J = motion_jacobian(x0 @ R.T + t - centre)
+    covariance = sandwich((J.mT @ curvature @ J).sum(axis=0), np.einsum("nki,nk->ni", J, pull), 6)
     transform = RigidTransform(R, t + centre_y - R @ centre_x)
     cost = float(norm.sum() if loss == "norm" else (norm**2).sum())
     return Registration(transform, covariance, centre + centre_y, norm, weights / weights.max(), cost)
@@ -138,19 +142,6 @@ def _sum_of_norms(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]
         if iteration >= 8 and before[0] - cost[0] <= 1e-14 * cost[0] + floor:
             break
     return R, t
-
-
-def _covariance(offset: np.ndarray, residual: np.ndarray, smooth: float) -> np.ndarray:
-    """Of (omega, tau) where sum sqrt(r^2 + smooth^2) is least (smooth = inf: half the squares)."""
-    jacobian = motion_jacobian(offset)
-    curvature = np.broadcast_to(np.eye(3), (len(offset), 3, 3))
-    if np.isfinite(smooth):
-        length = np.sqrt((residual**2).sum(axis=1) + smooth**2)[:, None]
-        direction = residual / length
-        curvature = (curvature - direction[:, :, None] * direction[:, None, :]) / length[:, None]
-        residual = residual / np.maximum(np.linalg.norm(residual, axis=1), 1e-300)[:, None]
-    hessian = np.einsum("nki,nkl,nlj->ij", jacobian, curvature, jacobian)
-    return sandwich(hessian, np.einsum("nki,nk->ni", jacobian, residual), 6)
 
 
 def sandwich(hessian: np.ndarray, gradient: np.ndarray, parameters: float) -> np.ndarray:
