@@ -174,11 +174,6 @@ class RigidTransform:
         """``a_from_b.compose(b_from_c)`` is ``a_from_c``: `other` is applied first."""
         return RigidTransform(self.R @ other.R, self.R @ other.t + self.t)
 
-    @property
-    def matrix(self) -> np.ndarray:
-        """Homogeneous (4, 4)."""
-        return np.vstack([np.column_stack([self.R, self.t]), [0.0, 0.0, 0.0, 1.0]])
-
 
 def image_from_cell(u_cell: ArrayLike, stride: ArrayLike) -> np.ndarray:
     """Pixels of the finer grid from cells of the coarser: u = s * u_cell + (s - 1) / 2, per axis.

@@ -217,20 +217,20 @@ def _calibrate(
         views, gates = consensus(x, y, ransac_px, np.random.default_rng(seed), sigma_x_mm=sigma_x_mm)
     for rows in views.T:
         refuse.check_spread(x[rows], assumed_x)
+    claimed = np.eye(m)[None] if noise is None else noise
     for last in (False, False, False, True):
         inliers = views.any(axis=1)
         rows_noise = noise if noise is None or len(noise) == 1 else noise[inliers]
         minimum, (sigma_u, sigma_x) = _minimise(
             plan, x[inliers], y[inliers], views[inliers], rows_noise, weighting, known, image_size_px
         )
-        scale = 1.0 if noise is None else sigma_u / noise_rms_px(rows_noise)
+        scale = sigma_u / noise_rms_px(claimed if rows_noise is None else rows_noise)
         f, J, _ = minimum.state.evaluate(x, derivatives=False)
         residuals = y - f
         if final:
             break
         # What looks like an outlier to an affine camera and equal noise may be neither: judge again by the model itself.
-        S = (sigma_u**2 * np.eye(m)[None] if noise is None else scale**2 * noise) + sigma_x**2 * J @ J.mT
-        new = view_distances2(residuals, S) < gates  # NaN, not seen, is not below
+        new = view_distances2(residuals, scale**2 * claimed + sigma_x**2 * J @ J.mT) < gates  # NaN, not seen, is not below
         if last or (new == views).all() or new.sum() < views.sum():  # those that the minimum is of
             break
         views = new
@@ -238,18 +238,17 @@ def _calibrate(
     parameter_covariance = inverse(minimum.information)
     if weighting == "paper":  # its weights are not the noise's: the sandwich H^-1 G H^-1
         variance_u, variance_x = paper_variances(sigma_u, sigma_x)
-        true = sigma_u**2 * np.eye(m) if noise is None else scale**2 * noise
         _, J_x, J_c = minimum.state.evaluate(minimum.points)
         outer = J_x @ J_x.mT
         WJ = precision(variance_u * np.eye(m) + variance_x * outer, views[inliers]) @ J_c
-        G = np.einsum("nip,nij,njq->pq", WJ, true + sigma_x**2 * outer, WJ)
+        G = np.einsum("nip,nij,njq->pq", WJ, scale**2 * claimed + sigma_x**2 * outer, WJ)
         parameter_covariance = parameter_covariance @ G @ parameter_covariance
     found = Calibration(
         minimum=minimum, parameter_covariance=parameter_covariance,
         view_inliers=views, sigma_u_px=sigma_u, sigma_x_mm=sigma_x, residuals_px=residuals, model=model,
         weighting=weighting, x_mm=x, y_px=y, covariance_px2=None if noise is None else scale**2 * noise,
         image_size_px=None if image_size_px is None else tuple(image_size_px), effective_rows=float(inliers.sum()),
-        detector_scale=scale,
+        detector_scale=1.0 if noise is None else scale,
     )  # fmt: skip
     if found.rig is not None and checks:
         spread, A = found.extents_mm[2], found.rig.left.linear
@@ -281,9 +280,8 @@ def _minimise(
             levels = before
             break
         variance_u, variance_x = paper_variances(*levels) if weighting == "paper" else np.square(levels).tolist()
-        weigh = variance_u * np.eye(m)[None]
-        if noise is not None and weighting != "paper":
-            weigh = noise * (levels[0] / noise_rms_px(noise)) ** 2
+        claimed = np.eye(m)[None] if noise is None or weighting == "paper" else noise
+        weigh = variance_u * claimed / noise_rms_px(claimed) ** 2
         if whole and len(weigh) == 1 and np.allclose(weigh[0], variance_u * np.eye(m), rtol=1e-12, atol=0):
             start = affine_minimum(x, y, variance_u, variance_x).matrix
         if minimum is None or (plan.is_affine and whole and len(weigh) == 1):

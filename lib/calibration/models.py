@@ -90,7 +90,6 @@ class State:
         model: Whose parameters the state moves by and the derivatives are taken by.
         A, offset: (cameras, 2, 3), and o (cameras, 2), the pixel of the reference point.
         rho, radial: (cameras,) 1/mm and 1/px^2.
-        rotation, zoom: (cameras, 3, 3) and (cameras, 2), A = diag(zoom) rotation[:2]; None for the affine base.
         reference, centre: x0 (3,) mm and c (cameras, 2) px, fixed.
     """
 
@@ -99,41 +98,41 @@ class State:
     offset: np.ndarray
     rho: np.ndarray
     radial: np.ndarray
-    rotation: np.ndarray | None
-    zoom: np.ndarray | None
     reference: np.ndarray
     centre: np.ndarray
 
     @classmethod
     def start(cls, model: Model, matrix: np.ndarray, reference: np.ndarray, centre: np.ndarray) -> State:
         """From affine cameras, `matrix` (2 cameras, 4), brought to the model's base."""
-        c, zeros = model.cameras, np.zeros(model.cameras)
-        A, offset = matrix[:, :3].reshape(c, 2, 3), (matrix[:, :3] @ reference + matrix[:, 3]).reshape(c, 2)
-        if model.base == "affine":
-            return cls(model, A, offset, zeros, zeros, None, None, reference, centre)
-        rotation, zoom = np.empty((c, 3, 3)), np.empty((c, 2))
-        for i in range(c):
+        A, zeros = matrix[:, :3].reshape(-1, 2, 3), np.zeros(model.cameras)
+        offset = (matrix[:, :3] @ reference + matrix[:, 3]).reshape(-1, 2)
+        if model.base != "affine":
             # Polar factors: the orthonormal rows nearest to A's, whichever axis the skew came from.
-            left, sizes, right = np.linalg.svd(A[i], full_matrices=False)
-            rows = left @ right
-            rotation[i] = np.vstack([rows, np.cross(*rows)])
-            zoom[i] = np.diag(left @ np.diag(sizes) @ left.T)
-        if model.base == "square":
-            zoom = np.repeat(zoom.mean(axis=1, keepdims=True), 2, axis=1)
-        elif model.base == "common_zoom":
-            zoom = np.full((c, 2), zoom.mean())
-        A = zoom[:, :, None] * rotation[:, :2]
-        return cls(model, A, offset, zeros, zeros, rotation, zoom, reference, centre)
+            left, sizes, right = np.linalg.svd(A, full_matrices=False)
+            zoom = np.einsum("cij,cj,cij->ci", left, sizes, left)
+            tied = {"zero_skew": (), "square": 1, "common_zoom": (0, 1)}[model.base]
+            A = np.mean(zoom, axis=tied, keepdims=True)[:, :, None] * (left @ right)
+        return cls(model, A, offset, zeros, zeros, reference, centre)
+
+    @property
+    def zoom(self) -> np.ndarray:
+        """(cameras, 2) px/mm, of bases other than affine."""
+        return np.linalg.norm(self.A, axis=2)
+
+    @property
+    def rotation(self) -> np.ndarray:
+        """(cameras, 3, 3), of bases other than affine: A = diag(zoom) rotation[:2]."""
+        rows = self.A / self.zoom[:, :, None]
+        return np.concatenate([rows, np.cross(rows[:, :1], rows[:, 1:])], axis=1)
 
     def moved(self, step: np.ndarray) -> State:
         """The state after a step (p,) of the model's parameters."""
         d = (self.model.selection @ step).reshape(len(self.A), -1)
         common = {"rho": self.rho + d[:, -2], "radial": self.radial + d[:, -1], "offset": self.offset + d[:, -4:-2]}
-        if self.rotation is None:
+        if self.model.base == "affine":
             return replace(self, A=self.A + d[:, :6].reshape(-1, 2, 3), **common)
         rotation = Rotation.from_rotvec(d[:, :3]).as_matrix() @ self.rotation
-        zoom = self.zoom * np.exp(d[:, 3:5])
-        return replace(self, A=zoom[:, :, None] * rotation[:, :2], rotation=rotation, zoom=zoom, **common)
+        return replace(self, A=(self.zoom * np.exp(d[:, 3:5]))[:, :, None] * rotation[:, :2], **common)
 
     def cameras(self) -> tuple[Camera, ...]:
         """The cameras of the public interface."""
@@ -179,7 +178,7 @@ class State:
 
     def _entries(self, i: int) -> np.ndarray:
         """Derivatives of the entries of A[i] by its own 6 or 5 increments, (2, 3, 6 or 5)."""
-        if self.rotation is None:
+        if self.model.base == "affine":
             return np.eye(6).reshape(2, 3, 6)
         result = np.zeros((2, 3, 5))
         turned = np.cross(np.eye(3)[:, None], self.rotation[i].T).T  # a left increment turns R by delta x R
