@@ -154,15 +154,13 @@ def drift_chart(monitors: Mapping[str, DriftMonitor], shift_at: int) -> Figure:
     """Left: chi-square of each frame; right: the cumulative sum with its alarm level."""
     page, axes = figure(1, 2, width_in=12, height_in=3.8)
     colours = [COLOURS["baseline"], COLOURS["right"], COLOURS["ours"], COLOURS["paper"]]
-    top = 0.0
     for (name, monitor), colour in zip(monitors.items(), colours, strict=False):
         chi2, freedom, statistic = np.array(monitor.history).T
         axes[0].plot(chi2 / freedom, color=colour, linewidth=1.0, label=name)
         axes[1].plot(statistic, color=colour, label=name)
-        top = monitor.threshold
     axes[0].set(yscale="log", xlabel="frame", title="One frame: chi-square per degree of freedom")
-    axes[1].axhline(top, color="black", linestyle=":", linewidth=1)
-    axes[1].set(ylim=(0, 3 * top), xlabel="frame", title="Cumulative sum, and the alarm level")
+    axes[1].axhline(1.0, color="black", linestyle=":", linewidth=1)
+    axes[1].set(ylim=(0, 3), xlabel="frame", title="Cumulative sum, and the alarm level")
     for ax in axes:
         ax.axvline(shift_at - 0.5, color=COLOURS["truth"], linestyle="--", linewidth=1)
     axes[1].legend(loc="upper left")
