@@ -8,7 +8,7 @@ from typing import ClassVar, Protocol
 import cv2
 import numpy as np
 
-from lib.simulator.limits import check, not_negative, positive
+from lib.simulator.limits import check
 from lib.simulator.texture import EXTENT_MM, GAMMA, fundus_texture, pattern, photograph_texture
 
 __all__ = ["Eye", "Ground", "Scene"]
@@ -59,11 +59,11 @@ class Eye:
     turn_rad: float = 0.0
 
     def __post_init__(self) -> None:
-        positive(self, "radius_mm")
+        check(self, "radius_mm", lambda v: v > 0, "must be positive")
         check(self, "depth_mm", lambda v: 0 <= v < self.radius_mm, f"must lie between 0 and the radius {self.radius_mm}")
         check(self, "fold_mm", lambda v: 0 <= v <= 0.5, "must lie between 0 and 0.5 so that no fold hides another")
         check(self, "tilt_rad", lambda v: 0 <= v <= 0.3, "must lie between 0 and 0.3")
-        not_negative(self, "gloss")
+        check(self, "gloss", lambda v: v >= 0, "must not be negative")
         check(self, "texture_px", lambda v: v >= 64, "must be at least 64")
 
     @property
@@ -107,22 +107,17 @@ class Ground(Eye):
 
     Attributes:
         kind: "fundus", or the name of a pattern (`lib.simulator.texture`).
-        size_mm: Side of the square that one texture covers; its mirror images cover the rest.
+        extent_mm: Side of the square that one texture covers; its mirror images cover the rest.
         colours: Linear reflectances (k, 3), from dark to bright texture; none = a fundus in its own colours.
         over, over_share: A second texture that is mixed with the first, and its share.
     """
 
     border: ClassVar[int] = cv2.BORDER_REFLECT
     kind: str = "fundus"
-    size_mm: float = Eye.extent_mm
+    extent_mm: float = EXTENT_MM
     colours: tuple[tuple[float, float, float], ...] = ()
     over: str | None = None
     over_share: float = 0.4
-
-    @property
-    def extent_mm(self) -> float:
-        """As `Scene` wants it."""
-        return self.size_mm
 
     @property
     def film_seed(self) -> int:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lib.simulator.limits import check, not_negative, positive
+from lib.simulator.limits import check
 
 __all__ = ["MAX_PITCH_RAD", "MAX_ROLL_RAD", "MAX_TIP_RADIUS_MM", "Finish", "Forceps", "Instrument", "Jaw", "Nodes", "Pose"]
 
@@ -47,7 +47,7 @@ class Pose:
         check(self, "pitch_rad", lambda v: 0 <= v <= MAX_PITCH_RAD, f"must lie between 0 and {MAX_PITCH_RAD:.2f}")
         rule = f"beyond {MAX_ROLL_RAD:.2f} an image no longer tells tip_1 from tip_2"
         check(self, "roll_rad", lambda v: abs(v) <= MAX_ROLL_RAD, rule)
-        not_negative(self, "opening_mm")
+        check(self, "opening_mm", lambda v: v >= 0, "must not be negative")
 
     @property
     def microscope_from_tool(self) -> np.ndarray:
@@ -90,7 +90,7 @@ class Forceps:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        positive(self, "shaft_radius_mm jaw_length_mm jaw_radius_mm tip_radius_mm taper")
+        check(self, "shaft_radius_mm jaw_length_mm jaw_radius_mm tip_radius_mm taper", lambda v: v > 0, "must be positive")
         radii = self.tip_radius_mm, self.jaw_radius_mm, self.shaft_radius_mm
         if not radii[0] <= radii[1] <= radii[2]:
             raise ValueError(f"tip_radius_mm, jaw_radius_mm, shaft_radius_mm: must not decrease in this order, got {radii}.")

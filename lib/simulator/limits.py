@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-__all__ = ["check", "not_negative", "positive"]
+__all__ = ["check"]
 
 
 def check(settings: object, names: str, holds: Callable[[object], bool], rule: str) -> None:
@@ -17,13 +17,3 @@ def check(settings: object, names: str, holds: Callable[[object], bool], rule: s
         value = getattr(settings, name)
         if not holds(value):
             raise ValueError(f"{name}: {rule}, got {value}.")
-
-
-def positive(settings: object, names: str) -> None:
-    """`check` that each value is above zero."""
-    check(settings, names, lambda value: value > 0, "must be positive")
-
-
-def not_negative(settings: object, names: str) -> None:
-    """`check` that each value is zero or above."""
-    check(settings, names, lambda value: value >= 0, "must not be negative")

@@ -8,7 +8,7 @@ from scipy.interpolate import PchipInterpolator
 
 from lib.simulator.eye import Scene
 from lib.simulator.forceps import MAX_ROLL_RAD, Forceps, Pose
-from lib.simulator.limits import not_negative, positive
+from lib.simulator.limits import check
 
 __all__ = ["DURATIONS_S", "Motion"]
 
@@ -39,8 +39,8 @@ class Motion:
     def __post_init__(self) -> None:
         if self.kind not in DURATIONS_S:
             raise ValueError(f"motion: unknown kind {self.kind!r}; one of {', '.join(DURATIONS_S)}.")
-        positive(self, "duration_s")
-        not_negative(self, "tremor_mm")
+        check(self, "duration_s", lambda v: v > 0, "must be positive")
+        check(self, "tremor_mm", lambda v: v >= 0, "must not be negative")
 
     @cached_property
     def _parts(self) -> tuple[tuple[float, PchipInterpolator], ...]:

@@ -14,11 +14,10 @@ import numpy as np
 from lib.cameras import AffineCamera
 from lib.geometry import RigidTransform
 from lib.simulator.eye import Eye, Ground
-from lib.simulator.families import ASPECTS, FAR, SHIFTED, TRAINING
+from lib.simulator.families import ASPECTS, FAR, SHIFTED, TRAINING, beside, random_object
 from lib.simulator.forceps import Forceps, Instrument, Pose
 from lib.simulator.render import render_view
 from lib.simulator.rig import IMAGE_SIZE_PX, Microscope
-from lib.simulator.shapes import beside, random_object
 from lib.simulator.video import Video, compressed
 from lib.simulator.window import Window, in_image
 

@@ -11,7 +11,7 @@ from lib.geometry import RigidTransform
 from lib.recordings import Recording, RecordingWriter, Truth
 from lib.simulator.eye import Eye, Scene
 from lib.simulator.forceps import Forceps
-from lib.simulator.limits import check, not_negative
+from lib.simulator.limits import check
 from lib.simulator.motion import DURATIONS_S, Motion
 from lib.simulator.population import RESERVED_SEEDS, reserved_forceps
 from lib.simulator.render import View, render_pair
@@ -46,7 +46,7 @@ class Design:
     click_px: float = 1.0
 
     def __post_init__(self) -> None:
-        not_negative(self, "robot_accuracy_mm click_px")
+        check(self, "robot_accuracy_mm click_px", lambda v: v >= 0, "must not be negative")
         check(self, "dropout", lambda v: 0 <= v < 1, "a share, at least 0 and below 1")
 
 

@@ -4,20 +4,19 @@ Microscope frame: origin at the centre of the field on the focal plane, x right 
 image, z away from the cameras (into the eye), millimetres.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from lib.cameras import AffineCamera, NearAffineCamera, StereoRig
 from lib.geometry import RigidTransform
 from lib.simulator.lighting import Lighting
-from lib.simulator.limits import check, not_negative, positive
+from lib.simulator.limits import check
 from lib.simulator.video import Video
 
 __all__ = ["IMAGE_SIZE_PX", "ROBOT_FROM_MICROSCOPE", "Microscope", "reference_rig"]
 
 IMAGE_SIZE_PX = (1920, 1080)
-_PLAIN = Lighting()
 
 #: Where the reference microscope stands over the reference robot: any general pose would do.
 ROBOT_FROM_MICROSCOPE = RigidTransform.from_rotation_vector((0.15, 2.90, -0.25), (12.0, -7.0, 35.0))
@@ -62,16 +61,16 @@ class Microscope:
     jpeg_quality: int | None = 92
     inverse_distance_per_mm: float = 0.0
     fps: float = 25.0
-    lighting: Lighting = _PLAIN
+    lighting: Lighting = field(default_factory=Lighting)
     video: Video | None = None
 
     def __post_init__(self) -> None:
         if min(self.image_size_px) < 16:
             raise ValueError(f"image_size_px: must be at least 16 x 16, got {self.image_size_px}.")
         check(self, "depth_of_field_mm", lambda v: v > 0, "must be positive (infinity switches defocus off)")
-        not_negative(self, "psf_px exposure_s readout_s vignetting read_noise brightness")
+        check(self, "psf_px exposure_s readout_s vignetting read_noise brightness", lambda v: v >= 0, "must not be negative")
         check(self, "full_well", lambda v: v > 0, "must be positive (infinity switches noise off)")
-        positive(self, "spot_radius_mm fps")
+        check(self, "spot_radius_mm fps", lambda v: v > 0, "must be positive")
         check(self, "jpeg_quality", lambda v: v is None or 0 <= v <= 100, "must lie between 0 and 100 or be None")
         check(self, "inverse_distance_per_mm", lambda v: -0.05 < v < 0.05, "the working distance must exceed 20 mm")
         check(self, "pixels_per_mm", lambda v: min(v) > 0, "must be positive")

@@ -12,7 +12,7 @@ import numpy as np
 
 from lib.simulator.forceps import MAX_TIP_RADIUS_MM, Forceps, Instrument, Nodes, Pose
 from lib.simulator.rig import Microscope
-from lib.simulator.window import Window, blur, blur_by_depth, in_image, motion_kernel
+from lib.simulator.window import Window, blur, blur_by_depth, in_image, motion_blur
 
 __all__ = ["ToolInView", "ToolRaster", "compose", "rasterise", "tool_in_view"]
 
@@ -223,9 +223,7 @@ def compose(
         layer = blur_by_depth(layer, sigma)
     else:
         layer = blur(layer, microscope.psf_px)
-    kernel = motion_kernel(shift)
-    if kernel is not None:
-        layer = cv2.filter2D(layer, -1, kernel)
+    layer = motion_blur(layer, shift)
     target = linear[y0 - pad[0] : y0 + height + pad[1], x0 - pad[2] : x0 + width + pad[3]]
     target *= 1 - layer[..., 3:]
     target += layer[..., :3]

@@ -13,7 +13,7 @@ import numpy as np
 from lib.cameras import AffineCamera, NearAffineCamera
 from lib.simulator.eye import Scene
 
-__all__ = ["Grid", "Window", "blur", "blur_by_depth", "in_image", "intersect", "motion_kernel", "surface_grid"]
+__all__ = ["Grid", "Window", "blur", "blur_by_depth", "in_image", "intersect", "motion_blur", "surface_grid"]
 
 
 _Camera = AffineCamera | NearAffineCamera
@@ -169,11 +169,11 @@ def blur_by_depth(image: np.ndarray, sigma_px: np.ndarray, grid: Grid | None = N
     return result
 
 
-def motion_kernel(shift_px: np.ndarray) -> np.ndarray | None:
-    """A centred box along the movement (2,) px during the exposure, or None if it is too short to see."""
+def motion_blur(image: np.ndarray, shift_px: np.ndarray) -> np.ndarray:
+    """Centred blur along the movement (2,) px during the exposure; one too short to see leaves the image as it is."""
     length = float(np.hypot(*shift_px))
     if length < 0.3:
-        return None
+        return image
     half = int(np.ceil(length / 2)) + 1
     kernel = np.zeros((2 * half + 1,) * 2, np.float32)
     for t in np.linspace(-0.5, 0.5, 4 * half + 1):
@@ -181,4 +181,4 @@ def motion_kernel(shift_px: np.ndarray) -> np.ndarray | None:
         i, j = int(np.floor(y)), int(np.floor(x))
         fy, fx = y - i, x - j
         kernel[i : i + 2, j : j + 2] += np.outer([1 - fy, fy], [1 - fx, fx])
-    return kernel / kernel.sum()
+    return cv2.filter2D(image, -1, kernel / kernel.sum())

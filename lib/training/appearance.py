@@ -7,7 +7,8 @@ rely on by habit (orange ground, grey tool, sharp edges), so that shape decides.
 import cv2
 import numpy as np
 
-from lib.simulator.window import motion_kernel
+from lib.simulator.video import compressed
+from lib.simulator.window import motion_blur
 
 __all__ = ["disguised"]
 
@@ -132,9 +133,8 @@ def _optics(x: np.ndarray, rng: np.random.Generator, length_px: float) -> tuple[
         blur_px = rng.uniform(0.1, 0.4) * length_px
     if blur_px:
         x = cv2.GaussianBlur(x, (0, 0), blur_px)
-    kernel = motion_kernel(rng.normal(0, 0.05 * length_px, 2)) if rng.random() < 0.15 else None
-    if kernel is not None:
-        x = cv2.filter2D(x, -1, kernel)
+    if rng.random() < 0.15:
+        x = motion_blur(x, rng.normal(0, 0.05 * length_px, 2))
     if rng.random() < 0.2:  # few pixels, doubled again
         h, w = x.shape[:2]
         small = rng.uniform(0.3, 0.9)
@@ -157,6 +157,5 @@ def _camera(x: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         x[1::2] = np.roll(x[1::2], int(rng.integers(-2, 3)), axis=1)
     image = np.clip(x * 255 + 0.5, 0, 255).astype(np.uint8)
     if rng.random() < 0.35:
-        quality = [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(15, 92))]
-        image = cv2.imdecode(cv2.imencode(".jpg", image, quality)[1], cv2.IMREAD_COLOR)
+        image = compressed(image, int(rng.integers(15, 92)))
     return image

@@ -9,9 +9,8 @@ from lib import paths
 from lib.files import write_json
 from lib.landmarks import Detector
 from lib.recordings import Recording
-from lib.training.config import PRESETS
 from lib.training.evaluation import evaluate
-from lib.training.loop import Training, load_training, train
+from lib.training.loop import PRESETS, Training, load_training, train
 from lib.training.samples import labelled_images
 from lib.training.shards import generate
 from lib.training.stages import STAGES, assemble, finetune, stage_config, stage_data, training_of

@@ -1,14 +1,16 @@
-"""Training a network: batches, optimiser, validation, checkpoints with exact resume.
+"""Training a network: its configuration, batches, optimiser, validation, checkpoints with exact resume.
 
 All randomness of step t comes from a generator seeded with (seed, t).  A run that was interrupted and resumed therefore
 equals one that was not, bit for bit on the CPU: the number of the step is the whole state of the generators.
 """
 
 import copy
+import json
+import math
 import os
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -19,16 +21,15 @@ from tqdm.auto import tqdm
 
 from lib.landmarks.checkpoints import checksum, load_network, read_checkpoint, write_checkpoint
 from lib.landmarks.error_model import closeup_peaks
-from lib.landmarks.heatmaps import decode
+from lib.landmarks.heatmaps import SIGMA_PX, decode
 from lib.landmarks.metrics import score, tool_length_px
-from lib.landmarks.network import OffsetNetwork, StackedHourglass, as_tensor, network_of
+from lib.landmarks.network import HourglassConfig, Network, OffsetConfig, OffsetNetwork, as_tensor, network_of
 from lib.provenance import commit_id, machine
-from lib.training.augmentation import Batch, leave_frame
-from lib.training.config import TrainingConfig
-from lib.training.losses import loss_of
+from lib.training.augmentation import AUGMENTATIONS, Augmentation, Batch, leave_frame
+from lib.training.losses import heatmap_loss, offset_loss, position_loss
 from lib.training.samples import Samples, Source
 
-__all__ = ["FORMAT", "Training", "average", "draw_batch", "load_training", "train", "validate"]
+__all__ = ["FORMAT", "PRESETS", "Training", "TrainingConfig", "average", "draw_batch", "load_training", "train", "validate"]
 
 FORMAT = "microstereo.training"
 #: What a checkpoint keeps of a `Run` beside its tensors.
@@ -38,10 +39,82 @@ _SAVE_EVERY_S = 50.0
 
 
 @dataclass(frozen=True)
+class TrainingConfig:
+    """All options of a training except its data.
+
+    Attributes:
+        optimiser: ``"rmsprop"`` (alpha 0.99, no momentum, as the paper prints) or ``"adamw"``.
+        schedule: Of the learning rate: ``"constant"``, or ``"cosine"`` after a warm-up.
+        ema: Decay of the moving average of the weights, which is validated and returned; 0 = the weights themselves.
+        clip: Largest norm of the gradient; 0 = unlimited.
+        precision: ``"fp32"``, or ``"bf16"``: mixed precision where the processor computes in it; the loss is always float32.
+        sigma_px: Width of the target Gaussians in pixels of the network's input.
+        position_weight_per_px: Weight of `position_loss` beside the l2 loss of the heatmaps; 0 as in the paper.
+        seed: Decides the first weights and every batch.
+
+    Raises:
+        ValueError: For an unknown choice, or a number below 1 where at least 1 is needed.
+
+    >>> TrainingConfig(steps=1000, learning_rate=1e-3, schedule="cosine").rate(500)
+    0.000505
+    """
+
+    network: HourglassConfig | OffsetConfig = field(default_factory=HourglassConfig)
+    augmentation: Augmentation = AUGMENTATIONS["paper"]
+    steps: int = 1000
+    batch_size: int = 4
+    optimiser: str = "rmsprop"
+    learning_rate: float = 5e-5
+    schedule: str = "constant"
+    ema: float = 0.0
+    clip: float = 0.0
+    precision: str = "fp32"
+    sigma_px: float = SIGMA_PX
+    position_weight_per_px: float = 0.0
+    validate_every: int = 100
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        known = {"optimiser": ("rmsprop", "adamw"), "schedule": ("constant", "cosine"), "precision": ("fp32", "bf16")}
+        for name, choices in known.items():
+            if getattr(self, name) not in choices:
+                raise ValueError(f"{name}: expected one of {', '.join(choices)}, got {getattr(self, name)!r}.")
+        if min(self.steps, self.batch_size, self.validate_every) < 1:
+            raise ValueError("steps, batch_size, validate_every: must be at least 1.")
+
+    def rate(self, step: int, spent: float = 0.0) -> float:
+        """Learning rate of a step; `spent` is the share of the time that has passed, if time ends the training."""
+        if self.schedule == "constant":
+            return self.learning_rate
+        warm = min(1.0, (step + 1) / max(1, min(100, self.steps // 10)))
+        done = max(step / self.steps, min(spent, 1.0))
+        return self.learning_rate * warm * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * done)))
+
+    def changed(self, stored: dict[str, object]) -> list[str]:
+        """Names of the options whose values differ in a checkpoint's configuration; what it does not name has its default.
+
+        `validate_every` may differ between two sittings of one training.
+        """
+        own, other = (json.loads(json.dumps(asdict(c))) for c in (self, TrainingConfig(type(self.network)())))
+        other |= stored | {part: other[part] | stored.get(part, {}) for part in ("network", "augmentation")}
+        return [name for name, value in other.items() if name != "validate_every" and own.get(name) != value]
+
+
+#: `paper`: as printed. `best`: trains the shipped networks.
+PRESETS = {
+    "paper": TrainingConfig(),
+    "best": TrainingConfig(
+        augmentation=AUGMENTATIONS["best"], batch_size=12, optimiser="adamw", learning_rate=2e-3, schedule="cosine",
+        ema=0.998, clip=1.0, precision="bf16",
+    ),
+}
+
+
+@dataclass(frozen=True)
 class Training:
     """A finished (or stopped) training: the network to use, one log row per validation, and its provenance."""
 
-    network: StackedHourglass | OffsetNetwork
+    network: Network
     log: list[dict[str, float]]
     provenance: dict[str, object]
 
@@ -60,8 +133,16 @@ def _batch(images: np.ndarray, u: np.ndarray, visibility: np.ndarray) -> Batch:
     return Batch(tensor, u, leave_frame(u, torch.from_numpy(visibility.astype(np.int64)), tuple(tensor.shape[-2:])))
 
 
+def _loss(network: Network, outputs: Sequence[Tensor], batch: Batch, config: TrainingConfig) -> Tensor:
+    """The loss that a configuration asks for; of a network that is validated without its position loss."""
+    if isinstance(network, OffsetNetwork):
+        return offset_loss(outputs, batch)
+    given, weight = (outputs, batch, network.stride, config.sigma_px), config.position_weight_per_px
+    return heatmap_loss(*given) + (weight * position_loss(*given) if weight and network.training else 0)
+
+
 @torch.no_grad()
-def validate(network: StackedHourglass | OffsetNetwork, samples: Samples, config: TrainingConfig) -> dict[str, float]:
+def validate(network: Network, samples: Samples, config: TrainingConfig) -> dict[str, float]:
     """Loss, PCK and median error on held-out images, and two signs of a collapsed network.
 
     `peak` is the mean height of the heatmaps of visible landmarks; 1 is right.  `spread` is the standard deviation of the
@@ -75,7 +156,7 @@ def validate(network: StackedHourglass | OffsetNetwork, samples: Samples, config
         part = slice(start, start + 16)
         labelled = _batch(samples.images[part], samples.u[part], samples.visibility[part])
         outputs = [output.cpu() for output in network(labelled.images.to(device))]
-        losses.append(loss_of(network, outputs, labelled, config).item())
+        losses.append(_loss(network, outputs, labelled, config).item())
         if isinstance(network, OffsetNetwork):
             found.append(closeup_peaks(outputs[-1], labelled.images.shape[-1]))
         else:
@@ -104,7 +185,7 @@ def average(tensors: Sequence[Tensor], world: int) -> None:
 class Run:
     """Weights, optimiser and log of a training under way, and their file."""
 
-    def __init__(self, config: TrainingConfig, initial: StackedHourglass | OffsetNetwork | None = None):
+    def __init__(self, config: TrainingConfig, initial: Network | None = None):
         self.config = config
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(config.seed)
@@ -138,7 +219,7 @@ class Run:
         batch = Batch(*(part.to(self.device) for part in (batch.images, batch.u, batch.visibility)))
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.mixed):
             outputs = self.network(batch.images.contiguous(memory_format=torch.channels_last))
-        loss = loss_of(self.network, outputs, batch, self.config)
+        loss = _loss(self.network, outputs, batch, self.config)
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
         if self.world > 1:

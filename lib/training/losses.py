@@ -4,14 +4,12 @@ import math
 from collections.abc import Sequence
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from lib.landmarks.heatmaps import SIGMA_PX, render, sigma_cells
-from lib.landmarks.network import OffsetNetwork
 from lib.training.augmentation import Batch
-from lib.training.config import TrainingConfig
 
-__all__ = ["heatmap_loss", "loss_of", "offset_loss", "position_loss"]
+__all__ = ["heatmap_loss", "offset_loss", "position_loss"]
 
 
 def heatmap_loss(outputs: Sequence[Tensor], batch: Batch, stride: int, sigma_px: float = SIGMA_PX) -> Tensor:
@@ -73,11 +71,3 @@ def offset_loss(outputs: Sequence[Tensor], batch: Batch) -> Tensor:
     distance = ((found[:, :2].float() - true).square() + 0.01).sqrt()
     log_scale = found[:, 2:].float()
     return ((log_scale + distance * (-log_scale).exp()).sum(1) * there).sum() / there.sum().clamp_min(1)
-
-
-def loss_of(network: nn.Module, outputs: Sequence[Tensor], batch: Batch, config: TrainingConfig) -> Tensor:
-    """The loss that a configuration asks for; of a network that is validated without its position loss."""
-    if isinstance(network, OffsetNetwork):
-        return offset_loss(outputs, batch)
-    given, weight = (outputs, batch, network.stride, config.sigma_px), config.position_weight_per_px
-    return heatmap_loss(*given) + (weight * position_loss(*given) if weight and network.training else 0)

@@ -104,11 +104,11 @@ def _read(path: Path, names: Sequence[str]) -> list[np.ndarray]:
         raise ValueError(f"{path}: corrupt; delete it and generate it again ({error}).") from error
 
 
-def read_shards(folder: str | Path, kinds: Sequence[str], names: Sequence[str], first: int | None = None) -> list[np.ndarray]:
-    """Arrays of the (first) shards of some kinds, joined; an error names a missing, corrupt or differently sized shard."""
-    found = [path for kind in kinds for path in sorted(Path(folder).glob(f"{kind}_*.npz"))][:first]
+def read_shards(folder: str | Path, kind: str, names: Sequence[str], first: int | None = None) -> list[np.ndarray]:
+    """Arrays of the (first) shards of a kind, joined; an error names a missing, corrupt or differently sized shard."""
+    found = sorted(Path(folder).glob(f"{kind}_*.npz"))[:first]
     if not found:
-        raise FileNotFoundError(f"{folder}: no shard {kinds[0]}_*.npz; make some with `python3 -m lib train generate`.")
+        raise FileNotFoundError(f"{folder}: no shard {kind}_*.npz; make some with `python3 -m lib train generate`.")
     parts: dict[str, list[np.ndarray]] = {name: [] for name in names}
     for path in found:
         for name, array in zip(names, _read(path, names), strict=True):
@@ -129,7 +129,7 @@ def _joined(parts: list[np.ndarray]) -> np.ndarray:
     return result
 
 
-def packed(images: Iterable[LabelledImage], long_side_px: int | None = None, quality: int = 95) -> tuple[np.ndarray, ...]:
+def packed(images: Iterable[LabelledImage], long_side_px: int | None = None) -> tuple[np.ndarray, ...]:
     """Labelled images of any size as (ends (n,), JPEGs one after the other, u (n, 3, 2), visibility (n, 3)), `long_side_px`
     long at most.
     """
@@ -139,7 +139,7 @@ def packed(images: Iterable[LabelledImage], long_side_px: int | None = None, qua
         if long_side_px and max(h, w) > long_side_px:
             size = round(w * long_side_px / max(h, w)), round(h * long_side_px / max(h, w))
             image, u = cv2.resize(image, size, interpolation=cv2.INTER_AREA), cell_from_image(u, np.array([w, h]) / size)
-        encoded = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+        encoded = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 95])[1]
         jpegs.append(encoded.ravel())
         points.append(u)
         seen.append(visibility)
@@ -161,5 +161,4 @@ def validation_images(folder: str | Path, kind: str = "held_out") -> Iterator[La
     for path in sorted(Path(folder).glob(f"{kind}_*.npz")):
         jpegs, ends, u, visibility = _read(path, ("jpegs", "jpeg_ends", "u", "visibility"))
         for i, piece in enumerate(np.split(jpegs, ends[:-1])):
-            image = cv2.cvtColor(cv2.imdecode(piece, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
-            yield LabelledImage(f"{path.stem} {i}", image, u[i], visibility[i])
+            yield LabelledImage(f"{path.stem} {i}", cv2.imdecode(piece, cv2.IMREAD_COLOR_RGB), u[i], visibility[i])

@@ -24,15 +24,13 @@ from lib.provenance import commit_id, machine
 from lib.recordings import Recording
 from lib.simulator.population import VALIDATION_TEXTURE_SEEDS, sample
 from lib.training.augmentation import AUGMENTATIONS
-from lib.training.config import PRESETS, TrainingConfig
 from lib.training.drawings import drawn_ground
 from lib.training.error_models import fit_error_models
 from lib.training.evaluation import evaluate
-from lib.training.loop import Training, load_training, train
+from lib.training.loop import PRESETS, Training, TrainingConfig, load_training, train
 from lib.training.samples import LabelledImage, Mixed, Samples, Source, labelled_images
-from lib.training.scenes import FRAME_PX, FrameSource, ToolSource
 from lib.training.shards import validation_images
-from lib.training.windows import CloseupSource
+from lib.training.sources import FRAME_PX, CloseupSource, FrameSource, ToolSource
 
 __all__ = ["STAGES", "assemble", "card", "finetune", "stage_config", "stage_data", "training_of"]
 

@@ -21,10 +21,10 @@ from lib.cameras import AffineCamera
 from lib.geometry import RigidTransform
 from lib.recordings import read_image
 from lib.simulator.eye import Eye, Ground
+from lib.simulator.families import TOOLS
 from lib.simulator.forceps import Forceps, Pose
 from lib.simulator.render import render_view
 from lib.simulator.rig import Microscope
-from lib.simulator.shapes import TOOLS
 from lib.simulator.texture import EXTENT_MM, fundus_texture
 from lib.simulator.window import Window
 from notebooks.studies.retinal import import_retinal_microsurgery

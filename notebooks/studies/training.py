@@ -11,8 +11,8 @@ import numpy as np
 from lib.geometry import cell_from_image
 from lib.landmarks.network import HourglassConfig
 from lib.training.augmentation import AUGMENTATIONS
-from lib.training.config import PRESETS, TrainingConfig
 from lib.training.evaluation import Evaluation
+from lib.training.loop import PRESETS, TrainingConfig
 from lib.training.samples import LabelledImage, Samples
 from lib.workbench import report
 from notebooks.studies.windows import TOOL, TOOL_REDUCTION, WindowSource

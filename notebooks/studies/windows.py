@@ -98,13 +98,13 @@ class WindowSource(Source):
     def load(cls, folder: str | Path, *, validation: bool = False, shards: int | None = None) -> WindowSource:
         """From the (first) shards of a folder."""
         names = "crops", "crop_u", "crop_visibility", "crop_landmark"
-        return cls(*read_shards(folder, ("validation" if validation else "training",), names, shards))
+        return cls(*read_shards(folder, "validation" if validation else "training", names, shards))
 
     @classmethod
     def load_tools(cls, folder: str | Path, *, validation: bool = False, shards: int | None = None) -> WindowSource:
         """Windows round the whole tool at `TOOL_REDUCTION`."""
         kind = "validation" if validation else "training"
-        frames, u, visibility = read_shards(folder, (kind,), ("frames", "u", "visibility"), shards)
+        frames, u, visibility = read_shards(folder, kind, ("frames", "u", "visibility"), shards)
         labels = cell_from_image(u, TOOL_REDUCTION), visibility, np.full(len(u), TOOL)
         return cls(frames, *labels, shift_px=8.0, turn_rad=0.2, zoom=(0.75, 1.3))
 

@@ -11,10 +11,9 @@ from lib.geometry import RigidTransform
 from lib.simulator import Microscope, Pose, render_view, simulate
 from lib.simulator.dataset import rung_design
 from lib.simulator.eye import Ground
-from lib.simulator.families import ASPECTS, FAR, SHIFTED, TRAINING
+from lib.simulator.families import ASPECTS, FAR, SHIFTED, TOOLS, TRAINING, random_object
 from lib.simulator.lighting import Lighting, Patch
 from lib.simulator.population import POPULATIONS, random_setup, sample
-from lib.simulator.shapes import TOOLS, random_object
 from lib.simulator.video import Video
 from lib.simulator.window import Window
 

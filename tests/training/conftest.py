@@ -6,8 +6,7 @@ from threadpoolctl import threadpool_limits
 from lib.landmarks.network import HourglassConfig
 from lib.parallel import single_threaded_torch
 from lib.training.augmentation import Augmentation
-from lib.training.config import PRESETS
-from lib.training.loop import train
+from lib.training.loop import PRESETS, train
 from notebooks.studies.windows import write_frames
 from tests.toys import toy_images, toy_samples
 

@@ -18,7 +18,7 @@ from lib.landmarks.network import HourglassConfig, OffsetConfig, OffsetNetwork, 
 from lib.training import command, stages
 from lib.training.command import main_evaluate
 from lib.training.loop import load_training
-from lib.training.scenes import FrameSource
+from lib.training.sources import FrameSource
 from tests.toys import toy_images
 
 

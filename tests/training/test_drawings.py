@@ -4,7 +4,7 @@ import numpy as np
 
 from lib.training.drawings import drawn_ground, drawn_tool
 from lib.training.samples import LabelledImage
-from lib.training.scenes import FrameSource, ToolSource
+from lib.training.sources import FrameSource, ToolSource
 
 GROUND = np.full((180, 320, 3), 120, np.uint8)
 

@@ -13,8 +13,7 @@ from lib.landmarks.heatmaps import render
 from lib.landmarks.network import HourglassConfig, OffsetConfig, OffsetNetwork, StackedHourglass
 from lib.training import loop
 from lib.training.augmentation import Augmentation, Batch
-from lib.training.config import PRESETS, TrainingConfig
-from lib.training.loop import load_training, train
+from lib.training.loop import PRESETS, TrainingConfig, load_training, train
 from lib.training.losses import heatmap_loss, offset_loss, position_loss
 from lib.training.samples import Mixed, Samples
 from tests.toys import toy_samples

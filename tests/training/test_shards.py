@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lib.training import shards
-from lib.training.windows import CloseupSource
+from lib.training.sources import CloseupSource
 
 
 def test_where_a_landmark_lies_in_its_jpeg_blocks_does_not_tell_its_place(monkeypatch, tmp_path):
