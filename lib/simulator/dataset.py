@@ -1,10 +1,4 @@
-"""The paper's data set, simulated: 10 sequences of 10 eyes, both kinds of motion, 7 to train and 3 to test.
-
-python3 -m lib simulate                    # data/cache/dataset-0; goes on where it stopped
-python3 -m lib simulate --dry-run          # says how long it takes and how many GB
-python3 -m lib simulate --shipped          # makes data/open_sky_eye anew
-python3 -m lib simulate --rung gauze       # one recording of a rung of shift: near, validation, or a far family
-"""
+"""The paper's data set, simulated: 10 sequences of 10 eyes, both kinds of motion, 7 to train and 3 to test."""
 
 import argparse
 import json
@@ -119,15 +113,15 @@ def make_dataset(
     return list(jobs)
 
 
-def _missing(folder: Path) -> list[int]:
-    """The sequences that `folder` does not hold; what it holds must open as a recording."""
-    made = {index: folder / sequence_name(index) for index in _SEQUENCES if (folder / sequence_name(index)).exists()}
-    for sequence in made.values():
+def _missing(folder: Path) -> int:
+    """How many sequences `folder` does not hold; what it holds must open as a recording."""
+    made = [folder / sequence_name(index) for index in _SEQUENCES if (folder / sequence_name(index)).exists()]
+    for sequence in made:
         try:
             Recording.open(sequence)
         except (ValueError, OSError) as error:
             raise ValueError(f"{sequence}: damaged ({error}). Delete the folder and it is made anew.") from error
-    return [index for index in _SEQUENCES if index not in made]
+    return len(_SEQUENCES) - len(made)
 
 
 def seconds_a_pair(shrink: int) -> float:
@@ -141,8 +135,8 @@ def seconds_a_pair(shrink: int) -> float:
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """`python3 -m lib simulate`: see the module's text."""
-    parser = argparse.ArgumentParser(prog="python3 -m lib simulate", description=__doc__.splitlines()[0])
+    """`python3 -m lib simulate`: the data set, where it stopped; the shipped recording; or one of a rung of shift."""
+    parser = argparse.ArgumentParser(prog="python3 -m lib simulate", description=__doc__)
     parser.add_argument("--folder", type=Path, help="where (default: data/cache/dataset-SEED)")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--pairs", type=int, default=80, help="stereo pairs a sequence (default: 80, 1600 images in all)")
@@ -172,7 +166,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         print(f"{recording.folder}: {len(recording)} pairs.")
         return
     folder = arguments.folder or paths.CACHE / f"dataset-{arguments.seed}"
-    left = len(_missing(folder)) * pairs
+    left = _missing(folder) * pairs
     workers = min(arguments.workers or cores(), len(_SEQUENCES))
     minutes = left * seconds_a_pair(shrink) / workers / 60 if left else 0.0
     print(
@@ -181,8 +175,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         flush=True,
     )
     if not arguments.dry_run:
-        start, length = time.perf_counter(), {"n_pairs": pairs, "duration_s": arguments.duration}
-        make_dataset(folder, seed=arguments.seed, workers=workers, shrink=shrink, **length)
+        start, size = time.perf_counter(), {"n_pairs": pairs, "duration_s": arguments.duration, "shrink": shrink}
+        make_dataset(folder, seed=arguments.seed, workers=workers, **size)
         seconds = time.perf_counter() - start
         if left:
             print(f"{left} pairs in {seconds / 60:.1f} min, {seconds / left:.2f} s a pair.")

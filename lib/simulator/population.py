@@ -1,12 +1,11 @@
 """Images for training, validation and tests: everything in them is drawn anew, from named families (`families.py`).
 
-The narrow population, eyes and forceps of the reference rig, is a part of the training.  There, eyes of `RESERVED_SEEDS`
-and tools with jaws of `RESERVED_JAW_MM` are never drawn.  Test recordings use them, so no test frame shows an eye or a
-tool of the training.
+The narrow population, eyes and forceps of the reference rig, is a part of the training.  Test recordings use what is
+reserved for them, so no test frame shows an eye or a tool of the training.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -40,9 +39,9 @@ _TEXTURE_PX = 1536
 _NARROW, _NARROW_TEXTURES = 0.2, 32  # share of the narrow population in training, and its textures, kept in memory
 
 
-def _eye(rng: np.random.Generator, textures: Sequence[int] = TEXTURE_SEEDS) -> Eye:
-    """An eye of the training population: shape, folds, gloss, and one of `textures`."""
-    return Eye(
+def _eye(rng: np.random.Generator, textures: Sequence[int], kind: type[Eye]) -> Eye:
+    """An eye of the reference rig, as an `Eye` or a `Ground`: shape, folds, gloss, and one of `textures`."""
+    return kind(
         seed=int(textures[rng.integers(len(textures))]), radius_mm=9.3, texture_px=_TEXTURE_PX,
         depth_mm=rng.uniform(1.2, 3.2), fold_mm=rng.uniform(0.02, 0.18), tilt_rad=rng.uniform(0.0, 0.08),
         centre_z_mm=rng.uniform(0.4, 1.8), gloss=float(rng.choice([0.0, 1.0], p=[0.08, 0.92]) * rng.uniform(0.3, 2.2)),
@@ -122,9 +121,8 @@ def random_setup(
         drawn_by = {"training": TEXTURE_SEEDS, "empty": TEXTURE_SEEDS, "validation": VALIDATION_TEXTURE_SEEDS}
         textures = drawn_by.get(population, _TEST_TEXTURE_SEEDS)
     if population == "near" or (population == "training" and rng.random() < _NARROW):
-        eye, forceps, microscope = _eye(rng, textures[:_NARROW_TEXTURES]), random_forceps(rng), _microscope(rng)
-        if population != "near":
-            eye = Ground(**{f.name: getattr(eye, f.name) for f in fields(Eye)})  # whose film stays in memory
+        kind = Eye if population == "near" else Ground  # whose film stays in memory
+        eye, forceps, microscope = _eye(rng, textures[:_NARROW_TEXTURES], kind), random_forceps(rng), _microscope(rng)
         pose = random_pose(rng, forceps, eye.centre_z_mm - 0.35 * eye.depth_mm)
         names = dict(zip(ASPECTS, ("plain_jaws", "coaxial", "fundus", "clean"), strict=True))
         return Setup(eye, forceps, microscope, pose, names)

@@ -10,11 +10,10 @@ from typing import Self
 import cv2
 import numpy as np
 
-from lib.cameras import AffineCamera, NearAffineCamera
+from lib.cameras import AffineCamera, NearAffineCamera, Resection
 from lib.simulator.eye import Scene
 
 __all__ = ["Grid", "Window", "blur", "blur_by_depth", "in_image", "intersect", "motion_blur", "surface_grid"]
-
 
 _Camera = AffineCamera | NearAffineCamera
 
@@ -50,13 +49,9 @@ class Window:
         return cls(replace(camera, **moved), size_px, field_px, tuple(origin))
 
     @cached_property
-    def affine(self) -> AffineCamera:
-        """The affine camera that touches the camera in its reference plane."""
-        return self.camera.affine if isinstance(self.camera, NearAffineCamera) else self.camera
-
-    @cached_property
-    def _resection(self):
-        return self.affine.resect()
+    def _resection(self) -> Resection:
+        """Of the affine camera that touches the camera in its reference plane."""
+        return AffineCamera(self.camera.matrix).resect()
 
     @property
     def R(self) -> np.ndarray:
@@ -83,11 +78,11 @@ class Window:
 
     def rays(self, u: tuple[np.ndarray, np.ndarray], z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(x, y) mm where the rays of pixels u meet depth z of the microscope frame; all of one shape."""
-        affine, camera = self.affine, self.camera
-        (a, b, c), (d, e, f) = affine.linear
-        right = (u[0] - affine.offset_px[0] - c * z, u[1] - affine.offset_px[1] - f * z)
+        camera = self.camera
+        (a, b, c), (d, e, f) = camera.linear
+        right = (u[0] - camera.offset_px[0] - c * z, u[1] - camera.offset_px[1] - f * z)
         if isinstance(camera, NearAffineCamera):
-            rho, axis, centre = camera.inverse_distance_per_mm, affine.viewing_direction, camera.centre_px
+            rho, axis, centre = camera.inverse_distance_per_mm, camera.viewing_direction, camera.centre_px
             du, dv = (u[0] - centre[0]) * rho, (u[1] - centre[1]) * rho
             shift = axis @ camera.reference_mm
             right = (right[0] + du * axis[2] * z - du * shift, right[1] + dv * axis[2] * z - dv * shift)

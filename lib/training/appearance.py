@@ -71,13 +71,13 @@ def _field(shape: tuple[int, int], rng: np.random.Generator, cells: int) -> np.n
 
 def _light(x: np.ndarray, u: np.ndarray, hidden: np.ndarray, rng: np.random.Generator, length_px: float) -> np.ndarray:
     h, w = x.shape[:2]
+    rows, columns = np.mgrid[:h, :w].astype(np.float32)
     if rng.random() < 0.3:
         x = x * (0.3 + 1.2 * _field((h, w), rng, int(rng.integers(2, 6))))[..., None]
     if rng.random() < 0.12:  # a lit disc, or a pupil, round about the tool
         known = np.isfinite(u).all(1)
         centre = (u[known].mean(0) if known.any() else np.array([w, h]) / 2) + rng.normal(0, 0.4, 2) * length_px
         radius, soft = rng.uniform(0.8, 2.5) * max(length_px, 15.0), rng.uniform(0.5, 0.15 * length_px + 1)
-        rows, columns = np.mgrid[:h, :w].astype(np.float32)
         inside = 1 / (1 + np.exp(np.clip((np.hypot(columns - centre[0], rows - centre[1]) - radius) / soft, -30, 30)))
         dark = np.float32(rng.uniform(0, 0.25))
         x = x * (dark + (1 - dark) * inside)[..., None].astype(np.float32)
@@ -86,7 +86,6 @@ def _light(x: np.ndarray, u: np.ndarray, hidden: np.ndarray, rng: np.random.Gene
     if rng.random() < 0.2:  # glare
         for _ in range(rng.integers(1, 4)):
             centre, size = rng.uniform((0, 0), (w, h)), rng.uniform(0.01, 0.12) * w
-            rows, columns = np.mgrid[:h, :w].astype(np.float32)
             distance = np.hypot(columns - centre[0], (rows - centre[1]) * rng.uniform(0.5, 2)) / size
             x = x + (rng.uniform(0.3, 1.5) * np.exp(-(distance ** rng.uniform(2, 8)))).astype(np.float32)[..., None]
     return np.clip(x, 0, 1)

@@ -10,6 +10,8 @@ import itertools
 import cv2
 import numpy as np
 
+from lib.simulator.window import in_image
+
 __all__ = ["drawn_ground", "drawn_tool"]
 
 #: Centre line (n, 2) px and radius (n,) px.
@@ -90,7 +92,7 @@ def drawn_tool(image: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray,
     u = np.array(u)
     if np.linalg.det(u[1:] - u[0]) < 0:  # the jaws cross: tip_1 is the left one
         u = u[[0, 2, 1]]
-    return np.clip(x, 0, 255).astype(np.uint8), u, np.where(((u > -0.5) & (u < np.array([w, h]) - 0.5)).all(1), 2, 0)
+    return np.clip(x, 0, 255).astype(np.uint8), u, np.where(in_image(u, (w, h)), 2, 0)
 
 
 def _jaw_shape(rng: np.random.Generator) -> dict[str, float]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from lib.landmarks import windows
 from lib.landmarks.metrics import tool_length_px
-from lib.simulator.window import motion_blur
+from lib.simulator.window import in_image, motion_blur
 from lib.training.appearance import disguised
 from lib.training.drawings import drawn_ground, drawn_tool
 from lib.training.samples import LabelledImage, Source
@@ -149,7 +149,7 @@ class ToolSource(SceneSource):
         image, at, visibility = self._seen(scene, matrix, (size, size), rng)
         if wrong.any():
             return image, np.full((3, 2), -float(size)), np.zeros(3, int)
-        inside = ((at > -0.5) & (at < size - 0.5)).all(1) & (visibility > 0)
+        inside = in_image(at, (size, size)) & (visibility > 0)
         return image, np.where(inside[:, None], np.nan, at), visibility  # another scale or direction is no example
 
 

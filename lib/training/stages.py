@@ -120,8 +120,7 @@ def finetune(
             if isinstance(simulated, str | Path):
                 source = Mixed(source, _SOURCES[stage].load(simulated), _OWN_SHARE)
             elif simulated:
-                others = _SOURCES[stage].of([one for i, one in enumerate(simulated) if i % 3])
-                source = Mixed(source, others, _OWN_SHARE)
+                source = Mixed(source, _SOURCES[stage].of([one for i, one in enumerate(simulated) if i % 3]), _OWN_SHARE)
             config = replace(stage_config(stage), network=detector.networks[stage].config, steps=steps, seed=seed)
             config = replace(config, batch_size=min(config.batch_size, 24), validate_every=max(1, steps // 3))
             config = replace(config, learning_rate=_RATES[stage], ema=0.995)
