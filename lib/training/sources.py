@@ -21,6 +21,7 @@ __all__ = ["CloseupSource", "FrameSource", "SceneSource", "ToolSource"]
 #: The first stage sees frames whose longer side is shrunk to this, here with (width, height) of the input.  It is trained on
 #: parts of them, which costs a third, since a frame is mostly background.
 FRAME_PX, PART_PX = (320, 192), (160, 128)
+_TOOL_SIZE = windows.TOOL_PX, windows.TOOL_PX
 #: Shorter tools are no target, they have no loss.
 SHORTEST_PX = 5.0
 #: Nor are tools in an image whose grey values spread less.
@@ -68,9 +69,10 @@ class SceneSource(Source):
         weight = np.ones(3) if self.weight is None else self.weight[index]
         return image, self.u[index], self.visibility[index], weight
 
-    def _seen(self, scene, matrix: np.ndarray, size: tuple[int, int], rng: np.random.Generator):
-        """A scene through a matrix, disguised or not; landmarks too small to see have no loss."""
+    def _seen(self, scene, centre: np.ndarray, angle: float, size: tuple[int, int], zoom: float, rng: np.random.Generator):
+        """A window of a scene, disguised or not; landmarks too small to see have no loss."""
         image, u, visibility, weight = scene
+        matrix = windows.window_from_image(centre, angle, size, zoom)
         scale = np.sqrt(abs(np.linalg.det(matrix[:, :2])))
         if scale < 0.8:  # interpolation alone would alias
             image = cv2.GaussianBlur(image, (0, 0), 0.45 * np.sqrt(1 / scale**2 - 1))
@@ -98,7 +100,7 @@ class FrameSource(SceneSource):
         fit, length = FRAME_PX[0] / max(frame.shape[:2]), _length_px(u, visibility)
         middle = (np.array(frame.shape[1::-1]) - 1) / 2
         if not self.disguise:  # as `Detector` sees it
-            return self._seen(scene, windows.window_from_image(middle, 0.0, FRAME_PX, fit), FRAME_PX, rng)
+            return self._seen(scene, middle, 0.0, FRAME_PX, fit, rng)
         zoom = np.clip(fit * np.exp(rng.normal(0, 0.45)), 0.4 * fit, None)
         if np.isfinite(length):
             zoom = np.clip(zoom, 7 / length, 85 / length)
@@ -108,8 +110,7 @@ class FrameSource(SceneSource):
         else:
             middle = rng.uniform((0, 0), frame.shape[1::-1])
         turn = rng.uniform(-np.pi, np.pi) if rng.random() < 0.5 else np.pi * rng.integers(2) + rng.normal(0, 0.2)
-        matrix = windows.window_from_image(middle, turn, PART_PX, zoom)
-        return _mirrored(*self._seen(scene, matrix, PART_PX, rng), rng)
+        return _mirrored(*self._seen(scene, middle, turn, PART_PX, zoom, rng), rng)
 
 
 class ToolSource(SceneSource):
@@ -120,7 +121,6 @@ class ToolSource(SceneSource):
 
     def draw(self, index: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         _, u, visibility, _ = scene = self.scene(index, rng)
-        size = windows.TOOL_PX
         (centre,), (angle,) = windows.tool_pose(u[None])
         length = _length_px(u, visibility)
         if not np.isfinite(angle + length) or (self.disguise and rng.random() < 0.3):
@@ -129,12 +129,11 @@ class ToolSource(SceneSource):
         zoom = windows.tool_zoom(length) * np.exp(np.clip(rng.normal(0, 0.12 * worse), -0.6, 0.6))
         centre = centre + np.clip(rng.normal(0, 7 * worse, 2), -30, 30) / zoom
         angle = angle + np.clip(rng.normal(0, 0.12 * worse), -0.7, 0.7)
-        matrix = windows.window_from_image(centre, angle, size, zoom)
-        return _mirrored(*self._seen(scene, matrix, (size, size), rng), rng if self.disguise else None)
+        return _mirrored(*self._seen(scene, centre, angle, _TOOL_SIZE, zoom, rng), rng if self.disguise else None)
 
     def _elsewhere(self, scene, centre: np.ndarray, angle: float, length: float, rng: np.random.Generator):
         """A window anywhere, or one by the tool that is turned, of another scale or shifted too far."""
-        size, wrong = windows.TOOL_PX, np.zeros(3, bool)
+        wrong = np.zeros(3, bool)
         if np.isfinite(angle + length) and rng.random() < 0.7 * scene[3].min():  # not by a doubtful label
             wrong = rng.random(3) < 0.4
             wrong[rng.integers(3)] = True
@@ -145,11 +144,10 @@ class ToolSource(SceneSource):
         else:
             zoom = np.exp(rng.uniform(np.log(0.4), np.log(2.5)))
             centre, angle = rng.uniform((0, 0), scene[0].shape[1::-1]), rng.uniform(-np.pi, np.pi)
-        matrix = windows.window_from_image(centre, angle, size, zoom)
-        image, at, visibility = self._seen(scene, matrix, (size, size), rng)
+        image, at, visibility = self._seen(scene, centre, angle, _TOOL_SIZE, zoom, rng)
         if wrong.any():
-            return image, np.full((3, 2), -float(size)), np.zeros(3, int)
-        inside = in_image(at, (size, size)) & (visibility > 0)
+            return image, np.full((3, 2), -float(windows.TOOL_PX)), np.zeros(3, int)
+        inside = in_image(at, _TOOL_SIZE) & (visibility > 0)
         return image, np.where(inside[:, None], np.nan, at), visibility  # another scale or direction is no example
 
 
