@@ -3,6 +3,7 @@
 import argparse
 import contextlib
 import datetime
+import itertools
 import json
 import os
 import shutil
@@ -10,8 +11,7 @@ import signal
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
-from functools import partial
+from collections.abc import Sequence
 from pathlib import Path
 
 from PIL import Image
@@ -19,13 +19,11 @@ from tqdm import tqdm
 
 from lib import files, paths
 from lib.provenance import commit, machine
-from lib.workbench import execution, headlines, pages, parameters
+from lib.workbench import execution, pages, parameters
 from lib.workbench.execution import Failure, execute
-from lib.workbench.parameters import UsageError
 
-__all__ = ["main", "main_site", "run"]
+__all__ = ["complete_runs", "main", "main_site", "previous_values", "run"]
 
-PROFILES = ("quick", "paper")
 #: Keeps room on the disk to write the last state of a run when the disk is full.
 _ROOM = ".room"
 #: Figures that the README shows.
@@ -34,17 +32,13 @@ README_FIGURES = ("overview", "landmark_detection", "reconstruction_surface", "c
 
 
 def main(argv: Sequence[str]) -> int:
-    """Parse the command line and run.
-
-    Returns:
-        int: 0 if every notebook came to its end, 1 if one failed, 2 for a command that cannot run, 128 + n for signal
-            n.
-    """
+    """Parse the command line and run: 0 if every notebook came to its end, 1 if one failed, 128 + n for signal n."""
     parser = argparse.ArgumentParser(
         prog="python3 -m lib run", description="Execute the notebooks and write their report into runs/<date>-<profile>/."
     )
     parser.add_argument("notebooks", nargs="*", metavar="NOTEBOOK", help="path, name or number (default: all)")
-    parser.add_argument("--profile", choices=PROFILES, default="quick", help="quick: minutes; paper: the paper's sizes")
+    parser.add_argument("--profile", choices=("quick", "paper"), default="quick",
+                        help="quick: minutes; paper: the paper's sizes")  # fmt: skip
     parser.add_argument("-p", dest="pairs", nargs=2, action="append", default=[], metavar=("NAME", "VALUE"),
                         help="a parameter of the notebooks that declare it")  # fmt: skip
     parser.add_argument("--cell-timeout", type=parameters.positive, metavar="S",
@@ -61,16 +55,12 @@ def main(argv: Sequence[str]) -> int:
     for name in ("SIGTERM", "SIGHUP"):  # as Ctrl-C: the report then says that the run was stopped
         if hasattr(signal, name):
             signal.signal(getattr(signal, name), stop)
-    try:
-        result = run(options.notebooks, options.profile, options.pairs, cell_timeout_s=timeout, runs=options.runs)
-    except (UsageError, OSError) as error:
-        print(f"python3 -m lib run: {error}", file=sys.stderr)
-        return 2
+    result = run(options.notebooks, options.profile, options.pairs, cell_timeout_s=timeout, runs=options.runs)
     return {"complete": 0, "failed": 1, "stopped": 128 + (received or [signal.SIGINT])[0]}[result["state"]]
 
 
 def main_site(argv: Sequence[str]) -> int:
-    """Copy the pages of a run into a folder that a web server shows as it is; 2 if there is no such run."""
+    """Copy the pages of a run into a folder that a web server shows as it is."""
     parser = argparse.ArgumentParser(
         prog="python3 -m lib site", description="Make a static site of a run, such as for GitHub Pages."
     )
@@ -78,18 +68,14 @@ def main_site(argv: Sequence[str]) -> int:
     parser.add_argument("--out", type=Path, default=paths.ROOT / "site", metavar="FOLDER", help="a new folder")
     parser.add_argument("--gallery", action="store_true", help="renew the README's pictures in data/gallery instead")
     options = parser.parse_args(argv)
-    chosen = options.run or next((folder for folder, _ in reversed(headlines.complete_runs(paths.RUNS))), paths.RUNS)
-    try:
-        if not (chosen / "index.html").is_file():
-            raise FileNotFoundError(f"{chosen}: no run with an index.html; `python3 -m lib run` makes one.")
-        if options.gallery:
-            renew_gallery(chosen)
-            return 0
-        shutil.copytree(chosen, options.out)
-        (options.out / ".nojekyll").touch()  # GitHub Pages then takes every file as it is
-    except OSError as error:
-        print(f"python3 -m lib site: {error}", file=sys.stderr)
-        return 2
+    chosen = options.run or next((folder for folder, _ in reversed(complete_runs(paths.RUNS))), paths.RUNS)
+    if not (chosen / "index.html").is_file():
+        raise FileNotFoundError(f"{chosen}: no run with an index.html; `python3 -m lib run` makes one.")
+    if options.gallery:
+        renew_gallery(chosen)
+        return 0
+    shutil.copytree(chosen, options.out)
+    (options.out / ".nojekyll").touch()  # GitHub Pages then takes every file as it is
     print(f"Site: {options.out / 'index.html'}")
     return 0
 
@@ -133,7 +119,7 @@ def run(
         dict: The content of the run's metrics.json.
 
     Raises:
-        UsageError: Before anything runs: for an unknown notebook or parameter, or a value of the wrong type.
+        ValueError: Before anything runs: for an unknown notebook or parameter, or a value of the wrong type.
         OSError: If the report cannot be written; its state is "failed" if that can still be written.
     """
     chosen = parameters.choose_notebooks(names, notebooks)
@@ -143,18 +129,23 @@ def run(
             values[book].setdefault("profile", profile)
     report = _Report(_new_folder(runs, profile), chosen, profile, dict(pairs))
     width = max(len(book.stem) for book in chosen)
-    live = sys.stderr.isatty()
     try:
-        with _shared_folder():
-            for number, book in enumerate(chosen, start=1):
-                label, start = f"[{number}/{len(chosen)}] {book.stem:<{width}}", time.monotonic()
-                report.begin(book)
-                with tqdm(desc=label, unit="cell", leave=False, disable=not live) as bar:
-                    on_cell = partial(_advance, bar)
-                    executed, limit = report.executed(book), cell_timeout_s
-                    failure = execute(book, executed, values[book], cell_timeout_s=limit, on_cell=on_cell)
+        paths.CACHE.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix="run-", dir=paths.CACHE, ignore_cleanup_errors=True) as shared:
+            os.environ[paths.SHARED_VARIABLE] = shared  # the kernels inherit it
+            for number, book in enumerate(chosen):
+                label, start = f"[{number + 1}/{len(chosen)}] {book.stem:<{width}}", time.monotonic()
+                report.begin(number)
+                with tqdm(desc=label, unit="cell", leave=False, disable=not sys.stderr.isatty()) as bar:
+
+                    def on_cell(cell: int, n_cells: int, bar: tqdm = bar) -> None:
+                        bar.total, bar.n = n_cells, cell
+                        bar.refresh()
+
+                    executed = report.folder / book.name
+                    failure = execute(book, executed, values[book], cell_timeout_s=cell_timeout_s, on_cell=on_cell)
                 seconds = time.monotonic() - start
-                report.end(book, failure, seconds)
+                report.end(number, failure, seconds)
                 print(f"{label}  {seconds:6.1f} s  {'failed' if failure else 'done'}", flush=True)
         report.finish()
     except KeyboardInterrupt:
@@ -164,6 +155,8 @@ def run(
     except OSError:
         report.finish("failed")
         raise
+    finally:
+        os.environ.pop(paths.SHARED_VARIABLE, None)
     for entry in report.content["notebooks"]:
         if entry["failure"]:
             print(f"FAILED {entry['name']}: {Failure(**entry['failure'])}", file=sys.stderr)
@@ -176,24 +169,35 @@ def run(
     return report.content
 
 
-@contextlib.contextmanager
-def _shared_folder() -> Iterator[None]:
-    """While the notebooks run, a folder for what they share, named in the environment that their kernels inherit."""
-    paths.CACHE.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix="run-", dir=paths.CACHE, ignore_cleanup_errors=True) as folder:
-        os.environ[paths.SHARED_VARIABLE] = folder
-        try:
-            yield
-        finally:
-            del os.environ[paths.SHARED_VARIABLE]
+def complete_runs(runs: Path) -> list[tuple[Path, dict]]:
+    """The folders of complete runs in `runs` with their metrics.json, the last run last."""
+    found = []
+    for file in runs.glob("*/metrics.json"):
+        with contextlib.suppress(OSError, ValueError, KeyError, TypeError):  # another version's, or cut off
+            content = json.loads(file.read_text(encoding="utf-8"))
+            if (content["format"], content["state"]) == ("microstereo.metrics", "complete"):
+                found.append((content["started"], file.parent, content))
+    return [entry[1:] for entry in sorted(found, key=lambda entry: entry[0])]
+
+
+def previous_values(runs: Path, content: dict) -> dict[str, float | None]:
+    """Metric -> its value in the last complete run that has it, of this run's machine, profile and parameters.
+
+    `content` is the metrics.json of this run.
+    """
+    found = {}
+    for _, other in complete_runs(runs):
+        alike = all(other[key] == content[key] for key in ("profile", "parameters"))
+        if alike and all(other["machine"][key] == content["machine"][key] for key in ("processor", "cores", "gpu")):
+            found |= {m["name"]: m["value"] for m in other["metrics"] if not pages.is_recorded(m)}
+    return found
 
 
 class _Report:
     """The folder of a run and the content of its metrics.json, kept in step."""
 
     def __init__(self, folder: Path, notebooks: Sequence[Path], profile: str, given: dict[str, str]):
-        self.folder, self.notebooks = folder, list(notebooks)
-        self.start = time.monotonic()
+        self.folder, self.notebooks, self.start = folder, notebooks, time.monotonic()
         self.content = {
             "format": "microstereo.metrics", "version": 1, "state": "running", "profile": profile, "parameters": given,
             "started": datetime.datetime.now().astimezone().isoformat(timespec="seconds"), "seconds": 0.0,
@@ -207,21 +211,19 @@ class _Report:
             ],
             "verdict": None, "reasons": [], "metrics": [], "figures": [], "download": None,
         }  # fmt: skip
-        self.content["previous"] = headlines.previous_values(folder.parent, self.content)
+        self.content["previous"] = previous_values(folder.parent, self.content)
         (folder / "figures").mkdir()
         (folder / _ROOM).write_bytes(bytes(1 << 20))
         self.write()
 
-    def executed(self, book: Path) -> Path:
-        return self.folder / book.name
-
-    def begin(self, book: Path) -> None:
-        self._entry(book)["state"] = "running"
+    def begin(self, number: int) -> None:
+        self.content["notebooks"][number]["state"] = "running"
         self.write()
 
-    def end(self, book: Path, failure: Failure | None, seconds: float) -> None:
-        """Collect what the notebook recorded (also one that failed, up to there) and write its page."""
-        entry, executed = self._entry(book), self.executed(book)
+    def end(self, number: int, failure: Failure | None, seconds: float) -> None:
+        """Collect what a notebook recorded (also one that failed, up to there) and write its page."""
+        book, entry = self.notebooks[number], self.content["notebooks"][number]
+        executed = self.folder / book.name
         entry.update(state="failed" if failure else "complete", seconds=round(seconds, 2))
         entry["failure"] = failure.as_dict() if failure else None
         try:
@@ -233,9 +235,14 @@ class _Report:
             entry.update(stated.verdict or {})
             self.content.update(execution.joined(self.content["notebooks"]) or {})
             self.content["metrics"] += [{"notebook": book.stem, **m} for m in stated.metrics]
-            for figure in stated.figures:
-                self._add_figure(book, figure)
-            self._write_page(book, entry)
+            for named, suffix, data in stated.figures:
+                file = f"figures/{named['name']}{suffix}"
+                if any(other["file"] == file for other in self.content["figures"]):
+                    file = f"figures/{book.stem}.{named['name']}{suffix}"
+                files.write_bytes(self.folder / file, data)
+                entry_of = {"notebook": book.stem, "name": named["name"], "file": file, "caption": named["caption"]}
+                self.content["figures"].append(entry_of)
+            self._write_page(number)
         self.write()
 
     def finish(self, state: str | None = None) -> None:
@@ -260,20 +267,12 @@ class _Report:
         files.write_json(self.folder / "metrics.json", self.content)
         files.write_text(self.folder / "index.html", pages.index_html(self.content))
 
-    def _add_figure(self, book: Path, figure: execution.NamedFigure) -> None:
-        file = f"figures/{figure.name}{figure.suffix}"
-        if any(other["file"] == file for other in self.content["figures"]):
-            file = f"figures/{book.stem}.{figure.name}{figure.suffix}"
-        files.write_bytes(self.folder / file, figure.data)
-        entry = {"notebook": book.stem, "name": figure.name, "file": file, "caption": figure.caption}
-        self.content["figures"].append(entry)
-
-    def _write_page(self, book: Path, entry: dict) -> None:
+    def _write_page(self, number: int) -> None:
+        book, entry = self.notebooks[number], self.content["notebooks"][number]
         pages_of = [None, *((f"{other['name']}.html", other["title"]) for other in self.content["notebooks"]), None]
-        place = self.notebooks.index(book)
         text = pages.page(
-            self.executed(book), title=entry["title"], folder=book.parent, verdict=entry,
-            previous=pages_of[place], following=pages_of[place + 2],
+            self.folder / book.name, title=entry["title"], folder=book.parent, verdict=entry,
+            previous=pages_of[number], following=pages_of[number + 2],
         )  # fmt: skip
         if pages.PLOTLY_FILE in text and not (self.folder / pages.PLOTLY_FILE).exists():
             import plotly
@@ -282,23 +281,13 @@ class _Report:
         files.write_text(self.folder / f"{book.stem}.html", text)
         entry.update(page=f"{book.stem}.html", executed=book.name)
 
-    def _entry(self, book: Path) -> dict:
-        return self.content["notebooks"][self.notebooks.index(book)]
-
-
-def _advance(bar: tqdm, cell: int, n_cells: int) -> None:
-    bar.total, bar.n = n_cells, cell
-    bar.refresh()
-
 
 def _new_folder(runs: Path, profile: str) -> Path:
     """``<date>-<profile>``, and with ``-2``, ``-3``, ... where that is taken: no run touches another's files."""
     runs.mkdir(parents=True, exist_ok=True)
     stem = f"{datetime.date.today().isoformat()}-{profile}"
-    number = 1
-    while True:
+    for number in itertools.count(1):
         folder = runs / (stem if number == 1 else f"{stem}-{number}")
         with contextlib.suppress(FileExistsError):
             folder.mkdir()
             return folder
-        number += 1

@@ -5,7 +5,7 @@ import logging
 import os
 import platform
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -15,12 +15,18 @@ from nbclient.exceptions import CellTimeoutError, DeadKernelError
 
 from lib.workbench.report import FIGURE_METADATA, METRIC_MIME, STOP_METADATA, VERDICT_COLOURS, VERDICT_MIME
 
-__all__ = ["Failure", "NamedFigure", "Stated", "execute", "failure_of", "joined", "kernel_environment", "outputs",
-           "stated_in", "versions"]  # fmt: skip
+__all__ = ["Failure", "Stated", "execute", "failure_of", "joined", "stated_in", "versions"]
 
 #: Packages whose version can change a figure.
 _TOLD = ("numpy", "scipy", "torch", "kornia", "opencv-python-headless", "open3d-cpu", "open3d", "cvxpy", "clarabel")
 _ADDED = {"injected-parameters", "papermill-error-cell-tag"}
+#: What kernels inherit: this interpreter's own kernel, quiet libraries, and that nobody answers what they show.
+_KERNEL_ENVIRONMENT = {
+    "MICROSTEREO_PAGE": "1",
+    "JUPYTER_PREFER_ENV_PATH": "1",  # a kernel named python3 elsewhere on the machine must not win
+    "OPEN3D_DISABLE_WEB_VISUALIZER": "true",  # it hangs without a display
+    "PYDEVD_DISABLE_FILE_VALIDATION": "1",  # a warning of the debugger on every start
+}
 _ANSI = re.compile(r"\x1b\[[0-9;]*m")
 
 
@@ -37,16 +43,6 @@ class Failure:
         return f"{self.kind}{where}: {self.message}"
 
     as_dict = asdict
-
-
-def kernel_environment() -> None:
-    """Set the environment variables that kernels inherit: this interpreter's own kernel, quiet libraries, and that what
-    they show becomes a page, where nobody answers."""
-    os.environ["MICROSTEREO_PAGE"] = "1"
-    os.environ["JUPYTER_PREFER_ENV_PATH"] = "1"  # a kernel named python3 elsewhere on the machine must not win
-    os.environ.pop("JUPYTER_PATH", None)
-    os.environ["OPEN3D_DISABLE_WEB_VISUALIZER"] = "true"  # it hangs without a display
-    os.environ["PYDEVD_DISABLE_FILE_VALIDATION"] = "1"  # a warning of the debugger on every start
 
 
 def execute(
@@ -69,7 +65,8 @@ def execute(
         running += not _is_added(cell)
         on_cell(running, cells)
 
-    kernel_environment()
+    os.environ.pop("JUPYTER_PATH", None)
+    os.environ.update(_KERNEL_ENVIRONMENT)
     logging.getLogger("papermill").setLevel(logging.CRITICAL)  # what it says is told by the failure returned
     try:
         papermill.execute_notebook(
@@ -124,21 +121,11 @@ def _longer_than(seconds: float | None) -> str:
 
 
 @dataclass(frozen=True)
-class NamedFigure:
-    """A picture that a notebook showed through `lib.workbench.report.show`; `suffix` is ".svg" or ".png"."""
-
-    name: str
-    caption: str
-    suffix: str
-    data: bytes
-
-
-@dataclass(frozen=True)
 class Stated:
     """What an executed notebook stated: of metrics and pictures with one name the last, in the order of the first."""
 
     metrics: list[dict]  # each with its `cell`
-    figures: list[NamedFigure]
+    figures: list[tuple[dict, str, bytes]]  # name and caption, ".svg" or ".png", the file's content
     verdict: dict | None  # `verdict` and `reasons` of all that it stated, joined
     left_out: str | None  # why `report.stop` ended it before its last cell
 
@@ -156,7 +143,7 @@ def stated_in(executed: Path) -> Stated:
             if named := metadata.get(FIGURE_METADATA):
                 drawn = data.get("image/svg+xml")
                 content = drawn.encode() if drawn else base64.b64decode(data["image/png"])
-                figures[named["name"]] = NamedFigure(**named, suffix=".svg" if drawn else ".png", data=content)
+                figures[named["name"]] = (named, ".svg" if drawn else ".png", content)
     return Stated(list(metrics.values()), list(figures.values()), joined(verdicts), left_out)
 
 
@@ -182,9 +169,3 @@ def versions() -> dict[str, str]:
         except PackageNotFoundError:
             continue
     return found
-
-
-def outputs(executed: Path) -> Iterator[dict]:
-    """The outputs of all cells, in order."""
-    for cell in nbformat.read(executed, as_version=4).cells:
-        yield from cell.get("outputs", [])

@@ -1,7 +1,9 @@
 """The pages of a run: ``index.html``, and one page of each notebook.  They open without network, equations and all."""
 
 import html
+import math
 import re
+import tomllib
 from functools import lru_cache, partial
 from pathlib import Path
 
@@ -13,10 +15,9 @@ from nbconvert.filters.markdown_mistune import IPythonRenderer, MarkdownWithMath
 
 from lib import paths
 from lib.workbench.execution import Failure
-from lib.workbench.headlines import headlines, is_recorded
-from lib.workbench.report import rendered, with_unit
+from lib.workbench.report import format_value, rendered, with_unit
 
-__all__ = ["PLOTLY_FILE", "equation_svg", "index_html", "markdown_html", "page"]
+__all__ = ["PLOTLY_FILE", "equation_svg", "headlines", "index_html", "is_recorded", "markdown_html", "page"]
 
 #: plotly's script lies once beside the pages that show a 3D view.
 PLOTLY_FILE = "plotly.min.js"
@@ -26,6 +27,10 @@ _RICHEST_FIRST = ["application/vnd.plotly.v1+json", "text/html", "application/vn
                   "image/png", "image/jpeg", "text/markdown", "text/latex", "text/plain"]  # fmt: skip
 #: (level, anchor, text) of a heading that nbconvert has given an anchor.
 _HEADING = re.compile(r'<h([23]) id="([^"]+)">(.*?)<a class="anchor-link"', re.DOTALL)
+#: The note of a number that was read from a record and not computed in the run.
+_RECORDED = re.compile(r"(.*, )?recorded\b")
+#: State of the notebook -> why it did not state a number; None: it is not part of the run.
+_MISSING = {None: "its notebook was not run", "pending": "not yet", "running": "not yet", "failed": "its notebook failed"}
 
 #: What the converter does not know, in its own words.
 _REWRITES = [
@@ -127,14 +132,59 @@ def page(
 
 
 def index_html(run: dict) -> str:
-    """The page of a run; every text in it is escaped.
-
-    Args:
-        run: The content of metrics.json.
-    """
+    """The page of a run, from the content of its metrics.json; every text in it is escaped."""
     rows, left_out = headlines(run)
     return rendered(
         "index.html", run=run, headlines=rows, left_out=left_out, shipped=paths.shown(paths.SHIPPED_RECORDING),
         books={book["name"]: book for book in run["notebooks"]}, is_recorded=is_recorded, with_unit=with_unit,
         reason=lambda failure: str(Failure(**failure)), markdown=markdown_html,
     )  # fmt: skip
+
+
+def is_recorded(metric: dict) -> bool:
+    """Whether a metric was read from a record."""
+    return bool(_RECORDED.match(metric["note"]))
+
+
+def headlines(run: dict) -> tuple[list[dict], list[str]]:
+    """The rows of the table on top of index.html, and what has no row because the user's recording has no truth.
+
+    ``templates/headlines.toml`` says which numbers these are, eight at most, with their targets; `run` is the content of
+    metrics.json.
+    """
+    text = (_TEMPLATES / "headlines.toml").read_text(encoding="utf-8")
+    metrics, books = ({entry["name"]: entry for entry in run[kind]} for kind in ("metrics", "notebooks"))
+    own = bool(run["parameters"].get("recording"))
+    rows, left_out = [], []
+    for line in tomllib.loads(text)["headline"]:
+        live, record = metrics.get(line["name"]), None if own else metrics.get(line.get("recorded"))
+        here = bool(live) and live["value"] is not None
+        if own and (line.get("elsewhere") or (line.get("truth") and not here)):
+            left_out += [] if line.get("elsewhere") else [line["words"]]
+            continue
+        unit, paper = line["unit"], (live or line).get("paper")
+        before, book = run.get("previous", {}).get(line["name"]), books.get(line["notebook"], {"state": None})
+        rows.append(line | {
+            "light": _light(live["value"], line) if here else "missing",
+            "target": _range(*line["target"], unit),
+            "value": with_unit(live["value"], unit) if here else _MISSING.get(book["state"], f"needs {line['needs']}"),
+            "recorded": record and with_unit(record["value"], unit),
+            "paper": paper is not None and with_unit(paper, unit),
+            "before": before is not None and with_unit(before, unit),
+            "from": live or record,
+        })  # fmt: skip
+    return rows[:8], left_out
+
+
+def _light(value: float, line: dict) -> str:
+    inside = {name: line[name][0] <= value <= line[name][1] for name in ("target", "close")}
+    return "met" if inside["target"] else "close" if inside["close"] else "missed"
+
+
+def _range(low: float, high: float, unit: str) -> str:
+    """A target and its direction in words."""
+    if low == 0:
+        return f"at most {with_unit(high, unit)} (lower is better)"
+    if high == math.inf or (unit == "%" and high == 100):
+        return f"at least {with_unit(low, unit)} (higher is better)"
+    return f"{format_value(low)} to {with_unit(high, unit)}"

@@ -3,7 +3,6 @@
 import argparse
 import ast
 import contextlib
-import functools
 import logging
 import math
 import re
@@ -14,17 +13,13 @@ import nbformat
 
 from lib import paths
 
-__all__ = ["UsageError", "choose_notebooks", "declared_grid", "declared_parameters", "parse_parameters", "positive",
-           "split_values", "title_of"]  # fmt: skip
+__all__ = ["choose_notebooks", "declared_grid", "declared_parameters", "parse_parameters", "positive", "split_values",
+           "title_of"]  # fmt: skip
 
 #: How the comment of a study's parameter ends: ``; grid: 75, 300, 1500``.
 _GRID = re.compile(r";\s*grid:(.*)$")
 #: A comma outside brackets.
 _COMMA = re.compile(r",(?![^\[({]*[\])}])")
-
-
-class UsageError(ValueError):
-    """The command cannot run: an unknown notebook or parameter, a value of the wrong type, a folder out of reach."""
 
 
 def choose_notebooks(names: Sequence[str] = (), folder: Path = paths.NOTEBOOKS) -> list[Path]:
@@ -33,12 +28,12 @@ def choose_notebooks(names: Sequence[str] = (), folder: Path = paths.NOTEBOOKS) 
     A name is a path, a file's name, its stem, or the leading number (``03``); studies are found by stem too.
 
     Raises:
-        UsageError: If a name fits none; the text lists what there is.
+        ValueError: If a name fits none; the text lists what there is.
     """
     shipped = sorted(folder.glob("[0-9]*.ipynb"))
     if not names:
         if not shipped:
-            raise UsageError(f"{folder} holds no notebooks.")
+            raise ValueError(f"{folder} holds no notebooks.")
         return shipped
     studies = sorted(folder.glob("studies/*.ipynb"))
     chosen = []
@@ -49,7 +44,7 @@ def choose_notebooks(names: Sequence[str] = (), folder: Path = paths.NOTEBOOKS) 
         fits = fits or [book for book in studies if path.with_suffix("") in (Path(book.stem), Path("studies", book.stem))]
         if not fits:
             there = [book.stem for book in shipped] + [f"studies/{book.stem}" for book in studies]
-            raise UsageError(f"unknown notebook: {name}. There are: {', '.join(there)}.")
+            raise ValueError(f"unknown notebook: {name}. There are: {', '.join(there)}.")
         chosen += [book for book in fits if book not in chosen]
     return sorted(chosen, key=lambda book: book.name)
 
@@ -78,13 +73,13 @@ def parse_parameters(pairs: Sequence[tuple[str, str]], notebooks: Sequence[Path]
     """What each notebook is given: the pairs that it declares, as values of the declared type.
 
     Raises:
-        UsageError: If no chosen notebook declares a name, or a text does not fit the declared type.
+        ValueError: If no chosen notebook declares a name, or a text does not fit the declared type.
     """
     declared = {notebook: declared_parameters(notebook) for notebook in notebooks}
     known = {name for names in declared.values() for name in names}
     for name, _ in pairs:
         if name not in known:
-            raise UsageError(f"unknown parameter: {name}. Declared are: {', '.join(sorted(known)) or 'none'}.")
+            raise ValueError(f"unknown parameter: {name}. Declared are: {', '.join(sorted(known)) or 'none'}.")
     return {
         notebook: {name: _value(name, text, names[name]) for name, text in pairs if name in names}
         for notebook, names in declared.items()
@@ -128,25 +123,19 @@ def _value(name: str, text: str, kind: str) -> object:
                 raise ValueError(type(value).__name__)
             return value
     except (ValueError, KeyError, SyntaxError):
-        raise UsageError(f"parameter {name}: {text!r} is not of type {kind}.") from None
+        raise ValueError(f"parameter {name}: {text!r} is not of type {kind}.") from None
     with contextlib.suppress(ValueError, SyntaxError):
         return ast.literal_eval(text)
     return {"true": True, "false": False, "none": None}.get(text.lower(), text)
 
 
 def _inspect(notebook: Path) -> dict[str, dict]:
-    if not notebook.is_file():
-        raise UsageError(f"{notebook}: no such notebook.")
-    return _inspect_version(notebook, notebook.stat().st_mtime_ns)
-
-
-@functools.lru_cache(maxsize=64)
-def _inspect_version(notebook: Path, changed_ns: int) -> dict[str, dict]:
-    """Once for each version of the file: a sweep asks for every point of its grid."""
     import papermill
 
+    if not notebook.is_file():
+        raise ValueError(f"{notebook}: no such notebook.")
     logging.getLogger("papermill").setLevel(logging.ERROR)  # no word about notebooks without a parameters cell
     try:
         return papermill.inspect_notebook(str(notebook))
     except (OSError, ValueError, nbformat.ValidationError) as error:  # also text that is not JSON
-        raise UsageError(f"{notebook}: not a notebook ({error}).") from None
+        raise ValueError(f"{notebook}: not a notebook ({error}).") from None

@@ -15,7 +15,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn, Protocol
+from typing import TYPE_CHECKING, NoReturn
 
 from jinja2 import Environment, FileSystemLoader
 
@@ -57,12 +57,6 @@ class _End(Exception):
 _End.__name__ = "SystemExit"  # papermill and JupyterLab know an error of this name, without a value, as an end in good order
 
 
-class Judged(Protocol):
-    """What `verdict` takes: `lib.trust.Verdict`."""
-
-    def to_json(self) -> dict: ...
-
-
 def record(name: str, value: float, unit: str, *, paper: float | None = None, note: str = "") -> None:
     """State one number: shown as a small row, and collected into the run's ``metrics.json``.
 
@@ -86,7 +80,7 @@ def record(name: str, value: float, unit: str, *, paper: float | None = None, no
     _publish({METRIC_MIME: metric, "text/html": page, "text/plain": text}, text)
 
 
-def verdict(found: Judged) -> None:
+def verdict(found: object) -> None:
     """State a verdict (`lib.trust.Verdict`): shown as a badge with its reasons, here and on top of the notebook's page.
 
     The main job joins what several cells and notebooks state; the worst counts.

@@ -25,7 +25,6 @@ from lib.provenance import Provenance, machine
 from lib.workbench import execution, results
 from lib.workbench.execution import execute
 from lib.workbench.parameters import (
-    UsageError,
     choose_notebooks,
     declared_grid,
     declared_parameters,
@@ -38,7 +37,7 @@ __all__ = ["column_name", "main", "save_plots", "sweep"]
 
 
 def main(argv: Sequence[str]) -> int:
-    """Parse the command line and sweep; 1 if a run failed, 2 for a command that cannot run."""
+    """Parse the command line and sweep; 1 if a run failed."""
     parser = argparse.ArgumentParser(
         prog="python3 -m lib sweep",
         description="Run one notebook at every point of a grid of parameters and make a table of its metrics.",
@@ -57,18 +56,11 @@ def main(argv: Sequence[str]) -> int:
     options = parser.parse_args(argv)
     if options.workers is not None and options.workers < 1:
         parser.error("--workers: at least 1.")
-    try:
-        grid = {name: split_values(values) for name, values in options.pairs}
-        table, failures = sweep(
-            options.notebook, grid, workers=options.workers, scheduler=options.scheduler, record=options.record,
-            cell_timeout_s=options.cell_timeout, runs=options.runs,
-        )  # fmt: skip
-    except (UsageError, OSError) as error:
-        print(f"python3 -m lib sweep: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("\nStopped; run again to go on.")
-        return 130
+    grid = {name: split_values(values) for name, values in options.pairs}
+    table, failures = sweep(
+        options.notebook, grid, workers=options.workers, scheduler=options.scheduler, record=options.record,
+        cell_timeout_s=options.cell_timeout, runs=options.runs,
+    )  # fmt: skip
     for point, failure in failures.items():
         print(f"FAILED {point or 'the run'}: {failure}", file=sys.stderr)
     print(f"Table: {paths.shown(table)}")
@@ -93,15 +85,15 @@ def sweep(
         tuple: ``results.csv`` (a row a run: its parameters, then its metrics), and what failed at which point.
 
     Raises:
-        UsageError: For an unknown notebook or parameter, a value of the wrong type, or a parameter without values.
+        ValueError: For an unknown notebook or parameter, a value of the wrong type, or a parameter without values.
     """
     chosen = choose_notebooks([name], notebooks)
     grid = grid or declared_grid(chosen[0])
     if len(chosen) != 1 or not all(grid.values()):
-        raise UsageError("a sweep takes one notebook, and values for each parameter: -p NAME VALUE,VALUE,...")
+        raise ValueError("a sweep takes one notebook, and values for each parameter: -p NAME VALUE,VALUE,...")
     book = chosen[0]
-    in_grid = [list(zip(grid, values, strict=True)) for values in itertools.product(*grid.values())]
-    points = [parse_parameters(pairs, [book])[book] for pairs in in_grid]
+    parsed = {key: [parse_parameters([(key, text)], [book])[book][key] for text in texts] for key, texts in grid.items()}
+    points = [dict(zip(parsed, values, strict=True)) for values in itertools.product(*parsed.values())]
     profile = {"profile": "quick"} if "profile" in declared_parameters(book) else {}
     folder = runs.resolve() / "sweeps" / f"{book.stem}-{_code_digest(book)}"
     folder.mkdir(parents=True, exist_ok=True)
@@ -185,8 +177,9 @@ def run_point(executed: Path, book: Path, values: dict, cell_timeout_s: float | 
             text = [f"{book.name} with {_label(values)}", str(failure)]
             if partial.exists():
                 shutil.copy(partial, failed)
-                for output in execution.outputs(failed):
-                    text.append(output.get("text") or "\n".join(output.get("traceback", [])))
+                for cell in nbformat.read(failed, as_version=4).cells:
+                    for output in cell.get("outputs", []):
+                        text.append(output.get("text") or "\n".join(output.get("traceback", [])))
             files.write_text(log, "\n".join(text) + "\n")
             raise RunFailed(str(failure))
         notebook = nbformat.read(partial, as_version=4)

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from lib import paths
-from lib.workbench.command import run
-from lib.workbench.headlines import complete_runs, is_recorded
+from lib.workbench.command import complete_runs, run
+from lib.workbench.pages import is_recorded
 from tests.browser import Chromium
 
 pytestmark = pytest.mark.slow

@@ -9,6 +9,7 @@ import pytest
 from PIL import Image
 
 from lib import files, paths
+from lib.__main__ import COMMANDS
 from lib.workbench import command
 
 
@@ -31,15 +32,15 @@ def test_the_gallery_takes_a_runs_pictures_or_changes_nothing(tmp_path, monkeypa
         cv2.imwrite(str(run / "figures" / f"{name}.png"), np.full((60, 2600, 3), 80, np.uint8))
     pages = [Image.fromarray(np.full((40, 60, 3), 80 * k, np.uint8)) for k in range(3)]
     pages[0].save(run / "figures" / "pipeline_push.png", save_all=True, append_images=pages[1:])
-    assert command.main_site([str(run), "--gallery"]) == 2
+    assert COMMANDS["site"]([str(run), "--gallery"]) == 2
     assert "no picture overview" in capsys.readouterr().err and not list(gallery.iterdir())
     (run / "figures" / "overview.svg").write_text("<svg/>", encoding="utf-8")
     (gallery / "overview.png").touch()
     files.write_json(run / "metrics.json", made_by | {"parameters": {"recording": "mine"}})
-    assert command.main_site([str(run), "--gallery"]) == 2
+    assert COMMANDS["site"]([str(run), "--gallery"]) == 2
     assert "recording that ships" in capsys.readouterr().err and len(list(gallery.iterdir())) == 1
     files.write_json(run / "metrics.json", made_by)
-    assert command.main_site([str(run), "--gallery"]) == 0
+    assert COMMANDS["site"]([str(run), "--gallery"]) == 0
     assert cv2.imread(str(gallery / "landmark_detection.jpg")).shape == (30, 1300, 3)
     assert Image.open(gallery / "pipeline_push.webp").n_frames == 3
     assert [path.name for path in gallery.glob("overview.*")] == ["overview.svg"]

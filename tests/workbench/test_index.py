@@ -8,8 +8,8 @@ import re
 import nbformat
 
 from lib import paths
-from lib.workbench.headlines import headlines, previous_values
-from lib.workbench.pages import index_html, markdown_html
+from lib.workbench.command import previous_values
+from lib.workbench.pages import headlines, index_html, markdown_html
 
 SCRIPT = "<script>alert(1)</script>"
 

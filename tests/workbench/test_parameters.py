@@ -10,13 +10,7 @@ import papermill
 import pytest
 
 from lib import paths
-from lib.workbench.parameters import (
-    UsageError,
-    choose_notebooks,
-    declared_grid,
-    parse_parameters,
-    positive,
-)
+from lib.workbench.parameters import choose_notebooks, declared_grid, parse_parameters, positive
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +28,7 @@ def test_notebooks_are_chosen_by_number_name_or_path(books):
     assert choose_notebooks([str(books / "03_good.ipynb")], books) == [(books / "03_good.ipynb").resolve()]
     for name in ("noise", "studies/noise", "studies/noise.ipynb"):
         assert choose_notebooks([name], books) == [books / "studies" / "noise.ipynb"]
-    with pytest.raises(UsageError, match="unknown notebook: 3. There are: 00_error"):
+    with pytest.raises(ValueError, match="unknown notebook: 3. There are: 00_error"):
         choose_notebooks(["3"], books)
 
 
@@ -48,7 +42,7 @@ def test_values_take_the_declared_type(books):
     ("name", "text"), [("seed", "1.5"), ("noise_px", "much"), ("crop", "maybe"), ("sizes", "(1,)")]
 )
 def test_a_value_of_another_type_is_an_error(books, name, text):
-    with pytest.raises(UsageError, match=f"parameter {name}: .* is not of type"):
+    with pytest.raises(ValueError, match=f"parameter {name}: .* is not of type"):
         parse_parameters([(name, text)], [books / "03_good.ipynb"])
 
 
@@ -56,7 +50,7 @@ def test_a_parameter_reaches_only_who_declares_it(write_notebook, tmp_path):
     one = write_notebook(tmp_path, "00_one", parameters="a: int = 1  # one")
     two = write_notebook(tmp_path, "01_two", parameters="b: int = 1  # two")
     assert parse_parameters([("b", "2")], [one, two]) == {one: {}, two: {"b": 2}}
-    with pytest.raises(UsageError, match=r"unknown parameter: c. Declared are: a, b\."):
+    with pytest.raises(ValueError, match=r"unknown parameter: c. Declared are: a, b\."):
         parse_parameters([("c", "2")], [one, two])
 
 
@@ -71,7 +65,7 @@ seed: int = 0  # drives all
 
 def test_a_notebook_that_is_no_json(tmp_path):
     (tmp_path / "torn.ipynb").write_text('{"cells": [', encoding="utf-8")
-    with pytest.raises(UsageError, match="torn.ipynb: not a notebook"):
+    with pytest.raises(ValueError, match="torn.ipynb: not a notebook"):
         declared_grid(tmp_path / "torn.ipynb")
 
 

@@ -17,10 +17,11 @@ from pathlib import Path
 import pytest
 
 from lib import paths
+from lib.__main__ import COMMANDS
 from lib.workbench import command
-from lib.workbench.command import main, main_site, run
+from lib.workbench.command import run
 from lib.workbench.execution import Failure, execute
-from lib.workbench.parameters import UsageError, choose_notebooks
+from lib.workbench.parameters import choose_notebooks
 
 GOOD = [
     "from lib.workbench import report\nimport matplotlib.pyplot as plt",
@@ -38,6 +39,7 @@ GOOD = [
     "import ipywidgets\nipywidgets.IntSlider()",
 ]
 
+main, main_site = COMMANDS["run"], COMMANDS["site"]
 ENDED = ["from lib.workbench import report\nreport.stop('No distances, because <i>nothing</i> was detected.')", "1 / 0"]
 
 
@@ -93,7 +95,7 @@ def test_the_others_still_run(finished):
 
 def test_a_notebook_that_is_no_json_fails_before_anything_runs(tmp_path):
     (tmp_path / "00_torn.ipynb").write_text('{"cells": [', encoding="utf-8")
-    with pytest.raises(UsageError, match="00_torn.ipynb: not a notebook"):
+    with pytest.raises(ValueError, match="00_torn.ipynb: not a notebook"):
         run(runs=tmp_path / "runs", notebooks=tmp_path)
     assert not (tmp_path / "runs").exists()
 

@@ -15,13 +15,15 @@ import numpy as np
 import pytest
 
 from lib import paths
+from lib.__main__ import COMMANDS
 from lib.provenance import commit
 from lib.workbench import results
 from lib.workbench import sweep as sweeping
-from lib.workbench.parameters import UsageError, split_values
-from lib.workbench.sweep import main, save_plots, sweep
+from lib.workbench.parameters import split_values
+from lib.workbench.sweep import save_plots, sweep
 from tests.processes import children
 
+main = COMMANDS["sweep"]
 PARAMETERS = """\
 seed: int = 0  # of the noise; grid: 0, 1
 distance_mm: float = 200.0  # to the eye; inf is an affine microscope; grid: 200, inf
@@ -107,7 +109,7 @@ def test_what_cannot_run_is_told_in_one_line(write_notebook, tmp_path, capsys):
     for words in (["--cell-timeout", "nan"], ["--workers", "0"], ["--workers", "2", "--scheduler", "tcp://a:1"]):
         with pytest.raises(SystemExit):
             main([book, *words])
-    with pytest.raises(UsageError, match="one notebook"):
+    with pytest.raises(ValueError, match="one notebook"):
         sweep(book, {"seed": []}, runs=tmp_path)
 
 
