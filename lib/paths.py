@@ -33,13 +33,9 @@ def shown(path: Path) -> str:
 
 
 def real_data(name: str) -> Path | None:
-    """The folder of a real data set, or None where it is not at hand.
+    """The folder of a real data set, such as ``"retinal_microsurgery"``, in that which ``MICROSTEREO_DATA`` names.
 
-    Real recordings do not ship.  The environment variable ``MICROSTEREO_DATA`` names the folder that holds
-    them, one folder a data set (`data/README.md` says where a user gets each).
-
-    Args:
-        name: Folder of the data set, such as ``"retinal_microsurgery"``.
+    None where it is not at hand: real recordings do not ship (`data/README.md` says where a user gets each).
     """
     root = os.environ.get(REAL_DATA_VARIABLE)
     folder = ROOT / root / name if root else None

@@ -6,7 +6,6 @@ import os
 import platform
 import subprocess
 import time
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -47,18 +46,12 @@ def machine() -> dict:
     return {"system": system, "processor": _processor(), "cores": cores(), "memory_gb": _memory_gb(), "gpu": _gpu()}
 
 
-@dataclass(frozen=True)
 class Provenance:
-    """Made when a measurement starts: its command, the commit whose code runs, and the clocks.
+    """Made when a measurement starts: what a user types to measure the same anew, the commit whose code runs, the clocks."""
 
-    Attributes:
-        command: What a user types to measure the same anew.
-    """
-
-    command: str
-    commit: dict | None = field(default_factory=commit)
-    wall_s: float = field(default_factory=time.perf_counter)
-    cpu_s: float = field(default_factory=lambda: _cpu_s())
+    def __init__(self, command: str) -> None:
+        self.command, self.commit = command, commit()
+        self.wall_s, self.cpu_s = time.perf_counter(), _cpu_s()
 
     def so_far(self) -> dict[str, object]:
         """What is known now, as `lib.workbench.results.write` takes it.

@@ -3,7 +3,6 @@
 Units that no column's name states are those in which the log's steps and motion are plausible.
 """
 
-import json
 import re
 import tomllib
 from collections import Counter
@@ -16,7 +15,7 @@ from lib.correspondences import LANDMARKS
 from lib.importing.labels import labels_of
 from lib.importing.logs import topics_of
 from lib.importing.video import IMAGES, VIDEOS, last_number
-from lib.recordings.tables import decoded
+from lib.recordings.tables import decoded, toml
 
 __all__ = ["guess_mapping"]
 
@@ -54,14 +53,8 @@ def guess_mapping(source: str | Path) -> str:
         table = key in ("video", "robot", "tool", "labels")
         lines = {f"{key}.{inner}": entry for inner, entry in value.items()} if table else {key: value}
         text += f"\n[{key}]\n" if table and value else ""
-        text += "".join(f"{k.split('.')[-1]} = {_toml(v)}  # {tells[k]}\n" for k, v in lines.items())
+        text += "".join(f"{k.split('.')[-1]} = {toml(v)}  # {tells[k]}\n" for k, v in lines.items())
     return text
-
-
-def _toml(value: object) -> str:
-    if isinstance(value, dict):
-        return "{ " + ", ".join(f"{key} = {_toml(item)}" for key, item in value.items()) + " }"
-    return json.dumps(value, ensure_ascii=False)
 
 
 def _video(folder: Path, paths: dict[str, Path], tables: dict[str, Path]) -> dict:

@@ -12,7 +12,7 @@ from lib.calibration import NoConsensusError, TimeOffset, Tool, estimate_time_of
 from lib.correspondences import LANDMARKS, NoDetectionError, of_recording
 from lib.geometry import RigidTransform
 from lib.importing.labels import read_labels
-from lib.importing.logs import RobotLog, increasing, read_robot, since
+from lib.importing.logs import RobotLog, increasing, read_robot, since, zero_of
 from lib.importing.mapping import Mapping, read_mapping
 from lib.importing.video import StereoSource, open_stereo
 from lib.landmarks import SharedDetector, detect
@@ -47,8 +47,8 @@ def import_recording(source: str | Path, mapping: str | Path | Mapping, out: str
     told = mapping if isinstance(mapping, Mapping) else read_mapping(mapping)
     stereo = open_stereo(folder, told.video)
     robot = read_robot(folder, told)
-    log = folder / told.robot.file
-    zeros = stereo_zero, robot_zero = increasing(stereo.time, "", 0, np.inf), increasing(robot.time, str(log), *_LOG_STEP_S)
+    increasing(robot.time, str(folder / told.robot.file), *_LOG_STEP_S)
+    zeros = stereo_zero, robot_zero = zero_of(stereo.time), zero_of(robot.time)
     given = 0.0 if told.robot.offset_s == "estimate" else told.robot.offset_s
     one_dated = told.robot.offset_s == "estimate" and bool(stereo_zero) != bool(robot_zero)
     offset_s = 0.0 if one_dated else float(stereo_zero + Decimal(str(given)) - robot_zero)
@@ -74,12 +74,12 @@ def import_recording(source: str | Path, mapping: str | Path | Mapping, out: str
                 writer.annotations(labels.u_left, labels.u_right, labels.visibility_left, labels.visibility_right)
             draft = writer.draft()
             clock = _clock(draft, told.robot.search_s) if told.robot.offset_s == "estimate" else None
+            found = None
             if isinstance(clock, TimeOffset):
-                writer.offset(clock.offset_s)
-                draft = writer.draft()
-            report = {"format": "microstereo.import", "did": _did(told, stereo, robot, draft, clock, zeros)}
-            found = isinstance(clock, TimeOffset)
-            report["clock"] = {"offset_s": round(clock.offset_s, 9), "sd_s": float(f"{clock.sd_s:.3g}")} if found else None
+                draft = writer.draft(clock.offset_s)
+                found = {"offset_s": round(clock.offset_s, 9), "sd_s": float(f"{clock.sd_s:.3g}")}
+            did = _did(told, stereo, robot, draft, clock, zeros)
+            report = {"format": "microstereo.import", "did": did, "clock": found}
             report |= {"tool": tool_told, "mapping": told.model_dump(mode="json"), "sources": _sources(folder, told, stereo)}
             files.write_json(writer.folder / "import.json", report)
     except ValueError as error:  # of the unfinished recording, which is gone: its place says more

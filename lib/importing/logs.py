@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from lib.importing.mapping import Mapping, Pose, Table
 from lib.recordings.tables import decoded, number, rows_of
 
-__all__ = ["RobotLog", "exact_seconds", "increasing", "read_columns", "read_robot", "since", "topics_of"]
+__all__ = ["RobotLog", "exact_seconds", "increasing", "read_columns", "read_robot", "since", "topics_of", "zero_of"]
 
 _SECONDS = {"s": Decimal(1), "ms": Decimal("1e-3"), "us": Decimal("1e-6"), "ns": Decimal("1e-9")}
 _MILLIMETRES = {"m": 1e3, "mm": 1.0, "um": 1e-3}
@@ -60,8 +60,13 @@ def since(time: Iterable[Decimal], zero: Decimal) -> np.ndarray:
     return np.array([float(t - zero) for t in time])
 
 
-def increasing(time: list[Decimal], where: str, shortest_s: float, longest_s: float) -> Decimal:
-    """Check times of rows or frames; returns their zero: 0, or the first whole second of times that count from a date.
+def zero_of(time: list[Decimal]) -> Decimal:
+    """What times count from in a recording: 0, or the first whole second of times that count from a date."""
+    return Decimal(int(time[0])) if abs(time[0]) > _EPOCH_S else Decimal(0)
+
+
+def increasing(time: list[Decimal], where: str, shortest_s: float, longest_s: float) -> None:
+    """Check times of rows or frames.
 
     Raises:
         ValueError: Where times repeat or go back, or their step fits another unit.
@@ -75,7 +80,6 @@ def increasing(time: list[Decimal], where: str, shortest_s: float, longest_s: fl
     if not shortest_s <= step <= longest_s:
         plausible = f"{shortest_s} to {longest_s} s is plausible"
         raise ValueError(f"{where}: entries are {step:.3g} s apart, {plausible}. Check time_unit.")
-    return Decimal(int(time[0])) if abs(time[0]) > _EPOCH_S else Decimal(0)
 
 
 def read_columns(path: Path, table: Table, names: Iterable[str]) -> tuple[list[Decimal], dict[str, np.ndarray]]:

@@ -14,7 +14,6 @@ Vector = tuple[float, float, float]
 Columns = tuple[str, str, str]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,31}$")]
 Text = Annotated[str, Field(pattern=r"^[^<>&\x00-\x1f\x7f]*$")]  # it goes into pages and terminals
-TimeUnit = Literal["s", "ms", "us", "ns", "iso"]
 
 
 class _Section(BaseModel):
@@ -38,7 +37,7 @@ class Table(_Section):
     separator: Annotated[str, Field(min_length=1, max_length=1)] = ","
     decimal: Literal[".", ","] = "."
     time: str
-    time_unit: TimeUnit = "s"
+    time_unit: Literal["s", "ms", "us", "ns", "iso"] = "s"
 
 
 class Video(_Section):

@@ -62,13 +62,12 @@ def coco_keypoints(path: Path) -> Iterator[tuple[str, list[str], np.ndarray]]:
         content = json.loads(path.read_bytes())
         categories = {c["id"]: list(c["keypoints"]) for c in content["categories"] if "keypoints" in c}
         images = {image["id"]: str(image["file_name"]) for image in content["images"]}
-        entries = [(a["image_id"], a["category_id"], a["keypoints"], a.get("absent", [])) for a in content["annotations"]]
-        found = [(images.get(image), categories.get(category)) for image, category, _, _ in entries]
-        absences = [set(absent) for *_, absent in entries]
+        entries = [(a["image_id"], a["category_id"], a["keypoints"], {*a.get("absent", ())}) for a in content["annotations"]]
+        found = [(images.get(image), categories.get(category)) for image, category, *_ in entries]
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         what = f"not COCO keypoints ({type(error).__name__}: {error})"
         raise ValueError(f"{path}: {what}. Export the annotations again.") from None
-    for (image_id, category_id, keypoints, _), (image, names), absent in zip(entries, found, absences, strict=True):
+    for (image_id, category_id, keypoints, absent), (image, names) in zip(entries, found, strict=True):
         if names is None or image is None:
             where = f"category {category_id}, image {image_id}"
             raise ValueError(f"{path}: an annotation names {where}, which the file does not describe. Export it again.")

@@ -4,7 +4,7 @@ import math
 import re
 import shlex
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple, Self
@@ -18,7 +18,7 @@ from lib.recordings.frames import Frames, open_side
 from lib.recordings.tables import columns, read_table, read_toml, refuse
 from lib.recordings.truth import Truth
 
-__all__ = ["FORMAT", "UNITS", "Doubt", "Kinematics", "Recording", "doubts", "kinematics_columns"]
+__all__ = ["FORMAT", "UNITS", "Doubt", "Kinematics", "Recording", "kinematics_columns"]
 
 FORMAT = "microstereo.recording"
 #: A longer step between samples than this, and than ten usual ones, is a gap: nothing is interpolated in it.
@@ -174,9 +174,30 @@ class Recording:
     @property
     def doubts(self) -> list[Doubt]:
         """What makes the recording suspicious though it can be read."""
-        reported = np.isfinite(self.landmarks_mm()).all(axis=2).any(axis=1)
-        robot_s = self.frames.time_s + self.offset_s
-        return list(doubts(robot_s, self.fps, self.kinematics.time_s, self.kinematics.x_mm, reported))
+        found, n = [], len(self)
+        frame_s, log_s = self.frames.time_s + self.offset_s, self.kinematics.time_s
+        span, logged = float(np.ptp(frame_s)), float(np.ptp(log_s))
+        uniform = np.allclose(np.diff(frame_s) * self.fps, 1.0, rtol=1e-3)
+        if uniform and logged > _LONGER * (span + 1.0 / self.fps) and logged > 2.0:
+            text = f"{n} frames at {self.fps:g} fps last {span:.1f} s, but the robot's log {logged:.1f} s."
+            cure = "If frames were left out, write their times to frames.csv (frame, time_s)."
+            found.append(Doubt("frame_times", text, cure))
+        reported = int(np.isfinite(self.landmarks_mm()).all(axis=2).any(axis=1).sum())
+        if reported / n < _COVERED:
+            text = f"The robot reports a position in {reported} of {n} frames; log and video hardly overlap."
+            cure = "Check offset_s and the time_s columns; export the log of the whole video."
+            found.append(Doubt("little_overlap", text, cure))
+        step = np.diff(log_s)
+        if len(step) and np.median(step) > _SLOW_S:
+            text = f"The robot's log has a sample every {np.median(step):.3g} s."
+            cure = "Is time_s in milliseconds? Give seconds, and ten samples a second or more."
+            found.append(Doubt("slow_log", text, cure))
+        jump = np.nan_to_num(np.linalg.norm(np.diff(self.kinematics.x_mm, axis=0), axis=2)).max(axis=1)
+        if (jump > _JUMP_MM).any():
+            k = int(jump.argmax())
+            text = f"In kinematics.csv a landmark jumps by {jump[k]:.0f} mm at {log_s[k + 1]:.3f} s (line {k + 3})."
+            found.append(Doubt("jump", text, "Leave the cells of a wrong sample empty."))
+        return found
 
     def landmarks_mm(self) -> np.ndarray:
         """The robot's landmarks (n, k, 3) mm at the frames' times, NaN where the robot says nothing.
@@ -242,28 +263,3 @@ def _read_kinematics(path: Path, landmarks: Sequence[str]) -> Kinematics:
         what = f"the median distance from {landmarks[0]} to the others is {reach_mm:.4g}, not plausible in mm (0.1 to 100)"
         raise ValueError(f"{path}: {what}. Metres or micrometres? Convert to mm.")
     return Kinematics(time_s, x)
-
-
-def doubts(frame_s: np.ndarray, fps: float, log_s: np.ndarray, x_mm: np.ndarray, reported: np.ndarray) -> Iterator[Doubt]:
-    """Judge times of the frames (n,) on the robot's clock, the log's times (m,), its positions (m, k, 3), and in which frames
-    (n,) the robot reports any landmark.
-    """
-    span, logged = float(np.ptp(frame_s)), float(np.ptp(log_s))
-    uniform = np.allclose(np.diff(frame_s) * fps, 1.0, rtol=1e-3)
-    if uniform and logged > _LONGER * (span + 1.0 / fps) and logged > 2.0:
-        text = f"{len(frame_s)} frames at {fps:g} fps last {span:.1f} s, but the robot's log {logged:.1f} s."
-        yield Doubt("frame_times", text, "If frames were left out, write their times to frames.csv (frame, time_s).")
-    if reported.mean() < _COVERED:
-        text = f"The robot reports a position in {reported.sum()} of {len(frame_s)} frames; log and video hardly overlap."
-        yield Doubt("little_overlap", text, "Check offset_s and the time_s columns; export the log of the whole video.")
-    if len(log_s) < 2:
-        return
-    step = np.diff(log_s)
-    if np.median(step) > _SLOW_S:
-        text = f"The robot's log has a sample every {np.median(step):.3g} s."
-        yield Doubt("slow_log", text, "Is time_s in milliseconds? Give seconds, and ten samples a second or more.")
-    jump = np.nan_to_num(np.linalg.norm(np.diff(x_mm, axis=0), axis=2)).max(axis=1)
-    if (jump > _JUMP_MM).any():
-        k = int(jump.argmax())
-        text = f"In kinematics.csv a landmark jumps by {jump[k]:.0f} mm at {log_s[k + 1]:.3f} s (line {k + 3})."
-        yield Doubt("jump", text, "Leave the cells of a wrong sample empty.")

@@ -2,6 +2,7 @@
 
 import csv
 import io
+import json
 import math
 import tomllib
 from collections.abc import Iterator, Sequence
@@ -13,7 +14,7 @@ import numpy as np
 from lib.correspondences import LANDMARKS
 from lib.files import write_text
 
-__all__ = ["columns", "decoded", "number", "read_table", "read_toml", "refuse", "rows_of", "write_table"]
+__all__ = ["columns", "decoded", "number", "read_table", "read_toml", "refuse", "rows_of", "toml", "write_table"]
 
 
 def columns(axes: Sequence[str], landmarks: Sequence[str] = LANDMARKS) -> list[str]:
@@ -43,6 +44,18 @@ def read_toml(path: Path) -> dict:
         return tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise ValueError(f"{path}: not valid TOML ({error}). Save it as UTF-8 text.") from None
+
+
+def toml(value: object) -> str:
+    """A value as TOML writes it.
+
+    >>> print(toml({"fps": 25.0, "names": ["base"], "end_s": float("inf")}))
+    { fps = 25.0, names = ["base"], end_s = inf }
+    """
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{key} = {toml(item)}" for key, item in value.items()) + " }"
+    text = json.dumps(value, ensure_ascii=False)
+    return {"Infinity": "inf", "-Infinity": "-inf", "NaN": "nan"}.get(text, text)
 
 
 def rows_of(path: Path, text: str, separator: str = ",") -> Iterator[tuple[str, list[str]]]:

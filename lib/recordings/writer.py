@@ -17,7 +17,7 @@ from lib.correspondences import LANDMARKS
 from lib.files import write_bytes, write_text
 from lib.recordings.annotations import Annotations, write_coco
 from lib.recordings.recording import FORMAT, UNITS, Recording, kinematics_columns
-from lib.recordings.tables import write_table
+from lib.recordings.tables import toml, write_table
 
 __all__ = ["RecordingWriter"]
 
@@ -118,12 +118,13 @@ class RecordingWriter:
         """Landmarks of all frames: `u_left`, `u_right` and their visibility, as in `Annotations`."""
         self._annotations = Annotations(*u_and_visibility)
 
-    def offset(self, offset_s: float) -> None:
-        """Set t_robot = t_video + offset_s, where it is found after `draft`."""
-        self._header["offset_s"] = float(offset_s)
+    def draft(self, offset_s: float | None = None) -> Recording:
+        """The recording as it is so far, valid or a ValueError; it lies in a folder that is removed if anything fails.
 
-    def draft(self) -> Recording:
-        """The recording as it is so far, valid or a ValueError; it lies in a folder that is removed if anything fails."""
+        `offset_s` replaces what was given, where a first draft was needed to find it.
+        """
+        if offset_s is not None:
+            self._header["offset_s"] = float(offset_s)
         lines = [_toml(key, value) for key, value in self._header.items()]
         for table, values in (("units", UNITS), ("details", self._details)):
             lines += ["", f"[{table}]"] if values else []
@@ -158,5 +159,4 @@ class RecordingWriter:
 
 def _toml(key: str, value: object) -> str:
     key = key if re.fullmatch(r"[\w-]+", key, re.ASCII) else json.dumps(key)
-    text = json.dumps(value, ensure_ascii=False)
-    return f"{key} = " + {"Infinity": "inf", "-Infinity": "-inf", "NaN": "nan"}.get(text, text)
+    return f"{key} = {toml(value)}"

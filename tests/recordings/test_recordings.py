@@ -9,6 +9,7 @@ import re
 import shutil
 import struct
 import zlib
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -16,10 +17,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from lib import paths
 from lib.cameras import NearAffineCamera
 from lib.correspondences import of_recording
-from lib.recordings import Kinematics, Recording, RecordingWriter, Truth, read_image
-from lib.recordings.recording import doubts
+from lib.recordings import Frames, Kinematics, Recording, RecordingWriter, Truth, read_image
 from lib.simulator.rig import reference_rig
 
 N, SIZE = 4, (64, 48)
@@ -596,9 +597,9 @@ def test_failure_leaves_nothing(tmp_path):
 def test_doubts(frames, times, jump, name):
     log = Kinematics(times, np.zeros((len(times), 3, 3)))
     log.x_mm[2] += jump
-    at = np.arange(frames) / 25
-    found = list(doubts(at, 25.0, log.time_s, log.x_mm, np.isfinite(log.at(at)).all(axis=2).any(axis=1)))
-    assert [doubt.name for doubt in found] == ([name] if name else [])
+    at = Frames(None, None, np.arange(frames) / 25)
+    recording = replace(Recording.open(paths.SHIPPED_RECORDING), frames=at, fps=25.0, offset_s=0.0, kinematics=log)
+    assert [doubt.name for doubt in recording.doubts] == ([name] if name else [])
 
 
 def test_nothing_is_interpolated_in_a_gap():
