@@ -67,7 +67,7 @@ def ensure(root: Path = ROOT, torch: str | None = None) -> Path:
     return python_of(venv)
 
 
-def lock(root: Path = ROOT, *, upgrade: bool = False) -> Path:
+def lock(*, upgrade: bool) -> Path:
     """Write the lock anew from environment.toml: each package, for each platform, with hashes and no host.
 
     Pins that still fit are kept unless `upgrade` is given.  Needs uv (``pip install uv``) and the network.
@@ -75,10 +75,10 @@ def lock(root: Path = ROOT, *, upgrade: bool = False) -> Path:
     uv = shutil.which("uv")
     if not uv:
         raise Problem("Writing the lock needs uv: python3 -m pip install uv")
-    workbench = manifest(root)["tool"]["workbench"]
-    path = root / workbench["lock"]
+    workbench = manifest()["tool"]["workbench"]
+    path = ROOT / workbench["lock"]
     with tempfile.TemporaryDirectory() as folder:
-        shutil.copy(root / "environment.toml", Path(folder) / "pyproject.toml")
+        shutil.copy(ROOT / "environment.toml", Path(folder) / "pyproject.toml")
         if path.exists() and not upgrade:
             shutil.copy(path, Path(folder) / "lock.txt")
         groups = [f"--group={group}" for group in workbench["groups"]]
@@ -246,11 +246,7 @@ def _write_site_files(root: Path, venv: Path) -> None:
 
 
 def missing_libraries(libraries: dict[str, str]) -> str:
-    """One line about the system libraries that Open3D needs and this Linux lacks; "" if there is nothing to say.
-
-    Args:
-        libraries: Shared object -> Debian package.
-    """
+    """One line about the `libraries`, shared object -> Debian package, that Open3D needs and this Linux lacks, or ""."""
     lacks = [package for name, package in libraries.items() if not _loads(name)] if sys.platform == "linux" else []
     if not lacks:
         return ""

@@ -8,32 +8,22 @@ import logging
 import os
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 from tqdm.auto import tqdm
 
-__all__ = ["Finished", "cores", "run_jobs", "single_threaded_torch", "step"]
+__all__ = ["cores", "run_jobs", "single_threaded_torch", "step"]
 
 _STEPS = "microstereo-steps"
 #: A scheduler must answer within these seconds.
 ANSWER_S = 15.0
 
 
-@dataclass(frozen=True)
-class Finished:
-    """A job that came to its end: the path that it makes, and what it returned or the error that ended it."""
-
-    path: Path
-    value: object = None
-    error: BaseException | None = None
-
-
 def run_jobs(
     function: Callable[..., object], jobs: Mapping[Path, tuple], *, workers: int | None = None,
     scheduler: str | None = None, title: str = "", unit: str = "job", steps: int = 0, progress: bool = True,
-) -> Iterator[Finished]:  # fmt: skip
-    """Call ``function(path, *jobs[path])`` for every path that does not exist; yield each job as it finishes.
+) -> Iterator[tuple[Path, BaseException | None]]:  # fmt: skip
+    """Call ``function(path, *jobs[path])`` for every path that does not exist; yield each path, and the error that ended it.
 
     A job whose worker process was killed is given to another worker, three times at most.  Closing the iterator drops
     the jobs that have not begun.
@@ -57,9 +47,9 @@ def run_jobs(
             with _client(min(workers or cores(), len(missing)), scheduler) as client:
                 if steps:
                     client.subscribe_topic(_STEPS, lambda event: bar.update())
-                for finished in _finished(client, function, missing):
+                for end in _ends(client, function, missing):
                     bar.update(0 if steps else 1)
-                    yield finished
+                    yield end
 
 
 def step() -> None:
@@ -88,7 +78,7 @@ def single_threaded_torch() -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
-def _finished(client, function: Callable, jobs: Mapping[Path, tuple]) -> Iterator[Finished]:
+def _ends(client, function: Callable, jobs: Mapping[Path, tuple]) -> Iterator[tuple[Path, BaseException | None]]:
     from distributed import KilledWorker, as_completed
 
     futures = {client.submit(_work, function, path, *jobs[path], pure=False): path for path in jobs}
@@ -99,15 +89,16 @@ def _finished(client, function: Callable, jobs: Mapping[Path, tuple]) -> Iterato
                 error = ChildProcessError("its workers were killed again and again, perhaps for lack of memory.")
             if future.status == "cancelled":
                 error = ConnectionError("the scheduler was lost.")
-            yield Finished(futures[future], None if error else future.result(), error)
+            yield futures[future], error
     finally:
         with contextlib.suppress(Exception):  # the scheduler may have gone
             client.cancel(list(futures))
 
 
-def _work(function: Callable, path: Path, *arguments: object) -> object:
+def _work(function: Callable, path: Path, *arguments: object) -> None:
     """In a worker.  The path exists if an attempt before was lost just after its end."""
-    return None if path.exists() else function(path, *arguments)
+    if not path.exists():
+        function(path, *arguments)
 
 
 @contextlib.contextmanager

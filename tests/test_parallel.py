@@ -21,11 +21,11 @@ def test_jobs_survive_a_lost_worker_and_run_once(tmp_path):
     before = set(children(os.getpid()))
     environment = dict(os.environ)
     finished = []
-    for done in parallel.run_jobs(files.write_text, jobs, workers=2, progress=False):
-        assert done.error is None
+    for path, error in parallel.run_jobs(files.write_text, jobs, workers=2, progress=False):
+        assert error is None
         if not finished and Path("/proc").exists():
             os.kill(max(set(children(os.getpid())) - before), signal.SIGKILL)
-        finished.append(done.path.name)
+        finished.append(path.name)
     assert sorted(finished) == [f"{k}.txt" for k in range(1, 8)]  # the one that was there is not made again
     assert (tmp_path / "0.txt").read_text() == "made before" and (tmp_path / "7.txt").read_text() == "job 7"
     assert dict(os.environ) == environment
@@ -45,7 +45,7 @@ def scheduler():
 
 def test_errors_stay_with_their_job(tmp_path, scheduler):
     jobs = {tmp_path / "gone" / "a.txt": ("no such folder",), tmp_path / "b.txt": ("fine",)}
-    ends = {done.path.name: done.error for done in parallel.run_jobs(files.write_text, jobs, scheduler=scheduler)}
+    ends = {path.name: error for path, error in parallel.run_jobs(files.write_text, jobs, scheduler=scheduler)}
     assert ends["b.txt"] is None and isinstance(ends["a.txt"], FileNotFoundError)
 
 

@@ -141,12 +141,11 @@ class StereoSource:
 
     def _split(self, *images: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         if self.layout != "two":
-            half = images[0].shape[1 if self.layout == "side_by_side" else 0] / 2
-            if half % 1:
+            axis = 1 if self.layout == "side_by_side" else 0
+            if images[0].shape[axis] % 2:
                 size = f"{images[0].shape[1]} x {images[0].shape[0]} px"
                 raise ValueError(f"{self.reels[0].files[0]}: {size} have no two halves. Check layout.")
-            h = int(half)
-            images = (images[0][:, :h], images[0][:, h:]) if self.layout == "side_by_side" else (images[0][:h], images[0][h:])
+            images = np.split(images[0], 2, axis=axis)
         if images[0].shape != images[1].shape:
             sizes = " and ".join(f"{i.shape[1]} x {i.shape[0]} px" for i in images)
             raise ValueError(f"{self.reels[-1].files[0]}: left and right frames differ in size ({sizes}); export both alike.")

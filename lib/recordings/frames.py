@@ -178,11 +178,7 @@ def open_side(folder: Path, side: str, image_size_px: tuple[int, int], bit_depth
 
 
 class Frames(Sequence[StereoFrame]):
-    """Stereo frames in order of time; decoded when indexed by a number, the last few kept.
-
-    Attributes:
-        time_s: (n,) video clock, strictly increasing.
-    """
+    """Stereo frames at `time_s` (n,), video clock, strictly increasing; decoded when indexed, the last few kept."""
 
     def __init__(self, left: ImageFolder | Video, right: ImageFolder | Video, time_s: np.ndarray) -> None:
         self.time_s = np.array(time_s, dtype=np.float64)

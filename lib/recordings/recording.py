@@ -49,7 +49,7 @@ class Doubt(NamedTuple):
     cure: str
 
 
-def kinematics_columns(landmarks: Sequence[str] = LANDMARKS) -> list[str]:
+def kinematics_columns(landmarks: Sequence[str]) -> list[str]:
     """The header of kinematics.csv."""
     return ["time_s", *columns(["x_mm", "y_mm", "z_mm"], landmarks)]
 

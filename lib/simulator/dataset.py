@@ -107,9 +107,9 @@ def make_dataset(
     for leftover in folder.glob("t*_??.*.partial"):
         shutil.rmtree(leftover)  # of a run that was killed
     jobs = {folder / sequence_name(k): (seed, k, n_pairs, duration_s, shrink) for k in _SEQUENCES}
-    for done in run_jobs(_make_sequence, jobs, workers=workers, title="Simulating", unit="pair", steps=n_pairs):
-        if done.error:
-            raise done.error
+    for _, error in run_jobs(_make_sequence, jobs, workers=workers, title="Simulating", unit="pair", steps=n_pairs):
+        if error:
+            raise error
     return list(jobs)
 
 

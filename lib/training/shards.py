@@ -51,9 +51,9 @@ def generate(folder: str | Path, kind: str, shards: int, *, workers: int | None 
     """
     Path(folder).mkdir(parents=True, exist_ok=True)
     jobs = {Path(folder) / f"{kind}_{i:04d}.npz": (kind, i) for i in range(shards)}
-    for done in run_jobs(make_shard, jobs, workers=workers, title=f"Simulating {kind}", unit="shard", progress=progress):
-        if done.error:
-            raise done.error
+    for _, error in run_jobs(make_shard, jobs, workers=workers, title=f"Simulating {kind}", unit="shard", progress=progress):
+        if error:
+            raise error
 
 
 def make_shard(path: Path, kind: str, index: int) -> None:

@@ -7,7 +7,7 @@ import platform
 import re
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import distributions
 from pathlib import Path
 
 import nbformat
@@ -15,7 +15,7 @@ from nbclient.exceptions import CellTimeoutError, DeadKernelError
 
 from lib.workbench.report import FIGURE_METADATA, METRIC_MIME, STOP_METADATA, VERDICT_COLOURS, VERDICT_MIME
 
-__all__ = ["Failure", "Stated", "execute", "failure_of", "joined", "stated_in", "versions"]
+__all__ = ["Failure", "Stated", "execute", "joined", "stated_in", "versions"]
 
 #: Packages whose version can change a figure.
 _TOLD = ("numpy", "scipy", "torch", "kornia", "opencv-python-headless", "open3d-cpu", "open3d", "cvxpy", "clarabel")
@@ -79,45 +79,34 @@ def execute(
     except PapermillExecutionError:
         pass  # told by the outputs, below
     except CellTimeoutError:
-        return Failure("timeout", running, _longer_than(cell_timeout_s))
+        return Failure("timeout", running, f"the cell took longer than {cell_timeout_s:g} s (--cell-timeout).")
     except DeadKernelError:
         return Failure("dead kernel", running, "the kernel died; the machine may have run out of memory.")
     except (nbformat.ValidationError, OSError, ValueError, RuntimeError) as error:
         return Failure("error", running or None, f"{type(error).__name__}: {error}")
-    return failure_of(output, cell_timeout_s)
+    return _failure_of(output)
 
 
-def failure_of(executed: Path, cell_timeout_s: float | None = None) -> Failure | None:
-    """Judge an executed notebook by its outputs: papermill calls a cell that was timed out completed.
-
-    A notebook that `report.stop` ended went well.
-    """
+def _failure_of(executed: Path) -> Failure | None:
+    """Judge an executed notebook by its outputs; one that `report.stop` ended went well."""
     cells = [cell for cell in nbformat.read(executed, as_version=4).cells if not _is_added(cell)]
     for number, cell in enumerate(cells, start=1):
         if cell.cell_type != "code" or "raises-exception" in cell.metadata.get("tags", []):
             continue
-        status = cell.metadata.get("papermill", {})
         for output in cell.outputs:
-            if output.output_type != "error":
-                continue
-            if output.ename == "SystemExit" and not output.evalue:
+            if output.output_type == "error" and output.ename == "SystemExit" and not output.evalue:
                 return None  # `report.stop`
-            seconds = float(status.get("duration") or 0.0)
-            if output.ename == "KeyboardInterrupt" and cell_timeout_s and seconds >= cell_timeout_s:
-                return Failure("timeout", number, _longer_than(cell_timeout_s))
-            return Failure("error", number, f"{output.ename}: {_ANSI.sub('', output.evalue)}")
-        if cell.source.strip() and status.get("status") not in (None, "completed"):
-            return Failure("error", number, f"the cell is {status.get('status')}.")
+            if output.output_type == "error":
+                return Failure("error", number, f"{output.ename}: {_ANSI.sub('', output.evalue)}")
+        status = cell.metadata.get("papermill", {}).get("status")
+        if cell.source.strip() and status not in (None, "completed"):
+            return Failure("error", number, f"the cell is {status}.")
     return None
 
 
 def _is_added(cell) -> bool:
     """papermill's own cells (values given, error marks), which the author does not count."""
     return bool(_ADDED & set(cell.metadata.get("tags", [])))
-
-
-def _longer_than(seconds: float | None) -> str:
-    return f"the cell took longer than {seconds:g} s (--cell-timeout)."
 
 
 @dataclass(frozen=True)
@@ -162,10 +151,5 @@ def joined(verdicts: Iterable[dict | None]) -> dict | None:
 
 def versions() -> dict[str, str]:
     """Python and the packages whose version can change a figure."""
-    found = {"python": platform.python_version()}
-    for package in _TOLD:
-        try:
-            found[package] = version(package)
-        except PackageNotFoundError:
-            continue
-    return found
+    installed = {package.name: package.version for package in distributions()}
+    return {"python": platform.python_version()} | {name: installed[name] for name in _TOLD if name in installed}

@@ -47,7 +47,7 @@ _REWRITES = [
 
 
 @lru_cache(maxsize=4096)
-def equation_svg(tex: str, *, display: bool, size_px: float = 17.0) -> str:
+def equation_svg(tex: str, *, display: bool) -> str:
     """An equation as inline SVG in HTML, on the line of the text; its TeX is the alternative text.
 
     TeX that the converter cannot read is shown as it is.
@@ -61,7 +61,7 @@ def equation_svg(tex: str, *, display: bool, size_px: float = 17.0) -> str:
     try:
         if re.search(r"\\|&#x0005C;", tex2mml(text)):
             raise ValueError("a command that the converter does not know")
-        drawn = ziamath.Latex(text, size=size_px, inline=not display)
+        drawn = ziamath.Latex(text, size=17.0, inline=not display)
         picture = drawn.svg().replace(' xmlns="http://www.w3.org/2000/svg"', "")  # in a heading it would become a prefix
     except Exception:  # whatever the converter stumbles over: the reader still gets the TeX
         return f'<code class="tex">{html.escape(tex)}</code>'

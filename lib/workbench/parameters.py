@@ -87,11 +87,7 @@ def parse_parameters(pairs: Sequence[tuple[str, str]], notebooks: Sequence[Path]
 
 
 def positive(text: str) -> float:
-    """A number of seconds on a command line.
-
-    Raises:
-        argparse.ArgumentTypeError: For anything but a finite number above 0.
-    """
+    """A number of seconds on a command line; an `argparse.ArgumentTypeError` for anything but a finite number above 0."""
     with contextlib.suppress(ValueError):
         if 0 < float(text) < math.inf:
             return float(text)

@@ -145,8 +145,7 @@ def timed(stage: str) -> Iterator[None]:
 def stop(reason: str) -> NoReturn:
     """End the notebook in good order: the report counts it as complete, says why, and leaves the cells that follow out.
 
-    Args:
-        reason: Full sentences: what is left out, why, and what to do.
+    `reason` says in full sentences what is left out, why, and what to do.
     """
     _publish({"text/html": rendered("caption.html", text=reason), "text/plain": reason}, reason, {STOP_METADATA: reason})
     raise _End

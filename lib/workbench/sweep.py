@@ -105,14 +105,15 @@ def sweep(
     rows = {executed: _row(executed, point) for executed, point in of_file.items() if executed.exists()}
     failures: dict[str, str] = {}
     table = folder / "results.csv"
-    for done in run_jobs(run_point, jobs, workers=workers, scheduler=scheduler, title=book.stem, unit="run"):
-        if done.error:
-            log = done.path.with_suffix(".log")
-            if not isinstance(done.error, RunFailed):  # the worker could not write it
-                files.write_text(log, f"{_label(of_file[done.path])}\n{done.error}\n")
-            failures[_label(of_file[done.path])] = f"{done.error} (log: {paths.shown(log)})"
+    for executed, error in run_jobs(run_point, jobs, workers=workers, scheduler=scheduler, title=book.stem, unit="run"):
+        point = of_file[executed]
+        if error:
+            log = executed.with_suffix(".log")
+            if not isinstance(error, RunFailed):  # the worker could not write it
+                files.write_text(log, f"{_label(point)}\n{error}\n")
+            failures[_label(point)] = f"{error} (log: {paths.shown(log)})"
             continue
-        rows[done.path] = _row(done.path, of_file[done.path])
+        rows[executed] = _row(executed, point)
         files.write_text(table, results.csv_text(rows[path] for path in of_file if path in rows))
     in_order = [rows[path] for path in of_file if path in rows]
     files.write_text(table, results.csv_text(in_order))

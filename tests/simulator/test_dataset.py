@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from lib import paths
-from lib.parallel import Finished
 from lib.recordings import Recording
 from lib.simulator.dataset import main, make_dataset, sequence_design, sequence_name
 from notebooks.figures.data import landmark_counts
@@ -23,7 +22,8 @@ NAMES = {sequence_name(k) for k in range(10)}
 
 def one_by_one(function, jobs, **options):
     for path, arguments in jobs.items():
-        yield Finished(path, function(path, *arguments))
+        function(path, *arguments)
+        yield path, None
 
 
 @pytest.fixture(scope="module")
