@@ -51,7 +51,7 @@ class Provenance:
 
     def __init__(self, command: str) -> None:
         self.command, self.commit = command, commit()
-        self.wall_s, self.cpu_s = time.perf_counter(), _cpu_s()
+        self.wall_s, self.cpu_s = time.perf_counter(), sum(os.times()[:4])
 
     def so_far(self) -> dict[str, object]:
         """What is known now, as `lib.workbench.results.write` takes it.
@@ -61,7 +61,7 @@ class Provenance:
         return {
             "command": self.command, "commit": self.commit, "machine": machine(),
             "weights": files.digest(paths.MODELS / "default.safetensors"), "date": datetime.date.today().isoformat(),
-            "seconds": time.perf_counter() - self.wall_s, "cpu_seconds": _cpu_s() - self.cpu_s,
+            "seconds": time.perf_counter() - self.wall_s, "cpu_seconds": sum(os.times()[:4]) - self.cpu_s,
         }  # fmt: skip
 
 
@@ -76,11 +76,6 @@ def plain(value: object) -> object:
     if isinstance(value, float | np.floating):
         return float(f"{float(value):.6g}") if np.isfinite(value) else None
     return value.item() if isinstance(value, np.generic) else value
-
-
-def _cpu_s() -> float:
-    times = os.times()
-    return times.user + times.system + times.children_user + times.children_system
 
 
 def _processor() -> str:

@@ -6,6 +6,6 @@
 
 from lib.importing.guess import guess_mapping
 from lib.importing.importer import import_recording
-from lib.importing.mapping import Mapping, read_mapping
+from lib.importing.mapping import read_mapping
 
-__all__ = ["Mapping", "guess_mapping", "import_recording", "read_mapping"]
+__all__ = ["guess_mapping", "import_recording", "read_mapping"]

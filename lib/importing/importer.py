@@ -24,12 +24,12 @@ _LOG_STEP_S = 2e-5, 3.0  # of a robot's samples; beyond it the unit of time is a
 _CLOCK_FRAMES = 60  # that the detector looks at where there are no labels
 
 
-def import_recording(source: str | Path, mapping: str | Path | Mapping, out: str | Path, *, overwrite: bool = False) -> dict:
+def import_recording(source: str | Path, mapping: str | Path, out: str | Path, *, overwrite: bool = False) -> dict:
     """Write the recording `out` from the files in the folder `source`; the same input gives the same bytes.
 
     Args:
         source: It is never changed.
-        mapping: The mapping file, or what `read_mapping` made of one.
+        mapping: The mapping file.
         overwrite: Replace a recording of that name.
 
     Returns:
@@ -44,7 +44,7 @@ def import_recording(source: str | Path, mapping: str | Path | Mapping, out: str
         raise FileNotFoundError(f"{folder}: no such folder; SOURCE is the folder that holds the files of the mapping.")
     if out.resolve().is_relative_to(folder.resolve()):
         raise ValueError(f"{out}: lies in the source, which an import does not change; choose a place beside it.")
-    told = mapping if isinstance(mapping, Mapping) else read_mapping(mapping)
+    told = read_mapping(mapping)
     stereo = open_stereo(folder, told.video)
     robot = read_robot(folder, told)
     increasing(robot.time, str(folder / told.robot.file), *_LOG_STEP_S)

@@ -60,16 +60,16 @@ def read_labels(
             xy = np.array([label.x, label.y]) - (0.5 if labels.pixel_origin == "corner" else 0.0)
             if given is not None:
                 side = given
-            elif source.layout != "two" and not any(name in label.image for name in labels.sides):
-                axis, size = (0, width) if source.layout == "side_by_side" else (1, height)
+            elif source.video.layout != "two" and not any(name in label.image for name in labels.sides):
+                axis, size = (0, width) if source.video.layout == "side_by_side" else (1, height)
                 half = int(xy[axis] > size - 0.5)
-                side, xy[axis] = half ^ source.exchanged, xy[axis] - half * size
+                side, xy[axis] = half ^ source.video.exchanged, xy[axis] - half * size
             elif [name in label.image for name in labels.sides].count(True) == 1:
                 side = int(labels.sides[1] in label.image)
             else:
                 cure = f"labels.sides = {list(labels.sides)} must tell one of two"
                 raise ValueError(f"{where}: the name tells no camera; {cure}.")
-            reel = side ^ source.exchanged if source.layout == "two" else 0
+            reel = side ^ source.video.exchanged if source.video.layout == "two" else 0
             image = PurePosixPath(label.image.replace("\\", "/"))
             number = (last_number(image) or 0) - labels.first_frame
             frame = frame_of[reel].get(numbers[reel].get(image.stem, numbers[reel].get(number, number)))

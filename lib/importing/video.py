@@ -41,21 +41,21 @@ class _Images:
             raise FileNotFoundError(f"{folder / pattern}: no image ({', '.join(IMAGES)}) matches the mapping's pattern.")
         if bad := [path for path in found if last_number(path) is None]:
             raise ValueError(f"{min(bad)}: the name holds no number, so its place in time is open. Number the files.")
-        self.paths = sorted(found, key=lambda path: (last_number(path), path.name))
-        for one, other in zip(self.paths, self.paths[1:], strict=False):
+        self.files = sorted(found, key=lambda path: (last_number(path), path.name))
+        for one, other in zip(self.files, self.files[1:], strict=False):
             if last_number(one) == last_number(other):
                 raise ValueError(f"{other}: numbered like {one.name}. Narrow the pattern, so that it names one camera.")
-        self.stamps, self.files = None, self.paths
-        counted = last_number(self.paths[-1]) < 10 * len(self.paths) + 10**6  # else the numbers are times
-        self.numbers = {path.stem: n for n, path in enumerate(self.paths)}
-        self.numbers |= {last_number(path): n for n, path in enumerate(self.paths) if counted}
+        self.stamps = None
+        counted = last_number(self.files[-1]) < 10 * len(self.files) + 10**6  # else the numbers are times
+        self.numbers = {path.stem: n for n, path in enumerate(self.files)}
+        self.numbers |= {last_number(path): n for n, path in enumerate(self.files) if counted}
 
     def __len__(self) -> int:
-        return len(self.paths)
+        return len(self.files)
 
     def read(self, wanted: np.ndarray) -> Iterator[np.ndarray]:
         for index in wanted:
-            yield read_image(self.paths[index], as_stored=True)
+            yield read_image(self.files[index], bit_depth=None)
 
 
 class _Film:
@@ -118,7 +118,7 @@ class StereoSource:
 
     Attributes:
         reels: The left and the right source, or the one that holds both views.
-        layout, exchanged: As in the mapping.
+        video: What the mapping says of them.
         index: (n, 2) which frame of each source makes a pair.
         time: n exact times of the pairs.
         bit_depth: What the brightest value of 16-bit frames is scaled by; None for 8-bit frames.
@@ -126,8 +126,7 @@ class StereoSource:
     """
 
     reels: tuple[_Images | _Film, ...]
-    layout: str
-    exchanged: bool
+    video: Video
     index: np.ndarray
     time: list[Decimal]
     bit_depth: int | None
@@ -137,19 +136,17 @@ class StereoSource:
         """Left and right images, (h, w, 3) uint8 RGB."""
         for images in zip(*(reel.read(index) for reel, index in zip(self.reels, self.index.T, strict=False)), strict=True):
             images = [to_8_bits(image, self.bit_depth, reel.files[0]) for image, reel in zip(images, self.reels, strict=True)]
-            yield self._split(*images)
-
-    def _split(self, *images: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        if self.layout != "two":
-            axis = 1 if self.layout == "side_by_side" else 0
-            if images[0].shape[axis] % 2:
-                size = f"{images[0].shape[1]} x {images[0].shape[0]} px"
-                raise ValueError(f"{self.reels[0].files[0]}: {size} have no two halves. Check layout.")
-            images = np.split(images[0], 2, axis=axis)
-        if images[0].shape != images[1].shape:
-            sizes = " and ".join(f"{i.shape[1]} x {i.shape[0]} px" for i in images)
-            raise ValueError(f"{self.reels[-1].files[0]}: left and right frames differ in size ({sizes}); export both alike.")
-        return (images[1], images[0]) if self.exchanged else (images[0], images[1])
+            sizes, file = [f"{image.shape[1]} x {image.shape[0]} px" for image in images], self.reels[-1].files[0]
+            if self.video.layout != "two":
+                axis = 1 if self.video.layout == "side_by_side" else 0
+                if images[0].shape[axis] % 2:
+                    raise ValueError(f"{file}: {sizes[0]} have no two halves. Check layout.")
+                images = np.split(images[0], 2, axis=axis)
+            left, right = images[::-1] if self.video.exchanged else images
+            if left.shape != right.shape:
+                what = f"left and right frames differ in size ({' and '.join(sizes)})"
+                raise ValueError(f"{file}: {what}; export both alike.")
+            yield left, right
 
 
 def open_stereo(folder: Path, video: Video) -> StereoSource:
@@ -173,7 +170,7 @@ def open_stereo(folder: Path, video: Video) -> StereoSource:
         raise ValueError(f"{folder}: no frame lies between start_s and end_s; the video lasts {time[-1] - time[0]} s.")
     kept, time = kept[chosen], [time[i] for i in chosen]
     dropped = sum(map(len, times)) - len(reels) * len(index)
-    return StereoSource(reels, video.layout, video.exchanged, kept, time, video.bit_depth or _bit_depth(reels, kept), dropped)
+    return StereoSource(reels, video, kept, time, video.bit_depth or _bit_depth(reels, kept), dropped)
 
 
 def _places(reels: Sequence[_Images | _Film]) -> list[np.ndarray]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from lib.cameras import StereoRig
 from lib.correspondences import Correspondences, of_recording
-from lib.recordings.annotations import Annotations, inside, mark_coco, read_coco
+from lib.recordings.annotations import inside, mark_coco, read_coco
 from lib.recordings.recording import Recording
 
 __all__ = ["Annotator"]
@@ -86,8 +86,7 @@ class Annotator:
     @property
     def complete(self) -> np.ndarray:
         """(n,) bool: every landmark of both views has a mark."""
-        a = self._annotations
-        return (np.stack([a.visibility_left, a.visibility_right]) != 0).all(axis=(0, 2))
+        return (self._marks[..., 2] != 0).all(axis=(0, 2))
 
     def mark(
         self, side: str, frame: int, landmark: str, u: tuple[float, float] | None = None, visibility: int | None = None
@@ -114,21 +113,18 @@ class Annotator:
             fresh = left[left != frame]
         if not len(fresh):
             return (frame + 1) % len(self.recording)
-        a = self._annotations
-        touched = np.flatnonzero((np.hstack([a.visibility_left, a.visibility_right]) != 0).any(axis=1))
+        touched = np.flatnonzero((self._marks[..., 2] != 0).any(axis=(0, 2)))
         gap = np.abs(fresh[:, None] - np.append(touched, frame)).min(axis=1)
         return int(fresh[np.lexsort((gap, np.nan_to_num(self.usefulness[fresh])))[-1]])
 
     def _read(self) -> None:
+        """Take the marks, x, y, visibility (2, n, k, 3) of the left and the right view, from the file."""
         r = self.recording
-        nothing = np.full((len(r), len(r.skeleton), 2), np.nan)
-        found = read_coco(self._path, len(r), r.image_size_px, r.skeleton) if self._path.exists() else None
-        self._annotations = found or Annotations(nothing, nothing)
-
-    def _values(self, side: str, frame: int) -> np.ndarray:
-        """x, y, visibility (k, 3) of the landmarks of one image."""
-        a = self._annotations
-        return np.column_stack([getattr(a, f"u_{side}")[frame], getattr(a, f"visibility_{side}")[frame]])
+        self._marks = np.tile([np.nan, np.nan, 0.0], (2, len(r), len(r.skeleton), 1))
+        if self._path.exists():
+            found = read_coco(self._path, len(r), r.image_size_px, r.skeleton)
+            self._marks[..., :2] = found.u_left, found.u_right
+            self._marks[..., 2] = found.visibility_left, found.visibility_right
 
     def _change(self, changes: list[tuple]) -> None:
         """Write changes (side, frame, number of the landmark, x, y, visibility) as one step that `undo` takes back."""
@@ -150,7 +146,7 @@ class Annotator:
             if v > 0 and not inside(np.array([x, y], np.float64), r.image_size_px):
                 raise ValueError(f"u: ({x}, {y}) lies outside the image of {r.image_size_px[0]} x {r.image_size_px[1]} px.")
         self._read()  # what another program wrote meanwhile stays
-        images = {(side, frame): self._values(side, frame) for side, frame, *_ in changes}
+        images = {(side, frame): self._marks[_SIDES.index(side), frame].copy() for side, frame, *_ in changes}
         before = [(side, frame, k, *images[side, frame][k]) for side, frame, k, *_ in changes]
         for side, frame, k, x, y, v in changes:
             images[side, frame][k] = (x, y, v) if v > 0 else (np.nan, np.nan, v)
@@ -204,10 +200,10 @@ class Annotator:
 
     def _state(self, frame: int) -> dict:
         """What the page shows of a frame: marks, suggestions, epipolar lines, and how much is labelled."""
-        marks = [_plain(self._values(side, frame)) for side in _SIDES]
         suggested = {name: _plain(u[:, frame]) for name, u in self._suggested.items()}
-        lines = [self._epipolar_line(u, frame) if v > 0 else None for *u, v in self._values("left", frame)]
-        told = {"frame": frame, "marks": marks, "lines": lines, "usefulness": float(self.usefulness[frame])}
+        lines = [self._epipolar_line(u, frame) if v > 0 else None for *u, v in self._marks[0, frame]]
+        told = {"frame": frame, "marks": _plain(self._marks[:, frame]), "lines": lines}
+        told["usefulness"] = float(self.usefulness[frame])
         return told | suggested | {"complete": self.complete.tolist(), "file": self._path.name}
 
     def _epipolar_line(self, u_left: np.ndarray, frame: int) -> list | None:

@@ -25,15 +25,12 @@ class StereoFrame:
     time_s: float
 
 
-def read_image(
-    path: Path, image_size_px: tuple[int, int] | None = None, bit_depth: int = 0, as_stored: bool = False
-) -> np.ndarray:
+def read_image(path: Path, image_size_px: tuple[int, int] | None = None, bit_depth: int | None = 0) -> np.ndarray:
     """An image file, colour or grey, as (h, w, 3) uint8 RGB; its pixels as they are stored, whatever EXIF says.
 
     Args:
         image_size_px: (width, height) that it must have.
-        bit_depth: Of frames of 16 bits, as in `to_8_bits`.
-        as_stored: Leave 16 bits as uint16.
+        bit_depth: Of frames of 16 bits, as in `to_8_bits`; None leaves them as uint16.
 
     Raises:
         FileNotFoundError, ValueError: If there is no such file, it cannot be decoded, a part of it is lost, or its size
@@ -52,7 +49,7 @@ def read_image(
     if image is None:
         raise ValueError(f"{path}: the image is corrupt; it cannot be decoded. Export it again.")
     _check_size(path, (image.shape[1], image.shape[0]), image_size_px)
-    return image if as_stored else to_8_bits(image, bit_depth, path)
+    return image if bit_depth is None else to_8_bits(image, bit_depth, path)
 
 
 def to_8_bits(image: np.ndarray, bit_depth: int | None, path: Path) -> np.ndarray:

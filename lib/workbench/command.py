@@ -225,7 +225,7 @@ class _Report:
         book, entry = self.notebooks[number], self.content["notebooks"][number]
         executed = self.folder / book.name
         entry.update(state="failed" if failure else "complete", seconds=round(seconds, 2))
-        entry["failure"] = failure.as_dict() if failure else None
+        entry["failure"] = failure._asdict() if failure else None
         try:
             stated = execution.stated_in(executed)
         except (OSError, ValueError):  # there is none, or a full disk has cut it off

@@ -6,9 +6,9 @@ import os
 import platform
 import re
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass
 from importlib.metadata import distributions
 from pathlib import Path
+from typing import NamedTuple
 
 import nbformat
 from nbclient.exceptions import CellTimeoutError, DeadKernelError
@@ -30,8 +30,7 @@ _KERNEL_ENVIRONMENT = {
 _ANSI = re.compile(r"\x1b\[[0-9;]*m")
 
 
-@dataclass(frozen=True)
-class Failure:
+class Failure(NamedTuple):
     """Why a notebook did not get to its end: `cell` counts its cells from 1."""
 
     kind: str  # "error", "timeout" or "dead kernel"
@@ -41,8 +40,6 @@ class Failure:
     def __str__(self) -> str:
         where = f" in cell {self.cell}" if self.cell else ""
         return f"{self.kind}{where}: {self.message}"
-
-    as_dict = asdict
 
 
 def execute(
@@ -109,8 +106,7 @@ def _is_added(cell) -> bool:
     return bool(_ADDED & set(cell.metadata.get("tags", [])))
 
 
-@dataclass(frozen=True)
-class Stated:
+class Stated(NamedTuple):
     """What an executed notebook stated: of metrics and pictures with one name the last, in the order of the first."""
 
     metrics: list[dict]  # each with its `cell`

@@ -119,8 +119,8 @@ def recorded(name: str, folder: Path = paths.RESULTS) -> Iterator[Table]:
         print(f"Left out: the recorded table {name} lacks {what}. `python3 -m lib sweep studies/{name} --record` records it.")
 
 
-def write(name: str, rows: Iterable[Mapping], provenance: Mapping, folder: Path = paths.RESULTS) -> Path:
-    """Write the table `name` with its provenance; returns the CSV file.
+def write(name: str, rows: Iterable[Mapping], provenance: Mapping, folder: Path = paths.RESULTS) -> None:
+    """Write the table `name` with its provenance.
 
     Args:
         rows: One mapping a row; None and NaN become empty entries, numbers keep six digits.
@@ -129,7 +129,6 @@ def write(name: str, rows: Iterable[Mapping], provenance: Mapping, folder: Path 
     folder.mkdir(parents=True, exist_ok=True)
     files.write_text(folder / f"{name}.csv", csv_text(rows))
     files.write_json(folder / f"{name}.json", plain(dict(provenance)))
-    return folder / f"{name}.csv"
 
 
 def csv_text(rows: Iterable[Mapping]) -> str:

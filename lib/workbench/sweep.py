@@ -123,7 +123,7 @@ def sweep(
     return table, failures
 
 
-def save_plots(rows: Sequence[dict], parameters: Sequence[str], folder: Path) -> list[Path]:
+def save_plots(rows: Sequence[dict], parameters: Sequence[str], folder: Path) -> None:
     """Write ``METRIC.png`` for each column of numbers that is no parameter.
 
     The horizontal axis is the first parameter with several values; the others but `seed` make lines.  A line joins
@@ -133,9 +133,8 @@ def save_plots(rows: Sequence[dict], parameters: Sequence[str], folder: Path) ->
     varied = [name for name in parameters if len({str(row[name]) for row in rows}) > 1]
     axis = next((name for name in varied if name != "seed"), "seed" if "seed" in varied else None)
     if axis is None:
-        return []
+        return
     lines = [name for name in varied if name not in (axis, "seed")]
-    written = []
     for metric, values in table.columns.items():
         if metric in parameters or isinstance(values, list) or not np.isfinite(values).any():
             continue
@@ -156,8 +155,6 @@ def save_plots(rows: Sequence[dict], parameters: Sequence[str], folder: Path) ->
             ax.legend(fontsize="small")
         with files.whole(folder / f"{metric}.png") as partial:
             figure.savefig(partial, dpi=150)
-        written.append(folder / f"{metric}.png")
-    return written
 
 
 class RunFailed(RuntimeError):
