@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from lib.matching.descriptors import CHANNELS, patch_quality, pixel_descriptors
-from lib.matching.pyramid import PATCH, POWER, bottom_up, n_levels, peak_ratio, pool, top_down, unit_patches, unpool
+from lib.matching.pyramid import PATCH, POWER, n_levels, path_scores, peak_ratio, pool, unit_patches, unpool
 from lib.matching.result import SIGMA_LEFT_PX, Matches
 
 __all__ = ["atomic_maps", "match_free", "predicted_bytes"]
@@ -81,7 +81,7 @@ def _match_grids(left: torch.Tensor, right: torch.Tensor) -> tuple[torch.Tensor,
     for part, maps in chunks():
         pooled[part] = pool(maps)[1]
     # The power is monotone, so it may follow the maximum, which is a quarter of the work.
-    score = top_down(bottom_up(pooled.pow_(POWER), n_levels(gy, gx), shifted=True))
+    score = path_scores(pooled.pow_(POWER), n_levels(gy, gx), shifted=True)
     best, place = score.new_empty(gy, gx), torch.empty(gy, gx, dtype=torch.long, device=score.device)
     ratio, strongest = np.empty((gy, gx)), score.new_full((n_y, n_x), -torch.inf)
     for part, maps in chunks():

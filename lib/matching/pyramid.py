@@ -15,25 +15,16 @@ displacements, in which a child stays where its parent is.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 import torch
+from torch.nn.functional import max_pool1d, pad
 
-__all__ = ["PATCH", "POWER", "bottom_up", "gather", "n_levels", "peak_ratio", "pool", "top_down", "unit_patches", "unpool"]
+__all__ = ["PATCH", "POWER", "gather", "n_levels", "path_scores", "peak_ratio", "pool", "unit_patches", "unpool"]
 
 PATCH = 4
 POWER = 1.4
 BORDER_POWER = 0.9
-
-
-@dataclass(frozen=True)
-class Pyramid:
-    """Responses of the patches of all sizes."""
-
-    pools: list[tuple[torch.Tensor | None, torch.Tensor]]  # maxima along x, and along both; of level 0 the latter
-    responses: list[torch.Tensor]  # levels 1 to top
-    shifted: bool  # whether the last two axes are places (else displacements)
 
 
 def unit_patches(grid: torch.Tensor) -> torch.Tensor:
@@ -54,25 +45,12 @@ def n_levels(gy: int, gx: int) -> int:
 
 def pool(maps: torch.Tensor, start: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
     """Maxima over three columns at every second one; and of these over three rows at rows start, start + 2, ..."""
-    along_x = _pool_axis(maps, 3, 0)
-    return along_x, _pool_axis(along_x, 2, start)
-
-
-def _every_second(maps: torch.Tensor, axis: int, first: int) -> torch.Tensor:
-    index = [slice(None)] * maps.ndim
-    index[axis] = slice(first, None, 2)
-    return maps[tuple(index)]
-
-
-def _pool_axis(maps: torch.Tensor, axis: int, start: int) -> torch.Tensor:
-    out = _every_second(maps, axis, start).clone(memory_format=torch.contiguous_format)
-    for neighbour in (start - 1, start + 1):
-        skip = int(neighbour < 0)  # nothing lies before the first sample
-        beside = _every_second(maps, axis, neighbour + 2 * skip)
-        n = min(beside.shape[axis], out.shape[axis] - skip)
-        there = out.narrow(axis, skip, n)
-        torch.maximum(there, beside.narrow(axis, 0, n), out=there)
-    return out
+    lines = max_pool1d(maps.flatten(0, 2), 3, stride=2, padding=1)
+    along_x = lines.reshape(*maps.shape[:3], -1)
+    padded = pad(along_x, (0, 0, 1 - start, 1), value=-torch.inf)
+    n = (maps.shape[2] - start + 1) // 2
+    before, centre, after = (padded[:, :, first : first + 2 * n - 1 : 2] for first in range(3))
+    return along_x, torch.maximum(before, centre).maximum(after)
 
 
 def unpool(
@@ -84,29 +62,29 @@ def unpool(
 
 def _unpool_axis(maps: torch.Tensor, pooled: torch.Tensor, score: torch.Tensor, axis: int, start: int) -> torch.Tensor:
     out = torch.full_like(maps, -torch.inf)
+    cells, given, pooled, score = (x.movedim(axis, 0) for x in (maps, out, pooled, score))
     for first in (start - 1, start, start + 1):
-        skip = int(first < 0)
-        there, here = (_every_second(x, axis, first + 2 * skip) for x in (out, maps))
-        n = min(here.shape[axis], pooled.shape[axis] - skip)
+        skip = int(first < 0)  # nothing lies before the first cell
+        here, there = (x[first + 2 * skip :: 2] for x in (cells, given))
+        n = min(len(here), len(pooled) - skip)
         if n > 0:
-            there, here = there.narrow(axis, 0, n), here.narrow(axis, 0, n)
-            chosen = here == pooled.narrow(axis, skip, n)
-            torch.maximum(there, torch.where(chosen, score.narrow(axis, skip, n), -torch.inf), out=there)
+            chosen = here[:n] == pooled[skip : skip + n]
+            torch.maximum(there[:n], torch.where(chosen, score[skip : skip + n], -torch.inf), out=there[:n])
     return out
 
 
-def _sides(axis: int, level: int, n: int, n_map: int, shifted: bool) -> Iterator[tuple[tuple, tuple]]:
-    """Indices of (parents, children) for the child before and the child behind along one axis of n children."""
+def _by_axis(maps: torch.Tensor, axis: int) -> torch.Tensor:
+    """The same responses with the lattice and the map along one axis first."""
+    return maps.movedim((axis, axis + 2), (0, 1))
+
+
+def _sides(level: int, n: int, n_map: int, shifted: bool) -> Iterator[tuple[tuple, tuple]]:
+    """Indices (lattice, map) of parents and children, for the child before and the child behind, of n children."""
+    wider = int(level == 1)  # there is a parent beyond the last child
     off = 1 if level == 1 else 2 ** (level - 2)
-    shift = int(shifted)
-    before = slice(off, n + (level == 1)), slice(0, n - off + (level == 1))
-    behind = (slice(0, n), slice(0, n)) if level == 1 else (slice(0, n - off), slice(off, n))
-    near, far = slice(0, n_map - shift), slice(shift, n_map)
-    for (parents, children), (to, origin) in ((before, (far, near)), (behind, (near, far))):
-        index = [[slice(None)] * 4 for _ in range(2)]
-        index[0][axis], index[0][axis + 2] = parents, to
-        index[1][axis], index[1][axis + 2] = children, origin
-        yield tuple(index[0]), tuple(index[1])
+    near, far = slice(0, n_map - shifted), slice(int(shifted), n_map)
+    yield (slice(off, n + wider), far), (slice(0, n + wider - off), near)
+    yield (slice(0, n + wider - off), near), (slice(off - wider, n), far)
 
 
 def gather(pooled: torch.Tensor, axis: int, level: int, *, shifted: bool) -> torch.Tensor:
@@ -115,17 +93,18 @@ def gather(pooled: torch.Tensor, axis: int, level: int, *, shifted: bool) -> tor
     Children beyond the lattice do not exist; of those that do, some have a place beyond the map (not valid).  The sum
     over the valid ones is divided by n_exist^0.1 n_valid^0.9, as in the published implementation.
     """
-    n, n_map = pooled.shape[axis], pooled.shape[axis + 2]
     shape = list(pooled.shape)
-    shape[axis] = n + (level == 1)
+    shape[axis] += level == 1
     out = pooled.new_zeros(shape)
-    exist, valid = (torch.zeros([s if k in (axis, axis + 2) else 1 for k, s in enumerate(shape)]) for _ in range(2))
-    for parents, children in _sides(axis, level, n, n_map, shifted):
-        out[parents] += pooled[children]
+    total, single = _by_axis(out, axis), _by_axis(pooled, axis)
+    exist, valid = torch.zeros(len(total), 1), torch.zeros(total.shape[:2])
+    for parents, children in _sides(level, *single.shape[:2], shifted):
+        total[parents] += single[children]
+        exist[parents[0]] += 1
         valid[parents] += 1
-        exist[tuple(s if k == axis else slice(None) for k, s in enumerate(parents))] += 1
     factor = exist.clamp_min(1) ** (BORDER_POWER - 1) * valid.clamp_min(1) ** -BORDER_POWER * (valid > 0)
-    return out.mul_(factor.to(out))
+    total *= factor.to(out)[..., None, None]
+    return out
 
 
 def _scatter(score: torch.Tensor, axis: int, level: int, n: int, *, shifted: bool) -> torch.Tensor:
@@ -133,40 +112,31 @@ def _scatter(score: torch.Tensor, axis: int, level: int, n: int, *, shifted: boo
     shape = list(score.shape)
     shape[axis] = n
     out = score.new_full(shape, -torch.inf)
-    for parents, children in _sides(axis, level, n, score.shape[axis + 2], shifted):
-        there = out[children]
-        torch.maximum(there, score[parents], out=there)
+    best, paths = _by_axis(out, axis), _by_axis(score, axis)
+    for parents, children in _sides(level, *best.shape[:2], shifted):
+        torch.maximum(best[children], paths[parents], out=best[children])
     return out
 
 
-def bottom_up(pooled: torch.Tensor, levels: int, *, shifted: bool) -> Pyramid:
-    """The pyramid over the pooled responses of the atomic patches, after the power; `levels` at most."""
-    pools, responses = [(None, pooled)], []
-    for level in range(1, levels + 1):
-        responses.append(gather(gather(pools[-1][1], 0, level, shifted=shifted), 1, level, shifted=shifted).pow_(POWER))
-        if level == levels or responses[-1].shape[2:].numel() == 1:
-            break
-        pools.append(pool(responses[-1], _start(responses[-1], shifted)))
-    return Pyramid(pools, responses, shifted)
+def path_scores(pooled: torch.Tensor, levels: int, *, shifted: bool, level: int = 1) -> torch.Tensor:
+    """Score of the best path through the pyramid to every pooled cell of the patches below a level; -inf where none leads.
 
-
-def _start(maps: torch.Tensor, shifted: bool) -> int:
-    """First row that is sampled: of displacements the epipolar line itself, the middle row, is always one of them."""
-    return 0 if shifted else (maps.shape[2] // 2) % 2
-
-
-def top_down(pyramid: Pyramid) -> torch.Tensor:
-    """Score of the best path to every pooled cell of the atomic patches; -inf where none leads."""
-    score = pyramid.responses[-1] if pyramid.responses else pyramid.pools[0][1]
-    for level in range(len(pyramid.responses), 0, -1):
-        along_x, pooled = pyramid.pools[level - 1]
-        for axis in (0, 1):
-            score = _scatter(score, axis, level, pooled.shape[axis], shifted=pyramid.shifted)
-        score.add_(pooled)
-        if level > 1:
-            maps = pyramid.responses[level - 2]
-            score = unpool(maps, along_x, pooled, score, _start(maps, pyramid.shifted))
-    return score
+    Args:
+        pooled: Responses after the power, pooled; of the atomic patches at the first level.
+        levels: Of the pyramid, at most.
+    """
+    if level > levels:
+        return pooled
+    score = gather(gather(pooled, 0, level, shifted=shifted), 1, level, shifted=shifted).pow_(POWER)
+    if level < levels and score.shape[2:].numel() > 1:
+        # Of displacements the epipolar line itself, the middle row, is always one that is sampled.
+        start = 0 if shifted else (score.shape[2] // 2) % 2
+        along_x, smaller = pool(score, start)
+        above = path_scores(smaller, levels, shifted=shifted, level=level + 1)
+        score = unpool(score, along_x, smaller, above, start)
+    for axis in (0, 1):
+        score = _scatter(score, axis, level, pooled.shape[axis], shifted=shifted)
+    return score.add_(pooled)
 
 
 def peak_ratio(maps: torch.Tensor, row: torch.Tensor, column: torch.Tensor) -> np.ndarray:

@@ -11,7 +11,7 @@ from typing import Self
 import numpy as np
 import torch
 
-from lib.matching.pyramid import PATCH, POWER, bottom_up, n_levels, pool, top_down, unit_patches, unpool
+from lib.matching.pyramid import PATCH, POWER, n_levels, path_scores, pool, unit_patches, unpool
 
 __all__ = ["VolumeMatches", "correlation_volume", "match_volume", "predicted_bytes"]
 
@@ -97,7 +97,7 @@ def match_volume(volume: torch.Tensor, low: int, *, reciprocal: bool = True) -> 
     v = rows // 2
     along_x, pooled = pool(volume, v % 2)
     # The power is monotone, so it may follow the maximum, which is a quarter of the work.
-    scores = top_down(bottom_up(pooled**POWER, n_levels(gy, gx) if rows * n > 1 else 0, shifted=False))
+    scores = path_scores(pooled**POWER, n_levels(gy, gx) if rows * n > 1 else 0, shifted=False)
 
     # The centre of a patch lies at cell 4 g + 2; its displaced copy falls into the bin (4 g + 2 + d) // 4, so
     # displacements in fours share a bin for every patch.

@@ -14,7 +14,7 @@ import torch
 from lib.matching import match
 from lib.matching.deepmatching import atomic_maps
 from lib.matching.descriptors import pixel_descriptors
-from lib.matching.pyramid import POWER, bottom_up, gather, n_levels, pool, top_down, unpool
+from lib.matching.pyramid import POWER, gather, n_levels, path_scores, pool, unpool
 from lib.paths import ROOT
 from notebooks.figures.reconstruction import response_map
 
@@ -109,9 +109,8 @@ def test_whole_map_passes_equal_the_recursion_they_replace():
     slow = slow_scores(left.astype(float), right.astype(float), levels=2)
     maps = atomic_maps(torch.from_numpy(left), torch.from_numpy(right)) ** POWER
     along_x, pooled = pool(maps)
-    pyramid = bottom_up(pooled, n_levels(4, 4), shifted=True)
-    assert len(pyramid.responses) == 2
-    score = unpool(maps, along_x, pooled, top_down(pyramid)).numpy()
+    assert n_levels(4, 4) == 2
+    score = unpool(maps, along_x, pooled, path_scores(pooled, n_levels(4, 4), shifted=True)).numpy()
     fast = {tuple(key): score[tuple(key)] for key in np.argwhere(np.isfinite(score)).tolist()}
     assert fast.keys() == slow.keys()
     assert max(abs(fast[key] - slow[key]) for key in slow) < 1e-4
