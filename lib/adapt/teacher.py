@@ -166,14 +166,12 @@ class Teacher:
     right: float
     turns: bool = False
 
-    def project(self, frames: np.ndarray, offset_mm: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    def project(self, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Pixels (m, 2, 3, 2) of the robot's landmarks at the instants of their image rows, and covariances (m, 2, 3, 2, 2).
 
-        NaN where the robot is silent.  `offset_mm` is used in place of the teacher's own; the covariance is that of
-        calibration, robot, clock and offset.
+        NaN where the robot is silent.  The covariance is that of calibration, robot, clock and offset.
         """
-        r, c = self.recording, self.calibration
-        offset = self.offset_mm if offset_mm is None else offset_mm
+        r, c, offset = self.recording, self.calibration, self.offset_mm
         turning = offset if self.turns else None
         known_at, known = _known_axes(r, turning)
         time, height = np.repeat(r.frames.time_s[frames][:, None], 3, axis=1) + r.offset_s, r.image_size_px[1]

@@ -8,6 +8,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.interpolate import BSpline
 from scipy.linalg import cho_solve_banded
 
 from lib.cameras import AffineCamera
@@ -16,8 +17,6 @@ from lib.surface.grid import SplineGrid, cubic_basis
 from lib.surface.solver import UNHELD, L1Problem, cholesky
 
 __all__ = ["BSplineSurface", "SurfaceFit", "ToolDistance"]
-
-_FEW = 256  # points: a sparse matrix costs more than it saves
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +51,7 @@ class SurfaceFit:
     weights: np.ndarray = field(repr=False)
     residual: np.ndarray = field(repr=False)
 
-    def covariance(self, grid: SplineGrid, u: np.ndarray) -> np.ndarray:
+    def covariance(self, u: np.ndarray) -> np.ndarray:
         """Covariance (n, 3, 3) mm^2 of Psi(u) (n, 2), NaN outside the domain.
 
         The curvature of the expected L1 loss is 2 f(0) B'B, where f(0) is the density of the residuals at zero; with
@@ -64,6 +63,7 @@ class SurfaceFit:
         calibration, is not in it.
         """
         result = np.full((len(u), 3, 3), np.nan)
+        grid = self.problem.grid
         inside = np.flatnonzero(grid.inside(u))
         for part in np.array_split(inside, max(1, len(inside) // 2048)):
             columns = grid.design(u[part]).toarray().T
@@ -169,10 +169,7 @@ class BSplineSurface:
         u = points(u, 2, "u")
         result = np.full((len(u), 3), np.nan)
         inside = self.grid.inside(u)
-        if inside.sum() <= _FEW and max(order) <= 2:
-            result[inside] = self._jet(u[inside])[order[1], order[0]]
-        else:
-            result[inside] = self.grid.design(u[inside], order) @ self.grid.flatten(self.control_points_mm)
+        result[inside] = self.grid.design(u[inside], order) @ self.grid.flatten(self.control_points_mm)
         return result
 
     def _jet(self, u: np.ndarray) -> np.ndarray:
@@ -184,16 +181,12 @@ class BSplineSurface:
 
     def on_grid(self, x_px: ArrayLike, y_px: ArrayLike) -> np.ndarray:
         """Points (len(y), len(x), 3) on the lattice of columns `x_px` and rows `y_px`: fast for whole images."""
-        bases = []
-        axes = zip((x_px, y_px), self.grid.domain[:2], self.grid.cell_px, self.grid.control, strict=True)
-        for values, low, cell, n in axes:
-            position = (np.asarray(values, dtype=np.float64) - low) / cell
-            index = np.clip(np.floor(np.nan_to_num(position)), 0, n - 4).astype(np.intp)
-            basis = np.zeros((len(position), n))
-            np.put_along_axis(basis, index[:, None] + np.arange(4), cubic_basis(position - index), axis=1)
-            basis[~((position >= 0) & (position <= n - 3))] = np.nan
-            bases.append(basis)
-        return np.matmul(bases[0], np.tensordot(bases[1], self.control_points_mm, axes=(1, 0)))
+        values = self.control_points_mm
+        for axis, u in ((1, x_px), (0, y_px)):
+            position = (np.asarray(u, dtype=np.float64) - self.grid.domain[1 - axis]) / self.grid.cell_px[1 - axis]
+            knots = np.arange(-3.0, values.shape[axis] + 1)
+            values = BSpline(knots, values, 3, axis=axis, extrapolate=False)(position)
+        return values
 
     def normal(self, u: ArrayLike) -> np.ndarray:
         """Unit normals (n, 3), towards the camera (for an unmirrored camera in a right-handed frame)."""
@@ -208,15 +201,14 @@ class BSplineSurface:
         """
         if self.fit is None:
             raise ValueError("covariance: this surface was not fitted to points, so its uncertainty is not known.")
-        return self.fit.covariance(self.grid, points(u, 2, "u"))
+        return self.fit.covariance(points(u, 2, "u"))
 
-    def distance(self, x_mm: ArrayLike, camera: AffineCamera, *, iterations: int = 20) -> ToolDistance:
+    def distance(self, x_mm: ArrayLike, camera: AffineCamera) -> ToolDistance:
         """Distance of points, such as tool tips, to the surface along the view and along the surface's normal.
 
         Args:
             x_mm: (n, 3) in the frame of the surface; NaN rows stay NaN.
             camera: The left camera, whose image parametrises the surface.
-            iterations: Gauss-Newton steps towards the nearest point; each stays inside the domain.
         """
         x = points(x_mm, 3, "x_mm")
         start = camera.project(x)
@@ -224,7 +216,7 @@ class BSplineSurface:
         low, high = np.reshape(self.grid.domain, (2, 2))
         u = np.clip(start, low, high)
         seen = np.isfinite(u).all(axis=1)
-        for _ in range(iterations):
+        for _ in range(20):  # Gauss-Newton steps towards the nearest point; each stays inside the domain
             jet = self._jet(u[seen])
             jacobian = np.stack([jet[0, 1], jet[1, 0]], axis=2)
             gap = x[seen] - jet[0, 0]

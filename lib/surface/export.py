@@ -48,15 +48,6 @@ class Mesh:
     u: np.ndarray
     texture: np.ndarray | None = None
 
-    @property
-    def colours(self) -> np.ndarray:
-        """Colour (n, 3) uint8 of each vertex in the texture; grey without one."""
-        if self.texture is None:
-            return np.full((len(self.u), 3), 160, dtype=np.uint8)
-        h, w = self.texture.shape[:2]
-        x, y = np.clip(np.rint(self.u), 0, (w - 1, h - 1)).astype(int).T
-        return self.texture[y, x]
-
 
 def surface_mesh(
     surface: BSplineSurface, *, step_px: float = 12.0, image: np.ndarray | None = None, mask: np.ndarray | None = None
@@ -163,8 +154,6 @@ def _write(path: Path, write: Callable[[str], bool], is_whole: Callable[[bytes],
 
     The writers return False on an error, but on a full disk some return True and leave part of the file.
     """
-    if not path.parent.is_dir():
-        raise FileNotFoundError(f"{path.parent}: no such folder.")
     with whole(path) as partial:
         if not write(str(partial)) or not is_whole(partial.read_bytes()):
             raise OSError(f"{path}: Open3D could not write the whole file; is the disk full?")

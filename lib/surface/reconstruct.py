@@ -59,8 +59,8 @@ class Reconstruction:
         return float(low) - margin_mm, float(high) + margin_mm
 
 
-def epipolar_inliers(rig: StereoRig, matches: Matches, *, sigmas: float = EPIPOLAR_SIGMAS) -> np.ndarray:
-    """Mask (n,) of the matches that lie on their epipolar lines, within `sigmas` of their own standard deviations.
+def epipolar_inliers(rig: StereoRig, matches: Matches) -> np.ndarray:
+    """Mask (n,) of the matches that lie on their epipolar lines, within `EPIPOLAR_SIGMAS` of their standard deviations.
 
     The median distance is subtracted first: the lines of a calibrated rig may be off by a fraction of a pixel,
     the same for all matches.
@@ -68,18 +68,16 @@ def epipolar_inliers(rig: StereoRig, matches: Matches, *, sigmas: float = EPIPOL
     if not len(matches):
         return np.zeros(0, dtype=bool)
     distance = rig.epipolar_distance(matches.u_left, matches.u_right)
-    return np.abs(distance - np.median(distance)) < sigmas * matches.sigma_along(rig.epipolar_normal)
+    return np.abs(distance - np.median(distance)) < EPIPOLAR_SIGMAS * matches.sigma_along(rig.epipolar_normal)
 
 
 def reconstruct(
     left: np.ndarray, right: np.ndarray, rig: StereoRig | Calibration, *, setting: str = "quality",
     method: str | Callable | None = None, refine: bool | None = None,
     u_landmarks: tuple[ArrayLike, ArrayLike] | None = None, mask_left: np.ndarray | None = None,
-    mask_right: np.ndarray | None = None, epipolar_sigmas: float = EPIPOLAR_SIGMAS,
-    domain: tuple[float, float, float, float] | None = None, percentiles: tuple[float, float] = (0.0, 100.0),
-    control: tuple[int, int] = (20, 20), smoothness: float | None = None, reject_mm: float | None = None,
-    depth_only: bool | None = None, depth_range_mm: tuple[float, float] | None = None, max_epipolar_px: float = 6.0,
-    seconds: dict[str, float] | None = None,
+    mask_right: np.ndarray | None = None, percentiles: tuple[float, float] = (0.0, 100.0),
+    control: tuple[int, int] = (20, 20), smoothness: float | None = None, depth_only: bool | None = None,
+    depth_range_mm: tuple[float, float] | None = None, max_epipolar_px: float = 6.0, seconds: dict[str, float] | None = None,
 ) -> Reconstruction:  # fmt: skip
     """Reconstruct the surface that a calibrated stereo pair shows.
 
@@ -93,11 +91,9 @@ def reconstruct(
             calibration of an affine pair.  None refines where it is.
         u_landmarks: Landmarks of the tool, (3, 2) px left and right, to mask the tool; NaN = missing.
         mask_left, mask_right: (h, w) bool, True = ignore, beside glints and tool.
-        epipolar_sigmas: As `sigmas` of `epipolar_inliers`.
-        domain: (x0, y0, x1, y1) px that the surface covers.  None takes it from the matches.
-        percentiles: (low, high) of the matches' coordinates that bound the domain where `domain` is None: (0, 100)
-            covers all matches, (1, 99) leaves out the rim, where few matches hold the surface.
-        control, reject_mm: As for `fit_surface`.
+        percentiles: (low, high) of the matches' coordinates that bound the surface's domain: (0, 100) covers all matches,
+            (1, 99) leaves out the rim, where few matches hold the surface.
+        control: As for `fit_surface`.
         smoothness: As for `fit_surface`; that of an earlier frame (`Reconstruction.surface.fit.smoothness`) saves time.
         depth_only: Fit one spline, the depth along the rays of the left camera, in place of three.  It needs an affine
             left camera. None is True in the fast setting with an affine rig.
@@ -147,17 +143,16 @@ def reconstruct(
         where = {"depth_range_mm": depth_range_mm, "max_epipolar_px": max_epipolar_px}
         found = match(left, right, rig=rig, method=method, setting=setting, **where, **masks)
     with _timed(seconds, "triangulate"):
-        matches = found.keep(epipolar_inliers(rig, found, sigmas=epipolar_sigmas))
+        matches = found.keep(epipolar_inliers(rig, found))
         points = rig.triangulate(matches.u_left, matches.u_right, matches.covariance_px2)
     with _timed(seconds, "surface"):
-        if domain is None:
-            if not len(matches):
-                raise ValueError("left, right: no match lies on its epipolar line; is there texture, does the rig fit?")
-            domain = tuple(np.percentile(matches.u_left, percentiles, axis=0).ravel().tolist())
+        if not len(matches):
+            raise ValueError("left, right: no match lies on its epipolar line; is there texture, does the rig fit?")
+        domain = tuple(np.percentile(matches.u_left, percentiles, axis=0).ravel().tolist())
         if depth_only is None:
             depth_only = fast and rig.is_affine
         surface = fit_surface(
-            matches.u_left, points.x_mm, domain=domain, control=control, smoothness=smoothness, reject_mm=reject_mm,
+            matches.u_left, points.x_mm, domain=domain, control=control, smoothness=smoothness,
             camera=rig.left if depth_only else None, tolerance=1e-4 if fast else 1e-8, quick=fast,
         )  # fmt: skip
     return Reconstruction(surface, points, matches, len(found), masks["mask_left"], rig, dict(seconds))

@@ -62,6 +62,7 @@ __all__ = [
     "spline_1d",
     "stereo_pair",
     "tool_over_surface",
+    "vertex_colours",
 ]
 
 _SIGNED = "RdBu_r"
@@ -646,13 +647,22 @@ def case_table(found: Sequence[Case], caption: str) -> HTML:
     return table(header, rows, caption)
 
 
+def vertex_colours(mesh: Mesh) -> np.ndarray:
+    """Colour (n, 3) uint8 of each vertex in the mesh's texture; grey without one."""
+    if mesh.texture is None:
+        return np.full((len(mesh.u), 3), 160, dtype=np.uint8)
+    h, w = mesh.texture.shape[:2]
+    x, y = np.clip(np.rint(mesh.u), 0, (w - 1, h - 1)).astype(int).T
+    return mesh.texture[y, x]
+
+
 def scene_view(
     mesh: Mesh, rig: StereoRig, x_tool_mm: np.ndarray, distance: ToolDistance, sd_um: float, *, height_px: int = 560
 ) -> go.Figure:
     """A plotly scene that turns under the mouse: surface, forceps (3, 3) mm, both cameras' rays, the tip's distance."""
     import plotly.graph_objects as go
 
-    colours = [f"rgb({r},{g},{b})" for r, g, b in mesh.colours.tolist()]
+    colours = [f"rgb({r},{g},{b})" for r, g, b in vertex_colours(mesh).tolist()]
     i, j, k = mesh.faces.T
     x, y, z = np.round(mesh.vertices_mm, 3).T
     view = go.Figure(go.Mesh3d(x=x, y=y, z=z, i=i, j=j, k=k, vertexcolor=colours, flatshading=False, hoverinfo="x+y+z"))

@@ -19,6 +19,7 @@ from lib.surface import (
     save_points,
     surface_mesh,
 )
+from notebooks.figures.reconstruction import vertex_colours
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -52,7 +53,7 @@ def test_mesh_lies_on_the_surface_and_faces_the_camera(surface, image, bowl):
     covered = np.abs(edge[:, 0] * other[:, 1] - edge[:, 1] * other[:, 0]).sum() / 2
     assert covered == pytest.approx(area_px2)
     nearest = np.rint(mesh.u).astype(int)
-    np.testing.assert_array_equal(mesh.colours, image[nearest[:, 1], nearest[:, 0]])
+    np.testing.assert_array_equal(vertex_colours(mesh), image[nearest[:, 1], nearest[:, 0]])
 
 
 def test_mask_hides_triangles(surface):
@@ -122,11 +123,12 @@ def test_without_open3d_one_line_says_what_to_install(monkeypatch, tmp_path):
 
 def test_ply_comes_back_with_colours(surface, image, bowl, tmp_path):
     mesh = surface_mesh(surface, step_px=80, image=image)
-    path = save_points(tmp_path / "cloud.ply", mesh.vertices_mm, colours=mesh.colours)
+    colours = vertex_colours(mesh)
+    path = save_points(tmp_path / "cloud.ply", mesh.vertices_mm, colours=colours)
     assert [p.name for p in tmp_path.iterdir()] == ["cloud.ply"]
     cloud = o3d.io.read_point_cloud(str(path))
     np.testing.assert_allclose(np.asarray(cloud.points), mesh.vertices_mm, atol=1e-6)
-    np.testing.assert_array_equal(np.rint(np.asarray(cloud.colors) * 255), mesh.colours)
+    np.testing.assert_array_equal(np.rint(np.asarray(cloud.colors) * 255), colours)
 
 
 def test_depth_map_is_the_surface_along_the_view(surface, bowl, tmp_path):
