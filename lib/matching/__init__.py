@@ -6,6 +6,7 @@ matches = match(left, right, rig=RECTIFIED)              # a rectified pair: row
 points = rig.triangulate(matches.u_left, matches.u_right, matches.covariance_px2)
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -16,15 +17,15 @@ from lib.matching.band import MAX_PIXELS, match_band
 from lib.matching.deepmatching import match_free
 from lib.matching.descriptors import as_gray
 from lib.matching.masks import checked_mask, glint_mask, tool_mask
-from lib.matching.opencv import DisparityFunction, match_with
+from lib.matching.opencv import match_with
 from lib.matching.rectification import RECTIFIED
 from lib.matching.result import Matches
 
-__all__ = ["RECTIFIED", "DisparityFunction", "Matches", "checked_mask", "glint_mask", "match", "tool_mask"]
+__all__ = ["RECTIFIED", "Matches", "checked_mask", "glint_mask", "match", "tool_mask"]
 
 
 def match(
-    left: ArrayLike, right: ArrayLike, *, method: str | DisparityFunction | None = None, rig: StereoRig | None = None,
+    left: ArrayLike, right: ArrayLike, *, method: str | Callable | None = None, rig: StereoRig | None = None,
     mask_left: ArrayLike | None = None, mask_right: ArrayLike | None = None,
     depth_range_mm: tuple[float, float] | None = None, setting: str = "quality", min_score: float | None = None,
     downscale: int | None = None, budget_bytes: int = 2 << 30, max_epipolar_px: float = 6.0, reciprocal: bool = True,
@@ -38,8 +39,8 @@ def match(
             `epipolar_px`. "band": DeepMatching along the epipolar lines, sub-pixel; needs a rig. "sgbm", "dis":
             OpenCV's, on rectified canvases; without a rig the pair is taken as rectified. A callable `f(left, right,
             (low, high)) -> (disparity, confidence)` of rectified grey uint8 images (h, w), x_right = x_left -
-            disparity, not finite = none: the slot for learned matchers.  A third array (h, w) bool, where it returns
-            one, is its own check of the way back. None is "band" with a rig, else "deepmatching".
+            disparity, not finite = none; confidence in [0, 1]: the slot for learned matchers.  A third array (h, w)
+            bool, where it returns one, is its own check of the way back. None is "band" with a rig, else "deepmatching".
         rig: Calibrated rig, or `RECTIFIED` for a pair whose rows correspond (depth is then disparity in px).
         mask_left, mask_right: (h, w) bool, True = ignore (see `glint_mask`, `tool_mask`).
         depth_range_mm: (near, far): the values of d.x to search, where d is the left camera's `viewing_direction` and x
@@ -83,8 +84,7 @@ def match(
         method = "deepmatching" if rig is None else "band"
     where = (setting, depth_range_mm, max_epipolar_px)
     if method == "deepmatching":
-        options = {"downscale": downscale, "budget_bytes": budget_bytes, "device": device}
-        matches = match_free(images, masks, reciprocal=reciprocal, **options)
+        matches = match_free(images, masks, downscale, budget_bytes=budget_bytes, reciprocal=reciprocal, device=device)
     elif method == "band":
         if rig is None:
             raise ValueError("rig: method 'band' needs a calibrated rig, or RECTIFIED for a rectified pair.")

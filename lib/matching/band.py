@@ -28,8 +28,6 @@ __all__ = ["MAX_PIXELS", "Search", "match_band", "plan_search", "refine"]
 
 Images = tuple[np.ndarray, np.ndarray]
 Masks = tuple[np.ndarray | None, np.ndarray | None]
-
-
 #: The setting of a search, the depth range in mm (None = found), and the largest misfit of the rig in px: see `match`.
 Where = tuple[str, tuple[float, float] | None, float]
 
@@ -118,7 +116,7 @@ def _coarse_displacement(images: Images, masks: Masks, rig: StereoRig, whole: Re
     rectification = rectify(rig, images[0].shape, images[1].shape, scale=scale)
     reach = int(np.ceil(COARSE_REACH * rectification.size_px[0] / CELL_PX))
     left, right = _descriptors(images, masks, rectification, (-reach, reach), COARSE_OFF_LINE)
-    matches, _ = _match(left, right, -reach, COARSE_OFF_LINE, rivals=False)
+    matches, _ = _match(left, right, -reach, COARSE_OFF_LINE)
     chosen = matches.keep(_supported(matches))
     start = chosen.patch * PATCH
     step, _ = refine(left, right, start, start + chosen.cell - (-reach, -COARSE_OFF_LINE))
@@ -150,11 +148,9 @@ def _descriptors(
 
 
 def _match(
-    left: np.ndarray, right: np.ndarray, low: int, off_line: int, *, reciprocal: bool = True, rivals: bool = True
-) -> tuple[VolumeMatches, np.ndarray | None]:
-    """Matches of two grids, without those on flat or mostly masked patches or without a peak, and with `rivals` their peak
-    ratios (n,).
-    """
+    left: np.ndarray, right: np.ndarray, low: int, off_line: int, *, reciprocal: bool = True
+) -> tuple[VolumeMatches, torch.Tensor]:
+    """Matches of two grids, without those on flat or mostly masked patches or without a peak, and the volume."""
     with single_threaded_torch():
         volume = correlation_volume(torch.from_numpy(left), torch.from_numpy(right), off_line)
         matches = match_volume(volume, low, reciprocal=reciprocal)
@@ -163,23 +159,18 @@ def _match(
     seen_right = np.mean(
         [right[start[:, 1] + r, start[:, 0] + c, CHANNELS - 1] > 0 for r in range(PATCH) for c in range(PATCH)], axis=0
     )
-    matches = matches.keep(patch_quality(left)[y, x] & (seen_right >= MIN_SEEN) & matches.peaked)
-    if not rivals:
-        return matches, None
-    x, y = torch.from_numpy(matches.patch.T)
-    along = torch.from_numpy(matches.cell[:, 0] - low)
-    return matches, peak_ratio(volume[y, x].amax(dim=1, keepdim=True), torch.zeros_like(along), along)
+    return matches.keep(patch_quality(left)[y, x] & (seen_right >= MIN_SEEN) & matches.peaked), volume
 
 
-def _supported(matches: VolumeMatches, tolerance: float = 1.5) -> np.ndarray:
-    """Mask (n,) of the matches with at least three neighbours on the lattice that moved alike (cells)."""
+def _supported(matches: VolumeMatches) -> np.ndarray:
+    """Mask (n,) of the matches with at least three neighbours on the lattice that moved alike, within 1.5 cells."""
     gx, gy = matches.patch.max(axis=0, initial=0) + 1
     field = np.full((gy + 2, gx + 2, 2), np.nan)
     x, y = matches.patch.T + 1
     field[y, x] = matches.displacement
     support = np.zeros(len(x), int)
     for dy, dx in np.ndindex(3, 3):
-        support += np.abs(field[y + dy - 1, x + dx - 1] - matches.displacement).max(axis=1, initial=0) <= tolerance
+        support += np.abs(field[y + dy - 1, x + dx - 1] - matches.displacement).max(axis=1, initial=0) <= 1.5
     return support > 3  # each match supports itself
 
 
@@ -202,7 +193,10 @@ def match_band(images: Images, masks: Masks, rig: StereoRig, where: Where, *, bu
             f"is {budget_bytes / 2**30:.2f} GiB. Narrow depth_range_mm, or take setting='fast'."
         )
     left, right = _descriptors(images, masks, rectification, (low, high), OFF_LINE, search.off_line_px)
-    found, ratio = _match(left, right, low, OFF_LINE, reciprocal=reciprocal)
+    found, volume = _match(left, right, low, OFF_LINE, reciprocal=reciprocal)
+    x, y = torch.from_numpy(found.patch.T)
+    along = torch.from_numpy(found.cell[:, 0] - low)
+    ratio = peak_ratio(volume[y, x].amax(dim=1, keepdim=True), torch.zeros_like(along), along)
 
     # The match lies on the line, at the best whole cell, and one step of `refine` from there.
     start = found.patch * PATCH

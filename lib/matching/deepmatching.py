@@ -99,7 +99,7 @@ def _match_grids(left: torch.Tensor, right: torch.Tensor) -> tuple[torch.Tensor,
 
 
 def match_free(
-    images: tuple[np.ndarray, np.ndarray], masks: tuple[np.ndarray | None, np.ndarray | None], *, downscale: int | None,
+    images: tuple[np.ndarray, np.ndarray], masks: tuple[np.ndarray | None, np.ndarray | None], downscale: int | None, *,
     budget_bytes: int, reciprocal: bool, device: str,
 ) -> Matches:  # fmt: skip
     """DeepMatching without any calibration; arguments as in `lib.matching.match`, images (h, w) uint8 grey."""
@@ -133,5 +133,6 @@ def match_free(
     variance = stride**2 / 12 + 0.25 * stride**2 / 4
     covariance = np.tile(np.diag([SIGMA_LEFT_PX**2] * 2 + [variance] * 2), (len(u_left), 1, 1))
     score = np.clip(best[kept] / (n_levels(*best.shape) + 1), 0, 1)
-    told = {"peak_ratio": ratio[kept], "reciprocal": passed[kept]}
-    return Matches(u_left, u_right, score, covariance, **told, method="deepmatching")
+    return Matches(
+        u_left, u_right, score, covariance, peak_ratio=ratio[kept], reciprocal=passed[kept], method="deepmatching"
+    )

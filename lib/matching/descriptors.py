@@ -8,6 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lib.matching.pyramid import PATCH
+
 __all__ = ["CHANNELS", "MIN_SEEN", "as_gray", "patch_quality", "pixel_descriptors"]
 
 #: Eight orientations and one constant, which keeps flat patches from matching noise.
@@ -96,12 +98,12 @@ def _describe(gray: np.ndarray, rows: slice, stride: int, out: np.ndarray) -> No
     out[:, :, CHANNELS - 1] = CONSTANT
 
 
-def patch_quality(grid: np.ndarray, patch: int = 4) -> np.ndarray:
+def patch_quality(grid: np.ndarray) -> np.ndarray:
     """Mask (gy, gx) of the patches that have texture and are mostly not masked, of descriptors (h, w, 9)."""
-    gy, gx = grid.shape[0] // patch, grid.shape[1] // patch
-    cells = grid[: gy * patch, : gx * patch].reshape(gy, patch, gx, patch, CHANNELS)
+    gy, gx = grid.shape[0] // PATCH, grid.shape[1] // PATCH
+    cells = grid[: gy * PATCH, : gx * PATCH].reshape(gy, PATCH, gx, PATCH, CHANNELS)
     constant = np.ascontiguousarray(cells[..., CHANNELS - 1])
     seen = (constant > 0).mean(axis=(1, 3))
-    rows = cells.reshape(gy, patch, gx, patch * CHANNELS)
+    rows = cells.reshape(gy, PATCH, gx, PATCH * CHANNELS)
     texture = np.einsum("yrxk,yrxk->yx", rows, rows) - np.einsum("yrxc,yrxc->yx", constant, constant)
-    return (seen >= MIN_SEEN) & (texture / patch**2 > MIN_TEXTURE)
+    return (seen >= MIN_SEEN) & (texture / PATCH**2 > MIN_TEXTURE)

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from lib.cameras import StereoRig
-from lib.matching.band import COARSE_REACH, Images, Masks, Where, plan_search
+from lib.matching.band import CELL_PX, COARSE_REACH, DOWNSCALE, Images, Masks, Where, plan_search
 from lib.matching.descriptors import patch_quality, pixel_descriptors
 from lib.matching.pyramid import PATCH, peak_ratio
 from lib.matching.rectification import warp
@@ -16,16 +16,10 @@ from lib.matching.result import SIGMA_LEFT_PX, Matches
 from lib.matching.volume import correlation_volume
 from lib.parallel import single_threaded_torch
 
-__all__ = ["DisparityFunction", "match_with"]
-
-#: Two rectified grey uint8 images (h, w) and the (low, high) disparity range, px, to disparity and confidence (h, w):
-#: x_right = x_left - disparity, not finite = none; confidence in [0, 1].  It may add a third array, bool: whether the way
-#: back from the right image ends where it started.
-DisparityFunction = Callable[..., tuple[np.ndarray, ...]]
+__all__ = ["match_with"]
 
 #: Matches are taken on this lattice, as DeepMatching's are at full resolution.
-LATTICE_PX = 8
-CELL_PX = LATTICE_PX // PATCH
+LATTICE_PX = PATCH * CELL_PX
 #: Standard deviation of a disparity in canvas px (1.48 times the median error, between that on simulated eyes and on
 #: Middlebury pairs); for callables too.  It is the same everywhere, since these matchers state no uncertainty.
 SIGMA_PX = 0.2
@@ -66,7 +60,7 @@ def _dis(left: np.ndarray, right: np.ndarray, range_px: tuple) -> tuple[np.ndarr
 
 
 def match_with(
-    function: DisparityFunction | str, images: Images, masks: Masks, rig: StereoRig, where: Where, *, reciprocal: bool
+    function: Callable | str, images: Images, masks: Masks, rig: StereoRig, where: Where, *, reciprocal: bool
 ) -> Matches:
     """Rectify by the rig, call a disparity function, and sample its result on a lattice.
 
@@ -127,7 +121,7 @@ def _judge(
     `reach`, a multiple of the lattice, is how far the canvases go on beyond the lattice on either side.
     """
     left, right = (
-        pixel_descriptors(image.astype(np.float32), CELL_PX.bit_length() - 1, valid=seen)
+        pixel_descriptors(image.astype(np.float32), DOWNSCALE, valid=seen)
         for image, seen in zip(images, valid, strict=True)
     )
     margin = reach // CELL_PX

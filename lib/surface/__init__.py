@@ -8,8 +8,7 @@ from lib.surface.bspline import BSplineSurface, ToolDistance
 from lib.surface.export import Mesh, depth_map, open3d, save_depth_map, save_mesh, save_points, surface_mesh
 from lib.surface.fitting import fit_surface
 from lib.surface.grid import SplineGrid
-from lib.surface.joint import refine_rig
-from lib.surface.reconstruct import Reconstruction, epipolar_inliers, reconstruct
+from lib.surface.reconstruct import Reconstruction, epipolar_inliers, reconstruct, refine_rig
 
 __all__ = [
     "BSplineSurface", "Mesh", "Reconstruction", "SplineGrid", "ToolDistance", "depth_map", "epipolar_inliers", "fit_surface",
