@@ -6,7 +6,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import cv2
 import numpy as np
@@ -15,15 +15,17 @@ from lib import files, paths
 from lib.adapt.judging import Agreement, agreement, better, epipolar_geometry, epipolar_px, frame_means
 from lib.adapt.teacher import RefusalError, Seen, Teacher, longest_still, look, stretches, teach
 from lib.calibration import Calibration
+from lib.correspondences import LANDMARKS
 from lib.landmarks import Detector, SharedDetector
 from lib.provenance import Provenance, plain
-from lib.recordings import Recording
-from lib.recordings.annotations import read_coco
+from lib.recordings import Recording, read_image
+from lib.recordings.annotations import CLICK_SD_PX, coco_keypoints, read_coco
+from lib.training.evaluation import evaluate
 from lib.training.samples import LabelledImage
 from lib.training.shards import generate, validation_images
 from lib.training.stages import finetune
 
-__all__ = ["RECIPE", "STEPS", "Adaptation", "adapt", "simulated_like"]
+__all__ = ["RECIPE", "STEPS", "Adaptation", "adapt", "adapt_images", "simulated_like"]
 
 #: Most rounds of training, and most steps of a stage in one; the time ends most trainings.
 ROUNDS, STEPS = 3, 4000
@@ -96,6 +98,58 @@ def adapt(
         return Adaptation(work.detector, None, work.finished(), False, {})
 
 
+def adapt_images(
+    images: str | Path, labels: str | Path, detector: Detector, *, minutes: float = 20.0, seed: int = 0,
+    folder: str | Path | None = None, progress: bool = True, tune: Callable[..., Detector] = finetune,
+) -> Adaptation:  # fmt: skip
+    """`adapt` where there is no robot: labelled images of one camera teach, stop and judge.
+
+    The first 65 % of them in the order of their names teach, the next fit the doubt, the last fifth judge.
+
+    Args:
+        images: Folder to which the file names in `labels` belong.
+        labels: COCO keypoints base, tip_1, tip_2.
+
+    Raises:
+        FileNotFoundError, ValueError: If a file is missing, or fewer than 10 images are labelled.
+    """
+    images, marked = Path(images), []
+    for name, names, values in sorted(coco_keypoints(Path(labels)), key=lambda entry: entry[0]):
+        if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
+            raise ValueError(f"{labels}: {name} lies outside {images}; give file names inside it.")
+        if not set(LANDMARKS) <= set(names):
+            raise ValueError(f"{labels}: image {name} has keypoints {names}; {list(LANDMARKS)} are needed.")
+        xyv = values[[names.index(landmark) for landmark in LANDMARKS]]
+        u = np.where(xyv[:, 2:] > 0, xyv[:, :2], np.nan)
+        marked.append(LabelledImage(name, read_image(images / name), u, np.maximum(xyv[:, 2].astype(int), 1), CLICK_SD_PX))
+    n = len(marked)
+    if n < 10:
+        raise ValueError(f"{labels}: {n} labelled images; label at least 10.")
+    first, second = round(0.65 * n), round(0.8 * n)
+    parts = {"learn": marked[:first], "stop": marked[first:second], "judge": marked[second:]}
+    report = {"recording": images.name, "minutes": minutes, "seed": seed, "notes": [], "rounds": []}
+    report["frames"] = {name: len(part) for name, part in parts.items()}
+    key = [str(images.resolve()), Path(labels).read_bytes(), getattr(detector, "digest", ""), seed, minutes, STEPS, RECIPE]
+    provenance = Provenance(f"python3 -m lib adapt {images.name} --labels {Path(labels).name}")
+    simulated = simulated_like([one.image for one in parts["learn"]], seed, progress)
+    how = {"minutes": minutes, "steps": STEPS, "seed": seed, "progress": progress}
+    work = _work_folder(folder, images.name, key)
+    tuned = tune(detector, parts["learn"], parts["stop"], work, simulated=simulated, **how)
+    before, after = (evaluate(one, parts["judge"]) for one in (detector, tuned))
+    gain, sd = better(*(frame_means(found.error_px / found.length_px[:, None]) for found in (before, after)))
+    improved = bool(gain > 2 * sd)
+    report["judged"] = {
+        name: {"median_px": s.median_px, "within_1_percent": s.pck_0_01, "within_5_percent": s.pck_0_05}
+        for name, s in (("before", before.scores), ("after", after.scores))
+    }
+    report |= {
+        "gain": {"labels": [gain, sd]}, "improved": improved,
+        "reason": "the images for judging agree better with their labels" if improved else
+        "on the images for judging the gain is no larger than chance allows",
+    }  # fmt: skip
+    return Adaptation(tuned if improved else detector, None, plain(report | provenance.so_far()), improved, {})
+
+
 class _Work:
     """The recording, the files that keep what is done, the time left, and the report as it grows."""
 
@@ -118,8 +172,7 @@ class _Work:
         key = [str(recording.folder.resolve()), recording.kinematics.x_mm.tobytes(), self.frames.tobytes(), seed, STEPS]
         key += [RECIPE, recording.offset_s, recording.readout_s, recording.frames.time_s.tobytes(), minutes]
         key += [getattr(self.detector, "digest", ""), Path(labels).read_bytes() if labels is not None else b""]
-        self.folder = Path(folder or paths.RUNS / f"adapt-{recording.name}") / "work"
-        self.folder /= hashlib.sha256(repr(key).encode()).hexdigest()[:12]
+        self.folder = _work_folder(folder, recording.name, key)
         self.folder.mkdir(parents=True, exist_ok=True)
         state = self.folder / "state.json"
         spent_s = json.loads(state.read_text(encoding="utf-8"))["seconds"] if state.is_file() else 0.0
@@ -301,6 +354,11 @@ class _Work:
             best if improved else self.detector, teacher.calibration, self.finished(), bool(improved), parts, agreements[1],
             seen, teacher.project(parts["judge"])[0],
         )  # fmt: skip
+
+
+def _work_folder(folder: str | Path | None, name: str, key: list) -> Path:
+    """Where an adaptation keeps what it has done: a folder of its own for each `key`."""
+    return Path(folder or paths.RUNS / f"adapt-{name}") / "work" / hashlib.sha256(repr(key).encode()).hexdigest()[:12]
 
 
 def simulated_like(images: Iterable[np.ndarray], seed: int, progress: bool) -> list[LabelledImage]:

@@ -8,8 +8,7 @@ import numpy as np
 from jinja2 import Environment, FileSystemLoader, select_autoescape
 
 from lib import files, paths
-from lib.adapt.labels_only import adapt_images
-from lib.adapt.loop import Adaptation, adapt
+from lib.adapt.loop import Adaptation, adapt, adapt_images
 from lib.landmarks import Detector
 from lib.recordings import Recording
 from lib.trust.check import data_uri, overlay

@@ -13,7 +13,7 @@ from lib.matching.descriptors import CHANNELS, patch_quality, pixel_descriptors
 from lib.matching.pyramid import PATCH, POWER, n_levels, path_scores, peak_ratio, pool, unit_patches, unpool
 from lib.matching.result import SIGMA_LEFT_PX, Matches
 
-__all__ = ["atomic_maps", "match_free", "predicted_bytes"]
+__all__ = ["correlation_maps", "match_free", "predicted_bytes", "unit_windows"]
 
 #: Bytes of the full maps of atomic patches that are held at once.
 CHUNK_BYTES = 32 << 20
@@ -34,19 +34,14 @@ def predicted_bytes(shape_left: tuple[int, int], shape_right: tuple[int, int], *
     return 4 * (windows + pooled + max(levels + 2 * pooled, pooled + 5 * chunk))
 
 
-def _windows(grid: torch.Tensor) -> torch.Tensor:
+def unit_windows(grid: torch.Tensor) -> torch.Tensor:
     """(h + 1, w + 1, 16 C) unit descriptors of the windows around every cell corner, zero outside the grid."""
     padded = torch.nn.functional.pad(grid, (0, 0, *[PATCH // 2] * 4))
     windows = padded.unfold(0, PATCH, 1).unfold(1, PATCH, 1).permute(0, 1, 3, 4, 2).flatten(2)
     return windows.div_(windows.norm(dim=2, keepdim=True).clamp_min(1e-12))
 
 
-def atomic_maps(left: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
-    """Correlation (gy, gx, h + 1, w + 1) of every atomic patch of a grid (H, W, C) with every place of another (h, w, C)."""
-    return _correlation_maps(unit_patches(left), _windows(right))
-
-
-def _correlation_maps(patches: torch.Tensor, windows: torch.Tensor) -> torch.Tensor:
+def correlation_maps(patches: torch.Tensor, windows: torch.Tensor) -> torch.Tensor:
     """Cosines (ry, rx, n_y, n_x) of atomic patches (ry, rx, 16 C) and windows (n_y, n_x, 16 C).
 
     At the border only the part of the patch that falls inside the image counts.
@@ -68,14 +63,14 @@ def _match_grids(left: torch.Tensor, right: torch.Tensor) -> tuple[torch.Tensor,
     """Best corner (gy, gx, 2) (x, y) of each patch of two descriptor grids, its score and peak ratio (gy, gx), and
     whether no other patch fits the same place of the right grid better (gy, gx).
     """
-    patches, windows = unit_patches(left), _windows(right)
+    patches, windows = unit_patches(left), unit_windows(right)
     (gy, gx), (n_y, n_x) = patches.shape[:2], windows.shape[:2]
 
     def chunks() -> Iterator[tuple[slice, torch.Tensor]]:
         step = max(1, CHUNK_BYTES // (gx * n_y * n_x * 4))
         for first in range(0, gy, step):
             part = slice(first, first + step)
-            yield part, _correlation_maps(patches[part], windows)
+            yield part, correlation_maps(patches[part], windows)
 
     pooled = patches.new_empty(gy, gx, (n_y + 1) // 2, (n_x + 1) // 2)
     for part, maps in chunks():

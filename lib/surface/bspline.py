@@ -30,7 +30,6 @@ class SurfaceFit:
         reject_mm: Bound on the L1 norm of a point's residual that was applied, after the first fit.
         inliers: (n,) points that the final fit used.
         residual_mm: (n, 3) Psi(u) - x of every given point at the final surface; NaN where u lies outside.
-        iterations: Newton steps of the final solve.
         held_out: (m, 2) candidates of the smoothness and their mean held-out L1 error (mm); (0, 2) where it was given.
         axes: (k, 3) orthonormal directions along which the L1 norm was taken: the axes of the frame for the plain fit.
         problem, penalty, weights, residual: What was solved last, over the inliers: the points on their grid, mu (k,)
@@ -43,7 +42,6 @@ class SurfaceFit:
     reject_mm: float
     inliers: np.ndarray
     residual_mm: np.ndarray
-    iterations: int
     held_out: np.ndarray
     axes: np.ndarray
     problem: L1Problem = field(repr=False)

@@ -119,7 +119,7 @@ def fit_surface(
     fit = SurfaceFit(
         objective=float(solution.objective.sum()), duality_gap=float(solution.duality_gap.sum()),
         smoothness=float(smoothness), reject_mm=float(reject_mm), inliers=inliers, residual_mm=residuals(surface),
-        iterations=solution.iterations, held_out=held_out, axes=axes, problem=problem, penalty=mu, weights=norms[inliers],
+        held_out=held_out, axes=axes, problem=problem, penalty=mu, weights=norms[inliers],
         residual=problem.design @ solution.coefficients - values[inliers],
     )  # fmt: skip
     return BSplineSurface(grid, surface.control_points_mm, fit)

@@ -105,14 +105,12 @@ class L1Solution:
         objective: (k,) the sum above at c.
         duality_gap: (k,) bound on how far the objective lies above the minimum, from a dual feasible point.
         dual: y (n, k), |y_i| <= w_i: the pull of each point on the surface.
-        iterations: Newton steps taken.
     """
 
     coefficients: np.ndarray
     objective: np.ndarray
     duality_gap: np.ndarray
     dual: np.ndarray
-    iterations: int
 
 
 def interior_point(
@@ -139,16 +137,16 @@ def interior_point(
     # Narrow bands gain nothing from more threads, and where cores are busy these wait for each other.
     with _blas().limit(limits=1, user_api="blas"):
         outputs = [_interior_point(by_cells, *column, tolerance, max_iterations) for column in columns]
-    coefficients, objective, gap, dual, iterations = zip(*outputs, strict=True)
+    coefficients, objective, gap, dual = zip(*outputs, strict=True)
     unsorted = np.empty_like(x)
     unsorted[order] = np.stack(dual, axis=1)
-    return L1Solution(np.stack(coefficients, 1), np.array(objective), np.array(gap), unsorted, max(iterations))
+    return L1Solution(np.stack(coefficients, 1), np.array(objective), np.array(gap), unsorted)
 
 
 def _interior_point(
     problem: L1Problem, x: np.ndarray, mu: float, w: np.ndarray, tolerance: float, max_iterations: int
-) -> tuple[np.ndarray, float, float, np.ndarray, int]:
-    """One output: (coefficients, objective, gap, dual, iterations)."""
+) -> tuple[np.ndarray, float, float, np.ndarray]:
+    """One output: (coefficients, objective, gap, dual)."""
     B, B_T, R = problem.design, problem.design_T, problem.bending
     total = w.sum()
     centre = w @ x / total
@@ -227,7 +225,7 @@ def _interior_point(
         slack_p, slack_q = slack_p - alpha * dy, slack_q + alpha * dy
         dual_residual *= 1.0 - alpha
 
-    return c * scale + centre, objective * scale, gap * scale, y, iteration
+    return c * scale + centre, objective * scale, gap * scale, y
 
 
 _blas = cache(ThreadpoolController)

@@ -20,7 +20,8 @@ from scipy.spatial import KDTree
 
 from lib.cameras import StereoRig
 from lib.matching import Matches
-from lib.matching.pyramid import PATCH
+from lib.matching.deepmatching import correlation_maps, unit_windows
+from lib.matching.pyramid import PATCH, unit_patches
 from lib.surface import BSplineSurface, Mesh, ToolDistance
 from lib.workbench.results import Table
 from notebooks.figures.interactive import explore
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from notebooks.studies.surface_evaluation import Case
 
 __all__ = [
+    "atomic_maps",
     "case_table",
     "cases",
     "descriptor_channels",
@@ -645,6 +647,11 @@ def case_table(found: Sequence[Case], caption: str) -> HTML:
             ]
         )
     return table(header, rows, caption)
+
+
+def atomic_maps(left: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
+    """Correlation (gy, gx, h + 1, w + 1) of every atomic patch of a grid (H, W, C) with every place of another (h, w, C)."""
+    return correlation_maps(unit_patches(left), unit_windows(right))
 
 
 def vertex_colours(mesh: Mesh) -> np.ndarray:

@@ -31,7 +31,7 @@ def cvxpy_reference(
     centre = np.average(x, axis=0, weights=w[:, 0])
     unit = np.maximum(np.abs(x - centre).max(axis=0), np.finfo(float).tiny)
     coefficients, dual = np.empty((problem.grid.size, k)), np.empty((n, k))
-    iterations, seconds = 0, 0.0
+    seconds = 0.0
     settings = {
         "CLARABEL": {"tol_gap_rel": tolerance, "tol_gap_abs": tolerance, "tol_feas": min(1e-8, tolerance)},
         "OSQP": {"eps_abs": tolerance, "eps_rel": tolerance, "max_iter": 100_000},
@@ -45,11 +45,10 @@ def cvxpy_reference(
         if c.value is None:
             raise ValueError(f"smoothness: {solver} found no solution ({model.status}); increase it.")
         coefficients[:, j], dual[:, j] = c.value * unit[j] + centre[j], split.dual_value
-        iterations = max(iterations, model.solver_stats.num_iters or 0)
         seconds += model.solver_stats.solve_time or 0.0
     fitted = problem.design @ coefficients - x
     objective = (w * np.abs(fitted)).sum(axis=0) + mu * (coefficients * (problem.bending @ coefficients)).sum(axis=0)
-    return L1Solution(coefficients, objective, np.full(k, np.nan), dual, iterations), seconds
+    return L1Solution(coefficients, objective, np.full(k, np.nan), dual), seconds
 
 
 def least_squares(problem: L1Problem, x: np.ndarray, mu: float | np.ndarray, w: np.ndarray) -> L1Solution:
@@ -67,4 +66,4 @@ def least_squares(problem: L1Problem, x: np.ndarray, mu: float | np.ndarray, w: 
     residual = problem.design @ coefficients - x
     energy = (coefficients * (problem.bending @ coefficients)).sum(axis=0)
     objective = ((w * residual) ** 2).sum(axis=0) + mu * energy
-    return L1Solution(coefficients, objective, np.zeros(k), 2 * w**2 * residual, 1)
+    return L1Solution(coefficients, objective, np.zeros(k), 2 * w**2 * residual)

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lib.adapt import RefusalError, adapt, labels_only, loop, report, teach
+from lib.adapt import RefusalError, adapt, loop, report, teach
 from lib.adapt.judging import Agreement, better
 from lib.adapt.teacher import look, stretches
 from lib.landmarks import Detector, Landmarks
@@ -332,8 +332,7 @@ def test_exit_codes_and_files(world, recording, tmp_path, monkeypatch, capsys):
     assert "weights.safetensors in this folder is of an earlier run" in capsys.readouterr().out
 
 
-def test_labels_of_one_camera_do_without_a_robot(world, recording, tmp_path, monkeypatch):
-    monkeypatch.setattr(labels_only, "simulated_like", lambda *_: [])
+def test_labels_of_one_camera_do_without_a_robot(world, recording, tmp_path):
     u = np.where(np.arange(world.n)[:, None, None, None] % 2, np.nan, world.u)
     write_coco(tmp_path / "labels.json", Annotations(u[:, 0], np.full_like(u[:, 1], np.nan)), SIZE, ".png")
     tune, folders = pupil(world), []
@@ -343,14 +342,14 @@ def test_labels_of_one_camera_do_without_a_robot(world, recording, tmp_path, mon
         return tune(detector, [one._replace(name=f"left {int(one.name[5:11])}") for one in images], held_out, folder, **how)
 
     how = {"detector": StandIn(world.u, wrong=0.5), "folder": tmp_path, "progress": False, "tune": tuned}
-    found = labels_only.adapt_images(recording.folder, tmp_path / "labels.json", **how)
+    found = loop.adapt_images(recording.folder, tmp_path / "labels.json", **how)
     write_coco(tmp_path / "labels.json", Annotations(u[:, 0] + 0.5, np.full_like(u[:, 1], np.nan)), SIZE, ".png")
-    labels_only.adapt_images(recording.folder, tmp_path / "labels.json", **how)
+    loop.adapt_images(recording.folder, tmp_path / "labels.json", **how)
     assert folders[0] != folders[1]  # a training with other labels is no training to resume
     assert found.improved and found.calibration is None
     assert sum(found.report["frames"].values()) == 20 and found.report["judged"]["after"]["median_px"] < 0.5
     with pytest.raises(ValueError, match="at least 10"):
-        labels_only.adapt_images(recording.folder, _few(tmp_path), StandIn(world.u), folder=tmp_path, tune=tune)
+        loop.adapt_images(recording.folder, _few(tmp_path), StandIn(world.u), folder=tmp_path, tune=tune)
 
 
 def _few(folder):

@@ -12,11 +12,10 @@ import pytest
 import torch
 
 from lib.matching import match
-from lib.matching.deepmatching import atomic_maps
 from lib.matching.descriptors import pixel_descriptors
 from lib.matching.pyramid import POWER, gather, n_levels, path_scores, pool, unpool
 from lib.paths import ROOT
-from notebooks.figures.reconstruction import response_map
+from notebooks.figures.reconstruction import atomic_maps, response_map
 
 
 def slow_scores(left: np.ndarray, right: np.ndarray, levels: int) -> dict[tuple[int, int, int, int], float]:
