@@ -27,8 +27,6 @@ from lib.surface import depth_map, reconstruct, save_depth_map, save_mesh, save_
 from lib.trust import LEVELS, Assessment, Reason, Verdict, assess, report
 from lib.trust.verdict import LIMITS
 
-__all__ = ["main_annotate", "main_calibrate", "main_detect", "main_import", "main_reconstruct", "main_register"]
-
 #: Fewer landmarks are fitted too well by cameras of their own to be compared with; errors below this say nothing.
 _FEWEST, _EXACT_PX = 24, 0.5
 

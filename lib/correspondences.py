@@ -13,11 +13,6 @@ from numpy.typing import ArrayLike
 
 from lib.geometry import pair_covariance, points
 
-__all__ = [
-    "LANDMARKS", "LANDMARK_COLOURS", "MIN_CONFIDENCE", "TRAIN_FURTHER", "Correspondences", "NoDetectionError", "of_recording",
-    "pair_with_robot",
-]  # fmt: skip
-
 #: The landmarks of the forceps, in the order of every array.
 LANDMARKS = ("base", "tip_1", "tip_2")
 #: RGB of each landmark in every picture (Okabe and Ito 2008, told apart by all eyes).

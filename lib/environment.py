@@ -23,8 +23,6 @@ from pathlib import Path
 
 from lib.files import write_text
 
-__all__ = ["Problem", "ensure", "lock", "manifest", "python_of"]
-
 ROOT = Path(__file__).resolve().parent.parent
 TORCH_BUILDS = ("cpu", "cuda")
 _STAMP = "microstereo.json"

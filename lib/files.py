@@ -9,8 +9,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-__all__ = ["digest", "whole", "write_bytes", "write_json", "write_text"]
-
 
 @contextmanager
 def whole(path: str | Path) -> Iterator[Path]:

@@ -12,11 +12,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-__all__ = [
-    "RigidTransform", "align_rotation", "cell_from_image", "finite_points", "image_from_cell", "pair_covariance", "points",
-    "precision", "view_distances2",
-]  # fmt: skip
-
 
 def points(values: ArrayLike, dimension: int, name: str) -> np.ndarray:
     """`values` as a float64 array (n, dimension); NaN passes.

@@ -9,8 +9,6 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["Minimum", "inverse", "minimise"]
-
 
 def inverse(information: np.ndarray) -> np.ndarray:
     """Covariance (p, p) from the information of parameters whose units may differ widely.

@@ -12,8 +12,6 @@ from pathlib import Path
 
 from tqdm.auto import tqdm
 
-__all__ = ["cores", "run_jobs", "single_threaded_torch", "step"]
-
 _STEPS = "microstereo-steps"
 #: A scheduler must answer within these seconds.
 ANSWER_S = 15.0

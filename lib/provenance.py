@@ -13,9 +13,6 @@ import numpy as np
 from lib import files, paths
 from lib.parallel import cores
 
-__all__ = ["Provenance", "commit", "commit_id", "machine", "plain"]
-
-
 #: What decides a result: these files of the repository, and not the results that are being written.
 _CODE = ("lib", "notebooks", "tests", "environment.toml")
 

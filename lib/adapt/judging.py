@@ -9,8 +9,6 @@ from lib.landmarks.metrics import tool_length_px
 from lib.recordings import Recording
 from lib.trust.health import affine_epipolar, feature_matches
 
-__all__ = ["Agreement", "agreement", "better", "epipolar_geometry", "epipolar_px", "frame_means"]
-
 #: Distances count up to this share of the tool's length, and so does a landmark that is missing.
 _CAP = 0.1
 _FEWEST = 60  # features of the eye, below which the detections' own geometry has to do

@@ -25,8 +25,6 @@ from lib.training.samples import LabelledImage
 from lib.training.shards import generate, validation_images
 from lib.training.stages import finetune
 
-__all__ = ["RECIPE", "STEPS", "Adaptation", "adapt", "adapt_images", "simulated_like"]
-
 #: Most rounds of training, and most steps of a stage in one; the time ends most trainings.
 ROUNDS, STEPS = 3, 4000
 RECIPE = 3  # raised where teaching or training changes: what an older one kept is not gone on with

@@ -13,8 +13,6 @@ from lib.landmarks import Detector
 from lib.recordings import Recording
 from lib.trust.check import data_uri, overlay
 
-__all__ = ["main", "write"]
-
 _NUMBERS = {
     "median_px": "median distance from the robot, px",
     "median_sigmas": "the same in stated standard deviations (1.2 is right)",

@@ -21,8 +21,6 @@ from lib.recordings.annotations import CLICK_SD_PX, inside
 from lib.trust import LEVELS, Hypothesis, diagnose, judge
 from lib.trust.fitting import Problem
 
-__all__ = ["RefusalError", "Seen", "Teacher", "longest_still", "look", "stretches", "teach"]
-
 #: Least share of the landmarks that must agree on the cameras, fewest in number, and the share that needs no other try.
 LEAST_RIGHT, _FEWEST_RIGHT, _CLEAR = 0.1, 30, 0.3
 #: Faults after which the robot is no teacher, and the least share of the residuals that they must explain.

@@ -15,10 +15,6 @@ from scipy.optimize import nnls
 from lib.calibration.checks import check_spread, stacked_rows
 from lib.cameras import AffineCamera
 
-__all__ = [
-    "AffineMinimum", "affine_minimum", "dlt", "estimate_noise", "noise_rms_px", "paper_variances", "regress",
-]  # fmt: skip
-
 
 def dlt(x_mm: ArrayLike, u: ArrayLike) -> AffineCamera:
     """Affine direct linear transform of one camera: least squares of u = M [x; 1] (paper Eq. 4).

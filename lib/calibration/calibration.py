@@ -12,8 +12,6 @@ from lib.cameras import AffineCamera, Camera, Points, Resection, StereoRig
 from lib.correspondences import Correspondences
 from lib.geometry import points, precision
 
-__all__ = ["Calibration", "LandmarkOffsets"]
-
 
 @dataclass(frozen=True, eq=False)
 class LandmarkOffsets:

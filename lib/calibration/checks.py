@@ -8,11 +8,6 @@ from scipy.special import chndtrix
 
 from lib.geometry import finite_points
 
-__all__ = [
-    "check_duplicates", "check_images", "check_order", "check_spread", "check_units", "extents", "eyes_exchanged",
-    "sides", "stacked_rows",
-]  # fmt: skip
-
 #: Zoom (px per mm) between a room camera and the resolution of light; what lies outside has the wrong unit.
 PLAUSIBLE_PX_PER_MM = (0.2, 5000.0)
 #: The robot accuracy assumed where none is given (the paper's), for judging whether points are coplanar.

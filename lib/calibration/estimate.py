@@ -19,8 +19,6 @@ from lib.correspondences import Correspondences
 from lib.geometry import pair_covariance, precision, view_distances2
 from lib.least_squares import inverse
 
-__all__ = ["calibrate"]
-
 #: Fewest rows with the tool's axes from which offsets are estimated unasked.
 _OFFSET_ROWS = 24
 #: Axes turn where offsets as large are so improbable without any, and if that moves landmarks by more than this.

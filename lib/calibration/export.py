@@ -10,8 +10,6 @@ import numpy as np
 from lib.cameras import Camera
 from lib.files import whole, write_text
 
-__all__ = ["write_opencv", "write_ros"]
-
 
 def write_opencv(camera: Camera, path: str | Path, image_size_px: tuple[int, int]) -> None:
     """A file for `cv2.FileStorage`; its suffix, .yml, .yaml, .xml or .json, says the format (another is a ValueError).

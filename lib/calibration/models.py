@@ -26,8 +26,6 @@ from lib.cameras import AffineCamera, Camera, NearAffineCamera, normal_to, radia
 from lib.geometry import precision
 from lib.least_squares import minimise
 
-__all__ = ["Fit", "Model", "State", "fit"]
-
 BASES = ("affine", "zero_skew", "square", "common_zoom")
 OPTIONS = ("distance", "distances", "radial")
 

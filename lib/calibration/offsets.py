@@ -18,8 +18,6 @@ from lib.calibration.calibration import Calibration, LandmarkOffsets
 from lib.calibration.scatter import sandwich
 from lib.correspondences import Correspondences
 
-__all__ = ["estimate_offsets", "rows_axes", "tool_axes", "with_offsets"]
-
 
 def tool_axes(x_mm: ArrayLike, offset_mm: np.ndarray | None = None) -> np.ndarray:
     """Axes R (n, 3, 3) of a forceps from its landmarks (n, 3, 3) mm: columns along it, from tip to tip, and their normal.

@@ -9,8 +9,6 @@ from lib.correspondences import Correspondences
 from lib.geometry import precision, view_distances2
 from lib.least_squares import inverse
 
-__all__ = ["OnlineCalibration"]
-
 
 class OnlineCalibration:
     """A calibration's minimum, moved by all rows that came since: an extended Kalman filter of the model's parameters.

@@ -7,8 +7,6 @@ import numpy as np
 from lib.calibration.calibration import Calibration
 from lib.geometry import RigidTransform
 
-__all__ = ["Optics", "optics"]
-
 
 @dataclass(frozen=True, eq=False)
 class Optics:

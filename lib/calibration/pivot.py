@@ -11,8 +11,6 @@ from lib.calibration.affine import regress
 from lib.cameras import AffineCamera
 from lib.geometry import RigidTransform
 
-__all__ = ["Pivot", "Tool", "ToolOffsets", "pivot_calibration", "tool_offsets"]
-
 _TURN = 0.02  # least RMS turn (rad) about a second axis: 10 um of the robot's noise then leave 0.5 mm / sqrt(poses)
 _OPENING = 0.03  # least range of half the opening (rad): 100 um at the end of a jaw of 3 mm
 _LARGEST_SD_MM = 1.0  # of an offset's coordinate; beyond it the motion determines nothing

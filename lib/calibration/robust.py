@@ -15,8 +15,6 @@ from scipy.special import fdtri, gammainccinv
 
 from lib.calibration.affine import regress
 
-__all__ = ["NoConsensusError", "consensus", "gate", "tightest_sample"]
-
 FALSE_ALARM = 1e-4
 _SAMPLES = (100, 300, 1000)  # tried one after another, until right ones are among them
 _ROWS_RANKED = 300

@@ -11,8 +11,6 @@ from scipy.special import chdtri, fdtri
 
 from lib.least_squares import inverse
 
-__all__ = ["sandwich"]
-
 _CORRELATIONS = np.array([0.0, 0.2, 0.4, 0.55, 0.7, 0.8, 0.88, 0.94, 0.97])
 _NONE = 0.5  # prior probability that the errors are independent
 

@@ -14,8 +14,6 @@ from lib.correspondences import Correspondences
 from lib.geometry import precision
 from lib.recordings import Kinematics
 
-__all__ = ["Paths", "TimeOffset", "estimate_time_offset", "shift_misfits"]
-
 _GRID = 41  # trial offsets of the coarse search
 #: Of landmarks that a detector sees with an error of the tool's own: how much deeper than the median trial each camera's
 #: misfit must be, and the largest residual, as a share of the pixels' extent.

@@ -13,8 +13,6 @@ from numpy.typing import ArrayLike
 
 from lib.geometry import RigidTransform, points
 
-__all__ = ["AffineCamera", "Camera", "MatrixCamera", "Resection", "normal_to"]
-
 
 @dataclass(frozen=True)
 class Resection:

@@ -9,8 +9,6 @@ from numpy.typing import ArrayLike
 from lib.cameras.affine import AffineCamera, MatrixCamera
 from lib.geometry import RigidTransform, points
 
-__all__ = ["NearAffineCamera", "radial_derivative"]
-
 
 @dataclass(frozen=True, eq=False)
 class NearAffineCamera(MatrixCamera):

@@ -19,8 +19,6 @@ from lib.cameras.near_affine import NearAffineCamera
 from lib.files import write_json
 from lib.geometry import RigidTransform, pair_covariance, points
 
-__all__ = ["Points", "StereoRig"]
-
 FORMAT = "microstereo.stereo_rig"
 UNITS = {"point": "mm", "image": "px"}
 _Pair = tuple[MatrixCamera, MatrixCamera]

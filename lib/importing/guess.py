@@ -17,8 +17,6 @@ from lib.importing.logs import topics_of
 from lib.importing.video import IMAGES, VIDEOS, last_number
 from lib.recordings.tables import decoded, toml
 
-__all__ = ["guess_mapping"]
-
 _TIME = re.compile(r"(?i)^(t|sec|secs|s|ms|us|ns)$|time|stamp|^t[_ \[(]")
 _AXIS = re.compile(r"(?i)^(.*?)[ _.\-]?([xyz])[ _]?[\[(]?(mm|um|m)?[\])]?$")
 _UNIT = re.compile(r"(?i)(?:^|[ _\[(])(ns|us|ms|s)[\])]?$")

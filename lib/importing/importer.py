@@ -18,8 +18,6 @@ from lib.importing.video import StereoSource, open_stereo
 from lib.landmarks import SharedDetector, detect
 from lib.recordings import Annotations, Recording, RecordingWriter
 
-__all__ = ["import_recording"]
-
 _LOG_STEP_S = 2e-5, 3.0  # of a robot's samples; beyond it the unit of time is another
 _CLOCK_FRAMES = 60  # that the detector looks at where there are no labels
 

@@ -17,8 +17,6 @@ from lib.recordings import Annotations
 from lib.recordings.annotations import coco_keypoints, inside
 from lib.recordings.tables import decoded, rows_of
 
-__all__ = ["Label", "labels_of", "read_labels"]
-
 _LARGEST_BYTES = 1 << 29  # of a label file; a zip of a few kB may claim any size
 
 

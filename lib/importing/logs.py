@@ -14,8 +14,6 @@ from scipy.spatial.transform import Rotation
 from lib.importing.mapping import Mapping, Pose, Table
 from lib.recordings.tables import decoded, number, rows_of
 
-__all__ = ["RobotLog", "exact_seconds", "increasing", "read_columns", "read_robot", "since", "topics_of", "zero_of"]
-
 _SECONDS = {"s": Decimal(1), "ms": Decimal("1e-3"), "us": Decimal("1e-6"), "ns": Decimal("1e-9")}
 _MILLIMETRES = {"m": 1e3, "mm": 1.0, "um": 1e-3}
 _EMPTY = {"nan", "NaN", "NAN", "null", "None", "NA"}

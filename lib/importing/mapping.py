@@ -8,8 +8,6 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from lib.correspondences import LANDMARKS
 from lib.recordings.tables import read_toml
 
-__all__ = ["Labels", "Mapping", "Pose", "Robot", "Table", "Tool", "Video", "read_mapping"]
-
 Vector = tuple[float, float, float]
 Columns = tuple[str, str, str]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,31}$")]

@@ -14,8 +14,6 @@ from lib.importing.logs import exact_seconds, increasing, read_columns, since
 from lib.importing.mapping import Video
 from lib.recordings import read_image, to_8_bits
 
-__all__ = ["IMAGES", "VIDEOS", "StereoSource", "last_number", "open_stereo"]
-
 IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".mpg", ".mpeg", ".webm", ".wmv", ".ts")
 _STEP_S = 1e-4, 60.0  # of frames; beyond it the unit of time is another

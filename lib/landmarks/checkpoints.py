@@ -11,8 +11,6 @@ from torch import Tensor, uint8
 from lib import files
 from lib.landmarks.network import HourglassConfig, Network, OffsetConfig, network_of
 
-__all__ = ["checksum", "load_network", "read_checkpoint", "write_checkpoint"]
-
 _CURE = "get the file again, or train one with `python3 -m lib train`."
 
 

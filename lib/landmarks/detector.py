@@ -34,8 +34,6 @@ from lib.landmarks.search import PEAKS, best_tools, without_peak
 from lib.parallel import single_threaded_torch
 from lib.recordings import Recording
 
-__all__ = ["CLOSE", "MISSING_BELOW", "TRACKED_FROM", "Detector", "Landmarks", "detect"]
-
 FORMAT = "microstereo.detector"
 #: The fields that a weights file keeps as plain values.
 _SETTINGS = ("frame_px", "window_px", "mirror", "method", "closeup_from")

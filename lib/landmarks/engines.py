@@ -22,8 +22,6 @@ from lib import files, paths
 from lib.landmarks.checkpoints import checksum
 from lib.landmarks.network import Network
 
-__all__ = ["ENGINES", "LastOutput", "OpenVinoNetwork", "accelerated", "default_engine", "openvino"]
-
 #: ``"openvino"`` computes in the fastest precision that the processor has.
 ENGINES = ("torch", "openvino", "openvino float32")
 #: How many images are run at once; fewer are filled up to the next of these.

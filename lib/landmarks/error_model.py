@@ -10,8 +10,6 @@ from torch import Tensor
 from lib.landmarks.heatmaps import Peaks
 from lib.landmarks.windows import CLOSEUP_REACH_PX, CLOSEUP_ZOOM, expected_in_closeup
 
-__all__ = ["FEATURES", "ErrorModel", "Rough", "closeup_peaks", "corrected", "covariance_and_confidence", "features_of"]
-
 #: How many features a peak has.
 FEATURES = 9
 #: Jaws look shut where the tips are nearer to each other than about this share of the tool's length.

@@ -28,8 +28,6 @@ from lib.landmarks.network import as_tensor
 from lib.landmarks.windows import map_points
 from lib.recordings import Recording
 
-__all__ = ["LARGEST", "StageWithDecoding", "export", "run_onnx"]
-
 #: Largest differences from torch that an exported stage may show, by unit.
 LARGEST = {"px": 0.01, "of variance": 0.02, "of confidence": 0.001}
 

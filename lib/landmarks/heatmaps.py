@@ -10,8 +10,6 @@ from typing import Self
 import torch
 from torch import Tensor
 
-__all__ = ["DECODERS", "SIGMA_PX", "Peaks", "decode", "render", "sigma_cells"]
-
 #: Standard deviation of the targets (paper Sec. V-B), px of the network's input.
 SIGMA_PX = 5.0
 #: The methods of `decode`.  Three more are compared in notebook 02 (`notebooks/studies/decoders.py`).

@@ -6,8 +6,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import chdtri
 
-__all__ = ["GROSS_PX", "PCK_THRESHOLDS", "Scores", "calibration_error", "errors_px", "nees", "pck", "reliability", "score"]
-
 #: The paper's range of thresholds, as parts of the tool's length.
 PCK_THRESHOLDS = np.linspace(0.001, 0.2, 200)
 #: A larger error is gross: no covariance means to explain it.

@@ -21,10 +21,6 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from lib.correspondences import LANDMARKS
 
-__all__ = [
-    "HourglassConfig", "Network", "OffsetConfig", "OffsetNetwork", "StackedHourglass", "as_tensor", "as_uint8", "network_of",
-]  # fmt: skip
-
 STEM_STRIDE = 4
 
 

@@ -7,8 +7,6 @@ import torch
 
 from lib.landmarks.heatmaps import SIGMA_PX, sigma_cells
 
-__all__ = ["PEAKS", "best_tools", "without_peak"]
-
 #: Peaks that are taken from each heatmap.
 PEAKS = 4
 #: Two tools are the same if their landmarks differ by less than this share of the length, in the mean.

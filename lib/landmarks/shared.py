@@ -12,8 +12,6 @@ import numpy as np
 from lib import files, paths
 from lib.landmarks.detector import Detector, Landmarks
 
-__all__ = ["SharedDetector"]
-
 
 class SharedDetector:
     """A detector for `detect` and `assess` that reads what another notebook of the same run has found in the same images.

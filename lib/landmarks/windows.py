@@ -10,11 +10,6 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-__all__ = [
-    "CLOSEUP_BEHIND_PX", "CLOSEUP_REACH_PX", "CLOSEUP_ZOOM", "TOOL_PX", "closeup_from_image", "closeup_scale", "cut",
-    "expected_in_closeup", "map_points", "tool_pose", "tool_zoom", "window_from_image",
-]  # fmt: skip
-
 #: Side of the tool's window, and the tool's length in it.
 TOOL_PX, _TOOL_LENGTH_PX = 128, 56.0
 #: Closeups of tools of these lengths, in image pixels, have one scale, which uses all of the image's resolution.

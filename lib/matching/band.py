@@ -24,8 +24,6 @@ from lib.matching.result import SIGMA_LEFT_PX, Matches
 from lib.matching.volume import VolumeMatches, correlation_volume, match_volume, predicted_bytes
 from lib.parallel import single_threaded_torch
 
-__all__ = ["MAX_PIXELS", "Search", "match_band", "plan_search", "refine"]
-
 Images = tuple[np.ndarray, np.ndarray]
 Masks = tuple[np.ndarray | None, np.ndarray | None]
 #: The setting of a search, the depth range in mm (None = found), and the largest misfit of the rig in px: see `match`.

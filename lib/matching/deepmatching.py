@@ -13,8 +13,6 @@ from lib.matching.descriptors import CHANNELS, patch_quality, pixel_descriptors
 from lib.matching.pyramid import PATCH, POWER, n_levels, path_scores, peak_ratio, pool, unit_patches, unpool
 from lib.matching.result import SIGMA_LEFT_PX, Matches
 
-__all__ = ["correlation_maps", "match_free", "predicted_bytes", "unit_windows"]
-
 #: Bytes of the full maps of atomic patches that are held at once.
 CHUNK_BYTES = 32 << 20
 

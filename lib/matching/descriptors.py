@@ -10,8 +10,6 @@ from numpy.typing import ArrayLike
 
 from lib.matching.pyramid import PATCH
 
-__all__ = ["CHANNELS", "MIN_SEEN", "as_gray", "patch_quality", "pixel_descriptors"]
-
 #: Eight orientations and one constant, which keeps flat patches from matching noise.
 CHANNELS = 9
 

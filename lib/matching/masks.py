@@ -4,8 +4,6 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-__all__ = ["checked_mask", "glint_mask", "tool_mask"]
-
 
 def glint_mask(image: ArrayLike, *, level: int = 245, grow_px: int = 5) -> np.ndarray:
     """Specular reflections: pixels whose every channel is nearly saturated, grown by a margin.

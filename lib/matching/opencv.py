@@ -16,8 +16,6 @@ from lib.matching.result import SIGMA_LEFT_PX, Matches
 from lib.matching.volume import correlation_volume
 from lib.parallel import single_threaded_torch
 
-__all__ = ["match_with"]
-
 #: Matches are taken on this lattice, as DeepMatching's are at full resolution.
 LATTICE_PX = PATCH * CELL_PX
 #: Standard deviation of a disparity in canvas px (1.48 times the median error, between that on simulated eyes and on

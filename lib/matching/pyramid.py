@@ -20,8 +20,6 @@ import numpy as np
 import torch
 from torch.nn.functional import max_pool1d, pad
 
-__all__ = ["PATCH", "POWER", "gather", "n_levels", "path_scores", "peak_ratio", "pool", "unit_patches", "unpool"]
-
 PATCH = 4
 POWER = 1.4
 BORDER_POWER = 0.9

@@ -13,8 +13,6 @@ import numpy as np
 
 from lib.cameras import AffineCamera, StereoRig
 
-__all__ = ["RECTIFIED", "Rectification", "rectify", "warp"]
-
 #: The rig of an already rectified pair: x = (x_left, y, disparity) px instead of mm, u_right = (x - disparity, y).
 #: Depth is then disparity (nearer is larger), so `depth_range_mm` is the range of disparity in px.
 RECTIFIED = StereoRig(AffineCamera([[1, 0, 0, 0], [0, 1, 0, 0]]), AffineCamera([[1, 0, -1, 0], [0, 1, 0, 0]]))

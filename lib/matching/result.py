@@ -5,8 +5,6 @@ from typing import Self
 
 import numpy as np
 
-__all__ = ["SIGMA_LEFT_PX", "Matches"]
-
 #: Standard deviation of `u_left`: the point is chosen, not measured, but a patch has no sharper centre than this.
 SIGMA_LEFT_PX = 0.05
 

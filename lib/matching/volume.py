@@ -13,8 +13,6 @@ import torch
 
 from lib.matching.pyramid import PATCH, POWER, n_levels, path_scores, pool, unit_patches, unpool
 
-__all__ = ["VolumeMatches", "correlation_volume", "match_volume", "predicted_bytes"]
-
 #: Lattice rows that are worked on at once: they stay in the cache.
 ROWS = 8
 

@@ -11,8 +11,6 @@ from lib.cameras import AffineCamera, StereoRig
 from lib.correspondences import Correspondences
 from lib.registration import MovedCameras, identify_motion
 
-__all__ = ["CONVINCING", "Explanation", "explain", "misfit"]
-
 #: Rows that a rig explains lose about 5.1 each, 8 log(1 + chi^2 / 4), with 1.7 times the noise 10.
 CONVINCING = 10.0
 _LATEST = 25  # frames by which a report may be late

@@ -5,8 +5,6 @@ import numpy as np
 
 from lib.correspondences import Correspondences
 
-__all__ = ["FrameChecks"]
-
 _STEP = 4  # every n-th pixel is compared; the noise of a sensor never repeats
 _DARK, _FLAT = 6.0, 1.5  # grey levels: an image that is darker on average, or varies less, shows nothing
 _REPEATED_PX = 0.3  # a detector finds the same landmarks in the same image within this

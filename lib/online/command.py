@@ -19,8 +19,6 @@ from lib.online.result import FrameResult, Settings
 from lib.online.video import Dashboard, video_file
 from lib.recordings import Recording
 
-__all__ = ["Tally", "main"]
-
 
 @dataclass
 class Tally:

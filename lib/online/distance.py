@@ -15,8 +15,6 @@ from lib.online.result import FrameResult, Settings
 from lib.online.tracker import RigTracker
 from lib.surface import Reconstruction
 
-__all__ = ["Surface", "TipDistance"]
-
 _WALK_MM = 0.005  # per square root of a second: how fast the correction may change
 _SMOOTH_S = 0.2  # over which the robot's velocity is averaged
 

@@ -14,8 +14,6 @@ from numpy.typing import ArrayLike
 from lib.correspondences import of_recording
 from lib.recordings import Recording
 
-__all__ = ["Arrival", "Live", "recorded"]
-
 _WAITING = 4  # frames at most, for a pause of the machine; when another comes, the oldest is lost
 
 

@@ -26,8 +26,6 @@ from lib.online.surface_worker import Beside, SurfaceJob, make
 from lib.online.tracker import RigTracker, Seen
 from lib.surface import Reconstruction, reconstruct
 
-__all__ = ["OnlinePipeline"]
-
 _DEPTH_MARGIN_MM = 0.5  # how far an eye may move along the view from one surface to the next
 
 

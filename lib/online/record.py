@@ -13,8 +13,6 @@ from lib.online.feeds import Arrival
 from lib.online.result import STAGES, FrameResult
 from lib.recordings import Recording
 
-__all__ = ["Recorder"]
-
 _QUANTITIES = ("distance_mm", "distance_sd_mm", "normal_mm", "normal_sd_mm", "approach_mm_s", "too_close")
 
 

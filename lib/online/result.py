@@ -12,8 +12,6 @@ from lib.correspondences import LANDMARKS, Correspondences
 from lib.registration import MovedCameras
 from lib.surface import Reconstruction
 
-__all__ = ["STAGES", "STATES", "FrameResult", "Settings"]
-
 #: The stages whose seconds and failures a `FrameResult` names, in their order.
 STAGES = ("detect", "calibrate", "register", "match", "triangulate", "surface", "distance")
 

@@ -13,8 +13,6 @@ from lib.cameras import StereoRig
 from lib.online.distance import Surface
 from lib.surface import Reconstruction, reconstruct
 
-__all__ = ["Beside", "SurfaceJob", "make"]
-
 _PARTS_OF_MATCHING = {"mask": "match", "refine": "match"}
 
 

@@ -14,8 +14,6 @@ from lib.online.result import FrameResult, Settings
 from lib.registration import DriftMonitor, MovedCameras
 from lib.trust import judge
 
-__all__ = ["RigTracker", "Seen"]
-
 _CHI2_4_MEDIAN = 3.357
 _STANDS_OUT = 8.0  # score of a single frame that is not to be believed
 _FAR_MM = 200.0  # of the robot's median position: no tool reaches that far

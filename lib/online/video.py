@@ -11,8 +11,6 @@ import numpy as np
 from lib.correspondences import LANDMARK_COLOURS, LANDMARKS
 from lib.online.result import STAGES, STATES, FrameResult
 
-__all__ = ["Dashboard", "video_file"]
-
 _SIZE = (1280, 720)
 _LIGHTS = dict(zip(STATES, ((120, 120, 120), (0, 170, 80), (90, 150, 230), (40, 40, 40), (240, 190, 60), (220, 60, 50)),
                    strict=True))  # fmt: skip

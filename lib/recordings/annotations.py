@@ -10,8 +10,6 @@ import numpy as np
 from lib.correspondences import LANDMARKS
 from lib.files import write_text
 
-__all__ = ["CLICK_SD_PX", "Annotations", "coco_keypoints", "inside", "mark_coco", "read_coco", "write_coco"]
-
 _SIDES = ("left", "right")
 #: Standard deviation of a label set by hand, along each axis.
 CLICK_SD_PX = 1.5

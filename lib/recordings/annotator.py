@@ -15,8 +15,6 @@ from lib.correspondences import Correspondences, of_recording
 from lib.recordings.annotations import inside, mark_coco, read_coco
 from lib.recordings.recording import Recording
 
-__all__ = ["Annotator"]
-
 _SIDES = ("left", "right")
 #: Depths of the viewing ray, mm about the tool, whose images make an epipolar line: a microscope's depth of field is 3 mm.
 _DEPTHS_MM = np.linspace(-20.0, 20.0, 9)

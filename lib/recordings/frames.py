@@ -10,8 +10,6 @@ import cv2
 import numpy as np
 from PIL import Image
 
-__all__ = ["Frames", "StereoFrame", "open_side", "read_image", "to_8_bits"]
-
 _SUFFIXES = (".jpg", ".jpeg", ".png")
 _LOST_BYTES = 512  # a disk sector: what a crash or a bad copy replaces by zeros
 

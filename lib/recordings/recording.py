@@ -18,8 +18,6 @@ from lib.recordings.frames import Frames, open_side
 from lib.recordings.tables import columns, read_table, read_toml, refuse
 from lib.recordings.truth import Truth
 
-__all__ = ["FORMAT", "UNITS", "Doubt", "Kinematics", "Recording", "kinematics_columns"]
-
 FORMAT = "microstereo.recording"
 #: A longer step between samples than this, and than ten usual ones, is a gap: nothing is interpolated in it.
 _GAP_S = 0.5

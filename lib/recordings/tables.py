@@ -14,8 +14,6 @@ import numpy as np
 from lib.correspondences import LANDMARKS
 from lib.files import write_text
 
-__all__ = ["columns", "decoded", "number", "read_table", "read_toml", "refuse", "rows_of", "toml", "write_table"]
-
 
 def columns(axes: Sequence[str], landmarks: Sequence[str] = LANDMARKS) -> list[str]:
     """Column names, landmark by landmark.

@@ -15,8 +15,6 @@ from lib.cameras import StereoRig
 from lib.geometry import points
 from lib.recordings.tables import columns, read_table, write_table
 
-__all__ = ["Truth"]
-
 _COLUMNS = ["frame", *columns(["x_mm", "y_mm", "z_mm"])]
 _COLUMNS += columns(["left_x_px", "left_y_px", "left_visibility", "right_x_px", "right_y_px", "right_visibility"])
 _GLINT_COLUMNS = columns(["left_in_glint", "right_in_glint"])  # optional, after the others

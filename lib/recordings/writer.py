@@ -19,8 +19,6 @@ from lib.recordings.annotations import Annotations, write_coco
 from lib.recordings.recording import FORMAT, UNITS, Recording, kinematics_columns
 from lib.recordings.tables import toml, write_table
 
-__all__ = ["RecordingWriter"]
-
 
 class RecordingWriter:
     """Context manager that writes a recording beside its final place and moves it there when it is valid.

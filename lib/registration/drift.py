@@ -9,8 +9,6 @@ from lib.cameras import StereoRig
 from lib.correspondences import Correspondences
 from lib.geometry import pair_covariance
 
-__all__ = ["DriftMonitor"]
-
 #: What is watched: the mean residual of a frame's landmarks along the directions of the images that lateral shifts move,
 #: along the one that a shift in depth moves, and across the epipolar lines; and their chi-square.
 AXES = ("lateral", "lateral", "lateral", "lateral", "depth", "epipolar", "scatter")

@@ -20,8 +20,6 @@ from lib.geometry import RigidTransform, pair_covariance, precision, view_distan
 from lib.least_squares import minimise
 from lib.registration.rigid import Registration, check_spread, motion_jacobian, register, sandwich
 
-__all__ = ["MovedCameras", "identify_motion", "register_images"]
-
 _FREEDOM = 4.0  # of the Student t that "robust" assumes: gross errors lose their weight, small ones keep it
 _BELIEVED = 20  # rows that the stated noise is worth, beside the scatter of the residuals, in the covariance
 _WRONG = 16.0  # chi-square of an image's two pixels that is no noise: once in 3,000

@@ -8,8 +8,6 @@ from numpy.typing import ArrayLike
 
 from lib.geometry import RigidTransform, align_rotation, finite_points, points
 
-__all__ = ["Registration", "check_spread", "motion_jacobian", "register", "sandwich"]
-
 _STARTS = 12  # minimal triples tried beside the least-squares start
 _ITERATIONS = 300
 

@@ -20,9 +20,6 @@ from lib.simulator.population import RESERVED_SEEDS, random_forceps, random_setu
 from lib.simulator.recording import Design, simulate
 from lib.simulator.rig import Microscope
 
-__all__ = ["TEST_SEQUENCES", "TRAIN_SEQUENCES", "main", "make_dataset", "rung_design", "seconds_a_pair", "sequence_design"]
-__all__ += ["sequence_name"]
-
 TRAIN_SEQUENCES, TEST_SEQUENCES = range(0, 7), range(7, 10)
 _SEQUENCES = (*TRAIN_SEQUENCES, *TEST_SEQUENCES)
 _MB_PER_PAIR = 0.62

@@ -11,8 +11,6 @@ import numpy as np
 from lib.simulator.limits import check
 from lib.simulator.texture import EXTENT_MM, GAMMA, fundus_texture, pattern, photograph_texture
 
-__all__ = ["Eye", "Ground", "Scene"]
-
 _FUNDUS_PX, _FILMS = 1024, 8
 
 

@@ -16,8 +16,6 @@ from lib.simulator.forceps import Finish, Instrument, Jaw, Pose
 from lib.simulator.lighting import Lighting, Patch
 from lib.simulator.rig import Microscope
 
-__all__ = ["ASPECTS", "FAR", "SHIFTED", "TOOLS", "TRAINING", "beside", "random_object"]
-
 ASPECTS = ("tool", "light", "scene", "optics")
 Rng = np.random.Generator
 

@@ -14,8 +14,6 @@ import numpy as np
 
 from lib.simulator.limits import check
 
-__all__ = ["MAX_PITCH_RAD", "MAX_ROLL_RAD", "MAX_TIP_RADIUS_MM", "Finish", "Forceps", "Instrument", "Jaw", "Nodes", "Pose"]
-
 MAX_ROLL_RAD = np.deg2rad(60.0)
 MAX_PITCH_RAD = np.deg2rad(60.0)
 MAX_TIP_RADIUS_MM = 0.02

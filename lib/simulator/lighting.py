@@ -8,8 +8,6 @@ import numpy as np
 from lib.simulator.forceps import Nodes
 from lib.simulator.window import Grid, Window
 
-__all__ = ["Lighting", "Patch"]
-
 _HALF_MM = 14.0  # of the square on which shadows fall
 
 

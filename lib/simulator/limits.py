@@ -2,8 +2,6 @@
 
 from collections.abc import Callable
 
-__all__ = ["check"]
-
 
 def check(settings: object, names: str, holds: Callable[[object], bool], rule: str) -> None:
     """Raise ValueError for the first of the attributes `names` (separated by spaces) whose value breaks the rule.

@@ -10,8 +10,6 @@ from lib.simulator.eye import Scene
 from lib.simulator.forceps import MAX_ROLL_RAD, Forceps, Pose
 from lib.simulator.limits import check
 
-__all__ = ["DURATIONS_S", "Motion"]
-
 #: Kinds of motion, and how long each takes by default.
 DURATIONS_S = {"sweep": 30.0, "surgeon": 18.0, "both": 45.0}
 _CLEARANCE_MM = 0.12  # between a tip and the retina

@@ -20,9 +20,6 @@ from lib.simulator.rig import IMAGE_SIZE_PX, Microscope
 from lib.simulator.video import Video, compressed
 from lib.simulator.window import Window, in_image
 
-__all__ = ["POPULATIONS", "RESERVED_JAW_MM", "RESERVED_SEEDS", "TEXTURE_SEEDS", "VALIDATION_TEXTURE_SEEDS", "Setup"]
-__all__ += ["random_forceps", "random_pose", "random_setup", "reserved_forceps", "sample"]
-
 #: Families from which the far rung draws what is not far.
 _ORDINARY = {"light": ("coaxial", "oblique", "near_lamp", "glare"), "optics": ("clean", "grey", "cast")}
 #: What `sample` draws from, beside the families of `FAR`.

@@ -18,8 +18,6 @@ from lib.simulator.render import View, render_pair
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, Microscope
 from lib.simulator.window import surface_grid
 
-__all__ = ["Design", "simulate"]
-
 _KINEMATICS_HZ, _KINEMATICS_MARGIN = 100.0, 5  # samples before the first and after the last frame
 _GLINT_REACH_PX = 3  # a detector looks at a landmark's surroundings, not at one pixel
 

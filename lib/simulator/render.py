@@ -18,8 +18,6 @@ from lib.simulator.texture import GAMMA, smooth_noise
 from lib.simulator.tool import compose, tool_in_view
 from lib.simulator.window import Grid, Window, blur_by_depth, in_image, intersect
 
-__all__ = ["View", "render_pair", "render_view"]
-
 _LINEAR = (np.arange(256, dtype=np.float32) / 255) ** GAMMA
 _BUMP_MM, _BUMP_PX = 10.0, 1024
 

@@ -14,8 +14,6 @@ from lib.simulator.lighting import Lighting
 from lib.simulator.limits import check
 from lib.simulator.video import Video
 
-__all__ = ["IMAGE_SIZE_PX", "ROBOT_FROM_MICROSCOPE", "Microscope", "reference_rig"]
-
 IMAGE_SIZE_PX = (1920, 1080)
 
 #: Where the reference microscope stands over the reference robot: any general pose would do.

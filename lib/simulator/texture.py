@@ -12,8 +12,6 @@ import numpy as np
 
 from lib.recordings import read_image
 
-__all__ = ["EXTENT_MM", "GAMMA", "fundus_texture", "pattern", "photograph_texture", "smooth_noise"]
-
 #: Side of the square of the eye that a texture covers.
 EXTENT_MM = 26.0
 #: Encoding of textures and camera images: value = linear ** (1 / GAMMA).

@@ -14,8 +14,6 @@ from lib.simulator.forceps import MAX_TIP_RADIUS_MM, Forceps, Instrument, Nodes,
 from lib.simulator.rig import Microscope
 from lib.simulator.window import Window, blur, blur_by_depth, in_image, motion_blur
 
-__all__ = ["ToolInView", "ToolRaster", "compose", "rasterise", "tool_in_view"]
-
 
 @dataclass(frozen=True)
 class ToolRaster:

@@ -6,8 +6,6 @@ from typing import Self
 import cv2
 import numpy as np
 
-__all__ = ["Video", "compressed"]
-
 _IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 

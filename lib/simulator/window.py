@@ -13,8 +13,6 @@ import numpy as np
 from lib.cameras import AffineCamera, NearAffineCamera, Resection
 from lib.simulator.eye import Scene
 
-__all__ = ["Grid", "Window", "blur", "blur_by_depth", "in_image", "intersect", "motion_blur", "surface_grid"]
-
 _Camera = AffineCamera | NearAffineCamera
 
 

@@ -16,8 +16,6 @@ from lib.geometry import points
 from lib.surface.grid import SplineGrid, cubic_basis
 from lib.surface.solver import UNHELD, L1Problem, cholesky
 
-__all__ = ["BSplineSurface", "SurfaceFit", "ToolDistance"]
-
 
 @dataclass(frozen=True, eq=False)
 class SurfaceFit:

@@ -18,8 +18,6 @@ from lib.files import whole, write_bytes
 from lib.geometry import finite_points
 from lib.surface.bspline import BSplineSurface
 
-__all__ = ["Mesh", "depth_map", "open3d", "save_depth_map", "save_mesh", "save_points", "surface_mesh"]
-
 
 def open3d() -> ModuleType:
     """The module open3d; an ImportError says in one line what to install where its system libraries are missing."""

@@ -12,8 +12,6 @@ from lib.surface.bspline import BSplineSurface, SurfaceFit
 from lib.surface.grid import SplineGrid
 from lib.surface.solver import L1Problem, L1Solution, interior_point
 
-__all__ = ["REJECT_MEDIANS", "fit_surface"]
-
 #: Default rejection: points whose L1 norm exceeds this many times the median.  Gaussian noise along one axis puts
 #: 0.1 % of its points beyond it.
 REJECT_MEDIANS = 5.0

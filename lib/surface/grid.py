@@ -10,8 +10,6 @@ from functools import cached_property
 import numpy as np
 from scipy import sparse
 
-__all__ = ["SplineGrid", "cubic_basis"]
-
 # Element matrices of one span of width 1: integrals over it of products of the four cubic basis functions that live
 # there, and of their first and second derivatives.  Summed over the spans they give the Gram matrices exactly.
 _ELEMENT = (

@@ -18,8 +18,6 @@ from lib.matching import Matches, checked_mask, glint_mask, match, tool_mask
 from lib.surface.bspline import BSplineSurface
 from lib.surface.fitting import fit_surface
 
-__all__ = ["EPIPOLAR_SIGMAS", "Reconstruction", "epipolar_inliers", "reconstruct", "refine_rig"]
-
 #: Matches farther from their epipolar line than this many of their own standard deviations are dropped.
 EPIPOLAR_SIGMAS = 2.0
 #: Of `refine_rig`: neighbouring matches share their errors off the line, and this many count as one; residuals beyond so

@@ -16,8 +16,6 @@ from threadpoolctl import ThreadpoolController
 
 from lib.surface.grid import SplineGrid, cubic_basis
 
-__all__ = ["UNHELD", "L1Problem", "L1Solution", "cholesky", "interior_point"]
-
 UNHELD = (
     "smoothness: too small to hold the control points that have no data near them; increase it, or use fewer control points."
 )

@@ -10,8 +10,6 @@ import numpy as np
 from lib.simulator.video import compressed
 from lib.simulator.window import motion_blur
 
-__all__ = ["disguised"]
-
 
 def disguised(
     image: np.ndarray, u: np.ndarray, visibility: np.ndarray, rng: np.random.Generator, length_px: float

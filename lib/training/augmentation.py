@@ -12,8 +12,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-__all__ = ["AUGMENTATIONS", "Augmentation", "Batch"]
-
 OCCLUDED, VISIBLE = 1, 2
 #: Height of an occluded landmark's target: its place is still learnt, and its height tells that it is not seen.
 OCCLUDED_PEAK = 0.5

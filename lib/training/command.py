@@ -15,8 +15,6 @@ from lib.training.samples import labelled_images
 from lib.training.shards import generate
 from lib.training.stages import STAGES, assemble, finetune, stage_config, stage_data, training_of
 
-__all__ = ["main", "main_evaluate"]
-
 
 def main(argv: list[str] | None = None) -> int:
     """`python3 -m lib train`: simulate training data, train or fine-tune the detector's stages (resuming), assemble them."""

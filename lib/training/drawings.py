@@ -12,8 +12,6 @@ import numpy as np
 
 from lib.simulator.window import in_image
 
-__all__ = ["drawn_ground", "drawn_tool"]
-
 #: Centre line (n, 2) px and radius (n,) px.
 Part = tuple[np.ndarray, np.ndarray]
 

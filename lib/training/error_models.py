@@ -17,8 +17,6 @@ from lib.landmarks.metrics import GROSS_PX, tool_length_px
 from lib.landmarks.windows import CLOSEUP_REACH_PX, CLOSEUP_ZOOM, expected_in_closeup, map_points
 from lib.training.samples import LabelledImage
 
-__all__ = ["TRACKED_SHIFT_PX", "Seen", "fit_error_models", "seen_by"]
-
 #: What a tool of 2 mm/s moves between two frames at 25 Hz, and the tool's length at that scale.
 TRACKED_SHIFT_PX, _LENGTH_PX = 8.0, 300.0
 #: Weight of a prior, in landmarks.  Chosen by how true the doubt is on held-out scenes after a fit on 20 others.

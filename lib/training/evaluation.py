@@ -13,8 +13,6 @@ from lib.landmarks import Landmarks
 from lib.landmarks.metrics import Scores, calibration_error, errors_px, pck, score, tool_length_px
 from lib.training.samples import LabelledImage
 
-__all__ = ["Evaluation", "evaluate"]
-
 
 @dataclass(frozen=True)
 class Evaluation:

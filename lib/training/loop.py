@@ -29,8 +29,6 @@ from lib.training.augmentation import AUGMENTATIONS, Augmentation, Batch, leave_
 from lib.training.losses import heatmap_loss, offset_loss, position_loss
 from lib.training.samples import Samples, Source
 
-__all__ = ["FORMAT", "PRESETS", "Training", "TrainingConfig", "average", "draw_batch", "load_training", "train", "validate"]
-
 FORMAT = "microstereo.training"
 #: What a checkpoint keeps of a `Run` beside its tensors.
 _STATE = ("step", "seconds", "log", "loss_sum", "since")

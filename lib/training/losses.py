@@ -9,8 +9,6 @@ from torch import Tensor
 from lib.landmarks.heatmaps import SIGMA_PX, render, sigma_cells
 from lib.training.augmentation import Batch
 
-__all__ = ["heatmap_loss", "offset_loss", "position_loss"]
-
 
 def heatmap_loss(outputs: Sequence[Tensor], batch: Batch, stride: int, sigma_px: float = SIGMA_PX) -> Tensor:
     """Squared distance of every stack's heatmaps from the Gaussians, scaled so that empty heatmaps cost 1.

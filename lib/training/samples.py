@@ -10,8 +10,6 @@ import numpy as np
 from lib.recordings import Recording
 from lib.recordings.annotations import CLICK_SD_PX
 
-__all__ = ["LabelledImage", "Mixed", "Samples", "Source", "labelled_images"]
-
 
 class LabelledImage(NamedTuple):
     """An image (h, w, 3) uint8 RGB and its landmarks base, tip_1, tip_2: u (3, 2) px and visibility (3,).

@@ -21,11 +21,6 @@ from lib.parallel import run_jobs
 from lib.simulator.population import TEXTURE_SEEDS, VALIDATION_TEXTURE_SEEDS, sample
 from lib.training.samples import LabelledImage
 
-__all__ = [
-    "BLOCK_PX", "CLOSEUP_CROP_PX", "SCENE_PX", "generate", "packed", "read_scenes", "read_shards", "square_round",
-    "validation_images",
-]  # fmt: skip
-
 #: Longest side of a stored whole scene.
 SCENE_PX = 512
 #: Seeds of each kind of shard.

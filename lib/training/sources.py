@@ -16,8 +16,6 @@ from lib.training.drawings import drawn_ground, drawn_tool
 from lib.training.samples import LabelledImage, Source
 from lib.training.shards import BLOCK_PX, CLOSEUP_CROP_PX, SCENE_PX, packed, read_scenes, read_shards, square_round
 
-__all__ = ["CloseupSource", "FrameSource", "SceneSource", "ToolSource"]
-
 #: The first stage sees frames whose longer side is shrunk to this, here with (width, height) of the input.  It is trained on
 #: parts of them, which costs a third, since a frame is mostly background.
 FRAME_PX, PART_PX = (320, 192), (160, 128)

@@ -32,8 +32,6 @@ from lib.training.samples import LabelledImage, Mixed, Samples, Source, labelled
 from lib.training.shards import validation_images
 from lib.training.sources import FRAME_PX, CloseupSource, FrameSource, ToolSource
 
-__all__ = ["STAGES", "assemble", "card", "finetune", "stage_config", "stage_data", "training_of"]
-
 #: The stages that are trained, in the order of their use, and the channels of the shipped networks.
 STAGES = {"frame": 32, "tool": 48, "closeup": 32}
 #: Standard deviation of a label, as a share of the tool's length, at which a stage lets it count half.

@@ -15,8 +15,6 @@ from lib.trust.diagnosis import Diagnosis, diagnose
 from lib.trust.health import Health, feature_matches, health, spread
 from lib.trust.verdict import Verdict, judge
 
-__all__ = ["Assessment", "assess", "report"]
-
 
 @dataclass(frozen=True, eq=False)
 class Assessment:

@@ -9,8 +9,6 @@ from lib.calibration.timing import Paths
 from lib.recordings import Kinematics
 from lib.trust.fitting import Problem, Robust
 
-__all__ = ["SIDES", "Case", "Hypothesis"]
-
 SIDES = ("left", "right")
 _LONGEST_S = 0.25  # between frames, whose own positions stand for the robot's log
 _PARAMETERS = 20  # of two affine cameras, and about as many of the nine offsets as data tell

@@ -21,8 +21,6 @@ from lib.trust.assessment import Assessment, assess, report
 from lib.trust.health import spread
 from lib.trust.verdict import LEVELS
 
-__all__ = ["Check", "check", "data_uri", "main", "overlay"]
-
 _COLOURS = np.array([*LANDMARK_COLOURS.values()])
 _SHOWN = 3  # best frames, and worst
 _MOST_FRAMES = 60  # spread over the recording; more take longer and say little more

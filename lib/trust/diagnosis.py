@@ -17,8 +17,6 @@ from lib.trust.clocks import TIME_TESTS
 from lib.trust.fitting import Problem, Robust
 from lib.trust.health import affine_epipolar
 
-__all__ = ["Diagnosis", "diagnose"]
-
 #: Least gain and least share explained of a hypothesis that is named.
 LEAST_GAIN = 6.0
 LEAST_EXPLAINED = 0.02

@@ -17,8 +17,6 @@ from lib.calibration.offsets import rows_axes
 from lib.calibration.robust import tightest_sample
 from lib.correspondences import Correspondences
 
-__all__ = ["Problem", "Robust"]
-
 #: Degrees of freedom tried; bivariate Cauchy to nearly Gaussian.
 _FREEDOM = np.array([0.7, 1.0, 2.0, 4.0, 10.0, 100.0])
 _LEAST_PX = 0.02  # smaller residuals are rounding

@@ -17,8 +17,6 @@ from lib.calibration import Calibration, with_offsets
 from lib.correspondences import Correspondences
 from lib.recordings import Recording
 
-__all__ = ["LIMITS", "Health", "affine_epipolar", "feature_matches", "health", "spread", "unfamiliar"]
-
 #: What a landmark of a frame may show of each part; see `Health.false_alarm_rate`.
 LIMITS = {
     "looks": 0.02,  # the same frame mirrored and shifted: largest move of the landmark, of the tool's length

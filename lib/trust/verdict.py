@@ -12,8 +12,6 @@ from lib.recordings import Doubt
 from lib.trust.diagnosis import Diagnosis
 from lib.trust.health import Health
 
-__all__ = ["LEVELS", "LIMITS", "Reason", "Verdict", "judge"]
-
 #: From best to worst.
 LEVELS = ("trustworthy", "doubtful", "not trustworthy")
 #: Check -> values at which a verdict becomes doubtful, and not trustworthy.

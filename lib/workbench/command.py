@@ -22,8 +22,6 @@ from lib.provenance import commit, machine
 from lib.workbench import execution, pages, parameters
 from lib.workbench.execution import Failure, execute
 
-__all__ = ["complete_runs", "main", "main_site", "previous_values", "run"]
-
 #: Keeps room on the disk to write the last state of a run when the disk is full.
 _ROOM = ".room"
 #: Figures that the README shows.

@@ -15,8 +15,6 @@ from nbclient.exceptions import CellTimeoutError, DeadKernelError
 
 from lib.workbench.report import FIGURE_METADATA, METRIC_MIME, STOP_METADATA, VERDICT_COLOURS, VERDICT_MIME
 
-__all__ = ["Failure", "Stated", "execute", "joined", "stated_in", "versions"]
-
 #: Packages whose version can change a figure.
 _TOLD = ("numpy", "scipy", "torch", "kornia", "opencv-python-headless", "open3d-cpu", "open3d", "cvxpy", "clarabel")
 _ADDED = {"injected-parameters", "papermill-error-cell-tag"}

@@ -17,8 +17,6 @@ from lib import paths
 from lib.workbench.execution import Failure
 from lib.workbench.report import format_value, rendered, with_unit
 
-__all__ = ["PLOTLY_FILE", "equation_svg", "headlines", "index_html", "is_recorded", "markdown_html", "page"]
-
 #: plotly's script lies once beside the pages that show a 3D view.
 PLOTLY_FILE = "plotly.min.js"
 _TEMPLATES = Path(__file__).with_name("templates")

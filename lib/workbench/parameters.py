@@ -13,9 +13,6 @@ import nbformat
 
 from lib import paths
 
-__all__ = ["choose_notebooks", "declared_grid", "declared_parameters", "parse_parameters", "positive", "split_values",
-           "title_of"]  # fmt: skip
-
 #: How the comment of a study's parameter ends: ``; grid: 75, 300, 1500``.
 _GRID = re.compile(r";\s*grid:(.*)$")
 #: A comma outside brackets.

@@ -22,11 +22,6 @@ from jinja2 import Environment, FileSystemLoader
 if TYPE_CHECKING:  # at run time it would slow every notebook's start
     from matplotlib.figure import Figure
 
-__all__ = [
-    "FIGURE_METADATA", "METRIC_MIME", "RECORDED", "STOP_METADATA", "VERDICT_COLOURS", "VERDICT_MIME", "format_value",
-    "record", "rendered", "show", "stop", "timed", "verdict", "with_unit",
-]  # fmt: skip
-
 #: Mime type of a metric in a notebook's outputs; the JSON holds name, value, unit, paper, note.
 METRIC_MIME = "application/vnd.microstereo.metric+json"
 #: Mime type of a verdict; the JSON is that of `lib.trust.Verdict`.

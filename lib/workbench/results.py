@@ -20,8 +20,6 @@ import numpy as np
 from lib import files, paths
 from lib.provenance import plain
 
-__all__ = ["Table", "csv_text", "read", "recorded", "write"]
-
 
 class _MissingColumn(ValueError, LookupError):
     """A column that a table does not have."""

@@ -33,8 +33,6 @@ from lib.workbench.parameters import (
     split_values,
 )
 
-__all__ = ["column_name", "main", "save_plots", "sweep"]
-
 
 def main(argv: Sequence[str]) -> int:
     """Parse the command line and sweep; 1 if a run failed."""

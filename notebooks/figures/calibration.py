@@ -20,33 +20,6 @@ from notebooks.figures.style import table as html_table
 from notebooks.studies.camera_models import Comparison
 from notebooks.studies.dvrk import RobotFrames, SphereFit
 
-__all__ = [
-    "advice_curves",
-    "advice_view",
-    "against_truth",
-    "checkerboards",
-    "correspondences",
-    "coverage",
-    "ellipsoids",
-    "estimators",
-    "focal_lengths",
-    "frame_residuals",
-    "ladder",
-    "ladder_table",
-    "noise_errors",
-    "offsets",
-    "residual_field",
-    "residuals",
-    "resolutions",
-    "robot_frames",
-    "root_mean_square",
-    "shallow_bias",
-    "time_offset",
-    "when_affine_wins",
-    "working_distance",
-]
-
-
 _WHITE = {"facecolor": "white", "edgecolor": "none", "pad": 0.5}
 #: Colours of the depth uncertainty in `advice_view`.
 DEPTH_SCALE_UM = (30.0, 2000.0)

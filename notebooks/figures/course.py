@@ -11,8 +11,6 @@ from numpy.typing import ArrayLike
 
 from lib.workbench import report
 
-__all__ = ["agree", "filled", "holds", "learnt", "metrics_named"]
-
 _NUMBER = re.compile(r"\{([a-z][a-z0-9_.]*?)(:[^{}]*)?\}")
 
 

@@ -18,22 +18,6 @@ from lib.simulator.window import Window
 from notebooks.figures.style import COLOURS, LANDMARK_COLOURS, figure, show_image
 from notebooks.studies.realism import Profiles
 
-__all__ = [
-    "annotation_errors",
-    "contact_sheet",
-    "gallery",
-    "landmark_counts",
-    "motion_page",
-    "profiles_page",
-    "ray_cast_depth",
-    "realism_page",
-    "realism_sheet",
-    "rig_page",
-    "stages_page",
-    "verdict_page",
-    "volume_page",
-]
-
 
 def gallery(images: Mapping[str, np.ndarray], *, columns: int = 4, width_in: float = 12.0) -> Figure:
     """Titled images of one size in rows."""

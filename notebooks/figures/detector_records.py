@@ -17,30 +17,6 @@ from lib.files import digest
 from lib.workbench.results import Table
 from notebooks.figures.style import COLOURS, figure
 
-__all__ = [
-    "PAPER_ABLATION",
-    "ablation_bars",
-    "curve",
-    "depth_groups",
-    "engine_bars",
-    "few_labels_curves",
-    "groups",
-    "label_noise_cost",
-    "label_noise_pairs",
-    "mean_and_error",
-    "most_labels",
-    "papers_network_curves",
-    "papers_network_rows",
-    "recorded",
-    "resolution_curves",
-    "shipped_curve",
-    "shipped_rows",
-    "speed_rows",
-    "verdicts",
-    "visibility_bars",
-    "weights",
-]
-
 #: PCK@0.05 in percent of the five networks in the paper.
 PAPER_ABLATION = {"encoder": 8.4, "+ decoder": 75.1, "+ skips": 95.2, "+ stack": 99.6, "+ residual": 99.7}
 
@@ -121,7 +97,7 @@ def resolution_curves(table: Table, title: str = "Resolution") -> Figure:
 
 
 def papers_network_curves(table: Table, shipped: Table) -> Figure:
-    """PCK against the threshold of the paper's network at each resolution, and of the shipped detector on the same sequences."""
+    """PCK against the threshold: the paper's network at each resolution, and the shipped detector on the same sequences."""
     fig = resolution_curves(table, "The paper's network")
     rows = [row for row in shipped.where(mode="whole frames").rows if row["recording"].startswith("test_")]
     thresholds, pck = curve(Table(rows))

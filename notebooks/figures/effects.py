@@ -14,8 +14,6 @@ from lib.simulator.render import View, render_view
 from lib.simulator.rig import Microscope
 from lib.simulator.window import Window
 
-__all__ = ["PLAIN", "effect_gallery", "render_window"]
-
 #: A microscope without imperfections: everything is sharp, evenly lit, free of noise and stored without loss.
 PLAIN = Microscope(
     depth_of_field_mm=float("inf"),

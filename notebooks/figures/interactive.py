@@ -24,8 +24,6 @@ from notebooks.figures.style import figure
 if TYPE_CHECKING:
     import plotly.graph_objects as go
 
-__all__ = ["epipolar_pointer", "explore", "show_scene", "still", "swipe"]
-
 _DPI = 80
 #: About as many pictures travel to a page, each drawn in the run.
 _STILLS = 5

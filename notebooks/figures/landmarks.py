@@ -21,27 +21,6 @@ from lib.simulator.rig import ROBOT_FROM_MICROSCOPE
 from lib.training.evaluation import Evaluation
 from notebooks.figures.style import COLOURS, LANDMARK_COLOURS, ON_IMAGE, figure, show_image
 
-__all__ = [
-    "augmented",
-    "decoder_errors",
-    "detection",
-    "disc_page",
-    "error_groups",
-    "focus_distance_mm",
-    "frame_explorer",
-    "heatmap_grid",
-    "landmark_dots",
-    "learning_curves",
-    "loss_slopes",
-    "network_page",
-    "pck_curves",
-    "printed_equation",
-    "stages",
-    "timing_bars",
-    "uncertainty",
-    "worst_frames",
-]
-
 
 def landmark_dots(axes: Axes, u: np.ndarray, *, size: float = 60.0, label: bool = False) -> None:
     """Landmarks (3, 2) as open circles in their colours; NaN is left out."""

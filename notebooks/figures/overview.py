@@ -10,8 +10,6 @@ from matplotlib.figure import Figure
 from lib.online import FrameResult
 from notebooks.figures.style import COLOURS, LANDMARK_COLOURS, ON_IMAGE, figure, show_image
 
-__all__ = ["frame_pair", "landmarks_on", "pipeline_page", "pixel_grid"]
-
 
 def landmarks_on(axes: Axes, u: np.ndarray, *, label: bool = True) -> None:
     """Mark base, tip_1 and tip_2, u (3, 2) px, and draw the jaws between them.  Missing landmarks have no legend entry."""

@@ -18,8 +18,6 @@ from notebooks.figures.interactive import explore
 from notebooks.figures.overview import landmarks_on
 from notebooks.figures.style import COLOURS, LANDMARK_COLOURS, figure, show_image
 
-__all__ = ["Film", "dashboard", "error_timeline", "frame_browser", "stage_times", "timeline"]
-
 _STATE_COLOURS = dict(zip(STATES, ("#f0f0f0", "white", "#dceaf7", "#b0b0b0", "#f7eec2", "#fde3c8"), strict=True))
 _STAGE_COLOURS = dict(
     zip(STAGES, ("#0072B2", "#56B4E9", "#CC79A7", "#D55E00", "#E69F00", "#009E73", "#999999"), strict=True)

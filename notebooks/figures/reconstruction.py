@@ -33,40 +33,6 @@ if TYPE_CHECKING:
 
     from notebooks.studies.surface_evaluation import Case
 
-__all__ = [
-    "atomic_maps",
-    "case_table",
-    "cases",
-    "descriptor_channels",
-    "disparity_errors",
-    "epipolar_geometry",
-    "epipolar_line",
-    "error_budget",
-    "error_maps",
-    "growing",
-    "held_out_curve",
-    "match_fields",
-    "mesh_still",
-    "neighbourhood",
-    "point_errors",
-    "predicted_error",
-    "profiles",
-    "reconstruction",
-    "recorded_speeds",
-    "recorded_table",
-    "response_map",
-    "response_pyramid",
-    "scene_view",
-    "score_table",
-    "smoothness_sections",
-    "smoothness_slider",
-    "sparsification",
-    "spline_1d",
-    "stereo_pair",
-    "tool_over_surface",
-    "vertex_colours",
-]
-
 _SIGNED = "RdBu_r"
 _ERROR = "magma"
 

@@ -15,8 +15,6 @@ from lib.registration import DriftMonitor
 from notebooks.figures.style import COLOURS, figure
 from notebooks.studies.moved_cameras import MotionErrors
 
-__all__ = ["drift_chart", "error_curves", "hypotheses", "icp_chart", "moved_tool", "noise_ellipses", "weights_view"]
-
 #: Fewer trials have no quartiles worth drawing.
 _FEW = 30
 _ESTIMATORS = {

@@ -12,8 +12,6 @@ from lib.workbench.results import Table
 from notebooks.figures.landmarks import landmark_dots
 from notebooks.figures.style import COLOURS, figure, show_image
 
-__all__ = ["real_curves", "recorded_bars", "rung_page"]
-
 
 def rung_page(
     evaluation: Evaluation, images: Sequence[np.ndarray], order: Sequence[int] | None = None, *, columns: int = 6

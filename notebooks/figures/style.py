@@ -13,8 +13,6 @@ from matplotlib.figure import Figure
 
 from lib import correspondences
 
-__all__ = ["COLOURS", "LANDMARK_COLOURS", "ON_IMAGE", "figure", "show_image", "table"]
-
 #: Colour-blind safe (after Okabe and Ito), 3:1 and more on white, named by what they mean here.
 COLOURS = {
     "ours": "#0072B2",

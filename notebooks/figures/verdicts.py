@@ -16,10 +16,6 @@ from lib.workbench import report
 from notebooks.figures.overview import landmarks_on
 from notebooks.figures.style import figure, show_image
 
-__all__ = [
-    "believed", "by_confidence", "half_and_rest", "health_chart", "sealed", "surest_and_least_sure", "whether_true",
-]  # fmt: skip
-
 #: Fewest rows of a calibration that is to be judged by held-out frames, and of those frames.
 _ROWS = (12, 3)
 

@@ -14,8 +14,6 @@ from lib.simulator.rig import ROBOT_FROM_MICROSCOPE
 from notebooks.studies.cameras import rms
 from notebooks.studies.scenes import Checkerboard, checkerboard_poses
 
-__all__ = ["BoardError", "SeenBoard", "measure", "render_boards"]
-
 
 @dataclass(frozen=True)
 class SeenBoard:

@@ -12,8 +12,6 @@ from lib.calibration.estimate import calibrate
 from lib.calibration.models import Model
 from lib.correspondences import Correspondences
 
-__all__ = ["LADDER", "Comparison", "Rung", "compare_models"]
-
 #: Each model's next freer one, whose likelihood-ratio test asks whether the constraint between them holds; from the stiffest
 #: to the freest.  A pair's cameras have their own zoom, so `common_zoom` is the first to fall.
 _FREER = {

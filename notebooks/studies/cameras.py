@@ -11,8 +11,6 @@ from scipy.linalg import rq
 
 from lib.geometry import finite_points, points
 
-__all__ = ["PerspectiveCamera", "perspective_dlt", "rms", "triangulate_perspective"]
-
 
 def rms(error: ArrayLike) -> float:
     """Root mean square of the lengths of vectors (n, k)."""

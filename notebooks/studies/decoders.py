@@ -12,8 +12,6 @@ from torch.nn import functional as F
 
 from lib.landmarks.heatmaps import decode, sigma_cells
 
-__all__ = ["DECODERS", "positions"]
-
 
 def _argmax(heatmaps: Tensor, sigma: float = 0.0) -> Tensor:
     """The highest cell."""

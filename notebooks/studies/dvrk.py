@@ -17,8 +17,6 @@ from scipy.optimize import minimize_scalar
 
 from lib.calibration import Calibration, calibrate
 
-__all__ = ["RobotFrames", "SphereFit", "calibrate_sphere", "find_spheres", "read_robot_frames"]
-
 
 @dataclass(frozen=True, eq=False)
 class RobotFrames:

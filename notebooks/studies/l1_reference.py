@@ -8,8 +8,6 @@ from scipy.linalg.lapack import dpbtrs
 
 from lib.surface.solver import UNHELD, L1Problem, L1Solution, cholesky
 
-__all__ = ["cvxpy_reference", "least_squares"]
-
 
 def cvxpy_reference(
     problem: L1Problem,

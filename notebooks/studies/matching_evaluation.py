@@ -12,15 +12,6 @@ from scipy.stats import rankdata
 
 from lib.matching.result import Matches
 
-__all__ = [
-    "CONFIDENCES",
-    "DisparityScore",
-    "detection_auc",
-    "non_occluded",
-    "score_against_disparity",
-    "sparsification",
-]
-
 #: The confidences of `Matches`, larger is surer.
 CONFIDENCES = ("score", "peak_ratio", "reciprocal")
 

@@ -20,18 +20,6 @@ from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
 from notebooks.studies.simulated_rows import SimulatedSweep
 from notebooks.studies.tracked import TrackedErrors
 
-__all__ = [
-    "Estimator",
-    "MotionErrors",
-    "by_points",
-    "motion_error",
-    "pushed_images",
-    "random_motion",
-    "recorded_errors",
-    "simulated_errors",
-    "tool_frames",
-]
-
 #: An estimator of the motion: (stale rig, Correspondences after the motion) -> Registration.
 Estimator = Callable[[StereoRig, Correspondences], Registration]
 

@@ -8,8 +8,6 @@ from numpy.typing import ArrayLike
 from lib.calibration import Calibration
 from lib.geometry import finite_points
 
-__all__ = ["added_error", "box_grid", "next_positions"]
-
 
 def box_grid(low_mm: ArrayLike, high_mm: ArrayLike, steps: int = 5) -> np.ndarray:
     """(steps^3, 3) points of a box in the robot frame, its corners among them.

@@ -29,25 +29,6 @@ from lib.simulator.texture import EXTENT_MM, fundus_texture
 from lib.simulator.window import Window
 from notebooks.studies.retinal import import_retinal_microsurgery
 
-__all__ = [
-    "FUNDUS_SET_BY",
-    "LIGHTS",
-    "SET_BY",
-    "STATISTICS",
-    "Light",
-    "Profiles",
-    "compare",
-    "exceptions",
-    "fundus_windows",
-    "image_statistics",
-    "in_vivo_window",
-    "landmark_window",
-    "profiles",
-    "real_windows",
-    "statistics_table",
-    "tool_windows",
-]
-
 #: name -> what it is.
 STATISTICS = {
     "luminance_mean": "mean luminance, 0 to 1",

@@ -28,8 +28,6 @@ from lib.training.loop import load_training
 from lib.training.samples import LabelledImage
 from notebooks.studies.windows import WindowSource
 
-__all__ = ["FIELD_PX", "RESOLUTIONS", "ReducedDetector", "load_resolution", "resolution_windows", "window_side_px"]
-
 #: (width, height) of the network's frames, by the paper's names.
 RESOLUTIONS = {"1080p": (1920, 1080), "480p": (854, 480), "480x640": (640, 480), "256x448": (448, 256)}
 #: What a window shows, in full-HD pixels, at any resolution.

@@ -12,8 +12,6 @@ from lib.recordings.annotations import CLICK_SD_PX
 from lib.recordings.tables import columns, read_table
 from lib.training.samples import LabelledImage
 
-__all__ = ["MonocularSequence", "import_retinal_microsurgery", "label_repeatability"]
-
 
 @dataclass(frozen=True)
 class MonocularSequence:

@@ -22,8 +22,6 @@ from lib.training.evaluation import Evaluation
 from lib.training.samples import LabelledImage, labelled_images
 from notebooks.studies.retinal import import_retinal_microsurgery
 
-__all__ = ["CHANGES", "EMPTY", "RUNGS", "images", "numbers"]
-
 Change = Callable[[np.ndarray, np.random.Generator], tuple[np.ndarray, float]]
 
 

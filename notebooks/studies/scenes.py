@@ -12,8 +12,6 @@ from scipy import ndimage
 from lib.geometry import RigidTransform
 from lib.simulator.texture import GAMMA, smooth_noise
 
-__all__ = ["OBJECTS", "Checkerboard", "Relief", "checkerboard_poses"]
-
 
 @dataclass(frozen=True)
 class Checkerboard:

@@ -12,8 +12,6 @@ from lib.correspondences import Correspondences
 from lib.geometry import RigidTransform
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
 
-__all__ = ["SimulatedSweep", "simulate_correspondences"]
-
 
 @dataclass(frozen=True, eq=False)
 class SimulatedSweep(Correspondences):

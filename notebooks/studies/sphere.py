@@ -11,8 +11,6 @@ from scipy.optimize import least_squares
 from lib.cameras import AffineCamera
 from lib.geometry import finite_points, points
 
-__all__ = ["Sphere", "fit_sphere"]
-
 
 @dataclass(frozen=True, eq=False)
 class Sphere:

@@ -17,8 +17,6 @@ from lib.recordings import Kinematics
 from lib.simulator import Microscope
 from lib.trust import diagnose, judge
 
-__all__ = ["GOOD", "SPOILED", "Result", "Scene", "Take", "examine", "takes"]
-
 #: First seed of the recordings on which thresholds are set, and of those that are judged once.
 SETS = {"setting": 0, "judging": 50_000}
 _SIZE = (1920, 1080)

@@ -32,28 +32,6 @@ from notebooks.studies.matching_evaluation import (
 from notebooks.studies.scenes import OBJECTS, Relief
 from notebooks.studies.sphere import Sphere, fit_sphere
 
-__all__ = [
-    "DOMAIN",
-    "Case",
-    "RealPair",
-    "SimulatedPair",
-    "aligned_rms_um",
-    "case",
-    "compare_matchers",
-    "confidence_curves",
-    "error_variants",
-    "eyes",
-    "full_hd_pair",
-    "objects",
-    "real_pair",
-    "retina_points",
-    "rms_um",
-    "simulated_pair",
-    "surface_error_mm",
-    "surface_on_rays",
-    "wrong_matches",
-]
-
 #: Of `retina_points`: a full-HD image, px.
 DOMAIN = (0.0, 0.0, 1920.0, 1080.0)
 

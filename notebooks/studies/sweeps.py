@@ -15,8 +15,6 @@ from lib.recordings import Recording
 from lib.simulator import Design, Microscope, simulate
 from notebooks.studies.cameras import rms
 
-__all__ = ["ESTIMATORS", "Judgement", "estimate", "exact_pixels", "judge", "label_rows", "sweep"]
-
 #: Options of `calibrate` and whether the detector's covariances weigh the rows, for each way to calibrate from detections.
 ESTIMATORS = {
     "plain": (False, False),

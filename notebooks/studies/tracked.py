@@ -16,8 +16,6 @@ from lib.landmarks.detector import TRACKED_FROM
 from lib.simulator import Eye, Microscope, Motion, Window, render_view
 from lib.simulator.population import RESERVED_SEEDS, reserved_forceps
 
-__all__ = ["TrackedErrors", "tracked_errors"]
-
 _SIDE_PX = 560  # of the rendered window around the tool: closeups see no more
 _LOST_PX = 60.0  # farther off, or less sure than `TRACKED_FROM`, the next frame is searched as a whole
 

@@ -17,8 +17,6 @@ from lib.training.samples import LabelledImage, Samples
 from lib.workbench import report
 from notebooks.studies.windows import TOOL, TOOL_REDUCTION, WindowSource
 
-__all__ = ["ABLATION", "CURVE", "record_scores", "small_config", "tool_windows"]
-
 #: The five columns of the paper's ablation table, in its order.
 ABLATION: dict[str, dict[str, int | bool]] = {
     "encoder": {"stacks": 1, "decoder": False, "skips": False, "residual": False},

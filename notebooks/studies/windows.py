@@ -20,14 +20,6 @@ from lib.simulator.population import TEXTURE_SEEDS, VALIDATION_TEXTURE_SEEDS, sa
 from lib.training.samples import LabelledImage, Source
 from lib.training.shards import packed, read_shards, square_round
 
-__all__ = [
-    "TOOL",
-    "TOOL_REDUCTION",
-    "WindowSource",
-    "simulated",
-    "write_frames",
-]
-
 #: Of the stored frames.
 STORED_REDUCTION = 5
 #: Reduction of the windows round the tool, and the landmark index that means the whole tool.
