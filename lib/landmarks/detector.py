@@ -137,7 +137,7 @@ class Detector:
     metadata: dict[str, object] = field(default_factory=dict)
     closeup_network: OffsetNetwork | None = None
     mirror: bool = False
-    closeup_from: float = 0.25
+    closeup_from: float = 0.1
     engine: str = "torch"
     _run: dict[str, Callable[[Tensor], list[Tensor]]] = field(init=False, repr=False, default_factory=dict)
 
