@@ -115,5 +115,5 @@ def test_an_error_model_of_another_version_is_named(tmp_path):
     tensors, metadata = read_checkpoint(path, FORMAT)
     old = [[[0.0] * 14, [0.0] * 14], [1.0] * 4]
     write_checkpoint(path, tensors, metadata | {"calibration": {"frame": old, "window": old}})
-    with pytest.raises(ValueError, match=r"safetensors: .*log_variance: expected \(2, 10\), got \(2, 14\); fit anew"):
+    with pytest.raises(ValueError, match=r"safetensors: .*log_variance: expected \(2, 11\), got \(2, 14\); fit anew"):
         Detector.load(path)
