@@ -36,7 +36,7 @@ from lib.recordings import Recording
 
 FORMAT = "microstereo.detector"
 #: The fields that a weights file keeps as plain values.
-_SETTINGS = ("frame_px", "window_px", "mirror", "method", "closeup_from")
+_SETTINGS = ("frame_px", "window_px", "mirror", "method")
 #: A landmark with a lower confidence counts as missing: NaN, confidence 0.
 MISSING_BELOW = 0.05
 #: Below this confidence a landmark is not followed from frame to frame.
@@ -117,7 +117,6 @@ class Detector:
         error_models: One for each stage: ``"frame"``, ``"tool"`` and ``"again"`` for the two looks at the tool, ``"window"``,
             ``"closeup"`` and ``"closer"`` for two closeups, the second where the first saw the landmark, and ``"tracking"``
             for the closeups that follow a landmark from frame to frame.
-        closeup_from: Below this confidence a landmark gets no closeup.
         mirror: The second look at the tool, and the windows' network, also see the mirror image, and the mean counts: where
             the two disagree its peak is low.
         engine: What runs the networks, one of `lib.landmarks.engines.ENGINES`; the weights are the same.
@@ -137,7 +136,6 @@ class Detector:
     metadata: dict[str, object] = field(default_factory=dict)
     closeup_network: OffsetNetwork | None = None
     mirror: bool = False
-    closeup_from: float = 0.1
     engine: str = "torch"
     _run: dict[str, Callable[[Tensor], list[Tensor]]] = field(init=False, repr=False, default_factory=dict)
 
@@ -192,7 +190,6 @@ class Detector:
         if not path.suffix and not path.is_file():
             path = paths.MODELS / f"{path.name}.safetensors"
         tensors, metadata = read_checkpoint(path, FORMAT)
-        metadata = {"closeup_from": cls.closeup_from} | metadata
         lacking = {"networks", "calibration", "provenance", *_SETTINGS} - metadata.keys()
         if text := ", ".join(sorted(lacking)):
             raise ValueError(f"{path}: its metadata lack {text}; get the file again, or make it with Detector.save.")
@@ -363,8 +360,7 @@ class Detector:
             near = peaks.value[:, 0].numpy() > 0
             confidence = np.where(near, confidence, 0.0)
         if stage in ("closeup", "closer"):
-            # The stage before decides whether the landmark is there; if either is unsure, it stays where it was seen.
-            near &= rough.confidence[which[:, 0], which[:, 1]] >= self.closeup_from
+            # The stage before decides whether the landmark is there; if a closeup is unsure, it stays where it was seen.
             result.confidence[tuple(which[near & (confidence < MISSING_BELOW)].T)] = MISSING_BELOW
             near &= confidence >= MISSING_BELOW
             u, covariance, confidence, which = u[near], covariance[near], confidence[near], which[near]

@@ -165,8 +165,6 @@ def seen_by(
     keep = np.ones(len(at), bool)
     if stage in CLOSE:
         keep = peaks.value[:, 0].numpy() > 0
-        if stage != "tracking":  # of an unsure landmark nothing is changed
-            keep &= rough.confidence[which[:, 0], which[:, 1]] >= detector.closeup_from
         moved = at - expected_in_closeup(detector.closeup_network.config.size_px, landmark)
     errors = at - map_points(matrices, labels[landmark])
     zoom = np.sqrt(np.abs(np.linalg.det(matrices[:, :, :2])))

@@ -15,7 +15,7 @@ from tqdm.auto import tqdm
 
 from lib.files import write_text
 from lib.landmarks import Detector
-from lib.landmarks.detector import CLOSE, MISSING_BELOW
+from lib.landmarks.detector import CLOSE
 from lib.landmarks.metrics import tool_length_px
 from lib.landmarks.network import HourglassConfig, Network, OffsetConfig
 from lib.landmarks.windows import tool_pose
@@ -139,15 +139,14 @@ def finetune(
         except BaseException:
             stopped.set()
             raise
-    tuned = replace(detector, **networks, closeup_from=MISSING_BELOW)
+    tuned = replace(detector, **networks)
     tuned = fit_error_models(tuned, [*held_out, *doubt_on], anew=False, progress=progress is True)
-    if detector.closeup_network is None:
-        return tuned
     old = {stage: detector.error_models[stage] for stage in CLOSE if stage in detector.error_models}
-    # Held-out images say whether the closeups gained by a short training, and whether unsure landmarks gain by closeups.
-    ways = [tuned, replace(tuned, closeup_network=detector.closeup_network, error_models=tuned.error_models | old)]
-    ways += [replace(one, closeup_from=detector.closeup_from) for one in ways]
-    scores = {way: evaluate(way, held_out).scores for way in ways[:: 1 if old else 2]}
+    if detector.closeup_network is None or not old:
+        return tuned
+    # Held-out images say whether the closeups gained by a short training.
+    ways = tuned, replace(tuned, closeup_network=detector.closeup_network, error_models=tuned.error_models | old)
+    scores = {way: evaluate(way, held_out).scores for way in ways}
     return max(scores, key=lambda way: scores[way].auc + scores[way].pck_0_01)  # near landmarks decide as much as all do
 
 

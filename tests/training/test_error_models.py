@@ -110,7 +110,7 @@ def test_closeups_that_know_nothing_do_no_harm(small, monkeypatch):
     torch.manual_seed(0)
     closeup = OffsetNetwork(OffsetConfig(4, 32)).eval()
     torch.nn.init.normal_(closeup.head[-1].weight, std=0.5)
-    full = replace(detector, window_network=detector.frame_network, window_px=64, closeup_network=closeup, closeup_from=0.0)
+    full = replace(detector, window_network=detector.frame_network, window_px=64, closeup_network=closeup)
     frames = frames[:10]
     once = fit_error_models(full, frames)
     assert set(once.error_models) == {"frame", "window", "closeup", "closer", "tracking"}
