@@ -63,6 +63,8 @@ def pair_covariance(covariance_px2: ArrayLike | Sequence[ArrayLike] | None, n: i
         covariance_px2 = np.stack(covariance_px2, axis=1)
     given = np.asarray(1.0 if covariance_px2 is None else covariance_px2, dtype=np.float64)
     if given.ndim == 0:
+        if not given > 0:
+            raise ValueError(f"covariance_px2: a variance must be positive, got {given}.")
         covariance = given * np.eye(m)[None]
     elif given.shape == (2, 2):
         covariance = np.kron(np.eye(images), given)[None]

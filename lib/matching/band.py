@@ -114,7 +114,7 @@ def _coarse_displacement(images: Images, masks: Masks, rig: StereoRig, whole: Re
     rectification = rectify(rig, images[0].shape, images[1].shape, scale=scale)
     reach = int(np.ceil(COARSE_REACH * rectification.size_px[0] / CELL_PX))
     left, right = _descriptors(images, masks, rectification, (-reach, reach), COARSE_OFF_LINE)
-    matches, _ = _match(left, right, -reach, COARSE_OFF_LINE)
+    matches = _match(left, right, -reach, COARSE_OFF_LINE)[0]  # the volume is large
     chosen = matches.keep(_supported(matches))
     start = chosen.patch * PATCH
     step, _ = refine(left, right, start, start + chosen.cell - (-reach, -COARSE_OFF_LINE))
@@ -195,6 +195,7 @@ def match_band(images: Images, masks: Masks, rig: StereoRig, where: Where, *, bu
     x, y = torch.from_numpy(found.patch.T)
     along = torch.from_numpy(found.cell[:, 0] - low)
     ratio = peak_ratio(volume[y, x].amax(dim=1, keepdim=True), torch.zeros_like(along), along)
+    del volume  # large
 
     # The match lies on the line, at the best whole cell, and one step of `refine` from there.
     start = found.patch * PATCH
