@@ -102,7 +102,7 @@ def papers_network_curves(table: Table, shipped: Table) -> Figure:
     rows = [row for row in shipped.where(mode="whole frames").rows if row["recording"].startswith("test_")]
     thresholds, pck = curve(Table(rows))
     fig.axes[0].plot(100 * thresholds, pck, "k--", label="shipped detector, full HD")
-    fig.axes[0].legend(loc="upper left")
+    fig.axes[0].legend(loc="upper left", bbox_to_anchor=(1, 1))
     return fig
 
 
