@@ -30,7 +30,7 @@ SMALLEST = {
     "shipped_detector": {"every": 12},
     "surfaces": {"scene": "eye 200"},
 }
-NEED_DATA = {"few_labels", "matching", "real_robot", "realism", "rungs"}
+NEED_DATA = {"few_labels", "matching", "papers_network", "real_robot", "realism", "rungs"}
 MAY_LACK = {"matching", "noticed_motion", "robot_labels", "rungs"}  # numbers that a picture or a motion does not have
 
 
