@@ -181,6 +181,14 @@ def test_epipolar_distance_of_unit_noise_has_unit_variance(rig, near):
         assert pair.epipolar_distance(*u).std() == pytest.approx(1, rel=0.05)
 
 
+def test_a_match_of_infinite_covariance_is_nan_and_the_others_are_not(near):
+    x = np.array([[0.5, -1.0, 0.2], [1.0, 2.0, -0.4], [-2.0, 0.3, 0.1]])
+    covariance = np.stack([np.eye(4), np.diag([np.inf] * 4), np.eye(4)])
+    found = near.triangulate(*near.project(x), covariance)
+    assert np.isnan(found.x_mm[1]).all()
+    np.testing.assert_allclose(found.x_mm[[0, 2]], x[[0, 2]], atol=1e-9)
+
+
 def test_near_affine_is_affine_where_the_inverse_distance_is_zero(rig):
     camera = NearAffineCamera(rig.left.matrix, 0.0, (959.5, 539.5))
     x = workspace(10)

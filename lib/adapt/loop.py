@@ -131,8 +131,7 @@ def adapt_images(
     provenance = Provenance(f"python3 -m lib adapt {images.name} --labels {Path(labels).name}")
     simulated = simulated_like([one.image for one in parts["learn"]], seed, progress)
     how = {"minutes": minutes, "steps": STEPS, "seed": seed, "progress": progress}
-    work = _work_folder(folder, images.name, key)
-    tuned = tune(detector, parts["learn"], parts["stop"], work, simulated=simulated, **how)
+    tuned = tune(detector, parts["learn"], parts["stop"], _work_folder(folder, images.name, key), simulated=simulated, **how)
     before, after = (evaluate(one, parts["judge"]) for one in (detector, tuned))
     gain, sd = better(*(frame_means(found.error_px / found.length_px[:, None]) for found in (before, after)))
     improved = bool(gain > 2 * sd)

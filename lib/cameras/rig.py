@@ -226,7 +226,8 @@ def _linearised(cameras: _Pair, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarra
 
 
 def _step(J: np.ndarray, r: np.ndarray, W: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Weighted least squares of r = J x: x (n, 3) and the inverse (n, 3, 3) of the normal matrix."""
+    """Weighted least squares of r = J x: x (n, 3) and the inverse (n, 3, 3) of the normal matrix; NaN where it has none."""
     WJ = W @ J
-    inverse = np.linalg.inv(J.mT @ WJ)
+    normal = J.mT @ WJ
+    inverse = np.linalg.inv(np.where(np.linalg.det(normal)[:, None, None] == 0, np.nan, normal))
     return (inverse @ (WJ.mT @ r[..., None]))[..., 0], inverse

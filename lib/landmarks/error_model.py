@@ -53,7 +53,7 @@ class ErrorModel:
 
     Attributes:
         log_variance: (2, 11): for x and y the constants of base, tip_1 and tip_2, and the slopes of the other features.
-        logit: (11,) likewise; 9 or fewer are one constant for all, and slopes.
+        logit: (11,) in the same order.  Of 9 numbers or fewer the first is the constant of all three landmarks.
         gain, bias: (3, 2) for base, tip_1 and tip_2 along x and y, closeups only.  A closeup's correction is scaled by the
             gain that minimises the validation error; the bias is the mean error that this leaves, in the closeup's pixels.
 

@@ -183,8 +183,8 @@ def _fitted(stage: str, parts: Sequence[Seen], prior: ErrorModel | None) -> Erro
         return seen.fit(gross_px, prior)
     # Many exact labels told a prior's gain and bias, and few labels have a constant error of their own.  While tracking, the
     # place where a landmark is expected is an old one, which is evidence of nothing.
-    of_images = seen.gain(gross_px, [1.0] if stage == "tracking" else np.linspace(0, 1, 51))
-    gain, bias = of_images if prior is None else map(np.array, (prior.gain, prior.bias))
+    gains = [1.0] if stage == "tracking" else np.linspace(0, 1, 51)
+    gain, bias = seen.gain(gross_px, gains) if prior is None else map(np.array, (prior.gain, prior.bias))
     seen = replace(seen, errors=seen.errors + (gain[seen.landmark] - 1) * seen.moved - bias[seen.landmark])
     return replace(seen.fit(gross_px, prior), gain=gain, bias=bias)
 
