@@ -18,7 +18,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import torch
-from torch.nn.functional import max_pool1d, pad
+from torch.nn.functional import max_pool1d
 
 PATCH = 4
 POWER = 1.4
@@ -43,12 +43,12 @@ def n_levels(gy: int, gx: int) -> int:
 
 def pool(maps: torch.Tensor, start: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
     """Maxima over three columns at every second one; and of these over three rows at rows start, start + 2, ..."""
-    lines = max_pool1d(maps.flatten(0, 2), 3, stride=2, padding=1)
-    along_x = lines.reshape(*maps.shape[:3], -1)
-    padded = pad(along_x, (0, 0, 1 - start, 1), value=-torch.inf)
-    n = (maps.shape[2] - start + 1) // 2
-    before, centre, after = (padded[:, :, first : first + 2 * n - 1 : 2] for first in range(3))
-    return along_x, torch.maximum(before, centre).maximum(after)
+    along_x = max_pool1d(maps.flatten(0, 2), 3, stride=2, padding=1).reshape(*maps.shape[:3], -1)
+    out = along_x[:, :, start::2].clone()
+    for first, beside in ((1 - start, along_x[:, :, 1 - start :: 2]), (0, along_x[:, :, start + 1 :: 2])):
+        there = out[:, :, first : first + beside.shape[2]]
+        torch.maximum(there, beside[:, :, : there.shape[2]], out=there)
+    return along_x, out
 
 
 def unpool(
