@@ -17,6 +17,7 @@ SMALLEST = {
     "few_labels": {"frames": 5, "minutes": 0.1},
     "l1_solver": {"n_points": 2000, "control": 20},
     "label_noise": {"steps": 100},
+    "left_out": {"minutes": 0.02, "n": 2},
     "matching": {"scene": "eye", "repeats": 1},
     "noise_and_coverage": {"runs": 4},
     "noticed_motion": {"recordings": 1, "before": 60, "after": 10, "scenes": 1},
