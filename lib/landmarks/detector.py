@@ -30,7 +30,7 @@ from lib.landmarks.error_model import ErrorModel, Rough, closeup_peaks, correcte
 from lib.landmarks.heatmaps import Peaks, decode
 from lib.landmarks.metrics import tool_length_px
 from lib.landmarks.network import Network, OffsetNetwork, StackedHourglass, as_tensor, as_uint8
-from lib.landmarks.search import PEAKS, best_tools, without_peak
+from lib.landmarks.search import PEAKS, best_tools, likelihood, without_peak
 from lib.parallel import single_threaded_torch
 from lib.recordings import Recording
 
@@ -43,7 +43,7 @@ MISSING_BELOW = 0.05
 TRACKED_FROM = 0.5
 #: The stages that look at closeups: twice of what the tool's window showed, and of what was found in the frame before.
 CLOSE = ("closeup", "closer", "tracking")
-#: Where a window's peaks are lower than this (geometric mean), the first stage's peaks at these scales make candidates.
+#: Where a window's peaks are lower than this (mean), the first stage's peaks at these scales make candidates.
 _SHOWN, _SCALES = 0.75, (0.75, 1.0, 1.5, 2.2)
 _SURE = 0.5  # a confidence of the first stage below this, or after a search, becomes this times the height of the peaks
 #: So many candidates are looked at once, and so many of them twice; none where all peaks are lower than the third number.
@@ -298,7 +298,7 @@ class Detector:
         """What later stages start from: `rough`, or, where its window does not show it well, the tool whose window does best.
 
         Candidates are `rough` and tools made of the highest peaks that the first stage sees at several scales.  All are
-        looked at once, the best ones again; the highest peaks win.  The second stage decides, however sure the first one is:
+        looked at once, the likeliest ones again; the likeliest wins.  The second stage decides, however sure the first one is:
         it has learnt what is no tool.  `seen` is what `stage_peaks` gave for `rough`, if that is known.
         """
         if self.tool_network is None:
@@ -311,22 +311,23 @@ class Detector:
             candidates = Landmarks.join([rough[i : i + 1], self._candidates(image)])
             looks = np.broadcast_to(image, (len(candidates), *image.shape[1:]))
             u, once = self._shown(self.stage_peaks(looks, candidates.u, "tool"), len(looks))
-            best = np.argsort(-once)[:_AGAIN]
-            _, twice = self._shown(self.stage_peaks(looks[best], u[best], "again"), len(best))
-            result._put(np.array([i]), candidates[best[[twice.argmax()]]])
-            height[i] = twice.max()
+            best = np.argsort(-likelihood(u, once))[:_AGAIN]
+            u, twice = self._shown(self.stage_peaks(looks[best], u[best], "again"), len(best))
+            chosen = likelihood(u, twice).argmax()
+            result._put(np.array([i]), candidates[best[[chosen]]])
+            height[i] = twice[chosen]
         unsure = searched | (rough.confidence < _SURE).any(1)
         return replace(result, confidence=np.where(unsure[:, None], _SURE * height[:, None], rough.confidence))
 
     @staticmethod
     def _shown(seen: tuple, n: int) -> tuple[np.ndarray, np.ndarray]:
-        """Landmarks (n, 3, 2) that windows of n tools show, and their peaks' geometric mean height (n,), by `stage_peaks`."""
+        """Landmarks (n, 3, 2) that windows of n tools show, and the mean height (n,) of their peaks, by `stage_peaks`."""
         peaks, matrices, which = seen
         i, k = which.T
         found, height = np.full((n, 3, 2), np.nan), np.zeros((n, 3))
         found[i, k] = _through_inverse(matrices, peaks.u[:, 0].double().numpy())
         height[i, k] = peaks.value[:, 0].numpy()
-        return found, np.exp(np.log(np.clip(height, 0.01, 1)).mean(1))
+        return found, np.clip(height, 0, 1).mean(1)
 
     def _candidates(self, image: np.ndarray) -> Landmarks:
         """Tools (m, 3, 2) that one image (1, h, w, 3) may show."""

@@ -6,11 +6,14 @@ import numpy as np
 import torch
 
 from lib.landmarks.heatmaps import SIGMA_PX, sigma_cells
+from lib.landmarks.metrics import tool_length_px
 
 #: Peaks that are taken from each heatmap.
 PEAKS = 4
 #: Two tools are the same if their landmarks differ by less than this share of the length, in the mean.
 _SAME = 0.25
+#: What jaws that are open by the tool's length add to the mean height of its peaks, chosen on validation scenes.
+_OPEN = 0.25
 
 
 def without_peak(heatmaps: torch.Tensor, u: torch.Tensor, stride: int) -> torch.Tensor:
@@ -46,3 +49,12 @@ def best_tools(u: np.ndarray, height: np.ndarray, n: int) -> np.ndarray:
         if len(chosen) == n:
             break
     return which[chosen]
+
+
+def likelihood(u: np.ndarray, height: np.ndarray) -> np.ndarray:
+    """How likely (n,) tools u (n, 3, 2) are among others, by the mean heights (n,) of their peaks.
+
+    A vessel, a fold or a rod may look like shut jaws: of two with equal peaks the one with open jaws is the likelier tool.
+    """
+    opening = np.linalg.norm(u[:, 1] - u[:, 2], axis=1) / np.maximum(tool_length_px(u), 1.0)
+    return height + _OPEN * np.nan_to_num(opening)
