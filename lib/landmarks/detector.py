@@ -273,7 +273,8 @@ class Detector:
             with self._threads():
                 part, near = images if usable.size == len(images) else images[usable], previous[usable]  # a pair takes 12 MB
                 found = self.refine(part, near, "tracking")
-                if _moved_px(near.u, found.u) > _SECOND_LOOK_PX:
+                scale = view.closeup_scale(np.maximum(tool_length_px(near.u), 1.0))[:, None]
+                if np.nanmax(np.linalg.norm(found.u - near.u, axis=2) * scale, initial=0.0) > _SECOND_LOOK_PX:
                     found = self.refine(part, found, "tracking")
                 result._put(usable, found)
         lost = np.flatnonzero((result.confidence < min_confidence).any(1))
@@ -452,12 +453,6 @@ class Detector:
 def _through_inverse(matrices: np.ndarray, u: np.ndarray) -> np.ndarray:
     """Points u (n, 2) of windows in the image, from the windows' matrices (n, 2, 3)."""
     return np.linalg.solve(matrices[:, :, :2], (u - matrices[:, :, 2])[..., None])[..., 0]
-
-
-def _moved_px(before: np.ndarray, after: np.ndarray) -> float:
-    """The longest way of a landmark (n, 3, 2), in image pixels of closeups of scale 1."""
-    scale = view.closeup_scale(np.maximum(tool_length_px(before), 1.0))[:, None]
-    return float(np.nanmax(np.linalg.norm(after - before, axis=2) * scale, initial=0.0))
 
 
 def detect(

@@ -200,7 +200,9 @@ class CloseupSource(Source):
     @classmethod
     def of(cls, images: Sequence[LabelledImage], *, still: bool = False, weight: np.ndarray | None = None) -> Self:
         """From labelled images of any size; for validation `still`, neither stretched nor blurred nor disguised."""
-        which = [(i, k) for i, labelled in enumerate(images) for k in np.flatnonzero(_sharp(labelled))]
+        usable = [np.isfinite(one.in_view).all(1) & (one.visibility == 2) & np.isfinite(windows.tool_pose(one.u[None])[1])
+                  for one in images]  # fmt: skip
+        which = [(i, k) for i, landmarks in enumerate(usable) for k in np.flatnonzero(landmarks)]
         if not which:
             raise ValueError("images: no visible landmark of a tool with base and tip; label some.")
         parts = ((*square_round(images[i].image, images[i].u, k, CLOSEUP_CROP_PX), images[i].visibility, k) for i, k in which)
@@ -236,9 +238,3 @@ class CloseupSource(Source):
         if self.weight is not None and rng.random() > self.weight[index]:
             seen = np.zeros(3, int)
         return image, u, seen
-
-
-def _sharp(labelled: LabelledImage) -> np.ndarray:
-    """(3,) bool: landmarks that a closeup can show, of tools with a direction."""
-    there = np.isfinite(labelled.in_view).all(1) & (labelled.visibility == 2)
-    return there & np.isfinite(windows.tool_pose(labelled.u[None])[1])

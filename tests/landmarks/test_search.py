@@ -7,7 +7,7 @@ from lib.landmarks import Detector
 from lib.landmarks.detector import Landmarks
 from lib.landmarks.heatmaps import decode, render
 from lib.landmarks.network import HourglassConfig, StackedHourglass
-from lib.landmarks.search import best_tools, without_peak
+from lib.landmarks.search import best_tools, likelihood, without_peak
 
 TOOL = np.array([[40.0, 50.0], [80.0, 40.0], [80.0, 60.0]])
 
@@ -26,6 +26,14 @@ def test_a_tool_needs_equal_jaws_and_the_tips_on_their_sides():
     ((_, one, two),) = mirrored[best_tools(mirrored, np.full((2, 3), 0.5), 1), np.arange(3)]
     assert one[1] <= two[1]
     assert len(best_tools(np.stack([TOOL, TOOL + 0.5]), np.full((2, 3), 0.5), 5)) <= 2  # tools that look alike count once
+
+
+def test_of_two_tools_the_higher_one_is_likelier_and_of_equal_ones_the_open_one():
+    shut = TOOL.copy()
+    shut[1:] = [[80.0, 49.5], [80.0, 50.5]]
+    pair = np.stack([shut, TOOL])
+    assert likelihood(pair, np.array([0.5, 0.5])).argmax() == 1 and likelihood(pair, np.array([0.9, 0.5])).argmax() == 0
+    assert np.array_equal(likelihood(np.full((1, 3, 2), np.nan), np.zeros(1)), [0.0])  # a tool without a window
 
 
 def test_an_image_starts_from_the_tool_that_its_window_shows_best(monkeypatch):
