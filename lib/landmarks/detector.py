@@ -299,7 +299,7 @@ class Detector:
         """What later stages start from: `rough`, or, where its window does not show it well, the tool whose window does best.
 
         Candidates are `rough` and tools made of the highest peaks that the first stage sees at several scales.  All are
-        looked at once, the likeliest ones again; the likeliest wins.  The second stage decides, however sure the first one is:
+        looked at once, the likeliest ones again; the likeliest wins.  The second stage decides, however sure the first is:
         it has learnt what is no tool.  `seen` is what `stage_peaks` gave for `rough`, if that is known.
         """
         if self.tool_network is None:
