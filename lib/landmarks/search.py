@@ -52,5 +52,5 @@ def best_tools(u: np.ndarray, height: np.ndarray, n: int) -> np.ndarray:
 
 
 def likelihood(u: np.ndarray, height: np.ndarray) -> np.ndarray:
-    """Scores (n,) of tools u (n, 3, 2) by the mean height (n,) of their peaks and their opening: a rod looks like shut jaws."""
+    """Scores (n,) of tools u (n, 3, 2), by the mean height (n,) of their peaks and by opening: a rod looks like shut jaws."""
     return height + _OPEN * np.nan_to_num(np.linalg.norm(u[:, 1] - u[:, 2], axis=1) / np.maximum(tool_length_px(u), 1.0))
