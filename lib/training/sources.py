@@ -20,6 +20,8 @@ from lib.training.shards import BLOCK_PX, CLOSEUP_CROP_PX, SCENE_PX, packed, rea
 #: parts of them, which costs a third, since a frame is mostly background.
 FRAME_PX, PART_PX = (320, 192), (160, 128)
 _TOOL_SIZE = windows.TOOL_PX, windows.TOOL_PX
+#: Drawings are made on a part of the frame of this (width, height): on all of it they would take most of the time.
+_DRAWN_PX = 320, 180
 #: Shorter tools are no target, they have no loss.
 SHORTEST_PX = 5.0
 #: Nor are tools in an image whose grey values spread less.
@@ -62,6 +64,8 @@ class SceneSource(Source):
         start = self.ends[index - 1] if index else 0
         image = cv2.imdecode(self.jpegs[start : self.ends[index]], cv2.IMREAD_COLOR_RGB)
         if self.drawn and rng.random() < self.drawn:
+            x, y = rng.integers(0, np.maximum(np.subtract(image.shape[1::-1], _DRAWN_PX), 0), endpoint=True)
+            image = image[y : y + _DRAWN_PX[1], x : x + _DRAWN_PX[0]]
             bare = not self.visibility[index].any() and rng.random() < 0.5
             return *drawn_tool(image if bare else drawn_ground(image, rng), rng), np.ones(3)
         weight = np.ones(3) if self.weight is None else self.weight[index]

@@ -33,7 +33,7 @@ from lib.training.shards import validation_images
 from lib.training.sources import FRAME_PX, CloseupSource, FrameSource, ToolSource
 
 #: The stages that are trained, in the order of their use, and the channels of the shipped networks.
-STAGES = {"frame": 48, "tool": 48, "closeup": 32}
+STAGES = {"frame": 32, "tool": 48, "closeup": 32}
 #: Standard deviation of a label, as a share of the tool's length, at which a stage lets it count half.
 LABEL_SD = {"frame": 0.1, "tool": 0.04, "closeup": 0.02}
 #: Of fine-tuning: share of the draws that are labelled frames, beside simulated ones, and of these in another guise.
@@ -53,6 +53,8 @@ def stage_config(stage: str, *, preset: str = "best", features: int | None = Non
         config = replace(config, augmentation=AUGMENTATIONS["closeups"])
         return replace(config, network=OffsetConfig(features), batch_size=64, clip=2.0)
     config = replace(config, augmentation=AUGMENTATIONS["none"], ema=0.998)  # what is drawn is changed already
+    if stage == "frame":
+        return replace(config, network=HourglassConfig(features, depth=3, growth=1.75), batch_size=16)
     network = HourglassConfig(features, stacks=1, depth=3, growth=5 / 3, basic=True)
     return replace(config, network=network, batch_size=16)
 
