@@ -86,6 +86,10 @@ class Network(nn.Module):
 
     config: HourglassConfig | OffsetConfig
 
+    def halved(self) -> Self:
+        """A copy with all weights rounded to half precision, which its file then holds in half the place."""
+        return copy.deepcopy(self).half().float()
+
     def fused(self) -> Self:
         """A copy for inference: batch normalisation folded into the convolutions, channels last (same outputs)."""
         network = copy.deepcopy(self).eval()

@@ -183,7 +183,7 @@ def assemble(
     typical = []
     for recording in map(Recording.open, recordings):  # 16 images of each, spread over it
         typical += labelled_images(recording, every=max(1, len(recording.frames) // 8))
-    networks = {f"{stage}_network": training.network for stage, training in stages.items()}
+    networks = {f"{stage}_network": training.network.halved() for stage, training in stages.items()}
     detector = Detector(**networks, frame_px=FRAME_PX[0], mirror=True)
     detector = fit_error_models(detector, frames[::2] + bare + typical, for_closeups=near_by, progress=True)
     held_out = evaluate(detector, frames[1::2], progress=True)

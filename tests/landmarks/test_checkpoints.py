@@ -71,6 +71,20 @@ def test_missing_metadata_error_models_and_checksums_are_named(tmp_path):
         Detector.load(path)
 
 
+def test_halved_weights_take_half_the_place_and_load_as_they_were(tmp_path):
+    whole, half = tmp_path / "whole.safetensors", tmp_path / "half.safetensors"
+    network = StackedHourglass(HourglassConfig(32, 1))
+    errors = {"frame": ErrorModel()}
+    Detector(network, 64, error_models=errors).save(whole)
+    detector = Detector(network.halved(), 64, error_models=errors)
+    detector.save(half)
+    assert half.stat().st_size < 0.6 * whole.stat().st_size
+    for path, written in ((half, detector.frame_network), (whole, network)):
+        loaded = Detector.load(path, engine="torch").frame_network.state_dict()
+        assert all(torch.equal(value, loaded[name]) for name, value in written.state_dict().items())
+        assert all(value.dtype != torch.half for value in loaded.values())
+
+
 def test_the_digest_tells_everything_that_decides_what_a_detector_finds():
     detector = untrained()
     weights = detector.networks["window"].state_dict()

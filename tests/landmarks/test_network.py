@@ -5,10 +5,13 @@ import torch
 from lib.landmarks.network import HourglassConfig, OffsetConfig, OffsetNetwork, StackedHourglass
 from notebooks.studies.training import ABLATION
 
+BASIC = {"stacks": 1, "depth": 3, "growth": 1.5, "basic": True}
+CONFIGURATIONS = ABLATION | {"basic boxes": BASIC}
 
-@pytest.mark.parametrize("name", ABLATION)
-def test_shapes_of_the_five_configurations(name):
-    config = HourglassConfig(features=8, **ABLATION[name])
+
+@pytest.mark.parametrize("name", CONFIGURATIONS)
+def test_shapes_of_all_configurations(name):
+    config = HourglassConfig(features=8, **CONFIGURATIONS[name])
     outputs = StackedHourglass(config)(torch.rand(2, 3, 128, 192))
     assert len(outputs) == config.stacks
     assert all(o.shape == (2, 3, 128 // config.stride, 192 // config.stride) for o in outputs)
@@ -34,10 +37,10 @@ def test_padding_is_the_callers_own_zeros():
         assert torch.allclose(network(image)[-1], network(by_hand)[-1][..., :25, :23], atol=1e-6)
 
 
-@pytest.mark.parametrize("name", ABLATION)
+@pytest.mark.parametrize("name", CONFIGURATIONS)
 def test_fused_network_gives_the_same_heatmaps(name):
     torch.manual_seed(0)
-    network = StackedHourglass(HourglassConfig(features=8, **ABLATION[name]))
+    network = StackedHourglass(HourglassConfig(features=8, **CONFIGURATIONS[name]))
     with torch.no_grad():
         for _ in range(3):  # batch statistics that are not the initial ones
             network.train()(torch.rand(4, 3, 64, 64))
@@ -49,10 +52,11 @@ def test_fused_network_gives_the_same_heatmaps(name):
         assert torch.allclose(network.fused()(image)[-1], expected, atol=1e-4)
 
 
-def test_the_stem_and_the_hourglass_keep_the_half_pixel_rule():
+@pytest.mark.parametrize("config", [HourglassConfig(8, 1), HourglassConfig(8, **BASIC)])
+def test_the_stem_and_the_hourglass_keep_the_half_pixel_rule(config):
     """A network whose weights are mirror-symmetric maps a mirrored image to mirrored heatmaps, cell by cell."""
     torch.manual_seed(0)
-    network = StackedHourglass(HourglassConfig(8, 1)).eval().double()
+    network = StackedHourglass(config).eval().double()
     with torch.no_grad():
         for p in network.parameters():
             if p.ndim == 4:
@@ -78,6 +82,7 @@ def test_wrong_channels_are_named(shape):
         ({"depth": 0}, "depth"),
         ({"decoder": False}, "skips"),
         ({"decoder": False, "skips": False}, "stacks"),
+        ({"residual": False, "basic": True}, "basic"),
     ],
 )
 def test_impossible_configurations_are_named(changes, name):
