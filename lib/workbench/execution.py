@@ -25,7 +25,6 @@ _KERNEL_ENVIRONMENT = {
     "OPEN3D_DISABLE_WEB_VISUALIZER": "true",  # it hangs without a display
     "PYDEVD_DISABLE_FILE_VALIDATION": "1",  # a warning of the debugger on every start
 }
-_ANSI = re.compile(r"\x1b\[[0-9;]*m")
 
 
 class Failure(NamedTuple):
@@ -46,9 +45,7 @@ def execute(
 ) -> Failure | None:  # fmt: skip
     """Execute `notebook` into `output` (written after each cell); None if every cell came to its end.
 
-    Args:
-        cell_timeout_s: The longest that one cell may take; None is without end.
-        on_cell: Called with the cell that starts (from 1) and the number of cells.
+    `on_cell` is called with the cell that starts (from 1) and the number of cells.
     """
     import papermill
     from papermill.exceptions import PapermillExecutionError
@@ -92,7 +89,8 @@ def _failure_of(executed: Path) -> Failure | None:
             if output.output_type == "error" and output.ename == "SystemExit" and not output.evalue:
                 return None  # `report.stop`
             if output.output_type == "error":
-                return Failure("error", number, f"{output.ename}: {_ANSI.sub('', output.evalue)}")
+                message = re.sub(r"\x1b\[[0-9;]*m", "", output.evalue)  # colours of a terminal
+                return Failure("error", number, f"{output.ename}: {message}")
         status = cell.metadata.get("papermill", {}).get("status")
         if cell.source.strip() and status not in (None, "completed"):
             return Failure("error", number, f"the cell is {status}.")

@@ -25,8 +25,6 @@ _RICHEST_FIRST = ["application/vnd.plotly.v1+json", "text/html", "application/vn
                   "image/png", "image/jpeg", "text/markdown", "text/latex", "text/plain"]  # fmt: skip
 #: (level, anchor, text) of a heading that nbconvert has given an anchor.
 _HEADING = re.compile(r'<h([23]) id="([^"]+)">(.*?)<a class="anchor-link"', re.DOTALL)
-#: The note of a number that was read from a record and not computed in the run.
-_RECORDED = re.compile(r"(.*, )?recorded\b")
 #: State of the notebook -> why it did not state a number; None: it is not part of the run.
 _MISSING = {None: "its notebook was not run", "pending": "not yet", "running": "not yet", "failed": "its notebook failed"}
 
@@ -102,12 +100,9 @@ def page(
     executed: Path, *, title: str, folder: Path, verdict: dict, previous: tuple[str, str] | None,
     following: tuple[str, str] | None,
 ) -> str:  # fmt: skip
-    """The HTML of an executed notebook.
+    """The HTML of an executed notebook whose source lies in `folder`, with its `verdict` and `reasons` on top.
 
-    Args:
-        folder: Where the notebook's source lies: what its relative pictures are relative to.
-        verdict: `verdict` (None: it stated none) and `reasons`, shown on top.
-        previous, following: (file, title) of the neighbouring pages.
+    `previous` and `following` are (file, title) of the neighbouring pages.
     """
 
     @pass_context
@@ -140,15 +135,14 @@ def index_html(run: dict) -> str:
 
 
 def is_recorded(metric: dict) -> bool:
-    """Whether a metric was read from a record."""
-    return bool(_RECORDED.match(metric["note"]))
+    """Whether a metric was read from a record and not computed in the run, as its note says."""
+    return bool(re.match(r"(.*, )?recorded\b", metric["note"]))
 
 
 def headlines(run: dict) -> tuple[list[dict], list[str]]:
     """The rows of the table on top of index.html, and what has no row because the user's recording has no truth.
 
-    ``templates/headlines.toml`` says which numbers these are, eight at most, with their targets; `run` is the content of
-    metrics.json.
+    ``templates/headlines.toml`` says which numbers these are, with their targets; `run` is the content of metrics.json.
     """
     text = (_TEMPLATES / "headlines.toml").read_text(encoding="utf-8")
     metrics, books = ({entry["name"]: entry for entry in run[kind]} for kind in ("metrics", "notebooks"))

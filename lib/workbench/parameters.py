@@ -22,10 +22,8 @@ _COMMA = re.compile(r",(?![^\[({]*[\])}])")
 def choose_notebooks(names: Sequence[str] = (), folder: Path = paths.NOTEBOOKS) -> list[Path]:
     """The notebooks named, in the order of the paper; all of them for no name.
 
-    A name is a path, a file's name, its stem, or the leading number (``03``); studies are found by stem too.
-
-    Raises:
-        ValueError: If a name fits none; the text lists what there is.
+    A name is a path, a file's name, its stem, or the leading number (``03``); studies are found by stem too.  A ValueError
+    for a name that fits none lists what there is.
     """
     shipped = sorted(folder.glob("[0-9]*.ipynb"))
     if not names:
@@ -103,30 +101,22 @@ def title_of(notebook: Path) -> str:
 def _value(name: str, text: str, kind: str) -> object:
     """`text` as the declared type; without one, as the Python literal it is, or else as text."""
     kind = kind.split("|")[0].strip().split("[")[0]
+    words = {"true": True, "false": False, "1": True, "0": False}
+    simple = {"str": str, "int": int, "float": float, "bool": lambda text: words[text.lower()]}
     try:
-        if kind == "str":
-            return text
-        if kind == "bool":
-            return {"true": True, "false": False, "1": True, "0": False}[text.lower()]
-        if kind in ("int", "float"):
-            return {"int": int, "float": float}[kind](text)
-        if kind in ("list", "tuple", "dict", "set"):
-            value = ast.literal_eval(text)
-            if type(value).__name__ != kind:
-                raise ValueError(type(value).__name__)
-            return value
+        value = simple.get(kind, ast.literal_eval)(text)
+        if kind in ("list", "tuple", "dict", "set") and type(value).__name__ != kind:
+            raise ValueError(f"a {type(value).__name__}")
+        return value
     except (ValueError, KeyError, SyntaxError):
-        raise ValueError(f"parameter {name}: {text!r} is not of type {kind}.") from None
-    with contextlib.suppress(ValueError, SyntaxError):
-        return ast.literal_eval(text)
-    return {"true": True, "false": False, "none": None}.get(text.lower(), text)
+        if kind in (*simple, "list", "tuple", "dict", "set"):
+            raise ValueError(f"parameter {name}: {text!r} is not of type {kind}.") from None
+        return {"true": True, "false": False, "none": None}.get(text.lower(), text)
 
 
 def _inspect(notebook: Path) -> dict[str, dict]:
     import papermill
 
-    if not notebook.is_file():
-        raise ValueError(f"{notebook}: no such notebook.")
     logging.getLogger("papermill").setLevel(logging.ERROR)  # no word about notebooks without a parameters cell
     try:
         return papermill.inspect_notebook(str(notebook))
