@@ -52,25 +52,16 @@ def write_bytes(path: str | Path, data: bytes) -> None:
 
 
 def write_json(path: str | Path, value: object) -> None:
-    """Write `value` as readable JSON.
-
-    Raises:
-        ValueError: For NaN and infinity, for which JSON has no word; give None.
-    """
+    """Write `value` as readable JSON; NaN and infinity, for which it has no word, are a ValueError."""
     write_text(path, json.dumps(value, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
 
 
 def digest(*files: str | Path, length: int = 12) -> str:
-    """The first `length` hexadecimal digits of the SHA-256 of the files' contents, one after the other.
-
-    Raises:
-        FileNotFoundError: Naming the file.
-    """
+    """The first `length` hexadecimal digits of the SHA-256 of the files' contents, one after the other."""
     total = hashlib.sha256()
     for path in files:
         if not Path(path).is_file():
             raise FileNotFoundError(f"{path}: no such file.")
         with open(path, "rb") as file:
-            for block in iter(lambda: file.read(1 << 20), b""):
-                total.update(block)
+            hashlib.file_digest(file, lambda: total)
     return total.hexdigest()[:length]

@@ -6,6 +6,7 @@ import os
 import platform
 import subprocess
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -39,8 +40,14 @@ def commit_id() -> str:
 
 def machine() -> dict:
     """System, processor, cores that this process may use, memory and GPU."""
+    processor, memory_gb = platform.processor() or platform.machine(), None
+    with suppress(OSError):  # no Linux
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        processor = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), processor)
+    with suppress(AttributeError, ValueError, OSError):  # Windows
+        memory_gb = round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9, 1)
     system = f"{platform.system()} {platform.release()}"
-    return {"system": system, "processor": _processor(), "cores": cores(), "memory_gb": _memory_gb(), "gpu": _gpu()}
+    return {"system": system, "processor": processor, "cores": cores(), "memory_gb": memory_gb, "gpu": _gpu()}
 
 
 class Provenance:
@@ -73,23 +80,6 @@ def plain(value: object) -> object:
     if isinstance(value, float | np.floating):
         return float(f"{float(value):.6g}") if np.isfinite(value) else None
     return value.item() if isinstance(value, np.generic) else value
-
-
-def _processor() -> str:
-    try:
-        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    except OSError:
-        pass
-    return platform.processor() or platform.machine()
-
-
-def _memory_gb() -> float | None:
-    try:
-        return round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9, 1)
-    except (AttributeError, ValueError, OSError):
-        return None
 
 
 @functools.cache

@@ -24,11 +24,7 @@ _LABELS = {".slp": ["sleap"], ".csv": ["deeplabcut"], ".json": ["coco", "label_s
 
 
 def guess_mapping(source: str | Path) -> str:
-    """The text of a mapping file for the files in a folder.
-
-    Raises:
-        FileNotFoundError, ValueError: If there is no video and no image, or no log of a robot that could be read.
-    """
+    """The text of a mapping file for the files in a folder, which needs a video or images, and a robot's log."""
     folder = Path(source)
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder}: no such folder; SOURCE is the folder with your files.")

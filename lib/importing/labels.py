@@ -36,9 +36,6 @@ def read_labels(
     """The labels of the frames that are imported; integer coordinates are pixel centres.
 
     Labels of other frames are left out.  Where the source holds both views in one image, so may the labels.
-
-    Raises:
-        FileNotFoundError, ValueError: Naming the file, the image and the cure.
     """
     theirs = {labels.names.get(name, name): k for k, name in enumerate(landmarks)}
     frame_of = [{int(f): n for n, f in enumerate(side)} for side in source.index.T]

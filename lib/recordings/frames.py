@@ -31,8 +31,7 @@ def read_image(path: Path, image_size_px: tuple[int, int] | None = None, bit_dep
         bit_depth: Of frames of 16 bits, as in `to_8_bits`; None leaves them as uint16.
 
     Raises:
-        FileNotFoundError, ValueError: If there is no such file, it cannot be decoded, a part of it is lost, or its size
-            is another.
+        ValueError: If it cannot be decoded, a part of it is lost, or its size is another.
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such image.")
