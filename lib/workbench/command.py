@@ -19,7 +19,7 @@ from tqdm import tqdm
 
 from lib import files, paths
 from lib.provenance import commit, machine
-from lib.workbench import execution, pages, parameters
+from lib.workbench import execution, pages
 from lib.workbench.execution import Failure, execute
 
 #: Keeps room on the disk to write the last state of a run when the disk is full.
@@ -38,7 +38,7 @@ def main(argv: Sequence[str]) -> int:
     add("notebooks", nargs="*", metavar="NOTEBOOK", help="path, name or number (default: all)")
     add("--profile", choices=("quick", "paper"), default="quick", help="quick: minutes; paper: the paper's sizes")
     add("-p", dest="pairs", nargs=2, action="append", default=[], metavar=("NAME", "VALUE"), help="a declared parameter")
-    add("--cell-timeout", type=parameters.positive, metavar="S", help="longest time of one cell (default: 900 for quick)")
+    add("--cell-timeout", type=execution.positive, metavar="S", help="longest time of one cell (default: 900 for quick)")
     add("--runs", type=Path, default=paths.RUNS, metavar="FOLDER", help="where the run's folder appears")
     options = parser.parse_args(argv)
     timeout = options.cell_timeout or (900.0 if options.profile == "quick" else None)
@@ -111,11 +111,8 @@ def run(
         ValueError: Before anything runs: for an unknown notebook or parameter, or a value of the wrong type.
         OSError: If the report cannot be written; its state is "failed" if that can still be written.
     """
-    chosen = parameters.choose_notebooks(names, notebooks)
-    values = parameters.parse_parameters(pairs, chosen)
-    for book in chosen:
-        if "profile" in parameters.declared_parameters(book):
-            values[book].setdefault("profile", profile)
+    chosen = execution.choose_notebooks(names, notebooks)
+    values = execution.parse_parameters(pairs, chosen, profile)
     report = _Report(_new_folder(runs, profile), chosen, profile, dict(pairs))
     width = max(len(book.stem) for book in chosen)
     try:
@@ -193,7 +190,7 @@ class _Report:
             "weights": files.digest(paths.MODELS / "default.safetensors"),
             "versions": execution.versions(),
             "notebooks": [
-                {"name": book.stem, "title": parameters.title_of(book), "state": "pending", "seconds": None, "failure": None,
+                {"name": book.stem, "title": execution.title_of(book), "state": "pending", "seconds": None, "failure": None,
                  "page": None, "executed": None, "left_out": None, "verdict": None, "reasons": []}
                 for book in notebooks
             ],

@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 from lib import files, paths
 from lib.parallel import run_jobs
 from lib.provenance import Provenance, machine
-from lib.workbench import execution, parameters, results
+from lib.workbench import execution, results
 
 
 def main(argv: Sequence[str]) -> int:
@@ -41,12 +41,12 @@ def main(argv: Sequence[str]) -> int:
     where.add_argument("--workers", type=int, metavar="N", help="runs at a time on this machine (default: one a core)")
     where.add_argument("--scheduler", metavar="ADDRESS", help="a running Dask scheduler, such as tcp://10.0.0.1:8786")
     add("--record", action="store_true", help="also write data/results/NOTEBOOK.csv and .json")
-    add("--cell-timeout", dest="cell_timeout_s", type=parameters.positive, metavar="S", help="longest time of one cell")
+    add("--cell-timeout", dest="cell_timeout_s", type=execution.positive, metavar="S", help="longest time of one cell")
     add("--runs", type=Path, default=paths.RUNS, metavar="FOLDER", help="where sweeps/ appears")
     options = parser.parse_args(argv)
     if options.workers is not None and options.workers < 1:
         parser.error("--workers: at least 1.")
-    options.grid = {name: parameters.split_values(values) for name, values in options.grid}
+    options.grid = {name: execution.split_values(values) for name, values in options.grid}
     table, failures = sweep(**vars(options))
     for point, failure in failures.items():
         print(f"FAILED {point or 'the run'}: {failure}", file=sys.stderr)
@@ -72,14 +72,14 @@ def sweep(
     Raises:
         ValueError: For an unknown notebook or parameter, a value of the wrong type, or a parameter without values.
     """
-    chosen = parameters.choose_notebooks([name], notebooks)
-    grid = grid or parameters.declared_grid(chosen[0])
+    chosen = execution.choose_notebooks([name], notebooks)
+    grid = grid or execution.declared_grid(chosen[0])
     if len(chosen) != 1 or not all(grid.values()):
         raise ValueError("a sweep takes one notebook, and values for each parameter: -p NAME VALUE,VALUE,...")
     book = chosen[0]
-    parse = parameters.parse_parameters
+    parse = execution.parse_parameters
+    profile = parse([], [book])[book]
     parsed = {key: [parse([(key, text)], [book])[book][key] for text in texts] for key, texts in grid.items()}
-    profile = {"profile": "quick"} if "profile" in parameters.declared_parameters(book) else {}
     folder = runs.resolve() / "sweeps" / f"{book.stem}-{_code_digest(book)}"
     folder.mkdir(parents=True, exist_ok=True)
     words = ["sweep", name, *itertools.chain(*(("-p", key, ",".join(values)) for key, values in grid.items()))]
