@@ -139,14 +139,14 @@ class Recording:
             raise FileNotFoundError(f"{folder}: no such recording folder.")
         header = _read_header(folder / "recording.toml")
         size, skeleton = header["image_size_px"], header["skeleton"]
-        left, right = (open_side(folder, side, size, header["bit_depth"]) for side in ("left", "right"))
-        if len(left) != len(right):
-            raise ValueError(f"{folder}: {len(left)} left and {len(right)} right frames; they come in pairs.")
-        if not len(left):
+        (n, left), (n_right, right) = (open_side(folder, side, size, header["bit_depth"]) for side in ("left", "right"))
+        if n != n_right:
+            raise ValueError(f"{folder}: {n} left and {n_right} right frames; they come in pairs.")
+        if not n:
             raise ValueError(f"{folder}: the recording is empty; it has no frame.")
-        time_s, path = np.arange(len(left)) / header["fps"], folder / "frames.csv"
+        time_s, path = np.arange(n) / header["fps"], folder / "frames.csv"
         if path.exists():
-            time_s = read_table(path, ["frame", "time_s"], n_frames=len(left))[:, 1]
+            time_s = read_table(path, ["frame", "time_s"], n_frames=n)[:, 1]
             refuse(path, ~(np.diff(time_s, prepend=-np.inf) > 0), _ORDER)
         frames = Frames(left, right, time_s)
         kinematics = _read_kinematics(folder / "kinematics.csv", skeleton)
@@ -156,8 +156,8 @@ class Recording:
             what = f"the frames ({seen}, robot clock) and kinematics.csv ({told}) do not overlap"
             raise ValueError(f"{folder}: {what}; check time_s (seconds) and offset_s.")
         path = folder / "annotations.json"
-        annotations = read_coco(path, len(frames), size, skeleton) if path.exists() else None
-        known = Truth.read(folder / "truth", len(frames)) if truth and (folder / "truth").is_dir() else None
+        annotations = read_coco(path, n, size, skeleton) if path.exists() else None
+        known = Truth.read(folder / "truth", n) if truth and (folder / "truth").is_dir() else None
         made = cls(folder=folder, frames=frames, kinematics=kinematics, annotations=annotations, truth=known, **header)
         for doubt in made.doubts:
             place = shlex.quote(re.sub(r"\.\d+-\w+\.partial$", "", str(folder)))  # where `RecordingWriter` moves it
