@@ -51,12 +51,14 @@ def import_recording(source: str | Path, mapping: str | Path, out: str | Path, *
     first = next(stereo.pairs())[0]
     size = first.shape[1], first.shape[0]
     labels = read_labels(folder, told.labels, stereo, told.landmarks, size) if told.labels else None
-    frames_s = time_s + offset_s + (0.0 if labels is None else _delay(labels, told.readout_s, size[1]))
+    frames_s = time_s + offset_s
+    if labels is not None:  # the mean instant at which the rows of a frame's labels were read
+        y = np.hstack([labels.u_left[..., 1], labels.u_right[..., 1]])
+        mean = np.nansum(y - (size[1] - 1) / 2, axis=1) / np.maximum(np.isfinite(y).sum(axis=1), 1)
+        frames_s += told.readout_s * mean / (size[1] - 1)
     x_mm, tool_told = _landmarks(told, robot, robot_s, frames_s, labels, float(robot_zero))
-    if told.video.fps is None:
-        fps = round(1 / float(np.median(np.diff(time_s))) if len(time_s) > 1 else 25.0, 6)
-    else:
-        fps = told.video.fps / told.video.every
+    usual_fps = round(1 / float(np.median(np.diff(time_s))) if len(time_s) > 1 else 25.0, 6)
+    fps = usual_fps if told.video.fps is None else told.video.fps / told.video.every
     writer = RecordingWriter(
         out, name=told.name, description=told.description, fps=fps, image_size_px=size, readout_s=told.readout_s,
         offset_s=offset_s, robot_accuracy_mm=told.robot_accuracy_mm, skeleton=told.landmarks, overwrite=overwrite,
@@ -81,13 +83,6 @@ def import_recording(source: str | Path, mapping: str | Path, out: str | Path, *
     except ValueError as error:  # of the unfinished recording, which is gone: its place says more
         raise ValueError(str(error).replace(str(writer.folder), str(out))) from None
     return report
-
-
-def _delay(labels: Annotations, readout_s: float, height_px: int) -> np.ndarray:
-    """(n,) s from a frame's time to the mean instant at which the rows of its labels were read."""
-    y = np.hstack([labels.u_left[..., 1], labels.u_right[..., 1]])
-    mean = np.nansum(y - (height_px - 1) / 2, axis=1) / np.maximum(np.isfinite(y).sum(axis=1), 1)
-    return readout_s * mean / (height_px - 1)
 
 
 def _clock(draft: Recording, search_s: float) -> TimeOffset | str:

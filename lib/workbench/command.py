@@ -15,7 +15,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from PIL import Image
-from tqdm import tqdm
 
 from lib import files, paths
 from lib.provenance import commit, machine
@@ -123,14 +122,7 @@ def run(
                 label, start = f"[{number + 1}/{len(chosen)}] {book.stem:<{width}}", time.monotonic()
                 report.content["notebooks"][number]["state"] = "running"
                 report.write()
-                with tqdm(desc=label, unit="cell", leave=False, disable=not sys.stderr.isatty()) as bar:
-
-                    def on_cell(cell: int, n_cells: int, bar: tqdm = bar) -> None:
-                        bar.total, bar.n = n_cells, cell
-                        bar.refresh()
-
-                    options = {"cell_timeout_s": cell_timeout_s, "on_cell": on_cell}
-                    failure = execute(book, report.folder / book.name, values[book], **options)
+                failure = execute(book, report.folder / book.name, values[book], cell_timeout_s=cell_timeout_s, label=label)
                 seconds = time.monotonic() - start
                 report.end(number, failure, seconds)
                 print(f"{label}  {seconds:6.1f} s  {'failed' if failure else 'done'}", flush=True)
@@ -220,10 +212,15 @@ class _Report:
                 if any(other["file"] == file for other in content["figures"]):
                     file = f"figures/{book.stem}.{named['name']}{suffix}"
                 files.write_bytes(self.folder / file, data)
-                content["figures"].append(
-                    {"notebook": book.stem, "name": named["name"], "file": file, "caption": named["caption"]}
-                )
-            self._write_page(number)
+                content["figures"].append({"notebook": book.stem, **named, "file": file})
+            before, after = ([None, *content["notebooks"], None][k] for k in (number, number + 2))
+            text = pages.page(executed, book.parent, entry, previous=before, following=after)
+            if pages.PLOTLY_FILE in text and not (self.folder / pages.PLOTLY_FILE).exists():
+                import plotly
+
+                shutil.copy(Path(plotly.__file__).parent / "package_data" / pages.PLOTLY_FILE, self.folder)
+            files.write_text(self.folder / f"{book.stem}.html", text)
+            entry |= {"page": f"{book.stem}.html", "executed": book.name}
         self.write()
 
     def finish(self, state: str | None = None) -> None:
@@ -247,20 +244,6 @@ class _Report:
         self.content["seconds"] = round(time.monotonic() - self.start, 2)
         files.write_json(self.folder / "metrics.json", self.content)
         files.write_text(self.folder / "index.html", pages.index_html(self.content))
-
-    def _write_page(self, number: int) -> None:
-        book, entry = self.notebooks[number], self.content["notebooks"][number]
-        pages_of = [None, *((f"{other['name']}.html", other["title"]) for other in self.content["notebooks"]), None]
-        text = pages.page(
-            self.folder / book.name, title=entry["title"], folder=book.parent, verdict=entry,
-            previous=pages_of[number], following=pages_of[number + 2],
-        )  # fmt: skip
-        if pages.PLOTLY_FILE in text and not (self.folder / pages.PLOTLY_FILE).exists():
-            import plotly
-
-            shutil.copy(Path(plotly.__file__).parent / "package_data" / pages.PLOTLY_FILE, self.folder)
-        files.write_text(self.folder / f"{book.stem}.html", text)
-        entry.update(page=f"{book.stem}.html", executed=book.name)
 
 
 def _new_folder(runs: Path, profile: str) -> Path:

@@ -8,7 +8,8 @@ import math
 import os
 import platform
 import re
-from collections.abc import Callable, Iterable, Sequence
+import sys
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from importlib.metadata import distributions
 from pathlib import Path
@@ -155,30 +156,28 @@ class Failure(NamedTuple):
 
 
 def execute(
-    notebook: Path, output: Path, parameters: dict, *, cell_timeout_s: float | None = None,
-    on_cell: Callable[[int, int], None] = lambda cell, n_cells: None,
-) -> Failure | None:  # fmt: skip
+    notebook: Path, output: Path, parameters: dict, *, cell_timeout_s: float | None = None, label: str = ""
+) -> Failure | None:
     """Execute `notebook` into `output` (written after each cell); None if every cell came to its end.
 
-    `on_cell` is called with the cell that starts (from 1) and the number of cells.
+    With a `label` a terminal shows how many cells are done.
     """
     import papermill
     from papermill.exceptions import PapermillExecutionError
 
-    running, cells = 0, len(nbformat.read(notebook, as_version=4).cells)
+    running = 0
 
     def on_cell_start(cell, cell_index):
         nonlocal running
         running += not _is_added(cell)
-        on_cell(running, cells)
 
     os.environ.pop("JUPYTER_PATH", None)
     os.environ.update(_KERNEL_ENVIRONMENT)
     logging.getLogger("papermill").setLevel(logging.CRITICAL)  # what it says is told by the failure returned
     try:
         papermill.execute_notebook(
-            str(notebook), str(output), parameters, kernel_name="python3", progress_bar=False,
-            execution_timeout=cell_timeout_s,
+            str(notebook), str(output), parameters, kernel_name="python3", execution_timeout=cell_timeout_s,
+            progress_bar={"desc": label, "leave": False, "disable": not (label and sys.stderr.isatty())},
             start_timeout=600,  # of the kernel: a busy machine takes its time
             on_cell_start=on_cell_start,  # this and the next are for nbclient
             extra_arguments=["--IPKernelApp.log_level=50"],  # its warning of unencrypted TCP on every start

@@ -96,13 +96,10 @@ def markdown_html(source: str, *, folder: Path = Path(), attachments: dict | Non
     return MarkdownWithMath(renderer=renderer).render(source)
 
 
-def page(
-    executed: Path, *, title: str, folder: Path, verdict: dict, previous: tuple[str, str] | None,
-    following: tuple[str, str] | None,
-) -> str:  # fmt: skip
-    """The HTML of an executed notebook whose source lies in `folder`, with its `verdict` and `reasons` on top.
+def page(executed: Path, folder: Path, entry: dict, *, previous: dict | None, following: dict | None) -> str:
+    """The HTML of an executed notebook whose source lies in `folder`.
 
-    `previous` and `following` are (file, title) of the neighbouring pages.
+    `entry` is what metrics.json says of it; `previous` and `following` are the entries of its neighbours.
     """
 
     @pass_context
@@ -119,8 +116,8 @@ def page(
     exporter.config.NbConvertBase.display_data_priority = _RICHEST_FIRST
     body, _ = exporter.from_notebook_node(nbformat.read(executed, as_version=4))
     return rendered(
-        "page.html", title=title, body=body, contents=_HEADING.findall(body), content=verdict, previous=previous,
-        following=following, plotly_file=PLOTLY_FILE if 'class="plotly-view"' in body else None,
+        "page.html", body=body, contents=_HEADING.findall(body), content=entry, previous=previous, following=following,
+        plotly_file=PLOTLY_FILE if 'class="plotly-view"' in body else None,
     )  # fmt: skip
 
 
