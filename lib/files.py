@@ -14,11 +14,8 @@ from pathlib import Path
 def whole(path: str | Path) -> Iterator[Path]:
     """Yield a partial path beside `path`; when the block ends well, what was written there takes the place of `path`.
 
-    The partial file keeps the suffix, since many writers choose the format by it.  On any error (a full disk above all)
-    it is removed and the file that was there stays.
-
-    Raises:
-        OSError: If nothing was written, or the disk is full.
+    The partial file keeps the suffix, since many writers choose the format by it.  On any error (a full disk, or nothing
+    was written) it is removed and the file that was there stays.
 
     >>> import tempfile
     >>> target = Path(tempfile.mkdtemp()) / "points.csv"

@@ -19,10 +19,7 @@ _CODE = ("lib", "notebooks", "tests", "environment.toml")
 
 
 def commit(root: Path = paths.ROOT) -> dict | None:
-    """The checked-out commit, as {"id": ..., "modified": ...}; None outside a git checkout.
-
-    `modified` is true if the code (lib, notebooks, tests, environment.toml) differs from the commit.
-    """
+    """The checked-out commit, {"id": ..., "modified": whether the code differs from it}; None outside a git checkout."""
     git = ["git", "-C", str(root)]
     try:
         head = subprocess.run([*git, "rev-parse", "HEAD"], capture_output=True, text=True, check=True)
@@ -58,10 +55,7 @@ class Provenance:
         self.wall_s, self.cpu_s = time.perf_counter(), sum(os.times()[:4])
 
     def so_far(self) -> dict[str, object]:
-        """What is known now, as `lib.workbench.results.write` takes it.
-
-        CPU seconds count finished child processes too; `weights` is the digest of the detector that ships.
-        """
+        """What is known now, as `lib.workbench.results.write` takes it; CPU seconds count finished child processes too."""
         return {
             "command": self.command, "commit": self.commit, "machine": machine(),
             "weights": files.digest(paths.MODELS / "default.safetensors"), "date": datetime.date.today().isoformat(),

@@ -76,7 +76,7 @@ def import_recording(source: str | Path, mapping: str | Path, out: str | Path, *
             if isinstance(clock, TimeOffset):
                 draft = writer.draft(clock.offset_s)
                 found = {"offset_s": round(clock.offset_s, 9), "sd_s": float(f"{clock.sd_s:.3g}")}
-            did = _did(told, stereo, robot, draft, clock, zeros)
+            did = _did(told, stereo, draft, clock, zeros)
             report = {"format": "microstereo.import", "did": did, "clock": found}
             report |= {"tool": tool_told, "mapping": told.model_dump(mode="json"), "sources": _sources(folder, told, stereo)}
             files.write_json(writer.folder / "import.json", report)
@@ -110,8 +110,8 @@ def _landmarks(
     """The robot's landmarks (m, k, 3) mm, and, where it reports poses, what is told of the tool."""
     if robot.R is None:
         return robot.x_mm, None
-    known = np.isfinite(robot.R).all(axis=(1, 2)) & np.isfinite(robot.t_mm).all(axis=1)
-    poses = [RigidTransform(R, t) for R, t in zip(robot.R[known], robot.t_mm[known], strict=True)]
+    known = np.isfinite(np.hstack([robot.R, robot.x_mm])).all(axis=(1, 2))
+    poses = [RigidTransform(R, t) for R, t in zip(robot.R[known], robot.x_mm[known, 0], strict=True)]
     opening = None if robot.opening_rad is None else robot.opening_rad[known]
     tool, sd = _tool(told, poses, robot_s[known], opening, frames_s, labels, zero_s)
     x = np.full((len(known), len(told.landmarks), 3), np.nan)
@@ -156,12 +156,7 @@ def _tool(
 
 
 def _did(
-    told: Mapping,
-    stereo: StereoSource,
-    robot: RobotLog,
-    draft: Recording,
-    clock: TimeOffset | str | None,
-    zeros: list[Decimal],
+    told: Mapping, stereo: StereoSource, draft: Recording, clock: TimeOffset | str | None, zeros: list[Decimal]
 ) -> list[str]:
     """What the import did, one plain sentence each."""
     time_s, (width, height) = draft.frames.time_s, draft.image_size_px
@@ -177,7 +172,7 @@ def _did(
     pair = draft.frames[0]
     if all(np.array_equal(image[..., 0], image[..., k]) for image in (pair.left, pair.right) for k in (1, 2)):
         said.append("The frames are grey; the detector learnt on colour, so look at what it finds.")
-    x, kind = draft.kinematics.x_mm, "its landmarks" if robot.R is None else "the pose of its tool"
+    x, kind = draft.kinematics.x_mm, "its landmarks" if told.robot.pose is None else "the pose of its tool"
     gaps = int(np.isnan(x[..., 0]).any(axis=1).sum())
     said.append(f"{len(x)} samples of the robot, which reports {kind}; {gaps} have gaps.")
     said += [f"Times of the {what} count from {z} s." for what, z in zip(("video", "robot"), zeros, strict=True) if z]

@@ -1,12 +1,12 @@
 """Labelled landmarks from COCO, CVAT, Label Studio, DeepLabCut and SLEAP, as annotations of a recording's frames."""
 
 import json
-import zipfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 from xml.etree import ElementTree
 from xml.etree.ElementTree import ParseError
+from zipfile import BadZipFile, ZipFile
 
 import h5py
 import numpy as np
@@ -91,7 +91,7 @@ def labels_of(kind: str, path: Path) -> Iterator[Label]:
         raise FileNotFoundError(f"{path}: no such file; the mapping names it as labels.")
     try:
         yield from read(path)
-    except (ValueError, LookupError, TypeError, AttributeError, RecursionError, ParseError, OSError) as error:
+    except (ValueError, LookupError, TypeError, AttributeError, RuntimeError, ParseError, BadZipFile, OSError) as error:
         if isinstance(error, ValueError) and str(path) in str(error):
             raise
         raise ValueError(f"{path}: not {what} ({type(error).__name__}: {error}). Export the labels again.") from None
@@ -119,16 +119,13 @@ def _cvat(path: Path) -> Iterator[Label]:
 
 
 def _from_zip(path: Path, name: str) -> str:
-    try:
-        with zipfile.ZipFile(path) as archive:
-            for entry in archive.namelist():  # nothing is unpacked; such a file is still no export of a label tool
-                if entry.startswith("/") or ".." in PurePosixPath(entry.replace("\\", "/")).parts or ":" in entry:
-                    raise ValueError(f"{path}: it holds {entry!r}, which leads out of the folder. Export it again.")
-            if archive.getinfo(name).file_size > _LARGEST_BYTES:
-                raise ValueError(f"{path}: {name} unpacks to over {_LARGEST_BYTES >> 20} MB. Export fewer frames.")
-            return archive.read(name).decode("utf-8-sig")
-    except (zipfile.BadZipFile, NotImplementedError, RuntimeError) as error:
-        raise ValueError(f"{path}: not a readable zip file ({error}). Export it again.") from None
+    with ZipFile(path) as archive:
+        for entry in archive.namelist():  # nothing is unpacked; such a file is still no export of a label tool
+            if entry.startswith("/") or ".." in PurePosixPath(entry.replace("\\", "/")).parts or ":" in entry:
+                raise ValueError(f"{path}: it holds {entry!r}, which leads out of the folder. Export it again.")
+        if archive.getinfo(name).file_size > _LARGEST_BYTES:
+            raise ValueError(f"{path}: {name} unpacks to over {_LARGEST_BYTES >> 20} MB. Export fewer frames.")
+        return archive.read(name).decode("utf-8-sig")
 
 
 def _label_studio(path: Path) -> Iterator[Label]:

@@ -22,16 +22,12 @@ _EMPTY = {"nan", "NaN", "NAN", "null", "None", "NA"}
 
 @dataclass(frozen=True, eq=False)
 class RobotLog:
-    """What a robot's log says: exact times (m,), and either `x_mm` (m, k, 3) or a pose R (m, 3, 3), t_mm (m, 3) of the tool.
-
-    `opening_rad` (m,) is the full angle between the jaws, None without a gripper.
-    """
+    """What a robot's log says: exact times (m,) and positions (m, k, 3) of the landmarks, or (m, 1, 3) of the tool's pose."""
 
     time: list[Decimal]
-    x_mm: np.ndarray | None = None
-    R: np.ndarray | None = None
-    t_mm: np.ndarray | None = None
-    opening_rad: np.ndarray | None = None
+    x_mm: np.ndarray
+    R: np.ndarray | None = None  # (m, 3, 3) of the tool's pose
+    opening_rad: np.ndarray | None = None  # (m,) full angle between the jaws
 
 
 def exact_seconds(text: str, unit: str, where: str) -> Decimal:
@@ -177,10 +173,10 @@ def read_robot(folder: Path, mapping: Mapping) -> RobotLog:
         what = f"with length_unit = {robot.length_unit!r} the tool moves over {spread_mm:.3g} mm"
         raise ValueError(f"{path}: {what}; 0.05 to 2000 mm is plausible. Check length_unit: m, mm or um.")
     if pose is None:
-        return RobotLog(time, x_mm=x)
+        return RobotLog(time, x)
     R = turn @ _rotations(path, pose, np.stack([columns[name] for name in pose.rotation], axis=-1))
     opening = _opening(path, mapping, columns[pose.gripper]) if pose.gripper else None
-    return RobotLog(time, R=R, t_mm=x[:, 0], opening_rad=opening)
+    return RobotLog(time, x, R, opening)
 
 
 def _opening(path: Path, mapping: Mapping, opening: np.ndarray) -> np.ndarray:

@@ -266,12 +266,10 @@ def _read_kinematics(path: Path, landmarks: Sequence[str]) -> Kinematics:
 
 
 class RecordingWriter:
-    """Context manager that writes a recording beside its final place and moves it there when it is valid.
-
-    `python3 -m lib check FOLDER` then says whether it is fit for use.
+    """Context manager that writes a recording beside its final place, and moves it there when it is valid.
 
     Args:
-        folder: Where the recording appears.  Until then its files lie beside it, in a folder ending with ``.partial``.
+        folder: Where the recording appears.
         image_size_px: (width, height).
         skeleton: Names of the landmarks.
         details: Own notes (numbers and text), kept in ``[details]`` of recording.toml.

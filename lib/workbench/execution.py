@@ -46,8 +46,6 @@ def choose_notebooks(names: Sequence[str] = (), folder: Path = paths.NOTEBOOKS) 
     """
     shipped = sorted(folder.glob("[0-9]*.ipynb"))
     if not names:
-        if not shipped:
-            raise ValueError(f"{folder} holds no notebooks.")
         return shipped
     studies = sorted(folder.glob("studies/*.ipynb"))
     chosen = []
@@ -86,8 +84,7 @@ def split_values(text: str) -> list[str]:
 def parse_parameters(pairs: Sequence[tuple[str, str]], notebooks: Sequence[Path], profile: str = "quick") -> dict[Path, dict]:
     """What each notebook is given: the pairs that it declares, and the profile, as values of the declared type.
 
-    Raises:
-        ValueError: If no chosen notebook declares a name, or a text does not fit the declared type.
+    A ValueError if no chosen notebook declares a name, or a text does not fit the declared type.
     """
     declared = {notebook: declared_parameters(notebook) for notebook in notebooks}
     known = {name for names in declared.values() for name in names}

@@ -44,10 +44,7 @@ _REWRITES = [
 
 @lru_cache(maxsize=4096)
 def equation_svg(tex: str, *, display: bool) -> str:
-    """An equation as inline SVG in HTML, on the line of the text; its TeX is the alternative text.
-
-    TeX that the converter cannot read is shown as it is.
-    """
+    """An equation as inline SVG in HTML, on the line of the text; TeX that the converter cannot read is shown as it is."""
     import ziamath  # not at the top: it takes half a second, and few commands need it
     from ziamath.tex import tex2mml
 
@@ -85,10 +82,7 @@ class _Renderer(IPythonRenderer):
 
 
 def markdown_html(source: str, *, folder: Path = Path(), attachments: dict | None = None, trusted: bool = True) -> str:
-    """Markdown with TeX as HTML; pictures it names, relative to `folder`, are embedded.
-
-    HTML in text that is not `trusted`, such as a caption that names a recording, is escaped.
-    """
+    """Markdown with TeX as HTML, with pictures that it names relative to `folder`; HTML that is not `trusted` is escaped."""
     renderer = _Renderer(
         escape=not trusted, allow_harmful_protocols=trusted, embed_images=True, path=str(folder),
         attachments=attachments or {},

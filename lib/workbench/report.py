@@ -54,9 +54,6 @@ def record(name: str, value: float, unit: str, *, paper: float | None = None, no
         unit: ``"px"``, ``"mm"``, ``"um"``, ``"s"``, ``"%"``, ...; ``""`` for a pure number.
         paper: The paper's value in the same unit, where it states one.
         note: What a reader must know to judge the number: the data, the number of samples.
-
-    Raises:
-        ValueError: For a name that is not snake case, or a value that is not a number.
     """
     theirs = None if paper is None else _number(paper, "paper")
     metric = {"name": _checked_name(name), "value": _number(value, "value"), "unit": unit, "paper": theirs, "note": note}
@@ -81,12 +78,10 @@ def rendered(template: str, **values: object) -> str:
 
 
 def show(figure: Figure, name: str, caption: str) -> None:
-    """Display a matplotlib figure with its caption, named for the run's ``figures/``, and close it.
-
-    It is an SVG where that is small, which what holds an image never is, and else a PNG.
+    """Display a matplotlib figure with its caption and close it; an SVG where that is small and holds no image, else a PNG.
 
     Args:
-        name: Lower-case snake case that starts with the stage; the file's name in ``figures/``.
+        name: Lower-case snake case that starts with the stage; the file's name in the run's ``figures/``.
         caption: One line: what the reader sees, and what to look at.
     """
     import matplotlib.pyplot as plt
@@ -127,10 +122,7 @@ def timed(stage: str) -> Iterator[None]:
 
 
 def stop(reason: str) -> NoReturn:
-    """End the notebook in good order: the report counts it as complete, says why, and leaves the cells that follow out.
-
-    `reason` says in full sentences what is left out, why, and what to do.
-    """
+    """End the notebook in good order, as complete; `reason` says in full sentences what is left out, why, and what to do."""
     _publish({"text/html": rendered("caption.html", text=reason), "text/plain": reason}, {STOP_METADATA: reason})
     raise _End
 

@@ -68,9 +68,6 @@ def sweep(
 
     Returns:
         tuple: ``results.csv`` (a row a run: its parameters, then its metrics), and what failed at which point.
-
-    Raises:
-        ValueError: For an unknown notebook or parameter, a value of the wrong type, or a parameter without values.
     """
     chosen = execution.choose_notebooks([name], notebooks)
     grid = grid or execution.declared_grid(chosen[0])
@@ -159,9 +156,8 @@ def run_point(executed: Path, book: Path, values: dict, cell_timeout_s: float | 
             text = [f"{book.name} with {_label(values)}", str(failure)]
             if partial.exists():
                 shutil.copy(partial, failed)
-                for cell in nbformat.read(failed, as_version=4).cells:
-                    for output in cell.get("outputs", []):
-                        text.append(output.get("text") or "\n".join(output.get("traceback", [])))
+                outputs = [out for cell in nbformat.read(failed, as_version=4).cells for out in cell.get("outputs", [])]
+                text += [output.get("text") or "\n".join(output.get("traceback", [])) for output in outputs]
             files.write_text(log, "\n".join(text) + "\n")
             raise RunFailed(str(failure))
         notebook = nbformat.read(partial, as_version=4)
