@@ -102,7 +102,7 @@ def _numbers(cells: list[str], decimal: str) -> np.ndarray:
 def _time(columns: dict[str, list[str]], decimal: str) -> dict[str, str]:
     """The column of the times and their unit, by its name, or else by its steps: rows come 1 ms to 3 s apart."""
     time = next(filter(_TIME.search, columns), next(iter(columns)))
-    if ":" in "".join(columns[time][:1]):
+    if any(":" in cell for cell in columns[time][:1]):
         return {"time": time, "time_unit": "iso"}
     if match := _UNIT.search(time):
         return {"time": time, "time_unit": match[1].lower()}

@@ -149,7 +149,7 @@ def open_stereo(folder: Path, video: Video) -> StereoSource:
     kept = [pair for pair in index[:: video.every] if (video.start_s or 0) <= times[0][pair[0]] - start <= end_s]
     if not kept:
         raise ValueError(f"{folder}: no frame lies between start_s and end_s; the video lasts {times[0][-1] - start} s.")
-    index, dropped = np.array(kept), sum(map(len, times)) - len(reels) * len(index)
+    dropped, index = sum(map(len, times)) - len(reels) * len(index), np.array(kept)
     time = [times[0][i] for i in index[:, 0]]
     return StereoSource(reels, video, index, time, video.bit_depth or _bit_depth(reels, index), dropped)
 

@@ -9,7 +9,6 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import NamedTuple, Self
 
 import cv2
@@ -78,8 +77,7 @@ class Kinematics:
             raise ValueError(f"time_s: expected (n,) or (n, {k}), got {time.shape}.")
         x = np.empty((*time.shape, 3))
         for landmark, axis in np.ndindex(k, 3):  # exactly on a sample, a dropped neighbour has no effect
-            report = self.time_s, self.x_mm[:, landmark, axis]
-            x[:, landmark, axis] = np.interp(time[:, landmark], *report, left=np.nan, right=np.nan)
+            x[:, landmark, axis] = np.interp(time[:, landmark], self.time_s, self.x_mm[:, landmark, axis], np.nan, np.nan)
         if len(self.time_s) > 1:
             step = np.diff(self.time_s)
             before = np.clip(np.searchsorted(self.time_s, time, side="right") - 1, 0, len(step) - 1)
@@ -320,7 +318,7 @@ class RecordingWriter:
             (self.folder / side).mkdir(parents=True)
         return self
 
-    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(self, kind: type | None, *_: object) -> None:
         try:
             if kind is None:
                 self._finish()

@@ -30,9 +30,7 @@ README_FIGURES = ("overview", "landmark_detection", "reconstruction_surface", "c
 
 def main(argv: Sequence[str]) -> int:
     """Parse the command line and run: 0 if every notebook came to its end, 1 if one failed, 128 + n for signal n."""
-    parser = argparse.ArgumentParser(
-        "python3 -m lib run", description="Execute notebooks; report into runs/<date>-<profile>/."
-    )
+    parser = argparse.ArgumentParser("python3 -m lib run", description="Execute notebooks; report in runs/<date>-<profile>/.")
     add = parser.add_argument
     add("notebooks", nargs="*", metavar="NOTEBOOK", help="path, name or number (default: all)")
     add("--profile", choices=("quick", "paper"), default="quick", help="quick: minutes; paper: the paper's sizes")
@@ -56,9 +54,7 @@ def main(argv: Sequence[str]) -> int:
 
 def main_site(argv: Sequence[str]) -> int:
     """Copy the pages of a run into a folder that a web server shows as it is."""
-    parser = argparse.ArgumentParser(
-        "python3 -m lib site", description="Make a static site of a run, such as for GitHub Pages."
-    )
+    parser = argparse.ArgumentParser("python3 -m lib site", description="Make a static site of a run, as for GitHub Pages.")
     parser.add_argument("run", nargs="?", type=Path, metavar="RUN", help="its folder (default: the last complete one)")
     parser.add_argument("--out", type=Path, default=paths.ROOT / "site", metavar="FOLDER", help="a new folder")
     parser.add_argument("--gallery", action="store_true", help="renew the README's pictures in data/gallery instead")
