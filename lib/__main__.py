@@ -11,6 +11,7 @@ import shutil
 import subprocess
 import sys
 import warnings
+from functools import partial
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -124,26 +125,23 @@ def _pytest(argv: list[str]) -> int:
     return subprocess.call(command, env=keep | os.environ)
 
 
-def _main_of(name: str, module: str, function: str):
-    """The command `name`: a function of a module.  An error that a user can mend is told in one line, without a traceback."""
-
-    def command(argv: list[str]) -> int:
-        usual = warnings.formatwarning
-        warnings.formatwarning = lambda message, kind, *place, **line: (  # a user has no use for the line of code
-            f"Warning: {message}\n" if kind is UserWarning else usual(message, kind, *place, **line)
-        )
-        try:
-            if module in ("lib.commands", "lib.trust.check", "lib.adapt.report"):  # they detect in a recording
-                _keep_detections()
-            return getattr(importlib.import_module(module), function)(argv)
-        except KeyboardInterrupt:
-            print("\nStopped; start again to go on.", file=sys.stderr)
-            return 130
-        except (OSError, ValueError) as error:
-            print(f"python3 -m lib {name}: {error}", file=sys.stderr)
-            return 2
-
-    return command
+def _call(name: str, argv: list[str]) -> int:
+    """The command `name` of `FUNCTIONS`.  An error that a user can mend is told in one line, without a traceback."""
+    module, function = FUNCTIONS[name]
+    usual = warnings.formatwarning
+    warnings.formatwarning = lambda message, kind, *place, **line: (  # a user has no use for the line of code
+        f"Warning: {message}\n" if kind is UserWarning else usual(message, kind, *place, **line)
+    )
+    try:
+        if module in ("lib.commands", "lib.trust.check", "lib.adapt.report"):  # they detect in a recording
+            _keep_detections()
+        return getattr(importlib.import_module(module), function)(argv)
+    except KeyboardInterrupt:
+        print("\nStopped; start again to go on.", file=sys.stderr)
+        return 130
+    except (OSError, ValueError) as error:
+        print(f"python3 -m lib {name}: {error}", file=sys.stderr)
+        return 2
 
 
 def _keep_detections() -> None:
@@ -181,7 +179,7 @@ FUNCTIONS = {
     "evaluate": ("lib.training.command", "main_evaluate"),
     "adapt": ("lib.adapt.report", "main"),
 }
-COMMANDS = {"test": test, "bench": bench, "lab": lab, **{name: _main_of(name, *FUNCTIONS[name]) for name in FUNCTIONS}}
+COMMANDS = {"test": test, "bench": bench, "lab": lab, **{name: partial(_call, name) for name in FUNCTIONS}}
 
 if __name__ == "__main__":
     sys.exit(main(sys.argv[1:]))

@@ -1,8 +1,7 @@
 """Makes and checks ``.venv``: the environment that every command of the workbench runs in.
 
-Standard library only, since it runs on a bare Python.  `ensure` compares a stamp, written when the environment was
-complete, with environment.toml and its lock; if they agree it does nothing else.  A half-made environment has no
-such stamp and is made anew.  One process makes it while others wait.
+Standard library only, since it runs on a bare Python.  `ensure` compares a stamp of the complete environment with
+environment.toml and its lock.  A half-made environment is made anew.  One process makes it while others wait.
 """
 
 from __future__ import annotations
@@ -47,22 +46,15 @@ def python_of(venv: Path) -> Path:
 
 
 def ensure(root: Path = ROOT, torch: str | None = None) -> Path:
-    """The interpreter of a complete ``.venv``, made, repaired or brought up to date first where need be.
+    """The interpreter of a complete ``.venv`` in `root`, made, repaired or brought up to date first, or a `Problem`.
 
-    Args:
-        root: Folder of environment.toml; ``.venv`` lies in it.
-        torch: ``"cpu"`` or ``"cuda"``; None keeps the build that is installed, or picks by whether there is an NVIDIA
-            GPU.
-
-    Raises:
-        Problem: If it cannot be made: no venv module, too little disk, no network.
+    `torch` is ``"cpu"`` or ``"cuda"``; None keeps the build that is installed, or picks by whether there is an NVIDIA GPU.
     """
-    venv = root / ".venv"
     if not _is_ready(root, torch):
         with _sole_maker(root) as lock_file:
             if not _is_ready(root, torch):  # another process may have made it meanwhile
-                _make(root, venv, torch, lock_file)
-    return python_of(venv)
+                _make(root, torch, lock_file)
+    return python_of(root / ".venv")
 
 
 def lock(*, upgrade: bool) -> Path:
@@ -91,8 +83,8 @@ def lock(*, upgrade: bool) -> Path:
 
 
 def _digest(root: Path) -> str:
-    files = [root / "environment.toml", root / "lib" / "environment.lock"]
-    return hashlib.sha256(b"\0".join(file.read_bytes() for file in files)).hexdigest()
+    contents = [(root / name).read_bytes() for name in ("environment.toml", "lib/environment.lock")]
+    return hashlib.sha256(b"\0".join(contents)).hexdigest()
 
 
 def _read_stamp(venv: Path) -> dict:
@@ -116,10 +108,7 @@ def _is_ready(root: Path, torch: str | None) -> bool:
 
 @contextlib.contextmanager
 def _sole_maker(root: Path):
-    """Hold a lock while making the environment.
-
-    The installer inherits it: if this process is killed, the next one waits until the orphan has ended.
-    """
+    """Hold a lock, which the installer inherits: if this process is killed, the next waits until the orphan has ended."""
     with open(root / "lib" / "environment.lock", "rb") as file:
         waiting = False
         while True:
@@ -148,9 +137,9 @@ def _take(file) -> None:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
-def _make(root: Path, venv: Path, torch: str | None, lock_file) -> None:
-    workbench = manifest(root)["tool"]["workbench"]
-    stamp = _read_stamp(venv)
+def _make(root: Path, torch: str | None, lock_file) -> None:
+    settings, venv = manifest(root), root / ".venv"
+    workbench, stamp = settings["tool"]["workbench"], _read_stamp(venv)
     if venv.exists() and not stamp and any(venv.iterdir()):
         raise Problem(f"{venv} was not made by microstereo; move it away and start again.")
     torch = torch or stamp.get("torch") or ("cuda" if _has_nvidia_gpu() else "cpu")
@@ -170,8 +159,7 @@ def _make(root: Path, venv: Path, torch: str | None, lock_file) -> None:
         _install(venv, "packages", locked, lock_file, uv=shutil.which("uv"))
     except Problem:  # uv reads nothing of pip's configuration, such as a mirror
         _install(venv, "packages with pip", locked, lock_file)
-    pins = manifest(root)["project"]["dependencies"]
-    version = next(pin.split("==")[1] for pin in pins if pin.startswith("torch=="))
+    version = next(pin.split("==")[1] for pin in settings["project"]["dependencies"] if pin.startswith("torch=="))
     _install(venv, f"torch ({torch})", torch_arguments(version, torch, sys.platform, workbench["torch"]), lock_file)
     _write_site_files(root, venv)
     write_text(venv / _STAMP, json.dumps({"state": "ready", "digest": _digest(root), "torch": torch}))

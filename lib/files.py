@@ -14,11 +14,8 @@ from pathlib import Path
 def whole(path: str | Path) -> Iterator[Path]:
     """Yield a partial path beside `path`; when the block ends well, what was written there takes the place of `path`.
 
-    The partial file keeps the suffix, since many writers choose the format by it.  On any error (a full disk above all)
-    it is removed and the file that was there stays.
-
-    Raises:
-        OSError: If nothing was written, or the disk is full.
+    The partial file keeps the suffix, since many writers choose the format by it.  On any error (a full disk, or nothing
+    was written) it is removed and the file that was there stays.
 
     >>> import tempfile
     >>> target = Path(tempfile.mkdtemp()) / "points.csv"
@@ -52,25 +49,16 @@ def write_bytes(path: str | Path, data: bytes) -> None:
 
 
 def write_json(path: str | Path, value: object) -> None:
-    """Write `value` as readable JSON.
-
-    Raises:
-        ValueError: For NaN and infinity, for which JSON has no word; give None.
-    """
+    """Write `value` as readable JSON; NaN and infinity, for which it has no word, are a ValueError."""
     write_text(path, json.dumps(value, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
 
 
 def digest(*files: str | Path, length: int = 12) -> str:
-    """The first `length` hexadecimal digits of the SHA-256 of the files' contents, one after the other.
-
-    Raises:
-        FileNotFoundError: Naming the file.
-    """
+    """The first `length` hexadecimal digits of the SHA-256 of the files' contents, one after the other."""
     total = hashlib.sha256()
     for path in files:
         if not Path(path).is_file():
             raise FileNotFoundError(f"{path}: no such file.")
         with open(path, "rb") as file:
-            for block in iter(lambda: file.read(1 << 20), b""):
-                total.update(block)
+            hashlib.file_digest(file, lambda: total)
     return total.hexdigest()[:length]

@@ -30,24 +30,34 @@ def run_jobs(
         function: Importable (not a closure).  It makes `path` whole or not at all, as `lib.files.whole` does.
         workers: Processes on this machine, at most one a job; None is one a core.
         scheduler: Address of a running Dask scheduler, such as ``"tcp://10.0.0.1:8786"``, instead of processes on this
-            machine. Its workers need this environment and the same folders.
+            machine. Its workers need this environment and the same folders; if it does not answer, a ConnectionError.
         title, unit, progress: Of the progress bar.
         steps: Parts of a job that it reports by `step`; 0 counts whole jobs.
-
-    Raises:
-        ConnectionError: If no scheduler answers at the address.
     """
     missing = {path: arguments for path, arguments in jobs.items() if not path.exists()}
     a_job = max(steps, 1)
     with tqdm(total=len(jobs) * a_job, initial=(len(jobs) - len(missing)) * a_job, desc=title, unit=unit,
               disable=not progress, smoothing=0.1) as bar:  # fmt: skip
-        if missing:
-            with _client(min(workers or cores(), len(missing)), scheduler) as client:
-                if steps:
-                    client.subscribe_topic(_STEPS, lambda event: bar.update())
-                for end in _ends(client, function, missing):
+        if not missing:
+            return
+        from distributed import KilledWorker, as_completed
+
+        with _client(min(workers or cores(), len(missing)), scheduler) as client:
+            if steps:
+                client.subscribe_topic(_STEPS, lambda event: bar.update())
+            futures = {client.submit(_work, function, path, *missing[path], pure=False): path for path in missing}
+            try:
+                for future in as_completed(futures):
+                    error = future.exception() if future.status == "error" else None
+                    if isinstance(error, KilledWorker):
+                        error = ChildProcessError("its workers were killed again and again, perhaps for lack of memory.")
+                    if future.status == "cancelled":
+                        error = ConnectionError("the scheduler was lost.")
                     bar.update(0 if steps else 1)
-                    yield end
+                    yield futures[future], error
+            finally:
+                with contextlib.suppress(Exception):  # the scheduler may have gone
+                    client.cancel(list(futures))
 
 
 def step() -> None:
@@ -76,23 +86,6 @@ def single_threaded_torch() -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
-def _ends(client, function: Callable, jobs: Mapping[Path, tuple]) -> Iterator[tuple[Path, BaseException | None]]:
-    from distributed import KilledWorker, as_completed
-
-    futures = {client.submit(_work, function, path, *jobs[path], pure=False): path for path in jobs}
-    try:
-        for future in as_completed(futures):
-            error = future.exception() if future.status == "error" else None
-            if isinstance(error, KilledWorker):
-                error = ChildProcessError("its workers were killed again and again, perhaps for lack of memory.")
-            if future.status == "cancelled":
-                error = ConnectionError("the scheduler was lost.")
-            yield futures[future], error
-    finally:
-        with contextlib.suppress(Exception):  # the scheduler may have gone
-            client.cancel(list(futures))
-
-
 def _work(function: Callable, path: Path, *arguments: object) -> None:
     """In a worker.  The path exists if an attempt before was lost just after its end."""
     if not path.exists():
@@ -102,6 +95,8 @@ def _work(function: Callable, path: Path, *arguments: object) -> None:
 @contextlib.contextmanager
 def _client(workers: int, scheduler: str | None):
     """A client of the cluster: of a given scheduler, or of processes on this machine that end with the block."""
+    from unittest.mock import patch
+
     import dask
     from distributed import Client, LocalCluster
 
@@ -117,22 +112,18 @@ def _client(workers: int, scheduler: str | None):
         return
     threads = max(1, cores() // workers)  # libraries read these when a worker, or its notebook's kernel, starts
     libraries = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
-    environment = dict(os.environ)
     settings = {
         "distributed.nanny.pre-spawn-environ": dict.fromkeys(libraries, threads),
         "distributed.worker.profile.enabled": False,
         "logging": {"distributed": "critical"},
     }
-    with dask.config.set(settings):
-        try:
-            with (
-                LocalCluster(
-                    n_workers=workers, threads_per_worker=1, memory_limit=None, silence_logs=logging.CRITICAL,
-                    dashboard_address="127.0.0.1:0", scheduler_kwargs={"dashboard": False},
-                ) as cluster,
-                Client(cluster) as client,
-            ):  # fmt: skip
-                yield client
-        finally:
-            os.environ.clear()  # Dask sets the limits in this process too
-            os.environ.update(environment)
+    with (
+        patch.dict(os.environ),  # Dask sets the limits in this process too
+        dask.config.set(settings),
+        LocalCluster(
+            n_workers=workers, threads_per_worker=1, memory_limit=None, silence_logs=logging.CRITICAL,
+            dashboard_address="127.0.0.1:0", scheduler_kwargs={"dashboard": False},
+        ) as cluster,
+        Client(cluster) as client,
+    ):  # fmt: skip
+        yield client

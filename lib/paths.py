@@ -19,10 +19,7 @@ SHARED_VARIABLE = "MICROSTEREO_SHARED"
 
 
 def recording_folder(folder: str = "") -> Path:
-    """The folder of a recording as a notebook's parameter names it: "" is the one that ships.
-
-    Relative folders count from the root of the workbench, wherever a notebook runs.
-    """
+    """The folder of a recording as a notebook's parameter names it, from the workbench's root; "" is the one that ships."""
     return ROOT / folder if folder else SHIPPED_RECORDING
 
 
@@ -33,9 +30,9 @@ def shown(path: Path) -> str:
 
 
 def real_data(name: str) -> Path | None:
-    """The folder of a real data set, such as ``"retinal_microsurgery"``, in that which ``MICROSTEREO_DATA`` names.
+    """The folder of a real data set, such as ``"fundus"``, in that which ``MICROSTEREO_DATA`` names; None where it is not.
 
-    None where it is not at hand: real recordings do not ship (`data/README.md` says where a user gets each).
+    Real recordings do not ship: `data/README.md` says where a user gets each.
     """
     root = os.environ.get(REAL_DATA_VARIABLE)
     folder = ROOT / root / name if root else None

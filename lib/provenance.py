@@ -6,6 +6,7 @@ import os
 import platform
 import subprocess
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -18,10 +19,7 @@ _CODE = ("lib", "notebooks", "tests", "environment.toml")
 
 
 def commit(root: Path = paths.ROOT) -> dict | None:
-    """The checked-out commit, as {"id": ..., "modified": ...}; None outside a git checkout.
-
-    `modified` is true if the code (lib, notebooks, tests, environment.toml) differs from the commit.
-    """
+    """The checked-out commit, {"id": ..., "modified": whether the code differs from it}; None outside a git checkout."""
     git = ["git", "-C", str(root)]
     try:
         head = subprocess.run([*git, "rev-parse", "HEAD"], capture_output=True, text=True, check=True)
@@ -39,8 +37,14 @@ def commit_id() -> str:
 
 def machine() -> dict:
     """System, processor, cores that this process may use, memory and GPU."""
+    processor, memory_gb = platform.processor() or platform.machine(), None
+    with suppress(OSError):  # no Linux
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        processor = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), processor)
+    with suppress(AttributeError, ValueError, OSError):  # Windows
+        memory_gb = round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9, 1)
     system = f"{platform.system()} {platform.release()}"
-    return {"system": system, "processor": _processor(), "cores": cores(), "memory_gb": _memory_gb(), "gpu": _gpu()}
+    return {"system": system, "processor": processor, "cores": cores(), "memory_gb": memory_gb, "gpu": _gpu()}
 
 
 class Provenance:
@@ -51,10 +55,7 @@ class Provenance:
         self.wall_s, self.cpu_s = time.perf_counter(), sum(os.times()[:4])
 
     def so_far(self) -> dict[str, object]:
-        """What is known now, as `lib.workbench.results.write` takes it.
-
-        CPU seconds count finished child processes too; `weights` is the digest of the detector that ships.
-        """
+        """What is known now, as `lib.workbench.results.write` takes it; CPU seconds count finished child processes too."""
         return {
             "command": self.command, "commit": self.commit, "machine": machine(),
             "weights": files.digest(paths.MODELS / "default.safetensors"), "date": datetime.date.today().isoformat(),
@@ -73,23 +74,6 @@ def plain(value: object) -> object:
     if isinstance(value, float | np.floating):
         return float(f"{float(value):.6g}") if np.isfinite(value) else None
     return value.item() if isinstance(value, np.generic) else value
-
-
-def _processor() -> str:
-    try:
-        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    except OSError:
-        pass
-    return platform.processor() or platform.machine()
-
-
-def _memory_gb() -> float | None:
-    try:
-        return round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9, 1)
-    except (AttributeError, ValueError, OSError):
-        return None
 
 
 @functools.cache

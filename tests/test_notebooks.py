@@ -18,7 +18,7 @@ from lib import paths, trust
 from lib.landmarks import Detector, Landmarks
 from lib.recordings import Recording, RecordingWriter
 from lib.workbench import pages, report, results
-from lib.workbench.parameters import declared_grid, declared_parameters, parse_parameters
+from lib.workbench.execution import declared_grid, declared_parameters, parse_parameters
 
 WALK = sorted(paths.NOTEBOOKS.glob("*.ipynb"))
 STUDIES = sorted(paths.NOTEBOOKS.glob("studies/*.ipynb"))

@@ -1,7 +1,6 @@
 """Recordings from the files of other programs: videos, robots' logs and labels, as a mapping file describes them.
 
-`import_recording` writes a recording, whole or not at all, and says what it did; it never changes the source.
-`guess_mapping` writes a first mapping.  This room lies above `lib.calibration`, which finds clock offsets and tools.
+This room lies above `lib.calibration`, which finds clock offsets and tools.
 """
 
 from lib.importing.guess import guess_mapping

@@ -24,11 +24,7 @@ _LABELS = {".slp": ["sleap"], ".csv": ["deeplabcut"], ".json": ["coco", "label_s
 
 
 def guess_mapping(source: str | Path) -> str:
-    """The text of a mapping file for the files in a folder.
-
-    Raises:
-        FileNotFoundError, ValueError: If there is no video and no image, or no log of a robot that could be read.
-    """
+    """The text of a mapping file for the files in a folder, which needs a video or images, and a robot's log."""
     folder = Path(source)
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder}: no such folder; SOURCE is the folder with your files.")
@@ -81,35 +77,36 @@ def _video(folder: Path, paths: dict[str, Path], tables: dict[str, Path]) -> dic
 def _frame_times(tables: dict[str, Path], frames: int) -> dict:
     """The table that has a time for each frame, if there is one."""
     for name, path in tables.items():
-        dialect, header, rows = _table(path)
-        if len(rows) == frames and any(map(_TIME.search, header)):
-            return {"times": "table", "table": {"file": name, **dialect, **_time(header, rows, dialect["decimal"])}}
+        dialect, columns = _table(path)
+        if any(len(cells) == frames and _TIME.search(column) for column, cells in columns.items()):
+            return {"times": "table", "table": {"file": name, **dialect, **_time(columns, dialect["decimal"])}}
     return {}
 
 
-def _table(path: Path) -> tuple[dict, list[str], list[list[str]]]:
-    """Separator and decimal mark, the header, and the cells of each row."""
+def _table(path: Path) -> tuple[dict[str, str], dict[str, list[str]]]:
+    """Separator and decimal mark, and the cells of each column."""
     lines = [line for line in decoded(path, utf_16=True).splitlines() if line.strip() and line.lstrip()[0] not in "#%"]
     separator = max("\t;,|", key=lines[0].count) if lines else ","
     header, *rows = ([cell.strip() for cell in line.split(separator)] for line in lines or [""])
     decimal = "," if separator != "," and rows and re.search(r"\d,\d", separator.join(rows[0])) else "."
-    return {"separator": separator, "decimal": decimal}, header, [row for row in rows if len(row) == len(header)]
+    columns = {name: [row[at] for row in rows if len(row) == len(header)] for at, name in enumerate(header)}
+    return {"separator": separator, "decimal": decimal}, columns
 
 
-def _numbers(rows: list[list[str]], at: int, decimal: str) -> np.ndarray:
-    """The numbers of a column; of other text NaN."""
-    cells = [row[at].replace(decimal, ".") for row in rows[:: max(1, len(rows) // 2000)]]
-    return np.array([float(cell) if re.fullmatch(r"[-+\d.eE]+", cell) else np.nan for cell in cells])
+def _numbers(cells: list[str], decimal: str) -> np.ndarray:
+    """The numbers in some cells of a column; of other text NaN."""
+    some = [cell.replace(decimal, ".") for cell in cells[:: max(1, len(cells) // 2000)]]
+    return np.array([float(cell) if re.fullmatch(r"[-+\d.eE]+", cell) else np.nan for cell in some])
 
 
-def _time(header: list[str], rows: list[list[str]], decimal: str) -> dict:
+def _time(columns: dict[str, list[str]], decimal: str) -> dict[str, str]:
     """The column of the times and their unit, by its name, or else by its steps: rows come 1 ms to 3 s apart."""
-    time = next((cell for cell in header if _TIME.search(cell)), header[0])
-    if rows and ":" in rows[0][header.index(time)]:
+    time = next(filter(_TIME.search, columns), next(iter(columns)))
+    if any(":" in cell for cell in columns[time][:1]):
         return {"time": time, "time_unit": "iso"}
     if match := _UNIT.search(time):
         return {"time": time, "time_unit": match[1].lower()}
-    step = np.nanmedian(np.diff(_numbers(rows[:100], header.index(time), decimal))) if len(rows) > 1 else 0.0
+    step = np.nanmedian(np.diff(_numbers(columns[time][:100], decimal))) if len(columns[time]) > 1 else 0.0
     return {"time": time, "time_unit": "s" if step < 3 else "ms" if step < 3e3 else "us" if step < 3e6 else "ns"}
 
 
@@ -120,27 +117,27 @@ def _robot(folder: Path, paths: dict[str, Path], tables: dict[str, Path]) -> dic
     if not tables:
         raise FileNotFoundError(f"{folder}: no log of a robot in it (.csv, .tsv, .txt, or a ROS bag).")
     name = max(tables, key=lambda name: tables[name].stat().st_size)
-    dialect, header, rows = _table(tables[name])
-    time = _time(header, rows, dialect["decimal"])
-    turn = [next((cell for cell in header if re.search(rf"(?i)q_?{axis}$", cell)), "") for axis in "xyzw"]
+    dialect, columns = _table(tables[name])
+    time = _time(columns, dialect["decimal"])
+    turn = [next((column for column in columns if re.search(rf"(?i)q_?{axis}$", column)), "") for axis in "xyzw"]
     groups: dict[str, dict[str, str]] = {}
-    for cell in header:
-        if (match := _AXIS.match(cell)) and cell not in (*turn, time["time"]):
-            groups.setdefault(match[1], {})[match[2].lower()] = cell
+    for column in columns:
+        if (match := _AXIS.match(column)) and column not in (*turn, time["time"]):
+            groups.setdefault(match[1], {})[match[2].lower()] = column
     points = {prefix: [axes[axis] for axis in "xyz"] for prefix, axes in groups.items() if set(axes) == set("xyz")}
     if not points:
-        raise ValueError(f"{tables[name]}: no three columns end in x, y and z; it has {header}. Write the mapping by hand.")
+        raise ValueError(f"{tables[name]}: no three columns end in x, y and z; it has {list(columns)}. Write it by hand.")
     length = next((match[3].lower() for point in points.values() if (match := _AXIS.match(point[0])) and match[3]), "")
     if not length:  # a tool moves over a millimetre to some centimetres
-        columns = (_numbers(rows, header.index(column), dialect["decimal"]) for column in next(iter(points.values())))
-        span = max(float(np.ptp(known)) if len(known := x[np.isfinite(x)]) else 1.0 for x in columns)
+        axes = (_numbers(columns[column], dialect["decimal"]) for column in next(iter(points.values())))
+        span = max(float(np.ptp(known)) if len(known := x[np.isfinite(x)]) else 1.0 for x in axes)
         length = "m" if span < 0.3 else "um" if span > 2000 else "mm"
     told = {"file": name, **dialect, **time, "length_unit": length}
     if len(points) > 1 and not all(turn):
         return told | {"landmarks": _matched(points)}
     pose = {"position": points[min(points, key=lambda prefix: "pos" not in prefix.lower())]}
     pose |= {"rotation": turn, "rotation_kind": "quaternion_xyzw"}
-    if jaw := next((cell for cell in header if re.search(r"(?i)grip|jaw|open", cell)), ""):
+    if jaw := next((column for column in columns if re.search(r"(?i)grip|jaw|open", column)), ""):
         pose |= {"gripper": jaw, "gripper_unit": next((unit for unit in ("deg", "mm") if unit in jaw.lower()), "rad")}
     return told | {"pose": pose}
 

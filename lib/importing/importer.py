@@ -1,6 +1,5 @@
 """From foreign files to a recording: everything is read and checked, then the recording appears whole."""
 
-from collections.abc import Sequence
 from decimal import Decimal
 from pathlib import Path
 
@@ -12,7 +11,7 @@ from lib.calibration import NoConsensusError, TimeOffset, Tool, estimate_time_of
 from lib.correspondences import LANDMARKS, NoDetectionError, of_recording
 from lib.geometry import RigidTransform
 from lib.importing.labels import read_labels
-from lib.importing.logs import RobotLog, increasing, read_robot, since, zero_of
+from lib.importing.logs import RobotLog, increasing, read_robot, since
 from lib.importing.mapping import Mapping, read_mapping
 from lib.importing.video import StereoSource, open_stereo
 from lib.landmarks import SharedDetector, detect
@@ -20,22 +19,17 @@ from lib.recordings import Annotations, Recording, RecordingWriter
 
 _LOG_STEP_S = 2e-5, 3.0  # of a robot's samples; beyond it the unit of time is another
 _CLOCK_FRAMES = 60  # that the detector looks at where there are no labels
+_EPOCH_S = 1_000_000  # larger times count from a date: 100 ns would drown in a float
 
 
 def import_recording(source: str | Path, mapping: str | Path, out: str | Path, *, overwrite: bool = False) -> dict:
-    """Write the recording `out` from the files in the folder `source`; the same input gives the same bytes.
+    """Write the recording `out` from the files in the folder `source`, which is never changed, as a mapping file says.
 
-    Args:
-        source: It is never changed.
-        mapping: The mapping file.
-        overwrite: Replace a recording of that name.
+    The same input gives the same bytes.  Errors name the file and the cure, and then nothing is written.
 
     Returns:
         What it did, as it stands in import.json of the recording: "did" in plain sentences, "clock", "tool", and
         the "sources" with their SHA-256.
-
-    Raises:
-        FileNotFoundError, FileExistsError, ValueError, OSError: Naming the file and the cure; then nothing is written.
     """
     folder, out = Path(source), Path(out)
     if not folder.is_dir():
@@ -46,18 +40,25 @@ def import_recording(source: str | Path, mapping: str | Path, out: str | Path, *
     stereo = open_stereo(folder, told.video)
     robot = read_robot(folder, told)
     increasing(robot.time, str(folder / told.robot.file), *_LOG_STEP_S)
-    zeros = stereo_zero, robot_zero = zero_of(stereo.time), zero_of(robot.time)
-    given = 0.0 if told.robot.offset_s == "estimate" else told.robot.offset_s
-    one_dated = told.robot.offset_s == "estimate" and bool(stereo_zero) != bool(robot_zero)
-    offset_s = 0.0 if one_dated else float(stereo_zero + Decimal(str(given)) - robot_zero)
+    # A recording's times count from 0, or from the first whole second of times that count from a date.
+    starts = stereo.time[0], robot.time[0]
+    zeros = stereo_zero, robot_zero = [Decimal(int(t)) if abs(t) > _EPOCH_S else Decimal(0) for t in starts]
+    estimated = told.robot.offset_s == "estimate"
+    one_dated = estimated and bool(stereo_zero) != bool(robot_zero)
+    given = Decimal("0" if estimated else str(told.robot.offset_s))
+    offset_s = 0.0 if one_dated else float(stereo_zero + given - robot_zero)
     time_s, robot_s = since(stereo.time, stereo_zero), since(robot.time, robot_zero)
     first = next(stereo.pairs())[0]
     size = first.shape[1], first.shape[0]
     labels = read_labels(folder, told.labels, stereo, told.landmarks, size) if told.labels else None
-    frames_s = time_s + offset_s + (0.0 if labels is None else _delay(labels, told.readout_s, size[1]))
+    frames_s = time_s + offset_s
+    if labels is not None:  # the mean instant at which the rows of a frame's labels were read
+        y = np.hstack([labels.u_left[..., 1], labels.u_right[..., 1]])
+        mean = np.nansum(y - (size[1] - 1) / 2, axis=1) / np.maximum(np.isfinite(y).sum(axis=1), 1)
+        frames_s += told.readout_s * mean / (size[1] - 1)
     x_mm, tool_told = _landmarks(told, robot, robot_s, frames_s, labels, float(robot_zero))
-    fps = told.video.fps or (1 / float(np.median(np.diff(time_s))) if len(time_s) > 1 else 25.0)
-    fps = round(fps, 6) if told.video.fps is None else fps / told.video.every
+    usual_fps = round(1 / float(np.median(np.diff(time_s))) if len(time_s) > 1 else 25.0, 6)
+    fps = usual_fps if told.video.fps is None else told.video.fps / told.video.every
     writer = RecordingWriter(
         out, name=told.name, description=told.description, fps=fps, image_size_px=size, readout_s=told.readout_s,
         offset_s=offset_s, robot_accuracy_mm=told.robot_accuracy_mm, skeleton=told.landmarks, overwrite=overwrite,
@@ -71,12 +72,11 @@ def import_recording(source: str | Path, mapping: str | Path, out: str | Path, *
             if labels is not None:
                 writer.annotations(labels.u_left, labels.u_right, labels.visibility_left, labels.visibility_right)
             draft = writer.draft()
-            clock = _clock(draft, told.robot.search_s) if told.robot.offset_s == "estimate" else None
-            found = None
+            clock, found = _clock(draft, told.robot.search_s) if estimated else None, None
             if isinstance(clock, TimeOffset):
                 draft = writer.draft(clock.offset_s)
                 found = {"offset_s": round(clock.offset_s, 9), "sd_s": float(f"{clock.sd_s:.3g}")}
-            did = _did(told, stereo, robot, draft, clock, zeros)
+            did = _did(told, stereo, draft, clock, zeros)
             report = {"format": "microstereo.import", "did": did, "clock": found}
             report |= {"tool": tool_told, "mapping": told.model_dump(mode="json"), "sources": _sources(folder, told, stereo)}
             files.write_json(writer.folder / "import.json", report)
@@ -85,23 +85,16 @@ def import_recording(source: str | Path, mapping: str | Path, out: str | Path, *
     return report
 
 
-def _delay(labels: Annotations, readout_s: float, height_px: int) -> np.ndarray:
-    """(n,) s from a frame's time to the mean instant at which the rows of its labels were read."""
-    y = np.hstack([labels.u_left[..., 1], labels.u_right[..., 1]])
-    mean = np.nansum(y - (height_px - 1) / 2, axis=1) / np.maximum(np.isfinite(y).sum(axis=1), 1)
-    return readout_s * mean / (height_px - 1)
-
-
 def _clock(draft: Recording, search_s: float) -> TimeOffset | str:
     """The offset of the clocks, from labels or else the detector; or why a detector that knows no such tool finds none."""
     labels = draft.annotations
-    if labels is None and draft.skeleton != LANDMARKS:
+    if labels is not None:
+        data = of_recording(draft, labels.u_left, labels.u_right)
+    elif draft.skeleton != LANDMARKS:
         return f"the detector knows {', '.join(LANDMARKS)} alone, and there are no labels"
-    if labels is None:
+    else:
         some = np.unique(np.linspace(0, len(draft) - 1, min(len(draft), _CLOCK_FRAMES)).astype(int))
         data = detect(draft, SharedDetector(), frames=some)
-    else:
-        data = of_recording(draft, labels.u_left, labels.u_right)
     try:
         return estimate_time_offset(data, draft.kinematics, start_s=draft.offset_s, search_s=search_s)
     except ValueError as error:
@@ -117,8 +110,8 @@ def _landmarks(
     """The robot's landmarks (m, k, 3) mm, and, where it reports poses, what is told of the tool."""
     if robot.R is None:
         return robot.x_mm, None
-    known = np.isfinite(robot.R).all(axis=(1, 2)) & np.isfinite(robot.t_mm).all(axis=1)
-    poses = [RigidTransform(R, t) for R, t in zip(robot.R[known], robot.t_mm[known], strict=True)]
+    known = np.isfinite(np.hstack([robot.R, robot.x_mm])).all(axis=(1, 2))
+    poses = [RigidTransform(R, t) for R, t in zip(robot.R[known], robot.x_mm[known, 0], strict=True)]
     opening = None if robot.opening_rad is None else robot.opening_rad[known]
     tool, sd = _tool(told, poses, robot_s[known], opening, frames_s, labels, zero_s)
     x = np.full((len(known), len(told.landmarks), 3), np.nan)
@@ -163,8 +156,7 @@ def _tool(
 
 
 def _did(
-    told: Mapping, stereo: StereoSource, robot: RobotLog, draft: Recording, clock: TimeOffset | str | None,
-    zeros: Sequence[Decimal],
+    told: Mapping, stereo: StereoSource, draft: Recording, clock: TimeOffset | str | None, zeros: list[Decimal]
 ) -> list[str]:
     """What the import did, one plain sentence each."""
     time_s, (width, height) = draft.frames.time_s, draft.image_size_px
@@ -180,7 +172,7 @@ def _did(
     pair = draft.frames[0]
     if all(np.array_equal(image[..., 0], image[..., k]) for image in (pair.left, pair.right) for k in (1, 2)):
         said.append("The frames are grey; the detector learnt on colour, so look at what it finds.")
-    x, kind = draft.kinematics.x_mm, "its landmarks" if robot.R is None else "the pose of its tool"
+    x, kind = draft.kinematics.x_mm, "its landmarks" if told.robot.pose is None else "the pose of its tool"
     gaps = int(np.isnan(x[..., 0]).any(axis=1).sum())
     said.append(f"{len(x)} samples of the robot, which reports {kind}; {gaps} have gaps.")
     said += [f"Times of the {what} count from {z} s." for what, z in zip(("video", "robot"), zeros, strict=True) if z]

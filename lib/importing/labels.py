@@ -1,12 +1,12 @@
 """Labelled landmarks from COCO, CVAT, Label Studio, DeepLabCut and SLEAP, as annotations of a recording's frames."""
 
 import json
-import zipfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 from xml.etree import ElementTree
 from xml.etree.ElementTree import ParseError
+from zipfile import BadZipFile, ZipFile
 
 import h5py
 import numpy as np
@@ -36,58 +36,52 @@ def read_labels(
     """The labels of the frames that are imported; integer coordinates are pixel centres.
 
     Labels of other frames are left out.  Where the source holds both views in one image, so may the labels.
-
-    Raises:
-        FileNotFoundError, ValueError: Naming the file, the image and the cure.
     """
     theirs = {labels.names.get(name, name): k for k, name in enumerate(landmarks)}
     frame_of = [{int(f): n for n, f in enumerate(side)} for side in source.index.T]
     numbers = [reel.numbers for reel in source.reels]
     width, height = image_size_px
     u, v = np.full((2, len(source.time), len(landmarks), 2), np.nan), np.zeros((2, len(source.time), len(landmarks)), int)
-    known, count = set(), 0
     files = [(labels.file, None)] if labels.file else [(f, s) for s, f in enumerate((labels.left, labels.right)) if f]
-    for file, given in files:
-        path = folder / file
-        for label in labels_of(labels.kind, path):
-            count += 1
-            known.add(label.name)
-            if label.name not in theirs or not label.visibility:
-                continue
-            where = f"{path}: {label.image}, {label.name}"
-            xy = np.array([label.x, label.y]) - (0.5 if labels.pixel_origin == "corner" else 0.0)
-            if given is not None:
-                side = given
-            elif source.video.layout != "two" and not any(name in label.image for name in labels.sides):
-                axis, size = (0, width) if source.video.layout == "side_by_side" else (1, height)
-                half = int(xy[axis] > size - 0.5)
-                side, xy[axis] = half ^ source.video.exchanged, xy[axis] - half * size
-            elif [name in label.image for name in labels.sides].count(True) == 1:
-                side = int(labels.sides[1] in label.image)
-            else:
-                cure = f"labels.sides = {list(labels.sides)} must tell one of two"
-                raise ValueError(f"{where}: the name tells no camera; {cure}.")
-            reel = side ^ source.video.exchanged if source.video.layout == "two" else 0
-            image = PurePosixPath(label.image.replace("\\", "/"))
-            number = (last_number(image) or 0) - labels.first_frame
-            frame = frame_of[reel].get(numbers[reel].get(image.stem, numbers[reel].get(number, number)))
-            if frame is None:
-                continue
-            if not inside(xy, image_size_px):
-                raise ValueError(f"{where}: ({xy[0]:.6g}, {xy[1]:.6g}) lies outside the image of {width} x {height} px.")
-            k = theirs[label.name]
-            if v[side, frame, k]:
-                raise ValueError(f"{where}: labelled twice; a frame has one tool. Keep one label.")
-            u[side, frame, k], v[side, frame, k] = xy, label.visibility
+    found = [(folder / file, side, label) for file, side in files for label in labels_of(labels.kind, folder / file)]
+    known, path = {label.name for _, _, label in found}, folder / files[-1][0]
     if missing := [name for name in theirs if name not in known]:
         cure = f"labels.names gives their name for each of {list(landmarks)}"
         raise ValueError(f"{path}: no label is called {missing[0]!r}; it has {sorted(known)}. {cure}.")
+    for path, given, label in found:
+        if label.name not in theirs or not label.visibility:
+            continue
+        where = f"{path}: {label.image}, {label.name}"
+        xy = np.array([label.x, label.y]) - (0.5 if labels.pixel_origin == "corner" else 0.0)
+        if given is not None:
+            side = given
+        elif source.video.layout != "two" and not any(name in label.image for name in labels.sides):
+            axis, size = (0, width) if source.video.layout == "side_by_side" else (1, height)
+            half = int(xy[axis] > size - 0.5)
+            side, xy[axis] = half ^ source.video.exchanged, xy[axis] - half * size
+        elif [name in label.image for name in labels.sides].count(True) == 1:
+            side = int(labels.sides[1] in label.image)
+        else:
+            cure = f"labels.sides = {list(labels.sides)} must tell one of two"
+            raise ValueError(f"{where}: the name tells no camera; {cure}.")
+        reel = side ^ source.video.exchanged if source.video.layout == "two" else 0
+        image = PurePosixPath(label.image.replace("\\", "/"))
+        number = (last_number(image) or 0) - labels.first_frame
+        frame = frame_of[reel].get(numbers[reel].get(image.stem, numbers[reel].get(number, number)))
+        if frame is None:
+            continue
+        if not inside(xy, image_size_px):
+            raise ValueError(f"{where}: ({xy[0]:.6g}, {xy[1]:.6g}) lies outside the image of {width} x {height} px.")
+        k = theirs[label.name]
+        if v[side, frame, k]:
+            raise ValueError(f"{where}: labelled twice; a frame has one tool. Keep one label.")
+        u[side, frame, k], v[side, frame, k] = xy, label.visibility
     if not v.any():
         cure = "Check labels.first_frame and the images' names"
-        raise ValueError(f"{path}: none of its {count} labels belongs to an imported frame. {cure}.")
+        raise ValueError(f"{path}: none of its {len(found)} labels belongs to an imported frame. {cure}.")
     if np.nanmax(u) <= min(100, min(image_size_px) / 4):
         raise ValueError(f"{path}: no label beyond {np.nanmax(u):.4g} px: fractions or per cent of the image? Export pixels.")
-    return Annotations(u[0], u[1], v[0], v[1])
+    return Annotations(*u, *v)
 
 
 def labels_of(kind: str, path: Path) -> Iterator[Label]:
@@ -97,7 +91,7 @@ def labels_of(kind: str, path: Path) -> Iterator[Label]:
         raise FileNotFoundError(f"{path}: no such file; the mapping names it as labels.")
     try:
         yield from read(path)
-    except (ValueError, LookupError, TypeError, AttributeError, RecursionError, ParseError, OSError) as error:
+    except (ValueError, LookupError, TypeError, AttributeError, RuntimeError, ParseError, BadZipFile, OSError) as error:
         if isinstance(error, ValueError) and str(path) in str(error):
             raise
         raise ValueError(f"{path}: not {what} ({type(error).__name__}: {error}). Export the labels again.") from None
@@ -125,16 +119,13 @@ def _cvat(path: Path) -> Iterator[Label]:
 
 
 def _from_zip(path: Path, name: str) -> str:
-    try:
-        with zipfile.ZipFile(path) as archive:
-            for entry in archive.namelist():  # nothing is unpacked; such a file is still no export of a label tool
-                if entry.startswith("/") or ".." in PurePosixPath(entry.replace("\\", "/")).parts or ":" in entry:
-                    raise ValueError(f"{path}: it holds {entry!r}, which leads out of the folder. Export it again.")
-            if archive.getinfo(name).file_size > _LARGEST_BYTES:
-                raise ValueError(f"{path}: {name} unpacks to over {_LARGEST_BYTES >> 20} MB. Export fewer frames.")
-            return archive.read(name).decode("utf-8-sig")
-    except (zipfile.BadZipFile, NotImplementedError, RuntimeError) as error:
-        raise ValueError(f"{path}: not a readable zip file ({error}). Export it again.") from None
+    with ZipFile(path) as archive:
+        for entry in archive.namelist():  # nothing is unpacked; such a file is still no export of a label tool
+            if entry.startswith("/") or ".." in PurePosixPath(entry.replace("\\", "/")).parts or ":" in entry:
+                raise ValueError(f"{path}: it holds {entry!r}, which leads out of the folder. Export it again.")
+        if archive.getinfo(name).file_size > _LARGEST_BYTES:
+            raise ValueError(f"{path}: {name} unpacks to over {_LARGEST_BYTES >> 20} MB. Export fewer frames.")
+        return archive.read(name).decode("utf-8-sig")
 
 
 def _label_studio(path: Path) -> Iterator[Label]:

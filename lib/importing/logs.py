@@ -1,11 +1,12 @@
 """Tables of other programs: CSV of any dialect and ROS bags, with exact times; and what a robot's log says in mm and s."""
 
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from decimal import Decimal, InvalidOperation
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -17,21 +18,16 @@ from lib.recordings.tables import decoded, number, rows_of
 _SECONDS = {"s": Decimal(1), "ms": Decimal("1e-3"), "us": Decimal("1e-6"), "ns": Decimal("1e-9")}
 _MILLIMETRES = {"m": 1e3, "mm": 1.0, "um": 1e-3}
 _EMPTY = {"nan", "NaN", "NAN", "null", "None", "NA"}
-_EPOCH_S = 1_000_000  # larger times count from a date: 100 ns would drown in a float
 
 
 @dataclass(frozen=True, eq=False)
 class RobotLog:
-    """What a robot's log says: exact times (m,), and either `x_mm` (m, k, 3) or a pose R (m, 3, 3), t_mm (m, 3) of the tool.
-
-    `opening_rad` (m,) is the full angle between the jaws, None without a gripper.
-    """
+    """What a robot's log says: exact times (m,) and positions (m, k, 3) of the landmarks, or (m, 1, 3) of the tool's pose."""
 
     time: list[Decimal]
-    x_mm: np.ndarray | None = None
-    R: np.ndarray | None = None
-    t_mm: np.ndarray | None = None
-    opening_rad: np.ndarray | None = None
+    x_mm: np.ndarray
+    R: np.ndarray | None = None  # (m, 3, 3) of the tool's pose
+    opening_rad: np.ndarray | None = None  # (m,) full angle between the jaws
 
 
 def exact_seconds(text: str, unit: str, where: str) -> Decimal:
@@ -40,16 +36,14 @@ def exact_seconds(text: str, unit: str, where: str) -> Decimal:
     >>> exact_seconds("1700000000123456789", "ns", "log.csv"), exact_seconds("1970-01-01T00:00:01.5", "iso", "log.csv")
     (Decimal('1700000000.123456789'), Decimal('1.500000'))
     """
-    try:
+    with suppress(ValueError, InvalidOperation):
         if unit == "iso":
             date = datetime.fromisoformat(text.strip())
-            date -= datetime.fromtimestamp(0, UTC) if date.tzinfo else datetime(1970, 1, 1)
-            return Decimal(date.days * 86400 + date.seconds) + Decimal(date.microseconds).scaleb(-6)
+            date = date if date.tzinfo else date.replace(tzinfo=UTC)
+            return Decimal((date - datetime.fromtimestamp(0, UTC)) // timedelta(microseconds=1)).scaleb(-6)
         value = Decimal(text.strip()) * _SECONDS[unit]
         if value.is_finite():
             return value
-    except (ValueError, InvalidOperation):
-        pass
     raise ValueError(f"{where}: {text.strip()!r} is not a time in {unit}. Check time, time_unit and decimal.")
 
 
@@ -58,34 +52,21 @@ def since(time: Iterable[Decimal], zero: Decimal) -> np.ndarray:
     return np.array([float(t - zero) for t in time])
 
 
-def zero_of(time: list[Decimal]) -> Decimal:
-    """What times count from in a recording: 0, or the first whole second of times that count from a date."""
-    return Decimal(int(time[0])) if abs(time[0]) > _EPOCH_S else Decimal(0)
-
-
 def increasing(time: list[Decimal], where: str, shortest_s: float, longest_s: float) -> None:
-    """Check times of rows or frames.
-
-    Raises:
-        ValueError: Where times repeat or go back, or their step fits another unit.
-    """
-    for i in range(1, len(time)):
-        if time[i] <= time[i - 1]:
-            what = "repeats" if time[i] == time[i - 1] else "goes back"
+    """Check times of rows or frames: a ValueError where they repeat or go back, or their step fits another unit."""
+    for i, (before, now) in enumerate(pairwise(time), start=2):
+        if now <= before:
+            what = "repeats" if now == before else "goes back"
             cure = "Sort the rows and drop the repeated ones, or name another column of times"
-            raise ValueError(f"{where}: the time {what} at entry {i + 1} ({time[i - 1]} s, then {time[i]} s). {cure}.")
+            raise ValueError(f"{where}: the time {what} at entry {i} ({before} s, then {now} s). {cure}.")
     step = float(np.median(np.diff(since(time, time[0])))) if len(time) > 1 else 1.0
     if not shortest_s <= step <= longest_s:
-        plausible = f"{shortest_s} to {longest_s} s is plausible"
-        raise ValueError(f"{where}: entries are {step:.3g} s apart, {plausible}. Check time_unit.")
+        what = f"entries are {step:.3g} s apart, {shortest_s} to {longest_s} s is plausible"
+        raise ValueError(f"{where}: {what}. Check time_unit.")
 
 
 def read_columns(path: Path, table: Table, names: Iterable[str]) -> tuple[list[Decimal], dict[str, np.ndarray]]:
-    """Exact times (m,) and the named columns, each (m,) float64 with NaN where a cell is empty, of a CSV file or a ROS bag.
-
-    Raises:
-        FileNotFoundError, ValueError: Naming file, line and column.
-    """
+    """Exact times and the named columns, (m,) float64 each with NaN where a cell is empty, of a CSV file or a ROS bag."""
     if path.suffix in (".bag", ".db3", ".mcap") or path.is_dir():
         return _read_bag(path, table, list(names))
     wanted = [table.time, *names]
@@ -173,11 +154,7 @@ def _field(message: object, field: str, where: str) -> float | Decimal:
 
 
 def read_robot(folder: Path, mapping: Mapping) -> RobotLog:
-    """The robot's log in mm, seconds and radians, in the robot frame that the mapping asks for.
-
-    Raises:
-        FileNotFoundError, ValueError: As `read_columns`; for rotations that are none; for an implausible unit.
-    """
+    """The robot's log in mm, seconds and radians, in the robot frame that the mapping asks for."""
     robot, pose = mapping.robot, mapping.robot.pose
     path = folder / robot.file
     groups = [robot.landmarks[name] for name in mapping.landmarks] if pose is None else [pose.position]
@@ -196,10 +173,10 @@ def read_robot(folder: Path, mapping: Mapping) -> RobotLog:
         what = f"with length_unit = {robot.length_unit!r} the tool moves over {spread_mm:.3g} mm"
         raise ValueError(f"{path}: {what}; 0.05 to 2000 mm is plausible. Check length_unit: m, mm or um.")
     if pose is None:
-        return RobotLog(time, x_mm=x)
+        return RobotLog(time, x)
     R = turn @ _rotations(path, pose, np.stack([columns[name] for name in pose.rotation], axis=-1))
     opening = _opening(path, mapping, columns[pose.gripper]) if pose.gripper else None
-    return RobotLog(time, R=R, t_mm=x[:, 0], opening_rad=opening)
+    return RobotLog(time, x, R, opening)
 
 
 def _opening(path: Path, mapping: Mapping, opening: np.ndarray) -> np.ndarray:

@@ -165,11 +165,7 @@ class Mapping(_Section):
 
 
 def read_mapping(path: str | Path) -> Mapping:
-    """Read and check a mapping file.
-
-    Raises:
-        FileNotFoundError, ValueError: Naming the file, the key, what it says and what it may say.
-    """
+    """Read and check a mapping file; errors name the file, the key, what it says and what it may say."""
     path = Path(path)
     if not path.is_file():
         cure = f"`python3 -m lib import SOURCE --guess --map {path.name}` writes one"

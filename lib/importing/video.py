@@ -91,20 +91,18 @@ class _Film:
         return len(self.stamps)
 
     def read(self, wanted: np.ndarray) -> Iterator[np.ndarray]:
-        left = set(map(int, wanted))
         with self._open() as container:
             container.streams.video[0].thread_type = "AUTO"
-            frames, index = container.decode(video=0), -1
-            while left:
+            frames, wanted = container.decode(video=0), set(map(int, wanted))
+            for index in range(max(wanted) + 1):
                 try:
-                    frame, index = next(frames), index + 1
+                    frame = next(frames)
                 except (StopIteration, av.error.FFmpegError):
-                    what = f"frame {index + 1} of {len(self)} cannot be decoded"
+                    what = f"frame {index} of {len(self)} cannot be decoded"
                     raise ValueError(f"{self.path}: {what}. The video is damaged; copy or convert it again.") from None
                 if frame.is_corrupt:
                     raise ValueError(f"{self.path}: frame {index} is damaged. Copy the video again.")
-                if index in left:
-                    left.remove(index)
+                if index in wanted:
                     deep = max(c.bits for c in frame.format.components) == 16
                     # Of 16 bits a camera may use 12; fewer bits the format itself states, and they are scaled by it.
                     yield frame.to_ndarray(format="rgb48le" if deep else "rgb24")
@@ -112,23 +110,14 @@ class _Film:
 
 @dataclass(frozen=True, eq=False)
 class StereoSource:
-    """Pairs of frames.
+    """Pairs of frames: which frame of each source makes a pair (n, 2), and the exact times of the pairs."""
 
-    Attributes:
-        reels: The left and the right source, or the one that holds both views.
-        video: What the mapping says of them.
-        index: (n, 2) which frame of each source makes a pair.
-        time: n exact times of the pairs.
-        bit_depth: What the brightest value of 16-bit frames is scaled by; None for 8-bit frames.
-        dropped: How many frames have no partner.
-    """
-
-    reels: tuple[_Images | _Film, ...]
+    reels: tuple[_Images | _Film, ...]  # left and right, or the one that holds both views
     video: Video
     index: np.ndarray
     time: list[Decimal]
-    bit_depth: int | None
-    dropped: int
+    bit_depth: int | None  # what the brightest value of 16-bit frames is scaled by; None for 8-bit frames
+    dropped: int  # frames that have no partner
 
     def pairs(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Left and right images, (h, w, 3) uint8 RGB."""
@@ -148,11 +137,7 @@ class StereoSource:
 
 
 def open_stereo(folder: Path, video: Video) -> StereoSource:
-    """Open the frames that a mapping describes; images are decoded when asked for.
-
-    Raises:
-        FileNotFoundError, ValueError: Naming the file and the cure.
-    """
+    """Open the frames that a mapping describes; images are decoded when asked for."""
     names = [video.left, video.right] if video.layout == "two" else [video.file]
     reels = tuple(_Film(folder / n) if Path(n).suffix.lower() in VIDEOS else _Images(folder, n) for n in names)
     places = _places(reels)
@@ -160,15 +145,13 @@ def open_stereo(folder: Path, video: Video) -> StereoSource:
     for reel, time in zip(reels, times, strict=True):
         increasing(time, str(reel.files[0]), *_STEP_S)
     index = _paired(folder, times)
-    kept = index[:: video.every]
-    time = [times[0][i] for i in kept[:, 0]]
-    low, high = (-np.inf if video.start_s is None else video.start_s), (np.inf if video.end_s is None else video.end_s)
-    chosen = [i for i, t in enumerate(time) if low <= t - times[0][0] <= high]
-    if not chosen:
-        raise ValueError(f"{folder}: no frame lies between start_s and end_s; the video lasts {time[-1] - time[0]} s.")
-    kept, time = kept[chosen], [time[i] for i in chosen]
-    dropped = sum(map(len, times)) - len(reels) * len(index)
-    return StereoSource(reels, video, kept, time, video.bit_depth or _bit_depth(reels, kept), dropped)
+    start, end_s = times[0][0], np.inf if video.end_s is None else video.end_s
+    kept = [pair for pair in index[:: video.every] if (video.start_s or 0) <= times[0][pair[0]] - start <= end_s]
+    if not kept:
+        raise ValueError(f"{folder}: no frame lies between start_s and end_s; the video lasts {times[0][-1] - start} s.")
+    dropped, index = sum(map(len, times)) - len(reels) * len(index), np.array(kept)
+    time = [times[0][i] for i in index[:, 0]]
+    return StereoSource(reels, video, index, time, video.bit_depth or _bit_depth(reels, index), dropped)
 
 
 def _places(reels: Sequence[_Images | _Film]) -> list[np.ndarray]:

@@ -9,9 +9,8 @@ A rolling shutter reads row y at readout_s * (y / (height - 1) - 1/2) after that
 from lib.recordings.annotations import Annotations
 from lib.recordings.annotator import Annotator
 from lib.recordings.frames import Frames, StereoFrame, read_image, to_8_bits
-from lib.recordings.recording import Doubt, Kinematics, Recording
+from lib.recordings.recording import Doubt, Kinematics, Recording, RecordingWriter
 from lib.recordings.truth import Truth
-from lib.recordings.writer import RecordingWriter
 
 __all__ = ["Annotations", "Annotator", "Doubt", "Frames", "Kinematics", "Recording", "RecordingWriter", "StereoFrame"]
 __all__ += ["Truth", "read_image", "to_8_bits"]

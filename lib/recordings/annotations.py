@@ -50,12 +50,7 @@ def coco_keypoints(path: Path) -> Iterator[tuple[str, list[str], np.ndarray]]:
     """The image, the names (k,) and x, y, visibility (k, 3) of each annotation in a file of COCO keypoints.
 
     COCO has no word for a landmark that an image does not show: an entry's own list ``absent`` names those of visibility -1.
-
-    Raises:
-        FileNotFoundError, ValueError: Naming the file and the entry.
     """
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file.")
     try:
         content = json.loads(path.read_bytes())
         categories = {c["id"]: list(c["keypoints"]) for c in content["categories"] if "keypoints" in c}
@@ -83,10 +78,6 @@ def read_coco(path: Path, n_frames: int, image_size_px: tuple[int, int], landmar
     """Read COCO keypoints whose image names are ``left/000012.jpg`` and the like.
 
     The names in the category order the keypoints, so any order in the file will do; other keypoints are ignored.
-    Integer coordinates are pixel centres.
-
-    Raises:
-        FileNotFoundError, ValueError: Naming the file and the entry.
     """
     width, height = image_size_px
     u = np.full((2, n_frames, len(landmarks), 2), np.nan)
@@ -108,7 +99,7 @@ def read_coco(path: Path, n_frames: int, image_size_px: tuple[int, int], landmar
         if not inside(xy[labelled], image_size_px).all():
             raise ValueError(f"{where}: a keypoint lies outside the image of {width} x {height} px.")
         u[side, frame, labelled], visibility[side, frame] = xy[labelled], v[:, 0]
-    return Annotations(u[0], u[1], visibility[0], visibility[1])
+    return Annotations(*u, *visibility)
 
 
 def write_coco(

@@ -28,7 +28,6 @@ class Annotator:
     it is; so a killed kernel loses nothing.
 
     Args:
-        recording: With any set of landmarks.
         rig: Cameras, if known.  They give the epipolar lines of left marks, and the robot's landmarks as suggestions.
         detected: What the detector found (`lib.landmarks.detect`), with the robot's position of each landmark.  Both are
             suggestions, and frames in which they disagree most come first.
@@ -53,29 +52,24 @@ class Annotator:
 
     def know(self, *, rig: StereoRig | None = None, detected: Correspondences | None = None) -> None:
         """Take a rig and detections that came later; an open page shows them at once."""
-        n, names = len(self.recording), self.recording.skeleton
-        nothing = np.full((n, len(names), 2), np.nan)
-        rows = of_recording(self.recording, nothing, nothing) if detected is None else detected
+        n, k = len(self.recording), len(self.recording.skeleton)
+        nothing = np.full((2, n, k, 2), np.nan)
+        rows = of_recording(self.recording, *nothing) if detected is None else detected
         self._rig, self._x_mm = rig, self.recording.landmarks_mm()
         self._x_mm[rows.frame, rows.landmark] = rows.x_mm
-        self._suggested = {name: np.full((2, n, len(names), 2), np.nan) for name in ("robot", "detector")}
-        found = np.where(rows.seen.T[..., None], (rows.u_left, rows.u_right), np.nan)
-        self._suggested["detector"][:, rows.frame, rows.landmark] = found
-        if rig is not None:
-            self._suggested["robot"] = np.reshape(rig.project(self._x_mm.reshape(-1, 3)), (2, n, len(names), 2))
-        looked = np.isin(np.arange(n), detected.frame) if detected is not None else np.zeros(n, bool)
-        self.usefulness = self._disagreement(looked)
-        if "widget" in vars(self):
-            self.widget.send({"renew": True})
-
-    def _disagreement(self, looked: np.ndarray) -> np.ndarray:
-        """(n,) px: the farthest that detector and robot are apart in a frame; the tool's length where one was not found."""
-        robot, detector = self._suggested.values()
+        robot = nothing if rig is None else np.reshape(rig.project(self._x_mm.reshape(-1, 3)), nothing.shape)
+        detector = nothing.copy()
+        detector[:, rows.frame, rows.landmark] = np.where(rows.seen.T[..., None], (rows.u_left, rows.u_right), np.nan)
+        self._suggested = {"robot": robot, "detector": detector}
+        # (n,) px: the farthest that both are apart in a frame; the tool's length where the detector did not find a landmark.
         off = np.linalg.norm(robot - detector, axis=-1)
         length = np.linalg.norm(robot[:, :, 1:] - robot[:, :, :1], axis=-1)
         length = np.nanmedian(length) if np.isfinite(length).any() else 0.0
         missed = inside(robot, self.recording.image_size_px) & ~np.isfinite(detector).all(axis=-1)
-        return np.where(looked, np.where(missed, length, np.nan_to_num(off)).max(axis=(0, 2)), 0.0)
+        looked = detected is not None and np.isin(np.arange(n), detected.frame)
+        self.usefulness = np.where(looked, np.where(missed, length, np.nan_to_num(off)).max(axis=(0, 2)), 0.0)
+        if "widget" in vars(self):
+            self.widget.send({"renew": True})
 
     def __repr__(self) -> str:
         labelled = f"{int(self.complete.sum())} of {len(self.recording)} frames are labelled"

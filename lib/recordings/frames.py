@@ -1,7 +1,7 @@
 """The stereo frames of a recording: folders of images or two videos, decoded when asked for."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -11,6 +11,8 @@ import numpy as np
 from PIL import Image
 
 _SUFFIXES = (".jpg", ".jpeg", ".png")
+#: Decodes a frame by its number.
+Reader = Callable[[int], np.ndarray]
 _LOST_BYTES = 512  # a disk sector: what a crash or a bad copy replaces by zeros
 
 
@@ -31,8 +33,7 @@ def read_image(path: Path, image_size_px: tuple[int, int] | None = None, bit_dep
         bit_depth: Of frames of 16 bits, as in `to_8_bits`; None leaves them as uint16.
 
     Raises:
-        FileNotFoundError, ValueError: If there is no such file, it cannot be decoded, a part of it is lost, or its size
-            is another.
+        ValueError: If it cannot be decoded, a part of it is lost, or its size is another.
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such image.")
@@ -90,21 +91,27 @@ def _check_size(path: Path, size: tuple[int, int], expected: tuple[int, int] | N
         raise ValueError(f"{path}: {size[0]} x {size[1]} px, but {told}.")
 
 
-class ImageFolder:
+def open_side(folder: Path, side: str, image_size_px: tuple[int, int], bit_depth: int) -> tuple[int, Reader]:
+    """How many frames one camera ("left" or "right") of a recording has, and a function that decodes one by its number."""
+    images, video = folder / side, folder / f"{side}.mp4"
+    if images.is_dir() and video.is_file():
+        raise ValueError(f"{folder}: both {side}/ and {side}.mp4; keep one.")
+    if video.is_file():
+        return _open_video(video, image_size_px)
+    if images.is_dir():
+        return _open_images(images, image_size_px, bit_depth)
+    raise FileNotFoundError(f"{folder}: no {side}/ folder of images and no {side}.mp4.")
+
+
+def _open_images(folder: Path, image_size_px: tuple[int, int], bit_depth: int) -> tuple[int, Reader]:
     """Images numbered from 0 without a gap; the header and the end of every file are checked at once."""
-
-    def __init__(self, folder: Path, image_size_px: tuple[int, int], bit_depth: int = 0) -> None:
-        self.image_size_px, self._bit_depth = image_size_px, bit_depth
-        self.paths = sorted((p for p in folder.iterdir() if p.suffix.lower() in _SUFFIXES), key=lambda p: p.stem.zfill(9))
-        for index, path in enumerate(self.paths):
-            if not path.stem.isdecimal():
-                raise ValueError(f"{path}: frames are named by number, such as 000000{path.suffix}.")
-            if int(path.stem) != index:
-                what = f"frame {index:06d} is missing or named twice (found {path.name} in its place)"
-                raise ValueError(f"{folder}: {what}. Frames are numbered from 000000 without a gap.")
-            self._check(path)
-
-    def _check(self, path: Path) -> None:
+    paths = sorted((p for p in folder.iterdir() if p.suffix.lower() in _SUFFIXES), key=lambda p: p.stem.zfill(9))
+    for index, path in enumerate(paths):
+        if not path.stem.isdecimal():
+            raise ValueError(f"{path}: frames are named by number, such as 000000{path.suffix}.")
+        if int(path.stem) != index:
+            what = f"frame {index:06d} is missing or named twice (found {path.name} in its place)"
+            raise ValueError(f"{folder}: {what}. Frames are numbered from 000000 without a gap.")
         if not path.is_file():
             raise ValueError(f"{path}: not an ordinary file; copy the image to this place.")
         try:
@@ -115,7 +122,7 @@ class ImageFolder:
             raise ValueError(f"{path}: the image is corrupt; its header cannot be read. Export it again.") from None
         except Image.DecompressionBombError as error:
             raise ValueError(f"{path}: far larger than image_size_px ({error}). Export it again.") from None
-        _check_size(path, size, self.image_size_px)
+        _check_size(path, size, image_size_px)
         if orientation != 1:
             cure = "Export it upright, without the orientation"
             raise ValueError(f"{path}: its EXIF orientation is {orientation}, so other programs turn it. {cure}.")
@@ -124,64 +131,44 @@ class ImageFolder:
             end = stream.read()
         if (b"IEND" if path.suffix.lower() == ".png" else b"\xff\xd9") not in end:
             raise ValueError(f"{path}: the image is cut off before its end. Export it again.")
-
-    def __len__(self) -> int:
-        return len(self.paths)
-
-    def read(self, index: int) -> np.ndarray:
-        return read_image(self.paths[index], self.image_size_px, self._bit_depth)
+    return len(paths), lambda index: read_image(paths[index], image_size_px, bit_depth)
 
 
-class Video:
+def _open_video(path: Path, image_size_px: tuple[int, int]) -> tuple[int, Reader]:
     """A video file; reading in order decodes each frame once, going back seeks."""
+    capture = cv2.VideoCapture(str(path))
+    if not capture.isOpened():
+        raise ValueError(f"{path}: the video cannot be opened; H.264 or MPEG-4 in an .mp4 file works.")
+    keys = (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FRAME_COUNT)
+    width, height, count = (int(capture.get(key)) for key in keys)
+    _check_size(path, (width, height), image_size_px)
+    following = 0
 
-    def __init__(self, path: Path, image_size_px: tuple[int, int]) -> None:
-        self.path = path
-        self._capture = cv2.VideoCapture(str(path))
-        if not self._capture.isOpened():
-            raise ValueError(f"{path}: the video cannot be opened; H.264 or MPEG-4 in an .mp4 file works.")
-        size = tuple(int(self._capture.get(key)) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
-        _check_size(path, size, image_size_px)
-        self._count = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
-        self._next = 0
-
-    def __len__(self) -> int:
-        return self._count
-
-    def read(self, index: int) -> np.ndarray:
-        if not self._next <= index < self._next + 32:
-            self._capture.set(cv2.CAP_PROP_POS_FRAMES, index)
-            self._next = index
-        while self._next <= index:
-            ok, image = self._capture.read()
+    def read(index: int) -> np.ndarray:
+        nonlocal following
+        if not following <= index < following + 32:
+            capture.set(cv2.CAP_PROP_POS_FRAMES, index)
+            following = index
+        while following <= index:
+            ok, image = capture.read()
             if not ok:
-                raise ValueError(f"{self.path}: frame {self._next} of {self._count} cannot be decoded; the file is cut.")
-            self._next += 1
+                raise ValueError(f"{path}: frame {following} of {count} cannot be decoded; the file is cut.")
+            following += 1
         return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
-
-def open_side(folder: Path, side: str, image_size_px: tuple[int, int], bit_depth: int) -> ImageFolder | Video:
-    """The frames of one camera (`side` is "left" or "right") of a recording's folder; `bit_depth` as in `to_8_bits`."""
-    images, video = folder / side, folder / f"{side}.mp4"
-    if images.is_dir() and video.is_file():
-        raise ValueError(f"{folder}: both {side}/ and {side}.mp4; keep one.")
-    if video.is_file():
-        return Video(video, image_size_px)
-    if images.is_dir():
-        return ImageFolder(images, image_size_px, bit_depth)
-    raise FileNotFoundError(f"{folder}: no {side}/ folder of images and no {side}.mp4.")
+    return count, read
 
 
 class Frames(Sequence[StereoFrame]):
     """Stereo frames at `time_s` (n,), video clock, strictly increasing; decoded when indexed, the last few kept."""
 
-    def __init__(self, left: ImageFolder | Video, right: ImageFolder | Video, time_s: np.ndarray) -> None:
+    def __init__(self, left: Reader, right: Reader, time_s: np.ndarray) -> None:
         self.time_s = np.array(time_s, dtype=np.float64)
         self.time_s.setflags(write=False)
 
         @lru_cache(4)
         def read(number: int) -> StereoFrame:
-            images = left.read(number), right.read(number)
+            images = left(number), right(number)
             for image in images:
                 image.setflags(write=False)
             return StereoFrame(*images, float(time_s[number]))

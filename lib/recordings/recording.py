@@ -1,54 +1,51 @@
-"""Reading a recording: everything is validated when it is opened, frames are decoded when asked for."""
+"""Recordings read and written: everything is validated at opening, frames are decoded when asked for."""
 
 import math
+import os
 import re
 import shlex
+import shutil
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple, Self
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
 from lib.correspondences import LANDMARKS
-from lib.recordings.annotations import Annotations, read_coco
+from lib.files import write_bytes, write_text
+from lib.recordings.annotations import Annotations, read_coco, write_coco
 from lib.recordings.frames import Frames, open_side
-from lib.recordings.tables import columns, read_table, read_toml, refuse
+from lib.recordings.tables import columns, read_table, read_toml, refuse, toml_entries, write_table
 from lib.recordings.truth import Truth
 
-FORMAT = "microstereo.recording"
-#: A longer step between samples than this, and than ten usual ones, is a gap: nothing is interpolated in it.
-_GAP_S = 0.5
-#: A position farther from the origin than this is no millimetre.
-_FARTHEST_MM = 1e5
-_ORDER = "time_s must be a number larger than the row before"
-UNITS = {"length": "mm", "image": "px", "time": "s"}
+_FORMAT = "microstereo.recording"
+_UNITS = {"length": "mm", "image": "px", "time": "s"}
 _REQUIRED = {"name": str, "fps": float, "image_size_px": list}
 _DEFAULTS = {"description": "", "readout_s": 0.0, "offset_s": 0.0, "robot_accuracy_mm": 0.010, "details": {}}
 _DEFAULTS |= {"skeleton": list(LANDMARKS), "bit_depth": 0}
-_FIXED = {"format": FORMAT, "units": UNITS}
-#: A log is that many times longer than its video only by intent, or if the times of the frames are missing.
-_LONGER = 5.0
+_FIXED = {"format": _FORMAT, "units": _UNITS}
+_GAP_S = 0.5  # in a step between samples that is longer than this and than ten usual ones, nothing is interpolated
+_FARTHEST_MM = 1e5  # a position farther from the origin is no millimetre
+_ORDER = "time_s must be a number larger than the row before"
+_LONGER = 5.0  # a log is that many times longer than its video by intent, or if the times of the frames are missing
 _COVERED = 0.75  # share of frames with a position, below which log and video do not fit
 _JUMP_MM = 20.0  # from one sample to the next; no surgical robot moves so
 _SLOW_S = 0.5  # between samples; robots report 10 to 1000 times a second
 
 
 class Doubt(NamedTuple):
-    """What makes a recording suspicious though it can be read (clocks, gaps, jumps).
-
-    A name in snake case, plain words with the numbers, and what to do.
-    """
+    """What makes a recording suspicious though it can be read: its name, plain words with the numbers, and what to do."""
 
     name: str
     text: str
     cure: str
 
 
-def kinematics_columns(landmarks: Sequence[str]) -> list[str]:
-    """The header of kinematics.csv."""
+def _kinematics_columns(landmarks: Sequence[str]) -> list[str]:
     return ["time_s", *columns(["x_mm", "y_mm", "z_mm"], landmarks)]
 
 
@@ -58,7 +55,7 @@ class Kinematics:
 
     Attributes:
         time_s: (m,) robot clock, strictly increasing.
-        x_mm: (m, k, 3) the landmarks in the robot frame, base, tip_1, tip_2 of a forceps; NaN where a sample was dropped.
+        x_mm: (m, k, 3) the landmarks in the robot frame; NaN where a sample was dropped.
 
     >>> report = Kinematics(np.array([0.0, 1.0]), np.zeros((2, 3, 3)) + np.array([[[0]], [[4]]]))
     >>> report.at([0.25, 2.0])[:, 0, 0].tolist()
@@ -80,8 +77,7 @@ class Kinematics:
             raise ValueError(f"time_s: expected (n,) or (n, {k}), got {time.shape}.")
         x = np.empty((*time.shape, 3))
         for landmark, axis in np.ndindex(k, 3):  # exactly on a sample, a dropped neighbour has no effect
-            report = self.time_s, self.x_mm[:, landmark, axis]
-            x[:, landmark, axis] = np.interp(time[:, landmark], *report, left=np.nan, right=np.nan)
+            x[:, landmark, axis] = np.interp(time[:, landmark], self.time_s, self.x_mm[:, landmark, axis], np.nan, np.nan)
         if len(self.time_s) > 1:
             step = np.diff(self.time_s)
             before = np.clip(np.searchsorted(self.time_s, time, side="right") - 1, 0, len(step) - 1)
@@ -128,11 +124,8 @@ class Recording:
     def open(cls, folder: str | Path, *, truth: bool = True) -> Self:
         """Open and validate a recording; what is suspicious (`doubts`) is a `UserWarning`.
 
-        Sizes, counts, headers and ends of all images are checked here; pixels are decoded when asked for.  With truth=False
-        the truth of a simulated recording is left alone.
-
-        Raises:
-            FileNotFoundError, ValueError: Naming the file (and line) and the cure.
+        Sizes, counts, headers and ends of all images are checked here.  Errors name the file, the line and the cure.  With
+        truth=False the truth of a simulated recording is left alone.
 
         >>> from lib import paths
         >>> recording = Recording.open(paths.SHIPPED_RECORDING)
@@ -144,14 +137,14 @@ class Recording:
             raise FileNotFoundError(f"{folder}: no such recording folder.")
         header = _read_header(folder / "recording.toml")
         size, skeleton = header["image_size_px"], header["skeleton"]
-        left, right = (open_side(folder, side, size, header["bit_depth"]) for side in ("left", "right"))
-        if len(left) != len(right):
-            raise ValueError(f"{folder}: {len(left)} left and {len(right)} right frames; they come in pairs.")
-        if not len(left):
+        (n, left), (n_right, right) = (open_side(folder, side, size, header["bit_depth"]) for side in ("left", "right"))
+        if n != n_right:
+            raise ValueError(f"{folder}: {n} left and {n_right} right frames; they come in pairs.")
+        if not n:
             raise ValueError(f"{folder}: the recording is empty; it has no frame.")
-        time_s, path = np.arange(len(left)) / header["fps"], folder / "frames.csv"
+        time_s, path = np.arange(n) / header["fps"], folder / "frames.csv"
         if path.exists():
-            time_s = read_table(path, ["frame", "time_s"], n_frames=len(left))[:, 1]
+            time_s = read_table(path, ["frame", "time_s"], n_frames=n)[:, 1]
             refuse(path, ~(np.diff(time_s, prepend=-np.inf) > 0), _ORDER)
         frames = Frames(left, right, time_s)
         kinematics = _read_kinematics(folder / "kinematics.csv", skeleton)
@@ -161,8 +154,8 @@ class Recording:
             what = f"the frames ({seen}, robot clock) and kinematics.csv ({told}) do not overlap"
             raise ValueError(f"{folder}: {what}; check time_s (seconds) and offset_s.")
         path = folder / "annotations.json"
-        annotations = read_coco(path, len(frames), size, skeleton) if path.exists() else None
-        known = Truth.read(folder / "truth", len(frames)) if truth and (folder / "truth").is_dir() else None
+        annotations = read_coco(path, n, size, skeleton) if path.exists() else None
+        known = Truth.read(folder / "truth", n) if truth and (folder / "truth").is_dir() else None
         made = cls(folder=folder, frames=frames, kinematics=kinematics, annotations=annotations, truth=known, **header)
         for doubt in made.doubts:
             place = shlex.quote(re.sub(r"\.\d+-\w+\.partial$", "", str(folder)))  # where `RecordingWriter` moves it
@@ -172,30 +165,37 @@ class Recording:
     @property
     def doubts(self) -> list[Doubt]:
         """What makes the recording suspicious though it can be read."""
-        found, n = [], len(self)
-        frame_s, log_s = self.frames.time_s + self.offset_s, self.kinematics.time_s
-        span, logged = float(np.ptp(frame_s)), float(np.ptp(log_s))
+        n, frame_s, log_s = len(self), self.frames.time_s + self.offset_s, self.kinematics.time_s
+        span, logged, step = float(np.ptp(frame_s)), float(np.ptp(log_s)), np.diff(log_s)
         uniform = np.allclose(np.diff(frame_s) * self.fps, 1.0, rtol=1e-3)
-        if uniform and logged > _LONGER * (span + 1.0 / self.fps) and logged > 2.0:
-            text = f"{n} frames at {self.fps:g} fps last {span:.1f} s, but the robot's log {logged:.1f} s."
-            cure = "If frames were left out, write their times to frames.csv (frame, time_s)."
-            found.append(Doubt("frame_times", text, cure))
+        usual_s = float(np.median(step)) if len(step) else 0.0
         reported = int(np.isfinite(self.landmarks_mm()).all(axis=2).any(axis=1).sum())
-        if reported / n < _COVERED:
-            text = f"The robot reports a position in {reported} of {n} frames; log and video hardly overlap."
-            cure = "Check offset_s and the time_s columns; export the log of the whole video."
-            found.append(Doubt("little_overlap", text, cure))
-        step = np.diff(log_s)
-        if len(step) and np.median(step) > _SLOW_S:
-            text = f"The robot's log has a sample every {np.median(step):.3g} s."
-            cure = "Is time_s in milliseconds? Give seconds, and ten samples a second or more."
-            found.append(Doubt("slow_log", text, cure))
-        jump = np.nan_to_num(np.linalg.norm(np.diff(self.kinematics.x_mm, axis=0), axis=2)).max(axis=1)
-        if (jump > _JUMP_MM).any():
-            k = int(jump.argmax())
-            text = f"In kinematics.csv a landmark jumps by {jump[k]:.0f} mm at {log_s[k + 1]:.3f} s (line {k + 3})."
-            found.append(Doubt("jump", text, "Leave the cells of a wrong sample empty."))
-        return found
+        moved_mm = np.linalg.norm(np.diff(self.kinematics.x_mm, axis=0, prepend=self.kinematics.x_mm[:1]), axis=2)
+        jump_mm = np.nan_to_num(moved_mm).max(axis=1)
+        k = int(jump_mm.argmax())
+        possible = {
+            "frame_times": (
+                uniform and logged > _LONGER * (span + 1.0 / self.fps) and logged > 2.0,
+                f"{n} frames at {self.fps:g} fps last {span:.1f} s, but the robot's log {logged:.1f} s.",
+                "If frames were left out, write their times to frames.csv (frame, time_s).",
+            ),
+            "little_overlap": (
+                reported / n < _COVERED,
+                f"The robot reports a position in {reported} of {n} frames; log and video hardly overlap.",
+                "Check offset_s and the time_s columns; export the log of the whole video.",
+            ),
+            "slow_log": (
+                usual_s > _SLOW_S,
+                f"The robot's log has a sample every {usual_s:.3g} s.",
+                "Is time_s in milliseconds? Give seconds, and ten samples a second or more.",
+            ),
+            "jump": (
+                jump_mm[k] > _JUMP_MM,
+                f"In kinematics.csv a landmark jumps by {jump_mm[k]:.0f} mm at {log_s[k]:.3f} s (line {k + 2}).",
+                "Leave the cells of a wrong sample empty.",
+            ),
+        }
+        return [Doubt(name, text, cure) for name, (found, text, cure) in possible.items() if found]
 
     def landmarks_mm(self) -> np.ndarray:
         """The robot's landmarks (n, k, 3) mm at the frames' times, NaN where the robot says nothing.
@@ -220,15 +220,15 @@ def _read_header(path: Path) -> dict:
         if not (number if kinds[key] is float else isinstance(value, kinds[key])):
             raise ValueError(f"{path}: {key} = {value!r} should be a {kinds[key].__name__}.")
     for key, unit in content.get("units", {}).items():
-        if UNITS.get(key) != unit:
-            raise ValueError(f"{path}: units.{key} = {unit!r}; recordings are in {UNITS}. Convert the files.")
+        if _UNITS.get(key) != unit:
+            raise ValueError(f"{path}: units.{key} = {unit!r}; recordings are in {_UNITS}. Convert the files.")
     header = {key: value for key, value in (_DEFAULTS | content).items() if key not in _FIXED}
     size, fps, readout_s = header["image_size_px"], header["fps"], header["readout_s"]
     whole = len(size) == 2 and all(isinstance(v, int) and not isinstance(v, bool) and v > 1 for v in size)
     accuracy_mm, names, bits = header["robot_accuracy_mm"], header["skeleton"], header["bit_depth"]
     named = [name for name in names if isinstance(name, str) and re.fullmatch(r"[A-Za-z]\w{0,31}", name, re.ASCII)]
     for valid, problem in (
-        (content.get("format", FORMAT) == FORMAT, f"format = {content.get('format')!r}, expected {FORMAT!r}"),
+        (content.get("format", _FORMAT) == _FORMAT, f"format = {content.get('format')!r}, expected {_FORMAT!r}"),
         (names == named and 2 <= len(set(names)) == len(names) <= 8, f"skeleton = {names}: 2 to 8 names, such as tip_1"),
         (set(named) != set(LANDMARKS) or names == list(LANDMARKS), f"skeleton = {names}: a forceps has {list(LANDMARKS)}"),
         (bits == 0 or 8 <= bits <= 16, f"bit_depth = {bits} should be 8 to 16, or 0 for frames of 8 bits"),
@@ -244,7 +244,7 @@ def _read_header(path: Path) -> dict:
 
 
 def _read_kinematics(path: Path, landmarks: Sequence[str]) -> Kinematics:
-    table = read_table(path, kinematics_columns(landmarks))
+    table = read_table(path, _kinematics_columns(landmarks))
     if not len(table):
         raise ValueError(f"{path}: the table is empty; the robot's landmarks are needed.")
     time_s, x = table[:, 0], table[:, 1:].reshape(-1, len(landmarks), 3)
@@ -261,3 +261,133 @@ def _read_kinematics(path: Path, landmarks: Sequence[str]) -> Kinematics:
         what = f"the median distance from {landmarks[0]} to the others is {reach_mm:.4g}, not plausible in mm (0.1 to 100)"
         raise ValueError(f"{path}: {what}. Metres or micrometres? Convert to mm.")
     return Kinematics(time_s, x)
+
+
+class RecordingWriter:
+    """Context manager that writes a recording beside its final place, and moves it there when it is valid.
+
+    Args:
+        folder: Where the recording appears.
+        image_size_px: (width, height).
+        skeleton: Names of the landmarks.
+        details: Own notes (numbers and text), kept in ``[details]`` of recording.toml.
+        suffix, jpeg_quality: ".jpg" or ".png", and the quality of a JPEG.
+        overwrite: Replace a recording of that name; any other folder that exists is a FileExistsError.
+
+    >>> import tempfile
+    >>> tool_mm = np.array([[0, 0, 0], [4, 1, 0], [4, -1, 0]])
+    >>> image = np.zeros((48, 64, 3), np.uint8)
+    >>> with RecordingWriter(tempfile.mkdtemp() + "/mine", name="mine", fps=25, image_size_px=(64, 48)) as writer:
+    ...     writer.add(image, image)
+    ...     writer.kinematics([0.0, 1.0], [tool_mm, tool_mm])
+    >>> len(Recording.open(writer.target))
+    1
+    """
+
+    def __init__(
+        self, folder: str | Path, *, name: str, fps: float, image_size_px: tuple[int, int], description: str = "",
+        readout_s: float = 0.0, offset_s: float = 0.0, robot_accuracy_mm: float = 0.010,
+        skeleton: Sequence[str] = LANDMARKS, details: Mapping[str, float | int | str] | None = None,
+        suffix: str = ".jpg", jpeg_quality: int = 90, overwrite: bool = False,
+    ) -> None:  # fmt: skip
+        if suffix not in {".jpg", ".png"}:
+            raise ValueError(f"suffix: '.jpg' or '.png', got {suffix!r}.")
+        self.target, self._overwrite = Path(folder), overwrite
+        self._check_target()
+        self.folder = self.target.with_name(f"{self.target.name}.{os.getpid()}-{os.urandom(3).hex()}.partial")
+        self.fps, self.image_size_px = float(fps), (int(image_size_px[0]), int(image_size_px[1]))
+        self._suffix, self._options = suffix, [cv2.IMWRITE_JPEG_QUALITY, int(jpeg_quality)] if suffix == ".jpg" else []
+        self._header = {
+            "format": _FORMAT, "name": name, "description": description, "fps": self.fps,
+            "image_size_px": list(self.image_size_px), "skeleton": list(skeleton),
+            "robot_accuracy_mm": float(robot_accuracy_mm), "readout_s": float(readout_s), "offset_s": float(offset_s),
+        }  # fmt: skip
+        self._details = dict(details or {})
+        self._time_s: list[float] = []
+        self._kinematics: list[np.ndarray] = []
+        self._annotations: Annotations | None = None
+
+    def _check_target(self) -> None:
+        if self.target.exists() and not self._overwrite:
+            raise FileExistsError(f"{self.target}: exists already; pass overwrite=True to replace it.")
+        if self.target.exists() and not (self.target / "recording.toml").is_file():
+            raise FileExistsError(f"{self.target}: is not a recording and is left alone; choose another name.")
+
+    def __enter__(self) -> Self:
+        for side in ("left", "right"):
+            (self.folder / side).mkdir(parents=True)
+        return self
+
+    def __exit__(self, kind: type | None, *_: object) -> None:
+        try:
+            if kind is None:
+                self._finish()
+        finally:
+            shutil.rmtree(self.folder, ignore_errors=True)
+
+    @property
+    def truth_folder(self) -> Path:
+        """truth/ of the unfinished recording, for `lib.recordings.Truth` and what else a simulator knows."""
+        folder = self.folder / "truth"
+        folder.mkdir(exist_ok=True)
+        return folder
+
+    def add(self, left: np.ndarray, right: np.ndarray, time_s: float | None = None) -> None:
+        """Append a stereo pair, (h, w, 3) uint8 RGB each; `time_s` on the video clock, None = uniform at fps."""
+        index = len(self._time_s)
+        shape = (self.image_size_px[1], self.image_size_px[0], 3)
+        for side, image in (("left", left), ("right", right)):
+            if image.shape != shape or image.dtype != np.uint8:
+                raise ValueError(f"{side}: expected {shape} uint8 RGB, got {image.shape} {image.dtype}.")
+            data = cv2.imencode(self._suffix, cv2.cvtColor(image, cv2.COLOR_RGB2BGR), self._options)[1]
+            write_bytes(self.folder / side / f"{index:06d}{self._suffix}", data.tobytes())
+        self._time_s.append(index / self.fps if time_s is None else float(time_s))
+
+    def kinematics(self, time_s: ArrayLike, x_mm: ArrayLike) -> None:
+        """Append samples: robot times (m,) and landmarks (m, k, 3) mm, NaN where a landmark was dropped."""
+        time, x = np.array(time_s, np.float64, ndmin=1), np.asarray(x_mm, np.float64)
+        k = len(self._header["skeleton"])
+        if x.shape != (len(time), k, 3):
+            raise ValueError(f"x_mm: expected ({len(time)}, {k}, 3), got {x.shape}.")
+        self._kinematics.append(np.column_stack([time, x.reshape(len(time), 3 * k)]))
+
+    def annotations(self, *u_and_visibility: ArrayLike) -> None:
+        """Landmarks of all frames: `u_left`, `u_right` and their visibility, as in `Annotations`."""
+        self._annotations = Annotations(*u_and_visibility)
+
+    def draft(self, offset_s: float | None = None) -> Recording:
+        """The recording as it is so far, valid or a ValueError; it lies in a folder that is removed if anything fails.
+
+        `offset_s` replaces what was given, where a first draft was needed to find it.
+        """
+        if offset_s is not None:
+            self._header["offset_s"] = float(offset_s)
+        lines = toml_entries(self._header)
+        for table, values in (("units", _UNITS), ("details", self._details)):
+            lines += ["", f"[{table}]", *toml_entries(values)] if values else []
+        write_text(self.folder / "recording.toml", "\n".join(lines) + "\n")
+        time = np.array(self._time_s)
+        if not np.allclose(time, np.arange(len(time)) / self.fps, rtol=0, atol=1e-7):
+            table = np.column_stack([np.arange(len(time)), time])
+            write_table(self.folder / "frames.csv", ["frame", "time_s"], table, [0, 7])
+        if self._kinematics:
+            table = np.vstack(self._kinematics)
+            names = _kinematics_columns(self._header["skeleton"])
+            write_table(self.folder / "kinematics.csv", names, table, [7] + [6] * (len(names) - 1))
+        if self._annotations is not None:
+            path, names = self.folder / "annotations.json", self._header["skeleton"]
+            write_coco(path, self._annotations, self.image_size_px, self._suffix, names)
+        return Recording.open(self.folder)
+
+    def _finish(self) -> None:
+        self.draft()  # what is not valid must not appear
+        self._check_target()
+        old = self.folder.with_suffix(".replaced")
+        if self.target.exists():
+            os.replace(self.target, old)
+        try:
+            os.replace(self.folder, self.target)
+        except OSError:
+            os.replace(old, self.target)
+            raise
+        shutil.rmtree(old, ignore_errors=True)

@@ -4,8 +4,9 @@ import csv
 import io
 import json
 import math
+import re
 import tomllib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -51,9 +52,15 @@ def toml(value: object) -> str:
     { fps = 25.0, names = ["base"], end_s = inf }
     """
     if isinstance(value, dict):
-        return "{ " + ", ".join(f"{key} = {toml(item)}" for key, item in value.items()) + " }"
+        return f"{{ {', '.join(toml_entries(value))} }}"
     text = json.dumps(value, ensure_ascii=False)
     return {"Infinity": "inf", "-Infinity": "-inf", "NaN": "nan"}.get(text, text)
+
+
+def toml_entries(values: Mapping[str, object]) -> list[str]:
+    """``key = value`` for each entry of a table, as TOML writes it."""
+    keys = (key if re.fullmatch(r"[\w-]+", key, re.ASCII) else json.dumps(key) for key in values)
+    return [f"{key} = {toml(value)}" for key, value in zip(keys, values.values(), strict=True)]
 
 
 def rows_of(path: Path, text: str, separator: str = ",") -> Iterator[tuple[str, list[str]]]:
@@ -88,10 +95,7 @@ def read_table(path: Path, names: Sequence[str], optional: Sequence[str] = (), n
     """The columns `names`, then `optional`, of a CSV file as (rows, columns) float64; an empty cell is NaN.
 
     A file has all of the optional columns or none of them; then they are NaN.  With `n_frames` the first column must
-    number the frames from 0.
-
-    Raises:
-        FileNotFoundError, ValueError: Naming file and line; "nan" is refused too, since a missing value is an empty cell.
+    number the frames from 0.  Errors name file and line; "nan" is one, since a missing value is an empty cell.
     """
     text = decoded(path)
     rows = rows_of(path, text)

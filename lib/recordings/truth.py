@@ -66,9 +66,8 @@ class Truth:
         """
         self.rig.save(self.folder / "rig.json")
         n = len(self.landmarks_mm)
-        image = np.empty((n, 3, 2, 3))
-        image[..., :2] = np.stack([self.u_left, self.u_right], axis=2)
-        image[..., 2] = np.stack([self.visibility_left, self.visibility_right], axis=2)
+        sides = (self.u_left, self.visibility_left), (self.u_right, self.visibility_right)
+        image = np.stack([np.dstack([u, visibility]) for u, visibility in sides], axis=2)
         table = np.column_stack([np.arange(n), np.reshape(self.landmarks_mm, (n, 9)), image.reshape(n, 18)])
         if self.in_glint_left is not None:
             glints = np.stack([self.in_glint_left, self.in_glint_right], axis=-1).astype(bool)

@@ -1,8 +1,6 @@
-"""The main job: executes the notebooks in order and makes the report of the run.
+"""The main job: `command` runs the notebooks and makes a report, `sweep` runs one notebook over a grid of parameters.
 
-``run`` (in `command`) works through notebooks into ``runs/<date>-<profile>/``: executed notebooks, one page each,
-figures, metrics.json, index.html.  ``sweep`` runs one notebook over a grid of parameters.  Notebooks call `report` to
-state what they find and `results` to read what was recorded.
+Notebooks call `report` to state what they find and `results` to read what was recorded.
 """
 
 import sys

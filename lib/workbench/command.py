@@ -15,11 +15,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from PIL import Image
-from tqdm import tqdm
 
 from lib import files, paths
 from lib.provenance import commit, machine
-from lib.workbench import execution, pages, parameters
+from lib.workbench import execution, pages
 from lib.workbench.execution import Failure, execute
 
 #: Keeps room on the disk to write the last state of a run when the disk is full.
@@ -31,17 +30,13 @@ README_FIGURES = ("overview", "landmark_detection", "reconstruction_surface", "c
 
 def main(argv: Sequence[str]) -> int:
     """Parse the command line and run: 0 if every notebook came to its end, 1 if one failed, 128 + n for signal n."""
-    parser = argparse.ArgumentParser(
-        prog="python3 -m lib run", description="Execute the notebooks and write their report into runs/<date>-<profile>/."
-    )
-    parser.add_argument("notebooks", nargs="*", metavar="NOTEBOOK", help="path, name or number (default: all)")
-    parser.add_argument("--profile", choices=("quick", "paper"), default="quick",
-                        help="quick: minutes; paper: the paper's sizes")  # fmt: skip
-    parser.add_argument("-p", dest="pairs", nargs=2, action="append", default=[], metavar=("NAME", "VALUE"),
-                        help="a parameter of the notebooks that declare it")  # fmt: skip
-    parser.add_argument("--cell-timeout", type=parameters.positive, metavar="S",
-                        help="longest time of one cell (default: 900 for quick)")  # fmt: skip
-    parser.add_argument("--runs", type=Path, default=paths.RUNS, metavar="FOLDER", help="where the run's folder appears")
+    parser = argparse.ArgumentParser("python3 -m lib run", description="Execute notebooks; report in runs/<date>-<profile>/.")
+    add = parser.add_argument
+    add("notebooks", nargs="*", metavar="NOTEBOOK", help="path, name or number (default: all)")
+    add("--profile", choices=("quick", "paper"), default="quick", help="quick: minutes; paper: the paper's sizes")
+    add("-p", dest="pairs", nargs=2, action="append", default=[], metavar=("NAME", "VALUE"), help="a declared parameter")
+    add("--cell-timeout", type=execution.positive, metavar="S", help="longest time of one cell (default: 900 for quick)")
+    add("--runs", type=Path, default=paths.RUNS, metavar="FOLDER", help="where the run's folder appears")
     options = parser.parse_args(argv)
     timeout = options.cell_timeout or (900.0 if options.profile == "quick" else None)
     received = []
@@ -59,9 +54,7 @@ def main(argv: Sequence[str]) -> int:
 
 def main_site(argv: Sequence[str]) -> int:
     """Copy the pages of a run into a folder that a web server shows as it is."""
-    parser = argparse.ArgumentParser(
-        prog="python3 -m lib site", description="Make a static site of a run, such as for GitHub Pages."
-    )
+    parser = argparse.ArgumentParser("python3 -m lib site", description="Make a static site of a run, as for GitHub Pages.")
     parser.add_argument("run", nargs="?", type=Path, metavar="RUN", help="its folder (default: the last complete one)")
     parser.add_argument("--out", type=Path, default=paths.ROOT / "site", metavar="FOLDER", help="a new folder")
     parser.add_argument("--gallery", action="store_true", help="renew the README's pictures in data/gallery instead")
@@ -79,11 +72,7 @@ def main_site(argv: Sequence[str]) -> int:
 
 
 def renew_gallery(run: Path) -> None:
-    """Take the README's pictures from the figures of a run of the shipped recording, and note what made them.
-
-    Raises:
-        OSError: If the run lacks one or shows another recording; then none is changed.
-    """
+    """Take the README's pictures from a run of all notebooks on the shipped recording; what it lacks is an OSError."""
     made_by, figures = json.loads((run / "metrics.json").read_text(encoding="utf-8")), run / "figures"
     chosen = [next(iter(sorted(figures.glob(f"{name}.*"))), figures / name) for name in README_FIGURES]
     if lacking := [path.stem for path in chosen if not path.is_file()]:
@@ -101,30 +90,24 @@ def renew_gallery(run: Path) -> None:
             picture = picture.convert("RGB")
             picture.thumbnail((1300, 1300))
             picture.save(paths.GALLERY / f"{path.stem}.jpg", quality=88, subsampling=0)
-    known = ("started", "commit", "machine", "weights")
-    files.write_json(paths.GALLERY / "made_by.json", {key: made_by[key] for key in known})
+    known = {key: made_by[key] for key in ("started", "commit", "machine", "weights")}
+    files.write_json(paths.GALLERY / "made_by.json", known)
 
 
 def run(
     names: Sequence[str] = (), profile: str = "quick", pairs: Sequence[tuple[str, str]] = (), *,
     cell_timeout_s: float | None = None, runs: Path = paths.RUNS, notebooks: Path = paths.NOTEBOOKS,
 ) -> dict:  # fmt: skip
-    """Execute notebooks into a new folder of `runs`; the others still run when one fails.
+    """Execute notebooks into a new folder of `runs`, and return its metrics.json; the others still run when one fails.
 
     Everything is written at once, so that a run that is killed leaves a readable report of what it had reached.
-
-    Returns:
-        dict: The content of the run's metrics.json.
 
     Raises:
         ValueError: Before anything runs: for an unknown notebook or parameter, or a value of the wrong type.
         OSError: If the report cannot be written; its state is "failed" if that can still be written.
     """
-    chosen = parameters.choose_notebooks(names, notebooks)
-    values = parameters.parse_parameters(pairs, chosen)
-    for book in chosen:
-        if "profile" in parameters.declared_parameters(book):
-            values[book].setdefault("profile", profile)
+    chosen = execution.choose_notebooks(names, notebooks)
+    values = execution.parse_parameters(pairs, chosen, profile)
     report = _Report(_new_folder(runs, profile), chosen, profile, dict(pairs))
     width = max(len(book.stem) for book in chosen)
     try:
@@ -133,15 +116,9 @@ def run(
             os.environ[paths.SHARED_VARIABLE] = shared  # the kernels inherit it
             for number, book in enumerate(chosen):
                 label, start = f"[{number + 1}/{len(chosen)}] {book.stem:<{width}}", time.monotonic()
-                report.begin(number)
-                with tqdm(desc=label, unit="cell", leave=False, disable=not sys.stderr.isatty()) as bar:
-
-                    def on_cell(cell: int, n_cells: int, bar: tqdm = bar) -> None:
-                        bar.total, bar.n = n_cells, cell
-                        bar.refresh()
-
-                    executed = report.folder / book.name
-                    failure = execute(book, executed, values[book], cell_timeout_s=cell_timeout_s, on_cell=on_cell)
+                report.content["notebooks"][number]["state"] = "running"
+                report.write()
+                failure = execute(book, report.folder / book.name, values[book], cell_timeout_s=cell_timeout_s, label=label)
                 seconds = time.monotonic() - start
                 report.end(number, failure, seconds)
                 print(f"{label}  {seconds:6.1f} s  {'failed' if failure else 'done'}", flush=True)
@@ -158,13 +135,14 @@ def run(
     for entry in report.content["notebooks"]:
         if entry["failure"]:
             print(f"FAILED {entry['name']}: {Failure(**entry['failure'])}", file=sys.stderr)
+    content = report.content
     print(f"\nReport: {report.folder / 'index.html'}")
-    if report.content["verdict"]:
-        names = ", ".join(dict.fromkeys(reason["name"].replace("_", " ") for reason in report.content["reasons"]))
-        folder = report.content["parameters"].get("recording") or paths.shown(paths.SHIPPED_RECORDING)
+    if content["verdict"]:
+        names = ", ".join(dict.fromkeys(reason["name"].replace("_", " ") for reason in content["reasons"]))
+        folder = content["parameters"].get("recording") or paths.shown(paths.SHIPPED_RECORDING)
         why = f" ({names}); `python3 -m lib check {folder}` says more" if names else ""
-        print(f"Verdict: {report.content['verdict']}{why}")
-    return report.content
+        print(f"Verdict: {content['verdict']}{why}")
+    return content
 
 
 def complete_runs(runs: Path) -> list[tuple[Path, dict]]:
@@ -173,16 +151,13 @@ def complete_runs(runs: Path) -> list[tuple[Path, dict]]:
     for file in runs.glob("*/metrics.json"):
         with contextlib.suppress(OSError, ValueError, KeyError, TypeError):  # another version's, or cut off
             content = json.loads(file.read_text(encoding="utf-8"))
-            if (content["format"], content["state"]) == ("microstereo.metrics", "complete"):
-                found.append((content["started"], file.parent, content))
-    return [entry[1:] for entry in sorted(found, key=lambda entry: entry[0])]
+            if (content["format"], content["state"]) == ("microstereo.metrics", "complete") and content["started"]:
+                found.append((file.parent, content))
+    return sorted(found, key=lambda run: run[1]["started"])
 
 
 def previous_values(runs: Path, content: dict) -> dict[str, float | None]:
-    """Metric -> its value in the last complete run that has it, of this run's machine, profile and parameters.
-
-    `content` is the metrics.json of this run.
-    """
+    """Metric -> its value in the last complete run that has it, on the machine and with the settings of `content`."""
     found = {}
     for _, other in complete_runs(runs):
         alike = all(other[key] == content[key] for key in ("profile", "parameters"))
@@ -203,7 +178,7 @@ class _Report:
             "weights": files.digest(paths.MODELS / "default.safetensors"),
             "versions": execution.versions(),
             "notebooks": [
-                {"name": book.stem, "title": parameters.title_of(book), "state": "pending", "seconds": None, "failure": None,
+                {"name": book.stem, "title": execution.title_of(book), "state": "pending", "seconds": None, "failure": None,
                  "page": None, "executed": None, "left_out": None, "verdict": None, "reasons": []}
                 for book in notebooks
             ],
@@ -214,33 +189,34 @@ class _Report:
         (folder / _ROOM).write_bytes(bytes(1 << 20))
         self.write()
 
-    def begin(self, number: int) -> None:
-        self.content["notebooks"][number]["state"] = "running"
-        self.write()
-
     def end(self, number: int, failure: Failure | None, seconds: float) -> None:
         """Collect what a notebook recorded (also one that failed, up to there) and write its page."""
-        book, entry = self.notebooks[number], self.content["notebooks"][number]
-        executed = self.folder / book.name
-        entry.update(state="failed" if failure else "complete", seconds=round(seconds, 2))
+        book, content = self.notebooks[number], self.content
+        entry, executed = content["notebooks"][number], self.folder / book.name
+        entry |= {"state": "failed" if failure else "complete", "seconds": round(seconds, 2)}
         entry["failure"] = failure._asdict() if failure else None
         try:
             stated = execution.stated_in(executed)
         except (OSError, ValueError):  # there is none, or a full disk has cut it off
             executed.unlink(missing_ok=True)
         else:
-            entry["left_out"] = stated.left_out
-            entry.update(stated.verdict or {})
-            self.content.update(execution.joined(self.content["notebooks"]) or {})
-            self.content["metrics"] += [{"notebook": book.stem, **m} for m in stated.metrics]
+            entry |= {"left_out": stated.left_out} | (stated.verdict or {})
+            content |= execution.joined(content["notebooks"]) or {}
+            content["metrics"] += [{"notebook": book.stem, **m} for m in stated.metrics]
             for named, suffix, data in stated.figures:
                 file = f"figures/{named['name']}{suffix}"
-                if any(other["file"] == file for other in self.content["figures"]):
+                if any(other["file"] == file for other in content["figures"]):
                     file = f"figures/{book.stem}.{named['name']}{suffix}"
                 files.write_bytes(self.folder / file, data)
-                entry_of = {"notebook": book.stem, "name": named["name"], "file": file, "caption": named["caption"]}
-                self.content["figures"].append(entry_of)
-            self._write_page(number)
+                content["figures"].append({"notebook": book.stem, **named, "file": file})
+            before, after = ([None, *content["notebooks"], None][k] for k in (number, number + 2))
+            text = pages.page(executed, book.parent, entry, previous=before, following=after)
+            if pages.PLOTLY_FILE in text and not (self.folder / pages.PLOTLY_FILE).exists():
+                import plotly
+
+                shutil.copy(Path(plotly.__file__).parent / "package_data" / pages.PLOTLY_FILE, self.folder)
+            files.write_text(self.folder / f"{book.stem}.html", text)
+            entry |= {"page": f"{book.stem}.html", "executed": book.name}
         self.write()
 
     def finish(self, state: str | None = None) -> None:
@@ -264,20 +240,6 @@ class _Report:
         self.content["seconds"] = round(time.monotonic() - self.start, 2)
         files.write_json(self.folder / "metrics.json", self.content)
         files.write_text(self.folder / "index.html", pages.index_html(self.content))
-
-    def _write_page(self, number: int) -> None:
-        book, entry = self.notebooks[number], self.content["notebooks"][number]
-        pages_of = [None, *((f"{other['name']}.html", other["title"]) for other in self.content["notebooks"]), None]
-        text = pages.page(
-            self.folder / book.name, title=entry["title"], folder=book.parent, verdict=entry,
-            previous=pages_of[number], following=pages_of[number + 2],
-        )  # fmt: skip
-        if pages.PLOTLY_FILE in text and not (self.folder / pages.PLOTLY_FILE).exists():
-            import plotly
-
-            shutil.copy(Path(plotly.__file__).parent / "package_data" / pages.PLOTLY_FILE, self.folder)
-        files.write_text(self.folder / f"{book.stem}.html", text)
-        entry.update(page=f"{book.stem}.html", executed=book.name)
 
 
 def _new_folder(runs: Path, profile: str) -> Path:

@@ -1,11 +1,16 @@
-"""Executes one notebook with papermill, judges by its outputs whether it went well, and reads back what it stated."""
+"""Notebooks and the values of their parameters, checked before anything runs; their execution, and what they stated."""
 
+import argparse
+import ast
 import base64
 import logging
+import math
 import os
 import platform
 import re
-from collections.abc import Callable, Iterable
+import sys
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from importlib.metadata import distributions
 from pathlib import Path
 from typing import NamedTuple
@@ -13,10 +18,16 @@ from typing import NamedTuple
 import nbformat
 from nbclient.exceptions import CellTimeoutError, DeadKernelError
 
+from lib import paths
 from lib.workbench.report import FIGURE_METADATA, METRIC_MIME, STOP_METADATA, VERDICT_COLOURS, VERDICT_MIME
 
 #: Packages whose version can change a figure.
 _TOLD = ("numpy", "scipy", "torch", "kornia", "opencv-python-headless", "open3d-cpu", "open3d", "cvxpy", "clarabel")
+#: How the comment of a study's parameter ends: ``; grid: 75, 300, 1500``.
+_GRID = re.compile(r";\s*grid:(.*)$")
+#: A comma outside brackets.
+_COMMA = re.compile(r",(?![^\[({]*[\])}])")
+#: Tags of papermill's own cells: values given, error marks.
 _ADDED = {"injected-parameters", "papermill-error-cell-tag"}
 #: What kernels inherit: this interpreter's own kernel, quiet libraries, and that nobody answers what they show.
 _KERNEL_ENVIRONMENT = {
@@ -25,7 +36,108 @@ _KERNEL_ENVIRONMENT = {
     "OPEN3D_DISABLE_WEB_VISUALIZER": "true",  # it hangs without a display
     "PYDEVD_DISABLE_FILE_VALIDATION": "1",  # a warning of the debugger on every start
 }
-_ANSI = re.compile(r"\x1b\[[0-9;]*m")
+
+
+def choose_notebooks(names: Sequence[str] = (), folder: Path = paths.NOTEBOOKS) -> list[Path]:
+    """The notebooks named, in the order of the paper; all of them for no name.
+
+    A name is a path, a file's name, its stem, or the leading number (``03``); studies are found by stem too.  A ValueError
+    for a name that fits none lists what there is.
+    """
+    shipped = sorted(folder.glob("[0-9]*.ipynb"))
+    if not names:
+        return shipped
+    studies = sorted(folder.glob("studies/*.ipynb"))
+    chosen = []
+    for name in names:
+        path = Path(name)
+        fits = [path.resolve()] if path.suffix == ".ipynb" and path.is_file() else []
+        fits = fits or [book for book in shipped if name in (book.name, book.stem, book.stem.split("_")[0])]
+        fits = fits or [book for book in studies if path.with_suffix("") in (Path(book.stem), Path("studies", book.stem))]
+        if not fits:
+            there = [book.stem for book in shipped] + [f"studies/{book.stem}" for book in studies]
+            raise ValueError(f"unknown notebook: {name}. There are: {', '.join(there)}.")
+        chosen += [book for book in fits if book not in chosen]
+    return sorted(chosen, key=lambda book: book.name)
+
+
+def declared_parameters(notebook: Path) -> dict[str, str]:
+    """Names and declared types ("int", "str", ...; "" where none is) of the cell tagged ``parameters``."""
+    return {name: (entry["inferred_type_name"] or "").replace("None", "") for name, entry in _inspect(notebook).items()}
+
+
+def declared_grid(notebook: Path) -> dict[str, list[str]]:
+    """The values that a sweep tries, as texts: those that comments of the parameters name after ``; grid:``."""
+    found = {name: _GRID.search(entry["help"] or "") for name, entry in _inspect(notebook).items()}
+    return {name: split_values(grid[1]) for name, grid in found.items() if grid}
+
+
+def split_values(text: str) -> list[str]:
+    """The values of ``75, 300`` or ``[1, 2], [3]``, as texts.
+
+    >>> split_values("[1, 2], band")
+    ['[1, 2]', 'band']
+    """
+    return [value.strip() for value in _COMMA.split(text) if value.strip()]
+
+
+def parse_parameters(pairs: Sequence[tuple[str, str]], notebooks: Sequence[Path], profile: str = "quick") -> dict[Path, dict]:
+    """What each notebook is given: the pairs that it declares, and the profile, as values of the declared type.
+
+    A ValueError if no chosen notebook declares a name, or a text does not fit the declared type.
+    """
+    declared = {notebook: declared_parameters(notebook) for notebook in notebooks}
+    known = {name for names in declared.values() for name in names}
+    for name, _ in pairs:
+        if name not in known:
+            raise ValueError(f"unknown parameter: {name}. Declared are: {', '.join(sorted(known)) or 'none'}.")
+    return {
+        notebook: {name: _value(name, text, names[name]) for name, text in [("profile", profile), *pairs] if name in names}
+        for notebook, names in declared.items()
+    }
+
+
+def positive(text: str) -> float:
+    """A number of seconds on a command line; an `argparse.ArgumentTypeError` for anything but a finite number above 0."""
+    with suppress(ValueError):
+        if 0 < float(text) < math.inf:
+            return float(text)
+    raise argparse.ArgumentTypeError(f"{text} is not a number of seconds above 0.")
+
+
+def title_of(notebook: Path) -> str:
+    """The first heading of the notebook, or its stem."""
+    for cell in nbformat.read(notebook, as_version=4).cells:
+        for line in cell.source.splitlines() if cell.cell_type == "markdown" else ():
+            if line.startswith("#"):
+                return line.lstrip("# ").strip()
+    return notebook.stem
+
+
+def _value(name: str, text: str, kind: str) -> object:
+    """`text` as the declared type; without one, as the Python literal it is, or else as text."""
+    kind = kind.split("|")[0].strip().split("[")[0]
+    words = {"true": True, "false": False, "1": True, "0": False}
+    simple = {"str": str, "int": int, "float": float, "bool": lambda text: words[text.lower()]}
+    try:
+        value = simple.get(kind, ast.literal_eval)(text)
+        if kind in ("list", "tuple", "dict", "set") and type(value).__name__ != kind:
+            raise ValueError(f"a {type(value).__name__}")
+        return value
+    except (ValueError, KeyError, SyntaxError):
+        if kind in (*simple, "list", "tuple", "dict", "set"):
+            raise ValueError(f"parameter {name}: {text!r} is not of type {kind}.") from None
+        return {"true": True, "false": False, "none": None}.get(text.lower(), text)
+
+
+def _inspect(notebook: Path) -> dict[str, dict]:
+    import papermill
+
+    logging.getLogger("papermill").setLevel(logging.ERROR)  # no word about notebooks without a parameters cell
+    try:
+        return papermill.inspect_notebook(str(notebook))
+    except (OSError, ValueError, nbformat.ValidationError) as error:  # also text that is not JSON
+        raise ValueError(f"{notebook}: not a notebook ({error}).") from None
 
 
 class Failure(NamedTuple):
@@ -41,32 +153,28 @@ class Failure(NamedTuple):
 
 
 def execute(
-    notebook: Path, output: Path, parameters: dict, *, cell_timeout_s: float | None = None,
-    on_cell: Callable[[int, int], None] = lambda cell, n_cells: None,
-) -> Failure | None:  # fmt: skip
+    notebook: Path, output: Path, parameters: dict, *, cell_timeout_s: float | None = None, label: str = ""
+) -> Failure | None:
     """Execute `notebook` into `output` (written after each cell); None if every cell came to its end.
 
-    Args:
-        cell_timeout_s: The longest that one cell may take; None is without end.
-        on_cell: Called with the cell that starts (from 1) and the number of cells.
+    With a `label` a terminal shows how many cells are done.
     """
     import papermill
     from papermill.exceptions import PapermillExecutionError
 
-    running, cells = 0, len(nbformat.read(notebook, as_version=4).cells)
+    running = 0
 
     def on_cell_start(cell, cell_index):
         nonlocal running
         running += not _is_added(cell)
-        on_cell(running, cells)
 
     os.environ.pop("JUPYTER_PATH", None)
     os.environ.update(_KERNEL_ENVIRONMENT)
     logging.getLogger("papermill").setLevel(logging.CRITICAL)  # what it says is told by the failure returned
     try:
         papermill.execute_notebook(
-            str(notebook), str(output), parameters, kernel_name="python3", progress_bar=False,
-            execution_timeout=cell_timeout_s,
+            str(notebook), str(output), parameters, kernel_name="python3", execution_timeout=cell_timeout_s,
+            progress_bar={"desc": label, "leave": False, "disable": not (label and sys.stderr.isatty())},
             start_timeout=600,  # of the kernel: a busy machine takes its time
             on_cell_start=on_cell_start,  # this and the next are for nbclient
             extra_arguments=["--IPKernelApp.log_level=50"],  # its warning of unencrypted TCP on every start
@@ -92,7 +200,8 @@ def _failure_of(executed: Path) -> Failure | None:
             if output.output_type == "error" and output.ename == "SystemExit" and not output.evalue:
                 return None  # `report.stop`
             if output.output_type == "error":
-                return Failure("error", number, f"{output.ename}: {_ANSI.sub('', output.evalue)}")
+                message = re.sub(r"\x1b\[[0-9;]*m", "", output.evalue)  # colours of a terminal
+                return Failure("error", number, f"{output.ename}: {message}")
         status = cell.metadata.get("papermill", {}).get("status")
         if cell.source.strip() and status not in (None, "completed"):
             return Failure("error", number, f"the cell is {status}.")

@@ -25,8 +25,6 @@ _RICHEST_FIRST = ["application/vnd.plotly.v1+json", "text/html", "application/vn
                   "image/png", "image/jpeg", "text/markdown", "text/latex", "text/plain"]  # fmt: skip
 #: (level, anchor, text) of a heading that nbconvert has given an anchor.
 _HEADING = re.compile(r'<h([23]) id="([^"]+)">(.*?)<a class="anchor-link"', re.DOTALL)
-#: The note of a number that was read from a record and not computed in the run.
-_RECORDED = re.compile(r"(.*, )?recorded\b")
 #: State of the notebook -> why it did not state a number; None: it is not part of the run.
 _MISSING = {None: "its notebook was not run", "pending": "not yet", "running": "not yet", "failed": "its notebook failed"}
 
@@ -46,10 +44,7 @@ _REWRITES = [
 
 @lru_cache(maxsize=4096)
 def equation_svg(tex: str, *, display: bool) -> str:
-    """An equation as inline SVG in HTML, on the line of the text; its TeX is the alternative text.
-
-    TeX that the converter cannot read is shown as it is.
-    """
+    """An equation as inline SVG in HTML, on the line of the text; TeX that the converter cannot read is shown as it is."""
     import ziamath  # not at the top: it takes half a second, and few commands need it
     from ziamath.tex import tex2mml
 
@@ -87,10 +82,7 @@ class _Renderer(IPythonRenderer):
 
 
 def markdown_html(source: str, *, folder: Path = Path(), attachments: dict | None = None, trusted: bool = True) -> str:
-    """Markdown with TeX as HTML; pictures it names, relative to `folder`, are embedded.
-
-    HTML in text that is not `trusted`, such as a caption that names a recording, is escaped.
-    """
+    """Markdown with TeX as HTML, with pictures that it names relative to `folder`; HTML that is not `trusted` is escaped."""
     renderer = _Renderer(
         escape=not trusted, allow_harmful_protocols=trusted, embed_images=True, path=str(folder),
         attachments=attachments or {},
@@ -98,16 +90,10 @@ def markdown_html(source: str, *, folder: Path = Path(), attachments: dict | Non
     return MarkdownWithMath(renderer=renderer).render(source)
 
 
-def page(
-    executed: Path, *, title: str, folder: Path, verdict: dict, previous: tuple[str, str] | None,
-    following: tuple[str, str] | None,
-) -> str:  # fmt: skip
-    """The HTML of an executed notebook.
+def page(executed: Path, folder: Path, entry: dict, *, previous: dict | None, following: dict | None) -> str:
+    """The HTML of an executed notebook whose source lies in `folder`.
 
-    Args:
-        folder: Where the notebook's source lies: what its relative pictures are relative to.
-        verdict: `verdict` (None: it stated none) and `reasons`, shown on top.
-        previous, following: (file, title) of the neighbouring pages.
+    `entry` is what metrics.json says of it; `previous` and `following` are the entries of its neighbours.
     """
 
     @pass_context
@@ -124,8 +110,8 @@ def page(
     exporter.config.NbConvertBase.display_data_priority = _RICHEST_FIRST
     body, _ = exporter.from_notebook_node(nbformat.read(executed, as_version=4))
     return rendered(
-        "page.html", title=title, body=body, contents=_HEADING.findall(body), content=verdict, previous=previous,
-        following=following, plotly_file=PLOTLY_FILE if 'class="plotly-view"' in body else None,
+        "page.html", body=body, contents=_HEADING.findall(body), content=entry, previous=previous, following=following,
+        plotly_file=PLOTLY_FILE if 'class="plotly-view"' in body else None,
     )  # fmt: skip
 
 
@@ -140,15 +126,14 @@ def index_html(run: dict) -> str:
 
 
 def is_recorded(metric: dict) -> bool:
-    """Whether a metric was read from a record."""
-    return bool(_RECORDED.match(metric["note"]))
+    """Whether a metric was read from a record and not computed in the run, as its note says."""
+    return bool(re.match(r"(.*, )?recorded\b", metric["note"]))
 
 
 def headlines(run: dict) -> tuple[list[dict], list[str]]:
     """The rows of the table on top of index.html, and what has no row because the user's recording has no truth.
 
-    ``templates/headlines.toml`` says which numbers these are, eight at most, with their targets; `run` is the content of
-    metrics.json.
+    ``templates/headlines.toml`` says which numbers these are, with their targets; `run` is the content of metrics.json.
     """
     text = (_TEMPLATES / "headlines.toml").read_text(encoding="utf-8")
     metrics, books = ({entry["name"]: entry for entry in run[kind]} for kind in ("metrics", "notebooks"))

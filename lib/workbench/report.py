@@ -1,7 +1,7 @@
 """What a notebook states: metrics, figures and verdicts that the main job collects from the executed notebook.
 
-They travel inside the notebook's outputs (metrics and verdicts as JSON under mime types of their own, a figure as a PNG
-that knows its name), so an executed notebook alone is the record of what it found.  Outside Jupyter they print one line.
+They travel in the notebook's outputs (metrics and verdicts as JSON, a figure as a picture that knows its name), so an
+executed notebook alone is the record of what it found.  Outside Jupyter they print one line.
 """
 
 from __future__ import annotations
@@ -22,24 +22,16 @@ from jinja2 import Environment, FileSystemLoader
 if TYPE_CHECKING:  # at run time it would slow every notebook's start
     from matplotlib.figure import Figure
 
-#: Mime type of a metric in a notebook's outputs; the JSON holds name, value, unit, paper, note.
-METRIC_MIME = "application/vnd.microstereo.metric+json"
-#: Mime type of a verdict; the JSON is that of `lib.trust.Verdict`.
-VERDICT_MIME = "application/vnd.microstereo.verdict+json"
+#: Mime types in a notebook's outputs: JSON of name, value, unit, paper and note; and of a `lib.trust.Verdict`.
+METRIC_MIME, VERDICT_MIME = "application/vnd.microstereo.metric+json", "application/vnd.microstereo.verdict+json"
+#: Keys of the output metadata: {"name": ..., "caption": ...} of a figure; why a notebook ended before its last cell.
+FIGURE_METADATA, STOP_METADATA = "microstereo_figure", "microstereo_stop"
 #: The colour of each verdict, from the best to the worst.
 VERDICT_COLOURS = {"trustworthy": "#067647", "doubtful": "#b54708", "not trustworthy": "#b42318"}
-#: Key of the output metadata that names a figure: {"name": ..., "caption": ...}.
-FIGURE_METADATA = "microstereo_figure"
-
 #: Longest SVG: the points of a large scatter are smaller as a PNG.
 _SVG_CHARACTERS = 200_000
-
-#: Key of the output metadata that says why a notebook ended before its last cell.
-STOP_METADATA = "microstereo_stop"
 #: Name -> value of the metrics that this kernel recorded; None where a value could not be computed.
 RECORDED: dict[str, float | None] = {}
-
-_NAME = re.compile(r"[a-z][a-z0-9_.]*")
 
 
 class _End(Exception):
@@ -56,15 +48,12 @@ def record(name: str, value: float, unit: str, *, paper: float | None = None, no
     """State one number: shown as a small row, and collected into the run's ``metrics.json``.
 
     Args:
-        name: Lower-case snake case that starts with the stage, such as ``"calibration_reprojection_px"``. Recording a
-            name again in the same notebook replaces its value.
+        name: Lower-case snake case that starts with the stage, such as ``"calibration_reprojection_px"``; again in the
+            same notebook it replaces the value.
         value: A number; NaN and infinity are stored as null (JSON has no word for them).
         unit: ``"px"``, ``"mm"``, ``"um"``, ``"s"``, ``"%"``, ...; ``""`` for a pure number.
         paper: The paper's value in the same unit, where it states one.
         note: What a reader must know to judge the number: the data, the number of samples.
-
-    Raises:
-        ValueError: For a name that is not snake case, or a value that is not a number.
     """
     theirs = None if paper is None else _number(paper, "paper")
     metric = {"name": _checked_name(name), "value": _number(value, "value"), "unit": unit, "paper": theirs, "note": note}
@@ -72,16 +61,13 @@ def record(name: str, value: float, unit: str, *, paper: float | None = None, no
     here, theirs = with_unit(metric["value"], unit), "" if paper is None else with_unit(metric["paper"], unit)
     text = f"{name} = {here}{f' (paper: {theirs})' if theirs else ''}{f'  # {note}' if note else ''}"
     page = rendered("metric.html", name=name, value=here, paper=theirs, note=note)
-    _publish({METRIC_MIME: metric, "text/html": page, "text/plain": text}, text)
+    _publish({METRIC_MIME: metric, "text/html": page, "text/plain": text})
 
 
 def verdict(found: object) -> None:
-    """State a verdict (`lib.trust.Verdict`): shown as a badge with its reasons, here and on top of the notebook's page.
-
-    The main job joins what several cells and notebooks state; the worst counts.
-    """
-    content, text = found.to_json(), str(found)
-    _publish({VERDICT_MIME: content, "text/html": rendered("verdict.html", content=content), "text/plain": text}, text)
+    """State a verdict (`lib.trust.Verdict`), shown as a badge with its reasons; of several in a run the worst counts."""
+    content = found.to_json()
+    _publish({VERDICT_MIME: content, "text/html": rendered("verdict.html", content=content), "text/plain": str(found)})
 
 
 def rendered(template: str, **values: object) -> str:
@@ -92,12 +78,10 @@ def rendered(template: str, **values: object) -> str:
 
 
 def show(figure: Figure, name: str, caption: str) -> None:
-    """Display a matplotlib figure with its caption, named for the run's ``figures/``, and close it.
-
-    It is an SVG where that is small, which what holds an image never is, and else a PNG.
+    """Display a matplotlib figure with its caption and close it; an SVG where that is small and holds no image, else a PNG.
 
     Args:
-        name: Lower-case snake case that starts with the stage; the file's name in ``figures/``.
+        name: Lower-case snake case that starts with the stage; the file's name in the run's ``figures/``.
         caption: One line: what the reader sees, and what to look at.
     """
     import matplotlib.pyplot as plt
@@ -108,8 +92,8 @@ def show(figure: Figure, name: str, caption: str) -> None:
         if _in_notebook():
             mime, drawn = _drawn(figure)
             named = {"name": name, "caption": caption}
-            _publish({mime: drawn, "text/plain": text}, text, {FIGURE_METADATA: named, mime: {"alt": caption}})
-            _publish({"text/html": rendered("caption.html", text=caption), "text/plain": caption}, caption)
+            _publish({mime: drawn, "text/plain": text}, {FIGURE_METADATA: named, mime: {"alt": caption}})
+            _publish({"text/html": rendered("caption.html", text=caption), "text/plain": caption})
         else:
             print(text)
     finally:
@@ -138,11 +122,8 @@ def timed(stage: str) -> Iterator[None]:
 
 
 def stop(reason: str) -> NoReturn:
-    """End the notebook in good order: the report counts it as complete, says why, and leaves the cells that follow out.
-
-    `reason` says in full sentences what is left out, why, and what to do.
-    """
-    _publish({"text/html": rendered("caption.html", text=reason), "text/plain": reason}, reason, {STOP_METADATA: reason})
+    """End the notebook in good order, as complete; `reason` says in full sentences what is left out, why, and what to do."""
+    _publish({"text/html": rendered("caption.html", text=reason), "text/plain": reason}, {STOP_METADATA: reason})
     raise _End
 
 
@@ -165,7 +146,7 @@ def with_unit(value: float | None, unit: str) -> str:
 
 
 def _checked_name(name: str) -> str:
-    if not _NAME.fullmatch(name):
+    if not re.fullmatch(r"[a-z][a-z0-9_.]*", name):
         raise ValueError(f"name: {name!r} is not lower-case snake case, such as 'calibration_reprojection_px'.")
     return name
 
@@ -186,10 +167,11 @@ def _in_notebook() -> bool:
     return shell is not None and getattr(shell, "kernel", None) is not None
 
 
-def _publish(bundle: dict, line: str, metadata: dict | None = None) -> None:
-    if not _in_notebook():
-        print(line)
-        return
-    from IPython.display import display
+def _publish(bundle: dict, metadata: dict | None = None) -> None:
+    """Display a bundle of mime types; outside Jupyter print its text."""
+    if _in_notebook():
+        from IPython.display import display
 
-    display(bundle, metadata=metadata, raw=True)
+        display(bundle, metadata=metadata, raw=True)
+    else:
+        print(bundle["text/plain"])

@@ -1,15 +1,14 @@
 """Recorded results: tables that ship in ``data/results``, made by studies and read by notebooks.
 
-A table is two files: ``NAME.csv`` (a row a run; units stand in the names of the columns) and ``NAME.json`` (its
-provenance: command, commit, machine, date).
+A table is ``NAME.csv`` (a row a run; units stand in the names of the columns) and its provenance, ``NAME.json``.
 """
 
 import csv
 import io
 import json
 import math
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -66,11 +65,7 @@ class Table:
         return found
 
     def where(self, **equal: object) -> Self:
-        """The rows whose entries equal those given, such as ``table.where(method="band", seed=0)``.
-
-        Raises:
-            ValueError: For a name that is no column.
-        """
+        """The rows whose entries equal those given, such as ``table.where(method="band", seed=0)``."""
         for name in equal:
             if name not in self.columns:
                 raise _MissingColumn(f"{name}: no such column; there are {', '.join(self.columns)}.")
@@ -79,11 +74,7 @@ class Table:
 
 
 def read(name: str, folder: Path = paths.RESULTS) -> Table | None:
-    """The recorded table `name`; None if there is none.
-
-    Raises:
-        ValueError: If one of its files is damaged; the text names it.
-    """
+    """The recorded table `name`; None if there is none, a ValueError that names the file if one is damaged."""
     table, origin = folder / f"{name}.csv", folder / f"{name}.json"
     if not table.is_file():
         return None
@@ -92,13 +83,12 @@ def read(name: str, folder: Path = paths.RESULTS) -> Table | None:
     except ValueError as error:
         raise ValueError(f"{origin}: not JSON ({error}); restore it.") from error
     with table.open(encoding="utf-8", newline="") as stream:
-        reader = csv.DictReader(stream, restkey="", strict=True)
-        rows = list(reader)
+        names, *rows = [row for row in csv.reader(stream, strict=True) if row] or [[]]
     for number, row in enumerate(rows, start=2):
-        if "" in row or None in row.values():
-            raise ValueError(f"{table}: row {number} does not have {len(reader.fieldnames or ())} entries; restore it.")
-    kinds = {key: _kind([row[key] for row in rows]) for key in reader.fieldnames or ()}
-    return Table([{key: kinds[key](text) for key, text in row.items()} for row in rows], provenance)
+        if len(row) != len(names):
+            raise ValueError(f"{table}: row {number} does not have {len(names)} entries; restore it.")
+    columns = [_typed(column) for column in zip(*rows, strict=True)]
+    return Table([dict(zip(names, row, strict=True)) for row in zip(*columns, strict=True)], provenance)
 
 
 @contextmanager
@@ -118,11 +108,9 @@ def recorded(name: str, folder: Path = paths.RESULTS) -> Iterator[Table]:
 
 
 def write(name: str, rows: Iterable[Mapping], provenance: Mapping, folder: Path = paths.RESULTS) -> None:
-    """Write the table `name` with its provenance.
+    """Write the table `name`: one mapping a row (None and NaN become empty entries, numbers keep six digits).
 
-    Args:
-        rows: One mapping a row; None and NaN become empty entries, numbers keep six digits.
-        provenance: As `lib.provenance.Provenance.so_far` gives it.
+    `provenance` is as `lib.provenance.Provenance.so_far` gives it.
     """
     folder.mkdir(parents=True, exist_ok=True)
     files.write_text(folder / f"{name}.csv", csv_text(rows))
@@ -146,16 +134,9 @@ def csv_text(rows: Iterable[Mapping]) -> str:
     return text.getvalue()
 
 
-def _kind(texts: list[str]):
-    """The narrowest type that reads all entries of a column."""
-    given = [text for text in texts if text]
-    if given and set(given) <= {"True", "False"} and len(given) == len(texts):
-        return lambda text: text == "True"
-    for kind in (int, float):
-        try:
-            [kind(text) for text in given]
-        except ValueError:
-            continue
-        if kind is float or len(given) == len(texts):
-            return lambda text, kind=kind: kind(text) if text else math.nan
-    return str
+def _typed(texts: Sequence[str]) -> list:
+    """The entries of a column as the narrowest type that reads all of them; NaN for an empty one of a column of numbers."""
+    for kind in ({"True": True, "False": False}.__getitem__, int, lambda text: float(text or math.nan)):
+        with suppress(KeyError, ValueError):
+            return [kind(text) for text in texts]
+    return list(texts)

@@ -23,42 +23,31 @@ from lib import files, paths
 from lib.parallel import run_jobs
 from lib.provenance import Provenance, machine
 from lib.workbench import execution, results
-from lib.workbench.execution import execute
-from lib.workbench.parameters import (
-    choose_notebooks,
-    declared_grid,
-    declared_parameters,
-    parse_parameters,
-    positive,
-    split_values,
-)
 
 
 def main(argv: Sequence[str]) -> int:
     """Parse the command line and sweep; 1 if a run failed."""
     parser = argparse.ArgumentParser(
-        prog="python3 -m lib sweep",
+        "python3 -m lib sweep",
         description="Run one notebook at every point of a grid of parameters and make a table of its metrics.",
         epilog=(Path(__file__).with_name("templates") / "sweep.txt").read_text(encoding="utf-8"),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("notebook", metavar="NOTEBOOK", help="path, name or number, such as studies/NAME or 05")
-    parser.add_argument("-p", dest="pairs", nargs=2, action="append", default=[], metavar=("NAME", "VALUE,VALUE,..."),
-                        help="a parameter and its values (default: the grid in the comments of the parameters)")  # fmt: skip
+    add = parser.add_argument
+    add("name", metavar="NOTEBOOK", help="path, name or number, such as studies/NAME or 05")
+    add("-p", dest="grid", nargs=2, action="append", default=[], metavar=("NAME", "VALUE,VALUE,..."),
+        help="a parameter and its values (default: the grid in the comments of the parameters)")  # fmt: skip
     where = parser.add_mutually_exclusive_group()
     where.add_argument("--workers", type=int, metavar="N", help="runs at a time on this machine (default: one a core)")
     where.add_argument("--scheduler", metavar="ADDRESS", help="a running Dask scheduler, such as tcp://10.0.0.1:8786")
-    parser.add_argument("--record", action="store_true", help="also write data/results/NOTEBOOK.csv and .json")
-    parser.add_argument("--cell-timeout", type=positive, metavar="S", help="longest time of one cell")
-    parser.add_argument("--runs", type=Path, default=paths.RUNS, metavar="FOLDER", help="where sweeps/ appears")
+    add("--record", action="store_true", help="also write data/results/NOTEBOOK.csv and .json")
+    add("--cell-timeout", dest="cell_timeout_s", type=execution.positive, metavar="S", help="longest time of one cell")
+    add("--runs", type=Path, default=paths.RUNS, metavar="FOLDER", help="where sweeps/ appears")
     options = parser.parse_args(argv)
     if options.workers is not None and options.workers < 1:
         parser.error("--workers: at least 1.")
-    grid = {name: split_values(values) for name, values in options.pairs}
-    table, failures = sweep(
-        options.notebook, grid, workers=options.workers, scheduler=options.scheduler, record=options.record,
-        cell_timeout_s=options.cell_timeout, runs=options.runs,
-    )  # fmt: skip
+    options.grid = {name: execution.split_values(values) for name, values in options.grid}
+    table, failures = sweep(**vars(options))
     for point, failure in failures.items():
         print(f"FAILED {point or 'the run'}: {failure}", file=sys.stderr)
     print(f"Table: {paths.shown(table)}")
@@ -70,9 +59,7 @@ def sweep(
     record: bool = False, cell_timeout_s: float | None = None, runs: Path = paths.RUNS,
     notebooks: Path = paths.NOTEBOOKS, recorded: Path = paths.RESULTS,
 ) -> tuple[Path, dict[str, str]]:  # fmt: skip
-    """Execute a notebook at every point of a grid on a Dask cluster.
-
-    Runs that an earlier sweep with the same notebook and the same code finished are kept; failed ones run again.
+    """Execute a notebook at every point of a grid; runs that the same notebook and code finished before are kept.
 
     Args:
         grid: Values as texts for each parameter; none takes the grid that the notebook declares.
@@ -81,24 +68,24 @@ def sweep(
 
     Returns:
         tuple: ``results.csv`` (a row a run: its parameters, then its metrics), and what failed at which point.
-
-    Raises:
-        ValueError: For an unknown notebook or parameter, a value of the wrong type, or a parameter without values.
     """
-    chosen = choose_notebooks([name], notebooks)
-    grid = grid or declared_grid(chosen[0])
+    chosen = execution.choose_notebooks([name], notebooks)
+    grid = grid or execution.declared_grid(chosen[0])
     if len(chosen) != 1 or not all(grid.values()):
         raise ValueError("a sweep takes one notebook, and values for each parameter: -p NAME VALUE,VALUE,...")
     book = chosen[0]
-    parsed = {key: [parse_parameters([(key, text)], [book])[book][key] for text in texts] for key, texts in grid.items()}
-    points = [dict(zip(parsed, values, strict=True)) for values in itertools.product(*parsed.values())]
-    profile = {"profile": "quick"} if "profile" in declared_parameters(book) else {}
+    parse = execution.parse_parameters
+    profile = parse([], [book])[book]
+    parsed = {key: [parse([(key, text)], [book])[book][key] for text in texts] for key, texts in grid.items()}
     folder = runs.resolve() / "sweeps" / f"{book.stem}-{_code_digest(book)}"
     folder.mkdir(parents=True, exist_ok=True)
     words = ["sweep", name, *itertools.chain(*(("-p", key, ",".join(values)) for key, values in grid.items()))]
     provenance = Provenance(shlex.join(["python3", "-m", "lib", *words]))
-    digests = (hashlib.sha256(json.dumps(one, sort_keys=True, default=str).encode()).hexdigest()[:12] for one in points)
-    of_file = {folder / f"{digest}.ipynb": point for digest, point in zip(digests, points, strict=True)}
+    of_file = {}
+    for values in itertools.product(*parsed.values()):
+        point = dict(zip(parsed, values, strict=True))
+        digest = hashlib.sha256(json.dumps(point, sort_keys=True, default=str).encode()).hexdigest()[:12]
+        of_file[folder / f"{digest}.ipynb"] = point
     jobs = {executed: (book, profile | point, cell_timeout_s) for executed, point in of_file.items()}
     rows = {executed: _row(executed, point) for executed, point in of_file.items() if executed.exists()}
     failures: dict[str, str] = {}
@@ -160,22 +147,17 @@ class RunFailed(RuntimeError):
 
 
 def run_point(executed: Path, book: Path, values: dict, cell_timeout_s: float | None) -> None:
-    """In a worker: one run of the notebook into `executed`, or into a log and a failed notebook beside it.
-
-    Raises:
-        RunFailed: With the cell and its error.
-    """
+    """In a worker: one run of the notebook into `executed`, or a log and a failed notebook beside it and `RunFailed`."""
     log, failed = executed.with_suffix(".log"), executed.with_suffix(".failed.ipynb")
     with files.whole(executed) as partial:
         # A context of its own: Jupyter keeps its event loop there, and two threads cannot run the same one.
-        failure = contextvars.Context().run(execute, book, partial, values, cell_timeout_s=cell_timeout_s)
+        failure = contextvars.Context().run(execution.execute, book, partial, values, cell_timeout_s=cell_timeout_s)
         if failure:
             text = [f"{book.name} with {_label(values)}", str(failure)]
             if partial.exists():
                 shutil.copy(partial, failed)
-                for cell in nbformat.read(failed, as_version=4).cells:
-                    for output in cell.get("outputs", []):
-                        text.append(output.get("text") or "\n".join(output.get("traceback", [])))
+                outputs = [out for cell in nbformat.read(failed, as_version=4).cells for out in cell.get("outputs", [])]
+                text += [output.get("text") or "\n".join(output.get("traceback", [])) for output in outputs]
             files.write_text(log, "\n".join(text) + "\n")
             raise RunFailed(str(failure))
         notebook = nbformat.read(partial, as_version=4)
@@ -197,7 +179,7 @@ def column_name(metric: str, unit: str) -> str:
 
 def _row(executed: Path, point: dict) -> dict:
     metrics = {column_name(m["name"], m["unit"]): m["value"] for m in execution.stated_in(executed).metrics}
-    return {**point, **metrics}
+    return point | metrics
 
 
 def _cost(executed: Iterable[Path]) -> dict:

@@ -10,7 +10,7 @@ import papermill
 import pytest
 
 from lib import paths
-from lib.workbench.parameters import choose_notebooks, declared_grid, parse_parameters, positive
+from lib.workbench.execution import choose_notebooks, declared_grid, parse_parameters, positive
 
 
 @pytest.fixture(scope="module")

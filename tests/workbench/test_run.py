@@ -20,8 +20,7 @@ from lib import paths
 from lib.__main__ import COMMANDS
 from lib.workbench import command
 from lib.workbench.command import run
-from lib.workbench.execution import Failure, execute
-from lib.workbench.parameters import choose_notebooks
+from lib.workbench.execution import Failure, choose_notebooks, execute
 
 GOOD = [
     "from lib.workbench import report\nimport matplotlib.pyplot as plt",
@@ -200,7 +199,7 @@ def test_a_site_is_a_copy_that_needs_no_server_of_ours(finished, tmp_path, monke
 @pytest.fixture
 def without_kernels(books, monkeypatch):
     """Notebooks that end as soon as they begin: what is tested is the command around them."""
-    monkeypatch.setattr(command.parameters, "choose_notebooks", lambda names, folder: choose_notebooks(names, books))
+    monkeypatch.setattr(command.execution, "choose_notebooks", lambda names, folder: choose_notebooks(names, books))
     monkeypatch.setattr(command, "execute", lambda book, output, values, **options: shutil.copy(book, output) and None)
     before = {number: signal.getsignal(number) for number in (signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM))}
     yield

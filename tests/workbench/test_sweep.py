@@ -19,7 +19,7 @@ from lib.__main__ import COMMANDS
 from lib.provenance import commit
 from lib.workbench import results
 from lib.workbench import sweep as sweeping
-from lib.workbench.parameters import split_values
+from lib.workbench.execution import split_values
 from lib.workbench.sweep import save_plots, sweep
 from tests.processes import children
 
