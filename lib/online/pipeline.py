@@ -1,12 +1,7 @@
 """The online system (paper Sec. V): every stage, frame by frame, with the seconds of each and what failed.
 
-    pipeline = OnlinePipeline(Detector.load())
-    for i, frame in enumerate(recording.frames):
-        result = pipeline.step(frame.left, frame.right, partial(of_recording, recording, frames=[i]))
-
-It starts without a calibration.  Landmarks and kinematics accumulate until the stereo rig can be calibrated.  From then
-on each frame is reconstructed, and the landmarks show whether the cameras stand where they stood.  If they do not, a few
-frames of the tool tell which camera moved and how (Sec. IV-C), or what else is wrong.
+It starts without a calibration, and calibrates as soon as there are landmarks and kinematics enough.  From then on each
+frame is reconstructed, and its landmarks show whether the cameras moved, or what else is wrong.
 """
 
 from collections.abc import Callable
@@ -32,8 +27,12 @@ _DEPTH_MARGIN_MM = 0.5  # how far an eye may move along the view from one surfac
 class OnlinePipeline:
     """Landmarks, calibration, watch and registration, surface and distance, one `step` a frame.
 
+        pipeline = OnlinePipeline(Detector.load())
+        for i, frame in enumerate(recording.frames):
+            result = pipeline.step(frame.left, frame.right, partial(of_recording, recording, frames=[i]))
+
     A frame never ends the run: a stage that fails leaves its reason in the result, and the others go on as far as they
-    can.  `lib.online.STATES` says what each state means and what follows from it.
+    can.  `lib.online.STATES` says what each state means.
 
     Args:
         detector: `lib.landmarks.Detector`, or anything alike: images (2, h, w, 3) uint8 RGB to `.u` (2, 3, 2), `.covariance`
@@ -218,8 +217,7 @@ class OnlinePipeline:
             if event:
                 result.failures["worker"] = event
         for surface in done:
-            for stage, seconds in surface.seconds.items():
-                result.seconds[stage] = result.seconds.get(stage, 0.0) + seconds
+            result.seconds.update(surface.seconds)  # a counter adds
             if surface.failure is not None:
                 result.failures[surface.failure[0]] = surface.failure[1]
             else:

@@ -1,6 +1,7 @@
 """What a user may change about the online system, and what it says about each frame."""
 
 import time
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -77,14 +78,13 @@ class Settings:
             raise ValueError(f"miss_rate: expected a probability below one half, got {self.miss_rate}.")
 
 
-def _nothing() -> Correspondences:
-    """The three landmarks, none of them seen or reported."""
-    missing = np.full((len(LANDMARKS), 2), np.nan)
-    return Correspondences.of_points(np.full((len(LANDMARKS), 3), np.nan), missing, missing, landmark=range(len(LANDMARKS)))
-
-
 def _unknown() -> np.ndarray:
     return np.full(len(LANDMARKS), np.nan)
+
+
+def _nothing() -> Correspondences:
+    """The three landmarks, none of them seen or reported."""
+    return Correspondences.of_points(*(np.full((3, size), np.nan) for size in (3, 2, 2)), landmark=range(len(LANDMARKS)))
 
 
 @dataclass
@@ -133,7 +133,7 @@ class FrameResult:
     drift: float = 0.0
     motion: MovedCameras | None = None
     dropped: int = 0
-    seconds: dict[str, float] = field(default_factory=dict)
+    seconds: Counter[str] = field(default_factory=Counter)
     failures: dict[str, str] = field(default_factory=dict)
 
     @property
@@ -150,4 +150,4 @@ class FrameResult:
         except Exception as error:  # whatever a stage dies of: the next frame comes in 40 ms
             self.failures[name] = f"{type(error).__name__}: {error}"
         finally:
-            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+            self.seconds[name] += time.perf_counter() - start

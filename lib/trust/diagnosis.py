@@ -12,9 +12,8 @@ import numpy as np
 from lib.calibration.checks import eyes_exchanged, sides
 from lib.correspondences import LANDMARKS, TRAIN_FURTHER, Correspondences
 from lib.recordings import Kinematics
-from lib.trust.case import SIDES, Case, Hypothesis
 from lib.trust.clocks import TIME_TESTS
-from lib.trust.fitting import Problem, Robust
+from lib.trust.fitting import SIDES, Case, Hypothesis, Problem, Robust
 from lib.trust.health import affine_epipolar
 
 #: Least gain and least share explained of a hypothesis that is named.
