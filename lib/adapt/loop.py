@@ -6,13 +6,14 @@ import sys
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path, PurePosixPath
 
 import cv2
 import numpy as np
 
 from lib import files, paths
-from lib.adapt.judging import Agreement, agreement, better, epipolar_geometry, epipolar_px, frame_means
+from lib.adapt.judging import Agreement, agreement, better, epipolar_px, frame_means
 from lib.adapt.teacher import RefusalError, Seen, Teacher, longest_still, look, stretches, teach
 from lib.calibration import Calibration
 from lib.correspondences import LANDMARKS
@@ -24,6 +25,7 @@ from lib.training.evaluation import evaluate
 from lib.training.samples import LabelledImage
 from lib.training.shards import generate, validation_images
 from lib.training.stages import finetune
+from lib.trust.health import spread
 
 #: Most rounds of training, and most steps of a stage in one; the time ends most trainings.
 ROUNDS, STEPS = 3, 4000
@@ -46,8 +48,7 @@ class Adaptation:
     Attributes:
         detector: The adapted one if `improved`, else the one that was given.
         calibration: From detections in the frames for learning; None where the recording could not teach.
-        report: What report.json holds: agreement with the robot and of left with right before and after, frames used and
-            refused, learning curve, the reason.
+        report: What report.json holds.
         improved: Whether the frames for judging agree better, with the robot and between the two images.
         frames: Numbers of the frames for learning, stopping and judging ("learn", "stop", "judge").
         after, seen, told: In the frames for judging: agreement with the robot after, what the two detectors find, and the
@@ -157,8 +158,7 @@ class _Work:
         self.recording, self.seed, self.progress = recording, seed, progress
         self.detector = detector or Detector.load()
         self.minutes, self.saved_s = minutes, 0.0
-        chosen = np.linspace(0, len(recording) - 1, min(_MOST_FRAMES, len(recording)))
-        self.frames = np.unique(chosen.round().astype(int))
+        self.frames = spread(len(recording), _MOST_FRAMES)
         self.labels, self.marked = None, np.zeros(0, int)
         if labels is not None:
             given = read_coco(Path(labels), len(recording), recording.image_size_px, recording.skeleton)
@@ -202,11 +202,10 @@ class _Work:
         """`look`, or what an earlier call kept."""
         path = self.folder / f"{name}.npz"
         if not path.is_file():
-            show = lambda part: self.say(f"Looking ({name})", part)  # noqa: E731
             asked = SharedDetector(detector) if near is None and self.learns else detector
-            found = look(self.recording, asked, frames, near=near, progress=show)
-            with files.whole(path) as partial, open(partial, "wb") as file:
-                np.savez(file, **found._asdict())
+            found = look(self.recording, asked, frames, near=near, progress=partial(self.say, f"Looking ({name})"))
+            with files.whole(path) as new:
+                np.savez(new, **found._asdict())
         with np.load(path) as kept:
             return Seen(*(kept[field] for field in Seen._fields))
 
@@ -320,9 +319,8 @@ class _Work:
     ) -> Adaptation:
         """Compare the detectors on the frames that took no part."""
         seen = first.of(parts["judge"]), best_seen.of(parts["judge"])
-        agreements = [agreement(teacher, own) for own in seen]
-        geometry, length = epipolar_geometry(self.recording, parts["judge"], best_seen), agreements[0].length_px.mean(axis=1)
-        distances = [epipolar_px(geometry, own) for own in seen]
+        agreements, distances = [agreement(teacher, own) for own in seen], epipolar_px(self.recording, seen, best_seen)
+        length = agreements[0].length_px.mean(axis=1)
         robot, robot_sd = better(*(own.relative for own in agreements))
         eye, eye_sd = better(*(frame_means(own / length) for own in distances))
         improved = best is not self.detector and robot > 2 * robot_sd and eye > 0

@@ -73,12 +73,13 @@ def main(argv: list[str] | None = None) -> int:
             recorder = Recorder(a.record, recording, patient=not a.live)
             stack.callback(recorder.close)
         pipeline = stack.enter_context(OnlinePipeline(detector, settings=settings, beside=a.live))
-        tally, page, said = Tally(), Dashboard(), None
+        tally, page, state = Tally(), Dashboard(), ""
         for arrival in feed:
             start = arrival.arrived_s if a.live else time.monotonic()
             result = pipeline.step(arrival.left, arrival.right, arrival.kinematics, time_s=arrival.time_s)
             tally.add(result, time.monotonic() - start)
-            if said != (said := (result.state, result.cause)):
+            if (result.state, result.cause) != state:
+                state = (result.state, result.cause)
                 print(f"frame {result.index:6d} {result.time_s:9.2f} s: {result.state} {result.cause}".rstrip())
             for name, why in result.failures.items():
                 print(f"frame {result.index:6d} {name}: {why}", file=sys.stderr)

@@ -44,9 +44,6 @@ class OnlinePipeline:
         beside: Reconstruct surfaces in a process beside this one, the newest frame first; else in turn, which gives the
             same output for the same input.  Use it in a ``with`` block, which ends the process.
         calibrate, reconstruct: Replace `lib.calibration.calibrate` and, in turn, `lib.surface.reconstruct`.
-
-    Attributes:
-        state: As in `FrameResult`.
     """
 
     def __init__(
@@ -54,7 +51,7 @@ class OnlinePipeline:
         settings: Settings | None = None, beside: bool = False, calibrate: Callable[..., Calibration] = calibrate,
         reconstruct: Callable[..., Reconstruction] = reconstruct,
     ) -> None:  # fmt: skip
-        self.settings, self.state = settings or Settings(), "calibrating"
+        self.settings = settings or Settings()
         self._detector, self._seen, self._index = detector, None, -1
         self._tracker = RigTracker(rig, noise_px=float(noise_px), settings=self.settings, calibrate=calibrate)
         self._checks, self._tips = FrameChecks(), TipDistance(self.settings)
@@ -143,19 +140,18 @@ class OnlinePipeline:
     def _name_state(self, result: FrameResult, blind: str, told: str, seen: bool) -> None:
         """From the worst: what the images show, what the robot says, how the two agree."""
         if result.state == "moved":  # this frame alone
-            self.state = result.state
             return
         state, cause = self._tracker.state, self._tracker.cause
+        measures = state in ("tracking", "robot")
         if blind:
             state, cause = "blind", blind
-        elif state in ("tracking", "robot"):
-            if not seen:
-                unheard = state == "robot" or bool(told)
-                state, cause = ("blind", "neither landmarks nor report") if unheard else ("unseen", "no landmarks")
-            elif told:
-                state, cause = "robot", told
-        self.state = result.state = state
-        result.cause = cause
+        elif measures and not seen and (told or state == "robot"):
+            state, cause = "blind", "neither landmarks nor report"
+        elif measures and not seen:
+            state, cause = "unseen", "no landmarks"
+        elif measures and told:
+            state, cause = "robot", told
+        result.state, result.cause = state, cause
 
     def _detect(self, left: np.ndarray, right: np.ndarray, kinematics: ArrayLike | Callable | None) -> Seen:
         if self._pair is None or self._pair.shape[1:] != left.shape:

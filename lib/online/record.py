@@ -24,13 +24,9 @@ class Recorder:
     Args:
         folder: New, or empty.
         recording: Where the frames come from: its kinematics and clocks make `input/` a recording like it.
-        patient: Wait for the disk; else images are left out where it is too slow (`left_out`).
+        patient: Wait for the disk; else frames are left out where it is too slow, and `left_out` counts them.
 
-    Attributes:
-        failure: Why the recording ended early, "" where it did not.
-
-    Raises:
-        FileExistsError: If the folder holds something.
+    `failure` says why the recording ended early, "" where it did not.  A `FileExistsError` if the folder holds something.
     """
 
     def __init__(self, folder: str | Path, recording: Recording, *, patient: bool = True) -> None:

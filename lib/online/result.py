@@ -98,8 +98,7 @@ class FrameResult:
         landmarks: Base, tip_1 and tip_2: where the detector saw them and where the robot reports them.
         x_tool_mm: (3, 3) landmarks as the cameras triangulate them.
         rig: In force after this frame.
-        reconstruction, reconstructed_at: The newest surface and its points, and the number of the frame that they are
-            from.
+        reconstruction, reconstructed_at: The newest surface and its points, and the number of their frame.
         distance_mm, distance_sd_mm: (3,) from each landmark to the surface along the view, positive = above it, and its
             standard deviation: detector, robot, calibration, surface and the surface's age.
         normal_mm, normal_sd_mm: The same along the surface's normal.

@@ -17,9 +17,8 @@ from lib.correspondences import LANDMARK_COLOURS, LANDMARKS, of_recording
 from lib.landmarks import Detector, SharedDetector, detect
 from lib.provenance import plain
 from lib.recordings import Recording, StereoFrame
-from lib.trust.assessment import Assessment, assess, report
 from lib.trust.health import spread
-from lib.trust.verdict import LEVELS
+from lib.trust.verdict import LEVELS, Assessment, assess, report
 
 _COLOURS = np.array([*LANDMARK_COLOURS.values()])
 _SHOWN = 3  # best frames, and worst
@@ -29,13 +28,7 @@ _SHOWN_PX = 760  # width of one image of an overlay
 
 @dataclass(frozen=True, eq=False)
 class Check:
-    """What `check` found.
-
-    Attributes:
-        recording, assessment: What was checked, and its verdict.
-        facts: Question -> answer in words: what is in the folder, clock, read-out, order of the tips, offsets, detector.
-        next_step: What to do now.
-    """
+    """What `check` found; `facts` answer in words: what is in the folder, clock, read-out, order of the tips, detector."""
 
     recording: Recording
     assessment: Assessment
