@@ -77,7 +77,8 @@ class Seen(NamedTuple):
         return Seen(*(part[np.isin(self.frame, frames)] for part in self))
 
     def labelled(self, u: np.ndarray) -> Self:
-        """With labels set by hand, u (m, 2, 3, 2), in place of what was found there; what has none stays as it was found."""
+        """With labels set by hand in place of what was found there: u (all frames, 2, 3, 2) px, NaN where there is none."""
+        u = u[self.frame]
         known = np.isfinite(u).all(axis=-1)
         covariance = np.where(known[..., None, None], CLICK_SD_PX**2 * np.eye(2), self.covariance)
         return Seen(self.frame, np.where(known[..., None], u, self.u), covariance, np.where(known, 1.0, self.confidence))

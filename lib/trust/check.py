@@ -103,14 +103,9 @@ class Check:
 
 
 def check(recording: str | Path | Recording, *, detector: Callable | None = None) -> Check:
-    """Detect, calibrate, diagnose and judge a recording; its truth is never opened.
+    """Detect (by the detector that ships, if none is given), calibrate, diagnose and judge a recording.
 
-    Args:
-        recording: Its folder, or the recording.
-        detector: None is the one that ships.
-
-    Raises:
-        FileNotFoundError, ValueError: If the folder is no recording that can be read.
+    The truth of a recording given by its folder is never opened.  A FileNotFoundError or ValueError if it cannot be read.
     """
     found = recording if isinstance(recording, Recording) else Recording.open(recording, truth=False)
     if found.skeleton == LANDMARKS:

@@ -60,23 +60,19 @@ class Shape:
 
 @dataclass(frozen=True, eq=False)
 class Robust:
-    """A fit: cameras M (2, 2, 4) on centred positions, additions theta (k,), offsets of the landmarks (3, 3) mm.
+    """The fit of a problem."""
 
-    `likelihood` (n, 2) is the log density of each image's residual (n, 2, 2) px, 0 where it is not seen, `penalty` that of
-    the offsets' prior; `design` is by how much correlated rows overstate what they tell.
-    """
-
-    M: np.ndarray
-    theta: np.ndarray
+    M: np.ndarray  # (2, 2, 4) cameras on centred positions
+    theta: np.ndarray  # (k,) additions, and their covariance
     covariance: np.ndarray
-    offsets: np.ndarray
+    offsets: np.ndarray  # (3, 3) mm of the landmarks, and (3,) their deviations
     offset_sd: np.ndarray
     camera_covariance: np.ndarray
-    residuals: np.ndarray
+    residuals: np.ndarray  # (n, 2, 2) px
     shapes: tuple[Shape, ...]
-    likelihood: np.ndarray
-    penalty: float
-    design: float
+    likelihood: np.ndarray  # (n, 2) log density of each image's residual, 0 where it is not seen
+    penalty: float  # the same of the offsets' prior
+    design: float  # by how much correlated rows overstate what they tell
 
     @property
     def total(self) -> float:
@@ -86,27 +82,18 @@ class Robust:
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """Rows of a recording as the fits take them.
+    """Rows of a recording as the fits take them."""
 
-    Attributes:
-        x: (n, 2, 3) mm, the robot's position for the left and for the right image, about `centre`.
-        y, seen: (n, 2, 2) px and (n, 2) bool.
-        noise: (n, 2) relative noise, from the detector's covariances; 1 on average.
-        axes: (n, 3, 3) of the tool, 0 where unknown.
-        frame: (n,) counted from 0 in their order.
-        offset_sd: Of the landmarks' offsets before the data, mm.
-    """
-
-    x: np.ndarray
-    y: np.ndarray
-    seen: np.ndarray
-    noise: np.ndarray
-    axes: np.ndarray
-    frame: np.ndarray
+    x: np.ndarray  # (n, 2, 3) mm, the robot's position for the left and for the right image, about `centre`
+    y: np.ndarray  # (n, 2, 2) px
+    seen: np.ndarray  # (n, 2) bool
+    noise: np.ndarray  # (n, 2) relative, from the detector's covariances; 1 on average
+    axes: np.ndarray  # (n, 3, 3) of the tool, 0 where unknown
+    frame: np.ndarray  # (n,) counted from 0 in their order
     landmark: np.ndarray
     time: np.ndarray
     centre: np.ndarray
-    offset_sd: float = _OFFSET_SD_MM
+    offset_sd: float = _OFFSET_SD_MM  # of the landmarks, before the data
 
     @classmethod
     def of(cls, data: Correspondences) -> Self:
@@ -136,12 +123,10 @@ class Problem:
         self, columns: Callable[[np.ndarray], np.ndarray] | None = None, *, start: np.ndarray | None = None,
         apart: np.ndarray | None = None, rounds: int = 40,
     ) -> Robust:  # fmt: skip
-        """Most probable cameras, offsets and additions.
+        """Most probable cameras, offsets and additions, near the cameras `start` or the best sample of four rows.
 
-        Args:
-            columns: Cameras M -> (n, 2, 2, k): change of the pixels by each addition.
-            start: Cameras to start from; None searches samples of four rows.
-            apart: (n,) bool: rows with a noise of their own.
+        `columns` gives the change of the pixels by each addition, cameras M -> (n, 2, 2, k); the rows `apart` (n,) bool have
+        a noise of their own.
         """
         apart = np.zeros(len(self), dtype=bool) if apart is None else apart
         if start is None:
@@ -225,14 +210,7 @@ class Problem:
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A possible fault.
-
-    Attributes:
-        text, cure: What the residuals look like, and the setting or call that mends it.
-        value, sd, unit: Its size.
-        explained: Share of the residuals' variance that it explains, 0 to 1 (robustly, from the likelihood).
-        gain: Log likelihood above "nothing is wrong", less the penalty for its parameters.
-    """
+    """A possible fault: what the residuals look like, the setting or call that mends it, and its size."""
 
     name: str
     text: str
@@ -240,8 +218,8 @@ class Hypothesis:
     value: float
     sd: float
     unit: str
-    explained: float
-    gain: float
+    explained: float  # share of the residuals' variance, 0 to 1 (robustly, from the likelihood)
+    gain: float  # log likelihood above "nothing is wrong", less the penalty for its parameters
 
 
 class Case:

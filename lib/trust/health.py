@@ -91,16 +91,10 @@ def health(
     recording: Recording | None, data: Correspondences, calibration: Calibration | None = None, *,
     detector: Callable | None = None,
 ) -> Health:  # fmt: skip
-    """Compare what the detector found with everything that is known without labels.
+    """Compare what the detector found, `data`, with everything that is known without labels; ValueError if it found no row.
 
-    Args:
-        data: Of `lib.landmarks.detect`, all frames or some.
-        calibration: Made from `data`; None leaves out what needs cameras.
-        recording: None leaves out what needs its pictures.
-        detector: Looks again at some frames, mirrored and shifted; None leaves that out.
-
-    Raises:
-        ValueError: If `data` holds no row.
+    The calibration is made from `data`, and the detector looks again at some frames, mirrored and shifted.  Without
+    recording, calibration or detector, what needs it is left out.
     """
     if not len(data):
         raise ValueError("data: no row; run the detector over some frames.")

@@ -108,12 +108,11 @@ def judge(
     health: Health | None = None, epipolar_px: float | None = None, robot_accuracy_mm: float | None = None,
     error: Exception | None = None, doubts: Sequence[Doubt] = (),
 ) -> Verdict:  # fmt: skip
-    """The verdict on a calibration from its own numbers and from witnesses.
+    """The verdict on a calibration from its own numbers and from witnesses; what is None is left out.
 
     Args:
-        data: What was calibrated with; None leaves out what only its frames can tell.
+        data: What was calibrated with; only its frames tell whether they are enough.
         calibration: None where it was refused; then `error` is the exception.
-        diagnosis, health: Of `lib.trust.diagnose` and `lib.trust.health`, where made.
         epipolar_px: Median epipolar distance of matches between the two images, which know nothing of the tool.
         robot_accuracy_mm: As its maker states it; None is 10 um.
         doubts: Of the recording (`lib.recordings.Recording.doubts`).
@@ -239,9 +238,7 @@ class Assessment:
 def assess(
     recording: Recording, data: Correspondences | None = None, *, detector: Callable | None = None, **options: object
 ) -> Assessment:  # fmt: skip
-    """Calibrate, diagnose, look at the detector's health and at a witness, and judge.
-
-    Never raises for what a recording shows: what is refused is a reason of the verdict.
+    """Calibrate, diagnose, look at the detector's health and at a witness, and judge; what is refused is a reason.
 
     Args:
         data: Its correspondences (detected, labelled); None runs the detector, the one that ships if none is given.
@@ -273,11 +270,9 @@ def assess(
 
 
 def report(calibration: Calibration, *, verdict: Verdict | None = None, robot_accuracy_mm: float | None = None) -> str:
-    """Several lines of text, with at most ten outliers, largest residual first.
+    """A calibration in several lines of text, with at most ten outliers, largest residual first.
 
-    Args:
-        verdict: Of `lib.trust.assess`; None judges by the calibration's own numbers alone.
-        robot_accuracy_mm: As its maker states it (`Recording.robot_accuracy_mm`).
+    Without the verdict of `lib.trust.assess`, the calibration's own numbers are judged alone.
     """
     verdict = judge(None, calibration, robot_accuracy_mm=robot_accuracy_mm) if verdict is None else verdict
     c, seen = calibration, np.isfinite(calibration.residuals_px[:, ::2])
