@@ -75,6 +75,7 @@ def adapt(
     The frames are split into three stretches of time.  The first teaches, the second says when to stop, the third judges.
 
     Args:
+        recording: With kinematics; the landmarks of a forceps.
         detector: Where the training starts; None is the one that ships.
         labels: COCO keypoints like annotations.json; ten labelled pairs are a start where the detector finds too little.
         minutes: The training ends after so many; detection and judging add a little.

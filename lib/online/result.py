@@ -42,8 +42,7 @@ class Settings:
         control: Control points of the surface (n_x, n_y).
         fps: Frames a second, for frames that come without a time.
         stale_s: Distances end where the surface, or the last sight of the landmarks, is older.
-        eye_mm_s: Speed at which the eye may move unseen; the distance's standard deviation grows by it with the surface's
-            age.
+        eye_mm_s: Speed at which the eye may move unseen, by which the distance's standard deviation grows.
         slip_mm: Standard deviation of how far the landmarks may lie off the robot's report, beside its own accuracy.
         robot_accuracy_mm: Standard deviation of the robot's report, per coordinate.
         alarm_mm, miss_rate: A tip is `too_close` where its distance may be below alarm_mm: a true one below it is missed
@@ -93,10 +92,9 @@ class FrameResult:
 
     Attributes:
         index, time_s: Number of the frame since the start; its time, video clock.
-        state: One of `STATES`.
-        cause: Why the state is not "tracking", in a few words; "" where it is.
-        landmarks: Base, tip_1 and tip_2: where the detector saw them and where the robot reports them.
-        x_tool_mm: (3, 3) landmarks as the cameras triangulate them.
+        state, cause: One of `STATES`, and why it is not "tracking", in a few words.
+        landmarks, x_tool_mm: Where the detector saw them and where the robot reports them; (3, 3) as the cameras triangulate
+            them.
         rig: In force after this frame.
         reconstruction, reconstructed_at: The newest surface and its points, and the number of their frame.
         distance_mm, distance_sd_mm: (3,) from each landmark to the surface along the view, positive = above it, and its

@@ -118,25 +118,21 @@ class Beside:
             self._memory = None
 
     def close(self) -> None:
-        """End the process and free its memory."""
-        with contextlib.suppress(OSError):
-            self._pipe.send(None)
-        self._process.join(2.0)
-        if self._process.is_alive():
-            self._process.kill()
-            self._process.join()
+        """End the process, which has nothing to lose, and free its memory."""
+        self._process.kill()
+        self._process.join()
         self._pipe.close()
         self._free()
 
 
 def _work(pipe: multiprocessing.connection.Connection) -> None:
-    """In the worker: jobs until None or until the other side is gone.  Landmarks come first, so it yields to them."""
+    """In the worker: jobs until the other side is gone.  Landmarks come first, so it yields to them."""
     with contextlib.suppress(AttributeError, OSError):  # not every system has priorities
         os.nice(10)
     pipe.send(None)
     with contextlib.suppress(EOFError, OSError, KeyboardInterrupt):
-        while (sent := pipe.recv()) is not None:
-            name, shape, job = sent
+        while True:
+            name, shape, job = pipe.recv()
             memory = shared_memory.SharedMemory(name=name)
             left, right = np.ndarray(shape, np.uint8, memory.buf).copy()
             memory.close()

@@ -69,7 +69,7 @@ class Check:
         for place, i in enumerate(chosen):
             number, score = int(health.frame[i]), health.score[i]
             rows = data.of_frames(number)
-            seen = np.where(rows.seen.T[:, :, None], np.stack([rows.u_left, rows.u_right]), np.nan)
+            seen = rows.stacked_px.reshape(-1, 2, 2).swapaxes(0, 1)
             told = None if c is None else np.stack(c.pair.project(rows.x_mm))
             picture = data_uri(overlay(self.recording.frames[number], seen, told), ".jpg")
             parts = {name: part[i].max() for name, part in health.parts.items() if np.isfinite(part[i]).any()}
