@@ -1,5 +1,6 @@
 """How well detections agree with the robot, and left with right by an epipolar geometry that the robot has no part in."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,14 +17,11 @@ _FEWEST = 60  # features of the eye, below which the detections' own geometry ha
 
 @dataclass(frozen=True, eq=False)
 class Agreement:
-    """Distances (m, 2, 3) px of detections from the robot's landmarks, infinite where missing, NaN where not in the image.
+    """How far detections are from the robot's landmarks: infinitely where missing, NaN where these are not in the image."""
 
-    `sigmas` are the same in units of their stated standard deviation (1 is right), `length_px` (m, 2, 1) the tool's lengths.
-    """
-
-    distance_px: np.ndarray
-    sigmas: np.ndarray
-    length_px: np.ndarray
+    distance_px: np.ndarray  # (m, 2, 3)
+    sigmas: np.ndarray  # the same in units of their stated standard deviation
+    length_px: np.ndarray  # (m, 2, 1) of the tool
 
     @property
     def relative(self) -> np.ndarray:
@@ -60,25 +58,19 @@ def agreement(teacher: Teacher, seen: Seen) -> Agreement:
     return Agreement(*(np.where(there, part, np.nan) for part in (distance, sigmas)), length)
 
 
-def epipolar_geometry(recording: Recording, frames: np.ndarray, seen: Seen) -> tuple[np.ndarray, np.ndarray]:
-    """Middle and normal (4,) of an affine epipolar geometry: matches y (4,) fulfil normal . (y - middle) = 0.
+def epipolar_px(recording: Recording, seen: Sequence[Seen], all_seen: Seen) -> list[np.ndarray]:
+    """Distances (m, 3) of left and right detections from an epipolar geometry, in px of one image; infinite where missing.
 
-    Told by features of the eye that both images show; where they are too few, by what most of the detections `seen` share.
+    Features of the eye that both images show tell the geometry; where they are too few, what most of `all_seen` share.
     """
-    y = feature_matches(recording, frames)
-    agree = affine_epipolar(y)[1]
+    matches = feature_matches(recording, seen[0].frame)
+    agree = affine_epipolar(matches)[1]
     if agree.sum() < _FEWEST:
-        y = np.concatenate([seen.u[:, 0], seen.u[:, 1]], axis=-1).reshape(-1, 4)
-        agree = affine_epipolar(y)[1]
-    middle = y[agree].mean(axis=0)
-    return middle, np.linalg.svd(y[agree] - middle, full_matrices=False)[2][3]
-
-
-def epipolar_px(geometry: tuple[np.ndarray, np.ndarray], seen: Seen) -> np.ndarray:
-    """Distances (m, 3) px of left and right detections from a geometry, in pixels of one image; infinite where missing."""
-    middle, normal = geometry
-    y = np.concatenate([seen.u[:, 0], seen.u[:, 1]], axis=-1)
-    return np.nan_to_num(np.sqrt(2) * np.abs((y - middle) @ normal), nan=np.inf)
+        matches = all_seen.stacked_px.reshape(-1, 4)
+        agree = affine_epipolar(matches)[1]
+    middle = matches[agree].mean(axis=0)
+    normal = np.linalg.svd(matches[agree] - middle, full_matrices=False)[2][3]
+    return [np.nan_to_num(np.sqrt(2) * np.abs((own.stacked_px - middle) @ normal), nan=np.inf) for own in seen]
 
 
 def better(before: np.ndarray, after: np.ndarray) -> tuple[float, float]:

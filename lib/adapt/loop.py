@@ -6,13 +6,14 @@ import sys
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path, PurePosixPath
 
 import cv2
 import numpy as np
 
 from lib import files, paths
-from lib.adapt.judging import Agreement, agreement, better, epipolar_geometry, epipolar_px, frame_means
+from lib.adapt.judging import Agreement, agreement, better, epipolar_px, frame_means
 from lib.adapt.teacher import RefusalError, Seen, Teacher, longest_still, look, stretches, teach
 from lib.calibration import Calibration
 from lib.correspondences import LANDMARKS
@@ -24,6 +25,7 @@ from lib.training.evaluation import evaluate
 from lib.training.samples import LabelledImage
 from lib.training.shards import generate, validation_images
 from lib.training.stages import finetune
+from lib.trust.health import spread
 
 #: Most rounds of training, and most steps of a stage in one; the time ends most trainings.
 ROUNDS, STEPS = 3, 4000
@@ -46,8 +48,7 @@ class Adaptation:
     Attributes:
         detector: The adapted one if `improved`, else the one that was given.
         calibration: From detections in the frames for learning; None where the recording could not teach.
-        report: What report.json holds: agreement with the robot and of left with right before and after, frames used and
-            refused, learning curve, the reason.
+        report: What report.json holds.
         improved: Whether the frames for judging agree better, with the robot and between the two images.
         frames: Numbers of the frames for learning, stopping and judging ("learn", "stop", "judge").
         after, seen, told: In the frames for judging: agreement with the robot after, what the two detectors find, and the
@@ -88,9 +89,9 @@ def adapt(
     """
     if not isinstance(recording, Recording):
         recording = Recording.open(recording, truth=False)
-    work = _Work(replace(recording, truth=None), detector, labels, seed, folder, minutes, progress)
+    work = _Work(replace(recording, truth=None), detector, labels, seed, folder, minutes, progress, tune)
     try:
-        return work.adapted(tune)
+        return work.adapted()
     except RefusalError as refused:
         work.report |= {"improved": False, "reason": str(refused)}
         return Adaptation(work.detector, None, work.finished(), False, {})
@@ -100,16 +101,9 @@ def adapt_images(
     images: str | Path, labels: str | Path, detector: Detector, *, minutes: float = 20.0, seed: int = 0,
     folder: str | Path | None = None, progress: bool = True, tune: Callable[..., Detector] = finetune,
 ) -> Adaptation:  # fmt: skip
-    """`adapt` where there is no robot: labelled images of one camera teach, stop and judge.
+    """`adapt` where there is no robot: the images of one camera in a folder that `labels` (COCO keypoints) name, at least 10.
 
     The first 65 % of them in the order of their names teach, the next fit the doubt, the last fifth judge.
-
-    Args:
-        images: Folder to which the file names in `labels` belong.
-        labels: COCO keypoints base, tip_1, tip_2.
-
-    Raises:
-        FileNotFoundError, ValueError: If a file is missing, or fewer than 10 images are labelled.
     """
     images, marked = Path(images), []
     for name, names, values in sorted(coco_keypoints(Path(labels)), key=lambda entry: entry[0]):
@@ -152,19 +146,17 @@ class _Work:
 
     def __init__(
         self, recording: Recording, detector: Callable | None, labels: str | Path | None, seed: int,
-        folder: str | Path | None, minutes: float, progress: bool,
+        folder: str | Path | None, minutes: float, progress: bool, tune: Callable[..., Detector],
     ) -> None:  # fmt: skip
-        self.recording, self.seed, self.progress = recording, seed, progress
+        self.recording, self.seed, self.progress, self.tune = recording, seed, progress, tune
         self.detector = detector or Detector.load()
         self.minutes, self.saved_s = minutes, 0.0
-        chosen = np.linspace(0, len(recording) - 1, min(_MOST_FRAMES, len(recording)))
-        self.frames = np.unique(chosen.round().astype(int))
-        self.labels, self.marked = None, np.zeros(0, int)
+        self.labels = np.full((len(recording), 2, 3, 2), np.nan)
         if labels is not None:
             given = read_coco(Path(labels), len(recording), recording.image_size_px, recording.skeleton)
             self.labels = np.stack([given.u_left, given.u_right], axis=1)
-            self.marked = np.flatnonzero(np.isfinite(self.labels).any(axis=(1, 2, 3)))
-            self.frames = np.union1d(self.frames, self.marked)
+        self.marked = np.flatnonzero(np.isfinite(self.labels).any(axis=(1, 2, 3)))
+        self.frames = np.union1d(spread(len(recording), _MOST_FRAMES), self.marked)
         self.learns = isinstance(self.detector, Detector)  # a stand-in has no networks
         key = [str(recording.folder.resolve()), recording.kinematics.x_mm.tobytes(), self.frames.tobytes(), seed, STEPS]
         key += [RECIPE, recording.offset_s, recording.readout_s, recording.frames.time_s.tobytes(), minutes]
@@ -189,24 +181,14 @@ class _Work:
         """The report, with where and when it was made."""
         return plain(self.report | self.provenance.so_far())
 
-    def with_labels(self, seen: Seen) -> Seen:
-        """What was seen, with the labels set by hand in its place where there are some."""
-        return seen if self.labels is None else seen.labelled(self.labels[seen.frame])
-
-    def by_hand(self) -> Seen:
-        """The labels alone."""
-        shape = len(self.marked), 2, 3
-        return self.with_labels(Seen(self.marked, *(np.full((*shape, *n), np.nan) for n in ((2,), (2, 2))), np.zeros(shape)))
-
     def look(self, name: str, detector: Callable, frames: np.ndarray, near: np.ndarray | None = None) -> Seen:
         """`look`, or what an earlier call kept."""
         path = self.folder / f"{name}.npz"
         if not path.is_file():
-            show = lambda part: self.say(f"Looking ({name})", part)  # noqa: E731
             asked = SharedDetector(detector) if near is None and self.learns else detector
-            found = look(self.recording, asked, frames, near=near, progress=show)
-            with files.whole(path) as partial, open(partial, "wb") as file:
-                np.savez(file, **found._asdict())
+            found = look(self.recording, asked, frames, near=near, progress=partial(self.say, f"Looking ({name})"))
+            with files.whole(path) as new:
+                np.savez(new, **found._asdict())
         with np.load(path) as kept:
             return Seen(*(kept[field] for field in Seen._fields))
 
@@ -222,17 +204,19 @@ class _Work:
                     found.append(LabelledImage(f"{side} {number}", getattr(frame, side), u, visibility, sd_px))
         return found
 
-    def adapted(self, tune: Callable[..., Detector]) -> Adaptation:
+    def adapted(self) -> Adaptation:
+        """Teach, train and look again, round after round, then judge."""
         recording, start, rounds = self.recording, self.detector, self.report["rounds"]
         first = self.look("before", start, self.frames)
-        seen = self.with_labels(first)
+        seen = first.labelled(self.labels)
         still, note = longest_still(recording, seen)
         self.report["notes"] += [note] if note else []
-        parts = stretches(np.setdiff1d(still, self.marked), recording.frames.time_s)
+        parts = self.parts = stretches(np.setdiff1d(still, self.marked), recording.frames.time_s)
         learn = parts["learn"] = np.union1d(parts["learn"], self.marked)
         self.report["frames"] = {name: len(part) for name, part in parts.items()}
-        teachers, refused = [], None
-        for part, by_hand in ((seen.of(learn), False), (self.by_hand(), True)):
+        teachers, refused, shape = [], None, (len(self.marked), 2, 3)
+        alone = Seen(self.marked, np.full((*shape, 2), np.nan), np.full((*shape, 2, 2), np.nan), np.zeros(shape))
+        for part, by_hand in ((seen.of(learn), False), (alone.labelled(self.labels), True)):
             if not by_hand or len(self.marked) >= 5:
                 try:
                     teachers.append(teach(recording, part, from_labels=by_hand))
@@ -246,7 +230,7 @@ class _Work:
         for k in range(_GUIDED if self.learns and start.closeup_network else 0):  # untaught, near where the robot says
             guided = self.look(f"guided {k}", start, learn, u)
             try:
-                teacher = teach(recording, self.with_labels(guided), opinion=guided, before=teacher)
+                teacher = teach(recording, guided.labelled(self.labels), opinion=guided, before=teacher)
             except RefusalError:
                 if len(self.marked) < 5:
                     raise
@@ -258,14 +242,14 @@ class _Work:
         best, best_seen, stop = start, first, agreement(teacher, first.of(parts["stop"])).summary()
         rounds.append({"round": 0, "right": teacher.right} | stop)
         some = learn[:: max(1, len(learn) // 8)]
-        simulated = simulated_like((recording.frames[int(i)].left for i in some), self.seed, self.progress)
+        self.simulated = simulated_like((recording.frames[int(i)].left for i in some), self.seed, self.progress)
         for k in range(1, ROUNDS + 1):
             if k > 1 and self.left_s < 6 * self.minutes:
                 break
-            tuned = self.round(k, best, teacher, parts, None if k == 1 else best_seen, simulated, tune)
+            tuned = self.round(k, best, teacher, None if k == 1 else best_seen)
             seen, said = self.look(f"round {k}", tuned, self.frames), {}
             try:
-                new = teach(recording, self.with_labels(seen).of(learn), before=teacher, opinion=guided)
+                new = teach(recording, seen.labelled(self.labels).of(learn), before=teacher, opinion=guided)
             except RefusalError as refused:
                 said = {"refused": str(refused)}
                 if len(self.marked) < 5:
@@ -277,14 +261,11 @@ class _Work:
             if now["mean_share"] > (1 - _LEAST_GAIN) * stop["mean_share"]:
                 break
             best, best_seen, teacher, stop = tuned, seen, new, now
-        return self.judged(parts, first, best, best_seen, teacher)
+        return self.judged(first, best, best_seen, teacher)
 
-    def round(
-        self, k: int, detector: Detector, teacher: Teacher, parts: dict[str, np.ndarray], seen: Seen | None,
-        simulated: list[LabelledImage], tune: Callable[..., Detector],
-    ) -> Detector:  # fmt: skip
+    def round(self, k: int, detector: Detector, teacher: Teacher, seen: Seen | None) -> Detector:
         """The detector trained further on what the teacher says of the frames for learning."""
-        path = self.folder / f"round {k}.safetensors"
+        path, parts = self.folder / f"round {k}.safetensors", self.parts
         if path.is_file():
             return Detector.load(path)
         held_out, doubt_on = self.images(parts["stop"], teacher, seen), parts["learn"][:0]
@@ -306,8 +287,8 @@ class _Work:
                 self.saved_s = time.perf_counter()
                 files.write_json(self.folder / "state.json", {"seconds": self.saved_s - self.began})
 
-        tuned = tune(
-            detector, images, held_out, self.folder / f"round {k}", simulated=simulated, steps=STEPS, seed=self.seed,
+        tuned = self.tune(
+            detector, images, held_out, self.folder / f"round {k}", simulated=self.simulated, steps=STEPS, seed=self.seed,
             minutes=max(self.left_s / 60 * _ROUND_SHARE, 0.05), progress=progress,
         )  # fmt: skip
         if self.learns:
@@ -315,14 +296,11 @@ class _Work:
         files.write_json(self.folder / "state.json", {"seconds": time.perf_counter() - self.began})
         return tuned
 
-    def judged(
-        self, parts: dict[str, np.ndarray], first: Seen, best: Detector, best_seen: Seen, teacher: Teacher
-    ) -> Adaptation:
+    def judged(self, first: Seen, best: Detector, best_seen: Seen, teacher: Teacher) -> Adaptation:
         """Compare the detectors on the frames that took no part."""
-        seen = first.of(parts["judge"]), best_seen.of(parts["judge"])
-        agreements = [agreement(teacher, own) for own in seen]
-        geometry, length = epipolar_geometry(self.recording, parts["judge"], best_seen), agreements[0].length_px.mean(axis=1)
-        distances = [epipolar_px(geometry, own) for own in seen]
+        seen = first.of(self.parts["judge"]), best_seen.of(self.parts["judge"])
+        agreements, distances = [agreement(teacher, own) for own in seen], epipolar_px(self.recording, seen, best_seen)
+        length = agreements[0].length_px.mean(axis=1)
         robot, robot_sd = better(*(own.relative for own in agreements))
         eye, eye_sd = better(*(frame_means(own / length) for own in distances))
         improved = best is not self.detector and robot > 2 * robot_sd and eye > 0
@@ -348,8 +326,8 @@ class _Work:
         if improved and self.learns:
             best = replace(best, metadata=best.metadata | {"adapted": self.finished()})
         return Adaptation(
-            best if improved else self.detector, teacher.calibration, self.finished(), bool(improved), parts, agreements[1],
-            seen, teacher.project(parts["judge"])[0],
+            best if improved else self.detector, teacher.calibration, self.finished(), bool(improved), self.parts,
+            agreements[1], seen, teacher.project(self.parts["judge"])[0],
         )  # fmt: skip
 
 

@@ -1,7 +1,7 @@
 """From half-wrong detections to labels: cameras that the right ones agree on, and the robot's landmarks seen through them.
 
-The robot may be wrong, too.  What it says is refused where its log stands still, where the image shows the whole tool
-elsewhere, and altogether where a fault of clock, axes or tool explains what the images show.
+What the robot says is refused where its log stands still, where the image shows the whole tool elsewhere, and altogether
+where a fault of clock, axes or tool explains what the images show.
 """
 
 from collections.abc import Callable
@@ -61,6 +61,11 @@ class Seen(NamedTuple):
     covariance: np.ndarray
     confidence: np.ndarray
 
+    @property
+    def stacked_px(self) -> np.ndarray:
+        """(m, 3, 4) px of left and right."""
+        return np.concatenate([self.u[:, 0], self.u[:, 1]], axis=-1)
+
     def rows(self, recording: Recording, least: float = 0.0) -> Correspondences:
         """With the robot's positions; of a confidence below `least` nothing counts."""
         known = {"covariance_px2": self.covariance, "confidence": np.where(self.confidence >= least, self.confidence, 0.0)}
@@ -72,7 +77,8 @@ class Seen(NamedTuple):
         return Seen(*(part[np.isin(self.frame, frames)] for part in self))
 
     def labelled(self, u: np.ndarray) -> Self:
-        """With labels set by hand, u (m, 2, 3, 2), in place of what was found there; what has none stays as it was found."""
+        """With labels set by hand in place of what was found there: u (all frames, 2, 3, 2) px, NaN where there is none."""
+        u = u[self.frame]
         known = np.isfinite(u).all(axis=-1)
         covariance = np.where(known[..., None, None], CLICK_SD_PX**2 * np.eye(2), self.covariance)
         return Seen(self.frame, np.where(known[..., None], u, self.u), covariance, np.where(known, 1.0, self.confidence))
@@ -145,24 +151,17 @@ def longest_still(recording: Recording, seen: Seen) -> tuple[np.ndarray, str]:
 class Teacher:
     """The robot's landmarks, seen through calibrated cameras.
 
-    Attributes:
-        recording: With the clock's offset as the images show it.
-        calibration: Of the frames for learning.
-        clock_sd_s: Of the clock's offset.
-        offset_mm, offset_sd_mm: (3, 3) in the tool's axes: where the landmarks are, beside where the robot reports them.
-        refused: Frames in which the robot is not believed.
-        right: Share of the landmarks that agree on the cameras.
-        turns: As `LandmarkOffsets.turns`.
+    `offset_mm` and its deviation (3, 3), in the tool's axes, say where the landmarks are beside where the robot reports them.
     """
 
-    recording: Recording
+    recording: Recording  # with the clock's offset as the images show it
     calibration: Calibration
     clock_sd_s: float
     offset_mm: np.ndarray
     offset_sd_mm: np.ndarray
-    refused: np.ndarray
-    right: float
-    turns: bool = False
+    refused: np.ndarray  # frames in which the robot is not believed
+    right: float  # share of the landmarks that agree on the cameras
+    turns: bool = False  # as `LandmarkOffsets.turns`
 
     def project(self, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Pixels (m, 2, 3, 2) of the robot's landmarks at the instants of their image rows, and covariances (m, 2, 3, 2, 2).
@@ -171,7 +170,9 @@ class Teacher:
         """
         r, c, offset = self.recording, self.calibration, self.offset_mm
         turning = offset if self.turns else None
-        known_at, known = _known_axes(r, turning)
+        known = tool_axes(r.kinematics.x_mm, turning)
+        is_open = np.isfinite(known).all(axis=(1, 2))
+        open_s, known = r.kinematics.time_s[is_open], known[is_open]
         time, height = np.repeat(r.frames.time_s[frames][:, None], 3, axis=1) + r.offset_s, r.image_size_px[1]
         u, covariance = np.full((len(frames), 2, 3, 2), np.nan), np.full((len(frames), 2, 3, 2, 2), np.nan)
         for side, camera in enumerate(c.cameras):
@@ -180,7 +181,7 @@ class Teacher:
                 x = r.kinematics.at(at)
                 axes = tool_axes(x, turning)
                 shut = ~np.isfinite(axes).all(axis=(1, 2))
-                axes[shut] = known[np.abs(known_at - at[shut, :1]).argmin(axis=1)]
+                axes[shut] = known[np.abs(open_s - at[shut, :1]).argmin(axis=1)] if len(known) else 0.0
                 x = x + np.einsum("mij,kj->mki", axes, offset)
                 u[:, side] = camera.project(x.reshape(-1, 3)).reshape(x.shape[:2] + (2,))
                 at = time + r.readout_s * np.nan_to_num(u[:, side, :, 1] / (height - 1) - 0.5).clip(-0.5, 0.5)
@@ -274,13 +275,6 @@ def teach(
             f"says: a frozen log, another clock, a moved microscope, or a tool that the robot does not hold."
         )
     return replace(teacher, refused=np.union1d(refused, against))
-
-
-def _known_axes(recording: Recording, turning: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-    """Times (m,) of the robot's samples in which the jaws are open, and the tool's axes (m, 3, 3); for want of any, zeros."""
-    axes = tool_axes(recording.kinematics.x_mm, turning)
-    known = np.isfinite(axes).all(axis=(1, 2))
-    return (recording.kinematics.time_s[known], axes[known]) if known.any() else (np.zeros(1), np.zeros((1, 3, 3)))
 
 
 def _frozen(recording: Recording, frames: np.ndarray) -> np.ndarray:

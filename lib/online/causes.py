@@ -22,28 +22,20 @@ _ROBUST = 12.0  # squared residual in standard deviations that begins to count l
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """The likeliest cause.
-
-    Attributes:
-        kind: "none", "moved", "optics", "exchanged", "clock", "slipped" or "open".
-        text: What happened, in a few words, where it is no motion.
-        rig: That explains the landmarks; None where no rig does.
-        motion: For "moved".
-        loss: Of a row, the mean over the rows; see `CONVINCING`.
-    """
+    """The likeliest cause: "none", "moved", "optics", "exchanged", "clock", "slipped" or "open"."""
 
     kind: str
-    text: str
-    rig: StereoRig | None = None
+    text: str = ""  # what happened, where it is no motion
+    rig: StereoRig | None = None  # that explains the landmarks
     motion: MovedCameras | None = None
-    loss: float = float("nan")
+    loss: float = float("nan")  # of a row, the mean over the rows; see `CONVINCING`
 
 
 def explain(
     rig: StereoRig, frames: Sequence[Correspondences], past: Sequence[Correspondences], covariance_px2: np.ndarray, *,
     undecided: bool = True,
 ) -> Explanation:  # fmt: skip
-    """The likeliest cause of what `frames` show, with the rig that was right before.
+    """The likeliest cause of what `frames` show; a ValueError if the landmarks leave every motion open.
 
     Args:
         rig: In force before.
@@ -51,14 +43,11 @@ def explain(
         past: Some twenty frames up to the newest of `frames`, and those themselves.
         covariance_px2: (n, 4, 4) of the complete rows' residuals.
         undecided: More frames may come: answer "open" where a motion and a late report explain these about equally well.
-
-    Raises:
-        ValueError: If the landmarks leave every motion open.
     """
     data = Correspondences.join(frames).complete
     motion = identify_motion(rig, data, covariance_px2=covariance_px2)
     least = min(motion.bic.values())
-    found = Explanation("none", "", rig) if motion.moved == "none" else Explanation("moved", "", motion.rig, motion)
+    found = Explanation("none", rig=rig) if motion.moved == "none" else Explanation("moved", "", motion.rig, motion)
     swapped = replace(data, u_left=data.u_right, u_right=data.u_left)
     others = [(misfit(rig, swapped, covariance_px2), Explanation("exchanged", "the eyes are exchanged", rig))]
     late = _lateness(rig, frames, past, covariance_px2)
@@ -88,9 +77,7 @@ def explain(
 def misfit(rig: StereoRig, data: Correspondences, covariance_px2: np.ndarray, parameters: int = 0) -> float:
     """How badly a rig explains complete rows, as the information criteria of `identify_motion` say it.
 
-    Args:
-        covariance_px2: (n, 4, 4) of the rows' residuals.
-        parameters: Number of values that were fitted to these rows.
+    The residuals' covariance is (n, 4, 4), and `parameters` is the number of values that were fitted to these rows.
     """
     try:
         residual = np.hstack([data.u_left, data.u_right]) - np.hstack(rig.project(data.x_mm))

@@ -6,7 +6,6 @@ import resource
 import sys
 import time
 from collections import Counter, deque
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -20,28 +19,18 @@ from lib.online.video import Dashboard, video_file
 from lib.recordings import Recording
 
 
-@dataclass
 class Tally:
-    """What a run came to, in constant memory.
+    """What a run came to, in constant memory: the latencies, from arrival to distance, are of the newest 100,000 frames."""
 
-    Attributes:
-        latency_s: From a frame's arrival to its distance, of the newest 100,000 frames.
-    """
-
-    surfaces: int = 0
-    dropped: int = 0
-    states: Counter = field(default_factory=Counter)
-    failures: Counter = field(default_factory=Counter)
-    latency_s: deque[float] = field(default_factory=lambda: deque(maxlen=100_000))
-    start: float = field(default_factory=time.monotonic)
-    cpu_start: float = field(default_factory=time.process_time)
-    _newest: int = -1
+    def __init__(self) -> None:
+        self.start, self.cpu_start = time.monotonic(), time.process_time()
+        self.states, self.failures, self.latency_s = Counter(), Counter(), deque(maxlen=100_000)
+        self.surfaces, self.dropped, self.newest = 0, 0, None
 
     def add(self, result: FrameResult, latency_s: float) -> None:
         """Count a frame."""
-        self.dropped = result.dropped
-        if result.reconstructed_at is not None and result.reconstructed_at != self._newest:
-            self.surfaces, self._newest = self.surfaces + 1, result.reconstructed_at
+        self.surfaces += result.reconstructed_at not in (None, self.newest)
+        self.dropped, self.newest = result.dropped, result.reconstructed_at
         self.states[result.state] += 1
         self.failures.update(result.failures.keys())
         self.latency_s.append(latency_s)
@@ -76,9 +65,8 @@ def main(argv: list[str] | None = None) -> int:
         parser.error("--frames and --surface-every: must be at least 1.")
     recording = Recording.open(a.recording)
     settings = Settings(surface_every=a.surface_every, fps=recording.fps, robot_accuracy_mm=recording.robot_accuracy_mm)
-    detector = Detector.load(a.weights)
-    frames = recorded(recording, a.frames)
-    feed, recorder = Live(frames) if a.live else frames, None
+    detector, frames, recorder = Detector.load(a.weights), recorded(recording, a.frames), None
+    feed = Live(frames) if a.live else frames
     with contextlib.ExitStack() as stack:
         show = stack.enter_context(video_file(a.video, min(recording.fps, 25.0))) if a.video else None
         if a.record:

@@ -1,8 +1,8 @@
 """From tip to retina: where each landmark is, how far from the surface, and how sure that is.
 
 A landmark lies where the robot reports it, plus a correction that changes slowly: a tool that slips, a robot that bends.
-A Kalman filter follows the correction: the robot's motion, which is known, drives the prediction, and each frame's
-triangulated landmarks measure it.  So the distances have the robot's small noise and not the detector's.
+A Kalman filter follows the correction, which each frame's triangulated landmarks measure.  So the distances have the
+robot's small noise and not the detector's.
 """
 
 from dataclasses import dataclass
@@ -44,11 +44,9 @@ class TipDistance:
         self._covariance = np.tile(self.settings.slip_mm**2 * np.eye(3), (len(LANDMARKS), 1, 1))
 
     def measure(self, result: FrameResult, tracker: RigTracker, x_mm: np.ndarray, at: Surface | None) -> None:
-        """Set the result's distances, standard deviations, approach and alarm.
+        """Set the result's distances to the newest surface, their standard deviations, approach and alarm.
 
-        Args:
-            x_mm: (3, 3) that the robot reports, NaN where it is silent or not to be believed.
-            at: The newest surface.
+        The robot reports `x_mm` (3, 3), NaN where it is silent or not to be believed.
         """
         seen, covariance = self.triangulate(result, tracker)
         robot = np.isfinite(x_mm).all(axis=1)

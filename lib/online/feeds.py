@@ -19,19 +19,13 @@ _WAITING = 4  # frames at most, for a pause of the machine; when another comes, 
 
 @dataclass(frozen=True, eq=False)
 class Arrival:
-    """A stereo frame as `OnlinePipeline.step` takes it.
-
-    Attributes:
-        left, right, kinematics, time_s: As there.
-        arrived_s: `time.monotonic` when it came; NaN where frames wait for whoever takes them.
-        source: Number of the frame in its recording.
-    """
+    """A stereo frame as `OnlinePipeline.step` takes it, and its number in the recording that it is from."""
 
     left: np.ndarray
     right: np.ndarray
     kinematics: ArrayLike | Callable | None
     time_s: float
-    arrived_s: float = float("nan")
+    arrived_s: float = float("nan")  # by `time.monotonic`, where frames do not wait for whoever takes them
     source: int = -1
 
 
@@ -51,14 +45,7 @@ def recorded(recording: Recording, n_frames: int | None = None) -> Iterator[Arri
 
 
 class Live:
-    """Any arrivals, each at its own time: who is busy then finds it in the queue, or lost.
-
-    Args:
-        arrivals: Decoded in a thread.
-
-    Attributes:
-        lost: Frames lost so far.
-    """
+    """Any arrivals, each at its own time: who is busy then finds it in the queue, or among the `lost`, which are counted."""
 
     def __init__(self, arrivals: Iterator[Arrival]) -> None:
         self.lost, self._arrivals = 0, arrivals

@@ -1,12 +1,7 @@
 """The online system (paper Sec. V): every stage, frame by frame, with the seconds of each and what failed.
 
-    pipeline = OnlinePipeline(Detector.load())
-    for i, frame in enumerate(recording.frames):
-        result = pipeline.step(frame.left, frame.right, partial(of_recording, recording, frames=[i]))
-
-It starts without a calibration.  Landmarks and kinematics accumulate until the stereo rig can be calibrated.  From then
-on each frame is reconstructed, and the landmarks show whether the cameras stand where they stood.  If they do not, a few
-frames of the tool tell which camera moved and how (Sec. IV-C), or what else is wrong.
+It starts without a calibration, and calibrates as soon as there are landmarks and kinematics enough.  From then on each
+frame is reconstructed, and its landmarks show whether the cameras moved, or what else is wrong.
 """
 
 from collections.abc import Callable
@@ -32,8 +27,12 @@ _DEPTH_MARGIN_MM = 0.5  # how far an eye may move along the view from one surfac
 class OnlinePipeline:
     """Landmarks, calibration, watch and registration, surface and distance, one `step` a frame.
 
+        pipeline = OnlinePipeline(Detector.load())
+        for i, frame in enumerate(recording.frames):
+            result = pipeline.step(frame.left, frame.right, partial(of_recording, recording, frames=[i]))
+
     A frame never ends the run: a stage that fails leaves its reason in the result, and the others go on as far as they
-    can.  `lib.online.STATES` says what each state means and what follows from it.
+    can.  `lib.online.STATES` says what each state means.
 
     Args:
         detector: `lib.landmarks.Detector`, or anything alike: images (2, h, w, 3) uint8 RGB to `.u` (2, 3, 2), `.covariance`
@@ -45,9 +44,6 @@ class OnlinePipeline:
         beside: Reconstruct surfaces in a process beside this one, the newest frame first; else in turn, which gives the
             same output for the same input.  Use it in a ``with`` block, which ends the process.
         calibrate, reconstruct: Replace `lib.calibration.calibrate` and, in turn, `lib.surface.reconstruct`.
-
-    Attributes:
-        state: As in `FrameResult`.
     """
 
     def __init__(
@@ -55,7 +51,7 @@ class OnlinePipeline:
         settings: Settings | None = None, beside: bool = False, calibrate: Callable[..., Calibration] = calibrate,
         reconstruct: Callable[..., Reconstruction] = reconstruct,
     ) -> None:  # fmt: skip
-        self.settings, self.state = settings or Settings(), "calibrating"
+        self.settings = settings or Settings()
         self._detector, self._seen, self._index = detector, None, -1
         self._tracker = RigTracker(rig, noise_px=float(noise_px), settings=self.settings, calibrate=calibrate)
         self._checks, self._tips = FrameChecks(), TipDistance(self.settings)
@@ -144,19 +140,18 @@ class OnlinePipeline:
     def _name_state(self, result: FrameResult, blind: str, told: str, seen: bool) -> None:
         """From the worst: what the images show, what the robot says, how the two agree."""
         if result.state == "moved":  # this frame alone
-            self.state = result.state
             return
         state, cause = self._tracker.state, self._tracker.cause
+        measures = state in ("tracking", "robot")
         if blind:
             state, cause = "blind", blind
-        elif state in ("tracking", "robot"):
-            if not seen:
-                unheard = state == "robot" or bool(told)
-                state, cause = ("blind", "neither landmarks nor report") if unheard else ("unseen", "no landmarks")
-            elif told:
-                state, cause = "robot", told
-        self.state = result.state = state
-        result.cause = cause
+        elif measures and not seen and (told or state == "robot"):
+            state, cause = "blind", "neither landmarks nor report"
+        elif measures and not seen:
+            state, cause = "unseen", "no landmarks"
+        elif measures and told:
+            state, cause = "robot", told
+        result.state, result.cause = state, cause
 
     def _detect(self, left: np.ndarray, right: np.ndarray, kinematics: ArrayLike | Callable | None) -> Seen:
         if self._pair is None or self._pair.shape[1:] != left.shape:
@@ -218,8 +213,7 @@ class OnlinePipeline:
             if event:
                 result.failures["worker"] = event
         for surface in done:
-            for stage, seconds in surface.seconds.items():
-                result.seconds[stage] = result.seconds.get(stage, 0.0) + seconds
+            result.seconds.update(surface.seconds)  # a counter adds
             if surface.failure is not None:
                 result.failures[surface.failure[0]] = surface.failure[1]
             else:

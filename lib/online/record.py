@@ -1,8 +1,10 @@
 """What went in and what came out, in a folder: `input/` is a recording that can be given again, `frames.csv` the outputs."""
 
+import csv
 import queue
 import shutil
 import threading
+from contextlib import ExitStack
 from pathlib import Path
 
 import cv2
@@ -22,13 +24,9 @@ class Recorder:
     Args:
         folder: New, or empty.
         recording: Where the frames come from: its kinematics and clocks make `input/` a recording like it.
-        patient: Wait for the disk; else images are left out where it is too slow (`left_out`).
+        patient: Wait for the disk; else frames are left out where it is too slow, and `left_out` counts them.
 
-    Attributes:
-        failure: Why the recording ended early, "" where it did not.
-
-    Raises:
-        FileExistsError: If the folder holds something.
+    `failure` says why the recording ended early, "" where it did not.  A `FileExistsError` if the folder holds something.
     """
 
     def __init__(self, folder: str | Path, recording: Recording, *, patient: bool = True) -> None:
@@ -46,12 +44,10 @@ class Recorder:
 
     def add(self, arrival: Arrival, result: FrameResult) -> None:
         """A frame and what was said about it."""
-        if self.failure:
-            return
-        if not self._patient and self._queue.full():
+        if not self.failure and not self._patient and self._queue.full():
             self.left_out += 1
-            return
-        self._queue.put((arrival, row(result), [result.seconds.get(stage, 0.0) for stage in STAGES]))
+        elif not self.failure:
+            self._queue.put((arrival, row(result), [f"{result.seconds.get(stage, 0.0):.6f}" for stage in STAGES]))
 
     def close(self) -> None:
         """Wait until all is written."""
@@ -60,24 +56,22 @@ class Recorder:
 
     def _work(self) -> None:
         try:
-            paths = [self.folder / "frames.csv", self.folder / "seconds.csv", self.folder / "input" / "frames.csv"]
-            heads = row(FrameResult(0)), ["frame", *STAGES], ["frame", "time_s"]
-            files = [path.open("w", encoding="utf-8", newline="\n") for path in paths]
-            try:
-                for file, head in zip(files, heads, strict=True):
-                    file.write(",".join(head) + "\n")
+            with ExitStack() as stack:
+                how = {"encoding": "utf-8", "newline": "", "buffering": 1}  # a line is in the file as soon as it is written
+                paths = (self.folder / name for name in ("frames.csv", "seconds.csv", "input/frames.csv"))
+                told, spent, times = (
+                    csv.writer(stack.enter_context(path.open("w", **how)), lineterminator="\n") for path in paths
+                )
+                told.writerow(row(FrameResult(0)))
+                spent.writerow(["frame", *STAGES])
+                times.writerow(["frame", "time_s"])
                 while (item := self._queue.get()) is not None:
                     arrival, cells, seconds = item
                     self._write_images(arrival)
-                    files[0].write(",".join(cells.values()) + "\n")
-                    files[1].write(",".join([cells["frame"], *(f"{value:.6f}" for value in seconds)]) + "\n")
-                    files[2].write(f"{self._count},{float(arrival.time_s)!r}\n")
+                    told.writerow(cells.values())
+                    spent.writerow([cells["frame"], *seconds])
+                    times.writerow([self._count, float(arrival.time_s)])
                     self._count += 1
-                    for file in files:
-                        file.flush()
-            finally:
-                for file in files:
-                    file.close()
         except OSError as error:
             self.failure = f"{self.folder}: the recording ended after {self._count} frames ({error})."
             while self._queue.get() is not None:  # nobody waits for a place
@@ -86,9 +80,9 @@ class Recorder:
     def _write_images(self, arrival: Arrival) -> None:
         for side, image in (("left", arrival.left), ("right", arrival.right)):
             target = self.folder / "input" / side / f"{self._count:06d}"
-            there = [p for p in (self._source / side).glob(f"{arrival.source:06d}.*") if arrival.source >= 0]
+            there = next((self._source / side).glob(f"{arrival.source:06d}.*"), None) if arrival.source >= 0 else None
             if there:
-                shutil.copyfile(there[0], target.with_suffix(there[0].suffix))
+                shutil.copyfile(there, target.with_suffix(there.suffix))
             else:
                 flat = [cv2.IMWRITE_PNG_COMPRESSION, 1]
                 data = cv2.imencode(".png", cv2.cvtColor(np.asarray(image), cv2.COLOR_RGB2BGR), flat)[1]

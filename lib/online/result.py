@@ -1,6 +1,7 @@
 """What a user may change about the online system, and what it says about each frame."""
 
 import time
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -41,8 +42,7 @@ class Settings:
         control: Control points of the surface (n_x, n_y).
         fps: Frames a second, for frames that come without a time.
         stale_s: Distances end where the surface, or the last sight of the landmarks, is older.
-        eye_mm_s: Speed at which the eye may move unseen; the distance's standard deviation grows by it with the surface's
-            age.
+        eye_mm_s: Speed at which the eye may move unseen, by which the distance's standard deviation grows.
         slip_mm: Standard deviation of how far the landmarks may lie off the robot's report, beside its own accuracy.
         robot_accuracy_mm: Standard deviation of the robot's report, per coordinate.
         alarm_mm, miss_rate: A tip is `too_close` where its distance may be below alarm_mm: a true one below it is missed
@@ -77,14 +77,13 @@ class Settings:
             raise ValueError(f"miss_rate: expected a probability below one half, got {self.miss_rate}.")
 
 
-def _nothing() -> Correspondences:
-    """The three landmarks, none of them seen or reported."""
-    missing = np.full((len(LANDMARKS), 2), np.nan)
-    return Correspondences.of_points(np.full((len(LANDMARKS), 3), np.nan), missing, missing, landmark=range(len(LANDMARKS)))
-
-
 def _unknown() -> np.ndarray:
     return np.full(len(LANDMARKS), np.nan)
+
+
+def _nothing() -> Correspondences:
+    """The three landmarks, none of them seen or reported."""
+    return Correspondences.of_points(*(np.full((3, size), np.nan) for size in (3, 2, 2)), landmark=range(len(LANDMARKS)))
 
 
 @dataclass
@@ -93,13 +92,11 @@ class FrameResult:
 
     Attributes:
         index, time_s: Number of the frame since the start; its time, video clock.
-        state: One of `STATES`.
-        cause: Why the state is not "tracking", in a few words; "" where it is.
-        landmarks: Base, tip_1 and tip_2: where the detector saw them and where the robot reports them.
-        x_tool_mm: (3, 3) landmarks as the cameras triangulate them.
+        state, cause: One of `STATES`, and why it is not "tracking", in a few words.
+        landmarks, x_tool_mm: Where the detector saw them and where the robot reports them; (3, 3) as the cameras triangulate
+            them.
         rig: In force after this frame.
-        reconstruction, reconstructed_at: The newest surface and its points, and the number of the frame that they are
-            from.
+        reconstruction, reconstructed_at: The newest surface and its points, and the number of their frame.
         distance_mm, distance_sd_mm: (3,) from each landmark to the surface along the view, positive = above it, and its
             standard deviation: detector, robot, calibration, surface and the surface's age.
         normal_mm, normal_sd_mm: The same along the surface's normal.
@@ -133,7 +130,7 @@ class FrameResult:
     drift: float = 0.0
     motion: MovedCameras | None = None
     dropped: int = 0
-    seconds: dict[str, float] = field(default_factory=dict)
+    seconds: Counter[str] = field(default_factory=Counter)
     failures: dict[str, str] = field(default_factory=dict)
 
     @property
@@ -150,4 +147,4 @@ class FrameResult:
         except Exception as error:  # whatever a stage dies of: the next frame comes in 40 ms
             self.failures[name] = f"{type(error).__name__}: {error}"
         finally:
-            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+            self.seconds[name] += time.perf_counter() - start

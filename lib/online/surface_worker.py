@@ -3,6 +3,7 @@
 import contextlib
 import multiprocessing
 import os
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from multiprocessing import shared_memory
@@ -13,7 +14,7 @@ from lib.cameras import StereoRig
 from lib.online.distance import Surface
 from lib.surface import Reconstruction, reconstruct
 
-_PARTS_OF_MATCHING = {"mask": "match", "refine": "match"}
+_STAGE_OF = {"mask": "match", "refine": "match"}  # what else is its own stage
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,12 +36,11 @@ def make(job: SurfaceJob, reconstruct: Callable[..., Reconstruction] = reconstru
         found, failure = reconstruct(job.left, job.right, job.rig, seconds=seconds, **job.options), None
         found.surface.covariance(found.u[:1])  # factorises once, so that no frame waits for it
     except Exception as error:  # whatever it dies of: the next frame may have a surface
-        stage = next(reversed(seconds), "match")
-        found, failure = None, (_PARTS_OF_MATCHING.get(stage, stage), f"{type(error).__name__}: {error}")
-    spent: dict[str, float] = {}
+        part = next(reversed(seconds), "match")
+        found, failure = None, (_STAGE_OF.get(part, part), f"{type(error).__name__}: {error}")
+    spent = Counter()
     for part, duration in seconds.items():
-        stage = _PARTS_OF_MATCHING.get(part, part)
-        spent[stage] = spent.get(stage, 0.0) + duration
+        spent[_STAGE_OF.get(part, part)] += duration
     return Surface(found, job.index, job.time_s, spent, failure)
 
 
@@ -118,25 +118,21 @@ class Beside:
             self._memory = None
 
     def close(self) -> None:
-        """End the process and free its memory."""
-        with contextlib.suppress(OSError):
-            self._pipe.send(None)
-        self._process.join(2.0)
-        if self._process.is_alive():
-            self._process.kill()
-            self._process.join()
+        """End the process, which has nothing to lose, and free its memory."""
+        self._process.kill()
+        self._process.join()
         self._pipe.close()
         self._free()
 
 
 def _work(pipe: multiprocessing.connection.Connection) -> None:
-    """In the worker: jobs until None or until the other side is gone.  Landmarks come first, so it yields to them."""
+    """In the worker: jobs until the other side is gone.  Landmarks come first, so it yields to them."""
     with contextlib.suppress(AttributeError, OSError):  # not every system has priorities
         os.nice(10)
     pipe.send(None)
     with contextlib.suppress(EOFError, OSError, KeyboardInterrupt):
-        while (sent := pipe.recv()) is not None:
-            name, shape, job = sent
+        while True:
+            name, shape, job = pipe.recv()
             memory = shared_memory.SharedMemory(name=name)
             left, right = np.ndarray(shape, np.uint8, memory.buf).copy()
             memory.close()

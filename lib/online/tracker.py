@@ -31,12 +31,8 @@ class Seen:
 class RigTracker:
     """The rig in force, and whether images and robot still agree with it.
 
-    Attributes:
-        rig: In force, None before the first calibration.
-        calibration: That `rig` comes from, None for a rig that was given.
-        state, cause: As in `FrameResult`: "calibrating", "tracking", "moved" or "robot".
-        rests_on_s: Time of the newest frame that went into the rig.
-        doubted_since: Number of the first frame that disagreed, while the state is not "tracking".
+    `rig`, `calibration`, `state` and `cause` are as in `OnlinePipeline` and `FrameResult`, `rests_on_s` is the time of the
+    newest frame that went into the rig, and `doubted_since` the number of the first frame that disagreed.
     """
 
     def __init__(

@@ -10,6 +10,8 @@ import numpy as np
 
 from lib.correspondences import LANDMARK_COLOURS, LANDMARKS
 from lib.online.result import STAGES, STATES, FrameResult
+from lib.recordings import StereoFrame
+from lib.trust.check import overlay
 
 _SIZE = (1280, 720)
 _LIGHTS = dict(zip(STATES, ((120, 120, 120), (0, 170, 80), (90, 150, 230), (40, 40, 40), (240, 190, 60), (220, 60, 50)),
@@ -26,24 +28,14 @@ class Dashboard:
     def draw(self, left: np.ndarray, right: np.ndarray, result: FrameResult) -> np.ndarray:
         """The page of a frame."""
         page = np.full((_SIZE[1], _SIZE[0], 3), 250, np.uint8)
-        for side, (image, u) in enumerate(((left, result.landmarks.u_left), (right, result.landmarks.u_right))):
-            self._view(page[:360, 640 * side : 640 * (side + 1)], image, u)
+        u, width = np.stack([result.landmarks.u_left, result.landmarks.u_right]), 360 * left.shape[1] // left.shape[0]
+        views = overlay(StereoFrame(left, right, result.time_s), u, None, min(637, width))
+        page[: views.shape[0], : views.shape[1]] = views
         self._lights(page, result)
         self._past.append((result.distance_mm, result.distance_sd_mm))
         self._curve(page[420:, :860])
         self._times(page[420:, 880:], result)
         return page
-
-    def _view(self, part: np.ndarray, image: np.ndarray, u: np.ndarray) -> None:
-        scale = min(part.shape[1] / image.shape[1], part.shape[0] / image.shape[0])
-        size = round(image.shape[1] * scale), round(image.shape[0] * scale)
-        small = np.ascontiguousarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
-        for name, point in zip(LANDMARKS, u, strict=True):
-            if np.isfinite(point).all():
-                at = tuple(int(v) for v in np.round((point + 0.5) * scale - 0.5))
-                cv2.circle(small, at, 6, (255, 255, 255), 3, cv2.LINE_AA)
-                cv2.circle(small, at, 6, LANDMARK_COLOURS[name], 2, cv2.LINE_AA)
-        part[: small.shape[0], : small.shape[1]] = small
 
     def _lights(self, page: np.ndarray, result: FrameResult) -> None:
         for i, (state, colour) in enumerate(_LIGHTS.items()):

@@ -34,13 +34,12 @@ class DriftMonitor:
     """CUSUM tests (Page 1954) on the residuals r = u - rig.project(x), one on each axis of `AXES` and to each side.
 
     The detector's error is biased and correlated in time, and its stated noise may be wrong.  So the bias is the slow
-    mean of the residuals, within half a pixel, and the noise is that of the residuals themselves: their long-run standard
-    deviation, which counts correlated frames for what they are worth.  A score z is the residual less its
-    bias in this unit.  With delta the shift to be noticed in the same unit, z adds to S the logarithm of how much likelier
-    the shift makes it, and the alarm level keeps false alarms `_FRAMES` frames apart (Siegmund 1985).
+    mean of the residuals, within half a pixel, and the noise is their own long-run standard deviation, which counts
+    correlated frames for what they are worth.  A score z is the residual less its bias in this unit.  It adds to the sum S
+    the logarithm of how much likelier the shift to be noticed makes it; the alarm level keeps false alarms `_FRAMES` frames
+    apart (Siegmund 1985).
 
     Args:
-        rig: As calibrated or last registered.
         covariance_px2, sigma_x_mm: Noise to start from: of (u_left, u_right), a number, (2, 2) or (4, 4) px^2; and of the
             robot's report, per coordinate.
 
@@ -91,11 +90,9 @@ class DriftMonitor:
         self, data: Correspondences | ArrayLike, u_left: ArrayLike | None = None, u_right: ArrayLike | None = None,
         covariance_px2: ArrayLike | None = None, rig_px2: ArrayLike | None = None,
     ) -> bool:  # fmt: skip
-        """Take in one frame; True = the cameras have moved.
+        """Take in the complete rows of a frame, Correspondences or x_mm (k, 3) and pixels (k, 2); True = the cameras moved.
 
         Args:
-            data, u_left, u_right: The frame's Correspondences; or x_mm (k, 3) and pixels (k, 2).  Incomplete rows are
-                left out.
             covariance_px2: (k, 4, 4) noise of this frame's residuals, if it is known better than in general.
             rig_px2: (k, 4, 4) covariance of the rig's projections.  It is large far from the landmarks that the rig was
                 calibrated with, and frame after frame errs alike there, which is no drift.
@@ -159,8 +156,7 @@ def _robust_mean(residual: np.ndarray, weight: np.ndarray) -> np.ndarray:
 def _long_run_sd(values: np.ndarray, known: int = 0) -> np.ndarray:
     """(k,) of series (n, k): the standard deviation that independent frames would need for means to scatter as these do.
 
-    The autocovariances are summed under a triangle (Bartlett), as far as a test of the axis adds up frames; `_RAISES` counts
-    for `known` frames beside them.
+    The autocovariances are summed under a triangle (Bartlett); `_RAISES` counts for `known` frames beside them.
     """
     n = len(values)
     d = values - values.mean(axis=0)

@@ -31,11 +31,9 @@ def register_images(
     rig: StereoRig, data: Correspondences | ArrayLike, u_left: ArrayLike | None = None, u_right: ArrayLike | None = None, *,
     covariance_px2: ArrayLike | None = None, sigma_x_mm: float = 0.0, loss: Loss = "squared",
 ) -> Registration:  # fmt: skip
-    """The motion of a rig whose cameras moved together, by maximum likelihood in the images.
+    """The motion of a rig whose cameras moved together: of points of the stale rig to the robot frame.
 
-    Like ``register(triangulated, x_mm)`` it takes points of the stale rig to the robot frame.
-    Minimises sum r^T C^-1 r over the six parameters of the motion, with r = u - rig.project(motion^-1 x) and
-    C = covariance_px2 + sigma_x^2 A A^T, by damped Gauss-Newton steps.
+    Minimises sum r^T C^-1 r, with r = u - rig.project(motion^-1 x) and C = covariance_px2 + sigma_x^2 A A^T.
 
     Args:
         rig: Calibrated before the motion; affine or near-affine cameras.
@@ -63,11 +61,9 @@ def register_images(
 class MovedCameras:
     """Which cameras moved, and the rig as it is now.
 
-    `moved` is "none", "shifted" (together, without turning), "together", "left", "right" or "apart", and `rig` has the
-    projections as they are now.  `left` and `right` are the motions of the cameras (the same one where they moved
-    together), None for one that stayed.  An affine camera alone does not show the shift along its viewing direction: that
-    is left at zero, and its variance is zero.  `bic` is the Bayesian information criterion of each hypothesis; the smallest
-    is chosen.
+    `moved` is "none", "shifted" (together, without turning), "together", "left", "right" or "apart".  `left` and `right` are
+    the motions of the cameras, None for one that stayed.  An affine camera alone does not show the shift along its viewing
+    direction: that is left at zero, and so is its variance.  `bic` is the information criterion of each hypothesis.
     """
 
     rig: StereoRig

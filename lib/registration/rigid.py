@@ -14,12 +14,10 @@ _ITERATIONS = 300
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """An estimated rigid motion and its uncertainty.
+    """An estimated rigid motion `transform`, target_from_source, and its uncertainty.
 
-    `transform` is target_from_source: the motion of the cameras in robot coordinates, if the source is what the stale
-    rig sees.  `covariance` (6, 6) is that of a small error of the transform, (rotation omega in rad, translation tau in
-    mm), both in the target frame and about `centre_mm` (3,), the centre of the data: a registered point p is off by
-    omega x (p - centre) + tau.  About the centre rotation and translation are nearly independent.
+    `covariance` (6, 6) is that of a small error (rotation omega in rad, translation tau in mm) in the target frame: a
+    registered point p is off by omega x (p - centre_mm) + tau, where `centre_mm` (3,) is the centre of the data.
 
     `residuals` (n,) has the norm of each row in mm (`register`) or its Mahalanobis distance (`register_images`), NaN
     where it was not used.  `weights` (n,) says what each row counted in the last step, 1 = fully.  `cost` is the minimum
@@ -46,10 +44,8 @@ class Registration:
 
 def motion_jacobian(offset: np.ndarray) -> np.ndarray:
     """(n, 3, 6): how points at `offset` (n, 3) from the centre of rotation move with (omega, tau)."""
-    jacobian = np.broadcast_to(np.eye(3, 6, 3), (len(offset), 3, 6)).copy()
-    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        jacobian[:, i, j], jacobian[:, j, i] = offset[:, k], -offset[:, k]
-    return jacobian
+    turned = np.cross(np.eye(3), offset[:, None]).mT
+    return np.concatenate([turned, np.broadcast_to(np.eye(3), turned.shape)], axis=2)
 
 
 def check_spread(x: np.ndarray, name: str) -> None:
@@ -69,10 +65,8 @@ def register(x_source: ArrayLike, x_target: ArrayLike, *, loss: Literal["norm", 
         loss: "norm" minimises sum |R x + t - y|, Eq. (7) as printed: robust, solved by iteratively reweighted least
             squares from several starts.  "squared" minimises the sum of squares, in closed form (Kabsch 1976).
 
-    Returns:
-        Registration: With the sandwich covariance of an M-estimator (Huber 1967).  It assumes neither Gaussian nor
-            isotropic noise but many points: below about ten it says little.  Standard deviations of the norm are good
-            to about 30 %.
+    The covariance is the sandwich of an M-estimator (Huber 1967).  It assumes neither Gaussian nor isotropic noise but many
+    points: below about ten it says little.  Standard deviations of the norm are good to about 30 %.
 
     Raises:
         ValueError: For rows that do not pair up, NaN, fewer than three points, or points on a line.

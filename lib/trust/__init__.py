@@ -1,10 +1,9 @@
 """May the numbers of a recording be believed?  Verdicts, diagnoses, the detector's health, and the check of a recording."""
 
-from lib.trust.assessment import Assessment, assess, report
-from lib.trust.case import Hypothesis
 from lib.trust.diagnosis import Diagnosis, diagnose
+from lib.trust.fitting import Hypothesis
 from lib.trust.health import Health, health
-from lib.trust.verdict import LEVELS, Reason, Verdict, judge
+from lib.trust.verdict import LEVELS, Assessment, Reason, Verdict, assess, judge, report
 
 __all__ = [
     "LEVELS", "Assessment", "Diagnosis", "Health", "Hypothesis", "Reason", "Verdict", "assess", "diagnose", "health", "judge",

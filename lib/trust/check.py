@@ -17,9 +17,8 @@ from lib.correspondences import LANDMARK_COLOURS, LANDMARKS, of_recording
 from lib.landmarks import Detector, SharedDetector, detect
 from lib.provenance import plain
 from lib.recordings import Recording, StereoFrame
-from lib.trust.assessment import Assessment, assess, report
 from lib.trust.health import spread
-from lib.trust.verdict import LEVELS
+from lib.trust.verdict import LEVELS, Assessment, assess, report
 
 _COLOURS = np.array([*LANDMARK_COLOURS.values()])
 _SHOWN = 3  # best frames, and worst
@@ -29,13 +28,7 @@ _SHOWN_PX = 760  # width of one image of an overlay
 
 @dataclass(frozen=True, eq=False)
 class Check:
-    """What `check` found.
-
-    Attributes:
-        recording, assessment: What was checked, and its verdict.
-        facts: Question -> answer in words: what is in the folder, clock, read-out, order of the tips, offsets, detector.
-        next_step: What to do now.
-    """
+    """What `check` found; `facts` answer in words: what is in the folder, clock, read-out, order of the tips, detector."""
 
     recording: Recording
     assessment: Assessment
@@ -76,7 +69,7 @@ class Check:
         for place, i in enumerate(chosen):
             number, score = int(health.frame[i]), health.score[i]
             rows = data.of_frames(number)
-            seen = np.where(rows.seen.T[:, :, None], np.stack([rows.u_left, rows.u_right]), np.nan)
+            seen = rows.stacked_px.reshape(-1, 2, 2).swapaxes(0, 1)
             told = None if c is None else np.stack(c.pair.project(rows.x_mm))
             picture = data_uri(overlay(self.recording.frames[number], seen, told), ".jpg")
             parts = {name: part[i].max() for name, part in health.parts.items() if np.isfinite(part[i]).any()}
@@ -110,14 +103,9 @@ class Check:
 
 
 def check(recording: str | Path | Recording, *, detector: Callable | None = None) -> Check:
-    """Detect, calibrate, diagnose and judge a recording; its truth is never opened.
+    """Detect (by the detector that ships, if none is given), calibrate, diagnose and judge a recording.
 
-    Args:
-        recording: Its folder, or the recording.
-        detector: None is the one that ships.
-
-    Raises:
-        FileNotFoundError, ValueError: If the folder is no recording that can be read.
+    The truth of a recording given by its folder is never opened.  A FileNotFoundError or ValueError if it cannot be read.
     """
     found = recording if isinstance(recording, Recording) else Recording.open(recording, truth=False)
     if found.skeleton == LANDMARKS:

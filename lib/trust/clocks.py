@@ -6,8 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from lib.calibration.timing import shift_misfits
-from lib.trust.case import SIDES, Case, Hypothesis
-from lib.trust.fitting import Problem, Robust
+from lib.trust.fitting import SIDES, Case, Hypothesis, Problem, Robust
 
 #: Frame rates by which a wrong one may be stated, as ratios; -1 is time backwards.
 _RATES = (-1.0, 0.5, 24 / 30, 25 / 30, 24 / 25, 25 / 24, 30 / 25, 30 / 24, 2.0)

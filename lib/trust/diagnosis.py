@@ -6,15 +6,15 @@ likelihood, less a penalty for its parameters (BIC), is its evidence.
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import permutations
 
 import numpy as np
 
 from lib.calibration.checks import eyes_exchanged, sides
 from lib.correspondences import LANDMARKS, TRAIN_FURTHER, Correspondences
 from lib.recordings import Kinematics
-from lib.trust.case import SIDES, Case, Hypothesis
 from lib.trust.clocks import TIME_TESTS
-from lib.trust.fitting import Problem, Robust
+from lib.trust.fitting import SIDES, Case, Hypothesis, Problem, Robust
 from lib.trust.health import affine_epipolar
 
 #: Least gain and least share explained of a hypothesis that is named.
@@ -35,10 +35,8 @@ def _tip_order(case: Case) -> Iterator[Hypothesis]:
     if problem.landmark.max() != 2:
         return
     table = case.by_frame(problem.x[:, 0])
-    for order, views in (
-        ((0, 2, 1), (0, 1)), ((0, 2, 1), (0,)), ((0, 2, 1), (1,)), ((1, 0, 2), (0, 1)), ((2, 1, 0), (0, 1)),
-        ((1, 2, 0), (0, 1)), ((2, 0, 1), (0, 1)),
-    ):  # fmt: skip
+    others = [(order, (0, 1)) for order in permutations(range(3)) if order != (0, 1, 2)]
+    for order, views in (*others, ((0, 2, 1), (0,)), ((0, 2, 1), (1,))):
         x = problem.x.copy()
         x[:, list(views)] = table[problem.frame, np.array(order)[problem.landmark]][:, None]
         moved = replace(problem, x=x)

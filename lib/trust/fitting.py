@@ -1,12 +1,11 @@
-"""Affine cameras under heavy-tailed noise, with additions: what a hypothesis about a recording's fault needs.
+"""A hypothesis about a recording's fault: affine cameras and additions, fitted under heavy-tailed noise, and its evidence.
 
 Each image's residual of a row has a bivariate Student t density whose scale and degrees of freedom are fitted too, so that
-30 % of wrong landmarks hide nothing, and a hypothesis is compared with "nothing is wrong" by the likelihood.  Landmarks
-may have constant offsets in the tool's axes, with a prior, because detectors do.
+30 % of wrong landmarks hide nothing.  Landmarks may have constant offsets in the tool's axes, with a prior.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Self
 
@@ -15,13 +14,18 @@ import numpy as np
 from lib.calibration.affine import regress
 from lib.calibration.offsets import rows_axes
 from lib.calibration.robust import tightest_sample
+from lib.calibration.timing import Paths
 from lib.correspondences import Correspondences
+from lib.recordings import Kinematics
 
+SIDES = ("left", "right")
 #: Degrees of freedom tried; bivariate Cauchy to nearly Gaussian.
 _FREEDOM = np.array([0.7, 1.0, 2.0, 4.0, 10.0, 100.0])
 _LEAST_PX = 0.02  # smaller residuals are rounding
 _OFFSET_SD_MM = 0.03  # of what a detector marks beside a landmark
 _BLOCK = 8  # frames over which residuals may be correlated
+_LONGEST_S = 0.25  # between frames, whose own positions stand for the robot's log
+_PARAMETERS = 20  # of two affine cameras, and about as many of the nine offsets as data tell
 
 
 @dataclass(frozen=True)
@@ -56,24 +60,19 @@ class Shape:
 
 @dataclass(frozen=True, eq=False)
 class Robust:
-    """A fit: cameras M (2, 2, 4) on centred positions, additions theta (k,) with covariance, `offsets` and
-    `offset_sd` of the landmarks (3, 3) and (3,) mm, residuals (n, 2, 2) px.
+    """The fit of a problem."""
 
-    `likelihood` (n, 2) is the log density of each image's residual, 0 where it is not seen, `penalty` that of the offsets'
-    prior; `design` is by how much correlated rows overstate what they tell.
-    """
-
-    M: np.ndarray
-    theta: np.ndarray
+    M: np.ndarray  # (2, 2, 4) cameras on centred positions
+    theta: np.ndarray  # (k,) additions, and their covariance
     covariance: np.ndarray
-    offsets: np.ndarray
+    offsets: np.ndarray  # (3, 3) mm of the landmarks, and (3,) their deviations
     offset_sd: np.ndarray
     camera_covariance: np.ndarray
-    residuals: np.ndarray
+    residuals: np.ndarray  # (n, 2, 2) px
     shapes: tuple[Shape, ...]
-    likelihood: np.ndarray
-    penalty: float
-    design: float
+    likelihood: np.ndarray  # (n, 2) log density of each image's residual, 0 where it is not seen
+    penalty: float  # the same of the offsets' prior
+    design: float  # by how much correlated rows overstate what they tell
 
     @property
     def total(self) -> float:
@@ -83,27 +82,18 @@ class Robust:
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """Rows of a recording as the fits take them.
+    """Rows of a recording as the fits take them."""
 
-    Attributes:
-        x: (n, 2, 3) mm, the robot's position for the left and for the right image, about `centre`.
-        y, seen: (n, 2, 2) px and (n, 2) bool.
-        noise: (n, 2) relative noise, from the detector's covariances; 1 on average.
-        axes: (n, 3, 3) of the tool, 0 where unknown.
-        frame, landmark, time: (n,); frames are counted from 0 in their order.
-        offset_sd: Of the landmarks' offsets before the data, mm.
-    """
-
-    x: np.ndarray
-    y: np.ndarray
-    seen: np.ndarray
-    noise: np.ndarray
-    axes: np.ndarray
-    frame: np.ndarray
+    x: np.ndarray  # (n, 2, 3) mm, the robot's position for the left and for the right image, about `centre`
+    y: np.ndarray  # (n, 2, 2) px
+    seen: np.ndarray  # (n, 2) bool
+    noise: np.ndarray  # (n, 2) relative, from the detector's covariances; 1 on average
+    axes: np.ndarray  # (n, 3, 3) of the tool, 0 where unknown
+    frame: np.ndarray  # (n,) counted from 0 in their order
     landmark: np.ndarray
     time: np.ndarray
     centre: np.ndarray
-    offset_sd: float = _OFFSET_SD_MM
+    offset_sd: float = _OFFSET_SD_MM  # of the landmarks, before the data
 
     @classmethod
     def of(cls, data: Correspondences) -> Self:
@@ -133,12 +123,10 @@ class Problem:
         self, columns: Callable[[np.ndarray], np.ndarray] | None = None, *, start: np.ndarray | None = None,
         apart: np.ndarray | None = None, rounds: int = 40,
     ) -> Robust:  # fmt: skip
-        """Most probable cameras, offsets and additions.
+        """Most probable cameras, offsets and additions, near the cameras `start` or the best sample of four rows.
 
-        Args:
-            columns: Cameras M -> (n, 2, 2, k): change of the pixels by each addition.
-            start: Cameras to start from; None searches samples of four rows.
-            apart: (n,) bool: rows with a noise of their own.
+        `columns` gives the change of the pixels by each addition, cameras M -> (n, 2, 2, k); the rows `apart` (n,) bool have
+        a noise of their own.
         """
         apart = np.zeros(len(self), dtype=bool) if apart is None else apart
         if start is None:
@@ -157,12 +145,10 @@ class Problem:
 
     def _design(self, M: np.ndarray, columns: Callable | None) -> np.ndarray:
         """(n, 2, 2, p): derivatives by the 16 entries of M, 9 offsets (mm) and the additions."""
-        n = len(self)
-        D = np.zeros((n, 2, 2, 25))
-        for view in range(2):
-            for j in range(2):
-                first = 8 * view + 4 * j
-                D[:, view, j, first : first + 3], D[:, view, j, first + 3] = self.x[:, view], 1.0
+        D = np.zeros((len(self), 2, 2, 25))
+        for view, j in np.ndindex(2, 2):
+            first = 8 * view + 4 * j
+            D[:, view, j, first : first + 3], D[:, view, j, first + 3] = self.x[:, view], 1.0
         image = np.einsum("cij,njk->ncik", M[:, :, :3], self.axes)
         for k in range(3):
             D[:, :, :, 16 + 3 * k : 19 + 3 * k] = image * (self.landmark == k)[:, None, None, None]
@@ -220,3 +206,101 @@ class Problem:
         sums = np.zeros((int(stretch.max(initial=0)) + 1, 2))
         np.add.at(sums, stretch, z.sum(axis=1))
         return float(max(1.0, ((sums**2).sum(axis=0) / np.maximum((z**2).sum(axis=(0, 1)), 1e-300)).mean()))
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A possible fault: what the residuals look like, the setting or call that mends it, and its size."""
+
+    name: str
+    text: str
+    cure: str
+    value: float
+    sd: float
+    unit: str
+    explained: float  # share of the residuals' variance, 0 to 1 (robustly, from the likelihood)
+    gain: float  # log likelihood above "nothing is wrong", less the penalty for its parameters
+
+
+class Case:
+    """The rows, the fit `null` of "nothing is wrong", the best fit of each hypothesis, and what the hypotheses share.
+
+    `paths` are those of the landmarks in time: of the robot's log, else of the rows themselves where the frames follow each
+    other closely enough, else None.  `size` is (width, height) of the images, None if unknown; `frames` their number.
+    """
+
+    def __init__(
+        self, problem: Problem, kinematics: Kinematics | None, offset_s: float, readout_s: float, size: tuple[int, int] | None
+    ) -> None:
+        self.problem, self.readout_s, self.size = problem, readout_s, size
+        self.null, self.fits = problem.fit(), {}
+        self.frames = int(problem.frame.max()) + 1
+        self.paths, self._clock_s = None, offset_s
+        time, landmark, x = problem.time, problem.landmark, problem.x[:, 0]
+        if not np.isfinite(time).all():
+            return
+        if kinematics is not None and landmark.max() < kinematics.x_mm.shape[1]:
+            log = np.swapaxes(kinematics.x_mm, 0, 1) - problem.centre
+            self.paths = Paths((kinematics.time_s, own) for own in log)
+        if self.paths is None or not all(self.paths.pieces):
+            each = [np.flatnonzero(landmark == k) for k in range(int(landmark.max()) + 1)]
+            each = [rows[np.unique(time[rows], return_index=True)[1]] for rows in each]
+            steps = np.concatenate([np.diff(time[rows]) for rows in each])
+            near = steps.size and np.median(steps) <= _LONGEST_S
+            self.paths, self._clock_s = Paths((time[rows], x[rows]) for rows in each) if near else None, 0.0
+
+    def moved(self, shift_s: float | np.ndarray) -> np.ndarray:
+        """(n, 3) mm: the positions of the rows as they were `shift_s` later; NaN where nothing tells."""
+        now = self.problem.time + self._clock_s
+        landmark = self.problem.landmark
+        return self.problem.x[:, 0] + self.paths.at(landmark, now + shift_s) - self.paths.at(landmark, now)
+
+    def velocity(self, shift_s: float | np.ndarray = 0.0) -> np.ndarray:
+        """(n, 3) mm/s of the rows, `shift_s` later."""
+        return self.paths.at(self.problem.landmark, self.problem.time + self._clock_s + shift_s, 1)
+
+    def by_frame(self, values: np.ndarray) -> np.ndarray:
+        """Values (n, ...) of the rows as (frames, 3, ...), NaN where a landmark is missing."""
+        table, rows = np.full((self.frames, 3, *values.shape[1:]), np.nan), self.problem.landmark <= 2
+        table[self.problem.frame[rows], self.problem.landmark[rows]] = values[rows]
+        return table
+
+    def chosen(self, x: np.ndarray) -> tuple[Robust, Problem, np.ndarray]:
+        """Each frame with the positions among x (t, n, 3) that suit it best: the fit, its rows, the choices (frames,)."""
+        problem, fit = self.problem, self.null
+        for _ in range(5):
+            r2 = ((problem.y - np.einsum("cij,tnj->tnci", fit.M[:, :, :3], x) - fit.M[:, :, 3]) ** 2).sum(axis=3)
+            loss = np.where(problem.used, np.nan_to_num(np.log1p(r2 / fit.shapes[0].scale ** 2), nan=1e3), 0.0).sum(axis=2)
+            own = np.array([np.bincount(problem.frame, row, self.frames) for row in loss]).argmin(axis=0)
+            moved = replace(problem, x=np.repeat(x[own[problem.frame], np.arange(len(problem))][:, None], 2, axis=1))
+            fit = moved.fit(start=fit.M, rounds=10)
+        return fit, moved, own
+
+    def linear(
+        self, columns: np.ndarray | Callable[[np.ndarray], np.ndarray], on: Problem | None = None
+    ) -> tuple[Robust, float, float]:
+        """The fit with `columns` (n, 2, 2, k) added to the pixels (or cameras -> columns): length and sd of the additions."""
+        fit = (on or self.problem).fit(columns if callable(columns) else lambda M: columns, start=self.null.M)
+        length = float(np.linalg.norm(fit.theta))
+        return fit, float(fit.theta[0]) if fit.theta.size == 1 else length, float(np.sqrt(np.trace(fit.covariance)))
+
+    def found(
+        self, name: str, fit: Robust, extra: float, size: tuple[float, float, str], text: str, cure: str, *,
+        on: Problem | None = None, raw: float | None = None,
+    ) -> Hypothesis:  # fmt: skip
+        """With the evidence of its fit, which has `extra` parameters more than "nothing is wrong" on the rows of `on`."""
+        null = self.null
+        if on is not None and (on.used != self.problem.used).any():
+            null = replace(self.problem, seen=on.used).fit(start=null.M)
+        raw = fit.total - null.total if raw is None else raw
+        n = 2.0 * (fit.likelihood != 0).sum()
+        # Of few rows any addition explains much: what chance gains, by the degrees of freedom, is taken off.
+        freedom = n / fit.design - _PARAMETERS
+        left, gain = freedom - extra, -np.inf
+        if left >= 4:
+            gain = left * (raw / n - 0.5 * np.log(freedom / left)) - 0.5 * extra * np.log(freedom)
+        if name not in self.fits or fit.total > self.fits[name].total:
+            self.fits[name] = fit
+        value, sd, unit = size
+        explained = 1.0 - np.exp(-2.0 * max(raw, 0.0) / n)
+        return Hypothesis(name, text, cure, float(value), float(sd), unit, float(explained), float(gain))

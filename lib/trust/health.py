@@ -1,8 +1,7 @@
 """The health of the detector without labels: where what it found contradicts itself, the other image or the robot.
 
-Each part is one number a landmark and frame, divided by its limit.  A network that does not know a picture answers anew when
-the picture is mirrored or shifted; one that knows it answers the same.  And pictures whose colours and details are unlike
-those of the training are unfamiliar, whatever the answer.
+A network that does not know a picture answers anew when the picture is mirrored or shifted; one that knows it answers the
+same.  And pictures whose colours and details are unlike those of the training are unfamiliar, whatever the answer.
 """
 
 import warnings
@@ -51,12 +50,10 @@ class Health:
     """What contradicts itself, for each landmark, and one number a frame.
 
     Attributes:
-        frame: (m,) numbers of the frames.
+        frame, seen: (m,) numbers of the frames, and (m, 3) bool: found in one image or both.
         parts: Name -> (m, 3) in units of its limit, the worse of the two images; NaN where a landmark does not have it.
-        seen: (m, 3) bool: found in one image or both.
         false_alarm_rate: Upper bound of the share of frames with right landmarks (all within 5 % of the tool's length) whose
-            score exceeds 1: 3 of 35 frames of three simulated recordings of the validation population without `unfamiliar`,
-            and the 2 % that this may add.
+            score exceeds 1: 3 of 35 frames of the validation population without `unfamiliar`, and the 2 % that this may add.
     """
 
     frame: np.ndarray
@@ -94,16 +91,10 @@ def health(
     recording: Recording | None, data: Correspondences, calibration: Calibration | None = None, *,
     detector: Callable | None = None,
 ) -> Health:  # fmt: skip
-    """Compare what the detector found with everything that is known without labels.
+    """Compare what the detector found, `data`, with everything that is known without labels; ValueError if it found no row.
 
-    Args:
-        data: Of `lib.landmarks.detect`, all frames or some.
-        calibration: Made from `data`; None leaves out what needs cameras.
-        recording: None leaves out what needs its pictures.
-        detector: Looks again at some frames, mirrored and shifted; None leaves that out.
-
-    Raises:
-        ValueError: If `data` holds no row.
+    The calibration is made from `data`, and the detector looks again at some frames, mirrored and shifted.  Without
+    recording, calibration or detector, what needs it is left out.
     """
     if not len(data):
         raise ValueError("data: no row; run the detector over some frames.")
@@ -113,21 +104,19 @@ def health(
     with warnings.catch_warnings(action="ignore"):  # means of what no frame shows
         length = np.nanmedian(np.linalg.norm(u[:, 1:] - u[:, :1], axis=-1))
         time = np.nanmean(data.grid("time_s"), axis=1)
-    shape = u.shape[:3]
-    distance = affine_epipolar(np.concatenate([u[:, :, 0], u[:, :, 1]], axis=2).reshape(-1, 4))[0].reshape(shape[:2])
-    parts = {"epipolar": distance / length}
+    shape, y = u.shape[:2], u.reshape(-1, 4)
+    parts = {"epipolar": affine_epipolar(y)[0].reshape(shape) / length}
     if calibration is not None and calibration.rig is not None:
         rig, x = calibration.rig, with_offsets(data, calibration.offsets).grid("x_mm")
-        told = np.stack([camera.project(x.reshape(-1, 3)) for camera in (rig.left, rig.right)], axis=1).reshape(u.shape)
-        off = u - told
+        off = u - np.hstack(rig.project(x.reshape(-1, 3))).reshape(u.shape)
         parts["robot"] = _worse(off) / max(calibration.reprojection_rms_px, 1.0)
         parts["smoothness"] = _worse(_jump_px(off, time)) / length
-        seen = rig.triangulate(u[:, :, 0].reshape(-1, 2), u[:, :, 1].reshape(-1, 2)).x_mm.reshape(x.shape)
-        parts["shape"] = np.repeat(np.abs(_tool_length(seen) / _tool_length(x) - 1.0)[:, None], shape[1], axis=1)
+        seen = rig.triangulate(y[:, :2], y[:, 2:]).x_mm.reshape(x.shape)
+        parts["shape"] = np.broadcast_to(np.abs(_tool_length(seen) / _tool_length(x) - 1.0)[:, None], shape)
     if detector is not None:
         parts["looks"] = np.fmax.reduce(_looks_px(recording, frame, u, detector), axis=2) / length
     if recording is not None:
-        parts["unfamiliar"] = np.full(shape[:2], np.nan)
+        parts["unfamiliar"] = np.full(shape, np.nan)
         for i in spread(len(frame), _PICTURES):
             parts["unfamiliar"][i] = unfamiliar(recording.frames[int(frame[i])].left)
     return Health(frame, {n: parts[n] / LIMITS[n] for n in LIMITS if n in parts}, np.isfinite(u[..., 0]).any(axis=2))
