@@ -2,7 +2,6 @@
 
 import argparse
 import contextlib
-import resource
 import sys
 import time
 from collections import Counter, deque
@@ -38,15 +37,24 @@ class Tally:
     def __str__(self) -> str:
         n, spent, cpu = self.states.total(), time.monotonic() - self.start, time.process_time() - self.cpu_start
         median, late = 1e3 * np.quantile(self.latency_s or [np.nan], (0.5, 0.99))
-        memory_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
         states = ", ".join(f"{state} {n}" for state, n in self.states.most_common())
         failures = ", ".join(f"{name} {n}" for name, n in self.failures.most_common()) or "none"
         return (
             f"{n} frames in {spent:.1f} s, {n / spent:.1f} a second; processor {cpu / max(n, 1):.3f} s a frame\n"
             f"{self.surfaces} surfaces, {self.surfaces / spent:.1f} a second; {self.dropped} dropped\n"
             f"latency from frame to distance: {median:.0f} ms median, {late:.0f} ms 99th percentile\n"
-            f"states: {states}\nfailures: {failures}\nmemory: at most {memory_mb:.0f} MB"
+            f"states: {states}\nfailures: {failures}{_memory()}"
         )
+
+
+def _memory() -> str:
+    """A line about the most memory that this process has held; none on Windows, which does not tell."""
+    try:
+        import resource
+    except ImportError:
+        return ""
+    unit = 2**20 if sys.platform == "darwin" else 2**10
+    return f"\nmemory: at most {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit:.0f} MB"
 
 
 def main(argv: list[str] | None = None) -> int:
