@@ -49,6 +49,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
     settings.register_profile("microstereo", derandomize=True, deadline=None, max_examples=50, database=None)
     settings.load_profile("microstereo")
+    gc.disable()  # until all is imported
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
@@ -67,8 +68,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 def pytest_collection_finish(session: pytest.Session) -> None:
     """What was imported stays: the garbage collector need not look through it again and again."""
-    gc.collect()
     gc.freeze()
+    gc.enable()
 
 
 @pytest.hookimpl(optionalhook=True)
