@@ -2,32 +2,34 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import shutil
 from pathlib import Path
 
-for _variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+for _variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"):
     os.environ.setdefault(_variable, "1")  # before numpy and torch are imported; every core has tests of its own
 os.environ.setdefault("MPLBACKEND", "Agg")
 os.environ.setdefault("OPEN3D_DISABLE_WEB_VISUALIZER", "true")
 os.fsync = lambda file: None  # what tests write need not outlast a crash of the machine
 
-import hypothesis
 import pytest
 
 import lib.workbench  # noqa: F401 - before nbformat: it spares each process seconds
 
 TESTS = Path(__file__).parent
-#: The files that take longest, from about 25 to 4 s of the processor: they go first, so that no worker begins one last.
+#: The files that take longest, from about 25 to 3 s of the processor: they go first, so that no worker begins one last.
 LONGEST = (
     "adapt/test_adapt.py", "landmarks/test_shipped.py", "training/test_loop.py", "online/test_faults.py",
-    "test_notebooks_course.py", "workbench/test_run.py", "simulator/test_dataset.py", "calibration/test_estimate.py",
-    "test_notebooks.py", "online/test_pipeline.py", "studies/test_calibration.py", "matching/test_stereo_pairs.py",
-    "test_readme.py", "landmarks/test_export.py", "studies/test_registration.py", "importing/test_import.py",
-    "calibration/test_robust.py", "landmarks/test_detector.py", "surface/test_reconstruct.py", "test_commands.py",
-    "training/test_error_models.py", "trust/test_diagnosis.py", "online/test_beside.py", "matching/test_match.py",
-    "calibration/test_instruments.py", "workbench/test_sweep.py", "simulator/test_geometry_of_images.py",
-    "registration/test_registration.py", "surface/test_fitting.py", "training/test_command.py",
+    "test_notebooks_course.py", "calibration/test_estimate.py", "workbench/test_run.py", "online/test_pipeline.py",
+    "test_notebooks.py", "calibration/test_robust.py", "simulator/test_dataset.py", "test_commands.py",
+    "importing/test_import.py", "surface/test_reconstruct.py", "trust/test_diagnosis.py", "trust/test_verdict.py",
+    "registration/test_registration.py", "matching/test_match.py", "studies/test_calibration.py", "trust/test_check.py",
+    "surface/test_fitting.py", "simulator/test_geometry_of_images.py", "online/test_beside.py", "workbench/test_sweep.py",
+    "studies/test_trust.py", "landmarks/test_detector.py", "training/test_command.py", "matching/test_deepmatching.py",
+    "calibration/test_instruments.py", "calibration/test_offsets.py", "simulator/test_population.py", "test_house.py",
+    "online/test_record.py", "test_parallel.py", "simulator/test_recordings_made.py", "landmarks/test_engines.py",
+    "matching/test_stereo_pairs.py",
 )  # fmt: skip
 #: File -> the file whose worker runs it too: what takes seconds to make for one is there for the other.
 TOGETHER = {"tests/training/test_error_models.py": "tests/training/test_loop.py"} | dict.fromkeys(  # a trained network
@@ -35,12 +37,19 @@ TOGETHER = {"tests/training/test_error_models.py": "tests/training/test_loop.py"
      "lib/landmarks/detector.py"), "tests/landmarks/test_shipped.py",  # the detector that ships, compiled
 )  # fmt: skip
 
-hypothesis.settings.register_profile("microstereo", derandomize=True, deadline=None, max_examples=50, database=None)
-hypothesis.settings.load_profile("microstereo")
-
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--slow", action="store_true", help="also run the tests marked slow")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    if not hasattr(config, "workerinput") and config.getoption("numprocesses", None):
+        return  # the workers, which wait for this process, run the tests
+    from hypothesis import settings
+
+    settings.register_profile("microstereo", derandomize=True, deadline=None, max_examples=50, database=None)
+    settings.load_profile("microstereo")
+    gc.disable()  # until all is imported
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
@@ -55,6 +64,12 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             item.add_marker(pytest.mark.skip(reason="slow: give --slow"))
         if "cuda" in item.keywords and not cuda:
             item.add_marker(pytest.mark.skip(reason="no NVIDIA GPU"))
+
+
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """What was imported stays: the garbage collector need not look through it again and again."""
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -225,6 +225,7 @@ class Run:
                 names |= {"recording": str(recording)} | parameters
 
     def show(self, page, name, caption):
+        page.set_dpi(30)  # pixels take time, and nobody looks at them
         page.canvas.draw()
         plt.close(page)
         self.captions.append(caption)

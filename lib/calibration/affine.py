@@ -129,7 +129,7 @@ def estimate_noise(
         new = np.where(free, least, v)
         target, scale = (observed - design @ new) * root, design[:, free].max(axis=0)
         new[free] += nnls(design[:, free] / scale * root[:, None], target)[0] / scale
-        if np.allclose(new, v, rtol=1e-10, atol=0.0):
+        if (np.abs(new - v) <= 1e-10 * v).all():
             break
         v = new
     return float(unit * np.sqrt(new[0])), float(np.sqrt(new[1]))

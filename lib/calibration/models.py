@@ -19,7 +19,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from lib.cameras import AffineCamera, Camera, NearAffineCamera, normal_to, radial_derivative
@@ -28,6 +27,7 @@ from lib.least_squares import minimise
 
 BASES = ("affine", "zero_skew", "square", "common_zoom")
 OPTIONS = ("distance", "distances", "radial")
+_CROSS = np.cross(np.eye(3)[:, None], np.eye(3))  # of every two unit vectors
 
 
 @dataclass(frozen=True)
@@ -112,12 +112,12 @@ class State:
             A = np.mean(zoom, axis=tied, keepdims=True)[:, :, None] * (left @ right)
         return cls(model, A, offset, zeros, zeros, reference, centre)
 
-    @property
+    @cached_property
     def zoom(self) -> np.ndarray:
         """(cameras, 2) px/mm, of bases other than affine."""
         return np.linalg.norm(self.A, axis=2)
 
-    @property
+    @cached_property
     def rotation(self) -> np.ndarray:
         """(cameras, 3, 3), of bases other than affine: A = diag(zoom) rotation[:2]."""
         rows = self.A / self.zoom[:, :, None]
@@ -143,9 +143,10 @@ class State:
     def evaluate(self, x_mm: np.ndarray, *, derivatives: bool = True) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Pixels y (n, m) of points (n, 3) mm, dy/dx (n, m, 3) and the derivatives by the model's parameters (n, m, p)."""
         x, n, c = x_mm - self.reference, len(x_mm), len(self.A)
-        if not (derivatives or self.rho.any() or self.radial.any()):
-            A = self.A.reshape(-1, 3)
-            return x @ A.T + self.offset.ravel(), np.tile(A, (n, 1, 1)), np.empty((n, 2 * c, 0))
+        if not (self.rho.any() or self.radial.any() or (derivatives and not self.model.is_affine)):
+            A, D = self.A.reshape(-1, 3), self._linear() if derivatives else np.empty((2 * c, 4, 0))
+            J_c = np.tensordot(np.column_stack([x, np.ones(n)]), D, axes=(1, 1))
+            return x @ A.T + self.offset.ravel(), np.tile(A, (n, 1, 1)), J_c
         k = len(self.model.selection) // c
         y, J_x, J_c = np.empty((n, 2 * c)), np.empty((n, 2 * c, 3)), np.zeros((n, 2 * c, k * c))
         for i in range(c):
@@ -179,21 +180,26 @@ class State:
         if self.model.base == "affine":
             return np.eye(6).reshape(2, 3, 6)
         result = np.zeros((2, 3, 5))
-        turned = np.cross(np.eye(3)[:, None], self.rotation[i].T).T  # a left increment turns R by delta x R
+        # A left increment turns R by delta x R.
+        turned = np.einsum("jkr,ks->rsj", _CROSS, self.rotation[i])
         result[:, :, :3] = self.zoom[i][:, None, None] * turned[:2]
         result[0, :, 3], result[1, :, 4] = self.A[i]
         return result
 
+    def _linear(self) -> np.ndarray:
+        """Derivatives of the matrices [A, o] about the reference point by the model's parameters, (2 cameras, 4, p)."""
+        c = len(self.A)
+        result = np.zeros((c, 2, 4, c, len(self.model.selection) // c))
+        for i in range(c):
+            result[i, :, :3, i, :-4] = self._entries(i)
+            result[i, :, 3, i, -4:-2] = np.eye(2)
+        return result.reshape(2 * c, 4, -1) @ self.model.selection
+
     def matrix_jacobian(self) -> np.ndarray:
         """Derivatives of the matrices' entries (8 a camera, row by row, left first) by the model's parameters."""
-        blocks = []
-        for i in range(len(self.A)):
-            entries = self._entries(i)
-            block = np.zeros((2, 4, entries.shape[2] + 4))
-            block[:, :3, :-4], block[:, 3, :-4] = entries, -self.reference @ entries
-            block[:, 3, -4:-2] = np.eye(2)
-            blocks.append(block.reshape(8, -1))
-        return block_diag(*blocks) @ self.model.selection
+        result = self._linear()
+        result[:, 3] -= self.reference @ result[:, :3]
+        return result.reshape(-1, result.shape[2])
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,9 +244,10 @@ def fit(start: State, x: np.ndarray, y: np.ndarray, noise: np.ndarray, variance_
 
     def evaluate(state: State) -> tuple[float, tuple] | None:
         for A, rho in zip(state.A, state.rho, strict=True):
-            normal = normal_to(A)
-            if rho and (1.0 + rho * ((x - state.reference) @ normal) / np.linalg.norm(normal)).min() <= 0.05:
-                return None  # a point lies behind the camera
+            if rho:
+                normal = normal_to(A)
+                if (1.0 + rho * ((x - state.reference) @ normal) / np.linalg.norm(normal)).min() <= 0.05:
+                    return None  # a point lies behind the camera
         cost, *work = settle(state, x, y, noise, variance_x, views)
         return (cost, work) if np.isfinite(cost) else None
 

@@ -55,8 +55,7 @@ def rows_axes(data: Correspondences, offset_mm: np.ndarray | None = None) -> np.
 
     Where the landmarks moved by `offset_mm`, of one to three landmarks, have no axes, those of the reported ones.
     """
-    rows = np.column_stack([data.frame, data.landmark])
-    if len(data) == 0 or data.landmark.max() > 2 or len(np.unique(rows, axis=0)) < len(rows):
+    if len(data) == 0 or data.landmark.max() > 2 or len(np.unique(3 * data.frame + data.landmark)) < len(data):
         return np.full((len(data), 3, 3), np.nan)
     x = data.grid("x_mm")
     axes = tool_axes(x)

@@ -199,11 +199,11 @@ def shift_misfits(x: np.ndarray, y: np.ndarray, least_share: float = 0.6) -> np.
         good = used.sum(axis=1) >= max(8, least_share * seen.sum())
         used = used[good]
         H = np.where(used[:, :, None], np.concatenate([x[good][:, seen], np.ones((*used.shape, 1))], axis=2), 0.0)
-        u, weight = u[seen], used.astype(float)
+        u, weight, median = u[seen], used.astype(float), np.median if used.all() else np.nanmedian  # which takes far longer
         for _ in range(10 if good.any() else 0):
             WH = (H * weight[:, :, None]).transpose(0, 2, 1)
             r2 = ((u - H @ (np.linalg.pinv(WH @ H, hermitian=True) @ (WH @ u))) ** 2).sum(axis=2)
-            s2 = np.maximum(np.nanmedian(np.where(used, r2, np.nan), axis=1, keepdims=True), 1e-4)
+            s2 = np.maximum(median(np.where(used, r2, np.nan), axis=1, keepdims=True), 1e-4)
             weight = np.where(used, 1.0 / (s2 + r2), 0.0)
             found[good, c] = np.log(s2[:, 0]) + 1.5 * np.average(np.log1p(r2 / s2), axis=1, weights=used)
     return found

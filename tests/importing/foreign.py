@@ -92,10 +92,11 @@ def side_by_side(folder: Path, source: Shipped) -> str:
 
 def images(folder: Path, source: Shipped) -> str:
     """Two folders of TIFF images, named by nanoseconds."""
+    plain = [cv2.IMWRITE_TIFF_COMPRESSION, cv2.IMWRITE_TIFF_COMPRESSION_NONE]
     for side, name in enumerate(("cam L", "cam R")):
         (folder / name).mkdir()
         for image, time in zip(source.frames[:, side], source.time_s, strict=True):
-            data = cv2.imencode(".tiff", image[..., ::-1])[1]
+            data = cv2.imencode(".tiff", image[..., ::-1], plain)[1]
             (folder / name / f"f_{round(1e9 * time):012d}.tiff").write_bytes(data.tobytes())
     return '[video]\nlayout = "two"\nleft = "cam L/*.tiff"\nright = "cam R/*.tiff"\ntimes = "names"\nname_unit = "ns"\n'
 
@@ -130,11 +131,11 @@ def robot_foreign_csv(folder: Path, source: Shipped) -> str:
 def robot_poses(folder: Path, source: Shipped) -> str:
     """Pose and gripper only, in micrometres, with dates in nanoseconds."""
     poses, opening, _ = posed(source)
+    turns = Rotation.from_matrix(np.stack([pose.R for pose in poses])).as_quat(scalar_first=True)
     with open(folder / "pose.tsv", "w", newline="") as file:
         writer = csv.writer(file, delimiter="\t")
         writer.writerow(["stamp_ns", "px", "py", "pz", "qw", "qx", "qy", "qz", "jaw_deg"])
-        for time, pose, angle in zip(source.robot_s, poses, opening, strict=True):
-            quaternion = Rotation.from_matrix(pose.R).as_quat(scalar_first=True)
+        for time, pose, quaternion, angle in zip(source.robot_s, poses, turns, opening, strict=True):
             numbers = [f"{v:.4f}" for v in 1e3 * pose.t] + [f"{v:.9f}" for v in (*quaternion, np.rad2deg(angle))]
             writer.writerow([1_700_000_000_000_000_000 + round(1e9 * time), *numbers])
     return POSES

@@ -250,6 +250,7 @@ def test_every_figure_draws(scene, result):
         figures.sparsification({"eye": {"score": (0.9, np.linspace(0, 0.1, 5))}}, np.linspace(0.2, 1, 5)),
     ]
     for page in pages:
+        page.set_dpi(30)  # pixels take time, and nobody looks at them
         page.canvas.draw()
         plt.close(page)
     from notebooks.figures import interactive
