@@ -31,10 +31,7 @@ def sequence_name(index: int) -> str:
 
 
 def sequence_design(seed: int, index: int, *, shrink: int = 1, duration_s: float = 60.0) -> Design:
-    """Eye, tool, microscope and clock of sequence `index` of the data set of this seed.
-
-    `shrink` makes images and texture this many times smaller.
-    """
+    """Eye, tool, microscope and clock of sequence `index` of the data set of this seed, its images `shrink` times smaller."""
     rng = np.random.default_rng([seed, 211, index])
     # Test sequences have eyes and tools that the training sampler never draws.
     if index in TEST_SEQUENCES:

@@ -13,7 +13,7 @@ import numpy as np
 from lib.cameras import AffineCamera
 from lib.geometry import RigidTransform
 from lib.simulator.eye import Eye, Ground
-from lib.simulator.families import ASPECTS, FAR, SHIFTED, TRAINING, beside, draw, random_object
+from lib.simulator.families import ASPECTS, FAR, SHIFTED, TRAINING, beside, draw, drawn, random_object
 from lib.simulator.forceps import Forceps, Instrument, Pose
 from lib.simulator.render import render_view
 from lib.simulator.rig import IMAGE_SIZE_PX, Microscope
@@ -42,7 +42,7 @@ def random_forceps(rng: Rng, seed: int | None = None) -> Forceps:
     low, high = RESERVED_JAW_MM
     length = rng.uniform(2.0, 4.0 - (high - low))
     return Forceps(
-        shaft_radius_mm=rng.uniform(0.22, 0.38), jaw_length_mm=float(length + (high - low) * (length >= low)),
+        shaft_radius_mm=rng.uniform(0.22, 0.38), jaw_length_mm=length + (high - low) * (length >= low),
         jaw_radius_mm=rng.uniform(0.07, 0.19), tip_radius_mm=rng.uniform(0.003, 0.006), taper=rng.uniform(0.5, 0.95),
         bow_mm=rng.uniform(0.02, 0.38), bend_mm=rng.uniform(-0.1, 0.35),
         hook_mm=rng.choice([0.0, 1.0]) * rng.uniform(0.02, 0.12),
@@ -53,10 +53,8 @@ def random_forceps(rng: Rng, seed: int | None = None) -> Forceps:
 
 def reserved_forceps(rng: Rng, seed: int) -> Forceps:
     """A design that training never draws; `seed`, one of `RESERVED_SEEDS`, makes its brush marks."""
-    return replace(
-        random_forceps(rng, seed), shaft_radius_mm=0.30, jaw_length_mm=float(rng.uniform(*RESERVED_JAW_MM)),
-        jaw_radius_mm=float(rng.uniform(0.10, 0.15)), brightness=float(rng.uniform(0.45, 0.65)),
-    )  # fmt: skip
+    plain, own = random_forceps(rng, seed), {"jaw_length_mm": RESERVED_JAW_MM, "jaw_radius_mm": (0.10, 0.15)}
+    return replace(plain, shaft_radius_mm=0.30, **drawn(rng, own | {"brightness": (0.45, 0.65)}))
 
 
 def random_pose(rng: Rng, forceps: Forceps, surface_z_mm: float = 0.8) -> Pose:
@@ -110,11 +108,7 @@ def random_setup(
     rng: Rng, population: str = "training", *, textures: Sequence[int] | None = None, without: Sequence[str] = (),
     centred: bool = False,
 ) -> Setup:  # fmt: skip
-    """Draw what an image shows; see `sample` for the arguments.  `centred` puts the tool, and its light, in mid-field.
-
-    Raises:
-        ValueError: If the population or a family to leave out is unknown, or a whole aspect is left out.
-    """
+    """Draw what an image shows; see `sample` for the arguments.  `centred` puts the tool, and its light, in mid-field."""
     choices = _choices(population, without)
     if textures is None:
         own = {"training": TEXTURE_SEEDS, "empty": TEXTURE_SEEDS, "validation": VALIDATION_TEXTURE_SEEDS}
@@ -216,7 +210,7 @@ def sample(
         visibility (3,): 0 outside, 1 hidden, 2 visible.
 
     Raises:
-        ValueError: If both sizes are given, one is too small, or a name is unknown.
+        ValueError: If both sizes are given, one is too small, a name is unknown, or no family of an aspect is left.
     """
     if crop_px is not None and size_px is not None:
         raise ValueError("crop_px, size_px: give one, a window at full resolution or the field at a reduced one.")
