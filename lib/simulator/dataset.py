@@ -31,10 +31,7 @@ def sequence_name(index: int) -> str:
 
 
 def sequence_design(seed: int, index: int, *, shrink: int = 1, duration_s: float = 60.0) -> Design:
-    """Eye, tool, microscope and clock of sequence `index` of the data set of this seed.
-
-    `shrink` makes images and texture this many times smaller.
-    """
+    """Eye, tool, microscope and clock of sequence `index` of the data set of this seed, its images `shrink` times smaller."""
     rng = np.random.default_rng([seed, 211, index])
     # Test sequences have eyes and tools that the training sampler never draws.
     if index in TEST_SEQUENCES:
@@ -44,17 +41,15 @@ def sequence_design(seed: int, index: int, *, shrink: int = 1, duration_s: float
         eye_seed = RESERVED_SEEDS.stop + 1000 + 100 * seed + index
         forceps = random_forceps(rng, eye_seed)
     eye = Eye(
-        seed=eye_seed, depth_mm=float(rng.uniform(1.6, 2.6)), fold_mm=float(rng.uniform(0.05, 0.15)),
-        tilt_rad=float(rng.uniform(0.02, 0.06)), gloss=float(rng.uniform(0.6, 1.2)),
-        texture_px=max(Eye.texture_px // shrink, 64),
+        seed=eye_seed, depth_mm=rng.uniform(1.6, 2.6), fold_mm=rng.uniform(0.05, 0.15), tilt_rad=rng.uniform(0.02, 0.06),
+        gloss=rng.uniform(0.6, 1.2), texture_px=max(Eye.texture_px // shrink, 64),
     )  # fmt: skip
-    gain = tuple(tuple(float(g) for g in np.exp(rng.normal(0, 0.06, 3))) for _ in range(2))
+    gain = tuple(map(tuple, np.exp(rng.normal(0, 0.06, (2, 3))).tolist()))
     microscope = Microscope(
         image_size_px=tuple(side // shrink for side in Microscope.image_size_px),
-        pixels_per_mm=tuple(float(v) / shrink for v in rng.uniform(95, 105, 2)),
-        image_rotation_rad=tuple(float(v) for v in rng.normal(0, 0.03, 2)),
-        light_slope=tuple(float(v) for v in rng.uniform(-0.5, 0.5, 2)),
-        spot_mm=tuple(float(v) for v in rng.normal(0, 1.2, 2)), brightness=float(rng.uniform(0.8, 1.15)), gain=gain,
+        pixels_per_mm=tuple((rng.uniform(95, 105, 2) / shrink).tolist()),
+        image_rotation_rad=tuple(rng.normal(0, 0.03, 2).tolist()), light_slope=tuple(rng.uniform(-0.5, 0.5, 2).tolist()),
+        spot_mm=tuple(rng.normal(0, 1.2, 2).tolist()), brightness=rng.uniform(0.8, 1.15), gain=gain,
     )  # fmt: skip
     offset_s = float(np.round(rng.uniform(-0.05, 0.05), 4))
     return Design(eye, forceps, microscope, duration_s=duration_s, offset_s=offset_s, dropout=0.01)
@@ -75,12 +70,9 @@ def rung_design(rung: str, seed: int, *, shrink: int = 1) -> Design:
     return replace(like, eye=drawn.scene, forceps=drawn.forceps, microscope=camera)
 
 
-def _make_sequence(folder: Path, seed: int, index: int, n_pairs: int, duration_s: float, shrink: int) -> None:
-    simulate(
-        folder, sequence_design(seed, index, shrink=shrink, duration_s=duration_s),
-        seed=1000 * seed + index, n_frames=n_pairs,
-        description="Simulated data set: calibration sweep, then a surgeon's movements.", progress=step,
-    )  # fmt: skip
+def _make_sequence(folder: Path, design: Design, seed: int, n_pairs: int) -> None:
+    text = "Simulated data set: calibration sweep, then a surgeon's movements."
+    simulate(folder, design, seed=seed, n_frames=n_pairs, description=text, progress=step)
 
 
 def make_dataset(
@@ -89,10 +81,7 @@ def make_dataset(
     """Make the sequences of `n_pairs` that are missing in `folder`, in parallel; files depend on seed and size alone.
 
     A sequence appears whole or not at all: after a kill, the finished ones are kept and the others are made.  `workers` are
-    processes, None is one a core.  `shrink` makes images and textures this many times smaller, for a quick look.
-
-    Raises:
-        ValueError: If the folder holds a data set of another seed or size, or a damaged sequence.
+    processes, None is one a core.  A ValueError refuses a folder with a data set of another seed or size.
     """
     folder.mkdir(parents=True, exist_ok=True)
     stamp, size = folder / "dataset.json", {"pairs_a_sequence": n_pairs, "duration_s": duration_s, "shrink": shrink}
@@ -100,10 +89,10 @@ def make_dataset(
     if stamp.is_file() and (found := stamp.read_text(encoding="utf-8", errors="replace").split()) != text.split():
         raise ValueError(f"{folder}: holds another data set ({' '.join(found)}); delete it or choose another folder.")
     files.write_text(stamp, text)
-    _missing(folder)  # names a damaged sequence
     for leftover in folder.glob("t*_??.*.partial"):
         shutil.rmtree(leftover)  # of a run that was killed
-    jobs = {folder / sequence_name(k): (seed, k, n_pairs, duration_s, shrink) for k in _SEQUENCES}
+    designs = {k: sequence_design(seed, k, shrink=shrink, duration_s=duration_s) for k in _SEQUENCES}
+    jobs = {folder / sequence_name(k): (design, 1000 * seed + k, n_pairs) for k, design in designs.items()}
     for _, error in run_jobs(_make_sequence, jobs, workers=workers, title="Simulating", unit="pair", steps=n_pairs):
         if error:
             raise error

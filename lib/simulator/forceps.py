@@ -1,10 +1,9 @@
 """Tools as chains of round cones, with their landmarks: the reference forceps, and instruments of any shape.
 
-Tool frame: the origin is the base, x runs along the shaft towards the tips, y points towards jaw 1, z = x cross y.
-base: the point on the shaft's axis where the jaws leave the shaft or its neck.  tip_1, tip_2: the farthest point of each
-jaw on its own centre line; of a ring or a spoon, its far end.  Jaw 1 is the left jaw for an observer at the microscope who
-looks along the shaft towards the tips.  So tip_1 lies left of the direction from base to tips in every image that is not
-mirrored: `Pose` limits the roll about the shaft to 60 degrees.
+Tool frame: the origin is the base, where the jaws leave the shaft's axis; x runs along the shaft towards the tips, y points
+towards jaw 1, z = x cross y.  A tip is the farthest point of a jaw on its own centre line; of a ring or a spoon, its far end.
+Jaw 1 is the left jaw for an observer at the microscope who looks along the shaft towards the tips, and so in every image
+that is not mirrored: `Pose` limits the roll about the shaft to 60 degrees.
 """
 
 import math

@@ -30,8 +30,8 @@ class Patch:
     edge: float = 0.1
     wobble: float = 0.0
 
-    def share(self, window: Window) -> np.ndarray:
-        """How far the patch fills each pixel of a window, (h, w) float32, 0 to 1."""
+    def lay(self, linear: np.ndarray, window: Window) -> np.ndarray:
+        """Lay the patch over the image (h, w, 3) of a window, in place; (h, w) bool, where it hides what is behind."""
         u = tuple(np.meshgrid(*(np.arange(side, dtype=np.float32) for side in window.size_px)))
         x, y = window.rays(u, np.float32(self.centre_mm[2]))
         dx, dy = x - self.centre_mm[0], y - self.centre_mm[1]
@@ -42,7 +42,14 @@ class Patch:
             angle, phase = np.arctan2(q, p), 37.0 * self.turn_rad
             waves = ((2, 1.0), (3, 0.7), (7, 0.5))
             radius = radius * (1 + self.wobble * sum(size * np.sin(k * angle + k * phase) for k, size in waves))
-        return _inside(radius, self.edge).astype(np.float32)
+        share = _inside(radius, self.edge).astype(np.float32)
+        if self.role == "pupil":
+            share = 1 - share
+        adds = self.role in ("glare", "flare")
+        if not adds:
+            linear *= 1 - share[..., None]
+        linear += share[..., None] * np.float32(self.colour)
+        return share * max(self.colour) > 1.0 if adds else share > 0.7
 
 
 @dataclass(frozen=True)
@@ -104,7 +111,7 @@ class Lighting:
         """Add to the scene (h, w, 3), in place, what lies behind the tool."""
         for patch in self.patches:
             if patch.role == "glare":
-                linear += patch.share(window)[..., None] * np.float32(patch.colour)
+                patch.lay(linear, window)
 
     def in_front(self, linear: np.ndarray, window: Window, u: np.ndarray, visibility: np.ndarray) -> np.ndarray:
         """Lay what lies before the tool over the image (h, w, 3), in place; the landmarks' visibility (3,) after that."""
@@ -120,20 +127,11 @@ class Lighting:
             linear += self.scatter * cv2.resize(small, linear.shape[1::-1], interpolation=cv2.INTER_LINEAR)
         visibility = visibility.copy()
         for patch in self.patches:
-            if patch.role == "glare":
-                continue
-            share = patch.share(window)
-            if patch.role == "flare":
-                linear += share[..., None] * np.float32(patch.colour)
-                hides = share * max(patch.colour) > 1.0
-            else:
-                share = 1 - share if patch.role == "pupil" else share
-                linear *= 1 - share[..., None]
-                linear += share[..., None] * np.float32(patch.colour)
-                hides = share > 0.7
-            for k in np.flatnonzero(visibility == 2):
-                column, row = np.round(u[k]).astype(int)
-                visibility[k] = 1 if hides[row, column] else 2
+            if patch.role != "glare":
+                hides = patch.lay(linear, window)
+                for k in np.flatnonzero(visibility == 2):
+                    column, row = np.round(u[k]).astype(int)
+                    visibility[k] = 1 if hides[row, column] else 2
         if any(self.haze):
             linear += np.float32(self.haze)
         return visibility

@@ -45,20 +45,16 @@ class Motion:
         """(start, interpolator of (jaw centre x, y, tip z, azimuth, pitch, roll, opening)) in order of time."""
         rng = np.random.default_rng([self.seed, 23])
         side = rng.uniform(-np.pi, np.pi)  # where the robot stands
-        sweep_end = {"sweep": 1.0, "surgeon": 0.0, "both": 0.66}[self.kind] * self.duration_s
-        parts = []
-        if sweep_end > 0:
-            points = self._sweep(rng, side)
-            pace = np.linalg.norm(np.diff(points, axis=0)[:, :3], axis=1) + 0.8  # mm, plus time to turn
-            times = np.concatenate([[0], np.cumsum(pace)]) / pace.sum() * sweep_end
-            parts.append((0.0, PchipInterpolator(times, points)))
-        if sweep_end < self.duration_s:
-            points, shares = self._surgeon(rng, side)
-            times = np.concatenate([[0], np.cumsum(shares)]) / np.sum(shares) * (self.duration_s - sweep_end)
-            parts.append((sweep_end, PchipInterpolator(sweep_end + times, points)))
-        return tuple(parts)
+        sweep_end, end = {"sweep": 1.0, "surgeon": 0.0, "both": 0.66}[self.kind] * self.duration_s, self.duration_s
+        parts = [(0.0, sweep_end, *self._sweep(rng, side))] if sweep_end > 0 else []
+        parts += [(sweep_end, end, *self._surgeon(rng, side))] if sweep_end < end else []
+        return tuple(
+            (start, PchipInterpolator(start + np.cumsum([0, *pace]) / np.sum(pace) * (stop - start), points))
+            for start, stop, points, pace in parts
+        )
 
-    def _sweep(self, rng: np.random.Generator, side: float) -> list[list[float]]:
+    def _sweep(self, rng: np.random.Generator, side: float) -> tuple[list[list[float]], np.ndarray]:
+        """Waypoints, and how long the way from each to the next takes, of any unit."""
         half_x, half_y = _HALF_FIELD_MM
         points = []
         for layer, z in enumerate(rng.permutation(_DEPTHS_MM)):
@@ -68,14 +64,14 @@ class Motion:
                     turn = [side + rng.normal(0, 0.45), rng.uniform(0.12, 0.6), np.clip(rng.normal(0, 0.3), -0.9, 0.9)]
                     opening = rng.uniform(0.1, 0.5) * self.forceps.jaw_length_mm
                     points.append([x, y, z + rng.normal(0, 0.12), *turn, opening])
-        return points
+        return points, np.linalg.norm(np.diff(points, axis=0)[:, :3], axis=1) + 0.8  # mm, plus time to turn
 
     def _surgeon(self, rng: np.random.Generator, side: float) -> tuple[list[list[float]], list[float]]:
         half_x, half_y = 0.7 * _HALF_FIELD_MM
         points, shares = [], []
         for _ in range(max(1, round(self.duration_s * (0.34 if self.kind == "both" else 1.0) / 9))):
             x, y = rng.uniform(-half_x, half_x), rng.uniform(-half_y, half_y)
-            ground = float(self.scene.height(np.array(x), np.array(y)))
+            ground = float(self.scene.height(x, y))
             turn = np.array([side + rng.normal(0, 0.3), rng.uniform(0.25, 0.6), np.clip(rng.normal(0, 0.25), -0.8, 0.8)])
             wide, shut = 0.35 * self.forceps.jaw_length_mm, 0.03
             peel = rng.uniform(0.8, 2.2) * np.array([np.cos(side + np.pi), np.sin(side + np.pi)])
@@ -106,14 +102,13 @@ class Motion:
         pose = Pose((0.0, 0.0, 0.0), azimuth, max(pitch, 0.0), roll, max(opening, 0))
         base, *tips = self.forceps.landmarks(pose)
         lowest = max(tip[2] for tip in tips)
-        centre = (base + np.mean(tips, axis=0)) / 2
-        moved = np.array([x - centre[0], y - centre[1], z - lowest])
+        moved = np.array([x, y, z]) - [*((base + np.mean(tips, axis=0)) / 2)[:2], lowest]
         for tip in tips:
-            ground = float(self.scene.height(np.array(tip[0] + moved[0]), np.array(tip[1] + moved[1])))
+            ground = float(self.scene.height(*(tip + moved)[:2]))
             moved[2] = min(moved[2], ground - _CLEARANCE_MM - tip[2])
         if self.kind == "surgeon" or start > 0:
             rng = np.random.default_rng([self.seed, 29])
             frequency, phase = rng.uniform(8, 12, (3, 3)), rng.uniform(0, 2 * np.pi, (3, 3))
             size = self.tremor_mm / 2 * np.array([0.75, 0.75, 0.4])[:, None] * np.array([0.6, 0.3, 0.2])
             moved += (size * np.sin(2 * np.pi * frequency * time + phase)).sum(axis=1)
-        return replace(pose, base_mm=tuple(float(v) for v in moved))
+        return replace(pose, base_mm=tuple(moved.tolist()))

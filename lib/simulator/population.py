@@ -13,10 +13,11 @@ import numpy as np
 from lib.cameras import AffineCamera
 from lib.geometry import RigidTransform
 from lib.simulator.eye import Eye, Ground
-from lib.simulator.families import ASPECTS, FAR, SHIFTED, TRAINING, beside, random_object
+from lib.simulator.families import ASPECTS, FAR, SHIFTED, TRAINING, beside, draw, drawn, random_object
 from lib.simulator.forceps import Forceps, Instrument, Pose
 from lib.simulator.render import render_view
 from lib.simulator.rig import IMAGE_SIZE_PX, Microscope
+from lib.simulator.texture import Rng
 from lib.simulator.video import Video, compressed
 from lib.simulator.window import Window, in_image
 
@@ -36,22 +37,12 @@ _TEXTURE_PX = 1536
 _NARROW, _NARROW_TEXTURES = 0.2, 32  # share of the narrow population in training, and its textures, kept in memory
 
 
-def _eye(rng: np.random.Generator, textures: Sequence[int], kind: type[Eye]) -> Eye:
-    """An eye of the reference rig, as an `Eye` or a `Ground`: shape, folds, gloss, and one of `textures`."""
-    return kind(
-        seed=int(textures[rng.integers(len(textures))]), radius_mm=9.3, texture_px=_TEXTURE_PX,
-        depth_mm=rng.uniform(1.2, 3.2), fold_mm=rng.uniform(0.02, 0.18), tilt_rad=rng.uniform(0.0, 0.08),
-        centre_z_mm=rng.uniform(0.4, 1.8), gloss=float(rng.choice([0.0, 1.0], p=[0.08, 0.92]) * rng.uniform(0.3, 2.2)),
-        turn_rad=float(rng.uniform(-np.pi, np.pi)),
-    )  # fmt: skip
-
-
-def random_forceps(rng: np.random.Generator, seed: int | None = None) -> Forceps:
+def random_forceps(rng: Rng, seed: int | None = None) -> Forceps:
     """A design: jaws of 2 to 4 mm (not the reserved lengths), width, taper, arch, bend, hook and metal."""
     low, high = RESERVED_JAW_MM
     length = rng.uniform(2.0, 4.0 - (high - low))
     return Forceps(
-        shaft_radius_mm=rng.uniform(0.22, 0.38), jaw_length_mm=float(length + (high - low) * (length >= low)),
+        shaft_radius_mm=rng.uniform(0.22, 0.38), jaw_length_mm=length + (high - low) * (length >= low),
         jaw_radius_mm=rng.uniform(0.07, 0.19), tip_radius_mm=rng.uniform(0.003, 0.006), taper=rng.uniform(0.5, 0.95),
         bow_mm=rng.uniform(0.02, 0.38), bend_mm=rng.uniform(-0.1, 0.35),
         hook_mm=rng.choice([0.0, 1.0]) * rng.uniform(0.02, 0.12),
@@ -60,15 +51,13 @@ def random_forceps(rng: np.random.Generator, seed: int | None = None) -> Forceps
     )  # fmt: skip
 
 
-def reserved_forceps(rng: np.random.Generator, seed: int) -> Forceps:
+def reserved_forceps(rng: Rng, seed: int) -> Forceps:
     """A design that training never draws; `seed`, one of `RESERVED_SEEDS`, makes its brush marks."""
-    return replace(
-        random_forceps(rng, seed), shaft_radius_mm=0.30, jaw_length_mm=float(rng.uniform(*RESERVED_JAW_MM)),
-        jaw_radius_mm=float(rng.uniform(0.10, 0.15)), brightness=float(rng.uniform(0.45, 0.65)),
-    )  # fmt: skip
+    plain, own = random_forceps(rng, seed), {"jaw_length_mm": RESERVED_JAW_MM, "jaw_radius_mm": (0.10, 0.15)}
+    return replace(plain, shaft_radius_mm=0.30, **drawn(rng, own | {"brightness": (0.45, 0.65)}))
 
 
-def random_pose(rng: np.random.Generator, forceps: Forceps, surface_z_mm: float = 0.8) -> Pose:
+def random_pose(rng: Rng, forceps: Forceps, surface_z_mm: float = 0.8) -> Pose:
     """A pose whose jaws lie in the field, between the retina and 3 mm above it, the shaft coming from anywhere."""
     azimuth, length = rng.uniform(-np.pi, np.pi), forceps.jaw_length_mm
     tips = _tips(rng, 1.03 if rng.random() < 0.1 else 0.93)
@@ -78,18 +67,16 @@ def random_pose(rng: np.random.Generator, forceps: Forceps, surface_z_mm: float 
     return _reaching(tips, tip_z, length, azimuth, pitch, np.clip(rng.normal(0, 0.4), -0.95, 0.95), opening)
 
 
-def _microscope(rng: np.random.Generator) -> Microscope:
+def _microscope(rng: Rng) -> Microscope:
     """Light, optics and sensor of one image."""
     tint = np.exp(rng.normal(0, [0.16, 0.10, 0.20]))
-    gain = tuple(float(v) for v in tint / tint.mean())
+    gain = tuple((tint / tint.mean()).tolist())
     return Microscope(
-        depth_of_field_mm=float(np.exp(rng.uniform(np.log(1.8), np.log(6.0)))), focus_z_mm=rng.normal(0, 0.6),
-        psf_px=rng.uniform(0.5, 1.5), exposure_s=rng.uniform(0.002, 0.02), readout_s=0.0,
-        light_slope=tuple(float(v) for v in rng.uniform(-0.9, 0.9, 2)),
-        spot_mm=tuple(float(v) for v in rng.normal(0, 2.5, 2)), spot_radius_mm=rng.uniform(4.5, 14.0),
+        depth_of_field_mm=draw(rng, (1.8, 6.0, "log")), focus_z_mm=rng.normal(0, 0.6), psf_px=rng.uniform(0.5, 1.5),
+        exposure_s=rng.uniform(0.002, 0.02), readout_s=0.0, light_slope=tuple(rng.uniform(-0.9, 0.9, 2).tolist()),
+        spot_mm=tuple(rng.normal(0, 2.5, 2).tolist()), spot_radius_mm=rng.uniform(4.5, 14.0),
         brightness=float(np.exp(rng.normal(-0.1, 0.38))), vignetting=rng.uniform(0.0, 0.7), gain=(gain, gain),
-        full_well=float(np.exp(rng.uniform(np.log(1500), np.log(20000)))), read_noise=rng.uniform(2, 20),
-        jpeg_quality=int(rng.integers(60, 98)),
+        full_well=draw(rng, (1500, 20000, "log")), read_noise=rng.uniform(2, 20), jpeg_quality=int(rng.integers(60, 98)),
     )  # fmt: skip
 
 
@@ -104,25 +91,31 @@ class Setup:
     families: dict[str, str]
 
 
-def random_setup(
-    rng: np.random.Generator, population: str = "training", *, textures: Sequence[int] | None = None,
-    without: Sequence[str] = (), centred: bool = False,
-) -> Setup:  # fmt: skip
-    """Draw what an image shows; see `sample` for the arguments.  `centred` puts the tool, and its light, in mid-field.
+def _narrow_setup(rng: Rng, textures: Sequence[int], kind: type[Eye]) -> Setup:
+    """Eyes and forceps of the reference rig; the eye is an `Eye` or a `Ground`, with one of `textures`."""
+    eye = kind(
+        seed=int(textures[rng.integers(len(textures))]), texture_px=_TEXTURE_PX, depth_mm=rng.uniform(1.2, 3.2),
+        fold_mm=rng.uniform(0.02, 0.18), tilt_rad=rng.uniform(0.0, 0.08), centre_z_mm=rng.uniform(0.4, 1.8),
+        gloss=float(rng.choice([0.0, 1.0], p=[0.08, 0.92]) * rng.uniform(0.3, 2.2)), turn_rad=rng.uniform(-np.pi, np.pi),
+    )  # fmt: skip
+    forceps, microscope = random_forceps(rng), _microscope(rng)
+    pose = random_pose(rng, forceps, eye.centre_z_mm - 0.35 * eye.depth_mm)
+    families = {"tool": "plain_jaws", "light": "coaxial", "scene": "fundus", "optics": "clean"}
+    return Setup(eye, forceps, microscope, pose, families)
 
-    Raises:
-        ValueError: If the population or a family to leave out is unknown, or a whole aspect is left out.
-    """
+
+def random_setup(
+    rng: Rng, population: str = "training", *, textures: Sequence[int] | None = None, without: Sequence[str] = (),
+    centred: bool = False,
+) -> Setup:  # fmt: skip
+    """Draw what an image shows; see `sample` for the arguments.  `centred` puts the tool, and its light, in mid-field."""
     choices = _choices(population, without)
     if textures is None:
-        drawn_by = {"training": TEXTURE_SEEDS, "empty": TEXTURE_SEEDS, "validation": VALIDATION_TEXTURE_SEEDS}
-        textures = drawn_by.get(population, _TEST_TEXTURE_SEEDS)
+        own = {"training": TEXTURE_SEEDS, "empty": TEXTURE_SEEDS, "validation": VALIDATION_TEXTURE_SEEDS}
+        textures = own.get(population, _TEST_TEXTURE_SEEDS)
     if population == "near" or (population == "training" and rng.random() < _NARROW):
-        kind = Eye if population == "near" else Ground  # whose film stays in memory
-        eye, forceps, microscope = _eye(rng, textures[:_NARROW_TEXTURES], kind), random_forceps(rng), _microscope(rng)
-        pose = random_pose(rng, forceps, eye.centre_z_mm - 0.35 * eye.depth_mm)
-        names = dict(zip(ASPECTS, ("plain_jaws", "coaxial", "fundus", "clean"), strict=True))
-        return Setup(eye, forceps, microscope, pose, names)
+        # The film of a `Ground` stays in memory.
+        return _narrow_setup(rng, textures[:_NARROW_TEXTURES], Eye if population == "near" else Ground)
     if population == "validation":  # at least one aspect is of a family that training never draws
         shifted = rng.random(len(ASPECTS)) < 0.35
         shifted[rng.integers(len(ASPECTS))] = True
@@ -130,11 +123,11 @@ def random_setup(
     names = {aspect: str(rng.choice(list(known))) for aspect, known in choices.items()}
     if "fundus" in choices["scene"] and rng.random() < 0.25:
         names["scene"] = "fundus"
-    draw = {aspect: choices[aspect][name] for aspect, name in names.items()}
-    scene = draw["scene"](rng, textures)
+    members = {aspect: choices[aspect][name] for aspect, name in names.items()}
+    scene = members["scene"](rng, textures)
     surface_z_mm = scene.centre_z_mm - 0.35 * scene.depth_mm
     sizes = (0.5, 1.3) if population in FAR else (0.2, 0.8) if names["light"] == "pupil" else (0.25, 1.5)
-    size = float(np.exp(rng.uniform(*np.log(sizes))))
+    size = draw(rng, (*sizes, "log"))
     if population == "empty":
         tool = random_object(rng, size) if rng.random() < 0.75 else None
     elif names["tool"] == "plain_jaws" and rng.random() < 0.5:
@@ -142,7 +135,7 @@ def random_setup(
         lengths = ("shaft_radius_mm", "jaw_length_mm", "jaw_radius_mm", "tip_radius_mm", "bow_mm", "bend_mm", "hook_mm")
         tool = replace(plain, **{name: getattr(plain, name) * size for name in lengths})
     else:
-        tool = draw["tool"](rng, size)
+        tool = members["tool"](rng, size)
     length = tool.jaw_length_mm if tool else 3 * size
     pose = Pose((-length / 2, 0.0, -0.5)) if centred else _wide_pose(rng, length, surface_z_mm)
     if isinstance(tool, Instrument) and rng.random() < 0.3:
@@ -151,8 +144,8 @@ def random_setup(
     # The exposure suits the scene more or less, as a camera's does.
     exposed = np.exp(rng.normal(-1.4, 0.55)) / (1.45 * np.mean((scene.texture[::16, ::16] / 255.0) ** 2.2) + 0.02)
     microscope = replace(_microscope(rng), brightness=float(np.clip(exposed, 0.1, 5.0)))
-    microscope = draw["light"](rng, microscope, middle, length, surface_z_mm)
-    settings = draw["optics"](rng)
+    microscope = members["light"](rng, microscope, middle, length, surface_z_mm)
+    settings = members["optics"](rng)
     if rng.random() < 0.35:  # two things are wrong with the camera
         settings = choices["optics"][str(rng.choice(list(choices["optics"])))](rng) | settings
     microscope = replace(microscope, jpeg_quality=int(rng.integers(40, 98)), video=Video(**settings))
@@ -174,7 +167,7 @@ def _choices(population: str, without: Sequence[str]) -> dict[str, dict[str, Cal
     return choices | {aspect: {population: draw} for aspect, draw in FAR.get(population, {}).items()}
 
 
-def _wide_pose(rng: np.random.Generator, length: float, surface_z_mm: float) -> Pose:
+def _wide_pose(rng: Rng, length: float, surface_z_mm: float) -> Pose:
     """As `random_pose`, with wider openings, steeper tools, and more of them partly outside the field."""
     azimuth, pitch = rng.uniform(-np.pi, np.pi), rng.uniform(0.0, 1.0)
     tips = _tips(rng, 1.15 if rng.random() < 0.15 else 0.93)
@@ -183,7 +176,7 @@ def _wide_pose(rng: np.random.Generator, length: float, surface_z_mm: float) -> 
     return _reaching(tips, tip_z, length, azimuth, pitch, np.clip(rng.normal(0, 0.45), -1.0, 1.0), opening)
 
 
-def _tips(rng: np.random.Generator, reach: float) -> np.ndarray:
+def _tips(rng: Rng, reach: float) -> np.ndarray:
     """Where the tips are, (2,) mm: anywhere in a field `reach` times as large, so that they fill it and not the base."""
     return rng.uniform(-1, 1, 2) * IMAGE_SIZE_PX / 200 * reach
 
@@ -198,9 +191,8 @@ def _reaching(
 
 
 def sample(
-    rng: np.random.Generator, *, crop_px: int | None = None, size_px: tuple[int, int] | None = None,
-    around: int | None = None, jitter: float = 0.35, textures: Sequence[int] | None = None, population: str = "training",
-    without: Sequence[str] = (),
+    rng: Rng, *, crop_px: int | None = None, size_px: tuple[int, int] | None = None, around: int | None = None,
+    jitter: float = 0.35, textures: Sequence[int] | None = None, population: str = "training", without: Sequence[str] = (),
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
     """One view, not a pair, with its landmarks; `rng` decides everything.
 
@@ -218,28 +210,29 @@ def sample(
         visibility (3,): 0 outside, 1 hidden, 2 visible.
 
     Raises:
-        ValueError: If both sizes are given, one is too small, or a name is unknown.
+        ValueError: If both sizes are given, one is too small, a name is unknown, or no family of an aspect is left.
     """
     if crop_px is not None and size_px is not None:
         raise ValueError("crop_px, size_px: give one, a window at full resolution or the field at a reduced one.")
     if min(crop_px or 64, *(size_px or (64, 64))) < 32:
         raise ValueError(f"crop_px, size_px: must be at least 32, got {crop_px}, {size_px}.")
-    drawn = random_setup(rng, population, textures=textures, without=without)
-    forceps, pose, microscope = drawn.forceps, drawn.pose, drawn.microscope
+    setup = random_setup(rng, population, textures=textures, without=without)
+    forceps, pose, microscope = setup.forceps, setup.pose, setup.microscope
     landmarks = np.full((3, 3), np.nan) if forceps is None else forceps.landmarks(pose)
+    has_landmarks = np.isfinite(landmarks).all()
     magnification = 100.0 * rng.uniform(0.85, 1.18)  # px per mm
     side = rng.choice([-1, 1])
     tilt = RigidTransform.from_rotation_vector((rng.normal(0, 0.01), -side * 0.057 + rng.normal(0, 0.01), 0.0))
     spin = RigidTransform.from_rotation_vector((0.0, 0.0, rng.normal(0, 0.05)))
-    field = np.array(IMAGE_SIZE_PX)
+    field, shrink = np.array(IMAGE_SIZE_PX), 1.0
     camera = AffineCamera(np.column_stack([magnification * spin.compose(tilt).R[:2], (field - 1) / 2]))
-    shrink = 1.0
     if crop_px is not None:
-        seen = camera.project(landmarks if np.isfinite(landmarks).all() else np.array([pose.base_mm] * 3))
+        seen = camera.project(landmarks if has_landmarks else np.array([pose.base_mm] * 3))
         held = seen.mean(axis=0) if around is None else seen[around]
         origin = held - (crop_px - 1) / 2 + rng.uniform(-jitter, jitter, 2) * crop_px
         origin = np.round(np.clip(origin, 0, np.maximum(field - crop_px, 0)))
         window = Window.around(camera, origin + crop_px / 2, (crop_px, crop_px), IMAGE_SIZE_PX)
+        size_px = window.size_px
     else:
         # The renderer's pixels are square: fill the width and stretch the rows afterwards.
         size_px = size_px or IMAGE_SIZE_PX
@@ -249,18 +242,19 @@ def sample(
         microscope = replace(microscope, psf_px=max(0.45, microscope.psf_px * shrink))
     speed = rng.normal(0, 2.0 if population == "near" else rng.choice([2.0, 6.0]), 3) * (rng.random() < 0.5)
     moved = replace(pose, base_mm=tuple(np.asarray(pose.base_mm) + 1e-3 * speed))
-    later = (moved, 1e-3) if np.isfinite(landmarks).all() else None
-    microscope, video = replace(microscope, video=None), microscope.video  # applied last, to the final size
-    view = render_view(drawn.scene, microscope, window, forceps=forceps, pose=pose, later=later, rng=rng)
+    view = render_view(
+        setup.scene, replace(microscope, video=None), window, forceps=forceps, pose=pose,
+        later=(moved, 1e-3) if has_landmarks else None, rng=rng,
+    )  # fmt: skip
     image, u, visibility = view.image, view.u, view.visibility
-    if size_px is not None and tuple(size_px) != window.size_px:
+    if tuple(size_px) != window.size_px:
         factor = np.array(size_px) / window.size_px
         image = cv2.resize(image, size_px, interpolation=cv2.INTER_AREA if factor[1] < 1 else cv2.INTER_LINEAR)
         u = (u + 0.5) * factor - 0.5
-    if video is not None:
+    if microscope.video is not None:  # applied last, to the final size
         if crop_px is None and rng.random() < 0.3:
             image, u, visibility = _distorted(image, u, visibility, rng.uniform(-0.25, 0.25))
-        image = video.shrunk(shrink)(image, rng)
+        image = microscope.video.shrunk(shrink)(image, rng)
     return compressed(image, microscope.jpeg_quality), u, visibility
 
 
@@ -268,11 +262,12 @@ def _distorted(image: np.ndarray, u: np.ndarray, visibility: np.ndarray, strengt
     """An image through a lens with radial distortion, with its landmarks: `strength` is the relative change at the corner."""
     size = np.array(image.shape[1::-1])
     centre, reach2 = (size - 1) / 2, float(((size / 2) ** 2).sum())
-    columns, rows = np.meshgrid(np.arange(size[0]) - centre[0], np.arange(size[1]) - centre[1])
+
     def grow(radius2: np.ndarray) -> np.ndarray:
         """Where a pixel comes from, relative to where it goes: never from outside the image."""
         return (1 + strength / reach2 * radius2) / (1 + max(strength, 0.0))
 
+    columns, rows = np.meshgrid(np.arange(size[0]) - centre[0], np.arange(size[1]) - centre[1])
     scale = grow(columns * columns + rows * rows)
     maps = ((columns * scale + centre[0]).astype(np.float32), (rows * scale + centre[1]).astype(np.float32))
     image = cv2.remap(image, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)

@@ -52,18 +52,15 @@ def simulate(
     folder: str | Path, design: Design | None = None, *, seed: int = 0, n_frames: int = 40, name: str | None = None,
     description: str = "", progress: bool | Callable[[], object] = True, overwrite: bool = False,
 ) -> Recording:  # fmt: skip
-    """Simulate a recording and write it to `folder`, which appears whole or not at all.
+    """Simulate a recording and write it to `folder`, which appears whole or not at all; the same arguments, the same files.
 
     The frames are spread over the motion: the video keeps every k-th frame, as the times in frames.csv say.
-    The same arguments give the same files.
 
     Args:
-        seed: Drives every random source.
         name, description: Of recording.toml; None = the folder's name.
         progress: Whether to show a bar, or a function to call after every pair.
 
     Raises:
-        ValueError: If a parameter is out of range.
         FileExistsError: If the folder exists and `overwrite` is False.
 
     >>> import tempfile
@@ -124,8 +121,8 @@ def simulate(
 def _in_glint(view: View) -> np.ndarray:
     """(3,) bool: whether saturated light lies within `_GLINT_REACH_PX` of a landmark in view.
 
-    It is the wet surface's mirror image of the lamp, which may surround a tip but never covers the tool, or a highlight of
-    the metal: two of three channels at full scale, as one alone may be the colour of the light.
+    It is a glint of the wet surface, which never covers the tool, or a highlight of the metal: two of three channels at
+    full scale, as one alone may be the colour of the light.
     """
     found = np.zeros(3, bool)
     for k in np.flatnonzero(view.visibility):

@@ -1,7 +1,6 @@
-"""Rendering: what one camera of the microscope sees of a scene and a tool, with the truth beside it.
+"""What one camera of the microscope sees of a scene and a tool, with the truth beside it.
 
-Everything is computed in linear light.  The optics follow in the order of a real microscope: defocus, motion blur,
-vignetting, sensor noise, gamma.
+All in linear light; the optics follow in the order of a microscope: defocus, motion blur, vignetting, sensor noise, gamma.
 """
 
 from dataclasses import dataclass
@@ -27,8 +26,8 @@ class View:
     """One camera's image (h, w, 3) uint8 RGB and its truth.
 
     Attributes:
-        u: Landmarks base, tip_1, tip_2 (3, 2) px as imaged, rolling shutter included; NaN without a tool.
-        visibility: (3,) COCO: 0 outside the image, 1 hidden, 2 visible.
+        u, visibility: Landmarks base, tip_1, tip_2 (3, 2) px as imaged, rolling shutter included, NaN without a tool; and
+            (3,) COCO: 0 outside the image, 1 hidden, 2 visible.
         surface_mm: (h, w), the scene's z in the microscope frame, or None if not asked for.
         tool_mask, glint_mask: (h, w) uint8: how much of the pixel the sharp tool covers, and whether a glint saturates it.
     """
@@ -62,8 +61,7 @@ def render_view(
         factor: Samples per pixel and axis of the tool's edges.
         surface: Whether to return the depth of every pixel too.
 
-    >>> from lib.simulator import Eye, Microscope, Window
-    >>> from lib.geometry import RigidTransform
+    >>> from lib.simulator import Eye
     >>> microscope = Microscope(pixels_per_mm=(4.0, 4.0), image_size_px=(80, 60))
     >>> left = microscope.rig(RigidTransform.identity()).left
     >>> render_view(Eye(texture_px=64), microscope, Window(left, (80, 60))).image.shape
@@ -80,14 +78,14 @@ def render_view(
     light_x, light_y = np.multiply(microscope.light_slope, 0.35)
     lambert = (1 - light_x * slope_x - light_y * slope_y) / np.sqrt(1 + slope_x**2 + slope_y**2)
     light = microscope.brightness * 1.45 * np.clip(lambert, 0.05, None)
-    lighting, at, onward = microscope.lighting, (x, y, z), grid.full
-    if lighting.spot_edge is not None or lighting.shadow_sigma_mm < 0.1:  # hard borders need every pixel
+    lighting, at = microscope.lighting, (x, y, z)
+    hard = lighting.spot_edge is not None or lighting.shadow_sigma_mm < 0.1  # hard borders need every pixel
+    if hard:
         light, *at = (grid.full(values) for values in (light, x, y, z))
-        onward = np.asarray
-    light = light * lighting.spot(at[0], at[1], microscope.spot_mm, microscope.spot_radius_mm)
+    light = light * lighting.spot(*at[:2], microscope.spot_mm, microscope.spot_radius_mm)
     if has_tool:
         light = light * lighting.shaded(at, forceps.nodes(pose), microscope.light_slope)
-    light = onward(light)
+    light = light if hard else grid.full(light)
     to_texture = scene.texture.shape[0] / scene.extent_mm
     (a, b, c), (d, e, f) = getattr(scene, "texture_from_surface", np.eye(2, 3))
     map_x = grid.full((a * x + b * y + c + scene.extent_mm / 2) * to_texture - 0.5)
@@ -127,7 +125,7 @@ def render_view(
         tool = tool_in_view(window, forceps, pose, later, readout_s=microscope.readout_s, factor=factor)
         u, visibility = tool.u, tool.visibility
         if tool.raster is not None and tool.raster.hit[0].size:
-            compose(linear, tool_mask, tool, microscope, (light_x, light_y), float(np.mean(z)))
+            compose(linear, tool_mask, tool, forceps, window, microscope, (light_x, light_y), float(np.mean(z)))
     visibility = lighting.in_front(linear, window, u, visibility)
     field = np.array(window.field_px)
     centre = (field - 1) / 2 - window.origin_px
@@ -155,8 +153,7 @@ def render_pair(
 ) -> tuple[View, View]:  # fmt: skip
     """The left and right view of one moment; arguments as for `render_view`.
 
-    Raises:
-        ValueError: If the tool is entirely outside the field of both cameras.
+    A ValueError refuses a tool that is entirely outside the field of both cameras.
     """
     rig, size = microscope.rig(RigidTransform.identity()), microscope.image_size_px
     if forceps is not None and pose is not None:

@@ -1,8 +1,7 @@
 """The tool in an image: its depth and normals, what hides its landmarks, and its metal.
 
-The tool is rasterised exactly, as round cones in orthographic view.  A round cone is the convex hull of two balls.  Along
-a ray its front is the minimum over s of f(s) = z(s) - sqrt(Q(s)) with Q(s) = r(s)^2 - |w - s c|^2.  Q is quadratic and f
-convex, so the minimum has a closed form and no mesh is needed.  The shaft is a cylinder that ends flat.
+A round cone is the convex hull of two balls.  In orthographic view its front along a ray is the minimum over s of the convex
+f(s) = z(s) - sqrt(Q(s)), Q(s) = r(s)^2 - |w - s c|^2, in closed form: no mesh is needed.  The shaft ends flat.
 """
 
 from dataclasses import dataclass
@@ -12,7 +11,7 @@ import numpy as np
 
 from lib.simulator.forceps import MAX_TIP_RADIUS_MM, Forceps, Instrument, Nodes, Pose
 from lib.simulator.rig import Microscope
-from lib.simulator.window import Window, blur, blur_by_depth, in_image, motion_blur
+from lib.simulator.window import Window, blur_by_depth, in_image, motion_blur
 
 
 @dataclass(frozen=True)
@@ -24,8 +23,7 @@ class ToolRaster:
         factor: Samples per pixel and axis; sample k of pixel i is at i + (k + 0.5) / factor - 0.5.
         depth_mm, part: (h, w) depth along the view, infinity without tool, and 0 none, 1 shaft, 2 jaw 1, 3 jaw 2.
         hit: (rows, columns), (n,) each, of the samples with tool; the following are theirs.
-        normal, tangent: (n, 3) in the camera frame (z away from the camera); the tangent runs along the part.
-        along_mm: (n,) position along the part, for brush marks.
+        normal, tangent, along_mm: (n, 3) in the camera frame, across and along the part, and (n,) the position along it.
     """
 
     origin_px: tuple[int, int]
@@ -104,60 +102,18 @@ def rasterise(
 
 @dataclass(frozen=True, eq=False)
 class ToolInView:
-    """The tool in the camera frame of a window (pixel = zoom * (x, y)), each point when its own row is exposed.
+    """The tool in a window, each point when its own row is exposed.
 
-    `landmarks` are (3, 3) mm, `velocity` is the mean one (2,) of the tips in the image plane, mm/s.  `raster` is None where
-    nothing is in view.
+    Attributes:
+        u, visibility: Landmarks (3, 2) px, and (3,) COCO: 0 outside the window, 1 hidden by another part, 2 visible.
+        velocity: (2,) mm/s of the tips in the image plane.
+        raster: None where nothing is in view.
     """
 
-    window: Window
-    forceps: Forceps | Instrument
-    landmarks: np.ndarray
-    nodes: Nodes
+    u: np.ndarray
+    visibility: np.ndarray
     velocity: np.ndarray
     raster: ToolRaster | None
-
-    @property
-    def u(self) -> np.ndarray:
-        """Landmarks (3, 2) px."""
-        return self.landmarks[:, :2] * self.window.zoom
-
-    @property
-    def visibility(self) -> np.ndarray:
-        """COCO visibility (3,) of the landmarks: 0 outside the window, 1 hidden by another part of the tool, 2 visible."""
-        u = self.u
-        inside = in_image(u, self.window.size_px)
-        found = np.where(inside, 2, 0)
-        for k in np.flatnonzero(inside) if self.raster else ():
-            # A blunt jaw's tip lies inside its outline as soon as the jaw is not parallel to the image.
-            pointed = self.forceps.tip_radius_mm <= MAX_TIP_RADIUS_MM
-            if self._behind_another_part(k) or (k > 0 and pointed and self._behind_its_jaw(k)):
-                found[k] = 1
-        return found
-
-    def _behind_another_part(self, k: int) -> bool:
-        raster = self.raster
-        column, row = np.floor((self.u[k] + 0.5 - raster.origin_px) * raster.factor).astype(int)
-        if not (0 <= row < raster.part.shape[0] and 0 <= column < raster.part.shape[1]):
-            return False
-        own_mm = self.forceps.shaft_radius_mm if k == 0 else 0.0
-        in_front = raster.depth_mm[row, column] < self.landmarks[k, 2] - own_mm - 0.06
-        return bool(in_front and raster.part[row, column] not in ((0, 1) if k == 0 else (0, k + 1)))
-
-    def _behind_its_jaw(self, k: int) -> bool:
-        """Whether a blunt jaw that points steeply away hides its own tip: the tip then lies inside the jaw's outline."""
-        factor, reach_px, side = 16, 0.25, 5
-        u, zoom = self.u[k], self.window.zoom
-        corner = np.round(u) - 2
-        centres, radii, chains = (part[self.nodes[2] == k] for part in self.nodes)
-        centres = centres - np.append(corner / zoom, 0)
-        raster = rasterise(centres, radii, chains, zoom=zoom, size_px=(side, side), factor=factor)
-        covered = np.zeros((side * factor, side * factor), bool)
-        if raster is not None:
-            covered[tuple(raster.hit + factor * np.array(raster.origin_px[::-1])[:, None])] = True
-        sample = (np.arange(side * factor) + 0.5) / factor - 0.5
-        near = np.add.outer((sample - (u - corner)[1]) ** 2, (sample - (u - corner)[0]) ** 2) < reach_px**2
-        return bool(covered[near].all())
 
 
 def tool_in_view(
@@ -179,29 +135,62 @@ def tool_in_view(
         row = seen[:, 1] * window.zoom + window.origin_px[1]
         delay = readout_s * np.clip(row / max(window.field_px[1] - 1, 1) - 0.5, -1, 1)
         seen, shrink = window.seen(points + speed * delay[:, None])
-    centres, radii = seen[3:], radii * shrink[3:]
-    raster = rasterise(centres, radii, chains, zoom=window.zoom, size_px=window.size_px, factor=factor)
-    velocity = speed[1:3].mean(axis=0) @ window.R[:2].T
-    return ToolInView(window, forceps, seen[:3], (centres, radii, chains), velocity, raster)
+    landmarks, nodes = seen[:3], (seen[3:], radii * shrink[3:], chains)
+    raster = rasterise(*nodes, zoom=window.zoom, size_px=window.size_px, factor=factor)
+    u = landmarks[:, :2] * window.zoom
+    visibility = np.where(in_image(u, window.size_px), 2, 0)
+    # A blunt jaw's tip lies inside its outline as soon as the jaw is not parallel to the image.
+    pointed = forceps.tip_radius_mm <= MAX_TIP_RADIUS_MM
+    for k in np.flatnonzero(visibility) if raster else ():
+        front_mm = landmarks[k, 2] - (forceps.shaft_radius_mm if k == 0 else 0.0)
+        hidden = _behind_another_part(raster, k, u[k], front_mm)
+        if hidden or (k > 0 and pointed and _behind_its_jaw(nodes, k, u[k], window.zoom)):
+            visibility[k] = 1
+    return ToolInView(u, visibility, speed[1:3].mean(axis=0) @ window.R[:2].T, raster)
+
+
+def _behind_another_part(raster: ToolRaster, k: int, u: np.ndarray, front_mm: float) -> bool:
+    """Whether something lies before landmark k at pixel u, whose own part begins at this depth."""
+    column, row = np.floor((u + 0.5 - raster.origin_px) * raster.factor).astype(int)
+    if not (0 <= row < raster.part.shape[0] and 0 <= column < raster.part.shape[1]):
+        return False
+    own = (0, 1) if k == 0 else (0, k + 1)
+    return raster.depth_mm[row, column] < front_mm - 0.06 and raster.part[row, column] not in own
+
+
+def _behind_its_jaw(nodes: Nodes, k: int, u: np.ndarray, zoom: float) -> bool:
+    """Whether a blunt jaw that points steeply away hides its own tip: the tip then lies inside the jaw's outline."""
+    factor, reach_px, side = 16, 0.25, 5
+    corner = np.round(u) - 2
+    centres, radii, chains = (part[nodes[2] == k] for part in nodes)
+    centres = centres - np.append(corner / zoom, 0)
+    raster = rasterise(centres, radii, chains, zoom=zoom, size_px=(side, side), factor=factor)
+    covered = np.zeros((side * factor, side * factor), bool)
+    if raster is not None:
+        covered[tuple(raster.hit + factor * np.array(raster.origin_px[::-1])[:, None])] = True
+    sample = (np.arange(side * factor) + 0.5) / factor - 0.5
+    near = np.add.outer((sample - (u - corner)[1]) ** 2, (sample - (u - corner)[0]) ** 2) < reach_px**2
+    return covered[near].all()
 
 
 def compose(
-    linear: np.ndarray, tool_mask: np.ndarray, tool: ToolInView, microscope: Microscope, light: tuple, scene_z_mm: float
-) -> None:
+    linear: np.ndarray, tool_mask: np.ndarray, tool: ToolInView, forceps: Forceps | Instrument, window: Window,
+    microscope: Microscope, light: tuple[float, float], scene_z_mm: float,
+) -> None:  # fmt: skip
     """Lay the tool, blurred by its depth and motion, over the scene: `linear` (h, w, 3) and `tool_mask` change in place.
 
     `light` is the lamp's direction (x, y) per unit of height, in the microscope frame, `scene_z_mm` the scene's mean depth.
     """
-    window, raster = tool.window, tool.raster
+    raster = tool.raster
     lamp = np.array([*light, -1.0]) @ window.R.T
     lamp /= np.linalg.norm(lamp)
     power = 1.15 * microscope.brightness * microscope.lighting.tool
-    if isinstance(tool.forceps, Instrument):
+    if isinstance(forceps, Instrument):
         clearance = max(scene_z_mm - float(raster.depth_mm[raster.hit].mean()), 0.3)
-        metal = _finished(raster, tool.forceps, lamp, linear / max(power, 0.02), window.zoom, clearance) * np.float32(power)
+        metal = _finished(raster, forceps, lamp, linear / max(power, 0.02), window.zoom, clearance) * np.float32(power)
     else:
         glow = linear[::16, ::16].reshape(-1, 3).mean(axis=0)
-        metal = _metal(raster, tool.forceps, lamp, glow) * np.float32(power)
+        metal = _metal(raster, forceps, lamp, glow) * np.float32(power)
     colour, alpha, depth = _at_image_resolution(raster, metal)
     shift = tool.velocity * window.zoom * microscope.exposure_s
     height, width = alpha.shape
@@ -211,17 +200,12 @@ def compose(
     # Beyond the image's border the tool goes on; elsewhere there is nothing beyond the layer.
     pad = np.minimum(margin, [y0, linear.shape[0] - y0 - height, x0, linear.shape[1] - x0 - width]).tolist()
     layer = cv2.copyMakeBorder(layer, *pad, cv2.BORDER_CONSTANT, value=0)
-    z = np.where(alpha > 0.01, depth, np.nan)  # depth along the axis is z of the microscope frame to a few um
-    if np.isfinite(microscope.depth_of_field_mm):
-        covered = cv2.blur((alpha > 0.01).astype(np.float32), (25, 25))
-        spread = cv2.blur(np.nan_to_num(z) * (alpha > 0.01), (25, 25)) / np.maximum(covered, 1e-3)
-        defocus_px = microscope.defocus_px(np.where(np.isfinite(z), z, spread))
-        sigma = np.hypot(microscope.psf_px, window.zoom / 100.0 * defocus_px)
-        sigma = cv2.copyMakeBorder(sigma.astype(np.float32), *pad, cv2.BORDER_REPLICATE)
-        layer = blur_by_depth(layer, sigma)
-    else:
-        layer = blur(layer, microscope.psf_px)
-    layer = motion_blur(layer, shift)
+    # Depth along the axis is z of the microscope frame to a few um; around the tool it is that of the tool near by.
+    covered = alpha > 0.01
+    spread = cv2.blur(np.where(covered, depth, 0), (25, 25)) / np.maximum(cv2.blur(np.float32(covered), (25, 25)), 1e-3)
+    sigma = np.hypot(microscope.psf_px, window.zoom / 100.0 * microscope.defocus_px(np.where(covered, depth, spread)))
+    sigma = cv2.copyMakeBorder(sigma.astype(np.float32), *pad, cv2.BORDER_REPLICATE)
+    layer = motion_blur(blur_by_depth(layer, sigma), shift)
     target = linear[y0 - pad[0] : y0 + height + pad[1], x0 - pad[2] : x0 + width + pad[3]]
     target *= 1 - layer[..., 3:]
     target += layer[..., :3]
@@ -234,12 +218,12 @@ def _brush_marks(seed: int, n: int, sigma: float) -> np.ndarray:
     return marks / marks.std()
 
 
-def _metal(raster: ToolRaster, forceps: Forceps | Instrument, lamp: np.ndarray, glow: np.ndarray) -> np.ndarray:
+def _metal(raster: ToolRaster, forceps: Forceps, lamp: np.ndarray, glow: np.ndarray) -> np.ndarray:
     """Linear colour (n, 3) of the raster's tool samples under the lamp (3,), with the retina's glow (3,) from below."""
     normal, tangent = raster.normal, raster.tangent
     facing = np.clip(-normal[:, 2], 0, 1)
     up = 2 * facing * facing - 1  # of the mirrored view ray: 1 looks back into the microscope, -1 at the retina
-    half = lamp - np.array([0, 0, 1.0])
+    half = lamp - [0, 0, 1.0]
     half = (half / np.linalg.norm(half)).astype(np.float32)
     along = tangent @ half
     streak = np.sqrt(np.maximum(1 - along * along, 0)) ** 60 * np.clip(normal @ half, 0, 1) ** 6

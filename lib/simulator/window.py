@@ -1,6 +1,6 @@
-"""A window of a camera's image: its frame, the rays of its pixels, the scene that they meet, and blur.
+"""A window of a camera's image: the rays of its pixels, the smooth height field that they meet, and blur.
 
-Rays meet the smooth height field after a few fixed-point steps, on a coarse grid of pixels; the rest is interpolated.
+Rays meet the scene after a few fixed-point steps, on a coarse grid of pixels; the rest is interpolated.
 """
 
 from dataclasses import dataclass, replace
@@ -18,11 +18,10 @@ _Camera = AffineCamera | NearAffineCamera
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """What part of a camera's image is rendered.
+    """The part of a camera's image that is rendered: `camera` maps the microscope frame to its pixels, which are square.
 
-    `camera` maps the microscope frame to pixels of the window, which are square.  `field_px` and `origin_px` are the size
-    (w, h) of the whole image (None = the window's), and its pixel that is the window's first: vignetting and rolling
-    shutter depend on them.
+    `field_px` and `origin_px` are the size (w, h) of the whole image (None = the window's), and its pixel that is the
+    window's first: vignetting and rolling shutter depend on them.
     """
 
     camera: _Camera
