@@ -2,13 +2,14 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import ClassVar, Protocol
 
 import cv2
 import numpy as np
 
 from lib.simulator.limits import check
-from lib.simulator.texture import EXTENT_MM, GAMMA, fundus_texture, pattern
+from lib.simulator.texture import EXTENT_MM, GAMMA, fundus_texture, pattern, photograph_texture
 
 _FUNDUS_PX, _FILMS = 1024, 8
 
@@ -38,6 +39,7 @@ class Eye:
         radius_mm, depth_mm: Radius of the cut rim, and how far the deepest point lies below it.
         fold_mm, tilt_rad: Amplitude of the retina's folds, and standard deviation of the tilt about x and y.
         centre_z_mm: Height of the deepest point; 0 is the focal plane, positive is deeper.
+        texture_path: A photograph that replaces the procedural texture.
         gloss: Strength of the reflection of the wet surface; 0 switches it off.
         turn_rad: Rotation of the texture on the surface, so that one texture serves many eyes.
     """
@@ -49,6 +51,7 @@ class Eye:
     fold_mm: float = 0.10
     tilt_rad: float = 0.04
     centre_z_mm: float = 1.1
+    texture_path: str | Path | None = None
     texture_px: int = 2048
     gloss: float = 1.0
     turn_rad: float = 0.0
@@ -70,6 +73,8 @@ class Eye:
     @property
     def texture(self) -> np.ndarray:
         """Reflectance (n, n, 3) uint8 RGB."""
+        if self.texture_path is not None:
+            return photograph_texture(self.texture_path, self.texture_px)
         return fundus_texture(self.seed, self.texture_px, self.radius_mm)
 
     @cached_property
@@ -120,6 +125,8 @@ class Ground(Eye):
     @cached_property
     def texture(self) -> np.ndarray:
         """Reflectance (n, n, 3) uint8 RGB."""
+        if self.texture_path is not None:
+            return photograph_texture(self.texture_path, _FUNDUS_PX)
         if self.kind == "fundus":
             plain = fundus_texture(self.seed, _FUNDUS_PX, self.radius_mm)
             if not self.colours:

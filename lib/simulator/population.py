@@ -6,6 +6,7 @@ reserved for them, so no test frame shows an eye or a tool of the training.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -34,6 +35,7 @@ _TEST_TEXTURE_SEEDS = range(9_000, 9_016)
 #: Jaw lengths that training never draws: recordings for tests have tools of these.
 RESERVED_JAW_MM = (2.95, 3.15)
 _TEXTURE_PX = 1536
+_PHOTOGRAPHED = 0.4  # share of the scenes whose ground is a photograph, where there are some
 _NARROW, _NARROW_TEXTURES = 0.2, 32  # share of the narrow population in training, and its textures, kept in memory
 
 
@@ -106,7 +108,7 @@ def _narrow_setup(rng: Rng, textures: Sequence[int], kind: type[Eye]) -> Setup:
 
 def random_setup(
     rng: Rng, population: str = "training", *, textures: Sequence[int] | None = None, without: Sequence[str] = (),
-    centred: bool = False,
+    photographs: Sequence[Path] = (), centred: bool = False,
 ) -> Setup:  # fmt: skip
     """Draw what an image shows; see `sample` for the arguments.  `centred` puts the tool, and its light, in mid-field."""
     choices = _choices(population, without)
@@ -125,6 +127,8 @@ def random_setup(
         names["scene"] = "fundus"
     members = {aspect: choices[aspect][name] for aspect, name in names.items()}
     scene = members["scene"](rng, textures)
+    if photographs and rng.random() < _PHOTOGRAPHED:
+        scene = replace(scene, texture_path=photographs[rng.integers(len(photographs))])
     surface_z_mm = scene.centre_z_mm - 0.35 * scene.depth_mm
     sizes = (0.5, 1.3) if population in FAR else (0.2, 0.8) if names["light"] == "pupil" else (0.25, 1.5)
     size = draw(rng, (*sizes, "log"))
@@ -193,6 +197,7 @@ def _reaching(
 def sample(
     rng: Rng, *, crop_px: int | None = None, size_px: tuple[int, int] | None = None, around: int | None = None,
     jitter: float = 0.35, textures: Sequence[int] | None = None, population: str = "training", without: Sequence[str] = (),
+    photographs: Sequence[Path] = (),
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
     """One view, not a pair, with its landmarks; `rng` decides everything.
 
@@ -205,6 +210,7 @@ def sample(
         population: "training"; "validation", with kinds beside those of training; "near", the reference rig's eyes and
             forceps alone; "empty", scenes and objects without the tool; or a family of `FAR`, which training never draws.
         without: Families of `TRAINING` to leave out.
+        photographs: Image files, each of which may be the ground of a scene.
 
     Returns: image (h, w, 3) uint8 RGB; u (3, 2) px of base, tip_1, tip_2, also if outside, NaN without the tool;
         visibility (3,): 0 outside, 1 hidden, 2 visible.
@@ -216,7 +222,7 @@ def sample(
         raise ValueError("crop_px, size_px: give one, a window at full resolution or the field at a reduced one.")
     if min(crop_px or 64, *(size_px or (64, 64))) < 32:
         raise ValueError(f"crop_px, size_px: must be at least 32, got {crop_px}, {size_px}.")
-    setup = random_setup(rng, population, textures=textures, without=without)
+    setup = random_setup(rng, population, textures=textures, without=without, photographs=photographs)
     forceps, pose, microscope = setup.forceps, setup.pose, setup.microscope
     landmarks = np.full((3, 3), np.nan) if forceps is None else forceps.landmarks(pose)
     has_landmarks = np.isfinite(landmarks).all()

@@ -5,9 +5,12 @@ row and column run along y and x of the microscope frame.
 """
 
 from functools import lru_cache
+from pathlib import Path
 
 import cv2
 import numpy as np
+
+from lib.recordings import read_image
 
 #: Side of the square of the eye that a texture covers.
 EXTENT_MM = 26.0
@@ -127,6 +130,17 @@ def fundus_texture(seed: int, size_px: int = 2048, rim_mm: float = 9.3) -> np.nd
         value += sclera_share * (sclera - value)
         value *= 1 - 0.45 * border * (0.6, 1.0, 1.0)[channel]
         texture[..., channel] = np.round(255 * np.clip(value, 0, 1) ** (1 / GAMMA))
+    texture.setflags(write=False)
+    return texture
+
+
+@lru_cache(maxsize=64)
+def photograph_texture(path: str | Path, size_px: int = 2048) -> np.ndarray:
+    """Any photograph as a texture: its central square stretched over the retina."""
+    image = read_image(Path(path))
+    side = min(image.shape[:2])
+    top, left = (image.shape[0] - side) // 2, (image.shape[1] - side) // 2
+    texture = cv2.resize(image[top : top + side, left : left + side], (size_px, size_px), interpolation=cv2.INTER_AREA)
     texture.setflags(write=False)
     return texture
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from lib import paths
 from lib.files import write_json
 from lib.landmarks import Detector
-from lib.recordings import Recording
+from lib.recordings import Recording, read_image
 from lib.training.evaluation import evaluate
 from lib.training.loop import PRESETS, Training, load_training, train
 from lib.training.samples import labelled_images
@@ -30,6 +30,7 @@ def main(argv: list[str] | None = None) -> int:
     add("--scenes", type=int, default=120, help="generate: shards of 64 small scenes")
     add("--closeups", type=int, default=40, help="generate: shards of 1024 closeups of a landmark")
     add("--held-out", type=int, default=24, help="generate: shards of 16 full scenes, for the doubt")
+    add("--photographs", type=Path, help="generate: a folder of images, the ground of some of the scenes that train")
     add("--workers", type=int, help="generate: processes (default: one a core)")
     add("--preset", choices=sorted(PRESETS), default="best")
     add("--steps", type=int, default=6000)
@@ -47,7 +48,7 @@ def main(argv: list[str] | None = None) -> int:
     if a.what == "generate":
         shards = {"held_out": a.held_out, "scenes": a.scenes, "closeups": a.closeups}
         for kind, count in shards.items():
-            generate(a.data, kind, count, workers=a.workers)
+            generate(a.data, kind, count, workers=a.workers, photographs=_images(a.photographs) if a.photographs else ())
     elif a.what == "finetune":
         _finetune(a)
     elif a.what == "assemble":
@@ -64,6 +65,16 @@ def main(argv: list[str] | None = None) -> int:
         initial = _start(a.initial, a.what) if a.initial else None
         print(train(config, *stage_data(a.what, a.data), a.folder / a.what, initial=initial).provenance["metrics"])
     return 0
+
+
+def _images(folder: Path) -> list[Path]:
+    """The image files of a folder, each of which can be read."""
+    found = sorted(path.resolve() for path in folder.rglob("*") if path.suffix.lower() in (".png", ".jpg", ".jpeg"))
+    if not found:
+        raise FileNotFoundError(f"{folder}: holds no .png or .jpg; give --photographs a folder of images.")
+    for path in found:
+        read_image(path)  # names a damaged one
+    return found
 
 
 def _start(path: Path, stage: str) -> Training:

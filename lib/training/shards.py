@@ -38,31 +38,36 @@ HELD_OUT_SIZES = ((1920, 1080), (1280, 720), (960, 540))
 BLOCK_PX = 16
 
 
-def generate(folder: str | Path, kind: str, shards: int, *, workers: int | None = None, progress: bool = True) -> None:
+def generate(
+    folder: str | Path, kind: str, shards: int, *, workers: int | None = None, progress: bool = True,
+    photographs: Sequence[Path] = (),
+) -> None:  # fmt: skip
     """Write the first `shards` shards of a kind into `folder`, except those that exist.
 
-    A shard depends on its kind and number alone.  Crops are rendered alone, each of an eye and a tool of its own: many times
-    as many scenes a second.  `workers` processes share the work (None: all cores).
+    A shard depends on its kind, its number and the `photographs` alone, which are the ground of some of the scenes that train.
+    Crops are rendered alone, each of an eye and a tool of its own: many times as many scenes a second.  `workers` processes
+    share the work (None: all cores).
     """
     Path(folder).mkdir(parents=True, exist_ok=True)
-    jobs = {Path(folder) / f"{kind}_{i:04d}.npz": (kind, i) for i in range(shards)}
+    jobs = {Path(folder) / f"{kind}_{i:04d}.npz": (kind, i, photographs) for i in range(shards)}
     for _, error in run_jobs(make_shard, jobs, workers=workers, title=f"Simulating {kind}", unit="shard", progress=progress):
         if error:
             raise error
 
 
-def make_shard(path: Path, kind: str, index: int) -> None:
+def make_shard(path: Path, kind: str, index: int, photographs: Sequence[Path] = ()) -> None:
     """Simulate and write one shard."""
     rng = np.random.default_rng([*_SEEDS[kind], index])
     if kind == "closeups":
-        _write_closeups(path, rng)
+        _write_closeups(path, rng, photographs)
         return
     n, shares = SCENES[kind]
     sizes = HELD_OUT_SIZES if kind == "held_out" else ((SCENE_PX, round(SCENE_PX * 9 / 16)),)
     textures = VALIDATION_TEXTURE_SEEDS if kind == "held_out" else TEXTURE_SEEDS
     populations = rng.choice(list(shares), n, p=list(shares.values()))
+    how = {"textures": textures, "photographs": photographs if kind == "scenes" else ()}
     drawn = (
-        LabelledImage(name, *sample(rng, size_px=sizes[rng.integers(len(sizes))], population=name, textures=textures))
+        LabelledImage(name, *sample(rng, size_px=sizes[rng.integers(len(sizes))], population=name, **how))
         for name in populations.tolist()
     )
     ends, jpegs, u, visibility = packed(drawn)
@@ -70,7 +75,7 @@ def make_shard(path: Path, kind: str, index: int) -> None:
         np.savez(partial, jpegs=jpegs, jpeg_ends=ends, u=u, visibility=visibility)
 
 
-def _write_closeups(path: Path, rng: np.random.Generator) -> None:
+def _write_closeups(path: Path, rng: np.random.Generator, photographs: Sequence[Path]) -> None:
     n, side_px = CLOSEUPS, CLOSEUP_CROP_PX
     crops, u, seen = np.empty((n, side_px, side_px, 3), np.uint8), np.empty((n, 3, 2)), np.zeros((n, 3), int)
     landmark, rendered_px = rng.integers(3, size=n), side_px + BLOCK_PX
@@ -79,7 +84,7 @@ def _write_closeups(path: Path, rng: np.random.Generator) -> None:
             # A third is of the reference rig, where the last tenth of a pixel counts.
             population = "near" if rng.random() < 1 / 3 else "training"
             how = {"around": k, "jitter": BLOCK_PX / 2 / rendered_px, "textures": TEXTURE_SEEDS, "population": population}
-            image, at, seen[i] = sample(rng, crop_px=rendered_px, **how)
+            image, at, seen[i] = sample(rng, crop_px=rendered_px, photographs=photographs, **how)
         crops[i], u[i] = square_round(image, at, k, side_px)  # the landmark is not in the middle where the field ends
     with whole(path) as partial:
         np.savez(partial, crops=crops, crop_u=u, crop_visibility=seen, crop_landmark=landmark)

@@ -159,3 +159,17 @@ def test_rungs_have_stereo_recordings_with_truth(rung, tmp_path):
     assert_allclose(np.stack([truth.u_left, truth.u_right]).reshape(-1, 2), np.vstack([u_left, u_right]), atol=1e-3)
     assert np.isfinite(recording.kinematics.x_mm).any() and recording.frames[0].left.std() > 2
     assert repr(rung_design(rung, 1).microscope) != repr(rung_design(rung, 2).microscope)
+
+
+def test_photographs_are_the_ground_of_some_scenes_and_change_no_others(tmp_path):
+    photograph = tmp_path / "red.png"
+    cv2.imwrite(str(photograph), np.full((40, 60, 3), (20, 30, 200), np.uint8))
+    shown = []
+    for seed in range(30):
+        setup = random_setup(np.random.default_rng(seed), photographs=[photograph])
+        plain = random_setup(np.random.default_rng(seed))
+        shown.append(setup.scene.texture_path is not None)
+        if shown[-1]:
+            assert (setup.scene.texture == (200, 30, 20)).all()
+        assert plain.scene.texture_path is None and plain.scene.seed == setup.scene.seed
+    assert 4 <= sum(shown) <= 20

@@ -181,6 +181,11 @@ def test_bad_parameters_are_named(make, said):
         make()
 
 
+def test_missing_photograph_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"no\.jpg"):
+        render_pair(Eye(texture_path=tmp_path / "no.jpg"), SMALL)
+
+
 def test_image_statistics_of_known_images():
     rng = np.random.default_rng(0)
     noise = np.repeat(rng.normal(128, 20, (96, 96, 1)).clip(0, 255).astype(np.uint8), 3, axis=2)

@@ -27,6 +27,11 @@ def test_the_train_command_names_what_is_missing(tmp_path, capsys):
     assert "no shard" in capsys.readouterr().err
     assert COMMANDS["train"](["assemble", "--data", str(tmp_path), "--folder", str(tmp_path)]) == 2
     assert "last.safetensors" in capsys.readouterr().err
+    assert COMMANDS["train"](["generate", "--data", str(tmp_path), "--photographs", str(tmp_path)]) == 2
+    assert "holds no .png or .jpg" in capsys.readouterr().err
+    (tmp_path / "torn.png").write_bytes(b"no image")
+    assert COMMANDS["train"](["generate", "--data", str(tmp_path), "--photographs", str(tmp_path)]) == 2
+    assert "torn.png" in capsys.readouterr().err
 
 
 @pytest.mark.skipif(

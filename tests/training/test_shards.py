@@ -13,7 +13,7 @@ def test_where_a_landmark_lies_in_its_jpeg_blocks_does_not_tell_its_place(monkey
     """A stand-in for the simulator that asks where the landmark will lie in the image that is compressed."""
     places = []
 
-    def sample(rng, *, crop_px, around, jitter, textures, population):
+    def sample(rng, *, crop_px, around, jitter, textures, population, photographs):
         u = (crop_px - 1) / 2 - np.round(rng.uniform(-jitter, jitter, (3, 2)) * crop_px)
         places.append(u[around])
         return np.zeros((crop_px, crop_px, 3), np.uint8), u, np.full(3, 2)
