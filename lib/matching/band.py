@@ -17,11 +17,10 @@ import numpy as np
 import torch
 
 from lib.cameras import StereoRig
-from lib.matching.descriptors import CHANNELS, MIN_SEEN, patch_quality, pixel_descriptors
-from lib.matching.pyramid import PATCH, peak_ratio
+from lib.matching.deepmatching import VolumeMatches, correlation_volume, match_volume, peak_ratio, volume_bytes
+from lib.matching.descriptors import CHANNELS, MIN_SEEN, PATCH, patch_quality, pixel_descriptors
 from lib.matching.rectification import Rectification, rectify, warp
 from lib.matching.result import SIGMA_LEFT_PX, Matches
-from lib.matching.volume import VolumeMatches, correlation_volume, match_volume, predicted_bytes
 from lib.parallel import single_threaded_torch
 
 Images = tuple[np.ndarray, np.ndarray]
@@ -76,8 +75,7 @@ class Search:
 def plan_search(images: Images, masks: Masks, rig: StereoRig, where: Where) -> Search:
     """Choose the canvas, check the rig by coarse matches, and find the range of depth where it is not given.
 
-    Raises:
-        ValueError: If the rig does not fit the images, or both cameras see nothing in the depth range.
+    A ValueError refuses a rig that does not fit the images, and a depth range in which both cameras see nothing.
     """
     setting, depth_range_mm, max_epipolar_px = where
     shapes = images[0].shape, images[1].shape
@@ -173,18 +171,14 @@ def _supported(matches: VolumeMatches) -> np.ndarray:
 
 
 def match_band(images: Images, masks: Masks, rig: StereoRig, where: Where, *, budget_bytes: int, reciprocal: bool) -> Matches:
-    """Matches of a calibrated pair; arguments as in `lib.matching.match`, images (h, w) uint8 grey.
-
-    Raises:
-        ValueError: As `plan_search`, and if the search would need more memory than the budget.
-    """
+    """Matches of a calibrated pair; arguments as in `lib.matching.match`, images (h, w) uint8 grey."""
     search = plan_search(images, masks, rig, where)
     if not search.n_found and where[1] is None:
         return Matches(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros((0, 4, 4)), method="band")
     rectification = search.rectification
     low, high = (int(np.floor(search.range_px[0] / CELL_PX)) - 1, int(np.ceil(search.range_px[1] / CELL_PX)) + 1)
     gx, gy = (side // (PATCH * CELL_PX) for side in rectification.size_px)
-    need = predicted_bytes(gy, gx, high - low + 1, OFF_LINE)
+    need = volume_bytes(gy, gx, high - low + 1, OFF_LINE)
     if need > budget_bytes:
         raise ValueError(
             f"budget_bytes: {high - low + 1} displacements of {gx} x {gy} patches need {need / 2**30:.2f} GiB, the budget "

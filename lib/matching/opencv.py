@@ -9,11 +9,10 @@ import torch
 
 from lib.cameras import StereoRig
 from lib.matching.band import CELL_PX, COARSE_REACH, DOWNSCALE, Images, Masks, Where, plan_search
-from lib.matching.descriptors import patch_quality, pixel_descriptors
-from lib.matching.pyramid import PATCH, peak_ratio
+from lib.matching.deepmatching import correlation_volume, peak_ratio
+from lib.matching.descriptors import PATCH, patch_quality, pixel_descriptors
 from lib.matching.rectification import warp
 from lib.matching.result import SIGMA_LEFT_PX, Matches
-from lib.matching.volume import correlation_volume
 from lib.parallel import single_threaded_torch
 
 #: Matches are taken on this lattice, as DeepMatching's are at full resolution.

@@ -15,10 +15,8 @@ from lib.surface.solver import L1Problem, L1Solution, interior_point
 #: Default rejection: points whose L1 norm exceeds this many times the median.  Gaussian noise along one axis puts
 #: 0.1 % of its points beyond it.
 REJECT_MEDIANS = 5.0
-
 _FOLDS = 3
-_ENOUGH_HELD_OUT = 1500  # points in the folds that are tried: more only cost time
-_QUICK_HELD_OUT = 1000
+_ENOUGH_HELD_OUT, _QUICK_HELD_OUT = 1500, 1000  # points in the folds that are tried: more only cost time
 _LADDER = 10.0**0.5  # step between candidates of the smoothness
 _EXTENT = 8  # at most so many steps from the first candidate, either way
 
@@ -52,9 +50,8 @@ def fit_surface(
         quick: Choose the smoothness and reject points at fits of five Newton steps, within some percent of the minimum;
             only the final fit is solved to `tolerance`.
 
-    Raises:
-        ValueError: For shapes or counts that do not fit, NaN, negative smoothness, points that do not determine a
-            surface: fewer in the domain than a quarter of the control points, or than 16.
+    A ValueError refuses NaN and points that do not determine a surface: fewer in the domain than a quarter of the control
+    points, or than 16.
     """
     grid = SplineGrid(domain, control)
     u, x = finite_points(u, 2, "u"), finite_points(x_mm, 3, "x_mm")
