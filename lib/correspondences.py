@@ -237,7 +237,7 @@ def of_recording(
     )  # fmt: skip
 
 
-def _affine(x: np.ndarray, u: np.ndarray, rounds: int = 10) -> np.ndarray:
+def _affine(x: np.ndarray, u: np.ndarray) -> np.ndarray:
     """A (2, 3) px per mm of the affine camera with the least sum of distances: it only turns small shifts into pixels."""
     known = np.isfinite(np.hstack([x, u])).all(axis=1)
     if known.sum() < 5:
@@ -245,7 +245,7 @@ def _affine(x: np.ndarray, u: np.ndarray, rounds: int = 10) -> np.ndarray:
     H, u = np.column_stack([x[known], np.ones(known.sum())]), u[known]
     H[:, :3] -= H[:, :3].mean(axis=0)
     weight = np.ones((len(H), 1))
-    for _ in range(rounds):
+    for _ in range(10):
         M = np.linalg.lstsq(np.sqrt(weight) * H, np.sqrt(weight) * u, rcond=1e-6)[0]
         weight = 1.0 / np.maximum(np.linalg.norm(u - H @ M, axis=1, keepdims=True), 0.1)
     return M[:3].T

@@ -62,9 +62,7 @@ def calibrate(
 
     Raises:
         NoConsensusError: A ValueError, where a camera's detections agree on no camera, or on two that compete.
-        ValueError: For NaN in plain arrays, fewer than four points, coplanar or collinear points, wrong units, repeated rows,
-            detections that stand still or are the same in both images, swapped cameras, an unknown model
-            or weighting, offsets that the data cannot tell.
+        ValueError: For rows that determine no camera, offsets that the data cannot tell, and what `checks` finds.
 
     >>> from lib.cameras import AffineCamera
     >>> rng = np.random.default_rng(0)
@@ -105,7 +103,11 @@ def calibrate(
     if axes is None and offsets != "image":
         found = fitted(x, y)
         if weighting == "likelihood" and None in (sigma_u_px, sigma_x_mm):
-            found = _scattered(found, None if usable is None else rows)
+            # The covariance that an estimated noise level and errors correlated in time ask for.
+            _, J, weight, r = found.system
+            order = (None, None) if usable is None else (rows.frame[found.inliers], rows.landmark[found.inliers])
+            known, effective = sandwich(J, weight, r, *order, np.zeros((J.shape[2], J.shape[2])))
+            found = replace(found, parameter_covariance=known, effective_rows=effective)
     else:
         estimate = partial(estimate_offsets, fitted, x, y, rows.landmark, frame=rows.frame, prior_sd=offset_prior_sd)
         found = estimate(axes=axes)
@@ -155,14 +157,6 @@ def _turned(
     if fewer or np.linalg.norm(found.residuals_px[both]) <= np.linalg.norm(other.residuals_px[both]):
         return found
     return replace(other, offsets=replace(other.offsets, turns=True))
-
-
-def _scattered(found: Calibration, rows: Correspondences | None) -> Calibration:
-    """The calibration with the covariance that an estimated noise level and errors correlated in time ask for."""
-    _, J, weight, r = found.system
-    time = (None, None) if rows is None else (rows.frame[found.inliers], rows.landmark[found.inliers])
-    known, effective = sandwich(J, weight, r, *time, np.zeros((J.shape[2], J.shape[2])))
-    return replace(found, parameter_covariance=known, effective_rows=effective)
 
 
 def _spread_out(found: Calibration, usable: np.ndarray) -> Calibration:

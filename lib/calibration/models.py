@@ -1,16 +1,7 @@
 """The ladder of camera models, their analytic Jacobians, and the constrained minimum of the same energy.
 
-A model is a base and options joined by "+":
-
-    affine        8 numbers a camera
-    zero_skew     K diagonal (the paper's): rotation, two zooms, two offsets; 7 a camera
-    square        one zoom a camera; 6
-    common_zoom   one zoom for both; 11 a pair
-    +distance     one 1/distance for all cameras (near-affine), +distances one a camera
-    +radial       one radial distortion coefficient a camera
-
-"near_affine" is short for "zero_skew+distance".  A state moves by increments; every model is a selection matrix
-from its free parameters to the increments of all cameras, so one set of derivatives serves all.
+A state moves by increments; every model is a selection matrix from its free parameters to the increments of all cameras,
+so one set of derivatives serves all.
 """
 
 from __future__ import annotations
@@ -32,7 +23,15 @@ OPTIONS = ("distance", "distances", "radial")
 
 @dataclass(frozen=True)
 class Model:
-    """A rung of the ladder for one or two cameras."""
+    """A rung of the ladder for one or two cameras: a base and options joined by "+".
+
+    affine        8 numbers a camera
+    zero_skew     K diagonal (the paper's): rotation, two zooms, two offsets; 7 a camera
+    square        one zoom a camera; 6
+    common_zoom   one zoom for both; 11 a pair
+    +distance     one 1/distance for all cameras (near-affine), +distances one a camera
+    +radial       one radial distortion coefficient a camera
+    """
 
     base: str
     distance: str | None

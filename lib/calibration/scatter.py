@@ -1,9 +1,8 @@
 """How far estimates scatter where the noise is estimated and neighbouring frames err alike.
 
-A detector that looks at the same tool in the same light repeats its errors, and so does a robot.  The errors of a landmark
-are taken for a first-order autoregression over the frames, whose correlation the residuals tell (restricted maximum
-likelihood, averaged over its posterior); the estimates stay as they are, their covariance becomes the sandwich
-H^-1 (J^T W R W J) H^-1 (Liang and Zeger, "Longitudinal data analysis using generalized linear models", 1986).
+The errors of a landmark are taken for a first-order autoregression over the frames, whose correlation the residuals tell
+(restricted maximum likelihood, averaged over its posterior); the estimates stay as they are, their covariance becomes the
+sandwich H^-1 (J^T W R W J) H^-1 (Liang and Zeger, "Longitudinal data analysis using generalized linear models", 1986).
 """
 
 import numpy as np

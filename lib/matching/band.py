@@ -2,12 +2,6 @@
 
 A coarse pass on small images, free to leave the epipolar line, tells whether the rig fits the images and where in depth
 the scene lies.  The fine pass searches only the band that is left.
-
-The sub-cell displacement is one symmetric Gauss-Newton step on the descriptors.  Raw intensity would be biased where the
-two optical paths differ in gain and blur (by 0.4 px on retinal images); the descriptors are squashed gradients, and each
-patch is scaled to the other's norm.  With f the left and g the right patch and w the mean of their gradients along x
-(efficient second-order minimisation: Malis, ICRA 2004), the step is w.(f - g) / w.w.  It is exact to second order and has
-no bias at zero, unlike the vertex of a parabola through three correlations, the starting point for `VolumeMatches`.
 """
 
 from concurrent.futures import ThreadPoolExecutor
@@ -130,7 +124,6 @@ def _descriptors(
     step, low, high = PATCH * CELL_PX, *range_cells
     width, height = (side // step * step for side in rectification.size_px)
     margin_y = off_line * CELL_PX
-
     wide = width + (high - low) * CELL_PX, height + 2 * margin_y
 
     def one(image: np.ndarray, mask: np.ndarray | None, target: np.ndarray, size: tuple, shift: tuple) -> np.ndarray:
@@ -232,7 +225,11 @@ def _derivatives(windows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def refine(
     left: np.ndarray, right: np.ndarray, start_left: np.ndarray, start_right: np.ndarray, *, margin: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Refine matches of whole cells.
+    """Refine matches of whole cells by one symmetric Gauss-Newton step on the descriptors.
+
+    With f the left and g the right patch, scaled to the same norm, and w the mean of their gradients along x, the step is
+    w.(f - g) / w.w (efficient second-order minimisation: Malis, ICRA 2004).  It is exact to second order and has no bias at
+    zero, unlike the vertex of a parabola; raw intensity would be biased where gain and blur differ (by 0.4 px on retinas).
 
     Args:
         left, right: (h, w, C) float32 descriptor grids.
@@ -240,9 +237,8 @@ def refine(
         margin: Cells added to the patch on every side: steadier on smooth surfaces, worse at depth edges.
 
     Returns:
-        (step, sigma): (n, 2) cells to add to the right (x, y), at most 1 either way: x on the line, and y as a step
-            that may leave the line finds it.  And their standard deviations (n, 2) if the descriptors' residuals were
-            independent: the shape of the uncertainty, not yet its scale.
+        Cells (n, 2) to add to the right (x, y), at most 1 either way: x on the line, and y as a step that may leave the line
+        finds it.  And their standard deviations (n, 2) if the descriptors' residuals were independent, up to a scale.
     """
     pad = margin + REACH
     left, right = (np.pad(grid, ((margin + 1, margin + 1), (pad, pad), (0, 0))) for grid in (left, right))

@@ -137,7 +137,7 @@ def save_depth_map(path: str | Path, depth_mm: np.ndarray) -> Path:
 
 
 def _write(path: Path, write: Callable[[str], bool], is_whole: Callable[[bytes], bool]) -> None:
-    """Let one of Open3D's writers fill a file; it returns False on an error, but on a full disk some leave a part and True."""
+    """Let one of Open3D's writers fill a file: False says that it failed, but some say True of a part on a full disk."""
     with whole(path) as partial:
         if not write(str(partial)) or not is_whole(partial.read_bytes()):
             raise OSError(f"{path}: Open3D could not write the whole file; is the disk full?")
