@@ -31,10 +31,8 @@ def finite_points(values: ArrayLike, dimension: int, name: str) -> np.ndarray:
     array = points(values, dimension, name)
     bad = np.flatnonzero(~np.isfinite(array).all(axis=1))
     if bad.size:
-        raise ValueError(
-            f"{name}: {bad.size} of {len(array)} rows are not finite (the first is row {bad[0]}). "
-            "Drop the rows of missing landmarks first."
-        )
+        found = f"{bad.size} of {len(array)} rows are not finite (the first is row {bad[0]})"
+        raise ValueError(f"{name}: {found}. Drop the rows of missing landmarks first.")
     return array
 
 

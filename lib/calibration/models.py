@@ -44,10 +44,8 @@ class Model:
         base, *options = ("zero_skew+distance" if name == "near_affine" else str(name)).split("+")
         known = base in BASES and all(o in OPTIONS for o in options) and len(set(options)) == len(options)
         if not known or {"distance", "distances"} <= set(options):
-            raise ValueError(
-                f"model: unknown model {name!r}; take one of {', '.join(BASES)} or near_affine, and add +distance or "
-                "+distances, +radial."
-            )
+            names = f"{', '.join(BASES)} or near_affine, and add +distance or +distances, +radial"
+            raise ValueError(f"model: unknown model {name!r}; take one of {names}.")
         return cls(base, next((o for o in options if o != "radial"), None), "radial" in options, cameras)
 
     @property

@@ -183,7 +183,5 @@ def _poses(robot_from_tool: Sequence[RigidTransform]) -> tuple[np.ndarray, np.nd
 def _check_determined(covariance_mm2: np.ndarray) -> None:
     variance = np.diagonal(covariance_mm2, axis1=-2, axis2=-1)
     if not ((variance >= 0) & (variance < _LARGEST_SD_MM**2)).all():
-        raise ValueError(
-            f"robot_from_tool: the motion leaves an offset open by {np.sqrt(np.abs(variance).max()):.2g} mm; turn the tool "
-            "further, about two axes, or give more poses."
-        )
+        sd_mm = np.sqrt(np.abs(variance).max())
+        raise ValueError(f"robot_from_tool: the motion leaves an offset open by {sd_mm:.2g} mm; turn more, about two axes.")

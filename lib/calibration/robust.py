@@ -78,10 +78,7 @@ def _one_camera(
     n = len(u)
     if n < 8:
         return _Found(np.ones(n, dtype=bool), regress(x, u), 0.0, np.inf, np.inf)
-    cure = (
-        "check that x_mm and u belong together (frames, order of landmarks, time offset) and that the detector knows this "
-        "tool"
-    )
+    cure = "check that x_mm and u belong together (frames, landmarks, clocks) and that the detector knows this tool"
     if threshold_px is None and n < _FEW:
         found, enough = _by_growth(x, u, rng, least_mm), min(8, n - n // 4)
     else:

@@ -78,11 +78,9 @@ def match_with(
     right, valid_right = warp(images[1], rectification.right_from_canvas, size, shift_px=shift, mask=masks[1])
     left, right = (np.clip(np.rint(image), 0, 255).astype(np.uint8) for image in (left, right))
     disparity, confidence, *rest = maps = [np.asarray(part) for part in call(left, right, (-high, -low))]
-    if any(part.shape != left.shape for part in maps):
-        raise ValueError(
-            f"method: the matcher {name} must return disparity and confidence of shape {left.shape}, "
-            f"got {', '.join(str(part.shape) for part in maps)}."
-        )
+    shapes = [part.shape for part in maps]
+    if any(shape != left.shape for shape in shapes):
+        raise ValueError(f"method: the matcher {name} must return disparity and confidence {left.shape}, got {shapes}.")
     passed = rest[0].astype(bool) if rest else np.ones(left.shape, dtype=bool)
 
     x, y = np.meshgrid(
