@@ -79,13 +79,12 @@ def calibrate(
         usable, axes = _usable_rows(data, offsets, weighting)
         rows = data.subset(usable)
         x, y = rows.x_mm, rows.stacked_px
+        noise = None
         if covariance_px2 is not None:
             noise = pair_covariance(covariance_px2, len(data))
             noise = noise[usable] if len(noise) > 1 else noise
-        else:
-            own = weighting == "likelihood" and sigma_u_px is None and np.isfinite(rows.covariance_px2[rows.seen]).all()
-            noise = np.where(rows.seen[:, :, None, None], rows.covariance_px2, np.eye(2)) if own else None
-            noise = None if noise is None else pair_covariance(noise, len(rows))
+        elif weighting == "likelihood" and sigma_u_px is None and np.isfinite(rows.covariance_px2[rows.seen]).all():
+            noise = pair_covariance(np.where(rows.seen[:, :, None, None], rows.covariance_px2, np.eye(2)), len(rows))
     else:
         if u is None:
             raise ValueError("u: give [u_left, u_right] with plain positions, or Correspondences alone.")
@@ -105,8 +104,8 @@ def calibrate(
         if weighting == "likelihood" and None in (sigma_u_px, sigma_x_mm):
             # The covariance that an estimated noise level and errors correlated in time ask for.
             _, J, weight, r = found.system
-            order = (None, None) if usable is None else (rows.frame[found.inliers], rows.landmark[found.inliers])
-            known, effective = sandwich(J, weight, r, *order, np.zeros((J.shape[2], J.shape[2])))
+            order = () if usable is None else (rows.frame[found.inliers], rows.landmark[found.inliers])
+            known, effective = sandwich(J, weight, r, *order)
             found = replace(found, parameter_covariance=known, effective_rows=effective)
     else:
         estimate = partial(estimate_offsets, fitted, x, y, rows.landmark, frame=rows.frame, prior_sd=offset_prior_sd)
@@ -161,16 +160,15 @@ def _turned(
 
 def _spread_out(found: Calibration, usable: np.ndarray) -> Calibration:
     """The calibration of the usable rows with an entry for every row given."""
-
-    def full(values: np.ndarray, filler: object) -> np.ndarray:
-        result = np.full((len(usable), *values.shape[1:]), filler)
-        result[usable] = values
-        return result
-
-    names = ["residuals_px", "x_mm", "y_px"]
+    fillers = {"view_inliers": False, "residuals_px": np.nan, "x_mm": np.nan, "y_px": np.nan}
     if found.covariance_px2 is not None and len(found.covariance_px2) > 1:
-        names.append("covariance_px2")
-    return replace(found, view_inliers=full(found.view_inliers, False), **{n: full(getattr(found, n), np.nan) for n in names})
+        fillers["covariance_px2"] = np.nan
+    full = {}
+    for name, filler in fillers.items():
+        values = getattr(found, name)
+        full[name] = np.full((len(usable), *values.shape[1:]), filler)
+        full[name][usable] = values
+    return replace(found, **full)
 
 
 def _calibrate(

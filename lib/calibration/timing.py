@@ -171,7 +171,7 @@ def estimate_time_offset(
                 break
     if offset in (low, high):
         raise ValueError(f"search_s: {offset:.3f} s, lies at the end of the search; widen search_s or move start_s.")
-    sd = float(np.sqrt(sandwich(image[:, :, None], W, r, frame, landmark, np.zeros((1, 1)))[0][0, 0]))
+    sd = float(np.sqrt(sandwich(image[:, :, None], W, r, frame, landmark)[0][0, 0]))
     return TimeOffset(offset, sd, float(_rms_px(at(offset)[None], y, views)[0]), trial, misfit)
 
 

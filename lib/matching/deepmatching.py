@@ -397,6 +397,4 @@ def match_free(
     variance = stride**2 / 12 + 0.25 * stride**2 / 4
     covariance = np.tile(np.diag([SIGMA_LEFT_PX**2] * 2 + [variance] * 2), (len(u_left), 1, 1))
     score = np.clip(best[kept] / (n_levels(*best.shape) + 1), 0, 1)
-    return Matches(
-        u_left, u_right, score, covariance, peak_ratio=ratio[kept], reciprocal=passed[kept], method="deepmatching"
-    )
+    return Matches(u_left, u_right, score, covariance, peak_ratio=ratio[kept], reciprocal=passed[kept], method="deepmatching")

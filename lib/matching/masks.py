@@ -5,17 +5,17 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 
-def glint_mask(image: ArrayLike, *, level: int = 245, grow_px: int = 5) -> np.ndarray:
-    """Specular reflections: pixels whose every channel is nearly saturated, grown by a margin.
+def glint_mask(image: ArrayLike, *, grow_px: int = 5) -> np.ndarray:
+    """Specular reflections: pixels whose every channel is nearly saturated (245), grown by a margin for the halo.
 
     A glint moves with the viewpoint, not with the surface, so a match on one has the depth of a mirror image.  The image is
-    uint8, (h, w, 3) RGB or (h, w); `level` is the smallest value of the darkest channel, `grow_px` the margin for the halo.
+    uint8, (h, w, 3) RGB or (h, w).
     """
     image = np.asarray(image)
     if image.dtype != np.uint8 or image.ndim not in (2, 3):
         raise ValueError(f"image: expected a uint8 image (h, w, 3) or (h, w), got {image.dtype} {image.shape}.")
     channels = 1 if image.ndim == 2 else image.shape[2]
-    core = cv2.inRange(np.ascontiguousarray(image), (level,) * channels, (255,) * channels)
+    core = cv2.inRange(np.ascontiguousarray(image), (245,) * channels, (255,) * channels)
     if grow_px:
         core = cv2.dilate(core, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * grow_px + 1,) * 2))
     return core.astype(bool)

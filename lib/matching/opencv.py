@@ -116,8 +116,7 @@ def _judge(
     `reach`, a multiple of the lattice, is how far the canvases go on beyond the lattice on either side.
     """
     left, right = (
-        pixel_descriptors(image.astype(np.float32), DOWNSCALE, valid=seen)
-        for image, seen in zip(images, valid, strict=True)
+        pixel_descriptors(image.astype(np.float32), DOWNSCALE, valid=seen) for image, seen in zip(images, valid, strict=True)
     )
     margin = reach // CELL_PX
     gy, gx = len(left) // PATCH, (left.shape[1] - 2 * margin) // PATCH

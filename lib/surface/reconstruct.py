@@ -164,10 +164,7 @@ def reconstruct(
     True
     """
     seconds = {} if seconds is None else seconds
-    covariance = rig.covariance if isinstance(rig, Calibration) else None
-    rig = rig.rig if isinstance(rig, Calibration) else rig
-    if rig is None:
-        raise ValueError("rig: the calibration is of one camera; a stereo pair needs both.")
+    covariance, rig = (rig.covariance, rig.pair) if isinstance(rig, Calibration) else (None, rig)
     if refine and covariance is None:
         raise ValueError("refine: needs the covariance of the rig; give the Calibration in place of its rig.")
     if refine is None:
