@@ -13,7 +13,7 @@ from scipy.linalg import cho_solve_banded
 
 from lib.cameras import AffineCamera
 from lib.geometry import points, store_array
-from lib.surface.grid import SplineGrid, cubic_basis
+from lib.surface.grid import SplineGrid
 from lib.surface.solver import UNHELD, L1Problem, cholesky
 
 
@@ -159,10 +159,7 @@ class BSplineSurface:
         u = points(u, 2, "u")
         result = np.full((len(u), 3), np.nan)
         inside = self.grid.inside(u)
-        (cell, t), k = self.grid.locate(u[inside]), np.arange(4)
-        along_x, along_y = (cubic_basis(t[:, i], order[i]) / self.grid.cell_px[i] ** order[i] for i in (0, 1))
-        near = self.control_points_mm[cell[:, 1, None, None] + k[:, None], cell[:, 0, None, None] + k]
-        result[inside] = np.einsum("nj,njk->nk", along_y, np.einsum("ni,njik->njk", along_x, near))
+        result[inside] = self.grid.design(u[inside], order) @ self.grid.flatten(self.control_points_mm)
         return result
 
     def on_grid(self, x_px: ArrayLike, y_px: ArrayLike) -> np.ndarray:

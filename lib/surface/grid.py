@@ -100,14 +100,15 @@ class SplineGrid:
         cell = np.clip(np.floor(position), 0, np.array(self.cells) - 1).astype(np.intp)
         return cell, position - cell
 
-    def design(self, u: np.ndarray) -> sparse.csr_matrix:
-        """B (n, size) with 16 entries a row: B @ coefficients is the spline at u (n, 2)."""
+    def design(self, u: np.ndarray, derivative: tuple[int, int] = (0, 0)) -> sparse.csr_matrix:
+        """B (n, size) with 16 entries a row: B @ coefficients is the spline, or its derivative per px, at u (n, 2)."""
         cell, t = self.locate(u)
-        basis = cubic_basis(t)
+        scale = self.cell_px ** -np.array(derivative, dtype=float)
+        along_x, along_y = (cubic_basis(t[:, i], derivative[i]) * scale[i] for i in (0, 1))
         step_x, step_y = self.stride
         offset = np.arange(4, dtype=np.int32)[:, None] * step_y + np.arange(4, dtype=np.int32) * step_x
         columns = (cell @ self.stride).astype(np.int32)[:, None, None] + offset
-        values = basis[:, 1, :, None] * basis[:, 0, None, :]
+        values = along_y[:, :, None] * along_x[:, None, :]
         indptr = np.arange(0, 16 * len(u) + 1, 16, dtype=np.int32)
         return sparse.csr_matrix((values.ravel(), columns.ravel(), indptr), shape=(len(u), self.size))
 
