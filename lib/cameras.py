@@ -162,11 +162,6 @@ class NearAffineCamera(MatrixCamera):
                 raise ValueError(f"{name}: must be finite; 0 is the affine camera.")
             object.__setattr__(self, name, float(getattr(self, name)))
 
-    @property
-    def affine(self) -> AffineCamera:
-        """The affine camera that touches this one in the reference plane."""
-        return AffineCamera(self.matrix)
-
     def depth_ratio(self, x: np.ndarray) -> np.ndarray:
         """D (n,) of points (n, 3) mm: distance along the view over d; zero or less behind the camera."""
         return 1.0 + self.inverse_distance_per_mm * ((x - self.reference_mm) @ self.viewing_direction)

@@ -193,7 +193,7 @@ def test_near_affine_is_affine_where_the_inverse_distance_is_zero(rig):
     camera = NearAffineCamera(rig.left.matrix, 0.0, (959.5, 539.5))
     x = workspace(10)
     np.testing.assert_allclose(camera.project(x), rig.left.project(x), atol=1e-9)
-    np.testing.assert_array_equal(camera.affine.matrix, rig.left.matrix)
+    np.testing.assert_array_equal(camera.matrix, rig.left.matrix)
 
 
 def test_near_affine_is_a_pinhole():
