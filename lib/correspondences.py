@@ -81,8 +81,10 @@ class Correspondences:
         """
         x, left, right = points(x_mm, 3, "x_mm"), points(u_left, 2, "u_left"), points(u_right, 2, "u_right")
         n = len(x)
+        if not n == len(left) == len(right):
+            raise ValueError(f"x_mm, u_left, u_right: {n}, {len(left)} and {len(right)} rows; give one of each a landmark.")
         if confidence is None:
-            confidence = np.column_stack([np.isfinite(u).all(axis=1) for u in (left, right)])
+            confidence = np.isfinite([left, right]).all(axis=2).T
         return cls(
             x, left, right, np.full((n, 2, 2, 2), np.nan) if covariance_px2 is None else covariance_px2, confidence,
             np.arange(n) if frame is None else frame, np.zeros(n) if landmark is None else landmark,

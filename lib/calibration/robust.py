@@ -124,12 +124,12 @@ def _by_growth(x: np.ndarray, u: np.ndarray, rng: np.random.Generator, least_mm:
     Of few rows some minimal sample always fits a few others by chance, so its residuals say too little about the noise
     (Atkinson and Riani, "Robust diagnostic regression analysis", 2000).
     """
-    n = len(u)
-    H, size = np.column_stack([x - x.mean(axis=0), np.ones(n)]), (n + 5) // 2
-    sets = _samples(H[:, :3], 300, rng, least_mm)
-    distance2 = _distances2(H, u, np.linalg.solve(H[sets], u[sets]))
-    least_median = np.partition(distance2, n // 2, axis=1)[:, n // 2].argmin()
-    H, keep = np.column_stack([x, np.ones(n)]), np.argsort(distance2[least_median])[:size]
+    n, size = len(u), (len(u) + 5) // 2
+    centred, H = (np.column_stack([positions, np.ones(n)]) for positions in (x - x.mean(axis=0), x))
+    sets = _samples(centred[:, :3], 300, rng, least_mm)
+    distance2 = _distances2(centred, u, np.linalg.solve(centred[sets], u[sets]))
+    best = np.partition(distance2, n // 2, axis=1)[:, n // 2].argmin()  # of the least median
+    keep = np.argsort(distance2[best])[:size]
     for _ in range(10):  # concentrate: the rows nearest to their own fit
         keep, before = np.argsort(((u - H @ regress(x[keep], u[keep]).T) ** 2).sum(axis=1))[:size], keep
         if set(keep) == set(before):
