@@ -80,7 +80,7 @@ def match_with(
     disparity, confidence, *rest = maps = [np.asarray(part) for part in call(left, right, (-high, -low))]
     shapes = [part.shape for part in maps]
     if any(shape != left.shape for shape in shapes):
-        raise ValueError(f"method: the matcher {name} must return disparity and confidence {left.shape}, got {shapes}.")
+        raise ValueError(f"method: the matcher {name} must return arrays of the shape {left.shape}, got {shapes}.")
     passed = rest[0].astype(bool) if rest else np.ones(left.shape, dtype=bool)
 
     x, y = np.meshgrid(
