@@ -1,7 +1,6 @@
 """Correspondences: where the robot says a landmark is and where two cameras see it, each row at its own instant.
 
-This is the one type that calibration, clocks, registration, drift and the online system take, whoever found the
-landmarks: the detector, a person who labels, or the simulator (paper Eq. 2).
+Every later stage takes this type, whoever found the landmarks: detector, person or simulator (paper Eq. 2).
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -118,13 +117,13 @@ class Correspondences:
         """The rows that are complete."""
         return self.subset(self.is_complete)
 
-    def check_detections(self, fewest: int = 4) -> None:
-        """Raise a `NoDetectionError` where an image shows fewer than `fewest` landmarks whose position the robot reports."""
+    def check_detections(self) -> None:
+        """Raise a `NoDetectionError` where an image shows fewer than four landmarks whose position the robot reports."""
         usable = int((self.seen & np.isfinite(self.x_mm).all(axis=1)[:, None]).sum(axis=0).min())
-        if usable >= fewest:
+        if usable >= 4:
             return
         left, right = self.seen.sum(axis=0)
-        if min(left, right) >= fewest:
+        if min(left, right) >= 4:
             raise NoDetectionError(
                 f"data: the robot reports a position for {usable} of the {min(left, right)} landmarks that an image shows; "
                 "check offset_s and the times of frames and kinematics (`python3 -m lib check RECORDING`)."
@@ -176,21 +175,14 @@ def pair_with_robot(
     instant by the landmark's velocity.  A landmark seen in one image alone is taken at that image's instant.
 
     Args:
-        u_left, u_right: (m, k, 2) px, NaN = not seen.
+        u_left, u_right: (m, k, 2) px, NaN = not seen; they give m * k rows, frame by frame.
         position: Robot times (j, k) in s -> (j, k, 3) mm, NaN where it is silent: `lib.recordings.Kinematics.at`.
         time_s: (m,) times of the frames, video clock.
-        height_px: Rows of an image.
-        readout_s: Time from the first to the last row; 0 is a global shutter.
+        height_px, readout_s: Rows of an image, and time from the first to the last; 0 s is a global shutter.
         offset_s: t_robot = t_video + offset_s.
         covariance_px2, confidence: (m, k, 2, 2, 2) and (m, k, 2), left and right; None as in `Correspondences.of_points`.
         frame: (m,) numbers of the frames; None = 0 to m - 1.
         linear: (4, 3) px per mm, left and right, that turns velocities into pixels; None = fitted to these rows.
-
-    Returns:
-        Correspondences: m * k rows, frame by frame.
-
-    Raises:
-        ValueError: For wrong shapes, or a read-out time or height that make no shutter.
 
     A landmark moves down at 10 mm/s; at 100 px/mm a shutter of 20 ms sees it in the first and the last row, 20 ms apart:
 
@@ -236,11 +228,9 @@ def of_recording(
     recording: object, u_left: ArrayLike, u_right: ArrayLike, *, frames: Sequence[int] | slice | None = None,
     **known: ArrayLike | None,
 ) -> Correspondences:  # fmt: skip
-    """`pair_with_robot` with the clocks, shutter and kinematics of a `lib.recordings.Recording`.
+    """`pair_with_robot` of some `frames` (None = all) of a `lib.recordings.Recording`, which knows clocks and shutter.
 
-    Args:
-        u_left, u_right, known: Landmarks of the frames chosen; and covariance_px2, confidence, linear, as there.
-        frames: Which frames of the recording these are; None = all.
+    `known` are covariance_px2, confidence and linear, as there.
     """
     chosen = np.arange(len(recording.frames))[slice(None) if frames is None else frames]
     return pair_with_robot(
@@ -249,7 +239,7 @@ def of_recording(
     )  # fmt: skip
 
 
-def _affine(x: np.ndarray, u: np.ndarray, rounds: int = 10) -> np.ndarray:
+def _affine(x: np.ndarray, u: np.ndarray) -> np.ndarray:
     """A (2, 3) px per mm of the affine camera with the least sum of distances: it only turns small shifts into pixels."""
     known = np.isfinite(np.hstack([x, u])).all(axis=1)
     if known.sum() < 5:
@@ -257,7 +247,7 @@ def _affine(x: np.ndarray, u: np.ndarray, rounds: int = 10) -> np.ndarray:
     H, u = np.column_stack([x[known], np.ones(known.sum())]), u[known]
     H[:, :3] -= H[:, :3].mean(axis=0)
     weight = np.ones((len(H), 1))
-    for _ in range(rounds):
+    for _ in range(10):
         M = np.linalg.lstsq(np.sqrt(weight) * H, np.sqrt(weight) * u, rcond=1e-6)[0]
         weight = 1.0 / np.maximum(np.linalg.norm(u - H @ M, axis=1, keepdims=True), 0.1)
     return M[:3].T

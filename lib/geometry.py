@@ -14,10 +14,9 @@ from scipy.spatial.transform import Rotation
 
 
 def points(values: ArrayLike, dimension: int, name: str) -> np.ndarray:
-    """`values` as a float64 array (n, dimension); NaN passes.
+    """`values`, (n, dimension) or a single point, as a float64 array (n, dimension); NaN passes.
 
-    Raises:
-        ValueError: If the shape is not (n, dimension) or a single (dimension,) point; `name` is the argument named.
+    A ValueError of another shape names the argument `name`.
     """
     array = np.asarray(values, dtype=np.float64)
     if array.shape == (dimension,):
@@ -28,19 +27,22 @@ def points(values: ArrayLike, dimension: int, name: str) -> np.ndarray:
 
 
 def finite_points(values: ArrayLike, dimension: int, name: str) -> np.ndarray:
-    """`points`, with NaN and infinity refused.
-
-    Raises:
-        ValueError: Also if a row is not finite; the message counts the rows and names the first.
-    """
+    """`points`, with NaN and infinity refused by a ValueError that counts the rows and names the first."""
     array = points(values, dimension, name)
     bad = np.flatnonzero(~np.isfinite(array).all(axis=1))
     if bad.size:
-        raise ValueError(
-            f"{name}: {bad.size} of {len(array)} rows are not finite (the first is row {bad[0]}). "
-            "Drop the rows of missing landmarks first."
-        )
+        found = f"{bad.size} of {len(array)} rows are not finite (the first is row {bad[0]})"
+        raise ValueError(f"{name}: {found}. Drop the rows of missing landmarks first.")
     return array
+
+
+def store_array(instance: object, name: str, shape: tuple[int, ...]) -> None:
+    """Make a frozen dataclass's attribute a read-only float64 array; a ValueError where it is not finite or of `shape`."""
+    array = np.array(getattr(instance, name), dtype=np.float64)
+    if array.shape != shape or not np.isfinite(array).all():
+        raise ValueError(f"{name}: expected finite numbers of shape {shape}, got {array}.")
+    array.setflags(write=False)
+    object.__setattr__(instance, name, array)
 
 
 def pair_covariance(covariance_px2: ArrayLike | Sequence[ArrayLike] | None, n: int, images: int = 2) -> np.ndarray:
@@ -49,11 +51,8 @@ def pair_covariance(covariance_px2: ArrayLike | Sequence[ArrayLike] | None, n: i
     Args:
         covariance_px2: A number (the variance of each coordinate), (2, 2) for every image, (4, 4) for the pair, (n, 4, 4)
             one a match, (n, 2, 2, 2) one a match and image, or a list of one (n, 2, 2) an image.  None is 1 px^2.  NaN
-            passes, for landmarks that are not seen.
+            passes, for landmarks that are not seen; a ValueError refuses what is not positive definite.
         images: 2, or 1 for a single camera; then (2, 2) and (n, 2, 2) take the place of (4, 4) and (n, 4, 4).
-
-    Raises:
-        ValueError: For another shape, or a finite matrix that is not positive definite.
 
     >>> pair_covariance(4.0, 10)[0].diagonal()
     array([4., 4., 4., 4.])
@@ -135,16 +134,10 @@ class RigidTransform:
     t: np.ndarray
 
     def __post_init__(self) -> None:
-        R, t = np.array(self.R, dtype=np.float64), np.array(self.t, dtype=np.float64)
-        if R.shape != (3, 3) or t.shape != (3,):
-            raise ValueError(f"RigidTransform: R must be (3, 3) and t (3,), got {R.shape} and {t.shape}.")
-        if not (np.isfinite(R).all() and np.isfinite(t).all()):
-            raise ValueError("RigidTransform: R and t must be finite.")
-        if np.abs(R @ R.T - np.eye(3)).max() > 1e-5 or np.linalg.det(R) < 0:
-            raise ValueError("RigidTransform: R is not a rotation (orthonormal, determinant +1).")
-        for name, array in (("R", R), ("t", t)):
-            array.setflags(write=False)
-            object.__setattr__(self, name, array)
+        store_array(self, "R", (3, 3))
+        store_array(self, "t", (3,))
+        if np.abs(self.R @ self.R.T - np.eye(3)).max() > 1e-5 or np.linalg.det(self.R) < 0:
+            raise ValueError("R: it is not a rotation (orthonormal, determinant +1).")
 
     @classmethod
     def identity(cls) -> Self:

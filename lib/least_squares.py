@@ -50,10 +50,7 @@ def minimise(
         rank: Number of directions that the data determine; steps leave the others alone.  None is all p.
         iterations, tolerance: Most steps, and the relative decrease of the energy below which it is at its minimum.
 
-    Raises:
-        ValueError: If the start is not allowed.
-
-    The x where exp(x) = 2:
+    A ValueError refuses a start that is not allowed.  The x where exp(x) = 2:
 
     >>> def evaluate(x):
     ...     return 0.5 * float(2 - np.exp(x)) ** 2, 2 - np.exp(x)

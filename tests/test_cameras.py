@@ -117,7 +117,7 @@ def test_triangulation_is_the_weighted_minimum_and_its_covariance_is_right(rig, 
 
 @pytest.mark.parametrize("each", [False, True])
 def test_near_affine_triangulation_is_that_of_a_general_solver(near, each, monkeypatch):
-    monkeypatch.setattr("lib.cameras.rig._BLOCK", 7)
+    monkeypatch.setattr("lib.cameras._BLOCK", 7)
     rng = np.random.default_rng(5)
     x = workspace(23)
     u_left, u_right = (u + rng.normal(0, 3, u.shape) for u in near.project(x))
@@ -193,7 +193,7 @@ def test_near_affine_is_affine_where_the_inverse_distance_is_zero(rig):
     camera = NearAffineCamera(rig.left.matrix, 0.0, (959.5, 539.5))
     x = workspace(10)
     np.testing.assert_allclose(camera.project(x), rig.left.project(x), atol=1e-9)
-    np.testing.assert_array_equal(camera.affine.matrix, rig.left.matrix)
+    np.testing.assert_array_equal(camera.matrix, rig.left.matrix)
 
 
 def test_near_affine_is_a_pinhole():

@@ -19,8 +19,7 @@ from lib.cameras import AffineCamera
 def dlt(x_mm: ArrayLike, u: ArrayLike) -> AffineCamera:
     """Affine direct linear transform of one camera: least squares of u = M [x; 1] (paper Eq. 4).
 
-    Args:
-        x_mm, u: (n, 3) points in the robot frame and (n, 2) pixels, n >= 4, finite, not coplanar (else a ValueError).
+    The points x_mm (n, 3) and pixels u (n, 2), n >= 4, must be finite and not coplanar (else a ValueError).
 
     >>> x = np.vstack([np.zeros(3), np.eye(3)])
     >>> dlt(x, AffineCamera([[100, 1, 8, 960], [2, 100, 3, 540]]).project(x)).matrix.round(6).tolist()

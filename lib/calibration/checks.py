@@ -43,14 +43,10 @@ def check_spread(x: np.ndarray, sigma_x_mm: float = 0.0) -> None:
     least = max(1e-6 * extent[0], chance * sigma_x_mm)
     if extent[0] <= least:
         raise ValueError(f"x_mm: the points hardly move (RMS {extent[0]:.3g} mm); move the tool through the volume.")
-    for size, shape, cure in (
-        (extent[1], "collinear", "move the tool in all three directions"),
-        (extent[2], "coplanar", "cover a few depths as well"),
-    ):
+    cures = {"collinear": "move the tool in all three directions", "coplanar": "cover a few depths as well"}
+    for size, (shape, cure) in zip(extent[1:], cures.items(), strict=True):
         if size <= least:
-            raise ValueError(
-                f"x_mm: the points are {shape} (RMS {size:.3g} mm away, robot accuracy {sigma_x_mm:.3g} mm); {cure}."
-            )
+            raise ValueError(f"x_mm: the points are {shape} (RMS {size:.3g} mm, robot errors {sigma_x_mm:.3g} mm); {cure}.")
 
 
 def extents(x: np.ndarray) -> np.ndarray:
@@ -73,18 +69,14 @@ def check_units(x: np.ndarray, y: np.ndarray) -> None:
     if zoom > high:
         raise ValueError(f"x_mm: {zoom:.3g} px per mm is finer than light resolves; multiply metres by 1000.")
     if zoom < low:
-        raise ValueError(
-            f"x_mm: {zoom:.3g} px per mm is coarser than any camera over a tool; divide micrometres by 1000 (or move it)."
-        )
+        raise ValueError(f"x_mm: {zoom:.3g} px per mm is too coarse; divide micrometres by 1000, or move the tool.")
 
 
 def check_duplicates(x: np.ndarray, y: np.ndarray) -> None:
     """Refuse rows that repeat another row in every digit: they add no information and fake precision."""
     repeated = len(x) - len(np.unique(np.nan_to_num(np.hstack([x, y]), nan=-1e9), axis=0))
     if repeated:
-        raise ValueError(
-            f"x_mm, u: {repeated} of {len(x)} rows repeat another row exactly; drop frames frozen or read twice."
-        )
+        raise ValueError(f"x_mm, u: {repeated} of {len(x)} rows repeat another row; drop frames frozen or read twice.")
 
 
 def check_images(y: np.ndarray, image_size_px: tuple[int, int] | None = None) -> None:

@@ -62,9 +62,7 @@ def calibrate(
 
     Raises:
         NoConsensusError: A ValueError, where a camera's detections agree on no camera, or on two that compete.
-        ValueError: For NaN in plain arrays, fewer than four points, coplanar or collinear points, wrong units, repeated rows,
-            detections that stand still or are the same in both images, swapped cameras, an unknown model
-            or weighting, offsets that the data cannot tell.
+        ValueError: For rows that determine no camera, offsets that the data cannot tell, and what `checks` finds.
 
     >>> from lib.cameras import AffineCamera
     >>> rng = np.random.default_rng(0)
@@ -81,13 +79,12 @@ def calibrate(
         usable, axes = _usable_rows(data, offsets, weighting)
         rows = data.subset(usable)
         x, y = rows.x_mm, rows.stacked_px
+        noise = None
         if covariance_px2 is not None:
             noise = pair_covariance(covariance_px2, len(data))
             noise = noise[usable] if len(noise) > 1 else noise
-        else:
-            own = weighting == "likelihood" and sigma_u_px is None and np.isfinite(rows.covariance_px2[rows.seen]).all()
-            noise = np.where(rows.seen[:, :, None, None], rows.covariance_px2, np.eye(2)) if own else None
-            noise = None if noise is None else pair_covariance(noise, len(rows))
+        elif weighting == "likelihood" and sigma_u_px is None and np.isfinite(rows.covariance_px2[rows.seen]).all():
+            noise = pair_covariance(np.where(rows.seen[:, :, None, None], rows.covariance_px2, np.eye(2)), len(rows))
     else:
         if u is None:
             raise ValueError("u: give [u_left, u_right] with plain positions, or Correspondences alone.")
@@ -105,7 +102,11 @@ def calibrate(
     if axes is None and offsets != "image":
         found = fitted(x, y)
         if weighting == "likelihood" and None in (sigma_u_px, sigma_x_mm):
-            found = _scattered(found, None if usable is None else rows)
+            # The covariance that an estimated noise level and errors correlated in time ask for.
+            _, J, weight, r = found.system
+            order = () if usable is None else (rows.frame[found.inliers], rows.landmark[found.inliers])
+            known, effective = sandwich(J, weight, r, *order)
+            found = replace(found, parameter_covariance=known, effective_rows=effective)
     else:
         estimate = partial(estimate_offsets, fitted, x, y, rows.landmark, frame=rows.frame, prior_sd=offset_prior_sd)
         found = estimate(axes=axes)
@@ -157,26 +158,17 @@ def _turned(
     return replace(other, offsets=replace(other.offsets, turns=True))
 
 
-def _scattered(found: Calibration, rows: Correspondences | None) -> Calibration:
-    """The calibration with the covariance that an estimated noise level and errors correlated in time ask for."""
-    _, J, weight, r = found.system
-    time = (None, None) if rows is None else (rows.frame[found.inliers], rows.landmark[found.inliers])
-    known, effective = sandwich(J, weight, r, *time, np.zeros((J.shape[2], J.shape[2])))
-    return replace(found, parameter_covariance=known, effective_rows=effective)
-
-
 def _spread_out(found: Calibration, usable: np.ndarray) -> Calibration:
     """The calibration of the usable rows with an entry for every row given."""
-
-    def full(values: np.ndarray, filler: object) -> np.ndarray:
-        result = np.full((len(usable), *values.shape[1:]), filler)
-        result[usable] = values
-        return result
-
-    names = ["residuals_px", "x_mm", "y_px"]
+    fillers = {"view_inliers": False, "residuals_px": np.nan, "x_mm": np.nan, "y_px": np.nan}
     if found.covariance_px2 is not None and len(found.covariance_px2) > 1:
-        names.append("covariance_px2")
-    return replace(found, view_inliers=full(found.view_inliers, False), **{n: full(getattr(found, n), np.nan) for n in names})
+        fillers["covariance_px2"] = np.nan
+    full = {}
+    for name, filler in fillers.items():
+        values = getattr(found, name)
+        full[name] = np.full((len(usable), *values.shape[1:]), filler)
+        full[name][usable] = values
+    return replace(found, **full)
 
 
 def _calibrate(

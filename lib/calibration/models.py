@@ -1,16 +1,7 @@
 """The ladder of camera models, their analytic Jacobians, and the constrained minimum of the same energy.
 
-A model is a base and options joined by "+":
-
-    affine        8 numbers a camera
-    zero_skew     K diagonal (the paper's): rotation, two zooms, two offsets; 7 a camera
-    square        one zoom a camera; 6
-    common_zoom   one zoom for both; 11 a pair
-    +distance     one 1/distance for all cameras (near-affine), +distances one a camera
-    +radial       one radial distortion coefficient a camera
-
-"near_affine" is short for "zero_skew+distance".  A state moves by increments; every model is a selection matrix
-from its free parameters to the increments of all cameras, so one set of derivatives serves all.
+A state moves by increments; every model is a selection matrix from its free parameters to the increments of all cameras,
+so one set of derivatives serves all.
 """
 
 from __future__ import annotations
@@ -32,7 +23,15 @@ _CROSS = np.cross(np.eye(3)[:, None], np.eye(3))  # of every two unit vectors
 
 @dataclass(frozen=True)
 class Model:
-    """A rung of the ladder for one or two cameras."""
+    """A rung of the ladder for one or two cameras: a base and options joined by "+".
+
+    affine        8 numbers a camera
+    zero_skew     K diagonal (the paper's): rotation, two zooms, two offsets; 7 a camera
+    square        one zoom a camera; 6
+    common_zoom   one zoom for both; 11 a pair
+    +distance     one 1/distance for all cameras (near-affine), +distances one a camera
+    +radial       one radial distortion coefficient a camera
+    """
 
     base: str
     distance: str | None
@@ -45,10 +44,8 @@ class Model:
         base, *options = ("zero_skew+distance" if name == "near_affine" else str(name)).split("+")
         known = base in BASES and all(o in OPTIONS for o in options) and len(set(options)) == len(options)
         if not known or {"distance", "distances"} <= set(options):
-            raise ValueError(
-                f"model: unknown model {name!r}; take one of {', '.join(BASES)} or near_affine, and add +distance or "
-                "+distances, +radial."
-            )
+            names = f"{', '.join(BASES)} or near_affine, and add +distance or +distances, +radial"
+            raise ValueError(f"model: unknown model {name!r}; take one of {names}.")
         return cls(base, next((o for o in options if o != "radial"), None), "radial" in options, cameras)
 
     @property

@@ -25,10 +25,8 @@ def tool_axes(x_mm: ArrayLike, offset_mm: np.ndarray | None = None) -> np.ndarra
     With `offset_mm` (3, 3), those of the landmarks moved by it in these very axes, which turns those of nearly shut jaws.
     NaN where the jaws are shut (tips closer than 5 % of the tool's length), a landmark is missing, or no axes fulfil that.
 
-    >>> tool_axes([[[0, 0, 0], [3, -0.5, 0], [3, 0.5, 0]]])[0]
-    array([[1., 0., 0.],
-           [0., 1., 0.],
-           [0., 0., 1.]])
+    >>> tool_axes([[[0, 0, 0], [3, -0.5, 0], [3, 0.5, 0]]])[0].tolist()
+    [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     """
     x = np.asarray(x_mm, dtype=np.float64)
     if x.ndim != 3 or x.shape[1:] != (3, 3):

@@ -28,9 +28,7 @@ class Pivot:
 
 @dataclass(frozen=True, eq=False)
 class Tool:
-    """Landmarks in the tool frame, of a tool whose jaws may open: offset + sin(o / 2) sine + (1 - cos(o / 2)) versine.
-
-    Here o is the full angle between the jaws.
+    """Landmarks in the tool frame, at a full angle o between the jaws: offset + sin(o / 2) sine + (1 - cos(o / 2)) versine.
 
     Attributes:
         offset_mm: (k, 3) where the landmarks are when the jaws are closed.
@@ -80,8 +78,7 @@ class ToolOffsets(Tool):
 def pivot_calibration(robot_from_tool: Sequence[RigidTransform]) -> Pivot:
     """Classical pivot calibration: the tip rests in one point while the tool turns, R_i p + t_i = c.
 
-    Raises:
-        ValueError: For fewer than three poses, rotations about one axis only, or a tip that did not rest.
+    A ValueError refuses fewer than three poses, rotations about one axis only, and a tip that did not rest.
 
     >>> R = [RigidTransform.from_rotation_vector(v).R for v in ((0, 0, 0), (0.4, 0, 0), (0, 0.4, 0), (-0.3, 0.2, 0))]
     >>> tip, rest = np.array([2.0, 1.0, 12.0]), np.array([5.0, 5.0, 5.0])
@@ -116,8 +113,7 @@ def tool_offsets(
         opening_rad: (n,) full angle between the jaws; None is a tool without a hinge.
         turning: (k,) not 0 for landmarks on a jaw; None is all but the first.
 
-    Raises:
-        ValueError: For too few poses, motion that does not determine the offsets or the hinge, or shapes that do not match.
+    A ValueError refuses too few poses, and motion that does not determine the offsets or the hinge.
     """
     R, t = _poses(robot_from_tool)
     images = [np.asarray(pixels, dtype=np.float64) for pixels in u]
@@ -187,7 +183,5 @@ def _poses(robot_from_tool: Sequence[RigidTransform]) -> tuple[np.ndarray, np.nd
 def _check_determined(covariance_mm2: np.ndarray) -> None:
     variance = np.diagonal(covariance_mm2, axis1=-2, axis2=-1)
     if not ((variance >= 0) & (variance < _LARGEST_SD_MM**2)).all():
-        raise ValueError(
-            f"robot_from_tool: the motion leaves an offset open by {np.sqrt(np.abs(variance).max()):.2g} mm; turn the tool "
-            "further, about two axes, or give more poses."
-        )
+        sd_mm = np.sqrt(np.abs(variance).max())
+        raise ValueError(f"robot_from_tool: the motion leaves an offset open by {sd_mm:.2g} mm; turn more, about two axes.")

@@ -1,11 +1,9 @@
 """Which detections agree on a camera at all: the tightest consensus that the data support, each camera alone.
 
-A detector that is lost is wrong in more than one way and at more than one scale, so no threshold is known beforehand.
 Samples of four points give affine cameras, ranked with the scale of every row marginalised (a sum of log distances).  The
 best start an expectation maximisation of three populations: right detections (Gaussian), wrong ones that have something to
 do with the tool (a Gaussian at least four times as wide), and any pixel (uniform).  Few rows cannot tell three populations
-apart; there the half that agrees best takes in one row after another (the forward search).  A camera without a
-consensus is refused, and so is one with two.
+apart; there the half that agrees best takes in one row after another (the forward search).
 """
 
 from typing import NamedTuple
@@ -80,12 +78,9 @@ def _one_camera(
     n = len(u)
     if n < 8:
         return _Found(np.ones(n, dtype=bool), regress(x, u), 0.0, np.inf, np.inf)
-    cure = (
-        "check that x_mm and u belong together (frames, order of landmarks, time offset) and that the detector knows this "
-        "tool"
-    )
+    cure = "check that x_mm and u belong together (frames, landmarks, clocks) and that the detector knows this tool"
     if threshold_px is None and n < _FEW:
-        found, enough = _by_growth(x, u, _best_sample(x, u, rng, least_mm)), min(8, n - n // 4)
+        found, enough = _by_growth(x, u, rng, least_mm), min(8, n - n // 4)
     else:
         found = _tightest(x, u, threshold_px, rng, least_mm)
         enough = max(8, int((_LEAST_SHARE if threshold_px is None else 0.1) * n))
@@ -123,23 +118,18 @@ def _competing(name: str, first: np.ndarray, second: np.ndarray, n: int) -> str:
 # --- few rows
 
 
-def _best_sample(x: np.ndarray, u: np.ndarray, rng: np.random.Generator, least_mm: float) -> np.ndarray:
-    """Squared distances (n,) to the camera of the sample with the least median of them."""
-    H = np.column_stack([x - x.mean(axis=0), np.ones(len(x))])
-    sets = _samples(H[:, :3], 300, rng, least_mm)
-    distance2 = _distances2(H, u, np.linalg.solve(H[sets], u[sets]))
-    return distance2[np.partition(distance2, len(x) // 2, axis=1)[:, len(x) // 2].argmin()]
-
-
-def _by_growth(x: np.ndarray, u: np.ndarray, distance2: np.ndarray) -> _Found:
+def _by_growth(x: np.ndarray, u: np.ndarray, rng: np.random.Generator, least_mm: float) -> _Found:
     """Few rows: from the half that agrees best, taking in the next best row as long as an F test lets it.
 
     Of few rows some minimal sample always fits a few others by chance, so its residuals say too little about the noise
     (Atkinson and Riani, "Robust diagnostic regression analysis", 2000).
     """
-    n = len(u)
-    H, size = np.column_stack([x, np.ones(n)]), (n + 5) // 2
-    keep = np.argsort(distance2)[:size]
+    n, size = len(u), (len(u) + 5) // 2
+    centred, H = (np.column_stack([positions, np.ones(n)]) for positions in (x - x.mean(axis=0), x))
+    sets = _samples(centred[:, :3], 300, rng, least_mm)
+    distance2 = _distances2(centred, u, np.linalg.solve(centred[sets], u[sets]))
+    best = np.partition(distance2, n // 2, axis=1)[:, n // 2].argmin()  # of the least median
+    keep = np.argsort(distance2[best])[:size]
     for _ in range(10):  # concentrate: the rows nearest to their own fit
         keep, before = np.argsort(((u - H @ regress(x[keep], u[keep]).T) ** 2).sum(axis=1))[:size], keep
         if set(keep) == set(before):

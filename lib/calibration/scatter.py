@@ -1,9 +1,8 @@
 """How far estimates scatter where the noise is estimated and neighbouring frames err alike.
 
-A detector that looks at the same tool in the same light repeats its errors, and so does a robot.  The errors of a landmark
-are taken for a first-order autoregression over the frames, whose correlation the residuals tell (restricted maximum
-likelihood, averaged over its posterior); the estimates stay as they are, their covariance becomes the sandwich
-H^-1 (J^T W R W J) H^-1 (Liang and Zeger, "Longitudinal data analysis using generalized linear models", 1986).
+The errors of a landmark are taken for a first-order autoregression over the frames, whose correlation the residuals tell
+(restricted maximum likelihood, averaged over its posterior); the estimates stay as they are, their covariance becomes the
+sandwich H^-1 (J^T W R W J) H^-1 (Liang and Zeger, "Longitudinal data analysis using generalized linear models", 1986).
 """
 
 import numpy as np
@@ -16,15 +15,15 @@ _NONE = 0.5  # prior probability that the errors are independent
 
 
 def sandwich(
-    J: np.ndarray, weight: np.ndarray, r: np.ndarray, frame: np.ndarray | None, landmark: np.ndarray | None,
-    prior: np.ndarray,
+    J: np.ndarray, weight: np.ndarray, r: np.ndarray, frame: np.ndarray | None = None, landmark: np.ndarray | None = None,
+    prior: np.ndarray | float = 0.0,
 ) -> tuple[np.ndarray, float]:  # fmt: skip
     """Covariance (p, p) of estimates from rows whose noise level is estimated, and as how many independent rows they count.
 
     Args:
         J, weight, r: (n, m, p) derivatives, (1 or n, m, m) inverse covariances, (n, m) residuals; zero where not seen.
         frame, landmark: (n,) of the rows, whose errors may be correlated from frame to frame; None: they are independent.
-        prior: (p, p) information that does not come from the rows.
+        prior: (p, p) information that does not come from the rows, 0 where there is none.
     """
     n, m, p = J.shape
     seen = np.broadcast_to(np.diagonal(weight, axis1=1, axis2=2) > 0, (n, m))
@@ -46,7 +45,7 @@ def sandwich(
             rows = rows[np.argsort(frame[rows], kind="stable")]
             groups.append((rows, slice(2 * c, 2 * c + 2), np.abs(np.subtract.outer(frame[rows], frame[rows])) / step))
     chance, variance = _posterior(K, e, groups, known)
-    meat = prior.copy()
+    meat = np.zeros((p, p)) + prior
     for rows, view, lag in groups:
         block = 300 if len(rows) > 600 else 600  # long recordings: what lies beyond a block is independent
         for first in range(0, len(rows), block):

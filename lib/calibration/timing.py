@@ -104,9 +104,8 @@ def estimate_time_offset(
         start_s, search_s: Middle and half width of the search.
         smooth_s: Time within which the motion is smooth: the kinematics' noise is averaged over it.
 
-    Raises:
-        ValueError: For wrong shapes, fewer than eight instants inside the kinematics, a tool at rest, no cameras that the
-            rows agree on (`NoConsensusError`), or an offset at the end of the search.
+    A ValueError refuses fewer than eight instants inside the kinematics, a tool at rest, rows that agree on no cameras
+    (`NoConsensusError`), and an offset at the end of the search.
     """
     time, frame, landmark, y = _rows(data)
     paths = _paths(kinematics, smooth_s)
@@ -172,7 +171,7 @@ def estimate_time_offset(
                 break
     if offset in (low, high):
         raise ValueError(f"search_s: {offset:.3f} s, lies at the end of the search; widen search_s or move start_s.")
-    sd = float(np.sqrt(sandwich(image[:, :, None], W, r, frame, landmark, np.zeros((1, 1)))[0][0, 0]))
+    sd = float(np.sqrt(sandwich(image[:, :, None], W, r, frame, landmark)[0][0, 0]))
     return TimeOffset(offset, sd, float(_rms_px(at(offset)[None], y, views)[0]), trial, misfit)
 
 
@@ -186,17 +185,17 @@ def _rms_px(x: np.ndarray, y: np.ndarray, views: np.ndarray) -> np.ndarray:
     return np.sqrt(squares / views.sum())
 
 
-def shift_misfits(x: np.ndarray, y: np.ndarray, least_share: float = 0.6) -> np.ndarray:
+def shift_misfits(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Misfit (t, cameras) of pixels y (n, m), NaN = not seen, to the cameras that suit each trial's positions x (t, n, 3).
 
     The mean negative log of a bivariate Cauchy density whose scale is the median residual: right detections decide, however
-    many others there are.  Infinite where fewer than `least_share` of the rows, or than eight, have a position.
+    many others there are.  Infinite where fewer than 60 % of the rows, or than eight, have a position.
     """
     found = np.full((len(x), y.shape[1] // 2), np.inf)
     for c, u in enumerate(np.split(y, found.shape[1], axis=1)):
         seen = np.isfinite(u).all(axis=1)
         used = np.isfinite(x[:, seen]).all(axis=2)
-        good = used.sum(axis=1) >= max(8, least_share * seen.sum())
+        good = used.sum(axis=1) >= max(8, 0.6 * seen.sum())
         used = used[good]
         H = np.where(used[:, :, None], np.concatenate([x[good][:, seen], np.ones((*used.shape, 1))], axis=2), 0.0)
         u, weight, median = u[seen], used.astype(float), np.median if used.all() else np.nanmedian  # which takes far longer

@@ -1,10 +1,4 @@
-"""Semi-dense stereo matching: DeepMatching, its fast form along epipolar lines, and alternatives (paper Sec. IV-B).
-
-matches = match(left, right, rig=rig)                    # along the epipolar lines, sub-pixel: the default
-matches = match(left, right)                             # free DeepMatching, no calibration needed
-matches = match(left, right, rig=RECTIFIED)              # a rectified pair: rows correspond
-points = rig.triangulate(matches.u_left, matches.u_right, matches.covariance_px2)
-"""
+"""Semi-dense stereo matching: DeepMatching, its fast form along epipolar lines, and alternatives (paper Sec. IV-B)."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -39,8 +33,8 @@ def match(
             `epipolar_px`. "band": DeepMatching along the epipolar lines, sub-pixel; needs a rig. "sgbm", "dis":
             OpenCV's, on rectified canvases; without a rig the pair is taken as rectified. A callable `f(left, right,
             (low, high)) -> (disparity, confidence)` of rectified grey uint8 images (h, w), x_right = x_left -
-            disparity, not finite = none; confidence in [0, 1]: the slot for learned matchers.  A third array (h, w)
-            bool, where it returns one, is its own check of the way back. None is "band" with a rig, else "deepmatching".
+            disparity, not finite = none; confidence in [0, 1].  A third array (h, w) bool, where it returns one, is its own
+            check of the way back. None is "band" with a rig, else "deepmatching".
         rig: Calibrated rig, or `RECTIFIED` for a pair whose rows correspond (depth is then disparity in px).
         mask_left, mask_right: (h, w) bool, True = ignore (see `glint_mask`, `tool_mask`).
         depth_range_mm: (near, far): the values of d.x to search, where d is the left camera's `viewing_direction` and x
@@ -57,12 +51,9 @@ def match(
         device: torch device of free DeepMatching, such as "cuda".
 
     Returns:
-        Matches: Possibly none.  Of its three confidences the score is usually the best, but SGBM has none (always 1);
-            the peak ratio and the reciprocal check mean the same for every method.
-
-    Raises:
-        ValueError: For images of a wrong type or shape, masks of a wrong shape or that leave nothing, an unknown method
-            or setting, too small a budget, or a rig that does not fit the images (with the epipolar error).
+        Possibly none.  Of the three confidences the score is usually the best, but SGBM has none (always 1); the peak ratio
+        and the reciprocal check mean the same for every method.  A ValueError refuses unfit images, masks and options, and
+        a rig that does not fit the images (with the epipolar error).
 
     >>> noise = np.random.default_rng(0).integers(0, 255, (48, 64), dtype=np.uint8)
     >>> matches = match(noise, np.roll(noise, 4, axis=1))

@@ -2,12 +2,6 @@
 
 A coarse pass on small images, free to leave the epipolar line, tells whether the rig fits the images and where in depth
 the scene lies.  The fine pass searches only the band that is left.
-
-The sub-cell displacement is one symmetric Gauss-Newton step on the descriptors.  Raw intensity would be biased where the
-two optical paths differ in gain and blur (by 0.4 px on retinal images); the descriptors are squashed gradients, and each
-patch is scaled to the other's norm.  With f the left and g the right patch and w the mean of their gradients along x
-(efficient second-order minimisation: Malis, ICRA 2004), the step is w.(f - g) / w.w.  It is exact to second order and has
-no bias at zero, unlike the vertex of a parabola through three correlations, the starting point for `VolumeMatches`.
 """
 
 from concurrent.futures import ThreadPoolExecutor
@@ -17,11 +11,10 @@ import numpy as np
 import torch
 
 from lib.cameras import StereoRig
-from lib.matching.descriptors import CHANNELS, MIN_SEEN, patch_quality, pixel_descriptors
-from lib.matching.pyramid import PATCH, peak_ratio
+from lib.matching.deepmatching import VolumeMatches, correlation_volume, match_volume, peak_ratio, volume_bytes
+from lib.matching.descriptors import CHANNELS, MIN_SEEN, PATCH, patch_quality, pixel_descriptors
 from lib.matching.rectification import Rectification, rectify, warp
 from lib.matching.result import SIGMA_LEFT_PX, Matches
-from lib.matching.volume import VolumeMatches, correlation_volume, match_volume, predicted_bytes
 from lib.parallel import single_threaded_torch
 
 Images = tuple[np.ndarray, np.ndarray]
@@ -76,8 +69,7 @@ class Search:
 def plan_search(images: Images, masks: Masks, rig: StereoRig, where: Where) -> Search:
     """Choose the canvas, check the rig by coarse matches, and find the range of depth where it is not given.
 
-    Raises:
-        ValueError: If the rig does not fit the images, or both cameras see nothing in the depth range.
+    A ValueError refuses a rig that does not fit the images, and a depth range in which both cameras see nothing.
     """
     setting, depth_range_mm, max_epipolar_px = where
     shapes = images[0].shape, images[1].shape
@@ -132,7 +124,6 @@ def _descriptors(
     step, low, high = PATCH * CELL_PX, *range_cells
     width, height = (side // step * step for side in rectification.size_px)
     margin_y = off_line * CELL_PX
-
     wide = width + (high - low) * CELL_PX, height + 2 * margin_y
 
     def one(image: np.ndarray, mask: np.ndarray | None, target: np.ndarray, size: tuple, shift: tuple) -> np.ndarray:
@@ -173,18 +164,14 @@ def _supported(matches: VolumeMatches) -> np.ndarray:
 
 
 def match_band(images: Images, masks: Masks, rig: StereoRig, where: Where, *, budget_bytes: int, reciprocal: bool) -> Matches:
-    """Matches of a calibrated pair; arguments as in `lib.matching.match`, images (h, w) uint8 grey.
-
-    Raises:
-        ValueError: As `plan_search`, and if the search would need more memory than the budget.
-    """
+    """Matches of a calibrated pair; arguments as in `lib.matching.match`, images (h, w) uint8 grey."""
     search = plan_search(images, masks, rig, where)
     if not search.n_found and where[1] is None:
         return Matches(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros((0, 4, 4)), method="band")
     rectification = search.rectification
     low, high = (int(np.floor(search.range_px[0] / CELL_PX)) - 1, int(np.ceil(search.range_px[1] / CELL_PX)) + 1)
     gx, gy = (side // (PATCH * CELL_PX) for side in rectification.size_px)
-    need = predicted_bytes(gy, gx, high - low + 1, OFF_LINE)
+    need = volume_bytes(gy, gx, high - low + 1, OFF_LINE)
     if need > budget_bytes:
         raise ValueError(
             f"budget_bytes: {high - low + 1} displacements of {gx} x {gy} patches need {need / 2**30:.2f} GiB, the budget "
@@ -238,7 +225,11 @@ def _derivatives(windows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def refine(
     left: np.ndarray, right: np.ndarray, start_left: np.ndarray, start_right: np.ndarray, *, margin: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Refine matches of whole cells.
+    """Refine matches of whole cells by one symmetric Gauss-Newton step on the descriptors.
+
+    With f the left and g the right patch, scaled to the same norm, and w the mean of their gradients along x, the step is
+    w.(f - g) / w.w (efficient second-order minimisation: Malis, ICRA 2004).  It is exact to second order and has no bias at
+    zero, unlike the vertex of a parabola; raw intensity would be biased where gain and blur differ (by 0.4 px on retinas).
 
     Args:
         left, right: (h, w, C) float32 descriptor grids.
@@ -246,9 +237,8 @@ def refine(
         margin: Cells added to the patch on every side: steadier on smooth surfaces, worse at depth edges.
 
     Returns:
-        (step, sigma): (n, 2) cells to add to the right (x, y), at most 1 either way: x on the line, and y as a step
-            that may leave the line finds it.  And their standard deviations (n, 2) if the descriptors' residuals were
-            independent: the shape of the uncertainty, not yet its scale.
+        Cells (n, 2) to add to the right (x, y), at most 1 either way: x on the line, and y as a step that may leave the line
+        finds it.  And their standard deviations (n, 2) if the descriptors' residuals were independent, up to a scale.
     """
     pad = margin + REACH
     left, right = (np.pad(grid, ((margin + 1, margin + 1), (pad, pad), (0, 0))) for grid in (left, right))

@@ -1,20 +1,291 @@
-"""Free DeepMatching of two images, on the CPU or on CUDA: no calibration, whole positions (see `lib.matching.pyramid`).
+"""DeepMatching: the pyramid of responses, on displacements along the epipolar line or free, on the CPU or on CUDA.
 
-Of the atomic patches only the pooled maps are stored.  Their full maps are four times as large, and are computed again
-where the paths arrive at them.
+Source: Revaud, Weinzaepfel, Harchaoui, Schmid, DeepMatching: Hierarchical Deformable Dense Matching (IJCV 2016).
+
+1. The atomic patches of 4 x 4 cells are correlated with the right image: responses (gy, gx, rows, columns).
+2. Bottom-up: the response of a patch twice as large is the mean of its four children's responses, each max-pooled
+   (so that a child may move by a cell) and halved; then raised to the power 1.4.
+3. Top-down: from every cell of every top map the best children are followed down and their responses added up.  Each
+   cell keeps its best path only.  This is a max-sum dynamic programme, so it runs on whole maps at once.
+4. A match is kept if it is the best of its left patch and of its place in the right image.
+
+Parents live on a dense lattice whose step is the atomic patch, so every level has about as many maps as the first.  The
+last two axes are either places in the right image (`shifted`: a child lies one pooled cell away from its parent) or
+displacements, in which a child stays where its parent is, so that both passes are slices only.
 """
 
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple, Self
 
 import numpy as np
 import torch
+from torch.nn.functional import max_pool1d, max_pool2d, pad
 
-from lib.matching.descriptors import CHANNELS, patch_quality, pixel_descriptors
-from lib.matching.pyramid import PATCH, POWER, n_levels, path_scores, peak_ratio, pool, unit_patches, unpool
+from lib.matching.descriptors import CHANNELS, PATCH, patch_quality, pixel_descriptors
 from lib.matching.result import SIGMA_LEFT_PX, Matches
 
+POWER = 1.4
+BORDER_POWER = 0.9
+#: Lattice rows of a volume that are worked on at once: they stay in the cache.
+ROWS = 8
 #: Bytes of the full maps of atomic patches that are held at once.
 CHUNK_BYTES = 32 << 20
+
+
+def unit_patches(grid: torch.Tensor) -> torch.Tensor:
+    """(gy, gx, 16 C) unit descriptors of the atomic patches of a grid (h, w, C)."""
+    gy, gx = grid.shape[0] // PATCH, grid.shape[1] // PATCH
+    cells = grid[: gy * PATCH, : gx * PATCH].reshape(gy, PATCH, gx, PATCH, -1)
+    patches = cells.permute(0, 2, 1, 3, 4).reshape(gy, gx, -1)
+    return patches / patches.norm(dim=2, keepdim=True).clamp_min(1e-12)
+
+
+def n_levels(gy: int, gx: int) -> int:
+    """Levels above the atomic patches: patches double while they fit the longer side and all their children exist."""
+    levels = 0
+    while 2 ** (levels + 1) <= max(gy, gx) and 2 ** max(levels - 1, 0) <= min(gy, gx) / 2:
+        levels += 1
+    return levels
+
+
+def pool(maps: torch.Tensor, start: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
+    """Maxima over three columns at every second one; and of these over three rows at rows start, start + 2, ..."""
+    along_x = max_pool1d(maps.flatten(0, 2), 3, stride=2, padding=1).reshape(*maps.shape[:3], -1)
+    out = along_x[:, :, start::2].clone()
+    for first, beside in ((1 - start, along_x[:, :, 1 - start :: 2]), (0, along_x[:, :, start + 1 :: 2])):
+        there = out[:, :, first : first + beside.shape[2]]
+        torch.maximum(there, beside[:, :, : there.shape[2]], out=there)
+    return along_x, out
+
+
+def unpool(
+    maps: torch.Tensor, along_x: torch.Tensor, pooled: torch.Tensor, score: torch.Tensor, start: int = 0
+) -> torch.Tensor:
+    """Give the score of each pooled cell to the cell that was its maximum in `pool`; cells that none reaches get -inf."""
+    return _unpool_axis(maps, along_x, _unpool_axis(along_x, pooled, score, 2, start), 3, 0)
+
+
+def _unpool_axis(maps: torch.Tensor, pooled: torch.Tensor, score: torch.Tensor, axis: int, start: int) -> torch.Tensor:
+    out = torch.full_like(maps, -torch.inf)
+    cells, given, pooled, score = (x.movedim(axis, 0) for x in (maps, out, pooled, score))
+    for first in (start - 1, start, start + 1):
+        skip = int(first < 0)  # nothing lies before the first cell
+        here, there = (x[first + 2 * skip :: 2] for x in (cells, given))
+        n = min(len(here), len(pooled) - skip)
+        if n > 0:
+            chosen = here[:n] == pooled[skip : skip + n]
+            torch.maximum(there[:n], torch.where(chosen, score[skip : skip + n], -torch.inf), out=there[:n])
+    return out
+
+
+def _by_axis(maps: torch.Tensor, axis: int) -> torch.Tensor:
+    """The same responses with the lattice and the map along one axis first."""
+    return maps.movedim((axis, axis + 2), (0, 1))
+
+
+def _sides(level: int, n: int, n_map: int, shifted: bool) -> Iterator[tuple[tuple, tuple]]:
+    """Indices (lattice, map) of parents and children, for the child before and the child behind, of n children."""
+    wider = int(level == 1)  # there is a parent beyond the last child
+    off = 1 if level == 1 else 2 ** (level - 2)
+    near, far = slice(0, n_map - shifted), slice(int(shifted), n_map)
+    yield (slice(off, n + wider), far), (slice(0, n + wider - off), near)
+    yield (slice(0, n + wider - off), near), (slice(off - wider, n), far)
+
+
+def gather(pooled: torch.Tensor, axis: int, level: int, *, shifted: bool) -> torch.Tensor:
+    """Responses of the parents of a level along one lattice axis: the mean of the children that exist.
+
+    Children beyond the lattice do not exist; of those that do, some have a place beyond the map (not valid).  The sum
+    over the valid ones is divided by n_exist^0.1 n_valid^0.9, as in the published implementation.
+    """
+    shape = list(pooled.shape)
+    shape[axis] += level == 1
+    out = pooled.new_zeros(shape)
+    total, single = _by_axis(out, axis), _by_axis(pooled, axis)
+    exist, valid = torch.zeros(len(total), 1), torch.zeros(total.shape[:2])
+    for parents, children in _sides(level, *single.shape[:2], shifted):
+        total[parents] += single[children]
+        exist[parents[0]] += 1
+        valid[parents] += 1
+    factor = exist.clamp_min(1) ** (BORDER_POWER - 1) * valid.clamp_min(1) ** -BORDER_POWER * (valid > 0)
+    total *= factor.to(out)[..., None, None]
+    return out
+
+
+def _scatter(score: torch.Tensor, axis: int, level: int, n: int, *, shifted: bool) -> torch.Tensor:
+    """Best score of the two parents for n children along one lattice axis: the reverse of `gather`."""
+    shape = list(score.shape)
+    shape[axis] = n
+    out = score.new_full(shape, -torch.inf)
+    best, paths = _by_axis(out, axis), _by_axis(score, axis)
+    for parents, children in _sides(level, *best.shape[:2], shifted):
+        torch.maximum(best[children], paths[parents], out=best[children])
+    return out
+
+
+def path_scores(pooled: torch.Tensor, levels: int, *, shifted: bool, level: int = 1) -> torch.Tensor:
+    """Score of the best path through the pyramid to every pooled cell of the patches below a level; -inf where none leads.
+
+    `pooled` are the responses after the power, those of the atomic patches at the first of at most `levels`.
+    """
+    if level > levels:
+        return pooled
+    score = gather(gather(pooled, 0, level, shifted=shifted), 1, level, shifted=shifted).pow_(POWER)
+    if level < levels and score.shape[2:].numel() > 1:
+        # Of displacements the epipolar line itself, the middle row, is always one that is sampled.
+        start = 0 if shifted else (score.shape[2] // 2) % 2
+        along_x, smaller = pool(score, start)
+        above = path_scores(smaller, levels, shifted=shifted, level=level + 1)
+        score = unpool(score, along_x, smaller, above, start)
+    for axis in (0, 1):
+        score = _scatter(score, axis, level, pooled.shape[axis], shifted=shifted)
+    return score.add_(pooled)
+
+
+def peak_ratio(maps: torch.Tensor, row: torch.Tensor, column: torch.Tensor) -> np.ndarray:
+    """Response (m,) around each match over the largest one elsewhere in its map (Hu and Mordohai, PAMI 2012).
+
+    Infinite where nothing else responds, NaN where there is no place for a rival.  The maps (m, rows, columns), 0 where
+    nothing is seen, are overwritten; the match lies at `row`, `column` (m,) int, and the cells next to it count as it.
+    """
+    step = torch.arange(-1, 2, device=maps.device)
+    rows = (row[:, None, None] + step[:, None]).clamp(0, maps.shape[1] - 1)
+    columns = (column[:, None, None] + step).clamp(0, maps.shape[2] - 1)
+    around = (rows * maps.shape[2] + columns).flatten(1)
+    flat = maps.flatten(1)
+    response = flat.gather(1, around).amax(dim=1)
+    rival = flat.scatter_(1, around, -1.0).amax(dim=1)
+    return torch.where(rival >= 0, response / rival.clamp_min(0), torch.nan).cpu().numpy().astype(np.float64)
+
+
+# --- displacements along the epipolar line
+
+
+class VolumeMatches(NamedTuple):
+    """Matches on the lattice, in cells of the pooled descriptor grid."""
+
+    patch: np.ndarray  # (n, 2) int, (gx, gy) of the 4 x 4 cell patch
+    cell: np.ndarray  # (n, 2) int, (dx, dy) displacement in whole cells
+    displacement: np.ndarray  # (n, 2), the same at the vertex of a parabola through the response and its neighbours
+    peaked: np.ndarray  # (n,) bool, whether the response has an interior peak along x
+    reciprocal: np.ndarray  # (n,) bool, whether no other patch fits the same place of the right image better
+
+    def keep(self, chosen: np.ndarray) -> Self:
+        """The matches of a mask (n,) or of indices."""
+        return VolumeMatches(*(values[chosen] for values in self))
+
+
+def volume_bytes(gy: int, gx: int, n: int, v: int) -> int:
+    """Peak memory (float32) of `correlation_volume` and `match_volume`: the volume, and its pooled copies."""
+    return int(4 * gy * gx * (2 * v + 1) * n * 2.7)
+
+
+def correlation_volume(left: torch.Tensor, right: torch.Tensor, v: int) -> torch.Tensor:
+    """Cosines (gy, gx, 2 v + 1, n) of every 4 x 4 patch of the left grid with its displaced windows in the right one.
+
+    The left grid (4 gy, 4 gx, C) is contiguous; the right one (4 gy + 2 v, 4 gx + n - 1, C) has v more rows on either side,
+    and the reach of n displacements.
+    """
+    height, width, channels = left.shape
+    gy, gx, n = height // PATCH, width // PATCH, right.shape[1] - width + 1
+    depth = PATCH * PATCH * channels
+    patches = unit_patches(left)
+    n_x, n_y = right.shape[1] - PATCH + 1, right.shape[0] - PATCH + 1
+    energy = right.square().sum(dim=2)
+    energy = sum(energy[:, c : c + n_x] for c in range(PATCH))
+    energy = sum(energy[r : r + n_y] for r in range(PATCH))
+    inverse_norm = torch.where(energy > 1e-12, energy.clamp_min(1e-12).rsqrt(), 0.0).contiguous()
+
+    volume = right.new_empty(gy, gx, 2 * v + 1, n)
+    block, row = max(4, min(gx, n // 2)), PATCH * channels
+    column = (PATCH * ROWS + 2 * v) * row
+    turned = right.transpose(0, 1)
+
+    def correlate(top: int) -> None:
+        """Fill one chunk of lattice rows, from windows laid out as (x, y, 4 cells of the row): any is then contiguous."""
+        k = min(ROWS, gy - top)
+        rows = slice(PATCH * top, PATCH * (top + k) + 2 * v)
+        strip = right.new_empty(n_x, column // row, row)
+        for c in range(PATCH):
+            strip[:, : rows.stop - rows.start, c * channels : (c + 1) * channels] = turned[c : c + n_x, rows]
+        for j in range(2 * v + 1):
+            for start in range(0, gx, block):
+                b = min(block, gx - start)
+                windows = PATCH * (b - 1) + n
+                view = strip.as_strided((k, windows, depth), (PATCH * row, column, 1), PATCH * start * column + j * row)
+                product = torch.bmm(patches[top : top + k, start : start + b], view.transpose(1, 2))
+                skewed = product.as_strided((k, b, n), (b * windows, windows + PATCH, 1))
+                first = (PATCH * top + j) * n_x + PATCH * start
+                scale = inverse_norm.as_strided((k, b, n), (PATCH * n_x, PATCH, 1), first)
+                torch.mul(skewed, scale, out=volume[top : top + k, start : start + b, j])
+
+    with ThreadPoolExecutor(2) as executor:
+        list(executor.map(correlate, range(0, gy, ROWS)))
+    return volume
+
+
+def match_volume(volume: torch.Tensor, low: int, *, reciprocal: bool = True) -> VolumeMatches:
+    """The best displacement of each patch: bottom-up, top-down, reciprocal check, sub-cell peak.
+
+    `low` is the volume's first displacement along x, cells; without `reciprocal` that check drops nothing.
+    """
+    gy, gx, rows, n = volume.shape
+    v = rows // 2
+    along_x, pooled = pool(volume, v % 2)
+    # The power is monotone, so it may follow the maximum, which is a quarter of the work.
+    scores = path_scores(pooled**POWER, n_levels(gy, gx) if rows * n > 1 else 0, shifted=False)
+
+    # The centre of a patch lies at cell 4 g + 2; its displaced copy falls into the bin (4 g + 2 + d) // 4, so
+    # displacements in fours share a bin for every patch.
+    bin_x, bin_y = (low + np.arange(n) + 2) // PATCH, (np.arange(-v, v + 1) + 2) // PATCH
+    in_x, in_y = ([np.flatnonzero(of == i) for i in range(of[0], of[-1] + 1)] for of in (bin_x, bin_y))
+    bins = volume.new_full((gy + len(in_y) - 1, gx + len(in_x) - 1), -torch.inf)
+    best, flat = volume.new_empty(gy, gx), torch.empty(gy, gx, dtype=torch.long)
+
+    def search(top: int) -> list[list[torch.Tensor]]:
+        """Best displacements of a chunk of lattice rows; its strongest scores per bin, (chunk, gx) for each (y, x)."""
+        part = slice(top, min(top + ROWS, gy))
+        score = unpool(volume[part], along_x[part], pooled[part], scores[part], v % 2)
+        torch.max(score.flatten(2), dim=2, out=(best[part], flat[part]))
+        return [[score[:, :, y[0] : y[-1] + 1, x[0] : x[-1] + 1].amax(dim=(2, 3)) for x in in_x] for y in in_y]
+
+    tops = range(0, gy, ROWS)
+    with ThreadPoolExecutor(2) as executor:
+        for top, strongest in zip(tops, executor.map(search, tops), strict=True):
+            for y, row in enumerate(strongest):
+                for x, chunk in enumerate(row):
+                    there = bins[top + y : top + y + len(chunk), x : x + gx]
+                    torch.maximum(there, chunk, out=there)
+    y, x = torch.meshgrid(torch.arange(gy), torch.arange(gx), indexing="ij")
+    j, k = flat // n, flat % n
+    own_y, own_x = (torch.from_numpy(of - of[0])[at] + grid for of, at, grid in ((bin_y, j, y), (bin_x, k, x)))
+    passed = best >= bins[own_y, own_x]
+    kept = torch.isfinite(best) & (passed | (not reciprocal))
+
+    place = y[kept], x[kept], j[kept], k[kept]
+    vertex_x, peaked = _parabola(volume, place, 3)
+    vertex_y, _ = _parabola(volume, place, 2)
+    cell = torch.stack([place[3] + low, place[2] - v], dim=1)
+    return VolumeMatches(
+        patch=torch.stack([place[1], place[0]], dim=1).numpy(), cell=cell.numpy(),
+        displacement=(cell + torch.stack([vertex_x, vertex_y], dim=1).double()).numpy(),
+        peaked=peaked.numpy(), reciprocal=passed[kept].numpy(),
+    )  # fmt: skip
+
+
+def _parabola(volume: torch.Tensor, place: tuple[torch.Tensor, ...], axis: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Vertex (in [-0.5, 0.5]) of the response around its peak along one axis, 0 where it has no interior peak; has it?"""
+    n, index = volume.shape[axis], place[axis]
+    before, centre, after = (
+        volume[tuple((index + step).clamp(0, n - 1) if k == axis else i for k, i in enumerate(place))] for step in (-1, 0, 1)
+    )
+    curvature = 2 * centre - before - after
+    peaked = (index > 0) & (index < n - 1) & (centre >= before) & (centre >= after) & (curvature > 1e-9)
+    return torch.where(peaked, 0.5 * (after - before) / curvature.clamp_min(1e-9), 0.0), peaked
+
+
+# --- free
 
 
 def predicted_bytes(shape_left: tuple[int, int], shape_right: tuple[int, int], *, downscale: int = 1) -> int:
@@ -34,7 +305,7 @@ def predicted_bytes(shape_left: tuple[int, int], shape_right: tuple[int, int], *
 
 def unit_windows(grid: torch.Tensor) -> torch.Tensor:
     """(h + 1, w + 1, 16 C) unit descriptors of the windows around every cell corner, zero outside the grid."""
-    padded = torch.nn.functional.pad(grid, (0, 0, *[PATCH // 2] * 4))
+    padded = pad(grid, (0, 0, *[PATCH // 2] * 4))
     windows = padded.unfold(0, PATCH, 1).unfold(1, PATCH, 1).permute(0, 1, 3, 4, 2).flatten(2)
     return windows.div_(windows.norm(dim=2, keepdim=True).clamp_min(1e-12))
 
@@ -86,7 +357,7 @@ def _match_grids(left: torch.Tensor, right: torch.Tensor) -> tuple[torch.Tensor,
         strongest = torch.maximum(strongest, full.amax(dim=(0, 1)))
         ratio[part] = peak_ratio(small.flatten(0, 1), row.flatten(), column.flatten()).reshape(peak.shape)
     x, y = place % n_x, torch.div(place, n_x, rounding_mode="floor")
-    bins = torch.nn.functional.max_pool2d(strongest[None], PATCH, ceil_mode=True)[0]
+    bins = max_pool2d(strongest[None], PATCH, ceil_mode=True)[0]
     own = bins[torch.div(y, PATCH, rounding_mode="floor"), torch.div(x, PATCH, rounding_mode="floor")]
     return torch.stack([x, y], dim=2), best, ratio, best >= own
 
@@ -126,6 +397,4 @@ def match_free(
     variance = stride**2 / 12 + 0.25 * stride**2 / 4
     covariance = np.tile(np.diag([SIGMA_LEFT_PX**2] * 2 + [variance] * 2), (len(u_left), 1, 1))
     score = np.clip(best[kept] / (n_levels(*best.shape) + 1), 0, 1)
-    return Matches(
-        u_left, u_right, score, covariance, peak_ratio=ratio[kept], reciprocal=passed[kept], method="deepmatching"
-    )
+    return Matches(u_left, u_right, score, covariance, peak_ratio=ratio[kept], reciprocal=passed[kept], method="deepmatching")

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lib.matching.pyramid import PATCH
-
+#: Cells along a side of DeepMatching's atomic patches.
+PATCH = 4
 #: Eight orientations and one constant, which keeps flat patches from matching noise.
 CHANNELS = 9
 
@@ -26,10 +26,9 @@ MIN_SEEN = 0.5
 
 
 def as_gray(image: ArrayLike, name: str) -> np.ndarray:
-    """A grey uint8 image (h, w) of an RGB (h, w, 3) or grey (h, w) uint8 image.
+    """A grey uint8 image (h, w) of an RGB (h, w, 3) or grey (h, w) uint8 image of 16 x 16 px or more.
 
-    Raises:
-        ValueError: For any other shape or type, or an image below 16 x 16 px; `name` is the argument named.
+    A ValueError of anything else names the argument `name`.
     """
     image = np.asarray(image)
     if image.dtype != np.uint8:
@@ -48,18 +47,11 @@ def _blur(image: np.ndarray) -> np.ndarray:
 
 
 def pixel_descriptors(gray: np.ndarray, downscale: int = 1, *, valid: np.ndarray | None = None) -> np.ndarray:
-    """Descriptors of a grey image, average-pooled by 2^downscale.
+    """Descriptors (h >> downscale, w >> downscale, 9) float32 of a grey image (h, w), float32 or uint8, 0..255.
 
     The image is smoothed, its gradient projected on eight directions and rectified, smoothed, squashed by
-    2 / (1 + exp(-0.2 x)) - 1 (so that contrast matters little), smoothed again; a constant ninth channel ends it.
-
-    Args:
-        gray: (h, w) float32 or uint8, 0..255.
-        downscale: Binary logarithm of the pooling.
-        valid: (h, w) bool; descriptors of cells with any invalid pixel are zero, and so say nothing.
-
-    Returns:
-        np.ndarray: (h >> downscale, w >> downscale, 9) float32.  The centre of cell 0 lies at (2^downscale - 1) / 2 px.
+    2 / (1 + exp(-0.2 x)) - 1 (so that contrast matters little), smoothed again; a constant ninth channel ends it.  Then
+    cells of 2^downscale px are averaged.  Those with any pixel that is not `valid` (h, w) are zero, and so say nothing.
     """
     stride = 1 << downscale
     rows, columns = gray.shape[0] // stride, gray.shape[1] // stride

@@ -5,21 +5,17 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 
-def glint_mask(image: ArrayLike, *, level: int = 245, grow_px: int = 5) -> np.ndarray:
-    """Specular reflections: pixels whose every channel is nearly saturated, grown by a margin.
+def glint_mask(image: ArrayLike, *, grow_px: int = 5) -> np.ndarray:
+    """Specular reflections: pixels whose every channel is nearly saturated (245), grown by a margin for the halo.
 
-    A glint moves with the viewpoint, not with the surface, so a match on one has the depth of a mirror image.
-
-    Args:
-        image: (h, w, 3) RGB or (h, w), uint8.
-        level: Smallest value of the darkest channel.
-        grow_px: Margin for the halo around the saturated core.
+    A glint moves with the viewpoint, not with the surface, so a match on one has the depth of a mirror image.  The image is
+    uint8, (h, w, 3) RGB or (h, w).
     """
     image = np.asarray(image)
     if image.dtype != np.uint8 or image.ndim not in (2, 3):
         raise ValueError(f"image: expected a uint8 image (h, w, 3) or (h, w), got {image.dtype} {image.shape}.")
     channels = 1 if image.ndim == 2 else image.shape[2]
-    core = cv2.inRange(np.ascontiguousarray(image), (level,) * channels, (255,) * channels)
+    core = cv2.inRange(np.ascontiguousarray(image), (245,) * channels, (255,) * channels)
     if grow_px:
         core = cv2.dilate(core, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * grow_px + 1,) * 2))
     return core.astype(bool)
@@ -53,11 +49,7 @@ def tool_mask(shape: tuple[int, int], u_landmarks: ArrayLike, *, width_px: float
 
 
 def checked_mask(mask: ArrayLike, shape: tuple[int, int], name: str) -> np.ndarray:
-    """A mask as an array.
-
-    Raises:
-        ValueError: If it is not bool (h, w) of this shape, or leaves nothing; `name` is the argument named.
-    """
+    """The mask as an array; a ValueError that names the argument `name` if it is not bool of this shape or leaves nothing."""
     mask = np.asarray(mask)
     if mask.shape != shape or mask.dtype != bool:
         raise ValueError(f"{name}: expected a bool array {shape}, True = ignore, got {mask.dtype} {mask.shape}.")

@@ -9,11 +9,10 @@ import torch
 
 from lib.cameras import StereoRig
 from lib.matching.band import CELL_PX, COARSE_REACH, DOWNSCALE, Images, Masks, Where, plan_search
-from lib.matching.descriptors import patch_quality, pixel_descriptors
-from lib.matching.pyramid import PATCH, peak_ratio
+from lib.matching.deepmatching import correlation_volume, peak_ratio
+from lib.matching.descriptors import PATCH, patch_quality, pixel_descriptors
 from lib.matching.rectification import warp
 from lib.matching.result import SIGMA_LEFT_PX, Matches
-from lib.matching.volume import correlation_volume
 from lib.parallel import single_threaded_torch
 
 #: Matches are taken on this lattice, as DeepMatching's are at full resolution.
@@ -79,11 +78,9 @@ def match_with(
     right, valid_right = warp(images[1], rectification.right_from_canvas, size, shift_px=shift, mask=masks[1])
     left, right = (np.clip(np.rint(image), 0, 255).astype(np.uint8) for image in (left, right))
     disparity, confidence, *rest = maps = [np.asarray(part) for part in call(left, right, (-high, -low))]
-    if any(part.shape != left.shape for part in maps):
-        raise ValueError(
-            f"method: the matcher {name} must return disparity and confidence of shape {left.shape}, "
-            f"got {', '.join(str(part.shape) for part in maps)}."
-        )
+    shapes = [part.shape for part in maps]
+    if any(shape != left.shape for shape in shapes):
+        raise ValueError(f"method: the matcher {name} must return arrays of the shape {left.shape}, got {shapes}.")
     passed = rest[0].astype(bool) if rest else np.ones(left.shape, dtype=bool)
 
     x, y = np.meshgrid(
@@ -119,8 +116,7 @@ def _judge(
     `reach`, a multiple of the lattice, is how far the canvases go on beyond the lattice on either side.
     """
     left, right = (
-        pixel_descriptors(image.astype(np.float32), DOWNSCALE, valid=seen)
-        for image, seen in zip(images, valid, strict=True)
+        pixel_descriptors(image.astype(np.float32), DOWNSCALE, valid=seen) for image, seen in zip(images, valid, strict=True)
     )
     margin = reach // CELL_PX
     gy, gx = len(left) // PATCH, (left.shape[1] - 2 * margin) // PATCH

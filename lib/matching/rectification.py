@@ -50,8 +50,7 @@ class Rectification:
     def search_range_px(self, depth_range_mm: tuple[float, float], shape_right: tuple[int, int]) -> tuple[float, float]:
         """(low, high) displacements of a range of depth, as far as both cameras can see it in a right image (h, w).
 
-        Raises:
-            ValueError: If they see nothing of it; the message says what depths they see.
+        A ValueError where they see nothing of it says what depths they see.
         """
         low, high = self.displacement_range_px(depth_range_mm)
         corners = np.array(list(np.ndindex(2, 2))) * np.subtract(shape_right[::-1], 1)
@@ -79,10 +78,8 @@ def rectify(
 ) -> Rectification:
     """The rectification of a rig for images of these shapes (h, w), with `scale` canvas pixels per left pixel.
 
-    Of near-affine cameras it is that of the affine cameras which touch them.
-
-    Raises:
-        ValueError: If the rig's two cameras look along the same direction (no depth can be seen).
+    Of near-affine cameras it is that of the affine cameras which touch them.  A ValueError refuses two cameras that look
+    along the same direction, since no depth can be seen.
     """
     A_l, A_r = rig.left.linear, rig.right.linear
     H = A_r @ np.linalg.pinv(A_l)
@@ -122,7 +119,7 @@ def warp(
         mask: (h, w) bool, True = ignore.
 
     Returns:
-        (gray, valid): (height, width) float32, borders continued; and bool, False outside the image and where masked.
+        (height, width) float32, borders continued; and bool, False outside the image and where masked.
     """
     linear = image_from_canvas[:, :2]
     offset = image_from_canvas[:, 2] + linear @ np.asarray(shift_px, dtype=np.float64)

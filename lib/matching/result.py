@@ -17,8 +17,7 @@ class Matches:
         u_left, u_right: (n, 2) px, integer coordinates at pixel centres.  `u_left` lies on a lattice chosen by the
             matcher.
         score: (n,) confidence in [0, 1]; larger is surer.  Comparable within one call, not between methods.
-        covariance_px2: (n, 4, 4) covariance of (u_left, u_right).  A match says where in the right image lies what is
-            seen at `u_left`, so nearly all of the noise stands in the right block.
+        covariance_px2: (n, 4, 4) of (u_left, u_right), nearly all of it in the right block (see `SIGMA_LEFT_PX`).
         peak_ratio: (n,) response at the match over the best one elsewhere; at 1 and below another place fits as well.
             Infinite where nothing else responds, NaN where there was no other place.
         reciprocal: (n,) bool, whether the way back from the right image leads to the same left patch (DeepMatching,

@@ -1,8 +1,4 @@
-"""Robust bicubic B-spline surfaces from semi-dense stereo points (paper Sec. IV-B).
-
-`fit_surface` solves Eq. (6); what it returns evaluates position, normal, uncertainty and the distance of a
-tool.  `surface_mesh`, `depth_map` and the `save_` functions take it to other programs.
-"""
+"""Robust bicubic B-spline surfaces from semi-dense stereo points (paper Sec. IV-B), and their files."""
 
 from lib.surface.bspline import BSplineSurface, ToolDistance
 from lib.surface.export import Mesh, depth_map, open3d, save_depth_map, save_mesh, save_points, surface_mesh

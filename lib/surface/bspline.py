@@ -12,8 +12,8 @@ from scipy.interpolate import BSpline
 from scipy.linalg import cho_solve_banded
 
 from lib.cameras import AffineCamera
-from lib.geometry import points
-from lib.surface.grid import SplineGrid, cubic_basis
+from lib.geometry import points, store_array
+from lib.surface.grid import SplineGrid
 from lib.surface.solver import UNHELD, L1Problem, cholesky
 
 
@@ -90,8 +90,7 @@ class SurfaceFit:
     @cached_property
     def _inflation(self) -> np.ndarray:
         """Variance (k,) of the sum of residual signs in a quarter of a cell, over that of independent signs."""
-        signs = np.sign(self.residual)
-        grid = self.problem.grid
+        signs, grid = np.sign(self.residual), self.problem.grid
         cell, t = grid.locate(self.problem.u)
         quarter = (2 * cell + (t >= 0.5)) @ (1, 2 * grid.cells[0])
         _, place, counts = np.unique(quarter, return_inverse=True, return_counts=True)
@@ -139,12 +138,7 @@ class BSplineSurface:
     fit: SurfaceFit | None = None
 
     def __post_init__(self) -> None:
-        control_points = np.array(self.control_points_mm, dtype=np.float64)
-        n_x, n_y = self.grid.control
-        if control_points.shape != (n_y, n_x, 3) or not np.isfinite(control_points).all():
-            raise ValueError(f"control_points_mm: expected finite ({n_y}, {n_x}, 3), got {control_points.shape}.")
-        control_points.setflags(write=False)
-        object.__setattr__(self, "control_points_mm", control_points)
+        store_array(self, "control_points_mm", (*self.grid.control[::-1], 3))
 
     @property
     def objective(self) -> float:
@@ -168,13 +162,6 @@ class BSplineSurface:
         result[inside] = self.grid.design(u[inside], order) @ self.grid.flatten(self.control_points_mm)
         return result
 
-    def _jet(self, u: np.ndarray) -> np.ndarray:
-        """Values and derivatives [q, p, n, 3] mm per px^(p+q), p along x and q along y up to 2, at few points inside."""
-        (cell, t), k = self.grid.locate(u), np.arange(4)
-        basis = np.stack([cubic_basis(t, order) / self.grid.cell_px[:, None] ** order for order in range(3)])
-        near = self.control_points_mm[cell[:, 1, None, None] + k[:, None], cell[:, 0, None, None] + k]
-        return np.einsum("qnj,pnjk->qpnk", basis[:, :, 1], np.einsum("pni,njik->pnjk", basis[:, :, 0], near))
-
     def on_grid(self, x_px: ArrayLike, y_px: ArrayLike) -> np.ndarray:
         """Points (len(y), len(x), 3) on the lattice of columns `x_px` and rows `y_px`: fast for whole images."""
         values = self.control_points_mm
@@ -190,21 +177,15 @@ class BSplineSurface:
         return normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
     def covariance(self, u: ArrayLike) -> np.ndarray:
-        """Covariance (n, 3, 3) mm^2 of Psi(u) from the scatter of the fitted points; see `SurfaceFit.covariance`.
-
-        Raises:
-            ValueError: For a surface that was not fitted.
-        """
+        """Covariance (n, 3, 3) mm^2 of Psi(u) from the scatter of the fitted points; see `SurfaceFit.covariance`."""
         if self.fit is None:
             raise ValueError("covariance: this surface was not fitted to points, so its uncertainty is not known.")
         return self.fit.covariance(points(u, 2, "u"))
 
     def distance(self, x_mm: ArrayLike, camera: AffineCamera) -> ToolDistance:
-        """Distance of points, such as tool tips, to the surface along the view and along the surface's normal.
+        """Distance of points (n, 3), such as tool tips, to the surface along the view and along the surface's normal.
 
-        Args:
-            x_mm: (n, 3) in the frame of the surface; NaN rows stay NaN.
-            camera: The left camera, whose image parametrises the surface.
+        The points are in the frame of the surface, NaN rows stay NaN; `camera` is the left one, whose image parametrises it.
         """
         x = points(x_mm, 3, "x_mm")
         start = camera.project(x)
@@ -213,12 +194,13 @@ class BSplineSurface:
         u = np.clip(start, low, high)
         seen = np.isfinite(u).all(axis=1)
         for _ in range(20):  # Gauss-Newton steps towards the nearest point; each stays inside the domain
-            jet = self._jet(u[seen])
-            jacobian = np.stack([jet[0, 1], jet[1, 0]], axis=2)
-            gap = x[seen] - jet[0, 0]
+            orders = (0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2)
+            psi, psi_x, psi_y, psi_xx, psi_xy, psi_yy = (self.derivative(u[seen], order) for order in orders)
+            jacobian = np.stack([psi_x, psi_y], axis=2)
+            gap = x[seen] - psi
             normal = np.einsum("nki,nkj->nij", jacobian, jacobian)
             # Second-order term of the distance: keeps steps right where the tool is far above a curved surface.
-            hessian = normal - np.einsum("ijnk,nk->nij", jet[[[0, 1], [1, 2]], [[2, 1], [1, 0]]], gap)
+            hessian = normal - np.einsum("ijnk,nk->nij", [[psi_xx, psi_xy], [psi_xy, psi_yy]], gap)
             convex = (np.linalg.det(hessian) > 0) & (hessian[:, 0, 0] > 0)
             hessian[~convex] = normal[~convex]
             step = np.linalg.solve(hessian, np.einsum("nki,nk->ni", jacobian, gap)[..., None])[..., 0]

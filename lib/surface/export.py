@@ -1,7 +1,6 @@
-"""Surfaces for other programs: textured meshes (GLB), point clouds (PLY), depth maps (TIFF).
+"""Surfaces for other programs: textured meshes (GLB), point clouds (PLY), depth maps (TIFF), whole or not at all.
 
-Open3D writes meshes and point clouds.  It is imported here only, when it is first needed, since it needs system
-libraries.  Files appear whole or not at all.
+Open3D writes meshes and point clouds.  It is imported here only, when it is first needed, since it needs system libraries.
 """
 
 from collections.abc import Callable
@@ -55,10 +54,7 @@ def surface_mesh(
     Args:
         step_px: Distance of neighbouring vertices in the left image, at most.
         image: (h, w, 3) uint8 RGB left image for the texture.
-        mask: (h, w) bool, True where the surface is to be shown; None is everywhere.
-
-    Raises:
-        ValueError: For a step that is not positive, or a mask that leaves no triangle.
+        mask: (h, w) bool, True where the surface is to be shown; None is everywhere.  A ValueError if no triangle is left.
     """
     if not step_px > 0:
         raise ValueError(f"step_px: must be positive, got {step_px}.")
@@ -82,9 +78,7 @@ def surface_mesh(
 def save_mesh(mesh: Mesh, path: str | Path) -> Path:
     """Write a mesh as binary glTF (.glb) with its texture inside, in metres, the unit of glTF.
 
-    Raises:
-        ValueError: For another suffix.
-        ImportError, OSError: Where Open3D does not load, or cannot write the file.
+    An ImportError or OSError says where Open3D does not load or cannot write the file.
     """
     path = _suffixed(path, ".glb")
     o3d = open3d()
@@ -110,12 +104,7 @@ def save_mesh(mesh: Mesh, path: str | Path) -> Path:
 
 
 def save_points(path: str | Path, x_mm: ArrayLike, *, colours: np.ndarray | None = None) -> Path:
-    """Write points (n, 3) mm as a binary PLY, with colours (n, 3) uint8 RGB where given.
-
-    Raises:
-        ValueError: For NaN, counts that differ, or another suffix.
-        ImportError, OSError: Where Open3D does not load, or cannot write the file.
-    """
+    """Write points (n, 3) mm as a binary PLY, with colours (n, 3) uint8 RGB where given; errors as for `save_mesh`."""
     path = _suffixed(path, ".ply")
     x = finite_points(x_mm, 3, "x_mm")
     if colours is not None and np.shape(colours) != x.shape:
@@ -148,10 +137,7 @@ def save_depth_map(path: str | Path, depth_mm: np.ndarray) -> Path:
 
 
 def _write(path: Path, write: Callable[[str], bool], is_whole: Callable[[bytes], bool]) -> None:
-    """Let one of Open3D's writers fill a file, whole or not at all.
-
-    The writers return False on an error, but on a full disk some return True and leave part of the file.
-    """
+    """Let one of Open3D's writers fill a file: False says that it failed, but some say True of a part on a full disk."""
     with whole(path) as partial:
         if not write(str(partial)) or not is_whole(partial.read_bytes()):
             raise OSError(f"{path}: Open3D could not write the whole file; is the disk full?")

@@ -15,10 +15,8 @@ from lib.surface.solver import L1Problem, L1Solution, interior_point
 #: Default rejection: points whose L1 norm exceeds this many times the median.  Gaussian noise along one axis puts
 #: 0.1 % of its points beyond it.
 REJECT_MEDIANS = 5.0
-
 _FOLDS = 3
-_ENOUGH_HELD_OUT = 1500  # points in the folds that are tried: more only cost time
-_QUICK_HELD_OUT = 1000
+_ENOUGH_HELD_OUT, _QUICK_HELD_OUT = 1500, 1000  # points in the folds that are tried: more only cost time
 _LADDER = 10.0**0.5  # step between candidates of the smoothness
 _EXTENT = 8  # at most so many steps from the first candidate, either way
 
@@ -52,9 +50,8 @@ def fit_surface(
         quick: Choose the smoothness and reject points at fits of five Newton steps, within some percent of the minimum;
             only the final fit is solved to `tolerance`.
 
-    Raises:
-        ValueError: For shapes or counts that do not fit, NaN, negative smoothness, points that do not determine a
-            surface: fewer in the domain than a quarter of the control points, or than 16.
+    A ValueError refuses NaN and points that do not determine a surface: fewer in the domain than a quarter of the control
+    points, or than 16.
     """
     grid = SplineGrid(domain, control)
     u, x = finite_points(u, 2, "u"), finite_points(x_mm, 3, "x_mm")
@@ -64,9 +61,8 @@ def fit_surface(
     least = max(16, grid.size // 4)
     if used.sum() < least:
         raise ValueError(
-            f"u: {used.sum()} of {len(u)} points lie in the domain, and a grid of {grid.control[0]} x {grid.control[1]} "
-            f"control points needs {least} or more. Match more points, give fewer control points, or check that domain "
-            "and u are both px of the left image."
+            f"u: {used.sum()} of {len(u)} points lie in the domain, and {grid.size} control points need {least} or more. "
+            "Match more points, give fewer control points, or check that domain and u are both px of the left image."
         )
     spread = np.linalg.svd(u[used] - u[used].mean(axis=0), compute_uv=False)
     if spread[1] < 1e-6 * spread[0]:
@@ -109,10 +105,8 @@ def fit_surface(
     inliers = used & (np.nan_to_num(norm, nan=np.inf) <= reject_mm)
     if quick or (inliers != used).any():
         if inliers.sum() < least:
-            raise ValueError(
-                f"reject_mm: only {inliers.sum()} of {used.sum()} points lie within {reject_mm:.4g} mm of the surface; "
-                "increase it."
-            )
+            found = f"only {inliers.sum()} of {used.sum()} points lie within {reject_mm:.4g} mm of the surface"
+            raise ValueError(f"reject_mm: {found}; increase it.")
         problem, solution, surface = solve(inliers, exact)
     fit = SurfaceFit(
         objective=float(solution.objective.sum()), duality_gap=float(solution.duality_gap.sum()),
@@ -128,10 +122,7 @@ def _outputs(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(axes (k, 3), values (n, k) = x along them, weights (n, k) of their absolute residuals)."""
     if camera is not None and not isinstance(camera, AffineCamera):
-        raise ValueError(
-            "camera: the rays of a near-affine camera are not parallel, so the depth along them is no B-spline; fit all "
-            "three coordinates, without a camera."
-        )
+        raise ValueError("camera: the depth along the rays of a near-affine camera is no B-spline; fit without a camera.")
     n = len(x)
     axes = np.eye(3) if camera is None else camera.viewing_direction[None]
     if covariance_mm2 is None:

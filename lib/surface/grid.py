@@ -104,8 +104,7 @@ class SplineGrid:
         """B (n, size) with 16 entries a row: B @ coefficients is the spline, or its derivative per px, at u (n, 2)."""
         cell, t = self.locate(u)
         scale = self.cell_px ** -np.array(derivative, dtype=float)
-        along_x = cubic_basis(t[:, 0], derivative[0]) * scale[0]
-        along_y = cubic_basis(t[:, 1], derivative[1]) * scale[1]
+        along_x, along_y = (cubic_basis(t[:, i], derivative[i]) * scale[i] for i in (0, 1))
         step_x, step_y = self.stride
         offset = np.arange(4, dtype=np.int32)[:, None] * step_y + np.arange(4, dtype=np.int32) * step_x
         columns = (cell @ self.stride).astype(np.int32)[:, None, None] + offset

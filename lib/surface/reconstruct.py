@@ -1,7 +1,4 @@
-"""From a stereo pair to its surface: mask, refine, match, triangulate, fit (paper Sec. IV-B).
-
-This is the one way from two images to a surface; the notebooks and the online system both take it.
-"""
+"""From a stereo pair to its surface: mask, refine, match, triangulate, fit (paper Sec. IV-B)."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -86,12 +83,9 @@ def refine_rig(rig: StereoRig, covariance: np.ndarray, matches: Matches) -> Ster
     uncertain, so few or poor matches change little.
 
     Args:
-        rig: A calibrated affine pair.
+        rig: A calibrated affine pair; a ValueError refuses another.
         covariance: (16, 16) of the entries of its matrices, row by row, left first (`Calibration.covariance`).
         matches: Of `lib.matching.match` with this rig, best of the static scene with the tool masked.
-
-    Raises:
-        ValueError: If the rig is not affine, or the covariance has another shape.
     """
     if rig is None or not rig.is_affine:
         raise ValueError("rig: only an affine stereo pair can be refined; reconstruct with refine=False.")
@@ -151,17 +145,14 @@ def reconstruct(
         mask_left, mask_right: (h, w) bool, True = ignore, beside glints and tool.
         percentiles: (low, high) of the matches' coordinates that bound the surface's domain: (0, 100) covers all matches,
             (1, 99) leaves out the rim, where few matches hold the surface.
-        control: As for `fit_surface`.
-        smoothness: As for `fit_surface`; that of an earlier frame (`Reconstruction.surface.fit.smoothness`) saves time.
+        control, smoothness: As for `fit_surface`; the smoothness of an earlier frame (`surface.fit.smoothness`) saves time.
         depth_only: Fit one spline, the depth along the rays of the left camera, in place of three.  It needs an affine
             left camera. None is True in the fast setting with an affine rig.
         depth_range_mm, max_epipolar_px: As for `lib.matching.match`; those of an earlier frame (`depth_range_mm` of its
             result) save time.
         seconds: A dictionary that gets the seconds of each stage as it ends, also of the stage that fails.
 
-    Raises:
-        ValueError: As `match` and `fit_surface` do: unfit images, a rig that does not fit them, too few matches; and
-            for `refine=True` without a covariance.
+    A ValueError says what is wrong, as those of `match` and `fit_surface` do.
 
     >>> from lib import paths
     >>> from lib.recordings import Recording
@@ -173,10 +164,7 @@ def reconstruct(
     True
     """
     seconds = {} if seconds is None else seconds
-    covariance = rig.covariance if isinstance(rig, Calibration) else None
-    rig = rig.rig if isinstance(rig, Calibration) else rig
-    if rig is None:
-        raise ValueError("rig: the calibration is of one camera; a stereo pair needs both.")
+    covariance, rig = (rig.covariance, rig.pair) if isinstance(rig, Calibration) else (None, rig)
     if refine and covariance is None:
         raise ValueError("refine: needs the covariance of the rig; give the Calibration in place of its rig.")
     if refine is None:

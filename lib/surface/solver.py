@@ -126,8 +126,7 @@ def interior_point(
         weights: w (n, k) > 0; None is 1.
         tolerance: Stop when the duality gap is below this fraction of the objective.
 
-    Raises:
-        ValueError: If the data do not determine the coefficients (a control point without data, at mu = 0).
+    A ValueError says that the data do not determine the coefficients (a control point without data, at mu = 0).
     """
     weights = np.ones_like(x) if weights is None else weights
     order, by_cells = problem.by_cells

@@ -20,8 +20,8 @@ from scipy.spatial import KDTree
 
 from lib.cameras import StereoRig
 from lib.matching import Matches
-from lib.matching.deepmatching import correlation_maps, unit_windows
-from lib.matching.pyramid import PATCH, unit_patches
+from lib.matching.deepmatching import correlation_maps, unit_patches, unit_windows
+from lib.matching.descriptors import PATCH
 from lib.surface import BSplineSurface, Mesh, ToolDistance
 from lib.workbench.results import Table
 from notebooks.figures.interactive import explore

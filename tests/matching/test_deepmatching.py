@@ -12,8 +12,8 @@ import pytest
 import torch
 
 from lib.matching import match
+from lib.matching.deepmatching import POWER, gather, n_levels, path_scores, pool, unpool
 from lib.matching.descriptors import pixel_descriptors
-from lib.matching.pyramid import POWER, gather, n_levels, path_scores, pool, unpool
 from lib.paths import ROOT
 from notebooks.figures.reconstruction import atomic_maps, response_map
 

@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from lib.matching.band import refine
-from lib.matching.pyramid import peak_ratio
-from lib.matching.volume import correlation_volume, match_volume
+from lib.matching.deepmatching import correlation_volume, match_volume, peak_ratio
 
 
 @pytest.fixture(scope="module")

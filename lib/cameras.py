@@ -1,0 +1,401 @@
+"""Affine and near-affine cameras, and the calibrated stereo pair: projection, epipolar geometry, triangulation.
+
+An affine camera maps a point x (mm, robot frame unless said otherwise) to the pixel u = M [x; 1] with M (2, 4)
+(paper Sec. IV-A).  Two of them stack to y = A x + t with y = (u_left, u_right), A (4, 3): four numbers that hold a 3D
+point and one epipolar residual, so triangulation is one small constant matrix.
+"""
+
+import json
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Protocol, Self, runtime_checkable
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from lib.files import write_json
+from lib.geometry import RigidTransform, pair_covariance, points, store_array
+
+FORMAT = "microstereo.stereo_rig"
+UNITS = {"point": "mm", "image": "px"}
+#: Points at a time: few enough for their arrays to stay in the processor's cache.
+_BLOCK = 8192
+
+
+@dataclass(frozen=True)
+class Resection:
+    """M = K [r1 t1; r2 t2] (paper Eq. 5): intrinsics and pose, all but the shift along the optical axis.
+
+    Attributes:
+        K: (2, 2) upper triangular [[alpha_x, skew], [0, alpha_y]], px per mm.
+        R: (3, 3) rotation camera_from_robot; its third row is the viewing direction, away from the camera.
+        t: (2,) mm, so that u = K (R[:2] @ x + t).
+        mirrored: As the caller said: one affine camera alone cannot tell (a reflection only flips R's unseen third row).
+    """
+
+    K: np.ndarray
+    R: np.ndarray
+    t: np.ndarray
+    mirrored: bool = False
+
+
+@runtime_checkable
+class Camera(Protocol):
+    """Anything that projects points."""
+
+    def project(self, x: ArrayLike) -> np.ndarray:
+        """Pixels (n, 2) of points (n, 3) in mm."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class MatrixCamera:
+    """What our cameras share: the matrix (2, 4), px per mm and px, of the affine camera that it is or that touches it.
+
+    A model adds `project`, `jacobian` and `projection_matrix`.  A ValueError refuses a matrix that is not finite or whose
+    linear part has rank below 2.
+    """
+
+    matrix: np.ndarray
+
+    def __post_init__(self) -> None:
+        store_array(self, "matrix", (2, 4))
+        if np.linalg.svd(self.linear, compute_uv=False)[1] <= 1e-9 * np.abs(self.linear).max():
+            raise ValueError("matrix: its linear part has rank below 2, so it sees a line, not a plane.")
+
+    @property
+    def linear(self) -> np.ndarray:
+        """A, (2, 3) px per mm."""
+        return self.matrix[:, :3]
+
+    @property
+    def offset_px(self) -> np.ndarray:
+        """The matrix's last column (2,)."""
+        return self.matrix[:, 3]
+
+    @cached_property
+    def viewing_direction(self) -> np.ndarray:
+        """Unit vector (3,) along which points share a pixel of `matrix`, away from the camera (unmirrored optics)."""
+        direction = normal_to(self.linear)
+        return direction / np.linalg.norm(direction)
+
+    def moved(self, motion: RigidTransform) -> Self:
+        """The camera after a rigid motion of itself: it sees motion.apply(x) where it saw x.
+
+        >>> camera = AffineCamera([[100, 0, 0, 960], [0, 100, 0, 540]])
+        >>> camera.moved(RigidTransform(np.eye(3), [1, 0, 0])).project([1, 0, 0]).tolist()
+        [[960.0, 540.0]]
+        """
+        back = motion.inverse()
+        return replace(self, matrix=np.column_stack([self.linear @ back.R, self.linear @ back.t + self.offset_px]))
+
+
+def normal_to(A: np.ndarray) -> np.ndarray:
+    """Cross product (3,) of the two rows of A (2, 3); numpy's own is far slower for single vectors."""
+    (a, b, c), (d, e, f) = A.tolist()
+    return np.array([b * f - c * e, c * d - a * f, a * e - b * d])
+
+
+class AffineCamera(MatrixCamera):
+    """u = matrix @ [x; 1], matrix (2, 4) in px per mm and px."""
+
+    def project(self, x: ArrayLike) -> np.ndarray:
+        """Pixels (n, 2) of points (n, 3) in mm; NaN rows stay NaN."""
+        return points(x, 3, "x") @ self.linear.T + self.offset_px
+
+    def jacobian(self, x: ArrayLike) -> np.ndarray:
+        """Derivative of `project`, (n, 2, 3) px per mm; the same at every point."""
+        return np.broadcast_to(self.linear, (len(points(x, 3, "x")), 2, 3))
+
+    @property
+    def projection_matrix(self) -> np.ndarray:
+        """Homogeneous P (3, 4); an affine camera's last row is (0, 0, 0, 1)."""
+        return np.vstack([self.matrix, [0.0, 0.0, 0.0, 1.0]])
+
+    def resect(self, *, mirrored: bool = False) -> Resection:
+        """K, R and t of the camera by RQ factorisation (paper Eq. 5).
+
+        With optics that flip the image (`mirrored`: an odd number of reflections) R maps to the unflipped camera frame,
+        whose third axis still points away from the camera.
+        """
+        a_x, a_y = self.linear
+        alpha_y = np.linalg.norm(a_y)
+        r_2 = a_y / alpha_y
+        skew = a_x @ r_2
+        alpha_x = np.linalg.norm(a_x - skew * r_2)
+        r_1 = (a_x - skew * r_2) / alpha_x
+        K = np.array([[alpha_x, skew], [0.0, alpha_y]])
+        if mirrored:
+            r_1, K = -r_1, K @ np.diag([-1.0, 1.0])
+        return Resection(K, np.stack([r_1, r_2, np.cross(r_1, r_2)]), np.linalg.solve(K, self.offset_px), mirrored)
+
+
+@dataclass(frozen=True, eq=False)
+class NearAffineCamera(MatrixCamera):
+    """A camera at a finite working distance d, one parameter beyond affine: u = c + (M [x; 1] - c) / D.
+
+    D = 1 + r3.(x - reference) / d.  Affine is 1/d = 0, a regular point, so 1/d can be estimated and tested where
+    perspective resection is ill-conditioned.  r3 is the viewing direction of M, away from the camera; d is the
+    distance along r3 from the camera to the plane through the reference point.  A mirrored image shows as a
+    negative 1/d, since reflection turns the direction r3 that M implies round.
+
+    Attributes:
+        matrix: M (2, 4), the affine camera that touches this one in the plane r3.(x - reference) = 0.
+        inverse_distance_per_mm: 1/d.
+        centre_px: c, the principal point (2,), towards which distant points shrink.
+        reference_mm: A point (3,) of the plane where the two touch; the origin unless given.
+        radial_per_px2: k of radial distortion about c: the pixel above moves by k |u - c|^2 (u - c).
+    """
+
+    inverse_distance_per_mm: float
+    centre_px: np.ndarray
+    reference_mm: np.ndarray = (0.0, 0.0, 0.0)
+    radial_per_px2: float = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        store_array(self, "centre_px", (2,))
+        store_array(self, "reference_mm", (3,))
+        for name in ("inverse_distance_per_mm", "radial_per_px2"):
+            if not np.isfinite(getattr(self, name)):
+                raise ValueError(f"{name}: must be finite; 0 is the affine camera.")
+            object.__setattr__(self, name, float(getattr(self, name)))
+
+    def depth_ratio(self, x: np.ndarray) -> np.ndarray:
+        """D (n,) of points (n, 3) mm: distance along the view over d; zero or less behind the camera."""
+        return 1.0 + self.inverse_distance_per_mm * ((x - self.reference_mm) @ self.viewing_direction)
+
+    def _undistorted(self, x: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+        """Pixels (n, 2) relative to the centre and before distortion, and D (n, 1)."""
+        x = points(x, 3, "x")
+        ratio = self.depth_ratio(x)[:, None]
+        if (ratio <= 0).any():
+            raise ValueError("x: a point lies behind the camera; check the units (mm) and the frame.")
+        return (x @ self.linear.T + self.offset_px - self.centre_px) / ratio, ratio
+
+    def project(self, x: ArrayLike) -> np.ndarray:
+        """Pixels (n, 2) of points (n, 3) in mm; NaN rows stay NaN, and a ValueError refuses points behind the camera."""
+        v = self._undistorted(x)[0]
+        return self.centre_px + v * (1.0 + self.radial_per_px2 * (v**2).sum(axis=1, keepdims=True))
+
+    def jacobian(self, x: ArrayLike) -> np.ndarray:
+        """Derivative of `project`, (n, 2, 3) px per mm."""
+        v, ratio = self._undistorted(x)
+        J = (self.linear - self.inverse_distance_per_mm * v[:, :, None] * self.viewing_direction) / ratio[:, :, None]
+        return radial_derivative(v, self.radial_per_px2) @ J if self.radial_per_px2 else J
+
+    def undistort(self, u: ArrayLike) -> np.ndarray:
+        """Pixels (n, 2) with the radial distortion taken out (Newton's method on the radius)."""
+        u = points(u, 2, "u")
+        if not self.radial_per_px2:
+            return u
+        w = u - self.centre_px
+        distorted = np.linalg.norm(w, axis=1)
+        radius = distorted.copy()
+        for _ in range(20):
+            step = (radius + self.radial_per_px2 * radius**3 - distorted) / (1 + 3 * self.radial_per_px2 * radius**2)
+            radius = radius - step
+            if not (np.abs(step) > 1e-13 * np.maximum(distorted, 1.0)).any():
+                break
+        return self.centre_px + w * np.divide(radius, distorted, out=np.ones_like(radius), where=distorted > 0)[:, None]
+
+    @property
+    def projection_matrix(self) -> np.ndarray:
+        """Homogeneous P (3, 4) of the camera without its radial distortion; it is 1 in the reference plane."""
+        last = self.inverse_distance_per_mm * np.append(self.viewing_direction, 0.0)
+        last[3] = 1.0 - last[:3] @ self.reference_mm
+        return np.vstack([self.matrix + np.outer(self.centre_px, last - [0, 0, 0, 1]), last])
+
+    def moved(self, motion: RigidTransform) -> Self:
+        """As of an affine camera, and the reference point moves along."""
+        return replace(super().moved(motion), reference_mm=motion.apply(self.reference_mm))
+
+
+def radial_derivative(v: np.ndarray, k: float) -> np.ndarray:
+    """d/dv of v (1 + k |v|^2), (n, 2, 2), for v (n, 2)."""
+    scale = 1.0 + k * (v**2).sum(axis=1)
+    return scale[:, None, None] * np.eye(2) + 2.0 * k * v[:, :, None] * v[:, None, :]
+
+
+@dataclass(frozen=True)
+class Points:
+    """Triangulated points: `x_mm` (n, 3), `covariance_mm2` (n, 3, 3), signed `epipolar_px` residual (n,)."""
+
+    x_mm: np.ndarray
+    covariance_mm2: np.ndarray
+    epipolar_px: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class StereoRig:
+    """Two calibrated cameras that share the frame of their points (the robot's, unless a name says otherwise).
+
+    >>> left = AffineCamera([[100, 0, 0, 960], [0, 100, 0, 540]])
+    >>> right = AffineCamera([[100, 0, 11, 960], [0, 100, 0, 540]])
+    >>> rig = StereoRig(left, right)
+    >>> found = rig.triangulate(*rig.project([[1.0, 2.0, 0.5]]))
+    >>> found.x_mm.round(9).tolist(), found.epipolar_px.round(9).tolist()
+    ([[1.0, 2.0, 0.5]], [0.0])
+    """
+
+    left: MatrixCamera
+    right: MatrixCamera
+
+    @cached_property
+    def is_affine(self) -> bool:
+        """True where both cameras are affine, so that every formula below is one constant matrix."""
+        return isinstance(self.left, AffineCamera) and isinstance(self.right, AffineCamera)
+
+    @cached_property
+    def linear(self) -> np.ndarray:
+        """A (4, 3), rows left x, left y, right x, right y."""
+        return np.vstack([self.left.linear, self.right.linear])
+
+    @cached_property
+    def offset_px(self) -> np.ndarray:
+        """t (4,), so that y = A x + t."""
+        return np.concatenate([self.left.offset_px, self.right.offset_px])
+
+    @cached_property
+    def epipolar_normal(self) -> np.ndarray:
+        """Unit n (4,) with n.A = 0: n.(y - t) = 0 is the affine epipolar constraint."""
+        normal = np.linalg.svd(self.linear)[0][:, 3]
+        return normal * (1.0 if normal[np.argmax(np.abs(normal))] > 0 else -1.0)
+
+    @property
+    def fundamental(self) -> np.ndarray:
+        """Fundamental matrix F (3, 3), [u_right; 1].F.[u_left; 1] = 0; of an affine pair scaled so that its value is px.
+
+        Of near-affine cameras it holds for undistorted pixels and has unit Frobenius norm.
+        """
+        if not self.is_affine:
+            P, Q = self.left.projection_matrix, self.right.projection_matrix
+            pairs = [[np.vstack([np.delete(P, j, axis=0), np.delete(Q, i, axis=0)]) for j in range(3)] for i in range(3)]
+            F = np.linalg.det(pairs) * [[1, -1, 1], [-1, 1, -1], [1, -1, 1]]
+            return F / np.linalg.norm(F)
+        n, e = self.epipolar_normal, -self.epipolar_normal @ self.offset_px
+        return np.array([[0.0, 0.0, n[2]], [0.0, 0.0, n[3]], [n[0], n[1], e]])
+
+    def moved(self, left: RigidTransform, right: RigidTransform | None = None) -> Self:
+        """The rig after its cameras moved in the frame of their points, both alike or each by its own motion."""
+        return StereoRig(self.left.moved(left), self.right.moved(left if right is None else right))
+
+    @cached_property
+    def convergence_rad(self) -> float:
+        """Angle between the two viewing directions."""
+        return float(np.arccos(np.clip(self.left.viewing_direction @ self.right.viewing_direction, -1.0, 1.0)))
+
+    def project(self, x: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+        """(u_left, u_right), (n, 2) px each, of points (n, 3) in mm."""
+        return self.left.project(x), self.right.project(x)
+
+    def jacobian(self, x: ArrayLike) -> np.ndarray:
+        """Derivative of the four pixel coordinates, (n, 4, 3) px per mm."""
+        return np.concatenate([self.left.jacobian(x), self.right.jacobian(x)], axis=1)
+
+    def epipolar_distance(self, u_left: ArrayLike, u_right: ArrayLike) -> np.ndarray:
+        """Signed distance (n,) px of each match from the epipolar constraint.
+
+        The distance is in the four pixel coordinates together, so independent noise of 1 px in each gives a
+        distance of standard deviation 1 px (Hartley and Zisserman, Sec. 14.4).
+        """
+        if not self.is_affine:
+            return self.triangulate(u_left, u_right).epipolar_px
+        return (_stacked(u_left, u_right) - self.offset_px) @ self.epipolar_normal
+
+    def triangulate(self, u_left: ArrayLike, u_right: ArrayLike, covariance_px2: ArrayLike | None = None) -> Points:
+        """Maximum-likelihood points of matches (n, 2) px, with the covariance of each from the noise of its match.
+
+        Rows that are NaN, or that only a point behind a near-affine camera would explain, give NaN.  `covariance_px2` of
+        the matches has any form that `lib.geometry.pair_covariance` takes; None is 1 px^2.
+        """
+        y = _stacked(u_left, u_right)
+        covariance = pair_covariance(covariance_px2, len(y))
+        if not self.is_affine:
+            return self._triangulate_near_affine(y, covariance)
+        y = y.T - self.offset_px[:, None]
+        weight_A = np.linalg.solve(covariance, np.broadcast_to(self.linear, (len(covariance), 4, 3)))
+        covariance_mm2 = np.linalg.inv(self.linear.T @ weight_A)
+        gain = covariance_mm2 @ weight_A.mT
+        x = (gain[0] @ y).T if len(gain) == 1 else np.einsum("nij,jn->ni", gain, y)
+        return Points(x, np.broadcast_to(covariance_mm2, (len(x), 3, 3)), self.epipolar_normal @ y)
+
+    def _triangulate_near_affine(self, y: np.ndarray, covariance: np.ndarray) -> Points:
+        """Linear for each point (the projection's denominator multiplied out), then two Gauss-Newton steps on the pixels."""
+        x, covariance_mm2, epipolar = (np.full((len(y), *shape), np.nan) for shape in ((3,), (3, 3), ()))
+        known = np.flatnonzero(np.isfinite(y).all(axis=1))
+        for start in range(0, len(known), _BLOCK):
+            rows = known[start : start + _BLOCK]
+            W = np.linalg.inv(covariance if len(covariance) == 1 else covariance[rows])
+            found, step, seen = self._linear_points(y[rows]), 0.0, np.ones(len(rows), dtype=bool)
+            for _ in range(3):  # the last time for the covariance at the point found
+                found = found + step
+                J, r, in_front = self._linearised(found, y[rows])
+                step, inverse = _least_squares(J, r, W)
+                seen &= in_front
+            # What no point explains, along the epipolar normal; that of the affine cameras says its sign.
+            off = r - (J @ _least_squares(J, r, np.eye(4))[0][:, :, None])[:, :, 0]
+            off = np.sign(off @ self.epipolar_normal) * np.linalg.norm(off, axis=1)
+            x[rows[seen]], covariance_mm2[rows[seen]], epipolar[rows[seen]] = found[seen], inverse[seen], off[seen]
+        return Points(x, covariance_mm2, epipolar)
+
+    def _linear_points(self, y: np.ndarray) -> np.ndarray:
+        """x (n, 3) from P_i [x; 1] - u_i P_3 [x; 1] = 0 for undistorted pixels."""
+        rows, right_hand = [], []
+        for camera, u in zip((self.left, self.right), (y[:, :2], y[:, 2:]), strict=True):
+            P, u = camera.projection_matrix, camera.undistort(u) if isinstance(camera, NearAffineCamera) else u
+            rows.append(P[:2, :3] - u[:, :, None] * P[2, :3])
+            right_hand.append(u * P[2, 3] - P[:2, 3])
+        return _least_squares(np.concatenate(rows, axis=1), np.concatenate(right_hand, axis=1), np.eye(4))[0]
+
+    def _linearised(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Jacobian (n, 4, 3), residuals (n, 4), and which points lie before both cameras; the others stand at the centre."""
+        near = [camera for camera in (self.left, self.right) if isinstance(camera, NearAffineCamera)]
+        in_front = np.all([camera.depth_ratio(x) > 0 for camera in near], axis=0)
+        safe = np.where(in_front[:, None], x, near[0].reference_mm)
+        return self.jacobian(safe), y - np.hstack(self.project(safe)), in_front
+
+    def save(self, path: str | Path) -> None:
+        """Write the rig as JSON (matrices, units); the file appears whole or not at all."""
+
+        def numbers(camera: MatrixCamera) -> dict:
+            return {field.name: np.asarray(getattr(camera, field.name)).tolist() for field in fields(camera)}
+
+        write_json(path, {"format": FORMAT, "units": UNITS, "left": numbers(self.left), "right": numbers(self.right)})
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read what `save` wrote; a FileNotFoundError or ValueError names the file."""
+        path = Path(path)
+        if not path.is_file():
+            raise FileNotFoundError(f"{path}: no such file; StereoRig.save writes one.")
+        try:
+            content = json.loads(path.read_text(encoding="utf-8"))
+            for key, expected in (("format", FORMAT), ("units", UNITS)):
+                if content.get(key, expected) != expected:
+                    raise ValueError(f"{key} is {content[key]!r}, expected {expected!r}")
+            left, right = (
+                (NearAffineCamera if "inverse_distance_per_mm" in numbers else AffineCamera)(**numbers)
+                for numbers in (content["left"], content["right"])
+            )
+            return cls(left, right)
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+            why = f"{type(error).__name__}: {error}"
+            raise ValueError(f"{path}: not a stereo rig written by StereoRig.save ({why}).") from None
+
+
+def _stacked(u_left: ArrayLike, u_right: ArrayLike) -> np.ndarray:
+    """y (n, 4) of matches (n, 2)."""
+    u_left, u_right = points(u_left, 2, "u_left"), points(u_right, 2, "u_right")
+    if len(u_left) != len(u_right):
+        raise ValueError(f"u_left, u_right: {len(u_left)} and {len(u_right)} points; matches come in pairs.")
+    return np.hstack([u_left, u_right])
+
+
+def _least_squares(J: np.ndarray, r: np.ndarray, W: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Weighted least squares of r = J x: x (n, 3) and the inverse (n, 3, 3) of the normal matrix; NaN where it has none."""
+    WJ = W @ J
+    normal = J.mT @ WJ
+    inverse = np.linalg.inv(np.where(np.linalg.det(normal)[:, None, None] == 0, np.nan, normal))
+    return (inverse @ (WJ.mT @ r[..., None]))[..., 0], inverse
