@@ -94,7 +94,7 @@ def drawn_tool(image: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray,
 
 
 def _jaw_shape(rng: np.random.Generator) -> dict[str, float]:
-    """Bow outward, bend of all, hook, taper, end and swelling: of the unit of length."""
+    """Bow outward, bend of all, hook, taper, end and swelling, of the unit of length; where the jaw turns inward, by what angle."""
     def some(share: float, value: float) -> float:
         return value if rng.random() < share else 0.0
 
@@ -102,7 +102,8 @@ def _jaw_shape(rng: np.random.Generator) -> dict[str, float]:
         "long": rng.uniform(0.75, 1.1), "bow": some(0.7, rng.uniform(-0.05, 0.35)), "power": rng.uniform(0.6, 1.8),
         "bend": some(0.3, rng.normal(0, 0.3)), "hook": some(0.25, rng.uniform(0.02, 0.2)), "start": rng.uniform(0.5, 0.9),
         "taper": rng.uniform(0.1, 1.0), "end": some(0.5, rng.uniform(0.1, 1.0)), "swell": some(0.25, rng.uniform(0.2, 1.5)),
-        "teeth": some(0.12, rng.uniform(0.1, 0.5)),
+        "teeth": some(0.12, rng.uniform(0.1, 0.5)), "elbow": rng.uniform(0.3, 0.95),
+        "turn": some(0.4, rng.choice([-1, 1], p=[0.2, 0.8]) * rng.uniform(0.3, 1.9)),
     }  # fmt: skip
 
 
@@ -114,6 +115,12 @@ def _jaw(
     along, across = s * shape["long"], shape["bow"] * np.sin(np.pi * s ** shape["power"]) * side
     across = across + shape["bend"] * s**2
     across = across - side * shape["hook"] * np.clip((s - shape["start"]) / (1 - shape["start"]), 0, 1) ** 2
+    # Beyond the elbow the jaw goes on in another direction: its tip is its end, not the corner.
+    before, beyond = s <= shape["elbow"], np.maximum(s - shape["elbow"], 0) * shape["long"]
+    corner = np.interp(shape["elbow"], s, along), np.interp(shape["elbow"], s, across)
+    if shape["turn"]:
+        along = np.where(before, along, corner[0] + beyond * np.cos(shape["turn"]))
+        across = np.where(before, across, corner[1] - side * beyond * np.sin(shape["turn"]))
     radius = thick * (1 - shape["taper"] * s) + shape["end"] * thick * np.clip(4 * s - 3, 0, 1)
     radius = radius * (1 + shape["swell"] * np.exp(-(((s - 0.8) / 0.12) ** 2)))
     radius = radius * (1 + shape["teeth"] * (np.arange(24) % 2) * (s > 0.4))
