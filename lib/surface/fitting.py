@@ -122,7 +122,7 @@ def _outputs(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(axes (k, 3), values (n, k) = x along them, weights (n, k) of their absolute residuals)."""
     if camera is not None and not isinstance(camera, AffineCamera):
-        raise ValueError("camera: the depth along the rays of a near-affine camera is no B-spline; fit without a camera.")
+        raise ValueError("camera: the rays of a near-affine camera make the depth no B-spline; fit without a camera.")
     n = len(x)
     axes = np.eye(3) if camera is None else camera.viewing_direction[None]
     if covariance_mm2 is None:
