@@ -35,8 +35,6 @@ class HourglassConfig:
         growth: By how much the channels multiply with each halving; 1 as in the paper.
         decoder, skips, residual: The parts that the ablation adds one by one.  Without a decoder the heatmaps have stride
             4 * 2**depth.
-        basic: Boxes are two 3 x 3 convolutions in place of the paper's bottlenecks: eight times the arithmetic for twice
-            the time, since processors do wide convolutions best.  There is no box at half resolution then.
 
         >>> HourglassConfig().stride, HourglassConfig(stacks=1, decoder=False, skips=False).stride
         (4, 64)
@@ -49,7 +47,6 @@ class HourglassConfig:
     decoder: bool = True
     skips: bool = True
     residual: bool = True
-    basic: bool = False
 
     def __post_init__(self) -> None:
         if self.features < 2 or self.features % 2:
@@ -60,8 +57,6 @@ class HourglassConfig:
             raise ValueError(f"growth: must be 1, or more with a decoder, got {self.growth}.")
         if self.skips and not self.decoder:
             raise ValueError("skips: skip connections end in the decoder; set decoder=True or skips=False.")
-        if self.basic and not self.residual:
-            raise ValueError("basic: is a kind of residual box; set residual=True or basic=False.")
         if self.stacks > 1 and not self.decoder:
             raise ValueError("stacks: hourglasses without a decoder cannot be stacked; set stacks=1 or decoder=True.")
 
@@ -112,12 +107,10 @@ class _Block(nn.Module):
         return self.body(x) if self.skip is None else F.relu(self.body(x) + self.skip(x))
 
 
-def _box(inputs: int, outputs: int, config: HourglassConfig) -> _Block:
-    """A box of the paper's figure: a bottleneck or basic residual module (He et al. 2016), or a plain 3 x 3 convolution."""
-    if not config.residual:
+def _box(inputs: int, outputs: int, residual: bool) -> _Block:
+    """A box of the paper's figure: a bottleneck residual module (He et al. 2016), or a plain 3 x 3 convolution."""
+    if not residual:
         return _Block(_conv(inputs, outputs, 3))
-    if config.basic:
-        return _residual(inputs, outputs)
     middle = max(outputs // 2, 1)
     body = nn.Sequential(_conv(inputs, middle, 1), _conv(middle, middle, 3), _conv(middle, outputs, 1, relu=False))
     return _Block(body, nn.Identity() if inputs == outputs else _conv(inputs, outputs, 1, relu=False))
@@ -137,11 +130,11 @@ class _Hourglass(nn.Module):
 
     def __init__(self, config: HourglassConfig, depth: int, f: int):
         super().__init__()
-        below = 2 * round(f * config.growth / 2)
-        self.skip = _box(f, f, config) if config.skips else None
-        self.down = _box(f, below, config)
-        self.inner = _Hourglass(config, depth - 1, below) if depth > 1 else _box(below, below, config)
-        self.up = _box(below, f, config) if config.decoder else None
+        residual, below = config.residual, 2 * round(f * config.growth / 2)
+        self.skip = _box(f, f, residual) if config.skips else None
+        self.down = _box(f, below, residual)
+        self.inner = _Hourglass(config, depth - 1, below) if depth > 1 else _box(below, below, residual)
+        self.up = _box(below, f, residual) if config.decoder else None
 
     def forward(self, x: Tensor) -> Tensor:
         y = self.inner(self.down(F.max_pool2d(x, 2)))
@@ -167,19 +160,19 @@ class StackedHourglass(Network):
         super().__init__()
         self.config = config = config or HourglassConfig()
         self.stride = config.stride
-        f, half = config.features, config.features // 2
+        f, half, residual = config.features, config.features // 2, config.residual
         self.stem = nn.Sequential(
             nn.Conv2d(3, half, 6, stride=2, padding=2, bias=False),  # even kernel: centred between pixels 2i and 2i + 1
             nn.BatchNorm2d(half),
             nn.ReLU(inplace=True),
-            nn.Identity() if config.basic else _box(half, half, config),
+            _box(half, half, residual),
             nn.MaxPool2d(2),
-            _box(half, f, config),
-            _box(f, f, config),
+            _box(half, f, residual),
+            _box(f, f, residual),
         )
         stacks = range(config.stacks)
         self.hourglasses = nn.ModuleList([_Hourglass(config, config.depth, f) for _ in stacks])
-        self.features = nn.ModuleList([nn.Sequential(_box(f, f, config), _conv(f, f, 1)) for _ in stacks])
+        self.features = nn.ModuleList([nn.Sequential(_box(f, f, residual), _conv(f, f, 1)) for _ in stacks])
         self.heads = nn.ModuleList([nn.Conv2d(f, len(LANDMARKS), 1) for _ in stacks])
         between = stacks[:-1]
         self.merge_features = nn.ModuleList([nn.Conv2d(f, f, 1) for _ in between])

@@ -55,8 +55,7 @@ def stage_config(stage: str, *, preset: str = "best", features: int | None = Non
     config = replace(config, augmentation=AUGMENTATIONS["none"], ema=0.998)  # what is drawn is changed already
     if stage == "frame":
         return replace(config, network=HourglassConfig(features, depth=3, growth=1.75), batch_size=16)
-    network = HourglassConfig(features, stacks=1, depth=3, growth=5 / 3, basic=True)
-    return replace(config, network=network, batch_size=16)
+    return replace(config, network=HourglassConfig(features, growth=1.4))
 
 
 def stage_data(stage: str, folder: str | Path) -> tuple[Source, Samples]:
