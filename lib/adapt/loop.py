@@ -151,6 +151,8 @@ class _Work:
         self.recording, self.seed, self.progress, self.tune = recording, seed, progress, tune
         self.detector = detector or Detector.load()
         self.minutes, self.saved_s = minutes, 0.0
+        self.parts: dict[str, np.ndarray] = {}  # frames for learning, stopping and judging
+        self.simulated: list[LabelledImage] = []  # in the colours of this recording
         self.labels = np.full((len(recording), 2, 3, 2), np.nan)
         if labels is not None:
             given = read_coco(Path(labels), len(recording), recording.image_size_px, recording.skeleton)

@@ -35,7 +35,7 @@ _TEST_TEXTURE_SEEDS = range(9_000, 9_016)
 #: Jaw lengths that training never draws: recordings for tests have tools of these.
 RESERVED_JAW_MM = (2.95, 3.15)
 _TEXTURE_PX = 1536
-_PHOTOGRAPHED = 0.4  # share of the scenes whose ground is a photograph, where there are some
+_PHOTOGRAPHED = 0.4  # share of the scenes, but those of the reference rig, whose ground is a photograph if there are some
 _NARROW, _NARROW_TEXTURES = 0.2, 32  # share of the narrow population in training, and its textures, kept in memory
 
 

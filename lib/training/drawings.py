@@ -94,7 +94,10 @@ def drawn_tool(image: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray,
 
 
 def _jaw_shape(rng: np.random.Generator) -> dict[str, float]:
-    """Bow outward, bend of all, hook, taper, end and swelling, of the unit of length; where the jaw turns inward, by what angle."""
+    """The outline of a jaw of length 1: its bow outward, bend, hook, taper, end and swelling; the place of its elbow and the
+    angle (rad) by which it turns inward there, 0 = none.
+    """
+
     def some(share: float, value: float) -> float:
         return value if rng.random() < share else 0.0
 
@@ -115,10 +118,9 @@ def _jaw(
     along, across = s * shape["long"], shape["bow"] * np.sin(np.pi * s ** shape["power"]) * side
     across = across + shape["bend"] * s**2
     across = across - side * shape["hook"] * np.clip((s - shape["start"]) / (1 - shape["start"]), 0, 1) ** 2
-    # Beyond the elbow the jaw goes on in another direction: its tip is its end, not the corner.
-    before, beyond = s <= shape["elbow"], np.maximum(s - shape["elbow"], 0) * shape["long"]
-    corner = np.interp(shape["elbow"], s, along), np.interp(shape["elbow"], s, across)
-    if shape["turn"]:
+    if shape["turn"]:  # beyond the elbow the jaw goes on in another direction: its tip is its end, not the corner
+        before, beyond = s <= shape["elbow"], np.maximum(s - shape["elbow"], 0) * shape["long"]
+        corner = np.interp(shape["elbow"], s, along), np.interp(shape["elbow"], s, across)
         along = np.where(before, along, corner[0] + beyond * np.cos(shape["turn"]))
         across = np.where(before, across, corner[1] - side * beyond * np.sin(shape["turn"]))
     radius = thick * (1 - shape["taper"] * s) + shape["end"] * thick * np.clip(4 * s - 3, 0, 1)
