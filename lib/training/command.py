@@ -30,7 +30,7 @@ def main(argv: list[str] | None = None) -> int:
     add("--scenes", type=int, default=120, help="generate: shards of 64 small scenes")
     add("--closeups", type=int, default=40, help="generate: shards of 1024 closeups of a landmark")
     add("--held-out", type=int, default=24, help="generate: shards of 16 full scenes, for the doubt")
-    add("--photographs", type=Path, help="generate: a folder of images, the ground of a third of the scenes that are made now")
+    add("--photographs", type=Path, help="generate: a folder of images, the ground of a third of the scenes made now")
     add("--workers", type=int, help="generate: processes (default: one a core)")
     add("--preset", choices=sorted(PRESETS), default="best")
     add("--steps", type=int, default=6000)

@@ -44,7 +44,7 @@ def generate(
 ) -> None:  # fmt: skip
     """Write the first `shards` shards of a kind into `folder`, except those that exist.
 
-    A shard depends on its kind, its number and the `photographs` alone, which are the ground of some of the scenes that train.
+    A shard depends on its kind, its number and the `photographs` alone, which are the ground of some scenes that train.
     Crops are rendered alone, each of an eye and a tool of its own: many times as many scenes a second.  `workers` processes
     share the work (None: all cores).
     """
