@@ -314,17 +314,25 @@ class Detector:
         height = self._shown(seen or self.stage_peaks(images, rough.u, "tool"), len(images))[1]
         searched = height < _SHOWN
         for i in np.flatnonzero(searched):
-            image = images[i : i + 1]
-            candidates = Landmarks.join([rough[i : i + 1], self._candidates(image)])
-            looks = np.broadcast_to(image, (len(candidates), *image.shape[1:]))
-            u, once = self._shown(self.stage_peaks(looks, candidates.u, "tool"), len(looks))
+            candidates, u, once = self.proposed(images[i], rough[i : i + 1])
             best = np.argsort(-likelihood(u, once))[:_AGAIN]
-            u, twice = self._shown(self.stage_peaks(looks[best], u[best], "again"), len(best))
+            u, twice = self._looked(images[i], u[best], "again")
             chosen = likelihood(u, twice).argmax()
             result._put(np.array([i]), candidates[best[[chosen]]])
             height[i] = twice[chosen]
         unsure = searched | (rough.confidence < _SURE).any(1)
         return replace(result, confidence=np.where(unsure[:, None], _SURE * height[:, None], rough.confidence))
+
+    def proposed(self, image: np.ndarray, *others: Landmarks) -> tuple[Landmarks, np.ndarray, np.ndarray]:
+        """Tools that an image (h, w, 3) may show: `others` and those that the first stage's peaks make; u (m, 3, 2) px of
+        what a look at each shows, and the mean height (m,) of the peaks there.
+        """
+        candidates = Landmarks.join([*others, self._candidates(image[None])])
+        return candidates, *self._looked(image, candidates.u, "tool")
+
+    def _looked(self, image: np.ndarray, u: np.ndarray, stage: str) -> tuple[np.ndarray, np.ndarray]:
+        """`_shown` of several tools u (n, 3, 2) in one image."""
+        return self._shown(self.stage_peaks(np.broadcast_to(image, (len(u), *image.shape)), u, stage), len(u))
 
     @staticmethod
     def _shown(seen: tuple, n: int) -> tuple[np.ndarray, np.ndarray]:

@@ -24,9 +24,12 @@ def disguised(
     >>> disguised(np.full((32, 48, 3), 90, np.uint8), u, np.full(3, 2), rng, 9.0)[0].shape
     (32, 48, 3)
     """
-    if rng.random() < 0.1:
+    kind = rng.random()
+    if kind < 0.1:
         return image, u, visibility
     x, hidden = image.astype(np.float32) / 255, np.zeros(3, bool)
+    if kind < 0.4:  # another camera of the same scene
+        return (255 * _colours(x, rng) + 0.5).astype(np.uint8), u, visibility
     x = _things_in_front(x, u, hidden, rng, length_px)
     x = _colours(x, rng)
     x = _light(x, u, hidden, rng, length_px)
@@ -53,7 +56,7 @@ def _colours(x: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     if rng.random() < 0.5:  # saturation
         x = x.mean(axis=2, keepdims=True) * (1 - (s := np.float32(rng.uniform(0, 1.5)))) + x * s
     if rng.random() < 0.6:
-        x = x * np.exp(rng.normal(0, 0.2, 3) + rng.normal(0, 0.35)).astype(np.float32)
+        x = x * np.exp(rng.normal(0, 0.2, 3) + rng.uniform(-0.9, 0.9)).astype(np.float32)
     if rng.random() < 0.6:
         x = np.clip(x, 0, 1) ** np.float32(np.exp(rng.normal(0, 0.4)))
     if rng.random() < 0.15:  # haze and veil

@@ -12,7 +12,7 @@ from lib.recordings import Recording, read_image
 from lib.training.evaluation import evaluate
 from lib.training.loop import PRESETS, Training, load_training, train
 from lib.training.samples import labelled_images
-from lib.training.shards import generate
+from lib.training.shards import generate, propose
 from lib.training.stages import STAGES, assemble, finetune, stage_config, stage_data, training_of
 
 
@@ -20,8 +20,9 @@ def main(argv: list[str] | None = None) -> int:
     """`python3 -m lib train`: simulate training data, train or fine-tune the detector's stages (resuming), assemble them."""
     parser = argparse.ArgumentParser(prog="python3 -m lib train", description=main.__doc__.split(": ", 1)[1])
     add = parser.add_argument
-    add("what", choices=["generate", *STAGES, "finetune", "assemble", "export"],
-        help="generate: simulate the training data; frame, tool, closeup: train this stage; finetune: train all "
+    add("what", choices=["generate", "propose", *STAGES, "finetune", "assemble", "export"],
+        help="generate: simulate the training data; propose: search it for what --initial takes for tools; frame, tool, "
+        "closeup: train this stage (tool: on the proposals, too, if they are there); finetune: train all "
         "further on labelled recordings; assemble: join them into a detector with its card; export: write ONNX")  # fmt: skip
     add("recordings", nargs="*", type=Path, help="labelled recordings; finetune holds out the end of each")
     add("--data", type=Path, default=paths.CACHE / "landmarks", help="folder of the simulated shards")
@@ -49,6 +50,8 @@ def main(argv: list[str] | None = None) -> int:
         shards = {"held_out": a.held_out, "scenes": a.scenes, "closeups": a.closeups}
         for kind, count in shards.items():
             generate(a.data, kind, count, workers=a.workers, photographs=_images(a.photographs) if a.photographs else ())
+    elif a.what == "propose":
+        propose(a.data, a.initial, workers=a.workers)
     elif a.what == "finetune":
         _finetune(a)
     elif a.what == "assemble":

@@ -49,15 +49,19 @@ def drawn_ground(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return np.clip(x, 0, 255).astype(np.uint8)
 
 
-def drawn_tool(image: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def drawn_tool(
+    image: np.ndarray, rng: np.random.Generator, *, length_px: float | None = None, around: int | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A forceps drawn on an image (h, w, 3) uint8: the image, landmarks (3, 2) px and their visibility (3,).
+
+    Its jaws are about `length_px` long (None: to suit the image), and landmark `around` is near the middle (None: anywhere).
 
     >>> image, u, visibility = drawn_tool(np.full((90, 160, 3), 90, np.uint8), np.random.default_rng(0))
     >>> image.shape, u.shape
     ((90, 160, 3), (3, 2))
     """
     h, w = image.shape[:2]
-    length = np.exp(rng.uniform(np.log(0.045), np.log(0.3))) * w
+    length = length_px or np.exp(rng.uniform(np.log(0.045), np.log(0.3))) * w
     angle = rng.uniform(-np.pi, np.pi)
     ahead = np.array([np.cos(angle), np.sin(angle)])
     middle = rng.uniform((0.05 * w, 0.05 * h), (0.95 * w, 0.95 * h))
@@ -76,20 +80,23 @@ def drawn_tool(image: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray,
     back = np.linspace(0, 1, 12)[:, None]
     bent = rng.normal(0, 0.03) if rng.random() < 0.2 else 0.0
     shaft = base - back * 1.6 * w * ahead + (bent * back**2) * 1.6 * w * np.array([-ahead[1], ahead[0]])
-    shaft += rng.uniform(0, 0.08) * length * ahead * (1 - back)  # how far it covers the jaws' roots
+    shaft += rng.uniform(0, 0.02) * length * ahead * (1 - back)  # it ends where the jaws leave it
     radius = shaft_radius * (1 + rng.uniform(-0.2, 1.2) * back[:, 0])
     if rng.random() < 0.3:  # a sleeve
         radius = np.where(np.arange(12) > rng.integers(1, 4), radius * rng.uniform(1.1, 2.0), radius)
     if rng.random() < 0.3:  # rounded or conical end
         radius[0] *= rng.uniform(0.2, 0.8)
     parts.insert(int(rng.choice([0, 2])), (shaft, radius))
+    u = np.array(u)
+    if np.linalg.det(u[1:] - u[0]) < 0:  # the jaws cross: tip_1 is the left one
+        u = u[[0, 2, 1]]
+    if around is not None:
+        shift = (np.array([w, h]) - 1) / 2 + rng.uniform(-8, 8, 2) - u[around]
+        u, parts = u + shift, [(line + shift, radius) for line, radius in parts]
     x = image.astype(np.float32)
     if rng.random() < 0.6:
         x = _shadowed(x, parts, length, rng)
     x = _painted(x, parts, length, rng)
-    u = np.array(u)
-    if np.linalg.det(u[1:] - u[0]) < 0:  # the jaws cross: tip_1 is the left one
-        u = u[[0, 2, 1]]
     return np.clip(x, 0, 255).astype(np.uint8), u, np.where(in_image(u, (w, h)), 2, 0)
 
 

@@ -16,9 +16,12 @@ import numpy as np
 
 from lib.files import whole
 from lib.geometry import cell_from_image
+from lib.landmarks import Detector
+from lib.landmarks.metrics import tool_length_px
 from lib.landmarks.windows import cut
-from lib.parallel import run_jobs
+from lib.parallel import run_jobs, single_threaded_torch
 from lib.simulator.population import TEXTURE_SEEDS, VALIDATION_TEXTURE_SEEDS, sample
+from lib.training.appearance import disguised
 from lib.training.samples import LabelledImage
 
 #: Longest side of a stored whole scene.
@@ -27,10 +30,13 @@ SCENE_PX = 512
 _SEEDS = {"closeups": (5, 77), "scenes": (6,), "held_out": (7,)}
 #: Side of the crops that closeups are cut from.
 CLOSEUP_CROP_PX = 160
-#: Closeups in a shard.
-CLOSEUPS = 1024
+#: Closeups in a shard, and the most proposals that are kept of a scene.
+CLOSEUPS, PROPOSALS = 1024, 12
 #: Shards of whole scenes: how many, and the share of each population.
-SCENES = {"scenes": (64, {"training": 0.88, "empty": 0.12}), "held_out": (16, {"validation": 0.6, "near": 0.2, "empty": 0.2})}
+SCENES = {
+    "scenes": (64, {"training": 0.55, "near": 0.33, "empty": 0.12}),
+    "held_out": (16, {"validation": 0.6, "near": 0.2, "empty": 0.2}),
+}
 #: Sizes of held-out scenes: what stage sees what must not depend on them.
 HELD_OUT_SIZES = ((1920, 1080), (1280, 720), (960, 540))
 #: A crop is rendered with its landmark anywhere within a JPEG block of this many pixels.  Were its place in the block always
@@ -154,6 +160,50 @@ def read_scenes(folder: str | Path) -> tuple[np.ndarray, ...]:
     ends, *parts = zip(*(_read(path, ("jpeg_ends", "jpegs", "u", "visibility")) for path in found), strict=True)
     before = np.cumsum([0, *(own[-1] for own in ends[:-1])])
     return tuple(map(np.concatenate, ([own + start for own, start in zip(ends, before, strict=True)], *parts)))
+
+
+def propose(folder: str | Path, detector: str | Path | None = None, *, workers: int | None = None) -> None:
+    """Write what a detector's first stage takes for tools in the scenes of a folder, except where that is known.
+
+    Most are none: they are the negatives that teach the second stage most.  `detector`: as `Detector.load` takes it.
+    """
+    jobs = {_proposals(path): (path, detector) for path in sorted(Path(folder).glob("scenes_*.npz"))}
+    for _, error in run_jobs(make_proposals, jobs, workers=workers, title="Searching scenes", unit="shard"):
+        if error:
+            raise error
+
+
+def make_proposals(path: Path, scenes: Path, detector: str | Path | None) -> None:
+    """Search the scenes of one shard, half of them disguised; write u (n, PROPOSALS, 3, 2) px, NaN beyond those there are."""
+    searching, rng = Detector.load(detector), np.random.default_rng([8, int(scenes.stem[-4:])])
+    jpegs, ends, u, visibility = _read(scenes, ("jpegs", "jpeg_ends", "u", "visibility"))
+    found = np.full((len(u), PROPOSALS, 3, 2), np.nan)
+    with single_threaded_torch():
+        for i, piece in enumerate(np.split(jpegs, ends[:-1])):
+            image = cv2.imdecode(piece, cv2.IMREAD_COLOR_RGB)
+            if rng.random() < 0.5:
+                length_px = np.nan_to_num(tool_length_px(u[i : i + 1])[0], nan=40.0)
+                image = disguised(image, u[i], visibility[i], rng, float(length_px))[0]
+            seen, _, height = searching.proposed(image)
+            best = np.argsort(-height)[:PROPOSALS]
+            found[i, : len(best)] = seen.u[best]
+    with whole(path) as partial:
+        np.savez(partial, u=found)
+
+
+def _proposals(scenes: Path) -> Path:
+    return scenes.with_name(scenes.name.replace("scenes", "proposals"))
+
+
+def read_proposals(folder: str | Path) -> np.ndarray | None:
+    """What `propose` found in a folder's scenes, (n, PROPOSALS, 3, 2) px, NaN where it did not look; None if nowhere."""
+    known, parts = False, []
+    for path in sorted(Path(folder).glob("scenes_*.npz")):
+        own = _proposals(path)
+        known |= own.is_file()
+        n = len(_read(path, ("jpeg_ends",))[0])
+        parts.append(_read(own, ("u",))[0] if own.is_file() else np.full((n, PROPOSALS, 3, 2), np.nan))
+    return np.concatenate(parts) if known else None
 
 
 def validation_images(folder: str | Path, kind: str = "held_out") -> Iterator[LabelledImage]:

@@ -11,10 +11,10 @@ import numpy as np
 from lib.landmarks import windows
 from lib.landmarks.metrics import tool_length_px
 from lib.simulator.window import in_image, motion_blur
+from lib.training import shards
 from lib.training.appearance import disguised
 from lib.training.drawings import drawn_ground, drawn_tool
 from lib.training.samples import LabelledImage, Source
-from lib.training.shards import BLOCK_PX, CLOSEUP_CROP_PX, SCENE_PX, packed, read_scenes, read_shards, square_round
 
 #: The first stage sees frames whose longer side is shrunk to this, here with (width, height) of the input.  It is trained on
 #: parts of them, which costs a third, since a frame is mostly background.
@@ -28,8 +28,12 @@ SHORTEST_PX = 5.0
 FLAT = 5.0
 #: By how much a window is turned (rad), magnified (log) and shifted (its pixels) if it still shows the tool, and if not.
 _SHOWS, _SHOWS_NOT = ((0.0, 0.7), (0.0, 0.6), (0.0, 30.0)), ((1.0, np.pi), (0.8, 1.6), (60.0, 150.0))
+#: Share of the windows that are where a first stage saw a tool, of scenes in which that is known.
+_PROPOSED = 0.4
 #: A closeup shows a part of the tool: blur and things in front are drawn as for a tool of this length.
 _DISGUISE_PX = 40.0
+#: Drawn tools in closeups: their length, and the blur of lens and sensor, px.
+_DRAWN_LENGTH_PX, _DRAWN_BLUR_PX = (90.0, 450.0), (0.4, 3.0)
 
 
 @dataclass(frozen=True)
@@ -52,24 +56,28 @@ class SceneSource(Source):
     @classmethod
     def load(cls, folder: str | Path) -> Self:
         """From the shards of a folder, to train with."""
-        return cls(*read_scenes(folder), disguise=0.7, drawn=0.35)
+        return cls(*shards.read_scenes(folder), disguise=0.7, drawn=0.35)
 
     @classmethod
     def of(cls, images: Iterable[LabelledImage], *, still: bool = False, weight: np.ndarray | None = None) -> Self:
         """From labelled images of any size; `still` shows each as the detector sees it, for validation."""
-        return cls(*packed(images, SCENE_PX), disguise=0.0 if still else 0.5, weight=weight)
+        return cls(*shards.packed(images, shards.SCENE_PX), disguise=0.0 if still else 0.5, weight=weight)
 
     def scene(self, index: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """The frame, or a drawn tool on a ground made of it, with landmarks (3, 2), visibility and weight (3,)."""
-        start = self.ends[index - 1] if index else 0
-        image = cv2.imdecode(self.jpegs[start : self.ends[index]], cv2.IMREAD_COLOR_RGB)
+        image, *labels = self.frame(index)
         if self.drawn and rng.random() < self.drawn:
             x, y = rng.integers(0, np.maximum(np.subtract(image.shape[1::-1], _DRAWN_PX), 0), endpoint=True)
             image = image[y : y + _DRAWN_PX[1], x : x + _DRAWN_PX[0]]
             bare = not self.visibility[index].any() and rng.random() < 0.5
             return *drawn_tool(image if bare else drawn_ground(image, rng), rng), np.ones(3)
-        weight = np.ones(3) if self.weight is None else self.weight[index]
-        return image, self.u[index], self.visibility[index], weight
+        return image, *labels
+
+    def frame(self, index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """The frame as it is, with landmarks (3, 2), visibility and weight (3,)."""
+        start = self.ends[index - 1] if index else 0
+        image = cv2.imdecode(self.jpegs[start : self.ends[index]], cv2.IMREAD_COLOR_RGB)
+        return image, self.u[index], self.visibility[index], np.ones(3) if self.weight is None else self.weight[index]
 
     def _seen(self, scene, centre: np.ndarray, angle: float, size: tuple[int, int], zoom: float, rng: np.random.Generator):
         """A window of a scene, disguised or not; landmarks too small to see have no loss."""
@@ -115,13 +123,26 @@ class FrameSource(SceneSource):
         return _mirrored(*self._seen(scene, middle, turn, PART_PX, zoom, rng), rng)
 
 
+@dataclass(frozen=True)
 class ToolSource(SceneSource):
     """Upright windows of `windows.TOOL_PX` round the tool, placed, turned and scaled as badly as the stage before does.
 
     Three in ten show no tool that stands upright in its size: peaks must be low there, since they decide between places.
+    Where it is known what a first stage took for tools, four in ten show that: `proposals` (n, m, 3, 2) px, NaN where there
+    are fewer than m.
     """
 
+    proposals: np.ndarray | None = None
+
+    @classmethod
+    def load(cls, folder: str | Path) -> Self:
+        return replace(super().load(folder), proposals=shards.read_proposals(folder))
+
     def draw(self, index: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        if self.proposals is not None and rng.random() < _PROPOSED:
+            known = self.proposals[index][np.isfinite(self.proposals[index]).all((1, 2))]
+            if len(known):
+                return self._proposed(self.frame(index), known[rng.integers(len(known))], rng)
         _, u, visibility, _ = scene = self.scene(index, rng)
         (centre,), (angle,) = windows.tool_pose(u[None])
         length = _length_px(u, visibility)
@@ -132,6 +153,19 @@ class ToolSource(SceneSource):
         centre = centre + np.clip(rng.normal(0, 7 * worse, 2), -30, 30) / zoom
         angle = angle + np.clip(rng.normal(0, 0.12 * worse), -0.7, 0.7)
         return _mirrored(*self._seen(scene, centre, angle, _TOOL_SIZE, zoom, rng), rng if self.disguise else None)
+
+    def _proposed(self, scene, tool: np.ndarray, rng: np.random.Generator):
+        """The window of a tool (3, 2) that a first stage saw, labelled if that is the tool, and else without one."""
+        (centre, own), (angle, direction) = windows.tool_pose(np.stack([tool, scene[1]]))
+        zoom = windows.tool_zoom(max(_length_px(tool, np.ones(3)), SHORTEST_PX)) * np.exp(rng.normal(0, 0.1))
+        centre, angle = centre + rng.normal(0, 4, 2) / zoom, angle + rng.normal(0, 0.1)
+        image, u, visibility = self._seen(scene, centre, angle, _TOOL_SIZE, zoom, rng)
+        turn, scale = np.angle(np.exp(1j * (angle - direction))), zoom / windows.tool_zoom(_length_px(*scene[1:3]))
+        off = np.array([abs(turn), abs(np.log(scale)), zoom * np.linalg.norm(own - centre)])
+        if not np.isfinite(off).all() or (off > np.array(_SHOWS_NOT)[:, 0]).any():
+            return image, np.full((3, 2), -float(windows.TOOL_PX)), np.zeros(3, int)
+        shows = (off < np.array(_SHOWS)[:, 1]).all()
+        return _mirrored(image, u if shows else np.full((3, 2), np.nan), visibility, rng)
 
     def _elsewhere(self, scene, centre: np.ndarray, angle: float, length: float, rng: np.random.Generator):
         """A window anywhere, or one by the tool that is turned, of another scale or shifted too far."""
@@ -175,6 +209,7 @@ class CloseupSource(Source):
         stretch, shear: Standard deviations of the logarithms of two stretches, along and across the tool, and of the shear.
         motion_px: Standard deviation of the movement that blurs half of the closeups, in their pixels along x and y.
         disguise: Share of closeups whose appearance is changed.
+        drawn: Share of closeups that show a drawn tool on a ground made of the crop (`drawings.py`).
         weight: (n,) share of the draws in which a label counts.
     """
 
@@ -192,14 +227,15 @@ class CloseupSource(Source):
     shear: float = 0.05
     motion_px: float = 1.7
     disguise: float = 0.5
+    drawn: float = 0.0
     weight: np.ndarray | None = None
 
     @classmethod
     def load(cls, folder: str | Path) -> Self:
-        """From a folder's shards, the landmarks that are not hidden."""
-        parts = read_shards(folder, "closeups", ("crops", "crop_u", "crop_visibility", "crop_landmark"))
+        """From a folder's shards, the landmarks that are not hidden, to train with."""
+        parts = shards.read_shards(folder, "closeups", ("crops", "crop_u", "crop_visibility", "crop_landmark"))
         seen = parts[2][np.arange(len(parts[3])), parts[3]] == 2
-        return cls(*(parts if seen.all() else (part[seen] for part in parts)))
+        return cls(*(parts if seen.all() else (part[seen] for part in parts)), drawn=0.3)
 
     @classmethod
     def of(cls, images: Sequence[LabelledImage], *, still: bool = False, weight: np.ndarray | None = None) -> Self:
@@ -209,7 +245,8 @@ class CloseupSource(Source):
         which = [(i, k) for i, landmarks in enumerate(usable) for k in np.flatnonzero(landmarks)]
         if not which:
             raise ValueError("images: no visible landmark of a tool with base and tip; label some.")
-        parts = ((*square_round(images[i].image, images[i].u, k, CLOSEUP_CROP_PX), images[i].visibility, k) for i, k in which)
+        crops = (shards.square_round(images[i].image, images[i].u, k, shards.CLOSEUP_CROP_PX) for i, k in which)
+        parts = ((*crop, images[i].visibility, k) for crop, (i, k) in zip(crops, which, strict=True))
         weight = None if weight is None else np.array([weight[i, k] for i, k in which])
         source = cls(*map(np.array, zip(*parts, strict=True)), weight=weight)
         return source if not still else replace(source, stretch=0.0, shear=0.0, motion_px=0.0, disguise=0.0)
@@ -218,9 +255,13 @@ class CloseupSource(Source):
         """A closeup; only its own landmark counts as visible."""
         k = self.landmark[index]
         # A crop ends before a turned closeup's corners do.  Where it ends must not tell where its middle was.
-        x, y = rng.integers(0, BLOCK_PX, 2, endpoint=True)
-        h, w = (side - BLOCK_PX for side in self.crops.shape[1:3])
+        x, y = rng.integers(0, shards.BLOCK_PX, 2, endpoint=True)
+        h, w = (side - shards.BLOCK_PX for side in self.crops.shape[1:3])
         crop, u = self.crops[index, y : y + h, x : x + w], self.u[index] - (x, y)
+        if self.drawn and rng.random() < self.drawn:
+            length, blur = (np.exp(rng.uniform(*np.log(r))) for r in (_DRAWN_LENGTH_PX, _DRAWN_BLUR_PX))
+            crop, u, _ = drawn_tool(drawn_ground(crop, rng), rng, length_px=length, around=k)
+            crop = cv2.GaussianBlur(crop, (0, 0), blur)
         length = tool_length_px(u[None])[0] * np.exp(rng.normal(0, self.length))
         shift = rng.normal(0, self.shifts_px[rng.choice(len(self.shifts_px), p=self.shift_shares)], 2)
         shift *= min(1.0, windows.CLOSEUP_REACH_PX / max(np.linalg.norm(shift), 1e-9)) / windows.closeup_scale(length)

@@ -1,10 +1,13 @@
 """Drawn tools: their landmarks lie where the drawing is, in the workbench's order."""
 
+from dataclasses import replace
+
 import numpy as np
 
+from lib.training import sources
 from lib.training.drawings import drawn_ground, drawn_tool
 from lib.training.samples import LabelledImage
-from lib.training.sources import FrameSource, ToolSource
+from lib.training.sources import CloseupSource, FrameSource, ToolSource
 
 GROUND = np.full((180, 320, 3), 120, np.uint8)
 
@@ -19,6 +22,9 @@ def test_landmarks_lie_on_the_drawing_and_tip_1_on_the_left_of_the_tool():
         one, two = u[1:] - u[0]
         order.append(one[0] * two[1] - one[1] * two[0])
         assert ((visibility == 2) == ((u > -0.5) & (u < (319.5, 179.5))).all(axis=1)).all()
+        _, near, _ = drawn_tool(GROUND, np.random.default_rng(seed), length_px=200.0, around=seed % 3)
+        assert np.abs(near[seed % 3] - (159.5, 89.5)).max() <= 8
+        assert 50 < np.linalg.norm(near[1:] - near[0], axis=1).mean() < 300
     assert np.mean(painted) > 0.9  # some have the colour of the ground
     assert min(order) > -1e-6
 
@@ -43,6 +49,9 @@ def test_a_source_draws_tools_and_undrawn_frames_keep_their_labels():
         rng = np.random.default_rng(0)
         assert not any(np.isfinite(plain.draw(0, rng)[1]).all(axis=1).any() for _ in range(5))  # weight 0: no label counts
         assert any(np.isfinite(drawn.draw(0, rng)[1]).all() for _ in range(10))
+    closeups = CloseupSource.of(images, still=True)
+    (image, at, seen), k = replace(closeups, drawn=1.0).draw(1, np.random.default_rng(0)), closeups.landmark[1]
+    assert image.std() > 5 and seen[k] == 2 and (np.abs(at[k] - 31.5) < 31.5).all()
 
 
 def test_some_windows_show_that_a_tool_askew_too_small_or_aside_is_none():
@@ -54,3 +63,18 @@ def test_some_windows_show_that_a_tool_askew_too_small_or_aside_is_none():
     shown = np.stack([at for at, visibility in draws if (visibility > 0).all() and (abs(at - 63.5) < 64).all()])
     ahead = shown[:, 1:].mean(1) - shown[:, 0]
     assert (np.abs(np.arctan2(ahead[:, 1], ahead[:, 0])) < 0.75).all()
+
+
+def test_what_a_first_stage_took_for_a_tool_is_an_example_of_one_or_of_none(monkeypatch):
+    monkeypatch.setattr(sources, "_PROPOSED", 1.0)
+    u, nothing = np.array([[100.0, 90], [150, 80], [150, 100]]), np.full((1, 3, 2), np.nan)
+    source = ToolSource.of([LabelledImage("a", GROUND, u, np.full(3, 2))], still=True)
+    source, rng = replace(source, u=source.u.astype(float)), np.random.default_rng(0)
+    draws = {}
+    for name, tool in {"it": u, "turned": u[::-1] + 0.0, "far": u + 90, "none": nothing[0]}.items():
+        own = replace(source, proposals=np.stack([tool[None] if name != "none" else nothing]))
+        draws[name] = [own.draw(0, rng)[1:] for _ in range(20)]
+    for _, visibility in draws["it"] + draws["none"]:
+        assert (visibility == 2).all()
+    for at, visibility in draws["turned"] + draws["far"]:
+        assert not visibility.any() and (at == -128).all()

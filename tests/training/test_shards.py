@@ -5,7 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from lib.landmarks import Landmarks
 from lib.training import shards
+from lib.training.samples import LabelledImage
 from lib.training.sources import CloseupSource
 
 
@@ -44,7 +46,7 @@ def test_closeups_are_stretched_with_their_landmark(tmp_path):
     visibility = np.full((30, 3), 2)
     visibility[4, 1] = 1  # hidden: not trained on
     np.savez(tmp_path / "closeups_0000.npz", crop_visibility=visibility, **arrays)
-    source = replace(CloseupSource.load(tmp_path), disguise=0.0)
+    source = replace(CloseupSource.load(tmp_path), disguise=0.0, drawn=0.0)
     assert len(source) == 29
     for i in range(len(source)):
         image, at, seen = source.draw(i, rng)
@@ -63,6 +65,26 @@ def test_closeups_are_stretched_with_their_landmark(tmp_path):
         {"landmark": 2 - source.landmark},
     ):
         assert source.fingerprint != replace(source, **change).fingerprint
+
+
+def test_proposals_are_found_once_and_missing_ones_are_nan(monkeypatch, tmp_path):
+    class Proposing:
+        """Sees two tools in every image, the second one better."""
+
+        def proposed(self, image):
+            u = np.stack([np.full((3, 2), 1.0), np.full((3, 2), 2.0)])
+            return Landmarks(u, np.zeros((2, 3, 2, 2)), np.ones((2, 3))), u, np.array([0.1, 0.9])
+
+    monkeypatch.setattr(shards.Detector, "load", lambda name: Proposing())
+    image = LabelledImage("a", np.full((90, 160, 3), 90, np.uint8), np.full((3, 2), 40.0), np.full(3, 2))
+    assert shards.read_proposals(tmp_path) is None
+    for number in range(2):
+        ends, jpegs, u, visibility = shards.packed([image] * 3)
+        np.savez(tmp_path / f"scenes_{number:04d}.npz", jpegs=jpegs, jpeg_ends=ends, u=u, visibility=visibility)
+    shards.make_proposals(tmp_path / "proposals_0001.npz", tmp_path / "scenes_0001.npz", None)
+    found = shards.read_proposals(tmp_path)
+    assert found.shape == (6, shards.PROPOSALS, 3, 2) and np.isnan(found[:3]).all()
+    assert (found[3:, 0] == 2).all() and (found[3:, 1] == 1).all() and np.isnan(found[3:, 2:]).all()
 
 
 def test_missing_and_corrupt_shards_are_named(tmp_path):
