@@ -358,11 +358,10 @@ class StereoRig:
 
     def save(self, path: str | Path) -> None:
         """Write the rig as JSON (matrices, units); the file appears whole or not at all."""
-
-        def numbers(camera: MatrixCamera) -> dict:
-            return {field.name: np.asarray(getattr(camera, field.name)).tolist() for field in fields(camera)}
-
-        write_json(path, {"format": FORMAT, "units": UNITS, "left": numbers(self.left), "right": numbers(self.right)})
+        content = {"format": FORMAT, "units": UNITS}
+        for side, camera in (("left", self.left), ("right", self.right)):
+            content[side] = {field.name: np.asarray(getattr(camera, field.name)).tolist() for field in fields(camera)}
+        write_json(path, content)
 
     @classmethod
     def load(cls, path: str | Path) -> Self:

@@ -93,7 +93,6 @@ def patch_quality(grid: np.ndarray) -> np.ndarray:
     gy, gx = grid.shape[0] // PATCH, grid.shape[1] // PATCH
     cells = grid[: gy * PATCH, : gx * PATCH].reshape(gy, PATCH, gx, PATCH, CHANNELS)
     constant = np.ascontiguousarray(cells[..., CHANNELS - 1])
-    seen = (constant > 0).mean(axis=(1, 3))
     rows = cells.reshape(gy, PATCH, gx, PATCH * CHANNELS)
     texture = np.einsum("yrxk,yrxk->yx", rows, rows) - np.einsum("yrxc,yrxc->yx", constant, constant)
-    return (seen >= MIN_SEEN) & (texture / PATCH**2 > MIN_TEXTURE)
+    return ((constant > 0).mean(axis=(1, 3)) >= MIN_SEEN) & (texture / PATCH**2 > MIN_TEXTURE)

@@ -111,10 +111,9 @@ def warp(
     gray: np.ndarray, image_from_canvas: np.ndarray, size_px: tuple[int, int], *, shift_px: tuple[float, float] = (0, 0),
     mask: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """An image (h, w), float32 or uint8, on a canvas; anti-aliased where the canvas is coarser.
+    """An image (h, w), float32 or uint8, on a canvas by `image_from_canvas` (2, 3); anti-aliased where that is coarser.
 
     Args:
-        image_from_canvas: (2, 3).
         size_px, shift_px: (width, height) of the part of the canvas, which starts at canvas pixel `shift_px`.
         mask: (h, w) bool, True = ignore.
 

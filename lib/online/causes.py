@@ -99,9 +99,8 @@ def _lateness(rig, frames, past, covariance_px2) -> tuple[float, Explanation] | 
         data = replace(Correspondences.join(seen), x_mm=np.concatenate([part.x_mm for part in told])).complete
         if len(data) < 0.7 * len(covariance_px2):
             continue
-        noise = np.resize(covariance_px2, (len(data), 4, 4))
         # Fewer rows must not make a delay likelier.
-        value = misfit(rig, data, noise, 2) * len(covariance_px2) / len(data)
+        value = misfit(rig, data, np.resize(covariance_px2, (len(data), 4, 4)), 2) * len(covariance_px2) / len(data)
         if best is None or value < best[0]:
             who = "robot's report is" if delay > 0 else "images are"
             best = value, Explanation("clock", f"the {who} late by {abs(delay)} frames", rig)

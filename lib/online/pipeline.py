@@ -159,8 +159,7 @@ class OnlinePipeline:
         images, previous = np.stack([left, right], out=self._pair), self._seen
         self._seen = None  # whatever fails now, the next frame is searched as a whole
         follow = previous is not None and hasattr(self._detector, "track")
-        found = self._detector.track(images, previous) if follow else self._detector(images)
-        self._seen = found
+        self._seen = found = self._detector.track(images, previous) if follow else self._detector(images)
         u = np.where(found.confidence[..., None] >= MIN_CONFIDENCE, found.u, np.nan)
         stated = {"covariance_px2": np.swapaxes(found.covariance, 0, 1), "confidence": np.transpose(found.confidence)}
         index = np.full(len(LANDMARKS), self._index)

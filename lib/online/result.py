@@ -45,9 +45,8 @@ class Settings:
         eye_mm_s: Speed at which the eye may move unseen, by which the distance's standard deviation grows.
         slip_mm: Standard deviation of how far the landmarks may lie off the robot's report, beside its own accuracy.
         robot_accuracy_mm: Standard deviation of the robot's report, per coordinate.
-        alarm_mm, miss_rate: A tip is `too_close` where its distance may be below alarm_mm: a true one below it is missed
-            with this probability.  False alarms are as rare for tips farther away than alarm_mm and twice
-            `FrameResult.margin_mm`.
+        alarm_mm, miss_rate: A tip is `too_close` where its distance may be below alarm_mm: a true one below it is missed with
+            this probability.  False alarms are as rare for tips farther away than alarm_mm and twice `FrameResult.margin_mm`.
     """
 
     calibration_frames: tuple[int, int] = (8, 60)

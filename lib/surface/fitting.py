@@ -151,9 +151,8 @@ def _choose_smoothness(
     It walks down a ladder of half decades to the lowest rung, then takes the parabola through it and its neighbours.
     """
     n, stiffness = len(u), norms.mean(axis=0)
-    order = np.lexsort((*values.T, u[:, 0], u[:, 1]))
     fold = np.empty(n, dtype=np.intp)
-    fold[order] = np.arange(n) % _FOLDS
+    fold[np.lexsort((*values.T, u[:, 0], u[:, 1]))] = np.arange(n) % _FOLDS
     parts = [
         (L1Problem(grid, u[fold != f]), fold != f, grid.design(u[fold == f]), fold == f)
         for f in range(min(_FOLDS, -(-enough * _FOLDS // n)))

@@ -130,8 +130,7 @@ class Problem:
         """
         apart = np.zeros(len(self), dtype=bool) if apart is None else apart
         if start is None:
-            fits = [self._descend(M, columns, apart, 8) for M in self._starts()]
-            start = max(fits, key=lambda fit: fit.total).M
+            start = max((self._descend(M, columns, apart, 8) for M in self._starts()), key=lambda fit: fit.total).M
         return self._descend(start, columns, apart, rounds)
 
     def _starts(self) -> np.ndarray:
@@ -240,8 +239,7 @@ class Case:
         if not np.isfinite(time).all():
             return
         if kinematics is not None and landmark.max() < kinematics.x_mm.shape[1]:
-            log = np.swapaxes(kinematics.x_mm, 0, 1) - problem.centre
-            self.paths = Paths((kinematics.time_s, own) for own in log)
+            self.paths = Paths((kinematics.time_s, own) for own in np.swapaxes(kinematics.x_mm, 0, 1) - problem.centre)
         if self.paths is None or not all(self.paths.pieces):
             each = [np.flatnonzero(landmark == k) for k in range(int(landmark.max()) + 1)]
             each = [rows[np.unique(time[rows], return_index=True)[1]] for rows in each]
