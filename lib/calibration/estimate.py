@@ -278,10 +278,8 @@ def _minimise(
         weigh = variance_u * claimed / noise_rms_px(claimed) ** 2
         if whole and len(weigh) == 1 and np.allclose(weigh[0], variance_u * np.eye(m), rtol=1e-12, atol=0):
             start = affine_minimum(x, y, variance_u, variance_x).matrix
-        if minimum is None or (plan.is_affine and whole and len(weigh) == 1):
-            state = State.start(plan, start, x.mean(axis=0), centre)
-        else:
-            state = minimum.state
+        anew = minimum is None or (plan.is_affine and whole and len(weigh) == 1)
+        state = State.start(plan, start, x.mean(axis=0), centre) if anew else minimum.state
         minimum = fit(state, x, y, weigh, variance_x, views)
         if known["sigma_x_mm"] is not None and known["sigma_u_px"] is not None:
             break

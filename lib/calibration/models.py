@@ -232,9 +232,8 @@ def settle(
 def fit(start: State, x: np.ndarray, y: np.ndarray, noise: np.ndarray, variance_x: float, views: np.ndarray) -> Fit:
     """Minimum of 1/2 sum (y - f(x~))^T noise^-1 (y - f(x~)) + |x~ - x|^2 / variance_x by Levenberg-Marquardt.
 
-    Every point is eliminated exactly, which leaves residuals of covariance S = noise + variance_x J J^T and a system in the
-    camera parameters alone.  x (n, 3) is in mm, y (n, m) in px, noise (1 or n, m, m) in px^2; only the `views` (n, cameras)
-    bool count.
+    Eliminating every point exactly leaves residuals of covariance S = noise + variance_x J J^T and a system in the camera
+    parameters alone.  x (n, 3) is in mm, y (n, m) in px, noise (1 or n, m, m) in px^2; only `views` (n, cameras) count.
     """
     y = np.where(np.repeat(views, 2, axis=1), y, 0.0)
 

@@ -22,8 +22,7 @@ _MORE_THAN_CHANCE = 5.0  # log evidence: of clean data some rows agree better th
 _LEAST_SHARE = 0.25  # of a view's rows, that must agree
 #: A wider population within this many scales of the right one is its heavy tail, else it is contamination.
 _CONTRAST = 8.0
-#: Largest noise, as a share of the extent of the pixels, where there are outliers that do not stand clearly apart; and where
-#: there are none.
+#: Largest noise, as a share of the pixels' extent, where there are outliers that do not stand clearly apart; and without any.
 _LARGEST_NOISE = (0.01, 0.25)
 _TAILS = 0.1  # share of outliers up to which they may be the tails of the noise; more must stand apart
 _NEARLY_ALL = 0.8  # share of the rows that a camera explains, of which a part may agree better by chance
@@ -197,7 +196,7 @@ def tightest_sample(x: np.ndarray, u: np.ndarray, rng: np.random.Generator) -> n
 
 
 def _tightest(x: np.ndarray, u: np.ndarray, threshold_px: float | None, rng: np.random.Generator, least_mm: float) -> _Found:
-    """The consensus of the camera that makes the rows most probable (or has most of them within `threshold_px`)."""
+    """The consensus of the camera that makes the rows most probable (or has most of them within `threshold_px`: MSAC)."""
     n, middle = len(u), np.median(u, axis=0)
     u = u - middle
     area = float(np.prod(_extent(u)))
@@ -208,19 +207,15 @@ def _tightest(x: np.ndarray, u: np.ndarray, threshold_px: float | None, rng: np.
         sets = _samples(H[:, :3], count, rng, least_mm)
         new = np.linalg.solve(H[sets], u[sets])
         distance2 = _distances2(H[some], u[some], new)
-        if threshold_px is not None:
-            ranks = np.minimum(distance2, threshold_px**2).sum(axis=1)  # MSAC
-        else:
-            ranks = _scale_free(distance2, area)
+        ranks = _scale_free(distance2, area) if threshold_px is None else np.minimum(distance2, threshold_px**2).sum(axis=1)
         rank = min(max(6, int(0.15 * len(some))), len(some) - 1)
         low = np.partition(distance2, rank, axis=1)[:, rank]
         M, score, near2 = (np.concatenate(pair) for pair in ((M, new), (score, ranks), (near2, low)))
         best = np.argsort(score)[:_STARTS]
         M, score, near2 = M[best], score[best], near2[best]
-        if threshold_px is None:
-            # Where half the rows and more agree with the best sample, right samples are many.
-            if (_distances2(H[some], u[some], M[:1])[0] < 16.0 * near2[0]).mean() > 0.5:
-                break
+        # Where half the rows and more agree with the best sample, right samples are many.
+        if threshold_px is None and (_distances2(H[some], u[some], M[:1])[0] < 16.0 * near2[0]).mean() > 0.5:
+            break
     if threshold_px is not None:
         keep, before = _distances2(H, u, M[:1])[0] < threshold_px**2, None
         for _ in range(10):  # refitted until the rows no longer change

@@ -122,9 +122,7 @@ def estimate_time_offset(
         return paths.at(landmark, time + offset, derivative)
 
     def linearised(offset: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """By how much each pixel moves with the offset (n, m), the weights (n, m, m), and the residuals (n, m); zero where
-        a view is not used.
-        """
+        """Each pixel's motion with the offset (n, m), the weights (n, m, m) and residuals (n, m); zero in views not used."""
         x, v = at(offset), at(offset, 1)
         matrix = np.vstack([regress(x[rows], y[rows, 2 * c : 2 * c + 2]) for c, rows in enumerate(views.T)])
         A, r = matrix[:, :3], np.where(used, y - x @ matrix[:, :3].T - matrix[:, 3], 0.0)

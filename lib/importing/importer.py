@@ -27,8 +27,7 @@ def import_recording(source: str | Path, mapping: str | Path, out: str | Path, *
 
     The same input gives the same bytes.  Errors name the file and the cure, and then nothing is written.
 
-    Returns what it did, as it stands in import.json of the recording: "did" in plain sentences, "clock", "tool", and the
-    "sources" with their SHA-256.
+    Returns what stands in the recording's import.json: "did" in plain sentences, "clock", "tool", "sources" with SHA-256.
     """
     folder, out = Path(source), Path(out)
     if not folder.is_dir():

@@ -59,10 +59,9 @@ def plan_search(
 ) -> tuple[Rectification, float, tuple[float, float], float, int]:
     """Choose the canvas, check the rig by coarse matches, and find the range of depth where it is not given.
 
-    Returns the rectification, its canvas pixels per left pixel, the range (low, high) of displacements along the line and
-    the median one off it (canvas pixels; 0 below half a left pixel, where resampling gains nothing), and how many coarse
-    matches were found.  A ValueError refuses a rig that does not fit the images, and a depth range in which both cameras
-    see nothing.
+    Returns the rectification, its canvas pixels per left pixel, the range (low, high) of displacements along the line and the
+    median one off it (canvas pixels; 0 below half a left pixel, where resampling gains nothing), and the number of coarse
+    matches.  A ValueError refuses a rig that does not fit the images, and a depth range of which both cameras see nothing.
     """
     setting, depth_range_mm, max_epipolar_px = where
     shapes = images[0].shape, images[1].shape

@@ -182,8 +182,7 @@ def volume_bytes(gy: int, gx: int, n: int, v: int) -> int:
 def correlation_volume(left: torch.Tensor, right: torch.Tensor, v: int) -> torch.Tensor:
     """Cosines (gy, gx, 2 v + 1, n) of every 4 x 4 patch of the left grid with its displaced windows in the right one.
 
-    The left grid (4 gy, 4 gx, C) is contiguous; the right one (4 gy + 2 v, 4 gx + n - 1, C) has v more rows on either side,
-    and the reach of n displacements.
+    The left grid (4 gy, 4 gx, C) is contiguous; the right one (4 gy + 2 v, 4 gx + n - 1, C) has v more rows on either side.
     """
     height, width, channels = left.shape
     gy, gx, n = height // PATCH, width // PATCH, right.shape[1] - width + 1

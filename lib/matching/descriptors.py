@@ -37,9 +37,7 @@ def as_gray(image: ArrayLike, name: str) -> np.ndarray:
         raise ValueError(f"{name}: expected (h, w, 3) RGB or (h, w) grey, got shape {image.shape}.")
     if min(image.shape[:2]) < 16:
         raise ValueError(f"{name}: {image.shape[1]} x {image.shape[0]} px is too small; give at least 16 x 16 px.")
-    if image.ndim == 3:
-        return cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY)
-    return image
+    return cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY) if image.ndim == 3 else image
 
 
 def _blur(image: np.ndarray) -> np.ndarray:

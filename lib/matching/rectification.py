@@ -26,8 +26,7 @@ class Rectification:
         left_from_canvas, right_from_canvas: (2, 3) affine maps from canvas to image pixels, pixel centres on integers.
             The right one holds at `reference_depth_mm`.
         size_px: (width, height) of the canvas.
-        displacement_px_per_mm: A point dz deeper than the reference appears on the right canvas shifted by this times
-            dz along +x.
+        displacement_px_per_mm: On the right canvas a point dz deeper than the reference is shifted by this times dz along +x.
         reference_depth_mm: Depth d.x along the left viewing direction d at which the displacement is 0.
     """
 
