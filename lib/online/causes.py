@@ -51,8 +51,7 @@ def explain(
     swapped = replace(data, u_left=data.u_right, u_right=data.u_left)
     others = [(misfit(rig, swapped, covariance_px2), Explanation("exchanged", "the eyes are exchanged", rig))]
     late = _lateness(rig, frames, past, covariance_px2)
-    if late is not None:
-        others.append(late)
+    others += [late] if late else []
     axes = rows_axes(data)
     if np.isfinite(axes).all():
         offset = _offset(rig, data, axes, covariance_px2)

@@ -92,8 +92,7 @@ class FrameResult:
     Attributes:
         index, time_s: Number of the frame since the start; its time, video clock.
         state, cause: One of `STATES`, and why it is not "tracking", in a few words.
-        landmarks, x_tool_mm: Where the detector saw them and where the robot reports them; (3, 3) as the cameras triangulate
-            them.
+        landmarks, x_tool_mm: Where the detector saw and the robot reports them; (3, 3) as the cameras triangulate them.
         rig: In force after this frame.
         reconstruction, reconstructed_at: The newest surface and its points, and the number of their frame.
         distance_mm, distance_sd_mm: (3,) from each landmark to the surface along the view, positive = above it, and its
@@ -105,8 +104,7 @@ class FrameResult:
         drift: Statistic of the drift monitor, in units of its alarm threshold.
         motion: The registration made in this frame, if one was.
         dropped: Surfaces asked for and dropped so far, because a newer frame came first.
-        seconds, failures: By stage: wall-clock seconds of what ran, reason of what failed.  Failures of no stage are
-            "images", "robot" and "worker".
+        seconds, failures: By stage: wall-clock seconds of what ran, reason of what failed; also "images", "robot", "worker".
     """
 
     index: int
