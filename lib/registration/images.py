@@ -42,8 +42,7 @@ def register_images(
         covariance_px2: Of (u_left, u_right): a number, (2, 2), (4, 4) or (n, 4, 4).  None: that of the correspondences;
             without one, equal and unknown, estimated from the residuals.
         sigma_x_mm: Standard deviation of the robot's report, per coordinate.
-        loss: "robust" assumes heavy tails (Student t with 4 degrees of freedom), so that gross detection errors lose
-            their weight.
+        loss: "robust" assumes heavy tails (Student t with 4 degrees of freedom), so that gross errors lose their weight.
 
     A ValueError refuses shapes that do not pair up, and landmarks that leave the motion open.
 

@@ -127,8 +127,7 @@ class BSplineSurface:
     Attributes:
         grid: Domain and number of control points.
         control_points_mm: (n_y, n_x, 3).
-        fit: How it was found: data term, smoothness, inliers, certificate (`SurfaceFit`); None for a surface that was
-            not fitted.
+        fit: How it was found: data term, smoothness, inliers, certificate (`SurfaceFit`); None where it was not fitted.
     """
 
     grid: SplineGrid

@@ -116,8 +116,7 @@ def save_points(path: str | Path, x_mm: ArrayLike, *, colours: np.ndarray | None
 def depth_map(surface: BSplineSurface, camera: AffineCamera, image_size_px: tuple[int, int]) -> np.ndarray:
     """Depth (h, w) float32 mm of every left pixel along the viewing direction, NaN outside the domain.
 
-    Depth 0 is the plane across the view through the origin of the surface's frame: an affine camera has no centre to
-    measure from.
+    Depth 0 is the plane across the view through the origin of the surface's frame: an affine camera has no centre.
     """
     width, height = image_size_px
     return (surface.on_grid(np.arange(width), np.arange(height)) @ camera.viewing_direction).astype(np.float32)

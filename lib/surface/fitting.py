@@ -50,8 +50,7 @@ def fit_surface(
         quick: Choose the smoothness and reject points at fits of five Newton steps, within some percent of the minimum;
             only the final fit is solved to `tolerance`.
 
-    A ValueError refuses NaN and points that do not determine a surface: fewer in the domain than a quarter of the control
-    points, or than 16.
+    A ValueError refuses NaN and points that determine no surface: fewer in the domain than 16 or a quarter of control points.
     """
     grid = SplineGrid(domain, control)
     u, x = finite_points(u, 2, "u"), finite_points(x_mm, 3, "x_mm")
