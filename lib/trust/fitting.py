@@ -200,8 +200,7 @@ class Problem:
 
     def _overcount(self, z: np.ndarray) -> float:
         """Variance of the sums of weighted residuals z (n, 2, 2) over stretches of frames, over that of independent ones."""
-        frames = int(self.frame.max(initial=0)) + 1
-        stretch = self.frame // max(1, min(_BLOCK, frames // 6))
+        stretch = self.frame // max(1, min(_BLOCK, (int(self.frame.max(initial=0)) + 1) // 6))
         sums = np.zeros((int(stretch.max(initial=0)) + 1, 2))
         np.add.at(sums, stretch, z.sum(axis=1))
         return float(max(1.0, ((sums**2).sum(axis=0) / np.maximum((z**2).sum(axis=(0, 1)), 1e-300)).mean()))

@@ -79,8 +79,7 @@ def rendered(template: str, **values: object) -> str:
 def show(figure: Figure, name: str, caption: str) -> None:
     """Display a matplotlib figure with its caption and close it; an SVG where that is small and holds no image, else a PNG.
 
-    The `name`, as in `record`, is the file's name in the run's ``figures/``.  The `caption` says in one line what the reader
-    sees, and what to look at.
+    `name` is as in `record`, and the file's in the run's ``figures/``; `caption` is one line: what one sees, what to look at.
     """
     import matplotlib.pyplot as plt
 
