@@ -46,7 +46,6 @@ class Camera(Protocol):
 
     def project(self, x: ArrayLike) -> np.ndarray:
         """Pixels (n, 2) of points (n, 3) in mm."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
