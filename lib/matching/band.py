@@ -157,10 +157,10 @@ def _supported(matches: VolumeMatches) -> np.ndarray:
 
 def match_band(images: Images, masks: Masks, rig: StereoRig, where: Where, *, budget_bytes: int, reciprocal: bool) -> Matches:
     """Matches of a calibrated pair; arguments as in `lib.matching.match`, images (h, w) uint8 grey."""
-    rectification, _, (nearest, farthest), off_line_px, n_found = plan_search(images, masks, rig, where)
+    rectification, _, range_px, off_line_px, n_found = plan_search(images, masks, rig, where)
     if not n_found and where[1] is None:
         return Matches(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros((0, 4, 4)), method="band")
-    low, high = int(np.floor(nearest / CELL_PX)) - 1, int(np.ceil(farthest / CELL_PX)) + 1
+    low, high = int(np.floor(range_px[0] / CELL_PX)) - 1, int(np.ceil(range_px[1] / CELL_PX)) + 1
     gx, gy = (side // (PATCH * CELL_PX) for side in rectification.size_px)
     need = volume_bytes(gy, gx, high - low + 1, OFF_LINE)
     if need > budget_bytes:
