@@ -94,8 +94,9 @@ def save_mesh(mesh: Mesh, path: str | Path) -> Path:
         written.material.set_default_properties()
         written.material.material_name = "defaultLit"
         written.material.texture_maps["albedo"] = o3d.t.geometry.Image(tensor(mesh.texture))
+    # The header of a GLB states the length of the file.
     _write(path, lambda name: o3d.t.io.write_triangle_mesh(name, written),
-           lambda data: len(data) > 12 and int.from_bytes(data[8:12], "little") == len(data))  # fmt: skip  # a GLB states its length
+           lambda data: len(data) > 12 and int.from_bytes(data[8:12], "little") == len(data))  # fmt: skip
     return path
 
 
