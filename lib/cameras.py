@@ -46,7 +46,6 @@ class Camera(Protocol):
 
     def project(self, x: ArrayLike) -> np.ndarray:
         """Pixels (n, 2) of points (n, 3) in mm."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -358,11 +357,10 @@ class StereoRig:
 
     def save(self, path: str | Path) -> None:
         """Write the rig as JSON (matrices, units); the file appears whole or not at all."""
-
-        def numbers(camera: MatrixCamera) -> dict:
-            return {field.name: np.asarray(getattr(camera, field.name)).tolist() for field in fields(camera)}
-
-        write_json(path, {"format": FORMAT, "units": UNITS, "left": numbers(self.left), "right": numbers(self.right)})
+        content = {"format": FORMAT, "units": UNITS}
+        for side, camera in (("left", self.left), ("right", self.right)):
+            content[side] = {field.name: np.asarray(getattr(camera, field.name)).tolist() for field in fields(camera)}
+        write_json(path, content)
 
     @classmethod
     def load(cls, path: str | Path) -> Self:

@@ -60,8 +60,7 @@ class Correspondences:
     def __post_init__(self) -> None:
         n = len(np.atleast_1d(self.frame))
         for name, tail in _SHAPES.items():
-            dtype = np.int64 if name in ("frame", "landmark") else np.float64
-            array = np.asarray(getattr(self, name), dtype=dtype)
+            array = np.asarray(getattr(self, name), dtype=np.int64 if name in ("frame", "landmark") else np.float64)
             if array.shape != (n, *tail):
                 raise ValueError(f"{name}: expected {(n, *tail)}, got {array.shape}.")
             object.__setattr__(self, name, array)

@@ -75,8 +75,7 @@ def lock(*, upgrade: bool) -> Path:
         options = ["--universal", "--generate-hashes", "--no-annotate", "--no-header", "--quiet", "-o", "lock.txt"]
         _call([uv, "pip", "compile", "pyproject.toml", *groups, *options], "Resolving failed", cwd=folder)
         text = (Path(folder) / "lock.txt").read_text(encoding="utf-8")
-    blocks = re.split(r"\n(?=[a-zA-Z0-9])", text.strip())
-    blocks = [block for block in blocks if not _TORCH_PACKAGES.fullmatch(block.split("==")[0])]
+    blocks = [b for b in re.split(r"\n(?=[a-zA-Z0-9])", text.strip()) if not _TORCH_PACKAGES.fullmatch(b.split("==")[0])]
     header = "# Made by `python3 -m lib lock` from environment.toml; torch comes by build and is not in here.\n"
     write_text(path, header + "\n".join(blocks) + "\n")
     return path

@@ -113,8 +113,7 @@ def view_distances2(residual: np.ndarray, covariance: np.ndarray) -> np.ndarray:
 def align_rotation(moment: ArrayLike) -> np.ndarray:
     """The rotation R (..., 3, 3) that maximises trace(R^T moment), the one nearest to `moment`.
 
-    With moment = sum y x^T of two centred sets of points it is the least-squares alignment y = R x (Kabsch, 1976; Umeyama,
-    1991).
+    With moment = sum y x^T of two centred point sets it is the least-squares alignment y = R x (Kabsch, 1976; Umeyama, 1991).
 
     >>> R = RigidTransform.from_rotation_vector((0.1, -0.2, 0.3)).R
     >>> x = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]])

@@ -23,8 +23,7 @@ def run_jobs(
 ) -> Iterator[tuple[Path, BaseException | None]]:  # fmt: skip
     """Call ``function(path, *jobs[path])`` for every path that does not exist; yield each path, and the error that ended it.
 
-    A job whose worker process was killed is given to another worker, three times at most.  Closing the iterator drops
-    the jobs that have not begun.
+    A job whose worker was killed goes to another, three times at most.  Closing the iterator drops jobs that have not begun.
 
     Args:
         function: Importable (not a closure).  It makes `path` whole or not at all, as `lib.files.whole` does.

@@ -41,5 +41,4 @@ def real_data(name: str) -> Path | None:
 
 def missing_data_line(name: str) -> str:
     """The one line a notebook prints when a real data set is not at hand, and then goes on."""
-    cure = f"point {REAL_DATA_VARIABLE} at the folder that holds it"
-    return f"Skipped: the real data set '{name}' is not at hand; {cure}."
+    return f"Skipped: the real data set '{name}' is not at hand; point {REAL_DATA_VARIABLE} at the folder that holds it."

@@ -56,8 +56,7 @@ def affine_minimum(x: np.ndarray, y: np.ndarray, variance_u: float, variance_x: 
     mean = z.mean(axis=0)
     z -= mean
     scatter = z.T @ z
-    smallest = np.linalg.eigvalsh(scatter[m:, m:])[0] / len(x)
-    if variance_x <= 1e-14 * smallest:
+    if variance_x <= 1e-14 * (np.linalg.eigvalsh(scatter[m:, m:])[0] / len(x)):  # next to the smallest spread of x
         A = np.linalg.solve(scatter[m:, m:], scatter[m:, :m]).T
         cost = 0.5 * np.trace(scatter[:m, :m] - A @ scatter[m:, :m]) / variance_u
     else:

@@ -121,11 +121,3 @@ def eyes_exchanged(A: np.ndarray, sd_rad: float) -> bool:
     along, across = sides(A)
     return bool(np.deg2rad(1) < np.hypot(along, across) < np.deg2rad(30) and along < -max(3.0 * abs(across), 5.0 * sd_rad))
 
-
-def check_order(A: np.ndarray, sd_rad: float) -> None:
-    """Refuse a stereo head A (4, 3) whose eyes are exchanged."""
-    if eyes_exchanged(A, sd_rad):
-        raise ValueError(
-            f"u: the cameras are swapped, left stands on the right by {np.rad2deg(-sides(A)[0]):.1f} degrees; exchange "
-            "u_left and u_right (or flip both images, if they are mirrored).  checks=False takes them as they are."
-        )

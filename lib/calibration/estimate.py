@@ -60,9 +60,8 @@ def calibrate(
         image_size_px: (width, height); the principal point of near-affine models is its centre, else the detections'.
         checks: False skips the plausibility checks: units, repeated rows, swapped cameras, pixels outside the image.
 
-    Raises:
-        NoConsensusError: A ValueError, where a camera's detections agree on no camera, or on two that compete.
-        ValueError: For rows that determine no camera, offsets that the data cannot tell, and what `checks` finds.
+    A `NoConsensusError` (a ValueError) says that a camera's detections agree on no camera, or on two that compete; a
+    ValueError refuses rows that determine no camera, offsets that the data cannot tell, and what `checks` finds.
 
     >>> from lib.cameras import AffineCamera
     >>> rng = np.random.default_rng(0)
@@ -244,7 +243,12 @@ def _calibrate(
         spread, A = found.extents_mm[2], found.rig.left.linear
         zoom = np.sqrt(np.abs(np.linalg.det(A @ A.T)) ** 0.5)
         sd_rad = np.hypot(sigma_u / zoom, sigma_x) / (spread * np.sqrt(views.sum(axis=0).min() / 2))
-        refuse.check_order(found.rig.linear, sd_rad)
+        if refuse.eyes_exchanged(found.rig.linear, sd_rad):
+            degrees = np.rad2deg(-refuse.sides(found.rig.linear)[0])
+            raise ValueError(
+                f"u: the cameras are swapped, left stands on the right by {degrees:.1f} degrees; exchange u_left and u_right "
+                "(or flip both images, if they are mirrored).  checks=False takes them as they are."
+            )
     return found
 
 
@@ -274,10 +278,8 @@ def _minimise(
         weigh = variance_u * claimed / noise_rms_px(claimed) ** 2
         if whole and len(weigh) == 1 and np.allclose(weigh[0], variance_u * np.eye(m), rtol=1e-12, atol=0):
             start = affine_minimum(x, y, variance_u, variance_x).matrix
-        if minimum is None or (plan.is_affine and whole and len(weigh) == 1):
-            state = State.start(plan, start, x.mean(axis=0), centre)
-        else:
-            state = minimum.state
+        anew = minimum is None or (plan.is_affine and whole and len(weigh) == 1)
+        state = State.start(plan, start, x.mean(axis=0), centre) if anew else minimum.state
         minimum = fit(state, x, y, weigh, variance_x, views)
         if known["sigma_x_mm"] is not None and known["sigma_u_px"] is not None:
             break

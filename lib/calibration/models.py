@@ -178,8 +178,7 @@ class State:
             return np.eye(6).reshape(2, 3, 6)
         result = np.zeros((2, 3, 5))
         # A left increment turns R by delta x R.
-        turned = np.einsum("jkr,ks->rsj", _CROSS, self.rotation[i])
-        result[:, :, :3] = self.zoom[i][:, None, None] * turned[:2]
+        result[:, :, :3] = self.zoom[i][:, None, None] * np.einsum("jkr,ks->rsj", _CROSS, self.rotation[i])[:2]
         result[0, :, 3], result[1, :, 4] = self.A[i]
         return result
 
@@ -233,9 +232,8 @@ def settle(
 def fit(start: State, x: np.ndarray, y: np.ndarray, noise: np.ndarray, variance_x: float, views: np.ndarray) -> Fit:
     """Minimum of 1/2 sum (y - f(x~))^T noise^-1 (y - f(x~)) + |x~ - x|^2 / variance_x by Levenberg-Marquardt.
 
-    Every point is eliminated exactly, which leaves residuals of covariance S = noise + variance_x J J^T and a system in the
-    camera parameters alone.  x (n, 3) is in mm, y (n, m) in px, noise (1 or n, m, m) in px^2; only the `views` (n, cameras)
-    bool count.
+    Eliminating every point exactly leaves residuals of covariance S = noise + variance_x J J^T and a system in the camera
+    parameters alone.  x (n, 3) is in mm, y (n, m) in px, noise (1 or n, m, m) in px^2; only `views` (n, cameras) count.
     """
     y = np.where(np.repeat(views, 2, axis=1), y, 0.0)
 
@@ -256,5 +254,4 @@ def fit(start: State, x: np.ndarray, y: np.ndarray, noise: np.ndarray, variance_
 
     with np.errstate(all="ignore"):  # a first step may be far too long: its energy is not finite, and it is shortened
         found = minimise(start, evaluate, normal_equations, State.moved)
-    r, settled, _ = found.work
-    return Fit(found.state, found.energy, r, settled, found.information, found.converged)
+    return Fit(found.state, found.energy, *found.work[:2], found.information, found.converged)

@@ -90,8 +90,7 @@ def estimate_offsets(
     """
     m = y.shape[1]
     size = m if axes is None else 3
-    offset, p_value = np.zeros((int(landmark.max()) + 1, size)), np.nan
-    views = None
+    offset, p_value, views = np.zeros((int(landmark.max()) + 1, size)), np.nan, None
     for i in range(iterations):
         shift = offset[landmark]
         moved = (x, y - shift) if axes is None else (x + np.einsum("nij,nj->ni", axes, shift), y)
@@ -123,10 +122,9 @@ def estimate_offsets(
     p = J_c.shape[2]
     prior = np.diag(np.repeat([0.0, prior_sd**-2], [p, offset.size]))
     full, effective = sandwich(np.concatenate([J_c, J], axis=2), weight, r, frame[rows], landmark[rows], prior)
-    known, covariance = full[:p, :p], full[p:, p:]
-    blocks = np.stack([covariance[j : j + size, j : j + size] for j in range(0, offset.size, size)])
+    blocks = np.stack([full[j : j + size, j : j + size] for j in range(p, len(full), size)])
     learnt = LandmarkOffsets(offset, blocks, prior_sd, p_value)
-    return replace(found, parameter_covariance=known, effective_rows=effective, offsets=learnt)
+    return replace(found, parameter_covariance=full[:p, :p], effective_rows=effective, offsets=learnt)
 
 
 def _evidence(information: np.ndarray, gradient: np.ndarray, least: float) -> tuple[float, float]:

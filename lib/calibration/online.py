@@ -14,10 +14,8 @@ class OnlineCalibration:
     """A calibration's minimum, moved by all rows that came since: an extended Kalman filter of the model's parameters.
 
     It has the calibration's camera model, and its information from the calibration's rows; each new row counts by its own
-    covariance, or the calibration's where it states none.  So it starts where the calibration ended.
-
-    Args:
-        calibration: Where it starts; its noise levels judge the new rows.
+    covariance, or the calibration's where it states none.  So it starts where the calibration ended, and the calibration's
+    noise levels judge the new rows.
 
     >>> from lib.calibration import calibrate
     >>> rng, A = np.random.default_rng(0), np.array([[99.0, 0, -9], [0, 99, 0], [99, 0, 9], [0, 99, 0]])
@@ -43,8 +41,7 @@ class OnlineCalibration:
         x = np.where(used.any(axis=1, keepdims=True), data.x_mm, self._state.reference)
         y, J_x, J = self._state.evaluate(x)
         r, S = np.where(np.repeat(used, 2, axis=1), pixels - y, 0.0), noise + variance_x * J_x @ J_x.mT
-        expected = S + J @ self._covariance @ J.mT  # the rig is uncertain itself
-        used &= view_distances2(r, expected) < gate(100, 2)
+        used &= view_distances2(r, S + J @ self._covariance @ J.mT) < gate(100, 2)  # the rig is uncertain itself
         if used.any():
             W = precision(S, used)
             # The derivatives belong to the corrected points, as in `fit`: those of noisy ones would flatten the depth.

@@ -122,8 +122,7 @@ def tool_offsets(
     y = np.concatenate(images, axis=2)
     k, m = y.shape[1:]
     half = None if opening_rad is None else np.asarray(opening_rad, np.float64) / 2
-    known = np.isfinite(y).all(axis=2) & (True if half is None else np.isfinite(half)[:, None])
-    frame, landmark = np.nonzero(known)
+    frame, landmark = np.nonzero(np.isfinite(y).all(axis=2) & (True if half is None else np.isfinite(half)[:, None]))
     pixels, R, t = y[frame, landmark], R[frame], t[frame]
     own = (landmark[:, None] == np.arange(k)).astype(np.float64)
     on_jaw = np.arange(k) > 0 if turning is None else np.asarray(turning) != 0

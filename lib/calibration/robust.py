@@ -22,8 +22,7 @@ _MORE_THAN_CHANCE = 5.0  # log evidence: of clean data some rows agree better th
 _LEAST_SHARE = 0.25  # of a view's rows, that must agree
 #: A wider population within this many scales of the right one is its heavy tail, else it is contamination.
 _CONTRAST = 8.0
-#: Largest noise, as a share of the extent of the pixels, where there are outliers that do not stand clearly apart; and where
-#: there are none.
+#: Largest noise, as a share of the pixels' extent, where there are outliers that do not stand clearly apart; and without any.
 _LARGEST_NOISE = (0.01, 0.25)
 _TAILS = 0.1  # share of outliers up to which they may be the tails of the noise; more must stand apart
 _NEARLY_ALL = 0.8  # share of the rows that a camera explains, of which a part may agree better by chance
@@ -166,8 +165,7 @@ def _samples(x: np.ndarray, count: int, rng: np.random.Generator, least_mm: floa
     n = len(x)
     sets = np.argpartition(rng.random((3 * count, n)), 4, axis=1)[:, :4] if n < 40 else rng.integers(0, n, (3 * count, 4))
     a, b, c = np.swapaxes(x[sets[:, 1:]] - x[sets[:, :1]], 0, 1)
-    volume = np.abs(np.einsum("ni,ni->n", np.cross(a, b), c))
-    sets = sets[np.argsort(-volume)[:count]]
+    sets = sets[np.argsort(-np.abs(np.einsum("ni,ni->n", np.cross(a, b), c)))[:count]]  # of the largest volume
     corners = x[sets] - x[sets].mean(axis=1, keepdims=True)
     thick = np.sqrt(np.maximum(np.linalg.eigvalsh(np.swapaxes(corners, 1, 2) @ corners)[:, 0], 0.0))
     spans = thick > 1e-6 * np.abs(x).max()  # rounding leaves 1e-8
@@ -198,7 +196,7 @@ def tightest_sample(x: np.ndarray, u: np.ndarray, rng: np.random.Generator) -> n
 
 
 def _tightest(x: np.ndarray, u: np.ndarray, threshold_px: float | None, rng: np.random.Generator, least_mm: float) -> _Found:
-    """The consensus of the camera that makes the rows most probable (or has most of them within `threshold_px`)."""
+    """The consensus of the camera that makes the rows most probable (or has most of them within `threshold_px`: MSAC)."""
     n, middle = len(u), np.median(u, axis=0)
     u = u - middle
     area = float(np.prod(_extent(u)))
@@ -209,19 +207,15 @@ def _tightest(x: np.ndarray, u: np.ndarray, threshold_px: float | None, rng: np.
         sets = _samples(H[:, :3], count, rng, least_mm)
         new = np.linalg.solve(H[sets], u[sets])
         distance2 = _distances2(H[some], u[some], new)
-        if threshold_px is not None:
-            ranks = np.minimum(distance2, threshold_px**2).sum(axis=1)  # MSAC
-        else:
-            ranks = _scale_free(distance2, area)
+        ranks = _scale_free(distance2, area) if threshold_px is None else np.minimum(distance2, threshold_px**2).sum(axis=1)
         rank = min(max(6, int(0.15 * len(some))), len(some) - 1)
         low = np.partition(distance2, rank, axis=1)[:, rank]
         M, score, near2 = (np.concatenate(pair) for pair in ((M, new), (score, ranks), (near2, low)))
         best = np.argsort(score)[:_STARTS]
         M, score, near2 = M[best], score[best], near2[best]
-        if threshold_px is None:
-            # Where half the rows and more agree with the best sample, right samples are many.
-            if (_distances2(H[some], u[some], M[:1])[0] < 16.0 * near2[0]).mean() > 0.5:
-                break
+        # Where half the rows and more agree with the best sample, right samples are many.
+        if threshold_px is None and (_distances2(H[some], u[some], M[:1])[0] < 16.0 * near2[0]).mean() > 0.5:
+            break
     if threshold_px is not None:
         keep, before = _distances2(H, u, M[:1])[0] < threshold_px**2, None
         for _ in range(10):  # refitted until the rows no longer change
@@ -230,49 +224,41 @@ def _tightest(x: np.ndarray, u: np.ndarray, threshold_px: float | None, rng: np.
             keep, before = _distances2(H, u, regress(H[keep, :3], u[keep]).T[None])[0] < threshold_px**2, keep
         return _Found(keep, regress(H[keep, :3], u[keep]) if keep.sum() > 3 else np.zeros((2, 4)), 0.0, np.inf, np.inf)
     middle2 = np.median(_distances2(H[some], u[some], M[:4]), axis=1)
-    found = _mixture(H[some], u[some], np.concatenate([M, M[:4]]), np.sqrt(np.append(near2 / 8, middle2)), area, 8)
+    scales = np.sqrt(np.append(near2 / 8, middle2))
+    M, scales, share, evidence = _mixture(H[some], u[some], np.concatenate([M, M[:4]]), scales, area, 8)
     # The best of each noise level, and the one with most rows: the others arrive where these do.
-    order = np.argsort(-found.evidence)
-    level = np.round(3.0 * np.log(found.sigma[order, 0]))
+    order = np.argsort(-evidence)
+    level = np.round(3.0 * np.log(scales[order, 0]))
     few = order[np.sort(np.unique(level, return_index=True)[1])][:5]
-    few = np.unique([*few, found.share[:, 0].argmax()])
-    found = _mixture(H[some], u[some], found.M[few], found.sigma[few, 0], area, 50)
+    few = np.unique([*few, share[:, 0].argmax()])
+    M, scales, share, evidence = _mixture(H[some], u[some], M[few], scales[few, 0], area, 50)
     # Where a camera explains nearly all rows, that fewer agree better must be more than chance.
-    best, most = found.evidence.argmax(), found.share[:, 0].argmax()
-    chance = found.evidence[best] < found.evidence[most] + _MORE_THAN_CHANCE or found.share[best, 0] < _LEAST_SHARE
-    if found.share[most, 0] > _NEARLY_ALL and chance:
+    best, most = evidence.argmax(), share[:, 0].argmax()
+    chance = evidence[best] < evidence[most] + _MORE_THAN_CHANCE or share[best, 0] < _LEAST_SHARE
+    if share[most, 0] > _NEARLY_ALL and chance:
         best = most
     if len(some) < n:
-        found, best = _mixture(H, u, found.M[best : best + 1], found.sigma[best : best + 1, 0], area, 30), 0
-    sigma, wider, share = *(float(value) for value in found.sigma[best]), found.share[best]
-    gate2 = gate(n, 2)
+        (M, scales, share, _), best = _mixture(H, u, M[[best]], scales[[best], 0], area, 30), 0
+    (sigma, wider), share, gate2 = scales[best].tolist(), share[best], gate(n, 2)
     if wider > _CONTRAST * sigma:  # contamination: a row is kept where it is more probably right than wrong
         wrong = share[1] / wider**2 + 2.0 * np.pi * share[2] / area
         gate2 = float(np.clip(2.0 * np.log(share[0] / sigma**2 / wrong), 4.0, gate2))
-    keep = _distances2(H, u, found.M[best : best + 1])[0] < gate2 * sigma**2
-    matrix = found.M[best].T.copy()
+    keep = _distances2(H, u, M[[best]])[0] < gate2 * sigma**2
+    matrix = M[best].T.copy()
     matrix[:, 3] += middle - matrix[:, :3] @ x.mean(axis=0)
     return _Found(keep, matrix, sigma, wider, gate2)
 
 
-class _Mixtures(NamedTuple):
-    """k fits: cameras M (k, 4, 2), scales `sigma` (k, 2), shares (k, 3) of the populations, log `evidence` (k,).
+def _mixture(
+    H: np.ndarray, u: np.ndarray, M: np.ndarray, sigma: np.ndarray, area: float, rounds: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Expectation maximisation of the three populations from k cameras M (k, 4, 2) and noise levels `sigma` (k,).
 
-    The evidence is the likelihood with the cameras integrated out: a camera that a few rows fix to a hair by chance has
-    little of it.
+    The cameras, scales (k, 2) and shares (k, 3) of the populations, and log evidence (k,): the likelihood with the cameras
+    integrated out, of which a camera that a few rows fix to a hair by chance has little.
     """
-
-    M: np.ndarray
-    sigma: np.ndarray
-    share: np.ndarray
-    evidence: np.ndarray
-
-
-def _mixture(H: np.ndarray, u: np.ndarray, M: np.ndarray, sigma: np.ndarray, area: float, rounds: int) -> _Mixtures:
-    """Expectation maximisation of the three populations from k cameras M (k, 4, 2) and noise levels `sigma` (k,)."""
     n, k, side = len(u), len(M), np.sqrt(area)
-    products = [(H[:, :, None] * other[:, None]).reshape(n, -1) for other in (H, u)]
-    products = np.concatenate(products, axis=1)
+    products = np.hstack([(H[:, :, None] * other[:, None]).reshape(n, -1) for other in (H, u)])
     floor = 1e-7 * side
     variance = np.stack([np.maximum(sigma, floor), np.maximum(6.0 * sigma, 0.017 * side)], axis=1) ** 2
     share, before = np.tile([0.4, 0.3, 0.3], (k, 1)), -np.inf
@@ -303,4 +289,4 @@ def _mixture(H: np.ndarray, u: np.ndarray, M: np.ndarray, sigma: np.ndarray, are
         second = np.clip(squares[1] / np.maximum(2.0 * mass[1], 1e-9), 16.0 * first, (0.1 * side + 4.0 * np.sqrt(first)) ** 2)
         variance = np.stack([first, second], axis=1)
         share = (mass.T + 1.0) / (n + 3)
-    return _Mixtures(M, np.sqrt(variance), share, likelihood - np.linalg.slogdet(G)[1])
+    return M, np.sqrt(variance), share, likelihood - np.linalg.slogdet(G)[1]

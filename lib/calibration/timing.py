@@ -15,6 +15,7 @@ from lib.geometry import precision
 from lib.recordings import Kinematics
 
 _GRID = 41  # trial offsets of the coarse search
+_SMOOTH_S = 0.1  # within which the robot's motion is smooth
 #: Of landmarks that a detector sees with an error of the tool's own: how much deeper than the median trial each camera's
 #: misfit must be, and the largest residual, as a share of the pixels' extent.
 _CLEAR, _NEAR = 0.4, 0.03
@@ -35,12 +36,10 @@ class TimeOffset:
 
 
 class Paths:
-    """The landmarks' motion as least-squares cubic splines with a knot every `smooth_s`, a piece a stretch without a gap.
+    """The landmarks' motion as least-squares cubic splines with a knot every 0.1 s, a piece a stretch without a gap.
 
     The derivative of an interpolating spline is mostly encoder noise at 100 Hz, which biases what is regressed on it.
-
-    Args:
-        samples: Of each landmark, times (m,) s, and positions (m, 3) mm, NaN where the robot is silent.
+    Of each landmark `samples` has the times (m,) s, and the positions (m, 3) mm, NaN where the robot is silent.
 
     >>> time = np.linspace(0, 1, 101)
     >>> paths = Paths([(time, np.outer(time, [1.0, 2.0, 3.0]))])
@@ -48,17 +47,17 @@ class Paths:
     [[0.5, 1.0, 1.5], [nan, nan, nan]]
     """
 
-    def __init__(self, samples: Iterable[tuple[np.ndarray, np.ndarray]], smooth_s: float = 0.1) -> None:
-        self.pieces = [list(self._splines(time, x, smooth_s)) for time, x in samples]
+    def __init__(self, samples: Iterable[tuple[np.ndarray, np.ndarray]]) -> None:
+        self.pieces = [list(self._splines(time, x)) for time, x in samples]
 
     @staticmethod
-    def _splines(time: np.ndarray, x: np.ndarray, smooth_s: float) -> Iterator[BSpline]:
+    def _splines(time: np.ndarray, x: np.ndarray) -> Iterator[BSpline]:
         known = np.isfinite(x).all(axis=1)
         time, x = time[known], x[known]
         step = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
-        every = max(2, int(np.ceil(smooth_s / step)))
-        # The motion is smooth within `smooth_s`, so a dropped sample is bridged; a longer silence is not.
-        gaps = np.flatnonzero(np.diff(time) > max(smooth_s, 2.5 * step))
+        every = max(2, int(np.ceil(_SMOOTH_S / step)))
+        # The motion is smooth within that time, so a dropped sample is bridged; a longer silence is not.
+        gaps = np.flatnonzero(np.diff(time) > max(_SMOOTH_S, 2.5 * step))
         for t, part in zip(np.split(time, gaps + 1), np.split(x, gaps + 1), strict=True):
             if len(t) >= 4:
                 knots = np.concatenate([np.full(4, t[0]), t[every : len(t) - every : every], np.full(4, t[-1])])
@@ -90,7 +89,7 @@ class Paths:
 
 def estimate_time_offset(
     data: Correspondences | tuple[ArrayLike, list[ArrayLike]], kinematics: Kinematics | tuple[ArrayLike, ArrayLike], *,
-    start_s: float = 0.0, search_s: float = 0.2, smooth_s: float = 0.1,
+    start_s: float = 0.0, search_s: float = 0.2,
 ) -> TimeOffset:  # fmt: skip
     """Offset of the clocks: the shift of the kinematics that lets affine cameras explain the video best.
 
@@ -100,15 +99,14 @@ def estimate_time_offset(
     Args:
         data: `Correspondences`, or (time_s (n,), u) with one array a camera, (n, 2) or (n, k, 2) px, NaN where missing.
         kinematics: `lib.recordings.Kinematics`, or (time_s (m,), x_mm (m, 3) or (m, k, 3)), denser than the motion is
-            fast.  NaN where the robot is silent: rows that fall into a gap of more than `smooth_s` are left out.
+            fast; their noise is averaged over 0.1 s.  NaN where the robot is silent: rows in a longer gap are left out.
         start_s, search_s: Middle and half width of the search.
-        smooth_s: Time within which the motion is smooth: the kinematics' noise is averaged over it.
 
     A ValueError refuses fewer than eight instants inside the kinematics, a tool at rest, rows that agree on no cameras
     (`NoConsensusError`), and an offset at the end of the search.
     """
     time, frame, landmark, y = _rows(data)
-    paths = _paths(kinematics, smooth_s)
+    paths = _paths(kinematics)
     if landmark.max(initial=0) >= len(paths.pieces):
         raise ValueError(f"u: {landmark.max() + 1} landmarks, the kinematics have {len(paths.pieces)}.")
     known = np.isfinite(y).any(axis=1) & np.isfinite(time)
@@ -124,9 +122,7 @@ def estimate_time_offset(
         return paths.at(landmark, time + offset, derivative)
 
     def linearised(offset: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """By how much each pixel moves with the offset (n, m), the weights (n, m, m), and the residuals (n, m); zero where
-        a view is not used.
-        """
+        """Each pixel's motion with the offset (n, m), the weights (n, m, m) and residuals (n, m); zero in views not used."""
         x, v = at(offset), at(offset, 1)
         matrix = np.vstack([regress(x[rows], y[rows, 2 * c : 2 * c + 2]) for c, rows in enumerate(views.T)])
         A, r = matrix[:, :3], np.where(used, y - x @ matrix[:, :3].T - matrix[:, 3], 0.0)
@@ -222,7 +218,7 @@ def _rows(data: Correspondences | tuple) -> tuple[np.ndarray, np.ndarray, np.nda
     return np.repeat(time, k), frame, landmark, y.reshape(len(time) * k, -1)
 
 
-def _paths(kinematics: Kinematics | tuple, smooth_s: float) -> Paths:
+def _paths(kinematics: Kinematics | tuple) -> Paths:
     given = kinematics if isinstance(kinematics, tuple) else (kinematics.time_s, kinematics.x_mm)
     time, x = (np.asarray(values, dtype=np.float64) for values in given)
     x = x[:, None] if x.ndim == 2 else x
@@ -230,4 +226,4 @@ def _paths(kinematics: Kinematics | tuple, smooth_s: float) -> Paths:
         raise ValueError(f"kinematics: expected times (m,) and positions (m, k, 3) or (m, 3), got {time.shape}, {x.shape}.")
     if len(time) < 4 or not np.isfinite(time).all() or (np.diff(time) <= 0).any():
         raise ValueError("kinematics: times must be finite and increase, and at least four samples are needed.")
-    return Paths([(time, x[:, k]) for k in range(x.shape[1])], smooth_s)
+    return Paths([(time, x[:, k]) for k in range(x.shape[1])])

@@ -11,7 +11,7 @@ from lib.calibration import NoConsensusError, TimeOffset, Tool, estimate_time_of
 from lib.correspondences import LANDMARKS, NoDetectionError, of_recording
 from lib.geometry import RigidTransform
 from lib.importing.labels import read_labels
-from lib.importing.logs import RobotLog, increasing, read_robot, since
+from lib.importing.logs import increasing, read_robot, since
 from lib.importing.mapping import Mapping, read_mapping
 from lib.importing.video import StereoSource, open_stereo
 from lib.landmarks import SharedDetector, detect
@@ -27,9 +27,7 @@ def import_recording(source: str | Path, mapping: str | Path, out: str | Path, *
 
     The same input gives the same bytes.  Errors name the file and the cure, and then nothing is written.
 
-    Returns:
-        What it did, as it stands in import.json of the recording: "did" in plain sentences, "clock", "tool", and
-        the "sources" with their SHA-256.
+    Returns what stands in the recording's import.json: "did" in plain sentences, "clock", "tool", "sources" with SHA-256.
     """
     folder, out = Path(source), Path(out)
     if not folder.is_dir():
@@ -38,16 +36,16 @@ def import_recording(source: str | Path, mapping: str | Path, out: str | Path, *
         raise ValueError(f"{out}: lies in the source, which an import does not change; choose a place beside it.")
     told = read_mapping(mapping)
     stereo = open_stereo(folder, told.video)
-    robot = read_robot(folder, told)
-    increasing(robot.time, str(folder / told.robot.file), *_LOG_STEP_S)
+    robot_time, *reported = read_robot(folder, told)
+    increasing(robot_time, str(folder / told.robot.file), *_LOG_STEP_S)
     # A recording's times count from 0, or from the first whole second of times that count from a date.
-    starts = stereo.time[0], robot.time[0]
+    starts = stereo.time[0], robot_time[0]
     zeros = stereo_zero, robot_zero = [Decimal(int(t)) if abs(t) > _EPOCH_S else Decimal(0) for t in starts]
     estimated = told.robot.offset_s == "estimate"
     one_dated = estimated and bool(stereo_zero) != bool(robot_zero)
     given = Decimal("0" if estimated else str(told.robot.offset_s))
     offset_s = 0.0 if one_dated else float(stereo_zero + given - robot_zero)
-    time_s, robot_s = since(stereo.time, stereo_zero), since(robot.time, robot_zero)
+    time_s, robot_s = since(stereo.time, stereo_zero), since(robot_time, robot_zero)
     first = next(stereo.pairs())[0]
     size = first.shape[1], first.shape[0]
     labels = read_labels(folder, told.labels, stereo, told.landmarks, size) if told.labels else None
@@ -56,7 +54,7 @@ def import_recording(source: str | Path, mapping: str | Path, out: str | Path, *
         y = np.hstack([labels.u_left[..., 1], labels.u_right[..., 1]])
         mean = np.nansum(y - (size[1] - 1) / 2, axis=1) / np.maximum(np.isfinite(y).sum(axis=1), 1)
         frames_s += told.readout_s * mean / (size[1] - 1)
-    x_mm, tool_told = _landmarks(told, robot, robot_s, frames_s, labels, float(robot_zero))
+    x_mm, tool_told = _landmarks(told, reported, robot_s, frames_s, labels, float(robot_zero))
     usual_fps = round(1 / float(np.median(np.diff(time_s))) if len(time_s) > 1 else 25.0, 6)
     fps = usual_fps if told.video.fps is None else told.video.fps / told.video.every
     writer = RecordingWriter(
@@ -76,8 +74,7 @@ def import_recording(source: str | Path, mapping: str | Path, out: str | Path, *
             if isinstance(clock, TimeOffset):
                 draft = writer.draft(clock.offset_s)
                 found = {"offset_s": round(clock.offset_s, 9), "sd_s": float(f"{clock.sd_s:.3g}")}
-            did = _did(told, stereo, draft, clock, zeros)
-            report = {"format": "microstereo.import", "did": did, "clock": found}
+            report = {"format": "microstereo.import", "did": _did(told, stereo, draft, clock, zeros), "clock": found}
             report |= {"tool": tool_told, "mapping": told.model_dump(mode="json"), "sources": _sources(folder, told, stereo)}
             files.write_json(writer.folder / "import.json", report)
     except ValueError as error:  # of the unfinished recording, which is gone: its place says more
@@ -105,14 +102,15 @@ def _clock(draft: Recording, search_s: float) -> TimeOffset | str:
 
 
 def _landmarks(
-    told: Mapping, robot: RobotLog, robot_s: np.ndarray, frames_s: np.ndarray, labels: Annotations | None, zero_s: float
+    told: Mapping, reported: list, robot_s: np.ndarray, frames_s: np.ndarray, labels: Annotations | None, zero_s: float
 ) -> tuple[np.ndarray, dict | None]:
     """The robot's landmarks (m, k, 3) mm, and, where it reports poses, what is told of the tool."""
-    if robot.R is None:
-        return robot.x_mm, None
-    known = np.isfinite(np.hstack([robot.R, robot.x_mm])).all(axis=(1, 2))
-    poses = [RigidTransform(R, t) for R, t in zip(robot.R[known], robot.x_mm[known, 0], strict=True)]
-    opening = None if robot.opening_rad is None else robot.opening_rad[known]
+    x_mm, R, opening = reported  # as `read_robot` has them
+    if R is None:
+        return x_mm, None
+    known = np.isfinite(np.hstack([R, x_mm])).all(axis=(1, 2))
+    poses = [RigidTransform(*pose) for pose in zip(R[known], x_mm[known, 0], strict=True)]
+    opening = None if opening is None else opening[known]
     tool, sd = _tool(told, poses, robot_s[known], opening, frames_s, labels, zero_s)
     x = np.full((len(known), len(told.landmarks), 3), np.nan)
     x[known] = tool.positions_mm(poses, opening)

@@ -164,8 +164,7 @@ def _deeplabcut(path: Path) -> Iterator[Label]:
 def _sleap(path: Path) -> Iterator[Label]:
     with h5py.File(path) as file:
         metadata = json.loads(bytes(file["metadata"].attrs["json"]).decode())
-        order = [link["id"] for link in metadata["skeletons"][0]["nodes"]]
-        names = [metadata["nodes"][i]["name"] for i in order]
+        names = [metadata["nodes"][link["id"]]["name"] for link in metadata["skeletons"][0]["nodes"]]
         corner = 0.5 if file["metadata"].attrs.get("format_id", 2.0) < 1.1 else 0.0  # SLEAP counted from the corner once
         videos = [str(json.loads(video)["backend"].get("filename", "")) for video in file["videos_json"][:]]
         frames, instances, points = file["frames"][:], file["instances"][:], file["points"][:]

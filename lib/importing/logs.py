@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from decimal import Decimal, InvalidOperation
 from functools import partial
@@ -18,16 +17,6 @@ from lib.recordings.tables import decoded, number, rows_of
 _SECONDS = {"s": Decimal(1), "ms": Decimal("1e-3"), "us": Decimal("1e-6"), "ns": Decimal("1e-9")}
 _MILLIMETRES = {"m": 1e3, "mm": 1.0, "um": 1e-3}
 _EMPTY = {"nan", "NaN", "NAN", "null", "None", "NA"}
-
-
-@dataclass(frozen=True, eq=False)
-class RobotLog:
-    """What a robot's log says: exact times (m,) and positions (m, k, 3) of the landmarks, or (m, 1, 3) of the tool's pose."""
-
-    time: list[Decimal]
-    x_mm: np.ndarray
-    R: np.ndarray | None = None  # (m, 3, 3) of the tool's pose
-    opening_rad: np.ndarray | None = None  # (m,) full angle between the jaws
 
 
 def exact_seconds(text: str, unit: str, where: str) -> Decimal:
@@ -153,8 +142,14 @@ def _field(message: object, field: str, where: str) -> float | Decimal:
         raise ValueError(f"{where}: this field is no number; name one inside it.") from None
 
 
-def read_robot(folder: Path, mapping: Mapping) -> RobotLog:
-    """The robot's log in mm, seconds and radians, in the robot frame that the mapping asks for."""
+def read_robot(
+    folder: Path, mapping: Mapping
+) -> tuple[list[Decimal], np.ndarray, np.ndarray | None, np.ndarray | None]:
+    """The robot's log, in the robot frame that the mapping asks for.
+
+    Exact times (m,), and positions (m, k, 3) mm of the landmarks; or those (m, 1, 3) of the tool's poses, their rotations
+    (m, 3, 3), and the full angle (m,) rad between the jaws, where the robot tells that.
+    """
     robot, pose = mapping.robot, mapping.robot.pose
     path = folder / robot.file
     groups = [robot.landmarks[name] for name in mapping.landmarks] if pose is None else [pose.position]
@@ -173,10 +168,9 @@ def read_robot(folder: Path, mapping: Mapping) -> RobotLog:
         what = f"with length_unit = {robot.length_unit!r} the tool moves over {spread_mm:.3g} mm"
         raise ValueError(f"{path}: {what}; 0.05 to 2000 mm is plausible. Check length_unit: m, mm or um.")
     if pose is None:
-        return RobotLog(time, x)
+        return time, x, None, None
     R = turn @ _rotations(path, pose, np.stack([columns[name] for name in pose.rotation], axis=-1))
-    opening = _opening(path, mapping, columns[pose.gripper]) if pose.gripper else None
-    return RobotLog(time, x, R, opening)
+    return time, x, R, _opening(path, mapping, columns[pose.gripper]) if pose.gripper else None
 
 
 def _opening(path: Path, mapping: Mapping, opening: np.ndarray) -> np.ndarray:

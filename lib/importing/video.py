@@ -52,8 +52,7 @@ class _Images:
         return len(self.files)
 
     def read(self, wanted: np.ndarray) -> Iterator[np.ndarray]:
-        for index in wanted:
-            yield read_image(self.files[index], bit_depth=None)
+        return (read_image(self.files[index], bit_depth=None) for index in wanted)
 
 
 class _Film:
@@ -140,8 +139,7 @@ def open_stereo(folder: Path, video: Video) -> StereoSource:
     """Open the frames that a mapping describes; images are decoded when asked for."""
     names = [video.left, video.right] if video.layout == "two" else [video.file]
     reels = tuple(_Film(folder / n) if Path(n).suffix.lower() in VIDEOS else _Images(folder, n) for n in names)
-    places = _places(reels)
-    times = [_times(folder, video, reel, place) for reel, place in zip(reels, places, strict=True)]
+    times = [_times(folder, video, reel, place) for reel, place in zip(reels, _places(reels), strict=True)]
     for reel, time in zip(reels, times, strict=True):
         increasing(time, str(reel.files[0]), *_STEP_S)
     index = _paired(folder, times)

@@ -5,7 +5,6 @@ the scene lies.  The fine pass searches only the band that is left.
 """
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -55,21 +54,14 @@ REACH = 2
 RIDGE = 0.05
 
 
-@dataclass(frozen=True, eq=False)
-class Search:
-    """Where to look for matches."""
-
-    rectification: Rectification
-    scale: float  # canvas pixels per left pixel
-    range_px: tuple[float, float]  # (low, high) displacement along the line, canvas pixels
-    off_line_px: float  # median displacement off the line; 0 below half a left pixel, where resampling gains nothing
-    n_found: int  # coarse matches found
-
-
-def plan_search(images: Images, masks: Masks, rig: StereoRig, where: Where) -> Search:
+def plan_search(
+    images: Images, masks: Masks, rig: StereoRig, where: Where
+) -> tuple[Rectification, float, tuple[float, float], float, int]:
     """Choose the canvas, check the rig by coarse matches, and find the range of depth where it is not given.
 
-    A ValueError refuses a rig that does not fit the images, and a depth range in which both cameras see nothing.
+    Returns the rectification, its canvas pixels per left pixel, the range (low, high) of displacements along the line and the
+    median one off it (canvas pixels; 0 below half a left pixel, where resampling gains nothing), and the number of coarse
+    matches.  A ValueError refuses a rig that does not fit the images, and a depth range of which both cameras see nothing.
     """
     setting, depth_range_mm, max_epipolar_px = where
     shapes = images[0].shape, images[1].shape
@@ -78,7 +70,7 @@ def plan_search(images: Images, masks: Masks, rig: StereoRig, where: Where) -> S
     scale = min(1.0, float(np.sqrt(MAX_PIXELS[setting] / (width * height))))
     rectification = rectify(rig, *shapes, scale=scale)
     if depth_range_mm is not None and np.isinf(max_epipolar_px):
-        return Search(rectification, scale, rectification.search_range_px(depth_range_mm, shapes[1]), 0.0, 0)
+        return rectification, scale, rectification.search_range_px(depth_range_mm, shapes[1]), 0.0, 0
     displacement, n_found = _coarse_displacement(images, masks, rig, whole)
     off_line_px, range_px = 0.0, (-COARSE_REACH * width, COARSE_REACH * width)
     if len(displacement) >= MIN_SUPPORTED:
@@ -95,7 +87,7 @@ def plan_search(images: Images, masks: Masks, rig: StereoRig, where: Where) -> S
         range_px = float(low - margin), float(high + margin)
     range_mm = whole.depth_range_mm(range_px) if depth_range_mm is None else depth_range_mm
     off_line_px = off_line_px * scale if abs(off_line_px) >= 0.5 else 0.0
-    return Search(rectification, scale, rectification.search_range_px(range_mm, shapes[1]), off_line_px, n_found)
+    return rectification, scale, rectification.search_range_px(range_mm, shapes[1]), off_line_px, n_found
 
 
 def _coarse_displacement(images: Images, masks: Masks, rig: StereoRig, whole: Rectification) -> tuple[np.ndarray, int]:
@@ -165,11 +157,10 @@ def _supported(matches: VolumeMatches) -> np.ndarray:
 
 def match_band(images: Images, masks: Masks, rig: StereoRig, where: Where, *, budget_bytes: int, reciprocal: bool) -> Matches:
     """Matches of a calibrated pair; arguments as in `lib.matching.match`, images (h, w) uint8 grey."""
-    search = plan_search(images, masks, rig, where)
-    if not search.n_found and where[1] is None:
+    rectification, _, range_px, off_line_px, n_found = plan_search(images, masks, rig, where)
+    if not n_found and where[1] is None:
         return Matches(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros((0, 4, 4)), method="band")
-    rectification = search.rectification
-    low, high = (int(np.floor(search.range_px[0] / CELL_PX)) - 1, int(np.ceil(search.range_px[1] / CELL_PX)) + 1)
+    low, high = int(np.floor(range_px[0] / CELL_PX)) - 1, int(np.ceil(range_px[1] / CELL_PX)) + 1
     gx, gy = (side // (PATCH * CELL_PX) for side in rectification.size_px)
     need = volume_bytes(gy, gx, high - low + 1, OFF_LINE)
     if need > budget_bytes:
@@ -177,7 +168,7 @@ def match_band(images: Images, masks: Masks, rig: StereoRig, where: Where, *, bu
             f"budget_bytes: {high - low + 1} displacements of {gx} x {gy} patches need {need / 2**30:.2f} GiB, the budget "
             f"is {budget_bytes / 2**30:.2f} GiB. Narrow depth_range_mm, or take setting='fast'."
         )
-    left, right = _descriptors(images, masks, rectification, (low, high), OFF_LINE, search.off_line_px)
+    left, right = _descriptors(images, masks, rectification, (low, high), OFF_LINE, off_line_px)
     found, volume = _match(left, right, low, OFF_LINE, reciprocal=reciprocal)
     x, y = torch.from_numpy(found.patch.T)
     along = torch.from_numpy(found.cell[:, 0] - low)
@@ -197,7 +188,7 @@ def match_band(images: Images, masks: Masks, rig: StereoRig, where: Where, *, bu
     covariance[:, 2:, 2:] = np.einsum("ij,nj,kj->nik", linear, deviation**2, linear)
     return Matches(
         rectification.u_left(canvas),
-        rectification.u_right(canvas + displacement * CELL_PX + (0.0, search.off_line_px)),
+        rectification.u_right(canvas + displacement * CELL_PX + (0.0, off_line_px)),
         1 / (1 + (sigma[:, 0] / SIGMA_HALF) ** 4),
         covariance, peak_ratio=ratio, reciprocal=found.reciprocal, method="band",
     )  # fmt: skip
@@ -252,19 +243,17 @@ def refine(
         )
         slopes = [[a.reshape(len(f), -1) for a in _derivatives(windows)] for windows in (f, g)]
         f, g = (np.ascontiguousarray(a[:, 1:-1, REACH:-REACH]).reshape(len(a), -1) for a in (f, g))
-        energy = np.einsum("ij,ij->i", g, g)
-        scale = np.sqrt(np.einsum("ij,ij->i", f, f) / np.maximum(energy, 1e-12))[:, None]
+        scale = np.sqrt(np.einsum("ij,ij->i", f, f) / np.maximum(np.einsum("ij,ij->i", g, g), 1e-12))[:, None]
         w, across = ((mine + other * scale) * np.float32(0.5) for mine, other in zip(*slopes, strict=True))
         f -= g * scale
         information = np.maximum(np.einsum("ij,ij->i", w, w), 1e-12)
         projection = np.einsum("ij,ij->i", w, f)
-        residual = np.maximum(np.einsum("ij,ij->i", f, f) - projection**2 / information, 0)
+        variance = np.maximum(np.einsum("ij,ij->i", f, f) - projection**2 / information, 0) / (f.shape[1] - 1)
 
         cross = np.einsum("ij,ij->i", w, across)
         free = np.einsum("ij,ij->i", across, across) * (1 + RIDGE) - cross**2 / information
         rest = np.einsum("ij,ij->i", across, f) - cross / information * projection
         step[part] = np.clip(np.column_stack([projection / information, rest / np.maximum(free, 1e-12)]), -1, 1)
-        variance = residual / (f.shape[1] - 1)
         sigma[part] = np.sqrt(np.column_stack([variance / information, variance / np.maximum(free, 1e-12)]))
 
     with ThreadPoolExecutor(2) as pool:

@@ -36,8 +36,7 @@ CHUNK_BYTES = 32 << 20
 def unit_patches(grid: torch.Tensor) -> torch.Tensor:
     """(gy, gx, 16 C) unit descriptors of the atomic patches of a grid (h, w, C)."""
     gy, gx = grid.shape[0] // PATCH, grid.shape[1] // PATCH
-    cells = grid[: gy * PATCH, : gx * PATCH].reshape(gy, PATCH, gx, PATCH, -1)
-    patches = cells.permute(0, 2, 1, 3, 4).reshape(gy, gx, -1)
+    patches = grid[: gy * PATCH, : gx * PATCH].reshape(gy, PATCH, gx, PATCH, -1).permute(0, 2, 1, 3, 4).reshape(gy, gx, -1)
     return patches / patches.norm(dim=2, keepdim=True).clamp_min(1e-12)
 
 
@@ -136,8 +135,7 @@ def path_scores(pooled: torch.Tensor, levels: int, *, shifted: bool, level: int 
         # Of displacements the epipolar line itself, the middle row, is always one that is sampled.
         start = 0 if shifted else (score.shape[2] // 2) % 2
         along_x, smaller = pool(score, start)
-        above = path_scores(smaller, levels, shifted=shifted, level=level + 1)
-        score = unpool(score, along_x, smaller, above, start)
+        score = unpool(score, along_x, smaller, path_scores(smaller, levels, shifted=shifted, level=level + 1), start)
     for axis in (0, 1):
         score = _scatter(score, axis, level, pooled.shape[axis], shifted=shifted)
     return score.add_(pooled)
@@ -184,8 +182,7 @@ def volume_bytes(gy: int, gx: int, n: int, v: int) -> int:
 def correlation_volume(left: torch.Tensor, right: torch.Tensor, v: int) -> torch.Tensor:
     """Cosines (gy, gx, 2 v + 1, n) of every 4 x 4 patch of the left grid with its displaced windows in the right one.
 
-    The left grid (4 gy, 4 gx, C) is contiguous; the right one (4 gy + 2 v, 4 gx + n - 1, C) has v more rows on either side,
-    and the reach of n displacements.
+    The left grid (4 gy, 4 gx, C) is contiguous; the right one (4 gy + 2 v, 4 gx + n - 1, C) has v more rows on either side.
     """
     height, width, channels = left.shape
     gy, gx, n = height // PATCH, width // PATCH, right.shape[1] - width + 1
@@ -305,8 +302,7 @@ def predicted_bytes(shape_left: tuple[int, int], shape_right: tuple[int, int], *
 
 def unit_windows(grid: torch.Tensor) -> torch.Tensor:
     """(h + 1, w + 1, 16 C) unit descriptors of the windows around every cell corner, zero outside the grid."""
-    padded = pad(grid, (0, 0, *[PATCH // 2] * 4))
-    windows = padded.unfold(0, PATCH, 1).unfold(1, PATCH, 1).permute(0, 1, 3, 4, 2).flatten(2)
+    windows = pad(grid, (0, 0, *[PATCH // 2] * 4)).unfold(0, PATCH, 1).unfold(1, PATCH, 1).permute(0, 1, 3, 4, 2).flatten(2)
     return windows.div_(windows.norm(dim=2, keepdim=True).clamp_min(1e-12))
 
 

@@ -37,9 +37,7 @@ def as_gray(image: ArrayLike, name: str) -> np.ndarray:
         raise ValueError(f"{name}: expected (h, w, 3) RGB or (h, w) grey, got shape {image.shape}.")
     if min(image.shape[:2]) < 16:
         raise ValueError(f"{name}: {image.shape[1]} x {image.shape[0]} px is too small; give at least 16 x 16 px.")
-    if image.ndim == 3:
-        return cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY)
-    return image
+    return cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY) if image.ndim == 3 else image
 
 
 def _blur(image: np.ndarray) -> np.ndarray:
@@ -93,7 +91,6 @@ def patch_quality(grid: np.ndarray) -> np.ndarray:
     gy, gx = grid.shape[0] // PATCH, grid.shape[1] // PATCH
     cells = grid[: gy * PATCH, : gx * PATCH].reshape(gy, PATCH, gx, PATCH, CHANNELS)
     constant = np.ascontiguousarray(cells[..., CHANNELS - 1])
-    seen = (constant > 0).mean(axis=(1, 3))
     rows = cells.reshape(gy, PATCH, gx, PATCH * CHANNELS)
     texture = np.einsum("yrxk,yrxk->yx", rows, rows) - np.einsum("yrxc,yrxc->yx", constant, constant)
-    return (seen >= MIN_SEEN) & (texture / PATCH**2 > MIN_TEXTURE)
+    return ((constant > 0).mean(axis=(1, 3)) >= MIN_SEEN) & (texture / PATCH**2 > MIN_TEXTURE)

@@ -66,8 +66,7 @@ def match_with(
     named = isinstance(function, str)
     call = {"sgbm": partial(_sgbm, checked=reciprocal), "dis": _dis}[function] if named else function
     name = function if named else getattr(function, "__name__", "callable")
-    search = plan_search(images, masks, rig, where)
-    rectification, (low, high) = search.rectification, search.range_px
+    rectification, scale, (low, high), *_ = plan_search(images, masks, rig, where)
 
     # Matchers only find what lies in both images, so the canvas is widened by the reach of the search.
     width, height = rectification.size_px
@@ -96,12 +95,11 @@ def match_with(
     x, y, d = x[kept], y[kept], d[kept]
     canvas = np.column_stack([x - reach, y]).astype(np.float64)
     ratio, textured = _judge((left, right), (valid_left, valid_right), reach, (low, high), canvas.astype(int), -d)
-    sigma = SIGMA_PX / search.scale
     matches = Matches(
         rectification.u_left(canvas),
         rectification.u_right(canvas - np.column_stack([d, np.zeros(len(d))])),
         np.clip(confidence[y, x], 0.0, 1.0).astype(np.float64),
-        np.tile(np.diag([SIGMA_LEFT_PX**2] * 2 + [sigma**2] * 2), (len(d), 1, 1)),
+        np.tile(np.diag([SIGMA_LEFT_PX**2] * 2 + [(SIGMA_PX / scale) ** 2] * 2), (len(d), 1, 1)),
         peak_ratio=ratio, reciprocal=passed[y, x], method=name,
     )  # fmt: skip
     return matches.keep(textured)

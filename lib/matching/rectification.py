@@ -26,8 +26,7 @@ class Rectification:
         left_from_canvas, right_from_canvas: (2, 3) affine maps from canvas to image pixels, pixel centres on integers.
             The right one holds at `reference_depth_mm`.
         size_px: (width, height) of the canvas.
-        displacement_px_per_mm: A point dz deeper than the reference appears on the right canvas shifted by this times
-            dz along +x.
+        displacement_px_per_mm: On the right canvas a point dz deeper than the reference is shifted by this times dz along +x.
         reference_depth_mm: Depth d.x along the left viewing direction d at which the displacement is 0.
     """
 
@@ -111,10 +110,9 @@ def warp(
     gray: np.ndarray, image_from_canvas: np.ndarray, size_px: tuple[int, int], *, shift_px: tuple[float, float] = (0, 0),
     mask: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """An image (h, w), float32 or uint8, on a canvas; anti-aliased where the canvas is coarser.
+    """An image (h, w), float32 or uint8, on a canvas by `image_from_canvas` (2, 3); anti-aliased where that is coarser.
 
     Args:
-        image_from_canvas: (2, 3).
         size_px, shift_px: (width, height) of the part of the canvas, which starts at canvas pixel `shift_px`.
         mask: (h, w) bool, True = ignore.
 

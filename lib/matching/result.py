@@ -14,8 +14,7 @@ class Matches:
     """Semi-dense matches of a stereo pair.
 
     Attributes:
-        u_left, u_right: (n, 2) px, integer coordinates at pixel centres.  `u_left` lies on a lattice chosen by the
-            matcher.
+        u_left, u_right: (n, 2) px, integer coordinates at pixel centres.  `u_left` lies on a lattice chosen by the matcher.
         score: (n,) confidence in [0, 1]; larger is surer.  Comparable within one call, not between methods.
         covariance_px2: (n, 4, 4) of (u_left, u_right), nearly all of it in the right block (see `SIGMA_LEFT_PX`).
         peak_ratio: (n,) response at the match over the best one elsewhere; at 1 and below another place fits as well.

@@ -51,8 +51,7 @@ def explain(
     swapped = replace(data, u_left=data.u_right, u_right=data.u_left)
     others = [(misfit(rig, swapped, covariance_px2), Explanation("exchanged", "the eyes are exchanged", rig))]
     late = _lateness(rig, frames, past, covariance_px2)
-    if late is not None:
-        others.append(late)
+    others += [late] if late else []
     axes = rows_axes(data)
     if np.isfinite(axes).all():
         offset = _offset(rig, data, axes, covariance_px2)
@@ -99,9 +98,8 @@ def _lateness(rig, frames, past, covariance_px2) -> tuple[float, Explanation] | 
         data = replace(Correspondences.join(seen), x_mm=np.concatenate([part.x_mm for part in told])).complete
         if len(data) < 0.7 * len(covariance_px2):
             continue
-        noise = np.resize(covariance_px2, (len(data), 4, 4))
         # Fewer rows must not make a delay likelier.
-        value = misfit(rig, data, noise, 2) * len(covariance_px2) / len(data)
+        value = misfit(rig, data, np.resize(covariance_px2, (len(data), 4, 4)), 2) * len(covariance_px2) / len(data)
         if best is None or value < best[0]:
             who = "robot's report is" if delay > 0 else "images are"
             best = value, Explanation("clock", f"the {who} late by {abs(delay)} frames", rig)

@@ -87,15 +87,13 @@ class TipDistance:
     def triangulate(result: FrameResult, tracker: RigTracker) -> tuple[np.ndarray, np.ndarray]:
         """Landmarks as the cameras see them (3, 3) mm, also into the result; their covariance from the detector (3, 3, 3)."""
         data = result.landmarks
-        noise = tracker.detection_covariance(data)
-        found = tracker.rig.triangulate(data.u_left, data.u_right, noise)
+        found = tracker.rig.triangulate(data.u_left, data.u_right, tracker.detection_covariance(data))
         result.x_tool_mm = found.x_mm
-        return found.x_mm, np.array(np.broadcast_to(found.covariance_mm2, (len(data), 3, 3)))
+        return found.x_mm, found.covariance_mm2
 
     def _predict(self, time_s: float, x_mm: np.ndarray) -> None:
         if np.isfinite(self._time) and time_s > self._time:
-            self._covariance = self._covariance + _WALK_MM**2 * (time_s - self._time) * np.eye(3)
-            self._covariance = np.minimum(self._covariance, 1.0)
+            self._covariance = np.minimum(self._covariance + _WALK_MM**2 * (time_s - self._time) * np.eye(3), 1.0)
         self._time = time_s
         if not np.isfinite(x_mm).all():
             return

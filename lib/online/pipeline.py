@@ -38,8 +38,7 @@ class OnlinePipeline:
         detector: `lib.landmarks.Detector`, or anything alike: images (2, h, w, 3) uint8 RGB to `.u` (2, 3, 2), `.covariance`
             and `.confidence`.  If it has a method `track(images, previous)`, frames after the first are given to that.  The
             memory of the images holds the next frame later: a detector that keeps them needs a copy.
-        rig: A rig or a calibration to start from, which is kept until the cameras move; None calibrates from the first
-            frames.
+        rig: A rig or a calibration to start from, kept until the cameras move; None calibrates from the first frames.
         noise_px: Standard deviation of a landmark's residual per coordinate, for a `rig` that is no calibration.
         beside: Reconstruct surfaces in a process beside this one, the newest frame first; else in turn, which gives the
             same output for the same input.  Use it in a ``with`` block, which ends the process.
@@ -159,8 +158,7 @@ class OnlinePipeline:
         images, previous = np.stack([left, right], out=self._pair), self._seen
         self._seen = None  # whatever fails now, the next frame is searched as a whole
         follow = previous is not None and hasattr(self._detector, "track")
-        found = self._detector.track(images, previous) if follow else self._detector(images)
-        self._seen = found
+        self._seen = found = self._detector.track(images, previous) if follow else self._detector(images)
         u = np.where(found.confidence[..., None] >= MIN_CONFIDENCE, found.u, np.nan)
         stated = {"covariance_px2": np.swapaxes(found.covariance, 0, 1), "confidence": np.transpose(found.confidence)}
         index = np.full(len(LANDMARKS), self._index)

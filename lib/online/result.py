@@ -45,9 +45,8 @@ class Settings:
         eye_mm_s: Speed at which the eye may move unseen, by which the distance's standard deviation grows.
         slip_mm: Standard deviation of how far the landmarks may lie off the robot's report, beside its own accuracy.
         robot_accuracy_mm: Standard deviation of the robot's report, per coordinate.
-        alarm_mm, miss_rate: A tip is `too_close` where its distance may be below alarm_mm: a true one below it is missed
-            with this probability.  False alarms are as rare for tips farther away than alarm_mm and twice
-            `FrameResult.margin_mm`.
+        alarm_mm, miss_rate: A tip is `too_close` where its distance may be below alarm_mm: a true one below it is missed with
+            this probability.  False alarms are as rare for tips farther away than alarm_mm and twice `FrameResult.margin_mm`.
     """
 
     calibration_frames: tuple[int, int] = (8, 60)
@@ -93,8 +92,7 @@ class FrameResult:
     Attributes:
         index, time_s: Number of the frame since the start; its time, video clock.
         state, cause: One of `STATES`, and why it is not "tracking", in a few words.
-        landmarks, x_tool_mm: Where the detector saw them and where the robot reports them; (3, 3) as the cameras triangulate
-            them.
+        landmarks, x_tool_mm: Where the detector saw and the robot reports them; (3, 3) as the cameras triangulate them.
         rig: In force after this frame.
         reconstruction, reconstructed_at: The newest surface and its points, and the number of their frame.
         distance_mm, distance_sd_mm: (3,) from each landmark to the surface along the view, positive = above it, and its
@@ -106,8 +104,7 @@ class FrameResult:
         drift: Statistic of the drift monitor, in units of its alarm threshold.
         motion: The registration made in this frame, if one was.
         dropped: Surfaces asked for and dropped so far, because a newer frame came first.
-        seconds, failures: By stage: wall-clock seconds of what ran, reason of what failed.  Failures of no stage are
-            "images", "robot" and "worker".
+        seconds, failures: By stage: wall-clock seconds of what ran, reason of what failed; also "images", "robot", "worker".
     """
 
     index: int

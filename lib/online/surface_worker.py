@@ -90,15 +90,13 @@ class Beside:
     def collect(self) -> tuple[list[Surface], str]:
         """The surfaces made since the last call, and what happened to the worker ("" = nothing); never waits."""
         done, event = [], ""
-        try:
+        with contextlib.suppress(EOFError, OSError):  # a dead worker is found below
             while self._pipe.poll():
                 if (surface := self._pipe.recv()) is None:  # it has started
                     continue
                 self._in_work = False
                 if not self._stale:
                     done.append(surface)
-        except (EOFError, OSError):
-            pass  # found dead below
         if not self._process.is_alive():
             event = f"the surface worker ended (exit code {self._process.exitcode}) and was started again"
             self._pipe.close()

@@ -110,8 +110,7 @@ class RigTracker:
             if self._online is None:
                 self._online = OnlineCalibration(self.calibration)
                 accepted = self._frames[self._fitted :]
-            used = [self._online.add(self.corrected(frame.data)).any() for frame in accepted]
-            if any(used):
+            if any([self._online.add(self.corrected(frame.data)).any() for frame in accepted]):  # each is added
                 self.rig = self._online.solve()
                 self._monitor.follow(self.rig)
             return
@@ -262,10 +261,9 @@ class RigTracker:
 
     def point_covariance(self, x_mm: np.ndarray) -> np.ndarray:
         """(n, 3, 3) mm^2: how far the rig may put points beside the robot's."""
-        known = self.calibration
         own = np.zeros((len(x_mm), 3, 3))
-        if known is not None:
-            own += known.point_covariance(x_mm, detection=False) * self._remains(x_mm)
+        if self.calibration is not None:
+            own += self.calibration.point_covariance(x_mm, detection=False) * self._remains(x_mm)
         moves = [motion for motion in self._motions if motion is not None]
         stale = [motion.covariance_at(motion.transform.inverse().apply(x_mm)) for motion in moves]
         return own + sum(stale) / max(len(moves), 1)
@@ -279,8 +277,7 @@ class RigTracker:
 
     def _noise(self, data: Correspondences) -> np.ndarray:
         """(n, 4, 4) px^2 of landmarks' residuals: of the detections, and of the robot's report."""
-        known = self.calibration
-        sigma_x = self.settings.robot_accuracy_mm if known is None else known.sigma_x_mm
+        sigma_x = self.settings.robot_accuracy_mm if self.calibration is None else self.calibration.sigma_x_mm
         A = (self._before or self.rig).linear
         return self.detection_covariance(data) + self._scale2 * sigma_x**2 * A @ A.T
 

@@ -16,7 +16,6 @@ from lib.trust.check import overlay
 _SIZE = (1280, 720)
 _LIGHTS = dict(zip(STATES, ((120, 120, 120), (0, 170, 80), (90, 150, 230), (40, 40, 40), (240, 190, 60), (220, 60, 50)),
                    strict=True))  # fmt: skip
-_FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
 class Dashboard:
@@ -79,7 +78,7 @@ class Dashboard:
 
 
 def _text(image: np.ndarray, text: str, at: tuple[int, int], colour: tuple[int, ...] = (60, 60, 60)) -> None:
-    cv2.putText(image, text, at, _FONT, 0.45, colour, 1, cv2.LINE_AA)
+    cv2.putText(image, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, 1, cv2.LINE_AA)
 
 
 @contextmanager

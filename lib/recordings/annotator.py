@@ -18,7 +18,6 @@ from lib.recordings.recording import Recording
 _SIDES = ("left", "right")
 #: Depths of the viewing ray, mm about the tool, whose images make an epipolar line: a microscope's depth of field is 3 mm.
 _DEPTHS_MM = np.linspace(-20.0, 20.0, 9)
-_JPEG_QUALITY = 95
 
 
 class Annotator:
@@ -183,7 +182,7 @@ class Annotator:
                 frame = frame if changed is None else changed
             if todo in ("hello", "next", "show"):
                 pair = self.recording.frames[frame]
-                how = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
+                how = [cv2.IMWRITE_JPEG_QUALITY, 95]
                 images = [cv2.imencode(".jpg", one[..., ::-1], how)[1].tobytes() for one in (pair.left, pair.right)]
             answer |= self._state(frame)
         except (ValueError, OSError) as error:
@@ -205,8 +204,7 @@ class Annotator:
         left, near = self._rig.left, self._x_mm[np.isfinite(self._x_mm).all(axis=-1)]
         x = (near.mean(axis=0) if len(near) else np.zeros(3)) + _DEPTHS_MM[:, None] * left.viewing_direction
         for _ in range(4):  # Gauss-Newton; the first step is exact where the camera is affine
-            off = np.asarray(u_left) - left.project(x)
-            x = x + np.einsum("nij,nj->ni", np.linalg.pinv(left.jacobian(x)), off)
+            x = x + np.einsum("nij,nj->ni", np.linalg.pinv(left.jacobian(x)), np.asarray(u_left) - left.project(x))
         return _plain(self._rig.right.project(x))
 
 

@@ -32,8 +32,7 @@ def read_image(path: Path, image_size_px: tuple[int, int] | None = None, bit_dep
         image_size_px: (width, height) that it must have.
         bit_depth: Of frames of 16 bits, as in `to_8_bits`; None leaves them as uint16.
 
-    Raises:
-        ValueError: If it cannot be decoded, a part of it is lost, or its size is another.
+    A ValueError if it cannot be decoded, a part of it is lost, or its size is another.
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such image.")
@@ -128,9 +127,8 @@ def _open_images(folder: Path, image_size_px: tuple[int, int], bit_depth: int) -
             raise ValueError(f"{path}: its EXIF orientation is {orientation}, so other programs turn it. {cure}.")
         with path.open("rb") as stream:
             stream.seek(-min(path.stat().st_size, 32), 2)
-            end = stream.read()
-        if (b"IEND" if path.suffix.lower() == ".png" else b"\xff\xd9") not in end:
-            raise ValueError(f"{path}: the image is cut off before its end. Export it again.")
+            if (b"IEND" if path.suffix.lower() == ".png" else b"\xff\xd9") not in stream.read():
+                raise ValueError(f"{path}: the image is cut off before its end. Export it again.")
     return len(paths), lambda index: read_image(paths[index], image_size_px, bit_depth)
 
 

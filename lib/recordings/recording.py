@@ -264,12 +264,9 @@ def _read_kinematics(path: Path, landmarks: Sequence[str]) -> Kinematics:
 
 
 class RecordingWriter:
-    """Context manager that writes a recording beside its final place, and moves it there when it is valid.
+    """Context manager that writes a recording beside its final place `folder`, and moves it there when it is valid.
 
-    Args:
-        folder: Where the recording appears.
-        image_size_px: (width, height).
-        skeleton: Names of the landmarks.
+    Args, beside those that are as in `Recording`:
         details: Own notes (numbers and text), kept in ``[details]`` of recording.toml.
         suffix, jpeg_quality: ".jpg" or ".png", and the quality of a JPEG.
         overwrite: Replace a recording of that name; any other folder that exists is a FileExistsError.

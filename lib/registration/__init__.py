@@ -1,8 +1,7 @@
 """Registration of moved cameras to the robot (paper Sec. IV-C), and the detection of drift.
 
 Calibrated cameras moved by an unknown rigid `motion`, so the stale rig triangulates ``motion.inverse().apply(x_robot)``.
-Every estimate here is that motion: it takes points of the stale rig to the robot frame, and ``rig.moved(motion)`` is the
-rig as it is now.
+Every estimate is that motion: it takes points of the stale rig to the robot frame; ``rig.moved(motion)`` is the rig now.
 """
 
 from lib.registration.drift import DriftMonitor

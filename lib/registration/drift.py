@@ -33,15 +33,12 @@ _FREEDOM = 4.0  # of the Student t of a landmark about the frame's mean: one wro
 class DriftMonitor:
     """CUSUM tests (Page 1954) on the residuals r = u - rig.project(x), one on each axis of `AXES` and to each side.
 
-    The detector's error is biased and correlated in time, and its stated noise may be wrong.  So the bias is the slow
-    mean of the residuals, within half a pixel, and the noise is their own long-run standard deviation, which counts
-    correlated frames for what they are worth.  A score z is the residual less its bias in this unit.  It adds to the sum S
-    the logarithm of how much likelier the shift to be noticed makes it; the alarm level keeps false alarms `_FRAMES` frames
-    apart (Siegmund 1985).
-
-    Args:
-        covariance_px2, sigma_x_mm: Noise to start from: of (u_left, u_right), a number, (2, 2) or (4, 4) px^2; and of the
-            robot's report, per coordinate.
+    The detector's error is biased and correlated in time, and its stated noise may be wrong.  So the bias is the slow mean of
+    the residuals, within half a pixel, and the noise is their own long-run standard deviation, which counts correlated frames
+    for what they are worth.  A score z is the residual less its bias in this unit.  It adds to the sum S the logarithm of how
+    much likelier the shift to be noticed makes it; the alarm level keeps false alarms `_FRAMES` frames apart (Siegmund 1985).
+    The noise to start from is `covariance_px2` of (u_left, u_right), a number, (2, 2) or (4, 4) px^2, and `sigma_x_mm` of the
+    robot's report, per coordinate.
 
     Attributes:
         statistic: Largest S after the last frame, in units of its alarm level; above 1 the cameras have moved.

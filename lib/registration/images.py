@@ -42,11 +42,9 @@ def register_images(
         covariance_px2: Of (u_left, u_right): a number, (2, 2), (4, 4) or (n, 4, 4).  None: that of the correspondences;
             without one, equal and unknown, estimated from the residuals.
         sigma_x_mm: Standard deviation of the robot's report, per coordinate.
-        loss: "robust" assumes heavy tails (Student t with 4 degrees of freedom), so that gross detection errors lose
-            their weight.
+        loss: "robust" assumes heavy tails (Student t with 4 degrees of freedom), so that gross errors lose their weight.
 
-    Raises:
-        ValueError: For shapes that do not pair up, or landmarks that leave the motion open.
+    A ValueError refuses shapes that do not pair up, and landmarks that leave the motion open.
 
     >>> from lib.cameras import AffineCamera
     >>> rig = StereoRig(*(AffineCamera([[99, 0, z, 900], [0, 99, 0, 500]]) for z in (9, -9)))
@@ -224,8 +222,7 @@ def _minimum(rig: StereoRig, data: _Observed, stale: RigidTransform, loss: Loss,
         turn = Rotation.from_rotvec(step[:3]).as_matrix()
         return RigidTransform(turn @ stale.R, turn @ (stale.t - centre) + centre + step[3:])
 
-    evaluate = partial(_evaluate, rig, data, loss)
-    found = minimise(stale, evaluate, normal_equations, move, rank=parameters, tolerance=1e-11)
+    found = minimise(stale, partial(_evaluate, rig, data, loss), normal_equations, move, rank=parameters, tolerance=1e-11)
     information, (_, distance2, weights) = found.information, found.work
     if np.linalg.matrix_rank(information, tol=_OPEN * np.trace(information), hermitian=True) < parameters:
         raise ValueError("x_mm, u_left, u_right: these landmarks leave the motion open. Add frames in other positions.")

@@ -66,10 +66,8 @@ def register(x_source: ArrayLike, x_target: ArrayLike, *, loss: Literal["norm", 
             squares from several starts.  "squared" minimises the sum of squares, in closed form (Kabsch 1976).
 
     The covariance is the sandwich of an M-estimator (Huber 1967).  It assumes neither Gaussian nor isotropic noise but many
-    points: below about ten it says little.  Standard deviations of the norm are good to about 30 %.
-
-    Raises:
-        ValueError: For rows that do not pair up, NaN, fewer than three points, or points on a line.
+    points: below about ten it says little.  Standard deviations of the norm are good to about 30 %.  A ValueError refuses
+    rows that do not pair up, NaN, fewer than three points, and points on a line.
 
     >>> x = np.array([[0.0, 0, 0], [4, 0, 0], [0, 3, 0], [0, 0, 2], [3, 3, 0], [2, 0, 1]])
     >>> y = x + [0.5, 0.25, -1]

@@ -50,13 +50,12 @@ class SurfaceFit:
     def covariance(self, u: np.ndarray) -> np.ndarray:
         """Covariance (n, 3, 3) mm^2 of Psi(u) (n, 2), NaN outside the domain.
 
-        The curvature of the expected L1 loss is 2 f(0) B'B, where f(0) is the density of the residuals at zero; with
-        the bending energy as the prior this gives C = (2 f B'B + 2 mu R)^-1 / (2 f) for the coefficients of an output
-        (Koenker, Quantile Regression, Sec. 4.2; Wahba, J. R. Stat. Soc. B 45, 1983, for reading the penalty as a
-        prior, which makes the bands hold the smoothing bias on average).  Neighbouring matches share part of their
-        error; C is inflated by how much more the signs of residuals in a quarter of a cell agree than independent ones
-        would.  Outputs correlate as the signs of their residuals do.  What all points share, such as the error of the
-        calibration, is not in it.
+        The curvature of the expected L1 loss is 2 f(0) B'B, where f(0) is the density of the residuals at zero; with the
+        bending energy as the prior this gives C = (2 f B'B + 2 mu R)^-1 / (2 f) for the coefficients of an output (Koenker,
+        Quantile Regression, Sec. 4.2; Wahba, J. R. Stat. Soc. B 45, 1983, for reading the penalty as a prior, which makes the
+        bands hold the smoothing bias on average).  Neighbouring matches share part of their error; C is inflated by how much
+        more the signs of residuals in a quarter of a cell agree than independent ones would.  Outputs correlate as the signs
+        of their residuals do.  What all points share, such as the error of the calibration, is not in it.
         """
         result = np.full((len(u), 3, 3), np.nan)
         grid = self.problem.grid
@@ -76,8 +75,7 @@ class SurfaceFit:
     def _posterior(self) -> list[tuple[np.ndarray, float]]:
         """Factor of 2 f B'W^2 B + 2 mu R and density f, one an output."""
         posterior = []
-        scatter = np.abs(self.weights * self.residual).T
-        for mu, weights, size in zip(self.penalty, self.weights.T, scatter, strict=True):
+        for mu, weights, size in zip(self.penalty, self.weights.T, np.abs(self.weights * self.residual).T, strict=True):
             # The surface meets some points exactly; only the others show the scatter, half of them within their median.
             free = size[size > 1e-3 * size.mean()]
             density = 0.25 / max(np.median(free), np.finfo(float).tiny) if len(free) else np.inf
@@ -129,8 +127,7 @@ class BSplineSurface:
     Attributes:
         grid: Domain and number of control points.
         control_points_mm: (n_y, n_x, 3).
-        fit: How it was found: data term, smoothness, inliers, certificate (`SurfaceFit`); None for a surface that was
-            not fitted.
+        fit: How it was found: data term, smoothness, inliers, certificate (`SurfaceFit`); None where it was not fitted.
     """
 
     grid: SplineGrid
@@ -167,8 +164,7 @@ class BSplineSurface:
         values = self.control_points_mm
         for axis, u in ((1, x_px), (0, y_px)):
             position = (np.asarray(u, dtype=np.float64) - self.grid.domain[1 - axis]) / self.grid.cell_px[1 - axis]
-            knots = np.arange(-3.0, values.shape[axis] + 1)
-            values = BSpline(knots, values, 3, axis=axis, extrapolate=False)(position)
+            values = BSpline(np.arange(-3.0, values.shape[axis] + 1), values, 3, axis=axis, extrapolate=False)(position)
         return values
 
     def normal(self, u: ArrayLike) -> np.ndarray:

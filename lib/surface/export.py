@@ -58,9 +58,8 @@ def surface_mesh(
     """
     if not step_px > 0:
         raise ValueError(f"step_px: must be positive, got {step_px}.")
-    x0, y0, x1, y1 = surface.grid.domain
-    x = np.linspace(x0, x1, int(np.ceil((x1 - x0) / step_px)) + 1)
-    y = np.linspace(y0, y1, int(np.ceil((y1 - y0) / step_px)) + 1)
+    ends = np.reshape(surface.grid.domain, (2, 2)).T
+    x, y = (np.linspace(low, high, int(np.ceil((high - low) / step_px)) + 1) for low, high in ends)
     u = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     corner = (np.arange(len(y) - 1)[:, None] * len(x) + np.arange(len(x) - 1)).ravel()
     right, below = corner + 1, corner + len(x)
@@ -95,11 +94,9 @@ def save_mesh(mesh: Mesh, path: str | Path) -> Path:
         written.material.set_default_properties()
         written.material.material_name = "defaultLit"
         written.material.texture_maps["albedo"] = o3d.t.geometry.Image(tensor(mesh.texture))
-
-    def is_whole(data: bytes) -> bool:  # the header of a GLB states the length of the file
-        return len(data) > 12 and int.from_bytes(data[8:12], "little") == len(data)
-
-    _write(path, lambda name: o3d.t.io.write_triangle_mesh(name, written), is_whole)
+    # The header of a GLB states the length of the file.
+    _write(path, lambda name: o3d.t.io.write_triangle_mesh(name, written),
+           lambda data: len(data) > 12 and int.from_bytes(data[8:12], "little") == len(data))  # fmt: skip
     return path
 
 
@@ -120,8 +117,7 @@ def save_points(path: str | Path, x_mm: ArrayLike, *, colours: np.ndarray | None
 def depth_map(surface: BSplineSurface, camera: AffineCamera, image_size_px: tuple[int, int]) -> np.ndarray:
     """Depth (h, w) float32 mm of every left pixel along the viewing direction, NaN outside the domain.
 
-    Depth 0 is the plane across the view through the origin of the surface's frame: an affine camera has no centre to
-    measure from.
+    Depth 0 is the plane across the view through the origin of the surface's frame: an affine camera has no centre.
     """
     width, height = image_size_px
     return (surface.on_grid(np.arange(width), np.arange(height)) @ camera.viewing_direction).astype(np.float32)

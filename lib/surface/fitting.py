@@ -50,8 +50,7 @@ def fit_surface(
         quick: Choose the smoothness and reject points at fits of five Newton steps, within some percent of the minimum;
             only the final fit is solved to `tolerance`.
 
-    A ValueError refuses NaN and points that do not determine a surface: fewer in the domain than a quarter of the control
-    points, or than 16.
+    A ValueError refuses NaN and points that determine no surface: fewer in the domain than 16 or a quarter of control points.
     """
     grid = SplineGrid(domain, control)
     u, x = finite_points(u, 2, "u"), finite_points(x_mm, 3, "x_mm")
@@ -151,9 +150,8 @@ def _choose_smoothness(
     It walks down a ladder of half decades to the lowest rung, then takes the parabola through it and its neighbours.
     """
     n, stiffness = len(u), norms.mean(axis=0)
-    order = np.lexsort((*values.T, u[:, 0], u[:, 1]))
     fold = np.empty(n, dtype=np.intp)
-    fold[order] = np.arange(n) % _FOLDS
+    fold[np.lexsort((*values.T, u[:, 0], u[:, 1]))] = np.arange(n) % _FOLDS
     parts = [
         (L1Problem(grid, u[fold != f]), fold != f, grid.design(u[fold == f]), fold == f)
         for f in range(min(_FOLDS, -(-enough * _FOLDS // n)))

@@ -139,5 +139,4 @@ class SplineGrid:
     @property
     def sites(self) -> np.ndarray:
         """Image points (n_y, n_x, 2) of the control points: f(sites) as control points reproduce a linear f exactly."""
-        index = np.stack(np.meshgrid(*map(np.arange, self.control)), axis=-1)
-        return self.domain[:2] + (index - 1) * self.cell_px
+        return self.domain[:2] + (np.stack(np.meshgrid(*map(np.arange, self.control)), axis=-1) - 1) * self.cell_px

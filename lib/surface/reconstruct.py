@@ -33,8 +33,7 @@ class Reconstruction:
         n_matches: Number of matches before the filter.
         mask_left: (h, w) bool, True where tool or glints hid the surface.
         rig: The cameras that made the points: as given, or refined by the matches.
-        seconds: Wall clock of each stage: "mask", "refine" (only where the rig was refined), "match", "triangulate",
-            "surface".
+        seconds: Wall clock of each stage: "mask", "refine" (where the rig was refined), "match", "triangulate", "surface".
     """
 
     surface: BSplineSurface
@@ -59,8 +58,7 @@ class Reconstruction:
 def epipolar_inliers(rig: StereoRig, matches: Matches) -> np.ndarray:
     """Mask (n,) of the matches that lie on their epipolar lines, within `EPIPOLAR_SIGMAS` of their standard deviations.
 
-    The median distance is subtracted first: the lines of a calibrated rig may be off by a fraction of a pixel,
-    the same for all matches.
+    The median distance is subtracted first: a calibrated rig's lines may be off by part of a pixel, for all matches alike.
     """
     if not len(matches):
         return np.zeros(0, dtype=bool)
@@ -148,8 +146,7 @@ def reconstruct(
         control, smoothness: As for `fit_surface`; the smoothness of an earlier frame (`surface.fit.smoothness`) saves time.
         depth_only: Fit one spline, the depth along the rays of the left camera, in place of three.  It needs an affine
             left camera. None is True in the fast setting with an affine rig.
-        depth_range_mm, max_epipolar_px: As for `lib.matching.match`; those of an earlier frame (`depth_range_mm` of its
-            result) save time.
+        depth_range_mm, max_epipolar_px: As for `match`; those of an earlier frame (`depth_range_mm` of its result) save time.
         seconds: A dictionary that gets the seconds of each stage as it ends, also of the stage that fails.
 
     A ValueError says what is wrong, as those of `match` and `fit_surface` do.

@@ -20,15 +20,11 @@ UNHELD = (
     "smoothness: too small to hold the control points that have no data near them; increase it, or use fewer control points."
 )
 _PAIRS = np.triu_indices(4)
+_blas = cache(ThreadpoolController)
 
 
 class L1Problem:
-    """Points on a spline grid, with everything of the Newton matrix that does not change between iterations.
-
-    Args:
-        grid: Where the coefficients lie.
-        u: (n, 2) px, all inside the domain.
-    """
+    """Points u (n, 2) px, all inside the domain of `grid`, and all of the Newton matrix that no iteration changes."""
 
     def __init__(self, grid: SplineGrid, u: np.ndarray) -> None:
         self.grid, self.u, self.bending = grid, u, grid.bending
@@ -83,10 +79,9 @@ class L1Problem:
         a, b = np.nonzero(local[:, None] >= local)
         pair = np.zeros((4, 4), dtype=np.intp)
         pair[_PAIRS] = pair[_PAIRS[::-1]] = np.arange(10)
-        source = pair[j[a], j[b]] * 10 + pair[i[a], i[b]]
         corner = np.repeat(corner, n_blocks)
         place = (corner[:, None] + local[b]) * height + local[a] - local[b]
-        column = np.arange(len(corner))[:, None] * 100 + source
+        column = np.arange(len(corner))[:, None] * 100 + (pair[j[a], j[b]] * 10 + pair[i[a], i[b]])
         entries = np.ones(place.size), (place.ravel(), column.ravel())
         scatter = sparse.csc_matrix(entries, shape=(height * grid.size, 100 * len(corner)))
         lower = sparse.tril(self.bending).tocoo()
@@ -223,9 +218,6 @@ def _interior_point(
         dual_residual *= 1.0 - alpha
 
     return c * scale + centre, objective * scale, gap * scale, y
-
-
-_blas = cache(ThreadpoolController)
 
 
 def cholesky(band: np.ndarray) -> np.ndarray | None:

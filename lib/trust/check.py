@@ -64,9 +64,8 @@ class Check:
         """(caption, picture) of the worst and the best frames."""
         health, data, c = self.assessment.health, self.assessment.data, self.assessment.calibration
         order = np.argsort(-np.nan_to_num(health.score, nan=np.inf), kind="stable")
-        chosen = list(dict.fromkeys([*order[:_SHOWN], *order[::-1][:_SHOWN]]))
         found = []
-        for place, i in enumerate(chosen):
+        for place, i in enumerate(dict.fromkeys([*order[:_SHOWN], *order[::-1][:_SHOWN]])):
             number, score = int(health.frame[i]), health.score[i]
             rows = data.of_frames(number)
             seen = rows.stacked_px.reshape(-1, 2, 2).swapaxes(0, 1)

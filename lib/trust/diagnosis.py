@@ -230,8 +230,7 @@ def _rigid_tips(case: Case) -> Iterator[Hypothesis]:
     text = f"The robot reports tips {width.mean():.2f} mm apart, always; in the images this varies by {size:.2f} mm."
     cure = "Log the opening of the jaws with the robot's pose, or calibrate with the base alone."
     chosen = 0.5 * float((np.log1p(sd**2 * information) + (opening / sd) ** 2).sum())  # the openings integrated out
-    raw = fit.total - case.null.total - chosen
-    yield case.found("rigid_tips", fit, 1, (size, 0.0, "mm"), text, cure, raw=raw)
+    yield case.found("rigid_tips", fit, 1, (size, 0.0, "mm"), text, cure, raw=fit.total - case.null.total - chosen)
 
 
 def _optics(case: Case) -> Iterator[Hypothesis]:
@@ -324,12 +323,6 @@ def _unexplained(case: Case, fit: Robust) -> list[Hypothesis]:
     return [Hypothesis("detector_unfit", text, _UNFIT, 100 * share, 0.0, "%", share, float(gain))]
 
 
-_TESTS = (
-    _tip_order, _finite_distance, _landmark_offset, _tool_bends, _drift, _bad_part, _camera_moved, _frozen, _rigid_tips,
-    _optics,
-)  # fmt: skip
-
-
 @dataclass(frozen=True)
 class Diagnosis:
     """The hypotheses, most likely first."""
@@ -374,7 +367,9 @@ def diagnose(
         text = f"Only {problem.used.all(axis=1).sum()} of {len(data)} rows have both images and the robot's report."
         return Diagnosis((Hypothesis("detector_unfit", text, _UNFIT, 100.0, 0.0, "%", 1.0, float(len(data))),))
     case = Case(problem, kinematics, offset_s, readout_s, image_size_px)
-    found = [h for test in (*(TIME_TESTS if case.paths else ()), *_TESTS) for h in test(case)]
+    tests = [_tip_order, _finite_distance, _landmark_offset, _tool_bends, _drift, _bad_part, _camera_moved, _frozen]
+    tests = [*(TIME_TESTS if case.paths else ()), *tests, _rigid_tips, _optics]
+    found = [h for test in tests for h in test(case)]
     found = sorted((h for h in found if np.isfinite(h.gain)), key=lambda h: -h.gain)
     best = Diagnosis(tuple(found)).best
     found += _unexplained(case, case.null if best is None else case.fits.get(best.name, case.null))

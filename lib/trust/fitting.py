@@ -130,8 +130,7 @@ class Problem:
         """
         apart = np.zeros(len(self), dtype=bool) if apart is None else apart
         if start is None:
-            fits = [self._descend(M, columns, apart, 8) for M in self._starts()]
-            start = max(fits, key=lambda fit: fit.total).M
+            start = max((self._descend(M, columns, apart, 8) for M in self._starts()), key=lambda fit: fit.total).M
         return self._descend(start, columns, apart, rounds)
 
     def _starts(self) -> np.ndarray:
@@ -201,8 +200,7 @@ class Problem:
 
     def _overcount(self, z: np.ndarray) -> float:
         """Variance of the sums of weighted residuals z (n, 2, 2) over stretches of frames, over that of independent ones."""
-        frames = int(self.frame.max(initial=0)) + 1
-        stretch = self.frame // max(1, min(_BLOCK, frames // 6))
+        stretch = self.frame // max(1, min(_BLOCK, (int(self.frame.max(initial=0)) + 1) // 6))
         sums = np.zeros((int(stretch.max(initial=0)) + 1, 2))
         np.add.at(sums, stretch, z.sum(axis=1))
         return float(max(1.0, ((sums**2).sum(axis=0) / np.maximum((z**2).sum(axis=(0, 1)), 1e-300)).mean()))
@@ -240,8 +238,7 @@ class Case:
         if not np.isfinite(time).all():
             return
         if kinematics is not None and landmark.max() < kinematics.x_mm.shape[1]:
-            log = np.swapaxes(kinematics.x_mm, 0, 1) - problem.centre
-            self.paths = Paths((kinematics.time_s, own) for own in log)
+            self.paths = Paths((kinematics.time_s, own) for own in np.swapaxes(kinematics.x_mm, 0, 1) - problem.centre)
         if self.paths is None or not all(self.paths.pieces):
             each = [np.flatnonzero(landmark == k) for k in range(int(landmark.max()) + 1)]
             each = [rows[np.unique(time[rows], return_index=True)[1]] for rows in each]

@@ -200,9 +200,7 @@ def affine_epipolar(y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def feature_matches(recording: Recording, frames: np.ndarray) -> np.ndarray:
-    """Features (n, 4) px matched freely between left and right, such that those of a frame agree on some affine epipolar
-    geometry, whichever it is.
-    """
+    """Features (n, 4) px matched freely between left and right; those of a frame agree on some affine epipolar geometry."""
     sift, found = cv2.SIFT_create(2000), [np.zeros((0, 4))]
     for i in frames:
         pair = recording.frames[int(i)]

@@ -100,11 +100,9 @@ def run(
 ) -> dict:  # fmt: skip
     """Execute notebooks into a new folder of `runs`, and return its metrics.json; the others still run when one fails.
 
-    Everything is written at once, so that a run that is killed leaves a readable report of what it had reached.
-
-    Raises:
-        ValueError: Before anything runs: for an unknown notebook or parameter, or a value of the wrong type.
-        OSError: If the report cannot be written; its state is "failed" if that can still be written.
+    Everything is written at once, so that a run that is killed leaves a readable report of what it had reached.  Before
+    anything runs a ValueError refuses an unknown notebook or parameter, or a value of the wrong type; an OSError says that
+    the report cannot be written (its state is "failed" if that can still be written).
     """
     chosen = execution.choose_notebooks(names, notebooks)
     values = execution.parse_parameters(pairs, chosen, profile)

@@ -148,8 +148,7 @@ class Failure(NamedTuple):
     message: str
 
     def __str__(self) -> str:
-        where = f" in cell {self.cell}" if self.cell else ""
-        return f"{self.kind}{where}: {self.message}"
+        return f"{self.kind}{f' in cell {self.cell}' if self.cell else ''}: {self.message}"
 
 
 def execute(

@@ -135,11 +135,10 @@ def headlines(run: dict) -> tuple[list[dict], list[str]]:
 
     ``templates/headlines.toml`` says which numbers these are, with their targets; `run` is the content of metrics.json.
     """
-    text = (_TEMPLATES / "headlines.toml").read_text(encoding="utf-8")
     metrics, books = ({entry["name"]: entry for entry in run[kind]} for kind in ("metrics", "notebooks"))
     own = bool(run["parameters"].get("recording"))
     rows, left_out = [], []
-    for line in tomllib.loads(text)["headline"]:
+    for line in tomllib.loads((_TEMPLATES / "headlines.toml").read_text(encoding="utf-8"))["headline"]:
         live, record = metrics.get(line["name"]), None if own else metrics.get(line.get("recorded"))
         here = bool(live) and live["value"] is not None
         if own and (line.get("elsewhere") or (line.get("truth") and not here)):
@@ -147,8 +146,10 @@ def headlines(run: dict) -> tuple[list[dict], list[str]]:
             continue
         unit, paper = line["unit"], (live or line).get("paper")
         before, book = run.get("previous", {}).get(line["name"]), books.get(line["notebook"], {"state": None})
+        lights = {"met": line["target"], "close": line["close"], "missed": (-math.inf, math.inf)}
+        fitting = (light for light, (low, high) in lights.items() if here and low <= live["value"] <= high)
         rows.append(line | {
-            "light": _light(live["value"], line) if here else "missing",
+            "light": next(fitting, "missing"),
             "target": _range(*line["target"], unit),
             "value": with_unit(live["value"], unit) if here else _MISSING.get(book["state"], f"needs {line['needs']}"),
             "recorded": record and with_unit(record["value"], unit),
@@ -157,11 +158,6 @@ def headlines(run: dict) -> tuple[list[dict], list[str]]:
             "from": live or record,
         })  # fmt: skip
     return rows[:8], left_out
-
-
-def _light(value: float, line: dict) -> str:
-    inside = {name: line[name][0] <= value <= line[name][1] for name in ("target", "close")}
-    return "met" if inside["target"] else "close" if inside["close"] else "missed"
 
 
 def _range(low: float, high: float, unit: str) -> str:

@@ -72,17 +72,14 @@ def verdict(found: object) -> None:
 
 def rendered(template: str, **values: object) -> str:
     """HTML from a file of ``templates/``; it escapes every value that it does not call safe."""
-    folder = Path(__file__).with_name("templates")
-    made = Environment(loader=FileSystemLoader(folder), autoescape=True).get_template(template)
-    return made.render(values, colours=VERDICT_COLOURS)
+    templates = Environment(loader=FileSystemLoader(Path(__file__).with_name("templates")), autoescape=True)
+    return templates.get_template(template).render(values, colours=VERDICT_COLOURS)
 
 
 def show(figure: Figure, name: str, caption: str) -> None:
     """Display a matplotlib figure with its caption and close it; an SVG where that is small and holds no image, else a PNG.
 
-    Args:
-        name: Lower-case snake case that starts with the stage; the file's name in the run's ``figures/``.
-        caption: One line: what the reader sees, and what to look at.
+    `name` is as in `record`, and the file's in the run's ``figures/``; `caption` is one line: what one sees, what to look at.
     """
     import matplotlib.pyplot as plt
 
@@ -91,8 +88,8 @@ def show(figure: Figure, name: str, caption: str) -> None:
     try:
         if _in_notebook():
             mime, drawn = _drawn(figure)
-            named = {"name": name, "caption": caption}
-            _publish({mime: drawn, "text/plain": text}, {FIGURE_METADATA: named, mime: {"alt": caption}})
+            metadata = {FIGURE_METADATA: {"name": name, "caption": caption}, mime: {"alt": caption}}
+            _publish({mime: drawn, "text/plain": text}, metadata)
             _publish({"text/html": rendered("caption.html", text=caption), "text/plain": caption})
         else:
             print(text)

@@ -66,8 +66,7 @@ def sweep(
         workers, scheduler: As in `lib.parallel.run_jobs`.
         record: Also write the table to the folder `recorded`, if no run failed.
 
-    Returns:
-        tuple: ``results.csv`` (a row a run: its parameters, then its metrics), and what failed at which point.
+    Returns ``results.csv`` (a row a run: its parameters, then its metrics), and what failed at which point.
     """
     chosen = execution.choose_notebooks([name], notebooks)
     grid = grid or execution.declared_grid(chosen[0])
@@ -114,13 +113,12 @@ def save_plots(rows: Sequence[dict], parameters: Sequence[str], folder: Path) ->
     The horizontal axis is the first parameter with several values; the others but `seed` make lines.  A line joins
     medians over what is left, such as seeds; dots are the runs.
     """
-    table = results.Table(list(rows))
     varied = [name for name in parameters if len({str(row[name]) for row in rows}) > 1]
     axis = next((name for name in varied if name != "seed"), "seed" if "seed" in varied else None)
     if axis is None:
         return
     lines = [name for name in varied if name not in (axis, "seed")]
-    for metric, values in table.columns.items():
+    for metric, values in results.Table(list(rows)).columns.items():
         if metric in parameters or isinstance(values, list) or not np.isfinite(values).any():
             continue
         figure = Figure(figsize=(6.4, 4.0), layout="constrained")
@@ -178,8 +176,7 @@ def column_name(metric: str, unit: str) -> str:
 
 
 def _row(executed: Path, point: dict) -> dict:
-    metrics = {column_name(m["name"], m["unit"]): m["value"] for m in execution.stated_in(executed).metrics}
-    return point | metrics
+    return point | {column_name(m["name"], m["unit"]): m["value"] for m in execution.stated_in(executed).metrics}
 
 
 def _cost(executed: Iterable[Path]) -> dict:
