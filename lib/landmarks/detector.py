@@ -327,7 +327,18 @@ class Detector:
         """Tools that an image (h, w, 3) may show: `others` and those that the first stage's peaks make; u (m, 3, 2) px of
         what a look at each shows, and the mean height (m,) of the peaks there.
         """
-        candidates = Landmarks.join([*others, self._candidates(image[None])])
+        peaks, found, one = [], [], image[None]
+        for scale in _SCALES:
+            stride, heatmaps = self.frame_stride(one, scale), self.outputs(self.reduced(one, scale), "frame")
+            for _ in range(PEAKS):
+                peaks.append(decode(heatmaps, self.frame_network.stride, method=self.method))
+                found.append(self._in_image(peaks[-1], stride))
+                heatmaps = without_peak(heatmaps, peaks[-1].u, self.frame_network.stride)
+        every = Landmarks.join(found)
+        height = torch.cat([part.value for part in peaks]).numpy()
+        which = best_tools(every.u, height, _CANDIDATES) if height.max() > _NOTHING else np.zeros((0, 3), int)
+        at = which, np.arange(3)
+        candidates = Landmarks.join([*others, Landmarks(every.u[at], every.covariance[at], every.confidence[at])])
         return candidates, *self._looked(image, candidates.u, "tool")
 
     def _looked(self, image: np.ndarray, u: np.ndarray, stage: str) -> tuple[np.ndarray, np.ndarray]:
@@ -343,21 +354,6 @@ class Detector:
         found[i, k] = _through_inverse(matrices, peaks.u[:, 0].double().numpy())
         height[i, k] = peaks.value[:, 0].numpy()
         return found, np.clip(height, 0, 1).mean(1)
-
-    def _candidates(self, image: np.ndarray) -> Landmarks:
-        """Tools (m, 3, 2) that one image (1, h, w, 3) may show."""
-        peaks, found = [], []
-        for scale in _SCALES:
-            stride, heatmaps = self.frame_stride(image, scale), self.outputs(self.reduced(image, scale), "frame")
-            for _ in range(PEAKS):
-                peaks.append(decode(heatmaps, self.frame_network.stride, method=self.method))
-                found.append(self._in_image(peaks[-1], stride))
-                heatmaps = without_peak(heatmaps, peaks[-1].u, self.frame_network.stride)
-        every = Landmarks.join(found)
-        height = torch.cat([part.value for part in peaks]).numpy()
-        which = best_tools(every.u, height, _CANDIDATES) if height.max() > _NOTHING else np.zeros((0, 3), int)
-        at = which, np.arange(3)
-        return Landmarks(every.u[at], every.covariance[at], every.confidence[at])
 
     def refine(self, images: np.ndarray, rough: Landmarks, stage: str, seen: tuple | None = None) -> Landmarks:
         """Landmarks by a later stage, which looks where the `rough` ones lie; ``"tracking"`` is one too.

@@ -45,11 +45,15 @@ def test_an_image_starts_from_the_tool_that_its_window_shows_best(monkeypatch):
 
     sure_and_unsure = [landmarks(u[None], confidence) for u in (TOOL, TOOL + 200) for confidence in (0.9, 0.3)]
     rough = Landmarks.join(sure_and_unsure)  # whether the first stage is sure of a wrong one does not matter
-    monkeypatch.setattr(Detector, "_candidates", lambda *_: landmarks(np.stack([TOOL + 90, TOOL]), 0.1))
+
+    def proposed(self, image, *others):
+        tools = Landmarks.join([*others, landmarks(np.stack([TOOL + 90, TOOL]), 0.1)])
+        return tools, *shown(tools.u, len(tools))
 
     def shown(seen, n):
         return seen, np.where(np.linalg.norm(seen - TOOL, axis=2).max(1) < 20, 0.8, 0.2)
 
+    monkeypatch.setattr(Detector, "proposed", proposed)
     monkeypatch.setattr(Detector, "stage_peaks", lambda self, images, u, stage: u)
     monkeypatch.setattr(Detector, "_shown", staticmethod(shown))
     found = detector.searched(np.zeros((4, 64, 96, 3), np.uint8), rough)
