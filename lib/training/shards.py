@@ -167,7 +167,7 @@ def propose(folder: str | Path, detector: str | Path | None = None, *, workers: 
 
     Most are none: they are the negatives that teach the second stage most.  `detector`: as `Detector.load` takes it.
     """
-    jobs = {_proposals(path): (path, detector) for path in sorted(Path(folder).glob("scenes_*.npz"))}
+    jobs = {_proposals(path): (path, detector) for path in Path(folder).glob("scenes_*.npz")}
     for _, error in run_jobs(make_proposals, jobs, workers=workers, title="Searching scenes", unit="shard"):
         if error:
             raise error
@@ -199,10 +199,11 @@ def read_proposals(folder: str | Path) -> np.ndarray | None:
     """What `propose` found in a folder's scenes, (n, PROPOSALS, 3, 2) px, NaN where it did not look; None if nowhere."""
     known, parts = False, []
     for path in sorted(Path(folder).glob("scenes_*.npz")):
-        own = _proposals(path)
+        own, n = _proposals(path), len(_read(path, ("jpeg_ends",))[0])
         known |= own.is_file()
-        n = len(_read(path, ("jpeg_ends",))[0])
         parts.append(_read(own, ("u",))[0] if own.is_file() else np.full((n, PROPOSALS, 3, 2), np.nan))
+        if len(parts[-1]) != n:
+            raise ValueError(f"{own}: is of other scenes than {path.name}; delete it and call `lib train propose` again.")
     return np.concatenate(parts) if known else None
 
 
