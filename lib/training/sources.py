@@ -13,6 +13,7 @@ from lib.landmarks.metrics import tool_length_px
 from lib.simulator.window import in_image, motion_blur
 from lib.training import shards
 from lib.training.appearance import disguised
+from lib.training.bending import bent
 from lib.training.drawings import drawn_ground, drawn_tool
 from lib.training.samples import LabelledImage, Source
 
@@ -34,6 +35,8 @@ _PROPOSED = 0.4
 _DISGUISE_PX = 40.0
 #: Drawn tools in closeups: their length, and the blur of lens and sensor, px.
 _DRAWN_LENGTH_PX, _DRAWN_BLUR_PX = (90.0, 450.0), (0.4, 3.0)
+#: Drawn bases for each drawn tip: where a drawn jaw leaves its shaft is less exact than where it ends.
+_DRAWN_BASES = 0.3
 
 
 @dataclass(frozen=True)
@@ -41,8 +44,8 @@ class SceneSource(Source):
     """Frames as JPEG, one after the other, that end at `ends` (n,), with u (n, 3, 2) in their pixels and visibility (n, 3).
 
     Frames without a tool are among them: all landmarks have visibility 0.  `disguise` is the share of the
-    draws whose appearance is changed, `drawn` that of the draws whose tool is a drawing (`drawings.py`), `weight` (n, 3)
-    that of the draws in which a label counts.
+    draws whose appearance is changed, `drawn` that of the draws whose tool is a drawing (`drawings.py`), `bent` that of the
+    others whose jaws are bent (`bending.py`), `weight` (n, 3) that of the draws in which a label counts.
     """
 
     ends: np.ndarray
@@ -52,11 +55,12 @@ class SceneSource(Source):
     disguise: float = 0.5
     weight: np.ndarray | None = None
     drawn: float = 0.0
+    bent: float = 0.0
 
     @classmethod
     def load(cls, folder: str | Path) -> Self:
         """From the shards of a folder, to train with."""
-        return cls(*shards.read_scenes(folder), disguise=0.7, drawn=0.35)
+        return cls(*shards.read_scenes(folder), disguise=0.7, drawn=0.35, bent=0.3)
 
     @classmethod
     def of(cls, images: Iterable[LabelledImage], *, still: bool = False, weight: np.ndarray | None = None) -> Self:
@@ -71,6 +75,8 @@ class SceneSource(Source):
             image = image[y : y + _DRAWN_PX[1], x : x + _DRAWN_PX[0]]
             bare = not self.visibility[index].any() and rng.random() < 0.5
             return *drawn_tool(image if bare else drawn_ground(image, rng), rng), np.ones(3)
+        if self.bent and self.visibility[index].any() and rng.random() < self.bent and np.isfinite(labels[0]).all():
+            return *bent(image, labels[0], rng), *labels[1:]
         return image, *labels
 
     def frame(self, index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -258,7 +264,7 @@ class CloseupSource(Source):
         x, y = rng.integers(0, shards.BLOCK_PX, 2, endpoint=True)
         h, w = (side - shards.BLOCK_PX for side in self.crops.shape[1:3])
         crop, u = self.crops[index, y : y + h, x : x + w], self.u[index] - (x, y)
-        if self.drawn and rng.random() < self.drawn:
+        if self.drawn and rng.random() < self.drawn * (1 if k else _DRAWN_BASES):
             length, blur = (np.exp(rng.uniform(*np.log(r))) for r in (_DRAWN_LENGTH_PX, _DRAWN_BLUR_PX))
             crop, u, _ = drawn_tool(drawn_ground(crop, rng), rng, length_px=length, around=k)
             crop = cv2.GaussianBlur(crop, (0, 0), blur)
