@@ -76,7 +76,7 @@ class SceneSource(Source):
             bare = not self.visibility[index].any() and rng.random() < 0.5
             return *drawn_tool(image if bare else drawn_ground(image, rng), rng), np.ones(3)
         if self.bent and self.visibility[index].any() and rng.random() < self.bent and np.isfinite(labels[0]).all():
-            return *bent(image, labels[0], rng), *labels[1:]
+            return *bent(image, *labels[:2], rng), labels[2]
         return image, *labels
 
     def frame(self, index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -224,8 +224,8 @@ class CloseupSource(Source):
     visibility: np.ndarray
     landmark: np.ndarray
     size: int = 64
-    shifts_px: tuple[float, ...] = (2.0, 4.0, 8.0)
-    shift_shares: tuple[float, ...] = (0.5, 0.25, 0.25)
+    shifts_px: tuple[float, ...] = (2.0, 5.0, 11.0)
+    shift_shares: tuple[float, ...] = (0.35, 0.3, 0.35)
     turn_rad: float = 0.03
     length: float = 0.08
     alone: float = 0.05

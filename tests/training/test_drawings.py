@@ -1,10 +1,11 @@
-"""Drawn tools: their landmarks lie where the drawing is, in the workbench's order."""
+"""Drawn tools and bent jaws: their landmarks lie where the picture shows them, in the workbench's order."""
 
 from dataclasses import replace
 
 import numpy as np
 
 from lib.training import sources
+from lib.training.bending import bent
 from lib.training.drawings import drawn_ground, drawn_tool
 from lib.training.samples import LabelledImage
 from lib.training.sources import CloseupSource, FrameSource, ToolSource
@@ -78,3 +79,21 @@ def test_what_a_first_stage_took_for_a_tool_is_an_example_of_one_or_of_none(monk
         assert (visibility == 2).all()
     for at, visibility in draws["turned"] + draws["far"]:
         assert not visibility.any() and (at == -128).all()
+
+
+def test_the_landmarks_of_bent_jaws_move_with_the_image_and_tip_1_stays_on_the_left():
+    rows, columns = np.mgrid[:240, :320]
+    base, tips, turned = np.array([100.0, 120]), np.array([[200.0, 90], [200, 150]]), 0
+    for seed in range(30):
+        rng, u = np.random.default_rng(seed), np.vstack([base, tips + np.random.default_rng(seed).uniform(-20, 20, (2, 2))])
+        spots = [np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / 4.0) for x, y in u]
+        image = (200 * np.stack(spots, axis=2)).astype(np.uint8)
+        out, moved, visibility = bent(image, u, np.array([2, 1, 2]), rng)
+        swapped = visibility[1] == 2
+        for channel, (x, y) in zip(np.moveaxis(out, 2, 0).astype(float), moved[[0, 2, 1]] if swapped else moved, strict=True):
+            assert np.hypot((channel * columns).sum() / channel.sum() - x, (channel * rows).sum() / channel.sum() - y) < 1.0
+        np.testing.assert_allclose(moved[0], base, atol=1e-6)
+        assert np.linalg.det(moved[1:] - moved[0]) > 0
+        np.testing.assert_array_equal(out[:, :20], image[:, :20])  # what is far stays as it is
+        turned += np.linalg.norm(moved - u, axis=1).max() > 8
+    assert turned > 20
