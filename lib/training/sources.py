@@ -60,7 +60,7 @@ class SceneSource(Source):
     @classmethod
     def load(cls, folder: str | Path) -> Self:
         """From the shards of a folder, to train with."""
-        return cls(*shards.read_scenes(folder), disguise=0.7, drawn=0.35, bent=0.3)
+        return cls(*shards.read_scenes(folder), disguise=0.7, drawn=0.35, bent=0.4)
 
     @classmethod
     def of(cls, images: Iterable[LabelledImage], *, still: bool = False, weight: np.ndarray | None = None) -> Self:
