@@ -91,7 +91,7 @@ def test_the_landmarks_of_bent_jaws_move_with_the_image_and_tip_1_stays_on_the_l
         out, moved, visibility = bent(image, u, np.array([2, 1, 2]), rng)
         swapped = visibility[1] == 2
         for channel, (x, y) in zip(np.moveaxis(out, 2, 0).astype(float), moved[[0, 2, 1]] if swapped else moved, strict=True):
-            assert np.hypot((channel * columns).sum() / channel.sum() - x, (channel * rows).sum() / channel.sum() - y) < 1.0
+            assert np.hypot((channel * columns).sum() / channel.sum() - x, (channel * rows).sum() / channel.sum() - y) < 2.0
         assert np.linalg.norm(moved[0] - base) < 5
         assert np.linalg.det(moved[1:] - moved[0]) > 0
         np.testing.assert_array_equal(out[:, :20], image[:, :20])  # what is far stays as it is
