@@ -266,6 +266,30 @@ def test_labels_teach_a_tool_that_no_closeup_knows(world, recording, tmp_path, m
     assert not adapt(recording, Lost(world.u, wrong=0.97), folder=tmp_path / "none", **how).improved
 
 
+def test_closeups_that_see_no_end_of_the_shaft_do_not_drift_along_it(world, recording, tmp_path, monkeypatch):
+    class Blurred(StandIn):
+        networks, closeup_network = {}, "some"
+
+        @staticmethod
+        def refine(pair, rough, setting):
+            along = rough.u[:, 1:].mean(axis=1) - rough.u[:, 0]
+            u = rough.u.copy()
+            u[:, 0] += 0.3 * along / np.linalg.norm(along, axis=1, keepdims=True)
+            return Landmarks(u, np.tile(np.eye(2), (2, 3, 1, 1)), np.full((2, 3), 0.9))
+
+    class ReachedError(Exception):
+        """Training starts."""
+
+    def tune(detector, images, *rest, **how):
+        off = [one.u[0] - world.u[int(one.name.split()[1]), int(one.name.startswith("right")), 0] for one in images]
+        assert np.nanmedian(np.linalg.norm(off, axis=1)) < 1.5
+        raise ReachedError
+
+    monkeypatch.setattr(loop, "Detector", Blurred)
+    with pytest.raises(ReachedError):
+        adapt(recording, Blurred(world.u, wrong=0.3), folder=tmp_path, progress=False, tune=tune)
+
+
 def test_labels_of_one_eye_do_not_stop_a_detector_that_teaches_by_itself(world, recording, tmp_path):
     u = np.full(world.u.shape, np.nan)
     u[[1, 7, 13, 19, 24], 0] = world.u[[1, 7, 13, 19, 24], 0]
