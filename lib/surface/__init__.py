@@ -1,8 +1,7 @@
 """Robust bicubic B-spline surfaces from semi-dense stereo points (paper Sec. IV-B), and their files."""
 
-from lib.surface.bspline import BSplineSurface, ToolDistance
+from lib.surface.bspline import BSplineSurface, ToolDistance, fit_surface
 from lib.surface.export import Mesh, depth_map, open3d, save_depth_map, save_mesh, save_points, surface_mesh
-from lib.surface.fitting import fit_surface
 from lib.surface.grid import SplineGrid
 from lib.surface.reconstruct import Reconstruction, epipolar_inliers, reconstruct, refine_rig
 

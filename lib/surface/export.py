@@ -32,11 +32,8 @@ def open3d() -> ModuleType:
 class Mesh:
     """Triangles of a surface.
 
-    Attributes:
-        vertices_mm, normals: (n, 3), and unit vectors (n, 3) towards the camera.
-        faces: (m, 3) int32, counter-clockwise as the camera sees them.
-        u: (n, 2) px of the left image, the texture coordinates.
-        texture: (h, w, 3) uint8 RGB left image, or None.
+    `vertices_mm` (n, 3) have unit `normals` (n, 3) towards the camera; `faces` (m, 3) int32 are counter-clockwise as the
+    camera sees them; `u` (n, 2) px are texture coordinates in the left image, `texture` (h, w, 3) uint8 RGB or None.
     """
 
     vertices_mm: np.ndarray

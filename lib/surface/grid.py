@@ -1,7 +1,6 @@
 """Uniform bicubic B-splines over an image: basis, control grid, exact bending energy.
 
-A grid of ``control = (n_x, n_y)`` control points covers the domain (x0, y0, x1, y1) px with (n_x - 3) x (n_y - 3) cells,
-so the control points reach one cell beyond it on each side.
+``control = (n_x, n_y)`` points cover the domain (x0, y0, x1, y1) px, (n_x - 3) x (n_y - 3) cells, and one cell around it.
 """
 
 from dataclasses import dataclass
@@ -43,12 +42,8 @@ def _gram(n: int, derivative: int) -> sparse.csr_matrix:
 class SplineGrid:
     """Where the control points of a bicubic spline lie.
 
-    Coefficients are flat vectors (n_x n_y,) whose fast axis is the shorter side of the grid: this makes every matrix
-    of the fit as narrow-banded as can be.
-
-    Attributes:
-        domain: (x0, y0, x1, y1) px.
-        control: (n_x, n_y), each at least 4.
+    `domain` is (x0, y0, x1, y1) px, `control` (n_x, n_y), each at least 4.  Coefficients are flat (n_x n_y,), the shorter
+    side fast, which makes every matrix of the fit as narrow-banded as can be.
     """
 
     domain: tuple[float, float, float, float]

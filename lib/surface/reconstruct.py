@@ -12,13 +12,11 @@ from numpy.typing import ArrayLike
 from lib.calibration import Calibration
 from lib.cameras import AffineCamera, Points, StereoRig
 from lib.matching import Matches, checked_mask, glint_mask, match, tool_mask
-from lib.surface.bspline import BSplineSurface
-from lib.surface.fitting import fit_surface
+from lib.surface.bspline import BSplineSurface, fit_surface
 
 #: Matches farther from their epipolar line than this many of their own standard deviations are dropped.
 EPIPOLAR_SIGMAS = 2.0
-#: Of `refine_rig`: neighbouring matches share their errors off the line, and this many count as one; residuals beyond so
-#: many robust standard deviations lose their weight.
+#: Of `refine_rig`: so many neighbouring matches count as one; residuals beyond so many deviations lose their weight.
 _ALIKE, _SOFT = 10.0, 2.0
 
 
@@ -69,16 +67,10 @@ def epipolar_inliers(rig: StereoRig, matches: Matches) -> np.ndarray:
 def refine_rig(rig: StereoRig, covariance: np.ndarray, matches: Matches) -> StereoRig:
     """The rig that agrees best with its own calibration and with the epipolar geometry of dense matches.
 
-    A calibration from a few hundred landmarks leaves its epipolar lines off by some tenths of a pixel, and matches along
-    them slide on oblique edges.  But each match also measures its own distance from the line.  With true cameras (A*, t*)
-    and n the unit normal of the calibrated rig, n.A = 0, that distance is
-
-        r = n.(y - t) = n.((A* - A) x + (t* - t)) + noise.
-
-    It is linear in the point x.  A robust regression over all matches therefore measures four numbers of the calibration's
-    error, and the covariance of the calibration carries them over to all sixteen entries of its matrices: the update of a
-    Kalman filter whose prior is the calibration.  The cameras move only along directions that the calibration leaves
-    uncertain, so few or poor matches change little.
+    With true cameras (A*, t*) and the unit normal n of the calibrated rig, n.A = 0, a match lies n.((A* - A) x + (t* - t))
+    and noise off its line: linear in the point x.  So a robust regression over all matches measures four numbers of the
+    calibration's error, and its covariance carries them over to all sixteen entries of its matrices: the update of a Kalman
+    filter whose prior is the calibration.  Few or poor matches change little.
 
     Args:
         rig: A calibrated affine pair; a ValueError refuses another.
@@ -137,12 +129,10 @@ def reconstruct(
         setting: "quality", or "fast" for several pairs a second: coarser matching (see `lib.matching.match`), an
             approximate choice of smoothness, and `depth_only`.
         method: The matcher; see `lib.matching.match`.
-        refine: Correct the epipolar geometry of the rig by a first, fast matching (`refine_rig`); `rig` must then be a
-            calibration of an affine pair.  None refines where it is.
+        refine: Correct the rig by a first, fast matching (`refine_rig`); None does for a calibration of an affine pair.
         u_landmarks: Landmarks of the tool, (3, 2) px left and right, to mask the tool; NaN = missing.
         mask_left, mask_right: (h, w) bool, True = ignore, beside glints and tool.
-        percentiles: (low, high) of the matches' coordinates that bound the surface's domain: (0, 100) covers all matches,
-            (1, 99) leaves out the rim, where few matches hold the surface.
+        percentiles: (low, high) of the matches' coordinates that bound the surface's domain; (1, 99) leaves out the rim.
         control, smoothness: As for `fit_surface`; the smoothness of an earlier frame (`surface.fit.smoothness`) saves time.
         depth_only: Fit one spline, the depth along the rays of the left camera, in place of three.  It needs an affine
             left camera. None is True in the fast setting with an affine rig.
@@ -164,8 +154,7 @@ def reconstruct(
     covariance, rig = (rig.covariance, rig.pair) if isinstance(rig, Calibration) else (None, rig)
     if refine and covariance is None:
         raise ValueError("refine: needs the covariance of the rig; give the Calibration in place of its rig.")
-    if refine is None:
-        refine = covariance is not None and rig.is_affine
+    refine = covariance is not None and rig.is_affine if refine is None else refine
     low, high = percentiles
     if not 0 <= low < high <= 100:
         raise ValueError(f"percentiles: expected 0 <= low < high <= 100, got {percentiles}.")
@@ -192,8 +181,7 @@ def reconstruct(
         if not len(matches):
             raise ValueError("left, right: no match lies on its epipolar line; is there texture, does the rig fit?")
         domain = tuple(np.percentile(matches.u_left, percentiles, axis=0).ravel().tolist())
-        if depth_only is None:
-            depth_only = fast and rig.is_affine
+        depth_only = fast and rig.is_affine if depth_only is None else depth_only
         surface = fit_surface(
             matches.u_left, points.x_mm, domain=domain, control=control, smoothness=smoothness,
             camera=rig.left if depth_only else None, tolerance=1e-4 if fast else 1e-8, quick=fast,

@@ -1,8 +1,7 @@
 """L1 splines: min_c sum_i w_i |b_i.c - x_i| + mu c.R.c, the problem of paper Eq. (6), one output at a time.
 
 Eq. (6) decouples over x, y and z, and each output is a quadratic programme whose Newton matrix B'DB + 2 mu R has the
-narrow band of the spline's own grid.  `interior_point` walks to its exact minimum in a dozen banded factorisations
-and returns the duality gap as proof.
+narrow band of the spline's own grid.  `interior_point` takes a dozen factorisations, and the duality gap is the proof.
 """
 
 from dataclasses import dataclass
@@ -56,11 +55,9 @@ class L1Problem:
 
     @cached_property
     def _blocks(self) -> tuple[np.ndarray, ...]:
-        """The points by cells, in blocks of equal size so that the cells' sums are batched products.
+        """The points by cells, in blocks of equal size: slots, the 10 distinct products of basis functions along x and y.
 
-        A cell's 16 x 16 block sums over its points products of basis functions that separate in x and y: of the 10
-        distinct products along x with the 10 along y.  Last come the matrix that adds these sums to the band, and the
-        bending energy as a band.
+        Last come the matrix that adds the cells' sums of these to the band, and the bending energy as a band.
         """
         grid, height = self.grid, self.grid.bandwidth + 1
         cell, t = grid.locate(self.u)
@@ -93,11 +90,8 @@ class L1Problem:
 class L1Solution:
     """Minimum of sum_i w_i |b_i.c - x_i| + mu c.R.c for each of k outputs, and its proof.
 
-    Attributes:
-        coefficients: c (size, k).
-        objective: (k,) the sum above at c.
-        duality_gap: (k,) bound on how far the objective lies above the minimum, from a dual feasible point.
-        dual: y (n, k), |y_i| <= w_i: the pull of each point on the surface.
+    `coefficients` c (size, k) give the sums `objective` (k,), and `duality_gap` (k,) bounds how far these lie above the
+    minimum, from a dual feasible point `dual` y (n, k), |y_i| <= w_i: the pull of each point on the surface.
     """
 
     coefficients: np.ndarray
@@ -111,9 +105,6 @@ def interior_point(
     tolerance: float = 1e-9, max_iterations: int = 60,
 ) -> L1Solution:  # fmt: skip
     """Primal-dual interior point method with Mehrotra's predictor and corrector (Nocedal and Wright, Sec. 16.6).
-
-    The residual is split, b.c - x = p - q with p, q >= 0; the dual variable y of the split lies in [-w, w], with slacks
-    w - y for p and w + y for q.
 
     Args:
         x: (n, k) data of k outputs.
@@ -155,8 +146,8 @@ def _interior_point(
     x, c, residual = x / scale, c / scale, residual / scale
     bend = 2 * mu * scale  # the quadratic term grows as scale^2, the L1 term as scale
 
-    # On the central path but for the dual residual: p - q = residual and p (w - y) = q (w + y) = w.  Every step keeps
-    # the former, so it is never computed again, and shrinks the dual residual by what it leaves of its full length.
+    # The residual is split into p - q, both positive; the dual y has slacks w - y for p, w + y for q.  On the central path
+    # p (w - y) = q (w + y) = w.  Every step keeps the split and shrinks the dual residual by what it leaves of its length.
     smooth = 1.0 + np.sqrt(residual**2 + 1.0)
     p, q = (smooth + residual) / 2, (smooth - residual) / 2
     slack_p, slack_q = w / p, w / q
@@ -197,8 +188,7 @@ def _interior_point(
             dy += pull
             return dc, dy
 
-        # Predictor: straight to the solution, where both products vanish; how far it gets tells how much centring the
-        # corrector needs, and dp dy and dq dy tell its second-order term.
+        # Predictor: straight to the solution.  How far it gets tells the corrector's centring and second-order term.
         _, dy = newton(p - q)
         ratio_p, ratio_q = dy / slack_p, dy / slack_q
         alpha = 1.0 / max(1.0, 1.0 - ratio_p.min(), ratio_p.max(), 1.0 + ratio_q.max(), -ratio_q.min())
