@@ -33,16 +33,14 @@ def match(
             `epipolar_px`. "band": DeepMatching along the epipolar lines, sub-pixel; needs a rig. "sgbm", "dis":
             OpenCV's, on rectified canvases; without a rig the pair is taken as rectified. A callable `f(left, right,
             (low, high)) -> (disparity, confidence)` of rectified grey uint8 images (h, w), x_right = x_left -
-            disparity, not finite = none; confidence in [0, 1].  A third array (h, w) bool, where it returns one, is its own
-            check of the way back. None is "band" with a rig, else "deepmatching".
+            disparity, not finite = none; confidence in [0, 1]; and perhaps (h, w) bool, its own check of the way back.
+            None is "band" with a rig, else "deepmatching".
         rig: Calibrated rig, or `RECTIFIED` for a pair whose rows correspond (depth is then disparity in px).
         mask_left, mask_right: (h, w) bool, True = ignore (see `glint_mask`, `tool_mask`).
-        depth_range_mm: (near, far): the values of d.x to search, where d is the left camera's `viewing_direction` and x
-            a point in the rig's frame (so the sign and the origin are those of the rig's frame along d).  None = found
-            by a coarse pass.  Only used with a rig.
+        depth_range_mm: (near, far): the values of d.x to search, where d is the left camera's `viewing_direction` and x a
+            point in the rig's frame, whose origin and sign they have.  None = found by a coarse pass.  Only used with a rig.
         setting: "quality" searches at full resolution (up to 3 Mpx), "fast" at up to 0.4 Mpx.  Not for "deepmatching".
-        min_score: Matches with a lower score are dropped.  None is 0.5 for "band" (half of the wrong matches and few of
-            the right ones lie below), and 0 for the others.
+        min_score: Matches with a lower one are dropped.  None is 0.5 for "band", below which lie half of the wrong, or 0.
         downscale: DeepMatching only: pools descriptors by 2^downscale; None is the smallest from 1 that fits the budget.
         budget_bytes: Memory that DeepMatching may take; a search predicted to need more is refused.
         max_epipolar_px: A rig whose epipolar lines lie farther than this from free coarse matches is refused.  With
@@ -50,10 +48,8 @@ def match(
         reciprocal: Drop matches whose way back from the right image leads elsewhere (occlusions, above all).
         device: torch device of free DeepMatching, such as "cuda".
 
-    Returns:
-        Possibly none.  Of the three confidences the score is usually the best, but SGBM has none (always 1); the peak ratio
-        and the reciprocal check mean the same for every method.  A ValueError refuses unfit images, masks and options, and
-        a rig that does not fit the images (with the epipolar error).
+    Possibly none are found.  Of the three confidences the score is usually the best, but SGBM has none (always 1).  A
+    ValueError refuses unfit images, masks and options, and a rig that does not fit the images (with the epipolar error).
 
     >>> noise = np.random.default_rng(0).integers(0, 255, (48, 64), dtype=np.uint8)
     >>> matches = match(noise, np.roll(noise, 4, axis=1))
@@ -61,10 +57,8 @@ def match(
     [4.0, 0.0]
     """
     images = as_gray(left, "left"), as_gray(right, "right")
-    masks = tuple(
-        None if mask is None else checked_mask(mask, image.shape, name)
-        for mask, image, name in zip((mask_left, mask_right), images, ("mask_left", "mask_right"), strict=True)
-    )
+    given = zip((mask_left, mask_right), images, ("mask_left", "mask_right"), strict=True)
+    masks = tuple(None if mask is None else checked_mask(mask, image.shape, name) for mask, image, name in given)
     if setting not in MAX_PIXELS:
         raise ValueError(f"setting: expected one of {sorted(MAX_PIXELS)}, got {setting!r}.")
     if depth_range_mm is not None:

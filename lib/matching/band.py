@@ -1,7 +1,6 @@
 """Matching along the epipolar lines of a calibrated rig: rectify, find the depth range, match, refine.
 
-A coarse pass on small images, free to leave the epipolar line, tells whether the rig fits the images and where in depth
-the scene lies.  The fine pass searches only the band that is left.
+A coarse pass on small images, free to leave the line, tells whether the rig fits and which band of depth is searched.
 """
 
 from concurrent.futures import ThreadPoolExecutor
@@ -76,11 +75,10 @@ def plan_search(
     if len(displacement) >= MIN_SUPPORTED:
         misfit = float(np.median(np.abs(displacement[:, 1])))
         if misfit > max_epipolar_px:
-            raise ValueError(
-                f"rig: it does not fit the images: the median of {len(displacement)} free matches lies {misfit:.1f} px "
-                f"off its epipolar lines, {max_epipolar_px:.1f} px are allowed (max_epipolar_px). Calibrate again, or "
-                "check that left and right are not exchanged."
-            )
+            what = f"the median of {len(displacement)} free matches lies {misfit:.1f} px off its epipolar lines"
+            cure = "Calibrate again, or check that left and right are not exchanged"
+            allowed = f"{max_epipolar_px:.1f} px are allowed (max_epipolar_px)"
+            raise ValueError(f"rig: it does not fit the images: {what}, {allowed}. {cure}.")
         off_line_px = float(np.median(displacement[:, 1]))
         low, high = np.percentile(displacement[:, 0], (0.5, 99.5))
         margin = 4 / min(1.0, COARSE_WIDTH_PX / max(whole.size_px))
@@ -99,7 +97,12 @@ def _coarse_displacement(images: Images, masks: Masks, rig: StereoRig, whole: Re
     reach = int(np.ceil(COARSE_REACH * rectification.size_px[0] / CELL_PX))
     left, right = _descriptors(images, masks, rectification, (-reach, reach), COARSE_OFF_LINE)
     matches = _match(left, right, -reach, COARSE_OFF_LINE)[0]  # the volume is large
-    chosen = matches.keep(_supported(matches))
+    # Those that three neighbours on the lattice or more support: they moved alike, within 1.5 cells.
+    gx, gy = matches.patch.max(axis=0, initial=0) + 1
+    field, (x, y) = np.full((gy + 2, gx + 2, 2), np.nan), matches.patch.T + 1
+    field[y, x] = matches.displacement
+    apart = np.array([field[y + dy - 1, x + dx - 1] - matches.displacement for dy, dx in np.ndindex(3, 3)])
+    chosen = matches.keep((np.abs(apart).max(axis=2, initial=0) <= 1.5).sum(axis=0) > 3)  # each match supports itself
     start = chosen.patch * PATCH
     step, _ = refine(left, right, start, start + chosen.cell - (-reach, -COARSE_OFF_LINE))
     displacement = (chosen.cell + step) * CELL_PX / scale
@@ -137,22 +140,9 @@ def _match(
         matches = match_volume(volume, low, reciprocal=reciprocal)
     x, y = matches.patch.T
     start = matches.cell - (low, -off_line) + matches.patch * PATCH
-    seen_right = np.mean(
-        [right[start[:, 1] + r, start[:, 0] + c, CHANNELS - 1] > 0 for r in range(PATCH) for c in range(PATCH)], axis=0
-    )
+    cells = np.ndindex(PATCH, PATCH)
+    seen_right = np.mean([right[start[:, 1] + r, start[:, 0] + c, CHANNELS - 1] > 0 for r, c in cells], axis=0)
     return matches.keep(patch_quality(left)[y, x] & (seen_right >= MIN_SEEN) & matches.peaked), volume
-
-
-def _supported(matches: VolumeMatches) -> np.ndarray:
-    """Mask (n,) of the matches with at least three neighbours on the lattice that moved alike, within 1.5 cells."""
-    gx, gy = matches.patch.max(axis=0, initial=0) + 1
-    field = np.full((gy + 2, gx + 2, 2), np.nan)
-    x, y = matches.patch.T + 1
-    field[y, x] = matches.displacement
-    support = np.zeros(len(x), int)
-    for dy, dx in np.ndindex(3, 3):
-        support += np.abs(field[y + dy - 1, x + dx - 1] - matches.displacement).max(axis=1, initial=0) <= 1.5
-    return support > 3  # each match supports itself
 
 
 def match_band(images: Images, masks: Masks, rig: StereoRig, where: Where, *, budget_bytes: int, reciprocal: bool) -> Matches:
@@ -164,10 +154,9 @@ def match_band(images: Images, masks: Masks, rig: StereoRig, where: Where, *, bu
     gx, gy = (side // (PATCH * CELL_PX) for side in rectification.size_px)
     need = volume_bytes(gy, gx, high - low + 1, OFF_LINE)
     if need > budget_bytes:
-        raise ValueError(
-            f"budget_bytes: {high - low + 1} displacements of {gx} x {gy} patches need {need / 2**30:.2f} GiB, the budget "
-            f"is {budget_bytes / 2**30:.2f} GiB. Narrow depth_range_mm, or take setting='fast'."
-        )
+        what = f"{high - low + 1} displacements of {gx} x {gy} patches need {need / 2**30:.2f} GiB"
+        budget = f"the budget is {budget_bytes / 2**30:.2f} GiB"
+        raise ValueError(f"budget_bytes: {what}, {budget}. Narrow depth_range_mm, or take setting='fast'.")
     left, right = _descriptors(images, masks, rectification, (low, high), OFF_LINE, off_line_px)
     found, volume = _match(left, right, low, OFF_LINE, reciprocal=reciprocal)
     x, y = torch.from_numpy(found.patch.T)
@@ -199,9 +188,8 @@ def _cut(grid: np.ndarray, x: np.ndarray, y: np.ndarray, margin: int) -> np.ndar
     side = PATCH + 2 * margin
     rows, columns = y - margin - 1, x - margin - REACH
     height, width, channels = grid.shape
-    view = np.lib.stride_tricks.sliding_window_view(
-        grid.reshape(height, width * channels), (side + 2, (side + 2 * REACH) * channels)
-    )
+    window = side + 2, (side + 2 * REACH) * channels
+    view = np.lib.stride_tricks.sliding_window_view(grid.reshape(height, width * channels), window)
     return view[rows, columns * channels].reshape(len(x), side + 2, side + 2 * REACH, channels)
 
 
@@ -219,17 +207,15 @@ def refine(
     """Refine matches of whole cells by one symmetric Gauss-Newton step on the descriptors.
 
     With f the left and g the right patch, scaled to the same norm, and w the mean of their gradients along x, the step is
-    w.(f - g) / w.w (efficient second-order minimisation: Malis, ICRA 2004).  It is exact to second order and has no bias at
-    zero, unlike the vertex of a parabola; raw intensity would be biased where gain and blur differ (by 0.4 px on retinas).
+    w.(f - g) / w.w (efficient second-order minimisation: Malis, ICRA 2004), which has no bias at zero.
 
     Args:
         left, right: (h, w, C) float32 descriptor grids.
         start_left, start_right: (n, 2) int, (x, y) cells where the matching 4 x 4 patches start.
         margin: Cells added to the patch on every side: steadier on smooth surfaces, worse at depth edges.
 
-    Returns:
-        Cells (n, 2) to add to the right (x, y), at most 1 either way: x on the line, and y as a step that may leave the line
-        finds it.  And their standard deviations (n, 2) if the descriptors' residuals were independent, up to a scale.
+    Returns cells (n, 2) to add to the right (x, y), at most 1 either way: x on the line, and y as a step that may leave it
+    finds it; and their standard deviations (n, 2) if the descriptors' residuals were independent, up to a scale.
     """
     pad = margin + REACH
     left, right = (np.pad(grid, ((margin + 1, margin + 1), (pad, pad), (0, 0))) for grid in (left, right))
@@ -237,10 +223,8 @@ def refine(
 
     def one(first: int) -> None:
         part = slice(first, first + CHUNK)
-        f, g = (
-            _cut(grid, start[part, 0] + pad, start[part, 1] + margin + 1, margin)
-            for grid, start in ((left, start_left), (right, start_right))
-        )
+        sides = (left, start_left[part] + (pad, margin + 1)), (right, start_right[part] + (pad, margin + 1))
+        f, g = (_cut(grid, *start.T, margin) for grid, start in sides)
         slopes = [[a.reshape(len(f), -1) for a in _derivatives(windows)] for windows in (f, g)]
         f, g = (np.ascontiguousarray(a[:, 1:-1, REACH:-REACH]).reshape(len(a), -1) for a in (f, g))
         scale = np.sqrt(np.einsum("ij,ij->i", f, f) / np.maximum(np.einsum("ij,ij->i", g, g), 1e-12))[:, None]

@@ -157,9 +157,6 @@ def peak_ratio(maps: torch.Tensor, row: torch.Tensor, column: torch.Tensor) -> n
     return torch.where(rival >= 0, response / rival.clamp_min(0), torch.nan).cpu().numpy().astype(np.float64)
 
 
-# --- displacements along the epipolar line
-
-
 class VolumeMatches(NamedTuple):
     """Matches on the lattice, in cells of the pooled descriptor grid."""
 
@@ -233,8 +230,7 @@ def match_volume(volume: torch.Tensor, low: int, *, reciprocal: bool = True) -> 
     # The power is monotone, so it may follow the maximum, which is a quarter of the work.
     scores = path_scores(pooled**POWER, n_levels(gy, gx) if rows * n > 1 else 0, shifted=False)
 
-    # The centre of a patch lies at cell 4 g + 2; its displaced copy falls into the bin (4 g + 2 + d) // 4, so
-    # displacements in fours share a bin for every patch.
+    # The displaced centre of a patch falls into the bin (4 g + 2 + d) // 4: displacements in fours share one.
     bin_x, bin_y = (low + np.arange(n) + 2) // PATCH, (np.arange(-v, v + 1) + 2) // PATCH
     in_x, in_y = ([np.flatnonzero(of == i) for i in range(of[0], of[-1] + 1)] for of in (bin_x, bin_y))
     bins = volume.new_full((gy + len(in_y) - 1, gx + len(in_x) - 1), -torch.inf)
@@ -282,9 +278,6 @@ def _parabola(volume: torch.Tensor, place: tuple[torch.Tensor, ...], axis: int) 
     return torch.where(peaked, 0.5 * (after - before) / curvature.clamp_min(1e-9), 0.0), peaked
 
 
-# --- free
-
-
 def predicted_bytes(shape_left: tuple[int, int], shape_right: tuple[int, int], *, downscale: int = 1) -> int:
     """Peak memory in bytes of free DeepMatching of two images (h, w)."""
     (gy, gx), (n_y, n_x) = ([n >> downscale for n in shape[:2]] for shape in (shape_left, shape_right))
@@ -325,9 +318,7 @@ def correlation_maps(patches: torch.Tensor, windows: torch.Tensor) -> torch.Tens
 
 
 def _match_grids(left: torch.Tensor, right: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, np.ndarray, torch.Tensor]:
-    """Best corner (gy, gx, 2) (x, y) of each patch of two descriptor grids, its score and peak ratio (gy, gx), and
-    whether no other patch fits the same place of the right grid better (gy, gx).
-    """
+    """Of each patch (gy, gx): best corner (x, y), score, peak ratio, and whether no other patch fits its place better."""
     patches, windows = unit_patches(left), unit_windows(right)
     (gy, gx), (n_y, n_x) = patches.shape[:2], windows.shape[:2]
 
@@ -371,15 +362,12 @@ def match_free(
     fitting = [d for d in choices if predicted_bytes(*shapes, downscale=d) <= budget_bytes]
     if not fitting:
         need = predicted_bytes(*shapes, downscale=max(choices))
-        raise ValueError(
-            f"budget_bytes: DeepMatching with downscale {max(choices)} needs {need / 2**30:.2f} GiB, the budget is "
-            f"{budget_bytes / 2**30:.2f}. Raise the budget or downscale, or match with a rig (method 'band')."
-        )
+        what = f"DeepMatching with downscale {max(choices)} needs {need / 2**30:.2f} GiB"
+        cure = "Raise the budget or downscale, or match with a rig (method 'band')"
+        raise ValueError(f"budget_bytes: {what}, the budget is {budget_bytes / 2**30:.2f}. {cure}.")
     stride = 1 << fitting[0]
-    left, right = (
-        pixel_descriptors(image, fitting[0], valid=None if mask is None else ~mask)
-        for image, mask in zip(images, masks, strict=True)
-    )
+    valid = [None if mask is None else ~mask for mask in masks]
+    left, right = (pixel_descriptors(image, fitting[0], valid=seen) for image, seen in zip(images, valid, strict=True))
     corner, best, ratio, passed = _match_grids(*(torch.from_numpy(grid).to(device) for grid in (left, right)))
     corner, best, passed = (array.cpu().numpy() for array in (corner, best.double(), passed))
     target = np.clip(corner, 0, np.array(right.shape[1::-1]) - 1)

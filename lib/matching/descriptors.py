@@ -1,7 +1,6 @@
 """Pixel descriptors of DeepMatching: soft histograms of gradient orientation, computed with OpenCV on the CPU.
 
-Source: Weinzaepfel, Revaud, Harchaoui, Schmid, DeepFlow (ICCV 2013); Revaud et al., DeepMatching: Hierarchical
-Deformable Dense Matching (IJCV 2016), Sec. 3.1.
+Source: Weinzaepfel, Revaud, Harchaoui, Schmid, DeepFlow (ICCV 2013); Revaud et al., DeepMatching (IJCV 2016), Sec. 3.1.
 """
 
 import cv2

@@ -8,8 +8,7 @@ from numpy.typing import ArrayLike
 def glint_mask(image: ArrayLike, *, grow_px: int = 5) -> np.ndarray:
     """Specular reflections: pixels whose every channel is nearly saturated (245), grown by a margin for the halo.
 
-    A glint moves with the viewpoint, not with the surface, so a match on one has the depth of a mirror image.  The image is
-    uint8, (h, w, 3) RGB or (h, w).
+    A glint moves with the viewpoint, so a match on one has a mirror image's depth.  `image` is uint8, (h, w, 3) or (h, w).
     """
     image = np.asarray(image)
     if image.dtype != np.uint8 or image.ndim not in (2, 3):
@@ -26,8 +25,7 @@ def tool_mask(shape: tuple[int, int], u_landmarks: ArrayLike, *, width_px: float
 
     Args:
         shape: (h, w) of the image.
-        u_landmarks: (3, 2) px: base, tip_1, tip_2; NaN = missing.  A jaw without its tip is left out; without the base,
-            or with both tips missing, the mask is empty.
+        u_landmarks: (3, 2) px of base, tip_1, tip_2.  A jaw whose tip is NaN is left out; without base or jaws all is.
         width_px: Full width of jaws and shaft, with margin; None is 0.45 of the mean jaw length.
     """
     u = np.asarray(u_landmarks, dtype=np.float64)

@@ -82,10 +82,8 @@ def match_with(
         raise ValueError(f"method: the matcher {name} must return arrays of the shape {left.shape}, got {shapes}.")
     passed = rest[0].astype(bool) if rest else np.ones(left.shape, dtype=bool)
 
-    x, y = np.meshgrid(
-        np.arange(reach + LATTICE_PX // 2, reach + width // LATTICE_PX * LATTICE_PX, LATTICE_PX),
-        np.arange(LATTICE_PX // 2, height // LATTICE_PX * LATTICE_PX, LATTICE_PX),
-    )
+    columns, rows = (np.arange(LATTICE_PX // 2, side // LATTICE_PX * LATTICE_PX, LATTICE_PX) for side in (width, height))
+    x, y = np.meshgrid(reach + columns, rows)
     kept = valid_left[y, x] & np.isfinite(disparity[y, x]) & (passed[y, x] | (not reciprocal))
     x, y = x[kept], y[kept]
     d = disparity[y, x].astype(np.float64)
@@ -113,9 +111,8 @@ def _judge(
 
     `reach`, a multiple of the lattice, is how far the canvases go on beyond the lattice on either side.
     """
-    left, right = (
-        pixel_descriptors(image.astype(np.float32), DOWNSCALE, valid=seen) for image, seen in zip(images, valid, strict=True)
-    )
+    pairs = zip(images, valid, strict=True)
+    left, right = (pixel_descriptors(image.astype(np.float32), DOWNSCALE, valid=seen) for image, seen in pairs)
     margin = reach // CELL_PX
     gy, gx = len(left) // PATCH, (left.shape[1] - 2 * margin) // PATCH
     low = max(int(np.floor(range_px[0] / CELL_PX)) - 1, -margin)

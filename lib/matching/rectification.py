@@ -2,8 +2,7 @@
 
 For an affine rig a point seen at u_left lies at u_right = H (u_left - t_l) + t_r + z e, where z = d.x is its depth
 along the left viewing direction d, H = A_r pinv(A_l) and e = A_r d.  So the right image warped by H looks like the
-left one up to a shift along H^-1 e that is linear in depth.  There is no singular configuration, unlike for
-perspective cameras, as long as the two viewing directions differ.
+left one up to a shift along H^-1 e that is linear in depth, as long as the two viewing directions differ.
 """
 
 from dataclasses import dataclass
@@ -23,8 +22,7 @@ class Rectification:
     """A canvas that covers the left image and on which both images share their rows.
 
     Attributes:
-        left_from_canvas, right_from_canvas: (2, 3) affine maps from canvas to image pixels, pixel centres on integers.
-            The right one holds at `reference_depth_mm`.
+        left_from_canvas, right_from_canvas: (2, 3) maps from canvas to image pixels; the right one at `reference_depth_mm`.
         size_px: (width, height) of the canvas.
         displacement_px_per_mm: On the right canvas a point dz deeper than the reference is shifted by this times dz along +x.
         reference_depth_mm: Depth d.x along the left viewing direction d at which the displacement is 0.
@@ -57,10 +55,8 @@ class Rectification:
         visible = float(x.min() - self.size_px[0]), float(x.max())
         if high < visible[0] or low > visible[1]:
             near, far = self.depth_range_mm(visible)
-            raise ValueError(
-                f"depth_range_mm: nothing from {depth_range_mm[0]:g} to {depth_range_mm[1]:g} mm along the left "
-                f"viewing direction is seen by both cameras; they share {near:.1f} to {far:.1f} mm."
-            )
+            what = f"nothing from {depth_range_mm[0]:g} to {depth_range_mm[1]:g} mm along the left viewing direction"
+            raise ValueError(f"depth_range_mm: {what} is seen by both cameras; they share {near:.1f} to {far:.1f} mm.")
         return max(low, visible[0]), min(high, visible[1])
 
     def u_left(self, canvas: np.ndarray) -> np.ndarray:
@@ -77,8 +73,7 @@ def rectify(
 ) -> Rectification:
     """The rectification of a rig for images of these shapes (h, w), with `scale` canvas pixels per left pixel.
 
-    Of near-affine cameras it is that of the affine cameras which touch them.  A ValueError refuses two cameras that look
-    along the same direction, since no depth can be seen.
+    Of near-affine cameras it is that of the affine ones which touch them.  A ValueError refuses two that look the same way.
     """
     A_l, A_r = rig.left.linear, rig.right.linear
     H = A_r @ np.linalg.pinv(A_l)
@@ -97,8 +92,7 @@ def rectify(
     at_zero = H @ (left[:, 2] - rig.left.offset_px) + rig.right.offset_px
     right_linear = H @ left[:, :2]
 
-    # Depth zero may be far away: refer to the depth that brings the image centres together, moved by whole
-    # canvas pixels so that an already rectified pair is not resampled.
+    # The depth that brings the image centres together, but for whole pixels: a rectified pair is not resampled.
     displacement = float(scale * direction @ shift)
     gap = (np.array(shape_right[::-1]) - 1) / 2 - (right_linear @ ((np.array(size) - 1) / 2) + at_zero)
     whole = np.rint(np.linalg.solve(right_linear, gap)[0])
@@ -112,12 +106,8 @@ def warp(
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """An image (h, w), float32 or uint8, on a canvas by `image_from_canvas` (2, 3); anti-aliased where that is coarser.
 
-    Args:
-        size_px, shift_px: (width, height) of the part of the canvas, which starts at canvas pixel `shift_px`.
-        mask: (h, w) bool, True = ignore.
-
-    Returns:
-        (height, width) float32, borders continued; and bool, False outside the image and where masked.
+    The part of the canvas has `size_px` (width, height) from pixel `shift_px`; `mask` (h, w) bool is True = ignore.  Gives
+    (height, width) float32, borders continued; and bool, False outside the image and where masked.
     """
     linear = image_from_canvas[:, :2]
     offset = image_from_canvas[:, 2] + linear @ np.asarray(shift_px, dtype=np.float64)
@@ -125,10 +115,8 @@ def warp(
     factor = max(1, int(np.sqrt(abs(np.linalg.det(linear))) + 0.25))
     if factor > 1:  # the mean of whole blocks; a rest of rows or columns is dropped
         rows, columns = gray.shape[0] // factor, gray.shape[1] // factor
-        gray, seen = (
-            cv2.resize(image[: rows * factor, : columns * factor], (columns, rows), interpolation=cv2.INTER_AREA)
-            for image in (gray, seen)
-        )
+        blocks = np.s_[: rows * factor, : columns * factor]
+        gray, seen = (cv2.resize(one[blocks], (columns, rows), interpolation=cv2.INTER_AREA) for one in (gray, seen))
         linear, offset = linear / factor, (offset - (factor - 1) / 2) / factor
     matrix, flags = np.column_stack([linear, offset]), cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     gray = gray.astype(np.float32, copy=False)

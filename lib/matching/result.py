@@ -21,8 +21,7 @@ class Matches:
             Infinite where nothing else responds, NaN where there was no other place.
         reciprocal: (n,) bool, whether the way back from the right image leads to the same left patch (DeepMatching,
             band), or to within a pixel (SGBM, DIS).  `match` drops the others unless told otherwise.
-        epipolar_px: Median over the matches of the absolute distance from the rig's epipolar constraint (as in
-            `StereoRig.epipolar_distance`); NaN without a rig or matches.
+        epipolar_px: Median over the matches of |`StereoRig.epipolar_distance`|; NaN without a rig or matches.
         method: Name of the matcher.
     """
 
