@@ -99,17 +99,6 @@ def make_dataset(
     return list(jobs)
 
 
-def _missing(folder: Path) -> int:
-    """How many sequences `folder` does not hold; what it holds must open as a recording."""
-    made = [folder / sequence_name(index) for index in _SEQUENCES if (folder / sequence_name(index)).exists()]
-    for sequence in made:
-        try:
-            Recording.open(sequence)
-        except (ValueError, OSError) as error:
-            raise ValueError(f"{sequence}: damaged ({error}). Delete the folder and it is made anew.") from error
-    return len(_SEQUENCES) - len(made)
-
-
 def seconds_a_pair(shrink: int) -> float:
     """CPU seconds of a stereo pair of the data set on this machine, measured on two pairs; the eye's texture excluded."""
     design = sequence_design(0, TEST_SEQUENCES[0], shrink=shrink, duration_s=1.5)
@@ -152,14 +141,18 @@ def main(argv: Sequence[str] | None = None) -> None:
         print(f"{recording.folder}: {len(recording)} pairs.")
         return
     folder = arguments.folder or paths.CACHE / f"dataset-{arguments.seed}"
-    left = _missing(folder) * pairs
+    made = [sequence for index in _SEQUENCES if (sequence := folder / sequence_name(index)).exists()]
+    for sequence in made:  # what is there must open as a recording
+        try:
+            Recording.open(sequence)
+        except (ValueError, OSError) as error:
+            raise ValueError(f"{sequence}: damaged ({error}). Delete the folder and it is made anew.") from error
+    left = (len(_SEQUENCES) - len(made)) * pairs
     workers = min(arguments.workers or cores(), len(_SEQUENCES))
     minutes = left * seconds_a_pair(shrink) / workers / 60 if left else 0.0
-    print(
-        f"{paths.shown(folder)}: {left} of {len(_SEQUENCES) * pairs} stereo pairs to make, about {minutes:.0f} min on "
-        f"{workers} idle core{'s' if workers > 1 else ''}, {left * _MB_PER_PAIR / shrink**2 / 1000:.2f} GB.",
-        flush=True,
-    )
+    cost = f"about {minutes:.0f} min on {workers} idle core{'s' if workers > 1 else ''}"
+    cost += f", {left * _MB_PER_PAIR / shrink**2 / 1000:.2f} GB"
+    print(f"{paths.shown(folder)}: {left} of {len(_SEQUENCES) * pairs} stereo pairs to make, {cost}.", flush=True)
     if not arguments.dry_run:
         start, size = time.perf_counter(), {"n_pairs": pairs, "duration_s": arguments.duration, "shrink": shrink}
         make_dataset(folder, seed=arguments.seed, workers=workers, **size)

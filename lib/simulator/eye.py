@@ -19,8 +19,7 @@ class Scene(Protocol):
 
     `height(x, y)` is the surface z.  `texture` is its reflectance (n, n, 3) uint8 over a square of side `extent_mm`
     around the origin.  `gloss` is the strength of the wet film's mirror image; 0 is a matt surface.  Optional are
-    `texture_from_surface` (2, 3), which maps (x, y, 1) to the texture, and `step_px`, the spacing of the pixels at which the
-    surface is intersected (8 by default; a rough surface needs less).
+    `texture_from_surface` (2, 3), which maps (x, y, 1) to the texture, and `step_px`, 8 or less if the surface is rough.
     """
 
     gloss: float

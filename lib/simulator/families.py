@@ -283,10 +283,6 @@ def _camera(rng: Rng, *, colours: Callable[[Rng], np.ndarray] | None = None, **r
     return drawn(rng, ranges) | ({"colours": tuple(map(tuple, colours(rng).tolist()))} if colours else {})
 
 
-def _grey(rng: Rng) -> np.ndarray:
-    return np.outer(_hue(rng, rng.choice([0.0, 0.2])), rng.dirichlet([1.0, 1.0, 1.0]))
-
-
 def _cast(rng: Rng) -> np.ndarray:
     """Colours mixed, exchanged or washed out."""
     share, order = rng.uniform(0, 0.7), rng.permutation(3) if rng.random() < 0.5 else np.arange(3)
@@ -332,7 +328,7 @@ TRAINING: dict[str, dict[str, Callable]] = {
                          banding=[0.0, 0.01]),
         "compressed": partial(_camera, resample=[1.0, (1.0, 2.5)], chroma=[1, 2, 4], quality=(12, 70)),
         "sharpened": partial(_camera, sharpening=(0.5, 4.0), sharpening_px=(0.7, 3.0), contrast=(0.9, 1.4)),
-        "grey": partial(_camera, colours=_grey),
+        "grey": partial(_camera, colours=lambda rng: np.outer(_hue(rng, rng.choice([0.0, 0.2])), rng.dirichlet([1.0] * 3))),
         "cast": partial(_camera, colours=_cast),
         "toned": partial(_camera, gamma=(0.5, 2.0, "log"), contrast=(0.35, 2.2, "log"), black=(0, 0.25)),
         "interlaced": partial(_camera, field_shift_px=(-4.0, 4.0), chroma=[1, 2], noise=(0, 0.03)),

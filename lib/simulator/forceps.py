@@ -67,8 +67,7 @@ class Forceps:
     Attributes:
         shaft_radius_mm: 0.3 is the usual 23 gauge, 0.6 mm thick.
         jaw_length_mm: From the base to the tips of the closed tool, along the shaft's axis.
-        jaw_radius_mm, tip_radius_mm, taper: Radii of a jaw at its ends, and the exponent of the power law between; 1 is a
-            cone, below 1 the jaw stays thick until close to the tip.
+        jaw_radius_mm, tip_radius_mm, taper: Radii of a jaw at its ends, and the exponent between; 1 is a cone.
         bow_mm, bend_mm, hook_mm: How far each closed jaw arches outwards in its middle, both tips bend out of the jaws'
             plane towards the retina, and the last fifth of a jaw turns inwards.
         brightness, brushed: Reflectance of the metal, and contrast of its brush marks.
@@ -146,8 +145,7 @@ class Jaw:
     """A closed jaw in the tool frame; y is the distance from the plane between the jaws, whichever jaw it is.
 
     `line` (n, 3) and `radii` (n,) mm are its round cones, from the base; `tip` is the farthest point (3,) on its centre
-    line.  With `flex` 0 it turns about the base as one piece, with 1 it bends more and more towards the tip.  `share` is
-    the part of the opening that it takes.
+    line.  With `flex` 0 it turns as one piece, with 1 it bends more and more towards the tip; `share` is of the opening.
     """
 
     line: np.ndarray

@@ -58,8 +58,7 @@ class Lighting:
 
     Attributes:
         ambient, tool: Shares of the light that reach the scene outside the spot, and the tool.
-        spot_edge: None = the spot is a Gaussian of `Microscope.spot_radius_mm`; else a disc of that radius whose border has
-            this width as a share of the radius.
+        spot_edge: Width of a disc's border as a share of `Microscope.spot_radius_mm`; None = the spot is a Gaussian of that.
         band_rad: The spot is a band in this direction rather than a disc.
         shadow, shadow_sigma_mm: Depth (0 to 1) and softness of the tool's shadow.
         source_mm: A lamp near the scene casts the shadow; None = light from far, as `Microscope.light_slope` says.
@@ -99,8 +98,11 @@ class Lighting:
             lamp, ground = np.array(self.source_mm), float(np.mean(z))
             grow = (ground - lamp[2]) / np.maximum(centres[:, 2] - lamp[2], 0.3)
             flat, columns, rows = lamp[:2] + (centres[:, :2] - lamp[:2]) * grow[:, None], x, y
-        wide = radii * grow
-        mask = _silhouette(flat, np.clip((wide[:-1] + wide[1:]) * scale, 1, 200), chains, scale)
+        wide, mask = radii * grow, np.zeros((int(2 * _HALF_MM * scale),) * 2, np.uint8)  # the tool's silhouette
+        width_px = np.clip((wide[:-1] + wide[1:]) * scale, 1, 200)
+        ends = np.clip(np.round((flat + _HALF_MM) * scale * 16), -(2**20), 2**20).astype(int).tolist()
+        for k in np.flatnonzero(chains[1:] == chains[:-1]):
+            cv2.line(mask, ends[k], ends[k + 1], 255, int(width_px[k]), cv2.LINE_AA, 4)
         small = cv2.resize(mask, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) if self.shadow_sigma_mm > 0.3 else mask
         scale *= small.shape[0] / mask.shape[0]
         near = cv2.GaussianBlur(small, (0, 0), max(self.shadow_sigma_mm * scale, 0.4))
@@ -135,15 +137,6 @@ class Lighting:
         if any(self.haze):
             linear += np.float32(self.haze)
         return visibility
-
-
-def _silhouette(flat: np.ndarray, width_px: np.ndarray, chains: np.ndarray, scale: float) -> np.ndarray:
-    """Image uint8 of a tool's shadow from its nodes' shadows (n, 2) mm, `scale` px per mm; `width_px` is of each join."""
-    mask = np.zeros((int(2 * _HALF_MM * scale),) * 2, np.uint8)
-    ends = np.clip(np.round((flat + _HALF_MM) * scale * 16), -(2**20), 2**20).astype(int).tolist()
-    for k in np.flatnonzero(chains[1:] == chains[:-1]):
-        cv2.line(mask, ends[k], ends[k + 1], 255, int(width_px[k]), cv2.LINE_AA, 4)
-    return mask
 
 
 def _inside(radius: np.ndarray, edge: float) -> np.ndarray:

@@ -48,10 +48,9 @@ class Motion:
         sweep_end, end = {"sweep": 1.0, "surgeon": 0.0, "both": 0.66}[self.kind] * self.duration_s, self.duration_s
         parts = [(0.0, sweep_end, *self._sweep(rng, side))] if sweep_end > 0 else []
         parts += [(sweep_end, end, *self._surgeon(rng, side))] if sweep_end < end else []
-        return tuple(
-            (start, PchipInterpolator(start + np.cumsum([0, *pace]) / np.sum(pace) * (stop - start), points))
-            for start, stop, points, pace in parts
-        )
+        shares = [np.cumsum([0, *pace]) / np.sum(pace) for *_, pace in parts]
+        return tuple((start, PchipInterpolator(start + share * (stop - start), points))
+                     for share, (start, stop, points, _) in zip(shares, parts, strict=True))  # fmt: skip
 
     def _sweep(self, rng: np.random.Generator, side: float) -> tuple[list[list[float]], np.ndarray]:
         """Waypoints, and how long the way from each to the next takes, of any unit."""

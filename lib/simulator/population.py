@@ -204,8 +204,7 @@ def sample(
     Args:
         crop_px: Side of a square window of the full-resolution image that holds the jaws somewhere.
         size_px: (w, h) of the whole field shrunk to this size.  Without either size the image is the full-HD field.
-        around, jitter: The landmark that a window holds, 0 base, 1 or 2 a tip, None = the jaws' centre; and how far it may
-            lie from the window's centre, as a share of the window's side.
+        around, jitter: The landmark (0, 1, 2) that a window holds, None = the jaws' centre; how far off, in window sides.
         textures: Seeds of the textures to draw from, kept in memory; None = those of the population.
         population: "training"; "validation", with kinds beside those of training; "near", the reference rig's eyes and
             forceps alone; "empty", scenes and objects without the tool; or a family of `FAR`, which training never draws.
@@ -213,10 +212,7 @@ def sample(
         photographs: Image files, each of which may be the ground of a scene.
 
     Returns: image (h, w, 3) uint8 RGB; u (3, 2) px of base, tip_1, tip_2, also if outside, NaN without the tool;
-        visibility (3,): 0 outside, 1 hidden, 2 visible.
-
-    Raises:
-        ValueError: If both sizes are given, one is too small, a name is unknown, or no family of an aspect is left.
+        visibility (3,): 0 outside, 1 hidden, 2 visible.  A ValueError refuses two sizes, small ones, and unknown names.
     """
     if crop_px is not None and size_px is not None:
         raise ValueError("crop_px, size_px: give one, a window at full resolution or the field at a reduced one.")

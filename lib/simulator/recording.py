@@ -56,12 +56,8 @@ def simulate(
 
     The frames are spread over the motion: the video keeps every k-th frame, as the times in frames.csv say.
 
-    Args:
-        name, description: Of recording.toml; None = the folder's name.
-        progress: Whether to show a bar, or a function to call after every pair.
-
-    Raises:
-        FileExistsError: If the folder exists and `overwrite` is False.
+    `name` and `description` are of recording.toml, None = the folder's name; `progress` is whether to show a bar, or a
+    function to call after every pair.  A FileExistsError if the folder exists and `overwrite` is False.
 
     >>> import tempfile
     >>> microscope = Microscope(pixels_per_mm=(4.0, 4.0), image_size_px=(80, 60))
@@ -94,9 +90,8 @@ def simulate(
     ) as writer:  # fmt: skip
         for k in tqdm(range(n_frames), desc=f"Simulating {folder.name}", unit="pair", disable=progress is not True):
             pose, noise = motion.pose(time_s[k]), np.random.default_rng([seed, 107, k])
-            views = render_pair(
-                eye, microscope, forceps=forceps, pose=pose, later=(motion.pose(time_s[k] + 1e-3), 1e-3), rng=noise
-            )
+            later = motion.pose(time_s[k] + 1e-3), 1e-3
+            views = render_pair(eye, microscope, forceps=forceps, pose=pose, later=later, rng=noise)
             writer.add(views[0].image, views[1].image, time_s[k])
             landmarks[k] = forceps.landmarks(pose)
             for side, view in enumerate(views):
@@ -119,14 +114,10 @@ def simulate(
 
 
 def _in_glint(view: View) -> np.ndarray:
-    """(3,) bool: whether saturated light lies within `_GLINT_REACH_PX` of a landmark in view.
-
-    It is a glint of the wet surface, which never covers the tool, or a highlight of the metal: two of three channels at
-    full scale, as one alone may be the colour of the light.
-    """
+    """(3,) bool: whether a glint, or a highlight of the metal, lies within `_GLINT_REACH_PX` of a landmark in view."""
     found = np.zeros(3, bool)
     for k in np.flatnonzero(view.visibility):
         column, row = (slice(max(c - _GLINT_REACH_PX, 0), c + _GLINT_REACH_PX + 1) for c in np.round(view.u[k]).astype(int))
-        clipped = np.sort(view.image[row, column], axis=2)[..., 1] >= 250  # of 255
+        clipped = np.sort(view.image[row, column], axis=2)[..., 1] >= 250  # two channels: one may be the light's colour
         found[k] = clipped.any() or view.glint_mask[row, column].any()
     return found

@@ -26,8 +26,7 @@ class View:
     """One camera's image (h, w, 3) uint8 RGB and its truth.
 
     Attributes:
-        u, visibility: Landmarks base, tip_1, tip_2 (3, 2) px as imaged, rolling shutter included, NaN without a tool; and
-            (3,) COCO: 0 outside the image, 1 hidden, 2 visible.
+        u, visibility: Landmarks (3, 2) px as imaged, NaN without a tool; (3,) COCO: 0 outside, 1 hidden, 2 visible.
         surface_mm: (h, w), the scene's z in the microscope frame, or None if not asked for.
         tool_mask, glint_mask: (h, w) uint8: how much of the pixel the sharp tool covers, and whether a glint saturates it.
     """

@@ -1,7 +1,6 @@
 """Procedural textures: a fundus with pigment, vessels, disc, macula and sclera; and patterns of many statistics.
 
-A texture is an image of reflectance, (n, n, 3) uint8 RGB with display gamma, square, centred on the eye's axis;
-row and column run along y and x of the microscope frame.
+A texture is reflectance (n, n, 3) uint8 RGB with display gamma; rows and columns run along y and x of the microscope frame.
 """
 
 from functools import lru_cache

@@ -258,10 +258,9 @@ def _finished(
     normal, tangent = raster.normal, raster.tangent
     chain = raster.part[raster.hit].astype(int) - 1
     finishes = [f for one in (tool, *(other for other, _ in tool.others)) for f in (one.finishes[0], *[one.finishes[1]] * 2)]
-    matt, mirror, shine, sharpness, brushed, colour = (
-        np.array([getattr(finish, name) for finish in finishes], np.float32)[chain]
-        for name in ("matt", "mirror", "shine", "sharpness", "brushed", "colour")
-    )
+    names = ("matt", "mirror", "shine", "sharpness", "brushed", "colour")
+    values = (np.array([getattr(finish, name) for finish in finishes], np.float32)[chain] for name in names)
+    matt, mirror, shine, sharpness, brushed, colour = values
     lamp = lamp.astype(np.float32)
     half = (lamp - [0, 0, 1]).astype(np.float32)
     half /= np.linalg.norm(half)

@@ -65,11 +65,17 @@ class Video:
         value = np.float32(self.black) + np.float32((1 - self.black) * self.contrast) * value
         np.clip(value, 0, 1, out=value)
         if rng is not None and self.noise:
-            value += self._noise(rng, value.shape)
+            noise = rng.standard_normal(value.shape, dtype=np.float32) * np.float32(1 - self.noise_grey)
+            noise += rng.standard_normal((*value.shape[:2], 1), dtype=np.float32) * np.float32(self.noise_grey)
+            if self.noise_px > 0.3:
+                noise = cv2.GaussianBlur(noise, (0, 0), self.noise_px)
+            value += noise * np.float32(self.noise / max(float(noise.std()), 1e-6))
         if rng is not None and self.banding:
             value += np.float32(self.banding) * rng.standard_normal((value.shape[0], 1, 1), dtype=np.float32)
-        if self.mosaic:
-            value = _mosaic(value)
+        if self.mosaic:  # sampled through a colour filter of 2 x 2 pixels and interpolated
+            raw = np.clip(value[..., 1], 0, 1).copy()
+            raw[::2, ::2], raw[1::2, 1::2] = value[::2, ::2, 0], value[1::2, 1::2, 2]
+            value = cv2.cvtColor(cv2.convertScaleAbs(raw, alpha=255), cv2.COLOR_BayerBG2RGB).astype(np.float32) / 255
         if self.sharpening:
             value += np.float32(self.sharpening) * (value - cv2.GaussianBlur(value, (0, 0), self.sharpening_px))
         np.clip(value, 0, 1, out=value)
@@ -93,13 +99,6 @@ class Video:
         """For an image of which every length is `factor` times as long; compression and noise stay."""
         lengths = ("defocus_px", "fringe_px", "field_shift_px")
         return replace(self, **{name: factor * getattr(self, name) for name in lengths})
-
-    def _noise(self, rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
-        coloured = rng.standard_normal(shape, dtype=np.float32) * np.float32(1 - self.noise_grey)
-        coloured += rng.standard_normal((*shape[:2], 1), dtype=np.float32) * np.float32(self.noise_grey)
-        if self.noise_px > 0.3:
-            coloured = cv2.GaussianBlur(coloured, (0, 0), self.noise_px)
-        return coloured * np.float32(self.noise / max(float(coloured.std()), 1e-6))
 
 
 def compressed(image: np.ndarray, quality: int) -> np.ndarray:
@@ -125,10 +124,3 @@ def _disc_blur(value: np.ndarray, radius: float, stretch: float) -> np.ndarray:
     kernel = np.clip(r + 0.5 - np.sqrt((x / stretch) ** 2 + (y * stretch) ** 2), 0, 1).astype(np.float32)
     small = cv2.filter2D(small, -1, kernel / kernel.sum(), borderType=cv2.BORDER_REPLICATE)
     return cv2.resize(small, (width, height), interpolation=cv2.INTER_CUBIC) if step > 1 else small
-
-
-def _mosaic(value: np.ndarray) -> np.ndarray:
-    """Sampled through a colour filter of 2 x 2 pixels and interpolated."""
-    raw = np.clip(value[..., 1], 0, 1).copy()
-    raw[::2, ::2], raw[1::2, 1::2] = value[::2, ::2, 0], value[1::2, 1::2, 2]
-    return cv2.cvtColor(cv2.convertScaleAbs(raw, alpha=255), cv2.COLOR_BayerBG2RGB).astype(np.float32) / 255

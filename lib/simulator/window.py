@@ -20,8 +20,7 @@ _Camera = AffineCamera | NearAffineCamera
 class Window:
     """The part of a camera's image that is rendered: `camera` maps the microscope frame to its pixels, which are square.
 
-    `field_px` and `origin_px` are the size (w, h) of the whole image (None = the window's), and its pixel that is the
-    window's first: vignetting and rolling shutter depend on them.
+    `field_px` is the size (w, h) of the whole image (None = the window's), and `origin_px` the window's first pixel in it.
     """
 
     camera: _Camera
