@@ -306,7 +306,7 @@ class RecordingWriter:
 
     def _check_target(self) -> None:
         if self.target.exists() and not self._overwrite:
-            raise FileExistsError(f"{self.target}: exists already; pass overwrite=True to replace it.")
+            raise FileExistsError(f"{self.target}: exists already; pass overwrite=True (--overwrite) to replace it.")
         if self.target.exists() and not (self.target / "recording.toml").is_file():
             raise FileExistsError(f"{self.target}: is not a recording and is left alone; choose another name.")
 

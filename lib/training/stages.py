@@ -189,7 +189,8 @@ def assemble(
     keys = "data images commit steps seconds processes precision machine config metrics before".split()
     by_visibility = {k: {"labels": v.labels, "median_px": v.median_px} for k, v in held_out.by_visibility().items()}
     provenance = {
-        "trained_on": "simulated frames only (lib.simulator.population); no eye or tool of a shipped recording",
+        "trained_on": "simulated frames and flat drawings only (lib.simulator.population, lib.training.drawings); "
+        "no eye or tool of a shipped recording",
         "commit": commit_id(), "machine": machine(), "notes": list(notes),
         "stages": {name: {key: training.provenance.get(key) for key in keys} for name, training in stages.items()},
         "validation_frames": len(frames), "bare_frames": len(bare), "near_frames": len(near_by),
@@ -237,6 +238,7 @@ def card(detector: Detector, path: Path) -> str:
         **{f"{k.replace('_', ' ')}, confidence above 0.5": f"{v:.1f} %" for k, v in m["detection"].items()},
         "missed, gross (above 20 px), all labels": f"{m['missed']}, {m['gross']}, {m['labels']}",
     }
+    recorded = f", and on {p['recorded_frames']} frames of {p['recordings']} recordings" if p["recordings"] else ""
     return f"""\
 # {path.name}
 
@@ -244,15 +246,14 @@ Weights of the landmark detector: base, tip_1 and tip_2 of the forceps in micros
 {path.stat().st_size / 1e6:.1f} MB, safetensors; configuration, error models and the numbers below are inside.
 Notebook 02 explains the stages.
 
-| stage | images | optimiser | steps x batch x processes | position loss, per px | hours x processes | data | commit |
+| stage | images | optimiser | steps x batch x processes | position loss, per px | process hours | data | commit |
 |---|---|---|---|---|---|---|---|
 {chr(10).join(trainings)}
 
 Each training of a stage starts from the one before. The error models (covariance, confidence) are fitted on half of
 {p["validation_frames"]} held-out scenes, which have families of tools, light, ground and optics that training never draws and
-of which some show no tool, on {p["bare_frames"]} drawn grounds without one, and on {p["recorded_frames"]} frames of
-{p["recordings"]} recordings; those of the closeups also on {p["near_frames"]} images of the reference rig. The numbers below
-are of the other half.
+of which some show no tool, on {p["bare_frames"]} drawn grounds without one{recorded}; those of the closeups also on
+{p["near_frames"]} images of the reference rig. The numbers below are of the other half.
 
 | held-out frames | |
 |---|---|
