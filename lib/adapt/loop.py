@@ -23,7 +23,7 @@ from lib.provenance import Provenance, plain
 from lib.recordings import Recording, read_image
 from lib.recordings.annotations import CLICK_SD_PX, coco_keypoints, read_coco
 from lib.training.evaluation import evaluate
-from lib.training.samples import LabelledImage
+from lib.training.samples import LabelledImage, shown_by_coco
 from lib.training.shards import generate, validation_images
 from lib.training.stages import finetune
 from lib.trust.health import spread
@@ -38,9 +38,8 @@ _MOST_FRAMES = 96
 _SIMULATED_SHARDS = 3
 #: A round that brings the frames for stopping nearer to the robot by less than this share is the last.
 _LEAST_GAIN = 0.03
-#: Most rounds of closeups, placed by the robot, before anything is trained; they end where no landmark moves by more than
-#: this share of the tool's length.  Each round adds the closeups' own constant error to where the next ones look: in
-#: validation recordings the base drifts along the shaft, away from where it is.
+#: Most rounds of closeups, placed by the robot, before anything is trained, and the share of the tool's length below which
+#: a landmark's move ends them: more would let the base drift along the shaft, as each adds the closeups' constant error.
 _GUIDED, _SETTLED = 3, 0.01
 
 
@@ -115,12 +114,13 @@ def adapt_images(
         if not set(LANDMARKS) <= set(names):
             raise ValueError(f"{labels}: image {name} has keypoints {names}; {list(LANDMARKS)} are needed.")
         xyv = values[[names.index(landmark) for landmark in LANDMARKS]]
-        u = np.where(xyv[:, 2:] > 0, xyv[:, :2], np.nan)
-        marked.append(LabelledImage(name, read_image(images / name), u, np.maximum(xyv[:, 2].astype(int), 1), CLICK_SD_PX))
+        u, shown = np.where(xyv[:, 2:] > 0, xyv[:, :2], np.nan), shown_by_coco(xyv[:, 2].astype(int))
+        marked.append(LabelledImage(name, read_image(images / name), u, shown, CLICK_SD_PX))
     n = len(marked)
     if n < 10:
         raise ValueError(f"{labels}: {n} labelled images; label at least 10.")
-    first, second = round(0.65 * n), round(0.8 * n)
+    second = min(round(0.8 * n), n - 3)
+    first = min(round(0.65 * n), second - 2)
     parts = {"learn": marked[:first], "stop": marked[first:second], "judge": marked[second:]}
     report = {"recording": images.name, "minutes": minutes, "seed": seed, "notes": [], "rounds": []}
     report["frames"] = {name: len(part) for name, part in parts.items()}
@@ -184,7 +184,7 @@ class _Work:
 
     def finished(self) -> dict:
         """The report, with where and when it was made."""
-        return plain(self.report | self.provenance.so_far())
+        return plain(self.report | self.provenance.so_far() | {"weights": getattr(self.detector, "digest", "")[:12]})
 
     def look(self, name: str, detector: Callable, frames: np.ndarray, near: np.ndarray | None = None) -> Seen:
         """`look`, or what an earlier call kept."""
@@ -273,7 +273,7 @@ class _Work:
         """The detector trained further on what the teacher says of the frames for learning."""
         path, parts = self.folder / f"round {k}.safetensors", self.parts
         if path.is_file():
-            return Detector.load(path)
+            return Detector.load(path, engine=detector.engine)
         held_out, doubt_on = self.images(parts["stop"], teacher, seen), parts["learn"][:0]
         if len(held_out) < _DOUBT_IMAGES:  # the errors of frames that were trained on say nothing of others
             doubt_on = parts["learn"][3::4]

@@ -15,7 +15,7 @@ from lib.trust.check import data_uri, overlay
 
 _NUMBERS = {
     "median_px": "median distance from the robot, px",
-    "median_sigmas": "the same in stated standard deviations (1.2 is right)",
+    "median_sigmas": "the same in stated standard deviations (0.8 is right)",
     "within_1_percent": "within 1 % of the tool's length, %",
     "within_5_percent": "within 5 %, %",
     "within_10_percent": "within 10 %, %",
@@ -72,7 +72,7 @@ def main(argv: list[str]) -> int:
     add("--seed", type=int, default=0)
     a = parser.parse_args(argv)
     if not 0 < a.minutes < 1e4:
-        parser.error("--minutes: must be positive.")
+        parser.error(f"--minutes: must lie between 0 and 10000, got {a.minutes:g}.")
     out = a.out or paths.RUNS / f"adapt-{a.recording.resolve().name}"
     how = {"minutes": a.minutes, "seed": a.seed, "folder": out}
     recording = None

@@ -114,7 +114,7 @@ def stretches(frames: np.ndarray, time_s: np.ndarray) -> dict[str, np.ndarray]:
     [(0, 24), (26, 31), (33, 39)]
     """
     n = len(frames)
-    if n < 12:
+    if n < 17:  # fewer leave less than three to judge by
         raise RefusalError(f"recording: {n} frames are too few to learn from and to judge by; record 30 and more.")
     first, second = round(0.64 * n), round(0.79 * n)
     parts = {"learn": frames[: first - 1], "stop": frames[first:second], "judge": frames[second + 1 :]}
@@ -385,7 +385,7 @@ def _contradicted(teacher: Teacher, seen: Seen) -> np.ndarray:
     sd = np.sqrt(np.trace(covariance, axis1=-2, axis2=-1) / 2) + teacher.calibration.reprojection_rms_px
     size = np.linalg.norm(off, axis=-1)
     wrong = (size > 0.06 * length) & (size > 6 * sd)  # (m, 2, 3)
-    pairs = [(0, 1), (0, 2), (1, 2)]
-    alike = [np.linalg.norm(off[:, :, i] - off[:, :, j], axis=-1) < 0.3 * size[:, :, i] for i, j in pairs]
-    both = np.stack([wrong[:, :, i] & wrong[:, :, j] & same for (i, j), same in zip(pairs, alike, strict=True)], axis=-1)
+    i, j = np.triu_indices(3, 1)  # pairs of landmarks
+    alike = np.linalg.norm(off[:, :, i] - off[:, :, j], axis=-1) < 0.3 * size[:, :, i]
+    both = wrong[:, :, i] & wrong[:, :, j] & alike
     return seen.frame[both.all(axis=1).any(axis=1)]

@@ -117,8 +117,7 @@ class Detector:
         error_models: One for each stage: ``"frame"``, ``"tool"`` and ``"again"`` for the two looks at the tool, ``"window"``,
             ``"closeup"`` and ``"closer"`` for two closeups, the second where the first saw the landmark, and ``"tracking"``
             for the closeups that follow a landmark from frame to frame.
-        mirror: The second look at the tool, and the windows' network, also see the mirror image, and the mean counts: where
-            the two disagree its peak is low.
+        mirror: The second look at the tool also sees the mirror image, and the mean counts: low where the two disagree.
         engine: What runs the networks, one of `lib.landmarks.engines.ENGINES`; the weights are the same.
 
         >>> found = Detector.load(engine="torch")(np.zeros((1, 270, 480, 3), np.uint8))
@@ -144,8 +143,6 @@ class Detector:
             raise ValueError(f"frame_px: must be at least 16 px, got {self.frame_px}.")
         if self.closeup_network and not (self.window_network or self.tool_network):
             raise ValueError("closeup_network: looks at what a tool_network or a window_network has found; give one.")
-        if self.mirror and self.window_network and self.window_px % self.window_network.stride:
-            raise ValueError(f"mirror: needs window_px to be a multiple of the stride, got {self.window_px}.")
         run = cache(accelerated)  # stages may share a network
         for stage in self.stages:
             self._run[stage] = run(self.network_of(stage), self.engine, mirror=self.mirrors(stage))
@@ -156,7 +153,7 @@ class Detector:
 
     def mirrors(self, stage: str) -> bool:
         """Whether a stage also sees the mirror image."""
-        return self.mirror and stage in ("again", "window")
+        return self.mirror and stage == "again"
 
     @property
     def networks(self) -> dict[str, Network]:
@@ -174,8 +171,6 @@ class Detector:
     def with_error_models(self, **models: ErrorModel) -> Self:
         """A copy with the error models of some stages (``frame=``, ``window=``, ...) replaced."""
         return replace(self, error_models={**self.error_models, **models})
-
-    # Files
 
     @classmethod
     def load(cls, path_or_name: str | Path | None = None, *, engine: str | None = None) -> Self:
@@ -241,8 +236,6 @@ class Detector:
                 f"{path}: no error model for {', '.join(lacking)}, so covariance and confidence would mean nothing; "
                 "fit them with `lib.training.error_models.fit_error_models` or `python3 -m lib train assemble`."
             )
-
-    # Detection
 
     def __call__(self, images: ArrayLike, *, batch: int = 4) -> Landmarks:
         """Landmarks of images (n, h, w, 3), uint8 RGB or float in [0, 1]; `batch` images at a time.
@@ -362,8 +355,6 @@ class Detector:
         """
         peaks, matrices, which = seen or self.stage_peaks(images, rough.u, stage)
         result = Landmarks(rough.u.copy(), rough.covariance.copy(), rough.confidence.copy())
-        if not len(which):
-            return result if stage == "tool" else result.without_unsure()
         fine = self._measured(peaks, self.rough_in_windows(rough, matrices, which, stage), stage, which[:, 1:])
         u, back = _through_inverse(matrices, fine.u[:, 0]), np.linalg.inv(matrices[:, :, :2])
         covariance = back @ fine.covariance[:, 0] @ back.mT
@@ -492,9 +483,7 @@ def detect(
         frame = recording.frames[int(i)]
         pair = np.stack([frame.left, frame.right])
         found.append(detector.track(pair, found[-1]) if track and found else detector(pair))
-    u, covariance, confidence = (
-        np.stack([getattr(pair, name) for pair in found], axis=1) for name in ("u", "covariance", "confidence")
-    )
-    return of_recording(
-        recording, *u, covariance_px2=np.moveaxis(covariance, 0, 2), confidence=np.moveaxis(confidence, 0, 2), frames=chosen
-    )
+    every, n = Landmarks.join(found), len(chosen)
+    known = {"covariance_px2": every.covariance.reshape(n, 2, 3, 2, 2), "confidence": every.confidence.reshape(n, 2, 3)}
+    known = {name: part.swapaxes(1, 2) for name, part in known.items()}
+    return of_recording(recording, every.u[::2], every.u[1::2], frames=chosen, **known)

@@ -1,7 +1,5 @@
 """Where else the tool may lie: the first stage's highest peaks, at several scales, put together to tools."""
 
-from itertools import product
-
 import numpy as np
 import torch
 
@@ -34,7 +32,7 @@ def best_tools(u: np.ndarray, height: np.ndarray, n: int) -> np.ndarray:
     >>> best_tools(u, np.array([[1.0, 1.0, 0.8], [0.2, 0.7, 0.5]]), 1)
     array([[0, 0, 1]])
     """
-    which = np.array(list(product(range(len(u)), repeat=3)))
+    which = np.indices((len(u),) * 3).reshape(3, -1).T
     tools, score = u[which, np.arange(3)], np.log(np.clip(height[which, np.arange(3)], 0.02, 1)).sum(1)
     base, one, two = (tools[:, k] for k in range(3))
     jaws = np.stack([np.linalg.norm(one - base, axis=1), np.linalg.norm(two - base, axis=1)]) + 1.0

@@ -13,6 +13,7 @@ import numpy as np
 
 from lib.cameras import AffineCamera
 from lib.geometry import RigidTransform
+from lib.recordings.annotations import inside
 from lib.simulator.eye import Eye, Ground
 from lib.simulator.families import ASPECTS, FAR, SHIFTED, TRAINING, beside, draw, drawn, random_object
 from lib.simulator.forceps import Forceps, Instrument, Pose
@@ -20,7 +21,7 @@ from lib.simulator.render import render_view
 from lib.simulator.rig import IMAGE_SIZE_PX, Microscope
 from lib.simulator.texture import Rng
 from lib.simulator.video import Video, compressed
-from lib.simulator.window import Window, in_image
+from lib.simulator.window import Window
 
 #: Families from which the far rung draws what is not far.
 _ORDINARY = {"light": ("coaxial", "oblique", "near_lamp", "glare"), "optics": ("clean", "grey", "cast")}
@@ -277,4 +278,4 @@ def _distorted(image: np.ndarray, u: np.ndarray, visibility: np.ndarray, strengt
     for _ in range(30):
         after = before / grow((after**2).sum(axis=1, keepdims=True))
     u = after + centre
-    return image, u, np.where(in_image(u, size), visibility, 0)
+    return image, u, np.where(inside(u, size), visibility, 0)

@@ -10,12 +10,13 @@ import cv2
 import numpy as np
 
 from lib.geometry import RigidTransform
+from lib.recordings.annotations import inside
 from lib.simulator.eye import Scene
 from lib.simulator.forceps import Forceps, Pose
 from lib.simulator.rig import Microscope
 from lib.simulator.texture import GAMMA, smooth_noise
 from lib.simulator.tool import compose, tool_in_view
-from lib.simulator.window import Grid, Window, blur_by_depth, in_image, intersect
+from lib.simulator.window import Grid, Window, blur_by_depth, intersect
 
 _LINEAR = (np.arange(256, dtype=np.float32) / 255) ** GAMMA
 _BUMP_MM, _BUMP_PX = 10.0, 1024
@@ -156,7 +157,7 @@ def render_pair(
     """
     rig, size = microscope.rig(RigidTransform.identity()), microscope.image_size_px
     if forceps is not None and pose is not None:
-        if not any(in_image(u, size).any() for u in rig.project(forceps.landmarks(pose))):
+        if not any(inside(u, size).any() for u in rig.project(forceps.landmarks(pose))):
             base = f"its base is at {np.round(pose.base_mm, 2).tolist()} mm"
             raise ValueError(f"pose: the tool is outside the field; {base}, move it towards the microscope frame's origin.")
     options |= {"forceps": forceps, "pose": pose, "factor": factor}

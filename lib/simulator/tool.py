@@ -9,9 +9,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from lib.recordings.annotations import inside
 from lib.simulator.forceps import MAX_TIP_RADIUS_MM, Forceps, Instrument, Nodes, Pose
 from lib.simulator.rig import Microscope
-from lib.simulator.window import Window, blur_by_depth, in_image, motion_blur
+from lib.simulator.window import Window, blur_by_depth, motion_blur
 
 
 @dataclass(frozen=True)
@@ -138,7 +139,7 @@ def tool_in_view(
     landmarks, nodes = seen[:3], (seen[3:], radii * shrink[3:], chains)
     raster = rasterise(*nodes, zoom=window.zoom, size_px=window.size_px, factor=factor)
     u = landmarks[:, :2] * window.zoom
-    visibility = np.where(in_image(u, window.size_px), 2, 0)
+    visibility = np.where(inside(u, window.size_px), 2, 0)
     # A blunt jaw's tip lies inside its outline as soon as the jaw is not parallel to the image.
     pointed = forceps.tip_radius_mm <= MAX_TIP_RADIUS_MM
     for k in np.flatnonzero(visibility) if raster else ():

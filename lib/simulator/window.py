@@ -135,11 +135,6 @@ def surface_grid(
     return x_px, y_px, np.stack(intersect(scene, Window(camera, size_px), tuple(np.meshgrid(x_px, y_px))), axis=-1)
 
 
-def in_image(u: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
-    """Which of the points (n, 2) px lie on the pixels of an image of this size (w, h); NaN does not."""
-    return ((u > -0.5) & (u < np.array(size_px) - 0.5)).all(axis=1)
-
-
 def blur(image: np.ndarray, sigma_px: float) -> np.ndarray:
     """Gaussian blur; a width too small to see leaves the image as it is."""
     return cv2.GaussianBlur(image, (0, 0), sigma_px) if sigma_px > 0.15 else image

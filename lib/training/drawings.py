@@ -10,7 +10,7 @@ import itertools
 import cv2
 import numpy as np
 
-from lib.simulator.window import in_image
+from lib.recordings.annotations import inside
 
 #: Centre line (n, 2) px and radius (n,) px.
 Part = tuple[np.ndarray, np.ndarray]
@@ -97,7 +97,7 @@ def drawn_tool(
     if rng.random() < 0.6:
         x = _shadowed(x, parts, length, rng)
     x = _painted(x, parts, length, rng)
-    return np.clip(x, 0, 255).astype(np.uint8), u, np.where(in_image(u, (w, h)), 2, 0)
+    return np.clip(x, 0, 255).astype(np.uint8), u, np.where(inside(u, (w, h)), 2, 0)
 
 
 def _jaw_shape(rng: np.random.Generator) -> dict[str, float]:

@@ -43,10 +43,18 @@ def labelled_images(recording: Recording, *, every: int = 1) -> Iterator[Labelle
         frame = recording.frames[i]
         for side, image in (("left", frame.left), ("right", frame.right)):
             u, visibility = getattr(labels, f"u_{side}")[i], getattr(labels, f"visibility_{side}")[i]
-            if recording.truth is None:  # COCO's 0 is "not labelled"; -1 says that the landmark is absent, which is 0 here
-                u = np.where(visibility[:, None] > 0, u, np.nan)
-                visibility = np.where(visibility < 0, 0, np.maximum(visibility, 1))
+            if recording.truth is None:
+                u, visibility = np.where(visibility[:, None] > 0, u, np.nan), shown_by_coco(visibility)
             yield LabelledImage(f"{side} {i}", image, u, visibility, 0.0 if recording.truth else CLICK_SD_PX)
+
+
+def shown_by_coco(visibility: np.ndarray) -> np.ndarray:
+    """Visibility of a `LabelledImage` from that of annotations: 0 there is "not labelled", and -1 is absent, which is 0 here.
+
+    >>> shown_by_coco(np.array([-1, 0, 1, 2])).tolist()
+    [0, 1, 1, 2]
+    """
+    return np.where(visibility < 0, 0, np.maximum(visibility, 1))
 
 
 class Source:

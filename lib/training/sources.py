@@ -10,7 +10,8 @@ import numpy as np
 
 from lib.landmarks import windows
 from lib.landmarks.metrics import tool_length_px
-from lib.simulator.window import in_image, motion_blur
+from lib.recordings.annotations import inside
+from lib.simulator.window import motion_blur
 from lib.training import shards
 from lib.training.appearance import disguised
 from lib.training.bending import bent
@@ -189,8 +190,8 @@ class ToolSource(SceneSource):
         image, at, visibility = self._seen(scene, centre, angle, _TOOL_SIZE, zoom, rng)
         if wrong.any():
             return image, np.full((3, 2), -float(windows.TOOL_PX)), np.zeros(3, int)
-        inside = in_image(at, _TOOL_SIZE) & (visibility > 0)
-        return image, np.where(inside[:, None], np.nan, at), visibility  # another scale or direction is no example
+        seen = inside(at, _TOOL_SIZE) & (visibility > 0)
+        return image, np.where(seen[:, None], np.nan, at), visibility  # another scale or direction is no example
 
 
 def _mirrored(image, u, visibility, rng: np.random.Generator | None):
@@ -248,12 +249,12 @@ class CloseupSource(Source):
         """From labelled images of any size; for validation `still`, neither stretched nor blurred nor disguised."""
         usable = [np.isfinite(one.in_view).all(1) & (one.visibility == 2) & np.isfinite(windows.tool_pose(one.u[None])[1])
                   for one in images]  # fmt: skip
-        which = [(i, k) for i, landmarks in enumerate(usable) for k in np.flatnonzero(landmarks)]
-        if not which:
+        which = np.argwhere(usable)
+        if not len(which):
             raise ValueError("images: no visible landmark of a tool with base and tip; label some.")
         crops = (shards.square_round(images[i].image, images[i].u, k, shards.CLOSEUP_CROP_PX) for i, k in which)
         parts = ((*crop, images[i].visibility, k) for crop, (i, k) in zip(crops, which, strict=True))
-        weight = None if weight is None else np.array([weight[i, k] for i, k in which])
+        weight = None if weight is None else weight[tuple(which.T)]
         source = cls(*map(np.array, zip(*parts, strict=True)), weight=weight)
         return source if not still else replace(source, stretch=0.0, shear=0.0, motion_px=0.0, disguise=0.0)
 

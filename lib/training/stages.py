@@ -66,6 +66,8 @@ def stage_data(stage: str, folder: str | Path) -> tuple[Source, Samples]:
 def _still(stage: str, images: Iterable[LabelledImage]) -> Samples:
     """What a stage sees of held-out images; of those with a tool in view, since the others have nothing to measure."""
     shown = [one for one in images if (np.isfinite(one.u).all(1) & (one.visibility == 2)).any()]
+    if not shown:
+        raise ValueError(f"{stage}: no held-out image shows a landmark; label some, or `python3 -m lib train generate`.")
     return Samples.drawn(_SOURCES[stage].of(shown, still=True))
 
 
@@ -139,7 +141,8 @@ def finetune(
         except BaseException:
             stopped.set()
             raise
-    tuned = replace(detector, **networks)
+    then = {"finetuned": {"images": len(images), "held_out": len(held_out), "commit": commit_id()}}
+    tuned = replace(detector, **networks, metadata=detector.metadata | then)
     tuned = fit_error_models(tuned, [*held_out, *doubt_on], anew=False, progress=progress is True)
     old = {stage: detector.error_models[stage] for stage in CLOSE if stage in detector.error_models}
     if detector.closeup_network is None or not old:

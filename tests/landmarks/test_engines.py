@@ -67,11 +67,10 @@ def test_the_mean_with_the_mirror_image_does_not_know_left_from_right(engine):
     assert torch.allclose(turned, seen.flip(-2)[:, [0, 2, 1]], **close)
     assert not torch.allclose(seen, single, **close)
     windows = np.random.default_rng(0).integers(0, 256, (3, 64, 64, 3), dtype=np.uint8)
-    plain = Detector(network, window_network=network, window_px=64, engine=engine)
+    plain = Detector(network, tool_network=network, engine=engine)
     both = replace(plain, mirror=True)
-    assert not torch.allclose(both.outputs(windows, "window"), plain.outputs(windows, "window"), **close)
-    with pytest.raises(ValueError, match="mirror: needs window_px"):
-        Detector(network, window_network=network, window_px=126, mirror=True)
+    assert not torch.allclose(both.outputs(windows, "again"), plain.outputs(windows, "again"), **close)
+    assert torch.equal(both.outputs(windows, "tool"), plain.outputs(windows, "tool"))
 
 
 @needs_openvino
