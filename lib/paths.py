@@ -14,7 +14,7 @@ RUNS = ROOT / "runs"
 SHIPPED_RECORDING = DATA / "open_sky_eye"
 
 REAL_DATA_VARIABLE = "MICROSTEREO_DATA"
-#: Names the folder in which the notebooks of one run share what each would else work out again.
+#: Names the folder in which notebooks of one run, or commands, share what each would else work out again.
 SHARED_VARIABLE = "MICROSTEREO_SHARED"
 
 

@@ -4,9 +4,9 @@ A stage takes its own input, RGB in [0, 1] of shape (n, 3, h, w), and gives what
 covariance (n, 3, 2, 2) px^2 and confidence (n, 3).  The first stage gives them in pixels of the frame before it was
 resized.  The others but ``tracking`` also take ``rough_u`` (n, 3, 2), the landmarks that the stage before found, in pixels
 of their input, and ``rough_confidence`` (n, 3).  ``again`` is the second look of ``tool``.  The stages ``window``,
-``closeup`` and ``tracking`` see a window of one landmark, and the caller takes that landmark's row.  ``closeup`` corrects
-confident landmarks, unless it is unsure itself; ``tracking`` corrects the landmarks of the frame before.  Stages that share
-a network differ in their error models.
+``closeup``, ``closer`` and ``tracking`` see a window of one landmark, and the caller takes that landmark's row.  ``closeup``
+corrects the landmarks of the stage before, unless it is unsure, ``closer`` those of ``closeup``, and ``tracking`` those of
+the frame before.  Stages that share a network differ in their error models.
 """
 
 import importlib.util

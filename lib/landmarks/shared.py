@@ -1,4 +1,4 @@
-"""Detections that the notebooks of one run share, so that no stereo pair is looked at twice."""
+"""Detections that notebooks of one run, or commands, share, so that no stereo pair is looked at twice."""
 
 import hashlib
 import os
@@ -14,11 +14,11 @@ from lib.landmarks.detector import Detector, Landmarks
 
 
 class SharedDetector:
-    """A detector for `detect` and `assess` that reads what another notebook of the same run has found in the same images.
+    """A detector for `detect` and `assess` that reads what was found in the same images before.
 
-    `python3 -m lib run` makes a folder for its notebooks, names it in the environment and removes it at its end; anywhere
-    else this is the detector itself.  A file's name is the digest of the images' pixels, the weights, the settings and the
-    engine.  Where a time is measured, call the detector itself.
+    `python3 -m lib` names a folder for that in the environment: `run` one of its own, which it removes at its end, other
+    commands one in data/cache.  Anywhere else this is the detector itself.  A file's name is the digest of the images'
+    pixels, the weights, the settings and the engine.  Where a time is measured, call the detector itself.
 
     Attributes:
         seconds: What detecting took: here, and where it was read, there.
@@ -32,8 +32,8 @@ class SharedDetector:
     def __init__(self, detector: Detector | Callable[[np.ndarray], Landmarks] | None = None):
         self.detector = detector or Detector.load()
         self.seconds, self.pairs, self.read = 0.0, 0, 0
-        self._folder = os.environ.get(paths.SHARED_VARIABLE)
-        self._digest = self.detector.digest if self._folder else ""
+        self._digest = getattr(self.detector, "digest", "")
+        self._folder = os.environ.get(paths.SHARED_VARIABLE) if self._digest else None
 
     def __call__(self, images: np.ndarray) -> Landmarks:
         """Landmarks of a stereo pair (2, h, w, 3), uint8 RGB."""
@@ -59,4 +59,4 @@ class SharedDetector:
         if not self.read:
             return f"Detected in {self.pairs} stereo pairs, {self.seconds:.1f} s."
         seconds = f"finding them took {self.seconds:.1f} s"
-        return f"Detections in {self.read} of {self.pairs} stereo pairs were read from this run's cache; {seconds}."
+        return f"Detections in {self.read} of {self.pairs} stereo pairs were read from the cache; {seconds}."

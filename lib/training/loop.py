@@ -290,10 +290,9 @@ def train(
     if initial is not None and initial.network.config != config.network:
         raise ValueError(f"initial: is a network {initial.network.config}, not {config.network} as the configuration asks.")
     run = Run(config, initial.network if initial is not None else None)
-    provenance: dict[str, object] = {
-        "data": source.fingerprint, "images": len(source), "torch": torch.__version__, "commit": commit_id(),
-        "machine": machine(), "processes": run.world, "precision": "bf16" if run.mixed else "fp32",
-    }  # fmt: skip
+    provenance: dict[str, object] = {"data": source.fingerprint, "images": len(source), "torch": torch.__version__}
+    precision = {"precision": "bf16" if run.mixed else "fp32"}
+    provenance |= {"commit": commit_id(), "machine": machine(), "processes": run.world} | precision
     if initial is not None:
         provenance |= {"before": initial.provenance, "initial": checksum(initial.network.state_dict(), {})[:16]}
     last = Path(folder) / "last.safetensors" if folder is not None else None

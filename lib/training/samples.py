@@ -31,7 +31,7 @@ class LabelledImage(NamedTuple):
 
 
 def labelled_images(recording: Recording, *, every: int = 1) -> Iterator[LabelledImage]:
-    """Left and right images of every `every`-th frame with their labels: the exact truth if simulated, else annotations.
+    """Left and right images of every `every`-th frame with labels: the truth of a simulated one, else annotated images alone.
 
     Raises:
         ValueError: If the recording has neither.
@@ -40,12 +40,13 @@ def labelled_images(recording: Recording, *, every: int = 1) -> Iterator[Labelle
     if labels is None:
         raise ValueError(f"{recording.name}: it has neither truth/ nor annotations.json; give a labelled recording.")
     for i in range(0, len(recording.frames), every):
-        frame = recording.frames[i]
-        for side, image in (("left", frame.left), ("right", frame.right)):
-            u, visibility = getattr(labels, f"u_{side}")[i], getattr(labels, f"visibility_{side}")[i]
+        marks = {s: (getattr(labels, f"u_{s}")[i], getattr(labels, f"visibility_{s}")[i]) for s in ("left", "right")}
+        marked = {side: mark for side, mark in marks.items() if recording.truth or mark[1].any()}
+        frame = recording.frames[i] if marked else None
+        for side, (u, visibility) in marked.items():
             if recording.truth is None:
                 u, visibility = np.where(visibility[:, None] > 0, u, np.nan), shown_by_coco(visibility)
-            yield LabelledImage(f"{side} {i}", image, u, visibility, 0.0 if recording.truth else CLICK_SD_PX)
+            yield LabelledImage(f"{side} {i}", getattr(frame, side), u, visibility, 0.0 if recording.truth else CLICK_SD_PX)
 
 
 def shown_by_coco(visibility: np.ndarray) -> np.ndarray:

@@ -36,7 +36,7 @@ def test_a_second_notebook_reads_what_the_first_has_found(shared):
     for name, value in vars(found).items():
         np.testing.assert_array_equal(getattr(read, name), value)
     assert second.seconds == first.seconds > 0
-    assert "in 1 of 1 stereo pairs were read from this run's cache" in str(second) and "read" not in str(first)
+    assert "in 1 of 1 stereo pairs were read from the cache" in str(second) and "read" not in str(first)
 
 
 @pytest.mark.parametrize("change", ["pixel", "mirrored", "shape", "detector"])
