@@ -13,6 +13,6 @@ def test_outliers_ruin_least_squares_and_not_the_robust_estimates(run_study):
 
 
 def test_distances_of_the_recording_that_ships(run_study):
-    found, _ = run_study("tip_distance", frames=14, surface_every=6)
-    assert found["tips_distances"] == 4 and found["tips_rms_um"] < 100 and found["tips_covered_percent"] > 80
+    found, _ = run_study("tip_distance", frames=20, surface_every=6)
+    assert found["tips_distances"] == 12 and found["tips_rms_um"] < 100 and found["tips_covered_percent"] > 80
     assert run_study("tip_distance", recording="nowhere")[0] == {}
