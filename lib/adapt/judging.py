@@ -54,7 +54,7 @@ def agreement(teacher: Teacher, seen: Seen) -> Agreement:
     S = np.where(np.isfinite(S), S, np.eye(2))
     sigmas = np.sqrt((off[..., None, :] @ np.linalg.inv(S) @ off[..., None])[..., 0, 0] / 2)
     distance = np.nan_to_num(np.linalg.norm(off, axis=-1), nan=np.inf)
-    length = tool_length_px(u.reshape(-1, 3, 2)).reshape(*u.shape[:2], 1)
+    length = tool_length_px(u)[..., None]
     return Agreement(*(np.where(there, part, np.nan) for part in (distance, sigmas)), length)
 
 

@@ -122,8 +122,8 @@ def adapt_images(
     second = min(round(0.8 * n), n - 3)
     first = min(round(0.65 * n), second - 2)
     parts = {"learn": marked[:first], "stop": marked[first:second], "judge": marked[second:]}
-    report = {"recording": images.name, "minutes": minutes, "seed": seed, "notes": [], "rounds": []}
-    report["frames"] = {name: len(part) for name, part in parts.items()}
+    report = {"recording": images.name, "weights": getattr(detector, "digest", "")[:12], "minutes": minutes, "seed": seed}
+    report |= {"notes": [], "rounds": [], "frames": {name: len(part) for name, part in parts.items()}}
     key = [str(images.resolve()), Path(labels).read_bytes(), getattr(detector, "digest", ""), seed, minutes, STEPS, RECIPE]
     provenance = Provenance(f"python3 -m lib adapt {images.name} --labels {Path(labels).name}")
     simulated = simulated_like([one.image for one in parts["learn"]], seed, progress)
@@ -141,7 +141,7 @@ def adapt_images(
         "reason": "the images for judging agree better with their labels" if improved else
         "on the images for judging the gain is no larger than chance allows",
     }  # fmt: skip
-    return Adaptation(tuned if improved else detector, None, plain(report | provenance.so_far()), improved, {})
+    return Adaptation(tuned if improved else detector, None, plain(provenance.so_far() | report), improved, {})
 
 
 class _Work:
@@ -165,13 +165,15 @@ class _Work:
         self.learns = isinstance(self.detector, Detector)  # a stand-in has no networks
         key = [str(recording.folder.resolve()), recording.kinematics.x_mm.tobytes(), self.frames.tobytes(), seed, STEPS]
         key += [RECIPE, recording.offset_s, recording.readout_s, recording.frames.time_s.tobytes(), minutes]
-        key += [getattr(self.detector, "digest", ""), Path(labels).read_bytes() if labels is not None else b""]
+        digest = getattr(self.detector, "digest", "")  # of the detector that learns
+        key += [digest, Path(labels).read_bytes() if labels is not None else b""]
         self.folder = _work_folder(folder, recording.name, key)
         self.folder.mkdir(parents=True, exist_ok=True)
         state = self.folder / "state.json"
         spent_s = json.loads(state.read_text(encoding="utf-8"))["seconds"] if state.is_file() else 0.0
         self.began, self.provenance = time.perf_counter() - spent_s, Provenance("python3 -m lib adapt")
-        self.report: dict = {"recording": recording.name, "minutes": minutes, "seed": seed, "notes": [], "rounds": []}
+        self.report: dict = {"recording": recording.name, "weights": digest[:12], "minutes": minutes, "seed": seed}
+        self.report |= {"notes": [], "rounds": []}
 
     @property
     def left_s(self) -> float:
@@ -184,7 +186,7 @@ class _Work:
 
     def finished(self) -> dict:
         """The report, with where and when it was made."""
-        return plain(self.report | self.provenance.so_far() | {"weights": getattr(self.detector, "digest", "")[:12]})
+        return plain(self.provenance.so_far() | self.report)
 
     def look(self, name: str, detector: Callable, frames: np.ndarray, near: np.ndarray | None = None) -> Seen:
         """`look`, or what an earlier call kept."""
@@ -241,7 +243,7 @@ class _Work:
                     raise
                 break  # closeups that do not know the tool correct nothing; labels set by hand do
             u, last = teacher.labels(learn)[0], u
-            moved = np.linalg.norm(u - last, axis=-1) / tool_length_px(u.reshape(-1, 3, 2)).reshape(*u.shape[:2], 1)
+            moved = np.linalg.norm(u - last, axis=-1) / tool_length_px(u)[..., None]
             if np.nanmax(np.nanmedian(moved, axis=(0, 1))) < _SETTLED:
                 break
         self.report["refused_frames"] = teacher.refused

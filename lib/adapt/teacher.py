@@ -207,7 +207,7 @@ class Teacher:
         shown = np.where(inside(u, self.recording.image_size_px) | np.isnan(u[..., 0]), 2, 0)
         if seen is not None:
             part = seen.of(frames)
-            length = tool_length_px(u.reshape(-1, 3, 2)).reshape(u.shape[:2])[..., None]
+            length = tool_length_px(u)[..., None]
             right = (np.linalg.norm(part.u - u, axis=-1) < 0.05 * length) & (part.confidence >= MIN_CONFIDENCE)
             shown = np.where(~right & (right.sum(axis=2, keepdims=True) == 2) & (shown == 2), 1, shown)
         return u, covariance, shown
@@ -315,7 +315,7 @@ def _fitted(recording: Recording, seen: Seen, least: float, ransac_px: float | N
 def _calibrated(recording: Recording, seen: Seen, from_labels: bool) -> tuple[Calibration, float]:
     """Cameras that the detections agree on, the confident ones if all do not, and the share of landmarks that agree."""
     told = 6 * int(np.isfinite(recording.landmarks_mm()[seen.frame]).all(axis=(1, 2)).sum())
-    length, reason, best, poor, competing = tool_length_px(seen.u.reshape(-1, 3, 2)), "none was found", None, None, False
+    length, reason, best, poor, competing = tool_length_px(seen.u), "none was found", None, None, False
     near_px = _NEAR * float(np.quantile(length[np.isfinite(length)], 0.25)) if np.isfinite(length).any() else 0.0
     # Offsets of an unknown tool widen the errors of the right ones, until the wrong ones do not stand apart.
     ways = [(0.0, None)] if from_labels else [*((least, None) for least in _CONFIDENCES), (MIN_CONFIDENCE, near_px)]
@@ -350,7 +350,7 @@ def _fault(recording: Recording, seen: Seen, calibration: Calibration, from_labe
     red = [r for r in judge(None, calibration).reasons if r.level == LEVELS[2] and r.name in ("implausible_optics", "thin")]
     if red:
         raise RefusalError(f"cameras: {red[0].text} {red[0].cure}")
-    length = np.nanmedian(tool_length_px(seen.u.reshape(-1, 3, 2)))
+    length = np.nanmedian(tool_length_px(seen.u))
     if from_labels or calibration.reprojection_rms_px < _HARMLESS * length:
         return None
     rows = seen.rows(recording)
@@ -381,7 +381,7 @@ def _contradicted(teacher: Teacher, seen: Seen) -> np.ndarray:
         teacher = replace(teacher, offset_mm=free.offset, turns=free.turns)
     u, covariance = teacher.project(seen.frame)
     off = np.where((seen.confidence >= 0.5)[..., None], seen.u - u, np.nan)
-    length = tool_length_px(u.reshape(-1, 3, 2)).reshape(u.shape[:2])[..., None]
+    length = tool_length_px(u)[..., None]
     sd = np.sqrt(np.trace(covariance, axis1=-2, axis2=-1) / 2) + teacher.calibration.reprojection_rms_px
     size = np.linalg.norm(off, axis=-1)
     wrong = (size > 0.06 * length) & (size > 6 * sd)  # (m, 2, 3)

@@ -168,10 +168,6 @@ class Detector:
         names = ("frame", "tool", "again", "window", "closeup", "closer", "tracking")
         return [name for name in names if _NETWORK_OF.get(name, name) in there]
 
-    def with_error_models(self, **models: ErrorModel) -> Self:
-        """A copy with the error models of some stages (``frame=``, ``window=``, ...) replaced."""
-        return replace(self, error_models={**self.error_models, **models})
-
     @classmethod
     def load(cls, path_or_name: str | Path | None = None, *, engine: str | None = None) -> Self:
         """A detector from a weights file, or from a name in ``data/models``; None is the one that ships.

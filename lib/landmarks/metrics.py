@@ -27,14 +27,14 @@ def errors_px(u: ArrayLike, u_true: ArrayLike) -> np.ndarray:
 
 
 def tool_length_px(u_true: ArrayLike) -> np.ndarray:
-    """Mean distance (n,) of the labelled tips from the base, the PCK's unit; NaN without a base or without a tip.
+    """Mean distance (...) of labelled tips (..., 3, 2) from the base, the PCK's unit; NaN without a base or without a tip.
 
     The paper normalises by "the distance of the tool-tip from its base" and leaves open which tip.
     """
     u_true = np.asarray(u_true, dtype=np.float64)
-    distance = np.linalg.norm(u_true[:, 1:] - u_true[:, :1], axis=2)
+    distance = np.linalg.norm(u_true[..., 1:, :] - u_true[..., :1, :], axis=-1)
     known = np.isfinite(distance)
-    return np.where(known.any(1), np.where(known, distance, 0).sum(1) / np.maximum(known.sum(1), 1), np.nan)
+    return np.where(known.any(-1), np.where(known, distance, 0).sum(-1) / np.maximum(known.sum(-1), 1), np.nan)
 
 
 def pck(u: ArrayLike, u_true: ArrayLike, threshold: ArrayLike = PCK_THRESHOLDS, *, length_px: ArrayLike | None = None):

@@ -40,7 +40,7 @@ def match(
         depth_range_mm: (near, far): the values of d.x to search, where d is the left camera's `viewing_direction` and x a
             point in the rig's frame, whose origin and sign they have.  None = found by a coarse pass.  Only used with a rig.
         setting: "quality" searches at full resolution (up to 3 Mpx), "fast" at up to 0.4 Mpx.  Not for "deepmatching".
-        min_score: Matches with a lower one are dropped.  None is 0.5 for "band", below which lie half of the wrong, or 0.
+        min_score: Matches with a lower score are dropped.  None is 0.5 for "band" (half of the wrong ones lie below), else 0.
         downscale: DeepMatching only: pools descriptors by 2^downscale; None is the smallest from 1 that fits the budget.
         budget_bytes: Memory that DeepMatching may take; a search predicted to need more is refused.
         max_epipolar_px: A rig whose epipolar lines lie farther than this from free coarse matches is refused.  With

@@ -145,7 +145,7 @@ class Jaw:
     """A closed jaw in the tool frame; y is the distance from the plane between the jaws, whichever jaw it is.
 
     `line` (n, 3) and `radii` (n,) mm are its round cones, from the base; `tip` is the farthest point (3,) on its centre
-    line.  With `flex` 0 it turns as one piece, with 1 it bends more and more towards the tip; `share` is of the opening.
+    line.  With `flex` 0 it turns as one piece, with 1 it bends towards the tip.  It has a `share` of the opening.
     """
 
     line: np.ndarray

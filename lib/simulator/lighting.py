@@ -58,7 +58,7 @@ class Lighting:
 
     Attributes:
         ambient, tool: Shares of the light that reach the scene outside the spot, and the tool.
-        spot_edge: Width of a disc's border as a share of `Microscope.spot_radius_mm`; None = the spot is a Gaussian of that.
+        spot_edge: Border of a lit disc, as a share of `Microscope.spot_radius_mm`; None = a Gaussian spot of that radius.
         band_rad: The spot is a band in this direction rather than a disc.
         shadow, shadow_sigma_mm: Depth (0 to 1) and softness of the tool's shadow.
         source_mm: A lamp near the scene casts the shadow; None = light from far, as `Microscope.light_slope` says.

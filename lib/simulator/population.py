@@ -205,7 +205,8 @@ def sample(
     Args:
         crop_px: Side of a square window of the full-resolution image that holds the jaws somewhere.
         size_px: (w, h) of the whole field shrunk to this size.  Without either size the image is the full-HD field.
-        around, jitter: The landmark (0, 1, 2) that a window holds, None = the jaws' centre; how far off, in window sides.
+        around, jitter: The landmark that a window holds, 0 base, 1 or 2 a tip, None = the jaws' centre; and how far it may
+            lie from the window's centre, as a share of the window's side.
         textures: Seeds of the textures to draw from, kept in memory; None = those of the population.
         population: "training"; "validation", with kinds beside those of training; "near", the reference rig's eyes and
             forceps alone; "empty", scenes and objects without the tool; or a family of `FAR`, which training never draws.

@@ -26,7 +26,7 @@ class Microscope:
 
     Attributes:
         convergence_rad: Angle between the two viewing directions.
-        depth_of_field_mm: Range of depth around `focus_z_mm` of at most 1 px defocus (sd at 100 px per mm); infinity = none.
+        depth_of_field_mm: Range of depth around `focus_z_mm` of at most 1 px defocus (sd at 100 px per mm); infinity = sharp.
         psf_px: Standard deviation of the point spread in focus.
         exposure_s, readout_s: Exposure of a row, and the time from the first to the last row of a rolling shutter.
         light_slope: Obliqueness of the light (x, y): a shadow moves by this many mm on the retina per mm of height.

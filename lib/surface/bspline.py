@@ -17,7 +17,7 @@ from lib.geometry import finite_points, points, store_array
 from lib.surface.grid import SplineGrid
 from lib.surface.solver import UNHELD, L1Problem, L1Solution, cholesky, interior_point
 
-#: Default rejection: points of an L1 norm beyond so many medians, as 0.1 % are of Gaussian noise along one axis.
+#: Default rejection: L1 norms above this many times the median.  Of Gaussian noise along one axis 0.1 % lies beyond.
 REJECT_MEDIANS = 5.0
 _FOLDS = 3
 _ENOUGH_HELD_OUT, _QUICK_HELD_OUT = 1500, 1000  # points in the folds that are tried: more only cost time

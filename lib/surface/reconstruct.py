@@ -129,7 +129,7 @@ def reconstruct(
         setting: "quality", or "fast" for several pairs a second: coarser matching (see `lib.matching.match`), an
             approximate choice of smoothness, and `depth_only`.
         method: The matcher; see `lib.matching.match`.
-        refine: Correct the rig by a first, fast matching (`refine_rig`); None does for a calibration of an affine pair.
+        refine: Correct the rig by a first, fast matching (`refine_rig`); None does so for a calibration of affine cameras.
         u_landmarks: Landmarks of the tool, (3, 2) px left and right, to mask the tool; NaN = missing.
         mask_left, mask_right: (h, w) bool, True = ignore, beside glints and tool.
         percentiles: (low, high) of the matches' coordinates that bound the surface's domain; (1, 99) leaves out the rim.

@@ -55,9 +55,8 @@ class L1Problem:
 
     @cached_property
     def _blocks(self) -> tuple[np.ndarray, ...]:
-        """The points by cells, in blocks of equal size: slots, the 10 distinct products of basis functions along x and y.
-
-        Last come the matrix that adds the cells' sums of these to the band, and the bending energy as a band.
+        """The points by cells, in blocks of equal size so that the cells' sums are batched products: slots; the 10 distinct
+        products of basis functions along x, and along y; the matrix that adds the sums to the band; the bending energy.
         """
         grid, height = self.grid, self.grid.bandwidth + 1
         cell, t = grid.locate(self.u)
@@ -90,8 +89,8 @@ class L1Problem:
 class L1Solution:
     """Minimum of sum_i w_i |b_i.c - x_i| + mu c.R.c for each of k outputs, and its proof.
 
-    `coefficients` c (size, k) give the sums `objective` (k,), and `duality_gap` (k,) bounds how far these lie above the
-    minimum, from a dual feasible point `dual` y (n, k), |y_i| <= w_i: the pull of each point on the surface.
+    The sums are `objective` (k,) at `coefficients` c (size, k).  They lie at most `duality_gap` (k,) above the minimum: that
+    follows from the dual feasible point `dual` y (n, k), |y_i| <= w_i, the pull of each point on the surface.
     """
 
     coefficients: np.ndarray

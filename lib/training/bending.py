@@ -33,8 +33,10 @@ def bent(
     return image, u, visibility
 
 
-def _turned(image: np.ndarray, u: np.ndarray, elbow: np.ndarray, ahead: np.ndarray, turn: float, reach: float):
-    """What lies within `reach` px `ahead` of the elbow turned about it; nothing moves beyond twice that."""
+def _turned(
+    image: np.ndarray, u: np.ndarray, elbow: np.ndarray, ahead: np.ndarray, turn: float, reach: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """What lies `ahead` of the elbow, within `reach` px, turned about it by up to `turn` rad; within twice that, by less."""
     radius, first = 2.0 * reach, np.arctan2(*ahead[::-1])
     low = np.clip(np.floor(elbow - radius), 0, image.shape[1::-1]).astype(int)
     high = np.clip(np.ceil(elbow + radius) + 1, 0, image.shape[1::-1]).astype(int)
@@ -42,18 +44,16 @@ def _turned(image: np.ndarray, u: np.ndarray, elbow: np.ndarray, ahead: np.ndarr
         return image, u
 
     def turned_by(far: np.ndarray, angle: np.ndarray) -> np.ndarray:
-        """By how much (rad) what is now seen so `far` from the elbow at an `angle` has turned about it."""
+        """The turn (rad) of what is then seen `far` px from the elbow at an `angle`."""
         fade = np.clip((radius - far) / (0.8 * reach), 0, 1)
         return turn * 0.5 * (1 + np.cos(angle - first)) * fade**2 * (3 - 2 * fade)
 
-    x, y = np.meshgrid(np.arange(low[0], high[0]) - elbow[0], np.arange(low[1], high[1]) - elbow[1])
-    by = turned_by(np.hypot(x, y), np.arctan2(y, x))
-    cos, sin = np.cos(by), np.sin(by)
-    maps = (cos * x + sin * y + elbow[0]).astype(np.float32), (cos * y - sin * x + elbow[1]).astype(np.float32)
+    z = np.arange(low[0], high[0]) - elbow[0] + 1j * (np.arange(low[1], high[1]) - elbow[1])[:, None]
+    z = z * np.exp(-1j * turned_by(np.abs(z), np.angle(z)))  # where a pixel comes from
+    maps = (z.real + elbow[0]).astype(np.float32), (z.imag + elbow[1]).astype(np.float32)
     image = image.copy()
     image[low[1] : high[1], low[0] : high[0]] = cv2.remap(image, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
-    x, y = (u - elbow).T
-    far, angle = np.hypot(x, y), np.arctan2(y, x)
+    far, angle = np.linalg.norm(u - elbow, axis=1), np.arctan2(*(u - elbow).T[::-1])
     now = angle
     for _ in range(60):  # the inverse: half a step contracts
         now = (now + angle + turned_by(far, now)) / 2

@@ -228,7 +228,7 @@ def fit_error_models(
         if stage in ("closeup", "closer"):  # how often a landmark is right, the other images tell
             parts[n:] = (replace(part, known=np.zeros_like(part.known)) for part in parts[n:])
         fit = _fitted(stage, parts if stage in CLOSE else parts[:n], None if anew else before.get(stage))
-        detector = detector.with_error_models(**{stage: fit})
+        detector = replace(detector, error_models=detector.error_models | {stage: fit})
         if stage == "frame":  # the landmarks that the next stage starts from
             rough = [detector.searched(image, detector.coarse(image)) for image in (part.image[None] for part in images)]
         elif stage != "tracking":

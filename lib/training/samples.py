@@ -40,10 +40,10 @@ def labelled_images(recording: Recording, *, every: int = 1) -> Iterator[Labelle
     if labels is None:
         raise ValueError(f"{recording.name}: it has neither truth/ nor annotations.json; give a labelled recording.")
     for i in range(0, len(recording.frames), every):
-        marks = {s: (getattr(labels, f"u_{s}")[i], getattr(labels, f"visibility_{s}")[i]) for s in ("left", "right")}
-        marked = {side: mark for side, mark in marks.items() if recording.truth or mark[1].any()}
+        marked = [side for side in ("left", "right") if recording.truth or getattr(labels, f"visibility_{side}")[i].any()]
         frame = recording.frames[i] if marked else None
-        for side, (u, visibility) in marked.items():
+        for side in marked:
+            u, visibility = getattr(labels, f"u_{side}")[i], getattr(labels, f"visibility_{side}")[i]
             if recording.truth is None:
                 u, visibility = np.where(visibility[:, None] > 0, u, np.nan), shown_by_coco(visibility)
             yield LabelledImage(f"{side} {i}", getattr(frame, side), u, visibility, 0.0 if recording.truth else CLICK_SD_PX)

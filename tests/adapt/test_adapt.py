@@ -52,7 +52,8 @@ def test_stretches_are_disjoint_in_time():
         assert time_s[parts[after]].min() - time_s[parts[before]].max() > 0.15
     assert min(map(len, parts.values())) >= 20
     with pytest.raises(RefusalError, match="too few"):
-        stretches(np.arange(9), time_s)
+        stretches(np.arange(16), time_s)
+    assert len(stretches(np.arange(17), time_s)["judge"]) == 3  # fewer frames tell no gain from chance
 
 
 def test_half_wrong_detections_give_right_labels(world, recording):
@@ -372,6 +373,9 @@ def test_labels_of_one_camera_do_without_a_robot(world, recording, tmp_path):
     assert folders[0] != folders[1]  # a training with other labels is no training to resume
     assert found.improved and found.calibration is None
     assert sum(found.report["frames"].values()) == 20 and found.report["judged"]["after"]["median_px"] < 0.5
+    write_coco(tmp_path / "ten.json", Annotations(u[:20, 0], np.full_like(u[:20, 1], np.nan)), SIZE, ".png")
+    ten = loop.adapt_images(recording.folder, tmp_path / "ten.json", **how)
+    assert ten.report["frames"] == {"learn": 5, "stop": 2, "judge": 3} and np.isfinite(ten.report["gain"]["labels"][1])
     with pytest.raises(ValueError, match="at least 10"):
         loop.adapt_images(recording.folder, _few(tmp_path), StandIn(world.u), folder=tmp_path, tune=tune)
 

@@ -40,7 +40,9 @@ def test_coarse_to_fine(benchmark, mode, engine):
         pytest.skip("OpenVINO is not installed here")
     shipped = Detector.load(engine=engine)
     sure = ErrorModel(logit=(9.0, 0.0, 0.0, 0.0))
-    detector = shipped.with_error_models(frame=sure, tool=sure, again=sure, closeup=sure, tracking=sure)
+    detector = replace(
+        shipped, error_models=shipped.error_models | dict.fromkeys(("frame", "tool", "again", "closeup", "tracking"), sure)
+    )
     torch.nn.init.zeros_(detector.closeup_network.head[-1].weight)  # on noise it would lose the tool now and then
     detector = replace(detector)
     images = pair((1080, 1920))

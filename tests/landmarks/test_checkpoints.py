@@ -92,7 +92,7 @@ def test_the_digest_tells_everything_that_decides_what_a_detector_finds():
         replace(detector, frame_px=32),
         replace(detector, method="paper"),
         replace(detector, engine="openvino"),
-        detector.with_error_models(window=ErrorModel(logit=(5.5, 0.0, 0.0, 0.0))),
+        replace(detector, error_models=detector.error_models | {"window": ErrorModel(logit=(5.5, 0.0, 0.0, 0.0))}),
     ]
     before = detector.digest
     assert len({before, *(other.digest for other in others)}) == 5 and replace(detector).digest == before

@@ -30,6 +30,10 @@ def sure():
     return {name: ErrorModel(logit=(5.0, 0.0, 0.0, 0.0)) for name in ("frame", "window")}
 
 
+def with_models(detector, **models):
+    return replace(detector, error_models=detector.error_models | models)
+
+
 def untrained(frame_px=66):
     torch.manual_seed(0)
     networks = [StackedHourglass(HourglassConfig(8, 1)) for _ in range(2)]
@@ -72,7 +76,7 @@ def test_save_and_load(images, tmp_path):
 
 def test_missing_is_nan_with_confidence_zero(images):
     never = {name: ErrorModel(logit=(-50.0, 0.0, 0.0, 0.0)) for name in ("frame", "window")}
-    found = untrained().with_error_models(**never)(images)
+    found = with_models(untrained(), **never)(images)
     assert np.isnan(found.u).all()
     assert np.isnan(found.covariance).all()
     assert (found.confidence == 0).all()
@@ -177,9 +181,9 @@ def test_what_the_stage_before_found_is_evidence(images):
     moved = np.linalg.norm(peaks.u[:, 0].numpy() - map_points(matrices, rough.u[0]), axis=1)
     np.testing.assert_allclose(features[:, 0, 0, 5].numpy(), np.log1p(np.minimum(moved, 100) / 2), rtol=1e-4)
     trusting = ErrorModel(logit=(*7 * (0.0,), 1.0))
-    found = detector.with_error_models(tool=trusting, again=ErrorModel(logit=(2.0,))).refine(images[:1], rough, "tool")
+    found = with_models(detector, tool=trusting, again=ErrorModel(logit=(2.0,))).refine(images[:1], rough, "tool")
     np.testing.assert_allclose(found.confidence, 0.5, atol=1e-9)
-    again = detector.with_error_models(again=ErrorModel(logit=(2.0,))).refine(images[:1], rough, "again")
+    again = with_models(detector, again=ErrorModel(logit=(2.0,))).refine(images[:1], rough, "again")
     np.testing.assert_allclose(again.confidence, 1 / (1 + np.exp(-2.0)))
 
 
@@ -210,7 +214,7 @@ def test_a_closeup_moves_what_the_stage_before_found(images):
         closeup.head[-1].bias.copy_(torch.tensor([10 * 8 / size, 2 * 8 / size, -1.0, 0.5]))
     plain = untrained()
     sure_too = replace(ErrorModel(), logit=(5.0,))
-    detector = replace(plain, closeup_network=closeup).with_error_models(closeup=sure_too)
+    detector = with_models(replace(plain, closeup_network=closeup), closeup=sure_too)
     before = plain(images)
     after = detector.refine(images, before, "closeup")
     seen = np.isfinite(before.u).all(axis=2)
@@ -225,7 +229,7 @@ def test_a_closeup_moves_what_the_stage_before_found(images):
         np.testing.assert_allclose(after.u[i, k] - before.u[i, k], moved, atol=1e-3)
         spread = turn @ np.diag([2 * np.exp(-2.0), 2 * np.exp(1.0)]) @ turn.T / zoom**2  # of Laplace distributions
         np.testing.assert_allclose(after.covariance[i, k], spread, rtol=1e-3)
-    unsure = detector.with_error_models(closeup=replace(ErrorModel(), logit=(-5.0,))).refine(images, before, "closeup")
+    unsure = with_models(detector, closeup=replace(ErrorModel(), logit=(-5.0,))).refine(images, before, "closeup")
     np.testing.assert_array_equal(unsure.u, before.u)  # it says that nothing is there, so the landmark stays, and is doubted
     assert (unsure.confidence == MISSING_BELOW).all()
     with torch.no_grad():
@@ -260,7 +264,7 @@ def test_tracking_looks_twice_where_the_tool_moved_far_and_knows_when_it_lost_it
 def test_closeups_and_what_is_believed_of_them_are_saved(tmp_path, images):
     fit = ErrorModel(gain=((0.5, 0.25),) * 3, bias=((0.1, -0.1),) * 3)
     detector = replace(untrained(), closeup_network=OffsetNetwork(OffsetConfig(4, 32)).eval())
-    detector = detector.with_error_models(closeup=fit, closer=fit, tracking=ErrorModel())
+    detector = with_models(detector, closeup=fit, closer=fit, tracking=ErrorModel())
     detector.save(tmp_path / "weights.safetensors")
     loaded = Detector.load(tmp_path / "weights.safetensors", engine="torch")
     assert loaded.closeup_network.config == OffsetConfig(4, 32)

@@ -78,6 +78,8 @@ def test_stages_are_fine_tuned_on_labelled_frames(tmp_path, monkeypatch):
     noted = lambda found, **how: weights.append(how.get("weight")) or of(found, **how)  # noqa: E731
     monkeypatch.setattr(FrameSource, "of", noted)
     tuned = stages.finetune(detector, images[:6], images[6:], tmp_path, **options)
+    finetuned = tuned.metadata["finetuned"]
+    assert (finetuned["images"], finetuned["held_out"]) == (5, 2)  # those with a base and a tip
     assert sorted(done) == [("closeup", 1.0), ("frame", 1.0), ("tool", 1.0)]  # side by side
     for stage, network in tuned.networks.items():
         provenance = load_training(tmp_path / stage / "last.safetensors").provenance

@@ -95,5 +95,8 @@ def test_labels_are_the_truth_or_else_the_annotations():
     assert isinstance(clicked, LabelledImage)
     assert np.isnan(clicked.in_view[1]).all() and clicked.visibility[1] == 1
     np.testing.assert_array_equal(clicked.u[0], annotations.u_left[0, 0])
+    annotations.visibility_left[:] = annotations.visibility_right[1:] = 0
+    marked = labelled_images(replace(recording, truth=None, annotations=annotations))
+    assert [one.name for one in marked] == ["right 0"]  # what nobody marked is not read
     with pytest.raises(ValueError, match=r"neither truth/ nor annotations\.json"):
         next(iter(labelled_images(replace(recording, truth=None, annotations=None))))
