@@ -30,7 +30,7 @@ from lib.trust.health import spread
 
 #: Most rounds of training, and most steps of a stage in one; the time ends most trainings.
 ROUNDS, STEPS = 3, 4000
-RECIPE = 4  # raised where teaching or training changes: what an older one kept is not gone on with
+RECIPE = 5  # raised where teaching or training changes: what an older one kept is not gone on with
 #: Share of the time left that a round takes, and fewest images for stopping to which alone the doubt is fitted.
 _ROUND_SHARE, _DOUBT_IMAGES = 0.85, 10
 #: Most stereo frames that are looked at, spread over the recording.
@@ -38,8 +38,8 @@ _MOST_FRAMES = 96
 _SIMULATED_SHARDS = 3
 #: A round that brings the frames for stopping nearer to the robot by less than this share is the last.
 _LEAST_GAIN = 0.03
-#: Most rounds of closeups, placed by the robot, before anything is trained, and the share of the tool's length below which
-#: a landmark's move ends them: more would let the base drift along the shaft, as each adds the closeups' constant error.
+#: Most rounds of looking where the robot says, before anything is trained, and the share of the tool's length below which a
+#: landmark's move ends them.
 _GUIDED, _SETTLED = 3, 0.01
 
 
@@ -241,7 +241,7 @@ class _Work:
             except RefusalError:
                 if len(self.marked) < 5:
                     raise
-                break  # closeups that do not know the tool correct nothing; labels set by hand do
+                break  # a detector that does not know the tool corrects nothing; labels set by hand do
             u, last = teacher.labels(learn)[0], u
             moved = np.linalg.norm(u - last, axis=-1) / tool_length_px(u)[..., None]
             if np.nanmax(np.nanmedian(moved, axis=(0, 1))) < _SETTLED:

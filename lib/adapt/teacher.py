@@ -36,7 +36,9 @@ _CONTRADICTED = 0.2
 #: Standard deviation of a detector's own constant error, as a share of the tool's length: along, across, normal.  The base
 #: has no edge that ends along the shaft.  Chosen by the closeups' errors in four recordings of unfamiliar tools and lights.
 _OWN_BIAS = 0.004 * np.array([[2.5, 1.0, 1.5], [1.2, 1.0, 1.5], [1.2, 1.0, 1.5]])
-_LARGEST_OFFSET = 0.15  # of a landmark, as a share of the tool's length; what is farther is another point of the tool
+#: Largest offset of a landmark, as a share of the tool's length or in mm, whichever is more: what is farther is another point
+#: of the tool.  A robot's own tool calibration errs by tenths of a millimetre, however short the tool is.
+_LARGEST_OFFSET, _LARGEST_OFFSET_MM = 0.15, 0.25
 _TURNED = 0.3  # error of an offset, as a share of it, where shut jaws borrow the tool's axes from another time
 _ODD = 0.2  # share of a large offset that may be the detector's all the same: some tools it knows far worse than others
 #: Gain in log likelihood of a detection, by which cameras of their own for a part of the time must explain it better.
@@ -88,7 +90,7 @@ def look(
     recording: Recording, detector: Callable, frames: np.ndarray, *, near: np.ndarray | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Seen:  # fmt: skip
-    """What a detector finds in some frames; with `near` (m, 2, 3, 2) px its closeups alone, placed there."""
+    """What a detector finds in some frames; with `near` (m, 2, 3, 2) px its later stages alone, which look there."""
     found = []
     for i, number in enumerate(frames):
         frame = recording.frames[int(number)]
@@ -98,8 +100,10 @@ def look(
         else:
             known = np.isfinite(near[i]).all(axis=-1)
             rough = Landmarks(near[i], np.tile(np.eye(2), (2, 3, 1, 1)), known.astype(float))
-            for _ in range(2):  # the first closeup says where to look
-                rough = detector.refine(pair, rough, "tracking")
+            for stage in detector.stages:
+                # A window shows the whole tool: closeups alone would add their constant error to the place in every round.
+                if stage not in ("frame", "tool", "tracking"):
+                    rough = detector.refine(pair, rough, stage)
             found.append(rough)
         if progress is not None:
             progress((i + 1) / len(frames))
@@ -226,7 +230,7 @@ def teach(
 
     Raises:
         RefusalError: If fewer than a tenth of the landmarks, or 30, agree on cameras, the cameras are no stereo microscope's,
-            a landmark is seen more than 15 % of the tool's length off, or the robot contradicts the images.
+            a landmark is seen more than 15 % of the tool's length and 0.25 mm off, or the robot contradicts the images.
     """
     frozen = _frozen(recording, seen.frame)
     refused = frozen if before is None else np.union1d(frozen, before.refused)
@@ -258,11 +262,11 @@ def teach(
     if told is not None and told.offset.shape == (3, 3):
         x = recording.landmarks_mm()
         length = np.nanmedian(np.linalg.norm(x[:, 1:].mean(axis=1) - x[:, 0], axis=1))
-        size = np.linalg.norm(told.offset, axis=1) / length
-        if size.max() > _LARGEST_OFFSET and not from_labels:
+        size_mm = np.linalg.norm(told.offset, axis=1)
+        if size_mm.max() > max(_LARGEST_OFFSET * length, _LARGEST_OFFSET_MM) and not from_labels:
             raise RefusalError(
-                f"detector: it sees {LANDMARKS[size.argmax()]} {100 * size.max():.0f} % of the tool's length from where the "
-                f"robot reports it. It takes another point for it, or the robot's tool has other dimensions. {_LABEL}"
+                f"detector: it sees {LANDMARKS[size_mm.argmax()]} {size_mm.max():.2f} mm from where the robot reports it, "
+                f"{100 * size_mm.max() / length:.0f} % of the tool's length. It takes another point for it, or the robot's tool has other dimensions. {_LABEL}"
             )
         turns, (offset, sd) = told.turns, _robots_share(told, (0.2 if from_labels else 1.0) * _OWN_BIAS * length)
     elif before is not None:

@@ -34,7 +34,7 @@ CLOSEUP_CROP_PX = 160
 CLOSEUPS, PROPOSALS = 1024, 12
 #: Shards of whole scenes: how many, and the share of each population.
 SCENES = {
-    "scenes": (64, {"training": 0.55, "near": 0.33, "empty": 0.12}),
+    "scenes": (64, {"training": 0.5, "near": 0.3, "empty": 0.2}),
     "held_out": (16, {"validation": 0.6, "near": 0.2, "empty": 0.2}),
 }
 #: Sizes of held-out scenes: what stage sees what must not depend on them.

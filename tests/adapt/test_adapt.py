@@ -9,6 +9,7 @@ import pytest
 from lib.adapt import RefusalError, adapt, loop, report, teach
 from lib.adapt.judging import Agreement, better
 from lib.adapt.teacher import look, stretches
+from lib.calibration.offsets import tool_axes
 from lib.landmarks import Detector, Landmarks
 from lib.recordings.annotations import Annotations, write_coco
 from tests.adapt.world import SIZE, StandIn, World, pupil
@@ -108,6 +109,18 @@ def test_a_detector_that_takes_elbows_for_tips_is_no_start(world, recording):
     elbows[:, :, 1:] += 0.25 * (elbows[:, :, :1] - elbows[:, :, 1:])
     with pytest.raises(RefusalError, match="sees tip_.*another point.*Label 10 pairs"):
         taught(recording, StandIn(elbows, noise_px=0.7, wrong=0.2))
+
+
+def test_a_robot_of_a_small_tool_may_err_by_a_fifth_of_its_length(world, recording):
+    """0.2 mm are usual for a robot, and much for jaws of 1 mm: no other point of the tool is meant."""
+    k = recording.kinematics
+    length_mm = np.nanmedian(np.linalg.norm(k.x_mm[:, 1] - k.x_mm[:, 0], axis=1))
+    x = k.x_mm / length_mm
+    axes, off = tool_axes(x), np.array([[0.0, 0.2, 0.0], [0.0, 0.0, -0.2], [0.2, 0.0, 0.0]])
+    known = np.isfinite(axes).all(axis=(1, 2))
+    x[known] += np.einsum("mij,kj->mki", axes[known], off)
+    small = replace(recording, kinematics=replace(k, x_mm=x))
+    assert np.median(label_errors(world, taught(small, StandIn(world.u, noise_px=0.7, wrong=0.2)))[0]) < 2.0
 
 
 def test_few_landmarks_that_agree_are_no_consensus(world, recording):
@@ -245,7 +258,7 @@ def test_five_labelled_pairs_are_a_start(world, recording, tmp_path, monkeypatch
 
 def test_labels_teach_a_tool_that_no_closeup_knows(world, recording, tmp_path, monkeypatch):
     class Lost(StandIn):
-        networks, closeup_network = {}, "some"
+        networks, closeup_network, stages = {}, "some", ("frame", "closeup")
         refine = staticmethod(lambda pair, rough, setting: Landmarks.none(2))
 
     class ReachedError(Exception):
@@ -269,13 +282,18 @@ def test_labels_teach_a_tool_that_no_closeup_knows(world, recording, tmp_path, m
 
 def test_closeups_that_see_no_end_of_the_shaft_do_not_drift_along_it(world, recording, tmp_path, monkeypatch):
     class Blurred(StandIn):
+        """Its window errs by half a pixel wherever it is placed; each of its closeups moves the base on by 0.3."""
+
         networks, closeup_network = {}, "some"
+        stages = ("frame", "tool", "again", "closeup", "closer", "tracking")
 
         @staticmethod
-        def refine(pair, rough, setting):
-            along = rough.u[:, 1:].mean(axis=1) - rough.u[:, 0]
+        def refine(pair, rough, stage):
             u = rough.u.copy()
-            u[:, 0] += 0.3 * along / np.linalg.norm(along, axis=1, keepdims=True)
+            if stage == "again":
+                u = world.u[np.nanargmin(np.nansum((world.u - u) ** 2, axis=(1, 2, 3)))].copy()
+            along = u[:, 1:].mean(axis=1) - u[:, 0]
+            u[:, 0] += (0.5 if stage == "again" else 0.3) * along / np.linalg.norm(along, axis=1, keepdims=True)
             return Landmarks(u, np.tile(np.eye(2), (2, 3, 1, 1)), np.full((2, 3), 0.9))
 
     class ReachedError(Exception):
