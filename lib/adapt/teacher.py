@@ -266,7 +266,8 @@ def teach(
         if size_mm.max() > max(_LARGEST_OFFSET * length, _LARGEST_OFFSET_MM) and not from_labels:
             raise RefusalError(
                 f"detector: it sees {LANDMARKS[size_mm.argmax()]} {size_mm.max():.2f} mm from where the robot reports it, "
-                f"{100 * size_mm.max() / length:.0f} % of the tool's length. It takes another point for it, or the robot's tool has other dimensions. {_LABEL}"
+                f"{100 * size_mm.max() / length:.0f} % of the tool's length. It takes another point for it, or the robot's "
+                f"tool has other dimensions. {_LABEL}"
             )
         turns, (offset, sd) = told.turns, _robots_share(told, (0.2 if from_labels else 1.0) * _OWN_BIAS * length)
     elif before is not None:
