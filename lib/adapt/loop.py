@@ -14,7 +14,17 @@ import numpy as np
 
 from lib import files, paths
 from lib.adapt.judging import Agreement, agreement, better, epipolar_px, frame_means
-from lib.adapt.teacher import RefusalError, Seen, Teacher, longest_still, look, stretches, teach
+from lib.adapt.teacher import (
+    RefusalError,
+    Seen,
+    Teacher,
+    longest_still,
+    look,
+    look_elsewhere,
+    standing_still,
+    stretches,
+    teach,
+)  # fmt: skip
 from lib.calibration import Calibration
 from lib.correspondences import LANDMARKS
 from lib.landmarks import Detector, SharedDetector
@@ -190,10 +200,25 @@ class _Work:
 
     def look(self, name: str, detector: Callable, frames: np.ndarray, near: np.ndarray | None = None) -> Seen:
         """`look`, or what an earlier call kept."""
+        asked = SharedDetector(detector) if near is None and self.learns else detector
+        return self.kept(name, partial(look, self.recording, asked, frames, near=near))
+
+    def moving(self, seen: Seen, detector: Detector) -> Seen:
+        """`seen`, and other tools where those that it holds stand still while the robot moves."""
+        still = standing_still(seen, self.recording.landmarks_mm()[seen.frame])
+        if not still.any() or not self.learns:
+            return seen
+        self.report["notes"].append(
+            f"In {still.sum()} of {still.size} images the detector takes for the tool what stands still while the robot "
+            "moves: another object, or a pattern. There it has looked for the tool elsewhere."
+        )
+        return self.kept("elsewhere", partial(look_elsewhere, self.recording, detector, seen, still))
+
+    def kept(self, name: str, look: Callable[..., Seen]) -> Seen:
+        """What `look` finds, or what an earlier call kept."""
         path = self.folder / f"{name}.npz"
         if not path.is_file():
-            asked = SharedDetector(detector) if near is None and self.learns else detector
-            found = look(self.recording, asked, frames, near=near, progress=partial(self.say, f"Looking ({name})"))
+            found = look(progress=partial(self.say, f"Looking ({name})"))
             with files.whole(path) as new:
                 np.savez(new, **found._asdict())
         with np.load(path) as kept:
@@ -215,7 +240,7 @@ class _Work:
         """Teach, train and look again, round after round, then judge."""
         recording, start, rounds = self.recording, self.detector, self.report["rounds"]
         first = self.look("before", start, self.frames)
-        seen = first.labelled(self.labels)
+        seen = self.moving(first, start).labelled(self.labels)
         still, note = longest_still(recording, seen)
         self.report["notes"] += [note] if note else []
         parts = self.parts = stretches(np.setdiff1d(still, self.marked), recording.frames.time_s)

@@ -43,6 +43,8 @@ _TURNED = 0.3  # error of an offset, as a share of it, where shut jaws borrow th
 _ODD = 0.2  # share of a large offset that may be the detector's all the same: some tools it knows far worse than others
 #: Gain in log likelihood of a detection, by which cameras of their own for a part of the time must explain it better.
 _SURE_MOVE = 0.1
+#: A tool stands still if others stand nearer than this share of its length, in so many frames and more with itself.
+_STILL, _STILL_FRAMES = 0.15, 4
 _CONFIDENCES = (MIN_CONFIDENCE, 0.5, 0.8)
 _NEAR = 0.1  # share of a short tool's length: as near a detection is taken for right where the noise does not tell
 _LABEL = (
@@ -108,6 +110,37 @@ def look(
         if progress is not None:
             progress((i + 1) / len(frames))
     return Seen(np.asarray(frames), *(np.stack([getattr(p, n) for p in found]) for n in ("u", "covariance", "confidence")))
+
+
+def standing_still(seen: Seen, x_mm: np.ndarray) -> np.ndarray:
+    """(m, 2) which tools stand in their image where those of other frames do, while the robot's x_mm (m, 3, 3) moves.
+
+    The robot moves in more than one direction, since a tool that moves along the view stands still in the image.
+    """
+    centre, length_mm = x_mm.mean(axis=1), np.nanmedian(np.linalg.norm(x_mm[:, 1:].mean(axis=1) - x_mm[:, 0], axis=-1))
+    found = np.zeros((len(x_mm), 2), bool)
+    for i, side in np.argwhere(np.isfinite(seen.u).all(axis=(2, 3)) & np.isfinite(centre).all(axis=1, keepdims=True)):
+        u = seen.u[:, side]
+        near = np.linalg.norm(u - u[i], axis=2).mean(axis=1) < _STILL * tool_length_px(u[i : i + 1])
+        at = centre[near & np.isfinite(centre).all(axis=1)]
+        spread = np.linalg.svd(at - at.mean(axis=0), compute_uv=False) / np.sqrt(len(at))
+        found[i, side] = len(at) >= _STILL_FRAMES and spread[1] > 2 * _STILL * length_mm
+    return found
+
+
+def look_elsewhere(
+    recording: Recording, detector: Callable, seen: Seen, still: np.ndarray, progress: Callable[[float], None] | None = None
+) -> Seen:
+    """`seen`, but where tools are `still` (m, 2): there what else the detector finds."""
+    found, images = Seen(*(part.copy() for part in seen)), np.argwhere(still)
+    for k, (i, side) in enumerate(images):
+        frame = recording.frames[int(seen.frame[i])]
+        other = detector((frame.left, frame.right)[side][None], avoid=seen.u[still[:, side], side])
+        for part, one in zip(found[1:], (other.u, other.covariance, other.confidence), strict=True):
+            part[i, side] = one[0]
+        if progress is not None:
+            progress((k + 1) / len(images))
+    return found
 
 
 def stretches(frames: np.ndarray, time_s: np.ndarray) -> dict[str, np.ndarray]:
@@ -238,7 +271,13 @@ def teach(
     if len(used.frame) < 5:
         raise RefusalError(f"kinematics: they stand still in {len(refused)} of {len(seen.frame)} frames; check the log.")
     recording, clock_sd_s = _clock(recording if before is None else before.recording, used)
-    calibration, right = _calibrated(recording, used, from_labels)
+    try:
+        calibration, right = _calibrated(recording, used, from_labels)
+    except RefusalError:  # few right ones agree on cameras by a clock that is off, and do not tell its offset
+        if from_labels:
+            raise
+        recording, clock_sd_s = _scanned_clock(recording, used), 0.01
+        calibration, right = _calibrated(recording, used, from_labels)
     if not from_labels:
         again, sd = _clock(recording, used, calibration)
         if again is not recording:
@@ -297,9 +336,7 @@ def _clock(recording: Recording, seen: Seen, calibration: Calibration | None = N
     if calibration is not None:  # of the rows that agree alone
         rows = replace(rows, confidence=np.where(calibration.view_inliers, rows.confidence, 0.0))
     if len(seen.frame) < 8:  # too few for that: the offset at which cameras explain the labels best
-        trial = recording.offset_s + np.linspace(-0.2, 0.2, 41)
-        misfit = [_fitted(replace(recording, offset_s=t), seen, 0.0).reprojection_rms_px for t in trial.tolist()]
-        return replace(recording, offset_s=float(trial[np.argmin(misfit)])), 0.01
+        return _scanned_clock(recording, seen, lambda found: -found.reprojection_rms_px), 0.01
     for reach_s in (0.2, 1.0):
         try:
             found = estimate_time_offset(rows, recording.kinematics, start_s=recording.offset_s, search_s=reach_s)
@@ -309,6 +346,19 @@ def _clock(recording: Recording, seen: Seen, calibration: Calibration | None = N
             return replace(recording, offset_s=found.offset_s), found.sd_s
         return recording, min(found.sd_s, 0.01)
     return recording, 0.005
+
+
+def _scanned_clock(
+    recording: Recording, seen: Seen, merit: Callable[[Calibration], float] = lambda found: found.view_inliers.sum()
+) -> Recording:
+    """The recording with the offset of the clocks, of 41 within 0.2 s, that gives the best cameras: most agree on them."""
+    def score(offset_s: float) -> float:
+        try:
+            return merit(_fitted(replace(recording, offset_s=offset_s), seen, 0.0))
+        except ValueError:
+            return -np.inf
+
+    return replace(recording, offset_s=max((recording.offset_s + np.linspace(-0.2, 0.2, 41)).tolist(), key=score))
 
 
 def _fitted(recording: Recording, seen: Seen, least: float, ransac_px: float | None = None) -> Calibration:

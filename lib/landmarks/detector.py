@@ -30,7 +30,7 @@ from lib.landmarks.error_model import ErrorModel, Rough, closeup_peaks, correcte
 from lib.landmarks.heatmaps import Peaks, decode
 from lib.landmarks.metrics import tool_length_px
 from lib.landmarks.network import Network, OffsetNetwork, StackedHourglass, as_tensor, as_uint8
-from lib.landmarks.search import PEAKS, best_tools, likelihood, without_peak
+from lib.landmarks.search import PEAKS, at_one_place, best_tools, likelihood, without_peak
 from lib.parallel import single_threaded_torch
 from lib.recordings import Recording
 
@@ -233,10 +233,11 @@ class Detector:
                 "fit them with `lib.training.error_models.fit_error_models` or `python3 -m lib train assemble`."
             )
 
-    def __call__(self, images: ArrayLike, *, batch: int = 4) -> Landmarks:
+    def __call__(self, images: ArrayLike, *, batch: int = 4, avoid: np.ndarray | None = None) -> Landmarks:
         """Landmarks of images (n, h, w, 3), uint8 RGB or float in [0, 1]; `batch` images at a time.
 
-        Raises `ValueError` for images of another shape, type or range.
+        `avoid` (k, 3, 2) px are what looks like the tool and is none, such as a second instrument.  Raises `ValueError` for
+        images of another shape, type or range.
         """
         images = as_uint8(images)
         found = []
@@ -245,7 +246,7 @@ class Detector:
                 part = images[start : start + batch]
                 rough = self.coarse(part)
                 seen = self.stage_peaks(part, rough.u, "tool") if self.tool_network else None
-                result = self.searched(part, rough, seen)
+                result = self.searched(part, rough, seen, avoid)
                 same = np.array_equal(result.u, rough.u, equal_nan=True)
                 for stage in [stage for stage in self.stages[1:] if stage != "tracking"]:
                     result = self.refine(part, result, stage, seen if same and stage == "tool" else None)
@@ -290,24 +291,28 @@ class Detector:
         found = self._measured(peaks, None, "frame")
         return Landmarks(image_from_cell(found.u, stride), found.covariance * np.outer(stride, stride), found.confidence)
 
-    def searched(self, images: np.ndarray, rough: Landmarks, seen: tuple | None = None) -> Landmarks:
+    def searched(
+        self, images: np.ndarray, rough: Landmarks, seen: tuple | None = None, avoid: np.ndarray | None = None
+    ) -> Landmarks:
         """What later stages start from: `rough`, or, where its window does not show it well, the tool whose window does best.
 
         Candidates are `rough` and tools made of the highest peaks that the first stage sees at several scales.  All are
         looked at once, the likeliest ones again; the likeliest wins.  The second stage decides, however sure the first is:
-        it has learnt what is no tool.  `seen` is what `stage_peaks` gave for `rough`, if that is known.
+        it has learnt what is no tool.  `seen` is what `stage_peaks` gave for `rough`, if that is known; `avoid` as in a call.
         """
         if self.tool_network is None:
             return rough
         result = Landmarks.join([rough])  # a copy
         height = self._shown(seen or self.stage_peaks(images, rough.u, "tool"), len(images))[1]
-        searched = height < _SHOWN
+        searched = (height < _SHOWN) | (avoid is not None)
         for i in np.flatnonzero(searched):
             candidates, u, once = self.proposed(images[i], rough[i : i + 1])
-            best = np.argsort(-likelihood(u, once))[:_AGAIN]
+            best = np.argsort(-_scores(u, once, avoid))[:_AGAIN]
             u, twice = self._looked(images[i], u[best], "again")
-            chosen = likelihood(u, twice).argmax()
-            result._put(np.array([i]), candidates[best[[chosen]]])
+            scores = _scores(u, twice, avoid)
+            chosen = scores.argmax()
+            found = candidates[best[[chosen]]] if np.isfinite(scores[chosen]) else Landmarks.none(1)
+            result._put(np.array([i]), found)
             height[i] = twice[chosen]
         unsure = searched | (rough.confidence < _SURE).any(1)
         return replace(result, confidence=np.where(unsure[:, None], _SURE * height[:, None], rough.confidence))
@@ -445,6 +450,12 @@ class Detector:
         fit = self.error_models.get(stage, ErrorModel())
         covariance, confidence = covariance_and_confidence(peaks.double(), rough, fit, landmark)
         return Landmarks(peaks.u.numpy(), covariance.numpy(), confidence.numpy())
+
+
+def _scores(u: np.ndarray, height: np.ndarray, avoid: np.ndarray | None) -> np.ndarray:
+    """`likelihood` of tools u (n, 3, 2), none where they are to be avoided."""
+    scores = likelihood(u, height)
+    return scores if avoid is None else np.where(at_one_place(u, avoid), -np.inf, scores)
 
 
 def _through_inverse(matrices: np.ndarray, u: np.ndarray) -> np.ndarray:

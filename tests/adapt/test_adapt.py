@@ -8,7 +8,7 @@ import pytest
 
 from lib.adapt import RefusalError, adapt, loop, report, teach
 from lib.adapt.judging import Agreement, better
-from lib.adapt.teacher import look, stretches
+from lib.adapt.teacher import look, look_elsewhere, standing_still, stretches
 from lib.calibration.offsets import tool_axes
 from lib.landmarks import Detector, Landmarks
 from lib.recordings.annotations import Annotations, write_coco
@@ -109,6 +109,31 @@ def test_a_detector_that_takes_elbows_for_tips_is_no_start(world, recording):
     elbows[:, :, 1:] += 0.25 * (elbows[:, :, :1] - elbows[:, :, 1:])
     with pytest.raises(RefusalError, match="sees tip_.*another point.*Label 10 pairs"):
         taught(recording, StandIn(elbows, noise_px=0.7, wrong=0.2))
+
+
+def test_what_stands_still_while_the_robot_moves_is_not_the_tool(world, recording):
+    """Half of the detections are one pattern of the ground; the other half, and a tool that moves in depth, are the tool."""
+    seen, x = look(recording, StandIn(world.u, noise_px=0.7, wrong=0.0), np.arange(world.n)), world.at(world.time_s)
+    pattern = np.arange(world.n) % 2 == 1
+    seen.u[pattern] = seen.u[3] + np.random.default_rng(0).normal(0, 1.0, (pattern.sum(), 2, 3, 2))
+    assert (standing_still(seen, x) == pattern[:, None]).all()
+    seen.u[:], depth = seen.u[2], np.zeros_like(x)
+    depth[:, :, 2] = np.linspace(0, 5, world.n)[:, None]
+    assert not standing_still(seen, x[2] + depth).any()
+
+    def elsewhere(image, avoid):
+        assert avoid.shape == (world.n, 3, 2)
+        return Landmarks.none(1)
+
+    found = look_elsewhere(recording, elsewhere, seen, np.repeat([[True, False]], world.n, axis=0))
+    assert np.isnan(found.u[:, 0]).all() and np.array_equal(found.u[:, 1], seen.u[:, 1])
+
+
+def test_few_right_detections_by_another_clock_still_teach(world, tmp_path):
+    """They are too few to tell the clock's offset by themselves: the one by which the most agree on cameras is right."""
+    late = world.record(tmp_path / "late", clock_s=0.18)
+    teacher = taught(late, StandIn(world.u, noise_px=0.3, wrong=0.7, seed=3))
+    assert np.median(label_errors(world, teacher)[0]) < 1.0
 
 
 def test_a_robot_of_a_small_tool_may_err_by_a_fifth_of_its_length(world, recording):

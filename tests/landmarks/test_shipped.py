@@ -57,6 +57,15 @@ def test_an_empty_field_has_no_landmarks_and_disturbs_no_other(shipped):
     assert shipped.torch.searched(both, shipped.torch.coarse(both)).confidence[1].max() < 0.4
 
 
+def test_what_is_to_be_avoided_is_not_found_but_the_other_tool_is(shipped):
+    both = np.concatenate([shipped.images[0], shipped.images[8]], axis=1)[None]  # two tools side by side
+    tools = shipped.u[[0, 8]] + np.array([[[0.0, 0.0]], [[shipped.images.shape[2], 0.0]]])
+    for avoided, other in ((0, 1), (1, 0)):
+        found = shipped.default(both, avoid=tools[[avoided]])
+        assert (np.linalg.norm(found.u[0] - tools[other], axis=1) < 0.05 * tool_length_px(tools[[other]])).all()
+    assert not (shipped.default(both, avoid=tools).confidence > 0.5).any()
+
+
 def test_without_a_second_stage_nothing_is_searched(shipped):
     alone, rough = replace(shipped.torch, tool_network=None, closeup_network=None), Landmarks.none(1)
     assert alone.searched(shipped.images[:1], rough) is rough
