@@ -336,7 +336,7 @@ def _clock(recording: Recording, seen: Seen, calibration: Calibration | None = N
     if calibration is not None:  # of the rows that agree alone
         rows = replace(rows, confidence=np.where(calibration.view_inliers, rows.confidence, 0.0))
     if len(seen.frame) < 8:  # too few for that: the offset at which cameras explain the labels best
-        return _scanned_clock(recording, seen, lambda found: -found.reprojection_rms_px), 0.01
+        return _scanned_clock(recording, seen), 0.01
     for reach_s in (0.2, 1.0):
         try:
             found = estimate_time_offset(rows, recording.kinematics, start_s=recording.offset_s, search_s=reach_s)
@@ -348,17 +348,16 @@ def _clock(recording: Recording, seen: Seen, calibration: Calibration | None = N
     return recording, 0.005
 
 
-def _scanned_clock(
-    recording: Recording, seen: Seen, merit: Callable[[Calibration], float] = lambda found: found.view_inliers.sum()
-) -> Recording:
-    """The recording with the offset of the clocks, of 41 within 0.2 s, that gives the best cameras: most agree on them."""
-    def score(offset_s: float) -> float:
+def _scanned_clock(recording: Recording, seen: Seen) -> Recording:
+    """The recording with the offset of the clocks, of 41 within 0.2 s, at which the most landmarks agree best on cameras."""
+    def merit(offset_s: float) -> tuple[float, float]:
         try:
-            return merit(_fitted(replace(recording, offset_s=offset_s), seen, 0.0))
+            found = _fitted(replace(recording, offset_s=offset_s), seen, 0.0)
         except ValueError:
-            return -np.inf
+            return -np.inf, 0.0
+        return found.view_inliers.sum(), -found.reprojection_rms_px
 
-    return replace(recording, offset_s=max((recording.offset_s + np.linspace(-0.2, 0.2, 41)).tolist(), key=score))
+    return replace(recording, offset_s=max((recording.offset_s + np.linspace(-0.2, 0.2, 41)).tolist(), key=merit))
 
 
 def _fitted(recording: Recording, seen: Seen, least: float, ransac_px: float | None = None) -> Calibration:

@@ -58,8 +58,7 @@ def check_units(x: np.ndarray, y: np.ndarray) -> None:
     """Refuse points whose implied zoom no camera has: metres or micrometres given as millimetres."""
 
     def extent(values: np.ndarray) -> float:  # robust: a few gross rows must not look like another unit
-        columns = [column[np.isfinite(column)] for column in values.T]
-        middle = max(np.median(np.abs(column - np.median(column))) for column in columns)
+        middle = np.nanmedian(np.abs(values - np.nanmedian(values, axis=0)), axis=0).max()
         return float(middle or np.nanstd(values, axis=0).max())
 
     size = extent(x)

@@ -4,10 +4,9 @@ A state moves by increments; every model is a selection matrix from its free par
 so one set of derivatives serves all.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Self
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -39,7 +38,7 @@ class Model:
     cameras: int
 
     @classmethod
-    def parse(cls, name: str, cameras: int) -> Model:
+    def parse(cls, name: str, cameras: int) -> Self:
         """The model called `name`; a ValueError for an unknown one lists the known ones."""
         base, *options = ("zero_skew+distance" if name == "near_affine" else str(name)).split("+")
         known = base in BASES and all(o in OPTIONS for o in options) and len(set(options)) == len(options)
@@ -97,7 +96,7 @@ class State:
     centre: np.ndarray
 
     @classmethod
-    def start(cls, model: Model, matrix: np.ndarray, reference: np.ndarray, centre: np.ndarray) -> State:
+    def start(cls, model: Model, matrix: np.ndarray, reference: np.ndarray, centre: np.ndarray) -> Self:
         """From affine cameras, `matrix` (2 cameras, 4), brought to the model's base."""
         A, zeros = matrix[:, :3].reshape(-1, 2, 3), np.zeros(model.cameras)
         offset = (matrix[:, :3] @ reference + matrix[:, 3]).reshape(-1, 2)
@@ -120,7 +119,7 @@ class State:
         rows = self.A / self.zoom[:, :, None]
         return np.concatenate([rows, np.cross(rows[:, :1], rows[:, 1:])], axis=1)
 
-    def moved(self, step: np.ndarray) -> State:
+    def moved(self, step: np.ndarray) -> Self:
         """The state after a step (p,) of the model's parameters."""
         d = (self.model.selection @ step).reshape(len(self.A), -1)
         common = {"rho": self.rho + d[:, -2], "radial": self.radial + d[:, -1], "offset": self.offset + d[:, -4:-2]}

@@ -69,20 +69,12 @@ class Paths:
         ends = np.array([[piece.t[0], piece.t[-1]] for pieces in self.pieces for piece in pieces])
         return float(np.ptp(ends)) if len(ends) else 0.0
 
-    def covers(self, landmark: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        """(n,) bool: one piece of the row's landmark holds the whole interval."""
-        inside = np.zeros(len(landmark), dtype=bool)
-        for k, pieces in enumerate(self.pieces):
-            for piece in pieces:
-                inside |= (landmark == k) & (low >= piece.t[0]) & (high <= piece.t[-1])
-        return inside
-
-    def at(self, landmark: np.ndarray, time: np.ndarray, derivative: int = 0) -> np.ndarray:
-        """(n, 3) mm, or mm/s, of each row's landmark; NaN where no piece covers its time."""
+    def at(self, landmark: np.ndarray, time: np.ndarray, derivative: int = 0, within_s: float = 0.0) -> np.ndarray:
+        """(n, 3) mm, or mm/s, of each row's landmark; NaN where no piece covers its time and `within_s` around it."""
         x = np.full((len(time), 3), np.nan)
         for k, pieces in enumerate(self.pieces):
             for piece in pieces:
-                rows = (landmark == k) & (time >= piece.t[0]) & (time <= piece.t[-1])
+                rows = (landmark == k) & (time - within_s >= piece.t[0]) & (time + within_s <= piece.t[-1])
                 x[rows] = piece(time[rows], derivative)
         return x
 
@@ -110,7 +102,7 @@ def estimate_time_offset(
     if landmark.max(initial=0) >= len(paths.pieces):
         raise ValueError(f"u: {landmark.max() + 1} landmarks, the kinematics have {len(paths.pieces)}.")
     known = np.isfinite(y).any(axis=1) & np.isfinite(time)
-    known &= paths.covers(landmark, time + start_s - search_s, time + start_s + search_s)
+    known &= np.isfinite(paths.at(landmark, time + start_s, within_s=search_s)).all(axis=1)
     time, frame, landmark, y = time[known], frame[known], landmark[known], y[known]
     n, m = len(np.unique(time)), y.shape[1]
     if n < 8:

@@ -4,7 +4,6 @@ Units that no column's name states are those in which the log's steps and motion
 """
 
 import re
-import tomllib
 from collections import Counter
 from pathlib import Path
 
@@ -15,7 +14,7 @@ from lib.correspondences import LANDMARKS
 from lib.importing.labels import labels_of
 from lib.importing.logs import topics_of
 from lib.importing.video import IMAGES, VIDEOS, last_number
-from lib.recordings.tables import decoded, toml
+from lib.recordings.tables import decoded, read_toml, toml
 
 _TIME = re.compile(r"(?i)^(t|sec|secs|s|ms|us|ns)$|time|stamp|^t[_ \[(]")
 _AXIS = re.compile(r"(?i)^(.*?)[ _.\-]?([xyz])[ _]?[\[(]?(mm|um|m)?[\])]?$")
@@ -41,7 +40,7 @@ def guess_mapping(source: str | Path) -> str:
     video = _video(folder, paths, {n: p for n, p in tables.items() if n != robot["file"]})
     told |= {"robot_accuracy_mm": 0.01, "readout_s": 0.0, "video": video, "robot": robot, "tool": tool}
     told["labels"] = _labels(labels)
-    tells = tomllib.loads(Path(__file__).with_name("comments.toml").read_text(encoding="utf-8"))
+    tells = read_toml(Path(__file__).with_name("comments.toml"))
     text = "# What `python3 -m lib import` reads, guessed from the files.  Look at each line.\n"
     for key, value in told.items():
         table = key in ("video", "robot", "tool", "labels")

@@ -46,8 +46,7 @@ def import_recording(source: str | Path, mapping: str | Path, out: str | Path, *
     given = Decimal("0" if estimated else str(told.robot.offset_s))
     offset_s = 0.0 if one_dated else float(stereo_zero + given - robot_zero)
     time_s, robot_s = since(stereo.time, stereo_zero), since(robot_time, robot_zero)
-    first = next(stereo.pairs())[0]
-    size = first.shape[1], first.shape[0]
+    size = next(stereo.pairs())[0].shape[1::-1]  # width and height
     labels = read_labels(folder, told.labels, stereo, told.landmarks, size) if told.labels else None
     frames_s = time_s + offset_s
     if labels is not None:  # the mean instant at which the rows of a frame's labels were read
@@ -114,7 +113,6 @@ def _landmarks(
     tool, sd = _tool(told, poses, robot_s[known], opening, frames_s, labels, zero_s)
     x = np.full((len(known), len(told.landmarks), 3), np.nan)
     x[known] = tool.positions_mm(poses, opening)
-    x[np.isnan(x).any(axis=2)] = np.nan
     kinds = {"offset_mm": tool.offset_mm, "sine_mm": tool.sine_mm, "versine_mm": tool.versine_mm, "sd_mm": sd}
     return x, {kind: dict(zip(told.landmarks, values.round(6).tolist(), strict=True)) for kind, values in kinds.items()}
 

@@ -4,8 +4,7 @@ import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
-from xml.etree import ElementTree
-from xml.etree.ElementTree import ParseError
+from xml.etree.ElementTree import ParseError, fromstring
 from zipfile import BadZipFile, ZipFile
 
 import h5py
@@ -107,7 +106,7 @@ def _cvat(path: Path) -> Iterator[Label]:
     text = _from_zip(path, "annotations.xml") if path.suffix.lower() == ".zip" else decoded(path, utf_16=True)
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise ValueError(f"{path}: the XML defines entities, which CVAT does not. Export it again.")
-    root = ElementTree.fromstring(text)
+    root = fromstring(text)
     # A track is one landmark of a video; a skeleton's points are nested and have labels of their own.
     for parent in (*root.iter("image"), *root.iter("track")):
         for points in parent.iter("points"):

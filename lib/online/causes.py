@@ -62,8 +62,9 @@ def explain(
     if len(frames) >= 4 and rig.is_affine and depth > _VOLUME_MM:
         with suppress(np.linalg.LinAlgError):
             fresh = _refitted(data, covariance_px2)
-            zoom = [_zoom(new) / _zoom(old) for new, old in ((fresh.left, rig.left), (fresh.right, rig.right))]
-            text = f"the optics changed: zoom x {zoom[0]:.3f} left, x {zoom[1]:.3f} right"
+            cameras = (fresh.left, fresh.right, rig.left, rig.right)
+            zoom = np.sqrt([np.linalg.norm(np.cross(*camera.linear)) for camera in cameras])  # px per mm, mean of x and y
+            text = f"the optics changed: zoom x {zoom[0] / zoom[2]:.3f} left, x {zoom[1] / zoom[3]:.3f} right"
             others.append((misfit(fresh, data, covariance_px2, 16), Explanation("optics", text, fresh)))
     best, other = min(others, key=lambda pair: pair[0])
     penalty = {"slipped": 3, "optics": 16, "clock": 2}.get(other.kind, 0) * np.log(2.0 * 2.0 * len(data))
@@ -128,8 +129,3 @@ def _refitted(data: Correspondences, covariance_px2: np.ndarray) -> StereoRig:
         M = np.linalg.lstsq(root * H, root * y, rcond=None)[0].T
         weight = _ROBUST / (_ROBUST + ((y - H @ M.T) ** 2).sum(axis=1) / variance)
     return StereoRig(AffineCamera(M[:2]), AffineCamera(M[2:]))
-
-
-def _zoom(camera: AffineCamera) -> float:
-    """Pixels per mm, the mean of both directions."""
-    return float(np.sqrt(np.linalg.norm(np.cross(*camera.linear))))

@@ -155,8 +155,7 @@ class RigTracker:
         result.drift = monitor.statistic
         self._recent.append(frame)
         if alarm:
-            n = max(min(monitor.since, len(self._recent)), 1)
-            self._since = [*self._since, frame] if self._before is not None else list(self._recent)[-n:]
+            self._since = [*self._since, frame] if self._before is not None else list(self._recent)[-monitor.since :]
             self.state, self.cause, self._waiting = "moved", f"images and robot disagree ({monitor.axis})", 0
             self.doubted_since = int(self._since[0].data.frame[0])
             if self._before is None:

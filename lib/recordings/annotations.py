@@ -10,7 +10,7 @@ import numpy as np
 from lib.correspondences import LANDMARKS
 from lib.files import write_text
 
-_SIDES = ("left", "right")
+SIDES = ("left", "right")
 #: Standard deviation of a label set by hand, along each axis.
 CLICK_SD_PX = 1.5
 
@@ -31,7 +31,7 @@ class Annotations:
     visibility_right: np.ndarray | None = None
 
     def __post_init__(self) -> None:
-        for side in _SIDES:
+        for side in SIDES:
             u, v = np.asarray(getattr(self, f"u_{side}"), np.float64), getattr(self, f"visibility_{side}")
             v = np.full(u.shape[:2], 2) if v is None else np.asarray(v)
             if u.ndim != 3 or u.shape[2] != 2 or v.shape != u.shape[:2] or u.shape != np.shape(self.u_left):
@@ -87,10 +87,10 @@ def read_coco(path: Path, n_frames: int, image_size_px: tuple[int, int], landmar
         file, where = PurePosixPath(image), f"{path}: image {image}"
         if not set(landmarks) <= set(names):
             raise ValueError(f"{where} has keypoints {names}; {list(landmarks)} are needed.")
-        if file.parent.name not in _SIDES or not file.stem.isdecimal() or int(file.stem) >= n_frames:
+        if file.parent.name not in SIDES or not file.stem.isdecimal() or int(file.stem) >= n_frames:
             known = f"left/000000.jpg to right/{n_frames - 1:06d}.jpg"
             raise ValueError(f"{where} is not a frame of this recording ({known}).")
-        side, frame = at = _SIDES.index(file.parent.name), int(file.stem)
+        side, frame = at = SIDES.index(file.parent.name), int(file.stem)
         if at in seen:
             raise ValueError(f"{where} is annotated twice; a frame has one tool.")
         seen.add(at)
@@ -108,7 +108,7 @@ def write_coco(
     """Write `annotations`; points that are NaN or outside the image are written as not labelled."""
     content = _empty(landmarks)
     images, entries = content["images"], content["annotations"]
-    for side in _SIDES:
+    for side in SIDES:
         us, visibilities = getattr(annotations, f"u_{side}"), getattr(annotations, f"visibility_{side}")
         for frame, (u, visibility) in enumerate(zip(us, visibilities, strict=True)):
             images.append(_image(len(images) + 1, f"{side}/{frame:06d}{suffix}", image_size_px))

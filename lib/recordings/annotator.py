@@ -3,7 +3,6 @@
 `Annotator` holds what is marked and suggested and answers the messages of its page, annotator.js, which draws.
 """
 
-import os
 from functools import cached_property
 from pathlib import Path
 
@@ -11,11 +10,10 @@ import cv2
 import numpy as np
 
 from lib.cameras import StereoRig
-from lib.correspondences import Correspondences, of_recording
-from lib.recordings.annotations import inside, mark_coco, read_coco
+from lib.correspondences import Correspondences
+from lib.recordings.annotations import SIDES, inside, mark_coco, read_coco
 from lib.recordings.recording import Recording
 
-_SIDES = ("left", "right")
 #: Depths of the viewing ray, mm about the tool, whose images make an epipolar line: a microscope's depth of field is 3 mm.
 _DEPTHS_MM = np.linspace(-20.0, 20.0, 9)
 
@@ -53,12 +51,11 @@ class Annotator:
         """Take a rig and detections that came later; an open page shows them at once."""
         n, k = len(self.recording), len(self.recording.skeleton)
         nothing = np.full((2, n, k, 2), np.nan)
-        rows = of_recording(self.recording, *nothing) if detected is None else detected
-        self._rig, self._x_mm = rig, self.recording.landmarks_mm()
-        self._x_mm[rows.frame, rows.landmark] = rows.x_mm
+        detector, self._rig, self._x_mm = nothing.copy(), rig, self.recording.landmarks_mm()
+        if rows := detected:
+            self._x_mm[rows.frame, rows.landmark] = rows.x_mm
+            detector[:, rows.frame, rows.landmark] = np.where(rows.seen.T[..., None], (rows.u_left, rows.u_right), np.nan)
         robot = nothing if rig is None else np.reshape(rig.project(self._x_mm.reshape(-1, 3)), nothing.shape)
-        detector = nothing.copy()
-        detector[:, rows.frame, rows.landmark] = np.where(rows.seen.T[..., None], (rows.u_left, rows.u_right), np.nan)
         self._suggested = {"robot": robot, "detector": detector}
         # (n,) px: the farthest that both are apart in a frame; the tool's length where the detector did not find a landmark.
         off = np.linalg.norm(robot - detector, axis=-1)
@@ -132,12 +129,12 @@ class Annotator:
         """Write changes to the file and return those that take them back."""
         r, n = self.recording, len(self.recording)
         for side, frame, landmark, x, y, v in changes:
-            if side not in _SIDES or not 0 <= frame < n or not 0 <= landmark < len(r.skeleton) or v not in (-1, 0, 1, 2):
+            if side not in SIDES or not 0 <= frame < n or not 0 <= landmark < len(r.skeleton) or v not in (-1, 0, 1, 2):
                 raise ValueError(f"mark: {side!r}, frame {frame}, landmark {landmark}, visibility {v}: no such thing here.")
             if v > 0 and not inside(np.array([x, y], np.float64), r.image_size_px):
                 raise ValueError(f"u: ({x}, {y}) lies outside the image of {r.image_size_px[0]} x {r.image_size_px[1]} px.")
         self._read()  # what another program wrote meanwhile stays
-        images = {(side, frame): self._marks[_SIDES.index(side), frame].copy() for side, frame, *_ in changes}
+        images = {(side, frame): self._marks[SIDES.index(side), frame].copy() for side, frame, *_ in changes}
         before = [(side, frame, k, *images[side, frame][k]) for side, frame, k, *_ in changes]
         for side, frame, k, x, y, v in changes:
             images[side, frame][k] = (x, y, v) if v > 0 else (np.nan, np.nan, v)
@@ -171,7 +168,7 @@ class Annotator:
             if todo == "hello":
                 r = self.recording
                 answer |= {"name": r.name, "landmarks": r.skeleton, "n": len(r), "size": r.image_size_px}
-                answer |= {"key": os.fspath(r.folder.resolve())}
+                answer |= {"key": str(r.folder.resolve())}
                 frame = int(np.argmax(np.where(self.complete, -1.0, np.nan_to_num(self.usefulness))))
             elif todo == "next":
                 frame = self.next_frame(frame)

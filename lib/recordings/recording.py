@@ -173,29 +173,23 @@ class Recording:
         moved_mm = np.linalg.norm(np.diff(self.kinematics.x_mm, axis=0, prepend=self.kinematics.x_mm[:1]), axis=2)
         jump_mm = np.nan_to_num(moved_mm).max(axis=1)
         k = int(jump_mm.argmax())
-        possible = {
-            "frame_times": (
-                uniform and logged > _LONGER * (span + 1.0 / self.fps) and logged > 2.0,
-                f"{n} frames at {self.fps:g} fps last {span:.1f} s, but the robot's log {logged:.1f} s.",
-                "If frames were left out, write their times to frames.csv (frame, time_s).",
-            ),
-            "little_overlap": (
-                reported / n < _COVERED,
-                f"The robot reports a position in {reported} of {n} frames; log and video hardly overlap.",
-                "Check offset_s and the time_s columns; export the log of the whole video.",
-            ),
-            "slow_log": (
-                usual_s > _SLOW_S,
-                f"The robot's log has a sample every {usual_s:.3g} s.",
-                "Is time_s in milliseconds? Give seconds, and ten samples a second or more.",
-            ),
-            "jump": (
-                jump_mm[k] > _JUMP_MM,
-                f"In kinematics.csv a landmark jumps by {jump_mm[k]:.0f} mm at {log_s[k]:.3f} s (line {k + 2}).",
-                "Leave the cells of a wrong sample empty.",
-            ),
-        }
-        return [Doubt(name, text, cure) for name, (found, text, cure) in possible.items() if found]
+        found = []
+        if uniform and logged > _LONGER * (span + 1.0 / self.fps) and logged > 2.0:
+            text = f"{n} frames at {self.fps:g} fps last {span:.1f} s, but the robot's log {logged:.1f} s."
+            cure = "If frames were left out, write their times to frames.csv (frame, time_s)."
+            found.append(Doubt("frame_times", text, cure))
+        if reported / n < _COVERED:
+            text = f"The robot reports a position in {reported} of {n} frames; log and video hardly overlap."
+            cure = "Check offset_s and the time_s columns; export the log of the whole video."
+            found.append(Doubt("little_overlap", text, cure))
+        if usual_s > _SLOW_S:
+            text = f"The robot's log has a sample every {usual_s:.3g} s."
+            cure = "Is time_s in milliseconds? Give seconds, and ten samples a second or more."
+            found.append(Doubt("slow_log", text, cure))
+        if jump_mm[k] > _JUMP_MM:
+            text = f"In kinematics.csv a landmark jumps by {jump_mm[k]:.0f} mm at {log_s[k]:.3f} s (line {k + 2})."
+            found.append(Doubt("jump", text, "Leave the cells of a wrong sample empty."))
+        return found
 
     def landmarks_mm(self) -> np.ndarray:
         """The robot's landmarks (n, k, 3) mm at the frames' times, NaN where the robot says nothing.
@@ -322,13 +316,6 @@ class RecordingWriter:
         finally:
             shutil.rmtree(self.folder, ignore_errors=True)
 
-    @property
-    def truth_folder(self) -> Path:
-        """truth/ of the unfinished recording, for `lib.recordings.Truth` and what else a simulator knows."""
-        folder = self.folder / "truth"
-        folder.mkdir(exist_ok=True)
-        return folder
-
     def add(self, left: np.ndarray, right: np.ndarray, time_s: float | None = None) -> None:
         """Append a stereo pair, (h, w, 3) uint8 RGB each; `time_s` on the video clock, None = uniform at fps."""
         index = len(self._time_s)
@@ -385,6 +372,7 @@ class RecordingWriter:
         try:
             os.replace(self.folder, self.target)
         except OSError:
-            os.replace(old, self.target)
+            if old.exists():
+                os.replace(old, self.target)
             raise
         shutil.rmtree(old, ignore_errors=True)

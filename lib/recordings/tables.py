@@ -127,8 +127,6 @@ def refuse(path: Path, bad: np.ndarray, problem: str) -> None:
 
 def write_table(path: Path, names: Sequence[str], values: np.ndarray, decimals: Sequence[int]) -> None:
     """Write what `read_table` reads: NaN as an empty cell, `decimals` places in each column."""
-    lines = [",".join(names)]
-    for row in np.asarray(values, dtype=np.float64):
-        cells = ("" if math.isnan(v) else f"{v:.{places}f}" for v, places in zip(row, decimals, strict=True))
-        lines.append(",".join(cells))
-    write_text(path, "\n".join(lines) + "\n")
+    rows = io.StringIO()
+    np.savetxt(rows, values, [f"%.{places}f" for places in decimals], delimiter=",")
+    write_text(path, ",".join(names) + "\n" + rows.getvalue().replace("nan", ""))

@@ -60,10 +60,11 @@ class Truth:
         return cls(rig, x, u[:, :, 0], u[:, :, 1], visibility[:, :, 0], visibility[:, :, 1], folder, *in_glint)
 
     def write(self, surface: tuple[ArrayLike, ArrayLike, ArrayLike] | None = None) -> None:
-        """Write what `read` reads into `folder`.
+        """Write what `read` reads into `folder`, of a `RecordingWriter` its folder's truth/; it is made.
 
         `surface` is (x_px (a,), y_px (b,), x_mm (b, a, 3)): surface points seen on a grid of left pixels.
         """
+        self.folder.mkdir(exist_ok=True)
         self.rig.save(self.folder / "rig.json")
         n = len(self.landmarks_mm)
         sides = (self.u_left, self.visibility_left), (self.u_right, self.visibility_right)

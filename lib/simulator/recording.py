@@ -108,7 +108,7 @@ def simulate(
         clicked = np.where(visibility[..., None] == 2, u + rng.normal(0, design.click_px, u.shape), np.nan)
         writer.annotations(*clicked, *np.where(visibility == 2, 2, 0))
         x_px, y_px, surface_mm = surface_grid(eye, microscope.rig(RigidTransform.identity()).left, microscope.image_size_px)
-        truth = Truth(microscope.rig(), to_robot(landmarks), *u, *visibility, writer.truth_folder, *in_glint)
+        truth = Truth(microscope.rig(), to_robot(landmarks), *u, *visibility, writer.folder / "truth", *in_glint)
         truth.write((x_px, y_px, to_robot(surface_mm)))
     return Recording.open(folder)
 

@@ -49,8 +49,7 @@ def _colours(x: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     elif kind == 3:  # turned about the grey axis
         x = x @ cv2.Rodrigues(np.full(3, rng.uniform(-np.pi, np.pi) / np.sqrt(3)))[0].astype(np.float32)
     elif kind == 4:
-        mix = rng.dirichlet((0.7, 0.7, 0.7), 3).T.astype(np.float32)
-        x = x @ mix
+        x = x @ rng.dirichlet((0.7, 0.7, 0.7), 3).T.astype(np.float32)
     elif kind == 5:
         x = 1 - x
     if rng.random() < 0.5:  # saturation

@@ -106,8 +106,7 @@ def _finetune(a: argparse.Namespace) -> None:
 
 def main_evaluate(argv: list[str] | None = None) -> int:
     """`python3 -m lib evaluate`: scores of a detector on a labelled recording, printed and, on request, written as JSON."""
-    description = main_evaluate.__doc__.split(": ", 1)[1]
-    parser = argparse.ArgumentParser(prog="python3 -m lib evaluate", description=description)
+    parser = argparse.ArgumentParser(prog="python3 -m lib evaluate", description=main_evaluate.__doc__.split(": ", 1)[1])
     parser.add_argument("recording", type=Path, help="folder of a recording with truth/ or annotations.json")
     parser.add_argument("--weights", help="weights file or name in data/models (default: the shipped ones)")
     parser.add_argument("--every", type=int, default=1, help="evaluate every N-th frame")

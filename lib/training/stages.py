@@ -211,25 +211,22 @@ def assemble(
     return detector
 
 
-def _trainings(provenance: dict) -> list[dict]:
-    """A training and those that it was fine-tuned from, the first one first."""
-    before = provenance.get("before")
-    return [*(_trainings(before) if before else []), provenance]
-
-
 def card(detector: Detector, path: Path) -> str:
     """The model card (Markdown) of a weights file, from its metadata."""
     p = detector.metadata
     m, trainings = p["metrics"], []
-    for stage, t in [(stage, t) for stage, last in p["stages"].items() for t in _trainings(last)]:
-        config, processes, precision = t["config"], t.get("processes") or 1, t.get("precision") or t["config"]["precision"]
-        kind = "hourglass, {stacks} x {features}" if "stacks" in config["network"] else "offset network, {features}"
-        trainings.append(
-            f"| {stage} ({kind.format(**config['network'])} features) | {t['images']} "
-            f"| {config['optimiser']} {config['learning_rate']:g} {config['schedule']}, {precision} "
-            f"| {t['steps']} x {config['batch_size']} x {processes} | {config.get('position_weight_per_px', 0):g} "
-            f"| {t['seconds'] * processes / 3600:.2f} | `{t['data']}` | `{t['commit']}` |"
-        )
+    for stage, t in reversed(p["stages"].items()):
+        while t:  # from the last training to the first
+            config, processes = t["config"], t.get("processes") or 1
+            kind = "hourglass, {stacks} x {features}" if "stacks" in config["network"] else "offset network, {features}"
+            trainings.append(
+                f"| {stage} ({kind.format(**config['network'])} features) | {t['images']} "
+                f"| {config['optimiser']} {config['learning_rate']:g} {config['schedule']}, "
+                f"{t.get('precision') or config['precision']} "
+                f"| {t['steps']} x {config['batch_size']} x {processes} | {config.get('position_weight_per_px', 0):g} "
+                f"| {t['seconds'] * processes / 3600:.2f} | `{t['data']}` | `{t['commit']}` |"
+            )
+            t = t.get("before")
     numbers = {
         "PCK@0.01, 0.05, 0.10": f"{m['pck_0_01']:.1f}, {m['pck_0_05']:.1f}, {m['pck_0_10']:.1f} %",
         "error, median and 95th percentile": f"{m['median_px']:.2f} px, {m['p95_px']:.2f} px",
@@ -251,7 +248,7 @@ Notebook 02 explains the stages.
 
 | stage | images | optimiser | steps x batch x processes | position loss, per px | process hours | data | commit |
 |---|---|---|---|---|---|---|---|
-{chr(10).join(trainings)}
+{chr(10).join(reversed(trainings))}
 
 Each training of a stage starts from the one before. The error models (covariance, confidence) are fitted on half of
 {p["validation_frames"]} held-out scenes, which have families of tools, light, ground and optics that training never draws and

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from itertools import permutations
 
 import numpy as np
+from scipy.ndimage import binary_opening
 
 from lib.calibration.checks import eyes_exchanged, sides
 from lib.correspondences import LANDMARKS, TRAIN_FURTHER, Correspondences
@@ -175,11 +176,10 @@ def _frozen(case: Case) -> Iterator[Hypothesis]:
         return
     x, y, time = (case.by_frame(v) for v in (problem.x[:, 0], problem.y.reshape(-1, 4), problem.time))
     velocity = np.diff(x, axis=0) / np.diff(time, axis=0)[..., None]
-    change = _most(np.linalg.norm(np.diff(velocity, axis=0), axis=2))
-    step_x, step_y = (_most(np.linalg.norm(np.diff(v, axis=0), axis=2)) for v in (x, y))
-    straight = np.append((change >= 0) & (change < 2e-3), False)
-    straight = np.convolve(straight, np.ones(3), "same") == 3  # five frames on one line
-    straight = np.convolve(straight, np.ones(3), "same") > 0
+    sizes = [np.linalg.norm(np.diff(v, axis=0), axis=2) for v in (velocity, x, y)]
+    # (frames,) the largest of the landmarks, -1 where all are missing
+    change, step_x, step_y = (np.where(np.isfinite(size), size, -1.0).max(axis=1) for size in sizes)
+    straight = binary_opening(np.append((change >= 0) & (change < 2e-3), False))  # five frames on one line
 
     def certain(name: str, fit: Robust, repeated: np.ndarray, text: str, cure: str) -> Hypothesis:
         share = 100.0 * float(repeated.mean())
@@ -201,11 +201,6 @@ def _frozen(case: Case) -> Iterator[Hypothesis]:
         text = "the detections repeat those of the frame before while the robot moves"
         cure = "Drop images that the camera delivered twice, and give the others their own times in frames.csv."
         yield certain("frozen_video", fit, twice, text, cure)
-
-
-def _most(sizes: np.ndarray) -> np.ndarray:
-    """(frames,) largest of (frames, landmarks), -1 where all are missing."""
-    return np.where(np.isfinite(sizes), sizes, -1.0).max(axis=1)
 
 
 def _rigid_tips(case: Case) -> Iterator[Hypothesis]:

@@ -99,8 +99,7 @@ def health(
     if not len(data):
         raise ValueError("data: no row; run the detector over some frames.")
     frame = np.unique(data.frame)
-    u = np.stack([data.grid("u_left"), data.grid("u_right")], axis=2)  # (m, 3, 2, 2)
-    u = np.where((data.grid("seen") > 0)[..., None], u, np.nan)
+    u = data.grid("stacked_px").reshape(len(frame), -1, 2, 2)  # (m, 3, 2, 2)
     with warnings.catch_warnings(action="ignore"):  # means of what no frame shows
         length = np.nanmedian(np.linalg.norm(u[:, 1:] - u[:, :1], axis=-1))
         time = np.nanmean(data.grid("time_s"), axis=1)

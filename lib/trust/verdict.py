@@ -105,7 +105,7 @@ class Verdict:
 
 def judge(
     data: Correspondences | None, calibration: Calibration | None, *, diagnosis: Diagnosis | None = None,
-    health: Health | None = None, epipolar_px: float | None = None, robot_accuracy_mm: float | None = None,
+    health: Health | None = None, epipolar_px: float | None = None, robot_accuracy_mm: float = 0.010,
     error: Exception | None = None, doubts: Sequence[Doubt] = (),
 ) -> Verdict:  # fmt: skip
     """The verdict on a calibration from its own numbers and from witnesses; what is None is left out.
@@ -114,7 +114,7 @@ def judge(
         data: What was calibrated with; only its frames tell whether they are enough.
         calibration: None where it was refused; then `error` is the exception.
         epipolar_px: Median epipolar distance of matches between the two images, which know nothing of the tool.
-        robot_accuracy_mm: As its maker states it; None is 10 um.
+        robot_accuracy_mm: As its maker states it.
         doubts: Of the recording (`lib.recordings.Recording.doubts`).
     """
     found: list[Reason] = []
@@ -126,8 +126,7 @@ def judge(
         cure = f"{_OVERLAYS}; where the detector errs, {TRAIN_FURTHER}."
         found.append(Reason(name, LEVELS[2], f"There is no calibration: {error}", cure))
     else:
-        robot_mm = 0.01 if robot_accuracy_mm is None else robot_accuracy_mm
-        for finding in (*_residuals(data, calibration, robot_mm), *_geometry(calibration, robot_mm)):
+        for finding in (*_residuals(data, calibration, robot_accuracy_mm), *_geometry(calibration, robot_accuracy_mm)):
             found += _reason(*finding)
         if epipolar_px is not None and np.isfinite(epipolar_px):
             n, middle = calibration.pair.epipolar_normal, calibration.x_mm[calibration.inliers].mean(axis=0)
@@ -269,7 +268,7 @@ def assess(
     return Assessment(data, calibration, Verdict(tuple(told)), diagnosis, found, epipolar_px)
 
 
-def report(calibration: Calibration, *, verdict: Verdict | None = None, robot_accuracy_mm: float | None = None) -> str:
+def report(calibration: Calibration, *, verdict: Verdict | None = None, robot_accuracy_mm: float = 0.010) -> str:
     """A calibration in several lines of text, with at most ten outliers, largest residual first.
 
     Without the verdict of `lib.trust.assess`, the calibration's own numbers are judged alone.

@@ -27,7 +27,7 @@ _TOLD = ("numpy", "scipy", "torch", "kornia", "opencv-python-headless", "open3d-
 _GRID = re.compile(r";\s*grid:(.*)$")
 #: A comma outside brackets.
 _COMMA = re.compile(r",(?![^\[({]*[\])}])")
-#: Tags of papermill's own cells: values given, error marks.
+#: Tags of papermill's own cells (values given, error marks), which the author does not count.
 _ADDED = {"injected-parameters", "papermill-error-cell-tag"}
 #: What kernels inherit: this interpreter's own kernel, quiet libraries, and that nobody answers what they show.
 _KERNEL_ENVIRONMENT = {
@@ -165,7 +165,7 @@ def execute(
 
     def on_cell_start(cell, cell_index):
         nonlocal running
-        running += not _is_added(cell)
+        running += not _ADDED & set(cell.metadata.get("tags", []))
 
     os.environ.pop("JUPYTER_PATH", None)
     os.environ.update(_KERNEL_ENVIRONMENT)
@@ -191,7 +191,7 @@ def execute(
 
 def _failure_of(executed: Path) -> Failure | None:
     """Judge an executed notebook by its outputs; one that `report.stop` ended went well."""
-    cells = [cell for cell in nbformat.read(executed, as_version=4).cells if not _is_added(cell)]
+    cells = [cell for cell in nbformat.read(executed, as_version=4).cells if not _ADDED & set(cell.metadata.get("tags", []))]
     for number, cell in enumerate(cells, start=1):
         if cell.cell_type != "code" or "raises-exception" in cell.metadata.get("tags", []):
             continue
@@ -205,11 +205,6 @@ def _failure_of(executed: Path) -> Failure | None:
         if cell.source.strip() and status not in (None, "completed"):
             return Failure("error", number, f"the cell is {status}.")
     return None
-
-
-def _is_added(cell) -> bool:
-    """papermill's own cells (values given, error marks), which the author does not count."""
-    return bool(_ADDED & set(cell.metadata.get("tags", [])))
 
 
 class Stated(NamedTuple):

@@ -61,7 +61,7 @@ def written(tmp_path_factory):
         grid = np.arange(0.0, 64, 8), np.arange(0.0, 48, 8)
         surface = np.stack([*np.meshgrid(*grid), np.ones((6, 8))], axis=-1)
         in_glint = np.arange(2 * N * 3).reshape(2, N, 3) % 5 == 0
-        truth = Truth(reference_rig(), tool(N), *u, visibility, visibility, writer.truth_folder, *in_glint)
+        truth = Truth(reference_rig(), tool(N), *u, visibility, visibility, writer.folder / "truth", *in_glint)
         truth.write(surface=(*grid, surface))
     return folder, u
 
@@ -605,3 +605,17 @@ def test_doubts(frames, times, jump, name):
 def test_nothing_is_interpolated_in_a_gap():
     log = Kinematics(np.array([0.0, 0.01, 0.02, 3600.0, 3600.01]), np.zeros((5, 3, 3)))
     assert np.isfinite(log.at([0.015, 0.02, 1800.0, 3600.0, 3600.005])[:, 0, 0]).tolist() == [True, True, False, True, True]
+
+
+def test_a_move_that_fails_says_why_and_leaves_nothing(tmp_path, monkeypatch):
+    writer = RecordingWriter(tmp_path / "r", name="r", fps=25, image_size_px=SIZE)
+    with pytest.raises(OSError, match="No space left"), writer:
+        for left, right in frames():
+            writer.add(left, right)
+        writer.kinematics(np.linspace(-1, 1, 50), tool(50))
+        monkeypatch.setattr("lib.recordings.recording.os.replace", full_disk)
+    assert not list(tmp_path.iterdir())
+
+
+def full_disk(*_):
+    raise OSError(errno.ENOSPC, "No space left on device")
