@@ -31,11 +31,13 @@ class Resection:
         K: (2, 2) upper triangular [[alpha_x, skew], [0, alpha_y]], px per mm.
         R: (3, 3) rotation camera_from_robot; its third row is the viewing direction, away from the camera.
         t: (2,) mm, so that u = K (R[:2] @ x + t).
+        mirrored: As the caller said: one affine camera alone cannot tell (a reflection only flips R's unseen third row).
     """
 
     K: np.ndarray
     R: np.ndarray
     t: np.ndarray
+    mirrored: bool = False
 
 
 @runtime_checkable
@@ -110,10 +112,11 @@ class AffineCamera(MatrixCamera):
         """Homogeneous P (3, 4); an affine camera's last row is (0, 0, 0, 1)."""
         return np.vstack([self.matrix, [0.0, 0.0, 0.0, 1.0]])
 
-    def resect(self) -> Resection:
+    def resect(self, *, mirrored: bool = False) -> Resection:
         """K, R and t of the camera by RQ factorisation (paper Eq. 5).
 
-        One affine camera alone cannot tell whether its optics mirror the image: that only flips R's unseen third row.
+        With optics that flip the image (`mirrored`: an odd number of reflections) R maps to the unflipped camera frame,
+        whose third axis still points away from the camera.
         """
         a_x, a_y = self.linear
         alpha_y = np.linalg.norm(a_y)
@@ -122,7 +125,9 @@ class AffineCamera(MatrixCamera):
         alpha_x = np.linalg.norm(a_x - skew * r_2)
         r_1 = (a_x - skew * r_2) / alpha_x
         K = np.array([[alpha_x, skew], [0.0, alpha_y]])
-        return Resection(K, np.stack([r_1, r_2, np.cross(r_1, r_2)]), np.linalg.solve(K, self.offset_px))
+        if mirrored:
+            r_1, K = -r_1, K @ np.diag([-1.0, 1.0])
+        return Resection(K, np.stack([r_1, r_2, np.cross(r_1, r_2)]), np.linalg.solve(K, self.offset_px), mirrored)
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,7 +190,8 @@ class NearAffineCamera(MatrixCamera):
         if not self.radial_per_px2:
             return u
         w = u - self.centre_px
-        radius = distorted = np.linalg.norm(w, axis=1)
+        distorted = np.linalg.norm(w, axis=1)
+        radius = distorted.copy()
         for _ in range(20):
             step = (radius + self.radial_per_px2 * radius**3 - distorted) / (1 + 3 * self.radial_per_px2 * radius**2)
             radius = radius - step

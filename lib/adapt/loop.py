@@ -206,19 +206,19 @@ class _Work:
     def moving(self, seen: Seen, detector: Detector) -> Seen:
         """`seen`, and other tools where those that it holds stand still while the robot moves."""
         still = standing_still(seen, self.recording.landmarks_mm()[seen.frame])
-        if not still.any() or not self.learns:
+        if not still.any() or not self.learns or detector.tool_network is None:
             return seen
         self.report["notes"].append(
-            f"In {still.sum()} of {still.size} images the detector takes for the tool what stands still while the robot "
-            "moves: another object, or a pattern. There it has looked for the tool elsewhere."
+            f"In {still.sum()} of {still.size} images what the detector takes for the tool stands still while the robot "
+            "moves: it is another object, or a pattern. There the detector looked for the tool elsewhere."
         )
         return self.kept("elsewhere", partial(look_elsewhere, self.recording, detector, seen, still))
 
-    def kept(self, name: str, look: Callable[..., Seen]) -> Seen:
-        """What `look` finds, or what an earlier call kept."""
+    def kept(self, name: str, find: Callable[..., Seen]) -> Seen:
+        """What `find` finds, or what an earlier call kept."""
         path = self.folder / f"{name}.npz"
         if not path.is_file():
-            found = look(progress=partial(self.say, f"Looking ({name})"))
+            found = find(progress=partial(self.say, f"Looking ({name})"))
             with files.whole(path) as new:
                 np.savez(new, **found._asdict())
         with np.load(path) as kept:

@@ -93,7 +93,11 @@ def look(
     progress: Callable[[float], None] | None = None,
 ) -> Seen:  # fmt: skip
     """What a detector finds in some frames; with `near` (m, 2, 3, 2) px its later stages alone, which look there."""
-    found = []
+    found, later = [], []
+    if near is not None:
+        # A window shows the whole tool: closeups alone would add their constant error to the place in every round.
+        later = [stage for stage in detector.stages if stage not in ("frame", "tool", "tracking")]
+        later = later if {"again", "window"} & {*later} else ["tracking", "tracking"]
     for i, number in enumerate(frames):
         frame = recording.frames[int(number)]
         pair = np.stack([frame.left, frame.right])
@@ -101,11 +105,11 @@ def look(
             found.append(detector(pair))
         else:
             known = np.isfinite(near[i]).all(axis=-1)
-            rough = Landmarks(near[i], np.tile(np.eye(2), (2, 3, 1, 1)), known.astype(float))
-            for stage in detector.stages:
-                # A window shows the whole tool: closeups alone would add their constant error to the place in every round.
-                if stage not in ("frame", "tool", "tracking"):
-                    rough = detector.refine(pair, rough, stage)
+            known &= known[:, :1] & known[:, 1:].any(axis=1, keepdims=True)  # no window without base and tip
+            u = np.where(known[..., None], near[i], np.nan)
+            rough = Landmarks(u, np.tile(np.eye(2), (2, 3, 1, 1)), known.astype(float))
+            for stage in later:
+                rough = detector.refine(pair, rough, stage)
             found.append(rough)
         if progress is not None:
             progress((i + 1) / len(frames))
@@ -117,14 +121,16 @@ def standing_still(seen: Seen, x_mm: np.ndarray) -> np.ndarray:
 
     The robot moves in more than one direction, since a tool that moves along the view stands still in the image.
     """
-    centre, length_mm = x_mm.mean(axis=1), np.nanmedian(np.linalg.norm(x_mm[:, 1:].mean(axis=1) - x_mm[:, 0], axis=-1))
-    found = np.zeros((len(x_mm), 2), bool)
-    for i, side in np.argwhere(np.isfinite(seen.u).all(axis=(2, 3)) & np.isfinite(centre).all(axis=1, keepdims=True)):
+    centre, length_mm = x_mm.mean(axis=1), np.linalg.norm(x_mm[:, 1:].mean(axis=1) - x_mm[:, 0], axis=-1)
+    known, found = np.isfinite(centre).all(axis=1), np.zeros((len(x_mm), 2), bool)
+    least_mm = 2 * _STILL * np.median(length_mm[known]) if known.any() else 0.0
+    for i, side in np.argwhere(np.isfinite(seen.u).all(axis=(2, 3)) & known[:, None]):
         u = seen.u[:, side]
         near = np.linalg.norm(u - u[i], axis=2).mean(axis=1) < _STILL * tool_length_px(u[i : i + 1])
-        at = centre[near & np.isfinite(centre).all(axis=1)]
-        spread = np.linalg.svd(at - at.mean(axis=0), compute_uv=False) / np.sqrt(len(at))
-        found[i, side] = len(at) >= _STILL_FRAMES and spread[1] > 2 * _STILL * length_mm
+        at = centre[near & known]
+        if len(at) >= _STILL_FRAMES:
+            spread = np.linalg.svd(at - at.mean(axis=0), compute_uv=False) / np.sqrt(len(at))
+            found[i, side] = spread[1] > least_mm
     return found
 
 
@@ -257,7 +263,7 @@ def teach(
     """The robot as the teacher of what a detector has `seen` in the frames for learning.
 
     Args:
-        opinion: Of closeups that were never taught by this robot.  They tell the landmarks' offsets; None: `seen` does.
+        opinion: Of later stages that this robot never taught.  They tell the landmarks' offsets; None: `seen` does.
         before: The teacher of the round before: its clock is the start, and what it refused stays refused.
         from_labels: `seen` are labels set by hand, of few frames.
 
@@ -273,10 +279,10 @@ def teach(
     recording, clock_sd_s = _clock(recording if before is None else before.recording, used)
     try:
         calibration, right = _calibrated(recording, used, from_labels)
-    except RefusalError:  # few right ones agree on cameras by a clock that is off, and do not tell its offset
-        if from_labels:
+    except RefusalError as error:  # few right ones agree on cameras by a clock that is off, and do not tell its offset
+        if from_labels or error.__cause__ is not None:
             raise
-        recording, clock_sd_s = _scanned_clock(recording, used), 0.01
+        recording, clock_sd_s = _scanned_clock(recording, used, lambda found: found.view_inliers.sum()), 0.01
         calibration, right = _calibrated(recording, used, from_labels)
     if not from_labels:
         again, sd = _clock(recording, used, calibration)
@@ -336,7 +342,7 @@ def _clock(recording: Recording, seen: Seen, calibration: Calibration | None = N
     if calibration is not None:  # of the rows that agree alone
         rows = replace(rows, confidence=np.where(calibration.view_inliers, rows.confidence, 0.0))
     if len(seen.frame) < 8:  # too few for that: the offset at which cameras explain the labels best
-        return _scanned_clock(recording, seen), 0.01
+        return _scanned_clock(recording, seen, lambda found: -found.reprojection_rms_px), 0.01
     for reach_s in (0.2, 1.0):
         try:
             found = estimate_time_offset(rows, recording.kinematics, start_s=recording.offset_s, search_s=reach_s)
@@ -348,16 +354,19 @@ def _clock(recording: Recording, seen: Seen, calibration: Calibration | None = N
     return recording, 0.005
 
 
-def _scanned_clock(recording: Recording, seen: Seen) -> Recording:
-    """The recording with the offset of the clocks, of 41 within 0.2 s, at which the most landmarks agree best on cameras."""
-    def merit(offset_s: float) -> tuple[float, float]:
-        try:
-            found = _fitted(replace(recording, offset_s=offset_s), seen, 0.0)
-        except ValueError:
-            return -np.inf, 0.0
-        return found.view_inliers.sum(), -found.reprojection_rms_px
+def _scanned_clock(recording: Recording, seen: Seen, merit: Callable[[Calibration], float]) -> Recording:
+    """The recording with the offset of the clocks that gives cameras of the highest merit; 41 within 0.2 s are tried.
 
-    return replace(recording, offset_s=max((recording.offset_s + np.linspace(-0.2, 0.2, 41)).tolist(), key=merit))
+    Of equal ones the smallest change; none where no offset gives cameras.
+    """
+    def merit_at(change_s: float) -> float:
+        try:
+            return merit(_fitted(replace(recording, offset_s=recording.offset_s + change_s), seen, 0.0))
+        except ValueError:
+            return -np.inf
+
+    tried = sorted(np.linspace(-0.2, 0.2, 41).round(9).tolist(), key=abs)
+    return replace(recording, offset_s=recording.offset_s + max(tried, key=merit_at))
 
 
 def _fitted(recording: Recording, seen: Seen, least: float, ransac_px: float | None = None) -> Calibration:
@@ -369,7 +378,7 @@ def _fitted(recording: Recording, seen: Seen, least: float, ransac_px: float | N
 def _calibrated(recording: Recording, seen: Seen, from_labels: bool) -> tuple[Calibration, float]:
     """Cameras that the detections agree on, the confident ones if all do not, and the share of landmarks that agree."""
     told = 6 * int(np.isfinite(recording.landmarks_mm()[seen.frame]).all(axis=(1, 2)).sum())
-    length, reason, best, poor, competing = tool_length_px(seen.u), "none was found", None, None, False
+    length, reason, best, poor, competing = tool_length_px(seen.u), "none was found", None, None, None
     near_px = _NEAR * float(np.quantile(length[np.isfinite(length)], 0.25)) if np.isfinite(length).any() else 0.0
     # Offsets of an unknown tool widen the errors of the right ones, until the wrong ones do not stand apart.
     ways = [(0.0, None)] if from_labels else [*((least, None) for least in _CONFIDENCES), (MIN_CONFIDENCE, near_px)]
@@ -381,7 +390,7 @@ def _calibrated(recording: Recording, seen: Seen, from_labels: bool) -> tuple[Ca
         except ValueError as error:
             if ransac_px is None and (not competing or isinstance(error, CompetingCamerasError)):
                 reason = str(error).partition(". ")[0].partition("; ")[0]  # their cures lead here
-            competing = competing or isinstance(error, CompetingCamerasError)
+            competing = error if isinstance(error, CompetingCamerasError) else competing
             continue
         right = float(found.view_inliers.sum() / max(told, 1))
         if from_labels:
@@ -396,7 +405,7 @@ def _calibrated(recording: Recording, seen: Seen, from_labels: bool) -> tuple[Ca
             poor = poor or (found, right)
     if best or poor:
         return best or poor
-    raise RefusalError(f"detector: too few landmarks are right to start from ({reason}). {_LABEL}")
+    raise RefusalError(f"detector: too few landmarks are right to start from ({reason}). {_LABEL}") from competing
 
 
 def _fault(recording: Recording, seen: Seen, calibration: Calibration, from_labels: bool) -> Hypothesis | None:

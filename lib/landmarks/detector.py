@@ -236,8 +236,8 @@ class Detector:
     def __call__(self, images: ArrayLike, *, batch: int = 4, avoid: np.ndarray | None = None) -> Landmarks:
         """Landmarks of images (n, h, w, 3), uint8 RGB or float in [0, 1]; `batch` images at a time.
 
-        `avoid` (k, 3, 2) px are what looks like the tool and is none, such as a second instrument.  Raises `ValueError` for
-        images of another shape, type or range.
+        `avoid` (k, 3, 2) px are what looks like the tool and is none, such as a second instrument; it needs
+        the second stage.  Raises `ValueError` for images of another shape, type or range.
         """
         images = as_uint8(images)
         found = []
@@ -311,9 +311,9 @@ class Detector:
             u, twice = self._looked(images[i], u[best], "again")
             scores = _scores(u, twice, avoid)
             chosen = scores.argmax()
-            found = candidates[best[[chosen]]] if np.isfinite(scores[chosen]) else Landmarks.none(1)
-            result._put(np.array([i]), found)
-            height[i] = twice[chosen]
+            there = np.isfinite(scores[chosen])
+            result._put(np.array([i]), candidates[best[[chosen]]] if there else Landmarks.none(1))
+            height[i] = twice[chosen] if there else 0.0
         unsure = searched | (rough.confidence < _SURE).any(1)
         return replace(result, confidence=np.where(unsure[:, None], _SURE * height[:, None], rough.confidence))
 

@@ -128,5 +128,5 @@ def refuse(path: Path, bad: np.ndarray, problem: str) -> None:
 def write_table(path: Path, names: Sequence[str], values: np.ndarray, decimals: Sequence[int]) -> None:
     """Write what `read_table` reads: NaN as an empty cell, `decimals` places in each column."""
     rows = io.StringIO()
-    np.savetxt(rows, values, [f"%.{places}f" for places in decimals], delimiter=",")
+    np.savetxt(rows, np.reshape(values, (-1, len(names))), [f"%.{places}f" for places in decimals], delimiter=",")
     write_text(path, ",".join(names) + "\n" + rows.getvalue().replace("nan", ""))

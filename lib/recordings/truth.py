@@ -60,7 +60,7 @@ class Truth:
         return cls(rig, x, u[:, :, 0], u[:, :, 1], visibility[:, :, 0], visibility[:, :, 1], folder, *in_glint)
 
     def write(self, surface: tuple[ArrayLike, ArrayLike, ArrayLike] | None = None) -> None:
-        """Write what `read` reads into `folder`, of a `RecordingWriter` its folder's truth/; it is made.
+        """Write what `read` reads into `folder`, which is made; of a `RecordingWriter` that is ``writer.folder / "truth"``.
 
         `surface` is (x_px (a,), y_px (b,), x_mm (b, a, 3)): surface points seen on a grid of left pixels.
         """

@@ -305,7 +305,7 @@ def test_labels_teach_a_tool_that_no_closeup_knows(world, recording, tmp_path, m
     assert not adapt(recording, Lost(world.u, wrong=0.97), folder=tmp_path / "none", **how).improved
 
 
-def test_closeups_that_see_no_end_of_the_shaft_do_not_drift_along_it(world, recording, tmp_path, monkeypatch):
+def test_a_base_without_an_edge_does_not_drift_along_the_shaft(world, recording, tmp_path, monkeypatch):
     class Blurred(StandIn):
         """Its window errs by half a pixel wherever it is placed; each of its closeups moves the base on by 0.3."""
 

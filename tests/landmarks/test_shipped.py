@@ -63,7 +63,8 @@ def test_what_is_to_be_avoided_is_not_found_but_the_other_tool_is(shipped):
     for avoided, other in ((0, 1), (1, 0)):
         found = shipped.default(both, avoid=tools[[avoided]])
         assert (np.linalg.norm(found.u[0] - tools[other], axis=1) < 0.05 * tool_length_px(tools[[other]])).all()
-    assert not (shipped.default(both, avoid=tools).confidence > 0.5).any()
+    nothing = shipped.default(both, avoid=tools)
+    assert not (nothing.confidence > 0.5).any() and (nothing.confidence[np.isnan(nothing.u[..., 0])] == 0).all()
 
 
 def test_without_a_second_stage_nothing_is_searched(shipped):
