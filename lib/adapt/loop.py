@@ -18,13 +18,13 @@ from lib.adapt.teacher import (
     RefusalError,
     Seen,
     Teacher,
+    at_rest,
     longest_still,
     look,
     look_elsewhere,
-    standing_still,
     stretches,
     teach,
-)  # fmt: skip
+)
 from lib.calibration import Calibration
 from lib.correspondences import LANDMARKS
 from lib.landmarks import Detector, SharedDetector
@@ -205,7 +205,7 @@ class _Work:
 
     def moving(self, seen: Seen, detector: Detector) -> Seen:
         """`seen`, and other tools where those that it holds stand still while the robot moves."""
-        still = standing_still(seen, self.recording.landmarks_mm()[seen.frame])
+        still = at_rest(seen, self.recording.landmarks_mm()[seen.frame])
         if not still.any() or not self.learns or detector.tool_network is None:
             return seen
         self.report["notes"].append(

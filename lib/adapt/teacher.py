@@ -116,7 +116,7 @@ def look(
     return Seen(np.asarray(frames), *(np.stack([getattr(p, n) for p in found]) for n in ("u", "covariance", "confidence")))
 
 
-def standing_still(seen: Seen, x_mm: np.ndarray) -> np.ndarray:
+def at_rest(seen: Seen, x_mm: np.ndarray) -> np.ndarray:
     """(m, 2) which tools stand in their image where those of other frames do, while the robot's x_mm (m, 3, 3) moves.
 
     The robot moves in more than one direction, since a tool that moves along the view stands still in the image.
@@ -137,7 +137,7 @@ def standing_still(seen: Seen, x_mm: np.ndarray) -> np.ndarray:
 def look_elsewhere(
     recording: Recording, detector: Callable, seen: Seen, still: np.ndarray, progress: Callable[[float], None] | None = None
 ) -> Seen:
-    """`seen`, but where tools are `still` (m, 2): there what else the detector finds."""
+    """`seen`; where its tools are `still` (m, 2), what the detector finds in other places of the image instead."""
     found, images = Seen(*(part.copy() for part in seen)), np.argwhere(still)
     for k, (i, side) in enumerate(images):
         frame = recording.frames[int(seen.frame[i])]

@@ -8,7 +8,7 @@ import pytest
 
 from lib.adapt import RefusalError, adapt, loop, report, teach
 from lib.adapt.judging import Agreement, better
-from lib.adapt.teacher import look, look_elsewhere, standing_still, stretches
+from lib.adapt.teacher import at_rest, look, look_elsewhere, stretches
 from lib.calibration.offsets import tool_axes
 from lib.landmarks import Detector, Landmarks
 from lib.recordings.annotations import Annotations, write_coco
@@ -116,10 +116,10 @@ def test_what_stands_still_while_the_robot_moves_is_not_the_tool(world, recordin
     seen, x = look(recording, StandIn(world.u, noise_px=0.7, wrong=0.0), np.arange(world.n)), world.at(world.time_s)
     pattern = np.arange(world.n) % 2 == 1
     seen.u[pattern] = seen.u[3] + np.random.default_rng(0).normal(0, 1.0, (pattern.sum(), 2, 3, 2))
-    assert (standing_still(seen, x) == pattern[:, None]).all()
+    assert (at_rest(seen, x) == pattern[:, None]).all()
     seen.u[:], depth = seen.u[2], np.zeros_like(x)
     depth[:, :, 2] = np.linspace(0, 5, world.n)[:, None]
-    assert not standing_still(seen, x[2] + depth).any()
+    assert not at_rest(seen, x[2] + depth).any()
 
     def elsewhere(image, avoid):
         assert avoid.shape == (world.n, 3, 2)
