@@ -1,4 +1,4 @@
-"""How well detections agree with the robot, and left with right by an epipolar geometry that the robot has no part in."""
+"""Frames that judge, how well detections agree there with the robot, and left with right by an own epipolar geometry."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,6 +13,24 @@ from lib.trust.health import affine_epipolar, feature_matches
 #: Distances count up to this share of the tool's length, and so does a landmark that is missing.
 _CAP = 0.1
 _FEWEST = 60  # features of the eye, below which the detections' own geometry has to do
+
+
+def stretches(frames: np.ndarray, time_s: np.ndarray) -> dict[str, np.ndarray]:
+    """Frames for learning, stopping and judging: three stretches of time with gaps of a frame and of 0.2 s between them.
+
+    >>> parts = stretches(np.arange(40), np.arange(40) / 4)
+    >>> [(int(part[0]), int(part[-1])) for part in parts.values()]
+    [(0, 24), (26, 31), (33, 39)]
+    """
+    n = len(frames)
+    if n < 17:  # fewer leave less than three to judge by
+        raise RefusalError(f"recording: {n} frames are too few to learn from and to judge by; record 30 and more.")
+    first, second = round(0.64 * n), round(0.79 * n)
+    parts = {"learn": frames[: first - 1], "stop": frames[first:second], "judge": frames[second + 1 :]}
+    for before, part in (("learn", "stop"), ("stop", "judge")):
+        late = time_s[parts[part]] - time_s[parts[before][-1]] >= min(0.2, 0.02 * np.ptp(time_s[frames]))
+        parts[part] = parts[part][late]
+    return parts
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,18 +13,8 @@ import cv2
 import numpy as np
 
 from lib import files, paths
-from lib.adapt.judging import Agreement, agreement, better, epipolar_px, frame_means
-from lib.adapt.teacher import (
-    RefusalError,
-    Seen,
-    Teacher,
-    at_rest,
-    longest_still,
-    look,
-    look_elsewhere,
-    stretches,
-    teach,
-)
+from lib.adapt.judging import Agreement, agreement, better, epipolar_px, frame_means, stretches
+from lib.adapt.teacher import RefusalError, Seen, Teacher, at_rest, longest_still, look, look_elsewhere, teach
 from lib.calibration import Calibration
 from lib.correspondences import LANDMARKS
 from lib.landmarks import Detector, SharedDetector
@@ -333,7 +323,7 @@ class _Work:
         """Compare the detectors on the frames that took no part."""
         seen = first.of(self.parts["judge"]), best_seen.of(self.parts["judge"])
         agreements, distances = [agreement(teacher, own) for own in seen], epipolar_px(self.recording, seen, best_seen)
-        length = agreements[0].length_px.mean(axis=1)
+        length, (told, spread) = agreements[0].length_px.mean(axis=1), teacher.project(self.parts["judge"])
         robot, robot_sd = better(*(own.relative for own in agreements))
         eye, eye_sd = better(*(frame_means(own / length) for own in distances))
         improved = best is not self.detector and robot > 2 * robot_sd and eye > 0
@@ -343,6 +333,12 @@ class _Work:
             "left and right of the frames for judging do not agree better, in which the robot has no part": not eye > 0,
             "the frames for judging agree better with the robot, and left with right": True,
         }
+        labels_sd_px = np.nanmedian(np.sqrt(np.trace(spread, axis1=-2, axis2=-1) / 2), axis=(0, 1))
+        self.report["notes"].append(
+            "Where the robot puts the landmarks in the images has standard deviations of "
+            f"{', '.join(f'{sd:.1f}' for sd in labels_sd_px)} px ({', '.join(LANDMARKS)}). Most of that error is the same in "
+            "all frames: agreement with the robot does not show it."
+        )
         self.report |= {
             "improved": bool(improved), "reason": next(reason for reason, holds in reasons.items() if holds),
             "judged": {
@@ -353,6 +349,7 @@ class _Work:
             "offset_s": teacher.recording.offset_s, "clock_sd_s": teacher.clock_sd_s,
             "landmark_offset_mm": teacher.offset_mm, "landmark_offset_sd_mm": teacher.offset_sd_mm,
             "landmark_offset_turns_axes": teacher.turns,
+            "labels_sd_px": labels_sd_px,
             "gauge": "An offset that all landmarks share and a shift of the cameras look alike: the deviations leave it out. "
             "An offset of the robot and a constant error of the detector look alike, too; labels set by hand tell.",
         }  # fmt: skip
@@ -360,7 +357,7 @@ class _Work:
             best = replace(best, metadata=best.metadata | {"adapted": self.finished()})
         return Adaptation(
             best if improved else self.detector, teacher.calibration, self.finished(), bool(improved), self.parts,
-            agreements[1], seen, teacher.project(self.parts["judge"])[0],
+            agreements[1], seen, told,
         )  # fmt: skip
 
 

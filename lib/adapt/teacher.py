@@ -149,24 +149,6 @@ def look_elsewhere(
     return found
 
 
-def stretches(frames: np.ndarray, time_s: np.ndarray) -> dict[str, np.ndarray]:
-    """Frames for learning, stopping and judging: three stretches of time with gaps of a frame and of 0.2 s between them.
-
-    >>> parts = stretches(np.arange(40), np.arange(40) / 4)
-    >>> [(int(part[0]), int(part[-1])) for part in parts.values()]
-    [(0, 24), (26, 31), (33, 39)]
-    """
-    n = len(frames)
-    if n < 17:  # fewer leave less than three to judge by
-        raise RefusalError(f"recording: {n} frames are too few to learn from and to judge by; record 30 and more.")
-    first, second = round(0.64 * n), round(0.79 * n)
-    parts = {"learn": frames[: first - 1], "stop": frames[first:second], "judge": frames[second + 1 :]}
-    for before, part in (("learn", "stop"), ("stop", "judge")):
-        late = time_s[parts[part]] - time_s[parts[before][-1]] >= min(0.2, 0.02 * np.ptp(time_s[frames]))
-        parts[part] = parts[part][late]
-    return parts
-
-
 def longest_still(recording: Recording, seen: Seen) -> tuple[np.ndarray, str]:
     """The frames before or after the cameras moved, whichever are more, and what to say of it; all if they did not."""
     rows, frames = seen.rows(_clock(recording, seen)[0]), seen.frame

@@ -30,7 +30,7 @@ from lib.landmarks.error_model import ErrorModel, Rough, closeup_peaks, correcte
 from lib.landmarks.heatmaps import Peaks, decode
 from lib.landmarks.metrics import tool_length_px
 from lib.landmarks.network import Network, OffsetNetwork, StackedHourglass, as_tensor, as_uint8
-from lib.landmarks.search import PEAKS, at_one_place, best_tools, likelihood, without_peak
+from lib.landmarks.search import PEAKS, best_tools, likelihood, without_peak
 from lib.parallel import single_threaded_torch
 from lib.recordings import Recording
 
@@ -307,9 +307,9 @@ class Detector:
         searched = (height < _SHOWN) | (avoid is not None)
         for i in np.flatnonzero(searched):
             candidates, u, once = self.proposed(images[i], rough[i : i + 1])
-            best = np.argsort(-_scores(u, once, avoid))[:_AGAIN]
+            best = np.argsort(-likelihood(u, once, avoid))[:_AGAIN]
             u, twice = self._looked(images[i], u[best], "again")
-            scores = _scores(u, twice, avoid)
+            scores = likelihood(u, twice, avoid)
             chosen = scores.argmax()
             there = np.isfinite(scores[chosen])
             result._put(np.array([i]), candidates[best[[chosen]]] if there else Landmarks.none(1))
@@ -450,12 +450,6 @@ class Detector:
         fit = self.error_models.get(stage, ErrorModel())
         covariance, confidence = covariance_and_confidence(peaks.double(), rough, fit, landmark)
         return Landmarks(peaks.u.numpy(), covariance.numpy(), confidence.numpy())
-
-
-def _scores(u: np.ndarray, height: np.ndarray, avoid: np.ndarray | None) -> np.ndarray:
-    """`likelihood` of tools u (n, 3, 2), none where they are to be avoided."""
-    scores = likelihood(u, height)
-    return scores if avoid is None else np.where(at_one_place(u, avoid), -np.inf, scores)
 
 
 def _through_inverse(matrices: np.ndarray, u: np.ndarray) -> np.ndarray:

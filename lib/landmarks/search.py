@@ -51,9 +51,14 @@ def best_tools(u: np.ndarray, height: np.ndarray, n: int) -> np.ndarray:
     return which[chosen]
 
 
-def likelihood(u: np.ndarray, height: np.ndarray) -> np.ndarray:
-    """Scores (n,) of tools u (n, 3, 2), by the mean height (n,) of their peaks and by opening: a rod looks like shut jaws."""
-    return height + _OPEN * np.nan_to_num(np.linalg.norm(u[:, 1] - u[:, 2], axis=1) / np.maximum(tool_length_px(u), 1.0))
+def likelihood(u: np.ndarray, height: np.ndarray, avoid: np.ndarray | None = None) -> np.ndarray:
+    """Scores (n,) of tools u (n, 3, 2), by the mean height (n,) of their peaks and by opening: a rod looks like shut jaws.
+
+    They are -inf where one of the tools `avoid` (k, 3, 2) stands.
+    """
+    opening = np.linalg.norm(u[:, 1] - u[:, 2], axis=1) / np.maximum(tool_length_px(u), 1.0)
+    away = True if avoid is None else ~at_one_place(u, avoid)
+    return np.where(away, height + _OPEN * np.nan_to_num(opening), -np.inf)
 
 
 def at_one_place(u: np.ndarray, tools: np.ndarray) -> np.ndarray:

@@ -4,7 +4,7 @@ import argparse
 import base64
 import shlex
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -24,6 +24,7 @@ _COLOURS = np.array([*LANDMARK_COLOURS.values()])
 _SHOWN = 3  # best frames, and worst
 _MOST_FRAMES = 60  # spread over the recording; more take longer and say little more
 _SHOWN_PX = 760  # width of one image of an overlay
+_USE = "Use it: `python3 -m lib run"
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +116,7 @@ def check(recording: str | Path | Recording, *, detector: Callable | None = None
     else:
         raise ValueError(f"{found.folder}: the detector knows {', '.join(LANDMARKS)} only, and there are no annotations.")
     a = assess(found, data, detector=detector)
-    next_step = "Use it: `python3 -m lib run -p recording RECORDING`."
+    next_step = f"{_USE} -p recording RECORDING`."
     if a.verdict.level != LEVELS[0]:
         next_step = a.verdict.reasons[0].cure if a.diagnosis.best is None else a.diagnosis.best.cure
     return Check(found, a, _facts(found, a), next_step.replace("RECORDING", shlex.quote(paths.shown(found.folder))))
@@ -191,6 +192,8 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="of check.html and check.json (default: runs/check-NAME)")
     a = parser.parse_args(argv)
     found = check(a.recording, detector=Detector.load(a.weights) if a.weights else None)
+    if a.weights:  # notebook 07 alone takes others than those that ship
+        found = replace(found, next_step=found.next_step.replace(_USE, f"{_USE} 07 -p weights {shlex.quote(a.weights)}"))
     page = found.write(a.out or paths.RUNS / f"check-{a.recording.resolve().name}")
     print(f"{found.assessment.verdict}\nNext: {found.next_step}\nReport: {page}")
     return 0

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from lib.adapt import RefusalError, adapt, loop, report, teach
-from lib.adapt.judging import Agreement, better
-from lib.adapt.teacher import at_rest, look, look_elsewhere, stretches
+from lib.adapt.judging import Agreement, better, stretches
+from lib.adapt.teacher import at_rest, look, look_elsewhere
 from lib.calibration.offsets import tool_axes
 from lib.landmarks import Detector, Landmarks
 from lib.recordings.annotations import Annotations, write_coco

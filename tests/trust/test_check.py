@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -66,6 +67,17 @@ def test_nothing_found_is_said_once_and_the_command_ends_well(folder, tmp_path, 
     said = capsys.readouterr().out
     assert "the detector failed on 10 frames" in said and f"lib adapt {folder}" in said and "RECORDING" not in said
     assert f"lib adapt {folder}" in content["next_step"] or content["next_step"] in said
+
+
+def test_the_next_step_names_the_weights_that_were_given(folder, detector, tmp_path, monkeypatch, capsys):
+    good = replace(check(folder, detector=detector), next_step=f"Use it: `python3 -m lib run -p recording {folder}`.")
+    monkeypatch.setattr(module.Detector, "load", lambda path: detector)
+    monkeypatch.setattr(module, "check", lambda recording, detector: good)
+    assert main([str(folder), "--out", str(tmp_path), "--weights", "my weights.safetensors"]) == 0
+    step = f"`python3 -m lib run 07 -p weights 'my weights.safetensors' -p recording {folder}`"
+    assert step in capsys.readouterr().out
+    assert main([str(folder), "--out", str(tmp_path)]) == 0
+    assert "run -p recording" in capsys.readouterr().out
 
 
 def test_a_second_check_reads_what_the_first_has_detected(folder, detector, tmp_path, monkeypatch):
