@@ -151,13 +151,17 @@ def _fixed(polygon: np.ndarray) -> np.ndarray:
 
 
 def _shadowed(x: np.ndarray, parts: list[Part], length: float, rng: np.random.Generator) -> np.ndarray:
-    mask = np.zeros(x.shape[:2], np.float32)
-    offset = rng.normal(0, 0.6, 2) * length
-    grown = rng.uniform(0.8, 1.3)
-    for line, radius in parts:
-        cv2.fillPoly(mask, [_fixed(_outline(line + offset, grown * radius, -1, 1))], 1.0, cv2.LINE_AA, 4)
-    mask = cv2.GaussianBlur(mask, (0, 0), np.exp(rng.uniform(np.log(0.5), np.log(0.2 * length + 1))))
-    return x * (1 - np.float32(rng.uniform(0.2, 0.9)) * mask)[..., None]
+    """Up to three shadows of the tool: a light on one side turns, stretches and moves it, and a second tool seems to be there."""
+    for _ in range(rng.choice(3, p=[0.6, 0.3, 0.1]) + 1):
+        mask, grown = np.zeros(x.shape[:2], np.float32), rng.uniform(0.8, 1.3)
+        base, offset = parts[1][0][0], rng.normal(0, rng.choice([0.15, 0.6]), 2) * length
+        cast = cv2.Rodrigues(np.array([0, 0, rng.normal(0, 0.2)]))[0][:2, :2] @ (np.eye(2) + rng.normal(0, 0.12, (2, 2)))
+        for line, radius in parts:
+            line = (line - base) @ cast.T + base + offset
+            cv2.fillPoly(mask, [_fixed(_outline(line, grown * radius, -1, 1))], 1.0, cv2.LINE_AA, 4)
+        mask = cv2.GaussianBlur(mask, (0, 0), np.exp(rng.uniform(np.log(0.5), np.log(0.2 * length + 1))))
+        x = x * (1 - np.float32(rng.uniform(0.2, 0.9)) * mask)[..., None]
+    return x
 
 
 def _painted(x: np.ndarray, parts: list[Part], length: float, rng: np.random.Generator) -> np.ndarray:
