@@ -151,7 +151,7 @@ def _fixed(polygon: np.ndarray) -> np.ndarray:
 
 
 def _shadowed(x: np.ndarray, parts: list[Part], length: float, rng: np.random.Generator) -> np.ndarray:
-    """Up to three shadows of the tool: a light on one side turns, stretches and moves it, and a second tool seems to be there."""
+    """With up to three shadows, which lights from the side turn, stretch and move, until they look like tools."""
     for _ in range(rng.choice(3, p=[0.6, 0.3, 0.1]) + 1):
         mask, grown = np.zeros(x.shape[:2], np.float32), rng.uniform(0.8, 1.3)
         base, offset = parts[1][0][0], rng.normal(0, rng.choice([0.15, 0.6]), 2) * length
