@@ -80,7 +80,6 @@ def drawn_tool(
     back = np.linspace(0, 1, 12)[:, None]
     bent = rng.normal(0, 0.03) if rng.random() < 0.2 else 0.0
     shaft = base - back * 1.6 * w * ahead + (bent * back**2) * 1.6 * w * np.array([-ahead[1], ahead[0]])
-    shaft += rng.uniform(0, 0.02) * length * ahead * (1 - back)  # it ends where the jaws leave it
     radius = shaft_radius * (1 + rng.uniform(-0.2, 1.2) * back[:, 0])
     if rng.random() < 0.3:  # a sleeve
         radius = np.where(np.arange(12) > rng.integers(1, 4), radius * rng.uniform(1.1, 2.0), radius)
