@@ -36,8 +36,6 @@ _PROPOSED = 0.4
 _DISGUISE_PX = 40.0
 #: Drawn tools in closeups: their length, and the blur of lens and sensor, px.
 _DRAWN_LENGTH_PX, _DRAWN_BLUR_PX = (90.0, 450.0), (0.4, 3.0)
-#: Drawn bases for each drawn tip: where a drawn jaw leaves its shaft is less exact than where it ends.
-_DRAWN_BASES = 0.3
 
 
 @dataclass(frozen=True)
@@ -265,7 +263,7 @@ class CloseupSource(Source):
         x, y = rng.integers(0, shards.BLOCK_PX, 2, endpoint=True)
         h, w = (side - shards.BLOCK_PX for side in self.crops.shape[1:3])
         crop, u = self.crops[index, y : y + h, x : x + w], self.u[index] - (x, y)
-        if self.drawn and rng.random() < self.drawn * (1 if k else _DRAWN_BASES):
+        if rng.random() < self.drawn:
             length, blur = (np.exp(rng.uniform(*np.log(r))) for r in (_DRAWN_LENGTH_PX, _DRAWN_BLUR_PX))
             crop, u, _ = drawn_tool(drawn_ground(crop, rng), rng, length_px=length, around=k)
             crop = cv2.GaussianBlur(crop, (0, 0), blur)
