@@ -1,4 +1,4 @@
-"""Frames that judge, how well detections agree there with the robot, and left with right by an own epipolar geometry."""
+"""The frames for judging, and how well detections agree there: with the robot, and left with right by epipolar lines."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
