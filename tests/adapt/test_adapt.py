@@ -254,6 +254,13 @@ def test_a_half_wrong_detector_is_improved(continued):
     assert all(int(one.name.split()[1]) in numbers["learn"] for call in tune.calls for one in call["images"])
 
 
+def test_the_stated_deviations_of_the_labels_cover_their_errors(world, continued):
+    found, sd_px = continued[0], np.array(continued[0].report["labels_sd_px"])
+    off = found.told - np.asarray(world.u)[found.frames["judge"]]
+    assert (np.sqrt(np.nanmean(off**2, axis=(0, 1, 3))) < 3 * sd_px).all() and (sd_px < 3.0).all()
+    assert ", ".join(f"{sd:.1f}" for sd in sd_px) in found.report["notes"][-1]
+
+
 def test_a_good_detector_is_left_alone(world, recording, tmp_path):
     detector = StandIn(world.u, noise_px=0.2)
     found = adapt(recording, detector, folder=tmp_path, progress=False, tune=pupil(world))
