@@ -23,6 +23,8 @@ from lib.least_squares import inverse
 _OFFSET_ROWS = 24
 #: Axes turn where offsets as large are so improbable without any, and if that moves landmarks by more than this.
 _SURE_OFFSETS, _LEAST_TURN_MM = 1e-3, 0.005
+#: Axes turn unless their log likelihood is lower by more than this.
+_AS_LIKELY = 3.0
 
 
 def calibrate(
@@ -107,8 +109,8 @@ def calibrate(
             known, effective = sandwich(J, weight, r, *order)
             found = replace(found, parameter_covariance=known, effective_rows=effective)
     else:
-        estimate = partial(estimate_offsets, fitted, x, y, rows.landmark, frame=rows.frame, prior_sd=offset_prior_sd)
-        found = estimate(axes=axes)
+        estimate = partial(estimate_offsets, fitted, x, y, rows.landmark, rows.frame, prior_sd=offset_prior_sd)
+        found = estimate(axes=None if axes is None else lambda offset: axes)
         if axes is not None:
             found = _turned(found, estimate, data, usable, axes)
     return found if usable is None else _spread_out(found, usable)
@@ -136,23 +138,25 @@ def _usable_rows(data: Correspondences, offsets: bool | str | None, weighting: s
 def _turned(
     found: Calibration, estimate: Callable[..., Calibration], data: Correspondences, usable: np.ndarray, axes: np.ndarray
 ) -> Calibration:
-    """The calibration with the axes of the moved landmarks, if these explain the detections better than the reported ones.
+    """The calibration with the axes of the moved landmarks, unless the reported ones explain the detections better.
 
     What a robot with a wrong tool reports is off in the axes of the true tool, and turns the axes of the reported one.
+    Offsets that turn the axes that much are more often the robot's than the detector's.
     """
-    other = found
-    for _ in range(3 if found.offsets.p_value < _SURE_OFFSETS else 0):
-        offset = other.offsets.offset
-        turned = rows_axes(data, offset)[usable]
-        if np.einsum("nij,nj->ni", turned - axes, offset[data.landmark[usable]]).std() < _LEAST_TURN_MM:
-            return found
-        try:
-            other = estimate(axes=turned)
-        except ValueError:  # no cameras fit them
-            return found
-    both = np.repeat(found.view_inliers & other.view_inliers, 2, axis=1)
-    fewer = other.view_inliers.sum() < 0.98 * found.view_inliers.sum()
-    if fewer or np.linalg.norm(found.residuals_px[both]) <= np.linalg.norm(other.residuals_px[both]):
+    def turned(offset: np.ndarray) -> np.ndarray:
+        return rows_axes(data, offset)[usable]
+
+    offset = found.offsets.offset
+    turn_mm = np.einsum("nij,nj->ni", turned(offset) - axes, offset[data.landmark[usable]]).std()
+    if found.offsets.p_value >= _SURE_OFFSETS or turn_mm < _LEAST_TURN_MM:
+        return found
+    try:
+        other = estimate(axes=turned, start=found)
+    except ValueError:  # no cameras fit them
+        return found
+    used = np.repeat(found.view_inliers, 2, axis=1)
+    worse = np.linalg.norm(other.residuals_px[used]) / np.linalg.norm(found.residuals_px[used])
+    if used.sum() * np.log(worse) > _AS_LIKELY:
         return found
     return replace(other, offsets=replace(other.offsets, turns=True))
 

@@ -18,6 +18,9 @@ from lib.calibration.calibration import Calibration, LandmarkOffsets
 from lib.calibration.scatter import sandwich
 from lib.correspondences import Correspondences
 
+#: Step of the offsets' derivatives, mm or px.
+_STEP = 1e-4
+
 
 def tool_axes(x_mm: ArrayLike, offset_mm: np.ndarray | None = None) -> np.ndarray:
     """Axes R (n, 3, 3) of a forceps from its landmarks (n, 3, 3) mm: columns along it, from tip to tip, and their normal.
@@ -32,20 +35,28 @@ def tool_axes(x_mm: ArrayLike, offset_mm: np.ndarray | None = None) -> np.ndarra
     if x.ndim != 3 or x.shape[1:] != (3, 3):
         raise ValueError(f"x_mm: expected base, tip_1 and tip_2 (n, 3, 3), got {x.shape}.")
     offset = np.zeros((3, 3)) if offset_mm is None else offset_mm
-    middle, apart, axes = offset[1:].mean(axis=0) - offset[0], offset[2] - offset[1], np.zeros((len(x), 3, 3))
-    for _ in range(1 if offset_mm is None else 10):  # of the direction along the tool; the turn about it is exact
-        along = x[:, 1:].mean(axis=1) - x[:, 0] + np.nan_to_num(axes) @ middle
-        length = np.linalg.norm(along, axis=1, keepdims=True)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            along, across = along / length, x[:, 2] - x[:, 1]
-            across = across - (across * along).sum(axis=1, keepdims=True) * along
-            width = np.linalg.norm(across, axis=1, keepdims=True)
-            across, sine = across / width, -apart[2] / width
-            cosine = np.sqrt(1 - sine**2)
-            is_open = apart[1] + cosine * width > 0.05 * length
-            across = np.where(is_open, cosine * across - sine * np.cross(along, across), np.nan)
-        axes = np.stack([along, across, np.cross(along, across)], axis=2)
-    return axes
+    middle, apart = offset[1:].mean(axis=0) - offset[0], offset[2] - offset[1]
+    along, across = x[:, 1:].mean(axis=1) - x[:, 0], x[:, 2] - x[:, 1]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        # In the tool's axes the reported vector along the tool is known but for its length; so is the height, along the
+        # normal, of the one from tip to tip.  Together they are all three angles.
+        size = np.linalg.norm(along, axis=1)
+        straight = np.sqrt(size**2 - middle[1] ** 2 - middle[2] ** 2)
+        a = np.stack([straight, *np.broadcast_arrays(-middle[1], -middle[2], straight)[:2]], axis=1) / size[:, None]
+        up = np.array([0.0, 0.0, 1.0]) - a[:, 2:] * a
+        up /= np.linalg.norm(up, axis=1, keepdims=True)
+        side, m = np.cross(up, a), along / size[:, None]
+        beside = (across * m).sum(axis=1, keepdims=True)
+        across = across - beside * m
+        width = np.linalg.norm(across, axis=1, keepdims=True)
+        sine = (-apart[2] - beside * a[:, 2:]) / (width * up[:, 2:])
+        cosine, c = np.sqrt(1 - sine**2), across / width
+        g = np.cross(m, c)
+        own = np.stack([a, side, up], axis=2)
+        axes = np.stack([m, cosine * c - sine * g, sine * c + cosine * g], axis=2) @ own.mT
+        opening = apart[1] + (beside * a + width * (cosine * side + sine * up))[:, 1]
+        is_open = opening > 0.05 * (straight + middle[0])
+    return np.where(is_open[:, None, None], axes, np.nan)
 
 
 def rows_axes(data: Correspondences, offset_mm: np.ndarray | None = None) -> np.ndarray:
@@ -79,27 +90,37 @@ def with_offsets(data: Correspondences, offsets: LandmarkOffsets | None) -> Corr
 
 
 def estimate_offsets(
-    fit: Callable[..., Calibration], x: np.ndarray, y: np.ndarray, landmark: np.ndarray,
-    axes: np.ndarray | None, frame: np.ndarray, prior_sd: float | None = None, iterations: int = 20,
+    fit: Callable[..., Calibration], x: np.ndarray, y: np.ndarray, landmark: np.ndarray, frame: np.ndarray,
+    axes: Callable[[np.ndarray], np.ndarray] | None = None, prior_sd: float | None = None, iterations: int = 20,
+    start: Calibration | None = None,
 ) -> Calibration:  # fmt: skip
-    """The calibration with one constant offset a landmark, in the tool's axes (n, 3, 3) or (axes=None) in the images.
+    """The calibration with one constant offset a landmark, in the tool's axes or (axes=None) in the images.
 
     Gauss-Newton on the offsets with the cameras eliminated: every step is a whole calibration `fit` of positions (n, 3) and
     pixels (n, m) with the `views` to use, and one Schur complement; a `RuntimeWarning` where `iterations` are too few.
+    `axes` takes offsets (landmarks, 3) and returns the axes (n, 3, 3) of the rows.  `start` gives the first offsets, their
+    prior, and the views, which stay.
     Without `prior_sd` it is the one that makes the data most probable, between 0.1 and 300 um, or 0.01 and 30 px.
     """
     m = y.shape[1]
-    size = m if axes is None else 3
-    offset, p_value, views = np.zeros((int(landmark.max()) + 1, size)), np.nan, None
+    offset, p_value, views = np.zeros((int(landmark.max()) + 1, m if axes is None else 3)), np.nan, None
+    if start is not None:
+        offset, prior_sd, p_value = start.offsets.offset, start.offsets.prior_sd, start.offsets.p_value
+        views = start.view_inliers
+    step, share = np.zeros(offset.size), 1.0
+
+    def shift(offset: np.ndarray) -> np.ndarray:
+        return offset[landmark] if axes is None else np.einsum("nij,nj->ni", axes(offset), offset[landmark])
+
     for i in range(iterations):
-        shift = offset[landmark]
-        moved = (x, y - shift) if axes is None else (x + np.einsum("nij,nj->ni", axes, shift), y)
-        found = fit(*moved, views=views)
-        views = found.view_inliers if i >= 2 else None  # outliers that come and go from step to step would be no end
+        found = fit(*((x, y - shift(offset)) if axes is None else (x + shift(offset), y)), views=views)
+        # Outliers that come and go from step to step would be no end.
+        views = found.view_inliers if i >= 2 or start is not None else None
         rows = found.inliers
         J_x, J_c, weight, r = found.system
-        J_o = J_x @ axes[rows] if axes is not None else np.broadcast_to(np.eye(m), (rows.sum(), m, m))
-        J = (J_o[:, :, None] * (landmark[rows][:, None] == np.arange(len(offset)))[:, None, :, None]).reshape(len(r), m, -1)
+        steps = _STEP * np.eye(offset.size).reshape(-1, *offset.shape)  # of a central difference, since axes turn
+        J = np.stack([shift(offset + one) - shift(offset - one) for one in steps], axis=2)[rows] / (2 * _STEP)
+        J = J if axes is None else J_x @ J
         WJ = weight @ J
         H_co = np.einsum("nip,niq->pq", J_c, WJ)
         explained = np.linalg.solve(np.einsum("nip,niq->pq", J_c, weight @ J_c), H_co)
@@ -109,8 +130,9 @@ def estimate_offsets(
             chosen_sd, p_value = _evidence(information, gradient, 1e-4 if axes is not None else 1e-2)
             prior_sd = prior_sd or chosen_sd
         covariance = np.linalg.inv(information + np.eye(offset.size) / prior_sd**2)
-        step = covariance @ (gradient - offset.ravel() / prior_sd**2)
-        offset = offset + step.reshape(offset.shape)
+        before, step = step, covariance @ (gradient - offset.ravel() / prior_sd**2)
+        share = max(share / 2, 0.25) if step @ before < 0 else min(2 * share, 1.0)  # to and fro: it went too far
+        offset = offset + share * step.reshape(offset.shape)
         if np.abs(step).max() < 1e-4 * np.sqrt(np.diag(covariance).min()):
             break
     else:
@@ -119,7 +141,7 @@ def estimate_offsets(
             "steps; look at the outliers (`ransac_px`).",
             RuntimeWarning, stacklevel=3,
         )  # fmt: skip
-    p = J_c.shape[2]
+    p, size = J_c.shape[2], offset.shape[1]
     prior = np.diag(np.repeat([0.0, prior_sd**-2], [p, offset.size]))
     full, effective = sandwich(np.concatenate([J_c, J], axis=2), weight, r, frame[rows], landmark[rows], prior)
     blocks = np.stack([full[j : j + size, j : j + size] for j in range(p, len(full), size)])

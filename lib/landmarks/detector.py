@@ -48,9 +48,6 @@ _SHOWN, _SCALES = 0.75, (0.75, 1.0, 1.5, 2.2)
 _SURE = 0.5  # a confidence of the first stage below this, or after a search, becomes this times the height of the peaks
 #: So many candidates are looked at once, and so many of them twice; none where all peaks are lower than the third number.
 _CANDIDATES, _AGAIN, _NOTHING = 24, 6, 0.01
-#: A tracked landmark that moved farther than this, in closeups of scale 1, gets a second closeup.  After a shorter way one
-#: closeup is as exact, as validation images of other eyes and tools say.
-_SECOND_LOOK_PX = 4.0
 #: Stages that use another stage's network.
 _NETWORK_OF = {"again": "tool", "closer": "closeup", "tracking": "closeup"}
 
@@ -247,9 +244,11 @@ class Detector:
                 rough = self.coarse(part)
                 seen = self.stage_peaks(part, rough.u, "tool") if self.tool_network else None
                 result = self.searched(part, rough, seen, avoid)
-                same = np.array_equal(result.u, rough.u, equal_nan=True)
+                same, before = np.array_equal(result.u, rough.u, equal_nan=True), rough
                 for stage in [stage for stage in self.stages[1:] if stage != "tracking"]:
-                    result = self.refine(part, result, stage, seen if same and stage == "tool" else None)
+                    again = view.moved_far(before.u, result.u) if stage == "closer" else None
+                    before = result
+                    result = self.refine(part, result, stage, seen if same and stage == "tool" else None, only=again)
                 found.append(result)
         return Landmarks.join(found)
 
@@ -269,10 +268,7 @@ class Detector:
             with self._threads():
                 part, near = images if usable.size == len(images) else images[usable], previous[usable]  # a pair takes 12 MB
                 found = self.refine(part, near, "tracking")
-                scale = view.closeup_scale(np.maximum(tool_length_px(near.u), 1.0))[:, None]
-                if np.nanmax(np.linalg.norm(found.u - near.u, axis=2) * scale, initial=0.0) > _SECOND_LOOK_PX:
-                    found = self.refine(part, found, "tracking")
-                result._put(usable, found)
+                result._put(usable, self.refine(part, found, "tracking", only=view.moved_far(near.u, found.u)))
         lost = np.flatnonzero((result.confidence < min_confidence).any(1))
         if lost.size:
             result._put(lost, self(images[lost]))
@@ -349,12 +345,15 @@ class Detector:
         height[i, k] = peaks.value[:, 0].numpy()
         return found, np.clip(height, 0, 1).mean(1)
 
-    def refine(self, images: np.ndarray, rough: Landmarks, stage: str, seen: tuple | None = None) -> Landmarks:
+    def refine(
+        self, images: np.ndarray, rough: Landmarks, stage: str, seen: tuple | None = None, *, only: np.ndarray | None = None
+    ) -> Landmarks:
         """Landmarks by a later stage, which looks where the `rough` ones lie; ``"tracking"`` is one too.
 
-        `seen` is what `stage_peaks` gave for them, if that is known.
+        `seen` is what `stage_peaks` gave for them, if that is known.  Closeups are of the landmarks `only` (n, 3); the others
+        stay as they are.
         """
-        peaks, matrices, which = seen or self.stage_peaks(images, rough.u, stage)
+        peaks, matrices, which = seen or self.stage_peaks(images, rough.u, stage, only)
         result = Landmarks(rough.u.copy(), rough.covariance.copy(), rough.confidence.copy())
         fine = self._measured(peaks, self.rough_in_windows(rough, matrices, which, stage), stage, which[:, 1:])
         u, back = _through_inverse(matrices, fine.u[:, 0]), np.linalg.inv(matrices[:, :, :2])
@@ -386,8 +385,10 @@ class Detector:
         heatmaps = self.outputs(self.reduced(as_uint8(images)), "frame")
         return decode(heatmaps, self.frame_network.stride, method=self.method)
 
-    def windows(self, images: np.ndarray, u: ArrayLike, stage: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The inputs of a stage after the first, round rough landmarks u (n, 3, 2).
+    def windows(
+        self, images: np.ndarray, u: ArrayLike, stage: str, only: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The inputs of a stage after the first, round rough landmarks u (n, 3, 2), of closeups the landmarks `only` (n, 3).
 
         Returns windows (m, s, s, 3) uint8; window_from_image (m, 2, 3); and which (m, 2) image and landmark each window
         shows, or which image (m,) for the looks at the tool.  A tool without base or tips and a missing landmark have no
@@ -400,7 +401,7 @@ class Detector:
             matrices, which = view.window_from_image(centre[image], angle[image], size, view.tool_zoom(length[image])), image
         else:
             size = self.closeup_network.config.size_px if stage in CLOSE else self.window_px
-            which = np.argwhere(np.isfinite(u).all(2) & np.isfinite(angle)[:, None])
+            which = np.argwhere(np.isfinite(u).all(2) & np.isfinite(angle)[:, None] & (True if only is None else only))
             image, landmark = which.T
             place = u[image, landmark], angle[image], size
             window = stage == "window"
@@ -413,11 +414,13 @@ class Detector:
         with torch.inference_mode():
             return self._run[stage](as_tensor(images))[-1]
 
-    def stage_peaks(self, images: np.ndarray, u: ArrayLike, stage: str) -> tuple[Peaks, np.ndarray, np.ndarray]:
+    def stage_peaks(
+        self, images: np.ndarray, u: ArrayLike, stage: str, only: np.ndarray | None = None
+    ) -> tuple[Peaks, np.ndarray, np.ndarray]:
         """Peaks (m, 1) of a stage after the first in its windows' pixels, window_from_image (m, 2, 3), and which (m, 2)
         image and landmark each is.
         """
-        windows, matrices, which = self.windows(images, u, stage)
+        windows, matrices, which = self.windows(images, u, stage, only)
         if not len(which):
             return Peaks(*(torch.zeros(0, 1, *s) for s in ((2,), (), (), (2, 2), ()))), matrices, np.zeros((0, 2), int)
         outputs = self.outputs(windows, stage)
@@ -443,6 +446,9 @@ class Detector:
             return images
         size = tuple(int(v) for v in np.round(images.shape[2:0:-1] / stride))
         how = cv2.INTER_AREA if stride.max() > 1 else cv2.INTER_LINEAR
+        if stride.min() >= 4:  # OpenCV is quick at halving
+            half = tuple(side // 2 for side in images.shape[2:0:-1])
+            images = [cv2.resize(image, half, interpolation=how) for image in images]
         return np.stack([cv2.resize(image, size, interpolation=how) for image in images])
 
     def _measured(self, peaks: Peaks, rough: Rough | None, stage: str, landmark: np.ndarray | slice = np.s_[:]) -> Landmarks:

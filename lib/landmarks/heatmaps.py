@@ -14,6 +14,8 @@ from torch import Tensor
 SIGMA_PX = 5.0
 #: The methods of `decode`.  Three more are compared in notebook 02 (`notebooks/studies/decoders.py`).
 DECODERS = ("paper", "gauss_newton")
+#: A fit ends when its steps, in cells and shares, are below this.
+_SETTLED = 1e-4
 
 
 def sigma_cells(stride: int, sigma_px: float = SIGMA_PX) -> float:
@@ -117,20 +119,29 @@ def _gauss_newton(
     theta = torch.stack([*(start - cell).double().unbind(-1), one, value.double(), 0 * one], -1)
 
     def model(theta: Tensor) -> tuple[Tensor, Tensor]:
-        x, y, width, a, b = (t[..., None] for t in theta.unbind(-1))
-        dx, dy, s2 = offsets[:, 0] - x, offsets[:, 1] - y, (width * sigma) ** 2
-        g = torch.exp(-0.5 * (dx**2 + dy**2) / s2)
-        jacobian = torch.stack([a * g * dx / s2, a * g * dy / s2, a * g * (dx**2 + dy**2) / (s2 * width), g, g * 0 + 1])
-        return (p - a * g - b) * weight, jacobian.movedim(0, -1) * weight[..., None]
+        width, a, b = theta[..., None, 2:].unbind(-1)
+        apart = offsets - theta[..., None, :2]
+        s2 = (width * sigma) ** 2
+        q = apart.square().sum(-1) / s2
+        g = torch.exp(-0.5 * q) * weight
+        ag = a * g
+        jacobian = [(ag / s2)[..., None] * apart, torch.stack([ag * q / width, g, weight.expand_as(g)], -1)]
+        return (p - b) * weight - ag, torch.cat(jacobian, -1)
 
     eye = torch.eye(5, dtype=torch.float64, device=p.device)
-    step_limit = torch.tensor([0.7 * sigma, 0.7 * sigma, 0.4, 1.0, 1.0], dtype=torch.float64, device=p.device)
+    bounds = [[0.7 * sigma, 0.7 * sigma, 0.4, 1.0, 1.0], [torch.inf, torch.inf, 3.0, torch.inf, torch.inf]]
+    longest, most = torch.tensor(bounds, dtype=torch.float64, device=p.device)
+    least = torch.where(most < torch.inf, 0.3, -torch.inf)
+    settled = torch.zeros_like(one, dtype=torch.bool)  # peak by peak: what else the batch holds changes none
     for _ in range(iterations):
         residual, jacobian = model(theta)
         transposed = jacobian.transpose(-1, -2)  # ONNX does not know .mT
         step = _solve(transposed @ jacobian + 1e-6 * eye, transposed @ residual[..., None])[..., 0]
-        theta = theta + torch.maximum(torch.minimum(step, step_limit), -step_limit)
-        theta = torch.cat([theta[..., :2], theta[..., 2:3].clamp(0.3, 3.0), theta[..., 3:]], -1)
+        step = torch.maximum(torch.minimum(step, longest), -longest).masked_fill(settled[..., None], 0.0)
+        theta = torch.maximum(torch.minimum(theta + step, most), least)
+        settled = settled | (step.abs() < _SETTLED).all(-1)
+        if not torch.onnx.is_in_onnx_export() and settled.all():
+            break
     residual, jacobian = model(theta)
     variance = residual.square().sum(-1) / (weight.sum(-1) - 5).clamp_min(1) + 1e-8
     normal, unit = jacobian.transpose(-1, -2) @ jacobian + 1e-6 * eye, eye[:, :2].expand(*jacobian.shape[:-2], 5, 2)

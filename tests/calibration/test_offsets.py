@@ -39,6 +39,32 @@ def test_axes_of_a_tool_that_is_reported_off(width_mm, side):
     assert np.isnan(tool_axes(np.zeros((1, 3, 3)), offset)).any()
 
 
+#: As large as a third of a tool of 0.6 mm, and as its jaws' opening.
+LARGE_MM = np.array([[0.006, -0.078, -0.184], [-0.082, -0.109, 0.146], [0.146, 0.074, -0.115]])
+
+
+@pytest.mark.parametrize("width_mm", [0.25, 0.32, 0.41])
+def test_axes_of_a_short_tool_that_is_reported_far_off(width_mm):
+    tool = np.array([[0.0, 0.0, 0.0], [0.56, 0.1 - width_mm / 2, 0.0], [0.52, 0.1 + width_mm / 2, 0.0]])
+    tool[1:] -= [0, tool[1:].mean(axis=0)[1], 0]
+    R = RigidTransform.from_rotation_vector((0.3, -1.2, 2.0), (5, 6, 7))
+    np.testing.assert_allclose(tool_axes(R.apply(tool - LARGE_MM)[None], LARGE_MM)[0], R.R, atol=1e-9)
+
+
+def test_large_offsets_of_a_short_tool_are_found():
+    rng, (data, rig, _) = np.random.default_rng(5), tool_sweep(5)
+    x, offset = data.grid("x_mm"), 0.6 * LARGE_MM
+    middle = x.mean(axis=1, keepdims=True)
+    x = middle + 0.3 * (x - middle)
+    x[:, 1:] += (x[:, 1:].mean(axis=1, keepdims=True) - x[:, 1:]) * rng.uniform(-0.4, 0.3, (len(x), 1, 1))  # jaws that open
+    reported = x - np.einsum("nij,kj->nki", tool_axes(x), offset) + rng.normal(0, 0.003, x.shape)
+    u = [p + rng.normal(0, 0.5, p.shape) for p in rig.project(x.reshape(-1, 3))]
+    found = calibrate(Correspondences.of_points(reported.reshape(-1, 3), *u, frame=data.frame, landmark=data.landmark))
+    assert found.offsets.turns and found.reprojection_rms_px < 1.5
+    apart = found.offsets.offset - offset
+    assert np.abs(apart - apart.mean(axis=0)).max() < 0.02  # what all share looks like a shift of the cameras
+
+
 @pytest.mark.parametrize(
     ("model", "distance_mm", "runs"), [("zero_skew", np.inf, 5), ("affine", np.inf, 3), ("near_affine", 200.0, 2)]
 )
@@ -154,7 +180,7 @@ def test_too_few_steps_are_told():
     with pytest.warns(RuntimeWarning, match=r"offsets: they still move by up to .* mm after 1 steps"):
         estimate_offsets(
             lambda x, y, views: calibrate(x, [y[:, :2], y[:, 2:]]),
-            data.x_mm, y, data.landmark, axes, data.frame, iterations=1,
+            data.x_mm, y, data.landmark, data.frame, lambda offset: axes, iterations=1,
         )
 
 

@@ -241,12 +241,12 @@ def test_a_closeup_moves_what_the_stage_before_found(images):
 def test_tracking_looks_twice_where_the_tool_moved_far_and_knows_when_it_lost_it(images, monkeypatch, way_px, looks_twice):
     closeup = OffsetNetwork(OffsetConfig(4, 32)).eval()
     detector = replace(untrained(), closeup_network=closeup)
-    looks = []
+    looks, every = [], np.ones((1, 3), bool)
 
-    def refined(self, part, rough, stage):
-        looks.append(stage)
+    def refined(self, part, rough, stage, *, only=every):
+        looks.append(only.sum())
         return Landmarks(
-            rough.u + way_px / closeup_scale(length), rough.covariance,
+            rough.u + only[..., None] * way_px / closeup_scale(length), rough.covariance,
             np.full((len(part), 3), 0.9 if rough.u[0, 0, 0] < 50 else 0.1),
         )
 
@@ -254,8 +254,8 @@ def test_tracking_looks_twice_where_the_tool_moved_far_and_knows_when_it_lost_it
     before = Landmarks(np.full((1, 3, 2), 20.0), np.tile(np.eye(2), (1, 3, 1, 1)), np.ones((1, 3)))
     length = np.maximum(tool_length_px(before.u), 1.0)
     found = detector.track(images[:1], before).u
-    assert looks == ["tracking"] * (2 if looks_twice else 1)
-    np.testing.assert_allclose(found, before.u + len(looks) * way_px / closeup_scale(length))
+    assert looks == [3, 3 * looks_twice]
+    np.testing.assert_allclose(found, before.u + sum(looks) / 3 * way_px / closeup_scale(length))
     lost = replace(before, u=before.u + 40)
     monkeypatch.setattr(Detector, "__call__", lambda self, part: before)
     np.testing.assert_array_equal(detector.track(images[:1], lost).u, before.u)
