@@ -46,7 +46,10 @@ _SURE_MOVE = 0.1
 #: A tool stands still if others stand nearer than this share of its length, in so many frames and more with itself.
 _STILL, _STILL_FRAMES = 0.15, 4
 _CONFIDENCES = (MIN_CONFIDENCE, 0.5, 0.8)
-_NEAR = 0.1  # share of a short tool's length: as near a detection is taken for right where the noise does not tell
+#: Share of the tool's length: as near to where it should be a detection is taken for right, farther for another thing.
+_NEAR = 0.1
+#: A landmark that is seen there so much more rarely than another one is one that the detector takes for another point.
+_KNOWN = 0.25
 _LABEL = (
     "Label 10 pairs of frames (5 at least), far apart in place and depth (`python3 -m lib annotate RECORDING`), and give "
     "annotations.json with --labels."
@@ -110,7 +113,9 @@ def look(
             rough = Landmarks(u, np.tile(np.eye(2), (2, 3, 1, 1)), known.astype(float))
             for stage in later:
                 rough = detector.refine(pair, rough, stage)
-            found.append(rough)
+            away = np.linalg.norm(rough.u - u, axis=-1) > _NEAR * tool_length_px(u)[:, None]  # that is another thing
+            u, confidence = np.where(away[..., None], np.nan, rough.u), np.where(away, 0.0, rough.confidence)
+            found.append(Landmarks(u, rough.covariance, confidence))
         if progress is not None:
             progress((i + 1) / len(frames))
     return Seen(np.asarray(frames), *(np.stack([getattr(p, n) for p in found]) for n in ("u", "covariance", "confidence")))
@@ -282,6 +287,13 @@ def teach(
     offset, sd = np.zeros((3, 3)), np.full((3, 3), 0.0 if calibration.offsets is not None else 0.1)
     told, turns = calibration.offsets, False
     if opinion is not None:
+        shares = (opinion.confidence >= MIN_CONFIDENCE).mean(axis=(0, 1))
+        if shares.min() < _KNOWN * shares.max():
+            rare, often = LANDMARKS[shares.argmin()], LANDMARKS[shares.argmax()]
+            raise RefusalError(
+                f"detector: where the robot says, it sees {rare} in {100 * shares.min():.0f} % of the images and {often} in "
+                f"{100 * shares.max():.0f} %. It takes another point for {rare}. {_LABEL}"
+            )
         try:
             told = _fitted(recording, opinion.of(used.frame), 0.0).offsets
         except ValueError:

@@ -111,6 +111,36 @@ def test_a_detector_that_takes_elbows_for_tips_is_no_start(world, recording):
         taught(recording, StandIn(elbows, noise_px=0.7, wrong=0.2))
 
 
+class LaterStages(StandIn):
+    """Its closeups see what the stand-in finds, wherever they are asked to look."""
+
+    stages = ("tracking",)
+
+    def refine(self, images, rough, stage):
+        return self(images)
+
+
+def test_what_is_seen_far_from_where_the_robot_says_is_no_opinion(world, recording):
+    """In two thirds of the images the detector takes the elbow of a jaw for its tip: the others tell the offsets."""
+    frames, elbows = np.arange(world.n), world.u.copy()
+    elbows[::3, :, 2] += 0.25 * (elbows[::3, :, 0] - elbows[::3, :, 2])
+    elbows[1::3, :, 2] += 0.25 * (elbows[1::3, :, 0] - elbows[1::3, :, 2])
+    first = taught(recording, StandIn(world.u, noise_px=0.7, wrong=0.3))
+    opinion = look(recording, LaterStages(elbows, noise_px=0.7), frames, near=first.labels(frames)[0])
+    assert (opinion.confidence[::3, :, 2] == 0).all() and (opinion.confidence[2::3] > 0.5).mean() > 0.9
+    teacher = teach(recording, opinion, opinion=opinion, before=first)
+    assert np.median(label_errors(world, teacher)[0]) < 1.0
+
+
+def test_a_landmark_that_is_hardly_ever_seen_where_the_robot_says_is_another_point(world, recording):
+    frames, elbows = np.arange(world.n), world.u.copy()
+    elbows[:, :, 2] += 0.25 * (elbows[:, :, 0] - elbows[:, :, 2])
+    first = taught(recording, StandIn(world.u, noise_px=0.7, wrong=0.3))
+    opinion = look(recording, LaterStages(elbows, noise_px=0.7), frames, near=first.labels(frames)[0])
+    with pytest.raises(RefusalError, match="sees tip_2 in .* another point for tip_2.*Label 10 pairs"):
+        teach(recording, opinion, opinion=opinion, before=first)
+
+
 def test_what_stands_still_while_the_robot_moves_is_not_the_tool(world, recording):
     """Half of the detections are one pattern of the ground; the other half, and a tool that moves in depth, are the tool."""
     seen, x = look(recording, StandIn(world.u, noise_px=0.7, wrong=0.0), np.arange(world.n)), world.at(world.time_s)
