@@ -41,6 +41,8 @@ _LEAST_GAIN = 0.03
 #: Most rounds of looking where the robot says, before anything is trained, and the share of the tool's length below which a
 #: landmark's move ends them.
 _GUIDED, _SETTLED = 3, 0.01
+#: Median distance, as a share of the tool's length, from labels set by hand, above which these say otherwise.
+_CONTRADICTED = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,6 +246,7 @@ class _Work:
                     teachers.append(teach(recording, part, from_labels=by_hand))
                 except ValueError as error:
                     refused = error
+        teachers = [one for one in teachers if one is teachers[-1] or not self.contradicted(one)]  # labels come last
         if not teachers:
             raise RefusalError(str(refused)) from refused
         teacher = min(teachers, key=lambda one: np.nanmedian(np.trace(one.project(learn)[1], axis1=-2, axis2=-1)))
@@ -252,11 +255,14 @@ class _Work:
         for k in range(_GUIDED if self.learns and start.closeup_network else 0):  # untaught, near where the robot says
             guided = self.look(f"guided {k}", start, learn, u)
             try:
-                teacher = teach(recording, guided.labelled(self.labels), opinion=guided, before=teacher)
+                found = teach(recording, guided.labelled(self.labels), opinion=guided, before=teacher)
             except RefusalError:
                 if len(self.marked) < 5:
                     raise
                 break  # a detector that does not know the tool corrects nothing; labels set by hand do
+            if self.contradicted(found):
+                break
+            teacher = found
             u, last = teacher.labels(learn)[0], u
             moved = np.linalg.norm(u - last, axis=-1) / tool_length_px(u)[..., None]
             if np.nanmax(np.nanmedian(moved, axis=(0, 1))) < _SETTLED:
@@ -285,6 +291,12 @@ class _Work:
                 break
             best, best_seen, teacher, stop = tuned, seen, new, now
         return self.judged(first, best, best_seen, teacher)
+
+    def contradicted(self, teacher: Teacher) -> bool:
+        """Whether labels set by hand say otherwise than a teacher."""
+        told = self.labels[self.marked]
+        off = np.linalg.norm(teacher.project(self.marked)[0] - told, axis=-1) / tool_length_px(told)[..., None]
+        return len(self.marked) >= 5 and np.nanmedian(off) > _CONTRADICTED
 
     def round(self, k: int, detector: Detector, teacher: Teacher, seen: Seen | None) -> Detector:
         """The detector trained further on what the teacher says of the frames for learning."""

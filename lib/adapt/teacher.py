@@ -4,6 +4,7 @@ What the robot says is refused where its log stands still, where the image shows
 where a fault of clock, axes or tool explains what the images show.
 """
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
@@ -50,6 +51,8 @@ _CONFIDENCES = (MIN_CONFIDENCE, 0.5, 0.8)
 _NEAR = 0.1
 #: A landmark that is seen there so much more rarely than another one is one that the detector takes for another point.
 _KNOWN = 0.25
+#: Fewer labelled pairs tell neither outliers nor how large offsets are: a robot's usual ones, mm, standard deviation.
+_FEW_PAIRS, _ROBOTS_OFFSET_MM = 8, 0.15
 _LABEL = (
     "Label 10 pairs of frames (5 at least), far apart in place and depth (`python3 -m lib annotate RECORDING`), and give "
     "annotations.json with --labels."
@@ -269,7 +272,7 @@ def teach(
     except RefusalError as error:  # few right ones agree on cameras by a clock that is off, and do not tell its offset
         if from_labels or error.__cause__ is not None:
             raise
-        recording, clock_sd_s = _scanned_clock(recording, used, lambda found: found.view_inliers.sum()), 0.01
+        recording, clock_sd_s = _scanned_clock(recording, lambda one: _fitted(one, used, 0.0).view_inliers.sum()), 0.01
         calibration, right = _calibrated(recording, used, from_labels)
     if not from_labels:
         again, sd = _clock(recording, used, calibration)
@@ -335,8 +338,8 @@ def _clock(recording: Recording, seen: Seen, calibration: Calibration | None = N
     rows = seen.rows(recording)
     if calibration is not None:  # of the rows that agree alone
         rows = replace(rows, confidence=np.where(calibration.view_inliers, rows.confidence, 0.0))
-    if len(seen.frame) < 8:  # too few for that: the offset at which cameras explain the labels best
-        return _scanned_clock(recording, seen, lambda found: -found.reprojection_rms_px), 0.01
+    if len(seen.frame) < _FEW_PAIRS:  # too few for that: the offset at which cameras explain the labels best
+        return _scanned_clock(recording, lambda one: -_from_few(one, seen).reprojection_rms_px), 0.005
     for reach_s in (0.2, 1.0):
         try:
             found = estimate_time_offset(rows, recording.kinematics, start_s=recording.offset_s, search_s=reach_s)
@@ -348,19 +351,21 @@ def _clock(recording: Recording, seen: Seen, calibration: Calibration | None = N
     return recording, 0.005
 
 
-def _scanned_clock(recording: Recording, seen: Seen, merit: Callable[[Calibration], float]) -> Recording:
-    """The recording with the offset of the clocks that gives cameras of the highest merit; 41 within 0.2 s are tried.
+def _scanned_clock(recording: Recording, merit: Callable[[Recording], float]) -> Recording:
+    """The recording with the offset of the clocks of the highest merit, of 41 within 0.2 s and 19 round the best of these.
 
     Of equal ones the smallest change; none where no offset gives cameras.
     """
+    @cache
     def merit_at(change_s: float) -> float:
         try:
-            return merit(_fitted(replace(recording, offset_s=recording.offset_s + change_s), seen, 0.0))
+            return merit(replace(recording, offset_s=recording.offset_s + change_s))
         except ValueError:
             return -np.inf
 
-    tried = sorted(np.linspace(-0.2, 0.2, 41).round(9).tolist(), key=abs)
-    return replace(recording, offset_s=recording.offset_s + max(tried, key=merit_at))
+    best_s = max(sorted(np.linspace(-0.2, 0.2, 41).round(9).tolist(), key=abs), key=merit_at)
+    near_s = (best_s + np.linspace(-0.009, 0.009, 19)).round(9).tolist()
+    return replace(recording, offset_s=recording.offset_s + max(sorted([best_s, *near_s], key=abs), key=merit_at))
 
 
 def _fitted(recording: Recording, seen: Seen, least: float, ransac_px: float | None = None) -> Calibration:
@@ -369,14 +374,30 @@ def _fitted(recording: Recording, seen: Seen, least: float, ransac_px: float | N
     return calibrate(seen.rows(recording, least), model="square", image_size_px=size, ransac_px=ransac_px)
 
 
+def _from_few(recording: Recording, labels: Seen) -> Calibration:
+    """As `_fitted` from labels set by hand, all of them right: too few to tell the width of the offsets, or outliers."""
+    rows, how = labels.rows(recording), {"model": "square", "image_size_px": recording.image_size_px, "ransac_px": np.inf}
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "offsets:", RuntimeWarning)  # by a clock that is off they find no end
+            return calibrate(rows, offsets=True, offset_prior_sd=_ROBOTS_OFFSET_MM, **how)
+    except ValueError:  # jaws that are shut have no axes
+        return calibrate(rows, **how)
+
+
 def _calibrated(recording: Recording, seen: Seen, from_labels: bool) -> tuple[Calibration, float]:
     """Cameras that the detections agree on, the confident ones if all do not, and the share of landmarks that agree."""
     told = 6 * int(np.isfinite(recording.landmarks_mm()[seen.frame]).all(axis=(1, 2)).sum())
     length, reason, best, poor, competing = tool_length_px(seen.u), "none was found", None, None, None
     near_px = _NEAR * float(np.quantile(length[np.isfinite(length)], 0.25)) if np.isfinite(length).any() else 0.0
     # Offsets of an unknown tool widen the errors of the right ones, until the wrong ones do not stand apart.
-    ways = [(0.0, None)] if from_labels else [*((least, None) for least in _CONFIDENCES), (MIN_CONFIDENCE, near_px)]
-    for least, ransac_px in ways:
+    if from_labels:
+        try:
+            found = _from_few(recording, seen) if len(seen.frame) < _FEW_PAIRS else _fitted(recording, seen, 0.0)
+        except ValueError as error:
+            raise RefusalError(f"labels: no cameras agree with them ({error}). {_LABEL}") from error
+        return found, float(found.view_inliers.sum() / max(told, 1))
+    for least, ransac_px in (*((least, None) for least in _CONFIDENCES), (MIN_CONFIDENCE, near_px)):
         if ransac_px is not None and competing:
             break  # nothing tells which is the robot's
         try:
@@ -387,8 +408,6 @@ def _calibrated(recording: Recording, seen: Seen, from_labels: bool) -> tuple[Ca
             competing = error if isinstance(error, CompetingCamerasError) else competing
             continue
         right = float(found.view_inliers.sum() / max(told, 1))
-        if from_labels:
-            return found, right
         if found.view_inliers.sum() < max(LEAST_RIGHT * told, min(_FEWEST_RIGHT, 0.5 * told)):
             reason = f"only {100 * right:.0f} % of the landmarks agree on cameras, {found.view_inliers.sum()} in number"
         elif found.reprojection_rms_px < near_px:

@@ -1,5 +1,6 @@
 """`calibrate`: from correspondences to cameras with their covariance."""
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -151,8 +152,10 @@ def _turned(
     if found.offsets.p_value >= _SURE_OFFSETS or turn_mm < _LEAST_TURN_MM:
         return found
     try:
-        other = estimate(axes=turned, start=found)
-    except ValueError:  # no cameras fit them
+        with warnings.catch_warnings():
+            warnings.filterwarnings("error", "offsets:", RuntimeWarning)
+            other = estimate(axes=turned, start=found)
+    except (ValueError, RuntimeWarning):  # no cameras fit them, or the offsets find no end
         return found
     used = np.repeat(found.view_inliers, 2, axis=1)
     worse = np.linalg.norm(other.residuals_px[used]) / np.linalg.norm(found.residuals_px[used])

@@ -133,7 +133,7 @@ def estimate_offsets(
         before, step = step, covariance @ (gradient - offset.ravel() / prior_sd**2)
         share = max(share / 2, 0.25) if step @ before < 0 else min(2 * share, 1.0)  # to and fro: it went too far
         offset = offset + share * step.reshape(offset.shape)
-        if np.abs(step).max() < 1e-4 * np.sqrt(np.diag(covariance).min()):
+        if np.abs(step).max() < 1e-3 * np.sqrt(np.diag(covariance).min()):
             break
     else:
         warnings.warn(
