@@ -18,7 +18,7 @@ def disguised(
 
     Args:
         u, visibility: Landmarks (3, 2) px and (3,); what is covered becomes hidden, what is blurred away unlabelled.
-        length_px: The tool's length, to which blur is compared.
+        length_px: The tool's length, to which blur is compared; NaN without a tool.
 
     >>> rng, u = np.random.default_rng(0), np.full((3, 2), 20.0)
     >>> disguised(np.full((32, 48, 3), 90, np.uint8), u, np.full(3, 2), rng, 9.0)[0].shape
@@ -28,6 +28,7 @@ def disguised(
     if kind < 0.1:
         return image, u, visibility
     x, hidden = image.astype(np.float32) / 255, np.zeros(3, bool)
+    length_px = 40.0 if np.isnan(length_px) else length_px
     if kind < 0.4:  # another camera of the same scene
         return (255 * _colours(x, rng) + 0.5).astype(np.uint8), u, visibility
     x = _things_in_front(x, u, hidden, rng, length_px)

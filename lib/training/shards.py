@@ -182,8 +182,7 @@ def make_proposals(path: Path, scenes: Path, detector: str | Path | None) -> Non
         for i, piece in enumerate(np.split(jpegs, ends[:-1])):
             image = cv2.imdecode(piece, cv2.IMREAD_COLOR_RGB)
             if rng.random() < 0.5:
-                length_px = np.nan_to_num(tool_length_px(u[i : i + 1])[0], nan=40.0)
-                image = disguised(image, u[i], visibility[i], rng, float(length_px))[0]
+                image = disguised(image, u[i], visibility[i], rng, float(tool_length_px(u[i])))[0]
             seen, _, height = searching.proposed(image)
             best = np.argsort(-height)[:PROPOSALS]
             found[i, : len(best)] = seen.u[best]

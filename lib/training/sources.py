@@ -96,7 +96,7 @@ class SceneSource(Source):
         length = scale * _length_px(u, visibility)
         u = windows.map_points(matrix, u)
         if rng.random() < self.disguise:
-            image, u, visibility = disguised(image, u, visibility, rng, length if np.isfinite(length) else 40.0)
+            image, u, visibility = disguised(image, u, visibility, rng, length)
         if length < SHORTEST_PX or image.std() < FLAT:
             u = np.where((visibility > 0)[:, None], np.nan, u)
         return image, np.where((rng.random(3) > weight)[:, None], np.nan, u), visibility
@@ -104,7 +104,7 @@ class SceneSource(Source):
 
 def _length_px(u: np.ndarray, visibility: np.ndarray) -> float:
     """The tool's length; NaN without a tool."""
-    return float(tool_length_px(u[None])[0]) if visibility.any() else np.nan
+    return float(tool_length_px(u)) if visibility.any() else np.nan
 
 
 class FrameSource(SceneSource):
@@ -250,8 +250,8 @@ class CloseupSource(Source):
         which = np.argwhere(usable)
         if not len(which):
             raise ValueError("images: no visible landmark of a tool with base and tip; label some.")
-        crops = (shards.square_round(images[i].image, images[i].u, k, shards.CLOSEUP_CROP_PX) for i, k in which)
-        parts = ((*crop, images[i].visibility, k) for crop, (i, k) in zip(crops, which, strict=True))
+        shown = ((images[i], k) for i, k in which)
+        parts = ((*shards.square_round(one.image, one.u, k, shards.CLOSEUP_CROP_PX), one.visibility, k) for one, k in shown)
         weight = None if weight is None else weight[tuple(which.T)]
         source = cls(*map(np.array, zip(*parts, strict=True)), weight=weight)
         return source if not still else replace(source, stretch=0.0, shear=0.0, motion_px=0.0, disguise=0.0)
@@ -267,7 +267,7 @@ class CloseupSource(Source):
             length, blur = (np.exp(rng.uniform(*np.log(r))) for r in (_DRAWN_LENGTH_PX, _DRAWN_BLUR_PX))
             crop, u, _ = drawn_tool(drawn_ground(crop, rng), rng, length_px=length, around=k)
             crop = cv2.GaussianBlur(crop, (0, 0), blur)
-        length = tool_length_px(u[None])[0] * np.exp(rng.normal(0, self.length))
+        length = tool_length_px(u) * np.exp(rng.normal(0, self.length))
         shift = rng.normal(0, self.shifts_px[rng.choice(len(self.shifts_px), p=self.shift_shares)], 2)
         shift *= min(1.0, windows.CLOSEUP_REACH_PX / max(np.linalg.norm(shift), 1e-9)) / windows.closeup_scale(length)
         known = u.copy()

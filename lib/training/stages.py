@@ -99,7 +99,7 @@ def finetune(
         if not usable[-1]:
             raise ValueError(f"{kind} images: none has a labelled base and tip; label some.")
     images, held_out = usable
-    relative_sd = np.stack([np.broadcast_to(one.sd_px, 3) / tool_length_px(one.u[None]) for one in images])
+    relative_sd = np.stack([np.broadcast_to(one.sd_px, 3) / tool_length_px(one.u) for one in images])
     doubt_on = validation_images(simulated) if isinstance(simulated, str | Path) else (simulated or ())[::3]
     began, names, stopped = time.perf_counter(), list(detector.networks), threading.Event()
     bars = {stage: tqdm(total=1.0, desc=stage, disable=progress is not True, bar_format="{l_bar}{bar}") for stage in names}
