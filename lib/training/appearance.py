@@ -9,6 +9,7 @@ import numpy as np
 
 from lib.simulator.video import compressed
 from lib.simulator.window import motion_blur
+from lib.training.drawings import fill
 
 
 def disguised(
@@ -103,7 +104,7 @@ def _things_in_front(x, u, hidden, rng: np.random.Generator, length_px: float) -
             wide = rng.uniform(0.05, 0.3, 2) * length_px
             corners = [centre + s * wide[0] * across for s in (-1, 1)]
             corners += [centre + long * ahead + s * wide[1] * across for s in (1, -1)]
-            cv2.fillPoly(mask, [np.round(np.array(corners) * 16).astype(np.int32)], 1.0, cv2.LINE_AA, 4)
+            fill(mask, np.array(corners), 1.0)
         else:
             axes = tuple(int(v) + 1 for v in rng.uniform(0.05, 0.6, 2) * length_px)
             cv2.ellipse(mask, tuple(int(v) for v in centre), axes, np.degrees(angle), 0, 360, 1.0, -1, cv2.LINE_AA)

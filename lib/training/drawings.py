@@ -45,7 +45,7 @@ def drawn_ground(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         x = x + noise[..., None] * (rng.uniform(2, 30) * rng.dirichlet((2, 2, 2)) * 2).astype(np.float32)
     for _ in range(rng.integers(0, 5) if rng.random() < 0.5 else 0):  # patches with edges
         corners = rng.uniform((0, 0), (w, h)) + rng.normal(0, rng.uniform(0.02, 0.2) * w, (int(rng.integers(3, 8)), 2))
-        cv2.fillPoly(x, [_fixed(corners)], rng.uniform(0, 220, 3).tolist(), cv2.LINE_AA, 4)
+        fill(x, corners, rng.uniform(0, 220, 3).tolist())
     return np.clip(x, 0, 255).astype(np.uint8)
 
 
@@ -145,8 +145,9 @@ def _outline(line: np.ndarray, radius: np.ndarray, low: float, high: float) -> n
     return np.vstack([line + low * radius[:, None] * beside, (line + high * radius[:, None] * beside)[::-1]])
 
 
-def _fixed(polygon: np.ndarray) -> np.ndarray:
-    return np.round(np.clip(polygon, -3e4, 3e4) * 16).astype(np.int32)
+def fill(image: np.ndarray, polygon: np.ndarray, value: float | list[float]) -> None:
+    """Fill a polygon (n, 2) px of an image, in place, to a sixteenth of a pixel."""
+    cv2.fillPoly(image, [np.round(np.clip(polygon, -3e4, 3e4) * 16).astype(np.int32)], value, cv2.LINE_AA, 4)
 
 
 def _shadowed(x: np.ndarray, parts: list[Part], length: float, rng: np.random.Generator) -> np.ndarray:
@@ -157,7 +158,7 @@ def _shadowed(x: np.ndarray, parts: list[Part], length: float, rng: np.random.Ge
         cast = cv2.Rodrigues(np.array([0, 0, rng.normal(0, 0.2)]))[0][:2, :2] @ (np.eye(2) + rng.normal(0, 0.12, (2, 2)))
         for line, radius in parts:
             line = (line - base) @ cast.T + base + offset
-            cv2.fillPoly(mask, [_fixed(_outline(line, grown * radius, -1, 1))], 1.0, cv2.LINE_AA, 4)
+            fill(mask, _outline(line, grown * radius, -1, 1), 1.0)
         mask = cv2.GaussianBlur(mask, (0, 0), np.exp(rng.uniform(np.log(0.5), np.log(0.2 * length + 1))))
         x = x * (1 - np.float32(rng.uniform(0.2, 0.9)) * mask)[..., None]
     return x
@@ -172,13 +173,12 @@ def _painted(x: np.ndarray, parts: list[Part], length: float, rng: np.random.Gen
     edges = np.linspace(-1, 1, _STRIPS + 1)
     for line, radius in parts:
         level = tone * (np.exp(rng.normal(0, 0.35)) if own else 1.0)
-        cv2.fillPoly(mask, [_fixed(_outline(line, radius, -1, 1))], 1.0, cv2.LINE_AA, 4)
+        fill(mask, _outline(line, radius, -1, 1), 1.0)
         for low, high in itertools.pairwise(edges):
             q = (low + high) / 2
             shade = 1 - round_ * (0.5 + 0.5 * phase * q) * abs(q - 0.3 * phase)
             shade += shine * np.exp(-(((q - where) / 0.25) ** 2))
-            polygon = _outline(line, radius * 1.05, low - 0.02, high + 0.02)
-            cv2.fillPoly(layer, [_fixed(polygon)], (level * max(shade, 0.05)).tolist(), cv2.LINE_AA, 4)
+            fill(layer, _outline(line, radius * 1.05, low - 0.02, high + 0.02), (level * max(shade, 0.05)).tolist())
     if rng.random() < 0.6:  # light and reflections that change along it
         cells = max(int(w / (rng.uniform(0.1, 1.0) * length)), 2)
         field = cv2.resize(rng.random((cells, cells), dtype=np.float32), (w, h), interpolation=cv2.INTER_CUBIC)

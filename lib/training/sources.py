@@ -245,8 +245,7 @@ class CloseupSource(Source):
     @classmethod
     def of(cls, images: Sequence[LabelledImage], *, still: bool = False, weight: np.ndarray | None = None) -> Self:
         """From labelled images of any size; for validation `still`, neither stretched nor blurred nor disguised."""
-        usable = [np.isfinite(one.in_view).all(1) & (one.visibility == 2) & np.isfinite(windows.tool_pose(one.u[None])[1])
-                  for one in images]  # fmt: skip
+        usable = [np.isfinite(one.u).all(1) & (one.visibility == 2) & np.isfinite(tool_length_px(one.u)) for one in images]
         which = np.argwhere(usable)
         if not len(which):
             raise ValueError("images: no visible landmark of a tool with base and tip; label some.")
