@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lib.simulator.limits import check
+from lib.geometry import check
 
 MAX_ROLL_RAD = np.deg2rad(60.0)
 MAX_PITCH_RAD = np.deg2rad(60.0)

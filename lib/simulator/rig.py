@@ -9,9 +9,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from lib.cameras import AffineCamera, NearAffineCamera, StereoRig
-from lib.geometry import RigidTransform
+from lib.geometry import RigidTransform, check
 from lib.simulator.lighting import Lighting
-from lib.simulator.limits import check
 from lib.simulator.video import Video
 
 IMAGE_SIZE_PX = (1920, 1080)

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lib.simulator.limits import check
+from lib.geometry import check
 
 OCCLUDED, VISIBLE = 1, 2
 #: Height of an occluded landmark's target: its place is still learnt, and its height tells that it is not seen.

@@ -19,13 +19,13 @@ import torch.distributed as dist
 from torch import Tensor, nn
 from tqdm.auto import tqdm
 
+from lib.geometry import check
 from lib.landmarks.checkpoints import checksum, load_network, read_checkpoint, write_checkpoint
 from lib.landmarks.error_model import closeup_peaks
 from lib.landmarks.heatmaps import SIGMA_PX, decode
 from lib.landmarks.metrics import score, tool_length_px
 from lib.landmarks.network import HourglassConfig, Network, OffsetConfig, OffsetNetwork, as_tensor, network_of
 from lib.provenance import commit_id, machine
-from lib.simulator.limits import check
 from lib.training.augmentation import AUGMENTATIONS, Augmentation, Batch, leave_frame
 from lib.training.losses import heatmap_loss, offset_loss, position_loss
 from lib.training.samples import Samples, Source

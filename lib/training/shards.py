@@ -139,16 +139,15 @@ def packed(images: Iterable[LabelledImage], long_side_px: int | None = None) -> 
     """Labelled images of any size as (ends (n,), JPEGs one after the other, u (n, 3, 2), visibility (n, 3)), `long_side_px`
     long at most.
     """
-    jpegs, points, seen = [], [], []
+    parts = []
     for _, image, u, visibility, _ in images:
         h, w = image.shape[:2]
         if long_side_px and max(h, w) > long_side_px:
             size = round(w * long_side_px / max(h, w)), round(h * long_side_px / max(h, w))
             image, u = cv2.resize(image, size, interpolation=cv2.INTER_AREA), cell_from_image(u, np.array([w, h]) / size)
         encoded = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 95])[1]
-        jpegs.append(encoded.ravel())
-        points.append(u)
-        seen.append(visibility)
+        parts.append((encoded.ravel(), u, visibility))
+    jpegs, points, seen = zip(*parts, strict=True)
     return np.cumsum([j.size for j in jpegs]), np.concatenate(jpegs), np.stack(points), np.stack(seen)
 
 
