@@ -14,8 +14,7 @@ from lib.recordings.annotations import inside
 from lib.simulator.window import motion_blur
 from lib.training import shards
 from lib.training.appearance import disguised
-from lib.training.bending import bent
-from lib.training.drawings import drawn_ground, drawn_tool
+from lib.training.drawings import bent, drawn_ground, drawn_tool
 from lib.training.samples import LabelledImage, Source
 
 #: The first stage sees frames whose longer side is shrunk to this, here with (width, height) of the input.  It is trained on
@@ -43,8 +42,8 @@ class SceneSource(Source):
     """Frames as JPEG, one after the other, that end at `ends` (n,), with u (n, 3, 2) in their pixels and visibility (n, 3).
 
     Frames without a tool are among them: all landmarks have visibility 0.  `disguise` is the share of the
-    draws whose appearance is changed, `drawn` that of the draws whose tool is a drawing (`drawings.py`), `bent` that of the
-    others whose jaws are bent (`bending.py`), `weight` (n, 3) that of the draws in which a label counts.
+    draws whose appearance is changed, `drawn` that of the draws whose tool is a drawing, `bent` that of the others whose
+    jaws are bent (both in `drawings.py`), `weight` (n, 3) that of the draws in which a label counts.
     """
 
     ends: np.ndarray
