@@ -118,8 +118,7 @@ class FrameSource(SceneSource):
         zoom = np.clip(fit * np.exp(rng.normal(0, 0.45)), 0.4 * fit, None)
         if np.isfinite(length):
             zoom = np.clip(zoom, 7 / length, 85 / length)
-            far = rng.random() < 0.25
-            spread = (1.5 if far else 0.4) * np.array(PART_PX) / zoom
+            spread = (1.5 if rng.random() < 0.25 else 0.4) * np.array(PART_PX) / zoom
             middle = np.nanmean(u, axis=0) + rng.uniform(-1, 1, 2) * spread
         else:
             middle = rng.uniform((0, 0), frame.shape[1::-1])
