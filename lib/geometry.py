@@ -4,7 +4,7 @@ Conventions: points are rows, (n, 3) millimetres or (n, 2) pixels (x right, y do
 pixel centres); a transform is named ``target_from_source``; angles are radians.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -43,6 +43,20 @@ def store_array(instance: object, name: str, shape: tuple[int, ...]) -> None:
         raise ValueError(f"{name}: expected finite numbers of shape {shape}, got {array}.")
     array.setflags(write=False)
     object.__setattr__(instance, name, array)
+
+
+def check(settings: object, names: str, holds: Callable[[object], bool], rule: str) -> None:
+    """Raise ValueError for the first of the attributes `names` (separated by spaces) whose value breaks the rule.
+
+    >>> from types import SimpleNamespace
+    >>> check(SimpleNamespace(gloss=-1), "gloss", lambda value: value >= 0, "must not be negative")
+    Traceback (most recent call last):
+    ValueError: gloss: must not be negative, got -1.
+    """
+    for name in names.split():
+        value = getattr(settings, name)
+        if not holds(value):
+            raise ValueError(f"{name}: {rule}, got {value}.")
 
 
 def pair_covariance(covariance_px2: ArrayLike | Sequence[ArrayLike] | None, n: int, images: int = 2) -> np.ndarray:

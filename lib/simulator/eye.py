@@ -8,7 +8,7 @@ from typing import ClassVar, Protocol
 import cv2
 import numpy as np
 
-from lib.simulator.limits import check
+from lib.geometry import check
 from lib.simulator.texture import EXTENT_MM, GAMMA, fundus_texture, pattern, photograph_texture
 
 _FUNDUS_PX, _FILMS = 1024, 8

@@ -200,8 +200,6 @@ def _light(
         value["source_mm"] = (*(middle[:2] + rng.normal(0, 4.0, 2)).tolist(), float(ground - rng.uniform(3.0, 10.0)))
     changes["brightness"] = microscope.brightness * value.pop("power")
     value["haze"] = _hue(rng, 0.3, value.pop("haze_level"))
-    if "band" in value:
-        value["band_rad"] = value.pop("band") * np.pi
     if "tint" in value:
         value["tint_per_mm"] = tuple(map(tuple, rng.normal(0, value.pop("tint"), (3, 2)).tolist()))
     lighting = Lighting(**value, patches=tuple(patches(rng, middle, length, ground)) if patches else ())
@@ -299,7 +297,7 @@ SHIFTED: dict[str, dict[str, Callable]] = {
 #: Family of the far rung -> what it replaces in each aspect.
 FAR: dict[str, dict[str, Callable]] = {
     "angled_jaws": {"tool": TOOLS["angled_jaws"]},
-    "slit_light": {"light": partial(_light, ambient=(0.06, 0.2), band=(0, 1), spot=(0.5, 1.2), spot_edge=(0.1, 0.5))},
+    "slit_light": {"light": partial(_light, ambient=(0.06, 0.2), band_rad=(0, np.pi), spot=(0.5, 1.2), spot_edge=(0.1, 0.5))},
     "gauze": {"scene": partial(_ground, "gauze", overlay=False)},
     "aberrated": {
         "optics": partial(_camera, fringe_px=(1.5, 3.5), defocus_px=(1.5, 3.0), astigmatism=(1.5, 2.2), banding=0.02)

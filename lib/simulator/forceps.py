@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lib.simulator.limits import check
+from lib.geometry import check
 
 MAX_ROLL_RAD = np.deg2rad(60.0)
 MAX_PITCH_RAD = np.deg2rad(60.0)
@@ -39,8 +39,7 @@ class Pose:
     opening_mm: float = 0.8
 
     def __post_init__(self) -> None:
-        if np.shape(self.base_mm) != (3,) or not np.isfinite(self.base_mm).all():
-            raise ValueError(f"base_mm: expected three finite coordinates, got {self.base_mm}.")
+        check(self, "base_mm", lambda v: np.shape(v) == (3,) and np.isfinite(v).all(), "expected three finite coordinates")
         check(self, "pitch_rad", lambda v: 0 <= v <= MAX_PITCH_RAD, f"must lie between 0 and {MAX_PITCH_RAD:.2f}")
         rule = f"beyond {MAX_ROLL_RAD:.2f} an image no longer tells tip_1 from tip_2"
         check(self, "roll_rad", lambda v: abs(v) <= MAX_ROLL_RAD, rule)

@@ -130,10 +130,9 @@ class Lighting:
         visibility = visibility.copy()
         for patch in self.patches:
             if patch.role != "glare":
-                hides = patch.lay(linear, window)
-                for k in np.flatnonzero(visibility == 2):
-                    column, row = np.round(u[k]).astype(int)
-                    visibility[k] = 1 if hides[row, column] else 2
+                hides, seen = patch.lay(linear, window), visibility == 2
+                column, row = np.round(u[seen]).astype(int).T
+                visibility[seen] = np.where(hides[row, column], 1, 2)
         if any(self.haze):
             linear += np.float32(self.haze)
         return visibility

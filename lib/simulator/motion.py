@@ -6,9 +6,9 @@ from functools import cached_property
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
+from lib.geometry import check
 from lib.simulator.eye import Scene
 from lib.simulator.forceps import MAX_ROLL_RAD, Forceps, Pose
-from lib.simulator.limits import check
 
 #: Kinds of motion, and how long each takes by default.
 DURATIONS_S = {"sweep": 30.0, "surgeon": 18.0, "both": 45.0}

@@ -137,8 +137,7 @@ def random_setup(
         tool = random_object(rng, size) if rng.random() < 0.75 else None
     elif names["tool"] == "plain_jaws" and rng.random() < 0.5:
         plain = random_forceps(rng)
-        lengths = ("shaft_radius_mm", "jaw_length_mm", "jaw_radius_mm", "tip_radius_mm", "bow_mm", "bend_mm", "hook_mm")
-        tool = replace(plain, **{name: getattr(plain, name) * size for name in lengths})
+        tool = replace(plain, **{name: value * size for name, value in vars(plain).items() if name.endswith("_mm")})
     else:
         tool = members["tool"](rng, size)
     length = tool.jaw_length_mm if tool else 3 * size

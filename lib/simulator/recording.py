@@ -7,11 +7,10 @@ from pathlib import Path
 import numpy as np
 from tqdm.auto import tqdm
 
-from lib.geometry import RigidTransform
+from lib.geometry import RigidTransform, check
 from lib.recordings import Recording, RecordingWriter, Truth
 from lib.simulator.eye import Eye, Scene
 from lib.simulator.forceps import Forceps
-from lib.simulator.limits import check
 from lib.simulator.motion import DURATIONS_S, Motion
 from lib.simulator.population import RESERVED_SEEDS, reserved_forceps
 from lib.simulator.render import View, render_pair

@@ -9,9 +9,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from lib.cameras import AffineCamera, NearAffineCamera, StereoRig
-from lib.geometry import RigidTransform
+from lib.geometry import RigidTransform, check
 from lib.simulator.lighting import Lighting
-from lib.simulator.limits import check
 from lib.simulator.video import Video
 
 IMAGE_SIZE_PX = (1920, 1080)
@@ -62,8 +61,7 @@ class Microscope:
     video: Video | None = None
 
     def __post_init__(self) -> None:
-        if min(self.image_size_px) < 16:
-            raise ValueError(f"image_size_px: must be at least 16 x 16, got {self.image_size_px}.")
+        check(self, "image_size_px", lambda v: min(v) >= 16, "must be at least 16 x 16")
         check(self, "depth_of_field_mm", lambda v: v > 0, "must be positive (infinity switches defocus off)")
         check(self, "psf_px exposure_s readout_s vignetting read_noise brightness", lambda v: v >= 0, "must not be negative")
         check(self, "full_well", lambda v: v > 0, "must be positive (infinity switches noise off)")

@@ -9,6 +9,7 @@ import numpy as np
 
 from lib.simulator.video import compressed
 from lib.simulator.window import motion_blur
+from lib.training.drawings import fill
 
 
 def disguised(
@@ -18,7 +19,7 @@ def disguised(
 
     Args:
         u, visibility: Landmarks (3, 2) px and (3,); what is covered becomes hidden, what is blurred away unlabelled.
-        length_px: The tool's length, to which blur is compared.
+        length_px: The tool's length, to which blur is compared; NaN without a tool.
 
     >>> rng, u = np.random.default_rng(0), np.full((3, 2), 20.0)
     >>> disguised(np.full((32, 48, 3), 90, np.uint8), u, np.full(3, 2), rng, 9.0)[0].shape
@@ -28,6 +29,7 @@ def disguised(
     if kind < 0.1:
         return image, u, visibility
     x, hidden = image.astype(np.float32) / 255, np.zeros(3, bool)
+    length_px = 40.0 if np.isnan(length_px) else length_px
     if kind < 0.4:  # another camera of the same scene
         return (255 * _colours(x, rng) + 0.5).astype(np.uint8), u, visibility
     x = _things_in_front(x, u, hidden, rng, length_px)
@@ -102,7 +104,7 @@ def _things_in_front(x, u, hidden, rng: np.random.Generator, length_px: float) -
             wide = rng.uniform(0.05, 0.3, 2) * length_px
             corners = [centre + s * wide[0] * across for s in (-1, 1)]
             corners += [centre + long * ahead + s * wide[1] * across for s in (1, -1)]
-            cv2.fillPoly(mask, [np.round(np.array(corners) * 16).astype(np.int32)], 1.0, cv2.LINE_AA, 4)
+            fill(mask, np.array(corners), 1.0)
         else:
             axes = tuple(int(v) + 1 for v in rng.uniform(0.05, 0.6, 2) * length_px)
             cv2.ellipse(mask, tuple(int(v) for v in centre), axes, np.degrees(angle), 0, 360, 1.0, -1, cv2.LINE_AA)

@@ -12,6 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lib.geometry import check
+
 OCCLUDED, VISIBLE = 1, 2
 #: Height of an occluded landmark's target: its place is still learnt, and its height tells that it is not seen.
 OCCLUDED_PEAK = 0.5
@@ -59,11 +61,8 @@ class Augmentation:
     photometric_share: float = 1.0
 
     def __post_init__(self) -> None:
-        if not 0 < self.zoom[0] <= self.zoom[1]:
-            raise ValueError(f"zoom: expected 0 < smallest <= largest, got {self.zoom}.")
-        for name in ("photometric", "photometric_share"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"{name}: must lie between 0 and 1, got {getattr(self, name)}.")
+        check(self, "zoom", lambda v: 0 < v[0] <= v[1], "expected 0 < smallest <= largest")
+        check(self, "photometric photometric_share", lambda v: 0 <= v <= 1, "must lie between 0 and 1")
 
     def __call__(self, batch: Batch, rng: np.random.Generator) -> Batch:
         """The batch transformed; the caller's is left alone."""

@@ -1,8 +1,9 @@
-"""Tools painted on an image: flat drawings of forceps of any outline, many a second.
+"""Outlines beyond the simulator's: flat drawings of forceps, many a second, and rendered jaws bent at an elbow.
 
-They are no pictures of a real tool.  What they share with real ones is what a landmark is: a straight shaft, two jaws that
-leave it at one point of its axis (the base), and the farthest point of each jaw's centre line (its tip).  Training on them,
-beside rendered scenes, makes the networks look for that and not for the shapes and metals that the simulator knows.
+Drawings are no pictures of a real tool.  What they share with real ones is what a landmark is: a straight shaft, two jaws
+that leave it at one point of its axis (the base), and the farthest point of each jaw's centre line (its tip).  Training on
+them, beside rendered scenes, makes the networks look for that and not for the shapes and metals that the simulator knows.
+Bent jaws are a warp of the image, since the renderer's training families have none.
 """
 
 import itertools
@@ -16,6 +17,8 @@ from lib.recordings.annotations import inside
 Part = tuple[np.ndarray, np.ndarray]
 
 _STRIPS = 6  # of different shades across a part, which make it look round
+#: Where along a jaw its elbow is, by how much it turns there (rad), and how often inward; how often both jaws have one.
+_PLACE, _TURN, _INWARD, _BOTH = (0.5, 0.9), (0.4, 2.2), 0.8, 0.75
 
 
 def drawn_ground(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -45,7 +48,7 @@ def drawn_ground(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         x = x + noise[..., None] * (rng.uniform(2, 30) * rng.dirichlet((2, 2, 2)) * 2).astype(np.float32)
     for _ in range(rng.integers(0, 5) if rng.random() < 0.5 else 0):  # patches with edges
         corners = rng.uniform((0, 0), (w, h)) + rng.normal(0, rng.uniform(0.02, 0.2) * w, (int(rng.integers(3, 8)), 2))
-        cv2.fillPoly(x, [_fixed(corners)], rng.uniform(0, 220, 3).tolist(), cv2.LINE_AA, 4)
+        fill(x, corners, rng.uniform(0, 220, 3).tolist())
     return np.clip(x, 0, 255).astype(np.uint8)
 
 
@@ -145,8 +148,9 @@ def _outline(line: np.ndarray, radius: np.ndarray, low: float, high: float) -> n
     return np.vstack([line + low * radius[:, None] * beside, (line + high * radius[:, None] * beside)[::-1]])
 
 
-def _fixed(polygon: np.ndarray) -> np.ndarray:
-    return np.round(np.clip(polygon, -3e4, 3e4) * 16).astype(np.int32)
+def fill(image: np.ndarray, polygon: np.ndarray, value: float | list[float]) -> None:
+    """Fill a polygon (n, 2) px of an image, in place, to a sixteenth of a pixel."""
+    cv2.fillPoly(image, [np.round(np.clip(polygon, -3e4, 3e4) * 16).astype(np.int32)], value, cv2.LINE_AA, 4)
 
 
 def _shadowed(x: np.ndarray, parts: list[Part], length: float, rng: np.random.Generator) -> np.ndarray:
@@ -157,7 +161,7 @@ def _shadowed(x: np.ndarray, parts: list[Part], length: float, rng: np.random.Ge
         cast = cv2.Rodrigues(np.array([0, 0, rng.normal(0, 0.2)]))[0][:2, :2] @ (np.eye(2) + rng.normal(0, 0.12, (2, 2)))
         for line, radius in parts:
             line = (line - base) @ cast.T + base + offset
-            cv2.fillPoly(mask, [_fixed(_outline(line, grown * radius, -1, 1))], 1.0, cv2.LINE_AA, 4)
+            fill(mask, _outline(line, grown * radius, -1, 1), 1.0)
         mask = cv2.GaussianBlur(mask, (0, 0), np.exp(rng.uniform(np.log(0.5), np.log(0.2 * length + 1))))
         x = x * (1 - np.float32(rng.uniform(0.2, 0.9)) * mask)[..., None]
     return x
@@ -172,13 +176,12 @@ def _painted(x: np.ndarray, parts: list[Part], length: float, rng: np.random.Gen
     edges = np.linspace(-1, 1, _STRIPS + 1)
     for line, radius in parts:
         level = tone * (np.exp(rng.normal(0, 0.35)) if own else 1.0)
-        cv2.fillPoly(mask, [_fixed(_outline(line, radius, -1, 1))], 1.0, cv2.LINE_AA, 4)
+        fill(mask, _outline(line, radius, -1, 1), 1.0)
         for low, high in itertools.pairwise(edges):
             q = (low + high) / 2
             shade = 1 - round_ * (0.5 + 0.5 * phase * q) * abs(q - 0.3 * phase)
             shade += shine * np.exp(-(((q - where) / 0.25) ** 2))
-            polygon = _outline(line, radius * 1.05, low - 0.02, high + 0.02)
-            cv2.fillPoly(layer, [_fixed(polygon)], (level * max(shade, 0.05)).tolist(), cv2.LINE_AA, 4)
+            fill(layer, _outline(line, radius * 1.05, low - 0.02, high + 0.02), (level * max(shade, 0.05)).tolist())
     if rng.random() < 0.6:  # light and reflections that change along it
         cells = max(int(w / (rng.uniform(0.1, 1.0) * length)), 2)
         field = cv2.resize(rng.random((cells, cells), dtype=np.float32), (w, h), interpolation=cv2.INTER_CUBIC)
@@ -190,3 +193,56 @@ def _painted(x: np.ndarray, parts: list[Part], length: float, rng: np.random.Gen
     if rng.random() < 0.3:  # grain and scratches
         layer = layer * (1 + rng.uniform(0.05, 0.3) * rng.standard_normal((h, w), dtype=np.float32))[..., None]
     return x * (1 - mask[..., None]) + layer.astype(np.float32) * mask[..., None]
+
+
+def bent(
+    image: np.ndarray, u: np.ndarray, visibility: np.ndarray, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """An image (h, w, 3) uint8 with one jaw or both bent, its landmarks (3, 2) px and their visibility (3,).
+
+    What lies round the end of a jaw is turned about the elbow, what is farther or behind less, so that nothing tears.  Where
+    the jaws cross, the tips exchange their names.
+
+    >>> u = np.array([[20.0, 30], [60, 20], [60, 40]])
+    >>> image, moved, _ = bent(np.zeros((60, 90, 3), np.uint8), u, np.full(3, 2), np.random.default_rng(0))
+    >>> image.shape, moved.shape
+    ((60, 90, 3), (3, 2))
+    """
+    place, turn = rng.uniform(*_PLACE), rng.uniform(*_TURN) * (1 if rng.random() < _INWARD else -1)
+    straight = u
+    for k in rng.permutation([1, 2])[: 2 if rng.random() < _BOTH else 1]:
+        ahead, other = u[k] - u[0], u[3 - k] - u[0]
+        sign = np.sign(ahead[0] * other[1] - ahead[1] * other[0]) or 1.0
+        elbow, reach = u[0] + place * ahead, (1 - place) * np.linalg.norm(ahead)
+        for _ in range(2):  # a larger turn at once would fold the image
+            image, u = _turned(image, u, elbow, u[k] - elbow, sign * turn / 2, reach)
+    if np.linalg.det(u[1:] - u[0]) * np.linalg.det(straight[1:] - straight[0]) < 0:
+        u, visibility = u[[0, 2, 1]], visibility[[0, 2, 1]]
+    return image, u, visibility
+
+
+def _turned(
+    image: np.ndarray, u: np.ndarray, elbow: np.ndarray, ahead: np.ndarray, turn: float, reach: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """What lies `ahead` of the elbow, within `reach` px, turned about it by up to `turn` rad; within twice that, by less."""
+    radius, first = 2.0 * reach, np.arctan2(*ahead[::-1])
+    low = np.clip(np.floor(elbow - radius), 0, image.shape[1::-1]).astype(int)
+    high = np.clip(np.ceil(elbow + radius) + 1, 0, image.shape[1::-1]).astype(int)
+    if (high <= low).any():
+        return image, u
+
+    def turned_by(far: np.ndarray, angle: np.ndarray) -> np.ndarray:
+        """The turn (rad) of what is then seen `far` px from the elbow at an `angle`."""
+        fade = np.clip((radius - far) / (0.8 * reach), 0, 1)
+        return turn * 0.5 * (1 + np.cos(angle - first)) * fade**2 * (3 - 2 * fade)
+
+    z = np.arange(low[0], high[0]) - elbow[0] + 1j * (np.arange(low[1], high[1]) - elbow[1])[:, None]
+    z = z * np.exp(-1j * turned_by(np.abs(z), np.angle(z)))  # where a pixel comes from
+    maps = (z.real + elbow[0]).astype(np.float32), (z.imag + elbow[1]).astype(np.float32)
+    image = image.copy()
+    image[low[1] : high[1], low[0] : high[0]] = cv2.remap(image, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
+    far, angle = np.linalg.norm(u - elbow, axis=1), np.arctan2(*(u - elbow).T[::-1])
+    now = angle
+    for _ in range(60):  # the inverse: half a step contracts
+        now = (now + angle + turned_by(far, now)) / 2
+    return image, elbow + far[:, None] * np.column_stack([np.cos(now), np.sin(now)])

@@ -149,8 +149,7 @@ def seen_by(
     labels, image = labelled.in_view, labelled.image[None]
     # A stage that only says where the next one looks is right if that finds the landmark there.
     share = 0.25 if stage in ("frame", "tool") and len(detector.networks) > 1 else 0.05
-    length = tool_length_px(np.asarray(labelled.u, dtype=float)[None])
-    tolerance, label_sd = np.repeat(share * length, 3), np.broadcast_to(labelled.sd_px, 3)
+    tolerance, label_sd = np.repeat(share * tool_length_px(labelled.u), 3), np.broadcast_to(labelled.sd_px, 3)
     known = np.isfinite(labels).all(1) | (labelled.visibility == 0)
     if stage == "frame":
         peaks, stride = detector.frame_peaks(image), detector.frame_stride(image)

@@ -19,6 +19,7 @@ import torch.distributed as dist
 from torch import Tensor, nn
 from tqdm.auto import tqdm
 
+from lib.geometry import check
 from lib.landmarks.checkpoints import checksum, load_network, read_checkpoint, write_checkpoint
 from lib.landmarks.error_model import closeup_peaks
 from lib.landmarks.heatmaps import SIGMA_PX, decode
@@ -75,10 +76,8 @@ class TrainingConfig:
     def __post_init__(self) -> None:
         known = {"optimiser": ("rmsprop", "adamw"), "schedule": ("constant", "cosine"), "precision": ("fp32", "bf16")}
         for name, choices in known.items():
-            if getattr(self, name) not in choices:
-                raise ValueError(f"{name}: expected one of {', '.join(choices)}, got {getattr(self, name)!r}.")
-        if min(self.steps, self.batch_size, self.validate_every) < 1:
-            raise ValueError("steps, batch_size, validate_every: must be at least 1.")
+            check(self, name, choices.__contains__, f"expected one of {', '.join(choices)}")
+        check(self, "steps batch_size validate_every", lambda v: v >= 1, "must be at least 1")
 
     def rate(self, step: int, spent: float = 0.0) -> float:
         """Learning rate of a step; `spent` is the share of the time that has passed, if time ends the training."""

@@ -139,16 +139,15 @@ def packed(images: Iterable[LabelledImage], long_side_px: int | None = None) -> 
     """Labelled images of any size as (ends (n,), JPEGs one after the other, u (n, 3, 2), visibility (n, 3)), `long_side_px`
     long at most.
     """
-    jpegs, points, seen = [], [], []
+    parts = []
     for _, image, u, visibility, _ in images:
         h, w = image.shape[:2]
         if long_side_px and max(h, w) > long_side_px:
             size = round(w * long_side_px / max(h, w)), round(h * long_side_px / max(h, w))
             image, u = cv2.resize(image, size, interpolation=cv2.INTER_AREA), cell_from_image(u, np.array([w, h]) / size)
         encoded = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 95])[1]
-        jpegs.append(encoded.ravel())
-        points.append(u)
-        seen.append(visibility)
+        parts.append((encoded.ravel(), u, visibility))
+    jpegs, points, seen = zip(*parts, strict=True)
     return np.cumsum([j.size for j in jpegs]), np.concatenate(jpegs), np.stack(points), np.stack(seen)
 
 
@@ -182,8 +181,7 @@ def make_proposals(path: Path, scenes: Path, detector: str | Path | None) -> Non
         for i, piece in enumerate(np.split(jpegs, ends[:-1])):
             image = cv2.imdecode(piece, cv2.IMREAD_COLOR_RGB)
             if rng.random() < 0.5:
-                length_px = np.nan_to_num(tool_length_px(u[i : i + 1])[0], nan=40.0)
-                image = disguised(image, u[i], visibility[i], rng, float(length_px))[0]
+                image = disguised(image, u[i], visibility[i], rng, float(tool_length_px(u[i])))[0]
             seen, _, height = searching.proposed(image)
             best = np.argsort(-height)[:PROPOSALS]
             found[i, : len(best)] = seen.u[best]

@@ -14,8 +14,7 @@ from lib.recordings.annotations import inside
 from lib.simulator.window import motion_blur
 from lib.training import shards
 from lib.training.appearance import disguised
-from lib.training.bending import bent
-from lib.training.drawings import drawn_ground, drawn_tool
+from lib.training.drawings import bent, drawn_ground, drawn_tool
 from lib.training.samples import LabelledImage, Source
 
 #: The first stage sees frames whose longer side is shrunk to this, here with (width, height) of the input.  It is trained on
@@ -43,8 +42,8 @@ class SceneSource(Source):
     """Frames as JPEG, one after the other, that end at `ends` (n,), with u (n, 3, 2) in their pixels and visibility (n, 3).
 
     Frames without a tool are among them: all landmarks have visibility 0.  `disguise` is the share of the
-    draws whose appearance is changed, `drawn` that of the draws whose tool is a drawing (`drawings.py`), `bent` that of the
-    others whose jaws are bent (`bending.py`), `weight` (n, 3) that of the draws in which a label counts.
+    draws whose appearance is changed, `drawn` that of the draws whose tool is a drawing, `bent` that of the others whose
+    jaws are bent (both in `drawings.py`), `weight` (n, 3) that of the draws in which a label counts.
     """
 
     ends: np.ndarray
@@ -96,7 +95,7 @@ class SceneSource(Source):
         length = scale * _length_px(u, visibility)
         u = windows.map_points(matrix, u)
         if rng.random() < self.disguise:
-            image, u, visibility = disguised(image, u, visibility, rng, length if np.isfinite(length) else 40.0)
+            image, u, visibility = disguised(image, u, visibility, rng, length)
         if length < SHORTEST_PX or image.std() < FLAT:
             u = np.where((visibility > 0)[:, None], np.nan, u)
         return image, np.where((rng.random(3) > weight)[:, None], np.nan, u), visibility
@@ -104,7 +103,7 @@ class SceneSource(Source):
 
 def _length_px(u: np.ndarray, visibility: np.ndarray) -> float:
     """The tool's length; NaN without a tool."""
-    return float(tool_length_px(u[None])[0]) if visibility.any() else np.nan
+    return float(tool_length_px(u)) if visibility.any() else np.nan
 
 
 class FrameSource(SceneSource):
@@ -119,8 +118,7 @@ class FrameSource(SceneSource):
         zoom = np.clip(fit * np.exp(rng.normal(0, 0.45)), 0.4 * fit, None)
         if np.isfinite(length):
             zoom = np.clip(zoom, 7 / length, 85 / length)
-            far = rng.random() < 0.25
-            spread = (1.5 if far else 0.4) * np.array(PART_PX) / zoom
+            spread = (1.5 if rng.random() < 0.25 else 0.4) * np.array(PART_PX) / zoom
             middle = np.nanmean(u, axis=0) + rng.uniform(-1, 1, 2) * spread
         else:
             middle = rng.uniform((0, 0), frame.shape[1::-1])
@@ -245,13 +243,12 @@ class CloseupSource(Source):
     @classmethod
     def of(cls, images: Sequence[LabelledImage], *, still: bool = False, weight: np.ndarray | None = None) -> Self:
         """From labelled images of any size; for validation `still`, neither stretched nor blurred nor disguised."""
-        usable = [np.isfinite(one.in_view).all(1) & (one.visibility == 2) & np.isfinite(windows.tool_pose(one.u[None])[1])
-                  for one in images]  # fmt: skip
+        usable = [np.isfinite(one.u).all(1) & (one.visibility == 2) & np.isfinite(tool_length_px(one.u)) for one in images]
         which = np.argwhere(usable)
         if not len(which):
             raise ValueError("images: no visible landmark of a tool with base and tip; label some.")
-        crops = (shards.square_round(images[i].image, images[i].u, k, shards.CLOSEUP_CROP_PX) for i, k in which)
-        parts = ((*crop, images[i].visibility, k) for crop, (i, k) in zip(crops, which, strict=True))
+        shown = ((images[i], k) for i, k in which)
+        parts = ((*shards.square_round(one.image, one.u, k, shards.CLOSEUP_CROP_PX), one.visibility, k) for one, k in shown)
         weight = None if weight is None else weight[tuple(which.T)]
         source = cls(*map(np.array, zip(*parts, strict=True)), weight=weight)
         return source if not still else replace(source, stretch=0.0, shear=0.0, motion_px=0.0, disguise=0.0)
@@ -267,7 +264,7 @@ class CloseupSource(Source):
             length, blur = (np.exp(rng.uniform(*np.log(r))) for r in (_DRAWN_LENGTH_PX, _DRAWN_BLUR_PX))
             crop, u, _ = drawn_tool(drawn_ground(crop, rng), rng, length_px=length, around=k)
             crop = cv2.GaussianBlur(crop, (0, 0), blur)
-        length = tool_length_px(u[None])[0] * np.exp(rng.normal(0, self.length))
+        length = tool_length_px(u) * np.exp(rng.normal(0, self.length))
         shift = rng.normal(0, self.shifts_px[rng.choice(len(self.shifts_px), p=self.shift_shares)], 2)
         shift *= min(1.0, windows.CLOSEUP_REACH_PX / max(np.linalg.norm(shift), 1e-9)) / windows.closeup_scale(length)
         known = u.copy()

@@ -18,7 +18,6 @@ from lib.landmarks import Detector
 from lib.landmarks.detector import CLOSE
 from lib.landmarks.metrics import tool_length_px
 from lib.landmarks.network import HourglassConfig, Network, OffsetConfig
-from lib.landmarks.windows import tool_pose
 from lib.parallel import cores, single_threaded_torch
 from lib.provenance import commit_id, machine
 from lib.recordings import Recording
@@ -93,13 +92,11 @@ def finetune(
         ValueError: If there is no usable image, or fewer than 20 landmarks are found in the held-out ones and the detector
             has no error models yet.
     """
-    usable = []
+    images, held_out = ([one for one in part if np.isfinite(tool_length_px(one.u))] for part in (images, held_out))
     for kind, part in (("training", images), ("validation", held_out)):
-        usable.append([labelled for labelled in part if np.isfinite(tool_pose(labelled.u[None])[1]).all()])
-        if not usable[-1]:
+        if not part:
             raise ValueError(f"{kind} images: none has a labelled base and tip; label some.")
-    images, held_out = usable
-    relative_sd = np.stack([np.broadcast_to(one.sd_px, 3) / tool_length_px(one.u[None]) for one in images])
+    relative_sd = np.stack([np.broadcast_to(one.sd_px, 3) / tool_length_px(one.u) for one in images])
     doubt_on = validation_images(simulated) if isinstance(simulated, str | Path) else (simulated or ())[::3]
     began, names, stopped = time.perf_counter(), list(detector.networks), threading.Event()
     bars = {stage: tqdm(total=1.0, desc=stage, disable=progress is not True, bar_format="{l_bar}{bar}") for stage in names}

@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from lib.training import sources
-from lib.training.bending import bent
-from lib.training.drawings import drawn_ground, drawn_tool
+from lib.training.drawings import bent, drawn_ground, drawn_tool
 from lib.training.samples import LabelledImage
 from lib.training.sources import CloseupSource, FrameSource, ToolSource
 
