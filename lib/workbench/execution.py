@@ -105,11 +105,9 @@ def positive(text: str) -> float:
 
 def title_of(notebook: Path) -> str:
     """The first heading of the notebook, or its stem."""
-    for cell in nbformat.read(notebook, as_version=4).cells:
-        for line in cell.source.splitlines() if cell.cell_type == "markdown" else ():
-            if line.startswith("#"):
-                return line.lstrip("# ").strip()
-    return notebook.stem
+    prose = (cell.source for cell in nbformat.read(notebook, as_version=4).cells if cell.cell_type == "markdown")
+    heading = re.search(r"^#[# ]*(.*)", "\n".join(prose), re.MULTILINE)
+    return heading[1].strip() if heading else notebook.stem
 
 
 def _value(name: str, text: str, kind: str) -> object:
