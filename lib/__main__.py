@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import importlib
-import json
 import os
 import shutil
 import subprocess
@@ -157,13 +156,9 @@ def _keep_detections() -> None:
 def ruff_options() -> list[str]:
     """[tool.ruff] of environment.toml as command-line options (ruff reads only files of its own names)."""
     from lib.environment import manifest
+    from lib.files import toml_entries
 
-    def toml(value: object) -> str:
-        if isinstance(value, dict):
-            return "{" + ", ".join(f"{json.dumps(key)} = {toml(item)}" for key, item in value.items()) + "}"
-        return json.dumps(value)
-
-    return ["--isolated", *(f"--config={key} = {toml(value)}" for key, value in manifest()["tool"]["ruff"].items())]
+    return ["--isolated", *(f"--config={entry}" for entry in toml_entries(manifest()["tool"]["ruff"]))]
 
 
 #: Command -> the function that it calls, and its module.

@@ -229,11 +229,10 @@ def _write_landmarks(path: Path, recording: Recording, data: Correspondences) ->
     names += [f"{side}_{what}" for side in ("left", "right") for what in ("x_px", "y_px", "confidence", "sd_x_px", "sd_y_px")]
     lines = [",".join(names)]
     sd = np.sqrt(np.diagonal(data.covariance_px2, axis1=2, axis2=3))
-    for row in range(len(data)):
-        sides = [[*u[row], data.confidence[row, k], *sd[row, k]] for k, u in enumerate((data.u_left, data.u_right))]
-        numbers = [data.time_s[row], *data.x_mm[row], *np.concatenate(sides)]
+    sides = np.dstack([np.stack([data.u_left, data.u_right], axis=1), data.confidence, sd]).reshape(-1, 10)
+    for frame, landmark, *numbers in zip(data.frame, data.landmark, data.time_s, *data.x_mm.T, *sides.T, strict=True):
         cells = ["" if np.isnan(value) else f"{value:.6f}" for value in numbers]
-        lines.append(",".join([str(data.frame[row]), recording.skeleton[data.landmark[row]], *cells]))
+        lines.append(",".join([str(frame), recording.skeleton[landmark], *cells]))
     files.write_text(path, "\n".join(lines) + "\n")
 
 

@@ -1,11 +1,12 @@
-"""Files written whole or not at all, and the digests that name their content.  Standard library only."""
+"""Files written whole or not at all, text as TOML writes it, and the digests of files.  Standard library only."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import os
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -51,6 +52,24 @@ def write_bytes(path: str | Path, data: bytes) -> None:
 def write_json(path: str | Path, value: object) -> None:
     """Write `value` as readable JSON; NaN and infinity, for which it has no word, are a ValueError."""
     write_text(path, json.dumps(value, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
+
+
+def toml(value: object) -> str:
+    """A value as TOML writes it.
+
+    >>> print(toml({"fps": 25.0, "names": ["base"], "end_s": float("inf")}))
+    { fps = 25.0, names = ["base"], end_s = inf }
+    """
+    if isinstance(value, dict):
+        return f"{{ {', '.join(toml_entries(value))} }}"
+    text = json.dumps(value, ensure_ascii=False)
+    return {"Infinity": "inf", "-Infinity": "-inf", "NaN": "nan"}.get(text, text)
+
+
+def toml_entries(values: Mapping[str, object]) -> list[str]:
+    """``key = value`` for each entry of a table, as TOML writes it."""
+    keys = (key if re.fullmatch(r"[\w-]+", key, re.ASCII) else json.dumps(key) for key in values)
+    return [f"{key} = {toml(value)}" for key, value in zip(keys, values.values(), strict=True)]
 
 
 def digest(*files: str | Path, length: int = 12) -> str:

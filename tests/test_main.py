@@ -146,4 +146,4 @@ def test_supported_pythons_agree_with_environment_toml():
 def test_ruff_is_told_what_environment_toml_says():
     options = command_line.ruff_options()
     assert "--config=line-length = 120" in options
-    assert any(option.startswith('--config=lint = {"select" = ["E"') for option in options)
+    assert any(option.startswith('--config=lint = { select = ["E"') for option in options)

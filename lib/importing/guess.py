@@ -11,10 +11,11 @@ import av
 import numpy as np
 
 from lib.correspondences import LANDMARKS
+from lib.files import toml
 from lib.importing.labels import labels_of
 from lib.importing.logs import topics_of
 from lib.importing.video import IMAGES, VIDEOS, last_number
-from lib.recordings.tables import decoded, read_toml, toml
+from lib.recordings.tables import decoded, read_toml
 
 _TIME = re.compile(r"(?i)^(t|sec|secs|s|ms|us|ns)$|time|stamp|^t[_ \[(]")
 _AXIS = re.compile(r"(?i)^(.*?)[ _.\-]?([xyz])[ _]?[\[(]?(mm|um|m)?[\])]?$")

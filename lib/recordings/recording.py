@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lib.correspondences import LANDMARKS
-from lib.files import write_bytes, write_text
+from lib.files import toml_entries, write_bytes, write_text
 from lib.recordings.annotations import Annotations, read_coco, write_coco
 from lib.recordings.frames import Frames, open_side
-from lib.recordings.tables import columns, read_table, read_toml, refuse, toml_entries, write_table
+from lib.recordings.tables import columns, read_table, read_toml, refuse, write_table
 from lib.recordings.truth import Truth
 
 _FORMAT = "microstereo.recording"

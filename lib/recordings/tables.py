@@ -2,11 +2,9 @@
 
 import csv
 import io
-import json
 import math
-import re
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -43,24 +41,6 @@ def read_toml(path: Path) -> dict:
         return tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise ValueError(f"{path}: not valid TOML ({error}). Save it as UTF-8 text.") from None
-
-
-def toml(value: object) -> str:
-    """A value as TOML writes it.
-
-    >>> print(toml({"fps": 25.0, "names": ["base"], "end_s": float("inf")}))
-    { fps = 25.0, names = ["base"], end_s = inf }
-    """
-    if isinstance(value, dict):
-        return f"{{ {', '.join(toml_entries(value))} }}"
-    text = json.dumps(value, ensure_ascii=False)
-    return {"Infinity": "inf", "-Infinity": "-inf", "NaN": "nan"}.get(text, text)
-
-
-def toml_entries(values: Mapping[str, object]) -> list[str]:
-    """``key = value`` for each entry of a table, as TOML writes it."""
-    keys = (key if re.fullmatch(r"[\w-]+", key, re.ASCII) else json.dumps(key) for key in values)
-    return [f"{key} = {toml(value)}" for key, value in zip(keys, values.values(), strict=True)]
 
 
 def rows_of(path: Path, text: str, separator: str = ",") -> Iterator[tuple[str, list[str]]]:

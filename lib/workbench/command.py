@@ -224,8 +224,7 @@ class _Report:
             if entry["state"] == "running":
                 entry["state"] = "pending"
         (self.folder / _ROOM).unlink(missing_ok=True)
-        if state != "stopped":
-            self.content["download"] = f"{self.folder.name}.zip"
+        self.content["download"] = None if state == "stopped" else f"{self.folder.name}.zip"
         self.write()
         if self.content["download"]:
             try:

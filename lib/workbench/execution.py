@@ -27,8 +27,6 @@ _TOLD = ("numpy", "scipy", "torch", "kornia", "opencv-python-headless", "open3d-
 _GRID = re.compile(r";\s*grid:(.*)$")
 #: A comma outside brackets.
 _COMMA = re.compile(r",(?![^\[({]*[\])}])")
-#: Tags of papermill's own cells (values given, error marks), which the author does not count.
-_ADDED = {"injected-parameters", "papermill-error-cell-tag"}
 #: What kernels inherit: this interpreter's own kernel, quiet libraries, and that nobody answers what they show.
 _KERNEL_ENVIRONMENT = {
     "MICROSTEREO_PAGE": "1",
@@ -107,11 +105,9 @@ def positive(text: str) -> float:
 
 def title_of(notebook: Path) -> str:
     """The first heading of the notebook, or its stem."""
-    for cell in nbformat.read(notebook, as_version=4).cells:
-        for line in cell.source.splitlines() if cell.cell_type == "markdown" else ():
-            if line.startswith("#"):
-                return line.lstrip("# ").strip()
-    return notebook.stem
+    prose = (cell.source for cell in nbformat.read(notebook, as_version=4).cells if cell.cell_type == "markdown")
+    heading = re.search(r"^#[# ]*(.*)", "\n".join(prose), re.MULTILINE)
+    return heading[1].strip() if heading else notebook.stem
 
 
 def _value(name: str, text: str, kind: str) -> object:
@@ -159,13 +155,13 @@ def execute(
     With a `label` a terminal shows how many cells are done.
     """
     import papermill
-    from papermill.exceptions import PapermillExecutionError
+    from papermill.exceptions import PapermillExecutionError, strip_color
 
     running = 0
 
     def on_cell_start(cell, cell_index):
         nonlocal running
-        running += not _ADDED & set(cell.metadata.get("tags", []))
+        running += "injected-parameters" not in cell.metadata.get("tags", [])  # papermill's own, which no author counts
 
     os.environ.pop("JUPYTER_PATH", None)
     os.environ.update(_KERNEL_ENVIRONMENT)
@@ -178,32 +174,14 @@ def execute(
             on_cell_start=on_cell_start,  # this and the next are for nbclient
             extra_arguments=["--IPKernelApp.log_level=50"],  # its warning of unencrypted TCP on every start
         )  # fmt: skip
-    except PapermillExecutionError:
-        pass  # told by the outputs, below
+    except PapermillExecutionError as error:  # none for `report.stop`
+        return Failure("error", running, f"{error.ename}: {strip_color(error.evalue)}")
     except CellTimeoutError:
         return Failure("timeout", running, f"the cell took longer than {cell_timeout_s:g} s (--cell-timeout).")
     except DeadKernelError:
         return Failure("dead kernel", running, "the kernel died; the machine may have run out of memory.")
     except (nbformat.ValidationError, OSError, ValueError, RuntimeError) as error:
         return Failure("error", running or None, f"{type(error).__name__}: {error}")
-    return _failure_of(output)
-
-
-def _failure_of(executed: Path) -> Failure | None:
-    """Judge an executed notebook by its outputs; one that `report.stop` ended went well."""
-    cells = [cell for cell in nbformat.read(executed, as_version=4).cells if not _ADDED & set(cell.metadata.get("tags", []))]
-    for number, cell in enumerate(cells, start=1):
-        if cell.cell_type != "code" or "raises-exception" in cell.metadata.get("tags", []):
-            continue
-        for output in cell.outputs:
-            if output.output_type == "error" and output.ename == "SystemExit" and not output.evalue:
-                return None  # `report.stop`
-            if output.output_type == "error":
-                message = re.sub(r"\x1b\[[0-9;]*m", "", output.evalue)  # colours of a terminal
-                return Failure("error", number, f"{output.ename}: {message}")
-        status = cell.metadata.get("papermill", {}).get("status")
-        if cell.source.strip() and status not in (None, "completed"):
-            return Failure("error", number, f"the cell is {status}.")
     return None
 
 

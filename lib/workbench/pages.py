@@ -30,8 +30,7 @@ _MISSING = {None: "its notebook was not run", "pending": "not yet", "running": "
 
 #: What the converter does not know, in its own words.
 _REWRITES = [
-    (re.compile(r"\\operatorname\*\{([^{}]*)\}_\{([^{}]*)\}"), r"\\underset{\2}{\\mathrm{\1}}\\,"),
-    (re.compile(r"\\operatorname\*\{([^{}]*)\}_(\w)"), r"\\underset{\2}{\\mathrm{\1}}\\,"),
+    (re.compile(r"\\operatorname\*\{([^{}]*)\}_(?:\{([^{}]*)\}|(\w))"), r"\\underset{\2\3}{\\mathrm{\1}}\\,"),
     (re.compile(r"\\operatorname\*?\{([^{}]*)\}"), r"\\mathrm{\1}\\,"),
     (re.compile(r"\\(begin|end)\{(aligned|gathered|align|equation)\}"), r"\\\1{align*}"),
     (re.compile(r"\\math(bb|cal|bf|rm|sf)\s+(\w)"), r"\\math\1{\2}"),

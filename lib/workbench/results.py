@@ -20,10 +20,6 @@ from lib import files, paths
 from lib.provenance import plain
 
 
-class _MissingColumn(ValueError, LookupError):
-    """A column that a table does not have."""
-
-
 class _Absent:
     """Stands for a table that was never recorded: whatever is asked of it is missing."""
 
@@ -68,7 +64,7 @@ class Table:
         """The rows whose entries equal those given, such as ``table.where(method="band", seed=0)``."""
         for name in equal:
             if name not in self.columns:
-                raise _MissingColumn(f"{name}: no such column; there are {', '.join(self.columns)}.")
+                raise LookupError(f"{name}: no such column; there are {', '.join(self.columns)}.")
         rows = [row for row in self.rows if all(row.get(name) == value for name, value in equal.items())]
         return Table(rows, self.provenance)
 

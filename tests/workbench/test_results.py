@@ -27,7 +27,7 @@ def test_a_table_comes_back(tmp_path):
     np.testing.assert_array_equal(table.columns["error_um"], [12.3457, math.nan, math.nan])
     np.testing.assert_array_equal(table.columns["extra_px"], [math.nan, math.nan, 3.0])
     assert len(table.where(masked=True, seed=2)) == 1 and len(table.where(method="none")) == 0
-    with pytest.raises(ValueError, match="sede: no such column; there are method, seed"):
+    with pytest.raises(LookupError, match="sede: no such column; there are method, seed"):
         table.where(sede=0)
 
 
