@@ -27,33 +27,20 @@ _EXTENT = 8  # at most so many steps from the first candidate, either way
 
 @dataclass(frozen=True, eq=False)
 class SurfaceFit:
-    """How a surface was found.
+    """How a surface was found; from `problem` on what was solved last, over the inliers."""
 
-    Attributes:
-        objective: Eq. (6) over the final inliers.  With point covariances the norms are whitened, with a camera depths.
-        duality_gap: Proven bound, in the unit of the objective, on its distance from the minimum.
-        smoothness: mu of Eq. (6), px^2 / mm: given, or chosen by held-out error.
-        reject_mm: Bound on the L1 norm of a point's residual that was applied, after the first fit.
-        inliers: (n,) points that the final fit used.
-        residual_mm: (n, 3) Psi(u) - x of every given point at the final surface; NaN where u lies outside.
-        held_out: (m, 2) candidates of the smoothness and their mean held-out L1 error (mm); (0, 2) where it was given.
-        axes: (k, 3) orthonormal directions along which the L1 norm was taken: the axes of the frame for the plain fit.
-        problem, penalty, weights, residual: What was solved last, over the inliers: the points on their grid, mu (k,)
-            of each output along `axes`, factors (n, k) of the absolute residuals, and the residuals (n, k).
-    """
-
-    objective: float
-    duality_gap: float
-    smoothness: float
-    reject_mm: float
-    inliers: np.ndarray
-    residual_mm: np.ndarray
-    held_out: np.ndarray
-    axes: np.ndarray
-    problem: L1Problem = field(repr=False)
-    penalty: np.ndarray = field(repr=False)
-    weights: np.ndarray = field(repr=False)
-    residual: np.ndarray = field(repr=False)
+    objective: float  # Eq. (6) over the final inliers; with point covariances the norms are whitened, with a camera depths
+    duality_gap: float  # proven bound, in the unit of the objective, on its distance from the minimum
+    smoothness: float  # mu of Eq. (6), px^2 / mm: given, or chosen by held-out error
+    reject_mm: float  # bound on the L1 norm of a point's residual that was applied, after the first fit
+    inliers: np.ndarray  # (n,) points that the final fit used
+    residual_mm: np.ndarray  # (n, 3) Psi(u) - x of every given point at the final surface; NaN where u lies outside
+    held_out: np.ndarray  # (m, 2) candidates of the smoothness and their mean held-out L1 error (mm); (0, 2) if it was given
+    axes: np.ndarray  # (k, 3) orthonormal directions along which the L1 norm was taken; the frame's axes for the plain fit
+    problem: L1Problem = field(repr=False)  # the points on their grid
+    penalty: np.ndarray = field(repr=False)  # mu (k,) of each output along `axes`
+    weights: np.ndarray = field(repr=False)  # factors (n, k) of the absolute residuals
+    residual: np.ndarray = field(repr=False)  # (n, k)
 
     def covariance(self, u: np.ndarray) -> np.ndarray:
         """Covariance (n, 3, 3) mm^2 of Psi(u) (n, 2), NaN outside the domain.
@@ -206,8 +193,7 @@ class BSplineSurface:
 def fit_surface(
     u: ArrayLike, x_mm: ArrayLike, *, domain: tuple[float, float, float, float], control: tuple[int, int] = (20, 20),
     smoothness: float | None = None, reject_mm: float | None = None, covariance_mm2: ArrayLike | None = None,
-    camera: AffineCamera | None = None, solver: Callable[..., L1Solution] = interior_point, tolerance: float = 1e-8,
-    quick: bool = False,
+    camera: AffineCamera | None = None, solver: Callable[..., L1Solution] = interior_point, quick: bool = False,
 ) -> BSplineSurface:  # fmt: skip
     """The bicubic B-spline Psi that minimises paper Eq. (6), sum_i |Psi(u_i) - x_i|_1 + mu int |d^2 Psi / du^2|^2 du.
 
@@ -226,8 +212,8 @@ def fit_surface(
         camera: The left camera, affine.  Its ray through u is then exact, Psi(u) = ray(u) + s(u) d, and only the depth
             s along the viewing direction d is fitted, to d.x.  Give `u` as matched in the image.
         solver: Takes the place of `lib.surface.solver.interior_point`, for comparisons.
-        tolerance: Duality gap at which the solver stops, relative to the objective.
-        quick: Five Newton steps, some percent off the minimum, choose smoothness and inliers; the final fit has `tolerance`.
+        quick: Five Newton steps, some percent off the minimum, choose smoothness and inliers, and the final fit stops at a
+            duality gap of 1e-4 of the objective; else it stops at 1e-8.
 
     A ValueError refuses NaN and points that determine no surface: fewer in the domain than 16 or a quarter of control points.
     """
@@ -252,7 +238,7 @@ def fit_surface(
         raise ValueError(f"reject_mm: a bound in mm above 0, infinity, or None; got {reject_mm}.")
     exact = search = solver
     if solver is interior_point:
-        exact = partial(solver, tolerance=tolerance)
+        exact = partial(solver, tolerance=1e-4 if quick else 1e-8)
         # As near the minimum as the choice of the smoothness needs.
         search = partial(solver, max_iterations=5) if quick else partial(solver, tolerance=1e-3)
     held_out = np.empty((0, 2))
