@@ -42,28 +42,8 @@ class SurfaceFit:
     weights: np.ndarray = field(repr=False)  # factors (n, k) of the absolute residuals
     residual: np.ndarray = field(repr=False)  # (n, k)
 
-    def covariance(self, u: np.ndarray) -> np.ndarray:
-        """Covariance (n, 3, 3) mm^2 of Psi(u) (n, 2), NaN outside the domain.
-
-        With f the density of the residuals at zero and the bending energy as the prior, the coefficients of an output have
-        C = (2 f B'B + 2 mu R)^-1 / (2 f) (Koenker, Quantile Regression, Sec. 4.2; Wahba, J. R. Stat. Soc. B 45, 1983).
-        Neighbouring matches share part of their error, so C is inflated by how much the signs of their residuals agree, and
-        outputs correlate as signs do.  What all points share, such as the error of the calibration, is not in it.
-        """
-        result = np.full((len(u), 3, 3), np.nan)
-        grid = self.problem.grid
-        inside = np.flatnonzero(grid.inside(u))
-        for part in np.array_split(inside, max(1, len(inside) // 2048)):
-            B = grid.design(u[part]).toarray().T
-            variance = [(B * cho_solve_banded((factor, True), B)).sum(axis=0) / (2 * f) for factor, f in self._posterior]
-            inflation, correlation = self._agreement
-            sigma = np.sqrt(np.stack(variance, axis=1) * inflation)
-            covariance = sigma[:, :, None] * correlation * sigma[:, None, :]
-            result[part] = np.einsum("ki,nkl,lj->nij", self.axes, covariance, self.axes)
-        return result
-
     @cached_property
-    def _posterior(self) -> list[tuple[np.ndarray, float]]:
+    def posterior(self) -> list[tuple[np.ndarray, float]]:
         """Factor of 2 f B'W^2 B + 2 mu R and density f, one an output."""
         posterior = []
         for mu, weights, size in zip(self.penalty, self.weights.T, np.abs(self.weights * self.residual).T, strict=True):
@@ -77,7 +57,7 @@ class SurfaceFit:
         return posterior
 
     @cached_property
-    def _agreement(self) -> tuple[np.ndarray, np.ndarray]:
+    def agreement(self) -> tuple[np.ndarray, np.ndarray]:
         """Of residual signs: variance (k,) of sums in a quarter cell over that of independent ones; correlation (k, k)."""
         signs, grid = np.sign(self.residual), self.problem.grid
         cell, t = grid.locate(self.problem.u)
@@ -154,10 +134,24 @@ class BSplineSurface:
         return normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
     def covariance(self, u: ArrayLike) -> np.ndarray:
-        """Covariance (n, 3, 3) mm^2 of Psi(u) from the scatter of the fitted points; see `SurfaceFit.covariance`."""
+        """Covariance (n, 3, 3) mm^2 of Psi(u) (n, 2) from the scatter of the fitted points; NaN outside the domain.
+
+        With f the density of the residuals at zero and the bending energy as the prior, the coefficients of an output have
+        C = (2 f B'B + 2 mu R)^-1 / (2 f) (Koenker, Quantile Regression, Sec. 4.2; Wahba, J. R. Stat. Soc. B 45, 1983).
+        Neighbouring matches share part of their error, so C is inflated by how much the signs of their residuals agree, and
+        outputs correlate as signs do.  What all points share, such as the error of the calibration, is not in it.
+        """
         if self.fit is None:
             raise ValueError("covariance: this surface was not fitted to points, so its uncertainty is not known.")
-        return self.fit.covariance(points(u, 2, "u"))
+        u, axes, (inflation, correlation) = points(u, 2, "u"), self.fit.axes, self.fit.agreement
+        result, inside = np.full((len(u), 3, 3), np.nan), np.flatnonzero(self.grid.inside(u))
+        for part in np.array_split(inside, max(1, len(inside) // 2048)):
+            B = self.grid.design(u[part]).toarray().T
+            variance = [(B * cho_solve_banded((factor, True), B)).sum(axis=0) / (2 * f) for factor, f in self.fit.posterior]
+            sigma = np.sqrt(np.stack(variance, axis=1) * inflation)
+            covariance = sigma[:, :, None] * correlation * sigma[:, None, :]
+            result[part] = np.einsum("ki,nkl,lj->nij", axes, covariance, axes)
+        return result
 
     def distance(self, x_mm: ArrayLike, camera: AffineCamera) -> ToolDistance:
         """Distance of points (n, 3), such as tool tips, to the surface along the view and along the surface's normal.
