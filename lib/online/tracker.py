@@ -128,7 +128,7 @@ class RigTracker:
         base = np.array([np.nanmean(frame.data.x_mm, axis=0) for frame in frames])
         near = np.linalg.norm(base - np.median(base, axis=0), axis=1) < _FAR_MM
         frames = [frame for frame, fine in zip(frames, near, strict=True) if fine]
-        parts, refused = [frames], None
+        parts, refused = [frames] if frames else [], None
         if len(frames) >= first + 2:
             half = max(first, (len(frames) + 1) // 2)
             parts += [frames[-half:], frames[:half]]
