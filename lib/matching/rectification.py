@@ -24,7 +24,7 @@ class Rectification:
     left_from_canvas: np.ndarray  # (2, 3) maps from canvas to image pixels
     right_from_canvas: np.ndarray  # the same at `reference_depth_mm`
     size_px: tuple[int, int]  # (width, height) of the canvas
-    displacement_px_per_mm: float  # a point dz deeper than the reference is shifted by this times dz along +x, on the right
+    displacement_px_per_mm: float  # a point dz deeper than the reference lies this times dz further along +x on the right
     reference_depth_mm: float  # depth d.x along the left viewing direction d at which the displacement is 0
 
     def depth_range_mm(self, displacement_range_px: tuple[float, float]) -> tuple[float, float]:

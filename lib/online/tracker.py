@@ -50,7 +50,7 @@ class RigTracker:
     def _start_again(self, frames: Sequence[Seen], cause: str = "") -> None:
         """Without a rig: at first, and where the optics changed, not only the pose."""
         self.rig, self.calibration, self.state, self.cause = None, None, "calibrating", cause
-        self._given = False  # a rig that was given is never calibrated anew
+        self._given = False  # a rig that was given is in force, which no calibration replaces
         self._frames, self._tried, self._fitted = list(frames), 0, 0  # that the rig is calibrated with; how many of them
         self._online: OnlineCalibration | None = None  # take the frames after the last calibration
         self._monitor: DriftMonitor | None = None
