@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from lib.cameras import StereoRig
-from lib.matching.deepmatching import VolumeMatches, correlation_volume, match_volume, peak_ratio, volume_bytes
+from lib.matching.deepmatching import VolumeMatches, correlation_volume, match_volume, peak_ratio
 from lib.matching.descriptors import CHANNELS, MIN_SEEN, PATCH, patch_quality, pixel_descriptors
 from lib.matching.rectification import Rectification, rectify, warp
 from lib.matching.result import SIGMA_LEFT_PX, Matches
@@ -152,7 +152,7 @@ def match_band(images: Images, masks: Masks, rig: StereoRig, where: Where, *, bu
         return Matches(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros((0, 4, 4)), method="band")
     low, high = int(np.floor(range_px[0] / CELL_PX)) - 1, int(np.ceil(range_px[1] / CELL_PX)) + 1
     gx, gy = (side // (PATCH * CELL_PX) for side in rectification.size_px)
-    need = volume_bytes(gy, gx, high - low + 1, OFF_LINE)
+    need = 4 * gy * gx * (2 * OFF_LINE + 1) * (high - low + 1) * 2.7  # bytes: the volume as float32, and its pooled copies
     if need > budget_bytes:
         what = f"{high - low + 1} displacements of {gx} x {gy} patches need {need / 2**30:.2f} GiB"
         budget = f"the budget is {budget_bytes / 2**30:.2f} GiB"

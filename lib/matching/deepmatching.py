@@ -171,11 +171,6 @@ class VolumeMatches(NamedTuple):
         return VolumeMatches(*(values[chosen] for values in self))
 
 
-def volume_bytes(gy: int, gx: int, n: int, v: int) -> int:
-    """Peak memory (float32) of `correlation_volume` and `match_volume`: the volume, and its pooled copies."""
-    return int(4 * gy * gx * (2 * v + 1) * n * 2.7)
-
-
 def correlation_volume(left: torch.Tensor, right: torch.Tensor, v: int) -> torch.Tensor:
     """Cosines (gy, gx, 2 v + 1, n) of every 4 x 4 patch of the left grid with its displaced windows in the right one.
 

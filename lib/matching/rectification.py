@@ -19,28 +19,16 @@ RECTIFIED = StereoRig(AffineCamera([[1, 0, 0, 0], [0, 1, 0, 0]]), AffineCamera([
 
 @dataclass(frozen=True, eq=False)
 class Rectification:
-    """A canvas that covers the left image and on which both images share their rows.
+    """A canvas that covers the left image and on which both images share their rows."""
 
-    Attributes:
-        left_from_canvas, right_from_canvas: (2, 3) maps from canvas to image pixels; the right one at `reference_depth_mm`.
-        size_px: (width, height) of the canvas.
-        displacement_px_per_mm: On the right canvas a point dz deeper than the reference is shifted by this times dz along +x.
-        reference_depth_mm: Depth d.x along the left viewing direction d at which the displacement is 0.
-    """
-
-    left_from_canvas: np.ndarray
-    right_from_canvas: np.ndarray
-    size_px: tuple[int, int]
-    displacement_px_per_mm: float
-    reference_depth_mm: float
-
-    def displacement_range_px(self, depth_range_mm: tuple[float, float]) -> tuple[float, float]:
-        """(low, high) displacement on the canvas of a range of depth."""
-        ends = np.subtract(depth_range_mm, self.reference_depth_mm) * self.displacement_px_per_mm
-        return float(ends.min()), float(ends.max())
+    left_from_canvas: np.ndarray  # (2, 3) maps from canvas to image pixels
+    right_from_canvas: np.ndarray  # the same at `reference_depth_mm`
+    size_px: tuple[int, int]  # (width, height) of the canvas
+    displacement_px_per_mm: float  # a point dz deeper than the reference lies this times dz further along +x on the right
+    reference_depth_mm: float  # depth d.x along the left viewing direction d at which the displacement is 0
 
     def depth_range_mm(self, displacement_range_px: tuple[float, float]) -> tuple[float, float]:
-        """The inverse of `displacement_range_px`."""
+        """(near, far) depth of a range of displacements on the canvas."""
         ends = self.reference_depth_mm + np.asarray(displacement_range_px) / self.displacement_px_per_mm
         return float(ends.min()), float(ends.max())
 
@@ -49,7 +37,7 @@ class Rectification:
 
         A ValueError where they see nothing of it says what depths they see.
         """
-        low, high = self.displacement_range_px(depth_range_mm)
+        low, high = np.sort(np.subtract(depth_range_mm, self.reference_depth_mm) * self.displacement_px_per_mm).tolist()
         corners = np.array(list(np.ndindex(2, 2))) * np.subtract(shape_right[::-1], 1)
         x = np.linalg.solve(self.right_from_canvas[:, :2], (corners - self.right_from_canvas[:, 2]).T)[0]
         visible = float(x.min() - self.size_px[0]), float(x.max())

@@ -90,21 +90,19 @@ def misfit(rig: StereoRig, data: Correspondences, covariance_px2: np.ndarray, pa
 def _lateness(rig, frames, past, covariance_px2) -> tuple[float, Explanation] | None:
     """The delay between report and images that explains the frames best."""
     number = {int(part.frame[0]): part for part in (*past, *frames)}
-    numbers, best = [int(part.frame[0]) for part in frames], None
+    numbers, found = [int(part.frame[0]) for part in frames], []
     for delay in [*range(-_LATEST, 0), *range(1, _LATEST + 1)]:
         seen = [number.get(i - max(delay, 0)) for i in numbers]  # what a late report says now, the images showed before
         told = [number.get(i + min(delay, 0)) for i in numbers]
         if any(part is None for part in (*seen, *told)):
             continue
         data = replace(Correspondences.join(seen), x_mm=np.concatenate([part.x_mm for part in told])).complete
-        if len(data) < 0.7 * len(covariance_px2):
-            continue
-        # Fewer rows must not make a delay likelier.
-        value = misfit(rig, data, np.resize(covariance_px2, (len(data), 4, 4)), 2) * len(covariance_px2) / len(data)
-        if best is None or value < best[0]:
+        if len(data) >= 0.7 * len(covariance_px2):
+            # Fewer rows must not make a delay likelier.
+            value = misfit(rig, data, np.resize(covariance_px2, (len(data), 4, 4)), 2) * len(covariance_px2) / len(data)
             who = "robot's report is" if delay > 0 else "images are"
-            best = value, Explanation("clock", f"the {who} late by {abs(delay)} frames", rig)
-    return best
+            found.append((value, Explanation("clock", f"the {who} late by {abs(delay)} frames", rig)))
+    return min(found, key=lambda pair: pair[0], default=None)
 
 
 def _offset(rig: StereoRig, data: Correspondences, axes: np.ndarray, covariance_px2: np.ndarray) -> np.ndarray:

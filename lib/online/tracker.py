@@ -39,9 +39,9 @@ class RigTracker:
         self, rig: StereoRig | Calibration | None, *, noise_px: float, settings: Settings,
         calibrate: Callable[..., Calibration],
     ) -> None:  # fmt: skip
-        self.settings, self._calibrate = settings, calibrate
-        self._noise_px, self._given = noise_px, rig is not None
+        self.settings, self._calibrate, self._noise_px = settings, calibrate, noise_px
         self._start_again([])
+        self._given = rig is not None
         if isinstance(rig, StereoRig):
             self._use(rig, None)
         elif rig is not None:
@@ -50,6 +50,7 @@ class RigTracker:
     def _start_again(self, frames: Sequence[Seen], cause: str = "") -> None:
         """Without a rig: at first, and where the optics changed, not only the pose."""
         self.rig, self.calibration, self.state, self.cause = None, None, "calibrating", cause
+        self._given = False  # a rig that was given is in force, which no calibration replaces
         self._frames, self._tried, self._fitted = list(frames), 0, 0  # that the rig is calibrated with; how many of them
         self._online: OnlineCalibration | None = None  # take the frames after the last calibration
         self._monitor: DriftMonitor | None = None
@@ -128,7 +129,7 @@ class RigTracker:
         base = np.array([np.nanmean(frame.data.x_mm, axis=0) for frame in frames])
         near = np.linalg.norm(base - np.median(base, axis=0), axis=1) < _FAR_MM
         frames = [frame for frame, fine in zip(frames, near, strict=True) if fine]
-        parts, refused = [frames], None
+        parts, refused = [frames] if frames else [], None
         if len(frames) >= first + 2:
             half = max(first, (len(frames) + 1) // 2)
             parts += [frames[-half:], frames[:half]]
@@ -205,7 +206,6 @@ class RigTracker:
             # The oldest may be from before, or from during the motion.
             self._since, self._waiting, self.cause = self._since[1 - 2 * first :], self._waiting + 1, str(error)
             if self._waiting > self.settings.give_up_frames:
-                self._given = False
                 self._start_again(self._since, "no cause explains the images; calibrating afresh")
             raise
         if found.kind == "open":
@@ -215,7 +215,6 @@ class RigTracker:
             self._held, self._waiting, self.rig, self._motion = True, 1, self._before, self._motion_before
             self._since, result.failures["robot"] = self._since[1 - first :], found.text
         elif found.kind == "optics":
-            self._given = False
             self._start_again(self._since, found.text)
             result.failures["register"] = found.text
         elif found.kind == "none":

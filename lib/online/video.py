@@ -44,8 +44,8 @@ class Dashboard:
         _text(page, f"{result.time_s:8.2f} s  {result.cause}"[:44], (930, 395))
 
     def _curve(self, part: np.ndarray) -> None:
-        known = np.array([distance for distance, _ in self._past])
-        top = max(float(np.nanmax(known, initial=0.5, where=np.isfinite(known))), 0.5) * 1.15
+        past = np.array(self._past)  # (n, 2, 3)
+        top = max(float(np.nanmax(past[:, 0], initial=0.5, where=np.isfinite(past[:, 0]))), 0.5) * 1.15
         height, width = part.shape[0] - 40, part.shape[1] - 70
 
         def place(i: float, mm: float) -> tuple[int, int]:
@@ -56,8 +56,7 @@ class Dashboard:
             cv2.line(part, place(0, mm), place(self._past.maxlen, mm), (225, 225, 225), 1)
             _text(part, f"{mm:.1f}", (15, place(0, mm)[1] + 4))
         for k, name in enumerate(LANDMARKS):
-            for i, past in enumerate(self._past):
-                d, sd = past[0][k], past[1][k]
+            for i, (d, sd) in enumerate(past[:, :, k]):
                 if np.isfinite(d) and np.isfinite(sd):
                     pale = tuple(int(200 + 0.2 * c) for c in LANDMARK_COLOURS[name])
                     cv2.line(part, place(i, d - 2 * sd), place(i, d + 2 * sd), pale, 2)

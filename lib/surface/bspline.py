@@ -27,56 +27,23 @@ _EXTENT = 8  # at most so many steps from the first candidate, either way
 
 @dataclass(frozen=True, eq=False)
 class SurfaceFit:
-    """How a surface was found.
+    """How a surface was found; from `problem` on what was solved last, over the inliers."""
 
-    Attributes:
-        objective: Eq. (6) over the final inliers.  With point covariances the norms are whitened, with a camera depths.
-        duality_gap: Proven bound, in the unit of the objective, on its distance from the minimum.
-        smoothness: mu of Eq. (6), px^2 / mm: given, or chosen by held-out error.
-        reject_mm: Bound on the L1 norm of a point's residual that was applied, after the first fit.
-        inliers: (n,) points that the final fit used.
-        residual_mm: (n, 3) Psi(u) - x of every given point at the final surface; NaN where u lies outside.
-        held_out: (m, 2) candidates of the smoothness and their mean held-out L1 error (mm); (0, 2) where it was given.
-        axes: (k, 3) orthonormal directions along which the L1 norm was taken: the axes of the frame for the plain fit.
-        problem, penalty, weights, residual: What was solved last, over the inliers: the points on their grid, mu (k,)
-            of each output along `axes`, factors (n, k) of the absolute residuals, and the residuals (n, k).
-    """
-
-    objective: float
-    duality_gap: float
-    smoothness: float
-    reject_mm: float
-    inliers: np.ndarray
-    residual_mm: np.ndarray
-    held_out: np.ndarray
-    axes: np.ndarray
-    problem: L1Problem = field(repr=False)
-    penalty: np.ndarray = field(repr=False)
-    weights: np.ndarray = field(repr=False)
-    residual: np.ndarray = field(repr=False)
-
-    def covariance(self, u: np.ndarray) -> np.ndarray:
-        """Covariance (n, 3, 3) mm^2 of Psi(u) (n, 2), NaN outside the domain.
-
-        With f the density of the residuals at zero and the bending energy as the prior, the coefficients of an output have
-        C = (2 f B'B + 2 mu R)^-1 / (2 f) (Koenker, Quantile Regression, Sec. 4.2; Wahba, J. R. Stat. Soc. B 45, 1983).
-        Neighbouring matches share part of their error, so C is inflated by how much the signs of their residuals agree, and
-        outputs correlate as signs do.  What all points share, such as the error of the calibration, is not in it.
-        """
-        result = np.full((len(u), 3, 3), np.nan)
-        grid = self.problem.grid
-        inside = np.flatnonzero(grid.inside(u))
-        for part in np.array_split(inside, max(1, len(inside) // 2048)):
-            B = grid.design(u[part]).toarray().T
-            variance = [(B * cho_solve_banded((factor, True), B)).sum(axis=0) / (2 * f) for factor, f in self._posterior]
-            inflation, correlation = self._agreement
-            sigma = np.sqrt(np.stack(variance, axis=1) * inflation)
-            covariance = sigma[:, :, None] * correlation * sigma[:, None, :]
-            result[part] = np.einsum("ki,nkl,lj->nij", self.axes, covariance, self.axes)
-        return result
+    objective: float  # Eq. (6) over the final inliers; with point covariances the norms are whitened, with a camera depths
+    duality_gap: float  # proven bound, in the unit of the objective, on its distance from the minimum
+    smoothness: float  # mu of Eq. (6), px^2 / mm: given, or chosen by held-out error
+    reject_mm: float  # bound on the L1 norm of a point's residual that was applied, after the first fit
+    inliers: np.ndarray  # (n,) points that the final fit used
+    residual_mm: np.ndarray  # (n, 3) Psi(u) - x of every given point at the final surface; NaN where u lies outside
+    held_out: np.ndarray  # (m, 2) candidates of the smoothness and their mean held-out L1 error (mm); (0, 2) if it was given
+    axes: np.ndarray  # (k, 3) orthonormal directions along which the L1 norm was taken; the frame's axes for the plain fit
+    problem: L1Problem = field(repr=False)  # the points on their grid
+    penalty: np.ndarray = field(repr=False)  # mu (k,) of each output along `axes`
+    weights: np.ndarray = field(repr=False)  # factors (n, k) of the absolute residuals
+    residual: np.ndarray = field(repr=False)  # (n, k)
 
     @cached_property
-    def _posterior(self) -> list[tuple[np.ndarray, float]]:
+    def posterior(self) -> list[tuple[np.ndarray, float]]:
         """Factor of 2 f B'W^2 B + 2 mu R and density f, one an output."""
         posterior = []
         for mu, weights, size in zip(self.penalty, self.weights.T, np.abs(self.weights * self.residual).T, strict=True):
@@ -90,7 +57,7 @@ class SurfaceFit:
         return posterior
 
     @cached_property
-    def _agreement(self) -> tuple[np.ndarray, np.ndarray]:
+    def agreement(self) -> tuple[np.ndarray, np.ndarray]:
         """Of residual signs: variance (k,) of sums in a quarter cell over that of independent ones; correlation (k, k)."""
         signs, grid = np.sign(self.residual), self.problem.grid
         cell, t = grid.locate(self.problem.u)
@@ -167,10 +134,24 @@ class BSplineSurface:
         return normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
     def covariance(self, u: ArrayLike) -> np.ndarray:
-        """Covariance (n, 3, 3) mm^2 of Psi(u) from the scatter of the fitted points; see `SurfaceFit.covariance`."""
+        """Covariance (n, 3, 3) mm^2 of Psi(u) (n, 2) from the scatter of the fitted points; NaN outside the domain.
+
+        With f the density of the residuals at zero and the bending energy as the prior, the coefficients of an output have
+        C = (2 f B'B + 2 mu R)^-1 / (2 f) (Koenker, Quantile Regression, Sec. 4.2; Wahba, J. R. Stat. Soc. B 45, 1983).
+        Neighbouring matches share part of their error, so C is inflated by how much the signs of their residuals agree, and
+        outputs correlate as signs do.  What all points share, such as the error of the calibration, is not in it.
+        """
         if self.fit is None:
             raise ValueError("covariance: this surface was not fitted to points, so its uncertainty is not known.")
-        return self.fit.covariance(points(u, 2, "u"))
+        u, axes, (inflation, correlation) = points(u, 2, "u"), self.fit.axes, self.fit.agreement
+        result, inside = np.full((len(u), 3, 3), np.nan), np.flatnonzero(self.grid.inside(u))
+        for part in np.array_split(inside, max(1, len(inside) // 2048)):
+            B = self.grid.design(u[part]).toarray().T
+            variance = [(B * cho_solve_banded((factor, True), B)).sum(axis=0) / (2 * f) for factor, f in self.fit.posterior]
+            sigma = np.sqrt(np.stack(variance, axis=1) * inflation)
+            covariance = sigma[:, :, None] * correlation * sigma[:, None, :]
+            result[part] = np.einsum("ki,nkl,lj->nij", axes, covariance, axes)
+        return result
 
     def distance(self, x_mm: ArrayLike, camera: AffineCamera) -> ToolDistance:
         """Distance of points (n, 3), such as tool tips, to the surface along the view and along the surface's normal.
@@ -206,8 +187,7 @@ class BSplineSurface:
 def fit_surface(
     u: ArrayLike, x_mm: ArrayLike, *, domain: tuple[float, float, float, float], control: tuple[int, int] = (20, 20),
     smoothness: float | None = None, reject_mm: float | None = None, covariance_mm2: ArrayLike | None = None,
-    camera: AffineCamera | None = None, solver: Callable[..., L1Solution] = interior_point, tolerance: float = 1e-8,
-    quick: bool = False,
+    camera: AffineCamera | None = None, solver: Callable[..., L1Solution] = interior_point, quick: bool = False,
 ) -> BSplineSurface:  # fmt: skip
     """The bicubic B-spline Psi that minimises paper Eq. (6), sum_i |Psi(u_i) - x_i|_1 + mu int |d^2 Psi / du^2|^2 du.
 
@@ -226,8 +206,8 @@ def fit_surface(
         camera: The left camera, affine.  Its ray through u is then exact, Psi(u) = ray(u) + s(u) d, and only the depth
             s along the viewing direction d is fitted, to d.x.  Give `u` as matched in the image.
         solver: Takes the place of `lib.surface.solver.interior_point`, for comparisons.
-        tolerance: Duality gap at which the solver stops, relative to the objective.
-        quick: Five Newton steps, some percent off the minimum, choose smoothness and inliers; the final fit has `tolerance`.
+        quick: Five Newton steps, some percent off the minimum, choose smoothness and inliers, and the final fit stops at a
+            duality gap of 1e-4 of the objective; else it stops at 1e-8.
 
     A ValueError refuses NaN and points that determine no surface: fewer in the domain than 16 or a quarter of control points.
     """
@@ -252,7 +232,7 @@ def fit_surface(
         raise ValueError(f"reject_mm: a bound in mm above 0, infinity, or None; got {reject_mm}.")
     exact = search = solver
     if solver is interior_point:
-        exact = partial(solver, tolerance=tolerance)
+        exact = partial(solver, tolerance=1e-4 if quick else 1e-8)
         # As near the minimum as the choice of the smoothness needs.
         search = partial(solver, max_iterations=5) if quick else partial(solver, tolerance=1e-3)
     held_out = np.empty((0, 2))

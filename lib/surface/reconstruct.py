@@ -184,7 +184,7 @@ def reconstruct(
         depth_only = fast and rig.is_affine if depth_only is None else depth_only
         surface = fit_surface(
             matches.u_left, points.x_mm, domain=domain, control=control, smoothness=smoothness,
-            camera=rig.left if depth_only else None, tolerance=1e-4 if fast else 1e-8, quick=fast,
+            camera=rig.left if depth_only else None, quick=fast,
         )  # fmt: skip
     return Reconstruction(surface, points, matches, len(found), masks["mask_left"], rig, dict(seconds))
 

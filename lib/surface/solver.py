@@ -87,16 +87,12 @@ class L1Problem:
 
 @dataclass(frozen=True)
 class L1Solution:
-    """Minimum of sum_i w_i |b_i.c - x_i| + mu c.R.c for each of k outputs, and its proof.
+    """Minimum of sum_i w_i |b_i.c - x_i| + mu c.R.c for each of k outputs, and its proof."""
 
-    The sums are `objective` (k,) at `coefficients` c (size, k).  They lie at most `duality_gap` (k,) above the minimum: that
-    follows from the dual feasible point `dual` y (n, k), |y_i| <= w_i, the pull of each point on the surface.
-    """
-
-    coefficients: np.ndarray
-    objective: np.ndarray
-    duality_gap: np.ndarray
-    dual: np.ndarray
+    coefficients: np.ndarray  # c (size, k)
+    objective: np.ndarray  # (k,) the sums there
+    duality_gap: np.ndarray  # (k,) by how much they lie above the minimum at most, which follows from `dual`
+    dual: np.ndarray  # y (n, k), a dual feasible point, |y_i| <= w_i: the pull of each point on the surface
 
 
 def interior_point(

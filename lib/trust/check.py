@@ -39,7 +39,7 @@ class Check:
     def to_json(self) -> dict:
         """verdict, reasons, next_step, facts and the score of each frame, as in check.json."""
         a = self.assessment
-        hypotheses = [{k: plain(v) for k, v in vars(h).items()} for h in a.diagnosis.hypotheses[:5]]
+        hypotheses = [plain(vars(h)) for h in a.diagnosis.hypotheses[:5]]
         frames = {"frame": a.health.frame.tolist(), "score": plain(a.health.score.tolist())}
         facts = {"recording": self.recording.name, **self.facts, "next_step": self.next_step}
         numbers = {"epipolar_px": plain(a.epipolar_px), "unhealthy_share": a.health.unhealthy}
@@ -53,8 +53,7 @@ class Check:
         here = Environment(loader=FileSystemLoader(Path(__file__).parent), autoescape=True)
         a = self.assessment
         text = here.get_template("check.html").render(
-            recording=self.recording, verdict=a.verdict, facts=self.facts, next_step=self.next_step,
-            overlays=self._overlays(), coverage=data_uri(self._coverage(), ".png"),
+            vars(self), verdict=a.verdict, overlays=self._overlays(), coverage=data_uri(self._coverage(), ".png"),
             report="" if a.calibration is None else report(a.calibration, verdict=a.verdict),
             hypotheses=[h for h in a.diagnosis.hypotheses if h.gain > 0][:5],
         )  # fmt: skip

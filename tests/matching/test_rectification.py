@@ -42,9 +42,9 @@ def test_rows_are_shared_and_displacement_is_depth(rotation, rolls, zoom, conver
     expected = (depth - found.reference_depth_mm) * found.displacement_px_per_mm
     assert np.allclose(right[:, 0] - left[:, 0], expected, atol=1e-6)
     assert np.allclose(found.u_left(left), u_left) and np.allclose(found.u_right(right), u_right)
-    low, high = found.displacement_range_px((depth.min(), depth.max()))
-    assert np.allclose((low, high), (expected.min(), expected.max()))
-    assert np.allclose(found.depth_range_mm((low, high)), (depth.min(), depth.max()))
+    assert np.allclose(found.depth_range_mm((expected.min(), expected.max())), (depth.min(), depth.max()))
+    near_far = found.depth_range_mm((-10.0, 10.0))  # which both images show, whose centres lie together at 0
+    assert np.allclose(found.search_range_px(near_far, (1080, 1920)), (-10, 10))
     # The canvas holds the whole left image and is upright as far as it can be.
     corners = canvas_from(found.left_from_canvas, np.array([[0, 0], [1919, 0], [0, 1079], [1919, 1079]], float))
     assert (corners > -1).all() and (corners < found.size_px).all()

@@ -238,3 +238,10 @@ def test_memory_is_flat():
         used.append(tracemalloc.get_traced_memory()[0])
     tracemalloc.stop()
     assert used[1] - used[0] < 100 * 450  # bytes: the drift monitor remembers the newest 1000 frames
+
+
+def test_two_places_that_no_tool_reaches_from_each_other_are_named():
+    world = World()
+    world.x_mm[4:] += 400.0  # mm, in each coordinate; the jump is believed after ten frames
+    results = run(make(world, settings=SELDOM), world, 18)
+    assert "too far apart" in results[-1].failures["calibrate"]
