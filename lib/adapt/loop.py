@@ -42,7 +42,7 @@ _LEAST_GAIN = 0.03
 #: landmark's move ends them.
 _GUIDED, _SETTLED = 3, 0.01
 #: Median distance, as a share of the tool's length, from labels set by hand, above which these say otherwise.
-_CONTRADICTED = 0.05
+_OFF_LABELS = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -296,7 +296,7 @@ class _Work:
         """Whether labels set by hand say otherwise than a teacher."""
         told = self.labels[self.marked]
         off = np.linalg.norm(teacher.project(self.marked)[0] - told, axis=-1) / tool_length_px(told)[..., None]
-        return len(self.marked) >= 5 and np.nanmedian(off) > _CONTRADICTED
+        return len(self.marked) >= 5 and np.nanmedian(off) > _OFF_LABELS
 
     def round(self, k: int, detector: Detector, teacher: Teacher, seen: Seen | None) -> Detector:
         """The detector trained further on what the teacher says of the frames for learning."""

@@ -356,7 +356,6 @@ def _scanned_clock(recording: Recording, merit: Callable[[Recording], float]) ->
 
     Of equal ones the smallest change; none where no offset gives cameras.
     """
-    @cache
     def merit_at(change_s: float) -> float:
         try:
             return merit(replace(recording, offset_s=recording.offset_s + change_s))
@@ -368,21 +367,20 @@ def _scanned_clock(recording: Recording, merit: Callable[[Recording], float]) ->
     return replace(recording, offset_s=recording.offset_s + max(sorted([best_s, *near_s], key=abs), key=merit_at))
 
 
-def _fitted(recording: Recording, seen: Seen, least: float, ransac_px: float | None = None) -> Calibration:
+def _fitted(recording: Recording, seen: Seen, least: float, ransac_px: float | None = None, **more: float) -> Calibration:
     """Cameras of square pixels, which leave the landmarks' offsets the least room."""
-    size = recording.image_size_px
-    return calibrate(seen.rows(recording, least), model="square", image_size_px=size, ransac_px=ransac_px)
+    how = {"model": "square", "image_size_px": recording.image_size_px, "ransac_px": ransac_px} | more
+    return calibrate(seen.rows(recording, least), **how)
 
 
 def _from_few(recording: Recording, labels: Seen) -> Calibration:
     """As `_fitted` from labels set by hand, all of them right: too few to tell the width of the offsets, or outliers."""
-    rows, how = labels.rows(recording), {"model": "square", "image_size_px": recording.image_size_px, "ransac_px": np.inf}
-    try:
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "offsets:", RuntimeWarning)  # by a clock that is off they find no end
-            return calibrate(rows, offsets=True, offset_prior_sd=_ROBOTS_OFFSET_MM, **how)
-    except ValueError:  # jaws that are shut have no axes
-        return calibrate(rows, **how)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "offsets:", RuntimeWarning)  # by a clock that is off they find no end
+        try:
+            return _fitted(recording, labels, 0.0, np.inf, offsets=True, offset_prior_sd=_ROBOTS_OFFSET_MM)
+        except ValueError:  # jaws that are shut have no axes
+            return _fitted(recording, labels, 0.0, np.inf)
 
 
 def _calibrated(recording: Recording, seen: Seen, from_labels: bool) -> tuple[Calibration, float]:

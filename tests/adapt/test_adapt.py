@@ -8,7 +8,7 @@ import pytest
 
 from lib.adapt import RefusalError, adapt, loop, report, teach
 from lib.adapt.judging import Agreement, better, stretches
-from lib.adapt.teacher import at_rest, look, look_elsewhere
+from lib.adapt.teacher import Seen, at_rest, look, look_elsewhere
 from lib.calibration.offsets import tool_axes
 from lib.landmarks import Detector, Landmarks
 from lib.recordings.annotations import Annotations, write_coco
@@ -316,6 +316,34 @@ def test_five_labelled_pairs_are_a_start(world, recording, tmp_path, monkeypatch
     assert found.improved and np.nanmedian(np.linalg.norm(tune.calls[-1]["off"], axis=-1)) < 1.5
     images, held_out = tune.calls[-1]["images"], tune.calls[-1]["held_out"]  # what all labels err alike is no noise of theirs
     assert all((one.sd_px > 0).all() for one in images) and all(one.sd_px == 0 for one in held_out)
+
+
+def five_labelled(world):
+    """Labels set by hand, to half a pixel, of five frames (n, 2, 3, 2), and as a `Seen`."""
+    some, u = np.array([1, 7, 13, 19, 24]), np.full(world.u.shape, np.nan)
+    u[some] = world.u[some] + np.random.default_rng(0).normal(0, 0.5, u[some].shape)
+    shape = (len(some), 2, 3)
+    return u, Seen(some, np.full((*shape, 2), np.nan), np.full((*shape, 2, 2), np.nan), np.zeros(shape)).labelled(u)
+
+
+def test_five_labelled_pairs_tell_clock_and_offsets(world, tmp_path):
+    offset = 0.2 * np.array([[0.0, 0.6, 0.8], [0.6, -0.8, 0.0], [-0.8, 0.0, 0.6]])
+    axes = lambda x: np.nan_to_num(tool_axes(x))  # noqa: E731
+    off = world.record(tmp_path / "off", robot=lambda _, x: x + np.einsum("mij,kj->mki", axes(x), offset), clock_s=0.04)
+    teacher = teach(off, five_labelled(world)[1], from_labels=True)
+    assert np.nanmedian(label_errors(world, teacher)[0]) < 1.5  # 0.2 mm are 5 px
+    assert teacher.recording.offset_s == pytest.approx(0.04, abs=0.015)
+
+
+def test_labels_overrule_a_detector_that_agrees_with_itself(world, recording, tmp_path):
+    elbows = world.u.copy()
+    elbows[:, :, 1:] += 0.12 * (elbows[:, :, :1] - elbows[:, :, 1:])
+    u = five_labelled(world)[0]
+    write_coco(tmp_path / "labels.json", Annotations(u[:, 0], u[:, 1]), SIZE, ".png")
+    for labels, wrong in ((None, True), (tmp_path / "labels.json", False)):
+        tune = pupil(world)
+        adapt(recording, StandIn(elbows, noise_px=0.7), labels=labels, folder=tmp_path, progress=False, tune=tune)
+        assert (np.nanmedian(np.linalg.norm(tune.calls[0]["off"], axis=-1)) > 4.0) == wrong
 
 
 def test_labels_teach_a_tool_that_no_closeup_knows(world, recording, tmp_path, monkeypatch):
