@@ -266,13 +266,13 @@ def teach(
     used = seen.of(np.setdiff1d(seen.frame, refused))
     if len(used.frame) < 5:
         raise RefusalError(f"kinematics: they stand still in {len(refused)} of {len(seen.frame)} frames; check the log.")
-    recording, clock_sd_s = _clock(recording if before is None else before.recording, used)
+    recording, clock_sd_s = _clock(recording if before is None else before.recording, used, from_labels=from_labels)
     try:
         calibration, right = _calibrated(recording, used, from_labels)
     except RefusalError as error:  # few right ones agree on cameras by a clock that is off, and do not tell its offset
         if from_labels or error.__cause__ is not None:
             raise
-        recording, clock_sd_s = _scanned_clock(recording, lambda one: _fitted(one, used, 0.0).view_inliers.sum()), 0.01
+        recording, clock_sd_s = _scanned_clock(recording, lambda one: _fitted(one, used).view_inliers.sum()), 0.01
         calibration, right = _calibrated(recording, used, from_labels)
     if not from_labels:
         again, sd = _clock(recording, used, calibration)
@@ -298,7 +298,7 @@ def teach(
                 f"{100 * shares.max():.0f} %. It takes another point for {rare}. {_LABEL}"
             )
         try:
-            told = _fitted(recording, opinion.of(used.frame), 0.0).offsets
+            told = _fitted(recording, opinion.of(used.frame)).offsets
         except ValueError:
             told = None
     if told is not None and told.offset.shape == (3, 3):
@@ -333,13 +333,16 @@ def _frozen(recording: Recording, frames: np.ndarray) -> np.ndarray:
     return np.asarray(frames)[same[nearest]]
 
 
-def _clock(recording: Recording, seen: Seen, calibration: Calibration | None = None) -> tuple[Recording, float]:
+def _clock(
+    recording: Recording, seen: Seen, calibration: Calibration | None = None, *, from_labels: bool = False
+) -> tuple[Recording, float]:
     """The recording with the offset of the clocks that the images show, if they do, and its standard deviation."""
     rows = seen.rows(recording)
     if calibration is not None:  # of the rows that agree alone
         rows = replace(rows, confidence=np.where(calibration.view_inliers, rows.confidence, 0.0))
     if len(seen.frame) < _FEW_PAIRS:  # too few for that: the offset at which cameras explain the labels best
-        return _scanned_clock(recording, lambda one: -_from_few(one, seen).reprojection_rms_px), 0.005
+        fit = _labelled if from_labels else _fitted
+        return _scanned_clock(recording, lambda one: -fit(one, seen).reprojection_rms_px), 0.01
     for reach_s in (0.2, 1.0):
         try:
             found = estimate_time_offset(rows, recording.kinematics, start_s=recording.offset_s, search_s=reach_s)
@@ -367,20 +370,24 @@ def _scanned_clock(recording: Recording, merit: Callable[[Recording], float]) ->
     return replace(recording, offset_s=recording.offset_s + max(sorted([best_s, *near_s], key=abs), key=merit_at))
 
 
-def _fitted(recording: Recording, seen: Seen, least: float, ransac_px: float | None = None, **more: float) -> Calibration:
+def _fitted(
+    recording: Recording, seen: Seen, least: float = 0.0, ransac_px: float | None = None, **more: float
+) -> Calibration:
     """Cameras of square pixels, which leave the landmarks' offsets the least room."""
     how = {"model": "square", "image_size_px": recording.image_size_px, "ransac_px": ransac_px} | more
     return calibrate(seen.rows(recording, least), **how)
 
 
-def _from_few(recording: Recording, labels: Seen) -> Calibration:
-    """As `_fitted` from labels set by hand, all of them right: too few to tell the width of the offsets, or outliers."""
+def _labelled(recording: Recording, labels: Seen) -> Calibration:
+    """As `_fitted`, of labels set by hand; few of them are all right, and do not tell the width of the offsets."""
+    if len(labels.frame) >= _FEW_PAIRS:
+        return _fitted(recording, labels)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "offsets:", RuntimeWarning)  # by a clock that is off they find no end
         try:
-            return _fitted(recording, labels, 0.0, np.inf, offsets=True, offset_prior_sd=_ROBOTS_OFFSET_MM)
+            return _fitted(recording, labels, ransac_px=np.inf, offsets=True, offset_prior_sd=_ROBOTS_OFFSET_MM)
         except ValueError:  # jaws that are shut have no axes
-            return _fitted(recording, labels, 0.0, np.inf)
+            return _fitted(recording, labels, ransac_px=np.inf)
 
 
 def _calibrated(recording: Recording, seen: Seen, from_labels: bool) -> tuple[Calibration, float]:
@@ -391,7 +398,7 @@ def _calibrated(recording: Recording, seen: Seen, from_labels: bool) -> tuple[Ca
     # Offsets of an unknown tool widen the errors of the right ones, until the wrong ones do not stand apart.
     if from_labels:
         try:
-            found = _from_few(recording, seen) if len(seen.frame) < _FEW_PAIRS else _fitted(recording, seen, 0.0)
+            found = _labelled(recording, seen)
         except ValueError as error:
             raise RefusalError(f"labels: no cameras agree with them ({error}). {_LABEL}") from error
         return found, float(found.view_inliers.sum() / max(told, 1))

@@ -27,7 +27,7 @@ from lib.landmarks.metrics import score, tool_length_px
 from lib.landmarks.network import HourglassConfig, Network, OffsetConfig, OffsetNetwork, as_tensor, network_of
 from lib.provenance import commit_id, machine
 from lib.training.augmentation import AUGMENTATIONS, Augmentation, Batch, leave_frame
-from lib.training.losses import heatmap_loss, offset_loss, position_loss
+from lib.training.losses import heatmap_loss, offset_loss
 from lib.training.samples import Samples, Source
 
 FORMAT = "microstereo.training"
@@ -48,7 +48,6 @@ class TrainingConfig:
         clip: Largest norm of the gradient; 0 = unlimited.
         precision: ``"fp32"``, or ``"bf16"``: mixed precision where the processor computes in it; the loss is always float32.
         sigma_px: Width of the target Gaussians in pixels of the network's input.
-        position_weight_per_px: Weight of `position_loss` beside the l2 loss of the heatmaps; 0 as in the paper.
         seed: Decides the first weights and every batch.
 
     Raises:
@@ -69,7 +68,6 @@ class TrainingConfig:
     clip: float = 0.0
     precision: str = "fp32"
     sigma_px: float = SIGMA_PX
-    position_weight_per_px: float = 0.0
     validate_every: int = 100
     seed: int = 0
 
@@ -90,11 +88,11 @@ class TrainingConfig:
     def changed(self, stored: dict[str, object]) -> list[str]:
         """Names of the options whose values differ in a checkpoint's configuration; what it does not name has its default.
 
-        `validate_every` may differ between two sittings of one training.
+        `validate_every` may differ between two sittings of one training.  Options that are gone must have been 0.
         """
         own, other = (json.loads(json.dumps(asdict(c))) for c in (self, TrainingConfig(type(self.network)())))
         other |= stored | {part: other[part] | stored.get(part, {}) for part in ("network", "augmentation")}
-        return [name for name, value in other.items() if name != "validate_every" and own.get(name) != value]
+        return [name for name, value in other.items() if name != "validate_every" and own.get(name, 0) != value]
 
 
 #: `paper`: as printed. `best`: trains the shipped networks, each with the augmentation of its stage (`stage_config`).
@@ -131,11 +129,9 @@ def _batch(images: np.ndarray, u: np.ndarray, visibility: np.ndarray) -> Batch:
 
 
 def _loss(network: Network, outputs: Sequence[Tensor], batch: Batch, config: TrainingConfig) -> Tensor:
-    """The loss that a configuration asks for; of a network that is validated without its position loss."""
     if isinstance(network, OffsetNetwork):
         return offset_loss(outputs, batch)
-    given, weight = (outputs, batch, network.stride, config.sigma_px), config.position_weight_per_px
-    return heatmap_loss(*given) + (weight * position_loss(*given) if weight and network.training else 0)
+    return heatmap_loss(outputs, batch, network.stride, config.sigma_px)
 
 
 @torch.no_grad()

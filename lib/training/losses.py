@@ -1,4 +1,4 @@
-"""Losses: l2 of heatmaps, distance of their peaks, likelihood of offsets."""
+"""Losses: l2 of heatmaps, likelihood of offsets."""
 
 import math
 from collections.abc import Sequence
@@ -23,34 +23,6 @@ def heatmap_loss(outputs: Sequence[Tensor], batch: Batch, stride: int, sigma_px:
     target = render(batch.u.float(), tuple(batch.images.shape[-2:]), stride, sigma_px) * batch.peak[..., None, None]
     scale = math.pi * sigma_cells(stride, sigma_px) ** 2 * batch.weight.sum().clamp_min(1)
     losses = [((output.float() - target).square().sum((-2, -1)) * batch.weight).sum() / scale for output in outputs]
-    return torch.stack(losses).mean()
-
-
-def position_loss(outputs: Sequence[Tensor], batch: Batch, stride: int, sigma_px: float = SIGMA_PX) -> Tensor:
-    """Mean distance in px (smoothed within 0.2 px) of every stack's peaks from the visible landmarks.
-
-    The l2 loss of heatmaps is nearly flat within the last pixel: a displacement d costs (d / sigma)^2 / 2 of an empty
-    heatmap.  A peak's position is twice the centroid of its product with the target's Gaussian, relative to the landmark:
-    exact for a Gaussian of the same width (the product's centre lies halfway), smooth, and independent of what lies far
-    away.  Landmarks within 2 sigma of the border, where the sums are cut, and those with less than a quarter of a peak do
-    not count.
-    """
-    size = tuple(batch.images.shape[-2:])
-    u = batch.u.float()
-    inside = ((u > 2 * sigma_px) & (u < u.new_tensor(size[::-1]) - 1 - 2 * sigma_px)).all(-1)  # NaN is not inside
-    weight = (inside & (batch.visibility == 2)).float()
-    target = render(u, size, stride, sigma_px)
-    rows, columns = (stride * torch.arange(n, device=u.device) + (stride - 1) / 2 for n in target.shape[-2:])
-    least = 0.25 * math.pi * sigma_cells(stride, sigma_px) ** 2
-    losses = []
-    for output in outputs:
-        product = output.float() * target
-        total = product.sum((-2, -1))
-        sums = torch.stack([product.sum(-2) @ columns, product.sum(-1) @ rows], -1)
-        moved = sums - total[..., None] * torch.nan_to_num(u)
-        there = weight * (total > least)
-        distance = ((2 * moved / total.clamp_min(least)[..., None]).square().sum(-1) + 0.04).sqrt() - 0.2
-        losses.append((distance * there).sum() / weight.sum().clamp_min(1))
     return torch.stack(losses).mean()
 
 

@@ -220,7 +220,7 @@ def card(detector: Detector, path: Path) -> str:
                 f"| {stage} ({kind.format(**config['network'])} features) | {t['images']} "
                 f"| {config['optimiser']} {config['learning_rate']:g} {config['schedule']}, "
                 f"{t.get('precision') or config['precision']} "
-                f"| {t['steps']} x {config['batch_size']} x {processes} | {config.get('position_weight_per_px', 0):g} "
+                f"| {t['steps']} x {config['batch_size']} x {processes} "
                 f"| {t['seconds'] * processes / 3600:.2f} | `{t['data']}` | `{t['commit']}` |"
             )
             t = t.get("before")
@@ -243,8 +243,8 @@ Weights of the landmark detector: base, tip_1 and tip_2 of the forceps in micros
 {path.stat().st_size / 1e6:.1f} MB, safetensors; configuration, error models and the numbers below are inside.
 Notebook 02 explains the stages.
 
-| stage | images | optimiser | steps x batch x processes | position loss, per px | process hours | data | commit |
-|---|---|---|---|---|---|---|---|
+| stage | images | optimiser | steps x batch x processes | process hours | data | commit |
+|---|---|---|---|---|---|---|
 {chr(10).join(reversed(trainings))}
 
 Each training of a stage starts from the one before. The error models (covariance, confidence) are fitted on half of

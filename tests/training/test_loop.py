@@ -14,7 +14,7 @@ from lib.landmarks.network import HourglassConfig, OffsetConfig, OffsetNetwork, 
 from lib.training import loop
 from lib.training.augmentation import Augmentation, Batch
 from lib.training.loop import PRESETS, TrainingConfig, load_training, train
-from lib.training.losses import heatmap_loss, offset_loss, position_loss
+from lib.training.losses import heatmap_loss, offset_loss
 from lib.training.samples import Mixed, Samples
 from tests.toys import toy_samples
 
@@ -80,32 +80,6 @@ def test_resume_is_exact(whole, toy, tmp_path, changes):
     assert [row["step"] for row in resumed.log] == [2, 4, 6]
     assert resumed.log[-1]["validation_loss"] == whole.log[-1]["validation_loss"]
     assert same(load_training(tmp_path / "last.safetensors").network, whole.network)
-
-
-def test_position_loss_is_the_distance_of_the_peaks():
-    u = torch.tensor([[[40.3, 41.8], [20.0, 70.5], [90.1, 33.3]]])
-    batch = Batch(torch.zeros(1, 3, 96, 128), u, torch.full((1, 3), 2))
-    smoothed = [np.hypot(d, 0.2) - 0.2 for d in (0.0, 0.5, 3.0)]
-    moved = u + torch.tensor([[[0.0, 0.0], [0.3, -0.4], [0.0, 3.0]]])
-    for height in (1.0, 0.6):
-        heatmaps = height * render(moved, (96, 128), 4)
-        assert position_loss([heatmaps, heatmaps], batch, 4).item() == pytest.approx(np.mean(smoothed), abs=2e-3)
-    exact = render(u, (96, 128), 4).requires_grad_()
-    position_loss([exact], batch, 4).backward()
-    assert exact.grad.abs().max() < 1e-3
-
-
-def test_position_loss_counts_only_peaks_that_can_be_measured():
-    u = torch.tensor([[[3.0, 50.0], [torch.nan, torch.nan], [60.0, 50.0]]])
-    batch = Batch(torch.zeros(1, 3, 96, 128), u, torch.tensor([[2, 2, 1]]))  # at the border, unlabelled, occluded
-    heatmaps = render(torch.full((1, 3, 2), 50.0), (96, 128), 4).requires_grad_()
-    loss = position_loss([heatmaps], batch, 4)
-    loss.backward()
-    assert loss.item() == 0
-    assert not heatmaps.grad.any()
-    far = render(torch.full((1, 3, 2), 10.0), (96, 128), 4)  # no peak near the landmark: the l2 loss brings it there
-    seen = Batch(batch.images, torch.full((1, 3, 2), 60.0), torch.full((1, 3), 2))
-    assert position_loss([far], seen, 4).item() == 0
 
 
 def test_another_seed_is_another_training(toy):
@@ -261,10 +235,11 @@ def test_a_checkpoint_older_than_an_option_resumes_by_its_default(toy, tmp_path)
     path = tmp_path / "last.safetensors"
     tensors, metadata = loop.read_checkpoint(path, loop.FORMAT)
     assert metadata["step"] < 4
-    del metadata["config"]["position_weight_per_px"], metadata["config"]["augmentation"]["photometric_share"]
+    del metadata["config"]["sigma_px"], metadata["config"]["augmentation"]["photometric_share"]
+    metadata["config"]["gone"] = 0.0  # an option of an earlier version, which was off
     loop.write_checkpoint(path, tensors, metadata)
-    with pytest.raises(ValueError, match="another position_weight_per_px"):
-        train(replace(config, position_weight_per_px=0.1), toy(6), toy(2), tmp_path, progress=False)
+    with pytest.raises(ValueError, match="another sigma_px"):
+        train(replace(config, sigma_px=4.0), toy(6), toy(2), tmp_path, progress=False)
     assert train(config, toy(6), toy(2), tmp_path, progress=False).provenance["steps"] == 4
     metadata["config"]["magic"] = 1
     loop.write_checkpoint(path, tensors, metadata)
