@@ -41,7 +41,7 @@ _SETTINGS = ("frame_px", "window_px", "mirror", "method")
 MISSING_BELOW = 0.05
 #: Below this confidence a landmark is not followed from frame to frame.
 TRACKED_FROM = 0.5
-#: The stages that look at closeups: twice of what the tool's window showed, and of what was found in the frame before.
+#: The stages that look at closeups: of what the tool's window showed, of what that moved far, and of the frame before.
 CLOSE = ("closeup", "closer", "tracking")
 #: Where a window's peaks are lower than this (mean), the first stage's peaks at these scales make candidates.
 _SHOWN, _SCALES = 0.75, (0.75, 1.0, 1.5, 2.2)
@@ -112,8 +112,8 @@ class Detector:
         tool_network: The second stage, which sees one window round the tool; None = no such stage.
         closeup_network: The last stage, which predicts where in a closeup the landmark lies; None = no such stage.
         error_models: One for each stage: ``"frame"``, ``"tool"`` and ``"again"`` for the two looks at the tool, ``"window"``,
-            ``"closeup"`` and ``"closer"`` for two closeups, the second where the first saw the landmark, and ``"tracking"``
-            for the closeups that follow a landmark from frame to frame.
+            ``"closeup"`` and ``"closer"`` for two closeups, the second where the first moved the landmark far, and
+            ``"tracking"`` for the closeups that follow a landmark from frame to frame.
         mirror: The second look at the tool also sees the mirror image, and the mean counts: low where the two disagree.
         engine: What runs the networks, one of `lib.landmarks.engines.ENGINES`; the weights are the same.
 

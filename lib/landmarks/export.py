@@ -5,8 +5,8 @@ covariance (n, 3, 2, 2) px^2 and confidence (n, 3).  The first stage gives them 
 resized.  The others but ``tracking`` also take ``rough_u`` (n, 3, 2), the landmarks that the stage before found, in pixels
 of their input, and ``rough_confidence`` (n, 3).  ``again`` is the second look of ``tool``.  The stages ``window``,
 ``closeup``, ``closer`` and ``tracking`` see a window of one landmark, and the caller takes that landmark's row.  ``closeup``
-corrects the landmarks of the stage before, unless it is unsure, ``closer`` those of ``closeup``, and ``tracking`` those of
-the frame before.  Stages that share a network differ in their error models.
+corrects the landmarks of the stage before, unless it is unsure, ``closer`` those that ``closeup`` moved far
+(`windows.moved_far`), and ``tracking`` those of the frame before.  Stages that share a network differ in their error models.
 """
 
 import importlib.util
