@@ -22,7 +22,8 @@ from lib.recordings.annotations import CLICK_SD_PX, inside
 from lib.trust import LEVELS, Hypothesis, diagnose, judge
 from lib.trust.fitting import Problem
 
-#: Least share of the landmarks that must agree on the cameras, fewest in number, and the share that needs no other try.
+#: Least share of the landmarks that must agree on the cameras, and of the views of one that show it where the robot says;
+#: fewest landmarks in number, and the share that needs no other try.
 LEAST_RIGHT, _FEWEST_RIGHT, _CLEAR = 0.1, 30, 0.3
 #: Faults after which the robot is no teacher, and the least share of the residuals that they must explain.
 FAULTS = {
@@ -49,8 +50,6 @@ _STILL, _STILL_FRAMES = 0.15, 4
 _CONFIDENCES = (MIN_CONFIDENCE, 0.5, 0.8)
 #: Share of the tool's length: as near to where it should be a detection is taken for right, farther for another thing.
 _NEAR = 0.1
-#: A landmark that is seen there so much more rarely than another one is one that the detector takes for another point.
-_KNOWN = 0.25
 #: Fewer labelled pairs tell neither outliers nor how large offsets are: a robot's usual ones, mm, standard deviation.
 _FEW_PAIRS, _ROBOTS_OFFSET_MM = 8, 0.15
 _LABEL = (
@@ -291,7 +290,7 @@ def teach(
     told, turns = calibration.offsets, False
     if opinion is not None:
         shares = (opinion.confidence >= MIN_CONFIDENCE).mean(axis=(0, 1))
-        if shares.min() < _KNOWN * shares.max():
+        if shares.min() < LEAST_RIGHT * shares.max():
             rare, often = LANDMARKS[shares.argmin()], LANDMARKS[shares.argmax()]
             raise RefusalError(
                 f"detector: where the robot says, it sees {rare} in {100 * shares.min():.0f} % of the images and {often} in "
