@@ -354,7 +354,7 @@ def _clock(
 
 
 def _scanned_clock(recording: Recording, merit: Callable[[Recording], float]) -> Recording:
-    """The recording with the offset of the clocks of the highest merit, of 41 within 0.2 s and 19 round the best of these.
+    """The recording with the offset of the clocks of the highest merit, of 21 within 0.2 s and 19 round the best of these.
 
     Of equal ones the smallest change; none where no offset gives cameras.
     """
@@ -364,8 +364,8 @@ def _scanned_clock(recording: Recording, merit: Callable[[Recording], float]) ->
         except ValueError:
             return -np.inf
 
-    best_s = max(sorted(np.linspace(-0.2, 0.2, 41).round(9).tolist(), key=abs), key=merit_at)
-    near_s = (best_s + np.linspace(-0.009, 0.009, 19)).round(9).tolist()
+    best_s = max(sorted(np.linspace(-0.2, 0.2, 21).round(9).tolist(), key=abs), key=merit_at)
+    near_s = (best_s + np.linspace(-0.018, 0.018, 19)).round(9).tolist()
     return replace(recording, offset_s=recording.offset_s + max(sorted([best_s, *near_s], key=abs), key=merit_at))
 
 
