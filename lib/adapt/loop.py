@@ -243,10 +243,12 @@ class _Work:
         for part, by_hand in ((seen.of(learn), False), (alone.labelled(self.labels), True)):
             if not by_hand or len(self.marked) >= 5:
                 try:
-                    teachers.append(teach(recording, part, from_labels=by_hand))
+                    one = teach(recording, part, from_labels=by_hand)
+                    if not by_hand and self.contradicted(one):
+                        raise RefusalError("labels: they lie elsewhere than where detector and robot agree; check both.")
+                    teachers.append(one)
                 except ValueError as error:
                     refused = error
-        teachers = [one for one in teachers if one is teachers[-1] or not self.contradicted(one)]  # labels come last
         if not teachers:
             raise RefusalError(str(refused)) from refused
         teacher = min(teachers, key=lambda one: np.nanmedian(np.trace(one.project(learn)[1], axis1=-2, axis2=-1)))

@@ -394,13 +394,13 @@ def _calibrated(recording: Recording, seen: Seen, from_labels: bool) -> tuple[Ca
     told = 6 * int(np.isfinite(recording.landmarks_mm()[seen.frame]).all(axis=(1, 2)).sum())
     length, reason, best, poor, competing = tool_length_px(seen.u), "none was found", None, None, None
     near_px = _NEAR * float(np.quantile(length[np.isfinite(length)], 0.25)) if np.isfinite(length).any() else 0.0
-    # Offsets of an unknown tool widen the errors of the right ones, until the wrong ones do not stand apart.
     if from_labels:
         try:
             found = _labelled(recording, seen)
         except ValueError as error:
             raise RefusalError(f"labels: no cameras agree with them ({error}). {_LABEL}") from error
         return found, float(found.view_inliers.sum() / max(told, 1))
+    # Offsets of an unknown tool widen the errors of the right ones, until the wrong ones do not stand apart.
     for least, ransac_px in (*((least, None) for least in _CONFIDENCES), (MIN_CONFIDENCE, near_px)):
         if ransac_px is not None and competing:
             break  # nothing tells which is the robot's
