@@ -47,8 +47,8 @@ def calibrate(
         offsets: Constant offsets of the landmarks (`lib.calibration.offsets`).  "tool" or True: in the tool's axes, from
             frames in which the robot reports three landmarks of open jaws, or in those of the landmarks where they are seen,
             if offsets turn these and explain the detections as well (`LandmarkOffsets.turns`); "image": in the images, for a
-            detector that is off by some pixels whatever the tool does; False: none.  None: "tool" where at least 24 rows and half of
-            all allow it, else none.
+            detector that is off by some pixels whatever the tool does; False: none.  None: "tool" where at least 24 rows
+            and half of all allow it, else none.
         offset_prior_sd: Standard deviation of an offset's coordinate, mm or px; None = chosen by the data.
         model: "affine", "zero_skew" (the paper's), "square", "common_zoom"; with "+distance" (one 1/distance) or
             "+distances" (one a camera), and "+radial".  "near_affine" is "zero_skew+distance".
