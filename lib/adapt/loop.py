@@ -30,14 +30,18 @@ from lib.trust.health import spread
 
 #: Most rounds of training, and most steps of a stage in one; the time ends most trainings.
 ROUNDS, STEPS = 3, 4000
-RECIPE = 6  # raised where teaching or training changes: what an older one kept is not gone on with
+RECIPE = 7  # raised where teaching or training changes: what an older one kept is not gone on with
 #: Share of the time left that a round takes, and fewest images for stopping to which alone the doubt is fitted.
 _ROUND_SHARE, _DOUBT_IMAGES = 0.85, 10
 #: Most stereo frames that are looked at, spread over the recording.
 _MOST_FRAMES = 96
 _SIMULATED_SHARDS = 3
-#: A round that brings the frames for stopping nearer to the robot by less than this share is the last.
+#: A round that brings the frames for stopping nearer to the robot by less than this share is the last; one that takes them
+#: farther away by more is not kept.  They are few, so the frames for judging decide.
 _LEAST_GAIN = 0.03
+#: Gain on the frames for judging, in its standard deviations, from which the new weights are kept.  The epipolar lines, in
+#: which the robot has no part, must agree.
+_SURE_GAIN = 1.0
 #: Most rounds of looking where the robot says, before anything is trained, and the share of the tool's length below which a
 #: landmark's move ends them.
 _GUIDED, _SETTLED = 3, 0.01
@@ -289,9 +293,11 @@ class _Work:
                 new = teacher  # what the labels say still holds
             now = agreement(new, seen.of(parts["stop"])).summary()
             rounds.append({"round": k, "right": new.right} | now | said)
-            if now["mean_share"] > (1 - _LEAST_GAIN) * stop["mean_share"]:
+            last = now["mean_share"] > (1 - _LEAST_GAIN) * stop["mean_share"]
+            if now["mean_share"] <= (1 + _LEAST_GAIN) * stop["mean_share"]:
+                best, best_seen, teacher, stop = tuned, seen, new, now
+            if last:
                 break
-            best, best_seen, teacher, stop = tuned, seen, new, now
         return self.judged(first, best, best_seen, teacher)
 
     def contradicted(self, teacher: Teacher) -> bool:
@@ -340,10 +346,10 @@ class _Work:
         length, (told, spread) = agreements[0].length_px.mean(axis=1), teacher.project(self.parts["judge"])
         robot, robot_sd = better(*(own.relative for own in agreements))
         eye, eye_sd = better(*(frame_means(own / length) for own in distances))
-        improved = best is not self.detector and robot > 2 * robot_sd and eye > 0
+        improved = best is not self.detector and robot > _SURE_GAIN * robot_sd and eye > 0
         reasons = {
             "no round brought the frames for stopping nearer to the robot; more --minutes may": best is self.detector,
-            "on the frames for judging the gain is no larger than chance allows": not robot > 2 * robot_sd,
+            "on the frames for judging the gain is no larger than chance allows": not robot > _SURE_GAIN * robot_sd,
             "left and right of the frames for judging do not agree better, in which the robot has no part": not eye > 0,
             "the frames for judging agree better with the robot, and left with right": True,
         }
