@@ -131,16 +131,17 @@ def test_resized_frames_keep_the_half_pixel_rule(frame_px):
     assert np.allclose(image_from_cell(centre, stride), (61.7, 44.1), atol=0.1)
 
 
-def test_a_finer_or_coarser_cut_keeps_its_place():
+@pytest.mark.parametrize("blob", [(110.3, 92.6), (22.3, 14.6)])  # the second window leaves the image
+def test_a_finer_or_coarser_cut_keeps_its_place(blob):
     """What a window at any scale shows of a blob lies where its matrix says."""
-    y, x = np.mgrid[:200, :240]
-    image = (255 * np.exp(-((x - 110.3) ** 2 + (y - 92.6) ** 2) / 60)).astype(np.uint8)[..., None].repeat(3, 2)
-    for zoom in (0.2, 0.45, 1.0, 1.7):
-        matrix = window_from_image((112.0, 90.0), 0.4, 64, zoom)
+    y, x = np.mgrid[:200, :241]
+    image = (255 * np.exp(-((x - blob[0]) ** 2 + (y - blob[1]) ** 2) / 20)).astype(np.uint8)[..., None].repeat(3, 2)
+    for zoom in (0.09, 0.2, 0.45, 1.0, 1.7):
+        matrix = window_from_image(np.add(blob, (1.7, -2.6)), 0.4, 64, zoom)
         seen = cut(image, matrix, 64)[..., 0].astype(float)
         rows, columns = np.indices(seen.shape)
         centre = np.array([(seen * columns).sum(), (seen * rows).sum()]) / seen.sum()
-        assert np.allclose(centre, map_points(matrix, np.array([110.3, 92.6])), atol=0.06)
+        assert np.allclose(centre, map_points(matrix, np.array(blob)), atol=0.06)
 
 
 def test_every_tool_fills_the_same_share_of_its_window(images):
