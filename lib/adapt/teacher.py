@@ -44,7 +44,8 @@ _LARGEST_OFFSET, _LARGEST_OFFSET_MM = 0.15, 0.25
 _TURNED = 0.3  # error of an offset, as a share of it, where shut jaws borrow the tool's axes from another time
 _ODD = 0.2  # share of a large offset that may be the detector's all the same: some tools it knows far worse than others
 #: Gain in log likelihood of a detection, by which cameras of their own for a part of the time must explain it better.
-_SURE_MOVE = 0.1
+#: Less narrows the residuals by less than a quarter, and offsets do as much where the tool is held otherwise.
+_SURE_MOVE = 0.5
 #: A tool stands still if others stand nearer than this share of its length, in so many frames and more with itself.
 _STILL, _STILL_FRAMES = 0.15, 4
 _CONFIDENCES = (MIN_CONFIDENCE, 0.5, 0.8)
