@@ -1,7 +1,8 @@
 """Engines that run a network on a CPU: torch, or OpenVINO, which is faster in the same precision.
 
 OpenVINO computes in bfloat16 where the processor has units for it, else in float32.  In bfloat16 heatmaps differ by about
-0.01 of their height.  The recorded table of the detector's speed compares the two.
+0.01 of their height.  Some processors with such units are faster in float32, as the recorded table of the detector's speed
+shows: there name the engine ``"openvino float32"``.
 """
 
 import importlib.util
@@ -22,7 +23,7 @@ from lib import files, paths
 from lib.landmarks.checkpoints import checksum
 from lib.landmarks.network import Network
 
-#: ``"openvino"`` computes in the fastest precision that the processor has.
+#: ``"openvino"`` computes in bfloat16 where the processor has units for it.
 ENGINES = ("torch", "openvino", "openvino float32")
 #: How many images are run at once; fewer are filled up to the next of these.
 BATCHES = (1, 2, 3, 6)
