@@ -45,7 +45,7 @@ _SURE_GAIN = 1.0
 #: Most rounds of looking where the robot says, before anything is trained, and the share of the tool's length below which a
 #: landmark's move ends them.
 _GUIDED, _SETTLED = 3, 0.01
-#: Median distance, as a share of the tool's length, from labels set by hand, above which these say otherwise.
+#: Largest median distance of a teacher's landmarks from labels set by hand, as a share of the tool's length.
 _OFF_LABELS = 0.05
 
 
@@ -301,7 +301,7 @@ class _Work:
         return self.judged(first, best, best_seen, teacher)
 
     def contradicted(self, teacher: Teacher) -> bool:
-        """Whether labels set by hand say otherwise than a teacher."""
+        """Whether a teacher puts the landmarks elsewhere than labels set by hand do."""
         told = self.labels[self.marked]
         off = np.linalg.norm(teacher.project(self.marked)[0] - told, axis=-1) / tool_length_px(told)[..., None]
         return len(self.marked) >= 5 and np.nanmedian(off) > _OFF_LABELS
@@ -349,7 +349,7 @@ class _Work:
         improved = best is not self.detector and robot > _SURE_GAIN * robot_sd and eye > 0
         reasons = {
             "no round brought the frames for stopping nearer to the robot; more --minutes may": best is self.detector,
-            "on the frames for judging the gain is no larger than chance allows": not robot > _SURE_GAIN * robot_sd,
+            "on the frames for judging the gain is no larger than its standard deviation": not robot > _SURE_GAIN * robot_sd,
             "left and right of the frames for judging do not agree better, in which the robot has no part": not eye > 0,
             "the frames for judging agree better with the robot, and left with right": True,
         }

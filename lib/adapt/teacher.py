@@ -44,14 +44,14 @@ _LARGEST_OFFSET, _LARGEST_OFFSET_MM = 0.15, 0.25
 _TURNED = 0.3  # error of an offset, as a share of it, where shut jaws borrow the tool's axes from another time
 _ODD = 0.2  # share of a large offset that may be the detector's all the same: some tools it knows far worse than others
 #: Gain in log likelihood of a detection, by which cameras of their own for a part of the time must explain it better.
-#: Less narrows the residuals by less than a quarter, and offsets do as much where the tool is held otherwise.
+#: A smaller gain narrows the residuals by less than a quarter, which unknown offsets of the landmarks do, too.
 _SURE_MOVE = 0.5
 #: A tool stands still if others stand nearer than this share of its length, in so many frames and more with itself.
 _STILL, _STILL_FRAMES = 0.15, 4
 _CONFIDENCES = (MIN_CONFIDENCE, 0.5, 0.8)
 #: Share of the tool's length: as near to where it should be a detection is taken for right, farther for another thing.
 _NEAR = 0.1
-#: Fewer labelled pairs tell neither outliers nor how large offsets are: a robot's usual ones, mm, standard deviation.
+#: Fewer labelled pairs tell neither outliers nor how large the offsets are; the usual ones of a robot, standard deviation.
 _FEW_PAIRS, _ROBOTS_OFFSET_MM = 8, 0.15
 _LABEL = (
     "Label 10 pairs of frames (5 at least), far apart in place and depth (`python3 -m lib annotate RECORDING`), and give "
@@ -355,7 +355,7 @@ def _clock(
 
 
 def _scanned_clock(recording: Recording, merit: Callable[[Recording], float]) -> Recording:
-    """The recording with the offset of the clocks of the highest merit, of 21 within 0.2 s and 19 round the best of these.
+    """The recording with the clock offset of the highest merit: first of 21 within 0.2 s, then of 19 round the best.
 
     Of equal ones the smallest change; none where no offset gives cameras.
     """
@@ -379,7 +379,7 @@ def _fitted(
 
 
 def _labelled(recording: Recording, labels: Seen) -> Calibration:
-    """As `_fitted`, of labels set by hand; few of them are all right, and do not tell the width of the offsets."""
+    """As `_fitted`, from labels set by hand.  If they are few, all count as right, with a robot's usual offsets."""
     if len(labels.frame) >= _FEW_PAIRS:
         return _fitted(recording, labels)
     with warnings.catch_warnings():
