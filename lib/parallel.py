@@ -5,6 +5,7 @@ A job makes one file or folder.  What exists is not made again, so that work tha
 
 import contextlib
 import logging
+import multiprocessing
 import os
 import sys
 from collections.abc import Callable, Iterator, Mapping
@@ -39,6 +40,8 @@ def run_jobs(
               disable=not progress, smoothing=0.1) as bar:  # fmt: skip
         if not missing:
             return
+        if getattr(multiprocessing.current_process(), "_inheriting", False):  # a worker imports the user's script
+            raise SystemExit(1)
         from distributed import KilledWorker, as_completed
 
         with _client(min(workers or cores(), len(missing)), scheduler) as client:
@@ -113,16 +116,17 @@ def _client(workers: int, scheduler: str | None):
     libraries = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
     settings = {
         "distributed.nanny.pre-spawn-environ": dict.fromkeys(libraries, threads),
-        "distributed.worker.profile.enabled": False,
-        "logging": {"distributed": "critical"},
-    }
-    with (
-        patch.dict(os.environ),  # Dask sets the limits in this process too
-        dask.config.set(settings),
-        LocalCluster(
-            n_workers=workers, threads_per_worker=1, memory_limit=None, silence_logs=logging.CRITICAL,
-            dashboard_address="127.0.0.1:0", scheduler_kwargs={"dashboard": False},
-        ) as cluster,
-        Client(cluster) as client,
-    ):  # fmt: skip
-        yield client
+        "distributed.worker.profile.enabled": False, "logging": {"distributed": "critical"},
+    }  # fmt: skip
+    local = {
+        "n_workers": workers, "threads_per_worker": 1, "memory_limit": None, "silence_logs": logging.CRITICAL,
+        "dashboard_address": "127.0.0.1:0", "scheduler_kwargs": {"dashboard": False},
+    }  # fmt: skip
+    with patch.dict(os.environ), dask.config.set(settings):  # Dask sets the limits in this process too
+        try:
+            cluster = LocalCluster(**local)
+        except RuntimeError as error:
+            need = 'Each imports your script: put what that runs under `if __name__ == "__main__":`.'
+            raise RuntimeError(f"The worker processes did not start ({error}). {need}") from None
+        with cluster, Client(cluster) as client:
+            yield client

@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import shutil
 import signal
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -32,6 +34,19 @@ def test_jobs_survive_a_lost_worker_and_run_once(tmp_path):
     start = time.perf_counter()
     assert list(parallel.run_jobs(files.write_text, jobs, workers=2, progress=False)) == []
     assert time.perf_counter() - start < 0.1  # no cluster is started for nothing
+
+
+def test_a_script_without_a_main_guard_is_told_what_to_write(tmp_path):
+    script, made = tmp_path / "script.py", tmp_path / "made"
+    script.write_text(
+        "import sys\nfrom pathlib import Path\nfrom lib.parallel import run_jobs\n"
+        "list(run_jobs(Path.touch, {Path(sys.argv[1]): ()}, progress=False))\n"
+    )
+    environment = os.environ | {"PYTHONPATH": str(Path(parallel.__file__).parents[1])}
+    ended = subprocess.run([sys.executable, script, made], capture_output=True, text=True, env=environment)
+    assert ended.stderr.count("Traceback") == 1
+    assert 'under `if __name__ == "__main__":`' in ended.stderr.splitlines()[-1]
+    assert not made.exists()
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,7 @@
 """Landmarks of the forceps in an image: base, tip_1, tip_2, with covariance and confidence (paper Sec. III)."""
 
-from lib.landmarks.detector import Detector, Landmarks, detect
+from lib.landmarks.detector import Detector, Landmarks
+from lib.landmarks.recorded import detect
 from lib.landmarks.shared import SharedDetector
 
 __all__ = ["Detector", "Landmarks", "SharedDetector", "detect"]

@@ -3,7 +3,8 @@
 It works from coarse to fine.  The first stage finds the tool in the whole frame, shrunk to a fixed size.  The second names
 its landmarks in one upright window, scaled so that every tool has the same length in it; it looks twice, since the first
 look corrects direction and scale.  Where its window does not show the tool well, it decides between several places.  The
-last measures each landmark in a closeup.  The first stage alone, at full resolution, is the paper's detector (Sec. III).
+last measures each landmark in a closeup.  An image that leaves doubt is seen again with more contrast.  The first stage
+alone, at full resolution, is the paper's detector (Sec. III).
 """
 
 from collections.abc import Callable, Sequence
@@ -18,13 +19,12 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
-from tqdm.auto import tqdm
 
 from lib import paths
-from lib.correspondences import Correspondences, of_recording
 from lib.geometry import image_from_cell
 from lib.landmarks import windows as view
 from lib.landmarks.checkpoints import checksum, load_network, read_checkpoint, write_checkpoint
+from lib.landmarks.contrast import equalised, stretched
 from lib.landmarks.engines import accelerated, default_engine
 from lib.landmarks.error_model import ErrorModel, Rough, closeup_peaks, corrected, covariance_and_confidence
 from lib.landmarks.heatmaps import Peaks, decode
@@ -32,7 +32,6 @@ from lib.landmarks.metrics import tool_length_px
 from lib.landmarks.network import Network, OffsetNetwork, StackedHourglass, as_tensor, as_uint8
 from lib.landmarks.search import PEAKS, best_tools, likelihood, without_peak
 from lib.parallel import single_threaded_torch
-from lib.recordings import Recording
 
 FORMAT = "microstereo.detector"
 #: The fields that a weights file keeps as plain values.
@@ -41,6 +40,8 @@ _SETTINGS = ("frame_px", "window_px", "mirror", "method")
 MISSING_BELOW = 0.05
 #: Below this confidence a landmark is not followed from frame to frame.
 TRACKED_FROM = 0.5
+#: Below this mean confidence of its landmarks an image is seen again with more contrast; chosen on validation images.
+_UNSURE = 0.5
 #: The stages that look at closeups: of what the tool's window showed, of what that moved far, and of the frame before.
 CLOSE = ("closeup", "closer", "tracking")
 #: Where a window's peaks are lower than this (mean), the first stage's peaks at these scales make candidates.
@@ -237,20 +238,32 @@ class Detector:
         the second stage.  Raises `ValueError` for images of another shape, type or range.
         """
         images = as_uint8(images)
-        found = []
         with self._threads():
-            for start in range(0, len(images), batch):
-                part = images[start : start + batch]
-                rough = self.coarse(part)
-                seen = self.stage_peaks(part, rough.u, "tool") if self.tool_network else None
-                result = self.searched(part, rough, seen, avoid)
-                same, before = np.array_equal(result.u, rough.u, equal_nan=True), rough
-                for stage in [stage for stage in self.stages[1:] if stage != "tracking"]:
-                    again = view.moved_far(before.u, result.u) if stage == "closer" else None
-                    before = result
-                    result = self.refine(part, result, stage, seen if same and stage == "tool" else None, only=again)
-                found.append(result)
-        return Landmarks.join(found)
+            parts = (images[start : start + batch] for start in range(0, len(images), batch))
+            return Landmarks.join([self._seen(part, avoid) for part in parts])
+
+    def _seen(self, images: np.ndarray, avoid: np.ndarray | None) -> Landmarks:
+        """Landmarks of a few images; where they are in doubt, the surest of those that images with more contrast show."""
+        result = self._once(images, avoid)
+        for more in (equalised, stretched) if self.tool_network else ():
+            unsure = np.flatnonzero(result.confidence.mean(1) < _UNSURE)
+            if unsure.size:
+                other = self._once(np.stack([more(image) for image in images[unsure]]), avoid)
+                better = other.confidence.mean(1) > result.confidence[unsure].mean(1)
+                result._put(unsure[better], other[better])
+        return result
+
+    def _once(self, images: np.ndarray, avoid: np.ndarray | None) -> Landmarks:
+        """Landmarks of a few images as they are, by all stages but tracking."""
+        rough = self.coarse(images)
+        seen = self.stage_peaks(images, rough.u, "tool") if self.tool_network else None
+        result = self.searched(images, rough, seen, avoid)
+        same, before = np.array_equal(result.u, rough.u, equal_nan=True), rough
+        for stage in [stage for stage in self.stages[1:] if stage != "tracking"]:
+            again = view.moved_far(before.u, result.u) if stage == "closer" else None
+            before = result
+            result = self.refine(images, result, stage, seen if same and stage == "tool" else None, only=again)
+        return result
 
     def track(self, images: ArrayLike, previous: Landmarks, *, min_confidence: float = TRACKED_FROM) -> Landmarks:
         """Landmarks of images (n, h, w, 3) that follow those of `previous`, such as the next left and right image.
@@ -461,36 +474,3 @@ class Detector:
 def _through_inverse(matrices: np.ndarray, u: np.ndarray) -> np.ndarray:
     """Points u (n, 2) of windows in the image, from the windows' matrices (n, 2, 3)."""
     return np.linalg.solve(matrices[:, :, :2], (u - matrices[:, :, 2])[..., None])[..., 0]
-
-
-def detect(
-    recording: Recording, detector: Detector | None = None, *, frames: slice | np.ndarray | None = None, track: bool = False
-) -> Correspondences:
-    """Run the detector over a recording, one stereo frame at a time (a full-HD pair takes 12 MB).
-
-    Returns three rows a frame (base, tip_1, tip_2), each with the robot's position at its instant, and NaN where a landmark
-    is missing.  `Correspondences.complete` keeps the rows that both cameras and the robot saw.
-
-    Args:
-        detector: None is the one that ships.
-        frames: Which frames; None is all.
-        track: Follow the landmarks from frame to frame (`Detector.track`): several times faster if frames follow each other.
-
-        >>> from lib import paths
-        >>> found = detect(Recording.open(paths.SHIPPED_RECORDING), frames=slice(0, 2))
-        >>> len(found), found.x_mm.shape, found.covariance_px2.shape
-        (6, (6, 3), (6, 2, 2, 2))
-    """
-    detector = detector or Detector.load()
-    chosen = np.arange(len(recording.frames))[slice(None) if frames is None else frames]
-    if not chosen.size:
-        raise ValueError(f"frames: none of the {len(recording.frames)} frames of the recording; choose at least one.")
-    found = []
-    for i in tqdm(chosen, desc="landmarks", unit="pair", leave=False):
-        frame = recording.frames[int(i)]
-        pair = np.stack([frame.left, frame.right])
-        found.append(detector.track(pair, found[-1]) if track and found else detector(pair))
-    every, n = Landmarks.join(found), len(chosen)
-    known = {"covariance_px2": every.covariance.reshape(n, 2, 3, 2, 2), "confidence": every.confidence.reshape(n, 2, 3)}
-    known = {name: part.swapaxes(1, 2) for name, part in known.items()}
-    return of_recording(recording, every.u[::2], every.u[1::2], frames=chosen, **known)

@@ -52,6 +52,16 @@ def test_an_offset_network_says_the_same_with_either_engine(engine):
     assert torch.allclose(found, expected, atol=0.03 * float(expected.abs().max()))  # bfloat16 where there is
 
 
+@needs_openvino
+@pytest.mark.parametrize(("engine", "units", "precision"), [
+    ("openvino", True, "bf16"), ("openvino", False, "f32"), ("openvino float32", True, "f32"),
+    ("openvino bfloat16", False, "bf16"),
+])  # fmt: skip
+def test_bfloat16_is_chosen_where_the_processor_has_matrix_units(monkeypatch, engine, units, precision):
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"amx_bf16": units})
+    assert accelerated(StackedHourglass(HourglassConfig(4, 1, 1)), engine).precision == precision
+
+
 @pytest.mark.parametrize("engine", ["torch", pytest.param("openvino", marks=needs_openvino)])
 def test_the_mean_with_the_mirror_image_does_not_know_left_from_right(engine):
     torch.manual_seed(0)

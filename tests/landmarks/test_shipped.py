@@ -57,6 +57,19 @@ def test_an_empty_field_has_no_landmarks_and_disturbs_no_other(shipped):
     assert shipped.torch.searched(both, shipped.torch.coarse(both)).confidence[1].max() < 0.4
 
 
+def test_an_image_in_doubt_is_seen_again_with_more_contrast(shipped, monkeypatch):
+    clear, looks = shipped.images[:1], []
+    dull = np.clip(np.round((clear - clear.mean()) * 0.05 + 110), 0, 255).astype(np.uint8)
+    once = type(shipped.torch)._once
+    alone = once(shipped.torch, dull, None)
+    monkeypatch.setattr(type(shipped.torch), "_once", lambda *given: looks.append(len(given[1])) or once(*given))
+    found = shipped.torch(np.concatenate([clear, dull]))
+    assert looks[0] == 2 and set(looks[1:]) == {1}  # the clear image is seen once
+    error = np.linalg.norm(found.u - shipped.u[:1], axis=2) / tool_length_px(shipped.u[:1])
+    assert (error < 0.05).all() and (found.confidence > 0.5).all()
+    assert alone.confidence.mean() < 0.5
+
+
 def test_what_is_to_be_avoided_is_not_found_but_the_other_tool_is(shipped):
     both = np.concatenate([shipped.images[0], shipped.images[8]], axis=1)[None]  # two tools side by side
     tools = shipped.u[[0, 8]] + np.array([[[0.0, 0.0]], [[shipped.images.shape[2], 0.0]]])
