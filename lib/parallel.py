@@ -40,7 +40,7 @@ def run_jobs(
               disable=not progress, smoothing=0.1) as bar:  # fmt: skip
         if not missing:
             return
-        if getattr(multiprocessing.current_process(), "_inheriting", False):  # a worker imports the user's script
+        if getattr(multiprocessing.current_process(), "_inheriting", False):  # a worker imports the script; the parent tells
             raise SystemExit(1)
         from distributed import KilledWorker, as_completed
 

@@ -234,8 +234,8 @@ class Detector:
     def __call__(self, images: ArrayLike, *, batch: int = 4, avoid: np.ndarray | None = None) -> Landmarks:
         """Landmarks of images (n, h, w, 3), uint8 RGB or float in [0, 1]; `batch` images at a time.
 
-        `avoid` (k, 3, 2) px are what looks like the tool and is none, such as a second instrument; it needs
-        the second stage.  Raises `ValueError` for images of another shape, type or range.
+        An image in doubt is seen again with more contrast, which takes up to three times as long.  `avoid` (k, 3, 2) px are
+        what looks like the tool and is none; it needs the second stage.  A `ValueError` for another shape, type or range.
         """
         images = as_uint8(images)
         with self._threads():
@@ -243,7 +243,7 @@ class Detector:
             return Landmarks.join([self._seen(part, avoid) for part in parts])
 
     def _seen(self, images: np.ndarray, avoid: np.ndarray | None) -> Landmarks:
-        """Landmarks of a few images; where they are in doubt, the surest of those that images with more contrast show."""
+        """Landmarks of a few images.  One that leaves doubt is seen again with more contrast, and its surest look counts."""
         result = self._once(images, avoid)
         for more in (equalised, stretched) if self.tool_network else ():
             unsure = np.flatnonzero(result.confidence.mean(1) < _UNSURE)
