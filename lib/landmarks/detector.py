@@ -3,14 +3,15 @@
 It works from coarse to fine.  The first stage finds the tool in the whole frame, shrunk to a fixed size.  The second names
 its landmarks in one upright window, scaled so that every tool has the same length in it; it looks twice, since the first
 look corrects direction and scale.  Where its window does not show the tool well, it decides between several places.  The
-last measures each landmark in a closeup.  An image that leaves doubt is seen again with more contrast.  The first stage
-alone, at full resolution, is the paper's detector (Sec. III).
+last measures each landmark in a closeup.  An image that leaves doubt is seen again with more contrast, then swept by the
+second stage.  The first stage alone, at full resolution, is the paper's detector (Sec. III).
 """
 
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache
+from itertools import product
 from pathlib import Path
 from typing import Self
 
@@ -30,7 +31,7 @@ from lib.landmarks.error_model import ErrorModel, Rough, closeup_peaks, correcte
 from lib.landmarks.heatmaps import Peaks, decode
 from lib.landmarks.metrics import tool_length_px
 from lib.landmarks.network import Network, OffsetNetwork, StackedHourglass, as_tensor, as_uint8
-from lib.landmarks.search import PEAKS, best_tools, likelihood, without_peak
+from lib.landmarks.search import PEAKS, best_tools, likelihood, several_peaks
 from lib.parallel import single_threaded_torch
 
 FORMAT = "microstereo.detector"
@@ -40,7 +41,7 @@ _SETTINGS = ("frame_px", "window_px", "mirror", "method")
 MISSING_BELOW = 0.05
 #: Below this confidence a landmark is not followed from frame to frame.
 TRACKED_FROM = 0.5
-#: Below this mean confidence of its landmarks an image is seen again with more contrast; chosen on validation images.
+#: Below this mean confidence of its landmarks an image is seen again; chosen on validation images.
 _UNSURE = 0.5
 #: The stages that look at closeups: of what the tool's window showed, of what that moved far, and of the frame before.
 CLOSE = ("closeup", "closer", "tracking")
@@ -49,6 +50,8 @@ _SHOWN, _SCALES = 0.75, (0.75, 1.0, 1.5, 2.2)
 _SURE = 0.5  # a confidence of the first stage below this, or after a search, becomes this times the height of the peaks
 #: So many candidates are looked at once, and so many of them twice; none where all peaks are lower than the third number.
 _CANDIDATES, _AGAIN, _NOTHING = 24, 6, 0.01
+#: The second stage sweeps an image for tools of these lengths, shares of its longer side, in so many turns; chosen likewise.
+_SWEPT, _TURNS = (0.21, 0.1), 6
 #: Stages that use another stage's network.
 _NETWORK_OF = {"again": "tool", "closer": "closeup", "tracking": "closeup"}
 
@@ -234,8 +237,8 @@ class Detector:
     def __call__(self, images: ArrayLike, *, batch: int = 4, avoid: np.ndarray | None = None) -> Landmarks:
         """Landmarks of images (n, h, w, 3), uint8 RGB or float in [0, 1]; `batch` images at a time.
 
-        An image in doubt is seen again with more contrast, which takes up to three times as long.  `avoid` (k, 3, 2) px are
-        what looks like the tool and is none; it needs the second stage.  A `ValueError` for another shape, type or range.
+        An image in doubt is seen again with more contrast, then swept, which takes many times as long.  `avoid` (k, 3, 2) px
+        are what looks like the tool and is none; it needs the second stage.  A `ValueError` for another shape, type or range.
         """
         images = as_uint8(images)
         with self._threads():
@@ -243,21 +246,22 @@ class Detector:
             return Landmarks.join([self._seen(part, avoid) for part in parts])
 
     def _seen(self, images: np.ndarray, avoid: np.ndarray | None) -> Landmarks:
-        """Landmarks of a few images.  One that leaves doubt is seen again with more contrast, and its surest look counts."""
+        """Landmarks of a few images.  One in doubt is seen again with more contrast, then swept; its surest look counts."""
         result = self._once(images, avoid)
-        for more in (equalised, stretched) if self.tool_network else ():
+        for more in (equalised, stretched, None) if self.tool_network else ():
             unsure = np.flatnonzero(result.confidence.mean(1) < _UNSURE)
             if unsure.size:
-                other = self._once(np.stack([more(image) for image in images[unsure]]), avoid)
+                again = np.stack([more(image) if more else image for image in images[unsure]])
+                other = self._once(again, avoid, sweep=more is None)
                 better = other.confidence.mean(1) > result.confidence[unsure].mean(1)
                 result._put(unsure[better], other[better])
         return result
 
-    def _once(self, images: np.ndarray, avoid: np.ndarray | None) -> Landmarks:
-        """Landmarks of a few images as they are, by all stages but tracking."""
+    def _once(self, images: np.ndarray, avoid: np.ndarray | None, sweep: bool = False) -> Landmarks:
+        """Landmarks of a few images as they are, by all stages but tracking; `sweep` as in `searched`."""
         rough = self.coarse(images)
         seen = self.stage_peaks(images, rough.u, "tool") if self.tool_network else None
-        result = self.searched(images, rough, seen, avoid)
+        result = self.searched(images, rough, seen, avoid, sweep=sweep)
         same, before = np.array_equal(result.u, rough.u, equal_nan=True), rough
         for stage in [stage for stage in self.stages[1:] if stage != "tracking"]:
             again = view.moved_far(before.u, result.u) if stage == "closer" else None
@@ -301,13 +305,15 @@ class Detector:
         return Landmarks(image_from_cell(found.u, stride), found.covariance * np.outer(stride, stride), found.confidence)
 
     def searched(
-        self, images: np.ndarray, rough: Landmarks, seen: tuple | None = None, avoid: np.ndarray | None = None
-    ) -> Landmarks:
+        self, images: np.ndarray, rough: Landmarks, seen: tuple | None = None, avoid: np.ndarray | None = None, *,
+        sweep: bool = False,
+    ) -> Landmarks:  # fmt: skip
         """What later stages start from: `rough`, or, where its window does not show it well, the tool whose window does best.
 
         Candidates are `rough` and tools made of the highest peaks that the first stage sees at several scales.  All are
         looked at once, the likeliest ones again; the likeliest wins.  The second stage decides, however sure the first is:
         it has learnt what is no tool.  `seen` is what `stage_peaks` gave for `rough`, if that is known; `avoid` as in a call.
+        With `sweep` the candidates are those of `swept`.
         """
         if self.tool_network is None:
             return rough
@@ -315,7 +321,7 @@ class Detector:
         height = self._shown(seen or self.stage_peaks(images, rough.u, "tool"), len(images))[1]
         searched = (height < _SHOWN) | (avoid is not None)
         for i in np.flatnonzero(searched):
-            candidates, u, once = self.proposed(images[i], rough[i : i + 1])
+            candidates, u, once = self.swept(images[i]) if sweep else self.proposed(images[i], rough[i : i + 1])
             best = np.argsort(-likelihood(u, once, avoid))[:_AGAIN]
             u, twice = self._looked(images[i], u[best], "again")
             scores = likelihood(u, twice, avoid)
@@ -333,16 +339,32 @@ class Detector:
         peaks, found, one = [], [], image[None]
         for scale in _SCALES:
             stride, heatmaps = self.frame_stride(one, scale), self.outputs(self.reduced(one, scale), "frame")
-            for _ in range(PEAKS):
-                peaks.append(decode(heatmaps, self.frame_network.stride, method=self.method))
-                found.append(self._in_image(peaks[-1], stride))
-                heatmaps = without_peak(heatmaps, peaks[-1].u, self.frame_network.stride)
+            peaks += several_peaks(heatmaps, PEAKS, self.frame_network.stride, self.method)
+            found += [self._in_image(part, stride) for part in peaks[-PEAKS:]]
         every = Landmarks.join(found)
         height = torch.cat([part.value for part in peaks]).numpy()
         which = best_tools(every.u, height, _CANDIDATES) if height.max() > _NOTHING else np.zeros((0, 3), int)
         at = which, np.arange(3)
         candidates = Landmarks.join([*others, Landmarks(every.u[at], every.covariance[at], every.confidence[at])])
         return candidates, *self._looked(image, candidates.u, "tool")
+
+    def swept(self, image: np.ndarray) -> tuple[Landmarks, np.ndarray, np.ndarray]:
+        """As `proposed`, what the second stage sees where it slides over the whole image, at some scales and turns."""
+        tools, height, sides = [], [], np.array(image.shape[1::-1])
+        turns = 2 * np.pi * np.arange(_TURNS) / _TURNS
+        for length, turn in product(_SWEPT, turns.tolist()):
+            zoom, (c, s) = view.tool_zoom(length * sides.max()), np.abs([np.cos(turn), np.sin(turn)])
+            size = np.ceil(zoom * (np.array([[c, s], [s, c]]) @ sides)).astype(int)
+            matrix = view.window_from_image((sides - 1) / 2, turn, size, zoom)
+            heatmaps = self.outputs(view.cut(image, matrix, size)[None], "tool")
+            peaks = several_peaks(heatmaps, PEAKS, self.tool_network.stride, self.method)
+            u, value = (torch.cat([getattr(part, name) for part in peaks]).numpy() for name in ("u", "value"))
+            at = best_tools(u, value, PEAKS), np.arange(3)
+            tools.append(_through_inverse(matrix[None], u[at].reshape(-1, 2)).reshape(-1, 3, 2))
+            height.append(np.clip(value[at], 0, 1).mean(axis=1))
+        found = Landmarks.none(sum(map(len, tools)))
+        found.u[:] = u = np.concatenate(tools)
+        return found, u, np.concatenate(height)
 
     def _looked(self, image: np.ndarray, u: np.ndarray, stage: str) -> tuple[np.ndarray, np.ndarray]:
         """`_shown` of several tools u (n, 3, 2) in one image."""

@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from lib.landmarks.heatmaps import SIGMA_PX, sigma_cells
+from lib.landmarks.heatmaps import SIGMA_PX, Peaks, decode, sigma_cells
 from lib.landmarks.metrics import tool_length_px
 
 #: Peaks that are taken from each heatmap.
@@ -16,12 +16,16 @@ _PLACE = 0.5
 _OPEN = 0.25
 
 
-def without_peak(heatmaps: torch.Tensor, u: torch.Tensor, stride: int) -> torch.Tensor:
-    """Heatmaps (n, k, h, w) with nothing within 3 sigma of u (n, k, 2), in pixels of the network's input."""
-    rows, columns = (torch.arange(side, dtype=u.dtype) for side in heatmaps.shape[-2:])
-    x, y = (((u - (stride - 1) / 2) / stride)[..., None, None]).unbind(2)
-    near = (columns - x) ** 2 + (rows[:, None] - y) ** 2 < (3 * sigma_cells(stride, SIGMA_PX)) ** 2
-    return heatmaps.masked_fill(near, -1.0)
+def several_peaks(heatmaps: torch.Tensor, n: int, stride: int, method: str) -> list[Peaks]:
+    """The `n` highest peaks of every heatmap (m, k, h, w), more than 3 sigma apart; `stride` and `method` as for `decode`."""
+    rows, columns = (torch.arange(side, dtype=heatmaps.dtype) for side in heatmaps.shape[-2:])
+    found = []
+    for _ in range(n):
+        found.append(decode(heatmaps, stride, method=method))
+        x, y = (((found[-1].u - (stride - 1) / 2) / stride)[..., None, None]).unbind(2)
+        near = (columns - x) ** 2 + (rows[:, None] - y) ** 2 < (3 * sigma_cells(stride, SIGMA_PX)) ** 2
+        heatmaps = heatmaps.masked_fill(near, -1.0)
+    return found
 
 
 def best_tools(u: np.ndarray, height: np.ndarray, n: int) -> np.ndarray:

@@ -113,15 +113,16 @@ def map_points(matrix: np.ndarray, u: ArrayLike) -> np.ndarray:
     return (matrix[..., :2] @ np.asarray(u, dtype=np.float64)[..., None])[..., 0] + matrix[..., 2]
 
 
-def cut(image: np.ndarray, matrix: np.ndarray, size: int, *, border: int = cv2.BORDER_CONSTANT) -> np.ndarray:
-    """The window (size, size, 3) uint8 of an image; black, or what OpenCV's `border` says, where it leaves the image.
+def cut(image: np.ndarray, matrix: np.ndarray, size: int | ArrayLike, *, border: int = cv2.BORDER_CONSTANT) -> np.ndarray:
+    """The window (h, w, 3) uint8 of an image, whose `size` is its side or (w, h); black, or what OpenCV's `border` says,
+    where it leaves the image.
 
     A window at less than half the image's scale is the mean over blocks of a finer one, so that nothing aliases; at less
     than a quarter, the part of the image that it shows is halved first, which is quicker.
     """
-    finer = int(np.clip(1 / np.sqrt(abs(np.linalg.det(matrix[:, :2]))), 1, 8))
+    finer, side = int(np.clip(1 / np.sqrt(abs(np.linalg.det(matrix[:, :2]))), 1, 8)), np.broadcast_to(size, 2)
     if finer >= 4:
-        corners = (np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * size - 0.5 - matrix[:, 2]) @ np.linalg.inv(matrix[:, :2]).T
+        corners = (np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * side - 0.5 - matrix[:, 2]) @ np.linalg.inv(matrix[:, :2]).T
         (x, y), (right, bottom) = corners.min(axis=0).astype(int) // 2 * 2 - 4, corners.max(axis=0).astype(int) // 2 * 2 + 6
         x, y, (right, bottom) = max(x, 0), max(y, 0), np.minimum((right, bottom), np.array(image.shape[1::-1]) // 2 * 2)
         if x < right and y < bottom:
@@ -129,5 +130,5 @@ def cut(image: np.ndarray, matrix: np.ndarray, size: int, *, border: int = cv2.B
             shift = matrix[:, :2] @ [x + 0.5, y + 0.5] + matrix[:, 2]
             return cut(half, np.column_stack([2 * matrix[:, :2], shift]), size, border=border)
     matrix = finer * matrix + [0, 0, (finer - 1) / 2]
-    whole = cv2.warpAffine(image, matrix, (size * finer,) * 2, flags=cv2.INTER_LINEAR, borderMode=border)
-    return whole if finer == 1 else cv2.resize(whole, (size, size), interpolation=cv2.INTER_AREA)
+    whole = cv2.warpAffine(image, matrix, (side * finer).tolist(), flags=cv2.INTER_LINEAR, borderMode=border)
+    return whole if finer == 1 else cv2.resize(whole, side.tolist(), interpolation=cv2.INTER_AREA)

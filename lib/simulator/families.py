@@ -59,8 +59,6 @@ _JAWS: dict[str, dict[str, Any]] = {
     "blunt_jaws": {"thick": (0.03, 0.08), "end": (0.015, 0.05), "bow": (0, 0.12), "taper": (0.5, 1.5)},
     "curved_jaws": {"bend": [(-0.55, -0.2), (0.2, 0.55)], "bow": (0, 0.15), "thick": (0.02, 0.05), "flex": (0, 0.6)},
     "asymmetric_jaws": {"long": (0.65, 1.1), "bow": (0, 0.25), "thick": (0.015, 0.07), "end": (0.002, 0.02)},
-    "flared_jaws": {"claw": (-1.3, -0.4), "start": (0.5, 0.85), "bow": (0, 0.1), "thick": (0.015, 0.04), "flex": (0, 0.4)},
-    "stepped_jaws": {"claw": [(-1.1, -0.5), (0.5, 1.1)], "start": (0.2, 0.45), "until": (0.5, 0.75), "thick": (0.015, 0.04)},
     "hooked_jaws": {"claw": (0.7, 1.5), "start": (0.65, 0.85), "thick": (0.02, 0.04), "flex": 0.0},
     "angled_jaws": {"turn": [(-0.95, -0.45), (0.45, 0.95)], "start": (0.08, 0.3), "bow": (0.02, 0.12)},
 }
@@ -76,8 +74,7 @@ _FINISHES: dict[str, dict[str, Any]] = {
 def _jaw(
     length: float, side: int, *, long: float = 1.0, bow: float = 0.0, power: float = 1.1, skew: float = 1.0,
     bend: float = 0.0, thick: float = 0.04, end: float = 0.002, taper: float = 0.7, flex: float = 0.5, n: int = 14,
-    start: float = 0.5, until: float = 1.0, cup: float = 0.0, teeth: float = 0.0, ring: float = 0.0, claw: float = 0.0,
-    turn: float = 0.0,
+    start: float = 0.5, cup: float = 0.0, teeth: float = 0.0, ring: float = 0.0, claw: float = 0.0, turn: float = 0.0,
 ) -> Jaw:  # fmt: skip
     """A jaw of `n` cones, on `side` +1 or -1; lengths are shares of `length`, angles rad.
 
@@ -85,7 +82,7 @@ def _jaw(
         long, bend: Its own length, and how far it leaves the plane of the jaws.
         bow, power, skew: How far it arches outwards, how evenly, and where most.
         thick, end, taper: Radii at both ends, and the exponent between.
-        start, until: Where a cup, teeth, a ring or a kink begins, and where the jaw turns back from a kink.
+        start: Where a cup, teeth, a ring or a kink begins.
         cup, teeth, ring: Radius that a cup adds, height of teeth in radii, and half width of a ring.
         claw, turn: Angles of a kink: inwards, or both jaws to one side.
     """
@@ -102,9 +99,8 @@ def _jaw(
         line, radii = np.column_stack([x, y, -bend * x * x]), np.full(len(x), thick)
         return Jaw(length * line, length * radii, length * np.array([long, ring + thick, -bend]), flex)
     if claw or turn:
-        angle, far = (side * turn if turn else -claw), np.clip(x - start, 0, until - start)
-        inward = max((min(until, 1.0) - start) * np.sin(claw), 0.0)  # jaws that bend inward part before, to shut at their tips
-        x, y = x - far * (1 - np.cos(angle)), y + far * np.sin(angle) + inward * np.clip(x / start, 0, 1)
+        angle, far = (side * turn if turn else -claw), np.clip(x - start, 0, None)
+        x, y = x - far * (1 - np.cos(angle)), y + far * np.sin(angle) + (1 - start) * np.sin(claw) * np.clip(x / start, 0, 1)
     line = np.column_stack([x, y, -bend * s**2])
     last = line[-1] - line[-2]
     tip = line[-1] + radii[-1] * last / np.linalg.norm(last)

@@ -43,7 +43,7 @@ def disguised(
 
 
 def _colours(x: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    kind = rng.choice(6, p=[0.2, 0.12, 0.42, 0.12, 0.09, 0.05])
+    kind = rng.choice(6, p=[0.25, 0.15, 0.3, 0.15, 0.1, 0.05])
     if kind == 1:
         x = x[..., rng.permutation(3)]
     elif kind == 2:  # grey, of any filter

@@ -5,16 +5,17 @@ import torch
 
 from lib.landmarks import Detector
 from lib.landmarks.detector import Landmarks
-from lib.landmarks.heatmaps import decode, render
+from lib.landmarks.heatmaps import render
 from lib.landmarks.network import HourglassConfig, StackedHourglass
-from lib.landmarks.search import best_tools, likelihood, without_peak
+from lib.landmarks.search import best_tools, likelihood, several_peaks
+from lib.landmarks.windows import map_points
 
 TOOL = np.array([[40.0, 50.0], [80.0, 40.0], [80.0, 60.0]])
 
 
 def test_the_second_peak_is_found_once_the_first_is_taken_out():
     heatmaps = render(torch.tensor([[[20.0, 30.0]]]), (64, 96), 4) + 0.6 * render(torch.tensor([[[70.0, 33.0]]]), (64, 96), 4)
-    second = decode(without_peak(heatmaps, decode(heatmaps, 4).u, 4), 4)
+    _, second = several_peaks(heatmaps, 2, 4, "gauss_newton")
     assert np.allclose(second.u, [70, 33], atol=0.1) and abs(second.value.item() - 0.6) < 0.1
 
 
@@ -58,3 +59,27 @@ def test_an_image_starts_from_the_tool_that_its_window_shows_best(monkeypatch):
     monkeypatch.setattr(Detector, "_shown", staticmethod(shown))
     found = detector.searched(np.zeros((4, 64, 96, 3), np.uint8), rough)
     assert np.array_equal(found.u, np.stack([TOOL] * 4)) and found.confidence[:, 0].tolist() == [0.9, 0.4, 0.4, 0.4]
+
+
+def test_the_second_stage_sweeps_the_whole_image_and_gives_places_in_its_pixels(monkeypatch):
+    network = StackedHourglass(HourglassConfig(features=8, stacks=1))
+    detector, cuts = Detector(network, tool_network=network), []
+    tool = np.array([[130.0, 260.0], [240.0, 220.0], [250.0, 262.0]])
+
+    def cut(image, matrix, size):
+        cuts.append((matrix, size))
+        return np.zeros((*size[::-1], 3), np.uint8)
+
+    def outputs(self, images, stage):
+        return render(torch.from_numpy(map_points(cuts[-1][0], tool))[None].float(), images.shape[1:3], 4)
+
+    monkeypatch.setattr("lib.landmarks.windows.cut", cut)
+    monkeypatch.setattr(Detector, "outputs", outputs)
+    candidates, u, height = detector.swept(np.zeros((360, 640, 3), np.uint8))
+    sharp = height > 0.9
+    assert len(candidates) == len(u) == len(height) and sharp.sum() >= 6
+    assert np.abs(u[sharp] - tool).max() < 1.0
+    corners = np.array([[0, 0], [639, 0], [0, 359], [639, 359]])
+    for matrix, size in cuts:  # nothing of the image is left out
+        at = map_points(matrix, corners)
+        assert (at > -1.5).all() and (at < size + 0.5).all()

@@ -62,12 +62,23 @@ def test_an_image_in_doubt_is_seen_again_with_more_contrast(shipped, monkeypatch
     dull = np.clip(np.round((clear - clear.mean()) * 0.05 + 110), 0, 255).astype(np.uint8)
     once = type(shipped.torch)._once
     alone = once(shipped.torch, dull, None)
-    monkeypatch.setattr(type(shipped.torch), "_once", lambda *given: looks.append(len(given[1])) or once(*given))
+    monkeypatch.setattr(type(shipped.torch), "_once", lambda *a, **how: looks.append(len(a[1])) or once(*a, **how))
     found = shipped.torch(np.concatenate([clear, dull]))
     assert looks[0] == 2 and set(looks[1:]) == {1}  # the clear image is seen once
     error = np.linalg.norm(found.u - shipped.u[:1], axis=2) / tool_length_px(shipped.u[:1])
     assert (error < 0.05).all() and (found.confidence > 0.5).all()
     assert alone.confidence.mean() < 0.5
+
+
+def test_a_tool_that_the_first_stage_overlooks_is_found_by_sweeping(shipped, monkeypatch):
+    def blind(self, images):
+        return Landmarks.none(len(images))
+
+    monkeypatch.setattr(type(shipped.torch), "coarse", blind)
+    monkeypatch.setattr(type(shipped.torch), "proposed", lambda self, image, *others: (others[0], others[0].u, np.zeros(1)))
+    found = shipped.torch(shipped.images[:2])
+    error = np.linalg.norm(found.u - shipped.u[:2], axis=2) / tool_length_px(shipped.u[:2])[:, None]
+    assert (error < 0.05).all() and (found.confidence > 0.5).all()
 
 
 def test_what_is_to_be_avoided_is_not_found_but_the_other_tool_is(shipped):
