@@ -52,6 +52,7 @@ _SURE = 0.5  # a confidence of the first stage below this, or after a search, be
 _CANDIDATES, _AGAIN, _NOTHING = 24, 6, 0.01
 #: The second stage sweeps an image for tools of these lengths, shares of its longer side, in so many turns; chosen likewise.
 _SWEPT, _TURNS = (0.21, 0.1), 6
+_UNWITNESSED = 0.5  # by which the confidence of what only the sweep finds is multiplied: the first stage does not see it
 #: Stages that use another stage's network.
 _NETWORK_OF = {"again": "tool", "closer": "closeup", "tracking": "closeup"}
 
@@ -253,6 +254,7 @@ class Detector:
             if unsure.size:
                 again = np.stack([more(image) if more else image for image in images[unsure]])
                 other = self._once(again, avoid, sweep=more is None)
+                other = other if more else replace(other, confidence=_UNWITNESSED * other.confidence)
                 better = other.confidence.mean(1) > result.confidence[unsure].mean(1)
                 result._put(unsure[better], other[better])
         return result
