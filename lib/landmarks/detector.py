@@ -50,9 +50,9 @@ _SHOWN, _SCALES = 0.75, (0.75, 1.0, 1.5, 2.2)
 _SURE = 0.5  # a confidence of the first stage below this, or after a search, becomes this times the height of the peaks
 #: So many candidates are looked at once, and so many of them twice; none where all peaks are lower than the third number.
 _CANDIDATES, _AGAIN, _NOTHING = 24, 6, 0.01
-#: The second stage sweeps an image for tools of these lengths, shares of its longer side, in so many turns; chosen likewise.
+#: A sweep looks for tools of these lengths, shares of the image's longer side, in so many turns; chosen on validation images.
 _SWEPT, _TURNS = (0.21, 0.1), 6
-_UNWITNESSED = 0.5  # by which the confidence of what only the sweep finds is multiplied: the first stage does not see it
+_UNWITNESSED = 0.5  # what a sweep finds has this times its confidence, since the first stage did not see it there
 #: Stages that use another stage's network.
 _NETWORK_OF = {"again": "tool", "closer": "closeup", "tracking": "closeup"}
 
@@ -351,7 +351,7 @@ class Detector:
         return candidates, *self._looked(image, candidates.u, "tool")
 
     def swept(self, image: np.ndarray) -> tuple[Landmarks, np.ndarray, np.ndarray]:
-        """As `proposed`, what the second stage sees where it slides over the whole image, at some scales and turns."""
+        """As `proposed`, but by the second stage, which sees the whole image (h, w, 3) at some scales and turns."""
         tools, height, sides = [], [], np.array(image.shape[1::-1])
         turns = 2 * np.pi * np.arange(_TURNS) / _TURNS
         for length, turn in product(_SWEPT, turns.tolist()):
@@ -365,8 +365,8 @@ class Detector:
             tools.append(_through_inverse(matrix[None], u[at].reshape(-1, 2)).reshape(-1, 3, 2))
             height.append(np.clip(value[at], 0, 1).mean(axis=1))
         found = Landmarks.none(sum(map(len, tools)))
-        found.u[:] = u = np.concatenate(tools)
-        return found, u, np.concatenate(height)
+        found.u[:] = np.concatenate(tools)
+        return found, found.u, np.concatenate(height)
 
     def _looked(self, image: np.ndarray, u: np.ndarray, stage: str) -> tuple[np.ndarray, np.ndarray]:
         """`_shown` of several tools u (n, 3, 2) in one image."""
