@@ -229,6 +229,7 @@ def test_a_closeup_moves_what_the_stage_before_found(images):
         moved = turn @ np.array([ahead, side * 2.0 / zoom])
         np.testing.assert_allclose(after.u[i, k] - before.u[i, k], moved, atol=1e-3)
         spread = turn @ np.diag([2 * np.exp(-2.0), 2 * np.exp(1.0)]) @ turn.T / zoom**2  # of Laplace distributions
+        spread *= 1 + 3 * (1 - after.confidence[i, k])  # a wrong landmark has four times the variance of a right one
         np.testing.assert_allclose(after.covariance[i, k], spread, rtol=1e-3)
     unsure = with_models(detector, closeup=replace(ErrorModel(), logit=(-5.0,))).refine(images, before, "closeup")
     np.testing.assert_array_equal(unsure.u, before.u)  # it says that nothing is there, so the landmark stays, and is doubted
