@@ -364,9 +364,8 @@ class Detector:
             at = best_tools(u, value, PEAKS), np.arange(3)
             tools.append(_through_inverse(matrix[None], u[at].reshape(-1, 2)).reshape(-1, 3, 2))
             height.append(np.clip(value[at], 0, 1).mean(axis=1))
-        found = Landmarks.none(sum(map(len, tools)))
-        found.u[:] = np.concatenate(tools)
-        return found, found.u, np.concatenate(height)
+        u = np.concatenate(tools)
+        return replace(Landmarks.none(len(u)), u=u), u, np.concatenate(height)
 
     def _looked(self, image: np.ndarray, u: np.ndarray, stage: str) -> tuple[np.ndarray, np.ndarray]:
         """`_shown` of several tools u (n, 3, 2) in one image."""

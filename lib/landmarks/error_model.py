@@ -14,9 +14,7 @@ from lib.landmarks.windows import CLOSEUP_REACH_PX, CLOSEUP_ZOOM, expected_in_cl
 FEATURES = 9
 #: Jaws look shut where the tips are nearer to each other than about this share of the tool's length.
 _SHUT = 0.15
-#: By how much the variance of a landmark that is wrong exceeds that of one that is right, as a multiple of the latter.
-#: Chosen on validation images, where covariances without it are four times too small below a confidence of 0.7.
-_WRONG = 3.0
+_WRONG = 3.0  # so many times its own a wrong landmark's variance exceeds a right one's; chosen on validation images
 
 
 @dataclass(frozen=True)
@@ -96,8 +94,7 @@ def features_of(peaks: Peaks, rough: Rough | None = None) -> Tensor:
     log of the distance from where the stage before saw it, the two logits of `Rough`, and how shut the jaws look; the last
     four are 0 without it.  A rod or a needle looks like a tool with shut jaws.
     """
-    covariance = peaks.covariance
-    covariance = torch.where(torch.isfinite(covariance), covariance, torch.eye(2, dtype=covariance.dtype))
+    covariance = torch.where(torch.isfinite(peaks.covariance), peaks.covariance, torch.eye(2, dtype=peaks.u.dtype))
     (xx, xy), (yx, yy) = (row.unbind(-1) for row in covariance.unbind(-2))
     both = (xx * yy - xy * yx).clamp_min(1e-12).sqrt()
     one, height, width = torch.ones_like(peaks.value), peaks.value.clamp(-0.5, 1.5), peaks.width.log().abs()
@@ -114,9 +111,9 @@ def features_of(peaks: Peaks, rough: Rough | None = None) -> Tensor:
 def covariance_and_confidence(
     peaks: Peaks, rough: Rough | None, fit: ErrorModel, landmark: np.ndarray | slice = np.s_[:]
 ) -> tuple[Tensor, Tensor]:
-    """Covariance (..., 2, 2) px^2 of the stage's input and confidence (...) of peaks; `landmark` says which each is.
+    """Covariance (..., 2, 2) px^2 of the stage's input, of right and wrong landmarks together, and confidence (...) of peaks.
 
-    The covariance is that of the mixture of right and wrong landmarks.  Torch can trace it.
+    `landmark` says which each is.  Torch can trace it.
     """
     features = features_of(peaks, rough)
     value = (features * torch.tensor(fit.coefficients[landmark], dtype=features.dtype)).sum(-1)
