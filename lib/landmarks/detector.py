@@ -252,7 +252,7 @@ class Detector:
         for more in (equalised, stretched, None) if self.tool_network else ():
             unsure = np.flatnonzero(result.confidence.mean(1) < _UNSURE)
             if unsure.size:
-                again = np.stack([more(image) if more else image for image in images[unsure]])
+                again = np.stack([more(image) for image in images[unsure]]) if more else images[unsure]
                 other = self._once(again, avoid, sweep=more is None)
                 other = other if more else replace(other, confidence=_UNWITNESSED * other.confidence)
                 better = other.confidence.mean(1) > result.confidence[unsure].mean(1)

@@ -14,7 +14,7 @@ from lib.landmarks.windows import CLOSEUP_REACH_PX, CLOSEUP_ZOOM, expected_in_cl
 FEATURES = 9
 #: Jaws look shut where the tips are nearer to each other than about this share of the tool's length.
 _SHUT = 0.15
-_WRONG = 3.0  # so many times its own a wrong landmark's variance exceeds a right one's; chosen on validation images
+_WRONG = 3.0  # a wrong landmark's variance is 1 + this times a right one's; no part of the fit, chosen on validation images
 
 
 @dataclass(frozen=True)
@@ -48,9 +48,9 @@ class ErrorModel:
     """The error model of one stage, fitted by `lib.training.error_models.fit_error_models`.
 
     The covariance of a peak is diagonal in the axes of the stage's input.  In an upright window these run along the tool
-    and across it, the directions in which errors differ most.  The logarithm of the variance in px^2 of the stage's input is
-    a linear function of the peak's features (`features_of`), and so is the logit of the confidence.  The two tips, mirror
-    images of each other, have equal coefficients.
+    and across it, the directions in which errors differ most.  The logarithm of a right landmark's variance, in px^2 of
+    that input, is a linear function of the peak's features (`features_of`), and so is the logit of the confidence.  The two
+    tips, mirror images of each other, have equal coefficients.
 
     Attributes:
         log_variance: (2, 11): for x and y the constants of base, tip_1 and tip_2, and the slopes of the other features.
