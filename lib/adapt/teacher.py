@@ -41,7 +41,8 @@ _OWN_BIAS = 0.004 * np.array([[2.5, 1.0, 1.5], [1.2, 1.0, 1.5], [1.2, 1.0, 1.5]]
 #: Largest offset of a landmark, as a share of the tool's length or in mm, whichever is more: what is farther is another point
 #: of the tool.  A robot's own tool calibration errs by tenths of a millimetre, however short the tool is.
 _LARGEST_OFFSET, _LARGEST_OFFSET_MM = 0.15, 0.25
-_TURNED = 0.3  # error of an offset, as a share of it, where shut jaws borrow the tool's axes from another time
+#: Error of an offset, as a share of it, where shut jaws borrow the tool's axes from a time that is farther away than this.
+_TURNED, _BORROWED_S = 0.3, 0.1
 _ODD = 0.2  # share of a large offset that may be the detector's all the same: some tools it knows far worse than others
 #: Gain in log likelihood of a detection, by which cameras of their own for a part of the time must explain it better.
 #: A smaller gain narrows the residuals by less than a quarter, which unknown offsets of the landmarks do, too.
@@ -212,9 +213,9 @@ class Teacher:
             at = time
             for _ in range(3 if r.readout_s else 1):
                 x = r.kinematics.at(at)
-                axes = tool_axes(x, turning)
-                shut = ~np.isfinite(axes).all(axis=(1, 2))
-                axes[shut] = known[np.abs(open_s - at[shut, :1]).argmin(axis=1)] if len(known) else 0.0
+                apart_s = np.abs(open_s - at[:, :1])
+                axes = known[apart_s.argmin(axis=1)] if len(known) else np.zeros((len(at), 3, 3))
+                shut = apart_s.min(axis=1, initial=np.inf) > _BORROWED_S
                 x = x + np.einsum("mij,kj->mki", axes, offset)
                 u[:, side] = camera.project(x.reshape(-1, 3)).reshape(x.shape[:2] + (2,))
                 at = time + r.readout_s * np.nan_to_num(u[:, side, :, 1] / (height - 1) - 0.5).clip(-0.5, 0.5)

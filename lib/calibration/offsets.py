@@ -26,7 +26,8 @@ def tool_axes(x_mm: ArrayLike, offset_mm: np.ndarray | None = None) -> np.ndarra
     """Axes R (n, 3, 3) of a forceps from its landmarks (n, 3, 3) mm: columns along it, from tip to tip, and their normal.
 
     With `offset_mm` (3, 3), those of the landmarks moved by it in these very axes, which turns those of nearly shut jaws.
-    NaN where the jaws are shut (tips closer than 5 % of the tool's length), a landmark is missing, or no axes fulfil that.
+    Where these may point from tip_1 to tip_2 or back, they turn least from one tool to the next: give them in order of time.
+    NaN where the tips are reported closer than 5 % of the tool's length, a landmark is missing, or no axes fulfil that.
 
     >>> tool_axes([[[0, 0, 0], [3, -0.5, 0], [3, 0.5, 0]]])[0].tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
@@ -50,13 +51,35 @@ def tool_axes(x_mm: ArrayLike, offset_mm: np.ndarray | None = None) -> np.ndarra
         across = across - beside * m
         width = np.linalg.norm(across, axis=1, keepdims=True)
         sine = (-apart[2] - beside * a[:, 2:]) / (width * up[:, 2:])
-        cosine, c = np.sqrt(1 - sine**2), across / width
+        cosine, c = np.array([[[1]], [[-1]]]) * np.sqrt(1 - sine**2), across / width
         g = np.cross(m, c)
         own = np.stack([a, side, up], axis=2)
-        axes = np.stack([m, cosine * c - sine * g, sine * c + cosine * g], axis=2) @ own.mT
-        opening = apart[1] + (beside * a + width * (cosine * side + sine * up))[:, 1]
-        is_open = opening > 0.05 * (straight + middle[0])
-    return np.where(is_open[:, None, None], axes, np.nan)
+        y, z = cosine * c - sine * g, sine * c + cosine * g
+        axes = np.stack([np.broadcast_to(m, y.shape), y, z], axis=3) @ own.mT  # (2, n, 3, 3)
+        opening = apart[1] + (beside * a + width * (cosine * side + sine * up))[..., 1]
+        shut = 0.05 * (straight + middle[0])
+        possible = (opening > -shut) & (width[:, 0] > shut)  # jaws do not cross
+    return _least_turning(axes, possible)
+
+
+def _least_turning(axes: np.ndarray, possible: np.ndarray) -> np.ndarray:
+    """Of two axes (2, n, 3, 3) for each tool the `possible` (2, n) ones that turn least from tool to tool; NaN without any.
+
+    The first ones count where both turn as little.
+    """
+    found, known = np.full(axes.shape[1:], np.nan), np.flatnonzero(possible.any(axis=0))
+    if not known.size:
+        return found
+    y, own = axes[..., 1][:, known], np.where(possible[:, known], [[0.0], [1e-6]], np.inf)
+    turn = 1 - np.einsum("snx,tnx->nst", y[:, :-1], y[:, 1:])
+    total, came = own[:, 0], np.zeros((len(known), 2), int)
+    for i, step in enumerate(turn, 1):  # the shortest way from the first tool to each
+        way = total[:, None] + np.nan_to_num(step, nan=np.inf)
+        came[i], total = way.argmin(axis=0), way.min(axis=0) + own[:, i]
+    which = total.argmin()
+    for i in range(len(known) - 1, -1, -1):
+        found[known[i]], which = axes[which, known[i]], came[i, which]
+    return found
 
 
 def rows_axes(data: Correspondences, offset_mm: np.ndarray | None = None) -> np.ndarray:

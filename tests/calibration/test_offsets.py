@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from lib.calibration import calibrate, with_offsets
 from lib.calibration.offsets import estimate_offsets, tool_axes
@@ -49,6 +50,20 @@ def test_axes_of_a_short_tool_that_is_reported_far_off(width_mm):
     tool[1:] -= [0, tool[1:].mean(axis=0)[1], 0]
     R = RigidTransform.from_rotation_vector((0.3, -1.2, 2.0), (5, 6, 7))
     np.testing.assert_allclose(tool_axes(R.apply(tool - LARGE_MM)[None], LARGE_MM)[0], R.R, atol=1e-9)
+
+
+def test_axes_of_shut_jaws_that_are_reported_crossed():
+    """By its offsets the robot reports tip_2 where tip_1 is; jaws that were open before and after tell which is which."""
+    width_mm = np.array([0.9, 0.6, 0.38, 0.05, 0.02, 0.0, 0.03, 0.37, 0.8])
+    offset = np.array([[0.02, -0.15, 0.0], [-0.05, -0.1, 0.04], [0.05, 0.11, -0.03]])
+    tool = np.zeros((len(width_mm), 3, 3))
+    tool[:, 1:, 0], tool[:, 1, 1], tool[:, 2, 1] = 3.0, -width_mm / 2, width_mm / 2
+    R = Rotation.from_rotvec(np.outer(np.arange(len(tool)), [0.3, 0.1, -0.05])).as_matrix()
+    reported = (tool - offset) @ R.mT
+    crossed = np.einsum("ni,ni->n", reported[:, 2] - reported[:, 1], R[:, :, 1]) < 0
+    assert crossed.tolist() == 3 * [False] + 4 * [True] + 2 * [False]
+    np.testing.assert_allclose(tool_axes(reported, offset), R, atol=1e-6)
+    assert np.abs(tool_axes(reported[4:5], offset)[0] - R[4]).max() > 1  # alone it does not
 
 
 def test_large_offsets_of_a_short_tool_are_found():
