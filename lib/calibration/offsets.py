@@ -50,7 +50,7 @@ def tool_axes(x_mm: ArrayLike, offset_mm: np.ndarray | None = None) -> np.ndarra
         beside = (across * m).sum(axis=1, keepdims=True)
         across = across - beside * m
         width = np.linalg.norm(across, axis=1, keepdims=True)
-        sine = (-apart[2] - beside * a[:, 2:]) / (width * up[:, 2:])
+        sine = np.clip((-apart[2] - beside * a[:, 2:]) / (width * up[:, 2:]), -1, 1)
         cosine, c = np.array([[[1]], [[-1]]]) * np.sqrt(1 - sine**2), across / width
         g = np.cross(m, c)
         own = np.stack([a, side, up], axis=2)
@@ -58,7 +58,7 @@ def tool_axes(x_mm: ArrayLike, offset_mm: np.ndarray | None = None) -> np.ndarra
         axes = np.stack([np.broadcast_to(m, y.shape), y, z], axis=3) @ own.mT  # (2, n, 3, 3)
         opening = apart[1] + (beside * a + width * (cosine * side + sine * up))[..., 1]
         shut = 0.05 * (straight + middle[0])
-        possible = (opening > -shut) & (width[:, 0] > shut)  # jaws do not cross
+        possible = (width[:, 0] > shut) & (opening > np.stack([np.full(len(x), -np.inf), -shut]))  # jaws hardly cross
     return _least_turning(axes, possible)
 
 
@@ -154,16 +154,18 @@ def estimate_offsets(
             prior_sd = prior_sd or chosen_sd
         covariance = np.linalg.inv(information + np.eye(offset.size) / prior_sd**2)
         before, step = step, covariance @ (gradient - offset.ravel() / prior_sd**2)
-        share = max(share / 2, 0.25) if step @ before < 0 else min(2 * share, 1.0)  # to and fro: it went too far
+        share = share / 2 if step @ before < 0 else min(1.5 * share, 1.0)  # to and fro: it went too far
         offset = offset + share * step.reshape(offset.shape)
-        if np.abs(step).max() < 1e-3 * np.sqrt(np.diag(covariance).min()):
+        moved, least_sd = share * np.abs(step).max(), np.sqrt(np.diag(covariance).min())
+        if moved < 1e-3 * least_sd:
             break
     else:
-        warnings.warn(
-            f"offsets: they still move by up to {np.abs(step).max():.2g} {'px' if axes is None else 'mm'} after {iterations} "
-            "steps; look at the outliers (`ransac_px`).",
-            RuntimeWarning, stacklevel=3,
-        )  # fmt: skip
+        if moved > 0.1 * least_sd:
+            warnings.warn(
+                f"offsets: they still move by up to {moved:.2g} {'px' if axes is None else 'mm'} after {iterations} steps; look "
+                "at the outliers (`ransac_px`).",
+                RuntimeWarning, stacklevel=3,
+            )  # fmt: skip
     p, size = J_c.shape[2], offset.shape[1]
     prior = np.diag(np.repeat([0.0, prior_sd**-2], [p, offset.size]))
     full, effective = sandwich(np.concatenate([J_c, J], axis=2), weight, r, frame[rows], landmark[rows], prior)
