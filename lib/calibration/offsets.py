@@ -161,11 +161,8 @@ def estimate_offsets(
             break
     else:
         if moved > 0.1 * least_sd:
-            warnings.warn(
-                f"offsets: they still move by up to {moved:.2g} {'px' if axes is None else 'mm'} after {iterations} steps; look "
-                "at the outliers (`ransac_px`).",
-                RuntimeWarning, stacklevel=3,
-            )  # fmt: skip
+            text = f"they still move by up to {moved:.2g} {'px' if axes is None else 'mm'} after {iterations} steps"
+            warnings.warn(f"offsets: {text}; look at the outliers (`ransac_px`).", RuntimeWarning, stacklevel=3)
     p, size = J_c.shape[2], offset.shape[1]
     prior = np.diag(np.repeat([0.0, prior_sd**-2], [p, offset.size]))
     full, effective = sandwich(np.concatenate([J_c, J], axis=2), weight, r, frame[rows], landmark[rows], prior)
