@@ -30,7 +30,7 @@ from lib.trust.health import spread
 
 #: Most rounds of training, and most steps of a stage in one; the time ends most trainings.
 ROUNDS, STEPS = 3, 4000
-RECIPE = 8  # raised where teaching or training changes: what an older one kept is not gone on with
+RECIPE = 9  # raised where teaching or training changes: what an older one kept is not gone on with
 #: Share of the time left that a round takes, and fewest images for stopping to which alone the doubt is fitted.
 _ROUND_SHARE, _DOUBT_IMAGES = 0.85, 10
 #: Most stereo frames that are looked at, spread over the recording.
@@ -45,8 +45,9 @@ _SURE_GAIN = 1.0
 #: Most rounds of looking where the robot says, before anything is trained, and the share of the tool's length below which a
 #: landmark's move ends them.
 _GUIDED, _SETTLED = 3, 0.01
-#: Largest median distance of a teacher's landmarks from labels set by hand, as a share of the tool's length.
-_OFF_LABELS = 0.05
+#: Largest median distance of a teacher's landmarks from labels set by hand: a share of the tool's length, or twice that of
+#: labels which err as much as clicks do, whichever is more.  A detector that does not know the tool errs alike in all frames.
+_OFF_LABELS, _OFF_LABELS_PX = 0.015, 2 * 1.18 * CLICK_SD_PX
 
 
 @dataclass(frozen=True, eq=False)
@@ -285,6 +286,7 @@ class _Work:
             seen, said = self.look(f"round {k}", tuned, self.frames), {}
             try:
                 new = teach(recording, seen.labelled(self.labels).of(learn), before=teacher, opinion=guided)
+                new = teacher if self.contradicted(new) else new
             except RefusalError as refused:
                 said = {"refused": str(refused)}
                 if len(self.marked) < 5:
@@ -303,8 +305,9 @@ class _Work:
     def contradicted(self, teacher: Teacher) -> bool:
         """Whether a teacher puts the landmarks elsewhere than labels set by hand do."""
         told = self.labels[self.marked]
-        off = np.linalg.norm(teacher.project(self.marked)[0] - told, axis=-1) / tool_length_px(told)[..., None]
-        return len(self.marked) >= 5 and np.nanmedian(off) > _OFF_LABELS
+        off = np.linalg.norm(teacher.project(self.marked)[0] - told, axis=-1)
+        off /= np.maximum(_OFF_LABELS * tool_length_px(told), _OFF_LABELS_PX)[..., None]
+        return len(self.marked) >= 5 and np.nanmedian(off) > 1
 
     def round(self, k: int, detector: Detector, teacher: Teacher, seen: Seen | None) -> Detector:
         """The detector trained further on what the teacher says of the frames for learning."""

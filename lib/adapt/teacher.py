@@ -316,6 +316,11 @@ def teach(
     elif before is not None:
         offset, sd, turns = before.offset_mm, before.offset_sd_mm, before.turns
     teacher = Teacher(recording, calibration, clock_sd_s, offset, sd, refused, right, turns)
+    at, spread = teacher.project(used.frame)
+    sd = np.nanmedian(np.sqrt(np.trace(spread, axis1=-2, axis2=-1) / 2) / tool_length_px(at)[..., None])
+    if sd > _NEAR:
+        raise RefusalError(f"{'labels' if from_labels else 'detector'}: the landmarks' places have a standard deviation of "
+                           f"{100 * sd:.0f} % of the tool's length, too much to learn from. {_LABEL}")  # fmt: skip
     against = _contradicted(teacher, used)
     if len(against) > max(_CONTRADICTED * len(used.frame), 2):
         raise RefusalError(
