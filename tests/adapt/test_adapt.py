@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -344,6 +345,22 @@ def test_labels_overrule_a_detector_that_agrees_with_itself(world, recording, tm
         tune = pupil(world)
         adapt(recording, StandIn(elbows, noise_px=0.7), labels=labels, folder=tmp_path, progress=False, tune=tune)
         assert (np.nanmedian(np.linalg.norm(tune.calls[0]["off"], axis=-1)) > 4.0) == wrong
+
+
+@pytest.mark.parametrize(("length_px", "agrees_px", "contradicts_px"), [(300, 4.0, 5.0), (60, 3.2, 4.0)])
+def test_a_teacher_that_errs_alike_in_all_labelled_frames_contradicts_them(length_px, agrees_px, contradicts_px):
+    told = np.tile([[100.0, 100.0], [100 + length_px, 100], [100 + length_px, 100]], (5, 2, 1, 1))
+    for off_px, contradicts in ((agrees_px, False), (contradicts_px, True)):
+        teacher = SimpleNamespace(project=lambda frames, off_px=off_px: (told[frames] + [0, off_px], None))
+        for n in (5, 4):  # fewer than five overrule nothing
+            work = SimpleNamespace(labels=told, marked=np.arange(n))
+            assert loop._Work.contradicted(work, teacher) == (contradicts and n == 5)
+
+
+def test_labels_that_leave_the_places_open_are_refused(world, recording, monkeypatch):
+    monkeypatch.setattr("lib.adapt.teacher._NEAR", 0.001)
+    with pytest.raises(RefusalError, match="labels: .*standard deviation of [0-9]+ % .*Label 10 pairs"):
+        teach(recording, five_labelled(world)[1], from_labels=True)
 
 
 def test_labels_teach_a_tool_that_no_closeup_knows(world, recording, tmp_path, monkeypatch):
