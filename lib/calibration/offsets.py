@@ -63,22 +63,20 @@ def tool_axes(x_mm: ArrayLike, offset_mm: np.ndarray | None = None) -> np.ndarra
 
 
 def _least_turning(axes: np.ndarray, possible: np.ndarray) -> np.ndarray:
-    """Of two axes (2, n, 3, 3) for each tool the `possible` (2, n) ones that turn least from tool to tool; NaN without any.
-
-    The first ones count where both turn as little.
-    """
+    """Of two axes (2, n, 3, 3) of each tool the `possible` (2, n) ones that turn least, else the first; NaN without any."""
     found, known = np.full(axes.shape[1:], np.nan), np.flatnonzero(possible.any(axis=0))
     if not known.size:
         return found
     y, own = axes[..., 1][:, known], np.where(possible[:, known], [[0.0], [1e-6]], np.inf)
-    turn = 1 - np.einsum("snx,tnx->nst", y[:, :-1], y[:, 1:])
-    total, came = own[:, 0], np.zeros((len(known), 2), int)
-    for i, step in enumerate(turn, 1):  # the shortest way from the first tool to each
-        way = total[:, None] + np.nan_to_num(step, nan=np.inf)
-        came[i], total = way.argmin(axis=0), way.min(axis=0) + own[:, i]
-    which = total.argmin()
-    for i in range(len(known) - 1, -1, -1):
-        found[known[i]], which = axes[which, known[i]], came[i, which]
+    turn = np.nan_to_num(1 - np.einsum("snx,tnx->nst", y[:, :-1], y[:, 1:]), nan=np.inf).tolist()
+    (a, b), came = own[:, 0].tolist(), []
+    for ((aa, ab), (ba, bb)), (own_a, own_b) in zip(turn, own.T[1:].tolist(), strict=True):  # the shortest way to each
+        came.append((a + aa > b + ba, a + ab > b + bb))
+        a, b = min(a + aa, b + ba) + own_a, min(a + ab, b + bb) + own_b
+    which = [b < a]
+    for step in reversed(came):
+        which.append(step[which[-1]])
+    found[known] = axes[np.array(which[::-1], int), known]
     return found
 
 
