@@ -45,8 +45,7 @@ _SURE_GAIN = 1.0
 #: Most rounds of looking where the robot says, before anything is trained, and the share of the tool's length below which a
 #: landmark's move ends them.
 _GUIDED, _SETTLED = 3, 0.01
-#: Largest median distance of a teacher's landmarks from labels set by hand: a share of the tool's length, or twice that of
-#: labels which err as much as clicks do, whichever is more.  A detector that does not know the tool errs alike in all frames.
+#: Largest median distance of a teacher from labels set by hand: a share of the tool's length, at least twice that of clicks.
 _OFF_LABELS, _OFF_LABELS_PX = 0.015, 2 * 1.18 * CLICK_SD_PX
 
 
@@ -285,8 +284,8 @@ class _Work:
             tuned = self.round(k, best, teacher, None if k == 1 else best_seen)
             seen, said = self.look(f"round {k}", tuned, self.frames), {}
             try:
-                new = teach(recording, seen.labelled(self.labels).of(learn), before=teacher, opinion=guided)
-                new = teacher if self.contradicted(new) else new
+                found = teach(recording, seen.labelled(self.labels).of(learn), before=teacher, opinion=guided)
+                new = teacher if self.contradicted(found) else found
             except RefusalError as refused:
                 said = {"refused": str(refused)}
                 if len(self.marked) < 5:

@@ -41,7 +41,7 @@ _OWN_BIAS = 0.004 * np.array([[2.5, 1.0, 1.5], [1.2, 1.0, 1.5], [1.2, 1.0, 1.5]]
 #: Largest offset of a landmark, as a share of the tool's length or in mm, whichever is more: what is farther is another point
 #: of the tool.  A robot's own tool calibration errs by tenths of a millimetre, however short the tool is.
 _LARGEST_OFFSET, _LARGEST_OFFSET_MM = 0.15, 0.25
-#: Error of an offset, as a share of it, where shut jaws borrow the tool's axes from a time that is farther away than this.
+#: Error of an offset, as a share of it, where shut jaws borrow the tool's axes from another time, farther away than this.
 _TURNED, _BORROWED_S = 0.3, 0.1
 _ODD = 0.2  # share of a large offset that may be the detector's all the same: some tools it knows far worse than others
 #: Gain in log likelihood of a detection, by which cameras of their own for a part of the time must explain it better.
@@ -203,17 +203,17 @@ class Teacher:
         NaN where the robot is silent.  The covariance is that of calibration, robot, clock and offset.
         """
         r, c, offset = self.recording, self.calibration, self.offset_mm
-        turning = offset if self.turns else None
-        known = tool_axes(r.kinematics.x_mm, turning)
-        is_open = np.isfinite(known).all(axis=(1, 2))
-        open_s, known = r.kinematics.time_s[is_open], known[is_open]
         time, height = np.repeat(r.frames.time_s[frames][:, None], 3, axis=1) + r.offset_s, r.image_size_px[1]
         u, covariance = np.full((len(frames), 2, 3, 2), np.nan), np.full((len(frames), 2, 3, 2, 2), np.nan)
         for side, camera in enumerate(c.cameras):
             at = time
             for _ in range(3 if r.readout_s else 1):
                 x = r.kinematics.at(at)
-                apart_s = np.abs(open_s - at[:, :1])
+                when_s = np.append(r.kinematics.time_s, at[:, 0])  # the log's own times show how shut jaws were turned before
+                order = np.argsort(when_s)
+                known = tool_axes(np.concatenate([r.kinematics.x_mm, x])[order], offset if self.turns else None)
+                is_open = np.isfinite(known).all(axis=(1, 2))
+                known, apart_s = known[is_open], np.abs(when_s[order][is_open] - at[:, :1])
                 axes = known[apart_s.argmin(axis=1)] if len(known) else np.zeros((len(at), 3, 3))
                 shut = apart_s.min(axis=1, initial=np.inf) > _BORROWED_S
                 x = x + np.einsum("mij,kj->mki", axes, offset)
@@ -260,7 +260,8 @@ def teach(
 
     Raises:
         RefusalError: If fewer than a tenth of the landmarks, or 30, agree on cameras, the cameras are no stereo microscope's,
-            a landmark is seen more than 15 % of the tool's length and 0.25 mm off, or the robot contradicts the images.
+            a landmark is seen more than 15 % of the tool's length and 0.25 mm off, its place stays open by more than 10 %, or
+            the robot contradicts the images.
     """
     frozen = _frozen(recording, seen.frame)
     refused = frozen if before is None else np.union1d(frozen, before.refused)
@@ -316,11 +317,11 @@ def teach(
     elif before is not None:
         offset, sd, turns = before.offset_mm, before.offset_sd_mm, before.turns
     teacher = Teacher(recording, calibration, clock_sd_s, offset, sd, refused, right, turns)
-    at, spread = teacher.project(used.frame)
-    sd = np.nanmedian(np.sqrt(np.trace(spread, axis1=-2, axis2=-1) / 2) / tool_length_px(at)[..., None])
-    if sd > _NEAR:
-        raise RefusalError(f"{'labels' if from_labels else 'detector'}: the landmarks' places have a standard deviation of "
-                           f"{100 * sd:.0f} % of the tool's length, too much to learn from. {_LABEL}")  # fmt: skip
+    u, covariance = teacher.project(used.frame)
+    share = np.nanmedian(np.sqrt(np.trace(covariance, axis1=-2, axis2=-1) / 2) / tool_length_px(u)[..., None])
+    if share > _NEAR:
+        told = "labels" if from_labels else "detections"
+        raise RefusalError(f"{told}: they tell a landmark's place to {100 * share:.0f} % of the tool's length only. {_LABEL}")
     against = _contradicted(teacher, used)
     if len(against) > max(_CONTRADICTED * len(used.frame), 2):
         raise RefusalError(

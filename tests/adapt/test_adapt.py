@@ -336,6 +336,21 @@ def test_five_labelled_pairs_tell_clock_and_offsets(world, tmp_path):
     assert teacher.recording.offset_s == pytest.approx(0.04, abs=0.015)
 
 
+def test_offsets_follow_the_tool_between_the_samples_of_a_slow_log(world, recording):
+    """The tool turns between samples; its axes at a frame are those of that instant."""
+    teacher, k = taught(recording, StandIn(world.u, noise_px=0.7)), recording.kinematics
+    offset = np.array([[0.0, 0.1, 0.2], [0.1, 0.0, -0.2], [-0.1, 0.1, 0.0]])
+    slow = replace(k, time_s=k.time_s[::60], x_mm=k.x_mm[::60])  # of 1.2 s
+    teacher = replace(teacher, recording=replace(teacher.recording, kinematics=slow), offset_mm=offset, turns=False)
+    x = slow.at(recording.frames.time_s + teacher.recording.offset_s)
+    axes = tool_axes(x)
+    open_jaws = np.flatnonzero(np.isfinite(axes).all(axis=(1, 2)))
+    moved = (x + np.einsum("mij,kj->mki", axes, offset))[open_jaws]
+    left = teacher.calibration.cameras[0].project(moved.reshape(-1, 3)).reshape(-1, 3, 2)
+    assert len(open_jaws) > 10
+    np.testing.assert_allclose(teacher.project(open_jaws)[0][:, 0], left, atol=1e-6)
+
+
 def test_labels_overrule_a_detector_that_agrees_with_itself(world, recording, tmp_path):
     elbows = world.u.copy()
     elbows[:, :, 1:] += 0.12 * (elbows[:, :, :1] - elbows[:, :, 1:])
@@ -359,7 +374,7 @@ def test_a_teacher_that_errs_alike_in_all_labelled_frames_contradicts_them(lengt
 
 def test_labels_that_leave_the_places_open_are_refused(world, recording, monkeypatch):
     monkeypatch.setattr("lib.adapt.teacher._NEAR", 0.001)
-    with pytest.raises(RefusalError, match="labels: .*standard deviation of [0-9]+ % .*Label 10 pairs"):
+    with pytest.raises(RefusalError, match="labels: .* to [0-9]+ % of the tool's length only. Label 10 pairs"):
         teach(recording, five_labelled(world)[1], from_labels=True)
 
 

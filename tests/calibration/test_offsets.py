@@ -63,7 +63,7 @@ def test_axes_of_shut_jaws_that_are_reported_crossed():
     crossed = np.einsum("ni,ni->n", reported[:, 2] - reported[:, 1], R[:, :, 1]) < 0
     assert crossed.tolist() == 3 * [False] + 4 * [True] + 2 * [False]
     np.testing.assert_allclose(tool_axes(reported, offset), R, atol=1e-6)
-    assert np.abs(tool_axes(reported[4:5], offset)[0] - R[4]).max() > 1  # alone it does not
+    assert np.abs(tool_axes(reported[4:5], offset)[0] - R[4]).max() > 1  # that row alone does not tell
 
 
 def test_large_offsets_of_a_short_tool_are_found():
