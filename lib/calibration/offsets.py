@@ -25,8 +25,8 @@ _STEP = 1e-4
 def tool_axes(x_mm: ArrayLike, offset_mm: np.ndarray | None = None) -> np.ndarray:
     """Axes R (n, 3, 3) of a forceps from its landmarks (n, 3, 3) mm: columns along it, from tip to tip, and their normal.
 
-    With `offset_mm` (3, 3), the axes of the landmarks moved by it in these same axes.  Tips that are reported crossed leave two;
-    those that turn least from row to row count, so the rows must be in order of time.
+    With `offset_mm` (3, 3), the axes of the landmarks moved by it in these same axes.  Tips that are reported crossed leave
+    two; those that turn least from row to row count, so the rows must be in order of time.
     NaN where the tips are reported closer than 5 % of the tool's length, or a landmark is missing.
 
     >>> tool_axes([[[0, 0, 0], [3, -0.5, 0], [3, 0.5, 0]]])[0].tolist()
