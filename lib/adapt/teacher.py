@@ -13,7 +13,7 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from lib.calibration import Calibration, CompetingCamerasError, LandmarkOffsets, calibrate, estimate_time_offset
-from lib.calibration.offsets import tool_axes
+from lib.calibration.offsets import carried, tool_axes
 from lib.correspondences import LANDMARKS, MIN_CONFIDENCE, Correspondences, of_recording
 from lib.landmarks import Landmarks
 from lib.landmarks.metrics import tool_length_px
@@ -211,10 +211,10 @@ class Teacher:
                 x = r.kinematics.at(at)
                 when_s = np.append(r.kinematics.time_s, at[:, 0])  # the log's own times show how shut jaws were turned before
                 order = np.argsort(when_s)
-                known = tool_axes(np.concatenate([r.kinematics.x_mm, x])[order], offset if self.turns else None)
-                is_open = np.isfinite(known).all(axis=(1, 2))
-                known, apart_s = known[is_open], np.abs(when_s[order][is_open] - at[:, :1])
-                axes = known[apart_s.argmin(axis=1)] if len(known) else np.zeros((len(at), 3, 3))
+                told = np.concatenate([r.kinematics.x_mm, x])[order]
+                known = tool_axes(told, offset if self.turns else None)
+                axes = np.nan_to_num(carried(known, told, when_s[order])[np.argsort(order)[len(when_s) - len(at) :]])
+                apart_s = np.abs(when_s[order][np.isfinite(known).all(axis=(1, 2))] - at[:, :1])
                 shut = apart_s.min(axis=1, initial=np.inf) > _BORROWED_S
                 x = x + np.einsum("mij,kj->mki", axes, offset)
                 u[:, side] = camera.project(x.reshape(-1, 3)).reshape(x.shape[:2] + (2,))

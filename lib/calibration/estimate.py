@@ -13,7 +13,7 @@ from lib.calibration import checks as refuse
 from lib.calibration.affine import affine_minimum, estimate_noise, noise_rms_px, paper_variances, regress
 from lib.calibration.calibration import Calibration
 from lib.calibration.models import Fit, Model, State, fit
-from lib.calibration.offsets import estimate_offsets, rows_axes
+from lib.calibration.offsets import estimate_offsets, rows_axes, start_of_turning
 from lib.calibration.robust import consensus
 from lib.calibration.scatter import sandwich
 from lib.correspondences import Correspondences
@@ -152,14 +152,16 @@ def _turned(
     if found.offsets.p_value >= _SURE_OFFSETS or turn_mm < _LEAST_TURN_MM:
         return found
     try:
+        begin = start_of_turning(found, axes, turned, data.landmark[usable])
         with warnings.catch_warnings():
-            warnings.filterwarnings("error", "offsets:", RuntimeWarning)
-            other = estimate(axes=turned, start=found)
-    except (ValueError, RuntimeWarning):  # no cameras fit them, or the offsets find no end
+            warnings.filterwarnings("ignore", "offsets:", RuntimeWarning)
+            other = estimate(axes=turned, start=replace(found, offsets=replace(found.offsets, offset=begin)))
+    except ValueError:  # no cameras fit them
         return found
     used = np.repeat(found.view_inliers, 2, axis=1)
-    worse = np.linalg.norm(other.residuals_px[used]) / np.linalg.norm(found.residuals_px[used])
-    if used.sum() * np.log(worse) > _AS_LIKELY:
+    most = 2 * found.reprojection_rms_px  # of a frame whose axes stay unknown more would say nothing
+    rms = [np.linalg.norm(np.clip(one.residuals_px[used], -most, most)) for one in (other, found)]
+    if used.sum() * np.log(rms[0] / rms[1]) > _AS_LIKELY:
         return found
     return replace(other, offsets=replace(other.offsets, turns=True))
 

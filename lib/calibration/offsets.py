@@ -9,17 +9,22 @@ whose width the data choose (empirical Bayes).  What the data cannot tell stays 
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 from scipy.special import chdtrc
 
 from lib.calibration.calibration import Calibration, LandmarkOffsets
+from lib.calibration.robust import CompetingCamerasError
 from lib.calibration.scatter import sandwich
 from lib.correspondences import Correspondences
 
 #: Step of the offsets' derivatives, mm or px.
 _STEP = 1e-4
+#: Where offsets that turn the axes start: a robot's own calibration of its tool errs by tenths of a millimetre.
+_GRID_MM, _POLISHED = (0.0, 0.12, -0.12, 0.28, -0.28), 8
 
 
 def tool_axes(x_mm: ArrayLike, offset_mm: np.ndarray | None = None) -> np.ndarray:
@@ -80,25 +85,49 @@ def _least_turning(axes: np.ndarray, possible: np.ndarray) -> np.ndarray:
     return found
 
 
-def rows_axes(data: Correspondences, offset_mm: np.ndarray | None = None) -> np.ndarray:
+def rows_axes(data: Correspondences, offset_mm: np.ndarray | None = None, *, carry: bool = False) -> np.ndarray:
     """`tool_axes` (n, 3, 3) of each row's frame; NaN too where recordings joined under the same frame numbers repeat rows.
 
-    Where the landmarks moved by `offset_mm`, of one to three landmarks, have no axes, those of the reported ones.
+    Where the landmarks moved by `offset_mm`, of one to three landmarks, have no axes, those of the reported ones; before
+    that, if `carry`, those `carried` from another frame.
     """
     if len(data) == 0 or data.landmark.max() > 2 or len(np.unique(3 * data.frame + data.landmark)) < len(data):
         return np.full((len(data), 3, 3), np.nan)
     x = data.grid("x_mm")
     axes = tool_axes(x)
+    axes = carried(axes, x) if carry else axes
     if offset_mm is not None:
         turned = tool_axes(x, np.pad(offset_mm, ((0, 3 - len(offset_mm)), (0, 0))))
+        turned = carried(turned, x) if carry else turned
         axes = np.where(np.isfinite(turned), turned, axes)
     return axes[np.unique(data.frame, return_inverse=True)[1]]
+
+
+def carried(axes: np.ndarray, x_mm: np.ndarray, time_s: np.ndarray | None = None) -> np.ndarray:
+    """The axes (n, 3, 3) of tools at x_mm (n, 3, 3), in order of time; those that are NaN from the nearest row with axes.
+
+    They are turned as the shaft turned: shut jaws tell where the shaft points, and not how it is rolled.  The nearest row is
+    that in time, or without `time_s` in order.
+    """
+    along = x_mm[:, 1:].mean(axis=1) - x_mm[:, 0]
+    found, time = axes.copy(), np.arange(len(axes)) if time_s is None else time_s
+    is_known, is_told = np.isfinite(axes).all(axis=(1, 2)), np.isfinite(along).all(axis=1)
+    known, shut = np.flatnonzero(is_known & is_told), np.flatnonzero(~is_known & is_told)
+    if known.size:
+        middles = (time[known[1:]] + time[known[:-1]]) / 2
+        nearest = known[np.searchsorted(middles, time[shut])]
+        axis = np.cross(along[nearest], along[shut])
+        sine, cosine = np.linalg.norm(axis, axis=1), (along[nearest] * along[shut]).sum(axis=1)
+        turn = Rotation.from_rotvec(axis * (np.arctan2(sine, cosine) / np.maximum(sine, 1e-300))[:, None])
+        found[shut] = turn.as_matrix() @ axes[nearest]
+    return found
 
 
 def with_offsets(data: Correspondences, offsets: LandmarkOffsets | None) -> Correspondences:
     """The rows with their landmarks where the detector sees them, as far as `Calibration.offsets` has learnt it.
 
-    Offsets in the tool's axes move positions, where the jaws are open; offsets in the images move pixels; None nothing.
+    Offsets in the tool's axes move positions, those of shut jaws by the axes of the nearest frame with open ones (`carried`);
+    offsets in the images move pixels; None nothing.
     """
     if offsets is None:
         return data
@@ -106,7 +135,7 @@ def with_offsets(data: Correspondences, offsets: LandmarkOffsets | None) -> Corr
     shift = np.pad(offsets.offset, ((0, unknown), (0, 0)))[data.landmark]
     if shift.shape[1] == 4:
         return replace(data, u_left=data.u_left - shift[:, :2], u_right=data.u_right - shift[:, 2:])
-    shift = np.einsum("nij,nj->ni", rows_axes(data, offsets.offset if offsets.turns else None), shift)
+    shift = np.einsum("nij,nj->ni", rows_axes(data, offsets.offset if offsets.turns else None, carry=True), shift)
     return replace(data, x_mm=data.x_mm + np.where(np.isfinite(shift), shift, 0.0))
 
 
@@ -119,34 +148,35 @@ def estimate_offsets(
 
     Gauss-Newton on the offsets with the cameras eliminated: every step is a whole calibration `fit` of positions (n, 3) and
     pixels (n, m) with the `views` to use, and one Schur complement; a `RuntimeWarning` where `iterations` are too few.
-    `axes` takes offsets (landmarks, 3) and returns the axes (n, 3, 3) of the rows.  `start` gives the first offsets, their
-    prior, and the views, which stay.
+    `axes` takes offsets (landmarks, 3) and returns the axes (n, 3, 3) of the rows.  `start` gives the first offsets
+    and their prior.
     Without `prior_sd` it is the one that makes the data most probable, between 0.1 and 300 um, or 0.01 and 30 px.
     """
     m = y.shape[1]
     offset, p_value, views = np.zeros((int(landmark.max()) + 1, m if axes is None else 3)), np.nan, None
     if start is not None:
         offset, prior_sd, p_value = start.offsets.offset, start.offsets.prior_sd, start.offsets.p_value
-        views = start.view_inliers
     step, share = np.zeros(offset.size), 1.0
 
     def shift(offset: np.ndarray) -> np.ndarray:
         return offset[landmark] if axes is None else np.einsum("nij,nj->ni", axes(offset), offset[landmark])
 
     for i in range(iterations):
-        found = fit(*((x, y - shift(offset)) if axes is None else (x + shift(offset), y)), views=views)
+        moved_rows = (x, y - shift(offset)) if axes is None else (x + shift(offset), y)
+        try:
+            found = fit(*moved_rows, views=views)
+        except CompetingCamerasError:  # landmarks that are off by different offsets look like two cameras
+            if i > 0:
+                raise
+            found = fit(*moved_rows, views=np.isfinite(y).reshape(len(y), -1, 2).all(axis=2))
         # Outliers that come and go from step to step would be no end.
-        views = found.view_inliers if i >= 2 or start is not None else None
+        views = found.view_inliers if i >= 2 else None
         rows = found.inliers
         J_x, J_c, weight, r = found.system
         steps = _STEP * np.eye(offset.size).reshape(-1, *offset.shape)  # of a central difference, since axes turn
         J = np.stack([shift(offset + one) - shift(offset - one) for one in steps], axis=2)[rows] / (2 * _STEP)
         J = J if axes is None else J_x @ J
-        WJ = weight @ J
-        H_co = np.einsum("nip,niq->pq", J_c, WJ)
-        explained = np.linalg.solve(np.einsum("nip,niq->pq", J_c, weight @ J_c), H_co)
-        information = np.einsum("nip,niq->pq", J, WJ) - H_co.T @ explained
-        gradient = np.einsum("nip,ni->p", WJ, r)
+        information, gradient = _without_cameras(J, J_c, weight, r)
         if np.isnan(p_value):
             chosen_sd, p_value = _evidence(information, gradient, 1e-4 if axes is not None else 1e-2)
             prior_sd = prior_sd or chosen_sd
@@ -167,6 +197,53 @@ def estimate_offsets(
     blocks = np.stack([full[j : j + size, j : j + size] for j in range(p, len(full), size)])
     learnt = LandmarkOffsets(offset, blocks, prior_sd, p_value)
     return replace(found, parameter_covariance=full[:p, :p], effective_rows=effective, offsets=learnt)
+
+
+def _without_cameras(J: np.ndarray, J_c: np.ndarray, weight: np.ndarray, r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Information (p, p) and gradient (p,) of offsets by derivatives J (n, m, p), without the cameras' part, J_c (n, m, q)."""
+    WJ = weight @ J
+    shared = np.einsum("nip,niq->pq", J_c, WJ)
+    explained = np.linalg.solve(np.einsum("nip,niq->pq", J_c, weight @ J_c), shared)
+    free = np.einsum("nip,ni->p", WJ, r) - explained.T @ np.einsum("nip,ni->p", J_c, (weight @ r[:, :, None])[:, :, 0])
+    return np.einsum("nip,niq->pq", J, WJ) - shared.T @ explained, free
+
+
+def start_of_turning(
+    found: Calibration, axes: np.ndarray, turned: Callable[[np.ndarray], np.ndarray], landmark: np.ndarray
+) -> np.ndarray:
+    """Offsets (k, 3) from which to estimate those that turn the axes; of many starts the one that explains most.
+
+    Offsets turn the axes by three numbers: where the tips' middle lies beside the shaft, in two directions, and their
+    heights.  From each point of a grid of them the offsets follow linearly, and the best improve as they turn the axes anew.
+    `found` is the calibration by the reported `axes` (n, 3, 3), `turned` gives the axes of offsets.
+    """
+    rows, offset, k = found.inliers, found.offsets.offset, len(found.offsets.offset)
+    J_x, J_c, weight, r = found.system
+    r = r + (J_x @ axes[rows] @ offset[landmark[rows]][:, :, None])[:, :, 0]
+    chosen = np.eye(k)[landmark[rows]]
+    prior = np.eye(3 * k) / max(found.offsets.prior_sd, _GRID_MM[1]) ** 2
+
+    def explained(offset: np.ndarray) -> tuple[float, np.ndarray]:
+        """How much better than none offsets explain the detections, and the best ones if the axes stayed."""
+        J = np.einsum("nia,nk->nika", J_x @ turned(offset)[rows], chosen).reshape(len(r), -1, 3 * k)
+        information, gradient = _without_cameras(J, J_c, weight, r)
+        information, d = information + prior, offset.ravel()
+        return float(2 * gradient @ d - d @ information @ d), np.linalg.solve(information, gradient).reshape(offset.shape)
+
+    starts = []
+    for beside, above, apart in product(_GRID_MM, repeat=3):
+        turn = np.array([[0.0, 0.0, 0.0], [0.0, beside, above - apart / 2], [0.0, beside, above + apart / 2]])[:k]
+        offset = explained(turn)[1]
+        starts.append((*explained(offset), offset))
+    best = max(starts, key=lambda start: start[0])
+    for start in sorted(starts, key=lambda start: -start[0])[:_POLISHED]:
+        share = 0.7
+        for _ in range(6):
+            offset = start[2] + share * (start[1] - start[2])
+            new = (*explained(offset), offset)
+            start, share = (new, share) if new[0] > start[0] else (start, share / 2)
+        best = max(best, start, key=lambda start: start[0])
+    return best[2]
 
 
 def _evidence(information: np.ndarray, gradient: np.ndarray, least: float) -> tuple[float, float]:

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from lib.calibration import calibrate, with_offsets
-from lib.calibration.offsets import estimate_offsets, tool_axes
+from lib.calibration import CompetingCamerasError, calibrate, with_offsets
+from lib.calibration.offsets import carried, estimate_offsets, tool_axes
 from lib.correspondences import Correspondences
 from lib.geometry import RigidTransform
 from lib.simulator.rig import IMAGE_SIZE_PX
@@ -78,6 +78,52 @@ def test_large_offsets_of_a_short_tool_are_found():
     assert found.offsets.turns and found.reprojection_rms_px < 1.5
     apart = found.offsets.offset - offset
     assert np.abs(apart - apart.mean(axis=0)).max() < 0.02  # what all share looks like a shift of the cameras
+
+
+@pytest.mark.parametrize("seed", [0, 4, 7])
+def test_offsets_as_large_as_a_fifth_of_the_tool_are_found_from_far_off(seed):
+    """The reported axes lead to another minimum; of a grid of turns one leads to the right one."""
+    rng, (data, rig, _) = np.random.default_rng(seed), tool_sweep(seed)
+    offset = rng.normal(size=(3, 3))
+    offset *= 0.2 / np.linalg.norm(offset, axis=1, keepdims=True)
+    x = data.grid("x_mm")
+    middle = x.mean(axis=1, keepdims=True)
+    x = middle + 0.3 * (x - middle)
+    x[:, 1:] += (x[:, 1:].mean(axis=1, keepdims=True) - x[:, 1:]) * rng.uniform(-0.4, 0.3, (len(x), 1, 1))
+    reported = x - np.einsum("nij,kj->nki", tool_axes(x), offset) + rng.normal(0, 0.003, x.shape)
+    u = [p + rng.normal(0, 0.5, p.shape) for p in rig.project(x.reshape(-1, 3))]
+    found = calibrate(Correspondences.of_points(reported.reshape(-1, 3), *u, frame=data.frame, landmark=data.landmark))
+    apart = found.offsets.offset - offset
+    assert found.offsets.turns and np.abs(apart - apart.mean(axis=0)).max() < 0.015
+
+
+@pytest.mark.parametrize("seed", [2, 4])
+def test_landmarks_that_are_off_are_no_cameras_that_compete(seed):
+    """A tool that hardly turns: base and tips agree on two cameras each, but for offsets of 0.15 mm."""
+    offset = np.array([[0.02, -0.15, 0.0], [-0.05, 0.1, 0.04], [0.05, 0.11, -0.03]])
+    data = tool_sweep(seed, turn_rad=0.05, offset_mm=offset, sigma_px=0.5)[0]
+    with pytest.raises(CompetingCamerasError):
+        calibrate(data, offsets=False)
+    found = calibrate(data)
+    assert found.reprojection_rms_px < 2 and found.view_inliers.all()
+    apart = found.offsets.offset - offset
+    assert np.abs(apart - apart.mean(axis=0)).max() < 0.03
+
+
+def test_shut_jaws_carry_the_axes_of_open_ones_along_the_shaft():
+    turns = Rotation.from_rotvec(np.outer(np.arange(6), [0.0, 0.1, 0.2])).as_matrix()  # without a roll
+    width_mm = np.array([0.01, 0.9, 0.02, 0.01, 0.0, 0.8])
+    tool = np.zeros((6, 3, 3))
+    tool[:, 1:, 0], tool[:, 1, 1], tool[:, 2, 1] = 3.0, -width_mm / 2, width_mm / 2
+    x = tool @ turns.mT + [4.0, -2.0, 7.0]
+    axes = tool_axes(x)
+    assert np.isnan(axes).all(axis=(1, 2)).tolist() == [True, False, True, True, True, False]
+    np.testing.assert_allclose(carried(axes, x), turns, atol=1e-9)
+    rolled = np.where(np.arange(6)[:, None, None] < 5, axes, axes @ np.diag([1.0, -1.0, -1.0]))  # half a turn
+    near = carried(rolled, x, np.array([0.0, 1.0, 9.0, 9.1, 9.2, 9.3]))
+    assert (near[:, :, 1] * turns[:, :, 1]).sum(axis=1).round(6).tolist() == [1, 1, -1, -1, -1, -1]
+    silent = np.full_like(x, np.nan)
+    assert np.isnan(carried(tool_axes(silent), silent)).all()
 
 
 @pytest.mark.parametrize(
