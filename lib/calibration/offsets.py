@@ -200,7 +200,7 @@ def estimate_offsets(
 
 
 def _without_cameras(J: np.ndarray, J_c: np.ndarray, weight: np.ndarray, r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Information (p, p) and gradient (p,) of offsets by derivatives J (n, m, p), without the cameras' part, J_c (n, m, q)."""
+    """Information (p, p) and gradient (p,) of offsets with derivatives J (n, m, p), where the cameras, with J_c, are free."""
     WJ = weight @ J
     shared = np.einsum("nip,niq->pq", J_c, WJ)
     explained = np.linalg.solve(np.einsum("nip,niq->pq", J_c, weight @ J_c), shared)
