@@ -14,6 +14,7 @@ import numpy as np
 
 from lib.calibration import Calibration, CompetingCamerasError, LandmarkOffsets, calibrate, estimate_time_offset
 from lib.calibration.offsets import carried, tool_axes
+from lib.calibration.timing import clock_error
 from lib.correspondences import LANDMARKS, MIN_CONFIDENCE, Correspondences, of_recording
 from lib.landmarks import Landmarks
 from lib.landmarks.metrics import tool_length_px
@@ -49,6 +50,8 @@ _ODD = 0.2  # share of a large offset that may be the detector's all the same: s
 _SURE_MOVE = 0.5
 #: A tool stands still if others stand nearer than this share of its length, in so many frames and more with itself.
 _STILL, _STILL_FRAMES = 0.15, 4
+#: Largest correction of the clock along with cameras and offsets, which is linear in the time.
+_LARGEST_STEP_S = 0.03
 _CONFIDENCES = (MIN_CONFIDENCE, 0.5, 0.8)
 #: Share of the tool's length: as near to where it should be a detection is taken for right, farther for another thing.
 _NEAR = 0.1
@@ -289,6 +292,12 @@ def teach(
         calibration, right = _calibrated(recording, used, from_labels)
     if fault is not None:
         raise RefusalError(f"robot: {fault.text} {fault.cure}")
+    step_s, sd_s = clock_error(calibration, used.rows(recording), recording.kinematics, recording.offset_s)
+    if sd_s < clock_sd_s or len(used.frame) < _FEW_PAIRS:  # a scan of few pairs states none
+        clock_sd_s = sd_s
+        if abs(step_s) < _LARGEST_STEP_S:
+            recording = replace(recording, offset_s=recording.offset_s + step_s)
+            calibration, right = _calibrated(recording, used, from_labels)
     offset, sd = np.zeros((3, 3)), np.full((3, 3), 0.0 if calibration.offsets is not None else 0.1)
     told, turns = calibration.offsets, False
     if opinion is not None:

@@ -113,7 +113,7 @@ def calibrate(
         estimate = partial(estimate_offsets, fitted, x, y, rows.landmark, rows.frame, prior_sd=offset_prior_sd)
         found = estimate(axes=None if axes is None else lambda offset: axes)
         if axes is not None:
-            found = _turned(found, estimate, data, usable, axes)
+            found = _turned(found, estimate, data, usable, axes, sure=offset_prior_sd is not None)
     return found if usable is None else _spread_out(found, usable)
 
 
@@ -137,19 +137,20 @@ def _usable_rows(data: Correspondences, offsets: bool | str | None, weighting: s
 
 
 def _turned(
-    found: Calibration, estimate: Callable[..., Calibration], data: Correspondences, usable: np.ndarray, axes: np.ndarray
-) -> Calibration:
+    found: Calibration, estimate: Callable[..., Calibration], data: Correspondences, usable: np.ndarray, axes: np.ndarray, *,
+    sure: bool,
+) -> Calibration:  # fmt: skip
     """The calibration with the axes of the moved landmarks, unless the reported ones explain the detections better.
 
     What a robot with a wrong tool reports is off in the axes of the true tool, and turns the axes of the reported one.
-    Offsets that turn the axes that much are more often the robot's than the detector's.
+    Offsets that turn the axes that much are more often the robot's than the detector's.  `sure`: somebody knows of offsets.
     """
     def turned(offset: np.ndarray) -> np.ndarray:
         return rows_axes(data, offset)[usable]
 
     offset = found.offsets.offset
     turn_mm = np.einsum("nij,nj->ni", turned(offset) - axes, offset[data.landmark[usable]]).std()
-    if found.offsets.p_value >= _SURE_OFFSETS or turn_mm < _LEAST_TURN_MM:
+    if (found.offsets.p_value >= _SURE_OFFSETS and not sure) or turn_mm < _LEAST_TURN_MM:
         return found
     try:
         begin = start_of_turning(found, axes, turned, data.landmark[usable])

@@ -8,6 +8,8 @@ from numpy.typing import ArrayLike
 from scipy.interpolate import BSpline, make_lsq_spline
 
 from lib.calibration.affine import estimate_noise, regress
+from lib.calibration.calibration import Calibration
+from lib.calibration.offsets import rows_axes
 from lib.calibration.robust import NoConsensusError, consensus
 from lib.calibration.scatter import sandwich
 from lib.correspondences import Correspondences
@@ -161,6 +163,31 @@ def estimate_time_offset(
         raise ValueError(f"search_s: {offset:.3f} s, lies at the end of the search; widen search_s or move start_s.")
     sd = float(np.sqrt(sandwich(image[:, :, None], W, r, frame, landmark)[0][0, 0]))
     return TimeOffset(offset, sd, float(_rms_px(at(offset)[None], y, views)[0]), trial, misfit)
+
+
+def clock_error(
+    found: Calibration, data: Correspondences, kinematics: Kinematics, offset_s: float
+) -> tuple[float, float]:  # fmt: skip
+    """What the robot's clock is still off by where `data` were paired with `offset_s`, s, and its standard deviation.
+
+    One Gauss-Newton step of cameras, landmarks' offsets and clock together, from the calibration `found` of `data`.
+    `estimate_time_offset` has affine cameras and no offsets, which the turning tool can take for a part of the time.
+    """
+    rows = data.subset(found.inliers)
+    J_x, J_c, weight, r = found.system
+    v = np.nan_to_num(_paths(kinematics).at(rows.landmark, rows.time_s + offset_s, 1))
+    parts, p, penalty, pull = [J_x @ v[:, :, None], np.broadcast_to(J_c, (len(r), *J_c.shape[1:]))], 1 + J_c.shape[2], 0.0, 0.0
+    if found.offsets is not None and found.offsets.offset.shape[1] == 3:
+        axes = np.nan_to_num(rows_axes(data, found.offsets.offset if found.offsets.turns else None)[found.inliers])
+        chosen = np.eye(len(found.offsets.offset))[rows.landmark]
+        parts.append(np.einsum("nia,nk->nika", J_x @ axes, chosen).reshape(len(r), r.shape[1], -1))
+        penalty, pull = found.offsets.prior_sd**-2, found.offsets.offset.ravel() / found.offsets.prior_sd**2
+    J = np.concatenate(parts, axis=2)
+    prior = np.diag(np.where(np.arange(J.shape[2]) < p, 0.0, penalty))
+    gradient = np.einsum("nip,ni->p", J, (weight @ r[:, :, None])[:, :, 0])
+    gradient[p:] -= pull
+    step = np.linalg.solve(np.einsum("nip,niq->pq", J, weight @ J) + prior, gradient)[0]
+    return float(step), float(np.sqrt(sandwich(J, weight, r, rows.frame, rows.landmark, prior)[0][0, 0]))
 
 
 def _rms_px(x: np.ndarray, y: np.ndarray, views: np.ndarray) -> np.ndarray:
