@@ -279,10 +279,11 @@ def teach(
             raise
         recording, clock_sd_s = _scanned_clock(recording, lambda one: _fitted(one, used).view_inliers.sum()), 0.01
         calibration, right = _calibrated(recording, used, from_labels)
-    if not from_labels:
-        again, sd = _clock(recording, used, calibration)
-        if again is not recording:
-            recording, clock_sd_s = again, sd
+    step_s, sd_s = clock_error(calibration, used.rows(recording), recording.kinematics, recording.offset_s)
+    if sd_s < clock_sd_s or len(used.frame) < _FEW_PAIRS:  # a scan of few pairs states none
+        clock_sd_s = sd_s
+        if abs(step_s) < _LARGEST_STEP_S:
+            recording = replace(recording, offset_s=recording.offset_s + step_s)
             calibration, right = _calibrated(recording, used, from_labels)
     for _ in range(3):
         fault = _fault(recording, used, calibration, from_labels)
@@ -292,12 +293,6 @@ def teach(
         calibration, right = _calibrated(recording, used, from_labels)
     if fault is not None:
         raise RefusalError(f"robot: {fault.text} {fault.cure}")
-    step_s, sd_s = clock_error(calibration, used.rows(recording), recording.kinematics, recording.offset_s)
-    if sd_s < clock_sd_s or len(used.frame) < _FEW_PAIRS:  # a scan of few pairs states none
-        clock_sd_s = sd_s
-        if abs(step_s) < _LARGEST_STEP_S:
-            recording = replace(recording, offset_s=recording.offset_s + step_s)
-            calibration, right = _calibrated(recording, used, from_labels)
     offset, sd = np.zeros((3, 3)), np.full((3, 3), 0.0 if calibration.offsets is not None else 0.1)
     told, turns = calibration.offsets, False
     if opinion is not None:
@@ -349,13 +344,9 @@ def _frozen(recording: Recording, frames: np.ndarray) -> np.ndarray:
     return np.asarray(frames)[same[nearest]]
 
 
-def _clock(
-    recording: Recording, seen: Seen, calibration: Calibration | None = None, *, from_labels: bool = False
-) -> tuple[Recording, float]:
+def _clock(recording: Recording, seen: Seen, *, from_labels: bool = False) -> tuple[Recording, float]:
     """The recording with the offset of the clocks that the images show, if they do, and its standard deviation."""
     rows = seen.rows(recording)
-    if calibration is not None:  # of the rows that agree alone
-        rows = replace(rows, confidence=np.where(calibration.view_inliers, rows.confidence, 0.0))
     if len(seen.frame) < _FEW_PAIRS:  # too few for that: the offset at which cameras explain the labels best
         fit = _labelled if from_labels else _fitted
         return _scanned_clock(recording, lambda one: -fit(one, seen).reprojection_rms_px), 0.01

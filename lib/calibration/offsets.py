@@ -162,15 +162,14 @@ def estimate_offsets(
         return offset[landmark] if axes is None else np.einsum("nij,nj->ni", axes(offset), offset[landmark])
 
     for i in range(iterations):
-        moved_rows = (x, y - shift(offset)) if axes is None else (x + shift(offset), y)
+        shifted = (x, y - shift(offset)) if axes is None else (x + shift(offset), y)
         try:
-            found = fit(*moved_rows, views=views)
-        except CompetingCamerasError:  # landmarks that are off by different offsets look like two cameras
-            if i > 0:
+            found = fit(*shifted, views=views)
+            views = found.view_inliers if i >= 2 else None  # outliers that come and go from step to step would be no end
+        except CompetingCamerasError:  # landmarks of different offsets look like two cameras; soon they must not
+            if i > 3:
                 raise
-            found = fit(*moved_rows, views=np.isfinite(y).reshape(len(y), -1, 2).all(axis=2))
-        # Outliers that come and go from step to step would be no end.
-        views = found.view_inliers if i >= 2 else None
+            found = fit(*shifted, views=np.isfinite(y).reshape(len(y), -1, 2).all(axis=2))
         rows = found.inliers
         J_x, J_c, weight, r = found.system
         steps = _STEP * np.eye(offset.size).reshape(-1, *offset.shape)  # of a central difference, since axes turn

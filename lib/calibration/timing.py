@@ -176,13 +176,13 @@ def clock_error(
     rows = data.subset(found.inliers)
     J_x, J_c, weight, r = found.system
     v = np.nan_to_num(_paths(kinematics).at(rows.landmark, rows.time_s + offset_s, 1))
-    parts, p, penalty, pull = [J_x @ v[:, :, None], np.broadcast_to(J_c, (len(r), *J_c.shape[1:]))], 1 + J_c.shape[2], 0.0, 0.0
+    parts, penalty, pull = [J_x @ v[:, :, None], np.broadcast_to(J_c, (len(r), *J_c.shape[1:]))], 0.0, 0.0
     if found.offsets is not None and found.offsets.offset.shape[1] == 3:
         axes = np.nan_to_num(rows_axes(data, found.offsets.offset if found.offsets.turns else None)[found.inliers])
         chosen = np.eye(len(found.offsets.offset))[rows.landmark]
         parts.append(np.einsum("nia,nk->nika", J_x @ axes, chosen).reshape(len(r), r.shape[1], -1))
         penalty, pull = found.offsets.prior_sd**-2, found.offsets.offset.ravel() / found.offsets.prior_sd**2
-    J = np.concatenate(parts, axis=2)
+    J, p = np.concatenate(parts, axis=2), 1 + J_c.shape[2]
     prior = np.diag(np.where(np.arange(J.shape[2]) < p, 0.0, penalty))
     gradient = np.einsum("nip,ni->p", J, (weight @ r[:, :, None])[:, :, 0])
     gradient[p:] -= pull

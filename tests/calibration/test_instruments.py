@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from lib.calibration import (
     OnlineCalibration,
@@ -13,6 +14,7 @@ from lib.calibration import (
     write_opencv,
     write_ros,
 )
+from lib.calibration.timing import clock_error
 from lib.cameras import AffineCamera, StereoRig
 from lib.correspondences import Correspondences, pair_with_robot
 from lib.geometry import RigidTransform
@@ -21,7 +23,7 @@ from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
 from lib.trust import report
 from notebooks.studies.camera_models import compare_models
 from notebooks.studies.simulated_rows import simulate_correspondences
-from tests.calibration.rigs import data, tool_sweep
+from tests.calibration.rigs import LANDMARKS_MM, data, tool_sweep
 
 
 def sweep(time_s, speed_mm_s=2.0):
@@ -81,6 +83,32 @@ def test_time_offset_is_found_where_a_detector_sees_an_unknown_tool_elsewhere():
     with pytest.raises(ValueError, match="no consensus"):
         anywhere = [rng.uniform(0, 1000, p.shape) for p in u]
         estimate_time_offset((time, anywhere), (robot_time, np.repeat(robot_x[:, None], 3, axis=1)))
+
+
+def test_the_clock_along_with_cameras_and_offsets():
+    """A turning tool whose landmarks are 0.2 mm off: the offset of the clocks alone takes that for a part of the time."""
+    alone, together = [], []
+    for seed in range(8):
+        rng, robot_time, time = np.random.default_rng(seed), np.arange(-1, 10, 0.01), np.arange(40) / 5
+        offset = rng.normal(size=(3, 3))
+        offset *= 0.2 / np.linalg.norm(offset, axis=1, keepdims=True)
+
+        def seen(t, offset=offset):
+            turn = Rotation.from_rotvec(np.sin(np.outer(t, [0.9, 1.3, 0.7])) * [0.4, 0.3, 0.5]).as_matrix()
+            return (LANDMARKS_MM + offset) @ turn.mT + sweep(t, speed_mm_s=4.0)[:, None]
+
+        reported = seen(robot_time, 0 * offset)
+        kinematics = Kinematics(robot_time, reported + rng.normal(0, 0.01, reported.shape))
+        u = reference_rig().project(seen(time + 0.03).reshape(-1, 3))
+        u = [rng.normal(p, 1.0).reshape(-1, 3, 2) for p in u]
+        first = estimate_time_offset(pair_with_robot(*u, position=kinematics.at, time_s=time, height_px=1080), kinematics)
+        rows = pair_with_robot(*u, position=kinematics.at, time_s=time, height_px=1080, offset_s=first.offset_s)
+        step_s, sd_s = clock_error(calibrate(rows), rows, kinematics, first.offset_s)
+        alone.append(first.offset_s - 0.03)
+        together.append([first.offset_s + step_s - 0.03, sd_s])
+    errors, deviations = np.transpose(together)
+    assert np.sqrt(np.mean(errors**2)) < 0.5 * np.sqrt(np.mean(np.square(alone)))
+    assert 0.5 < np.sqrt(np.mean((errors / deviations) ** 2)) < 1.6
 
 
 def test_time_offset_of_correspondences_with_gaps_in_the_kinematics():
