@@ -93,32 +93,27 @@ class Forceps:
         check(self, "tip_radius_mm", lambda v: v <= MAX_TIP_RADIUS_MM, rule)
         check(self, "brightness", lambda v: 0 < v <= 1, "must lie between 0 and 1")
 
-    def _jaw(self, side: int, opening_mm: float) -> tuple[np.ndarray, np.ndarray]:
-        """Centreline (n, 3) in the tool frame, which ends one tip radius before the landmark, and radii (n,); +1 is jaw 1."""
+    def _jaw(self, side: int, opening_mm: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Centreline (n, 3) in the tool frame, radii (n,), and the landmark one tip radius beyond the line; +1 is jaw 1."""
         s, half, root = _ALONG, max(opening_mm / 2, self.tip_radius_mm), 0.45 * self.jaw_radius_mm
         y = root * (1 - s) ** 2 + self.bow_mm * _BOW + self.hook_mm * _HOOK + half * s**1.5
         # Opening the jaws turns them, it does not stretch them.
         x = s * np.sqrt(max(self.jaw_length_mm**2 - max(half - self.tip_radius_mm, 0) ** 2, 1e-6))
         line = np.column_stack([x, side * y, -self.bend_mm * s**2])
         radii = self.tip_radius_mm + (self.jaw_radius_mm - self.tip_radius_mm) * (1 - s) ** self.taper
-        end = line[-1] - line[-2]
+        tip, end = line[-1].copy(), line[-1] - line[-2]
         line[-1] -= self.tip_radius_mm * end / np.linalg.norm(end)
-        return line, radii
+        return line, radii, tip
 
     def landmarks(self, pose: Pose) -> np.ndarray:
         """base, tip_1, tip_2 (3, 3) mm in the microscope frame."""
-        points = [np.zeros(3)]
-        for side in (+1, -1):
-            line, radii = self._jaw(side, pose.opening_mm)
-            direction = line[-1] - line[-2]
-            points.append(line[-1] + radii[-1] * direction / np.linalg.norm(direction))
-        return pose.place(np.array(points))
+        return pose.place(np.array([np.zeros(3), *(self._jaw(side, pose.opening_mm)[2] for side in (+1, -1))]))
 
     def nodes(self, pose: Pose) -> Nodes:
         """The tool as chains of round cones: 0 is the shaft (far end first), 1 and 2 the jaws."""
         k = round(_SHAFT_MM) + 1
         shaft = np.column_stack([np.linspace(-_SHAFT_MM, 0, k), np.zeros(k), np.zeros(k)])
-        parts = [(shaft, np.full(k, self.shaft_radius_mm)), *(self._jaw(side, pose.opening_mm) for side in (+1, -1))]
+        parts = [(shaft, np.full(k, self.shaft_radius_mm)), *(self._jaw(side, pose.opening_mm)[:2] for side in (+1, -1))]
         lines, radii = zip(*parts, strict=True)
         return pose.place(np.vstack(lines)), np.concatenate(radii), np.repeat(np.arange(3), [len(line) for line in lines])
 
