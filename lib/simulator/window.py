@@ -74,17 +74,11 @@ class Window:
 
     def rays(self, u: tuple[np.ndarray, np.ndarray], z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(x, y) mm where the rays of pixels u meet depth z of the microscope frame; all of one shape."""
-        camera = self.camera
-        (a, b, c), (d, e, f) = camera.linear
-        right = (u[0] - camera.offset_px[0] - c * z, u[1] - camera.offset_px[1] - f * z)
-        if isinstance(camera, NearAffineCamera):
-            rho, axis, centre = camera.inverse_distance_per_mm, camera.viewing_direction, camera.centre_px
-            du, dv = (u[0] - centre[0]) * rho, (u[1] - centre[1]) * rho
-            shift = axis @ camera.reference_mm
-            right = (right[0] + du * axis[2] * z - du * shift, right[1] + dv * axis[2] * z - dv * shift)
-            a, b = a - du * axis[0], b - du * axis[1]
-            d, e = d - dv * axis[0], e - dv * axis[1]
-        determinant = a * e - b * d
+        *rows, last = self.camera.projection_matrix
+        # (row - u * last) @ [x, y, z, 1] = 0; zeros, all but one of an affine camera, cost nothing.
+        equations = ([m - u[k] * n if n else m for m, n in zip(row, last, strict=True)] for k, row in enumerate(rows))
+        (a, b, c, s), (d, e, f, t) = equations
+        right, determinant = (-s - c * z, -t - f * z), a * e - b * d
         return (e * right[0] - b * right[1]) / determinant, (a * right[1] - d * right[0]) / determinant
 
 
