@@ -78,12 +78,10 @@ class Microscope:
             # The left camera stands at negative x and looks towards positive x.
             tilt = RigidTransform.from_rotation_vector((0.0, -side * self.convergence_rad / 2, 0.0))
             spin = RigidTransform.from_rotation_vector((0.0, 0.0, roll))
-            camera_from_robot = spin.compose(tilt).compose(robot_from_microscope.inverse())
-            matrix = zoom * np.column_stack([camera_from_robot.R[:2], camera_from_robot.t[:2]])
-            matrix[:, 3] += centre_px
-            near = self.inverse_distance_per_mm, centre_px, robot_from_microscope.t
-            cameras.append(NearAffineCamera(matrix, *near) if near[0] else AffineCamera(matrix))
-        return StereoRig(*cameras)
+            matrix = np.column_stack([zoom * spin.compose(tilt).R[:2], centre_px])
+            near = self.inverse_distance_per_mm
+            cameras.append(NearAffineCamera(matrix, near, centre_px) if near else AffineCamera(matrix))
+        return StereoRig(*cameras).moved(robot_from_microscope)
 
     def defocus_px(self, z_mm: np.ndarray) -> np.ndarray:
         """Standard deviation of the defocus at depth z, at 100 px per mm: 1 px at the ends of the depth of field."""
