@@ -108,9 +108,7 @@ def compressed(image: np.ndarray, quality: int) -> np.ndarray:
 
 def _shifted(image: np.ndarray, x: float, y: float) -> np.ndarray:
     """The image moved by (x, y) px."""
-    source = np.ascontiguousarray(image)
-    move = np.float32([[1, 0, x], [0, 1, y]])
-    return cv2.warpAffine(source, move, source.shape[1::-1], borderMode=cv2.BORDER_REPLICATE)
+    return cv2.warpAffine(image, np.float32([[1, 0, x], [0, 1, y]]), image.shape[1::-1], borderMode=cv2.BORDER_REPLICATE)
 
 
 def _disc_blur(value: np.ndarray, radius: float, stretch: float) -> np.ndarray:
