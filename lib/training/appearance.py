@@ -83,8 +83,7 @@ def _light(x: np.ndarray, u: np.ndarray, hidden: np.ndarray, rng: np.random.Gene
         inside = 1 / (1 + np.exp(np.clip((np.hypot(columns - centre[0], rows - centre[1]) - radius) / soft, -30, 30)))
         dark = np.float32(rng.uniform(0, 0.25))
         x = x * (dark + (1 - dark) * inside)[..., None].astype(np.float32)
-        with np.errstate(invalid="ignore"):
-            hidden |= (np.linalg.norm(u - centre, axis=1) > radius + 2 * soft) & (dark < 0.08)
+        hidden |= (np.linalg.norm(u - centre, axis=1) > radius + 2 * soft) & (dark < 0.08)
     if rng.random() < 0.2:  # glare
         for _ in range(rng.integers(1, 4)):
             centre, size = rng.uniform((0, 0), (w, h)), rng.uniform(0.01, 0.12) * w
