@@ -101,9 +101,7 @@ def _solve(matrix: Tensor, right: Tensor) -> Tensor:
     return both[..., n:]
 
 
-def _gauss_newton(
-    heatmaps: Tensor, sigma: float, start: Tensor, value: Tensor, iterations: int = 6
-) -> tuple[Tensor, Tensor, Tensor]:
+def _gauss_newton(heatmaps: Tensor, sigma: float, start: Tensor, value: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Least-squares fit of a exp(-|c - x|^2 / (2 (w sigma)^2)) + b in a disc, started from the paper's disc centroid.
 
     The five unknowns are x, y, width w, height a and offset b.  Steps are damped and limited.  A fit that leaves the disc
@@ -133,7 +131,7 @@ def _gauss_newton(
     longest, most = torch.tensor(bounds, dtype=torch.float64, device=p.device)
     least = torch.where(most < torch.inf, 0.3, -torch.inf)
     settled = torch.zeros_like(one, dtype=torch.bool)  # peak by peak: what else the batch holds changes none
-    for _ in range(iterations):
+    for _ in range(6):
         residual, jacobian = model(theta)
         transposed = jacobian.transpose(-1, -2)  # ONNX does not know .mT
         step = _solve(transposed @ jacobian + 1e-6 * eye, transposed @ residual[..., None])[..., 0]
