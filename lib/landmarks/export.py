@@ -10,7 +10,6 @@ corrects the landmarks of the stage before, unless it is unsure, ``closer`` thos
 """
 
 import importlib.util
-import tempfile
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -92,12 +91,11 @@ def export(detector: Detector, folder: str | Path, examples: np.ndarray | None =
             raise ValueError("examples: no tool was found in them, so nothing can be compared; give other frames.")
         x = as_tensor(images).contiguous()
         module = StageWithDecoding(detector, stage, stride).eval()
-        with tempfile.TemporaryDirectory() as scratch:
-            path = Path(scratch) / f"{stage}.onnx"
-            _write(module, (x, *evidence), path)
-            difference = _difference(module, (x, *evidence), path, stage)
-            files.write_bytes(folder / f"{stage}.onnx", path.read_bytes())
-        result[stage] = folder / f"{stage}.onnx", difference
+        path = folder / f"{stage}.onnx"
+        with files.whole(path) as partial:
+            _write(module, (x, *evidence), partial)
+            difference = _difference(module, (x, *evidence), partial, stage)
+        result[stage] = path, difference
     return result
 
 
