@@ -94,12 +94,9 @@ class Landmarks:
 
     def without_unsure(self) -> Self:
         """NaN and confidence 0 for every landmark below `MISSING_BELOW`."""
-        missing = ~(self.confidence >= MISSING_BELOW)
-        return Landmarks(
-            np.where(missing[..., None], np.nan, self.u),
-            np.where(missing[..., None, None], np.nan, self.covariance),
-            np.where(missing, 0.0, self.confidence),
-        )
+        missing, result = ~(self.confidence >= MISSING_BELOW), Landmarks.join([self])  # a copy
+        result.u[missing], result.covariance[missing], result.confidence[missing] = np.nan, np.nan, 0.0
+        return result
 
     def _put(self, rows: np.ndarray, values: Self) -> None:
         self.u[rows], self.covariance[rows], self.confidence[rows] = values.u, values.covariance, values.confidence
@@ -390,7 +387,7 @@ class Detector:
         stay as they are.
         """
         peaks, matrices, which = seen or self.stage_peaks(images, rough.u, stage, only)
-        result = Landmarks(rough.u.copy(), rough.covariance.copy(), rough.confidence.copy())
+        result = Landmarks.join([rough])  # a copy
         fine = self._measured(peaks, self.rough_in_windows(rough, matrices, which, stage), stage, which[:, 1:])
         u, back = _through_inverse(matrices, fine.u[:, 0]), np.linalg.inv(matrices[:, :, :2])
         covariance = back @ fine.covariance[:, 0] @ back.mT
