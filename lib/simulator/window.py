@@ -64,13 +64,9 @@ class Window:
 
         In the camera frame pixel = zoom * (x, y), and z is the depth along the viewing direction.
         """
-        R, camera = self.R, self.camera
-        flat = np.column_stack([x @ R[:2].T + self._resection.t, x @ R[2]])
-        if not isinstance(camera, NearAffineCamera):
-            return flat, np.ones(len(flat))
-        shrink = 1 / (1 + camera.inverse_distance_per_mm * (flat[:, 2] - R[2] @ camera.reference_mm))
-        centre = camera.centre_px / self.zoom
-        return np.column_stack([centre + (flat[:, :2] - centre) * shrink[:, None], flat[:, 2]]), shrink
+        homogeneous = np.column_stack([x, np.ones(len(x))]) @ self.camera.projection_matrix.T
+        shrink = 1 / homogeneous[:, 2]
+        return np.column_stack([homogeneous[:, :2] * (shrink / self.zoom)[:, None], x @ self.R[2]]), shrink
 
     def rays(self, u: tuple[np.ndarray, np.ndarray], z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(x, y) mm where the rays of pixels u meet depth z of the microscope frame; all of one shape."""
