@@ -350,8 +350,7 @@ class Detector:
     def swept(self, image: np.ndarray) -> tuple[Landmarks, np.ndarray, np.ndarray]:
         """As `proposed`, but by the second stage, which sees the whole image (h, w, 3) at some scales and turns."""
         tools, height, sides = [], [], np.array(image.shape[1::-1])
-        turns = 2 * np.pi * np.arange(_TURNS) / _TURNS
-        for length, turn in product(_SWEPT, turns.tolist()):
+        for length, turn in product(_SWEPT, (2 * np.pi * np.arange(_TURNS) / _TURNS).tolist()):
             zoom, (c, s) = view.tool_zoom(length * sides.max()), np.abs([np.cos(turn), np.sin(turn)])
             size = np.ceil(zoom * (np.array([[c, s], [s, c]]) @ sides)).astype(int)
             matrix = view.window_from_image((sides - 1) / 2, turn, size, zoom)
@@ -415,8 +414,7 @@ class Detector:
 
     def frame_peaks(self, images: ArrayLike) -> Peaks:
         """Peaks of the first stage, in pixels of its input."""
-        heatmaps = self.outputs(self.reduced(as_uint8(images)), "frame")
-        return decode(heatmaps, self.frame_network.stride, method=self.method)
+        return decode(self.outputs(self.reduced(as_uint8(images)), "frame"), self.frame_network.stride, method=self.method)
 
     def windows(
         self, images: np.ndarray, u: ArrayLike, stage: str, only: np.ndarray | None = None

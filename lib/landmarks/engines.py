@@ -98,8 +98,7 @@ class OpenVinoNetwork:
     digest: str = field(init=False)
 
     def __post_init__(self) -> None:
-        digest = checksum(self.network.state_dict(), {"config": repr(self.network.config)})
-        object.__setattr__(self, "digest", digest)
+        object.__setattr__(self, "digest", checksum(self.network.state_dict(), {"config": repr(self.network.config)}))
 
     def __call__(self, images: Tensor) -> list[Tensor]:
         x = np.ascontiguousarray(images.numpy())

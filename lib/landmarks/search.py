@@ -72,5 +72,4 @@ def at_one_place(u: np.ndarray, tools: np.ndarray) -> np.ndarray:
     >>> at_one_place(tool + np.array([[[5.0, 0.0]], [[70.0, 0.0]]]), tool[None])
     array([ True, False])
     """
-    apart = np.linalg.norm(u[:, None] - tools, axis=3).mean(axis=2)
-    return (apart < _PLACE * tool_length_px(tools)).any(axis=1)
+    return (np.linalg.norm(u[:, None] - tools, axis=3).mean(axis=2) < _PLACE * tool_length_px(tools)).any(axis=1)

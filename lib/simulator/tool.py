@@ -129,8 +129,7 @@ def tool_in_view(
     points = np.vstack([forceps.landmarks(pose), centres])
     speed = np.zeros_like(points)
     if later is not None:
-        other = np.vstack([forceps.landmarks(later[0]), forceps.nodes(later[0])[0]])
-        speed = (other - points) / later[1]
+        speed = (np.vstack([forceps.landmarks(later[0]), forceps.nodes(later[0])[0]]) - points) / later[1]
     seen, _ = window.seen(points)
     for _ in range(3):  # two steps reach 1e-3 px
         row = seen[:, 1] * window.zoom + window.origin_px[1]

@@ -173,11 +173,10 @@ def _painted(x: np.ndarray, parts: list[Part], length: float, rng: np.random.Gen
     layer, mask = np.zeros_like(x), np.zeros((h, w), np.float32)
     phase, round_, shine, where = rng.uniform(-1, 1), rng.uniform(0, 1), rng.uniform(0, 1.5), rng.uniform(-0.7, 0.7)
     own = rng.random() < 0.5  # each part has its own shade
-    edges = np.linspace(-1, 1, _STRIPS + 1)
     for line, radius in parts:
         level = tone * (np.exp(rng.normal(0, 0.35)) if own else 1.0)
         fill(mask, _outline(line, radius, -1, 1), 1.0)
-        for low, high in itertools.pairwise(edges):
+        for low, high in itertools.pairwise(np.linspace(-1, 1, _STRIPS + 1)):
             q = (low + high) / 2
             shade = 1 - round_ * (0.5 + 0.5 * phase * q) * abs(q - 0.3 * phase)
             shade += shine * np.exp(-(((q - where) / 0.25) ** 2))

@@ -258,8 +258,7 @@ class Run:
         if self.average is not None:
             self.average.load_state_dict(_part(tensors, "average."))
         parts = ((i, _part(tensors, f"optimiser.{i}.")) for i, _ in enumerate(self.network.parameters()))
-        state = {i: part for i, part in parts if part}
-        self.optimiser.load_state_dict(self.optimiser.state_dict() | {"state": state})
+        self.optimiser.load_state_dict(self.optimiser.state_dict() | {"state": {i: part for i, part in parts if part}})
         for name in _STATE:
             setattr(self, name, metadata[name])
 

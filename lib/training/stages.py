@@ -187,7 +187,6 @@ def assemble(
     detector = fit_error_models(detector, frames[::2] + bare + typical, for_closeups=near_by, progress=True)
     held_out = evaluate(detector, frames[1::2], progress=True)
     keys = "data images commit steps seconds processes precision machine config metrics before".split()
-    by_visibility = {k: {"labels": v.labels, "median_px": v.median_px} for k, v in held_out.by_visibility().items()}
     provenance = {
         "trained_on": "simulated frames and flat drawings only (lib.simulator.population, lib.training.drawings); "
         "no eye or tool of a shipped recording",
@@ -197,7 +196,7 @@ def assemble(
         "recorded_frames": len(typical), "recordings": len(recordings),
         "metrics": asdict(held_out.scores) | {
             "confidence_calibration_error": held_out.confidence_error, "detection": held_out.detection(),
-            "by_visibility": by_visibility,
+            "by_visibility": {k: {"labels": v.labels, "median_px": v.median_px} for k, v in held_out.by_visibility().items()},
             "by_landmark_median_px": {k: v.median_px for k, v in held_out.by_landmark().items()},
         },
     }  # fmt: skip
