@@ -74,8 +74,7 @@ class ErrorModel:
             if name == "logit" and 0 < value.size <= FEATURES:
                 value = np.concatenate([np.repeat(value[:1], 3), value[1:]])
             if name in ("log_variance", "logit") and value.ndim == len(shape) and value.shape[-1] < shape[-1]:
-                missing = [(0, 0)] * (value.ndim - 1) + [(0, shape[-1] - value.shape[-1])]
-                value = np.pad(value, missing)  # slopes that are not given are 0
+                value = np.pad(value, {-1: (0, shape[-1] - value.shape[-1])})  # slopes that are not given are 0
             if value.shape != shape:
                 raise ValueError(f"{name}: expected {shape}, got {value.shape}; fit anew (`python3 -m lib train assemble`).")
             object.__setattr__(self, name, tuple(map(tuple, value.tolist())) if value.ndim == 2 else tuple(value.tolist()))

@@ -108,8 +108,7 @@ def _gauss_newton(heatmaps: Tensor, sigma: float, start: Tensor, value: Tensor) 
     or ends with a width below 0.4 or above 2.5 falls back to the centroid, with a wide covariance.
     """
     h, w = heatmaps.shape[-2:]
-    limit = torch.tensor([w - 1, h - 1], device=heatmaps.device)
-    cell = torch.minimum(start.round().long().clamp_min(0), limit)
+    cell = torch.minimum(start.round().long().clamp_min(0), torch.tensor([w - 1, h - 1], device=heatmaps.device))
     reach = max(2.0 * sigma, 1.5)
     p, offsets, inside = (part.double() for part in _patches(heatmaps, cell, int(reach + 0.5)))
     weight = inside * (offsets.square().sum(-1) <= (reach + 0.25) ** 2)
