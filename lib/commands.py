@@ -21,7 +21,7 @@ from lib.correspondences import LANDMARKS, Correspondences, of_recording
 from lib.importing import guess_mapping, import_recording
 from lib.landmarks import Detector, SharedDetector, detect
 from lib.matching.rectification import rectify
-from lib.recordings import Recording
+from lib.recordings import Recording, encoded
 from lib.registration import register_images
 from lib.surface import depth_map, reconstruct, save_depth_map, save_mesh, save_points, surface_mesh
 from lib.trust import LEVELS, Assessment, Reason, Verdict, assess, report
@@ -249,8 +249,7 @@ def _write_rectified(out: Path, rig: StereoRig, left: np.ndarray, right: np.ndar
     maps = rectify(rig, left.shape[:2], right.shape[:2])
     for side, image, matrix in (("left", left, maps.left_from_canvas), ("right", right, maps.right_from_canvas)):
         warped = cv2.warpAffine(image, matrix, maps.size_px, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
-        data = cv2.imencode(".png", cv2.cvtColor(warped, cv2.COLOR_RGB2BGR))[1]
-        files.write_bytes(out / f"rectified_{side}.png", data.tobytes())
+        files.write_bytes(out / f"rectified_{side}.png", encoded(warped, ".png"))
     numbers = {"left_from_canvas": maps.left_from_canvas.tolist(), "right_from_canvas": maps.right_from_canvas.tolist()}
     numbers |= {"displacement_px_per_mm": maps.displacement_px_per_mm, "reference_depth_mm": maps.reference_depth_mm}
     files.write_json(out / "rectification.json", numbers)

@@ -13,7 +13,7 @@ import numpy as np
 from lib.correspondences import LANDMARKS
 from lib.online.feeds import Arrival
 from lib.online.result import STAGES, FrameResult
-from lib.recordings import Recording
+from lib.recordings import Recording, encoded
 
 _QUANTITIES = ("distance_mm", "distance_sd_mm", "normal_mm", "normal_sd_mm", "approach_mm_s", "too_close")
 
@@ -84,9 +84,8 @@ class Recorder:
             if there:
                 shutil.copyfile(there, target.with_suffix(there.suffix))
             else:
-                flat = [cv2.IMWRITE_PNG_COMPRESSION, 1]
-                data = cv2.imencode(".png", cv2.cvtColor(np.asarray(image), cv2.COLOR_RGB2BGR), flat)[1]
-                target.with_suffix(".png").write_bytes(data.tobytes())
+                data = encoded(np.asarray(image), ".png", cv2.IMWRITE_PNG_COMPRESSION, 1)
+                target.with_suffix(".png").write_bytes(data)
 
 
 def row(result: FrameResult) -> dict[str, str]:

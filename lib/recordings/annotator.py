@@ -6,12 +6,12 @@
 from functools import cached_property
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from lib.cameras import StereoRig
 from lib.correspondences import Correspondences
 from lib.recordings.annotations import SIDES, inside, mark_coco, read_coco
+from lib.recordings.frames import encoded
 from lib.recordings.recording import Recording
 
 #: Depths of the viewing ray, mm about the tool, whose images make an epipolar line: a microscope's depth of field is 3 mm.
@@ -179,8 +179,7 @@ class Annotator:
                 frame = frame if changed is None else changed
             if todo in ("hello", "next", "show"):
                 pair = self.recording.frames[frame]
-                how = [cv2.IMWRITE_JPEG_QUALITY, 95]
-                images = [cv2.imencode(".jpg", one[..., ::-1], how)[1].tobytes() for one in (pair.left, pair.right)]
+                images = [encoded(one, ".jpg") for one in (pair.left, pair.right)]
             answer |= self._state(frame)
         except (ValueError, OSError) as error:
             answer["error"] = str(error)

@@ -66,6 +66,11 @@ def to_8_bits(image: np.ndarray, bit_depth: int | None, path: Path) -> np.ndarra
     return np.rint(np.arange(1 << bit_depth) * (255 / ((1 << bit_depth) - 1))).astype(np.uint8)[image]
 
 
+def encoded(image: np.ndarray, suffix: str, *options: int) -> bytes:
+    """The content of an image file, such as ".png", for (h, w, 3) uint8 RGB; `options` as `cv2.imencode` has them."""
+    return cv2.imencode(suffix, cv2.cvtColor(image, cv2.COLOR_RGB2BGR), options)[1].tobytes()
+
+
 def _may_hold_zeros(data: bytes) -> bool:
     """False for a JPEG in which a long run of zeros is damage, which OpenCV decodes without complaint.
 

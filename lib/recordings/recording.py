@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from lib.correspondences import LANDMARKS
 from lib.files import toml_entries, write_bytes, write_text
 from lib.recordings.annotations import Annotations, read_coco, write_coco
-from lib.recordings.frames import Frames, open_side
+from lib.recordings.frames import Frames, encoded, open_side
 from lib.recordings.tables import columns, read_table, read_toml, refuse, write_table
 from lib.recordings.truth import Truth
 
@@ -323,8 +323,7 @@ class RecordingWriter:
         for side, image in (("left", left), ("right", right)):
             if image.shape != shape or image.dtype != np.uint8:
                 raise ValueError(f"{side}: expected {shape} uint8 RGB, got {image.shape} {image.dtype}.")
-            data = cv2.imencode(self._suffix, cv2.cvtColor(image, cv2.COLOR_RGB2BGR), self._options)[1]
-            write_bytes(self.folder / side / f"{index:06d}{self._suffix}", data.tobytes())
+            write_bytes(self.folder / side / f"{index:06d}{self._suffix}", encoded(image, self._suffix, *self._options))
         self._time_s.append(index / self.fps if time_s is None else float(time_s))
 
     def kinematics(self, time_s: ArrayLike, x_mm: ArrayLike) -> None:

@@ -16,7 +16,7 @@ from lib.calibration import estimate_time_offset
 from lib.correspondences import LANDMARK_COLOURS, LANDMARKS, of_recording
 from lib.landmarks import Detector, SharedDetector, detect
 from lib.provenance import plain
-from lib.recordings import Recording, StereoFrame
+from lib.recordings import Recording, StereoFrame, encoded
 from lib.trust.health import spread
 from lib.trust.verdict import LEVELS, Assessment, assess, report
 
@@ -179,8 +179,8 @@ def overlay(frame: StereoFrame, seen: np.ndarray, told: np.ndarray | None, width
 
 def data_uri(image: np.ndarray, suffix: str) -> str:
     """An RGB image as text that a page embeds."""
-    data = cv2.imencode(suffix, cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1]
-    return f"data:image/{'jpeg' if suffix == '.jpg' else 'png'};base64,{base64.b64encode(data.tobytes()).decode('ascii')}"
+    text = base64.b64encode(encoded(image, suffix)).decode("ascii")
+    return f"data:image/{'jpeg' if suffix == '.jpg' else 'png'};base64,{text}"
 
 
 def main(argv: list[str]) -> int:
