@@ -72,11 +72,10 @@ class RigTracker:
         if calibration is not None:
             both = calibration.view_inliers[calibration.inliers].all(axis=1)
             _, _, weight, r = calibration.system
-            weight, r = weight if len(weight) == 1 else weight[both], r[both]
-            chi2 = np.einsum("ni,nij,nj->n", r, np.broadcast_to(weight, (len(r), 4, 4)), r)
-            scatter = np.median(chi2) / _CHI2_4_MEDIAN
+            chi2 = np.einsum("ni,nij,nj->n", r, np.broadcast_to(weight, (len(r), 4, 4)), r)[both]
+            scatter, n = np.median(chi2) / _CHI2_4_MEDIAN, len(chi2)
             # Corrected for the 16 parameters that the residuals have paid for, and the upper end of what so few allow.
-            self._scale2 = scatter / (1.0 - 16.0 / max(r.size, 17)) * (1.0 + 1.0 / np.sqrt(len(r))) ** 2
+            self._scale2 = scatter / (1.0 - 16.0 / max(4 * n, 17)) * (1.0 + 1.0 / np.sqrt(n)) ** 2
 
     def take(self, result: FrameResult, frame: Seen) -> None:
         """A frame with landmarks that both images and the robot know."""
