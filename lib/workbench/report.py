@@ -160,8 +160,7 @@ def _number(value: float, argument: str) -> float | int | None:
 def _in_notebook() -> bool:
     """True in a Jupyter kernel (not in plain Python, nor in terminal IPython)."""
     ipython = sys.modules.get("IPython")
-    shell = ipython.get_ipython() if ipython else None
-    return shell is not None and getattr(shell, "kernel", None) is not None
+    return ipython is not None and getattr(ipython.get_ipython(), "kernel", None) is not None
 
 
 def _publish(bundle: dict, metadata: dict | None = None) -> None:
