@@ -13,6 +13,7 @@ from typing import Protocol, Self, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.linalg import rq
 
 from lib.files import write_json
 from lib.geometry import RigidTransform, pair_covariance, points, store_array
@@ -118,16 +119,10 @@ class AffineCamera(MatrixCamera):
         With optics that flip the image (`mirrored`: an odd number of reflections) R maps to the unflipped camera frame,
         whose third axis still points away from the camera.
         """
-        a_x, a_y = self.linear
-        alpha_y = np.linalg.norm(a_y)
-        r_2 = a_y / alpha_y
-        skew = a_x @ r_2
-        alpha_x = np.linalg.norm(a_x - skew * r_2)
-        r_1 = (a_x - skew * r_2) / alpha_x
-        K = np.array([[alpha_x, skew], [0.0, alpha_y]])
-        if mirrored:
-            r_1, K = -r_1, K @ np.diag([-1.0, 1.0])
-        return Resection(K, np.stack([r_1, r_2, np.cross(r_1, r_2)]), np.linalg.solve(K, self.offset_px), mirrored)
+        K, R = rq(self.linear, mode="economic")  # (2, 2) and (2, 3), but for the signs
+        signs = np.sign(np.diag(K)) * [-1.0 if mirrored else 1.0, 1.0]
+        K, R = K * signs, R * signs[:, None]
+        return Resection(K, np.vstack([R, np.cross(*R)]), np.linalg.solve(K, self.offset_px), mirrored)
 
 
 @dataclass(frozen=True, eq=False)
