@@ -368,11 +368,8 @@ class StereoRig:
             for key, expected in (("format", FORMAT), ("units", UNITS)):
                 if content.get(key, expected) != expected:
                     raise ValueError(f"{key} is {content[key]!r}, expected {expected!r}")
-            left, right = (
-                (NearAffineCamera if "inverse_distance_per_mm" in numbers else AffineCamera)(**numbers)
-                for numbers in (content["left"], content["right"])
-            )
-            return cls(left, right)
+            sides = content["left"], content["right"]
+            return cls(*((NearAffineCamera if "inverse_distance_per_mm" in own else AffineCamera)(**own) for own in sides))
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             why = f"{type(error).__name__}: {error}"
             raise ValueError(f"{path}: not a stereo rig written by StereoRig.save ({why}).") from None
