@@ -159,7 +159,7 @@ def _turned(
             other = estimate(axes=turned, start=replace(found, offsets=replace(found.offsets, offset=begin)))
     except ValueError:  # no cameras fit them
         return found
-    used = np.repeat(found.view_inliers, 2, axis=1)
+    used = np.repeat(found.view_inliers | other.view_inliers, 2, axis=1)
     most = 2 * found.reprojection_rms_px  # of a frame whose axes stay unknown more would say nothing
     rms = [np.linalg.norm(np.clip(one.residuals_px[used], -most, most)) for one in (other, found)]
     if used.sum() * np.log(rms[0] / rms[1]) > _AS_LIKELY:

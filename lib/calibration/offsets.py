@@ -23,6 +23,8 @@ from lib.correspondences import Correspondences
 
 #: Step of the offsets' derivatives, mm or px.
 _STEP = 1e-4
+#: Largest offset, from the mean of all, that may explain two cameras: what is farther off is another landmark.
+_MOST_MM = 0.4
 #: Where offsets that turn the axes start: a robot's own calibration of its tool errs by tenths of a millimetre.
 _GRID_MM, _POLISHED = (0.0, 0.12, -0.12, 0.28, -0.28), 8
 
@@ -161,14 +163,17 @@ def estimate_offsets(
     def shift(offset: np.ndarray) -> np.ndarray:
         return offset[landmark] if axes is None else np.einsum("nij,nj->ni", axes(offset), offset[landmark])
 
+    competing = None
     for i in range(iterations):
         shifted = (x, y - shift(offset)) if axes is None else (x + shift(offset), y)
         try:
             found = fit(*shifted, views=views)
             views = found.view_inliers if i >= 2 else None  # outliers that come and go from step to step would be no end
-        except CompetingCamerasError:  # landmarks of different offsets look like two cameras; soon they must not
+            is_one = True
+        except CompetingCamerasError as error:  # landmarks of different offsets look like two cameras; soon they must not
             if i > 3:
                 raise
+            competing, is_one = error, False
             found = fit(*shifted, views=np.isfinite(y).reshape(len(y), -1, 2).all(axis=2))
         rows = found.inliers
         J_x, J_c, weight, r = found.system
@@ -184,12 +189,14 @@ def estimate_offsets(
         share = share / 2 if step @ before < 0 else min(1.5 * share, 1.0)  # to and fro: it went too far
         offset = offset + share * step.reshape(offset.shape)
         moved, least_sd = share * np.abs(step).max(), np.sqrt(np.diag(covariance).min())
-        if moved < 1e-3 * least_sd:
+        if moved < 1e-3 * least_sd and is_one:
             break
     else:
         if moved > 0.1 * least_sd:
             text = f"they still move by up to {moved:.2g} {'px' if axes is None else 'mm'} after {iterations} steps"
             warnings.warn(f"offsets: {text}; look at the outliers (`ransac_px`).", RuntimeWarning, stacklevel=3)
+    if competing and np.linalg.norm(offset - offset.mean(axis=0), axis=1).max() > _MOST_MM:
+        raise competing
     p, size = J_c.shape[2], offset.shape[1]
     prior = np.diag(np.repeat([0.0, prior_sd**-2], [p, offset.size]))
     full, effective = sandwich(np.concatenate([J_c, J], axis=2), weight, r, frame[rows], landmark[rows], prior)

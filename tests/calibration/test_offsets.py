@@ -110,6 +110,18 @@ def test_landmarks_that_are_off_are_no_cameras_that_compete(seed):
     assert np.abs(apart - apart.mean(axis=0)).max() < 0.03
 
 
+@pytest.mark.parametrize("fault", ["moved", "tips", "place"])
+def test_cameras_that_compete_are_not_explained_away_by_offsets(fault):
+    """The cameras moved by 30 px, all tips are exchanged, or a second tool is seen at times, of a tool that hardly turns."""
+    data, rig, _ = tool_sweep(0, turn_rad=0.05)
+    late, two = data.frame >= 38, np.repeat(np.random.default_rng(0).random(75) < 0.45, 3)
+    u = {"moved": np.where(late[:, None], data.stacked_px + [30, 9, 30, 6], data.stacked_px)}
+    u["tips"] = data.stacked_px.reshape(-1, 3, 4)[:, [0, 2, 1]].reshape(-1, 4)
+    u["place"] = data.stacked_px + np.where(two[:, None], rig.linear @ [3.0, 1.0, 0.3], 0.0)
+    with pytest.raises(CompetingCamerasError):
+        calibrate(replace(data, u_left=u[fault][:, :2], u_right=u[fault][:, 2:]))
+
+
 def test_shut_jaws_carry_the_axes_of_open_ones_along_the_shaft():
     turns = Rotation.from_rotvec(np.outer(np.arange(6), [0.0, 0.1, 0.2])).as_matrix()  # without a roll
     width_mm = np.array([0.01, 0.9, 0.02, 0.01, 0.0, 0.8])
