@@ -196,7 +196,8 @@ def estimate_offsets(
             text = f"they still move by up to {moved:.2g} {'px' if axes is None else 'mm'} after {iterations} steps"
             warnings.warn(f"offsets: {text}; look at the outliers (`ransac_px`).", RuntimeWarning, stacklevel=3)
     shares = np.bincount(landmark, rows) / np.maximum(np.bincount(landmark), 1)  # one camera holds for all landmarks
-    if competing and (np.linalg.norm(offset - offset.mean(axis=0), axis=1).max() > _MOST_MM or shares.min() < 0.5 * shares.max()):
+    largest = np.linalg.norm(offset - offset.mean(axis=0), axis=1).max()
+    if competing and (largest > _MOST_MM or shares.min() < 0.5 * shares.max()):
         raise competing
     p, size = J_c.shape[2], offset.shape[1]
     prior = np.diag(np.repeat([0.0, prior_sd**-2], [p, offset.size]))
