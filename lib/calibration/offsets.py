@@ -26,7 +26,7 @@ _STEP = 1e-4
 #: Largest offset, from the mean of all, that may explain two cameras: what is farther off is another landmark.
 _MOST_MM = 0.4
 #: Where offsets that turn the axes start: a robot's own calibration of its tool errs by tenths of a millimetre.
-_GRID_MM, _POLISHED = (0.0, 0.12, -0.12, 0.28, -0.28), 8
+_GRID_MM, _POLISHED = (0.0, 0.2, -0.2), 8
 
 
 def tool_axes(x_mm: ArrayLike, offset_mm: np.ndarray | None = None) -> np.ndarray:
