@@ -50,7 +50,7 @@ _ODD = 0.2  # share of a large offset that may be the detector's all the same: s
 _SURE_MOVE = 0.5
 #: A tool stands still if others stand nearer than this share of its length, in so many frames and more with itself.
 _STILL, _STILL_FRAMES = 0.15, 4
-#: Largest correction of the clock along with cameras and offsets, which is linear in the time.
+#: Largest correction of the clock along with cameras and offsets: one step takes motions for straight.
 _LARGEST_STEP_S = 0.03
 _CONFIDENCES = (MIN_CONFIDENCE, 0.5, 0.8)
 #: Share of the tool's length: as near to where it should be a detection is taken for right, farther for another thing.
@@ -281,9 +281,9 @@ def teach(
         calibration, right = _calibrated(recording, used, from_labels)
     for _ in range(2):  # a scan of few pairs states no deviation of its own
         step_s, sd_s = clock_error(calibration, used.rows(recording), recording.kinematics, recording.offset_s)
-        if sd_s > 1.1 * clock_sd_s and len(used.frame) >= _FEW_PAIRS:
+        if np.isinf(sd_s) or (sd_s > 1.1 * clock_sd_s and len(used.frame) >= _FEW_PAIRS):
             break
-        clock_sd_s = sd_s
+        clock_sd_s = max(sd_s, abs(step_s)) if abs(step_s) >= _LARGEST_STEP_S else sd_s
         if not 0.1 * sd_s < abs(step_s) < _LARGEST_STEP_S:
             break
         recording = replace(recording, offset_s=recording.offset_s + step_s)

@@ -63,8 +63,8 @@ def calibrate(
         image_size_px: (width, height); the principal point of near-affine models is its centre, else the detections'.
         checks: False skips the plausibility checks: units, repeated rows, swapped cameras, pixels outside the image.
 
-    A `NoConsensusError` (a ValueError) says that a camera's detections agree on no camera, or on two that compete; a
-    ValueError refuses rows that determine no camera, offsets that the data cannot tell, and what `checks` finds.
+    A `NoConsensusError` (a ValueError) says that a camera's detections agree on no camera, or on two that no offsets
+    explain; a ValueError refuses rows that determine no camera, offsets that the data cannot tell, and what `checks` finds.
 
     >>> from lib.cameras import AffineCamera
     >>> rng = np.random.default_rng(0)

@@ -106,7 +106,7 @@ def rows_axes(data: Correspondences, offset_mm: np.ndarray | None = None, *, car
 
 
 def carried(axes: np.ndarray, x_mm: np.ndarray, time_s: np.ndarray | None = None) -> np.ndarray:
-    """The axes (n, 3, 3) of tools at x_mm (n, 3, 3), in order of time; those that are NaN from the nearest row with axes.
+    """The axes (n, 3, 3) of tools at x_mm (n, 3, 3), in order of time; NaN ones are taken from the nearest row with axes.
 
     They are turned as the shaft turned: shut jaws tell where the shaft points, and not how it is rolled.  The nearest row is
     that in time, or without `time_s` in order.
@@ -171,7 +171,7 @@ def estimate_offsets(
             views = found.view_inliers if i >= 2 else None  # outliers that come and go from step to step would be no end
             is_one = True
         except CompetingCamerasError as error:  # landmarks of different offsets look like two cameras; soon they must not
-            if i > 3:
+            if i > 3 or axes is None:
                 raise
             competing, is_one = error, False
             found = fit(*shifted, views=np.isfinite(y).reshape(len(y), -1, 2).all(axis=2))
@@ -195,8 +195,9 @@ def estimate_offsets(
         if moved > 0.1 * least_sd:
             text = f"they still move by up to {moved:.2g} {'px' if axes is None else 'mm'} after {iterations} steps"
             warnings.warn(f"offsets: {text}; look at the outliers (`ransac_px`).", RuntimeWarning, stacklevel=3)
-    shares = np.bincount(landmark, rows) / np.maximum(np.bincount(landmark), 1)  # one camera holds for all landmarks
-    largest = np.linalg.norm(offset - offset.mean(axis=0), axis=1).max()
+    seen = np.flatnonzero(np.bincount(landmark))
+    shares = np.bincount(landmark, rows)[seen] / np.bincount(landmark)[seen]  # one camera holds for all landmarks
+    largest = np.linalg.norm(offset[seen] - offset[seen].mean(axis=0), axis=1).max()
     if competing and (largest > _MOST_MM or shares.min() < 0.5 * shares.max()):
         raise competing
     p, size = J_c.shape[2], offset.shape[1]

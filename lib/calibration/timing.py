@@ -170,12 +170,15 @@ def clock_error(
 ) -> tuple[float, float]:  # fmt: skip
     """What the robot's clock is still off by where `data` were paired with `offset_s`, s, and its standard deviation.
 
-    One Gauss-Newton step of cameras, landmarks' offsets and clock together, from the calibration `found` of `data`.
-    `estimate_time_offset` has affine cameras and no offsets, which the turning tool can take for a part of the time.
+    One Gauss-Newton step of cameras, landmarks' offsets and clock together, from the calibration `found` of `data`; 0 and
+    infinity where the kinematics are too sparse for velocities.  `estimate_time_offset` knows no offsets; those of a turning
+    tool look like a part of the time.
     """
     rows = data.subset(found.inliers)
     J_x, J_c, weight, r = found.system
     v = np.nan_to_num(_paths(kinematics).at(rows.landmark, rows.time_s + offset_s, 1))
+    if np.count_nonzero(v.any(axis=1)) < 8:
+        return 0.0, np.inf
     parts, penalty, pull = [J_x @ v[:, :, None], np.broadcast_to(J_c, (len(r), *J_c.shape[1:]))], 0.0, 0.0
     if found.offsets is not None and found.offsets.offset.shape[1] == 3:
         axes = np.nan_to_num(rows_axes(data, found.offsets.offset if found.offsets.turns else None)[found.inliers])

@@ -242,9 +242,9 @@ class RigTracker:
     # --- noise --------------------------------------------------------------------------------------------------------
 
     def corrected(self, data: Correspondences) -> Correspondences:
-        """With the landmarks where the detector sees them; the frames before tell the axes of jaws reported crossed."""
+        """With the landmarks where the detector sees them; the frames before tell the axes of shut and crossed jaws."""
         offsets = None if self.calibration is None else self.calibration.offsets
-        if offsets is None or not offsets.turns or not len(data):
+        if offsets is None or not len(data):
             return with_offsets(data, offsets)
         before = [part for part in self._past if len(part) and part.frame[-1] < data.frame[0]]
         return with_offsets(Correspondences.join([*before, data]), offsets).of_frames(data.frame)

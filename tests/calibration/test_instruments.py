@@ -106,6 +106,9 @@ def test_the_clock_along_with_cameras_and_offsets():
         step_s, sd_s = clock_error(calibrate(rows), rows, kinematics, first.offset_s)
         alone.append(first.offset_s - 0.03)
         together.append([first.offset_s + step_s - 0.03, sd_s])
+    bursts = np.repeat(time, 2) + np.tile([0.0, 0.02], len(time)) + 0.03  # too sparse for a velocity
+    sparse = Kinematics(bursts, seen(bursts, 0 * offset))
+    assert clock_error(calibrate(rows), rows, sparse, first.offset_s) == (0.0, np.inf)
     errors, deviations = np.transpose(together)
     assert np.sqrt(np.mean(errors**2)) < 0.5 * np.sqrt(np.mean(np.square(alone)))
     assert 0.5 < np.sqrt(np.mean((errors / deviations) ** 2)) < 1.6

@@ -108,6 +108,8 @@ def test_landmarks_that_are_off_are_no_cameras_that_compete(seed):
     assert found.reprojection_rms_px < 2 and found.view_inliers.all()
     apart = found.offsets.offset - offset
     assert np.abs(apart - apart.mean(axis=0)).max() < 0.03
+    without = np.where(data.landmark == 1, 0.0, data.confidence.T).T  # tip_1 is never seen
+    assert calibrate(replace(data, confidence=without)).view_inliers[data.landmark != 1].all()
 
 
 @pytest.mark.parametrize("fault", ["moved", "tips", "place"])
