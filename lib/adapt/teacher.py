@@ -279,9 +279,10 @@ def teach(
             raise
         recording, clock_sd_s = _scanned_clock(recording, lambda one: _fitted(one, used).view_inliers.sum()), 0.01
         calibration, right = _calibrated(recording, used, from_labels)
-    for _ in range(2):  # a scan of few pairs states no deviation of its own
+    for _ in range(2):
         step_s, sd_s = clock_error(calibration, used.rows(recording), recording.kinematics, recording.offset_s)
-        if np.isinf(sd_s) or (sd_s > 1.1 * clock_sd_s and len(used.frame) >= _FEW_PAIRS):
+        surer = sd_s <= 1.1 * clock_sd_s or len(used.frame) < _FEW_PAIRS  # a scan of few pairs states no deviation
+        if np.isinf(sd_s) or not surer:
             break
         clock_sd_s = max(sd_s, abs(step_s)) if abs(step_s) >= _LARGEST_STEP_S else sd_s
         if not 0.1 * sd_s < abs(step_s) < _LARGEST_STEP_S:

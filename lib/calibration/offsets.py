@@ -150,9 +150,9 @@ def estimate_offsets(
 
     Gauss-Newton on the offsets with the cameras eliminated: every step is a whole calibration `fit` of positions (n, 3) and
     pixels (n, m) with the `views` to use, and one Schur complement; a `RuntimeWarning` where `iterations` are too few.
-    `axes` takes offsets (landmarks, 3) and returns the axes (n, 3, 3) of the rows.  `start` gives the first offsets
-    and their prior.
-    Without `prior_sd` it is the one that makes the data most probable, between 0.1 and 300 um, or 0.01 and 30 px.
+    `axes` takes offsets (landmarks, 3) and returns the axes (n, 3, 3) of the rows.  `start` gives the first offsets, their
+    prior and p-value.  Without `prior_sd` it is the one that makes the data most probable, 0.1 to 300 um or 0.01 to 30 px.
+    Where two cameras compete, small offsets may explain it within four steps; else the `CompetingCamerasError` stays.
     """
     m = y.shape[1]
     offset, p_value, views = np.zeros((int(landmark.max()) + 1, m if axes is None else 3)), np.nan, None

@@ -165,9 +165,7 @@ def estimate_time_offset(
     return TimeOffset(offset, sd, float(_rms_px(at(offset)[None], y, views)[0]), trial, misfit)
 
 
-def clock_error(
-    found: Calibration, data: Correspondences, kinematics: Kinematics, offset_s: float
-) -> tuple[float, float]:  # fmt: skip
+def clock_error(found: Calibration, data: Correspondences, kinematics: Kinematics, offset_s: float) -> tuple[float, float]:
     """What the robot's clock is still off by where `data` were paired with `offset_s`, s, and its standard deviation.
 
     One Gauss-Newton step of cameras, landmarks' offsets and clock together, from the calibration `found` of `data`; 0 and
