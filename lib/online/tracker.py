@@ -57,6 +57,7 @@ class RigTracker:
         self._recent: deque[Seen] = deque(maxlen=_PAST)  # not yet taken in: the cameras may have moved meanwhile
         self._doubtful: deque[int] = deque(maxlen=_PAST)  # numbers of frames that stood out alone
         self._past: deque[Correspondences] = deque(maxlen=_PAST)
+        self._open: tuple[float, list[Correspondences]] = (0.0, [])  # the last frame before them with wide jaws; how wide
         self._since: list[Seen] = []  # frames that tell where the cameras are now
         self._before: StereoRig | None = None  # the rig before, while the frames since are being explained
         self._motion: MovedCameras | None = None
@@ -79,6 +80,8 @@ class RigTracker:
 
     def take(self, result: FrameResult, frame: Seen) -> None:
         """A frame with landmarks that both images and the robot know."""
+        if len(self._past) == _PAST and (width := _width_mm(self._past[0])) > 0.5 * self._open[0]:
+            self._open = width, [self._past[0]]
         self._past.append(frame.data)
         accepted = [frame] if self.rig is None else []
         if self.rig is not None:
@@ -246,7 +249,7 @@ class RigTracker:
         offsets = None if self.calibration is None else self.calibration.offsets
         if offsets is None or not len(data):
             return with_offsets(data, offsets)
-        before = [part for part in self._past if len(part) and part.frame[-1] < data.frame[0]]
+        before = [part for part in (*self._open[1], *self._past) if len(part) and part.frame[-1] < data.frame[0]]
         return with_offsets(Correspondences.join([*before, data]), offsets).of_frames(data.frame)
 
     @property
@@ -292,3 +295,9 @@ class RigTracker:
             if motion is not None:
                 covariance[:, rows, rows] += self.rig.linear[rows] @ motion.covariance_at(stale) @ self.rig.linear[rows].T
         return covariance
+
+
+def _width_mm(frame: Correspondences) -> float:
+    """How far apart the robot reports the tips of a frame; NaN where it reports fewer than all landmarks."""
+    x = frame.grid("x_mm")[0]
+    return float(np.linalg.norm(x[2] - x[1])) if len(frame) == len(x) else float("nan")

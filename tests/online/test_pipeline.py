@@ -221,22 +221,27 @@ def test_landmark_offsets_are_learnt_and_raise_no_alarm():
     assert all(r.state == "tracking" for r in results[10:])
 
 
-def test_jaws_that_the_robot_reports_crossed_raise_no_alarm():
+@pytest.mark.parametrize("shut", [0, 65], ids=["now and then", "for long"])
+def test_jaws_that_the_robot_reports_crossed_raise_no_alarm(shut):
     """Its tips are 0.15 mm off, so it reports shut jaws crossed; the frames before tell which tip is which."""
-    world, n = World(4), 45
+    world, n = World(4), 45 + shut
     t = np.arange(n) / 10
     offset = np.array([[0.02, -0.15, 0.0], [-0.05, -0.15, 0.04], [0.05, 0.15, -0.03]])
     tool = np.zeros((n, 3, 3))
     tool[:, 1:, 0], tool[:, 2, 1] = 3.0, 0.3 + 0.2 * np.sin(2.1 * t)
+    tool[45:, 2, 1] = 0.1
     tool[:, 1, 1] = -tool[:, 2, 1]
-    R = Rotation.from_rotvec(np.sin(np.outer(t, [0.9, 1.3, 0.7])) * [0.5, 0.3, 0.6]).as_matrix() @ ROBOT_FROM_MICROSCOPE.R
+    turn = np.sin(np.outer(t, [0.9, 1.3, 0.7])) * [0.5, 0.3, 0.6]
+    turn[45:, 0] = turn[44, 0]  # what shut jaws do not tell
+    R = Rotation.from_rotvec(turn).as_matrix() @ ROBOT_FROM_MICROSCOPE.R
     place = CENTRE_MM + np.sin(np.outer(t, [0.8, 1.1, 1.7])) * [4.0, 2.0, 1.0]
     world.x_mm, reported = tool @ R.mT + place[:, None], (tool - offset) @ R.mT + place[:, None]
     assert ((reported[:, 2] - reported[:, 1]) * R[:, :, 1]).sum(axis=1).min() < -0.05
     frame, landmark = np.divmod(np.arange(3 * n), 3)
     u = (world.rng.normal(p, 1.0) for p in RIG.project(world.x_mm.reshape(-1, 3)))
     told = world.rng.normal(reported, 0.01)
-    learnt = calibrate(Correspondences.of_points(told.reshape(-1, 3), *u, frame=frame, landmark=landmark))
+    seen = Correspondences.of_points(told.reshape(-1, 3), *u, frame=frame, landmark=landmark)
+    learnt = calibrate(seen.subset(frame < 45))
     assert learnt.offsets.turns
     pipeline, results = make(world, rig=learnt, settings=SELDOM), []
     for x in told:
