@@ -52,6 +52,7 @@ _SURE_MOVE = 0.5
 _STILL, _STILL_FRAMES = 0.15, 4
 #: Largest correction of the clock along with cameras and offsets: one step takes motions for straight.
 _LARGEST_STEP_S = 0.03
+_FINITE = 3.0  # the inverse distance of cameras, in its standard deviations, from which it is taken for finite
 _CONFIDENCES = (MIN_CONFIDENCE, 0.5, 0.8)
 #: Share of the tool's length: as near to where it should be a detection is taken for right, farther for another thing.
 _NEAR = 0.1
@@ -383,9 +384,11 @@ def _scanned_clock(recording: Recording, merit: Callable[[Recording], float]) ->
 def _fitted(
     recording: Recording, seen: Seen, least: float = 0.0, ransac_px: float | None = None, **more: float
 ) -> Calibration:
-    """Cameras of square pixels, which leave the landmarks' offsets the least room."""
-    how = {"model": "square", "image_size_px": recording.image_size_px, "ransac_px": ransac_px} | more
-    return calibrate(seen.rows(recording, least), **how)
+    """Cameras of square pixels, which leave the landmarks' offsets the least room; of a finite distance where that shows."""
+    rows, how = seen.rows(recording, least), {"image_size_px": recording.image_size_px, "ransac_px": ransac_px} | more
+    affine, near = (calibrate(rows, model=model, **how) for model in ("square", "square+distance"))
+    value, sd = near.inverse_distance_per_mm
+    return near if value > _FINITE * sd else affine
 
 
 def _labelled(recording: Recording, labels: Seen) -> Calibration:

@@ -8,7 +8,9 @@ whose width the data choose (empirical Bayes).  What the data cannot tell stays 
 
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from itertools import product
 
 import numpy as np
@@ -25,6 +27,8 @@ from lib.correspondences import Correspondences
 _STEP = 1e-4
 #: Largest offset, from the mean of all, that may explain two cameras: what is farther off is another landmark.
 _MOST_MM = 0.4
+#: So many steps take every detection before those that look like another camera's may go.
+_TAKEN = 4
 #: Where offsets that turn the axes start: a robot's own calibration of its tool errs by tenths of a millimetre.
 _GRID_MM, _POLISHED = (0.0, 0.2, -0.2), 8
 
@@ -152,8 +156,44 @@ def estimate_offsets(
     pixels (n, m) with the `views` to use, and one Schur complement; a `RuntimeWarning` where `iterations` are too few.
     `axes` takes offsets (landmarks, 3) and returns the axes (n, 3, 3) of the rows.  `start` gives the first offsets, their
     prior and p-value.  Without `prior_sd` it is the one that makes the data most probable, 0.1 to 300 um or 0.01 to 30 px.
-    Where two cameras compete, small offsets may explain it within four steps; else the `CompetingCamerasError` stays.
+    Where two cameras compete, or one landmark agrees on none with the others, small offsets may explain it; else the
+    `CompetingCamerasError`, or the calibration without that landmark, stays.
     """
+    steps = partial(_steps, fit, x, y, landmark, frame, axes, prior_sd, iterations, start)
+    if axes is None:
+        return steps()
+    found, competing = None, None
+    try:
+        found = steps()
+    except CompetingCamerasError as error:
+        competing = error
+    if found is not None and _agree_alike(found, landmark):
+        return found
+    with suppress(ValueError, RuntimeWarning), warnings.catch_warnings():
+        warnings.filterwarnings("error", "offsets:", RuntimeWarning)  # still moving: no explanation
+        other = steps(taken=_TAKEN)
+        seen = np.bincount(landmark) > 0
+        largest = np.linalg.norm(other.offsets.offset - other.offsets.offset[seen].mean(axis=0), axis=1)[seen].max()
+        if largest <= _MOST_MM and _agree_alike(other, landmark):
+            return other
+    if competing:
+        raise competing
+    return found
+
+
+def _agree_alike(found: Calibration, landmark: np.ndarray) -> bool:
+    """Whether the cameras hold for each landmark that is seen, and not for some far more often than for others."""
+    count = np.bincount(landmark)
+    shares = np.bincount(landmark, found.inliers)[count > 0] / count[count > 0]
+    return bool(shares.min() >= 0.5 * shares.max())
+
+
+def _steps(
+    fit: Callable[..., Calibration], x: np.ndarray, y: np.ndarray, landmark: np.ndarray, frame: np.ndarray,
+    axes: Callable[[np.ndarray], np.ndarray] | None, prior_sd: float | None, iterations: int, start: Calibration | None, *,
+    taken: int = 0,
+) -> Calibration:  # fmt: skip
+    """`estimate_offsets`; the first steps, as many as `taken`, use every detection, though they look like two cameras'."""
     m = y.shape[1]
     offset, p_value, views = np.zeros((int(landmark.max()) + 1, m if axes is None else 3)), np.nan, None
     if start is not None:
@@ -163,18 +203,11 @@ def estimate_offsets(
     def shift(offset: np.ndarray) -> np.ndarray:
         return offset[landmark] if axes is None else np.einsum("nij,nj->ni", axes(offset), offset[landmark])
 
-    competing = None
     for i in range(iterations):
-        shifted = (x, y - shift(offset)) if axes is None else (x + shift(offset), y)
-        try:
-            found = fit(*shifted, views=views)
-            views = found.view_inliers if i >= 2 else None  # outliers that come and go from step to step would be no end
-            is_one = True
-        except CompetingCamerasError as error:  # landmarks of different offsets look like two cameras; soon they must not
-            if i > 3 or axes is None:
-                raise
-            competing, is_one = error, False
-            found = fit(*shifted, views=np.isfinite(y).reshape(len(y), -1, 2).all(axis=2))
+        if i < taken:
+            views = np.isfinite(y).reshape(len(y), -1, 2).all(axis=2)
+        found = fit(*((x, y - shift(offset)) if axes is None else (x + shift(offset), y)), views=views)
+        views = found.view_inliers if i >= taken + 2 else None  # outliers that come and go from step to step would be no end
         rows = found.inliers
         J_x, J_c, weight, r = found.system
         steps = _STEP * np.eye(offset.size).reshape(-1, *offset.shape)  # of a central difference, since axes turn
@@ -189,17 +222,12 @@ def estimate_offsets(
         share = share / 2 if step @ before < 0 else min(1.5 * share, 1.0)  # to and fro: it went too far
         offset = offset + share * step.reshape(offset.shape)
         moved, least_sd = share * np.abs(step).max(), np.sqrt(np.diag(covariance).min())
-        if moved < 1e-3 * least_sd and is_one:
+        if moved < 1e-3 * least_sd and i >= taken:
             break
     else:
         if moved > 0.1 * least_sd:
             text = f"they still move by up to {moved:.2g} {'px' if axes is None else 'mm'} after {iterations} steps"
             warnings.warn(f"offsets: {text}; look at the outliers (`ransac_px`).", RuntimeWarning, stacklevel=3)
-    seen = np.flatnonzero(np.bincount(landmark))
-    shares = np.bincount(landmark, rows)[seen] / np.bincount(landmark)[seen]  # one camera holds for all landmarks
-    largest = np.linalg.norm(offset[seen] - offset[seen].mean(axis=0), axis=1).max()
-    if competing and (largest > _MOST_MM or shares.min() < 0.5 * shares.max()):
-        raise competing
     p, size = J_c.shape[2], offset.shape[1]
     prior = np.diag(np.repeat([0.0, prior_sd**-2], [p, offset.size]))
     full, effective = sandwich(np.concatenate([J_c, J], axis=2), weight, r, frame[rows], landmark[rows], prior)

@@ -112,6 +112,25 @@ def test_landmarks_that_are_off_are_no_cameras_that_compete(seed):
     assert calibrate(replace(data, confidence=without)).view_inliers[data.landmark != 1].all()
 
 
+@pytest.mark.parametrize(("seed", "turn_rad"), [(5, 0.4), (1, 0.2)], ids=["a landmark left out", "cameras that compete"])
+def test_a_landmark_far_from_its_report_is_no_outlier(seed, turn_rad):
+    """Offsets of 0.2 mm, as large as a robot's may be: no landmark is left out, and no recording refused."""
+    rng = np.random.default_rng(seed)
+    offset = rng.normal(size=(3, 3))
+    offset *= 0.2 / np.linalg.norm(offset, axis=1, keepdims=True)
+    found = calibrate(tool_sweep(seed, turn_rad=turn_rad, offset_mm=offset, sigma_px=0.5)[0])
+    assert found.view_inliers.all() and found.reprojection_rms_px < 2
+
+
+def test_a_landmark_that_is_another_point_of_the_tool_stays_left_out():
+    data, rig, _ = tool_sweep(0, turn_rad=0.4)
+    tip = data.landmark == 1
+    beside = 0.8 * tool_axes(data.grid("x_mm"))[:, :, 0] @ rig.linear.T  # along the tool
+    u = data.stacked_px + np.where(tip[:, None], np.repeat(beside, 3, axis=0), 0.0)
+    found = calibrate(replace(data, u_left=u[:, :2], u_right=u[:, 2:]))
+    assert not found.inliers[tip].any() and found.inliers[~tip].all()
+
+
 @pytest.mark.parametrize("fault", ["moved", "tips", "place"])
 def test_cameras_that_compete_are_not_explained_away_by_offsets(fault):
     """The cameras moved by 30 px, all tips are exchanged, or a second tool is seen at times, of a tool that hardly turns."""
