@@ -6,6 +6,7 @@ where a fault of clock, axes or tool explains what the images show.
 
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import NamedTuple, Self
@@ -309,7 +310,7 @@ def teach(
                 f"{100 * shares.max():.0f} %. It takes another point for {rare}. {_LABEL}"
             )
         try:
-            told = _fitted(recording, opinion.of(used.frame)).offsets
+            told = _placed(recording, opinion.of(used.frame)).offsets
         except ValueError:
             told = None
     if told is not None and told.offset.shape == (3, 3):
@@ -382,19 +383,27 @@ def _scanned_clock(recording: Recording, merit: Callable[[Recording], float]) ->
 
 
 def _fitted(
-    recording: Recording, seen: Seen, least: float = 0.0, ransac_px: float | None = None, **more: float
+    recording: Recording, seen: Seen, least: float = 0.0, ransac_px: float | None = None, **more: float | str
 ) -> Calibration:
-    """Cameras of square pixels, which leave the landmarks' offsets the least room; of a finite distance where that shows."""
-    rows, how = seen.rows(recording, least), {"image_size_px": recording.image_size_px, "ransac_px": ransac_px} | more
-    affine, near = (calibrate(rows, model=model, **how) for model in ("square", "square+distance"))
-    value, sd = near.inverse_distance_per_mm
-    return near if value > _FINITE * sd else affine
+    """Affine cameras of square pixels, which leave the landmarks' offsets the least room."""
+    how = {"model": "square", "image_size_px": recording.image_size_px, "ransac_px": ransac_px} | more
+    return calibrate(seen.rows(recording, least), **how)
+
+
+def _placed(recording: Recording, seen: Seen, least: float = 0.0, ransac_px: float | None = None) -> Calibration:
+    """As `_fitted`, of a finite distance where the detections show one."""
+    affine = _fitted(recording, seen, least, ransac_px)
+    with suppress(ValueError):
+        near = _fitted(recording, seen, least, ransac_px, model="square+distance")
+        value, sd = near.inverse_distance_per_mm
+        return near if value > _FINITE * sd else affine
+    return affine
 
 
 def _labelled(recording: Recording, labels: Seen) -> Calibration:
-    """As `_fitted`, from labels set by hand.  If they are few, all count as right, with a robot's usual offsets."""
+    """As `_placed`, from labels set by hand.  If they are few, all count as right, with a robot's usual offsets."""
     if len(labels.frame) >= _FEW_PAIRS:
-        return _fitted(recording, labels)
+        return _placed(recording, labels)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "offsets:", RuntimeWarning)  # by a clock that is off they find no end
         try:
@@ -419,7 +428,7 @@ def _calibrated(recording: Recording, seen: Seen, from_labels: bool) -> tuple[Ca
         if ransac_px is not None and competing:
             break  # nothing tells which is the robot's
         try:
-            found = _fitted(recording, seen, least, ransac_px)
+            found = _placed(recording, seen, least, ransac_px)
         except ValueError as error:
             if ransac_px is None and (not competing or isinstance(error, CompetingCamerasError)):
                 reason = str(error).partition(". ")[0].partition("; ")[0]  # their cures lead here

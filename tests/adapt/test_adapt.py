@@ -88,6 +88,13 @@ def test_offsets_of_an_unknown_tool_do_not_hide_which_half_is_right(world, tmp_p
     assert 0.3 < teacher.right < 0.6 and np.median(label_errors(world, teacher)[0]) < 1.5
 
 
+def test_cameras_of_a_finite_distance_are_no_affine_ones(tmp_path):
+    near = World(distance_mm=70.0)
+    teacher = taught(near.record(tmp_path / "near"), StandIn(near.u, noise_px=0.7, wrong=0.3))
+    value, sd = teacher.calibration.inverse_distance_per_mm
+    assert abs(value - 1 / 70) < 3 * sd and np.median(label_errors(near, teacher)[0]) < 0.4
+
+
 def test_shut_jaws_borrow_the_axes_of_another_time(world, recording):
     """The offsets of their landmarks are known but for the turn about the shaft, and the covariance says so."""
     teacher = taught(recording, StandIn(world.u, noise_px=0.7, wrong=0.2))

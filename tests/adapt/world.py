@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lib.cameras import StereoRig
+from lib.cameras import NearAffineCamera, StereoRig
 from lib.landmarks import Landmarks
 from lib.recordings import Recording, RecordingWriter
 from lib.simulator.eye import Eye
@@ -34,10 +34,14 @@ class World:
     n: int = 40
     seed: int = 0
     moved_from: int | None = None
+    distance_mm: float = np.inf
     rig: StereoRig = field(init=False)
 
     def __post_init__(self):
         self.rig = reference_rig(image_size_px=SIZE, pixels_per_mm=(25.0, 25.0))
+        if np.isfinite(self.distance_mm):
+            seen_from = 1 / self.distance_mm, (np.array(SIZE) - 1) / 2, ROBOT_FROM_MICROSCOPE.t
+            self.rig = StereoRig(*(NearAffineCamera(c.matrix, *seen_from) for c in (self.rig.left, self.rig.right)))
         self.time_s = np.arange(self.n) / FPS
         self.u = np.stack([self.project(i, x) for i, x in enumerate(self.at(self.time_s))])  # (n, 2, 3, 2)
 
