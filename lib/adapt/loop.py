@@ -20,7 +20,7 @@ from lib.correspondences import LANDMARKS
 from lib.landmarks import Detector, SharedDetector
 from lib.landmarks.metrics import tool_length_px
 from lib.provenance import Provenance, plain
-from lib.recordings import Recording, read_image
+from lib.recordings import Recording, read_image, smoothed
 from lib.recordings.annotations import CLICK_SD_PX, coco_keypoints, read_coco
 from lib.training.evaluation import evaluate
 from lib.training.samples import LabelledImage, shown_by_coco
@@ -97,7 +97,8 @@ def adapt(
     """
     if not isinstance(recording, Recording):
         recording = Recording.open(recording, truth=False)
-    work = _Work(replace(recording, truth=None), detector, labels, seed, folder, minutes, progress, tune)
+    recording = replace(recording, truth=None, kinematics=smoothed(recording.kinematics))
+    work = _Work(recording, detector, labels, seed, folder, minutes, progress, tune)
     try:
         return work.adapted()
     except RefusalError as refused:

@@ -10,7 +10,8 @@ from lib.recordings.annotations import Annotations
 from lib.recordings.annotator import Annotator
 from lib.recordings.frames import Frames, StereoFrame, encoded, read_image, to_8_bits
 from lib.recordings.recording import Doubt, Kinematics, Recording, RecordingWriter
+from lib.recordings.smoothing import smoothed
 from lib.recordings.truth import Truth
 
 __all__ = ["Annotations", "Annotator", "Doubt", "Frames", "Kinematics", "Recording", "RecordingWriter", "StereoFrame"]
-__all__ += ["Truth", "encoded", "read_image", "to_8_bits"]
+__all__ += ["Truth", "encoded", "read_image", "smoothed", "to_8_bits"]

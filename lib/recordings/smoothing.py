@@ -1,0 +1,73 @@
+"""The robot's log without most of its noise: a tool moves smoothly from sample to sample, and noise does not."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from lib.recordings.recording import Kinematics
+
+#: Degree of the local polynomials, and half the samples in their windows, of which each sample has its own.
+_DEGREE, _HALVES = 4, (3, 4, 5, 7, 10, 14, 20)
+#: So many samples on either side tell with it which window predicts best: few, since hands start and stop at once.
+_BESIDE = 4
+#: Fewest samples more than the polynomial has coefficients; samples that are looked at together.
+_SPARE, _CHUNK = 2, 20000
+#: A sample so many standard deviations off is a jump.
+_JUMP = 6.0
+
+
+def smoothed(kinematics: Kinematics) -> Kinematics:
+    """The log with each sample moved to a local polynomial of the samples around it, in their own times.
+
+    Its window is the one whose polynomials best predict the samples that they leave out, thereabouts.  Beside jumps nothing
+    changes, nor anywhere if the narrowest window does best on the whole: then the log is too slow to tell motion from noise.
+    Dropped samples stay NaN, and samples that repeat each other stay the same.
+    (Cleveland, "Robust locally weighted regression and smoothing scatterplots", 1979.)
+
+    >>> rng, time_s = np.random.default_rng(0), np.arange(400) / 100
+    >>> x_mm = np.stack([np.sin(3 * time_s), np.cos(2 * time_s), time_s], axis=1)[:, None]
+    >>> found = smoothed(Kinematics(time_s, x_mm + rng.normal(0, 0.01, x_mm.shape)))
+    >>> bool((found.x_mm - x_mm).std() < 0.005)
+    True
+    """
+    x = kinematics.x_mm.reshape(len(kinematics.x_mm), -1)
+    known, score, found = np.isfinite(x).all(axis=1), [], []
+    if known.sum() < 4 * _HALVES[-1]:
+        return kinematics
+    for half in _HALVES:
+        fitted, own = _local_polynomials(kinematics.time_s, x, known, half)
+        off = np.abs(x - fitted) / (1 - own)[:, None]  # had the sample been left out
+        if not found:
+            most = _JUMP / 0.6745 * np.nanmedian(off, axis=0) + 1e-9
+            jump = np.convolve((off > most).any(axis=1), np.ones(2 * half + 1), "same") > 0.5
+        share = np.nan_to_num(np.minimum(off / most, 1) ** 2, nan=1.0).mean(axis=1)
+        score.append(np.convolve(share, np.ones(2 * _BESIDE + 1), "same"))
+        found.append(fitted)
+    if np.argmin(np.sum(score, axis=1)) == 0:
+        return kinematics
+    best = np.take_along_axis(np.array(found), np.argmin(score, axis=0)[None, :, None], axis=0)[0]
+    stays = jump[:, None] | ~np.isfinite(best) | (np.abs(x - best) < 1e-9)
+    return replace(kinematics, x_mm=np.where(stays, x, best).reshape(kinematics.x_mm.shape))
+
+
+def _local_polynomials(time_s: np.ndarray, x: np.ndarray, known: np.ndarray, half: int) -> tuple[np.ndarray, np.ndarray]:
+    """Values (n, m) at each sample of the polynomial through its window, NaN where too few samples are `known` (n,) bool.
+
+    And the weight (n,) of the sample itself in its value.
+    """
+    n, reach_s = len(x), 1.01 * half * np.median(np.diff(time_s))
+    fitted, own, x = np.full(x.shape, np.nan), np.zeros(n), np.where(known[:, None], x, 0.0)
+    for first in range(0, n, _CHUNK):
+        rows = np.arange(first, min(first + _CHUNK, n))
+        window = rows[:, None] + np.arange(-half, half + 1)
+        at = window.clip(0, n - 1)
+        when = (time_s[at] - time_s[rows, None]) / reach_s
+        weight = (known[at] & (window == at) & (np.abs(when) <= 2)).astype(float)
+        powers = when[:, :, None] ** np.arange(_DEGREE + 1)
+        enough = known[rows] & (weight.sum(axis=1) >= _DEGREE + 1 + _SPARE)
+        G = np.einsum("nip,ni,niq->npq", powers[enough], weight[enough], powers[enough])
+        coefficients = np.linalg.solve(G + 1e-12 * np.eye(_DEGREE + 1), np.eye(_DEGREE + 1)[:, :1])[:, :, 0]
+        share = weight[enough] * np.einsum("nip,np->ni", powers[enough], coefficients)
+        fitted[rows[enough]] = np.einsum("ni,nim->nm", share, x[at[enough]])
+        own[rows[enough]] = share[:, half]
+    return fitted, own
