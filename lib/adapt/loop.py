@@ -97,7 +97,7 @@ def adapt(
     """
     if not isinstance(recording, Recording):
         recording = Recording.open(recording, truth=False)
-    recording = replace(recording, truth=None, kinematics=smoothed(recording.kinematics))
+    recording = replace(recording, truth=None, kinematics=smoothed(recording.kinematics, recording.robot_accuracy_mm))
     work = _Work(recording, detector, labels, seed, folder, minutes, progress, tune)
     try:
         return work.adapted()

@@ -12,42 +12,45 @@ _DEGREE, _HALVES = 4, (3, 4, 5, 7, 10, 14, 20)
 _BESIDE = 4
 #: Fewest samples more than the polynomial has coefficients; samples that are looked at together.
 _SPARE, _CHUNK = 2, 20000
-#: A sample so many standard deviations off is a jump.
-_JUMP = 6.0
+#: What moves samples by more than the robot's noise times this (RMS) is no noise.
+_MOST = 1.5
 
 
-def smoothed(kinematics: Kinematics) -> Kinematics:
+def smoothed(kinematics: Kinematics, noise_mm: float) -> Kinematics:
     """The log with each sample moved to a local polynomial of the samples around it, in their own times.
 
-    Its window is the one whose polynomials best predict the samples that they leave out, thereabouts.  Beside jumps nothing
-    changes, nor anywhere if the narrowest window does best on the whole: then the log is too slow to tell motion from noise.
-    Dropped samples stay NaN, and samples that repeat each other stay the same.
+    Its window is the one whose polynomials best predict the samples that they leave out, thereabouts.  Samples stay as they
+    are where that would move them by more than `noise_mm`, the robot's accuracy per coordinate, allows: at jumps, and where
+    the log is too slow for the motion.  Dropped samples stay NaN, and samples that repeat each other stay the same.
     (Cleveland, "Robust locally weighted regression and smoothing scatterplots", 1979.)
 
     >>> rng, time_s = np.random.default_rng(0), np.arange(400) / 100
     >>> x_mm = np.stack([np.sin(3 * time_s), np.cos(2 * time_s), time_s], axis=1)[:, None]
-    >>> found = smoothed(Kinematics(time_s, x_mm + rng.normal(0, 0.01, x_mm.shape)))
+    >>> found = smoothed(Kinematics(time_s, x_mm + rng.normal(0, 0.01, x_mm.shape)), 0.01)
     >>> bool((found.x_mm - x_mm).std() < 0.005)
     True
     """
     x = kinematics.x_mm.reshape(len(kinematics.x_mm), -1)
-    known, score, found = np.isfinite(x).all(axis=1), [], []
-    if known.sum() < 4 * _HALVES[-1]:
+    known, errors, found = np.isfinite(x).all(axis=1), [], []
+    if known.sum() <= 2 * _HALVES[-1]:
         return kinematics
     for half in _HALVES:
         fitted, own = _local_polynomials(kinematics.time_s, x, known, half)
-        off = np.abs(x - fitted) / (1 - own)[:, None]  # had the sample been left out
-        if not found:
-            most = _JUMP / 0.6745 * np.nanmedian(off, axis=0) + 1e-9
-            jump = np.convolve((off > most).any(axis=1), np.ones(2 * half + 1), "same") > 0.5
-        share = np.nan_to_num(np.minimum(off / most, 1) ** 2, nan=1.0).mean(axis=1)
-        score.append(np.convolve(share, np.ones(2 * _BESIDE + 1), "same"))
+        errors.append(_thereabouts(((x - fitted) / (1 - own)[:, None]) ** 2))  # had the sample been left out
         found.append(fitted)
-    if np.argmin(np.sum(score, axis=1)) == 0:
-        return kinematics
-    best = np.take_along_axis(np.array(found), np.argmin(score, axis=0)[None, :, None], axis=0)[0]
-    stays = jump[:, None] | ~np.isfinite(best) | (np.abs(x - best) < 1e-9)
-    return replace(kinematics, x_mm=np.where(stays, x, best).reshape(kinematics.x_mm.shape))
+    best = np.take_along_axis(np.array(found), np.argmin(errors, axis=0)[None, :, None], axis=0)[0]
+    moves = _thereabouts((x - best) ** 2)
+    best = np.where((moves < (_MOST * noise_mm) ** 2)[:, None] & (np.abs(x - best) > 1e-9), best, x)
+    return replace(kinematics, x_mm=best.reshape(kinematics.x_mm.shape))
+
+
+def _thereabouts(squares: np.ndarray) -> np.ndarray:
+    """Means (n,) of squares (n, m) over the samples beside each one; infinite without any."""
+    known = np.isfinite(squares).all(axis=1)
+    kernel = np.ones(2 * _BESIDE + 1)
+    count = np.convolve(known, kernel, "same")
+    total = np.convolve(np.where(known[:, None], squares, 0).mean(axis=1), kernel, "same")
+    return np.where(count > 0, total / np.maximum(count, 1), np.inf)
 
 
 def _local_polynomials(time_s: np.ndarray, x: np.ndarray, known: np.ndarray, half: int) -> tuple[np.ndarray, np.ndarray]:
