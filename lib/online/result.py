@@ -10,6 +10,7 @@ import numpy as np
 
 from lib.cameras import StereoRig
 from lib.correspondences import LANDMARKS, Correspondences
+from lib.geometry import check
 from lib.registration import MovedCameras
 from lib.surface import Reconstruction
 
@@ -64,16 +65,11 @@ class Settings:
     miss_rate: float = 0.01
 
     def __post_init__(self) -> None:
-        for name in ("calibration_frames", "registration_frames"):
-            first, last = getattr(self, name)
-            if not 2 <= first <= last:
-                raise ValueError(f"{name}: expected 2 <= first <= last, got {(first, last)}.")
-        if self.surface_every < 1 or self.give_up_frames < 1:
-            raise ValueError("surface_every, give_up_frames: must be at least 1.")
-        if not (self.fps > 0 and self.stale_s > 0 and min(self.eye_mm_s, self.slip_mm, self.robot_accuracy_mm) >= 0):
-            raise ValueError("fps, stale_s must be positive; eye_mm_s, slip_mm, robot_accuracy_mm must not be negative.")
-        if not 0 < self.miss_rate < 0.5:
-            raise ValueError(f"miss_rate: expected a probability below one half, got {self.miss_rate}.")
+        check(self, "calibration_frames registration_frames", lambda n: 2 <= n[0] <= n[1], "expected 2 <= first <= last")
+        check(self, "surface_every give_up_frames", lambda value: value >= 1, "must be at least 1")
+        check(self, "fps stale_s", lambda value: value > 0, "must be positive")
+        check(self, "eye_mm_s slip_mm robot_accuracy_mm", lambda value: value >= 0, "must not be negative")
+        check(self, "miss_rate", lambda value: 0 < value < 0.5, "expected a probability below one half")
 
 
 def _unknown() -> np.ndarray:
