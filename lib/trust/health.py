@@ -108,10 +108,15 @@ def health(
     if calibration is not None and calibration.rig is not None:
         rig, x = calibration.rig, with_offsets(data, calibration.offsets).grid("x_mm")
         off = u - np.hstack(rig.project(x.reshape(-1, 3))).reshape(u.shape)
-        parts["robot"] = _worse(off) / max(calibration.reprojection_rms_px, 1.0)
-        parts["smoothness"] = _worse(_jump_px(off, time)) / length
+        # Off the median of a frame and its two neighbours, where these are close in time.
+        jump, near = np.full(off.shape, np.nan), (time[2:] - time[:-2] <= 2 * _NEXT_S)[:, None, None, None]
+        jump[1:-1] = np.where(near, off[1:-1] - np.median([off[:-2], off[1:-1], off[2:]], axis=0), np.nan)
+        distance, jump = (np.fmax.reduce(np.linalg.norm(one, axis=-1), axis=2) for one in (off, jump))  # of the worse image
+        parts["robot"] = distance / max(calibration.reprojection_rms_px, 1.0)
+        parts["smoothness"] = jump / length
         seen = rig.triangulate(y[:, :2], y[:, 2:]).x_mm.reshape(x.shape)
-        parts["shape"] = np.broadcast_to(np.abs(_tool_length(seen) / _tool_length(x) - 1.0)[:, None], shape)
+        lengths = [np.linalg.norm(one[:, 1:].mean(axis=1) - one[:, 0], axis=1) for one in (seen, x)]
+        parts["shape"] = np.broadcast_to(np.abs(lengths[0] / lengths[1] - 1.0)[:, None], shape)
     if detector is not None:
         parts["looks"] = np.fmax.reduce(_looks_px(recording, frame, u, detector), axis=2) / length
     if recording is not None:
@@ -139,25 +144,6 @@ def unfamiliar(image: np.ndarray) -> float:
     spread = np.log([*(chroma.std(axis=(0, 1)) + 3e-3), grey.std() + 1e-6, *detail])
     looks = np.array([*np.median(chroma, axis=(0, 1)), *spread[:2], grey.mean(), *spread[2:]])
     return float(np.sqrt((((looks - _FAMILIAR[0]) / _FAMILIAR[1]) ** 2).mean()))
-
-
-def _worse(off: np.ndarray) -> np.ndarray:
-    """(m, 3) the longer of the two images' vectors (m, 3, 2, 2)."""
-    return np.fmax.reduce(np.linalg.norm(off, axis=-1), axis=2)
-
-
-def _tool_length(x: np.ndarray) -> np.ndarray:
-    """(m,) mm from the base to between the tips of (m, 3, 3)."""
-    return np.linalg.norm(x[:, 1:].mean(axis=1) - x[:, 0], axis=1)
-
-
-def _jump_px(off: np.ndarray, time_s: np.ndarray) -> np.ndarray:
-    """(m, 3, 2, 2) differences from the median of a frame and its two neighbours, NaN where these are not close in time."""
-    jump = np.full(off.shape, np.nan)
-    if len(off) > 2:
-        near = (time_s[2:] - time_s[:-2] <= 2 * _NEXT_S)[:, None, None, None]
-        jump[1:-1] = np.where(near, off[1:-1] - np.median([off[:-2], off[1:-1], off[2:]], axis=0), np.nan)
-    return jump
 
 
 def _looks_px(recording: Recording, frame: np.ndarray, u: np.ndarray, detector: Callable) -> np.ndarray:
