@@ -129,18 +129,14 @@ class Problem:
         a noise of their own.
         """
         apart = np.zeros(len(self), dtype=bool) if apart is None else apart
-        if start is None:
-            start = max((self._descend(M, columns, apart, 8) for M in self._starts()), key=lambda fit: fit.total).M
+        if start is None:  # of least squares, or of the samples of four rows that most rows are near to
+            starts, rng = np.zeros((2, 2, 2, 4)), np.random.default_rng(0)
+            for view, rows in enumerate(self.used.T):
+                if rows.sum() >= 4:
+                    x, y = self.x[rows, view], self.y[rows, view]
+                    starts[:, view] = regress(x, y), tightest_sample(x, y, rng)
+            start = max((self._descend(M, columns, apart, 8) for M in starts), key=lambda fit: fit.total).M
         return self._descend(start, columns, apart, rounds)
-
-    def _starts(self) -> np.ndarray:
-        """Cameras (2, 2, 2, 4) of least squares, and of the samples of four rows that most rows are near to."""
-        found, rng = np.zeros((2, 2, 2, 4)), np.random.default_rng(0)
-        for view, rows in enumerate(self.used.T):
-            if rows.sum() >= 4:
-                x, y = self.x[rows, view], self.y[rows, view]
-                found[:, view] = regress(x, y), tightest_sample(x, y, rng)
-        return found
 
     def _design(self, M: np.ndarray, columns: Callable | None) -> np.ndarray:
         """(n, 2, 2, p): derivatives by the 16 entries of M, 9 offsets (mm) and the additions."""
