@@ -319,13 +319,16 @@ class StereoRig:
         """Linear for each point (the projection's denominator multiplied out), then two Gauss-Newton steps on the pixels."""
         x, covariance_mm2, epipolar = (np.full((len(y), *shape), np.nan) for shape in ((3,), (3, 3), ()))
         known = np.flatnonzero(np.isfinite(y).all(axis=1))
+        near = [camera for camera in (self.left, self.right) if isinstance(camera, NearAffineCamera)]
         for start in range(0, len(known), _BLOCK):
             rows = known[start : start + _BLOCK]
             W = np.linalg.inv(covariance if len(covariance) == 1 else covariance[rows])
             found, step, seen = self._linear_points(y[rows]), 0.0, np.ones(len(rows), dtype=bool)
             for _ in range(3):  # the last time for the covariance at the point found
                 found = found + step
-                J, r, in_front = self._linearised(found, y[rows])
+                in_front = np.all([camera.depth_ratio(found) > 0 for camera in near], axis=0)
+                safe = np.where(in_front[:, None], found, near[0].reference_mm)  # the others stand at the centre
+                J, r = self.jacobian(safe), y[rows] - np.hstack(self.project(safe))
                 step, inverse = _least_squares(J, r, W)
                 seen &= in_front
             # What no point explains, along the epipolar normal; that of the affine cameras says its sign.
@@ -342,13 +345,6 @@ class StereoRig:
             rows.append(P[:2, :3] - u[:, :, None] * P[2, :3])
             right_hand.append(u * P[2, 3] - P[:2, 3])
         return _least_squares(np.concatenate(rows, axis=1), np.concatenate(right_hand, axis=1), np.eye(4))[0]
-
-    def _linearised(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Jacobian (n, 4, 3), residuals (n, 4), and which points lie before both cameras; the others stand at the centre."""
-        near = [camera for camera in (self.left, self.right) if isinstance(camera, NearAffineCamera)]
-        in_front = np.all([camera.depth_ratio(x) > 0 for camera in near], axis=0)
-        safe = np.where(in_front[:, None], x, near[0].reference_mm)
-        return self.jacobian(safe), y - np.hstack(self.project(safe)), in_front
 
     def save(self, path: str | Path) -> None:
         """Write the rig as JSON (matrices, units); the file appears whole or not at all."""
