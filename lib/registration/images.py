@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from lib.cameras import AffineCamera, NearAffineCamera, StereoRig
+from lib.cameras import StereoRig
 from lib.correspondences import Correspondences
 from lib.geometry import RigidTransform, pair_covariance, precision, view_distances2
 from lib.least_squares import minimise
@@ -89,8 +89,14 @@ def identify_motion(
         raise ValueError("covariance_px2: give the noise of the detections; it decides which hypothesis explains them.")
     together = _register_both(rig, observed, "robust")
     shifted = _fit(rig, observed, [RigidTransform.identity()], "robust", 3)
-    left, right = (_register_one(rig, observed, side) for side in (0, 1))
-    n_left, n_right = (_parameters(camera) for camera in (rig.left, rig.right))
+    alone = []  # each camera's own motion, and its parameters: an affine camera sees no shift along its own axis
+    for side, (name, camera) in enumerate((("left", rig.left), ("right", rig.right))):
+        check_spread(observed.x[observed.seen[:, side]], f"x_mm (rows seen by the {name} camera)")
+        own = replace(observed, seen=observed.seen & (np.arange(2) == side))
+        parameters = 6 if getattr(camera, "inverse_distance_per_mm", 0.0) else 5
+        squared = _fit(rig, own, [RigidTransform.identity()], "squared", parameters)
+        alone.append((_fit(rig, own, [squared.transform], "robust", parameters), parameters))
+    (left, n_left), (right, n_right) = alone
     hypotheses = {
         "none": (None, None, 0), "shifted": (shifted, shifted, 3), "together": (together, together, 6),
         "left": (left, None, n_left), "right": (None, right, n_right), "apart": (left, right, n_left + n_right),
@@ -159,18 +165,6 @@ def _register_both(rig: StereoRig, data: _Observed, loss: Loss) -> Registration:
     energy, (_, distance2, weights) = _evaluate(rig, data, loss, found.transform.inverse())
     distance, weights = np.where(data.dimension > 0, (np.sqrt(distance2), weights), [[np.nan], [0.0]])
     return replace(found, residuals=distance, weights=weights, cost=2 * energy)
-
-
-def _register_one(rig: StereoRig, data: _Observed, side: int) -> Registration:
-    check_spread(data.x[data.seen[:, side]], f"x_mm (rows seen by the {('left', 'right')[side]} camera)")
-    data, parameters = replace(data, seen=data.seen & (np.arange(2) == side)), _parameters((rig.left, rig.right)[side])
-    squared = _fit(rig, data, [RigidTransform.identity()], "squared", parameters)
-    return _fit(rig, data, [squared.transform], "robust", parameters)
-
-
-def _parameters(camera: AffineCamera | NearAffineCamera) -> int:
-    """Parameters of a motion that one camera shows: an affine one sees no shift along its own axis."""
-    return 6 if getattr(camera, "inverse_distance_per_mm", 0.0) else 5
 
 
 def _evaluate(rig: StereoRig, data: _Observed, loss: Loss, stale: RigidTransform) -> tuple[float, tuple[np.ndarray, ...]]:
