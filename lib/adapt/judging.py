@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lib.adapt.teacher import RefusalError, Seen, Teacher
-from lib.landmarks.metrics import tool_length_px
+from lib.landmarks.metrics import errors_px, nees, tool_length_px
 from lib.recordings import Recording
 from lib.trust.health import affine_epipolar, feature_matches
 
@@ -68,12 +68,9 @@ def agreement(teacher: Teacher, seen: Seen) -> Agreement:
     there = np.isfinite(u).all(axis=-1) & (shown > 0)
     if not there.any():
         raise RefusalError(f"robot: it labels none of the {len(seen.frame)} frames that are kept for stopping or judging.")
-    off, S = seen.u - u, covariance + seen.covariance
-    S = np.where(np.isfinite(S), S, np.eye(2))
-    sigmas = np.sqrt((off[..., None, :] @ np.linalg.inv(S) @ off[..., None])[..., 0, 0] / 2)
-    distance = np.nan_to_num(np.linalg.norm(off, axis=-1), nan=np.inf)
-    length = tool_length_px(u)[..., None]
-    return Agreement(*(np.where(there, part, np.nan) for part in (distance, sigmas)), length)
+    found, told = seen.u.reshape(-1, 3, 2), np.where(there[..., None], u, np.nan).reshape(-1, 3, 2)
+    sigmas = np.sqrt(nees(found, told, (covariance + seen.covariance).reshape(-1, 3, 2, 2)) / 2)
+    return Agreement(errors_px(found, told).reshape(there.shape), sigmas.reshape(there.shape), tool_length_px(u)[..., None])
 
 
 def epipolar_px(recording: Recording, seen: Sequence[Seen], all_seen: Seen) -> list[np.ndarray]:
