@@ -102,7 +102,7 @@ class Seen(NamedTuple):
 
 def look(
     recording: Recording, detector: Callable, frames: np.ndarray, *, near: np.ndarray | None = None,
-    progress: Callable[[float], None] | None = None,
+    progress: Callable[[float], None] = lambda done: None,
 ) -> Seen:  # fmt: skip
     """What a detector finds in some frames; with `near` (m, 2, 3, 2) px its later stages alone, which look there."""
     found, later = [], []
@@ -125,8 +125,7 @@ def look(
             away = np.linalg.norm(rough.u - u, axis=-1) > _NEAR * tool_length_px(u)[:, None]  # that is another thing
             u, confidence = np.where(away[..., None], np.nan, rough.u), np.where(away, 0.0, rough.confidence)
             found.append(Landmarks(u, rough.covariance, confidence))
-        if progress is not None:
-            progress((i + 1) / len(frames))
+        progress((i + 1) / len(frames))
     return Seen(np.asarray(frames), *(np.stack([getattr(p, n) for p in found]) for n in ("u", "covariance", "confidence")))
 
 
@@ -149,8 +148,9 @@ def at_rest(seen: Seen, x_mm: np.ndarray) -> np.ndarray:
 
 
 def look_elsewhere(
-    recording: Recording, detector: Callable, seen: Seen, still: np.ndarray, progress: Callable[[float], None] | None = None
-) -> Seen:
+    recording: Recording, detector: Callable, seen: Seen, still: np.ndarray,
+    progress: Callable[[float], None] = lambda done: None,
+) -> Seen:  # fmt: skip
     """`seen`; where its tools are `still` (m, 2), what the detector finds in other places of the image instead."""
     found, images = Seen(*(part.copy() for part in seen)), np.argwhere(still)
     for k, (i, side) in enumerate(images):
@@ -158,8 +158,7 @@ def look_elsewhere(
         other = detector((frame.left, frame.right)[side][None], avoid=seen.u[still[:, side], side])
         for part, one in zip(found[1:], (other.u, other.covariance, other.confidence), strict=True):
             part[i, side] = one[0]
-        if progress is not None:
-            progress((k + 1) / len(images))
+        progress((k + 1) / len(images))
     return found
 
 
