@@ -1,6 +1,6 @@
 """The offset between the clocks of video and robot."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,20 +50,19 @@ class Paths:
     """
 
     def __init__(self, samples: Iterable[tuple[np.ndarray, np.ndarray]]) -> None:
-        self.pieces = [list(self._splines(time, x)) for time, x in samples]
-
-    @staticmethod
-    def _splines(time: np.ndarray, x: np.ndarray) -> Iterator[BSpline]:
-        known = np.isfinite(x).all(axis=1)
-        time, x = time[known], x[known]
-        step = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
-        every = max(2, int(np.ceil(_SMOOTH_S / step)))
-        # The motion is smooth within that time, so a dropped sample is bridged; a longer silence is not.
-        gaps = np.flatnonzero(np.diff(time) > max(_SMOOTH_S, 2.5 * step))
-        for t, part in zip(np.split(time, gaps + 1), np.split(x, gaps + 1), strict=True):
-            if len(t) >= 4:
-                knots = np.concatenate([np.full(4, t[0]), t[every : len(t) - every : every], np.full(4, t[-1])])
-                yield make_lsq_spline(t, part, knots, k=3)
+        self.pieces: list[list[BSpline]] = []  # of each landmark
+        for time, x in samples:
+            self.pieces.append([])
+            known = np.isfinite(x).all(axis=1)
+            time, x = time[known], x[known]
+            step = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
+            every = max(2, int(np.ceil(_SMOOTH_S / step)))
+            # The motion is smooth within that time, so a dropped sample is bridged; a longer silence is not.
+            gaps = np.flatnonzero(np.diff(time) > max(_SMOOTH_S, 2.5 * step))
+            for t, part in zip(np.split(time, gaps + 1), np.split(x, gaps + 1), strict=True):
+                if len(t) >= 4:
+                    knots = np.concatenate([np.full(4, t[0]), t[every : len(t) - every : every], np.full(4, t[-1])])
+                    self.pieces[-1].append(make_lsq_spline(t, part, knots, k=3))
 
     @property
     def span_s(self) -> float:
