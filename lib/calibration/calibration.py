@@ -179,8 +179,7 @@ class Calibration:
     def point_covariance(self, x_mm: ArrayLike, *, detection: bool = True) -> np.ndarray:
         """(n, 3, 3) mm^2 of triangulated points, from the calibration's own uncertainty and (`detection`) the detections'."""
         J = self.pair.jacobian(x_mm)
-        weight = np.linalg.inv(self.noise_px2)
-        gain = np.linalg.solve(np.swapaxes(J, 1, 2) @ weight @ J, np.swapaxes(J, 1, 2) @ weight)
+        gain = np.linalg.solve(J.mT @ J, J.mT)  # the noise is the same in every pixel coordinate
         noise = self.projection_covariance(x_mm) + (self.noise_px2 if detection else 0.0)
         return gain @ noise @ np.swapaxes(gain, 1, 2)
 
