@@ -172,12 +172,9 @@ def _spread_out(found: Calibration, usable: np.ndarray) -> Calibration:
     fillers = {"view_inliers": False, "residuals_px": np.nan, "x_mm": np.nan, "y_px": np.nan}
     if found.covariance_px2 is not None and len(found.covariance_px2) > 1:
         fillers["covariance_px2"] = np.nan
-    full = {}
-    for name, filler in fillers.items():
-        values = getattr(found, name)
-        full[name] = np.full((len(usable), *values.shape[1:]), filler)
-        full[name][usable] = values
-    return replace(found, **full)
+    missing = np.flatnonzero(~usable)
+    places = missing - np.arange(len(missing))  # the usable rows before which they stand
+    return replace(found, **{name: np.insert(getattr(found, name), places, fill, axis=0) for name, fill in fillers.items()})
 
 
 def _calibrate(
