@@ -294,9 +294,7 @@ class StereoRig:
         The distance is in the four pixel coordinates together, so independent noise of 1 px in each gives a
         distance of standard deviation 1 px (Hartley and Zisserman, Sec. 14.4).
         """
-        if not self.is_affine:
-            return self.triangulate(u_left, u_right).epipolar_px
-        return (_stacked(u_left, u_right) - self.offset_px) @ self.epipolar_normal
+        return self.triangulate(u_left, u_right).epipolar_px
 
     def triangulate(self, u_left: ArrayLike, u_right: ArrayLike, covariance_px2: ArrayLike | None = None) -> Points:
         """Maximum-likelihood points of matches (n, 2) px, with the covariance of each from the noise of its match.
@@ -304,7 +302,10 @@ class StereoRig:
         Rows that are NaN, or that only a point behind a near-affine camera would explain, give a NaN point.  `covariance_px2`
         of the matches has any form that `lib.geometry.pair_covariance` takes; None is 1 px^2.
         """
-        y = _stacked(u_left, u_right)
+        u_left, u_right = points(u_left, 2, "u_left"), points(u_right, 2, "u_right")
+        if len(u_left) != len(u_right):
+            raise ValueError(f"u_left, u_right: {len(u_left)} and {len(u_right)} points; matches come in pairs.")
+        y = np.hstack([u_left, u_right])
         covariance = pair_covariance(covariance_px2, len(y))
         if not self.is_affine:
             return self._triangulate_near_affine(y, covariance)
@@ -369,14 +370,6 @@ class StereoRig:
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             why = f"{type(error).__name__}: {error}"
             raise ValueError(f"{path}: not a stereo rig written by StereoRig.save ({why}).") from None
-
-
-def _stacked(u_left: ArrayLike, u_right: ArrayLike) -> np.ndarray:
-    """y (n, 4) of matches (n, 2)."""
-    u_left, u_right = points(u_left, 2, "u_left"), points(u_right, 2, "u_right")
-    if len(u_left) != len(u_right):
-        raise ValueError(f"u_left, u_right: {len(u_left)} and {len(u_right)} points; matches come in pairs.")
-    return np.hstack([u_left, u_right])
 
 
 def _least_squares(J: np.ndarray, r: np.ndarray, W: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
