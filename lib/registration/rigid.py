@@ -115,22 +115,17 @@ def _sum_of_norms(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     rng = np.random.default_rng(0)
     triples = [np.isin(np.arange(len(x)), rng.choice(len(x), 3, replace=False)) for _ in range(_STARTS)]
     R, t = _kabsch(x, y, np.array([np.ones(len(x)), *triples]))
-    floor = 1e-12 * max(1.0, float(np.abs(y).max()))
-
-    def norms() -> np.ndarray:
-        return np.linalg.norm(x @ np.swapaxes(R, 1, 2) + t[:, None] - y, axis=2)
-
-    norm = norms()
-    for iteration in range(1, _ITERATIONS + 1):
-        before = norm.sum(axis=1)
-        R, t = _kabsch(x, y, 1.0 / np.maximum(norm, floor))
-        norm = norms()
+    floor, before = 1e-12 * max(1.0, float(np.abs(y).max())), np.empty(0)
+    for iteration in range(_ITERATIONS):
+        norm = np.linalg.norm(x @ np.swapaxes(R, 1, 2) + t[:, None] - y, axis=2)
         cost = norm.sum(axis=1)
         if iteration == 8:  # the basins are settled: go on with the deepest
             best = [int(cost.argmin())]
             R, t, norm, cost, before = R[best], t[best], norm[best], cost[best], before[best]
         if iteration >= 8 and before[0] - cost[0] <= 1e-14 * cost[0] + floor:
             break
+        before = cost
+        R, t = _kabsch(x, y, 1.0 / np.maximum(norm, floor))
     return R, t
 
 
