@@ -288,7 +288,5 @@ def _minimise(
         anew = minimum is None or (plan.is_affine and whole and len(weigh) == 1)
         state = State.start(plan, start, x.mean(axis=0), centre) if anew else minimum.state
         minimum = fit(state, x, y, weigh, variance_x, views)
-        if known["sigma_x_mm"] is not None and known["sigma_u_px"] is not None:
-            break
         residuals, A, parameters = minimum.residuals, minimum.state.A.reshape(m, 3), len(plan.parameter_names)
     return minimum, levels
