@@ -93,25 +93,22 @@ def _one_camera(
             f"{count} of {n} rows, and the others do not stand apart; {cure}."
         )
     rest, least = np.flatnonzero(~found.keep), max(10, 0.2 * n, 0.5 * count)
-    if threshold_px is None and len(rest) >= least:
-        other = _tightest(x[rest], u[rest], None, rng, least_mm)
-        second = rest[other.keep]
-        r = u[second] - x[second] @ found.matrix[:, :3].T - found.matrix[:, 3]
-        beside = np.sqrt((r**2).sum(axis=1).mean() / 2) > max(_CONTRAST * found.sigma_px, _LARGEST_NOISE[0] * extent)
-        if len(second) >= least and other.sigma_px <= 3.0 * found.sigma_px and beside:
-            raise CompetingCamerasError(_competing(name, np.flatnonzero(found.keep), second, n))
-    return found
-
-
-def _competing(name: str, first: np.ndarray, second: np.ndarray, n: int) -> str:
-    """What to say of two cameras, one that the rows `first` agree on, and one of the rows `second`."""
+    if threshold_px is not None or len(rest) < least:
+        return found
+    other = _tightest(x[rest], u[rest], None, rng, least_mm)
+    first, second = np.flatnonzero(found.keep), rest[other.keep]
+    r = u[second] - x[second] @ found.matrix[:, :3].T - found.matrix[:, 3]
+    beside = np.sqrt((r**2).sum(axis=1).mean() / 2) > max(_CONTRAST * found.sigma_px, _LARGEST_NOISE[0] * extent)
+    if len(second) < least or other.sigma_px > 3.0 * found.sigma_px or not beside:
+        return found
     early, late = sorted((first, second), key=np.median)
     cut = np.sort(np.concatenate([first, second]))[len(early)]
     if (early < cut).mean() + (late >= cut).mean() > 1.8:
         cure = f"rows up to {cut - 1} and the later ones: the camera moved or a clock jumped, calibrate each part alone"
     else:
         cure = "mixed over the recording: look for two tools, two clocks, or landmarks that are taken for one another"
-    return f"{name}: two consensuses compete, {len(first)} and {len(second)} of {n} rows agree on two cameras; {cure}."
+    text = f"{name}: two consensuses compete, {len(first)} and {len(second)} of {n} rows agree on two cameras; {cure}."
+    raise CompetingCamerasError(text)
 
 
 # --- few rows
