@@ -324,7 +324,13 @@ class StereoRig:
         for start in range(0, len(known), _BLOCK):
             rows = known[start : start + _BLOCK]
             W = np.linalg.inv(covariance if len(covariance) == 1 else covariance[rows])
-            found, step, seen = self._linear_points(y[rows]), 0.0, np.ones(len(rows), dtype=bool)
+            equations = []  # P_i [x; 1] - u_i P_3 [x; 1] = 0 for undistorted pixels
+            for camera, u in zip((self.left, self.right), (y[rows, :2], y[rows, 2:]), strict=True):
+                P, u = camera.projection_matrix, camera.undistort(u) if isinstance(camera, NearAffineCamera) else u
+                equations.append(P[:2] - u[:, :, None] * P[2])
+            linear = np.concatenate(equations, axis=1)
+            found = _least_squares(linear[:, :, :3], -linear[:, :, 3], np.eye(4))[0]
+            step, seen = 0.0, np.ones(len(rows), dtype=bool)
             for _ in range(3):  # the last time for the covariance at the point found
                 found = found + step
                 in_front = np.all([camera.depth_ratio(found) > 0 for camera in near], axis=0)
@@ -337,15 +343,6 @@ class StereoRig:
             off = np.sign(off @ self.epipolar_normal) * np.linalg.norm(off, axis=1)
             x[rows[seen]], covariance_mm2[rows[seen]], epipolar[rows[seen]] = found[seen], inverse[seen], off[seen]
         return Points(x, covariance_mm2, epipolar)
-
-    def _linear_points(self, y: np.ndarray) -> np.ndarray:
-        """x (n, 3) from P_i [x; 1] - u_i P_3 [x; 1] = 0 for undistorted pixels."""
-        rows, right_hand = [], []
-        for camera, u in zip((self.left, self.right), (y[:, :2], y[:, 2:]), strict=True):
-            P, u = camera.projection_matrix, camera.undistort(u) if isinstance(camera, NearAffineCamera) else u
-            rows.append(P[:2, :3] - u[:, :, None] * P[2, :3])
-            right_hand.append(u * P[2, 3] - P[:2, 3])
-        return _least_squares(np.concatenate(rows, axis=1), np.concatenate(right_hand, axis=1), np.eye(4))[0]
 
     def save(self, path: str | Path) -> None:
         """Write the rig as JSON (matrices, units); the file appears whole or not at all."""
