@@ -18,11 +18,9 @@ def points(values: ArrayLike, dimension: int, name: str) -> np.ndarray:
 
     A ValueError of another shape names the argument `name`.
     """
-    array = np.asarray(values, dtype=np.float64)
-    if array.shape == (dimension,):
-        array = array[None]
+    array = np.atleast_2d(np.asarray(values, dtype=np.float64))
     if array.ndim != 2 or array.shape[1] != dimension:
-        raise ValueError(f"{name}: expected one point a row, (n, {dimension}), got {array.shape}.")
+        raise ValueError(f"{name}: expected one point a row, (n, {dimension}), got {np.shape(values)}.")
     return array
 
 
