@@ -27,7 +27,7 @@ class Surface:
     index: int
     time_s: float
     seconds: dict[str, float]
-    failure: tuple[str, str] | None = None
+    failures: dict[str, str]  # stage -> why it has none
 
 
 class TipDistance:

@@ -212,9 +212,8 @@ class OnlinePipeline:
                 result.failures["worker"] = event
         for surface in done:
             result.seconds.update(surface.seconds)  # a counter adds
-            if surface.failure is not None:
-                result.failures[surface.failure[0]] = surface.failure[1]
-            else:
+            result.failures |= surface.failures
+            if surface.reconstruction is not None:
                 # Chosen by held-out error once: the eye is the same in the next frame.
                 self._surface, self._smoothness = surface, surface.reconstruction.surface.fit.smoothness
                 self._most_points = max(self._most_points, len(surface.reconstruction.u))

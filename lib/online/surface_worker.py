@@ -33,15 +33,15 @@ def make(job: SurfaceJob, reconstruct: Callable[..., Reconstruction] = reconstru
     """The surface of a job, or why there is none."""
     seconds: dict[str, float] = {}
     try:
-        found, failure = reconstruct(job.left, job.right, job.rig, seconds=seconds, **job.options), None
+        found, failures = reconstruct(job.left, job.right, job.rig, seconds=seconds, **job.options), {}
         found.surface.covariance(found.u[:1])  # factorises once, so that no frame waits for it
     except Exception as error:  # whatever it dies of: the next frame may have a surface
         part = next(reversed(seconds), "match")
-        found, failure = None, (_STAGE_OF.get(part, part), f"{type(error).__name__}: {error}")
+        found, failures = None, {_STAGE_OF.get(part, part): f"{type(error).__name__}: {error}"}
     spent = Counter()
     for part, duration in seconds.items():
         spent[_STAGE_OF.get(part, part)] += duration
-    return Surface(found, job.index, job.time_s, spent, failure)
+    return Surface(found, job.index, job.time_s, spent, failures)
 
 
 class Beside:

@@ -39,7 +39,7 @@ def news(surfaces: Beside) -> tuple[list[int], str]:
     for _ in range(6000):
         done, event = surfaces.collect()
         if done or event:
-            assert all(surface.failure is None for surface in done)
+            assert all(not surface.failures for surface in done)
             assert all(set(surface.seconds) == {"match", "triangulate", "surface"} for surface in done)
             return [surface.index for surface in done], event
         time.sleep(0.02)
