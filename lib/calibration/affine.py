@@ -101,17 +101,15 @@ def estimate_noise(
     free, share = np.isnan(known), 1.0 - parameters / count
     if share * count < 2 * m or not free.any():  # nothing to learn from: the weights that make plain least squares
         return tuple(np.where(free, [unit, 0.0], known).tolist())
-    gain, observed, freedom = [], [], []
+    parts = []
     for kind in np.unique(code):
         own, rows = np.repeat([kind & 1, kind & 2], 2)[:m] > 0, code == kind
         white = np.linalg.inv(np.linalg.cholesky((claimed if len(claimed) == 1 else claimed[rows])[:, own][:, :, own]))
         values, directions = np.linalg.eigh(white @ (A[own] @ A[own].T) @ np.swapaxes(white, 1, 2))
         square = np.square(np.swapaxes(directions, 1, 2) @ white @ residuals[rows][:, own, None])[:, :, 0] / share
         square, weight = (square, share) if len(white) > 1 else (square.mean(axis=0), share * rows.sum())
-        gain.append(np.maximum(values, 0.0).ravel())
-        observed.append(square.ravel())
-        freedom.append(np.full(square.size, weight))
-    gain, observed, freedom = (np.concatenate(parts) for parts in (gain, observed, freedom))
+        parts.append((np.maximum(values, 0.0).ravel(), square.ravel(), np.full(square.size, weight)))
+    gain, observed, freedom = (np.concatenate(part) for part in zip(*parts, strict=True))
     floor = 1e-18 + 1e-24 * gain.max()
     least[0] = max(least[0], floor)
     if free.all() and not (np.bincount(code, minlength=4)[3] >= 4 and m > 2):
