@@ -84,8 +84,7 @@ class Recorder:
             if there:
                 shutil.copyfile(there, target.with_suffix(there.suffix))
             else:
-                data = encoded(np.asarray(image), ".png", cv2.IMWRITE_PNG_COMPRESSION, 1)
-                target.with_suffix(".png").write_bytes(data)
+                target.with_suffix(".png").write_bytes(encoded(np.asarray(image), ".png", cv2.IMWRITE_PNG_COMPRESSION, 1))
 
 
 def row(result: FrameResult) -> dict[str, str]:
