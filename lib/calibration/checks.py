@@ -12,25 +12,22 @@ from lib.geometry import finite_points
 PLAUSIBLE_PX_PER_MM = (0.2, 5000.0)
 #: The robot accuracy assumed where none is given (the paper's), for judging whether points are coplanar.
 ROBOT_ACCURACY_MM = 0.010
+_NAMES = {1: ["u"], 2: ["u_left", "u_right"]}  # of the pixels of so many cameras
 
 
 def stacked_rows(x_mm: ArrayLike, u: Sequence[ArrayLike]) -> tuple[np.ndarray, np.ndarray]:
     """x (n, 3) and the stacked pixels y (n, 2 cameras) of one or two cameras, finite and of one length, four at least."""
     x = finite_points(x_mm, 3, "x_mm")
     u = [u] if isinstance(u, np.ndarray) and u.ndim == 2 else list(u)
-    if len(u) not in (1, 2):
+    if len(u) not in _NAMES:
         raise ValueError(f"u: expected [u_left, u_right] or [u], got {len(u)} arrays.")
-    y = [finite_points(pixels, 2, name) for pixels, name in zip(u, _names(len(u)), strict=True)]
-    for pixels, name in zip(y, _names(len(u)), strict=True):
+    y = [finite_points(pixels, 2, name) for pixels, name in zip(u, _NAMES[len(u)], strict=True)]
+    for pixels, name in zip(y, _NAMES[len(u)], strict=True):
         if len(pixels) != len(x):
             raise ValueError(f"{name}: {len(pixels)} points, x_mm has {len(x)}; correspondences go row by row.")
     if len(x) < 4:
         raise ValueError(f"x_mm: {len(x)} points; an affine camera needs at least 4, better 50, not in one plane.")
     return x, np.hstack(y)
-
-
-def _names(cameras: int) -> list[str]:
-    return ["u_left", "u_right"] if cameras == 2 else ["u"]
 
 
 def check_spread(x: np.ndarray, sigma_x_mm: float = 0.0) -> None:
@@ -80,7 +77,7 @@ def check_duplicates(x: np.ndarray, y: np.ndarray) -> None:
 
 def check_images(y: np.ndarray, image_size_px: tuple[int, int] | None = None) -> None:
     """Refuse pixels (n, m) that stand still or on a line in a camera, are the same in both, or leave the image."""
-    names = _names(y.shape[1] // 2)
+    names = _NAMES[y.shape[1] // 2]
     for name, u in zip(names, np.split(y, len(names), axis=1), strict=True):
         u = u[np.isfinite(u).all(axis=1)]
         if len(u) < 4:
