@@ -114,7 +114,15 @@ def calibrate(
         found = estimate(axes=None if axes is None else lambda offset: axes)
         if axes is not None:
             found = _turned(found, estimate, data, usable, axes, sure=offset_prior_sd is not None)
-    return found if usable is None else _spread_out(found, usable)
+    if usable is None:
+        return found
+    # An entry for every row given, usable or not.
+    fillers = {"view_inliers": False, "residuals_px": np.nan, "x_mm": np.nan, "y_px": np.nan}
+    if found.covariance_px2 is not None and len(found.covariance_px2) > 1:
+        fillers["covariance_px2"] = np.nan
+    missing = np.flatnonzero(~usable)
+    places = missing - np.arange(len(missing))  # the usable rows before which they stand
+    return replace(found, **{name: np.insert(getattr(found, name), places, fill, axis=0) for name, fill in fillers.items()})
 
 
 def _usable_rows(data: Correspondences, offsets: bool | str | None, weighting: str) -> tuple[np.ndarray, np.ndarray | None]:
@@ -165,16 +173,6 @@ def _turned(
     if used.sum() * np.log(rms[0] / rms[1]) > _AS_LIKELY:
         return found
     return replace(other, offsets=replace(other.offsets, turns=True))
-
-
-def _spread_out(found: Calibration, usable: np.ndarray) -> Calibration:
-    """The calibration of the usable rows with an entry for every row given."""
-    fillers = {"view_inliers": False, "residuals_px": np.nan, "x_mm": np.nan, "y_px": np.nan}
-    if found.covariance_px2 is not None and len(found.covariance_px2) > 1:
-        fillers["covariance_px2"] = np.nan
-    missing = np.flatnonzero(~usable)
-    places = missing - np.arange(len(missing))  # the usable rows before which they stand
-    return replace(found, **{name: np.insert(getattr(found, name), places, fill, axis=0) for name, fill in fillers.items()})
 
 
 def _calibrate(
