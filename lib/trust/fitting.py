@@ -140,14 +140,11 @@ class Problem:
 
     def _design(self, M: np.ndarray, columns: Callable | None) -> np.ndarray:
         """(n, 2, 2, p): derivatives by the 16 entries of M, 9 offsets (mm) and the additions."""
-        D = np.zeros((len(self), 2, 2, 25))
-        for view, j in np.ndindex(2, 2):
-            first = 8 * view + 4 * j
-            D[:, view, j, first : first + 3], D[:, view, j, first + 3] = self.x[:, view], 1.0
-        image = np.einsum("cij,njk->ncik", M[:, :, :3], self.axes)
-        for k in range(3):
-            D[:, :, :, 16 + 3 * k : 19 + 3 * k] = image * (self.landmark == k)[:, None, None, None]
-        return D if columns is None else np.concatenate([D, columns(M)], axis=3)
+        H = np.concatenate([self.x, np.ones((len(self), 2, 1))], axis=2)
+        D = np.einsum("nck,cv,ij->ncivjk", H, np.eye(2), np.eye(2)).reshape(len(self), 2, 2, 16)
+        image, own = np.einsum("cij,njk->ncik", M[:, :, :3], self.axes), self.landmark[:, None] == np.arange(3)
+        parts = [D, np.einsum("ncik,nl->ncilk", image, own).reshape(len(self), 2, 2, 9)]
+        return np.concatenate(parts if columns is None else [*parts, columns(M)], axis=3)
 
     def _descend(self, M: np.ndarray, columns: Callable | None, apart: np.ndarray, rounds: int) -> Robust:
         used, y = self.used, np.where(self.used[:, :, None], self.y, 0.0)
