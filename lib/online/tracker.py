@@ -80,8 +80,9 @@ class RigTracker:
 
     def take(self, result: FrameResult, frame: Seen) -> None:
         """A frame with landmarks that both images and the robot know."""
-        if len(self._past) == _PAST and (width := _width_mm(self._past[0])) > 0.5 * self._open[0]:
-            self._open = width, [self._past[0]]
+        if len(self._past) == _PAST and int(self._past[0].frame[0]) not in self._doubtful:
+            width = _width_mm(self._past[0])
+            self._open = (width, [self._past[0]]) if width > 0.5 * self._open[0] else self._open
         self._past.append(frame.data)
         accepted = [frame] if self.rig is None else []
         if self.rig is not None:
@@ -249,7 +250,8 @@ class RigTracker:
         offsets = None if self.calibration is None else self.calibration.offsets
         if offsets is None or not len(data):
             return with_offsets(data, offsets)
-        before = [part for part in (*self._open[1], *self._past) if len(part) and part.frame[-1] < data.frame[0]]
+        past = (part for part in (*self._open[1], *self._past) if len(part) and int(part.frame[0]) not in self._doubtful)
+        before = [part for part in past if part.frame[-1] < data.frame[0]]
         return with_offsets(Correspondences.join([*before, data]), offsets).of_frames(data.frame)
 
     @property
