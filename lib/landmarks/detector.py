@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from lib import paths
-from lib.geometry import image_from_cell
+from lib.geometry import check, image_from_cell
 from lib.landmarks import windows as view
 from lib.landmarks.checkpoints import checksum, load_network, read_checkpoint, write_checkpoint
 from lib.landmarks.contrast import equalised, stretched
@@ -138,8 +138,7 @@ class Detector:
     _run: dict[str, Callable[[Tensor], list[Tensor]]] = field(init=False, repr=False, default_factory=dict)
 
     def __post_init__(self) -> None:
-        if self.frame_px is not None and self.frame_px < 16:
-            raise ValueError(f"frame_px: must be at least 16 px, got {self.frame_px}.")
+        check(self, "frame_px", lambda v: v is None or v >= 16, "must be at least 16 px")
         if self.closeup_network and not (self.window_network or self.tool_network):
             raise ValueError("closeup_network: looks at what a tool_network or a window_network has found; give one.")
         run = cache(accelerated)  # stages may share a network

@@ -20,6 +20,7 @@ from torch.nn import functional as F
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from lib.correspondences import LANDMARKS
+from lib.geometry import check
 
 STEM_STRIDE = 4
 
@@ -49,12 +50,9 @@ class HourglassConfig:
     residual: bool = True
 
     def __post_init__(self) -> None:
-        if self.features < 2 or self.features % 2:
-            raise ValueError(f"features: must be an even number of at least 2, got {self.features}.")
-        if self.stacks < 1 or self.depth < 1:
-            raise ValueError(f"stacks and depth: must be at least 1, got {self.stacks} and {self.depth}.")
-        if self.growth < 1 or (self.growth > 1 and not self.decoder):
-            raise ValueError(f"growth: must be 1, or more with a decoder, got {self.growth}.")
+        check(self, "features", lambda v: v >= 2 and v % 2 == 0, "must be an even number of at least 2")
+        check(self, "stacks depth", lambda v: v >= 1, "must be at least 1")
+        check(self, "growth", lambda v: v == 1 or (v > 1 and self.decoder), "must be 1, or more with a decoder")
         if self.skips and not self.decoder:
             raise ValueError("skips: skip connections end in the decoder; set decoder=True or skips=False.")
         if self.stacks > 1 and not self.decoder:
@@ -214,10 +212,8 @@ class OffsetConfig:
     size_px: int = 64
 
     def __post_init__(self) -> None:
-        if self.features < 1:
-            raise ValueError(f"features: must be positive, got {self.features}.")
-        if self.size_px < 16 or self.size_px % 16:
-            raise ValueError(f"size_px: must be a multiple of 16, got {self.size_px}.")
+        check(self, "features", lambda v: v >= 1, "must be positive")
+        check(self, "size_px", lambda v: v >= 16 and v % 16 == 0, "must be a multiple of 16")
 
 
 class OffsetNetwork(Network):
