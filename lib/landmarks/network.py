@@ -114,13 +114,12 @@ def _box(inputs: int, outputs: int, residual: bool) -> _Block:
     return _Block(body, nn.Identity() if inputs == outputs else _conv(inputs, outputs, 1, relu=False))
 
 
-def _residual(inputs: int, outputs: int, halve: bool = False) -> _Block:
-    """Two 3 x 3 convolutions and their skip connection (He et al. 2016); `halve` halves the resolution."""
+def _residual(inputs: int, outputs: int) -> _Block:
+    """Two 3 x 3 convolutions and their skip connection (He et al. 2016); more channels come with half the resolution."""
+    halve = inputs != outputs
     body = nn.Sequential(_conv(inputs, outputs, 3, stride=2 if halve else 1), _conv(outputs, outputs, 3, relu=False))
-    if inputs == outputs and not halve:
-        return _Block(body, nn.Identity())
-    pool = nn.AvgPool2d(2) if halve else nn.Identity()
-    return _Block(body, nn.Sequential(pool, _conv(inputs, outputs, 1, relu=False)))
+    skip = nn.Sequential(nn.AvgPool2d(2), _conv(inputs, outputs, 1, relu=False)) if halve else nn.Identity()
+    return _Block(body, skip)
 
 
 class _Hourglass(nn.Module):
@@ -232,8 +231,8 @@ class OffsetNetwork(Network):
         self.config = config = config or OffsetConfig()
         f = config.features
         self.body = nn.Sequential(
-            _conv(3, f, 5, stride=2), _residual(f, f), _residual(f, 2 * f, halve=True), _residual(2 * f, 2 * f),
-            _residual(2 * f, 3 * f, halve=True), _residual(3 * f, 3 * f), _residual(3 * f, 4 * f, halve=True),
+            _conv(3, f, 5, stride=2), _residual(f, f), _residual(f, 2 * f), _residual(2 * f, 2 * f),
+            _residual(2 * f, 3 * f), _residual(3 * f, 3 * f), _residual(3 * f, 4 * f),
         )  # fmt: skip
         # Fully connected, because a mean over the closeup would lose where something is seen.
         self.head = nn.Sequential(
