@@ -89,13 +89,12 @@ def export(detector: Detector, folder: str | Path, examples: np.ndarray | None =
                 evidence = tuple(torch.from_numpy(part).float() for part in parts)
         if not len(images):
             raise ValueError("examples: no tool was found in them, so nothing can be compared; give other frames.")
-        x = as_tensor(images).contiguous()
+        inputs = as_tensor(images).contiguous(), *evidence
         module = StageWithDecoding(detector, stage, stride).eval()
         path = folder / f"{stage}.onnx"
         with files.whole(path) as partial:
-            _write(module, (x, *evidence), partial)
-            difference = _difference(module, (x, *evidence), partial, stage)
-        result[stage] = path, difference
+            _write(module, inputs, partial)
+            result[stage] = path, _difference(module, inputs, partial, stage)
     return result
 
 
