@@ -38,8 +38,7 @@ def drawn_ground(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         stretch = np.exp(rng.normal(0, 0.5))
         cells_xy = max(int(w / fine * stretch), 2), max(int(h / fine / stretch), 2)
         noise = rng.standard_normal((cells_xy[1], cells_xy[0]), dtype=np.float32)
-        how = cv2.INTER_CUBIC if rng.random() < 0.8 else cv2.INTER_NEAREST
-        noise = cv2.resize(noise, (w, h), interpolation=how)
+        noise = cv2.resize(noise, (w, h), interpolation=cv2.INTER_CUBIC if rng.random() < 0.8 else cv2.INTER_NEAREST)
         if rng.random() < 0.4:  # threads, vessels, cracks
             noise = 1.5 * np.exp(-((noise / rng.uniform(0.1, 0.4)) ** 2)) * rng.choice([-1, 1])
         if rng.random() < 0.5:
@@ -67,19 +66,17 @@ def drawn_tool(
     length = length_px or np.exp(rng.uniform(np.log(0.045), np.log(0.3))) * w
     angle = rng.uniform(-np.pi, np.pi)
     ahead = np.array([np.cos(angle), np.sin(angle)])
-    middle = rng.uniform((0.05 * w, 0.05 * h), (0.95 * w, 0.95 * h))
-    base = middle - 0.5 * length * ahead
+    base = rng.uniform((0.05 * w, 0.05 * h), (0.95 * w, 0.95 * h)) - 0.5 * length * ahead
     opening = rng.choice([0.0, 1.0], p=[0.12, 0.88]) * rng.uniform(0.05, 1.1 if rng.random() < 0.8 else 1.6)
     lean = rng.normal(0, 0.15) + (rng.choice([-1, 1]) * rng.uniform(0.3, 0.9) if rng.random() < 0.15 else 0.0)
     shape = _jaw_shape(rng)
     other = shape if rng.random() < 0.7 else _jaw_shape(rng)
-    u, parts = [base], []
     thick = rng.uniform(0.025, 0.11) * length
     shaft_radius = np.clip(rng.uniform(0.5, 2.6) * thick + 0.02 * length, 0.8, 0.3 * length)
-    for side, jaw in ((-1, shape), (1, other)):
-        aside = side * 0.4 * min(thick, shaft_radius)
-        parts.append(_jaw(jaw, side, angle + lean + side * opening / 2, length, thick, base, aside))
-        u.append(parts[-1][0][-1])
+    aside = 0.4 * min(thick, shaft_radius)
+    parts = [_jaw(jaw, side, angle + lean + side * opening / 2, length, thick, base, side * aside)
+             for side, jaw in ((-1, shape), (1, other))]  # fmt: skip
+    u = np.array([base, *(line[-1] for line, _ in parts)])
     back = np.linspace(0, 1, 12)[:, None]
     bent = rng.normal(0, 0.03) if rng.random() < 0.2 else 0.0
     shaft = base - back * 1.6 * w * ahead + (bent * back**2) * 1.6 * w * np.array([-ahead[1], ahead[0]])
@@ -89,7 +86,6 @@ def drawn_tool(
     if rng.random() < 0.3:  # rounded or conical end
         radius[0] *= rng.uniform(0.2, 0.8)
     parts.insert(int(rng.choice([0, 2])), (shaft, radius))
-    u = np.array(u)
     if np.linalg.det(u[1:] - u[0]) < 0:  # the jaws cross: tip_1 is the left one
         u = u[[0, 2, 1]]
     if around is not None:
@@ -124,8 +120,7 @@ def _jaw(
 ) -> Part:
     """Centre line (n, 2) px from the base to the tip, and radius (n,) px."""
     s = np.linspace(0, 1, 24)
-    along, across = s * shape["long"], shape["bow"] * np.sin(np.pi * s ** shape["power"]) * side
-    across = across + shape["bend"] * s**2
+    along, across = s * shape["long"], shape["bow"] * np.sin(np.pi * s ** shape["power"]) * side + shape["bend"] * s**2
     across = across - side * shape["hook"] * np.clip((s - shape["start"]) / (1 - shape["start"]), 0, 1) ** 2
     if shape["turn"]:  # beyond the elbow the jaw goes on in another direction: its tip is its end, not the corner
         before, beyond = s <= shape["elbow"], np.maximum(s - shape["elbow"], 0) * shape["long"]

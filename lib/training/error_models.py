@@ -86,8 +86,7 @@ class Seen:
             return fitted(axis, deviance, use, start if prior is None else prior.log_variance[axis])
 
         log_variance = np.array([variance(0), variance(1)])
-        rows = ErrorModel(log_variance).coefficients[self.landmark, :2]
-        own = np.exp((rows * self.features[:, :2]).sum(-1))
+        own = np.exp((ErrorModel(log_variance).coefficients[self.landmark, :2] * self.features[:, :2]).sum(-1))
         correct = self._correct(own)[self.known]
         logit = fitted(
             2, lambda z: (np.logaddexp(0, z) - correct * z, expit(z) - correct), self.known, (prior or ErrorModel()).logit
