@@ -73,8 +73,7 @@ class Motion:
             ground = float(self.scene.height(x, y))
             turn = np.array([side + rng.normal(0, 0.3), rng.uniform(0.25, 0.6), np.clip(rng.normal(0, 0.25), -0.8, 0.8)])
             wide, shut = 0.35 * self.forceps.jaw_length_mm, 0.03
-            peel = rng.uniform(0.8, 2.2) * np.array([np.cos(side + np.pi), np.sin(side + np.pi)])
-            peel += rng.normal(0, 0.4, 2)
+            peel = rng.uniform(0.8, 2.2) * np.array([np.cos(side + np.pi), np.sin(side + np.pi)]) + rng.normal(0, 0.4, 2)
             path = [
                 ((0, 0), 2.2, wide * 0.6, 1.6),  # come near
                 ((0, 0), 0.5, wide, 1.0),  # open and descend
@@ -87,8 +86,7 @@ class Motion:
                 (peel, 2.2, wide * 0.6, 1.2),  # retreat
             ]
             for (dx, dy), above, opening, share in path:
-                drift = rng.normal(0, 0.03, 3)
-                points.append([x + dx, y + dy, ground - above, *(turn + drift), opening])
+                points.append([x + dx, y + dy, ground - above, *(turn + rng.normal(0, 0.03, 3)), opening])
                 shares.append(share)
         return points, shares[1:]
 
@@ -99,12 +97,10 @@ class Motion:
         x, y, z, azimuth, pitch, roll, opening = path(time)
         roll = np.clip(roll, -MAX_ROLL_RAD, MAX_ROLL_RAD)
         pose = Pose((0.0, 0.0, 0.0), azimuth, max(pitch, 0.0), roll, max(opening, 0))
-        base, *tips = self.forceps.landmarks(pose)
-        lowest = max(tip[2] for tip in tips)
-        moved = np.array([x, y, z]) - [*((base + np.mean(tips, axis=0)) / 2)[:2], lowest]
-        for tip in tips:
-            ground = float(self.scene.height(*(tip + moved)[:2]))
-            moved[2] = min(moved[2], ground - _CLEARANCE_MM - tip[2])
+        base, tips = np.split(self.forceps.landmarks(pose), [1])
+        moved = np.array([x, y, z]) - [*((base[0] + tips.mean(axis=0)) / 2)[:2], tips[:, 2].max()]
+        ground = self.scene.height(*(tips + moved)[:, :2].T)
+        moved[2] = min(moved[2], *(ground - _CLEARANCE_MM - tips[:, 2]))
         if self.kind == "surgeon" or start > 0:
             rng = np.random.default_rng([self.seed, 29])
             frequency, phase = rng.uniform(8, 12, (3, 3)), rng.uniform(0, 2 * np.pi, (3, 3))

@@ -91,15 +91,12 @@ def render_view(
     map_x = grid.full((a * x + b * y + c + scene.extent_mm / 2) * to_texture - 0.5)
     map_y = grid.full((d * x + e * y + f + scene.extent_mm / 2) * to_texture - 0.5)
     border = getattr(scene, "border", cv2.BORDER_REPLICATE)
-    albedo = cv2.remap(scene.texture, map_x, map_y, cv2.INTER_LINEAR, borderMode=border)
-    linear = cv2.LUT(albedo, _LINEAR)
+    linear = cv2.LUT(cv2.remap(scene.texture, map_x, map_y, cv2.INTER_LINEAR, borderMode=border), _LINEAR)
     linear *= light[..., None]
     glint_mask, tool_mask = np.zeros((2, *linear.shape[:2]), np.uint8)
     if scene.gloss > 0:
         # A film mirrors the lamp where its normal halves the directions of light and view.
-        R = window.R
-        view_x, view_y = -R[2, 0] / R[2, 2], -R[2, 1] / R[2, 2]
-        want_x, want_y = (light_x + view_x) / 2, (light_y + view_y) / 2
+        want_x, want_y = (np.array([light_x, light_y]) - window.R[2, :2] / window.R[2, 2]) / 2
         film_x, film_y = grid.full(-0.6 * slope_x + want_x), grid.full(-0.6 * slope_y + want_y)
         place = (axis * np.float32(_BUMP_PX / _BUMP_MM / to_texture) for axis in (map_x, map_y))
         film = _bumps(getattr(scene, "film_seed", getattr(scene, "seed", 0)))
