@@ -245,10 +245,8 @@ def sample(
         microscope = replace(microscope, psf_px=max(0.45, microscope.psf_px * shrink))
     speed = rng.normal(0, 2.0 if population == "near" else rng.choice([2.0, 6.0]), 3) * (rng.random() < 0.5)
     moved = replace(pose, base_mm=tuple(np.asarray(pose.base_mm) + 1e-3 * speed))
-    view = render_view(
-        setup.scene, replace(microscope, video=None), window, forceps=forceps, pose=pose,
-        later=(moved, 1e-3) if has_landmarks else None, rng=rng,
-    )  # fmt: skip
+    shown = {"forceps": forceps, "pose": pose, "later": (moved, 1e-3) if has_landmarks else None}
+    view = render_view(setup.scene, replace(microscope, video=None), window, **shown, rng=rng)
     image, u, visibility = view.image, view.u, view.visibility
     if tuple(size_px) != window.size_px:
         factor = np.array(size_px) / window.size_px
@@ -274,8 +272,7 @@ def _distorted(image: np.ndarray, u: np.ndarray, visibility: np.ndarray, strengt
     scale = grow(columns * columns + rows * rows)
     maps = ((columns * scale + centre[0]).astype(np.float32), (rows * scale + centre[1]).astype(np.float32))
     image = cv2.remap(image, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
-    before, after = u - centre, u - centre
+    before = after = u - centre
     for _ in range(30):
         after = before / grow((after**2).sum(axis=1, keepdims=True))
-    u = after + centre
-    return image, u, np.where(inside(u, size), visibility, 0)
+    return image, after + centre, np.where(inside(after + centre, size), visibility, 0)

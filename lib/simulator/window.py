@@ -136,12 +136,11 @@ def blur_by_depth(image: np.ndarray, sigma_px: np.ndarray, grid: Grid | None = N
     if high - low < 0.15:
         return blur(image, (low + high) / 2)
     levels = np.linspace(low, high, 3 if high - low > 0.8 else 2)
-    stack = [blur(image, level) for level in levels]
-    result = stack[0]
+    result = blur(image, low)
     for k in range(1, len(levels)):
         share = (sigma_px**2 - levels[k - 1] ** 2) / (levels[k] ** 2 - levels[k - 1] ** 2)
         share = np.clip(grid.full(share) if grid else share, 0, 1).astype(np.float32)[..., None]
-        result = result + share * (stack[k] - result)
+        result = result + share * (blur(image, levels[k]) - result)
     return result
 
 
