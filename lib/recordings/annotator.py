@@ -187,13 +187,12 @@ class Annotator:
 
     def _state(self, frame: int) -> dict:
         """What the page shows of a frame: marks, suggestions, epipolar lines, and how much is labelled."""
-        suggested = {name: _plain(u[:, frame]) for name, u in self._suggested.items()}
-        lines = [self._epipolar_line(u, frame) if v > 0 else None for *u, v in self._marks[0, frame]]
-        told = {"frame": frame, "marks": _plain(self._marks[:, frame]), "lines": lines}
-        told["usefulness"] = float(self.usefulness[frame])
-        return told | suggested | {"complete": self.complete.tolist(), "file": self._path.name}
+        told = {"frame": frame, "marks": _plain(self._marks[:, frame]), "usefulness": float(self.usefulness[frame])}
+        told |= {name: _plain(u[:, frame]) for name, u in self._suggested.items()}
+        told["lines"] = [self._epipolar_line(u) if v > 0 else None for *u, v in self._marks[0, frame]]
+        return told | {"complete": self.complete.tolist(), "file": self._path.name}
 
-    def _epipolar_line(self, u_left: np.ndarray, frame: int) -> list | None:
+    def _epipolar_line(self, u_left: np.ndarray) -> list | None:
         """Right pixels of points on the viewing ray of a left pixel."""
         if self._rig is None:
             return None
