@@ -68,11 +68,10 @@ def sweep(
 
     Returns ``results.csv`` (a row a run: its parameters, then its metrics), and what failed at which point.
     """
-    chosen = execution.choose_notebooks([name], notebooks)
-    grid = grid or execution.declared_grid(chosen[0])
-    if len(chosen) != 1 or not all(grid.values()):
+    book, *more = execution.choose_notebooks([name], notebooks)
+    grid = grid or execution.declared_grid(book)
+    if more or not all(grid.values()):
         raise ValueError("a sweep takes one notebook, and values for each parameter: -p NAME VALUE,VALUE,...")
-    book = chosen[0]
     parse = execution.parse_parameters
     profile = parse([], [book])[book]
     parsed = {key: [parse([(key, text)], [book])[book][key] for text in texts] for key, texts in grid.items()}
