@@ -11,6 +11,7 @@ import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -33,6 +34,7 @@ from lib.training.samples import Samples, Source
 FORMAT = "microstereo.training"
 #: What a checkpoint keeps of a `Run` beside its tensors.
 _STATE = ("step", "seconds", "log", "loss_sum", "since")
+_OPTIMISERS = {"rmsprop": partial(torch.optim.RMSprop, alpha=0.99), "adamw": partial(torch.optim.AdamW, weight_decay=1e-4)}
 #: A killed training loses at most this much.
 _SAVE_EVERY_S = 50.0
 
@@ -72,7 +74,7 @@ class TrainingConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        known = {"optimiser": ("rmsprop", "adamw"), "schedule": ("constant", "cosine"), "precision": ("fp32", "bf16")}
+        known = {"optimiser": tuple(_OPTIMISERS), "schedule": ("constant", "cosine"), "precision": ("fp32", "bf16")}
         for name, choices in known.items():
             check(self, name, choices.__contains__, f"expected one of {', '.join(choices)}")
         check(self, "steps batch_size validate_every", lambda v: v >= 1, "must be at least 1")
@@ -192,17 +194,12 @@ class Run:
         gpu = f"cuda:{os.environ.get('LOCAL_RANK', '0') if self.world > 1 else 0}"
         self.device = torch.device(gpu if torch.cuda.is_available() else "cpu")
         # A processor without such arithmetic imitates it, in eight times the time.
-        has = torch.cpu.get_capabilities()
-        fast = self.device.type == "cuda" or has.get("avx512_bf16") or has.get("amx_bf16")
-        self.mixed = config.precision == "bf16" and bool(fast)
+        fast = self.device.type == "cuda" or any(map(torch.cpu.get_capabilities().get, ("avx512_bf16", "amx_bf16")))
+        self.mixed = config.precision == "bf16" and fast
         self.network.to(self.device, memory_format=torch.channels_last)
         self.average = copy.deepcopy(self.network) if config.ema else None
         self.usable = self.average or self.network
-        parameters = self.network.parameters()
-        if config.optimiser == "rmsprop":
-            self.optimiser: torch.optim.Optimizer = torch.optim.RMSprop(parameters, config.learning_rate, alpha=0.99)
-        else:
-            self.optimiser = torch.optim.AdamW(parameters, config.learning_rate, weight_decay=1e-4)
+        self.optimiser: torch.optim.Optimizer = _OPTIMISERS[config.optimiser](self.network.parameters(), config.learning_rate)
         self.step, self.seconds, self.log, self.loss_sum, self.since = 0, 0.0, [], 0.0, 0  # both since the last validation
 
     def advance(self, batch: Batch, spent: float = 0.0) -> None:
