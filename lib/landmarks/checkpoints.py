@@ -47,8 +47,7 @@ def write_checkpoint(path: str | Path, tensors: dict[str, Tensor], metadata: dic
 def read_checkpoint(path: str | Path, kind: str) -> tuple[dict[str, Tensor], dict[str, object]]:
     """Tensors and metadata of a file that `write_checkpoint` wrote with ``metadata["format"] == kind``.
 
-    Raises:
-        FileNotFoundError, ValueError: If there is none; if it is damaged, has no checksum, or holds something else.
+    A FileNotFoundError if there is none; a ValueError if it is damaged, has no checksum, or holds something else.
     """
     path = Path(path)
     if not path.is_file():

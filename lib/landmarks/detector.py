@@ -172,8 +172,7 @@ class Detector:
 
         `engine` runs its networks; None is OpenVINO where that is installed (`lib.landmarks.engines`).
 
-        Raises:
-            FileNotFoundError, ValueError: If the file is missing, damaged, incomplete, or no detector.
+        A FileNotFoundError or ValueError if the file is missing, damaged, incomplete, or no detector.
         """
         path = Path(path_or_name or "default")
         if not path.suffix and not path.is_file():

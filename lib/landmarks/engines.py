@@ -50,8 +50,7 @@ def default_engine() -> str:
 def accelerated(network: Network, engine: str, *, mirror: bool = False) -> Callable[[Tensor], list[Tensor]]:
     """The network for inference: called with images (n, 3, h, w), its last output is that of `LastOutput`.
 
-    Raises:
-        ValueError: For an unknown engine, or one that is not installed.
+    A ValueError for an unknown engine, or one that is not installed.
     """
     if engine not in ENGINES:
         raise ValueError(f"engine: {engine!r} is none; choose one of {', '.join(ENGINES)}.")

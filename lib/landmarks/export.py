@@ -65,9 +65,8 @@ def export(detector: Detector, folder: str | Path, examples: np.ndarray | None =
         examples: Frames (n, h, w, 3) uint8 with the tool in view, on which the stages are compared; None = of the recording
             that ships.  The exported first stage takes frames of this size.
 
-    Raises:
-        ValueError: If a stage differs by more than `LARGEST` (its file is not written), nothing is found in `examples`, or
-            a package is missing.
+    A ValueError if a stage differs by more than `LARGEST` (its file is not written), nothing is found in `examples`, or
+    a package is missing.
     """
     for package in ("onnx", "openvino"):  # one writes the files, the other runs them for the comparison
         if not importlib.util.find_spec(package):

@@ -158,8 +158,7 @@ def decode(heatmaps: Tensor, stride: int, *, method: str = "gauss_newton", sigma
         method: ``"paper"``: the centroid of the disc of 3 sigma around the highest cell, Eq. (1) divided by the sum of p (as
             printed it is divided by the disc's area, which is no mean); ``"gauss_newton"``: a Gaussian fit, with covariance.
 
-    Raises:
-        ValueError: For an unknown method and for heatmaps of another shape or not finite.
+    A ValueError for an unknown method and for heatmaps of another shape or not finite.
 
     >>> heatmaps = render(torch.tensor([[[20.3, 12.8]]], dtype=torch.float64), (64, 64), 4)
     >>> decode(heatmaps, 4).u.round(decimals=3).tolist()

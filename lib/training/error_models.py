@@ -59,8 +59,7 @@ class Seen:
         outside the 95 % ellipses, and ellipses that hold 95 % make it less than 2.  The constants are set halfway, for the
         base and for the tips.
 
-        Raises:
-            ValueError: For fewer than 20 landmarks and no prior.
+        A ValueError for fewer than 20 landmarks and no prior.
         """
         size = np.linalg.norm(self.errors, axis=1)
         use = np.isfinite(size) & (size < gross_px)
@@ -203,8 +202,7 @@ def fit_error_models(
         for_closeups: More images, for gain, bias and covariance of the stages that look at closeups, and for tracking.
         anew: False begins from the models that the detector has, and changes them as far as so many images tell.
 
-    Raises:
-        ValueError: If too few landmarks are found in them, and there is no model to begin from.
+    A ValueError if too few landmarks are found in the images, and there is no model to begin from.
     """
     images = list(images)
     n, images, before = len(images), [*images, *for_closeups], detector.error_models

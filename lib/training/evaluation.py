@@ -103,8 +103,7 @@ def evaluate(
     Args:
         detector: A `lib.landmarks.Detector`, or any function from images (n, h, w, 3) to their `Landmarks`.
 
-    Raises:
-        ValueError: If there is no image.
+    A ValueError if there is no image.
 
     >>> missed = LabelledImage("dark", np.zeros((90, 90, 3), np.uint8), np.full((3, 2), 30.0), np.full(3, 2))
     >>> evaluate(lambda images: Landmarks.none(len(images)), [missed]).scores.missed

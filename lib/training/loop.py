@@ -52,8 +52,7 @@ class TrainingConfig:
         sigma_px: Width of the target Gaussians in pixels of the network's input.
         seed: Decides the first weights and every batch.
 
-    Raises:
-        ValueError: For an unknown choice, or a number below 1 where at least 1 is needed.
+    A ValueError for an unknown choice, or a number below 1 where at least 1 is needed.
 
     >>> TrainingConfig(steps=1000, learning_rate=1e-3, schedule="cosine").rate(500)
     0.000505
@@ -273,8 +272,7 @@ def train(
         max_seconds: Stop (resumably) after this long; a cosine schedule ends then.
         progress: Whether to show a bar, or a function that is called with the part that is done.
 
-    Raises:
-        ValueError: For an empty data set, an `initial` of another network, or a folder that holds another training.
+    A ValueError for an empty data set, an `initial` of another network, or a folder that holds another training.
     """
     if not len(source):
         raise ValueError("source: must not be empty; give labelled images.")

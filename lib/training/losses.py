@@ -29,9 +29,8 @@ def heatmap_loss(outputs: Sequence[Tensor], batch: Batch, stride: int, sigma_px:
 def offset_loss(outputs: Sequence[Tensor], batch: Batch) -> Tensor:
     """Negative log likelihood of an `OffsetNetwork`'s errors under Laplace distributions with the scales that it predicts.
 
-    A closeup has one visible landmark; without one, or without its label, it does not count.  The absolute error is
-    smoothed within 0.1 px.
-    Gross errors weigh little under it; divided by the scale, a sharp image weighs more than a blurred one.
+    A closeup has one visible landmark; without one, or without its label, it does not count.  The absolute error is smoothed
+    within 0.1 px.  Gross errors weigh little under it; divided by the scale, a sharp image weighs more than a blurred one.
     """
     (found,) = outputs
     centre = (batch.images.shape[-1] - 1) / 2

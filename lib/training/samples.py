@@ -33,8 +33,7 @@ class LabelledImage(NamedTuple):
 def labelled_images(recording: Recording, *, every: int = 1) -> Iterator[LabelledImage]:
     """Left and right images of every `every`-th frame with labels: the truth of a simulated one, else annotated images alone.
 
-    Raises:
-        ValueError: If the recording has neither.
+    A ValueError if the recording has neither.
     """
     labels = recording.truth or recording.annotations
     if labels is None:
@@ -84,8 +83,7 @@ class Source:
 class Samples(Source):
     """Labelled images in memory, (n, h, w, 3) uint8 RGB, with u (n, 3, 2) and visibility (n, 3) as in `LabelledImage`.
 
-    Raises:
-        ValueError: For an empty set, arrays of other shapes, or no visible landmark at all.
+    A ValueError for an empty set, arrays of other shapes, or no visible landmark at all.
     """
 
     images: np.ndarray

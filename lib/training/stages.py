@@ -88,9 +88,8 @@ def finetune(
         steps, minutes: Steps of each stage; training ends after `minutes`, each stage having had its share.
         progress: Whether to show a bar, or a function that is called with the stage and the part done.
 
-    Raises:
-        ValueError: If there is no usable image, or fewer than 20 landmarks are found in the held-out ones and the detector
-            has no error models yet.
+    A ValueError if there is no usable image, or fewer than 20 landmarks are found in the held-out ones and the detector has
+    no error models yet.
     """
     images, held_out = ([one for one in part if np.isfinite(tool_length_px(one.u))] for part in (images, held_out))
     for kind, part in (("training", images), ("validation", held_out)):
