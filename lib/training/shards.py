@@ -153,12 +153,10 @@ def packed(images: Iterable[LabelledImage], long_side_px: int | None = None) -> 
 
 def read_scenes(folder: str | Path) -> tuple[np.ndarray, ...]:
     """What `packed` gives, of all shards of scenes in a folder."""
-    found = sorted(Path(folder).glob("scenes_*.npz"))
-    if not found:
-        raise FileNotFoundError(f"{folder}: no shard scenes_*.npz; make some with `python3 -m lib train generate`.")
-    ends, *parts = zip(*(_read(path, ("jpeg_ends", "jpegs", "u", "visibility")) for path in found), strict=True)
+    parts = read_shards(folder, "scenes", ("jpegs", "u", "visibility"))
+    ends = [_read(path, ("jpeg_ends",))[0] for path in sorted(Path(folder).glob("scenes_*.npz"))]
     before = np.cumsum([0, *(own[-1] for own in ends[:-1])])
-    return tuple(map(np.concatenate, ([own + start for own, start in zip(ends, before, strict=True)], *parts)))
+    return np.concatenate([own + start for own, start in zip(ends, before, strict=True)]), *parts
 
 
 def propose(folder: str | Path, detector: str | Path | None = None, *, workers: int | None = None) -> None:
