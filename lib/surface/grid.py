@@ -113,9 +113,8 @@ class SplineGrid:
 
         Its null space is the linear functions, of dimension 3.
         """
-        (n_x, n_y), (h_x, h_y) = self.control, self.cell_px
-        gram_x = [_gram(n_x, k) * h_x ** (1 - 2 * k) for k in range(3)]
-        gram_y = [_gram(n_y, k) * h_y ** (1 - 2 * k) for k in range(3)]
+        along = zip(self.control, self.cell_px, strict=True)
+        gram_x, gram_y = ([_gram(n, k) * h ** (1 - 2 * k) for k in range(3)] for n, h in along)
         slow, fast = (gram_y, gram_x) if self.stride[0] == 1 else (gram_x, gram_y)
         terms = ((1.0, 2, 0), (2.0, 1, 1), (1.0, 0, 2))
         bending = sum(factor * sparse.kron(slow[p], fast[q], format="csr") for factor, p, q in terms).tocsr()
