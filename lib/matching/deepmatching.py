@@ -299,9 +299,8 @@ def correlation_maps(patches: torch.Tensor, windows: torch.Tensor) -> torch.Tens
 
     At the border only the part of the patch that falls inside the image counts.
     """
-    n_y, n_x, depth = windows.shape
-    maps = torch.matmul(patches.reshape(-1, depth), windows.reshape(-1, depth).T)
-    maps = maps.reshape(*patches.shape[:2], n_y, n_x)
+    n_y, n_x, _ = windows.shape
+    maps = torch.tensordot(patches, windows, ([2], [2]))
     energy = patches.reshape(*patches.shape[:2], PATCH, PATCH, -1).square().sum(dim=4)
     cells = [torch.arange(n)[:, None] + torch.arange(PATCH) - PATCH // 2 for n in (n_y, n_x)]
     rows, columns = (((0 <= cell) & (cell < len(cell) - 1)).to(maps) for cell in cells)
