@@ -61,12 +61,9 @@ def export(detector: Detector, folder: str | Path, examples: np.ndarray | None =
 
     Returns the file of each stage, and its largest difference from torch in px, over landmarks that torch finds.
 
-    Args:
-        examples: Frames (n, h, w, 3) uint8 with the tool in view, on which the stages are compared; None = of the recording
-            that ships.  The exported first stage takes frames of this size.
-
-    A ValueError if a stage differs by more than `LARGEST` (its file is not written), nothing is found in `examples`, or
-    a package is missing.
+    `examples` are frames (n, h, w, 3) uint8 with the tool in view, on which the stages are compared; None = of the recording
+    that ships.  The exported first stage takes frames of this size.  A ValueError if a stage differs by more than `LARGEST`
+    (its file is not written), nothing is found in `examples`, or a package is missing.
     """
     for package in ("onnx", "openvino"):  # one writes the files, the other runs them for the comparison
         if not importlib.util.find_spec(package):

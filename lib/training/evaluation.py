@@ -100,10 +100,8 @@ def evaluate(
 ) -> Evaluation:
     """Run a detector over labelled images, such as `lib.training.samples.labelled_images` of a recording.
 
-    Args:
-        detector: A `lib.landmarks.Detector`, or any function from images (n, h, w, 3) to their `Landmarks`.
-
-    A ValueError if there is no image.
+    `detector` is a `lib.landmarks.Detector`, or any function from images (n, h, w, 3) to their `Landmarks`.  A ValueError if
+    there is no image.
 
     >>> missed = LabelledImage("dark", np.zeros((90, 90, 3), np.uint8), np.full((3, 2), 30.0), np.full(3, 2))
     >>> evaluate(lambda images: Landmarks.none(len(images)), [missed]).scores.missed
