@@ -21,7 +21,7 @@ def smoothed(kinematics: Kinematics, noise_mm: float) -> Kinematics:
 
     Its window is the one whose polynomials best predict the samples that they leave out, thereabouts.  Samples stay as they
     are where that would move them by more than `noise_mm`, the robot's accuracy per coordinate, allows: at jumps, and where
-    the log is too slow for the motion.  Dropped samples stay NaN, and samples that repeat each other stay the same.
+    the log is too slow for the motion.  Dropped samples stay NaN, and samples that repeat each other count as frozen and stay.
     (Cleveland, "Robust locally weighted regression and smoothing scatterplots", 1979.)
 
     >>> rng, time_s = np.random.default_rng(0), np.arange(400) / 100
@@ -31,7 +31,8 @@ def smoothed(kinematics: Kinematics, noise_mm: float) -> Kinematics:
     True
     """
     x = kinematics.x_mm.reshape(len(kinematics.x_mm), -1)
-    known, errors, found = np.isfinite(x).all(axis=1), [], []
+    repeats = np.append(False, (np.diff(x, axis=0) == 0).all(axis=1))  # the log stands still
+    known, errors, found = np.isfinite(x).all(axis=1) & ~(repeats | np.append(repeats[1:], False)), [], []
     if known.sum() <= 2 * _HALVES[-1]:
         return kinematics
     for half in _HALVES:
@@ -40,7 +41,7 @@ def smoothed(kinematics: Kinematics, noise_mm: float) -> Kinematics:
         found.append(fitted)
     best = np.take_along_axis(np.array(found), np.argmin(errors, axis=0)[None, :, None], axis=0)[0]
     moves = _thereabouts((x - best) ** 2)
-    best = np.where((moves < (_MOST * noise_mm) ** 2)[:, None] & (np.abs(x - best) > 1e-9), best, x)
+    best = np.where((moves < (_MOST * noise_mm) ** 2)[:, None] & np.isfinite(best), best, x)
     return replace(kinematics, x_mm=best.reshape(kinematics.x_mm.shape))
 
 
