@@ -16,6 +16,7 @@ import numpy as np
 from lib.calibration import Calibration, CompetingCamerasError, LandmarkOffsets, calibrate, estimate_time_offset
 from lib.calibration.offsets import carried, tool_axes
 from lib.calibration.timing import clock_error
+from lib.cameras import NearAffineCamera
 from lib.correspondences import LANDMARKS, MIN_CONFIDENCE, Correspondences, of_recording
 from lib.landmarks import Landmarks
 from lib.landmarks.metrics import tool_length_px
@@ -54,6 +55,7 @@ _STILL, _STILL_FRAMES = 0.15, 4
 #: Largest correction of the clock along with cameras and offsets: one step takes motions for straight.
 _LARGEST_STEP_S = 0.03
 _FINITE = 3.0  # the inverse distance of cameras, in its standard deviations, from which it is taken for finite
+_BEHIND = 0.1  # distance from the camera, as a share of the working distance, below which nothing is in view
 _CONFIDENCES = (MIN_CONFIDENCE, 0.5, 0.8)
 #: Share of the tool's length: as near to where it should be a detection is taken for right, farther for another thing.
 _NEAR = 0.1
@@ -221,6 +223,8 @@ class Teacher:
                 apart_s = np.abs(when_s[order][np.isfinite(known).all(axis=(1, 2))] - at[:, :1])
                 shut = apart_s.min(axis=1, initial=np.inf) > _BORROWED_S
                 x = x + np.einsum("mij,kj->mki", axes, offset)
+                if isinstance(camera, NearAffineCamera):  # what the robot parks behind a camera is seen nowhere
+                    x[camera.depth_ratio(x.reshape(-1, 3)).reshape(x.shape[:2]) < _BEHIND] = np.nan
                 u[:, side] = camera.project(x.reshape(-1, 3)).reshape(x.shape[:2] + (2,))
                 at = time + r.readout_s * np.nan_to_num(u[:, side, :, 1] / (height - 1) - 0.5).clip(-0.5, 0.5)
             flat, view = np.nan_to_num(x).reshape(-1, 3), slice(2 * side, 2 * side + 2)

@@ -25,9 +25,10 @@ from lib.correspondences import Correspondences
 
 #: Step of the offsets' derivatives, mm or px.
 _STEP = 1e-4
-#: Largest offset, from the mean of all, that may explain two cameras: what is farther off is another landmark.
-_MOST_MM = 0.4
-#: So many steps take every detection before those that look like another camera's may go.
+#: Largest offset, from the mean of all, that may explain two cameras, and largest one that may explain a landmark which agrees
+#: with no camera of the others: what is farther off is another point of the tool.
+_MOST_MM, _MOST_ALONE_MM = 0.4, 0.25
+#: So many first steps use every detection; later ones drop those that fit another camera.
 _TAKEN = 4
 #: Where offsets that turn the axes start: a robot's own calibration of its tool errs by tenths of a millimetre.
 _GRID_MM, _POLISHED = (0.0, 0.2, -0.2), 8
@@ -156,7 +157,7 @@ def estimate_offsets(
     pixels (n, m) with the `views` to use, and one Schur complement; a `RuntimeWarning` where `iterations` are too few.
     `axes` takes offsets (landmarks, 3) and returns the axes (n, 3, 3) of the rows.  `start` gives the first offsets, their
     prior and p-value.  Without `prior_sd` it is the one that makes the data most probable, 0.1 to 300 um or 0.01 to 30 px.
-    Where two cameras compete, or one landmark agrees on none with the others, small offsets may explain it; else the
+    Where two cameras compete, or one landmark hardly agrees with the others' cameras, small offsets may explain it; else the
     `CompetingCamerasError`, or the calibration without that landmark, stays.
     """
     steps = partial(_steps, fit, x, y, landmark, frame, axes, prior_sd, iterations, start)
@@ -172,9 +173,9 @@ def estimate_offsets(
     with suppress(ValueError, RuntimeWarning), warnings.catch_warnings():
         warnings.filterwarnings("error", "offsets:", RuntimeWarning)  # still moving: no explanation
         other = steps(taken=_TAKEN)
-        seen = np.bincount(landmark) > 0
-        largest = np.linalg.norm(other.offsets.offset - other.offsets.offset[seen].mean(axis=0), axis=1)[seen].max()
-        if largest <= _MOST_MM and _agree_alike(other, landmark):
+        offset = other.offsets.offset[np.bincount(landmark) > 0]
+        most, centre = (_MOST_MM, offset.mean(axis=0)) if competing else (_MOST_ALONE_MM, 0.0)
+        if np.linalg.norm(offset - centre, axis=1).max() <= most and _agree_alike(other, landmark):
             return other
     if competing:
         raise competing
@@ -227,7 +228,7 @@ def _steps(
     else:
         if moved > 0.1 * least_sd:
             text = f"they still move by up to {moved:.2g} {'px' if axes is None else 'mm'} after {iterations} steps"
-            warnings.warn(f"offsets: {text}; look at the outliers (`ransac_px`).", RuntimeWarning, stacklevel=3)
+            warnings.warn(f"offsets: {text}; look at the outliers (`ransac_px`).", RuntimeWarning, stacklevel=4)
     p, size = J_c.shape[2], offset.shape[1]
     prior = np.diag(np.repeat([0.0, prior_sd**-2], [p, offset.size]))
     full, effective = sandwich(np.concatenate([J_c, J], axis=2), weight, r, frame[rows], landmark[rows], prior)

@@ -57,7 +57,7 @@ class RigTracker:
         self._recent: deque[Seen] = deque(maxlen=_PAST)  # not yet taken in: the cameras may have moved meanwhile
         self._doubtful: deque[int] = deque(maxlen=_PAST)  # numbers of frames that stood out alone
         self._past: deque[Correspondences] = deque(maxlen=_PAST)
-        self._open: tuple[float, list[Correspondences]] = (0.0, [])  # the last frame before them with wide jaws; how wide
+        self._open: list[Correspondences] = []  # the last frame that `_past` no longer holds whose jaws surely do not cross
         self._since: list[Seen] = []  # frames that tell where the cameras are now
         self._before: StereoRig | None = None  # the rig before, while the frames since are being explained
         self._motion: MovedCameras | None = None
@@ -80,9 +80,8 @@ class RigTracker:
 
     def take(self, result: FrameResult, frame: Seen) -> None:
         """A frame with landmarks that both images and the robot know."""
-        if len(self._past) == _PAST and int(self._past[0].frame[0]) not in self._doubtful:
-            width = _width_mm(self._past[0])
-            self._open = (width, [self._past[0]]) if width > 0.5 * self._open[0] else self._open
+        if len(self._past) == _PAST and int(self._past[0].frame[0]) not in self._doubtful and self._is_open(self._past[0]):
+            self._open = [self._past[0]]
         self._past.append(frame.data)
         accepted = [frame] if self.rig is None else []
         if self.rig is not None:
@@ -250,9 +249,17 @@ class RigTracker:
         offsets = None if self.calibration is None else self.calibration.offsets
         if offsets is None or not len(data):
             return with_offsets(data, offsets)
-        past = (part for part in (*self._open[1], *self._past) if len(part) and int(part.frame[0]) not in self._doubtful)
+        past = (part for part in (*self._open, *self._past) if len(part) and int(part.frame[0]) not in self._doubtful)
         before = [part for part in past if part.frame[-1] < data.frame[0]]
         return with_offsets(Correspondences.join([*before, data]), offsets).of_frames(data.frame)
+
+    def _is_open(self, data: Correspondences) -> bool:
+        """Whether a frame tells the tool's axes, however its landmarks are off: the tips are too far apart to be crossed."""
+        if len(data) < 3:
+            return False
+        x, offsets = data.grid("x_mm")[0], None if self.calibration is None else self.calibration.offsets
+        apart = 0.0 if offsets is None else np.linalg.norm(np.diff(offsets.offset[1:], axis=0))
+        return bool(np.linalg.norm(x[2] - x[1]) > apart + 0.05 * np.linalg.norm((x[1] + x[2]) / 2 - x[0]))
 
     @property
     def persistence(self) -> float:
@@ -297,9 +304,3 @@ class RigTracker:
             if motion is not None:
                 covariance[:, rows, rows] += self.rig.linear[rows] @ motion.covariance_at(stale) @ self.rig.linear[rows].T
         return covariance
-
-
-def _width_mm(frame: Correspondences) -> float:
-    """How far apart the robot reports the tips of a frame; NaN where it reports fewer than all landmarks."""
-    x = frame.grid("x_mm")[0]
-    return float(np.linalg.norm(x[2] - x[1])) if len(frame) == len(x) else float("nan")

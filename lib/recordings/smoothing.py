@@ -12,7 +12,7 @@ _DEGREE, _HALVES = 4, (3, 4, 5, 7, 10, 14, 20)
 _BESIDE = 4
 #: Fewest samples more than the polynomial has coefficients; samples that are looked at together.
 _SPARE, _CHUNK = 2, 20000
-#: What moves samples by more than the robot's noise times this (RMS) is no noise.
+#: What moves a landmark by more than the robot's noise times this (RMS) is no noise.
 _MOST = 1.5
 
 
@@ -20,8 +20,9 @@ def smoothed(kinematics: Kinematics, noise_mm: float) -> Kinematics:
     """The log with each sample moved to a local polynomial of the samples around it, in their own times.
 
     Its window is the one whose polynomials best predict the samples that they leave out, thereabouts.  Samples stay as they
-    are where that would move them by more than `noise_mm`, the robot's accuracy per coordinate, allows: at jumps, and where
-    the log is too slow for the motion.  Dropped samples stay NaN, and samples that repeat each other count as frozen and stay.
+    are where that would move a landmark by more than 1.5 times `noise_mm`, the robot's accuracy per coordinate (RMS of a few
+    samples): at jumps, and where the log is too slow for the motion.  Samples without all landmarks, and those that repeat
+    each other and so count as frozen, stay and tell nothing.
     (Cleveland, "Robust locally weighted regression and smoothing scatterplots", 1979.)
 
     >>> rng, time_s = np.random.default_rng(0), np.arange(400) / 100
@@ -32,16 +33,18 @@ def smoothed(kinematics: Kinematics, noise_mm: float) -> Kinematics:
     """
     x = kinematics.x_mm.reshape(len(kinematics.x_mm), -1)
     repeats = np.append(False, (np.diff(x, axis=0) == 0).all(axis=1))  # the log stands still
-    known, errors, found = np.isfinite(x).all(axis=1) & ~(repeats | np.append(repeats[1:], False)), [], []
+    known = np.isfinite(x).all(axis=1) & ~(repeats | np.append(repeats[1:], False))
+    best, least = x.copy(), np.full(len(x), np.inf)
     if known.sum() <= 2 * _HALVES[-1]:
         return kinematics
     for half in _HALVES:
         fitted, own = _local_polynomials(kinematics.time_s, x, known, half)
-        errors.append(_thereabouts(((x - fitted) / (1 - own)[:, None]) ** 2))  # had the sample been left out
-        found.append(fitted)
-    best = np.take_along_axis(np.array(found), np.argmin(errors, axis=0)[None, :, None], axis=0)[0]
-    moves = _thereabouts((x - best) ** 2)
-    best = np.where((moves < (_MOST * noise_mm) ** 2)[:, None] & np.isfinite(best), best, x)
+        error = _thereabouts(((x - fitted) / (1 - own)[:, None]) ** 2)  # had the sample been left out
+        better = (error < least) & np.isfinite(fitted).all(axis=1)
+        best[better], least[better] = fitted[better], error[better]
+    landmarks = np.split((x - best) ** 2, kinematics.x_mm.shape[1], axis=1)
+    moves = np.max([_thereabouts(part) for part in landmarks], axis=0)
+    best = np.where((moves < (_MOST * noise_mm) ** 2)[:, None], best, x)
     return replace(kinematics, x_mm=best.reshape(kinematics.x_mm.shape))
 
 

@@ -13,6 +13,7 @@ from lib.adapt.teacher import Seen, at_rest, look, look_elsewhere
 from lib.calibration.offsets import tool_axes
 from lib.landmarks import Detector, Landmarks
 from lib.recordings.annotations import Annotations, write_coco
+from lib.simulator.rig import ROBOT_FROM_MICROSCOPE
 from tests.adapt.world import SIZE, StandIn, World, pupil
 
 
@@ -93,6 +94,24 @@ def test_cameras_of_a_finite_distance_are_no_affine_ones(tmp_path):
     teacher = taught(near.record(tmp_path / "near"), StandIn(near.u, noise_px=0.7, wrong=0.3))
     value, sd = teacher.calibration.inverse_distance_per_mm
     assert abs(value - 1 / 70) < 3 * sd and np.median(label_errors(near, teacher)[0]) < 0.4
+
+
+def test_a_tool_behind_the_cameras_has_no_label(tmp_path):
+    """The robot parks it there at the end; affine cameras would put it somewhere."""
+    near, up = World(distance_mm=70.0), ROBOT_FROM_MICROSCOPE.R[:, 2]
+    with pytest.warns(UserWarning, match="jumps by 120 mm"):
+        parked = near.record(tmp_path / "parked", robot=lambda time_s, x: x - 120.0 * up * (time_s > 18.0)[:, None, None])
+    seen = look(parked, StandIn(near.u, noise_px=0.7, wrong=0.3), np.arange(34))
+    u = teach(parked, seen).labels(np.arange(near.n))[0]
+    assert np.isnan(u[38:]).all() and np.isfinite(u[:34]).all()
+
+
+def test_the_log_that_teaches_is_smoothed(world, recording, tmp_path, monkeypatch):
+    noise_mm = []
+    monkeypatch.setattr(loop, "smoothed", lambda kinematics, noise: noise_mm.append(noise) or kinematics)
+    with pytest.raises(FileNotFoundError):
+        adapt(recording, StandIn(world.u), labels=tmp_path / "none.json", folder=tmp_path, progress=False)
+    assert noise_mm == [recording.robot_accuracy_mm]
 
 
 def test_shut_jaws_borrow_the_axes_of_another_time(world, recording):

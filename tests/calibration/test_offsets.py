@@ -122,10 +122,11 @@ def test_a_landmark_far_from_its_report_is_no_outlier(seed, turn_rad):
     assert found.view_inliers.all() and found.reprojection_rms_px < 2
 
 
-def test_a_landmark_that_is_another_point_of_the_tool_stays_left_out():
+@pytest.mark.parametrize("beside_mm", [0.35, 0.8])
+def test_a_landmark_that_is_another_point_of_the_tool_stays_left_out(beside_mm):
     data, rig, _ = tool_sweep(0, turn_rad=0.4)
     tip = data.landmark == 1
-    beside = 0.8 * tool_axes(data.grid("x_mm"))[:, :, 0] @ rig.linear.T  # along the tool
+    beside = beside_mm * tool_axes(data.grid("x_mm"))[:, :, 0] @ rig.linear.T  # along the tool
     u = data.stacked_px + np.where(tip[:, None], np.repeat(beside, 3, axis=0), 0.0)
     found = calibrate(replace(data, u_left=u[:, :2], u_right=u[:, 2:]))
     assert not found.inliers[tip].any() and found.inliers[~tip].all()

@@ -229,7 +229,7 @@ def test_jaws_that_the_robot_reports_crossed_raise_no_alarm(shut):
     offset = np.array([[0.02, -0.15, 0.0], [-0.05, -0.15, 0.04], [0.05, 0.15, -0.03]])
     tool = np.zeros((n, 3, 3))
     tool[:, 1:, 0], tool[:, 2, 1] = 3.0, 0.3 + 0.2 * np.sin(2.1 * t)
-    tool[45:, 2, 1] = 0.1
+    tool[45:, 2, 1] = np.maximum(np.linspace(0.5, 0.1, 10)[np.minimum(np.arange(shut), 9)], 0.1)
     tool[:, 1, 1] = -tool[:, 2, 1]
     turn = np.sin(np.outer(t, [0.9, 1.3, 0.7])) * [0.5, 0.3, 0.6]
     turn[45:, 0] = turn[44, 0]  # what shut jaws do not tell

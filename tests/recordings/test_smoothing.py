@@ -26,7 +26,9 @@ def test_noise_is_averaged_out_and_motion_is_not(how, left):
 def test_a_polynomial_is_its_own_smoothing():
     time_s = np.arange(200) / 50
     x = (time_s[:, None] ** np.arange(5) @ np.random.default_rng(0).normal(size=(5, 9))).reshape(-1, 3, 3)
-    np.testing.assert_allclose(smoothed(Kinematics(time_s, x), 0.01).x_mm, x, atol=1e-8)
+    found = smoothed(Kinematics(time_s, x), 0.01).x_mm
+    np.testing.assert_allclose(found, x, atol=1e-8)
+    assert (found != x).any()
 
 
 def test_dropped_samples_stay_dropped_and_harm_no_others():
@@ -35,6 +37,15 @@ def test_dropped_samples_stay_dropped_and_harm_no_others():
     found = smoothed(reported, 0.01).x_mm
     np.testing.assert_array_equal(np.isnan(found), np.isnan(reported.x_mm))
     assert np.nanstd(found - true) < 0.005
+
+
+def test_nothing_is_averaged_across_a_gap():
+    reported, _ = log()
+    reported.time_s[400:] += 0.4
+    halves = [Kinematics(reported.time_s[part], reported.x_mm[part]) for part in (np.s_[:400], np.s_[400:])]
+    inner = np.r_[0:396, 404:800]  # those beside the gap may choose other windows
+    alone = np.concatenate([smoothed(half, 0.01).x_mm for half in halves])
+    np.testing.assert_allclose(smoothed(reported, 0.01).x_mm[inner], alone[inner], atol=1e-9)
 
 
 def test_a_jump_is_not_rounded():
