@@ -25,8 +25,8 @@ from lib.correspondences import Correspondences
 
 #: Step of the offsets' derivatives, mm or px.
 _STEP = 1e-4
-#: Largest offset, from the mean of all, that may explain two cameras, and largest one that may explain a landmark which agrees
-#: with no camera of the others: what is farther off is another point of the tool.
+#: Largest offset, from the mean of all, that may explain two cameras, and largest one that may explain a landmark which
+#: agrees with no camera of the others: what is farther off is another point of the tool.
 _MOST_MM, _MOST_ALONE_MM = 0.4, 0.25
 #: So many first steps use every detection; later ones drop those that fit another camera.
 _TAKEN = 4
