@@ -65,8 +65,7 @@ def match(
         depth_range_mm = tuple(float(z) for z in depth_range_mm)
         if len(depth_range_mm) != 2 or not np.isfinite(depth_range_mm).all() or depth_range_mm[0] >= depth_range_mm[1]:
             raise ValueError(f"depth_range_mm: expected (near, far) with near < far, got {depth_range_mm}.")
-    if method is None:
-        method = "deepmatching" if rig is None else "band"
+    method = ("deepmatching" if rig is None else "band") if method is None else method
     where = (setting, depth_range_mm, max_epipolar_px)
     if method == "deepmatching":
         matches = match_free(images, masks, downscale, budget_bytes=budget_bytes, reciprocal=reciprocal, device=device)
