@@ -176,8 +176,7 @@ def decode(heatmaps: Tensor, stride: int, *, method: str = "gauss_newton", sigma
     width, covariance = torch.ones_like(value), torch.full_like(u[..., None, :].expand(*u.shape, 2), torch.nan)
     if method == "gauss_newton":
         u, width, covariance = _gauss_newton(heatmaps, sigma, u, value)
-    h, w = heatmaps.shape[-2:]
-    rows, columns = (torch.arange(n, dtype=u.dtype, device=u.device) for n in (h, w))
+    rows, columns = (torch.arange(n, dtype=u.dtype, device=u.device) for n in heatmaps.shape[-2:])
     far = (rows[:, None] - u[..., 1, None, None]) ** 2 + (columns - u[..., 0, None, None]) ** 2 > (3 * sigma) ** 2
     rival = torch.where(far, heatmaps, torch.zeros_like(heatmaps)).flatten(-2).amax(-1)
     u_px = stride * u + (stride - 1) / 2  # as `lib.geometry.image_from_cell`
