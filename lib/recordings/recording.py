@@ -71,8 +71,7 @@ class Kinematics:
         NaN before the first sample, after the last, beside a dropped one, and in a gap of half a second and ten samples.
         """
         time, k = np.asarray(time_s, dtype=np.float64), self.x_mm.shape[1]
-        if time.ndim == 1:
-            time = np.repeat(time[:, None], k, axis=1)
+        time = np.repeat(time[:, None], k, axis=1) if time.ndim == 1 else time
         if time.ndim != 2 or time.shape[1] != k:
             raise ValueError(f"time_s: expected (n,) or (n, {k}), got {time.shape}.")
         x = np.empty((*time.shape, 3))
