@@ -91,9 +91,7 @@ class Video:
             image = cv2.cvtColor(ycc, cv2.COLOR_YCrCb2RGB)
         if self.quality < 100:
             image = compressed(image, int(self.quality))
-        if self.resample != 1.0:
-            image = cv2.resize(image, (width, height), interpolation=cv2.INTER_LINEAR)
-        return image
+        return image if self.resample == 1.0 else cv2.resize(image, (width, height), interpolation=cv2.INTER_LINEAR)
 
     def shrunk(self, factor: float) -> Self:
         """For an image of which every length is `factor` times as long; compression and noise stay."""

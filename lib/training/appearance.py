@@ -126,9 +126,7 @@ def _things_in_front(x, u, hidden, rng: np.random.Generator, length_px: float) -
 
 
 def _optics(x: np.ndarray, rng: np.random.Generator, length_px: float) -> tuple[np.ndarray, float]:
-    blur_px = 0.0
-    if rng.random() < 0.35:
-        blur_px = float(np.exp(rng.uniform(np.log(0.4), np.log(max(0.1 * length_px, 0.8)))))
+    blur_px = float(np.exp(rng.uniform(np.log(0.4), np.log(max(0.1 * length_px, 0.8))))) if rng.random() < 0.35 else 0.0
     if rng.random() < 0.04:
         blur_px = rng.uniform(0.1, 0.4) * length_px
     if blur_px:
@@ -156,6 +154,4 @@ def _camera(x: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         x = x.copy()
         x[1::2] = np.roll(x[1::2], int(rng.integers(-2, 3)), axis=1)
     image = np.clip(x * 255 + 0.5, 0, 255).astype(np.uint8)
-    if rng.random() < 0.35:
-        image = compressed(image, int(rng.integers(15, 92)))
-    return image
+    return compressed(image, int(rng.integers(15, 92))) if rng.random() < 0.35 else image
