@@ -19,10 +19,10 @@ _MOST = 1.5
 def smoothed(kinematics: Kinematics, noise_mm: float) -> Kinematics:
     """The log with each sample moved to a local polynomial of the samples around it, in their own times.
 
-    Its window is the one whose polynomials best predict the samples that they leave out, thereabouts.  Samples stay as they
-    are where that would move a landmark by more than 1.5 times `noise_mm`, the robot's accuracy per coordinate (RMS of a few
-    samples): at jumps, and where the log is too slow for the motion.  Samples without all landmarks, and those that repeat
-    each other and so count as frozen, stay and tell nothing.
+    Each sample has the window whose polynomials best predict it and its neighbours when these are left out.  Where that would
+    move a landmark by more than 1.5 times `noise_mm`, the robot's accuracy per coordinate (RMS of a few samples), they stay
+    as they are: at jumps, and where the log is too slow for the motion.  A sample that lacks a landmark, or repeats its
+    neighbour as a frozen log does, stays too, and no polynomial uses it.
     (Cleveland, "Robust locally weighted regression and smoothing scatterplots", 1979.)
 
     >>> rng, time_s = np.random.default_rng(0), np.arange(400) / 100
