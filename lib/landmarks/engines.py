@@ -1,4 +1,4 @@
-"""Engines that run a network on a CPU: torch, or OpenVINO, which is faster in the same precision.
+"""Engines that run a network: torch, on a CPU or an NVIDIA GPU, or OpenVINO, which is faster on a CPU in the same precision.
 
 ``"openvino"`` computes in bfloat16 where the processor has matrix units for it (AMX), else in float32: without them
 bfloat16 is no faster, as the recorded table of the detector's speed shows.  In bfloat16 heatmaps differ by about 0.01 of
@@ -24,7 +24,7 @@ from lib.landmarks.checkpoints import checksum
 from lib.landmarks.network import Network
 
 #: ``"openvino"`` chooses the faster precision for the processor.
-ENGINES = ("torch", "openvino", "openvino float32", "openvino bfloat16")
+ENGINES = ("torch", "cuda", "openvino", "openvino float32", "openvino bfloat16")
 #: How many images are run at once; fewer are filled up to the next of these.
 BATCHES = (1, 2, 3, 6)
 _lock = threading.Lock()
@@ -39,11 +39,13 @@ def openvino():
 
 
 def default_engine() -> str:
-    """``"openvino"`` where it is installed, else ``"torch"``.
+    """``"cuda"`` where there is an NVIDIA GPU, else ``"openvino"`` where it is installed, else ``"torch"``.
 
     >>> default_engine() in ENGINES
     True
     """
+    if torch.cuda.is_available():
+        return "cuda"
     return "openvino" if importlib.util.find_spec("openvino") else "torch"
 
 
@@ -60,8 +62,12 @@ def accelerated(network: Network, engine: str, *, mirror: bool = False) -> Calla
         chosen = torch.cpu.get_capabilities().get("amx_bf16", False)
         bfloat16 = {"openvino float32": False, "openvino bfloat16": True}.get(engine, chosen)
         return OpenVinoNetwork(network, mirror=mirror, precision="bf16" if bfloat16 else "f32")
-    last = cache(lambda: LastOutput(network, mirror=mirror).to(memory_format=torch.channels_last))  # made when it is needed
-    return lambda images: [last()(images)]
+    if engine == "cuda" and not torch.cuda.is_available():
+        raise ValueError("engine: torch sees no NVIDIA GPU here; choose 'torch'.")
+    device = "cuda" if engine == "cuda" else "cpu"
+    # Made when it is needed.
+    last = cache(lambda: LastOutput(network, mirror=mirror).to(device, memory_format=torch.channels_last))
+    return lambda images: [last()(images.to(device)).cpu()]
 
 
 class LastOutput(nn.Module):

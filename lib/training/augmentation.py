@@ -6,6 +6,7 @@ training repeats itself.
 """
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import kornia.augmentation as K
 import numpy as np
@@ -79,7 +80,7 @@ class Augmentation:
                 images = torch.cat([self.light()(images[:changed]).clamp(0, 1), images[changed:]])
         if self.mirror:
             flip = np.flatnonzero(rng.random(len(u)) < 0.5)
-            images = images.index_copy(0, torch.from_numpy(flip), images[flip].flip(-2))
+            images = images.index_copy(0, torch.from_numpy(flip).to(images.device), images[flip].flip(-2))
             u[flip, :, 1] = images.shape[-2] - 1 - u[flip, :, 1]
             u[flip], visibility[flip] = u[flip][:, [0, 2, 1]], visibility[flip][:, [0, 2, 1]]
         if changed:
@@ -101,19 +102,19 @@ class Augmentation:
 
     def _occlude(self, images: Tensor, u: Tensor, visibility: Tensor, rng: np.random.Generator) -> None:
         """Add glints (bright discs) and things in front (smooth ellipses), in place; what the latter cover is occluded."""
-        h, w = images.shape[-2:]
-        pixels = torch.stack(torch.meshgrid(torch.arange(w), torch.arange(h), indexing="xy"), -1).double()
+        (h, w), to = images.shape[-2:], partial(torch.as_tensor, device=images.device)
+        pixels = to(np.stack(np.meshgrid(np.arange(w), np.arange(h)), -1, dtype=float))
         for i in range(len(images)):
             if rng.random() < 0.3 * self.photometric:
                 centre, radius = rng.uniform((0, 0), (w, h)), rng.uniform(1.0, 0.03 * h + 2)
-                glow = torch.exp(-0.5 * (pixels - torch.from_numpy(centre)).square().sum(-1) / radius**2)
+                glow = torch.exp(-0.5 * (pixels - to(centre)).square().sum(-1) / radius**2)
                 images[i] = (images[i] + rng.uniform(0.4, 1.0) * glow).clamp(0, 1)
             if rng.random() < 0.15 * self.photometric:
                 centre, axes, angle = rng.uniform((0, 0), (w, h)), rng.uniform(0.03, 0.12, 2) * h, rng.uniform(0, np.pi)
                 turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]) / axes
-                from_centre = ((at - torch.from_numpy(centre)) @ torch.from_numpy(turn) for at in (pixels, u[i].double()))
+                from_centre = ((at - to(centre)) @ to(turn) for at in (pixels, u[i].double()))
                 cover, covered = (torch.sigmoid(6 * (1 - part.square().sum(-1))) for part in from_centre)
-                colour = torch.from_numpy(rng.uniform(0.02, 0.8) * rng.uniform(0.5, 1.0, 3))
+                colour = to(rng.uniform(0.02, 0.8) * rng.uniform(0.5, 1.0, 3))
                 images[i] = images[i] * (1 - cover) + colour[:, None, None] * cover
                 visibility[i] = torch.where((covered > 0.3) & (visibility[i] == VISIBLE), OCCLUDED, visibility[i])
 

@@ -14,10 +14,12 @@ from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 
+import cv2
 import numpy as np
 import torch
 import torch.distributed as dist
 from torch import Tensor, nn
+from torch.utils.data import DataLoader, Dataset
 from tqdm.auto import tqdm
 
 from lib.geometry import check
@@ -25,7 +27,8 @@ from lib.landmarks.checkpoints import checksum, load_network, read_checkpoint, w
 from lib.landmarks.error_model import closeup_peaks
 from lib.landmarks.heatmaps import SIGMA_PX, decode
 from lib.landmarks.metrics import score, tool_length_px
-from lib.landmarks.network import HourglassConfig, Network, OffsetConfig, OffsetNetwork, as_tensor, network_of
+from lib.landmarks.network import HourglassConfig, Network, OffsetConfig, OffsetNetwork, network_of
+from lib.parallel import cores
 from lib.provenance import commit_id, machine
 from lib.training.augmentation import AUGMENTATIONS, Augmentation, Batch, leave_frame
 from lib.training.losses import heatmap_loss, offset_loss
@@ -115,18 +118,42 @@ class Training:
     provenance: dict[str, object]
 
 
-def draw_batch(source: Source, config: TrainingConfig, step: int, rank: int = 0) -> Batch:
-    """The augmented batch of a step; `rank` is the number of the process among those that train together."""
+def draw_batch(source: Source, config: TrainingConfig, step: int, rank: int = 0) -> tuple[object, ...]:
+    """Images, landmarks and visibilities of a step, and the generator that `prepared` goes on with.
+
+    `rank` is the number of the process among those that train together.
+    """
     rng = np.random.default_rng([config.seed, step, *([rank] if rank else [])])
     indices = rng.choice(len(source), config.batch_size, replace=len(source) < config.batch_size)
-    drawn = map(np.stack, zip(*(source.draw(int(i), rng) for i in indices), strict=True))
-    return config.augmentation(_batch(*drawn), rng)
+    return *map(np.stack, zip(*(source.draw(int(i), rng) for i in indices), strict=True)), rng
 
 
-def _batch(images: np.ndarray, u: np.ndarray, visibility: np.ndarray) -> Batch:
+def prepared(drawn: Sequence, config: TrainingConfig, device: torch.device | str = "cpu") -> Batch:
+    """What `draw_batch` gave, augmented on the device that trains."""
+    *arrays, rng = drawn
+    return config.augmentation(_batch(*arrays, device), rng)
+
+
+class _Batches(Dataset):
+    """Batches by the number of their step, so that other processes can draw them ahead."""
+
+    def __init__(self, *drawn: object):
+        self.source, self.config, self.rank = drawn
+
+    def __getitem__(self, step: int) -> tuple[object, ...]:
+        return draw_batch(self.source, self.config, step, self.rank)
+
+
+def _alone(_: int) -> None:
+    """In a process that draws: it has one core."""
+    cv2.setNumThreads(1)
+
+
+def _batch(images: np.ndarray, u: np.ndarray, visibility: np.ndarray, device: torch.device | str = "cpu") -> Batch:
     """As tensors; landmarks outside the image are absent."""
-    tensor, u = as_tensor(images).contiguous(), torch.from_numpy(u).float()
-    return Batch(tensor, u, leave_frame(u, torch.from_numpy(visibility.astype(np.int64)), tuple(tensor.shape[-2:])))
+    images, u, visibility = (torch.as_tensor(part).to(device) for part in (images, u, visibility))
+    images, u = images.permute(0, 3, 1, 2).float().div_(255.0).contiguous(), u.float()
+    return Batch(images, u, leave_frame(u, visibility.long(), tuple(images.shape[-2:])))
 
 
 def _loss(network: Network, outputs: Sequence[Tensor], batch: Batch, config: TrainingConfig) -> Tensor:
@@ -199,15 +226,18 @@ class Run:
         self.average = copy.deepcopy(self.network) if config.ema else None
         self.usable = self.average or self.network
         self.optimiser: torch.optim.Optimizer = _OPTIMISERS[config.optimiser](self.network.parameters(), config.learning_rate)
+        self.forward: Callable[[Tensor], list[Tensor]] | None = None
         self.step, self.seconds, self.log, self.loss_sum, self.since = 0, 0.0, [], 0.0, 0  # both since the last validation
 
     def advance(self, batch: Batch, spent: float = 0.0) -> None:
-        """One step; `spent` as in `TrainingConfig.rate`."""
+        """One step on a batch on the device; `spent` as in `TrainingConfig.rate`."""
         self.network.train()
         self.optimiser.param_groups[0]["lr"] = self.config.rate(self.step, spent)
-        batch = Batch(*(part.to(self.device) for part in (batch.images, batch.u, batch.visibility)))
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.mixed):
-            outputs = self.network(batch.images.contiguous(memory_format=torch.channels_last))
+        images, graphs = batch.images.contiguous(memory_format=torch.channels_last), self.device.type == "cuda"
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.mixed, cache_enabled=not graphs):
+            if self.forward is None:
+                self.forward = self._graphed(images) if graphs and self.world == 1 else self.network
+            outputs = self.forward(images)
         loss = _loss(self.network, outputs, batch, self.config)
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
@@ -226,6 +256,13 @@ class Run:
                 mean.lerp_(value, 1 - decay) if mean.is_floating_point() else mean.copy_(value)
         self.step += 1
         self.loss_sum, self.since = self.loss_sum + loss.item(), self.since + 1
+
+    def _graphed(self, images: Tensor) -> Callable[[Tensor], list[Tensor]]:
+        """The network as CUDA graphs: a step is a thousand small kernels, which take longer to launch than to run."""
+        before = copy.deepcopy(self.network.state_dict())  # capturing moves the statistics of batch normalisation
+        graphed = torch.cuda.make_graphed_callables(copy.copy(self.network), (images,))
+        self.network.load_state_dict(before)
+        return graphed
 
     def save(self, path: Path, provenance: dict[str, object]) -> None:
         tensors = {f"network.{k}": v for k, v in self.network.state_dict().items()}
@@ -291,10 +328,14 @@ def train(
             run.restore(last, provenance)
     keeps = last is not None and run.rank == 0
     began, before, stop, saved = time.perf_counter(), run.seconds, False, time.perf_counter()
+    # A GPU learns faster than one process draws.
+    ahead = {"num_workers": max(1, cores() // run.world - 1), "worker_init_fn": _alone} if run.device.type == "cuda" else {}
+    steps = range(run.step, config.steps)
+    batches = iter(DataLoader(_Batches(source, config, run.rank), batch_size=None, sampler=steps, **ahead))
     with tqdm(total=config.steps, initial=run.step, disable=progress is not True or run.rank > 0, unit="step") as bar:
         while run.step < config.steps and not stop:
             spent = (time.perf_counter() - began) / max_seconds if max_seconds else 0.0
-            run.advance(draw_batch(source, config, run.step, run.rank), spent)
+            run.advance(prepared(next(batches), config, run.device), spent)
             bar.update()
             if callable(progress):
                 progress(min(1.0, max(run.step / config.steps, spent)))

@@ -128,7 +128,9 @@ def finetune(
         return found
 
     # A second thread of torch's own makes such small steps hardly faster, and far slower where the machine is busy.
-    threads, networks, own = min(cores(), len(names)), {}, {"initializer": torch.set_num_threads, "initargs": (1,)}
+    # A GPU is busy with one.
+    threads, networks = 1 if torch.cuda.is_available() else min(cores(), len(names)), {}
+    own = {"initializer": torch.set_num_threads, "initargs": (1,)}
     lanes = [names[first::threads] for first in range(threads)]  # two threads: frame and closeup beside tool
     with single_threaded_torch(), ThreadPoolExecutor(threads, **own) as pool:
         try:

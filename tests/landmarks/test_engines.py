@@ -100,7 +100,20 @@ def test_openvino_tells_nobody():
     assert sys.modules["openvino_telemetry"] is None
 
 
+@pytest.mark.cuda
+def test_a_gpu_finds_what_a_cpu_finds():
+    torch.manual_seed(0)
+    network, images = StackedHourglass(HourglassConfig(4, 2, 1)).eval(), torch.rand(3, 3, 33, 47)
+    for head in network.heads:
+        torch.nn.init.normal_(head.weight)
+    with torch.inference_mode():
+        gpu, cpu = (accelerated(network, engine, mirror=False)(images)[-1] for engine in ("cuda", "torch"))
+    assert gpu.device.type == "cpu"
+    assert torch.allclose(gpu, cpu, atol=0.01 * float(cpu.abs().max()))
+
+
 def test_unknown_and_missing_engines_are_named(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     network = StackedHourglass(HourglassConfig(8, 1, 2))
     with pytest.raises(ValueError, match="'abacus' is none"):
         Detector(network, engine="abacus")
@@ -108,3 +121,5 @@ def test_unknown_and_missing_engines_are_named(monkeypatch):
     assert default_engine() == "torch"
     with pytest.raises(ValueError, match="not installed here"):
         accelerated(network, "openvino")
+    with pytest.raises(ValueError, match="sees no NVIDIA GPU here"):
+        accelerated(network, "cuda")

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from torch.utils.data import DataLoader
 
 from lib.landmarks.heatmaps import render
 from lib.landmarks.network import HourglassConfig, OffsetConfig, OffsetNetwork, StackedHourglass
@@ -214,7 +215,7 @@ def test_averaging_over_processes_is_a_batch_of_all(monkeypatch, toy):
     for head in network.heads:
         torch.nn.init.normal_(head.weight, std=0.1)
     data = toy(4)
-    batches = [loop.draw_batch(data, replace(SMALL, seed=s), 0) for s in (0, 1)]
+    batches = [loop.prepared(loop.draw_batch(data, c := replace(SMALL, seed=s), 0), c) for s in (0, 1)]
 
     def gradients(batch):
         network.zero_grad()
@@ -227,6 +228,30 @@ def test_averaging_over_processes_is_a_batch_of_all(monkeypatch, toy):
     loop.average(mine, 2)
     for a, b in zip(mine, gradients(joined), strict=True):
         assert torch.allclose(a, b, atol=1e-5 + 1e-3 * float(b.abs().max()))
+
+
+def test_batches_that_other_processes_draw_are_the_same(toy):
+    data = toy(6)
+    ahead = DataLoader(loop._Batches(data, SMALL, 0), batch_size=None, sampler=range(3, 6), num_workers=2,
+                       worker_init_fn=loop._alone)  # fmt: skip
+    for step, drawn in zip(range(3, 6), ahead, strict=True):
+        one, other = loop.prepared(drawn, SMALL), loop.prepared(loop.draw_batch(data, SMALL, step), SMALL)
+        assert all(torch.equal(getattr(one, k), getattr(other, k)) for k in ("images", "u", "visibility"))
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("precision", ["fp32", "bf16"])
+def test_a_gpu_learns_what_a_cpu_does_and_resumes(monkeypatch, toy, tmp_path, precision):
+    config, data = replace(SMALL, steps=12, validate_every=4, precision=precision), (toy(6), toy(2, seed=1))
+    train(replace(config), *data, tmp_path, progress=False, max_seconds=0)  # stops after a step
+    on_gpu = train(config, *data, tmp_path, progress=False)
+    assert next(on_gpu.network.parameters()).device.type == "cpu"
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    on_cpu = train(replace(config, precision="fp32"), *data, progress=False)
+    assert on_gpu.log[-1]["loss"] == pytest.approx(on_cpu.log[-1]["loss"], rel=0.05)
+    image = torch.rand(1, 3, 64, 64)
+    gpu, cpu = (training.network(image)[-1] for training in (on_gpu, on_cpu))
+    assert (gpu - cpu).abs().max() < 0.1 * cpu.abs().max() + 0.02
 
 
 def test_a_checkpoint_older_than_an_option_resumes_by_its_default(toy, tmp_path):
