@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import os
 import shutil
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 for _variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"):
@@ -85,6 +86,26 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> object | 
             return TOGETHER.get(file, file)
 
     return Scheduling(config, log)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def hidden_gpu() -> Iterator[Callable[[], bool] | None]:
+    """Tests expect what a CPU computes, to the last bit; what sees the GPU is kept for `gpu`."""
+    if shutil.which("nvidia-smi") is None:
+        yield None
+        return
+    import torch
+
+    with pytest.MonkeyPatch.context() as patch:
+        sees = torch.cuda.is_available
+        patch.setattr(torch.cuda, "is_available", lambda: False)
+        yield sees
+
+
+@pytest.fixture
+def gpu(hidden_gpu: Callable[[], bool], monkeypatch: pytest.MonkeyPatch) -> None:
+    """For a test marked cuda: torch sees the GPU."""
+    monkeypatch.setattr("torch.cuda.is_available", hidden_gpu)
 
 
 def _torch_sees_cuda() -> bool:

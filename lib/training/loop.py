@@ -149,6 +149,13 @@ def _alone(_: int) -> None:
     cv2.setNumThreads(1)
 
 
+def _batches(source: Source, config: TrainingConfig, steps: range, rank: int, workers: int) -> DataLoader:
+    """The steps' batches, as `draw_batch` gives them; `workers` processes draw them ahead, or this one when they are due."""
+    # Not forked: OpenCV waits for ever for threads that a fork leaves behind.
+    ahead = {"num_workers": workers, "worker_init_fn": _alone, "multiprocessing_context": "spawn"} if workers else {}
+    return DataLoader(_Batches(source, config, rank), batch_size=None, sampler=steps, **ahead)
+
+
 def _batch(images: np.ndarray, u: np.ndarray, visibility: np.ndarray, device: torch.device | str = "cpu") -> Batch:
     """As tensors; landmarks outside the image are absent."""
     images, u, visibility = (torch.as_tensor(part).to(device) for part in (images, u, visibility))
@@ -329,9 +336,8 @@ def train(
     keeps = last is not None and run.rank == 0
     began, before, stop, saved = time.perf_counter(), run.seconds, False, time.perf_counter()
     # A GPU learns faster than one process draws.
-    ahead = {"num_workers": max(1, cores() // run.world - 1), "worker_init_fn": _alone} if run.device.type == "cuda" else {}
-    steps = range(run.step, config.steps)
-    batches = iter(DataLoader(_Batches(source, config, run.rank), batch_size=None, sampler=steps, **ahead))
+    workers = max(1, cores() // run.world - 1) if run.device.type == "cuda" else 0
+    batches = iter(_batches(source, config, range(run.step, config.steps), run.rank, workers))
     with tqdm(total=config.steps, initial=run.step, disable=progress is not True or run.rank > 0, unit="step") as bar:
         while run.step < config.steps and not stop:
             spent = (time.perf_counter() - began) / max_seconds if max_seconds else 0.0

@@ -101,7 +101,7 @@ def test_openvino_tells_nobody():
 
 
 @pytest.mark.cuda
-def test_a_gpu_finds_what_a_cpu_finds():
+def test_a_gpu_finds_what_a_cpu_finds(gpu):
     torch.manual_seed(0)
     network, images = StackedHourglass(HourglassConfig(4, 2, 1)).eval(), torch.rand(3, 3, 33, 47)
     for head in network.heads:

@@ -198,7 +198,7 @@ def test_responses_grow_sure(textured):
     assert near[2] < near[0]
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@pytest.mark.cuda
 def test_cuda_gives_the_same_matches(textured):
     right = np.roll(textured, -10, axis=1)
     on_cpu, on_gpu = match(textured, right), match(textured, right, device="cuda")
