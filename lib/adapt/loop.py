@@ -30,7 +30,7 @@ from lib.trust.health import spread
 
 #: Most rounds of training, and most steps of a stage in one; the time ends most trainings.
 ROUNDS, STEPS = 3, 4000
-RECIPE = 11  # raised where teaching or training changes: what an older one kept is not gone on with
+RECIPE = 12  # raised where teaching or training changes: what an older one kept is not gone on with
 #: Share of the time left that a round takes, and fewest images for stopping to which alone the doubt is fitted.
 _ROUND_SHARE, _DOUBT_IMAGES = 0.85, 10
 #: Most stereo frames that are looked at, spread over the recording.
@@ -97,7 +97,8 @@ def adapt(
     """
     if not isinstance(recording, Recording):
         recording = Recording.open(recording, truth=False)
-    recording = replace(recording, truth=None, kinematics=smoothed(recording.kinematics, recording.robot_accuracy_mm))
+    log, noise_mm = smoothed(recording.kinematics, recording.robot_accuracy_mm)
+    recording = replace(recording, truth=None, kinematics=log, robot_accuracy_mm=noise_mm)
     work = _Work(recording, detector, labels, seed, folder, minutes, progress, tune)
     try:
         return work.adapted()

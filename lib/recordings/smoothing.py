@@ -16,36 +16,40 @@ _SPARE, _CHUNK = 2, 20000
 _MOST = 1.5
 
 
-def smoothed(kinematics: Kinematics, noise_mm: float) -> Kinematics:
-    """The log with each sample moved to a local polynomial of the samples around it, in their own times.
+def smoothed(kinematics: Kinematics, noise_mm: float) -> tuple[Kinematics, float]:
+    """The log with each sample moved to a local polynomial of the samples around it, in their own times, and the noise left.
 
     Each sample has the window whose polynomials best predict it and its neighbours when these are left out.  Where that would
     move a landmark by more than 1.5 times `noise_mm`, the robot's accuracy per coordinate (RMS of a few samples), they stay
     as they are: at jumps, and where the log is too slow for the motion.  A sample that lacks a landmark, or repeats its
-    neighbour as a frozen log does, stays too, and no polynomial uses it.
+    neighbour as a frozen log does, stays too, and no polynomial uses it.  The noise left, mm per coordinate, is the RMS over
+    all samples (Mallows, "Some comments on Cp", 1973).
     (Cleveland, "Robust locally weighted regression and smoothing scatterplots", 1979.)
 
     >>> rng, time_s = np.random.default_rng(0), np.arange(400) / 100
     >>> x_mm = np.stack([np.sin(3 * time_s), np.cos(2 * time_s), time_s], axis=1)[:, None]
-    >>> found = smoothed(Kinematics(time_s, x_mm + rng.normal(0, 0.01, x_mm.shape)), 0.01)
-    >>> bool((found.x_mm - x_mm).std() < 0.005)
-    True
+    >>> found, left_mm = smoothed(Kinematics(time_s, x_mm + rng.normal(0, 0.01, x_mm.shape)), 0.01)
+    >>> bool((found.x_mm - x_mm).std() < 0.005), round(left_mm, 3)
+    (True, 0.004)
     """
     x = kinematics.x_mm.reshape(len(kinematics.x_mm), -1)
     repeats = np.append(False, (np.diff(x, axis=0) == 0).all(axis=1))  # the log stands still
     known = np.isfinite(x).all(axis=1) & ~(repeats | np.append(repeats[1:], False))
-    best, least = x.copy(), np.full(len(x), np.inf)
+    best, least, share = x.copy(), np.full(len(x), np.inf), np.ones(len(x))
     if known.sum() <= 2 * _HALVES[-1]:
-        return kinematics
+        return kinematics, noise_mm
     for half in _HALVES:
         fitted, own = _local_polynomials(kinematics.time_s, x, known, half)
         error = _thereabouts(((x - fitted) / (1 - own)[:, None]) ** 2)  # had the sample been left out
         better = (error < least) & np.isfinite(fitted).all(axis=1)
-        best[better], least[better] = fitted[better], error[better]
+        best[better], least[better], share[better] = fitted[better], error[better], own[better]
     landmarks = np.split((x - best) ** 2, kinematics.x_mm.shape[1], axis=1)
     moves = np.max([_thereabouts(part) for part in landmarks], axis=0)
-    best = np.where((moves < (_MOST * noise_mm) ** 2)[:, None], best, x)
-    return replace(kinematics, x_mm=best.reshape(kinematics.x_mm.shape))
+    smooth = moves < (_MOST * noise_mm) ** 2
+    best = np.where(smooth[:, None], best, x)
+    moved, own = ((x - best)[known] ** 2).mean(), np.where(smooth, share, 1.0)[known].mean()
+    left = max(moved + (2 * own - 1) * noise_mm**2, own * noise_mm**2)
+    return replace(kinematics, x_mm=best.reshape(kinematics.x_mm.shape)), float(np.sqrt(left))
 
 
 def _thereabouts(squares: np.ndarray) -> np.ndarray:

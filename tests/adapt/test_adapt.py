@@ -108,7 +108,7 @@ def test_a_tool_behind_the_cameras_has_no_label(tmp_path):
 
 def test_the_log_that_teaches_is_smoothed(world, recording, tmp_path, monkeypatch):
     noise_mm = []
-    monkeypatch.setattr(loop, "smoothed", lambda kinematics, noise: noise_mm.append(noise) or kinematics)
+    monkeypatch.setattr(loop, "smoothed", lambda kinematics, noise: noise_mm.append(noise) or (kinematics, noise))
     with pytest.raises(FileNotFoundError):
         adapt(recording, StandIn(world.u), labels=tmp_path / "none.json", folder=tmp_path, progress=False)
     assert noise_mm == [recording.robot_accuracy_mm]
