@@ -170,7 +170,7 @@ class Detector:
     def load(cls, path_or_name: str | Path | None = None, *, engine: str | None = None) -> Self:
         """A detector from a weights file, or from a name in ``data/models``; None is the one that ships.
 
-        `engine` runs its networks; None is OpenVINO where that is installed (`lib.landmarks.engines`).
+        `engine` runs its networks; None is the fastest one here (`lib.landmarks.engines.default_engine`).
 
         A FileNotFoundError or ValueError if the file is missing, damaged, incomplete, or no detector.
         """
