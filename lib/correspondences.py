@@ -123,10 +123,9 @@ class Correspondences:
             return
         left, right = self.seen.sum(axis=0)
         if min(left, right) >= 4:
-            raise NoDetectionError(
-                f"data: the robot reports a position for {usable} of the {min(left, right)} landmarks that an image shows; "
-                "check offset_s and the times of frames and kinematics (`python3 -m lib check RECORDING`)."
-            )
+            what = f"the robot reports a position for {usable} of the {min(left, right)} landmarks that an image shows"
+            cure = "check offset_s and the times of frames and kinematics (`python3 -m lib check RECORDING`)"
+            raise NoDetectionError(f"data: {what}; {cure}.")
         raise NoDetectionError(
             f"data: the detector failed on {len(np.unique(self.frame))} frames: of {len(self)} landmarks it found {left} "
             f"in left images and {right} in right ones. Do they show the tool, in colour, sharp, 200 to 400 px "

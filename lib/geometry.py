@@ -86,10 +86,8 @@ def pair_covariance(covariance_px2: ArrayLike | Sequence[ArrayLike] | None, n: i
     elif given.shape in ((m, m), (n, m, m)):
         covariance = given.reshape(-1, m, m)
     else:
-        raise ValueError(
-            f"covariance_px2: expected a number, (2, 2), ({m}, {m}), ({n}, {m}, {m}), ({n}, {images}, 2, 2) or a list of "
-            f"({n}, 2, 2), got {given.shape}."
-        )
+        forms = f"a number, (2, 2), ({m}, {m}), ({n}, {m}, {m}), ({n}, {images}, 2, 2) or a list of ({n}, 2, 2)"
+        raise ValueError(f"covariance_px2: expected {forms}, got {given.shape}.")
     # Cheap enough for every frame: what makes a 2 x 2 covariance positive definite, checked of every pair of coordinates.
     variance = np.einsum("nii->ni", covariance)
     excess = covariance**2 - variance[:, :, None] * variance[:, None, :]

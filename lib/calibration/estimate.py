@@ -250,10 +250,9 @@ def _calibrate(
         sd_rad = np.hypot(sigma_u / zoom, sigma_x) / (spread * np.sqrt(views.sum(axis=0).min() / 2))
         if refuse.eyes_exchanged(found.rig.linear, sd_rad):
             degrees = np.rad2deg(-refuse.sides(found.rig.linear)[0])
-            raise ValueError(
-                f"u: the cameras are swapped, left stands on the right by {degrees:.1f} degrees; exchange u_left and u_right "
-                "(or flip both images, if they are mirrored).  checks=False takes them as they are."
-            )
+            what = f"the cameras are swapped, left stands on the right by {degrees:.1f} degrees"
+            cure = "exchange u_left and u_right (or flip both images, if they are mirrored)"
+            raise ValueError(f"u: {what}; {cure}.  checks=False takes them as they are.")
     return found
 
 

@@ -88,10 +88,8 @@ def _one_camera(
         raise NoConsensusError(f"{name}: no consensus, only {count} of {n} rows agree on an affine camera; {cure}.")
     apart = n - count <= _TAILS * n or found.wider_px >= _CONTRAST * found.sigma_px
     if found.sigma_px > _LARGEST_NOISE[1 if apart else 0] * extent:
-        raise NoConsensusError(
-            f"{name}: no consensus, all rows look like outliers: the best affine camera leaves {found.sigma_px:.3g} px in "
-            f"{count} of {n} rows, and the others do not stand apart; {cure}."
-        )
+        what = f"all rows look like outliers: the best affine camera leaves {found.sigma_px:.3g} px in {count} of {n} rows"
+        raise NoConsensusError(f"{name}: no consensus, {what}, and the others do not stand apart; {cure}.")
     rest, least = np.flatnonzero(~found.keep), max(10, 0.2 * n, 0.5 * count)
     if threshold_px is not None or len(rest) < least:
         return found

@@ -223,12 +223,10 @@ class Detector:
         }
 
     def _check_complete(self, path: str | Path) -> None:
-        lacking = [stage for stage in self.stages if stage not in self.error_models]
-        if lacking:
-            raise ValueError(
-                f"{path}: no error model for {', '.join(lacking)}, so covariance and confidence would mean nothing; "
-                "fit them with `lib.training.error_models.fit_error_models` or `python3 -m lib train assemble`."
-            )
+        if lacking := [stage for stage in self.stages if stage not in self.error_models]:
+            what = f"no error model for {', '.join(lacking)}, so covariance and confidence would mean nothing"
+            cure = "fit them with `lib.training.error_models.fit_error_models` or `python3 -m lib train assemble`"
+            raise ValueError(f"{path}: {what}; {cure}.")
 
     def __call__(self, images: ArrayLike, *, batch: int = 4, avoid: np.ndarray | None = None) -> Landmarks:
         """Landmarks of images (n, h, w, 3), uint8 RGB or float in [0, 1]; `batch` images at a time.

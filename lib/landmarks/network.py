@@ -180,10 +180,8 @@ class StackedHourglass(Network):
 
     def forward(self, images: Tensor) -> list[Tensor]:
         if images.ndim != 4 or images.shape[1] != 3:
-            raise ValueError(
-                f"images: the network takes (n, 3, h, w) RGB, got {tuple(images.shape)}. "
-                "Repeat a grey channel three times; drop an alpha channel."
-            )
+            cure = "Repeat a grey channel three times; drop an alpha channel"
+            raise ValueError(f"images: the network takes (n, 3, h, w) RGB, got {tuple(images.shape)}. {cure}.")
         h, w = images.shape[-2:]
         multiple, stride = self.config.multiple, self.stride
         padded = F.pad(images, (0, -w % multiple, 0, -h % multiple))
@@ -266,10 +264,8 @@ def as_uint8(images: ArrayLike) -> np.ndarray:
     if array.ndim == 4 and array.shape[-1] == 1:
         array = np.repeat(array, 3, axis=-1)
     if array.ndim != 4 or array.shape[-1] != 3:
-        raise ValueError(
-            f"images: expected (n, h, w, 3) RGB or (n, h, w, 1) grey, got {array.shape}. "
-            "Add a first axis for one image; drop an alpha channel."
-        )
+        cure = "Add a first axis for one image; drop an alpha channel"
+        raise ValueError(f"images: expected (n, h, w, 3) RGB or (n, h, w, 1) grey, got {array.shape}. {cure}.")
     if not array.size:
         raise ValueError(f"images: empty, {array.shape}; give at least one image.")
     if array.dtype == np.uint8:

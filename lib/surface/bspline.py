@@ -218,10 +218,9 @@ def fit_surface(
     used = grid.inside(u)
     least = max(16, grid.size // 4)
     if used.sum() < least:
-        raise ValueError(
-            f"u: {used.sum()} of {len(u)} points lie in the domain, and {grid.size} control points need {least} or more. "
-            "Match more points, give fewer control points, or check that domain and u are both px of the left image."
-        )
+        what = f"{used.sum()} of {len(u)} points lie in the domain, and {grid.size} control points need {least} or more"
+        cure = "Match more points, give fewer control points, or check that domain and u are both px of the left image"
+        raise ValueError(f"u: {what}. {cure}.")
     spread = np.linalg.svd(u[used] - u[used].mean(axis=0), compute_uv=False)
     if spread[1] < 1e-6 * spread[0]:
         raise ValueError("u: the points lie on one line of the image, which does not determine a surface.")
