@@ -64,8 +64,7 @@ class Landmarks:
     Attributes:
         u: (n, 3, 2) px, NaN where missing.
         covariance: (n, 3, 2, 2) px^2, NaN where missing.
-        confidence: (n, 3), the probability that the landmark is in view and `u` lies within 5 % of the tool's length of it;
-            0 where missing.
+        confidence: (n, 3), the probability that it is in view and `u` within 5 % of the tool's length of it; 0 where missing.
 
         >>> found = Landmarks.none(2)
         >>> len(found), len(found[:1]), found.u.shape
@@ -107,8 +106,7 @@ class Detector:
     """Finds the landmarks in frames of any size and number; one detector serves both cameras.
 
     Attributes:
-        frame_network, frame_px: The first stage, which sees the frame resized so that its longer side is `frame_px`; None =
-            as it is.
+        frame_network, frame_px: The first stage, which sees the frame with a longer side of `frame_px`; None = as it is.
         window_network: A stage that sees one upright window of `window_px`, at full resolution, for each landmark; None = no
             such stage.  The shipped detector has none.
         tool_network: The second stage, which sees one window round the tool; None = no such stage.
@@ -378,8 +376,7 @@ class Detector:
     ) -> Landmarks:
         """Landmarks by a later stage, which looks where the `rough` ones lie; ``"tracking"`` is one too.
 
-        `seen` is what `stage_peaks` gave for them, if that is known.  Closeups are of the landmarks `only` (n, 3); the others
-        stay as they are.
+        `seen` is what `stage_peaks` gave for them, if that is known.  Closeups are of landmarks `only` (n, 3); others stay.
         """
         peaks, matrices, which = seen or self.stage_peaks(images, rough.u, stage, only)
         result = Landmarks.join([rough])  # a copy
@@ -417,8 +414,7 @@ class Detector:
         """The inputs of a stage after the first, round rough landmarks u (n, 3, 2), of closeups the landmarks `only` (n, 3).
 
         Returns windows (m, s, s, 3) uint8; window_from_image (m, 2, 3); and which (m, 2) image and landmark each window
-        shows, or which image (m,) for the looks at the tool.  A tool without base or tips and a missing landmark have no
-        window.
+        shows, or which image (m,) for the looks at the tool.  A tool without base or tips has none, nor a missing landmark.
         """
         u = np.asarray(u, dtype=np.float64)
         (centre, angle), length = view.tool_pose(u), np.maximum(tool_length_px(u), 1.0)

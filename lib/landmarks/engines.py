@@ -1,8 +1,7 @@
 """Engines that run a network: torch, on a CPU or an NVIDIA GPU, or OpenVINO, which is faster on a CPU in the same precision.
 
 ``"openvino"`` computes in bfloat16 where the processor has matrix units for it (AMX), else in float32: without them
-bfloat16 is no faster, as the recorded table of the detector's speed shows.  In bfloat16 heatmaps differ by about 0.01 of
-their height.
+bfloat16 is no faster, as the recorded table of the detector's speed shows.  It changes heatmaps by some 0.01 of their height.
 """
 
 import importlib.util

@@ -34,8 +34,7 @@ class HourglassConfig:
         stacks: Hourglasses in a row, each supervised.
         depth: Halvings inside an hourglass; 4 makes inputs a multiple of 4 * 2**4 = 64.
         growth: By how much the channels multiply with each halving; 1 as in the paper.
-        decoder, skips, residual: The parts that the ablation adds one by one.  Without a decoder the heatmaps have stride
-            4 * 2**depth.
+        decoder, skips, residual: The parts that the ablation adds one by one.  Without a decoder the stride is 4 * 2**depth.
 
         >>> HourglassConfig().stride, HourglassConfig(stacks=1, decoder=False, skips=False).stride
         (4, 64)

@@ -66,9 +66,7 @@ def closeup_scale(length_px: ArrayLike) -> np.ndarray:
 def window_from_image(
     centre: ArrayLike, angle_rad: ArrayLike, size: int | tuple[int, int], zoom: ArrayLike = 1.0
 ) -> np.ndarray:
-    """Matrices (..., 2, 3) that turn by -angle about `centre` (..., 2) and bring it to the middle of the window, whose `size`
-    is its side or (w, h).
-    """
+    """Matrices (..., 2, 3) that turn by -angle about `centre` (..., 2), the middle of a window of `size`, side or (w, h)."""
     centre, angle = np.asarray(centre, dtype=np.float64), np.asarray(angle_rad, dtype=np.float64)
     c, s = np.cos(angle) * zoom, np.sin(angle) * zoom
     linear = np.stack([np.stack([c, s], -1), np.stack([-s, c], -1)], -2)
@@ -114,8 +112,7 @@ def map_points(matrix: np.ndarray, u: ArrayLike) -> np.ndarray:
 
 
 def cut(image: np.ndarray, matrix: np.ndarray, size: int | ArrayLike, *, border: int = cv2.BORDER_CONSTANT) -> np.ndarray:
-    """The window (h, w, 3) uint8 of an image, whose `size` is its side or (w, h); black, or what OpenCV's `border` says,
-    where it leaves the image.
+    """The window (h, w, 3) uint8 of an image, of `size`, its side or (w, h); beyond the image black, or OpenCV's `border`.
 
     A window at less than half the image's scale is the mean over blocks of a finer one, so that nothing aliases; at less
     than a quarter, the part of the image that it shows is halved first, which is quicker.

@@ -136,9 +136,7 @@ def _joined(parts: list[np.ndarray]) -> np.ndarray:
 
 
 def packed(images: Iterable[LabelledImage], long_side_px: int | None = None) -> tuple[np.ndarray, ...]:
-    """Labelled images of any size as (ends (n,), JPEGs one after the other, u (n, 3, 2), visibility (n, 3)), `long_side_px`
-    long at most.
-    """
+    """Labelled images, `long_side_px` long at most, as (ends (n,), JPEGs in a row, u (n, 3, 2), visibility (n, 3))."""
     parts = []
     for _, image, u, visibility, _ in images:
         h, w = image.shape[:2]

@@ -131,8 +131,7 @@ class ToolSource(SceneSource):
     """Upright windows of `windows.TOOL_PX` round the tool, placed, turned and scaled as badly as the stage before does.
 
     Three in ten show no tool that stands upright in its size: peaks must be low there, since they decide between places.
-    Where it is known what a first stage took for tools, four in ten show that: `proposals` (n, m, 3, 2) px, NaN where there
-    are fewer than m.
+    Where it is known what a first stage took for tools, four in ten show that: `proposals` (n, m, 3, 2) px, NaN if fewer.
     """
 
     proposals: np.ndarray | None = None
@@ -205,8 +204,7 @@ class CloseupSource(Source):
     Stretching and shearing an image keeps its labels true and makes many tools of one.
 
     Attributes:
-        shifts_px, shift_shares: Standard deviations of the error of place, in image pixels at the reference scale, and the
-            share of closeups that has each.
+        shifts_px, shift_shares: Standard deviations of the error of place, image pixels at reference scale, and their shares.
         turn_rad, length: Standard deviations of the errors of direction and of the logarithm of the tool's length.
         alone: Share of closeups whose direction is that to one tip, as if the other one were missing.
         stretch, shear: Standard deviations of the logarithms of two stretches, along and across the tool, and of the shear.

@@ -127,8 +127,7 @@ def finetune(
             found[f"{stage}_network"] = train(config, *where, progress=partial(told, stage), **how).network
         return found
 
-    # A second thread of torch's own makes such small steps hardly faster, and far slower where the machine is busy.
-    # A GPU is busy with one.
+    # A second thread of torch's own makes small steps hardly faster, far slower on a busy machine.  A GPU is busy with one.
     threads, networks = 1 if torch.cuda.is_available() else min(cores(), len(names)), {}
     own = {"initializer": torch.set_num_threads, "initargs": (1,)}
     lanes = [names[first::threads] for first in range(threads)]  # two threads: frame and closeup beside tool

@@ -125,8 +125,7 @@ class Problem:
     ) -> Robust:  # fmt: skip
         """Most probable cameras, offsets and additions, near the cameras `start` or the best sample of four rows.
 
-        `columns` gives the change of the pixels by each addition, cameras M -> (n, 2, 2, k); the rows `apart` (n,) bool have
-        a noise of their own.
+        `columns` gives the pixels' change by each addition, cameras M -> (n, 2, 2, k); rows `apart` (n,) bool have own noise.
         """
         apart = np.zeros(len(self), dtype=bool) if apart is None else apart
         if start is None:  # of least squares, or of the samples of four rows that most rows are near to
