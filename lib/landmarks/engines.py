@@ -137,8 +137,7 @@ def _converted(compiled: OpenVinoNetwork) -> object:
             return openvino().Core().read_model(kept)
     shape = (2, 3, *2 * (getattr(compiled.network.config, "size_px", 128),))
     module = LastOutput(compiled.network, mirror=compiled.mirror).eval()
-    with torch.no_grad(), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # tracing fixes the shape, which `reshape` changes
+    with torch.no_grad(), warnings.catch_warnings(action="ignore"):  # tracing fixes the shape, which `reshape` changes
         traced = torch.jit.freeze(torch.jit.trace(module, torch.zeros(shape), check_trace=False))
         model = openvino().convert_model(traced, input=[(list(shape), np.float32)])  # of a trace it is much quicker
     with suppress(OSError, RuntimeError):  # a full disk costs time alone

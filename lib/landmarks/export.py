@@ -105,12 +105,9 @@ def run_onnx(path: str | Path, *inputs: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 def _write(module: nn.Module, example: tuple[Tensor, ...], path: Path) -> None:
     names, inputs = ["u", "covariance", "confidence"], ["images", "rough_u", "rough_confidence"][: len(example)]
-    with torch.no_grad(), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # sizes are fixed by tracing, as they shall be
-        torch.onnx.export(
-            module, example, str(path), dynamo=False, opset_version=18, input_names=inputs, output_names=names,
-            dynamic_axes={name: {0: "n"} for name in [*inputs, *names]},
-        )  # fmt: skip
+    how = {"dynamo": False, "opset_version": 18, "dynamic_axes": {name: {0: "n"} for name in [*inputs, *names]}}
+    with torch.no_grad(), warnings.catch_warnings(action="ignore"):  # sizes are fixed by tracing, as they shall be
+        torch.onnx.export(module, example, str(path), input_names=inputs, output_names=names, **how)
 
 
 def _difference(module: nn.Module, inputs: tuple[Tensor, ...], path: Path, stage: str) -> float:

@@ -157,15 +157,11 @@ class StackedHourglass(Network):
         self.config = config = config or HourglassConfig()
         self.stride = config.stride
         f, half, residual = config.features, config.features // 2, config.residual
+        first = nn.Conv2d(3, half, 6, stride=2, padding=2, bias=False)  # even kernel: centred between pixels 2i and 2i + 1
         self.stem = nn.Sequential(
-            nn.Conv2d(3, half, 6, stride=2, padding=2, bias=False),  # even kernel: centred between pixels 2i and 2i + 1
-            nn.BatchNorm2d(half),
-            nn.ReLU(inplace=True),
-            _box(half, half, residual),
-            nn.MaxPool2d(2),
-            _box(half, f, residual),
-            _box(f, f, residual),
-        )
+            first, nn.BatchNorm2d(half), nn.ReLU(inplace=True), _box(half, half, residual),
+            nn.MaxPool2d(2), _box(half, f, residual), _box(f, f, residual),
+        )  # fmt: skip
         stacks = range(config.stacks)
         self.hourglasses = nn.ModuleList([_Hourglass(config, config.depth, f) for _ in stacks])
         self.features = nn.ModuleList([nn.Sequential(_box(f, f, residual), _conv(f, f, 1)) for _ in stacks])
@@ -232,9 +228,8 @@ class OffsetNetwork(Network):
             _residual(2 * f, 3 * f), _residual(3 * f, 3 * f), _residual(3 * f, 4 * f),
         )  # fmt: skip
         # Fully connected, because a mean over the closeup would lose where something is seen.
-        self.head = nn.Sequential(
-            nn.Flatten(), nn.Linear(4 * f * (config.size_px // 16) ** 2, 128), nn.ReLU(inplace=True), nn.Linear(128, 4)
-        )
+        side = config.size_px // 16
+        self.head = nn.Sequential(nn.Flatten(), nn.Linear(4 * f * side**2, 128), nn.ReLU(inplace=True), nn.Linear(128, 4))
         nn.init.zeros_(self.head[-1].weight)  # the start: in the middle, within about a pixel
         nn.init.zeros_(self.head[-1].bias)
 
