@@ -254,20 +254,16 @@ def match_volume(volume: torch.Tensor, low: int, *, reciprocal: bool = True) -> 
     place = y[kept], x[kept], j[kept], k[kept]
     vertex_x, peaked = _parabola(volume, place, 3)
     vertex_y, _ = _parabola(volume, place, 2)
-    cell = torch.stack([place[3] + low, place[2] - v], dim=1)
-    return VolumeMatches(
-        patch=torch.stack([place[1], place[0]], dim=1).numpy(), cell=cell.numpy(),
-        displacement=(cell + torch.stack([vertex_x, vertex_y], dim=1).double()).numpy(),
-        peaked=peaked.numpy(), reciprocal=passed[kept].numpy(),
-    )  # fmt: skip
+    patch, cell = torch.stack([place[1], place[0]], dim=1), torch.stack([place[3] + low, place[2] - v], dim=1)
+    displacement = cell + torch.stack([vertex_x, vertex_y], dim=1).double()
+    return VolumeMatches(*(part.numpy() for part in (patch, cell, displacement, peaked, passed[kept])))
 
 
 def _parabola(volume: torch.Tensor, place: tuple[torch.Tensor, ...], axis: int) -> tuple[torch.Tensor, torch.Tensor]:
     """Vertex (in [-0.5, 0.5]) of the response around its peak along one axis, 0 where it has no interior peak; has it?"""
     n, index = volume.shape[axis], place[axis]
-    before, centre, after = (
-        volume[tuple((index + step).clamp(0, n - 1) if k == axis else i for k, i in enumerate(place))] for step in (-1, 0, 1)
-    )
+    beside = ([(index + step).clamp(0, n - 1) if k == axis else i for k, i in enumerate(place)] for step in (-1, 0, 1))
+    before, centre, after = (volume[tuple(at)] for at in beside)
     curvature = 2 * centre - before - after
     peaked = (index > 0) & (index < n - 1) & (centre >= before) & (centre >= after) & (curvature > 1e-9)
     return torch.where(peaked, 0.5 * (after - before) / curvature.clamp_min(1e-9), 0.0), peaked
