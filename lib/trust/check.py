@@ -151,10 +151,9 @@ def _facts(recording: Recording, a: Assessment) -> dict[str, str]:
         offsets = zip(LANDMARKS, 1e3 * c.offsets.offset, strict=False)
         parts = ["{}: {:+.0f}, {:+.0f}, {:+.0f} um".format(name, *value) for name, value in offsets]
         facts["landmark offsets"] = "; ".join(parts) + " (along, across, normal)."
-    facts["detector"] = (
-        f"{a.health.text}; {int((a.health.score > 1).sum())} of {len(a.health.frame)} frames have a score above 1 (of frames "
-        f"with right landmarks {100 * a.health.false_alarm_rate:.0f} %)."
-    )
+    bad = f"{int((a.health.score > 1).sum())} of {len(a.health.frame)} frames have a score above 1"
+    usual = f"of frames with right landmarks {100 * a.health.false_alarm_rate:.0f} %"
+    facts["detector"] = f"{a.health.text}; {bad} ({usual})."
     if np.isfinite(a.epipolar_px):
         facts["epipolar witness"] = f"Features of both images lie {a.epipolar_px:.2f} px (median) off the epipolar lines."
     return facts

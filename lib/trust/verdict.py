@@ -254,10 +254,8 @@ def assess(
         error = refused
     if calibration is not None and len(y := feature_matches(recording, spread(len(recording), 3))):
         epipolar_px = float(np.median(np.abs(calibration.pair.epipolar_distance(y[:, :2], y[:, 2:]))))
-    diagnosis = diagnose(
-        data, kinematics=recording.kinematics, offset_s=recording.offset_s, readout_s=recording.readout_s,
-        image_size_px=recording.image_size_px,
-    )  # fmt: skip
+    stated = {name: getattr(recording, name) for name in ("kinematics", "offset_s", "readout_s", "image_size_px")}
+    diagnosis = diagnose(data, **stated)
     found = health(recording, data, calibration, detector=detector)
     verdict = judge(
         data, calibration, diagnosis=diagnosis, health=found, epipolar_px=epipolar_px, error=error,
@@ -302,10 +300,9 @@ def report(calibration: Calibration, *, verdict: Verdict | None = None, robot_ac
         o, x = optics(c), c.x_mm[c.inliers]
         alone, both = (1e3 * np.median(c.depth_sd_mm(x, detection=detection)) for detection in (False, True))
         at = ", ".join(f"{value:.1f}" for value in o.robot_from_microscope.t)
-        lines.append(
-            f"  head          convergence {np.rad2deg(o.convergence_rad):.2f} deg, right image rolled by "
-            f"{np.rad2deg(o.roll_rad):.2f} deg, mirrored: {o.mirrored}; the images' centre is ({at}) mm"
-        )
+        angle, roll = np.rad2deg([o.convergence_rad, o.roll_rad])
+        head = f"convergence {angle:.2f} deg, right image rolled by {roll:.2f} deg, mirrored: {o.mirrored}"
+        lines.append(f"  head          {head}; the images' centre is ({at}) mm")
         lines.append(f"  depth         {both:.0f} um sd of one detected point, of which the calibration {alone:.1f} um")
     if c.offsets is not None:
         scale, unit = (1e3, "um along, across, normal") if c.offsets.offset.shape[1] == 3 else (1.0, "px, left and right")
