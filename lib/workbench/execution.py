@@ -89,10 +89,8 @@ def parse_parameters(pairs: Sequence[tuple[str, str]], notebooks: Sequence[Path]
     for name, _ in pairs:
         if name not in known:
             raise ValueError(f"unknown parameter: {name}. Declared are: {', '.join(sorted(known)) or 'none'}.")
-    return {
-        notebook: {name: _value(name, text, names[name]) for name, text in [("profile", profile), *pairs] if name in names}
-        for notebook, names in declared.items()
-    }
+    given = [("profile", profile), *pairs]
+    return {book: {n: _value(n, text, names[n]) for n, text in given if n in names} for book, names in declared.items()}
 
 
 def positive(text: str) -> float:
@@ -218,10 +216,8 @@ def joined(verdicts: Iterable[dict | None]) -> dict | None:
         return None
     rank = list(VERDICT_COLOURS).index
     reasons = {(r["name"], r["level"], r["text"]): r for verdict in found for r in verdict["reasons"]}
-    return {
-        "verdict": max((verdict["verdict"] for verdict in found), key=rank),
-        "reasons": sorted(reasons.values(), key=lambda reason: -rank(reason["level"])),
-    }
+    worst = max((verdict["verdict"] for verdict in found), key=rank)
+    return {"verdict": worst, "reasons": sorted(reasons.values(), key=lambda reason: -rank(reason["level"]))}
 
 
 def versions() -> dict[str, str]:

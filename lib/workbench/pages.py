@@ -82,10 +82,8 @@ class _Renderer(IPythonRenderer):
 
 def markdown_html(source: str, *, folder: Path = Path(), attachments: dict | None = None, trusted: bool = True) -> str:
     """Markdown with TeX as HTML, with pictures that it names relative to `folder`; HTML that is not `trusted` is escaped."""
-    renderer = _Renderer(
-        escape=not trusted, allow_harmful_protocols=trusted, embed_images=True, path=str(folder),
-        attachments=attachments or {},
-    )  # fmt: skip
+    how = {"escape": not trusted, "allow_harmful_protocols": trusted, "embed_images": True, "path": str(folder)}
+    renderer = _Renderer(attachments=attachments or {}, **how)
     return MarkdownWithMath(renderer=renderer).render(source)
 
 
