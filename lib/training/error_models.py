@@ -87,9 +87,8 @@ class Seen:
         log_variance = np.array([variance(0), variance(1)])
         own = np.exp((ErrorModel(log_variance).coefficients[self.landmark, :2] * self.features[:, :2]).sum(-1))
         correct = self._correct(own)[self.known]
-        logit = fitted(
-            2, lambda z: (np.logaddexp(0, z) - correct * z, expit(z) - correct), self.known, (prior or ErrorModel()).logit
-        )
+        start = (prior or ErrorModel()).logit
+        logit = fitted(2, lambda z: (np.logaddexp(0, z) - correct * z, expit(z) - correct), self.known, start)
         total = own[use] + of_label[:, None]
         normalised, of_own = (squared / total).sum(1), own[use] / total
         for group, columns in ((~tip[use], np.s_[:1]), (tip[use], np.s_[1:3])):

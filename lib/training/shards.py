@@ -70,13 +70,10 @@ def make_shard(path: Path, kind: str, index: int, photographs: Sequence[Path] = 
     n, shares = SCENES[kind]
     sizes = HELD_OUT_SIZES if kind == "held_out" else ((SCENE_PX, round(SCENE_PX * 9 / 16)),)
     textures = VALIDATION_TEXTURE_SEEDS if kind == "held_out" else TEXTURE_SEEDS
-    populations = rng.choice(list(shares), n, p=list(shares.values()))
+    names = rng.choice(list(shares), n, p=list(shares.values())).tolist()
     how = {"textures": textures, "photographs": photographs if kind == "scenes" else ()}
-    drawn = (
-        LabelledImage(name, *sample(rng, size_px=sizes[rng.integers(len(sizes))], population=name, **how))
-        for name in populations.tolist()
-    )
-    ends, jpegs, u, visibility = packed(drawn)
+    drawn = (sample(rng, size_px=sizes[rng.integers(len(sizes))], population=name, **how) for name in names)
+    ends, jpegs, u, visibility = packed(LabelledImage(name, *one) for name, one in zip(names, drawn, strict=True))
     with whole(path) as partial:
         np.savez(partial, jpegs=jpegs, jpeg_ends=ends, u=u, visibility=visibility)
 
