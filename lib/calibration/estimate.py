@@ -215,9 +215,8 @@ def _calibrate(
     for last in (False, False, False, True):
         inliers = views.any(axis=1)
         rows_noise = noise if noise is None or len(noise) == 1 else noise[inliers]
-        minimum, (sigma_u, sigma_x) = _minimise(
-            plan, x[inliers], y[inliers], views[inliers], rows_noise, weighting, known, image_size_px
-        )
+        used = x[inliers], y[inliers], views[inliers], rows_noise
+        minimum, (sigma_u, sigma_x) = _minimise(plan, *used, weighting, known, image_size_px)
         scale = sigma_u / noise_rms_px(claimed if rows_noise is None else rows_noise)
         f, J, _ = minimum.state.evaluate(x, derivatives=False)
         residuals = y - f

@@ -126,9 +126,8 @@ class OnlinePipeline:
             with result.stage("triangulate"):
                 self._tips.triangulate(result, tracker)
         self._follow_surface(result, left, right)
-        reading = result.state in ("tracking", "robot") or (
-            result.state == "unseen" and time_s - self._rests_on["landmarks"] <= self.settings.stale_s
-        )
+        recent = time_s - self._rests_on["landmarks"] <= self.settings.stale_s
+        reading = result.state in ("tracking", "robot") or (result.state == "unseen" and recent)
         if tracker.rig is not None and reading:
             with result.stage("distance"):
                 self._tips.measure(result, tracker, x_mm, self._surface)

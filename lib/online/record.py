@@ -59,9 +59,8 @@ class Recorder:
             with ExitStack() as stack:
                 how = {"encoding": "utf-8", "newline": "", "buffering": 1}  # a line is in the file as soon as it is written
                 paths = (self.folder / name for name in ("frames.csv", "seconds.csv", "input/frames.csv"))
-                told, spent, times = (
-                    csv.writer(stack.enter_context(path.open("w", **how)), lineterminator="\n") for path in paths
-                )
+                files = [stack.enter_context(path.open("w", **how)) for path in paths]
+                told, spent, times = (csv.writer(file, lineterminator="\n") for file in files)
                 told.writerow(row(FrameResult(0)))
                 spent.writerow(["frame", *STAGES])
                 times.writerow(["frame", "time_s"])

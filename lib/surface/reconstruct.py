@@ -182,10 +182,8 @@ def reconstruct(
             raise ValueError("left, right: no match lies on its epipolar line; is there texture, does the rig fit?")
         domain = tuple(np.percentile(matches.u_left, percentiles, axis=0).ravel().tolist())
         depth_only = fast and rig.is_affine if depth_only is None else depth_only
-        surface = fit_surface(
-            matches.u_left, points.x_mm, domain=domain, control=control, smoothness=smoothness,
-            camera=rig.left if depth_only else None, quick=fast,
-        )  # fmt: skip
+        how = {"control": control, "smoothness": smoothness, "camera": rig.left if depth_only else None, "quick": fast}
+        surface = fit_surface(matches.u_left, points.x_mm, domain=domain, **how)
     return Reconstruction(surface, points, matches, len(found), masks["mask_left"], rig, dict(seconds))
 
 
