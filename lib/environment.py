@@ -88,10 +88,9 @@ def _digest(root: Path) -> str:
 
 def _read_stamp(venv: Path) -> dict:
     """{} where there is none; {"state": "making"} where the environment is half made."""
-    try:
+    with contextlib.suppress(OSError, ValueError):
         return json.loads((venv / _STAMP).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
+    return {}
 
 
 def _is_ready(root: Path, torch: str | None) -> bool:
@@ -239,18 +238,15 @@ def missing_libraries(libraries: dict[str, str]) -> str:
 
 
 def _loads(shared_object: str) -> bool:
-    try:
-        ctypes.CDLL(shared_object)
-    except OSError:
-        return False
-    return True
+    with contextlib.suppress(OSError):
+        return ctypes.CDLL(shared_object) is not None
+    return False
 
 
 def _has_nvidia_gpu() -> bool:
-    try:
+    with contextlib.suppress(OSError, subprocess.TimeoutExpired):
         return b"GPU" in subprocess.run(["nvidia-smi", "-L"], capture_output=True, timeout=20).stdout
-    except (OSError, subprocess.TimeoutExpired):
-        return False
+    return False
 
 
 def _check_disk(folder: Path, needed_gb: float) -> None:

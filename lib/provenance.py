@@ -21,12 +21,11 @@ _CODE = ("lib", "notebooks", "tests", "environment.toml")
 def commit(root: Path = paths.ROOT) -> dict | None:
     """The checked-out commit, {"id": ..., "modified": whether the code differs from it}; None outside a git checkout."""
     git = ["git", "-C", str(root)]
-    try:
+    with suppress(OSError, subprocess.CalledProcessError):
         head = subprocess.run([*git, "rev-parse", "HEAD"], capture_output=True, text=True, check=True)
         status = subprocess.run([*git, "status", "--porcelain", "--", *_CODE], capture_output=True, text=True, check=True)
-    except (OSError, subprocess.CalledProcessError):
-        return None
-    return {"id": head.stdout.strip(), "modified": bool(status.stdout.strip())}
+        return {"id": head.stdout.strip(), "modified": bool(status.stdout.strip())}
+    return None
 
 
 def commit_id() -> str:

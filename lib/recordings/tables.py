@@ -61,10 +61,9 @@ def rows_of(path: Path, text: str, separator: str = ",") -> Iterator[tuple[str, 
 
 def number(cell: str, place: str, column: str) -> float:
     """The finite number in a cell, NaN for an empty one."""
-    try:
+    value = math.inf
+    with suppress(ValueError):
         value = float(cell) if cell else 0.0
-    except ValueError:
-        value = math.inf
     if not math.isfinite(value):
         cure = "Check the decimal mark; leave the cell of a missing value empty"
         raise ValueError(f"{place}, column {column}: {cell!r} is not a finite number. {cure}.")
