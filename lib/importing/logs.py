@@ -142,9 +142,7 @@ def _field(message: object, field: str, where: str) -> float | Decimal:
         raise ValueError(f"{where}: this field is no number; name one inside it.") from None
 
 
-def read_robot(
-    folder: Path, mapping: Mapping
-) -> tuple[list[Decimal], np.ndarray, np.ndarray | None, np.ndarray | None]:
+def read_robot(folder: Path, mapping: Mapping) -> tuple[list[Decimal], np.ndarray, np.ndarray | None, np.ndarray | None]:
     """The robot's log, in the robot frame that the mapping asks for.
 
     Exact times (m,), and positions (m, k, 3) mm of the landmarks; or those (m, 1, 3) of the tool's poses, their rotations
