@@ -145,9 +145,8 @@ def render_view(
 
 
 def render_pair(
-    scene: Scene, microscope: Microscope, *, forceps: Forceps | None = None, pose: Pose | None = None, factor: int = 3,
-    **options: object,
-) -> tuple[View, View]:  # fmt: skip
+    scene: Scene, microscope: Microscope, *, forceps: Forceps | None = None, pose: Pose | None = None, **options: object
+) -> tuple[View, View]:
     """The left and right view of one moment; arguments as for `render_view`.
 
     A ValueError refuses a tool that is entirely outside the field of both cameras.
@@ -157,6 +156,6 @@ def render_pair(
         if not any(inside(u, size).any() for u in rig.project(forceps.landmarks(pose))):
             base = f"its base is at {np.round(pose.base_mm, 2).tolist()} mm"
             raise ValueError(f"pose: the tool is outside the field; {base}, move it towards the microscope frame's origin.")
-    options |= {"forceps": forceps, "pose": pose, "factor": factor}
+    options = {"factor": 3} | options | {"forceps": forceps, "pose": pose}
     windows = Window(rig.left, size), Window(rig.right, size)
     return tuple(render_view(scene, microscope, window, side=k, **options) for k, window in enumerate(windows))
