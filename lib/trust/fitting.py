@@ -185,10 +185,8 @@ class Problem:
         design = self._overcount(r * np.sqrt(weight)[:, :, None])
         inverse = np.linalg.inv(information) * np.outer(scale, scale) * design
         offset_sd = np.sqrt(np.diag(inverse)[16:25].reshape(3, 3).sum(axis=1))
-        return Robust(
-            M, beta[25:], inverse[25:, 25:], beta[16:25].reshape(3, 3), offset_sd, inverse[:16, :16], r,
-            tuple(shapes), likelihood, penalty, design,
-        )  # fmt: skip
+        additions, offsets = (beta[25:], inverse[25:, 25:]), (beta[16:25].reshape(3, 3), offset_sd)
+        return Robust(M, *additions, *offsets, inverse[:16, :16], r, tuple(shapes), likelihood, penalty, design)
 
     def _overcount(self, z: np.ndarray) -> float:
         """Variance of the sums of weighted residuals z (n, 2, 2) over stretches of frames, over that of independent ones."""
