@@ -43,9 +43,7 @@ def default_engine() -> str:
     >>> default_engine() in ENGINES
     True
     """
-    if torch.cuda.is_available():
-        return "cuda"
-    return "openvino" if importlib.util.find_spec("openvino") else "torch"
+    return "cuda" if torch.cuda.is_available() else "openvino" if importlib.util.find_spec("openvino") else "torch"
 
 
 def accelerated(network: Network, engine: str, *, mirror: bool = False) -> Callable[[Tensor], list[Tensor]]:
