@@ -33,6 +33,12 @@ ROUNDS, STEPS = 3, 4000
 RECIPE = 12  # raised where teaching or training changes: what an older one kept is not gone on with
 #: Share of the time left that a round takes, and fewest images for stopping to which alone the doubt is fitted.
 _ROUND_SHARE, _DOUBT_IMAGES = 0.85, 10
+#: Share of the robot's noise that is left in the log, from which the report says so.
+_SMOOTHED = 0.9
+_UNSMOOTHED = (
+    "The robot's noise was not averaged out: its log is too slow for the motion, or noisier than the {:.0f} um of "
+    "robot_accuracy_mm in recording.toml. Labels err as the log does; log faster, or correct that number."
+)
 #: Most stereo frames that are looked at, spread over the recording.
 _MOST_FRAMES = 96
 _SIMULATED_SHARDS = 3
@@ -97,9 +103,11 @@ def adapt(
     """
     if not isinstance(recording, Recording):
         recording = Recording.open(recording, truth=False)
-    log, noise_mm = smoothed(recording.kinematics, recording.robot_accuracy_mm)
+    log, noise_mm = smoothed(recording.kinematics, accuracy_mm := recording.robot_accuracy_mm)
     recording = replace(recording, truth=None, kinematics=log, robot_accuracy_mm=noise_mm)
     work = _Work(recording, detector, labels, seed, folder, minutes, progress, tune)
+    if noise_mm > _SMOOTHED * accuracy_mm:
+        work.report["notes"].append(_UNSMOOTHED.format(1e3 * accuracy_mm))
     try:
         return work.adapted()
     except RefusalError as refused:

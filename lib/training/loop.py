@@ -19,7 +19,7 @@ import numpy as np
 import torch
 import torch.distributed as dist
 from torch import Tensor, nn
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import DataLoader
 from tqdm.auto import tqdm
 
 from lib.geometry import check
@@ -125,23 +125,14 @@ def draw_batch(source: Source, config: TrainingConfig, step: int, rank: int = 0)
     """
     rng = np.random.default_rng([config.seed, step, *([rank] if rank else [])])
     indices = rng.choice(len(source), config.batch_size, replace=len(source) < config.batch_size)
-    return *map(np.stack, zip(*(source.draw(int(i), rng) for i in indices), strict=True)), rng
+    drawn = zip(*(source.draw(int(i), rng) for i in indices), strict=True)
+    return *(torch.from_numpy(np.stack(part)) for part in drawn), rng
 
 
 def prepared(drawn: Sequence, config: TrainingConfig, device: torch.device | str = "cpu") -> Batch:
     """What `draw_batch` gave, augmented on the device that trains."""
     *arrays, rng = drawn
     return config.augmentation(_batch(*arrays, device), rng)
-
-
-class _Batches(Dataset):
-    """Batches by the number of their step, so that other processes can draw them ahead."""
-
-    def __init__(self, *drawn: object):
-        self.source, self.config, self.rank = drawn
-
-    def __getitem__(self, step: int) -> tuple[object, ...]:
-        return draw_batch(self.source, self.config, step, self.rank)
 
 
 def _alone(_: int) -> None:
@@ -153,7 +144,8 @@ def _batches(source: Source, config: TrainingConfig, steps: range, rank: int, wo
     """The steps' batches, as `draw_batch` gives them; `workers` processes draw them ahead, or this one when they are due."""
     # Not forked: OpenCV waits for ever for threads that a fork leaves behind.
     ahead = {"num_workers": workers, "worker_init_fn": _alone, "multiprocessing_context": "spawn"} if workers else {}
-    return DataLoader(_Batches(source, config, rank), batch_size=None, sampler=steps, **ahead)
+    ahead |= {"collate_fn": partial(draw_batch, source, config, rank=rank), "generator": torch.Generator()}
+    return DataLoader(range(config.steps), batch_size=None, sampler=steps, **ahead)
 
 
 def _batch(images: np.ndarray, u: np.ndarray, visibility: np.ndarray, device: torch.device | str = "cpu") -> Batch:
@@ -267,6 +259,7 @@ class Run:
     def _graphed(self, images: Tensor) -> Callable[[Tensor], list[Tensor]]:
         """The network as CUDA graphs: a step is a thousand small kernels, which take longer to launch than to run."""
         before = copy.deepcopy(self.network.state_dict())  # capturing moves the statistics of batch normalisation
+        torch.autograd.graph.set_warn_on_accumulate_grad_stream_mismatch(False)  # of a capture, that says nothing
         graphed = torch.cuda.make_graphed_callables(copy.copy(self.network), (images,))
         self.network.load_state_dict(before)
         return graphed

@@ -114,6 +114,14 @@ def test_the_log_that_teaches_is_smoothed(world, recording, tmp_path, monkeypatc
     assert noise_mm == [recording.robot_accuracy_mm]
 
 
+@pytest.mark.parametrize(("noise_mm", "said"), [(0.01, False), (0.04, True)])
+def test_a_log_that_cannot_be_smoothed_is_said(world, tmp_path, noise_mm, said):
+    log = world.record(tmp_path / "log", noise_mm=noise_mm)
+    nothing = StandIn(np.full_like(world.u, np.nan))
+    report = adapt(log, nothing, folder=tmp_path / "out", progress=False).report
+    assert any("not averaged out" in note and "10 um" in note for note in report["notes"]) == said
+
+
 def test_shut_jaws_borrow_the_axes_of_another_time(world, recording):
     """The offsets of their landmarks are known but for the turn about the shaft, and the covariance says so."""
     teacher = taught(recording, StandIn(world.u, noise_px=0.7, wrong=0.2))

@@ -234,9 +234,11 @@ def test_batches_that_other_processes_draw_are_the_same(toy):
     """Also after OpenCV has threads here, for which a forked process would wait for ever."""
     data = toy(6)
     cv2.resize(np.zeros((1080, 1920, 3), np.uint8), (448, 256), interpolation=cv2.INTER_AREA)
+    state = torch.get_rng_state()
     for step, drawn in zip(range(3, 6), loop._batches(data, SMALL, range(3, 6), 0, 1), strict=True):
         one, other = loop.prepared(drawn, SMALL), loop.prepared(loop.draw_batch(data, SMALL, step), SMALL)
         assert all(torch.equal(getattr(one, k), getattr(other, k)) for k in ("images", "u", "visibility"))
+    assert torch.equal(torch.get_rng_state(), state)
 
 
 @pytest.mark.cuda
