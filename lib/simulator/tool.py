@@ -76,7 +76,8 @@ def rasterise(
         s *= gain
         s -= B
         s /= A
-        past = (chains[k] == 0 and (k + 2 >= len(chains) or chains[k + 2] != 0)) & (s > 1)
+        flat = chains[k] == 0 and (k + 2 >= len(chains) or chains[k + 2] != 0)
+        past = flat & (s > 1)
         np.clip(s, 0, 1, out=s)
         Q = (A * s + 2 * B) * s + C
         z = np.float32(a[2]) + s * np.float32(dz) - np.sqrt(np.maximum(Q, 0))
@@ -187,7 +188,8 @@ def compose(
         clearance = max(scene_z_mm - float(raster.depth_mm[raster.hit].mean()), 0.3)
         metal = _finished(raster, forceps, lamp, linear / max(power, 0.02), window.zoom, clearance) * np.float32(power)
     else:
-        metal = _metal(raster, forceps, lamp, linear[::16, ::16].reshape(-1, 3).mean(axis=0)) * np.float32(power)
+        glow = linear[::16, ::16].reshape(-1, 3).mean(axis=0)
+        metal = _metal(raster, forceps, lamp, glow) * np.float32(power)
     colour, alpha, depth = _at_image_resolution(raster, metal)
     shift = tool.velocity * window.zoom * microscope.exposure_s
     height, width = alpha.shape
@@ -227,7 +229,8 @@ def _metal(raster: ToolRaster, forceps: Forceps, lamp: np.ndarray, glow: np.ndar
     around = np.arctan2(normal[:, 0] * tangent[:, 1] - normal[:, 1] * tangent[:, 0], facing)
     rows = ((around / np.pi + 1) * 128).astype(int) % 256
     brush = 1 + forceps.brushed * _brush_marks(forceps.seed, 256, 5)[rows, (raster.along_mm * 6).astype(int) % 128]
-    body = forceps.brightness * (0.10 + 0.50 / (1 + np.exp(-(up - 0.55) / 0.14)) + 0.22 * np.clip(up + 0.2, 0, 1))
+    lit = 1 / (1 + np.exp(-(up - 0.55) / 0.14))
+    body = forceps.brightness * (0.10 + 0.50 * lit + 0.22 * np.clip(up + 0.2, 0, 1))
     grey = (body + 1.1 * forceps.brightness * streak) * np.clip(brush, 0.2, 2)
     colour = grey[:, None] * np.array([1.0, 0.99, 0.97], np.float32)
     return (colour + 0.35 * np.clip(0.3 - up, 0, 1)[:, None] * glow).astype(np.float32)
