@@ -90,7 +90,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> object | 
 
 @pytest.fixture(scope="session", autouse=True)
 def hidden_gpu() -> Iterator[Callable[[], bool] | None]:
-    """Tests expect what a CPU computes, to the last bit; what sees the GPU is kept for `gpu`."""
+    """What runs in this process expects what a CPU computes, to the last bit.  What sees the GPU is kept for `gpu`."""
     if shutil.which("nvidia-smi") is None:
         yield None
         return

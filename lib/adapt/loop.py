@@ -36,8 +36,8 @@ _ROUND_SHARE, _DOUBT_IMAGES = 0.85, 10
 #: Share of the robot's noise that is left in the log, from which the report says so.
 _SMOOTHED = 0.9
 _UNSMOOTHED = (
-    "The robot's noise was not averaged out: its log is too slow for the motion, or noisier than the {:.0f} um of "
-    "robot_accuracy_mm in recording.toml. Labels err as the log does; log faster, or correct that number."
+    "Smoothing averaged out little of the robot's noise, {:.2g} um by robot_accuracy_mm in recording.toml: its error changes "
+    "slowly, the log is short, repeats samples or is too slow for motion, or that number is wrong. Log faster, or correct it."
 )
 #: Most stereo frames that are looked at, spread over the recording.
 _MOST_FRAMES = 96

@@ -64,7 +64,7 @@ class Landmarks:
     Attributes:
         u: (n, 3, 2) px, NaN where missing.
         covariance: (n, 3, 2, 2) px^2, NaN where missing.
-        confidence: (n, 3), the probability that it is in view and `u` within 5 % of the tool's length of it; 0 where missing.
+        confidence: (n, 3), probability that the landmark is in view, within 5 % of the tool's length of `u`; 0 where missing.
 
         >>> found = Landmarks.none(2)
         >>> len(found), len(found[:1]), found.u.shape
@@ -414,7 +414,7 @@ class Detector:
         """The inputs of a stage after the first, round rough landmarks u (n, 3, 2), of closeups the landmarks `only` (n, 3).
 
         Returns windows (m, s, s, 3) uint8; window_from_image (m, 2, 3); and which (m, 2) image and landmark each window
-        shows, or which image (m,) for the looks at the tool.  A tool without base or tips has none, nor a missing landmark.
+        shows, or which image (m,) for the looks at the tool.  None for a tool without base or tips, or a missing landmark.
         """
         u = np.asarray(u, dtype=np.float64)
         (centre, angle), length = view.tool_pose(u), np.maximum(tool_length_px(u), 1.0)

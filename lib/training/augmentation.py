@@ -1,7 +1,7 @@
 """Augmentation with kornia: image and landmarks move together, landmarks that leave the frame become absent.
 
 Kornia's elastic, thin-plate and fisheye transforms are left out: they move the image and not the points.  Its motion blur
-shifts content unless its direction is 0.  A generator comes with every batch, so that a resumed training repeats itself.
+shifts content unless its direction is 0.  Random numbers come from a batch's own generator: a resumed training repeats them.
 """
 
 from dataclasses import dataclass, replace

@@ -9,17 +9,18 @@ import json
 import math
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
 from functools import partial
+from itertools import islice
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 import torch.distributed as dist
 from torch import Tensor, nn
-from torch.utils.data import DataLoader
 from tqdm.auto import tqdm
 
 from lib.geometry import check
@@ -119,14 +120,13 @@ class Training:
 
 
 def draw_batch(source: Source, config: TrainingConfig, step: int, rank: int = 0) -> tuple[object, ...]:
-    """Images, landmarks and visibilities of a step, and the generator that `prepared` goes on with.
+    """Images (n, h, w, 3) uint8, u (n, 3, 2) px, visibility (n, 3) of a step, and the generator that `prepared` goes on with.
 
     `rank` is the number of the process among those that train together.
     """
     rng = np.random.default_rng([config.seed, step, *([rank] if rank else [])])
     indices = rng.choice(len(source), config.batch_size, replace=len(source) < config.batch_size)
-    drawn = zip(*(source.draw(int(i), rng) for i in indices), strict=True)
-    return *(torch.from_numpy(np.stack(part)) for part in drawn), rng
+    return *map(np.stack, zip(*(source.draw(int(i), rng) for i in indices), strict=True)), rng
 
 
 def prepared(drawn: Sequence, config: TrainingConfig, device: torch.device | str = "cpu") -> Batch:
@@ -135,21 +135,27 @@ def prepared(drawn: Sequence, config: TrainingConfig, device: torch.device | str
     return config.augmentation(_batch(*arrays, device), rng)
 
 
-def _alone(_: int) -> None:
-    """In a process that draws: it has one core."""
-    cv2.setNumThreads(1)
+def batches(draw: Callable[[int], tuple], steps: range, threads: int = 0) -> Iterator[tuple]:
+    """What `draw` gives for each step, in order: drawn when it is due, or ahead of that by so many `threads`.
 
-
-def _batches(source: Source, config: TrainingConfig, steps: range, rank: int, workers: int) -> DataLoader:
-    """The steps' batches, as `draw_batch` gives them; `workers` processes draw them ahead, or this one when they are due."""
-    # Not forked: OpenCV waits for ever for threads that a fork leaves behind.
-    ahead = {"num_workers": workers, "worker_init_fn": _alone, "multiprocessing_context": "spawn"} if workers else {}
-    ahead |= {"collate_fn": partial(draw_batch, source, config, rank=rank), "generator": torch.Generator()}
-    return DataLoader(range(config.steps), batch_size=None, sampler=steps, **ahead)
+    >>> list(batches(lambda step: (step, step**2), range(3, 6), threads=2))
+    [(3, 9), (4, 16), (5, 25)]
+    """
+    if not threads:
+        yield from map(draw, steps)
+        return
+    left = iter(steps)
+    with ThreadPoolExecutor(threads) as pool:
+        waiting = deque(pool.submit(draw, step) for step in islice(left, 2 * threads))
+        while waiting:
+            yield waiting.popleft().result()
+            waiting.extend(pool.submit(draw, step) for step in islice(left, 1))
 
 
 def _batch(images: np.ndarray, u: np.ndarray, visibility: np.ndarray, device: torch.device | str = "cpu") -> Batch:
     """As tensors; landmarks outside the image are absent."""
+    if images.dtype != np.uint8:
+        raise ValueError(f"images: a source draws uint8, got {images.dtype}.")
     images, u, visibility = (torch.as_tensor(part).to(device) for part in (images, u, visibility))
     images, u = images.permute(0, 3, 1, 2).float().div_(255.0).contiguous(), u.float()
     return Batch(images, u, leave_frame(u, visibility.long(), tuple(images.shape[-2:])))
@@ -328,13 +334,13 @@ def train(
             run.restore(last, provenance)
     keeps = last is not None and run.rank == 0
     began, before, stop, saved = time.perf_counter(), run.seconds, False, time.perf_counter()
-    # A GPU learns faster than one process draws.
-    workers = max(1, cores() // run.world - 1) if run.device.type == "cuda" else 0
-    batches = iter(_batches(source, config, range(run.step, config.steps), run.rank, workers))
+    # A GPU learns faster than one thread draws.
+    threads = max(1, cores() // int(os.environ.get("LOCAL_WORLD_SIZE", "1")) - 1) if run.device.type == "cuda" else 0
+    drawn = batches(partial(draw_batch, source, config, rank=run.rank), range(run.step, config.steps), threads)
     with tqdm(total=config.steps, initial=run.step, disable=progress is not True or run.rank > 0, unit="step") as bar:
         while run.step < config.steps and not stop:
             spent = (time.perf_counter() - began) / max_seconds if max_seconds else 0.0
-            run.advance(prepared(next(batches), config, run.device), spent)
+            run.advance(prepared(next(drawn), config, run.device), spent)
             bar.update()
             if callable(progress):
                 progress(min(1.0, max(run.step / config.steps, spent)))

@@ -125,7 +125,7 @@ class Problem:
     ) -> Robust:  # fmt: skip
         """Most probable cameras, offsets and additions, near the cameras `start` or the best sample of four rows.
 
-        `columns` gives the pixels' change by each addition, cameras M -> (n, 2, 2, k); rows `apart` (n,) bool have own noise.
+        `columns` gives the pixels' change by each addition, cameras M -> (n, 2, 2, k); rows `apart` (n,) have another noise.
         """
         apart = np.zeros(len(self), dtype=bool) if apart is None else apart
         if start is None:  # of least squares, or of the samples of four rows that most rows are near to

@@ -23,7 +23,7 @@ LIMITS = {
     "robot": 8.0,  # distance from where the robot says, in RMS residuals of the calibration (at least 1 px)
     "smoothness": 0.05,  # the same less what the frames before and after have, of the tool's length
     "shape": 0.2,  # triangulated length of the tool, relative to the robot's; of a frame, not of a landmark
-    # RMS of the picture's `looks` in deviations of the training's; of a frame.  2 % of 96 validation pictures are beyond it.
+    # RMS of the picture's `looks` in standard deviations of training; of a frame.  2 % of 96 validation pictures exceed it.
     "unfamiliar": 2.1,
 }
 #: Parts that are of a frame: they tell no wrong landmark.

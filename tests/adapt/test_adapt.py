@@ -107,11 +107,14 @@ def test_a_tool_behind_the_cameras_has_no_label(tmp_path):
 
 
 def test_the_log_that_teaches_is_smoothed(world, recording, tmp_path, monkeypatch):
-    noise_mm = []
-    monkeypatch.setattr(loop, "smoothed", lambda kinematics, noise: noise_mm.append(noise) or (kinematics, noise))
-    with pytest.raises(FileNotFoundError):
-        adapt(recording, StandIn(world.u), labels=tmp_path / "none.json", folder=tmp_path, progress=False)
+    """And counts with the noise that is left."""
+    noise_mm, taught_by = [], []
+    monkeypatch.setattr(loop, "smoothed", lambda kinematics, noise: noise_mm.append(noise) or (kinematics, noise / 2))
+    monkeypatch.setattr(loop, "_Work", lambda recording, *_: taught_by.append(recording) or 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        adapt(recording, StandIn(world.u), folder=tmp_path, progress=False)
     assert noise_mm == [recording.robot_accuracy_mm]
+    assert taught_by[0].robot_accuracy_mm == recording.robot_accuracy_mm / 2
 
 
 @pytest.mark.parametrize(("noise_mm", "said"), [(0.01, False), (0.04, True)])
@@ -119,7 +122,7 @@ def test_a_log_that_cannot_be_smoothed_is_said(world, tmp_path, noise_mm, said):
     log = world.record(tmp_path / "log", noise_mm=noise_mm)
     nothing = StandIn(np.full_like(world.u, np.nan))
     report = adapt(log, nothing, folder=tmp_path / "out", progress=False).report
-    assert any("not averaged out" in note and "10 um" in note for note in report["notes"]) == said
+    assert any("averaged out little" in note and "10 um" in note for note in report["notes"]) == said
 
 
 def test_shut_jaws_borrow_the_axes_of_another_time(world, recording):

@@ -3,6 +3,7 @@
 Seconds per pair; the paper's Hz (Titan X) are in the benchmark's extra_info.
 """
 
+import importlib.util
 from dataclasses import replace
 
 import numpy as np
@@ -32,14 +33,15 @@ def test_the_papers_configuration(benchmark, size):
     benchmark.pedantic(detector, (pair(size),), rounds=3, warmup_rounds=1)
 
 
-@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("engine", [pytest.param(e, marks=[pytest.mark.cuda] * (e == "cuda")) for e in ENGINES])
 @pytest.mark.parametrize("mode", ["whole frame", "tracking"])
-def test_coarse_to_fine(benchmark, mode, engine):
+def test_coarse_to_fine(benchmark, request, mode, engine):
     """The shipped networks at 1080p; weights do not change the time, so all stages run on noise."""
-    try:
-        shipped = Detector.load(engine=engine)
-    except ValueError as missing:
-        pytest.skip(str(missing))
+    if engine == "cuda":
+        request.getfixturevalue("gpu")
+    elif engine.startswith("openvino") and not importlib.util.find_spec("openvino"):
+        pytest.skip("OpenVINO is not installed here")
+    shipped = Detector.load(engine=engine)
     sure = ErrorModel(logit=(9.0, 0.0, 0.0, 0.0))
     detector = replace(
         shipped, error_models=shipped.error_models | dict.fromkeys(("frame", "tool", "again", "closeup", "tracking"), sure)

@@ -2,10 +2,10 @@ import errno
 import multiprocessing
 import os
 import socket
+import time
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 import torch
@@ -190,8 +190,7 @@ def test_two_processes_train_one_network(tmp_path, monkeypatch):
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
-    # A fork imports nothing anew; but not of a process that has used a GPU.
-    context = multiprocessing.get_context("spawn" if torch.cuda.is_available() else "fork")
+    context = multiprocessing.get_context("fork")  # it imports nothing anew, and no GPU is seen there
     running = [context.Process(target=one_of_two, args=(rank, port, tmp_path)) for rank in (0, 1)]
     for process in running:
         process.start()
@@ -230,22 +229,41 @@ def test_averaging_over_processes_is_a_batch_of_all(monkeypatch, toy):
         assert torch.allclose(a, b, atol=1e-5 + 1e-3 * float(b.abs().max()))
 
 
-def test_batches_that_other_processes_draw_are_the_same(toy):
-    """Also after OpenCV has threads here, for which a forked process would wait for ever."""
+def test_batches_drawn_ahead_are_the_same_and_in_order(toy):
     data = toy(6)
-    cv2.resize(np.zeros((1080, 1920, 3), np.uint8), (448, 256), interpolation=cv2.INTER_AREA)
-    state = torch.get_rng_state()
-    for step, drawn in zip(range(3, 6), loop._batches(data, SMALL, range(3, 6), 0, 1), strict=True):
+
+    def late(step):
+        time.sleep(0.03 * (step % 2))  # the others overtake
+        return loop.draw_batch(data, SMALL, step)
+
+    for step, drawn in zip(range(3, 12), loop.batches(late, range(3, 12), threads=3), strict=True):
         one, other = loop.prepared(drawn, SMALL), loop.prepared(loop.draw_batch(data, SMALL, step), SMALL)
         assert all(torch.equal(getattr(one, k), getattr(other, k)) for k in ("images", "u", "visibility"))
-    assert torch.equal(torch.get_rng_state(), state)
+
+
+def test_an_error_while_drawing_ahead_ends_the_training():
+    def draw(step):
+        if step == 4:
+            raise ValueError("damaged")
+        return (step,)
+
+    drawn = loop.batches(draw, range(100), threads=2)
+    assert [next(drawn) for _ in range(4)] == [(0,), (1,), (2,), (3,)]
+    with pytest.raises(ValueError, match="damaged"):
+        next(drawn)
+
+
+def test_images_of_another_type_are_refused():
+    drawn = np.zeros((1, 8, 8, 3), np.float32), np.zeros((1, 3, 2)), np.zeros((1, 3)), np.random.default_rng(0)
+    with pytest.raises(ValueError, match="draws uint8, got float32"):
+        loop.prepared(drawn, SMALL)
 
 
 @pytest.mark.cuda
 @pytest.mark.parametrize("precision", ["fp32", "bf16"])
 def test_a_gpu_learns_what_a_cpu_does_and_resumes(gpu, monkeypatch, toy, tmp_path, precision):
     config, data = replace(SMALL, steps=12, validate_every=4, precision=precision), (toy(6), toy(2, seed=1))
-    train(replace(config), *data, tmp_path, progress=False, max_seconds=0)  # stops after a step
+    train(config, *data, tmp_path, progress=False, max_seconds=0)  # stops after a step
     on_gpu = train(config, *data, tmp_path, progress=False)
     assert next(on_gpu.network.parameters()).device.type == "cpu"
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
