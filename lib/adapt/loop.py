@@ -33,11 +33,10 @@ ROUNDS, STEPS = 3, 4000
 RECIPE = 12  # raised where teaching or training changes: what an older one kept is not gone on with
 #: Share of the time left that a round takes, and fewest images for stopping to which alone the doubt is fitted.
 _ROUND_SHARE, _DOUBT_IMAGES = 0.85, 10
-#: Share of the robot's noise that is left in the log, from which the report says so.
-_SMOOTHED = 0.9
+#: Said of a log of which more than half stays as it is.
 _UNSMOOTHED = (
-    "Smoothing averaged out little of the robot's noise, {:.2g} um by robot_accuracy_mm in recording.toml: its error changes "
-    "slowly, the log is short, repeats samples or is too slow for motion, or that number is wrong. Log faster, or correct it."
+    "The robot's log was not smoothed: it is short, repeats samples, is too slow for the motion, or is noisier than the "
+    "{:.2g} um of robot_accuracy_mm in recording.toml. Log faster, or correct that number."
 )
 #: Most stereo frames that are looked at, spread over the recording.
 _MOST_FRAMES = 96
@@ -104,9 +103,10 @@ def adapt(
     if not isinstance(recording, Recording):
         recording = Recording.open(recording, truth=False)
     log, noise_mm = smoothed(recording.kinematics, accuracy_mm := recording.robot_accuracy_mm)
+    unchanged = (log.x_mm == recording.kinematics.x_mm)[np.isfinite(log.x_mm)].mean()
     recording = replace(recording, truth=None, kinematics=log, robot_accuracy_mm=noise_mm)
     work = _Work(recording, detector, labels, seed, folder, minutes, progress, tune)
-    if noise_mm > _SMOOTHED * accuracy_mm:
+    if accuracy_mm and unchanged > 0.5:
         work.report["notes"].append(_UNSMOOTHED.format(1e3 * accuracy_mm))
     try:
         return work.adapted()

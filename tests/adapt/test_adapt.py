@@ -122,7 +122,7 @@ def test_a_log_that_cannot_be_smoothed_is_said(world, tmp_path, noise_mm, said):
     log = world.record(tmp_path / "log", noise_mm=noise_mm)
     nothing = StandIn(np.full_like(world.u, np.nan))
     report = adapt(log, nothing, folder=tmp_path / "out", progress=False).report
-    assert any("averaged out little" in note and "10 um" in note for note in report["notes"]) == said
+    assert any("was not smoothed" in note and "10 um" in note for note in report["notes"]) == said
 
 
 def test_shut_jaws_borrow_the_axes_of_another_time(world, recording):
