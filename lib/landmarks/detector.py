@@ -414,7 +414,7 @@ class Detector:
         """The inputs of a stage after the first, round rough landmarks u (n, 3, 2), of closeups the landmarks `only` (n, 3).
 
         Returns windows (m, s, s, 3) uint8; window_from_image (m, 2, 3); and which (m, 2) image and landmark each window
-        shows, or which image (m,) for the looks at the tool.  None for a tool without base or tips, or a missing landmark.
+        shows, or which image (m,) for the looks at the tool.  No tool without base or tips, and no missing landmark, has one.
         """
         u = np.asarray(u, dtype=np.float64)
         (centre, angle), length = view.tool_pose(u), np.maximum(tool_length_px(u), 1.0)

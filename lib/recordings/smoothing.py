@@ -22,9 +22,9 @@ def smoothed(kinematics: Kinematics, noise_mm: float) -> tuple[Kinematics, float
     Each sample has the window whose polynomials best predict it and its neighbours when these are left out.  Where that would
     move a landmark by more than 1.5 times `noise_mm`, the robot's accuracy per coordinate (RMS of a few samples), they stay
     as they are: at jumps, and where the log is too slow for the motion.  A sample that lacks a landmark, or repeats its
-    neighbour as a frozen log does, stays too, and no polynomial uses it.  The noise left, mm per coordinate, is the RMS over
-    the other samples (Mallows, "Some comments on Cp", 1973).  Noise that the polynomials do not take away counts as left: an
-    error that changes slowly looks like motion.
+    neighbour as a frozen log does, stays too, and no polynomial uses it.  The noise left is an RMS
+    in mm per coordinate (Mallows, "Some comments on Cp", 1973).  What the polynomials do not take away counts as left, since
+    an error that changes slowly looks like motion.
     (Cleveland, "Robust locally weighted regression and smoothing scatterplots", 1979.)
 
     >>> rng, time_s = np.random.default_rng(0), np.arange(400) / 100

@@ -136,7 +136,7 @@ def prepared(drawn: Sequence, config: TrainingConfig, device: torch.device | str
 
 
 def batches(draw: Callable[[int], tuple], steps: range, threads: int = 0) -> Iterator[tuple]:
-    """What `draw` gives for each step, in order: drawn when it is due, or ahead of that by so many `threads`.
+    """What `draw` gives for each step, in order.  So many `threads` draw ahead; without any, each is drawn when it is due.
 
     >>> list(batches(lambda step: (step, step**2), range(3, 6), threads=2))
     [(3, 9), (4, 16), (5, 25)]
