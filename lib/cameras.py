@@ -206,10 +206,10 @@ class NearAffineCamera(MatrixCamera):
         return replace(super().moved(motion), reference_mm=motion.apply(self.reference_mm))
 
 
-def radial_derivative(v: np.ndarray, k: float) -> np.ndarray:
-    """d/dv of v (1 + k |v|^2), (n, 2, 2), for v (n, 2)."""
-    scale = 1.0 + k * (v**2).sum(axis=1)
-    return scale[:, None, None] * np.eye(2) + 2.0 * k * v[:, :, None] * v[:, None, :]
+def radial_derivative(v: np.ndarray, k: ArrayLike) -> np.ndarray:
+    """d/dv of v (1 + k |v|^2), (..., 2, 2), for v (..., 2) and k (...) or a number."""
+    k = np.asarray(k)[..., None, None]
+    return (1.0 + k * (v**2).sum(axis=-1)[..., None, None]) * np.eye(2) + 2.0 * k * v[..., :, None] * v[..., None, :]
 
 
 @dataclass(frozen=True)

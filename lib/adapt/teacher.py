@@ -46,6 +46,7 @@ _OWN_BIAS = 0.004 * np.array([[2.5, 1.0, 1.5], [1.2, 1.0, 1.5], [1.2, 1.0, 1.5]]
 _LARGEST_OFFSET, _LARGEST_OFFSET_MM = 0.15, 0.25
 #: Error of an offset, as a share of it, where shut jaws borrow the tool's axes from another time, farther away than this.
 _TURNED, _BORROWED_S = 0.3, 0.1
+_TURNS_S = 0.02  # between samples of the log that show how jaws turn; more are not worth their time
 _ODD = 0.2  # share of a large offset that may be the detector's all the same: some tools it knows far worse than others
 #: Gain in log likelihood of a detection, by which cameras of their own for a part of the time must explain it better.
 #: A smaller gain narrows the residuals by less than a quarter, which unknown offsets of the landmarks do, too.
@@ -210,14 +211,15 @@ class Teacher:
         """
         r, c, offset = self.recording, self.calibration, self.offset_mm
         time, height = np.repeat(r.frames.time_s[frames][:, None], 3, axis=1) + r.offset_s, r.image_size_px[1]
+        log = slice(None, None, max(1, int(_TURNS_S / np.median(np.diff(r.kinematics.time_s)))))
         u, covariance = np.full((len(frames), 2, 3, 2), np.nan), np.full((len(frames), 2, 3, 2, 2), np.nan)
         for side, camera in enumerate(c.cameras):
             at = time
             for _ in range(3 if r.readout_s else 1):
                 x = r.kinematics.at(at)
-                when_s = np.append(r.kinematics.time_s, at[:, 0])  # the log's own times show how shut jaws were turned before
+                when_s = np.append(r.kinematics.time_s[log], at[:, 0])  # the log shows how shut jaws were turned before
                 order = np.argsort(when_s)
-                told = np.concatenate([r.kinematics.x_mm, x])[order]
+                told = np.concatenate([r.kinematics.x_mm[log], x])[order]
                 known = tool_axes(told, offset if self.turns else None)
                 axes = np.nan_to_num(carried(known, told, when_s[order])[np.argsort(order)[len(when_s) - len(at) :]])
                 apart_s = np.abs(when_s[order][np.isfinite(known).all(axis=(1, 2))] - at[:, :1])

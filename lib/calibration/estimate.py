@@ -13,7 +13,7 @@ from lib.calibration import checks as refuse
 from lib.calibration.affine import affine_minimum, estimate_noise, noise_rms_px, paper_variances, regress
 from lib.calibration.calibration import Calibration
 from lib.calibration.models import Fit, Model, State, fit
-from lib.calibration.offsets import estimate_offsets, rows_axes, start_of_turning
+from lib.calibration.offsets import estimate_offsets, rows_axes, start_of_turning, tool_axes
 from lib.calibration.robust import consensus
 from lib.calibration.scatter import sandwich
 from lib.correspondences import Correspondences
@@ -153,8 +153,11 @@ def _turned(
     What a robot with a wrong tool reports is off in the axes of the true tool, and turns the axes of the reported one.
     Offsets that turn the axes that much are more often the robot's than the detector's.  `sure`: somebody knows of offsets.
     """
+    x_mm, row = data.grid("x_mm"), np.unique(data.frame, return_inverse=True)[1][usable]
+
     def turned(offset: np.ndarray) -> np.ndarray:
-        return rows_axes(data, offset)[usable]
+        own = tool_axes(x_mm, np.pad(offset, ((0, 3 - len(offset)), (0, 0))))[row]
+        return np.where(np.isfinite(own), own, axes)
 
     offset = found.offsets.offset
     turn_mm = np.einsum("nij,nj->ni", turned(offset) - axes, offset[data.landmark[usable]]).std()

@@ -119,6 +119,13 @@ class State:
         rows = self.A / self.zoom[:, :, None]
         return np.concatenate([rows, np.cross(rows[:, :1], rows[:, 1:])], axis=1)
 
+    @cached_property
+    def axes(self) -> tuple[np.ndarray, np.ndarray]:
+        """Unit vectors r3 (cameras, 3) away from the cameras, and the length (cameras,) of the normal that each has of A."""
+        normal = np.stack([normal_to(A) for A in self.A])
+        size = np.linalg.norm(normal, axis=1)
+        return normal / size[:, None], size
+
     def moved(self, step: np.ndarray) -> Self:
         """The state after a step (p,) of the model's parameters."""
         d = (self.model.selection @ step).reshape(len(self.A), -1)
@@ -143,51 +150,46 @@ class State:
             A, D = self.A.reshape(-1, 3), self._linear() if derivatives else np.empty((2 * c, 4, 0))
             J_c = np.tensordot(np.column_stack([x, np.ones(n)]), D, axes=(1, 1))
             return x @ A.T + self.offset.ravel(), np.tile(A, (n, 1, 1)), J_c
-        k = len(self.model.selection) // c
-        y, J_x, J_c = np.empty((n, 2 * c)), np.empty((n, 2 * c, 3)), np.zeros((n, 2 * c, k * c))
-        for i in range(c):
-            rows = slice(2 * i, 2 * i + 2)
-            A, centre = self.A[i], self.centre[i]
-            normal = normal_to(A)
-            size = np.linalg.norm(normal)
-            r_3 = normal / size
-            depth = x @ r_3
-            ratio = (1.0 + self.rho[i] * depth)[:, None]
-            v = (x @ A.T + (self.offset[i] - centre)) / ratio
-            bend = radial_derivative(v, self.radial[i])
-            square = (v**2).sum(axis=1, keepdims=True)
-            y[:, rows] = centre + v * (1.0 + self.radial[i] * square)
-            J_x[:, rows] = bend @ ((A - self.rho[i] * v[:, :, None] * r_3) / ratio[:, :, None])
-            if not derivatives:
-                continue
-            # By the entries of A: d r3 = (I - r3 r3^T) (da1 x a2 + a1 x da2) / |a1 x a2|
-            dv = np.zeros((n, 2, 6))
-            flat = (x - depth[:, None] * r_3) / size
-            dv[:, 0, 0:3] = dv[:, 1, 3:6] = x
-            tilt = np.hstack([np.cross(A[1], flat), np.cross(flat, A[0])])  # x.(d r3)
-            dv -= self.rho[i] * v[:, :, None] * tilt[:, None, :]
-            offset, distance = np.broadcast_to(np.eye(2), (n, 2, 2)), -(v * depth[:, None])[:, :, None]
-            dv = bend @ (np.concatenate([dv @ self._entries(i).reshape(6, -1), offset, distance], axis=2) / ratio[:, :, None])
-            J_c[:, rows, i * k : (i + 1) * k] = np.concatenate([dv, (v * square)[:, :, None]], axis=2)
-        return y, J_x, J_c @ self.model.selection if derivatives else np.empty((n, 2 * c, 0))
+        r_3, size, k = *self.axes, len(self.model.selection) // c
+        depth = x @ r_3.T
+        ratio = (1.0 + self.rho * depth)[:, :, None]  # (n, cameras, 1)
+        v = ((x @ self.A.reshape(-1, 3).T).reshape(n, c, 2) + (self.offset - self.centre)) / ratio
+        bend, square = radial_derivative(v, self.radial), (v**2).sum(axis=2, keepdims=True)
+        y = (self.centre + v * (1.0 + self.radial[:, None] * square)).reshape(n, 2 * c)
+        J_x = bend @ ((self.A - self.rho[:, None, None] * v[:, :, :, None] * r_3[:, None]) / ratio[:, :, :, None])
+        if not derivatives:
+            return y, J_x.reshape(n, 2 * c, 3), np.empty((n, 2 * c, 0))
+        # By the entries of A: d r3 = (I - r3 r3^T) (da1 x a2 + a1 x da2) / |a1 x a2|
+        flat = (x[:, None] - depth[:, :, None] * r_3) / size[:, None]
+        turned = np.einsum("jks,crk->csrj", _CROSS, np.stack([self.A[:, 1], -self.A[:, 0]], axis=1)).reshape(c, 3, 6)
+        dv = -self.rho[:, None, None] * v[:, :, :, None] * (flat[:, :, None] @ turned)  # x.(d r3)
+        dv[:, :, 0, 0:3] += x[:, None]
+        dv[:, :, 1, 3:6] += x[:, None]
+        offset, distance = np.broadcast_to(np.eye(2), (n, c, 2, 2)), -(v * depth[:, :, None])[:, :, :, None]
+        dv = np.concatenate([dv @ self._entries.reshape(c, 6, -1), offset, distance], axis=3) / ratio[:, :, :, None]
+        dv = np.concatenate([bend @ dv, (v * square)[:, :, :, None]], axis=3)
+        J_c, each = np.zeros((n, c, 2, c, k)), np.arange(c)
+        J_c[:, each, :, each] = dv.swapaxes(0, 1)
+        return y, J_x.reshape(n, 2 * c, 3), J_c.reshape(n, 2 * c, k * c) @ self.model.selection
 
-    def _entries(self, i: int) -> np.ndarray:
-        """Derivatives of the entries of A[i] by its own 6 or 5 increments, (2, 3, 6 or 5)."""
+    @cached_property
+    def _entries(self) -> np.ndarray:
+        """Derivatives of the entries of A by each camera's own 6 or 5 increments, (cameras, 2, 3, 6 or 5)."""
+        c = len(self.A)
         if self.model.base == "affine":
-            return np.eye(6).reshape(2, 3, 6)
-        result = np.zeros((2, 3, 5))
+            return np.tile(np.eye(6).reshape(2, 3, 6), (c, 1, 1, 1))
+        result = np.zeros((c, 2, 3, 5))
         # A left increment turns R by delta x R.
-        result[:, :, :3] = self.zoom[i][:, None, None] * np.einsum("jkr,ks->rsj", _CROSS, self.rotation[i])[:2]
-        result[0, :, 3], result[1, :, 4] = self.A[i]
+        turned = np.einsum("jkr,cks->crsj", _CROSS, self.rotation)[:, :2]
+        result[..., :3] = self.zoom[:, :, None, None] * turned
+        result[:, 0, :, 3], result[:, 1, :, 4] = self.A[:, 0], self.A[:, 1]
         return result
 
     def _linear(self) -> np.ndarray:
         """Derivatives of the matrices [A, o] about the reference point by the model's parameters, (2 cameras, 4, p)."""
-        c = len(self.A)
+        c, each = len(self.A), np.arange(len(self.A))
         result = np.zeros((c, 2, 4, c, len(self.model.selection) // c))
-        for i in range(c):
-            result[i, :, :3, i, :-4] = self._entries(i)
-            result[i, :, 3, i, -4:-2] = np.eye(2)
+        result[each, :, :3, each, :-4], result[each, :, 3, each, -4:-2] = self._entries, np.eye(2)
         return result.reshape(2 * c, 4, -1) @ self.model.selection
 
     def matrix_jacobian(self) -> np.ndarray:
@@ -237,11 +239,8 @@ def fit(start: State, x: np.ndarray, y: np.ndarray, noise: np.ndarray, variance_
     y = np.where(np.repeat(views, 2, axis=1), y, 0.0)
 
     def evaluate(state: State) -> tuple[float, tuple] | None:
-        for A, rho in zip(state.A, state.rho, strict=True):
-            if rho:
-                normal = normal_to(A)
-                if (1.0 + rho * ((x - state.reference) @ normal) / np.linalg.norm(normal)).min() <= 0.05:
-                    return None  # a point lies behind the camera
+        if (1.0 + state.rho * ((x - state.reference) @ state.axes[0].T)).min() <= 0.05:
+            return None  # a point lies behind a camera
         cost, *work = settle(state, x, y, noise, variance_x, views)
         return (cost, work) if np.isfinite(cost) else None
 
@@ -252,5 +251,5 @@ def fit(start: State, x: np.ndarray, y: np.ndarray, noise: np.ndarray, variance_
         return J.reshape(WJ.shape).T @ WJ, WJ.T @ r.ravel()
 
     with np.errstate(all="ignore"):  # a first step may be far too long: its energy is not finite, and it is shortened
-        found = minimise(start, evaluate, normal_equations, State.moved)
+        found = minimise(start, evaluate, normal_equations, State.moved, tolerance=1e-10)
     return Fit(found.state, found.energy, *found.work[:2], found.information, found.converged)

@@ -79,6 +79,11 @@ def _least_turning(axes: np.ndarray, possible: np.ndarray) -> np.ndarray:
     found, known = np.full(axes.shape[1:], np.nan), np.flatnonzero(possible.any(axis=0))
     if not known.size:
         return found
+    found[known] = np.where(possible[0, known, None, None], axes[0, known], axes[1, known])
+    two = np.pad(possible[:, known].all(axis=0), 1)
+    known = known[two[:-2] | two[1:-1] | two[2:]]  # a row of one choice cuts the way: only those beside it matter
+    if not known.size:
+        return found
     y, own = axes[..., 1][:, known], np.where(possible[:, known], [[0.0], [1e-6]], np.inf)
     turn = np.nan_to_num(1 - np.einsum("snx,tnx->nst", y[:, :-1], y[:, 1:]), nan=np.inf).tolist()
     (a, b), came = own[:, 0].tolist(), []

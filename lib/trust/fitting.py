@@ -137,12 +137,16 @@ class Problem:
             start = max((self._descend(M, columns, apart, 8) for M in starts), key=lambda fit: fit.total).M
         return self._descend(start, columns, apart, rounds)
 
+    @cached_property
+    def _of_matrices(self) -> np.ndarray:
+        """(n, 2, 2, 16): derivatives by the entries of the cameras."""
+        H = np.concatenate([self.x, np.ones((len(self), 2, 1))], axis=2)
+        return np.einsum("nck,cv,ij->ncivjk", H, np.eye(2), np.eye(2)).reshape(len(self), 2, 2, 16)
+
     def _design(self, M: np.ndarray, columns: Callable | None) -> np.ndarray:
         """(n, 2, 2, p): derivatives by the 16 entries of M, 9 offsets (mm) and the additions."""
-        H = np.concatenate([self.x, np.ones((len(self), 2, 1))], axis=2)
-        D = np.einsum("nck,cv,ij->ncivjk", H, np.eye(2), np.eye(2)).reshape(len(self), 2, 2, 16)
         image, own = np.einsum("cij,njk->ncik", M[:, :, :3], self.axes), self.landmark[:, None] == np.arange(3)
-        parts = [D, np.einsum("ncik,nl->ncilk", image, own).reshape(len(self), 2, 2, 9)]
+        parts = [self._of_matrices, np.einsum("ncik,nl->ncilk", image, own).reshape(len(self), 2, 2, 9)]
         return np.concatenate(parts if columns is None else [*parts, columns(M)], axis=3)
 
     def _descend(self, M: np.ndarray, columns: Callable | None, apart: np.ndarray, rounds: int) -> Robust:

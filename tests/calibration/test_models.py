@@ -46,6 +46,7 @@ def test_jacobians_are_finite_differences(name):
     for j, e in enumerate(1e-5 * np.eye(3)):
         numeric = (at.evaluate(x + e)[0] - at.evaluate(x - e)[0]) / 2e-5
         np.testing.assert_allclose(J_x[:, :, j], numeric, rtol=1e-6, atol=1e-4)
+    assert [part.shape for part in at.evaluate(x[:0])] == [(0, 4), (0, 4, 3), (0, *J.shape[1:])]  # no points are no error
 
 
 @pytest.mark.parametrize("name", ["affine", "square+distances"])
