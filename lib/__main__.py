@@ -104,12 +104,13 @@ def _become(command: list[str]) -> int:
 
 def test(argv: list[str]) -> int:
     style = subprocess.call([sys.executable, "-m", "ruff", "check", "--output-format=concise", *ruff_options(), ROOT])
-    return _pytest(["--numprocesses=auto", "--dist=loadfile", "--no-loadscope-reorder", "-p", "no:dash", *argv]) or style
+    plugins = ["-p", "xdist.plugin", "-p", "_hypothesis_pytestplugin"]
+    return _pytest([*plugins, "--numprocesses=auto", "--dist=loadfile", "--no-loadscope-reorder", *argv]) or style
 
 
 def bench(argv: list[str]) -> int:
-    plain = "--override-ini=addopts=--import-mode=importlib --strict-markers"
-    return _pytest([plain, "--benchmark-only", "--benchmark-disable-gc", str(ROOT / "tests" / "benchmarks"), *argv])
+    plain = ["--override-ini=addopts=--import-mode=importlib --strict-markers", "-p", "pytest_benchmark.plugin"]
+    return _pytest([*plain, "--benchmark-only", "--benchmark-disable-gc", str(ROOT / "tests" / "benchmarks"), *argv])
 
 
 def lab(argv: list[str]) -> int:
@@ -120,6 +121,7 @@ def lab(argv: list[str]) -> int:
 
 def _pytest(argv: list[str]) -> int:
     keep = {f"MALLOC_{name}_THRESHOLD_": str(1 << 30) for name in ("TRIM", "MMAP")}  # arrays take memory that is at hand
+    keep["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"  # every package's plugin takes time to load
     command = [sys.executable, "-m", "pytest", "-c", ROOT / "environment.toml", f"--rootdir={ROOT}", *argv]
     return subprocess.call(command, env=keep | os.environ)
 

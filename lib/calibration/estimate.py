@@ -284,7 +284,7 @@ def _minimise(
         weigh = variance_u * claimed / noise_rms_px(claimed) ** 2
         if whole and len(weigh) == 1 and np.allclose(weigh[0], variance_u * np.eye(m), rtol=1e-12, atol=0):
             start = affine_minimum(x, y, variance_u, variance_x).matrix
-        anew = minimum is None or (plan.is_affine and whole and len(weigh) == 1)
+        anew = minimum is None or (plan.base == "affine" and plan.is_affine and whole and len(weigh) == 1)
         state = State.start(plan, start, x.mean(axis=0), centre) if anew else minimum.state
         minimum = fit(state, x, y, weigh, variance_x, views)
         residuals, A, parameters = minimum.residuals, minimum.state.A.reshape(m, 3), len(plan.parameter_names)
