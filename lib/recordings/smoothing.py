@@ -75,11 +75,12 @@ def _local_polynomials(time_s: np.ndarray, x: np.ndarray, known: np.ndarray, hal
         at = window.clip(0, n - 1)
         when = (time_s[at] - time_s[rows, None]) / reach_s
         weight = (known[at] & (window == at) & (np.abs(when) <= 2)).astype(float)
-        powers = when[:, :, None] ** np.arange(_DEGREE + 1)
         enough = known[rows] & (weight.sum(axis=1) >= _DEGREE + 1 + _SPARE)
-        G = np.einsum("nip,ni,niq->npq", powers[enough], weight[enough], powers[enough])
-        coefficients = np.linalg.solve(G + 1e-12 * np.eye(_DEGREE + 1), np.eye(_DEGREE + 1)[:, :1])[:, :, 0]
-        share = weight[enough] * np.einsum("nip,np->ni", powers[enough], coefficients)
+        powers = np.cumprod(np.stack([np.ones_like(when[enough]), *[when[enough]] * 2 * _DEGREE], axis=2), axis=2)
+        order = np.arange(_DEGREE + 1)
+        G = (weight[enough, None] @ powers)[:, 0, order[:, None] + order]  # sums of the products of two powers
+        coefficients = np.linalg.solve(G + 1e-12 * np.eye(len(order)), np.eye(len(order))[:, :1])
+        share = weight[enough] * (powers[:, :, order] @ coefficients)[:, :, 0]
         fitted[rows[enough]] = np.einsum("ni,nim->nm", share, x[at[enough]])
         own[rows[enough]] = share[:, half]
     return fitted, own
