@@ -36,11 +36,10 @@ def guess_mapping(source: str | Path) -> str:
     robot["offset_s"] = 0.0 if estimate else "estimate"
     open_yet = {"point_mm": [0.0] * 3, "axis": [0.0, 1.0, 0.0], "jaw_mm": [0.0] * 3}
     measured = {"landmarks_mm": {"base": [0.0] * 3}, "hinge": open_yet} if "pose" in robot else {}
-    tool = {"estimate": True} if estimate else measured
     told = {"name": re.sub(r"[<>&]", "_", folder.resolve().name), "landmarks": list(robot.get("landmarks", LANDMARKS))}
     video = _video(folder, paths, {n: p for n, p in tables.items() if n != robot["file"]})
-    told |= {"robot_accuracy_mm": 0.01, "readout_s": 0.0, "video": video, "robot": robot, "tool": tool}
-    told["labels"] = _labels(labels)
+    told |= {"robot_accuracy_mm": 0.01, "readout_s": 0.0, "video": video, "robot": robot}
+    told |= {"tool": {"estimate": True} if estimate else measured, "labels": _labels(labels)}
     tells = read_toml(Path(__file__).with_name("comments.toml"))
     text = "# What `python3 -m lib import` reads, guessed from the files.  Look at each line.\n"
     for key, value in told.items():
@@ -174,6 +173,5 @@ def _labels(paths: dict[str, Path]) -> dict:
                 continue
             if names:
                 told = {"kind": kind, "file": file, "names": _matched({name: name for name in names})}
-                origin = "corner" if kind in ("cvat", "label_studio") else "centre"
-                return told | {"pixel_origin": origin, "first_frame": 0}
+                return told | {"pixel_origin": "corner" if kind in ("cvat", "label_studio") else "centre", "first_frame": 0}
     return {}

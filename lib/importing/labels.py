@@ -61,8 +61,7 @@ def read_labels(
         elif [name in label.image for name in labels.sides].count(True) == 1:
             side = int(labels.sides[1] in label.image)
         else:
-            cure = f"labels.sides = {list(labels.sides)} must tell one of two"
-            raise ValueError(f"{where}: the name tells no camera; {cure}.")
+            raise ValueError(f"{where}: the name tells no camera; labels.sides = {list(labels.sides)} must tell one of two.")
         reel = side ^ source.video.exchanged if source.video.layout == "two" else 0
         image = PurePosixPath(label.image.replace("\\", "/"))
         number = (last_number(image) or 0) - labels.first_frame
@@ -155,8 +154,7 @@ def _deeplabcut(path: Path) -> Iterator[Label]:
     column = {key: i for i, key in enumerate(zip(rows[named["bodyparts"]], rows[top], strict=True))}
     for row in rows[top + 1 :]:
         for name in dict.fromkeys(rows[named["bodyparts"]][n:]):
-            cells = [row[column[name, axis]] for axis in "xy"]
-            x, y = (float(cell) if cell else np.nan for cell in cells)
+            x, y = (float(row[column[name, axis]] or np.nan) for axis in "xy")
             yield Label("/".join(filter(None, row[:n])), name, x, y, 2 if np.isfinite([x, y]).all() else 0)
 
 
@@ -166,16 +164,15 @@ def _sleap(path: Path) -> Iterator[Label]:
         names = [metadata["nodes"][link["id"]]["name"] for link in metadata["skeletons"][0]["nodes"]]
         corner = 0.5 if file["metadata"].attrs.get("format_id", 2.0) < 1.1 else 0.0  # SLEAP counted from the corner once
         videos = [str(json.loads(video)["backend"].get("filename", "")) for video in file["videos_json"][:]]
-        frames, instances, points = file["frames"][:], file["instances"][:], file["points"][:]
-        for frame in frames:
+        instances, points = file["instances"][:], file["points"][:]
+        for frame in file["frames"][:]:
             image = f"{videos[frame['video']]}/{frame['frame_idx']}"
             for instance in instances[frame["instance_id_start"] : frame["instance_id_end"]]:
                 if instance["instance_type"] != 0:  # 1 is a prediction
                     continue
                 for name, point in zip(names, points[instance["point_id_start"] : instance["point_id_end"]], strict=True):
-                    seen = np.isfinite([point["x"], point["y"]]).all()
                     x, y = (float(point[axis]) - corner for axis in "xy")
-                    yield Label(image, name, x, y, 2 if seen and point["visible"] else int(seen))
+                    yield Label(image, name, x, y, int(np.isfinite(x + y)) * (2 if point["visible"] else 1))
 
 
 _READERS = {

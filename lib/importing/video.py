@@ -130,8 +130,7 @@ class StereoSource:
                 images = np.split(images[0], 2, axis=axis)
             left, right = images[::-1] if self.video.exchanged else images
             if left.shape != right.shape:
-                what = f"left and right frames differ in size ({' and '.join(sizes)})"
-                raise ValueError(f"{file}: {what}; export both alike.")
+                raise ValueError(f"{file}: left and right frames differ in size ({' and '.join(sizes)}); export both alike.")
             yield left, right
 
 
