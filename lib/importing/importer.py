@@ -150,9 +150,7 @@ def _tool(
     return Tool(offset, np.zeros_like(offset), np.zeros_like(offset)), sd
 
 
-def _did(
-    told: Mapping, stereo: StereoSource, draft: Recording, clock: TimeOffset | str | None, zeros: list[Decimal]
-) -> list[str]:
+def _did(told: Mapping, stereo: StereoSource, draft: Recording, clock: TimeOffset | str | None, zeros: list) -> list[str]:
     """What the import did, one plain sentence each."""
     time_s, (width, height) = draft.frames.time_s, draft.image_size_px
     step = np.diff(time_s) if len(time_s) > 1 else np.array([0.0])

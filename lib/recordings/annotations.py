@@ -88,8 +88,7 @@ def read_coco(path: Path, n_frames: int, image_size_px: tuple[int, int], landmar
         if not set(landmarks) <= set(names):
             raise ValueError(f"{where} has keypoints {names}; {list(landmarks)} are needed.")
         if file.parent.name not in SIDES or not file.stem.isdecimal() or int(file.stem) >= n_frames:
-            known = f"left/000000.jpg to right/{n_frames - 1:06d}.jpg"
-            raise ValueError(f"{where} is not a frame of this recording ({known}).")
+            raise ValueError(f"{where} is not a frame of this recording (left/000000.jpg to right/{n_frames - 1:06d}.jpg).")
         side, frame = at = SIDES.index(file.parent.name), int(file.stem)
         if at in seen:
             raise ValueError(f"{where} is annotated twice; a frame has one tool.")

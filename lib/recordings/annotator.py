@@ -38,9 +38,7 @@ class Annotator:
     [812.5, 640.0]
     """
 
-    def __init__(
-        self, recording: Recording, *, rig: StereoRig | None = None, detected: Correspondences | None = None
-    ) -> None:
+    def __init__(self, recording: Recording, *, rig: StereoRig | None = None, detected: Correspondences | None = None):
         self.recording = recording
         self._path = recording.folder / "annotations.json"
         self._undone, self._done, self._visited = [], [], set()

@@ -172,23 +172,20 @@ class Recording:
         moved_mm = np.linalg.norm(np.diff(self.kinematics.x_mm, axis=0, prepend=self.kinematics.x_mm[:1]), axis=2)
         jump_mm = np.nan_to_num(moved_mm).max(axis=1)
         k = int(jump_mm.argmax())
-        found = []
-        if uniform and logged > _LONGER * (span + 1.0 / self.fps) and logged > 2.0:
-            text = f"{n} frames at {self.fps:g} fps last {span:.1f} s, but the robot's log {logged:.1f} s."
-            cure = "If frames were left out, write their times to frames.csv (frame, time_s)."
-            found.append(Doubt("frame_times", text, cure))
-        if reported / n < _COVERED:
-            text = f"The robot reports a position in {reported} of {n} frames; log and video hardly overlap."
-            cure = "Check offset_s and the time_s columns; export the log of the whole video."
-            found.append(Doubt("little_overlap", text, cure))
-        if usual_s > _SLOW_S:
-            text = f"The robot's log has a sample every {usual_s:.3g} s."
-            cure = "Is time_s in milliseconds? Give seconds, and ten samples a second or more."
-            found.append(Doubt("slow_log", text, cure))
-        if jump_mm[k] > _JUMP_MM:
-            text = f"In kinematics.csv a landmark jumps by {jump_mm[k]:.0f} mm at {log_s[k]:.3f} s (line {k + 2})."
-            found.append(Doubt("jump", text, "Leave the cells of a wrong sample empty."))
-        return found
+        longer = uniform and logged > _LONGER * (span + 1.0 / self.fps) and logged > 2.0
+        found = (
+            (longer, "frame_times", f"{n} frames at {self.fps:g} fps last {span:.1f} s, but the robot's log {logged:.1f} s.",
+             "If frames were left out, write their times to frames.csv (frame, time_s)."),
+            (reported / n < _COVERED, "little_overlap",
+             f"The robot reports a position in {reported} of {n} frames; log and video hardly overlap.",
+             "Check offset_s and the time_s columns; export the log of the whole video."),
+            (usual_s > _SLOW_S, "slow_log", f"The robot's log has a sample every {usual_s:.3g} s.",
+             "Is time_s in milliseconds? Give seconds, and ten samples a second or more."),
+            (jump_mm[k] > _JUMP_MM, "jump",
+             f"In kinematics.csv a landmark jumps by {jump_mm[k]:.0f} mm at {log_s[k]:.3f} s (line {k + 2}).",
+             "Leave the cells of a wrong sample empty."),
+        )  # fmt: skip
+        return [Doubt(*told) for holds, *told in found if holds]
 
     def landmarks_mm(self) -> np.ndarray:
         """The robot's landmarks (n, k, 3) mm at the frames' times, NaN where the robot says nothing.
@@ -204,8 +201,7 @@ def _read_header(path: Path) -> dict:
     content = read_toml(path)
     kinds = _REQUIRED | {key: type(value) for key, value in (_DEFAULTS | _FIXED).items()}
     if unknown := sorted(set(content) - set(kinds)):
-        known = f"Known: {', '.join(kinds)}; own notes go in [details]"
-        raise ValueError(f"{path}: unknown key {', '.join(unknown)}. {known}.")
+        raise ValueError(f"{path}: unknown key {', '.join(unknown)}. Known: {', '.join(kinds)}; own notes go in [details].")
     if missing := sorted(set(_REQUIRED) - set(content)):
         raise ValueError(f"{path}: {', '.join(missing)} is missing.")
     for key, value in content.items():
@@ -293,9 +289,7 @@ class RecordingWriter:
             "robot_accuracy_mm": float(robot_accuracy_mm), "readout_s": float(readout_s), "offset_s": float(offset_s),
         }  # fmt: skip
         self._details = dict(details or {})
-        self._time_s: list[float] = []
-        self._kinematics: list[np.ndarray] = []
-        self._annotations: Annotations | None = None
+        self._time_s, self._kinematics, self._annotations = [], [], None
 
     def _check_target(self) -> None:
         if self.target.exists() and not self._overwrite:

@@ -22,10 +22,9 @@ def smoothed(kinematics: Kinematics, noise_mm: float) -> tuple[Kinematics, float
     Each sample has the window whose polynomials best predict it and its neighbours when these are left out.  Where that would
     move a landmark by more than 1.5 times `noise_mm`, the robot's accuracy per coordinate (RMS of a few samples), they stay
     as they are: at jumps, and where the log is too slow for the motion.  A sample that lacks a landmark, or repeats its
-    neighbour as a frozen log does, stays too, and no polynomial uses it.  The noise left is an RMS
-    in mm per coordinate (Mallows, "Some comments on Cp", 1973).  What the polynomials do not take away counts as left, since
-    an error that changes slowly looks like motion.
-    (Cleveland, "Robust locally weighted regression and smoothing scatterplots", 1979.)
+    neighbour as a frozen log does, stays too, and no polynomial uses it.  The noise left is an RMS in mm per coordinate
+    (Mallows, "Some comments on Cp", 1973).  What the polynomials do not take away counts as left, since an error that changes
+    slowly looks like motion.  (Cleveland, "Robust locally weighted regression and smoothing scatterplots", 1979.)
 
     >>> rng, time_s = np.random.default_rng(0), np.arange(400) / 100
     >>> x_mm = np.stack([np.sin(3 * time_s), np.cos(2 * time_s), time_s], axis=1)[:, None]
@@ -44,8 +43,7 @@ def smoothed(kinematics: Kinematics, noise_mm: float) -> tuple[Kinematics, float
         error = _thereabouts(((x - fitted) / (1 - own)[:, None]) ** 2)  # had the sample been left out
         better = (error < least) & np.isfinite(fitted).all(axis=1)
         best[better], least[better], share[better] = fitted[better], error[better], own[better]
-    landmarks = np.split((x - best) ** 2, kinematics.x_mm.shape[1], axis=1)
-    moves = np.max([_thereabouts(part) for part in landmarks], axis=0)
+    moves = np.max([_thereabouts(part) for part in np.split((x - best) ** 2, kinematics.x_mm.shape[1], axis=1)], axis=0)
     smooth = moves < (_MOST * noise_mm) ** 2
     best = np.where(smooth[:, None], best, x)
     moved, own = ((x - best)[known] ** 2).mean(), np.where(smooth, share, 1.0)[known].mean()
