@@ -118,13 +118,12 @@ def _client(workers: int, scheduler: str | None):
         "distributed.nanny.pre-spawn-environ": dict.fromkeys(libraries, threads),
         "distributed.worker.profile.enabled": False, "logging": {"distributed": "critical"},
     }  # fmt: skip
-    local = {
-        "n_workers": workers, "threads_per_worker": 1, "memory_limit": None, "silence_logs": logging.CRITICAL,
-        "dashboard_address": "127.0.0.1:0", "scheduler_kwargs": {"dashboard": False},
-    }  # fmt: skip
     with patch.dict(os.environ), dask.config.set(settings):  # Dask sets the limits in this process too
         try:
-            cluster = LocalCluster(**local)
+            cluster = LocalCluster(
+                n_workers=workers, threads_per_worker=1, memory_limit=None, silence_logs=logging.CRITICAL,
+                dashboard_address="127.0.0.1:0", scheduler_kwargs={"dashboard": False},
+            )  # fmt: skip
         except RuntimeError as error:
             need = 'Each imports your script: put what that runs under `if __name__ == "__main__":`.'
             raise RuntimeError(f"The worker processes did not start ({error}). {need}") from None

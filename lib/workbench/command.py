@@ -138,8 +138,7 @@ def run(
     if content["verdict"]:
         names = ", ".join(dict.fromkeys(reason["name"].replace("_", " ") for reason in content["reasons"]))
         folder = content["parameters"].get("recording") or paths.shown(paths.SHIPPED_RECORDING)
-        why = f" ({names}); `python3 -m lib check {folder}` says more" if names else ""
-        print(f"Verdict: {content['verdict']}{why}")
+        print(f"Verdict: {content['verdict']}" + (f" ({names}); `python3 -m lib check {folder}` says more" if names else ""))
     return content
 
 
@@ -173,8 +172,7 @@ class _Report:
             "format": "microstereo.metrics", "version": 1, "state": "running", "profile": profile, "parameters": given,
             "started": datetime.datetime.now().astimezone().isoformat(timespec="seconds"), "seconds": 0.0,
             "commit": commit(), "machine": machine(),
-            "weights": files.digest(paths.MODELS / "default.safetensors"),
-            "versions": execution.versions(),
+            "weights": files.digest(paths.MODELS / "default.safetensors"), "versions": execution.versions(),
             "notebooks": [
                 {"name": book.stem, "title": execution.title_of(book), "state": "pending", "seconds": None, "failure": None,
                  "page": None, "executed": None, "left_out": None, "verdict": None, "reasons": []}

@@ -83,8 +83,7 @@ class _Renderer(IPythonRenderer):
 def markdown_html(source: str, *, folder: Path = Path(), attachments: dict | None = None, trusted: bool = True) -> str:
     """Markdown with TeX as HTML, with pictures that it names relative to `folder`; HTML that is not `trusted` is escaped."""
     how = {"escape": not trusted, "allow_harmful_protocols": trusted, "embed_images": True, "path": str(folder)}
-    renderer = _Renderer(attachments=attachments or {}, **how)
-    return MarkdownWithMath(renderer=renderer).render(source)
+    return MarkdownWithMath(renderer=_Renderer(attachments=attachments or {}, **how)).render(source)
 
 
 def page(executed: Path, folder: Path, entry: dict, *, previous: dict | None, following: dict | None) -> str:
