@@ -29,12 +29,11 @@ def match(
 
     Args:
         left, right: (h, w, 3) uint8 RGB or (h, w) uint8 grey; sizes may differ.
-        method: "deepmatching": free DeepMatching, integer positions, as published; a rig is only used for
-            `epipolar_px`. "band": DeepMatching along the epipolar lines, sub-pixel; needs a rig. "sgbm", "dis":
-            OpenCV's, on rectified canvases; without a rig the pair is taken as rectified. A callable `f(left, right,
-            (low, high)) -> (disparity, confidence)` of rectified grey uint8 images (h, w), x_right = x_left -
-            disparity, not finite = none; confidence in [0, 1]; and perhaps (h, w) bool, its own check of the way back.
-            None is "band" with a rig, else "deepmatching".
+        method: "deepmatching": free DeepMatching, integer positions, as published; a rig is only used for `epipolar_px`.
+            "band": DeepMatching along the epipolar lines, sub-pixel; needs a rig.  "sgbm", "dis": OpenCV's, on rectified
+            canvases; without a rig the pair is taken as rectified.  A callable `f(left, right, (low, high)) -> (disparity,
+            confidence)` of rectified grey uint8 images (h, w), x_right = x_left - disparity, not finite = none; confidence in
+            [0, 1]; and perhaps (h, w) bool, its own check of the way back.  None is "band" with a rig, else "deepmatching".
         rig: Calibrated rig, or `RECTIFIED` for a pair whose rows correspond (depth is then disparity in px).
         mask_left, mask_right: (h, w) bool, True = ignore (see `glint_mask`, `tool_mask`).
         depth_range_mm: (near, far): the values of d.x to search, where d is the left camera's `viewing_direction` and x a

@@ -186,11 +186,10 @@ def match_band(images: Images, masks: Masks, rig: StereoRig, where: Where, *, bu
 def _cut(grid: np.ndarray, x: np.ndarray, y: np.ndarray, margin: int) -> np.ndarray:
     """(n, s + 2, s + 4, C) windows of a grid (h, w, C) whose patches start at (x, y), with their margins."""
     side = PATCH + 2 * margin
-    rows, columns = y - margin - 1, x - margin - REACH
     height, width, channels = grid.shape
     window = side + 2, (side + 2 * REACH) * channels
     view = np.lib.stride_tricks.sliding_window_view(grid.reshape(height, width * channels), window)
-    return view[rows, columns * channels].reshape(len(x), side + 2, side + 2 * REACH, channels)
+    return view[y - margin - 1, (x - margin - REACH) * channels].reshape(len(x), side + 2, side + 2 * REACH, channels)
 
 
 def _derivatives(windows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

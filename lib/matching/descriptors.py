@@ -79,9 +79,7 @@ def _describe(gray: np.ndarray, rows: slice, stride: int, out: np.ndarray) -> No
             squashed *= np.float32(SLOPE / 2)
             np.tanh(squashed, out=squashed)  # 2 / (1 + exp(-SLOPE x)) - 1
             channel = _blur(squashed)[rows, : width * stride]
-            if stride > 1:
-                channel = cv2.resize(channel, (width, height), interpolation=cv2.INTER_AREA)
-            out[:, :, k + 4 * opposite] = channel
+            out[:, :, k + 4 * opposite] = cv2.resize(channel, (width, height), interpolation=cv2.INTER_AREA)
     out[:, :, CHANNELS - 1] = CONSTANT
 
 

@@ -56,9 +56,7 @@ class Rectification:
         return canvas @ self.right_from_canvas[:, :2].T + self.right_from_canvas[:, 2]
 
 
-def rectify(
-    rig: StereoRig, shape_left: tuple[int, int], shape_right: tuple[int, int], *, scale: float = 1.0
-) -> Rectification:
+def rectify(rig: StereoRig, shape_left: tuple[int, int], shape_right: tuple[int, int], *, scale: float = 1) -> Rectification:
     """The rectification of a rig for images of these shapes (h, w), with `scale` canvas pixels per left pixel.
 
     Of near-affine cameras it is that of the affine ones which touch them.  A ValueError refuses two that look the same way.

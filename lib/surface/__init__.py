@@ -5,7 +5,6 @@ from lib.surface.export import Mesh, depth_map, open3d, save_depth_map, save_mes
 from lib.surface.grid import SplineGrid
 from lib.surface.reconstruct import Reconstruction, epipolar_inliers, reconstruct, refine_rig
 
-__all__ = [
-    "BSplineSurface", "Mesh", "Reconstruction", "SplineGrid", "ToolDistance", "depth_map", "epipolar_inliers", "fit_surface",
-    "open3d", "reconstruct", "refine_rig", "save_depth_map", "save_mesh", "save_points", "surface_mesh",
-]  # fmt: skip
+__all__ = ["BSplineSurface", "Mesh", "Reconstruction", "SplineGrid", "ToolDistance"]
+__all__ += ["depth_map", "epipolar_inliers", "fit_surface", "open3d", "reconstruct", "refine_rig"]
+__all__ += ["save_depth_map", "save_mesh", "save_points", "surface_mesh"]

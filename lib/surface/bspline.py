@@ -34,7 +34,6 @@ class SurfaceFit:
     smoothness: float  # mu of Eq. (6), px^2 / mm: given, or chosen by held-out error
     reject_mm: float  # bound on the L1 norm of a point's residual that was applied, after the first fit
     inliers: np.ndarray  # (n,) points that the final fit used
-    residual_mm: np.ndarray  # (n, 3) Psi(u) - x of every given point at the final surface; NaN where u lies outside
     held_out: np.ndarray  # (m, 2) candidates of the smoothness and their mean held-out L1 error (mm); (0, 2) if it was given
     axes: np.ndarray  # (k, 3) orthonormal directions along which the L1 norm was taken; the frame's axes for the plain fit
     problem: L1Problem = field(repr=False)  # the points on their grid
@@ -149,8 +148,7 @@ class BSplineSurface:
             B = self.grid.design(u[part]).toarray().T
             variance = [(B * cho_solve_banded((factor, True), B)).sum(axis=0) / (2 * f) for factor, f in self.fit.posterior]
             sigma = np.sqrt(np.stack(variance, axis=1) * inflation)
-            covariance = sigma[:, :, None] * correlation * sigma[:, None, :]
-            result[part] = np.einsum("ki,nkl,lj->nij", axes, covariance, axes)
+            result[part] = np.einsum("ki,nkl,lj->nij", axes, sigma[:, :, None] * correlation * sigma[:, None, :], axes)
         return result
 
     def distance(self, x_mm: ArrayLike, camera: AffineCamera) -> ToolDistance:
@@ -249,13 +247,9 @@ def fit_surface(
             control_points = control_points + (grid.sites - camera.offset_px) @ np.linalg.pinv(camera.linear).T
         return problem, solution, BSplineSurface(grid, control_points)
 
-    def residuals(surface: BSplineSurface) -> np.ndarray:
-        # With a camera only the depth is fitted, so only it can be wrong.
-        difference = surface(u) - x
-        return difference if camera is None else (difference @ axes.T) @ axes
-
     problem, solution, surface = solve(used, search if quick else exact)
-    norm = np.abs(residuals(surface)).sum(axis=1)
+    residual = surface(u) - x  # with a camera only the depth is fitted, so only it can be wrong
+    norm = np.abs(residual if camera is None else (residual @ axes.T) @ axes).sum(axis=1)
     if reject_mm is None:
         # A surface as flexible as the points are few meets many of them exactly, and a median says nothing.
         reject_mm = max(REJECT_MEDIANS * float(np.median(norm[used])), float(np.partition(norm[used], least - 1)[least - 1]))
@@ -267,16 +261,13 @@ def fit_surface(
         problem, solution, surface = solve(inliers, exact)
     fit = SurfaceFit(
         objective=float(solution.objective.sum()), duality_gap=float(solution.duality_gap.sum()),
-        smoothness=float(smoothness), reject_mm=float(reject_mm), inliers=inliers, residual_mm=residuals(surface),
-        held_out=held_out, axes=axes, problem=problem, penalty=mu, weights=norms[inliers],
-        residual=problem.design @ solution.coefficients - values[inliers],
+        smoothness=float(smoothness), reject_mm=float(reject_mm), inliers=inliers, held_out=held_out, axes=axes, penalty=mu,
+        problem=problem, weights=norms[inliers], residual=problem.design @ solution.coefficients - values[inliers],
     )  # fmt: skip
     return BSplineSurface(grid, surface.control_points_mm, fit)
 
 
-def _outputs(
-    x: np.ndarray, covariance_mm2: ArrayLike | None, camera: AffineCamera | None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _outputs(x: np.ndarray, covariance_mm2: ArrayLike | None, camera: AffineCamera | None) -> tuple[np.ndarray, ...]:
     """(axes (k, 3), values (n, k) = x along them, weights (n, k) of their absolute residuals)."""
     if camera is not None and not isinstance(camera, AffineCamera):
         raise ValueError("camera: the rays of a near-affine camera make the depth no B-spline; fit without a camera.")

@@ -50,8 +50,7 @@ class L1Problem:
         packed = np.zeros((len(along_x), along_x.shape[1], 1))
         packed.ravel()[slot] = weights
         band = scatter @ np.matmul(along_y, packed * along_x).ravel() + stiffness * bending
-        # Columns of the band are contiguous, as LAPACK wants them.
-        return band.reshape(self.grid.size, -1).T
+        return band.reshape(self.grid.size, -1).T  # its columns are contiguous, as LAPACK wants them
 
     @cached_property
     def _blocks(self) -> tuple[np.ndarray, ...]:
