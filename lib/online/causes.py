@@ -80,7 +80,7 @@ def misfit(rig: StereoRig, data: Correspondences, covariance_px2: np.ndarray, pa
     The residuals' covariance is (n, 4, 4), and `parameters` is the number of values that were fitted to these rows.
     """
     try:
-        residual = np.hstack([data.u_left, data.u_right]) - np.hstack(rig.project(data.x_mm))
+        residual = data.stacked_px - np.hstack(rig.project(data.x_mm))
     except ValueError:  # behind a near-affine camera
         return np.inf
     chi2 = np.einsum("ni,ni->n", residual, np.linalg.solve(covariance_px2, residual[:, :, None])[:, :, 0])
@@ -108,19 +108,17 @@ def _lateness(rig, frames, past, covariance_px2) -> tuple[float, Explanation] | 
 def _offset(rig: StereoRig, data: Correspondences, axes: np.ndarray, covariance_px2: np.ndarray) -> np.ndarray:
     """(3,) mm in the tool's axes by which all landmarks lie off the report, robustly."""
     weight, offset = np.linalg.inv(covariance_px2), np.zeros(3)
-    y = np.hstack([data.u_left, data.u_right])
     for _ in range(10):
         x = data.x_mm + axes @ offset
-        r, J = y - np.hstack(rig.project(x)), rig.jacobian(x) @ axes
-        W = weight * (_ROBUST / (_ROBUST + np.einsum("ni,nij,nj->n", r, weight, r)))[:, None, None]
-        JtW = np.swapaxes(J, 1, 2) @ W
+        r, J = data.stacked_px - np.hstack(rig.project(x)), rig.jacobian(x) @ axes
+        JtW = J.mT @ (weight * (_ROBUST / (_ROBUST + np.einsum("ni,nij,nj->n", r, weight, r)))[:, None, None])
         offset = offset + np.linalg.lstsq((JtW @ J).sum(axis=0), np.einsum("nij,nj->i", JtW, r), rcond=None)[0]
     return offset
 
 
 def _refitted(data: Correspondences, covariance_px2: np.ndarray) -> StereoRig:
     """Two affine cameras fitted to the rows, robustly."""
-    y, H = np.hstack([data.u_left, data.u_right]), np.column_stack([data.x_mm, np.ones(len(data))])
+    y, H = data.stacked_px, np.column_stack([data.x_mm, np.ones(len(data))])
     variance, weight = np.einsum("nii->n", covariance_px2) / 4.0, np.ones(len(data))
     for _ in range(10):
         root = np.sqrt(weight / variance)[:, None]

@@ -99,8 +99,7 @@ class TipDistance:
             return
         if self._x is not None and time_s > self._moved_s:
             step_s = time_s - self._moved_s
-            gain = 1.0 - np.exp(-step_s / _SMOOTH_S)
-            self._velocity = self._velocity + gain * ((x_mm - self._x) / step_s - self._velocity)
+            self._velocity += (1.0 - np.exp(-step_s / _SMOOTH_S)) * ((x_mm - self._x) / step_s - self._velocity)
         self._x, self._moved_s = x_mm.copy(), time_s
 
     def _correct(self, gap: np.ndarray, noise: np.ndarray) -> None:

@@ -127,8 +127,7 @@ class OnlinePipeline:
                 self._tips.triangulate(result, tracker)
         self._follow_surface(result, left, right)
         recent = time_s - self._rests_on["landmarks"] <= self.settings.stale_s
-        reading = result.state in ("tracking", "robot") or (result.state == "unseen" and recent)
-        if tracker.rig is not None and reading:
+        if tracker.rig is not None and (result.state in ("tracking", "robot") or (result.state == "unseen" and recent)):
             with result.stage("distance"):
                 self._tips.measure(result, tracker, x_mm, self._surface)
         surface_s = self._surface.time_s if self._surface else float("nan")

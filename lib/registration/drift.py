@@ -162,5 +162,4 @@ def _long_run_sd(values: np.ndarray, known: int = 0) -> np.ndarray:
     for lag in range(1, int(widths.max()) + 1):
         total += 2.0 * np.maximum(1.0 - lag / (widths + 1.0), 0.0) * (d[lag:] * d[:-lag]).sum(axis=0) / n
     few, least = 1.0 + 3.0 / (1.0 + (n / _FEW) ** 2), np.maximum(variance, 0.05)
-    total = (n * total + known * np.array(_RAISES) * variance) / (n + known)
-    return np.sqrt(few * np.maximum(total, least))
+    return np.sqrt(few * np.maximum((n * total + known * np.array(_RAISES) * variance) / (n + known), least))

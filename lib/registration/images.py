@@ -104,8 +104,7 @@ def identify_motion(
     stay, rigs, bic = RigidTransform.identity(), {}, {}
     for name, (*motions, parameters) in hypotheses.items():
         rigs[name] = rig.moved(*(stay if motion is None else motion.transform for motion in motions))
-        energy, _ = _evaluate(rigs[name], observed, "robust", stay)
-        bic[name] = 2 * energy + parameters * np.log(2 * observed.seen.sum())
+        bic[name] = 2 * _evaluate(rigs[name], observed, "robust", stay)[0] + parameters * np.log(2 * observed.seen.sum())
     best = min(bic, key=bic.__getitem__)
     return MovedCameras(rigs[best], best, *hypotheses[best][:2], bic)
 

@@ -5,7 +5,5 @@ from lib.trust.fitting import Hypothesis
 from lib.trust.health import Health, health
 from lib.trust.verdict import LEVELS, Assessment, Reason, Verdict, assess, judge, report
 
-__all__ = [
-    "LEVELS", "Assessment", "Diagnosis", "Health", "Hypothesis", "Reason", "Verdict", "assess", "diagnose", "health", "judge",
-    "report",
-]  # fmt: skip
+__all__ = ["LEVELS", "Assessment", "Diagnosis", "Health", "Hypothesis", "Reason", "Verdict"]
+__all__ += ["assess", "diagnose", "health", "judge", "report"]

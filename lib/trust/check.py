@@ -152,8 +152,7 @@ def _facts(recording: Recording, a: Assessment) -> dict[str, str]:
         parts = ["{}: {:+.0f}, {:+.0f}, {:+.0f} um".format(name, *value) for name, value in offsets]
         facts["landmark offsets"] = "; ".join(parts) + " (along, across, normal)."
     bad = f"{int((a.health.score > 1).sum())} of {len(a.health.frame)} frames have a score above 1"
-    usual = f"of frames with right landmarks {100 * a.health.false_alarm_rate:.0f} %"
-    facts["detector"] = f"{a.health.text}; {bad} ({usual})."
+    facts["detector"] = f"{a.health.text}; {bad} (of frames with right landmarks {100 * a.health.false_alarm_rate:.0f} %)."
     if np.isfinite(a.epipolar_px):
         facts["epipolar witness"] = f"Features of both images lie {a.epipolar_px:.2f} px (median) off the epipolar lines."
     return facts

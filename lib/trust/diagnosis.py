@@ -364,8 +364,7 @@ def diagnose(
     case = Case(problem, kinematics, offset_s, readout_s, image_size_px)
     tests = [_tip_order, _finite_distance, _landmark_offset, _tool_bends, _drift, _bad_part, _camera_moved, _frozen]
     tests = [*(TIME_TESTS if case.paths else ()), *tests, _rigid_tips, _optics]
-    found = [h for test in tests for h in test(case)]
-    found = sorted((h for h in found if np.isfinite(h.gain)), key=lambda h: -h.gain)
-    best = Diagnosis(tuple(found)).best
+    found = [h for test in tests for h in test(case) if np.isfinite(h.gain)]
+    best = Diagnosis(tuple(sorted(found, key=lambda h: -h.gain))).best
     found += _unexplained(case, case.null if best is None else case.fits.get(best.name, case.null))
     return Diagnosis(tuple(sorted(found, key=lambda h: -h.gain)))
