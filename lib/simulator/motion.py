@@ -95,12 +95,10 @@ class Motion:
         time = float(np.clip(time_s, 0, self.duration_s))
         start, path = [part for part in self._parts if part[0] <= time][-1]
         x, y, z, azimuth, pitch, roll, opening = path(time)
-        roll = np.clip(roll, -MAX_ROLL_RAD, MAX_ROLL_RAD)
-        pose = Pose((0.0, 0.0, 0.0), azimuth, max(pitch, 0.0), roll, max(opening, 0))
+        pose = Pose((0.0, 0.0, 0.0), azimuth, max(pitch, 0.0), np.clip(roll, -MAX_ROLL_RAD, MAX_ROLL_RAD), max(opening, 0))
         base, tips = np.split(self.forceps.landmarks(pose), [1])
         moved = np.array([x, y, z]) - [*((base[0] + tips.mean(axis=0)) / 2)[:2], tips[:, 2].max()]
-        ground = self.scene.height(*(tips + moved)[:, :2].T)
-        moved[2] = min(moved[2], *(ground - _CLEARANCE_MM - tips[:, 2]))
+        moved[2] = min(moved[2], *(self.scene.height(*(tips + moved)[:, :2].T) - _CLEARANCE_MM - tips[:, 2]))
         if self.kind == "surgeon" or start > 0:
             rng = np.random.default_rng([self.seed, 29])
             frequency, phase = rng.uniform(8, 12, (3, 3)), rng.uniform(0, 2 * np.pi, (3, 3))

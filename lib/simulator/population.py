@@ -185,12 +185,10 @@ def _tips(rng: Rng, reach: float) -> np.ndarray:
     return rng.uniform(-1, 1, 2) * IMAGE_SIZE_PX / 200 * reach
 
 
-def _reaching(
-    tips: np.ndarray, tip_z: float, length: float, azimuth: float, pitch: float, roll: float, opening: float
-) -> Pose:
+def _reaching(tips: np.ndarray, z: float, length: float, azimuth: float, pitch: float, roll: float, opening: float) -> Pose:
     """The pose in which a tool of this length has its tips there."""
     flat = length * np.cos(pitch) * np.array([np.cos(azimuth), np.sin(azimuth)])
-    base = [*(tips - flat), tip_z - length * np.sin(pitch)]
+    base = [*(tips - flat), z - length * np.sin(pitch)]
     return Pose(tuple(float(v) for v in base), azimuth, pitch, float(roll), float(opening))
 
 

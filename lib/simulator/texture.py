@@ -119,8 +119,7 @@ def fundus_texture(seed: int, size_px: int = 2048, rim_mm: float = 9.3) -> np.nd
 
     texture = np.empty((size_px, size_px, 3), np.uint8)
     for channel in range(3):
-        tint = (0.75, 1.0, 1.1)[channel]
-        retina = pigment[channel] * np.exp(-tint * density - 0.35 * ring)
+        retina = pigment[channel] * np.exp(-(0.75, 1.0, 1.1)[channel] * density - 0.35 * ring)
         pale = _DISC[channel] * (0.75 + 0.35 * cup) * np.exp(-0.4 * density)
         value = retina + disc_share * (pale - retina)
         value *= np.exp(-_BLOOD["artery"][channel] * 0.55 * artery_map - _BLOOD["vein"][channel] * 0.75 * vein_map)

@@ -153,8 +153,7 @@ def _behind_another_part(raster: ToolRaster, k: int, u: np.ndarray, front_mm: fl
     column, row = np.floor((u + 0.5 - raster.origin_px) * raster.factor).astype(int)
     if not (0 <= row < raster.part.shape[0] and 0 <= column < raster.part.shape[1]):
         return False
-    own = (0, 1) if k == 0 else (0, k + 1)
-    return raster.depth_mm[row, column] < front_mm - 0.06 and raster.part[row, column] not in own
+    return raster.depth_mm[row, column] < front_mm - 0.06 and raster.part[row, column] not in (0, k + 1)
 
 
 def _behind_its_jaw(nodes: Nodes, k: int, u: np.ndarray, zoom: float) -> bool:
@@ -162,8 +161,7 @@ def _behind_its_jaw(nodes: Nodes, k: int, u: np.ndarray, zoom: float) -> bool:
     factor, reach_px, side = 16, 0.25, 5
     corner = np.round(u) - 2
     centres, radii, chains = (part[nodes[2] == k] for part in nodes)
-    centres = centres - np.append(corner / zoom, 0)
-    raster = rasterise(centres, radii, chains, zoom=zoom, size_px=(side, side), factor=factor)
+    raster = rasterise(centres - np.append(corner / zoom, 0), radii, chains, zoom=zoom, size_px=(side, side), factor=factor)
     covered = np.zeros((side * factor, side * factor), bool)
     if raster is not None:
         covered[tuple(raster.hit + factor * np.array(raster.origin_px[::-1])[:, None])] = True
@@ -186,10 +184,9 @@ def compose(
     power = 1.15 * microscope.brightness * microscope.lighting.tool
     if isinstance(forceps, Instrument):
         clearance = max(scene_z_mm - float(raster.depth_mm[raster.hit].mean()), 0.3)
-        metal = _finished(raster, forceps, lamp, linear / max(power, 0.02), window.zoom, clearance) * np.float32(power)
+        metal = _finished(raster, forceps, lamp, linear / max(power, 0.02), window.zoom * clearance) * np.float32(power)
     else:
-        glow = linear[::16, ::16].reshape(-1, 3).mean(axis=0)
-        metal = _metal(raster, forceps, lamp, glow) * np.float32(power)
+        metal = _metal(raster, forceps, lamp, linear[::16, ::16].reshape(-1, 3).mean(axis=0)) * np.float32(power)
     colour, alpha, depth = _at_image_resolution(raster, metal)
     shift = tool.velocity * window.zoom * microscope.exposure_s
     height, width = alpha.shape
@@ -250,10 +247,8 @@ def _at_image_resolution(raster: ToolRaster, metal: np.ndarray) -> tuple[np.ndar
     return colour, count / samples, total(raster.depth_mm[rows, columns]) / np.maximum(count, 1)
 
 
-def _finished(
-    raster: ToolRaster, tool: Instrument, lamp: np.ndarray, scene: np.ndarray, zoom: float, clearance_mm: float
-) -> np.ndarray:
-    """As `_metal`, for any finish, with `scene` (h, w, 3), `clearance_mm` below the tool, mirrored in it."""
+def _finished(raster: ToolRaster, tool: Instrument, lamp: np.ndarray, scene: np.ndarray, clearance_px: float) -> np.ndarray:
+    """As `_metal`, for any finish, with `scene` (h, w, 3), `clearance_px` below the tool, mirrored in it."""
     normal, tangent = raster.normal, raster.tangent
     chain = raster.part[raster.hit].astype(int) - 1
     finishes = [f for one in (tool, *(other for other, _ in tool.others)) for f in (one.finishes[0], *[one.finishes[1]] * 2)]
@@ -267,7 +262,7 @@ def _finished(
     streak = np.maximum(1 - along * along, 0) ** sharpness * to_half**4
     # The view ray (0, 0, 1), mirrored: where it goes down it meets the scene, where it goes up the room and the lamp.
     up = 2 * normal[:, 2] ** 2 - 1
-    shift = -2 * normal[:, 2:] * normal[:, :2] * (zoom * clearance_mm / np.maximum(-up, 0.15))[:, None]
+    shift = -2 * normal[:, 2:] * normal[:, :2] * (clearance_px / np.maximum(-up, 0.15))[:, None]
     sky = 0.08 + 0.75 / (1 + np.exp(-(up - 0.6) / 0.12))
     small = cv2.GaussianBlur(cv2.resize(scene, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA), (0, 0), 1.5)
     at = [(sample + 0.5) / raster.factor + first for sample, first in zip(raster.hit[::-1], raster.origin_px, strict=True)]

@@ -95,8 +95,7 @@ class Video:
 
     def shrunk(self, factor: float) -> Self:
         """For an image of which every length is `factor` times as long; compression and noise stay."""
-        lengths = ("defocus_px", "fringe_px", "field_shift_px")
-        return replace(self, **{name: factor * getattr(self, name) for name in lengths})
+        return replace(self, **{name: factor * getattr(self, name) for name in ("defocus_px", "fringe_px", "field_shift_px")})
 
 
 def compressed(image: np.ndarray, quality: int) -> np.ndarray:
