@@ -10,6 +10,7 @@ import contextlib
 import ctypes
 import hashlib
 import importlib.util
+import itertools
 import json
 import os
 import re
@@ -108,15 +109,13 @@ def _is_ready(root: Path, torch: str | None) -> bool:
 def _sole_maker(root: Path):
     """Hold a lock, which the installer inherits: if this process is killed, the next waits until the orphan has ended."""
     with open(root / "lib" / "environment.lock", "rb") as file:
-        waiting = False
-        while True:
+        for attempt in itertools.count():
             try:
                 _take(file)
                 break
             except (BlockingIOError, PermissionError):
-                if not waiting:
+                if not attempt:
                     _say("Another process is setting up the environment; waiting for it ...")
-                waiting = True
                 time.sleep(0.5)
             except OSError:
                 break  # a file system without locks: go on alone

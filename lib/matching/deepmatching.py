@@ -189,7 +189,6 @@ def correlation_volume(left: torch.Tensor, right: torch.Tensor, v: int) -> torch
     volume = right.new_empty(gy, gx, 2 * v + 1, n)
     block, row = max(4, min(gx, n // 2)), PATCH * channels
     column = (PATCH * ROWS + 2 * v) * row
-    turned = right.transpose(0, 1)
 
     def correlate(top: int) -> None:
         """Fill one chunk of lattice rows, from windows laid out as (x, y, 4 cells of the row): any is then contiguous."""
@@ -197,7 +196,7 @@ def correlation_volume(left: torch.Tensor, right: torch.Tensor, v: int) -> torch
         rows = slice(PATCH * top, PATCH * (top + k) + 2 * v)
         strip = right.new_empty(n_x, column // row, row)
         for c in range(PATCH):
-            strip[:, : rows.stop - rows.start, c * channels : (c + 1) * channels] = turned[c : c + n_x, rows]
+            strip[:, : rows.stop - rows.start, c * channels : (c + 1) * channels] = right[rows, c : c + n_x].transpose(0, 1)
         for j in range(2 * v + 1):
             for start in range(0, gx, block):
                 b = min(block, gx - start)
@@ -205,8 +204,7 @@ def correlation_volume(left: torch.Tensor, right: torch.Tensor, v: int) -> torch
                 view = strip.as_strided((k, windows, depth), (PATCH * row, column, 1), PATCH * start * column + j * row)
                 product = torch.bmm(patches[top : top + k, start : start + b], view.transpose(1, 2))
                 skewed = product.as_strided((k, b, n), (b * windows, windows + PATCH, 1))
-                first = (PATCH * top + j) * n_x + PATCH * start
-                scale = inverse_norm.as_strided((k, b, n), (PATCH * n_x, PATCH, 1), first)
+                scale = inverse_norm.as_strided((k, b, n), (PATCH * n_x, PATCH, 1), (PATCH * top + j) * n_x + PATCH * start)
                 torch.mul(skewed, scale, out=volume[top : top + k, start : start + b, j])
 
     with ThreadPoolExecutor(2) as executor:

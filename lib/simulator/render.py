@@ -100,8 +100,7 @@ def render_view(
         film_x, film_y = grid.full(-0.6 * slope_x + want_x), grid.full(-0.6 * slope_y + want_y)
         place = (axis * np.float32(_BUMP_PX / _BUMP_MM / to_texture) for axis in (map_x, map_y))
         film = _bumps(getattr(scene, "film_seed", getattr(scene, "seed", 0)))
-        bump = cv2.remap(film, *place, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
-        bump *= np.float32(0.13)
+        bump = np.float32(0.13) * cv2.remap(film, *place, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
         film_x += bump[..., 0]
         film_y += bump[..., 1]
         mirror = film_x * film_x + film_y * film_y
@@ -132,16 +131,12 @@ def render_view(
     if rng is not None and np.isfinite(microscope.full_well):
         variance = np.clip(linear, 0, 1.2) * np.float32(1 / microscope.full_well)
         variance += np.float32((microscope.read_noise / microscope.full_well) ** 2)
-        np.sqrt(variance, out=variance)
-        variance *= rng.standard_normal(linear.shape, dtype=np.float32)
-        linear += variance
-    np.clip(linear, 0, 1, out=linear)
-    cv2.pow(linear, 1 / GAMMA, linear)
+        linear += np.sqrt(variance) * rng.standard_normal(linear.shape, dtype=np.float32)
     glint_mask[tool_mask > 0] = 0
-    image, surface_mm = cv2.convertScaleAbs(linear, alpha=255), grid.full(z) if surface else None
+    image = cv2.convertScaleAbs(cv2.pow(np.clip(linear, 0, 1), 1 / GAMMA), alpha=255)
     if microscope.video is not None:
         image = microscope.video(image, rng)
-    return View(image, u, visibility, surface_mm, tool_mask, glint_mask)
+    return View(image, u, visibility, grid.full(z) if surface else None, tool_mask, glint_mask)
 
 
 def render_pair(

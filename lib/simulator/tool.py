@@ -56,9 +56,8 @@ def rasterise(
     x0, y0 = low.min(axis=0)
     x1, y1 = high.max(axis=0)
     shape = ((y1 - y0) * factor, (x1 - x0) * factor)
-    depth = np.full(shape, np.inf, np.float32)
+    depth, index = np.full(shape, np.inf, np.float32), np.full(shape, -1, np.int16)
     parameter = np.zeros(shape, np.float32)
-    index = np.full(shape, -1, np.int16)
     for k, (lx, ly), (hx, hy) in zip(joined, low, high, strict=True):
         a, b = centres[k], centres[k + 1]
         r, dr = radii[k], radii[k + 1] - radii[k]
@@ -72,10 +71,7 @@ def rasterise(
         A, gain = np.float32(A), np.float32(dz / np.sqrt(dz * dz - A))
         B = np.add.outer((r * dr + wy * c[1]).astype(np.float32), (wx * c[0]).astype(np.float32))
         C = np.subtract.outer((r * r - wy * wy).astype(np.float32), wx * wx)
-        s = np.sqrt(np.maximum(B * B - A * C, 0))
-        s *= gain
-        s -= B
-        s /= A
+        s = (gain * np.sqrt(np.maximum(B * B - A * C, 0)) - B) / A
         flat = chains[k] == 0 and (k + 2 >= len(chains) or chains[k + 2] != 0)
         past = flat & (s > 1)
         np.clip(s, 0, 1, out=s)
@@ -83,9 +79,8 @@ def rasterise(
         z = np.float32(a[2]) + s * np.float32(dz) - np.sqrt(np.maximum(Q, 0))
         view = np.s_[(ly - y0) * factor : (hy - y0) * factor, (lx - x0) * factor : (hx - x0) * factor]
         closer = (Q > 0) & (z < depth[view]) & ~past
-        np.copyto(depth[view], z, where=closer)
-        np.copyto(parameter[view], s, where=closer)
-        np.copyto(index[view], np.int16(k), where=closer)
+        for whole, own in ((depth, z), (parameter, s), (index, np.int16(k))):
+            np.copyto(whole[view], own, where=closer)
     rows, columns = np.nonzero(index >= 0)
     k, s = index[rows, columns], parameter[rows, columns][:, None]
     span = centres[1:] - centres[:-1]

@@ -60,10 +60,8 @@ class Video:
         if self.colours != _IDENTITY:
             value = cv2.transform(value, np.float32(self.colours))
         if self.gamma != 1.0:
-            np.clip(value, 0, None, out=value)
-            cv2.pow(value, self.gamma, value)
-        value = np.float32(self.black) + np.float32((1 - self.black) * self.contrast) * value
-        np.clip(value, 0, 1, out=value)
+            value = cv2.pow(np.clip(value, 0, None), self.gamma)
+        value = np.clip(np.float32(self.black) + np.float32((1 - self.black) * self.contrast) * value, 0, 1)
         if rng is not None and self.noise:
             noise = rng.standard_normal(value.shape, dtype=np.float32) * np.float32(1 - self.noise_grey)
             noise += rng.standard_normal((*value.shape[:2], 1), dtype=np.float32) * np.float32(self.noise_grey)
@@ -78,8 +76,7 @@ class Video:
             value = cv2.cvtColor(cv2.convertScaleAbs(raw, alpha=255), cv2.COLOR_BayerBG2RGB).astype(np.float32) / 255
         if self.sharpening:
             value += np.float32(self.sharpening) * (value - cv2.GaussianBlur(value, (0, 0), self.sharpening_px))
-        np.clip(value, 0, 1, out=value)
-        image = cv2.convertScaleAbs(value, alpha=255)
+        image = cv2.convertScaleAbs(np.clip(value, 0, 1), alpha=255)
         if self.field_shift_px:
             for first, sign in ((0, -0.5), (1, 0.5)):
                 image[first::2] = _shifted(image[first::2], sign * self.field_shift_px, 0.0)

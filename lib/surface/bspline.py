@@ -308,13 +308,12 @@ def _choose_smoothness(
 
     def error(step: int) -> float:
         if step not in errors:
-            total, count = 0.0, 0
+            total = 0.0
             for problem, train, design, test in parts:
                 scaled = unit * _LADDER**step * stiffness * train.sum() / n
                 apart = np.abs(design @ solver(problem, values[train], scaled, norms[train]).coefficients - values[test])
                 total += float((norms[test] / stiffness * apart).sum())
-                count += test.sum()
-            errors[step] = total / count
+            errors[step] = total / np.sum(tests)
         return errors[step]
 
     # Down a ladder of half decades to the lowest rung, then the parabola through it and its neighbours.

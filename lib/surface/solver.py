@@ -178,9 +178,7 @@ def _interior_point(
             """Newton step (dc, dy) that closes the dual residual, with D (B dc + pull) = dy."""
             pull = D * pull
             dc = dpbtrs(factor, -bending_pull - B_T @ (y + pull), lower=1)[0]
-            dy = D * (B @ dc)
-            dy += pull
-            return dc, dy
+            return dc, D * (B @ dc) + pull
 
         # Predictor: straight to the solution.  How far it gets tells the corrector's centring and second-order term.
         _, dy = newton(p - q)
