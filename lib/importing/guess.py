@@ -110,8 +110,7 @@ def _time(columns: dict[str, list[str]], decimal: str) -> dict[str, str]:
 
 
 def _robot(folder: Path, paths: dict[str, Path], tables: dict[str, Path]) -> dict:
-    bags = [name for name, path in paths.items() if path.suffix in (".bag", ".db3", ".mcap")]
-    if bags:
+    if bags := [name for name, path in paths.items() if path.suffix in (".bag", ".db3", ".mcap")]:
         return _bag(folder, bags[0].rpartition("/")[0] if (folder / bags[0]).with_name("metadata.yaml").exists() else bags[0])
     if not tables:
         raise FileNotFoundError(f"{folder}: no log of a robot in it (.csv, .tsv, .txt, or a ROS bag).")

@@ -82,8 +82,7 @@ def import_recording(source: str | Path, mapping: str | Path, out: str | Path, *
 
 def _clock(draft: Recording, search_s: float) -> TimeOffset | str:
     """The offset of the clocks, from labels or else the detector; or why a detector that knows no such tool finds none."""
-    labels = draft.annotations
-    if labels is not None:
+    if (labels := draft.annotations) is not None:
         data = of_recording(draft, labels.u_left, labels.u_right)
     elif draft.skeleton != LANDMARKS:
         return f"the detector knows {', '.join(LANDMARKS)} alone, and there are no labels"

@@ -34,8 +34,7 @@ class _Images:
     """Image files in the order of the numbers in their names."""
 
     def __init__(self, folder: Path, pattern: str) -> None:
-        found = [path for path in folder.glob(pattern) if path.suffix.lower() in IMAGES]
-        if not found:
+        if not (found := [path for path in folder.glob(pattern) if path.suffix.lower() in IMAGES]):
             raise FileNotFoundError(f"{folder / pattern}: no image ({', '.join(IMAGES)}) matches the mapping's pattern.")
         if bad := [path for path in found if last_number(path) is None]:
             raise ValueError(f"{min(bad)}: the name holds no number, so its place in time is open. Number the files.")

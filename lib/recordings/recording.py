@@ -233,8 +233,7 @@ def _read_header(path: Path) -> dict:
 
 
 def _read_kinematics(path: Path, landmarks: Sequence[str]) -> Kinematics:
-    table = read_table(path, _kinematics_columns(landmarks))
-    if not len(table):
+    if not len(table := read_table(path, _kinematics_columns(landmarks))):
         raise ValueError(f"{path}: the table is empty; the robot's landmarks are needed.")
     time_s, x = table[:, 0], table[:, 1:].reshape(-1, len(landmarks), 3)
     empty, far = np.isnan(x), np.abs(np.nan_to_num(x)) > _FARTHEST_MM
