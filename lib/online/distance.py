@@ -62,8 +62,7 @@ class TipDistance:
         found, view = surface.distance(x, camera), camera.viewing_direction
         result.distance_mm, result.normal_mm = found.along_view_mm, found.along_normal_mm
         drift = self.settings.eye_mm_s * max(result.time_s - at.time_s, 0.0)
-        rows = np.flatnonzero(np.isfinite(found.along_view_mm))
-        if not len(rows):
+        if not len(rows := np.flatnonzero(np.isfinite(found.along_view_mm))):
             return
         u = camera.project(x[rows])
         slope = np.stack([surface.derivative(u, order) @ view for order in ((1, 0), (0, 1))], axis=1)

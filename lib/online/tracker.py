@@ -42,10 +42,8 @@ class RigTracker:
         self.settings, self._calibrate, self._noise_px = settings, calibrate, noise_px
         self._start_again([])
         self._given = rig is not None
-        if isinstance(rig, StereoRig):
-            self._use(rig, None)
-        elif rig is not None:
-            self._use(rig.rig, rig)
+        if rig is not None:
+            self._use(rig)
 
     def _start_again(self, frames: Sequence[Seen], cause: str = "") -> None:
         """Without a rig: at first, and where the optics changed, not only the pose."""
@@ -63,7 +61,8 @@ class RigTracker:
         self._motion = self._motion_before = None  # the `MovedCameras` that led to this rig, and to the one before
         self._waiting, self._held, self.rests_on_s, self.doubted_since = 0, False, float("nan"), None
 
-    def _use(self, rig: StereoRig, calibration: Calibration | None) -> None:
+    def _use(self, found: StereoRig | Calibration) -> None:
+        rig, calibration = (found.rig, found) if isinstance(found, Calibration) else (found, None)
         self.rig, self.calibration, self.state, self.cause = rig, calibration, "tracking", ""
         if self._monitor is None:
             self._monitor = DriftMonitor(rig, covariance_px2=self._noise_px**2, sigma_x_mm=0.0)
@@ -118,11 +117,10 @@ class RigTracker:
             return
         self._tried = len(self._frames)
         found, kept = self._agreed()
-        verdict = judge(None, found, robot_accuracy_mm=self.settings.robot_accuracy_mm)
-        if verdict.is_red:
+        if (verdict := judge(None, found, robot_accuracy_mm=self.settings.robot_accuracy_mm)).is_red:
             raise ValueError("; ".join(reason.text for reason in verdict.reasons))
         self._frames, self._fitted = kept, len(kept)
-        self._use(found.rig, found)
+        self._use(found)
 
     def _agreed(self) -> tuple[Calibration, list[Seen]]:
         """The calibration by most frames, and the frames that agree with it: a bad frame is outvoted, at any place."""
@@ -185,8 +183,7 @@ class RigTracker:
         """Explain the frames since, by a motion or by another cause; convinced only if the newest frames agree."""
         first, last = self.settings.registration_frames
         self._since = self._since[-max(last, 30) :]
-        newest = [self.corrected(frame.data) for frame in self._since[-first:]]
-        if len(newest) < first:
+        if len(newest := [self.corrected(frame.data) for frame in self._since[-first:]]) < first:
             return
         if self._held and self._fits(self.rig, newest):
             self._settle()

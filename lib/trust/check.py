@@ -132,8 +132,7 @@ def _facts(recording: Recording, a: Assessment) -> dict[str, str]:
         "coverage": f"{len(a.health.frame)} frames looked at; {int(data.seen.all(axis=1).sum())} of {len(data)} landmarks "
         f"found in both images, {int(data.is_complete.sum())} of them with a position of the robot.",
     }
-    x = data.x_mm[data.is_complete]
-    if len(x):
+    if len(x := data.x_mm[data.is_complete]):
         facts["volume"] = "The tool was seen within {:.1f} x {:.1f} x {:.1f} mm.".format(*np.ptp(x, axis=0))
     stated = f"offset_s = {recording.offset_s:g} s is stated"
     try:

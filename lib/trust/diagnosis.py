@@ -40,8 +40,7 @@ def _tip_order(case: Case) -> Iterator[Hypothesis]:
     for order, views in (*others, ((0, 2, 1), (0,)), ((0, 2, 1), (1,))):
         x = problem.x.copy()
         x[:, list(views)] = table[problem.frame, np.array(order)[problem.landmark]][:, None]
-        moved = replace(problem, x=x)
-        if moved.used.all(axis=1).sum() < 6:
+        if (moved := replace(problem, x=x)).used.all(axis=1).sum() < 6:
             continue
         where, call = ("both images", "call") if len(views) == 2 else (f"the {SIDES[views[0]]} image", "calls")
         text = f"What {where} {call} {', '.join(LANDMARKS)} is {', '.join(LANDMARKS[k] for k in order)} for the robot."
@@ -115,8 +114,7 @@ def _bad_part(case: Case) -> Iterator[Hypothesis]:
         parts.append(("bad_landmark", problem.landmark == k, 2, f"{LANDMARKS[k]} has", cure))
     r2 = (case.null.residuals**2).sum(axis=2) / problem.noise**2
     score = np.log1p(r2 / max(np.median(r2[problem.used]) / 1.4, 1e-6)) - 1.5
-    total = np.bincount(problem.frame, np.where(problem.used, score, 0.0).sum(axis=1), case.frames)
-    total = np.append(0.0, np.cumsum(total))
+    total = np.append(0.0, np.cumsum(np.bincount(problem.frame, np.where(problem.used, score, 0.0).sum(axis=1), case.frames)))
     last = int((total - np.minimum.accumulate(total)).argmax())
     first = int(total[: last + 1].argmin())
     if 2 <= last - first <= 0.6 * case.frames:
@@ -310,8 +308,7 @@ def _unexplained(case: Case, fit: Robust) -> list[Hypothesis]:
         cure = "Check times, units, columns of kinematics.csv; or the detector errs alike in both images: see its overlays."
         explained, gain = 1.0 - (epipolar / missed) ** 2, half * float(np.log(missed / epipolar)) / fit.design
         return [Hypothesis("robot_noise", text, cure, 1e3 * missed / zoom, 0.0, "um", explained, gain)]
-    share = float((distance[problem.used] > 0.05 * length).mean())
-    if share < 0.2:
+    if (share := float((distance[problem.used] > 0.05 * length).mean())) < 0.2:
         return []
     gain = half * (share * np.log(share / 0.05) + (1 - share) * np.log(max(1 - share, 1e-9) / 0.95))
     text = f"{100 * share:.0f} % of the landmarks lie more than 5 % of the tool's length from where a camera would see them."

@@ -195,7 +195,6 @@ def feature_matches(recording: Recording, frames: np.ndarray) -> np.ndarray:
         pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(a, b, k=2)
         pairs = [best for best, second in pairs if best.distance < _RATIO * second.distance]
         y = _HALVED * np.array([[*left[m.queryIdx].pt, *right[m.trainIdx].pt] for m in pairs]).reshape(-1, 4)
-        agree = affine_epipolar(y)[1]
-        if agree.sum() >= _FEWEST:
+        if (agree := affine_epipolar(y)[1]).sum() >= _FEWEST:
             found.append(y[agree])
     return np.concatenate(found)
