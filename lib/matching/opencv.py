@@ -88,8 +88,7 @@ def match_with(
     x, y = x[kept], y[kept]
     d = disparity[y, x].astype(np.float64)
     target = np.rint(x - d).astype(np.intp)
-    kept = (target >= 0) & (target < size[0])
-    kept[kept] = valid_right[y[kept], target[kept]]
+    kept = (target >= 0) & (target < size[0]) & valid_right[y, np.clip(target, 0, size[0] - 1)]
     x, y, d = x[kept], y[kept], d[kept]
     canvas = np.column_stack([x - reach, y]).astype(np.float64)
     ratio, textured = _judge((left, right), (valid_left, valid_right), reach, (low, high), canvas.astype(int), -d)

@@ -106,8 +106,7 @@ def render_view(
         mirror = film_x * film_x + film_y * film_y
         # A narrow core that saturates in a broad sheen.
         sheen = cv2.exp(mirror * np.float32(-1 / (2 * 0.09**2)))
-        mirror = cv2.exp(mirror * np.float32(-1 / (2 * 0.011**2)))
-        mirror *= np.float32(2.2)
+        mirror = np.float32(2.2) * cv2.exp(mirror * np.float32(-1 / (2 * 0.011**2)))
         mirror += np.float32(0.10) * sheen
         mirror *= light * np.float32(scene.gloss)
         glint_mask[mirror > 0.55] = 255

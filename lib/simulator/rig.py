@@ -65,10 +65,9 @@ class Microscope:
         check(self, "depth_of_field_mm", lambda v: v > 0, "must be positive (infinity switches defocus off)")
         check(self, "psf_px exposure_s readout_s vignetting read_noise brightness", lambda v: v >= 0, "must not be negative")
         check(self, "full_well", lambda v: v > 0, "must be positive (infinity switches noise off)")
-        check(self, "spot_radius_mm fps", lambda v: v > 0, "must be positive")
+        check(self, "spot_radius_mm fps pixels_per_mm", lambda v: np.min(v) > 0, "must be positive")
         check(self, "jpeg_quality", lambda v: v is None or 0 <= v <= 100, "must lie between 0 and 100 or be None")
         check(self, "inverse_distance_per_mm", lambda v: -0.05 < v < 0.05, "the working distance must exceed 20 mm")
-        check(self, "pixels_per_mm", lambda v: min(v) > 0, "must be positive")
         check(self, "convergence_rad", lambda v: 0 < v < np.pi / 2, "must lie between 0 and pi/2")
 
     def rig(self, robot_from_microscope: RigidTransform = ROBOT_FROM_MICROSCOPE) -> StereoRig:

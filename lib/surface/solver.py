@@ -131,8 +131,7 @@ def _interior_point(
 
     # A least-squares spline starts it, and its residuals give the unit of length.
     unit = max(np.abs(x).max(), np.finfo(float).tiny)
-    factor = cholesky(problem.normal_band(w, 2 * mu / unit))
-    if factor is None:
+    if (factor := cholesky(problem.normal_band(w, 2 * mu / unit))) is None:
         raise ValueError(UNHELD)
     c = dpbtrs(factor, B_T @ (w * x), lower=1)[0]
     residual = B @ c - x

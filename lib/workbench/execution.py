@@ -211,8 +211,7 @@ def stated_in(executed: Path) -> Stated:
 
 def joined(verdicts: Iterable[dict | None]) -> dict | None:
     """The worst verdict with the reasons of all, each once and the worst first; None if there is none."""
-    found = [verdict for verdict in verdicts if verdict and verdict["verdict"]]
-    if not found:
+    if not (found := [verdict for verdict in verdicts if verdict and verdict["verdict"]]):
         return None
     rank = list(VERDICT_COLOURS).index
     reasons = {(r["name"], r["level"], r["text"]): r for verdict in found for r in verdict["reasons"]}
