@@ -104,12 +104,12 @@ def _become(command: list[str]) -> int:
 
 def test(argv: list[str]) -> int:
     style = subprocess.call([sys.executable, "-m", "ruff", "check", "--output-format=concise", *ruff_options(), ROOT])
-    plugins = ["-p", "xdist.plugin", "-p", "_hypothesis_pytestplugin"]
+    plugins = ["-p", "xdist", "-p", "hypothesispytest"]
     return _pytest([*plugins, "--numprocesses=auto", "--dist=loadfile", "--no-loadscope-reorder", *argv]) or style
 
 
 def bench(argv: list[str]) -> int:
-    plain = ["--override-ini=addopts=--import-mode=importlib --strict-markers", "-p", "pytest_benchmark.plugin"]
+    plain = ["--override-ini=addopts=--import-mode=importlib --strict-markers", "-p", "benchmark"]
     return _pytest([*plain, "--benchmark-only", "--benchmark-disable-gc", str(ROOT / "tests" / "benchmarks"), *argv])
 
 

@@ -211,13 +211,14 @@ class Teacher:
         """
         r, c, offset = self.recording, self.calibration, self.offset_mm
         time, height = np.repeat(r.frames.time_s[frames][:, None], 3, axis=1) + r.offset_s, r.image_size_px[1]
-        log = slice(None, None, max(1, int(_TURNS_S / np.median(np.diff(r.kinematics.time_s)))))
+        log_s = r.kinematics.time_s
+        log = slice(None, None, max(1, int(_TURNS_S * (len(log_s) - 1) / max(np.ptp(log_s), _TURNS_S))))
         u, covariance = np.full((len(frames), 2, 3, 2), np.nan), np.full((len(frames), 2, 3, 2, 2), np.nan)
         for side, camera in enumerate(c.cameras):
             at = time
             for _ in range(3 if r.readout_s else 1):
                 x = r.kinematics.at(at)
-                when_s = np.append(r.kinematics.time_s[log], at[:, 0])  # the log shows how shut jaws were turned before
+                when_s = np.append(log_s[log], at[:, 0])  # the log shows how shut jaws were turned before
                 order = np.argsort(when_s)
                 told = np.concatenate([r.kinematics.x_mm[log], x])[order]
                 known = tool_axes(told, offset if self.turns else None)

@@ -282,9 +282,9 @@ def _minimise(
         variance_u, variance_x = paper_variances(*levels) if weighting == "paper" else np.square(levels).tolist()
         claimed = np.eye(m)[None] if noise is None or weighting == "paper" else noise
         weigh = variance_u * claimed / noise_rms_px(claimed) ** 2
-        if whole and len(weigh) == 1 and np.allclose(weigh[0], variance_u * np.eye(m), rtol=1e-12, atol=0):
-            start = affine_minimum(x, y, variance_u, variance_x).matrix
         anew = minimum is None or (plan.base == "affine" and plan.is_affine and whole and len(weigh) == 1)
+        if anew and whole and len(weigh) == 1 and np.allclose(weigh[0], variance_u * np.eye(m), rtol=1e-12, atol=0):
+            start = affine_minimum(x, y, variance_u, variance_x).matrix
         state = State.start(plan, start, x.mean(axis=0), centre) if anew else minimum.state
         minimum = fit(state, x, y, weigh, variance_x, views)
         residuals, A, parameters = minimum.residuals, minimum.state.A.reshape(m, 3), len(plan.parameter_names)

@@ -120,8 +120,8 @@ class State:
         return np.concatenate([rows, np.cross(rows[:, :1], rows[:, 1:])], axis=1)
 
     @cached_property
-    def axes(self) -> tuple[np.ndarray, np.ndarray]:
-        """Unit vectors r3 (cameras, 3) away from the cameras, and the length (cameras,) of the normal that each has of A."""
+    def normals(self) -> tuple[np.ndarray, np.ndarray]:
+        """Unit normals r3 (cameras, 3) of the two rows of A, away from the camera, and the lengths (cameras,) that they had."""
         normal = np.stack([normal_to(A) for A in self.A])
         size = np.linalg.norm(normal, axis=1)
         return normal / size[:, None], size
@@ -150,7 +150,7 @@ class State:
             A, D = self.A.reshape(-1, 3), self._linear() if derivatives else np.empty((2 * c, 4, 0))
             J_c = np.tensordot(np.column_stack([x, np.ones(n)]), D, axes=(1, 1))
             return x @ A.T + self.offset.ravel(), np.tile(A, (n, 1, 1)), J_c
-        r_3, size, k = *self.axes, len(self.model.selection) // c
+        r_3, size, k = *self.normals, len(self.model.selection) // c
         depth = x @ r_3.T
         ratio = (1.0 + self.rho * depth)[:, :, None]  # (n, cameras, 1)
         v = ((x @ self.A.reshape(-1, 3).T).reshape(n, c, 2) + (self.offset - self.centre)) / ratio
@@ -239,7 +239,7 @@ def fit(start: State, x: np.ndarray, y: np.ndarray, noise: np.ndarray, variance_
     y = np.where(np.repeat(views, 2, axis=1), y, 0.0)
 
     def evaluate(state: State) -> tuple[float, tuple] | None:
-        if (1.0 + state.rho * ((x - state.reference) @ state.axes[0].T)).min() <= 0.05:
+        if (1.0 + state.rho * ((x - state.reference) @ state.normals[0].T)).min() <= 0.05:
             return None  # a point lies behind a camera
         cost, *work = settle(state, x, y, noise, variance_x, views)
         return (cost, work) if np.isfinite(cost) else None
@@ -251,5 +251,6 @@ def fit(start: State, x: np.ndarray, y: np.ndarray, noise: np.ndarray, variance_
         return J.reshape(WJ.shape).T @ WJ, WJ.T @ r.ravel()
 
     with np.errstate(all="ignore"):  # a first step may be far too long: its energy is not finite, and it is shortened
+        # What 1e-10 of the energy leaves open is a ten-thousandth of a deviation.
         found = minimise(start, evaluate, normal_equations, State.moved, tolerance=1e-10)
     return Fit(found.state, found.energy, *found.work[:2], found.information, found.converged)

@@ -171,8 +171,9 @@ def _sleap(path: Path) -> Iterator[Label]:
                 if instance["instance_type"] != 0:  # 1 is a prediction
                     continue
                 for name, point in zip(names, points[instance["point_id_start"] : instance["point_id_end"]], strict=True):
+                    seen = np.isfinite([point["x"], point["y"]]).all()
                     x, y = (float(point[axis]) - corner for axis in "xy")
-                    yield Label(image, name, x, y, int(np.isfinite(x + y)) * (2 if point["visible"] else 1))
+                    yield Label(image, name, x, y, 2 if seen and point["visible"] else int(seen))
 
 
 _READERS = {

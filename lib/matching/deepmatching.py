@@ -98,7 +98,9 @@ def gather(pooled: torch.Tensor, axis: int, level: int, *, shifted: bool) -> tor
     Children beyond the lattice do not exist; of those that do, some have a place beyond the map (not valid).  The sum
     over the valid ones is divided by n_exist^0.1 n_valid^0.9, as in the published implementation.
     """
-    out = pooled.new_zeros([n + (k == axis and level == 1) for k, n in enumerate(pooled.shape)])
+    shape = list(pooled.shape)
+    shape[axis] += level == 1
+    out = pooled.new_zeros(shape)
     total, single = _by_axis(out, axis), _by_axis(pooled, axis)
     exist, valid = torch.zeros(len(total), 1), torch.zeros(total.shape[:2])
     for parents, children in _sides(level, *single.shape[:2], shifted):
@@ -112,7 +114,9 @@ def gather(pooled: torch.Tensor, axis: int, level: int, *, shifted: bool) -> tor
 
 def _scatter(score: torch.Tensor, axis: int, level: int, n: int, *, shifted: bool) -> torch.Tensor:
     """Best score of the two parents for n children along one lattice axis: the reverse of `gather`."""
-    out = score.new_full([n if k == axis else size for k, size in enumerate(score.shape)], -torch.inf)
+    shape = list(score.shape)
+    shape[axis] = n
+    out = score.new_full(shape, -torch.inf)
     best, paths = _by_axis(out, axis), _by_axis(score, axis)
     for parents, children in _sides(level, *best.shape[:2], shifted):
         torch.maximum(best[children], paths[parents], out=best[children])

@@ -107,10 +107,10 @@ def _lateness(rig, frames, past, covariance_px2) -> tuple[float, Explanation] | 
 
 def _offset(rig: StereoRig, data: Correspondences, axes: np.ndarray, covariance_px2: np.ndarray) -> np.ndarray:
     """(3,) mm in the tool's axes by which all landmarks lie off the report, robustly."""
-    weight, offset = np.linalg.inv(covariance_px2), np.zeros(3)
+    y, weight, offset = data.stacked_px, np.linalg.inv(covariance_px2), np.zeros(3)
     for _ in range(10):
         x = data.x_mm + axes @ offset
-        r, J = data.stacked_px - np.hstack(rig.project(x)), rig.jacobian(x) @ axes
+        r, J = y - np.hstack(rig.project(x)), rig.jacobian(x) @ axes
         JtW = J.mT @ (weight * (_ROBUST / (_ROBUST + np.einsum("ni,nij,nj->n", r, weight, r)))[:, None, None])
         offset = offset + np.linalg.lstsq((JtW @ J).sum(axis=0), np.einsum("nij,nj->i", JtW, r), rcond=None)[0]
     return offset

@@ -48,7 +48,7 @@ class FrameChecks:
 
     def robot(self, data: Correspondences) -> str:
         """Why the robot's report is not to be used, "" where it is."""
-        x, y, before = data.x_mm, data.stacked_px, self._believed
+        x, y, before = data.x_mm, np.hstack([data.u_left, data.u_right]), self._believed
         if not np.isfinite(x).all(axis=1).any():
             return "the robot reports nothing"
         same = before is not None and np.array_equal(x, before[0])

@@ -11,7 +11,7 @@ from lib.cameras import StereoRig
 from lib.correspondences import Correspondences
 from lib.online.causes import CONVINCING, explain, misfit
 from lib.online.result import FrameResult, Settings
-from lib.registration import DriftMonitor
+from lib.registration import DriftMonitor, MovedCameras
 from lib.trust import judge
 
 _CHI2_4_MEDIAN = 3.357
@@ -58,7 +58,8 @@ class RigTracker:
         self._open: list[Correspondences] = []  # the last frame that `_past` no longer holds whose jaws surely do not cross
         self._since: list[Seen] = []  # frames that tell where the cameras are now
         self._before: StereoRig | None = None  # the rig before, while the frames since are being explained
-        self._motion = self._motion_before = None  # the `MovedCameras` that led to this rig, and to the one before
+        self._motion: MovedCameras | None = None  # that led to this rig, and to the one before
+        self._motion_before: MovedCameras | None = None
         self._waiting, self._held, self.rests_on_s, self.doubted_since = 0, False, float("nan"), None
 
     def _use(self, found: StereoRig | Calibration) -> None:

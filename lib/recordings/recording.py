@@ -173,7 +173,7 @@ class Recording:
         jump_mm = np.nan_to_num(moved_mm).max(axis=1)
         k = int(jump_mm.argmax())
         longer = uniform and logged > _LONGER * (span + 1.0 / self.fps) and logged > 2.0
-        found = (
+        cases = (
             (longer, "frame_times", f"{n} frames at {self.fps:g} fps last {span:.1f} s, but the robot's log {logged:.1f} s.",
              "If frames were left out, write their times to frames.csv (frame, time_s)."),
             (reported / n < _COVERED, "little_overlap",
@@ -185,7 +185,7 @@ class Recording:
              f"In kinematics.csv a landmark jumps by {jump_mm[k]:.0f} mm at {log_s[k]:.3f} s (line {k + 2}).",
              "Leave the cells of a wrong sample empty."),
         )  # fmt: skip
-        return [Doubt(*told) for holds, *told in found if holds]
+        return [Doubt(*told) for holds, *told in cases if holds]
 
     def landmarks_mm(self) -> np.ndarray:
         """The robot's landmarks (n, k, 3) mm at the frames' times, NaN where the robot says nothing.
@@ -288,7 +288,9 @@ class RecordingWriter:
             "robot_accuracy_mm": float(robot_accuracy_mm), "readout_s": float(readout_s), "offset_s": float(offset_s),
         }  # fmt: skip
         self._details = dict(details or {})
-        self._time_s, self._kinematics, self._annotations = [], [], None
+        self._time_s: list[float] = []
+        self._kinematics: list[np.ndarray] = []
+        self._annotations: Annotations | None = None
 
     def _check_target(self) -> None:
         if self.target.exists() and not self._overwrite:

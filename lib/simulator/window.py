@@ -13,7 +13,7 @@ import numpy as np
 from lib.cameras import AffineCamera, NearAffineCamera, Resection
 from lib.simulator.eye import Scene
 
-Camera = AffineCamera | NearAffineCamera
+_Camera = AffineCamera | NearAffineCamera
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +23,7 @@ class Window:
     `field_px` is the size (w, h) of the whole image (None = the window's), and `origin_px` the window's first pixel in it.
     """
 
-    camera: Camera
+    camera: _Camera
     size_px: tuple[int, int]
     field_px: tuple[int, int] | None = None
     origin_px: tuple[float, float] = (0.0, 0.0)
@@ -34,7 +34,9 @@ class Window:
             raise ValueError("camera: the renderer needs square pixels without skew.")
 
     @classmethod
-    def around(cls, camera: Camera, u: np.ndarray, size_px: tuple[int, int], field_px: tuple[int, int] | None = None) -> Self:
+    def around(
+        cls, camera: _Camera, u: np.ndarray, size_px: tuple[int, int], field_px: tuple[int, int] | None = None
+    ) -> Self:
         """The window of `size_px` around pixel `u` (2,) of a camera whose whole image has `field_px`."""
         origin = np.round(np.asarray(u) - np.array(size_px) / 2)
         moved = {"matrix": camera.matrix - [[0, 0, 0, origin[0]], [0, 0, 0, origin[1]]]}
@@ -112,7 +114,9 @@ class Grid:
         return self.rows @ ((values - offset).astype(np.float32) @ self.columns.T) + np.float32(offset)
 
 
-def surface_grid(scene: Scene, camera: Camera, size_px: tuple[int, int], step_px: int = 8) -> tuple[np.ndarray, ...]:
+def surface_grid(
+    scene: Scene, camera: _Camera, size_px: tuple[int, int], step_px: int = 8
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The true surface: columns (a,) px, rows (b,) px and the points (b, a, 3) mm, microscope frame, seen there.
 
     Linear interpolation between the points is right to 1 um for eyes at the default step.

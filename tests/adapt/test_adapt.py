@@ -139,6 +139,10 @@ def test_shut_jaws_borrow_the_axes_of_another_time(world, recording):
     moved, sd = np.linalg.norm(u - plain, axis=-1)[late], np.sqrt(np.trace(S - S0, axis1=-2, axis2=-1).clip(0) / 2)[late]
     assert np.nanmin(moved[:, :, 1:]) > 1.0 and np.nanmax(moved[:, :, 0]) < 1e-6
     assert np.nanmin(sd[:, :, 1:]) > 0.2 * np.nanmin(moved[:, :, 1:])
+    bursts_s = (k.time_s[:, None] + 1e-5 * np.arange(5)).ravel()  # a log that sends five samples at once
+    log = replace(k, time_s=bursts_s, x_mm=np.repeat(x, 5, axis=0))
+    again = replace(shut, recording=replace(shut.recording, kinematics=log)).project(frames)[0]
+    np.testing.assert_allclose(again, u, atol=0.1)
 
 
 def test_a_detector_that_takes_elbows_for_tips_is_no_start(world, recording):

@@ -11,7 +11,9 @@ from functools import cache
 import numpy as np
 import pytest
 
+from lib.correspondences import Correspondences
 from lib.online import Settings
+from lib.online.checks import FrameChecks
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
 from tests.online.world import BLACK, RIG, SELDOM, World, make, rig_error_mm, run, shifted, started
 
@@ -40,6 +42,15 @@ def test_frozen_video_is_noticed_and_never_calibrated_with():
         after = run(pipeline, world, 60)
         assert all(r.state == "tracking" for r in after[10:])
         assert rig_error_mm(pipeline.rig, world) < max(0.03, 1.5 * rig_error_mm(before, world))
+
+
+@pytest.mark.parametrize("confidence", [1.0, 0.1])
+def test_a_report_is_frozen_while_the_tool_moves_however_doubtful_the_detector(confidence):
+    x, u = np.eye(3), np.arange(6.0).reshape(3, 2)
+    how = {"frame": np.zeros(3, int), "landmark": np.arange(3), "confidence": np.full((3, 2), confidence)}
+    checks = FrameChecks()
+    assert checks.robot(Correspondences.of_points(x, u, u, **how)) == ""
+    assert "frozen while the tool moves" in checks.robot(Correspondences.of_points(x, u + 20, u + 20, **how))
 
 
 def test_one_frozen_eye():
