@@ -121,7 +121,7 @@ class State:
 
     @cached_property
     def normals(self) -> tuple[np.ndarray, np.ndarray]:
-        """Unit normals r3 (cameras, 3) of the two rows of A, away from the camera, and the lengths (cameras,) that they had."""
+        """Unit normals r3 (cameras, 3) of the two rows of A, away from the camera, and their lengths (cameras,)."""
         normal = np.stack([normal_to(A) for A in self.A])
         size = np.linalg.norm(normal, axis=1)
         return normal / size[:, None], size
