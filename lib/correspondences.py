@@ -82,8 +82,7 @@ class Correspondences:
         n = len(x)
         if not n == len(left) == len(right):
             raise ValueError(f"x_mm, u_left, u_right: {n}, {len(left)} and {len(right)} rows; give one of each a landmark.")
-        if confidence is None:
-            confidence = np.isfinite([left, right]).all(axis=2).T
+        confidence = np.isfinite([left, right]).all(axis=2).T if confidence is None else confidence
         return cls(
             x, left, right, np.full((n, 2, 2, 2), np.nan) if covariance_px2 is None else covariance_px2, confidence,
             np.arange(n) if frame is None else frame, np.zeros(n) if landmark is None else landmark,

@@ -33,8 +33,7 @@ def write(found: Adaptation, folder: str | Path, recording: Recording | None = N
     here = Environment(loader=FileSystemLoader(Path(__file__).parent), autoescape=select_autoescape())
     if found.improved:
         found.detector.save(folder / "weights.safetensors")
-        card = here.get_template("weights.md").render(r=found.report, numbers=_NUMBERS)
-        files.write_text(folder / "weights.md", card)
+        files.write_text(folder / "weights.md", here.get_template("weights.md").render(r=found.report, numbers=_NUMBERS))
     elif (folder / "weights.safetensors").exists():
         found.report["notes"] = [*found.report["notes"], "weights.safetensors in this folder is of an earlier run."]
     files.write_json(folder / "report.json", found.report)

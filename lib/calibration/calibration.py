@@ -160,10 +160,7 @@ class Calibration:
 
     @cached_property
     def system(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Over the inliers: derivatives by points and parameters, inverse covariance of the residuals, residuals.
-
-        The last two are zero in views that are not used.
-        """
+        """Over the inliers: derivatives by points and parameters; inverse covariances and residuals, 0 in views not used."""
         _, J_x, J_c = self.minimum.state.evaluate(self.minimum.points)
         J = J_x[:1] if self.minimum.state.model.is_affine else J_x
         noise = self.noise_px2[None] if self.covariance_px2 is None else self.covariance_px2
@@ -180,8 +177,7 @@ class Calibration:
         """(n, 3, 3) mm^2 of triangulated points, from the calibration's own uncertainty and (`detection`) the detections'."""
         J = self.pair.jacobian(x_mm)
         gain = np.linalg.solve(J.mT @ J, J.mT)  # the noise is the same in every pixel coordinate
-        noise = self.projection_covariance(x_mm) + (self.noise_px2 if detection else 0.0)
-        return gain @ noise @ np.swapaxes(gain, 1, 2)
+        return gain @ (self.projection_covariance(x_mm) + (self.noise_px2 if detection else 0.0)) @ np.swapaxes(gain, 1, 2)
 
     def triangulate(self, u_left: ArrayLike, u_right: ArrayLike, covariance_px2: ArrayLike | None = None) -> Points:
         """`StereoRig.triangulate`, with the calibration's uncertainty in the covariance and sigma_u_px as the default."""
@@ -260,7 +256,6 @@ def optics(calibration: Calibration) -> Optics:
     x = rows[0][0] if mirrored != "left" else rows[1][0]
     x = x - (x @ z) * z
     x /= np.linalg.norm(x)
-    y = np.cross(z, x)
     roll = float(np.arctan2(-rows[1][0] @ rows[0][1], rows[1][0] @ rows[0][0]))
     if calibration.image_size_px is not None:
         centre = (np.asarray(calibration.image_size_px, dtype=float) - 1) / 2
@@ -268,4 +263,4 @@ def optics(calibration: Calibration) -> Optics:
         centre = np.nanmean(calibration.y_px[calibration.inliers].reshape(-1, 2, 2), axis=(0, 1))
     origin = rig.triangulate(centre[None], centre[None]).x_mm[0]
     angle = float(np.arccos(np.clip(abs(cosine), -1, 1)))
-    return Optics(mirrored, angle, roll, RigidTransform(np.column_stack([x, y, z]), origin))
+    return Optics(mirrored, angle, roll, RigidTransform(np.column_stack([x, np.cross(z, x), z]), origin))

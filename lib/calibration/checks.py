@@ -95,13 +95,10 @@ def check_images(y: np.ndarray, image_size_px: tuple[int, int] | None = None) ->
 
 
 def sides(A: np.ndarray) -> tuple[float, float]:
-    """Where the right camera of A (4, 3) stands, along and across the image rows: rad of the angle between the two views.
-
-    Cameras stand against their viewing directions, so the right camera lies along left - right.
-    """
+    """Where the right camera of A (4, 3) stands, along and across the image rows: rad of the angle between the two views."""
     a, b, c, d = A / np.linalg.norm(A, axis=1, keepdims=True)
     left, right = np.cross(a, b), np.cross(c, d)
-    apart = left / np.linalg.norm(left) - right / np.linalg.norm(right)
+    apart = left / np.linalg.norm(left) - right / np.linalg.norm(right)  # cameras stand against their viewing directions
     return apart @ (a + c) / 2, apart @ (b + d) / 2
 
 

@@ -80,8 +80,7 @@ def calibrate(
         data.check_detections()
         usable, axes = _usable_rows(data, offsets, weighting)
         rows = data.subset(usable)
-        x, y = rows.x_mm, rows.stacked_px
-        noise = None
+        x, y, noise = rows.x_mm, rows.stacked_px, None
         if covariance_px2 is not None:
             noise = pair_covariance(covariance_px2, len(data))
             noise = noise[usable] if len(noise) > 1 else noise
@@ -183,10 +182,7 @@ def _calibrate(
     known: dict[str, float | None], ransac_px: float | None, seed: int, image_size_px: tuple[int, int] | None, checks: bool,
     views: np.ndarray | None = None,
 ) -> Calibration:  # fmt: skip
-    """`calibrate` of rows x (n, 3) and y (n, m), NaN = not seen, with their covariances, (1, m, m) or (n, m, m).
-
-    `views` (n, cameras) bool are those to use; None finds them.
-    """
+    """`calibrate` of x (n, 3), y (n, m), NaN = not seen, `noise` (1 or n, m, m); `views` (n, cameras), which None finds."""
     n, m = y.shape
     plan = Model.parse(model, m // 2)
     if weighting not in ("likelihood", "paper"):
@@ -240,11 +236,10 @@ def _calibrate(
         G = np.einsum("nip,nij,njq->pq", WJ, scale**2 * claimed + sigma_x**2 * outer, WJ)
         parameter_covariance = parameter_covariance @ G @ parameter_covariance
     found = Calibration(
-        minimum=minimum, parameter_covariance=parameter_covariance,
-        view_inliers=views, sigma_u_px=sigma_u, sigma_x_mm=sigma_x, residuals_px=residuals, model=model,
-        weighting=weighting, x_mm=x, y_px=y, covariance_px2=None if noise is None else scale**2 * noise,
+        minimum=minimum, parameter_covariance=parameter_covariance, view_inliers=views, sigma_u_px=sigma_u,
+        sigma_x_mm=sigma_x, residuals_px=residuals, model=model, weighting=weighting, x_mm=x, y_px=y,
         image_size_px=None if image_size_px is None else tuple(image_size_px), effective_rows=float(inliers.sum()),
-        detector_scale=1.0 if noise is None else scale,
+        covariance_px2=None if noise is None else scale**2 * noise, detector_scale=1.0 if noise is None else scale,
     )  # fmt: skip
     if found.rig is not None and checks:
         spread, A = found.extents_mm[2], found.rig.left.linear

@@ -180,8 +180,7 @@ class State:
             return np.tile(np.eye(6).reshape(2, 3, 6), (c, 1, 1, 1))
         result = np.zeros((c, 2, 3, 5))
         # A left increment turns R by delta x R.
-        turned = np.einsum("jkr,cks->crsj", _CROSS, self.rotation)[:, :2]
-        result[..., :3] = self.zoom[:, :, None, None] * turned
+        result[..., :3] = self.zoom[:, :, None, None] * np.einsum("jkr,cks->crsj", _CROSS, self.rotation)[:, :2]
         result[:, 0, :, 3], result[:, 1, :, 4] = self.A[:, 0], self.A[:, 1]
         return result
 

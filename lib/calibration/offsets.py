@@ -126,8 +126,7 @@ def carried(axes: np.ndarray, x_mm: np.ndarray, time_s: np.ndarray | None = None
     is_known, is_told = np.isfinite(axes).all(axis=(1, 2)), np.isfinite(along).all(axis=1)
     known, shut = np.flatnonzero(is_known & is_told), np.flatnonzero(~is_known & is_told)
     if known.size:
-        middles = (time[known[1:]] + time[known[:-1]]) / 2
-        nearest = known[np.searchsorted(middles, time[shut])]
+        nearest = known[np.searchsorted((time[known[1:]] + time[known[:-1]]) / 2, time[shut])]
         axis = np.cross(along[nearest], along[shut])
         sine, cosine = np.linalg.norm(axis, axis=1), (along[nearest] * along[shut]).sum(axis=1)
         turn = Rotation.from_rotvec(axis * (np.arctan2(sine, cosine) / np.maximum(sine, 1e-300))[:, None])
@@ -200,8 +199,7 @@ def _steps(
     taken: int = 0,
 ) -> Calibration:  # fmt: skip
     """`estimate_offsets`; the first steps, as many as `taken`, use every detection, though they look like two cameras'."""
-    m = y.shape[1]
-    offset, p_value, views = np.zeros((int(landmark.max()) + 1, m if axes is None else 3)), np.nan, None
+    offset, p_value, views = np.zeros((int(landmark.max()) + 1, y.shape[1] if axes is None else 3)), np.nan, None
     if start is not None:
         offset, prior_sd, p_value = start.offsets.offset, start.offsets.prior_sd, start.offsets.p_value
     step, share = np.zeros(offset.size), 1.0

@@ -109,9 +109,6 @@ def _one_camera(
     raise CompetingCamerasError(text)
 
 
-# --- few rows
-
-
 def _by_growth(x: np.ndarray, u: np.ndarray, rng: np.random.Generator, least_mm: float) -> _Found:
     """Few rows: from the half that agrees best, taking in the next best row as long as an F test lets it.
 
@@ -144,9 +141,6 @@ def _by_growth(x: np.ndarray, u: np.ndarray, rng: np.random.Generator, least_mm:
     r = u[keep] - x[keep] @ matrix[:, :3].T - matrix[:, 3]
     sigma = float(np.sqrt((r**2).sum() / max(r.size - 8, 2)))
     return _Found(np.isin(np.arange(n), keep), matrix, sigma, np.inf, gate(n, 2))
-
-
-# --- many rows
 
 
 def _extent(u: np.ndarray) -> np.ndarray:
@@ -218,8 +212,7 @@ def _tightest(x: np.ndarray, u: np.ndarray, threshold_px: float | None, rng: np.
                 break
             keep, before = _distances2(H, u, regress(H[keep, :3], u[keep]).T[None])[0] < threshold_px**2, keep
         return _Found(keep, regress(H[keep, :3], u[keep]) if keep.sum() > 3 else np.zeros((2, 4)), 0.0, np.inf, np.inf)
-    middle2 = np.median(_distances2(H[some], u[some], M[:4]), axis=1)
-    scales = np.sqrt(np.append(near2 / 8, middle2))
+    scales = np.sqrt(np.append(near2 / 8, np.median(_distances2(H[some], u[some], M[:4]), axis=1)))
     M, scales, share, evidence = _mixture(H[some], u[some], np.concatenate([M, M[:4]]), scales, area, 8)
     # The best of each noise level, and the one with most rows: the others arrive where these do.
     order = np.argsort(-evidence)
@@ -230,8 +223,7 @@ def _tightest(x: np.ndarray, u: np.ndarray, threshold_px: float | None, rng: np.
     # Where a camera explains nearly all rows, that fewer agree better must be more than chance.
     best, most = evidence.argmax(), share[:, 0].argmax()
     chance = evidence[best] < evidence[most] + _MORE_THAN_CHANCE or share[best, 0] < _LEAST_SHARE
-    if share[most, 0] > _NEARLY_ALL and chance:
-        best = most
+    best = most if share[most, 0] > _NEARLY_ALL and chance else best
     if len(some) < n:
         (M, scales, share, _), best = _mixture(H, u, M[[best]], scales[[best], 0], area, 30), 0
     (sigma, wider), share, gate2 = scales[best].tolist(), share[best], gate(n, 2)

@@ -11,7 +11,7 @@ from scipy.special import chdtri, fdtri
 from lib.least_squares import inverse
 
 _CORRELATIONS = np.array([0.0, 0.2, 0.4, 0.55, 0.7, 0.8, 0.88, 0.94, 0.97])
-_NONE = 0.5  # prior probability that the errors are independent
+_PRIOR = np.append(0.5, np.full(8, 0.5 / 8))  # of each, before the data: even odds that the errors are independent
 
 
 def sandwich(
@@ -66,7 +66,7 @@ def _posterior(K: np.ndarray, e: np.ndarray, groups: list[tuple], known: np.ndar
     unit = np.linalg.cholesky(known)  # parameters in their own deviations
     both = np.concatenate([K, e[:, :, None]], axis=2)
     series = [(both[rows][:, view], np.diagonal(lag, 1)[:, None, None]) for rows, view, lag in groups]
-    count = sum(values[..., 0].size for values, _ in series)
+    freedom = max(sum(values[..., 0].size for values, _ in series) - p, 1)
     for correlation in _CORRELATIONS:
         squares, log = np.zeros((p + 1, p + 1)), 0.0
         for values, gap in series:  # an autoregression is white where each value has the one before taken off
@@ -78,10 +78,7 @@ def _posterior(K: np.ndarray, e: np.ndarray, groups: list[tuple], known: np.ndar
         values, vectors = np.linalg.eigh(unit.T @ squares[:p, :p] @ unit)
         values = np.maximum(values, 1e-12)
         along = vectors.T @ (unit.T @ squares[:p, p])
-        freedom = max(count - p, 1)
         variance.append((squares[p, p] - (along**2 / values).sum()) / freedom)
         likelihood.append(-0.5 * (log + np.log(values).sum() + freedom * np.log(max(variance[-1], 1e-300))))
-    chance = np.full(len(_CORRELATIONS), (1.0 - _NONE) / (len(_CORRELATIONS) - 1))
-    chance[0] = _NONE
-    chance = chance * np.exp(np.array(likelihood) - max(likelihood))
+    chance = _PRIOR * np.exp(np.array(likelihood) - max(likelihood))
     return chance / chance.sum(), np.array(variance) / max(variance[0], 1e-300)

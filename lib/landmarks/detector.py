@@ -169,15 +169,13 @@ class Detector:
         """A detector from a weights file, or from a name in ``data/models``; None is the one that ships.
 
         `engine` runs its networks; None is the fastest one here (`lib.landmarks.engines.default_engine`).
-
         A FileNotFoundError or ValueError if the file is missing, damaged, incomplete, or no detector.
         """
         path = Path(path_or_name or "default")
         if not path.suffix and not path.is_file():
             path = paths.MODELS / f"{path.name}.safetensors"
         tensors, metadata = read_checkpoint(path, FORMAT)
-        lacking = {"networks", "calibration", "provenance", *_SETTINGS} - metadata.keys()
-        if text := ", ".join(sorted(lacking)):
+        if text := ", ".join(sorted({"networks", "calibration", "provenance", *_SETTINGS} - metadata.keys())):
             raise ValueError(f"{path}: its metadata lack {text}; get the file again, or make it with Detector.save.")
         configs = metadata["networks"].items()
         networks = {f"{name}_network": load_network(path, config, tensors, f"{name}.") for name, config in configs}
@@ -439,9 +437,7 @@ class Detector:
     def stage_peaks(
         self, images: np.ndarray, u: ArrayLike, stage: str, only: np.ndarray | None = None
     ) -> tuple[Peaks, np.ndarray, np.ndarray]:
-        """Peaks (m, 1) of a stage after the first in its windows' pixels, window_from_image (m, 2, 3), and which (m, 2)
-        image and landmark each is.
-        """
+        """Peaks (m, 1) of a later stage, in its windows' pixels; window_from_image (m, 2, 3); image and landmark (m, 2)."""
         windows, matrices, which = self.windows(images, u, stage, only)
         if not len(which):
             return Peaks(*(torch.zeros(0, 1, *s) for s in ((2,), (), (), (2, 2), ()))), matrices, np.zeros((0, 2), int)

@@ -122,13 +122,10 @@ def covariance_and_confidence(
 
 
 def closeup_peaks(found: Tensor, size_px: int) -> Peaks:
-    """Outputs (n, 4) of an `OffsetNetwork` as peaks (n, 1) of height and width 1.
-
-    The network predicts the scale b of a Laplace distribution, whose variance is 2 b^2.
-    """
+    """Outputs (n, 4) of an `OffsetNetwork` as peaks (n, 1) of height and width 1."""
     u = (size_px - 1) / 2 + found[:, None, :2]
     one = torch.ones_like(u[..., 0])
-    variance = 2 * (2 * found[:, None, 2:]).exp()
+    variance = 2 * (2 * found[:, None, 2:]).exp()  # 2 b^2 of a Laplace distribution, whose scale b is predicted
     return Peaks(u, one, one, variance[..., None] * torch.eye(2, dtype=variance.dtype), 0 * one)
 
 

@@ -111,14 +111,13 @@ def score(u: ArrayLike, u_true: ArrayLike, covariance: ArrayLike | None = None, 
     u, u_true = _pairs(u, u_true)
     error = errors_px(u, u_true)
     found, fine = error[np.isfinite(error)], error < GROSS_PX
-    curve = pck(u, u_true, length_px=length_px)
     squared = np.zeros(0) if covariance is None else nees(u, u_true, covariance)[fine]
     squared = squared[np.isfinite(squared)]
     median, p95 = np.percentile(found, [50, 95]) if found.size else (np.nan, np.nan)
     x, y = (u - u_true)[fine].mean(axis=0) if fine.any() else (np.nan, np.nan)
     return Scores(
         *pck(u, u_true, [0.01, 0.05, 0.10], length_px=length_px).tolist(),
-        auc=float(np.trapezoid(curve, PCK_THRESHOLDS) / np.ptp(PCK_THRESHOLDS)),
+        auc=float(np.trapezoid(pck(u, u_true, length_px=length_px), PCK_THRESHOLDS) / np.ptp(PCK_THRESHOLDS)),
         median_px=float(median), p95_px=float(p95), bias_px=(float(x), float(y)),
         nees=float(squared.mean()) if squared.size else np.nan,
         coverage_95=100.0 * float((squared <= chdtri(2, 0.05)).mean()) if squared.size else np.nan,

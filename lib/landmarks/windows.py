@@ -63,9 +63,7 @@ def closeup_scale(length_px: ArrayLike) -> np.ndarray:
     return np.minimum(np.clip(length, *_SAME_SCALE_PX) / length, 2 / max(CLOSEUP_ZOOM))
 
 
-def window_from_image(
-    centre: ArrayLike, angle_rad: ArrayLike, size: int | tuple[int, int], zoom: ArrayLike = 1.0
-) -> np.ndarray:
+def window_from_image(centre: ArrayLike, angle_rad: ArrayLike, size: ArrayLike, zoom: ArrayLike = 1.0) -> np.ndarray:
     """Matrices (..., 2, 3) that turn by -angle about `centre` (..., 2), the middle of a window of `size`, side or (w, h)."""
     centre, angle = np.asarray(centre, dtype=np.float64), np.asarray(angle_rad, dtype=np.float64)
     c, s = np.cos(angle) * zoom, np.sin(angle) * zoom

@@ -32,8 +32,7 @@ def disguised(
     length_px = 40.0 if np.isnan(length_px) else length_px
     if kind < 0.4:  # another camera of the same scene
         return (255 * _colours(x, rng) + 0.5).astype(np.uint8), u, visibility
-    x = _things_in_front(x, u, hidden, rng, length_px)
-    x = _colours(x, rng)
+    x = _colours(_things_in_front(x, u, hidden, rng, length_px), rng)
     x = _light(x, u, hidden, rng, length_px)
     x, blur_px = _optics(x, rng, length_px)
     x = _camera(x, rng)
@@ -134,10 +133,9 @@ def _optics(x: np.ndarray, rng: np.random.Generator, length_px: float) -> tuple[
     if rng.random() < 0.15:
         x = motion_blur(x, rng.normal(0, 0.05 * length_px, 2))
     if rng.random() < 0.2:  # few pixels, doubled again
-        h, w = x.shape[:2]
-        small = rng.uniform(0.3, 0.9)
-        size = max(int(w * small), 8), max(int(h * small), 8)
-        x = cv2.resize(cv2.resize(x, size, interpolation=cv2.INTER_AREA), (w, h), interpolation=cv2.INTER_LINEAR)
+        small, whole = rng.uniform(0.3, 0.9), x.shape[1::-1]
+        size = [max(int(side * small), 8) for side in whole]
+        x = cv2.resize(cv2.resize(x, size, interpolation=cv2.INTER_AREA), whole, interpolation=cv2.INTER_LINEAR)
     if rng.random() < 0.12:  # sharpening
         x = x + np.float32(rng.uniform(0.3, 2.0)) * (x - cv2.GaussianBlur(x, (0, 0), rng.uniform(0.7, 2.0)))
     return x, blur_px

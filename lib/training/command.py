@@ -47,9 +47,8 @@ def main(argv: list[str] | None = None) -> int:
     if a.recordings and a.what not in ("finetune", "assemble"):
         parser.error(f"{a.what}: takes no recordings.")
     if a.what == "generate":
-        shards = {"held_out": a.held_out, "scenes": a.scenes, "closeups": a.closeups}
         photographs = _images(a.photographs) if a.photographs else ()
-        for kind, count in shards.items():
+        for kind, count in {"held_out": a.held_out, "scenes": a.scenes, "closeups": a.closeups}.items():
             generate(a.data, kind, count, workers=a.workers, photographs=photographs)
     elif a.what == "propose":
         propose(a.data, a.initial, workers=a.workers)

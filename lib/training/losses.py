@@ -33,10 +33,9 @@ def offset_loss(outputs: Sequence[Tensor], batch: Batch) -> Tensor:
     within 0.1 px.  Gross errors weigh little under it; divided by the scale, a sharp image weighs more than a blurred one.
     """
     (found,) = outputs
-    centre = (batch.images.shape[-1] - 1) / 2
     own = (batch.visibility == 2) & batch.u.isfinite().all(-1)
     there = own.any(1).float()
-    true = torch.where(own[..., None], batch.u.float(), 0.0).sum(1) - centre
+    true = torch.where(own[..., None], batch.u.float(), 0.0).sum(1) - (batch.images.shape[-1] - 1) / 2
     distance = ((found[:, :2].float() - true).square() + 0.01).sqrt()
     log_scale = found[:, 2:].float()
     return ((log_scale + distance * (-log_scale).exp()).sum(1) * there).sum() / there.sum().clamp_min(1)

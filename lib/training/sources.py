@@ -79,8 +79,7 @@ class SceneSource(Source):
 
     def frame(self, index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """The frame as it is, with landmarks (3, 2), visibility and weight (3,)."""
-        start = self.ends[index - 1] if index else 0
-        image = cv2.imdecode(self.jpegs[start : self.ends[index]], cv2.IMREAD_COLOR_RGB)
+        image = cv2.imdecode(self.jpegs[self.ends[index - 1] if index else 0 : self.ends[index]], cv2.IMREAD_COLOR_RGB)
         return image, self.u[index], self.visibility[index], np.ones(3) if self.weight is None else self.weight[index]
 
     def _seen(self, scene, centre: np.ndarray, angle: float, size: tuple[int, int], zoom: float, rng: np.random.Generator):

@@ -129,9 +129,8 @@ def finetune(
 
     # A second thread of torch's own makes small steps hardly faster, far slower on a busy machine.  A GPU is busy with one.
     threads, networks = 1 if torch.cuda.is_available() else min(cores(), len(names)), {}
-    own = {"initializer": torch.set_num_threads, "initargs": (1,)}
     lanes = [names[first::threads] for first in range(threads)]  # two threads: frame and closeup beside tool
-    with single_threaded_torch(), ThreadPoolExecutor(threads, **own) as pool:
+    with single_threaded_torch(), ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
         try:
             for found in as_completed([pool.submit(trained, lane) for lane in lanes]):
                 networks |= found.result()

@@ -169,9 +169,9 @@ class Problem:
             D = np.where(used[:, :, None, None], np.nan_to_num(self._design(M, columns)), 0.0)
             J = (D * np.sqrt(weight)[:, :, None, None]).reshape(-1, D.shape[3])
             information = J.T @ J + np.diag(np.append(prior, np.zeros(D.shape[3] - 25)))
-            gradient = J.T @ (y * np.sqrt(weight)[:, :, None]).reshape(-1)
             scale = 1.0 / np.sqrt(np.diag(information) + 1e-12)
             information = information * np.outer(scale, scale) + 1e-10 * np.eye(len(scale))  # an unseen addition stays 0
+            gradient = J.T @ (y * np.sqrt(weight)[:, :, None]).reshape(-1)
             beta = scale * np.linalg.solve(information, scale * gradient)
             M = beta[:16].reshape(2, 2, 4)
             r = y - D @ beta
@@ -242,8 +242,7 @@ class Case:
 
     def moved(self, shift_s: float | np.ndarray) -> np.ndarray:
         """(n, 3) mm: the positions of the rows as they were `shift_s` later; NaN where nothing tells."""
-        now = self.problem.time + self._clock_s
-        landmark = self.problem.landmark
+        landmark, now = self.problem.landmark, self.problem.time + self._clock_s
         return self.problem.x[:, 0] + self.paths.at(landmark, now + shift_s) - self.paths.at(landmark, now)
 
     def velocity(self, shift_s: float | np.ndarray = 0.0) -> np.ndarray:
@@ -287,9 +286,8 @@ class Case:
         n = 2.0 * (fit.likelihood != 0).sum()
         # Of few rows any addition explains much: what chance gains, by the degrees of freedom, is taken off.
         freedom = n / fit.design - _PARAMETERS
-        left, gain = freedom - extra, -np.inf
-        if left >= 4:
-            gain = left * (raw / n - 0.5 * np.log(freedom / left)) - 0.5 * extra * np.log(freedom)
+        left = freedom - extra
+        gain = left * (raw / n - 0.5 * np.log(freedom / left)) - 0.5 * extra * np.log(freedom) if left >= 4 else -np.inf
         if name not in self.fits or fit.total > self.fits[name].total:
             self.fits[name] = fit
         value, sd, unit = size
