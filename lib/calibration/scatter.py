@@ -43,17 +43,16 @@ def sandwich(
         for c in range(m // 2):
             rows = np.flatnonzero((landmark == k) & seen[:, 2 * c])
             rows = rows[np.argsort(frame[rows], kind="stable")]
-            groups.append((rows, slice(2 * c, 2 * c + 2), np.abs(np.subtract.outer(frame[rows], frame[rows])) / step))
+            groups.append((rows, slice(2 * c, 2 * c + 2), np.diff(frame[rows]) / step))
     chance, variance = _posterior(K, e, groups, known)
-    meat = np.zeros((p, p)) + prior
-    for rows, view, lag in groups:
-        block = 300 if len(rows) > 600 else 600  # long recordings: what lies beyond a block is independent
-        for first in range(0, len(rows), block):
-            part = slice(first, first + block)
-            R = np.einsum("t,tij->ij", chance * variance, _CORRELATIONS[:, None, None] ** lag[part, part])
-            for i in (view.start, view.start + 1):
-                k = K[rows[part], i]
-                meat += k.T @ R @ k
+    meat, share = np.zeros((p, p)) + prior, chance * variance
+    for rows, view, gaps in groups:
+        k, decay = K[rows][:, view], _CORRELATIONS[:, None] ** gaps
+        past = np.empty((len(rows), len(share), *k.shape[1:]))  # sums of all rows up to each one, as they decay until then
+        for i, own in enumerate(k):
+            past[i] = own + decay[:, i - 1, None, None] * past[i - 1] if i else own
+        half = np.einsum("nip,niq->pq", k, np.einsum("t,ntip->nip", share, past))
+        meat += half + half.T - share.sum() * np.einsum("nip,niq->pq", k, k)
     sd = np.sqrt(np.diag(known))
     unit = np.outer(sd, sd)
     ratio = np.linalg.slogdet(information * unit)[1] - np.linalg.slogdet(meat * unit)[1]
@@ -65,7 +64,7 @@ def _posterior(K: np.ndarray, e: np.ndarray, groups: list[tuple], known: np.ndar
     p, likelihood, variance = K.shape[2], [], []
     unit = np.linalg.cholesky(known)  # parameters in their own deviations
     both = np.concatenate([K, e[:, :, None]], axis=2)
-    series = [(both[rows][:, view], np.diagonal(lag, 1)[:, None, None]) for rows, view, lag in groups]
+    series = [(both[rows][:, view], gaps[:, None, None]) for rows, view, gaps in groups]
     freedom = max(sum(values[..., 0].size for values, _ in series) - p, 1)
     for correlation in _CORRELATIONS:
         squares, log = np.zeros((p + 1, p + 1)), 0.0
