@@ -32,7 +32,7 @@ def sandwich(
     values, vectors = np.linalg.eigh(weight)
     root = (vectors * np.sqrt(np.maximum(values, 0.0))[:, None]) @ np.swapaxes(vectors, 1, 2)
     K, e = root @ J, (root @ r[:, :, None])[:, :, 0]
-    information = np.einsum("nip,niq->pq", K, K) + prior
+    information = np.tensordot(K, K, axes=([0, 1], [0, 1])) + prior
     known = inverse(information)
     if frame is None:
         return wider * known, float(n)
@@ -51,8 +51,8 @@ def sandwich(
         past = np.empty((len(rows), len(share), *k.shape[1:]))  # sums of all rows up to each one, as they decay until then
         for i, own in enumerate(k):
             past[i] = own + decay[:, i - 1, None, None] * past[i - 1] if i else own
-        half = np.einsum("nip,niq->pq", k, np.einsum("t,ntip->nip", share, past))
-        meat += half + half.T - share.sum() * np.einsum("nip,niq->pq", k, k)
+        half = np.tensordot(k, np.einsum("t,ntip->nip", share, past) - share.sum() / 2 * k, axes=([0, 1], [0, 1]))
+        meat += half + half.T
     sd = np.sqrt(np.diag(known))
     unit = np.outer(sd, sd)
     ratio = np.linalg.slogdet(information * unit)[1] - np.linalg.slogdet(meat * unit)[1]
