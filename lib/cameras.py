@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from scipy.linalg import rq
 
 from lib.files import write_json
-from lib.geometry import RigidTransform, pair_covariance, points, store_array
+from lib.geometry import RigidTransform, cross, pair_covariance, points, store_array
 
 FORMAT = "microstereo.stereo_rig"
 UNITS = {"point": "mm", "image": "px"}
@@ -77,7 +77,7 @@ class MatrixCamera:
     @cached_property
     def viewing_direction(self) -> np.ndarray:
         """Unit vector (3,) along which points share a pixel of `matrix`, away from the camera (unmirrored optics)."""
-        direction = normal_to(self.linear)
+        direction = cross(*self.linear)
         return direction / np.linalg.norm(direction)
 
     def moved(self, motion: RigidTransform) -> Self:
@@ -89,12 +89,6 @@ class MatrixCamera:
         """
         back = motion.inverse()
         return replace(self, matrix=np.column_stack([self.linear @ back.R, self.linear @ back.t + self.offset_px]))
-
-
-def normal_to(A: np.ndarray) -> np.ndarray:
-    """Cross product (3,) of the two rows of A (2, 3); numpy's own is far slower for single vectors."""
-    (a, b, c), (d, e, f) = A.tolist()
-    return np.array([b * f - c * e, c * d - a * f, a * e - b * d])
 
 
 class AffineCamera(MatrixCamera):
