@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from scipy.linalg import rq
 
 from lib.files import write_json
-from lib.geometry import RigidTransform, cross, pair_covariance, points, store_array
+from lib.geometry import RigidTransform, pair_covariance, points, store_array
 
 FORMAT = "microstereo.stereo_rig"
 UNITS = {"point": "mm", "image": "px"}
@@ -77,7 +77,7 @@ class MatrixCamera:
     @cached_property
     def viewing_direction(self) -> np.ndarray:
         """Unit vector (3,) along which points share a pixel of `matrix`, away from the camera (unmirrored optics)."""
-        direction = cross(*self.linear)
+        direction = np.cross(*self.linear)
         return direction / np.linalg.norm(direction)
 
     def moved(self, motion: RigidTransform) -> Self:

@@ -115,13 +115,7 @@ def main_reconstruct(argv: list[str]) -> int:
         print(f"Without surface.glb and points.ply: {error}")
     if found.rig.is_affine:
         save_depth_map(out / "depth.tiff", depth_map(found.surface, found.rig.left, recording.image_size_px))
-    maps = rectify(found.rig, frame.left.shape[:2], frame.right.shape[:2])  # common rows, for any stereo network
-    for side, matrix in (("left", maps.left_from_canvas), ("right", maps.right_from_canvas)):
-        warped = cv2.warpAffine(getattr(frame, side), matrix, maps.size_px, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
-        files.write_bytes(out / f"rectified_{side}.png", encoded(warped, ".png"))
-    numbers = {"left_from_canvas": maps.left_from_canvas.tolist(), "right_from_canvas": maps.right_from_canvas.tolist()}
-    numbers |= {"displacement_px_per_mm": maps.displacement_px_per_mm, "reference_depth_mm": maps.reference_depth_mm}
-    files.write_json(out / "rectification.json", numbers)
+    _write_rectified(out, found.rig, frame.left, frame.right)
     found.rig.save(out / "refined_rig.json")  # as the matches refined it
     numbers = {"frame": a.frame % len(recording), "points": len(found.u), "matches": found.n_matches}
     return _done(a, out, "reconstruction", numbers, verdict)
@@ -248,3 +242,14 @@ def _write_rig(out: Path, rig: StereoRig, recording: Recording, prefix: str = ""
         write_opencv(camera, out / f"{prefix}{side}.yml", recording.image_size_px)
         if not getattr(camera, "radial_per_px2", 0.0):
             write_ros(camera, out / f"{prefix}{side}_camera_info.yaml", recording.image_size_px, name=side)
+
+
+def _write_rectified(out: Path, rig: StereoRig, left: np.ndarray, right: np.ndarray) -> None:
+    """The pair with common rows, for any stereo network, and the matrices that lead back."""
+    maps = rectify(rig, left.shape[:2], right.shape[:2])
+    for side, image, matrix in (("left", left, maps.left_from_canvas), ("right", right, maps.right_from_canvas)):
+        warped = cv2.warpAffine(image, matrix, maps.size_px, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+        files.write_bytes(out / f"rectified_{side}.png", encoded(warped, ".png"))
+    numbers = {"left_from_canvas": maps.left_from_canvas.tolist(), "right_from_canvas": maps.right_from_canvas.tolist()}
+    numbers |= {"displacement_px_per_mm": maps.displacement_px_per_mm, "reference_depth_mm": maps.reference_depth_mm}
+    files.write_json(out / "rectification.json", numbers)

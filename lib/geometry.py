@@ -24,11 +24,6 @@ def points(values: ArrayLike, dimension: int, name: str) -> np.ndarray:
     return array
 
 
-def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Cross products (..., 3) of vectors (..., 3); numpy's own is several times slower for few vectors."""
-    return a[..., [1, 2, 0]] * b[..., [2, 0, 1]] - a[..., [2, 0, 1]] * b[..., [1, 2, 0]]
-
-
 def finite_points(values: ArrayLike, dimension: int, name: str) -> np.ndarray:
     """`points`, with NaN and infinity refused by a ValueError that counts the rows and names the first."""
     array = points(values, dimension, name)

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import chndtrix
 
-from lib.geometry import cross, finite_points
+from lib.geometry import finite_points
 
 #: Zoom (px per mm) between a room camera and the resolution of light; what lies outside has the wrong unit.
 PLAUSIBLE_PX_PER_MM = (0.2, 5000.0)
@@ -97,7 +97,7 @@ def check_images(y: np.ndarray, image_size_px: tuple[int, int] | None = None) ->
 def sides(A: np.ndarray) -> tuple[float, float]:
     """Where the right camera of A (4, 3) stands, along and across the image rows: rad of the angle between the two views."""
     a, b, c, d = A / np.linalg.norm(A, axis=1, keepdims=True)
-    left, right = cross(a, b), cross(c, d)
+    left, right = np.cross(a, b), np.cross(c, d)
     apart = left / np.linalg.norm(left) - right / np.linalg.norm(right)  # cameras stand against their viewing directions
     return apart @ (a + c) / 2, apart @ (b + d) / 2
 

@@ -22,7 +22,6 @@ from lib.calibration.calibration import Calibration, LandmarkOffsets
 from lib.calibration.robust import CompetingCamerasError
 from lib.calibration.scatter import sandwich
 from lib.correspondences import Correspondences
-from lib.geometry import cross
 
 #: Step of the offsets' derivatives, mm or px.
 _STEP = 1e-4
@@ -59,13 +58,13 @@ def tool_axes(x_mm: ArrayLike, offset_mm: np.ndarray | None = None) -> np.ndarra
         a = np.stack([straight, *np.broadcast_arrays(-middle[1], -middle[2], straight)[:2]], axis=1) / size[:, None]
         up = np.array([0.0, 0.0, 1.0]) - a[:, 2:] * a
         up /= np.linalg.norm(up, axis=1, keepdims=True)
-        side, m = cross(up, a), along / size[:, None]
+        side, m = np.cross(up, a), along / size[:, None]
         beside = (across * m).sum(axis=1, keepdims=True)
         across = across - beside * m
         width = np.linalg.norm(across, axis=1, keepdims=True)
         sine = np.clip((-apart[2] - beside * a[:, 2:]) / (width * up[:, 2:]), -1, 1)
         cosine, c = np.array([[[1]], [[-1]]]) * np.sqrt(1 - sine**2), across / width
-        g = cross(m, c)
+        g = np.cross(m, c)
         own = np.stack([a, side, up], axis=2)
         y, z = cosine * c - sine * g, sine * c + cosine * g
         axes = np.stack([np.broadcast_to(m, y.shape), y, z], axis=3) @ own.mT  # (2, n, 3, 3)
@@ -128,7 +127,7 @@ def carried(axes: np.ndarray, x_mm: np.ndarray, time_s: np.ndarray | None = None
     known, shut = np.flatnonzero(is_known & is_told), np.flatnonzero(~is_known & is_told)
     if known.size:
         nearest = known[np.searchsorted((time[known[1:]] + time[known[:-1]]) / 2, time[shut])]
-        axis = cross(along[nearest], along[shut])
+        axis = np.cross(along[nearest], along[shut])
         sine, cosine = np.linalg.norm(axis, axis=1), (along[nearest] * along[shut]).sum(axis=1)
         turn = Rotation.from_rotvec(axis * (np.arctan2(sine, cosine) / np.maximum(sine, 1e-300))[:, None])
         found[shut] = turn.as_matrix() @ axes[nearest]
@@ -259,7 +258,7 @@ def start_of_turning(
     heights.  From each point of a grid of them the offsets follow linearly, and the best improve as they turn the axes anew.
     `found` is the calibration by the reported `axes` (n, 3, 3), `turned` gives the axes of offsets.
     """
-    some = slice(None, None, max(1, found.inliers.sum() // _STARTING_ROWS))
+    some = np.random.default_rng(0).permutation(found.inliers.sum())[:_STARTING_ROWS]  # every third would be one landmark
     rows, offset, k = np.flatnonzero(found.inliers)[some], found.offsets.offset, len(found.offsets.offset)
     J_x, J_c, weight, r = (part if len(part) == 1 else part[some] for part in found.system)
     r = r + (J_x @ axes[rows] @ offset[landmark[rows]][:, :, None])[:, :, 0]

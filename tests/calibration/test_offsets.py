@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from lib.calibration import CompetingCamerasError, calibrate, with_offsets
-from lib.calibration.offsets import carried, estimate_offsets, tool_axes
+from lib.calibration.offsets import carried, estimate_offsets, start_of_turning, tool_axes
 from lib.correspondences import Correspondences
 from lib.geometry import RigidTransform
 from lib.simulator.rig import IMAGE_SIZE_PX
@@ -95,6 +95,25 @@ def test_offsets_as_large_as_a_fifth_of_the_tool_are_found_from_far_off(seed):
     found = calibrate(Correspondences.of_points(reported.reshape(-1, 3), *u, frame=data.frame, landmark=data.landmark))
     apart = found.offsets.offset - offset
     assert found.offsets.turns and np.abs(apart - apart.mean(axis=0)).max() < 0.015
+
+
+def test_some_rows_of_all_landmarks_tell_where_turning_offsets_start(monkeypatch):
+    rng, (data, rig, _) = np.random.default_rng(4), tool_sweep(4, frames=150)
+    x, offset = data.grid("x_mm"), 0.6 * LARGE_MM
+    reported = x - np.einsum("nij,kj->nki", tool_axes(x), offset)
+    u = [p + rng.normal(0, 0.5, p.shape) for p in rig.project(x.reshape(-1, 3))]
+    data = Correspondences.of_points(reported.reshape(-1, 3), *u, frame=data.frame, landmark=data.landmark)
+    monkeypatch.setattr("lib.calibration.offsets._STARTING_ROWS", len(data) // 3)
+    starts = []
+
+    def kept(*given):
+        starts.append(start_of_turning(*given))
+        return starts[-1]
+
+    monkeypatch.setattr("lib.calibration.estimate.start_of_turning", kept)
+    calibrate(data)
+    apart = starts[0] - offset
+    assert np.abs(apart - apart.mean(axis=0)).max() < 0.02
 
 
 @pytest.mark.parametrize("seed", [2, 4])
