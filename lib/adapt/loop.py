@@ -30,7 +30,7 @@ from lib.trust.health import spread
 
 #: Most rounds of training, and most steps of a stage in one; the time ends most trainings.
 ROUNDS, STEPS = 3, 4000
-RECIPE = 13  # raised where teaching or training changes: what an older one kept is not gone on with
+RECIPE = 14  # raised where teaching or training changes: what an older one kept is not gone on with
 #: Share of the time left that a round takes, and fewest images for stopping to which alone the doubt is fitted.
 _ROUND_SHARE, _DOUBT_IMAGES = 0.85, 10
 #: Said of a log of which more than half stays as it is.
@@ -50,6 +50,7 @@ _SURE_GAIN = 1.0
 #: Most rounds of looking where the robot says, before anything is trained, and the share of the tool's length below which a
 #: landmark's move ends them.
 _GUIDED, _SETTLED = 3, 0.01
+_OVERRULE = 5  # fewest labelled pairs that overrule the detector
 #: Largest median distance of a teacher from labels set by hand: a share of the tool's length, at least twice that of clicks.
 _OFF_LABELS, _OFF_LABELS_PX = 0.015, 2 * 1.18 * CLICK_SD_PX
 
@@ -246,19 +247,21 @@ class _Work:
         """Teach, train and look again, round after round, then judge."""
         recording, start, rounds = self.recording, self.detector, self.report["rounds"]
         first = self.look("before", start, self.frames)
-        seen = self.moving(first, start).labelled(self.labels)
-        still, note = longest_still(recording, seen)
+        seen = self.moving(first, start)
+        by_hand, few = Seen.by_hand(self.labels), np.full_like(self.labels, np.nan)
+        if len(self.marked) < _OVERRULE:  # they only take the place of what was detected there
+            by_hand, few = None, self.labels
+        still, note = longest_still(recording, seen.labelled(few))
         self.report["notes"] += [note] if note else []
         parts = self.parts = stretches(np.setdiff1d(still, self.marked), recording.frames.time_s)
         learn = parts["learn"] = np.union1d(parts["learn"], self.marked)
         self.report["frames"] = {name: len(part) for name, part in parts.items()}
-        teachers, refused, shape = [], None, (len(self.marked), 2, 3)
-        alone = Seen(self.marked, np.full((*shape, 2), np.nan), np.full((*shape, 2, 2), np.nan), np.zeros(shape))
-        for part, by_hand in ((seen.of(learn), False), (alone.labelled(self.labels), True)):
-            if not by_hand or len(self.marked) >= 5:
+        teachers, refused = [], None
+        for part, hand in ((seen.labelled(few).of(learn), by_hand), (by_hand, None)):
+            if part is not None:
                 try:
-                    one = teach(recording, part, from_labels=by_hand)
-                    if not by_hand and self.contradicted(one):
+                    one = teach(recording, part, by_hand=hand, from_labels=part is by_hand)
+                    if part is not by_hand and self.contradicted(one):
                         raise RefusalError("labels: they lie elsewhere than where detector and robot agree; check both.")
                     teachers.append(one)
                 except ValueError as error:
@@ -271,9 +274,9 @@ class _Work:
         for k in range(_GUIDED if self.learns and start.closeup_network else 0):  # untaught, near where the robot says
             guided = self.look(f"guided {k}", start, learn, u)
             try:
-                found = teach(recording, guided.labelled(self.labels), opinion=guided, before=teacher)
+                found = teach(recording, guided.labelled(few), opinion=guided, before=teacher, by_hand=by_hand)
             except RefusalError:
-                if len(self.marked) < 5:
+                if by_hand is None:
                     raise
                 break  # a detector that does not know the tool corrects nothing; labels set by hand do
             if self.contradicted(found):
@@ -294,11 +297,12 @@ class _Work:
             tuned = self.round(k, best, teacher, None if k == 1 else best_seen)
             seen, said = self.look(f"round {k}", tuned, self.frames), {}
             try:
-                found = teach(recording, seen.labelled(self.labels).of(learn), before=teacher, opinion=guided)
+                part = seen.labelled(few).of(learn)
+                found = teach(recording, part, before=teacher, opinion=guided, by_hand=by_hand)
                 new = teacher if self.contradicted(found) else found
             except RefusalError as refused:
                 said = {"refused": str(refused)}
-                if len(self.marked) < 5:
+                if by_hand is None:
                     rounds.append({"round": k} | said)
                     break
                 new = teacher  # what the labels say still holds
@@ -316,7 +320,7 @@ class _Work:
         told = self.labels[self.marked]
         off = np.linalg.norm(teacher.project(self.marked)[0] - told, axis=-1)
         off /= np.maximum(_OFF_LABELS * tool_length_px(told), _OFF_LABELS_PX)[..., None]
-        return len(self.marked) >= 5 and np.nanmedian(off) > 1
+        return len(self.marked) >= _OVERRULE and np.nanmedian(off) > 1
 
     def round(self, k: int, detector: Detector, teacher: Teacher, seen: Seen | None) -> Detector:
         """The detector trained further on what the teacher says of the frames for learning."""

@@ -12,6 +12,7 @@ from functools import cache
 from typing import NamedTuple, Self
 
 import numpy as np
+from scipy.optimize import least_squares
 
 from lib.calibration import Calibration, CompetingCamerasError, LandmarkOffsets, calibrate, estimate_time_offset
 from lib.calibration.offsets import carried, tool_axes
@@ -62,6 +63,7 @@ _CONFIDENCES = (MIN_CONFIDENCE, 0.5, 0.8)
 _NEAR = 0.1
 #: Fewer labelled pairs tell neither outliers nor how large the offsets are; the usual ones of a robot, standard deviation.
 _FEW_PAIRS, _ROBOTS_OFFSET_MM = 8, 0.15
+_OTHER_POINT = 0.3  # from a detector's point to the labelled one, standard deviation, as a share of the tool's length
 _LABEL = (
     "Label 10 pairs of frames (5 at least), far apart in place and depth (`python3 -m lib annotate RECORDING`), and give "
     "annotations.json with --labels."
@@ -79,6 +81,13 @@ class Seen(NamedTuple):
     u: np.ndarray
     covariance: np.ndarray
     confidence: np.ndarray
+
+    @classmethod
+    def by_hand(cls, u: np.ndarray) -> Self:
+        """Labels set by hand: u (all frames, 2, 3, 2) px, NaN where there is none."""
+        frames = np.flatnonzero(np.isfinite(u).any(axis=(1, 2, 3)))
+        nothing = np.full((len(frames), 2, 3, 2), np.nan)
+        return cls(frames, nothing, nothing[..., None] * np.eye(2), np.zeros((len(frames), 2, 3))).labelled(u)
 
     @property
     def stacked_px(self) -> np.ndarray:
@@ -260,7 +269,7 @@ class Teacher:
 
 def teach(
     recording: Recording, seen: Seen, *, opinion: Seen | None = None, before: Teacher | None = None,
-    from_labels: bool = False,
+    from_labels: bool = False, by_hand: Seen | None = None,
 ) -> Teacher:  # fmt: skip
     """The robot as the teacher of what a detector has `seen` in the frames for learning.
 
@@ -268,6 +277,7 @@ def teach(
         opinion: Of later stages that this robot never taught.  They tell the landmarks' offsets; None: `seen` does.
         before: The teacher of the round before: its clock is the start, and what it refused stays refused.
         from_labels: `seen` are labels set by hand, of few frames.
+        by_hand: Labels set by hand.  They tell the offsets in place of detections, which may be of other points of the tool.
 
     Raises:
         RefusalError: If fewer than a tenth of the landmarks, or 30, agree on cameras, the cameras are no stereo microscope's,
@@ -307,7 +317,9 @@ def teach(
         raise RefusalError(f"robot: {fault.text} {fault.cure}")
     offset, sd = np.zeros((3, 3)), np.full((3, 3), 0.0 if calibration.offsets is not None else 0.1)
     told, turns = calibration.offsets, False
-    if opinion is not None:
+    if by_hand is not None:
+        told = None
+    elif opinion is not None:
         shares = (opinion.confidence >= MIN_CONFIDENCE).mean(axis=(0, 1))
         if shares.min() < LEAST_RIGHT * shares.max():
             rare, often = LANDMARKS[shares.argmin()], LANDMARKS[shares.argmax()]
@@ -333,7 +345,9 @@ def teach(
     elif before is not None:
         offset, sd, turns = before.offset_mm, before.offset_sd_mm, before.turns
     teacher = Teacher(recording, calibration, clock_sd_s, offset, sd, refused, right, turns)
-    u, covariance = teacher.project(used.frame)
+    if by_hand is not None:
+        teacher = _as_labelled(teacher, by_hand)
+    u, covariance = teacher.project(np.arange(len(recording)))
     share = np.nanmedian(np.sqrt(np.trace(covariance, axis1=-2, axis2=-1) / 2) / tool_length_px(u)[..., None])
     if share > _NEAR:
         told = "labels" if from_labels else "detections"
@@ -481,6 +495,26 @@ def _robots_share(found: LandmarkOffsets, own_sd: np.ndarray) -> tuple[np.ndarra
     # What the rig hides moves cameras and offsets together and leaves the labels where they are: no reason to believe less.
     share = width**2 / (width**2 + own_sd**2)
     return share * found.offset, np.hypot(np.sqrt(share) * own_sd, _ODD * share * found.offset)
+
+
+def _as_labelled(teacher: Teacher, labels: Seen) -> Teacher:
+    """The teacher with the offsets at which its cameras see the robot's landmarks where labels set by hand are."""
+    free, x = teacher.calibration.offsets, teacher.recording.landmarks_mm()
+    known = free is not None and free.offset.shape == (3, 3)
+    teacher, start = replace(teacher, turns=known and free.turns), free.offset.ravel() if known else np.zeros(9)
+    wide_mm = _OTHER_POINT * np.nanmedian(np.linalg.norm(x[:, 1:].mean(axis=1) - x[:, 0], axis=1))
+
+    def misfit(offset: np.ndarray) -> np.ndarray:
+        u = replace(teacher, offset_mm=offset.reshape(3, 3)).project(labels.frame)[0]
+        return np.append(np.nan_to_num((u - labels.u) / CLICK_SD_PX), (offset - start) / wide_mm)
+
+    def jacobian(offset: np.ndarray) -> np.ndarray:
+        steps = 1e-4 * np.eye(9)
+        return np.stack([misfit(offset + step) - misfit(offset - step) for step in steps], axis=1) / 2e-4
+
+    found = least_squares(misfit, start, jacobian, loss="soft_l1", f_scale=2.0)  # a wild click counts little
+    sd = np.sqrt(np.diag(np.linalg.inv(found.jac.T @ found.jac)) * max(1.0, 2 * found.cost / labels.u.size))
+    return replace(teacher, offset_mm=found.x.reshape(3, 3), offset_sd_mm=sd.reshape(3, 3))
 
 
 def _contradicted(teacher: Teacher, seen: Seen) -> np.ndarray:

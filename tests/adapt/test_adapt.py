@@ -364,15 +364,18 @@ def five_labelled(world):
     """Labels set by hand, to half a pixel, of five frames (n, 2, 3, 2), and as a `Seen`."""
     some, u = np.array([1, 7, 13, 19, 24]), np.full(world.u.shape, np.nan)
     u[some] = world.u[some] + np.random.default_rng(0).normal(0, 0.5, u[some].shape)
-    shape = (len(some), 2, 3)
-    return u, Seen(some, np.full((*shape, 2), np.nan), np.full((*shape, 2, 2), np.nan), np.zeros(shape)).labelled(u)
+    return u, Seen.by_hand(u)
+
+
+def off_by_a_fifth(world, folder):
+    """A recording of a robot whose landmarks are off by 0.2 mm and whose clock is off by 40 ms."""
+    offset = 0.2 * np.array([[0.0, 0.6, 0.8], [0.6, -0.8, 0.0], [-0.8, 0.0, 0.6]])
+    axes = lambda x: np.nan_to_num(tool_axes(x))  # noqa: E731
+    return world.record(folder / "off", robot=lambda _, x: x + np.einsum("mij,kj->mki", axes(x), offset), clock_s=0.04)
 
 
 def test_five_labelled_pairs_tell_clock_and_offsets(world, tmp_path):
-    offset = 0.2 * np.array([[0.0, 0.6, 0.8], [0.6, -0.8, 0.0], [-0.8, 0.0, 0.6]])
-    axes = lambda x: np.nan_to_num(tool_axes(x))  # noqa: E731
-    off = world.record(tmp_path / "off", robot=lambda _, x: x + np.einsum("mij,kj->mki", axes(x), offset), clock_s=0.04)
-    teacher = teach(off, five_labelled(world)[1], from_labels=True)
+    teacher = teach(off_by_a_fifth(world, tmp_path), five_labelled(world)[1], from_labels=True)
     assert np.nanmedian(label_errors(world, teacher)[0]) < 1.5  # 0.2 mm are 5 px
     assert teacher.recording.offset_s == pytest.approx(0.04, abs=0.015)
 
@@ -401,6 +404,21 @@ def test_labels_overrule_a_detector_that_agrees_with_itself(world, recording, tm
         tune = pupil(world)
         adapt(recording, StandIn(elbows, noise_px=0.7), labels=labels, folder=tmp_path, progress=False, tune=tune)
         assert (np.nanmedian(np.linalg.norm(tune.calls[0]["off"], axis=-1)) > 4.0) == wrong
+
+
+@pytest.mark.parametrize("wild_click", [False, True])
+def test_a_few_labels_tell_which_points_of_the_tool_a_detector_sees(world, tmp_path, wild_click):
+    """It takes elbows for tips, and the robot errs: that is refused without labels, and with five labelled pairs no harm."""
+    off, elbows = off_by_a_fifth(world, tmp_path), world.u.copy()
+    elbows[:, :, 1:] += 0.3 * (elbows[:, :, :1] - elbows[:, :, 1:])
+    seen = look(off, StandIn(elbows, noise_px=0.7), np.arange(world.n))
+    with pytest.raises(RefusalError, match="another point"):
+        teach(off, seen)
+    by_hand = five_labelled(world)[1]
+    if wild_click:
+        by_hand.u[2, 0, 1] += 80.0
+    error, relative = label_errors(world, teach(off, seen, by_hand=by_hand))
+    assert np.nanmedian(error) < 1.0 and 0.2 < np.sqrt(np.nanmean(relative**2)) < 1.5
 
 
 @pytest.mark.parametrize(("length_px", "agrees_px", "contradicts_px"), [(300, 4.0, 5.0), (60, 3.2, 4.0)])

@@ -26,13 +26,15 @@ SMALLEST = {
     "realism": {"windows": 8},
     "reconstruction_speed": {},
     "resolution": {"steps": 100},
+    "robot_and_clicks": {"pairs": 14, "minutes": 0.1},
     "robot_labels": {"pairs": 14, "minutes": 0.1},
     "rungs": {"n": 2},
     "shipped_detector": {"every": 12},
     "surfaces": {"scene": "eye 200"},
 }
 NEED_DATA = {"few_labels", "matching", "papers_network", "real_robot", "realism", "rungs"}
-MAY_LACK = {"matching", "noticed_motion", "robot_labels", "rungs"}  # numbers that a picture or a motion does not have
+#: Numbers that a picture or a motion does not have.
+MAY_LACK = {"matching", "noticed_motion", "robot_and_clicks", "robot_labels", "rungs"}
 
 
 def test_every_study_is_run_by_a_test():
