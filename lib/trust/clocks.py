@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from lib.calibration.timing import shift_misfits
-from lib.trust.fitting import SIDES, Case, Hypothesis, Problem, Robust
+from lib.trust.fitting import FITS, SIDES, Case, Hypothesis, Problem, Robust
 
 #: Frame rates by which a wrong one may be stated, as ratios; -1 is time backwards.
 _RATES = (-1.0, 0.5, 24 / 30, 25 / 30, 24 / 25, 25 / 24, 30 / 25, 30 / 24, 2.0)
@@ -73,8 +73,7 @@ def _scan(case: Case, half_s: float, rate: float = 1.0) -> tuple[np.ndarray, np.
 
 def _clock_rate(case: Case) -> Iterator[Hypothesis]:
     """A wrong frame rate, or frames in reverse; sought only where the residuals are large."""
-    scale = min(fit.shapes[0].scale for fit in (case.null, *case.fits.values()))
-    if scale < 0.03 * case.problem.y[case.problem.used].std(axis=0).max():
+    if case.misfit(case.null, *case.fits.values()) < FITS:
         return
     scans = {rate: _scan(case, 0.2 * case.paths.span_s, rate) for rate in _RATES}
     rate = min(scans, key=lambda r: scans[r][1].sum(axis=1).min())

@@ -15,7 +15,7 @@ from lib.calibration.checks import eyes_exchanged, sides
 from lib.correspondences import LANDMARKS, TRAIN_FURTHER, Correspondences
 from lib.recordings import Kinematics
 from lib.trust.clocks import TIME_TESTS
-from lib.trust.fitting import SIDES, Case, Hypothesis, Problem, Robust
+from lib.trust.fitting import FITS, SIDES, Case, Hypothesis, Problem, Robust
 from lib.trust.health import affine_epipolar
 
 #: Least gain and least share explained of a hypothesis that is named.
@@ -28,6 +28,7 @@ _ROBOT_MM = 0.04  # a robot for eye surgery is better
 _SKEW_SD, _ASPECT_SD = 0.002, 0.003
 #: A common log aspect above this is no lens: the images were resized, and their aspect is free.
 _RESIZED = 0.1
+_UPSIDE_DOWN = 20.0  # odds that a microscope sees the tips of a tool below its base
 
 
 def _tip_order(case: Case) -> Iterator[Hypothesis]:
@@ -45,6 +46,7 @@ def _tip_order(case: Case) -> Iterator[Hypothesis]:
         where, call = ("both images", "call") if len(views) == 2 else (f"the {SIDES[views[0]]} image", "calls")
         text = f"What {where} {call} {', '.join(LANDMARKS)} is {', '.join(LANDMARKS[k] for k in order)} for the robot."
         cure = f"Bring the columns of kinematics.csv, or the detections of {where}, into one order."
+        cure += " If both images are mirrored, flip them instead." if (order, views) == ((0, 2, 1), (0, 1)) else ""
         yield case.found("tip_order", moved.fit(), 1, (1.0, 0.0, ""), text, cure, on=moved)
     swapped = table[:, [0, 2, 1]][problem.frame, problem.landmark]  # frame by frame: one bit each
     fit, moved, own = case.chosen(np.stack([problem.x[:, 0], swapped]))
@@ -233,8 +235,9 @@ def _optics(case: Case) -> Iterator[Hypothesis]:
     few = 2 * case.problem.used.sum() < 40
     if few or not np.isfinite(covariance).all() or min(np.linalg.svd(a, compute_uv=False)[1] for a in A) < 1e-6:
         return
-    yield from _scaled_axis(A, covariance)
-    yield from _exchanged(case.problem, A, covariance)
+    if case.misfit(case.null) < FITS:  # cameras that fit nothing always have skewed pixels
+        yield from _scaled_axis(A, covariance)
+    yield from _handedness(case, A, covariance)
 
 
 def _constraints(A: np.ndarray) -> np.ndarray:
@@ -269,26 +272,33 @@ def _scaled_axis(A: np.ndarray, covariance: np.ndarray) -> Iterator[Hypothesis]:
         yield Hypothesis("scaled_axis", text, cure, scale, sd * scale, "times", explained, gain)
 
 
-def _exchanged(problem: Problem, A: np.ndarray, covariance: np.ndarray) -> Iterator[Hypothesis]:
-    """A left camera that stands on the right: exchanged eyes, or a mirrored axis."""
+def _handedness(case: Case, A: np.ndarray, covariance: np.ndarray) -> Iterator[Hypothesis]:
+    """A left camera on the right, or a tool that points at the cameras: exchanged eyes, or something is mirrored."""
+    view = np.cross(A, np.roll(A, -1, axis=1))[:, 0].sum(axis=0)  # away from the cameras, if nothing is mirrored
+    depth = case.by_frame(case.problem.x[:, 0]) @ view
+    ahead = depth[:, 1:].mean(axis=1) - depth[:, 0]
+    near, far = int((ahead < 0).sum()), int((ahead > 0).sum())
     side, step = sides(A.reshape(4, 3))[0], 1e-6 * np.abs(A).max()
     J = np.array([(sides((A.ravel() + step * e).reshape(4, 3))[0] - side) / step for e in np.eye(12)])
     sd = float(np.sqrt(J @ covariance @ J))
-    if not eyes_exchanged(A.reshape(4, 3), sd):
-        return
-    view = np.cross(A, np.roll(A, -1, axis=1))[:, 0].sum(axis=0)  # away from the cameras, if nothing is mirrored
-    tips, base = problem.landmark > 0, problem.landmark == 0
-    depth = [np.nanmedian(problem.x[rows, 0] @ view) if rows.any() else np.nan for rows in (tips, base)]
     degrees = np.rad2deg(-side)
     size = float(degrees), float(np.rad2deg(sd)), "degrees", 1.0, float(0.5 * (side / sd) ** 2)
     where = f"The left camera stands on the right, by {degrees:.1f} degrees"
-    if depth[0] <= depth[1]:
-        text = f"{where}, and the tool points at the cameras: an axis of the robot is mirrored."
-        cure = "Use a right-handed robot frame: negate one axis, or exchange two, in kinematics.csv."
-        yield Hypothesis("mirrored_axis", text, cure, *size)
-    else:
-        text = f"{where}, and the tool points away from the cameras: the images of the two eyes are exchanged."
-        yield Hypothesis("exchanged_eyes", text, "Exchange the folders left/ and right/ (or u_left and u_right).", *size)
+    if eyes_exchanged(A.reshape(4, 3), sd):
+        if near >= far:
+            text = f"{where}, and the tool points at the cameras: an axis of the robot is mirrored."
+            cure = "Use a right-handed robot frame: negate one axis, or exchange two, in kinematics.csv."
+            yield Hypothesis("mirrored_axis", text, cure, *size)
+        else:
+            text = f"{where}, and the tool points away from the cameras: the images of the two eyes are exchanged."
+            yield Hypothesis("exchanged_eyes", text, "Exchange the folders left/ and right/ (or u_left and u_right).", *size)
+    elif near > far:
+        share = near / (near + far)
+        text = f"In {100 * share:.0f} % of the frames the tips lie nearer to the cameras than the base. If both images are "
+        text += "mirrored, heights and distances have the wrong sign."
+        cure = "Flip both images, and undo what was done to the tips' order. Where the tool does point so, --force goes on."
+        gain = (near - far) * np.log(_UPSIDE_DOWN)
+        yield Hypothesis("mirrored_images", text, cure, 100 * share, 0.0, "%", 2 * share - 1, float(gain))
 
 
 def _unexplained(case: Case, fit: Robust) -> list[Hypothesis]:
@@ -358,6 +368,10 @@ def diagnose(
             return Diagnosis()
         text = f"Only {problem.used.all(axis=1).sum()} of {len(data)} rows have both images and the robot's report."
         return Diagnosis((Hypothesis("detector_unfit", text, _UNFIT, 100.0, 0.0, "%", 1.0, float(len(data))),))
+    own = (problem.y[(problem.landmark == k) & problem.used.all(axis=1)] for k in np.unique(problem.landmark))
+    if max(np.ptp(y, axis=0).max() for y in own if len(y)) < 1e-6:
+        text, cure = "All frames show the same picture, while the robot moves.", "Record anew; does the camera still deliver?"
+        return Diagnosis((Hypothesis("frozen_video", text, cure, 100.0, 0.0, "%", 1.0, float(len(data))),))
     case = Case(problem, kinematics, offset_s, readout_s, image_size_px)
     tests = [_tip_order, _finite_distance, _landmark_offset, _tool_bends, _drift, _bad_part, _camera_moved, _frozen]
     tests = [*(TIME_TESTS if case.paths else ()), *tests, _rigid_tips, _optics]

@@ -21,6 +21,7 @@ from lib.recordings import Kinematics
 SIDES = ("left", "right")
 #: Degrees of freedom tried; bivariate Cauchy to nearly Gaussian.
 _FREEDOM = np.array([0.7, 1.0, 2.0, 4.0, 10.0, 100.0])
+FITS = 0.03  # the scale of the residuals over the spread of the pixels, below which cameras fit
 _LEAST_PX = 0.02  # smaller residuals are rounding
 _OFFSET_SD_MM = 0.03  # of what a detector marks beside a landmark
 _BLOCK = 8  # frames over which residuals may be correlated
@@ -239,6 +240,10 @@ class Case:
             steps = np.concatenate([np.diff(time[rows]) for rows in each])
             near = steps.size and np.median(steps) <= _LONGEST_S
             self.paths, self._clock_s = Paths((time[rows], x[rows]) for rows in each) if near else None, 0.0
+
+    def misfit(self, *fits: Robust) -> float:
+        """The scale of the residuals over the spread of the pixels, of the best of some fits."""
+        return min(fit.shapes[0].scale for fit in fits) / self.problem.y[self.problem.used].std(axis=0).max()
 
     def moved(self, shift_s: float | np.ndarray) -> np.ndarray:
         """(n, 3) mm: the positions of the rows as they were `shift_s` later; NaN where nothing tells."""

@@ -377,6 +377,7 @@ def _late(view: int, seconds: float) -> Callable[[Scene], None]:
 
 
 _SWAP = _pixels(lambda scene, u: u[:, :, ::-1].copy())
+_MIRROR = _pixels(lambda scene, u: (_SIZE[0] - 1, 0) + u * (-1, 1))
 _REVERSE = _report(lambda scene, t, x: x[::-1].copy())
 
 
@@ -411,6 +412,7 @@ SPOILED: dict[tuple[str, str], tuple[tuple[str, ...], Callable[[Scene], None]]] 
        for s in (0.010, 0.020, 0.035)},
     **{("axis mirrored", "xyz"[a]): (("mirrored_axis",), _scale(tuple(1 - 2 * np.eye(3)[a]))) for a in range(3)},
     ("eyes exchanged", ""): (("exchanged_eyes",), _SWAP),
+    ("both images mirrored", "and the tips exchanged"): (("mirrored_images",), _MIRROR),
     **{("landmark offset", f"{s} mm"): (("landmark_offset",), _offset(k, s)) for k, s in enumerate((0.3, 0.5, 1.0))},
     **{("finite distance", f"{d} mm"): (("finite_distance",), _set(inverse_distance_per_mm=1 / d)) for d in (300, 150, 75)},
     **{("bad landmark", f"{s} px"): (("bad_landmark",), _one_landmark(k, s, 0.8)) for k, s in enumerate((10.0, 40.0, 150.0))},
@@ -421,6 +423,7 @@ SPOILED: dict[tuple[str, str], tuple[tuple[str, ...], Callable[[Scene], None]]] 
     ("right camera late", "100 ms"): (("camera_clock",), _late(1, 0.1)),
     ("images creep", "20 px"): (("drift",), _set(drift_px=20.0)),
     ("frames twice", "30 %"): (("frozen_video",), _frozen_video(0.3)),
+    ("frames all the same", ""): (("frozen_video",), _frozen_video(1.1)),
     ("frames out of order", "within 6"): (("frame_order", "detector_unfit", "clock"), _shuffled(6)),
     ("time runs backwards", ""): (("frame_order", "clock"), _REVERSE),
     ("frame rate wrong", "25 for 30"): (("clock_rate", "clock"), _set(rate=1.2)),

@@ -35,7 +35,8 @@ def test_a_good_recording_has_no_fault(name):
     [
         ("read-out time left at 0", "20 ms", 20.0),
         ("tips exchanged", "half of the frames", None), ("z scaled", "2.0", 2.0), ("rigid tips", "1.0 mm", None),
-        ("axis mirrored", "z", None), ("eyes exchanged", "", None), ("finite distance", "150 mm", 1 / 150),
+        ("axis mirrored", "z", None), ("eyes exchanged", "", None), ("frames all the same", "", 100.0),
+        ("both images mirrored", "and the tips exchanged", 100.0), ("finite distance", "150 mm", 1 / 150),
         ("landmark offset", "1.0 mm", 1000.0), ("bad stretch", "40.0 px", None),
         ("robot noise", "100 um", None), ("camera moved", "1.0 degrees", None), ("detector partly wrong", "50 %", None),
         ("kinematics frozen", "25 %", 24.0), ("left camera late", "40 ms", -40.0),
@@ -48,6 +49,11 @@ def test_a_fault_is_named_with_its_size_and_its_cure(way, strength, value):
     assert best.gain > 12 and 0 < best.explained <= 1 and best.text.endswith(".") and best.cure.endswith(".")
     if value is not None:
         assert best.value == pytest.approx(value, abs=max(4 * best.sd, 0.1 * abs(value)))
+
+
+def test_cameras_that_do_not_fit_say_nothing_of_an_axis():
+    """Their pixels are always skewed or oblong."""
+    assert "scaled_axis" not in {h.name for h in found(take("random detections", "150.0 px")).hypotheses}
 
 
 def test_a_clock_is_found_among_wrong_landmarks_and_without_the_log():
