@@ -28,6 +28,7 @@ _ROBOT_MM = 0.04  # a robot for eye surgery is better
 _SKEW_SD, _ASPECT_SD = 0.002, 0.003
 #: A common log aspect above this is no lens: the images were resized, and their aspect is free.
 _RESIZED = 0.1
+_STILL_PX = 0.1  # detections of one picture differ by less
 _UPSIDE_DOWN = 20.0  # odds that a microscope sees the tips of a tool below its base
 
 
@@ -368,8 +369,9 @@ def diagnose(
             return Diagnosis()
         text = f"Only {problem.used.all(axis=1).sum()} of {len(data)} rows have both images and the robot's report."
         return Diagnosis((Hypothesis("detector_unfit", text, _UNFIT, 100.0, 0.0, "%", 1.0, float(len(data))),))
-    own = (problem.y[(problem.landmark == k) & problem.used.all(axis=1)] for k in np.unique(problem.landmark))
-    if max(np.ptp(y, axis=0).max() for y in own if len(y)) < 1e-6:
+    tracks = [(problem.landmark == k) & problem.used.all(axis=1) for k in np.unique(problem.landmark)]
+    moved_px, moved_mm = (max(np.ptp(v[own], axis=0).max() for own in tracks if own.any()) for v in (problem.y, problem.x))
+    if moved_px < _STILL_PX and moved_mm > _ROBOT_MM:
         text, cure = "All frames show the same picture, while the robot moves.", "Record anew; does the camera still deliver?"
         return Diagnosis((Hypothesis("frozen_video", text, cure, 100.0, 0.0, "%", 1.0, float(len(data))),))
     case = Case(problem, kinematics, offset_s, readout_s, image_size_px)
