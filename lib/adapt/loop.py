@@ -256,19 +256,14 @@ class _Work:
         parts = self.parts = stretches(np.setdiff1d(still, self.marked), recording.frames.time_s)
         learn = parts["learn"] = np.union1d(parts["learn"], self.marked)
         self.report["frames"] = {name: len(part) for name, part in parts.items()}
-        teachers, refused = [], None
-        for part, hand in ((seen.labelled(few).of(learn), by_hand), (by_hand, None)):
-            if part is not None:
-                try:
-                    one = teach(recording, part, by_hand=hand, from_labels=part is by_hand)
-                    if part is not by_hand and self.contradicted(one):
-                        raise RefusalError("labels: they lie elsewhere than where detector and robot agree; check both.")
-                    teachers.append(one)
-                except ValueError as error:
-                    refused = error
-        if not teachers:
-            raise RefusalError(str(refused)) from refused
-        teacher = min(teachers, key=lambda one: np.nanmedian(np.trace(one.project(learn)[1], axis1=-2, axis2=-1)))
+        try:
+            teacher = teach(recording, seen.labelled(few).of(learn), by_hand=by_hand)
+            if self.contradicted(teacher):
+                raise RefusalError("labels: they lie elsewhere than where detector and robot agree; check both.")
+        except RefusalError:
+            if by_hand is None:
+                raise
+            teacher = teach(recording, by_hand, from_labels=True)
         self.report["start_share"] = teacher.right
         u, guided = teacher.labels(learn)[0], None
         for k in range(_GUIDED if self.learns and start.closeup_network else 0):  # untaught, near where the robot says

@@ -502,8 +502,8 @@ def test_labels_of_one_eye_do_not_stop_a_detector_that_teaches_by_itself(world, 
 
 
 @pytest.mark.parametrize("labelled", [range(1, 26, 3), [1, 7, 13, 19, 24]])
-def test_of_two_teachers_the_surer_teaches(world, recording, tmp_path, labelled):
-    """Nine frames of exact labels against a detector that errs by 3 px; five of them tell too little."""
+def test_labels_and_a_poor_detector_teach_together(world, recording, tmp_path, labelled):
+    """Nine frames of exact labels, or five, and a detector that errs by 3 px where it is right."""
     u = np.full(world.u.shape, np.nan)
     u[list(labelled)] = world.u[list(labelled)]
     write_coco(tmp_path / "labels.json", Annotations(u[:, 0], u[:, 1]), SIZE, ".png")
