@@ -14,7 +14,8 @@ import numpy as np
 
 from lib import files, paths
 from lib.adapt.judging import Agreement, agreement, better, epipolar_px, frame_means, stretches
-from lib.adapt.teacher import RefusalError, Seen, Teacher, at_rest, longest_still, look, look_elsewhere, teach
+from lib.adapt.looking import Seen, at_rest, look, look_elsewhere
+from lib.adapt.teacher import RefusalError, Teacher, longest_still, teach
 from lib.calibration import Calibration
 from lib.correspondences import LANDMARKS
 from lib.landmarks import Detector, SharedDetector

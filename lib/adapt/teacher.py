@@ -9,17 +9,16 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import NamedTuple, Self
 
 import numpy as np
 from scipy.optimize import least_squares
 
+from lib.adapt.looking import NEAR, Seen
 from lib.calibration import Calibration, CompetingCamerasError, LandmarkOffsets, calibrate, estimate_time_offset
 from lib.calibration.offsets import carried, tool_axes
 from lib.calibration.timing import clock_error
 from lib.cameras import NearAffineCamera
-from lib.correspondences import LANDMARKS, MIN_CONFIDENCE, Correspondences, of_recording
-from lib.landmarks import Landmarks
+from lib.correspondences import LANDMARKS, MIN_CONFIDENCE
 from lib.landmarks.metrics import tool_length_px
 from lib.recordings import Recording
 from lib.recordings.annotations import CLICK_SD_PX, inside
@@ -52,15 +51,11 @@ _ODD = 0.2  # share of a large offset that may be the detector's all the same: s
 #: Gain in log likelihood of a detection, by which cameras of their own for a part of the time must explain it better.
 #: A smaller gain narrows the residuals by less than a quarter, which unknown offsets of the landmarks do, too.
 _SURE_MOVE = 0.5
-#: A tool stands still if others stand nearer than this share of its length, in so many frames and more with itself.
-_STILL, _STILL_FRAMES = 0.15, 4
 #: Largest correction of the clock along with cameras and offsets: one step takes motions for straight.
 _LARGEST_STEP_S = 0.03
 _FINITE = 3.0  # the inverse distance of cameras, in its standard deviations, from which it is taken for finite
 _BEHIND = 0.1  # distance from the camera, as a share of the working distance, below which nothing is in view
 _CONFIDENCES = (MIN_CONFIDENCE, 0.5, 0.8)
-#: Share of the tool's length: as near to where it should be a detection is taken for right, farther for another thing.
-_NEAR = 0.1
 #: Fewer labelled pairs tell neither outliers nor how large the offsets are; the usual ones of a robot, standard deviation.
 _FEW_PAIRS, _ROBOTS_OFFSET_MM = 8, 0.15
 _OTHER_POINT = 0.3  # from a detector's point to the labelled one, standard deviation, as a share of the tool's length
@@ -72,106 +67,6 @@ _LABEL = (
 
 class RefusalError(ValueError):
     """The recording cannot teach; the text says why, and what to do."""
-
-
-class Seen(NamedTuple):
-    """Landmarks of m stereo frames: u (m, 2, 3, 2) px, covariance (m, 2, 3, 2, 2), confidence (m, 2, 3)."""
-
-    frame: np.ndarray
-    u: np.ndarray
-    covariance: np.ndarray
-    confidence: np.ndarray
-
-    @classmethod
-    def by_hand(cls, u: np.ndarray) -> Self:
-        """Labels set by hand: u (all frames, 2, 3, 2) px, NaN where there is none."""
-        frames = np.flatnonzero(np.isfinite(u).any(axis=(1, 2, 3)))
-        nothing = np.full((len(frames), 2, 3, 2), np.nan)
-        return cls(frames, nothing, nothing[..., None] * np.eye(2), np.zeros((len(frames), 2, 3))).labelled(u)
-
-    @property
-    def stacked_px(self) -> np.ndarray:
-        """(m, 3, 4) px of left and right."""
-        return np.concatenate([self.u[:, 0], self.u[:, 1]], axis=-1)
-
-    def rows(self, recording: Recording, least: float = 0.0) -> Correspondences:
-        """With the robot's positions; of a confidence below `least` nothing counts."""
-        known = {"covariance_px2": self.covariance, "confidence": np.where(self.confidence >= least, self.confidence, 0.0)}
-        known = {name: np.moveaxis(value, 1, 2) for name, value in known.items()}
-        return of_recording(recording, self.u[:, 0], self.u[:, 1], frames=self.frame, **known)
-
-    def of(self, frames: np.ndarray) -> Self:
-        """Those of some frames."""
-        return Seen(*(part[np.isin(self.frame, frames)] for part in self))
-
-    def labelled(self, u: np.ndarray) -> Self:
-        """With labels set by hand in place of what was found there: u (all frames, 2, 3, 2) px, NaN where there is none."""
-        u = u[self.frame]
-        known = np.isfinite(u).all(axis=-1)
-        covariance = np.where(known[..., None, None], CLICK_SD_PX**2 * np.eye(2), self.covariance)
-        return Seen(self.frame, np.where(known[..., None], u, self.u), covariance, np.where(known, 1.0, self.confidence))
-
-
-def look(
-    recording: Recording, detector: Callable, frames: np.ndarray, *, near: np.ndarray | None = None,
-    progress: Callable[[float], None] = lambda done: None,
-) -> Seen:  # fmt: skip
-    """What a detector finds in some frames; with `near` (m, 2, 3, 2) px its later stages alone, which look there."""
-    found, later = [], []
-    if near is not None:
-        # A window shows the whole tool: closeups alone would add their constant error to the place in every round.
-        later = [stage for stage in detector.stages if stage not in ("frame", "tool", "tracking")]
-        later = later if {"again", "window"} & {*later} else ["tracking", "tracking"]
-    for i, number in enumerate(frames):
-        frame = recording.frames[int(number)]
-        pair = np.stack([frame.left, frame.right])
-        if near is None:
-            found.append(detector(pair))
-        else:
-            known = np.isfinite(near[i]).all(axis=-1)
-            known &= known[:, :1] & known[:, 1:].any(axis=1, keepdims=True)  # no window without base and tip
-            u = np.where(known[..., None], near[i], np.nan)
-            rough = Landmarks(u, np.tile(np.eye(2), (2, 3, 1, 1)), known.astype(float))
-            for stage in later:
-                rough = detector.refine(pair, rough, stage)
-            away = np.linalg.norm(rough.u - u, axis=-1) > _NEAR * tool_length_px(u)[:, None]  # that is another thing
-            u, confidence = np.where(away[..., None], np.nan, rough.u), np.where(away, 0.0, rough.confidence)
-            found.append(Landmarks(u, rough.covariance, confidence))
-        progress((i + 1) / len(frames))
-    return Seen(np.asarray(frames), *(np.stack([getattr(p, n) for p in found]) for n in ("u", "covariance", "confidence")))
-
-
-def at_rest(seen: Seen, x_mm: np.ndarray) -> np.ndarray:
-    """(m, 2) which tools stand in their image where those of other frames do, while the robot's x_mm (m, 3, 3) moves.
-
-    The robot moves in more than one direction, since a tool that moves along the view stands still in the image.
-    """
-    centre, length_mm = x_mm.mean(axis=1), np.linalg.norm(x_mm[:, 1:].mean(axis=1) - x_mm[:, 0], axis=-1)
-    known, found = np.isfinite(centre).all(axis=1), np.zeros((len(x_mm), 2), bool)
-    least_mm = 2 * _STILL * np.median(length_mm[known]) if known.any() else 0.0
-    for i, side in np.argwhere(np.isfinite(seen.u).all(axis=(2, 3)) & known[:, None]):
-        u = seen.u[:, side]
-        near = np.linalg.norm(u - u[i], axis=2).mean(axis=1) < _STILL * tool_length_px(u[i : i + 1])
-        at = centre[near & known]
-        if len(at) >= _STILL_FRAMES:
-            spread = np.linalg.svd(at - at.mean(axis=0), compute_uv=False) / np.sqrt(len(at))
-            found[i, side] = spread[1] > least_mm
-    return found
-
-
-def look_elsewhere(
-    recording: Recording, detector: Callable, seen: Seen, still: np.ndarray,
-    progress: Callable[[float], None] = lambda done: None,
-) -> Seen:  # fmt: skip
-    """`seen`; where its tools are `still` (m, 2), what the detector finds in other places of the image instead."""
-    found, images = Seen(*(part.copy() for part in seen)), np.argwhere(still)
-    for k, (i, side) in enumerate(images):
-        frame = recording.frames[int(seen.frame[i])]
-        other = detector((frame.left, frame.right)[side][None], avoid=seen.u[still[:, side], side])
-        for part, one in zip(found[1:], (other.u, other.covariance, other.confidence), strict=True):
-            part[i, side] = one[0]
-        progress((k + 1) / len(images))
-    return found
 
 
 def longest_still(recording: Recording, seen: Seen) -> tuple[np.ndarray, str]:
@@ -349,7 +244,7 @@ def teach(
         teacher = _as_labelled(teacher, by_hand)
     u, covariance = teacher.project(np.arange(len(recording)))
     share = np.nanmedian(np.sqrt(np.trace(covariance, axis1=-2, axis2=-1) / 2) / tool_length_px(u)[..., None])
-    if share > _NEAR:
+    if share > NEAR:
         told = "labels" if from_labels else "detections"
         raise RefusalError(f"{told}: they tell a landmark's place to {100 * share:.0f} % of the tool's length only. {_LABEL}")
     against = _contradicted(teacher, used)
@@ -436,7 +331,7 @@ def _calibrated(recording: Recording, seen: Seen, from_labels: bool) -> tuple[Ca
     """Cameras that the detections agree on, the confident ones if all do not, and the share of landmarks that agree."""
     told = 6 * int(np.isfinite(recording.landmarks_mm()[seen.frame]).all(axis=(1, 2)).sum())
     length, reason, best, poor, competing = tool_length_px(seen.u), "none was found", None, None, None
-    near_px = _NEAR * float(np.quantile(length[np.isfinite(length)], 0.25)) if np.isfinite(length).any() else 0.0
+    near_px = NEAR * float(np.quantile(length[np.isfinite(length)], 0.25)) if np.isfinite(length).any() else 0.0
     if from_labels:
         try:
             found = _labelled(recording, seen)

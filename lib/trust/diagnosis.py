@@ -372,7 +372,7 @@ def diagnose(
     tracks = [(problem.landmark == k) & problem.used.all(axis=1) for k in np.unique(problem.landmark)]
     moved_px, moved_mm = (max(np.ptp(v[own], axis=0).max() for own in tracks if own.any()) for v in (problem.y, problem.x))
     if moved_px < _STILL_PX and moved_mm > _ROBOT_MM:
-        text, cure = "All frames show the same picture, while the robot moves.", "Check that the cameras deliver, and record anew."
+        text, cure = "All frames show one picture, while the robot moves.", "Check that the cameras deliver, and record anew."
         return Diagnosis((Hypothesis("frozen_video", text, cure, 100.0, 0.0, "%", 1.0, float(len(data))),))
     case = Case(problem, kinematics, offset_s, readout_s, image_size_px)
     tests = [_tip_order, _finite_distance, _landmark_offset, _tool_bends, _drift, _bad_part, _camera_moved, _frozen]

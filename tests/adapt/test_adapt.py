@@ -9,7 +9,7 @@ import pytest
 
 from lib.adapt import RefusalError, adapt, loop, report, teach
 from lib.adapt.judging import Agreement, better, stretches
-from lib.adapt.teacher import Seen, at_rest, look, look_elsewhere
+from lib.adapt.looking import Seen, at_rest, look, look_elsewhere
 from lib.calibration.offsets import tool_axes
 from lib.landmarks import Detector, Landmarks
 from lib.recordings.annotations import Annotations, write_coco
@@ -432,7 +432,7 @@ def test_a_teacher_that_errs_alike_in_all_labelled_frames_contradicts_them(lengt
 
 
 def test_labels_that_leave_the_places_open_are_refused(world, recording, monkeypatch):
-    monkeypatch.setattr("lib.adapt.teacher._NEAR", 0.001)
+    monkeypatch.setattr("lib.adapt.teacher.NEAR", 0.001)
     with pytest.raises(RefusalError, match="labels: .* to [0-9]+ % of the tool's length only. Label 10 pairs"):
         teach(recording, five_labelled(world)[1], from_labels=True)
 

@@ -1,0 +1,117 @@
+"""What a detector sees in some frames: anywhere, near where the robot says, or away from what stands still."""
+
+from collections.abc import Callable
+from typing import NamedTuple, Self
+
+import numpy as np
+
+from lib.correspondences import Correspondences, of_recording
+from lib.landmarks import Landmarks
+from lib.landmarks.metrics import tool_length_px
+from lib.recordings import Recording
+from lib.recordings.annotations import CLICK_SD_PX
+
+#: Share of the tool's length: as near to where it should be a detection is taken for right, farther for another thing.
+NEAR = 0.1
+#: A tool stands still if others stand nearer than this share of its length, in so many frames and more with itself.
+_STILL, _STILL_FRAMES = 0.15, 4
+
+
+class Seen(NamedTuple):
+    """Landmarks of m stereo frames: u (m, 2, 3, 2) px, covariance (m, 2, 3, 2, 2), confidence (m, 2, 3)."""
+
+    frame: np.ndarray
+    u: np.ndarray
+    covariance: np.ndarray
+    confidence: np.ndarray
+
+    @classmethod
+    def by_hand(cls, u: np.ndarray) -> Self:
+        """Labels set by hand: u (all frames, 2, 3, 2) px, NaN where there is none."""
+        frames = np.flatnonzero(np.isfinite(u).any(axis=(1, 2, 3)))
+        nothing = np.full((len(frames), 2, 3, 2), np.nan)
+        return cls(frames, nothing, nothing[..., None] * np.eye(2), np.zeros((len(frames), 2, 3))).labelled(u)
+
+    @property
+    def stacked_px(self) -> np.ndarray:
+        """(m, 3, 4) px of left and right."""
+        return np.concatenate([self.u[:, 0], self.u[:, 1]], axis=-1)
+
+    def rows(self, recording: Recording, least: float = 0.0) -> Correspondences:
+        """With the robot's positions; of a confidence below `least` nothing counts."""
+        known = {"covariance_px2": self.covariance, "confidence": np.where(self.confidence >= least, self.confidence, 0.0)}
+        known = {name: np.moveaxis(value, 1, 2) for name, value in known.items()}
+        return of_recording(recording, self.u[:, 0], self.u[:, 1], frames=self.frame, **known)
+
+    def of(self, frames: np.ndarray) -> Self:
+        """Those of some frames."""
+        return Seen(*(part[np.isin(self.frame, frames)] for part in self))
+
+    def labelled(self, u: np.ndarray) -> Self:
+        """With labels set by hand in place of what was found there: u (all frames, 2, 3, 2) px, NaN where there is none."""
+        u = u[self.frame]
+        known = np.isfinite(u).all(axis=-1)
+        covariance = np.where(known[..., None, None], CLICK_SD_PX**2 * np.eye(2), self.covariance)
+        return Seen(self.frame, np.where(known[..., None], u, self.u), covariance, np.where(known, 1.0, self.confidence))
+
+
+def look(
+    recording: Recording, detector: Callable, frames: np.ndarray, *, near: np.ndarray | None = None,
+    progress: Callable[[float], None] = lambda done: None,
+) -> Seen:  # fmt: skip
+    """What a detector finds in some frames; with `near` (m, 2, 3, 2) px its later stages alone, which look there."""
+    found, later = [], []
+    if near is not None:
+        # A window shows the whole tool: closeups alone would add their constant error to the place in every round.
+        later = [stage for stage in detector.stages if stage not in ("frame", "tool", "tracking")]
+        later = later if {"again", "window"} & {*later} else ["tracking", "tracking"]
+    for i, number in enumerate(frames):
+        frame = recording.frames[int(number)]
+        pair = np.stack([frame.left, frame.right])
+        if near is None:
+            found.append(detector(pair))
+        else:
+            known = np.isfinite(near[i]).all(axis=-1)
+            known &= known[:, :1] & known[:, 1:].any(axis=1, keepdims=True)  # no window without base and tip
+            u = np.where(known[..., None], near[i], np.nan)
+            rough = Landmarks(u, np.tile(np.eye(2), (2, 3, 1, 1)), known.astype(float))
+            for stage in later:
+                rough = detector.refine(pair, rough, stage)
+            away = np.linalg.norm(rough.u - u, axis=-1) > NEAR * tool_length_px(u)[:, None]  # that is another thing
+            u, confidence = np.where(away[..., None], np.nan, rough.u), np.where(away, 0.0, rough.confidence)
+            found.append(Landmarks(u, rough.covariance, confidence))
+        progress((i + 1) / len(frames))
+    return Seen(np.asarray(frames), *(np.stack([getattr(p, n) for p in found]) for n in ("u", "covariance", "confidence")))
+
+
+def at_rest(seen: Seen, x_mm: np.ndarray) -> np.ndarray:
+    """(m, 2) which tools stand in their image where those of other frames do, while the robot's x_mm (m, 3, 3) moves.
+
+    The robot moves in more than one direction, since a tool that moves along the view stands still in the image.
+    """
+    centre, length_mm = x_mm.mean(axis=1), np.linalg.norm(x_mm[:, 1:].mean(axis=1) - x_mm[:, 0], axis=-1)
+    known, found = np.isfinite(centre).all(axis=1), np.zeros((len(x_mm), 2), bool)
+    least_mm = 2 * _STILL * np.median(length_mm[known]) if known.any() else 0.0
+    for i, side in np.argwhere(np.isfinite(seen.u).all(axis=(2, 3)) & known[:, None]):
+        u = seen.u[:, side]
+        near = np.linalg.norm(u - u[i], axis=2).mean(axis=1) < _STILL * tool_length_px(u[i : i + 1])
+        at = centre[near & known]
+        if len(at) >= _STILL_FRAMES:
+            spread = np.linalg.svd(at - at.mean(axis=0), compute_uv=False) / np.sqrt(len(at))
+            found[i, side] = spread[1] > least_mm
+    return found
+
+
+def look_elsewhere(
+    recording: Recording, detector: Callable, seen: Seen, still: np.ndarray,
+    progress: Callable[[float], None] = lambda done: None,
+) -> Seen:  # fmt: skip
+    """`seen`; where its tools are `still` (m, 2), what the detector finds in other places of the image instead."""
+    found, images = Seen(*(part.copy() for part in seen)), np.argwhere(still)
+    for k, (i, side) in enumerate(images):
+        frame = recording.frames[int(seen.frame[i])]
+        other = detector((frame.left, frame.right)[side][None], avoid=seen.u[still[:, side], side])
+        for part, one in zip(found[1:], (other.u, other.covariance, other.confidence), strict=True):
+            part[i, side] = one[0]
+        progress((k + 1) / len(images))
+    return found
