@@ -403,11 +403,7 @@ def _as_labelled(teacher: Teacher, labels: Seen) -> Teacher:
         u = replace(teacher, offset_mm=offset.reshape(3, 3)).project(labels.frame)[0]
         return np.append(np.nan_to_num((u - labels.u) / CLICK_SD_PX), (offset - start) / wide_mm)
 
-    def jacobian(offset: np.ndarray) -> np.ndarray:
-        steps = 1e-4 * np.eye(9)
-        return np.stack([misfit(offset + step) - misfit(offset - step) for step in steps], axis=1) / 2e-4
-
-    found = least_squares(misfit, start, jacobian, loss="soft_l1", f_scale=2.0)  # a wild click counts little
+    found = least_squares(misfit, start, loss="soft_l1", f_scale=2.0, ftol=1e-4, xtol=1e-4)  # a wild click counts little
     sd = np.sqrt(np.diag(np.linalg.inv(found.jac.T @ found.jac)) * max(1.0, 2 * found.cost / labels.u.size))
     return replace(teacher, offset_mm=found.x.reshape(3, 3), offset_sd_mm=sd.reshape(3, 3))
 
