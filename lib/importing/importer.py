@@ -34,6 +34,8 @@ def import_recording(source: str | Path, mapping: str | Path, out: str | Path, *
         raise FileNotFoundError(f"{folder}: no such folder; SOURCE is the folder that holds the files of the mapping.")
     if out.resolve().is_relative_to(folder.resolve()):
         raise ValueError(f"{out}: lies in the source, which an import does not change; choose a place beside it.")
+    if any(Path(path).resolve().is_relative_to(out.resolve()) for path in (folder, mapping)):
+        raise ValueError(f"{out}: holds your files, and --overwrite replaces all of it; choose another --out.")
     told = read_mapping(mapping)
     stereo = open_stereo(folder, told.video)
     robot_time, *reported = read_robot(folder, told)
@@ -180,7 +182,7 @@ def _did(
     if not inside.all():
         said.append(f"The robot is silent at {int((~inside).sum())} frames.")
     if draft.annotations is None:
-        said.append("No labels.")
+        said.append("The mapping names no labels.")
     else:
         seen = draft.annotations.visibility_left, draft.annotations.visibility_right
         counts = [int((visibility > 0).any(axis=1).sum()) for visibility in seen]

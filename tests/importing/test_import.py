@@ -100,7 +100,7 @@ def test_an_import_is_repeatable_and_says_what_it_did(shipped, tmp_path):
     assert json.loads((tmp_path / "one" / "import.json").read_text()) == first
     log = next(entry for entry in first["sources"] if entry["file"] == "log.csv")
     assert log["sha256"] == hashlib.sha256((folder / "log.csv").read_bytes()).hexdigest()
-    assert "No labels." in first["did"]
+    assert "The mapping names no labels." in first["did"]
 
 
 def test_a_variable_frame_rate_keeps_its_times_and_lost_frames_leave_pairs(shipped, tmp_path):

@@ -321,6 +321,10 @@ def test_what_is_there_stays(good, tmp_path):
         import_recording(good[0], mapping, tmp_path / "thesis", overwrite=True)
     with pytest.raises(ValueError, match="lies in the source"):
         import_recording(good[0], mapping, good[0] / "out")
+    with pytest.raises(ValueError, match="holds your files, and --overwrite replaces all of it; choose another --out"):
+        import_recording(good[0], mapping, good[0].parent, overwrite=True)
+    with pytest.raises(ValueError, match="holds your files"):
+        import_recording(good[0], mapping, tmp_path, overwrite=True)
     with pytest.raises(FileNotFoundError, match="no such folder"):
         import_recording(tmp_path / "nowhere", mapping, tmp_path / "out")
     with pytest.raises(FileNotFoundError, match="--guess --map none.toml"):
