@@ -14,7 +14,7 @@ from lib.correspondences import LANDMARKS
 from lib.files import toml
 from lib.importing.labels import labels_of
 from lib.importing.logs import topics_of
-from lib.importing.video import IMAGES, VIDEOS, last_number
+from lib.importing.video import IMAGES, VIDEOS, decimals, last_number
 from lib.recordings.tables import decoded, read_toml
 
 _TIME = re.compile(r"(?i)^(t|sec|secs|s|ms|us|ns)$|time|stamp|^t[_ \[(]")
@@ -65,8 +65,10 @@ def _video(folder: Path, paths: dict[str, Path], tables: dict[str, Path]) -> dic
     names = names if len(names) > 1 else [names[0].replace("*", f"*{side}*") for side in ("left", "right")]
     left, right, *_ = sorted(names, key=lambda name: ("right" in name.lower(), name))
     digits = len(str(max((last_number(name) or 0 for name in images), default=0)))
-    times = {"times": "container"}
-    if not films and digits >= 10:
+    times, seconds = {"times": "container"}, [] if films else decimals(list(folder.glob(left)))
+    if seconds and (int(min(seconds)) < int(max(seconds)) or max(seconds) >= 10**9):  # else cam_1.0001 is frame 1
+        times = {"times": "names", "name_unit": "s"}
+    elif not films and digits >= 10:
         times = {"times": "names", "name_unit": {10: "s", 13: "ms", 16: "us"}.get(digits, "ns")}
     elif not films:
         times = _frame_times(tables, len(list(folder.glob(left)))) or {"times": "fps", "fps": 25.0}

@@ -51,7 +51,7 @@ def increasing(time: list[Decimal], where: str, shortest_s: float, longest_s: fl
     step = float(np.median(np.diff(since(time, time[0])))) if len(time) > 1 else 1.0
     if not shortest_s <= step <= longest_s:
         what = f"entries are {step:.3g} s apart, {shortest_s} to {longest_s} s is plausible"
-        raise ValueError(f"{where}: {what}. Check time_unit.")
+        raise ValueError(f"{where}: {what}. Check time_unit, or name_unit of images.")
 
 
 def read_columns(path: Path, table: Table, names: Iterable[str]) -> tuple[list[Decimal], dict[str, np.ndarray]]:
