@@ -13,7 +13,7 @@ import numpy as np
 from lib.correspondences import LANDMARKS
 from lib.files import toml
 from lib.importing.labels import labels_of
-from lib.importing.logs import topics_of
+from lib.importing.logs import separator_of, topics_of, uncommented
 from lib.importing.video import IMAGES, VIDEOS, decimals, last_number
 from lib.recordings.tables import decoded, read_toml
 
@@ -86,8 +86,8 @@ def _frame_times(tables: dict[str, Path], frames: int) -> dict:
 
 def _table(path: Path) -> tuple[dict[str, str], dict[str, list[str]]]:
     """Separator and decimal mark, and the cells of each column."""
-    lines = [line for line in decoded(path, utf_16=True).splitlines() if line.strip() and line.lstrip()[0] not in "#%"]
-    separator = max("\t;,|", key=lines[0].count) if lines else ","
+    lines = [line for line in uncommented(decoded(path, utf_16=True)) if line.strip()]
+    separator = separator_of(lines[0]) if lines else ","
     header, *rows = ([cell.strip() for cell in line.split(separator)] for line in lines or [""])
     decimal = "," if separator != "," and rows and re.search(r"\d,\d", separator.join(rows[0])) else "."
     columns = {name: [row[at] for row in rows if len(row) == len(header)] for at, name in enumerate(header)}

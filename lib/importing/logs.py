@@ -1,5 +1,6 @@
 """Tables of other programs: CSV of any dialect and ROS bags, with exact times; and what a robot's log says in mm and s."""
 
+import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime, timedelta
@@ -54,13 +55,36 @@ def increasing(time: list[Decimal], where: str, shortest_s: float, longest_s: fl
         raise ValueError(f"{where}: {what}. Check time_unit, or name_unit of images.")
 
 
+def uncommented(text: str, separator: str = "") -> list[str]:
+    """The lines of a table, those of comments blank.  The last comment before numbers is the header if it has as many cells.
+
+    `numpy.savetxt` writes headers so.  The separator of its first row is found where none is given.
+
+    >>> uncommented("# made by a robot\\n# t,x\\n0.1,2\\n")
+    ['', 't,x', '0.1,2']
+    """
+    lines = text.splitlines()
+    bare = ["" if line.lstrip()[:1] in ("#", "%") else line for line in lines]
+    first = next((i for i, line in enumerate(bare) if line.strip()), 0)
+    if header := next((line for line in reversed(lines[:first]) if line.strip()), "").lstrip(" \t#%"):
+        cells = bare[first].split(separator or separator_of(bare[first]))
+        as_many = len(header.split(separator or separator_of(bare[first]))) == len(cells)
+        if as_many and all(re.fullmatch(r"[-+]?\.?\d.*|nan|", cell.strip(' \t"'), re.IGNORECASE) for cell in cells):
+            bare[first - 1] = header
+    return bare
+
+
+def separator_of(line: str) -> str:
+    """What most often parts the cells of a line."""
+    return max("\t;,|", key=line.count)
+
+
 def read_columns(path: Path, table: Table, names: Iterable[str]) -> tuple[list[Decimal], dict[str, np.ndarray]]:
     """Exact times and the named columns, (m,) float64 each with NaN where a cell is empty, of a CSV file or a ROS bag."""
     if path.suffix in (".bag", ".db3", ".mcap") or path.is_dir():
         return _read_bag(path, table, list(names))
     wanted = [table.time, *names]
-    lines = ["" if line.lstrip()[:1] in ("#", "%") else line for line in decoded(path, utf_16=True).splitlines()]
-    rows = rows_of(path, "\n".join(lines), table.separator)
+    rows = rows_of(path, "\n".join(uncommented(decoded(path, utf_16=True), table.separator)), table.separator)
     place, header = next(rows, (str(path), []))
     for name in wanted:
         if header.count(name) != 1:

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from lib.importing import import_recording, read_mapping
+from lib.importing import guess_mapping, import_recording, read_mapping
 from lib.recordings import Recording
 from tests.importing import foreign
 from tests.importing.test_import import HINGE, content, thinned
@@ -331,7 +331,7 @@ def test_what_is_there_stays(good, tmp_path):
         read_mapping(tmp_path / "none.toml")
 
 
-@pytest.mark.parametrize("change", ["BOM", "CRLF", "UTF-16", "comments", "ISO dates"])
+@pytest.mark.parametrize("change", ["BOM", "CRLF", "UTF-16", "comments", "numpy", "ISO dates"])
 def test_harmless_dialects_are_read(change, good, tmp_path):
     folder = shutil.copytree(good[0], tmp_path / "source")
     unit = '[robot]\ntime_unit = "iso"' if "ISO" in change else "[robot]"
@@ -341,9 +341,12 @@ def test_harmless_dialects_are_read(change, good, tmp_path):
     data = {
         "BOM": text.encode("utf-8-sig"), "CRLF": text.replace("\n", "\r\n").encode(), "UTF-16": text.encode("utf-16"),
         "comments": b"# made by a robot\n\n" + text.encode(),
+        "numpy": b"# made by a robot\n# " + text.encode(),
         "ISO dates": "\n".join([header, *(f"1970-01-01T00:00:{float(t) + 1:09.6f}Z,{rest}" for t, _, rest in rows)]).encode(),
     }[change]  # fmt: skip
     (folder / "log.csv").write_bytes(data)
+    (folder / "pose.tsv").unlink()
+    assert change not in ("comments", "numpy") or 'time = "time_s"' in guess_mapping(folder)
     import_recording(folder, tmp_path / "map.toml", tmp_path / "out")
     recording = Recording.open(tmp_path / "out")
     assert len(recording) == 6 and len(recording.kinematics.time_s) == 110
