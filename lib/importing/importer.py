@@ -51,6 +51,12 @@ def import_recording(source: str | Path, mapping: str | Path, out: str | Path, *
     size = next(stereo.pairs())[0].shape[1::-1]  # width and height
     labels = read_labels(folder, told.labels, stereo, told.landmarks, size) if told.labels else None
     frames_s = time_s + offset_s
+    if frames_s[-1] < robot_s[0] or frames_s[0] > robot_s[-1]:
+        spans = [f"{time[0]:.3f} to {time[-1]:.3f} s" for time in (robot_time, stereo.time)]
+        what = "its times ({}) and those of the frames ({}) do not overlap".format(*spans)
+        cure = ', or say "estimate" where log and video began together' if bool(stereo_zero) != bool(robot_zero) else ""
+        cure = f"Correct robot.offset_s = {told.robot.offset_s!r} in {mapping} (t_robot = t_video + offset_s){cure}"
+        raise ValueError(f"{folder / told.robot.file}: {what}. {cure}.")
     if labels is not None:  # the mean instant at which the rows of a frame's labels were read
         y = np.hstack([labels.u_left[..., 1], labels.u_right[..., 1]])
         mean = np.nansum(y - (size[1] - 1) / 2, axis=1) / np.maximum(np.isfinite(y).sum(axis=1), 1)

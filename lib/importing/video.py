@@ -215,6 +215,6 @@ def _bit_depth(reels: tuple[_Images | _Film, ...], index: np.ndarray) -> int | N
             wanted = wanted[: max(1, len(wanted) // 4)]  # a video is decoded up to there
         for image in reel.read(wanted):
             if image.dtype == np.uint8:
-                return None
-            brightest = max(brightest, int(image.max()))
-    return next(bits for bits in (8, 10, 12, 14, 16) if brightest < 1 << bits)
+                break  # the other camera may have 16
+            brightest = max(brightest, int(image.max()), 1)
+    return next(bits for bits in (8, 10, 12, 14, 16) if brightest < 1 << bits) if brightest else None

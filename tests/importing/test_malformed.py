@@ -2,6 +2,7 @@
 
 import errno
 import json
+import re
 import shutil
 import zipfile
 from dataclasses import replace
@@ -220,7 +221,13 @@ SPOILT = {
     "ms called s": (edit("log.csv", lambda t: _scaled(t, 1e3, times=True)), r"log\.csv: entries are 400 s apart.*time_unit"),
     "seconds called us": (told("[robot]\n", '[robot]\ntime_unit = "us"\n'),
         r"log\.csv: entries are 4e-07 s apart.*time_unit"),
-    "clocks apart": (told("[robot]\n", "[robot]\noffset_s = 500\n"), r"do not overlap; check time_s.*offset_s"),
+    "clocks apart": (told("[robot]\n", "[robot]\noffset_s = 500\n"), 
+        r"log\.csv: its times \(.*frames \(.*\) do not overlap\. Correct robot\.offset_s = 500\.0 in .*map\.toml \(.*\)\.$"),
+    "a dated log": (edit("log.csv", lambda t: re.sub(r"(?m)^-?[\d.]+", lambda m: f"{1.7e9 + float(m[0]):.3f}", t)),
+        r"log\.csv: its times \(1.*do not overlap.*map\.toml .*or say \"estimate\" where log and video"),
+    "an image of 16 bits among others": (images(lambda f: cv2.imwrite(
+        str(f / "left/003.png"), np.full((134, 240), 1900, np.uint16))),
+        r"left/\d+\.png: 16-bit values up to 1900, and no bit_depth is stated\. .*video\.bit_depth in an import's mapping"),
     "too few for a clock": (told("[robot]\n", '[robot]\noffset_s = "estimate"\n'), r"offset_s = 'estimate': data: . frames"),
     "not COCO": (bytes_of("person_keypoints.json", b"[1, 2"), r"person_keypoints\.json: not COCO keypoints"),
     "per cent": (coco(percent), r"person_keypoints\.json: no label beyond .* per cent"),
