@@ -42,8 +42,8 @@ def since(time: Iterable[Decimal], zero: Decimal) -> np.ndarray:
     return np.array([float(t - zero) for t in time])
 
 
-def increasing(time: list[Decimal], where: str, shortest_s: float, longest_s: float) -> None:
-    """Check times of rows or frames: a ValueError where they repeat or go back, or their step fits another unit."""
+def increasing(time: list[Decimal], where: str, shortest_s: float, longest_s: float, unit: str = "time_unit") -> None:
+    """Check times of rows or frames: a ValueError where they repeat or go back, or their step fits another `unit`."""
     for i, (before, now) in enumerate(pairwise(time), start=2):
         if now <= before:
             what = "repeats" if now == before else "goes back"
@@ -52,7 +52,7 @@ def increasing(time: list[Decimal], where: str, shortest_s: float, longest_s: fl
     step = float(np.median(np.diff(since(time, time[0])))) if len(time) > 1 else 1.0
     if not shortest_s <= step <= longest_s:
         what = f"entries are {step:.3g} s apart, {shortest_s} to {longest_s} s is plausible"
-        raise ValueError(f"{where}: {what}. Check time_unit, or name_unit of images.")
+        raise ValueError(f"{where}: {what}. Check {unit}.")
 
 
 def uncommented(text: str, separator: str = "") -> list[str]:
@@ -67,8 +67,8 @@ def uncommented(text: str, separator: str = "") -> list[str]:
     bare = ["" if line.lstrip()[:1] in ("#", "%") else line for line in lines]
     first = next((i for i, line in enumerate(bare) if line.strip()), 0)
     if header := next((line for line in reversed(lines[:first]) if line.strip()), "").lstrip(" \t#%"):
-        cells = bare[first].split(separator or separator_of(bare[first]))
-        as_many = len(header.split(separator or separator_of(bare[first]))) == len(cells)
+        cells = bare[first].split(separator := separator or separator_of(bare[first]))
+        as_many = header.count(separator) == bare[first].count(separator)
         if as_many and all(re.fullmatch(r"[-+]?\.?\d.*|nan|", cell.strip(' \t"'), re.IGNORECASE) for cell in cells):
             bare[first - 1] = header
     return bare

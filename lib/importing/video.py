@@ -157,7 +157,7 @@ def open_stereo(folder: Path, video: Video) -> StereoSource:
     reels = tuple(_Film(folder / n) if Path(n).suffix.lower() in VIDEOS else _Images(folder, n) for n in names)
     times = [_times(folder, video, reel, place) for reel, place in zip(reels, _places(reels), strict=True)]
     for reel, time in zip(reels, times, strict=True):
-        increasing(time, str(reel.files[0]), *_STEP_S)
+        increasing(time, str(reel.files[0]), *_STEP_S, "name_unit" if video.times == "names" else "time_unit")
     index = _paired(folder, times)
     start, end_s = times[0][0], np.inf if video.end_s is None else video.end_s
     kept = [pair for pair in index[:: video.every] if (video.start_s or 0) <= times[0][pair[0]] - start <= end_s]
