@@ -9,6 +9,7 @@ import json
 import shlex
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -16,6 +17,7 @@ import numpy as np
 
 from lib import files, paths
 from lib.calibration import Calibration, write_opencv, write_ros
+from lib.calibration.models import Model
 from lib.cameras import StereoRig
 from lib.correspondences import LANDMARKS, Correspondences, of_recording
 from lib.importing import guess_mapping, import_recording
@@ -77,7 +79,7 @@ def main_detect(argv: list[str]) -> int:
     data = _data(a, recording)
     _write_landmarks(out / "landmarks.csv", recording, data)
     print(f"{int(data.seen.sum())} of {data.seen.size} landmarks found. Wrote {out / 'landmarks.csv'}.")
-    print(assess(recording, data, detector=a.detector).verdict)
+    print(_assessed(a, recording, data).verdict)
     return 0
 
 
@@ -139,7 +141,7 @@ def main_register(argv: list[str]) -> int:
     print(f"The cameras moved by {shift_mm:.3f} mm at the tool, standard deviation {found.translation_sd_mm.max():.3f} mm.")
     if len(seen):
         print(f"The tool is now {medians[1]:.3f} mm from where the robot reports it (median).")
-    found = assess(recording, data, detector=a.detector)
+    found = _assessed(a, recording, data)
     return _done(a, out, "registration", numbers, Verdict.join([_as_one(moved, found), found.verdict]))
 
 
@@ -164,6 +166,7 @@ def _parsed(
     add("--out", type=Path, help="folder of the results (default: runs/NAME of the recording)")
     add("--landmarks", choices=("detected", "annotations"), default="detected", help="where they come from")
     add("--weights", help="weights file of the detector (default: the shipped ones)")
+    add("--model", default="zero_skew", help="of the cameras: zero_skew, near_affine (a finite distance), affine, ...")
     add("--force", action="store_true", help="write results whatever the verdict")
     if frame:
         add("--frame", type=int, default=0, help="number of the frame, from 0")
@@ -171,11 +174,12 @@ def _parsed(
     if rig:
         add("--rig", type=Path, required=needs_rig, help="rig.json of an earlier calibration")
     a = parser.parse_args(argv)
+    Model.parse(a.model, 2)  # an unknown one is refused
     recording = Recording.open(a.recording)
     if frame and not -len(recording) <= a.frame < len(recording):
         parser.error(f"--frame: the recording has frames 0 to {len(recording) - 1}.")
     a.detector = None if a.landmarks == "annotations" else SharedDetector(Detector.load(a.weights))
-    out = a.out or paths.RUNS / a.recording.resolve().name
+    out = a.out or paths.results_folder(a.recording.resolve().name, a.recording)
     out.mkdir(parents=True, exist_ok=True)
     a.earlier = {path: path.lstat().st_mtime_ns for path in out.iterdir()}
     return a, recording, out
@@ -196,6 +200,14 @@ def _data(a: argparse.Namespace, recording: Recording, frames: np.ndarray | None
     return detect(recording, a.detector, frames=frames)
 
 
+def _assessed(a: argparse.Namespace, recording: Recording, data: Correspondences) -> Assessment:
+    found = assess(recording, data, detector=a.detector, model=a.model)
+    if not Model.parse(a.model, 2).distance:
+        return found
+    reasons = tuple(reason for reason in found.verdict.reasons if reason.name != "finite_distance")  # these cameras have it
+    return replace(found, verdict=Verdict(reasons))
+
+
 def _calibrated(
     a: argparse.Namespace, recording: Recording, out: Path
 ) -> tuple[Calibration | StereoRig | None, Verdict, Correspondences]:
@@ -206,13 +218,14 @@ def _calibrated(
         text = f"{a.rig} was not calibrated from this recording, and nothing here tests it."
         cure = f"Run: {shlex.join(['python3', '-m', 'lib', 'register', str(a.recording), '--rig', str(a.rig)])}"
         return StereoRig.load(a.rig), Verdict((Reason("rig_given", LEVELS[1], text, cure),)), data
-    found = assess(recording, data, detector=a.detector)
+    found = _assessed(a, recording, data)
     if found.calibration is not None and (a.force or not found.verdict.is_red):
         (out / "verdict.json").unlink(missing_ok=True)  # of an earlier run that was refused
         return found.calibration, found.verdict, data
     files.write_json(out / "verdict.json", found.verdict.to_json())
     force = "" if found.calibration is None else "; --force writes the results of a calibration whatever the verdict"
-    earlier = f" Results of an earlier run are in {paths.shown(out)}." if a.earlier.keys() - {out / "verdict.json"} else ""
+    earlier = a.earlier.keys() - {out / "verdict.json", out / paths.RECORDING_NOTE}
+    earlier = f" Results of an earlier run are in {paths.shown(out)}." if earlier else ""
     print(f"{found.verdict}\nNothing else was written{force}.{earlier}")
     return None, found.verdict, data
 

@@ -116,7 +116,12 @@ class Correspondences:
         return self.subset(self.is_complete)
 
     def check_detections(self) -> None:
-        """Raise a `NoDetectionError` where an image shows fewer than four landmarks whose position the robot reports."""
+        """Raise a `NoDetectionError` where an image shows fewer than four landmarks whose position the robot reports.
+
+        Fewer than four rows at all are a ValueError.
+        """
+        if len(self) < 4:
+            raise ValueError(f"data: {len(self)} landmarks in all, and a camera needs four. Record more frames; 30 are good.")
         usable = int((self.seen & np.isfinite(self.x_mm).all(axis=1)[:, None]).sum(axis=0).min())
         if usable >= 4:
             return

@@ -13,6 +13,8 @@ CACHE = DATA / "cache"
 RUNS = ROOT / "runs"
 SHIPPED_RECORDING = DATA / "open_sky_eye"
 
+#: In a folder of results: the recording's place, since recordings of two folders may have one name.
+RECORDING_NOTE = "recording.txt"
 REAL_DATA_VARIABLE = "MICROSTEREO_DATA"
 #: Names the folder in which notebooks of one run, or commands, share what each would else work out again.
 SHARED_VARIABLE = "MICROSTEREO_SHARED"
@@ -21,6 +23,17 @@ SHARED_VARIABLE = "MICROSTEREO_SHARED"
 def recording_folder(folder: str = "") -> Path:
     """The folder of a recording as a notebook's parameter names it, from the workbench's root; "" is the one that ships."""
     return ROOT / folder if folder else SHIPPED_RECORDING
+
+
+def results_folder(name: str, recording: Path) -> Path:
+    """The folder runs/NAME for results of a recording, made; a FileExistsError where they are of another recording's."""
+    folder, recording = RUNS / name, recording.resolve()
+    note = folder / RECORDING_NOTE
+    if note.is_file() and (other := Path(note.read_text(encoding="utf-8").strip())) != recording and other.is_dir():
+        raise FileExistsError(f"{shown(folder)}: it has the results of another recording, {other}. Name a folder with --out.")
+    folder.mkdir(parents=True, exist_ok=True)
+    note.write_text(f"{recording}\n", encoding="utf-8")
+    return folder
 
 
 def shown(path: Path) -> str:

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import cv2
@@ -14,7 +15,9 @@ from lib.cameras import StereoRig
 from lib.correspondences import of_recording
 from lib.landmarks import Detector, Landmarks
 from lib.recordings import Recording
+from lib.simulator import Design, Eye, Microscope, simulate
 from lib.surface import export
+from lib.trust import check
 from tests.importing import foreign
 from tests.importing.test_import import source_of, thinned
 
@@ -108,6 +111,35 @@ def test_a_red_verdict_writes_nothing_but_itself(tmp_path, capsys):
     assert {path.name for path in results.iterdir()} == {"verdict.json", "rig.json"}
     said = capsys.readouterr().out
     assert f"Nothing else was written. Results of an earlier run are in {results}." in said and "--force" not in said
+
+
+def test_cameras_of_a_finite_distance_are_calibrated_as_such(tmp_path, capsys):
+    """The cure of `finite_distance` can be followed on the command line."""
+    microscope = Microscope(pixels_per_mm=(20.0, 20.0), image_size_px=(384, 216), inverse_distance_per_mm=1 / 50)
+    design = Design(Eye(texture_px=128), microscope=microscope, motion="sweep", duration_s=20.0, click_px=0.1)
+    simulate(tmp_path / "eye", design, n_frames=24, progress=False)
+    argv = [str(tmp_path / "eye"), *LABELS, "--out", str(tmp_path / "out")]
+    assert commands.main_calibrate(argv) == 3 and "finite_distance" in capsys.readouterr().out
+    assert commands.main_calibrate([*argv, "--model", "near_affine"]) == 0
+    assert "finite_distance" not in capsys.readouterr().out
+    assert json.loads((tmp_path / "out" / "calibration.json").read_text())["model"] == "near_affine"
+    with pytest.raises(ValueError, match="unknown model 'near'; take one of .*near_affine"):
+        commands.main_calibrate([*argv, "--model", "near"])
+
+
+def test_results_of_another_recording_of_that_name_stay(tmp_path, monkeypatch):
+    """patient1/recording and patient2/recording; a recording that is gone has no claim."""
+    monkeypatch.setattr(paths, "RUNS", tmp_path / "runs")
+    other = tmp_path / "other" / paths.SHIPPED_RECORDING.name
+    other.mkdir(parents=True)
+    for name, call in ((other.name, partial(commands.main_detect, [*LABELS, str(paths.SHIPPED_RECORDING)])),
+                       (f"check-{other.name}", partial(check.main, [str(paths.SHIPPED_RECORDING)]))):  # fmt: skip
+        folder = paths.results_folder(name, other)
+        with pytest.raises(FileExistsError, match=rf"{name}: it has the results of another recording, {other}\. .*--out"):
+            call()
+        assert [path.name for path in folder.iterdir()] == [paths.RECORDING_NOTE]
+    other.rmdir()
+    assert paths.results_folder(other.name, paths.SHIPPED_RECORDING) == tmp_path / "runs" / other.name
 
 
 def test_guess_writes_a_mapping_once(tmp_path, capsys):

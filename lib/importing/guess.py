@@ -13,8 +13,8 @@ import numpy as np
 from lib.correspondences import LANDMARKS
 from lib.files import toml
 from lib.importing.labels import labels_of
-from lib.importing.logs import topics_of
-from lib.importing.video import IMAGES, VIDEOS, last_number
+from lib.importing.logs import separator_of, topics_of, uncommented
+from lib.importing.video import IMAGES, VIDEOS, decimals, last_number
 from lib.recordings.tables import decoded, read_toml
 
 _TIME = re.compile(r"(?i)^(t|sec|secs|s|ms|us|ns)$|time|stamp|^t[_ \[(]")
@@ -65,8 +65,10 @@ def _video(folder: Path, paths: dict[str, Path], tables: dict[str, Path]) -> dic
     names = names if len(names) > 1 else [names[0].replace("*", f"*{side}*") for side in ("left", "right")]
     left, right, *_ = sorted(names, key=lambda name: ("right" in name.lower(), name))
     digits = len(str(max((last_number(name) or 0 for name in images), default=0)))
-    times = {"times": "container"}
-    if not films and digits >= 10:
+    times, seconds = {"times": "container"}, [] if films else decimals(list(folder.glob(left)))
+    if seconds and (int(min(seconds)) < int(max(seconds)) or max(seconds) >= 10**9):  # else cam_1.0001 is frame 1
+        times = {"times": "names", "name_unit": "s"}
+    elif not films and digits >= 10:
         times = {"times": "names", "name_unit": {10: "s", 13: "ms", 16: "us"}.get(digits, "ns")}
     elif not films:
         times = _frame_times(tables, len(list(folder.glob(left)))) or {"times": "fps", "fps": 25.0}
@@ -84,8 +86,8 @@ def _frame_times(tables: dict[str, Path], frames: int) -> dict:
 
 def _table(path: Path) -> tuple[dict[str, str], dict[str, list[str]]]:
     """Separator and decimal mark, and the cells of each column."""
-    lines = [line for line in decoded(path, utf_16=True).splitlines() if line.strip() and line.lstrip()[0] not in "#%"]
-    separator = max("\t;,|", key=lines[0].count) if lines else ","
+    lines = [line for line in uncommented(decoded(path, utf_16=True)) if line.strip()]
+    separator = separator_of(lines[0]) if lines else ","
     header, *rows = ([cell.strip() for cell in line.split(separator)] for line in lines or [""])
     decimal = "," if separator != "," and rows and re.search(r"\d,\d", separator.join(rows[0])) else "."
     columns = {name: [row[at] for row in rows if len(row) == len(header)] for at, name in enumerate(header)}

@@ -34,6 +34,8 @@ def import_recording(source: str | Path, mapping: str | Path, out: str | Path, *
         raise FileNotFoundError(f"{folder}: no such folder; SOURCE is the folder that holds the files of the mapping.")
     if out.resolve().is_relative_to(folder.resolve()):
         raise ValueError(f"{out}: lies in the source, which an import does not change; choose a place beside it.")
+    if any(Path(path).resolve().is_relative_to(out.resolve()) for path in (folder, mapping)):
+        raise ValueError(f"{out}: holds your files, and --overwrite replaces all of it; choose another --out.")
     told = read_mapping(mapping)
     stereo = open_stereo(folder, told.video)
     robot_time, *reported = read_robot(folder, told)
@@ -49,6 +51,12 @@ def import_recording(source: str | Path, mapping: str | Path, out: str | Path, *
     size = next(stereo.pairs())[0].shape[1::-1]  # width and height
     labels = read_labels(folder, told.labels, stereo, told.landmarks, size) if told.labels else None
     frames_s = time_s + offset_s
+    if frames_s[-1] < robot_s[0] or frames_s[0] > robot_s[-1]:
+        spans = [f"{time[0]:.3f} to {time[-1]:.3f} s" for time in (robot_time, stereo.time)]
+        what = "its times ({}) and those of the frames ({}) do not overlap".format(*spans)
+        cure = ', or say "estimate" where log and video began together' if bool(stereo_zero) != bool(robot_zero) else ""
+        cure = f"Correct robot.offset_s = {told.robot.offset_s!r} in {mapping} (t_robot = t_video + offset_s){cure}"
+        raise ValueError(f"{folder / told.robot.file}: {what}. {cure}.")
     if labels is not None:  # the mean instant at which the rows of a frame's labels were read
         y = np.hstack([labels.u_left[..., 1], labels.u_right[..., 1]])
         mean = np.nansum(y - (size[1] - 1) / 2, axis=1) / np.maximum(np.isfinite(y).sum(axis=1), 1)
@@ -180,7 +188,7 @@ def _did(
     if not inside.all():
         said.append(f"The robot is silent at {int((~inside).sum())} frames.")
     if draft.annotations is None:
-        said.append("No labels.")
+        said.append("The mapping names no labels.")
     else:
         seen = draft.annotations.visibility_left, draft.annotations.visibility_right
         counts = [int((visibility > 0).any(axis=1).sum()) for visibility in seen]

@@ -1,5 +1,6 @@
 """Tables of other programs: CSV of any dialect and ROS bags, with exact times; and what a robot's log says in mm and s."""
 
+import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime, timedelta
@@ -41,8 +42,8 @@ def since(time: Iterable[Decimal], zero: Decimal) -> np.ndarray:
     return np.array([float(t - zero) for t in time])
 
 
-def increasing(time: list[Decimal], where: str, shortest_s: float, longest_s: float) -> None:
-    """Check times of rows or frames: a ValueError where they repeat or go back, or their step fits another unit."""
+def increasing(time: list[Decimal], where: str, shortest_s: float, longest_s: float, unit: str = "time_unit") -> None:
+    """Check times of rows or frames: a ValueError where they repeat or go back, or their step fits another `unit`."""
     for i, (before, now) in enumerate(pairwise(time), start=2):
         if now <= before:
             what = "repeats" if now == before else "goes back"
@@ -51,7 +52,31 @@ def increasing(time: list[Decimal], where: str, shortest_s: float, longest_s: fl
     step = float(np.median(np.diff(since(time, time[0])))) if len(time) > 1 else 1.0
     if not shortest_s <= step <= longest_s:
         what = f"entries are {step:.3g} s apart, {shortest_s} to {longest_s} s is plausible"
-        raise ValueError(f"{where}: {what}. Check time_unit.")
+        raise ValueError(f"{where}: {what}. Check {unit}.")
+
+
+def uncommented(text: str, separator: str = "") -> list[str]:
+    """The lines of a table, those of comments blank.  The last comment before numbers is the header if it has as many cells.
+
+    `numpy.savetxt` writes headers so.  The separator of its first row is found where none is given.
+
+    >>> uncommented("# made by a robot\\n# t,x\\n0.1,2\\n")
+    ['', 't,x', '0.1,2']
+    """
+    lines = text.splitlines()
+    bare = ["" if line.lstrip()[:1] in ("#", "%") else line for line in lines]
+    first = next((i for i, line in enumerate(bare) if line.strip()), 0)
+    if header := next((line for line in reversed(lines[:first]) if line.strip()), "").lstrip(" \t#%"):
+        cells = bare[first].split(separator := separator or separator_of(bare[first]))
+        as_many = header.count(separator) == bare[first].count(separator)
+        if as_many and all(re.fullmatch(r"[-+]?\.?\d.*|nan|", cell.strip(' \t"'), re.IGNORECASE) for cell in cells):
+            bare[first - 1] = header
+    return bare
+
+
+def separator_of(line: str) -> str:
+    """What most often parts the cells of a line."""
+    return max("\t;,|", key=line.count)
 
 
 def read_columns(path: Path, table: Table, names: Iterable[str]) -> tuple[list[Decimal], dict[str, np.ndarray]]:
@@ -59,8 +84,7 @@ def read_columns(path: Path, table: Table, names: Iterable[str]) -> tuple[list[D
     if path.suffix in (".bag", ".db3", ".mcap") or path.is_dir():
         return _read_bag(path, table, list(names))
     wanted = [table.time, *names]
-    lines = ["" if line.lstrip()[:1] in ("#", "%") else line for line in decoded(path, utf_16=True).splitlines()]
-    rows = rows_of(path, "\n".join(lines), table.separator)
+    rows = rows_of(path, "\n".join(uncommented(decoded(path, utf_16=True), table.separator)), table.separator)
     place, header = next(rows, (str(path), []))
     for name in wanted:
         if header.count(name) != 1:

@@ -4,6 +4,7 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
+from itertools import pairwise
 from pathlib import Path, PurePath
 
 import av
@@ -18,6 +19,7 @@ IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".mpg", ".mpeg", ".webm", ".wmv", ".ts")
 _STEP_S = 1e-4, 60.0  # of frames; beyond it the unit of time is another
 _DEPTH_SAMPLES = 12
+_DECIMAL = re.compile(r"(?<![\d.])(\d+\.|\d{10}[_-])(\d{1,9})$")  # more digits after the point are a time of their own
 
 
 def last_number(path: str | PurePath) -> int | None:
@@ -30,6 +32,19 @@ def last_number(path: str | PurePath) -> int | None:
     return int(found[-1]) if found else None
 
 
+def decimals(files: Sequence[Path]) -> list[Decimal]:
+    """The numbers at the end of the files' names where they have a decimal point, as seconds in dumps of ROS; else none.
+
+    >>> decimals([Path("cam0/1700000000.250000.png"), Path("cam0/1700000000_500000.png")])
+    [Decimal('1700000000.250000'), Decimal('1700000000.500000')]
+    """
+    found = [_DECIMAL.search(path.stem) for path in files]
+    if any(found) and len(digits := {m and len(m[2]) for m in found}) > 1:  # .5 may be half a second, or 5 ns
+        what = f"some names end on a decimal number, but not all, or not with as many digits ({len(digits)} kinds)"
+        raise ValueError(f"{files[0].parent}: {what}. Number the files 000000, 000001, ..., and give their times in a table.")
+    return [Decimal(f"{m[1][:-1]}.{m[2]}") for m in found if m]
+
+
 class _Images:
     """Image files in the order of the numbers in their names."""
 
@@ -38,12 +53,15 @@ class _Images:
             raise FileNotFoundError(f"{folder / pattern}: no image ({', '.join(IMAGES)}) matches the mapping's pattern.")
         if bad := [path for path in found if last_number(path) is None]:
             raise ValueError(f"{min(bad)}: the name holds no number, so its place in time is open. Number the files.")
-        self.files = sorted(found, key=lambda path: (last_number(path), path.name))
-        for one, other in zip(self.files, self.files[1:], strict=False):
-            if last_number(one) == last_number(other):
-                raise ValueError(f"{other}: numbered like {one.name}. Narrow the pattern, so that it names one camera.")
+        seconds = decimals(found)
+        order = sorted(zip(seconds or map(last_number, found), found, strict=True))
+        self.in_names, self.files = [number for number, _ in order], [path for _, path in order]
+        for (one, path), (other, later) in pairwise(order):
+            if one == other:
+                raise ValueError(f"{later}: numbered like {path.name}. Narrow the pattern, so that it names one camera.")
         self.stamps = None
         counted = last_number(self.files[-1]) < 10 * len(self.files) + 10**6  # else the numbers are times
+        counted &= len(set(map(int, seconds))) < 2
         self.numbers = {path.stem: n for n, path in enumerate(self.files)}
         self.numbers |= {last_number(path): n for n, path in enumerate(self.files) if counted}
 
@@ -139,7 +157,7 @@ def open_stereo(folder: Path, video: Video) -> StereoSource:
     reels = tuple(_Film(folder / n) if Path(n).suffix.lower() in VIDEOS else _Images(folder, n) for n in names)
     times = [_times(folder, video, reel, place) for reel, place in zip(reels, _places(reels), strict=True)]
     for reel, time in zip(reels, times, strict=True):
-        increasing(time, str(reel.files[0]), *_STEP_S)
+        increasing(time, str(reel.files[0]), *_STEP_S, "name_unit" if video.times == "names" else "time_unit")
     index = _paired(folder, times)
     start, end_s = times[0][0], np.inf if video.end_s is None else video.end_s
     kept = [pair for pair in index[:: video.every] if (video.start_s or 0) <= times[0][pair[0]] - start <= end_s]
@@ -162,7 +180,7 @@ def _times(folder: Path, video: Video, reel: _Images | _Film, places: np.ndarray
     if video.times == "fps":
         return [Decimal(int(place)) / Decimal(str(video.fps)) for place in places]
     if video.times == "names" and reel.stamps is None:
-        return [exact_seconds(str(last_number(p)), video.name_unit, str(p)) for p in reel.files]
+        return [exact_seconds(str(n), video.name_unit, str(p)) for n, p in zip(reel.in_names, reel.files, strict=True)]
     if video.times == "table":
         time = read_columns(folder / video.table.file, video.table, [])[0]
         if len(time) != len(reel):
@@ -197,6 +215,6 @@ def _bit_depth(reels: tuple[_Images | _Film, ...], index: np.ndarray) -> int | N
             wanted = wanted[: max(1, len(wanted) // 4)]  # a video is decoded up to there
         for image in reel.read(wanted):
             if image.dtype == np.uint8:
-                return None
-            brightest = max(brightest, int(image.max()))
-    return next(bits for bits in (8, 10, 12, 14, 16) if brightest < 1 << bits)
+                break  # the other camera may have 16
+            brightest = max(brightest, int(image.max()), 1)
+    return next(bits for bits in (8, 10, 12, 14, 16) if brightest < 1 << bits) if brightest else None

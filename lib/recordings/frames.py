@@ -61,8 +61,9 @@ def to_8_bits(image: np.ndarray, bit_depth: int | None, path: Path) -> np.ndarra
     if image.dtype != np.uint16:
         raise ValueError(f"{path}: pixels of type {image.dtype}; images of 8 or 16 bits work. Export it again.")
     if not bit_depth or image.max() >= 1 << bit_depth:
-        told = f"more than bit_depth = {bit_depth} holds" if bit_depth else "and recording.toml states no bit_depth"
-        raise ValueError(f"{path}: 16-bit values up to {image.max()}, {told}. State what the camera uses, such as 12.")
+        told = f"more than bit_depth = {bit_depth} holds" if bit_depth else "and no bit_depth is stated"
+        cure = "State what the camera uses, such as 12: bit_depth in recording.toml, video.bit_depth in an import's mapping"
+        raise ValueError(f"{path}: 16-bit values up to {image.max()}, {told}. {cure}.")
     return np.rint(np.arange(1 << bit_depth) * (255 / ((1 << bit_depth) - 1))).astype(np.uint8)[image]
 
 

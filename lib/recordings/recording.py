@@ -1,5 +1,7 @@
 """Recordings read and written: everything is validated at opening, frames are decoded when asked for."""
 
+import contextlib
+import filecmp
 import math
 import os
 import re
@@ -17,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from lib.correspondences import LANDMARKS
 from lib.files import toml_entries, write_bytes, write_text
-from lib.recordings.annotations import Annotations, read_coco, write_coco
+from lib.recordings.annotations import SIDES, Annotations, read_coco, write_coco
 from lib.recordings.frames import Frames, encoded, open_side
 from lib.recordings.tables import columns, read_table, read_toml, refuse, write_table
 from lib.recordings.truth import Truth
@@ -257,7 +259,8 @@ class RecordingWriter:
     Args, beside those that are as in `Recording`:
         details: Own notes (numbers and text), kept in ``[details]`` of recording.toml.
         suffix, jpeg_quality: ".jpg" or ".png", and the quality of a JPEG.
-        overwrite: Replace a recording of that name; any other folder that exists is a FileExistsError.
+        overwrite: Replace a recording of that name; any other folder that exists is a FileExistsError.  Its labels stay
+            where the frames are the same; what else the new one lacks stays in a folder beside, and a `UserWarning` says so.
 
     >>> import tempfile
     >>> tool_mm = np.array([[0, 0, 0], [4, 1, 0], [4, -1, 0]])
@@ -356,7 +359,17 @@ class RecordingWriter:
             write_coco(path, self._annotations, self.image_size_px, self._suffix, names)
         return Recording.open(self.folder)
 
+    def _carry_labels(self) -> None:
+        """Labels of the recording that is replaced belong to the new one too if its frames are the same, byte for byte."""
+        old, new = self.target / "annotations.json", self.folder / "annotations.json"
+        frames = [path.relative_to(self.folder) for side in SIDES for path in (self.folder / side).iterdir()]
+        if old.is_file() and not new.exists() and all(_same(self.target / path, self.folder / path) for path in frames):
+            with contextlib.suppress(ValueError):  # of other landmarks
+                read_coco(old, len(self._time_s), self.image_size_px, self._header["skeleton"])
+                write_bytes(new, old.read_bytes())
+
     def _finish(self) -> None:
+        self._carry_labels()
         self.draft()  # what is not valid must not appear
         self._check_target()
         old = self.folder.with_suffix(".replaced")
@@ -368,4 +381,23 @@ class RecordingWriter:
             if old.exists():
                 os.replace(old, self.target)
             raise
+        if old.exists():
+            _keep_apart(old, self.target)
+
+
+def _same(one: Path, other: Path) -> bool:
+    return one.is_file() and other.is_file() and filecmp.cmp(one, other, shallow=False)
+
+
+def _keep_apart(old: Path, new: Path) -> None:
+    """Remove from the folder `old` what `new` holds too.  The rest may be a person's work: it stays."""
+    for path in sorted(old.rglob("*"), reverse=True):  # a folder after what it holds
+        if _same(path, new / path.relative_to(old)):
+            path.unlink()
+        elif path.is_dir() and not path.is_symlink() and not any(path.iterdir()):
+            path.rmdir()
+    if theirs := sorted({path.name for path in old.iterdir()} - {"import.json"}):
+        what = f"the recording that it replaces held other {', '.join(theirs)}"
+        warnings.warn(f"{new}: {what}, which {old} keeps. Remove what you do not need.", stacklevel=4)
+    else:
         shutil.rmtree(old, ignore_errors=True)

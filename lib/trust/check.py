@@ -187,9 +187,11 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--weights", metavar="FILE", help="of the detector (default: those that ship)")
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="of check.html and check.json (default: runs/check-NAME)")
     a = parser.parse_args(argv)
-    found = check(a.recording, detector=Detector.load(a.weights) if a.weights else None)
+    recording = Recording.open(a.recording, truth=False)
+    out = a.out or paths.results_folder(f"check-{a.recording.resolve().name}", a.recording)
+    found = check(recording, detector=Detector.load(a.weights) if a.weights else None)
     if a.weights:  # notebook 07 alone takes others than those that ship
         found = replace(found, next_step=found.next_step.replace(_USE, f"{_USE} 07 -p weights {shlex.quote(a.weights)}"))
-    page = found.write(a.out or paths.RUNS / f"check-{a.recording.resolve().name}")
+    page = found.write(out)
     print(f"{found.assessment.verdict}\nNext: {found.next_step}\nReport: {page}")
     return 0

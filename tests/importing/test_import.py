@@ -100,7 +100,7 @@ def test_an_import_is_repeatable_and_says_what_it_did(shipped, tmp_path):
     assert json.loads((tmp_path / "one" / "import.json").read_text()) == first
     log = next(entry for entry in first["sources"] if entry["file"] == "log.csv")
     assert log["sha256"] == hashlib.sha256((folder / "log.csv").read_bytes()).hexdigest()
-    assert "No labels." in first["did"]
+    assert "The mapping names no labels." in first["did"]
 
 
 def test_a_variable_frame_rate_keeps_its_times_and_lost_frames_leave_pairs(shipped, tmp_path):
@@ -132,13 +132,36 @@ def test_an_image_that_is_missing_leaves_its_partner_alone(shipped, tmp_path):
     assert any("1 frames without a partner" in line for line in report["did"])
 
 
-@pytest.mark.parametrize("form", ["png", "video"])
+def test_names_of_decimal_seconds_order_and_date_the_frames(shipped, tmp_path):
+    """Dumps of ROS: read as one number, not by the digits after the point, which begin anew each second."""
+    folder, mapping = source_of(tmp_path, thinned(shipped, 20), foreign.robot_csv)
+    time_s = [1700000000.7, 1700000000.9, 1700000001.1, 1700000001.3]
+    for i, t in enumerate(time_s):
+        for name in ("left", "right"):
+            cv2.imwrite(str(folder / f"{name}_{t:.6f}.png"), np.full((8, 8), 60 * i, np.uint8))
+    text = guess_mapping(folder)
+    assert 'times = "names"' in text and 'name_unit = "s"' in text
+    video = '[video]\nlayout = "two"\nleft = "left_*.png"\nright = "right_*.png"\ntimes = "names"\n'
+    mapping.write_text(mapping.read_text("utf-8") + "offset_s = -1700000000\n" + video, "utf-8")
+    with pytest.raises(ValueError, match=r"left_1700000000\.700000\.png: entries are 2e-10 s apart.*Check .*name_unit"):
+        import_recording(folder, mapping, tmp_path / "eye")
+    mapping.write_text(mapping.read_text("utf-8") + 'name_unit = "s"\n', "utf-8")
+    import_recording(folder, mapping, tmp_path / "eye")
+    frames = Recording.open(tmp_path / "eye").frames
+    np.testing.assert_allclose(frames.time_s, [0.7, 0.9, 1.1, 1.3], atol=1e-6)
+    assert all(abs(frame.left.mean() - 60 * i) < 3 for i, frame in enumerate(frames))
+    (folder / "left_1700000001.300000.png").rename(folder / "left_1700000001.3.png")
+    with pytest.raises(ValueError, match=r"not with as many digits .*Number the files 000000, .* times in a table"):
+        import_recording(folder, mapping, tmp_path / "two")
+
+
+@pytest.mark.parametrize("form", ["png", "one camera", "video"])
 def test_twelve_grey_bits_in_sixteen_are_not_black(form, shipped, tmp_path):
     grey = (shipped.frames[:4].mean(axis=-1) * (4095 / 255)).astype(np.uint16)
     folder, mapping = source_of(tmp_path, thinned(shipped, 20), foreign.robot_csv)
-    if form == "png":
+    if form != "video":
         for side, name in enumerate(("left", "right")):
-            for i, image in enumerate(grey[:, side]):
+            for i, image in enumerate(shipped.frames[:4, 1, ..., 0] if form == "one camera" and side else grey[:, side]):
                 cv2.imwrite(str(folder / f"{name}_{i:04d}.png"), image)
         video = '[video]\nlayout = "two"\nleft = "left_*.png"\nright = "right_*.png"\ntimes = "fps"\nfps = 25\n'
     else:

@@ -2,6 +2,7 @@
 
 import errno
 import json
+import re
 import shutil
 import zipfile
 from dataclasses import replace
@@ -12,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
-from lib.importing import import_recording, read_mapping
+from lib.importing import guess_mapping, import_recording, read_mapping
 from lib.recordings import Recording
 from tests.importing import foreign
 from tests.importing.test_import import HINGE, content, thinned
@@ -220,7 +221,13 @@ SPOILT = {
     "ms called s": (edit("log.csv", lambda t: _scaled(t, 1e3, times=True)), r"log\.csv: entries are 400 s apart.*time_unit"),
     "seconds called us": (told("[robot]\n", '[robot]\ntime_unit = "us"\n'),
         r"log\.csv: entries are 4e-07 s apart.*time_unit"),
-    "clocks apart": (told("[robot]\n", "[robot]\noffset_s = 500\n"), r"do not overlap; check time_s.*offset_s"),
+    "clocks apart": (told("[robot]\n", "[robot]\noffset_s = 500\n"), 
+        r"log\.csv: its times \(.*frames \(.*\) do not overlap\. Correct robot\.offset_s = 500\.0 in .*map\.toml \(.*\)\.$"),
+    "a dated log": (edit("log.csv", lambda t: re.sub(r"(?m)^-?[\d.]+", lambda m: f"{1.7e9 + float(m[0]):.3f}", t)),
+        r"log\.csv: its times \(1.*do not overlap.*map\.toml .*or say \"estimate\" where log and video"),
+    "an image of 16 bits among others": (images(lambda f: cv2.imwrite(
+        str(f / "left/003.png"), np.full((134, 240), 1900, np.uint16))),
+        r"left/\d+\.png: 16-bit values up to 1900, and no bit_depth is stated\. .*video\.bit_depth in an import's mapping"),
     "too few for a clock": (told("[robot]\n", '[robot]\noffset_s = "estimate"\n'), r"offset_s = 'estimate': data: . frames"),
     "not COCO": (bytes_of("person_keypoints.json", b"[1, 2"), r"person_keypoints\.json: not COCO keypoints"),
     "per cent": (coco(percent), r"person_keypoints\.json: no label beyond .* per cent"),
@@ -321,13 +328,17 @@ def test_what_is_there_stays(good, tmp_path):
         import_recording(good[0], mapping, tmp_path / "thesis", overwrite=True)
     with pytest.raises(ValueError, match="lies in the source"):
         import_recording(good[0], mapping, good[0] / "out")
+    with pytest.raises(ValueError, match="holds your files, and --overwrite replaces all of it; choose another --out"):
+        import_recording(good[0], mapping, good[0].parent, overwrite=True)
+    with pytest.raises(ValueError, match="holds your files"):
+        import_recording(good[0], mapping, tmp_path, overwrite=True)
     with pytest.raises(FileNotFoundError, match="no such folder"):
         import_recording(tmp_path / "nowhere", mapping, tmp_path / "out")
     with pytest.raises(FileNotFoundError, match="--guess --map none.toml"):
         read_mapping(tmp_path / "none.toml")
 
 
-@pytest.mark.parametrize("change", ["BOM", "CRLF", "UTF-16", "comments", "ISO dates"])
+@pytest.mark.parametrize("change", ["BOM", "CRLF", "UTF-16", "comments", "numpy", "ISO dates"])
 def test_harmless_dialects_are_read(change, good, tmp_path):
     folder = shutil.copytree(good[0], tmp_path / "source")
     unit = '[robot]\ntime_unit = "iso"' if "ISO" in change else "[robot]"
@@ -337,9 +348,12 @@ def test_harmless_dialects_are_read(change, good, tmp_path):
     data = {
         "BOM": text.encode("utf-8-sig"), "CRLF": text.replace("\n", "\r\n").encode(), "UTF-16": text.encode("utf-16"),
         "comments": b"# made by a robot\n\n" + text.encode(),
+        "numpy": b"# made by a robot\n# " + text.encode(),
         "ISO dates": "\n".join([header, *(f"1970-01-01T00:00:{float(t) + 1:09.6f}Z,{rest}" for t, _, rest in rows)]).encode(),
     }[change]  # fmt: skip
     (folder / "log.csv").write_bytes(data)
+    (folder / "pose.tsv").unlink()
+    assert change not in ("comments", "numpy") or 'time = "time_s"' in guess_mapping(folder)
     import_recording(folder, tmp_path / "map.toml", tmp_path / "out")
     recording = Recording.open(tmp_path / "out")
     assert len(recording) == 6 and len(recording.kinematics.time_s) == 110

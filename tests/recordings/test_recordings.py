@@ -20,7 +20,8 @@ from PIL import Image
 from lib import paths
 from lib.cameras import NearAffineCamera
 from lib.correspondences import of_recording
-from lib.recordings import Frames, Kinematics, Recording, RecordingWriter, Truth, read_image
+from lib.recordings import Annotations, Frames, Kinematics, Recording, RecordingWriter, Truth, read_image
+from lib.recordings.annotations import write_coco
 from lib.simulator.rig import reference_rig
 
 N, SIZE = 4, (64, 48)
@@ -506,10 +507,34 @@ def test_writer_refuses_bad_input(tmp_path, written):
             writer.annotations(np.zeros((3, 2)), np.zeros((3, 2)))
         writer.add(*frames()[0])
         writer.kinematics([0.0, 1.0], tool(2))
-    with RecordingWriter(tmp_path / "r", name="second", fps=25, image_size_px=SIZE, overwrite=True) as writer:
-        writer.add(*frames()[0])
-        writer.kinematics([0.0, 1.0], tool(2))
+    with pytest.warns(UserWarning, match="held other recording.toml"):
+        replace_recording(tmp_path / "r", name="second")
     assert Recording.open(tmp_path / "r").name == "second"
+
+
+def replace_recording(folder: Path, seed: int = 0, **header) -> None:
+    """Write a recording of one frame, also where there is one."""
+    with RecordingWriter(folder, **({"name": "x"} | header), fps=25, image_size_px=SIZE, overwrite=True) as writer:
+        writer.add(*frames(seed)[0])
+        writer.kinematics([0.0, 1.0], tool(2))
+
+
+def test_a_replaced_recording_loses_no_work(tmp_path):
+    """Labels go on with the same frames; what else a person added or set is kept beside, and one line says so."""
+    eye, marks = tmp_path / "eye", np.array([[[5.0, 6], [7, 8], [9, 10]]])
+    replace_recording(eye)
+    replace_recording(eye)
+    assert [p.name for p in tmp_path.iterdir()] == ["eye"]
+    write_coco(eye / "annotations.json", Annotations(marks, marks), SIZE, ".jpg")
+    replace_recording(eye)
+    assert Recording.open(eye).annotations.u_left[0].tolist() == marks[0].tolist()
+    (eye / "raw").mkdir(), (eye / "raw" / "notes.txt").write_text("mine")
+    with pytest.warns(UserWarning, match=r"held other annotations\.json, left, raw, recording\.toml, right, which") as told:
+        replace_recording(eye, seed=1, offset_s=0.1)
+    assert Recording.open(eye).annotations is None
+    kept = Path(re.search(r"which (\S*) keeps", " ".join(str(one.message) for one in told))[1])
+    assert (kept / "raw" / "notes.txt").read_text() == "mine" and (kept / "annotations.json").is_file()
+    assert not (kept / "kinematics.csv").exists()
 
 
 def test_the_writer_deletes_only_recordings(tmp_path):
