@@ -72,13 +72,13 @@ def main(argv: list[str]) -> int:
     a = parser.parse_args(argv)
     if not 0 < a.minutes < 1e4:
         parser.error(f"--minutes: must lie between 0 and 10000, got {a.minutes:g}.")
-    out = a.out or paths.RUNS / f"adapt-{a.recording.resolve().name}"
+    images = a.recording.is_dir() and not (a.recording / "recording.toml").exists() and a.labels is not None
+    recording = None if images else Recording.open(a.recording, truth=False)
+    out = a.out or paths.results_folder(f"adapt-{a.recording.resolve().name}", a.recording)
     how = {"minutes": a.minutes, "seed": a.seed, "folder": out}
-    recording = None
-    if a.recording.is_dir() and not (a.recording / "recording.toml").exists() and a.labels is not None:
+    if recording is None:
         found = adapt_images(a.recording, a.labels, Detector.load(a.weights), **how)
     else:
-        recording = Recording.open(a.recording, truth=False)
         found = adapt(recording, Detector.load(a.weights), labels=a.labels, **how)
     page = write(found, out, recording)
     where = shlex.quote(paths.shown(a.recording))

@@ -71,7 +71,8 @@ def _finite_distance(case: Case) -> Iterator[Hypothesis]:
     fit, value, sd = case.linear(columns)
     far = f"by a working distance of {1 / value:.0f} mm" if value > 0 else "the wrong way, as in a mirrored image"
     text = f"The residuals are curved {far}: 1/distance is {value:.5f} +- {sd:.5f} per mm."
-    yield case.found("finite_distance", fit, 1, (value, sd, "1/mm"), text, "Calibrate with model='near_affine'.")
+    cure = "Calibrate with model='near_affine' (--model near_affine on the command line)."
+    yield case.found("finite_distance", fit, 1, (value, sd, "1/mm"), text, cure)
 
 
 def _landmark_offset(case: Case) -> Iterator[Hypothesis]:

@@ -51,6 +51,7 @@ LIMITS: dict[str, tuple[float, float]] = {
 #: Pixel noise assumed where the detections claim none: that of labels set by hand.
 _LABEL_PX = 3.0
 _CHECK = "`python3 -m lib check RECORDING`"
+_MORE_FRAMES = "Record more frames, with the tool in other places."
 _OVERLAYS = f"Look at the overlays of {_CHECK}"
 
 
@@ -123,7 +124,8 @@ def judge(
         found += _reason("diagnosis", best.explained, text, best.cure, best.name)
     if calibration is None:
         name = {NoDetectionError: "no_detection", NoConsensusError: "no_consensus"}.get(type(error), "refused")
-        cure = f"{_OVERLAYS}; where the detector errs, {TRAIN_FURTHER}."
+        few = data is not None and len(np.unique(data.frame)) < LIMITS["frames"][1]
+        cure = _MORE_FRAMES if few else f"{_OVERLAYS}; where the detector errs, {TRAIN_FURTHER}."
         found.append(Reason(name, LEVELS[2], f"There is no calibration: {error}", cure))
     else:
         for finding in (*_residuals(data, calibration, robot_accuracy_mm), *_geometry(calibration, robot_accuracy_mm)):
@@ -176,13 +178,12 @@ def _residuals(data: Correspondences | None, c: Calibration, robot_mm: float) ->
     text = f"Only {100 * share:.0f} % of the {usable} detections agree on the cameras."
     yield "consensus", share, text, f"{_OVERLAYS}: the other detections are wrong, or these are.", "minority"
 
-    cure = "Record more frames, with the tool in other places."
     text = f"The rows that agree count as {c.effective_rows:.0f} of independent errors; {LIMITS['rows'][0]:g} are needed."
-    yield "rows", c.effective_rows + 1e-9, text, cure, "few_rows"
+    yield "rows", c.effective_rows + 1e-9, text, _MORE_FRAMES, "few_rows"
     if data is not None:
         frames = len(np.unique(data.frame[used]))
         text = f"{frames} frames have landmarks that agree; {LIMITS['frames'][0]:g} are needed, 30 are good."
-        yield "frames", frames + 1e-9, text, cure, "few_frames"
+        yield "frames", frames + 1e-9, text, _MORE_FRAMES, "few_frames"
 
 
 def _geometry(c: Calibration, robot_mm: float) -> Iterator[tuple]:
