@@ -89,7 +89,8 @@ def pipeline_page(
     ax.set_box_aspect((np.ptp(x), np.ptp(y), 2.5 * max(np.ptp(height), 0.2)))
     ax.view_init(elev=35, azim=-65)
     ax.set(xlabel="x (mm)", ylabel="y (mm)", zlabel="height (mm)")
-    ax.locator_params(axis="z", nbins=3)
+    for axis in "yz":  # their ticks would overlap
+        ax.locator_params(axis=axis, nbins=3)
     ax.set_title("4  The retina, heights 2.5 times", **title)
 
     ax = page.add_subplot(grid[1, 1])
