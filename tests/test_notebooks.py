@@ -137,7 +137,7 @@ ELSEWHERE = {
     "01": "01-(rig|effects|slider|pair|check|motion|format|scenes|training|realism|dataset).*",
     "02": "02-(04|06|08|10|12|13|37|hourglass|half-pixel|loss|eq1|disc|decoding|(03|heat|eq1|11)-record).*",
     "03": "03-(data|dlt|resec|elim|pers|claim|ener|weig|fit|lad|dist|uncert|elli|advice|clock|record|reso|boar|fac|robot).*",
-    "04": "04-(desc|pyr|top|two|epi|match|fields|l1|spli|eq6|smoo|cvxpy|surface-r|export|err|gal|rec|sca|real|distance-sc).*",
+    "04": "04-(desc|pyr|top|two|epi|match|fields|l1|spli|eq6|smoo|cvxpy|surface-r|exp|err|gal|recor|sca|real|distance-sc).*",
     "05": "05-(one|eq7|ellipses|experiment|robust|icp|alone|drift).*",
     "06": "06-slider",
     "07": "",

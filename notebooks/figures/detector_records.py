@@ -97,11 +97,11 @@ def resolution_curves(table: Table, title: str = "Resolution") -> Figure:
 
 
 def papers_network_curves(table: Table, shipped: Table) -> Figure:
-    """PCK against the threshold: the paper's network at each resolution, and the shipped detector on the same sequences."""
+    """PCK against the threshold: the paper's network at each resolution, and a coarse-to-fine one on the same sequences."""
     fig = resolution_curves(table, "The paper's network")
     rows = [row for row in shipped.where(mode="whole frames").rows if row["recording"].startswith("test_")]
     thresholds, pck = curve(Table(rows))
-    fig.axes[0].plot(100 * thresholds, pck, "k--", label="shipped detector, full HD")
+    fig.axes[0].plot(100 * thresholds, pck, "k--", label="coarse to fine, full HD")
     fig.axes[0].legend(loc="upper left", bbox_to_anchor=(1, 1))
     return fig
 

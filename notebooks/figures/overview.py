@@ -88,11 +88,13 @@ def pipeline_page(
     ax.plot_surface(x, y, height, cmap="viridis", linewidth=0, antialiased=True, rcount=60, ccount=60)
     ax.set_box_aspect((np.ptp(x), np.ptp(y), 2.5 * max(np.ptp(height), 0.2)))
     ax.view_init(elev=35, azim=-65)
-    ax.set(xlabel="mm", ylabel="mm")
+    ax.set(xlabel="x (mm)", ylabel="y (mm)", zlabel="height (mm)")
+    for axis in "yz":  # their ticks would overlap
+        ax.locator_params(axis=axis, nbins=3)
     ax.set_title("4  The retina, heights 2.5 times", **title)
 
     ax = page.add_subplot(grid[1, 1])
-    shown, unit, map_name = (height * 1e3, "height, um", "viridis") if error_um is None else (error_um, "um", "RdBu")
+    shown, unit, map_name = (height * 1e3, "height, um", "viridis") if error_um is None else (error_um, "um", "RdBu_r")
     limit = np.nanquantile(np.abs(shown), 0.98)
     picture = ax.imshow(shown, cmap=map_name, vmin=-limit, vmax=limit, aspect="equal")
     page.colorbar(picture, ax=ax, shrink=0.7, label=unit)

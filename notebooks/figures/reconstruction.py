@@ -226,12 +226,20 @@ def profiles(
 def _section(
     ax: Axes, position_mm: np.ndarray, points: tuple[np.ndarray, np.ndarray], curves: dict[str, tuple[np.ndarray, str]]
 ) -> None:
-    ax.plot(*points, ".", color=COLOURS["baseline"], markersize=3, alpha=0.6, label="triangulated points")
     for name, (depth, colour) in curves.items():
         ax.plot(position_mm, depth, color=COLOURS[colour], label=name, lw=2.6 if colour == "truth" else 1.6)
     depths = np.concatenate([depth for depth, _ in curves.values()])
     margin = 0.25 * np.ptp(depths[np.isfinite(depths)])
-    ax.set(xlabel="along the image row (mm)", ylim=(np.nanmax(depths) + margin, np.nanmin(depths) - margin))
+    near, far = np.nanmin(depths) - margin, np.nanmax(depths) + margin
+    x, beyond = points
+    ax.plot(x, np.where((beyond >= near) & (beyond <= far), beyond, np.nan), ".", color=COLOURS["baseline"], markersize=3,
+            alpha=0.6, label="triangulated points")  # fmt: skip
+    for outside, border, marker in ((beyond < near, near, "^"), (beyond > far, far, "v")):
+        label = "points beyond the figure" if marker == "^" or not (beyond < near).any() else None
+        if outside.any():
+            ax.plot(x[outside], np.full(outside.sum(), border), marker, color=COLOURS["baseline"], markersize=4,
+                    alpha=0.6, clip_on=False, label=label)  # fmt: skip
+    ax.set(xlabel="along the image row (mm)", ylim=(far, near))
 
 
 def held_out_curve(
