@@ -126,10 +126,12 @@ class OnlinePipeline:
             with result.stage("triangulate"):
                 self._tips.triangulate(result, tracker)
         self._follow_surface(result, left, right)
-        recent = time_s - self._rests_on["landmarks"] <= self.settings.stale_s
+        recent = 0.0 <= time_s - self._rests_on["landmarks"] <= self.settings.stale_s
         if tracker.rig is not None and (result.state in ("tracking", "robot") or (result.state == "unseen" and recent)):
             with result.stage("distance"):
-                self._tips.measure(result, tracker, x_mm, self._surface)
+                # That a report is late, or the tool slipped, is what the tracker says, and not the frame's own checks.
+                told_mm = np.full((3, 3), np.nan) if result.state == "robot" else x_mm
+                self._tips.measure(result, tracker, told_mm, self._surface)
         surface_s = self._surface.time_s if self._surface else float("nan")
         result.rests_on = self._rests_on | {"rig": tracker.rests_on_s, "surface": surface_s}
         return result
@@ -188,12 +190,11 @@ class OnlinePipeline:
     def _follow_surface(self, result: FrameResult, left: np.ndarray, right: np.ndarray) -> None:
         """Ask for a surface of this frame, and take the newest that is there."""
         tracker = self._tracker
-        if tracker.doubted_since is not None or tracker.rig is None:
-            if self._beside:
-                self._beside.forget()
-            if self._surface is not None and (tracker.rig is None or self._surface.index >= tracker.doubted_since):
-                self._surface = None  # its cameras stood elsewhere
-        done, due = [], self._index % self.settings.surface_every == 0
+        if self._beside and (tracker.doubted_since is not None or tracker.rig is None):
+            self._beside.forget()
+        if self._surface is not None and tracker.doubts(self._surface.index):
+            self._surface = None  # its cameras stood elsewhere
+        done, due = [], self._index % self.settings.surface_every == 0 or result.motion is not None
         if due and result.state in ("tracking", "unseen", "robot") and tracker.doubted_since is None:
             tool = result.landmarks.u_left, result.landmarks.u_right
             options = {"setting": self.settings.setting, "control": self.settings.control, "smoothness": self._smoothness}
@@ -211,7 +212,7 @@ class OnlinePipeline:
         for surface in done:
             result.seconds.update(surface.seconds)  # a counter adds
             result.failures |= surface.failures
-            if surface.reconstruction is not None:
+            if surface.reconstruction is not None and not tracker.doubts(surface.index):
                 # Chosen by held-out error once: the eye is the same in the next frame.
                 self._surface, self._smoothness = surface, surface.reconstruction.surface.fit.smoothness
                 self._most_points = max(self._most_points, len(surface.reconstruction.u))

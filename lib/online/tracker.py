@@ -61,6 +61,7 @@ class RigTracker:
         self._motion: MovedCameras | None = None  # that led to this rig, and to the one before
         self._motion_before: MovedCameras | None = None
         self._waiting, self._held, self.rests_on_s, self.doubted_since = 0, False, float("nan"), None
+        self._astray = range(0)  # numbers of the frames from the motion before to its registration
 
     def _use(self, found: StereoRig | Calibration) -> None:
         rig, calibration = (found.rig, found) if isinstance(found, Calibration) else (found, None)
@@ -76,6 +77,11 @@ class RigTracker:
             scatter, n = np.median(chi2) / _CHI2_4_MEDIAN, len(chi2)
             # Corrected for the 16 parameters that the residuals have paid for, and the upper end of what so few allow.
             self._scale2 = scatter / (1.0 - 16.0 / max(4 * n, 17)) * (1.0 + 1.0 / np.sqrt(n)) ** 2
+
+    def doubts(self, index: int) -> bool:
+        """Whether the cameras had moved in frame number `index` and the rig of then had not."""
+        since = self.doubted_since
+        return self.rig is None or index in self._astray or (since is not None and index >= since)
 
     def take(self, result: FrameResult, frame: Seen) -> None:
         """A frame with landmarks that both images and the robot know."""
@@ -223,6 +229,8 @@ class RigTracker:
             self.rig, self.state, self.cause = found.rig, "tracking", ""
             result.motion = self._motion = found.motion
             self._monitor.reset(found.rig)
+            if self.doubted_since is not None:
+                self._astray = range(self.doubted_since, result.index)
             self.rests_on_s, self.doubted_since = result.time_s, None
             if len(self._since) >= last:
                 self._settle()
@@ -274,9 +282,17 @@ class RigTracker:
         own = np.zeros((len(x_mm), 3, 3))
         if self.calibration is not None:
             own += self.calibration.point_covariance(x_mm, detection=False) * self._remains(x_mm)
-        moves = [motion for motion in self._motions if motion is not None]
-        stale = [motion.covariance_at(motion.transform.inverse().apply(x_mm)) for motion in moves]
-        return own + sum(stale) / max(len(moves), 1)
+        left, right = self._motions
+        if left is right:
+            return own if left is None else own + left.covariance_at(left.transform.inverse().apply(x_mm))
+        # A camera alone does not know its shift along its own view, which it does not show; what it shows becomes depth.
+        J, pixels = self.rig.jacobian(x_mm), np.zeros((len(x_mm), 4, 4))
+        for motion, rows in zip(self._motions, (slice(0, 2), slice(2, 4)), strict=True):
+            if motion is not None:
+                stale = motion.covariance_at(motion.transform.inverse().apply(x_mm))
+                pixels[:, rows, rows] = J[:, rows] @ stale @ J[:, rows].mT
+        gain = np.linalg.solve(J.mT @ J, J.mT)
+        return own + gain @ pixels @ gain.mT
 
     def _remains(self, x_mm: np.ndarray) -> np.ndarray:
         return np.ones((1, 1, 1)) if self._online is None else self._online.remains(x_mm)[:, None, None]

@@ -44,9 +44,10 @@ def test_frozen_video_is_noticed_and_never_calibrated_with():
         assert rig_error_mm(pipeline.rig, world) < max(0.03, 1.5 * rig_error_mm(before, world))
 
 
-@pytest.mark.parametrize("confidence", [1.0, 0.1])
-def test_a_report_is_frozen_while_the_tool_moves_however_doubtful_the_detector(confidence):
+@pytest.mark.parametrize(("confidence", "unreported"), [(1.0, 0), (0.1, 0), (1.0, 1)])
+def test_a_report_is_frozen_while_the_tool_moves_however_doubtful_the_detector(confidence, unreported):
     x, u = np.eye(3), np.arange(6.0).reshape(3, 2)
+    x[:unreported] = np.nan
     how = {"frame": np.zeros(3, int), "landmark": np.arange(3), "confidence": np.full((3, 2), confidence)}
     checks = FrameChecks()
     assert checks.robot(Correspondences.of_points(x, u, u, **how)) == ""
@@ -163,6 +164,9 @@ def test_late_kinematics_are_named_and_the_rig_is_kept():
     for _ in range(40):
         told.append(world.advance())
         results.append(pipeline.step(*world.images, told.pop(0)))
+    last = results[-1]
+    seen = last.reconstruction.surface.distance(last.x_tool_mm, rig.left).along_view_mm
+    np.testing.assert_allclose(last.distance_mm, seen, rtol=1e-3)  # not from the late report
     assert any("late by 5 frames" in r.cause for r in results[:8])
     assert not any(r.state == "tracking" for r in results[5:])
     assert not any(r.motion for r in results)
@@ -217,6 +221,31 @@ def test_reordered_frames_are_left_out():
     assert "older" in pipeline.step(*world.images, world.advance(), time_s=1.0).failures["images"]
 
 
+@pytest.mark.parametrize("wrong_s", [np.nan, 1e6, -50.0])
+def test_a_wrong_time_costs_few_frames(wrong_s):
+    world, pipeline = calibrated()
+    results = [pipeline.step(*world.images, world.advance(), time_s=wrong_s)]
+    later = 2.4 if wrong_s > 0 else max(np.nan_to_num(wrong_s, nan=2.4), -50.0)  # a clock that restarts goes on from there
+    results += [pipeline.step(*world.images, world.advance(), time_s=later + i / 25) for i in range(1, 41)]
+    assert results[0].state == "blind" or wrong_s > 0
+    assert all(r.state == "tracking" for r in results[11:])
+    for r in results:
+        assert np.isfinite(r.distance_sd_mm).all() == np.isfinite(r.distance_mm).all()
+    assert np.isfinite(results[-1].distance_mm).all()
+
+
+def test_the_approach_is_that_of_the_newest_reports():
+    world, pipeline = calibrated(60, smooth=True)
+    there = np.ones((3, 1))
+    there[2] = np.nan  # never reported from now on
+    results = [pipeline.step(*world.images, world.advance() * there) for _ in range(25)]
+    assert np.isfinite(results[-1].approach_mm_s).tolist() == [True, True, False]
+    results = [pipeline.step(*world.images, world.advance() * np.nan) for _ in range(25)]
+    assert np.isfinite(results[2].approach_mm_s).tolist() == [True, True, False]
+    assert np.isnan(results[-1].approach_mm_s).all()
+    assert np.isfinite(results[-1].distance_mm).all()
+
+
 @cache
 def quiet(seed: int):
     """A pipeline that saw 150 frames in which nothing happened, and said so."""
@@ -236,6 +265,17 @@ def test_small_shifts_are_noticed(shift_mm, within):
         results = run(pipeline, world, 30)
         delays.append(next((i + 1 for i, r in enumerate(results) if r.drift > 1), 99))
     assert np.median(delays) <= within
+
+
+def test_a_surface_of_the_rig_before_ends_with_the_registration():
+    world, pipeline = deepcopy(quiet(20))
+    run(pipeline, world, 9)
+    world.rig = shifted(RIG, 0.05 * VIEW)
+    results = run(pipeline, world, 20)
+    assert results[1].reconstructed  # in every 20th frame, and the motion is not noticed yet
+    registered = next(r for r in results if r.motion)
+    assert registered.reconstructed
+    assert np.abs(results[-1].distance_mm - world.true_distance_mm()).max() < 0.04
 
 
 def test_memory_is_flat():
