@@ -156,7 +156,7 @@ class BSplineSurface:
 
     @cached_property
     def _lattice(self) -> tuple[np.ndarray, KDTree]:
-        """Image points (m, 2), three a cell, and a search tree of the surface there, whose nearest lies in the right valley."""
+        """Image points (m, 2), three a cell, and a search tree of the surface there; its nearest is in the right valley."""
         low, high = np.reshape(self.grid.domain, (2, 2))
         x, y = (np.linspace(*ends) for ends in zip(low, high, 3 * np.array(self.grid.cells) + 1, strict=True))
         return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2), KDTree(self.on_grid(x, y).reshape(-1, 3))
