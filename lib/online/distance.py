@@ -42,7 +42,7 @@ class TipDistance:
 
     def reset(self) -> None:
         """Forget the correction: the cameras that measured it are not where they were."""
-        self._correction, self._time = np.zeros((len(LANDMARKS), 3)), float("nan")
+        self._correction, self._time, self._seen_s = np.zeros((len(LANDMARKS), 3)), float("nan"), float("inf")
         self._covariance = np.tile(self.settings.slip_mm**2 * np.eye(3), (len(LANDMARKS), 1, 1))
 
     def measure(self, result: FrameResult, tracker: RigTracker, x_mm: np.ndarray, at: Surface | None) -> None:
@@ -53,6 +53,7 @@ class TipDistance:
         seen, covariance = self.triangulate(result, tracker)
         robot = np.isfinite(x_mm).all(axis=1)
         self._predict(result.time_s, x_mm)
+        self._seen_s = result.time_s if np.isfinite(seen).any() else self._seen_s
         if result.state == "tracking":
             self._correct(seen - tracker.corrected(result.landmarks).x_mm, covariance * tracker.persistence)
         x = np.where(robot[:, None], x_mm + self._correction, seen)
@@ -64,7 +65,8 @@ class TipDistance:
         surface, camera = at.reconstruction.surface, at.reconstruction.rig.left
         found, view = surface.distance(x, camera), camera.viewing_direction
         result.distance_mm, result.normal_mm = found.along_view_mm, found.along_normal_mm
-        drift = self.settings.eye_mm_s * age_s
+        # What moves unseen is the eye since the surface, and cameras since the landmarks were seen.
+        drift = self.settings.eye_mm_s * max(age_s, result.time_s - self._seen_s)
         if not len(rows := np.flatnonzero(np.isfinite(found.along_view_mm))):
             return
         u = camera.project(x[rows])

@@ -21,6 +21,7 @@ from lib.online.surface_worker import Beside, SurfaceJob, make
 from lib.online.tracker import RigTracker, Seen
 from lib.surface import Reconstruction, reconstruct
 
+_JUMP_MM = 0.15  # by which a surface differs from one before only where the eye or the cameras moved
 _DEPTH_MARGIN_MM = 0.5  # how far an eye may move along the view from one surface to the next
 
 
@@ -55,6 +56,7 @@ class OnlinePipeline:
         self._tracker = RigTracker(rig, noise_px=float(noise_px), settings=self.settings, calibrate=calibrate)
         self._checks, self._tips = FrameChecks(), TipDistance(self.settings)
         self._surface: Surface | None = None
+        self._surface_seen: Surface | None = None  # the newest while the landmarks were in view
         self._pair: np.ndarray | None = None
         self._smoothness: float | None = None
         self._asked = self._most_points = self._rig_since = 0  # surfaces; most points since the last search everywhere
@@ -127,6 +129,10 @@ class OnlinePipeline:
                 self._tips.triangulate(result, tracker)
         self._follow_surface(result, left, right)
         recent = 0.0 <= time_s - self._rests_on["landmarks"] <= self.settings.stale_s
+        if seen:
+            self._surface_seen = self._surface
+        elif result.state == "unseen" and self._surface_jumped():
+            recent, result.cause = False, "no landmarks, and eye or cameras moved since they were seen"
         if tracker.rig is not None and (result.state in ("tracking", "robot") or (result.state == "unseen" and recent)):
             with result.stage("distance"):
                 # That a report is late, or the tool slipped, is what the tracker says, and not the frame's own checks.
@@ -141,6 +147,8 @@ class OnlinePipeline:
         if result.state == "moved":  # this frame alone
             return
         state, cause = self._tracker.state, self._tracker.cause
+        if state == "tracking" and self._tracker.is_unsettled(result.index):
+            state, cause = "moved", "the cameras seem to move again and again: something else has changed"
         measures = state in ("tracking", "robot")
         if blind:
             state, cause = "blind", blind
@@ -177,6 +185,16 @@ class OnlinePipeline:
             raise ValueError(f"kinematics: expected (3, 3) mm, one landmark a row, got {x.shape}.")
         data = Correspondences.of_points(x, *u, frame=index, landmark=range(len(LANDMARKS)), **stated)
         return Seen(data, lambda rig: data)
+
+    def _surface_jumped(self) -> bool:
+        """Whether the newest surface lies elsewhere than the newest one while the landmarks were in view."""
+        now, before = self._surface, self._surface_seen
+        if now is None or before is None or now is before:
+            return False
+        u, view = now.reconstruction.u, now.reconstruction.rig.left.viewing_direction
+        u = u[:: len(u) // 100 + 1]
+        apart = np.abs((now.reconstruction.surface(u) - before.reconstruction.surface(u)) @ view)
+        return bool(np.median(apart[np.isfinite(apart)]) > _JUMP_MM)
 
     def _where_to_search(self) -> dict[str, Any]:
         """Where to match: near the last surface, but everywhere in every tenth frame, for a new rig, or after few points."""

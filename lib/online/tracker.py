@@ -18,6 +18,7 @@ _CHI2_4_MEDIAN = 3.357
 _STANDS_OUT = 8.0  # score of a single frame that is not to be believed
 _FAR_MM = 200.0  # of the robot's median position: no tool reaches that far
 _PAST = 40  # frames kept to find a late report
+_AGAIN = 30  # frames after a registration in which no microscope moves again; then the registration was no explanation
 
 
 @dataclass(frozen=True)
@@ -61,6 +62,8 @@ class RigTracker:
         self._motion: MovedCameras | None = None  # that led to this rig, and to the one before
         self._motion_before: MovedCameras | None = None
         self._waiting, self._held, self.rests_on_s, self.doubted_since = 0, False, float("nan"), None
+        self._registered = self._again = -_AGAIN  # numbers of the frames of the newest registration, and of the newest motion
+        # that was noticed soon after one.
         self._astray = range(0)  # numbers of the frames from the motion before to its registration
 
     def _use(self, found: StereoRig | Calibration) -> None:
@@ -82,6 +85,10 @@ class RigTracker:
         """Whether the cameras had moved in frame number `index` and the rig of then had not."""
         since = self.doubted_since
         return self.rig is None or index in self._astray or (since is not None and index >= since)
+
+    def is_unsettled(self, index: int) -> bool:
+        """Whether the newest registration is doubted, because one not long before it did not last."""
+        return index - self._again < _AGAIN
 
     def take(self, result: FrameResult, frame: Seen) -> None:
         """A frame with landmarks that both images and the robot know."""
@@ -167,6 +174,7 @@ class RigTracker:
             self.doubted_since = int(self._since[0].data.frame[0])
             if self._before is None:
                 self._before, self._motion_before = self.rig, self._motion
+                self._again = result.index if result.index - self._registered < _AGAIN else self._again
             monitor.forget()
             self._recent.clear()
             self._resolve(result)
@@ -203,7 +211,7 @@ class RigTracker:
         try:
             past = [self.corrected(part) for part in self._past]
             found = explain(self._before, frames, past, self._noise(joined), undecided=len(frames) < last)
-            shifted = found.kind in ("clock", "slipped", "exchanged")
+            shifted = found.kind in ("clock", "slipped", "exchanged", "eye")
             if not (found.loss <= CONVINCING if shifted else found.kind == "open" or self._fits(found.rig, newest)):
                 raise ValueError("no cause explains the newest frames.")
         except ValueError as error:
@@ -214,9 +222,9 @@ class RigTracker:
                 self._start_again(self._since, "no cause explains the images; calibrating afresh")
             raise
         if found.kind == "open":
-            self.cause = found.text
+            self.cause = self.cause if self._held else found.text
         elif shifted:
-            self.state, self.cause = "robot" if found.kind != "exchanged" else "moved", found.text
+            self.state, self.cause = "robot" if found.kind in ("clock", "slipped") else "moved", found.text
             self._held, self._waiting, self.rig, self._motion = True, 1, self._before, self._motion_before
             self._since, result.failures["robot"] = self._since[1 - first :], found.text
         elif found.kind == "optics":
@@ -227,7 +235,7 @@ class RigTracker:
             self._settle()
         else:
             self.rig, self.state, self.cause = found.rig, "tracking", ""
-            result.motion = self._motion = found.motion
+            result.motion, self._motion, self._registered = found.motion, found.motion, result.index
             self._monitor.reset(found.rig)
             if self.doubted_since is not None:
                 self._astray = range(self.doubted_since, result.index)

@@ -15,7 +15,7 @@ from lib.correspondences import Correspondences
 from lib.online import Settings
 from lib.online.checks import FrameChecks
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
-from tests.online.world import BLACK, RIG, SELDOM, World, make, rig_error_mm, run, shifted, started
+from tests.online.world import BLACK, CENTRE_MM, RIG, SELDOM, World, make, rig_error_mm, run, shifted, started
 
 NOISE_PX = 0.6
 VIEW = ROBOT_FROM_MICROSCOPE.R[:, 2]
@@ -175,6 +175,35 @@ def test_late_kinematics_are_named_and_the_rig_is_kept():
     assert all(r.state == "tracking" for r in after[10:])
 
 
+@pytest.mark.parametrize("side", [0, 1])
+def test_one_late_camera_is_named_and_no_motion(side):
+    world, pipeline, _ = started(100, sigma_px=NOISE_PX, smooth=True)
+    queue = [world.detect(np.stack(world.images)).u[side]]
+
+    def detect(images):
+        found = world.detect(images)
+        queue.append(found.u[side].copy())
+        found.u[side] = queue.pop(0)
+        return found
+
+    pipeline._detector = detect
+    results = run(pipeline, world, 10)
+    assert any(f"the {('left', 'right')[side]} images are late by 1 frames" in r.cause for r in results)
+    assert not any(measured(results)[2:])
+    assert not any(r.motion for r in results)
+
+
+def test_motions_that_do_not_last_are_no_motions():
+    """The robot's report is scaled: each registration explains it where the tool is, and not where it goes."""
+    world, pipeline, _ = started(100, sigma_px=NOISE_PX, smooth=True)
+    results = []
+    for _ in range(45):
+        told = world.advance()
+        results.append(pipeline.step(*world.images, CENTRE_MM + 1.01 * (told - CENTRE_MM)))
+    assert sum(measured(results)) < 28
+    assert any("again and again" in r.cause for r in results)
+
+
 def test_frozen_kinematics_are_named_at_once():
     world, pipeline = calibrated(100, smooth=True)
     told = world.advance()
@@ -214,6 +243,21 @@ def test_a_tool_out_of_view_and_back():
     assert sd[-1] > sd[0]  # nothing confirms the robot's report
     pipeline._detector = world.detect
     assert run(pipeline, world, 1)[0].state == "tracking"
+
+
+def test_cameras_that_move_while_the_tool_is_out_of_view_give_no_distances():
+    world = World(11, NOISE_PX, still=True)
+    pipeline = make(world, rig=RIG, noise_px=NOISE_PX)
+    run(pipeline, world, 5)
+    nothing = {"u": np.full((2, 3, 2), np.nan), "confidence": np.zeros((2, 3))}
+    pipeline._detector = lambda images: replace(world.detect(images), **nothing)
+    results = run(pipeline, world, 50)
+    assert all(measured(results))
+    assert results[-1].distance_sd_mm[0] > results[0].distance_sd_mm[0] + 0.02  # as much as cameras may have moved
+    world.rig = shifted(RIG, 0.3 * VIEW)
+    results = run(pipeline, world, 3)
+    assert all(r.state == "unseen" and "cameras moved" in r.cause for r in results)
+    assert not any(measured(results))
 
 
 def test_reordered_frames_are_left_out():
