@@ -120,7 +120,7 @@ def test_distance_of_a_tool_along_view_and_normal():
 
 def test_the_nearest_point_lies_in_the_right_valley_or_beyond_the_border():
     wavy = graph_surface(lambda x, y: 0.15 * np.sin(9 * x) + 0.4 * y)
-    x = np.random.default_rng(3).uniform([-0.9, -0.9, -1.0], [0.9, 0.9, 0.5], (200, 3))
+    x = np.random.default_rng(3).uniform([-0.9, -0.9, -1.0], [0.9, 0.9, 0.5], (60, 3))
     found = wavy.distance(x, AffineCamera([[100.0, 0, 0, 0], [0, 100.0, 0, 0]]))
     lattice = np.linspace(-100, 100, 401)
     points = wavy.on_grid(lattice, lattice).reshape(-1, 3)
