@@ -193,8 +193,9 @@ class OnlinePipeline:
             return False
         u, view = now.reconstruction.u, now.reconstruction.rig.left.viewing_direction
         u = u[:: len(u) // 100 + 1]
-        apart = np.abs((now.reconstruction.surface(u) - before.reconstruction.surface(u)) @ view)
-        return bool(np.median(apart[np.isfinite(apart)]) > _JUMP_MM)
+        apart = (now.reconstruction.surface(u) - before.reconstruction.surface(u)) @ view
+        apart = np.abs(apart[np.isfinite(apart)])
+        return not len(apart) or bool(np.median(apart) > _JUMP_MM)
 
     def _where_to_search(self) -> dict[str, Any]:
         """Where to match: near the last surface, but everywhere in every tenth frame, for a new rig, or after few points."""

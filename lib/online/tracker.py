@@ -62,9 +62,8 @@ class RigTracker:
         self._motion: MovedCameras | None = None  # that led to this rig, and to the one before
         self._motion_before: MovedCameras | None = None
         self._waiting, self._held, self.rests_on_s, self.doubted_since = 0, False, float("nan"), None
-        self._registered = self._again = -_AGAIN  # numbers of the frames of the newest registration, and of the newest motion
-        # that was noticed soon after one.
-        self._astray = range(0)  # numbers of the frames from the motion before to its registration
+        # Numbers of frames: the newest registration, the newest motion soon after one, from a motion to its registration.
+        self._registered, self._again, self._astray = -_AGAIN, -_AGAIN, range(0)
 
     def _use(self, found: StereoRig | Calibration) -> None:
         rig, calibration = (found.rig, found) if isinstance(found, Calibration) else (found, None)
