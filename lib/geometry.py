@@ -92,7 +92,13 @@ def pair_covariance(covariance_px2: ArrayLike | Sequence[ArrayLike] | None, n: i
     variance = np.einsum("nii->ni", covariance)
     excess = covariance**2 - variance[:, :, None] * variance[:, None, :]
     np.einsum("nii->ni", excess)[...] = -1.0
-    if (variance <= 0).any() or (excess >= 0).any():
+    fit = not ((variance <= 0).any() or (excess >= 0).any())
+    if fit and given.shape in ((m, m), (n, m, m)):  # in the other forms the images are independent
+        try:
+            np.linalg.cholesky(covariance[np.isfinite(covariance).all(axis=(1, 2))])
+        except np.linalg.LinAlgError:
+            fit = False
+    if not fit:
         raise ValueError("covariance_px2: every covariance must be positive definite.")
     return covariance
 

@@ -90,7 +90,13 @@ def test_pair_covariance_takes_every_form():
     assert np.isnan(pair_covariance(unseen, 5)[2]).any()
 
 
-@pytest.mark.parametrize("bad", [np.eye(3), np.ones((4, 4, 4)), -1.0, np.diag([1.0, 1, 1, -1]), np.zeros((5, 4, 4))])
+#: Each pair of coordinates alone could be so correlated, and the three together cannot.
+INDEFINITE = np.eye(4) - 0.6 * (np.ones((4, 4)) - np.eye(4))
+
+
+@pytest.mark.parametrize(
+    "bad", [np.eye(3), np.ones((4, 4, 4)), -1.0, np.diag([1.0, 1, 1, -1]), np.zeros((5, 4, 4)), INDEFINITE]
+)
 def test_pair_covariance_refuses_what_is_no_covariance(bad):
     with pytest.raises(ValueError, match="covariance_px2"):
         pair_covariance(bad, 5)

@@ -10,7 +10,7 @@ from lib.calibration.checks import extents
 from lib.calibration.models import Fit
 from lib.cameras import AffineCamera, Camera, Points, Resection, StereoRig
 from lib.correspondences import Correspondences
-from lib.geometry import RigidTransform, points, precision
+from lib.geometry import RigidTransform, pair_covariance, points, precision
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,10 +181,13 @@ class Calibration:
 
     def triangulate(self, u_left: ArrayLike, u_right: ArrayLike, covariance_px2: ArrayLike | None = None) -> Points:
         """`StereoRig.triangulate`, with the calibration's uncertainty in the covariance and sigma_u_px as the default."""
-        found = self.pair.triangulate(u_left, u_right, self.noise_px2 if covariance_px2 is None else covariance_px2)
+        noise = self.noise_px2 if covariance_px2 is None else covariance_px2
+        found = self.pair.triangulate(u_left, u_right, noise)
         known = np.isfinite(found.x_mm).all(axis=1)
-        covariance = found.covariance_mm2.copy()
-        covariance[known] += self.point_covariance(found.x_mm[known], detection=False)
+        x, covariance = found.x_mm[known], found.covariance_mm2.copy()
+        noise = np.broadcast_to(pair_covariance(noise, len(known)), (len(known), 4, 4))[known]
+        gain = covariance[known] @ np.linalg.solve(noise, self.pair.jacobian(x)).mT
+        covariance[known] += gain @ self.projection_covariance(x) @ gain.mT
         return Points(found.x_mm, covariance, found.epipolar_px)
 
     def depth_sd_mm(self, x_mm: ArrayLike, *, detection: bool = False) -> np.ndarray:

@@ -15,7 +15,8 @@ def write_opencv(camera: Camera, path: str | Path, image_size_px: tuple[int, int
     """A file for `cv2.FileStorage`; its suffix, .yml, .yaml, .xml or .json, says the format (another is a ValueError).
 
     It holds `projection_matrix` (3 x 4, millimetres of the robot frame to pixels, the last row of an affine camera is
-    0 0 0 1), `image_width`, `image_height`, `unit_of_points` and `radial_per_px2`.
+    0 0 0 1), `image_width`, `image_height`, `unit_of_points`, and k = `radial_per_px2` with c = `distortion_centre`: what the
+    matrix projects to u is seen at u + k |u - c|^2 (u - c).
 
     >>> import tempfile
     >>> from lib.cameras import AffineCamera
@@ -35,6 +36,7 @@ def write_opencv(camera: Camera, path: str | Path, image_size_px: tuple[int, int
         storage.write("unit_of_points", "mm")
         storage.write("projection_matrix", np.array(camera.projection_matrix))
         storage.write("radial_per_px2", float(getattr(camera, "radial_per_px2", 0.0)))
+        storage.write("distortion_centre", np.array(getattr(camera, "centre_px", (0.0, 0.0))))
         storage.release()
 
 

@@ -64,6 +64,9 @@ def match(
         depth_range_mm = tuple(float(z) for z in depth_range_mm)
         if len(depth_range_mm) != 2 or not np.isfinite(depth_range_mm).all() or depth_range_mm[0] >= depth_range_mm[1]:
             raise ValueError(f"depth_range_mm: expected (near, far) with near < far, got {depth_range_mm}.")
+    for name, value in (("min_score", min_score), ("max_epipolar_px", max_epipolar_px)):
+        if value is not None and np.isnan(value):
+            raise ValueError(f"{name}: expected a number, got NaN.")
     method = ("deepmatching" if rig is None else "band") if method is None else method
     where = (setting, depth_range_mm, max_epipolar_px)
     if method == "deepmatching":

@@ -344,9 +344,9 @@ def match_free(
     """DeepMatching without any calibration; arguments as in `lib.matching.match`, images (h, w) uint8 grey."""
     shapes = images[0].shape, images[1].shape
     largest = int(np.log2(min(shapes[0] + shapes[1]) / (2 * PATCH)))
-    if downscale is not None and not 0 <= downscale <= largest:
+    if downscale is not None and downscale not in range(largest + 1):
         raise ValueError(f"downscale: expected 0 to {largest} for images of these sizes, got {downscale}.")
-    choices = range(1, largest + 1) if downscale is None else [downscale]
+    choices = range(1, largest + 1) if downscale is None else [int(downscale)]
     if not (fitting := [d for d in choices if predicted_bytes(*shapes, downscale=d) <= budget_bytes]):
         need = predicted_bytes(*shapes, downscale=max(choices))
         what = f"DeepMatching with downscale {max(choices)} needs {need / 2**30:.2f} GiB"
@@ -355,7 +355,11 @@ def match_free(
     stride = 1 << fitting[0]
     valid = [None if mask is None else ~mask for mask in masks]
     left, right = (pixel_descriptors(image, fitting[0], valid=seen) for image, seen in zip(images, valid, strict=True))
-    corner, best, ratio, passed = _match_grids(*(torch.from_numpy(grid).to(device) for grid in (left, right)))
+    try:
+        grids = [torch.from_numpy(grid).to(device) for grid in (left, right)]
+    except (RuntimeError, AssertionError) as error:  # unknown, absent, or not what this torch was built for
+        raise ValueError(f"device: {device!r} cannot be used: {error}") from None
+    corner, best, ratio, passed = _match_grids(*grids)
     corner, best, passed = (array.cpu().numpy() for array in (corner, best.double(), passed))
     target = np.clip(corner, 0, np.array(right.shape[1::-1]) - 1)
     kept = np.isfinite(best) & patch_quality(left) & (right[target[..., 1], target[..., 0], CHANNELS - 1] > 0)

@@ -13,7 +13,7 @@ from lib.registration import MovedCameras, identify_motion
 
 #: Rows that a rig explains lose about 5.1 each, 8 log(1 + chi^2 / 4), with 1.7 times the noise 10.
 CONVINCING = 10.0
-_LATEST = 25  # frames by which a report may be late
+_LATEST, _LATEST_EYE = 25, 5  # frames by which a report, and the images of one camera, may be late
 _VOLUME_MM = 0.2  # least extent of positions that tell a change of the optics
 _PLAIN = 10.0  # by how much less likely the motion of a camera must be than any other cause
 _OPEN = 40.0  # the same, for a tool that glides: a late report and a shift of the cameras then look alike at first
@@ -22,7 +22,7 @@ _ROBUST = 12.0  # squared residual in standard deviations that begins to count l
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """The likeliest cause: "none", "moved", "optics", "exchanged", "clock", "slipped" or "open"."""
+    """The likeliest cause: "none", "moved", "optics", "exchanged", "clock", "eye" (is late), "slipped" or "open"."""
 
     kind: str
     text: str = ""  # what happened, where it is no motion
@@ -51,7 +51,7 @@ def explain(
     swapped = replace(data, u_left=data.u_right, u_right=data.u_left)
     others = [(misfit(rig, swapped, covariance_px2), Explanation("exchanged", "the eyes are exchanged", rig))]
     late = _lateness(rig, frames, past, covariance_px2)
-    others += [late] if late else []
+    others += late
     axes = rows_axes(data)
     if np.isfinite(axes).all():
         offset = _offset(rig, data, axes, covariance_px2)
@@ -67,10 +67,11 @@ def explain(
             text = f"the optics changed: zoom x {zoom[0] / zoom[2]:.3f} left, x {zoom[1] / zoom[3]:.3f} right"
             others.append((misfit(fresh, data, covariance_px2, 16), Explanation("optics", text, fresh)))
     best, other = min(others, key=lambda pair: pair[0])
-    penalty = {"slipped": 3, "optics": 16, "clock": 2}.get(other.kind, 0) * np.log(2.0 * 2.0 * len(data))
+    penalty = {"slipped": 3, "optics": 16, "clock": 2, "eye": 2}.get(other.kind, 0) * np.log(2.0 * 2.0 * len(data))
     other = replace(other, loss=(best - penalty) / len(data))
-    if undecided and found.kind == "moved" and late is not None and late[0] - least <= _OPEN and best >= least - _PLAIN:
-        return Explanation("open", "the cameras moved or the report is late: not decided yet")
+    near = min((value for value, _ in late), default=np.inf) - least <= _OPEN
+    if undecided and found.kind == "moved" and near and best >= least - _PLAIN:
+        return Explanation("open", "the cameras moved, or the report or an image is late: not decided yet")
     return other if best < least - _PLAIN else found
 
 
@@ -87,22 +88,26 @@ def misfit(rig: StereoRig, data: Correspondences, covariance_px2: np.ndarray, pa
     return float(8.0 * np.log1p(chi2 / 4.0).sum() + parameters * np.log(4.0 * len(data)))
 
 
-def _lateness(rig, frames, past, covariance_px2) -> tuple[float, Explanation] | None:
-    """The delay between report and images that explains the frames best."""
-    number = {int(part.frame[0]): part for part in (*past, *frames)}
-    numbers, found = [int(part.frame[0]) for part in frames], []
-    for delay in [*range(-_LATEST, 0), *range(1, _LATEST + 1)]:
-        seen = [number.get(i - max(delay, 0)) for i in numbers]  # what a late report says now, the images showed before
-        told = [number.get(i + min(delay, 0)) for i in numbers]
-        if any(part is None for part in (*seen, *told)):
+def _lateness(rig, frames, past, covariance_px2) -> list[tuple[float, Explanation]]:
+    """How badly delays of the report, of the images, or of one camera's images explain the frames."""
+    number, found = {int(part.frame[0]): part for part in (*past, *frames)}, []
+    now = Correspondences.join(frames)
+    for delay in range(1, _LATEST + 1):
+        earlier = [number.get(int(part.frame[0]) - delay) for part in frames]
+        if any(part is None for part in earlier):
             continue
-        data = replace(Correspondences.join(seen), x_mm=np.concatenate([part.x_mm for part in told])).complete
-        if len(data) >= 0.7 * len(covariance_px2):
-            # Fewer rows must not make a delay likelier.
-            value = misfit(rig, data, np.resize(covariance_px2, (len(data), 4, 4)), 2) * len(covariance_px2) / len(data)
-            who = "robot's report is" if delay > 0 else "images are"
-            found.append((value, Explanation("clock", f"the {who} late by {abs(delay)} frames", rig)))
-    return min(found, key=lambda pair: pair[0], default=None)
+        before = Correspondences.join(earlier)
+        cases = {"robot's report is": replace(before, x_mm=now.x_mm), "images are": replace(now, x_mm=before.x_mm)}
+        if delay <= _LATEST_EYE:
+            sides = {"left images are": {"u_left": now.u_left}, "right images are": {"u_right": now.u_right}}
+            cases |= {who: replace(before, **late) for who, late in sides.items()}
+        for who, data in cases.items():
+            if len(data := data.complete) >= 0.7 * len(covariance_px2):
+                # Fewer rows must not make a delay likelier.
+                value = misfit(rig, data, np.resize(covariance_px2, (len(data), 4, 4)), 2) * len(covariance_px2) / len(data)
+                kind = "eye" if who.split()[0] in ("left", "right") else "clock"
+                found.append((value, Explanation(kind, f"the {who} late by {delay} frames", rig)))
+    return found
 
 
 def _offset(rig: StereoRig, data: Correspondences, axes: np.ndarray, covariance_px2: np.ndarray) -> np.ndarray:

@@ -9,6 +9,7 @@ _STEP = 4  # every n-th pixel is compared; the noise of a sensor never repeats
 _DARK, _FLAT = 6.0, 1.5  # grey levels: an image that is darker on average, or varies less, shows nothing
 _REPEATED_PX = 0.3  # a detector finds the same landmarks in the same image within this
 _MOVED_PX = 5.0  # landmarks that all moved farther than this moved
+_RESTARTED = 10  # frames in order that are older than one before: then the clock is another
 _FAR_MM = 300.0  # from where the robot was: beyond any tool's reach
 
 
@@ -19,7 +20,7 @@ class FrameChecks:
         self._thumbs: tuple[np.ndarray | None, ...] = (None, None)
         self._same, self._u = np.zeros(2, dtype=bool), np.full((2, 3, 2), np.nan)
         self._believed: tuple[np.ndarray, np.ndarray] | None = None  # the newest report, and the landmarks when it came
-        self._doubted, self._time = 0, -np.inf
+        self._doubted, self._time, self._older = 0, -np.inf, []
 
     def images(self, left: object, right: object, time_s: float) -> str:
         """Why this pair of images shows nothing new, "" where it does; call `landmarks` next."""
@@ -32,10 +33,19 @@ class FrameChecks:
         names = [name for name, (mean, sd) in looks if mean.mean() < _DARK or sd.max() < _FLAT]
         self._same = np.array([np.array_equal(now, before) for now, before in zip(thumbs, self._thumbs, strict=True)])
         self._thumbs = thumbs
-        late, self._time = time_s <= self._time, max(time_s, self._time)
-        if names:
-            return f"the {' and the '.join(names)} image is black or blank"
-        return "the frame is older than the one before" if late else ""
+        wrong = self._wrong_time(time_s)
+        return f"the {' and the '.join(names)} image is black or blank" if names else wrong
+
+    def _wrong_time(self, time_s: float) -> str:
+        if not np.isfinite(time_s):
+            return "the frame has no time"
+        if self._older and time_s <= self._older[-1]:
+            self._older = []
+        self._older = [*self._older, time_s] if time_s <= self._time else []
+        if self._older and len(self._older) <= _RESTARTED:
+            return "the frame is older than the one before"
+        self._time, self._older = time_s, []
+        return ""
 
     def landmarks(self, u: np.ndarray) -> str:
         """Why landmarks u (2, 3, 2) px, NaN = missing, are those of the frame before, "" where they are not."""
@@ -51,7 +61,7 @@ class FrameChecks:
         x, y, before = data.x_mm, np.hstack([data.u_left, data.u_right]), self._believed
         if not np.isfinite(x).all(axis=1).any():
             return "the robot reports nothing"
-        same = before is not None and np.array_equal(x, before[0])
+        same = before is not None and np.array_equal(x, before[0], equal_nan=True)
         if before is not None and self._doubted < 10:
             jump = np.nanmax(np.linalg.norm(x - before[0], axis=1), initial=0.0)
             if jump > _FAR_MM:

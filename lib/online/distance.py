@@ -17,6 +17,7 @@ from lib.surface import Reconstruction
 
 _WALK_MM = 0.005  # per square root of a second: how fast the correction may change
 _SMOOTH_S = 0.2  # over which the robot's velocity is averaged
+_SILENT_S = 0.5  # after so long without a report the velocity is not known
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,11 +37,12 @@ class TipDistance:
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
         self.reset()
-        self._x, self._velocity, self._moved_s = None, np.zeros((3, 3)), float("nan")
+        # Newest report of each landmark, its velocity and time.
+        self._x, self._velocity, self._moved_s = np.full((3, 3), np.nan), np.full((3, 3), np.nan), np.full(3, np.nan)
 
     def reset(self) -> None:
         """Forget the correction: the cameras that measured it are not where they were."""
-        self._correction, self._time = np.zeros((len(LANDMARKS), 3)), float("nan")
+        self._correction, self._time, self._seen_s = np.zeros((len(LANDMARKS), 3)), float("nan"), float("inf")
         self._covariance = np.tile(self.settings.slip_mm**2 * np.eye(3), (len(LANDMARKS), 1, 1))
 
     def measure(self, result: FrameResult, tracker: RigTracker, x_mm: np.ndarray, at: Surface | None) -> None:
@@ -51,17 +53,20 @@ class TipDistance:
         seen, covariance = self.triangulate(result, tracker)
         robot = np.isfinite(x_mm).all(axis=1)
         self._predict(result.time_s, x_mm)
+        self._seen_s = result.time_s if np.isfinite(seen).any() else self._seen_s
         if result.state == "tracking":
             self._correct(seen - tracker.corrected(result.landmarks).x_mm, covariance * tracker.persistence)
         x = np.where(robot[:, None], x_mm + self._correction, seen)
         own = self._covariance + self.settings.robot_accuracy_mm**2 * np.eye(3)
         covariance = np.where(robot[:, None, None], own, covariance)
-        if at is None or result.time_s - at.time_s > self.settings.stale_s:
+        age_s = float("nan") if at is None else result.time_s - at.time_s
+        if not 0.0 <= age_s <= self.settings.stale_s:  # below 0 where the clock started again
             return
         surface, camera = at.reconstruction.surface, at.reconstruction.rig.left
         found, view = surface.distance(x, camera), camera.viewing_direction
         result.distance_mm, result.normal_mm = found.along_view_mm, found.along_normal_mm
-        drift = self.settings.eye_mm_s * max(result.time_s - at.time_s, 0.0)
+        # What moves unseen is the eye since the surface, and cameras since the landmarks were seen.
+        drift = self.settings.eye_mm_s * max(age_s, result.time_s - self._seen_s)
         if not len(rows := np.flatnonzero(np.isfinite(found.along_view_mm))):
             return
         u = camera.project(x[rows])
@@ -70,13 +75,13 @@ class TipDistance:
         towards = slope @ camera.linear - view
         behind, nearest = np.split(surface.covariance(np.concatenate([u, found.nearest_u[rows]])), 2)
         normal = surface.normal(found.nearest_u[rows])
-        # The calibration puts the surface beside the robot's points, and not the tip.
-        tip = covariance[rows] + tracker.point_covariance(x[rows])
-        for sd, direction, along, own in (
-            (result.distance_sd_mm, towards, np.broadcast_to(view, towards.shape), behind),
-            (result.normal_sd_mm, normal, normal, nearest),
+        for sd, direction, along, own, at_mm in (
+            (result.distance_sd_mm, towards, np.broadcast_to(view, towards.shape), behind, surface(u)),
+            (result.normal_sd_mm, normal, normal, nearest, found.nearest_mm[rows]),
         ):
-            variance = np.einsum("ni,nij,nj->n", direction, tip, direction)
+            # The calibration puts the surface beside the robot's points, and not the tip.
+            apart = covariance[rows] + tracker.point_covariance(at_mm)
+            variance = np.einsum("ni,nij,nj->n", direction, apart, direction)
             sd[rows] = np.sqrt(variance + np.einsum("ni,nij,nj->n", along, own, along) + drift**2)
         result.approach_mm_s[rows] = -np.einsum("ni,ni->n", towards, self._velocity[rows])
         result.margin_mm = -ndtri(self.settings.miss_rate) * result.distance_sd_mm
@@ -94,12 +99,15 @@ class TipDistance:
         if np.isfinite(self._time) and time_s > self._time:
             self._covariance = np.minimum(self._covariance + _WALK_MM**2 * (time_s - self._time) * np.eye(3), 1.0)
         self._time = time_s
-        if not np.isfinite(x_mm).all():
-            return
-        if self._x is not None and time_s > self._moved_s:
-            step_s = time_s - self._moved_s
-            self._velocity += (1.0 - np.exp(-step_s / _SMOOTH_S)) * ((x_mm - self._x) / step_s - self._velocity)
-        self._x, self._moved_s = x_mm.copy(), time_s
+        step_s = time_s - self._moved_s
+        known = (step_s > 0) & (step_s <= _SILENT_S)
+        self._velocity[~known] = np.nan
+        for k in np.flatnonzero(np.isfinite(x_mm).all(axis=1)):
+            if known[k]:
+                now = (x_mm[k] - self._x[k]) / step_s[k]
+                before = self._velocity[k] if np.isfinite(self._velocity[k]).all() else now
+                self._velocity[k] = before + (1.0 - np.exp(-step_s[k] / _SMOOTH_S)) * (now - before)
+            self._x[k], self._moved_s[k] = x_mm[k], time_s
 
     def _correct(self, gap: np.ndarray, noise: np.ndarray) -> None:
         for k in np.flatnonzero(np.isfinite(gap).all(axis=1) & np.isfinite(noise).all(axis=(1, 2))):

@@ -21,6 +21,7 @@ from lib.online.surface_worker import Beside, SurfaceJob, make
 from lib.online.tracker import RigTracker, Seen
 from lib.surface import Reconstruction, reconstruct
 
+_JUMP_MM = 0.15  # by which a surface differs from one before only where the eye or the cameras moved
 _DEPTH_MARGIN_MM = 0.5  # how far an eye may move along the view from one surface to the next
 
 
@@ -55,6 +56,7 @@ class OnlinePipeline:
         self._tracker = RigTracker(rig, noise_px=float(noise_px), settings=self.settings, calibrate=calibrate)
         self._checks, self._tips = FrameChecks(), TipDistance(self.settings)
         self._surface: Surface | None = None
+        self._surface_seen: Surface | None = None  # the newest while the landmarks were in view
         self._pair: np.ndarray | None = None
         self._smoothness: float | None = None
         self._asked = self._most_points = self._rig_since = 0  # surfaces; most points since the last search everywhere
@@ -126,10 +128,16 @@ class OnlinePipeline:
             with result.stage("triangulate"):
                 self._tips.triangulate(result, tracker)
         self._follow_surface(result, left, right)
-        recent = time_s - self._rests_on["landmarks"] <= self.settings.stale_s
+        recent = 0.0 <= time_s - self._rests_on["landmarks"] <= self.settings.stale_s
+        if seen:
+            self._surface_seen = self._surface
+        elif result.state == "unseen" and self._surface_jumped():
+            recent, result.cause = False, "no landmarks, and eye or cameras moved since they were seen"
         if tracker.rig is not None and (result.state in ("tracking", "robot") or (result.state == "unseen" and recent)):
             with result.stage("distance"):
-                self._tips.measure(result, tracker, x_mm, self._surface)
+                # That a report is late, or the tool slipped, is what the tracker says, and not the frame's own checks.
+                told_mm = np.full((3, 3), np.nan) if result.state == "robot" else x_mm
+                self._tips.measure(result, tracker, told_mm, self._surface)
         surface_s = self._surface.time_s if self._surface else float("nan")
         result.rests_on = self._rests_on | {"rig": tracker.rests_on_s, "surface": surface_s}
         return result
@@ -139,6 +147,8 @@ class OnlinePipeline:
         if result.state == "moved":  # this frame alone
             return
         state, cause = self._tracker.state, self._tracker.cause
+        if state == "tracking" and self._tracker.is_unsettled(result.index):
+            state, cause = "moved", "the cameras seem to move again and again: something else has changed"
         measures = state in ("tracking", "robot")
         if blind:
             state, cause = "blind", blind
@@ -176,6 +186,17 @@ class OnlinePipeline:
         data = Correspondences.of_points(x, *u, frame=index, landmark=range(len(LANDMARKS)), **stated)
         return Seen(data, lambda rig: data)
 
+    def _surface_jumped(self) -> bool:
+        """Whether the newest surface lies elsewhere than the newest one while the landmarks were in view."""
+        now, before = self._surface, self._surface_seen
+        if now is None or before is None or now is before:
+            return False
+        u, view = now.reconstruction.u, now.reconstruction.rig.left.viewing_direction
+        u = u[:: len(u) // 100 + 1]
+        apart = (now.reconstruction.surface(u) - before.reconstruction.surface(u)) @ view
+        apart = np.abs(apart[np.isfinite(apart)])
+        return not len(apart) or bool(np.median(apart) > _JUMP_MM)
+
     def _where_to_search(self) -> dict[str, Any]:
         """Where to match: near the last surface, but everywhere in every tenth frame, for a new rig, or after few points."""
         last, self._asked = self._surface, self._asked + 1
@@ -188,12 +209,11 @@ class OnlinePipeline:
     def _follow_surface(self, result: FrameResult, left: np.ndarray, right: np.ndarray) -> None:
         """Ask for a surface of this frame, and take the newest that is there."""
         tracker = self._tracker
-        if tracker.doubted_since is not None or tracker.rig is None:
-            if self._beside:
-                self._beside.forget()
-            if self._surface is not None and (tracker.rig is None or self._surface.index >= tracker.doubted_since):
-                self._surface = None  # its cameras stood elsewhere
-        done, due = [], self._index % self.settings.surface_every == 0
+        if self._beside and (tracker.doubted_since is not None or tracker.rig is None):
+            self._beside.forget()
+        if self._surface is not None and tracker.doubts(self._surface.index):
+            self._surface = None  # its cameras stood elsewhere
+        done, due = [], self._index % self.settings.surface_every == 0 or result.motion is not None
         if due and result.state in ("tracking", "unseen", "robot") and tracker.doubted_since is None:
             tool = result.landmarks.u_left, result.landmarks.u_right
             options = {"setting": self.settings.setting, "control": self.settings.control, "smoothness": self._smoothness}
@@ -211,7 +231,7 @@ class OnlinePipeline:
         for surface in done:
             result.seconds.update(surface.seconds)  # a counter adds
             result.failures |= surface.failures
-            if surface.reconstruction is not None:
+            if surface.reconstruction is not None and not tracker.doubts(surface.index):
                 # Chosen by held-out error once: the eye is the same in the next frame.
                 self._surface, self._smoothness = surface, surface.reconstruction.surface.fit.smoothness
                 self._most_points = max(self._most_points, len(surface.reconstruction.u))

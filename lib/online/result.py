@@ -21,10 +21,11 @@ STAGES = ("detect", "calibrate", "register", "match", "triangulate", "surface", 
 STATES = {
     "calibrating": "there is no rig yet, or the optics changed; no distances",
     "tracking": "images, robot and rig agree; distances from all three",
-    "unseen": "the eye is in view and the landmarks are not; distances from the robot's report, with a growing sd",
+    "unseen": "the eye is in view and the landmarks are not; distances from the robot's report, with a growing sd, until the "
+    "surface is not where it was",
     "blind": "an image is black, corrupt, or repeats the one before; no distances",
     "robot": "the robot's report is missing, frozen or late, or the tool slipped; distances from the images",
-    "moved": "images and robot disagree and nothing explains it yet; no distances",
+    "moved": "images and robot disagree and nothing lasting explains it, or a camera's images are late; no distances",
 }
 
 
@@ -43,7 +44,7 @@ class Settings:
         control: Control points of the surface (n_x, n_y).
         fps: Frames a second, for frames that come without a time.
         stale_s: Distances end where the surface, or the last sight of the landmarks, is older.
-        eye_mm_s: Speed at which the eye may move unseen, by which the distance's standard deviation grows.
+        eye_mm_s: Speed at which eye and cameras may move unseen, by which the distance's standard deviation grows.
         slip_mm: Standard deviation of how far the landmarks may lie off the robot's report, beside its own accuracy.
         robot_accuracy_mm: Standard deviation of the robot's report, per coordinate.
         alarm_mm, miss_rate: A tip is `too_close` where its distance may be below alarm_mm: a true one below it is missed with
@@ -94,7 +95,8 @@ class FrameResult:
         distance_mm, distance_sd_mm: (3,) from each landmark to the surface along the view, positive = above it, and its
             standard deviation: detector, robot, calibration, surface and the surface's age.
         normal_mm, normal_sd_mm: The same along the surface's normal.
-        approach_mm_s: (3,) speed at which the robot takes each landmark towards the surface, along the view.
+        approach_mm_s: (3,) speed at which the robot takes each landmark towards the surface, along the view; NaN where it has
+            been silent for half a second.
         too_close, margin_mm: (3,) alarm of `Settings.alarm_mm`, and how far above it the alarm already sounds.
         rests_on: Time in s of the newest frame behind each of "landmarks", "robot", "rig" and "surface"; NaN = none.
         drift: Statistic of the drift monitor, in units of its alarm threshold.

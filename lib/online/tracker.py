@@ -18,6 +18,7 @@ _CHI2_4_MEDIAN = 3.357
 _STANDS_OUT = 8.0  # score of a single frame that is not to be believed
 _FAR_MM = 200.0  # of the robot's median position: no tool reaches that far
 _PAST = 40  # frames kept to find a late report
+_AGAIN = 30  # frames after a registration in which no microscope moves again; then the registration was no explanation
 
 
 @dataclass(frozen=True)
@@ -61,6 +62,8 @@ class RigTracker:
         self._motion: MovedCameras | None = None  # that led to this rig, and to the one before
         self._motion_before: MovedCameras | None = None
         self._waiting, self._held, self.rests_on_s, self.doubted_since = 0, False, float("nan"), None
+        # Numbers of frames: the newest registration, the newest motion soon after one, from a motion to its registration.
+        self._registered, self._again, self._astray = -_AGAIN, -_AGAIN, range(0)
 
     def _use(self, found: StereoRig | Calibration) -> None:
         rig, calibration = (found.rig, found) if isinstance(found, Calibration) else (found, None)
@@ -76,6 +79,15 @@ class RigTracker:
             scatter, n = np.median(chi2) / _CHI2_4_MEDIAN, len(chi2)
             # Corrected for the 16 parameters that the residuals have paid for, and the upper end of what so few allow.
             self._scale2 = scatter / (1.0 - 16.0 / max(4 * n, 17)) * (1.0 + 1.0 / np.sqrt(n)) ** 2
+
+    def doubts(self, index: int) -> bool:
+        """Whether the cameras had moved in frame number `index` and the rig of then had not."""
+        since = self.doubted_since
+        return self.rig is None or index in self._astray or (since is not None and index >= since)
+
+    def is_unsettled(self, index: int) -> bool:
+        """Whether the newest registration is doubted, because one not long before it did not last."""
+        return index - self._again < _AGAIN
 
     def take(self, result: FrameResult, frame: Seen) -> None:
         """A frame with landmarks that both images and the robot know."""
@@ -161,6 +173,7 @@ class RigTracker:
             self.doubted_since = int(self._since[0].data.frame[0])
             if self._before is None:
                 self._before, self._motion_before = self.rig, self._motion
+                self._again = result.index if result.index - self._registered < _AGAIN else self._again
             monitor.forget()
             self._recent.clear()
             self._resolve(result)
@@ -197,7 +210,7 @@ class RigTracker:
         try:
             past = [self.corrected(part) for part in self._past]
             found = explain(self._before, frames, past, self._noise(joined), undecided=len(frames) < last)
-            shifted = found.kind in ("clock", "slipped", "exchanged")
+            shifted = found.kind in ("clock", "slipped", "exchanged", "eye")
             if not (found.loss <= CONVINCING if shifted else found.kind == "open" or self._fits(found.rig, newest)):
                 raise ValueError("no cause explains the newest frames.")
         except ValueError as error:
@@ -208,9 +221,9 @@ class RigTracker:
                 self._start_again(self._since, "no cause explains the images; calibrating afresh")
             raise
         if found.kind == "open":
-            self.cause = found.text
+            self.cause = self.cause if self._held else found.text
         elif shifted:
-            self.state, self.cause = "robot" if found.kind != "exchanged" else "moved", found.text
+            self.state, self.cause = "robot" if found.kind in ("clock", "slipped") else "moved", found.text
             self._held, self._waiting, self.rig, self._motion = True, 1, self._before, self._motion_before
             self._since, result.failures["robot"] = self._since[1 - first :], found.text
         elif found.kind == "optics":
@@ -221,8 +234,10 @@ class RigTracker:
             self._settle()
         else:
             self.rig, self.state, self.cause = found.rig, "tracking", ""
-            result.motion = self._motion = found.motion
+            result.motion, self._motion, self._registered = found.motion, found.motion, result.index
             self._monitor.reset(found.rig)
+            if self.doubted_since is not None:
+                self._astray = range(self.doubted_since, result.index)
             self.rests_on_s, self.doubted_since = result.time_s, None
             if len(self._since) >= last:
                 self._settle()
@@ -274,9 +289,17 @@ class RigTracker:
         own = np.zeros((len(x_mm), 3, 3))
         if self.calibration is not None:
             own += self.calibration.point_covariance(x_mm, detection=False) * self._remains(x_mm)
-        moves = [motion for motion in self._motions if motion is not None]
-        stale = [motion.covariance_at(motion.transform.inverse().apply(x_mm)) for motion in moves]
-        return own + sum(stale) / max(len(moves), 1)
+        left, right = self._motions
+        if left is right:
+            return own if left is None else own + left.covariance_at(left.transform.inverse().apply(x_mm))
+        # A camera alone does not know its shift along its own view, which it does not show; what it shows becomes depth.
+        J, pixels = self.rig.jacobian(x_mm), np.zeros((len(x_mm), 4, 4))
+        for motion, rows in zip(self._motions, (slice(0, 2), slice(2, 4)), strict=True):
+            if motion is not None:
+                stale = motion.covariance_at(motion.transform.inverse().apply(x_mm))
+                pixels[:, rows, rows] = J[:, rows] @ stale @ J[:, rows].mT
+        gain = np.linalg.solve(J.mT @ J, J.mT)
+        return own + gain @ pixels @ gain.mT
 
     def _remains(self, x_mm: np.ndarray) -> np.ndarray:
         return np.ones((1, 1, 1)) if self._online is None else self._online.remains(x_mm)[:, None, None]

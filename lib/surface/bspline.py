@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.interpolate import BSpline
 from scipy.linalg import cho_solve_banded
+from scipy.spatial import KDTree
 
 from lib.cameras import AffineCamera
 from lib.geometry import finite_points, points, store_array
@@ -74,7 +75,7 @@ class ToolDistance:
     """Distance of points to a surface; positive on the camera's side of it, NaN outside the domain.
 
     `along_view_mm` (n,) is to the surface point that the camera sees behind the tool, `along_normal_mm` (n,) to the nearest
-    one, which is `nearest_mm` (n, 3) with the parameter `nearest_u` (n, 2).
+    one, which is `nearest_mm` (n, 3) with the parameter `nearest_u` (n, 2); NaN where that lies beyond the domain's border.
     """
 
     along_view_mm: np.ndarray
@@ -123,7 +124,9 @@ class BSplineSurface:
         """Points (len(y), len(x), 3) on the lattice of columns `x_px` and rows `y_px`: fast for whole images."""
         values = self.control_points_mm
         for axis, u in ((1, x_px), (0, y_px)):
-            position = (np.asarray(u, dtype=np.float64) - self.grid.domain[1 - axis]) / self.grid.cell_px[1 - axis]
+            u, low, high = np.asarray(u, dtype=np.float64), self.grid.domain[1 - axis], self.grid.domain[3 - axis]
+            position = (u - low) / self.grid.cell_px[1 - axis]
+            position = np.where((u >= low) & (u <= high), np.clip(position, 0, values.shape[axis] - 3), position)  # rounding
             values = BSpline(np.arange(-3.0, values.shape[axis] + 1), values, 3, axis=axis, extrapolate=False)(position)
         return values
 
@@ -151,17 +154,25 @@ class BSplineSurface:
             result[part] = np.einsum("ki,nkl,lj->nij", axes, sigma[:, :, None] * correlation * sigma[:, None, :], axes)
         return result
 
+    @cached_property
+    def _lattice(self) -> tuple[np.ndarray, KDTree]:
+        """Image points (m, 2), three a cell, and a search tree of the surface there; its nearest is in the right valley."""
+        low, high = np.reshape(self.grid.domain, (2, 2))
+        x, y = (np.linspace(*ends) for ends in zip(low, high, 3 * np.array(self.grid.cells) + 1, strict=True))
+        return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2), KDTree(self.on_grid(x, y).reshape(-1, 3))
+
     def distance(self, x_mm: ArrayLike, camera: AffineCamera) -> ToolDistance:
         """Distance of points (n, 3), such as tool tips, to the surface along the view and along the surface's normal.
 
         The points are in the frame of the surface, NaN rows stay NaN; `camera` is the left one, whose image parametrises it.
         """
         x = points(x_mm, 3, "x_mm")
-        start = camera.project(x)
-        along_view = (self(start) - x) @ camera.viewing_direction
+        behind = camera.project(x)
+        along_view = (self(behind) - x) @ camera.viewing_direction
         low, high = np.reshape(self.grid.domain, (2, 2))
-        u = np.clip(start, low, high)
-        seen = np.isfinite(u).all(axis=1)
+        u, seen = np.full_like(behind, np.nan), np.isfinite(along_view)
+        lattice, tree = self._lattice
+        u[seen] = lattice[tree.query(x[seen])[1]]
         for _ in range(20):  # Gauss-Newton steps towards the nearest point; each stays inside the domain
             orders = (0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2)
             psi, psi_x, psi_y, psi_xx, psi_xy, psi_yy = (self.derivative(u[seen], order) for order in orders)
@@ -173,11 +184,11 @@ class BSplineSurface:
             convex = (np.linalg.det(hessian) > 0) & (hessian[:, 0, 0] > 0)
             hessian[~convex] = normal[~convex]
             step = np.linalg.solve(hessian, np.einsum("nki,nk->ni", jacobian, gap)[..., None])[..., 0]
-            u[seen] = np.clip(u[seen] + step, low, high)
-            if not step.size or np.abs(step).max() < 1e-7:
+            before, u[seen] = u[seen], np.clip(u[seen] + step, low, high)
+            if np.abs(u[seen] - before).max(initial=0.0) < 1e-7:
                 break
         # At the domain's border the nearest point may lie beyond it: then there is none to name.
-        u[~np.isfinite(along_view)] = np.nan
+        u[seen] = np.where((np.abs(before + step - u[seen]) < 1e-6).all(axis=1, keepdims=True), u[seen], np.nan)
         nearest = self(u)
         return ToolDistance(along_view, np.einsum("nk,nk->n", x - nearest, self.normal(u)), nearest, u)
 

@@ -130,7 +130,7 @@ def _interior_point(
     x = x - centre
 
     # A least-squares spline starts it, and its residuals give the unit of length.
-    unit = max(np.abs(x).max(), np.finfo(float).tiny)
+    unit = max(np.abs(x).max(), 1e-9)  # x may be constant
     if (factor := cholesky(problem.normal_band(w, 2 * mu / unit))) is None:
         raise ValueError(UNHELD)
     c = dpbtrs(factor, B_T @ (w * x), lower=1)[0]

@@ -319,6 +319,7 @@ def test_exports_hold_the_cameras(model, tmp_path):
             np.testing.assert_array_equal(P[2], [0, 0, 0, 1])
         if getattr(camera, "radial_per_px2", 0):
             assert storage.getNode("radial_per_px2").real() == camera.radial_per_px2
+            np.testing.assert_array_equal(storage.getNode("distortion_centre").mat().ravel(), camera.centre_px)
             with pytest.raises(ValueError, match="radial"):
                 write_ros(camera, tmp_path / "info.yaml", (1920, 1080))
             continue

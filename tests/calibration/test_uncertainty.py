@@ -82,6 +82,17 @@ def test_covariance_of_points_holds_calibration_and_detection():
     assert np.mean(distances) == pytest.approx(3, rel=0.15)
 
 
+def test_the_calibrations_share_goes_through_the_gain_of_the_weighted_estimate():
+    c, found = made(20)
+    noise = np.diag([25.0, 25.0, 0.1, 0.1])
+    points = found.triangulate(c.u_left[:3], c.u_right[:3], noise)
+    own = found.rig.triangulate(c.u_left[:3], c.u_right[:3], noise).covariance_mm2
+    moved = [np.hstack([c.u_left[:3], c.u_right[:3]]) + step for step in np.eye(4)]  # the estimate is linear in the pixels
+    gain = np.stack([found.rig.triangulate(v[:, :2], v[:, 2:], noise).x_mm - points.x_mm for v in moved], axis=2)
+    expected = own + gain @ found.projection_covariance(points.x_mm) @ gain.mT
+    np.testing.assert_allclose(points.covariance_mm2, expected, rtol=1e-6, atol=1e-12)
+
+
 def test_depth_map_grows_away_from_the_data():
     c, found = made(60, half_size_mm=(3, 2, 1))
     z = ROBOT_FROM_MICROSCOPE.apply(np.array([[0, 0, 0], [6, 0, 0], [6, 4, 0], [6, 4, 3.0]]))

@@ -239,6 +239,10 @@ def test_a_rig_without_parallax_is_refused(affine_pair):
         ({"depth_range_mm": (3, 1)}, "depth_range_mm: expected .near, far."),
         ({"depth_range_mm": (0, np.nan)}, "depth_range_mm: expected .near, far."),
         ({"method": "deepmatching", "downscale": 9}, "downscale: expected 0 to"),
+        ({"method": "deepmatching", "downscale": 0.5}, "downscale: expected 0 to"),
+        ({"method": "deepmatching", "device": "foo"}, "device: 'foo' cannot be used"),
+        ({"min_score": np.nan}, "min_score: expected a number"),
+        ({"max_epipolar_px": np.nan}, "max_epipolar_px: expected a number"),
         ({"method": "deepmatching", "downscale": 1, "budget_bytes": 1000}, "budget_bytes: .* needs .* GiB"),
     ],
 )

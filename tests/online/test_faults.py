@@ -15,7 +15,7 @@ from lib.correspondences import Correspondences
 from lib.online import Settings
 from lib.online.checks import FrameChecks
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
-from tests.online.world import BLACK, RIG, SELDOM, World, make, rig_error_mm, run, shifted, started
+from tests.online.world import BLACK, CENTRE_MM, RIG, SELDOM, World, make, rig_error_mm, run, shifted, started
 
 NOISE_PX = 0.6
 VIEW = ROBOT_FROM_MICROSCOPE.R[:, 2]
@@ -44,9 +44,10 @@ def test_frozen_video_is_noticed_and_never_calibrated_with():
         assert rig_error_mm(pipeline.rig, world) < max(0.03, 1.5 * rig_error_mm(before, world))
 
 
-@pytest.mark.parametrize("confidence", [1.0, 0.1])
-def test_a_report_is_frozen_while_the_tool_moves_however_doubtful_the_detector(confidence):
+@pytest.mark.parametrize(("confidence", "unreported"), [(1.0, 0), (0.1, 0), (1.0, 1)])
+def test_a_report_is_frozen_while_the_tool_moves_however_doubtful_the_detector(confidence, unreported):
     x, u = np.eye(3), np.arange(6.0).reshape(3, 2)
+    x[:unreported] = np.nan
     how = {"frame": np.zeros(3, int), "landmark": np.arange(3), "confidence": np.full((3, 2), confidence)}
     checks = FrameChecks()
     assert checks.robot(Correspondences.of_points(x, u, u, **how)) == ""
@@ -163,12 +164,44 @@ def test_late_kinematics_are_named_and_the_rig_is_kept():
     for _ in range(40):
         told.append(world.advance())
         results.append(pipeline.step(*world.images, told.pop(0)))
+    last = results[-1]
+    seen = last.reconstruction.surface.distance(last.x_tool_mm, rig.left).along_view_mm
+    np.testing.assert_allclose(last.distance_mm, seen, rtol=1e-3)  # not from the late report
     assert any("late by 5 frames" in r.cause for r in results[:8])
     assert not any(r.state == "tracking" for r in results[5:])
     assert not any(r.motion for r in results)
     assert pipeline.rig is rig
     after = run(pipeline, world, 30)
     assert all(r.state == "tracking" for r in after[10:])
+
+
+@pytest.mark.parametrize("side", [0, 1])
+def test_one_late_camera_is_named_and_no_motion(side):
+    world, pipeline, _ = started(100, sigma_px=NOISE_PX, smooth=True)
+    queue = [world.detect(np.stack(world.images)).u[side]]
+
+    def detect(images):
+        found = world.detect(images)
+        queue.append(found.u[side].copy())
+        found.u[side] = queue.pop(0)
+        return found
+
+    pipeline._detector = detect
+    results = run(pipeline, world, 10)
+    assert any(f"the {('left', 'right')[side]} images are late by 1 frames" in r.cause for r in results)
+    assert not any(measured(results)[2:])
+    assert not any(r.motion for r in results)
+
+
+def test_motions_that_do_not_last_are_no_motions():
+    """The robot's report is scaled: each registration explains it where the tool is, and not where it goes."""
+    world, pipeline, _ = started(100, sigma_px=NOISE_PX, smooth=True)
+    results = []
+    for _ in range(32):
+        told = world.advance()
+        results.append(pipeline.step(*world.images, CENTRE_MM + 1.01 * (told - CENTRE_MM)))
+    assert not any(measured(results)[26:])
+    assert any("again and again" in r.cause for r in results)
 
 
 def test_frozen_kinematics_are_named_at_once():
@@ -212,9 +245,49 @@ def test_a_tool_out_of_view_and_back():
     assert run(pipeline, world, 1)[0].state == "tracking"
 
 
+def test_cameras_that_move_while_the_tool_is_out_of_view_give_no_distances():
+    world = World(11, NOISE_PX, still=True)
+    pipeline = make(world, rig=RIG, noise_px=NOISE_PX)
+    run(pipeline, world, 5)
+    nothing = {"u": np.full((2, 3, 2), np.nan), "confidence": np.zeros((2, 3))}
+    pipeline._detector = lambda images: replace(world.detect(images), **nothing)
+    results = run(pipeline, world, 50)
+    assert all(measured(results))
+    assert results[-1].distance_sd_mm[0] > results[0].distance_sd_mm[0] + 0.02  # as much as cameras may have moved
+    world.rig = shifted(RIG, 0.3 * VIEW)
+    results = run(pipeline, world, 3)
+    assert all(r.state == "unseen" and "cameras moved" in r.cause for r in results)
+    assert not any(measured(results))
+
+
 def test_reordered_frames_are_left_out():
     world, pipeline = calibrated()
     assert "older" in pipeline.step(*world.images, world.advance(), time_s=1.0).failures["images"]
+
+
+@pytest.mark.parametrize("wrong_s", [np.nan, 1e6, -50.0])
+def test_a_wrong_time_costs_few_frames(wrong_s):
+    world, pipeline = calibrated()
+    results = [pipeline.step(*world.images, world.advance(), time_s=wrong_s)]
+    later = 2.4 if wrong_s > 0 else max(np.nan_to_num(wrong_s, nan=2.4), -50.0)  # a clock that restarts goes on from there
+    results += [pipeline.step(*world.images, world.advance(), time_s=later + i / 25) for i in range(1, 41)]
+    assert results[0].state == "blind" or wrong_s > 0
+    assert all(r.state == "tracking" for r in results[11:])
+    for r in results:
+        assert np.isfinite(r.distance_sd_mm).all() == np.isfinite(r.distance_mm).all()
+    assert np.isfinite(results[-1].distance_mm).all()
+
+
+def test_the_approach_is_that_of_the_newest_reports():
+    world, pipeline = calibrated(60, smooth=True)
+    there = np.ones((3, 1))
+    there[2] = np.nan  # never reported from now on
+    results = [pipeline.step(*world.images, world.advance() * there) for _ in range(25)]
+    assert np.isfinite(results[-1].approach_mm_s).tolist() == [True, True, False]
+    results = [pipeline.step(*world.images, world.advance() * np.nan) for _ in range(25)]
+    assert np.isfinite(results[2].approach_mm_s).tolist() == [True, True, False]
+    assert np.isnan(results[-1].approach_mm_s).all()
+    assert np.isfinite(results[-1].distance_mm).all()
 
 
 @cache
@@ -236,6 +309,17 @@ def test_small_shifts_are_noticed(shift_mm, within):
         results = run(pipeline, world, 30)
         delays.append(next((i + 1 for i, r in enumerate(results) if r.drift > 1), 99))
     assert np.median(delays) <= within
+
+
+def test_a_surface_of_the_rig_before_ends_with_the_registration():
+    world, pipeline = deepcopy(quiet(20))
+    run(pipeline, world, 9)
+    world.rig = shifted(RIG, 0.05 * VIEW)
+    results = run(pipeline, world, 20)
+    assert results[1].reconstructed  # in every 20th frame, and the motion is not noticed yet
+    registered = next(r for r in results if r.motion)
+    assert registered.reconstructed
+    assert np.abs(results[-1].distance_mm - world.true_distance_mm()).max() < 0.04
 
 
 def test_memory_is_flat():

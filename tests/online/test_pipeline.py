@@ -60,12 +60,21 @@ def test_moved_cameras_are_noticed_and_registered(moved):
     assert results[-1].state == "tracking"
     assert [r.motion for r in results if r.motion][-1].moved == moved
     assert rig_error_mm(pipeline.rig, world) < 0.12
-    assert not np.isnan(results[-1].distance_mm).any()
+    # A camera alone shows no shift along its own view, and what it shows becomes depth.
+    assert (np.abs(results[-1].distance_mm - world.true_distance_mm()) < 4 * results[-1].distance_sd_mm).all()
     # And it goes on: the next hundred frames hold still, the next motion is noticed again.
     assert all(r.state == "tracking" for r in run(pipeline, world, 30))
     world.rig = world.rig.moved(a)
     assert any(r.motion for r in run(pipeline, world, 5))
     assert rig_error_mm(pipeline.rig, world) < 0.3
+
+
+def test_the_sd_of_the_distance_is_that_of_the_surface_far_below_the_tool():
+    world = World(1)
+    world.depth_mm = 8.0  # the first calibration puts it 0.3 mm too deep
+    last = run(make(world), world, 9)[-1]
+    assert (np.abs(last.distance_mm - world.true_distance_mm()) < 3 * last.distance_sd_mm).all()
+    np.testing.assert_allclose(last.normal_sd_mm, last.distance_sd_mm, rtol=0.05)  # the plane is nearly across the view
 
 
 def test_changed_optics_are_calibrated_afresh():

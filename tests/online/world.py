@@ -83,6 +83,9 @@ class Plane:
     def __init__(self, u: np.ndarray, x: np.ndarray) -> None:
         self.coefficients = np.linalg.lstsq(np.column_stack([u, np.ones(len(u))]), x, rcond=None)[0]
 
+    def __call__(self, u: np.ndarray) -> np.ndarray:
+        return np.column_stack([u, np.ones(len(u))]) @ self.coefficients
+
     def derivative(self, u: np.ndarray, order: tuple[int, int]) -> np.ndarray:
         return np.tile(self.coefficients[order.index(1)], (len(u), 1))
 
@@ -95,9 +98,10 @@ class Plane:
 
     def distance(self, x_mm: np.ndarray, camera: AffineCamera) -> SimpleNamespace:
         u = camera.project(x_mm)
-        gap = np.column_stack([u, np.ones(len(x_mm))]) @ self.coefficients - x_mm
+        gap = self(u) - x_mm
         along_normal = -np.einsum("ni,ni->n", gap, self.normal(u))
-        return SimpleNamespace(along_view_mm=gap @ camera.viewing_direction, along_normal_mm=along_normal, nearest_u=u)
+        nearest = {"nearest_u": u, "nearest_mm": self(u)}
+        return SimpleNamespace(along_view_mm=gap @ camera.viewing_direction, along_normal_mm=along_normal, **nearest)
 
 
 def make(world: World, **options) -> OnlinePipeline:

@@ -118,6 +118,26 @@ def test_distance_of_a_tool_along_view_and_normal():
     assert np.isnan(lost.along_view_mm).all() and np.isnan(lost.along_normal_mm).all()
 
 
+def test_the_nearest_point_lies_in_the_right_valley_or_beyond_the_border():
+    wavy = graph_surface(lambda x, y: 0.15 * np.sin(9 * x) + 0.4 * y)
+    x = np.random.default_rng(3).uniform([-0.9, -0.9, -1.0], [0.9, 0.9, 0.5], (60, 3))
+    found = wavy.distance(x, AffineCamera([[100.0, 0, 0, 0], [0, 100.0, 0, 0]]))
+    lattice = np.linspace(-100, 100, 401)
+    points = wavy.on_grid(lattice, lattice).reshape(-1, 3)
+    nearest = np.array([np.linalg.norm(points - tip, axis=1).min() for tip in x])
+    named = np.isfinite(found.along_normal_mm)
+    assert 0.5 < named.mean() < 1.0  # where the tool is beyond the tilted surface's border there is none to name
+    np.testing.assert_allclose(np.abs(found.along_normal_mm[named]), nearest[named], atol=2e-3)
+    assert np.isfinite(found.along_view_mm).all()
+
+
+def test_a_lattice_reaches_the_domains_own_corners():
+    for x0, y0, x1, y1 in np.random.default_rng(0).uniform([0, 0, 600, 600], [500, 500, 1900, 1900], (100, 4)):
+        surface = BSplineSurface(SplineGrid((x0, y0, x1, y1), (16, 12)), np.ones((12, 16, 3)))
+        assert np.isfinite(surface.on_grid([x0, x1], [y0, y1])).all()
+        assert np.isnan(surface.on_grid([x0 - 0.1], [y0])).all()
+
+
 @pytest.mark.parametrize(
     ("domain", "control", "named"),
     [

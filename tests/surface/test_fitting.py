@@ -150,9 +150,10 @@ def test_uncertainty_grows_where_points_are_missing(bowl):
     assert np.isnan(surface.covariance([[0.0, 0.0]])).all()
 
 
-def test_planes_and_exact_data_are_fine():
+@pytest.mark.parametrize("slope", [(0.01, 0.02), (0.0, 0.0)])
+def test_planes_and_exact_data_are_fine(slope):
     u = np.random.default_rng(0).uniform(0, 100, (200, 2))
-    x = np.column_stack([u / 100, u @ [0.01, 0.02]])
+    x = np.column_stack([u / 100, u @ slope])
     surface = fit_surface(u, x, domain=(0, 0, 100, 100), control=(8, 8))
     np.testing.assert_allclose(surface(u), x, atol=1e-6)
 
