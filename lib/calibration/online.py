@@ -15,7 +15,8 @@ class OnlineCalibration:
 
     It has the calibration's camera model, and its information from the calibration's rows; each new row counts by its own
     covariance, or the calibration's where it states none.  So it starts where the calibration ended, and the calibration's
-    noise levels judge the new rows.
+    noise levels judge the new rows.  `drift_mm` is the standard deviation along each axis by which the cameras may shift in a
+    second, a random walk: without it a slow shift ends in the parameters that the rows tell least well.
 
     >>> from lib.calibration import calibrate
     >>> rng, A = np.random.default_rng(0), np.array([[99.0, 0, -9], [0, 99, 0], [99, 0, 9], [0, 99, 0]])
@@ -28,13 +29,21 @@ class OnlineCalibration:
     [99, 0, -9]
     """
 
-    def __init__(self, calibration: Calibration) -> None:
+    def __init__(self, calibration: Calibration, *, drift_mm: float = 0.0) -> None:
         self._calibration, self._state = calibration, calibration.minimum.state
         self._information = calibration.minimum.information
         self._covariance = self._first = inverse(self._information)
+        _, by_points, by_parameters = self._state.evaluate(calibration.x_mm[calibration.inliers])
+        # What a shift of the cameras changes, which moves the images as the opposite shift of all points does.
+        shift = drift_mm * np.linalg.lstsq(np.concatenate(by_parameters), np.concatenate(by_points), rcond=None)[0]
+        self._drift, self._time_s = shift @ shift.T, -np.inf
 
     def add(self, data: Correspondences) -> np.ndarray:
         """Fold in the rows of a frame; returns the views (n, 2) bool that were used, those the rig so far does not refuse."""
+        before_s, self._time_s = self._time_s, data.time_s[np.isfinite(data.time_s)].max(initial=self._time_s)
+        if np.isfinite(before_s):
+            self._covariance = self._covariance + (self._time_s - before_s) * self._drift
+            self._information = inverse(self._covariance)
         known, variance_x = self._calibration, self._calibration.sigma_x_mm**2
         used = data.seen & np.isfinite(data.x_mm).all(axis=1, keepdims=True)
         pixels, noise = data.stacked_px, known.detection_covariance(data)
