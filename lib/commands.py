@@ -9,7 +9,6 @@ import json
 import shlex
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -79,7 +78,7 @@ def main_detect(argv: list[str]) -> int:
     data = _data(a, recording)
     _write_landmarks(out / "landmarks.csv", recording, data)
     print(f"{int(data.seen.sum())} of {data.seen.size} landmarks found. Wrote {out / 'landmarks.csv'}.")
-    print(_assessed(a, recording, data).verdict)
+    print(assess(recording, data, detector=a.detector, model=a.model).verdict)
     return 0
 
 
@@ -141,7 +140,7 @@ def main_register(argv: list[str]) -> int:
     print(f"The cameras moved by {shift_mm:.3f} mm at the tool, standard deviation {found.translation_sd_mm.max():.3f} mm.")
     if len(seen):
         print(f"The tool is now {medians[1]:.3f} mm from where the robot reports it (median).")
-    found = _assessed(a, recording, data)
+    found = assess(recording, data, detector=a.detector, model=a.model)
     return _done(a, out, "registration", numbers, Verdict.join([_as_one(moved, found), found.verdict]))
 
 
@@ -200,14 +199,6 @@ def _data(a: argparse.Namespace, recording: Recording, frames: np.ndarray | None
     return detect(recording, a.detector, frames=frames)
 
 
-def _assessed(a: argparse.Namespace, recording: Recording, data: Correspondences) -> Assessment:
-    found = assess(recording, data, detector=a.detector, model=a.model)
-    if not Model.parse(a.model, 2).distance:
-        return found
-    reasons = tuple(reason for reason in found.verdict.reasons if reason.name != "finite_distance")  # these cameras have it
-    return replace(found, verdict=Verdict(reasons))
-
-
 def _calibrated(
     a: argparse.Namespace, recording: Recording, out: Path
 ) -> tuple[Calibration | StereoRig | None, Verdict, Correspondences]:
@@ -218,7 +209,7 @@ def _calibrated(
         text = f"{a.rig} was not calibrated from this recording, and nothing here tests it."
         cure = f"Run: {shlex.join(['python3', '-m', 'lib', 'register', str(a.recording), '--rig', str(a.rig)])}"
         return StereoRig.load(a.rig), Verdict((Reason("rig_given", LEVELS[1], text, cure),)), data
-    found = _assessed(a, recording, data)
+    found = assess(recording, data, detector=a.detector, model=a.model)
     if found.calibration is not None and (a.force or not found.verdict.is_red):
         (out / "verdict.json").unlink(missing_ok=True)  # of an earlier run that was refused
         return found.calibration, found.verdict, data

@@ -84,6 +84,8 @@ def epipolar_px(recording: Recording, seen: Sequence[Seen], all_seen: Seen) -> l
     if agree.sum() < _FEWEST:
         matches = all_seen.stacked_px.reshape(-1, 4)
         agree = affine_epipolar(matches)[1]
+    if agree.sum() < 4:
+        raise RefusalError("images: left and right share too few features and landmarks, so nothing could judge a gain.")
     middle = matches[agree].mean(axis=0)
     normal = np.linalg.svd(matches[agree] - middle, full_matrices=False)[2][3]
     return [np.nan_to_num(np.sqrt(2) * np.abs((own.stacked_px - middle) @ normal), nan=np.inf) for own in seen]

@@ -212,9 +212,9 @@ def teach(
         raise RefusalError(f"robot: {fault.text} {fault.cure}")
     offset, sd = np.zeros((3, 3)), np.full((3, 3), 0.0 if calibration.offsets is not None else 0.1)
     told, turns = calibration.offsets, False
-    if by_hand is not None:
-        told = None
-    elif opinion is not None:
+    by_hand = by_hand and by_hand.of(np.setdiff1d(by_hand.frame, refused))
+    clicked = by_hand is not None and len(by_hand.frame) > 0
+    if opinion is not None and not clicked:
         shares = (opinion.confidence >= MIN_CONFIDENCE).mean(axis=(0, 1))
         if shares.min() < LEAST_RIGHT * shares.max():
             rare, often = LANDMARKS[shares.argmin()], LANDMARKS[shares.argmax()]
@@ -230,7 +230,7 @@ def teach(
         x = recording.landmarks_mm()
         length = np.nanmedian(np.linalg.norm(x[:, 1:].mean(axis=1) - x[:, 0], axis=1))
         size_mm = np.linalg.norm(told.offset, axis=1)
-        if size_mm.max() > max(_LARGEST_OFFSET * length, _LARGEST_OFFSET_MM) and not from_labels:
+        if size_mm.max() > max(_LARGEST_OFFSET * length, _LARGEST_OFFSET_MM) and not (from_labels or clicked):
             raise RefusalError(
                 f"detector: it sees {LANDMARKS[size_mm.argmax()]} {size_mm.max():.2f} mm from where the robot reports it, "
                 f"{100 * size_mm.max() / length:.0f} % of the tool's length. It takes another point for it, or the robot's "
@@ -240,9 +240,9 @@ def teach(
     elif before is not None:
         offset, sd, turns = before.offset_mm, before.offset_sd_mm, before.turns
     teacher = Teacher(recording, calibration, clock_sd_s, offset, sd, refused, right, turns)
-    if by_hand is not None:
+    if clicked:
         teacher = _as_labelled(teacher, by_hand)
-    u, covariance = teacher.project(np.arange(len(recording)))
+    u, covariance = teacher.project(np.unique(np.linspace(0, len(recording) - 1, 200).astype(int)))
     share = np.nanmedian(np.sqrt(np.trace(covariance, axis1=-2, axis2=-1) / 2) / tool_length_px(u)[..., None])
     if share > NEAR:
         told = "labels" if from_labels else "detections"
@@ -399,13 +399,17 @@ def _as_labelled(teacher: Teacher, labels: Seen) -> Teacher:
     teacher, start = replace(teacher, turns=known and free.turns), free.offset.ravel() if known else np.zeros(9)
     wide_mm = _OTHER_POINT * np.nanmedian(np.linalg.norm(x[:, 1:].mean(axis=1) - x[:, 0], axis=1))
 
-    def misfit(offset: np.ndarray) -> np.ndarray:
-        u = replace(teacher, offset_mm=offset.reshape(3, 3)).project(labels.frame)[0]
-        return np.append(np.nan_to_num((u - labels.u) / CLICK_SD_PX), (offset - start) / wide_mm)
+    def misfit(change: np.ndarray) -> np.ndarray:
+        u = replace(teacher, offset_mm=(start + wide_mm * change).reshape(3, 3)).project(labels.frame)[0]
+        return np.append(np.nan_to_num((u - labels.u) / CLICK_SD_PX), change)
 
-    found = least_squares(misfit, start, loss="soft_l1", f_scale=2.0, ftol=1e-4, xtol=1e-4)  # a wild click counts little
-    sd = np.sqrt(np.diag(np.linalg.inv(found.jac.T @ found.jac)) * max(1.0, 2 * found.cost / labels.u.size))
-    return replace(teacher, offset_mm=found.x.reshape(3, 3), offset_sd_mm=sd.reshape(3, 3))
+    known = np.isfinite(labels.u)
+    # A wild click counts little.
+    found = least_squares(misfit, np.zeros(9), loss="soft_l1", f_scale=2.0, ftol=1e-4, xtol=1e-4)
+    sd = wide_mm * np.sqrt(np.diag(np.linalg.inv(found.jac.T @ found.jac)) * max(1.0, 2 * found.cost / known.sum()))
+    told = known.any(axis=(0, 1, 3))[:, None]  # of other landmarks the labels say nothing
+    parts = {"offset_mm": (start + wide_mm * found.x).reshape(3, 3), "offset_sd_mm": sd.reshape(3, 3)}
+    return replace(teacher, **{name: np.where(told, part, getattr(teacher, name)) for name, part in parts.items()})
 
 
 def _contradicted(teacher: Teacher, seen: Seen) -> np.ndarray:

@@ -9,6 +9,8 @@ from lib.correspondences import Correspondences
 from lib.geometry import precision, view_distances2
 from lib.least_squares import inverse
 
+_LONGEST_S = 60.0  # between frames, of which the cameras' creeping is told
+
 
 class OnlineCalibration:
     """A calibration's minimum, moved by all rows that came since: an extended Kalman filter of the model's parameters.
@@ -40,10 +42,12 @@ class OnlineCalibration:
 
     def add(self, data: Correspondences) -> np.ndarray:
         """Fold in the rows of a frame; returns the views (n, 2) bool that were used, those the rig so far does not refuse."""
-        before_s, self._time_s = self._time_s, data.time_s[np.isfinite(data.time_s)].max(initial=self._time_s)
-        if np.isfinite(before_s):
-            self._covariance = self._covariance + (self._time_s - before_s) * self._drift
-            self._information = inverse(self._covariance)
+        if (known := np.isfinite(data.time_s)).any():
+            now_s = data.time_s[known].max()
+            if np.isfinite(self._time_s):  # a wrong time must not open all
+                self._covariance = self._covariance + np.clip(now_s - self._time_s, 0, _LONGEST_S) * self._drift
+                self._information = inverse(self._covariance)
+            self._time_s = now_s
         known, variance_x = self._calibration, self._calibration.sigma_x_mm**2
         used = data.seen & np.isfinite(data.x_mm).all(axis=1, keepdims=True)
         pixels, noise = data.stacked_px, known.detection_covariance(data)

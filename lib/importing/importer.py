@@ -54,7 +54,8 @@ def import_recording(source: str | Path, mapping: str | Path, out: str | Path, *
     if frames_s[-1] < robot_s[0] or frames_s[0] > robot_s[-1]:
         spans = [f"{time[0]:.3f} to {time[-1]:.3f} s" for time in (robot_time, stereo.time)]
         what = "its times ({}) and those of the frames ({}) do not overlap".format(*spans)
-        cure = ', or say "estimate" where log and video began together' if bool(stereo_zero) != bool(robot_zero) else ""
+        unlike = not estimated and bool(stereo_zero) != bool(robot_zero)  # one is dated, the other starts at 0
+        cure = ', or say "estimate" where log and video began together' if unlike else ""
         cure = f"Correct robot.offset_s = {told.robot.offset_s!r} in {mapping} (t_robot = t_video + offset_s){cure}"
         raise ValueError(f"{folder / told.robot.file}: {what}. {cure}.")
     if labels is not None:  # the mean instant at which the rows of a frame's labels were read

@@ -39,7 +39,10 @@ def decimals(files: Sequence[Path]) -> list[Decimal]:
     [Decimal('1700000000.250000'), Decimal('1700000000.500000')]
     """
     found = [_DECIMAL.search(path.stem) for path in files]
-    if any(found) and len(digits := {m and len(m[2]) for m in found}) > 1:  # .5 may be half a second, or 5 ns
+    digits, whole = {m and len(m[2]) for m in found}, {int(m[1][:-1]) for m in found if m}
+    if len(digits) > 1 and len(whole) < 2 and max(whole, default=0) < 10**9:
+        return []  # as in v1.9, v1.10
+    if len(digits) > 1:  # .5 may be half a second, or 5 ns
         what = f"some names end on a decimal number, but not all, or not with as many digits ({len(digits)} kinds)"
         raise ValueError(f"{files[0].parent}: {what}. Number the files 000000, 000001, ..., and give their times in a table.")
     return [Decimal(f"{m[1][:-1]}.{m[2]}") for m in found if m]

@@ -98,9 +98,9 @@ class TipDistance:
     def _predict(self, time_s: float, x_mm: np.ndarray) -> None:
         if np.isfinite(self._time) and time_s > self._time:
             self._covariance = np.minimum(self._covariance + _WALK_MM**2 * (time_s - self._time) * np.eye(3), 1.0)
-        self._time = time_s
         step_s = time_s - self._moved_s
-        known = (step_s > 0) & (step_s <= _SILENT_S)
+        known = (step_s > 0) & ((step_s <= _SILENT_S) | (self._moved_s == self._time))  # in the frame before
+        self._time = time_s
         self._velocity[~known] = np.nan
         for k in np.flatnonzero(np.isfinite(x_mm).all(axis=1)):
             if known[k]:

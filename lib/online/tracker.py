@@ -224,14 +224,15 @@ class RigTracker:
         if found.kind == "open":
             self.cause = self.cause if self._held else found.text
         elif shifted:
+            self._revert(result.index)
             self.state, self.cause = "robot" if found.kind in ("clock", "slipped") else "moved", found.text
-            self._held, self._waiting, self.rig, self._motion = True, 1, self._before, self._motion_before
+            self._held, self._waiting = True, 1
             self._since, result.failures["robot"] = self._since[1 - first :], found.text
         elif found.kind == "optics":
             self._start_again(self._since, found.text)
             result.failures["register"] = found.text
         elif found.kind == "none":
-            self.rig, self._motion = self._before, self._motion_before
+            self._revert(result.index)
             self._settle()
         else:
             self.rig, self.state, self.cause = found.rig, "tracking", ""
@@ -242,6 +243,12 @@ class RigTracker:
             self.rests_on_s, self.doubted_since = result.time_s, None
             if len(self._since) >= last:
                 self._settle()
+
+    def _revert(self, index: int) -> None:
+        """The cameras did not move, or are back: the rig of before, and no surface that another one made."""
+        if self.rig is not self._before:
+            self._astray = range(self._astray.start, index)
+        self.rig, self._motion = self._before, self._motion_before
 
     def _settle(self) -> None:
         """What happened is over, or known well enough."""

@@ -390,7 +390,10 @@ def _same(one: Path, other: Path) -> bool:
 
 
 def _keep_apart(old: Path, new: Path) -> None:
-    """Remove from the folder `old` what `new` holds too.  The rest may be a person's work: it stays."""
+    """Remove from the folder `old` what `new` holds too.  The rest may be a person's work: it stays, as behind a link."""
+    if old.is_symlink():
+        old.unlink()
+        return
     for path in sorted(old.rglob("*"), reverse=True):  # a folder after what it holds
         if _same(path, new / path.relative_to(old)):
             path.unlink()

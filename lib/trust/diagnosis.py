@@ -29,6 +29,8 @@ _SKEW_SD, _ASPECT_SD = 0.002, 0.003
 #: A common log aspect above this is no lens: the images were resized, and their aspect is free.
 _RESIZED = 0.1
 _STILL_PX = 0.1  # detections of one picture differ by less
+BY_HANDEDNESS = ("mirrored_axis", "exchanged_eyes", "mirrored_images")  # which the residuals do not show
+_ACROSS = 0.15  # sine of a tool's angle to the images, below which it points neither way
 _UPSIDE_DOWN = 20.0  # odds that a microscope sees the tips of a tool below its base
 
 
@@ -277,9 +279,10 @@ def _scaled_axis(A: np.ndarray, covariance: np.ndarray) -> Iterator[Hypothesis]:
 def _handedness(case: Case, A: np.ndarray, covariance: np.ndarray) -> Iterator[Hypothesis]:
     """A left camera on the right, or a tool that points at the cameras: exchanged eyes, or something is mirrored."""
     view = np.cross(A, np.roll(A, -1, axis=1))[:, 0].sum(axis=0)  # away from the cameras, if nothing is mirrored
-    depth = case.by_frame(case.problem.x[:, 0]) @ view
-    ahead = depth[:, 1:].mean(axis=1) - depth[:, 0]
-    near, far = int((ahead < 0).sum()), int((ahead > 0).sum())
+    base, tips = np.split(case.by_frame(case.problem.x[:, 0]), [1], axis=1)
+    tool = tips.mean(axis=1) - base[:, 0]
+    ahead = tool @ view / np.linalg.norm(view) / np.linalg.norm(tool, axis=1)  # of a tool across the view nearly 0
+    near, far = int((ahead < -_ACROSS).sum()), int((ahead > _ACROSS).sum())
     side, step = sides(A.reshape(4, 3))[0], 1e-6 * np.abs(A).max()
     J = np.array([(sides((A.ravel() + step * e).reshape(4, 3))[0] - side) / step for e in np.eye(12)])
     sd = float(np.sqrt(J @ covariance @ J))

@@ -9,10 +9,11 @@ import numpy as np
 
 from lib import paths
 from lib.calibration import Calibration, NoConsensusError, calibrate, optics
+from lib.calibration.models import Model
 from lib.correspondences import LANDMARKS, TRAIN_FURTHER, Correspondences, NoDetectionError
 from lib.landmarks import Detector, detect
 from lib.recordings import Doubt, Recording
-from lib.trust.diagnosis import Diagnosis, diagnose
+from lib.trust.diagnosis import BY_HANDEDNESS, Diagnosis, diagnose
 from lib.trust.health import Health, feature_matches, health, spread
 
 #: From best to worst.
@@ -121,10 +122,11 @@ def judge(
     found: list[Reason] = []
     if diagnosis is not None and (best := diagnosis.best) is not None:
         text = f"{best.text} It explains {100 * best.explained:.0f} % of the residuals."
+        text = best.text if best.name in BY_HANDEDNESS else text
         found += _reason("diagnosis", best.explained, text, best.cure, best.name)
     if calibration is None:
         name = {NoDetectionError: "no_detection", NoConsensusError: "no_consensus"}.get(type(error), "refused")
-        few = data is not None and len(np.unique(data.frame)) < LIMITS["frames"][1]
+        few = name == "refused" and data is not None and len(np.unique(data.frame)) < LIMITS["frames"][1]
         cure = _MORE_FRAMES if few else f"{_OVERLAYS}; where the detector errs, {TRAIN_FURTHER}."
         found.append(Reason(name, LEVELS[2], f"There is no calibration: {error}", cure))
     else:
@@ -257,6 +259,9 @@ def assess(
         epipolar_px = float(np.median(np.abs(calibration.pair.epipolar_distance(y[:, :2], y[:, 2:]))))
     stated = {name: getattr(recording, name) for name in ("kinematics", "offset_s", "readout_s", "image_size_px")}
     diagnosis = diagnose(data, **stated)
+    if calibration is not None and Model.parse(calibration.model, len(calibration.cameras)).distance:
+        others = (h for h in diagnosis.hypotheses if h.name != "finite_distance" or h.value < 0)  # these cameras have one
+        diagnosis = Diagnosis(tuple(others))
     found = health(recording, data, calibration, detector=detector)
     verdict = judge(
         data, calibration, diagnosis=diagnosis, health=found, epipolar_px=epipolar_px, error=error,

@@ -421,6 +421,20 @@ def test_a_few_labels_tell_which_points_of_the_tool_a_detector_sees(world, off_b
     assert np.nanmedian(error) < 1.0 and 0.2 < np.sqrt(np.nanmean(relative**2)) < 1.5
 
 
+def test_labels_move_a_teacher_that_needs_no_offsets_where_the_robot_is_believed(world, recording):
+    """All clicks lie 4 px to the right, one of them in a frame in which the log stands still; tip_2 is never labelled."""
+    seen, u = look(recording, StandIn(world.u, noise_px=0.7), np.arange(world.n)), five_labelled(world)[0]
+    u[..., 0] += 4.0
+    u[:, :, 2] = np.nan
+    k = recording.kinematics
+    near = np.abs(k.time_s - recording.frames.time_s[13] - 0.04) < 0.2
+    still = replace(recording, kinematics=replace(k, x_mm=np.where(near[:, None, None], k.x_mm[np.argmax(near)], k.x_mm)))
+    teacher = teach(still, seen, by_hand=Seen.by_hand(u))
+    off = np.nanmedian((teacher.project(np.arange(world.n))[0] - world.u)[..., 0], axis=(0, 1))
+    np.testing.assert_allclose(off, [4.0, 4.0, 0.0], atol=1.2)
+    assert 13 in teacher.refused and np.linalg.norm(teacher.offset_sd_mm, axis=1).max() < 0.2
+
+
 @pytest.mark.parametrize(("length_px", "agrees_px", "contradicts_px"), [(300, 4.0, 5.0), (60, 3.2, 4.0)])
 def test_a_teacher_that_errs_alike_in_all_labelled_frames_contradicts_them(length_px, agrees_px, contradicts_px):
     told = np.tile([[100.0, 100.0], [100 + length_px, 100], [100 + length_px, 100]], (5, 2, 1, 1))

@@ -224,6 +224,15 @@ def test_online_starts_where_the_calibration_ended_and_weighs_rows_by_their_cova
     assert errors[-1] < 1.2 * error(calibrate(rows, model="affine").rig) + 0.01
 
 
+def test_a_wrong_time_does_not_end_what_is_known_of_the_cameras():
+    c = data(60, 6)
+    online = OnlineCalibration(calibrate(c.x_mm, [c.u_left, c.u_right], model="affine"), drift_mm=0.005)
+    for time_s in (1.0, 1e9, 1.1, 1.2):
+        online.add(Correspondences.of_points(c.x_mm, c.u_left, c.u_right, time_s=np.full(60, time_s)))
+    assert np.abs(np.hstack(online.solve().project(c.true_x_mm)) - np.hstack(c.true_rig.project(c.true_x_mm))).max() < 3.0
+    assert online.remains(c.x_mm).max() < 1.5
+
+
 def test_cameras_that_creep_are_followed_where_a_random_walk_is_allowed():
     """0.02 mm/s along the view, and rows of one depth: without the walk it ends in parameters that these rows hardly tell."""
     c = data(900, 6, half_size_mm=(4, 3, 1))

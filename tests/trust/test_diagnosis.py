@@ -56,6 +56,14 @@ def test_cameras_that_do_not_fit_say_nothing_of_an_axis():
     assert "scaled_axis" not in {h.name for h in found(take("random detections", "150.0 px")).hypotheses}
 
 
+def test_a_tool_across_the_view_points_neither_way():
+    scene = take()
+    x, view = scene.data.grid("x_mm"), np.array([0.0, 0.0, 1.0])
+    flat = x - ((x - x[:, :1]) @ view)[..., None] * view - 0.01 * (np.arange(3) > 0)[:, None] * view
+    rows = replace(scene.data, x_mm=flat[np.searchsorted(np.unique(scene.data.frame), scene.data.frame), scene.data.landmark])
+    assert "mirrored_images" not in {h.name for h in diagnose(rows).hypotheses}
+
+
 def test_a_clock_is_found_among_wrong_landmarks_and_without_the_log():
     best = found(take("clock", "183 ms", outliers=0.3)).best
     assert best.name == "clock" and best.value == pytest.approx(-183, abs=5)
