@@ -151,9 +151,10 @@ def test_exercises_have_a_hint_and_a_solution_that_runs(path):
     assert len(exercises) >= 3
     assert text.count("<summary>Hint</summary>") == text.count("<summary>Solution</summary>") == len(exercises)
     assert len(solutions(path)) == len(exercises)
+    names = begun(path)
     for solution in solutions(path):
         assert "assert " in solution, "a solution states what it finds"
-        exec(compile(solution, path.stem, "exec"), begun(path))
+        exec(compile(solution, path.stem, "exec"), dict(names))
 
 
 @each(WALK)
