@@ -9,16 +9,13 @@ from lib.correspondences import Correspondences
 from lib.geometry import precision, view_distances2
 from lib.least_squares import inverse
 
-_LONGEST_S = 60.0  # between frames, of which the cameras' creeping is told
-
 
 class OnlineCalibration:
     """A calibration's minimum, moved by all rows that came since: an extended Kalman filter of the model's parameters.
 
     It has the calibration's camera model, and its information from the calibration's rows; each new row counts by its own
     covariance, or the calibration's where it states none.  So it starts where the calibration ended, and the calibration's
-    noise levels judge the new rows.  `drift_mm` is the standard deviation along each axis by which the cameras may shift in a
-    second, a random walk: without it a slow shift ends in the parameters that the rows tell least well.
+    noise levels judge the new rows.
 
     >>> from lib.calibration import calibrate
     >>> rng, A = np.random.default_rng(0), np.array([[99.0, 0, -9], [0, 99, 0], [99, 0, 9], [0, 99, 0]])
@@ -31,23 +28,13 @@ class OnlineCalibration:
     [99, 0, -9]
     """
 
-    def __init__(self, calibration: Calibration, *, drift_mm: float = 0.0) -> None:
+    def __init__(self, calibration: Calibration) -> None:
         self._calibration, self._state = calibration, calibration.minimum.state
         self._information = calibration.minimum.information
         self._covariance = self._first = inverse(self._information)
-        _, by_points, by_parameters = self._state.evaluate(calibration.x_mm[calibration.inliers])
-        # What a shift of the cameras changes, which moves the images as the opposite shift of all points does.
-        shift = drift_mm * np.linalg.lstsq(np.concatenate(by_parameters), np.concatenate(by_points), rcond=None)[0]
-        self._drift, self._time_s = shift @ shift.T, -np.inf
 
     def add(self, data: Correspondences) -> np.ndarray:
         """Fold in the rows of a frame; returns the views (n, 2) bool that were used, those the rig so far does not refuse."""
-        if (known := np.isfinite(data.time_s)).any():
-            now_s = data.time_s[known].max()
-            if np.isfinite(self._time_s):  # a wrong time must not open all
-                self._covariance = self._covariance + np.clip(now_s - self._time_s, 0, _LONGEST_S) * self._drift
-                self._information = inverse(self._covariance)
-            self._time_s = now_s
         known, variance_x = self._calibration, self._calibration.sigma_x_mm**2
         used = data.seen & np.isfinite(data.x_mm).all(axis=1, keepdims=True)
         pixels, noise = data.stacked_px, known.detection_covariance(data)

@@ -102,7 +102,7 @@ class OnlinePipeline:
         blind, told, x_mm = "the images cannot be read", "", np.full((3, 3), np.nan)
         with result.stage("detect"):
             blind = self._checks.images(left, right, time_s)
-            frame = None if blind else self._detect(left, right, kinematics, time_s)
+            frame = None if blind else self._detect(left, right, kinematics)
             blind = blind or self._checks.landmarks(np.stack([frame.data.u_left, frame.data.u_right]))
             if frame is not None:
                 result.landmarks = frame.data
@@ -160,7 +160,7 @@ class OnlinePipeline:
             state, cause = "robot", told
         result.state, result.cause = state, cause
 
-    def _detect(self, left: np.ndarray, right: np.ndarray, kinematics: ArrayLike | Callable | None, time_s: float) -> Seen:
+    def _detect(self, left: np.ndarray, right: np.ndarray, kinematics: ArrayLike | Callable | None) -> Seen:
         if self._pair is None or self._pair.shape[1:] != left.shape:
             self._pair = np.empty((2, *left.shape), np.uint8)  # kept: fresh memory costs more than the copy
         images, previous = np.stack([left, right], out=self._pair), self._seen
@@ -183,8 +183,7 @@ class OnlinePipeline:
         x = np.full((3, 3), np.nan) if kinematics is None else np.array(kinematics, dtype=np.float64)
         if x.shape != (3, 3):
             raise ValueError(f"kinematics: expected (3, 3) mm, one landmark a row, got {x.shape}.")
-        stated |= {"time_s": np.full(len(LANDMARKS), time_s), "landmark": range(len(LANDMARKS))}
-        data = Correspondences.of_points(x, *u, frame=index, **stated)
+        data = Correspondences.of_points(x, *u, frame=index, landmark=range(len(LANDMARKS)), **stated)
         return Seen(data, lambda rig: data)
 
     def _surface_jumped(self) -> bool:

@@ -17,7 +17,6 @@ from lib.trust import judge
 _CHI2_4_MEDIAN = 3.357
 _STANDS_OUT = 8.0  # score of a single frame that is not to be believed
 _FAR_MM = 200.0  # of the robot's median position: no tool reaches that far
-_DRIFT_MM = 0.005  # by which the microscope may shift in a second, unnoticed
 _PAST = 40  # frames kept to find a late report
 _AGAIN = 30  # frames after a registration in which no microscope moves again; then the registration was no explanation
 
@@ -123,7 +122,7 @@ class RigTracker:
         """Calibrate with all frames so far; after the last calibration let each frame improve it."""
         if self.rig is not None and len(self._frames) > self.settings.calibration_frames[1]:
             if self._online is None:
-                self._online = OnlineCalibration(self.calibration, drift_mm=_DRIFT_MM)
+                self._online = OnlineCalibration(self.calibration)
                 accepted = self._frames[self._fitted :]
             if any([self._online.add(self.corrected(frame.data)).any() for frame in accepted]):  # each is added
                 self.rig = self._online.solve()
