@@ -26,7 +26,7 @@ def recording_folder(folder: str = "") -> Path:
 
 
 def results_folder(name: str, recording: Path) -> Path:
-    """The folder runs/NAME for results of a recording, made; a FileExistsError where they are of another recording's."""
+    """Make the folder runs/NAME for a recording's results; a FileExistsError where it holds another recording's."""
     folder, recording = RUNS / name, recording.resolve()
     note = folder / RECORDING_NOTE
     if note.is_file() and (other := Path(note.read_text(encoding="utf-8").strip())) != recording and other.is_dir():

@@ -395,8 +395,8 @@ def _robots_share(found: LandmarkOffsets, own_sd: np.ndarray) -> tuple[np.ndarra
 def _as_labelled(teacher: Teacher, labels: Seen) -> Teacher:
     """The teacher with the offsets at which its cameras see the robot's landmarks where labels set by hand are."""
     free, x = teacher.calibration.offsets, teacher.recording.landmarks_mm()
-    known = free is not None and free.offset.shape == (3, 3)
-    teacher, start = replace(teacher, turns=known and free.turns), free.offset.ravel() if known else np.zeros(9)
+    fitted = free is not None and free.offset.shape == (3, 3)
+    teacher, start = replace(teacher, turns=fitted and free.turns), free.offset.ravel() if fitted else np.zeros(9)
     wide_mm = _OTHER_POINT * np.nanmedian(np.linalg.norm(x[:, 1:].mean(axis=1) - x[:, 0], axis=1))
 
     def misfit(change: np.ndarray) -> np.ndarray:

@@ -244,7 +244,7 @@ class RigTracker:
                 self._settle()
 
     def _revert(self, index: int) -> None:
-        """The cameras did not move, or are back: the rig of before, and no surface that another one made."""
+        """Go back to the rig before the motion, and doubt the surfaces that the other rig made."""
         if self.rig is not self._before:
             self._astray = range(self._astray.start, index)
         self.rig, self._motion = self._before, self._motion_before

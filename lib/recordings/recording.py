@@ -390,7 +390,7 @@ def _same(one: Path, other: Path) -> bool:
 
 
 def _keep_apart(old: Path, new: Path) -> None:
-    """Remove from the folder `old` what `new` holds too.  The rest may be a person's work: it stays, as behind a link."""
+    """Remove from the folder `old` what `new` holds too; the rest may be a person's work.  A link goes without its folder."""
     if old.is_symlink():
         old.unlink()
         return

@@ -290,7 +290,7 @@ def _handedness(case: Case, A: np.ndarray, covariance: np.ndarray) -> Iterator[H
     size = float(degrees), float(np.rad2deg(sd)), "degrees", 1.0, float(0.5 * (side / sd) ** 2)
     where = f"The left camera stands on the right, by {degrees:.1f} degrees"
     if eyes_exchanged(A.reshape(4, 3), sd):
-        if near >= far:
+        if near > far:
             text = f"{where}, and the tool points at the cameras: an axis of the robot is mirrored."
             cure = "Use a right-handed robot frame: negate one axis, or exchange two, in kinematics.csv."
             yield Hypothesis("mirrored_axis", text, cure, *size)

@@ -56,6 +56,13 @@ def test_cameras_that_do_not_fit_say_nothing_of_an_axis():
     assert "scaled_axis" not in {h.name for h in found(take("random detections", "150.0 px")).hypotheses}
 
 
+def test_exchanged_eyes_are_named_where_the_tool_tells_nothing():
+    scene = take("eyes exchanged")
+    base = scene.data.subset(scene.data.landmark == 0)
+    names = {h.name for h in diagnose(base).hypotheses}
+    assert "exchanged_eyes" in names and "mirrored_axis" not in names
+
+
 def test_a_tool_across_the_view_points_neither_way():
     scene = take()
     x, view = scene.data.grid("x_mm"), np.array([0.0, 0.0, 1.0])
