@@ -112,6 +112,7 @@ def papers_network_rows(table: Table) -> tuple[list[str], list[list[str]]]:
         "epochs": ("epochs_done", ".1f"),
         "steps": ("steps", ".0f"),
         "minutes": ("training_min", ".0f"),
+        "on a GPU": ("on_gpu", ".0f"),
         **{f"PCK@{t}": (f"pck_{t:.3f}_percent", ".1f") for t in (0.01, 0.05, 0.1, 0.2)},
         "median, px": ("median_px", ".1f"),
     }
