@@ -4,17 +4,18 @@ Seconds per pair; the paper's Hz (Titan X) are in the benchmark's extra_info.
 """
 
 import importlib.util
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from lib.landmarks import Detector, Landmarks
+from lib import paths
+from lib.landmarks import Detector
 from lib.landmarks.engines import ENGINES
 from lib.landmarks.error_model import ErrorModel
 from lib.landmarks.heatmaps import render
 from lib.landmarks.network import HourglassConfig, StackedHourglass
+from lib.recordings import Recording
 from notebooks.studies.decoders import DECODERS, positions
 
 PAPER_HZ = {(1080, 1920): 35, (480, 854): 77, (480, 640): 95, (256, 448): 140}
@@ -36,24 +37,16 @@ def test_the_papers_configuration(benchmark, size):
 @pytest.mark.parametrize("engine", [pytest.param(e, marks=[pytest.mark.cuda] * (e == "cuda")) for e in ENGINES])
 @pytest.mark.parametrize("mode", ["whole frame", "tracking"])
 def test_coarse_to_fine(benchmark, request, mode, engine):
-    """The shipped networks at 1080p; weights do not change the time, so all stages run on noise."""
+    """The shipped detector on a full-HD pair that shows the tool; an image that shows none is searched, which takes longer."""
     if engine == "cuda":
         request.getfixturevalue("gpu")
     elif engine.startswith("openvino") and not importlib.util.find_spec("openvino"):
         pytest.skip("OpenVINO is not installed here")
-    shipped = Detector.load(engine=engine)
-    sure = ErrorModel(logit=(9.0, 0.0, 0.0, 0.0))
-    detector = replace(
-        shipped, error_models=shipped.error_models | dict.fromkeys(("frame", "tool", "again", "closeup", "tracking"), sure)
-    )
-    torch.nn.init.zeros_(detector.closeup_network.head[-1].weight)  # on noise it would lose the tool now and then
-    detector = replace(detector)
-    images = pair((1080, 1920))
+    detector, frame = Detector.load(engine=engine), Recording.open(paths.SHIPPED_RECORDING).frames[0]
+    images = np.stack([frame.left, frame.right])
     benchmark.extra_info.update(paper_hz=35, threads=torch.get_num_threads())
     if mode == "tracking":
-        u = np.tile([[[900.0, 500.0], [1150.0, 480.0], [1150.0, 560.0]]], (2, 1, 1))
-        previous = Landmarks(u, np.tile(np.eye(2), (2, 3, 1, 1)), np.ones((2, 3)))
-        benchmark.pedantic(detector.track, (images, previous), rounds=20, warmup_rounds=3)
+        benchmark.pedantic(detector.track, (images, detector(images)), rounds=20, warmup_rounds=3)
     else:
         benchmark.pedantic(detector, (images,), rounds=20, warmup_rounds=3)
 
