@@ -34,7 +34,7 @@ SMALLEST = {
 }
 NEED_DATA = {"few_labels", "matching", "papers_network", "real_robot", "realism", "rungs"}
 #: Numbers that a picture or a motion does not have.
-MAY_LACK = {"matching", "noticed_motion", "robot_and_clicks", "robot_labels", "rungs"}
+MAY_LACK = {"matching", "noticed_motion", "papers_network", "robot_and_clicks", "robot_labels", "rungs"}
 
 
 def test_every_study_is_run_by_a_test():
