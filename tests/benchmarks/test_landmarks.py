@@ -37,7 +37,7 @@ def test_the_papers_configuration(benchmark, size):
 @pytest.mark.parametrize("engine", [pytest.param(e, marks=[pytest.mark.cuda] * (e == "cuda")) for e in ENGINES])
 @pytest.mark.parametrize("mode", ["whole frame", "tracking"])
 def test_coarse_to_fine(benchmark, request, mode, engine):
-    """The shipped detector on a full-HD pair that shows the tool; an image that shows none is searched, which takes longer."""
+    """The shipped detector on a full-HD pair that shows the tool; one that shows none is searched, which takes longer."""
     if engine == "cuda":
         request.getfixturevalue("gpu")
     elif engine.startswith("openvino") and not importlib.util.find_spec("openvino"):
