@@ -107,7 +107,7 @@ def papers_network_curves(table: Table, shipped: Table) -> Figure:
 
 
 def papers_network_rows(table: Table) -> tuple[list[str], list[list[str]]]:
-    """How long the paper's network was trained and how good it became, header and rows."""
+    """How long the paper's network was trained, how good it became, and the calibration from it; header and rows."""
     columns = {
         "epochs": ("epochs_done", ".1f"),
         "steps": ("steps", ".0f"),
@@ -115,6 +115,8 @@ def papers_network_rows(table: Table) -> tuple[list[str], list[list[str]]]:
         "on a GPU": ("on_gpu", ".0f"),
         **{f"PCK@{t}": (f"pck_{t:.3f}_percent", ".1f") for t in (0.01, 0.05, 0.1, 0.2)},
         "median, px": ("median_px", ".1f"),
+        "calibration, um": ("calibration_from_detections_um", ".0f"),
+        "from labels, um": ("calibration_from_labels_um", ".0f"),
     }
     cells = [[row["resolution"], *(format(row[key], form) for key, form in columns.values())] for row in table.rows]
     return ["resolution", *columns], cells
