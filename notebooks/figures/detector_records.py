@@ -81,14 +81,14 @@ def ablation_bars(table: Table) -> Figure:
     return fig
 
 
-def resolution_curves(table: Table, title: str = "Resolution") -> Figure:
+def resolution_curves(table: Table) -> Figure:
     """PCK against the threshold at each resolution of the table."""
     fig, ax = figure(width_in=8, height_in=3.6)
     colours = [COLOURS["ours"], COLOURS["truth"], COLOURS["right"], COLOURS["warning"]]
     for (name, rows), colour in zip(groups(table, "resolution").items(), colours, strict=False):
         thresholds, pck = curve(rows)
         ax.plot(100 * thresholds, pck, color=colour, marker="o", ms=3, label=name)
-    ax.set(xscale="log", ylim=(0, 101), xlabel="threshold, % of the tool's length", ylabel="PCK, %", title=title)
+    ax.set(xscale="log", ylim=(0, 101), xlabel="threshold, % of the tool's length", ylabel="PCK, %", title="The paper's network")
     ticks = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20)
     ax.set_xticks(ticks, [f"{t:g}" for t in ticks])
     ax.minorticks_off()
@@ -98,7 +98,7 @@ def resolution_curves(table: Table, title: str = "Resolution") -> Figure:
 
 def papers_network_curves(table: Table, shipped: Table) -> Figure:
     """PCK against the threshold: the paper's network at each resolution, and a coarse-to-fine one on the same sequences."""
-    fig = resolution_curves(table, "The paper's network")
+    fig = resolution_curves(table)
     rows = [row for row in shipped.where(mode="whole frames").rows if row["recording"].startswith("test_")]
     thresholds, pck = curve(Table(rows))
     fig.axes[0].plot(100 * thresholds, pck, "k--", label="coarse to fine, full HD")

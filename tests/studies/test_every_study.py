@@ -25,7 +25,6 @@ SMALLEST = {
     "real_robot": {},
     "realism": {"windows": 8},
     "reconstruction_speed": {},
-    "resolution": {"steps": 100},
     "robot_and_clicks": {"pairs": 14, "minutes": 0.1},
     "robot_labels": {"pairs": 14, "minutes": 0.1},
     "rungs": {"n": 2},

@@ -116,12 +116,12 @@ def test_speed_is_compared_in_one_engine_and_precision():
     assert records.speed_rows(Table(rows)) == {"torch float32": {"paper's network": 100.0, "coarse to fine": 100.0}}
 
 
-@pytest.mark.parametrize("name", ["ablation", "resolution", "label_noise", "few_labels", "engines_and_speed"])
+@pytest.mark.parametrize("name", ["ablation", "papers_network", "label_noise", "few_labels", "engines_and_speed"])
 def test_every_recorded_table_can_be_drawn(name):
     table = results.read(name)
     draw = {
         "ablation": records.ablation_bars,
-        "resolution": records.resolution_curves,
+        "papers_network": records.resolution_curves,
         "label_noise": records.label_noise_pairs,
         "few_labels": records.few_labels_curves,
         "engines_and_speed": records.engine_bars,
