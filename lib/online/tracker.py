@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lib.calibration import Calibration, OnlineCalibration, with_offsets
+from lib.calibration.offsets import rows_axes
 from lib.cameras import StereoRig
 from lib.correspondences import Correspondences
 from lib.online.causes import CONVINCING, explain, misfit
@@ -266,8 +267,8 @@ class RigTracker:
     def corrected(self, data: Correspondences) -> Correspondences:
         """With the landmarks where the detector sees them; the frames before tell the axes of shut and crossed jaws."""
         offsets = None if self.calibration is None else self.calibration.offsets
-        if offsets is None or not len(data):
-            return with_offsets(data, offsets)
+        if offsets is None or not len(data) or (not offsets.turns and np.isfinite(rows_axes(data)).all()):
+            return with_offsets(data, offsets)  # open jaws that no offset turns tell their axes by themselves
         past = (part for part in (*self._open, *self._past) if len(part) and int(part.frame[0]) not in self._doubtful)
         before = [part for part in past if part.frame[-1] < data.frame[0]]
         return with_offsets(Correspondences.join([*before, data]), offsets).of_frames(data.frame)
