@@ -22,6 +22,7 @@ from lib.calibration.calibration import Calibration, LandmarkOffsets
 from lib.calibration.robust import CompetingCamerasError
 from lib.calibration.scatter import sandwich
 from lib.correspondences import Correspondences
+from lib.geometry import cross
 
 #: Step of the offsets' derivatives, mm or px.
 _STEP = 1e-4
@@ -58,14 +59,13 @@ def tool_axes(x_mm: ArrayLike, offset_mm: np.ndarray | None = None) -> np.ndarra
         a = np.stack([straight, *np.broadcast_arrays(-middle[1], -middle[2], straight)[:2]], axis=1) / size[:, None]
         up = np.array([0.0, 0.0, 1.0]) - a[:, 2:] * a
         up /= np.linalg.norm(up, axis=1, keepdims=True)
-        side, m = np.cross(up, a), along / size[:, None]
+        side, m = cross(up, a), along / size[:, None]
         beside = (across * m).sum(axis=1, keepdims=True)
         across = across - beside * m
         width = np.linalg.norm(across, axis=1, keepdims=True)
         sine = np.clip((-apart[2] - beside * a[:, 2:]) / (width * up[:, 2:]), -1, 1)
         cosine, c = np.array([[[1]], [[-1]]]) * np.sqrt(1 - sine**2), across / width
-        g = np.cross(m, c)
-        own = np.stack([a, side, up], axis=2)
+        g, own = cross(m, c), np.stack([a, side, up], axis=2)
         y, z = cosine * c - sine * g, sine * c + cosine * g
         axes = np.stack([np.broadcast_to(m, y.shape), y, z], axis=3) @ own.mT  # (2, n, 3, 3)
         opening = apart[1] + (beside * a + width * (cosine * side + sine * up))[..., 1]

@@ -178,9 +178,8 @@ def _scale_free(distance2: np.ndarray, area: float) -> np.ndarray:
 
 def tightest_sample(x: np.ndarray, u: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """The camera (2, 4) through four of the points x (n, 3) mm that most pixels u (n, 2) are near to."""
-    H = np.column_stack([x, np.ones(len(x))])
-    sets = _samples(x, 150, rng, 0.0)
-    M = np.linalg.pinv(H[sets]) @ u[sets]
+    H, sets = np.column_stack([x, np.ones(len(x))]), _samples(x, 150, rng, 0.0)
+    M = np.linalg.solve(H[sets], u[sets])
     return M[_scale_free(_distances2(H, u, M), float(np.prod(_extent(u)))).argmin()].T
 
 
@@ -188,8 +187,7 @@ def _tightest(x: np.ndarray, u: np.ndarray, threshold_px: float | None, rng: np.
     """The consensus of the camera that makes the rows most probable (or has most of them within `threshold_px`: MSAC)."""
     n, middle = len(u), np.median(u, axis=0)
     u = u - middle
-    area = float(np.prod(_extent(u)))
-    H = np.column_stack([x - x.mean(axis=0), np.ones(n)])
+    area, H = float(np.prod(_extent(u))), np.column_stack([x - x.mean(axis=0), np.ones(n)])
     some = np.arange(n) if n <= _ROWS_RANKED else rng.choice(n, _ROWS_RANKED, replace=False)
     M, score, near2 = np.empty((0, 4, 2)), np.empty(0), np.empty(0)
     for count in _SAMPLES:
@@ -230,8 +228,7 @@ def _tightest(x: np.ndarray, u: np.ndarray, threshold_px: float | None, rng: np.
     if wider > _CONTRAST * sigma:  # contamination: a row is kept where it is more probably right than wrong
         wrong = share[1] / wider**2 + 2.0 * np.pi * share[2] / area
         gate2 = float(np.clip(2.0 * np.log(share[0] / sigma**2 / wrong), 4.0, gate2))
-    keep = _distances2(H, u, M[[best]])[0] < gate2 * sigma**2
-    matrix = M[best].T.copy()
+    keep, matrix = _distances2(H, u, M[[best]])[0] < gate2 * sigma**2, M[best].T.copy()
     matrix[:, 3] += middle - matrix[:, :3] @ x.mean(axis=0)
     return _Found(keep, matrix, sigma, wider, gate2)
 
@@ -248,11 +245,9 @@ def _mixture(
     products = np.hstack([(H[:, :, None] * other[:, None]).reshape(n, -1) for other in (H, u)])
     floor = 1e-7 * side
     variance = np.stack([np.maximum(sigma, floor), np.maximum(6.0 * sigma, 0.017 * side)], axis=1) ** 2
-    share, before = np.tile([0.4, 0.3, 0.3], (k, 1)), -np.inf
-    distance2 = _distances2(H, u, M)
+    share, before, distance2 = np.tile([0.4, 0.3, 0.3], (k, 1)), -np.inf, _distances2(H, u, M)
     for i in range(rounds):
-        log = np.empty((3, k, n))
-        spread = variance.T[:, :, None]
+        log, spread = np.empty((3, k, n)), variance.T[:, :, None]
         log[:2] = np.log(share.T[:2, :, None] / (2.0 * np.pi * spread)) - distance2 / (2.0 * spread)
         log[2] = np.log(share[:, 2] / area)[:, None]
         top = log.max(axis=0)
@@ -262,18 +257,15 @@ def _mixture(
         likelihood = (top + np.log(total)).sum(axis=1)
         if i > 5 and (likelihood - before < 1e-3).all():
             break
-        before = likelihood
-        moments = (p[:2] / spread).sum(axis=0) @ products
+        before, moments = likelihood, (p[:2] / spread).sum(axis=0) @ products
         G = moments[:, :16].reshape(k, 4, 4)
         G = G + 1e-12 * np.trace(G, axis1=1, axis2=2)[:, None, None] * np.eye(4)
         M = np.linalg.solve(G, moments[:, 16:].reshape(k, 4, 2))
         distance2 = _distances2(H, u, M)
-        mass = p.sum(axis=2)
-        squares = np.einsum("jkn,kn->jk", p[:2], distance2)
+        mass, squares = p.sum(axis=2), np.einsum("jkn,kn->jk", p[:2], distance2)
         # The camera's eight numbers are paid for by the pixels that weigh in it.
         paid = 8.0 * mass[0] / (mass[0] + mass[1] * variance[:, 0] / variance[:, 1])
         first = np.maximum(squares[0] / np.maximum(2.0 * mass[0] - paid, 1.0), floor**2)
         second = np.clip(squares[1] / np.maximum(2.0 * mass[1], 1e-9), 16.0 * first, (0.1 * side + 4.0 * np.sqrt(first)) ** 2)
-        variance = np.stack([first, second], axis=1)
-        share = (mass.T + 1.0) / (n + 3)
+        variance, share = np.stack([first, second], axis=1), (mass.T + 1.0) / (n + 3)
     return M, np.sqrt(variance), share, likelihood - np.linalg.slogdet(G)[1]
