@@ -1,8 +1,6 @@
 """The robot as a teacher: half-wrong detections are enough, and a robot that errs teaches nothing wrong."""
 
-import hashlib
 import json
-import pickle
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -10,46 +8,20 @@ import numpy as np
 import pytest
 
 from lib.adapt import RefusalError, adapt, loop, report, teach
-from lib.adapt import teacher as teachers
 from lib.adapt.judging import Agreement, better, stretches
 from lib.adapt.looking import Seen, at_rest, look, look_elsewhere
 from lib.calibration.offsets import tool_axes
 from lib.landmarks import Detector, Landmarks
 from lib.recordings.annotations import Annotations, write_coco
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE
-from lib.trust.fitting import Problem
 from tests.adapt.world import SIZE, StandIn, World, pupil
-
-
-def remembering(function):
-    """The function; what it has found for equal arguments, or refused, it does not work out a second time."""
-    known = {}
-
-    def answer(*args, **how):
-        try:
-            key = hashlib.sha256(pickle.dumps((args, how))).digest()
-        except (AttributeError, pickle.PicklingError):  # a function of a function
-            return function(*args, **how)
-        if key not in known:
-            try:
-                known[key] = function(*args, **how), None
-            except ValueError as error:
-                known[key] = None, error
-        found, error = known[key]
-        if error is not None:
-            raise error
-        return found
-
-    return answer
+from tests.remembering import remembering_teacher
 
 
 @pytest.fixture(scope="module", autouse=True)
 def worked_out_once():
     """Tests start alike, and rounds and clocks that are tried ask again for the same cameras."""
-    with pytest.MonkeyPatch.context() as patch:
-        for name in ("calibrate", "diagnose", "estimate_time_offset"):
-            patch.setattr(teachers, name, remembering(getattr(teachers, name)))
-        patch.setattr(Problem, "fit", remembering(Problem.fit))
+    with remembering_teacher():
         yield
 
 
