@@ -10,6 +10,7 @@ from contextlib import contextmanager
 import pytest
 
 from lib.adapt import teacher
+from lib.calibration import estimate
 from lib.trust.fitting import Problem
 
 
@@ -37,9 +38,13 @@ def remembering(function: Callable) -> Callable:
 
 @contextmanager
 def remembering_teacher() -> Iterator[None]:
-    """In here the robot's teacher asks once for the cameras, the clock and the faults of the same rows."""
+    """In here the robot's teacher asks once for the cameras, the clock and the faults of the same rows.
+
+    Cameras of two models start from one consensus.
+    """
+    asked = {teacher: ("calibrate", "diagnose", "estimate_time_offset"), Problem: ("fit",), estimate: ("consensus",)}
     with pytest.MonkeyPatch.context() as patch:
-        for name in ("calibrate", "diagnose", "estimate_time_offset"):
-            patch.setattr(teacher, name, remembering(getattr(teacher, name)))
-        patch.setattr(Problem, "fit", remembering(Problem.fit))
+        for where, names in asked.items():
+            for name in names:
+                patch.setattr(where, name, remembering(getattr(where, name)))
         yield
