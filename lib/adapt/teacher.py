@@ -157,8 +157,7 @@ class Teacher:
         u = np.where(np.isin(frames, self.refused)[:, None, None, None], np.nan, u)
         shown = np.where(inside(u, self.recording.image_size_px) | np.isnan(u[..., 0]), 2, 0)
         if seen is not None:
-            part = seen.of(frames)
-            length = tool_length_px(u)[..., None]
+            part, length = seen.of(frames), tool_length_px(u)[..., None]
             right = (np.linalg.norm(part.u - u, axis=-1) < 0.05 * length) & (part.confidence >= MIN_CONFIDENCE)
             shown = np.where(~right & (right.sum(axis=2, keepdims=True) == 2) & (shown == 2), 1, shown)
         return u, covariance, shown
@@ -421,8 +420,7 @@ def _contradicted(teacher: Teacher, seen: Seen) -> np.ndarray:
     if free is not None and free.offset.shape == (3, 3):
         teacher = replace(teacher, offset_mm=free.offset, turns=free.turns)
     u, covariance = teacher.project(seen.frame)
-    off = np.where((seen.confidence >= 0.5)[..., None], seen.u - u, np.nan)
-    length = tool_length_px(u)[..., None]
+    off, length = np.where((seen.confidence >= 0.5)[..., None], seen.u - u, np.nan), tool_length_px(u)[..., None]
     sd = np.sqrt(np.trace(covariance, axis1=-2, axis2=-1) / 2) + teacher.calibration.reprojection_rms_px
     size = np.linalg.norm(off, axis=-1)
     wrong = (size > 0.06 * length) & (size > 6 * sd)  # (m, 2, 3)
