@@ -19,6 +19,7 @@ from lib.correspondences import of_recording
 from lib.recordings import Recording
 from lib.workbench import pages, report
 from notebooks.figures import course
+from tests.remembering import remembering_teacher
 
 TAUGHT = ("00", "01", "02", "03", "04", "05", "06")
 WALK = [path for path in sorted(paths.NOTEBOOKS.glob("*.ipynb")) if path.stem[:2] in TAUGHT]
@@ -87,6 +88,13 @@ def own(names: dict) -> dict:
             found[name] = FunctionType(value.__code__, found, value.__name__, value.__defaults__, value.__closure__)
             found[name].__kwdefaults__ = value.__kwdefaults__
     return found
+
+
+@pytest.fixture(scope="module", autouse=True)
+def worked_out_once():
+    """Solutions go on from what a notebook has worked out."""
+    with remembering_teacher():
+        yield
 
 
 @pytest.fixture(autouse=True)

@@ -121,15 +121,17 @@ class Teacher:
         for side, camera in enumerate(c.cameras):
             at = time
             for _ in range(3 if r.readout_s else 1):
-                x = r.kinematics.at(at)
-                when_s = np.append(log_s[log], at[:, 0])  # the log shows how shut jaws were turned before
-                order = np.argsort(when_s)
-                told = np.concatenate([r.kinematics.x_mm[log], x])[order]
-                known = tool_axes(told, offset if self.turns else None)
-                axes = np.nan_to_num(carried(known, told, when_s[order])[np.argsort(order)[len(when_s) - len(at) :]])
-                apart_s = np.abs(when_s[order][np.isfinite(known).all(axis=(1, 2))] - at[:, :1])
-                shut = apart_s.min(axis=1, initial=np.inf) > _BORROWED_S
-                x = x + np.einsum("mij,kj->mki", axes, offset)
+                if side == 0 or r.readout_s:  # else both images are of the same instants
+                    x = r.kinematics.at(at)
+                    when_s = np.append(log_s[log], at[:, 0])  # the log shows how shut jaws were turned before
+                    order = np.argsort(when_s)
+                    told = np.concatenate([r.kinematics.x_mm[log], x])[order]
+                    known = tool_axes(told, offset if self.turns else None)
+                    axes = np.nan_to_num(carried(known, told, when_s[order])[np.argsort(order)[len(when_s) - len(at) :]])
+                    apart_s = np.abs(when_s[order][np.isfinite(known).all(axis=(1, 2))] - at[:, :1])
+                    shut = apart_s.min(axis=1, initial=np.inf) > _BORROWED_S
+                    moved_mm = x + np.einsum("mij,kj->mki", axes, offset)
+                x = moved_mm.copy()
                 if isinstance(camera, NearAffineCamera):  # what the robot parks behind a camera is seen nowhere
                     x[camera.depth_ratio(x.reshape(-1, 3)).reshape(x.shape[:2]) < _BEHIND] = np.nan
                 u[:, side] = camera.project(x.reshape(-1, 3)).reshape(x.shape[:2] + (2,))
@@ -155,8 +157,7 @@ class Teacher:
         u = np.where(np.isin(frames, self.refused)[:, None, None, None], np.nan, u)
         shown = np.where(inside(u, self.recording.image_size_px) | np.isnan(u[..., 0]), 2, 0)
         if seen is not None:
-            part = seen.of(frames)
-            length = tool_length_px(u)[..., None]
+            part, length = seen.of(frames), tool_length_px(u)[..., None]
             right = (np.linalg.norm(part.u - u, axis=-1) < 0.05 * length) & (part.confidence >= MIN_CONFIDENCE)
             shown = np.where(~right & (right.sum(axis=2, keepdims=True) == 2) & (shown == 2), 1, shown)
         return u, covariance, shown
@@ -339,7 +340,8 @@ def _calibrated(recording: Recording, seen: Seen, from_labels: bool) -> tuple[Ca
             raise RefusalError(f"labels: no cameras agree with them ({error}). {_LABEL}") from error
         return found, float(found.view_inliers.sum() / max(told, 1))
     # Offsets of an unknown tool widen the errors of the right ones, until the wrong ones do not stand apart.
-    for least, ransac_px in (*((least, None) for least in _CONFIDENCES), (MIN_CONFIDENCE, near_px)):
+    rows_kept = {int((seen.confidence >= least).sum()): least for least in _CONFIDENCES[::-1]}  # as many are the same rows
+    for least, ransac_px in (*((least, None) for least in sorted(rows_kept.values())), (MIN_CONFIDENCE, near_px)):
         if ransac_px is not None and competing:
             break  # nothing tells which is the robot's
         try:
@@ -418,8 +420,7 @@ def _contradicted(teacher: Teacher, seen: Seen) -> np.ndarray:
     if free is not None and free.offset.shape == (3, 3):
         teacher = replace(teacher, offset_mm=free.offset, turns=free.turns)
     u, covariance = teacher.project(seen.frame)
-    off = np.where((seen.confidence >= 0.5)[..., None], seen.u - u, np.nan)
-    length = tool_length_px(u)[..., None]
+    off, length = np.where((seen.confidence >= 0.5)[..., None], seen.u - u, np.nan), tool_length_px(u)[..., None]
     sd = np.sqrt(np.trace(covariance, axis1=-2, axis2=-1) / 2) + teacher.calibration.reprojection_rms_px
     size = np.linalg.norm(off, axis=-1)
     wrong = (size > 0.06 * length) & (size > 6 * sd)  # (m, 2, 3)

@@ -63,8 +63,7 @@ def affine_minimum(x: np.ndarray, y: np.ndarray, variance_u: float, variance_x: 
         scale = np.repeat([variance_u**-0.5, variance_x**-0.5], [m, 3])
         values, vectors = np.linalg.eigh(scatter * np.outer(scale, scale))
         leading = vectors[:, m:]
-        A = np.linalg.solve(leading[m:].T, leading[:m].T).T * np.sqrt(variance_u / variance_x)
-        cost = 0.5 * values[:m].sum()
+        A, cost = np.linalg.solve(leading[m:].T, leading[:m].T).T * np.sqrt(variance_u / variance_x), 0.5 * values[:m].sum()
     return AffineMinimum(np.column_stack([A, mean[:m] - A @ mean[m:]]), float(max(cost, 0.0)))
 
 
@@ -121,8 +120,7 @@ def estimate_noise(
         v[1] = np.median(np.maximum(observed[~flat] - v[0], 0.0) / gain[~flat])
     design = np.column_stack([np.ones(len(gain)), gain])
     for _ in range(50):
-        root = np.sqrt(freedom) / np.maximum(design @ v, floor)
-        new = np.where(free, least, v)
+        root, new = np.sqrt(freedom) / np.maximum(design @ v, floor), np.where(free, least, v)
         target, scale = (observed - design @ new) * root, design[:, free].max(axis=0)
         new[free] += nnls(design[:, free] / scale * root[:, None], target)[0] / scale
         if (np.abs(new - v) <= 1e-10 * v).all():

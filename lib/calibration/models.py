@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lib.cameras import AffineCamera, Camera, NearAffineCamera, radial_derivative
-from lib.geometry import precision
+from lib.geometry import cross, precision
 from lib.least_squares import minimise
 
 BASES = ("affine", "zero_skew", "square", "common_zoom")
@@ -117,12 +117,12 @@ class State:
     def rotation(self) -> np.ndarray:
         """(cameras, 3, 3), of bases other than affine: A = diag(zoom) rotation[:2]."""
         rows = self.A / self.zoom[:, :, None]
-        return np.concatenate([rows, np.cross(rows[:, :1], rows[:, 1:])], axis=1)
+        return np.concatenate([rows, cross(rows[:, :1], rows[:, 1:])], axis=1)
 
     @cached_property
     def normals(self) -> tuple[np.ndarray, np.ndarray]:
         """Unit normals r3 (cameras, 3) of the two rows of A, away from the camera, and their lengths (cameras,)."""
-        normal = np.cross(self.A[:, 0], self.A[:, 1])
+        normal = cross(self.A[:, 0], self.A[:, 1])
         size = np.linalg.norm(normal, axis=1)
         return normal / size[:, None], size
 
@@ -238,7 +238,7 @@ def fit(start: State, x: np.ndarray, y: np.ndarray, noise: np.ndarray, variance_
     y = np.where(np.repeat(views, 2, axis=1), y, 0.0)
 
     def evaluate(state: State) -> tuple[float, tuple] | None:
-        if (1.0 + state.rho * ((x - state.reference) @ state.normals[0].T)).min() <= 0.05:
+        if state.rho.any() and (1.0 + state.rho * ((x - state.reference) @ state.normals[0].T)).min() <= 0.05:
             return None  # a point lies behind a camera
         cost, *work = settle(state, x, y, noise, variance_x, views)
         return (cost, work) if np.isfinite(cost) else None

@@ -22,6 +22,7 @@ from lib.calibration.calibration import Calibration, LandmarkOffsets
 from lib.calibration.robust import CompetingCamerasError
 from lib.calibration.scatter import sandwich
 from lib.correspondences import Correspondences
+from lib.geometry import cross
 
 #: Step of the offsets' derivatives, mm or px.
 _STEP = 1e-4
@@ -58,18 +59,16 @@ def tool_axes(x_mm: ArrayLike, offset_mm: np.ndarray | None = None) -> np.ndarra
         a = np.stack([straight, *np.broadcast_arrays(-middle[1], -middle[2], straight)[:2]], axis=1) / size[:, None]
         up = np.array([0.0, 0.0, 1.0]) - a[:, 2:] * a
         up /= np.linalg.norm(up, axis=1, keepdims=True)
-        side, m = np.cross(up, a), along / size[:, None]
+        side, m = cross(up, a), along / size[:, None]
         beside = (across * m).sum(axis=1, keepdims=True)
         across = across - beside * m
         width = np.linalg.norm(across, axis=1, keepdims=True)
         sine = np.clip((-apart[2] - beside * a[:, 2:]) / (width * up[:, 2:]), -1, 1)
         cosine, c = np.array([[[1]], [[-1]]]) * np.sqrt(1 - sine**2), across / width
-        g = np.cross(m, c)
-        own = np.stack([a, side, up], axis=2)
+        g, own = cross(m, c), np.stack([a, side, up], axis=2)
         y, z = cosine * c - sine * g, sine * c + cosine * g
         axes = np.stack([np.broadcast_to(m, y.shape), y, z], axis=3) @ own.mT  # (2, n, 3, 3)
-        opening = apart[1] + (beside * a + width * (cosine * side + sine * up))[..., 1]
-        shut = 0.05 * (straight + middle[0])
+        opening, shut = apart[1] + (beside * a + width * (cosine * side + sine * up))[..., 1], 0.05 * (straight + middle[0])
         possible = (width[:, 0] > shut) & (opening > np.stack([np.full(len(x), -np.inf), -shut]))  # jaws hardly cross
     return _least_turning(axes, possible)
 
@@ -125,9 +124,9 @@ def carried(axes: np.ndarray, x_mm: np.ndarray, time_s: np.ndarray | None = None
     found, time = axes.copy(), np.arange(len(axes)) if time_s is None else time_s
     is_known, is_told = np.isfinite(axes).all(axis=(1, 2)), np.isfinite(along).all(axis=1)
     known, shut = np.flatnonzero(is_known & is_told), np.flatnonzero(~is_known & is_told)
-    if known.size:
+    if known.size and shut.size:
         nearest = known[np.searchsorted((time[known[1:]] + time[known[:-1]]) / 2, time[shut])]
-        axis = np.cross(along[nearest], along[shut])
+        axis = cross(along[nearest], along[shut])
         sine, cosine = np.linalg.norm(axis, axis=1), (along[nearest] * along[shut]).sum(axis=1)
         turn = Rotation.from_rotvec(axis * (np.arctan2(sine, cosine) / np.maximum(sine, 1e-300))[:, None])
         found[shut] = turn.as_matrix() @ axes[nearest]
@@ -262,8 +261,7 @@ def start_of_turning(
     rows, offset, k = np.flatnonzero(found.inliers)[some], found.offsets.offset, len(found.offsets.offset)
     J_x, J_c, weight, r = (part if len(part) == 1 else part[some] for part in found.system)
     r = r + (J_x @ axes[rows] @ offset[landmark[rows]][:, :, None])[:, :, 0]
-    chosen = np.eye(k)[landmark[rows]]
-    prior = np.eye(3 * k) / max(found.offsets.prior_sd, _GRID_MM[1]) ** 2
+    chosen, prior = np.eye(k)[landmark[rows]], np.eye(3 * k) / max(found.offsets.prior_sd, _GRID_MM[1]) ** 2
 
     def explained(offset: np.ndarray) -> tuple[float, np.ndarray]:
         """How much better than none offsets explain the detections, and the best ones if the axes stayed."""

@@ -167,8 +167,8 @@ def _samples(x: np.ndarray, count: int, rng: np.random.Generator, least_mm: floa
 
 def _distances2(H: np.ndarray, u: np.ndarray, M: np.ndarray) -> np.ndarray:
     """Squared distances (k, n) of pixels u (n, 2) to the projections of H (n, 4) by cameras M (k, 4, 2)."""
-    r = (H @ M.transpose(1, 0, 2).reshape(4, -1)).reshape(len(H), len(M), 2) - u[:, None]
-    return np.einsum("nkc,nkc->kn", r, r)
+    r = M.mT @ H.T - u.T
+    return (r**2).sum(axis=1)
 
 
 def _scale_free(distance2: np.ndarray, area: float) -> np.ndarray:
@@ -178,9 +178,8 @@ def _scale_free(distance2: np.ndarray, area: float) -> np.ndarray:
 
 def tightest_sample(x: np.ndarray, u: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """The camera (2, 4) through four of the points x (n, 3) mm that most pixels u (n, 2) are near to."""
-    H = np.column_stack([x, np.ones(len(x))])
-    sets = _samples(x, 150, rng, 0.0)
-    M = np.linalg.pinv(H[sets]) @ u[sets]
+    H, sets = np.column_stack([x, np.ones(len(x))]), _samples(x, 150, rng, 0.0)
+    M = np.linalg.solve(H[sets], u[sets])
     return M[_scale_free(_distances2(H, u, M), float(np.prod(_extent(u)))).argmin()].T
 
 
@@ -188,8 +187,7 @@ def _tightest(x: np.ndarray, u: np.ndarray, threshold_px: float | None, rng: np.
     """The consensus of the camera that makes the rows most probable (or has most of them within `threshold_px`: MSAC)."""
     n, middle = len(u), np.median(u, axis=0)
     u = u - middle
-    area = float(np.prod(_extent(u)))
-    H = np.column_stack([x - x.mean(axis=0), np.ones(n)])
+    area, H = float(np.prod(_extent(u))), np.column_stack([x - x.mean(axis=0), np.ones(n)])
     some = np.arange(n) if n <= _ROWS_RANKED else rng.choice(n, _ROWS_RANKED, replace=False)
     M, score, near2 = np.empty((0, 4, 2)), np.empty(0), np.empty(0)
     for count in _SAMPLES:
@@ -230,8 +228,7 @@ def _tightest(x: np.ndarray, u: np.ndarray, threshold_px: float | None, rng: np.
     if wider > _CONTRAST * sigma:  # contamination: a row is kept where it is more probably right than wrong
         wrong = share[1] / wider**2 + 2.0 * np.pi * share[2] / area
         gate2 = float(np.clip(2.0 * np.log(share[0] / sigma**2 / wrong), 4.0, gate2))
-    keep = _distances2(H, u, M[[best]])[0] < gate2 * sigma**2
-    matrix = M[best].T.copy()
+    keep, matrix = _distances2(H, u, M[[best]])[0] < gate2 * sigma**2, M[best].T.copy()
     matrix[:, 3] += middle - matrix[:, :3] @ x.mean(axis=0)
     return _Found(keep, matrix, sigma, wider, gate2)
 
@@ -248,32 +245,26 @@ def _mixture(
     products = np.hstack([(H[:, :, None] * other[:, None]).reshape(n, -1) for other in (H, u)])
     floor = 1e-7 * side
     variance = np.stack([np.maximum(sigma, floor), np.maximum(6.0 * sigma, 0.017 * side)], axis=1) ** 2
-    share, before = np.tile([0.4, 0.3, 0.3], (k, 1)), -np.inf
-    distance2 = _distances2(H, u, M)
+    share, before, distance2 = np.tile([0.4, 0.3, 0.3], (k, 1)), -np.inf, _distances2(H, u, M)
     for i in range(rounds):
-        log = np.empty((3, k, n))
-        spread = variance.T[:, :, None]
-        log[:2] = np.log(share.T[:2, :, None] / (2.0 * np.pi * spread)) - distance2 / (2.0 * spread)
-        log[2] = np.log(share[:, 2] / area)[:, None]
-        top = log.max(axis=0)
-        p = np.exp(log - top)
-        total = p.sum(axis=0)
-        p /= total
-        likelihood = (top + np.log(total)).sum(axis=1)
+        scale = 1.0 / variance.T[:, :, None]  # (2, k, 1)
+        at_peak = share.T[:2, :, None] * scale * (area / (2.0 * np.pi * share[:, 2, None]))
+        p = at_peak * np.exp(np.maximum(-0.5 * scale * distance2, -500.0))  # odds against any pixel; it is slow below
+        total = 1.0 + p[0] + p[1]
+        likelihood = np.log(total).sum(axis=1) + n * np.log(share[:, 2] / area)
         if i > 5 and (likelihood - before < 1e-3).all():
             break
-        before = likelihood
-        moments = (p[:2] / spread).sum(axis=0) @ products
+        p /= total
+        before, moments = likelihood, (p[0] * scale[0] + p[1] * scale[1]) @ products
         G = moments[:, :16].reshape(k, 4, 4)
-        G = G + 1e-12 * np.trace(G, axis1=1, axis2=2)[:, None, None] * np.eye(4)
+        G = G + 1e-12 * np.einsum("kii->k", G)[:, None, None] * np.eye(4)
         M = np.linalg.solve(G, moments[:, 16:].reshape(k, 4, 2))
         distance2 = _distances2(H, u, M)
-        mass = p.sum(axis=2)
-        squares = np.einsum("jkn,kn->jk", p[:2], distance2)
+        mass, squares = p.sum(axis=2), np.einsum("jkn,kn->jk", p, distance2)
         # The camera's eight numbers are paid for by the pixels that weigh in it.
         paid = 8.0 * mass[0] / (mass[0] + mass[1] * variance[:, 0] / variance[:, 1])
         first = np.maximum(squares[0] / np.maximum(2.0 * mass[0] - paid, 1.0), floor**2)
         second = np.clip(squares[1] / np.maximum(2.0 * mass[1], 1e-9), 16.0 * first, (0.1 * side + 4.0 * np.sqrt(first)) ** 2)
         variance = np.stack([first, second], axis=1)
-        share = (mass.T + 1.0) / (n + 3)
+        share = np.column_stack([mass.T + 1.0, n + 1.0 - mass[0] - mass[1]]) / (n + 3)
     return M, np.sqrt(variance), share, likelihood - np.linalg.slogdet(G)[1]

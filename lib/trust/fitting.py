@@ -140,21 +140,22 @@ class Problem:
 
     @cached_property
     def _of_matrices(self) -> np.ndarray:
-        """(n, 2, 2, 16): derivatives by the entries of the cameras."""
-        H = np.concatenate([self.x, np.ones((len(self), 2, 1))], axis=2)
+        """(n, 2, 2, 16): derivatives by the entries of the cameras, 0 in images that are not used."""
+        H = np.where(self.used[:, :, None], np.concatenate([self.x, np.ones((len(self), 2, 1))], axis=2), 0.0)
         return np.einsum("nck,cv,ij->ncivjk", H, np.eye(2), np.eye(2)).reshape(len(self), 2, 2, 16)
 
     def _design(self, M: np.ndarray, columns: Callable | None) -> np.ndarray:
-        """(n, 2, 2, p): derivatives by the 16 entries of M, 9 offsets (mm) and the additions."""
+        """(n, 2, 2, p): derivatives by the 16 entries of M, 9 offsets (mm) and the additions; 0 in images not used."""
         image, own = np.einsum("cij,njk->ncik", M[:, :, :3], self.axes), self.landmark[:, None] == np.arange(3)
+        image = np.where(self.used[:, :, None, None], image, 0.0)
         parts = [self._of_matrices, np.einsum("ncik,nl->ncilk", image, own).reshape(len(self), 2, 2, 9)]
-        return np.concatenate(parts if columns is None else [*parts, columns(M)], axis=3)
+        parts += [] if columns is None else [np.where(self.used[:, :, None, None], np.nan_to_num(columns(M)), 0.0)]
+        return np.concatenate(parts, axis=3)
 
     def _descend(self, M: np.ndarray, columns: Callable | None, apart: np.ndarray, rounds: int) -> Robust:
         used, y = self.used, np.where(self.used[:, :, None], self.y, 0.0)
         groups = [rows for rows in (used & ~apart[:, None], used & apart[:, None]) if rows.any()]
-        prior = np.zeros(25)
-        prior[16:] = self.offset_sd**-2
+        prior = np.repeat([0.0, self.offset_sd**-2], [16, 9])
         r = np.where(used[:, :, None], y - np.einsum("cij,ncj->nci", M[:, :, :3], self.x) - M[:, :, 3], 0.0)
         r2 = (r**2).sum(axis=2) / self.noise**2
         # Few rows a parameter: a density with a sharp peak would fit some of them exactly.
@@ -167,15 +168,13 @@ class Problem:
             for rows, shape in zip(groups, shapes, strict=True):
                 weight[rows] = (shape.freedom + 2.0) / (shape.freedom * shape.scale**2 + r2[rows])
             weight /= self.noise**2
-            D = np.where(used[:, :, None, None], np.nan_to_num(self._design(M, columns)), 0.0)
-            J = (D * np.sqrt(weight)[:, :, None, None]).reshape(-1, D.shape[3])
+            D, root = self._design(M, columns), np.sqrt(weight)[:, :, None]
+            J = (D * root[:, :, :, None]).reshape(-1, D.shape[3])
             information = J.T @ J + np.diag(np.append(prior, np.zeros(D.shape[3] - 25)))
             scale = 1.0 / np.sqrt(np.diag(information) + 1e-12)
             information = information * np.outer(scale, scale) + 1e-10 * np.eye(len(scale))  # an unseen addition stays 0
-            gradient = J.T @ (y * np.sqrt(weight)[:, :, None]).reshape(-1)
-            beta = scale * np.linalg.solve(information, scale * gradient)
-            M = beta[:16].reshape(2, 2, 4)
-            r = y - D @ beta
+            beta = scale * np.linalg.solve(information, scale * (J.T @ (y * root).reshape(-1)))
+            M, r = beta[:16].reshape(2, 2, 4), y - D @ beta
             r2 = (r**2).sum(axis=2) / self.noise**2
             likelihood = np.zeros(used.shape)
             for i, rows in enumerate(groups):
@@ -187,7 +186,7 @@ class Problem:
                 break
             before = total
         likelihood = np.where(used, likelihood - 2.0 * np.log(self.noise), 0.0)
-        design = self._overcount(r * np.sqrt(weight)[:, :, None])
+        design = self._overcount(r * root)
         inverse = np.linalg.inv(information) * np.outer(scale, scale) * design
         offset_sd = np.sqrt(np.diag(inverse)[16:25].reshape(3, 3).sum(axis=1))
         additions, offsets = (beta[25:], inverse[25:, 25:]), (beta[16:25].reshape(3, 3), offset_sd)

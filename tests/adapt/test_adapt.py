@@ -15,6 +15,14 @@ from lib.landmarks import Detector, Landmarks
 from lib.recordings.annotations import Annotations, write_coco
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE
 from tests.adapt.world import SIZE, StandIn, World, pupil
+from tests.remembering import remembering_teacher
+
+
+@pytest.fixture(scope="module", autouse=True)
+def worked_out_once():
+    """Tests start alike, and rounds and clocks that are tried ask again for the same cameras."""
+    with remembering_teacher():
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ import numpy as np
 
 from lib.cameras import NearAffineCamera, StereoRig
 from lib.landmarks import Landmarks
-from lib.recordings import Recording, RecordingWriter
+from lib.recordings import Recording, RecordingWriter, StereoFrame
 from lib.simulator.eye import Eye
 from lib.simulator.forceps import Forceps
 from lib.simulator.motion import Motion
@@ -61,24 +61,34 @@ class World:
         sample_s = np.arange(-0.4, self.time_s[-1] + 0.4, 1 / HZ)
         x = robot(sample_s, self.at(sample_s) + rng.normal(0, noise_mm, (len(sample_s), 3, 3)))
         with RecordingWriter(folder, name=folder.name, fps=FPS, image_size_px=SIZE, suffix=".png") as writer:
-            for i, t in enumerate(self.time_s):
-                writer.add(*(np.full((*SIZE[::-1], 3), (i + 1, 60 * side + 20, 90), np.uint8) for side in (0, 1)), t)
+            for t, pair in zip(self.time_s, blank_pairs(self.n), strict=True):
+                writer.add(*pair, t)
             writer.kinematics(rate * sample_s + clock_s, x)
         recording = Recording.open(folder)
-        return replace(recording, frames=Kept(recording.frames))
+        return replace(recording, frames=Kept(recording.frames.time_s))
+
+
+@cache
+def blank_pairs(n: int) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
+    """The left and the right image of n frames, (h, w, 3); a frame's number and its side are its colour."""
+    rows = (np.tile(np.uint8([i + 1, 60 * side + 20, 90]), (SIZE[0], 1)) for i in range(n) for side in (0, 1))
+    images = [np.tile(row, (SIZE[1], 1, 1)) for row in rows]
+    for image in images:
+        image.setflags(write=False)  # as those of a recording
+    return tuple(zip(images[::2], images[1::2], strict=True))
 
 
 class Kept:
-    """Frames that are read once: every stage looks at them anew."""
+    """Frames as the files hold them, without reading these: every stage looks at them anew."""
 
-    def __init__(self, frames):
-        self.time_s, self._read = frames.time_s, cache(frames.__getitem__)
+    def __init__(self, time_s):
+        self.time_s, self._pairs = time_s, blank_pairs(len(time_s))
 
     def __len__(self):
         return len(self.time_s)
 
     def __getitem__(self, index):
-        return self._read(index)
+        return StereoFrame(*self._pairs[index], self.time_s[index])
 
 
 @dataclass(eq=False)
