@@ -1,6 +1,7 @@
 """Cameras and the stereo pair: known answers, properties, degenerate cases, files."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -223,6 +224,41 @@ def test_radial_distortion_is_undone(near):
     again = near.right.centre_px + v * (1 + near.right.radial_per_px2 * (v**2).sum(axis=1, keepdims=True))
     np.testing.assert_allclose(again, u, atol=1e-9)
     np.testing.assert_allclose(near.right.undistort(near.right.centre_px[None])[0], near.right.centre_px)
+
+
+def test_a_pixel_beyond_the_fold_of_barrel_distortion_is_no_point(near):
+    """The distorted radius is largest where 1 + 3 k r^2 = 0; no point is seen farther out."""
+    barrel = replace(near.left, radial_per_px2=-1e-6)
+    largest_px = (2 / 3) / np.sqrt(3e-6)
+    u = barrel.centre_px + largest_px * np.array([[0.999, 0.0], [0.6, 0.8], [0.61, 0.81]])
+    found = barrel.undistort(u)
+    assert np.isfinite(found[0]).all() and np.isnan(found[2]).all()
+    assert np.linalg.norm(found[0] - barrel.centre_px) < 1.5 * largest_px
+    rig = StereoRig(barrel, near.right)
+    seen = rig.triangulate(u, near.right.project(near.triangulate(u[:1], u[:1]).x_mm).repeat(3, axis=0))
+    assert np.isnan(seen.x_mm[2]).all() and np.isnan(seen.covariance_mm2[2]).all() and np.isfinite(seen.x_mm[0]).all()
+
+
+@pytest.mark.parametrize("turn", [0.0, 1e-9, 1e-7])
+def test_cameras_that_look_the_same_way_see_no_depth(rig, turn, tmp_path):
+    """The inverse of the normal matrix has entries of either sign there, and says nothing."""
+    linear = 1.01 * rig.left.linear + turn * 100 * rig.left.viewing_direction
+    alike = StereoRig(rig.left, AffineCamera(np.column_stack([linear, [900, 500]])))
+    found = alike.triangulate(*alike.project([[1.0, 2.0, 0.5]]))
+    assert np.isnan(found.x_mm).all() and np.isnan(found.covariance_mm2).all() and abs(found.epipolar_px[0]) < 1e-6
+    alike.save(tmp_path / "rig.json")
+    with pytest.raises(ValueError, match=r"rig\.json: both cameras look along the same direction.*calibrate again"):
+        StereoRig.load(tmp_path / "rig.json")
+
+
+def test_a_hundredth_of_a_degree_sees_depth_as_poorly_as_it_says(rig):
+    linear = rig.left.linear + 1e-4 * 100 * np.outer([1.0, 0.0], rig.left.viewing_direction)
+    narrow = StereoRig(rig.left, AffineCamera(np.column_stack([linear, [900, 500]])))
+    u = np.hstack(narrow.project([[1.0, 2.0, 0.5]])) + np.random.default_rng(0).normal(0, 1, (2000, 4))
+    found = narrow.triangulate(u[:, :2], u[:, 2:])
+    depth = found.x_mm @ rig.left.viewing_direction
+    stated = rig.left.viewing_direction @ found.covariance_mm2[0] @ rig.left.viewing_direction
+    assert depth.var() == pytest.approx(stated, rel=0.1) and np.sqrt(stated) > 50
 
 
 def test_projection_matrix_round_trip(near):
