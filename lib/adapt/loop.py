@@ -13,9 +13,10 @@ import cv2
 import numpy as np
 
 from lib import files, paths
+from lib.adapt.cameras import RefusalError, longest_still
 from lib.adapt.judging import Agreement, agreement, better, epipolar_px, frame_means, stretches
 from lib.adapt.looking import Seen, at_rest, look, look_elsewhere
-from lib.adapt.teacher import RefusalError, Teacher, longest_still, teach
+from lib.adapt.teacher import Teacher, teach
 from lib.calibration import Calibration
 from lib.correspondences import LANDMARKS
 from lib.landmarks import Detector, SharedDetector
@@ -264,7 +265,7 @@ class _Work:
         except RefusalError:
             if by_hand is None:
                 raise
-            teacher = teach(recording, by_hand, from_labels=True)
+            teacher = teach(recording, None, by_hand=by_hand)
         self.report["start_share"] = teacher.right
         u, guided = teacher.labels(learn)[0], None
         for k in range(_GUIDED if self.learns and start.closeup_network else 0):  # untaught, near where the robot says

@@ -377,7 +377,7 @@ def off_by_a_fifth(world, tmp_path_factory):
 
 
 def test_five_labelled_pairs_tell_clock_and_offsets(world, off_by_a_fifth):
-    teacher = teach(off_by_a_fifth, five_labelled(world)[1], from_labels=True)
+    teacher = teach(off_by_a_fifth, None, by_hand=five_labelled(world)[1])
     assert np.nanmedian(label_errors(world, teacher)[0]) < 1.5  # 0.2 mm are 5 px
     assert teacher.recording.offset_s == pytest.approx(0.04, abs=0.015)
 
@@ -448,7 +448,7 @@ def test_a_teacher_that_errs_alike_in_all_labelled_frames_contradicts_them(lengt
 def test_labels_that_leave_the_places_open_are_refused(world, recording, monkeypatch):
     monkeypatch.setattr("lib.adapt.teacher.NEAR", 0.001)
     with pytest.raises(RefusalError, match="labels: .* to [0-9]+ % of the tool's length only. Label 10 pairs"):
-        teach(recording, five_labelled(world)[1], from_labels=True)
+        teach(recording, None, by_hand=five_labelled(world)[1])
 
 
 def test_labels_teach_a_tool_that_no_closeup_knows(world, recording, tmp_path, monkeypatch):
