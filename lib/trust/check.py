@@ -111,7 +111,7 @@ def check(recording: str | Path | Recording, *, detector: Callable | None = None
         detector = SharedDetector(detector)
         data = detect(found, detector, frames=spread(len(found), _MOST_FRAMES))
     elif detector is not None:
-        raise ValueError(f"detector (--weights): none knows {', '.join(found.skeleton)}; leave it out, and labels are judged.")
+        raise ValueError(f"detector (--weights): none knows {', '.join(found.skeleton)}; leave it out: labels are judged.")
     elif (marks := found.annotations) is not None:
         data = of_recording(found, marks.u_left, marks.u_right)
     else:
