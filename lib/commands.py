@@ -86,7 +86,7 @@ def main_detect(argv: list[str]) -> int:
 
 def main_calibrate(argv: list[str]) -> int:
     """`python3 -m lib calibrate`: both cameras from landmarks and the robot; JSON, OpenCV YAML and ROS CameraInfo."""
-    a, recording, out = _parsed("calibrate", main_calibrate, argv, force=True)
+    a, recording, out = _parsed("calibrate", main_calibrate, argv)
     calibration, verdict, data = _calibrated(a, recording, out)
     if calibration is None:
         return 3
@@ -103,7 +103,7 @@ def main_calibrate(argv: list[str]) -> int:
 
 def main_reconstruct(argv: list[str]) -> int:
     """`python3 -m lib reconstruct`: the surface that one stereo frame shows; GLB, PLY, a depth map, the rectified pair."""
-    a, recording, out = _parsed("reconstruct", main_reconstruct, argv, force=True, frame=True, rig=True)
+    a, recording, out = _parsed("reconstruct", main_reconstruct, argv, frame=True, rig=True)
     rig, verdict, data = _calibrated(a, recording, out)
     if rig is None:
         return 3
@@ -159,9 +159,8 @@ def _as_one(moved: StereoRig, found: Assessment) -> Verdict:
 
 
 def _parsed(
-    name: str, function: object, argv: list[str], *, force: bool = False, frame: bool = False, rig: bool = False,
-    needs_rig: bool = False,
-) -> tuple[argparse.Namespace, Recording, Path]:  # fmt: skip
+    name: str, function: object, argv: list[str], *, frame: bool = False, rig: bool = False, needs_rig: bool = False
+) -> tuple[argparse.Namespace, Recording, Path]:
     parser = argparse.ArgumentParser(prog=f"python3 -m lib {name}", description=function.__doc__.split(": ", 1)[1])
     add = parser.add_argument
     add("recording", type=Path, help="folder of a recording")
@@ -169,7 +168,7 @@ def _parsed(
     add("--landmarks", choices=("detected", "annotations"), default="detected", help="where they come from")
     add("--weights", help="weights file of the detector (default: the shipped ones)")
     add("--model", help="of the cameras: zero_skew (the default), near_affine (a finite distance), affine, ...")
-    if force:
+    if name in ("calibrate", "reconstruct"):  # they may be refused
         add("--force", action="store_true", help="write results whatever the verdict")
     if frame:
         add("--frame", type=int, default=0, help="number of the frame, from 0")
@@ -179,7 +178,7 @@ def _parsed(
     a = parser.parse_args(argv)
     if a.weights and a.landmarks == "annotations":
         parser.error("--weights: with --landmarks annotations no detector looks; leave one of the two out.")
-    if force and rig and a.rig and (a.model or a.force):
+    if frame and a.rig and (a.model or a.force):
         parser.error("--model, --force: with --rig no camera is calibrated; leave them out, or --rig.")
     a.model = a.model or "zero_skew"
     Model.parse(a.model, 2)  # an unknown one is refused

@@ -1,7 +1,6 @@
 """The robot labels the frames: a detector learns a new microscope, eye and tool from a recording, without a click."""
 
-from lib.adapt.cameras import RefusalError
 from lib.adapt.loop import Adaptation, adapt
-from lib.adapt.teacher import Teacher, teach
+from lib.adapt.teacher import RefusalError, Teacher, teach
 
 __all__ = ["Adaptation", "RefusalError", "Teacher", "adapt", "teach"]

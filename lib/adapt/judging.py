@@ -5,9 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lib.adapt.cameras import RefusalError
 from lib.adapt.looking import Seen
-from lib.adapt.teacher import Teacher
+from lib.adapt.teacher import RefusalError, Teacher
 from lib.landmarks.metrics import errors_px, nees, tool_length_px
 from lib.recordings import Recording
 from lib.trust.health import affine_epipolar, feature_matches

@@ -13,10 +13,9 @@ import cv2
 import numpy as np
 
 from lib import files, paths
-from lib.adapt.cameras import RefusalError, longest_still
 from lib.adapt.judging import Agreement, agreement, better, epipolar_px, frame_means, stretches
 from lib.adapt.looking import Seen, at_rest, look, look_elsewhere
-from lib.adapt.teacher import Teacher, teach
+from lib.adapt.teacher import RefusalError, Teacher, longest_still, teach
 from lib.calibration import Calibration
 from lib.correspondences import LANDMARKS
 from lib.landmarks import Detector, SharedDetector
