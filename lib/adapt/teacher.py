@@ -96,14 +96,15 @@ def longest_still(recording: Recording, seen: Seen) -> tuple[np.ndarray, str]:
 class Teacher:
     """The robot's landmarks, seen through calibrated cameras.
 
-    `offset_mm` and its deviation (3, 3), in the tool's axes, say where the landmarks are beside where the robot reports them.
+    `offset_mm` (3, 3), in the tool's axes, says where the landmarks are beside where the robot reports them;
+    `offset_covariance_mm2` (3, 3, 3) is that of each landmark.
     """
 
     recording: Recording  # with the clock's offset as the images show it
     calibration: Calibration
     clock_sd_s: float
     offset_mm: np.ndarray
-    offset_sd_mm: np.ndarray
+    offset_covariance_mm2: np.ndarray
     refused: np.ndarray  # frames in which the robot is not believed
     right: float  # share of the landmarks that agree on the cameras
     turns: bool = False  # as `LandmarkOffsets.turns`
@@ -138,7 +139,7 @@ class Teacher:
             J = c.derivatives(flat)[0][:, view]
             velocity = (r.kinematics.at(at + 0.02) - r.kinematics.at(at - 0.02)).reshape(-1, 3) / 0.04
             moved = self.clock_sd_s * np.einsum("nij,nj->ni", J, np.nan_to_num(velocity))
-            spread = np.einsum("mij,kj,mlj->mkil", axes, self.offset_sd_mm**2, axes).reshape(-1, 3, 3)
+            spread = np.einsum("mij,kjn,mln->mkil", axes, self.offset_covariance_mm2, axes).reshape(-1, 3, 3)
             spread += (_TURNED * shut[:, None] * np.linalg.norm(offset, axis=1)).reshape(-1, 1, 1) ** 2 * np.eye(3)
             spread = spread + max(r.robot_accuracy_mm, c.sigma_x_mm) ** 2 * np.eye(3)
             S = c.projection_covariance(flat)[:, view, view] + J @ spread @ J.mT + moved[:, :, None] * moved[:, None]
@@ -190,7 +191,7 @@ def teach(
     clicks = None if by_hand is None else by_hand.of(np.setdiff1d(by_hand.frame, refused))
     clicked = not alone and clicks is not None and len(clicks.frame) > 0
     told, turns = calibration.offsets, False
-    offset, sd = np.zeros((3, 3)), np.full((3, 3), 0.0 if told is not None else 0.1)
+    offset, covariance = np.zeros((3, 3)), np.tile(0.1**2 * np.eye(3), (3, 1, 1))
     if opinion is not None and not clicked:
         told = _opinion(recording, opinion, used.frame)
     if told is not None and told.offset.shape == (3, 3):
@@ -202,10 +203,10 @@ def teach(
                 f"{100 * size_mm.max() / length:.0f} % of the tool's length. It takes another point for it, or the robot's "
                 f"tool has other dimensions. {_LABEL}"
             )
-        turns, (offset, sd) = told.turns, _robots_share(told, (0.2 if alone else 1.0) * _OWN_BIAS * length)
+        turns, (offset, covariance) = told.turns, _robots_share(told, (0.2 if alone else 1.0) * _OWN_BIAS * length)
     elif before is not None:
-        offset, sd, turns = before.offset_mm, before.offset_sd_mm, before.turns
-    teacher = Teacher(recording, calibration, clock_sd_s, offset, sd, refused, right, turns)
+        offset, covariance, turns = before.offset_mm, before.offset_covariance_mm2, before.turns
+    teacher = Teacher(recording, calibration, clock_sd_s, offset, covariance, refused, right, turns)
     if clicked:
         teacher = _as_labelled(teacher, clicks)
     u, covariance = teacher.project(np.unique(np.linspace(0, len(recording) - 1, 200).astype(int)))
@@ -403,7 +404,7 @@ def _fault(recording: Recording, seen: Seen, calibration: Calibration, *, by_han
 
 
 def _robots_share(found: LandmarkOffsets, own_sd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The part of the offsets (3, 3) that is the robot's, and its standard deviation; the rest is the detector's own.
+    """The part of the offsets (3, 3) that is the robot's, and its covariance (3, 3, 3); the rest is the detector's own.
 
     Both have Gaussian priors: the detector's of `own_sd` (3, 3) mm, the robot's of the width that makes the nine numbers most
     probable.  Offsets no larger than a detector's usual ones are taken for the detector's.
@@ -413,7 +414,7 @@ def _robots_share(found: LandmarkOffsets, own_sd: np.ndarray) -> tuple[np.ndarra
     width = widths[(np.log(total) + found.offset**2 / total).sum(axis=(1, 2)).argmin(), 0, 0]
     # What the rig hides moves cameras and offsets together and leaves the labels where they are: no reason to believe less.
     share = width**2 / (width**2 + own_sd**2)
-    return share * found.offset, np.hypot(np.sqrt(share) * own_sd, _ODD * share * found.offset)
+    return share * found.offset, np.hypot(np.sqrt(share) * own_sd, _ODD * share * found.offset)[:, :, None] ** 2 * np.eye(3)
 
 
 def _as_labelled(teacher: Teacher, labels: Seen) -> Teacher:
@@ -430,10 +431,11 @@ def _as_labelled(teacher: Teacher, labels: Seen) -> Teacher:
     known = np.isfinite(labels.u)
     # A wild click counts little.
     found = least_squares(misfit, np.zeros(9), loss="soft_l1", f_scale=2.0, ftol=1e-4, xtol=1e-4)
-    sd = wide_mm * np.sqrt(np.diag(np.linalg.inv(found.jac.T @ found.jac)) * max(1.0, 2 * found.cost / known.sum()))
+    covariance = wide_mm**2 * max(1.0, 2 * found.cost / known.sum()) * np.linalg.inv(found.jac.T @ found.jac)
     told = known.any(axis=(0, 1, 3))[:, None]  # of other landmarks the labels say nothing
-    parts = {"offset_mm": (start + wide_mm * found.x).reshape(3, 3), "offset_sd_mm": sd.reshape(3, 3)}
-    return replace(teacher, **{name: np.where(told, part, getattr(teacher, name)) for name, part in parts.items()})
+    offset = np.where(told, (start + wide_mm * found.x).reshape(3, 3), teacher.offset_mm)
+    own = np.where(told[:, :, None], np.einsum("kikj->kij", covariance.reshape(3, 3, 3, 3)), teacher.offset_covariance_mm2)
+    return replace(teacher, offset_mm=offset, offset_covariance_mm2=own)
 
 
 def _contradicted(teacher: Teacher, seen: Seen) -> np.ndarray:
