@@ -15,37 +15,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 
-USAGE = """\
-python3 -m lib COMMAND [options]        (in the folder of the workbench)
-
-  run [NOTEBOOK ...] [--profile quick|paper] [-p NAME VALUE]
-              work through the notebooks; the report appears in runs/<date>-<profile>/index.html
-  site [RUN] [--out FOLDER | --gallery]
-              a static site of a run (default: the last complete one), such as for GitHub Pages, or the README's pictures
-  test [...]  style and tests; what follows goes to pytest
-  lab  [...]  open the notebooks in JupyterLab
-  bench [...] benchmarks; what follows goes to pytest
-  sweep NOTEBOOK [-p NAME VALUE,VALUE,...] [--workers N | --scheduler ADDRESS] [--record]
-              one notebook over a grid of parameters, on Dask; a table and a plot of each metric
-  check RECORDING [--out FOLDER]
-              is a recording fit for use, and if not, why: one page, check.html, and check.json
-  adapt RECORDING [--labels FILE] [--minutes 20] [--out FOLDER]
-              let the robot teach the detector a new microscope, eye and tool
-  import SOURCE --map MAPPING.toml [--guess | --out RECORDING]
-              a recording from videos, a robot's log and labels, as the mapping says
-  annotate RECORDING
-              label frames by hand, in JupyterLab
-  detect, calibrate, reconstruct, register RECORDING [--out FOLDER]
-              landmarks, cameras, surface and registration into files for other programs
-  online RECORDING [--live] [--record FOLDER] [--video FILE.mp4]
-              the online system, frame by frame; --live gives the frames at their own times
-  simulate, train, evaluate [...]
-              make recordings and data sets; train the landmark detector; measure it (--help says more)
-  setup       only make the environment (each command does it when it is needed)
-  lock        pin the packages anew after a change of environment.toml
-
-  --torch cpu|cuda    with any command: the build of torch (default: cuda where there is an NVIDIA GPU)
-"""
+USAGE = (ROOT / "lib" / "usage.txt").read_text(encoding="utf-8")
 
 #: Oldest and first unsupported Python; environment.toml says the same to other tools.
 PYTHONS = ((3, 11), (3, 15))

@@ -9,7 +9,7 @@ import json
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Protocol, Self, runtime_checkable
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -32,21 +32,11 @@ class Resection:
         K: (2, 2) upper triangular [[alpha_x, skew], [0, alpha_y]], px per mm.
         R: (3, 3) rotation camera_from_robot; its third row is the viewing direction, away from the camera.
         t: (2,) mm, so that u = K (R[:2] @ x + t).
-        mirrored: As the caller said: one affine camera alone cannot tell (a reflection only flips R's unseen third row).
     """
 
     K: np.ndarray
     R: np.ndarray
     t: np.ndarray
-    mirrored: bool = False
-
-
-@runtime_checkable
-class Camera(Protocol):
-    """Anything that projects points."""
-
-    def project(self, x: ArrayLike) -> np.ndarray:
-        """Pixels (n, 2) of points (n, 3) in mm."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,16 +97,12 @@ class AffineCamera(MatrixCamera):
         """Homogeneous P (3, 4); an affine camera's last row is (0, 0, 0, 1)."""
         return np.vstack([self.matrix, [0.0, 0.0, 0.0, 1.0]])
 
-    def resect(self, *, mirrored: bool = False) -> Resection:
-        """K, R and t of the camera by RQ factorisation (paper Eq. 5).
-
-        With optics that flip the image (`mirrored`: an odd number of reflections) R maps to the unflipped camera frame,
-        whose third axis still points away from the camera.
-        """
+    def resect(self) -> Resection:
+        """K, R and t by RQ factorisation (paper Eq. 5).  A camera alone does not tell whether its image is mirrored."""
         K, R = rq(self.linear, mode="economic")  # (2, 2) and (2, 3), but for the signs
-        signs = np.sign(np.diag(K)) * [-1.0 if mirrored else 1.0, 1.0]
+        signs = np.sign(np.diag(K))
         K, R = K * signs, R * signs[:, None]
-        return Resection(K, np.vstack([R, np.cross(*R)]), np.linalg.solve(K, self.offset_px), mirrored)
+        return Resection(K, np.vstack([R, np.cross(*R)]), np.linalg.solve(K, self.offset_px))
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,19 +160,28 @@ class NearAffineCamera(MatrixCamera):
         return radial_derivative(v, self.radial_per_px2) @ J if self.radial_per_px2 else J
 
     def undistort(self, u: ArrayLike) -> np.ndarray:
-        """Pixels (n, 2) with the radial distortion taken out (Newton's method on the radius)."""
+        """Pixels (n, 2) with the radial distortion taken out (Newton's method on the radius).
+
+        Barrel distortion (k < 0) folds the image over at a largest radius; pixels beyond, which it shows nowhere, become NaN.
+
+        >>> camera = NearAffineCamera([[100, 0, 0, 0], [0, 100, 0, 0]], 0.01, [0, 0], radial_per_px2=-1e-6)
+        >>> camera.undistort([[0, 351], [0, 400]]).round().tolist()
+        [[0.0, 431.0], [nan, nan]]
+        """
         u = points(u, 2, "u")
         if not self.radial_per_px2:
             return u
         w = u - self.centre_px
         distorted = np.linalg.norm(w, axis=1)
+        if self.radial_per_px2 < 0:
+            distorted[distorted > (2 / 3) / np.sqrt(-3 * self.radial_per_px2)] = np.nan
         radius = distorted.copy()
         for _ in range(20):
             step = (radius + self.radial_per_px2 * radius**3 - distorted) / (1 + 3 * self.radial_per_px2 * radius**2)
             radius = radius - step
             if not (np.abs(step) > 1e-13 * np.maximum(distorted, 1.0)).any():
                 break
-        return self.centre_px + w * np.divide(radius, distorted, out=np.ones_like(radius), where=distorted > 0)[:, None]
+        return self.centre_px + w * np.divide(radius, distorted, out=np.ones_like(radius), where=distorted != 0)[:, None]
 
     @property
     def projection_matrix(self) -> np.ndarray:
@@ -274,6 +269,12 @@ class StereoRig:
         """Angle between the two viewing directions."""
         return float(np.arccos(np.clip(self.left.viewing_direction @ self.right.viewing_direction, -1.0, 1.0)))
 
+    @cached_property
+    def sees_depth(self) -> bool:
+        """False where both (touching) affine cameras look along one line: how deep a point lies moves no pixel."""
+        per_mm = self.right.linear @ self.left.viewing_direction
+        return bool(np.linalg.norm(per_mm) > 1e-6 * np.linalg.norm(self.right.linear))
+
     def project(self, x: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """(u_left, u_right), (n, 2) px each, of points (n, 3) in mm."""
         return self.left.project(x), self.right.project(x)
@@ -293,8 +294,9 @@ class StereoRig:
     def triangulate(self, u_left: ArrayLike, u_right: ArrayLike, covariance_px2: ArrayLike | None = None) -> Points:
         """Maximum-likelihood points of matches (n, 2) px, with the covariance of each from the noise of its match.
 
-        Rows that are NaN, or that only a point behind a near-affine camera would explain, give a NaN point.  `covariance_px2`
-        of the matches has any form that `lib.geometry.pair_covariance` takes; None is 1 px^2.
+        A row gives a NaN point with a NaN covariance where it is NaN, where no point in front of near-affine cameras explains
+        it, and where affine cameras see no depth.  `covariance_px2` of the matches has any form that
+        `lib.geometry.pair_covariance` takes; None is 1 px^2.
         """
         u_left, u_right = points(u_left, 2, "u_left"), points(u_right, 2, "u_right")
         if len(u_left) != len(u_right):
@@ -305,7 +307,7 @@ class StereoRig:
             return self._triangulate_near_affine(y, covariance)
         y = y.T - self.offset_px[:, None]
         weight_A = np.linalg.solve(covariance, np.broadcast_to(self.linear, (len(covariance), 4, 3)))
-        covariance_mm2 = np.linalg.inv(self.linear.T @ weight_A)
+        covariance_mm2 = np.linalg.inv(self.linear.T @ weight_A if self.sees_depth else np.full((1, 3, 3), np.nan))
         gain = covariance_mm2 @ weight_A.mT
         x = (gain[0] @ y).T if len(gain) == 1 else np.einsum("nij,jn->ni", gain, y)
         return Points(x, np.broadcast_to(covariance_mm2, (len(x), 3, 3)), self.epipolar_normal @ y)
@@ -347,7 +349,7 @@ class StereoRig:
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read what `save` wrote; a FileNotFoundError or ValueError names the file."""
+        """Read what `save` wrote; a FileNotFoundError or ValueError names the file, also of a rig that sees no depth."""
         path = Path(path)
         if not path.is_file():
             raise FileNotFoundError(f"{path}: no such file; StereoRig.save writes one.")
@@ -357,15 +359,19 @@ class StereoRig:
                 if content.get(key, expected) != expected:
                     raise ValueError(f"{key} is {content[key]!r}, expected {expected!r}")
             sides = content["left"], content["right"]
-            return cls(*((NearAffineCamera if "inverse_distance_per_mm" in own else AffineCamera)(**own) for own in sides))
+            rig = cls(*((NearAffineCamera if "inverse_distance_per_mm" in own else AffineCamera)(**own) for own in sides))
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             why = f"{type(error).__name__}: {error}"
             raise ValueError(f"{path}: not a stereo rig written by StereoRig.save ({why}).") from None
+        if not rig.sees_depth:
+            raise ValueError(f"{path}: both cameras look along the same direction, so depth cannot be seen; calibrate again.")
+        return rig
 
 
 def _least_squares(J: np.ndarray, r: np.ndarray, W: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Weighted least squares of r = J x: x (n, 3) and the inverse (n, 3, 3) of the normal matrix; NaN where it has none."""
     WJ = W @ J
     normal = J.mT @ WJ
-    inverse = np.linalg.inv(np.where(np.linalg.det(normal)[:, None, None] == 0, np.nan, normal))
+    with np.errstate(invalid="ignore"):  # of NaN
+        inverse = np.linalg.inv(np.where(np.linalg.det(normal)[:, None, None] == 0, np.nan, normal))
     return (inverse @ (WJ.mT @ r[..., None]))[..., 0], inverse

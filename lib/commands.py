@@ -42,6 +42,8 @@ def main_import(argv: list[str]) -> int:
     parser.add_argument("--overwrite", action="store_true", help="replace a recording of that name")
     a = parser.parse_args(argv)
     if a.guess:
+        if a.out or a.overwrite:
+            parser.error("--out, --overwrite: --guess writes a mapping only; leave them out, and give them without --guess.")
         if a.map.exists():
             raise FileExistsError(f"{a.map}: exists already; choose another name, or remove it.")
         text = guess_mapping(a.source)
@@ -165,14 +167,20 @@ def _parsed(
     add("--out", type=Path, help="folder of the results (default: runs/NAME of the recording)")
     add("--landmarks", choices=("detected", "annotations"), default="detected", help="where they come from")
     add("--weights", help="weights file of the detector (default: the shipped ones)")
-    add("--model", default="zero_skew", help="of the cameras: zero_skew, near_affine (a finite distance), affine, ...")
-    add("--force", action="store_true", help="write results whatever the verdict")
+    add("--model", help="of the cameras: zero_skew (the default), near_affine (a finite distance), affine, ...")
+    if name in ("calibrate", "reconstruct"):  # they may be refused
+        add("--force", action="store_true", help="write results whatever the verdict")
     if frame:
         add("--frame", type=int, default=0, help="number of the frame, from 0")
         add("--setting", choices=("quality", "fast"), default="quality")
     if rig:
         add("--rig", type=Path, required=needs_rig, help="rig.json of an earlier calibration")
     a = parser.parse_args(argv)
+    if a.weights and a.landmarks == "annotations":
+        parser.error("--weights: with --landmarks annotations no detector looks; leave one of the two out.")
+    if frame and a.rig and (a.model or a.force):
+        parser.error("--model, --force: with --rig no camera is calibrated; leave them out, or --rig.")
+    a.model = a.model or "zero_skew"
     Model.parse(a.model, 2)  # an unknown one is refused
     recording = Recording.open(a.recording)
     if frame and not -len(recording) <= a.frame < len(recording):

@@ -127,6 +127,20 @@ def test_cameras_of_a_finite_distance_are_calibrated_as_such(tmp_path, capsys):
         commands.main_calibrate([*argv, "--model", "near"])
 
 
+@pytest.mark.parametrize(("command", "argv", "said"), [
+    ("reconstruct", ["--rig", "rig.json", "--model", "near_affine"], "--model, --force: with --rig no camera is calibrated"),
+    ("reconstruct", ["--rig", "rig.json", "--force"], "--model, --force: with --rig no camera is calibrated"),
+    ("calibrate", [*LABELS, "--weights", "mine.safetensors"], "--weights: with --landmarks annotations no detector looks"),
+    ("detect", ["--force"], "unrecognized arguments: --force"),
+    ("register", ["--rig", "rig.json", "--force"], "unrecognized arguments: --force"),
+    ("import", ["--guess", "--map", "map.toml", "--overwrite"], "--guess writes a mapping only"),
+])  # fmt: skip
+def test_an_option_that_cannot_act_is_refused(command, argv, said, tmp_path, capsys):
+    with pytest.raises(SystemExit) as ended:
+        getattr(commands, f"main_{command}")([str(paths.SHIPPED_RECORDING), *argv, "--out", str(tmp_path)])
+    assert ended.value.code == 2 and said in capsys.readouterr().err and not list(tmp_path.iterdir())
+
+
 def test_results_of_another_recording_of_that_name_stay(tmp_path, monkeypatch):
     """patient1/recording and patient2/recording; a recording that is gone has no claim."""
     monkeypatch.setattr(paths, "RUNS", tmp_path / "runs")

@@ -264,7 +264,7 @@ class _Work:
         except RefusalError:
             if by_hand is None:
                 raise
-            teacher = teach(recording, by_hand, from_labels=True)
+            teacher = teach(recording, None, by_hand=by_hand)
         self.report["start_share"] = teacher.right
         u, guided = teacher.labels(learn)[0], None
         for k in range(_GUIDED if self.learns and start.closeup_network else 0):  # untaught, near where the robot says
@@ -379,7 +379,8 @@ class _Work:
             },
             "gain": {"robot": [robot, robot_sd], "epipolar": [eye, eye_sd]},
             "offset_s": teacher.recording.offset_s, "clock_sd_s": teacher.clock_sd_s,
-            "landmark_offset_mm": teacher.offset_mm, "landmark_offset_sd_mm": teacher.offset_sd_mm,
+            "landmark_offset_mm": teacher.offset_mm,
+            "landmark_offset_sd_mm": np.sqrt(np.diagonal(teacher.offset_covariance_mm2, axis1=1, axis2=2)),
             "landmark_offset_turns_axes": teacher.turns,
             "labels_sd_px": labels_sd_px,
             "gauge": "An offset that all landmarks share and a shift of the cameras look alike: the deviations leave it out. "

@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -96,14 +96,15 @@ def longest_still(recording: Recording, seen: Seen) -> tuple[np.ndarray, str]:
 class Teacher:
     """The robot's landmarks, seen through calibrated cameras.
 
-    `offset_mm` and its deviation (3, 3), in the tool's axes, say where the landmarks are beside where the robot reports them.
+    `offset_mm` (3, 3), in the tool's axes, says where the landmarks are beside where the robot reports them;
+    `offset_covariance_mm2` (3, 3, 3) is that of each landmark.
     """
 
     recording: Recording  # with the clock's offset as the images show it
     calibration: Calibration
     clock_sd_s: float
     offset_mm: np.ndarray
-    offset_sd_mm: np.ndarray
+    offset_covariance_mm2: np.ndarray
     refused: np.ndarray  # frames in which the robot is not believed
     right: float  # share of the landmarks that agree on the cameras
     turns: bool = False  # as `LandmarkOffsets.turns`
@@ -140,7 +141,7 @@ class Teacher:
             J = c.derivatives(flat)[0][:, view]
             velocity = (r.kinematics.at(at + 0.02) - r.kinematics.at(at - 0.02)).reshape(-1, 3) / 0.04
             moved = self.clock_sd_s * np.einsum("nij,nj->ni", J, np.nan_to_num(velocity))
-            spread = np.einsum("mij,kj,mlj->mkil", axes, self.offset_sd_mm**2, axes).reshape(-1, 3, 3)
+            spread = np.einsum("mij,kjn,mln->mkil", axes, self.offset_covariance_mm2, axes).reshape(-1, 3, 3)
             spread += (_TURNED * shut[:, None] * np.linalg.norm(offset, axis=1)).reshape(-1, 1, 1) ** 2 * np.eye(3)
             spread = spread + max(r.robot_accuracy_mm, c.sigma_x_mm) ** 2 * np.eye(3)
             S = c.projection_covariance(flat)[:, view, view] + J @ spread @ J.mT + moved[:, :, None] * moved[:, None]
@@ -164,15 +165,15 @@ class Teacher:
 
 
 def teach(
-    recording: Recording, seen: Seen, *, opinion: Seen | None = None, before: Teacher | None = None,
-    from_labels: bool = False, by_hand: Seen | None = None,
+    recording: Recording, seen: Seen | None, *, opinion: Seen | None = None, before: Teacher | None = None,
+    by_hand: Seen | None = None,
 ) -> Teacher:  # fmt: skip
     """The robot as the teacher of what a detector has `seen` in the frames for learning.
 
     Args:
+        seen: None where labels set by hand, of few frames, have to do.
         opinion: Of later stages that this robot never taught.  They tell the landmarks' offsets; None: `seen` does.
         before: The teacher of the round before: its clock is the start, and what it refused stays refused.
-        from_labels: `seen` are labels set by hand, of few frames.
         by_hand: Labels set by hand.  They tell the offsets in place of detections, which may be of other points of the tool.
 
     Raises:
@@ -180,74 +181,40 @@ def teach(
             a landmark is seen more than 15 % of the tool's length and 0.25 mm off, its place stays open by more than 10 %, or
             the robot contradicts the images.
     """
-    frozen = _frozen(recording, seen.frame)
-    refused = frozen if before is None else np.union1d(frozen, before.refused)
+    alone, seen = seen is None, by_hand if seen is None else seen
+    refused = _frozen(recording, seen.frame)
+    if before is not None:
+        recording, refused = before.recording, np.union1d(refused, before.refused)
     used = seen.of(np.setdiff1d(seen.frame, refused))
     if len(used.frame) < 5:
         raise RefusalError(f"kinematics: they stand still in {len(refused)} of {len(seen.frame)} frames; check the log.")
-    recording, clock_sd_s = _clock(recording if before is None else before.recording, used, from_labels=from_labels)
-    try:
-        calibration, right = _calibrated(recording, used, from_labels)
-    except RefusalError as error:  # few right ones agree on cameras by a clock that is off, and do not tell its offset
-        if from_labels or error.__cause__ is not None:
-            raise
-        recording, clock_sd_s = _scanned_clock(recording, lambda one: _fitted(one, used).view_inliers.sum()), 0.01
-        calibration, right = _calibrated(recording, used, from_labels)
-    for _ in range(2):
-        step_s, sd_s = clock_error(calibration, used.rows(recording), recording.kinematics, recording.offset_s)
-        surer = sd_s <= 1.1 * clock_sd_s or len(used.frame) < _FEW_PAIRS  # a scan of few pairs states no deviation
-        if np.isinf(sd_s) or not surer:
-            break
-        clock_sd_s = max(sd_s, abs(step_s)) if abs(step_s) >= _LARGEST_STEP_S else sd_s
-        if not 0.1 * sd_s < abs(step_s) < _LARGEST_STEP_S:
-            break
-        recording = replace(recording, offset_s=recording.offset_s + step_s)
-        calibration, right = _calibrated(recording, used, from_labels)
-    for _ in range(3):
-        fault = _fault(recording, used, calibration, from_labels)
-        if fault is None or fault.name != "clock":
-            break
-        recording, clock_sd_s = replace(recording, offset_s=recording.offset_s + 1e-3 * fault.value), 1e-3 * fault.sd
-        calibration, right = _calibrated(recording, used, from_labels)
-    if fault is not None:
-        raise RefusalError(f"robot: {fault.text} {fault.cure}")
-    offset, sd = np.zeros((3, 3)), np.full((3, 3), 0.0 if calibration.offsets is not None else 0.1)
+    recording, calibration, clock_sd_s, right = _aligned(recording, used, by_hand=alone)
+    clicks = None if by_hand is None else by_hand.of(np.setdiff1d(by_hand.frame, refused))
+    clicked = not alone and clicks is not None and len(clicks.frame) > 0
     told, turns = calibration.offsets, False
-    by_hand = by_hand and by_hand.of(np.setdiff1d(by_hand.frame, refused))
-    clicked = by_hand is not None and len(by_hand.frame) > 0
+    offset, covariance = np.zeros((3, 3)), np.tile(0.1**2 * np.eye(3), (3, 1, 1))
     if opinion is not None and not clicked:
-        shares = (opinion.confidence >= MIN_CONFIDENCE).mean(axis=(0, 1))
-        if shares.min() < LEAST_RIGHT * shares.max():
-            rare, often = LANDMARKS[shares.argmin()], LANDMARKS[shares.argmax()]
-            raise RefusalError(
-                f"detector: where the robot says, it sees {rare} in {100 * shares.min():.0f} % of the images and {often} in "
-                f"{100 * shares.max():.0f} %. It takes another point for {rare}. {_LABEL}"
-            )
-        try:
-            told = _placed(recording, opinion.of(used.frame)).offsets
-        except ValueError:
-            told = None
+        told = _opinion(recording, opinion, used.frame)
     if told is not None and told.offset.shape == (3, 3):
-        x = recording.landmarks_mm()
-        length = np.nanmedian(np.linalg.norm(x[:, 1:].mean(axis=1) - x[:, 0], axis=1))
+        length = _length_mm(recording)
         size_mm = np.linalg.norm(told.offset, axis=1)
-        if size_mm.max() > max(_LARGEST_OFFSET * length, _LARGEST_OFFSET_MM) and not (from_labels or clicked):
+        if size_mm.max() > max(_LARGEST_OFFSET * length, _LARGEST_OFFSET_MM) and not (alone or clicked):
             raise RefusalError(
                 f"detector: it sees {LANDMARKS[size_mm.argmax()]} {size_mm.max():.2f} mm from where the robot reports it, "
                 f"{100 * size_mm.max() / length:.0f} % of the tool's length. It takes another point for it, or the robot's "
                 f"tool has other dimensions. {_LABEL}"
             )
-        turns, (offset, sd) = told.turns, _robots_share(told, (0.2 if from_labels else 1.0) * _OWN_BIAS * length)
+        turns, (offset, covariance) = told.turns, _robots_share(told, (0.2 if alone else 1.0) * _OWN_BIAS * length)
     elif before is not None:
-        offset, sd, turns = before.offset_mm, before.offset_sd_mm, before.turns
-    teacher = Teacher(recording, calibration, clock_sd_s, offset, sd, refused, right, turns)
+        offset, covariance, turns = before.offset_mm, before.offset_covariance_mm2, before.turns
+    teacher = Teacher(recording, calibration, clock_sd_s, offset, covariance, refused, right, turns)
     if clicked:
-        teacher = _as_labelled(teacher, by_hand)
+        teacher = _as_labelled(teacher, clicks)
     u, covariance = teacher.project(np.unique(np.linspace(0, len(recording) - 1, 200).astype(int)))
     share = np.nanmedian(np.sqrt(np.trace(covariance, axis1=-2, axis2=-1) / 2) / tool_length_px(u)[..., None])
     if share > NEAR:
-        told = "labels" if from_labels else "detections"
-        raise RefusalError(f"{told}: they tell a landmark's place to {100 * share:.0f} % of the tool's length only. {_LABEL}")
+        what = "labels" if alone else "detections"
+        raise RefusalError(f"{what}: they tell a landmark's place to {100 * share:.0f} % of the tool's length only. {_LABEL}")
     against = _contradicted(teacher, used)
     if len(against) > max(_CONTRADICTED * len(used.frame), 2):
         raise RefusalError(
@@ -255,6 +222,27 @@ def teach(
             f"says: a frozen log, another clock, a moved microscope, or a tool that the robot does not hold."
         )
     return replace(teacher, refused=np.union1d(refused, against))
+
+
+def _opinion(recording: Recording, opinion: Seen, frames: np.ndarray) -> LandmarkOffsets | None:
+    """The offsets that later stages see; a `RefusalError` where they hardly see a landmark near where the robot says."""
+    shares = (opinion.confidence >= MIN_CONFIDENCE).mean(axis=(0, 1))
+    if shares.min() < LEAST_RIGHT * shares.max():
+        rare, often = LANDMARKS[shares.argmin()], LANDMARKS[shares.argmax()]
+        raise RefusalError(
+            f"detector: where the robot says, it sees {rare} in {100 * shares.min():.0f} % of the images and {often} in "
+            f"{100 * shares.max():.0f} %. It takes another point for {rare}. {_LABEL}"
+        )
+    try:
+        return _placed(recording, opinion.of(frames)).offsets
+    except ValueError:
+        return None
+
+
+def _length_mm(recording: Recording) -> float:
+    """Of the tool, from its base to the middle of its tips."""
+    x = recording.landmarks_mm()
+    return float(np.nanmedian(np.linalg.norm(x[:, 1:].mean(axis=1) - x[:, 0], axis=1)))
 
 
 def _frozen(recording: Recording, frames: np.ndarray) -> np.ndarray:
@@ -266,11 +254,46 @@ def _frozen(recording: Recording, frames: np.ndarray) -> np.ndarray:
     return np.asarray(frames)[same[nearest]]
 
 
-def _clock(recording: Recording, seen: Seen, *, from_labels: bool = False) -> tuple[Recording, float]:
+def _aligned(recording: Recording, seen: Seen, *, by_hand: bool) -> tuple[Recording, Calibration, float, float]:
+    """The recording with the clock's offset that cameras tell, the cameras, the offset's deviation, the share that agrees.
+
+    A `RefusalError` where no cameras of a stereo microscope explain what is seen (or marked, if `by_hand`), or a fault does.
+    """
+    calibrated = partial(_by_labels if by_hand else _by_detections, seen=seen)
+    recording, clock_sd_s = _clock(recording, seen, by_hand=by_hand)
+    try:
+        calibration = calibrated(recording)
+    except RefusalError as error:  # few right ones agree on cameras by a clock that is off, and do not tell its offset
+        if error.__cause__ is not None:
+            raise
+        recording, clock_sd_s = _scanned_clock(recording, lambda one: _fitted(one, seen).view_inliers.sum()), 0.01
+        calibration = calibrated(recording)
+    for _ in range(2):
+        step_s, sd_s = clock_error(calibration, seen.rows(recording), recording.kinematics, recording.offset_s)
+        surer = sd_s <= 1.1 * clock_sd_s or len(seen.frame) < _FEW_PAIRS  # a scan of few pairs states no deviation
+        if np.isinf(sd_s) or not surer:
+            break
+        clock_sd_s = max(sd_s, abs(step_s)) if abs(step_s) >= _LARGEST_STEP_S else sd_s
+        if not 0.1 * sd_s < abs(step_s) < _LARGEST_STEP_S:
+            break
+        recording = replace(recording, offset_s=recording.offset_s + step_s)
+        calibration = calibrated(recording)
+    for _ in range(3):
+        fault = _fault(recording, seen, calibration, by_hand=by_hand)
+        if fault is None or fault.name != "clock":
+            break
+        recording, clock_sd_s = replace(recording, offset_s=recording.offset_s + 1e-3 * fault.value), 1e-3 * fault.sd
+        calibration = calibrated(recording)
+    if fault is not None:
+        raise RefusalError(f"robot: {fault.text} {fault.cure}")
+    return recording, calibration, clock_sd_s, float(calibration.view_inliers.sum() / max(_told(recording, seen), 1))
+
+
+def _clock(recording: Recording, seen: Seen, *, by_hand: bool = False) -> tuple[Recording, float]:
     """The recording with the offset of the clocks that the images show, if they do, and its standard deviation."""
     rows = seen.rows(recording)
     if len(seen.frame) < _FEW_PAIRS:  # too few for that: the offset at which cameras explain the labels best
-        fit = _labelled if from_labels else _fitted
+        fit = _by_labels if by_hand else _fitted
         return _scanned_clock(recording, lambda one: -fit(one, seen).reprojection_rms_px), 0.01
     for reach_s in (0.2, 1.0):
         try:
@@ -316,29 +339,26 @@ def _placed(recording: Recording, seen: Seen, least: float = 0.0, ransac_px: flo
     return affine
 
 
-def _labelled(recording: Recording, labels: Seen) -> Calibration:
+def _by_labels(recording: Recording, seen: Seen) -> Calibration:
     """As `_placed`, from labels set by hand.  If they are few, all count as right, with a robot's usual offsets."""
-    if len(labels.frame) >= _FEW_PAIRS:
-        return _placed(recording, labels)
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "offsets:", RuntimeWarning)  # by a clock that is off they find no end
-        try:
-            return _fitted(recording, labels, ransac_px=np.inf, offsets=True, offset_prior_sd=_ROBOTS_OFFSET_MM)
-        except ValueError:  # jaws that are shut have no axes
-            return _fitted(recording, labels, ransac_px=np.inf)
+    try:
+        if len(seen.frame) >= _FEW_PAIRS:
+            return _placed(recording, seen)
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "offsets:", RuntimeWarning)  # by a clock that is off they find no end
+            try:
+                return _fitted(recording, seen, ransac_px=np.inf, offsets=True, offset_prior_sd=_ROBOTS_OFFSET_MM)
+            except ValueError:  # jaws that are shut have no axes
+                return _fitted(recording, seen, ransac_px=np.inf)
+    except ValueError as error:
+        raise RefusalError(f"labels: no cameras agree with them ({error}). {_LABEL}") from error
 
 
-def _calibrated(recording: Recording, seen: Seen, from_labels: bool) -> tuple[Calibration, float]:
-    """Cameras that the detections agree on, the confident ones if all do not, and the share of landmarks that agree."""
-    told = 6 * int(np.isfinite(recording.landmarks_mm()[seen.frame]).all(axis=(1, 2)).sum())
-    length, reason, best, poor, competing = tool_length_px(seen.u), "none was found", None, None, None
+def _by_detections(recording: Recording, seen: Seen) -> Calibration:
+    """Cameras that the detections agree on, the confident ones if all do not."""
+    told, length = _told(recording, seen), tool_length_px(seen.u)
+    reason, best, poor, competing = "none was found", None, None, None
     near_px = NEAR * float(np.quantile(length[np.isfinite(length)], 0.25)) if np.isfinite(length).any() else 0.0
-    if from_labels:
-        try:
-            found = _labelled(recording, seen)
-        except ValueError as error:
-            raise RefusalError(f"labels: no cameras agree with them ({error}). {_LABEL}") from error
-        return found, float(found.view_inliers.sum() / max(told, 1))
     # Offsets of an unknown tool widen the errors of the right ones, until the wrong ones do not stand apart.
     rows_kept = {int((seen.confidence >= least).sum()): least for least in _CONFIDENCES[::-1]}  # as many are the same rows
     for least, ransac_px in (*((least, None) for least in sorted(rows_kept.values())), (MIN_CONFIDENCE, near_px)):
@@ -361,17 +381,22 @@ def _calibrated(recording: Recording, seen: Seen, from_labels: bool) -> tuple[Ca
         else:
             poor = poor or (found, right)
     if best or poor:
-        return best or poor
+        return (best or poor)[0]
     raise RefusalError(f"detector: too few landmarks are right to start from ({reason}). {_LABEL}") from competing
 
 
-def _fault(recording: Recording, seen: Seen, calibration: Calibration, from_labels: bool) -> Hypothesis | None:
+def _told(recording: Recording, seen: Seen) -> int:
+    """How many landmarks, of two views each, the robot reports in the frames of `seen`."""
+    return 6 * int(np.isfinite(recording.landmarks_mm()[seen.frame]).all(axis=(1, 2)).sum())
+
+
+def _fault(recording: Recording, seen: Seen, calibration: Calibration, *, by_hand: bool) -> Hypothesis | None:
     """The robot's fault that explains what the images show, if there is one; cameras of no stereo microscope are refused."""
     red = [r for r in judge(None, calibration).reasons if r.level == LEVELS[2] and r.name in ("implausible_optics", "thin")]
     if red:
         raise RefusalError(f"cameras: {red[0].text} {red[0].cure}")
     length = np.nanmedian(tool_length_px(seen.u))
-    if from_labels or calibration.reprojection_rms_px < _HARMLESS * length:
+    if by_hand or calibration.reprojection_rms_px < _HARMLESS * length:
         return None
     rows = seen.rows(recording)
     rows = replace(rows, confidence=np.where(calibration.view_inliers, rows.confidence, 0.0))
@@ -381,7 +406,7 @@ def _fault(recording: Recording, seen: Seen, calibration: Calibration, from_labe
 
 
 def _robots_share(found: LandmarkOffsets, own_sd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The part of the offsets (3, 3) that is the robot's, and its standard deviation; the rest is the detector's own.
+    """The part of the offsets (3, 3) that is the robot's, and its covariance (3, 3, 3); the rest is the detector's own.
 
     Both have Gaussian priors: the detector's of `own_sd` (3, 3) mm, the robot's of the width that makes the nine numbers most
     probable.  Offsets no larger than a detector's usual ones are taken for the detector's.
@@ -391,15 +416,15 @@ def _robots_share(found: LandmarkOffsets, own_sd: np.ndarray) -> tuple[np.ndarra
     width = widths[(np.log(total) + found.offset**2 / total).sum(axis=(1, 2)).argmin(), 0, 0]
     # What the rig hides moves cameras and offsets together and leaves the labels where they are: no reason to believe less.
     share = width**2 / (width**2 + own_sd**2)
-    return share * found.offset, np.hypot(np.sqrt(share) * own_sd, _ODD * share * found.offset)
+    return share * found.offset, np.hypot(np.sqrt(share) * own_sd, _ODD * share * found.offset)[:, :, None] ** 2 * np.eye(3)
 
 
 def _as_labelled(teacher: Teacher, labels: Seen) -> Teacher:
     """The teacher with the offsets at which its cameras see the robot's landmarks where labels set by hand are."""
-    free, x = teacher.calibration.offsets, teacher.recording.landmarks_mm()
+    free = teacher.calibration.offsets
     fitted = free is not None and free.offset.shape == (3, 3)
     teacher, start = replace(teacher, turns=fitted and free.turns), free.offset.ravel() if fitted else np.zeros(9)
-    wide_mm = _OTHER_POINT * np.nanmedian(np.linalg.norm(x[:, 1:].mean(axis=1) - x[:, 0], axis=1))
+    wide_mm = _OTHER_POINT * _length_mm(teacher.recording)
 
     def misfit(change: np.ndarray) -> np.ndarray:
         u = replace(teacher, offset_mm=(start + wide_mm * change).reshape(3, 3)).project(labels.frame)[0]
@@ -408,10 +433,11 @@ def _as_labelled(teacher: Teacher, labels: Seen) -> Teacher:
     known = np.isfinite(labels.u)
     # A wild click counts little.
     found = least_squares(misfit, np.zeros(9), loss="soft_l1", f_scale=2.0, ftol=1e-4, xtol=1e-4)
-    sd = wide_mm * np.sqrt(np.diag(np.linalg.inv(found.jac.T @ found.jac)) * max(1.0, 2 * found.cost / known.sum()))
+    covariance = wide_mm**2 * max(1.0, 2 * found.cost / known.sum()) * np.linalg.inv(found.jac.T @ found.jac)
     told = known.any(axis=(0, 1, 3))[:, None]  # of other landmarks the labels say nothing
-    parts = {"offset_mm": (start + wide_mm * found.x).reshape(3, 3), "offset_sd_mm": sd.reshape(3, 3)}
-    return replace(teacher, **{name: np.where(told, part, getattr(teacher, name)) for name, part in parts.items()})
+    offset = np.where(told, (start + wide_mm * found.x).reshape(3, 3), teacher.offset_mm)
+    own = np.where(told[:, :, None], np.einsum("kikj->kij", covariance.reshape(3, 3, 3, 3)), teacher.offset_covariance_mm2)
+    return replace(teacher, offset_mm=offset, offset_covariance_mm2=own)
 
 
 def _contradicted(teacher: Teacher, seen: Seen) -> np.ndarray:

@@ -63,10 +63,9 @@ def rectify(rig: StereoRig, shape_left: tuple[int, int], shape_right: tuple[int,
     """
     A_l, A_r = rig.left.linear, rig.right.linear
     H = A_r @ np.linalg.pinv(A_l)
-    per_mm = A_r @ rig.left.viewing_direction
-    if np.linalg.norm(per_mm) < 1e-6 * np.linalg.norm(A_r):
+    if not rig.sees_depth:
         raise ValueError("rig: both cameras look along the same direction, so depth cannot be seen; calibrate again.")
-    shift = np.linalg.solve(H, per_mm)
+    shift = np.linalg.solve(H, A_r @ rig.left.viewing_direction)
     direction = shift / np.linalg.norm(shift) * (1.0 if shift[0] >= 0 else -1.0)
     Q = np.array([direction, [-direction[1], direction[0]]])
 

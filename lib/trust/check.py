@@ -110,8 +110,10 @@ def check(recording: str | Path | Recording, *, detector: Callable | None = None
     if found.skeleton == LANDMARKS:
         detector = SharedDetector(detector)
         data = detect(found, detector, frames=spread(len(found), _MOST_FRAMES))
+    elif detector is not None:
+        raise ValueError(f"detector (--weights): none knows {', '.join(found.skeleton)}; leave it out: labels are judged.")
     elif (marks := found.annotations) is not None:
-        detector, data = None, of_recording(found, marks.u_left, marks.u_right)
+        data = of_recording(found, marks.u_left, marks.u_right)
     else:
         raise ValueError(f"{found.folder}: the detector knows {', '.join(LANDMARKS)} only, and there are no annotations.")
     a = assess(found, data, detector=detector)

@@ -109,17 +109,27 @@ def _frame_order(case: Case) -> Iterator[Hypothesis]:
 
 
 def _readout(case: Case) -> Iterator[Hypothesis]:
-    """A rolling shutter of another read-out time."""
+    """A rolling shutter of another read-out time; a negative one is that of images that are turned upside down."""
     if case.size is None:
         return
     row = np.clip(case.problem.y[:, :, 1:] / (case.size[1] - 1) - 0.5, -0.6, 0.6)
     velocity = case.velocity()
     known = replace(case.problem, seen=case.problem.used & np.isfinite(velocity).all(axis=1)[:, None])
-    fit, value, sd = case.linear(lambda M: np.einsum("cij,ncj->nci", M[:, :, :3], velocity[:, None] * row)[..., None], known)
-    off = f"{1e3 * value:.1f} +- {1e3 * sd:.1f} ms"
-    text = f"The residuals grow from row to row with the tool's velocity: the read-out time is off by {off}."
-    cure = f"Set readout_s = {max(case.readout_s + value, 0.0):.4f} in recording.toml."
-    yield case.found("readout", fit, 1, (1e3 * value, 1e3 * sd, "ms"), text, cure, on=known)
+    for views in ((0, 1), (0,), (1,)):
+        moved = velocity[:, None] * row * np.isin((0, 1), views)[:, None]
+        fit, value, sd = case.linear(lambda M, v=moved: np.einsum("cij,ncj->nci", M[:, :, :3], v)[..., None], known)
+        readout_s = case.readout_s + value
+        if readout_s < -3 * sd:
+            who, them = ("Both images are", "both") if len(views) == 2 else (f"The {SIDES[views[0]]} image is", "it")
+            took = f"{-1e3 * readout_s:.1f} +- {1e3 * sd:.1f} ms"
+            text = f"{who} turned by 180 degrees: its rows are read from the bottom up, in {took}."
+            cure = f"Turn {them} by 180 degrees, with readout_s = {-readout_s:.4f}."
+            yield case.found("turned_image", fit, 1, (1e3 * readout_s, 1e3 * sd, "ms"), text, cure, on=known)
+        elif len(views) == 2:
+            off = f"{1e3 * value:.1f} +- {1e3 * sd:.1f} ms"
+            text = f"The residuals grow from row to row with the tool's velocity: the read-out time is off by {off}."
+            cure = f"Set readout_s = {max(readout_s, 0.0):.4f} in recording.toml."
+            yield case.found("readout", fit, 1, (1e3 * value, 1e3 * sd, "ms"), text, cure, on=known)
 
 
 #: They need the tool's path in time (`Case.paths`).

@@ -153,6 +153,20 @@ def test_shut_jaws_borrow_the_axes_of_another_time(world, recording):
     np.testing.assert_allclose(again, u, atol=0.1)
 
 
+def test_an_offset_that_is_unknown_along_the_view_leaves_the_label_sure(world, recording):
+    """The variances in the tool's axes alone would say otherwise."""
+    teacher = taught(recording, StandIn(world.u, noise_px=0.7, wrong=0.2))
+    x = recording.kinematics.at(recording.frames.time_s + teacher.recording.offset_s)
+    axes = tool_axes(x)
+    frame = int(np.flatnonzero(np.isfinite(axes).all(axis=(1, 2)))[0])
+    view = axes[frame].T @ teacher.calibration.cameras[0].viewing_direction
+    sure, unknown, alike = (
+        np.trace(replace(teacher, offset_covariance_mm2=np.tile(own, (3, 1, 1))).project(np.array([frame]))[1][0, 0, 0])
+        for own in (np.zeros((3, 3)), 0.2**2 * np.outer(view, view), 0.2**2 * np.diag(view**2))
+    )
+    assert unknown - sure < 0.01 * (alike - sure)
+
+
 def test_a_detector_that_takes_elbows_for_tips_is_no_start(world, recording):
     """It agrees with itself and with the robot, but for an offset that no robot has."""
     elbows = world.u.copy()
@@ -385,7 +399,7 @@ def off_by_a_fifth(world, tmp_path_factory):
 
 
 def test_five_labelled_pairs_tell_clock_and_offsets(world, off_by_a_fifth):
-    teacher = teach(off_by_a_fifth, five_labelled(world)[1], from_labels=True)
+    teacher = teach(off_by_a_fifth, None, by_hand=five_labelled(world)[1])
     assert np.nanmedian(label_errors(world, teacher)[0]) < 1.5  # 0.2 mm are 5 px
     assert teacher.recording.offset_s == pytest.approx(0.04, abs=0.015)
 
@@ -440,7 +454,7 @@ def test_labels_move_a_teacher_that_needs_no_offsets_where_the_robot_is_believed
     teacher = teach(still, seen, by_hand=Seen.by_hand(u))
     off = np.nanmedian((teacher.project(np.arange(world.n))[0] - world.u)[..., 0], axis=(0, 1))
     np.testing.assert_allclose(off, [4.0, 4.0, 0.0], atol=1.2)
-    assert 13 in teacher.refused and np.linalg.norm(teacher.offset_sd_mm, axis=1).max() < 0.2
+    assert 13 in teacher.refused and np.trace(teacher.offset_covariance_mm2, axis1=1, axis2=2).max() < 0.2**2
 
 
 @pytest.mark.parametrize(("length_px", "agrees_px", "contradicts_px"), [(300, 4.0, 5.0), (60, 3.2, 4.0)])
@@ -456,7 +470,7 @@ def test_a_teacher_that_errs_alike_in_all_labelled_frames_contradicts_them(lengt
 def test_labels_that_leave_the_places_open_are_refused(world, recording, monkeypatch):
     monkeypatch.setattr("lib.adapt.teacher.NEAR", 0.001)
     with pytest.raises(RefusalError, match="labels: .* to [0-9]+ % of the tool's length only. Label 10 pairs"):
-        teach(recording, five_labelled(world)[1], from_labels=True)
+        teach(recording, None, by_hand=five_labelled(world)[1])
 
 
 def test_labels_teach_a_tool_that_no_closeup_knows(world, recording, tmp_path, monkeypatch):

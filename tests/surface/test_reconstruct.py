@@ -87,12 +87,10 @@ def test_epipolar_filter_drops_what_is_off_the_line(scene, result):
     assert not len(epipolar_inliers(scene.rig, matches.keep(np.zeros(len(matches), dtype=bool))))
 
 
-def test_black_images_and_full_masks_are_refused(scene):
+def test_black_images_are_refused(scene):
     black = np.zeros_like(scene.left)
     with pytest.raises(ValueError, match=r"left, right|u:|texture"):
         reconstruct(black, black, scene.rig)
-    with pytest.raises(ValueError, match="mask_left"):
-        reconstruct(scene.left, scene.right, scene.rig, mask_left=np.ones(black.shape[:2], dtype=bool))
 
 
 def test_the_left_image_twice_is_refused():
@@ -103,19 +101,9 @@ def test_the_left_image_twice_is_refused():
         reconstruct(left, left, recording.truth.rig)
 
 
-def window(x: int, y: int, size: int) -> np.ndarray:
-    """A mask (360, 640) of everything but a square."""
-    mask = np.ones((360, 640), dtype=bool)
-    mask[y : y + size, x : x + size] = False
-    return mask
-
-
 @pytest.mark.parametrize(
     ("change", "named"),
     [
-        ({"mask_left": window(300, 160, 40)}, "u: .* points lie in the domain, .* control points"),
-        ({"mask_left": np.ones((5, 5), dtype=bool)}, "mask_left: expected a bool array"),
-        ({"mask_right": np.zeros((360, 640))}, "mask_right: expected a bool array"),
         ({"setting": "best"}, "setting"),
         ({"right": np.zeros((360, 640, 3), np.uint8)}, "left, right: no match"),
         ({"rig": "off its lines"}, r"rig: it does not fit the images: .* px off"),

@@ -51,6 +51,16 @@ def test_a_fault_is_named_with_its_size_and_its_cure(way, strength, value):
         assert best.value == pytest.approx(value, abs=max(4 * best.sd, 0.1 * abs(value)))
 
 
+def test_a_turned_image_is_no_wrong_readout_time():
+    """Its rows are read from the bottom up; a camera takes up the turn, and the shutter alone tells."""
+    scene = Scene(np.random.default_rng(7), frames=40, fps=15.0, speed_mm_s=6.0, readout_s=0.02)
+    corner = np.array(scene.take().image_size_px) - 1.0
+    scene.edit_pixels.append(lambda scene, u: np.stack([u[:, :, 0], corner - u[:, :, 1]], axis=2))
+    best = found(scene.take()).best
+    assert best.name == "turned_image" and best.value == pytest.approx(-20.0, abs=4 * best.sd)
+    assert "The right image is turned by 180 degrees" in best.text and "Turn it by 180 degrees" in best.cure
+
+
 def test_cameras_that_do_not_fit_say_nothing_of_an_axis():
     """Their pixels are always skewed or oblong."""
     assert "scaled_axis" not in {h.name for h in found(take("random detections", "150.0 px")).hypotheses}
