@@ -9,7 +9,7 @@ import json
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Self
+from typing import Protocol, Self, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -32,11 +32,21 @@ class Resection:
         K: (2, 2) upper triangular [[alpha_x, skew], [0, alpha_y]], px per mm.
         R: (3, 3) rotation camera_from_robot; its third row is the viewing direction, away from the camera.
         t: (2,) mm, so that u = K (R[:2] @ x + t).
+        mirrored: As the caller said: one affine camera alone cannot tell (a reflection only flips R's unseen third row).
     """
 
     K: np.ndarray
     R: np.ndarray
     t: np.ndarray
+    mirrored: bool = False
+
+
+@runtime_checkable
+class Camera(Protocol):
+    """Anything that projects points."""
+
+    def project(self, x: ArrayLike) -> np.ndarray:
+        """Pixels (n, 2) of points (n, 3) in mm."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,12 +107,16 @@ class AffineCamera(MatrixCamera):
         """Homogeneous P (3, 4); an affine camera's last row is (0, 0, 0, 1)."""
         return np.vstack([self.matrix, [0.0, 0.0, 0.0, 1.0]])
 
-    def resect(self) -> Resection:
-        """K, R and t by RQ factorisation (paper Eq. 5).  A camera alone does not tell whether its image is mirrored."""
+    def resect(self, *, mirrored: bool = False) -> Resection:
+        """K, R and t of the camera by RQ factorisation (paper Eq. 5).
+
+        With optics that flip the image (`mirrored`: an odd number of reflections) R maps to the unflipped camera frame,
+        whose third axis still points away from the camera.
+        """
         K, R = rq(self.linear, mode="economic")  # (2, 2) and (2, 3), but for the signs
-        signs = np.sign(np.diag(K))
+        signs = np.sign(np.diag(K)) * [-1.0 if mirrored else 1.0, 1.0]
         K, R = K * signs, R * signs[:, None]
-        return Resection(K, np.vstack([R, np.cross(*R)]), np.linalg.solve(K, self.offset_px))
+        return Resection(K, np.vstack([R, np.cross(*R)]), np.linalg.solve(K, self.offset_px), mirrored)
 
 
 @dataclass(frozen=True, eq=False)
@@ -294,8 +308,8 @@ class StereoRig:
     def triangulate(self, u_left: ArrayLike, u_right: ArrayLike, covariance_px2: ArrayLike | None = None) -> Points:
         """Maximum-likelihood points of matches (n, 2) px, with the covariance of each from the noise of its match.
 
-        A row gives a NaN point with a NaN covariance where it is NaN, where no point in front of near-affine cameras explains
-        it, and where affine cameras see no depth.  `covariance_px2` of the matches has any form that
+        Rows that are NaN, that no point in front of near-affine cameras explains, or seen by affine cameras that see no depth,
+        give a NaN point with a NaN covariance.  `covariance_px2` of the matches has any form that
         `lib.geometry.pair_covariance` takes; None is 1 px^2.
         """
         u_left, u_right = points(u_left, 2, "u_left"), points(u_right, 2, "u_right")

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
 
-from lib.cameras import AffineCamera, NearAffineCamera, StereoRig
+from lib.cameras import AffineCamera, Camera, NearAffineCamera, StereoRig
 from lib.geometry import RigidTransform
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
 
@@ -50,6 +50,7 @@ def near_affine_of(P, radial_per_px2=0.0):
 def test_affine_projection_is_the_matrix_product():
     camera = AffineCamera([[1, 2, 3, 4], [5, 6, 8, 7]])
     np.testing.assert_allclose(camera.project([[1, 1, 2], [0, 0, 0]]), [[13, 34], [4, 7]])
+    assert isinstance(camera, Camera)
 
 
 def test_nan_rows_stay_nan(rig):
@@ -63,16 +64,18 @@ def test_nan_rows_stay_nan(rig):
     st.floats(0.5, 200),
     st.floats(0.5, 200),
     st.floats(-5, 5),
+    st.booleans(),
 )
-def test_resection_recomposes_the_matrix(rotation, zoom_x, zoom_y, skew):
+def test_resection_recomposes_the_matrix(rotation, zoom_x, zoom_y, skew, mirrored):
     R = RigidTransform.from_rotation_vector(rotation).R
     M = np.column_stack([np.array([[zoom_x, skew], [0, zoom_y]]) @ R[:2], [10.0, -4.0]])
-    found = AffineCamera(M).resect()
+    found = AffineCamera(M).resect(mirrored=mirrored)
     again = found.K @ np.column_stack([found.R[:2], found.t])
     np.testing.assert_allclose(again, M, atol=1e-9 * np.abs(M).max())
     np.testing.assert_allclose(found.R @ found.R.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(found.R) == pytest.approx(1)
-    np.testing.assert_allclose(found.K, [[zoom_x, skew], [0, zoom_y]], atol=1e-9 * max(zoom_x, zoom_y, 5))
+    if not mirrored:
+        np.testing.assert_allclose(found.K, [[zoom_x, skew], [0, zoom_y]], atol=1e-9 * max(zoom_x, zoom_y, 5))
 
 
 def test_triangulation_inverts_projection(rig, near):

@@ -21,8 +21,9 @@ from lib import surface as surfaces
 
 ATTRIBUTES = {
     geometry.RigidTransform: "R t apply inverse compose",
+    cameras.Camera: "project",
     cameras.AffineCamera: "matrix project resect",
-    cameras.Resection: "K R t",
+    cameras.Resection: "K R t mirrored",
     cameras.NearAffineCamera: "matrix inverse_distance_per_mm centre_px project",
     cameras.StereoRig: "left right project triangulate fundamental epipolar_distance save load",
     cameras.Points: "x_mm covariance_mm2 epipolar_px",

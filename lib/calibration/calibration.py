@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from lib.calibration.checks import extents
 from lib.calibration.models import Fit
-from lib.cameras import AffineCamera, MatrixCamera, Points, Resection, StereoRig
+from lib.cameras import AffineCamera, Camera, Points, Resection, StereoRig
 from lib.correspondences import Correspondences
 from lib.geometry import RigidTransform, pair_covariance, points, precision
 
@@ -77,7 +77,7 @@ class Calibration:
         return self.minimum.state.model.parameter_names
 
     @cached_property
-    def cameras(self) -> tuple[MatrixCamera, ...]:
+    def cameras(self) -> tuple[Camera, ...]:
         """One or two, near-affine if the model has 1/distance or radial distortion."""
         return self.minimum.state.cameras()
 

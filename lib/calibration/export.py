@@ -7,11 +7,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from lib.cameras import MatrixCamera
+from lib.cameras import Camera
 from lib.files import whole, write_text
 
 
-def write_opencv(camera: MatrixCamera, path: str | Path, image_size_px: tuple[int, int]) -> None:
+def write_opencv(camera: Camera, path: str | Path, image_size_px: tuple[int, int]) -> None:
     """A file for `cv2.FileStorage`; its suffix, .yml, .yaml, .xml or .json, says the format (another is a ValueError).
 
     It holds `projection_matrix` (3 x 4, millimetres of the robot frame to pixels, the last row of an affine camera is
@@ -40,7 +40,7 @@ def write_opencv(camera: MatrixCamera, path: str | Path, image_size_px: tuple[in
         storage.release()
 
 
-def write_ros(camera: MatrixCamera, path: str | Path, image_size_px: tuple[int, int], name: str = "camera") -> None:
+def write_ros(camera: Camera, path: str | Path, image_size_px: tuple[int, int], name: str = "camera") -> None:
     """ROS CameraInfo YAML (camera_info_manager).  P carries the whole camera, millimetres of the robot frame to pixels.
 
     K and R are identities and D is zero: only P has a meaning.  A ValueError refuses a `name` of anything but letters, digits

@@ -11,7 +11,7 @@ from typing import Self
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from lib.cameras import AffineCamera, MatrixCamera, NearAffineCamera, radial_derivative
+from lib.cameras import AffineCamera, Camera, NearAffineCamera, radial_derivative
 from lib.geometry import cross, precision
 from lib.least_squares import minimise
 
@@ -135,7 +135,7 @@ class State:
         rotation = Rotation.from_rotvec(d[:, :3]).as_matrix() @ self.rotation
         return replace(self, A=(self.zoom * np.exp(d[:, 3:5]))[:, :, None] * rotation[:, :2], **common)
 
-    def cameras(self) -> tuple[MatrixCamera, ...]:
+    def cameras(self) -> tuple[Camera, ...]:
         """The cameras of the public interface."""
         found = []
         for A, o, rho, k, c in zip(self.A, self.offset, self.rho, self.radial, self.centre, strict=True):

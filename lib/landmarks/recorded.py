@@ -9,7 +9,7 @@ from lib.recordings import Recording
 
 
 def detect(
-    recording: Recording, detector: Detector | None = None, *, frames: slice | np.ndarray | None = None
+    recording: Recording, detector: Detector | None = None, *, frames: slice | np.ndarray | None = None, track: bool = False
 ) -> Correspondences:
     """Run the detector over a recording, one stereo frame at a time (a full-HD pair takes 12 MB).
 
@@ -19,6 +19,7 @@ def detect(
     Args:
         detector: None is the one that ships.
         frames: Which frames; None is all.
+        track: Follow the landmarks from frame to frame (`Detector.track`): several times faster if frames follow each other.
 
         >>> from lib import paths
         >>> found = detect(Recording.open(paths.SHIPPED_RECORDING), frames=slice(0, 2))
@@ -32,7 +33,8 @@ def detect(
     found = []
     for i in tqdm(chosen, desc="landmarks", unit="pair", leave=False):
         frame = recording.frames[int(i)]
-        found.append(detector(np.stack([frame.left, frame.right])))
+        pair = np.stack([frame.left, frame.right])
+        found.append(detector.track(pair, found[-1]) if track and found else detector(pair))
     every, n = Landmarks.join(found), len(chosen)
     known = {"covariance_px2": every.covariance.reshape(n, 2, 3, 2, 2), "confidence": every.confidence.reshape(n, 2, 3)}
     known = {name: part.swapaxes(1, 2) for name, part in known.items()}

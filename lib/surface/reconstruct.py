@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from lib.calibration import Calibration
 from lib.cameras import AffineCamera, Points, StereoRig
-from lib.matching import Matches, glint_mask, match, tool_mask
+from lib.matching import Matches, checked_mask, glint_mask, match, tool_mask
 from lib.surface.bspline import BSplineSurface, fit_surface
 
 #: Matches farther from their epipolar line than this many of their own standard deviations are dropped.
@@ -116,7 +116,8 @@ def _regression(x: np.ndarray, value: np.ndarray, sigma: np.ndarray) -> tuple[np
 def reconstruct(
     left: np.ndarray, right: np.ndarray, rig: StereoRig | Calibration, *, setting: str = "quality",
     method: str | Callable | None = None, refine: bool | None = None,
-    u_landmarks: tuple[ArrayLike, ArrayLike] | None = None, percentiles: tuple[float, float] = (0.0, 100.0),
+    u_landmarks: tuple[ArrayLike, ArrayLike] | None = None, mask_left: np.ndarray | None = None,
+    mask_right: np.ndarray | None = None, percentiles: tuple[float, float] = (0.0, 100.0),
     control: tuple[int, int] = (20, 20), smoothness: float | None = None, depth_only: bool | None = None,
     depth_range_mm: tuple[float, float] | None = None, max_epipolar_px: float = 6.0, seconds: dict[str, float] | None = None,
 ) -> Reconstruction:  # fmt: skip
@@ -130,6 +131,7 @@ def reconstruct(
         method: The matcher; see `lib.matching.match`.
         refine: Correct the rig by a first, fast matching (`refine_rig`); None does so for a calibration of affine cameras.
         u_landmarks: Landmarks of the tool, (3, 2) px left and right, to mask the tool; NaN = missing.
+        mask_left, mask_right: (h, w) bool, True = ignore, beside glints and tool.
         percentiles: (low, high) of the matches' coordinates that bound the surface's domain; (1, 99) leaves out the rim.
         control, smoothness: As for `fit_surface`; the smoothness of an earlier frame (`surface.fit.smoothness`) saves time.
         depth_only: Fit one spline, the depth along the rays of the left camera, in place of three.  It needs an affine
@@ -161,9 +163,11 @@ def reconstruct(
     with _timed(seconds, "mask"):
         with ThreadPoolExecutor(2) as pool:
             masks = dict(zip(("mask_left", "mask_right"), pool.map(glint_mask, (left, right)), strict=True))
-        if u_landmarks is not None:
-            for mask, u in zip(masks.values(), u_landmarks, strict=True):
-                mask |= tool_mask(mask.shape, u)
+        for side, (name, given) in enumerate((("mask_left", mask_left), ("mask_right", mask_right))):
+            if u_landmarks is not None:
+                masks[name] |= tool_mask(masks[name].shape, u_landmarks[side])
+            if given is not None:
+                masks[name] |= checked_mask(given, masks[name].shape, name)
     if refine:
         with _timed(seconds, "refine"):
             rig = refine_rig(rig, covariance, match(left, right, rig=rig, setting="fast", **masks))

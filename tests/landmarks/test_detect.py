@@ -57,3 +57,20 @@ def test_some_frames_only(recording):
     np.testing.assert_array_equal(found.grid("x_mm"), recording.x_mm[[2, 4]])
     with pytest.raises(ValueError, match="frames: none of the 5"):
         detect(recording, detector, frames=slice(9, None))
+
+
+def test_tracking_starts_from_the_frame_before(recording):
+    looked = []
+
+    class Tracker:
+        def __call__(self, images):
+            looked.append("whole")
+            return detector(images)
+
+        def track(self, images, previous):
+            looked.append(previous.u[0, 0, 0])
+            return detector(images)
+
+    tracked = detect(recording, Tracker(), track=True)
+    assert looked == ["whole", 0.0, 1.0, 2.0, 3.0]
+    np.testing.assert_array_equal(tracked.u_left, detect(recording, detector).u_left)

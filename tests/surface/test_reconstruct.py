@@ -87,10 +87,12 @@ def test_epipolar_filter_drops_what_is_off_the_line(scene, result):
     assert not len(epipolar_inliers(scene.rig, matches.keep(np.zeros(len(matches), dtype=bool))))
 
 
-def test_black_images_are_refused(scene):
+def test_black_images_and_full_masks_are_refused(scene):
     black = np.zeros_like(scene.left)
     with pytest.raises(ValueError, match=r"left, right|u:|texture"):
         reconstruct(black, black, scene.rig)
+    with pytest.raises(ValueError, match="mask_left"):
+        reconstruct(scene.left, scene.right, scene.rig, mask_left=np.ones(black.shape[:2], dtype=bool))
 
 
 def test_the_left_image_twice_is_refused():
