@@ -57,7 +57,7 @@ def main(argv: list[str]) -> int:
 def _use_another_python(argv: list[str]) -> int:
     for minor in range(PYTHONS[1][1] - 1, PYTHONS[0][1] - 1, -1):
         python = shutil.which(f"python3.{minor}")
-        if python:
+        if python and not subprocess.run([python, "-c", ""], capture_output=True).returncode:  # no stub of a version manager
             return _become([python, "-m", "lib", *argv])
     wanted = f"3.{PYTHONS[0][1]} to 3.{PYTHONS[1][1] - 1}"
     print(f"microstereo needs Python {wanted}; this is {sys.version.split()[0]}.", file=sys.stderr)
@@ -85,8 +85,8 @@ def bench(argv: list[str]) -> int:
 
 def lab(argv: list[str]) -> int:
     root = ["--allow-root"] if hasattr(os, "geteuid") and os.geteuid() == 0 else []
-    command = [sys.executable, "-m", "jupyterlab", f"--notebook-dir={ROOT}", "--LabApp.default_url=/lab/tree/notebooks"]
-    return _become([*command, *root, *argv])
+    page = [] if "LabApp.default_url" in " ".join(argv) else ["--LabApp.default_url=/lab/tree/notebooks"]  # it takes but one
+    return _become([sys.executable, "-m", "jupyterlab", f"--notebook-dir={ROOT}", *page, *root, *argv])
 
 
 def _pytest(argv: list[str]) -> int:

@@ -10,6 +10,7 @@ import shlex
 import subprocess
 import sys
 from pathlib import Path
+from urllib.parse import quote
 
 import cv2
 import numpy as np
@@ -25,8 +26,7 @@ from lib.matching.rectification import rectify
 from lib.recordings import Recording, encoded
 from lib.registration import register_images
 from lib.surface import depth_map, reconstruct, save_depth_map, save_mesh, save_points, surface_mesh
-from lib.trust import LEVELS, Assessment, Reason, Verdict, assess, report
-from lib.trust.verdict import LIMITS
+from lib.trust import LEVELS, LIMITS, Assessment, Reason, Verdict, assess, report
 
 #: Fewer landmarks are fitted too well by cameras of their own to be compared with; errors below this say nothing.
 _FEWEST, _EXACT_PX = 24, 0.5
@@ -70,7 +70,7 @@ def main_annotate(argv: list[str]) -> int:
     page.parent.mkdir(exist_ok=True)
     text = json.dumps(json.dumps(str(folder))[1:-1])[1:-1]  # a Python string in JSON
     files.write_text(page, (paths.ROOT / "lib" / "annotate.ipynb").read_text(encoding="utf-8").replace("RECORDING", text))
-    lab = [sys.executable, "-m", "lib", "lab", f"--LabApp.default_url=/lab/tree/{paths.RUNS.name}/{page.name}"]
+    lab = [sys.executable, "-m", "lib", "lab", f"--LabApp.default_url=/lab/tree/{paths.RUNS.name}/{quote(page.name)}"]
     return subprocess.call(lab, cwd=paths.ROOT)
 
 
@@ -116,6 +116,7 @@ def main_reconstruct(argv: list[str]) -> int:
         save_points(out / "points.ply", found.points.x_mm, colours=frame.left[y, x])
     except ImportError as error:
         print(f"Without surface.glb and points.ply: {error}")
+    (out / "depth.tiff").unlink(missing_ok=True)  # that of an earlier run: without parallel rays there is none
     if found.rig.is_affine:
         save_depth_map(out / "depth.tiff", depth_map(found.surface, found.rig.left, recording.image_size_px))
     _write_rectified(out, found.rig, frame.left, frame.right)
@@ -237,9 +238,8 @@ def _done(a: argparse.Namespace, out: Path, name: str, numbers: dict, verdict: V
 
 
 def _write_landmarks(path: Path, recording: Recording, data: Correspondences) -> None:
-    names = ["frame", "landmark", "time_s", "x_mm", "y_mm", "z_mm"]
-    names += [f"{side}_{what}" for side in ("left", "right") for what in ("x_px", "y_px", "confidence", "sd_x_px", "sd_y_px")]
-    lines = [",".join(names)]
+    wide = [f"{side}_{what}" for side in ("left", "right") for what in ("x_px", "y_px", "confidence", "sd_x_px", "sd_y_px")]
+    lines = [",".join(["frame", "landmark", "time_s", "x_mm", "y_mm", "z_mm", *wide])]
     sd = np.sqrt(np.diagonal(data.covariance_px2, axis1=2, axis2=3))
     sides = np.dstack([np.stack([data.u_left, data.u_right], axis=1), data.confidence, sd]).reshape(-1, 10)
     for frame, landmark, *numbers in zip(data.frame, data.landmark, data.time_s, *data.x_mm.T, *sides.T, strict=True):

@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
+from urllib.parse import quote
 
 import cv2
 import nbformat
@@ -113,7 +114,7 @@ def test_a_red_verdict_writes_nothing_but_itself(tmp_path, capsys):
     assert f"Nothing else was written. Results of an earlier run are in {results}." in said and "--force" not in said
 
 
-def test_cameras_of_a_finite_distance_are_calibrated_as_such(tmp_path, capsys):
+def test_cameras_of_a_finite_distance_are_calibrated_as_such(tmp_path, capsys, monkeypatch):
     """The cure of `finite_distance` can be followed on the command line."""
     microscope = Microscope(pixels_per_mm=(20.0, 20.0), image_size_px=(384, 216), inverse_distance_per_mm=1 / 50)
     design = Design(Eye(texture_px=128), microscope=microscope, motion="sweep", duration_s=20.0, click_px=0.1)
@@ -123,6 +124,11 @@ def test_cameras_of_a_finite_distance_are_calibrated_as_such(tmp_path, capsys):
     assert commands.main_calibrate([*argv, "--model", "near_affine"]) == 0
     assert "finite_distance" not in capsys.readouterr().out
     assert json.loads((tmp_path / "out" / "calibration.json").read_text())["model"] == "near_affine"
+    (tmp_path / "out" / "depth.tiff").write_bytes(b"of affine cameras, earlier")
+    monkeypatch.setattr(commands, "save_mesh", lambda mesh, path: None)
+    monkeypatch.setattr(commands, "save_points", lambda path, x_mm, colours: None)
+    assert commands.main_reconstruct([*argv, "--model", "near_affine", "--setting", "fast"]) == 0
+    assert not (tmp_path / "out" / "depth.tiff").exists(), "it would pass for this run's"
     with pytest.raises(ValueError, match="unknown model 'near'; take one of .*near_affine"):
         commands.main_calibrate([*argv, "--model", "near"])
 
@@ -170,14 +176,14 @@ def test_annotate_opens_a_page_that_runs(tmp_path, monkeypatch):
     """Where the detector finds nothing, the page still lets one label."""
     makers = foreign.side_by_side, foreign.robot_csv
     folder, mapping = source_of(tmp_path, thinned(foreign.shipped(), 40), *makers)
-    recording = tmp_path / 'my "first" recording'
+    recording = tmp_path / 'my "first" recording #2'
     commands.main_import([str(folder), "--map", str(mapping), "--out", str(recording)])
     opened = []
     monkeypatch.setattr(commands.subprocess, "call", lambda argv, cwd: opened.append(argv[-1]) or 0)
     monkeypatch.setattr(paths, "RUNS", tmp_path / "runs")
     assert commands.main_annotate([str(recording)]) == 0
     (page,) = (tmp_path / "runs").iterdir()
-    assert opened == [f"--LabApp.default_url=/lab/tree/runs/{page.name}"]
+    assert opened == [f"--LabApp.default_url=/lab/tree/runs/{quote(page.name)}"] and "#" not in opened[0]
     (cell,) = nbformat.read(page, as_version=4).cells
     monkeypatch.setattr(Detector, "load", lambda *_: lambda images: Landmarks.none(len(images)))
     names: dict = {}

@@ -117,6 +117,14 @@ def test_outside_the_environment_it_becomes_its_python(monkeypatch):
     assert command_line.main(["test", "-k", "x"]) == ["/x/.venv/bin/python", "-m", "lib", "test", "-k", "x"]
 
 
+def test_lab_opens_the_notebooks_or_the_page_that_it_is_given(inside, monkeypatch):
+    """JupyterLab refuses two addresses with a traceback, and opens neither."""
+    monkeypatch.setattr(command_line, "_become", lambda command: [word for word in command if "default_url" in word])
+    given = "--LabApp.default_url=/lab/tree/runs/annotate-mine.ipynb"
+    assert command_line.main(["lab", "--no-browser"]) == ["--LabApp.default_url=/lab/tree/notebooks"]
+    assert command_line.main(["lab", given]) == [given]
+
+
 VersionInfo = namedtuple("VersionInfo", "major minor micro releaselevel serial")
 
 
@@ -124,7 +132,9 @@ VersionInfo = namedtuple("VersionInfo", "major minor micro releaselevel serial")
 def test_an_unfit_python_uses_a_fitting_one_or_says_so(version, monkeypatch, capsys):
     monkeypatch.setattr(command_line.sys, "version_info", VersionInfo(*version, 0, "final", 0))
     monkeypatch.setattr(command_line, "_become", lambda command: command)
-    monkeypatch.setattr(command_line.shutil, "which", lambda name: f"/bin/{name}" if name == "python3.12" else None)
+    monkeypatch.setattr(command_line.shutil, "which", lambda name: f"/bin/{name}" if name < "python3.14" else None)
+    stub = "/bin/python3.13"  # as of pyenv, which knows the version and does not run it here
+    monkeypatch.setattr(command_line.subprocess, "run", lambda words, **_: SimpleNamespace(returncode=words[0] == stub))
     assert command_line.main(["run"]) == ["/bin/python3.12", "-m", "lib", "run"]
     monkeypatch.setattr(command_line.shutil, "which", lambda name: None)
     assert command_line.main(["run"]) == 1

@@ -60,8 +60,8 @@ const STYLE = `
 .ms-annotator .state.bad { background: #b42318; color: #fff; font-weight: 600; }
 .ms-annotator .help { position: absolute; inset: 44px 12px auto auto; background: var(--paper); border: 1px solid var(--line);
   border-radius: 8px; padding: 10px 16px; box-shadow: 0 8px 30px #0005; z-index: 5; columns: 2; column-gap: 28px; max-width: 92%; }
-.ms-annotator .help div { break-inside: avoid; padding: 1px 0; }
-.ms-annotator .help kbd { display: inline-block; min-width: 74px; text-align: center; margin: 0 8px 0 0; }
+.ms-annotator .help div { display: flex; align-items: baseline; break-inside: avoid; padding: 1px 0; }
+.ms-annotator .help kbd { flex: none; min-width: 74px; text-align: center; margin: 0 8px 0 0; }
 .ms-annotator [hidden] { display: none; }`;
 
 function element(tag, className, parent, text) {
@@ -115,13 +115,22 @@ function render({ model, el }) {
 
   // --- messages: what was marked stays in the browser's store until the kernel says that it is in the file
 
-  const store = () => `microstereo.annotator:${about.key}`;
+  const me = Math.random().toString(36).slice(2); // several pages may show one recording, in one kernel or in several
+  const store = (page) => `microstereo.annotator:${about.key}|${page}`;
   function keep() {
     const marks = [...waiting.values()].filter((m) => m.do === "mark").map((m) => m.marks);
-    try { marks.length ? localStorage.setItem(store(), JSON.stringify(marks)) : localStorage.removeItem(store()); } catch { /* no store */ }
+    try { marks.length ? localStorage.setItem(store(me), JSON.stringify(marks)) : localStorage.removeItem(store(me)); } catch { /* no store */ }
+  }
+  function takeOver() { // what pages before this one could not save
+    try {
+      for (const name of Object.keys(localStorage).filter((name) => name.startsWith(store("")))) {
+        for (const marks of JSON.parse(localStorage.getItem(name))) ask({ do: "mark", marks, frame: marks[0][1] });
+        localStorage.removeItem(name); // they are kept under this page's name now
+      }
+    } catch { /* no store */ }
   }
   function ask(message) {
-    const sent = { ...message, id: ++count, since: Date.now() };
+    const sent = { ...message, id: `${me}.${++count}`, since: Date.now() };
     waiting.set(sent.id, sent);
     if (sent.do === "mark") keep();
     try { model.send(sent); } catch { /* told below, when no answer comes */ }
@@ -137,13 +146,19 @@ function render({ model, el }) {
   }
   async function hear(answer, buffers) {
     if (answer.renew) return shown && ask({ do: "show", frame: shown.frame });
-    if (!waiting.has(answer.id)) return; // of another page of the same annotator
+    if (!waiting.has(answer.id)) { // another page of the same annotator asked; what it changed holds here too
+      if (!shown || !answer.complete || waiting.size) return;
+      shown = answer.frame === shown.frame ? { ...shown, ...answer } : { ...shown, complete: answer.complete };
+      return draw();
+    }
     const asked = waiting.get(answer.id);
     waiting.delete(answer.id);
-    problem = answer.error ? `Not saved: ${answer.error}` : "";
-    if (asked.do === "hello") {
+    const writes = ["mark", "undo", "redo"].includes(asked.do);
+    if (answer.error) problem = (writes ? "Not saved: " : "") + answer.error;
+    else if (writes || !problem.startsWith("Not saved")) problem = ""; // what follows a refused mark does not hide it
+    if (asked.do === "hello" && answer.landmarks) {
       about = answer;
-      for (const marks of JSON.parse(localStorage.getItem(store()) || "[]")) ask({ do: "mark", marks, frame: marks[0][1] });
+      takeOver();
       dress();
     }
     if (about) keep();
@@ -409,10 +424,12 @@ function render({ model, el }) {
   }
   root.addEventListener("keydown", (event) => {
     const command = event.ctrlKey || event.metaKey;
-    if (event.altKey || (command && event.key.toLowerCase() !== "z") || event.target.tagName === "BUTTON" && event.key === "Enter") return;
+    const pressed = event.target.tagName === "BUTTON" && ["Enter", " "].includes(event.key);
+    if (event.altKey || (command && event.key.toLowerCase() !== "z") || pressed) return;
     views.forEach((view) => { view.at = null; });
     const used = command ? press(event.shiftKey ? "r" : "u", false) : press(event.key, event.shiftKey);
-    if (used) { event.preventDefault(); event.stopPropagation(); }
+    const typed = !command && event.key.length === 1; // else the notebook would take it for one of its own: m, y, i i, ...
+    if (used || typed) { event.preventDefault(); event.stopPropagation(); }
   });
   root.addEventListener("focus", draw);
   root.addEventListener("blur", draw);

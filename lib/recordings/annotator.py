@@ -163,10 +163,10 @@ class Annotator:
         todo, frame, images = message["do"], int(message.get("frame") or 0), []
         answer = {"id": message.get("id")}
         try:
+            self._read()  # another page or program may have written
             if todo == "hello":
-                r = self.recording
-                answer |= {"name": r.name, "landmarks": r.skeleton, "n": len(r), "size": r.image_size_px}
-                answer |= {"key": str(r.folder.resolve())}
+                r, key = self.recording, str(self.recording.folder.resolve())
+                answer |= {"name": r.name, "landmarks": r.skeleton, "n": len(r), "size": r.image_size_px, "key": key}
                 frame = int(np.argmax(np.where(self.complete, -1.0, np.nan_to_num(self.usefulness))))
             elif todo == "next":
                 frame = self.next_frame(frame)

@@ -3,7 +3,7 @@
 from lib.trust.diagnosis import Diagnosis, diagnose
 from lib.trust.fitting import Hypothesis
 from lib.trust.health import Health, health
-from lib.trust.verdict import LEVELS, Assessment, Reason, Verdict, assess, judge, report
+from lib.trust.verdict import LEVELS, LIMITS, Assessment, Reason, Verdict, assess, judge, report
 
-__all__ = ["LEVELS", "Assessment", "Diagnosis", "Health", "Hypothesis", "Reason", "Verdict"]
+__all__ = ["LEVELS", "LIMITS", "Assessment", "Diagnosis", "Health", "Hypothesis", "Reason", "Verdict"]
 __all__ += ["assess", "diagnose", "health", "judge", "report"]

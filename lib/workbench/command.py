@@ -90,8 +90,7 @@ def renew_gallery(run: Path) -> None:
             picture = picture.convert("RGB")
             picture.thumbnail((1300, 1300))
             picture.save(paths.GALLERY / f"{path.stem}.jpg", quality=88, subsampling=0)
-    known = {key: made_by[key] for key in ("started", "commit", "machine", "weights")}
-    files.write_json(paths.GALLERY / "made_by.json", known)
+    files.write_json(paths.GALLERY / "made_by.json", {k: made_by[k] for k in ("started", "commit", "machine", "weights")})
 
 
 def run(

@@ -86,9 +86,10 @@ def parse_parameters(pairs: Sequence[tuple[str, str]], notebooks: Sequence[Path]
     """
     declared = {notebook: declared_parameters(notebook) for notebook in notebooks}
     known = {name for names in declared.values() for name in names}
-    for name, _ in pairs:
-        if name not in known:
-            raise ValueError(f"unknown parameter: {name}. Declared are: {', '.join(sorted(known)) or 'none'}.")
+    if unknown := [name for name, _ in pairs if name not in known]:
+        raise ValueError(f"unknown parameter: {unknown[0]}. Declared are: {', '.join(sorted(known)) or 'none'}.")
+    if below := [text for name, text in pairs if name == "seed" and text.strip().startswith("-")]:
+        raise ValueError(f"parameter seed: {below[0]} is below 0.")
     given = [("profile", profile), *pairs]
     return {book: {n: _value(n, text, names[n]) for n, text in given if n in names} for book, names in declared.items()}
 
@@ -117,7 +118,7 @@ def _value(name: str, text: str, kind: str) -> object:
         value = simple.get(kind, ast.literal_eval)(text)
         if kind in ("list", "tuple", "dict", "set") and type(value).__name__ != kind:
             raise ValueError(f"a {type(value).__name__}")
-        return value
+        return list(value) if isinstance(value, tuple | set) else value  # of papermill's they would be texts
     except (ValueError, KeyError, SyntaxError):
         if kind in (*simple, "list", "tuple", "dict", "set"):
             raise ValueError(f"parameter {name}: {text!r} is not of type {kind}.") from None

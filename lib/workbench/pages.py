@@ -3,6 +3,7 @@
 import html
 import math
 import re
+import shlex
 import tomllib
 from functools import lru_cache, partial
 from pathlib import Path
@@ -14,7 +15,7 @@ from nbconvert import HTMLExporter
 from nbconvert.filters.markdown_mistune import IPythonRenderer, MarkdownWithMath
 
 from lib import paths
-from lib.workbench.execution import Failure
+from lib.workbench.execution import Failure, choose_notebooks
 from lib.workbench.report import format_value, rendered, with_unit
 
 #: plotly's script lies once beside the pages that show a 3D view.
@@ -113,11 +114,10 @@ def page(executed: Path, folder: Path, entry: dict, *, previous: dict | None, fo
 
 def index_html(run: dict) -> str:
     """The page of a run, from the content of its metrics.json; every text in it is escaped."""
-    rows, left_out = headlines(run)
     return rendered(
-        "index.html", run=run, headlines=rows, left_out=left_out, shipped=paths.shown(paths.SHIPPED_RECORDING),
+        "index.html", run=run, table=headlines(run), shipped=paths.shown(paths.SHIPPED_RECORDING), quote=shlex.quote,
         books={book["name"]: book for book in run["notebooks"]}, is_recorded=is_recorded, with_unit=with_unit,
-        reason=lambda failure: str(Failure(**failure)), markdown=markdown_html,
+        reason=lambda failure: str(Failure(**failure)), markdown=markdown_html, whole=[b.stem for b in choose_notebooks()],
     )  # fmt: skip
 
 
@@ -132,8 +132,7 @@ def headlines(run: dict) -> tuple[list[dict], list[str]]:
     ``templates/headlines.toml`` says which numbers these are, with their targets; `run` is the content of metrics.json.
     """
     metrics, books = ({entry["name"]: entry for entry in run[kind]} for kind in ("metrics", "notebooks"))
-    own = bool(run["parameters"].get("recording"))
-    rows, left_out = [], []
+    own, rows, left_out = bool(run["parameters"].get("recording")), [], []
     for line in tomllib.loads((_TEMPLATES / "headlines.toml").read_text(encoding="utf-8"))["headline"]:
         live, record = metrics.get(line["name"]), None if own else metrics.get(line.get("recorded"))
         here = bool(live) and live["value"] is not None

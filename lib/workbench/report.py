@@ -103,7 +103,7 @@ def _drawn(figure: Figure) -> tuple[str, str]:
         text = io.StringIO()
         figure.savefig(text, format="svg")
         if text.tell() <= _SVG_CHARACTERS:
-            return "image/svg+xml", text.getvalue()
+            return "image/svg+xml", text.getvalue().replace("<svg ", '<svg style="max-width: 100%; height: auto" ', 1)
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png")
     return "image/png", base64.b64encode(buffer.getvalue()).decode("ascii")

@@ -54,6 +54,7 @@ def explore(draw: Callable[..., Figure], **knobs: DescriptionWidget) -> VBox:
     """
     for name, knob in knobs.items():
         knob.description = knob.description or name.replace("_", " ")
+        knob.style.description_width = "initial"  # else a longer one is cut off
     defaults = {name: knob.value for name, knob in knobs.items()}
 
     def drawn(format: str = "png", **changed: object) -> tuple[bytes, int]:
@@ -73,7 +74,7 @@ def explore(draw: Callable[..., Figure], **knobs: DescriptionWidget) -> VBox:
 
     for knob in knobs.values():
         knob.observe(redraw, names="value")
-    box = _Explorer([HBox(list(knobs.values())), picture])
+    box = _Explorer([HBox(list(knobs.values()), layout=Layout(flex_flow="row wrap")), picture])
     if "MICROSTEREO_PAGE" in os.environ:
         shows = (draw.__doc__ or draw.__name__.replace("_", " ").strip("<>")).strip().split("\n")[0]
         box.still_html = _stills(shows, knobs, defaults, value, lambda **changed: drawn("webp", **changed)[0])

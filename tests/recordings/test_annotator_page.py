@@ -206,6 +206,32 @@ def test_marks_that_a_dead_kernel_did_not_write_come_back_with_the_next_one(brow
     assert browser.value("localStorage.length") == 0
 
 
+def test_a_page_beside_loses_nothing_and_shows_what_is_new(browser, folder):
+    """Two pages show one recording: what the other could not save yet stays, what it saved is seen."""
+    opened(browser, Annotator(Recording.open(folder), rig=RIG))
+    other, kept = f"microstereo.annotator:{folder.resolve()}|another", [[["left", 0, 1, 30.0, 40.0, 2]]]
+    browser.value(f"localStorage.setItem({json.dumps(other)}, {json.dumps(json.dumps(kept))}); {ROOT}.focus()")
+    browser.press("a")
+    saved(browser)
+    assert browser.value("Object.keys(localStorage)") == [other]
+    Annotator(Recording.open(folder)).mark("left", 1, "base", (50.0, 60.0))
+    browser.press(".")
+    browser.until(f"{ROOT}.dataset.frame === '1'", "the next frame")
+    assert browser.value(f"{ROOT}.dataset.landmark") == "tip_1", "the base has a mark"
+    browser.call("Page.reload")
+    wait(lambda: labels(folder).u_left[0, 1].tolist() == [30, 40], "the page takes over what the other left")
+    browser.until("localStorage.length === 0", "it is in the file")
+
+
+def test_no_key_reaches_the_notebook_around(browser, folder):
+    """There m would turn the cell into text, and the page would be gone."""
+    opened(browser, Annotator(Recording.open(folder)))
+    browser.value(f"{ROOT}.focus()")
+    browser.value("document.addEventListener('keydown', (event) => { window.heard = (window.heard ?? '') + event.key; })")
+    browser.press(*"my47ijk M", "Tab")
+    assert browser.value("window.heard") == "Tab"
+
+
 def test_a_folder_that_cannot_be_written_is_told_in_red(browser, folder, monkeypatch):
     annotator = Annotator(Recording.open(folder), rig=RIG)
     opened(browser, annotator)
@@ -213,4 +239,7 @@ def test_a_folder_that_cannot_be_written_is_told_in_red(browser, folder, monkeyp
     browser.value(f"{ROOT}.focus()")
     browser.press("a")
     browser.until(f"{ROOT}.querySelector('.state.bad')?.textContent.includes('read-only')", "the reason is shown")
+    browser.press(".")
+    browser.until(f"{ROOT}.dataset.frame === '1'", "the next frame")
+    assert "read-only" in browser.value(f"{ROOT}.querySelector('.state.bad').textContent"), "it stays until a mark is saved"
     assert not (folder / "annotations.json").exists()

@@ -58,7 +58,9 @@ def test_what_the_page_shows():
     for kind, name, value in ((" ours", "This run", 1.5), ("", "Previous run", 1.25), (" paper", "Paper", 2)):
         assert f'<td class="number{kind}" data-of="{name}">{value} px</td>' in page
     assert 'href="01_data.html#01-a"' in page
-    assert "n/a" in page and "<svg " in page and "-p recording eye" in page
+    assert "n/a" in page and "<svg " in page
+    assert "<code>python3 -m lib run 01_data --profile quick -p recording eye</code>" in page, "what ran, and no more"
+    assert "-p recording &#39;my eye&#39;</code>" in index_html(run_with("my eye")), "a shell takes it"
 
 
 def test_html_in_untrusted_markdown_is_escaped():

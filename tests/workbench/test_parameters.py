@@ -10,7 +10,7 @@ import papermill
 import pytest
 
 from lib import paths
-from lib.workbench.execution import choose_notebooks, declared_grid, parse_parameters, positive
+from lib.workbench.execution import choose_notebooks, declared_grid, execute, parse_parameters, positive
 
 
 @pytest.fixture(scope="module")
@@ -36,6 +36,19 @@ def test_values_take_the_declared_type(books):
     pairs = [("seed", "7"), ("noise_px", "1e-3"), ("crop", "true"), ("sizes", "[3]"), ("profile", "1")]
     (values,) = parse_parameters(pairs, [books / "03_good.ipynb"]).values()
     assert values == {"seed": 7, "noise_px": 0.001, "crop": True, "sizes": [3], "profile": "1"}
+
+
+def test_a_seed_below_zero_is_an_error(books):
+    with pytest.raises(ValueError, match="parameter seed: -1 is below 0"):
+        parse_parameters([("seed", "-1")], [books / "03_good.ipynb"])
+
+
+def test_a_tuple_reaches_the_notebook_as_numbers(write_notebook, tmp_path):
+    declared = "shift_mm: tuple[float, float] = (1.0, 2.0)  # mm"
+    book = write_notebook(tmp_path, "06", "print(sum(shift_mm))", parameters=declared)
+    (values,) = parse_parameters([("shift_mm", "0.5,0.25")], [book]).values()
+    assert execute(book, tmp_path / "out.ipynb", values) is None
+    assert '"0.75\\n"' in (tmp_path / "out.ipynb").read_text("utf-8")
 
 
 @pytest.mark.parametrize(

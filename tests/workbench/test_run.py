@@ -142,7 +142,8 @@ def test_verdicts_are_joined(finished):
 def test_figures_are_files(finished):
     content, folder = finished
     figure, line = content["figures"]
-    assert line["file"] == "figures/calibration_line.svg" and b"<svg" in (folder / line["file"]).read_bytes()
+    assert line["file"] == "figures/calibration_line.svg"
+    assert b'<svg style="max-width: 100%' in (folder / line["file"]).read_bytes()
     assert figure["file"] == "figures/calibration_residuals.png" and figure["caption"] == "Small everywhere."
     assert (folder / figure["file"]).read_bytes().startswith(b"\x89PNG")
 
