@@ -308,8 +308,8 @@ class StereoRig:
     def triangulate(self, u_left: ArrayLike, u_right: ArrayLike, covariance_px2: ArrayLike | None = None) -> Points:
         """Maximum-likelihood points of matches (n, 2) px, with the covariance of each from the noise of its match.
 
-        Rows that are NaN, that no point in front of near-affine cameras explains, or seen by affine cameras that see no depth,
-        give a NaN point with a NaN covariance.  `covariance_px2` of the matches has any form that
+        A row gives a NaN point with a NaN covariance where it is NaN, where no point in front of near-affine cameras explains
+        it, and where affine cameras see no depth.  `covariance_px2` of the matches has any form that
         `lib.geometry.pair_covariance` takes; None is 1 px^2.
         """
         u_left, u_right = points(u_left, 2, "u_left"), points(u_right, 2, "u_right")

@@ -88,7 +88,8 @@ def resolution_curves(table: Table) -> Figure:
     for (name, rows), colour in zip(groups(table, "resolution").items(), colours, strict=False):
         thresholds, pck = curve(rows)
         ax.plot(100 * thresholds, pck, color=colour, marker="o", ms=3, label=name)
-    ax.set(xscale="log", ylim=(0, 101), xlabel="threshold, % of the tool's length", ylabel="PCK, %", title="The paper's network")
+    ax.set(xscale="log", ylim=(0, 101), xlabel="threshold, % of the tool's length", ylabel="PCK, %")
+    ax.set_title("The paper's network")
     ticks = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20)
     ax.set_xticks(ticks, [f"{t:g}" for t in ticks])
     ax.minorticks_off()
