@@ -1,6 +1,5 @@
 """Where things lie: the one place that knows the folders of the workbench."""
 
-import os
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -15,7 +14,6 @@ SHIPPED_RECORDING = DATA / "open_sky_eye"
 
 #: In a folder of results: the recording's place, since recordings of two folders may have one name.
 RECORDING_NOTE = "recording.txt"
-REAL_DATA_VARIABLE = "MICROSTEREO_DATA"
 #: Names the folder in which notebooks of one run, or commands, share what each would else work out again.
 SHARED_VARIABLE = "MICROSTEREO_SHARED"
 
@@ -40,18 +38,3 @@ def shown(path: Path) -> str:
     """A path as a user types it in the workbench's folder: relative to it where it lies inside."""
     path = Path(path).absolute()
     return str(path.relative_to(ROOT) if path.is_relative_to(ROOT) else path)
-
-
-def real_data(name: str) -> Path | None:
-    """The folder of a real data set, such as ``"fundus"``, in that which ``MICROSTEREO_DATA`` names; None where it is not.
-
-    Real recordings do not ship: `data/README.md` says where a user gets each.
-    """
-    root = os.environ.get(REAL_DATA_VARIABLE)
-    folder = ROOT / root / name if root else None
-    return folder if folder and folder.is_dir() else None
-
-
-def missing_data_line(name: str) -> str:
-    """The one line a notebook prints when a real data set is not at hand, and then goes on."""
-    return f"Skipped: the real data set '{name}' is not at hand; point {REAL_DATA_VARIABLE} at the folder that holds it."

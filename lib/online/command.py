@@ -49,12 +49,12 @@ class Tally:
 
 def _memory() -> str:
     """A line about the most memory that this process has held; none on Windows, which does not tell."""
-    try:
+    with contextlib.suppress(ImportError):
         import resource
-    except ImportError:
-        return ""
-    unit = 2**20 if sys.platform == "darwin" else 2**10
-    return f"\nmemory: at most {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit:.0f} MB"
+
+        unit = 2**20 if sys.platform == "darwin" else 2**10
+        return f"\nmemory: at most {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit:.0f} MB"
+    return ""
 
 
 def main(argv: list[str] | None = None) -> int:

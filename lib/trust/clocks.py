@@ -121,13 +121,11 @@ def _readout(case: Case) -> Iterator[Hypothesis]:
         readout_s = case.readout_s + value
         if readout_s < -3 * sd:
             who, them = ("Both images are", "both") if len(views) == 2 else (f"The {SIDES[views[0]]} image is", "it")
-            took = f"{-1e3 * readout_s:.1f} +- {1e3 * sd:.1f} ms"
-            text = f"{who} turned by 180 degrees: its rows are read from the bottom up, in {took}."
+            text = f"{who} turned by 180 degrees: rows are read from the bottom up, in {-1e3 * readout_s:.1f} ms."
             cure = f"Turn {them} by 180 degrees, with readout_s = {-readout_s:.4f}."
             yield case.found("turned_image", fit, 1, (1e3 * readout_s, 1e3 * sd, "ms"), text, cure, on=known)
         elif len(views) == 2:
-            off = f"{1e3 * value:.1f} +- {1e3 * sd:.1f} ms"
-            text = f"The residuals grow from row to row with the tool's velocity: the read-out time is off by {off}."
+            text = f"Residuals grow row by row as the tool moves: readout_s is off by {1e3 * value:.1f} +- {1e3 * sd:.1f} ms."
             cure = f"Set readout_s = {max(readout_s, 0.0):.4f} in recording.toml."
             yield case.found("readout", fit, 1, (1e3 * value, 1e3 * sd, "ms"), text, cure, on=known)
 

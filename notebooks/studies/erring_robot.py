@@ -15,12 +15,13 @@ from lib.recordings import Recording
 from lib.simulator.dataset import rung_design
 from lib.simulator.recording import simulate
 from lib.workbench import report
+from notebooks import real_data
 
 
 def recorded(rung: str, recording_seed: int, pairs: int) -> tuple[Recording, np.ndarray] | None:
     """The recording of a rung, and where its landmarks are, (n, 2, 3, 2) px; None: the other renderer's is not at hand."""
     if rung == "other renderer":
-        folder = paths.real_data("path_traced")
+        folder = real_data.folder("path_traced")
         if folder is None:
             return None
         frames = json.loads((folder / "truth.json").read_text(encoding="utf-8"))["frames"]

@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from lib import paths
 from lib.geometry import RigidTransform
 from lib.matching import RECTIFIED, glint_mask, match
 from lib.simulator.rig import IMAGE_SIZE_PX, reference_rig
+from notebooks import real_data
 from notebooks.studies import surface_evaluation as evaluation
 
 
@@ -60,9 +60,9 @@ def test_full_hd(benchmark, full_hd, method, setting):
 @pytest.mark.parametrize("method", ["band", "sgbm", "dis", "deepmatching"])
 def test_motorcycle(benchmark, method, width_px):
     """The study `matching` scores the same matches."""
-    folder = paths.real_data("stereo_pairs")
+    folder = real_data.folder("stereo_pairs")
     if folder is None:
-        pytest.skip(paths.missing_data_line("stereo_pairs"))
+        pytest.skip(real_data.missing_line("stereo_pairs"))
     free = method == "deepmatching"
     if free and width_px > 512:
         pytest.skip("free DeepMatching grows with the fourth power of the width")

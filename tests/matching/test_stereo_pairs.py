@@ -8,13 +8,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lib import paths
 from lib.matching import RECTIFIED, match
+from notebooks import real_data
 from notebooks.studies.matching_evaluation import CONFIDENCES, detection_auc, score_against_disparity
 from notebooks.studies.surface_evaluation import real_pair
 
-FOLDER = paths.real_data("stereo_pairs")
-pytestmark = pytest.mark.skipif(FOLDER is None, reason=paths.missing_data_line("stereo_pairs"))
+FOLDER = real_data.folder("stereo_pairs")
+pytestmark = pytest.mark.skipif(FOLDER is None, reason=real_data.missing_line("stereo_pairs"))
 
 
 def load(name: str):

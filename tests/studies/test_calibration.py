@@ -18,6 +18,7 @@ from lib.recordings import Recording
 from lib.simulator import Microscope
 from lib.simulator.rig import reference_rig
 from lib.workbench import report, results
+from notebooks import real_data
 from notebooks.figures import calibration as figures
 from notebooks.studies import boards, dvrk, sweeps
 from notebooks.studies.cameras import perspective_dlt, triangulate_perspective
@@ -285,9 +286,9 @@ def test_robot_folder_errors_are_named(tmp_path):
 
 
 def test_one_over_distance_predicts_the_real_robot_better():
-    folder = paths.real_data("dvrk_hand_eye")
+    folder = real_data.folder("dvrk_hand_eye")
     if folder is None:
-        pytest.skip(paths.missing_data_line("dvrk_hand_eye"))
+        pytest.skip(real_data.missing_line("dvrk_hand_eye"))
     frames = dvrk.read_robot_frames(folder)
     assert len(frames.index) >= 49
     error = {}

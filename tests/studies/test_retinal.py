@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from lib import paths
+from notebooks import real_data
 from notebooks.studies.retinal import import_retinal_microsurgery
 
 
@@ -27,10 +27,10 @@ def test_retinal_microsurgery_layout(tmp_path):
 
 
 @pytest.mark.skipif(
-    paths.real_data("retinal_microsurgery") is None, reason=paths.missing_data_line("retinal_microsurgery")
+    real_data.folder("retinal_microsurgery") is None, reason=real_data.missing_line("retinal_microsurgery")
 )
 def test_real_retinal_microsurgery():
-    sequences = import_retinal_microsurgery(paths.real_data("retinal_microsurgery"))
+    sequences = import_retinal_microsurgery(real_data.folder("retinal_microsurgery"))
     assert [len(sequence) for sequence in sequences] == [402, 222]
     for sequence in sequences:
         assert sequence.image(len(sequence) // 2).shape == (480, 640, 3)

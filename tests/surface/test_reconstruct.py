@@ -20,6 +20,7 @@ from lib.simulator.render import render_pair
 from lib.simulator.rig import Microscope
 from lib.surface import BSplineSurface, SplineGrid, epipolar_inliers, reconstruct, surface_mesh
 from lib.workbench import results
+from notebooks import real_data
 from notebooks.studies import surface_evaluation as evaluation
 from notebooks.studies.simulated_rows import simulate_correspondences
 
@@ -256,9 +257,9 @@ def test_every_figure_draws(scene, result):
 
 
 def test_real_pairs_are_scored_beside_each_other():
-    folder = paths.real_data("stereo_pairs")
+    folder = real_data.folder("stereo_pairs")
     if folder is None:
-        pytest.skip(paths.missing_data_line("stereo_pairs"))
+        pytest.skip(real_data.missing_line("stereo_pairs"))
     import matplotlib.pyplot as plt
 
     from notebooks.figures import reconstruction as figures

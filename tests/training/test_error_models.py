@@ -19,15 +19,15 @@ from tests.toys import toy_images
 @pytest.fixture(scope="module")
 def small(trained):
     """A whole-frame detector, and toys that it has not seen."""
-    return Detector(trained.network, error_models={"frame": ErrorModel(logit=(5.0, 0.0, 0.0, 0.0))}), toy_images(40, seed=5)
+    return Detector(trained.network, error_models={"frame": ErrorModel(logit=(5.0, 0.0, 0.0, 0.0))}), toy_images(120, seed=5)
 
 
 def test_calibration_makes_covariances_and_confidence_true(small):
     detector, frames = small
-    result = evaluate(fit_error_models(detector, frames[:20]), frames[20:])
+    result = evaluate(fit_error_models(detector, frames[:60]), frames[60:])
     assert 0.5 < result.scores.nees < 6
     assert 75 < result.scores.coverage_95 <= 100
-    before = evaluate(detector, frames[20:])
+    before = evaluate(detector, frames[60:])
     labelled = ~np.isnan(result.error_px)
     error = [metrics.calibration_error(r.landmarks.confidence[labelled], r.correct[labelled]) for r in (before, result)]
     assert error[1] <= max(error[0], 0.25)

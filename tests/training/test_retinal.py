@@ -7,11 +7,11 @@ import cv2
 import numpy as np
 import pytest
 
-from lib import paths
 from lib.landmarks.metrics import tool_length_px
+from notebooks import real_data
 from notebooks.studies.retinal import MonocularSequence, import_retinal_microsurgery, label_repeatability
 
-RETINAL = paths.real_data("retinal_microsurgery")
+RETINAL = real_data.folder("retinal_microsurgery")
 
 
 def side(u: np.ndarray) -> np.ndarray:
@@ -38,7 +38,7 @@ def test_halves_are_in_time_and_frames_without_a_label_are_left_out(tmp_path, to
     np.testing.assert_array_equal(later[0].image, samples.images[4])
 
 
-@pytest.mark.skipif(RETINAL is None, reason=paths.missing_data_line("retinal_microsurgery"))
+@pytest.mark.skipif(RETINAL is None, reason=real_data.missing_line("retinal_microsurgery"))
 def test_real_tips_are_named_as_the_simulators():
     for sequence in import_retinal_microsurgery(RETINAL):
         u = sequence.u
