@@ -63,10 +63,12 @@ def main_site(argv: Sequence[str]) -> int:
     if not (chosen / "index.html").is_file():
         raise FileNotFoundError(f"{chosen}: no run with an index.html; `python3 -m lib run` makes one.")
     if options.gallery:
-        renew_gallery(chosen)
-        return 0
-    shutil.copytree(chosen, options.out)
-    (options.out / ".nojekyll").touch()  # GitHub Pages then takes every file as it is
+        return renew_gallery(chosen) or 0
+    if options.out.exists() or not options.out.absolute().parent.is_dir():
+        raise OSError(f"{options.out}: it exists already, or the folder for it does not; name another with --out.")
+    with tempfile.TemporaryDirectory(prefix="site-", dir=options.out.absolute().parent) as made:  # half a site is none
+        (shutil.copytree(chosen, Path(made) / "site") / ".nojekyll").touch()  # GitHub Pages then takes every file as it is
+        (Path(made) / "site").rename(options.out)
     print(f"Site: {options.out / 'index.html'}")
     return 0
 

@@ -192,6 +192,9 @@ def test_a_site_is_a_copy_that_needs_no_server_of_ours(finished, tmp_path, monke
     assert (tmp_path / "site" / ".nojekyll").exists()
     assert (tmp_path / "site" / "index.html").read_text() == (folder / "index.html").read_text()
     assert main_site([str(folder), "--out", str(tmp_path / "site")]) == 2, "nothing is overwritten"
+    assert "site: it exists already, or the folder for it does not; name another with --out" in capsys.readouterr().err
+    monkeypatch.setattr(command.shutil, "copytree", lambda *_: (_ for _ in ()).throw(OSError("the disk is full")))
+    assert main_site([str(folder), "--out", str(tmp_path / "half")]) == 2 and [p.name for p in tmp_path.iterdir()] == ["site"]
     monkeypatch.setattr(command.paths, "RUNS", tmp_path / "none")
     assert main_site(["--out", str(tmp_path / "other")]) == 2 and not (tmp_path / "other").exists()
     assert "`python3 -m lib run` makes one" in capsys.readouterr().err
