@@ -97,12 +97,12 @@ def page(executed: Path, folder: Path, entry: dict, *, previous: dict | None, fo
     def prose(context: Context, source: str) -> str:
         return markdown_html(source, folder=folder, attachments=context["cell"].get("attachments"))
 
+    untrusted = partial(markdown_html, trusted=False)
     exporter = HTMLExporter(
-        template_name="notebook",
-        extra_template_basedirs=[str(_TEMPLATES)],
-        filters={"markdown2html": prose, "untrusted_markdown": partial(markdown_html, trusted=False), "equation": equation_svg},
+        template_name="notebook", extra_template_basedirs=[str(_TEMPLATES)],
+        filters={"markdown2html": prose, "untrusted_markdown": untrusted, "equation": equation_svg},
         preprocessors=["nbconvert.preprocessors.CoalesceStreamsPreprocessor"],  # of a progress bar only its last state
-    )
+    )  # fmt: skip
     exporter.config.NbConvertBase.display_data_priority = _RICHEST_FIRST
     body, _ = exporter.from_notebook_node(nbformat.read(executed, as_version=4))
     return rendered(
