@@ -233,10 +233,9 @@ def _opinion(recording: Recording, opinion: Seen, frames: np.ndarray) -> Landmar
             f"detector: where the robot says, it sees {rare} in {100 * shares.min():.0f} % of the images and {often} in "
             f"{100 * shares.max():.0f} %. It takes another point for {rare}. {_LABEL}"
         )
-    try:
+    with suppress(ValueError):
         return _placed(recording, opinion.of(frames)).offsets
-    except ValueError:
-        return None
+    return None
 
 
 def _length_mm(recording: Recording) -> float:
@@ -312,10 +311,9 @@ def _scanned_clock(recording: Recording, merit: Callable[[Recording], float]) ->
     Of equal ones the smallest change; none where no offset gives cameras.
     """
     def merit_at(change_s: float) -> float:
-        try:
+        with suppress(ValueError):
             return merit(replace(recording, offset_s=recording.offset_s + change_s))
-        except ValueError:
-            return -np.inf
+        return -np.inf
 
     changes_s = sorted(np.linspace(-0.2, 0.2, 21).round(9).tolist(), key=abs)
     return replace(recording, offset_s=recording.offset_s + max(changes_s, key=merit_at))

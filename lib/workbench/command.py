@@ -63,7 +63,8 @@ def main_site(argv: Sequence[str]) -> int:
     if not (chosen / "index.html").is_file():
         raise FileNotFoundError(f"{chosen}: no run with an index.html; `python3 -m lib run` makes one.")
     if options.gallery:
-        return renew_gallery(chosen) or 0
+        renew_gallery(chosen)
+        return 0
     if options.out.exists() or not options.out.absolute().parent.is_dir():
         raise OSError(f"{options.out}: it exists already, or the folder for it does not; name another with --out.")
     with tempfile.TemporaryDirectory(prefix="site-", dir=options.out.absolute().parent) as made:  # half a site is none
