@@ -285,9 +285,8 @@ class StereoRig:
 
     @cached_property
     def sees_depth(self) -> bool:
-        """False where both (touching) affine cameras look along one line: how deep a point lies moves no pixel."""
-        per_mm = self.right.linear @ self.left.viewing_direction
-        return bool(np.linalg.norm(per_mm) > 1e-6 * np.linalg.norm(self.right.linear))
+        """False where both cameras look along the same line: how deep a point lies moves no pixel."""
+        return bool(np.linalg.norm(self.right.linear @ self.left.viewing_direction) > 1e-6 * np.linalg.norm(self.linear))
 
     def project(self, x: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """(u_left, u_right), (n, 2) px each, of points (n, 3) in mm."""

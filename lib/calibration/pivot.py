@@ -18,11 +18,12 @@ _LARGEST_SD_MM = 1.0  # of an offset's coordinate; beyond it the motion determin
 
 @dataclass(frozen=True, eq=False)
 class Pivot:
-    """`offset_mm` (3,) in the tool frame, the fixed `point_mm` (3,) in the robot frame, (6, 6) covariance of both."""
+    """`offset_mm` (3,) in the tool frame, the fixed `point_mm` (3,) in the robot frame, (6, 6) covariance of both, RMS."""
 
     offset_mm: np.ndarray
     point_mm: np.ndarray
     covariance_mm2: np.ndarray
+    rms_mm: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +72,7 @@ class ToolOffsets(Tool):
 
     covariance_mm2: np.ndarray
     cameras: tuple[AffineCamera, ...]
+    rms_px: float
 
 
 def pivot_calibration(robot_from_tool: Sequence[RigidTransform]) -> Pivot:
@@ -93,7 +95,7 @@ def pivot_calibration(robot_from_tool: Sequence[RigidTransform]) -> Pivot:
     if rms > max(0.25 * spread, 0.05):
         raise ValueError(f"robot_from_tool: the tip did not rest ({rms:.2f} mm RMS): hold it in a divot or use tool_offsets.")
     _check_determined(covariance[:3, :3])
-    return Pivot(solution[:3], solution[3:], covariance)
+    return Pivot(solution[:3], solution[3:], covariance, rms)
 
 
 def tool_offsets(
@@ -164,7 +166,7 @@ def tool_offsets(
     if half is not None:
         sine[on_jaw], versine[on_jaw] = np.split(offset[k:], 2)
     cameras = tuple(AffineCamera(matrix[2 * c : 2 * c + 2]) for c in range(m // 2))
-    return ToolOffsets(offset[:k], sine, versine, blocks, cameras)
+    return ToolOffsets(offset[:k], sine, versine, blocks, cameras, float(np.sqrt((r**2).sum() / (len(r) * m / 2))))
 
 
 def _poses(robot_from_tool: Sequence[RigidTransform]) -> tuple[np.ndarray, np.ndarray]:

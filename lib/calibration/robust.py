@@ -167,8 +167,7 @@ def _samples(x: np.ndarray, count: int, rng: np.random.Generator, least_mm: floa
 
 def _distances2(H: np.ndarray, u: np.ndarray, M: np.ndarray) -> np.ndarray:
     """Squared distances (k, n) of pixels u (n, 2) to the projections of H (n, 4) by cameras M (k, 4, 2)."""
-    r = M.mT @ H.T - u.T
-    return (r**2).sum(axis=1)
+    return ((M.mT @ H.T - u.T) ** 2).sum(axis=1)
 
 
 def _scale_free(distance2: np.ndarray, area: float) -> np.ndarray:

@@ -25,10 +25,11 @@ _CLEAR, _NEAR = 0.4, 0.03
 
 @dataclass(frozen=True, eq=False)
 class TimeOffset:
-    """t_robot = t_video + offset_s; its sd, which allows for errors that last; and the misfit at the offsets tried first."""
+    """t_robot = t_video + offset_s, its sd, which allows for errors that last, and the RMS there and at `trial_s`."""
 
     offset_s: float
     sd_s: float
+    rms_px: float  # of the detections that agree
     trial_s: np.ndarray
     trial_rms_px: np.ndarray
 
@@ -157,7 +158,7 @@ def estimate_time_offset(
     if offset in (low, high):
         raise ValueError(f"search_s: {offset:.3f} s, lies at the end of the search; widen search_s or move start_s.")
     sd = float(np.sqrt(sandwich(image[:, :, None], W, r, frame, landmark)[0][0, 0]))
-    return TimeOffset(offset, sd, trial, misfit)
+    return TimeOffset(offset, sd, float(_rms_px(at(offset)[None], y, views)[0]), trial, misfit)
 
 
 def clock_error(found: Calibration, data: Correspondences, kinematics: Kinematics, offset_s: float) -> tuple[float, float]:

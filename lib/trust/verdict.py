@@ -121,8 +121,7 @@ def judge(
     """
     found: list[Reason] = []
     if diagnosis is not None and (best := diagnosis.best) is not None:
-        share = f" It explains {100 * best.explained:.0f} % of the residuals."
-        text = best.text + ("" if best.name in BY_HANDEDNESS else share)
+        text = best.text + (best.name not in BY_HANDEDNESS) * f" It explains {100 * best.explained:.0f} % of the residuals."
         found += _reason("diagnosis", best.explained, text, best.cure, best.name)
     if calibration is None:
         name = {NoDetectionError: "no_detection", NoConsensusError: "no_consensus"}.get(type(error), "refused")

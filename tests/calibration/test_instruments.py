@@ -263,6 +263,7 @@ def test_tool_offsets_from_poses_and_images():
         errors.append(error)
         mahalanobis = np.einsum("ki,kij,kj->k", error, np.linalg.inv(found.covariance_mm2), error)
         assert mahalanobis.mean() < 10
+        assert found.rms_px == pytest.approx(1.5 * np.sqrt(2), rel=0.1)
         assert found.positions_mm(tool).shape == (300, 3, 3)
     assert np.sqrt(np.mean(np.square(errors))) < 0.005
 
@@ -277,6 +278,7 @@ def test_pivot_calibration():
     found = pivot_calibration(tool)
     np.testing.assert_allclose(found.offset_mm, tip, atol=0.01)
     np.testing.assert_allclose(found.point_mm, rest, atol=0.01)
+    assert found.rms_mm == pytest.approx(0.01 * np.sqrt(3), rel=0.1)
     error = np.concatenate([found.offset_mm - tip, found.point_mm - rest])
     assert error @ np.linalg.solve(found.covariance_mm2, error) < 22
 

@@ -104,9 +104,19 @@ def test_the_left_image_twice_is_refused():
         reconstruct(left, left, recording.truth.rig)
 
 
+def window(x: int, y: int, size: int) -> np.ndarray:
+    """A mask (360, 640) of everything but a square."""
+    mask = np.ones((360, 640), dtype=bool)
+    mask[y : y + size, x : x + size] = False
+    return mask
+
+
 @pytest.mark.parametrize(
     ("change", "named"),
     [
+        ({"mask_left": window(300, 160, 40)}, "u: .* points lie in the domain, .* control points"),
+        ({"mask_left": np.ones((5, 5), dtype=bool)}, "mask_left: expected a bool array"),
+        ({"mask_right": np.zeros((360, 640))}, "mask_right: expected a bool array"),
         ({"setting": "best"}, "setting"),
         ({"right": np.zeros((360, 640, 3), np.uint8)}, "left, right: no match"),
         ({"rig": "off its lines"}, r"rig: it does not fit the images: .* px off"),
