@@ -48,7 +48,7 @@ def minimise(
             and the direction J^T W r in which the energy falls.
         move: (state, step (p,)) -> the state after an increment.
         rank: Number of directions that the data determine; steps leave the others alone.  None is all p.
-        iterations, tolerance: Most steps, and the relative decrease of the energy below which it is at its minimum.
+        iterations, tolerance: Most steps; a step that promises a smaller decrease of the energy, relative to it, is the end.
 
     A ValueError refuses a start that is not allowed.  The x where exp(x) = 2:
 
@@ -63,8 +63,8 @@ def minimise(
     first = evaluate(start)
     if first is None:
         raise ValueError("start: the energy is not defined there.")
-    state, (energy, work), damping, converged = start, first, 0.0, False
-    for _ in range(iterations):
+    state, (energy, work), damping = start, first, 0.0
+    for steps in range(iterations + 1):
         information, gradient = normal_equations(state, work)
         scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
         values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
@@ -72,9 +72,11 @@ def minimise(
             values, vectors = values[-rank:], vectors[:, -rank:]
         values = np.maximum(values, 1e-15 * values[-1])
         along = vectors.T @ (scale * gradient)
+        converged = bool(0.5 * (along**2 / values).sum() <= tolerance * energy + 1e-22)
+        if converged or steps == iterations:
+            break
         for _ in range(12):
-            step = scale * (vectors @ (along / (values + damping)))
-            trial = move(state, step)
+            trial = move(state, scale * (vectors @ (along / (values + damping))))
             new = evaluate(trial)
             if new is not None and new[0] <= energy * (1 + 1e-14) + 1e-300:
                 break
@@ -82,9 +84,5 @@ def minimise(
         else:
             converged = True  # no step lowers the energy: the floor of rounding
             break
-        decrease, floor = energy - new[0], tolerance * energy + 1e-22
         state, (energy, work), damping = trial, new, damping / 30.0 if damping > 1e-9 else 0.0
-        if 0.5 * gradient @ step <= floor and decrease <= floor:
-            converged = True
-            break
-    return Minimum(state, energy, work, normal_equations(state, work)[0], converged)
+    return Minimum(state, energy, work, information, converged)
