@@ -7,7 +7,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from lib.calibration import Calibration, OnlineCalibration, with_offsets
+from lib.calibration import Calibration, LandmarkOffsets, OnlineCalibration, with_offsets
 from lib.calibration.offsets import rows_axes
 from lib.cameras import StereoRig
 from lib.correspondences import Correspondences
@@ -267,13 +267,14 @@ class RigTracker:
 
     def corrected(self, data: Correspondences) -> Correspondences:
         """With the landmarks where the detector sees them; the frames before tell the axes of shut and crossed jaws."""
-        if self.calibration is None or not len(data):
+        offsets = None if self.calibration is None else self.calibration.offsets
+        if offsets is None or not len(data):
             return data
-        if (found := _corrected_alone(data, self.calibration)) is not None:
-            return found
+        if (alone := _corrected_alone(data, offsets)) is not None:
+            return alone
         past = (part for part in (*self._open, *self._past) if len(part) and int(part.frame[0]) not in self._doubtful)
         before = [part for part in past if part.frame[-1] < data.frame[0]]
-        return with_offsets(Correspondences.join([*before, data]), self.calibration.offsets).of_frames(data.frame)
+        return with_offsets(Correspondences.join([*before, data]), offsets).of_frames(data.frame)
 
     def _is_open(self, data: Correspondences) -> bool:
         """Whether a frame tells the tool's axes, however its landmarks are off: the tips are too far apart to be crossed."""
@@ -337,8 +338,6 @@ class RigTracker:
 
 
 @lru_cache(maxsize=64)  # what looks for a cause asks for the same frames again and again
-def _corrected_alone(data: Correspondences, calibration: Calibration) -> Correspondences | None:
+def _corrected_alone(data: Correspondences, offsets: LandmarkOffsets) -> Correspondences | None:
     """The corrected rows where open jaws tell their axes by themselves and no offset turns these; None elsewhere."""
-    offsets = calibration.offsets
-    told = offsets is None or (not offsets.turns and np.isfinite(rows_axes(data)).all())
-    return with_offsets(data, offsets) if told else None
+    return with_offsets(data, offsets) if not offsets.turns and np.isfinite(rows_axes(data)).all() else None
