@@ -10,9 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from lib.landmarks import Detector
-from lib.online.feeds import Live, recorded
+from lib.online.feeds import Live, Recorder, recorded
 from lib.online.pipeline import OnlinePipeline
-from lib.online.record import Recorder
 from lib.online.result import FrameResult, Settings
 from lib.online.video import Dashboard, video_file
 from lib.recordings import Recording
