@@ -301,7 +301,8 @@ class OnlineCalibration:
         pixels, noise = data.stacked_px, known.detection_covariance(data)
         x = np.where(used.any(axis=1, keepdims=True), data.x_mm, self._state.reference)
         y, J_x, J = self._state.evaluate(x)
-        r, S = np.where(np.repeat(used, 2, axis=1), pixels - y, 0.0), noise + variance_x * J_x @ J_x.mT
+        r = np.where(np.repeat(used, 2, axis=1), pixels - y, 0.0)
+        S = noise + variance_x * J_x @ J_x.mT
         used &= view_distances2(r, S + J @ self._covariance @ J.mT) < gate(100, 2)  # the rig is uncertain itself
         if used.any():
             W = precision(S, used)

@@ -63,7 +63,8 @@ def rung_design(rung: str, seed: int, *, shrink: int = 1) -> Design:
     if rung == "near":  # seeds that no data set of the paper's size was ever made with
         return sequence_design(1000 + seed, TEST_SEQUENCES[seed % len(TEST_SEQUENCES)], shrink=shrink)
     rng = np.random.default_rng([seed, 307, *rung.encode()])
-    drawn, like = random_setup(rng, rung, centred=True), sequence_design(2000 + seed, TEST_SEQUENCES[0], shrink=shrink)
+    drawn = random_setup(rng, rung, centred=True)
+    like = sequence_design(2000 + seed, TEST_SEQUENCES[0], shrink=shrink)
     names = ("image_size_px", "pixels_per_mm", "image_rotation_rad", "readout_s")
     rig = {name: getattr(like.microscope, name) for name in names}
     camera = replace(drawn.microscope, video=drawn.microscope.video.shrunk(1 / shrink), **rig)
@@ -154,7 +155,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     cost += f", {left * _MB_PER_PAIR / shrink**2 / 1000:.2f} GB"
     print(f"{paths.shown(folder)}: {left} of {len(_SEQUENCES) * pairs} stereo pairs to make, {cost}.", flush=True)
     if not arguments.dry_run:
-        start, size = time.perf_counter(), {"n_pairs": pairs, "duration_s": arguments.duration, "shrink": shrink}
+        start = time.perf_counter()
+        size = {"n_pairs": pairs, "duration_s": arguments.duration, "shrink": shrink}
         make_dataset(folder, seed=arguments.seed, workers=workers, **size)
         seconds = time.perf_counter() - start
         if left:

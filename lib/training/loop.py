@@ -268,7 +268,8 @@ class Run:
         """One step on a batch on the device; `spent` as in `TrainingConfig.rate`."""
         self.network.train()
         self.optimiser.param_groups[0]["lr"] = self.config.rate(self.step, spent)
-        images, graphs = batch.images.contiguous(memory_format=torch.channels_last), self.device.type == "cuda"
+        images = batch.images.contiguous(memory_format=torch.channels_last)
+        graphs = self.device.type == "cuda"
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.mixed, cache_enabled=not graphs):
             if self.forward is None:
                 self.forward = self._graphed(images) if graphs and self.world == 1 else self.network

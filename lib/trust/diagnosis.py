@@ -256,7 +256,8 @@ def _scaled_axis(A: np.ndarray, covariance: np.ndarray) -> Iterator[Hypothesis]:
     tolerance = np.diag(np.square([_SKEW_SD, _SKEW_SD, _ASPECT_SD, _ASPECT_SD]))
     if abs(_constraints(A)[2:].mean()) > _RESIZED:
         tolerance[2:, 2:] += 1.0
-    near, spacing = 1e-6 * np.abs(A).max() * np.eye(12).reshape(12, 2, 2, 3), np.log(12.0) / 80
+    near = 1e-6 * np.abs(A).max() * np.eye(12).reshape(12, 2, 2, 3)
+    spacing = np.log(12.0) / 80
     logs = spacing * np.arange(-80, 81)
     scales = np.exp(logs[:, None] * np.eye(3)[:, None])[:, :, None, None, None]  # (axes, logs, 1, 1, 1, 3)
     seen = _constraints(A * scales)
