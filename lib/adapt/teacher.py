@@ -455,5 +455,4 @@ def _contradicted(teacher: Teacher, seen: Seen) -> np.ndarray:
     wrong = (size > 0.06 * length) & (size > 6 * sd)  # (m, 2, 3)
     i, j = np.triu_indices(3, 1)  # pairs of landmarks
     alike = np.linalg.norm(off[:, :, i] - off[:, :, j], axis=-1) < 0.3 * size[:, :, i]
-    both = wrong[:, :, i] & wrong[:, :, j] & alike
-    return seen.frame[both.all(axis=1).any(axis=1)]
+    return seen.frame[(wrong[:, :, i] & wrong[:, :, j] & alike).all(axis=1).any(axis=1)]

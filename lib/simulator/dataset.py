@@ -127,7 +127,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         parser.error("--pairs, --workers and --shrink must be at least 1.")
     if arguments.seed < 0 or not 0 < arguments.duration < float("inf"):
         parser.error("--seed must not be negative, --duration must be positive and finite.")
-    pairs, shrink = arguments.pairs, arguments.shrink
+    pairs, shrink, seed = arguments.pairs, arguments.shrink, arguments.seed
     if arguments.shipped or arguments.rung:
         if arguments.shipped:  # an eye and a tool never trained on, in a calibration sweep and then with a surgeon
             recording = simulate(
@@ -136,12 +136,12 @@ def main(argv: Sequence[str] | None = None) -> None:
                 description="Calibration sweep at several depths, then approach, grasp and peel. Made by lib.simulator.",
             )  # fmt: skip
         else:
-            folder = arguments.folder or paths.CACHE / "rungs" / f"{arguments.rung}-{arguments.seed}"
-            design = replace(rung_design(arguments.rung, arguments.seed, shrink=shrink), duration_s=arguments.duration)
-            recording = simulate(folder, design, seed=5000 + arguments.seed, n_frames=pairs)
+            folder = arguments.folder or paths.CACHE / "rungs" / f"{arguments.rung}-{seed}"
+            design = replace(rung_design(arguments.rung, seed, shrink=shrink), duration_s=arguments.duration)
+            recording = simulate(folder, design, seed=5000 + seed, n_frames=pairs)
         print(f"{recording.folder}: {len(recording)} pairs.")
         return
-    folder = arguments.folder or paths.CACHE / f"dataset-{arguments.seed}"
+    folder = arguments.folder or paths.CACHE / f"dataset-{seed}"
     made = [sequence for index in _SEQUENCES if (sequence := folder / sequence_name(index)).exists()]
     for sequence in made:  # what is there must open as a recording
         try:
@@ -156,8 +156,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     print(f"{paths.shown(folder)}: {left} of {len(_SEQUENCES) * pairs} stereo pairs to make, {cost}.", flush=True)
     if not arguments.dry_run:
         start = time.perf_counter()
-        size = {"n_pairs": pairs, "duration_s": arguments.duration, "shrink": shrink}
-        make_dataset(folder, seed=arguments.seed, workers=workers, **size)
+        make_dataset(folder, seed=seed, workers=workers, n_pairs=pairs, duration_s=arguments.duration, shrink=shrink)
         seconds = time.perf_counter() - start
         if left:
             print(f"{left} pairs in {seconds / 60:.1f} min, {seconds / left:.2f} s a pair.")

@@ -302,6 +302,7 @@ class Run:
         return graphed
 
     def save(self, path: Path, provenance: dict[str, object]) -> None:
+        """Write all that `restore` needs to go on."""
         tensors = {f"network.{k}": v for k, v in self.network.state_dict().items()}
         if self.average is not None:
             tensors |= {f"average.{k}": v for k, v in self.average.state_dict().items()}
