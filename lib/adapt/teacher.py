@@ -449,7 +449,8 @@ def _contradicted(teacher: Teacher, seen: Seen) -> np.ndarray:
     if free is not None and free.offset.shape == (3, 3):
         teacher = replace(teacher, offset_mm=free.offset, turns=free.turns)
     u, covariance = teacher.project(seen.frame)
-    off, length = np.where((seen.confidence >= 0.5)[..., None], seen.u - u, np.nan), tool_length_px(u)[..., None]
+    off = np.where((seen.confidence >= 0.5)[..., None], seen.u - u, np.nan)
+    length = tool_length_px(u)[..., None]
     sd = np.sqrt(np.trace(covariance, axis1=-2, axis2=-1) / 2) + teacher.calibration.reprojection_rms_px
     size = np.linalg.norm(off, axis=-1)
     wrong = (size > 0.06 * length) & (size > 6 * sd)  # (m, 2, 3)

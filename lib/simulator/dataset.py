@@ -85,7 +85,8 @@ def make_dataset(
     processes, None is one a core.  A ValueError refuses a folder with a data set of another seed or size.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    stamp, size = folder / "dataset.json", {"pairs_a_sequence": n_pairs, "duration_s": duration_s, "shrink": shrink}
+    stamp = folder / "dataset.json"
+    size = {"pairs_a_sequence": n_pairs, "duration_s": duration_s, "shrink": shrink}
     text = json.dumps({"seed": seed, **size}, indent=1) + "\n"
     if stamp.is_file() and (found := stamp.read_text(encoding="utf-8", errors="replace").split()) != text.split():
         raise ValueError(f"{folder}: holds another data set ({' '.join(found)}); delete it or choose another folder.")

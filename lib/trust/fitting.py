@@ -146,7 +146,8 @@ class Problem:
 
     def _design(self, M: np.ndarray, columns: Callable | None) -> np.ndarray:
         """(n, 2, 2, p): derivatives by the 16 entries of M, 9 offsets (mm) and the additions; 0 in images not used."""
-        image, own = np.einsum("cij,njk->ncik", M[:, :, :3], self.axes), self.landmark[:, None] == np.arange(3)
+        image = np.einsum("cij,njk->ncik", M[:, :, :3], self.axes)
+        own = self.landmark[:, None] == np.arange(3)
         image = np.where(self.used[:, :, None, None], image, 0.0)
         parts = [self._of_matrices, np.einsum("ncik,nl->ncilk", image, own).reshape(len(self), 2, 2, 9)]
         parts += [] if columns is None else [np.where(self.used[:, :, None, None], np.nan_to_num(columns(M)), 0.0)]

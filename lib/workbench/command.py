@@ -116,7 +116,8 @@ def run(
         with tempfile.TemporaryDirectory(prefix="run-", dir=paths.CACHE, ignore_cleanup_errors=True) as shared:
             os.environ[paths.SHARED_VARIABLE] = shared  # the kernels inherit it
             for number, book in enumerate(chosen):
-                label, start = f"[{number + 1}/{len(chosen)}] {book.stem:<{width}}", time.monotonic()
+                label = f"[{number + 1}/{len(chosen)}] {book.stem:<{width}}"
+                start = time.monotonic()
                 report.content["notebooks"][number]["state"] = "running"
                 report.write()
                 failure = execute(book, report.folder / book.name, values[book], cell_timeout_s=cell_timeout_s, label=label)
