@@ -73,17 +73,20 @@ def _become(command: list[str]) -> int:
 
 
 def test(argv: list[str]) -> int:
+    """Style, then the tests; `argv` goes to pytest."""
     style = subprocess.call([sys.executable, "-m", "ruff", "check", "--output-format=concise", *ruff_options(), ROOT])
     plugins = ["-p", "xdist", "-p", "hypothesispytest"]
     return _pytest([*plugins, "--numprocesses=auto", "--dist=loadfile", "--no-loadscope-reorder", *argv]) or style
 
 
 def bench(argv: list[str]) -> int:
+    """The timings of tests/benchmarks."""
     plain = ["--override-ini=addopts=--import-mode=importlib --strict-markers", "-p", "benchmark"]
     return _pytest([*plain, "--benchmark-only", "--benchmark-disable-gc", str(ROOT / "tests" / "benchmarks"), *argv])
 
 
 def lab(argv: list[str]) -> int:
+    """JupyterLab in this environment."""
     root = ["--allow-root"] if hasattr(os, "geteuid") and os.geteuid() == 0 else []
     page = [] if "LabApp.default_url" in " ".join(argv) else ["--LabApp.default_url=/lab/tree/notebooks"]  # it takes but one
     return _become([sys.executable, "-m", "jupyterlab", f"--notebook-dir={ROOT}", *page, *root, *argv])

@@ -16,6 +16,7 @@ from lib.parallel import cores
 
 #: What decides a result: these files of the repository, and not the results that are being written.
 _CODE = ("lib", "notebooks", "tests", "environment.toml")
+_GPU_NAMES = ["nvidia-smi", "--query-gpu=name", "--format=csv,noheader"]
 
 
 def commit(root: Path = paths.ROOT) -> dict | None:
@@ -34,16 +35,21 @@ def commit_id() -> str:
     return found["id"][:12] + "+modified" * found["modified"] if found else "unknown"
 
 
+@functools.cache
 def machine() -> dict:
     """System, processor, cores that this process may use, memory and GPU."""
-    processor, memory_gb = platform.processor() or platform.machine(), None
+    processor = platform.processor() or platform.machine()
+    memory_gb = gpu = None
     with suppress(OSError):  # no Linux
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
         processor = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), processor)
     with suppress(AttributeError, ValueError, OSError):  # Windows
         memory_gb = round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9, 1)
+    with suppress(OSError, subprocess.SubprocessError, IndexError):  # no driver, no answer, or no GPU
+        told = subprocess.run(_GPU_NAMES, capture_output=True, text=True, timeout=20, check=True).stdout
+        gpu = told.splitlines()[0].strip()
     system = f"{platform.system()} {platform.release()}"
-    return {"system": system, "processor": processor, "cores": cores(), "memory_gb": memory_gb, "gpu": _gpu()}
+    return {"system": system, "processor": processor, "cores": cores(), "memory_gb": memory_gb, "gpu": gpu}
 
 
 class Provenance:
@@ -72,11 +78,3 @@ def plain(value: object) -> object:
     if isinstance(value, float):
         return float(f"{value:.6g}") if np.isfinite(value) else None
     return value
-
-
-@functools.cache
-def _gpu() -> str | None:
-    command = ["nvidia-smi", "--query-gpu=name", "--format=csv,noheader"]
-    with suppress(OSError, subprocess.SubprocessError, IndexError):  # no driver, no answer, or no GPU
-        return subprocess.run(command, capture_output=True, text=True, timeout=20, check=True).stdout.splitlines()[0].strip()
-    return None

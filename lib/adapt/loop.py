@@ -323,7 +323,8 @@ class _Work:
         path, parts = self.folder / f"round {k}.safetensors", self.parts
         if path.is_file():
             return Detector.load(path, engine=detector.engine)
-        held_out, doubt_on = self.images(parts["stop"], teacher, seen), parts["learn"][:0]
+        held_out = self.images(parts["stop"], teacher, seen)
+        doubt_on = parts["learn"][:0]
         if len(held_out) < _DOUBT_IMAGES:  # the errors of frames that were trained on say nothing of others
             doubt_on = parts["learn"][3::4]
             held_out += self.images(doubt_on, teacher, seen)
@@ -354,8 +355,10 @@ class _Work:
     def judged(self, first: Seen, best: Detector, best_seen: Seen, teacher: Teacher) -> Adaptation:
         """Compare the detectors on the frames that took no part."""
         seen = first.of(self.parts["judge"]), best_seen.of(self.parts["judge"])
-        agreements, distances = [agreement(teacher, own) for own in seen], epipolar_px(self.recording, seen, best_seen)
-        length, (told, spread) = agreements[0].length_px.mean(axis=1), teacher.project(self.parts["judge"])
+        agreements = [agreement(teacher, own) for own in seen]
+        distances = epipolar_px(self.recording, seen, best_seen)
+        length = agreements[0].length_px.mean(axis=1)
+        told, spread = teacher.project(self.parts["judge"])
         robot, robot_sd = better(*(own.relative for own in agreements))
         eye, eye_sd = better(*(frame_means(own / length) for own in distances))
         improved = best is not self.detector and robot > _SURE_GAIN * robot_sd and eye > 0

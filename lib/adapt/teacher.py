@@ -115,7 +115,8 @@ class Teacher:
         NaN where the robot is silent.  The covariance is that of calibration, robot, clock and offset.
         """
         r, c, offset = self.recording, self.calibration, self.offset_mm
-        time, height = np.repeat(r.frames.time_s[frames][:, None], 3, axis=1) + r.offset_s, r.image_size_px[1]
+        time = np.repeat(r.frames.time_s[frames][:, None], 3, axis=1) + r.offset_s
+        height = r.image_size_px[1]
         log_s = r.kinematics.time_s
         log = slice(None, None, max(1, int(_TURNS_S * (len(log_s) - 1) / max(np.ptp(log_s), _TURNS_S))))
         u, covariance = np.full((len(frames), 2, 3, 2), np.nan), np.full((len(frames), 2, 3, 2, 2), np.nan)
@@ -204,7 +205,8 @@ def teach(
                 f"{100 * size_mm.max() / length:.0f} % of the tool's length. It takes another point for it, or the robot's "
                 f"tool has other dimensions. {_LABEL}"
             )
-        turns, (offset, covariance) = told.turns, _robots_share(told, (0.2 if alone else 1.0) * _OWN_BIAS * length)
+        turns = told.turns
+        offset, covariance = _robots_share(told, (0.2 if alone else 1.0) * _OWN_BIAS * length)
     elif before is not None:
         offset, covariance, turns = before.offset_mm, before.offset_covariance_mm2, before.turns
     teacher = Teacher(recording, calibration, clock_sd_s, offset, covariance, refused, right, turns)
@@ -265,7 +267,8 @@ def _aligned(recording: Recording, seen: Seen, *, by_hand: bool) -> tuple[Record
     except RefusalError as error:  # few right ones agree on cameras by a clock that is off, and do not tell its offset
         if error.__cause__ is not None:
             raise
-        recording, clock_sd_s = _scanned_clock(recording, lambda one: _fitted(one, seen).view_inliers.sum()), 0.01
+        recording = _scanned_clock(recording, lambda one: _fitted(one, seen).view_inliers.sum())
+        clock_sd_s = 0.01
         calibration = calibrated(recording)
     for _ in range(2):
         step_s, sd_s = clock_error(calibration, seen.rows(recording), recording.kinematics, recording.offset_s)
@@ -281,7 +284,8 @@ def _aligned(recording: Recording, seen: Seen, *, by_hand: bool) -> tuple[Record
         fault = _fault(recording, seen, calibration, by_hand=by_hand)
         if fault is None or fault.name != "clock":
             break
-        recording, clock_sd_s = replace(recording, offset_s=recording.offset_s + 1e-3 * fault.value), 1e-3 * fault.sd
+        recording = replace(recording, offset_s=recording.offset_s + 1e-3 * fault.value)
+        clock_sd_s = 1e-3 * fault.sd
         calibration = calibrated(recording)
     if fault is not None:
         raise RefusalError(f"robot: {fault.text} {fault.cure}")
@@ -421,7 +425,8 @@ def _as_labelled(teacher: Teacher, labels: Seen) -> Teacher:
     """The teacher with the offsets at which its cameras see the robot's landmarks where labels set by hand are."""
     free = teacher.calibration.offsets
     fitted = free is not None and free.offset.shape == (3, 3)
-    teacher, start = replace(teacher, turns=fitted and free.turns), free.offset.ravel() if fitted else np.zeros(9)
+    teacher = replace(teacher, turns=fitted and free.turns)
+    start = free.offset.ravel() if fitted else np.zeros(9)
     wide_mm = _OTHER_POINT * _length_mm(teacher.recording)
 
     def misfit(change: np.ndarray) -> np.ndarray:
@@ -444,11 +449,11 @@ def _contradicted(teacher: Teacher, seen: Seen) -> np.ndarray:
     if free is not None and free.offset.shape == (3, 3):
         teacher = replace(teacher, offset_mm=free.offset, turns=free.turns)
     u, covariance = teacher.project(seen.frame)
-    off, length = np.where((seen.confidence >= 0.5)[..., None], seen.u - u, np.nan), tool_length_px(u)[..., None]
+    off = np.where((seen.confidence >= 0.5)[..., None], seen.u - u, np.nan)
+    length = tool_length_px(u)[..., None]
     sd = np.sqrt(np.trace(covariance, axis1=-2, axis2=-1) / 2) + teacher.calibration.reprojection_rms_px
     size = np.linalg.norm(off, axis=-1)
     wrong = (size > 0.06 * length) & (size > 6 * sd)  # (m, 2, 3)
     i, j = np.triu_indices(3, 1)  # pairs of landmarks
     alike = np.linalg.norm(off[:, :, i] - off[:, :, j], axis=-1) < 0.3 * size[:, :, i]
-    both = wrong[:, :, i] & wrong[:, :, j] & alike
-    return seen.frame[both.all(axis=1).any(axis=1)]
+    return seen.frame[(wrong[:, :, i] & wrong[:, :, j] & alike).all(axis=1).any(axis=1)]

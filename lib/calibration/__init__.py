@@ -1,11 +1,10 @@
 """Calibration of affine and near-affine cameras from a robot's kinematics, and how good it is (paper Sec. IV-A)."""
 
 from lib.calibration.affine import affine_minimum, dlt, paper_variances
-from lib.calibration.calibration import Calibration, LandmarkOffsets, Optics, optics
+from lib.calibration.calibration import Calibration, LandmarkOffsets, OnlineCalibration, Optics, optics
 from lib.calibration.estimate import calibrate
 from lib.calibration.export import write_opencv, write_ros
 from lib.calibration.offsets import with_offsets
-from lib.calibration.online import OnlineCalibration
 from lib.calibration.pivot import Pivot, Tool, ToolOffsets, pivot_calibration, tool_offsets
 from lib.calibration.robust import CompetingCamerasError, NoConsensusError
 from lib.calibration.timing import TimeOffset, estimate_time_offset

@@ -63,7 +63,8 @@ def affine_minimum(x: np.ndarray, y: np.ndarray, variance_u: float, variance_x: 
         scale = np.repeat([variance_u**-0.5, variance_x**-0.5], [m, 3])
         values, vectors = np.linalg.eigh(scatter * np.outer(scale, scale))
         leading = vectors[:, m:]
-        A, cost = np.linalg.solve(leading[m:].T, leading[:m].T).T * np.sqrt(variance_u / variance_x), 0.5 * values[:m].sum()
+        A = np.linalg.solve(leading[m:].T, leading[:m].T).T * np.sqrt(variance_u / variance_x)
+        cost = 0.5 * values[:m].sum()
     return AffineMinimum(np.column_stack([A, mean[:m] - A @ mean[m:]]), float(max(cost, 0.0)))
 
 
@@ -92,7 +93,8 @@ def estimate_noise(
     n, m = residuals.shape
     code = np.full(n, 3) if views is None else views @ [1, 2][: m // 2]
     claimed = np.eye(m)[None] if claimed_px2 is None else claimed_px2
-    unit, least = noise_rms_px(claimed), np.array([0.0 if claimed_px2 is None else 1.0, 0.0])
+    unit = noise_rms_px(claimed)
+    least = np.array([0.0 if claimed_px2 is None else 1.0, 0.0])
     count = 2.0 * ((code & 1).sum() + (code >> 1).sum() * (m > 2))
     known = np.array([np.nan if sigma is None else float(sigma) for sigma in (sigma_u_px, sigma_x_mm)])
     if claimed_px2 is not None and sigma_u_px is not None:
@@ -120,8 +122,10 @@ def estimate_noise(
         v[1] = np.median(np.maximum(observed[~flat] - v[0], 0.0) / gain[~flat])
     design = np.column_stack([np.ones(len(gain)), gain])
     for _ in range(50):
-        root, new = np.sqrt(freedom) / np.maximum(design @ v, floor), np.where(free, least, v)
-        target, scale = (observed - design @ new) * root, design[:, free].max(axis=0)
+        root = np.sqrt(freedom) / np.maximum(design @ v, floor)
+        new = np.where(free, least, v)
+        target = (observed - design @ new) * root
+        scale = design[:, free].max(axis=0)
         new[free] += nnls(design[:, free] / scale * root[:, None], target)[0] / scale
         if (np.abs(new - v) <= 1e-10 * v).all():
             break

@@ -152,7 +152,8 @@ def _turned(
     What a robot with a wrong tool reports is off in the axes of the true tool, and turns the axes of the reported one.
     Offsets that turn the axes that much are more often the robot's than the detector's.  `sure`: somebody knows of offsets.
     """
-    x_mm, row = data.grid("x_mm"), np.unique(data.frame, return_inverse=True)[1][usable]
+    x_mm = data.grid("x_mm")
+    row = np.unique(data.frame, return_inverse=True)[1][usable]
 
     def turned(offset: np.ndarray) -> np.ndarray:
         own = tool_axes(x_mm, np.pad(offset, ((0, 3 - len(offset)), (0, 0))))[row]

@@ -147,7 +147,8 @@ class State:
         """Pixels y (n, m) of points (n, 3) mm, dy/dx (n, m, 3) and the derivatives by the model's parameters (n, m, p)."""
         x, n, c = x_mm - self.reference, len(x_mm), len(self.A)
         if not (self.rho.any() or self.radial.any() or (derivatives and not self.model.is_affine)):
-            A, D = self.A.reshape(-1, 3), self._linear() if derivatives else np.empty((2 * c, 4, 0))
+            A = self.A.reshape(-1, 3)
+            D = self._linear() if derivatives else np.empty((2 * c, 4, 0))
             J_c = np.tensordot(np.column_stack([x, np.ones(n)]), D, axes=(1, 1))
             return x @ A.T + self.offset.ravel(), np.tile(A, (n, 1, 1)), J_c
         r_3, size, k = *self.normals, len(self.model.selection) // c

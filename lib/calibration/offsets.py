@@ -64,11 +64,14 @@ def tool_axes(x_mm: ArrayLike, offset_mm: np.ndarray | None = None) -> np.ndarra
         across = across - beside * m
         width = np.linalg.norm(across, axis=1, keepdims=True)
         sine = np.clip((-apart[2] - beside * a[:, 2:]) / (width * up[:, 2:]), -1, 1)
-        cosine, c = np.array([[[1]], [[-1]]]) * np.sqrt(1 - sine**2), across / width
-        g, own = cross(m, c), np.stack([a, side, up], axis=2)
+        cosine = np.array([[[1]], [[-1]]]) * np.sqrt(1 - sine**2)
+        c = across / width
+        g = cross(m, c)
+        own = np.stack([a, side, up], axis=2)
         y, z = cosine * c - sine * g, sine * c + cosine * g
         axes = np.stack([np.broadcast_to(m, y.shape), y, z], axis=3) @ own.mT  # (2, n, 3, 3)
-        opening, shut = apart[1] + (beside * a + width * (cosine * side + sine * up))[..., 1], 0.05 * (straight + middle[0])
+        opening = apart[1] + (beside * a + width * (cosine * side + sine * up))[..., 1]
+        shut = 0.05 * (straight + middle[0])
         possible = (width[:, 0] > shut) & (opening > np.stack([np.full(len(x), -np.inf), -shut]))  # jaws hardly cross
     return _least_turning(axes, possible)
 
@@ -83,7 +86,8 @@ def _least_turning(axes: np.ndarray, possible: np.ndarray) -> np.ndarray:
     known = known[two[:-2] | two[1:-1] | two[2:]]  # a row of one choice cuts the way: only those beside it matter
     if not known.size:
         return found
-    y, own = axes[..., 1][:, known], np.where(possible[:, known], [[0.0], [1e-6]], np.inf)
+    y = axes[..., 1][:, known]
+    own = np.where(possible[:, known], [[0.0], [1e-6]], np.inf)
     turn = np.nan_to_num(1 - np.einsum("snx,tnx->nst", y[:, :-1], y[:, 1:]), nan=np.inf).tolist()
     (a, b), came = own[:, 0].tolist(), []
     for ((aa, ab), (ba, bb)), (own_a, own_b) in zip(turn, own.T[1:].tolist(), strict=True):  # the shortest way to each
@@ -198,7 +202,8 @@ def _steps(
     taken: int = 0,
 ) -> Calibration:  # fmt: skip
     """`estimate_offsets`; the first steps, as many as `taken`, use every detection, though they look like two cameras'."""
-    offset, p_value, views = np.zeros((int(landmark.max()) + 1, y.shape[1] if axes is None else 3)), np.nan, None
+    offset = np.zeros((int(landmark.max()) + 1, y.shape[1] if axes is None else 3))
+    p_value, views = np.nan, None
     if start is not None:
         offset, prior_sd, p_value = start.offsets.offset, start.offsets.prior_sd, start.offsets.p_value
     step, share = np.zeros(offset.size), 1.0
@@ -261,7 +266,8 @@ def start_of_turning(
     rows, offset, k = np.flatnonzero(found.inliers)[some], found.offsets.offset, len(found.offsets.offset)
     J_x, J_c, weight, r = (part if len(part) == 1 else part[some] for part in found.system)
     r = r + (J_x @ axes[rows] @ offset[landmark[rows]][:, :, None])[:, :, 0]
-    chosen, prior = np.eye(k)[landmark[rows]], np.eye(3 * k) / max(found.offsets.prior_sd, _GRID_MM[1]) ** 2
+    chosen = np.eye(k)[landmark[rows]]
+    prior = np.eye(3 * k) / max(found.offsets.prior_sd, _GRID_MM[1]) ** 2
 
     def explained(offset: np.ndarray) -> tuple[float, np.ndarray]:
         """How much better than none offsets explain the detections, and the best ones if the axes stayed."""

@@ -79,7 +79,8 @@ def _one_camera(
         return _Found(np.ones(n, dtype=bool), regress(x, u), 0.0, np.inf, np.inf)
     cure = "check that x_mm and u belong together (frames, landmarks, clocks) and that the detector knows this tool"
     if threshold_px is None and n < _FEW:
-        found, enough = _by_growth(x, u, rng, least_mm), min(8, n - n // 4)
+        found = _by_growth(x, u, rng, least_mm)
+        enough = min(8, n - n // 4)
     else:
         found = _tightest(x, u, threshold_px, rng, least_mm)
         enough = max(8, int((_LEAST_SHARE if threshold_px is None else 0.1) * n))
@@ -186,7 +187,8 @@ def _tightest(x: np.ndarray, u: np.ndarray, threshold_px: float | None, rng: np.
     """The consensus of the camera that makes the rows most probable (or has most of them within `threshold_px`: MSAC)."""
     n, middle = len(u), np.median(u, axis=0)
     u = u - middle
-    area, H = float(np.prod(_extent(u))), np.column_stack([x - x.mean(axis=0), np.ones(n)])
+    area = float(np.prod(_extent(u)))
+    H = np.column_stack([x - x.mean(axis=0), np.ones(n)])
     some = np.arange(n) if n <= _ROWS_RANKED else rng.choice(n, _ROWS_RANKED, replace=False)
     M, score, near2 = np.empty((0, 4, 2)), np.empty(0), np.empty(0)
     for count in _SAMPLES:
@@ -222,12 +224,16 @@ def _tightest(x: np.ndarray, u: np.ndarray, threshold_px: float | None, rng: np.
     chance = evidence[best] < evidence[most] + _MORE_THAN_CHANCE or share[best, 0] < _LEAST_SHARE
     best = most if share[most, 0] > _NEARLY_ALL and chance else best
     if len(some) < n:
-        (M, scales, share, _), best = _mixture(H, u, M[[best]], scales[[best], 0], area, 30), 0
-    (sigma, wider), share, gate2 = scales[best].tolist(), share[best], gate(n, 2)
+        M, scales, share, _ = _mixture(H, u, M[[best]], scales[[best], 0], area, 30)
+        best = 0
+    sigma, wider = scales[best].tolist()
+    share = share[best]
+    gate2 = gate(n, 2)
     if wider > _CONTRAST * sigma:  # contamination: a row is kept where it is more probably right than wrong
         wrong = share[1] / wider**2 + 2.0 * np.pi * share[2] / area
         gate2 = float(np.clip(2.0 * np.log(share[0] / sigma**2 / wrong), 4.0, gate2))
-    keep, matrix = _distances2(H, u, M[[best]])[0] < gate2 * sigma**2, M[best].T.copy()
+    keep = _distances2(H, u, M[[best]])[0] < gate2 * sigma**2
+    matrix = M[best].T.copy()
     matrix[:, 3] += middle - matrix[:, :3] @ x.mean(axis=0)
     return _Found(keep, matrix, sigma, wider, gate2)
 
@@ -244,7 +250,8 @@ def _mixture(
     products = np.hstack([(H[:, :, None] * other[:, None]).reshape(n, -1) for other in (H, u)])
     floor = 1e-7 * side
     variance = np.stack([np.maximum(sigma, floor), np.maximum(6.0 * sigma, 0.017 * side)], axis=1) ** 2
-    share, before, distance2 = np.tile([0.4, 0.3, 0.3], (k, 1)), -np.inf, _distances2(H, u, M)
+    share = np.tile([0.4, 0.3, 0.3], (k, 1))
+    before, distance2 = -np.inf, _distances2(H, u, M)
     for i in range(rounds):
         scale = 1.0 / variance.T[:, :, None]  # (2, k, 1)
         at_peak = share.T[:2, :, None] * scale * (area / (2.0 * np.pi * share[:, 2, None]))
@@ -254,7 +261,8 @@ def _mixture(
         if i > 5 and (likelihood - before < 1e-3).all():
             break
         p /= total
-        before, moments = likelihood, (p[0] * scale[0] + p[1] * scale[1]) @ products
+        before = likelihood
+        moments = (p[0] * scale[0] + p[1] * scale[1]) @ products
         G = moments[:, :16].reshape(k, 4, 4)
         G = G + 1e-12 * np.einsum("kii->k", G)[:, None, None] * np.eye(4)
         M = np.linalg.solve(G, moments[:, 16:].reshape(k, 4, 2))

@@ -62,7 +62,8 @@ def sandwich(
 def _posterior(K: np.ndarray, e: np.ndarray, groups: list[tuple], known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Probability of each correlation, and the variance of the whitened residuals under it, 1 where they are independent."""
     p, likelihood, variance = K.shape[2], [], []
-    unit, both = np.linalg.cholesky(known), np.concatenate([K, e[:, :, None]], axis=2)  # unit: a parameter's own deviation
+    unit = np.linalg.cholesky(known)  # a parameter's own deviation
+    both = np.concatenate([K, e[:, :, None]], axis=2)
     series = [(both[rows][:, view], gaps[:, None, None]) for rows, view, gaps in groups]
     freedom = max(sum(values[..., 0].size for values, _ in series) - p, 1)
     for correlation in _CORRELATIONS:

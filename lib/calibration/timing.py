@@ -173,7 +173,8 @@ def clock_error(found: Calibration, data: Correspondences, kinematics: Kinematic
     v = np.nan_to_num(_paths(kinematics).at(rows.landmark, rows.time_s + offset_s, 1))
     if np.count_nonzero(v.any(axis=1)) < 8:
         return 0.0, np.inf
-    parts, penalty, pull = [J_x @ v[:, :, None], np.broadcast_to(J_c, (len(r), *J_c.shape[1:]))], 0.0, 0.0
+    parts = [J_x @ v[:, :, None], np.broadcast_to(J_c, (len(r), *J_c.shape[1:]))]
+    penalty = pull = 0.0
     if found.offsets is not None and found.offsets.offset.shape[1] == 3:
         axes = np.nan_to_num(rows_axes(data, found.offsets.offset if found.offsets.turns else None)[found.inliers])
         chosen = np.eye(len(found.offsets.offset))[rows.landmark]
@@ -210,7 +211,8 @@ def shift_misfits(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         good = used.sum(axis=1) >= max(8, 0.6 * seen.sum())
         used = used[good]
         H = np.where(used[:, :, None], np.concatenate([x[good][:, seen], np.ones((*used.shape, 1))], axis=2), 0.0)
-        u, weight, median = u[seen], used.astype(float), np.median if used.all() else np.nanmedian  # which takes far longer
+        u, weight = u[seen], used.astype(float)
+        median = np.median if used.all() else np.nanmedian  # which takes far longer
         for _ in range(10 if good.any() else 0):
             WH = (H * weight[:, :, None]).transpose(0, 2, 1)
             r2 = ((u - H @ (np.linalg.pinv(WH @ H, hermitian=True) @ (WH @ u))) ** 2).sum(axis=2)

@@ -65,7 +65,8 @@ def _video(folder: Path, paths: dict[str, Path], tables: dict[str, Path]) -> dic
     names = names if len(names) > 1 else [names[0].replace("*", f"*{side}*") for side in ("left", "right")]
     left, right, *_ = sorted(names, key=lambda name: ("right" in name.lower(), name))
     digits = len(str(max((last_number(name) or 0 for name in images), default=0)))
-    times, seconds = {"times": "container"}, [] if films else decimals(list(folder.glob(left)))
+    times = {"times": "container"}
+    seconds = [] if films else decimals(list(folder.glob(left)))
     if seconds and (int(min(seconds)) < int(max(seconds)) or max(seconds) >= 10**9):  # else cam_1.0001 is frame 1
         times = {"times": "names", "name_unit": "s"}
     elif not films and digits >= 10:

@@ -176,7 +176,8 @@ def _did(
     pair = draft.frames[0]
     if all(np.array_equal(image[..., 0], image[..., k]) for image in (pair.left, pair.right) for k in (1, 2)):
         said.append("The frames are grey; the detector learnt on colour, so look at what it finds.")
-    x, kind = draft.kinematics.x_mm, "its landmarks" if told.robot.pose is None else "the pose of its tool"
+    x = draft.kinematics.x_mm
+    kind = "its landmarks" if told.robot.pose is None else "the pose of its tool"
     gaps = int(np.isnan(x[..., 0]).any(axis=1).sum())
     said.append(f"{len(x)} samples of the robot, which reports {kind}; {gaps} have gaps.")
     said += [f"Times of the {what} count from {z} s." for what, z in zip(("video", "robot"), zeros, strict=True) if z]

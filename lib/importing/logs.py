@@ -91,7 +91,8 @@ def read_columns(path: Path, table: Table, names: Iterable[str]) -> tuple[list[D
             what = "two columns are" if name in header else "no column is"
             cure = f"Check the names and separator = {table.separator!r}"
             raise ValueError(f"{place}: {what} called {name!r}; it has {header}. {cure}.")
-    at, time, values = [header.index(name) for name in wanted], [], []
+    at = [header.index(name) for name in wanted]
+    time, values = [], []
     for place, cells in rows:
         cells = [cells[i].replace(table.decimal, ".") for i in at]
         time.append(exact_seconds(cells[0], table.time_unit, f"{place}, column {table.time}"))
@@ -139,10 +140,10 @@ def _read_bag(path: Path, table: Table, names: list[str]) -> tuple[list[Decimal]
     time = found[table.time]
     if not time or not isinstance(time[0], Decimal):
         raise ValueError(f"{path}: {table.time!r} is no time; name /topic:header.stamp or /topic:received.")
-    columns, own = {}, table.time.partition(":")[0]
+    columns = {name: np.array(found[name], np.float64) for name in names}
     for name in names:
-        topic, columns[name] = name.partition(":")[0], np.array(found[name], np.float64)
-        if topic != own:
+        topic = name.partition(":")[0]
+        if topic != table.time.partition(":")[0]:
             at, known = since(time, time[0]), since(stamps[topic], time[0])
             columns[name] = np.interp(at, known, columns[name], left=np.nan, right=np.nan)
     return time, columns

@@ -142,7 +142,8 @@ class StereoSource:
         """Left and right images, (h, w, 3) uint8 RGB."""
         for images in zip(*(reel.read(index) for reel, index in zip(self.reels, self.index.T, strict=False)), strict=True):
             images = [to_8_bits(image, self.bit_depth, reel.files[0]) for image, reel in zip(images, self.reels, strict=True)]
-            sizes, file = [f"{image.shape[1]} x {image.shape[0]} px" for image in images], self.reels[-1].files[0]
+            sizes = [f"{image.shape[1]} x {image.shape[0]} px" for image in images]
+            file = self.reels[-1].files[0]
             if self.video.layout != "two":
                 axis = 1 if self.video.layout == "side_by_side" else 0
                 if images[0].shape[axis] % 2:

@@ -1,7 +1,6 @@
 """Landmarks of the forceps in an image: base, tip_1, tip_2, with covariance and confidence (paper Sec. III)."""
 
 from lib.landmarks.detector import Detector, Landmarks
-from lib.landmarks.recorded import detect
-from lib.landmarks.shared import SharedDetector
+from lib.landmarks.recorded import SharedDetector, detect
 
 __all__ = ["Detector", "Landmarks", "SharedDetector", "detect"]

@@ -253,7 +253,8 @@ class Detector:
         rough = self.coarse(images)
         seen = self.stage_peaks(images, rough.u, "tool") if self.tool_network else None
         result = self.searched(images, rough, seen, avoid, sweep=sweep)
-        same, before = np.array_equal(result.u, rough.u, equal_nan=True), rough
+        same = np.array_equal(result.u, rough.u, equal_nan=True)
+        before = rough
         for stage in [stage for stage in self.stages[1:] if stage != "tracking"]:
             again = view.moved_far(before.u, result.u) if stage == "closer" else None
             before = result
@@ -418,7 +419,8 @@ class Detector:
         (centre, angle), length = view.tool_pose(u), np.maximum(tool_length_px(u), 1.0)
         if stage in ("tool", "again"):
             size, image = view.TOOL_PX, np.flatnonzero(np.isfinite(angle))
-            matrices, which = view.window_from_image(centre[image], angle[image], size, view.tool_zoom(length[image])), image
+            matrices = view.window_from_image(centre[image], angle[image], size, view.tool_zoom(length[image]))
+            which = image
         else:
             size = self.closeup_network.config.size_px if stage in CLOSE else self.window_px
             which = np.argwhere(np.isfinite(u).all(2) & np.isfinite(angle)[:, None] & (True if only is None else only))

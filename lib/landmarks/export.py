@@ -74,7 +74,8 @@ def export(detector: Detector, folder: str | Path, examples: np.ndarray | None =
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     detector = replace(detector, engine="torch")
-    rough, result, stride = detector(examples), {}, detector.frame_stride(examples)
+    rough, stride = detector(examples), detector.frame_stride(examples)
+    result = {}
     for stage in detector.stages:
         images, evidence = detector.reduced(examples), ()
         if stage != "frame":

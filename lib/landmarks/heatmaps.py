@@ -141,7 +141,8 @@ def _gauss_newton(heatmaps: Tensor, sigma: float, start: Tensor, value: Tensor) 
             break
     residual, jacobian = model(theta)
     variance = residual.square().sum(-1) / (weight.sum(-1) - 5).clamp_min(1) + 1e-8
-    normal, unit = jacobian.transpose(-1, -2) @ jacobian + 1e-6 * eye, eye[:, :2].expand(*jacobian.shape[:-2], 5, 2)
+    normal = jacobian.transpose(-1, -2) @ jacobian + 1e-6 * eye
+    unit = eye[:, :2].expand(*jacobian.shape[:-2], 5, 2)
     covariance = variance[..., None, None] * _solve(normal, unit)[..., :2, :]
     width = theta[..., 2]
     near = (theta[..., :2].square().sum(-1) <= reach**2) & (width > 0.4) & (width < 2.5)

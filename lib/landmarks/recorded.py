@@ -1,8 +1,16 @@
-"""The detector over a recording: correspondences of the robot's and the images' landmarks."""
+"""The detector over a recording, and detections that notebooks of one run, or commands, share: no pair is looked at twice."""
+
+import hashlib
+import os
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
 
 import numpy as np
 from tqdm.auto import tqdm
 
+from lib import files, paths
 from lib.correspondences import Correspondences, of_recording
 from lib.landmarks.detector import Detector, Landmarks
 from lib.recordings import Recording
@@ -39,3 +47,52 @@ def detect(
     known = {"covariance_px2": every.covariance.reshape(n, 2, 3, 2, 2), "confidence": every.confidence.reshape(n, 2, 3)}
     known = {name: part.swapaxes(1, 2) for name, part in known.items()}
     return of_recording(recording, every.u[::2], every.u[1::2], frames=chosen, **known)
+
+
+class SharedDetector:
+    """A detector for `detect` and `assess` that reads what was found in the same images before.
+
+    `python3 -m lib` names a folder for that in the environment: `run` one of its own, which it removes at its end, other
+    commands one in data/cache.  Anywhere else this is the detector itself.  A file's name is the digest of the images'
+    pixels, the weights, the settings and the engine.  Where a time is measured, call the detector itself.
+
+    Attributes:
+        seconds: What detecting took: here, and where it was read, there.
+        pairs, read: How many calls there were, and how many of them were read.
+
+        >>> detector = SharedDetector(lambda images: Landmarks.none(len(images)))
+        >>> len(detector(np.zeros((2, 8, 8, 3), np.uint8))), detector.pairs, detector.read
+        (2, 1, 0)
+    """
+
+    def __init__(self, detector: Detector | Callable[[np.ndarray], Landmarks] | None = None):
+        self.detector = detector or Detector.load()
+        self.seconds, self.pairs, self.read = 0.0, 0, 0
+        self._digest = getattr(self.detector, "digest", "")
+        self._folder = os.environ.get(paths.SHARED_VARIABLE) if self._digest else None
+
+    def __call__(self, images: np.ndarray) -> Landmarks:
+        """Landmarks of a stereo pair (2, h, w, 3), uint8 RGB."""
+        self.pairs, file = self.pairs + 1, None
+        if self._folder:
+            content = f"{self._digest} {images.dtype} {images.shape}".encode() + images.tobytes()
+            file = Path(self._folder) / f"{hashlib.sha256(content).hexdigest()}.npz"
+            if file.is_file():
+                with np.load(file) as kept:
+                    self.read, self.seconds = self.read + 1, self.seconds + float(kept["seconds"])
+                    return Landmarks(kept["u"], kept["covariance"], kept["confidence"])
+        start = time.perf_counter()
+        found = self.detector(images)
+        seconds = time.perf_counter() - start
+        self.seconds += seconds
+        if file:
+            with suppress(OSError), files.whole(file) as partial:  # a full disk costs time, not the notebook
+                np.savez(partial, **vars(found), seconds=seconds)
+        return found
+
+    def __str__(self) -> str:
+        """Where the detections come from, in one sentence."""
+        if not self.read:
+            return f"Detected in {self.pairs} stereo pairs, {self.seconds:.1f} s."
+        seconds = f"finding them took {self.seconds:.1f} s"
+        return f"Detections in {self.read} of {self.pairs} stereo pairs were read from the cache; {seconds}."

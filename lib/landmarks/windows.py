@@ -115,7 +115,8 @@ def cut(image: np.ndarray, matrix: np.ndarray, size: int | ArrayLike, *, border:
     A window at less than half the image's scale is the mean over blocks of a finer one, so that nothing aliases; at less
     than a quarter, the part of the image that it shows is halved first, which is quicker.
     """
-    finer, side = int(np.clip(1 / np.sqrt(abs(np.linalg.det(matrix[:, :2]))), 1, 8)), np.broadcast_to(size, 2)
+    finer = int(np.clip(1 / np.sqrt(abs(np.linalg.det(matrix[:, :2]))), 1, 8))
+    side = np.broadcast_to(size, 2)
     if finer >= 4:
         corners = (np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * side - 0.5 - matrix[:, 2]) @ np.linalg.inv(matrix[:, :2]).T
         (x, y), (right, bottom) = corners.min(axis=0).astype(int) // 2 * 2 - 4, corners.max(axis=0).astype(int) // 2 * 2 + 6

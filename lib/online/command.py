@@ -10,9 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from lib.landmarks import Detector
-from lib.online.feeds import Live, recorded
+from lib.online.feeds import Live, Recorder, recorded
 from lib.online.pipeline import OnlinePipeline
-from lib.online.record import Recorder
 from lib.online.result import FrameResult, Settings
 from lib.online.video import Dashboard, video_file
 from lib.recordings import Recording
@@ -73,7 +72,9 @@ def main(argv: list[str] | None = None) -> int:
         parser.error("--frames and --surface-every: must be at least 1.")
     recording = Recording.open(a.recording)
     settings = Settings(surface_every=a.surface_every, fps=recording.fps, robot_accuracy_mm=recording.robot_accuracy_mm)
-    detector, frames, recorder = Detector.load(a.weights), recorded(recording, a.frames), None
+    detector = Detector.load(a.weights)
+    frames = recorded(recording, a.frames)
+    recorder = None
     feed = Live(frames) if a.live else frames
     with contextlib.ExitStack() as stack:
         show = stack.enter_context(video_file(a.video, min(recording.fps, 25.0))) if a.video else None

@@ -218,7 +218,9 @@ class RigTracker:
         except ValueError as error:
             self.state, self._held = "moved", False
             # The oldest may be from before, or from during the motion.
-            self._since, self._waiting, self.cause = self._since[1 - 2 * first :], self._waiting + 1, str(error)
+            self._since = self._since[1 - 2 * first :]
+            self._waiting += 1
+            self.cause = str(error)
             if self._waiting > self.settings.give_up_frames:
                 self._start_again(self._since, "no cause explains the images; calibrating afresh")
             raise
@@ -228,7 +230,8 @@ class RigTracker:
             self._revert(result.index)
             self.state, self.cause = "robot" if found.kind in ("clock", "slipped") else "moved", found.text
             self._held, self._waiting = True, 1
-            self._since, result.failures["robot"] = self._since[1 - first :], found.text
+            self._since = self._since[1 - first :]
+            result.failures["robot"] = found.text
         elif found.kind == "optics":
             self._start_again(self._since, found.text)
             result.failures["register"] = found.text

@@ -27,8 +27,8 @@ class Dashboard:
     def draw(self, left: np.ndarray, right: np.ndarray, result: FrameResult) -> np.ndarray:
         """The page of a frame."""
         page = np.full((_SIZE[1], _SIZE[0], 3), 250, np.uint8)
-        u, width = np.stack([result.landmarks.u_left, result.landmarks.u_right]), 360 * left.shape[1] // left.shape[0]
-        views = overlay(StereoFrame(left, right, result.time_s), u, None, min(637, width))
+        u = np.stack([result.landmarks.u_left, result.landmarks.u_right])
+        views = overlay(StereoFrame(left, right, result.time_s), u, None, min(637, 360 * left.shape[1] // left.shape[0]))
         page[: views.shape[0], : views.shape[1]] = views
         self._lights(page, result)
         self._past.append((result.distance_mm, result.distance_sd_mm))

@@ -284,7 +284,8 @@ class RecordingWriter:
         self._check_target()
         self.folder = self.target.with_name(f"{self.target.name}.{os.getpid()}-{os.urandom(3).hex()}.partial")
         self.fps, self.image_size_px = float(fps), (int(image_size_px[0]), int(image_size_px[1]))
-        self._suffix, self._options = suffix, [cv2.IMWRITE_JPEG_QUALITY, int(jpeg_quality)] if suffix == ".jpg" else []
+        self._suffix = suffix
+        self._options = [cv2.IMWRITE_JPEG_QUALITY, int(jpeg_quality)] if suffix == ".jpg" else []
         self._header = {
             "format": _FORMAT, "name": name, "description": description, "fps": self.fps,
             "image_size_px": list(self.image_size_px), "skeleton": list(skeleton),

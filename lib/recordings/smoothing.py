@@ -74,8 +74,8 @@ def _local_polynomials(time_s: np.ndarray, x: np.ndarray, known: np.ndarray, hal
         when = (time_s[at] - time_s[rows, None]) / reach_s
         weight = (known[at] & (window == at) & (np.abs(when) <= 2)).astype(float)
         enough = known[rows] & (weight.sum(axis=1) >= _DEGREE + 1 + _SPARE)
-        powers, order = np.vander(when[enough].ravel(), 2 * _DEGREE + 1, increasing=True), np.arange(_DEGREE + 1)
-        powers = powers.reshape(-1, 2 * half + 1, 2 * _DEGREE + 1)
+        order = np.arange(_DEGREE + 1)
+        powers = np.vander(when[enough].ravel(), 2 * _DEGREE + 1, increasing=True).reshape(-1, 2 * half + 1, 2 * _DEGREE + 1)
         G = (weight[enough, None] @ powers)[:, 0, order[:, None] + order]  # sums of the products of two powers
         coefficients = np.linalg.solve(G + 1e-12 * np.eye(len(order)), np.eye(len(order))[:, :1])
         share = weight[enough] * (powers[:, :, order] @ coefficients)[:, :, 0]

@@ -85,7 +85,8 @@ def read_table(path: Path, names: Sequence[str], optional: Sequence[str] = (), n
         detail = [f"{what}: {', '.join(which)}" for what, which in (("missing", missing), ("unknown", unknown)) if which]
         found = "; ".join(detail) or "order or repetition"
         raise ValueError(f"{path}, line 1: wrong columns ({found}). Expected: {','.join(wanted)}.")
-    found, many = np.full((0, 0), np.nan), text.count("\n") > 100 and "\r" not in text.replace("\r\n", "\n")
+    found = np.full((0, 0), np.nan)
+    many = text.count("\n") > 100 and "\r" not in text.replace("\r\n", "\n")
     with suppress(ValueError):  # the quick way, which knows no empty cells and names no lines
         found = np.loadtxt(io.StringIO(text), delimiter=",", skiprows=1, comments=None, ndmin=2) if many else found
     if found.shape[1] != len(wanted) or not np.isfinite(found).all():

@@ -146,7 +146,8 @@ class _Observed:
 
 def _register_both(rig: StereoRig, data: _Observed, loss: Loss) -> Registration:
     points = rig.triangulate(data.y[:, :2], data.y[:, 2:])
-    both, starts = data.seen.all(axis=1) & np.isfinite(points.x_mm).all(axis=1), [RigidTransform.identity()]
+    both = data.seen.all(axis=1) & np.isfinite(points.x_mm).all(axis=1)
+    starts = [RigidTransform.identity()]
     for kind in ("squared",) if loss == "squared" else ("squared", "norm"):
         with suppress(ValueError):  # too few landmarks in both images, or on a line
             starts.append(register(points.x_mm[both], data.x[both], loss=kind).transform)
@@ -228,7 +229,8 @@ def _minimum(rig: StereoRig, data: _Observed, stale: RigidTransform, loss: Loss,
         flatter = information - gradient.T @ (gradient * (2.0 / (_FREEDOM + data.dimension))[:, None])
         bent = np.linalg.eigvalsh(flatter)[-parameters] <= _OPEN * np.trace(information)
         own = sandwich(information if bent else flatter, gradient[used], parameters * n / size)
-    covariance, motion = (_BELIEVED * covariance + n * own) / (_BELIEVED + n), found.state.inverse()
+    covariance = (_BELIEVED * covariance + n * own) / (_BELIEVED + n)
+    motion = found.state.inverse()
     turn = np.kron(np.eye(2), motion.R)
     distance, weights = np.where(used, (np.sqrt(distance2), weights), [[np.nan], [0.0]])
     return Registration(motion, turn @ covariance @ turn.T, motion.apply(centre), distance, weights, 2 * found.energy)

@@ -63,7 +63,8 @@ def rung_design(rung: str, seed: int, *, shrink: int = 1) -> Design:
     if rung == "near":  # seeds that no data set of the paper's size was ever made with
         return sequence_design(1000 + seed, TEST_SEQUENCES[seed % len(TEST_SEQUENCES)], shrink=shrink)
     rng = np.random.default_rng([seed, 307, *rung.encode()])
-    drawn, like = random_setup(rng, rung, centred=True), sequence_design(2000 + seed, TEST_SEQUENCES[0], shrink=shrink)
+    drawn = random_setup(rng, rung, centred=True)
+    like = sequence_design(2000 + seed, TEST_SEQUENCES[0], shrink=shrink)
     names = ("image_size_px", "pixels_per_mm", "image_rotation_rad", "readout_s")
     rig = {name: getattr(like.microscope, name) for name in names}
     camera = replace(drawn.microscope, video=drawn.microscope.video.shrunk(1 / shrink), **rig)
@@ -84,7 +85,8 @@ def make_dataset(
     processes, None is one a core.  A ValueError refuses a folder with a data set of another seed or size.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    stamp, size = folder / "dataset.json", {"pairs_a_sequence": n_pairs, "duration_s": duration_s, "shrink": shrink}
+    stamp = folder / "dataset.json"
+    size = {"pairs_a_sequence": n_pairs, "duration_s": duration_s, "shrink": shrink}
     text = json.dumps({"seed": seed, **size}, indent=1) + "\n"
     if stamp.is_file() and (found := stamp.read_text(encoding="utf-8", errors="replace").split()) != text.split():
         raise ValueError(f"{folder}: holds another data set ({' '.join(found)}); delete it or choose another folder.")
@@ -126,7 +128,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         parser.error("--pairs, --workers and --shrink must be at least 1.")
     if arguments.seed < 0 or not 0 < arguments.duration < float("inf"):
         parser.error("--seed must not be negative, --duration must be positive and finite.")
-    pairs, shrink = arguments.pairs, arguments.shrink
+    pairs, shrink, seed = arguments.pairs, arguments.shrink, arguments.seed
     if arguments.shipped or arguments.rung:
         if arguments.shipped:  # an eye and a tool never trained on, in a calibration sweep and then with a surgeon
             recording = simulate(
@@ -135,12 +137,12 @@ def main(argv: Sequence[str] | None = None) -> None:
                 description="Calibration sweep at several depths, then approach, grasp and peel. Made by lib.simulator.",
             )  # fmt: skip
         else:
-            folder = arguments.folder or paths.CACHE / "rungs" / f"{arguments.rung}-{arguments.seed}"
-            design = replace(rung_design(arguments.rung, arguments.seed, shrink=shrink), duration_s=arguments.duration)
-            recording = simulate(folder, design, seed=5000 + arguments.seed, n_frames=pairs)
+            folder = arguments.folder or paths.CACHE / "rungs" / f"{arguments.rung}-{seed}"
+            design = replace(rung_design(arguments.rung, seed, shrink=shrink), duration_s=arguments.duration)
+            recording = simulate(folder, design, seed=5000 + seed, n_frames=pairs)
         print(f"{recording.folder}: {len(recording)} pairs.")
         return
-    folder = arguments.folder or paths.CACHE / f"dataset-{arguments.seed}"
+    folder = arguments.folder or paths.CACHE / f"dataset-{seed}"
     made = [sequence for index in _SEQUENCES if (sequence := folder / sequence_name(index)).exists()]
     for sequence in made:  # what is there must open as a recording
         try:
@@ -154,8 +156,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     cost += f", {left * _MB_PER_PAIR / shrink**2 / 1000:.2f} GB"
     print(f"{paths.shown(folder)}: {left} of {len(_SEQUENCES) * pairs} stereo pairs to make, {cost}.", flush=True)
     if not arguments.dry_run:
-        start, size = time.perf_counter(), {"n_pairs": pairs, "duration_s": arguments.duration, "shrink": shrink}
-        make_dataset(folder, seed=arguments.seed, workers=workers, **size)
+        start = time.perf_counter()
+        make_dataset(folder, seed=seed, workers=workers, n_pairs=pairs, duration_s=arguments.duration, shrink=shrink)
         seconds = time.perf_counter() - start
         if left:
             print(f"{left} pairs in {seconds / 60:.1f} min, {seconds / left:.2f} s a pair.")

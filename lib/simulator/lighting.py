@@ -98,7 +98,8 @@ class Lighting:
             lamp, ground = np.array(self.source_mm), float(np.mean(z))
             grow = (ground - lamp[2]) / np.maximum(centres[:, 2] - lamp[2], 0.3)
             flat, columns, rows = lamp[:2] + (centres[:, :2] - lamp[:2]) * grow[:, None], x, y
-        wide, mask = radii * grow, np.zeros((int(2 * _HALF_MM * scale),) * 2, np.uint8)  # the tool's silhouette
+        wide = radii * grow
+        mask = np.zeros((int(2 * _HALF_MM * scale),) * 2, np.uint8)  # the tool's silhouette
         width_px = np.clip((wide[:-1] + wide[1:]) * scale, 1, 200)
         ends = np.clip(np.round((flat + _HALF_MM) * scale * 16), -(2**20), 2**20).astype(int).tolist()
         for k in np.flatnonzero(chains[1:] == chains[:-1]):

@@ -101,7 +101,8 @@ class Augmentation:
 
     def _occlude(self, images: Tensor, u: Tensor, visibility: Tensor, rng: np.random.Generator) -> None:
         """Add glints (bright discs) and things in front (smooth ellipses), in place; what the latter cover is occluded."""
-        (h, w), to = images.shape[-2:], partial(torch.as_tensor, device=images.device)
+        h, w = images.shape[-2:]
+        to = partial(torch.as_tensor, device=images.device)
         pixels = to(np.stack(np.meshgrid(np.arange(w), np.arange(h)), -1, dtype=float))
         for i in range(len(images)):
             if rng.random() < 0.3 * self.photometric:

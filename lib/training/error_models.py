@@ -174,7 +174,8 @@ def _fitted(stage: str, parts: Sequence[Seen], prior: ErrorModel | None) -> Erro
         if prior is not None:
             return prior
         raise ValueError("images: the detector finds nothing in them to calibrate on; give other images.")
-    seen, gross_px = Seen.joined(parts), _GROSS_PX.get(stage, CLOSEUP_REACH_PX * min(CLOSEUP_ZOOM))
+    seen = Seen.joined(parts)
+    gross_px = _GROSS_PX.get(stage, CLOSEUP_REACH_PX * min(CLOSEUP_ZOOM))
     if stage not in CLOSE:
         return seen.fit(gross_px, prior)
     # Many exact labels told a prior's gain and bias, and few labels have a constant error of their own.  While tracking, the

@@ -1,4 +1,4 @@
-"""Training a network: its configuration, batches, optimiser, validation, checkpoints with exact resume.
+"""Training a network: its configuration, batches, losses, optimiser, validation, checkpoints with exact resume.
 
 All randomness of step t comes from a generator seeded with (seed, t).  A run that was interrupted and resumed therefore
 equals one that was not, bit for bit on the CPU: the number of the step is the whole state of the generators.
@@ -26,13 +26,12 @@ from tqdm.auto import tqdm
 from lib.geometry import check
 from lib.landmarks.checkpoints import checksum, load_network, read_checkpoint, write_checkpoint
 from lib.landmarks.error_model import closeup_peaks
-from lib.landmarks.heatmaps import SIGMA_PX, decode
+from lib.landmarks.heatmaps import SIGMA_PX, decode, render, sigma_cells
 from lib.landmarks.metrics import score, tool_length_px
 from lib.landmarks.network import HourglassConfig, Network, OffsetConfig, OffsetNetwork, network_of
 from lib.parallel import cores
 from lib.provenance import commit_id, machine
 from lib.training.augmentation import AUGMENTATIONS, Augmentation, Batch, leave_frame
-from lib.training.losses import heatmap_loss, offset_loss
 from lib.training.samples import Samples, Source
 
 FORMAT = "microstereo.training"
@@ -161,6 +160,37 @@ def _batch(images: np.ndarray, u: np.ndarray, visibility: np.ndarray, device: to
     return Batch(images, u, leave_frame(u, visibility.long(), tuple(images.shape[-2:])))
 
 
+def heatmap_loss(outputs: Sequence[Tensor], batch: Batch, stride: int, sigma_px: float = SIGMA_PX) -> Tensor:
+    """Squared distance of every stack's heatmaps from the Gaussians, scaled so that empty heatmaps cost 1.
+
+    It is the sum over cells divided by pi sigma^2 (the sum of a squared Gaussian of peak 1), the mean over the landmarks
+    that count, and the mean over stacks (intermediate supervision).
+
+    >>> batch = Batch(torch.zeros(1, 3, 96, 96), torch.full((1, 3, 2), 47.5), torch.full((1, 3), 2))
+    >>> round(heatmap_loss([torch.zeros(1, 3, 24, 24)], batch, stride=4).item(), 2)
+    1.0
+    """
+    target = render(batch.u.float(), tuple(batch.images.shape[-2:]), stride, sigma_px) * batch.peak[..., None, None]
+    scale = math.pi * sigma_cells(stride, sigma_px) ** 2 * batch.weight.sum().clamp_min(1)
+    losses = [((output.float() - target).square().sum((-2, -1)) * batch.weight).sum() / scale for output in outputs]
+    return torch.stack(losses).mean()
+
+
+def offset_loss(outputs: Sequence[Tensor], batch: Batch) -> Tensor:
+    """Negative log likelihood of an `OffsetNetwork`'s errors under Laplace distributions with the scales that it predicts.
+
+    A closeup has one visible landmark; without one, or without its label, it does not count.  The absolute error is smoothed
+    within 0.1 px.  Gross errors weigh little under it; divided by the scale, a sharp image weighs more than a blurred one.
+    """
+    (found,) = outputs
+    own = (batch.visibility == 2) & batch.u.isfinite().all(-1)
+    there = own.any(1).float()
+    true = torch.where(own[..., None], batch.u.float(), 0.0).sum(1) - (batch.images.shape[-1] - 1) / 2
+    distance = ((found[:, :2].float() - true).square() + 0.01).sqrt()
+    log_scale = found[:, 2:].float()
+    return ((log_scale + distance * (-log_scale).exp()).sum(1) * there).sum() / there.sum().clamp_min(1)
+
+
 def _loss(network: Network, outputs: Sequence[Tensor], batch: Batch, config: TrainingConfig) -> Tensor:
     if isinstance(network, OffsetNetwork):
         return offset_loss(outputs, batch)
@@ -238,7 +268,8 @@ class Run:
         """One step on a batch on the device; `spent` as in `TrainingConfig.rate`."""
         self.network.train()
         self.optimiser.param_groups[0]["lr"] = self.config.rate(self.step, spent)
-        images, graphs = batch.images.contiguous(memory_format=torch.channels_last), self.device.type == "cuda"
+        images = batch.images.contiguous(memory_format=torch.channels_last)
+        graphs = self.device.type == "cuda"
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.mixed, cache_enabled=not graphs):
             if self.forward is None:
                 self.forward = self._graphed(images) if graphs and self.world == 1 else self.network
@@ -271,6 +302,7 @@ class Run:
         return graphed
 
     def save(self, path: Path, provenance: dict[str, object]) -> None:
+        """Write all that `restore` needs to go on."""
         tensors = {f"network.{k}": v for k, v in self.network.state_dict().items()}
         if self.average is not None:
             tensors |= {f"average.{k}": v for k, v in self.average.state_dict().items()}

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from jinja2 import Environment, FileSystemLoader
 from tqdm.auto import tqdm
 
 from lib.files import write_text
@@ -120,15 +121,15 @@ def finetune(
             config = replace(stage_config(stage), network=detector.networks[stage].config, steps=steps, seed=seed)
             config = replace(config, batch_size=min(config.batch_size, 24), validate_every=max(1, steps // 3))
             config = replace(config, learning_rate=_RATES[stage], ema=0.995)
-            start, left = Training(detector.networks[stage], [], {"shipped": detector.metadata.get("commit")}), None
-            if minutes is not None:
-                left = (60 * minutes - (time.perf_counter() - began)) / (len(lane) - number)
-            where, how = (source, _still(stage, held_out), Path(folder) / stage), {"initial": start, "max_seconds": left}
-            found[f"{stage}_network"] = train(config, *where, progress=partial(told, stage), **how).network
+            start = Training(detector.networks[stage], [], {"shipped": detector.metadata.get("commit")})
+            left = None if minutes is None else (60 * minutes - (time.perf_counter() - began)) / (len(lane) - number)
+            how = {"initial": start, "max_seconds": left, "progress": partial(told, stage)}
+            found[f"{stage}_network"] = train(config, source, _still(stage, held_out), Path(folder) / stage, **how).network
         return found
 
     # A second thread of torch's own makes small steps hardly faster, far slower on a busy machine.  A GPU is busy with one.
-    threads, networks = 1 if torch.cuda.is_available() else min(cores(), len(names)), {}
+    threads = 1 if torch.cuda.is_available() else min(cores(), len(names))
+    networks = {}
     lanes = [names[first::threads] for first in range(threads)]  # two threads: frame and closeup beside tool
     with single_threaded_torch(), ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
         try:
@@ -208,54 +209,11 @@ def assemble(
 
 def card(detector: Detector, path: Path) -> str:
     """The model card (Markdown) of a weights file, from its metadata."""
-    p = detector.metadata
-    m, trainings = p["metrics"], []
-    for stage, t in reversed(p["stages"].items()):
-        while t:  # from the last training to the first
-            config, processes = t["config"], t.get("processes") or 1
-            kind = "hourglass, {stacks} x {features}" if "stacks" in config["network"] else "offset network, {features}"
-            trainings.append(
-                f"| {stage} ({kind.format(**config['network'])} features) | {t['images']} "
-                f"| {config['optimiser']} {config['learning_rate']:g} {config['schedule']}, "
-                f"{t.get('precision') or config['precision']} "
-                f"| {t['steps']} x {config['batch_size']} x {processes} "
-                f"| {t['seconds'] * processes / 3600:.2f} | `{t['data']}` | `{t['commit']}` |"
-            )
-            t = t.get("before")
-    numbers = {
-        "PCK@0.01, 0.05, 0.10": f"{m['pck_0_01']:.1f}, {m['pck_0_05']:.1f}, {m['pck_0_10']:.1f} %",
-        "error, median and 95th percentile": f"{m['median_px']:.2f} px, {m['p95_px']:.2f} px",
-        **{f"median error, {k}": f"{v:.2f} px" for k, v in m["by_landmark_median_px"].items()},
-        **{f"median error, {k}": f"{v['median_px']:.2f} px, {v['labels']} labels" for k, v in m["by_visibility"].items()},
-        "normalised squared error below 20 px (2 is right)": f"{m['nees']:.2f}",
-        "inside the 95 % ellipse, errors below 20 px": f"{m['coverage_95']:.1f} %",
-        "calibration error of the confidence": f"{m['confidence_calibration_error']:.3f}",
-        **{f"{k.replace('_', ' ')}, confidence above 0.5": f"{v:.1f} %" for k, v in m["detection"].items()},
-        "missed, gross (above 20 px), all labels": f"{m['missed']}, {m['gross']}, {m['labels']}",
-    }
-    recorded = f", and on {p['recorded_frames']} frames of {p['recordings']} recordings" if p["recordings"] else ""
-    return f"""\
-# {path.name}
-
-Weights of the landmark detector: base, tip_1 and tip_2 of the forceps in microscope images. Trained on {p["trained_on"]}.
-{path.stat().st_size / 1e6:.1f} MB, safetensors; configuration, error models and the numbers below are inside.
-Notebook 02 explains the stages.
-
-| stage | images | optimiser | steps x batch x processes | process hours | data | commit |
-|---|---|---|---|---|---|---|
-{chr(10).join(reversed(trainings))}
-
-Each training of a stage starts from the one before. The error models (covariance, confidence) are fitted on half of
-{p["validation_frames"]} held-out scenes, which have families of tools, light, ground and optics that training never draws and
-of which some show no tool, on {p["bare_frames"]} drawn grounds without one{recorded}; those of the closeups also on
-{p["near_frames"]} images of the reference rig. The numbers below are of the other half.
-
-| held-out frames | |
-|---|---|
-{chr(10).join(f"| {name} | {value} |" for name, value in numbers.items())}
-
-Made by `python3 -m lib train generate`, `frame`, `tool`, `closeup` and `assemble`, on {p["machine"]["processor"]},
-{p["machine"]["cores"]} cores, {p["machine"]["gpu"] or "no GPU"}.
-
-{chr(10).join(f"- {note}" for note in p["notes"])}
-"""
+    trainings = []
+    for stage, one in reversed(detector.metadata["stages"].items()):
+        while one:  # from the last training to the first
+            trainings.append((stage, one))
+            one = one.get("before")
+    here = Environment(loader=FileSystemLoader(Path(__file__).parent), trim_blocks=True)
+    told = {"p": detector.metadata, "trainings": trainings[::-1], "name": path.name, "megabytes": path.stat().st_size / 1e6}
+    return here.get_template("card.md").render(told)

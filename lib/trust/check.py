@@ -194,6 +194,5 @@ def main(argv: list[str]) -> int:
     found = check(recording, detector=Detector.load(a.weights) if a.weights else None)
     if a.weights:  # notebook 07 alone takes others than those that ship
         found = replace(found, next_step=found.next_step.replace(_USE, f"{_USE} 07 -p weights {shlex.quote(a.weights)}"))
-    page = found.write(out)
-    print(f"{found.assessment.verdict}\nNext: {found.next_step}\nReport: {page}")
+    print(f"{found.assessment.verdict}\nNext: {found.next_step}\nReport: {found.write(out)}")
     return 0

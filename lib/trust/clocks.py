@@ -64,7 +64,8 @@ def _refined(
 
 def _scan(case: Case, half_s: float, rate: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
     """Trial shifts (t,) and their misfit (t, 2) in each camera alone."""
-    problem, trial = case.problem, np.linspace(-half_s, half_s, 2 * int(np.clip(half_s / 0.02, 5, 60)) + 1)
+    problem = case.problem
+    trial = np.linspace(-half_s, half_s, 2 * int(np.clip(half_s / 0.02, 5, 60)) + 1)
     chosen = np.unique(np.linspace(0, len(problem) - 1, _ROWS).astype(int))
     later = (rate - 1.0) * (problem.time - np.median(problem.time))
     y = np.where(problem.used[:, :, None], problem.y, np.nan)[chosen].reshape(-1, 4)

@@ -256,7 +256,8 @@ def _scaled_axis(A: np.ndarray, covariance: np.ndarray) -> Iterator[Hypothesis]:
     tolerance = np.diag(np.square([_SKEW_SD, _SKEW_SD, _ASPECT_SD, _ASPECT_SD]))
     if abs(_constraints(A)[2:].mean()) > _RESIZED:
         tolerance[2:, 2:] += 1.0
-    near, spacing = 1e-6 * np.abs(A).max() * np.eye(12).reshape(12, 2, 2, 3), np.log(12.0) / 80
+    near = 1e-6 * np.abs(A).max() * np.eye(12).reshape(12, 2, 2, 3)
+    spacing = np.log(12.0) / 80
     logs = spacing * np.arange(-80, 81)
     scales = np.exp(logs[:, None] * np.eye(3)[:, None])[:, :, None, None, None]  # (axes, logs, 1, 1, 1, 3)
     seen = _constraints(A * scales)
@@ -315,13 +316,15 @@ def _unexplained(case: Case, fit: Robust) -> list[Hypothesis]:
     if not np.isfinite(reach).any():
         return []
     length, distance = np.nanmedian(reach), np.linalg.norm(fit.residuals, axis=2)
-    missed, zoom = float(np.median(distance[problem.used])), float(np.linalg.svd(fit.M[0, :, :3], compute_uv=False).mean())
+    missed = float(np.median(distance[problem.used]))
+    zoom = float(np.linalg.svd(fit.M[0, :, :3], compute_uv=False).mean())
     distances = affine_epipolar(problem.y[problem.used.all(axis=1)].reshape(-1, 4))[0]  # NaN of few, which is no witness
     epipolar, half = float(np.sqrt(2.0) * np.median(distances)), problem.used.sum() / 2.0
     if epipolar < 0.25 * missed and missed > _ROBOT_MM * zoom:
         text = f"The images agree with each other within {epipolar:.1f} px and miss the robot by {missed:.0f} px (medians)."
         cure = "Check times, units, columns of kinematics.csv; or the detector errs alike in both images: see its overlays."
-        explained, gain = 1.0 - (epipolar / missed) ** 2, half * float(np.log(missed / epipolar)) / fit.design
+        explained = 1.0 - (epipolar / missed) ** 2
+        gain = half * float(np.log(missed / epipolar)) / fit.design
         return [Hypothesis("robot_noise", text, cure, 1e3 * missed / zoom, 0.0, "um", explained, gain)]
     if (share := float((distance[problem.used] > 0.05 * length).mean())) < 0.2:
         return []

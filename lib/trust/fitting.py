@@ -146,7 +146,8 @@ class Problem:
 
     def _design(self, M: np.ndarray, columns: Callable | None) -> np.ndarray:
         """(n, 2, 2, p): derivatives by the 16 entries of M, 9 offsets (mm) and the additions; 0 in images not used."""
-        image, own = np.einsum("cij,njk->ncik", M[:, :, :3], self.axes), self.landmark[:, None] == np.arange(3)
+        image = np.einsum("cij,njk->ncik", M[:, :, :3], self.axes)
+        own = self.landmark[:, None] == np.arange(3)
         image = np.where(self.used[:, :, None, None], image, 0.0)
         parts = [self._of_matrices, np.einsum("ncik,nl->ncilk", image, own).reshape(len(self), 2, 2, 9)]
         parts += [] if columns is None else [np.where(self.used[:, :, None, None], np.nan_to_num(columns(M)), 0.0)]
@@ -189,7 +190,8 @@ class Problem:
         design = self._overcount(r * root)
         inverse = np.linalg.inv(information) * np.outer(scale, scale) * design
         offset_sd = np.sqrt(np.diag(inverse)[16:25].reshape(3, 3).sum(axis=1))
-        additions, offsets = (beta[25:], inverse[25:, 25:]), (beta[16:25].reshape(3, 3), offset_sd)
+        additions = (beta[25:], inverse[25:, 25:])
+        offsets = (beta[16:25].reshape(3, 3), offset_sd)
         return Robust(M, *additions, *offsets, inverse[:16, :16], r, tuple(shapes), likelihood, penalty, design)
 
     def _overcount(self, z: np.ndarray) -> float:
@@ -238,7 +240,8 @@ class Case:
             each = [rows[np.unique(time[rows], return_index=True)[1]] for rows in each]
             steps = np.concatenate([np.diff(time[rows]) for rows in each])
             near = steps.size and np.median(steps) <= _LONGEST_S
-            self.paths, self._clock_s = Paths((time[rows], x[rows]) for rows in each) if near else None, 0.0
+            self.paths = Paths((time[rows], x[rows]) for rows in each) if near else None
+            self._clock_s = 0.0
 
     def misfit(self, *fits: Robust) -> float:
         """The scale of the residuals over the spread of the pixels, of the best of some fits."""

@@ -108,7 +108,8 @@ def health(
         rig, x = calibration.rig, with_offsets(data, calibration.offsets).grid("x_mm")
         off = u - np.hstack(rig.project(x.reshape(-1, 3))).reshape(u.shape)
         # Off the median of a frame and its two neighbours, where these are close in time.
-        jump, near = np.full(off.shape, np.nan), (time[2:] - time[:-2] <= 2 * _NEXT_S)[:, None, None, None]
+        jump = np.full(off.shape, np.nan)
+        near = (time[2:] - time[:-2] <= 2 * _NEXT_S)[:, None, None, None]
         jump[1:-1] = np.where(near, off[1:-1] - np.median([off[:-2], off[1:-1], off[2:]], axis=0), np.nan)
         distance, jump = (np.fmax.reduce(np.linalg.norm(one, axis=-1), axis=2) for one in (off, jump))  # of the worse image
         parts["robot"] = distance / max(calibration.reprojection_rms_px, 1.0)

@@ -76,7 +76,8 @@ def main_site(argv: Sequence[str]) -> int:
 
 def renew_gallery(run: Path) -> None:
     """Take the README's pictures from a run of all notebooks on the shipped recording; what it lacks is an OSError."""
-    made_by, figures = json.loads((run / "metrics.json").read_text(encoding="utf-8")), run / "figures"
+    made_by = json.loads((run / "metrics.json").read_text(encoding="utf-8"))
+    figures = run / "figures"
     chosen = [next(iter(sorted(figures.glob(f"{name}.*"))), figures / name) for name in README_FIGURES]
     if lacking := [path.stem for path in chosen if not path.is_file()]:
         raise FileNotFoundError(f"{figures}: no picture {', '.join(lacking)}; run all notebooks.")
@@ -115,7 +116,8 @@ def run(
         with tempfile.TemporaryDirectory(prefix="run-", dir=paths.CACHE, ignore_cleanup_errors=True) as shared:
             os.environ[paths.SHARED_VARIABLE] = shared  # the kernels inherit it
             for number, book in enumerate(chosen):
-                label, start = f"[{number + 1}/{len(chosen)}] {book.stem:<{width}}", time.monotonic()
+                label = f"[{number + 1}/{len(chosen)}] {book.stem:<{width}}"
+                start = time.monotonic()
                 report.content["notebooks"][number]["state"] = "running"
                 report.write()
                 failure = execute(book, report.folder / book.name, values[book], cell_timeout_s=cell_timeout_s, label=label)

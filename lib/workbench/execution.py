@@ -21,7 +21,7 @@ from nbclient.exceptions import CellTimeoutError, DeadKernelError
 from lib import paths
 from lib.workbench.report import FIGURE_METADATA, METRIC_MIME, STOP_METADATA, VERDICT_COLOURS, VERDICT_MIME
 
-#: Packages whose version can change a figure.
+#: Packages whose version can change a number.
 _TOLD = ("numpy", "scipy", "torch", "kornia", "opencv-python-headless", "open3d-cpu", "open3d", "cvxpy", "clarabel")
 #: How the comment of a study's parameter ends: ``; grid: 75, 300, 1500``.
 _GRID = re.compile(r";\s*grid:(.*)$")
@@ -221,6 +221,6 @@ def joined(verdicts: Iterable[dict | None]) -> dict | None:
 
 
 def versions() -> dict[str, str]:
-    """Python and the packages whose version can change a figure."""
+    """Python and the packages whose version can change a number."""
     installed = {package.name: package.version for package in distributions()}
     return {"python": platform.python_version()} | {name: installed[name] for name in _TOLD if name in installed}

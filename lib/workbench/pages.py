@@ -131,15 +131,18 @@ def headlines(run: dict) -> tuple[list[dict], list[str]]:
     ``templates/headlines.toml`` says which numbers these are, with their targets; `run` is the content of metrics.json.
     """
     metrics, books = ({entry["name"]: entry for entry in run[kind]} for kind in ("metrics", "notebooks"))
-    own, rows, left_out = bool(run["parameters"].get("recording")), [], []
+    own = bool(run["parameters"].get("recording"))
+    rows, left_out = [], []
     for line in tomllib.loads((_TEMPLATES / "headlines.toml").read_text(encoding="utf-8"))["headline"]:
-        live, record = metrics.get(line["name"]), None if own else metrics.get(line.get("recorded"))
+        live = metrics.get(line["name"])
+        record = None if own else metrics.get(line.get("recorded"))
         here = bool(live) and live["value"] is not None
         if own and (line.get("elsewhere") or (line.get("truth") and not here)):
             left_out += [] if line.get("elsewhere") else [line["words"]]
             continue
         unit, paper = line["unit"], (live or line).get("paper")
-        before, book = run.get("previous", {}).get(line["name"]), books.get(line["notebook"], {"state": None})
+        before = run.get("previous", {}).get(line["name"])
+        book = books.get(line["notebook"], {"state": None})
         lights = {"met": line["target"], "close": line["close"], "missed": (-math.inf, math.inf)}
         fitting = (light for light, (low, high) in lights.items() if here and low <= live["value"] <= high)
         rows.append(line | {

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from lib import paths
-from lib.online import FrameResult, OnlinePipeline, Settings, command, record
-from lib.online.feeds import recorded
-from lib.online.record import Recorder, row
+from lib.online import FrameResult, OnlinePipeline, Settings, command, feeds
+from lib.online.feeds import Recorder, recorded, row
 from lib.online.video import Dashboard, video_file
 from lib.recordings import Recording
 from tests.online.world import World, make, run
@@ -75,7 +74,7 @@ def test_a_full_disk_ends_the_recording_and_not_the_run(tmp_path, shipped, monke
             raise OSError(errno.ENOSPC, "No space left on device")
         return target
 
-    monkeypatch.setattr(record.shutil, "copyfile", full)
+    monkeypatch.setattr(feeds.shutil, "copyfile", full)
     recorder = write(shipped, shipped.truth, tmp_path / "full")
     assert "ended after 4 frames" in recorder.failure
     assert "No space left" in recorder.failure

@@ -14,8 +14,7 @@ from lib.landmarks.heatmaps import render
 from lib.landmarks.network import HourglassConfig, OffsetConfig, OffsetNetwork, StackedHourglass
 from lib.training import loop
 from lib.training.augmentation import Augmentation, Batch
-from lib.training.loop import PRESETS, TrainingConfig, load_training, train
-from lib.training.losses import heatmap_loss, offset_loss
+from lib.training.loop import PRESETS, TrainingConfig, heatmap_loss, load_training, offset_loss, train
 from lib.training.samples import Mixed, Samples
 from tests.toys import toy_samples
 
