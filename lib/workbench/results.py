@@ -106,11 +106,14 @@ def recorded(name: str, folder: Path = paths.RESULTS) -> Iterator[Table]:
 def write(name: str, rows: Iterable[Mapping], provenance: Mapping, folder: Path = paths.RESULTS) -> None:
     """Write the table `name`: one mapping a row (None and NaN become empty entries, numbers keep six digits).
 
-    `provenance` is as `lib.provenance.Provenance.so_far` gives it.
+    `provenance` is as `lib.provenance.Provenance.so_far` gives it.  The record counts how often it was made: that often its
+    test set, if it has one, was opened.
     """
     folder.mkdir(parents=True, exist_ok=True)
+    before = read(name, folder)
+    times = 1 if before is None else before.provenance.get("times_recorded", 1) + 1
     files.write_text(folder / f"{name}.csv", csv_text(rows))
-    files.write_json(folder / f"{name}.json", plain(dict(provenance)))
+    files.write_json(folder / f"{name}.json", plain({**provenance, "times_recorded": times}))
 
 
 def csv_text(rows: Iterable[Mapping]) -> str:

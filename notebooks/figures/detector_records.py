@@ -22,8 +22,10 @@ PAPER_ABLATION = {"encoder": 8.4, "+ decoder": 75.1, "+ skips": 95.2, "+ stack":
 
 
 def recorded(table: Table) -> str:
-    """ "Recorded", and when: the beginning of a caption."""
-    return f"Recorded {table.provenance.get('date', 'at an unknown date')}"
+    """ "Recorded", when, and how often so far: the beginning of a caption."""
+    times = table.provenance.get("times_recorded", 1)
+    often = f" (the last of {times} times)" if times > 1 else ""
+    return f"Recorded {table.provenance.get('date', 'at an unknown date')}{often}"
 
 
 def weights(table: Table) -> str:

@@ -20,7 +20,7 @@ def test_a_table_comes_back(tmp_path):
     results.write("matching", ROWS, {"command": "python3 -m lib sweep", "seconds": np.float64(1.5)}, tmp_path)
     table = results.read("matching", tmp_path)
     assert sorted(file.name for file in tmp_path.iterdir()) == ["matching.csv", "matching.json"]
-    assert table.provenance == {"command": "python3 -m lib sweep", "seconds": 1.5}
+    assert table.provenance == {"command": "python3 -m lib sweep", "seconds": 1.5, "times_recorded": 1}
     assert list(table.columns) == ["method", "seed", "masked", "error_um", "note", "extra_px"]
     assert table.columns["method"] == ["band", '1, "2"\n', "sgbm"] and table.columns["note"] == ["", "slow", ""]
     assert table.columns["seed"].dtype.kind == "i" and table.columns["masked"].dtype == bool
@@ -29,6 +29,8 @@ def test_a_table_comes_back(tmp_path):
     assert len(table.where(masked=True, seed=2)) == 1 and len(table.where(method="none")) == 0
     with pytest.raises(LookupError, match="sede: no such column; there are method, seed"):
         table.where(sede=0)
+    results.write("matching", ROWS, {}, tmp_path)
+    assert results.read("matching", tmp_path).provenance == {"times_recorded": 2}  # so often was a test set opened
 
 
 def test_what_is_missing_or_damaged(tmp_path):
