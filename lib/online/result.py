@@ -77,11 +77,6 @@ def _unknown() -> np.ndarray:
     return np.full(len(LANDMARKS), np.nan)
 
 
-def _nothing() -> Correspondences:
-    """The three landmarks, none of them seen or reported."""
-    return Correspondences.of_points(*(np.full((3, size), np.nan) for size in (3, 2, 2)), landmark=range(len(LANDMARKS)))
-
-
 @dataclass
 class FrameResult:
     """What one frame told.  Arrays are NaN, objects None, where a stage did not run or failed.
@@ -109,7 +104,8 @@ class FrameResult:
     time_s: float = float("nan")
     state: str = "calibrating"
     cause: str = ""
-    landmarks: Correspondences = field(default_factory=_nothing)
+    landmarks: Correspondences = field(default_factory=lambda: Correspondences.of_points(
+        *(np.full((3, size), np.nan) for size in (3, 2, 2)), landmark=range(len(LANDMARKS))))  # fmt: skip
     x_tool_mm: np.ndarray = field(default_factory=lambda: np.full((3, 3), np.nan))
     rig: StereoRig | None = None
     reconstruction: Reconstruction | None = None
