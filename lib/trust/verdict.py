@@ -20,7 +20,7 @@ from lib.trust.health import Health, feature_matches, health, spread
 LEVELS = ("trustworthy", "doubtful", "not trustworthy")
 #: Check -> values at which a verdict becomes doubtful, and not trustworthy.
 LIMITS: dict[str, tuple[float, float]] = {
-    # RMS residual over what detector and robot claim.  Heavy tails (Student t, 4 degrees) reach 1.5; a clock 5 ms off 2.
+    # RMS of the residuals, each over what detector and robot claim for it.  Heavy tails (Student t, 4 degrees) reach 1.5; a clock 5 ms off 2.
     "residuals": (1.7, 2.6),
     # Cross-validated over fitted RMS, beyond what the leverages let expect.  Clean data of 6 rows reach 1.6.
     "cross_validation": (2.0, 4.0),
@@ -157,15 +157,18 @@ def _reason(check: str, value: float, text: str, cure: str, name: str = "") -> l
 
 def _residuals(data: Correspondences | None, c: Calibration, robot_mm: float) -> Iterator[tuple]:
     """What `_reason` takes: how large the residuals are, and how many rows they are of."""
-    used, variance = c.inliers, 2.0 * _LABEL_PX**2
+    used, views = c.inliers, c.view_inliers[c.inliers]
+    variance = np.full((1, 2 * views.shape[1]), _LABEL_PX**2)
     if c.covariance_px2 is not None:
         rows = c.covariance_px2 if len(c.covariance_px2) == 1 else c.covariance_px2[used]
-        variance = 2.0 * float(np.nanmean(np.diagonal(rows, axis1=1, axis2=2))) / c.detector_scale**2
-    gain = np.mean([(camera.jacobian(c.x_mm[used][:1]) ** 2).sum() for camera in c.cameras])
-    claim = float(np.sqrt(variance + gain * robot_mm**2))  # RMS distance in an image, averaged over views
-    text = f"The residuals are {c.reprojection_rms_px:.1f} px RMS; detector and robot claim {claim:.1f} px."
+        variance = np.diagonal(rows, axis1=1, axis2=2) / c.detector_scale**2
+    gain = [(camera.jacobian(c.x_mm[used][:1]) ** 2).sum() for camera in c.cameras]
+    r2, claim2 = (v.reshape(len(v), -1, 2).sum(axis=2) for v in (c.residuals_px[used] ** 2, variance))  # of distances in an image
+    ratio = float(np.sqrt((r2 / (claim2 + np.multiply(gain, robot_mm**2)))[views].mean()))
+    text = f"The residuals, {c.reprojection_rms_px:.1f} px RMS, are {ratio:.1f} times as large as detector and robot claim "
+    text += f"(RMS of each over its claim); {LIMITS['residuals'][0]:g} is allowed."
     cure = f"Read the diagnosis of {_CHECK}: clock, axes, order of tips, detector."
-    yield "residuals", c.reprojection_rms_px / claim, text, cure
+    yield "residuals", ratio, text, cure
 
     # What leaving a row out does to clean data: its residual grows by (1 - leverage)^-1/2.
     m = c.leverage.shape[1]
