@@ -375,9 +375,14 @@ def diagnose(
         return Diagnosis((Hypothesis("detector_unfit", text, _UNFIT, 100.0, 0.0, "%", 1.0, float(len(data))),))
     tracks = [(problem.landmark == k) & problem.used.all(axis=1) for k in np.unique(problem.landmark)]
     moved_px, moved_mm = (max(np.ptp(v[own], axis=0).max() for own in tracks if own.any()) for v in (problem.y, problem.x))
-    if moved_px < _STILL_PX and moved_mm > _ROBOT_MM:
-        text, cure = "All frames show one picture, while the robot moves.", "Check that the cameras deliver, and record anew."
-        return Diagnosis((Hypothesis("frozen_video", text, cure, 100.0, 0.0, "%", 1.0, float(len(data))),))
+    for name, still, text, cure in (
+        ("frozen_video", moved_px < _STILL_PX and moved_mm > _ROBOT_MM, "All frames show one picture, while the robot moves.",
+         "Check that the cameras deliver, and record anew."),
+        ("frozen_kinematics", moved_mm < 1e-9 and moved_px > _STILL_PX, "The robot reports one place, while the tool moves.",
+         "Log the robot at every sample, and record anew."),
+    ):  # fmt: skip
+        if still:
+            return Diagnosis((Hypothesis(name, text, cure, 100.0, 0.0, "%", 1.0, float(len(data))),))
     case = Case(problem, kinematics, offset_s, readout_s, image_size_px)
     tests = [_tip_order, _finite_distance, _landmark_offset, _tool_bends, _drift, _bad_part, _camera_moved, _frozen]
     tests = [*(TIME_TESTS if case.paths else ()), *tests, _rigid_tips, _optics]

@@ -5,6 +5,7 @@ Each image's residual of a row has a bivariate Student t density whose scale and
 """
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Self
@@ -134,7 +135,9 @@ class Problem:
             for view, rows in enumerate(self.used.T):
                 if rows.sum() >= 4:
                     x, y = self.x[rows, view], self.y[rows, view]
-                    starts[:, view] = regress(x, y), tightest_sample(x, y, rng)
+                    starts[0, view] = regress(x, y)
+                    with suppress(ValueError):  # positions in one plane
+                        starts[1, view] = tightest_sample(x, y, rng)
             start = max((self._descend(M, columns, apart, 8) for M in starts), key=lambda fit: fit.total).M
         return self._descend(start, columns, apart, rounds)
 

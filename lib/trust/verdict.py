@@ -182,7 +182,7 @@ def _residuals(data: Correspondences | None, c: Calibration, robot_mm: float) ->
     text = f"Only {100 * share:.0f} % of the {usable} detections agree on the cameras."
     yield "consensus", share, text, f"{_OVERLAYS}: the other detections are wrong, or these are.", "minority"
 
-    text = f"The rows that agree count as {c.effective_rows:.0f} of independent errors; {LIMITS['rows'][0]:g} are needed."
+    text = f"The rows that agree count as {c.effective_rows:.1f} of independent errors; {LIMITS['rows'][0]:g} are needed."
     yield "rows", c.effective_rows + 1e-9, text, _MORE_FRAMES, "few_rows"
     if data is not None:
         frames = len(np.unique(data.frame[used]))
@@ -260,10 +260,11 @@ def assess(
     if calibration is not None and len(y := feature_matches(recording, spread(len(recording), 3))):
         epipolar_px = float(np.median(np.abs(calibration.pair.epipolar_distance(y[:, :2], y[:, 2:]))))
     stated = {name: getattr(recording, name) for name in ("kinematics", "offset_s", "readout_s", "image_size_px")}
-    diagnosis = diagnose(data, **stated)
-    if calibration is not None and Model.parse(calibration.model, len(calibration.cameras)).distance:
-        others = (h for h in diagnosis.hypotheses if h.name != "finite_distance" or h.value < 0)  # these cameras have one
-        diagnosis = Diagnosis(tuple(others))
+    straight = data
+    if calibration is not None and Model.parse(calibration.model, len(calibration.cameras)).distance:  # faults beside that one
+        u = [camera.touching(u, data.x_mm) for camera, u in zip(calibration.cameras, (data.u_left, data.u_right), strict=True)]
+        straight = replace(data, u_left=u[0], u_right=u[1])
+    diagnosis = diagnose(straight, **stated)
     found = health(recording, data, calibration, detector=detector)
     verdict = judge(
         data, calibration, diagnosis=diagnosis, health=found, epipolar_px=epipolar_px, error=error,
@@ -299,7 +300,7 @@ def report(calibration: Calibration, *, verdict: Verdict | None = None, robot_ac
     for name, resection in zip(["left", "right"] if c.rig else ["camera"], c.resections(), strict=True):
         (zoom_x, skew), (_, zoom_y) = resection.K
         at = ", ".join(f"{value:.3f}" for value in resection.t)
-        lines.append(f"  {name:12s}  zoom {zoom_x:.3f} x {zoom_y:.3f} px/mm, skew {skew:.3f} px/mm, offset ({at}) mm")
+        lines.append(f"  {name:12s}  zoom {zoom_x:.3f} x {zoom_y:.3f} px/mm, skew {skew:z.3f} px/mm, offset ({at}) mm")
     distance, sd = c.inverse_distance_per_mm
     if sd > 0:
         far = "not distinguishable from affine" if abs(distance) < 3 * sd else f"working distance {1 / distance:.0f} mm"
@@ -309,7 +310,7 @@ def report(calibration: Calibration, *, verdict: Verdict | None = None, robot_ac
         alone, both = (1e3 * np.median(c.depth_sd_mm(x, detection=detection)) for detection in (False, True))
         at = ", ".join(f"{value:.1f}" for value in o.robot_from_microscope.t)
         angle, roll = np.rad2deg([o.convergence_rad, o.roll_rad])
-        head = f"convergence {angle:.2f} deg, right image rolled by {roll:.2f} deg, mirrored: {o.mirrored}"
+        head = f"convergence {angle:.2f} deg, right image rolled by {roll:z.2f} deg, mirrored: {o.mirrored}"
         lines.append(f"  head          {head}; the images' centre is ({at}) mm")
         lines.append(f"  depth         {both:.0f} um sd of one detected point, of which the calibration {alone:.1f} um")
     if c.offsets is not None:
@@ -317,7 +318,7 @@ def report(calibration: Calibration, *, verdict: Verdict | None = None, robot_ac
         lines.append(f"  offsets       p = {c.offsets.p_value:.2g} without any; {unit}:")
         for k, (values, sds) in enumerate(zip(c.offsets.offset, c.offsets.standard_deviation, strict=True)):
             name = LANDMARKS[k] if k < len(LANDMARKS) else f"landmark {k}"
-            numbers = [f"{scale * v:.1f} +- {scale * s:.1f}" for v, s in zip(values, sds, strict=True)]
+            numbers = [f"{scale * v:z.1f} +- {scale * s:.1f}" for v, s in zip(values, sds, strict=True)]
             lines.append(f"    {name:10s}  {', '.join(numbers)}")
     if outliers.size:
         distance = np.linalg.norm(c.residuals_px.reshape(rows, -1, 2)[tuple(outliers.T)], axis=1)
