@@ -100,13 +100,15 @@ def _frame_order(case: Case) -> Iterator[Hypothesis]:
     shifts = step * (np.arange(-8, 9) + round(float(trial[misfit.sum(axis=1).argmin()]) / step))
     fit, moved, own = case.chosen(np.stack([case.moved(shift) for shift in shifts]))
     share = float((np.abs(shifts[own]) > step / 2).mean())
-    within = " to ".join(f"{1e3 * shift:.0f}" for shift in shifts[[0, -1]])
-    text = f"{100 * share:.0f} % of the frames fit another instant, {within} ms later, better than their own."
-    cure = "Sort the frames, and write each one's true time to frames.csv."
+    if share * case.frames < 3:  # it may be a spike of the log
+        return
+    within = " and ".join(f"{1e3 * shift:.0f}" for shift in shifts[[0, -1]])
+    text = f"{100 * share:.0f} % of the frames fit another instant, between {within} ms later, better than their own."
+    cure = "Sort the frames, look for lost ones, and write each one's true time to frames.csv."
     counts = np.bincount(own, minlength=len(shifts)) / case.frames
     chosen = -case.frames * float((counts * np.log(np.maximum(counts, 1e-9))).sum())  # what the choices may cost
     raw = fit.total - case.null.total - chosen
-    yield case.found("frame_order", fit, len(shifts), (100 * share, 0.0, "%"), text, cure, on=moved, raw=raw)
+    yield case.found("frame_order", fit, np.count_nonzero(counts), (100 * share, 0.0, "%"), text, cure, on=moved, raw=raw)
 
 
 def _readout(case: Case) -> Iterator[Hypothesis]:

@@ -215,6 +215,7 @@ class Hypothesis:
     unit: str
     explained: float  # share of the residuals' variance, 0 to 1 (robustly, from the likelihood)
     gain: float  # log likelihood above "nothing is wrong", less the penalty for its parameters
+    design: float = np.inf  # by how much the correlated rows of its fit overstate what they tell; infinite without a fit
 
 
 class Case:
@@ -228,7 +229,7 @@ class Case:
         self, problem: Problem, kinematics: Kinematics | None, offset_s: float, readout_s: float, size: tuple[int, int] | None
     ) -> None:
         self.problem, self.readout_s, self.size = problem, readout_s, size
-        self.null, self.fits = problem.fit(), {}
+        self.null, self.fits, self._evidence = problem.fit(), {}, {}
         self.frames = int(problem.frame.max()) + 1
         self.paths, self._clock_s = None, offset_s
         time, landmark, x = problem.time, problem.landmark, problem.x[:, 0]
@@ -291,12 +292,22 @@ class Case:
             null = replace(self.problem, seen=on.used).fit(start=null.M)
         raw = fit.total - null.total if raw is None else raw
         n = 2.0 * (fit.likelihood != 0).sum()
-        # Of few rows any addition explains much: what chance gains, by the degrees of freedom, is taken off.
-        freedom = n / fit.design - _PARAMETERS
-        left = freedom - extra
-        gain = left * (raw / n - 0.5 * np.log(freedom / left)) - 0.5 * extra * np.log(freedom) if left >= 4 else -np.inf
+        gain, self._evidence[text] = _gain(raw, n, extra, fit.design), (raw, n, extra)
         if name not in self.fits or fit.total > self.fits[name].total:
             self.fits[name] = fit
-        value, sd, unit = size
         explained = 1.0 - np.exp(-2.0 * max(raw, 0.0) / n)
-        return Hypothesis(name, text, cure, float(value), float(sd), unit, float(explained), float(gain))
+        return Hypothesis(name, text, cure, *map(float, size[:2]), size[2], float(explained), gain, fit.design)
+
+    def compared(self, found: list[Hypothesis]) -> list[Hypothesis]:
+        """With gains as if all fits' rows told as much as those of the least `design`: only then the largest explains most."""
+        design = min((h.design for h in found), default=1.0)
+        own = [(h, self._evidence.get(h.text)) for h in found]
+        return [h if e is None else replace(h, gain=h.gain + _gain(*e, design) - _gain(*e, h.design)) for h, e in own]
+
+
+def _gain(raw: float, n: float, extra: float, design: float) -> float:
+    """Log likelihood `raw` of n numbers less the penalty of `extra` parameters, where rows overstate by `design`."""
+    # Of few rows any addition explains much: what chance gains, by the degrees of freedom, is taken off.
+    freedom = n / design - _PARAMETERS
+    left = freedom - extra
+    return float(left * (raw / n - 0.5 * np.log(freedom / left)) - 0.5 * extra * np.log(freedom)) if left >= 4 else -np.inf
