@@ -173,15 +173,6 @@ class NearAffineCamera(MatrixCamera):
         J = (self.linear - self.inverse_distance_per_mm * v[:, :, None] * self.viewing_direction) / ratio[:, :, None]
         return radial_derivative(v, self.radial_per_px2) @ J if self.radial_per_px2 else J
 
-    def touching(self, u: ArrayLike, x: ArrayLike) -> np.ndarray:
-        """Pixels (n, 2) as the affine camera of `matrix` would show points x (n, 3) mm that this one shows at u; NaN stay.
-
-        >>> camera = NearAffineCamera([[100, 0, 0, 0], [0, 100, 0, 0]], 0.01, [0, 0])
-        >>> camera.touching(camera.project([[1, 2, 3]]), [[1, 2, 3]]).round(6).tolist()
-        [[100.0, 200.0]]
-        """
-        return self.centre_px + (self.undistort(u) - self.centre_px) * self.depth_ratio(points(x, 3, "x"))[:, None]
-
     def undistort(self, u: ArrayLike) -> np.ndarray:
         """Pixels (n, 2) with the radial distortion taken out (Newton's method on the radius).
 

@@ -393,8 +393,7 @@ def _fault(recording: Recording, seen: Seen, calibration: Calibration, *, by_han
     red = [r for r in judge(None, calibration).reasons if r.level == LEVELS[2] and r.name in ("implausible_optics", "thin")]
     if red:
         raise RefusalError(f"cameras: {red[0].text} {red[0].cure}")
-    length = np.nanmedian(tool_length_px(seen.u))
-    if by_hand or calibration.reprojection_rms_px < _HARMLESS * length:
+    if by_hand or calibration.reprojection_rms_px < _HARMLESS * np.nanmedian(tool_length_px(seen.u)):
         return None
     rows = seen.rows(recording)
     rows = replace(rows, confidence=np.where(calibration.view_inliers, rows.confidence, 0.0))
@@ -450,5 +449,4 @@ def _contradicted(teacher: Teacher, seen: Seen) -> np.ndarray:
     wrong = (size > 0.06 * length) & (size > 6 * sd)  # (m, 2, 3)
     i, j = np.triu_indices(3, 1)  # pairs of landmarks
     alike = np.linalg.norm(off[:, :, i] - off[:, :, j], axis=-1) < 0.3 * size[:, :, i]
-    both = wrong[:, :, i] & wrong[:, :, j] & alike
-    return seen.frame[both.all(axis=1).any(axis=1)]
+    return seen.frame[(wrong[:, :, i] & wrong[:, :, j] & alike).all(axis=1).any(axis=1)]

@@ -158,8 +158,7 @@ def estimate_time_offset(
         raise ValueError(f"search_s: {offset:.3f} s, lies at the end of the search; widen search_s or move start_s.")
     rms_px = float(_rms_px(at(offset)[None], y, views)[0])
     if rms_px > far_px * (3 if clear else 1):  # a path that comes back to where it was has more minima
-        what = f"the best offset in the search, {offset:.3f} s, leaves {rms_px:.0f} px RMS"
-        raise ValueError(f"search_s: {what}, so none fits; widen search_s or move start_s.")
+        raise ValueError(f"search_s: the best, {offset:.3f} s, leaves {rms_px:.0f} px RMS; widen search_s or move start_s.")
     sd = float(np.sqrt(sandwich(image[:, :, None], W, r, frame, landmark)[0][0, 0]))
     return TimeOffset(offset, sd, rms_px, trial, misfit)
 
@@ -195,8 +194,7 @@ def _rms_px(x: np.ndarray, y: np.ndarray, views: np.ndarray) -> np.ndarray:
     squares = np.zeros(len(x))
     for c, rows in enumerate(views.T):
         own, u = (v - v.mean(axis=-2, keepdims=True) for v in (x[:, rows], y[rows, 2 * c : 2 * c + 2]))
-        A = np.linalg.pinv(own.mT @ own, hermitian=True) @ (own.mT @ u)
-        squares += ((u - own @ A) ** 2).sum(axis=(1, 2))
+        squares += ((u - own @ (np.linalg.pinv(own.mT @ own, hermitian=True) @ (own.mT @ u))) ** 2).sum(axis=(1, 2))
     return np.sqrt(squares / views.sum())
 
 

@@ -187,8 +187,7 @@ def _tips(rng: Rng, reach: float) -> np.ndarray:
 
 def _reaching(tips: np.ndarray, z: float, length: float, azimuth: float, pitch: float, roll: float, opening: float) -> Pose:
     """The pose in which a tool of this length has its tips there."""
-    flat = length * np.cos(pitch) * np.array([np.cos(azimuth), np.sin(azimuth)])
-    base = [*(tips - flat), z - length * np.sin(pitch)]
+    base = [*(tips - (length * np.cos(pitch) * np.array([np.cos(azimuth), np.sin(azimuth)]))), z - length * np.sin(pitch)]
     return Pose(tuple(float(v) for v in base), azimuth, pitch, float(roll), float(opening))
 
 
@@ -232,8 +231,7 @@ def sample(
         held = seen.mean(axis=0) if around is None else seen[around]
         origin = held - (crop_px - 1) / 2 + rng.uniform(-jitter, jitter, 2) * crop_px
         origin = np.round(np.clip(origin, 0, np.maximum(field - crop_px, 0)))
-        window = Window.around(camera, origin + crop_px / 2, (crop_px, crop_px), IMAGE_SIZE_PX)
-        size_px = window.size_px
+        size_px = Window.around(camera, origin + crop_px / 2, (crop_px, crop_px), IMAGE_SIZE_PX).size_px
     else:
         # The renderer's pixels are square: fill the width and stretch the rows afterwards.
         size_px = size_px or IMAGE_SIZE_PX

@@ -138,11 +138,8 @@ def _facts(recording: Recording, a: Assessment) -> dict[str, str]:
         facts["volume"] = "The tool was seen within {:.1f} x {:.1f} x {:.1f} mm.".format(*np.ptp(x, axis=0))
     stated, best = f"offset_s = {recording.offset_s:g} s is stated", a.diagnosis.best
     error_s, sd_s = (0.0, np.inf) if c is None else clock_error(c, data, recording.kinematics, recording.offset_s)
-    facts["clock"] = f"{stated}; the data differ by {1e3 * error_s:+z.2f} +- {1e3 * sd_s:.2f} ms."
-    if best is not None and best.name == "clock":
-        facts["clock"] = f"{stated}; {best.text}"
-    elif not np.isfinite(sd_s):
-        facts["clock"] = f"{stated}; the data cannot tell."
+    change = f"differ by {1e3 * error_s:+z.2f} +- {1e3 * sd_s:.2f} ms" if np.isfinite(sd_s) else "cannot tell"
+    facts["clock"] = f"{stated}; {best.text if best is not None and best.name == 'clock' else f'the data {change}.'}"
     told = {"readout": ("read-out", f"readout_s = {recording.readout_s:g} s"), "tip_order": ("tips", "base, tip_1, tip_2")}
     for name, (title, what) in told.items():
         doubt = best.text if best is not None and best.name == name else "nothing speaks against it."

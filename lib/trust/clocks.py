@@ -72,7 +72,7 @@ def _scan(case: Case, half_s: float, rate: float = 1.0) -> tuple[np.ndarray, np.
 
 
 def _clock_rate(case: Case) -> Iterator[Hypothesis]:
-    """A wrong frame rate, or frames in reverse; other than nearly right ones are sought only where the residuals are large."""
+    """A wrong frame rate, or frames in reverse; one that is far off is sought only where the residuals are large."""
     far = case.misfit(case.null, *case.fits.values()) >= FITS
     scans = {rate: _scan(case, 0.2 * case.paths.span_s, rate) for rate in (1.0, *(_RATES if far else ()))}
     rate = min(scans, key=lambda r: scans[r][1].sum(axis=1).min())
@@ -102,8 +102,8 @@ def _frame_order(case: Case) -> Iterator[Hypothesis]:
     share = float((np.abs(shifts[own]) > step / 2).mean())
     if share * case.frames < 3:  # it may be a spike of the log
         return
-    within = " and ".join(f"{1e3 * shift:.0f}" for shift in shifts[[0, -1]])
-    text = f"{100 * share:.0f} % of the frames fit another instant, between {within} ms later, better than their own."
+    text = f"{100 * share:.0f} % of the frames fit other instants, {1e3 * shifts[0]:.0f} to {1e3 * shifts[-1]:.0f} ms later, "
+    text += "better than their own."
     cure = "Sort the frames, look for lost ones, and write each one's true time to frames.csv."
     counts = np.bincount(own, minlength=len(shifts)) / case.frames
     chosen = -case.frames * float((counts * np.log(np.maximum(counts, 1e-9))).sum())  # what the choices may cost

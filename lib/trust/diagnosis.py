@@ -7,7 +7,6 @@ likelihood, less a penalty for its parameters (BIC), is its evidence.
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import permutations
-from typing import Self
 
 import numpy as np
 from scipy.ndimage import binary_opening
@@ -16,12 +15,9 @@ from lib.calibration.checks import eyes_exchanged, sides
 from lib.correspondences import LANDMARKS, TRAIN_FURTHER, Correspondences
 from lib.recordings import Kinematics
 from lib.trust.clocks import TIME_TESTS
-from lib.trust.fitting import FITS, SIDES, Case, Hypothesis, Problem, Robust
+from lib.trust.fitting import FITS, LEAST_EXPLAINED, LEAST_GAIN, SIDES, Case, Hypothesis, Problem, Robust
 from lib.trust.health import affine_epipolar
 
-#: Least gain and least share explained of a hypothesis that is named.
-LEAST_GAIN = 6.0
-LEAST_EXPLAINED = 0.02
 _MOST_ROWS, _FEWEST_FRAMES = 1200, 4  # of three frames nothing checks anything
 _UNFIT = f"The detector does not fit these pictures: look at its overlays, {TRAIN_FURTHER}."
 _ROBOT_MM = 0.04  # a robot for eye surgery is better
@@ -69,8 +65,7 @@ def _finite_distance(case: Case) -> Iterator[Hypothesis]:
     def columns(M: np.ndarray) -> np.ndarray:
         normal = np.cross(M[:, 0, :3], M[:, 1, :3])
         depth = np.einsum("ncj,cj->nc", problem.x, normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12))
-        pixel = np.einsum("cij,ncj->nci", M[:, :, :3], problem.x) + M[:, :, 3] - centre
-        return -(depth[:, :, None] * pixel)[..., None]
+        return -(depth[:, :, None] * (np.einsum("cij,ncj->nci", M[:, :, :3], problem.x) + M[:, :, 3] - centre))[..., None]
 
     fit, value, sd = case.linear(columns)
     far = f"by a working distance of {1 / value:.0f} mm" if value > 0 else "the wrong way, as in a mirrored image"
@@ -107,8 +102,7 @@ def _drift(case: Case) -> Iterator[Hypothesis]:
     """Images that creep at a constant speed."""
     time = case.problem.time
     if np.isfinite(time).all() and np.ptp(time) > 0:
-        G = np.eye(4).reshape(1, 2, 2, 4) * ((time - time.mean()) / np.ptp(time))[:, None, None, None]
-        fit, *size = case.linear(G)
+        fit, *size = case.linear(np.eye(4).reshape(1, 2, 2, 4) * ((time - time.mean()) / np.ptp(time))[:, None, None, None])
         text = f"The images creep by {size[0] / np.sqrt(2.0):.1f} px from the first frame to the last."
         cure = "Fix the microscope, or calibrate a shorter part (Correspondences.of_frames)."
         yield case.found("drift", fit, 4, (*(np.array(size) / np.sqrt(2.0)), "px"), text, cure)
@@ -194,7 +188,7 @@ def _frozen(case: Case) -> Iterator[Hypothesis]:
         return replace(found, gain=gain, explained=max(found.explained, share / 100))
 
     frozen = (step_y > 0) & (straight | ((step_x >= 0) & (step_x < 1e-9)))
-    if frozen.mean() >= 0.02 and not frozen.all():
+    if frozen.mean() >= 0.02:
         text = "the robot's positions stand still, or run on an exact straight line, while the tool moves in the images"
         cure = "Log the robot at every sample; where it was silent leave the cells blank, so that these frames are not used."
         fit = problem.fit(start=case.null.M, apart=np.isin(problem.frame, np.flatnonzero(frozen) + 1))
@@ -298,9 +292,8 @@ def _handedness(case: Case, A: np.ndarray, covariance: np.ndarray) -> Iterator[H
             cure = "Use a right-handed robot frame: negate one axis, or exchange two, in kinematics.csv."
             yield Hypothesis("mirrored_axis", text, cure, *size)
         else:
-            text = f"{where}, and the tool points away from the cameras: the images of the two eyes are exchanged, or both are "
-            text += "turned by 180 degrees."
-            cure = "Exchange the folders left/ and right/ (or u_left and u_right); if the images stand upside down, turn both."
+            text = f"{where}, and the tool points away from it: the eyes are exchanged, or both are turned by 180 degrees."
+            cure = "Exchange the folders left/ and right/ (or u_left and u_right); if the images are upside down, turn both."
             yield Hypothesis("exchanged_eyes", text, cure, *size)
     elif near > far:
         share = near / (near + far)
@@ -341,20 +334,13 @@ class Diagnosis:
 
     hypotheses: tuple[Hypothesis, ...] = ()
 
-    @classmethod
-    def of(cls, hypotheses: list[Hypothesis]) -> Self:
-        """In their order."""
-        return cls(tuple(sorted(hypotheses, key=lambda h: -h.gain)))
-
-    @property
-    def named(self) -> list[Hypothesis]:
-        """Those that beat "nothing is wrong"."""
-        return [h for h in self.hypotheses if h.gain >= LEAST_GAIN and h.explained >= LEAST_EXPLAINED]
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "hypotheses", tuple(sorted(self.hypotheses, key=lambda h: -h.gain)))
 
     @property
     def best(self) -> Hypothesis | None:
         """The fault that the data show; None where nothing beats "nothing is wrong"."""
-        return next(iter(self.named), None)
+        return next((h for h in self.hypotheses if h.gain >= LEAST_GAIN and h.explained >= LEAST_EXPLAINED), None)
 
     def __str__(self) -> str:
         return "no fault found" if self.best is None else f"{self.best.name}: {self.best.text} {self.best.cure}"
@@ -392,23 +378,16 @@ def diagnose(
         return Diagnosis((Hypothesis("detector_unfit", text, _UNFIT, 100.0, 0.0, "%", 1.0, float(len(data))),))
     tracks = [(problem.landmark == k) & problem.used.all(axis=1) for k in np.unique(problem.landmark)]
     moved_px, moved_mm = (max(np.ptp(v[own], axis=0).max() for own in tracks if own.any()) for v in (problem.y, problem.x))
-    for name, still, text, cure in (
-        ("frozen_video", moved_px < _STILL_PX and moved_mm > _ROBOT_MM, "All frames show one picture, while the robot moves.",
-         "Check that the cameras deliver, and record anew."),
-        ("frozen_kinematics", moved_mm < 1e-9 and moved_px > _STILL_PX, "The robot reports one place, while the tool moves.",
-         "Log the robot at every sample, and record anew."),
-    ):  # fmt: skip
-        if still:
-            return Diagnosis((Hypothesis(name, text, cure, 100.0, 0.0, "%", 1.0, float(len(data))),))
+    if moved_px < _STILL_PX and moved_mm > _ROBOT_MM:
+        text, cure = "All frames show one picture, while the robot moves.", "Check that the cameras deliver, and record anew."
+        return Diagnosis((Hypothesis("frozen_video", text, cure, 100.0, 0.0, "%", 1.0, float(len(data))),))
     case = Case(problem, kinematics, offset_s, readout_s, image_size_px)
     tests = [_tip_order, _finite_distance, _landmark_offset, _tool_bends, _drift, _bad_part, _camera_moved, _frozen]
     tests = [*(TIME_TESTS if case.paths else ()), *tests, _rigid_tips]
     found = [h for test in tests for h in test(case) if np.isfinite(h.gain)]
-    named = Diagnosis(tuple(found)).named
-    found = [h for h in found if h not in named] + case.compared(named)
-    best = Diagnosis.of(found).best
+    best = Diagnosis(found := case.compared(found)).best
     fit = case.null if best is None else case.fits.get(best.name, case.null)
     turned = best is not None and best.name == "turned_image" and best.text.startswith("Both")  # then left is right
     found += [h for h in _optics(case, fit, -1.0 if turned else 1.0) if np.isfinite(h.gain)]
-    best = Diagnosis.of(found).best
-    return Diagnosis.of([*found, *_unexplained(case, case.null if best is None else case.fits.get(best.name, fit))])
+    best = Diagnosis(found).best
+    return Diagnosis((*found, *_unexplained(case, case.null if best is None else case.fits.get(best.name, fit))))

@@ -22,6 +22,7 @@ from lib.recordings import Kinematics
 SIDES = ("left", "right")
 #: Degrees of freedom tried; bivariate Cauchy to nearly Gaussian.
 _FREEDOM = np.array([0.7, 1.0, 2.0, 4.0, 10.0, 100.0])
+LEAST_GAIN, LEAST_EXPLAINED = 6.0, 0.02  # of a hypothesis that is named
 FITS = 0.03  # the scale of the residuals over the spread of the pixels, below which cameras fit
 _LEAST_PX = 0.02  # smaller residuals are rounding
 _OFFSET_SD_MM = 0.03  # of what a detector marks beside a landmark
@@ -45,8 +46,7 @@ class Shape:
             tried = tried[np.abs(np.arange(len(tried)) - np.flatnonzero(tried == before)[0]) <= 1]
         freedom, s2 = tried[:, None], np.full((len(tried), 1), start**2)
         for _ in range(4):
-            weight = (freedom + 2.0) / (freedom + r2 / s2)
-            s2 = np.maximum((weight * r2).mean(axis=1, keepdims=True) / 2.0, _LEAST_PX**2)
+            s2 = np.maximum((((freedom + 2.0) / (freedom + r2 / s2)) * r2).mean(axis=1, keepdims=True) / 2.0, _LEAST_PX**2)
         best = cls(np.sqrt(s2), freedom).log_density(r2).sum(axis=1).argmax()
         return cls(float(np.sqrt(s2[best, 0])), float(tried[best]))
 
@@ -215,7 +215,6 @@ class Hypothesis:
     unit: str
     explained: float  # share of the residuals' variance, 0 to 1 (robustly, from the likelihood)
     gain: float  # log likelihood above "nothing is wrong", less the penalty for its parameters
-    design: float = np.inf  # by how much the correlated rows of its fit overstate what they tell; infinite without a fit
 
 
 class Case:
@@ -292,17 +291,18 @@ class Case:
             null = replace(self.problem, seen=on.used).fit(start=null.M)
         raw = fit.total - null.total if raw is None else raw
         n = 2.0 * (fit.likelihood != 0).sum()
-        gain, self._evidence[text] = _gain(raw, n, extra, fit.design), (raw, n, extra)
+        self._evidence[text] = raw, n, extra, fit.design
         if name not in self.fits or fit.total > self.fits[name].total:
             self.fits[name] = fit
         explained = 1.0 - np.exp(-2.0 * max(raw, 0.0) / n)
-        return Hypothesis(name, text, cure, *map(float, size[:2]), size[2], float(explained), gain, fit.design)
+        return Hypothesis(name, text, cure, *map(float, size[:2]), size[2], float(explained), _gain(*self._evidence[text]))
 
     def compared(self, found: list[Hypothesis]) -> list[Hypothesis]:
-        """With gains as if all fits' rows told as much as those of the least `design`: only then the largest explains most."""
-        design = min((h.design for h in found), default=1.0)
-        own = [(h, self._evidence.get(h.text)) for h in found]
-        return [h if e is None else replace(h, gain=h.gain + _gain(*e, design) - _gain(*e, h.design)) for h, e in own]
+        """Those named with gains as if the rows of all fits told as much as those of the least design, to compare them."""
+        own = [self._evidence.get(h.text) if h.gain >= LEAST_GAIN and h.explained >= LEAST_EXPLAINED else None for h in found]
+        least = min((e[3] for e in own if e), default=1.0)
+        pairs = zip(found, own, strict=True)
+        return [replace(h, gain=h.gain + max(_gain(*e[:3], least), 0) - max(_gain(*e), 0)) if e else h for h, e in pairs]
 
 
 def _gain(raw: float, n: float, extra: float, design: float) -> float:

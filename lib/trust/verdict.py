@@ -20,7 +20,7 @@ from lib.trust.health import Health, feature_matches, health, spread
 LEVELS = ("trustworthy", "doubtful", "not trustworthy")
 #: Check -> values at which a verdict becomes doubtful, and not trustworthy.
 LIMITS: dict[str, tuple[float, float]] = {
-    # RMS of the residuals, each over what detector and robot claim for it.  Heavy tails (Student t, 4 degrees) reach 1.5; a clock 5 ms off 2.
+    # RMS of the residuals, each over its claim.  Heavy tails (Student t, 4 degrees) reach 1.5; a clock 5 ms off 2.
     "residuals": (1.7, 2.6),
     # Cross-validated over fitted RMS, beyond what the leverages let expect.  Clean data of 6 rows reach 1.6.
     "cross_validation": (2.0, 4.0),
@@ -163,12 +163,11 @@ def _residuals(data: Correspondences | None, c: Calibration, robot_mm: float) ->
         rows = c.covariance_px2 if len(c.covariance_px2) == 1 else c.covariance_px2[used]
         variance = np.diagonal(rows, axis1=1, axis2=2) / c.detector_scale**2
     gain = [(camera.jacobian(c.x_mm[used][:1]) ** 2).sum() for camera in c.cameras]
-    r2, claim2 = (v.reshape(len(v), -1, 2).sum(axis=2) for v in (c.residuals_px[used] ** 2, variance))  # of distances in an image
+    r2, claim2 = (v.reshape(len(v), -1, 2).sum(axis=2) for v in (c.residuals_px[used] ** 2, variance))
     ratio = float(np.sqrt((r2 / (claim2 + np.multiply(gain, robot_mm**2)))[views].mean()))
     text = f"The residuals, {c.reprojection_rms_px:.1f} px RMS, are {ratio:.1f} times as large as detector and robot claim "
     text += f"(RMS of each over its claim); {LIMITS['residuals'][0]:g} is allowed."
-    cure = f"Read the diagnosis of {_CHECK}: clock, axes, order of tips, detector."
-    yield "residuals", ratio, text, cure
+    yield "residuals", ratio, text, f"Read the diagnosis of {_CHECK}: clock, axes, order of tips, detector."
 
     # What leaving a row out does to clean data: its residual grows by (1 - leverage)^-1/2.
     m = c.leverage.shape[1]
@@ -261,8 +260,9 @@ def assess(
         epipolar_px = float(np.median(np.abs(calibration.pair.epipolar_distance(y[:, :2], y[:, 2:]))))
     stated = {name: getattr(recording, name) for name in ("kinematics", "offset_s", "readout_s", "image_size_px")}
     straight = data
-    if calibration is not None and Model.parse(calibration.model, len(calibration.cameras)).distance:  # faults beside that one
-        u = [camera.touching(u, data.x_mm) for camera, u in zip(calibration.cameras, (data.u_left, data.u_right), strict=True)]
+    if calibration is not None and Model.parse(calibration.model, len(calibration.cameras)).distance:  # beside it
+        told = zip(calibration.cameras, (data.u_left, data.u_right), strict=True)
+        u = [c.centre_px + (c.undistort(u) - c.centre_px) * c.depth_ratio(data.x_mm)[:, None] for c, u in told]
         straight = replace(data, u_left=u[0], u_right=u[1])
     diagnosis = diagnose(straight, **stated)
     found = health(recording, data, calibration, detector=detector)

@@ -129,7 +129,7 @@ def run(
             print("\nStopped.")
     except OSError as error:
         report.finish("failed")
-        raise OSError(f"{error}. The run in {paths.shown(report.folder)} ends here; see to its disk and run again.") from error
+        raise OSError(f"{error}. The run in {paths.shown(report.folder)} ends here; see to its disk.") from error
     finally:
         os.environ.pop(paths.SHARED_VARIABLE, None)
     for entry in report.content["notebooks"]:
