@@ -231,7 +231,8 @@ def sample(
         held = seen.mean(axis=0) if around is None else seen[around]
         origin = held - (crop_px - 1) / 2 + rng.uniform(-jitter, jitter, 2) * crop_px
         origin = np.round(np.clip(origin, 0, np.maximum(field - crop_px, 0)))
-        size_px = Window.around(camera, origin + crop_px / 2, (crop_px, crop_px), IMAGE_SIZE_PX).size_px
+        window = Window.around(camera, origin + crop_px / 2, (crop_px, crop_px), IMAGE_SIZE_PX)
+        size_px = window.size_px
     else:
         # The renderer's pixels are square: fill the width and stretch the rows afterwards.
         size_px = size_px or IMAGE_SIZE_PX
