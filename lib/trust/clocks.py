@@ -102,7 +102,7 @@ def _frame_order(case: Case) -> Iterator[Hypothesis]:
     share = float((np.abs(shifts[own]) > step / 2).mean())
     if share * case.frames < 3:  # it may be a spike of the log
         return
-    text = f"{100 * share:.0f} % of the frames fit other instants, {1e3 * shifts[0]:.0f} to {1e3 * shifts[-1]:.0f} ms later, better."
+    text = f"{100 * share:.0f} % of frames fit instants {1e3 * shifts[0]:.0f} to {1e3 * shifts[-1]:.0f} ms later, better."
     cure = "Sort the frames, look for lost ones, and write each one's true time to frames.csv."
     counts = np.bincount(own, minlength=len(shifts)) / case.frames
     chosen = -case.frames * float((counts * np.log(np.maximum(counts, 1e-9))).sum())  # what the choices may cost
