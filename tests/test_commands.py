@@ -1,6 +1,7 @@
 """detect, calibrate, reconstruct and register on the command line: the files they write, and when they write none."""
 
 import json
+import shutil
 from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
@@ -190,6 +191,10 @@ def test_annotate_opens_a_page_that_runs(tmp_path, monkeypatch):
     exec(compile(cell.source, page.name, "exec"), names)
     names["annotator"].mark("left", 2, "base", (20.0, 30.0))
     assert Recording.open(recording).annotations.u_left[2, 0].tolist() == [20, 30]
+    other = tmp_path / "other" / recording.name  # of the same name: it has a page of its own
+    shutil.copytree(recording, other)
+    assert commands.main_annotate([str(other)]) == 0
+    assert page.is_file() and len(list((tmp_path / "runs").iterdir())) == 2
 
 
 def test_detect_refuses_landmarks_that_the_detector_does_not_know(tmp_path):

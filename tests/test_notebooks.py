@@ -266,3 +266,13 @@ def test_a_red_calibration_gives_no_number_unless_forced(number, small, monkeypa
     run = Run(number, small, monkeypatch)
     assert "not trustworthy" in run.left_out and not [name for name in run.metrics if FOLLOWS.match(name)]
     assert Run(number, small, monkeypatch, force=True).left_out is None
+
+
+@pytest.mark.parametrize(("name", "share"), [("05_registration", "outliers"), ("08_the_robot_labels", "wrong")])
+def test_a_share_beyond_1_is_refused_before_anything_is_computed(name, share):
+    tree = ast.parse(code_cells(paths.NOTEBOOKS / f"{name}.ipynb")[1].source)
+    (guard,) = (node for node in tree.body if isinstance(node, ast.If) and share in ast.unparse(node.test))
+    code = compile(ast.Module([guard], []), name, "exec")
+    exec(code, {share: 1.0})
+    with pytest.raises(ValueError, match=rf"{share} = 1.5: give a share, 0 to 1\."):
+        exec(code, {share: 1.5})

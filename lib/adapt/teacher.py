@@ -397,8 +397,7 @@ def _fault(recording: Recording, seen: Seen, calibration: Calibration, *, by_han
     red = [r for r in judge(None, calibration).reasons if r.level == LEVELS[2] and r.name in ("implausible_optics", "thin")]
     if red:
         raise RefusalError(f"cameras: {red[0].text} {red[0].cure}")
-    length = np.nanmedian(tool_length_px(seen.u))
-    if by_hand or calibration.reprojection_rms_px < _HARMLESS * length:
+    if by_hand or calibration.reprojection_rms_px < _HARMLESS * np.nanmedian(tool_length_px(seen.u)):
         return None
     rows = seen.rows(recording)
     rows = replace(rows, confidence=np.where(calibration.view_inliers, rows.confidence, 0.0))

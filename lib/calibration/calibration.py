@@ -250,8 +250,7 @@ def optics(calibration: Calibration) -> Optics:
     distance, sd = calibration.inverse_distance_per_mm
     signs = np.sign([getattr(c, "inverse_distance_per_mm", 0.0) * (abs(distance) >= 3 * sd) for c in calibration.cameras])
     if cosine < 0:
-        one = "left" if signs[0] < 0 else "right"
-        mirrored = one if signs.any() and signs.sum() == 0 else "left or right"
+        mirrored = ("left" if signs[0] < 0 else "right") if signs.any() and signs.sum() == 0 else "left or right"
         directions[1] *= -1
     else:
         mirrored = ("both" if signs.sum() < 0 else "no") if signs.any() else "unknown"

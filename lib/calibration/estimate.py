@@ -249,7 +249,7 @@ def _calibrate(
         if refuse.eyes_exchanged(found.rig.linear, sd_rad):
             degrees = np.rad2deg(-refuse.sides(found.rig.linear)[0])
             what = f"the cameras are swapped, left stands on the right by {degrees:.1f} degrees"
-            cure = "exchange u_left and u_right (or flip both images, if they are mirrored)"
+            cure = "exchange u_left and u_right (or flip both images, if mirrored; turn both, if upside down)"
             raise ValueError(f"u: {what}; {cure}.  checks=False takes them as they are.")
     return found
 

@@ -125,7 +125,7 @@ def estimate_time_offset(
             image[rows, 2 * c : 2 * c + 2] = swept @ A[2 * c : 2 * c + 2].T
         return image, W, r
 
-    low, high = start_s - search_s, start_s + search_s
+    low, high, far_px = start_s - search_s, start_s + search_s, _NEAR * float(np.nanstd(y, axis=0).max() * np.sqrt(12))
     trial = np.linspace(low, high, _GRID)
     x_mm = np.stack([at(offset) for offset in trial])
     misfits = shift_misfits(x_mm, y)
@@ -141,7 +141,6 @@ def estimate_time_offset(
             if not clear:
                 offset = low if offset < start_s else high
                 break
-            far_px = _NEAR * float(np.nanstd(y, axis=0).max() * np.sqrt(12))
             views = consensus(at(offset), y, far_px, np.random.default_rng(0))[0]
         used = np.repeat(views, 2, axis=1)
         misfit = _rms_px(x_mm, y, views)  # of right detections squares tell more than absolute values
@@ -157,8 +156,11 @@ def estimate_time_offset(
                 break
     if offset in (low, high):
         raise ValueError(f"search_s: {offset:.3f} s, lies at the end of the search; widen search_s or move start_s.")
+    rms_px = float(_rms_px(at(offset)[None], y, views)[0])
+    if rms_px > far_px * (3 if clear else 1):  # a path that comes back to where it was has more minima
+        raise ValueError(f"search_s: the best, {offset:.3f} s, leaves {rms_px:.0f} px RMS; widen search_s or move start_s.")
     sd = float(np.sqrt(sandwich(image[:, :, None], W, r, frame, landmark)[0][0, 0]))
-    return TimeOffset(offset, sd, float(_rms_px(at(offset)[None], y, views)[0]), trial, misfit)
+    return TimeOffset(offset, sd, rms_px, trial, misfit)
 
 
 def clock_error(found: Calibration, data: Correspondences, kinematics: Kinematics, offset_s: float) -> tuple[float, float]:
@@ -193,8 +195,7 @@ def _rms_px(x: np.ndarray, y: np.ndarray, views: np.ndarray) -> np.ndarray:
     squares = np.zeros(len(x))
     for c, rows in enumerate(views.T):
         own, u = (v - v.mean(axis=-2, keepdims=True) for v in (x[:, rows], y[rows, 2 * c : 2 * c + 2]))
-        A = np.linalg.pinv(own.mT @ own, hermitian=True) @ (own.mT @ u)
-        squares += ((u - own @ A) ** 2).sum(axis=(1, 2))
+        squares += ((u - own @ (np.linalg.pinv(own.mT @ own, hermitian=True) @ (own.mT @ u))) ** 2).sum(axis=(1, 2))
     return np.sqrt(squares / views.sum())
 
 

@@ -120,7 +120,8 @@ def _robot(folder: Path, paths: dict[str, Path], tables: dict[str, Path]) -> dic
     name = max(tables, key=lambda name: tables[name].stat().st_size)
     dialect, columns = _table(tables[name])
     time = _time(columns, dialect["decimal"])
-    turn = [next((column for column in columns if re.search(rf"(?i)q_?{axis}$", column)), "") for axis in "xyzw"]
+    fours = ([c[:-1] + axis for axis in axes] for c in columns for axes in ("xyzw", "XYZW") if c[-1:] == axes[3])
+    turn = next((four for four in fours if set(four) <= columns.keys()), [""])
     groups: dict[str, dict[str, str]] = {}
     for column in columns:
         if (match := _AXIS.match(column)) and column not in (*turn, time["time"]):

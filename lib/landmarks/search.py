@@ -61,8 +61,7 @@ def likelihood(u: np.ndarray, height: np.ndarray, avoid: np.ndarray | None = Non
     They are -inf where one of the tools `avoid` (k, 3, 2) stands.
     """
     opening = np.linalg.norm(u[:, 1] - u[:, 2], axis=1) / np.maximum(tool_length_px(u), 1.0)
-    away = True if avoid is None else ~at_one_place(u, avoid)
-    return np.where(away, height + _OPEN * np.nan_to_num(opening), -np.inf)
+    return np.where(True if avoid is None else ~at_one_place(u, avoid), height + _OPEN * np.nan_to_num(opening), -np.inf)
 
 
 def at_one_place(u: np.ndarray, tools: np.ndarray) -> np.ndarray:

@@ -187,8 +187,7 @@ def _tips(rng: Rng, reach: float) -> np.ndarray:
 
 def _reaching(tips: np.ndarray, z: float, length: float, azimuth: float, pitch: float, roll: float, opening: float) -> Pose:
     """The pose in which a tool of this length has its tips there."""
-    flat = length * np.cos(pitch) * np.array([np.cos(azimuth), np.sin(azimuth)])
-    base = [*(tips - flat), z - length * np.sin(pitch)]
+    base = [*(tips - (length * np.cos(pitch) * np.array([np.cos(azimuth), np.sin(azimuth)]))), z - length * np.sin(pitch)]
     return Pose(tuple(float(v) for v in base), azimuth, pitch, float(roll), float(opening))
 
 

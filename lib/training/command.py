@@ -115,8 +115,7 @@ def main_evaluate(argv: list[str] | None = None) -> int:
         parser.error("--every: must be at least 1.")
     if a.json and not a.json.parent.is_dir():
         parser.error(f"--json: there is no folder {a.json.parent}; make it first.")
-    images = labelled_images(Recording.open(a.recording), every=a.every)
-    result = evaluate(Detector.load(a.weights), images, progress=True)
+    result = evaluate(Detector.load(a.weights), labelled_images(Recording.open(a.recording), every=a.every), progress=True)
     rows = {"all": result.scores} | result.by_landmark() | result.by_visibility()
     shown = {
         "PCK@0.01": "pck_0_01", "PCK@0.05": "pck_0_05", "PCK@0.10": "pck_0_10", "median px": "median_px", "95 % px": "p95_px",

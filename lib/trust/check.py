@@ -12,7 +12,7 @@ import numpy as np
 from jinja2 import Environment, FileSystemLoader
 
 from lib import files, paths
-from lib.calibration import estimate_time_offset
+from lib.calibration.timing import clock_error
 from lib.correspondences import LANDMARK_COLOURS, LANDMARKS, of_recording
 from lib.landmarks import Detector, SharedDetector, detect
 from lib.provenance import plain
@@ -136,21 +136,17 @@ def _facts(recording: Recording, a: Assessment) -> dict[str, str]:
     }
     if len(x := data.x_mm[data.is_complete]):
         facts["volume"] = "The tool was seen within {:.1f} x {:.1f} x {:.1f} mm.".format(*np.ptp(x, axis=0))
-    stated = f"offset_s = {recording.offset_s:g} s is stated"
-    try:
-        clock = estimate_time_offset(data, recording.kinematics, start_s=recording.offset_s)
-        change = f"{1e3 * (clock.offset_s - recording.offset_s):+.1f} +- {1e3 * clock.sd_s:.1f} ms"
-        facts["clock"] = f"{stated}; the data differ by {change}."
-    except ValueError as refused:
-        facts["clock"] = f"{stated}; the data cannot tell: {refused}"
-    best = a.diagnosis.best
+    stated, best = f"offset_s = {recording.offset_s:g} s is stated", a.diagnosis.best
+    error_s, sd_s = (0.0, np.inf) if c is None else clock_error(c, data, recording.kinematics, recording.offset_s)
+    change = f"differ by {1e3 * error_s:+z.2f} +- {1e3 * sd_s:.2f} ms" if np.isfinite(sd_s) else "cannot tell"
+    facts["clock"] = f"{stated}; {best.text if best is not None and best.name == 'clock' else f'the data {change}.'}"
     told = {"readout": ("read-out", f"readout_s = {recording.readout_s:g} s"), "tip_order": ("tips", "base, tip_1, tip_2")}
     for name, (title, what) in told.items():
         doubt = best.text if best is not None and best.name == name else "nothing speaks against it."
         facts[title] = f"{what} is stated; {doubt}"
     if c is not None and c.offsets is not None and c.offsets.offset.shape[1] == 3:
         offsets = zip(LANDMARKS, 1e3 * c.offsets.offset, strict=False)
-        parts = ["{}: {:+.0f}, {:+.0f}, {:+.0f} um".format(name, *value) for name, value in offsets]
+        parts = ["{}: {:+z.0f}, {:+z.0f}, {:+z.0f} um".format(name, *value) for name, value in offsets]
         facts["landmark offsets"] = "; ".join(parts) + " (along, across, normal)."
     bad = f"{int((a.health.score > 1).sum())} of {len(a.health.frame)} frames have a score above 1"
     facts["detector"] = f"{a.health.text}; {bad} (of frames with right landmarks {100 * a.health.false_alarm_rate:.0f} %)."

@@ -15,13 +15,10 @@ from lib.calibration.checks import eyes_exchanged, sides
 from lib.correspondences import LANDMARKS, TRAIN_FURTHER, Correspondences
 from lib.recordings import Kinematics
 from lib.trust.clocks import TIME_TESTS
-from lib.trust.fitting import FITS, SIDES, Case, Hypothesis, Problem, Robust
+from lib.trust.fitting import FITS, LEAST_EXPLAINED, LEAST_GAIN, SIDES, Case, Hypothesis, Problem, Robust
 from lib.trust.health import affine_epipolar
 
-#: Least gain and least share explained of a hypothesis that is named.
-LEAST_GAIN = 6.0
-LEAST_EXPLAINED = 0.02
-_MOST_ROWS = 1200
+_MOST_ROWS, _FEWEST_FRAMES = 1200, 4  # of three frames nothing checks anything
 _UNFIT = f"The detector does not fit these pictures: look at its overlays, {TRAIN_FURTHER}."
 _ROBOT_MM = 0.04  # a robot for eye surgery is better
 #: Standard deviations of a camera's skew and log pixel aspect.
@@ -49,7 +46,8 @@ def _tip_order(case: Case) -> Iterator[Hypothesis]:
         where, call = ("both images", "call") if len(views) == 2 else (f"the {SIDES[views[0]]} image", "calls")
         text = f"What {where} {call} {', '.join(LANDMARKS)} is {', '.join(LANDMARKS[k] for k in order)} for the robot."
         cure = f"Bring the columns of kinematics.csv, or the detections of {where}, into one order."
-        cure += " If both images are mirrored, flip them instead." if (order, views) == ((0, 2, 1), (0, 1)) else ""
+        mirrored = "both images are mirrored, flip them" if len(views) == 2 else "that image is mirrored, flip it"
+        cure += f" If {mirrored} instead." if order == (0, 2, 1) else ""
         yield case.found("tip_order", moved.fit(), 1, (1.0, 0.0, ""), text, cure, on=moved)
     swapped = table[:, [0, 2, 1]][problem.frame, problem.landmark]  # frame by frame: one bit each
     fit, moved, own = case.chosen(np.stack([problem.x[:, 0], swapped]))
@@ -67,8 +65,7 @@ def _finite_distance(case: Case) -> Iterator[Hypothesis]:
     def columns(M: np.ndarray) -> np.ndarray:
         normal = np.cross(M[:, 0, :3], M[:, 1, :3])
         depth = np.einsum("ncj,cj->nc", problem.x, normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12))
-        pixel = np.einsum("cij,ncj->nci", M[:, :, :3], problem.x) + M[:, :, 3] - centre
-        return -(depth[:, :, None] * pixel)[..., None]
+        return -(depth[:, :, None] * (np.einsum("cij,ncj->nci", M[:, :, :3], problem.x) + M[:, :, 3] - centre))[..., None]
 
     fit, value, sd = case.linear(columns)
     far = f"by a working distance of {1 / value:.0f} mm" if value > 0 else "the wrong way, as in a mirrored image"
@@ -105,8 +102,7 @@ def _drift(case: Case) -> Iterator[Hypothesis]:
     """Images that creep at a constant speed."""
     time = case.problem.time
     if np.isfinite(time).all() and np.ptp(time) > 0:
-        G = np.eye(4).reshape(1, 2, 2, 4) * ((time - time.mean()) / np.ptp(time))[:, None, None, None]
-        fit, *size = case.linear(G)
+        fit, *size = case.linear(np.eye(4).reshape(1, 2, 2, 4) * ((time - time.mean()) / np.ptp(time))[:, None, None, None])
         text = f"The images creep by {size[0] / np.sqrt(2.0):.1f} px from the first frame to the last."
         cure = "Fix the microscope, or calibrate a shorter part (Correspondences.of_frames)."
         yield case.found("drift", fit, 4, (*(np.array(size) / np.sqrt(2.0)), "px"), text, cure)
@@ -192,12 +188,13 @@ def _frozen(case: Case) -> Iterator[Hypothesis]:
         return replace(found, gain=gain, explained=max(found.explained, share / 100))
 
     frozen = (step_y > 0) & (straight | ((step_x >= 0) & (step_x < 1e-9)))
-    if frozen.mean() >= 0.02 and not frozen.all():
+    if frozen.mean() >= 0.02:
         text = "the robot's positions stand still, or run on an exact straight line, while the tool moves in the images"
         cure = "Log the robot at every sample; where it was silent leave the cells blank, so that these frames are not used."
         fit = problem.fit(start=case.null.M, apart=np.isin(problem.frame, np.flatnonzero(frozen) + 1))
         yield certain("frozen_kinematics", fit, frozen, text, cure)
-    twice = (step_x > 1e-6) & (step_y >= 0) & (step_y < 0.15 * case.null.shapes[0].scale)
+    noise = min(fit.shapes[0].scale for fit in (case.null, *case.fits.values()))
+    twice = (step_x > 1e-6) & (step_y >= 0) & (step_y < 0.15 * noise)
     if twice.mean() >= 0.02 and not twice.all():  # each image belongs to the instant at which it was first seen
         source = np.maximum.accumulate(np.where(np.append(True, ~twice), np.arange(case.frames), 0))[problem.frame]
         first = np.repeat(x[source, np.minimum(problem.landmark, 2)][:, None], 2, axis=1)
@@ -232,14 +229,14 @@ def _rigid_tips(case: Case) -> Iterator[Hypothesis]:
     yield case.found("rigid_tips", fit, 1, (size, 0.0, "mm"), text, cure, raw=fit.total - case.null.total - chosen)
 
 
-def _optics(case: Case) -> Iterator[Hypothesis]:
-    """What an affine camera absorbs: its optics alone are the witness."""
+def _optics(case: Case, fit: Robust, sign: float) -> Iterator[Hypothesis]:
+    """What an affine camera absorbs: its optics, in the fit of the best cause so far, alone are the witness."""
     rows = [8 * c + 4 * i + j for c in range(2) for i in range(2) for j in range(3)]
-    A, covariance = case.null.M[:, :, :3], case.null.camera_covariance[np.ix_(rows, rows)]
+    A, covariance = sign * fit.M[:, :, :3], fit.camera_covariance[np.ix_(rows, rows)]
     few = 2 * case.problem.used.sum() < 40
     if few or not np.isfinite(covariance).all() or min(np.linalg.svd(a, compute_uv=False)[1] for a in A) < 1e-6:
         return
-    if case.misfit(case.null) < FITS:  # cameras that fit nothing always have skewed pixels
+    if case.misfit(fit) < FITS:  # cameras that fit nothing always have skewed pixels
         yield from _scaled_axis(A, covariance)
     yield from _handedness(case, A, covariance)
 
@@ -296,8 +293,9 @@ def _handedness(case: Case, A: np.ndarray, covariance: np.ndarray) -> Iterator[H
             cure = "Use a right-handed robot frame: negate one axis, or exchange two, in kinematics.csv."
             yield Hypothesis("mirrored_axis", text, cure, *size)
         else:
-            text = f"{where}, and the tool points away from the cameras: the images of the two eyes are exchanged."
-            yield Hypothesis("exchanged_eyes", text, "Exchange the folders left/ and right/ (or u_left and u_right).", *size)
+            text = f"{where}, and the tool points away from it: the eyes are exchanged, or both are turned by 180 degrees."
+            cure = "Exchange the folders left/ and right/ (or u_left and u_right); if the images are upside down, turn both."
+            yield Hypothesis("exchanged_eyes", text, cure, *size)
     elif near > far:
         share = near / (near + far)
         text = f"In {100 * share:.0f} % of the frames the tips lie nearer to the cameras than the base. If both images are "
@@ -339,6 +337,9 @@ class Diagnosis:
 
     hypotheses: tuple[Hypothesis, ...] = ()
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "hypotheses", tuple(sorted(self.hypotheses, key=lambda h: -h.gain)))
+
     @property
     def best(self) -> Hypothesis | None:
         """The fault that the data show; None where nothing beats "nothing is wrong"."""
@@ -371,6 +372,8 @@ def diagnose(
     if len(data) > _MOST_ROWS:  # a part of the time: neighbours tell of clocks, and which part hardly matters
         data = data.of_frames(frames[np.linspace(0, len(frames) - 1, int(len(frames) * _MOST_ROWS / len(data))).astype(int)])
     problem = Problem.of(data)
+    if len(frames) < _FEWEST_FRAMES:
+        return Diagnosis()
     if problem.used.all(axis=1).sum() < 6:
         if len(data) < 12:
             return Diagnosis()
@@ -383,8 +386,11 @@ def diagnose(
         return Diagnosis((Hypothesis("frozen_video", text, cure, 100.0, 0.0, "%", 1.0, float(len(data))),))
     case = Case(problem, kinematics, offset_s, readout_s, image_size_px)
     tests = [_tip_order, _finite_distance, _landmark_offset, _tool_bends, _drift, _bad_part, _camera_moved, _frozen]
-    tests = [*(TIME_TESTS if case.paths else ()), *tests, _rigid_tips, _optics]
+    tests = [*(TIME_TESTS if case.paths else ()), *tests, _rigid_tips]
     found = [h for test in tests for h in test(case) if np.isfinite(h.gain)]
-    best = Diagnosis(tuple(sorted(found, key=lambda h: -h.gain))).best
-    found += _unexplained(case, case.null if best is None else case.fits.get(best.name, case.null))
-    return Diagnosis(tuple(sorted(found, key=lambda h: -h.gain)))
+    best = Diagnosis(found := case.compared(found)).best
+    fit = case.null if best is None else case.fits.get(best.name, case.null)
+    turned = best is not None and best.name == "turned_image" and best.text.startswith("Both")  # then left is right
+    found += [h for h in _optics(case, fit, -1.0 if turned else 1.0) if np.isfinite(h.gain)]
+    best = Diagnosis(found).best
+    return Diagnosis((*found, *_unexplained(case, case.null if best is None else case.fits.get(best.name, fit))))

@@ -5,6 +5,7 @@ Each image's residual of a row has a bivariate Student t density whose scale and
 """
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Self
@@ -21,6 +22,7 @@ from lib.recordings import Kinematics
 SIDES = ("left", "right")
 #: Degrees of freedom tried; bivariate Cauchy to nearly Gaussian.
 _FREEDOM = np.array([0.7, 1.0, 2.0, 4.0, 10.0, 100.0])
+LEAST_GAIN, LEAST_EXPLAINED = 6.0, 0.02  # of a hypothesis that is named
 FITS = 0.03  # the scale of the residuals over the spread of the pixels, below which cameras fit
 _LEAST_PX = 0.02  # smaller residuals are rounding
 _OFFSET_SD_MM = 0.03  # of what a detector marks beside a landmark
@@ -44,8 +46,7 @@ class Shape:
             tried = tried[np.abs(np.arange(len(tried)) - np.flatnonzero(tried == before)[0]) <= 1]
         freedom, s2 = tried[:, None], np.full((len(tried), 1), start**2)
         for _ in range(4):
-            weight = (freedom + 2.0) / (freedom + r2 / s2)
-            s2 = np.maximum((weight * r2).mean(axis=1, keepdims=True) / 2.0, _LEAST_PX**2)
+            s2 = np.maximum((((freedom + 2.0) / (freedom + r2 / s2)) * r2).mean(axis=1, keepdims=True) / 2.0, _LEAST_PX**2)
         best = cls(np.sqrt(s2), freedom).log_density(r2).sum(axis=1).argmax()
         return cls(float(np.sqrt(s2[best, 0])), float(tried[best]))
 
@@ -134,7 +135,9 @@ class Problem:
             for view, rows in enumerate(self.used.T):
                 if rows.sum() >= 4:
                     x, y = self.x[rows, view], self.y[rows, view]
-                    starts[:, view] = regress(x, y), tightest_sample(x, y, rng)
+                    starts[0, view] = regress(x, y)
+                    with suppress(ValueError):  # positions in one plane
+                        starts[1, view] = tightest_sample(x, y, rng)
             start = max((self._descend(M, columns, apart, 8) for M in starts), key=lambda fit: fit.total).M
         return self._descend(start, columns, apart, rounds)
 
@@ -227,7 +230,7 @@ class Case:
         self, problem: Problem, kinematics: Kinematics | None, offset_s: float, readout_s: float, size: tuple[int, int] | None
     ) -> None:
         self.problem, self.readout_s, self.size = problem, readout_s, size
-        self.null, self.fits = problem.fit(), {}
+        self.null, self.fits, self._evidence = problem.fit(), {}, {}
         self.frames = int(problem.frame.max()) + 1
         self.paths, self._clock_s = None, offset_s
         time, landmark, x = problem.time, problem.landmark, problem.x[:, 0]
@@ -291,12 +294,23 @@ class Case:
             null = replace(self.problem, seen=on.used).fit(start=null.M)
         raw = fit.total - null.total if raw is None else raw
         n = 2.0 * (fit.likelihood != 0).sum()
-        # Of few rows any addition explains much: what chance gains, by the degrees of freedom, is taken off.
-        freedom = n / fit.design - _PARAMETERS
-        left = freedom - extra
-        gain = left * (raw / n - 0.5 * np.log(freedom / left)) - 0.5 * extra * np.log(freedom) if left >= 4 else -np.inf
+        self._evidence[text] = raw, n, extra, fit.design
         if name not in self.fits or fit.total > self.fits[name].total:
             self.fits[name] = fit
-        value, sd, unit = size
         explained = 1.0 - np.exp(-2.0 * max(raw, 0.0) / n)
-        return Hypothesis(name, text, cure, float(value), float(sd), unit, float(explained), float(gain))
+        return Hypothesis(name, text, cure, *map(float, size[:2]), size[2], float(explained), _gain(*self._evidence[text]))
+
+    def compared(self, found: list[Hypothesis]) -> list[Hypothesis]:
+        """Those named with gains as if the rows of all fits told as much as those of the least design, to compare them."""
+        own = [self._evidence.get(h.text) if h.gain >= LEAST_GAIN and h.explained >= LEAST_EXPLAINED else None for h in found]
+        least = min((e[3] for e in own if e), default=1.0)
+        pairs = zip(found, own, strict=True)
+        return [replace(h, gain=h.gain + max(_gain(*e[:3], least), 0) - max(_gain(*e), 0)) if e else h for h, e in pairs]
+
+
+def _gain(raw: float, n: float, extra: float, design: float) -> float:
+    """Log likelihood `raw` of n numbers less the penalty of `extra` parameters, where rows overstate by `design`."""
+    # Of few rows any addition explains much: what chance gains, by the degrees of freedom, is taken off.
+    freedom = n / design - _PARAMETERS
+    left = freedom - extra
+    return float(left * (raw / n - 0.5 * np.log(freedom / left)) - 0.5 * extra * np.log(freedom)) if left >= 4 else -np.inf

@@ -20,7 +20,7 @@ from lib.trust.health import Health, feature_matches, health, spread
 LEVELS = ("trustworthy", "doubtful", "not trustworthy")
 #: Check -> values at which a verdict becomes doubtful, and not trustworthy.
 LIMITS: dict[str, tuple[float, float]] = {
-    # RMS residual over what detector and robot claim.  Heavy tails (Student t, 4 degrees) reach 1.5; a clock 5 ms off 2.
+    # RMS of the residuals, each over its claim.  Heavy tails (Student t, 4 degrees) reach 1.5; a clock 5 ms off 2.
     "residuals": (1.7, 2.6),
     # Cross-validated over fitted RMS, beyond what the leverages let expect.  Clean data of 6 rows reach 1.6.
     "cross_validation": (2.0, 4.0),
@@ -157,15 +157,17 @@ def _reason(check: str, value: float, text: str, cure: str, name: str = "") -> l
 
 def _residuals(data: Correspondences | None, c: Calibration, robot_mm: float) -> Iterator[tuple]:
     """What `_reason` takes: how large the residuals are, and how many rows they are of."""
-    used, variance = c.inliers, 2.0 * _LABEL_PX**2
+    used, views = c.inliers, c.view_inliers[c.inliers]
+    variance = np.full((1, 2 * views.shape[1]), _LABEL_PX**2)
     if c.covariance_px2 is not None:
         rows = c.covariance_px2 if len(c.covariance_px2) == 1 else c.covariance_px2[used]
-        variance = 2.0 * float(np.nanmean(np.diagonal(rows, axis1=1, axis2=2))) / c.detector_scale**2
-    gain = np.mean([(camera.jacobian(c.x_mm[used][:1]) ** 2).sum() for camera in c.cameras])
-    claim = float(np.sqrt(variance + gain * robot_mm**2))  # RMS distance in an image, averaged over views
-    text = f"The residuals are {c.reprojection_rms_px:.1f} px RMS; detector and robot claim {claim:.1f} px."
-    cure = f"Read the diagnosis of {_CHECK}: clock, axes, order of tips, detector."
-    yield "residuals", c.reprojection_rms_px / claim, text, cure
+        variance = np.diagonal(rows, axis1=1, axis2=2) / c.detector_scale**2
+    gain = [(camera.jacobian(c.x_mm[used][:1]) ** 2).sum() for camera in c.cameras]
+    r2, claim2 = (v.reshape(len(v), -1, 2).sum(axis=2) for v in (c.residuals_px[used] ** 2, variance))
+    ratio = float(np.sqrt((r2 / (claim2 + np.multiply(gain, robot_mm**2)))[views].mean()))
+    text = f"The residuals, {c.reprojection_rms_px:.1f} px RMS, are {ratio:.1f} times as large as detector and robot claim "
+    text += f"(RMS of each over its claim); {LIMITS['residuals'][0]:g} is allowed."
+    yield "residuals", ratio, text, f"Read the diagnosis of {_CHECK}: clock, axes, order of tips, detector."
 
     # What leaving a row out does to clean data: its residual grows by (1 - leverage)^-1/2.
     m = c.leverage.shape[1]
@@ -179,7 +181,7 @@ def _residuals(data: Correspondences | None, c: Calibration, robot_mm: float) ->
     text = f"Only {100 * share:.0f} % of the {usable} detections agree on the cameras."
     yield "consensus", share, text, f"{_OVERLAYS}: the other detections are wrong, or these are.", "minority"
 
-    text = f"The rows that agree count as {c.effective_rows:.0f} of independent errors; {LIMITS['rows'][0]:g} are needed."
+    text = f"The rows that agree count as {c.effective_rows:.1f} of independent errors; {LIMITS['rows'][0]:g} are needed."
     yield "rows", c.effective_rows + 1e-9, text, _MORE_FRAMES, "few_rows"
     if data is not None:
         frames = len(np.unique(data.frame[used]))
@@ -257,10 +259,12 @@ def assess(
     if calibration is not None and len(y := feature_matches(recording, spread(len(recording), 3))):
         epipolar_px = float(np.median(np.abs(calibration.pair.epipolar_distance(y[:, :2], y[:, 2:]))))
     stated = {name: getattr(recording, name) for name in ("kinematics", "offset_s", "readout_s", "image_size_px")}
-    diagnosis = diagnose(data, **stated)
-    if calibration is not None and Model.parse(calibration.model, len(calibration.cameras)).distance:
-        others = (h for h in diagnosis.hypotheses if h.name != "finite_distance" or h.value < 0)  # these cameras have one
-        diagnosis = Diagnosis(tuple(others))
+    straight = data
+    if calibration is not None and Model.parse(calibration.model, len(calibration.cameras)).distance:  # beside it
+        told = zip(calibration.cameras, (data.u_left, data.u_right), strict=True)
+        u = [c.centre_px + (c.undistort(u) - c.centre_px) * c.depth_ratio(data.x_mm)[:, None] for c, u in told]
+        straight = replace(data, u_left=u[0], u_right=u[1])
+    diagnosis = diagnose(straight, **stated)
     found = health(recording, data, calibration, detector=detector)
     verdict = judge(
         data, calibration, diagnosis=diagnosis, health=found, epipolar_px=epipolar_px, error=error,
@@ -296,7 +300,7 @@ def report(calibration: Calibration, *, verdict: Verdict | None = None, robot_ac
     for name, resection in zip(["left", "right"] if c.rig else ["camera"], c.resections(), strict=True):
         (zoom_x, skew), (_, zoom_y) = resection.K
         at = ", ".join(f"{value:.3f}" for value in resection.t)
-        lines.append(f"  {name:12s}  zoom {zoom_x:.3f} x {zoom_y:.3f} px/mm, skew {skew:.3f} px/mm, offset ({at}) mm")
+        lines.append(f"  {name:12s}  zoom {zoom_x:.3f} x {zoom_y:.3f} px/mm, skew {skew:z.3f} px/mm, offset ({at}) mm")
     distance, sd = c.inverse_distance_per_mm
     if sd > 0:
         far = "not distinguishable from affine" if abs(distance) < 3 * sd else f"working distance {1 / distance:.0f} mm"
@@ -306,7 +310,7 @@ def report(calibration: Calibration, *, verdict: Verdict | None = None, robot_ac
         alone, both = (1e3 * np.median(c.depth_sd_mm(x, detection=detection)) for detection in (False, True))
         at = ", ".join(f"{value:.1f}" for value in o.robot_from_microscope.t)
         angle, roll = np.rad2deg([o.convergence_rad, o.roll_rad])
-        head = f"convergence {angle:.2f} deg, right image rolled by {roll:.2f} deg, mirrored: {o.mirrored}"
+        head = f"convergence {angle:.2f} deg, right image rolled by {roll:z.2f} deg, mirrored: {o.mirrored}"
         lines.append(f"  head          {head}; the images' centre is ({at}) mm")
         lines.append(f"  depth         {both:.0f} um sd of one detected point, of which the calibration {alone:.1f} um")
     if c.offsets is not None:
@@ -314,7 +318,7 @@ def report(calibration: Calibration, *, verdict: Verdict | None = None, robot_ac
         lines.append(f"  offsets       p = {c.offsets.p_value:.2g} without any; {unit}:")
         for k, (values, sds) in enumerate(zip(c.offsets.offset, c.offsets.standard_deviation, strict=True)):
             name = LANDMARKS[k] if k < len(LANDMARKS) else f"landmark {k}"
-            numbers = [f"{scale * v:.1f} +- {scale * s:.1f}" for v, s in zip(values, sds, strict=True)]
+            numbers = [f"{scale * v:z.1f} +- {scale * s:.1f}" for v, s in zip(values, sds, strict=True)]
             lines.append(f"    {name:10s}  {', '.join(numbers)}")
     if outliers.size:
         distance = np.linalg.norm(c.residuals_px.reshape(rows, -1, 2)[tuple(outliers.T)], axis=1)

@@ -129,9 +129,9 @@ def run(
         report.finish("stopped")
         with contextlib.suppress(OSError):  # the terminal may have gone
             print("\nStopped.")
-    except OSError:
+    except OSError as error:
         report.finish("failed")
-        raise
+        raise OSError(f"{error}. The run in {paths.shown(report.folder)} ends here; see to its disk.") from error
     finally:
         os.environ.pop(paths.SHARED_VARIABLE, None)
     for entry in report.content["notebooks"]:

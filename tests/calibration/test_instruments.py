@@ -136,6 +136,20 @@ def test_time_offset_at_the_end_of_its_search_is_refused_with_the_cure():
     assert estimate_time_offset(frames, robot, search_s=0.7).offset_s == pytest.approx(0.5, abs=1e-3)
 
 
+def test_time_offset_refuses_the_best_of_a_search_that_does_not_fit():
+    """A path that comes back to nearly where it was has minima at other offsets too."""
+
+    def path(t):
+        return np.stack([3 * np.sin(6 * t), 2 * np.cos(6 * t) + 3 * np.sin(1.9 * t), 2 * np.sin(9 * t)], axis=1)
+
+    time, robot_time = np.arange(60) / 15, np.arange(-2, 7, 0.01)
+    u = [np.random.default_rng(0).normal(pixels, 1.0) for pixels in reference_rig().project(path(time + 1.0))]
+    with pytest.raises(ValueError, match=r"leaves \d+ px RMS; widen search_s"):
+        estimate_time_offset((time, u), (robot_time, path(robot_time)), search_s=0.5)
+    found = estimate_time_offset((time, u), (robot_time, path(robot_time)), search_s=1.5)
+    assert found.offset_s == pytest.approx(1.0, abs=1e-3)
+
+
 def test_time_offset_refuses_what_it_cannot_see():
     (time, u), (robot_time, robot_x) = video(0, 0)
     with pytest.raises(ValueError, match="frames lie inside"):

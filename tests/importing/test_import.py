@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import tomllib
 from dataclasses import replace
 from pathlib import Path
 
@@ -211,6 +212,15 @@ def test_the_guess_needs_little_change(shipped, tmp_path):
     told = read_mapping(path)
     assert told.robot.landmarks["base"] == ("/base:point.x", "/base:point.y", "/base:point.z")
     assert (told.video.times, told.video.left) == ("names", "cam L/*.tiff")
+
+
+def test_a_quaternion_of_any_name_is_no_point(shipped, tmp_path):
+    folder, _ = source_of(tmp_path, shipped, foreign.images, foreign.robot_poses, lambda *_: "")
+    log = folder / "pose.tsv"
+    for axis in "wxyz":
+        log.write_text(log.read_text().replace(f"q{axis}", f"pose.ori_{axis}", 1))
+    pose = tomllib.loads(guess_mapping(folder))["robot"]["pose"]
+    assert pose["rotation"] == [f"pose.ori_{axis}" for axis in "xyzw"] and pose["position"] == ["px", "py", "pz"]
 
 
 def test_the_guess_reads_units_and_frame_times_where_no_name_states_them(shipped, tmp_path):

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from lib.recordings import Kinematics
 from lib.trust import diagnose
 from notebooks.studies.spoiling import GOOD, SPOILED, Scene
 
@@ -59,6 +60,65 @@ def test_a_turned_image_is_no_wrong_readout_time():
     best = found(scene.take()).best
     assert best.name == "turned_image" and best.value == pytest.approx(-20.0, abs=4 * best.sd)
     assert "The right image is turned by 180 degrees" in best.text and "Turn it by 180 degrees" in best.cure
+
+
+@pytest.mark.parametrize("readout_s", [0.0, 0.02])
+def test_two_turned_images_are_not_only_called_exchanged_eyes(readout_s):
+    """Left then stands on the right.  The shutter tells, where there is one."""
+    scene = Scene(np.random.default_rng(7), frames=40, fps=15.0, speed_mm_s=6.0, readout_s=readout_s)
+    corner = np.array(scene.take().image_size_px) - 1.0
+    scene.edit_pixels.append(lambda scene, u: corner - u)
+    best = found(scene.take()).best
+    assert best.name == ("turned_image" if readout_s else "exchanged_eyes")
+    assert "turned by 180 degrees" in best.text and "turn" in best.cure.lower()
+
+
+def test_a_mirrored_image_is_no_scaled_axis():
+    """Its optics are judged by the cameras that fit once its tips are exchanged, as the detector does in a mirror."""
+    scene = Scene(np.random.default_rng(7), frames=40, fps=15.0, speed_mm_s=6.0)
+    width = scene.take().image_size_px[0]
+    scene.edit_pixels.append(
+        lambda scene, u: np.stack([[width - 1, 0] + u[:, [0, 2, 1], 0] * [-1, 1], u[:, :, 1]], axis=2)
+    )  # fmt: skip
+    best = found(scene.take()).best
+    assert best.name == "tip_order" and "What the left image calls" in best.text
+    assert best.cure.endswith("If that image is mirrored, flip it instead.")
+
+
+def test_frames_that_are_lost_now_and_then_are_no_clock():
+    lost, usual = np.array([10, 11, 30, 31, 32]), take(frames=60)
+    kept = np.setdiff1d(np.arange(60), lost)
+    rows = usual.data.of_frames(kept)
+    late = rows.time_s + (np.searchsorted(kept, rows.frame) - rows.frame) / 15.0  # as if none were
+    x = usual.kinematics.at(late)[np.arange(len(late)), rows.landmark]
+    best = found(replace(usual, data=replace(rows, time_s=late, x_mm=x))).best
+    assert best.name == "frame_order" and "lost ones" in best.cure
+
+
+def test_a_small_error_of_the_frame_rate_is_named():
+    best = found(take(rate=1.02, frames=60)).best
+    assert best.name == "clock_rate" and best.value == pytest.approx(1 / 1.02, abs=1e-3)
+    assert "In one second of the video's time 0.98" in best.text
+
+
+def test_the_cause_that_explains_most_is_named():
+    """The residuals that it leaves may be more alike than those that others leave."""
+    usual = take("rigid tips", "1.0 mm", readout_s=0.02, stated_readout_s=0.0, speed_mm_s=2.0)
+    found_all = found(usual)
+    assert found_all.best.explained == max(h.explained for h in found_all.hypotheses if h.gain >= 6)
+
+
+def test_a_robot_that_stands_still_is_named():
+    usual = take()
+    still = np.tile(usual.data.grid("x_mm")[0], (40, 1))
+    kinematics = Kinematics(usual.kinematics.time_s, np.tile(still[:3], (len(usual.kinematics.time_s), 1, 1)))
+    best = found(replace(usual, data=replace(usual.data, x_mm=still), kinematics=kinematics)).best
+    assert best.name == "frozen_kinematics" and "In 100 % of the frames" in best.text
+
+
+def test_three_frames_accuse_nobody():
+    usual = take(frames=40)
+    assert diagnose(usual.data.of_frames([0, 19, 39]), kinematics=usual.kinematics).hypotheses == ()
 
 
 def test_cameras_that_do_not_fit_say_nothing_of_an_axis():

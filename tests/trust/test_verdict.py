@@ -69,6 +69,15 @@ def test_residuals_beyond_the_claim_are_red():
     assert names(made(60)) == {}
 
 
+def test_detections_that_own_to_large_errors_do_not_condemn_the_others():
+    data, shift = made(60), np.zeros((60, 2))
+    shift[:3, 0] = 60.0
+    claimed = data.covariance_px2.copy()
+    claimed[:3] = 20.0**2 * np.eye(2)
+    unsure = replace(data, u_left=data.u_left + shift, u_right=data.u_right - shift, covariance_px2=claimed)
+    assert calibrate(unsure).inliers.all() and names(unsure) == {}
+
+
 def test_a_minority_and_few_frames_are_told():
     data, rng = made(60), np.random.default_rng(1)
     views = (data.u_left, data.u_right)

@@ -284,7 +284,7 @@ def test_a_full_disk_is_told_and_leaves_the_state_failed(without_kernels, tmp_pa
     monkeypatch.setattr(command, "execute", cut_off)
     assert main(["03", "--runs", str(tmp_path)]) == 2
     said = capsys.readouterr().err
-    assert "No space left on device" in said and said.count("\n") == 1
+    assert "No space left on device" in said and f"The run in {tmp_path}" in said and said.count("\n") == 1
     content = state_of(tmp_path)
     assert content["state"] == "failed" and "No space left" in content["notebooks"][0]["failure"]["message"]
 
