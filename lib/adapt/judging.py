@@ -29,7 +29,8 @@ def stretches(frames: np.ndarray, time_s: np.ndarray) -> dict[str, np.ndarray]:
     first, second = round(0.64 * n), round(0.79 * n)
     parts = {"learn": frames[: first - 1], "stop": frames[first:second], "judge": frames[second + 1 :]}
     for before, part in (("learn", "stop"), ("stop", "judge")):
-        parts[part] = parts[part][time_s[parts[part]] - time_s[parts[before][-1]] >= min(0.2, 0.02 * np.ptp(time_s[frames]))]
+        late = time_s[parts[part]] - time_s[parts[before][-1]] >= min(0.2, 0.02 * np.ptp(time_s[frames]))
+        parts[part] = parts[part][late]
     return parts
 
 

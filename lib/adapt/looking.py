@@ -97,7 +97,8 @@ def at_rest(seen: Seen, x_mm: np.ndarray) -> np.ndarray:
         near = np.linalg.norm(u - u[i], axis=2).mean(axis=1) < _STILL * tool_length_px(u[i : i + 1])
         at = centre[near & known]
         if len(at) >= _STILL_FRAMES:
-            found[i, side] = (np.linalg.svd(at - at.mean(axis=0), compute_uv=False) / np.sqrt(len(at)))[1] > least_mm
+            spread = np.linalg.svd(at - at.mean(axis=0), compute_uv=False) / np.sqrt(len(at))
+            found[i, side] = spread[1] > least_mm
     return found
 
 

@@ -45,7 +45,8 @@ def import_recording(source: str | Path, mapping: str | Path, out: str | Path, *
     zeros = stereo_zero, robot_zero = [Decimal(int(t)) if abs(t) > _EPOCH_S else Decimal(0) for t in starts]
     estimated = told.robot.offset_s == "estimate"
     one_dated = estimated and bool(stereo_zero) != bool(robot_zero)
-    offset_s = 0.0 if one_dated else float(stereo_zero + Decimal("0" if estimated else str(told.robot.offset_s)) - robot_zero)
+    given = Decimal("0" if estimated else str(told.robot.offset_s))
+    offset_s = 0.0 if one_dated else float(stereo_zero + given - robot_zero)
     time_s, robot_s = since(stereo.time, stereo_zero), since(robot_time, robot_zero)
     size = next(stereo.pairs())[0].shape[1::-1]  # width and height
     labels = read_labels(folder, told.labels, stereo, told.landmarks, size) if told.labels else None

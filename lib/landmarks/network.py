@@ -117,7 +117,8 @@ def _residual(inputs: int, outputs: int) -> _Block:
     """Two 3 x 3 convolutions and their skip connection (He et al. 2016); more channels come with half the resolution."""
     halve = inputs != outputs
     body = nn.Sequential(_conv(inputs, outputs, 3, stride=2 if halve else 1), _conv(outputs, outputs, 3, relu=False))
-    return _Block(body, nn.Sequential(nn.AvgPool2d(2), _conv(inputs, outputs, 1, relu=False)) if halve else nn.Identity())
+    skip = nn.Sequential(nn.AvgPool2d(2), _conv(inputs, outputs, 1, relu=False)) if halve else nn.Identity()
+    return _Block(body, skip)
 
 
 class _Hourglass(nn.Module):
@@ -178,7 +179,8 @@ class StackedHourglass(Network):
             raise ValueError(f"images: the network takes (n, 3, h, w) RGB, got {tuple(images.shape)}. {cure}.")
         h, w = images.shape[-2:]
         multiple, stride = self.config.multiple, self.stride
-        x = self.stem((F.pad(images, (0, -w % multiple, 0, -h % multiple)) - 0.5) * 4.0)  # about zero mean and unit variance
+        padded = F.pad(images, (0, -w % multiple, 0, -h % multiple))
+        x = self.stem((padded - 0.5) * 4.0)  # about zero mean and unit variance
         outputs = []
         for i, hourglass in enumerate(self.hourglasses):
             y = self.features[i](hourglass(x))

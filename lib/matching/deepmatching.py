@@ -149,7 +149,8 @@ def peak_ratio(maps: torch.Tensor, row: torch.Tensor, column: torch.Tensor) -> n
     """
     step = torch.arange(-1, 2, device=maps.device)
     rows = (row[:, None, None] + step[:, None]).clamp(0, maps.shape[1] - 1)
-    around = (rows * maps.shape[2] + (column[:, None, None] + step).clamp(0, maps.shape[2] - 1)).flatten(1)
+    columns = (column[:, None, None] + step).clamp(0, maps.shape[2] - 1)
+    around = (rows * maps.shape[2] + columns).flatten(1)
     flat = maps.flatten(1)
     response = flat.gather(1, around).amax(dim=1)
     rival = flat.scatter_(1, around, -1.0).amax(dim=1)

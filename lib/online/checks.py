@@ -67,7 +67,8 @@ class FrameChecks:
             if jump > _FAR_MM:
                 self._doubted += 1
                 return f"the robot's report jumped by {jump:.0f} mm"
-            if same and np.fmin.reduce(np.linalg.norm(y - before[1], axis=1)) > np.sqrt(2.0) * _MOVED_PX:
+            step = np.linalg.norm(y - before[1], axis=1) / np.sqrt(2.0)
+            if same and np.fmin.reduce(step) > _MOVED_PX:
                 return "the robot's report is frozen while the tool moves"
         if not same:  # else compared with where the tool was seen when the report last changed
             self._believed, self._doubted = (x.copy(), y), 0

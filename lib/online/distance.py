@@ -70,8 +70,9 @@ class TipDistance:
         if not len(rows := np.flatnonzero(np.isfinite(found.along_view_mm))):
             return
         u = camera.project(x[rows])
+        slope = np.stack([surface.derivative(u, order) @ view for order in ((1, 0), (0, 1))], axis=1)
         # How the distance along the view changes with the tip: the surface point behind it moves too.
-        towards = np.stack([surface.derivative(u, order) @ view for order in ((1, 0), (0, 1))], axis=1) @ camera.linear - view
+        towards = slope @ camera.linear - view
         behind, nearest = np.split(surface.covariance(np.concatenate([u, found.nearest_u[rows]])), 2)
         normal = surface.normal(found.nearest_u[rows])
         for sd, direction, along, own, at_mm in (
@@ -79,7 +80,8 @@ class TipDistance:
             (result.normal_sd_mm, normal, normal, nearest, found.nearest_mm[rows]),
         ):
             # The calibration puts the surface beside the robot's points, and not the tip.
-            variance = np.einsum("ni,nij,nj->n", direction, covariance[rows] + tracker.point_covariance(at_mm), direction)
+            apart = covariance[rows] + tracker.point_covariance(at_mm)
+            variance = np.einsum("ni,nij,nj->n", direction, apart, direction)
             sd[rows] = np.sqrt(variance + np.einsum("ni,nij,nj->n", along, own, along) + drift**2)
         result.approach_mm_s[rows] = -np.einsum("ni,ni->n", towards, self._velocity[rows])
         result.margin_mm = -ndtri(self.settings.miss_rate) * result.distance_sd_mm

@@ -50,7 +50,8 @@ def _vessel_tree(rng: np.random.Generator, disc_mm: np.ndarray, kind: str) -> li
         line, widths, wiggle, step, since = [point], [width], 0.0, 0.12, 0.0
         while width > 0.02 and np.abs(point).max() < EXTENT_MM / 2:
             wiggle = 0.8 * wiggle + rng.normal(0, 0.03)
-            heading += bend * step + wiggle + 0.03 * np.sin(np.arctan2(*(point - disc_mm)[::-1]) - heading)
+            outwards = np.arctan2(*(point - disc_mm)[::-1])
+            heading += bend * step + wiggle + 0.03 * np.sin(outwards - heading)
             bend *= 0.99
             point = point + step * np.array([np.cos(heading), np.sin(heading)])
             width *= 0.994
@@ -119,7 +120,8 @@ def fundus_texture(seed: int, size_px: int = 2048, rim_mm: float = 9.3) -> np.nd
     texture = np.empty((size_px, size_px, 3), np.uint8)
     for channel in range(3):
         retina = pigment[channel] * np.exp(-(0.75, 1.0, 1.1)[channel] * density - 0.35 * ring)
-        value = retina + disc_share * ((_DISC[channel] * (0.75 + 0.35 * cup) * np.exp(-0.4 * density)) - retina)
+        pale = _DISC[channel] * (0.75 + 0.35 * cup) * np.exp(-0.4 * density)
+        value = retina + disc_share * (pale - retina)
         value *= np.exp(-_BLOOD["artery"][channel] * 0.55 * artery_map - _BLOOD["vein"][channel] * 0.75 * vein_map)
         value += 0.09 * reflex * (1.0, 0.55, 0.45)[channel]
         sclera = _SCLERA[channel] * np.exp(-(0.6, 1.0, 1.0)[channel] * (0.25 + blotches)) * (1 - 0.15 * border)

@@ -66,7 +66,8 @@ def _colours(x: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 def _field(shape: tuple[int, int], rng: np.random.Generator, cells: int) -> np.ndarray:
     """A smooth random field (h, w) between 0 and 1."""
-    return cv2.resize(rng.random((cells, cells)).astype(np.float32), shape[::-1], interpolation=cv2.INTER_CUBIC).clip(0, 1)
+    small = rng.random((cells, cells)).astype(np.float32)
+    return cv2.resize(small, shape[::-1], interpolation=cv2.INTER_CUBIC).clip(0, 1)
 
 
 def _light(x: np.ndarray, u: np.ndarray, hidden: np.ndarray, rng: np.random.Generator, length_px: float) -> np.ndarray:

@@ -165,7 +165,8 @@ class ToolSource(SceneSource):
         off = np.array([abs(turn), abs(np.log(scale)), zoom * np.linalg.norm(own - centre)])
         if not np.isfinite(off).all() or (off > np.array(_SHOWS_NOT)[:, 0]).any():
             return image, np.full((3, 2), -float(windows.TOOL_PX)), np.zeros(3, int)
-        return _mirrored(image, u if (off < np.array(_SHOWS)[:, 1]).all() else np.full((3, 2), np.nan), visibility, rng)
+        shows = (off < np.array(_SHOWS)[:, 1]).all()
+        return _mirrored(image, u if shows else np.full((3, 2), np.nan), visibility, rng)
 
     def _elsewhere(self, scene, centre: np.ndarray, angle: float, length: float, rng: np.random.Generator):
         """A window anywhere, or one by the tool that is turned, of another scale or shifted too far."""
