@@ -90,6 +90,17 @@ class MatrixCamera:
         back = motion.inverse()
         return replace(self, matrix=np.column_stack([self.linear @ back.R, self.linear @ back.t + self.offset_px]))
 
+    def resect(self, *, mirrored: bool = False) -> Resection:
+        """K, R and t of the camera of `matrix` by RQ factorisation (paper Eq. 5).
+
+        With optics that flip the image (`mirrored`: an odd number of reflections) R maps to the unflipped camera frame,
+        whose third axis still points away from the camera.
+        """
+        K, R = rq(self.linear, mode="economic")  # (2, 2) and (2, 3), but for the signs
+        signs = np.sign(np.diag(K)) * [-1.0 if mirrored else 1.0, 1.0]
+        K, R = K * signs, R * signs[:, None]
+        return Resection(K, np.vstack([R, np.cross(*R)]), np.linalg.solve(K, self.offset_px), mirrored)
+
 
 class AffineCamera(MatrixCamera):
     """u = matrix @ [x; 1], matrix (2, 4) in px per mm and px."""
@@ -106,17 +117,6 @@ class AffineCamera(MatrixCamera):
     def projection_matrix(self) -> np.ndarray:
         """Homogeneous P (3, 4); an affine camera's last row is (0, 0, 0, 1)."""
         return np.vstack([self.matrix, [0.0, 0.0, 0.0, 1.0]])
-
-    def resect(self, *, mirrored: bool = False) -> Resection:
-        """K, R and t of the camera by RQ factorisation (paper Eq. 5).
-
-        With optics that flip the image (`mirrored`: an odd number of reflections) R maps to the unflipped camera frame,
-        whose third axis still points away from the camera.
-        """
-        K, R = rq(self.linear, mode="economic")  # (2, 2) and (2, 3), but for the signs
-        signs = np.sign(np.diag(K)) * [-1.0 if mirrored else 1.0, 1.0]
-        K, R = K * signs, R * signs[:, None]
-        return Resection(K, np.vstack([R, np.cross(*R)]), np.linalg.solve(K, self.offset_px), mirrored)
 
 
 @dataclass(frozen=True, eq=False)

@@ -116,19 +116,20 @@ def test_a_red_verdict_writes_nothing_but_itself(tmp_path, capsys):
 
 
 def test_cameras_of_a_finite_distance_are_calibrated_as_such(tmp_path, capsys, monkeypatch):
-    """The cure of `finite_distance` can be followed on the command line."""
+    """Unasked; as affine ones, if somebody insists, they are refused with the reason."""
     microscope = Microscope(pixels_per_mm=(20.0, 20.0), image_size_px=(384, 216), inverse_distance_per_mm=1 / 50)
     design = Design(Eye(texture_px=128), microscope=microscope, motion="sweep", duration_s=20.0, click_px=0.1)
     simulate(tmp_path / "eye", design, n_frames=24, progress=False)
     argv = [str(tmp_path / "eye"), *LABELS, "--out", str(tmp_path / "out")]
-    assert commands.main_calibrate(argv) == 3 and "finite_distance" in capsys.readouterr().out
-    assert commands.main_calibrate([*argv, "--model", "near_affine"]) == 0
-    assert "finite_distance" not in capsys.readouterr().out
+    assert commands.main_calibrate([*argv, "--model", "zero_skew"]) == 3 and "finite_distance" in capsys.readouterr().out
+    assert commands.main_calibrate(argv) == 0
+    said = capsys.readouterr().out
+    assert "working distance" in said and "finite_distance" not in said
     assert json.loads((tmp_path / "out" / "calibration.json").read_text())["model"] == "near_affine"
     (tmp_path / "out" / "depth.tiff").write_bytes(b"of affine cameras, earlier")
     monkeypatch.setattr(commands, "save_mesh", lambda mesh, path: None)
     monkeypatch.setattr(commands, "save_points", lambda path, x_mm, colours: None)
-    assert commands.main_reconstruct([*argv, "--model", "near_affine", "--setting", "fast"]) == 0
+    assert commands.main_reconstruct([*argv, "--setting", "fast"]) == 0
     assert not (tmp_path / "out" / "depth.tiff").exists(), "it would pass for this run's"
     with pytest.raises(ValueError, match="unknown model 'near'; take one of .*near_affine"):
         commands.main_calibrate([*argv, "--model", "near"])

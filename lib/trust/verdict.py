@@ -246,7 +246,8 @@ def assess(
     Args:
         data: Its correspondences (detected, labelled); None runs the detector, the one that ships if none is given.
         detector: The one that made `data`; with it some frames are looked at again, mirrored and shifted.
-        options: Of `lib.calibration.calibrate`, such as model="near_affine".
+        options: Of `lib.calibration.calibrate`, such as model="affine".  Without a model the cameras are affine ones, or of
+            a finite distance where the detections show one.
     """
     if data is None:
         detector = detector or Detector.load()
@@ -265,6 +266,10 @@ def assess(
         u = [c.centre_px + (c.undistort(u) - c.centre_px) * c.depth_ratio(data.x_mm)[:, None] for c, u in told]
         straight = replace(data, u_left=u[0], u_right=u[1])
     diagnosis = diagnose(straight, **stated)
+    if "model" not in options and (best := diagnosis.best) is not None and best.name == "finite_distance" and best.value > 0:
+        near = assess(recording, data, detector=detector, model="near_affine", **options)
+        if near.calibration is not None:
+            return near
     found = health(recording, data, calibration, detector=detector)
     verdict = judge(
         data, calibration, diagnosis=diagnosis, health=found, epipolar_px=epipolar_px, error=error,

@@ -20,8 +20,11 @@ from notebooks.figures.style import figure, show_image
 _ROWS = (12, 3)
 
 
-def believed(assessed: Assessment, *, force: bool) -> Calibration:
-    """The calibration of a recording; without one, or on a red one unless `force`, the notebook ends here and says why."""
+def believed(assessed: Assessment, *, force: bool, affine: bool = False) -> Calibration:
+    """The calibration of a recording; without one, or on a red one unless `force`, the notebook ends here and says why.
+
+    So it does where it needs `affine` cameras and these are not.
+    """
     left_out = "So what follows from the cameras (surface, distance, registration) is not computed, and the rest of this"
     left_out += " notebook is left out. The verdict above says why, and what to do."
     if assessed.calibration is None:
@@ -29,16 +32,23 @@ def believed(assessed: Assessment, *, force: bool) -> Calibration:
     if assessed.verdict.is_red and not force:
         anyway = "With `-p force True` the notebook goes on in spite of it."
         report.stop(f"The calibration of this recording is not trustworthy. {left_out} {anyway}")
+    if affine and not assessed.calibration.pair.is_affine:
+        report.stop(
+            "The cameras of this recording have a finite distance. This notebook works out step by step what holds for "
+            "affine ones, so its rest is left out. Notebooks 00 and 07 reconstruct with the cameras as they are."
+        )
     return assessed.calibration
 
 
-def half_and_rest(data: Correspondences, chosen: np.ndarray) -> tuple[Calibration | None, Correspondences]:
+def half_and_rest(
+    data: Correspondences, chosen: np.ndarray, *, model: str = "zero_skew"
+) -> tuple[Calibration | None, Correspondences]:
     """A calibration with the rows `chosen`, and the others with its offsets; None, with a line that says so, if too few."""
     rows = data.subset(chosen), data.subset(~chosen)
     try:
         if any(len(part.complete) < least for part, least in zip(rows, _ROWS, strict=True)):
             raise ValueError(f"a calibration needs {_ROWS[0]} landmarks seen in both images, its check {_ROWS[1]}.")
-        half = calibrate(rows[0])
+        half = calibrate(rows[0], model=model)
     except ValueError as error:
         print(f"The recording is too short to hold out frames: {error}")
         return None, rows[1]
