@@ -91,7 +91,7 @@ class MatrixCamera:
         return replace(self, matrix=np.column_stack([self.linear @ back.R, self.linear @ back.t + self.offset_px]))
 
     def resect(self, *, mirrored: bool = False) -> Resection:
-        """K, R and t of the camera of `matrix` by RQ factorisation (paper Eq. 5).
+        """K, R and t by RQ factorisation (paper Eq. 5), of a near-affine camera those of `matrix`.
 
         With optics that flip the image (`mirrored`: an odd number of reflections) R maps to the unflipped camera frame,
         whose third axis still points away from the camera.

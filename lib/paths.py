@@ -18,11 +18,6 @@ RECORDING_NOTE = "recording.txt"
 SHARED_VARIABLE = "MICROSTEREO_SHARED"
 
 
-def recording_folder(folder: str = "") -> Path:
-    """The folder of a recording as a notebook's parameter names it, from the workbench's root; "" is the one that ships."""
-    return ROOT / folder if folder else SHIPPED_RECORDING
-
-
 def results_folder(name: str, recording: Path) -> Path:
     """Make the folder runs/NAME for a recording's results; a FileExistsError where it holds another recording's."""
     folder, recording = RUNS / name, recording.resolve()

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from lib.calibration.checks import extents
 from lib.calibration.models import Fit
 from lib.calibration.robust import gate
-from lib.cameras import Camera, Points, Resection, StereoRig
+from lib.cameras import Camera, Points, StereoRig
 from lib.correspondences import Correspondences
 from lib.geometry import RigidTransform, pair_covariance, points, precision, view_distances2
 from lib.least_squares import inverse
@@ -140,10 +140,6 @@ class Calibration:
             if "1/distance" in name:
                 return float(self.minimum.state.rho[0]), float(np.sqrt(self.parameter_covariance[i, i]))
         return 0.0, 0.0
-
-    def resections(self) -> tuple[Resection, ...]:
-        """K, R, t (paper Eq. 5) of each camera, or of the affine camera that touches a near-affine one."""
-        return tuple(camera.resect() for camera in self.cameras)
 
     @property
     def noise_px2(self) -> np.ndarray:

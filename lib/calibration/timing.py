@@ -195,7 +195,8 @@ def _rms_px(x: np.ndarray, y: np.ndarray, views: np.ndarray) -> np.ndarray:
     squares = np.zeros(len(x))
     for c, rows in enumerate(views.T):
         own, u = (v - v.mean(axis=-2, keepdims=True) for v in (x[:, rows], y[rows, 2 * c : 2 * c + 2]))
-        squares += ((u - own @ (np.linalg.pinv(own.mT @ own, hermitian=True) @ (own.mT @ u))) ** 2).sum(axis=(1, 2))
+        A = np.linalg.pinv(own.mT @ own, hermitian=True) @ (own.mT @ u)
+        squares += ((u - own @ A) ** 2).sum(axis=(1, 2))
     return np.sqrt(squares / views.sum())
 
 

@@ -5,6 +5,7 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 
@@ -73,8 +74,7 @@ class Settings:
         check(self, "miss_rate", lambda value: 0 < value < 0.5, "expected a probability below one half")
 
 
-def _unknown() -> np.ndarray:
-    return np.full(len(LANDMARKS), np.nan)
+_unknown = partial(np.full, len(LANDMARKS), np.nan)
 
 
 @dataclass

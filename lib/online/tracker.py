@@ -106,8 +106,6 @@ class RigTracker:
         if self.state == "tracking" and accepted:
             self.rests_on_s = result.time_s
 
-    # --- calibration --------------------------------------------------------------------------------------------------
-
     def _takes_in(self, accepted: list[Seen]) -> bool:
         """As soon as possible, then whenever a quarter more frames are at hand; never again once the cameras moved."""
         first, last = self.settings.calibration_frames
@@ -156,8 +154,6 @@ class RigTracker:
             used = found.inliers.reshape(len(part), -1).any(axis=1)
             return found, [frame for frame, fine in zip(part, used, strict=True) if fine]
         raise refused or ValueError("the robot's positions lie too far apart.")
-
-    # --- watch --------------------------------------------------------------------------------------------------------
 
     def _watch(self, result: FrameResult, frame: Seen) -> list[Seen]:
         """Do images and robot still agree?  If not, why not?  Returns frames that may improve the rig."""
@@ -265,8 +261,6 @@ class RigTracker:
     def _fits(self, rig: StereoRig, frames: Sequence[Correspondences]) -> bool:
         data = Correspondences.join(frames).complete
         return bool(len(data) and misfit(rig, data, self._noise(data)) <= CONVINCING * len(data))
-
-    # --- noise --------------------------------------------------------------------------------------------------------
 
     def corrected(self, data: Correspondences) -> Correspondences:
         """With the landmarks where the detector sees them; the frames before tell the axes of shut and crossed jaws."""

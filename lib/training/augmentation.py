@@ -4,7 +4,7 @@ Kornia's elastic, thin-plate and fisheye transforms are left out: they move the 
 shifts content unless its direction is 0.  Random numbers come from a batch's own generator: a resumed training repeats them.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import kornia.augmentation as K
@@ -48,15 +48,11 @@ class Augmentation:
     Attributes:
         rotation_deg: Up to this angle either way, about the image's centre.
         zoom: Factor, drawn uniformly from this range.
-        shift: Part of the image's size, either way.
-        mirror: Flip top and bottom every second time, and swap the tips.
         photometric, photometric_share: Strength (0 to 1) of the changes of light and optics; part of a batch that has them.
     """
 
     rotation_deg: float = 30.0
     zoom: tuple[float, float] = (0.75, 1.25)
-    shift: float = 0.0
-    mirror: bool = False
     photometric: float = 0.0
     photometric_share: float = 1.0
 
@@ -70,18 +66,12 @@ class Augmentation:
         with torch.random.fork_rng(devices=[]):  # kornia draws from torch's global generator
             torch.manual_seed(int(rng.integers(2**63)))
             images, u, visibility = batch.images, batch.u.clone(), batch.visibility.clone()
-            if self.rotation_deg or self.shift or self.zoom != (1.0, 1.0):
-                shift = (self.shift, self.shift) if self.shift else None
-                affine = K.RandomAffine(self.rotation_deg, translate=shift, scale=self.zoom, padding_mode="border", p=1.0)
+            if self.rotation_deg or self.zoom != (1.0, 1.0):
+                affine = K.RandomAffine(self.rotation_deg, scale=self.zoom, padding_mode="border", p=1.0)
                 both = K.AugmentationSequential(affine, data_keys=["input", "keypoints"])
                 images, u = both(images, u.to(images.dtype))  # NaN points stay NaN
             if changed:
                 images = torch.cat([self.light()(images[:changed]).clamp(0, 1), images[changed:]])
-        if self.mirror:
-            flip = np.flatnonzero(rng.random(len(u)) < 0.5)
-            images = images.index_copy(0, torch.from_numpy(flip).to(images.device), images[flip].flip(-2))
-            u[flip, :, 1] = images.shape[-2] - 1 - u[flip, :, 1]
-            u[flip], visibility[flip] = u[flip][:, [0, 2, 1]], visibility[flip][:, [0, 2, 1]]
         if changed:
             self._occlude(images[:changed], u[:changed], visibility[:changed], rng)
         u = u.to(batch.u.dtype)
@@ -126,11 +116,9 @@ def leave_frame(u: Tensor, visibility: Tensor, image_size: tuple[int, int]) -> T
     return torch.where(outside, 0, visibility)
 
 
-_STILL = Augmentation(0.0, (1.0, 1.0))  # windows are rotated and zoomed where they are cut out
-#: None, where sources change what they draw; the paper's; a stronger one; and the one of closeups.
+#: None, where sources change what they draw; the paper's; and that of closeups, which are turned and mirrored already.
 AUGMENTATIONS = {
-    "none": _STILL,
+    "none": Augmentation(0.0, (1.0, 1.0)),
     "paper": Augmentation(),
-    "best": Augmentation(180.0, (0.7, 1.3), shift=0.15, mirror=True, photometric=1.0),
-    "closeups": replace(_STILL, photometric=1.0, photometric_share=0.25),  # closeups of tip_2 are mirrored already
+    "closeups": Augmentation(0.0, (1.0, 1.0), photometric=1.0, photometric_share=0.25),
 }

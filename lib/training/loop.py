@@ -103,8 +103,7 @@ class TrainingConfig:
 PRESETS = {
     "paper": TrainingConfig(),
     "best": TrainingConfig(
-        augmentation=AUGMENTATIONS["best"], batch_size=12, optimiser="adamw", learning_rate=2e-3, schedule="cosine",
-        ema=0.998, clip=1.0, precision="bf16",
+        batch_size=12, optimiser="adamw", learning_rate=2e-3, schedule="cosine", ema=0.998, clip=1.0, precision="bf16",
     ),
 }
 

@@ -46,7 +46,8 @@ class Shape:
             tried = tried[np.abs(np.arange(len(tried)) - np.flatnonzero(tried == before)[0]) <= 1]
         freedom, s2 = tried[:, None], np.full((len(tried), 1), start**2)
         for _ in range(4):
-            s2 = np.maximum((((freedom + 2.0) / (freedom + r2 / s2)) * r2).mean(axis=1, keepdims=True) / 2.0, _LEAST_PX**2)
+            weight = (freedom + 2.0) / (freedom + r2 / s2)
+            s2 = np.maximum((weight * r2).mean(axis=1, keepdims=True) / 2.0, _LEAST_PX**2)
         best = cls(np.sqrt(s2), freedom).log_density(r2).sum(axis=1).argmax()
         return cls(float(np.sqrt(s2[best, 0])), float(tried[best]))
 

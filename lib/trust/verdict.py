@@ -191,7 +191,7 @@ def _residuals(data: Correspondences | None, c: Calibration, robot_mm: float) ->
 
 def _geometry(c: Calibration, robot_mm: float) -> Iterator[tuple]:
     """What `_reason` takes: the optics that follow from the cameras, and the volume that the tool covered."""
-    zooms, name = np.array([np.diag(resection.K) for resection in c.resections()]), "implausible_optics"
+    zooms, name = np.array([np.diag(camera.resect().K) for camera in c.cameras]), "implausible_optics"
     cure = "Check axes and units of the kinematics, the order of the tips, and which image is left."
     aspect = float(np.exp(np.abs(np.log(zooms[:, 0] / zooms[:, 1])).max()))
     text = f"A camera's zoom differs by a factor of {aspect:.2f} between x and y; pixels are square within some per cent."
@@ -246,8 +246,7 @@ def assess(
     Args:
         data: Its correspondences (detected, labelled); None runs the detector, the one that ships if none is given.
         detector: The one that made `data`; with it some frames are looked at again, mirrored and shifted.
-        options: Of `lib.calibration.calibrate`, such as model="affine".  Without a model the cameras are affine ones, or of
-            a finite distance where the detections show one.
+        options: Of `lib.calibration.calibrate`.  Without `model` cameras are affine, or of a finite distance if that shows.
     """
     if data is None:
         detector = detector or Detector.load()
@@ -302,7 +301,7 @@ def report(calibration: Calibration, *, verdict: Verdict | None = None, robot_ac
         f"  chi-square    {value:.0f} for {freedom} degrees of freedom",
         "  volume        {:.2f} x {:.2f} x {:.2f} mm RMS".format(*c.extents_mm),
     ]
-    for name, resection in zip(["left", "right"] if c.rig else ["camera"], c.resections(), strict=True):
+    for name, resection in zip(["left", "right"] if c.rig else ["camera"], (k.resect() for k in c.cameras), strict=True):
         (zoom_x, skew), (_, zoom_y) = resection.K
         at = ", ".join(f"{value:.3f}" for value in resection.t)
         lines.append(f"  {name:12s}  zoom {zoom_x:.3f} x {zoom_y:.3f} px/mm, skew {skew:z.3f} px/mm, offset ({at}) mm")

@@ -106,8 +106,7 @@ def recorded(name: str, folder: Path = paths.RESULTS) -> Iterator[Table]:
 def write(name: str, rows: Iterable[Mapping], provenance: Mapping, folder: Path = paths.RESULTS) -> None:
     """Write the table `name`: one mapping a row (None and NaN become empty entries, numbers keep six digits).
 
-    `provenance` is as `lib.provenance.Provenance.so_far` gives it.  The record counts how often it was made: that often its
-    test set, if it has one, was opened.
+    `provenance` is as `Provenance.so_far` gives it; the record adds how often it was made, and so its test set was opened.
     """
     folder.mkdir(parents=True, exist_ok=True)
     before = read(name, folder)

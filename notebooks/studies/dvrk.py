@@ -151,7 +151,7 @@ class SphereFit:
     def focal_px(self) -> float:
         """Zoom over 1/distance: the focal length of the pinhole camera this is; infinite for an affine camera."""
         distance, _ = self.calibration.inverse_distance_per_mm
-        K = self.calibration.resections()[0].K
+        K = self.calibration.cameras[0].resect().K
         return float(np.sqrt(K[0, 0] * K[1, 1]) / distance) if distance else float("inf")
 
 

@@ -106,7 +106,7 @@ def test_constraints_hold_and_cost_grows_with_them():
     for model in ("affine", "zero_skew", "square", "common_zoom"):
         found = calibrate(c.x_mm, [c.u_left, c.u_right], model=model, sigma_u_px=1.5, sigma_x_mm=0.01, ransac_px=np.inf)
         costs.append(found.cost)
-        K = np.stack([r.K for r in found.resections()])
+        K = np.stack([camera.resect().K for camera in found.cameras])
         if model != "affine":
             np.testing.assert_allclose(K[:, 0, 1], 0, atol=1e-9)
         if model in ("square", "common_zoom"):

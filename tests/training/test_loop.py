@@ -21,7 +21,7 @@ from tests.toys import toy_samples
 SMALL = replace(
     PRESETS["best"],
     network=HourglassConfig(6, 1, 2),
-    augmentation=Augmentation(20.0, (0.8, 1.2), photometric=0.5, mirror=True),
+    augmentation=Augmentation(20.0, (0.8, 1.2), photometric=0.5),
     steps=6,
     batch_size=2,
     validate_every=2,
@@ -262,7 +262,7 @@ def test_images_of_another_type_are_refused():
 @pytest.mark.parametrize("precision", ["fp32", "bf16"])
 def test_a_gpu_learns_what_a_cpu_does_and_resumes(gpu, monkeypatch, toy, tmp_path, precision):
     """But for rounding, which Adam's first steps make large, and noise, which a GPU draws by itself."""
-    still = Augmentation(20.0, (0.8, 1.2), mirror=True)
+    still = Augmentation(20.0, (0.8, 1.2))
     config = replace(SMALL, augmentation=still, steps=12, validate_every=4, precision=precision)
     data = toy(6), toy(2, seed=1)
     train(config, *data, tmp_path, progress=False, max_seconds=0)  # stops after a step
