@@ -13,7 +13,7 @@ import torch
 from lib.landmarks.heatmaps import render
 from lib.landmarks.network import HourglassConfig, OffsetConfig, OffsetNetwork, StackedHourglass
 from lib.training import loop
-from lib.training.augmentation import Augmentation, Batch
+from lib.training.augmentation import AUGMENTATIONS, Augmentation, Batch
 from lib.training.loop import PRESETS, TrainingConfig, heatmap_loss, load_training, offset_loss, train
 from lib.training.samples import Mixed, Samples
 from tests.toys import toy_samples
@@ -28,7 +28,7 @@ SMALL = replace(
 )
 TOGETHER = replace(
     PRESETS["best"], network=HourglassConfig(6, 1, 2), steps=12, batch_size=2, validate_every=4, precision="fp32",
-    learning_rate=4e-3,
+    learning_rate=4e-3, augmentation=AUGMENTATIONS["none"],
 )  # fmt: skip
 
 
