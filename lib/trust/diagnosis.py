@@ -25,7 +25,7 @@ _ROBOT_MM = 0.04  # a robot for eye surgery is better
 _SKEW_SD, _ASPECT_SD = 0.002, 0.003
 #: A common log aspect above this is no lens: the images were resized, and their aspect is free.
 _RESIZED = 0.1
-_STILL_PX = 0.1  # detections of one picture differ by less
+_STILL_PX = 0.3  # detections of one picture differ by less
 BY_HANDEDNESS = ("mirrored_axis", "exchanged_eyes", "mirrored_images")  # which the residuals do not show
 _ACROSS = 0.15  # sine of a tool's angle to the images, below which it points neither way
 _UPSIDE_DOWN = 20.0  # odds that a microscope sees the tips of a tool below its base
