@@ -74,13 +74,13 @@ def _scan(case: Case, half_s: float, rate: float = 1.0) -> tuple[np.ndarray, np.
 
 def _clock_rate(case: Case) -> Iterator[Hypothesis]:
     """A wrong frame rate, or frames in reverse; one that is far off is sought only where the residuals are large."""
-    far = case.misfit(case.null, *case.fits.values()) >= FITS
-    scans = {rate: _scan(case, 0.2 * case.paths.span_s, rate) for rate in (1.0, *(_RATES if far else ()))}
-    rate = min(scans, key=lambda r: scans[r][1].sum(axis=1).min())
-    trial, misfit = scans[rate]
-    score = misfit.sum(axis=1)
-    fitted = _refined(case, float(trial[score.argmin()]), (0, 1), rate) if np.isfinite(score).any() else None
-    if fitted is None:
+    rate, shift = 1.0, 0.0
+    if case.misfit(case.null, *case.fits.values()) >= FITS:
+        scans = {rate: _scan(case, 0.2 * case.paths.span_s, rate) for rate in (1.0, *_RATES)}
+        rate = min(scans, key=lambda r: scans[r][1].sum(axis=1).min())
+        trial, misfit = scans[rate]
+        shift = float(trial[misfit.sum(axis=1).argmin()])
+    if (fitted := _refined(case, shift, (0, 1), rate)) is None:
         return
     fit, problem, (_, value), (_, sd) = fitted
     if rate < 0:
