@@ -81,7 +81,7 @@ def main_detect(argv: list[str]) -> int:
     data = _data(a, recording)
     _write_landmarks(out / "landmarks.csv", recording, data)
     print(f"{int(data.seen.sum())} of {data.seen.size} landmarks found. Wrote {out / 'landmarks.csv'}.")
-    print(assess(recording, data, detector=a.detector, **a.model).verdict)
+    print(assess(recording, data, detector=a.detector, **a.options).verdict)
     return 0
 
 
@@ -144,7 +144,7 @@ def main_register(argv: list[str]) -> int:
     print(f"The cameras moved by {shift_mm:.3f} mm at the tool, standard deviation {found.translation_sd_mm.max():.3f} mm.")
     if len(seen):
         print(f"The tool is now {medians[1]:.3f} mm from where the robot reports it (median).")
-    found = assess(recording, data, detector=a.detector, **a.model)
+    found = assess(recording, data, detector=a.detector, **a.options)
     return _done(a, out, "registration", numbers, Verdict.join([_as_one(moved, found), found.verdict]))
 
 
@@ -182,8 +182,8 @@ def _parsed(
         parser.error("--weights: with --landmarks annotations no detector looks; leave one of the two out.")
     if frame and a.rig and (a.model or a.force):
         parser.error("--model, --force: with --rig no camera is calibrated; leave them out, or --rig.")
-    a.model = {"model": a.model} if a.model else {}
-    Model.parse(a.model.get("model", "zero_skew"), 2)  # an unknown one is refused
+    a.options = {"model": a.model} if a.model else {}
+    Model.parse(a.model or "zero_skew", 2)  # an unknown one is refused
     recording = Recording.open(a.recording)
     if frame and not -len(recording) <= a.frame < len(recording):
         parser.error(f"--frame: the recording has frames 0 to {len(recording) - 1}.")
@@ -219,7 +219,7 @@ def _calibrated(
         text = f"{a.rig} was not calibrated from this recording, and nothing here tests it."
         cure = f"Run: {shlex.join(['python3', '-m', 'lib', 'register', str(a.recording), '--rig', str(a.rig)])}"
         return StereoRig.load(a.rig), Verdict((Reason("rig_given", LEVELS[1], text, cure),)), data
-    found = assess(recording, data, detector=a.detector, **a.model)
+    found = assess(recording, data, detector=a.detector, **a.options)
     if found.calibration is not None and (a.force or not found.verdict.is_red):
         (out / "verdict.json").unlink(missing_ok=True)  # of an earlier run that was refused
         return found.calibration, found.verdict, data

@@ -148,9 +148,8 @@ def _facts(recording: Recording, a: Assessment) -> dict[str, str]:
         offsets = zip(LANDMARKS, 1e3 * c.offsets.offset, strict=False)
         parts = ["{}: {:+z.0f}, {:+z.0f}, {:+z.0f} um".format(name, *value) for name, value in offsets]
         facts["landmark offsets"] = "; ".join(parts) + " (along, across, normal)."
-    distance, sd = (0.0, 0.0) if c is None else c.inverse_distance_per_mm
-    if sd > 0:
-        facts["cameras"] = f"of a finite distance, {1 / distance:.0f} +- {sd / distance**2:.0f} mm, as the detections show."
+    if c is not None and (far := c.inverse_distance_per_mm)[1] > 0:
+        facts["cameras"] = f"of a finite distance, {1 / far[0]:.0f} +- {far[1] / far[0] ** 2:.0f} mm, as the detections show."
     bad = f"{int((a.health.score > 1).sum())} of {len(a.health.frame)} frames have a score above 1"
     facts["detector"] = f"{a.health.text}; {bad} (of frames with right landmarks {100 * a.health.false_alarm_rate:.0f} %)."
     if np.isfinite(a.epipolar_px):

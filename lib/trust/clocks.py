@@ -103,7 +103,7 @@ def _frame_order(case: Case) -> Iterator[Hypothesis]:
     share = float((np.abs(shifts[own]) > step / 2).mean())
     if share * case.frames < 3:  # it may be a spike of the log
         return
-    text = f"{100 * share:.0f} % of frames fit instants {1e3 * shifts[0]:.0f} to {1e3 * shifts[-1]:.0f} ms later, better."
+    text = f"{100 * share:.0f} % of the frames fit better {1e3 * shifts[0]:.0f} to {1e3 * shifts[-1]:.0f} ms later."
     cure = "Sort the frames, look for lost ones, and write each one's true time to frames.csv."
     counts = np.bincount(own, minlength=len(shifts)) / case.frames
     chosen = -case.frames * float((counts * np.log(np.maximum(counts, 1e-9))).sum())  # what the choices may cost
@@ -124,7 +124,7 @@ def _readout(case: Case) -> Iterator[Hypothesis]:
         readout_s = case.readout_s + value
         if readout_s < -3 * sd:
             who, them = ("Both images are", "both") if len(views) == 2 else (f"The {SIDES[views[0]]} image is", "it")
-            text = f"{who} turned by 180 degrees: rows are read from the bottom up, in {-1e3 * readout_s:.1f} ms."
+            text = f"{who} turned by 180 degrees: rows are read upwards, in {-1e3 * readout_s:.1f} +- {1e3 * sd:.1f} ms."
             cure = f"Turn {them} by 180 degrees, with readout_s = {-readout_s:.4f}."
             yield case.found("turned_image", fit, 1, (1e3 * readout_s, 1e3 * sd, "ms"), text, cure, on=known)
         elif len(views) == 2:

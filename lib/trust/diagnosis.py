@@ -15,7 +15,7 @@ from lib.calibration.checks import eyes_exchanged, sides
 from lib.correspondences import LANDMARKS, TRAIN_FURTHER, Correspondences
 from lib.recordings import Kinematics
 from lib.trust.clocks import TIME_TESTS
-from lib.trust.fitting import FITS, LEAST_EXPLAINED, LEAST_GAIN, SIDES, Case, Hypothesis, Problem, Robust
+from lib.trust.fitting import FITS, SIDES, Case, Hypothesis, Problem, Robust
 from lib.trust.health import affine_epipolar
 
 _MOST_ROWS, _FEWEST_FRAMES = 1200, 4  # of three frames nothing checks anything
@@ -65,7 +65,8 @@ def _finite_distance(case: Case) -> Iterator[Hypothesis]:
     def columns(M: np.ndarray) -> np.ndarray:
         normal = np.cross(M[:, 0, :3], M[:, 1, :3])
         depth = np.einsum("ncj,cj->nc", problem.x, normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12))
-        return -(depth[:, :, None] * (np.einsum("cij,ncj->nci", M[:, :, :3], problem.x) + M[:, :, 3] - centre))[..., None]
+        pixel = np.einsum("cij,ncj->nci", M[:, :, :3], problem.x) + M[:, :, 3] - centre
+        return -(depth[:, :, None] * pixel)[..., None]
 
     fit, value, sd = case.linear(columns)
     far = f"by a working distance of {1 / value:.0f} mm" if value > 0 else "the wrong way, as in a mirrored image"
@@ -337,13 +338,10 @@ class Diagnosis:
 
     hypotheses: tuple[Hypothesis, ...] = ()
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "hypotheses", tuple(sorted(self.hypotheses, key=lambda h: -h.gain)))
-
     @property
     def best(self) -> Hypothesis | None:
         """The fault that the data show; None where nothing beats "nothing is wrong"."""
-        return next((h for h in self.hypotheses if h.gain >= LEAST_GAIN and h.explained >= LEAST_EXPLAINED), None)
+        return max((h for h in self.hypotheses if h.is_named), key=lambda h: h.gain, default=None)
 
     def __str__(self) -> str:
         return "no fault found" if self.best is None else f"{self.best.name}: {self.best.text} {self.best.cure}"
@@ -372,11 +370,10 @@ def diagnose(
     if len(data) > _MOST_ROWS:  # a part of the time: neighbours tell of clocks, and which part hardly matters
         data = data.of_frames(frames[np.linspace(0, len(frames) - 1, int(len(frames) * _MOST_ROWS / len(data))).astype(int)])
     problem = Problem.of(data)
-    if len(frames) < _FEWEST_FRAMES:
+    few = problem.used.all(axis=1).sum() < 6
+    if len(frames) < _FEWEST_FRAMES or (few and len(data) < 12):
         return Diagnosis()
-    if problem.used.all(axis=1).sum() < 6:
-        if len(data) < 12:
-            return Diagnosis()
+    if few:
         text = f"Only {problem.used.all(axis=1).sum()} of {len(data)} rows have both images and the robot's report."
         return Diagnosis((Hypothesis("detector_unfit", text, _UNFIT, 100.0, 0.0, "%", 1.0, float(len(data))),))
     tracks = [(problem.landmark == k) & problem.used.all(axis=1) for k in np.unique(problem.landmark)]
@@ -393,4 +390,5 @@ def diagnose(
     turned = best is not None and best.name == "turned_image" and best.text.startswith("Both")  # then left is right
     found += [h for h in _optics(case, fit, -1.0 if turned else 1.0) if np.isfinite(h.gain)]
     best = Diagnosis(found).best
-    return Diagnosis((*found, *_unexplained(case, case.null if best is None else case.fits.get(best.name, fit))))
+    found += _unexplained(case, case.null if best is None else case.fits.get(best.name, fit))
+    return Diagnosis(tuple(sorted(found, key=lambda h: -h.gain)))

@@ -22,7 +22,7 @@ from lib.recordings import Kinematics
 SIDES = ("left", "right")
 #: Degrees of freedom tried; bivariate Cauchy to nearly Gaussian.
 _FREEDOM = np.array([0.7, 1.0, 2.0, 4.0, 10.0, 100.0])
-LEAST_GAIN, LEAST_EXPLAINED = 6.0, 0.02  # of a hypothesis that is named
+_LEAST_GAIN, _LEAST_EXPLAINED = 6.0, 0.02  # of a hypothesis that is named
 FITS = 0.03  # the scale of the residuals over the spread of the pixels, below which cameras fit
 _LEAST_PX = 0.02  # smaller residuals are rounding
 _OFFSET_SD_MM = 0.03  # of what a detector marks beside a landmark
@@ -219,6 +219,11 @@ class Hypothesis:
     explained: float  # share of the residuals' variance, 0 to 1 (robustly, from the likelihood)
     gain: float  # log likelihood above "nothing is wrong", less the penalty for its parameters
 
+    @property
+    def is_named(self) -> bool:
+        """Whether it beats "nothing is wrong"."""
+        return self.gain >= _LEAST_GAIN and self.explained >= _LEAST_EXPLAINED
+
 
 class Case:
     """The rows, the fit `null` of "nothing is wrong", the best fit of each hypothesis, and what the hypotheses share.
@@ -302,16 +307,15 @@ class Case:
         return Hypothesis(name, text, cure, *map(float, size[:2]), size[2], float(explained), _gain(*self._evidence[text]))
 
     def compared(self, found: list[Hypothesis]) -> list[Hypothesis]:
-        """Those named with gains as if the rows of all fits told as much as those of the least design, to compare them."""
-        own = [self._evidence.get(h.text) if h.gain >= LEAST_GAIN and h.explained >= LEAST_EXPLAINED else None for h in found]
+        """Hypotheses whose gains can be compared: rows count by one design for all that are named, the least of theirs."""
+        own = [self._evidence.get(h.text) if h.is_named else None for h in found]
         least = min((e[3] for e in own if e), default=1.0)
         pairs = zip(found, own, strict=True)
         return [replace(h, gain=h.gain + max(_gain(*e[:3], least), 0) - max(_gain(*e), 0)) if e else h for h, e in pairs]
 
 
 def _gain(raw: float, n: float, extra: float, design: float) -> float:
-    """Log likelihood `raw` of n numbers less the penalty of `extra` parameters, where rows overstate by `design`."""
-    # Of few rows any addition explains much: what chance gains, by the degrees of freedom, is taken off.
+    """Log likelihood `raw` of n numbers, overstated by `design`, less what `extra` parameters of few rows gain by chance."""
     freedom = n / design - _PARAMETERS
     left = freedom - extra
     return float(left * (raw / n - 0.5 * np.log(freedom / left)) - 0.5 * extra * np.log(freedom)) if left >= 4 else -np.inf

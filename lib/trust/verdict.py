@@ -165,8 +165,7 @@ def _residuals(data: Correspondences | None, c: Calibration, robot_mm: float) ->
     gain = [(camera.jacobian(c.x_mm[used][:1]) ** 2).sum() for camera in c.cameras]
     r2, claim2 = (v.reshape(len(v), -1, 2).sum(axis=2) for v in (c.residuals_px[used] ** 2, variance))
     ratio = float(np.sqrt((r2 / (claim2 + np.multiply(gain, robot_mm**2)))[views].mean()))
-    text = f"The residuals, {c.reprojection_rms_px:.1f} px RMS, are {ratio:.1f} times as large as detector and robot claim "
-    text += f"(RMS of each over its claim); {LIMITS['residuals'][0]:g} is allowed."
+    text = f"The residuals, {c.reprojection_rms_px:.1f} px RMS, are {ratio:.1f} times what detector and robot claim of each."
     yield "residuals", ratio, text, f"Read the diagnosis of {_CHECK}: clock, axes, order of tips, detector."
 
     # What leaving a row out does to clean data: its residual grows by (1 - leverage)^-1/2.
@@ -260,7 +259,7 @@ def assess(
         epipolar_px = float(np.median(np.abs(calibration.pair.epipolar_distance(y[:, :2], y[:, 2:]))))
     stated = {name: getattr(recording, name) for name in ("kinematics", "offset_s", "readout_s", "image_size_px")}
     straight = data
-    if calibration is not None and Model.parse(calibration.model, len(calibration.cameras)).distance:  # beside it
+    if calibration is not None and Model.parse(calibration.model, len(calibration.cameras)).distance:  # what else is wrong?
         told = zip(calibration.cameras, (data.u_left, data.u_right), strict=True)
         u = [c.centre_px + (c.undistort(u) - c.centre_px) * c.depth_ratio(data.x_mm)[:, None] for c, u in told]
         straight = replace(data, u_left=u[0], u_right=u[1])
