@@ -3,8 +3,8 @@
 It works from coarse to fine.  The first stage finds the tool in the whole frame, shrunk to a fixed size.  The second names
 its landmarks in one upright window, scaled so that every tool has the same length in it; it looks twice, since the first
 look corrects direction and scale.  Where its window does not show the tool well, it decides between several places.  The
-last measures each landmark in a closeup.  An image that leaves doubt is seen again with more contrast, then swept by the
-second stage.  The first stage alone, at full resolution, is the paper's detector (Sec. III).
+last measures each landmark in a closeup.  An image that leaves doubt is seen again by wider networks, with more contrast,
+then swept by the second stage.  The first stage alone, at full resolution, is the paper's detector (Sec. III).
 """
 
 from collections.abc import Callable, Sequence
@@ -115,6 +115,7 @@ class Detector:
             ``"closeup"`` and ``"closer"`` for two closeups, the second where the first moved the landmark far, and
             ``"tracking"`` for the closeups that follow a landmark from frame to frame.
         mirror: The second look at the tool also sees the mirror image, and the mean counts: low where the two disagree.
+        in_doubt: Wider and slower networks, which see the images again that leave this detector in doubt; None = it does so.
         engine: What runs the networks, one of `lib.landmarks.engines.ENGINES`; the weights are the same.
 
         >>> found = Detector.load(engine="torch")(np.zeros((1, 270, 480, 3), np.uint8))
@@ -132,6 +133,7 @@ class Detector:
     metadata: dict[str, object] = field(default_factory=dict)
     closeup_network: OffsetNetwork | None = None
     mirror: bool = False
+    in_doubt: Self | None = None
     engine: str = "torch"
     _run: dict[str, Callable[[Tensor], list[Tensor]]] = field(init=False, repr=False, default_factory=dict)
 
@@ -139,6 +141,8 @@ class Detector:
         check(self, "frame_px", lambda v: v is None or v >= 16, "must be at least 16 px")
         if self.closeup_network and not (self.window_network or self.tool_network):
             raise ValueError("closeup_network: looks at what a tool_network or a window_network has found; give one.")
+        if self.in_doubt and self.in_doubt.engine != self.engine:
+            object.__setattr__(self, "in_doubt", replace(self.in_doubt, engine=self.engine))
         run = cache(accelerated)  # stages may share a network
         for stage in self.stages:
             self._run[stage] = run(self.network_of(stage), self.engine, mirror=self.mirrors(stage))
@@ -156,6 +160,12 @@ class Detector:
         """The networks by stage, in the order of their use."""
         stages = {name: getattr(self, f"{name}_network") for name in ("frame", "tool", "window", "closeup")}
         return {name: network for name, network in stages.items() if network is not None}
+
+    @property
+    def all_networks(self) -> dict[str, Network]:
+        """The networks by their names in a weights file: those of `in_doubt`, if they are others, begin with ``in_doubt.``"""
+        own, wider = self.networks, self.in_doubt.networks if self.in_doubt else {}
+        return own | {f"in_doubt.{name}": network for name, network in wider.items() if network is not own.get(name)}
 
     @property
     def stages(self) -> list[str]:
@@ -177,14 +187,17 @@ class Detector:
         tensors, metadata = read_checkpoint(path, FORMAT)
         if text := ", ".join(sorted({"networks", "calibration", "provenance", *_SETTINGS} - metadata.keys())):
             raise ValueError(f"{path}: its metadata lack {text}; get the file again, or make it with Detector.save.")
-        configs = metadata["networks"].items()
-        networks = {f"{name}_network": load_network(path, config, tensors, f"{name}.") for name, config in configs}
+        parts: dict[str, dict[str, object]] = {"": {"error_models": {}}, "in_doubt": {"error_models": {}}}
+        for name, config in metadata["networks"].items():
+            part, _, stage = name.rpartition(".")
+            parts[part][f"{stage}_network"] = load_network(path, config, tensors, f"{name}.")
+        for name, fit in metadata["calibration"].items():
+            part, _, stage = name.rpartition(".")
+            parts[part]["error_models"][stage] = ErrorModel(*fit)
+        same = {name: metadata[name] for name in _SETTINGS} | {"engine": engine or default_engine()}
         try:
-            detector = cls(
-                **networks, **{name: metadata[name] for name in _SETTINGS},
-                error_models={name: ErrorModel(*fit) for name, fit in metadata["calibration"].items()},
-                metadata=metadata["provenance"], engine=engine or default_engine(),
-            )  # fmt: skip
+            wider = cls(**parts[""] | parts["in_doubt"], **same) if len(parts["in_doubt"]) > 1 else None
+            detector = cls(**parts[""], **same, metadata=metadata["provenance"], in_doubt=wider)
         except (TypeError, ValueError) as error:
             raise ValueError(f"{path}: {error}") from error
         detector._check_complete(path)
@@ -209,12 +222,13 @@ class Detector:
 
     def _content(self) -> tuple[dict[str, Tensor], dict[str, object]]:
         """Tensors and metadata of the detector's file."""
-        states = {stage: network.state_dict() for stage, network in self.networks.items()}
-        tensors = {f"{stage}.{key}": value for stage, state in states.items() for key, value in state.items()}
+        networks, wider = self.all_networks, self.in_doubt.error_models if self.in_doubt else {}
+        fits = self.error_models | {f"in_doubt.{stage}": fit for stage, fit in wider.items()}
+        tensors = {f"{name}.{key}": value for name, part in networks.items() for key, value in part.state_dict().items()}
         return tensors, {name: getattr(self, name) for name in _SETTINGS} | {
             "format": FORMAT,
-            "networks": {stage: asdict(network.config) for stage, network in self.networks.items()},
-            "calibration": {stage: list(asdict(fit).values()) for stage, fit in self.error_models.items()},
+            "networks": {name: asdict(network.config) for name, network in networks.items()},
+            "calibration": {name: list(asdict(fit).values()) for name, fit in fits.items()},
             "provenance": self.metadata,
         }
 
@@ -223,12 +237,14 @@ class Detector:
             what = f"no error model for {', '.join(lacking)}, so covariance and confidence would mean nothing"
             cure = "fit them with `lib.training.error_models.fit_error_models` or `python3 -m lib train assemble`"
             raise ValueError(f"{path}: {what}; {cure}.")
+        if self.in_doubt:
+            self.in_doubt._check_complete(path)
 
     def __call__(self, images: ArrayLike, *, batch: int = 4, avoid: np.ndarray | None = None) -> Landmarks:
         """Landmarks of images (n, h, w, 3), uint8 RGB or float in [0, 1]; `batch` images at a time.
 
-        An image in doubt is seen again with more contrast, then swept, which takes many times as long.  `avoid` (k, 3, 2) px
-        are what looks like the tool and is none; it needs the second stage.  A `ValueError` for another shape, type or range.
+        An image in doubt is seen in more ways, which takes many times as long.  `avoid` (k, 3, 2) px are what looks like the
+        tool and is none; it needs the second stage.  A `ValueError` for another shape, type or range.
         """
         images = as_uint8(images)
         with self._threads():
@@ -236,9 +252,14 @@ class Detector:
             return Landmarks.join([self._seen(part, avoid) for part in parts])
 
     def _seen(self, images: np.ndarray, avoid: np.ndarray | None) -> Landmarks:
-        """Landmarks of a few images.  One in doubt is seen again with more contrast, then swept; its surest look counts."""
+        """Landmarks of a few images.  Those in doubt are left to `in_doubt`; without one they are seen again with more
+        contrast, then swept, and the surest look counts.
+        """
         result = self._once(images, avoid)
-        for more in (equalised, stretched, None) if self.tool_network else ():
+        unsure = np.flatnonzero(result.confidence.mean(1) < _UNSURE)
+        if self.in_doubt and unsure.size:
+            result._put(unsure, self.in_doubt._seen(images[unsure], avoid))
+        for more in (equalised, stretched, None) if self.tool_network and not self.in_doubt else ():
             unsure = np.flatnonzero(result.confidence.mean(1) < _UNSURE)
             if unsure.size:
                 again = np.stack([more(image) for image in images[unsure]]) if more else images[unsure]
@@ -351,7 +372,7 @@ class Detector:
             peaks = several_peaks(heatmaps, PEAKS, self.tool_network.stride, self.method)
             u, value = (torch.cat([getattr(part, name) for part in peaks]).numpy() for name in ("u", "value"))
             at = best_tools(u, value, PEAKS), np.arange(3)
-            tools.append(_through_inverse(matrix[None], u[at].reshape(-1, 2)).reshape(-1, 3, 2))
+            tools.append(view.unmapped(matrix[None], u[at].reshape(-1, 2)).reshape(-1, 3, 2))
             height.append(np.clip(value[at], 0, 1).mean(axis=1))
         u = np.concatenate(tools)
         return replace(Landmarks.none(len(u)), u=u), u, np.concatenate(height)
@@ -366,7 +387,7 @@ class Detector:
         peaks, matrices, which = seen
         i, k = which.T
         found, height = np.full((n, 3, 2), np.nan), np.zeros((n, 3))
-        found[i, k] = _through_inverse(matrices, peaks.u[:, 0].double().numpy())
+        found[i, k] = view.unmapped(matrices, peaks.u[:, 0].double().numpy())
         height[i, k] = peaks.value[:, 0].numpy()
         return found, np.clip(height, 0, 1).mean(1)
 
@@ -380,7 +401,7 @@ class Detector:
         peaks, matrices, which = seen or self.stage_peaks(images, rough.u, stage, only)
         result = Landmarks.join([rough])  # a copy
         fine = self._measured(peaks, self.rough_in_windows(rough, matrices, which, stage), stage, which[:, 1:])
-        u, back = _through_inverse(matrices, fine.u[:, 0]), np.linalg.inv(matrices[:, :, :2])
+        u, back = view.unmapped(matrices, fine.u[:, 0]), np.linalg.inv(matrices[:, :, :2])
         covariance = back @ fine.covariance[:, 0] @ back.mT
         confidence = fine.confidence[:, 0]
         if stage in CLOSE:
@@ -476,8 +497,3 @@ class Detector:
         fit = self.error_models.get(stage, ErrorModel())
         covariance, confidence = covariance_and_confidence(peaks.double(), rough, fit, landmark)
         return Landmarks(peaks.u.numpy(), covariance.numpy(), confidence.numpy())
-
-
-def _through_inverse(matrices: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """Points u (n, 2) of windows in the image, from the windows' matrices (n, 2, 3)."""
-    return np.linalg.solve(matrices[:, :, :2], (u - matrices[:, :, 2])[..., None])[..., 0]

@@ -109,6 +109,11 @@ def map_points(matrix: np.ndarray, u: ArrayLike) -> np.ndarray:
     return (matrix[..., :2] @ np.asarray(u, dtype=np.float64)[..., None])[..., 0] + matrix[..., 2]
 
 
+def unmapped(matrices: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """Points u (n, 2) of windows in the image, from the windows' matrices (n, 2, 3)."""
+    return np.linalg.solve(matrices[:, :, :2], (u - matrices[:, :, 2])[..., None])[..., 0]
+
+
 def cut(image: np.ndarray, matrix: np.ndarray, size: int | ArrayLike, *, border: int = cv2.BORDER_CONSTANT) -> np.ndarray:
     """The window (h, w, 3) uint8 of an image, of `size`, its side or (w, h); beyond the image black, or OpenCV's `border`.
 

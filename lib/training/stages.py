@@ -34,6 +34,8 @@ from lib.training.sources import FRAME_PX, CloseupSource, FrameSource, ToolSourc
 
 #: The stages that are trained, in the order of their use, and the channels of the shipped networks.
 STAGES = {"frame": 32, "tool": 48, "closeup": 32}
+#: The stages of `Detector.in_doubt` that have networks of their own.
+_WIDER = {"in_doubt.frame": "frame", "in_doubt.tool": "tool"}
 #: Standard deviation of a label, as a share of the tool's length, at which a stage lets it count half.
 LABEL_SD = {"frame": 0.1, "tool": 0.04, "closeup": 0.02}
 #: Of fine-tuning: share of the draws that are labelled frames, beside simulated ones, and of these in another guise.
@@ -151,10 +153,10 @@ def finetune(
 
 
 def training_of(detector: Detector, stage: str) -> Training:
-    """The network of a detector's stage, with what its metadata tell of its training."""
-    if stage not in detector.networks:
-        raise ValueError(f"initial: has no {stage} stage; its stages are {', '.join(detector.networks)}.")
-    return Training(detector.networks[stage], [], detector.metadata.get("stages", {}).get(stage, {}))
+    """The network of a stage, named as in `Detector.all_networks`, with what the metadata tell of its training."""
+    if stage not in detector.all_networks:
+        raise ValueError(f"initial: has no {stage} stage; its stages are {', '.join(detector.all_networks)}.")
+    return Training(detector.all_networks[stage], [], detector.metadata.get("stages", {}).get(stage, {}))
 
 
 def assemble(
@@ -167,10 +169,14 @@ def assemble(
     on labelled `recordings`, if any; those of the closeups also on half as many images of the reference rig, since their bias
     is not that of unfamiliar tools alone.  The card's numbers are measured on the other half of the scenes.  `notes` are
     lines for the card.  A stage that `folder` lacks is `initial`'s; without one, and without shards, a `FileNotFoundError`.
+    The wider stages for images in doubt, if any, are in its folder ``in_doubt``.  What `initial` knows of its errors stays
+    true where no stage is new.
     """
-    out = Path(out)
-    trained = {stage: Path(folder) / stage / "last.safetensors" for stage in STAGES}
-    stages = {k: load_training(p) if p.exists() or not initial else training_of(initial, k) for k, p in trained.items()}
+    out, known = Path(out), initial.all_networks if initial else {}
+    trained = {name: Path(folder, *name.split("."), "last.safetensors") for name in (*STAGES, *_WIDER)}
+    new = {name for name, path in trained.items() if path.exists()}
+    needed = [name for name in trained if name in new or name in known or name in STAGES]
+    stages = {k: training_of(initial, k) if k in known and k not in new else load_training(trained[k]) for k in needed}
     frames = list(validation_images(data))
     if not frames:
         raise FileNotFoundError(f"{data}: no shard held_out_*.npz; make some with `python3 -m lib train generate`.")
@@ -182,9 +188,15 @@ def assemble(
     typical = []
     for recording in map(Recording.open, recordings):  # 16 images of each, spread over it
         typical += labelled_images(recording, every=max(1, len(recording.frames) // 8))
-    networks = {f"{stage}_network": training.network.halved() for stage, training in stages.items()}
-    detector = Detector(**networks, frame_px=FRAME_PX[0], mirror=True)
-    detector = fit_error_models(detector, frames[::2] + bare + typical, for_closeups=near_by, progress=True)
+    networks = {name: training.network.halved() for name, training in stages.items()}
+    own = {f"{stage}_network": networks[stage] for stage in STAGES}
+    wider = {f"{stage}_network": networks[name] for name, stage in _WIDER.items() if name in networks}
+    fitted = partial(fit_error_models, images=frames[::2] + bare + typical, for_closeups=near_by, progress=True)
+    shape = partial(Detector, frame_px=FRAME_PX[0], mirror=True)
+    detector = fitted(shape(**own)) if new & STAGES.keys() or not initial else replace(initial, in_doubt=None)
+    if wider:
+        kept = initial.in_doubt if initial and not new else None
+        detector = replace(detector, in_doubt=kept or fitted(shape(**own | wider)))
     held_out = evaluate(detector, frames[1::2], progress=True)
     keys = "data images commit steps seconds processes precision machine config metrics before".split()
     provenance = {
