@@ -191,11 +191,11 @@ class Detector:
         for name, config in metadata["networks"].items():
             part, _, stage = name.rpartition(".")
             parts[part][f"{stage}_network"] = load_network(path, config, tensors, f"{name}.")
-        for name, fit in metadata["calibration"].items():
-            part, _, stage = name.rpartition(".")
-            parts[part]["error_models"][stage] = ErrorModel(*fit)
         same = {name: metadata[name] for name in _SETTINGS} | {"engine": engine or default_engine()}
         try:
+            for name, fit in metadata["calibration"].items():
+                part, _, stage = name.rpartition(".")
+                parts[part]["error_models"][stage] = ErrorModel(*fit)
             wider = cls(**parts[""] | parts["in_doubt"], **same) if len(parts["in_doubt"]) > 1 else None
             detector = cls(**parts[""], **same, metadata=metadata["provenance"], in_doubt=wider)
         except (TypeError, ValueError) as error:

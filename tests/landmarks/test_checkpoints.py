@@ -38,6 +38,21 @@ def test_missing_corrupt_and_foreign_files_are_named(tmp_path):
         Detector.load(foreign)
 
 
+def test_wider_networks_are_kept_with_their_error_models_and_shared_ones_once(tmp_path):
+    detector, path = untrained(), tmp_path / "weights.safetensors"
+    networks = {"frame_network": StackedHourglass(HourglassConfig(6, 1, 1)), "window_network": detector.networks["window"]}
+    doubt = {name: ErrorModel(logit=(2.0, 0.0, 0.0, 0.0)) for name in ("frame", "window")}
+    both = replace(detector, in_doubt=replace(detector, **networks, error_models=doubt))
+    both.save(path)
+    loaded = Detector.load(path, engine="torch")
+    assert list(loaded.all_networks) == ["frame", "window", "in_doubt.frame"]
+    assert loaded.digest == both.digest != detector.digest
+    assert loaded.in_doubt.networks["window"] is loaded.networks["window"]
+    assert loaded.in_doubt.error_models["frame"].logit == doubt["frame"].logit
+    with pytest.raises(ValueError, match="no error model for window"):
+        replace(both, in_doubt=replace(both.in_doubt, error_models={"frame": doubt["frame"]})).save(path)
+
+
 @pytest.mark.parametrize("where", ["metadata", "tensors"])
 def test_a_flipped_bit_is_noticed_wherever_it_is(where, tmp_path):
     path = tmp_path / "weights.safetensors"

@@ -70,6 +70,18 @@ def test_an_image_in_doubt_is_seen_again_with_more_contrast(shipped, monkeypatch
     assert alone.confidence.mean() < 0.5
 
 
+def test_only_an_image_in_doubt_is_left_to_the_wider_networks(shipped, monkeypatch):
+    clear, looks = shipped.images[:1], []
+    dull = np.clip(np.round((clear - clear.mean()) * 0.05 + 110), 0, 255).astype(np.uint8)
+    narrow, wider = replace(shipped.torch, in_doubt=None), replace(shipped.torch, in_doubt=None, mirror=False)
+    once = type(narrow)._once
+    monkeypatch.setattr(type(narrow), "_once", lambda *a, **how: looks.append((a[0].mirror, a[1])) or once(*a, **how))
+    found = replace(narrow, in_doubt=wider)(np.concatenate([clear, dull]))
+    assert [mirror for mirror, _ in looks] == [True] + [False] * (len(looks) - 1) and len(looks) > 1
+    assert np.array_equal(looks[1][1], dull)  # as it is, before its contrast is changed
+    assert np.array_equal(found.u[:1], narrow(clear).u) and np.array_equal(found.u[1:], wider(dull).u)
+
+
 def test_a_tool_that_the_first_stage_overlooks_is_found_by_sweeping(shipped, monkeypatch):
     def blind(self, images):
         return Landmarks.none(len(images))

@@ -57,10 +57,19 @@ def test_the_card_beside_the_shipped_weights_is_theirs():
 
 
 def test_a_stage_begins_from_a_checkpoint_or_from_shipped_weights():
-    shipped = command._start(Path("default"), "closeup")
+    shipped = command._start(Path("default"), "closeup", OffsetConfig())
     assert shipped.provenance == Detector.load(engine="torch").metadata["stages"]["closeup"]
     with pytest.raises(FileNotFoundError, match="nowhere"):
-        command._start(Path("nowhere"), "closeup")
+        command._start(Path("nowhere"), "closeup", OffsetConfig())
+
+
+def test_a_stage_with_more_channels_begins_widened():
+    config = stages.stage_config("tool", features=50).network
+    narrow, wide = Detector.load(engine="torch").tool_network, command._start(Path("default"), "tool", config).network
+    image = torch.rand(1, 3, 64, 64, generator=torch.Generator().manual_seed(0))
+    assert wide.config == config and torch.allclose(wide.eval()(image)[-1], narrow.eval()(image)[-1], atol=1e-5)
+    with pytest.raises(ValueError, match="is not a wider form of"):
+        command._start(Path("default"), "tool", stages.stage_config("tool", features=46).network)
 
 
 def test_stages_are_fine_tuned_on_labelled_frames(tmp_path, monkeypatch):
