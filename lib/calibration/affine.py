@@ -121,12 +121,11 @@ def estimate_noise(
     if free[1] and not flat.all():
         v[1] = np.median(np.maximum(observed[~flat] - v[0], 0.0) / gain[~flat])
     design = np.column_stack([np.ones(len(gain)), gain])
+    scale, start = design[:, free].max(axis=0), np.where(free, least, v)
+    columns, left, likely = design[:, free] / scale, observed - design @ start, np.sqrt(freedom)
     for _ in range(50):
-        root = np.sqrt(freedom) / np.maximum(design @ v, floor)
-        new = np.where(free, least, v)
-        target = (observed - design @ new) * root
-        scale = design[:, free].max(axis=0)
-        new[free] += nnls(design[:, free] / scale * root[:, None], target)[0] / scale
+        root, new = likely / np.maximum(design @ v, floor), start.copy()
+        new[free] += nnls(columns * root[:, None], left * root)[0] / scale
         if (np.abs(new - v) <= 1e-10 * v).all():
             break
         v = new

@@ -147,10 +147,9 @@ class State:
         """Pixels y (n, m) of points (n, 3) mm, dy/dx (n, m, 3) and the derivatives by the model's parameters (n, m, p)."""
         x, n, c = x_mm - self.reference, len(x_mm), len(self.A)
         if not (self.rho.any() or self.radial.any() or (derivatives and not self.model.is_affine)):
-            A = self.A.reshape(-1, 3)
-            D = self._linear() if derivatives else np.empty((2 * c, 4, 0))
-            J_c = np.tensordot(np.column_stack([x, np.ones(n)]), D, axes=(1, 1))
-            return x @ A.T + self.offset.ravel(), np.tile(A, (n, 1, 1)), J_c
+            A, D = self.A.reshape(-1, 3), self._linear() if derivatives else np.empty((2 * c, 4, 0))
+            J_c = (np.column_stack([x, np.ones(n)]) @ D.swapaxes(0, 1).reshape(4, -1)).reshape(n, 2 * c, D.shape[2])
+            return x @ A.T + self.offset.ravel(), np.broadcast_to(A, (n, *A.shape)), J_c
         r_3, size, k = *self.normals, len(self.model.selection) // c
         depth = x @ r_3.T
         ratio = (1.0 + self.rho * depth)[:, :, None]  # (n, cameras, 1)

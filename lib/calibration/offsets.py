@@ -48,25 +48,27 @@ def tool_axes(x_mm: ArrayLike, offset_mm: np.ndarray | None = None) -> np.ndarra
     x = np.asarray(x_mm, dtype=np.float64)
     if x.ndim != 3 or x.shape[1:] != (3, 3):
         raise ValueError(f"x_mm: expected base, tip_1 and tip_2 (n, 3, 3), got {x.shape}.")
-    offset = np.zeros((3, 3)) if offset_mm is None else offset_mm
-    middle, apart = offset[1:].mean(axis=0) - offset[0], offset[2] - offset[1]
     along, across = x[:, 1:].mean(axis=1) - x[:, 0], x[:, 2] - x[:, 1]
     with np.errstate(invalid="ignore", divide="ignore"):
+        size = np.linalg.norm(along, axis=1)
+        m = along / size[:, None]
+        beside = (across * m).sum(axis=1, keepdims=True)
+        across = across - beside * m
+        width = np.linalg.norm(across, axis=1, keepdims=True)
+        c = across / width
+        g = cross(m, c)
+        if offset_mm is None:
+            return np.where((width > 0.05 * size[:, None])[:, :, None], np.stack([m, c, g], axis=2), np.nan)
         # In the tool's axes the reported vector along the tool is known but for its length; so is the height, along the
         # normal, of the one from tip to tip.  Together they are all three angles.
-        size = np.linalg.norm(along, axis=1)
+        middle, apart = offset_mm[1:].mean(axis=0) - offset_mm[0], offset_mm[2] - offset_mm[1]
         straight = np.sqrt(size**2 - middle[1] ** 2 - middle[2] ** 2)
         a = np.stack([straight, *np.broadcast_arrays(-middle[1], -middle[2], straight)[:2]], axis=1) / size[:, None]
         up = np.array([0.0, 0.0, 1.0]) - a[:, 2:] * a
         up /= np.linalg.norm(up, axis=1, keepdims=True)
-        side, m = cross(up, a), along / size[:, None]
-        beside = (across * m).sum(axis=1, keepdims=True)
-        across = across - beside * m
-        width = np.linalg.norm(across, axis=1, keepdims=True)
+        side = cross(up, a)
         sine = np.clip((-apart[2] - beside * a[:, 2:]) / (width * up[:, 2:]), -1, 1)
         cosine = np.array([[[1]], [[-1]]]) * np.sqrt(1 - sine**2)
-        c = across / width
-        g = cross(m, c)
         own = np.stack([a, side, up], axis=2)
         y, z = cosine * c - sine * g, sine * c + cosine * g
         axes = np.stack([np.broadcast_to(m, y.shape), y, z], axis=3) @ own.mT  # (2, n, 3, 3)
@@ -79,8 +81,6 @@ def tool_axes(x_mm: ArrayLike, offset_mm: np.ndarray | None = None) -> np.ndarra
 def _least_turning(axes: np.ndarray, possible: np.ndarray) -> np.ndarray:
     """Of two axes (2, n, 3, 3) of each tool the `possible` (2, n) ones that turn least, else the first; NaN without any."""
     found, known = np.full(axes.shape[1:], np.nan), np.flatnonzero(possible.any(axis=0))
-    if not known.size:
-        return found
     found[known] = np.where(possible[0, known, None, None], axes[0, known], axes[1, known])
     two = np.pad(possible[:, known].all(axis=0), 1)
     known = known[two[:-2] | two[1:-1] | two[2:]]  # a row of one choice cuts the way: only those beside it matter

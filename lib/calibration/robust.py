@@ -12,6 +12,7 @@ import numpy as np
 from scipy.special import fdtri, gammainccinv
 
 from lib.calibration.affine import regress
+from lib.geometry import cross
 
 FALSE_ALARM = 1e-4
 _SAMPLES = (100, 300, 1000)  # tried one after another, until right ones are among them
@@ -146,7 +147,8 @@ def _by_growth(x: np.ndarray, u: np.ndarray, rng: np.random.Generator, least_mm:
 
 def _extent(u: np.ndarray) -> np.ndarray:
     """(2,) width and height of the pixels, whatever one row in ten does."""
-    low, high = np.quantile(u, [0.1, 0.9], axis=0)
+    at, places = np.array([0.1, 0.9]) * (len(u) - 1), np.arange(len(u))
+    low, high = np.transpose([np.interp(at, places, v) for v in np.sort(u.T)])  # `np.quantile` takes five times as long
     return np.maximum((high - low) / 0.8, 1e-9)
 
 
@@ -155,7 +157,7 @@ def _samples(x: np.ndarray, count: int, rng: np.random.Generator, least_mm: floa
     n = len(x)
     sets = np.argpartition(rng.random((3 * count, n)), 4, axis=1)[:, :4] if n < 40 else rng.integers(0, n, (3 * count, 4))
     a, b, c = np.swapaxes(x[sets[:, 1:]] - x[sets[:, :1]], 0, 1)
-    sets = sets[np.argsort(-np.abs(np.einsum("ni,ni->n", np.cross(a, b), c)))[:count]]  # of the largest volume
+    sets = sets[np.argsort(-np.abs(np.einsum("ni,ni->n", cross(a, b), c)))[:count]]  # of the largest volume
     corners = x[sets] - x[sets].mean(axis=1, keepdims=True)
     thick = np.sqrt(np.maximum(np.linalg.eigvalsh(np.swapaxes(corners, 1, 2) @ corners)[:, 0], 0.0))
     spans = thick > 1e-6 * np.abs(x).max()  # rounding leaves 1e-8
@@ -168,7 +170,8 @@ def _samples(x: np.ndarray, count: int, rng: np.random.Generator, least_mm: floa
 
 def _distances2(H: np.ndarray, u: np.ndarray, M: np.ndarray) -> np.ndarray:
     """Squared distances (k, n) of pixels u (n, 2) to the projections of H (n, 4) by cameras M (k, 4, 2)."""
-    return ((M.mT @ H.T - u.T) ** 2).sum(axis=1)
+    x, y = (M[:, :, axis] @ H.T - u[:, axis] for axis in (0, 1))  # each is far quicker than an axis of two
+    return x * x + y * y
 
 
 def _scale_free(distance2: np.ndarray, area: float) -> np.ndarray:
@@ -249,29 +252,30 @@ def _mixture(
     n, k, side = len(u), len(M), np.sqrt(area)
     products = np.hstack([(H[:, :, None] * other[:, None]).reshape(n, -1) for other in (H, u)])
     floor = 1e-7 * side
-    variance = np.stack([np.maximum(sigma, floor), np.maximum(6.0 * sigma, 0.017 * side)], axis=1) ** 2
-    share = np.tile([0.4, 0.3, 0.3], (k, 1))
+    variance = np.array([np.maximum(sigma, floor), np.maximum(6.0 * sigma, 0.017 * side)]) ** 2  # (2, k)
+    share = np.tile([[0.4], [0.3], [0.3]], k)  # (3, k)
     before, distance2 = -np.inf, _distances2(H, u, M)
     for i in range(rounds):
-        scale = 1.0 / variance.T[:, :, None]  # (2, k, 1)
-        at_peak = share.T[:2, :, None] * scale * (area / (2.0 * np.pi * share[:, 2, None]))
-        p = at_peak * np.exp(np.maximum(-0.5 * scale * distance2, -500.0))  # odds against any pixel; it is slow below
+        scale = 1.0 / variance
+        at_peak = share[:2] * scale * (area / (2.0 * np.pi * share[2]))
+        # Odds against any pixel; the exponential is slow below.
+        p = at_peak[:, :, None] * np.exp(np.maximum((-0.5 * scale)[:, :, None] * distance2, -500.0))
         total = 1.0 + p[0] + p[1]
-        likelihood = np.log(total).sum(axis=1) + n * np.log(share[:, 2] / area)
+        likelihood = np.log(total).sum(axis=1) + n * np.log(share[2] / area)
         if i > 5 and (likelihood - before < 1e-3).all():
             break
         p /= total
         before = likelihood
-        moments = (p[0] * scale[0] + p[1] * scale[1]) @ products
+        moments = (p[0] * scale[0, :, None] + p[1] * scale[1, :, None]) @ products
+        moments[:, :16:5] += 1e-12 * moments[:, :16:5].sum(axis=1, keepdims=True)  # the diagonal
         G = moments[:, :16].reshape(k, 4, 4)
-        G = G + 1e-12 * np.einsum("kii->k", G)[:, None, None] * np.eye(4)
         M = np.linalg.solve(G, moments[:, 16:].reshape(k, 4, 2))
         distance2 = _distances2(H, u, M)
-        mass, squares = p.sum(axis=2), np.einsum("jkn,kn->jk", p, distance2)
+        mass, squares = p.sum(axis=2), (p * distance2).sum(axis=2)
         # The camera's eight numbers are paid for by the pixels that weigh in it.
-        paid = 8.0 * mass[0] / (mass[0] + mass[1] * variance[:, 0] / variance[:, 1])
+        paid = 8.0 * mass[0] / (mass[0] + mass[1] * variance[0] / variance[1])
         first = np.maximum(squares[0] / np.maximum(2.0 * mass[0] - paid, 1.0), floor**2)
-        second = np.clip(squares[1] / np.maximum(2.0 * mass[1], 1e-9), 16.0 * first, (0.1 * side + 4.0 * np.sqrt(first)) ** 2)
-        variance = np.stack([first, second], axis=1)
-        share = np.column_stack([mass.T + 1.0, n + 1.0 - mass[0] - mass[1]]) / (n + 3)
-    return M, np.sqrt(variance), share, likelihood - np.linalg.slogdet(G)[1]
+        second = np.maximum(squares[1] / np.maximum(2.0 * mass[1], 1e-9), 16.0 * first)
+        variance = np.array([first, np.minimum(second, (0.1 * side + 4.0 * np.sqrt(first)) ** 2)])
+        share = np.array([*(mass + 1.0), n + 1.0 - mass[0] - mass[1]]) / (n + 3)
+    return M, np.sqrt(variance.T), share.T, likelihood - np.linalg.slogdet(G)[1]

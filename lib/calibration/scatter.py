@@ -48,9 +48,9 @@ def sandwich(
     meat, share = np.zeros((p, p)) + prior, chance * variance
     for rows, view, gaps in groups:
         k, decay = K[rows][:, view], _CORRELATIONS[:, None] ** gaps
-        past = np.empty((len(rows), len(share), *k.shape[1:]))  # sums of all rows up to each one, as they decay until then
-        for i, own in enumerate(k):
-            past[i] = own + decay[:, i - 1, None, None] * past[i - 1] if i else own
+        past = np.tile(k[:, None], (1, len(share), 1, 1))  # sums of all rows up to each one, as they decay until then
+        for before, now, kept in zip(past[:-1], past[1:], decay.T[:, :, None, None], strict=True):
+            now += kept * before
         half = np.tensordot(k, np.einsum("t,ntip->nip", share, past) - share.sum() / 2 * k, axes=([0, 1], [0, 1]))
         meat += half + half.T
     sd = np.sqrt(np.diag(known))
@@ -61,23 +61,21 @@ def sandwich(
 
 def _posterior(K: np.ndarray, e: np.ndarray, groups: list[tuple], known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Probability of each correlation, and the variance of the whitened residuals under it, 1 where they are independent."""
-    p, likelihood, variance = K.shape[2], [], []
-    unit = np.linalg.cholesky(known)  # a parameter's own deviation
-    both = np.concatenate([K, e[:, :, None]], axis=2)
-    series = [(both[rows][:, view], gaps[:, None, None]) for rows, view, gaps in groups]
-    freedom = max(sum(values[..., 0].size for values, _ in series) - p, 1)
-    for correlation in _CORRELATIONS:
-        squares, log = np.zeros((p + 1, p + 1)), 0.0
-        for values, gap in series:  # an autoregression is white where each value has the one before taken off
-            kept = correlation**gap
-            sd = np.sqrt(np.maximum(1.0 - kept**2, 1e-9))
-            white = np.concatenate([values[:1], (values[1:] - kept * values[:-1]) / sd]).reshape(-1, p + 1)
-            squares += white.T @ white
-            log += 4.0 * np.log(sd).sum()
-        values, vectors = np.linalg.eigh(unit.T @ squares[:p, :p] @ unit)
-        values = np.maximum(values, 1e-12)
-        along = vectors.T @ (unit.T @ squares[:p, p])
-        variance.append((squares[p, p] - (along**2 / values).sum()) / freedom)
-        likelihood.append(-0.5 * (log + np.log(values).sum() + freedom * np.log(max(variance[-1], 1e-300))))
-    chance = _PRIOR * np.exp(np.array(likelihood) - max(likelihood))
-    return chance / chance.sum(), np.array(variance) / max(variance[0], 1e-300)
+    p, unit = K.shape[2], np.linalg.cholesky(known)  # a parameter's own deviation
+    both, t = np.concatenate([K, e[:, :, None]], axis=2), len(_CORRELATIONS)
+    squares, log = np.zeros((t, p + 1, p + 1)), np.zeros(t)
+    for rows, view, gaps in groups:  # an autoregression is white where each value has the one before taken off
+        values, kept = both[rows][:, view].reshape(-1, 2 * (p + 1)), _CORRELATIONS[:, None] ** gaps
+        sd = np.sqrt(np.maximum(1.0 - kept**2, 1e-9))
+        later = (values[1:] - kept[:, :, None] * values[:-1]) / sd[:, :, None]
+        white = np.concatenate([np.tile(values[:1], (t, 1, 1)), later], axis=1).reshape(t, -1, p + 1)
+        squares += white.mT @ white
+        log += 4.0 * np.log(sd).sum(axis=1)
+    freedom = max(2 * sum(len(rows) for rows, *_ in groups) - p, 1)
+    values, vectors = np.linalg.eigh(unit.T @ squares[:, :p, :p] @ unit)
+    values = np.maximum(values, 1e-12)
+    along = (squares[:, p:, :p] @ unit @ vectors)[:, 0]
+    variance = (squares[:, p, p] - (along**2 / values).sum(axis=1)) / freedom
+    likelihood = -0.5 * (log + np.log(values).sum(axis=1) + freedom * np.log(np.maximum(variance, 1e-300)))
+    chance = _PRIOR * np.exp(likelihood - likelihood.max())
+    return chance / chance.sum(), variance / max(variance[0], 1e-300)

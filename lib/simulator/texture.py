@@ -3,6 +3,7 @@
 A texture is reflectance (n, n, 3) uint8 RGB with display gamma; rows and columns run along y and x of the microscope frame.
 """
 
+import math
 from functools import lru_cache
 from pathlib import Path
 
@@ -44,25 +45,25 @@ def _vessel_tree(rng: np.random.Generator, disc_mm: np.ndarray, kind: str) -> li
     for arcade in (-2.2, -1.15, 1.15, 2.2):
         heading = towards_centre + arcade + rng.normal(0, 0.15) + (0.12 if kind == "vein" else -0.12)
         bend = -np.sign(arcade) * rng.uniform(0.10, 0.17) * (1 if abs(arcade) < 1.5 else 0.3)
-        stack.append((disc_mm + rng.normal(0, 0.08, 2), heading, caliber * rng.uniform(0.8, 1.15), bend))
+        stack.append(((disc_mm + rng.normal(0, 0.08, 2)).tolist(), heading, caliber * rng.uniform(0.8, 1.15), bend))
     while stack and len(branches) < 60:
-        point, heading, width, bend = stack.pop()
-        line, widths, wiggle, step, since = [point], [width], 0.0, 0.12, 0.0
-        while width > 0.02 and np.abs(point).max() < EXTENT_MM / 2:
+        (x, y), heading, width, bend = stack.pop()
+        line, widths, wiggle, step, since = [(x, y)], [width], 0.0, 0.12, 0.0
+        while width > 0.02 and max(abs(x), abs(y)) < EXTENT_MM / 2:
             wiggle = 0.8 * wiggle + rng.normal(0, 0.03)
-            outwards = np.arctan2(*(point - disc_mm)[::-1])
-            heading += bend * step + wiggle + 0.03 * np.sin(outwards - heading)
+            outwards = math.atan2(y - disc_mm[1], x - disc_mm[0])
+            heading += bend * step + wiggle + 0.03 * math.sin(outwards - heading)
             bend *= 0.99
-            point = point + step * np.array([np.cos(heading), np.sin(heading)])
+            x, y = x + step * math.cos(heading), y + step * math.sin(heading)
             width *= 0.994
-            line.append(point)
+            line.append((x, y))
             widths.append(width)
             since += step
             if since > 0.7 and rng.random() < 0.09:
                 side, share = rng.choice([-1, 1]), rng.uniform(0.35, 0.8)
                 child = width * share
                 if child > 0.024:
-                    stack.append((point, heading + side * rng.uniform(0.5, 1.1), child, -side * rng.uniform(0, 0.2)))
+                    stack.append(((x, y), heading + side * rng.uniform(0.5, 1.1), child, -side * rng.uniform(0, 0.2)))
                     width *= (1 - share**3) ** (1 / 3) * 0.3 + 0.7  # Murray's law, softened
                     heading -= side * 0.15 * share
                 since = 0.0
@@ -74,10 +75,9 @@ def _draw(branches: list[tuple[np.ndarray, np.ndarray]], size_px: int, share: fl
     """Optical density (size_px, size_px) of vessels in 0..1, of `share` of their width."""
     image, scale = np.zeros((size_px, size_px), np.uint8), size_px / EXTENT_MM
     for line, widths in branches:
-        pixels = np.round(((line + EXTENT_MM / 2) * scale - 0.5) * 16).astype(np.int32)
-        for a, b, width in zip(pixels[:-1], pixels[1:], widths[1:] * share * scale, strict=True):
-            value = int(255 * min(1.0, 0.35 + width / 14.0))
-            cv2.line(image, tuple(map(int, a)), tuple(map(int, b)), value, max(1, round(width)), cv2.LINE_AA, 4)
+        pixels = np.round(((line + EXTENT_MM / 2) * scale - 0.5) * 16).astype(np.int32).tolist()
+        for a, b, width in zip(pixels[:-1], pixels[1:], (widths[1:] * share * scale).tolist(), strict=True):
+            cv2.line(image, a, b, int(255 * min(1.0, 0.35 + width / 14.0)), max(1, round(width)), cv2.LINE_AA, 4)
     return image.astype(np.float32) / 255
 
 

@@ -69,7 +69,7 @@ def _scan(case: Case, half_s: float, rate: float = 1.0) -> tuple[np.ndarray, np.
     chosen = np.unique(np.linspace(0, len(problem) - 1, _ROWS).astype(int))
     later = (rate - 1.0) * (problem.time - np.median(problem.time))
     y = np.where(problem.used[:, :, None], problem.y, np.nan)[chosen].reshape(-1, 4)
-    return trial, shift_misfits(np.stack([case.moved(shift + later)[chosen] for shift in trial]), y)
+    return trial, shift_misfits(case.moved(trial[:, None] + later)[:, chosen], y)
 
 
 def _clock_rate(case: Case) -> Iterator[Hypothesis]:
@@ -99,7 +99,7 @@ def _frame_order(case: Case) -> Iterator[Hypothesis]:
         return
     trial, misfit = _scan(case, min(2.0, 0.4 * case.paths.span_s))  # lost frames may add up: most fit a later instant
     shifts = step * (np.arange(-8, 9) + round(float(trial[misfit.sum(axis=1).argmin()]) / step))
-    fit, moved, own = case.chosen(np.stack([case.moved(shift) for shift in shifts]))
+    fit, moved, own = case.chosen(case.moved(shifts[:, None]))
     share = float((np.abs(shifts[own]) > step / 2).mean())
     if share * case.frames < 3:  # it may be a spike of the log
         return

@@ -46,8 +46,8 @@ class Shape:
             tried = tried[np.abs(np.arange(len(tried)) - np.flatnonzero(tried == before)[0]) <= 1]
         freedom, s2 = tried[:, None], np.full((len(tried), 1), start**2)
         for _ in range(4):
-            weight = (freedom + 2.0) / (freedom + r2 / s2)
-            s2 = np.maximum((weight * r2).mean(axis=1, keepdims=True) / 2.0, _LEAST_PX**2)
+            weighted = (r2 / (freedom + r2 / s2)).sum(axis=1, keepdims=True)
+            s2 = np.maximum((freedom + 2.0) / (2.0 * len(r2)) * weighted, _LEAST_PX**2)
         best = cls(np.sqrt(s2), freedom).log_density(r2).sum(axis=1).argmax()
         return cls(float(np.sqrt(s2[best, 0])), float(tried[best]))
 
@@ -150,10 +150,9 @@ class Problem:
 
     def _design(self, M: np.ndarray, columns: Callable | None) -> np.ndarray:
         """(n, 2, 2, p): derivatives by the 16 entries of M, 9 offsets (mm) and the additions; 0 in images not used."""
-        image = np.einsum("cij,njk->ncik", M[:, :, :3], self.axes)
-        own = self.landmark[:, None] == np.arange(3)
-        image = np.where(self.used[:, :, None, None], image, 0.0)
-        parts = [self._of_matrices, np.einsum("ncik,nl->ncilk", image, own).reshape(len(self), 2, 2, 9)]
+        image = (M[:, :, :3].reshape(4, 3) @ self.axes).reshape(len(self), 2, 2, 1, 3)
+        own = self.used[:, :, None] & (self.landmark[:, None, None] == np.arange(3))  # (n, 2, 3)
+        parts = [self._of_matrices, (image * own[:, :, None, :, None]).reshape(len(self), 2, 2, 9)]
         parts += [] if columns is None else [np.where(self.used[:, :, None, None], np.nan_to_num(columns(M)), 0.0)]
         return np.concatenate(parts, axis=3)
 
@@ -257,7 +256,7 @@ class Case:
         return min(fit.shapes[0].scale for fit in fits) / self.problem.y[self.problem.used].std(axis=0).max()
 
     def moved(self, shift_s: float | np.ndarray) -> np.ndarray:
-        """(n, 3) mm: the positions of the rows as they were `shift_s` later; NaN where nothing tells."""
+        """(..., n, 3) mm: the positions of the rows `shift_s` later, a number or (..., n); NaN where nothing tells."""
         landmark, now = self.problem.landmark, self.problem.time + self._clock_s
         return self.problem.x[:, 0] + self.paths.at(landmark, now + shift_s) - self.paths.at(landmark, now)
 
