@@ -502,7 +502,7 @@ def test_dlt_refuses_what_it_cannot_solve():
 def test_cameras_have_a_finite_distance_only_where_the_detections_show_one():
     """Mirrored ones, and few rows, stay affine."""
     rng = np.random.default_rng(3)
-    x = rng.uniform(-4, 4, (60, 3))
+    x = ROBOT_FROM_MICROSCOPE.apply(rng.uniform(-4, 4, (60, 3)))
     for distance_mm, rows in ((np.inf, 60), (-190, 60), (190, 4), (190, 60)):
         u = [v + rng.normal(0, 1, v.shape) for v in reference_rig(inverse_distance_per_mm=1 / distance_mm).project(x)]
         data = Correspondences.of_points(x, *u).subset(slice(rows))
