@@ -5,7 +5,6 @@ is "not trustworthy", so no file that follows from the calibration is written (-
 """
 
 import argparse
-import hashlib
 import json
 import shlex
 import subprocess
@@ -67,7 +66,7 @@ def main_annotate(argv: list[str]) -> int:
     parser = argparse.ArgumentParser(prog="python3 -m lib annotate", description=main_annotate.__doc__.split(": ", 1)[1])
     parser.add_argument("recording", type=Path, help="folder of a recording")
     folder = Recording.open(parser.parse_args(argv).recording, truth=False).folder.resolve()
-    page = paths.RUNS / f"annotate-{folder.name}-{hashlib.sha256(str(folder).encode()).hexdigest()[:6]}.ipynb"  # one a folder
+    page = paths.RUNS / f"annotate-{folder.name}-{files.digest(str(folder).encode(), length=6)}.ipynb"  # one a folder
     page.parent.mkdir(exist_ok=True)
     text = json.dumps(json.dumps(str(folder))[1:-1])[1:-1]  # a Python string in JSON
     files.write_text(page, (paths.ROOT / "lib" / "annotate.ipynb").read_text(encoding="utf-8").replace("RECORDING", text))

@@ -27,7 +27,11 @@ _SHAPES = {"x_mm": (3,), "u_left": (2,), "u_right": (2,), "covariance_px2": (2, 
            "landmark": (), "time_s": ()}  # fmt: skip
 
 
-class NoDetectionError(ValueError):
+class DataError(ValueError):
+    """The data tell too little, or contradict themselves: no argument of the call would change that."""
+
+
+class NoDetectionError(DataError):
     """Hardly any landmark was found in both images; the text counts them and says what to do."""
 
 
@@ -116,12 +120,9 @@ class Correspondences:
         return self.subset(self.is_complete)
 
     def check_detections(self) -> None:
-        """Raise a `NoDetectionError` where an image shows fewer than four landmarks whose position the robot reports.
-
-        Fewer than four rows at all are a ValueError.
-        """
+        """Raise a `DataError` where an image shows fewer than four landmarks whose position the robot reports."""
         if len(self) < 4:
-            raise ValueError(f"data: {len(self)} landmarks in all, and a camera needs four. Record more frames; 30 are good.")
+            raise DataError(f"data: {len(self)} landmarks in all, and a camera needs four. Record more frames; 30 are good.")
         usable = int((self.seen & np.isfinite(self.x_mm).all(axis=1)[:, None]).sum(axis=0).min())
         if usable >= 4:
             return

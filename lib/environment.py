@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
-import hashlib
 import importlib.util
 import itertools
 import json
@@ -21,7 +20,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from lib.files import write_text
+from lib.files import digest, write_text
 
 ROOT = Path(__file__).resolve().parent.parent
 TORCH_BUILDS = ("cpu", "cuda")
@@ -84,7 +83,7 @@ def lock(*, upgrade: bool) -> Path:
 
 def _digest(root: Path) -> str:
     contents = [(root / name).read_bytes() for name in ("environment.toml", "lib/environment.lock")]
-    return hashlib.sha256(b"\0".join(contents)).hexdigest()
+    return digest(b"\0".join(contents), length=64)
 
 
 def _read_stamp(venv: Path) -> dict:

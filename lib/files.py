@@ -1,4 +1,4 @@
-"""Files written whole or not at all, text as TOML writes it, and the digests of files.  Standard library only."""
+"""Files written whole or not at all, text as TOML writes it, and digests.  Standard library only."""
 
 from __future__ import annotations
 
@@ -72,12 +72,13 @@ def toml_entries(values: Mapping[str, object]) -> list[str]:
     return [f"{key} = {toml(value)}" for key, value in zip(keys, values.values(), strict=True)]
 
 
-def digest(*files: str | Path, length: int = 12) -> str:
-    """The first `length` hexadecimal digits of the SHA-256 of the files' contents, one after the other."""
+def digest(*parts: str | Path | bytes, length: int = 12) -> str:
+    """The first `length` hexadecimal digits of the SHA-256 of bytes, and of what is in files, one after the other."""
     total = hashlib.sha256()
-    for path in files:
-        if not Path(path).is_file():
-            raise FileNotFoundError(f"{path}: no such file.")
-        with open(path, "rb") as file:
-            hashlib.file_digest(file, lambda: total)
+    for part in parts:
+        if isinstance(part, str | Path):
+            with open(part, "rb") as file:
+                hashlib.file_digest(file, lambda: total)
+        else:
+            total.update(part)
     return total.hexdigest()[:length]

@@ -50,5 +50,6 @@ def test_digest_names_content(tmp_path):
     a.write_bytes(b"x" * 3_000_000)
     b.write_bytes(b"y")
     assert files.digest(a) == files.digest(a) != files.digest(b) and len(files.digest(a, b, length=64)) == 64
+    assert files.digest(a, str(b)) == files.digest(b"x" * 3_000_000, b"y") == files.digest(a, memoryview(b"y"))
     with pytest.raises(FileNotFoundError, match="missing"):
         files.digest(Path("missing"))

@@ -1,6 +1,5 @@
 """Detect, calibrate, project, train further, detect again: until frames that took no part agree no better."""
 
-import hashlib
 import json
 import sys
 import time
@@ -399,7 +398,7 @@ class _Work:
 
 def _work_folder(folder: str | Path | None, name: str, key: list) -> Path:
     """Where an adaptation keeps what it has done: a folder of its own for each `key`."""
-    return Path(folder or paths.RUNS / f"adapt-{name}") / "work" / hashlib.sha256(repr(key).encode()).hexdigest()[:12]
+    return Path(folder or paths.RUNS / f"adapt-{name}") / "work" / files.digest(repr(key).encode())
 
 
 def simulated_like(images: Iterable[np.ndarray], seed: int, progress: bool) -> list[LabelledImage]:

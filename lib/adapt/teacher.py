@@ -14,11 +14,11 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from lib.adapt.looking import NEAR, Seen
-from lib.calibration import Calibration, CompetingCamerasError, LandmarkOffsets, calibrate, estimate_time_offset
+from lib.calibration import Calibration, CompetingCamerasError, LandmarkOffsets, calibrate, calibrate_as_shown
 from lib.calibration.offsets import carried, tool_axes
-from lib.calibration.timing import clock_error
+from lib.calibration.timing import clock_error, estimate_time_offset
 from lib.cameras import NearAffineCamera
-from lib.correspondences import LANDMARKS, MIN_CONFIDENCE
+from lib.correspondences import LANDMARKS, MIN_CONFIDENCE, DataError
 from lib.landmarks.metrics import tool_length_px
 from lib.recordings import Recording
 from lib.recordings.annotations import CLICK_SD_PX, inside
@@ -53,11 +53,11 @@ _ODD = 0.2  # share of a large offset that may be the detector's all the same: s
 _SURE_MOVE = 0.5
 #: Largest correction of the clock along with cameras and offsets: one step takes motions for straight.
 _LARGEST_STEP_S = 0.03
-_FINITE = 3.0  # the inverse distance of cameras, in its standard deviations, from which it is taken for finite
 _BEHIND = 0.1  # distance from the camera, as a share of the working distance, below which nothing is in view
 _CONFIDENCES = (MIN_CONFIDENCE, 0.5, 0.8)
 #: Fewer labelled pairs tell neither outliers nor how large the offsets are; the usual ones of a robot, standard deviation.
 _FEW_PAIRS, _ROBOTS_OFFSET_MM = 8, 0.15
+_POOR = (DataError, np.linalg.LinAlgError)  # what data end in that tell too little; other errors are of the program
 _OTHER_POINT = 0.3  # from a detector's point to the labelled one, standard deviation, as a share of the tool's length
 _LABEL = (
     "Label 10 pairs of frames (5 at least), far apart in place and depth (`python3 -m lib annotate RECORDING`), and give "
@@ -65,7 +65,7 @@ _LABEL = (
 )
 
 
-class RefusalError(ValueError):
+class RefusalError(DataError):
     """The recording cannot teach; the text says why, and what to do."""
 
 
@@ -235,7 +235,7 @@ def _opinion(recording: Recording, opinion: Seen, frames: np.ndarray) -> Landmar
             f"detector: where the robot says, it sees {rare} in {100 * shares.min():.0f} % of the images and {often} in "
             f"{100 * shares.max():.0f} %. It takes another point for {rare}. {_LABEL}"
         )
-    with suppress(ValueError):
+    with suppress(*_POOR):
         return _placed(recording, opinion.of(frames)).offsets
     return None
 
@@ -301,7 +301,7 @@ def _clock(recording: Recording, seen: Seen, *, by_hand: bool = False) -> tuple[
     for reach_s in (0.2, 1.0):
         try:
             found = estimate_time_offset(rows, recording.kinematics, start_s=recording.offset_s, search_s=reach_s)
-        except ValueError:
+        except _POOR:
             continue
         if abs(found.offset_s - recording.offset_s) > 3 * found.sd_s and found.sd_s < 0.02:
             return replace(recording, offset_s=found.offset_s), found.sd_s
@@ -315,7 +315,7 @@ def _scanned_clock(recording: Recording, merit: Callable[[Recording], float]) ->
     Of equal ones the smallest change; none where no offset gives cameras.
     """
     def merit_at(change_s: float) -> float:
-        with suppress(ValueError):
+        with suppress(*_POOR):
             return merit(replace(recording, offset_s=recording.offset_s + change_s))
         return -np.inf
 
@@ -323,22 +323,15 @@ def _scanned_clock(recording: Recording, merit: Callable[[Recording], float]) ->
     return replace(recording, offset_s=recording.offset_s + max(changes_s, key=merit_at))
 
 
-def _fitted(
-    recording: Recording, seen: Seen, least: float = 0.0, ransac_px: float | None = None, **more: float | str
-) -> Calibration:
+def _fitted(recording: Recording, seen: Seen, **more: float | bool) -> Calibration:
     """Affine cameras of square pixels, which leave the landmarks' offsets the least room."""
-    how = {"model": "square", "image_size_px": recording.image_size_px, "ransac_px": ransac_px} | more
-    return calibrate(seen.rows(recording, least), **how)
+    return calibrate(seen.rows(recording), model="square", image_size_px=recording.image_size_px, **more)
 
 
 def _placed(recording: Recording, seen: Seen, least: float = 0.0, ransac_px: float | None = None) -> Calibration:
     """As `_fitted`, of a finite distance where the detections show one."""
-    affine = _fitted(recording, seen, least, ransac_px)
-    with suppress(ValueError):
-        near = _fitted(recording, seen, least, ransac_px, model="square+distance")
-        value, sd = near.inverse_distance_per_mm
-        return near if value > _FINITE * sd else affine
-    return affine
+    how = {"models": ("square", "square+distance"), "image_size_px": recording.image_size_px, "ransac_px": ransac_px}
+    return calibrate_as_shown(seen.rows(recording, least), **how)
 
 
 def _by_labels(recording: Recording, seen: Seen) -> Calibration:
@@ -346,13 +339,12 @@ def _by_labels(recording: Recording, seen: Seen) -> Calibration:
     try:
         if len(seen.frame) >= _FEW_PAIRS:
             return _placed(recording, seen)
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "offsets:", RuntimeWarning)  # by a clock that is off they find no end
+        with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # by a clock that is off offsets find no end
             try:
                 return _fitted(recording, seen, ransac_px=np.inf, offsets=True, offset_prior_sd=_ROBOTS_OFFSET_MM)
-            except ValueError:  # jaws that are shut have no axes
+            except _POOR:  # jaws that are shut have no axes
                 return _fitted(recording, seen, ransac_px=np.inf)
-    except ValueError as error:
+    except _POOR as error:
         raise RefusalError(f"labels: no cameras agree with them ({error}). {_LABEL}") from error
 
 
@@ -368,7 +360,7 @@ def _by_detections(recording: Recording, seen: Seen) -> Calibration:
             break  # nothing tells which is the robot's
         try:
             found = _placed(recording, seen, least, ransac_px)
-        except ValueError as error:
+        except _POOR as error:
             if ransac_px is None and (not competing or isinstance(error, CompetingCamerasError)):
                 reason = str(error).partition(". ")[0].partition("; ")[0]  # their cures lead here
             competing = error if isinstance(error, CompetingCamerasError) else competing

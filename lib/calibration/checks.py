@@ -1,4 +1,4 @@
-"""What is refused before any fit: each check raises a ValueError with the reason and the cure."""
+"""What is refused before any fit: each check raises a `DataError` with the reason and the cure."""
 
 from collections.abc import Sequence
 
@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import chndtrix
 
+from lib.correspondences import DataError
 from lib.geometry import finite_points
 
 #: Zoom (px per mm) between a room camera and the resolution of light; what lies outside has the wrong unit.
@@ -26,7 +27,7 @@ def stacked_rows(x_mm: ArrayLike, u: Sequence[ArrayLike]) -> tuple[np.ndarray, n
         if len(pixels) != len(x):
             raise ValueError(f"{name}: {len(pixels)} points, x_mm has {len(x)}; correspondences go row by row.")
     if len(x) < 4:
-        raise ValueError(f"x_mm: {len(x)} points; an affine camera needs at least 4, better 50, not in one plane.")
+        raise DataError(f"x_mm: {len(x)} points; an affine camera needs at least 4, better 50, not in one plane.")
     return x, np.hstack(y)
 
 
@@ -39,11 +40,11 @@ def check_spread(x: np.ndarray, sigma_x_mm: float = 0.0) -> None:
     chance = np.sqrt(chndtrix(1e-9, max(n - 3, 1), 4.0 * n) / n)  # the thickness has a non-central chi-square distribution
     least = max(1e-6 * extent[0], chance * sigma_x_mm)
     if extent[0] <= least:
-        raise ValueError(f"x_mm: the points hardly move (RMS {extent[0]:.3g} mm); move the tool through the volume.")
+        raise DataError(f"x_mm: the points hardly move (RMS {extent[0]:.3g} mm); move the tool through the volume.")
     cures = {"collinear": "move the tool in all three directions", "coplanar": "cover a few depths as well"}
     for size, (shape, cure) in zip(extent[1:], cures.items(), strict=True):
         if size <= least:
-            raise ValueError(f"x_mm: the points are {shape} (RMS {size:.3g} mm, robot errors {sigma_x_mm:.3g} mm); {cure}.")
+            raise DataError(f"x_mm: the points are {shape} (RMS {size:.3g} mm, robot errors {sigma_x_mm:.3g} mm); {cure}.")
 
 
 def extents(x: np.ndarray) -> np.ndarray:
@@ -63,16 +64,16 @@ def check_units(x: np.ndarray, y: np.ndarray) -> None:
         return  # no motion at all: `check_spread` says so
     zoom, (low, high) = extent(y) / size, PLAUSIBLE_PX_PER_MM
     if zoom > high:
-        raise ValueError(f"x_mm: {zoom:.3g} px per mm is finer than light resolves; multiply metres by 1000.")
+        raise DataError(f"x_mm: {zoom:.3g} px per mm is finer than light resolves; multiply metres by 1000.")
     if zoom < low:
-        raise ValueError(f"x_mm: {zoom:.3g} px per mm is too coarse; divide micrometres by 1000, or move the tool.")
+        raise DataError(f"x_mm: {zoom:.3g} px per mm is too coarse; divide micrometres by 1000, or move the tool.")
 
 
 def check_duplicates(x: np.ndarray, y: np.ndarray) -> None:
     """Refuse rows that repeat another row in every digit: they add no information and fake precision."""
     repeated = len(x) - len(np.unique(np.nan_to_num(np.hstack([x, y]), nan=-1e9), axis=0))
     if repeated:
-        raise ValueError(f"x_mm, u: {repeated} of {len(x)} rows repeat another row; drop frames frozen or read twice.")
+        raise DataError(f"x_mm, u: {repeated} of {len(x)} rows repeat another row; drop frames frozen or read twice.")
 
 
 def check_images(y: np.ndarray, image_size_px: tuple[int, int] | None = None) -> None:
@@ -81,17 +82,17 @@ def check_images(y: np.ndarray, image_size_px: tuple[int, int] | None = None) ->
     for name, u in zip(names, np.split(y, len(names), axis=1), strict=True):
         u = u[np.isfinite(u).all(axis=1)]
         if len(u) < 4:
-            raise ValueError(f"{name}: {len(u)} detections; an affine camera needs at least 4, better 50, not in one plane.")
+            raise DataError(f"{name}: {len(u)} detections; an affine camera needs at least 4, better 50, not in one plane.")
         if np.linalg.svd(u - u.mean(axis=0), compute_uv=False)[1] <= 1e-9 * np.abs(u).max() * np.sqrt(len(u)):
-            raise ValueError(f"{name}: the detections stand still or lie on one line; is this the moving tool?")
+            raise DataError(f"{name}: the detections stand still or lie on one line; is this the moving tool?")
         if image_size_px is not None:
             limit = np.asarray(image_size_px, dtype=float)
             outside, swapped = (((v < -0.1 * limit) | (v > 1.1 * limit)).any(axis=1).mean() for v in (u, u[:, ::-1]))
             if outside > 0.1 and swapped < 0.5 * outside:
-                raise ValueError(f"{name}: {100 * outside:.0f} % lie outside the image; give (x, y), not (row, column).")
+                raise DataError(f"{name}: {100 * outside:.0f} % lie outside the image; give (x, y), not (row, column).")
     both = y[np.isfinite(y).all(axis=1)]
     if len(names) == 2 and len(both) and (both[:, :2] == both[:, 2:]).all(axis=1).mean() > 0.5:
-        raise ValueError("u_right: the same pixels as u_left; give the right camera's own detections.")
+        raise DataError("u_right: the same pixels as u_left; give the right camera's own detections.")
 
 
 def sides(A: np.ndarray) -> tuple[float, float]:

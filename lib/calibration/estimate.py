@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from typing import Literal
@@ -13,10 +14,10 @@ from lib.calibration import checks as refuse
 from lib.calibration.affine import affine_minimum, estimate_noise, noise_rms_px, paper_variances, regress
 from lib.calibration.calibration import Calibration
 from lib.calibration.models import Fit, Model, State, fit
-from lib.calibration.offsets import estimate_offsets, rows_axes, start_of_turning, tool_axes
+from lib.calibration.offsets import estimate_offsets, further_step, rows_axes, start_of_turning, tool_axes
 from lib.calibration.robust import consensus
 from lib.calibration.scatter import sandwich
-from lib.correspondences import Correspondences
+from lib.correspondences import Correspondences, DataError
 from lib.geometry import pair_covariance, precision, view_distances2
 from lib.least_squares import inverse
 
@@ -26,6 +27,8 @@ _OFFSET_ROWS = 24
 _SURE_OFFSETS, _LEAST_TURN_MM = 1e-3, 0.005
 #: Axes turn unless their log likelihood is lower by more than this.
 _AS_LIKELY = 3.0
+#: Standard deviations of 1/distance that show a finite distance: one of 2000 sets of affine cameras does; derivatives' step.
+_FINITE, _STEP_PER_MM = 3.0, 1e-6
 
 
 def calibrate(
@@ -124,6 +127,31 @@ def calibrate(
     return replace(found, **{name: np.insert(getattr(found, name), places, fill, axis=0) for name, fill in fillers.items()})
 
 
+def calibrate_as_shown(
+    data: Correspondences, *, models: tuple[str, str] = ("zero_skew", "near_affine"), **options: object
+) -> Calibration:  # fmt: skip
+    """`calibrate` with affine cameras, or with cameras of a finite distance where the detections show one.
+
+    They do where a step from the affine cameras makes 1/distance (1/mm) positive by three of its standard deviations.  The
+    `models` are without it and with one for both cameras; `options` and errors are those of `calibrate`.
+
+    >>> from lib.simulator.rig import reference_rig
+    >>> rng = np.random.default_rng(0)
+    >>> x = rng.uniform(-4, 4, (60, 3))
+    >>> u = [v + rng.normal(0, 1, v.shape) for v in reference_rig(inverse_distance_per_mm=1 / 190).project(x)]
+    >>> calibrate_as_shown(Correspondences.of_points(x, *u)).model
+    'near_affine'
+    """
+    found = calibrate(data, model=models[0], **options)
+    state, x = found.minimum.state, found.minimum.points
+    far, near = (replace(state, rho=state.rho + h).evaluate(x, derivatives=False)[0] for h in (0.0, _STEP_PER_MM))
+    with suppress(DataError, np.linalg.LinAlgError):  # of rows that are too few for one number more
+        value, sd = further_step(found, data, (near - far) / _STEP_PER_MM)
+        if value > _FINITE * sd:
+            return calibrate(data, model=models[1], **options)
+    return found
+
+
 def _usable_rows(data: Correspondences, offsets: bool | str | None, weighting: str) -> tuple[np.ndarray, np.ndarray | None]:
     """Mask of the rows to calibrate with (seen in one view at least), and the tool's axes in them or None."""
     if offsets not in (None, False, True, "tool", "image"):
@@ -139,7 +167,7 @@ def _usable_rows(data: Correspondences, offsets: bool | str | None, weighting: s
     if offsets is None and count < max(_OFFSET_ROWS, 0.5 * usable.sum()):
         return usable, None
     if count < 4:
-        raise ValueError(f"offsets: {count} rows have the tool's axes; the robot must report landmarks with open jaws.")
+        raise DataError(f"offsets: {count} rows have the tool's axes; the robot must report landmarks with open jaws.")
     return open_jaws, axes[open_jaws]
 
 
@@ -165,10 +193,9 @@ def _turned(
         return found
     try:
         begin = start_of_turning(found, axes, turned, data.landmark[usable])
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "offsets:", RuntimeWarning)
+        with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # that they find no end
             other = estimate(axes=turned, start=replace(found, offsets=replace(found.offsets, offset=begin)))
-    except ValueError:  # no cameras fit them
+    except (DataError, np.linalg.LinAlgError):  # no cameras fit them
         return found
     used = np.repeat(found.view_inliers | other.view_inliers, 2, axis=1)
     most = 2 * found.reprojection_rms_px  # of a frame whose axes stay unknown more would say nothing
@@ -192,7 +219,7 @@ def _calibrate(
         if value is not None and not (value > 0 or (value == 0 and name != "sigma_u_px")):
             raise ValueError(f"{name}: must not be negative, nor sigma_u_px zero, got {value}; None estimates it.")
     if np.isfinite(y).sum() < len(plan.parameter_names):
-        raise ValueError(f"x_mm: {n} points are too few for the {len(plan.parameter_names)} parameters of '{model}'.")
+        raise DataError(f"x_mm: {n} points are too few for the {len(plan.parameter_names)} parameters of '{model}'.")
     if noise is not None and not np.isfinite(noise).all():
         raise ValueError("covariance_px2: must be finite in every row.")
     if weighting == "paper" and noise is not None and len(noise) > 1:
@@ -250,7 +277,7 @@ def _calibrate(
             degrees = np.rad2deg(-refuse.sides(found.rig.linear)[0])
             what = f"the cameras are swapped, left stands on the right by {degrees:.1f} degrees"
             cure = "exchange u_left and u_right (or flip both images, if mirrored; turn both, if upside down)"
-            raise ValueError(f"u: {what}; {cure}.  checks=False takes them as they are.")
+            raise DataError(f"u: {what}; {cure}.  checks=False takes them as they are.")
     return found
 
 

@@ -21,7 +21,7 @@ from scipy.special import chdtrc
 from lib.calibration.calibration import Calibration, LandmarkOffsets
 from lib.calibration.robust import CompetingCamerasError
 from lib.calibration.scatter import sandwich
-from lib.correspondences import Correspondences
+from lib.correspondences import Correspondences, DataError
 from lib.geometry import cross
 
 #: Step of the offsets' derivatives, mm or px.
@@ -177,7 +177,7 @@ def estimate_offsets(
         competing = error
     if found is not None and _agree_alike(found, landmark):
         return found
-    with suppress(ValueError, RuntimeWarning), warnings.catch_warnings():
+    with suppress(DataError, np.linalg.LinAlgError, RuntimeWarning), warnings.catch_warnings():
         warnings.filterwarnings("error", "offsets:", RuntimeWarning)  # still moving: no explanation
         other = steps(taken=_TAKEN)
         offset = other.offsets.offset[np.bincount(landmark) > 0]
@@ -304,3 +304,22 @@ def _evidence(information: np.ndarray, gradient: np.ndarray, least: float) -> tu
     known = values * (500 * least) ** 2 > 1.0
     p_value = float(chdtrc(known.sum(), (along[known] / values[known]).sum())) if known.any() else 1.0
     return float(candidates[np.argmax(evidence)]), p_value
+
+
+def further_step(found: Calibration, data: Correspondences, column: np.ndarray) -> tuple[float, float]:
+    """A number that the calibration `found` of `data` does not have, and its standard deviation.
+
+    One Gauss-Newton step of cameras, landmarks' offsets and it together; `column` (inliers, m) is the pixels' change with it.
+    """
+    rows, learnt = data.subset(found.inliers), found.offsets
+    J_x, J_c, weight, r = found.system
+    J, now, prior = column[:, :, None], np.zeros(1), np.zeros(1)
+    if learnt is not None and learnt.offset.shape[1] == 3:
+        axes = np.nan_to_num(rows_axes(data, learnt.offset if learnt.turns else None)[found.inliers])
+        of_offsets = np.einsum("nia,nk->nika", J_x @ axes, np.eye(len(learnt.offset))[rows.landmark]).reshape(*r.shape, -1)
+        J, now = np.concatenate([J, of_offsets], axis=2), np.append(now, learnt.offset)
+        prior = np.append(prior, np.full(learnt.offset.size, learnt.prior_sd**-2))
+    information, gradient = _without_cameras(J, J_c, weight, r)
+    step = np.linalg.solve(information + np.diag(prior), gradient - prior * now)[0]
+    J, prior = np.concatenate([J, J_c], axis=2), np.diag(np.append(prior, np.zeros(J_c.shape[2])))
+    return float(step), float(np.sqrt(sandwich(J, weight, r, rows.frame, rows.landmark, prior)[0][0, 0]))

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.special import fdtri, gammainccinv
 
 from lib.calibration.affine import regress
+from lib.correspondences import DataError
 from lib.geometry import cross
 
 FALSE_ALARM = 1e-4
@@ -29,7 +30,7 @@ _TAILS = 0.1  # share of outliers up to which they may be the tails of the noise
 _NEARLY_ALL = 0.8  # share of the rows that a camera explains, of which a part may agree better by chance
 
 
-class NoConsensusError(ValueError):
+class NoConsensusError(DataError):
     """The rows agree on no camera, or on two that compete; the text says which, how many rows, and the cure."""
 
 
@@ -162,7 +163,7 @@ def _samples(x: np.ndarray, count: int, rng: np.random.Generator, least_mm: floa
     thick = np.sqrt(np.maximum(np.linalg.eigvalsh(np.swapaxes(corners, 1, 2) @ corners)[:, 0], 0.0))
     spans = thick > 1e-6 * np.abs(x).max()  # rounding leaves 1e-8
     if not spans.any():
-        raise ValueError("x_mm: no four of the positions span a volume; move the tool through more places and depths.")
+        raise DataError("x_mm: no four of the positions span a volume; move the tool through more places and depths.")
     sets, thick = sets[spans], thick[spans]
     fine = thick > least_mm
     return sets[fine] if fine.sum() >= 20 else sets[np.argsort(-thick)[:20]]

@@ -9,10 +9,10 @@ from scipy.interpolate import BSpline, make_lsq_spline
 
 from lib.calibration.affine import estimate_noise, regress
 from lib.calibration.calibration import Calibration
-from lib.calibration.offsets import rows_axes
+from lib.calibration.offsets import further_step
 from lib.calibration.robust import NoConsensusError, consensus
 from lib.calibration.scatter import sandwich
-from lib.correspondences import Correspondences
+from lib.correspondences import Correspondences, DataError
 from lib.geometry import precision
 from lib.recordings import Kinematics
 
@@ -25,11 +25,10 @@ _CLEAR, _NEAR = 0.4, 0.03
 
 @dataclass(frozen=True, eq=False)
 class TimeOffset:
-    """t_robot = t_video + offset_s, its sd, which allows for errors that last, and the RMS there and at `trial_s`."""
+    """t_robot = t_video + offset_s, its sd, which allows for errors that last, and the RMS px at `trial_s`."""
 
     offset_s: float
     sd_s: float
-    rms_px: float  # of the detections that agree
     trial_s: np.ndarray
     trial_rms_px: np.ndarray
 
@@ -92,7 +91,7 @@ def estimate_time_offset(
             fast; their noise is averaged over 0.1 s.  NaN where the robot is silent: rows in a longer gap are left out.
         start_s, search_s: Middle and half width of the search.
 
-    A ValueError refuses fewer than eight instants inside the kinematics, a tool at rest, rows that agree on no cameras
+    A `DataError` refuses fewer than eight instants inside the kinematics, a tool at rest, rows that agree on no cameras
     (`NoConsensusError`), and an offset at the end of the search.
     """
     time, frame, landmark, y = _rows(data)
@@ -106,7 +105,7 @@ def estimate_time_offset(
     if n < 8:
         if isinstance(data, Correspondences):
             data.check_detections()
-        raise ValueError(f"data: {n} frames lie inside the kinematics by search_s = {search_s} s, away from gaps; give 8.")
+        raise DataError(f"data: {n} frames lie inside the kinematics by search_s = {search_s} s, away from gaps; give 8.")
 
     def at(offset: float | np.ndarray, derivative: int = 0) -> np.ndarray:
         return paths.at(landmark, time + offset, derivative)
@@ -148,45 +147,31 @@ def estimate_time_offset(
             image, W, r = linearised(offset)
             information = np.einsum("ni,nij,nj->", image, W, image)
             if information <= 0:
-                raise ValueError("kinematics: the tool moves at no varying speed; the offset cannot be seen.")
+                raise DataError("kinematics: the tool moves at no varying speed; the offset cannot be seen.")
             step = np.einsum("ni,nij,nj->", image, W, r) / information
             offset = float(np.clip(offset + step, low, high))
             if abs(step) < 1e-7:
                 break
     if offset in (low, high):
-        raise ValueError(f"search_s: {offset:.3f} s, lies at the end of the search; widen search_s or move start_s.")
+        raise DataError(f"search_s: {offset:.3f} s, lies at the end of the search; widen search_s or move start_s.")
     rms_px = float(_rms_px(at(offset)[None], y, views)[0])
     if rms_px > far_px * (3 if clear else 1):  # a path that comes back to where it was has more minima
-        raise ValueError(f"search_s: the best, {offset:.3f} s, leaves {rms_px:.0f} px RMS; widen search_s or move start_s.")
+        raise DataError(f"search_s: the best, {offset:.3f} s, leaves {rms_px:.0f} px RMS; widen search_s or move start_s.")
     sd = float(np.sqrt(sandwich(image[:, :, None], W, r, frame, landmark)[0][0, 0]))
-    return TimeOffset(offset, sd, rms_px, trial, misfit)
+    return TimeOffset(offset, sd, trial, misfit)
 
 
 def clock_error(found: Calibration, data: Correspondences, kinematics: Kinematics, offset_s: float) -> tuple[float, float]:
     """What the robot's clock is still off by where `data` were paired with `offset_s`, s, and its standard deviation.
 
-    One Gauss-Newton step of cameras, landmarks' offsets and clock together, from the calibration `found` of `data`; 0 and
-    infinity where the kinematics are too sparse for velocities.  `estimate_time_offset` knows no offsets; those of a turning
-    tool look like a part of the time.
+    A `further_step` from the calibration `found` of `data`; 0 and infinity where the kinematics are too sparse for it.
+    `estimate_time_offset` knows no offsets; those of a turning tool look like a part of the time.
     """
     rows = data.subset(found.inliers)
-    J_x, J_c, weight, r = found.system
     v = np.nan_to_num(_paths(kinematics).at(rows.landmark, rows.time_s + offset_s, 1))
     if np.count_nonzero(v.any(axis=1)) < 8:
         return 0.0, np.inf
-    parts = [J_x @ v[:, :, None], np.broadcast_to(J_c, (len(r), *J_c.shape[1:]))]
-    penalty = pull = 0.0
-    if found.offsets is not None and found.offsets.offset.shape[1] == 3:
-        axes = np.nan_to_num(rows_axes(data, found.offsets.offset if found.offsets.turns else None)[found.inliers])
-        chosen = np.eye(len(found.offsets.offset))[rows.landmark]
-        parts.append(np.einsum("nia,nk->nika", J_x @ axes, chosen).reshape(len(r), r.shape[1], -1))
-        penalty, pull = found.offsets.prior_sd**-2, found.offsets.offset.ravel() / found.offsets.prior_sd**2
-    J, p = np.concatenate(parts, axis=2), 1 + J_c.shape[2]
-    prior = np.diag(np.where(np.arange(J.shape[2]) < p, 0.0, penalty))
-    gradient = np.einsum("nip,ni->p", J, (weight @ r[:, :, None])[:, :, 0])
-    gradient[p:] -= pull
-    step = np.linalg.solve(np.einsum("nip,niq->pq", J, weight @ J) + prior, gradient)[0]
-    return float(step), float(np.sqrt(sandwich(J, weight, r, rows.frame, rows.landmark, prior)[0][0, 0]))
+    return further_step(found, data, (found.system[0] @ v[:, :, None])[:, :, 0])
 
 
 def _rms_px(x: np.ndarray, y: np.ndarray, views: np.ndarray) -> np.ndarray:

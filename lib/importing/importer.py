@@ -1,14 +1,18 @@
 """From foreign files to a recording: everything is read and checked, then the recording appears whole."""
 
+from contextlib import suppress
+from dataclasses import replace
 from decimal import Decimal
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from lib import files
-from lib.calibration import NoConsensusError, TimeOffset, Tool, estimate_time_offset, pivot_calibration, tool_offsets
-from lib.correspondences import LANDMARKS, NoDetectionError, of_recording
+from lib.calibration import NoConsensusError, TimeOffset, Tool, calibrate_as_shown, pivot_calibration, tool_offsets
+from lib.calibration.timing import clock_error, estimate_time_offset
+from lib.correspondences import LANDMARKS, DataError, NoDetectionError, of_recording
 from lib.geometry import RigidTransform
 from lib.importing.labels import read_labels
 from lib.importing.logs import increasing, read_robot, since
@@ -93,19 +97,27 @@ def import_recording(source: str | Path, mapping: str | Path, out: str | Path, *
 def _clock(draft: Recording, search_s: float) -> TimeOffset | str:
     """The offset of the clocks, from labels or else the detector; or why a detector that knows no such tool finds none."""
     if (labels := draft.annotations) is not None:
-        data = of_recording(draft, labels.u_left, labels.u_right)
+        known = {"u_left": labels.u_left, "u_right": labels.u_right}
     elif draft.skeleton != LANDMARKS:
         return f"the detector knows {', '.join(LANDMARKS)} alone, and there are no labels"
     else:
         some = np.unique(np.linspace(0, len(draft) - 1, min(len(draft), _CLOCK_FRAMES)).astype(int))
-        data = detect(draft, SharedDetector(), frames=some)
+        seen = detect(replace(draft, readout_s=0.0), SharedDetector(), frames=some)  # the pixels as they were found
+        known = {name: seen.grid(name) for name in ("u_left", "u_right", "covariance_px2", "confidence")} | {"frames": some}
+    paired = partial(of_recording, **known)
     try:
-        return estimate_time_offset(data, draft.kinematics, start_s=draft.offset_s, search_s=search_s)
+        found = estimate_time_offset(paired(draft), draft.kinematics, start_s=draft.offset_s, search_s=search_s)
     except ValueError as error:
         if labels is None and isinstance(error, NoConsensusError | NoDetectionError):
             return str(error).removesuffix(".")
         cure = "Or state offset_s, where t_robot = t_video + offset_s"
         raise ValueError(f"robot.offset_s = 'estimate': {error} {cure}.") from None
+    with suppress(DataError):  # cameras of their own ask for more
+        data = paired(replace(draft, offset_s=found.offset_s))
+        calibration = calibrate_as_shown(data, image_size_px=draft.image_size_px)
+        step_s, sd_s = clock_error(calibration, data, draft.kinematics, found.offset_s)  # the landmarks' offsets are free
+        found = replace(found, offset_s=found.offset_s + step_s, sd_s=sd_s) if np.isfinite(sd_s) else found
+    return found
 
 
 def _landmarks(

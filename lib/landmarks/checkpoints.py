@@ -1,6 +1,5 @@
 """Weights on disk: safetensors files with JSON metadata and a checksum of both."""
 
-import hashlib
 import json
 from pathlib import Path
 
@@ -16,14 +15,12 @@ _CURE = "get the file again, or train one with `python3 -m lib train`."
 
 def checksum(tensors: dict[str, Tensor], metadata: dict[str, str]) -> str:
     """SHA-256 (hexadecimal) over names, types, shapes and bytes of the tensors and over the metadata but ``"sha256"``."""
-    digest = hashlib.sha256()
+    parts = []
     for name, tensor in sorted(tensors.items()):
-        digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}\n".encode())
-        digest.update(tensor.detach().cpu().contiguous().reshape(-1).view(uint8).numpy().data)
-    for name, value in sorted(metadata.items()):
-        if name != "sha256":
-            digest.update(f"{name} {value}\n".encode())
-    return digest.hexdigest()
+        parts.append(f"{name} {tensor.dtype} {tuple(tensor.shape)}\n".encode())
+        parts.append(tensor.detach().cpu().contiguous().reshape(-1).view(uint8).numpy().data)
+    parts += [f"{name} {value}\n".encode() for name, value in sorted(metadata.items()) if name != "sha256"]
+    return files.digest(*parts, length=64)
 
 
 def write_checkpoint(path: str | Path, tensors: dict[str, Tensor], metadata: dict[str, object]) -> None:

@@ -1,6 +1,5 @@
 """The detector over a recording, and detections that notebooks of one run, or commands, share: no pair is looked at twice."""
 
-import hashlib
 import os
 import time
 from collections.abc import Callable
@@ -76,7 +75,7 @@ class SharedDetector:
         self.pairs, file = self.pairs + 1, None
         if self._folder:
             content = f"{self._digest} {images.dtype} {images.shape}".encode() + images.tobytes()
-            file = Path(self._folder) / f"{hashlib.sha256(content).hexdigest()}.npz"
+            file = Path(self._folder) / f"{files.digest(content, length=64)}.npz"
             if file.is_file():
                 with np.load(file) as kept:
                     self.read, self.seconds = self.read + 1, self.seconds + float(kept["seconds"])

@@ -42,18 +42,8 @@ class Tally:
             f"{n} frames in {spent:.1f} s, {n / spent:.1f} a second; processor {cpu / max(n, 1):.3f} s a frame\n"
             f"{self.surfaces} surfaces, {self.surfaces / spent:.1f} a second; {self.dropped} dropped\n"
             f"latency from frame to distance: {median:.0f} ms median, {late:.0f} ms 99th percentile\n"
-            f"states: {states}\nfailures: {failures}{_memory()}"
+            f"states: {states}\nfailures: {failures}"
         )
-
-
-def _memory() -> str:
-    """A line about the most memory that this process has held; none on Windows, which does not tell."""
-    with contextlib.suppress(ImportError):
-        import resource
-
-        unit = 2**20 if sys.platform == "darwin" else 2**10
-        return f"\nmemory: at most {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit:.0f} MB"
-    return ""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -87,9 +77,10 @@ def main(argv: list[str] | None = None) -> int:
             start = arrival.arrived_s if a.live else time.monotonic()
             result = pipeline.step(arrival.left, arrival.right, arrival.kinematics, time_s=arrival.time_s)
             tally.add(result, time.monotonic() - start)
-            if (result.state, result.cause) != state:
-                state = (result.state, result.cause)
-                print(f"frame {result.index:6d} {result.time_s:9.2f} s: {result.state} {result.cause}".rstrip())
+            near = "; the cameras have a finite distance" if np.isfinite(result.working_distance_mm) else ""
+            if (told := f"{result.state} {result.cause}".rstrip() + near) != state:
+                state = told
+                print(f"frame {result.index:6d} {result.time_s:9.2f} s: {told}")
             for name, why in result.failures.items():
                 print(f"frame {result.index:6d} {name}: {why}", file=sys.stderr)
             if recorder:

@@ -167,7 +167,7 @@ def row(result: FrameResult) -> dict[str, str]:
     for side, u in (("left", result.landmarks.u_left), ("right", result.landmarks.u_right)):
         numbers |= {f"{side}_{name}_{axis}_px": u[k, i] for k, name in enumerate(LANDMARKS) for i, axis in enumerate("xy")}
     numbers |= {f"rests_on_{name}_s": result.rests_on.get(name, np.nan) for name in ("landmarks", "robot", "rig", "surface")}
-    numbers["drift"] = result.drift
+    numbers |= {"working_distance_mm": result.working_distance_mm, "drift": result.drift}
     return {
         "frame": str(result.index), "time_s": repr(float(result.time_s)),
         "state": result.state, "cause": _plain(result.cause),

@@ -11,7 +11,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lib.calibration import Calibration, calibrate
+from lib.calibration import Calibration, calibrate_as_shown
 from lib.cameras import StereoRig
 from lib.correspondences import LANDMARKS, MIN_CONFIDENCE, Correspondences
 from lib.online.checks import FrameChecks
@@ -43,12 +43,12 @@ class OnlinePipeline:
         noise_px: Standard deviation of a landmark's residual per coordinate, for a `rig` that is no calibration.
         beside: Reconstruct surfaces in a process beside this one, the newest frame first; else in turn, which gives the
             same output for the same input.  Use it in a ``with`` block, which ends the process.
-        calibrate, reconstruct: Replace `lib.calibration.calibrate` and, in turn, `lib.surface.reconstruct`.
+        calibrate, reconstruct: Replace `lib.calibration.calibrate_as_shown` and, in turn, `lib.surface.reconstruct`.
     """
 
     def __init__(
         self, detector: Callable[[np.ndarray], Any], *, rig: StereoRig | Calibration | None = None, noise_px: float = 1.5,
-        settings: Settings | None = None, beside: bool = False, calibrate: Callable[..., Calibration] = calibrate,
+        settings: Settings | None = None, beside: bool = False, calibrate: Callable[..., Calibration] = calibrate_as_shown,
         reconstruct: Callable[..., Reconstruction] = reconstruct,
     ) -> None:  # fmt: skip
         self.settings = settings or Settings()

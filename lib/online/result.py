@@ -125,9 +125,10 @@ class FrameResult:
     failures: dict[str, str] = field(default_factory=dict)
 
     @property
-    def reconstructed(self) -> bool:
-        """True where the surface is this frame's own."""
-        return self.reconstructed_at == self.index
+    def working_distance_mm(self) -> float:
+        """Of the cameras in force: finite where the detections show one, infinite of affine ones and without a rig."""
+        near = 0.0 if self.rig is None else getattr(self.rig.left, "inverse_distance_per_mm", 0.0)
+        return 1.0 / near if near else float("inf")
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:

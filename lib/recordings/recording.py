@@ -245,11 +245,11 @@ def _read_kinematics(path: Path, landmarks: Sequence[str]) -> Kinematics:
     refuse(path, (empty.any(axis=2) & ~empty.all(axis=2)).any(axis=1), problem)
     reach = np.linalg.norm(x[:, 1:] - x[:, :1], axis=2)
     if not np.isfinite(reach).any():
-        raise ValueError(f"{path}: no row holds {landmarks[0]} and another landmark; the kinematics are empty.")
+        raise ValueError(f"{path}: no row holds {landmarks[0]} and one more; log {', '.join(landmarks)} in each row.")
     reach_mm = float(np.nanmedian(reach))
-    if not 0.1 <= reach_mm <= 100:  # a jaw or shaft in metres or micrometres falls far outside
-        what = f"the median distance from {landmarks[0]} to the others is {reach_mm:.4g}, not plausible in mm (0.1 to 100)"
-        raise ValueError(f"{path}: {what}. Metres or micrometres? Convert to mm.")
+    if not 0.25 <= reach_mm <= 100:  # a jaw or shaft in metres, inches or micrometres falls outside
+        what = f"the median distance from {landmarks[0]} to the others is {reach_mm:.4g}, not plausible in mm (0.25 to 100)"
+        raise ValueError(f"{path}: {what}. Metres, inches or micrometres? Convert to mm.")
     return Kinematics(time_s, x)
 
 

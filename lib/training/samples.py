@@ -1,12 +1,12 @@
 """Labelled images: one by one from a recording, in memory, and mixed."""
 
-import hashlib
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from typing import NamedTuple, Self
 
 import numpy as np
 
+from lib import files
 from lib.recordings import Recording
 from lib.recordings.annotations import CLICK_SD_PX
 
@@ -70,13 +70,13 @@ class Source:
     @property
     def fingerprint(self) -> str:
         """Of all fields: the images, their labels, and how images are drawn from them."""
-        digest = hashlib.sha256()
+        parts = []
         for value in (getattr(self, field.name) for field in fields(self)):
             if isinstance(value, np.ndarray):
-                digest.update(np.ascontiguousarray(value[:, ::7, ::7] if value.ndim == 4 else value))
+                parts.append(np.ascontiguousarray(value[:, ::7, ::7] if value.ndim == 4 else value))
             else:
-                digest.update((value.fingerprint if isinstance(value, Source) else repr(value)).encode())
-        return digest.hexdigest()[:16]
+                parts.append((value.fingerprint if isinstance(value, Source) else repr(value)).encode())
+        return files.digest(*parts, length=16)
 
 
 @dataclass(frozen=True)

@@ -39,7 +39,7 @@ class Check:
     def to_json(self) -> dict:
         """verdict, reasons, next_step, facts and the score of each frame, as in check.json."""
         a = self.assessment
-        hypotheses = [plain(vars(h)) for h in a.diagnosis.hypotheses[:5]]
+        hypotheses = [plain({k: v for k, v in vars(h).items() if k != "evidence"}) for h in a.diagnosis.hypotheses[:5]]
         frames = {"frame": a.health.frame.tolist(), "score": plain(a.health.score.tolist())}
         facts = {"recording": self.recording.name, **self.facts, "next_step": self.next_step}
         numbers = {"epipolar_px": plain(a.epipolar_px), "unhealthy_share": a.health.unhealthy}
@@ -144,10 +144,6 @@ def _facts(recording: Recording, a: Assessment) -> dict[str, str]:
     for name, (title, what) in told.items():
         doubt = best.text if best is not None and best.name == name else "nothing speaks against it."
         facts[title] = f"{what} is stated; {doubt}"
-    if c is not None and c.offsets is not None and c.offsets.offset.shape[1] == 3:
-        offsets = zip(LANDMARKS, 1e3 * c.offsets.offset, strict=False)
-        parts = ["{}: {:+z.0f}, {:+z.0f}, {:+z.0f} um".format(name, *value) for name, value in offsets]
-        facts["landmark offsets"] = "; ".join(parts) + " (along, across, normal)."
     if c is not None and (far := c.inverse_distance_per_mm)[1] > 0:
         facts["cameras"] = f"of a finite distance, {1 / far[0]:.0f} +- {far[1] / far[0] ** 2:.0f} mm, as the detections show."
     bad = f"{int((a.health.score > 1).sum())} of {len(a.health.frame)} frames have a score above 1"

@@ -36,7 +36,7 @@ def _clock(case: Case) -> Iterator[Hypothesis]:
         else:
             text = f"The {SIDES[views[0]]} camera alone shows the tool {text} later than the frame's time."
             cure = f"Trigger both cameras together, or pair each right image with the left one of its instant ({text})."
-        yield case.found(name, fit, 1, (1e3 * value, 1e3 * sd, "ms"), text, cure, on=problem)
+        yield case.found(name, fit, 1, (1e3 * value, 1e3 * sd, "ms"), text, cure, on=problem, images=views)
 
 
 def _refined(
@@ -126,7 +126,7 @@ def _readout(case: Case) -> Iterator[Hypothesis]:
             who, them = ("Both images are", "both") if len(views) == 2 else (f"The {SIDES[views[0]]} image is", "it")
             text = f"{who} turned by 180 degrees: rows are read upwards, in {-1e3 * readout_s:.1f} +- {1e3 * sd:.1f} ms."
             cure = f"Turn {them} by 180 degrees, with readout_s = {-readout_s:.4f}."
-            yield case.found("turned_image", fit, 1, (1e3 * readout_s, 1e3 * sd, "ms"), text, cure, on=known)
+            yield case.found("turned_image", fit, 1, (1e3 * readout_s, 1e3 * sd, "ms"), text, cure, on=known, images=views)
         elif len(views) == 2:
             text = f"Residuals grow row by row as the tool moves: readout_s is off by {1e3 * value:.1f} +- {1e3 * sd:.1f} ms."
             cure = f"Set readout_s = {max(readout_s, 0.0):.4f} in recording.toml."

@@ -15,7 +15,7 @@ from lib.calibration.checks import eyes_exchanged, sides
 from lib.correspondences import LANDMARKS, TRAIN_FURTHER, Correspondences
 from lib.recordings import Kinematics
 from lib.trust.clocks import TIME_TESTS
-from lib.trust.fitting import FITS, SIDES, Case, Hypothesis, Problem, Robust
+from lib.trust.fitting import FITS, SIDES, Case, Hypothesis, Problem, Robust, compared
 from lib.trust.health import affine_epipolar
 
 _MOST_ROWS, _FEWEST_FRAMES = 1200, 4  # of three frames nothing checks anything
@@ -48,7 +48,7 @@ def _tip_order(case: Case) -> Iterator[Hypothesis]:
         cure = f"Bring the columns of kinematics.csv, or the detections of {where}, into one order."
         mirrored = "both images are mirrored, flip them" if len(views) == 2 else "that image is mirrored, flip it"
         cure += f" If {mirrored} instead." if order == (0, 2, 1) else ""
-        yield case.found("tip_order", moved.fit(), 1, (1.0, 0.0, ""), text, cure, on=moved)
+        yield case.found("tip_order", moved.fit(), 1, (1.0, 0.0, ""), text, cure, on=moved, images=views)
     swapped = table[:, [0, 2, 1]][problem.frame, problem.landmark]  # frame by frame: one bit each
     fit, moved, own = case.chosen(np.stack([problem.x[:, 0], swapped]))
     text = f"The tips are exchanged in {100 * own.mean():.0f} % of the frames."
@@ -167,7 +167,7 @@ def _camera_moved(case: Case) -> Iterator[Hypothesis]:
         who = "Both cameras" if len(views) == 2 else f"The {SIDES[views[0]]} camera"
         text = f"{who} moved at about frame {frame} of those seen: the images shift by {size:.1f} px."
         cure = "Calibrate before and after on their own, or follow the move with lib.registration.register_images."
-        yield case.found("camera_moved", fit, 8 * len(views) + 3, (size, 0.0, "px"), text, cure)
+        yield case.found("camera_moved", fit, 8 * len(views) + 3, (size, 0.0, "px"), text, cure, images=views)
 
 
 def _frozen(case: Case) -> Iterator[Hypothesis]:
@@ -343,9 +343,6 @@ class Diagnosis:
         """The fault that the data show; None where nothing beats "nothing is wrong"."""
         return max((h for h in self.hypotheses if h.is_named), key=lambda h: h.gain, default=None)
 
-    def __str__(self) -> str:
-        return "no fault found" if self.best is None else f"{self.best.name}: {self.best.text} {self.best.cure}"
-
 
 def diagnose(
     data: Correspondences, *, kinematics: Kinematics | None = None, offset_s: float = 0.0, readout_s: float = 0.0,
@@ -385,9 +382,9 @@ def diagnose(
     tests = [_tip_order, _finite_distance, _landmark_offset, _tool_bends, _drift, _bad_part, _camera_moved, _frozen]
     tests = [*(TIME_TESTS if case.paths else ()), *tests, _rigid_tips]
     found = [h for test in tests for h in test(case) if np.isfinite(h.gain)]
-    best = Diagnosis(found := case.compared(found)).best
+    best = Diagnosis(found := compared(found)).best
     fit = case.null if best is None else case.fits.get(best.name, case.null)
-    turned = best is not None and best.name == "turned_image" and best.text.startswith("Both")  # then left is right
+    turned = best is not None and best.name == "turned_image" and len(best.images) == 2  # then left is right
     found += [h for h in _optics(case, fit, -1.0 if turned else 1.0) if np.isfinite(h.gain)]
     best = Diagnosis(found).best
     found += _unexplained(case, case.null if best is None else case.fits.get(best.name, fit))

@@ -207,7 +207,7 @@ class Problem:
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A possible fault: what the residuals look like, the setting or call that mends it, and its size."""
+    """A possible fault: what the residuals look like, the setting or call that mends it, its size, the images it is in."""
 
     name: str
     text: str
@@ -217,6 +217,8 @@ class Hypothesis:
     unit: str
     explained: float  # share of the residuals' variance, 0 to 1 (robustly, from the likelihood)
     gain: float  # log likelihood above "nothing is wrong", less the penalty for its parameters
+    images: tuple[int, ...] = (0, 1)  # left and right
+    evidence: tuple[float, float, float, float] | None = None  # of the fit that the gain is of, as `_gain` takes it
 
     @property
     def is_named(self) -> bool:
@@ -235,7 +237,7 @@ class Case:
         self, problem: Problem, kinematics: Kinematics | None, offset_s: float, readout_s: float, size: tuple[int, int] | None
     ) -> None:
         self.problem, self.readout_s, self.size = problem, readout_s, size
-        self.null, self.fits, self._evidence = problem.fit(), {}, {}
+        self.null, self.fits = problem.fit(), {}
         self.frames = int(problem.frame.max()) + 1
         self.paths, self._clock_s = None, offset_s
         time, landmark, x = problem.time, problem.landmark, problem.x[:, 0]
@@ -291,7 +293,7 @@ class Case:
 
     def found(
         self, name: str, fit: Robust, extra: float, size: tuple[float, float, str], text: str, cure: str, *,
-        on: Problem | None = None, raw: float | None = None,
+        on: Problem | None = None, raw: float | None = None, images: tuple[int, ...] = (0, 1),
     ) -> Hypothesis:  # fmt: skip
         """With the evidence of its fit, which has `extra` parameters more than "nothing is wrong" on the rows of `on`."""
         null = self.null
@@ -299,18 +301,18 @@ class Case:
             null = replace(self.problem, seen=on.used).fit(start=null.M)
         raw = fit.total - null.total if raw is None else raw
         n = 2.0 * (fit.likelihood != 0).sum()
-        self._evidence[text] = raw, n, extra, fit.design
+        evidence = raw, n, extra, fit.design
         if name not in self.fits or fit.total > self.fits[name].total:
             self.fits[name] = fit
-        explained = 1.0 - np.exp(-2.0 * max(raw, 0.0) / n)
-        return Hypothesis(name, text, cure, *map(float, size[:2]), size[2], float(explained), _gain(*self._evidence[text]))
+        explained = float(1.0 - np.exp(-2.0 * max(raw, 0.0) / n))
+        return Hypothesis(name, text, cure, *map(float, size[:2]), size[2], explained, _gain(*evidence), images, evidence)
 
-    def compared(self, found: list[Hypothesis]) -> list[Hypothesis]:
-        """Hypotheses whose gains can be compared: rows count by one design for all that are named, the least of theirs."""
-        own = [self._evidence.get(h.text) if h.is_named else None for h in found]
-        least = min((e[3] for e in own if e), default=1.0)
-        pairs = zip(found, own, strict=True)
-        return [replace(h, gain=h.gain + max(_gain(*e[:3], least), 0) - max(_gain(*e), 0)) if e else h for h, e in pairs]
+
+def compared(found: list[Hypothesis]) -> list[Hypothesis]:
+    """Hypotheses whose gains can be compared: rows count by one design for all that are named, the least of theirs."""
+    least = min((h.evidence[3] for h in found if h.is_named), default=1.0)
+    own = (max(_gain(*h.evidence[:3], least), 0) - max(_gain(*h.evidence), 0) if h.is_named else 0 for h in found)
+    return [replace(h, gain=h.gain + more) for h, more in zip(found, own, strict=True)]
 
 
 def _gain(raw: float, n: float, extra: float, design: float) -> float:

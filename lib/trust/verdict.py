@@ -8,8 +8,7 @@ from typing import Self
 import numpy as np
 
 from lib import paths
-from lib.calibration import Calibration, NoConsensusError, calibrate, optics
-from lib.calibration.models import Model
+from lib.calibration import Calibration, NoConsensusError, calibrate, calibrate_as_shown, optics
 from lib.correspondences import LANDMARKS, TRAIN_FURTHER, Correspondences, NoDetectionError
 from lib.landmarks import Detector, detect
 from lib.recordings import Doubt, Recording
@@ -252,22 +251,19 @@ def assess(
         data = detect(recording, detector)
     calibration, error, epipolar_px = None, None, np.nan
     try:
-        calibration = calibrate(data, image_size_px=recording.image_size_px, **options)
+        fit = calibrate if "model" in options else calibrate_as_shown
+        calibration = fit(data, image_size_px=recording.image_size_px, **options)
     except ValueError as refused:
         error = refused
     if calibration is not None and len(y := feature_matches(recording, spread(len(recording), 3))):
         epipolar_px = float(np.median(np.abs(calibration.pair.epipolar_distance(y[:, :2], y[:, 2:]))))
     stated = {name: getattr(recording, name) for name in ("kinematics", "offset_s", "readout_s", "image_size_px")}
     straight = data
-    if calibration is not None and Model.parse(calibration.model, len(calibration.cameras)).distance:  # what else is wrong?
+    if calibration is not None and calibration.inverse_distance_per_mm[1] > 0:  # what else is wrong?
         told = zip(calibration.cameras, (data.u_left, data.u_right), strict=True)
         u = [c.centre_px + (c.undistort(u) - c.centre_px) * c.depth_ratio(data.x_mm)[:, None] for c, u in told]
         straight = replace(data, u_left=u[0], u_right=u[1])
     diagnosis = diagnose(straight, **stated)
-    if "model" not in options and (best := diagnosis.best) is not None and best.name == "finite_distance" and best.value > 0:
-        near = assess(recording, data, detector=detector, model="near_affine", **options)
-        if near.calibration is not None:
-            return near
     found = health(recording, data, calibration, detector=detector)
     verdict = judge(
         data, calibration, diagnosis=diagnosis, health=found, epipolar_px=epipolar_px, error=error,
@@ -286,7 +282,7 @@ def report(calibration: Calibration, *, verdict: Verdict | None = None, robot_ac
     verdict = judge(None, calibration, robot_accuracy_mm=robot_accuracy_mm) if verdict is None else verdict
     c, seen = calibration, np.isfinite(calibration.residuals_px[:, ::2])
     outliers = np.argwhere(seen & ~c.view_inliers)
-    rows, used, usable = len(c.inliers), int(c.inliers.sum()), int(c.usable.sum())
+    rows, used, usable = len(c.inliers), int(c.inliers.sum()), int(seen.any(axis=1).sum())
     value, freedom = c.chi_square
     left_out = "" if usable == rows else f", {rows - usable} without a detection, position or axes"
     lines = [

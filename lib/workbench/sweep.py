@@ -5,7 +5,6 @@ Each point of the grid is one run of the notebook, each run one row of the table
 
 import argparse
 import contextvars
-import hashlib
 import itertools
 import json
 import re
@@ -82,7 +81,7 @@ def sweep(
     of_file = {}
     for values in itertools.product(*parsed.values()):
         point = dict(zip(parsed, values, strict=True))
-        digest = hashlib.sha256(json.dumps(point, sort_keys=True, default=str).encode()).hexdigest()[:12]
+        digest = files.digest(json.dumps(point, sort_keys=True, default=str).encode())
         of_file[folder / f"{digest}.ipynb"] = point
     jobs = {executed: (book, profile | point, cell_timeout_s) for executed, point in of_file.items()}
     rows = {executed: _row(executed, point) for executed, point in of_file.items() if executed.exists()}

@@ -163,7 +163,7 @@ def dashboard(left: np.ndarray, result: FrameResult) -> Figure:
     seen = (x - centre) @ view.T
     bottom = np.nanmax(seen[..., 2])
     height = bottom - seen[..., 2]
-    if result.reconstructed:
+    if result.reconstructed_at == result.index:
         u, points = result.reconstruction.u, result.reconstruction.points.x_mm
         shown = np.arange(0, len(u), max(1, len(u) // 1500))
         h = bottom - (points[shown] - centre) @ view[2]

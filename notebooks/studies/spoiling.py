@@ -213,8 +213,9 @@ def examine(take: Take) -> Result:
     verdict = judge(
         take.data, calibration, diagnosis=diagnosis, robot_accuracy_mm=take.robot_accuracy_mm, error=error
     )
-    named = "" if diagnosis.best is None else diagnosis.best.name
-    return Result(take, effect, verdict.level, named, str(diagnosis))
+    best = diagnosis.best
+    named, text = ("", "no fault found") if best is None else (best.name, f"{best.name}: {best.text} {best.cure}")
+    return Result(take, effect, verdict.level, named, text)
 
 
 # --- ways of spoiling: each takes a scene and a strength

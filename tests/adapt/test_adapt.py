@@ -7,10 +7,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from lib.adapt import RefusalError, adapt, loop, report, teach
+from lib.adapt import RefusalError, adapt, loop, report, teach, teacher
 from lib.adapt.judging import Agreement, better, stretches
 from lib.adapt.looking import Seen, at_rest, look, look_elsewhere
 from lib.calibration.offsets import tool_axes
+from lib.correspondences import DataError
 from lib.landmarks import Detector, Landmarks
 from lib.recordings.annotations import Annotations, write_coco
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE
@@ -102,6 +103,19 @@ def test_cameras_of_a_finite_distance_are_no_affine_ones(tmp_path):
     teacher = taught(near.record(tmp_path / "near"), StandIn(near.u, noise_px=0.7, wrong=0.3))
     value, sd = teacher.calibration.inverse_distance_per_mm
     assert abs(value - 1 / 70) < 3 * sd and np.median(label_errors(near, teacher)[0]) < 0.4
+
+
+@pytest.mark.parametrize(("error", "surfaces"), [(ValueError, True), (DataError, False), (np.linalg.LinAlgError, False)])
+def test_only_poor_data_are_a_refusal(world, recording, monkeypatch, error, surfaces):
+    """An error of the program must not pass for one of the recording."""
+
+    def broken(*data, **options):
+        raise error("operands could not be broadcast together")
+
+    monkeypatch.setattr(teacher, "calibrate_as_shown", broken)
+    with pytest.raises(ValueError, match="operands" if surfaces else "too few landmarks are right") as raised:
+        taught(recording, StandIn(world.u, noise_px=0.7))
+    assert isinstance(raised.value, RefusalError) != surfaces
 
 
 def test_a_tool_behind_the_cameras_has_no_label(tmp_path):

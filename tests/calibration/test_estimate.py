@@ -8,6 +8,7 @@ from scipy.stats import chi2
 from lib.calibration import (
     affine_minimum,
     calibrate,
+    calibrate_as_shown,
     dlt,
     paper_variances,
 )
@@ -496,3 +497,17 @@ def test_dlt_refuses_what_it_cannot_solve():
         dlt(np.column_stack([x[:, :2], np.zeros(60)]), u[0])
     with pytest.raises(ValueError, match="59 points, x_mm has 60"):
         dlt(x, u[0][:-1])
+
+
+def test_cameras_have_a_finite_distance_only_where_the_detections_show_one():
+    """Mirrored ones, and few rows, stay affine."""
+    rng = np.random.default_rng(3)
+    x = ROBOT_FROM_MICROSCOPE.apply(rng.uniform(-4, 4, (60, 3)))
+    for distance_mm, rows in ((np.inf, 60), (-190, 60), (190, 4), (190, 60)):
+        u = [v + rng.normal(0, 1, v.shape) for v in reference_rig(inverse_distance_per_mm=1 / distance_mm).project(x)]
+        data = Correspondences.of_points(x, *u).subset(slice(rows))
+        model = "near_affine" if (distance_mm, rows) == (190, 60) else "zero_skew"
+        assert calibrate_as_shown(data, ransac_px=np.inf).model == model
+    square = calibrate_as_shown(data, models=("square", "square+distance"))
+    value, sd = square.inverse_distance_per_mm
+    assert square.model == "square+distance" and abs(value - 1 / 190) < 3 * sd

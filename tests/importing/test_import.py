@@ -10,11 +10,14 @@ import cv2
 import numpy as np
 import pytest
 
+from lib import paths
 from lib.calibration import calibrate
+from lib.calibration.offsets import tool_axes
 from lib.correspondences import of_recording
 from lib.geometry import RigidTransform
-from lib.importing import guess_mapping, import_recording, read_mapping
-from lib.recordings import Recording
+from lib.importing import guess_mapping, import_recording, importer, read_mapping
+from lib.recordings import Annotations, Recording
+from lib.recordings.frames import Frames
 from tests.importing import foreign
 
 HINGE = (
@@ -260,6 +263,20 @@ def test_a_detector_that_knows_no_such_tool_leaves_the_clock_open(shipped, tmp_p
     report = import_recording(folder, mapping, tmp_path / "eye")
     assert report["clock"] is None and Recording.open(tmp_path / "eye").offset_s == 0
     assert any("offset of the clocks was not found" in line and "`check` and `adapt`" in line for line in report["did"])
+
+
+def test_offsets_of_the_landmarks_are_no_part_of_the_clock():
+    """Whoever marks them takes other points of the tool; as it turns, that looks like another time."""
+    recording, rng = Recording.open(paths.SHIPPED_RECORDING), np.random.default_rng(0)
+    log, offset = recording.kinematics, np.array([[0.1, -0.15, 0.05], [-0.12, 0.1, 0.1], [0.15, 0.1, -0.08]])
+    time_s = np.linspace(log.time_s[0] + 4, log.time_s[-1] - 4, 60)
+    x = log.at(time_s)
+    x += np.einsum("mij,kj->mki", np.nan_to_num(tool_axes(x)), offset)
+    u = [u.reshape(60, 3, 2) + rng.normal(0, 1, (60, 3, 2)) for u in recording.truth.rig.project(x.reshape(-1, 3))]
+    late = replace(log, time_s=log.time_s + 2.0)
+    draft = replace(recording, kinematics=late, annotations=Annotations(*u), readout_s=0.0, frames=Frames(None, None, time_s))
+    found = importer._clock(draft, search_s=3.0)
+    assert abs(found.offset_s - 2.0) < min(4e-4, 4 * found.sd_s)
 
 
 def test_jaws_are_estimated_from_poses_gripper_and_labels(shipped, tmp_path):

@@ -29,7 +29,7 @@ def test_from_nothing_to_distances():
     assert rig_error_mm(first.rig, world) < 0.2
     assert rig_error_mm(last.rig, world) < 0.05
     assert pipeline.calibration.sigma_x_mm == pytest.approx(0.01, rel=0.25)
-    assert last.reconstructed
+    assert last.reconstructed_at == last.index
     assert set(last.seconds) <= set(STAGES)
     assert min(last.seconds.values()) >= 0
     # The plane is DEPTH_MM below the focal plane; tools are above it by what their own depth says.
@@ -89,6 +89,19 @@ def test_changed_optics_are_calibrated_afresh():
     assert rig_error_mm(pipeline.rig, world) < 0.1
 
 
+def test_cameras_of_a_finite_distance_are_taken_for_such_as_soon_as_that_shows():
+    """And no affine ones are."""
+    near, far = World(4), World(4)
+    near.rig = reference_rig(inverse_distance_per_mm=1 / 190)
+    results = run(pipeline := make(near, settings=SELDOM), near, 60)
+    assert [r.state for r in results] == ["calibrating"] * 7 + ["tracking"] * 53
+    distances_mm = np.array([r.working_distance_mm for r in results])
+    assert np.isinf(distances_mm[:7]).all() and np.isfinite(distances_mm[20:]).all()
+    assert distances_mm[-1] == pytest.approx(190, abs=30)
+    assert pipeline.calibration.model == "near_affine" and rig_error_mm(pipeline.rig, near) < 0.05
+    assert {r.working_distance_mm for r in run(make(far, settings=SELDOM), far, 60)[7:]} == {np.inf}
+
+
 def test_a_given_rig_is_used_from_the_first_frame_and_kept():
     world = World()
     pipeline = make(world, rig=RIG, noise_px=1.5)
@@ -124,7 +137,7 @@ def test_bad_input_is_a_failed_frame(left, right, kinematics):
     result = pipeline.step(left, right, kinematics)
     assert set(result.failures) == {"detect"}
     assert result.state in ("blind", "unseen")
-    assert not result.reconstructed or result.state == "unseen"
+    assert result.reconstructed_at != result.index or result.state == "unseen"
     assert np.isnan(result.landmarks.u_left).all()
     assert not run(pipeline, world, 1)[0].failures
 
@@ -148,7 +161,7 @@ def test_missing_landmarks():
     assert not any(r.failures for r in results)
     assert np.isnan(results[30].landmarks.u_left).all()
     assert np.isfinite(results[30].distance_mm).all()  # from the robot's report
-    assert results[30].reconstructed
+    assert results[30].reconstructed_at == 30
     assert np.isnan(results[33].landmarks.u_right[2]).all()
 
 
@@ -346,7 +359,7 @@ def test_a_failing_stage_is_named_and_the_others_go_on(stage):
     result = run(make(world, **broken), world, 12)[-1]
     assert result.failures == {stage: "RuntimeError: out of order"}
     assert result.state == ("calibrating" if stage in ("detect", "calibrate") else "tracking")
-    assert result.reconstructed == (stage == "distance")
+    assert (result.reconstructed_at == result.index) == (stage == "distance")
 
 
 def test_interrupts_are_not_swallowed():

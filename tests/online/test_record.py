@@ -56,7 +56,8 @@ def test_a_replay_gives_the_same_bytes(tmp_path, shipped):
     lines = first.decode().splitlines()
     columns = list(row(FrameResult(0)))
     assert lines[0].split(",") == columns and columns[:5] == ["frame", "time_s", "state", "cause", "base_distance_mm"]
-    assert columns[-4:] == ["drift", "moved", "surface_frame", "failures"] and len(columns) == 4 + 18 + 12 + 4 + 4
+    assert columns[-5:] == ["working_distance_mm", "drift", "moved", "surface_frame", "failures"]
+    assert len(columns) == 4 + 18 + 12 + 4 + 5
     assert len(lines) == 11
     assert all(len(line.split(",")) == len(columns) for line in lines)
     assert lines[-1].split(",")[2] == "tracking"

@@ -401,12 +401,21 @@ def test_near_affine_cameras_of_the_truth_survive(written, tmp_path):
     np.testing.assert_array_equal(found.project(tool(5)[:, 0]), rig.project(tool(5)[:, 0]))
 
 
-def test_metres_are_refused(tmp_path):
+@pytest.mark.parametrize("unit_mm", [1e3, 25.4])
+def test_metres_and_inches_are_refused(tmp_path, unit_mm):
     writer = RecordingWriter(tmp_path / "r", name="r", fps=25, image_size_px=SIZE)
-    with pytest.raises(ValueError, match="Metres or micrometres"), writer:
+    with pytest.raises(ValueError, match="Metres, inches or micrometres"), writer:
         writer.add(*frames()[0])
-        writer.kinematics([0.0, 1.0], tool(2) * 1e-3)
+        writer.kinematics([0.0, 1.0], tool(2) / unit_mm)
     assert list(tmp_path.iterdir()) == []  # whole or not at all
+
+
+def test_a_log_of_the_base_alone_is_told_what_it_lacks(tmp_path):
+    base = np.where((np.arange(3) == 0)[:, None], tool(2), np.nan)
+    writer = RecordingWriter(tmp_path / "r", name="r", fps=25, image_size_px=SIZE)
+    with pytest.raises(ValueError, match="no row holds base and one more; log base, tip_1, tip_2 in each row"), writer:
+        writer.add(*frames()[0])
+        writer.kinematics([0.0, 1.0], base)
 
 
 def test_pixels_that_rot_after_opening_are_noticed(folder):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lib.recordings import Kinematics
-from lib.trust import diagnose
+from lib.trust import Hypothesis, diagnose
 from notebooks.studies.spoiling import GOOD, SPOILED, Scene
 
 
@@ -60,6 +60,7 @@ def test_a_turned_image_is_no_wrong_readout_time():
     best = found(scene.take()).best
     assert best.name == "turned_image" and best.value == pytest.approx(-20.0, abs=4 * best.sd)
     assert "The right image is turned by 180 degrees" in best.text and "Turn it by 180 degrees" in best.cure
+    assert best.images == (1,)
 
 
 @pytest.mark.parametrize("readout_s", [0.0, 0.02])
@@ -71,6 +72,23 @@ def test_two_turned_images_are_not_only_called_exchanged_eyes(readout_s):
     best = found(scene.take()).best
     assert best.name == ("turned_image" if readout_s else "exchanged_eyes")
     assert "turned by 180 degrees" in best.text and "turn" in best.cure.lower()
+    assert best.images == (0, 1)
+
+
+def test_no_cause_is_told_by_its_words(monkeypatch):
+    """They may be said in any language; two turned images, which exchange the sides, are no mirrored axis either."""
+    scene = Scene(np.random.default_rng(7), frames=40, fps=15.0, speed_mm_s=6.0, readout_s=0.02)
+    corner = np.array(scene.take().image_size_px) - 1.0
+    scene.edit_pixels.append(lambda scene, u: corner - u)
+    both = scene.take()
+    usual, said = found(both), Hypothesis.__init__
+
+    def untold(self, name, text, *more, **known):
+        said(self, name, "...", *more, **known)
+
+    monkeypatch.setattr(Hypothesis, "__init__", untold)
+    other = found(both)
+    assert [(h.name, h.gain) for h in other.hypotheses] == [(h.name, h.gain) for h in usual.hypotheses]
 
 
 def test_a_mirrored_image_is_no_scaled_axis():
