@@ -22,12 +22,16 @@ def inverse(information: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Minimum:
-    """Where the energy is least: `state`, `energy` and `work` as the caller's functions made them."""
+    """Where the energy is least: `state`, `energy` and `work` as the caller's functions made them.
+
+    `information` (p, p) is the Gauss-Newton Hessian there; `converged` is False where the `iterations` ran out.
+    """
 
     state: Any
     energy: float
     work: Any
-    information: np.ndarray  # (p, p), the Gauss-Newton Hessian there
+    information: np.ndarray
+    converged: bool
 
 
 def minimise(
@@ -53,8 +57,8 @@ def minimise(
     >>> def normal_equations(x, r):
     ...     return np.array([[np.exp(2 * x)]]), np.array([np.exp(x) * r])
     >>> found = minimise(0.0, evaluate, normal_equations, lambda x, step: x + step[0])
-    >>> print(round(found.state, 6))
-    0.693147
+    >>> print(round(found.state, 6), found.converged)
+    0.693147 True
     """
     first = evaluate(start)
     if first is None:
@@ -68,7 +72,8 @@ def minimise(
             values, vectors = values[-rank:], vectors[:, -rank:]
         values = np.maximum(values, 1e-15 * values[-1])
         along = vectors.T @ (scale * gradient)
-        if 0.5 * (along**2 / values).sum() <= tolerance * energy + 1e-22 or steps == iterations:
+        converged = bool(0.5 * (along**2 / values).sum() <= tolerance * energy + 1e-22)
+        if converged or steps == iterations:
             break
         for _ in range(12):
             trial = move(state, scale * (vectors @ (along / (values + damping))))
@@ -76,7 +81,8 @@ def minimise(
             if new is not None and new[0] <= energy * (1 + 1e-14) + 1e-300:
                 break
             damping = max(10.0 * damping, 1e-6)
-        else:  # no step lowers the energy: the floor of rounding
+        else:
+            converged = True  # no step lowers the energy: the floor of rounding
             break
         state, (energy, work), damping = trial, new, damping / 30.0 if damping > 1e-9 else 0.0
-    return Minimum(state, energy, work, information)
+    return Minimum(state, energy, work, information, converged)

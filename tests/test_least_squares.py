@@ -27,7 +27,7 @@ def test_rosenbrocks_valley_is_descended_to_its_end():
         ),
     )
     np.testing.assert_allclose(found.state, [1, 1], atol=1e-9)
-    assert found.energy < 1e-18
+    assert found.converged and found.energy < 1e-18
 
 
 def test_directions_beyond_the_rank_are_left_alone():
@@ -35,7 +35,7 @@ def test_directions_beyond_the_rank_are_left_alone():
     b = np.array([2.0, 4.0, 2.5])
     found = minimise(np.array([3.0, 0.0]), *problem(lambda x: A @ x - b, lambda x: A), rank=1)
     np.testing.assert_allclose(found.state[0] - found.state[1], 3.0, atol=1e-12)
-    assert found.state.sum() == pytest.approx(A[:, 0] @ b / 6)
+    assert found.converged and found.state.sum() == pytest.approx(A[:, 0] @ b / 6)
 
 
 def test_a_step_out_of_the_domain_is_shortened():
@@ -44,3 +44,7 @@ def test_a_step_out_of_the_domain_is_shortened():
     assert guarded.state[0] == pytest.approx(2)
     with pytest.raises(ValueError, match="start"):
         minimise(np.array([-1.0]), lambda x: None, normal_equations, move)
+
+
+def test_iterations_that_run_out_are_told():
+    assert not minimise(np.array([30.0]), *problem(lambda x: x**3, lambda x: np.diag(3 * x**2)), iterations=2).converged

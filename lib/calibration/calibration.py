@@ -112,6 +112,11 @@ class Calibration:
         return self.view_inliers.any(axis=1)
 
     @property
+    def usable(self) -> np.ndarray:
+        """(n,) bool: the rows that could be used in at least one view; those that are no inliers are outliers."""
+        return np.isfinite(self.residuals_px).any(axis=1)
+
+    @property
     def extents_mm(self) -> np.ndarray:
         """(3,) RMS extents of the inliers' positions, the largest first; the last is their thickness."""
         return extents(self.x_mm[self.inliers])

@@ -211,6 +211,7 @@ class Fit:
     residuals: np.ndarray
     points: np.ndarray
     information: np.ndarray
+    converged: bool
 
 
 def settle(
@@ -251,4 +252,4 @@ def fit(start: State, x: np.ndarray, y: np.ndarray, noise: np.ndarray, variance_
     with np.errstate(all="ignore"):  # a first step may be far too long: its energy is not finite, and it is shortened
         # What 1e-10 of the energy leaves open is a ten-thousandth of a deviation.
         found = minimise(start, evaluate, normal_equations, State.moved, tolerance=1e-10)
-    return Fit(found.state, found.energy, *found.work[:2], found.information)
+    return Fit(found.state, found.energy, *found.work[:2], found.information, found.converged)

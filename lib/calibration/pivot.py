@@ -72,6 +72,7 @@ class ToolOffsets(Tool):
 
     covariance_mm2: np.ndarray
     cameras: tuple[AffineCamera, ...]
+    rms_px: float
 
 
 def pivot_calibration(robot_from_tool: Sequence[RigidTransform]) -> Pivot:
@@ -165,7 +166,7 @@ def tool_offsets(
     if half is not None:
         sine[on_jaw], versine[on_jaw] = np.split(offset[k:], 2)
     cameras = tuple(AffineCamera(matrix[2 * c : 2 * c + 2]) for c in range(m // 2))
-    return ToolOffsets(offset[:k], sine, versine, blocks, cameras)
+    return ToolOffsets(offset[:k], sine, versine, blocks, cameras, float(np.sqrt((r**2).sum() / (len(r) * m / 2))))
 
 
 def _poses(robot_from_tool: Sequence[RigidTransform]) -> tuple[np.ndarray, np.ndarray]:

@@ -25,10 +25,11 @@ _CLEAR, _NEAR = 0.4, 0.03
 
 @dataclass(frozen=True, eq=False)
 class TimeOffset:
-    """t_robot = t_video + offset_s, its sd, which allows for errors that last, and the RMS px at `trial_s`."""
+    """t_robot = t_video + offset_s, its sd, which allows for errors that last, and the RMS there and at `trial_s`."""
 
     offset_s: float
     sd_s: float
+    rms_px: float  # of the detections that agree
     trial_s: np.ndarray
     trial_rms_px: np.ndarray
 
@@ -158,7 +159,7 @@ def estimate_time_offset(
     if rms_px > far_px * (3 if clear else 1):  # a path that comes back to where it was has more minima
         raise DataError(f"search_s: the best, {offset:.3f} s, leaves {rms_px:.0f} px RMS; widen search_s or move start_s.")
     sd = float(np.sqrt(sandwich(image[:, :, None], W, r, frame, landmark)[0][0, 0]))
-    return TimeOffset(offset, sd, trial, misfit)
+    return TimeOffset(offset, sd, rms_px, trial, misfit)
 
 
 def clock_error(found: Calibration, data: Correspondences, kinematics: Kinematics, offset_s: float) -> tuple[float, float]:

@@ -42,8 +42,18 @@ class Tally:
             f"{n} frames in {spent:.1f} s, {n / spent:.1f} a second; processor {cpu / max(n, 1):.3f} s a frame\n"
             f"{self.surfaces} surfaces, {self.surfaces / spent:.1f} a second; {self.dropped} dropped\n"
             f"latency from frame to distance: {median:.0f} ms median, {late:.0f} ms 99th percentile\n"
-            f"states: {states}\nfailures: {failures}"
+            f"states: {states}\nfailures: {failures}{_memory()}"
         )
+
+
+def _memory() -> str:
+    """A line about the most memory that this process has held; none on Windows, which does not tell."""
+    with contextlib.suppress(ImportError):
+        import resource
+
+        unit = 2**20 if sys.platform == "darwin" else 2**10
+        return f"\nmemory: at most {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit:.0f} MB"
+    return ""
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -144,6 +144,10 @@ def _facts(recording: Recording, a: Assessment) -> dict[str, str]:
     for name, (title, what) in told.items():
         doubt = best.text if best is not None and best.name == name else "nothing speaks against it."
         facts[title] = f"{what} is stated; {doubt}"
+    if c is not None and c.offsets is not None and c.offsets.offset.shape[1] == 3:
+        offsets = zip(LANDMARKS, 1e3 * c.offsets.offset, strict=False)
+        parts = ["{}: {:+z.0f}, {:+z.0f}, {:+z.0f} um".format(name, *value) for name, value in offsets]
+        facts["landmark offsets"] = "; ".join(parts) + " (along, across, normal)."
     if c is not None and (far := c.inverse_distance_per_mm)[1] > 0:
         facts["cameras"] = f"of a finite distance, {1 / far[0]:.0f} +- {far[1] / far[0] ** 2:.0f} mm, as the detections show."
     bad = f"{int((a.health.score > 1).sum())} of {len(a.health.frame)} frames have a score above 1"

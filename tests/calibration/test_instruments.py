@@ -277,6 +277,7 @@ def test_tool_offsets_from_poses_and_images():
         errors.append(error)
         mahalanobis = np.einsum("ki,kij,kj->k", error, np.linalg.inv(found.covariance_mm2), error)
         assert mahalanobis.mean() < 10
+        assert found.rms_px == pytest.approx(1.5 * np.sqrt(2), rel=0.1)
         assert found.positions_mm(tool).shape == (300, 3, 3)
     assert np.sqrt(np.mean(np.square(errors))) < 0.005
 

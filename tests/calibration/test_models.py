@@ -96,6 +96,7 @@ def test_minimum_is_stationary(name):
     y = np.hstack([c.u_left, c.u_right])
     data = (c.x_mm, y, 2.25 * np.eye(4)[None], 1e-4, np.ones((60, 2), dtype=bool))
     found = fit(start, *data)
+    assert found.converged
     sd = np.sqrt(np.diag(np.linalg.inv(found.information)))
     for j, s in enumerate(sd):
         for sign in (-1, 1):

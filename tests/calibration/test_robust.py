@@ -122,7 +122,7 @@ def test_the_clock_is_found_among_wrong_detections():
         scale = np.where(rng.random(len(pixels)) < 0.5, 35.0, 180.0)
         spoiled.append(pixels + wrong[:, None] * rng.normal(size=pixels.shape) * scale[:, None])
     found = estimate_time_offset((time, spoiled), robot)
-    assert found.offset_s == pytest.approx(0.08, abs=2e-3) and found.sd_s < 1e-3
+    assert found.offset_s == pytest.approx(0.08, abs=2e-3) and found.sd_s < 1e-3 and found.rms_px < 4
 
 
 @pytest.mark.parametrize("places", [3, 4, 5, 8])
