@@ -223,7 +223,8 @@ def card(detector: Detector, path: Path) -> str:
     """The model card (Markdown) of a weights file, from its metadata."""
     trainings = []
     for stage, one in reversed(detector.metadata["stages"].items()):
-        while one:  # from the last training to the first
+        features = one["config"]["network"]["features"]
+        while one and one["config"]["network"]["features"] == features:  # from the last to the first, or to the narrower ones
             trainings.append((stage, one))
             one = one.get("before")
     here = Environment(loader=FileSystemLoader(Path(__file__).parent), trim_blocks=True)
