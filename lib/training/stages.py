@@ -141,8 +141,7 @@ def finetune(
             stopped.set()
             raise
     then = {"finetuned": {"images": len(images), "held_out": len(held_out), "commit": commit_id()}}
-    # Of the labelled frames `in_doubt` knows nothing: the tuned networks themselves see again what leaves them in doubt.
-    tuned = replace(detector, **networks, in_doubt=None, metadata=detector.metadata | then)
+    tuned = replace(detector, **networks, in_doubt=None, metadata=detector.metadata | then)  # it knows the old tools alone
     tuned = fit_error_models(tuned, [*held_out, *doubt_on], anew=False, progress=progress is True)
     old = {stage: detector.error_models[stage] for stage in CLOSE if stage in detector.error_models}
     if detector.closeup_network is None or not old:
