@@ -112,7 +112,7 @@ def _clock(draft: Recording, search_s: float) -> TimeOffset | str:
             return str(error).removesuffix(".")
         cure = "Or state offset_s, where t_robot = t_video + offset_s"
         raise ValueError(f"robot.offset_s = 'estimate': {error} {cure}.") from None
-    with suppress(DataError):  # cameras of their own ask for more
+    with suppress(DataError, np.linalg.LinAlgError):  # cameras of their own ask for more
         data = paired(replace(draft, offset_s=found.offset_s))
         calibration = calibrate_as_shown(data, image_size_px=draft.image_size_px)
         step_s, sd_s = clock_error(calibration, data, draft.kinematics, found.offset_s)  # the landmarks' offsets are free

@@ -89,7 +89,7 @@ def _start(path: Path, stage: str, network: HourglassConfig | OffsetConfig) -> T
         start = load_training(path)
     except (FileNotFoundError, ValueError):
         start = training_of(Detector.load(path), stage)
-    narrow = isinstance(network, HourglassConfig) and start.network.config != network
+    narrow = HourglassConfig is type(network) is type(start.network.config) and start.network.config != network
     return replace(start, network=start.network.widened(network)) if narrow else start
 
 

@@ -141,7 +141,7 @@ def finetune(
             stopped.set()
             raise
     then = {"finetuned": {"images": len(images), "held_out": len(held_out), "commit": commit_id()}}
-    tuned = replace(detector, **networks, metadata=detector.metadata | then)
+    tuned = replace(detector, **networks, in_doubt=None, metadata=detector.metadata | then)  # it knows the old tools alone
     tuned = fit_error_models(tuned, [*held_out, *doubt_on], anew=False, progress=progress is True)
     old = {stage: detector.error_models[stage] for stage in CLOSE if stage in detector.error_models}
     if detector.closeup_network is None or not old:
@@ -188,7 +188,7 @@ def assemble(
     typical = []
     for recording in map(Recording.open, recordings):  # 16 images of each, spread over it
         typical += labelled_images(recording, every=max(1, len(recording.frames) // 8))
-    networks = {name: training.network.halved() for name, training in stages.items()}
+    networks = {k: one.network.halved() if k in new else one.network for k, one in stages.items()}
     own = {f"{stage}_network": networks[stage] for stage in STAGES}
     wider = {f"{stage}_network": networks[name] for name, stage in _WIDER.items() if name in networks}
     fitted = partial(fit_error_models, images=frames[::2] + bare + typical, for_closeups=near_by, progress=True)

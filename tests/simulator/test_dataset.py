@@ -87,6 +87,8 @@ def test_says_beforehand_how_long_and_how_large(tmp_path, monkeypatch, capsys):
     main(["--folder", str(tmp_path / "new"), "--dry-run", "--workers", "2"])
     said = capsys.readouterr().out
     assert "800 of 800 stereo pairs" in said and "13 min on 2 idle cores" in said and "0.50 GB" in said
+    main(["--folder", str(tmp_path / "new"), "--dry-run", "--workers", "1"])
+    assert "27 min on 1 idle core, 0.50 GB" in capsys.readouterr().out
     assert not (tmp_path / "new").exists()
 
 
