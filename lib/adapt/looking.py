@@ -64,7 +64,7 @@ def look(
     if near is not None:
         # A window shows the whole tool: closeups alone would add their constant error to the place in every round.
         later = [stage for stage in detector.stages if stage not in ("frame", "tool", "tracking")]
-        later = later if {"again", "window"} & {*later} else ["tracking", "tracking"]
+        later = later if "again" in later else ["tracking", "tracking"]
     for i, number in enumerate(frames):
         frame = recording.frames[int(number)]
         pair = np.stack([frame.left, frame.right])

@@ -35,8 +35,10 @@ from lib.landmarks.search import PEAKS, best_tools, likelihood, several_peaks
 from lib.parallel import single_threaded_torch
 
 FORMAT = "microstereo.detector"
+#: The stages that have networks of their own, in the order of their use.
+_STAGES = ("frame", "tool", "closeup")
 #: The fields that a weights file keeps as plain values.
-_SETTINGS = ("frame_px", "window_px", "mirror", "method")
+_SETTINGS = ("frame_px", "method")
 #: A landmark with a lower confidence counts as missing: NaN, confidence 0.
 MISSING_BELOW = 0.05
 #: Below this confidence a landmark is not followed from frame to frame.
@@ -55,6 +57,8 @@ _SWEPT, _TURNS = (0.21, 0.1), 6
 _UNWITNESSED = 0.5  # what a sweep finds has this times its confidence, since the first stage did not see it there
 #: Stages that use another stage's network.
 _NETWORK_OF = {"again": "tool", "closer": "closeup", "tracking": "closeup"}
+#: The second look at the tool also sees the mirror image, and the mean counts: low where the two disagree.
+MIRRORED = "again"
 
 
 @dataclass(frozen=True)
@@ -107,14 +111,11 @@ class Detector:
 
     Attributes:
         frame_network, frame_px: The first stage, which sees the frame with a longer side of `frame_px`; None = as it is.
-        window_network: A stage that sees one upright window of `window_px`, at full resolution, for each landmark; None = no
-            such stage.  The shipped detector has none.
         tool_network: The second stage, which sees one window round the tool; None = no such stage.
         closeup_network: The last stage, which predicts where in a closeup the landmark lies; None = no such stage.
-        error_models: One for each stage: ``"frame"``, ``"tool"`` and ``"again"`` for the two looks at the tool, ``"window"``,
-            ``"closeup"`` and ``"closer"`` for two closeups, the second where the first moved the landmark far, and
-            ``"tracking"`` for the closeups that follow a landmark from frame to frame.
-        mirror: The second look at the tool also sees the mirror image, and the mean counts: low where the two disagree.
+        error_models: One for each stage: ``"frame"``, ``"tool"`` and ``"again"`` for the two looks at the tool, ``"closeup"``
+            and ``"closer"`` for two closeups, the second where the first moved the landmark far, and ``"tracking"`` for the
+            closeups that follow a landmark from frame to frame.
         in_doubt: Wider and slower networks, which see the images again that leave this detector in doubt; None = it does so.
         engine: What runs the networks, one of `lib.landmarks.engines.ENGINES`; the weights are the same.
 
@@ -125,40 +126,33 @@ class Detector:
 
     frame_network: StackedHourglass
     frame_px: int | None = None
-    window_network: StackedHourglass | None = None
     tool_network: StackedHourglass | None = None
-    window_px: int = 128
     method: str = "gauss_newton"
     error_models: dict[str, ErrorModel] = field(default_factory=dict)
     metadata: dict[str, object] = field(default_factory=dict)
     closeup_network: OffsetNetwork | None = None
-    mirror: bool = False
     in_doubt: Self | None = None
     engine: str = "torch"
     _run: dict[str, Callable[[Tensor], list[Tensor]]] = field(init=False, repr=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         check(self, "frame_px", lambda v: v is None or v >= 16, "must be at least 16 px")
-        if self.closeup_network and not (self.window_network or self.tool_network):
-            raise ValueError("closeup_network: looks at what a tool_network or a window_network has found; give one.")
+        if self.closeup_network and not self.tool_network:
+            raise ValueError("closeup_network: looks at what a tool_network has found; give one.")
         if self.in_doubt and self.in_doubt.engine != self.engine:
             object.__setattr__(self, "in_doubt", replace(self.in_doubt, engine=self.engine))
         run = cache(accelerated)  # stages may share a network
         for stage in self.stages:
-            self._run[stage] = run(self.network_of(stage), self.engine, mirror=self.mirrors(stage))
+            self._run[stage] = run(self.network_of(stage), self.engine, mirror=stage == MIRRORED)
 
     def network_of(self, stage: str) -> Network:
         """The network of a stage, which may be another stage's."""
         return self.networks[_NETWORK_OF.get(stage, stage)]
 
-    def mirrors(self, stage: str) -> bool:
-        """Whether a stage also sees the mirror image."""
-        return self.mirror and stage == "again"
-
     @property
     def networks(self) -> dict[str, Network]:
         """The networks by stage, in the order of their use."""
-        stages = {name: getattr(self, f"{name}_network") for name in ("frame", "tool", "window", "closeup")}
+        stages = {name: getattr(self, f"{name}_network") for name in _STAGES}
         return {name: network for name, network in stages.items() if network is not None}
 
     @property
@@ -171,7 +165,7 @@ class Detector:
     def stages(self) -> list[str]:
         """The stages in the order of their use, each with an error model; the last one, if any, is tracking."""
         there = self.networks
-        names = ("frame", "tool", "again", "window", "closeup", "closer", "tracking")
+        names = ("frame", "tool", "again", "closeup", "closer", "tracking")
         return [name for name in names if _NETWORK_OF.get(name, name) in there]
 
     @classmethod
@@ -187,6 +181,8 @@ class Detector:
         tensors, metadata = read_checkpoint(path, FORMAT)
         if text := ", ".join(sorted({"networks", "calibration", "provenance", *_SETTINGS} - metadata.keys())):
             raise ValueError(f"{path}: its metadata lack {text}; get the file again, or make it with Detector.save.")
+        if other := metadata["networks"].keys() - {part + stage for part in ("", "in_doubt.") for stage in _STAGES}:
+            raise ValueError(f"{path}: it has networks of stages that are none ({', '.join(sorted(other))}); train it anew.")
         parts: dict[str, dict[str, object]] = {"": {"error_models": {}}, "in_doubt": {"error_models": {}}}
         for name, config in metadata["networks"].items():
             part, _, stage = name.rpartition(".")
@@ -443,12 +439,10 @@ class Detector:
             matrices = view.window_from_image(centre[image], angle[image], size, view.tool_zoom(length[image]))
             which = image
         else:
-            size = self.closeup_network.config.size_px if stage in CLOSE else self.window_px
+            size = self.closeup_network.config.size_px
             which = np.argwhere(np.isfinite(u).all(2) & np.isfinite(angle)[:, None] & (True if only is None else only))
             image, landmark = which.T
-            place = u[image, landmark], angle[image], size
-            window = stage == "window"
-            matrices = view.window_from_image(*place) if window else view.closeup_from_image(*place, landmark, length[image])
+            matrices = view.closeup_from_image(u[image, landmark], angle[image], size, landmark, length[image])
         windows = [view.cut(images[i], matrix, size) for i, matrix in zip(image, matrices, strict=True)]
         return np.stack(windows) if windows else np.zeros((0, size, size, 3), np.uint8), matrices, which
 
@@ -468,12 +462,10 @@ class Detector:
         if stage in CLOSE:
             size, fit = windows.shape[1], self.error_models.get(stage, ErrorModel())
             return corrected(closeup_peaks(outputs, size), fit, size, which[:, 1:]), matrices, which
-        if stage in ("tool", "again"):  # one window holds all three landmarks
-            which = np.stack([np.repeat(which, 3), np.tile(np.arange(3), len(which))], axis=1)
-            matrices, heatmaps = np.repeat(matrices, 3, axis=0), outputs.flatten(0, 1)[:, None]
-        else:
-            heatmaps = outputs[torch.arange(len(which)), torch.from_numpy(which[:, 1])][:, None]
-        return decode(heatmaps, self.network_of(stage).stride, method=self.method), matrices, which
+        # One window holds all three landmarks.
+        which = np.stack([np.repeat(which, 3), np.tile(np.arange(3), len(which))], axis=1)
+        peaks = decode(outputs.flatten(0, 1)[:, None], self.tool_network.stride, method=self.method)
+        return peaks, np.repeat(matrices, 3, axis=0), which
 
     def frame_stride(self, images: np.ndarray, scale: float = 1.0) -> np.ndarray:
         """Image pixels per pixel of the first stage's input, along x and y; `scale` enlarges that."""

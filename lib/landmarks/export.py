@@ -3,10 +3,10 @@
 A stage takes its own input, RGB in [0, 1] of shape (n, 3, h, w), and gives what `Landmarks` holds: u (n, 3, 2) px,
 covariance (n, 3, 2, 2) px^2 and confidence (n, 3).  The first stage gives them in pixels of the frame before it was
 resized.  The others but ``tracking`` also take ``rough_u`` (n, 3, 2), the landmarks that the stage before found, in pixels
-of their input, and ``rough_confidence`` (n, 3).  ``again`` is the second look of ``tool``.  The stages ``window``,
-``closeup``, ``closer`` and ``tracking`` see a window of one landmark, and the caller takes that landmark's row.  ``closeup``
-corrects the landmarks of the stage before, unless it is unsure, ``closer`` those that ``closeup`` moved far
-(`windows.moved_far`), and ``tracking`` those of the frame before.  Stages that share a network differ in their error models.
+of their input, and ``rough_confidence`` (n, 3).  ``again`` is the second look of ``tool``.  The stages ``closeup``,
+``closer`` and ``tracking`` see a window of one landmark, and the caller takes that landmark's row.  ``closeup`` corrects the
+landmarks of the stage before, unless it is unsure, ``closer`` those that ``closeup`` moved far (`windows.moved_far`), and
+``tracking`` those of the frame before.  Stages that share a network differ in their error models.
 """
 
 import importlib.util
@@ -19,7 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from lib import files, paths
-from lib.landmarks.detector import CLOSE, MISSING_BELOW, Detector
+from lib.landmarks.detector import CLOSE, MIRRORED, MISSING_BELOW, Detector
 from lib.landmarks.engines import LastOutput, openvino
 from lib.landmarks.error_model import ErrorModel, Rough, closeup_peaks, corrected, covariance_and_confidence
 from lib.landmarks.heatmaps import Peaks, decode
@@ -37,7 +37,7 @@ class StageWithDecoding(nn.Module):
     def __init__(self, detector: Detector, stage: str, stride: np.ndarray):
         super().__init__()
         network = detector.network_of(stage)
-        self.network = LastOutput(network, mirror=detector.mirrors(stage))
+        self.network = LastOutput(network, mirror=stage == MIRRORED)
         self.config, self.closeup, self.method = network.config, stage in CLOSE, detector.method
         self.stride = torch.tensor(stride if stage == "frame" else [1.0, 1.0])
         self.fit = detector.error_models.get(stage, ErrorModel())

@@ -149,7 +149,8 @@ def match_band(images: Images, masks: Masks, rig: StereoRig, where: Where, *, bu
     """Matches of a calibrated pair; arguments as in `lib.matching.match`, images (h, w) uint8 grey."""
     rectification, _, range_px, off_line_px, n_found = plan_search(images, masks, rig, where)
     if not n_found and where[1] is None:
-        return Matches(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros((0, 4, 4)), method="band")
+        none, u = np.zeros(0), np.zeros((0, 2))
+        return Matches(u, u, none, np.zeros((0, 4, 4)), peak_ratio=none, reciprocal=none.astype(bool), method="band")
     low, high = int(np.floor(range_px[0] / CELL_PX)) - 1, int(np.ceil(range_px[1] / CELL_PX)) + 1
     gx, gy = (side // (PATCH * CELL_PX) for side in rectification.size_px)
     need = 4 * gy * gx * (2 * OFF_LINE + 1) * (high - low + 1) * 2.7  # bytes: the volume as float32, and its pooled copies

@@ -1,6 +1,6 @@
 """What every matcher returns."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -21,23 +21,18 @@ class Matches:
             Infinite where nothing else responds, NaN where there was no other place.
         reciprocal: (n,) bool, whether the way back from the right image leads to the same left patch (DeepMatching,
             band), or to within a pixel (SGBM, DIS).  `match` drops the others unless told otherwise.
-        epipolar_px: Median over the matches of |`StereoRig.epipolar_distance`|; NaN without a rig or matches.
         method: Name of the matcher.
+        epipolar_px: Median over the matches of |`StereoRig.epipolar_distance`|; NaN without a rig or matches.
     """
 
     u_left: np.ndarray
     u_right: np.ndarray
     score: np.ndarray
     covariance_px2: np.ndarray
-    peak_ratio: np.ndarray = field(default=None, kw_only=True)
-    reciprocal: np.ndarray = field(default=None, kw_only=True)
-    epipolar_px: float = field(default=float("nan"), kw_only=True)
-    method: str = field(default="", kw_only=True)
-
-    def __post_init__(self) -> None:
-        for name, unknown in (("peak_ratio", np.nan), ("reciprocal", True)):
-            if getattr(self, name) is None:
-                object.__setattr__(self, name, np.full(len(self), unknown))
+    peak_ratio: np.ndarray
+    reciprocal: np.ndarray
+    method: str
+    epipolar_px: float = float("nan")
 
     def __len__(self) -> int:
         return len(self.u_left)

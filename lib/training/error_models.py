@@ -25,7 +25,7 @@ _PRIOR = 20.0
 _RIDGE = (1e-2, 1e-2, 1e-3)
 _INSIDE = chdtri(2, 0.05)  # squared length below which 95 % of a standard normal plane lie
 #: Larger errors, in pixels of a stage's input, are no part of what a covariance describes.
-_GROSS_PX = {"frame": GROSS_PX, "tool": 10.0, "again": 8.0, "window": GROSS_PX}
+_GROSS_PX = {"frame": GROSS_PX, "tool": 10.0, "again": 8.0}
 
 
 @dataclass(frozen=True)

@@ -90,10 +90,6 @@ class Evaluation:
         """PCK in percent at thresholds (fractions of the tool's length)."""
         return pck(self.landmarks.u, self.u_true, thresholds, length_px=self.length_px)
 
-    def worst(self, n: int) -> np.ndarray:
-        """Indices of the n images with the largest error."""
-        return np.argsort(-np.nan_to_num(self.error_px, nan=-1.0, posinf=1e9).max(1), kind="stable")[:n]
-
 
 def evaluate(
     detector: Callable[[np.ndarray], Landmarks], images: Iterable[LabelledImage], *, progress: bool = False

@@ -192,7 +192,7 @@ def assemble(
     own = {f"{stage}_network": networks[stage] for stage in STAGES}
     wider = {f"{stage}_network": networks[name] for name, stage in _WIDER.items() if name in networks}
     fitted = partial(fit_error_models, images=frames[::2] + bare + typical, for_closeups=near_by, progress=True)
-    shape = partial(Detector, frame_px=FRAME_PX[0], mirror=True)
+    shape = partial(Detector, frame_px=FRAME_PX[0])
     detector = fitted(shape(**own)) if new & STAGES.keys() or not initial else replace(initial, in_doubt=None)
     if wider:
         kept = initial.in_doubt if initial and not new else None

@@ -90,10 +90,9 @@ def sweep(
     for executed, error in run_jobs(run_point, jobs, workers=workers, scheduler=scheduler, title=book.stem, unit="run"):
         point = of_file[executed]
         if error:
-            log = executed.with_suffix(".log")
-            if not isinstance(error, RunFailed):  # the worker could not write it
-                files.write_text(log, f"{_label(point)}\n{error}\n")
-            failures[_label(point)] = f"{error} (log: {paths.shown(log)})"
+            log, why = executed.with_suffix(".log"), str(error).partition("\n")[0]
+            files.write_text(log, f"{book.name} with {_label(jobs[executed][1])}\n{error}\n")
+            failures[_label(point)] = f"{why} (log: {paths.shown(log)})"
             continue
         rows[executed] = _row(executed, point)
         files.write_text(table, results.csv_text(rows[path] for path in of_file if path in rows))
@@ -138,24 +137,19 @@ def save_plots(rows: Sequence[dict], parameters: Sequence[str], folder: Path) ->
             figure.savefig(partial, dpi=150)
 
 
-class RunFailed(RuntimeError):
-    """A run of the notebook failed; its log is written."""
-
-
 def run_point(executed: Path, book: Path, values: dict, cell_timeout_s: float | None) -> None:
-    """In a worker: one run of the notebook into `executed`, or a log and a failed notebook beside it and `RunFailed`."""
+    """In a worker: one run of the notebook into `executed`; or a failed notebook beside it, and an error for the log."""
     log, failed = executed.with_suffix(".log"), executed.with_suffix(".failed.ipynb")
     with files.whole(executed) as partial:
         # A context of its own: Jupyter keeps its event loop there, and two threads cannot run the same one.
         failure = contextvars.Context().run(execution.execute, book, partial, values, cell_timeout_s=cell_timeout_s)
         if failure:
-            text = [f"{book.name} with {_label(values)}", str(failure)]
+            text = [str(failure)]
             if partial.exists():
                 shutil.copy(partial, failed)
                 outputs = [out for cell in nbformat.read(failed, as_version=4).cells for out in cell.get("outputs", [])]
                 text += [output.get("text") or "\n".join(output.get("traceback", [])) for output in outputs]
-            files.write_text(log, "\n".join(text) + "\n")
-            raise RunFailed(str(failure))
+            raise RuntimeError("\n".join(text))
         notebook = nbformat.read(partial, as_version=4)
         notebook.metadata["microstereo"] = {"machine": machine()}
         nbformat.write(notebook, partial)

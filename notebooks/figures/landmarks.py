@@ -192,6 +192,11 @@ def pck_curves(
     return fig
 
 
+def worst(result: Evaluation, n: int) -> np.ndarray:
+    """Indices of the n images with the largest error."""
+    return np.argsort(-np.nan_to_num(result.error_px, nan=-1.0, posinf=1e9).max(1), kind="stable")[:n]
+
+
 def _ellipse(axes: Axes, u: np.ndarray, covariance: np.ndarray, colour: str, probability: float = 0.95) -> None:
     values, vectors = np.linalg.eigh(covariance)
     size = 2 * np.sqrt(values * chi2.ppf(probability, 2))

@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
+import torch
 from numpy.typing import ArrayLike
+from torch import Tensor
 
 from lib.landmarks import Detector, Landmarks
+from lib.landmarks.engines import accelerated
 from lib.landmarks.error_model import ErrorModel
+from lib.landmarks.heatmaps import Peaks, decode
 from lib.landmarks.metrics import GROSS_PX
-from lib.landmarks.network import StackedHourglass
+from lib.landmarks.network import StackedHourglass, as_tensor
+from lib.landmarks.windows import cut, tool_pose, window_from_image
 from lib.training.error_models import Seen, seen_by
 from lib.training.samples import LabelledImage
+
+#: Side of the windows.
+WINDOW_PX = 128
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,14 +45,38 @@ class WindowStage:
 
     @cached_property
     def last(self) -> Detector:
-        """The windows' stage alone."""
-        return Detector(self.finder.frame_network, window_network=self.network, error_models={"window": self.errors})
+        """The windows' error model under the name of the stage, for a detector that is given the peaks."""
+        return Detector(self.finder.frame_network, error_models={"window": self.errors})
+
+    @cached_property
+    def _run(self) -> Callable[[Tensor], list[Tensor]]:
+        """The network as torch runs it best."""
+        return accelerated(self.network, "torch")
 
     def __call__(self, images: ArrayLike) -> Landmarks:
         """Landmarks of images (n, h, w, 3)."""
-        return self.last.refine(np.asarray(images), self.finder(images), "window")
+        images, rough = np.asarray(images), self.finder(images)
+        seen = self.stage_peaks(images, rough.u)
+        return self.last.refine(images, rough, "window", seen) if seen else rough.without_unsure()
+
+    def stage_peaks(self, images: np.ndarray, u: np.ndarray) -> tuple[Peaks, np.ndarray, np.ndarray] | None:
+        """As `Detector.stage_peaks`, of the windows round rough landmarks u (n, 3, 2); None without any window."""
+        angle = tool_pose(u)[1]
+        which = np.argwhere(np.isfinite(u).all(2) & np.isfinite(angle)[:, None])
+        if not len(which):
+            return None
+        image, landmark = which.T
+        matrices = window_from_image(u[image, landmark], angle[image], WINDOW_PX)
+        windows = np.stack([cut(images[i], matrix, WINDOW_PX) for i, matrix in zip(image, matrices, strict=True)])
+        with torch.inference_mode():
+            (heatmaps,) = self._run(as_tensor(windows))
+        own = heatmaps[torch.arange(len(which)), torch.from_numpy(landmark)][:, None]
+        return decode(own, self.network.stride), matrices, which
 
     def fitted(self, images: Sequence[LabelledImage], rough: Landmarks) -> WindowStage:
         """A copy whose error model is fitted on validation images, `rough` being the finder's landmarks in them."""
-        parts = [seen_by(self.last, "window", one, rough[i : i + 1]) for i, one in enumerate(images)]
-        return replace(self, errors=Seen.joined([part for part in parts if len(part.landmark)]).fit(GROSS_PX))
+        parts = []
+        for i, one in enumerate(images):
+            if seen := self.stage_peaks(one.image[None], rough.u[i : i + 1]):
+                parts.append(seen_by(self.last, "window", one, rough[i : i + 1], seen))
+        return replace(self, errors=Seen.joined(parts).fit(GROSS_PX))

@@ -17,8 +17,8 @@ from lib.landmarks.network import HourglassConfig, StackedHourglass
 
 def untrained(frame_px=64):
     networks = [StackedHourglass(HourglassConfig(4, 1, 1)) for _ in range(2)]
-    models = {name: ErrorModel(logit=(5.0, 0.0, 0.0, 0.0)) for name in ("frame", "window")}
-    return Detector(networks[0], frame_px, networks[1], window_px=64, error_models=models)
+    models = {name: ErrorModel(logit=(5.0, 0.0, 0.0, 0.0)) for name in ("frame", "tool", "again")}
+    return Detector(networks[0], frame_px, networks[1], error_models=models)
 
 
 def test_missing_corrupt_and_foreign_files_are_named(tmp_path):
@@ -40,16 +40,16 @@ def test_missing_corrupt_and_foreign_files_are_named(tmp_path):
 
 def test_wider_networks_are_kept_with_their_error_models_and_shared_ones_once(tmp_path):
     detector, path = untrained(), tmp_path / "weights.safetensors"
-    networks = {"frame_network": StackedHourglass(HourglassConfig(6, 1, 1)), "window_network": detector.networks["window"]}
-    doubt = {name: ErrorModel(logit=(2.0, 0.0, 0.0, 0.0)) for name in ("frame", "window")}
+    networks = {"frame_network": StackedHourglass(HourglassConfig(6, 1, 1)), "tool_network": detector.networks["tool"]}
+    doubt = {name: ErrorModel(logit=(2.0, 0.0, 0.0, 0.0)) for name in ("frame", "tool", "again")}
     both = replace(detector, in_doubt=replace(detector, **networks, error_models=doubt))
     both.save(path)
     loaded = Detector.load(path, engine="torch")
-    assert list(loaded.all_networks) == ["frame", "window", "in_doubt.frame"]
+    assert list(loaded.all_networks) == ["frame", "tool", "in_doubt.frame"]
     assert loaded.digest == both.digest != detector.digest
-    assert loaded.in_doubt.networks["window"] is loaded.networks["window"]
+    assert loaded.in_doubt.networks["tool"] is loaded.networks["tool"]
     assert loaded.in_doubt.error_models["frame"].logit == doubt["frame"].logit
-    with pytest.raises(ValueError, match="no error model for window"):
+    with pytest.raises(ValueError, match="no error model for tool, again"):
         replace(both, in_doubt=replace(both.in_doubt, error_models={"frame": doubt["frame"]})).save(path)
 
 
@@ -77,9 +77,9 @@ def test_missing_metadata_error_models_and_checksums_are_named(tmp_path):
         with pytest.raises(ValueError, match=rf"weights\.safetensors: its metadata lack {lacking}; get the file again"):
             Detector.load(path)
     write_checkpoint(path, tensors, metadata | {"calibration": {"frame": metadata["calibration"]["frame"]}})
-    with pytest.raises(ValueError, match=r"weights\.safetensors: no error model for window.*train assemble"):
+    with pytest.raises(ValueError, match=r"weights\.safetensors: no error model for tool, again.*train assemble"):
         Detector.load(path)
-    with pytest.raises(ValueError, match="no error model for frame, window"):
+    with pytest.raises(ValueError, match="no error model for frame, tool, again"):
         replace(detector, error_models={}).save(whole)
     save_file(tensors, path, {name: json.dumps(value) for name, value in metadata.items()})
     with pytest.raises(ValueError, match=r"weights\.safetensors: damaged, its SHA-256 checksum is missing"):
@@ -102,12 +102,12 @@ def test_halved_weights_take_half_the_place_and_load_as_they_were(tmp_path):
 
 def test_the_digest_tells_everything_that_decides_what_a_detector_finds():
     detector = untrained()
-    weights = detector.networks["window"].state_dict()
+    weights = detector.networks["tool"].state_dict()
     others = [
         replace(detector, frame_px=32),
         replace(detector, method="paper"),
         replace(detector, engine="openvino"),
-        replace(detector, error_models=detector.error_models | {"window": ErrorModel(logit=(5.5, 0.0, 0.0, 0.0))}),
+        replace(detector, error_models=detector.error_models | {"tool": ErrorModel(logit=(5.5, 0.0, 0.0, 0.0))}),
     ]
     before = detector.digest
     assert len({before, *(other.digest for other in others)}) == 5 and replace(detector).digest == before
@@ -130,11 +130,25 @@ def test_weights_of_another_network_are_named(tmp_path):
     path = tmp_path / "weights.safetensors"
     network = StackedHourglass(HourglassConfig(8, 1))
     metadata = {
-        "format": "microstereo.detector", "networks": {"frame": {"features": 16}}, "frame_px": None, "window_px": 64,
-        "mirror": False, "method": "paper", "calibration": {}, "provenance": {},
+        "format": "microstereo.detector", "networks": {"frame": {"features": 16}}, "frame_px": None,
+        "method": "paper", "calibration": {}, "provenance": {},
     }  # fmt: skip
     write_checkpoint(path, {f"frame.{k}": v for k, v in network.state_dict().items()}, metadata)
     with pytest.raises(ValueError, match=r"weights\.safetensors: its weights do not fit"):
+        Detector.load(path)
+
+
+def test_networks_of_a_stage_that_is_none_are_named_and_settings_that_are_gone_are_not(tmp_path):
+    path = tmp_path / "weights.safetensors"
+    detector = untrained()
+    detector.save(path)
+    tensors, metadata = read_checkpoint(path, FORMAT)
+    write_checkpoint(path, tensors, metadata | {"window_px": 128, "mirror": True})  # as earlier versions wrote them
+    assert Detector.load(path, engine="torch").digest == detector.digest
+    networks = metadata["networks"] | {"window": metadata["networks"]["tool"]}
+    tensors |= {f"window{key[4:]}": value.clone() for key, value in tensors.items() if key.startswith("tool.")}
+    write_checkpoint(path, tensors, metadata | {"networks": networks})
+    with pytest.raises(ValueError, match=r"weights\.safetensors: it has networks of stages that are none \(window\); train"):
         Detector.load(path)
 
 
@@ -143,6 +157,6 @@ def test_an_error_model_of_another_version_is_named(tmp_path):
     untrained().save(path)
     tensors, metadata = read_checkpoint(path, FORMAT)
     old = [[[0.0] * 14, [0.0] * 14], [1.0] * 4]
-    write_checkpoint(path, tensors, metadata | {"calibration": {"frame": old, "window": old}})
+    write_checkpoint(path, tensors, metadata | {"calibration": {"frame": old, "tool": old}})
     with pytest.raises(ValueError, match=r"safetensors: .*log_variance: expected \(2, 11\), got \(2, 14\); fit anew"):
         Detector.load(path)

@@ -27,7 +27,7 @@ from lib.landmarks.windows import (
 
 def sure():
     """A calibration that keeps every detection."""
-    return {name: ErrorModel(logit=(5.0, 0.0, 0.0, 0.0)) for name in ("frame", "window")}
+    return {name: ErrorModel(logit=(5.0, 0.0, 0.0, 0.0)) for name in ("frame", "tool", "again")}
 
 
 def with_models(detector, **models):
@@ -37,7 +37,7 @@ def with_models(detector, **models):
 def untrained(frame_px=66):
     torch.manual_seed(0)
     networks = [StackedHourglass(HourglassConfig(8, 1)) for _ in range(2)]
-    return Detector(networks[0], frame_px, networks[1], window_px=64, error_models=sure())
+    return Detector(networks[0], frame_px, networks[1], error_models=sure())
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +75,7 @@ def test_save_and_load(images, tmp_path):
 
 
 def test_missing_is_nan_with_confidence_zero(images):
-    never = {name: ErrorModel(logit=(-50.0, 0.0, 0.0, 0.0)) for name in ("frame", "window")}
+    never = {name: ErrorModel(logit=(-50.0, 0.0, 0.0, 0.0)) for name in ("frame", "tool", "again")}
     found = with_models(untrained(), **never)(images)
     assert np.isnan(found.u).all()
     assert np.isnan(found.covariance).all()

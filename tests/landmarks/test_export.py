@@ -47,13 +47,13 @@ def quick(monkeypatch):
 def small():
     """A detector of every stage with small networks that are not trained, and two frames."""
     torch.manual_seed(0)
-    networks = [StackedHourglass(HourglassConfig(4, 1, 1)).eval() for _ in range(3)]
+    networks = [StackedHourglass(HourglassConfig(4, 1, 1)).eval() for _ in range(2)]
     closeup = OffsetNetwork(OffsetConfig(4, 32)).eval()
     for head in [*(network.heads[0] for network in networks), closeup.head[-1]]:
         torch.nn.init.normal_(head.weight, std=0.1)
-    models = dict.fromkeys(("frame", "tool", "again", "window"), SURE)
+    models = dict.fromkeys(("frame", "tool", "again"), SURE)
     models |= dict.fromkeys(("closeup", "tracking"), replace(SURE, gain=((0.5, 0.8),) * 3, bias=((0.2, -0.1),) * 3))
-    detector = Detector(networks[0], 80, networks[1], networks[2], 64, "paper", models, closeup_network=closeup, mirror=True)
+    detector = Detector(networks[0], 80, networks[1], "paper", models, closeup_network=closeup)
     return detector, np.random.default_rng(0).integers(0, 256, (2, 120, 160, 3), dtype=np.uint8)
 
 

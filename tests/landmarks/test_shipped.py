@@ -73,11 +73,11 @@ def test_an_image_in_doubt_is_seen_again_with_more_contrast(shipped, monkeypatch
 def test_only_an_image_in_doubt_is_left_to_the_wider_networks(shipped, monkeypatch):
     clear, looks = shipped.images[:1], []
     dull = np.clip(np.round((clear - clear.mean()) * 0.05 + 110), 0, 255).astype(np.uint8)
-    narrow, wider = replace(shipped.torch, in_doubt=None), replace(shipped.torch, in_doubt=None, mirror=False)
+    narrow, wider = replace(shipped.torch, in_doubt=None), replace(shipped.torch, in_doubt=None, method="paper")
     once = type(narrow)._once
-    monkeypatch.setattr(type(narrow), "_once", lambda *a, **how: looks.append((a[0].mirror, a[1])) or once(*a, **how))
+    monkeypatch.setattr(type(narrow), "_once", lambda *a, **how: looks.append((a[0].method, a[1])) or once(*a, **how))
     found = replace(narrow, in_doubt=wider)(np.concatenate([clear, dull]))
-    assert [mirror for mirror, _ in looks] == [True] + [False] * (len(looks) - 1) and len(looks) > 1
+    assert [how for how, _ in looks] == ["gauss_newton"] + ["paper"] * (len(looks) - 1) and len(looks) > 1
     assert np.array_equal(looks[1][1], dull)  # as it is, before its contrast is changed
     assert np.array_equal(found.u[:1], narrow(clear).u) and np.array_equal(found.u[1:], wider(dull).u)
 

@@ -11,7 +11,8 @@ from notebooks.studies.matching_evaluation import detection_auc, non_occluded, s
 
 def matches_of(u_left: np.ndarray, disparity: np.ndarray) -> Matches:
     u_right = u_left - np.column_stack([disparity, np.zeros(len(disparity))])
-    return Matches(u_left, u_right, np.ones(len(u_left)), np.tile(np.eye(4), (len(u_left), 1, 1)))
+    one, covariance = np.ones(len(u_left)), np.tile(np.eye(4), (len(u_left), 1, 1))
+    return Matches(u_left, u_right, one, covariance, peak_ratio=one, reciprocal=one > 0, method="made")
 
 
 def step_disparity() -> np.ndarray:

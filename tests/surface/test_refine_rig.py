@@ -26,7 +26,8 @@ def matches_of(rig, x_mm: np.ndarray, rng: np.random.Generator, *, outliers: flo
     wrong = rng.random(len(x_mm)) < outliers
     u_right[wrong] += rng.uniform(-15, 25, (wrong.sum(), 2))
     covariance = np.tile(np.diag([1e-4, 1e-4, NOISE_PX**2, NOISE_PX**2]), (len(x_mm), 1, 1))
-    return Matches(u_left, u_right, np.ones(len(x_mm)), covariance)
+    one = np.ones(len(x_mm))
+    return Matches(u_left, u_right, one, covariance, peak_ratio=one, reciprocal=one > 0, method="made")
 
 
 def calibrated(seed: int, **weights):

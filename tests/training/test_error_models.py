@@ -106,14 +106,15 @@ def test_closeups_that_know_nothing_do_no_harm(small, monkeypatch):
     """The corrections of an untrained offset network are a constant, which is bias, or noise, which is not believed."""
     for module in (error_models, detectors):
         monkeypatch.setattr(module, "TRACKED_FROM", 0.0)  # toys are too small to be sure of
+    monkeypatch.setattr(detectors, "MISSING_BELOW", 0.0)  # nor does a window, in which they are larger, show what was learnt
     detector, frames = small
     torch.manual_seed(0)
     closeup = OffsetNetwork(OffsetConfig(4, 32)).eval()
     torch.nn.init.normal_(closeup.head[-1].weight, std=0.5)
-    full = replace(detector, window_network=detector.frame_network, window_px=64, closeup_network=closeup)
-    frames = frames[:10]
+    full = replace(detector, tool_network=detector.frame_network, closeup_network=closeup)
+    frames = frames[:20]
     once = fit_error_models(full, frames)
-    assert set(once.error_models) == {"frame", "window", "closeup", "closer", "tracking"}
+    assert set(once.error_models) == {"frame", "tool", "again", "closeup", "closer", "tracking"}
     gain = np.array(once.error_models["closeup"].gain)
     assert ((gain >= 0) & (gain <= 1)).all()
     assert once.error_models["tracking"].gain == ((1.0, 1.0),) * 3
