@@ -10,7 +10,7 @@ then swept by the second stage.  The first stage alone, at full resolution, is t
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, field, replace
-from functools import cache
+from functools import cache, cached_property
 from itertools import product
 from pathlib import Path
 from typing import Self
@@ -116,7 +116,8 @@ class Detector:
         error_models: One for each stage: ``"frame"``, ``"tool"`` and ``"again"`` for the two looks at the tool, ``"closeup"``
             and ``"closer"`` for two closeups, the second where the first moved the landmark far, and ``"tracking"`` for the
             closeups that follow a landmark from frame to frame.
-        in_doubt: Wider and slower networks, which see the images again that leave this detector in doubt; None = it does so.
+        wider: Networks of ``"frame"`` and ``"tool"`` with more channels, slower ones, which see the images again that leave
+            doubt; without any the usual ones do.  Their peaks have the same error models.
         engine: What runs the networks, one of `lib.landmarks.engines.ENGINES`; the weights are the same.
 
         >>> found = Detector.load(engine="torch")(np.zeros((1, 270, 480, 3), np.uint8))
@@ -131,7 +132,7 @@ class Detector:
     error_models: dict[str, ErrorModel] = field(default_factory=dict)
     metadata: dict[str, object] = field(default_factory=dict)
     closeup_network: OffsetNetwork | None = None
-    in_doubt: Self | None = None
+    wider: dict[str, StackedHourglass] = field(default_factory=dict)
     engine: str = "torch"
     _run: dict[str, Callable[[Tensor], list[Tensor]]] = field(init=False, repr=False, default_factory=dict)
 
@@ -139,8 +140,6 @@ class Detector:
         check(self, "frame_px", lambda v: v is None or v >= 16, "must be at least 16 px")
         if self.closeup_network and not self.tool_network:
             raise ValueError("closeup_network: looks at what a tool_network has found; give one.")
-        if self.in_doubt and self.in_doubt.engine != self.engine:
-            object.__setattr__(self, "in_doubt", replace(self.in_doubt, engine=self.engine))
         run = cache(accelerated)  # stages may share a network
         for stage in self.stages:
             self._run[stage] = run(self.network_of(stage), self.engine, mirror=stage == MIRRORED)
@@ -157,9 +156,14 @@ class Detector:
 
     @property
     def all_networks(self) -> dict[str, Network]:
-        """The networks by their names in a weights file: those of `in_doubt`, if they are others, begin with ``in_doubt.``"""
-        own, wider = self.networks, self.in_doubt.networks if self.in_doubt else {}
-        return own | {f"in_doubt.{name}": network for name, network in wider.items() if network is not own.get(name)}
+        """The networks by their names in a weights file; those of `wider` begin with ``wider.``"""
+        return self.networks | {f"wider.{stage}": network for stage, network in self.wider.items()}
+
+    @cached_property
+    def in_doubt(self) -> Self | None:
+        """The detector of the `wider` networks, if there are any."""
+        wider = {f"{stage}_network": network for stage, network in self.wider.items()}
+        return replace(self, **wider, wider={}) if wider else None
 
     @property
     def stages(self) -> list[str]:
@@ -181,19 +185,18 @@ class Detector:
         tensors, metadata = read_checkpoint(path, FORMAT)
         if text := ", ".join(sorted({"networks", "calibration", "provenance", *_SETTINGS} - metadata.keys())):
             raise ValueError(f"{path}: its metadata lack {text}; get the file again, or make it with Detector.save.")
-        if other := metadata["networks"].keys() - {part + stage for part in ("", "in_doubt.") for stage in _STAGES}:
+        if other := metadata["networks"].keys() - {part + stage for part in ("", "wider.") for stage in _STAGES}:
             raise ValueError(f"{path}: it has networks of stages that are none ({', '.join(sorted(other))}); train it anew.")
-        parts: dict[str, dict[str, object]] = {"": {"error_models": {}}, "in_doubt": {"error_models": {}}}
-        for name, config in metadata["networks"].items():
-            part, _, stage = name.rpartition(".")
-            parts[part][f"{stage}_network"] = load_network(path, config, tensors, f"{name}.")
-        same = {name: metadata[name] for name in _SETTINGS} | {"engine": engine or default_engine()}
+        configs = metadata["networks"].items()
+        networks = {name: load_network(path, config, tensors, f"{name}.") for name, config in configs}
         try:
-            for name, fit in metadata["calibration"].items():
-                part, _, stage = name.rpartition(".")
-                parts[part]["error_models"][stage] = ErrorModel(*fit)
-            wider = cls(**parts[""] | parts["in_doubt"], **same) if len(parts["in_doubt"]) > 1 else None
-            detector = cls(**parts[""], **same, metadata=metadata["provenance"], in_doubt=wider)
+            detector = cls(
+                **{f"{stage}_network": networks[stage] for stage in _STAGES if stage in networks},
+                wider={stage: networks[f"wider.{stage}"] for stage in _STAGES if f"wider.{stage}" in networks},
+                **{name: metadata[name] for name in _SETTINGS},
+                error_models={name: ErrorModel(*fit) for name, fit in metadata["calibration"].items()},
+                metadata=metadata["provenance"], engine=engine or default_engine(),
+            )  # fmt: skip
         except (TypeError, ValueError) as error:
             raise ValueError(f"{path}: {error}") from error
         detector._check_complete(path)
@@ -218,13 +221,12 @@ class Detector:
 
     def _content(self) -> tuple[dict[str, Tensor], dict[str, object]]:
         """Tensors and metadata of the detector's file."""
-        networks, wider = self.all_networks, self.in_doubt.error_models if self.in_doubt else {}
-        fits = self.error_models | {f"in_doubt.{stage}": fit for stage, fit in wider.items()}
+        networks = self.all_networks
         tensors = {f"{name}.{key}": value for name, part in networks.items() for key, value in part.state_dict().items()}
         return tensors, {name: getattr(self, name) for name in _SETTINGS} | {
             "format": FORMAT,
             "networks": {name: asdict(network.config) for name, network in networks.items()},
-            "calibration": {name: list(asdict(fit).values()) for name, fit in fits.items()},
+            "calibration": {stage: list(asdict(fit).values()) for stage, fit in self.error_models.items()},
             "provenance": self.metadata,
         }
 
@@ -233,8 +235,6 @@ class Detector:
             what = f"no error model for {', '.join(lacking)}, so covariance and confidence would mean nothing"
             cure = "fit them with `lib.training.error_models.fit_error_models` or `python3 -m lib train assemble`"
             raise ValueError(f"{path}: {what}; {cure}.")
-        if self.in_doubt:
-            self.in_doubt._check_complete(path)
 
     def __call__(self, images: ArrayLike, *, batch: int = 4, avoid: np.ndarray | None = None) -> Landmarks:
         """Landmarks of images (n, h, w, 3), uint8 RGB or float in [0, 1]; `batch` images at a time.

@@ -24,7 +24,7 @@ def main(argv: list[str] | None = None) -> int:
     add("what", choices=["generate", "propose", *STAGES, "finetune", "assemble", "export"],
         help="generate: simulate the training data; propose: search it for what --initial takes for tools; frame, tool, "
         "closeup: train this stage (tool: on the proposals, too, if they are there); finetune: train all "
-        "further on labelled recordings; assemble: join them, and what --folder in_doubt holds for images in doubt, into a "
+        "further on labelled recordings; assemble: join them, and what FOLDER/wider holds for images in doubt, into a "
         "detector with its card; export: write ONNX")  # fmt: skip
     add("recordings", nargs="*", type=Path, help="labelled recordings; finetune holds out the end of each")
     add("--data", type=Path, default=paths.CACHE / "landmarks", help="folder of the simulated shards")

@@ -34,8 +34,8 @@ from lib.training.sources import FRAME_PX, CloseupSource, FrameSource, ToolSourc
 
 #: The stages that are trained, in the order of their use, and the channels of the shipped networks.
 STAGES = {"frame": 32, "tool": 48, "closeup": 32}
-#: The stages of `Detector.in_doubt` that have networks of their own.
-_WIDER = {"in_doubt.frame": "frame", "in_doubt.tool": "tool"}
+#: The networks of `Detector.wider`, by their names in `Detector.all_networks`.
+_WIDER = {"wider.frame": "frame", "wider.tool": "tool"}
 #: Standard deviation of a label, as a share of the tool's length, at which a stage lets it count half.
 LABEL_SD = {"frame": 0.1, "tool": 0.04, "closeup": 0.02}
 #: Of fine-tuning: share of the draws that are labelled frames, beside simulated ones, and of these in another guise.
@@ -141,7 +141,7 @@ def finetune(
             stopped.set()
             raise
     then = {"finetuned": {"images": len(images), "held_out": len(held_out), "commit": commit_id()}}
-    tuned = replace(detector, **networks, in_doubt=None, metadata=detector.metadata | then)  # it knows the old tools alone
+    tuned = replace(detector, **networks, wider={}, metadata=detector.metadata | then)  # they know the old tools alone
     tuned = fit_error_models(tuned, [*held_out, *doubt_on], anew=False, progress=progress is True)
     old = {stage: detector.error_models[stage] for stage in CLOSE if stage in detector.error_models}
     if detector.closeup_network is None or not old:
@@ -169,8 +169,8 @@ def assemble(
     on labelled `recordings`, if any; those of the closeups also on half as many images of the reference rig, since their bias
     is not that of unfamiliar tools alone.  The card's numbers are measured on the other half of the scenes.  `notes` are
     lines for the card.  A stage that `folder` lacks is `initial`'s; without one, and without shards, a `FileNotFoundError`.
-    The wider stages for images in doubt, if any, are in its folder ``in_doubt``.  What `initial` knows of its errors stays
-    true where no stage is new.
+    The wider networks for images in doubt, if any, are in its folder ``wider``.  What `initial` knows of its errors stays
+    where no other stage is new.
     """
     out, known = Path(out), initial.all_networks if initial else {}
     trained = {name: Path(folder, *name.split("."), "last.safetensors") for name in (*STAGES, *_WIDER)}
@@ -190,13 +190,10 @@ def assemble(
         typical += labelled_images(recording, every=max(1, len(recording.frames) // 8))
     networks = {k: one.network.halved() if k in new else one.network for k, one in stages.items()}
     own = {f"{stage}_network": networks[stage] for stage in STAGES}
-    wider = {f"{stage}_network": networks[name] for name, stage in _WIDER.items() if name in networks}
-    fitted = partial(fit_error_models, images=frames[::2] + bare + typical, for_closeups=near_by, progress=True)
-    shape = partial(Detector, frame_px=FRAME_PX[0])
-    detector = fitted(shape(**own)) if new & STAGES.keys() or not initial else replace(initial, in_doubt=None)
-    if wider:
-        kept = initial.in_doubt if initial and not new else None
-        detector = replace(detector, in_doubt=kept or fitted(shape(**own | wider)))
+    detector = initial or Detector(**own, frame_px=FRAME_PX[0])
+    detector = replace(detector, **own, wider={stage: networks[name] for name, stage in _WIDER.items() if name in networks})
+    if new & STAGES.keys() or not initial:
+        detector = fit_error_models(detector, frames[::2] + bare + typical, for_closeups=near_by, progress=True)
     held_out = evaluate(detector, frames[1::2], progress=True)
     keys = "data images commit steps seconds processes precision machine config metrics before".split()
     provenance = {
