@@ -38,19 +38,16 @@ def test_missing_corrupt_and_foreign_files_are_named(tmp_path):
         Detector.load(foreign)
 
 
-def test_wider_networks_are_kept_with_their_error_models_and_shared_ones_once(tmp_path):
+def test_wider_networks_are_kept_and_see_what_is_in_doubt(tmp_path):
     detector, path = untrained(), tmp_path / "weights.safetensors"
-    networks = {"frame_network": StackedHourglass(HourglassConfig(6, 1, 1)), "tool_network": detector.networks["tool"]}
-    doubt = {name: ErrorModel(logit=(2.0, 0.0, 0.0, 0.0)) for name in ("frame", "tool", "again")}
-    both = replace(detector, in_doubt=replace(detector, **networks, error_models=doubt))
+    both = replace(detector, wider={"frame": StackedHourglass(HourglassConfig(6, 1, 1))})
     both.save(path)
     loaded = Detector.load(path, engine="torch")
-    assert list(loaded.all_networks) == ["frame", "tool", "in_doubt.frame"]
+    assert list(loaded.all_networks) == ["frame", "tool", "wider.frame"]
     assert loaded.digest == both.digest != detector.digest
-    assert loaded.in_doubt.networks["tool"] is loaded.networks["tool"]
-    assert loaded.in_doubt.error_models["frame"].logit == doubt["frame"].logit
-    with pytest.raises(ValueError, match="no error model for tool, again"):
-        replace(both, in_doubt=replace(both.in_doubt, error_models={"frame": doubt["frame"]})).save(path)
+    assert loaded.in_doubt.networks == {"frame": loaded.wider["frame"], "tool": loaded.tool_network}
+    assert loaded.in_doubt.error_models == loaded.error_models and loaded.in_doubt.in_doubt is None
+    assert replace(loaded, engine="openvino").in_doubt.engine == "openvino"
 
 
 @pytest.mark.parametrize("where", ["metadata", "tensors"])

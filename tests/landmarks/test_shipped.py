@@ -1,5 +1,6 @@
 """The weights that ship, on the recording that ships."""
 
+import copy
 import json
 from dataclasses import replace
 
@@ -73,11 +74,12 @@ def test_an_image_in_doubt_is_seen_again_with_more_contrast(shipped, monkeypatch
 def test_only_an_image_in_doubt_is_left_to_the_wider_networks(shipped, monkeypatch):
     clear, looks = shipped.images[:1], []
     dull = np.clip(np.round((clear - clear.mean()) * 0.05 + 110), 0, 255).astype(np.uint8)
-    narrow, wider = replace(shipped.torch, in_doubt=None), replace(shipped.torch, in_doubt=None, method="paper")
+    narrow, other = replace(shipped.torch, wider={}), copy.deepcopy(shipped.torch.tool_network)
+    wider = replace(narrow, tool_network=other)
     once = type(narrow)._once
-    monkeypatch.setattr(type(narrow), "_once", lambda *a, **how: looks.append((a[0].method, a[1])) or once(*a, **how))
-    found = replace(narrow, in_doubt=wider)(np.concatenate([clear, dull]))
-    assert [how for how, _ in looks] == ["gauss_newton"] + ["paper"] * (len(looks) - 1) and len(looks) > 1
+    monkeypatch.setattr(type(narrow), "_once", lambda *a, **how: looks.append((a[0].tool_network is other, a[1])) or once(*a, **how))
+    found = replace(narrow, wider={"tool": other})(np.concatenate([clear, dull]))
+    assert [wide for wide, _ in looks] == [False] + [True] * (len(looks) - 1) and len(looks) > 1
     assert np.array_equal(looks[1][1], dull)  # as it is, before its contrast is changed
     assert np.array_equal(found.u[:1], narrow(clear).u) and np.array_equal(found.u[1:], wider(dull).u)
 

@@ -81,21 +81,21 @@ def test_a_checkpoint_of_another_kind_of_network_is_refused(tmp_path, monkeypatc
 
 
 def test_networks_for_images_in_doubt_are_assembled_beside_others_that_stay(tmp_path, monkeypatch):
-    """The closeups, which both use, are in the file once."""
+    """Nothing is fitted where the stages that measure stay."""
     frame, tool, wide = (StackedHourglass(HourglassConfig(features, 1, 2)) for features in (4, 4, 6))
     models = {stage: ErrorModel() for stage in ("frame", "tool", "again", *CLOSE)}
     closeup = OffsetNetwork(OffsetConfig(4, 64))
     initial = Detector(frame, 96, tool_network=tool, closeup_network=closeup, error_models=models)
     monkeypatch.setattr(stages, "validation_images", lambda data: toy_images(2, size=(135, 240)))
-    monkeypatch.setattr(stages, "fit_error_models", lambda d, **how: replace(d, error_models=models))
+    monkeypatch.setattr(stages, "fit_error_models", lambda *a, **how: pytest.fail("fitted"))
     monkeypatch.setattr(stages, "load_training", lambda path: Training(wide, [], {}))
     monkeypatch.setattr(stages, "card", lambda detector, path: "")
-    (tmp_path / "in_doubt" / "tool").mkdir(parents=True)
-    (tmp_path / "in_doubt" / "tool" / "last.safetensors").touch()
+    (tmp_path / "wider" / "tool").mkdir(parents=True)
+    (tmp_path / "wider" / "tool" / "last.safetensors").touch()
     out = tmp_path / "new.safetensors"
     stages.assemble(tmp_path, "", out, initial=initial)
     found = Detector.load(out, engine="torch")
-    assert list(found.all_networks) == ["frame", "tool", "closeup", "in_doubt.tool"]
+    assert list(found.all_networks) == ["frame", "tool", "closeup", "wider.tool"]
     assert torch.equal(found.tool_network.stem[0].weight, tool.stem[0].weight)
 
 
@@ -106,7 +106,7 @@ def test_stages_are_fine_tuned_on_labelled_frames(tmp_path, monkeypatch):
     images[0] = images[0]._replace(u=np.full((3, 2), np.nan))
     hourglass, closeup = StackedHourglass(HourglassConfig(4, 1, 2)), OffsetNetwork(OffsetConfig(4, 64))
     detector = Detector(hourglass, 96, tool_network=hourglass, closeup_network=closeup)
-    detector = replace(detector, in_doubt=detector)
+    detector = replace(detector, wider={"tool": hourglass})
     fitted_on, done = [], []
     monkeypatch.setattr(stages, "fit_error_models", lambda d, held_out, anew, progress: fitted_on.append(held_out) or d)
     options = {"steps": 1, "progress": lambda stage, part: done.append((stage, part))}
@@ -115,7 +115,7 @@ def test_stages_are_fine_tuned_on_labelled_frames(tmp_path, monkeypatch):
     noted = lambda found, **how: weights.append(how.get("weight")) or of(found, **how)  # noqa: E731
     monkeypatch.setattr(FrameSource, "of", noted)
     tuned = stages.finetune(detector, images[:6], images[6:], tmp_path, **options)
-    assert tuned.in_doubt is None  # networks that know nothing of the labelled frames
+    assert not tuned.wider  # networks that know nothing of the labelled frames
     finetuned = tuned.metadata["finetuned"]
     assert (finetuned["images"], finetuned["held_out"]) == (5, 2)  # those with a base and a tip
     assert sorted(done) == [("closeup", 1.0), ("frame", 1.0), ("tool", 1.0)]  # side by side
