@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 
 from lib import paths
-from lib.correspondences import LANDMARKS, MIN_CONFIDENCE, Correspondences, of_recording, pair_with_robot
+from lib.correspondences import (
+    LANDMARKS,
+    MIN_CONFIDENCE,
+    Correspondences,
+    NoDetectionError,
+    of_recording,
+    pair_with_robot,
+)
 from lib.recordings import Recording
 
 A = np.array([[100, 3, 5], [-3, 100, 2], [99, 1, 16], [-2, 98, 3.0]])

@@ -77,7 +77,8 @@ def test_only_an_image_in_doubt_is_left_to_the_wider_networks(shipped, monkeypat
     narrow, other = replace(shipped.torch, wider={}), copy.deepcopy(shipped.torch.tool_network)
     wider = replace(narrow, tool_network=other)
     once = type(narrow)._once
-    monkeypatch.setattr(type(narrow), "_once", lambda *a, **how: looks.append((a[0].tool_network is other, a[1])) or once(*a, **how))
+    noted = lambda *a, **how: looks.append((a[0].tool_network is other, a[1])) or once(*a, **how)  # noqa: E731
+    monkeypatch.setattr(type(narrow), "_once", noted)
     found = replace(narrow, wider={"tool": other})(np.concatenate([clear, dull]))
     assert [wide for wide, _ in looks] == [False] + [True] * (len(looks) - 1) and len(looks) > 1
     assert np.array_equal(looks[1][1], dull)  # as it is, before its contrast is changed
