@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import os
 import re
@@ -76,9 +77,6 @@ def digest(*parts: str | Path | bytes, length: int = 12) -> str:
     """The first `length` hexadecimal digits of the SHA-256 of bytes, and of what is in files, one after the other."""
     total = hashlib.sha256()
     for part in parts:
-        if isinstance(part, str | Path):
-            with open(part, "rb") as file:
-                hashlib.file_digest(file, lambda: total)
-        else:
-            total.update(part)
+        with open(part, "rb") if isinstance(part, str | Path) else io.BytesIO(part) as file:
+            hashlib.file_digest(file, lambda: total)  # a video need not fit into memory
     return total.hexdigest()[:length]

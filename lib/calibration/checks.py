@@ -114,4 +114,3 @@ def eyes_exchanged(A: np.ndarray, sd_rad: float) -> bool:
         return False
     along, across = sides(A)
     return bool(np.deg2rad(1) < np.hypot(along, across) < np.deg2rad(30) and along < -max(3.0 * abs(across), 5.0 * sd_rad))
-

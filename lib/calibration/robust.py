@@ -148,8 +148,7 @@ def _by_growth(x: np.ndarray, u: np.ndarray, rng: np.random.Generator, least_mm:
 
 def _extent(u: np.ndarray) -> np.ndarray:
     """(2,) width and height of the pixels, whatever one row in ten does."""
-    at, places = np.array([0.1, 0.9]) * (len(u) - 1), np.arange(len(u))
-    low, high = np.transpose([np.interp(at, places, v) for v in np.sort(u.T)])  # `np.quantile` takes five times as long
+    low, high = np.quantile(u, [0.1, 0.9], axis=0)
     return np.maximum((high - low) / 0.8, 1e-9)
 
 

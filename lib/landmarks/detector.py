@@ -3,14 +3,14 @@
 It works from coarse to fine.  The first stage finds the tool in the whole frame, shrunk to a fixed size.  The second names
 its landmarks in one upright window, scaled so that every tool has the same length in it; it looks twice, since the first
 look corrects direction and scale.  Where its window does not show the tool well, it decides between several places.  The
-last measures each landmark in a closeup.  An image that leaves doubt is seen again by wider networks, with more contrast,
-then swept by the second stage.  The first stage alone, at full resolution, is the paper's detector (Sec. III).
+last measures each landmark in a closeup.  An image that leaves doubt is seen again with more contrast, then swept by the
+second stage.  The first stage alone, at full resolution, is the paper's detector (Sec. III).
 """
 
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, field, replace
-from functools import cache, cached_property
+from functools import cache
 from itertools import product
 from pathlib import Path
 from typing import Self
@@ -116,8 +116,6 @@ class Detector:
         error_models: One for each stage: ``"frame"``, ``"tool"`` and ``"again"`` for the two looks at the tool, ``"closeup"``
             and ``"closer"`` for two closeups, the second where the first moved the landmark far, and ``"tracking"`` for the
             closeups that follow a landmark from frame to frame.
-        wider: Networks of ``"frame"`` and ``"tool"`` with more channels, slower ones, which see the images again that leave
-            doubt; without any the usual ones do.  Their peaks have the same error models.
         engine: What runs the networks, one of `lib.landmarks.engines.ENGINES`; the weights are the same.
 
         >>> found = Detector.load(engine="torch")(np.zeros((1, 270, 480, 3), np.uint8))
@@ -132,7 +130,6 @@ class Detector:
     error_models: dict[str, ErrorModel] = field(default_factory=dict)
     metadata: dict[str, object] = field(default_factory=dict)
     closeup_network: OffsetNetwork | None = None
-    wider: dict[str, StackedHourglass] = field(default_factory=dict)
     engine: str = "torch"
     _run: dict[str, Callable[[Tensor], list[Tensor]]] = field(init=False, repr=False, default_factory=dict)
 
@@ -151,26 +148,13 @@ class Detector:
     @property
     def networks(self) -> dict[str, Network]:
         """The networks by stage, in the order of their use."""
-        stages = {name: getattr(self, f"{name}_network") for name in _STAGES}
-        return {name: network for name, network in stages.items() if network is not None}
-
-    @property
-    def all_networks(self) -> dict[str, Network]:
-        """The networks by their names in a weights file; those of `wider` begin with ``wider.``"""
-        return self.networks | {f"wider.{stage}": network for stage, network in self.wider.items()}
-
-    @cached_property
-    def in_doubt(self) -> Self | None:
-        """The detector of the `wider` networks, if there are any."""
-        wider = {f"{stage}_network": network for stage, network in self.wider.items()}
-        return replace(self, **wider, wider={}) if wider else None
+        return {stage: network for stage in _STAGES if (network := getattr(self, f"{stage}_network")) is not None}
 
     @property
     def stages(self) -> list[str]:
         """The stages in the order of their use, each with an error model; the last one, if any, is tracking."""
-        there = self.networks
         names = ("frame", "tool", "again", "closeup", "closer", "tracking")
-        return [name for name in names if _NETWORK_OF.get(name, name) in there]
+        return [name for name in names if _NETWORK_OF.get(name, name) in self.networks]
 
     @classmethod
     def load(cls, path_or_name: str | Path | None = None, *, engine: str | None = None) -> Self:
@@ -185,15 +169,13 @@ class Detector:
         tensors, metadata = read_checkpoint(path, FORMAT)
         if text := ", ".join(sorted({"networks", "calibration", "provenance", *_SETTINGS} - metadata.keys())):
             raise ValueError(f"{path}: its metadata lack {text}; get the file again, or make it with Detector.save.")
-        if other := metadata["networks"].keys() - {part + stage for part in ("", "wider.") for stage in _STAGES}:
+        if other := metadata["networks"].keys() - set(_STAGES):
             raise ValueError(f"{path}: it has networks of stages that are none ({', '.join(sorted(other))}); train it anew.")
         configs = metadata["networks"].items()
-        networks = {name: load_network(path, config, tensors, f"{name}.") for name, config in configs}
+        networks = {f"{name}_network": load_network(path, config, tensors, f"{name}.") for name, config in configs}
         try:
             detector = cls(
-                **{f"{stage}_network": networks[stage] for stage in _STAGES if stage in networks},
-                wider={stage: networks[f"wider.{stage}"] for stage in _STAGES if f"wider.{stage}" in networks},
-                **{name: metadata[name] for name in _SETTINGS},
+                **networks, **{name: metadata[name] for name in _SETTINGS},
                 error_models={name: ErrorModel(*fit) for name, fit in metadata["calibration"].items()},
                 metadata=metadata["provenance"], engine=engine or default_engine(),
             )  # fmt: skip
@@ -221,11 +203,11 @@ class Detector:
 
     def _content(self) -> tuple[dict[str, Tensor], dict[str, object]]:
         """Tensors and metadata of the detector's file."""
-        networks = self.all_networks
-        tensors = {f"{name}.{key}": value for name, part in networks.items() for key, value in part.state_dict().items()}
+        states = {stage: network.state_dict() for stage, network in self.networks.items()}
+        tensors = {f"{stage}.{key}": value for stage, state in states.items() for key, value in state.items()}
         return tensors, {name: getattr(self, name) for name in _SETTINGS} | {
             "format": FORMAT,
-            "networks": {name: asdict(network.config) for name, network in networks.items()},
+            "networks": {stage: asdict(network.config) for stage, network in self.networks.items()},
             "calibration": {stage: list(asdict(fit).values()) for stage, fit in self.error_models.items()},
             "provenance": self.metadata,
         }
@@ -239,8 +221,8 @@ class Detector:
     def __call__(self, images: ArrayLike, *, batch: int = 4, avoid: np.ndarray | None = None) -> Landmarks:
         """Landmarks of images (n, h, w, 3), uint8 RGB or float in [0, 1]; `batch` images at a time.
 
-        An image in doubt is seen in more ways, which takes many times as long.  `avoid` (k, 3, 2) px are what looks like the
-        tool and is none; it needs the second stage.  A `ValueError` for another shape, type or range.
+        An image in doubt is seen again with more contrast, then swept, which takes many times as long.  `avoid` (k, 3, 2) px
+        are what looks like the tool and is none; it needs the second stage.  A `ValueError` for another shape, type or range.
         """
         images = as_uint8(images)
         with self._threads():
@@ -248,14 +230,9 @@ class Detector:
             return Landmarks.join([self._seen(part, avoid) for part in parts])
 
     def _seen(self, images: np.ndarray, avoid: np.ndarray | None) -> Landmarks:
-        """Landmarks of a few images.  Those in doubt are left to `in_doubt`; without one they are seen again with more
-        contrast, then swept, and the surest look counts.
-        """
+        """Landmarks of a few images.  One in doubt is seen again with more contrast, then swept; its surest look counts."""
         result = self._once(images, avoid)
-        unsure = np.flatnonzero(result.confidence.mean(1) < _UNSURE)
-        if self.in_doubt and unsure.size:
-            result._put(unsure, self.in_doubt._seen(images[unsure], avoid))
-        for more in (equalised, stretched, None) if self.tool_network and not self.in_doubt else ():
+        for more in (equalised, stretched, None) if self.tool_network else ():
             unsure = np.flatnonzero(result.confidence.mean(1) < _UNSURE)
             if unsure.size:
                 again = np.stack([more(image) for image in images[unsure]]) if more else images[unsure]

@@ -190,34 +190,6 @@ class StackedHourglass(Network):
                 x = x + self.merge_features[i](y) + self.merge_heatmaps[i](heatmaps)
         return outputs
 
-    def widened(self, config: HourglassConfig, seed: int = 0) -> StackedHourglass:
-        """A network of a wider configuration that computes the same, to train further (Net2Net, Chen et al. 2016).
-
-        Each new channel copies one of the old ones; what reads it shares the old weight among the copies in random parts,
-        so that they learn different things.  A ValueError for a configuration that is not wider.
-
-        >>> narrow = StackedHourglass(HourglassConfig(features=4, stacks=1)).eval()
-        >>> wide, image = narrow.widened(HourglassConfig(features=10, stacks=1)).eval(), torch.rand(1, 3, 64, 64)
-        >>> torch.allclose(wide(image)[0], narrow(image)[0], atol=1e-6)
-        True
-        """
-        wide, rng = StackedHourglass(config), torch.Generator().manual_seed(seed)
-        old, targets, state = self.state_dict(), wide.state_dict(), {}
-        if old.keys() != targets.keys() or any(np.any(np.array(old[k].shape) > v.shape) for k, v in targets.items()):
-            raise ValueError(f"config: {config} is not a wider form of {self.config}.")
-        for name, target in targets.items():
-            value = old[name]
-            if value.ndim and len(target) > len(value):
-                value = value[torch.arange(len(target)) % len(value)]
-            if value.ndim > 1 and target.shape[1] > (inputs := value.shape[1]):
-                of = torch.arange(target.shape[1]) % inputs
-                parts = torch.exp(0.5 * torch.randn(len(value), len(of), generator=rng))
-                parts /= torch.zeros(len(value), inputs).index_add_(1, of, parts)[:, of]
-                value = value[:, of] * parts.reshape(*parts.shape, *[1] * (value.ndim - 2))
-            state[name] = value
-        wide.load_state_dict(state)
-        return wide
-
 
 @dataclass(frozen=True)
 class OffsetConfig:

@@ -152,7 +152,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     left = (len(_SEQUENCES) - len(made)) * pairs
     workers = min(arguments.workers or cores(), len(_SEQUENCES))
     minutes = left * seconds_a_pair(shrink) / workers / 60 if left else 0.0
-    cost = f"{minutes:.0f} min on {workers} idle core{'s'[: workers > 1]}, {left * _MB_PER_PAIR / shrink**2 / 1000:.2f} GB"
+    cost = f"{minutes:.0f} min on {workers} idle core{'s' * (workers > 1)}, {left * _MB_PER_PAIR / shrink**2 / 1000:.2f} GB"
     print(f"{paths.shown(folder)}: {left} of {len(_SEQUENCES) * pairs} stereo pairs to make, about {cost}.", flush=True)
     if not arguments.dry_run:
         start = time.perf_counter()

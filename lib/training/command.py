@@ -8,7 +8,6 @@ from pathlib import Path
 from lib import paths
 from lib.files import write_json
 from lib.landmarks import Detector
-from lib.landmarks.network import HourglassConfig, OffsetConfig
 from lib.recordings import Recording, read_image
 from lib.training.evaluation import evaluate
 from lib.training.loop import PRESETS, Training, load_training, train
@@ -24,8 +23,7 @@ def main(argv: list[str] | None = None) -> int:
     add("what", choices=["generate", "propose", *STAGES, "finetune", "assemble", "export"],
         help="generate: simulate the training data; propose: search it for what --initial takes for tools; frame, tool, "
         "closeup: train this stage (tool: on the proposals, too, if they are there); finetune: train all "
-        "further on labelled recordings; assemble: join them, and what FOLDER/wider holds for images in doubt, into a "
-        "detector with its card; export: write ONNX")  # fmt: skip
+        "further on labelled recordings; assemble: join them into a detector with its card; export: write ONNX")  # fmt: skip
     add("recordings", nargs="*", type=Path, help="labelled recordings; finetune holds out the end of each")
     add("--data", type=Path, default=paths.CACHE / "landmarks", help="folder of the simulated shards")
     add("--folder", type=Path, default=paths.CACHE / "training", help="checkpoints, one folder a stage")
@@ -41,8 +39,7 @@ def main(argv: list[str] | None = None) -> int:
     add("--minutes", type=float, help="finetune: stop after so many")
     add("--features", type=int, help="channels (default: the shipped detector's)")
     add("--seed", type=int, default=0)
-    add("--initial", type=Path, help="a checkpoint of the stage, a weights file, or a name in data/models, to start from; "
-        "with more --features it is widened")
+    add("--initial", type=Path, help="a checkpoint of the stage, a weights file, or a name in data/models, to start from")
     add("--every", type=int, default=1, help="finetune: use every N-th frame")
     add("--note", action="append", default=[], help="assemble: a line for the card; may be repeated")
     add("--onnx", type=Path, default=paths.CACHE / "onnx", help="export: folder of the ONNX files")
@@ -68,7 +65,7 @@ def main(argv: list[str] | None = None) -> int:
     else:
         config = stage_config(a.what, preset=a.preset, features=a.features)
         config = replace(config, steps=a.steps, seed=a.seed, validate_every=200, learning_rate=a.rate or config.learning_rate)
-        initial = _start(a.initial, a.what, config.network) if a.initial else None
+        initial = _start(a.initial, a.what) if a.initial else None
         print(train(config, *stage_data(a.what, a.data), a.folder / a.what, initial=initial).provenance["metrics"])
     return 0
 
@@ -83,14 +80,11 @@ def _images(folder: Path) -> list[Path]:
     return found
 
 
-def _start(path: Path, stage: str, network: HourglassConfig | OffsetConfig) -> Training:
-    """What to start from, widened if the `network` to train has more channels."""
+def _start(path: Path, stage: str) -> Training:
     try:
-        start = load_training(path)
+        return load_training(path)
     except (FileNotFoundError, ValueError):
-        start = training_of(Detector.load(path), stage)
-    narrow = HourglassConfig is type(network) is type(start.network.config) and start.network.config != network
-    return replace(start, network=start.network.widened(network)) if narrow else start
+        return training_of(Detector.load(path), stage)
 
 
 def _finetune(a: argparse.Namespace) -> None:

@@ -34,8 +34,6 @@ from lib.training.sources import FRAME_PX, CloseupSource, FrameSource, ToolSourc
 
 #: The stages that are trained, in the order of their use, and the channels of the shipped networks.
 STAGES = {"frame": 32, "tool": 48, "closeup": 32}
-#: The networks of `Detector.wider`, by their names in `Detector.all_networks`.
-_WIDER = {"wider.frame": "frame", "wider.tool": "tool"}
 #: Standard deviation of a label, as a share of the tool's length, at which a stage lets it count half.
 LABEL_SD = {"frame": 0.1, "tool": 0.04, "closeup": 0.02}
 #: Of fine-tuning: share of the draws that are labelled frames, beside simulated ones, and of these in another guise.
@@ -141,7 +139,7 @@ def finetune(
             stopped.set()
             raise
     then = {"finetuned": {"images": len(images), "held_out": len(held_out), "commit": commit_id()}}
-    tuned = replace(detector, **networks, wider={}, metadata=detector.metadata | then)  # they know the old tools alone
+    tuned = replace(detector, **networks, metadata=detector.metadata | then)
     tuned = fit_error_models(tuned, [*held_out, *doubt_on], anew=False, progress=progress is True)
     old = {stage: detector.error_models[stage] for stage in CLOSE if stage in detector.error_models}
     if detector.closeup_network is None or not old:
@@ -153,10 +151,10 @@ def finetune(
 
 
 def training_of(detector: Detector, stage: str) -> Training:
-    """The network of a stage, named as in `Detector.all_networks`, with what the metadata tell of its training."""
-    if stage not in detector.all_networks:
-        raise ValueError(f"initial: has no {stage} stage; its stages are {', '.join(detector.all_networks)}.")
-    return Training(detector.all_networks[stage], [], detector.metadata.get("stages", {}).get(stage, {}))
+    """The network of a detector's stage, with what its metadata tell of its training."""
+    if stage not in detector.networks:
+        raise ValueError(f"initial: has no {stage} stage; its stages are {', '.join(detector.networks)}.")
+    return Training(detector.networks[stage], [], detector.metadata.get("stages", {}).get(stage, {}))
 
 
 def assemble(
@@ -169,14 +167,10 @@ def assemble(
     on labelled `recordings`, if any; those of the closeups also on half as many images of the reference rig, since their bias
     is not that of unfamiliar tools alone.  The card's numbers are measured on the other half of the scenes.  `notes` are
     lines for the card.  A stage that `folder` lacks is `initial`'s; without one, and without shards, a `FileNotFoundError`.
-    The wider networks for images in doubt, if any, are in its folder ``wider``.  What `initial` knows of its errors stays
-    where no other stage is new.
     """
-    out, known = Path(out), initial.all_networks if initial else {}
-    trained = {name: Path(folder, *name.split("."), "last.safetensors") for name in (*STAGES, *_WIDER)}
-    new = {name for name, path in trained.items() if path.exists()}
-    needed = [name for name in trained if name in new or name in known or name in STAGES]
-    stages = {k: training_of(initial, k) if k in known and k not in new else load_training(trained[k]) for k in needed}
+    out = Path(out)
+    trained = {stage: Path(folder) / stage / "last.safetensors" for stage in STAGES}
+    stages = {k: load_training(p) if p.exists() or not initial else training_of(initial, k) for k, p in trained.items()}
     frames = list(validation_images(data))
     if not frames:
         raise FileNotFoundError(f"{data}: no shard held_out_*.npz; make some with `python3 -m lib train generate`.")
@@ -188,12 +182,9 @@ def assemble(
     typical = []
     for recording in map(Recording.open, recordings):  # 16 images of each, spread over it
         typical += labelled_images(recording, every=max(1, len(recording.frames) // 8))
-    networks = {k: one.network.halved() if k in new else one.network for k, one in stages.items()}
-    own = {f"{stage}_network": networks[stage] for stage in STAGES}
-    detector = initial or Detector(**own, frame_px=FRAME_PX[0])
-    detector = replace(detector, **own, wider={stage: networks[name] for name, stage in _WIDER.items() if name in networks})
-    if new & STAGES.keys() or not initial:
-        detector = fit_error_models(detector, frames[::2] + bare + typical, for_closeups=near_by, progress=True)
+    networks = {f"{stage}_network": training.network.halved() for stage, training in stages.items()}
+    detector = Detector(**networks, frame_px=FRAME_PX[0])
+    detector = fit_error_models(detector, frames[::2] + bare + typical, for_closeups=near_by, progress=True)
     held_out = evaluate(detector, frames[1::2], progress=True)
     keys = "data images commit steps seconds processes precision machine config metrics before".split()
     provenance = {
@@ -220,8 +211,7 @@ def card(detector: Detector, path: Path) -> str:
     """The model card (Markdown) of a weights file, from its metadata."""
     trainings = []
     for stage, one in reversed(detector.metadata["stages"].items()):
-        features = one["config"]["network"]["features"]
-        while one and one["config"]["network"]["features"] == features:  # from the last to the first, or to the narrower ones
+        while one:  # from the last training to the first
             trainings.append((stage, one))
             one = one.get("before")
     here = Environment(loader=FileSystemLoader(Path(__file__).parent), trim_blocks=True)

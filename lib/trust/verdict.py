@@ -282,7 +282,7 @@ def report(calibration: Calibration, *, verdict: Verdict | None = None, robot_ac
     verdict = judge(None, calibration, robot_accuracy_mm=robot_accuracy_mm) if verdict is None else verdict
     c, seen = calibration, np.isfinite(calibration.residuals_px[:, ::2])
     outliers = np.argwhere(seen & ~c.view_inliers)
-    rows, used, usable = len(c.inliers), int(c.inliers.sum()), int(seen.any(axis=1).sum())
+    rows, used, usable = len(c.inliers), int(c.inliers.sum()), int(c.usable.sum())
     value, freedom = c.chi_square
     left_out = "" if usable == rows else f", {rows - usable} without a detection, position or axes"
     lines = [

@@ -38,18 +38,6 @@ def test_missing_corrupt_and_foreign_files_are_named(tmp_path):
         Detector.load(foreign)
 
 
-def test_wider_networks_are_kept_and_see_what_is_in_doubt(tmp_path):
-    detector, path = untrained(), tmp_path / "weights.safetensors"
-    both = replace(detector, wider={"frame": StackedHourglass(HourglassConfig(6, 1, 1))})
-    both.save(path)
-    loaded = Detector.load(path, engine="torch")
-    assert list(loaded.all_networks) == ["frame", "tool", "wider.frame"]
-    assert loaded.digest == both.digest != detector.digest
-    assert loaded.in_doubt.networks == {"frame": loaded.wider["frame"], "tool": loaded.tool_network}
-    assert loaded.in_doubt.error_models == loaded.error_models and loaded.in_doubt.in_doubt is None
-    assert replace(loaded, engine="openvino").in_doubt.engine == "openvino"
-
-
 @pytest.mark.parametrize("where", ["metadata", "tensors"])
 def test_a_flipped_bit_is_noticed_wherever_it_is(where, tmp_path):
     path = tmp_path / "weights.safetensors"

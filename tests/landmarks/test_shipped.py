@@ -1,6 +1,5 @@
 """The weights that ship, on the recording that ships."""
 
-import copy
 import json
 from dataclasses import replace
 
@@ -69,20 +68,6 @@ def test_an_image_in_doubt_is_seen_again_with_more_contrast(shipped, monkeypatch
     error = np.linalg.norm(found.u - shipped.u[:1], axis=2) / tool_length_px(shipped.u[:1])
     assert (error < 0.05).all() and (found.confidence > 0.5).all()
     assert alone.confidence.mean() < 0.5
-
-
-def test_only_an_image_in_doubt_is_left_to_the_wider_networks(shipped, monkeypatch):
-    clear, looks = shipped.images[:1], []
-    dull = np.clip(np.round((clear - clear.mean()) * 0.05 + 110), 0, 255).astype(np.uint8)
-    narrow, other = replace(shipped.torch, wider={}), copy.deepcopy(shipped.torch.tool_network)
-    wider = replace(narrow, tool_network=other)
-    once = type(narrow)._once
-    noted = lambda *a, **how: looks.append((a[0].tool_network is other, a[1])) or once(*a, **how)  # noqa: E731
-    monkeypatch.setattr(type(narrow), "_once", noted)
-    found = replace(narrow, wider={"tool": other})(np.concatenate([clear, dull]))
-    assert [wide for wide, _ in looks] == [False] + [True] * (len(looks) - 1) and len(looks) > 1
-    assert np.array_equal(looks[1][1], dull)  # as it is, before its contrast is changed
-    assert np.array_equal(found.u[:1], narrow(clear).u) and np.array_equal(found.u[1:], wider(dull).u)
 
 
 def test_a_tool_that_the_first_stage_overlooks_is_found_by_sweeping(shipped, monkeypatch):

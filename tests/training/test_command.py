@@ -17,7 +17,7 @@ from lib.landmarks.error_model import ErrorModel
 from lib.landmarks.network import HourglassConfig, OffsetConfig, OffsetNetwork, StackedHourglass
 from lib.training import command, stages
 from lib.training.command import main_evaluate
-from lib.training.loop import Training, load_training
+from lib.training.loop import load_training
 from lib.training.sources import FrameSource
 from tests.toys import toy_images
 
@@ -57,46 +57,10 @@ def test_the_card_beside_the_shipped_weights_is_theirs():
 
 
 def test_a_stage_begins_from_a_checkpoint_or_from_shipped_weights():
-    shipped = command._start(Path("default"), "closeup", OffsetConfig())
+    shipped = command._start(Path("default"), "closeup")
     assert shipped.provenance == Detector.load(engine="torch").metadata["stages"]["closeup"]
     with pytest.raises(FileNotFoundError, match="nowhere"):
-        command._start(Path("nowhere"), "closeup", OffsetConfig())
-
-
-def test_a_stage_with_more_channels_begins_widened():
-    config = stages.stage_config("tool", features=50).network
-    narrow, wide = Detector.load(engine="torch").tool_network, command._start(Path("default"), "tool", config).network
-    image = torch.rand(1, 3, 64, 64, generator=torch.Generator().manual_seed(0))
-    assert wide.config == config and torch.allclose(wide.eval()(image)[-1], narrow.eval()(image)[-1], atol=1e-5)
-    with pytest.raises(ValueError, match="is not a wider form of"):
-        command._start(Path("default"), "tool", stages.stage_config("tool", features=46).network)
-
-
-def test_a_checkpoint_of_another_kind_of_network_is_refused(tmp_path, monkeypatch, capsys):
-    closeup = Training(OffsetNetwork(OffsetConfig(4, 64)), [], {})
-    monkeypatch.setattr(command, "load_training", lambda path: closeup)
-    monkeypatch.setattr(command, "stage_data", lambda stage, folder: (FrameSource.of(toy_images(2)), None))
-    assert COMMANDS["train"](["frame", "--initial", "closeup.safetensors", "--folder", str(tmp_path)]) == 2
-    assert "initial: is a network OffsetConfig" in capsys.readouterr().err
-
-
-def test_networks_for_images_in_doubt_are_assembled_beside_others_that_stay(tmp_path, monkeypatch):
-    """Nothing is fitted where the stages that measure stay."""
-    frame, tool, wide = (StackedHourglass(HourglassConfig(features, 1, 2)) for features in (4, 4, 6))
-    models = {stage: ErrorModel() for stage in ("frame", "tool", "again", *CLOSE)}
-    closeup = OffsetNetwork(OffsetConfig(4, 64))
-    initial = Detector(frame, 96, tool_network=tool, closeup_network=closeup, error_models=models)
-    monkeypatch.setattr(stages, "validation_images", lambda data: toy_images(2, size=(135, 240)))
-    monkeypatch.setattr(stages, "fit_error_models", lambda *a, **how: pytest.fail("fitted"))
-    monkeypatch.setattr(stages, "load_training", lambda path: Training(wide, [], {}))
-    monkeypatch.setattr(stages, "card", lambda detector, path: "")
-    (tmp_path / "wider" / "tool").mkdir(parents=True)
-    (tmp_path / "wider" / "tool" / "last.safetensors").touch()
-    out = tmp_path / "new.safetensors"
-    stages.assemble(tmp_path, "", out, initial=initial)
-    found = Detector.load(out, engine="torch")
-    assert list(found.all_networks) == ["frame", "tool", "closeup", "wider.tool"]
-    assert torch.equal(found.tool_network.stem[0].weight, tool.stem[0].weight)
+        command._start(Path("nowhere"), "closeup")
 
 
 def test_stages_are_fine_tuned_on_labelled_frames(tmp_path, monkeypatch):
@@ -106,7 +70,6 @@ def test_stages_are_fine_tuned_on_labelled_frames(tmp_path, monkeypatch):
     images[0] = images[0]._replace(u=np.full((3, 2), np.nan))
     hourglass, closeup = StackedHourglass(HourglassConfig(4, 1, 2)), OffsetNetwork(OffsetConfig(4, 64))
     detector = Detector(hourglass, 96, tool_network=hourglass, closeup_network=closeup)
-    detector = replace(detector, wider={"tool": hourglass})
     fitted_on, done = [], []
     monkeypatch.setattr(stages, "fit_error_models", lambda d, held_out, anew, progress: fitted_on.append(held_out) or d)
     options = {"steps": 1, "progress": lambda stage, part: done.append((stage, part))}
@@ -115,7 +78,6 @@ def test_stages_are_fine_tuned_on_labelled_frames(tmp_path, monkeypatch):
     noted = lambda found, **how: weights.append(how.get("weight")) or of(found, **how)  # noqa: E731
     monkeypatch.setattr(FrameSource, "of", noted)
     tuned = stages.finetune(detector, images[:6], images[6:], tmp_path, **options)
-    assert not tuned.wider  # networks that know nothing of the labelled frames
     finetuned = tuned.metadata["finetuned"]
     assert (finetuned["images"], finetuned["held_out"]) == (5, 2)  # those with a base and a tip
     assert sorted(done) == [("closeup", 1.0), ("frame", 1.0), ("tool", 1.0)]  # side by side
