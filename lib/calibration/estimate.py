@@ -132,8 +132,8 @@ def calibrate_as_shown(
 ) -> Calibration:  # fmt: skip
     """`calibrate` with affine cameras, or with cameras of a finite distance where the detections show one.
 
-    They do where a step from the affine cameras makes 1/distance (1/mm) positive by three of its standard deviations.  The
-    `models` are without it and with one for both cameras; `options` and errors are those of `calibrate`.
+    They show one if a Gauss-Newton step from the affine cameras makes 1/distance (1/mm) larger than three of its standard
+    deviations.  `models` names the affine cameras and those with a distance; other options and errors are `calibrate`'s.
 
     >>> from lib.simulator.rig import reference_rig
     >>> rng = np.random.default_rng(0)

@@ -307,9 +307,9 @@ def _evidence(information: np.ndarray, gradient: np.ndarray, least: float) -> tu
 
 
 def further_step(found: Calibration, data: Correspondences, column: np.ndarray) -> tuple[float, float]:
-    """A number that the calibration `found` of `data` does not have, and its standard deviation.
+    """One more parameter of the calibration `found` of `data`: its value, so far taken for 0, and its standard deviation.
 
-    One Gauss-Newton step of cameras, landmarks' offsets and it together; `column` (inliers, m) is the pixels' change with it.
+    It is one Gauss-Newton step of cameras, offsets and it together; `column` (inliers, m) is the pixels' derivative by it.
     """
     rows, learnt = data.subset(found.inliers), found.offsets
     J_x, J_c, weight, r = found.system

@@ -195,7 +195,7 @@ class Result:
 
 
 def examine(take: Take) -> Result:
-    """Calibrate, diagnose and judge, as `lib.trust.assess` does with a recording."""
+    """Calibrate affine cameras, diagnose and judge, as `lib.trust.assess` does with ``model="zero_skew"``."""
     calibration, error, effect = None, None, np.inf
     try:
         calibration = calibrate(take.data, image_size_px=take.image_size_px)
