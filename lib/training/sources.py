@@ -265,7 +265,7 @@ class CloseupSource(Source):
         shift = rng.normal(0, self.shifts_px[rng.choice(len(self.shifts_px), p=self.shift_shares)], 2)
         shift *= min(1.0, windows.CLOSEUP_REACH_PX / max(np.linalg.norm(shift), 1e-9)) / windows.closeup_scale(length)
         known = u.copy()
-        if rng.random() < self.alone:
+        if rng.random() < self.alone and np.isfinite(u).all():
             known[rng.choice([j for j in (1, 2) if j != k])] = np.nan
         angle = windows.tool_pose(known[None])[1][0] + rng.normal(0, self.turn_rad)
         matrix = windows.closeup_from_image(u[k] + shift, angle, self.size, k, length)

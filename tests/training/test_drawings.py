@@ -54,6 +54,18 @@ def test_a_source_draws_tools_and_undrawn_frames_keep_their_labels():
     assert image.std() > 5 and seen[k] == 2 and (np.abs(at[k] - 31.5) < 31.5).all()
 
 
+def test_a_tool_with_one_labelled_tip_is_drawn_by_every_source():
+    for tip in (1, 2):
+        u = np.array([[100.0, 90], [150, 80], [150, 100]])
+        u[tip] = np.nan
+        images, rng = [LabelledImage("a", GROUND, u, np.full(3, 2))], np.random.default_rng(0)
+        for source in (FrameSource.of(images), ToolSource.of(images), replace(CloseupSource.of(images), alone=1.0)):
+            for index in range(len(source)):
+                for image, at, seen in (source.draw(index, rng) for _ in range(30)):
+                    assert image.dtype == np.uint8
+                    assert np.isfinite(at[seen == 2]).all() or not isinstance(source, CloseupSource)
+
+
 def test_some_windows_show_that_a_tool_askew_too_small_or_aside_is_none():
     u = np.array([[100.0, 90], [150, 80], [150, 100]])
     source, rng = ToolSource.of([LabelledImage("a", GROUND, u, np.full(3, 2))]), np.random.default_rng(0)
