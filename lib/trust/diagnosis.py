@@ -61,14 +61,7 @@ def _finite_distance(case: Case) -> Iterator[Hypothesis]:
     """A perspective that an affine camera has not."""
     problem = case.problem
     centre = (np.asarray(case.size, dtype=float) - 1) / 2 if case.size else np.nanmedian(problem.y, axis=(0, 1))
-
-    def columns(M: np.ndarray) -> np.ndarray:
-        normal = np.cross(M[:, 0, :3], M[:, 1, :3])
-        depth = np.einsum("ncj,cj->nc", problem.x, normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12))
-        pixel = np.einsum("cij,ncj->nci", M[:, :, :3], problem.x) + M[:, :, 3] - centre
-        return -(depth[:, :, None] * pixel)[..., None]
-
-    fit, value, sd = case.linear(columns)
+    fit, value, sd = case.linear(problem.perspective(centre))
     far = f"by a working distance of {1 / value:.0f} mm" if value > 0 else "the wrong way, as in a mirrored image"
     text = f"The residuals are curved {far}: 1/distance is {value:.5f} +- {sd:.5f} per mm."
     cure = "Calibrate with model='near_affine' (--model near_affine on the command line)."

@@ -142,6 +142,17 @@ class Problem:
             start = max((self._descend(M, columns, apart, 8) for M in starts), key=lambda fit: fit.total).M
         return self._descend(start, columns, apart, rounds)
 
+    def perspective(self, centre_px: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+        """Columns for `fit`: the pixels' change by the inverse of a working distance, 1/mm, about the image's centre (2,)."""
+
+        def columns(M: np.ndarray) -> np.ndarray:
+            normal = np.cross(M[:, 0, :3], M[:, 1, :3])
+            normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+            pixel = np.einsum("cij,ncj->nci", M[:, :, :3], self.x) + M[:, :, 3] - centre_px
+            return -(np.einsum("ncj,cj->nc", self.x, normal)[:, :, None] * pixel)[..., None]
+
+        return columns
+
     @cached_property
     def _of_matrices(self) -> np.ndarray:
         """(n, 2, 2, 16): derivatives by the entries of the cameras, 0 in images that are not used."""

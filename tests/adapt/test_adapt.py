@@ -105,6 +105,14 @@ def test_cameras_of_a_finite_distance_are_no_affine_ones(tmp_path):
     assert abs(value - 1 / 70) < 3 * sd and np.median(label_errors(near, teacher)[0]) < 0.4
 
 
+@pytest.mark.parametrize(("n", "seed", "moved_from"), [(24, 4, None), (40, 0, 28)])
+def test_the_curvature_of_a_finite_distance_is_no_move(tmp_path, n, seed, moved_from):
+    near = World(n=n, seed=seed, distance_mm=90.0, moved_from=moved_from)
+    recording = near.record(tmp_path / "near", noise_mm=0.001)
+    kept, said = teacher.longest_still(recording, look(recording, StandIn(near.u, noise_px=0.07), np.arange(n)))
+    assert (len(kept), bool(said)) == (moved_from or n, moved_from is not None)
+
+
 @pytest.mark.parametrize(("error", "surfaces"), [(ValueError, True), (DataError, False), (np.linalg.LinAlgError, False)])
 def test_only_poor_data_are_a_refusal(world, recording, monkeypatch, error, surfaces):
     """An error of the program must not pass for one of the recording."""
