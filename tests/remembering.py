@@ -6,12 +6,18 @@ import hashlib
 import pickle
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cache
+from typing import TypeVar
 
 import pytest
+from torch import Tensor
 
 from lib.adapt import teacher
 from lib.calibration import estimate
+from lib.landmarks import detector, search
 from lib.trust.fitting import Problem
+
+Said = TypeVar("Said")
 
 
 def remembering(function: Callable) -> Callable:
@@ -34,6 +40,32 @@ def remembering(function: Callable) -> Callable:
         return found
 
     return answer
+
+
+@cache
+def said_once(function: Callable[..., Said]) -> Callable[..., Said]:
+    """A function of a tensor and settings, such as a network; nobody may change what it says, which is worked out once."""
+    said: dict[bytes, Said] = {}
+
+    def answer(tensor: Tensor, *more: object, **how: object) -> Said:
+        key = hashlib.sha256(repr((tensor.shape, more, how)).encode() + tensor.numpy().tobytes()).digest()
+        if key not in said:
+            said[key] = function(tensor, *more, **how)
+        return said[key]
+
+    return answer
+
+
+@contextmanager
+def remembering_detectors() -> Iterator[None]:
+    """In here detectors of the same networks, which nobody trains, share what these say and what that decodes to."""
+    accelerated = cache(detector.accelerated)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(detector, "accelerated", lambda *network, **how: said_once(accelerated(*network, **how)))
+        for where in (detector, search):
+            patch.setattr(where, "decode", said_once(where.decode))
+        patch.setattr(detector, "best_tools", remembering(detector.best_tools))
+        yield
 
 
 @contextmanager

@@ -5,6 +5,7 @@ import json
 import zipfile
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import lru_cache
 from pathlib import Path
 
 import av
@@ -45,7 +46,9 @@ class Shipped:
         return self.frames.shape[3], self.frames.shape[2]
 
 
+@lru_cache(maxsize=1)
 def shipped(reduction: int = 8) -> Shipped:
+    """Read once in a process; nobody can change its frames."""
     recording = Recording.open(paths.SHIPPED_RECORDING)
     flag = {1: cv2.IMREAD_COLOR_RGB, 8: cv2.IMREAD_REDUCED_COLOR_8}[reduction]
     frames = np.array([
@@ -53,6 +56,7 @@ def shipped(reduction: int = 8) -> Shipped:
         for pair in zip(*(sorted((paths.SHIPPED_RECORDING / side).iterdir()) for side in ("left", "right")), strict=True)
     ])  # fmt: skip
     frames = frames[:, :, : frames.shape[2] // 2 * 2]
+    frames.setflags(write=False)
     u = [(getattr(recording.annotations, f"u_{side}") + 0.5) / reduction - 0.5 for side in ("left", "right")]
     u = [np.where((side <= np.array(frames.shape[3:1:-1]) - 0.5).all(axis=2, keepdims=True), side, np.nan) for side in u]
     return Shipped(frames, recording.frames.time_s, Annotations(*u), recording.kinematics.time_s, recording.kinematics.x_mm)

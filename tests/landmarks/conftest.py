@@ -1,34 +1,19 @@
 """The shipped detector on the shipped recording, run once for all tests of the room."""
 
-import hashlib
-from collections.abc import Callable
-from functools import cache, cached_property
+from functools import cached_property
 
 import numpy as np
 import pytest
-from torch import Tensor
 
 from lib import paths
 from lib.landmarks import Detector, Landmarks
 from lib.recordings import Recording
+from tests.remembering import said_once
 
 
 def remembering(detector: Detector) -> Detector:
-    """The detector itself; what a network has said of the same pixels is not computed a second time."""
-
-    @cache
-    def remembered(run: Callable[[Tensor], list[Tensor]]) -> Callable[[Tensor], list[Tensor]]:
-        said = {}
-
-        def answer(images: Tensor) -> list[Tensor]:
-            key = hashlib.sha256(repr(images.shape).encode() + images.numpy().tobytes()).digest()
-            if key not in said:
-                said[key] = run(images)
-            return [part.clone() for part in said[key]]
-
-        return answer
-
-    detector._run.update({stage: remembered(run) for stage, run in detector._run.items()})
+    """The detector itself; its networks answer once."""
+    detector._run.update({stage: said_once(run) for stage, run in detector._run.items()})
     return detector
 
 

@@ -13,7 +13,15 @@ from lib.landmarks.network import OffsetConfig, OffsetNetwork
 from lib.training import error_models
 from lib.training.error_models import Seen, fit_error_models
 from lib.training.evaluation import evaluate
+from tests.remembering import remembering_detectors
 from tests.toys import toy_images
+
+
+@pytest.fixture(scope="module", autouse=True)
+def said_once():
+    """The same images are fitted on and evaluated again and again, and the networks stay the same."""
+    with remembering_detectors():
+        yield
 
 
 @pytest.fixture(scope="module")
