@@ -12,7 +12,7 @@ from lib.calibration import Calibration, NoConsensusError, calibrate, calibrate_
 from lib.correspondences import LANDMARKS, TRAIN_FURTHER, Correspondences, NoDetectionError
 from lib.landmarks import Detector, detect
 from lib.recordings import Doubt, Recording
-from lib.trust.diagnosis import BY_HANDEDNESS, Diagnosis, diagnose
+from lib.trust.diagnosis import BY_GEOMETRY, Diagnosis, diagnose
 from lib.trust.health import Health, feature_matches, health, spread
 
 #: From best to worst.
@@ -120,7 +120,7 @@ def judge(
     """
     found: list[Reason] = []
     if diagnosis is not None and (best := diagnosis.best) is not None:
-        text = best.text + (best.name not in BY_HANDEDNESS) * f" It explains {100 * best.explained:.0f} % of the residuals."
+        text = best.text + (best.name not in BY_GEOMETRY) * f" It explains {100 * best.explained:.0f} % of the residuals."
         found += _reason("diagnosis", best.explained, text, best.cure, best.name)
     if calibration is None:
         name = {NoDetectionError: "no_detection", NoConsensusError: "no_consensus"}.get(type(error), "refused")
