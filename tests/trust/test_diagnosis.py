@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from lib.calibration import calibrate_as_shown
 from lib.recordings import Kinematics
-from lib.trust import Hypothesis, diagnose
+from lib.trust import Hypothesis, assess, diagnose, verdict
 from notebooks.studies.spoiling import GOOD, SPOILED, Scene, takes
 
 
@@ -234,3 +237,31 @@ def test_too_little_to_say_anything():
     assert diagnose(usual.data.subset(slice(0, 4))).hypotheses == ()
     nothing = replace(usual.data, confidence=np.zeros_like(usual.data.confidence))
     assert diagnose(nothing).best.name == "detector_unfit"
+
+
+class _Stub(SimpleNamespace):
+    """A recording without pictures."""
+
+    folder, doubts, robot_accuracy_mm = Path("stub"), (), 0.01
+
+    def __len__(self):
+        return 40
+
+
+@pytest.mark.parametrize(
+    ("name", "seed", "only", "number", "fault"),
+    [("setting", 1, "creep", 0, "drift"), ("setting", 0, "z scaled", 0, "scaled_axis"), ("setting", 0, "finite", 0, None)],
+)
+def test_a_distance_that_another_fault_explains_better_is_not_shown(monkeypatch, name, seed, only, number, fault):
+    """Residuals of images that creep, or of a scaled axis, look a little like those of a finite distance."""
+    monkeypatch.setattr(verdict, "feature_matches", lambda *_: [])
+    monkeypatch.setattr(verdict, "health", lambda *_, **__: None)
+    spoiled = list(takes(name, seed, only))[number]
+    assert calibrate_as_shown(spoiled.data, image_size_px=spoiled.image_size_px).model == "near_affine"
+    stated = ("kinematics", "offset_s", "readout_s", "image_size_px")
+    recording = _Stub(**{key: getattr(spoiled, key) for key in stated})
+    found = assess(recording, spoiled.data)
+    best = found.diagnosis.best
+    assert (best.name if best else None) == fault
+    assert found.calibration.model == ("zero_skew" if fault else "near_affine")
+    assert assess(recording, spoiled.data, model="near_affine").calibration.model == "near_affine"  # as it is told to
