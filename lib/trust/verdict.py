@@ -244,8 +244,7 @@ def assess(
     Args:
         data: Its correspondences (detected, labelled); None runs the detector, the one that ships if none is given.
         detector: The one that made `data`; with it some frames are looked at again, mirrored and shifted.
-        options: Of `lib.calibration.calibrate`.  Without `model` cameras are affine, or of a finite distance if that shows and
-            no fault explains more.
+        options: Of `calibrate`.  Without `model` cameras are affine, or of a finite distance if no fault explains more.
     """
     if data is None:
         detector = detector or Detector.load()
