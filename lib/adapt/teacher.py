@@ -344,7 +344,8 @@ def _by_labels(recording: Recording, seen: Seen) -> Calibration:
     try:
         if len(seen.frame) >= _FEW_PAIRS:
             return _placed(recording, seen)
-        with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # by a clock that is off offsets find no end
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "offsets:", RuntimeWarning)  # by a clock that is off they find no end
             try:
                 return _fitted(recording, seen, ransac_px=np.inf, offsets=True, offset_prior_sd=_ROBOTS_OFFSET_MM)
             except _POOR:  # jaws that are shut have no axes

@@ -193,7 +193,8 @@ def _turned(
         return found
     try:
         begin = start_of_turning(found, axes, turned, data.landmark[usable])
-        with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # that they find no end
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "offsets:", RuntimeWarning)  # that they find no end
             other = estimate(axes=turned, start=replace(found, offsets=replace(found.offsets, offset=begin)))
     except (DataError, np.linalg.LinAlgError):  # no cameras fit them
         return found

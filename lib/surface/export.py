@@ -3,6 +3,7 @@
 Open3D writes meshes and point clouds.  It is imported here only, when it is first needed, since it needs system libraries.
 """
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +21,7 @@ from lib.surface.bspline import BSplineSurface
 
 def open3d() -> ModuleType:
     """The module open3d; an ImportError says in one line what to install where its system libraries are missing."""
+    os.environ.setdefault("OPEN3D_DISABLE_WEB_VISUALIZER", "true")  # in JupyterLab it prints lines, and hangs
     try:
         import open3d
     except (ImportError, OSError) as error:

@@ -31,11 +31,11 @@ def _clock(case: Case) -> Iterator[Hypothesis]:
         if not 0.95 * trial[0] < value < 0.95 * trial[-1]:
             text += f" (at the edge of the search, {trial[0]:.2f} to {trial[-1]:.2f} s)"
         if name == "clock":
-            text = f"The residuals lie along the image of the tool's velocity: the clocks differ by {text}."
             cure = f"Add {value:.4f} to offset_s in recording.toml; estimate_time_offset checks it."
+            text = f"The residuals lie along the image of the tool's velocity: the clocks differ by {text}."
         else:
-            text = f"The {SIDES[views[0]]} camera alone shows the tool {text} later than the frame's time."
             cure = f"Trigger both cameras together, or pair each right image with the left one of its instant ({text})."
+            text = f"The {SIDES[views[0]]} camera alone shows the tool {text} later than the frame's time."
         yield case.found(name, fit, 1, (1e3 * value, 1e3 * sd, "ms"), text, cure, on=problem, images=views)
 
 

@@ -25,8 +25,14 @@ _ROBOT_MM = 0.04  # a robot for eye surgery is better
 _SKEW_SD, _ASPECT_SD = 0.002, 0.003
 #: A common log aspect above this is no lens: the images were resized, and their aspect is free.
 _RESIZED = 0.1
+#: Of the jaws' lengths in the log: stretches of time whose means count, and parts of time that err apart.
+_STRETCHES, _PARTS = 60, 8
+#: The least change by a scaled axis, also in standard deviations, of which a good robot has one of its own; the share of the
+#: variance that it explains; the RMS that it leaves of their squares; the RMS by which the jaws' directions change.
+_LEAST_SCALED, _SURE_SCALED, _OWN_SD, _MOST_OF_IT, _ODD, _TURNED = 0.03, 5.0, 0.006, 0.5, 0.03, 0.01
 _STILL_PX = 0.3  # detections of one picture differ by less
-BY_HANDEDNESS = ("mirrored_axis", "exchanged_eyes", "mirrored_images")  # which the residuals do not show
+#: Which the residuals do not show.
+BY_GEOMETRY = ("scaled_axis", "mirrored_axis", "exchanged_eyes", "mirrored_images")
 _ACROSS = 0.15  # sine of a tool's angle to the images, below which it points neither way
 _UPSIDE_DOWN = 20.0  # odds that a microscope sees the tips of a tool below its base
 
@@ -231,7 +237,7 @@ def _optics(case: Case, fit: Robust, sign: float) -> Iterator[Hypothesis]:
     if few or not np.isfinite(covariance).all() or min(np.linalg.svd(a, compute_uv=False)[1] for a in A) < 1e-6:
         return
     if case.misfit(fit) < FITS:  # cameras that fit nothing always have skewed pixels
-        yield from _scaled_axis(A, covariance)
+        yield from _scaled_axis(case, A, covariance)
     yield from _handedness(case, A, covariance)
 
 
@@ -242,8 +248,45 @@ def _constraints(A: np.ndarray) -> np.ndarray:
     return np.concatenate([skew, np.log(size[..., 0] / size[..., 1])], axis=-1)
 
 
-def _scaled_axis(A: np.ndarray, covariance: np.ndarray) -> Iterator[Hypothesis]:
-    """A robot axis of the wrong scale: the pixels of A (2, 2, 3), of `covariance` (12, 12), are skewed or oblong."""
+def _jaws(case: Case, shares: np.ndarray) -> np.ndarray | None:
+    """Misfit (3, t) of the jaws' lengths in the log where 1 - scale^-2 of one axis is `shares` (t,); None if they tell none.
+
+    A rigid jaw, from base to tip, has one length, or one for each opening, wherever it points.  If its direction is n and an
+    axis is s times too long, length^-2 is smaller by the factor 1 - (1 - s^-2) n^2.
+    """
+    x = case.log[np.isfinite(case.log).all(axis=(1, 2))]
+    jaws = x[:, 1:] - x[:, :1]
+    squares = (jaws**2).sum(axis=2, keepdims=True)
+    if x.shape[1] != 3 or len(x) < 2 * _PARTS or squares.min() <= 0:
+        return None
+    opening = np.linalg.norm(x[:, 2] - x[:, 1], axis=1)
+    n, place = jaws / np.sqrt(squares), x[:, 1:] - x[:, 1:].mean(axis=(0, 1))
+    told = np.dstack([(1 / squares) / (1 / squares).mean(axis=0), n**2, n, (jaws * place).sum(axis=2) / squares[..., 0]])
+    opened = np.vander((opening - opening.mean()) / max(opening.std(), 1e-9), 3)
+    each = int(np.clip(len(x) / _STRETCHES, 1, 100))  # samples whose mean has less noise, and tells as much
+    rows = np.column_stack([opened, told.reshape(-1, 16)])[: len(x) // each * each].reshape(-1, each, 19).mean(axis=1)
+    opened, told = rows[:, :3], rows[:, 3:]
+    rest = (told - opened @ np.linalg.lstsq(opened, told, rcond=None)[0]).reshape(-1, 8)
+    length, turns, others = rest[:, 0], rest[:, 1:4], rest[:, 4:]
+    along, common, total = np.maximum((turns**2).sum(axis=0), 1e-12), turns.T @ length, length @ length
+    k = (common**2 / along).argmax()
+    slope = common[k] / along[k]
+    # A base that is displaced beside the tips, or tips that lag behind it, change the lengths otherwise.
+    left, otherwise = length - slope * turns[:, k], length - others @ np.linalg.lstsq(others, length, rcond=None)[0]
+    sums = [part.sum() for part in np.array_split(turns[:, k] * left, _PARTS)]  # errors last for a while
+    sd = np.hypot(np.linalg.norm(sums) / along[k], _OWN_SD)
+    most = min((1 - _MOST_OF_IT) * total, _ODD**2 * len(rest), 1.1 * otherwise @ otherwise)  # which has three numbers more
+    if abs(slope) < max(_LEAST_SCALED, _SURE_SCALED * sd) or turns[:, k].std() < _TURNED or left @ left > most:
+        return None
+    slopes = -shares / (1 - np.outer(told.reshape(-1, 8)[:, 1:4].mean(axis=0), shares))
+    return (total - 2 * slopes * common[:, None] + slopes**2 * along[:, None]) / (sd**2 * along[k])
+
+
+def _scaled_axis(case: Case, A: np.ndarray, covariance: np.ndarray) -> Iterator[Hypothesis]:
+    """A robot axis of the wrong scale: the pixels of A (2, 2, 3), of `covariance` (12, 12), are skewed or oblong.
+
+    Or the jaws' lengths depend on where they point.
+    """
     tolerance = np.diag(np.square([_SKEW_SD, _SKEW_SD, _ASPECT_SD, _ASPECT_SD]))
     if abs(_constraints(A)[2:].mean()) > _RESIZED:
         tolerance[2:, 2:] += 1.0
@@ -254,7 +297,10 @@ def _scaled_axis(A: np.ndarray, covariance: np.ndarray) -> Iterator[Hypothesis]:
     seen = _constraints(A * scales)
     J = (_constraints((A + near) * scales) - seen) / near.max()
     S = np.einsum("abik,ij,abjl->abkl", J, covariance, J) + tolerance
-    misfit = (seen @ np.linalg.solve(S, np.swapaxes(seen, 2, 3)))[..., 0, 0]
+    misfit, jaws = (seen @ np.linalg.solve(S, np.swapaxes(seen, 2, 3)))[..., 0, 0], _jaws(case, 1 - np.exp(-2 * logs))
+    misfit, what = misfit + (0.0 if jaws is None else jaws), "The cameras' pixels are skewed or oblong, and square"
+    if jaws is not None:
+        what = "The distances from base to tips depend on where the tool points, and hardly"
     none = float(misfit[0, 80])
     for name, values in zip("xyz", misfit, strict=True):
         best = int(values[1:-1].argmin()) + 1
@@ -262,8 +308,8 @@ def _scaled_axis(A: np.ndarray, covariance: np.ndarray) -> Iterator[Hypothesis]:
         bend = max(float(before - 2 * least + after) / spacing**2, 1e-9)
         log = logs[best] + np.clip(0.5 * (before - after) / bend / spacing, -spacing, spacing)
         scale, sd = float(np.exp(log)), float(np.sqrt(2.0 / bend))  # A times s is plausible: the numbers are s too large
-        text = f"The cameras' pixels are skewed or oblong, and square if the robot's {name} is divided by {scale:.3f}."
-        cure = f"Check the units and the scale of the {name} columns of kinematics.csv."
+        text = f"{what} if the robot's {name} is divided by {scale:.3f}."
+        cure = f"Check the units and the scale of the {name} columns of kinematics.csv, beside those of the others."
         explained, gain = 1.0 - float(least) / max(none, 1e-9), float(0.5 * (none - least) - 1.5)
         yield Hypothesis("scaled_axis", text, cure, scale, sd * scale, "times", explained, gain)
 

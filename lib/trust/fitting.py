@@ -241,7 +241,8 @@ class Case:
     """The rows, the fit `null` of "nothing is wrong", the best fit of each hypothesis, and what the hypotheses share.
 
     `paths` are those of the landmarks in time: of the robot's log, else of the rows themselves where the frames follow each
-    other closely enough, else None.  `size` is (width, height) of the images, None if unknown; `frames` their number.
+    other closely enough, else None.  `log` (m, k, 3) is the robot's, or has the rows' positions.  `size` is (width, height)
+    of the images, None if unknown; `frames` their number.
     """
 
     def __init__(
@@ -252,6 +253,7 @@ class Case:
         self.frames = int(problem.frame.max()) + 1
         self.paths, self._clock_s = None, offset_s
         time, landmark, x = problem.time, problem.landmark, problem.x[:, 0]
+        self.log = self.by_frame(x) if kinematics is None else kinematics.x_mm
         if not np.isfinite(time).all():
             return
         if kinematics is not None and landmark.max() < kinematics.x_mm.shape[1]:
@@ -286,6 +288,7 @@ class Case:
     def chosen(self, x: np.ndarray) -> tuple[Robust, Problem, np.ndarray]:
         """Each frame with the positions among x (t, n, 3) that suit it best: the fit, its rows, the choices (frames,)."""
         problem, fit = self.problem, self.null
+        x = np.where(np.isfinite(x).any(axis=0), x, problem.x[:, 0])  # beside a jump of the log nothing is known
         for _ in range(5):
             r2 = ((problem.y - np.einsum("cij,tnj->tnci", fit.M[:, :, :3], x) - fit.M[:, :, 3]) ** 2).sum(axis=3)
             loss = np.where(problem.used, np.nan_to_num(np.log1p(r2 / fit.shapes[0].scale ** 2), nan=1e3), 0.0).sum(axis=2)

@@ -12,7 +12,7 @@ from lib.calibration import Calibration, NoConsensusError, calibrate, calibrate_
 from lib.correspondences import LANDMARKS, TRAIN_FURTHER, Correspondences, NoDetectionError
 from lib.landmarks import Detector, detect
 from lib.recordings import Doubt, Recording
-from lib.trust.diagnosis import BY_HANDEDNESS, Diagnosis, diagnose
+from lib.trust.diagnosis import BY_GEOMETRY, Diagnosis, diagnose
 from lib.trust.health import Health, feature_matches, health, spread
 
 #: From best to worst.
@@ -120,7 +120,7 @@ def judge(
     """
     found: list[Reason] = []
     if diagnosis is not None and (best := diagnosis.best) is not None:
-        text = best.text + (best.name not in BY_HANDEDNESS) * f" It explains {100 * best.explained:.0f} % of the residuals."
+        text = best.text + (best.name not in BY_GEOMETRY) * f" It explains {100 * best.explained:.0f} % of the residuals."
         found += _reason("diagnosis", best.explained, text, best.cure, best.name)
     if calibration is None:
         name = {NoDetectionError: "no_detection", NoConsensusError: "no_consensus"}.get(type(error), "refused")
@@ -244,7 +244,7 @@ def assess(
     Args:
         data: Its correspondences (detected, labelled); None runs the detector, the one that ships if none is given.
         detector: The one that made `data`; with it some frames are looked at again, mirrored and shifted.
-        options: Of `lib.calibration.calibrate`.  Without `model` cameras are affine, or of a finite distance if that shows.
+        options: Of `calibrate`.  Without `model` cameras are affine, or of a finite distance if no fault explains more.
     """
     if data is None:
         detector = detector or Detector.load()
@@ -255,15 +255,17 @@ def assess(
         calibration = fit(data, image_size_px=recording.image_size_px, **options)
     except ValueError as refused:
         error = refused
+    stated = {name: getattr(recording, name) for name in ("kinematics", "offset_s", "readout_s", "image_size_px")}
+    diagnosis = diagnose(data, **stated)
+    if calibration is not None and calibration.inverse_distance_per_mm[1] > 0:
+        if "model" not in options and getattr(diagnosis.best, "name", "finite_distance") != "finite_distance":
+            calibration = calibrate(data, image_size_px=recording.image_size_px, **options)  # that fault explains more
+        else:  # what else is wrong?
+            told = zip(calibration.cameras, (data.u_left, data.u_right), strict=True)
+            u = [c.centre_px + (c.undistort(u) - c.centre_px) * c.depth_ratio(data.x_mm)[:, None] for c, u in told]
+            diagnosis = diagnose(replace(data, u_left=u[0], u_right=u[1]), **stated)
     if calibration is not None and len(y := feature_matches(recording, spread(len(recording), 3))):
         epipolar_px = float(np.median(np.abs(calibration.pair.epipolar_distance(y[:, :2], y[:, 2:]))))
-    stated = {name: getattr(recording, name) for name in ("kinematics", "offset_s", "readout_s", "image_size_px")}
-    straight = data
-    if calibration is not None and calibration.inverse_distance_per_mm[1] > 0:  # what else is wrong?
-        told = zip(calibration.cameras, (data.u_left, data.u_right), strict=True)
-        u = [c.centre_px + (c.undistort(u) - c.centre_px) * c.depth_ratio(data.x_mm)[:, None] for c, u in told]
-        straight = replace(data, u_left=u[0], u_right=u[1])
-    diagnosis = diagnose(straight, **stated)
     found = health(recording, data, calibration, detector=detector)
     verdict = judge(
         data, calibration, diagnosis=diagnosis, health=found, epipolar_px=epipolar_px, error=error,

@@ -15,6 +15,7 @@ from lib.simulator.eye import Scene
 from lib.simulator.motion import Motion
 from lib.simulator.rig import Microscope
 from lib.simulator.window import Window
+from lib.surface import open3d
 from notebooks.figures.style import COLOURS, LANDMARK_COLOURS, figure, show_image
 from notebooks.studies.realism import Profiles
 
@@ -287,9 +288,9 @@ def ray_cast_depth(scene: Scene, window: Window, u: np.ndarray, *, step_mm: floa
     but the height field and the camera.
     """
     try:
-        import open3d as o3d
-    except (ImportError, OSError) as error:
-        print(f"Skipped: Open3D cannot be imported ({error}).")
+        o3d = open3d()
+    except ImportError as error:
+        print(f"Skipped: {error}")
         return None
     low, high = (np.stack(window.rays(u.T, np.full(len(u), z)), axis=1) for z in (-20.0, 20.0))
     corners = np.vstack([np.stack(window.rays(u.T, np.full(len(u), z)), axis=1) for z in (-4.0, 4.0)])

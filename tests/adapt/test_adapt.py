@@ -1,6 +1,7 @@
 """The robot as a teacher: half-wrong detections are enough, and a robot that errs teaches nothing wrong."""
 
 import json
+import warnings
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -648,3 +649,16 @@ def test_gain_is_judged_frame_by_frame():
     assert gain == pytest.approx(0.1 / 3) and 0 < sd < 0.01
     missing = Agreement(np.full((1, 2, 3), np.inf), np.full((1, 2, 3), np.nan), np.full((1, 2, 1), 50.0))
     assert missing.summary()["mean_share"] == pytest.approx(0.1)
+
+
+def test_of_few_labels_only_the_offsets_may_go_on_for_ever(monkeypatch):
+    def warned(text):
+        return lambda *_, **__: warnings.warn(text, RuntimeWarning, stacklevel=2)
+
+    few = SimpleNamespace(frame=[0])
+    monkeypatch.setattr(teacher, "_fitted", warned("overflow"))
+    with pytest.warns(RuntimeWarning, match="overflow"):
+        teacher._by_labels(None, few)
+    monkeypatch.setattr(teacher, "_fitted", warned("offsets: they still move"))
+    with warnings.catch_warnings(action="error"):
+        teacher._by_labels(None, few)

@@ -1,12 +1,13 @@
 """Constant offsets of the landmarks: found where the tool turns, left to the prior where it does not."""
 
+import warnings
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from lib.calibration import CompetingCamerasError, calibrate, with_offsets
+from lib.calibration import CompetingCamerasError, calibrate, estimate, with_offsets
 from lib.calibration.offsets import carried, estimate_offsets, start_of_turning, tool_axes
 from lib.correspondences import Correspondences
 from lib.geometry import RigidTransform
@@ -285,6 +286,21 @@ def test_frames_without_axes_are_left_out_and_every_row_is_answered():
     shut = x.reshape(-1, 3, 3).copy()
     shut[:45, 1:] = shut[:45, 1:].mean(axis=1, keepdims=True)
     assert calibrate(replace(data, x_mm=shut.reshape(-1, 3)), checks=False, ransac_px=np.inf).offsets is None
+
+
+@pytest.mark.parametrize(("text", "told"), [("overflow", True), ("offsets: they still move", False)])
+def test_turned_axes_hide_no_other_warning(monkeypatch, text, told):
+    def late(*arguments, start=None, **options):
+        if start is not None:  # of the turned axes
+            warnings.warn(text, RuntimeWarning, stacklevel=2)
+        return estimate_offsets(*arguments, start=start, **options)
+
+    monkeypatch.setattr(estimate, "estimate_offsets", late)
+    rows = tool_sweep(0, offset_mm=10 * OFFSETS_MM)[0]
+    with warnings.catch_warnings(record=True) as given:
+        warnings.simplefilter("always")
+        assert calibrate(rows).offsets.turns
+    assert [str(w.message) for w in given] == [text] * told
 
 
 def test_too_few_steps_are_told():

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import struct
 import sys
+from contextlib import suppress
 
 import cv2
 import numpy as np
@@ -14,6 +16,7 @@ from scipy.spatial import KDTree
 from lib.surface import (
     depth_map,
     fit_surface,
+    open3d,
     save_depth_map,
     save_mesh,
     save_points,
@@ -155,3 +158,14 @@ def test_bad_files_are_named_and_leave_nothing(surface, tmp_path):
     with pytest.raises(FileNotFoundError):
         save_mesh(mesh, tmp_path / "missing" / "eye.glb")
     assert not list(tmp_path.iterdir())
+
+
+def test_open3d_starts_without_its_web_visualizer(monkeypatch):
+    """In JupyterLab that prints lines at each import; whoever wants it says so in the environment."""
+    for value, after in ((None, "true"), ("false", "false")):
+        monkeypatch.delenv("OPEN3D_DISABLE_WEB_VISUALIZER", raising=False)
+        if value:
+            monkeypatch.setenv("OPEN3D_DISABLE_WEB_VISUALIZER", value)
+        with suppress(ImportError):  # its system libraries may be missing
+            open3d()
+        assert os.environ["OPEN3D_DISABLE_WEB_VISUALIZER"] == after

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from lib.calibration import calibrate_as_shown
 from lib.recordings import Kinematics
-from lib.trust import Hypothesis, diagnose
-from notebooks.studies.spoiling import GOOD, SPOILED, Scene
+from lib.trust import Hypothesis, assess, diagnose, verdict
+from notebooks.studies.spoiling import GOOD, SPOILED, Scene, takes
 
 
 def take(way="", strength="", seed=7, **options):
@@ -29,6 +32,12 @@ def found(take, *, log=True):
 @pytest.mark.parametrize("name", ["12 frames", "correlated 0.5, heavy tails"])
 def test_a_good_recording_has_no_fault(name):
     assert found(take(**GOOD[name])).best is None
+
+
+@pytest.mark.parametrize("name", ["setting", "judging"])
+def test_a_spike_in_the_log_is_no_fault_of_the_frames(name):
+    (spike,) = takes(name, only="a spike")
+    assert found(spike).best is None
 
 
 @pytest.mark.parametrize(
@@ -89,6 +98,57 @@ def test_no_cause_is_told_by_its_words(monkeypatch):
     monkeypatch.setattr(Hypothesis, "__init__", untold)
     other = found(both)
     assert [(h.name, h.gain) for h in other.hypotheses] == [(h.name, h.gain) for h in usual.hypotheses]
+
+
+@pytest.mark.parametrize("scales", [(1, 1, 1.1), (1, 1, 0.9), (1.05, 1, 1)])
+def test_an_axis_that_cameras_absorb_is_told_by_the_jaws(scales):
+    """They are as long wherever they point, and no camera needs to see them."""
+    for seed in range(3):
+        scene = Scene(np.random.default_rng(seed), frames=60, fps=10.0)
+        scene.edit_report.append(lambda scene, t, x: x * scales)
+        best = found(scene.take()).best
+        assert best.name == "scaled_axis" and best.value == pytest.approx(np.prod(scales), abs=0.01)
+        assert scales[2] == 1 or "where the tool points" in best.text  # across the view pixels tell too
+        assert best.cure.startswith("Check the units and the scale of the ")
+        assert best.explained > 0.5
+
+
+def _slow(scene, t, x):
+    """A robot that errs by 10 um for seconds on end."""
+    knots = np.linspace(t[0], t[-1], 4)
+    return x + 0.01 * np.stack([np.interp(t, knots, e) for e in scene.rng.normal(size=(9, 4))], axis=1).reshape(x.shape)
+
+
+def _longer(scene, t, x):
+    """Jaws whose pivots lie ahead of the base: they are the longer, the more they open."""
+    opening = np.linalg.norm(x[:, 2] - x[:, 1], axis=1)[:, None, None]
+    return x[:, :1] + (x - x[:, :1]) * (1 + 0.1 * opening)
+
+
+def _sliding(scene, t, x):
+    return x[:, :1] + (x - x[:, :1]) * (1 + 0.05 * np.sin(1.7 * t))[:, None, None]
+
+
+def _displaced(scene, t, x):
+    return x + np.array([[0.0, 0.0, 0.2], [0, 0, 0], [0, 0, 0]])
+
+
+def _straight(scene, t, x):
+    """A tool that does not turn."""
+    return _slow(scene, t, x.mean(axis=1, keepdims=True) + (x - x.mean(axis=1, keepdims=True)).mean(axis=0))
+
+
+def _bent(share):
+    return lambda scene, t, x: np.concatenate([x[:, :1], x[:, 1:] - share * (x[:, 1:] - x.mean(axis=(0, 1)))], axis=1)
+
+
+@pytest.mark.parametrize("edit", [_slow, _longer, _sliding, _displaced, _straight, _bent(0.03), _bent(0.1)])
+def test_jaws_of_other_lengths_accuse_no_axis(edit):
+    for seed in range(3):
+        scene = Scene(np.random.default_rng(seed), frames=60, fps=10.0)
+        scene.edit_report.append(edit)
+        axes = [h for h in found(scene.take()).hypotheses if h.name == "scaled_axis"]
+        assert not any("where the tool points" in h.text for h in axes)
 
 
 def test_a_mirrored_image_is_no_scaled_axis():
@@ -177,3 +237,31 @@ def test_too_little_to_say_anything():
     assert diagnose(usual.data.subset(slice(0, 4))).hypotheses == ()
     nothing = replace(usual.data, confidence=np.zeros_like(usual.data.confidence))
     assert diagnose(nothing).best.name == "detector_unfit"
+
+
+class _Stub(SimpleNamespace):
+    """A recording without pictures."""
+
+    folder, doubts, robot_accuracy_mm = Path("stub"), (), 0.01
+
+    def __len__(self):
+        return 40
+
+
+@pytest.mark.parametrize(
+    ("name", "seed", "only", "number", "fault"),
+    [("setting", 1, "creep", 0, "drift"), ("setting", 0, "z scaled", 0, "scaled_axis"), ("setting", 0, "finite", 0, None)],
+)
+def test_a_distance_that_another_fault_explains_better_is_not_shown(monkeypatch, name, seed, only, number, fault):
+    """Residuals of images that creep, or of a scaled axis, look a little like those of a finite distance."""
+    monkeypatch.setattr(verdict, "feature_matches", lambda *_: [])
+    monkeypatch.setattr(verdict, "health", lambda *_, **__: None)
+    spoiled = list(takes(name, seed, only))[number]
+    assert calibrate_as_shown(spoiled.data, image_size_px=spoiled.image_size_px).model == "near_affine"
+    stated = ("kinematics", "offset_s", "readout_s", "image_size_px")
+    recording = _Stub(**{key: getattr(spoiled, key) for key in stated})
+    found = assess(recording, spoiled.data)
+    best = found.diagnosis.best
+    assert (best.name if best else None) == fault
+    assert found.calibration.model == ("zero_skew" if fault else "near_affine")
+    assert assess(recording, spoiled.data, model="near_affine").calibration.model == "near_affine"  # as it is told to
