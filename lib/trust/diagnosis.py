@@ -20,6 +20,7 @@ from lib.trust.health import affine_epipolar
 
 _MOST_ROWS, _FEWEST_FRAMES = 1200, 4  # of three frames nothing checks anything
 _UNFIT = f"The detector does not fit these pictures: look at its overlays, {TRAIN_FURTHER}."
+_SCALE = "Check the units and the scale of the {} columns of kinematics.csv, beside those of the others."
 _ROBOT_MM = 0.04  # a robot for eye surgery is better
 #: Standard deviations of a camera's skew and log pixel aspect.
 _SKEW_SD, _ASPECT_SD = 0.002, 0.003
@@ -237,7 +238,8 @@ def _optics(case: Case, fit: Robust, sign: float) -> Iterator[Hypothesis]:
     if few or not np.isfinite(covariance).all() or min(np.linalg.svd(a, compute_uv=False)[1] for a in A) < 1e-6:
         return
     if case.misfit(fit) < FITS:  # cameras that fit nothing always have skewed pixels
-        yield from _scaled_axis(case, A, covariance)
+        yield from _jaws(case)
+        yield from _scaled_axis(A, covariance)
     yield from _handedness(case, A, covariance)
 
 
@@ -248,45 +250,42 @@ def _constraints(A: np.ndarray) -> np.ndarray:
     return np.concatenate([skew, np.log(size[..., 0] / size[..., 1])], axis=-1)
 
 
-def _jaws(case: Case, shares: np.ndarray) -> np.ndarray | None:
-    """Misfit (3, t) of the jaws' lengths in the log where 1 - scale^-2 of one axis is `shares` (t,); None if they tell none.
+def _jaws(case: Case) -> Iterator[Hypothesis]:
+    """A robot axis of the wrong scale: the jaws' lengths in the log depend on where they point, and not on the opening alone.
 
-    A rigid jaw, from base to tip, has one length, or one for each opening, wherever it points.  If its direction is n and an
-    axis is s times too long, length^-2 is smaller by the factor 1 - (1 - s^-2) n^2.
+    If a jaw's direction is n and an axis is s times too long, length^-2 is smaller by the factor 1 - (1 - s^-2) n^2.
     """
     x = case.log[np.isfinite(case.log).all(axis=(1, 2))]
     jaws = x[:, 1:] - x[:, :1]
     squares = (jaws**2).sum(axis=2, keepdims=True)
     if x.shape[1] != 3 or len(x) < 2 * _PARTS or squares.min() <= 0:
-        return None
+        return
     opening = np.linalg.norm(x[:, 2] - x[:, 1], axis=1)
     n, place = jaws / np.sqrt(squares), x[:, 1:] - x[:, 1:].mean(axis=(0, 1))
     told = np.dstack([(1 / squares) / (1 / squares).mean(axis=0), n**2, n, (jaws * place).sum(axis=2) / squares[..., 0]])
     opened = np.vander((opening - opening.mean()) / max(opening.std(), 1e-9), 3)
     each = int(np.clip(len(x) / _STRETCHES, 1, 100))  # samples whose mean has less noise, and tells as much
     rows = np.column_stack([opened, told.reshape(-1, 16)])[: len(x) // each * each].reshape(-1, each, 19).mean(axis=1)
-    opened, told = rows[:, :3], rows[:, 3:]
-    rest = (told - opened @ np.linalg.lstsq(opened, told, rcond=None)[0]).reshape(-1, 8)
+    rest = (rows[:, 3:] - rows[:, :3] @ np.linalg.lstsq(rows[:, :3], rows[:, 3:], rcond=None)[0]).reshape(-1, 8)
     length, turns, others = rest[:, 0], rest[:, 1:4], rest[:, 4:]
-    along, common, total = np.maximum((turns**2).sum(axis=0), 1e-12), turns.T @ length, length @ length
+    along, common = np.maximum((turns**2).sum(axis=0), 1e-12), turns.T @ length
     k = (common**2 / along).argmax()
-    slope = common[k] / along[k]
+    slope, total = common[k] / along[k], length @ length
     # A base that is displaced beside the tips, or tips that lag behind it, change the lengths otherwise.
     left, otherwise = length - slope * turns[:, k], length - others @ np.linalg.lstsq(others, length, rcond=None)[0]
     sums = [part.sum() for part in np.array_split(turns[:, k] * left, _PARTS)]  # errors last for a while
-    sd = np.hypot(np.linalg.norm(sums) / along[k], _OWN_SD)
+    sd = float(np.hypot(np.linalg.norm(sums) / along[k], _OWN_SD))
     most = min((1 - _MOST_OF_IT) * total, _ODD**2 * len(rest), 1.1 * otherwise @ otherwise)  # which has three numbers more
-    if abs(slope) < max(_LEAST_SCALED, _SURE_SCALED * sd) or turns[:, k].std() < _TURNED or left @ left > most:
-        return None
-    slopes = -shares / (1 - np.outer(told.reshape(-1, 8)[:, 1:4].mean(axis=0), shares))
-    return (total - 2 * slopes * common[:, None] + slopes**2 * along[:, None]) / (sd**2 * along[k])
+    if abs(slope) >= max(_LEAST_SCALED, _SURE_SCALED * sd) and turns[:, k].std() >= _TURNED and left @ left <= most:
+        scale = float((1 - slope / (slope * (n[..., k] ** 2).mean() - 1)) ** -0.5)
+        text = "The distances from base to tips depend on where the tool points, and hardly if the robot's "
+        text, cure = f"{text}{'xyz'[k]} is divided by {scale:.3f}.", _SCALE.format("xyz"[k])
+        size = scale, sd * scale / 2, "times", float(1 - left @ left / total)
+        yield Hypothesis("scaled_axis", text, cure, *size, float(0.5 * (slope / sd) ** 2 - 1.5))
 
 
-def _scaled_axis(case: Case, A: np.ndarray, covariance: np.ndarray) -> Iterator[Hypothesis]:
-    """A robot axis of the wrong scale: the pixels of A (2, 2, 3), of `covariance` (12, 12), are skewed or oblong.
-
-    Or the jaws' lengths depend on where they point.
-    """
+def _scaled_axis(A: np.ndarray, covariance: np.ndarray) -> Iterator[Hypothesis]:
+    """A robot axis of the wrong scale: the pixels of A (2, 2, 3), of `covariance` (12, 12), are skewed or oblong."""
     tolerance = np.diag(np.square([_SKEW_SD, _SKEW_SD, _ASPECT_SD, _ASPECT_SD]))
     if abs(_constraints(A)[2:].mean()) > _RESIZED:
         tolerance[2:, 2:] += 1.0
@@ -297,10 +296,7 @@ def _scaled_axis(case: Case, A: np.ndarray, covariance: np.ndarray) -> Iterator[
     seen = _constraints(A * scales)
     J = (_constraints((A + near) * scales) - seen) / near.max()
     S = np.einsum("abik,ij,abjl->abkl", J, covariance, J) + tolerance
-    misfit, jaws = (seen @ np.linalg.solve(S, np.swapaxes(seen, 2, 3)))[..., 0, 0], _jaws(case, 1 - np.exp(-2 * logs))
-    misfit, what = misfit + (0.0 if jaws is None else jaws), "The cameras' pixels are skewed or oblong, and square"
-    if jaws is not None:
-        what = "The distances from base to tips depend on where the tool points, and hardly"
+    misfit = (seen @ np.linalg.solve(S, np.swapaxes(seen, 2, 3)))[..., 0, 0]
     none = float(misfit[0, 80])
     for name, values in zip("xyz", misfit, strict=True):
         best = int(values[1:-1].argmin()) + 1
@@ -308,10 +304,9 @@ def _scaled_axis(case: Case, A: np.ndarray, covariance: np.ndarray) -> Iterator[
         bend = max(float(before - 2 * least + after) / spacing**2, 1e-9)
         log = logs[best] + np.clip(0.5 * (before - after) / bend / spacing, -spacing, spacing)
         scale, sd = float(np.exp(log)), float(np.sqrt(2.0 / bend))  # A times s is plausible: the numbers are s too large
-        text = f"{what} if the robot's {name} is divided by {scale:.3f}."
-        cure = f"Check the units and the scale of the {name} columns of kinematics.csv, beside those of the others."
+        text = f"The cameras' pixels are skewed or oblong, and square if the robot's {name} is divided by {scale:.3f}."
         explained, gain = 1.0 - float(least) / max(none, 1e-9), float(0.5 * (none - least) - 1.5)
-        yield Hypothesis("scaled_axis", text, cure, scale, sd * scale, "times", explained, gain)
+        yield Hypothesis("scaled_axis", text, _SCALE.format(name), scale, sd * scale, "times", explained, gain)
 
 
 def _handedness(case: Case, A: np.ndarray, covariance: np.ndarray) -> Iterator[Hypothesis]:

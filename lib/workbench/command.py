@@ -14,8 +14,6 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from PIL import Image
-
 from lib import files, paths
 from lib.provenance import commit, machine
 from lib.workbench import execution, pages
@@ -23,9 +21,7 @@ from lib.workbench.execution import Failure, execute
 
 #: Keeps room on the disk to write the last state of a run when the disk is full.
 _ROOM = ".room"
-#: Figures that the README shows.
-README_FIGURES = ("overview", "landmark_detection", "reconstruction_surface", "calibration_ellipsoids",
-                  "registration_errors_recorded", "pipeline_push")  # fmt: skip
+
 
 
 def main(argv: Sequence[str]) -> int:
@@ -57,14 +53,10 @@ def main_site(argv: Sequence[str]) -> int:
     parser = argparse.ArgumentParser("python3 -m lib site", description="Make a static site of a run, as for GitHub Pages.")
     parser.add_argument("run", nargs="?", type=Path, metavar="RUN", help="its folder (default: the last complete one)")
     parser.add_argument("--out", type=Path, default=paths.ROOT / "site", metavar="FOLDER", help="a new folder")
-    parser.add_argument("--gallery", action="store_true", help="renew the README's pictures in data/gallery instead")
     options = parser.parse_args(argv)
     chosen = options.run or next((folder for folder, _ in reversed(complete_runs(paths.RUNS))), paths.RUNS)
     if not (chosen / "index.html").is_file():
         raise FileNotFoundError(f"{chosen}: no run with an index.html; `python3 -m lib run` makes one.")
-    if options.gallery:
-        renew_gallery(chosen)
-        return 0
     if options.out.exists() or not options.out.absolute().parent.is_dir():
         raise OSError(f"{options.out}: it exists already, or the folder for it does not; name another with --out.")
     with tempfile.TemporaryDirectory(prefix="site-", dir=options.out.absolute().parent) as made:  # half a site is none
@@ -72,29 +64,6 @@ def main_site(argv: Sequence[str]) -> int:
         (Path(made) / "site").rename(options.out)
     print(f"Site: {options.out / 'index.html'}")
     return 0
-
-
-def renew_gallery(run: Path) -> None:
-    """Take the README's pictures from a run of all notebooks on the shipped recording; what it lacks is an OSError."""
-    made_by = json.loads((run / "metrics.json").read_text(encoding="utf-8"))
-    figures = run / "figures"
-    chosen = [next(iter(sorted(figures.glob(f"{name}.*"))), figures / name) for name in README_FIGURES]
-    if lacking := [path.stem for path in chosen if not path.is_file()]:
-        raise FileNotFoundError(f"{figures}: no picture {', '.join(lacking)}; run all notebooks.")
-    if made_by["parameters"].get("recording") or "weights" not in made_by:
-        raise OSError(f"{run}: the README shows the recording that ships, by today's report; run all notebooks without -p.")
-    for path in chosen:
-        for old in paths.GALLERY.glob(f"{path.stem}.*"):
-            old.unlink()
-        if path.suffix == ".svg":
-            shutil.copy(path, paths.GALLERY)
-        elif getattr(picture := Image.open(path), "n_frames", 1) > 1:  # a film
-            picture.save(paths.GALLERY / f"{path.stem}.webp", save_all=True, quality=70)
-        else:  # a tenth of the PNG's bytes, all colours kept
-            picture = picture.convert("RGB")
-            picture.thumbnail((1300, 1300))
-            picture.save(paths.GALLERY / f"{path.stem}.jpg", quality=88, subsampling=0)
-    files.write_json(paths.GALLERY / "made_by.json", {k: made_by[k] for k in ("started", "commit", "machine", "weights")})
 
 
 def run(
