@@ -32,8 +32,7 @@ _STRETCHES, _PARTS = 60, 8
 #: variance that it explains; the RMS that it leaves of their squares; the RMS by which the jaws' directions change.
 _LEAST_SCALED, _SURE_SCALED, _OWN_SD, _MOST_OF_IT, _ODD, _TURNED = 0.03, 5.0, 0.006, 0.5, 0.03, 0.01
 _STILL_PX = 0.3  # detections of one picture differ by less
-#: Which the residuals do not show.
-BY_GEOMETRY = ("scaled_axis", "mirrored_axis", "exchanged_eyes", "mirrored_images")
+BY_GEOMETRY = ("scaled_axis", "mirrored_axis", "exchanged_eyes", "mirrored_images")  # which the residuals do not show
 _ACROSS = 0.15  # sine of a tool's angle to the images, below which it points neither way
 _UPSIDE_DOWN = 20.0  # odds that a microscope sees the tips of a tool below its base
 
@@ -278,10 +277,9 @@ def _jaws(case: Case) -> Iterator[Hypothesis]:
     most = min((1 - _MOST_OF_IT) * total, _ODD**2 * len(rest), 1.1 * otherwise @ otherwise)  # which has three numbers more
     if abs(slope) >= max(_LEAST_SCALED, _SURE_SCALED * sd) and turns[:, k].std() >= _TURNED and left @ left <= most:
         scale = float((1 - slope / (slope * (n[..., k] ** 2).mean() - 1)) ** -0.5)
-        text = "The distances from base to tips depend on where the tool points, and hardly if the robot's "
-        text, cure = f"{text}{'xyz'[k]} is divided by {scale:.3f}.", _SCALE.format("xyz"[k])
+        text = f"Jaws' lengths depend on where they point, and hardly if the robot's {'xyz'[k]} is divided by {scale:.3f}."
         size = scale, sd * scale / 2, "times", float(1 - left @ left / total)
-        yield Hypothesis("scaled_axis", text, cure, *size, float(0.5 * (slope / sd) ** 2 - 1.5))
+        yield Hypothesis("scaled_axis", text, _SCALE.format("xyz"[k]), *size, float(0.5 * (slope / sd) ** 2 - 1.5))
 
 
 def _scaled_axis(A: np.ndarray, covariance: np.ndarray) -> Iterator[Hypothesis]:

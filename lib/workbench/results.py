@@ -7,8 +7,8 @@ import csv
 import io
 import json
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -18,13 +18,6 @@ import numpy as np
 
 from lib import files, paths
 from lib.provenance import plain
-
-
-class _Absent:
-    """Stands for a table that was never recorded: whatever is asked of it is missing."""
-
-    def __getattr__(self, name: str) -> object:
-        raise LookupError("all of it")
 
 
 @dataclass(frozen=True)
@@ -85,22 +78,6 @@ def read(name: str, folder: Path = paths.RESULTS) -> Table | None:
             raise ValueError(f"{table}: row {number} does not have {len(names)} entries; restore it.")
     columns = [_typed(column) for column in zip(*rows, strict=True)]
     return Table([dict(zip(names, row, strict=True)) for row in zip(*columns, strict=True)], provenance)
-
-
-@contextmanager
-def recorded(name: str, folder: Path = paths.RESULTS) -> Iterator[Table]:
-    """The recorded table `name` for a block of a notebook, which ends with one line where the table lacks what it needs.
-
-    >>> with recorded("never_swept") as table:
-    ...     print(table.columns["error_um"].mean())
-    Left out: the recorded table never_swept lacks all of it. `python3 -m lib sweep studies/never_swept --record` records it.
-    """
-    table = read(name, folder)
-    try:
-        yield _Absent() if table is None else table
-    except LookupError as lacking:
-        what = "a row" if isinstance(lacking, IndexError) else str(lacking)
-        print(f"Left out: the recorded table {name} lacks {what}. `python3 -m lib sweep studies/{name} --record` records it.")
 
 
 def write(name: str, rows: Iterable[Mapping], provenance: Mapping, folder: Path = paths.RESULTS) -> None:

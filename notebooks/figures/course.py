@@ -1,15 +1,18 @@
-"""For a course: a cell's result against the library's, and conclusions that the run's numbers support."""
+"""For a course: a cell's result against the library's, recorded tables, and conclusions that the run's numbers support."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
 from IPython.display import Markdown
 from numpy.typing import ArrayLike
 
-from lib.workbench import report
+from lib import paths
+from lib.workbench import report, results
 
 _NUMBER = re.compile(r"\{([a-z][a-z0-9_.]*?)(:[^{}]*)?\}")
 
@@ -65,3 +68,26 @@ def learnt(claims: Mapping[str, str]) -> Markdown:
     if len(told) < len(claims):
         lines.append(f"- {len(claims) - len(told)} conclusions need numbers that this run did not measure.")
     return Markdown("\n".join(lines))
+
+
+class _Absent:
+    """Stands for a table that was never recorded: whatever is asked of it is missing."""
+
+    def __getattr__(self, name: str) -> object:
+        raise LookupError("all of it")
+
+
+@contextmanager
+def recorded_table(name: str, folder: Path = paths.RESULTS) -> Iterator[results.Table]:
+    """The recorded table `name` for a block of a notebook, which ends with one line where the table lacks what it needs.
+
+    >>> with recorded_table("never_swept") as table:
+    ...     print(table.columns["error_um"].mean())
+    Left out: the recorded table never_swept lacks all of it. `python3 -m lib sweep studies/never_swept --record` records it.
+    """
+    table = results.read(name, folder)
+    try:
+        yield _Absent() if table is None else table
+    except LookupError as lacking:
+        what = "a row" if isinstance(lacking, IndexError) else str(lacking)
+        print(f"Left out: the recorded table {name} lacks {what}. `python3 -m lib sweep studies/{name} --record` records it.")

@@ -107,7 +107,7 @@ def test_an_axis_that_cameras_absorb_is_told_by_the_jaws(scales):
     scene.edit_report.append(lambda scene, t, x: x * scales)
     best = found(scene.take()).best
     assert best.name == "scaled_axis" and best.value == pytest.approx(np.prod(scales), abs=0.01)
-    assert scales[2] == 1 or "where the tool points" in best.text  # across the view pixels tell too
+    assert scales[2] == 1 or "where they point" in best.text  # across the view pixels tell too
     assert best.cure.startswith("Check the units and the scale of the ")
     assert best.explained > 0.5
 
@@ -146,7 +146,7 @@ def test_jaws_of_other_lengths_accuse_no_axis(edit):
     scene = Scene(np.random.default_rng(0), frames=20, fps=3.0)
     scene.edit_report.append(edit)
     axes = [h for h in found(scene.take()).hypotheses if h.name == "scaled_axis"]
-    assert not any("where the tool points" in h.text for h in axes)
+    assert not any("where they point" in h.text for h in axes)
 
 
 def test_a_mirrored_image_is_no_scaled_axis():

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from lib.workbench import results
+from notebooks.figures.course import recorded_table
 
 ROWS = [
     {"method": "band", "seed": 0, "masked": True, "error_um": np.float32(12.3456789), "note": ""},
@@ -48,9 +49,9 @@ def test_what_is_missing_or_damaged(tmp_path):
 def test_what_a_recorded_table_lacks_is_told_in_one_line(tmp_path, capsys, needs):
     results.write("matching", ROWS, {}, tmp_path)
     for name in ("matching", "never_swept"):
-        with results.recorded(name, tmp_path) as table:
+        with recorded_table(name, tmp_path) as table:
             needs(table)
         out = capsys.readouterr().out
         assert out.startswith(f"Left out: the recorded table {name} lacks ") and out.count("\n") == 1
-    with results.recorded("matching", tmp_path) as table:
+    with recorded_table("matching", tmp_path) as table:
         assert len(table) == 3
