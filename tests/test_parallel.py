@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -63,10 +64,18 @@ def test_errors_stay_with_their_job(tmp_path, scheduler):
     assert ends["b.txt"] is None and isinstance(ends["a.txt"], FileNotFoundError)
 
 
-def test_each_job_moves_the_bar(tmp_path, scheduler, capsys):
-    jobs = {tmp_path / name: (name,) for name in ("a.txt", "b.txt")}
-    list(parallel.run_jobs(files.write_text, jobs, scheduler=scheduler, title="Writing"))
-    assert "Writing: 100%" in capsys.readouterr().err
+def test_steps_move_the_bar(tmp_path, scheduler, capsys):
+    jobs = {tmp_path / "a.txt": (), tmp_path / "b.txt": ()}
+    list(parallel.run_jobs(three_steps, jobs, scheduler=scheduler, title="Stepping", steps=3))
+    assert "Stepping: 100%" in capsys.readouterr().err
+    parallel.step()  # outside a job it does nothing
+
+
+def three_steps(path: Path) -> None:
+    for _ in range(3):
+        parallel.step()
+    time.sleep(0.1)
+    shutil.copy(__file__, path)
 
 
 def test_no_scheduler_is_told(tmp_path, monkeypatch):

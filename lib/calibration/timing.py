@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.interpolate import BSpline, make_lsq_spline
-from scipy.ndimage import maximum_filter1d, median_filter
 
 from lib.calibration.affine import estimate_noise, regress
 from lib.calibration.calibration import Calibration
@@ -19,8 +18,6 @@ from lib.recordings import Kinematics
 
 _GRID = 41  # trial offsets of the coarse search
 _SMOOTH_S = 0.1  # within which the robot's motion is smooth
-#: Least size of a jump of the log: over the steps around it, over the 90 % quantile of all, and in mm.
-_JUMP, _JUMP_NOISE, _JUMP_MM = 3.0, 4.0, 0.1
 #: Of landmarks that a detector sees with an error of the tool's own: how much deeper than the median trial each camera's
 #: misfit must be, and the largest residual, as a share of the pixels' extent.
 _CLEAR, _NEAR = 0.4, 0.03
@@ -38,7 +35,7 @@ class TimeOffset:
 
 
 class Paths:
-    """The landmarks' motion as least-squares cubic splines with a knot every 0.1 s, a piece a stretch without gap or jump.
+    """The landmarks' motion as least-squares cubic splines with a knot every 0.1 s, a piece a stretch without a gap.
 
     The derivative of an interpolating spline is mostly encoder noise at 100 Hz, which biases what is regressed on it.
     Of each landmark `samples` has the times (m,) s, and the positions (m, 3) mm, NaN where the robot is silent.
@@ -57,8 +54,8 @@ class Paths:
             time, x = time[known], x[known]
             step = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
             every = max(2, int(np.ceil(_SMOOTH_S / step)))
-            # The motion is smooth within that time, so a dropped sample is bridged; a longer silence and a jump are not.
-            gaps = np.flatnonzero((np.diff(time) > max(_SMOOTH_S, 2.5 * step)) | _jumps(time, x, step))
+            # The motion is smooth within that time, so a dropped sample is bridged; a longer silence is not.
+            gaps = np.flatnonzero(np.diff(time) > max(_SMOOTH_S, 2.5 * step))
             for t, part in zip(np.split(time, gaps + 1), np.split(x, gaps + 1), strict=True):
                 if len(t) >= 4:
                     knots = np.concatenate([np.full(4, t[0]), t[every : len(t) - every : every], np.full(4, t[-1])])
@@ -226,21 +223,6 @@ def _rows(data: Correspondences | tuple) -> tuple[np.ndarray, np.ndarray, np.nda
     y = np.concatenate([np.where(np.isfinite(p).all(axis=2, keepdims=True), p, np.nan) for p in u], axis=2)
     frame, landmark = np.divmod(np.arange(len(time) * k), k)
     return np.repeat(time, k), frame, landmark, y.reshape(len(time) * k, -1)
-
-
-def _jumps(time: np.ndarray, x: np.ndarray, step: float) -> np.ndarray:
-    """Steps (m - 1,) bool of positions x (m, 3), one every `step` s, that no tool makes: a slip, a spike, another origin.
-
-    They are far from the median velocity of 0.2 s, in which starts and stops remain.  Where the log is slower than 30 Hz, or
-    jumps more often than every two seconds, it is motion.
-    """
-    moved, took, window = np.diff(x, axis=0), np.diff(time)[:, None], 2 * int(_SMOOTH_S / step) + 1
-    if window < 7 or len(moved) < window:
-        return np.zeros(len(moved), dtype=bool)
-    usual = median_filter(moved / took, (window, 1), mode="nearest") * took
-    odd, longest = np.linalg.norm(moved - usual, axis=1), maximum_filter1d(np.linalg.norm(usual, axis=1), window)
-    found = odd > np.maximum(_JUMP * longest, _JUMP_NOISE * np.quantile(odd, 0.9)) + _JUMP_MM
-    return found & (2 * np.sum(found & ~np.append(False, found[:-1])) < np.ptp(time))
 
 
 def _paths(kinematics: Kinematics | tuple) -> Paths:

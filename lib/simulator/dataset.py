@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from lib import files, paths
-from lib.parallel import cores, run_jobs
+from lib.parallel import cores, run_jobs, step
 from lib.recordings import Recording
 from lib.simulator.eye import Eye
 from lib.simulator.families import FAR
@@ -73,7 +73,7 @@ def rung_design(rung: str, seed: int, *, shrink: int = 1) -> Design:
 
 def _make_sequence(folder: Path, design: Design, seed: int, n_pairs: int) -> None:
     text = "Simulated data set: calibration sweep, then a surgeon's movements."
-    simulate(folder, design, seed=seed, n_frames=n_pairs, description=text, progress=False)
+    simulate(folder, design, seed=seed, n_frames=n_pairs, description=text, progress=step)
 
 
 def make_dataset(
@@ -95,7 +95,7 @@ def make_dataset(
         shutil.rmtree(leftover)  # of a run that was killed
     designs = {k: sequence_design(seed, k, shrink=shrink, duration_s=duration_s) for k in _SEQUENCES}
     jobs = {folder / sequence_name(k): (design, 1000 * seed + k, n_pairs) for k, design in designs.items()}
-    for _, error in run_jobs(_make_sequence, jobs, workers=workers, title="Simulating", unit="sequence"):
+    for _, error in run_jobs(_make_sequence, jobs, workers=workers, title="Simulating", unit="pair", steps=n_pairs):
         if error:
             raise error
     return list(jobs)
@@ -155,4 +155,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     cost = f"{minutes:.0f} min on {workers} idle core{'s' * (workers > 1)}, {left * _MB_PER_PAIR / shrink**2 / 1000:.2f} GB"
     print(f"{paths.shown(folder)}: {left} of {len(_SEQUENCES) * pairs} stereo pairs to make, about {cost}.", flush=True)
     if not arguments.dry_run:
+        start = time.perf_counter()
         make_dataset(folder, seed=seed, workers=workers, n_pairs=pairs, duration_s=arguments.duration, shrink=shrink)
+        seconds = time.perf_counter() - start
+        if left:
+            print(f"{left} pairs in {seconds / 60:.1f} min, {seconds / left:.2f} s a pair.")

@@ -27,15 +27,15 @@ def _clock(case: Case) -> Iterator[Hypothesis]:
         if fitted is None:
             continue
         fit, problem, (value,), (sd,) = fitted
-        text = f"{1e3 * value:z.1f} +- {1e3 * sd:.1f} ms"
+        size = f"{1e3 * value:z.1f} +- {1e3 * sd:.1f} ms"
         if not 0.95 * trial[0] < value < 0.95 * trial[-1]:
-            text += f" (at the edge of the search, {trial[0]:.2f} to {trial[-1]:.2f} s)"
+            size += f" (at the edge of the search, {trial[0]:.2f} to {trial[-1]:.2f} s)"
         if name == "clock":
+            text = f"The residuals lie along the image of the tool's velocity: the clocks differ by {size}."
             cure = f"Add {value:.4f} to offset_s in recording.toml; estimate_time_offset checks it."
-            text = f"The residuals lie along the image of the tool's velocity: the clocks differ by {text}."
         else:
-            cure = f"Trigger both cameras together, or pair each right image with the left one of its instant ({text})."
-            text = f"The {SIDES[views[0]]} camera alone shows the tool {text} later than the frame's time."
+            text = f"The {SIDES[views[0]]} camera alone shows the tool {size} later than the frame's time."
+            cure = f"Trigger both cameras together, or pair each right image with the left one of its instant ({size})."
         yield case.found(name, fit, 1, (1e3 * value, 1e3 * sd, "ms"), text, cure, on=problem, images=views)
 
 

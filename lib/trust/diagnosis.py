@@ -237,8 +237,7 @@ def _optics(case: Case, fit: Robust, sign: float) -> Iterator[Hypothesis]:
     if few or not np.isfinite(covariance).all() or min(np.linalg.svd(a, compute_uv=False)[1] for a in A) < 1e-6:
         return
     if case.misfit(fit) < FITS:  # cameras that fit nothing always have skewed pixels
-        yield from _jaws(case)
-        yield from _scaled_axis(A, covariance)
+        yield from list(_jaws(case)) or _scaled_axis(A, covariance)  # pixels cannot tell x from y
     yield from _handedness(case, A, covariance)
 
 
@@ -277,7 +276,8 @@ def _jaws(case: Case) -> Iterator[Hypothesis]:
     most = min((1 - _MOST_OF_IT) * total, _ODD**2 * len(rest), 1.1 * otherwise @ otherwise)  # which has three numbers more
     if abs(slope) >= max(_LEAST_SCALED, _SURE_SCALED * sd) and turns[:, k].std() >= _TURNED and left @ left <= most:
         scale = float((1 - slope / (slope * (n[..., k] ** 2).mean() - 1)) ** -0.5)
-        text = f"Jaws' lengths depend on where they point, and hardly if the robot's {'xyz'[k]} is divided by {scale:.3f}."
+        text = "The jaws' lengths in the log change with their direction. "
+        text += f"They hardly change if the robot's {'xyz'[k]} is divided by {scale:.3f}."
         size = scale, sd * scale / 2, "times", float(1 - left @ left / total)
         yield Hypothesis("scaled_axis", text, _SCALE.format("xyz"[k]), *size, float(0.5 * (slope / sd) ** 2 - 1.5))
 

@@ -288,7 +288,7 @@ class Case:
     def chosen(self, x: np.ndarray) -> tuple[Robust, Problem, np.ndarray]:
         """Each frame with the positions among x (t, n, 3) that suit it best: the fit, its rows, the choices (frames,)."""
         problem, fit = self.problem, self.null
-        x = np.where(np.isfinite(x).any(axis=0), x, problem.x[:, 0])  # beside a jump of the log nothing is known
+        x = np.where(np.isfinite(x).any(axis=0), x, problem.x[:, 0])  # beside a gap of the log nothing is known
         for _ in range(5):
             r2 = ((problem.y - np.einsum("cij,tnj->tnci", fit.M[:, :, :3], x) - fit.M[:, :, 3]) ** 2).sum(axis=3)
             loss = np.where(problem.used, np.nan_to_num(np.log1p(r2 / fit.shapes[0].scale ** 2), nan=1e3), 0.0).sum(axis=2)

@@ -244,7 +244,7 @@ def assess(
     Args:
         data: Its correspondences (detected, labelled); None runs the detector, the one that ships if none is given.
         detector: The one that made `data`; with it some frames are looked at again, mirrored and shifted.
-        options: Of `calibrate`.  Without `model` cameras are affine, or of a finite distance if no fault explains more.
+        options: Of `lib.calibration.calibrate`.  Without `model` cameras are affine, or of a finite distance if that shows.
     """
     if data is None:
         detector = detector or Detector.load()
@@ -255,17 +255,15 @@ def assess(
         calibration = fit(data, image_size_px=recording.image_size_px, **options)
     except ValueError as refused:
         error = refused
-    stated = {name: getattr(recording, name) for name in ("kinematics", "offset_s", "readout_s", "image_size_px")}
-    diagnosis = diagnose(data, **stated)
-    if calibration is not None and calibration.inverse_distance_per_mm[1] > 0:
-        if "model" not in options and getattr(diagnosis.best, "name", "finite_distance") != "finite_distance":
-            calibration = calibrate(data, image_size_px=recording.image_size_px, **options)  # that fault explains more
-        else:  # what else is wrong?
-            told = zip(calibration.cameras, (data.u_left, data.u_right), strict=True)
-            u = [c.centre_px + (c.undistort(u) - c.centre_px) * c.depth_ratio(data.x_mm)[:, None] for c, u in told]
-            diagnosis = diagnose(replace(data, u_left=u[0], u_right=u[1]), **stated)
     if calibration is not None and len(y := feature_matches(recording, spread(len(recording), 3))):
         epipolar_px = float(np.median(np.abs(calibration.pair.epipolar_distance(y[:, :2], y[:, 2:]))))
+    stated = {name: getattr(recording, name) for name in ("kinematics", "offset_s", "readout_s", "image_size_px")}
+    straight = data
+    if calibration is not None and calibration.inverse_distance_per_mm[1] > 0:  # what else is wrong?
+        told = zip(calibration.cameras, (data.u_left, data.u_right), strict=True)
+        u = [c.centre_px + (c.undistort(u) - c.centre_px) * c.depth_ratio(data.x_mm)[:, None] for c, u in told]
+        straight = replace(data, u_left=u[0], u_right=u[1])
+    diagnosis = diagnose(straight, **stated)
     found = health(recording, data, calibration, detector=detector)
     verdict = judge(
         data, calibration, diagnosis=diagnosis, health=found, epipolar_px=epipolar_px, error=error,

@@ -23,7 +23,6 @@ from lib.workbench.execution import Failure, execute
 _ROOM = ".room"
 
 
-
 def main(argv: Sequence[str]) -> int:
     """Parse the command line and run: 0 if every notebook came to its end, 1 if one failed, 128 + n for signal n."""
     parser = argparse.ArgumentParser("python3 -m lib run", description="Execute notebooks; report in runs/<date>-<profile>/.")

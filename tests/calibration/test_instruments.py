@@ -14,7 +14,7 @@ from lib.calibration import (
     write_opencv,
     write_ros,
 )
-from lib.calibration.timing import Paths, clock_error
+from lib.calibration.timing import clock_error
 from lib.cameras import AffineCamera, StereoRig
 from lib.correspondences import Correspondences, pair_with_robot
 from lib.geometry import RigidTransform
@@ -127,45 +127,6 @@ def test_time_offset_of_correspondences_with_gaps_in_the_kinematics():
     robot_x[120:] = np.nan
     with pytest.raises(ValueError, match="away from gaps"):
         estimate_time_offset((time, [p[:, 0] for p in u]), (robot_time, robot_x))
-
-
-@pytest.mark.parametrize("kind", ["another place", "over 50 ms", "a spike"])
-def test_a_jump_in_the_log_does_not_move_the_clock(kind):
-    """A spline across it has a false speed for 0.2 s, which is much of 40 frames."""
-    errors, deviations = [], []
-    robot_time, time = np.arange(-1, 2.6, 0.01), np.arange(40) / 25
-    for seed in range(8):
-        rng = np.random.default_rng(seed)
-        jump, start_s = rng.normal(size=3), rng.uniform(0.32, 1.28)
-        jump *= 3.0 / np.linalg.norm(jump)
-
-        def place(t, start_s=start_s, jump=jump):
-            turn = Rotation.from_rotvec(np.sin(np.outer(t, [0.9, 1.3, 0.7])) * [0.4, 0.3, 0.5]).as_matrix()
-            over_s = 0.05 if kind == "over 50 ms" else 1e-9
-            part = np.clip((t - start_s) / over_s, 0, 1) * (kind != "a spike")  # the tool does jump
-            return LANDMARKS_MM @ turn.mT + (sweep(t, speed_mm_s=3.0) + np.outer(part, jump))[:, None]
-
-        robot_x = rng.normal(place(robot_time), 0.01)
-        if kind == "a spike":
-            robot_x[np.searchsorted(robot_time, start_s)] += 3 * jump
-        u = [rng.normal(p, 1.0).reshape(-1, 3, 2) for p in reference_rig().project(place(time).reshape(-1, 3))]
-        found = estimate_time_offset((time, u), (robot_time, robot_x))
-        errors.append(found.offset_s)
-        deviations.append(found.sd_s)
-    assert np.sqrt(np.mean(np.square(errors))) < 2e-3  # 6 to 10 ms by one spline
-    assert np.sqrt(np.mean(np.divide(errors, deviations) ** 2)) < 1.6
-
-
-@pytest.mark.parametrize("rate", [100, 40, 10])
-@pytest.mark.parametrize("grain_mm", [0.0, 0.01, 0.1])
-def test_motion_is_no_jump(rate, grain_mm):
-    """A tool that stands still, starts at once and stops at once, by a noisy log and by one of few digits."""
-    rng, time = np.random.default_rng(0), np.arange(0, 12, 1 / rate)
-    starts = np.repeat(rng.normal(0, 8, (12, 3)) * (np.arange(12) % 2)[:, None], rate, axis=0)
-    for noise in (0.0, 0.02):
-        x = np.cumsum(starts, axis=0) / rate + rng.normal(0, 1, (len(time), 3)) * noise
-        x = np.round(x / grain_mm) * grain_mm if grain_mm else x
-        assert len(Paths([(time, x)]).pieces[0]) == 1
 
 
 def test_time_offset_at_the_end_of_its_search_is_refused_with_the_cure():
