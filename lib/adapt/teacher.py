@@ -15,7 +15,7 @@ from scipy.optimize import least_squares
 
 from lib.adapt.looking import NEAR, Seen
 from lib.calibration import Calibration, CompetingCamerasError, LandmarkOffsets, calibrate, calibrate_as_shown
-from lib.calibration.offsets import carried, tool_axes
+from lib.calibration.offsets import Unsettled, carried, tool_axes
 from lib.calibration.timing import clock_error, estimate_time_offset
 from lib.cameras import NearAffineCamera
 from lib.correspondences import LANDMARKS, MIN_CONFIDENCE, DataError
@@ -344,8 +344,7 @@ def _by_labels(recording: Recording, seen: Seen) -> Calibration:
     try:
         if len(seen.frame) >= _FEW_PAIRS:
             return _placed(recording, seen)
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "offsets:", RuntimeWarning)  # by a clock that is off they find no end
+        with warnings.catch_warnings(action="ignore", category=Unsettled):  # by a clock that is off
             try:
                 return _fitted(recording, seen, ransac_px=np.inf, offsets=True, offset_prior_sd=_ROBOTS_OFFSET_MM)
             except _POOR:  # jaws that are shut have no axes

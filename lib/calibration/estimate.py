@@ -14,7 +14,7 @@ from lib.calibration import checks as refuse
 from lib.calibration.affine import affine_minimum, estimate_noise, noise_rms_px, paper_variances, regress
 from lib.calibration.calibration import Calibration
 from lib.calibration.models import Fit, Model, State, fit
-from lib.calibration.offsets import estimate_offsets, further_step, rows_axes, start_of_turning, tool_axes
+from lib.calibration.offsets import Unsettled, estimate_offsets, further_step, rows_axes, start_of_turning, tool_axes
 from lib.calibration.robust import consensus
 from lib.calibration.scatter import sandwich
 from lib.correspondences import Correspondences, DataError
@@ -193,8 +193,7 @@ def _turned(
         return found
     try:
         begin = start_of_turning(found, axes, turned, data.landmark[usable])
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "offsets:", RuntimeWarning)  # that they find no end
+        with warnings.catch_warnings(action="ignore", category=Unsettled):
             other = estimate(axes=turned, start=replace(found, offsets=replace(found.offsets, offset=begin)))
     except (DataError, np.linalg.LinAlgError):  # no cameras fit them
         return found

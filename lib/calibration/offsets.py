@@ -35,6 +35,10 @@ _TAKEN = 4
 _GRID_MM, _POLISHED, _STARTING_ROWS = (0.0, 0.2, -0.2), 8, 2000
 
 
+class Unsettled(RuntimeWarning):
+    """Offsets still move after all steps that they are given."""
+
+
 def tool_axes(x_mm: ArrayLike, offset_mm: np.ndarray | None = None) -> np.ndarray:
     """Axes R (n, 3, 3) of a forceps from its landmarks (n, 3, 3) mm: columns along it, from tip to tip, and their normal.
 
@@ -161,7 +165,7 @@ def estimate_offsets(
     """The calibration with one constant offset a landmark, in the tool's axes or (axes=None) in the images.
 
     Gauss-Newton on the offsets with the cameras eliminated: every step is a whole calibration `fit` of positions (n, 3) and
-    pixels (n, m) with the `views` to use, and one Schur complement; a `RuntimeWarning` where `iterations` are too few.
+    pixels (n, m) with the `views` to use, and one Schur complement; an `Unsettled` warning where `iterations` are too few.
     `axes` takes offsets (landmarks, 3) and returns the axes (n, 3, 3) of the rows.  `start` gives the first offsets, their
     prior and p-value.  Without `prior_sd` it is the one that makes the data most probable, 0.1 to 300 um or 0.01 to 30 px.
     Where two cameras compete, or one landmark hardly agrees with the others' cameras, small offsets may explain it; else the
@@ -177,8 +181,7 @@ def estimate_offsets(
         competing = error
     if found is not None and _agree_alike(found, landmark):
         return found
-    with suppress(DataError, np.linalg.LinAlgError, RuntimeWarning), warnings.catch_warnings():
-        warnings.filterwarnings("error", "offsets:", RuntimeWarning)  # still moving: no explanation
+    with suppress(DataError, np.linalg.LinAlgError, Unsettled), warnings.catch_warnings(action="error", category=Unsettled):
         other = steps(taken=_TAKEN)
         offset = other.offsets.offset[np.bincount(landmark) > 0]
         most, centre = (_MOST_MM, offset.mean(axis=0)) if competing else (_MOST_ALONE_MM, 0.0)
@@ -235,7 +238,7 @@ def _steps(
     else:
         if moved > 0.1 * least_sd:
             text = f"they still move by up to {moved:.2g} {'px' if axes is None else 'mm'} after {iterations} steps"
-            warnings.warn(f"offsets: {text}; look at the outliers (`ransac_px`).", RuntimeWarning, stacklevel=4)
+            warnings.warn(f"offsets: {text}; look at the outliers (`ransac_px`).", Unsettled, stacklevel=4)
     p, size = J_c.shape[2], offset.shape[1]
     prior = np.diag(np.repeat([0.0, prior_sd**-2], [p, offset.size]))
     full, effective = sandwich(np.concatenate([J_c, J], axis=2), weight, r, frame[rows], landmark[rows], prior)

@@ -28,9 +28,10 @@ _SKEW_SD, _ASPECT_SD = 0.002, 0.003
 _RESIZED = 0.1
 #: Of the jaws' lengths in the log: stretches of time whose means count, and parts of time that err apart.
 _STRETCHES, _PARTS = 60, 8
-#: The least change by a scaled axis, also in standard deviations, of which a good robot has one of its own; the share of the
-#: variance that it explains; the RMS that it leaves of their squares; the RMS by which the jaws' directions change.
-_LEAST_SCALED, _SURE_SCALED, _OWN_SD, _MOST_OF_IT, _ODD, _TURNED = 0.03, 5.0, 0.006, 0.5, 0.03, 0.01
+#: Least change of length^-2 by a scaled axis, also in standard deviations, and that which a good robot may have.
+_LEAST_SCALED, _SURE_SCALED, _OWN_SD = 0.03, 5.0, 0.006
+#: Least share of the variance that it explains, most that it leaves (RMS), and least turning of the jaws (RMS of n^2).
+_MOST_OF_IT, _ODD, _TURNED = 0.5, 0.03, 0.01
 _STILL_PX = 0.3  # detections of one picture differ by less
 BY_GEOMETRY = ("scaled_axis", "mirrored_axis", "exchanged_eyes", "mirrored_images")  # which the residuals do not show
 _ACROSS = 0.15  # sine of a tool's angle to the images, below which it points neither way
@@ -230,7 +231,7 @@ def _rigid_tips(case: Case) -> Iterator[Hypothesis]:
 
 
 def _optics(case: Case, fit: Robust, sign: float) -> Iterator[Hypothesis]:
-    """What an affine camera absorbs: its optics, in the fit of the best cause so far, alone are the witness."""
+    """What an affine camera absorbs: the jaws, and the optics in the fit of the best cause so far, are the witnesses."""
     rows = [8 * c + 4 * i + j for c in range(2) for i in range(2) for j in range(3)]
     A, covariance = sign * fit.M[:, :, :3], fit.camera_covariance[np.ix_(rows, rows)]
     few = 2 * case.problem.used.sum() < 40
@@ -260,11 +261,12 @@ def _jaws(case: Case) -> Iterator[Hypothesis]:
         return
     opening = np.linalg.norm(x[:, 2] - x[:, 1], axis=1)
     n, place = jaws / np.sqrt(squares), x[:, 1:] - x[:, 1:].mean(axis=(0, 1))
+    # Eight numbers of each jaw: length^-2, n^2, n, and its place along itself.  Means of stretches of time have less noise.
     told = np.dstack([(1 / squares) / (1 / squares).mean(axis=0), n**2, n, (jaws * place).sum(axis=2) / squares[..., 0]])
-    opened = np.vander((opening - opening.mean()) / max(opening.std(), 1e-9), 3)
-    each = int(np.clip(len(x) / _STRETCHES, 1, 100))  # samples whose mean has less noise, and tells as much
-    rows = np.column_stack([opened, told.reshape(-1, 16)])[: len(x) // each * each].reshape(-1, each, 19).mean(axis=1)
-    rest = (rows[:, 3:] - rows[:, :3] @ np.linalg.lstsq(rows[:, :3], rows[:, 3:], rcond=None)[0]).reshape(-1, 8)
+    each = int(np.clip(len(x) / _STRETCHES, 1, 100))
+    both = np.vander((opening - opening.mean()) / max(opening.std(), 1e-9), 3), told.reshape(len(x), -1)
+    opened, told = (v[: len(x) // each * each].reshape(-1, each, v.shape[1]).mean(axis=1) for v in both)
+    rest = (told - opened @ np.linalg.lstsq(opened, told, rcond=None)[0]).reshape(-1, 8)  # what the opening leaves
     length, turns, others = rest[:, 0], rest[:, 1:4], rest[:, 4:]
     along, common = np.maximum((turns**2).sum(axis=0), 1e-12), turns.T @ length
     k = (common**2 / along).argmax()
@@ -276,8 +278,7 @@ def _jaws(case: Case) -> Iterator[Hypothesis]:
     most = min((1 - _MOST_OF_IT) * total, _ODD**2 * len(rest), 1.1 * otherwise @ otherwise)  # which has three numbers more
     if abs(slope) >= max(_LEAST_SCALED, _SURE_SCALED * sd) and turns[:, k].std() >= _TURNED and left @ left <= most:
         scale = float((1 - slope / (slope * (n[..., k] ** 2).mean() - 1)) ** -0.5)
-        text = "The jaws' lengths in the log change with their direction. "
-        text += f"They hardly change if the robot's {'xyz'[k]} is divided by {scale:.3f}."
+        text = f"The jaw lengths change with direction. They would not if the robot's {'xyz'[k]} were divided by {scale:.3f}."
         size = scale, sd * scale / 2, "times", float(1 - left @ left / total)
         yield Hypothesis("scaled_axis", text, _SCALE.format("xyz"[k]), *size, float(0.5 * (slope / sd) ** 2 - 1.5))
 

@@ -17,6 +17,7 @@ from lib.calibration.offsets import rows_axes
 from lib.calibration.robust import tightest_sample
 from lib.calibration.timing import Paths
 from lib.correspondences import Correspondences
+from lib.geometry import cross
 from lib.recordings import Kinematics
 
 SIDES = ("left", "right")
@@ -146,7 +147,7 @@ class Problem:
         """Columns for `fit`: the pixels' change by the inverse of a working distance, 1/mm, about the image's centre (2,)."""
 
         def columns(M: np.ndarray) -> np.ndarray:
-            normal = np.cross(M[:, 0, :3], M[:, 1, :3])
+            normal = cross(M[:, 0, :3], M[:, 1, :3])
             normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
             pixel = np.einsum("cij,ncj->nci", M[:, :, :3], self.x) + M[:, :, 3] - centre_px
             return -(np.einsum("ncj,cj->nc", self.x, normal)[:, :, None] * pixel)[..., None]
@@ -204,9 +205,8 @@ class Problem:
         design = self._overcount(r * root)
         inverse = np.linalg.inv(information) * np.outer(scale, scale) * design
         offset_sd = np.sqrt(np.diag(inverse)[16:25].reshape(3, 3).sum(axis=1))
-        additions = (beta[25:], inverse[25:, 25:])
-        offsets = (beta[16:25].reshape(3, 3), offset_sd)
-        return Robust(M, *additions, *offsets, inverse[:16, :16], r, tuple(shapes), likelihood, penalty, design)
+        found = beta[25:], inverse[25:, 25:], beta[16:25].reshape(3, 3), offset_sd, inverse[:16, :16]
+        return Robust(M, *found, r, tuple(shapes), likelihood, penalty, design)
 
     def _overcount(self, z: np.ndarray) -> float:
         """Variance of the sums of weighted residuals z (n, 2, 2) over stretches of frames, over that of independent ones."""
@@ -240,9 +240,8 @@ class Hypothesis:
 class Case:
     """The rows, the fit `null` of "nothing is wrong", the best fit of each hypothesis, and what the hypotheses share.
 
-    `paths` are those of the landmarks in time: of the robot's log, else of the rows themselves where the frames follow each
-    other closely enough, else None.  `log` (m, k, 3) is the robot's, or has the rows' positions.  `size` is (width, height)
-    of the images, None if unknown; `frames` their number.
+    `paths` are the landmarks' in time: of the robot's log, else of the rows where the frames follow each other closely, else
+    None.  `log` (m, k, 3) has the robot's positions, else the rows'.  `size` is (width, height) or None; `frames` a number.
     """
 
     def __init__(
@@ -288,7 +287,6 @@ class Case:
     def chosen(self, x: np.ndarray) -> tuple[Robust, Problem, np.ndarray]:
         """Each frame with the positions among x (t, n, 3) that suit it best: the fit, its rows, the choices (frames,)."""
         problem, fit = self.problem, self.null
-        x = np.where(np.isfinite(x).any(axis=0), x, problem.x[:, 0])  # beside a gap of the log nothing is known
         for _ in range(5):
             r2 = ((problem.y - np.einsum("cij,tnj->tnci", fit.M[:, :, :3], x) - fit.M[:, :, 3]) ** 2).sum(axis=3)
             loss = np.where(problem.used, np.nan_to_num(np.log1p(r2 / fit.shapes[0].scale ** 2), nan=1e3), 0.0).sum(axis=2)

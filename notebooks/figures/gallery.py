@@ -40,4 +40,7 @@ def renew_gallery(run: Path) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser("python -m notebooks.figures.gallery", description="Renew the README's pictures.")
     parser.add_argument("run", type=Path, metavar="RUN", help="the folder of a run of all notebooks")
-    renew_gallery(parser.parse_args().run)
+    try:
+        renew_gallery(parser.parse_args().run)
+    except OSError as error:
+        parser.error(str(error))

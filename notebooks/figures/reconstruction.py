@@ -495,7 +495,7 @@ def sparsification(curves: dict[str, dict[str, tuple[float, np.ndarray]]], kept:
     return page
 
 
-def recorded_table(recorded: Mapping[str, Table], caption: str) -> HTML:
+def recorded_errors(recorded: Mapping[str, Table], caption: str) -> HTML:
     """Recorded surface errors with true cameras (`surfaces`) and with calibrated ones (`calibrated_surfaces`)."""
     def numbers(values) -> list[str]:
         return [f"{value:.1f}" if np.isfinite(value) else "" for value in values]

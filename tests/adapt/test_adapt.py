@@ -11,7 +11,7 @@ import pytest
 from lib.adapt import RefusalError, adapt, loop, report, teach, teacher
 from lib.adapt.judging import Agreement, better, stretches
 from lib.adapt.looking import Seen, at_rest, look, look_elsewhere
-from lib.calibration.offsets import tool_axes
+from lib.calibration.offsets import Unsettled, tool_axes
 from lib.correspondences import DataError
 from lib.landmarks import Detector, Landmarks
 from lib.recordings.annotations import Annotations, write_coco
@@ -652,13 +652,13 @@ def test_gain_is_judged_frame_by_frame():
 
 
 def test_of_few_labels_only_the_offsets_may_go_on_for_ever(monkeypatch):
-    def warned(text):
-        return lambda *_, **__: warnings.warn(text, RuntimeWarning, stacklevel=2)
+    def warned(kind):
+        return lambda *_, **__: warnings.warn("numbers", kind, stacklevel=2)
 
     few = SimpleNamespace(frame=[0])
-    monkeypatch.setattr(teacher, "_fitted", warned("overflow"))
-    with pytest.warns(RuntimeWarning, match="overflow"):
+    monkeypatch.setattr(teacher, "_fitted", warned(RuntimeWarning))
+    with pytest.warns(RuntimeWarning, match="numbers"):
         teacher._by_labels(None, few)
-    monkeypatch.setattr(teacher, "_fitted", warned("offsets: they still move"))
+    monkeypatch.setattr(teacher, "_fitted", warned(Unsettled))
     with warnings.catch_warnings(action="error"):
         teacher._by_labels(None, few)

@@ -218,9 +218,9 @@ def test_recorded_studies_are_tabled():
     table = figures.recorded_speeds(recorded, "Speeds.").data
     timed = sum(bool(row["width_px"] and np.isfinite(row["all_median_px"])) for row in recorded["matching"].rows)
     assert table.count("<tr") == 1 + timed + sum(len(recorded[k]) for k in ("l1_solver", "reconstruction_speed"))
-    empty = figures.recorded_table({}, "Errors."), figures.recorded_speeds({}, "Speeds.")
+    empty = figures.recorded_errors({}, "Errors."), figures.recorded_speeds({}, "Speeds.")
     assert not any("<td" in page.data for page in empty)
-    assert figures.recorded_table(recorded, "Errors.").data.count("<tr") > 1
+    assert figures.recorded_errors(recorded, "Errors.").data.count("<tr") > 1
 
 
 def test_every_figure_draws(scene, result):

@@ -107,7 +107,7 @@ def test_an_axis_that_cameras_absorb_is_told_by_the_jaws(axis, scale, seed):
     scene.edit_report.append(lambda scene, t, x: x * np.where(np.array(list("xyz")) == axis, scale, 1.0))
     best = found(scene.take()).best
     assert best.name == "scaled_axis" and best.value == pytest.approx(scale, abs=0.01)
-    assert "jaws' lengths" in best.text and f"robot's {axis} is" in best.text
+    assert "jaw lengths" in best.text and f"robot's {axis} were" in best.text
     assert best.cure.startswith(f"Check the units and the scale of the {axis} columns")
     assert best.explained > 0.5
 
@@ -146,7 +146,7 @@ def test_jaws_of_other_lengths_accuse_no_axis(edit):
     scene = Scene(np.random.default_rng(0), frames=20, fps=3.0)
     scene.edit_report.append(edit)
     axes = [h for h in found(scene.take()).hypotheses if h.name == "scaled_axis"]
-    assert not any("jaws' lengths" in h.text for h in axes)
+    assert not any("jaw lengths" in h.text for h in axes)
 
 
 def test_a_mirrored_image_is_no_scaled_axis():
