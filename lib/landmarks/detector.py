@@ -283,12 +283,9 @@ class Detector:
 
     def coarse(self, images: ArrayLike) -> Landmarks:
         """Landmarks by the first stage alone."""
-        return self._in_image(self.frame_peaks(images), self.frame_stride(np.asarray(images))).without_unsure()
-
-    def _in_image(self, peaks: Peaks, stride: np.ndarray) -> Landmarks:
-        """Peaks of the first stage as landmarks of the image."""
-        found = self._measured(peaks, None, "frame")
-        return Landmarks(image_from_cell(found.u, stride), found.covariance * np.outer(stride, stride), found.confidence)
+        found, stride = self._measured(self.frame_peaks(images), None, "frame"), self.frame_stride(np.asarray(images))
+        u, covariance = image_from_cell(found.u, stride), found.covariance * np.outer(stride, stride)
+        return Landmarks(u, covariance, found.confidence).without_unsure()
 
     def searched(
         self, images: np.ndarray, rough: Landmarks, seen: tuple | None = None, avoid: np.ndarray | None = None, *,
@@ -307,34 +304,35 @@ class Detector:
         height = self._shown(seen or self.stage_peaks(images, rough.u, "tool"), len(images))[1]
         searched = (height < _SHOWN) | (avoid is not None)
         for i in np.flatnonzero(searched):
-            candidates, u, once = self.swept(images[i]) if sweep else self.proposed(images[i], rough[i : i + 1])
+            tools, u, once = self.swept(images[i]) if sweep else self.proposed(images[i], rough.u[i : i + 1])
             best = np.argsort(-likelihood(u, once, avoid))[:_AGAIN]
             u, twice = self._looked(images[i], u[best], "again")
             scores = likelihood(u, twice, avoid)
             chosen = scores.argmax()
             there = np.isfinite(scores[chosen])
-            result._put(np.array([i]), candidates[best[[chosen]]] if there else Landmarks.none(1))
+            found = tools[best[[chosen]]] if there else np.full((1, 3, 2), np.nan)
+            result._put(np.array([i]), replace(Landmarks.none(1), u=found))
             height[i] = twice[chosen] if there else 0.0
         unsure = searched | (rough.confidence < _SURE).any(1)
         return replace(result, confidence=np.where(unsure[:, None], _SURE * height[:, None], rough.confidence))
 
-    def proposed(self, image: np.ndarray, *others: Landmarks) -> tuple[Landmarks, np.ndarray, np.ndarray]:
-        """Tools that an image (h, w, 3) may show: `others` and those that the first stage's peaks make; u (m, 3, 2) px of
-        what a look at each shows, and the mean height (m,) of the peaks there.
-        """
-        peaks, found, one = [], [], image[None]
-        for scale in _SCALES:
-            stride, heatmaps = self.frame_stride(one, scale), self.outputs(self.reduced(one, scale), "frame")
-            peaks += several_peaks(heatmaps, PEAKS, self.frame_network.stride, self.method)
-            found += [self._in_image(part, stride) for part in peaks[-PEAKS:]]
-        every = Landmarks.join(found)
-        height = torch.cat([part.value for part in peaks]).numpy()
-        which = best_tools(every.u, height, _CANDIDATES) if height.max() > _NOTHING else np.zeros((0, 3), int)
-        at = which, np.arange(3)
-        candidates = Landmarks.join([*others, Landmarks(every.u[at], every.covariance[at], every.confidence[at])])
-        return candidates, *self._looked(image, candidates.u, "tool")
+    def proposed(self, image: np.ndarray, *others: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Tools u (m, 3, 2) px that an image (h, w, 3) may show: `others`, and those that the first stage's peaks make.
 
-    def swept(self, image: np.ndarray) -> tuple[Landmarks, np.ndarray, np.ndarray]:
+        Also what a look at each of them shows, u (m, 3, 2) px and the mean height (m,) of the peaks there.
+        """
+        u, height, one = [], [], image[None]
+        for scale in _SCALES:
+            heatmaps = self.outputs(self.reduced(one, scale), "frame")
+            at, value = several_peaks(heatmaps, PEAKS, self.frame_network.stride)
+            u.append(image_from_cell(at, self.frame_stride(one, scale)))
+            height.append(value)
+        u, height = np.concatenate(u), np.concatenate(height)
+        which = best_tools(u, height, _CANDIDATES) if height.max() > _NOTHING else np.zeros((0, 3), int)
+        tools = np.concatenate([*others, u[which, np.arange(3)]])
+        return tools, *self._looked(image, tools, "tool")
+
+    def swept(self, image: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """As `proposed`, but by the second stage, which sees the whole image (h, w, 3) at some scales and turns."""
         tools, height, sides = [], [], np.array(image.shape[1::-1])
         for length, turn in product(_SWEPT, (2 * np.pi * np.arange(_TURNS) / _TURNS).tolist()):
@@ -342,13 +340,12 @@ class Detector:
             size = np.ceil(zoom * (np.array([[c, s], [s, c]]) @ sides)).astype(int)
             matrix = view.window_from_image((sides - 1) / 2, turn, size, zoom)
             heatmaps = self.outputs(view.cut(image, matrix, size)[None], "tool")
-            peaks = several_peaks(heatmaps, PEAKS, self.tool_network.stride, self.method)
-            u, value = (torch.cat([getattr(part, name) for part in peaks]).numpy() for name in ("u", "value"))
+            u, value = several_peaks(heatmaps, PEAKS, self.tool_network.stride)
             at = best_tools(u, value, PEAKS), np.arange(3)
             tools.append(view.unmapped(matrix[None], u[at].reshape(-1, 2)).reshape(-1, 3, 2))
             height.append(np.clip(value[at], 0, 1).mean(axis=1))
         u = np.concatenate(tools)
-        return replace(Landmarks.none(len(u)), u=u), u, np.concatenate(height)
+        return u, u, np.concatenate(height)
 
     def _looked(self, image: np.ndarray, u: np.ndarray, stage: str) -> tuple[np.ndarray, np.ndarray]:
         """`_shown` of several tools u (n, 3, 2) in one image."""

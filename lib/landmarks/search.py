@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from lib.landmarks.heatmaps import SIGMA_PX, Peaks, decode, sigma_cells
+from lib.landmarks.heatmaps import SIGMA_PX, decode, sigma_cells
 from lib.landmarks.metrics import tool_length_px
 
 #: Peaks that are taken from each heatmap.
@@ -16,16 +16,18 @@ _PLACE = 0.5
 _OPEN = 0.25
 
 
-def several_peaks(heatmaps: torch.Tensor, n: int, stride: int, method: str) -> list[Peaks]:
-    """The `n` highest peaks of every heatmap (m, k, h, w), more than 3 sigma apart; `stride` and `method` as for `decode`."""
+def several_peaks(heatmaps: torch.Tensor, n: int, stride: int) -> tuple[np.ndarray, np.ndarray]:
+    """Centroids (n m, k, 2) px and heights (n m, k) of the `n` highest peaks of every heatmap (m, k, h, w), more than 3 sigma
+    apart; `stride` as for `decode`.
+    """
     rows, columns = (torch.arange(side, dtype=heatmaps.dtype) for side in heatmaps.shape[-2:])
     found = []
     for _ in range(n):
-        found.append(decode(heatmaps, stride, method=method))
+        found.append(decode(heatmaps, stride, method="paper"))  # a window, which shows more, is looked at next
         x, y = (((found[-1].u - (stride - 1) / 2) / stride)[..., None, None]).unbind(2)
         near = (columns - x) ** 2 + (rows[:, None] - y) ** 2 < (3 * sigma_cells(stride, SIGMA_PX)) ** 2
         heatmaps = heatmaps.masked_fill(near, -1.0)
-    return found
+    return torch.cat([peaks.u for peaks in found]).numpy(), torch.cat([peaks.value for peaks in found]).numpy()
 
 
 def best_tools(u: np.ndarray, height: np.ndarray, n: int) -> np.ndarray:

@@ -175,9 +175,9 @@ def make_proposals(path: Path, scenes: Path, detector: str | Path | None) -> Non
             image = cv2.imdecode(piece, cv2.IMREAD_COLOR_RGB)
             if rng.random() < 0.5:
                 image = disguised(image, u[i], visibility[i], rng, float(tool_length_px(u[i])))[0]
-            seen, _, height = searching.proposed(image)
+            tools, _, height = searching.proposed(image)
             best = np.argsort(-height)[:PROPOSALS]
-            found[i, : len(best)] = seen.u[best]
+            found[i, : len(best)] = tools[best]
     with whole(path) as partial:
         np.savez(partial, u=found)
 

@@ -15,8 +15,8 @@ TOOL = np.array([[40.0, 50.0], [80.0, 40.0], [80.0, 60.0]])
 
 def test_the_second_peak_is_found_once_the_first_is_taken_out():
     heatmaps = render(torch.tensor([[[20.0, 30.0]]]), (64, 96), 4) + 0.6 * render(torch.tensor([[[70.0, 33.0]]]), (64, 96), 4)
-    _, second = several_peaks(heatmaps, 2, 4, "gauss_newton")
-    assert np.allclose(second.u, [70, 33], atol=0.1) and abs(second.value.item() - 0.6) < 0.1
+    u, height = several_peaks(heatmaps, 2, 4)
+    assert np.allclose(u[:, 0], [[20, 30], [70, 33]], atol=0.5) and np.allclose(height[:, 0], [1.0, 0.6], atol=0.1)
 
 
 def test_a_tool_needs_equal_jaws_and_the_tips_on_their_sides():
@@ -48,8 +48,8 @@ def test_an_image_starts_from_the_tool_that_its_window_shows_best(monkeypatch):
     rough = Landmarks.join(sure_and_unsure)  # whether the first stage is sure of a wrong one does not matter
 
     def proposed(self, image, *others):
-        tools = Landmarks.join([*others, landmarks(np.stack([TOOL + 90, TOOL]), 0.1)])
-        return tools, *shown(tools.u, len(tools))
+        tools = np.concatenate([*others, np.stack([TOOL + 90, TOOL])])
+        return tools, *shown(tools, len(tools))
 
     def shown(seen, n):
         return seen, np.where(np.linalg.norm(seen - TOOL, axis=2).max(1) < 20, 0.8, 0.2)
@@ -75,9 +75,9 @@ def test_the_second_stage_sweeps_the_whole_image_and_gives_places_in_its_pixels(
 
     monkeypatch.setattr("lib.landmarks.windows.cut", cut)
     monkeypatch.setattr(Detector, "outputs", outputs)
-    candidates, u, height = detector.swept(np.zeros((360, 640, 3), np.uint8))
+    tools, u, height = detector.swept(np.zeros((360, 640, 3), np.uint8))
     sharp = height > 0.9
-    assert len(candidates) == len(u) == len(height) and sharp.sum() >= 6
+    assert len(tools) == len(u) == len(height) and sharp.sum() >= 6
     assert np.abs(u[sharp] - tool).max() < 1.0
     corners = np.array([[0, 0], [639, 0], [0, 359], [639, 359]])
     for matrix, size in cuts:  # nothing of the image is left out

@@ -75,7 +75,7 @@ def test_a_tool_that_the_first_stage_overlooks_is_found_by_sweeping(shipped, mon
         return Landmarks.none(len(images))
 
     monkeypatch.setattr(type(shipped.torch), "coarse", blind)
-    monkeypatch.setattr(type(shipped.torch), "proposed", lambda self, image, *others: (others[0], others[0].u, np.zeros(1)))
+    monkeypatch.setattr(type(shipped.torch), "proposed", lambda self, image, *others: (*others, *others, np.zeros(1)))
     found = shipped.torch(shipped.images[:2])
     error = np.linalg.norm(found.u - shipped.u[:2], axis=2) / tool_length_px(shipped.u[:2])[:, None]
     assert (error < 0.05).all() and (found.confidence > 0.3).all() and (found.confidence <= 0.5).all()

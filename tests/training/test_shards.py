@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lib.landmarks import Landmarks
 from lib.training import shards
 from lib.training.samples import LabelledImage
 from lib.training.sources import CloseupSource
@@ -73,7 +72,7 @@ def test_proposals_are_found_once_and_missing_ones_are_nan(monkeypatch, tmp_path
 
         def proposed(self, image):
             u = np.stack([np.full((3, 2), 1.0), np.full((3, 2), 2.0)])
-            return Landmarks(u, np.zeros((2, 3, 2, 2)), np.ones((2, 3))), u, np.array([0.1, 0.9])
+            return u, u, np.array([0.1, 0.9])
 
     monkeypatch.setattr(shards.Detector, "load", lambda name: Proposing())
     image = LabelledImage("a", np.full((90, 160, 3), 90, np.uint8), np.full((3, 2), 40.0), np.full(3, 2))
