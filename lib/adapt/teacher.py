@@ -75,23 +75,23 @@ def longest_still(recording: Recording, seen: Seen) -> tuple[np.ndarray, str]:
     problem = Problem.of(rows)
     if problem.used.sum() < 60 or len(frames) < 24:
         return frames, ""
-    count, centre_px = len(frames), (np.array(recording.image_size_px) - 1) / 2
+    count = len(frames)
 
     @cache
-    def total(first: int, last: int, near: bool) -> float:
-        """Log likelihood of cameras of these frames' own; `near`: of a finite distance, whose curvature looks like a move."""
-        part = Problem.of(rows.of_frames(frames[first:last]))
-        return part.fit(part.perspective(centre_px) if near else None).total if part.used.sum() >= 16 else -np.inf
+    def total(first: int, last: int) -> float:
+        """Log likelihood of cameras of these frames' own."""
+        part = Problem.of(rows.of_frames(frames[first:last]), recording.image_size_px)
+        return part.fit().total if part.used.sum() >= 16 else -np.inf
 
-    def gain(cut: int, near: bool = False) -> float:
-        return total(0, cut, near) + total(cut, count, near) - total(0, count, near)
+    def gain(cut: int) -> float:
+        return total(0, cut) + total(cut, count) - total(0, count)
 
     cut = max(np.unique(np.linspace(0.15, 0.85, 8) * count).astype(int), key=gain)
     for step in (max(count // 16, 1), 1, 1):
         cut = max((cut, cut - step, cut + step), key=gain)
     # Cameras of their own have 16 numbers more, and the cut could lie anywhere.
     least = 16 * np.log(problem.used.sum()) / 2 + 12 + _SURE_MOVE * problem.used.sum()
-    if gain(cut) < least or gain(cut, near=True) < least:
+    if gain(cut) < least:
         return frames, ""
     kept = frames[:cut] if cut >= count - cut else frames[cut:]
     return kept, f"The cameras moved at about frame {frames[cut]}: only frames {kept[0]} to {kept[-1]} are used."

@@ -118,18 +118,7 @@ def read_shards(folder: str | Path, kind: str, names: Sequence[str], first: int 
             if parts[name] and array.shape[1:] != parts[name][0].shape[1:]:
                 raise ValueError(f"{path}: its images have another size; keep images of one size in a folder.")
             parts[name].append(array)
-    return [_joined(parts.pop(name)) for name in names]
-
-
-def _joined(parts: list[np.ndarray]) -> np.ndarray:
-    """Concatenated; each part is released as soon as it is copied, so that gigabytes are never held twice."""
-    end = sum(map(len, parts))
-    result = np.empty((end, *parts[0].shape[1:]), parts[0].dtype)
-    while parts:
-        part = parts.pop()
-        end -= len(part)
-        result[end : end + len(part)] = part
-    return result
+    return [np.concatenate(parts.pop(name)) for name in names]
 
 
 def packed(images: Iterable[LabelledImage], long_side_px: int | None = None) -> tuple[np.ndarray, ...]:

@@ -45,7 +45,7 @@ def _refined(
     """Gauss-Newton on the shift of the clock (and its rate): the fit, its rows, values and standard deviations."""
     time, views = case.problem.time - np.median(case.problem.time), list(views)
     powers = np.ones((1, len(time))) if rate is None else np.stack([np.ones(len(time)), time])
-    value, M = np.array([shift] if rate is None else [shift, rate - 1.0]), None
+    value, start = np.array([shift] if rate is None else [shift, rate - 1.0]), None
     for _ in range(6):
         later = value @ powers
         x, velocity = case.problem.x.copy(), np.zeros_like(case.problem.x)
@@ -54,8 +54,8 @@ def _refined(
         problem = replace(case.problem, x=np.where(np.isfinite(velocity), x, np.nan))
         if problem.used.all(axis=1).sum() < 6:
             return None
-        fit = problem.fit(lambda M, v=velocity: np.einsum("cij,ncj,kn->ncik", M[:, :, :3], v, powers), start=M)
-        M, sd = fit.M, np.sqrt(np.diag(fit.covariance))
+        fit = problem.fit(lambda M, v=velocity: np.einsum("cij,ncj,kn->ncik", M[:, :, :3], v, powers), start=start)
+        start, sd = fit.start, np.sqrt(np.diag(fit.covariance))
         if (np.abs(fit.theta) < 0.1 * sd).all():
             break
         value = value + np.clip(fit.theta, -0.1, 0.1)

@@ -64,20 +64,18 @@ def _tip_order(case: Case) -> Iterator[Hypothesis]:
     yield case.found("tip_order", fit, 1, (100 * own.mean(), 0.0, "%"), text, cure, on=moved, raw=raw)
 
 
-def _finite_distance(case: Case) -> Iterator[Hypothesis]:
-    """A perspective that an affine camera has not."""
-    problem = case.problem
-    centre = (np.asarray(case.size, dtype=float) - 1) / 2 if case.size else np.nanmedian(problem.y, axis=(0, 1))
-    fit, value, sd = case.linear(problem.perspective(centre))
+def _finite_distance(case: Case, fit: Robust) -> Iterator[Hypothesis]:
+    """A perspective that an affine camera has not, beside the best cause so far."""
+    value, sd = fit.nearness
     far = f"by a working distance of {1 / value:.0f} mm" if value > 0 else "the wrong way, as in a mirrored image"
     text = f"The residuals are curved {far}: 1/distance is {value:.5f} +- {sd:.5f} per mm."
     cure = "Calibrate with model='near_affine' (--model near_affine on the command line)."
-    yield case.found("finite_distance", fit, 1, (value, sd, "1/mm"), text, cure)
+    yield case.found("finite_distance", fit, 1, (value, sd, "1/mm"), text, cure, raw=0.5 * fit.design * (value / sd) ** 2)
 
 
 def _landmark_offset(case: Case) -> Iterator[Hypothesis]:
     """Landmarks that the robot reports far beside where they are seen, always in the tool's same direction."""
-    free = replace(case.problem, offset_sd=1.0).fit(start=case.null.M)
+    free = replace(case.problem, offset_sd=1.0).fit(start=case.null.start)
     size = 1e3 * np.linalg.norm(free.offsets, axis=1)
     k = int(size.argmax())
     if size[k] >= 150:
@@ -129,7 +127,7 @@ def _bad_part(case: Case) -> Iterator[Hypothesis]:
         inside, outside = problem.used & rows[:, None], problem.used & ~rows[:, None]
         if not inside.any() or not outside.any():
             continue
-        fit = problem.fit(start=case.null.M, apart=rows)
+        fit = problem.fit(start=case.null.start, apart=rows)
         distance = np.linalg.norm(fit.residuals, axis=2)
         ratio = float(np.median(distance[inside]) / max(np.median(distance[outside]), 1e-3))
         if ratio >= 3.0:
@@ -192,14 +190,14 @@ def _frozen(case: Case) -> Iterator[Hypothesis]:
     if frozen.mean() >= 0.02:
         text = "the robot's positions stand still, or run on an exact straight line, while the tool moves in the images"
         cure = "Log the robot at every sample; where it was silent leave the cells blank, so that these frames are not used."
-        fit = problem.fit(start=case.null.M, apart=np.isin(problem.frame, np.flatnonzero(frozen) + 1))
+        fit = problem.fit(start=case.null.start, apart=np.isin(problem.frame, np.flatnonzero(frozen) + 1))
         yield certain("frozen_kinematics", fit, frozen, text, cure)
     noise = min(fit.shapes[0].scale for fit in (case.null, *case.fits.values()))
     twice = (step_x > 1e-6) & (step_y >= 0) & (step_y < 0.15 * noise)
     if twice.mean() >= 0.02 and not twice.all():  # each image belongs to the instant at which it was first seen
         source = np.maximum.accumulate(np.where(np.append(True, ~twice), np.arange(case.frames), 0))[problem.frame]
         first = np.repeat(x[source, np.minimum(problem.landmark, 2)][:, None], 2, axis=1)
-        fit = replace(problem, x=first).fit(start=case.null.M)
+        fit = replace(problem, x=first).fit(start=case.null.start)
         text = "the detections repeat those of the frame before while the robot moves"
         cure = "Drop images that the camera delivered twice, and give the others their own times in frames.csv."
         yield certain("frozen_video", fit, twice, text, cure)
@@ -217,12 +215,12 @@ def _rigid_tips(case: Case) -> Iterator[Hypothesis]:
     for _ in range(8):
         d = np.einsum("cij,nj->nci", fit.M[:, :, :3], problem.axes[:, :, 1]) * side[:, None, None]
         weight = np.where(problem.used, 1.0 / (fit.shapes[0].scale ** 2 + (fit.residuals**2).sum(axis=2)), 0.0)[:, :, None]
-        seen = problem.y - np.einsum("cij,ncj->nci", fit.M[:, :, :3], problem.x) - fit.M[:, :, 3]
+        seen = problem.missed(fit, problem.x)
         information = np.bincount(problem.frame, (weight * d * d).sum(axis=(1, 2)), case.frames)
         opening = np.bincount(problem.frame, np.nansum(weight * d * seen, axis=(1, 2)), case.frames) / (information + sd**-2)
         sd = max(float(np.sqrt((opening**2 + 1.0 / (information + sd**-2)).mean())), 1e-3)
         x = problem.x + (side * opening[problem.frame])[:, None, None] * problem.axes[:, None, :, 1]
-        fit = replace(problem, x=x).fit(start=fit.M, rounds=10)
+        fit = replace(problem, x=x).fit(start=fit.start, rounds=10)
     size = 2.0 * float(opening.std())
     text = f"The robot reports tips {width.mean():.2f} mm apart, always; in the images this varies by {size:.2f} mm."
     cure = "Log the opening of the jaws with the robot's pose, or calibrate with the base alone."
@@ -379,7 +377,7 @@ class Diagnosis:
 
 def diagnose(
     data: Correspondences, *, kinematics: Kinematics | None = None, offset_s: float = 0.0, readout_s: float = 0.0,
-    image_size_px: tuple[int, int] | None = None,
+    image_size_px: tuple[int, int] | None = None, near: bool = False,
 ) -> Diagnosis:  # fmt: skip
     """Fit every hypothesis about what could be wrong, and rank them.
 
@@ -388,6 +386,7 @@ def diagnose(
         kinematics: The robot's log, which tells where the tool was a little earlier or later.  Without it the rows' own
             positions do, where the frames follow each other within 0.25 s.
         offset_s, readout_s, image_size_px: As the recording states them; without a size nothing is said of the read-out time.
+        near: The cameras that were calibrated have a finite distance, so that it is no fault.
 
     >>> from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
     >>> rng = np.random.default_rng(0)
@@ -399,7 +398,7 @@ def diagnose(
     frames = np.unique(data.frame)
     if len(data) > _MOST_ROWS:  # a part of the time: neighbours tell of clocks, and which part hardly matters
         data = data.of_frames(frames[np.linspace(0, len(frames) - 1, int(len(frames) * _MOST_ROWS / len(data))).astype(int)])
-    problem = Problem.of(data)
+    problem = Problem.of(data, image_size_px)
     few = problem.used.all(axis=1).sum() < 6
     if len(frames) < _FEWEST_FRAMES or (few and len(data) < 12):
         return Diagnosis()
@@ -412,13 +411,14 @@ def diagnose(
         text, cure = "All frames show one picture, while the robot moves.", "Check that the cameras deliver, and record anew."
         return Diagnosis((Hypothesis("frozen_video", text, cure, 100.0, 0.0, "%", 1.0, float(len(data))),))
     case = Case(problem, kinematics, offset_s, readout_s, image_size_px)
-    tests = [_tip_order, _finite_distance, _landmark_offset, _tool_bends, _drift, _bad_part, _camera_moved, _frozen]
+    tests = [_tip_order, _landmark_offset, _tool_bends, _drift, _bad_part, _camera_moved, _frozen]
     tests = [*(TIME_TESTS if case.paths else ()), *tests, _rigid_tips]
     found = [h for test in tests for h in test(case) if np.isfinite(h.gain)]
     best = Diagnosis(found := compared(found)).best
     fit = case.null if best is None else case.fits.get(best.name, case.null)
     turned = best is not None and best.name == "turned_image" and len(best.images) == 2  # then left is right
-    found += [h for h in _optics(case, fit, -1.0 if turned else 1.0) if np.isfinite(h.gain)]
+    more = [] if near else list(_finite_distance(case, fit))
+    found += [h for h in (*more, *_optics(case, fit, -1.0 if turned else 1.0)) if np.isfinite(h.gain)]
     best = Diagnosis(found).best
     found += _unexplained(case, case.null if best is None else case.fits.get(best.name, fit))
     return Diagnosis(tuple(sorted(found, key=lambda h: -h.gain)))

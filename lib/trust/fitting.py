@@ -1,7 +1,8 @@
 """A hypothesis about a recording's fault: affine cameras and additions, fitted under heavy-tailed noise, and its evidence.
 
 Each image's residual of a row has a bivariate Student t density whose scale and degrees of freedom are fitted too, so that
-30 % of wrong landmarks hide nothing.  Landmarks may have constant offsets in the tool's axes, with a prior.
+30 % of wrong landmarks hide nothing.  Landmarks may have constant offsets in the tool's axes, and the cameras a finite
+distance, both with a prior: whatever else is wrong, every microscope has these.
 """
 
 from collections.abc import Callable
@@ -27,9 +28,10 @@ _LEAST_GAIN, _LEAST_EXPLAINED = 6.0, 0.02  # of a hypothesis that is named
 FITS = 0.03  # the scale of the residuals over the spread of the pixels, below which cameras fit
 _LEAST_PX = 0.02  # smaller residuals are rounding
 _OFFSET_SD_MM = 0.03  # of what a detector marks beside a landmark
+_NEARNESS_SD = 0.006  # of 1/distance, per mm: a microscope stands 150 mm away and more
 _BLOCK = 8  # frames over which residuals may be correlated
 _LONGEST_S = 0.25  # between frames, whose own positions stand for the robot's log
-_PARAMETERS = 20  # of two affine cameras, and about as many of the nine offsets as data tell
+_PARAMETERS = 21  # of two cameras with a distance, and about as many of the nine offsets as data tell
 
 
 @dataclass(frozen=True)
@@ -66,21 +68,23 @@ class Shape:
 class Robust:
     """The fit of a problem."""
 
+    start: np.ndarray  # (26,) cameras, offsets and 1/distance, from which another fit may start
     M: np.ndarray  # (2, 2, 4) cameras on centred positions
     theta: np.ndarray  # (k,) additions, and their covariance
     covariance: np.ndarray
     offsets: np.ndarray  # (3, 3) mm of the landmarks, and (3,) their deviations
     offset_sd: np.ndarray
+    nearness: tuple[float, float]  # 1/distance, per mm, and its deviation
     camera_covariance: np.ndarray
     residuals: np.ndarray  # (n, 2, 2) px
     shapes: tuple[Shape, ...]
     likelihood: np.ndarray  # (n, 2) log density of each image's residual, 0 where it is not seen
-    penalty: float  # the same of the offsets' prior
+    penalty: float  # the same of the priors
     design: float  # by how much correlated rows overstate what they tell
 
     @property
     def total(self) -> float:
-        """Log likelihood with the prior of the offsets."""
+        """Log likelihood with the priors of offsets and distance."""
         return float(self.likelihood.sum() + self.penalty)
 
 
@@ -97,11 +101,12 @@ class Problem:
     landmark: np.ndarray
     time: np.ndarray
     centre: np.ndarray
+    centre_px: np.ndarray  # (2,) of the images
     offset_sd: float = _OFFSET_SD_MM  # of the landmarks, before the data
 
     @classmethod
-    def of(cls, data: Correspondences) -> Self:
-        """The rows that the robot reports and an image shows."""
+    def of(cls, data: Correspondences, size: tuple[int, int] | None = None) -> Self:
+        """The rows that the robot reports and an image shows, of `size`, (width, height) px."""
         rows = np.isfinite(data.x_mm).all(axis=1) & data.seen.any(axis=1)
         axes = np.nan_to_num(rows_axes(data))[rows]
         data = data.subset(rows)
@@ -113,7 +118,8 @@ class Problem:
         y = np.stack([data.u_left, data.u_right], axis=1)
         x = np.repeat((data.x_mm - centre)[:, None], 2, axis=1)
         frame = np.unique(data.frame, return_inverse=True)[1]
-        return cls(x, y, data.seen, noise, axes, frame, data.landmark, data.time_s, centre)
+        centre_px = (np.array(size) - 1) / 2 if size else np.nanmedian(y, axis=(0, 1)) if len(data) else np.zeros(2)
+        return cls(x, y, data.seen, noise, axes, frame, data.landmark, data.time_s, centre, centre_px)
 
     def __len__(self) -> int:
         return len(self.x)
@@ -127,55 +133,57 @@ class Problem:
         self, columns: Callable[[np.ndarray], np.ndarray] | None = None, *, start: np.ndarray | None = None,
         apart: np.ndarray | None = None, rounds: int = 40,
     ) -> Robust:  # fmt: skip
-        """Most probable cameras, offsets and additions, near the cameras `start` or the best sample of four rows.
+        """Most probable cameras, offsets and additions, near `start` (26,) or the best sample of four rows.
 
         `columns` gives the pixels' change by each addition, cameras M -> (n, 2, 2, k); rows `apart` (n,) have another noise.
         """
         apart = np.zeros(len(self), dtype=bool) if apart is None else apart
         if start is None:  # of least squares, or of the samples of four rows that most rows are near to
-            starts, rng = np.zeros((2, 2, 2, 4)), np.random.default_rng(0)
+            starts, rng = np.zeros((2, 26)), np.random.default_rng(0)
+            cameras = starts[:, :16].reshape(2, 2, 2, 4)
             for view, rows in enumerate(self.used.T):
                 if rows.sum() >= 4:
                     x, y = self.x[rows, view], self.y[rows, view]
-                    starts[0, view] = regress(x, y)
+                    cameras[0, view] = regress(x, y)
                     with suppress(ValueError):  # positions in one plane
-                        starts[1, view] = tightest_sample(x, y, rng)
-            start = max((self._descend(M, columns, apart, 8) for M in starts), key=lambda fit: fit.total).M
+                        cameras[1, view] = tightest_sample(x, y, rng)
+            start = max((self._descend(beta, columns, apart, 8) for beta in starts), key=lambda fit: fit.total).start
         return self._descend(start, columns, apart, rounds)
 
-    def perspective(self, centre_px: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-        """Columns for `fit`: the pixels' change by the inverse of a working distance, 1/mm, about the image's centre (2,)."""
+    def missed(self, fit: Robust, x: np.ndarray) -> np.ndarray:
+        """(..., n, 2, 2) px: what the cameras of a fit leave of the pixels at other positions x (..., n, 2, 3)."""
+        seen = np.einsum("cij,...cj->...ci", fit.M[:, :, :3], x) + fit.M[:, :, 3]
+        return self.y - seen - fit.nearness[0] * _shrinking(fit.M, x, seen - self.centre_px)
 
-        def columns(M: np.ndarray) -> np.ndarray:
-            normal = cross(M[:, 0, :3], M[:, 1, :3])
-            normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
-            pixel = np.einsum("cij,ncj->nci", M[:, :, :3], self.x) + M[:, :, 3] - centre_px
-            return -(np.einsum("ncj,cj->nc", self.x, normal)[:, :, None] * pixel)[..., None]
-
-        return columns
+    @cached_property
+    def _known_x(self) -> np.ndarray:
+        """`x`, 0 in images that are not used."""
+        return np.where(self.used[:, :, None], self.x, 0.0)
 
     @cached_property
     def _of_matrices(self) -> np.ndarray:
         """(n, 2, 2, 16): derivatives by the entries of the cameras, 0 in images that are not used."""
-        H = np.where(self.used[:, :, None], np.concatenate([self.x, np.ones((len(self), 2, 1))], axis=2), 0.0)
+        H = np.concatenate([self._known_x, self.used[:, :, None]], axis=2)
         return np.einsum("nck,cv,ij->ncivjk", H, np.eye(2), np.eye(2)).reshape(len(self), 2, 2, 16)
 
     def _design(self, M: np.ndarray, columns: Callable | None) -> np.ndarray:
-        """(n, 2, 2, p): derivatives by the 16 entries of M, 9 offsets (mm) and the additions; 0 in images not used."""
+        """(n, 2, 2, p): derivatives by the 16 entries of M, 9 offsets (mm), 1/distance, additions; 0 in images not used."""
         image = (M[:, :, :3].reshape(4, 3) @ self.axes).reshape(len(self), 2, 2, 1, 3)
         own = self.used[:, :, None] & (self.landmark[:, None, None] == np.arange(3))  # (n, 2, 3)
         parts = [self._of_matrices, (image * own[:, :, None, :, None]).reshape(len(self), 2, 2, 9)]
+        parts.append(_shrinking(M, self._known_x, self._of_matrices @ M.ravel() - self.centre_px)[..., None])
         parts += [] if columns is None else [np.where(self.used[:, :, None, None], np.nan_to_num(columns(M)), 0.0)]
         return np.concatenate(parts, axis=3)
 
-    def _descend(self, M: np.ndarray, columns: Callable | None, apart: np.ndarray, rounds: int) -> Robust:
+    def _descend(self, beta: np.ndarray, columns: Callable | None, apart: np.ndarray, rounds: int) -> Robust:
         used, y = self.used, np.where(self.used[:, :, None], self.y, 0.0)
         groups = [rows for rows in (used & ~apart[:, None], used & apart[:, None]) if rows.any()]
-        prior = np.repeat([0.0, self.offset_sd**-2], [16, 9])
-        r = np.where(used[:, :, None], y - np.einsum("cij,ncj->nci", M[:, :, :3], self.x) - M[:, :, 3], 0.0)
+        prior = np.repeat([0.0, self.offset_sd**-2, _NEARNESS_SD**-2], [16, 9, 1])
+        M = beta[:16].reshape(2, 2, 4)
+        r = y - self._design(M, None) @ beta
         r2 = (r**2).sum(axis=2) / self.noise**2
         # Few rows a parameter: a density with a sharp peak would fit some of them exactly.
-        rich = 2 * used.sum() / (20 if columns is None else 20 + columns(M).shape[3])
+        rich = 2 * used.sum() / (_PARAMETERS + (0 if columns is None else columns(M).shape[3]))
         least = 0.0 if rich > 10 else 2.0 if rich > 5 else 10.0
         shapes = [Shape.of(r2[rows], max(float(np.sqrt(np.median(r2[rows]))), _LEAST_PX), least) for rows in groups]
         before = -np.inf
@@ -186,7 +194,7 @@ class Problem:
             weight /= self.noise**2
             D, root = self._design(M, columns), np.sqrt(weight)[:, :, None]
             J = (D * root[:, :, :, None]).reshape(-1, D.shape[3])
-            information = J.T @ J + np.diag(np.append(prior, np.zeros(D.shape[3] - 25)))
+            information = J.T @ J + np.diag(np.append(prior, np.zeros(D.shape[3] - 26)))
             scale = 1.0 / np.sqrt(np.diag(information) + 1e-12)
             information = information * np.outer(scale, scale) + 1e-10 * np.eye(len(scale))  # an unseen addition stays 0
             beta = scale * np.linalg.solve(information, scale * (J.T @ (y * root).reshape(-1)))
@@ -196,7 +204,7 @@ class Problem:
             for i, rows in enumerate(groups):
                 shapes[i] = Shape.of(r2[rows], shapes[i].scale, least, shapes[i].freedom)
                 likelihood[rows] = shapes[i].log_density(r2[rows])
-            penalty = -0.5 * float(prior @ beta[:25] ** 2)
+            penalty = -0.5 * float(prior @ beta[:26] ** 2)
             total = likelihood.sum() + penalty
             if abs(total - before) < 0.02:
                 break
@@ -205,8 +213,9 @@ class Problem:
         design = self._overcount(r * root)
         inverse = np.linalg.inv(information) * np.outer(scale, scale) * design
         offset_sd = np.sqrt(np.diag(inverse)[16:25].reshape(3, 3).sum(axis=1))
-        found = beta[25:], inverse[25:, 25:], beta[16:25].reshape(3, 3), offset_sd, inverse[:16, :16]
-        return Robust(M, *found, r, tuple(shapes), likelihood, penalty, design)
+        nearness = float(beta[25]), float(np.sqrt(inverse[25, 25]))
+        found = beta[26:], inverse[26:, 26:], beta[16:25].reshape(3, 3), offset_sd, nearness, inverse[:16, :16]
+        return Robust(beta[:26], M, *found, r, tuple(shapes), likelihood, penalty, design)
 
     def _overcount(self, z: np.ndarray) -> float:
         """Variance of the sums of weighted residuals z (n, 2, 2) over stretches of frames, over that of independent ones."""
@@ -214,6 +223,13 @@ class Problem:
         sums = np.zeros((int(stretch.max(initial=0)) + 1, 2))
         np.add.at(sums, stretch, z.sum(axis=1))
         return float(max(1.0, ((sums**2).sum(axis=0) / np.maximum((z**2).sum(axis=(0, 1)), 1e-300)).mean()))
+
+
+def _shrinking(M: np.ndarray, x: np.ndarray, from_centre: np.ndarray) -> np.ndarray:
+    """(..., n, 2, 2) the change by 1/distance, in px mm, of pixels `from_centre` of positions x (..., n, 2, 3)."""
+    normal = cross(M[:, 0, :3], M[:, 1, :3])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    return -np.einsum("...cj,cj->...c", x, normal)[..., None] * from_centre
 
 
 @dataclass(frozen=True)
@@ -288,18 +304,18 @@ class Case:
         """Each frame with the positions among x (t, n, 3) that suit it best: the fit, its rows, the choices (frames,)."""
         problem, fit = self.problem, self.null
         for _ in range(5):
-            r2 = ((problem.y - np.einsum("cij,tnj->tnci", fit.M[:, :, :3], x) - fit.M[:, :, 3]) ** 2).sum(axis=3)
+            r2 = (problem.missed(fit, np.repeat(x[:, :, None], 2, axis=2)) ** 2).sum(axis=3)
             loss = np.where(problem.used, np.nan_to_num(np.log1p(r2 / fit.shapes[0].scale ** 2), nan=1e3), 0.0).sum(axis=2)
             own = np.array([np.bincount(problem.frame, row, self.frames) for row in loss]).argmin(axis=0)
             moved = replace(problem, x=np.repeat(x[own[problem.frame], np.arange(len(problem))][:, None], 2, axis=1))
-            fit = moved.fit(start=fit.M, rounds=10)
+            fit = moved.fit(start=fit.start, rounds=10)
         return fit, moved, own
 
     def linear(
         self, columns: np.ndarray | Callable[[np.ndarray], np.ndarray], on: Problem | None = None
     ) -> tuple[Robust, float, float]:
         """The fit with `columns` (n, 2, 2, k) added to the pixels (or cameras -> columns): length and sd of the additions."""
-        fit = (on or self.problem).fit(columns if callable(columns) else lambda M: columns, start=self.null.M)
+        fit = (on or self.problem).fit(columns if callable(columns) else lambda M: columns, start=self.null.start)
         length = float(np.linalg.norm(fit.theta))
         return fit, float(fit.theta[0]) if fit.theta.size == 1 else length, float(np.sqrt(np.trace(fit.covariance)))
 
@@ -310,7 +326,7 @@ class Case:
         """With the evidence of its fit, which has `extra` parameters more than "nothing is wrong" on the rows of `on`."""
         null = self.null
         if on is not None and (on.used != self.problem.used).any():
-            null = replace(self.problem, seen=on.used).fit(start=null.M)
+            null = replace(self.problem, seen=on.used).fit(start=null.start)
         raw = fit.total - null.total if raw is None else raw
         n = 2.0 * (fit.likelihood != 0).sum()
         evidence = raw, n, extra, fit.design

@@ -258,12 +258,8 @@ def assess(
     if calibration is not None and len(y := feature_matches(recording, spread(len(recording), 3))):
         epipolar_px = float(np.median(np.abs(calibration.pair.epipolar_distance(y[:, :2], y[:, 2:]))))
     stated = {name: getattr(recording, name) for name in ("kinematics", "offset_s", "readout_s", "image_size_px")}
-    straight = data
-    if calibration is not None and calibration.inverse_distance_per_mm[1] > 0:  # what else is wrong?
-        told = zip(calibration.cameras, (data.u_left, data.u_right), strict=True)
-        u = [c.centre_px + (c.undistort(u) - c.centre_px) * c.depth_ratio(data.x_mm)[:, None] for c, u in told]
-        straight = replace(data, u_left=u[0], u_right=u[1])
-    diagnosis = diagnose(straight, **stated)
+    near = calibration is not None and calibration.inverse_distance_per_mm[1] > 0
+    diagnosis = diagnose(data, near=near, **stated)
     found = health(recording, data, calibration, detector=detector)
     verdict = judge(
         data, calibration, diagnosis=diagnosis, health=found, epipolar_px=epipolar_px, error=error,

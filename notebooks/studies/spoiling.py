@@ -9,7 +9,7 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation
 
-from lib.calibration import calibrate
+from lib.calibration import Calibration, calibrate
 from lib.cameras import StereoRig
 from lib.correspondences import Correspondences, pair_with_robot
 from lib.geometry import RigidTransform
@@ -194,11 +194,11 @@ class Result:
         return self.named in (self.take.causes or ("",))
 
 
-def examine(take: Take) -> Result:
-    """Calibrate affine cameras, diagnose and judge, as `lib.trust.assess` does with ``model="zero_skew"``."""
+def examine(take: Take, fit: Callable[..., Calibration] = calibrate) -> Result:
+    """Calibrate, diagnose and judge, as `lib.trust.assess` does; `fit` is `calibrate` where that has a ``model``."""
     calibration, error, effect = None, None, np.inf
     try:
-        calibration = calibrate(take.data, image_size_px=take.image_size_px)
+        calibration = fit(take.data, image_size_px=take.image_size_px)
     except ValueError as refused:
         error = refused
     if calibration is not None:
@@ -208,7 +208,7 @@ def examine(take: Take) -> Result:
         effect = max(float(np.sqrt((d**2).sum(axis=1).mean())) for d in missed) / sd
     diagnosis = diagnose(
         take.data, kinematics=take.kinematics, offset_s=take.offset_s, readout_s=take.readout_s,
-        image_size_px=take.image_size_px,
+        image_size_px=take.image_size_px, near=calibration is not None and calibration.inverse_distance_per_mm[1] > 0,
     )  # fmt: skip
     verdict = judge(
         take.data, calibration, diagnosis=diagnosis, robot_accuracy_mm=take.robot_accuracy_mm, error=error
@@ -462,16 +462,18 @@ GOOD: dict[str, dict[str, object]] = {
 }
 
 
-def takes(recordings: str = "setting", seed: int = 0, only: str = "") -> Iterator[Take]:
+def takes(recordings: str = "setting", seed: int = 0, only: str = "", distance_mm: float = np.inf) -> Iterator[Take]:
     """The good and then the spoiled recordings of one set whose names contain `only`.
 
-    A `seed` is another draw of all rigs, tools, paths and noise.
+    A `seed` is another draw of all rigs, tools, paths and noise.  The microscopes have a working distance of `distance_mm`;
+    where it is finite, recordings that only lack that are left out.
     """
     for i, (name, options) in enumerate(GOOD.items()):
         if only in name:
-            yield Scene(np.random.default_rng([SETS[recordings], seed, 1, i]), **options).take(name)
+            rng = np.random.default_rng([SETS[recordings], seed, 1, i])
+            yield Scene(rng, inverse_distance_per_mm=1 / distance_mm, **options).take(name)
     for i, ((way, strength), (causes, spoil)) in enumerate(SPOILED.items()):
-        if only in way:
-            scene = Scene(np.random.default_rng([SETS[recordings], seed, 2, i]))
+        if only in way and (np.isinf(distance_mm) or way != "finite distance"):
+            scene = Scene(np.random.default_rng([SETS[recordings], seed, 2, i]), inverse_distance_per_mm=1 / distance_mm)
             spoil(scene)
             yield scene.take(way, strength, causes)

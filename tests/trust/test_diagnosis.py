@@ -58,6 +58,15 @@ def test_a_fault_is_named_with_its_size_and_its_cure(way, strength, value):
         assert best.value == pytest.approx(value, abs=max(4 * best.sd, 0.1 * abs(value)))
 
 
+@pytest.mark.parametrize(("seed", "frames"), [(2, 18), (8, 24)])
+def test_the_curvature_of_a_near_microscope_accuses_nobody_else(seed, frames):
+    """Few frames and many wrong landmarks hide a working distance, which skews the pixels of affine cameras."""
+    options = {"frames": frames, "noise_px": 0.7, "inverse_distance_per_mm": 1 / 160, "outliers": 0.25}
+    scene = Scene(np.random.default_rng([6, seed]), fps=10.0, speed_mm_s=4.0, **options)
+    best = found(scene.take()).best
+    assert best is None or best.name in ("finite_distance", "detector_unfit")
+
+
 def test_a_turned_image_is_no_wrong_readout_time():
     """Its rows are read from the bottom up; a camera takes up the turn, and the shutter alone tells."""
     scene = Scene(np.random.default_rng(7), frames=40, fps=15.0, speed_mm_s=6.0, readout_s=0.02)
