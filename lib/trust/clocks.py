@@ -120,7 +120,8 @@ def _readout(case: Case) -> Iterator[Hypothesis]:
     known = replace(case.problem, seen=case.problem.used & np.isfinite(velocity).all(axis=1)[:, None])
     for views in ((0, 1), (0,), (1,)):
         moved = velocity[:, None] * row * np.isin((0, 1), views)[:, None]
-        fit, value, sd = case.linear(lambda M, v=moved: np.einsum("cij,ncj->nci", M[:, :, :3], v)[..., None], known)
+        fit = case.linear(lambda M, v=moved: np.einsum("cij,ncj->nci", M[:, :, :3], v)[..., None], known)
+        value, sd = float(fit.theta[0]), float(np.sqrt(fit.covariance[0, 0]))
         readout_s = case.readout_s + value
         if readout_s < -3 * sd:
             who, them = ("Both images are", "both") if len(views) == 2 else (f"The {SIDES[views[0]]} image is", "it")

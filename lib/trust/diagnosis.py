@@ -87,24 +87,25 @@ def _landmark_offset(case: Case) -> Iterator[Hypothesis]:
 
 def _tool_bends(case: Case) -> Iterator[Hypothesis]:
     """Tips that move by other amounts than the base."""
-    tips = (case.problem.landmark > 0).astype(float)
+    tips = case.problem.landmark > 0
     if 0 < tips.mean() < 1:
         x = case.problem.x * tips[:, None, None]
-        fit, *size = case.linear(lambda M: np.einsum("cij,nck->ncijk", M[:, :, :3], x).reshape(*x.shape[:2], 2, 9))
-        size = 100 / np.sqrt(3.0) * np.array(size)
-        text = f"The tips move by {size[0]:.1f} % more or less than the base: a tool that bends, or a wrong pivot or angle."
+        fit = case.linear(lambda M: np.einsum("cij,nck->ncijk", M[:, :, :3], x).reshape(*x.shape[:2], 2, 9))
+        size = float(np.sqrt((fit.moved_px[tips] ** 2).sum(axis=2).mean()))
+        text = f"The tips move {size:.1f} px (RMS) more or less than the base: a tool that bends, or a wrong pivot or angle."
         cure = "Check the tool's geometry and joint angles in the robot's report (lib.calibration.pivot_calibration)."
-        yield case.found("tool_bends", fit, 9, (*size, "%"), text, cure)
+        yield case.found("tool_bends", fit, 9, (size, 0.0, "px"), text, cure)
 
 
 def _drift(case: Case) -> Iterator[Hypothesis]:
     """Images that creep at a constant speed."""
     time = case.problem.time
     if np.isfinite(time).all() and np.ptp(time) > 0:
-        fit, *size = case.linear(np.eye(4).reshape(1, 2, 2, 4) * ((time - time.mean()) / np.ptp(time))[:, None, None, None])
-        text = f"The images creep by {size[0] / np.sqrt(2.0):.1f} px from the first frame to the last."
+        fit = case.linear(np.eye(4).reshape(1, 2, 2, 4) * ((time - time.mean()) / np.ptp(time))[:, None, None, None])
+        size, sd = np.array([np.linalg.norm(fit.theta), np.sqrt(np.trace(fit.covariance))]) / np.sqrt(2.0)
+        text = f"The images creep by {size:.1f} px from the first frame to the last."
         cure = "Fix the microscope, or calibrate a shorter part (Correspondences.of_frames)."
-        yield case.found("drift", fit, 4, (*(np.array(size) / np.sqrt(2.0)), "px"), text, cure)
+        yield case.found("drift", fit, 4, (size, sd, "px"), text, cure)
 
 
 def _bad_part(case: Case) -> Iterator[Hypothesis]:
@@ -157,11 +158,10 @@ def _camera_moved(case: Case) -> Iterator[Hypothesis]:
             open_ = part[..., 4:, 4:] - part[..., 4:, :4] @ np.linalg.solve(G, part[..., :4, 4:])
             left = left + np.trace(open_, axis1=2, axis2=3).sum(axis=1)
         frame = int(left.argmin()) + 2
-        fit = case.linear(columns((0, 1)))[0]
+        fit = case.linear(columns((0, 1)))
     for views in ((0, 1), (0,), (1,)):
-        fit = case.linear(columns(views))[0] if len(views) < 2 else fit
-        change = (columns(views) @ fit.theta)[problem.frame >= frame][:, list(views)]
-        size = float(np.sqrt((change**2).sum(axis=2).mean()))
+        fit = case.linear(columns(views)) if len(views) < 2 else fit
+        size = float(np.sqrt((fit.moved_px[problem.frame >= frame][:, list(views)] ** 2).sum(axis=2).mean()))
         who = "Both cameras" if len(views) == 2 else f"The {SIDES[views[0]]} camera"
         text = f"{who} moved at about frame {frame} of those seen: the images shift by {size:.1f} px."
         cure = "Calibrate before and after on their own, or follow the move with lib.registration.register_images."

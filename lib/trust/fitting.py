@@ -70,8 +70,9 @@ class Robust:
 
     start: np.ndarray  # (26,) cameras, offsets and 1/distance, from which another fit may start
     M: np.ndarray  # (2, 2, 4) cameras on centred positions
-    theta: np.ndarray  # (k,) additions, and their covariance
+    theta: np.ndarray  # (k,) additions, their covariance, and by how much they move the pixels, (n, 2, 2) px
     covariance: np.ndarray
+    moved_px: np.ndarray
     offsets: np.ndarray  # (3, 3) mm of the landmarks, and (3,) their deviations
     offset_sd: np.ndarray
     nearness: tuple[float, float]  # 1/distance, per mm, and its deviation
@@ -214,7 +215,8 @@ class Problem:
         inverse = np.linalg.inv(information) * np.outer(scale, scale) * design
         offset_sd = np.sqrt(np.diag(inverse)[16:25].reshape(3, 3).sum(axis=1))
         nearness = float(beta[25]), float(np.sqrt(inverse[25, 25]))
-        found = beta[26:], inverse[26:, 26:], beta[16:25].reshape(3, 3), offset_sd, nearness, inverse[:16, :16]
+        added = beta[26:], inverse[26:, 26:], D[..., 26:] @ beta[26:]
+        found = *added, beta[16:25].reshape(3, 3), offset_sd, nearness, inverse[:16, :16]
         return Robust(beta[:26], M, *found, r, tuple(shapes), likelihood, penalty, design)
 
     def _overcount(self, z: np.ndarray) -> float:
@@ -311,13 +313,9 @@ class Case:
             fit = moved.fit(start=fit.start, rounds=10)
         return fit, moved, own
 
-    def linear(
-        self, columns: np.ndarray | Callable[[np.ndarray], np.ndarray], on: Problem | None = None
-    ) -> tuple[Robust, float, float]:
-        """The fit with `columns` (n, 2, 2, k) added to the pixels (or cameras -> columns): length and sd of the additions."""
-        fit = (on or self.problem).fit(columns if callable(columns) else lambda M: columns, start=self.null.start)
-        length = float(np.linalg.norm(fit.theta))
-        return fit, float(fit.theta[0]) if fit.theta.size == 1 else length, float(np.sqrt(np.trace(fit.covariance)))
+    def linear(self, columns: np.ndarray | Callable[[np.ndarray], np.ndarray], on: Problem | None = None) -> Robust:
+        """The fit with `columns` (n, 2, 2, k) added to the pixels (or cameras -> columns)."""
+        return (on or self.problem).fit(columns if callable(columns) else lambda M: columns, start=self.null.start)
 
     def found(
         self, name: str, fit: Robust, extra: float, size: tuple[float, float, str], text: str, cure: str, *,

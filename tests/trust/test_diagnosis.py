@@ -67,6 +67,14 @@ def test_the_curvature_of_a_near_microscope_accuses_nobody_else(seed, frames):
     assert best is None or best.name in ("finite_distance", "detector_unfit")
 
 
+def test_a_bend_has_the_size_by_which_the_tips_are_seen_to_move():
+    bent = take("tool bends", "10 %")
+    best, x = found(bent).best, bent.data.x_mm[bent.data.landmark > 0]
+    lag_mm = 0.1 / 0.9 * (x - np.nanmean(x, axis=0))
+    moved_px = np.sqrt(np.nanmean([((lag_mm @ A.T) ** 2).sum(axis=1) for A in bent.rigs[0].linear.reshape(2, 2, 3)]))
+    assert best.name == "tool_bends" and best.value == pytest.approx(moved_px, rel=0.25)
+
+
 def test_a_turned_image_is_no_wrong_readout_time():
     """Its rows are read from the bottom up; a camera takes up the turn, and the shutter alone tells."""
     scene = Scene(np.random.default_rng(7), frames=40, fps=15.0, speed_mm_s=6.0, readout_s=0.02)
