@@ -30,7 +30,8 @@ _REQUIRED = {"name": str, "fps": float, "image_size_px": list}
 _DEFAULTS = {"description": "", "readout_s": 0.0, "offset_s": 0.0, "robot_accuracy_mm": 0.010, "details": {}}
 _DEFAULTS |= {"skeleton": list(LANDMARKS), "bit_depth": 0}
 _FIXED = {"format": _FORMAT, "units": _UNITS}
-_GAP_S = 0.5  # in a step between samples that is longer than this and than ten usual ones, nothing is interpolated
+# In a longer step between samples, and than three usual ones, nothing is interpolated: 10 mm/s^2 make 0.08 mm there.
+_GAP_S = 0.25
 _FARTHEST_MM = 1e5  # a position farther from the origin is no millimetre
 _ORDER = "time_s must be a number larger than the row before"
 _LONGER = 5.0  # a log is that many times longer than its video by intent, or if the times of the frames are missing
@@ -70,7 +71,7 @@ class Kinematics:
     def at(self, time_s: ArrayLike) -> np.ndarray:
         """Landmarks (n, k, 3) mm at robot times (n,), or (n, k) for a time of each landmark; linear between samples.
 
-        NaN before the first sample, after the last, beside a dropped one, and in a gap of half a second and ten samples.
+        NaN before the first sample, after the last, beside a dropped one, and in a gap of 0.25 s and three samples.
         """
         time, k = np.asarray(time_s, dtype=np.float64), self.x_mm.shape[1]
         time = np.repeat(time[:, None], k, axis=1) if time.ndim == 1 else time
@@ -82,7 +83,7 @@ class Kinematics:
         if len(self.time_s) > 1:
             step = np.diff(self.time_s)
             before = np.clip(np.searchsorted(self.time_s, time, side="right") - 1, 0, len(step) - 1)
-            long = (step > max(_GAP_S, 10.0 * float(np.median(step))))[before]
+            long = (step > max(_GAP_S, 3.01 * float(np.median(step))))[before]
             x[long & (time != self.time_s[before]) & (time != self.time_s[before + 1])] = np.nan
         return x
 
@@ -171,6 +172,7 @@ class Recording:
         uniform = np.allclose(np.diff(frame_s) * self.fps, 1.0, rtol=1e-3)
         usual_s = float(np.median(step)) if len(step) else 0.0
         reported = int(np.isfinite(self.landmarks_mm()).all(axis=2).any(axis=1).sum())
+        covered = int(((frame_s >= log_s[0]) & (frame_s <= log_s[-1])).sum())
         moved_mm = np.linalg.norm(np.diff(self.kinematics.x_mm, axis=0, prepend=self.kinematics.x_mm[:1]), axis=2)
         jump_mm = np.nan_to_num(moved_mm).max(axis=1)
         k = int(jump_mm.argmax())
@@ -178,9 +180,11 @@ class Recording:
         cases = (
             (longer, "frame_times", f"{n} frames at {self.fps:g} fps last {span:.1f} s, but the robot's log {logged:.1f} s.",
              "If frames were left out, write their times to frames.csv (frame, time_s)."),
-            (reported / n < _COVERED, "little_overlap",
-             f"The robot reports a position in {reported} of {n} frames; log and video hardly overlap.",
+            (covered / n < _COVERED, "little_overlap", f"The robot's log lasts for {covered} of {n} frames.",
              "Check offset_s and the time_s columns; export the log of the whole video."),
+            (reported / n < _COVERED <= covered / n, "silent_robot",
+             f"The robot's log lasts for {covered} of {n} frames, but has a position in {reported} alone: it has gaps.",
+             "Log the robot without gaps: frames in a gap are not used."),
             (usual_s > _SLOW_S, "slow_log", f"The robot's log has a sample every {usual_s:.3g} s.",
              "Is time_s in milliseconds? Give seconds, and ten samples a second or more."),
             (jump_mm[k] > _JUMP_MM, "jump",
