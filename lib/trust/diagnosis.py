@@ -163,8 +163,8 @@ def _camera_moved(case: Case) -> Iterator[Hypothesis]:
         fit = case.linear(columns(views)) if len(views) < 2 else fit
         size = float(np.sqrt((fit.moved_px[problem.frame >= frame][:, list(views)] ** 2).sum(axis=2).mean()))
         who = "Both cameras" if len(views) == 2 else f"The {SIDES[views[0]]} camera"
-        text = f"{who} moved at about frame {frame} of those seen: the images shift by {size:.1f} px."
-        cure = "Calibrate before and after on their own, or follow the move with lib.registration.register_images."
+        text = f"{who} moved or zoomed at about frame {frame} of those seen: the images shift by {size:.1f} px."
+        cure = "Calibrate before and after on their own. lib.registration.register_images follows a move, and no zoom."
         yield case.found("camera_moved", fit, 8 * len(views) + 3, (size, 0.0, "px"), text, cure, images=views)
 
 

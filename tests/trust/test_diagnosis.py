@@ -31,6 +31,15 @@ def test_a_good_recording_has_no_fault(name):
     assert found(take(**GOOD[name])).best is None
 
 
+def test_a_zoom_in_the_middle_is_not_said_to_be_a_move_that_one_can_follow():
+    scene = take()
+    data, centre = scene.data, (np.array(scene.image_size_px) - 1) / 2
+    zoom = np.where(data.frame >= 20, 1.03, 1.0)[:, None]
+    left, right = (centre + zoom * (u - centre) for u in (data.u_left, data.u_right))
+    best = found(replace(scene, data=replace(data, u_left=left, u_right=right))).best
+    assert best.name == "camera_moved" and "zoomed at about frame 20" in best.text and "no zoom" in best.cure
+
+
 @pytest.mark.parametrize("name", ["setting", "judging"])
 def test_a_spike_in_the_log_is_no_fault_of_the_frames(name):
     (spike,) = takes(name, only="a spike")
