@@ -139,9 +139,9 @@ def judge(
             cure = "Did a camera move, or are left and right not of one instant? Calibrate anew."
             found += _reason("epipolar", max(epipolar_px - 3.0 * sd, 0.0), text, cure)
     if health is not None:
-        why = f"{health.text} (most often: {health.worst_part})."
+        text = f"{health.text} (most often: {health.worst_part})."
         cure = f"The detector may not know this tool or light. {_OVERLAYS}, then {TRAIN_FURTHER}."
-        found += _reason("health", health.unhealthy, why, cure, "detector_unfit")
+        found += _reason("health", health.unhealthy, text, cure, "detector_unfit")
     found += [Reason(doubt.name, LEVELS[1], doubt.text, doubt.cure) for doubt in doubts]
     return Verdict.join([Verdict(tuple(found))])
 
@@ -192,8 +192,7 @@ def _geometry(data: Correspondences | None, c: Calibration, robot_mm: float) -> 
     """What `_reason` takes: the optics that follow from the cameras, and the volume that the tool covered."""
     x = c.x_mm[c.inliers]
     if c.rig is not None:
-        told = (x, np.zeros(len(x), int)) if data is None else (data.x_mm[c.inliers], data.landmark[c.inliers])
-        firm = firmness(*told, robot_mm)
+        firm = firmness(x, np.zeros(len(x), int) if data is None else data.landmark[c.inliers], robot_mm)
         text = f"The tool lies {c.extents_mm[2]:.3f} mm (RMS) out of one plane, {firm:.1f} standard deviations of its errors."
         yield "thin", firm, text, "Move the tool along the view as well, turn it, open its jaws, and record more frames."
         if firm < LIMITS["thin"][1]:  # then errors shape the cameras
@@ -216,6 +215,7 @@ def _geometry(data: Correspondences | None, c: Calibration, robot_mm: float) -> 
     text = f"One image is a mirror image ({mirrored}), or an axis of the kinematics is."
     cure = "Flip that image when recording, or exchange the sign of the axis."
     yield "mirrored", mirrored in ("left", "right", "left or right"), text, cure
+
     along = np.linalg.svd(x - x.mean(axis=0))[2]
     low, high = np.percentile((x - x.mean(axis=0)) @ along.T, [5, 95], axis=0)
     corners = x.mean(axis=0) + np.stack(np.meshgrid(*np.stack([low, high]).T), axis=-1).reshape(-1, 3) @ along
