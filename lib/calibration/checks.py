@@ -13,7 +13,6 @@ from lib.geometry import finite_points
 PLAUSIBLE_PX_PER_MM = (0.2, 5000.0)
 #: The robot accuracy assumed where none is given (the paper's), for judging whether points are coplanar.
 ROBOT_ACCURACY_MM = 0.010
-_PLACED_MM = 0.1  # error of a landmark's place in the tool, the robot's and the detector's
 _NAMES = {1: ["u"], 2: ["u_left", "u_right"]}  # of the pixels of so many cameras
 
 
@@ -51,14 +50,6 @@ def check_spread(x: np.ndarray, sigma_x_mm: float = 0.0) -> None:
 def extents(x: np.ndarray) -> np.ndarray:
     """(3,) RMS extents of points (n, 3) along their principal axes, the largest first; the last is their thickness."""
     return np.sqrt(np.maximum(np.linalg.eigvalsh(np.cov(x.T, bias=True))[::-1], 0.0))
-
-
-def firmness(x: np.ndarray, landmark: np.ndarray, robot_mm: float) -> float:
-    """Thickness of positions (n, 3) of landmarks (n,) in the errors of the robot, and of a landmark's place in all frames."""
-    own = np.eye(landmark.max() + 1)[landmark]
-    place = own @ np.linalg.lstsq(own, x, rcond=None)[0]
-    moved, apart = (np.cov(v.T, bias=True) for v in ((x - place) / max(robot_mm, 1e-6), place / _PLACED_MM))
-    return float(np.sqrt(max(np.linalg.eigvalsh(moved + apart)[0], 0.0)))
 
 
 def check_units(x: np.ndarray, y: np.ndarray) -> None:

@@ -11,7 +11,7 @@ from itertools import permutations
 import numpy as np
 from scipy.ndimage import binary_opening
 
-from lib.calibration.checks import ROBOT_ACCURACY_MM, eyes_exchanged, firmness, sides
+from lib.calibration.checks import eyes_exchanged, sides
 from lib.correspondences import LANDMARKS, TRAIN_FURTHER, Correspondences
 from lib.recordings import Kinematics
 from lib.trust.clocks import TIME_TESTS
@@ -236,8 +236,7 @@ def _optics(case: Case, fit: Robust, sign: float) -> Iterator[Hypothesis]:
     if few or not np.isfinite(covariance).all() or min(np.linalg.svd(a, compute_uv=False)[1] for a in A) < 1e-6:
         return
     if case.misfit(fit) < FITS:  # cameras that fit nothing always have skewed pixels
-        firm = firmness(case.problem.x[:, 0], case.problem.landmark, ROBOT_ACCURACY_MM) > 4.0  # else errors shape the pixels
-        yield from list(_jaws(case)) or (_scaled_axis(A, covariance) if firm else ())  # pixels cannot tell x from y
+        yield from list(_jaws(case)) or _scaled_axis(A, covariance)  # pixels cannot tell x from y
     yield from _handedness(case, A, covariance)
 
 

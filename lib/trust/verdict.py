@@ -9,7 +9,6 @@ import numpy as np
 
 from lib import paths
 from lib.calibration import Calibration, NoConsensusError, calibrate, calibrate_as_shown, optics
-from lib.calibration.checks import firmness
 from lib.correspondences import LANDMARKS, TRAIN_FURTHER, Correspondences, NoDetectionError
 from lib.landmarks import Detector, detect
 from lib.recordings import Doubt, Recording
@@ -40,7 +39,7 @@ LIMITS: dict[str, tuple[float, float]] = {
     "mirrored": (0.5, np.inf),
     # Standard deviations of a landmark's depth that the calibration adds to the detector's, at the edge of its own volume.
     "coverage": (1.5, np.inf),
-    # RMS thickness of the tool's positions in standard deviations of their errors: what is thinner may be these.
+    # RMS thickness of the tool's positions in standard deviations of the robot's: what is thinner may be its noise.
     "thin": (4.0, 2.0),
     # Median epipolar distance of free matches, px, beyond three of its standard deviations: band matching fails from 6 px.
     "epipolar": (1.5, 4.0),
@@ -129,7 +128,7 @@ def judge(
         cure = _MORE_FRAMES if few else f"{_OVERLAYS}; where the detector errs, {TRAIN_FURTHER}."
         found.append(Reason(name, LEVELS[2], f"There is no calibration: {error}", cure))
     else:
-        for finding in (*_residuals(data, calibration, robot_accuracy_mm), *_geometry(data, calibration, robot_accuracy_mm)):
+        for finding in (*_residuals(data, calibration, robot_accuracy_mm), *_geometry(calibration, robot_accuracy_mm)):
             found += _reason(*finding)
         if epipolar_px is not None and np.isfinite(epipolar_px):
             n, middle = calibration.pair.epipolar_normal, calibration.x_mm[calibration.inliers].mean(axis=0)
@@ -188,15 +187,8 @@ def _residuals(data: Correspondences | None, c: Calibration, robot_mm: float) ->
         yield "frames", frames + 1e-9, text, _MORE_FRAMES, "few_frames"
 
 
-def _geometry(data: Correspondences | None, c: Calibration, robot_mm: float) -> Iterator[tuple]:
+def _geometry(c: Calibration, robot_mm: float) -> Iterator[tuple]:
     """What `_reason` takes: the optics that follow from the cameras, and the volume that the tool covered."""
-    x = c.x_mm[c.inliers]
-    if c.rig is not None:
-        firm = firmness(x, np.zeros(len(x), int) if data is None else data.landmark[c.inliers], robot_mm)
-        text = f"The tool lies {c.extents_mm[2]:.3f} mm (RMS) out of one plane, {firm:.1f} standard deviations of its errors."
-        yield "thin", firm, text, "Move the tool along the view as well, turn it, open its jaws, and record more frames."
-        if firm < LIMITS["thin"][1]:  # then errors shape the cameras
-            return
     zooms, name = np.array([np.diag(camera.resect().K) for camera in c.cameras]), "implausible_optics"
     cure = "Check axes and units of the kinematics, the order of the tips, and which image is left."
     aspect = float(np.exp(np.abs(np.log(zooms[:, 0] / zooms[:, 1])).max()))
@@ -216,6 +208,9 @@ def _geometry(data: Correspondences | None, c: Calibration, robot_mm: float) -> 
     cure = "Flip that image when recording, or exchange the sign of the axis."
     yield "mirrored", mirrored in ("left", "right", "left or right"), text, cure
 
+    x = c.x_mm[c.inliers]
+    text = f"The tool's positions lie {c.extents_mm[2]:.3f} mm (RMS) out of one plane; the robot errs by {robot_mm:.3f} mm."
+    yield "thin", c.extents_mm[2] / robot_mm, text, "Move the tool along the view as well, and record more frames."
     along = np.linalg.svd(x - x.mean(axis=0))[2]
     low, high = np.percentile((x - x.mean(axis=0)) @ along.T, [5, 95], axis=0)
     corners = x.mean(axis=0) + np.stack(np.meshgrid(*np.stack([low, high]).T), axis=-1).reshape(-1, 3) @ along
