@@ -30,8 +30,7 @@ _REQUIRED = {"name": str, "fps": float, "image_size_px": list}
 _DEFAULTS = {"description": "", "readout_s": 0.0, "offset_s": 0.0, "robot_accuracy_mm": 0.010, "details": {}}
 _DEFAULTS |= {"skeleton": list(LANDMARKS), "bit_depth": 0}
 _FIXED = {"format": _FORMAT, "units": _UNITS}
-# In a longer step between samples, and than three usual ones, nothing is interpolated: 10 mm/s^2 make 0.08 mm there.
-_GAP_S = 0.25
+_GAP_S = 0.25  # nothing is interpolated in a step longer than this and three usual ones: 10 mm/s^2 make 0.08 mm there
 _FARTHEST_MM = 1e5  # a position farther from the origin is no millimetre
 _ORDER = "time_s must be a number larger than the row before"
 _LONGER = 5.0  # a log is that many times longer than its video by intent, or if the times of the frames are missing
@@ -180,11 +179,9 @@ class Recording:
         cases = (
             (longer, "frame_times", f"{n} frames at {self.fps:g} fps last {span:.1f} s, but the robot's log {logged:.1f} s.",
              "If frames were left out, write their times to frames.csv (frame, time_s)."),
-            (covered / n < _COVERED, "little_overlap", f"The robot's log lasts for {covered} of {n} frames.",
-             "Check offset_s and the time_s columns; export the log of the whole video."),
-            (reported / n < _COVERED <= covered / n, "silent_robot",
-             f"The robot's log lasts for {covered} of {n} frames, but has a position in {reported} alone: it has gaps.",
-             "Log the robot without gaps: frames in a gap are not used."),
+            (reported / n < _COVERED, "little_overlap",
+             f"The robot reports a position in {reported} of {n} frames; its log lasts for {covered}.",
+             "Check offset_s and the time_s columns; export the log of the whole video, without gaps."),
             (usual_s > _SLOW_S, "slow_log", f"The robot's log has a sample every {usual_s:.3g} s.",
              "Is time_s in milliseconds? Give seconds, and ten samples a second or more."),
             (jump_mm[k] > _JUMP_MM, "jump",

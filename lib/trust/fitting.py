@@ -79,14 +79,8 @@ class Robust:
     camera_covariance: np.ndarray
     residuals: np.ndarray  # (n, 2, 2) px
     shapes: tuple[Shape, ...]
-    likelihood: np.ndarray  # (n, 2) log density of each image's residual, 0 where it is not seen
-    penalty: float  # the same of the priors
+    total: float  # log likelihood with the priors of offsets and distance
     design: float  # by how much correlated rows overstate what they tell
-
-    @property
-    def total(self) -> float:
-        """Log likelihood with the priors of offsets and distance."""
-        return float(self.likelihood.sum() + self.penalty)
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,23 +195,21 @@ class Problem:
             beta = scale * np.linalg.solve(information, scale * (J.T @ (y * root).reshape(-1)))
             M, r = beta[:16].reshape(2, 2, 4), y - D @ beta
             r2 = (r**2).sum(axis=2) / self.noise**2
-            likelihood = np.zeros(used.shape)
+            likelihood = -2.0 * np.log(self.noise[used]).sum()
             for i, rows in enumerate(groups):
                 shapes[i] = Shape.of(r2[rows], shapes[i].scale, least, shapes[i].freedom)
-                likelihood[rows] = shapes[i].log_density(r2[rows])
-            penalty = -0.5 * float(prior @ beta[:26] ** 2)
-            total = likelihood.sum() + penalty
+                likelihood += shapes[i].log_density(r2[rows]).sum()
+            total = float(likelihood - 0.5 * prior @ beta[:26] ** 2)
             if abs(total - before) < 0.02:
                 break
             before = total
-        likelihood = np.where(used, likelihood - 2.0 * np.log(self.noise), 0.0)
         design = self._overcount(r * root)
         inverse = np.linalg.inv(information) * np.outer(scale, scale) * design
         offset_sd = np.sqrt(np.diag(inverse)[16:25].reshape(3, 3).sum(axis=1))
         nearness = float(beta[25]), float(np.sqrt(inverse[25, 25]))
         added = beta[26:], inverse[26:, 26:], D[..., 26:] @ beta[26:]
         found = *added, beta[16:25].reshape(3, 3), offset_sd, nearness, inverse[:16, :16]
-        return Robust(beta[:26], M, *found, r, tuple(shapes), likelihood, penalty, design)
+        return Robust(beta[:26], M, *found, r, tuple(shapes), total, design)
 
     def _overcount(self, z: np.ndarray) -> float:
         """Variance of the sums of weighted residuals z (n, 2, 2) over stretches of frames, over that of independent ones."""
@@ -326,7 +318,7 @@ class Case:
         if on is not None and (on.used != self.problem.used).any():
             null = replace(self.problem, seen=on.used).fit(start=null.start)
         raw = fit.total - null.total if raw is None else raw
-        n = 2.0 * (fit.likelihood != 0).sum()
+        n = 2.0 * (on or self.problem).used.sum()
         evidence = raw, n, extra, fit.design
         if name not in self.fits or fit.total > self.fits[name].total:
             self.fits[name] = fit

@@ -51,6 +51,8 @@ LIMITS: dict[str, tuple[float, float]] = {
 #: Pixel noise assumed where the detections claim none: that of labels set by hand.
 _LABEL_PX = 3.0
 _CHECK = "`python3 -m lib check RECORDING`"
+#: Reasons that labels set by hand cause as detections do.
+_OF_LANDMARKS = ("detector_unfit", "minority", "no_consensus", "residuals")
 _MORE_FRAMES = "Record more frames, with the tool in other places."
 _OVERLAYS = f"Look at the overlays of {_CHECK}"
 
@@ -124,8 +126,10 @@ def judge(
         found += _reason("diagnosis", best.explained, text, best.cure, best.name)
     if calibration is None:
         name = {NoDetectionError: "no_detection", NoConsensusError: "no_consensus"}.get(type(error), "refused")
-        few = name == "refused" and data is not None and len(np.unique(data.frame)) < LIMITS["frames"][1]
-        cure = _MORE_FRAMES if few else f"{_OVERLAYS}; where the detector errs, {TRAIN_FURTHER}."
+        cure = f"{_OVERLAYS}; where the detector errs, {TRAIN_FURTHER}."
+        if name == "refused":  # the error names its cure
+            few = data is not None and len(np.unique(data.frame)) < LIMITS["frames"][1]
+            cure = _MORE_FRAMES if few else "Mend that, then check again."
         found.append(Reason(name, LEVELS[2], f"There is no calibration: {error}", cure))
     else:
         for finding in (*_residuals(data, calibration, robot_accuracy_mm), *_geometry(calibration, robot_accuracy_mm)):
@@ -265,8 +269,12 @@ def assess(
         data, calibration, diagnosis=diagnosis, health=found, epipolar_px=epipolar_px, error=error,
         robot_accuracy_mm=recording.robot_accuracy_mm, doubts=recording.doubts,
     )  # fmt: skip
-    where = shlex.quote(paths.shown(recording.folder))  # in the commands that cures name
-    told = [replace(r, **{k: getattr(r, k).replace("RECORDING", where) for k in ("text", "cure")}) for r in verdict.reasons]
+    reasons, where = verdict.reasons, shlex.quote(paths.shown(recording.folder))  # in the commands that cures name
+    if not np.isfinite(data.covariance_px2).any():  # labels set by hand
+        odd = ", ".join(map(str, found.frame[found.score > 1][:12]))
+        cure = f"Look again at the labels{' of frames ' * bool(odd)}{odd}: `python3 -m lib annotate RECORDING`."
+        reasons = [replace(r, cure=cure) if r.name in _OF_LANDMARKS else r for r in reasons]
+    told = [replace(r, **{k: getattr(r, k).replace("RECORDING", where) for k in ("text", "cure")}) for r in reasons]
     return Assessment(data, calibration, Verdict(tuple(told)), diagnosis, found, epipolar_px)
 
 

@@ -624,7 +624,7 @@ def test_failure_leaves_nothing(tmp_path):
 @pytest.mark.parametrize(("frames", "times", "jump", "name"), [
     (34, np.arange(0, 43, 0.1), 0.0, "frame_times"),
     (100, np.arange(0, 2, 0.01), 0.0, "little_overlap"),
-    (100, np.append(np.arange(0, 1, 0.05), np.arange(3, 5, 0.05)), 0.0, "silent_robot"),
+    (100, np.append(np.arange(0, 1, 0.05), np.arange(3, 5, 0.05)), 0.0, "little_overlap"),
     (40, np.arange(-1, 4, 1.0), 0.0, "slow_log"),
     (40, np.arange(-0.1, 2, 0.01), 500.0, "jump"),
     (40, np.arange(-0.1, 2, 0.01), 0.0, None),

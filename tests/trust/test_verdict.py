@@ -1,14 +1,16 @@
 """Verdicts: levels, how they join, and that the workbench knows the same levels."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from lib import paths
 from lib.calibration import calibrate
-from lib.correspondences import Correspondences, NoDetectionError
-from lib.recordings import Doubt
-from lib.trust import LEVELS, Health, Reason, Verdict, judge
+from lib.correspondences import Correspondences, DataError, NoDetectionError, of_recording
+from lib.recordings import Doubt, Recording
+from lib.trust import LEVELS, Health, Reason, Verdict, assess, judge
 from lib.workbench.report import VERDICT_COLOURS
 from notebooks.studies.simulated_rows import simulate_correspondences
 
@@ -92,6 +94,30 @@ def test_witnesses_count():
     bad = Health(np.arange(20), {"looks": np.full((20, 3), 3.0)}, np.ones((20, 3), bool))
     assert names(data, health=bad) == {"detector_unfit": LEVELS[2]}
     assert names(data, doubts=[Doubt("log_gap", "An hour.", "Look.")]) == {"log_gap": LEVELS[1]}
+
+
+def test_a_refusal_names_its_own_cure():
+    data = made(60, half_size_mm=(8.0, 4.5, 0.0))
+    flat = replace(data, x_mm=data.x_mm * [1, 1, 0])
+    with pytest.raises(DataError, match="coplanar") as error:
+        calibrate(flat)
+    (reason,) = judge(flat, None, error=error.value).reasons
+    assert reason.name == "refused" and reason.cure == "Mend that, then check again."
+    assert "cover a few depths as well" in reason.text
+
+
+def test_careless_labels_are_looked_at_again_and_no_detector_is_taught():
+    recording = Recording.open(paths.SHIPPED_RECORDING)
+    truth, rng = recording.truth, np.random.default_rng(3)
+    u = np.stack([truth.u_left, truth.u_right])
+    u = u + rng.normal(0, 1.5, u.shape)
+    wild = np.arange(0, len(recording), 4)
+    u[:, wild] += rng.choice([-25, 25], u[:, wild].shape)
+    verdict = assess(recording, of_recording(recording, *u)).verdict
+    cures = " ".join(reason.cure for reason in verdict.reasons)
+    assert verdict.level != LEVELS[0] and "adapt" not in cures and "detector" not in cures
+    named = re.search(r"labels of frames ([\d, ]+): `python3 -m lib annotate", cures)[1]
+    assert set(map(int, named.split(", "))) <= set(wild.tolist())
 
 
 def test_no_detection_is_one_message():
