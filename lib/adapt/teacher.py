@@ -72,10 +72,9 @@ class RefusalError(DataError):
 def longest_still(recording: Recording, seen: Seen) -> tuple[np.ndarray, str]:
     """The frames before or after the cameras moved, whichever are more, and what to say of it; all if they did not."""
     rows, frames = seen.rows(_clock(recording, seen)[0]), seen.frame
-    problem = Problem.of(rows)
-    if problem.used.sum() < 60 or len(frames) < 24:
+    used, count = int(Problem.of(rows).used.sum()), len(frames)
+    if used < 60 or count < 24:
         return frames, ""
-    count = len(frames)
 
     @cache
     def total(first: int, last: int) -> float:
@@ -90,7 +89,7 @@ def longest_still(recording: Recording, seen: Seen) -> tuple[np.ndarray, str]:
     for step in (max(count // 16, 1), 1, 1):
         cut = max((cut, cut - step, cut + step), key=gain)
     # Cameras of their own have 16 numbers more, and the cut could lie anywhere.
-    least = 16 * np.log(problem.used.sum()) / 2 + 12 + _SURE_MOVE * problem.used.sum()
+    least = 16 * np.log(used) / 2 + 12 + _SURE_MOVE * used
     if gain(cut) < least:
         return frames, ""
     kept = frames[:cut] if cut >= count - cut else frames[cut:]

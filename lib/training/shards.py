@@ -112,13 +112,11 @@ def read_shards(folder: str | Path, kind: str, names: Sequence[str], first: int 
     found = sorted(Path(folder).glob(f"{kind}_*.npz"))[:first]
     if not found:
         raise FileNotFoundError(f"{folder}: no shard {kind}_*.npz; make some with `python3 -m lib train generate`.")
-    parts: dict[str, list[np.ndarray]] = {name: [] for name in names}
-    for path in found:
-        for name, array in zip(names, _read(path, names), strict=True):
-            if parts[name] and array.shape[1:] != parts[name][0].shape[1:]:
-                raise ValueError(f"{path}: its images have another size; keep images of one size in a folder.")
-            parts[name].append(array)
-    return [np.concatenate(parts.pop(name)) for name in names]
+    shards = [_read(path, names) for path in found]
+    for path, shard in zip(found, shards, strict=True):
+        if any(own.shape[1:] != first.shape[1:] for own, first in zip(shard, shards[0], strict=True)):
+            raise ValueError(f"{path}: its images have another size; keep images of one size in a folder.")
+    return [np.concatenate(arrays) for arrays in zip(*shards, strict=True)]
 
 
 def packed(images: Iterable[LabelledImage], long_side_px: int | None = None) -> tuple[np.ndarray, ...]:

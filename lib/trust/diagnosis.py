@@ -70,7 +70,10 @@ def _finite_distance(case: Case, fit: Robust) -> Iterator[Hypothesis]:
     far = f"by a working distance of {1 / value:.0f} mm" if value > 0 else "the wrong way, as in a mirrored image"
     text = f"The residuals are curved {far}: 1/distance is {value:.5f} +- {sd:.5f} per mm."
     cure = "Calibrate with model='near_affine' (--model near_affine on the command line)."
-    yield case.found("finite_distance", fit, 1, (value, sd, "1/mm"), text, cure, raw=0.5 * fit.design * (value / sd) ** 2)
+    n = 2.0 * case.problem.used.sum()
+    beside = 0.5 * n * float(np.log1p(fit.design * (value / sd) ** 2 / n))  # Wald's test as a ratio of likelihoods
+    raw = min(case.null.total - replace(case.problem, nearness_sd=1e-9).fit(start=case.null.start).total, beside)
+    yield case.found("finite_distance", fit, 1, (value, sd, "1/mm"), text, cure, raw=raw)
 
 
 def _landmark_offset(case: Case) -> Iterator[Hypothesis]:

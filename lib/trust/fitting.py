@@ -97,7 +97,8 @@ class Problem:
     time: np.ndarray
     centre: np.ndarray
     centre_px: np.ndarray  # (2,) of the images
-    offset_sd: float = _OFFSET_SD_MM  # of the landmarks, before the data
+    offset_sd: float = _OFFSET_SD_MM  # of the landmarks, and of 1/distance, before the data
+    nearness_sd: float = _NEARNESS_SD
 
     @classmethod
     def of(cls, data: Correspondences, size: tuple[int, int] | None = None) -> Self:
@@ -173,7 +174,7 @@ class Problem:
     def _descend(self, beta: np.ndarray, columns: Callable | None, apart: np.ndarray, rounds: int) -> Robust:
         used, y = self.used, np.where(self.used[:, :, None], self.y, 0.0)
         groups = [rows for rows in (used & ~apart[:, None], used & apart[:, None]) if rows.any()]
-        prior = np.repeat([0.0, self.offset_sd**-2, _NEARNESS_SD**-2], [16, 9, 1])
+        prior = np.repeat([0.0, self.offset_sd**-2, self.nearness_sd**-2], [16, 9, 1])
         M = beta[:16].reshape(2, 2, 4)
         r = y - self._design(M, None) @ beta
         r2 = (r**2).sum(axis=2) / self.noise**2

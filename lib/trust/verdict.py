@@ -51,8 +51,6 @@ LIMITS: dict[str, tuple[float, float]] = {
 #: Pixel noise assumed where the detections claim none: that of labels set by hand.
 _LABEL_PX = 3.0
 _CHECK = "`python3 -m lib check RECORDING`"
-#: Reasons that labels set by hand cause as detections do.
-_OF_LANDMARKS = ("detector_unfit", "minority", "no_consensus", "residuals")
 _MORE_FRAMES = "Record more frames, with the tool in other places."
 _OVERLAYS = f"Look at the overlays of {_CHECK}"
 
@@ -273,7 +271,8 @@ def assess(
     if not np.isfinite(data.covariance_px2).any():  # labels set by hand
         odd = ", ".join(map(str, found.frame[found.score > 1][:12]))
         cure = f"Look again at the labels{' of frames ' * bool(odd)}{odd}: `python3 -m lib annotate RECORDING`."
-        reasons = [replace(r, cure=cure) if r.name in _OF_LANDMARKS else r for r in reasons]
+        theirs = ("detector_unfit", "minority", "no_consensus", "residuals")  # the reasons that wrong labels cause
+        reasons = [replace(r, cure=cure) if r.name in theirs else r for r in reasons]
     told = [replace(r, **{k: getattr(r, k).replace("RECORDING", where) for k in ("text", "cure")}) for r in reasons]
     return Assessment(data, calibration, Verdict(tuple(told)), diagnosis, found, epipolar_px)
 
