@@ -30,7 +30,7 @@ _REQUIRED = {"name": str, "fps": float, "image_size_px": list}
 _DEFAULTS = {"description": "", "readout_s": 0.0, "offset_s": 0.0, "robot_accuracy_mm": 0.010, "details": {}}
 _DEFAULTS |= {"skeleton": list(LANDMARKS), "bit_depth": 0}
 _FIXED = {"format": _FORMAT, "units": _UNITS}
-_GAP_S = 0.25  # nothing is interpolated in a step longer than this and three usual ones: 10 mm/s^2 make 0.08 mm there
+_GAP_S = 0.5  # in a step between samples that is longer than this and than five usual ones, nothing is interpolated
 _FARTHEST_MM = 1e5  # a position farther from the origin is no millimetre
 _ORDER = "time_s must be a number larger than the row before"
 _LONGER = 5.0  # a log is that many times longer than its video by intent, or if the times of the frames are missing
@@ -70,7 +70,7 @@ class Kinematics:
     def at(self, time_s: ArrayLike) -> np.ndarray:
         """Landmarks (n, k, 3) mm at robot times (n,), or (n, k) for a time of each landmark; linear between samples.
 
-        NaN before the first sample, after the last, beside a dropped one, and in a gap of 0.25 s and three samples.
+        NaN before the first sample, after the last, beside a dropped one, and in a gap of half a second and five samples.
         """
         time, k = np.asarray(time_s, dtype=np.float64), self.x_mm.shape[1]
         time = np.repeat(time[:, None], k, axis=1) if time.ndim == 1 else time
@@ -82,7 +82,7 @@ class Kinematics:
         if len(self.time_s) > 1:
             step = np.diff(self.time_s)
             before = np.clip(np.searchsorted(self.time_s, time, side="right") - 1, 0, len(step) - 1)
-            long = (step > max(_GAP_S, 3.01 * float(np.median(step))))[before]
+            long = (step > max(_GAP_S, 5.0 * float(np.median(step))))[before]
             x[long & (time != self.time_s[before]) & (time != self.time_s[before + 1])] = np.nan
         return x
 
@@ -180,7 +180,7 @@ class Recording:
             (longer, "frame_times", f"{n} frames at {self.fps:g} fps last {span:.1f} s, but the robot's log {logged:.1f} s.",
              "If frames were left out, write their times to frames.csv (frame, time_s)."),
             (reported / n < _COVERED, "little_overlap",
-             f"The robot reports a position in {reported} of {n} frames; its log lasts for {covered}.",
+             f"The robot reports a position in {reported} of {n} frames; {covered} lie between its first and last sample.",
              "Check offset_s and the time_s columns; export the log of the whole video, without gaps."),
             (usual_s > _SLOW_S, "slow_log", f"The robot's log has a sample every {usual_s:.3g} s.",
              "Is time_s in milliseconds? Give seconds, and ten samples a second or more."),

@@ -268,10 +268,10 @@ def assess(
         robot_accuracy_mm=recording.robot_accuracy_mm, doubts=recording.doubts,
     )  # fmt: skip
     reasons, where = verdict.reasons, shlex.quote(paths.shown(recording.folder))  # in the commands that cures name
-    if not np.isfinite(data.covariance_px2).any():  # labels set by hand
-        odd = ", ".join(map(str, found.frame[found.score > 1][:12]))
+    if data.seen.any() and not np.isfinite(data.covariance_px2).any():  # labels set by hand
+        odd = ", ".join(map(str, found.frame[found.bad.any(axis=1)][:12]))
         cure = f"Look again at the labels{' of frames ' * bool(odd)}{odd}: `python3 -m lib annotate RECORDING`."
-        theirs = ("detector_unfit", "minority", "no_consensus", "residuals")  # the reasons that wrong labels cause
+        theirs = ("detector_unfit", "minority", "no_consensus")  # the reasons that wrong labels cause
         reasons = [replace(r, cure=cure) if r.name in theirs else r for r in reasons]
     told = [replace(r, **{k: getattr(r, k).replace("RECORDING", where) for k in ("text", "cure")}) for r in reasons]
     return Assessment(data, calibration, Verdict(tuple(told)), diagnosis, found, epipolar_px)

@@ -118,6 +118,8 @@ def test_careless_labels_are_looked_at_again_and_no_detector_is_taught():
     assert verdict.level != LEVELS[0] and "adapt" not in cures and "detector" not in cures
     named = re.search(r"labels of frames ([\d, ]+): `python3 -m lib annotate", cures)[1]
     assert set(map(int, named.split(", "))) <= set(wild.tolist())
+    blind = assess(recording, of_recording(recording, *(u * np.nan))).verdict  # of a detector that finds nothing
+    assert not any("Look again at the labels" in reason.cure for reason in blind.reasons)
 
 
 def test_no_detection_is_one_message():
