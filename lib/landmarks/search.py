@@ -17,9 +17,7 @@ _OPEN = 0.25
 
 
 def several_peaks(heatmaps: torch.Tensor, n: int, stride: int) -> tuple[np.ndarray, np.ndarray]:
-    """Centroids (n m, k, 2) px and heights (n m, k) of the `n` highest peaks of every heatmap (m, k, h, w), more than 3 sigma
-    apart; `stride` as for `decode`.
-    """
+    """The `n` highest peaks of heatmaps (m, k, h, w), over 3 sigma apart: centroids (n m, k, 2) px and heights (n m, k)."""
     rows, columns = (torch.arange(side, dtype=heatmaps.dtype) for side in heatmaps.shape[-2:])
     found = []
     for _ in range(n):

@@ -305,7 +305,8 @@ def _scaled_axis(A: np.ndarray, covariance: np.ndarray) -> Iterator[Hypothesis]:
         log = logs[best] + np.clip(0.5 * (before - after) / bend / spacing, -spacing, spacing)
         scale, sd = float(np.exp(log)), float(np.sqrt(2.0 / bend))  # A times s is plausible: the numbers are s too large
         text = f"The cameras' pixels are skewed or oblong, and square if the robot's {name} is divided by {scale:.3f}."
-        explained, gain = 1.0 - float(least) / max(none, 1e-9), float(0.5 * (none - least) - 1.5)
+        # Rows that err alike say less than they seem to, and to accuse a robot's axis takes more than to accuse a clock.
+        explained, gain = 1.0 - float(least) / max(none, 1e-9), float(0.5 * (none - least) - 5.5)
         yield Hypothesis("scaled_axis", text, _SCALE.format(name), scale, sd * scale, "times", explained, gain)
 
 

@@ -205,7 +205,8 @@ class Problem:
                 break
             before = total
         design = self._overcount(r * root)
-        inverse = np.linalg.inv(information) * np.outer(scale, scale) * design
+        told = (shapes[0].freedom + 4.0) / (shapes[0].freedom + 2.0)  # by so much this exceeds Fisher's information
+        inverse = np.linalg.inv(information) * np.outer(scale, scale) * design * told
         offset_sd = np.sqrt(np.diag(inverse)[16:25].reshape(3, 3).sum(axis=1))
         nearness = float(beta[25]), float(np.sqrt(inverse[25, 25]))
         added = beta[26:], inverse[26:, 26:], D[..., 26:] @ beta[26:]
