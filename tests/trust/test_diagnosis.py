@@ -76,6 +76,12 @@ def test_the_curvature_of_a_near_microscope_accuses_nobody_else(seed, frames):
     assert best is None or best.name in ("finite_distance", "detector_unfit")
 
 
+def test_rows_that_err_alike_for_a_while_accuse_no_axis_of_the_robot():
+    rng, options = np.random.default_rng([77, 3, 0, 30, 5, 7]), {"outliers": 0.05, "memory": 0.7}
+    best = found(Scene(rng, frames=30, fps=15.0, speed_mm_s=4.0, **options).take(), log=False).best
+    assert best is None or best.name == "finite_distance"
+
+
 def test_a_bend_has_the_size_by_which_the_tips_are_seen_to_move_and_is_no_finite_distance():
     bent = take("tool bends", "3 %", frames=100)
     diagnosis, x = found(bent), bent.data.x_mm[bent.data.landmark > 0]
