@@ -129,7 +129,7 @@ class Problem:
         self, columns: Callable[[np.ndarray], np.ndarray] | None = None, *, start: np.ndarray | None = None,
         apart: np.ndarray | None = None, rounds: int = 40,
     ) -> Robust:  # fmt: skip
-        """Most probable cameras, offsets and additions, near `start` (26,) or the best sample of four rows.
+        """Most probable cameras, offsets and additions, near a `Robust.start` or the best sample of four rows.
 
         `columns` gives the pixels' change by each addition, cameras M -> (n, 2, 2, k); rows `apart` (n,) have another noise.
         """
