@@ -27,8 +27,6 @@ _FREEDOM = np.array([0.7, 1.0, 2.0, 4.0, 10.0, 100.0])
 _LEAST_GAIN, _LEAST_EXPLAINED = 6.0, 0.02  # of a hypothesis that is named
 FITS = 0.03  # the scale of the residuals over the spread of the pixels, below which cameras fit
 _LEAST_PX = 0.02  # smaller residuals are rounding
-_OFFSET_SD_MM = 0.03  # of what a detector marks beside a landmark
-_NEARNESS_SD = 0.006  # of 1/distance, per mm: a microscope stands 150 mm away and more
 _BLOCK = 8  # frames over which residuals may be correlated
 _LONGEST_S = 0.25  # between frames, whose own positions stand for the robot's log
 _PARAMETERS = 21  # of two cameras with a distance, and about as many of the nine offsets as data tell
@@ -97,12 +95,12 @@ class Problem:
     time: np.ndarray
     centre: np.ndarray
     centre_px: np.ndarray  # (2,) of the images
-    offset_sd: float = _OFFSET_SD_MM  # of the landmarks, and of 1/distance, before the data
-    nearness_sd: float = _NEARNESS_SD
+    offset_sd: float = 0.03  # mm, before the data: a detector may mark a place beside the landmark
+    nearness_sd: float = 0.006  # of 1/distance, per mm, before the data: a microscope stands 150 mm away and more
 
     @classmethod
     def of(cls, data: Correspondences, size: tuple[int, int] | None = None) -> Self:
-        """The rows that the robot reports and an image shows, of `size`, (width, height) px."""
+        """The rows that the robot reports and an image, of `size` (width, height) px, shows."""
         rows = np.isfinite(data.x_mm).all(axis=1) & data.seen.any(axis=1)
         axes = np.nan_to_num(rows_axes(data))[rows]
         data = data.subset(rows)
@@ -222,7 +220,7 @@ class Problem:
 
 
 def _shrinking(M: np.ndarray, x: np.ndarray, from_centre: np.ndarray) -> np.ndarray:
-    """(..., n, 2, 2) the change by 1/distance, in px mm, of pixels `from_centre` of positions x (..., n, 2, 3)."""
+    """(..., n, 2, 2) px mm: derivatives by 1/distance of pixels `from_centre` of the image, of positions x (..., n, 2, 3)."""
     normal = cross(M[:, 0, :3], M[:, 1, :3])
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
     return -np.einsum("...cj,cj->...c", x, normal)[..., None] * from_centre

@@ -260,8 +260,11 @@ def assess(
     if calibration is not None and len(y := feature_matches(recording, spread(len(recording), 3))):
         epipolar_px = float(np.median(np.abs(calibration.pair.epipolar_distance(y[:, :2], y[:, 2:]))))
     stated = {name: getattr(recording, name) for name in ("kinematics", "offset_s", "readout_s", "image_size_px")}
-    near = calibration is not None and calibration.inverse_distance_per_mm[1] > 0
-    diagnosis = diagnose(data, near=near, **stated)
+    straight, near = data, calibration is not None and calibration.inverse_distance_per_mm[1] > 0
+    if near:  # a lens that distorts is no fault either
+        left, right = calibration.cameras
+        straight = replace(data, u_left=left.undistort(data.u_left), u_right=right.undistort(data.u_right))
+    diagnosis = diagnose(straight, near=near, **stated)
     found = health(recording, data, calibration, detector=detector)
     verdict = judge(
         data, calibration, diagnosis=diagnosis, health=found, epipolar_px=epipolar_px, error=error,
@@ -270,7 +273,7 @@ def assess(
     reasons, where = verdict.reasons, shlex.quote(paths.shown(recording.folder))  # in the commands that cures name
     if data.seen.any() and not np.isfinite(data.covariance_px2).any():  # labels set by hand
         odd = ", ".join(map(str, found.frame[found.bad.any(axis=1)][:12]))
-        cure = f"Look again at the labels{' of frames ' * bool(odd)}{odd}: `python3 -m lib annotate RECORDING`."
+        cure = f"Look again at the labels{', first those of frames ' * bool(odd)}{odd}: `python3 -m lib annotate RECORDING`."
         theirs = ("detector_unfit", "minority", "no_consensus")  # the reasons that wrong labels cause
         reasons = [replace(r, cure=cure) if r.name in theirs else r for r in reasons]
     told = [replace(r, **{k: getattr(r, k).replace("RECORDING", where) for k in ("text", "cure")}) for r in reasons]
@@ -286,7 +289,6 @@ def report(calibration: Calibration, *, verdict: Verdict | None = None, robot_ac
     c, seen = calibration, np.isfinite(calibration.residuals_px[:, ::2])
     outliers = np.argwhere(seen & ~c.view_inliers)
     rows, used, usable = len(c.inliers), int(c.inliers.sum()), int(c.usable.sum())
-    value, freedom = c.chi_square
     left_out = "" if usable == rows else f", {rows - usable} without a detection, position or axes"
     lines = [
         str(verdict),
@@ -296,7 +298,7 @@ def report(calibration: Calibration, *, verdict: Verdict | None = None, robot_ac
         f"({100 * len(outliers) / seen.sum():.0f} %)",
         f"  noise         sigma_u {c.sigma_u_px:.2f} px, sigma_x {1e3 * c.sigma_x_mm:.1f} um",
         f"  reprojection  {c.reprojection_rms_px:.2f} px RMS, {c.press_rms_px:.2f} px cross-validated (leave one out)",
-        f"  chi-square    {value:.0f} for {freedom} degrees of freedom",
+        "  chi-square    {:.0f} for {} degrees of freedom".format(*c.chi_square),
         "  volume        {:.2f} x {:.2f} x {:.2f} mm RMS".format(*c.extents_mm),
     ]
     for name, resection in zip(["left", "right"] if c.rig else ["camera"], (k.resect() for k in c.cameras), strict=True):

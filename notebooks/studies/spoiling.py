@@ -195,7 +195,7 @@ class Result:
 
 
 def examine(take: Take, fit: Callable[..., Calibration] = calibrate) -> Result:
-    """Calibrate, diagnose and judge, as `lib.trust.assess` does; `fit` is `calibrate` where that has a ``model``."""
+    """Calibrate by `fit`, diagnose and judge, as `lib.trust.assess` does; `calibrate` alone keeps cameras affine."""
     calibration, error, effect = None, None, np.inf
     try:
         calibration = fit(take.data, image_size_px=take.image_size_px)

@@ -2,6 +2,8 @@
 
 import re
 from dataclasses import replace
+from pathlib import Path
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -10,9 +12,11 @@ from lib import paths
 from lib.calibration import calibrate
 from lib.correspondences import Correspondences, DataError, NoDetectionError, of_recording
 from lib.recordings import Doubt, Recording
-from lib.trust import LEVELS, Health, Reason, Verdict, assess, judge
+from lib.trust import LEVELS, Health, Reason, Verdict, assess, diagnose, judge
+from lib.trust import verdict as verdicts
 from lib.workbench.report import VERDICT_COLOURS
 from notebooks.studies.simulated_rows import simulate_correspondences
+from notebooks.studies.spoiling import Scene
 
 CLOCK = Reason("clock", "not trustworthy", "183 ms", "Set offset_s.")
 FEW = Reason("few_frames", "doubtful", "5 frames", "Record more.")
@@ -116,10 +120,25 @@ def test_careless_labels_are_looked_at_again_and_no_detector_is_taught():
     verdict = assess(recording, of_recording(recording, *u)).verdict
     cures = " ".join(reason.cure for reason in verdict.reasons)
     assert verdict.level != LEVELS[0] and "adapt" not in cures and "detector" not in cures
-    named = re.search(r"labels of frames ([\d, ]+): `python3 -m lib annotate", cures)[1]
+    named = re.search(r"first those of frames ([\d, ]+): `python3 -m lib annotate", cures)[1]
     assert set(map(int, named.split(", "))) <= set(wild.tolist())
     blind = assess(recording, of_recording(recording, *(u * np.nan))).verdict  # of a detector that finds nothing
     assert not any("Look again at the labels" in reason.cure for reason in blind.reasons)
+
+
+def test_a_lens_that_distorts_is_no_fault_where_the_cameras_have_it(monkeypatch):
+    monkeypatch.setattr(verdicts, "feature_matches", lambda *_: [])
+    monkeypatch.setattr(verdicts, "health", lambda *_, **__: None)
+    scene = Scene(np.random.default_rng([3, 0]), frames=60, inverse_distance_per_mm=1 / 200).take()
+    centre = (np.array(scene.image_size_px) - 1) / 2
+    far = [u - centre for u in (scene.data.u_left, scene.data.u_right)]
+    left, right = (centre + d * (1 + 8e-8 * (d**2).sum(axis=1, keepdims=True)) for d in far)
+    stated = {key: getattr(scene, key) for key in ("kinematics", "offset_s", "readout_s", "image_size_px")}
+    recording = MagicMock(folder=Path("stub"), doubts=(), robot_accuracy_mm=0.01, **stated)
+    recording.__len__.return_value = 60
+    data = replace(scene.data, u_left=left, u_right=right)
+    assert diagnose(data, near=True, **stated).best is not None
+    assert assess(recording, data, model="zero_skew+distance+radial").diagnosis.best is None
 
 
 def test_no_detection_is_one_message():
