@@ -1,12 +1,13 @@
-"""What a detector sees in some frames: anywhere, near where the robot says, or away from what stands still."""
+"""What a detector sees in some frames: anywhere, near where the robot says, or apart from what stands still."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple, Self
 
 import numpy as np
 
 from lib.correspondences import Correspondences, of_recording
-from lib.landmarks import Landmarks
+from lib.landmarks import Detector, Landmarks, with_ground
+from lib.landmarks.contrast import levelled
 from lib.landmarks.metrics import tool_length_px
 from lib.recordings import Recording
 from lib.recordings.annotations import CLICK_SD_PX
@@ -69,19 +70,28 @@ def look(
         frame = recording.frames[int(number)]
         pair = np.stack([frame.left, frame.right])
         if near is None:
-            found.append(detector(pair))
+            found.append(detector(pair, **with_ground(detector, recording)))
         else:
             known = np.isfinite(near[i]).all(axis=-1)
             known &= known[:, :1] & known[:, 1:].any(axis=1, keepdims=True)  # no window without base and tip
             u = np.where(known[..., None], near[i], np.nan)
-            rough = Landmarks(u, np.tile(np.eye(2), (2, 3, 1, 1)), known.astype(float))
-            for stage in later:
-                rough = detector.refine(pair, rough, stage)
+            start = Landmarks(u, np.tile(np.eye(2), (2, 3, 1, 1)), known.astype(float))
+            rough = _refined(detector, pair, start, later)
+            if rough.doubtful.any():
+                again = zip(pair, recording.ground(), rough.doubtful, strict=True)
+                again = np.stack([levelled(image, ground) if doubt else image for image, ground, doubt in again])
+                rough = rough.surest(_refined(detector, again, start, later))
             away = np.linalg.norm(rough.u - u, axis=-1) > NEAR * tool_length_px(u)[:, None]  # that is another thing
             u, confidence = np.where(away[..., None], np.nan, rough.u), np.where(away, 0.0, rough.confidence)
             found.append(Landmarks(u, rough.covariance, confidence))
         progress((i + 1) / len(frames))
     return Seen(np.asarray(frames), *(np.stack([getattr(p, n) for p in found]) for n in ("u", "covariance", "confidence")))
+
+
+def _refined(detector: Detector, images: np.ndarray, rough: Landmarks, stages: Sequence[str]) -> Landmarks:
+    for stage in stages:
+        rough = detector.refine(images, rough, stage)
+    return rough
 
 
 def at_rest(seen: Seen, x_mm: np.ndarray) -> np.ndarray:
@@ -106,11 +116,11 @@ def look_elsewhere(
     recording: Recording, detector: Callable, seen: Seen, still: np.ndarray,
     progress: Callable[[float], None] = lambda done: None,
 ) -> Seen:  # fmt: skip
-    """`seen`; where its tools are `still` (m, 2), what the detector finds in other places of the image instead."""
+    """`seen`; where its tools are `still` (m, 2), what the detector finds in what differs from the ground instead."""
     found, images = Seen(*(part.copy() for part in seen)), np.argwhere(still)
     for k, (i, side) in enumerate(images):
         frame = recording.frames[int(seen.frame[i])]
-        other = detector((frame.left, frame.right)[side][None], avoid=seen.u[still[:, side], side])
+        other = detector(levelled((frame.left, frame.right)[side], recording.ground()[side])[None])
         for part, one in zip(found[1:], (other.u, other.covariance, other.confidence), strict=True):
             part[i, side] = one[0]
         progress((k + 1) / len(images))

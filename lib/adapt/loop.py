@@ -30,7 +30,7 @@ from lib.trust.health import spread
 
 #: Most rounds of training, and most steps of a stage in one; the time ends most trainings.
 ROUNDS, STEPS = 3, 4000
-RECIPE = 19  # raised where teaching or training changes: what an older one kept is not gone on with
+RECIPE = 20  # raised where teaching or training changes: what an older one kept is not gone on with
 #: Share of the time left that a round takes, and fewest images for stopping to which alone the doubt is fitted.
 _ROUND_SHARE, _DOUBT_IMAGES = 0.85, 10
 #: Said of a log of which more than half stays as it is.
@@ -217,7 +217,7 @@ class _Work:
             return seen
         self.report["notes"].append(
             f"In {still.sum()} of {still.size} images what the detector takes for the tool stands still while the robot "
-            "moves: it is another object, or a pattern. There the detector looked for the tool elsewhere."
+            "moves: it is another object, or a pattern. There the detector looked at what differs from the ground."
         )
         return self.kept("elsewhere", partial(look_elsewhere, self.recording, detector, seen, still))
 

@@ -25,7 +25,7 @@ from lib import paths
 from lib.geometry import check, image_from_cell
 from lib.landmarks import windows as view
 from lib.landmarks.checkpoints import checksum, load_network, read_checkpoint, write_checkpoint
-from lib.landmarks.contrast import equalised, stretched
+from lib.landmarks.contrast import equalised, levelled, stretched
 from lib.landmarks.engines import accelerated, default_engine
 from lib.landmarks.error_model import ErrorModel, Rough, closeup_peaks, corrected, covariance_and_confidence
 from lib.landmarks.heatmaps import Peaks, decode
@@ -99,6 +99,17 @@ class Landmarks:
         """NaN and confidence 0 for every landmark below `MISSING_BELOW`."""
         missing, result = ~(self.confidence >= MISSING_BELOW), Landmarks.join([self])  # a copy
         result.u[missing], result.covariance[missing], result.confidence[missing] = np.nan, np.nan, 0.0
+        return result
+
+    @property
+    def doubtful(self) -> np.ndarray:
+        """(n,) images that leave doubt."""
+        return self.confidence.mean(1) < _UNSURE
+
+    def surest(self, other: Self) -> Self:
+        """Of each image these landmarks or the `other` ones: those whose mean confidence is higher."""
+        result, better = Landmarks.join([self]), other.confidence.mean(1) > self.confidence.mean(1)
+        result._put(better, other[better])
         return result
 
     def _put(self, rows: np.ndarray, values: Self) -> None:
@@ -218,35 +229,39 @@ class Detector:
             cure = "fit them with `lib.training.error_models.fit_error_models` or `python3 -m lib train assemble`"
             raise ValueError(f"{path}: {what}; {cure}.")
 
-    def __call__(self, images: ArrayLike, *, batch: int = 4, avoid: np.ndarray | None = None) -> Landmarks:
+    def __call__(
+        self, images: ArrayLike, *, batch: int = 4, ground: Callable[[], np.ndarray] | None = None
+    ) -> Landmarks:
         """Landmarks of images (n, h, w, 3), uint8 RGB or float in [0, 1]; `batch` images at a time.
 
-        An image in doubt is seen again with more contrast, then swept, which takes many times as long.  `avoid` (k, 3, 2) px
-        are what looks like the tool and is none; it needs the second stage.  A `ValueError` for another shape, type or range.
+        An image in doubt is seen again with more contrast, then swept, which takes many times as long.  `ground` gives the
+        images (n, h, w, 3) uint8 without the tool, such as `Recording.ground`: where there is doubt, what differs from them
+        is looked at.  A `ValueError` for another shape, type or range.
         """
         images = as_uint8(images)
         with self._threads():
-            parts = (images[start : start + batch] for start in range(0, len(images), batch))
-            return Landmarks.join([self._seen(part, avoid) for part in parts])
+            parts = (slice(start, start + batch) for start in range(0, len(images), batch))
+            return Landmarks.join([self._seen(images[p], ground and (lambda p=p: ground()[p])) for p in parts])
 
-    def _seen(self, images: np.ndarray, avoid: np.ndarray | None) -> Landmarks:
+    def _seen(self, images: np.ndarray, ground: Callable[[], np.ndarray] | None) -> Landmarks:
         """Landmarks of a few images.  One in doubt is seen again with more contrast, then swept; its surest look counts."""
-        result = self._once(images, avoid)
-        for more in (equalised, stretched, None) if self.tool_network else ():
-            unsure = np.flatnonzero(result.confidence.mean(1) < _UNSURE)
+        result = self._once(images)
+        looks = [lambda i: equalised(images[i]), lambda i: stretched(images[i]), lambda i: images[i]]
+        if ground is not None:
+            looks = [lambda i: levelled(images[i], ground()[i])] * 2
+        for k, look in enumerate(looks if self.tool_network else (), 1):
+            unsure = np.flatnonzero(result.doubtful)
             if unsure.size:
-                again = np.stack([more(image) for image in images[unsure]]) if more else images[unsure]
-                other = self._once(again, avoid, sweep=more is None)
-                other = other if more else replace(other, confidence=_UNWITNESSED * other.confidence)
-                better = other.confidence.mean(1) > result.confidence[unsure].mean(1)
-                result._put(unsure[better], other[better])
+                other = self._once(np.stack([look(i) for i in unsure]), sweep=k == len(looks))
+                other = other if k < len(looks) else replace(other, confidence=_UNWITNESSED * other.confidence)
+                result._put(unsure, result[unsure].surest(other))
         return result
 
-    def _once(self, images: np.ndarray, avoid: np.ndarray | None, sweep: bool = False) -> Landmarks:
+    def _once(self, images: np.ndarray, sweep: bool = False) -> Landmarks:
         """Landmarks of a few images as they are, by all stages but tracking; `sweep` as in `searched`."""
         rough = self.coarse(images)
         seen = self.stage_peaks(images, rough.u, "tool") if self.tool_network else None
-        result = self.searched(images, rough, seen, avoid, sweep=sweep)
+        result = self.searched(images, rough, seen, sweep=sweep)
         same = np.array_equal(result.u, rough.u, equal_nan=True)
         before = rough
         for stage in [stage for stage in self.stages[1:] if stage != "tracking"]:
@@ -255,16 +270,19 @@ class Detector:
             result = self.refine(images, result, stage, seen if same and stage == "tool" else None, only=again)
         return result
 
-    def track(self, images: ArrayLike, previous: Landmarks, *, min_confidence: float = TRACKED_FROM) -> Landmarks:
+    def track(
+        self, images: ArrayLike, previous: Landmarks, *, min_confidence: float = TRACKED_FROM,
+        ground: Callable[[], np.ndarray] | None = None,
+    ) -> Landmarks:  # fmt: skip
         """Landmarks of images (n, h, w, 3) that follow those of `previous`, such as the next left and right image.
 
-        Only closeups are looked at.  An image with a landmark below `min_confidence` is searched as a whole.
+        Only closeups are looked at.  An image with a landmark below `min_confidence` is searched as a whole, with its `ground`.
         """
         images = as_uint8(images)
         if len(previous) != len(images):
             raise ValueError(f"previous: holds {len(previous)} images, but images {len(images)}.")
         if self.closeup_network is None:
-            return self(images)
+            return self(images, ground=ground)
         usable = np.flatnonzero((previous.confidence >= min_confidence).all(1) & np.isfinite(previous.u).all((1, 2)))
         result = Landmarks.none(len(images))
         if usable.size:
@@ -274,7 +292,7 @@ class Detector:
                 result._put(usable, self.refine(part, found, "tracking", only=view.moved_far(near.u, found.u)))
         lost = np.flatnonzero((result.confidence < min_confidence).any(1))
         if lost.size:
-            result._put(lost, self(images[lost]))
+            result._put(lost, self(images[lost], ground=ground and (lambda: ground()[lost])))
         return result.without_unsure()
 
     def _threads(self) -> AbstractContextManager[None]:
@@ -288,31 +306,27 @@ class Detector:
         return Landmarks(u, covariance, found.confidence).without_unsure()
 
     def searched(
-        self, images: np.ndarray, rough: Landmarks, seen: tuple | None = None, avoid: np.ndarray | None = None, *,
-        sweep: bool = False,
-    ) -> Landmarks:  # fmt: skip
+        self, images: np.ndarray, rough: Landmarks, seen: tuple | None = None, *, sweep: bool = False
+    ) -> Landmarks:
         """What later stages start from: `rough`, or, where its window does not show it well, the tool whose window does best.
 
         Candidates are `rough` and tools made of the highest peaks that the first stage sees at several scales.  All are
         looked at once, the likeliest ones again; the likeliest wins.  The second stage decides, however sure the first is:
-        it has learnt what is no tool.  `seen` is what `stage_peaks` gave for `rough`, if that is known; `avoid` as in a call.
-        With `sweep` the candidates are those of `swept`.
+        it has learnt what is no tool.  `seen` is what `stage_peaks` gave for `rough`, if that is known.  With `sweep` the
+        candidates are those of `swept`.
         """
         if self.tool_network is None:
             return rough
         result = Landmarks.join([rough])  # a copy
         height = self._shown(seen or self.stage_peaks(images, rough.u, "tool"), len(images))[1]
-        searched = (height < _SHOWN) | (avoid is not None)
+        searched = height < _SHOWN
         for i in np.flatnonzero(searched):
             tools, u, once = self.swept(images[i]) if sweep else self.proposed(images[i], rough.u[i : i + 1])
-            best = np.argsort(-likelihood(u, once, avoid))[:_AGAIN]
+            best = np.argsort(-likelihood(u, once))[:_AGAIN]
             u, twice = self._looked(images[i], u[best], "again")
-            scores = likelihood(u, twice, avoid)
-            chosen = scores.argmax()
-            there = np.isfinite(scores[chosen])
-            found = tools[best[[chosen]]] if there else np.full((1, 3, 2), np.nan)
-            result._put(np.array([i]), replace(Landmarks.none(1), u=found))
-            height[i] = twice[chosen] if there else 0.0
+            chosen = likelihood(u, twice).argmax()
+            result._put(np.array([i]), replace(Landmarks.none(1), u=tools[best[[chosen]]]))
+            height[i] = twice[chosen]
         unsure = searched | (rough.confidence < _SURE).any(1)
         return replace(result, confidence=np.where(unsure[:, None], _SURE * height[:, None], rough.confidence))
 

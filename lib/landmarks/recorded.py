@@ -12,7 +12,7 @@ from tqdm.auto import tqdm
 from lib import files, paths
 from lib.correspondences import Correspondences, of_recording
 from lib.landmarks.detector import Detector, Landmarks
-from lib.recordings import Recording
+from lib.recordings import Ground, Recording
 
 
 def detect(
@@ -37,15 +37,25 @@ def detect(
     chosen = np.arange(len(recording.frames))[slice(None) if frames is None else frames]
     if not chosen.size:
         raise ValueError(f"frames: none of the {len(recording.frames)} frames of the recording; choose at least one.")
-    found = []
+    found, known = [], with_ground(detector, recording)
     for i in tqdm(chosen, desc="landmarks", unit="pair", leave=False):
         frame = recording.frames[int(i)]
         pair = np.stack([frame.left, frame.right])
-        found.append(detector.track(pair, found[-1]) if track and found else detector(pair))
+        found.append(detector.track(pair, found[-1], **known) if track and found else detector(pair, **known))
     every, n = Landmarks.join(found), len(chosen)
     known = {"covariance_px2": every.covariance.reshape(n, 2, 3, 2, 2), "confidence": every.confidence.reshape(n, 2, 3)}
     known = {name: part.swapaxes(1, 2) for name, part in known.items()}
     return of_recording(recording, every.u[::2], every.u[1::2], frames=chosen, **known)
+
+
+def with_ground(detector: Callable, recording: Recording, change: Callable[[np.ndarray], np.ndarray] | None = None) -> dict:
+    """What a call of the detector takes beside a pair of images: their ground, unless it is a stand-in of images alone.
+
+    `change` made the images of those of the recording.
+    """
+    if not isinstance(detector, Detector | SharedDetector):
+        return {}
+    return {"ground": recording.ground.changed(change) if change else recording.ground}
 
 
 class SharedDetector:
@@ -53,7 +63,7 @@ class SharedDetector:
 
     `python3 -m lib` names a folder for that in the environment: `run` one of its own, which it removes at its end, other
     commands one in data/cache.  Anywhere else this is the detector itself.  A file's name is the digest of the images'
-    pixels, the weights, the settings and the engine.  Where a time is measured, call the detector itself.
+    pixels, the ground's key, the weights, the settings and the engine.  Where a time is measured, call the detector itself.
 
     Attributes:
         seconds: What detecting took: here, and where it was read, there.
@@ -70,18 +80,18 @@ class SharedDetector:
         self._digest = getattr(self.detector, "digest", "")
         self._folder = os.environ.get(paths.SHARED_VARIABLE) if self._digest else None
 
-    def __call__(self, images: np.ndarray) -> Landmarks:
-        """Landmarks of a stereo pair (2, h, w, 3), uint8 RGB."""
+    def __call__(self, images: np.ndarray, *, ground: Ground | None = None) -> Landmarks:
+        """Landmarks of a stereo pair (2, h, w, 3), uint8 RGB; `ground` as in a `Detector`'s call."""
         self.pairs, file = self.pairs + 1, None
         if self._folder:
-            content = f"{self._digest} {images.dtype} {images.shape}".encode() + images.tobytes()
+            content = f"{self._digest} {images.dtype} {images.shape} {ground and ground.key}".encode() + images.tobytes()
             file = Path(self._folder) / f"{files.digest(content, length=64)}.npz"
             if file.is_file():
                 with np.load(file) as kept:
                     self.read, self.seconds = self.read + 1, self.seconds + float(kept["seconds"])
                     return Landmarks(kept["u"], kept["covariance"], kept["confidence"])
         start = time.perf_counter()
-        found = self.detector(images)
+        found = self.detector(images, **({"ground": ground} if isinstance(self.detector, Detector) else {}))
         seconds = time.perf_counter() - start
         self.seconds += seconds
         if file:

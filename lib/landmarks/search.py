@@ -10,8 +10,6 @@ from lib.landmarks.metrics import tool_length_px
 PEAKS = 4
 #: Two tools are the same if their landmarks differ by less than this share of the length, in the mean.
 _SAME = 0.25
-#: Tools stand at the same place if their landmarks lie nearer than this share of the length, in the mean.
-_PLACE = 0.5
 #: What jaws that are open by the tool's length add to the mean height of its peaks, chosen on validation scenes.
 _OPEN = 0.25
 
@@ -55,20 +53,7 @@ def best_tools(u: np.ndarray, height: np.ndarray, n: int) -> np.ndarray:
     return which[chosen]
 
 
-def likelihood(u: np.ndarray, height: np.ndarray, avoid: np.ndarray | None = None) -> np.ndarray:
-    """Scores (n,) of tools u (n, 3, 2), by the mean height (n,) of their peaks and by opening: a rod looks like shut jaws.
-
-    They are -inf where one of the tools `avoid` (k, 3, 2) stands.
-    """
+def likelihood(u: np.ndarray, height: np.ndarray) -> np.ndarray:
+    """Scores (n,) of tools u (n, 3, 2), by the mean height (n,) of their peaks and by opening: a rod looks like shut jaws."""
     opening = np.linalg.norm(u[:, 1] - u[:, 2], axis=1) / np.maximum(tool_length_px(u), 1.0)
-    return np.where(True if avoid is None else ~at_one_place(u, avoid), height + _OPEN * np.nan_to_num(opening), -np.inf)
-
-
-def at_one_place(u: np.ndarray, tools: np.ndarray) -> np.ndarray:
-    """(n,) which tools u (n, 3, 2) stand where one of `tools` (k, 3, 2) does.
-
-    >>> tool = np.array([[0.0, 0.0], [90.0, -9.0], [90.0, 9.0]])
-    >>> at_one_place(tool + np.array([[[5.0, 0.0]], [[70.0, 0.0]]]), tool[None])
-    array([ True, False])
-    """
-    return (np.linalg.norm(u[:, None] - tools, axis=3).mean(axis=2) < _PLACE * tool_length_px(tools)).any(axis=1)
+    return height + _OPEN * np.nan_to_num(opening)

@@ -10,6 +10,7 @@ import shutil
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple, Self
 
@@ -21,6 +22,7 @@ from lib.correspondences import LANDMARKS
 from lib.files import toml_entries, write_bytes, write_text
 from lib.recordings.annotations import SIDES, Annotations, read_coco, write_coco
 from lib.recordings.frames import Frames, encoded, open_side
+from lib.recordings.ground import Ground
 from lib.recordings.tables import columns, read_table, read_toml, refuse, write_table
 from lib.recordings.truth import Truth
 
@@ -189,6 +191,11 @@ class Recording:
              "Leave the cells of a wrong sample empty."),
         )  # fmt: skip
         return [Doubt(*told) for holds, *told in cases if holds]
+
+    @cached_property
+    def ground(self) -> Ground:
+        """What the cameras see behind the tool; a detector in doubt looks at what differs from it."""
+        return Ground.of_frames(self.frames, self.landmarks_mm(), f"{self.folder.resolve()} {self.frames.time_s.sum()!r}")
 
     def landmarks_mm(self) -> np.ndarray:
         """The robot's landmarks (n, k, 3) mm at the frames' times, NaN where the robot says nothing.

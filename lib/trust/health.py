@@ -14,6 +14,7 @@ import numpy as np
 
 from lib.calibration import Calibration, with_offsets
 from lib.correspondences import Correspondences
+from lib.landmarks import with_ground
 from lib.recordings import Recording
 
 #: What a landmark of a frame may show of each part; see `Health.false_alarm_rate`.
@@ -152,13 +153,22 @@ def _looks_px(recording: Recording, frame: np.ndarray, u: np.ndarray, detector: 
     for i in spread(len(frame), _LOOKS):
         pair = recording.frames[int(frame[i])]
         images = np.stack([pair.left, pair.right])
-        mirrored = detector(images[:, :, ::-1])
-        back = np.stack([images.shape[2] - 1 - mirrored.u[..., 0], mirrored.u[..., 1]], axis=-1)[:, [0, 2, 1]]
-        shifted = np.pad(images, ((0, 0), (_SHIFT_PX[1], 0), (_SHIFT_PX[0], 0), (0, 0)))
-        again = detector(shifted[:, : images.shape[1], : images.shape[2]]).u - _SHIFT_PX
-        distance = np.linalg.norm(np.stack([back, again]) - np.swapaxes(u[i], 0, 1), axis=-1).max(axis=0)
+        mirrored, again = (
+            detector(change(images), **with_ground(detector, recording, change)).u for change in (_mirrored, _shifted)
+        )
+        back = np.stack([images.shape[2] - 1 - mirrored[..., 0], mirrored[..., 1]], axis=-1)[:, [0, 2, 1]]
+        distance = np.linalg.norm(np.stack([back, again - _SHIFT_PX]) - np.swapaxes(u[i], 0, 1), axis=-1).max(axis=0)
         moved[i] = np.where(np.isnan(u[i, ..., 0]), np.nan, np.nan_to_num(distance, nan=np.inf).T)
     return moved
+
+
+def _mirrored(images: np.ndarray) -> np.ndarray:
+    return images[:, :, ::-1]
+
+
+def _shifted(images: np.ndarray) -> np.ndarray:
+    shifted = np.pad(images, ((0, 0), (_SHIFT_PX[1], 0), (_SHIFT_PX[0], 0), (0, 0)))
+    return shifted[:, : images.shape[1], : images.shape[2]]
 
 
 def affine_epipolar(y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -25,6 +25,7 @@ class Shipped:
         chosen, truth = range(0, len(recording.frames), 4), recording.truth
         frames = [recording.frames[i] for i in chosen]
         self.images = np.stack([image for frame in frames for image in (frame.left, frame.right)])
+        self.ground = recording.ground()
         both = ((truth.u_left, truth.visibility_left), (truth.u_right, truth.visibility_right))
         u, visibility = (np.stack([side[i] for side in both], 1) for i in (0, 1))
         self.u = u[chosen].reshape(-1, 3, 2)

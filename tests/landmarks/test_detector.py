@@ -259,7 +259,7 @@ def test_tracking_looks_twice_where_the_tool_moved_far_and_knows_when_it_lost_it
     assert looks == [3, 3 * looks_twice]
     np.testing.assert_allclose(found, before.u + sum(looks) / 3 * way_px / closeup_scale(length))
     lost = replace(before, u=before.u + 40)
-    monkeypatch.setattr(Detector, "__call__", lambda self, part: before)
+    monkeypatch.setattr(Detector, "__call__", lambda self, part, ground: before)
     np.testing.assert_array_equal(detector.track(images[:1], lost).u, before.u)
 
 

@@ -5,9 +5,11 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
+import pytest
 
 from lib import paths
 from lib.landmarks import Landmarks
+from lib.landmarks.contrast import levelled
 from lib.landmarks.engines import default_engine
 from lib.landmarks.metrics import errors_px, pck, tool_length_px
 
@@ -61,7 +63,7 @@ def test_an_image_in_doubt_is_seen_again_with_more_contrast(shipped, monkeypatch
     clear, looks = shipped.images[:1], []
     dull = np.clip(np.round((clear - clear.mean()) * 0.05 + 110), 0, 255).astype(np.uint8)
     once = type(shipped.torch)._once
-    alone = once(shipped.torch, dull, None)
+    alone = once(shipped.torch, dull)
     monkeypatch.setattr(type(shipped.torch), "_once", lambda *a, **how: looks.append(len(a[1])) or once(*a, **how))
     found = shipped.torch(np.concatenate([clear, dull]))
     assert looks[0] == 2 and set(looks[1:]) == {1}  # the clear image is seen once
@@ -81,14 +83,27 @@ def test_a_tool_that_the_first_stage_overlooks_is_found_by_sweeping(shipped, mon
     assert (error < 0.05).all() and (found.confidence > 0.3).all() and (found.confidence <= 0.5).all()
 
 
-def test_what_is_to_be_avoided_is_not_found_but_the_other_tool_is(shipped):
-    both = np.concatenate([shipped.images[0], shipped.images[8]], axis=1)[None]  # two tools side by side
-    tools = shipped.u[[0, 8]] + np.array([[[0.0, 0.0]], [[shipped.images.shape[2], 0.0]]])
-    for avoided, other in ((0, 1), (1, 0)):
-        found = shipped.default(both, avoid=tools[[avoided]])
-        assert (np.linalg.norm(found.u[0] - tools[other], axis=1) < 0.05 * tool_length_px(tools[[other]])).all()
-    nothing = shipped.default(both, avoid=tools)
-    assert not (nothing.confidence > 0.5).any() and (nothing.confidence[np.isnan(nothing.u[..., 0])] == 0).all()
+def test_a_tool_that_is_part_of_the_ground_is_not_found_but_the_other_one_is(shipped):
+    both, bare = (np.concatenate([image, shipped.images[8]], axis=1) for image in (shipped.images[0], shipped.ground[0]))
+    found = shipped.default(levelled(both, bare)[None])
+    assert (np.linalg.norm(found.u[0] - shipped.u[0], axis=1) < 0.05 * tool_length_px(shipped.u[:1])).all()
+    assert (found.confidence > 0.5).all()
+    assert not (shipped.default(levelled(both, both)[None]).confidence > 0.5).any()
+
+
+def test_where_there_is_doubt_what_differs_from_the_ground_decides(shipped):
+    """Without colour some frames leave doubt, and something else is taken for the tool.  The ground is asked for in doubt."""
+    images, ground = (
+        np.repeat(part.mean(axis=-1, keepdims=True).astype(np.uint8), 3, axis=-1)
+        for part in (shipped.images[-6:-2], np.tile(shipped.ground, (2, 1, 1, 1)))
+    )
+    asked: list[int] = []
+    found = shipped.torch(images, batch=2, ground=lambda: asked.append(1) or ground)
+    error = np.linalg.norm(found.u - shipped.u[-6:-2], axis=2) / tool_length_px(shipped.u[-6:-2])[:, None]
+    assert (error[:, 1:] < 0.05).all() and (found.confidence.mean(1) > 0.4).all() and asked
+    alone = shipped.torch._once(images)
+    assert (np.linalg.norm(alone.u - shipped.u[-6:-2], axis=2) > tool_length_px(shipped.u[-6:-2])[:, None]).any()
+    assert shipped.torch(shipped.images[:1], ground=pytest.fail).confidence.min() > 0.5
 
 
 def test_without_a_second_stage_nothing_is_searched(shipped):

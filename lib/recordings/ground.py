@@ -1,0 +1,63 @@
+"""What the two cameras of a recording see behind the tool: as the tool moves, most frames show each place without it."""
+
+from collections.abc import Callable, Sequence
+from functools import cache
+from typing import Self
+
+import numpy as np
+
+_FRAMES = 9  # so many make the ground; more take longer and show hardly more
+
+
+class Ground:
+    """The images (2, h, w, 3) uint8 RGB that two cameras see behind the tool; made when first called, then kept.
+
+    `key` names what they are made of.
+
+    >>> ground = Ground(lambda: np.zeros((2, 4, 6, 3), np.uint8), "dark")
+    >>> ground().shape, ground.changed(lambda images: images[:, :2]).key, ground.changed(lambda images: images[:, :2])().shape
+    ((2, 4, 6, 3), 'dark', (2, 2, 6, 3))
+    """
+
+    def __init__(self, see: Callable[[], np.ndarray], key: str) -> None:
+        self._see, self.key = cache(see), key
+
+    def __call__(self) -> np.ndarray:
+        return self._see()
+
+    @classmethod
+    def of_frames(cls, frames: Sequence, x_mm: np.ndarray, name: str) -> Self:
+        """The median of the frames of a recording called `name` between which the robot's tool, x_mm (n, k, 3), moves farthest.
+
+        Where the robot says nothing, frames are taken evenly.  What moves all the time is blurred, and a tool that rests is
+        part of the ground: who looks there must look at the frame itself, too.
+        """
+        chosen = apart(x_mm.mean(axis=1), _FRAMES)
+
+        def see() -> np.ndarray:
+            sides = ([getattr(frames[int(i)], side) for i in chosen] for side in ("left", "right"))
+            return np.stack([np.partition(np.stack(images), len(chosen) // 2, axis=0)[len(chosen) // 2] for images in sides])
+
+        return cls(see, f"{name} {chosen.tolist()}")
+
+    def changed(self, change: Callable[[np.ndarray], np.ndarray]) -> Self:
+        """The ground of images that `change` makes of the cameras' ones."""
+        return type(self)(lambda: change(self()), self.key)
+
+
+def apart(x: np.ndarray, count: int) -> np.ndarray:
+    """At most `count` of the points x (n, d), in ascending order: each the farthest from those before; NaN is no point.
+
+    Where fewer than three are points, evenly many of all rows.
+
+    >>> apart(np.array([[0.0], [1.0], [2.0], [np.nan], [9.0]]), 3)
+    array([0, 2, 4])
+    """
+    known = np.flatnonzero(np.isfinite(x).all(axis=1))
+    if len(known) < 3:
+        return np.unique(np.linspace(0, len(x) - 1, min(count, len(x))).round().astype(int))
+    chosen, distance = [known[0]], np.full(len(known), np.inf)
+    while len(chosen) < min(count, len(known)):
+        distance = np.minimum(distance, np.linalg.norm(x[known] - x[chosen[-1]], axis=1))
+        chosen.append(known[distance.argmax()])
+    return np.unique(chosen)

@@ -1,0 +1,55 @@
+"""What the cameras see behind the tool."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from lib.recordings import Ground, Recording
+from tests.adapt.world import World
+
+GROUND = np.random.default_rng(0).integers(40, 200, (2, 30, 40, 3), dtype=np.uint8)
+
+
+def frames(places):
+    """A dark square of 8 px stands at the places (n, 2) px, in the right image 3 px further right."""
+    made = []
+    for x, y in places:
+        both = GROUND.copy()
+        for side, shift in enumerate((0, 3)):
+            both[side, y : y + 8, x + shift : x + shift + 8] = 0
+        made.append(SimpleNamespace(left=both[0], right=both[1]))
+    return made
+
+
+def test_a_tool_that_moves_is_no_part_of_it():
+    places = np.column_stack([np.arange(0, 27, 3), np.tile([0, 11, 22], 3)])
+    x_mm = np.repeat(np.column_stack([places, np.zeros(9)])[:, None], 3, axis=1)
+    np.testing.assert_array_equal(Ground.of_frames(frames(places), x_mm, "one")(), GROUND)
+
+
+def test_a_long_rest_does_not_put_the_tool_into_it():
+    """In 60 of 66 frames the tool rests; those between which it moves farthest decide."""
+    places = np.array([*[[0, 0]] * 60, [9, 0], [18, 0], [27, 0], [0, 12], [12, 12], [24, 12]])
+    x_mm = np.repeat(np.column_stack([places, np.zeros(66)])[:, None], 3, axis=1).astype(float)
+    np.testing.assert_array_equal(Ground.of_frames(frames(places), x_mm, "one")(), GROUND)
+    x_mm[:] = np.nan  # without the robot it does
+    assert (Ground.of_frames(frames(places), x_mm, "one")() != GROUND).any()
+
+
+def test_nothing_is_decoded_before_it_is_asked_for_and_nothing_twice():
+    read = []
+    ground = Ground(lambda: read.append(1) or GROUND, "one")
+    mirrored = ground.changed(lambda images: images[:, :, ::-1])
+    assert not read and mirrored.key == ground.key
+    np.testing.assert_array_equal(mirrored(), ground()[:, :, ::-1])
+    mirrored(), ground()
+    assert len(read) == 1
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_recordings_have_one_each(tmp_path):
+    one, other = (World(n=n).record(tmp_path / str(n)) for n in (8, 12))
+    assert one.ground().shape == (2, *one.frames[0].left.shape)
+    assert one.ground is one.ground and len({one.ground.key, other.ground.key}) == 2
+    assert Recording.open(one.folder).ground.key == one.ground.key
