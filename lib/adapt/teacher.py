@@ -41,8 +41,8 @@ _CONTRADICTED = 0.2
 #: Standard deviation of a detector's own constant error, as a share of the tool's length: along, across, normal.  The base
 #: has no edge that ends along the shaft.  Chosen by the closeups' errors in four recordings of unfamiliar tools and lights.
 _OWN_BIAS = 0.004 * np.array([[2.5, 1.0, 1.5], [1.2, 1.0, 1.5], [1.2, 1.0, 1.5]])
-#: Largest offset of a landmark, as a share of the tool's length or in mm, whichever is more: what is farther is another point
-#: of the tool.  A robot's own tool calibration errs by tenths of a millimetre, however short the tool is.
+#: Largest offset of a landmark, as a share of the tool's length or in mm, whichever is more: what is farther by two standard
+#: deviations is another point of the tool.  A robot's tool calibration errs by tenths of a millimetre, however short it is.
 _LARGEST_OFFSET, _LARGEST_OFFSET_MM = 0.15, 0.25
 #: Error of an offset, as a share of it, where shut jaws borrow the tool's axes from another time, farther away than this.
 _TURNED, _BORROWED_S = 0.3, 0.1
@@ -203,11 +203,13 @@ def teach(
     if told is not None and told.offset.shape == (3, 3):
         length = _length_mm(recording)
         size_mm = np.linalg.norm(told.offset, axis=1)
-        if size_mm.max() > max(_LARGEST_OFFSET * length, _LARGEST_OFFSET_MM) and not (alone or clicked):
+        sure_mm = size_mm - 2 * np.linalg.norm(told.standard_deviation * told.offset, axis=1) / np.maximum(size_mm, 1e-9)
+        if sure_mm.max() > max(_LARGEST_OFFSET * length, _LARGEST_OFFSET_MM) and not (alone or clicked):
+            k = int(sure_mm.argmax())
             raise RefusalError(
-                f"detector: it sees {LANDMARKS[size_mm.argmax()]} {size_mm.max():.2f} mm from where the robot reports it, "
-                f"{100 * size_mm.max() / length:.0f} % of the tool's length. It takes another point for it, or the robot's "
-                f"tool has other dimensions. {_LABEL}"
+                f"detector: it sees {LANDMARKS[k]} {size_mm[k]:.2f} mm from where the robot reports it, "
+                f"{100 * size_mm[k] / length:.0f} % of the tool's length. It takes another point for it, or the robot's tool "
+                f"has other dimensions. {_LABEL}"
             )
         turns = told.turns
         offset, covariance = _robots_share(told, (0.2 if alone else 1.0) * _OWN_BIAS * length)

@@ -276,7 +276,7 @@ class Detector:
     ) -> Landmarks:  # fmt: skip
         """Landmarks of images (n, h, w, 3) that follow those of `previous`, such as the next left and right image.
 
-        Only closeups are looked at.  An image with a landmark below `min_confidence` is searched as a whole, with its `ground`.
+        Only closeups are looked at.  An image with a landmark below `min_confidence` is searched as a whole, on its `ground`.
         """
         images = as_uint8(images)
         if len(previous) != len(images):

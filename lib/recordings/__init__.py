@@ -14,5 +14,5 @@ from lib.recordings.recording import Doubt, Kinematics, Recording, RecordingWrit
 from lib.recordings.smoothing import smoothed
 from lib.recordings.truth import Truth
 
-__all__ = ["Annotations", "Annotator", "Doubt", "Frames", "Ground", "Kinematics", "Recording", "RecordingWriter", "StereoFrame"]
-__all__ += ["Truth", "encoded", "read_image", "smoothed", "to_8_bits"]
+__all__ = ["Annotations", "Annotator", "Doubt", "Frames", "Ground", "Kinematics", "Recording", "RecordingWriter"]
+__all__ += ["StereoFrame", "Truth", "encoded", "read_image", "smoothed", "to_8_bits"]

@@ -27,7 +27,7 @@ class Ground:
 
     @classmethod
     def of_frames(cls, frames: Sequence, x_mm: np.ndarray, name: str) -> Self:
-        """The median of the frames of a recording called `name` between which the robot's tool, x_mm (n, k, 3), moves farthest.
+        """The median of those frames of a recording (`name`) between which the robot's tool x_mm (n, k, 3) moves farthest.
 
         Where the robot says nothing, frames are taken evenly.  What moves all the time is blurred, and a tool that rests is
         part of the ground: who looks there must look at the frame itself, too.

@@ -15,6 +15,7 @@ SMALLEST = {
     "dataset": {"pairs": 1, "shrink": 4},
     "engines_and_speed": {"repeats": 1},
     "few_labels": {"frames": 5, "minutes": 0.1},
+    "ground": {"pairs": 4},
     "l1_solver": {"n_points": 2000, "control": 20},
     "label_noise": {"steps": 100},
     "left_out": {"minutes": 0.02, "n": 2},
