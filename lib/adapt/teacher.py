@@ -89,8 +89,7 @@ def longest_still(recording: Recording, seen: Seen) -> tuple[np.ndarray, str]:
     for step in (max(count // 16, 1), 1, 1):
         cut = max((cut, cut - step, cut + step), key=gain)
     # Cameras of their own have 16 numbers more, and the cut could lie anywhere.
-    least = 16 * np.log(used) / 2 + 12 + _SURE_MOVE * used
-    if gain(cut) < least:
+    if gain(cut) < 16 * np.log(used) / 2 + 12 + _SURE_MOVE * used:
         return frames, ""
     kept = frames[:cut] if cut >= count - cut else frames[cut:]
     return kept, f"The cameras moved at about frame {frames[cut]}: only frames {kept[0]} to {kept[-1]} are used."

@@ -184,7 +184,7 @@ def _turned(
     row = np.unique(data.frame, return_inverse=True)[1][usable]
 
     def turned(offset: np.ndarray) -> np.ndarray:
-        own = tool_axes(x_mm, np.pad(offset, ((0, 3 - len(offset)), (0, 0))))[row]
+        own = tool_axes(x_mm, np.vstack([offset, np.zeros((3 - len(offset), 3))]))[row]
         return np.where(np.isfinite(own), own, axes)
 
     offset = found.offsets.offset

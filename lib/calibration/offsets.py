@@ -52,7 +52,7 @@ def tool_axes(x_mm: ArrayLike, offset_mm: np.ndarray | None = None) -> np.ndarra
     x = np.asarray(x_mm, dtype=np.float64)
     if x.ndim != 3 or x.shape[1:] != (3, 3):
         raise ValueError(f"x_mm: expected base, tip_1 and tip_2 (n, 3, 3), got {x.shape}.")
-    along, across = x[:, 1:].mean(axis=1) - x[:, 0], x[:, 2] - x[:, 1]
+    along, across = (x[:, 1] + x[:, 2]) / 2 - x[:, 0], x[:, 2] - x[:, 1]
     with np.errstate(invalid="ignore", divide="ignore"):
         size = np.linalg.norm(along, axis=1)
         m = along / size[:, None]
@@ -65,9 +65,9 @@ def tool_axes(x_mm: ArrayLike, offset_mm: np.ndarray | None = None) -> np.ndarra
             return np.where((width > 0.05 * size[:, None])[:, :, None], np.stack([m, c, g], axis=2), np.nan)
         # In the tool's axes the reported vector along the tool is known but for its length; so is the height, along the
         # normal, of the one from tip to tip.  Together they are all three angles.
-        middle, apart = offset_mm[1:].mean(axis=0) - offset_mm[0], offset_mm[2] - offset_mm[1]
+        middle, apart = (offset_mm[1] + offset_mm[2]) / 2 - offset_mm[0], offset_mm[2] - offset_mm[1]
         straight = np.sqrt(size**2 - middle[1] ** 2 - middle[2] ** 2)
-        a = np.stack([straight, *np.broadcast_arrays(-middle[1], -middle[2], straight)[:2]], axis=1) / size[:, None]
+        a = np.column_stack([straight, np.full((len(x), 2), -middle[1:])]) / size[:, None]
         up = np.array([0.0, 0.0, 1.0]) - a[:, 2:] * a
         up /= np.linalg.norm(up, axis=1, keepdims=True)
         side = cross(up, a)
@@ -75,7 +75,7 @@ def tool_axes(x_mm: ArrayLike, offset_mm: np.ndarray | None = None) -> np.ndarra
         cosine = np.array([[[1]], [[-1]]]) * np.sqrt(1 - sine**2)
         own = np.stack([a, side, up], axis=2)
         y, z = cosine * c - sine * g, sine * c + cosine * g
-        axes = np.stack([np.broadcast_to(m, y.shape), y, z], axis=3) @ own.mT  # (2, n, 3, 3)
+        axes = np.stack([[m, m], y, z], axis=3) @ own.mT  # (2, n, 3, 3)
         opening = apart[1] + (beside * a + width * (cosine * side + sine * up))[..., 1]
         shut = 0.05 * (straight + middle[0])
         possible = (width[:, 0] > shut) & (opening > np.stack([np.full(len(x), -np.inf), -shut]))  # jaws hardly cross
@@ -86,7 +86,7 @@ def _least_turning(axes: np.ndarray, possible: np.ndarray) -> np.ndarray:
     """Of two axes (2, n, 3, 3) of each tool the `possible` (2, n) ones that turn least, else the first; NaN without any."""
     found, known = np.full(axes.shape[1:], np.nan), np.flatnonzero(possible.any(axis=0))
     found[known] = np.where(possible[0, known, None, None], axes[0, known], axes[1, known])
-    two = np.pad(possible[:, known].all(axis=0), 1)
+    two = np.concatenate([[False], possible[:, known].all(axis=0), [False]])
     known = known[two[:-2] | two[1:-1] | two[2:]]  # a row of one choice cuts the way: only those beside it matter
     if not known.size:
         return found
@@ -116,7 +116,7 @@ def rows_axes(data: Correspondences, offset_mm: np.ndarray | None = None, *, car
     axes = tool_axes(x)
     axes = carried(axes, x) if carry else axes
     if offset_mm is not None:
-        turned = tool_axes(x, np.pad(offset_mm, ((0, 3 - len(offset_mm)), (0, 0))))
+        turned = tool_axes(x, np.vstack([offset_mm, np.zeros((3 - len(offset_mm), 3))]))
         turned = carried(turned, x) if carry else turned
         axes = np.where(np.isfinite(turned), turned, axes)
     return axes[np.unique(data.frame, return_inverse=True)[1]]
@@ -150,7 +150,7 @@ def with_offsets(data: Correspondences, offsets: LandmarkOffsets | None) -> Corr
     if offsets is None:
         return data
     unknown = max(data.landmark.max(initial=0) + 1 - len(offsets.offset), 0)  # landmarks that no image showed
-    shift = np.pad(offsets.offset, ((0, unknown), (0, 0)))[data.landmark]
+    shift = np.vstack([offsets.offset, np.zeros((unknown, offsets.offset.shape[1]))])[data.landmark]
     if shift.shape[1] == 4:
         return replace(data, u_left=data.u_left - shift[:, :2], u_right=data.u_right - shift[:, 2:])
     shift = np.einsum("nij,nj->ni", rows_axes(data, offsets.offset if offsets.turns else None, carry=True), shift)

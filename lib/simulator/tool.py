@@ -72,8 +72,7 @@ def rasterise(
         B = np.add.outer((r * dr + wy * c[1]).astype(np.float32), (wx * c[0]).astype(np.float32))
         C = np.subtract.outer((r * r - wy * wy).astype(np.float32), wx * wx)
         s = (gain * np.sqrt(np.maximum(B * B - A * C, 0)) - B) / A
-        flat = chains[k] == 0 and (k + 2 >= len(chains) or chains[k + 2] != 0)
-        past = flat & (s > 1)
+        past = (s > 1) & (chains[k] == 0 and (k + 2 >= len(chains) or chains[k + 2] != 0))  # a flat end
         np.clip(s, 0, 1, out=s)
         Q = (A * s + 2 * B) * s + C
         z = np.float32(a[2]) + s * np.float32(dz) - np.sqrt(np.maximum(Q, 0))
@@ -136,8 +135,7 @@ def tool_in_view(
     # A blunt jaw's tip lies inside its outline as soon as the jaw is not parallel to the image.
     pointed = forceps.tip_radius_mm <= MAX_TIP_RADIUS_MM
     for k in np.flatnonzero(visibility) if raster else ():
-        front_mm = landmarks[k, 2] - (forceps.shaft_radius_mm if k == 0 else 0.0)
-        hidden = _behind_another_part(raster, k, u[k], front_mm)
+        hidden = _behind_another_part(raster, k, u[k], landmarks[k, 2] - (forceps.shaft_radius_mm if k == 0 else 0.0))
         if hidden or (k > 0 and pointed and _behind_its_jaw(nodes, k, u[k], window.zoom)):
             visibility[k] = 1
     return ToolInView(u, visibility, speed[1:3].mean(axis=0) @ window.R[:2].T, raster)

@@ -94,8 +94,7 @@ def drawn_tool(
     x = image.astype(np.float32)
     if rng.random() < 0.6:
         x = _shadowed(x, parts, length, rng)
-    x = _painted(x, parts, length, rng)
-    return np.clip(x, 0, 255).astype(np.uint8), u, np.where(inside(u, (w, h)), 2, 0)
+    return np.clip(_painted(x, parts, length, rng), 0, 255).astype(np.uint8), u, np.where(inside(u, (w, h)), 2, 0)
 
 
 def _jaw_shape(rng: np.random.Generator) -> dict[str, float]:

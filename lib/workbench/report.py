@@ -28,6 +28,7 @@ METRIC_MIME, VERDICT_MIME = "application/vnd.microstereo.metric+json", "applicat
 FIGURE_METADATA, STOP_METADATA = "microstereo_figure", "microstereo_stop"
 #: The colour of each verdict, from the best to the worst.
 VERDICT_COLOURS = {"trustworthy": "#067647", "doubtful": "#b54708", "not trustworthy": "#b42318"}
+_TEMPLATES = Environment(loader=FileSystemLoader(Path(__file__).with_name("templates")), autoescape=True)  # compiled once
 #: Longest SVG: the points of a large scatter are smaller as a PNG.
 _SVG_CHARACTERS = 200_000
 #: Name -> value of the metrics that this kernel recorded; None where a value could not be computed.
@@ -72,8 +73,7 @@ def verdict(found: object) -> None:
 
 def rendered(template: str, **values: object) -> str:
     """HTML from a file of ``templates/``; it escapes every value that it does not call safe."""
-    templates = Environment(loader=FileSystemLoader(Path(__file__).with_name("templates")), autoescape=True)
-    return templates.get_template(template).render(values, colours=VERDICT_COLOURS)
+    return _TEMPLATES.get_template(template).render(values, colours=VERDICT_COLOURS)
 
 
 def show(figure: Figure, name: str, caption: str) -> None:

@@ -81,8 +81,7 @@ def sweep(
     of_file = {}
     for values in itertools.product(*parsed.values()):
         point = dict(zip(parsed, values, strict=True))
-        digest = files.digest(json.dumps(point, sort_keys=True, default=str).encode())
-        of_file[folder / f"{digest}.ipynb"] = point
+        of_file[folder / f"{files.digest(json.dumps(point, sort_keys=True, default=str).encode())}.ipynb"] = point
     jobs = {executed: (book, profile | point, cell_timeout_s) for executed, point in of_file.items()}
     rows = {executed: _row(executed, point) for executed, point in of_file.items() if executed.exists()}
     failures: dict[str, str] = {}
