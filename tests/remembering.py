@@ -14,7 +14,7 @@ from torch import Tensor
 
 from lib.adapt import teacher
 from lib.calibration import estimate
-from lib.landmarks import detector, search
+from lib.landmarks import detector
 from lib.trust.fitting import Problem
 
 Said = TypeVar("Said")
@@ -62,8 +62,8 @@ def remembering_detectors() -> Iterator[None]:
     accelerated = cache(detector.accelerated)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(detector, "accelerated", lambda *network, **how: said_once(accelerated(*network, **how)))
-        for where in (detector, search):
-            patch.setattr(where, "decode", said_once(where.decode))
+        for name in ("decode", "several_peaks"):
+            patch.setattr(detector, name, said_once(getattr(detector, name)))
         patch.setattr(detector, "best_tools", remembering(detector.best_tools))
         yield
 

@@ -76,8 +76,10 @@ def _patches(heatmaps: Tensor, centre: Tensor, radius: int) -> tuple[Tensor, Ten
     return heatmaps.flatten(-2).gather(-1, flat), offsets.to(heatmaps.dtype), inside
 
 
-def _disc_mean(heatmaps: Tensor, sigma: float) -> tuple[Tensor, Tensor]:
+def disc_mean(heatmaps: Tensor, sigma: float) -> tuple[Tensor, Tensor]:
     """The mean of Eq. (1) over its disc Delta, weighted by p, in cells, and the height of the highest cell."""
+    if not torch.onnx.is_in_onnx_export() and not torch.isfinite(heatmaps).all():
+        raise ValueError("heatmaps: not finite; the network or its input is broken (look for NaN in the images).")
     value, flat = heatmaps.flatten(-2).max(-1)
     w = heatmaps.shape[-1]
     cell = torch.stack([flat % w, torch.div(flat, w, rounding_mode="floor")], -1)
@@ -170,10 +172,8 @@ def decode(heatmaps: Tensor, stride: int, *, method: str = "gauss_newton", sigma
     if heatmaps.ndim != 4 or not heatmaps.numel():
         raise ValueError(f"heatmaps: expected a non-empty (n, k, h, w), got {tuple(heatmaps.shape)}.")
     heatmaps = heatmaps.float() if heatmaps.dtype != torch.float64 else heatmaps
-    if not torch.onnx.is_in_onnx_export() and not torch.isfinite(heatmaps).all():
-        raise ValueError("heatmaps: not finite; the network or its input is broken (look for NaN in the images).")
     sigma = sigma_cells(stride, sigma_px)
-    u, value = _disc_mean(heatmaps, sigma)
+    u, value = disc_mean(heatmaps, sigma)
     width, covariance = torch.ones_like(value), torch.full_like(u[..., None, :].expand(*u.shape, 2), torch.nan)
     if method == "gauss_newton":
         u, width, covariance = _gauss_newton(heatmaps, sigma, u, value)

@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from lib.landmarks.heatmaps import SIGMA_PX, decode, sigma_cells
+from lib.landmarks.heatmaps import SIGMA_PX, disc_mean, sigma_cells
 from lib.landmarks.metrics import tool_length_px
 
 #: Peaks that are taken from each heatmap.
@@ -17,13 +17,13 @@ _OPEN = 0.25
 def several_peaks(heatmaps: torch.Tensor, n: int, stride: int) -> tuple[np.ndarray, np.ndarray]:
     """The `n` highest peaks of heatmaps (m, k, h, w), over 3 sigma apart: centroids (n m, k, 2) px and heights (n m, k)."""
     rows, columns = (torch.arange(side, dtype=heatmaps.dtype) for side in heatmaps.shape[-2:])
-    found = []
+    sigma, found = sigma_cells(stride, SIGMA_PX), []
     for _ in range(n):
-        found.append(decode(heatmaps, stride, method="paper"))  # a window, which shows more, is looked at next
-        x, y = (((found[-1].u - (stride - 1) / 2) / stride)[..., None, None]).unbind(2)
-        near = (columns - x) ** 2 + (rows[:, None] - y) ** 2 < (3 * sigma_cells(stride, SIGMA_PX)) ** 2
-        heatmaps = heatmaps.masked_fill(near, -1.0)
-    return torch.cat([peaks.u for peaks in found]).numpy(), torch.cat([peaks.value for peaks in found]).numpy()
+        found.append(disc_mean(heatmaps, sigma))  # no finer: a window, which shows more, is looked at next
+        x, y = found[-1][0][..., None, None].unbind(2)
+        heatmaps = heatmaps.masked_fill((columns - x) ** 2 + (rows[:, None] - y) ** 2 < (3 * sigma) ** 2, -1.0)
+    u, value = (torch.cat(part) for part in zip(*found, strict=True))
+    return (stride * u + (stride - 1) / 2).numpy(), value.numpy()
 
 
 def best_tools(u: np.ndarray, height: np.ndarray, n: int) -> np.ndarray:

@@ -53,19 +53,19 @@ def test_tracking_agrees_with_whole_frames(shipped):
 def test_an_empty_field_has_no_landmarks_and_disturbs_no_other(shipped):
     ground = np.random.default_rng(0).integers(90, 140, (27, 48, 3), dtype=np.uint8)
     both = np.stack([shipped.images[0], cv2.resize(ground, shipped.images.shape[2:0:-1])])
-    found = shipped.torch(both)
+    found = shipped.default(both)
     assert (found.confidence[1] < 0.5).all()
-    np.testing.assert_allclose(found.u[0], shipped.by_torch.u[0], atol=1e-3)  # one was searched, and the other was not
-    assert shipped.torch.searched(both, shipped.torch.coarse(both)).confidence[1].max() < 0.4
+    np.testing.assert_allclose(found.u[0], shipped.by_default.u[0], atol=1e-3)  # one was searched, and the other was not
+    assert shipped.default.searched(both, shipped.default.coarse(both)).confidence[1].max() < 0.4
 
 
 def test_an_image_in_doubt_is_seen_again_with_more_contrast(shipped, monkeypatch):
     clear, looks = shipped.images[:1], []
     dull = np.clip(np.round((clear - clear.mean()) * 0.05 + 110), 0, 255).astype(np.uint8)
-    once = type(shipped.torch)._once
-    alone = once(shipped.torch, dull)
-    monkeypatch.setattr(type(shipped.torch), "_once", lambda *a, **how: looks.append(len(a[1])) or once(*a, **how))
-    found = shipped.torch(np.concatenate([clear, dull]))
+    once = type(shipped.default)._once
+    alone = once(shipped.default, dull)
+    monkeypatch.setattr(type(shipped.default), "_once", lambda *a, **how: looks.append(len(a[1])) or once(*a, **how))
+    found = shipped.default(np.concatenate([clear, dull]))
     assert looks[0] == 2 and set(looks[1:]) == {1}  # the clear image is seen once
     error = np.linalg.norm(found.u - shipped.u[:1], axis=2) / tool_length_px(shipped.u[:1])
     assert (error < 0.05).all() and (found.confidence > 0.5).all()
@@ -76,9 +76,9 @@ def test_a_tool_that_the_first_stage_overlooks_is_found_by_sweeping(shipped, mon
     def blind(self, images):
         return Landmarks.none(len(images))
 
-    monkeypatch.setattr(type(shipped.torch), "coarse", blind)
-    monkeypatch.setattr(type(shipped.torch), "proposed", lambda self, image, *others: (*others, *others, np.zeros(1)))
-    found = shipped.torch(shipped.images[:2])
+    monkeypatch.setattr(type(shipped.default), "coarse", blind)
+    monkeypatch.setattr(type(shipped.default), "proposed", lambda self, image, *others: (*others, *others, np.zeros(1)))
+    found = shipped.default(shipped.images[:2])
     error = np.linalg.norm(found.u - shipped.u[:2], axis=2) / tool_length_px(shipped.u[:2])[:, None]
     assert (error < 0.05).all() and (found.confidence > 0.3).all() and (found.confidence <= 0.5).all()
 
@@ -98,12 +98,12 @@ def test_where_there_is_doubt_what_differs_from_the_ground_decides(shipped):
         for part in (shipped.images[-6:-2], np.tile(shipped.ground, (2, 1, 1, 1)))
     )
     asked: list[int] = []
-    found = shipped.torch(images, batch=2, ground=lambda: asked.append(1) or ground)
+    found = shipped.default(images, batch=2, ground=lambda: asked.append(1) or ground)
     error = np.linalg.norm(found.u - shipped.u[-6:-2], axis=2) / tool_length_px(shipped.u[-6:-2])[:, None]
     assert (error[:, 1:] < 0.05).all() and (found.confidence.mean(1) > 0.4).all() and asked
-    alone = shipped.torch._once(images)
+    alone = shipped.default._once(images)
     assert (np.linalg.norm(alone.u - shipped.u[-6:-2], axis=2) > tool_length_px(shipped.u[-6:-2])[:, None]).any()
-    assert shipped.torch(shipped.images[:1], ground=pytest.fail).confidence.min() > 0.5
+    assert shipped.default(shipped.images[:1], ground=pytest.fail).confidence.min() > 0.5
 
 
 def test_without_a_second_stage_nothing_is_searched(shipped):
