@@ -7,14 +7,18 @@ import pickle
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
+from pathlib import Path
 from typing import TypeVar
 
+import numpy as np
 import pytest
 from torch import Tensor
 
 from lib.adapt import teacher
 from lib.calibration import estimate
 from lib.landmarks import detector
+from lib.recordings import frames
+from lib.trust import verdict
 from lib.trust.fitting import Problem
 
 Said = TypeVar("Said")
@@ -80,4 +84,25 @@ def remembering_teacher() -> Iterator[None]:
         for where, names in asked.items():
             for name in names:
                 patch.setattr(where, name, remembering(getattr(where, name)))
+        yield
+
+
+@contextmanager
+def remembering_recordings() -> Iterator[None]:
+    """In here an image file that stays as it is is decoded once, and the faults of the same rows are sought once."""
+    read, known = frames.read_image, {}
+
+    def read_once(path: Path, *how: object) -> np.ndarray:
+        if not path.is_file():
+            return read(path, *how)
+        state = path.stat()
+        key = path, state.st_mtime_ns, state.st_size, state.st_ino, how
+        if key not in known:
+            known[key] = read(path, *how)
+            known[key].setflags(write=False)
+        return known[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(frames, "read_image", read_once)
+        patch.setattr(verdict, "diagnose", remembering(verdict.diagnose))
         yield

@@ -22,8 +22,16 @@ from lib.surface import export
 from lib.trust import check
 from tests.importing import foreign
 from tests.importing.test_import import source_of, thinned
+from tests.remembering import remembering_recordings
 
 LABELS = ["--landmarks", "annotations"]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def looked_at_once():
+    """Commands open the same recordings."""
+    with remembering_recordings():
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -19,12 +19,20 @@ from lib.landmarks import Detector, Landmarks
 from lib.recordings import Recording, RecordingWriter
 from lib.workbench import pages, report, results
 from lib.workbench.execution import declared_grid, declared_parameters, parse_parameters
+from tests.remembering import remembering_recordings
 
 WALK = sorted(paths.NOTEBOOKS.glob("*.ipynb"))
 STUDIES = sorted(paths.NOTEBOOKS.glob("studies/*.ipynb"))
 ORDER = ["00_overview", "01_data", "02_landmark_detection", "03_affine_calibration", "04_stereo_reconstruction",
          "05_registration", "06_online_pipeline", "07_your_own_recording",
          "08_the_robot_labels"]  # fmt: skip
+
+
+@pytest.fixture(scope="module", autouse=True)
+def looked_at_once():
+    """Notebooks open the same two recordings."""
+    with remembering_recordings():
+        yield
 
 
 def each(notebooks):
