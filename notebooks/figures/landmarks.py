@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse, FancyArrowPatch, FancyBboxPatch
 from matplotlib.ticker import LogLocator
-from scipy.stats import chi2
+from scipy.special import chdtr, chdtri
 
 from lib.landmarks import Landmarks
 from lib.landmarks.heatmaps import Peaks
@@ -199,7 +199,7 @@ def worst(result: Evaluation, n: int) -> np.ndarray:
 
 def _ellipse(axes: Axes, u: np.ndarray, covariance: np.ndarray, colour: str, probability: float = 0.95) -> None:
     values, vectors = np.linalg.eigh(covariance)
-    size = 2 * np.sqrt(values * chi2.ppf(probability, 2))
+    size = 2 * np.sqrt(values * chdtri(2, 1 - probability))
     angle = np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1]))
     axes.add_patch(Ellipse(u, size[1], size[0], angle=angle, fill=False, ec=colour, lw=1.6))
 
@@ -252,8 +252,8 @@ def uncertainty(evaluation: Evaluation, squared: np.ndarray) -> Figure:
     values = np.sort(squared[np.isfinite(squared)])
     grid = np.linspace(0, 12, 200)
     a.plot(grid, 100 * np.searchsorted(values, grid) / max(len(values), 1), color=COLOURS["ours"], label="detections")
-    a.plot(grid, 100 * chi2.cdf(grid, 2), color=COLOURS["truth"], ls="--", label="if covariances are right")
-    a.axvline(chi2.ppf(0.95, 2), color=COLOURS["baseline"], lw=1, label="95 % ellipse")
+    a.plot(grid, 100 * chdtr(2, grid), color=COLOURS["truth"], ls="--", label="if covariances are right")
+    a.axvline(chdtri(2, 0.05), color=COLOURS["baseline"], lw=1, label="95 % ellipse")
     a.set(title="Squared error over its covariance", xlabel="normalised squared error", ylabel="% below", ylim=(0, 101))
     a.legend()
     labelled = ~np.isnan(evaluation.error_px)
@@ -379,7 +379,7 @@ def closeups(windows: np.ndarray, expected: np.ndarray, seen: Peaks, kept: Peaks
         ax.set(xlim=(x - 6, x + 6), ylim=(y + 6, y - 6))
         deviation = np.sqrt(np.diag(seen.covariance[i, 0].numpy()))
         ax.plot(*expected[i], "+", ms=18, mew=2, color="white", label="windows")
-        size = 2 * np.sqrt(chi2.ppf(0.95, 2)) * deviation
+        size = 2 * np.sqrt(chdtri(2, 0.05)) * deviation
         ax.add_patch(Ellipse(seen.u[i, 0].numpy(), *size, fill=False, ec="yellow", lw=2, label="closeup, 95 %"))
         ax.plot(*kept.u[i, 0].numpy(), "o", ms=7, color=COLOURS["ours"], label="corrected")
     axes[1, 0].legend(loc="lower left", fontsize=8, **ON_IMAGE)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from lib.calibration.calibration import Calibration
 from lib.calibration.estimate import calibrate
@@ -99,6 +99,6 @@ def compare_models(
         freer = freer if freer in fits else None
         if freer is not None:
             gain, more = value - 2.0 * fits[freer].cost, len(fits[freer].parameter_names) - k
-            p = float(chi2.sf(max(gain, 0.0), more))
+            p = float(chdtrc(more, max(gain, 0.0)))
         rungs.append(Rung(m, k, value, value + k * float(np.log(2 * freest.view_inliers.sum())), freer, p, c))
     return Comparison(rungs, freest.sigma_u_px, freest.sigma_x_mm)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from lib.calibration import NoConsensusError, calibrate, estimate_time_offset
 from lib.correspondences import Correspondences
@@ -102,7 +102,7 @@ def test_regions_of_the_projections_hold_what_they_claim(kind):
         found = calibrate(Correspondences.of_points(rows.x_mm, *u, frame=rows.frame, landmark=rows.landmark))
         error = np.hstack(found.rig.project(true)) - np.hstack(rig.project(true))
         d2 = np.einsum("ni,ni->n", error, np.linalg.solve(found.projection_covariance(true), error[:, :, None])[:, :, 0])
-        inside.append((d2 < chi2.ppf(0.95, 4)).mean())
+        inside.append((d2 < chdtri(4, 0.05)).mean())
         effective.append(found.effective_rows)
     assert 0.88 < np.mean(inside) <= 1.0
     assert np.median(effective) < 35 if kind == "lasting" else np.median(effective) > 40
