@@ -5,10 +5,11 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from lib.cameras import NearAffineCamera, StereoRig
 from lib.landmarks import Landmarks
-from lib.recordings import Recording, RecordingWriter, StereoFrame
+from lib.recordings import Recording, RecordingWriter, StereoFrame, encoded, recording
 from lib.simulator.eye import Eye
 from lib.simulator.forceps import Forceps
 from lib.simulator.motion import Motion
@@ -60,12 +61,14 @@ class World:
         rng = np.random.default_rng([self.seed, 1])
         sample_s = np.arange(-0.4, self.time_s[-1] + 0.4, 1 / HZ)
         x = robot(sample_s, self.at(sample_s) + rng.normal(0, noise_mm, (len(sample_s), 3, 3)))
-        with RecordingWriter(folder, name=folder.name, fps=FPS, image_size_px=SIZE, suffix=".png") as writer:
+        header = {"name": folder.name, "fps": FPS, "image_size_px": SIZE, "suffix": ".png"}
+        with pytest.MonkeyPatch.context() as patch, RecordingWriter(folder, **header) as writer:
+            patch.setattr(recording, "encoded", encoded_once)
             for t, pair in zip(self.time_s, blank_pairs(self.n), strict=True):
                 writer.add(*pair, t)
             writer.kinematics(rate * sample_s + clock_s, x)
-        recording = Recording.open(folder)
-        return replace(recording, frames=Kept(recording.frames.time_s))
+        made = Recording.open(folder)
+        return replace(made, frames=Kept(made.frames.time_s))
 
 
 @cache
@@ -76,6 +79,16 @@ def blank_pairs(n: int) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
     for image in images:
         image.setflags(write=False)  # as those of a recording
     return tuple(zip(images[::2], images[1::2], strict=True))
+
+
+_ENCODED: dict[int, bytes] = {}
+
+
+def encoded_once(image: np.ndarray, *how: object) -> bytes:
+    """`encoded` of an image of `blank_pairs`, which lives as long as the process: every recording has the same ones."""
+    if id(image) not in _ENCODED:
+        _ENCODED[id(image)] = encoded(image, *how)
+    return _ENCODED[id(image)]
 
 
 class Kept:

@@ -37,6 +37,20 @@ def test_openvino_gives_the_heatmaps_of_torch():
         fast(torch.rand(1, 4, 32, 32))
 
 
+@needs_openvino
+def test_a_shape_that_is_met_often_is_compiled_for_and_says_the_same(monkeypatch):
+    torch.manual_seed(0)
+    network, asked, request = StackedHourglass(HourglassConfig(4, 1, 1)).eval(), [], engines._request
+    torch.nn.init.normal_(network.heads[0].weight)
+    fast, images, side = OpenVinoNetwork(network, precision="f32"), torch.rand(2, 3, 33, 47), network.config.multiple
+    monkeypatch.setattr(engines, "_OFTEN", 2)
+    monkeypatch.setattr(engines, "_request", lambda of, shape: asked.append(shape) or request(of, shape))
+    said = [fast(images)[-1] for _ in range(4)]
+    assert asked[:2] == 2 * [engines._ANY_SHAPE] and asked[2:] == 2 * [(2, 3, *(-(-n // side) * side for n in (33, 47)))]
+    for other in said[1:]:
+        torch.testing.assert_close(other, said[0], rtol=0, atol=1e-6 * float(said[0].abs().max()))
+
+
 @pytest.mark.parametrize("engine", ["torch", pytest.param("openvino", marks=needs_openvino)])
 def test_an_offset_network_says_the_same_with_either_engine(engine):
     torch.manual_seed(0)
