@@ -114,8 +114,8 @@ class OpenVinoNetwork:
         x = np.pad(x, ((0, 0), (0, 0), (0, 0 if self.mirror else -h % multiple), (0, -w % multiple)))  # as the network pads
         with _lock:  # a request is shared
             for part in np.array_split(x, range(_BATCH, len(x), _BATCH)):
-                _met[self, part.shape] += 1
-                own = self.precision != "f32" or part.shape[2] % multiple or _met[self, part.shape] > _OFTEN
+                _met[self.digest, part.shape] += 1
+                own = self.precision != "f32" or part.shape[2] % multiple or _met[self.digest, part.shape] > _OFTEN
                 said = _request(self, part.shape if own else _ANY_SHAPE).infer({0: part})[0]
                 found.append(said[..., : -(-h // stride), : -(-w // stride)].copy())  # of an offset network all
         return [torch.from_numpy(np.concatenate(found))]
