@@ -3,7 +3,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from lib.landmarks import Landmarks, detect
+from lib.landmarks import Landmarks, SharedDetector, detect, with_ground
+from lib.recordings import Ground
 
 
 @pytest.fixture
@@ -74,3 +75,14 @@ def test_tracking_starts_from_the_frame_before(recording):
     tracked = detect(recording, Tracker(), track=True)
     assert looked == ["whole", 0.0, 1.0, 2.0, 3.0]
     np.testing.assert_array_equal(tracked.u_left, detect(recording, detector).u_left)
+
+
+def test_only_a_detector_is_told_the_ground(recording):
+    """A stand-in is a function of images alone."""
+    recording.ground = Ground(lambda: np.arange(96, dtype=np.uint8).reshape(2, 4, 4, 3), "g")
+    assert with_ground(detector, recording) == {}
+    shared = SharedDetector(detector)
+    assert with_ground(shared, recording) == {"ground": recording.ground}
+    np.testing.assert_array_equal(detect(recording, shared).u_left, detect(recording, detector).u_left)
+    mirrored = with_ground(shared, recording, lambda images: images[:, :, ::-1])["ground"]
+    np.testing.assert_array_equal(mirrored(), recording.ground()[:, :, ::-1])

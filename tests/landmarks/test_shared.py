@@ -5,6 +5,7 @@ import pytest
 
 from lib import paths
 from lib.landmarks import Landmarks, SharedDetector
+from lib.recordings import Ground
 
 
 class Counting:
@@ -39,8 +40,8 @@ def test_a_second_notebook_reads_what_the_first_has_found(shared):
     assert "in 1 of 1 stereo pairs were read from the cache" in str(second) and "read" not in str(first)
 
 
-@pytest.mark.parametrize("change", ["pixel", "mirrored", "shape", "detector"])
-def test_another_image_or_another_detector_is_looked_at_anew(shared, change):
+@pytest.mark.parametrize("change", ["pixel", "mirrored", "shape", "detector", "ground"])
+def test_another_image_or_ground_or_detector_is_looked_at_anew(shared, change):
     SharedDetector(Counting())(PAIR)
     other = PAIR.copy()
     if change == "pixel":
@@ -50,7 +51,8 @@ def test_another_image_or_another_detector_is_looked_at_anew(shared, change):
     elif change == "shape":
         other = other.reshape(2, 6, 8, 3)
     again = SharedDetector(Counting("b" if change == "detector" else "a", 5.0))
-    assert again(other).u[0, 0, 0] == 5.0 and again.read == 0
+    ground = Ground(lambda: PAIR, "another") if change == "ground" else None
+    assert again(other, ground=ground).u[0, 0, 0] == 5.0 and again.read == 0
 
 
 def test_outside_a_run_nothing_is_kept(monkeypatch, tmp_path):
