@@ -36,7 +36,9 @@ def stretched(image: np.ndarray) -> np.ndarray:
 
 
 def levelled(image: np.ndarray, ground: np.ndarray) -> np.ndarray:
-    """An image (h, w, 3) uint8 RGB on a ground of one colour: what differs from its ground (h, w, 3), enlarged.
+    """An image (h, w, 3) uint8 RGB on a ground of one colour: what differs from its ground, enlarged.
+
+    A ValueError if the ground is not of the image's size.
 
     >>> ground = np.random.default_rng(0).integers(0, 200, (64, 64, 3), np.uint8)
     >>> tool = np.zeros((64, 64, 1), np.uint8)
@@ -45,6 +47,8 @@ def levelled(image: np.ndarray, ground: np.ndarray) -> np.ndarray:
     >>> (even[25] - even[5]).max()
     np.int64(80)
     """
+    if image.shape != ground.shape:
+        raise ValueError(f"ground: expected {image.shape}, as the image, got {ground.shape}.")
     difference = cv2.GaussianBlur(cv2.subtract(image, ground, dtype=cv2.CV_16S), (0, 0), _SMOOTH * max(image.shape))
     size = np.percentile(np.abs(difference[::_EVERY, ::_EVERY]).max(axis=2), _DIFFERENT)
     gain = float(np.clip(_DIFFERENCE / max(size, 1.0), *_GAINS))

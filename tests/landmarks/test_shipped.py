@@ -89,6 +89,8 @@ def test_a_tool_that_is_part_of_the_ground_is_not_found_but_the_other_one_is(shi
     assert (np.linalg.norm(found.u[0] - shipped.u[0], axis=1) < 0.05 * tool_length_px(shipped.u[:1])).all()
     assert (found.confidence > 0.5).all()
     assert not (shipped.default(levelled(both, both)[None]).confidence > 0.5).any()
+    with pytest.raises(ValueError, match="ground: expected .* as the image"):
+        levelled(both, shipped.ground[0])
 
 
 def test_where_there_is_doubt_what_differs_from_the_ground_decides(shipped):
