@@ -36,7 +36,7 @@ def stretched(image: np.ndarray) -> np.ndarray:
 
 
 def levelled(image: np.ndarray, ground: np.ndarray) -> np.ndarray:
-    """An image (h, w, 3) uint8 RGB on a ground of one colour: what differs from its ground, enlarged.
+    """An image (h, w, 3) uint8 RGB on a ground of one colour: what differs from its ground, seen in its light, enlarged.
 
     A ValueError if the ground is not of the image's size.
 
@@ -49,6 +49,8 @@ def levelled(image: np.ndarray, ground: np.ndarray) -> np.ndarray:
     """
     if image.shape != ground.shape:
         raise ValueError(f"ground: expected {image.shape}, as the image, got {ground.shape}.")
+    some = (part[::_EVERY, ::_EVERY] + 1.0 for part in (image, ground))
+    ground = cv2.multiply(ground, (*np.median(np.divide(*some), axis=(0, 1)), 0.0))
     difference = cv2.GaussianBlur(cv2.subtract(image, ground, dtype=cv2.CV_16S), (0, 0), _SMOOTH * max(image.shape))
     size = np.percentile(np.abs(difference[::_EVERY, ::_EVERY]).max(axis=2), _DIFFERENT)
     gain = float(np.clip(_DIFFERENCE / max(size, 1.0), *_GAINS))

@@ -236,7 +236,7 @@ class Detector:
 
         An image in doubt is seen again with more contrast, then swept, which takes many times as long.  `ground` gives the
         images (n, h, w, 3) uint8 without the tool, such as `Recording.ground`: where there is doubt, what differs from them
-        is looked at.  A `ValueError` for another shape, type or range.
+        is looked at first.  A `ValueError` for another shape, type or range.
         """
         images = as_uint8(images)
         with self._threads():
@@ -248,7 +248,7 @@ class Detector:
         result = self._once(images)
         looks = [lambda i: equalised(images[i]), lambda i: stretched(images[i]), lambda i: images[i]]
         if ground is not None:
-            looks = [lambda i: levelled(images[i], ground()[i])] * 2
+            looks.insert(0, lambda i: levelled(images[i], ground()[i]))
         for k, look in enumerate(looks if self.tool_network else (), 1):
             unsure = np.flatnonzero(result.doubtful)
             if unsure.size:
