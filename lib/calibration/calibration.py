@@ -9,9 +9,9 @@ from numpy.typing import ArrayLike
 from lib.calibration.checks import extents
 from lib.calibration.models import Fit
 from lib.calibration.robust import gate
-from lib.cameras import Camera, Points, StereoRig
+from lib.cameras import Camera, StereoRig
 from lib.correspondences import Correspondences
-from lib.geometry import RigidTransform, pair_covariance, points, precision, view_distances2
+from lib.geometry import RigidTransform, points, precision, view_distances2
 from lib.least_squares import inverse
 
 
@@ -176,17 +176,6 @@ class Calibration:
         J = self.pair.jacobian(x_mm)
         gain = np.linalg.solve(J.mT @ J, J.mT)  # the noise is the same in every pixel coordinate
         return gain @ (self.projection_covariance(x_mm) + (self.noise_px2 if detection else 0.0)) @ np.swapaxes(gain, 1, 2)
-
-    def triangulate(self, u_left: ArrayLike, u_right: ArrayLike, covariance_px2: ArrayLike | None = None) -> Points:
-        """`StereoRig.triangulate`, with the calibration's uncertainty in the covariance and sigma_u_px as the default."""
-        noise = self.noise_px2 if covariance_px2 is None else covariance_px2
-        found = self.pair.triangulate(u_left, u_right, noise)
-        known = np.isfinite(found.x_mm).all(axis=1)
-        x, covariance = found.x_mm[known], found.covariance_mm2.copy()
-        noise = np.broadcast_to(pair_covariance(noise, len(known)), (len(known), 4, 4))[known]
-        gain = covariance[known] @ np.linalg.solve(noise, self.pair.jacobian(x)).mT
-        covariance[known] += gain @ self.projection_covariance(x) @ gain.mT
-        return Points(found.x_mm, covariance, found.epipolar_px)
 
     def depth_sd_mm(self, x_mm: ArrayLike, *, detection: bool = False) -> np.ndarray:
         """(n,) standard deviation along the mean viewing direction, for maps of the workspace."""
