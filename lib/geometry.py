@@ -4,7 +4,7 @@ Conventions: points are rows, (n, 3) millimetres or (n, 2) pixels (x right, y do
 pixel centres); a transform is named ``target_from_source``; angles are radians.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Self
 
@@ -57,21 +57,19 @@ def check(settings: object, names: str, holds: Callable[[object], bool], rule: s
             raise ValueError(f"{name}: {rule}, got {value}.")
 
 
-def pair_covariance(covariance_px2: ArrayLike | Sequence[ArrayLike] | None, n: int, images: int = 2) -> np.ndarray:
+def pair_covariance(covariance_px2: ArrayLike | None, n: int, images: int = 2) -> np.ndarray:
     """Covariance of the stacked pixels (u_left, u_right) of n matches: (1, 4, 4) where all share it, else (n, 4, 4).
 
     Args:
         covariance_px2: A number (the variance of each coordinate), (2, 2) for every image, (4, 4) for the pair, (n, 4, 4)
-            one a match, (n, 2, 2, 2) one a match and image, or a list of one (n, 2, 2) an image.  None is 1 px^2.  NaN
-            passes, for landmarks that are not seen; a ValueError refuses what is not positive definite.
+            one a match, or (n, 2, 2, 2) one a match and image.  None is 1 px^2.  NaN passes, for landmarks that are not
+            seen; a ValueError refuses what is not positive definite.
         images: 2, or 1 for a single camera; then (2, 2) and (n, 2, 2) take the place of (4, 4) and (n, 4, 4).
 
     >>> pair_covariance(4.0, 10)[0].diagonal()
     array([4., 4., 4., 4.])
     """
     m = 2 * images
-    if isinstance(covariance_px2, (list, tuple)) and len(covariance_px2) == images and np.ndim(covariance_px2[0]) == 3:
-        covariance_px2 = np.stack(covariance_px2, axis=1)
     given = np.asarray(1.0 if covariance_px2 is None else covariance_px2, dtype=np.float64)
     if given.ndim == 0:
         if not given > 0:
@@ -86,7 +84,7 @@ def pair_covariance(covariance_px2: ArrayLike | Sequence[ArrayLike] | None, n: i
     elif given.shape in ((m, m), (n, m, m)):
         covariance = given.reshape(-1, m, m)
     else:
-        forms = f"a number, (2, 2), ({m}, {m}), ({n}, {m}, {m}), ({n}, {images}, 2, 2) or a list of ({n}, 2, 2)"
+        forms = f"a number, (2, 2), ({m}, {m}), ({n}, {m}, {m}) or ({n}, {images}, 2, 2)"
         raise ValueError(f"covariance_px2: expected {forms}, got {given.shape}.")
     # Cheap enough for every frame: what makes a 2 x 2 covariance positive definite, checked of every pair of coordinates.
     variance = np.einsum("nii->ni", covariance)

@@ -35,7 +35,7 @@ def calibrate(
     data: Correspondences | ArrayLike, u: Sequence[ArrayLike] | None = None, *,
     offsets: bool | Literal["tool", "image"] | None = None, offset_prior_sd: float | None = None,
     model: str = "zero_skew", weighting: str = "likelihood", sigma_u_px: float | None = None,
-    sigma_x_mm: float | None = None, covariance_px2: ArrayLike | Sequence[ArrayLike] | None = None,
+    sigma_x_mm: float | None = None, covariance_px2: ArrayLike | None = None,
     ransac_px: float | None = None, seed: int = 0, image_size_px: tuple[int, int] | None = None, checks: bool = True,
 ) -> Calibration:  # fmt: skip
     """Cameras from robot positions and their detections: outliers out, then the exact minimum of Eq. (3).

@@ -233,7 +233,7 @@ def test_detector_covariances_weigh_their_points():
         c = data(100, seed, sigma_u_px=0)
         sd = rng.uniform(0.3, 6, (2, 100))
         u = [p + s[:, None] * rng.normal(size=p.shape) for p, s in zip((c.u_left, c.u_right), sd, strict=True)]
-        covariance = [s[:, None, None] ** 2 * np.eye(2) for s in sd]
+        covariance = sd.T[:, :, None, None] ** 2 * np.eye(2)
         for name, given in (("with", covariance), ("without", None)):
             found = calibrate(c.x_mm, u, covariance_px2=given, ransac_px=np.inf)
             errors[name].append(found.rig.left.project(c.true_x_mm) - c.true_rig.left.project(c.true_x_mm))
@@ -247,7 +247,7 @@ def test_correspondences_bring_their_covariances_and_gaps():
     covariance = rng.uniform(0.5, 3, (80, 2, 1, 1)) * np.eye(2)
     u = [c.u_left, c.u_right]
     rows = Correspondences.of_points(c.x_mm, *u, covariance_px2=covariance)
-    each = calibrate(c.x_mm, u, covariance_px2=[covariance[:, 0], covariance[:, 1]])
+    each = calibrate(c.x_mm, u, covariance_px2=covariance)
     for name in ("cost", "sigma_x_mm", "detector_scale", "view_inliers", "residuals_px"):
         np.testing.assert_array_equal(getattr(calibrate(rows), name), getattr(each, name))
     plain = calibrate(c.x_mm, u, sigma_u_px=1.5)
