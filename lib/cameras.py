@@ -174,7 +174,7 @@ class NearAffineCamera(MatrixCamera):
         return radial_derivative(v, self.radial_per_px2) @ J if self.radial_per_px2 else J
 
     def undistort(self, u: ArrayLike) -> np.ndarray:
-        """Pixels (n, 2) with the radial distortion taken out (Newton's method on the radius).
+        """Pixels (n, 2) with the radial distortion taken out.
 
         Barrel distortion (k < 0) folds the image over at a largest radius; pixels beyond, which it shows nowhere, become NaN.
 
@@ -186,15 +186,11 @@ class NearAffineCamera(MatrixCamera):
         if not self.radial_per_px2:
             return u
         w = u - self.centre_px
-        distorted = np.linalg.norm(w, axis=1)
-        if self.radial_per_px2 < 0:
-            distorted[distorted > (2 / 3) / np.sqrt(-3 * self.radial_per_px2)] = np.nan
-        radius = distorted.copy()
-        for _ in range(20):
-            step = (radius + self.radial_per_px2 * radius**3 - distorted) / (1 + 3 * self.radial_per_px2 * radius**2)
-            radius = radius - step
-            if not (np.abs(step) > 1e-13 * np.maximum(distorted, 1.0)).any():
-                break
+        distorted, size = np.linalg.norm(w, axis=1), 2 / np.sqrt(3 * abs(self.radial_per_px2))
+        # The cubic equation for the radius is that for the sine, or the hyperbolic sine, of a third of an angle.
+        sine, angle = (np.sin, np.arcsin) if self.radial_per_px2 < 0 else (np.sinh, np.arcsinh)
+        with np.errstate(invalid="ignore"):  # of what is beyond
+            radius = size * sine(angle(3 * distorted / size) / 3)
         return self.centre_px + w * np.divide(radius, distorted, out=np.ones_like(radius), where=distorted != 0)[:, None]
 
     @property
