@@ -48,34 +48,17 @@ def n_levels(gy: int, gx: int) -> int:
     return levels
 
 
-def pool(maps: torch.Tensor, start: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
-    """Maxima over three columns at every second one; and of these over three rows at rows start, start + 2, ..."""
+def pool(maps: torch.Tensor, start: int = 0) -> torch.Tensor:
+    """Maxima over 3 x 3 cells, at every second column and at the rows start (0 or 1), start + 2, ..."""
     along_x = max_pool1d(maps.flatten(0, 2), 3, stride=2, padding=1).reshape(*maps.shape[:3], -1)
-    out = along_x[:, :, start::2].clone()
-    for first, beside in ((1 - start, along_x[:, :, 1 - start :: 2]), (0, along_x[:, :, start + 1 :: 2])):
-        there = out[:, :, first : first + beside.shape[2]]
-        torch.maximum(there, beside[:, :, : there.shape[2]], out=there)
-    return along_x, out
+    return max_pool2d(along_x, (3, 1), stride=(2, 1), padding=(1 - start, 0))
 
 
-def unpool(
-    maps: torch.Tensor, along_x: torch.Tensor, pooled: torch.Tensor, score: torch.Tensor, start: int = 0
-) -> torch.Tensor:
+def unpool(maps: torch.Tensor, score: torch.Tensor, start: int = 0) -> torch.Tensor:
     """Give the score of each pooled cell to the cell that was its maximum in `pool`; cells that none reaches get -inf."""
-    return _unpool_axis(maps, along_x, _unpool_axis(along_x, pooled, score, 2, start), 3, 0)
-
-
-def _unpool_axis(maps: torch.Tensor, pooled: torch.Tensor, score: torch.Tensor, axis: int, start: int) -> torch.Tensor:
-    out = torch.full_like(maps, -torch.inf)
-    cells, given, pooled, score = (x.movedim(axis, 0) for x in (maps, out, pooled, score))
-    for first in (start - 1, start, start + 1):
-        skip = int(first < 0)  # nothing lies before the first cell
-        here, there = (x[first + 2 * skip :: 2] for x in (cells, given))
-        n = min(len(here), len(pooled) - skip)
-        if n > 0:
-            chosen = here[:n] == pooled[skip : skip + n]
-            torch.maximum(there[:n], torch.where(chosen, score[skip : skip + n], -torch.inf), out=there[:n])
-    return out
+    highest = max_pool2d(maps, 3, stride=2, padding=(1 - start, 1), return_indices=True)[1]
+    out = torch.full_like(maps, -torch.inf).flatten(2)
+    return out.scatter_reduce_(2, highest.flatten(2), score.flatten(2), "amax").view(maps.shape)
 
 
 def _by_axis(maps: torch.Tensor, axis: int) -> torch.Tensor:
@@ -134,8 +117,7 @@ def path_scores(pooled: torch.Tensor, levels: int, *, shifted: bool, level: int 
     if level < levels and score.shape[2:].numel() > 1:
         # Of displacements the epipolar line itself, the middle row, is always one that is sampled.
         start = 0 if shifted else (score.shape[2] // 2) % 2
-        along_x, smaller = pool(score, start)
-        score = unpool(score, along_x, smaller, path_scores(smaller, levels, shifted=shifted, level=level + 1), start)
+        score = unpool(score, path_scores(pool(score, start), levels, shifted=shifted, level=level + 1), start)
     for axis in (0, 1):
         score = _scatter(score, axis, level, pooled.shape[axis], shifted=shifted)
     return score.add_(pooled)
@@ -219,9 +201,8 @@ def match_volume(volume: torch.Tensor, low: int, *, reciprocal: bool = True) -> 
     """
     gy, gx, rows, n = volume.shape
     v = rows // 2
-    along_x, pooled = pool(volume, v % 2)
     # The power is monotone, so it may follow the maximum, which is a quarter of the work.
-    scores = path_scores(pooled**POWER, n_levels(gy, gx) if rows * n > 1 else 0, shifted=False)
+    scores = path_scores(pool(volume, v % 2) ** POWER, n_levels(gy, gx) if rows * n > 1 else 0, shifted=False)
 
     # The displaced centre of a patch falls into the bin (4 g + 2 + d) // 4: displacements in fours share one.
     bin_x, bin_y = (low + np.arange(n) + 2) // PATCH, (np.arange(-v, v + 1) + 2) // PATCH
@@ -232,7 +213,7 @@ def match_volume(volume: torch.Tensor, low: int, *, reciprocal: bool = True) -> 
     def search(top: int) -> list[list[torch.Tensor]]:
         """Best displacements of a chunk of lattice rows; its strongest scores per bin, (chunk, gx) for each (y, x)."""
         part = slice(top, min(top + ROWS, gy))
-        score = unpool(volume[part], along_x[part], pooled[part], scores[part], v % 2)
+        score = unpool(volume[part], scores[part], v % 2)
         torch.max(score.flatten(2), dim=2, out=(best[part], flat[part]))
         return [[score[:, :, y[0] : y[-1] + 1, x[0] : x[-1] + 1].amax(dim=(2, 3)) for x in in_x] for y in in_y]
 
@@ -318,16 +299,16 @@ def _match_grids(left: torch.Tensor, right: torch.Tensor) -> tuple[torch.Tensor,
 
     pooled = patches.new_empty(gy, gx, (n_y + 1) // 2, (n_x + 1) // 2)
     for part, maps in chunks():
-        pooled[part] = pool(maps)[1]
+        pooled[part] = pool(maps)
     # The power is monotone, so it may follow the maximum, which is a quarter of the work.
     score = path_scores(pooled.pow_(POWER), n_levels(gy, gx), shifted=True)
     best, place = score.new_empty(gy, gx), torch.empty(gy, gx, dtype=torch.long, device=score.device)
     ratio, strongest = np.empty((gy, gx)), score.new_full((n_y, n_x), -torch.inf)
     for part, maps in chunks():
-        along_x, small = pool(maps)
+        small = pool(maps)
         best[part], peak = score[part].flatten(2).max(dim=2)
         row, column = torch.div(peak, small.shape[3], rounding_mode="floor"), peak % small.shape[3]
-        full = unpool(maps, along_x, small, score[part])
+        full = unpool(maps, score[part])
         place[part] = full.flatten(2).argmax(dim=2)
         strongest = torch.maximum(strongest, full.amax(dim=(0, 1)))
         ratio[part] = peak_ratio(small.flatten(0, 1), row.flatten(), column.flatten()).reshape(peak.shape)
