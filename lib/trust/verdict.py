@@ -3,9 +3,11 @@
 import shlex
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Self
 
 import numpy as np
+from jinja2 import Environment, FileSystemLoader
 
 from lib import paths
 from lib.calibration import Calibration, NoConsensusError, calibrate, calibrate_as_shown, optics
@@ -286,48 +288,15 @@ def report(calibration: Calibration, *, verdict: Verdict | None = None, robot_ac
     Without the verdict of `lib.trust.assess`, the calibration's own numbers are judged alone.
     """
     verdict = judge(None, calibration, robot_accuracy_mm=robot_accuracy_mm) if verdict is None else verdict
-    c, seen = calibration, np.isfinite(calibration.residuals_px[:, ::2])
+    c, told = calibration, {}
+    seen = np.isfinite(c.residuals_px[:, ::2])
     outliers = np.argwhere(seen & ~c.view_inliers)
-    rows, used, usable = len(c.inliers), int(c.inliers.sum()), int(c.usable.sum())
-    left_out = "" if usable == rows else f", {rows - usable} without a detection, position or axes"
-    lines = [
-        str(verdict),
-        f"Calibration: model {c.model}, weighting {c.weighting}, {len(c.parameter_names)} parameters",
-        f"  rows          {used} of {rows} used{left_out}; they count as {c.effective_rows:.0f} independent ones",
-        f"  detections    {c.view_inliers.sum()} of {seen.sum()} used, {len(outliers)} outliers "
-        f"({100 * len(outliers) / seen.sum():.0f} %)",
-        f"  noise         sigma_u {c.sigma_u_px:.2f} px, sigma_x {1e3 * c.sigma_x_mm:.1f} um",
-        f"  reprojection  {c.reprojection_rms_px:.2f} px RMS, {c.press_rms_px:.2f} px cross-validated (leave one out)",
-        "  chi-square    {:.0f} for {} degrees of freedom".format(*c.chi_square),
-        "  volume        {:.2f} x {:.2f} x {:.2f} mm RMS".format(*c.extents_mm),
-    ]
-    for name, resection in zip(["left", "right"] if c.rig else ["camera"], (k.resect() for k in c.cameras), strict=True):
-        (zoom_x, skew), (_, zoom_y) = resection.K
-        at = ", ".join(f"{value:.3f}" for value in resection.t)
-        lines.append(f"  {name:12s}  zoom {zoom_x:.3f} x {zoom_y:.3f} px/mm, skew {skew:z.3f} px/mm, offset ({at}) mm")
-    distance, sd = c.inverse_distance_per_mm
-    if sd > 0:
-        far = "not distinguishable from affine" if abs(distance) < 3 * sd else f"working distance {1 / distance:.0f} mm"
-        lines.append(f"  1/distance    {distance:.5f} +- {sd:.5f} per mm: {far}")
+    size_px = np.linalg.norm(c.residuals_px.reshape(*seen.shape, 2)[tuple(outliers.T)], axis=1)
     if c.rig is not None:
-        o, x = optics(c), c.x_mm[c.inliers]
-        alone, both = (1e3 * np.median(c.depth_sd_mm(x, detection=detection)) for detection in (False, True))
-        at = ", ".join(f"{value:.1f}" for value in o.robot_from_microscope.t)
-        angle, roll = np.rad2deg([o.convergence_rad, o.roll_rad])
-        head = f"convergence {angle:.2f} deg, right image rolled by {roll:z.2f} deg, mirrored: {o.mirrored}"
-        lines.append(f"  head          {head}; the images' centre is ({at}) mm")
-        lines.append(f"  depth         {both:.0f} um sd of one detected point, of which the calibration {alone:.1f} um")
-    if c.offsets is not None:
-        scale, unit = (1e3, "um along, across, normal") if c.offsets.offset.shape[1] == 3 else (1.0, "px, left and right")
-        lines.append(f"  offsets       p = {c.offsets.p_value:.2g} without any; {unit}:")
-        for k, (values, sds) in enumerate(zip(c.offsets.offset, c.offsets.standard_deviation, strict=True)):
-            name = LANDMARKS[k] if k < len(LANDMARKS) else f"landmark {k}"
-            numbers = [f"{scale * v:z.1f} +- {scale * s:.1f}" for v, s in zip(values, sds, strict=True)]
-            lines.append(f"    {name:10s}  {', '.join(numbers)}")
-    if outliers.size:
-        distance = np.linalg.norm(c.residuals_px.reshape(rows, -1, 2)[tuple(outliers.T)], axis=1)
-        sides = ("left", "right") if c.rig else ("",)
-        worst = [(*outliers[i], distance[i]) for i in np.argsort(-distance)[:10]]
-        lines.append(f"Outliers (row: residual), {len(worst)} of {len(outliers)}")
-        lines += [f"  {row:6d}: {size:.1f} px {sides[side]}".rstrip() for row, side, size in worst]
-    return "\n".join(lines)
+        depths = (c.depth_sd_mm(c.x_mm[c.inliers], detection=detection) for detection in (False, True))
+        told = {"optics": optics(c), "depth_um": [1e3 * np.median(depth) for depth in depths], "degrees": np.rad2deg}
+    here = Environment(loader=FileSystemLoader(Path(__file__).parent), trim_blocks=True)
+    return here.get_template("report.txt").render(
+        told, c=c, verdict=verdict, detections=seen.sum(), outliers=len(outliers), landmarks=LANDMARKS,
+        worst=[(*outliers[i], size_px[i]) for i in np.argsort(-size_px)[:10]],
+    ).rstrip()  # fmt: skip
