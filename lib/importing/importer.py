@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from jinja2 import Environment, FileSystemLoader
 from scipy.spatial.transform import Rotation, Slerp
 
 from lib import files
@@ -175,39 +176,19 @@ def _did(
     told: Mapping, stereo: StereoSource, draft: Recording, clock: TimeOffset | str | None, zeros: list[Decimal]
 ) -> list[str]:
     """What the import did, one plain sentence each."""
-    time_s, (width, height) = draft.frames.time_s, draft.image_size_px
+    time_s, pair, labels = draft.frames.time_s, draft.frames[0], draft.annotations
     step = np.diff(time_s) if len(time_s) > 1 else np.array([0.0])
-    said = [f"{len(draft)} stereo frames of {width} x {height} px over {np.ptp(time_s):.3f} s."]
-    if np.ptp(step) > 0.02 * np.median(step):
-        said.append(f"The frame rate varies: {step.min():.4f} to {step.max():.4f} s a frame; frames.csv holds each time.")
-    if stereo.dropped:
-        said.append(f"{stereo.dropped} frames without a partner of the other camera were left out.")
-    if stereo.bit_depth:
-        source = "as the mapping says" if told.video.bit_depth else "which hold the brightest value"
-        said.append(f"Frames of {stereo.bit_depth} bits, {source}, were scaled to 8 bits.")
-    pair = draft.frames[0]
-    if all(np.array_equal(image[..., 0], image[..., k]) for image in (pair.left, pair.right) for k in (1, 2)):
-        said.append("The frames are grey; the detector learnt on colour, so look at what it finds.")
-    x = draft.kinematics.x_mm
-    kind = "its landmarks" if told.robot.pose is None else "the pose of its tool"
-    gaps = int(np.isnan(x[..., 0]).any(axis=1).sum())
-    said.append(f"{len(x)} samples of the robot, which reports {kind}; {gaps} have gaps.")
-    said += [f"Times of the {what} count from {z} s." for what, z in zip(("video", "robot"), zeros, strict=True) if z]
-    if isinstance(clock, str):
-        cure = "offset_s is 0 in recording.toml; `check` and `adapt` look for it again"
-        said.append(f"The offset of the clocks was not found ({clock}): {cure}.")
-    elif clock:
-        said.append(f"The clocks differ by {1e3 * clock.offset_s:.2f} ms, standard deviation {1e3 * clock.sd_s:.2f} ms.")
-    inside = np.isfinite(draft.landmarks_mm()).any(axis=(1, 2))
-    if not inside.all():
-        said.append(f"The robot is silent at {int((~inside).sum())} frames.")
-    if draft.annotations is None:
-        said.append("The mapping names no labels.")
-    else:
-        seen = draft.annotations.visibility_left, draft.annotations.visibility_right
-        counts = [int((visibility > 0).any(axis=1).sum()) for visibility in seen]
-        said.append(f"Labels in {counts[0]} left and {counts[1]} right frames; the others are unlabelled, not empty.")
-    return said
+    seen = () if labels is None else (labels.visibility_left, labels.visibility_right)
+    here = Environment(loader=FileSystemLoader(Path(__file__).parent), trim_blocks=True)
+    text = here.get_template("did.txt").render(
+        told=told, stereo=stereo, draft=draft, clock=clock, span_s=np.ptp(time_s), step=step, usual_step=np.median(step),
+        is_grey=all((image == image[..., :1]).all() for image in (pair.left, pair.right)),
+        gaps=np.isnan(draft.kinematics.x_mm[..., 0]).any(axis=1).sum(),
+        zeros=[(what, zero) for what, zero in zip(("video", "robot"), zeros, strict=True) if zero],
+        silent=np.isnan(draft.landmarks_mm()).all(axis=(1, 2)).sum(),
+        labelled=tuple((visibility > 0).any(axis=1).sum() for visibility in seen),
+    )  # fmt: skip
+    return text.rstrip().split("\n")
 
 
 def _sources(folder: Path, told: Mapping, stereo: StereoSource) -> list[dict]:
