@@ -125,36 +125,15 @@ def check(recording: str | Path | Recording, *, detector: Callable | None = None
 
 def _facts(recording: Recording, a: Assessment) -> dict[str, str]:
     """Answers to what a user asks first."""
-    time, log, data, c = recording.frames.time_s, recording.kinematics.time_s, a.data, a.calibration
-    width, height = recording.image_size_px
-    facts = {
-        "folder": f"{len(recording)} stereo frames of {width} x {height} px over {np.ptp(time):.1f} s, {len(log)} samples of "
-        f"the robot over {np.ptp(log):.1f} s; robot accuracy {1e3 * recording.robot_accuracy_mm:.0f} um; "
-        f"{'labels' if recording.annotations is not None else 'no labels'}.",
-        "coverage": f"{len(a.health.frame)} frames looked at; {int(data.seen.all(axis=1).sum())} of {len(data)} landmarks "
-        f"found in both images, {int(data.is_complete.sum())} of them with a position of the robot.",
-    }
-    if len(x := data.x_mm[data.is_complete]):
-        facts["volume"] = "The tool was seen within {:.1f} x {:.1f} x {:.1f} mm.".format(*np.ptp(x, axis=0))
-    stated, best = f"offset_s = {recording.offset_s:g} s is stated", a.diagnosis.best
-    error_s, sd_s = (0.0, np.inf) if c is None else clock_error(c, data, recording.kinematics, recording.offset_s)
-    change = f"differ by {1e3 * error_s:+z.2f} +- {1e3 * sd_s:.2f} ms" if np.isfinite(sd_s) else "cannot tell"
-    facts["clock"] = f"{stated}; {best.text if best is not None and best.name == 'clock' else f'the data {change}.'}"
-    told = {"readout": ("read-out", f"readout_s = {recording.readout_s:g} s"), "tip_order": ("tips", "base, tip_1, tip_2")}
-    for name, (title, what) in told.items():
-        doubt = best.text if best is not None and best.name == name else "nothing speaks against it."
-        facts[title] = f"{what} is stated; {doubt}"
-    if c is not None and c.offsets is not None and c.offsets.offset.shape[1] == 3:
-        offsets = zip(LANDMARKS, 1e3 * c.offsets.offset, strict=False)
-        parts = ["{}: {:+z.0f}, {:+z.0f}, {:+z.0f} um".format(name, *value) for name, value in offsets]
-        facts["landmark offsets"] = "; ".join(parts) + " (along, across, normal)."
-    if c is not None and (far := c.inverse_distance_per_mm)[1] > 0:
-        facts["cameras"] = f"of a finite distance, {1 / far[0]:.0f} +- {far[1] / far[0] ** 2:.0f} mm, as the detections show."
-    bad = f"{int((a.health.score > 1).sum())} of {len(a.health.frame)} frames have a score above 1"
-    facts["detector"] = f"{a.health.text}; {bad} (of frames with right landmarks {100 * a.health.false_alarm_rate:.0f} %)."
-    if np.isfinite(a.epipolar_px):
-        facts["epipolar witness"] = f"Features of both images lie {a.epipolar_px:.2f} px (median) off the epipolar lines."
-    return facts
+    time_s, log, x, c = recording.frames.time_s, recording.kinematics, a.data.complete.x_mm, a.calibration
+    clock_s = (0.0, np.inf) if c is None else clock_error(c, a.data, log, recording.offset_s)
+    here = Environment(loader=FileSystemLoader(Path(__file__).parent), trim_blocks=True)
+    text = here.get_template("facts.txt").render(
+        recording=recording, a=a, landmarks=LANDMARKS, film_s=np.ptp(time_s), log_s=np.ptp(log.time_s),
+        volume_mm=np.ptp(x, axis=0) if len(x) else None,
+        clock_ms=1e3 * np.array(clock_s) if np.isfinite(clock_s[1]) else None,
+    )  # fmt: skip
+    return dict(line.split(": ", 1) for line in text.rstrip().split("\n"))
 
 
 def overlay(frame: StereoFrame, seen: np.ndarray, told: np.ndarray | None, width_px: int = _SHOWN_PX) -> np.ndarray:
