@@ -13,14 +13,13 @@ from pathlib import Path
 
 from tqdm.auto import tqdm
 
-_STEPS = "microstereo-steps"
 #: A scheduler must answer within these seconds.
 ANSWER_S = 15.0
 
 
 def run_jobs(
     function: Callable[..., object], jobs: Mapping[Path, tuple], *, workers: int | None = None,
-    scheduler: str | None = None, title: str = "", unit: str = "job", steps: int = 0, progress: bool = True,
+    scheduler: str | None = None, title: str = "", unit: str = "job", progress: bool = True,
 ) -> Iterator[tuple[Path, BaseException | None]]:  # fmt: skip
     """Call ``function(path, *jobs[path])`` for every path that does not exist; yield each path, and the error that ended it.
 
@@ -32,12 +31,10 @@ def run_jobs(
         scheduler: Address of a running Dask scheduler, such as ``"tcp://10.0.0.1:8786"``, instead of processes on this
             machine. Its workers need this environment and the same folders; if it does not answer, a ConnectionError.
         title, unit, progress: Of the progress bar.
-        steps: Parts of a job that it reports by `step`; 0 counts whole jobs.
     """
     missing = {path: arguments for path, arguments in jobs.items() if not path.exists()}
-    a_job = max(steps, 1)
-    with tqdm(total=len(jobs) * a_job, initial=(len(jobs) - len(missing)) * a_job, desc=title, unit=unit,
-              disable=not progress, smoothing=0.1) as bar:  # fmt: skip
+    known = {"total": len(jobs), "initial": len(jobs) - len(missing), "desc": title, "unit": unit}
+    with tqdm(**known, disable=not progress, smoothing=0.1) as bar:
         if not missing:
             return
         if getattr(multiprocessing.current_process(), "_inheriting", False):  # a worker imports the script; the parent tells
@@ -45,8 +42,6 @@ def run_jobs(
         from distributed import KilledWorker, as_completed
 
         with _client(min(workers or cores(), len(missing)), scheduler) as client:
-            if steps:
-                client.subscribe_topic(_STEPS, lambda event: bar.update())
             futures = {client.submit(_work, function, path, *missing[path], pure=False): path for path in missing}
             try:
                 for future in as_completed(futures):
@@ -55,19 +50,11 @@ def run_jobs(
                         error = ChildProcessError("its workers were killed again and again, perhaps for lack of memory.")
                     if future.status == "cancelled":
                         error = ConnectionError("the scheduler was lost.")
-                    bar.update(0 if steps else 1)
+                    bar.update()
                     yield futures[future], error
             finally:
                 with contextlib.suppress(Exception):  # the scheduler may have gone
                     client.cancel(list(futures))
-
-
-def step() -> None:
-    """Inside a job: one of its steps is done."""
-    from distributed import get_worker
-
-    with contextlib.suppress(ValueError):  # called outside a job
-        get_worker().log_event(_STEPS, "")
 
 
 def cores() -> int:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -62,20 +61,6 @@ def test_errors_stay_with_their_job(tmp_path, scheduler):
     jobs = {tmp_path / "gone" / "a.txt": ("no such folder",), tmp_path / "b.txt": ("fine",)}
     ends = {path.name: error for path, error in parallel.run_jobs(files.write_text, jobs, scheduler=scheduler)}
     assert ends["b.txt"] is None and isinstance(ends["a.txt"], FileNotFoundError)
-
-
-def test_steps_move_the_bar(tmp_path, scheduler, capsys):
-    jobs = {tmp_path / "a.txt": (), tmp_path / "b.txt": ()}
-    list(parallel.run_jobs(three_steps, jobs, scheduler=scheduler, title="Stepping", steps=3))
-    assert "Stepping: 100%" in capsys.readouterr().err
-    parallel.step()  # outside a job it does nothing
-
-
-def three_steps(path: Path) -> None:
-    for _ in range(3):
-        parallel.step()
-    time.sleep(0.1)
-    shutil.copy(__file__, path)
 
 
 def test_no_scheduler_is_told(tmp_path, monkeypatch):

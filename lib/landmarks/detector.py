@@ -229,9 +229,7 @@ class Detector:
             cure = "fit them with `lib.training.error_models.fit_error_models` or `python3 -m lib train assemble`"
             raise ValueError(f"{path}: {what}; {cure}.")
 
-    def __call__(
-        self, images: ArrayLike, *, batch: int = 4, ground: Callable[[], np.ndarray] | None = None
-    ) -> Landmarks:
+    def __call__(self, images: ArrayLike, *, batch: int = 4, ground: Callable[[], np.ndarray] | None = None) -> Landmarks:
         """Landmarks of images (n, h, w, 3), uint8 RGB or float in [0, 1]; `batch` images at a time.
 
         An image in doubt is seen again with more contrast, then swept, which takes many times as long.  `ground` gives the
@@ -305,9 +303,7 @@ class Detector:
         u, covariance = image_from_cell(found.u, stride), found.covariance * np.outer(stride, stride)
         return Landmarks(u, covariance, found.confidence).without_unsure()
 
-    def searched(
-        self, images: np.ndarray, rough: Landmarks, seen: tuple | None = None, *, sweep: bool = False
-    ) -> Landmarks:
+    def searched(self, images: np.ndarray, rough: Landmarks, seen: tuple | None = None, *, sweep: bool = False) -> Landmarks:
         """What later stages start from: `rough`, or, where its window does not show it well, the tool whose window does best.
 
         Candidates are `rough` and tools made of the highest peaks that the first stage sees at several scales.  All are

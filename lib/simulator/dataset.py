@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from lib import files, paths
-from lib.parallel import cores, run_jobs, step
+from lib.parallel import cores, run_jobs
 from lib.recordings import Recording
 from lib.simulator.eye import Eye
 from lib.simulator.families import FAR
@@ -73,7 +73,7 @@ def rung_design(rung: str, seed: int, *, shrink: int = 1) -> Design:
 
 def _make_sequence(folder: Path, design: Design, seed: int, n_pairs: int) -> None:
     text = "Simulated data set: calibration sweep, then a surgeon's movements."
-    simulate(folder, design, seed=seed, n_frames=n_pairs, description=text, progress=step)
+    simulate(folder, design, seed=seed, n_frames=n_pairs, description=text, progress=False)
 
 
 def make_dataset(
@@ -95,7 +95,7 @@ def make_dataset(
         shutil.rmtree(leftover)  # of a run that was killed
     designs = {k: sequence_design(seed, k, shrink=shrink, duration_s=duration_s) for k in _SEQUENCES}
     jobs = {folder / sequence_name(k): (design, 1000 * seed + k, n_pairs) for k, design in designs.items()}
-    for _, error in run_jobs(_make_sequence, jobs, workers=workers, title="Simulating", unit="pair", steps=n_pairs):
+    for _, error in run_jobs(_make_sequence, jobs, workers=workers, title="Simulating", unit="sequence"):
         if error:
             raise error
     return list(jobs)

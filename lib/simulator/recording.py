@@ -1,6 +1,5 @@
 """Whole recordings with known truth, in the format of `lib.recordings`."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -49,14 +48,14 @@ class Design:
 
 def simulate(
     folder: str | Path, design: Design | None = None, *, seed: int = 0, n_frames: int = 40, name: str | None = None,
-    description: str = "", progress: bool | Callable[[], object] = True, overwrite: bool = False,
+    description: str = "", progress: bool = True, overwrite: bool = False,
 ) -> Recording:  # fmt: skip
     """Simulate a recording and write it to `folder`, which appears whole or not at all; the same arguments, the same files.
 
     The frames are spread over the motion: the video keeps every k-th frame, as the times in frames.csv say.
 
-    `name` and `description` are of recording.toml, None = the folder's name; `progress` is whether to show a bar, or a
-    function to call after every pair.  A FileExistsError if the folder exists and `overwrite` is False.
+    `name` and `description` are of recording.toml, None = the folder's name; `progress` is whether to show a bar.  A
+    FileExistsError if the folder exists and `overwrite` is False.
 
     >>> import tempfile
     >>> microscope = Microscope(pixels_per_mm=(4.0, 4.0), image_size_px=(80, 60))
@@ -87,7 +86,7 @@ def simulate(
         offset_s=design.offset_s, robot_accuracy_mm=design.robot_accuracy_mm,
         suffix=".png" if microscope.jpeg_quality is None else ".jpg", jpeg_quality=microscope.jpeg_quality or 90,
     ) as writer:  # fmt: skip
-        for k in tqdm(range(n_frames), desc=f"Simulating {folder.name}", unit="pair", disable=progress is not True):
+        for k in tqdm(range(n_frames), desc=f"Simulating {folder.name}", unit="pair", disable=not progress):
             pose, noise = motion.pose(time_s[k]), np.random.default_rng([seed, 107, k])
             later = motion.pose(time_s[k] + 1e-3), 1e-3
             views = render_pair(eye, microscope, forceps=forceps, pose=pose, later=later, rng=noise)
@@ -95,8 +94,6 @@ def simulate(
             landmarks[k] = forceps.landmarks(pose)
             for side, view in enumerate(views):
                 u[side, k], visibility[side, k], in_glint[side, k] = view.u, view.visibility, _in_glint(view)
-            if callable(progress):
-                progress()
         rng, to_robot = np.random.default_rng([seed, 101]), ROBOT_FROM_MICROSCOPE.apply
         count = int(np.ceil(time_s[-1] * _KINEMATICS_HZ)) + 1 + 2 * _KINEMATICS_MARGIN
         sample_s = (np.arange(count) - _KINEMATICS_MARGIN) / _KINEMATICS_HZ

@@ -153,9 +153,7 @@ def _looks_px(recording: Recording, frame: np.ndarray, u: np.ndarray, detector: 
     for i in spread(len(frame), _LOOKS):
         pair = recording.frames[int(frame[i])]
         images = np.stack([pair.left, pair.right])
-        mirrored, again = (
-            detector(change(images), **with_ground(detector, recording, change)).u for change in (_mirrored, _shifted)
-        )
+        mirrored, again = (detector(f(images), **with_ground(detector, recording, f)).u for f in (_mirrored, _shifted))
         back = np.stack([images.shape[2] - 1 - mirrored[..., 0], mirrored[..., 1]], axis=-1)[:, [0, 2, 1]]
         distance = np.linalg.norm(np.stack([back, again - _SHIFT_PX]) - np.swapaxes(u[i], 0, 1), axis=-1).max(axis=0)
         moved[i] = np.where(np.isnan(u[i, ..., 0]), np.nan, np.nan_to_num(distance, nan=np.inf).T)

@@ -72,9 +72,9 @@ def test_a_killed_run_resumes_to_the_same_files(made, tmp_path, capfd):
     assert finished(folder) == NAMES and not any(folder.glob("*.partial"))
     assert {name: (folder / name).stat().st_mtime_ns for name in kept} == before
     assert contents(folder) == contents(made)
-    said = capfd.readouterr()  # progress is counted in pairs, with the remaining time
+    said = capfd.readouterr()  # progress is counted in sequences, with the remaining time
     assert f"{20 - 2 * len(kept)} of 20 stereo pairs to make" in said.out and "s a pair" in said.out
-    assert re.search(r"20/20 \[\d\d:\d\d<\d\d:\d\d", said.err)
+    assert re.search(r"10/10 \[\d\d:\d\d<\d\d:\d\d", said.err)
 
 
 def test_sequences_depend_on_seed_and_index_alone():
