@@ -42,7 +42,7 @@ _CONTRADICTED = 0.2
 #: has no edge that ends along the shaft.  Chosen by the closeups' errors in four recordings of unfamiliar tools and lights.
 _OWN_BIAS = 0.004 * np.array([[2.5, 1.0, 1.5], [1.2, 1.0, 1.5], [1.2, 1.0, 1.5]])
 #: Largest offset of a landmark, as a share of the tool's length or in mm, whichever is more: what is farther by two standard
-#: deviations is another point of the tool.  A robot's tool calibration errs by tenths of a millimetre, however short it is.
+#: deviations is another point of the tool.  A robot's tool calibration errs by tenths of a mm, however short the tool.
 _LARGEST_OFFSET, _LARGEST_OFFSET_MM = 0.15, 0.25
 #: Error of an offset, as a share of it, where shut jaws borrow the tool's axes from another time, farther away than this.
 _TURNED, _BORROWED_S = 0.3, 0.1
