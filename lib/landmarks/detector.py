@@ -103,7 +103,7 @@ class Landmarks:
 
     @property
     def doubtful(self) -> np.ndarray:
-        """(n,) images that leave doubt."""
+        """(n,) bool, images that leave doubt: the mean confidence of their landmarks is low."""
         return self.confidence.mean(1) < _UNSURE
 
     def surest(self, other: Self) -> Self:

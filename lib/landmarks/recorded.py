@@ -52,6 +52,9 @@ def with_ground(detector: Callable, recording: Recording, change: Callable[[np.n
     """What a call of the detector takes beside a pair of images: their ground, unless it is a stand-in of images alone.
 
     `change` made the images of those of the recording.
+
+    >>> with_ground(lambda images: Landmarks.none(len(images)), None)
+    {}
     """
     if not isinstance(detector, Detector | SharedDetector):
         return {}

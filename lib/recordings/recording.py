@@ -195,7 +195,7 @@ class Recording:
     @cached_property
     def ground(self) -> Ground:
         """What the cameras see behind the tool; a detector in doubt looks at what differs from it."""
-        return Ground.of_frames(self.frames, self.landmarks_mm(), f"{self.folder.resolve()} {self.frames.time_s.sum()!r}")
+        return Ground.of_frames(self.frames, self.landmarks_mm(), f"{self.folder.resolve()} {self.frames.time_s.sum()}")
 
     def landmarks_mm(self) -> np.ndarray:
         """The robot's landmarks (n, k, 3) mm at the frames' times, NaN where the robot says nothing.

@@ -7,6 +7,7 @@ same.  And pictures whose colours and details are unlike those of the training a
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 
 import cv2
@@ -37,6 +38,7 @@ _WIDTH_PX = 240  # of a picture whose looks are taken
 _LOOKS, _PICTURES = 12, 60  # frames looked at again; pictures compared with those of the training
 #: Frames further apart in time are not compared for smoothness.
 _NEXT_S = 0.15
+_MIRRORED = partial(np.flip, axis=2)
 #: By how much a look is shifted, (x, y) px: no multiple of a network's stride.
 _SHIFT_PX = (37, 21)
 #: The images are halved: features of the retina are larger than a pixel, and it takes a quarter of the time.
@@ -153,15 +155,11 @@ def _looks_px(recording: Recording, frame: np.ndarray, u: np.ndarray, detector: 
     for i in spread(len(frame), _LOOKS):
         pair = recording.frames[int(frame[i])]
         images = np.stack([pair.left, pair.right])
-        mirrored, again = (detector(f(images), **with_ground(detector, recording, f)).u for f in (_mirrored, _shifted))
+        mirrored, again = (detector(f(images), **with_ground(detector, recording, f)).u for f in (_MIRRORED, _shifted))
         back = np.stack([images.shape[2] - 1 - mirrored[..., 0], mirrored[..., 1]], axis=-1)[:, [0, 2, 1]]
         distance = np.linalg.norm(np.stack([back, again - _SHIFT_PX]) - np.swapaxes(u[i], 0, 1), axis=-1).max(axis=0)
         moved[i] = np.where(np.isnan(u[i, ..., 0]), np.nan, np.nan_to_num(distance, nan=np.inf).T)
     return moved
-
-
-def _mirrored(images: np.ndarray) -> np.ndarray:
-    return images[:, :, ::-1]
 
 
 def _shifted(images: np.ndarray) -> np.ndarray:

@@ -78,10 +78,9 @@ def sweep(
     folder.mkdir(parents=True, exist_ok=True)
     words = ["sweep", name, *itertools.chain(*(("-p", key, ",".join(values)) for key, values in grid.items()))]
     provenance = Provenance(shlex.join(["python3", "-m", "lib", *words]))
-    of_file = {}
-    for values in itertools.product(*parsed.values()):
-        point = dict(zip(parsed, values, strict=True))
-        of_file[folder / f"{files.digest(json.dumps(point, sort_keys=True, default=str).encode())}.ipynb"] = point
+    points = [dict(zip(parsed, values, strict=True)) for values in itertools.product(*parsed.values())]
+    digests = [files.digest(json.dumps(point, sort_keys=True, default=str).encode()) for point in points]
+    of_file = {folder / f"{digest}.ipynb": point for digest, point in zip(digests, points, strict=True)}
     jobs = {executed: (book, profile | point, cell_timeout_s) for executed, point in of_file.items()}
     rows = {executed: _row(executed, point) for executed, point in of_file.items() if executed.exists()}
     failures: dict[str, str] = {}
