@@ -12,7 +12,7 @@ from tqdm.auto import tqdm
 from lib import files, paths
 from lib.correspondences import Correspondences, of_recording
 from lib.landmarks.detector import Detector, Landmarks
-from lib.recordings import Ground, Recording
+from lib.recordings import Ground, GrowingGround, Recording
 
 
 def detect(
@@ -48,7 +48,9 @@ def detect(
     return of_recording(recording, every.u[::2], every.u[1::2], frames=chosen, **known)
 
 
-def with_ground(detector: Callable, recording: Recording, change: Callable[[np.ndarray], np.ndarray] | None = None) -> dict:
+def with_ground(
+    detector: Callable, recording: Recording | GrowingGround, change: Callable[[np.ndarray], np.ndarray] | None = None
+) -> dict:
     """What a call of the detector takes beside a pair of images: their ground, unless it is a stand-in of images alone.
 
     `change` made the images of those of the recording.

@@ -14,11 +14,13 @@ from numpy.typing import ArrayLike
 from lib.calibration import Calibration, calibrate_as_shown
 from lib.cameras import StereoRig
 from lib.correspondences import LANDMARKS, MIN_CONFIDENCE, Correspondences
+from lib.landmarks import with_ground
 from lib.online.checks import FrameChecks
 from lib.online.distance import Surface, TipDistance
 from lib.online.result import FrameResult, Settings
 from lib.online.surface_worker import Beside, SurfaceJob, make
 from lib.online.tracker import RigTracker, Seen
+from lib.recordings import GrowingGround
 from lib.surface import Reconstruction, reconstruct
 
 _JUMP_MM = 0.15  # by which a surface differs from one before only where the eye or the cameras moved
@@ -58,6 +60,7 @@ class OnlinePipeline:
         self._surface: Surface | None = None
         self._surface_seen: Surface | None = None  # the newest while the landmarks were in view
         self._pair: np.ndarray | None = None
+        self._ground = GrowingGround()
         self._smoothness: float | None = None
         self._asked = self._most_points = self._rig_since = 0  # surfaces; most points since the last search everywhere
         self._rests_on = dict.fromkeys(("landmarks", "robot"), float("nan"))
@@ -108,6 +111,7 @@ class OnlinePipeline:
                 result.landmarks = frame.data
                 told = self._checks.robot(frame.data)
                 x_mm = x_mm if told else frame.data.x_mm
+                self._ground.take(self._pair, x_mm)
         if blind and "detect" not in result.failures:
             result.failures["images"] = blind
         if told and kinematics is not None:
@@ -122,6 +126,8 @@ class OnlinePipeline:
         result.rig = tracker.rig
         if tracker.calibration is not calibration or result.motion is not None:
             self._rig_since = self._index
+        if result.motion is not None:
+            self._ground = GrowingGround()  # the cameras see other places now
         if tracker.rig is not before and (result.motion is not None or tracker.rig is None):
             self._tips.reset()
         if tracker.rig is not None and seen:
@@ -163,10 +169,12 @@ class OnlinePipeline:
     def _detect(self, left: np.ndarray, right: np.ndarray, kinematics: ArrayLike | Callable | None) -> Seen:
         if self._pair is None or self._pair.shape[1:] != left.shape:
             self._pair = np.empty((2, *left.shape), np.uint8)  # kept: fresh memory costs more than the copy
+            self._ground = GrowingGround()
         images, previous = np.stack([left, right], out=self._pair), self._seen
         self._seen = None  # whatever fails now, the next frame is searched as a whole
+        known = with_ground(self._detector, self._ground)
         follow = previous is not None and hasattr(self._detector, "track")
-        self._seen = found = self._detector.track(images, previous) if follow else self._detector(images)
+        self._seen = found = self._detector.track(images, previous, **known) if follow else self._detector(images, **known)
         u = np.where(found.confidence[..., None] >= MIN_CONFIDENCE, found.u, np.nan)
         stated = {"covariance_px2": np.swapaxes(found.covariance, 0, 1), "confidence": np.transpose(found.confidence)}
         index = np.full(len(LANDMARKS), self._index)

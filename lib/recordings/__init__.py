@@ -9,10 +9,10 @@ A rolling shutter reads row y at readout_s * (y / (height - 1) - 1/2) after that
 from lib.recordings.annotations import Annotations
 from lib.recordings.annotator import Annotator
 from lib.recordings.frames import Frames, StereoFrame, encoded, read_image, to_8_bits
-from lib.recordings.ground import Ground
+from lib.recordings.ground import Ground, GrowingGround
 from lib.recordings.recording import Doubt, Kinematics, Recording, RecordingWriter
 from lib.recordings.smoothing import smoothed
 from lib.recordings.truth import Truth
 
-__all__ = ["Annotations", "Annotator", "Doubt", "Frames", "Ground", "Kinematics", "Recording", "RecordingWriter"]
-__all__ += ["StereoFrame", "Truth", "encoded", "read_image", "smoothed", "to_8_bits"]
+__all__ = ["Annotations", "Annotator", "Doubt", "Frames", "Ground", "GrowingGround", "Kinematics", "Recording"]
+__all__ += ["RecordingWriter", "StereoFrame", "Truth", "encoded", "read_image", "smoothed", "to_8_bits"]

@@ -1,12 +1,13 @@
 """What the two cameras of a recording see behind the tool: as the tool moves, most frames show each place without it."""
 
 from collections.abc import Callable, Sequence
-from functools import cache
+from functools import cache, partial
 from typing import Self
 
 import numpy as np
 
 _FRAMES = 9  # so many make the ground; more take longer and show hardly more
+_FEWEST = 5  # before so many have come, most of what one shows may be the tool
 
 
 class Ground:
@@ -36,13 +37,43 @@ class Ground:
 
         def see() -> np.ndarray:
             sides = ([getattr(frames[int(i)], side) for i in chosen] for side in ("left", "right"))
-            return np.stack([np.partition(np.stack(images), len(chosen) // 2, axis=0)[len(chosen) // 2] for images in sides])
+            return np.stack([_median(list(images)) for images in sides])
 
         return cls(see, f"{name} {chosen.tolist()}")
 
     def changed(self, change: Callable[[np.ndarray], np.ndarray]) -> Self:
         """The ground of images that `change` makes of the cameras' ones."""
         return type(self)(lambda: change(self()), self.key)
+
+
+class GrowingGround:
+    """The `ground` of frames that come one by one, as in `Ground.of_frames`; None before there are five.
+
+    >>> growing = GrowingGround()
+    >>> for k in range(5):
+    ...     growing.take(np.full((2, 4, 6, 3), k, np.uint8), np.full((3, 3), float(k)))
+    >>> growing.ground().max()
+    np.uint8(2)
+    """
+
+    def __init__(self) -> None:
+        self._kept: list[np.ndarray] = []
+        self._centre_mm = np.empty((0, 3))
+        self.ground: Ground | None = None
+
+    def take(self, images: np.ndarray, x_mm: np.ndarray) -> None:
+        """A stereo frame (2, h, w, 3) uint8, copied if it is kept, and where the robot has the tool, (k, 3)."""
+        centre_mm, new = np.vstack([self._centre_mm, x_mm.mean(axis=0)]), len(self._kept)
+        chosen = apart(centre_mm, _FRAMES)
+        if new not in chosen or np.isnan(centre_mm[new]).any():
+            return
+        self._kept, self._centre_mm = [images.copy() if i == new else self._kept[i] for i in chosen], centre_mm[chosen]
+        if len(chosen) >= _FEWEST:
+            self.ground = Ground(partial(_median, self._kept), str(self._centre_mm.tolist()))
+
+
+def _median(images: Sequence[np.ndarray]) -> np.ndarray:
+    return np.partition(np.stack(images), len(images) // 2, axis=0)[len(images) // 2]
 
 
 def apart(x: np.ndarray, count: int) -> np.ndarray:

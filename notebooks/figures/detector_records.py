@@ -29,9 +29,10 @@ def recorded(table: Table) -> str:
 
 
 def weights(table: Table) -> str:
-    """Whether a table was recorded with the detector that ships now."""
+    """Whether a table was recorded with the weights that ship now, and by the code of which commit."""
     same = table.provenance.get("weights") == digest(paths.MODELS / "default.safetensors")
-    return "with the weights that ship" if same else "with other weights than those that ship now"
+    commit = table.provenance.get("commit", {}).get("id", "an unknown commit")[:7]
+    return f"with {'the weights that ship' if same else 'other weights than those that ship now'}, by the code of {commit}"
 
 
 def mean_and_error(values: Sequence[float]) -> tuple[float, float]:

@@ -10,6 +10,7 @@ from lib.calibration import calibrate
 from lib.calibration.offsets import tool_axes
 from lib.correspondences import Correspondences, pair_with_robot
 from lib.geometry import RigidTransform
+from lib.landmarks import SharedDetector
 from lib.online import STAGES, Settings
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
 from notebooks.studies.moved_cameras import random_motion
@@ -207,6 +208,23 @@ def test_landmarks_are_followed_from_frame_to_frame_and_searched_anew_after_a_fa
     results = run(make(world, detector=Follower()), world, 6)
     assert calls == ["whole", "track", "track", "whole", "whole", "track"]
     assert ["detect" in r.failures for r in results] == [False, False, True, True, False, False]
+
+
+def test_what_was_seen_becomes_the_ground_until_the_cameras_move():
+    world, known = World(), []
+
+    class Looking(SharedDetector):
+        def __call__(self, images, *, ground=None):
+            known.append(ground and ground.key)
+            return world.detect(images)
+
+    pipeline = make(world, detector=Looking(world.detect), rig=RIG, settings=SELDOM)
+    run(pipeline, world, 30)
+    assert known[:5] == [None] * 5 and None not in known[5:]
+    world.rig = RIG.moved(random_motion(world.rng, centre_mm=CENTRE_MM, rotation_rad=0.05, translation_mm=0.4))
+    results = run(pipeline, world, 30)
+    moved = next(k for k, result in enumerate(results) if result.motion is not None)
+    assert known[30 + moved] is not None and known[31 + moved] is None
 
 
 def test_the_detectors_covariances_reach_calibration_and_drift():

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from lib.recordings import Ground, Recording
+from lib.recordings import Ground, GrowingGround, Recording
 from tests.adapt.world import World
 
 GROUND = np.random.default_rng(0).integers(40, 200, (2, 30, 40, 3), dtype=np.uint8)
@@ -35,6 +35,17 @@ def test_a_long_rest_does_not_put_the_tool_into_it():
     np.testing.assert_array_equal(Ground.of_frames(frames(places), x_mm, "one")(), GROUND)
     x_mm[:] = np.nan  # without the robot it does
     assert (Ground.of_frames(frames(places), x_mm, "one")() != GROUND).any()
+
+
+def test_it_grows_with_the_frames_and_a_rest_at_their_end_does_not_put_the_tool_into_it():
+    growing, places = GrowingGround(), [*np.column_stack([np.arange(0, 27, 3), np.tile([0, 11, 22], 3)]), *[[24, 22]] * 30]
+    for k, (frame, place) in enumerate(zip(frames(places), places, strict=True)):
+        images, x_mm = np.stack([frame.left, frame.right]), np.tile([*place, 0.0], (3, 1))
+        growing.take(images, x_mm * np.nan)  # where the robot is silent, nobody knows what a frame shows
+        assert (growing.ground is None) == (k < 5)
+        growing.take(images, x_mm)
+        images[:] = 0  # the memory holds the next frame later
+    np.testing.assert_array_equal(growing.ground(), GROUND)
 
 
 def test_nothing_is_decoded_before_it_is_asked_for_and_nothing_twice():
