@@ -103,7 +103,7 @@ def main_calibrate(argv: list[str]) -> int:
 
 def main_reconstruct(argv: list[str]) -> int:
     """`python3 -m lib reconstruct`: the surface that one stereo frame shows; GLB, PLY, a depth map, the rectified pair."""
-    a, recording, out = _parsed("reconstruct", main_reconstruct, argv, frame=True, rig=True)
+    a, recording, out = _parsed("reconstruct", main_reconstruct, argv)
     rig, verdict, data = _calibrated(a, recording, out)
     if rig is None:
         return 3
@@ -127,7 +127,7 @@ def main_reconstruct(argv: list[str]) -> int:
 
 def main_register(argv: list[str]) -> int:
     """`python3 -m lib register`: where cameras that were calibrated before are now, after the microscope was moved."""
-    a, recording, out = _parsed("register", main_register, argv, rig=True, needs_rig=True)
+    a, recording, out = _parsed("register", main_register, argv)
     data = _data(a, recording)
     found = register_images(StereoRig.load(a.rig), data, sigma_x_mm=recording.robot_accuracy_mm, loss="robust")
     moved = StereoRig.load(a.rig).moved(found.transform)
@@ -159,9 +159,7 @@ def _as_one(moved: StereoRig, found: Assessment) -> Verdict:
     return Verdict(() if level == LEVELS[0] else (Reason("no_common_motion", level, text, cure),))
 
 
-def _parsed(
-    name: str, function: object, argv: list[str], *, frame: bool = False, rig: bool = False, needs_rig: bool = False
-) -> tuple[argparse.Namespace, Recording, Path]:
+def _parsed(name: str, function: object, argv: list[str]) -> tuple[argparse.Namespace, Recording, Path]:
     parser = argparse.ArgumentParser(prog=f"python3 -m lib {name}", description=function.__doc__.split(": ", 1)[1])
     add = parser.add_argument
     add("recording", type=Path, help="folder of a recording")
@@ -171,20 +169,20 @@ def _parsed(
     add("--model", help="of the cameras: zero_skew, near_affine (a finite distance), affine, ... (default: as the data show)")
     if name in ("calibrate", "reconstruct"):  # they may be refused
         add("--force", action="store_true", help="write results whatever the verdict")
-    if frame:
+    if name == "reconstruct":
         add("--frame", type=int, default=0, help="number of the frame, from 0")
         add("--setting", choices=("quality", "fast"), default="quality")
-    if rig:
-        add("--rig", type=Path, required=needs_rig, help="rig.json of an earlier calibration")
+    if name in ("reconstruct", "register"):
+        add("--rig", type=Path, required=name == "register", help="rig.json of an earlier calibration")
     a = parser.parse_args(argv)
     if a.weights and a.landmarks == "annotations":
         parser.error("--weights: with --landmarks annotations no detector looks; leave one of the two out.")
-    if frame and a.rig and (a.model or a.force):
+    if name == "reconstruct" and a.rig and (a.model or a.force):
         parser.error("--model, --force: with --rig no camera is calibrated; leave them out, or --rig.")
     a.options = {"model": a.model} if a.model else {}
     Model.parse(a.model or "zero_skew", 2)  # an unknown one is refused
     recording = Recording.open(a.recording)
-    if frame and not -len(recording) <= a.frame < len(recording):
+    if name == "reconstruct" and not -len(recording) <= a.frame < len(recording):
         parser.error(f"--frame: the recording has frames 0 to {len(recording) - 1}.")
     a.detector = None if a.landmarks == "annotations" else SharedDetector(Detector.load(a.weights))
     out = a.out or paths.results_folder(a.recording.resolve().name, a.recording)
