@@ -59,8 +59,7 @@ class Agreement:
 def frame_means(share: np.ndarray) -> np.ndarray:
     """(m,) means over the landmarks of (m, ...) shares of the tool's length, each at most a tenth; NaN does not count."""
     share = np.minimum(share, _CAP).reshape(len(share), -1)
-    known = ~np.isnan(share)
-    return np.where(known.any(axis=1), np.where(known, share, 0).sum(axis=1) / np.maximum(known.sum(axis=1), 1), np.nan)
+    return np.ma.masked_invalid(share).mean(axis=1).filled(np.nan)
 
 
 def agreement(teacher: Teacher, seen: Seen) -> Agreement:
