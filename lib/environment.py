@@ -114,7 +114,7 @@ def _sole_maker(root: Path):
                 break
             except (BlockingIOError, PermissionError):
                 if not attempt:
-                    _say("Another process is setting up the environment; waiting for it ...")
+                    print("Another process is setting up the environment; waiting for it ...", flush=True)
                 time.sleep(0.5)
             except OSError:
                 break  # a file system without locks: go on alone
@@ -144,7 +144,8 @@ def _make(root: Path, torch: str | None, lock_file) -> None:
         shutil.rmtree(venv, ignore_errors=True)
         _check_disk(root, workbench["disk_gb"][torch])
     cost = f"{workbench['disk_gb'][torch]} GB of disk and up to {workbench['download_gb'][torch]} GB of download"
-    _say(f"{'Updating' if update else 'Making'} the environment in .venv, torch for {torch}: 1 to 5 minutes, {cost}.")
+    what = f"{'Updating' if update else 'Making'} the environment in .venv, torch for {torch}"
+    print(f"{what}: 1 to 5 minutes, {cost}.", flush=True)
     start = time.monotonic()
     venv.mkdir(exist_ok=True)
     write_text(venv / _STAMP, json.dumps({"state": "making", "torch": torch}))
@@ -159,8 +160,9 @@ def _make(root: Path, torch: str | None, lock_file) -> None:
     _install(venv, f"torch ({torch})", torch_arguments(version, torch, sys.platform, workbench["torch"]), lock_file)
     _write_site_files(root, venv)
     write_text(venv / _STAMP, json.dumps({"state": "ready", "digest": _digest(root), "torch": torch}))
-    _say(f"The environment is ready after {time.monotonic() - start:.0f} s.")
-    _say(missing_libraries(workbench["system_libraries"]))
+    print(f"The environment is ready after {time.monotonic() - start:.0f} s.", flush=True)
+    if lacks := missing_libraries(workbench["system_libraries"]):
+        print(lacks, flush=True)
 
 
 def _make_venv(venv: Path) -> None:
@@ -258,8 +260,3 @@ def _call(command: list[str], failure: str, **options) -> str:
     if answer.returncode:
         raise Problem(f"{failure}:\n{(answer.stderr or answer.stdout).strip()[-2000:]}")
     return answer.stdout
-
-
-def _say(text: str) -> None:
-    if text:
-        print(text, flush=True)
