@@ -54,8 +54,9 @@ class Model:
 
     @cached_property
     def selection(self) -> np.ndarray:
-        """(increments of all cameras, parameters), zeros and ones."""
-        return np.array([[float(name == free) for free in self.parameter_names] for name in self._increment_names])
+        """(cameras, increments of one, parameters), zeros and ones."""
+        chosen = [[float(name == free) for free in self.parameter_names] for name in self._increment_names]
+        return np.reshape(chosen, (self.cameras, -1, len(self.parameter_names)))
 
     @cached_property
     def parameter_names(self) -> list[str]:
@@ -128,7 +129,7 @@ class State:
 
     def moved(self, step: np.ndarray) -> Self:
         """The state after a step (p,) of the model's parameters."""
-        d = (self.model.selection @ step).reshape(len(self.A), -1)
+        d = self.model.selection @ step
         common = {"rho": self.rho + d[:, -2], "radial": self.radial + d[:, -1], "offset": self.offset + d[:, -4:-2]}
         if self.model.base == "affine":
             return replace(self, A=self.A + d[:, :6].reshape(-1, 2, 3), **common)
@@ -150,7 +151,7 @@ class State:
             A, D = self.A.reshape(-1, 3), self._linear() if derivatives else np.empty((2 * c, 4, 0))
             J_c = (np.column_stack([x, np.ones(n)]) @ D.swapaxes(0, 1).reshape(4, -1)).reshape(n, 2 * c, D.shape[2])
             return x @ A.T + self.offset.ravel(), np.broadcast_to(A, (n, *A.shape)), J_c
-        r_3, size, k = *self.normals, len(self.model.selection) // c
+        r_3, size = self.normals
         depth = x @ r_3.T
         ratio = (1.0 + self.rho * depth)[:, :, None]  # (n, cameras, 1)
         v = ((x @ self.A.reshape(-1, 3).T).reshape(n, c, 2) + (self.offset - self.centre)) / ratio
@@ -168,9 +169,7 @@ class State:
         offset, distance = np.broadcast_to(np.eye(2), (n, c, 2, 2)), -(v * depth[:, :, None])[:, :, :, None]
         dv = np.concatenate([dv @ self._entries.reshape(c, 6, -1), offset, distance], axis=3) / ratio[:, :, :, None]
         dv = np.concatenate([bend @ dv, (v * square)[:, :, :, None]], axis=3)
-        J_c, each = np.zeros((n, c, 2, c, k)), np.arange(c)
-        J_c[:, each, :, each] = dv.swapaxes(0, 1)
-        return y, J_x.reshape(n, 2 * c, 3), J_c.reshape(n, 2 * c, k * c) @ self.model.selection
+        return y, J_x.reshape(n, 2 * c, 3), (dv @ self.model.selection).reshape(n, 2 * c, len(self.model.parameter_names))
 
     @cached_property
     def _entries(self) -> np.ndarray:
@@ -186,10 +185,9 @@ class State:
 
     def _linear(self) -> np.ndarray:
         """Derivatives of the matrices [A, o] about the reference point by the model's parameters, (2 cameras, 4, p)."""
-        c, each = len(self.A), np.arange(len(self.A))
-        result = np.zeros((c, 2, 4, c, len(self.model.selection) // c))
-        result[each, :, :3, each, :-4], result[each, :, 3, each, -4:-2] = self._entries, np.eye(2)
-        return result.reshape(2 * c, 4, -1) @ self.model.selection
+        result = np.zeros((len(self.A), 2, 4, self.model.selection.shape[1]))
+        result[..., :3, :-4], result[..., 3, -4:-2] = self._entries, np.eye(2)
+        return (result @ self.model.selection[:, None]).reshape(2 * len(self.A), 4, -1)
 
     def matrix_jacobian(self) -> np.ndarray:
         """Derivatives of the matrices' entries (8 a camera, row by row, left first) by the model's parameters."""

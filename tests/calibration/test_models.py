@@ -22,12 +22,11 @@ def state(model, seed=0):
     rig = reference_rig()
     matrix = np.vstack([rig.left.matrix, rig.right.matrix])[: 2 * model.cameras]
     start = State.start(model, matrix, ROBOT_FROM_MICROSCOPE.t, np.tile([959.5, 539.5], (model.cameras, 1)))
-    increments = len(model.selection) // model.cameras
-    scale = np.full(increments, 0.05)
+    scale = np.full(model.selection.shape[1], 0.05)
     if model.base == "affine":
         scale[:6] = 3.0
     scale[-4:-2], scale[-2], scale[-1] = 20.0, 4e-3, 3e-9
-    return start.moved(model.selection.T @ (np.tile(scale, model.cameras) * rng.normal(size=increments * model.cameras)))
+    return start.moved(np.einsum("cip,ci->p", model.selection, scale * rng.normal(size=model.selection.shape[:2])))
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -74,8 +73,8 @@ def test_matrix_jacobian_is_a_finite_difference(name):
 )  # fmt: skip
 def test_parameters_are_counted(name, cameras, count):
     model = Model.parse(name, cameras)
-    assert len(model.parameter_names) == count == model.selection.shape[1]
-    assert np.linalg.matrix_rank(model.selection) == count
+    assert len(model.parameter_names) == count == model.selection.shape[2]
+    assert np.linalg.matrix_rank(model.selection.reshape(-1, count)) == count
 
 
 def test_state_and_camera_project_alike():
