@@ -6,7 +6,6 @@ narrow band of the spline's own grid.  `interior_point` takes a dozen factorisat
 
 from dataclasses import dataclass
 from functools import cache, cached_property
-from typing import Self
 
 import numpy as np
 from scipy import sparse
@@ -37,12 +36,6 @@ class L1Problem:
     def design_T(self) -> sparse.csr_matrix:
         """B', stored by rows too: products with it then run through the points in order."""
         return self.design.T.tocsr()
-
-    @cached_property
-    def by_cells(self) -> tuple[np.ndarray, Self]:
-        """Order (n,) of the points by cells, and the problem in that order: neighbours in space are so in memory."""
-        order = np.argsort(self.grid.locate(self.u)[0] @ self.grid.stride, kind="stable")
-        return order, L1Problem(self.grid, self.u[order])
 
     def normal_band(self, weights: np.ndarray, stiffness: float = 0.0) -> np.ndarray:
         """B' diag(weights) B + stiffness R for weights (n,), as a lower band (bandwidth + 1, size)."""
@@ -109,15 +102,12 @@ def interior_point(
     A ValueError says that the data do not determine the coefficients (a control point without data, at mu = 0).
     """
     weights = np.ones_like(x) if weights is None else weights
-    order, by_cells = problem.by_cells
-    columns = zip(x.T[:, order], np.broadcast_to(mu, x.shape[1]), weights.T[:, order], strict=True)
+    columns = zip(x.T, np.broadcast_to(mu, x.shape[1]), weights.T, strict=True)
     # Narrow bands gain nothing from more threads, and where cores are busy these wait for each other.
     with _blas().limit(limits=1, user_api="blas"):
-        outputs = [_interior_point(by_cells, *column, tolerance, max_iterations) for column in columns]
+        outputs = [_interior_point(problem, *column, tolerance, max_iterations) for column in columns]
     coefficients, objective, gap, dual = zip(*outputs, strict=True)
-    unsorted = np.empty_like(x)
-    unsorted[order] = np.stack(dual, axis=1)
-    return L1Solution(np.stack(coefficients, 1), np.array(objective), np.array(gap), unsorted)
+    return L1Solution(np.stack(coefficients, 1), np.array(objective), np.array(gap), np.stack(dual, 1))
 
 
 def _interior_point(
