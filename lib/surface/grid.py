@@ -9,14 +9,6 @@ from functools import cached_property
 import numpy as np
 from scipy import sparse
 
-# Element matrices of one span of width 1: integrals over it of products of the four cubic basis functions that live
-# there, and of their first and second derivatives.  Summed over the spans they give the Gram matrices exactly.
-_ELEMENT = (
-    np.array([[20, 129, 60, 1], [129, 1188, 933, 60], [60, 933, 1188, 129], [1, 60, 129, 20]]) / 5040.0,
-    np.array([[6, 7, -12, -1], [7, 34, -29, -12], [-12, -29, 34, 7], [-1, -12, 7, 6]]) / 120.0,
-    np.array([[2, -3, 0, 1], [-3, 6, -3, 0], [0, -3, 6, -3], [1, 0, -3, 2]]) / 6.0,
-)
-
 
 def cubic_basis(t: np.ndarray, derivative: int = 0) -> np.ndarray:
     """The four uniform cubic B-splines that live on a span, (..., 4), at t in [0, 1], or a derivative in t."""
@@ -34,7 +26,9 @@ def _gram(n: int, derivative: int) -> sparse.csr_matrix:
     """Integrals (n, n) over the domain of products of the basis functions' derivatives, spans of width 1."""
     cell = np.arange(n - 3)[:, None, None]
     row, column = np.broadcast_arrays(cell + np.arange(4)[:, None], cell + np.arange(4))
-    values = np.broadcast_to(_ELEMENT[derivative], row.shape)
+    t, weight = np.polynomial.legendre.leggauss(4)  # exact for products of two cubics
+    basis = cubic_basis((t + 1) / 2, derivative)
+    values = np.broadcast_to(basis.T * (weight / 2) @ basis, row.shape)
     return sparse.csr_matrix((values.ravel(), (row.ravel(), column.ravel())), shape=(n, n))
 
 
