@@ -9,7 +9,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jinja2 import Environment, FileSystemLoader
 
 from lib import files, paths
 from lib.calibration.timing import clock_error
@@ -18,7 +17,7 @@ from lib.landmarks import Detector, SharedDetector, detect
 from lib.provenance import plain
 from lib.recordings import Recording, StereoFrame, encoded
 from lib.trust.health import spread
-from lib.trust.verdict import LEVELS, Assessment, assess, report
+from lib.trust.verdict import LEVELS, TEMPLATES, Assessment, assess, report
 
 _COLOURS = np.array([*LANDMARK_COLOURS.values()])
 _SHOWN = 3  # best frames, and worst
@@ -50,9 +49,8 @@ class Check:
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
         files.write_json(folder / "check.json", self.to_json())
-        here = Environment(loader=FileSystemLoader(Path(__file__).parent), autoescape=True)
         a = self.assessment
-        text = here.get_template("check.html").render(
+        text = TEMPLATES.get_template("check.html").render(
             vars(self), verdict=a.verdict, overlays=self._overlays(), coverage=data_uri(self._coverage(), ".png"),
             report="" if a.calibration is None else report(a.calibration, verdict=a.verdict),
             hypotheses=[h for h in a.diagnosis.hypotheses if h.gain > 0][:5],
@@ -127,8 +125,7 @@ def _facts(recording: Recording, a: Assessment) -> dict[str, str]:
     """Answers to what a user asks first."""
     time_s, log, x, c = recording.frames.time_s, recording.kinematics, a.data.complete.x_mm, a.calibration
     clock_s = (0.0, np.inf) if c is None else clock_error(c, a.data, log, recording.offset_s)
-    here = Environment(loader=FileSystemLoader(Path(__file__).parent), trim_blocks=True)
-    text = here.get_template("facts.txt").render(
+    text = TEMPLATES.get_template("facts.txt").render(
         recording=recording, a=a, landmarks=LANDMARKS, film_s=np.ptp(time_s), log_s=np.ptp(log.time_s),
         volume_mm=np.ptp(x, axis=0) if len(x) else None,
         clock_ms=1e3 * np.array(clock_s) if np.isfinite(clock_s[1]) else None,

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Self
 
 import numpy as np
-from jinja2 import Environment, FileSystemLoader
+from jinja2 import Environment, FileSystemLoader, select_autoescape
 
 from lib import paths
 from lib.calibration import Calibration, NoConsensusError, calibrate, calibrate_as_shown, optics
@@ -55,6 +55,8 @@ _LABEL_PX = 3.0
 _CHECK = "`python3 -m lib check RECORDING`"
 _MORE_FRAMES = "Record more frames, with the tool in other places."
 _OVERLAYS = f"Look at the overlays of {_CHECK}"
+#: The texts and the page of this folder, compiled once.
+TEMPLATES = Environment(loader=FileSystemLoader(Path(__file__).parent), autoescape=select_autoescape(), trim_blocks=True)
 
 
 @dataclass(frozen=True)
@@ -295,8 +297,7 @@ def report(calibration: Calibration, *, verdict: Verdict | None = None, robot_ac
     if c.rig is not None:
         depths = (c.depth_sd_mm(c.x_mm[c.inliers], detection=detection) for detection in (False, True))
         told = {"optics": optics(c), "depth_um": [1e3 * np.median(depth) for depth in depths], "degrees": np.rad2deg}
-    here = Environment(loader=FileSystemLoader(Path(__file__).parent), trim_blocks=True)
-    return here.get_template("report.txt").render(
+    return TEMPLATES.get_template("report.txt").render(
         told, c=c, verdict=verdict, detections=seen.sum(), outliers=len(outliers), landmarks=LANDMARKS,
         worst=[(*outliers[i], size_px[i]) for i in np.argsort(-size_px)[:10]],
     ).rstrip()  # fmt: skip
