@@ -7,6 +7,7 @@ import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -71,11 +72,6 @@ def rung_design(rung: str, seed: int, *, shrink: int = 1) -> Design:
     return replace(like, eye=drawn.scene, forceps=drawn.forceps, microscope=camera)
 
 
-def _make_sequence(folder: Path, design: Design, seed: int, n_pairs: int) -> None:
-    text = "Simulated data set: calibration sweep, then a surgeon's movements."
-    simulate(folder, design, seed=seed, n_frames=n_pairs, description=text, progress=False)
-
-
 def make_dataset(
     folder: Path, *, seed: int = 0, n_pairs: int = 80, duration_s: float = 60.0, workers: int | None = None, shrink: int = 1
 ) -> list[Path]:  # fmt: skip
@@ -95,7 +91,9 @@ def make_dataset(
         shutil.rmtree(leftover)  # of a run that was killed
     designs = {k: sequence_design(seed, k, shrink=shrink, duration_s=duration_s) for k in _SEQUENCES}
     jobs = {folder / sequence_name(k): (design, 1000 * seed + k, n_pairs) for k, design in designs.items()}
-    for _, error in run_jobs(_make_sequence, jobs, workers=workers, title="Simulating", unit="sequence"):
+    told = "Simulated data set: calibration sweep, then a surgeon's movements."
+    make = partial(simulate, description=told, progress=False)
+    for _, error in run_jobs(make, jobs, workers=workers, title="Simulating", unit="sequence"):
         if error:
             raise error
     return list(jobs)

@@ -47,7 +47,7 @@ class Design:
 
 
 def simulate(
-    folder: str | Path, design: Design | None = None, *, seed: int = 0, n_frames: int = 40, name: str | None = None,
+    folder: str | Path, design: Design | None = None, seed: int = 0, n_frames: int = 40, *, name: str | None = None,
     description: str = "", progress: bool = True, overwrite: bool = False,
 ) -> Recording:  # fmt: skip
     """Simulate a recording and write it to `folder`, which appears whole or not at all; the same arguments, the same files.
