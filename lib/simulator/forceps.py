@@ -150,12 +150,11 @@ class Jaw:
 
     def opened(self, side: int, opening_mm: float) -> np.ndarray:
         """Centres and tip (n + 1, 3) when the tips are about `opening_mm` apart; `side` is +1 for jaw 1."""
-        points = np.vstack([self.line, self.tip])
+        x, y, z = np.vstack([self.line, self.tip]).T
         angle = 2 * self.share * np.arcsin(np.clip(opening_mm / 2 / np.hypot(*self.tip[:2]), 0.0, 0.71))
-        angle = angle * np.clip(points[:, 0] / max(self.tip[0], 1e-3), 0, 1) ** self.flex
-        x, y = points[:, 0], points[:, 1]
+        angle = angle * np.clip(x / max(self.tip[0], 1e-3), 0, 1) ** self.flex
         cosine, sine = np.cos(angle), np.sin(angle)
-        return np.column_stack([cosine * x - sine * y, side * (sine * x + cosine * y), points[:, 2]])
+        return np.column_stack([cosine * x - sine * y, side * (sine * x + cosine * y), z])
 
 
 @dataclass(frozen=True, eq=False)
