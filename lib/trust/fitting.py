@@ -150,14 +150,9 @@ class Problem:
         return self.y - seen - fit.nearness[0] * _shrinking(fit.M, x, seen - self.centre_px)
 
     @cached_property
-    def _known_x(self) -> np.ndarray:
-        """`x`, 0 in images that are not used."""
-        return np.where(self.used[:, :, None], self.x, 0.0)
-
-    @cached_property
     def _of_matrices(self) -> np.ndarray:
         """(n, 2, 2, 16): derivatives by the entries of the cameras, 0 in images that are not used."""
-        H = np.concatenate([self._known_x, self.used[:, :, None]], axis=2)
+        H = np.where(self.used[:, :, None], np.concatenate([self.x, np.ones((len(self), 2, 1))], axis=2), 0.0)
         return np.einsum("nck,cv,ij->ncivjk", H, np.eye(2), np.eye(2)).reshape(len(self), 2, 2, 16)
 
     def _design(self, M: np.ndarray, columns: Callable | None) -> np.ndarray:
@@ -165,8 +160,9 @@ class Problem:
         image = (M[:, :, :3].reshape(4, 3) @ self.axes).reshape(len(self), 2, 2, 1, 3)
         own = self.used[:, :, None] & (self.landmark[:, None, None] == np.arange(3))  # (n, 2, 3)
         parts = [self._of_matrices, (image * own[:, :, None, :, None]).reshape(len(self), 2, 2, 9)]
-        parts.append(_shrinking(M, self._known_x, self._of_matrices @ M.ravel() - self.centre_px)[..., None])
-        parts += [] if columns is None else [np.where(self.used[:, :, None, None], np.nan_to_num(columns(M)), 0.0)]
+        rest = [_shrinking(M, self.x, self._of_matrices @ M.ravel() - self.centre_px)[..., None]]
+        rest += [] if columns is None else [columns(M)]
+        parts += [np.where(self.used[:, :, None, None], np.nan_to_num(part), 0.0) for part in rest]
         return np.concatenate(parts, axis=3)
 
     def _descend(self, beta: np.ndarray, columns: Callable | None, apart: np.ndarray, rounds: int) -> Robust:
