@@ -3,14 +3,14 @@
 Rays meet the scene after a few fixed-point steps, on a coarse grid of pixels; the rest is interpolated.
 """
 
-from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Self
 
 import cv2
 import numpy as np
 
-from lib.cameras import AffineCamera, NearAffineCamera, Resection
+from lib.cameras import AffineCamera, NearAffineCamera
 from lib.simulator.eye import Scene
 
 _Camera = AffineCamera | NearAffineCamera
@@ -21,16 +21,21 @@ class Window:
     """The part of a camera's image that is rendered: `camera` maps the microscope frame to its pixels, which are square.
 
     `field_px` is the size (w, h) of the whole image (None = the window's), and `origin_px` the window's first pixel in it.
+    `R` is the rotation (3, 3) camera_from_microscope, whose third row is the viewing direction, and `zoom` px per mm.
     """
 
     camera: _Camera
     size_px: tuple[int, int]
     field_px: tuple[int, int] | None = None
     origin_px: tuple[float, float] = (0.0, 0.0)
+    R: np.ndarray = field(init=False)
+    zoom: float = field(init=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "field_px", self.field_px or self.size_px)
-        if not np.allclose(self._resection.K, self.zoom * np.eye(2), atol=1e-6 * self.zoom):
+        found = self.camera.resect()
+        for name, value in (("field_px", self.field_px or self.size_px), ("R", found.R), ("zoom", float(found.K[1, 1]))):
+            object.__setattr__(self, name, value)
+        if not np.allclose(found.K, self.zoom * np.eye(2), atol=1e-6 * self.zoom):
             raise ValueError("camera: the renderer needs square pixels without skew.")
 
     @classmethod
@@ -43,21 +48,6 @@ class Window:
         if isinstance(camera, NearAffineCamera):
             moved["centre_px"] = camera.centre_px - origin
         return cls(replace(camera, **moved), size_px, field_px, tuple(origin))
-
-    @cached_property
-    def _resection(self) -> Resection:
-        """Of the affine camera that touches the camera in its reference plane."""
-        return AffineCamera(self.camera.matrix).resect()
-
-    @property
-    def R(self) -> np.ndarray:
-        """Rotation (3, 3) camera_from_microscope; the third row is the viewing direction."""
-        return self._resection.R
-
-    @property
-    def zoom(self) -> float:
-        """px per mm."""
-        return float(self._resection.K[1, 1])
 
     def seen(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Points (n, 3) mm in the camera frame, and the scale (n,) by which perspective shrinks lengths there.
