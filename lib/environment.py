@@ -161,7 +161,8 @@ def _make(root: Path, torch: str | None, lock_file) -> None:
     _write_site_files(root, venv)
     write_text(venv / _STAMP, json.dumps({"state": "ready", "digest": _digest(root), "torch": torch}))
     print(f"The environment is ready after {time.monotonic() - start:.0f} s.", flush=True)
-    if lacks := missing_libraries(workbench["system_libraries"]):
+    lacks = missing_libraries(workbench["system_libraries"])
+    if lacks:
         print(lacks, flush=True)
 
 
