@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -161,8 +160,7 @@ def reconstruct(
     fast = setting == "fast"
 
     with _timed(seconds, "mask"):
-        with ThreadPoolExecutor(2) as pool:
-            masks = dict(zip(("mask_left", "mask_right"), pool.map(glint_mask, (left, right)), strict=True))
+        masks = {"mask_left": glint_mask(left), "mask_right": glint_mask(right)}
         for side, (name, given) in enumerate((("mask_left", mask_left), ("mask_right", mask_right))):
             if u_landmarks is not None:
                 masks[name] |= tool_mask(masks[name].shape, u_landmarks[side])
