@@ -25,7 +25,7 @@ _AGAIN = 30  # frames after a registration in which no microscope moves again; t
 
 @dataclass(frozen=True)
 class Seen:
-    """Landmarks of a frame, and how to pair them with the robot by another rig, which moves pixels to one instant."""
+    """The landmarks of a frame, three rows, and how to pair them with the robot by another rig: it moves pixels in time."""
 
     data: Correspondences
     pair: Callable[[StereoRig | None], Correspondences]
@@ -265,18 +265,16 @@ class RigTracker:
     def corrected(self, data: Correspondences) -> Correspondences:
         """With the landmarks where the detector sees them; the frames before tell the axes of shut and crossed jaws."""
         offsets = None if self.calibration is None else self.calibration.offsets
-        if offsets is None or not len(data):
+        if offsets is None:
             return data
         if (alone := _corrected_alone(data, offsets)) is not None:
             return alone
-        past = (part for part in (*self._open, *self._past) if len(part) and int(part.frame[0]) not in self._doubtful)
+        past = (part for part in (*self._open, *self._past) if int(part.frame[0]) not in self._doubtful)
         before = [part for part in past if part.frame[-1] < data.frame[0]]
         return with_offsets(Correspondences.join([*before, data]), offsets).of_frames(data.frame)
 
     def _is_open(self, data: Correspondences) -> bool:
         """Whether a frame tells the tool's axes, however its landmarks are off: the tips are too far apart to be crossed."""
-        if len(data) < 3:
-            return False
         x, offsets = data.grid("x_mm")[0], None if self.calibration is None else self.calibration.offsets
         apart = 0.0 if offsets is None else np.linalg.norm(np.diff(offsets.offset[1:], axis=0))
         return bool(np.linalg.norm(x[2] - x[1]) > apart + 0.05 * np.linalg.norm((x[1] + x[2]) / 2 - x[0]))
