@@ -32,11 +32,6 @@ class L1Problem:
         """B (n, size)."""
         return self.grid.design(self.u)
 
-    @cached_property
-    def design_T(self) -> sparse.csr_matrix:
-        """B', stored by rows too: products with it then run through the points in order."""
-        return self.design.T.tocsr()
-
     def normal_band(self, weights: np.ndarray, stiffness: float = 0.0) -> np.ndarray:
         """B' diag(weights) B + stiffness R for weights (n,), as a lower band (bandwidth + 1, size)."""
         slot, along_x, along_y, scatter, bending = self._blocks
@@ -114,7 +109,7 @@ def _interior_point(
     problem: L1Problem, x: np.ndarray, mu: float, w: np.ndarray, tolerance: float, max_iterations: int
 ) -> tuple[np.ndarray, float, float, np.ndarray]:
     """One output: (coefficients, objective, gap, dual)."""
-    B, B_T, R = problem.design, problem.design_T, problem.bending
+    B, B_T, R = problem.design, problem.design.T, problem.bending
     total = w.sum()
     centre = w @ x / total
     x = x - centre

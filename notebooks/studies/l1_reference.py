@@ -60,7 +60,7 @@ def least_squares(problem: L1Problem, x: np.ndarray, mu: float | np.ndarray, w: 
         factor = cholesky(problem.normal_band(w[:, j] ** 2, mu_j))
         if factor is None:
             raise ValueError(UNHELD)
-        coefficients[:, j] = dpbtrs(factor, problem.design_T @ (w[:, j] ** 2 * x[:, j]), lower=1)[0]
+        coefficients[:, j] = dpbtrs(factor, problem.design.T @ (w[:, j] ** 2 * x[:, j]), lower=1)[0]
     residual = problem.design @ coefficients - x
     energy = (coefficients * (problem.bending @ coefficients)).sum(axis=0)
     objective = ((w * residual) ** 2).sum(axis=0) + mu * energy
