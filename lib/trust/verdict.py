@@ -11,6 +11,7 @@ from jinja2 import Environment, FileSystemLoader, select_autoescape
 
 from lib import paths
 from lib.calibration import Calibration, NoConsensusError, calibrate, calibrate_as_shown, optics
+from lib.calibration.checks import extents
 from lib.correspondences import LANDMARKS, TRAIN_FURTHER, Correspondences, NoDetectionError
 from lib.landmarks import Detector, detect
 from lib.recordings import Doubt, Recording
@@ -43,6 +44,9 @@ LIMITS: dict[str, tuple[float, float]] = {
     "coverage": (1.5, np.inf),
     # RMS thickness of the tool's positions in standard deviations of the robot's: what is thinner may be its noise.
     "thin": (4.0, 2.0),
+    # The same of each landmark's own positions, across the line or out of the plane that they lie nearest to.
+    "one_line": (4.0, 4.0),
+    "one_plane": (4.0, 0.0),
     # Median epipolar distance of free matches, px, beyond three of its standard deviations: band matching fails from 6 px.
     "epipolar": (1.5, 4.0),
     # Share of the landmarks that contradict themselves, the other image or the robot.  10 % gross errors a view reach 0.2.
@@ -134,7 +138,8 @@ def judge(
             cure = _MORE_FRAMES if few else "Mend that, then check again."
         found.append(Reason(name, LEVELS[2], f"There is no calibration: {error}", cure))
     else:
-        for finding in (*_residuals(data, calibration, robot_accuracy_mm), *_geometry(calibration, robot_accuracy_mm)):
+        what = data, calibration, robot_accuracy_mm
+        for finding in (*_residuals(*what), *_geometry(*what)):
             found += _reason(*finding)
         if epipolar_px is not None and np.isfinite(epipolar_px):
             n, middle = calibration.pair.epipolar_normal, calibration.x_mm[calibration.inliers].mean(axis=0)
@@ -193,8 +198,17 @@ def _residuals(data: Correspondences | None, c: Calibration, robot_mm: float) ->
         yield "frames", frames + 1e-9, text, _MORE_FRAMES, "few_frames"
 
 
-def _geometry(c: Calibration, robot_mm: float) -> Iterator[tuple]:
-    """What `_reason` takes: the optics that follow from the cameras, and the volume that the tool covered."""
+def _geometry(data: Correspondences | None, c: Calibration, robot_mm: float) -> Iterator[tuple]:
+    """What `_reason` takes: how the tool moved, the optics that follow from the cameras, and the volume that it covered."""
+    x = c.x_mm[c.inliers]
+    if data is not None and np.ptp(landmark := data.landmark[c.inliers]):
+        own = extents(np.concatenate([x[landmark == k] - x[landmark == k].mean(axis=0) for k in np.unique(landmark)]))
+        shape, size_mm = ("line", own[1]) if own[1] < LIMITS["one_line"][0] * robot_mm else ("plane", own[2])
+        text = f"Each landmark stays within {size_mm:.3f} mm (RMS) of one {shape}. Across it the cameras rest on the tool's "
+        text += "shape as the robot reports it, which may be off."
+        yield f"one_{shape}", size_mm / robot_mm, text, "Move the tool in all three directions, and turn it."
+        if shape == "line":  # the optics would rest on that shape, too
+            return
     zooms, name = np.array([np.diag(camera.resect().K) for camera in c.cameras]), "implausible_optics"
     cure = "Check axes and units of the kinematics, the order of the tips, and which image is left."
     aspect = float(np.exp(np.abs(np.log(zooms[:, 0] / zooms[:, 1])).max()))
@@ -214,7 +228,6 @@ def _geometry(c: Calibration, robot_mm: float) -> Iterator[tuple]:
     cure = "Flip that image when recording, or exchange the sign of the axis."
     yield "mirrored", mirrored in ("left", "right", "left or right"), text, cure
 
-    x = c.x_mm[c.inliers]
     text = f"The tool's positions lie {c.extents_mm[2]:.3f} mm (RMS) out of one plane; the robot errs by {robot_mm:.3f} mm."
     yield "thin", c.extents_mm[2] / robot_mm, text, "Move the tool along the view as well, and record more frames."
     along = np.linalg.svd(x - x.mean(axis=0))[2]

@@ -12,6 +12,7 @@ from lib import paths
 from lib.calibration import calibrate
 from lib.correspondences import Correspondences, DataError, NoDetectionError, of_recording
 from lib.recordings import Doubt, Recording
+from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
 from lib.trust import LEVELS, Health, Reason, Verdict, assess, diagnose, judge
 from lib.trust import verdict as verdicts
 from lib.workbench.report import VERDICT_COLOURS
@@ -68,6 +69,23 @@ def test_few_clean_rows_in_a_plane_are_calibrated_and_never_trusted(half_depth_m
         error = found.pair.triangulate(*test.true_rig.project(x)).x_mm - x
         own = found.point_covariance(x, detection=False)
         assert (error**2).sum(axis=1).mean() < 16 * np.trace(own, axis1=1, axis2=2).mean()
+
+
+@pytest.mark.parametrize(("moves_mm", "expected"), [
+    ((6.0, 0.0, 0.0), {"one_line": LEVELS[2]}),  # its cameras have oblong pixels, which is no fault of axes or units
+    ((6.0, 3.0, 0.0), {"one_plane": LEVELS[1]}),
+    ((6.0, 3.0, 1.0), {}),
+])  # fmt: skip
+def test_a_tool_that_does_not_turn_leaves_open_what_lies_across_its_path(moves_mm, expected):
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        tool_mm = ROBOT_FROM_MICROSCOPE.t + np.array([[0.0, 0.0, 0.0], [3.0, 0.8, 0.5], [3.0, -0.8, -0.3]])
+        x_mm = (rng.uniform(-1, 1, (40, 1, 3)) * moves_mm + tool_mm).reshape(-1, 3)
+        u_left, u_right = (u + rng.normal(0, 1.5, u.shape) for u in reference_rig().project(x_mm))
+        rows = {"frame": np.repeat(np.arange(40), 3), "landmark": np.tile(np.arange(3), 40)}
+        claimed = np.broadcast_to(1.5**2 * np.eye(2), (120, 2, 2, 2))
+        x_mm = x_mm + rng.normal(0, 0.01, x_mm.shape)
+        assert names(Correspondences.of_points(x_mm, u_left, u_right, covariance_px2=claimed, **rows)) == expected
 
 
 def test_residuals_beyond_the_claim_are_red():
