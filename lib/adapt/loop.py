@@ -18,7 +18,6 @@ from lib.adapt.teacher import RefusalError, Teacher, longest_still, teach
 from lib.calibration import Calibration
 from lib.correspondences import LANDMARKS
 from lib.landmarks import Detector, SharedDetector
-from lib.landmarks.contrast import levelled
 from lib.landmarks.metrics import tool_length_px
 from lib.provenance import Provenance, plain
 from lib.recordings import Recording, read_image, smoothed
@@ -31,7 +30,7 @@ from lib.trust.health import spread
 
 #: Most rounds of training, and most steps of a stage in one; the time ends most trainings.
 ROUNDS, STEPS = 3, 4000
-RECIPE = 21  # raised where teaching or training changes: what an older one kept is not gone on with
+RECIPE = 20  # raised where teaching or training changes: what an older one kept is not gone on with
 #: Share of the time left that a round takes, and fewest images for stopping to which alone the doubt is fitted.
 _ROUND_SHARE, _DOUBT_IMAGES = 0.85, 10
 #: Said of a log of which more than half stays as it is.
@@ -333,9 +332,6 @@ class _Work:
         images = self.images(np.setdiff1d(parts["learn"], doubt_on), teacher, seen)
         if len(images) < 8 or len(held_out) < 4:
             raise RefusalError(f"robot: it labels {len(images)} images to learn from and {len(held_out)} others; 8 and 4 do.")
-        # A detector in doubt looks at what differs from the ground: it learns how the tool looks there, too.
-        ground = dict(zip(("left", "right"), self.recording.ground(), strict=True))
-        images += [one._replace(image=levelled(one.image, ground[one.name.split()[0]])) for one in images]
         done = {}
 
         def progress(stage: str, part: float) -> None:
