@@ -41,7 +41,7 @@ def main(argv: list[str]) -> int:
             print(f"Wrote {environment.lock(upgrade='--upgrade' in argv).relative_to(ROOT)}")
             return 0
         python = environment.ensure(torch=options.torch)
-    except environment.Problem as problem:
+    except (environment.Problem, OSError) as problem:
         print(f"\n{problem}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:

@@ -250,8 +250,9 @@ def _write_rig(out: Path, rig: StereoRig, recording: Recording, prefix: str = ""
     rig.save(out / f"{prefix}rig.json")
     for side, camera in (("left", rig.left), ("right", rig.right)):
         write_opencv(camera, out / f"{prefix}{side}.yml", recording.image_size_px)
+        (info := out / f"{prefix}{side}_camera_info.yaml").unlink(missing_ok=True)  # that of an earlier run
         if not getattr(camera, "radial_per_px2", 0.0):
-            write_ros(camera, out / f"{prefix}{side}_camera_info.yaml", recording.image_size_px, name=side)
+            write_ros(camera, info, recording.image_size_px, name=side)
 
 
 def _write_rectified(out: Path, rig: StereoRig, left: np.ndarray, right: np.ndarray) -> None:

@@ -142,6 +142,7 @@ def adapt_images(
     report = {"recording": images.name, "weights": getattr(detector, "digest", "")[:12], "minutes": minutes, "seed": seed}
     report |= {"notes": [], "rounds": [], "frames": {name: len(part) for name, part in parts.items()}}
     key = [str(images.resolve()), Path(labels).read_bytes(), getattr(detector, "digest", ""), seed, minutes, STEPS, RECIPE]
+    key += [files.digest(*(one.image.tobytes() for one in marked))]
     provenance = Provenance(f"python3 -m lib adapt {images.name} --labels {Path(labels).name}")
     simulated = simulated_like([one.image for one in parts["learn"]], seed, progress)
     how = {"minutes": minutes, "steps": STEPS, "seed": seed, "progress": progress}
@@ -178,10 +179,14 @@ class _Work:
             given = read_coco(Path(labels), len(recording), recording.image_size_px, recording.skeleton)
             self.labels = np.stack([given.u_left, given.u_right], axis=1)
         self.marked = np.flatnonzero(np.isfinite(self.labels).any(axis=(1, 2, 3)))
+        kept = self.marked[spread(len(self.marked), max(len(recording) - 20, 10))]  # the others stop and judge
+        self.labels[np.setdiff1d(self.marked, kept)], self.marked = np.nan, kept
         self.frames = np.union1d(spread(len(recording), _MOST_FRAMES), self.marked)
         self.learns = isinstance(self.detector, Detector)  # a stand-in has no networks
         key = [str(recording.folder.resolve()), recording.kinematics.x_mm.tobytes(), self.frames.tobytes(), seed, STEPS]
         key += [RECIPE, recording.offset_s, recording.readout_s, recording.frames.time_s.tobytes(), minutes]
+        shown = (recording.frames[int(i)] for i in self.frames[::12])  # other images in the same folder are other work
+        key += [recording.kinematics.time_s.tobytes(), *(files.digest(p.left.tobytes(), p.right.tobytes()) for p in shown)]
         digest = getattr(self.detector, "digest", "")  # of the detector that learns
         key += [digest, Path(labels).read_bytes() if labels is not None else b""]
         self.folder = _work_folder(folder, recording.name, key)
@@ -248,11 +253,13 @@ class _Work:
         recording, start, rounds = self.recording, self.detector, self.report["rounds"]
         first = self.look("before", start, self.frames)
         seen = self.moving(first, start)
+        few = self.labels if len(self.marked) < _OVERRULE else np.full_like(self.labels, np.nan)
+        still, note = longest_still(recording, seen.labelled(few))
+        self.report["notes"] += [note] if note else []
+        self.labels[np.setdiff1d(self.frames, still)], self.marked = np.nan, np.intersect1d(self.marked, still)
         by_hand, few = Seen.by_hand(self.labels), np.full_like(self.labels, np.nan)
         if len(self.marked) < _OVERRULE:  # they only take the place of what was detected there
             by_hand, few = None, self.labels
-        still, note = longest_still(recording, seen.labelled(few))
-        self.report["notes"] += [note] if note else []
         parts = self.parts = stretches(np.setdiff1d(still, self.marked), recording.frames.time_s)
         learn = parts["learn"] = np.union1d(parts["learn"], self.marked)
         self.report["frames"] = {name: len(part) for name, part in parts.items()}

@@ -53,6 +53,7 @@ _ODD = 0.2  # share of a large offset that may be the detector's all the same: s
 _SURE_MOVE = 0.5
 #: Largest correction of the clock along with cameras and offsets: one step takes motions for straight.
 _LARGEST_STEP_S = 0.03
+_HELD_S = 0.1  # so long a log may repeat a sample that the robot has not renewed
 _BEHIND = 0.1  # distance from the camera, as a share of the working distance, below which nothing is in view
 _CONFIDENCES = (MIN_CONFIDENCE, 0.5, 0.8)
 #: Fewer labelled pairs tell neither outliers nor how large the offsets are; the usual ones of a robot, standard deviation.
@@ -252,12 +253,14 @@ def _length_mm(recording: Recording) -> float:
 
 
 def _frozen(recording: Recording, frames: np.ndarray) -> np.ndarray:
-    """Frames at which the robot's log repeats itself to the last digit, or is silent."""
+    """Frames at which the robot's log repeats itself to the last digit for longer than `_HELD_S`, or is silent."""
     k = recording.kinematics
     same = np.append(False, (np.diff(np.nan_to_num(k.x_mm.reshape(len(k.x_mm), -1)), axis=0) == 0).all(axis=1))
-    same = np.convolve(same, np.ones(3), "same") >= 2  # two in a row
-    nearest = np.abs(k.time_s[None] - (recording.frames.time_s[frames] + recording.offset_s)[:, None]).argmin(axis=1)
-    return np.asarray(frames)[same[nearest]]
+    first = np.append(np.flatnonzero(~same), len(same))  # samples that differ from the one before
+    held_s = k.time_s[first[1:] - 1] - k.time_s[first[:-1]]
+    now_s = recording.frames.time_s[frames] + recording.offset_s
+    nearest = np.interp(now_s, k.time_s, np.arange(len(same))).round()
+    return np.asarray(frames)[held_s[np.searchsorted(first, nearest, side="right") - 1] > _HELD_S]
 
 
 def _aligned(recording: Recording, seen: Seen, *, by_hand: bool) -> tuple[Recording, Calibration, float, float]:
@@ -398,7 +401,7 @@ def _fault(recording: Recording, seen: Seen, calibration: Calibration, *, by_han
         return None
     rows = seen.rows(recording)
     rows = replace(rows, confidence=np.where(calibration.view_inliers, rows.confidence, 0.0))
-    how = {"kinematics": recording.kinematics, "readout_s": recording.readout_s, "image_size_px": recording.image_size_px}
+    how = {name: getattr(recording, name) for name in ("kinematics", "offset_s", "readout_s", "image_size_px")}
     best = diagnose(rows, near=True, **how).best
     return best if best is not None and best.name in FAULTS and best.explained >= _EXPLAINED else None
 

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from lib.cameras import Camera
-from lib.files import whole, write_text
+from lib.files import write_text
 
 
 def write_opencv(camera: Camera, path: str | Path, image_size_px: tuple[int, int]) -> None:
@@ -29,15 +29,14 @@ def write_opencv(camera: Camera, path: str | Path, image_size_px: tuple[int, int
     path = Path(path)
     if path.suffix not in (".yml", ".yaml", ".xml", ".json"):
         raise ValueError(f"{path}: OpenCV writes .yml, .yaml, .xml or .json.")
-    with whole(path) as partial:
-        storage = cv2.FileStorage(str(partial), cv2.FILE_STORAGE_WRITE)
-        storage.write("image_width", int(image_size_px[0]))
-        storage.write("image_height", int(image_size_px[1]))
-        storage.write("unit_of_points", "mm")
-        storage.write("projection_matrix", np.array(camera.projection_matrix))
-        storage.write("radial_per_px2", float(getattr(camera, "radial_per_px2", 0.0)))
-        storage.write("distortion_centre", np.array(getattr(camera, "centre_px", (0.0, 0.0))))
-        storage.release()
+    storage = cv2.FileStorage(path.name, cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)  # OpenCV hides a full disk
+    storage.write("image_width", int(image_size_px[0]))
+    storage.write("image_height", int(image_size_px[1]))
+    storage.write("unit_of_points", "mm")
+    storage.write("projection_matrix", np.array(camera.projection_matrix))
+    storage.write("radial_per_px2", float(getattr(camera, "radial_per_px2", 0.0)))
+    storage.write("distortion_centre", np.array(getattr(camera, "centre_px", (0.0, 0.0))))
+    write_text(path, storage.releaseAndGetString())
 
 
 def write_ros(camera: Camera, path: str | Path, image_size_px: tuple[int, int], name: str = "camera") -> None:

@@ -20,7 +20,7 @@ from lib.importing.logs import increasing, read_robot, since
 from lib.importing.mapping import Mapping, read_mapping
 from lib.importing.video import StereoSource, open_stereo
 from lib.landmarks import SharedDetector, detect
-from lib.recordings import Annotations, Recording, RecordingWriter
+from lib.recordings import Annotations, Kinematics, Recording, RecordingWriter
 
 _LOG_STEP_S = 2e-5, 3.0  # of a robot's samples; beyond it the unit of time is another
 _CLOCK_FRAMES = 60  # that the detector looks at where there are no labels
@@ -148,12 +148,12 @@ def _tool(
     if tool.estimate:
         if labels is None or told.robot.offset_s == "estimate":
             raise ValueError("tool.estimate: it needs labels and a number as robot.offset_s; or give the tool's landmarks.")
-        inside = (frames_s >= robot_s[0]) & (frames_s <= robot_s[-1])
+        reported_mm = Kinematics(robot_s, np.array([[pose.t] for pose in poses])).at(frames_s)[:, 0]
+        inside = np.isfinite(reported_mm).all(axis=1)  # nothing is told in a gap
         at, u = frames_s[inside], [side[inside] for side in (labels.u_left, labels.u_right)]
         turns = Slerp(robot_s, Rotation.from_matrix([pose.R for pose in poses]))(at).as_matrix()
-        shifts = np.stack([np.interp(at, robot_s, axis) for axis in np.transpose([pose.t for pose in poses])], axis=1)
         jaws = {} if opening is None else {"opening_rad": np.interp(at, robot_s, opening), "turning": turning}
-        found = tool_offsets([RigidTransform(R, t) for R, t in zip(turns, shifts, strict=True)], u, **jaws)
+        found = tool_offsets([RigidTransform(R, t) for R, t in zip(turns, reported_mm[inside], strict=True)], u, **jaws)
         return found, np.sqrt(np.diagonal(found.covariance_mm2, axis1=1, axis2=2))
     offset, sd = np.full((len(names), 3), np.nan), np.zeros((len(names), 3))
     for k, name in enumerate(names):
@@ -185,6 +185,7 @@ def _did(
         is_grey=all((image == image[..., :1]).all() for image in (pair.left, pair.right)),
         gaps=np.isnan(draft.kinematics.x_mm[..., 0]).any(axis=1).sum(),
         zeros=[(what, zero) for what, zero in zip(("video", "robot"), zeros, strict=True) if zero],
+        zero_s=float(zeros[0] - zeros[1]) if all(zeros) else 0.0,
         silent=np.isnan(draft.landmarks_mm()).all(axis=(1, 2)).sum(),
         labelled=tuple((visibility > 0).any(axis=1).sum() for visibility in seen),
     )  # fmt: skip

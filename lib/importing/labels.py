@@ -64,8 +64,11 @@ def read_labels(
             raise ValueError(f"{where}: the name tells no camera; labels.sides = {list(labels.sides)} must tell one of two.")
         reel = side ^ source.video.exchanged if source.video.layout == "two" else 0
         image = PurePosixPath(label.image.replace("\\", "/"))
-        number = (last_number(image) or 0) - labels.first_frame
-        frame = frame_of[reel].get(numbers[reel].get(image.stem, numbers[reel].get(number, number)))
+        # A bare number counts frames.  One in a name is that of a file, unless first_frame says where it counts from.
+        number, of_file = last_number(image), {} if image.name.isdecimal() else numbers[reel]
+        own = [n for n in of_file if isinstance(n, int) and not labels.first_frame]
+        nth = None if number is None or (own and min(own) < number < max(own)) else number - labels.first_frame
+        frame = frame_of[reel].get(of_file.get(image.stem, of_file.get(number, nth) if own else nth))
         if frame is None:
             continue
         if not inside(xy, image_size_px):
@@ -108,8 +111,9 @@ def _cvat(path: Path) -> Iterator[Label]:
     root = fromstring(text)
     # A track is one landmark of a video; a skeleton's points are nested and have labels of their own.
     for parent in (*root.iter("image"), *root.iter("track")):
-        for points in parent.iter("points"):
-            image, name = parent.get("name") or points.get("frame") or "", points.get("label") or parent.get("label")
+        for shape, points in ((s, p) for s in (parent, *parent.iter("skeleton")) for p in s.findall("points")):
+            image = parent.get("name") or points.get("frame") or shape.get("frame") or ""
+            name = points.get("label") or parent.get("label")
             if ";" in points.get("points"):
                 raise ValueError(f"label {name!r} of {image} has several points; label each landmark on its own")
             x, y = map(float, points.get("points").split(","))
@@ -163,10 +167,11 @@ def _sleap(path: Path) -> Iterator[Label]:
         metadata = json.loads(bytes(file["metadata"].attrs["json"]).decode())
         names = [metadata["nodes"][link["id"]]["name"] for link in metadata["skeletons"][0]["nodes"]]
         corner = 0.5 if file["metadata"].attrs.get("format_id", 2.0) < 1.1 else 0.0  # SLEAP counted from the corner once
-        videos = [str(json.loads(video)["backend"].get("filename", "")) for video in file["videos_json"][:]]
+        videos = [json.loads(video)["backend"] for video in file["videos_json"][:]]
         instances, points = file["instances"][:], file["points"][:]
         for frame in file["frames"][:]:
-            image = f"{videos[frame['video']]}/{frame['frame_idx']}"
+            video, number = videos[frame["video"]], frame["frame_idx"]
+            image = str(video["filenames"][number]) if video.get("filenames") else f"{video.get('filename', '')}/{number}"
             for instance in instances[frame["instance_id_start"] : frame["instance_id_end"]]:
                 if instance["instance_type"] != 0:  # 1 is a prediction
                     continue

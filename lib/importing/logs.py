@@ -13,6 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lib.importing.mapping import Mapping, Pose, Table
+from lib.recordings import Kinematics
 from lib.recordings.tables import decoded, number, rows_of
 
 _SECONDS = {"s": Decimal(1), "ms": Decimal("1e-3"), "us": Decimal("1e-6"), "ns": Decimal("1e-9")}
@@ -145,7 +146,7 @@ def _read_bag(path: Path, table: Table, names: list[str]) -> tuple[list[Decimal]
         topic = name.partition(":")[0]
         if topic != table.time.partition(":")[0]:
             at, known = since(time, time[0]), since(stamps[topic], time[0])
-            columns[name] = np.interp(at, known, columns[name], left=np.nan, right=np.nan)
+            columns[name] = Kinematics(known, np.tile(columns[name][:, None, None], 3)).at(at)[:, 0, 0]  # blank in a gap
     return time, columns
 
 

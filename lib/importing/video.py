@@ -52,6 +52,8 @@ class _Images:
     """Image files in the order of the numbers in their names."""
 
     def __init__(self, folder: Path, pattern: str) -> None:
+        if Path(pattern).is_absolute():
+            raise ValueError(f"{pattern}: name the images by where they are in {folder}, as left/*.png.")
         if not (found := [path for path in folder.glob(pattern) if path.suffix.lower() in IMAGES]):
             raise FileNotFoundError(f"{folder / pattern}: no image ({', '.join(IMAGES)}) matches the mapping's pattern.")
         if bad := [path for path in found if last_number(path) is None]:

@@ -3,9 +3,10 @@
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 
+import av
 import cv2
 import numpy as np
 from PIL import Image
@@ -87,7 +88,8 @@ def _may_hold_zeros(data: bytes) -> bool:
                 ends_block.append(data[table + 17] == 0)
             table += 17 + sum(data[table + 1 : table + 17])
         at = after
-    return data[:2] != b"\xff\xd8" or data[at + 1 : at + 2] == b"\xc2" or all(ends_block)
+    whole = bytes(_LOST_BYTES) not in data[at:]  # what precedes are tables, and metadata, which may hold zeros
+    return whole or data[:2] != b"\xff\xd8" or data[at + 1 : at + 2] == b"\xc2" or all(ends_block)
 
 
 def _check_size(path: Path, size: tuple[int, int], expected: tuple[int, int] | None) -> None:
@@ -139,7 +141,7 @@ def _open_images(folder: Path, image_size_px: tuple[int, int], bit_depth: int) -
 
 
 def _open_video(path: Path, image_size_px: tuple[int, int]) -> tuple[int, Reader]:
-    """A video file; reading in order decodes each frame once, going back seeks."""
+    """A video file; reading in order decodes each frame once, going back seeks, or begins anew."""
     capture = cv2.VideoCapture(str(path))
     if not capture.isOpened():
         raise ValueError(f"{path}: the video cannot be opened; H.264 or MPEG-4 in an .mp4 file works.")
@@ -148,11 +150,19 @@ def _open_video(path: Path, image_size_px: tuple[int, int]) -> tuple[int, Reader
     _check_size(path, (width, height), image_size_px)
     following = 0
 
+    @cache
+    def steady() -> bool:
+        """Whether frames come at a constant rate, since OpenCV seeks by it."""
+        with av.open(str(path)) as container:
+            times = np.sort([packet.pts for packet in container.demux(video=0) if packet.pts is not None])
+        even = np.linspace(times[0], times[-1], len(times))
+        return bool(np.abs(times - even).max() < 0.4 * np.ptp(times) / len(times))
+
     def read(index: int) -> np.ndarray:
         nonlocal following
-        if not following <= index < following + 32:
-            capture.set(cv2.CAP_PROP_POS_FRAMES, index)
-            following = index
+        if index < following or (index >= following + 32 and steady()):
+            following = index if steady() else 0
+            capture.set(cv2.CAP_PROP_POS_FRAMES, following)
         while following <= index:
             ok, image = capture.read()
             if not ok:

@@ -78,15 +78,22 @@ class Kinematics:
         time = np.repeat(time[:, None], k, axis=1) if time.ndim == 1 else time
         if time.ndim != 2 or time.shape[1] != k:
             raise ValueError(f"time_s: expected (n,) or (n, {k}), got {time.shape}.")
-        x = np.empty((*time.shape, 3))
+        x, known = np.empty((*time.shape, 3)), time[np.isfinite(time)]
+        # A frame asks for few samples of a log that may have a million.
+        low, high = np.searchsorted(self.time_s, (known.min(), known.max())) if known.size else (0, 0)
+        near_s, near_mm = (part[max(low - 1, 0) : high + 1] for part in (self.time_s, self.x_mm))
         for landmark, axis in np.ndindex(k, 3):  # exactly on a sample, a dropped neighbour has no effect
-            x[:, landmark, axis] = np.interp(time[:, landmark], self.time_s, self.x_mm[:, landmark, axis], np.nan, np.nan)
-        if len(self.time_s) > 1:
-            step = np.diff(self.time_s)
-            before = np.clip(np.searchsorted(self.time_s, time, side="right") - 1, 0, len(step) - 1)
-            long = (step > max(_GAP_S, 5.0 * float(np.median(step))))[before]
-            x[long & (time != self.time_s[before]) & (time != self.time_s[before + 1])] = np.nan
+            x[:, landmark, axis] = np.interp(time[:, landmark], near_s, near_mm[:, landmark, axis], np.nan, np.nan)
+        if len(near_s) > 1:
+            before = np.clip(np.searchsorted(near_s, time, side="right") - 1, 0, len(near_s) - 2)
+            long = (np.diff(near_s) > self._longest_step_s)[before]
+            x[long & (time != near_s[before]) & (time != near_s[before + 1])] = np.nan
         return x
+
+    @cached_property
+    def _longest_step_s(self) -> float:
+        """Between samples, beyond which there is a gap."""
+        return max(_GAP_S, 5.0 * float(np.median(np.diff(self.time_s))))
 
 
 @dataclass(frozen=True, eq=False)

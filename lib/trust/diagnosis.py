@@ -189,13 +189,13 @@ def _frozen(case: Case) -> Iterator[Hypothesis]:
         gain = max(found.gain, 0.0) + float(repeated.sum() * np.log(100.0))  # noise repeats no number
         return replace(found, gain=gain, explained=max(found.explained, share / 100))
 
-    frozen = (step_y > 0) & (straight | ((step_x >= 0) & (step_x < 1e-9)))
+    noise = min(fit.shapes[0].scale for fit in (case.null, *case.fits.values()))
+    frozen = (step_y > 6 * noise) & (straight | ((step_x >= 0) & (step_x < 1e-9)))
     if frozen.mean() >= 0.02:
         text = "the robot's positions stand still, or run on an exact straight line, while the tool moves in the images"
         cure = "Log the robot at every sample; where it was silent leave the cells blank, so that these frames are not used."
         fit = problem.fit(start=case.null.start, apart=np.isin(problem.frame, np.flatnonzero(frozen) + 1))
         yield certain("frozen_kinematics", fit, frozen, text, cure)
-    noise = min(fit.shapes[0].scale for fit in (case.null, *case.fits.values()))
     twice = (step_x > 1e-6) & (step_y >= 0) & (step_y < 0.15 * noise)
     if twice.mean() >= 0.02 and not twice.all():  # each image belongs to the instant at which it was first seen
         source = np.maximum.accumulate(np.where(np.append(True, ~twice), np.arange(case.frames), 0))[problem.frame]

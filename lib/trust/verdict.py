@@ -278,8 +278,10 @@ def assess(
         epipolar_px = float(np.median(np.abs(calibration.pair.epipolar_distance(y[:, :2], y[:, 2:]))))
     stated = {name: getattr(recording, name) for name in ("kinematics", "offset_s", "readout_s", "image_size_px")}
     straight, near = data, calibration is not None and calibration.inverse_distance_per_mm[1] > 0
-    if near:  # a lens that distorts is no fault either
+    if near:  # a lens that distorts is no fault either, and what the robot parks behind a camera is seen nowhere
         left, right = calibration.cameras
+        behind = (left.depth_ratio(data.x_mm) <= 0) | (right.depth_ratio(data.x_mm) <= 0)
+        data = replace(data, x_mm=np.where(behind[:, None], np.nan, data.x_mm))
         straight = replace(data, u_left=left.undistort(data.u_left), u_right=right.undistort(data.u_right))
     diagnosis = diagnose(straight, near=near, **stated)
     found = health(recording, data, calibration, detector=detector)

@@ -41,7 +41,7 @@ def main(argv: Sequence[str]) -> int:
         raise KeyboardInterrupt
 
     for name in ("SIGTERM", "SIGHUP"):  # as Ctrl-C: the report then says that the run was stopped
-        if hasattr(signal, name):
+        if hasattr(signal, name) and signal.getsignal(getattr(signal, name)) is not signal.SIG_IGN:  # as nohup has it
             signal.signal(getattr(signal, name), stop)
     result = run(options.notebooks, options.profile, options.pairs, cell_timeout_s=timeout, runs=options.runs)
     return {"complete": 0, "failed": 1, "stopped": 128 + (received or [signal.SIGINT])[0]}[result["state"]]
@@ -200,6 +200,7 @@ class _Report:
             try:
                 shutil.move(shutil.make_archive(str(self.folder), "zip", self.folder.parent, self.folder.name), self.folder)
             except OSError:  # a disk without room for the copy
+                Path(f"{self.folder}.zip").unlink(missing_ok=True)
                 self.content["download"] = None
                 self.write()
 
