@@ -81,7 +81,7 @@ class Kinematics:
         x, known = np.empty((*time.shape, 3)), time[np.isfinite(time)]
         # A frame asks for few samples of a log that may have a million.
         low, high = np.searchsorted(self.time_s, (known.min(), known.max())) if known.size else (0, 0)
-        near_s, near_mm = (part[max(low - 1, 0) : high + 1] for part in (self.time_s, self.x_mm))
+        near_s, near_mm = (part[max(low - 2, 0) : high + 2] for part in (self.time_s, self.x_mm))
         for landmark, axis in np.ndindex(k, 3):  # exactly on a sample, a dropped neighbour has no effect
             x[:, landmark, axis] = np.interp(time[:, landmark], near_s, near_mm[:, landmark, axis], np.nan, np.nan)
         if len(near_s) > 1:

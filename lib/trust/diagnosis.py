@@ -32,6 +32,7 @@ _STRETCHES, _PARTS = 60, 8
 _LEAST_SCALED, _SURE_SCALED, _OWN_SD = 0.03, 5.0, 0.006
 #: Least share of the variance that it explains, most that it leaves (RMS), and least turning of the jaws (RMS of n^2).
 _MOST_OF_IT, _ODD, _TURNED = 0.5, 0.03, 0.01
+_RESTS_MM = 0.1  # a tool whose landmarks move less rests
 _STILL_PX = 0.3  # detections of one picture differ by less
 BY_GEOMETRY = ("scaled_axis", "mirrored_axis", "exchanged_eyes", "mirrored_images")  # which the residuals do not show
 _ACROSS = 0.15  # sine of a tool's angle to the images, below which it points neither way
@@ -189,13 +190,16 @@ def _frozen(case: Case) -> Iterator[Hypothesis]:
         gain = max(found.gain, 0.0) + float(repeated.sum() * np.log(100.0))  # noise repeats no number
         return replace(found, gain=gain, explained=max(found.explained, share / 100))
 
-    noise = min(fit.shapes[0].scale for fit in (case.null, *case.fits.values()))
-    frozen = (step_y > 6 * noise) & (straight | ((step_x >= 0) & (step_x < 1e-9)))
+    frozen = (step_y > 0) & (straight | ((step_x >= 0) & (step_x < 1e-9)))
+    if frozen.mean() >= 0.02:
+        fit = problem.fit(start=case.null.start, apart=np.isin(problem.frame, np.flatnonzero(frozen) + 1))
+        if not frozen.all():  # a tool that rests is seen to move by the noise alone
+            frozen &= step_y > 8 * fit.shapes[0].scale
     if frozen.mean() >= 0.02:
         text = "the robot's positions stand still, or run on an exact straight line, while the tool moves in the images"
         cure = "Log the robot at every sample; where it was silent leave the cells blank, so that these frames are not used."
-        fit = problem.fit(start=case.null.start, apart=np.isin(problem.frame, np.flatnonzero(frozen) + 1))
         yield certain("frozen_kinematics", fit, frozen, text, cure)
+    noise = min(fit.shapes[0].scale for fit in (case.null, *case.fits.values()))
     twice = (step_x > 1e-6) & (step_y >= 0) & (step_y < 0.15 * noise)
     if twice.mean() >= 0.02 and not twice.all():  # each image belongs to the instant at which it was first seen
         source = np.maximum.accumulate(np.where(np.append(True, ~twice), np.arange(case.frames), 0))[problem.frame]
@@ -414,10 +418,18 @@ def diagnose(
     if moved_px < _STILL_PX and moved_mm > _ROBOT_MM:
         text, cure = "All frames show one picture, while the robot moves.", "Check that the cameras deliver, and record anew."
         return Diagnosis((Hypothesis("frozen_video", text, cure, 100.0, 0.0, "%", 1.0, float(len(data))),))
-    case = Case(problem, kinematics, offset_s, readout_s, image_size_px)
+    stated = kinematics, offset_s, readout_s, image_size_px
+    whole = case = Case(problem, *stated)
+    # Where a tool rests its detections repeat one error, which is no fault that begins or ends there.
+    kept, x_mm = [0], np.nan_to_num(data.grid("x_mm"))
+    for i in range(1, len(x_mm)):
+        kept += [i] if np.linalg.norm(x_mm[i] - x_mm[kept[-1]], axis=1).max() > _RESTS_MM else []
+    if max(_FEWEST_FRAMES, 0.25 * len(x_mm)) <= len(kept) < len(x_mm):
+        case = Case(Problem.of(data.of_frames(np.unique(data.frame)[kept]), image_size_px), *stated)
+        whole.fits = case.fits
     tests = [_tip_order, _landmark_offset, _tool_bends, _drift, _bad_part, _camera_moved, _frozen]
     tests = [*(TIME_TESTS if case.paths else ()), *tests, _rigid_tips]
-    found = [h for test in tests for h in test(case) if np.isfinite(h.gain)]
+    found = [h for test in tests for h in test(whole if test is _frozen else case) if np.isfinite(h.gain)]
     best = Diagnosis(found := compared(found)).best
     fit = case.null if best is None else case.fits.get(best.name, case.null)
     turned = best is not None and best.name == "turned_image" and len(best.images) == 2  # then left is right

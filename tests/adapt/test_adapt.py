@@ -14,6 +14,7 @@ from lib.adapt.looking import Seen, at_rest, look, look_elsewhere
 from lib.calibration.offsets import Unsettled, tool_axes
 from lib.correspondences import DataError
 from lib.landmarks import Detector, Landmarks
+from lib.recordings import Kinematics
 from lib.recordings.annotations import Annotations, write_coco
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE
 from tests.adapt.world import SIZE, StandIn, World, pupil
@@ -337,6 +338,18 @@ def test_a_robot_that_errs_teaches_nothing_wrong(world, tmp_path, fault):
         assert set(range(12, 19)) <= set(found.report["refused_frames"])
     if fault == "moved":
         assert "moved" in found.report["notes"][0] and tune.calls
+
+
+def test_a_log_may_hold_its_samples_and_not_stand_still():
+    """A robot that reports every 10 ms, logged every millisecond; it stands still from 2 to 4 s and is silent from 6 to 7 s."""
+    time_s = np.arange(0, 10, 1e-3)
+    moving_s = np.where((time_s > 2) & (time_s < 4), 2.0, time_s)
+    x_mm = np.floor(moving_s * 100)[:, None, None] * np.ones((3, 3))
+    x_mm[(time_s > 6) & (time_s < 7)] = np.nan
+    frames_s = np.arange(0.05, 10, 0.1)
+    stub = SimpleNamespace(kinematics=Kinematics(time_s, x_mm), frames=SimpleNamespace(time_s=frames_s), offset_s=0.0)
+    refused = frames_s[teacher._frozen(stub, np.arange(100))]
+    np.testing.assert_array_equal(refused, frames_s[((frames_s > 2) & (frames_s < 4)) | ((frames_s > 6) & (frames_s < 7))])
 
 
 # --- the loop

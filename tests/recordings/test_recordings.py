@@ -23,6 +23,7 @@ from lib.correspondences import of_recording
 from lib.recordings import Annotations, Frames, Kinematics, Recording, RecordingWriter, Truth, read_image
 from lib.recordings.annotations import write_coco
 from lib.simulator.rig import reference_rig
+from tests.importing import foreign
 
 N, SIZE = 4, (64, 48)
 
@@ -475,6 +476,22 @@ def test_bad_annotations_are_refused(folder, change, text):
         Recording.open(folder)
 
 
+def test_a_frame_asks_for_a_part_of_a_long_log():
+    rng = np.random.default_rng(1)
+    time_s = np.cumsum(rng.choice([0.01, 0.02, 0.7], 3000, p=[0.6, 0.39, 0.01]))
+    x_mm = rng.normal(size=(3000, 3, 3))
+    x_mm[rng.random(3000) < 0.05] = np.nan
+    log, asked = Kinematics(time_s, x_mm), np.append(rng.uniform(-1, time_s[-1] + 1, 400), [*time_s[::500], np.nan])
+    np.testing.assert_array_equal(log.at(asked), np.concatenate([log.at([t]) for t in asked]))
+    assert 0.05 < np.isnan(log.at(asked)).mean() < 0.5
+
+
+def test_zeros_in_the_metadata_of_a_jpeg_are_no_damage(tmp_path):
+    noise = np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8)
+    Image.fromarray(noise).save(tmp_path / "a.jpg", exif=b"Exif\0\0MM\0*\0\0\0\x08\0\0" + bytes(2000))
+    assert read_image(tmp_path / "a.jpg").shape == (48, 64, 3)
+
+
 def test_videos(tmp_path):
     """A pair of videos behaves like two folders, forwards, backwards and in jumps."""
     folder = tmp_path / "video"
@@ -492,6 +509,15 @@ def test_videos(tmp_path):
     assert len(read) == 20
     for i in [0, 1, 2, 19, 5, 18, 3]:
         assert abs(read[i].left.mean() - level[i]) < 5.5  # the codec rounds; the next level is 11 away
+    rng, bars = np.random.default_rng(0), 1 << np.arange(8)  # a frame shows its number, bit by bit
+    for side in ("left", "right"):
+        shown = [np.full((SIZE[1], 8, 3), 0, np.uint8) + 255 * (i & bars > 0)[None, :, None].astype(np.uint8) for i in range(90)]
+        images = np.stack([cv2.resize(image, SIZE, interpolation=cv2.INTER_NEAREST) for image in shown])
+        foreign.video(folder / f"{side}.mp4", images, np.cumsum(rng.uniform(0.01, 0.3, 90)))  # at no constant rate
+    read = Recording.open(folder).frames
+    for i in [0, 80, 7, 41, 88, 89, 3]:
+        bits = cv2.resize(read[i].right, (8, 1), interpolation=cv2.INTER_AREA)[0, :, 0] > 127
+        assert bits @ bars == i
     (folder / "left").mkdir()
     with pytest.raises(ValueError, match="keep one"):
         Recording.open(folder)

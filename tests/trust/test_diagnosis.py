@@ -226,6 +226,17 @@ def test_a_robot_that_stands_still_is_named():
     assert best.name == "frozen_kinematics" and "In 100 % of the frames" in best.text
 
 
+def test_a_tool_at_rest_is_no_frozen_log():
+    """A log is rounded, so that it repeats itself where the tool rests; the detections scatter by their noise alone."""
+    usual, noise = take(frames=40), np.random.default_rng(0).normal(0, 1.0, (2, 120, 2))
+    last = np.minimum(np.arange(120), 72 + np.arange(120) % 3)  # it rests from frame 24 on
+    names = ("x_mm", "u_left", "u_right")
+    x_mm, left, right = (getattr(usual.data, name)[last] for name in names)
+    rested = np.arange(120)[:, None] >= 75
+    data = replace(usual.data, x_mm=x_mm, u_left=left + rested * noise[0], u_right=right + rested * noise[1])
+    assert found(replace(usual, data=data)).best is None
+
+
 def test_three_frames_accuse_nobody():
     usual = take(frames=40)
     assert diagnose(usual.data.of_frames([0, 19, 39]), kinematics=usual.kinematics).hypotheses == ()
