@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from lib import commands, paths
+from lib.calibration import calibrate
 from lib.cameras import StereoRig
 from lib.correspondences import of_recording
 from lib.landmarks import Detector, Landmarks
@@ -20,6 +21,7 @@ from lib.recordings import Recording
 from lib.simulator import Design, Eye, Microscope, simulate
 from lib.surface import export
 from lib.trust import check
+from notebooks.studies.simulated_rows import simulate_correspondences
 from tests.importing import foreign
 from tests.importing.test_import import source_of, thinned
 from tests.remembering import remembering_recordings
@@ -51,6 +53,14 @@ def test_calibrate_writes_cameras_for_other_programs(out):
     assert told["verdict"] in ("trustworthy", "doubtful") and told["rows"] == 102
     rows = (out / "landmarks.csv").read_text().splitlines()
     assert len(rows) == 103 and rows[1].startswith("0,base,")
+
+
+def test_camera_files_of_an_earlier_run_do_not_pass_for_this_ones(tmp_path):
+    c = simulate_correspondences(60, rng=np.random.default_rng(0))
+    found = calibrate(c.x_mm, [c.u_left, c.u_right], model="zero_skew+distance+radial", image_size_px=(1920, 1080))
+    (tmp_path / "left_camera_info.yaml").write_text("of cameras without distortion, earlier")
+    commands._write_rig(tmp_path, found.rig, SimpleNamespace(image_size_px=(1920, 1080)))
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["left.yml", "rig.json", "right.yml"]
 
 
 def test_register_finds_the_cameras_where_they_are(out, tmp_path, capsys):

@@ -17,7 +17,7 @@ from lib.landmarks import Detector, Landmarks
 from lib.recordings import Kinematics
 from lib.recordings.annotations import Annotations, write_coco
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE
-from tests.adapt.world import SIZE, StandIn, World, pupil
+from tests.adapt.world import SIZE, Kept, StandIn, World, pupil
 from tests.remembering import remembering_teacher
 
 
@@ -280,6 +280,14 @@ def test_what_an_older_recipe_kept_is_not_gone_on_with(world, recording, tmp_pat
     assert len(list((tmp_path / "work").iterdir())) == 2
 
 
+def test_other_images_in_the_same_folder_are_other_work(world, recording, tmp_path):
+    exchanged = Kept(world.time_s)
+    exchanged._pairs = [pair[::-1] for pair in exchanged._pairs]
+    for one in (recording, recording, replace(recording, frames=exchanged)):
+        assert not adapt(one, StandIn(world.u, noise_px=0.7, wrong=1.0), folder=tmp_path, progress=False).improved
+    assert len(list((tmp_path / "work").iterdir())) == 2
+
+
 class Sure(StandIn):
     """Is sure of the lost landmarks, too."""
 
@@ -416,6 +424,20 @@ def test_five_labelled_pairs_are_a_start(world, recording, tmp_path, monkeypatch
     assert found.improved and np.nanmedian(np.linalg.norm(tune.calls[-1]["off"], axis=-1)) < 1.5
     images, held_out = tune.calls[-1]["images"], tune.calls[-1]["held_out"]  # what all labels err alike is no noise of theirs
     assert all((one.sd_px > 0).all() for one in images) and all(one.sd_px == 0 for one in held_out)
+
+
+@pytest.mark.parametrize(("moved_from", "marked", "used"), [(28, 7, 5), (None, 40, 20)])
+def test_labels_are_used_of_one_stand_of_the_cameras_and_some_frames_stay_to_judge_by(tmp_path, moved_from, marked, used):
+    there = World(moved_from=moved_from)
+    u, some = np.full(there.u.shape, np.nan), np.linspace(1, 38, marked).astype(int) if moved_from else np.arange(40)
+    u[some] = there.u[some]
+    write_coco(tmp_path / "labels.json", Annotations(u[:, 0], u[:, 1]), SIZE, ".png")
+    tune, there_too = pupil(there), there.record(tmp_path / "one")
+    detector = StandIn(there.u, wrong=0.3)
+    found = adapt(there_too, detector, labels=tmp_path / "labels.json", folder=tmp_path, progress=False, tune=tune)
+    assert np.nanquantile(np.linalg.norm(tune.calls[-1]["off"], axis=-1), 0.95) < 1.5
+    learnt = found.frames["learn"]
+    assert np.isin(some, learnt).sum() >= used and len(found.frames["judge"]) >= 3 and (learnt < (moved_from or 40)).all()
 
 
 def five_labelled(world):

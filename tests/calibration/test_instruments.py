@@ -348,6 +348,19 @@ def test_exports_hold_the_cameras(model, tmp_path):
         np.testing.assert_array_equal(a, b)
 
 
+def test_a_full_disk_leaves_the_cameras_of_before(tmp_path):
+    resource = pytest.importorskip("resource")
+    write_opencv(reference_rig().left, tmp_path / "camera.yml", (1920, 1080))
+    before, limit = (tmp_path / "camera.yml").read_bytes(), resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, limit[1]))
+    try:
+        with pytest.raises(OSError):
+            write_opencv(reference_rig().right, tmp_path / "camera.yml", (1920, 1080))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+    assert (tmp_path / "camera.yml").read_bytes() == before
+
+
 def test_exports_refuse_names_that_are_yaml_and_unknown_formats(tmp_path):
     camera = reference_rig().left
     for name in ("left\nprojection_matrix: 1", "a: b", "", "{}"):

@@ -205,7 +205,8 @@ def without_kernels(books, monkeypatch):
     """Notebooks that end as soon as they begin: what is tested is the command around them."""
     monkeypatch.setattr(command.execution, "choose_notebooks", lambda names, folder: choose_notebooks(names, books))
     monkeypatch.setattr(command, "execute", lambda book, output, values, **options: shutil.copy(book, output) and None)
-    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM))}
+    numbers = (signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM))
+    before = {number: signal.signal(number, signal.SIG_DFL) for number in numbers}  # nohup's child inherits "ignore"
     yield
     for number, handler in before.items():
         signal.signal(number, handler)
@@ -247,6 +248,23 @@ def test_a_signal_leaves_the_state_stopped(without_kernels, tmp_path, monkeypatc
         signal.signal(signal.SIGINT, before)
     content = state_of(tmp_path)
     assert content["state"] == "stopped" and content["notebooks"][0]["state"] == "pending"
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no such signals")
+def test_a_run_under_nohup_outlives_its_terminal(without_kernels, tmp_path):
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    assert main(["03", "--runs", str(tmp_path)]) == 0
+    assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN and signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL
+
+
+def test_no_room_for_the_zip_leaves_a_complete_run_without_it(without_kernels, tmp_path, monkeypatch):
+    def half(base, *_):
+        Path(f"{base}.zip").write_bytes(b"half")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(command.shutil, "make_archive", half)
+    assert main(["03", "--runs", str(tmp_path)]) == 0
+    assert state_of(tmp_path)["download"] is None  # and the run's folder is all there is
 
 
 def test_the_notebooks_of_a_run_share_a_folder_that_goes_with_it(without_kernels, tmp_path, monkeypatch):
