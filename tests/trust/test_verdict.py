@@ -157,9 +157,10 @@ def test_a_lens_that_distorts_is_no_fault_where_the_cameras_have_it(monkeypatch)
     data = replace(scene.data, u_left=left, u_right=right)
     assert diagnose(data, near=True, **stated).best is not None
     assert assess(recording, data, model="zero_skew+distance+radial").diagnosis.best is None
-    parked_mm = data.x_mm.copy()  # one of them lies behind the cameras
-    parked_mm[[30, 60]] += np.outer([500.0, -500.0], ROBOT_FROM_MICROSCOPE.R[:, 2])
-    assert assess(recording, replace(data, x_mm=parked_mm), model="zero_skew+distance+radial").diagnosis.best is None
+    parked_mm = data.x_mm.copy()  # behind the cameras
+    parked_mm[30] -= 500.0 * ROBOT_FROM_MICROSCOPE.R[:, 2]
+    parked = assess(recording, replace(data, x_mm=parked_mm), model="zero_skew+distance+radial")
+    assert np.flatnonzero(np.isnan(parked.data.x_mm[:, 0])).tolist() == [30] and parked.diagnosis.best is None
 
 
 def test_no_detection_is_one_message():
