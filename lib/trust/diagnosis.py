@@ -32,7 +32,7 @@ _STRETCHES, _PARTS = 60, 8
 _LEAST_SCALED, _SURE_SCALED, _OWN_SD = 0.03, 5.0, 0.006
 #: Least share of the variance that it explains, most that it leaves (RMS), and least turning of the jaws (RMS of n^2).
 _MOST_OF_IT, _ODD, _TURNED = 0.5, 0.03, 0.01
-_RESTS_MM = 0.1  # a tool whose landmarks move less rests
+_RESTS_MM = 0.06  # a tool whose landmarks move less rests, noise of the robot included
 _STILL_PX = 0.3  # detections of one picture differ by less
 BY_GEOMETRY = ("scaled_axis", "mirrored_axis", "exchanged_eyes", "mirrored_images")  # which the residuals do not show
 _ACROSS = 0.15  # sine of a tool's angle to the images, below which it points neither way
