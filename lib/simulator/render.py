@@ -3,8 +3,8 @@
 All in linear light; the optics follow in the order of a microscope: defocus, motion blur, vignetting, sensor noise, gamma.
 """
 
-from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -22,8 +22,7 @@ _LINEAR = (np.arange(256, dtype=np.float32) / 255) ** GAMMA
 _BUMP_MM, _BUMP_PX = 10.0, 1024
 
 
-@dataclass(frozen=True, eq=False)
-class View:
+class View(NamedTuple):
     """One camera's image (h, w, 3) uint8 RGB and its truth.
 
     Attributes:

@@ -4,7 +4,7 @@ A round cone is the convex hull of two balls.  In orthographic view its front al
 f(s) = z(s) - sqrt(Q(s)), Q(s) = r(s)^2 - |w - s c|^2, in closed form: no mesh is needed.  The shaft ends flat.
 """
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -15,8 +15,7 @@ from lib.simulator.rig import Microscope
 from lib.simulator.window import Window, blur_by_depth, motion_blur
 
 
-@dataclass(frozen=True)
-class ToolRaster:
+class ToolRaster(NamedTuple):
     """What a camera sees of the tool, on a grid `factor` times finer than the image, over a box of it.
 
     Attributes:
@@ -94,8 +93,7 @@ def rasterise(
     return ToolRaster((int(x0), int(y0)), factor, depth, part, (rows, columns), normal, tangent, along)
 
 
-@dataclass(frozen=True, eq=False)
-class ToolInView:
+class ToolInView(NamedTuple):
     """The tool in a window, each point when its own row is exposed.
 
     Attributes:

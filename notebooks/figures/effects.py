@@ -54,7 +54,7 @@ def render_window(
     if microscope.jpeg_quality is None:
         return view
     data = cv2.imencode(".jpg", view.image, [cv2.IMWRITE_JPEG_QUALITY, microscope.jpeg_quality])[1]
-    return replace(view, image=cv2.imdecode(data, cv2.IMREAD_COLOR))
+    return view._replace(image=cv2.imdecode(data, cv2.IMREAD_COLOR))
 
 
 def effect_gallery(eye: Eye, forceps: Forceps, pose: Pose) -> dict[str, np.ndarray]:
