@@ -1,9 +1,9 @@
 """Fitting what makes covariance and confidence true: the error model of each stage, on validation images."""
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import replace
 from itertools import product
-from typing import Self
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize
@@ -28,8 +28,7 @@ _INSIDE = chdtri(2, 0.05)  # squared length below which 95 % of a standard norma
 _GROSS_PX = {"frame": GROSS_PX, "tool": 10.0, "again": 8.0}
 
 
-@dataclass(frozen=True)
-class Seen:
+class Seen(NamedTuple):
     """Peaks of `landmark` (m,) that a stage decoded: `features` (m, 3, 9) as `features_of` gives them, and `errors` (m, 2).
 
     All in pixels of the stage's input.  Errors are NaN without a label; below `tolerance` (m,) a landmark is correct.
@@ -44,11 +43,6 @@ class Seen:
     moved: np.ndarray
     known: np.ndarray
     label_sd: np.ndarray
-
-    @classmethod
-    def joined(cls, parts: Sequence[Self]) -> Self:
-        """One after the other."""
-        return cls(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(cls)))
 
     def fit(self, gross_px: float, prior: ErrorModel | None = None) -> ErrorModel:
         """Maximum likelihood of the errors below `gross_px`, and a logistic regression of being correct.
@@ -174,7 +168,7 @@ def _fitted(stage: str, parts: Sequence[Seen], prior: ErrorModel | None) -> Erro
         if prior is not None:
             return prior
         raise ValueError("images: the detector finds nothing in them to calibrate on; give other images.")
-    seen = Seen.joined(parts)
+    seen = Seen(*map(np.concatenate, zip(*parts, strict=True)))
     gross_px = _GROSS_PX.get(stage, CLOSEUP_REACH_PX * min(CLOSEUP_ZOOM))
     if stage not in CLOSE:
         return seen.fit(gross_px, prior)
@@ -182,7 +176,7 @@ def _fitted(stage: str, parts: Sequence[Seen], prior: ErrorModel | None) -> Erro
     # place where a landmark is expected is an old one, which is evidence of nothing.
     gains = [1.0] if stage == "tracking" else np.linspace(0, 1, 51)
     gain, bias = seen.gain(gross_px, gains) if prior is None else map(np.array, (prior.gain, prior.bias))
-    seen = replace(seen, errors=seen.errors + (gain[seen.landmark] - 1) * seen.moved - bias[seen.landmark])
+    seen = seen._replace(errors=seen.errors + (gain[seen.landmark] - 1) * seen.moved - bias[seen.landmark])
     return replace(seen.fit(gross_px, prior), gain=gain, bias=bias)
 
 
@@ -222,7 +216,7 @@ def fit_error_models(
             found.append(None if stage == "frame" else detector.stage_peaks(labelled.image[None], start.u, stage))
             parts.append(seen_by(detector, stage, labelled, start, found[-1]))
         if stage in ("closeup", "closer"):  # how often a landmark is right, the other images tell
-            parts[n:] = (replace(part, known=np.zeros_like(part.known)) for part in parts[n:])
+            parts[n:] = (part._replace(known=np.zeros_like(part.known)) for part in parts[n:])
         fit = _fitted(stage, parts if stage in CLOSE else parts[:n], None if anew else before.get(stage))
         detector = replace(detector, error_models=detector.error_models | {stage: fit})
         if stage == "frame":  # the landmarks that the next stage starts from

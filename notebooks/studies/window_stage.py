@@ -79,4 +79,4 @@ class WindowStage:
         for i, one in enumerate(images):
             if seen := self.stage_peaks(one.image[None], rough.u[i : i + 1]):
                 parts.append(seen_by(self.last, "window", one, rough[i : i + 1], seen))
-        return replace(self, errors=Seen.joined(parts).fit(GROSS_PX))
+        return replace(self, errors=Seen(*map(np.concatenate, zip(*parts, strict=True))).fit(GROSS_PX))
