@@ -1,9 +1,8 @@
 """Scores of a detector on labelled images."""
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, fields
 from itertools import chain
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 from tqdm.auto import tqdm
@@ -14,8 +13,7 @@ from lib.landmarks.metrics import Scores, calibration_error, errors_px, pck, sco
 from lib.training.samples import LabelledImage
 
 
-@dataclass(frozen=True)
-class Evaluation:
+class Evaluation(NamedTuple):
     """Detections in n images beside their labels.
 
     Attributes:
@@ -35,7 +33,7 @@ class Evaluation:
     @classmethod
     def joined(cls, parts: Iterable[Self]) -> Self:
         """Several evaluations as one."""
-        found, *arrays, names = zip(*([getattr(e, field.name) for field in fields(cls)] for e in parts), strict=True)
+        found, *arrays, names = zip(*parts, strict=True)
         return cls(Landmarks.join(found), *map(np.concatenate, arrays), list(chain(*names)))
 
     @property
