@@ -402,7 +402,7 @@ class Detector:
             return None
         i, own = which[:, 0], (np.arange(len(which)), which[:, 1])
         parts = view.map_points(matrices[:, None], rough.u[i]), rough.confidence[i]
-        return Rough(*(part[own][:, None] for part in vars(Rough.of(*map(torch.from_numpy, parts))).values()))
+        return Rough(*(part[own][:, None] for part in Rough.of(*map(torch.from_numpy, parts))))
 
     def frame_peaks(self, images: ArrayLike) -> Peaks:
         """Peaks of the first stage, in pixels of its input."""

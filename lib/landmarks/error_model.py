@@ -1,7 +1,7 @@
 """From peaks to covariance and confidence: the error model that is fitted on validation images."""
 
-from dataclasses import dataclass, replace
-from typing import Self
+from dataclasses import dataclass
+from typing import NamedTuple, Self
 
 import numpy as np
 import torch
@@ -17,8 +17,7 @@ _SHUT = 0.15
 _WRONG = 3.0  # a wrong landmark's variance is 1 + this times a right one's; no part of the fit, chosen on validation images
 
 
-@dataclass(frozen=True)
-class Rough:
+class Rough(NamedTuple):
     """What the stage before found: agreement with it is evidence.
 
     Attributes:
@@ -140,4 +139,4 @@ def corrected(peaks: Peaks, fit: ErrorModel, size_px: int, landmark: np.ndarray)
     expected, gain, bias, reach = (torch.tensor(part, dtype=peaks.u.dtype) for part in parts)
     move = peaks.u - expected
     near = (move.square().sum(-1) < reach.square()).to(move.dtype)
-    return replace(peaks, u=expected + gain * move - bias, value=peaks.value * near)
+    return peaks._replace(u=expected + gain * move - bias, value=peaks.value * near)

@@ -47,7 +47,7 @@ class StageWithDecoding(nn.Module):
         if self.closeup:
             # The graph does not know which landmark a closeup shows, so it corrects it as each of the three.
             one = closeup_peaks(seen, self.config.size_px)
-            three = Peaks(*(part.expand(-1, 3, *part.shape[2:]) for part in vars(one).values()))
+            three = Peaks(*(part.expand(-1, 3, *part.shape[2:]) for part in one))
             peaks = corrected(three, self.fit, self.config.size_px, np.arange(3))
         else:
             peaks = decode(seen, self.config.stride, method=self.method)

@@ -4,8 +4,7 @@ Cells and pixels obey the half-pixel rule of `lib.geometry`: cell c of a heatmap
 s * c + (s - 1) / 2.  Sigma is in pixels of the network's input whatever the stride.
 """
 
-from dataclasses import dataclass
-from typing import Self
+from typing import NamedTuple, Self
 
 import torch
 from torch import Tensor
@@ -41,8 +40,7 @@ def render(u: Tensor, image_size: tuple[int, int], stride: int, sigma_px: float 
     return torch.nan_to_num(along_y[..., :, None] * along_x[..., None, :], nan=0.0)
 
 
-@dataclass(frozen=True)
-class Peaks:
+class Peaks(NamedTuple):
     """The peak that a decoder finds in each heatmap.
 
     Attributes:
@@ -61,7 +59,7 @@ class Peaks:
 
     def double(self) -> Self:
         """The same in float64."""
-        return Peaks(*(part.double() for part in vars(self).values()))
+        return Peaks(*(part.double() for part in self))
 
 
 def _patches(heatmaps: Tensor, centre: Tensor, radius: int) -> tuple[Tensor, Tensor, Tensor]:

@@ -1,6 +1,5 @@
 """Figures of recorded results, drawn from small made-up records: what is stated is what was recorded."""
 
-from dataclasses import replace
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -168,7 +167,7 @@ def test_closeups_show_what_was_expected_seen_and_believed():
     one = torch.ones(2, 1)
     peaks = Peaks(at, one, one, torch.eye(2).expand(2, 1, 2, 2), 0 * one)
     expected = np.full((2, 2), 16.0)
-    kept = replace(peaks, u=(at + 16) / 2)
+    kept = peaks._replace(u=(at + 16) / 2)
     figure = plots.closeups(np.zeros((2, 32, 32, 3), np.uint8), expected, peaks, kept, ["base", "tip_1"])
     first = figure.axes[2]  # the near view of the first
     drawn = [tuple(float(v) for v in line.get_xydata()[0]) for line in first.lines]
