@@ -63,8 +63,7 @@ def rung_design(rung: str, seed: int, *, shrink: int = 1) -> Design:
     """
     if rung == "near":  # seeds that no data set of the paper's size was ever made with
         return sequence_design(1000 + seed, TEST_SEQUENCES[seed % len(TEST_SEQUENCES)], shrink=shrink)
-    rng = np.random.default_rng([seed, 307, *rung.encode()])
-    drawn = random_setup(rng, rung, centred=True)
+    drawn = random_setup(np.random.default_rng([seed, 307, *rung.encode()]), rung, centred=True)
     like = sequence_design(2000 + seed, TEST_SEQUENCES[0], shrink=shrink)
     names = ("image_size_px", "pixels_per_mm", "image_rotation_rad", "readout_s")
     rig = {name: getattr(like.microscope, name) for name in names}
@@ -91,8 +90,7 @@ def make_dataset(
         shutil.rmtree(leftover)  # of a run that was killed
     designs = {k: sequence_design(seed, k, shrink=shrink, duration_s=duration_s) for k in _SEQUENCES}
     jobs = {folder / sequence_name(k): (design, 1000 * seed + k, n_pairs) for k, design in designs.items()}
-    told = "Simulated data set: calibration sweep, then a surgeon's movements."
-    make = partial(simulate, description=told, progress=False)
+    make = partial(simulate, description="Simulated data set: calibration sweep, then a surgeon's movements.", progress=False)
     for _, error in run_jobs(make, jobs, workers=workers, title="Simulating", unit="sequence"):
         if error:
             raise error
