@@ -48,11 +48,10 @@ class Pose:
     @property
     def microscope_from_tool(self) -> np.ndarray:
         """Rotation (3, 3): columns are the tool's x, y and z in the microscope frame."""
-        # At azimuth 0 jaw 1 (tool y) points up in the image, -y; the tool's z then points out of the eye.
-        upright = np.diag([1.0, -1.0, -1.0])
         (a, b), (c, d), (e, f) = ((math.cos(v), math.sin(v)) for v in (self.azimuth_rad, self.pitch_rad, self.roll_rad))
         turn = np.array([[a * c, -b, -a * d], [b * c, a, -b * d], [d, 0.0, c]])  # about z, then about y by -pitch
-        return turn @ upright @ np.array([[1.0, 0.0, 0.0], [0.0, e, -f], [0.0, f, e]])
+        # At azimuth 0 jaw 1 (tool y) points up in the image, -y; the tool's z then points out of the eye.
+        return turn @ np.diag([1.0, -1.0, -1.0]) @ np.array([[1.0, 0.0, 0.0], [0.0, e, -f], [0.0, f, e]])
 
     def place(self, points: np.ndarray) -> np.ndarray:
         """Points (n, 3) of the tool frame in the microscope frame."""

@@ -102,9 +102,8 @@ def _narrow_setup(rng: Rng, textures: Sequence[int], kind: type[Eye]) -> Setup:
         gloss=float(rng.choice([0.0, 1.0], p=[0.08, 0.92]) * rng.uniform(0.3, 2.2)), turn_rad=rng.uniform(-np.pi, np.pi),
     )  # fmt: skip
     forceps, microscope = random_forceps(rng), _microscope(rng)
-    pose = random_pose(rng, forceps, eye.centre_z_mm - 0.35 * eye.depth_mm)
     families = {"tool": "plain_jaws", "light": "coaxial", "scene": "fundus", "optics": "clean"}
-    return Setup(eye, forceps, microscope, pose, families)
+    return Setup(eye, forceps, microscope, random_pose(rng, forceps, eye.centre_z_mm - 0.35 * eye.depth_mm), families)
 
 
 def random_setup(

@@ -145,8 +145,7 @@ def render_pair(
     A ValueError refuses a tool that is entirely outside the field of both cameras.
     """
     rig, size = microscope.rig(RigidTransform.identity()), microscope.image_size_px
-    shows = forceps is None or pose is None or any(inside(u, size).any() for u in rig.project(forceps.landmarks(pose)))
-    if not shows:
+    if forceps and pose and not any(inside(u, size).any() for u in rig.project(forceps.landmarks(pose))):
         base = f"its base is at {np.round(pose.base_mm, 2).tolist()} mm"
         raise ValueError(f"pose: the tool is outside the field; {base}, move it towards the microscope frame's origin.")
     options = {"factor": 3} | options | {"forceps": forceps, "pose": pose}
