@@ -222,5 +222,4 @@ def joined(verdicts: Iterable[dict | None]) -> dict | None:
 
 def versions() -> dict[str, str]:
     """Python and the packages whose version can change a number."""
-    installed = {package.name: package.version for name in _TOLD for package in distributions(name=name)}
-    return {"python": platform.python_version()} | {name: installed[name] for name in _TOLD if name in installed}
+    return {"python": platform.python_version()} | {p.name: p.version for name in _TOLD for p in distributions(name=name)}
