@@ -118,8 +118,7 @@ def _residual(inputs: int, outputs: int) -> _Block:
     """Two 3 x 3 convolutions and their skip connection (He et al. 2016); more channels come with half the resolution."""
     halve = inputs != outputs
     body = nn.Sequential(_conv(inputs, outputs, 3, stride=2 if halve else 1), _conv(outputs, outputs, 3, relu=False))
-    skip = nn.Sequential(nn.AvgPool2d(2), _conv(inputs, outputs, 1, relu=False)) if halve else nn.Identity()
-    return _Block(body, skip)
+    return _Block(body, nn.Sequential(nn.AvgPool2d(2), _conv(inputs, outputs, 1, relu=False)) if halve else nn.Identity())
 
 
 class _Hourglass(nn.Module):
