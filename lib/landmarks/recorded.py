@@ -42,10 +42,8 @@ def detect(
         frame = recording.frames[int(i)]
         pair = np.stack([frame.left, frame.right])
         found.append(detector.track(pair, found[-1], **known) if track and found else detector(pair, **known))
-    every, n = Landmarks.join(found), len(chosen)
-    known = {"covariance_px2": every.covariance.reshape(n, 2, 3, 2, 2), "confidence": every.confidence.reshape(n, 2, 3)}
-    known = {name: part.swapaxes(1, 2) for name, part in known.items()}
-    return of_recording(recording, every.u[::2], every.u[1::2], frames=chosen, **known)
+    u, covariance, confidence = (np.stack([part[::2], part[1::2]], axis=2) for part in vars(Landmarks.join(found)).values())
+    return of_recording(recording, u[:, :, 0], u[:, :, 1], frames=chosen, covariance_px2=covariance, confidence=confidence)
 
 
 def with_ground(
