@@ -35,8 +35,7 @@ def labelled_images(recording: Recording, *, every: int = 1) -> Iterator[Labelle
 
     A ValueError if the recording has neither.
     """
-    labels = recording.truth or recording.annotations
-    if labels is None:
+    if (labels := recording.truth or recording.annotations) is None:
         raise ValueError(f"{recording.name}: it has neither truth/ nor annotations.json; give a labelled recording.")
     for i in range(0, len(recording.frames), every):
         marked = [side for side in ("left", "right") if recording.truth or getattr(labels, f"visibility_{side}")[i].any()]
@@ -91,8 +90,7 @@ class Samples(Source):
     visibility: np.ndarray
 
     def __post_init__(self) -> None:
-        n = len(self.images)
-        if n == 0:
+        if not (n := len(self.images)):
             raise ValueError("images: an empty data set; give at least one labelled image.")
         if self.images.ndim != 4 or self.images.shape[-1] != 3 or self.images.dtype != np.uint8:
             raise ValueError(f"images: expected (n, h, w, 3) uint8, got {self.images.shape} {self.images.dtype}.")

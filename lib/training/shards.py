@@ -109,8 +109,7 @@ def _read(path: Path, names: Sequence[str]) -> list[np.ndarray]:
 
 def read_shards(folder: str | Path, kind: str, names: Sequence[str], first: int | None = None) -> list[np.ndarray]:
     """Arrays of the (first) shards of a kind, joined; an error names a missing, corrupt or differently sized shard."""
-    found = sorted(Path(folder).glob(f"{kind}_*.npz"))[:first]
-    if not found:
+    if not (found := sorted(Path(folder).glob(f"{kind}_*.npz"))[:first]):
         raise FileNotFoundError(f"{folder}: no shard {kind}_*.npz; make some with `python3 -m lib train generate`.")
     shards = [_read(path, names) for path in found]
     for path, shard in zip(found, shards, strict=True):

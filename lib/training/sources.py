@@ -241,8 +241,7 @@ class CloseupSource(Source):
     def of(cls, images: Sequence[LabelledImage], *, still: bool = False, weight: np.ndarray | None = None) -> Self:
         """From labelled images of any size; for validation `still`, neither stretched nor blurred nor disguised."""
         usable = [np.isfinite(one.u).all(1) & (one.visibility == 2) & np.isfinite(tool_length_px(one.u)) for one in images]
-        which = np.argwhere(usable)
-        if not len(which):
+        if not len(which := np.argwhere(usable)):
             raise ValueError("images: no visible landmark of a tool with base and tip; label some.")
         shown = ((images[i], k) for i, k in which)
         parts = ((*shards.square_round(one.image, one.u, k, shards.CLOSEUP_CROP_PX), one.visibility, k) for one, k in shown)

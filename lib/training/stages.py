@@ -65,8 +65,7 @@ def stage_data(stage: str, folder: str | Path) -> tuple[Source, Samples]:
 
 def _still(stage: str, images: Iterable[LabelledImage]) -> Samples:
     """What a stage sees of held-out images; of those with a tool in view, since the others have nothing to measure."""
-    shown = [one for one in images if (np.isfinite(one.u).all(1) & (one.visibility == 2)).any()]
-    if not shown:
+    if not (shown := [one for one in images if (np.isfinite(one.u).all(1) & (one.visibility == 2)).any()]):
         raise ValueError(f"{stage}: no held-out image shows a landmark; label some, or `python3 -m lib train generate`.")
     return Samples.drawn(_SOURCES[stage].of(shown, still=True))
 
@@ -171,8 +170,7 @@ def assemble(
     out = Path(out)
     trained = {stage: Path(folder) / stage / "last.safetensors" for stage in STAGES}
     stages = {k: load_training(p) if p.exists() or not initial else training_of(initial, k) for k, p in trained.items()}
-    frames = list(validation_images(data))
-    if not frames:
+    if not (frames := list(validation_images(data))):
         raise FileNotFoundError(f"{data}: no shard held_out_*.npz; make some with `python3 -m lib train generate`.")
     rng = np.random.default_rng(len(frames))
     near = {"population": "near", "textures": VALIDATION_TEXTURE_SEEDS}
