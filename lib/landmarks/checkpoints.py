@@ -46,8 +46,7 @@ def read_checkpoint(path: str | Path, kind: str) -> tuple[dict[str, Tensor], dic
 
     A FileNotFoundError if there is none; a ValueError if it is damaged, has no checksum, or holds something else.
     """
-    path = Path(path)
-    if not path.is_file():
+    if not Path(path).is_file():
         raise FileNotFoundError(f"{path}: no such weights file; train one with `python3 -m lib train`.")
     try:
         with safe_open(path, framework="pt") as file:

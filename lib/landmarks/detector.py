@@ -248,8 +248,7 @@ class Detector:
         if ground is not None:
             looks.insert(0, lambda i: levelled(images[i], ground()[i]))
         for k, look in enumerate(looks if self.tool_network else (), 1):
-            unsure = np.flatnonzero(result.doubtful)
-            if unsure.size:
+            if len(unsure := np.flatnonzero(result.doubtful)):
                 other = self._once(np.stack([look(i) for i in unsure]), sweep=k == len(looks))
                 other = other if k < len(looks) else replace(other, confidence=_UNWITNESSED * other.confidence)
                 result._put(unsure, result[unsure].surest(other))
@@ -288,8 +287,7 @@ class Detector:
                 part, near = images if usable.size == len(images) else images[usable], previous[usable]  # a pair takes 12 MB
                 found = self.refine(part, near, "tracking")
                 result._put(usable, self.refine(part, found, "tracking", only=view.moved_far(near.u, found.u)))
-        lost = np.flatnonzero((result.confidence < min_confidence).any(1))
-        if lost.size:
+        if len(lost := np.flatnonzero((result.confidence < min_confidence).any(1))):
             result._put(lost, self(images[lost], ground=ground and (lambda: ground()[lost])))
         return result.without_unsure()
 

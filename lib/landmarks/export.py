@@ -116,8 +116,7 @@ def _difference(module: nn.Module, inputs: tuple[Tensor, ...], path: Path, stage
     u, covariance, confidence = run_onnx(path, *(part.numpy() for part in inputs))
     with torch.inference_mode():
         u_torch, covariance_torch, confidence_torch = (part.numpy() for part in module(*inputs))
-    seen = confidence_torch >= MISSING_BELOW
-    if not seen.any():
+    if not (seen := confidence_torch >= MISSING_BELOW).any():
         raise ValueError(f"examples: the stage {stage!r} finds nothing in them; give other frames.")
     variance = np.trace(covariance_torch, axis1=-2, axis2=-1)[..., None, None]
     differences = {
