@@ -61,8 +61,7 @@ def _vessel_tree(rng: np.random.Generator, disc_mm: np.ndarray, kind: str) -> li
             since += step
             if since > 0.7 and rng.random() < 0.09:
                 side, share = rng.choice([-1, 1]), rng.uniform(0.35, 0.8)
-                child = width * share
-                if child > 0.024:
+                if (child := width * share) > 0.024:
                     stack.append(((x, y), heading + side * rng.uniform(0.5, 1.1), child, -side * rng.uniform(0, 0.2)))
                     width *= (1 - share**3) ** (1 / 3) * 0.3 + 0.7  # Murray's law, softened
                     heading -= side * 0.15 * share

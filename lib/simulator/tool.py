@@ -48,8 +48,7 @@ def rasterise(
     low, high = np.floor(pixel - reach[:, None]), np.ceil(pixel + reach[:, None]) + 1
     low = np.maximum(np.minimum(low[joined], low[joined + 1]), 0).astype(int)
     high = np.minimum(np.maximum(high[joined], high[joined + 1]), size_px).astype(int)
-    seen = (high > low).all(axis=1)
-    if not seen.any():
+    if not (seen := (high > low).all(axis=1)).any():
         return None
     joined, low, high = joined[seen], low[seen], high[seen]
     x0, y0 = low.min(axis=0)

@@ -136,8 +136,7 @@ def blur_by_depth(image: np.ndarray, sigma_px: np.ndarray, grid: Grid | None = N
 
 def motion_blur(image: np.ndarray, shift_px: np.ndarray) -> np.ndarray:
     """Centred blur along the movement (2,) px during the exposure; one too short to see leaves the image as it is."""
-    length = float(np.hypot(*shift_px))
-    if length < 0.3:
+    if (length := float(np.hypot(*shift_px))) < 0.3:
         return image
     half = int(np.ceil(length / 2)) + 1
     kernel = np.zeros((2 * half + 1,) * 2, np.float32)
