@@ -94,8 +94,7 @@ class Samples(Source):
             raise ValueError("images: an empty data set; give at least one labelled image.")
         if self.images.ndim != 4 or self.images.shape[-1] != 3 or self.images.dtype != np.uint8:
             raise ValueError(f"images: expected (n, h, w, 3) uint8, got {self.images.shape} {self.images.dtype}.")
-        shapes = self.u.shape, self.visibility.shape
-        if shapes != ((n, 3, 2), (n, 3)):
+        if (shapes := (self.u.shape, self.visibility.shape)) != ((n, 3, 2), (n, 3)):
             raise ValueError(f"u and visibility: expected ({n}, 3, 2) and ({n}, 3), got {shapes[0]} and {shapes[1]}.")
         if not (np.isfinite(self.u).all(2) & (self.visibility == 2)).any():
             raise ValueError("u: all landmarks of all images are missing; there is nothing to learn.")

@@ -141,8 +141,7 @@ class ToolSource(SceneSource):
 
     def draw(self, index: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         if self.proposals is not None and rng.random() < _PROPOSED:
-            known = self.proposals[index][np.isfinite(self.proposals[index]).all((1, 2))]
-            if len(known):
+            if len(known := self.proposals[index][np.isfinite(self.proposals[index]).all((1, 2))]):
                 return self._proposed(self.frame(index), known[rng.integers(len(known))], rng)
         _, u, visibility, _ = scene = self.scene(index, rng)
         (centre,), (angle,) = windows.tool_pose(u[None])
