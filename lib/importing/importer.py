@@ -46,12 +46,11 @@ def import_recording(source: str | Path, mapping: str | Path, out: str | Path, *
     robot_time, *reported = read_robot(folder, told)
     increasing(robot_time, str(folder / told.robot.file), *_LOG_STEP_S)
     # A recording's times count from 0, or from the first whole second of times that count from a date.
-    starts = stereo.time[0], robot_time[0]
-    zeros = stereo_zero, robot_zero = [Decimal(int(t)) if abs(t) > _EPOCH_S else Decimal(0) for t in starts]
+    zeros = stereo_zero, robot_zero = [Decimal(int(t) if abs(t) > _EPOCH_S else 0) for t in (stereo.time[0], robot_time[0])]
+    one_dated = bool(stereo_zero) != bool(robot_zero)  # the other starts at 0
     estimated = told.robot.offset_s == "estimate"
-    one_dated = estimated and bool(stereo_zero) != bool(robot_zero)
     given = Decimal("0" if estimated else str(told.robot.offset_s))
-    offset_s = 0.0 if one_dated else float(stereo_zero + given - robot_zero)
+    offset_s = 0.0 if estimated and one_dated else float(stereo_zero + given - robot_zero)
     time_s, robot_s = since(stereo.time, stereo_zero), since(robot_time, robot_zero)
     size = next(stereo.pairs())[0].shape[1::-1]  # width and height
     labels = read_labels(folder, told.labels, stereo, told.landmarks, size) if told.labels else None
@@ -59,8 +58,7 @@ def import_recording(source: str | Path, mapping: str | Path, out: str | Path, *
     if frames_s[-1] < robot_s[0] or frames_s[0] > robot_s[-1]:
         spans = [f"{time[0]:.3f} to {time[-1]:.3f} s" for time in (robot_time, stereo.time)]
         what = "its times ({}) and those of the frames ({}) do not overlap".format(*spans)
-        unlike = not estimated and bool(stereo_zero) != bool(robot_zero)  # one is dated, the other starts at 0
-        cure = ', or say "estimate" where log and video began together' if unlike else ""
+        cure = ', or say "estimate" where log and video began together' if one_dated and not estimated else ""
         cure = f"Correct robot.offset_s = {told.robot.offset_s!r} in {mapping} (t_robot = t_video + offset_s){cure}"
         raise ValueError(f"{folder / told.robot.file}: {what}. {cure}.")
     if labels is not None:  # the mean instant at which the rows of a frame's labels were read
