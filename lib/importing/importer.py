@@ -177,8 +177,7 @@ def _did(
     time_s, pair, labels = draft.frames.time_s, draft.frames[0], draft.annotations
     step = np.diff(time_s) if len(time_s) > 1 else np.array([0.0])
     seen = () if labels is None else (labels.visibility_left, labels.visibility_right)
-    here = Environment(loader=FileSystemLoader(Path(__file__).parent), trim_blocks=True)
-    text = here.get_template("did.txt").render(
+    text = Environment(loader=FileSystemLoader(Path(__file__).parent), trim_blocks=True).get_template("did.txt").render(
         told=told, stereo=stereo, draft=draft, clock=clock, span_s=np.ptp(time_s), step=step, usual_step=np.median(step),
         is_grey=all((image == image[..., :1]).all() for image in (pair.left, pair.right)),
         gaps=np.isnan(draft.kinematics.x_mm[..., 0]).any(axis=1).sum(),
