@@ -15,9 +15,7 @@ def glint_mask(image: ArrayLike, *, grow_px: int = 5) -> np.ndarray:
         raise ValueError(f"image: expected a uint8 image (h, w, 3) or (h, w), got {image.dtype} {image.shape}.")
     channels = 1 if image.ndim == 2 else image.shape[2]
     core = cv2.inRange(np.ascontiguousarray(image), (245,) * channels, (255,) * channels)
-    if grow_px:
-        core = cv2.dilate(core, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * grow_px + 1,) * 2))
-    return core.astype(bool)
+    return cv2.dilate(core, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * grow_px + 1,) * 2)).astype(bool)
 
 
 def tool_mask(shape: tuple[int, int], u_landmarks: ArrayLike, *, width_px: float | None = None) -> np.ndarray:
