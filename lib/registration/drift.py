@@ -95,9 +95,8 @@ class DriftMonitor:
                 calibrated with, and frame after frame errs alike there, which is no drift.
         """
         data = data if isinstance(data, Correspondences) else Correspondences.of_points(data, u_left, u_right)
-        covariance = self.covariance_px2 + self.sigma_x_mm**2 * self.rig.linear @ self.rig.linear.T
-        if covariance_px2 is not None:
-            covariance = pair_covariance(covariance_px2, len(data))
+        usual = self.covariance_px2 + self.sigma_x_mm**2 * self.rig.linear @ self.rig.linear.T
+        covariance = usual if covariance_px2 is None else pair_covariance(covariance_px2, len(data))
         used, uncertain = data.is_complete, np.zeros((4, 4)) if rig_px2 is None else np.asarray(rig_px2)
         covariance, uncertain = (np.broadcast_to(c, (len(used), 4, 4))[used] for c in (covariance, uncertain))
         covariance, data = covariance + uncertain, data.subset(used)
