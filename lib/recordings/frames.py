@@ -94,8 +94,7 @@ def _may_hold_zeros(data: bytes) -> bool:
 
 def _check_size(path: Path, size: tuple[int, int], expected: tuple[int, int] | None) -> None:
     if expected is not None and size != tuple(expected):
-        told = f"recording.toml says image_size_px = [{expected[0]}, {expected[1]}]"
-        raise ValueError(f"{path}: {size[0]} x {size[1]} px, but {told}.")
+        raise ValueError(f"{path}: {size[0]} x {size[1]} px, but recording.toml says image_size_px = {list(expected)}.")
 
 
 def open_side(folder: Path, side: str, image_size_px: tuple[int, int], bit_depth: int) -> tuple[int, Reader]:
