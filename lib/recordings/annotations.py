@@ -79,7 +79,6 @@ def read_coco(path: Path, n_frames: int, image_size_px: tuple[int, int], landmar
 
     The names in the category order the keypoints, so any order in the file will do; other keypoints are ignored.
     """
-    width, height = image_size_px
     u = np.full((2, n_frames, len(landmarks), 2), np.nan)
     visibility = np.zeros((2, n_frames, len(landmarks)), dtype=np.int64)
     seen = set()
@@ -96,7 +95,7 @@ def read_coco(path: Path, n_frames: int, image_size_px: tuple[int, int], landmar
         xy, v = np.split(values[[names.index(landmark) for landmark in landmarks]], [2], axis=1)
         labelled = v[:, 0] > 0
         if not inside(xy[labelled], image_size_px).all():
-            raise ValueError(f"{where}: a keypoint lies outside the image of {width} x {height} px.")
+            raise ValueError(f"{where}: a keypoint lies outside the image of {image_size_px[0]} x {image_size_px[1]} px.")
         u[side, frame, labelled], visibility[side, frame] = xy[labelled], v[:, 0]
     return Annotations(*u, *visibility)
 
