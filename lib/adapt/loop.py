@@ -252,13 +252,12 @@ class _Work:
         recording, start, rounds = self.recording, self.detector, self.report["rounds"]
         first = self.look("before", start, self.frames)
         seen = self.moving(first, start)
-        few = self.labels if len(self.marked) < _OVERRULE else np.full_like(self.labels, np.nan)
-        still, note = longest_still(recording, seen.labelled(few))
+        nothing = np.full_like(self.labels, np.nan)
+        still, note = longest_still(recording, seen.labelled(self.labels if len(self.marked) < _OVERRULE else nothing))
         self.report["notes"] += [note] if note else []
         self.labels[np.setdiff1d(self.frames, still)], self.marked = np.nan, np.intersect1d(self.marked, still)
-        by_hand, few = Seen.by_hand(self.labels), np.full_like(self.labels, np.nan)
-        if len(self.marked) < _OVERRULE:  # they only take the place of what was detected there
-            by_hand, few = None, self.labels
+        # Few labels only take the place of what was detected there.
+        by_hand, few = (None, self.labels) if len(self.marked) < _OVERRULE else (Seen.by_hand(self.labels), nothing)
         parts = self.parts = stretches(np.setdiff1d(still, self.marked), recording.frames.time_s)
         learn = parts["learn"] = np.union1d(parts["learn"], self.marked)
         self.report["frames"] = {name: len(part) for name, part in parts.items()}
