@@ -120,7 +120,6 @@ class Teacher:
         """
         r, c, offset = self.recording, self.calibration, self.offset_mm
         time = np.repeat(r.frames.time_s[frames][:, None], 3, axis=1) + r.offset_s
-        height = r.image_size_px[1]
         log_s = r.kinematics.time_s
         log = slice(None, None, max(1, int(_TURNS_S * (len(log_s) - 1) / max(np.ptp(log_s), _TURNS_S))))
         u, covariance = np.full((len(frames), 2, 3, 2), np.nan), np.full((len(frames), 2, 3, 2, 2), np.nan)
@@ -141,7 +140,7 @@ class Teacher:
                 if isinstance(camera, NearAffineCamera):  # what the robot parks behind a camera is seen nowhere
                     x[camera.depth_ratio(x.reshape(-1, 3)).reshape(x.shape[:2]) < _BEHIND] = np.nan
                 u[:, side] = camera.project(x.reshape(-1, 3)).reshape(x.shape[:2] + (2,))
-                at = time + r.readout_s * np.nan_to_num(u[:, side, :, 1] / (height - 1) - 0.5).clip(-0.5, 0.5)
+                at = time + r.readout_s * np.nan_to_num(u[:, side, :, 1] / (r.image_size_px[1] - 1) - 0.5).clip(-0.5, 0.5)
             flat, view = np.nan_to_num(x).reshape(-1, 3), slice(2 * side, 2 * side + 2)
             J = c.derivatives(flat)[0][:, view]
             velocity = (r.kinematics.at(at + 0.02) - r.kinematics.at(at - 0.02)).reshape(-1, 3) / 0.04
@@ -258,8 +257,7 @@ def _frozen(recording: Recording, frames: np.ndarray) -> np.ndarray:
     same = np.append(False, (np.diff(np.nan_to_num(k.x_mm.reshape(len(k.x_mm), -1)), axis=0) == 0).all(axis=1))
     first = np.append(np.flatnonzero(~same), len(same))  # samples that differ from the one before
     held_s = k.time_s[first[1:] - 1] - k.time_s[first[:-1]]
-    now_s = recording.frames.time_s[frames] + recording.offset_s
-    nearest = np.interp(now_s, k.time_s, np.arange(len(same))).round()
+    nearest = np.interp(recording.frames.time_s[frames] + recording.offset_s, k.time_s, np.arange(len(same))).round()
     return np.asarray(frames)[held_s[np.searchsorted(first, nearest, side="right") - 1] > _HELD_S]
 
 
