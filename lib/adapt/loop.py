@@ -179,9 +179,9 @@ class _Work:
             given = read_coco(Path(labels), len(recording), recording.image_size_px, recording.skeleton)
             self.labels = np.stack([given.u_left, given.u_right], axis=1)
         self.marked = np.flatnonzero(np.isfinite(self.labels).any(axis=(1, 2, 3)))
-        kept = self.marked[spread(len(self.marked), max(len(recording) - 20, 10))]  # the others stop and judge
-        self.labels[np.setdiff1d(self.marked, kept)], self.marked = np.nan, kept
         self.frames = np.union1d(spread(len(recording), _MOST_FRAMES), self.marked)
+        kept = self.marked[spread(len(self.marked), max(len(self.frames) - 20, 10))]  # the others stop and judge
+        self.labels[np.setdiff1d(self.marked, kept)], self.marked = np.nan, kept
         self.learns = isinstance(self.detector, Detector)  # a stand-in has no networks
         key = [str(recording.folder.resolve()), recording.kinematics.x_mm.tobytes(), self.frames.tobytes(), seed, STEPS]
         key += [RECIPE, recording.offset_s, recording.readout_s, recording.frames.time_s.tobytes(), minutes]
