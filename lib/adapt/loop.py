@@ -180,7 +180,7 @@ class _Work:
             self.labels = np.stack([given.u_left, given.u_right], axis=1)
         self.marked = np.flatnonzero(np.isfinite(self.labels).any(axis=(1, 2, 3)))
         self.frames = np.union1d(spread(len(recording), _MOST_FRAMES), self.marked)
-        kept = self.marked[spread(len(self.marked), max(len(self.frames) - 20, 10))]  # the others stop and judge
+        kept = self.marked[spread(len(self.marked), max(len(self.frames) - 20, 5))]  # the others stop and judge
         self.labels[np.setdiff1d(self.marked, kept)], self.marked = np.nan, kept
         self.learns = isinstance(self.detector, Detector)  # a stand-in has no networks
         key = [str(recording.folder.resolve()), recording.kinematics.x_mm.tobytes(), self.frames.tobytes(), seed, STEPS]

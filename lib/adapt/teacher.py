@@ -53,7 +53,7 @@ _ODD = 0.2  # share of a large offset that may be the detector's all the same: s
 _SURE_MOVE = 0.5
 #: Largest correction of the clock along with cameras and offsets: one step takes motions for straight.
 _LARGEST_STEP_S = 0.03
-_HELD_S = 0.1  # so long a log may repeat a sample that the robot has not renewed
+_HELD_S = 0.12  # so long a log may repeat a sample that the robot has not renewed
 _BEHIND = 0.1  # distance from the camera, as a share of the working distance, below which nothing is in view
 _CONFIDENCES = (MIN_CONFIDENCE, 0.5, 0.8)
 #: Fewer labelled pairs tell neither outliers nor how large the offsets are; the usual ones of a robot, standard deviation.

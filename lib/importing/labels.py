@@ -38,6 +38,8 @@ def read_labels(
     """
     theirs = {labels.names.get(name, name): k for k, name in enumerate(landmarks)}
     frame_of = [{int(f): n for n, f in enumerate(side)} for side in source.index.T]
+    of_files = ([n for n in reel.numbers if isinstance(n, int) and not labels.first_frame] for reel in source.reels)
+    ends = [(min(own, default=0), max(own, default=0)) for own in of_files]  # lowest and highest number of a file
     width, height = image_size_px
     u, v = np.full((2, len(source.time), len(landmarks), 2), np.nan), np.zeros((2, len(source.time), len(landmarks)), int)
     files = [(labels.file, None)] if labels.file else [(f, s) for s, f in enumerate((labels.left, labels.right)) if f]
@@ -65,9 +67,9 @@ def read_labels(
         image = PurePosixPath(label.image.replace("\\", "/"))
         # A bare number counts frames.  One in a name is that of a file, unless first_frame says where it counts from.
         number, of_file = last_number(image), {} if image.name.isdecimal() else source.reels[reel].numbers
-        own = [n for n in of_file if isinstance(n, int) and not labels.first_frame]
-        nth = None if number is None or (own and min(own) < number < max(own)) else number - labels.first_frame
-        frame = frame_of[reel].get(of_file.get(image.stem, of_file.get(number, nth) if own else nth))
+        low, high = ends[reel] if of_file else (0, 0)
+        nth = None if number is None or low < number < high else number - labels.first_frame
+        frame = frame_of[reel].get(of_file.get(image.stem, of_file.get(number, nth) if high else nth))
         if frame is None:
             continue
         if not inside(xy, image_size_px):
