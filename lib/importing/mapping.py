@@ -168,8 +168,7 @@ def read_mapping(path: str | Path) -> Mapping:
     """Read and check a mapping file; errors name the file, the key, what it says and what it may say."""
     path = Path(path)
     if not path.is_file():
-        cure = f"`python3 -m lib import SOURCE --guess --map {path.name}` writes one"
-        raise FileNotFoundError(f"{path}: no such mapping; {cure}.")
+        raise FileNotFoundError(f"{path}: no such file; `python3 -m lib import SOURCE --guess --map {path.name}` writes one.")
     try:
         return Mapping.model_validate(read_toml(path))
     except ValidationError as error:
