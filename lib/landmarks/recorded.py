@@ -46,9 +46,7 @@ def detect(
     return of_recording(recording, u[:, :, 0], u[:, :, 1], frames=chosen, covariance_px2=covariance, confidence=confidence)
 
 
-def with_ground(
-    detector: Callable, recording: Recording | GrowingGround, change: Callable[[np.ndarray], np.ndarray] | None = None
-) -> dict:
+def with_ground(detector: Callable, recording: Recording | GrowingGround, change: Callable | None = None) -> dict:
     """What a call of the detector takes beside a pair of images: their ground, unless it is a stand-in of images alone.
 
     `change` made the images of those of the recording.
