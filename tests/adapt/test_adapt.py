@@ -349,7 +349,7 @@ def test_a_robot_that_errs_teaches_nothing_wrong(world, tmp_path, fault):
 
 
 def test_a_log_may_hold_its_samples_and_not_stand_still():
-    """A robot that reports every 10 ms, logged every millisecond; it stands still from 2 to 4 s and is silent from 6 to 7 s."""
+    """A robot that reports every 10 ms, logged every millisecond; it stands still for 2 s and is silent for 1 s."""
     time_s = np.arange(0, 10, 1e-3)
     moving_s = np.where((time_s > 2) & (time_s < 4), 2.0, time_s)
     x_mm = np.floor(moving_s * 100)[:, None, None] * np.ones((3, 3))

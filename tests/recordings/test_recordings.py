@@ -511,7 +511,7 @@ def test_videos(tmp_path):
         assert abs(read[i].left.mean() - level[i]) < 5.5  # the codec rounds; the next level is 11 away
     rng, bars = np.random.default_rng(0), 1 << np.arange(8)  # a frame shows its number, bit by bit
     for side in ("left", "right"):
-        shown = [np.full((SIZE[1], 8, 3), 0, np.uint8) + 255 * (i & bars > 0)[None, :, None].astype(np.uint8) for i in range(90)]
+        shown = np.uint8([255 * (i & bars > 0) for i in range(90)])[:, None, :, None].repeat(3, axis=3)
         images = np.stack([cv2.resize(image, SIZE, interpolation=cv2.INTER_NEAREST) for image in shown])
         foreign.video(folder / f"{side}.mp4", images, np.cumsum(rng.uniform(0.01, 0.3, 90)))  # at no constant rate
     read = Recording.open(folder).frames
