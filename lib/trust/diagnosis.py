@@ -4,6 +4,7 @@ Those about time are in `lib.trust.clocks`.  Each is fitted under heavy-tailed n
 likelihood, less a penalty for its parameters (BIC), is its evidence.
 """
 
+from collections import ChainMap
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import permutations
@@ -426,7 +427,7 @@ def diagnose(
         kept += [i] if np.linalg.norm(x_mm[i] - x_mm[kept[-1]], axis=1).max() > _RESTS_MM else []
     if max(_FEWEST_FRAMES, 0.25 * len(x_mm)) <= len(kept) < len(x_mm):
         case = Case(Problem.of(data.of_frames(np.unique(data.frame)[kept]), image_size_px), *stated)
-        whole.fits = case.fits
+        whole.fits = ChainMap({}, case.fits)  # its own fits are of other rows
     tests = [_tip_order, _landmark_offset, _tool_bends, _drift, _bad_part, _camera_moved, _frozen]
     tests = [*(TIME_TESTS if case.paths else ()), *tests, _rigid_tips]
     found = [h for test in tests for h in test(whole if test is _frozen else case) if np.isfinite(h.gain)]
