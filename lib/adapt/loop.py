@@ -230,8 +230,9 @@ class _Work:
         """What `find` finds, or what an earlier call kept."""
         path = self.folder / f"{name}.npz"
         if not path.is_file():
+            found = find(progress=partial(self.say, f"Looking ({name})"))
             with files.whole(path) as new:
-                np.savez(new, **find(progress=partial(self.say, f"Looking ({name})"))._asdict())
+                np.savez(new, **found._asdict())
         with np.load(path) as kept:
             return Seen(*(kept[field] for field in Seen._fields))
 
