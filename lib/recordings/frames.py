@@ -140,7 +140,7 @@ def _open_images(folder: Path, image_size_px: tuple[int, int], bit_depth: int) -
 
 
 def _open_video(path: Path, image_size_px: tuple[int, int]) -> tuple[int, Reader]:
-    """A video file; reading in order decodes each frame once, going back seeks, or begins anew."""
+    """A video file.  In order each frame is decoded once; a leap seeks, or where the rate varies decodes all on its way."""
     capture = cv2.VideoCapture(str(path))
     if not capture.isOpened():
         raise ValueError(f"{path}: the video cannot be opened; H.264 or MPEG-4 in an .mp4 file works.")

@@ -33,7 +33,7 @@ _STRETCHES, _PARTS = 60, 8
 _LEAST_SCALED, _SURE_SCALED, _OWN_SD = 0.03, 5.0, 0.006
 #: Least share of the variance that it explains, most that it leaves (RMS), and least turning of the jaws (RMS of n^2).
 _MOST_OF_IT, _ODD, _TURNED = 0.5, 0.03, 0.01
-_RESTS_MM, _RESTS_FRAMES = 0.06, 5  # a tool whose landmarks move less in so many frames rests; noise included
+_RESTS, _RESTS_MM = 4, 0.06  # a tool rests whose landmarks are where they were so many frames before, noise included
 _STILL_PX = 0.3  # detections of one picture differ by less
 BY_GEOMETRY = ("scaled_axis", "mirrored_axis", "exchanged_eyes", "mirrored_images")  # which the residuals do not show
 _ACROSS = 0.15  # sine of a tool's angle to the images, below which it points neither way
@@ -422,11 +422,8 @@ def diagnose(
     stated = kinematics, offset_s, readout_s, image_size_px
     whole = case = Case(problem, *stated)
     # Where a tool rests its detections repeat one error, which is no fault that begins or ends there.
-    first, x_mm = [0], np.nan_to_num(data.grid("x_mm"))
-    for i in range(1, len(x_mm)):
-        first += [i] if np.linalg.norm(x_mm[i] - x_mm[first[-1]], axis=1).max() > _RESTS_MM else []
-    length = np.diff([*first, len(x_mm)])
-    kept = np.isin(np.arange(len(x_mm)), first) | np.repeat(length < _RESTS_FRAMES, length)
+    x_mm, kept = np.nan_to_num(data.grid("x_mm")), np.ones(len(np.unique(data.frame)), dtype=bool)
+    kept[_RESTS:] = np.linalg.norm(x_mm[_RESTS:] - x_mm[:-_RESTS], axis=2).max(axis=1) > _RESTS_MM
     if kept.sum() >= max(_FEWEST_FRAMES, 0.25 * len(kept)) and not kept.all():
         case = Case(Problem.of(data.of_frames(np.unique(data.frame)[kept]), image_size_px), *stated)
         whole.fits = ChainMap({}, case.fits)  # its own fits are of other rows
