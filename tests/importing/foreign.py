@@ -160,6 +160,8 @@ def robot_bag(folder: Path, source: Shipped, version: int = 2) -> str:
             ns = 1_700_000_000_000_000_000 + round(1e9 * time)
             sequence = {} if version == 2 else {"seq": 0}
             for topic, mm in zip(topics, x, strict=True):
+                if np.isnan(mm).any():  # this topic is silent
+                    continue
                 stamp = header(stamp=at(sec=ns // 10**9, nanosec=ns % 10**9), frame_id="robot", **sequence)
                 message = stamped(header=stamp, point=point(*(float(v) / 1e3 for v in mm)))
                 data = store.serialize_cdr if version == 2 else store.serialize_ros1

@@ -15,7 +15,7 @@ from lib.calibration import calibrate
 from lib.calibration.offsets import tool_axes
 from lib.correspondences import of_recording
 from lib.geometry import RigidTransform
-from lib.importing import guess_mapping, import_recording, importer, read_mapping
+from lib.importing import guess_mapping, import_recording, importer, logs, read_mapping
 from lib.recordings import Annotations, Recording
 from lib.recordings.frames import Frames
 from tests.importing import foreign
@@ -93,6 +93,15 @@ def test_a_foreign_form_comes_back(form, shipped, tmp_path):
         frame = recording.frames[3]
         assert np.abs(frame.left.astype(float) - shipped.frames[3, 0]).mean() < 4
         assert np.abs(frame.right.astype(float) - shipped.frames[3, 1]).mean() < 4
+
+
+def test_a_topic_that_drops_out_leaves_its_landmark_blank(shipped, tmp_path):
+    silent, x_mm = (shipped.robot_s > 3.0) & (shipped.robot_s < 6.0), shipped.x_mm.copy()
+    x_mm[silent, 1] = np.nan
+    folder, mapping = source_of(tmp_path, replace(shipped, x_mm=x_mm), foreign.side_by_side, foreign.robot_bag)
+    found = logs.read_robot(folder, read_mapping(mapping))[1]
+    blank = np.isnan(found).any(axis=2)
+    assert blank[silent][2:-2, 1].all() and not blank[:, [0, 2]].any() and blank[~silent, 1].sum() <= 2
 
 
 def test_an_import_is_repeatable_and_says_what_it_did(shipped, tmp_path):
