@@ -73,7 +73,11 @@ class GrowingGround:
 
 
 def _median(images: Sequence[np.ndarray]) -> np.ndarray:
-    return np.partition(np.stack(images), len(images) // 2, axis=0)[len(images) // 2]
+    ranked, middle = list(images), len(images) // 2
+    for last in range(len(ranked) - 1, middle - 1, -1):  # the brightest of those up to it goes there
+        for i in range(last):
+            ranked[i : i + 2] = np.minimum(*ranked[i : i + 2]), np.maximum(*ranked[i : i + 2])
+    return ranked[middle]
 
 
 def apart(x: np.ndarray, count: int) -> np.ndarray:
