@@ -3,6 +3,7 @@
 import csv
 import io
 import math
+import re
 import tomllib
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -12,6 +13,9 @@ import numpy as np
 
 from lib.correspondences import LANDMARKS
 from lib.files import write_text
+
+#: Where the number of an empty cell would stand, among others in its line.
+_EMPTY = re.compile(r"(?<![^,\n])(?=,)|(?<=,)(?![^\n])")
 
 
 def columns(axes: Sequence[str], landmarks: Sequence[str] = LANDMARKS) -> list[str]:
@@ -85,11 +89,11 @@ def read_table(path: Path, names: Sequence[str], optional: Sequence[str] = (), n
         detail = [f"{what}: {', '.join(which)}" for what, which in (("missing", missing), ("unknown", unknown)) if which]
         found = "; ".join(detail) or "order or repetition"
         raise ValueError(f"{path}, line 1: wrong columns ({found}). Expected: {','.join(wanted)}.")
-    found = np.full((0, 0), np.nan)
-    many = text.count("\n") > 100 and "\r" not in text.replace("\r\n", "\n")
-    with suppress(ValueError):  # the quick way, which knows no empty cells and names no lines
-        found = np.loadtxt(io.StringIO(text), delimiter=",", skiprows=1, comments=None, ndmin=2) if many else found
-    if found.shape[1] != len(wanted) or not np.isfinite(found).all():
+    found, body = np.full((0, 0), np.nan), text.replace("\r\n", "\n").partition("\n")[2]
+    if body.count("\n") > 99 and not re.search("[\rnN]", body):  # no NaN but that of an empty cell
+        with suppress(ValueError):  # the quick way, which names no lines
+            found = np.loadtxt(io.StringIO(_EMPTY.sub("nan", body)), delimiter=",", comments=None, ndmin=2)
+    if found.shape[1] != len(wanted) or np.isinf(found).any():
         found = [[number(cell, place, name) for cell, name in zip(cells, wanted, strict=True)] for place, cells in rows]
     table = np.full((len(found), len(names) + len(optional)), np.nan)
     table[:, : len(wanted)] = np.array(found, dtype=np.float64).reshape(len(found), len(wanted))
