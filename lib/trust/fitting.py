@@ -155,42 +155,47 @@ class Problem:
         H = np.where(self.used[:, :, None], np.concatenate([self.x, np.ones((len(self), 2, 1))], axis=2), 0.0)
         return np.einsum("nck,cv,ij->ncivjk", H, np.eye(2), np.eye(2)).reshape(len(self), 2, 2, 16)
 
+    @cached_property
+    def _of_offsets(self) -> np.ndarray:
+        """(2, 3, n * 9): what the offsets add to the positions for the left and the right image, 0 where it is not used."""
+        own = self.used[:, :, None] & (self.landmark[:, None, None] == np.arange(3))  # (n, 2, 3)
+        return np.einsum("nij,nck->cinkj", self.axes, own).reshape(2, 3, -1)
+
     def _design(self, M: np.ndarray, columns: Callable | None) -> np.ndarray:
         """(n, 2, 2, p): derivatives by the 16 entries of M, 9 offsets (mm), 1/distance, additions; 0 in images not used."""
-        image = (M[:, :, :3].reshape(4, 3) @ self.axes).reshape(len(self), 2, 2, 1, 3)
-        own = self.used[:, :, None] & (self.landmark[:, None, None] == np.arange(3))  # (n, 2, 3)
-        parts = [self._of_matrices, (image * own[:, :, None, :, None]).reshape(len(self), 2, 2, 9)]
-        rest = [_shrinking(M, self.x, self._of_matrices @ M.ravel() - self.centre_px)[..., None]]
-        rest += [] if columns is None else [columns(M)]
-        parts += [np.where(self.used[:, :, None, None], np.nan_to_num(part), 0.0) for part in rest]
-        return np.concatenate(parts, axis=3)
+        image = (M[:, :, :3] @ self._of_offsets).reshape(2, 2, len(self), 9).transpose(2, 0, 1, 3)
+        seen = (self._of_matrices.reshape(-1, 16) @ M.ravel()).reshape(self.y.shape)
+        rest = [_shrinking(M, self.x, seen - self.centre_px)[..., None], *([] if columns is None else [columns(M)])]
+        rest = [np.where(self.used[:, :, None, None], np.nan_to_num(part), 0.0) for part in rest]
+        return np.concatenate([self._of_matrices, image, *rest], axis=3)
 
     def _descend(self, beta: np.ndarray, columns: Callable | None, apart: np.ndarray, rounds: int) -> Robust:
         used, y = self.used, np.where(self.used[:, :, None], self.y, 0.0)
         groups = [rows for rows in (used & ~apart[:, None], used & apart[:, None]) if rows.any()]
         prior = np.repeat([0.0, self.offset_sd**-2, self.nearness_sd**-2], [16, 9, 1])
         M = beta[:16].reshape(2, 2, 4)
-        r = y - self._design(M, None) @ beta
+        r = y - (self._design(M, None).reshape(-1, 26) @ beta).reshape(y.shape)
         r2 = (r**2).sum(axis=2) / self.noise**2
         # Few rows a parameter: a density with a sharp peak would fit some of them exactly.
         rich = 2 * used.sum() / (_PARAMETERS + (0 if columns is None else columns(M).shape[3]))
         least = 0.0 if rich > 10 else 2.0 if rich > 5 else 10.0
         shapes = [Shape.of(r2[rows], max(float(np.sqrt(np.median(r2[rows]))), _LEAST_PX), least) for rows in groups]
-        before = -np.inf
+        before, of_noise = -np.inf, -2.0 * np.log(self.noise[used]).sum()
         for _ in range(rounds):
             weight = np.zeros(used.shape)
             for rows, shape in zip(groups, shapes, strict=True):
                 weight[rows] = (shape.freedom + 2.0) / (shape.freedom * shape.scale**2 + r2[rows])
             weight /= self.noise**2
-            D, root = self._design(M, columns), np.sqrt(weight)[:, :, None]
-            J = (D * root[:, :, :, None]).reshape(-1, D.shape[3])
-            information = J.T @ J + np.diag(np.append(prior, np.zeros(D.shape[3] - 26)))
+            root = np.sqrt(weight)[:, :, None]
+            D = self._design(M, columns).reshape(y.size, -1)
+            J = D * np.broadcast_to(root, y.shape).reshape(-1, 1)
+            information = J.T @ J + np.diag(np.append(prior, np.zeros(D.shape[1] - 26)))
             scale = 1.0 / np.sqrt(np.diag(information) + 1e-12)
             information = information * np.outer(scale, scale) + 1e-10 * np.eye(len(scale))  # an unseen addition stays 0
             beta = scale * np.linalg.solve(information, scale * (J.T @ (y * root).reshape(-1)))
-            M, r = beta[:16].reshape(2, 2, 4), y - D @ beta
+            M, r = beta[:16].reshape(2, 2, 4), y - (D @ beta).reshape(y.shape)
             r2 = (r**2).sum(axis=2) / self.noise**2
-            likelihood = -2.0 * np.log(self.noise[used]).sum()
+            likelihood = of_noise
             for i, rows in enumerate(groups):
                 shapes[i] = Shape.of(r2[rows], shapes[i].scale, least, shapes[i].freedom)
                 likelihood += shapes[i].log_density(r2[rows]).sum()
@@ -203,7 +208,7 @@ class Problem:
         inverse = np.linalg.inv(information) * np.outer(scale, scale) * design * told
         offset_sd = np.sqrt(np.diag(inverse)[16:25].reshape(3, 3).sum(axis=1))
         nearness = float(beta[25]), float(np.sqrt(inverse[25, 25]))
-        added = beta[26:], inverse[26:, 26:], D[..., 26:] @ beta[26:]
+        added = beta[26:], inverse[26:, 26:], (D[:, 26:] @ beta[26:]).reshape(y.shape)
         found = *added, beta[16:25].reshape(3, 3), offset_sd, nearness, inverse[:16, :16]
         return Robust(beta[:26], M, *found, r, tuple(shapes), total, design)
 
