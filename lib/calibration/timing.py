@@ -196,19 +196,23 @@ def shift_misfits(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         seen = np.isfinite(u).all(axis=1)
         used = np.isfinite(x[:, seen]).all(axis=2)
         good = used.sum(axis=1) >= max(8, 0.6 * seen.sum())
-        used = used[good]
-        H = np.where(used[:, :, None], np.concatenate([x[good][:, seen], np.ones((*used.shape, 1))], axis=2), 0.0)
+        if not good.any():
+            continue
+        used, own = used[good], x[good][:, seen]
+        own = own - own[used].mean(axis=0)  # far from the origin the normal equations would lose digits
+        H = np.where(used[:, :, None], np.concatenate([own, np.ones((*used.shape, 1))], axis=2), 0.0)
         u, weight, count = u[seen], used.astype(float), used.sum(axis=1)
         middle = np.column_stack([(count - 1) // 2, count // 2])  # of the used ones; nanmedian takes ten times as long
-        for _ in range(10 if good.any() else 0):
+        for _ in range(10):
             WH = (H * weight[:, :, None]).transpose(0, 2, 1)
-            r = u - H @ (np.linalg.pinv(WH @ H, hermitian=True) @ (WH @ u))
+            G = WH @ H
+            G += 1e-14 * np.trace(G, axis1=1, axis2=2)[:, None, None] * np.eye(4)  # of a tool at rest it is singular
+            r = u - H @ np.linalg.solve(G, WH @ u)
             r2 = r[..., 0] ** 2 + r[..., 1] ** 2  # a sum over an axis of two takes ten times as long
             ranked = np.take_along_axis(np.sort(np.where(used, r2, np.inf), axis=1), middle, axis=1)
             s2 = np.maximum(ranked.mean(axis=1, keepdims=True), 1e-4)
             weight = np.where(used, 1.0 / (s2 + r2), 0.0)
-        if good.any():
-            found[good, c] = np.log(s2[:, 0]) + 1.5 * np.average(np.log1p(r2 / s2), axis=1, weights=used)
+        found[good, c] = np.log(s2[:, 0]) + 1.5 * np.average(np.log1p(r2 / s2), axis=1, weights=used)
     return found
 
 

@@ -47,7 +47,7 @@ class Shape:
             tried = tried[np.abs(np.arange(len(tried)) - np.flatnonzero(tried == before)[0]) <= 1]
         freedom, s2 = tried[:, None], np.full((len(tried), 1), start**2)
         for _ in range(4):
-            weighted = (r2 / (freedom + r2 / s2)).sum(axis=1, keepdims=True)
+            weighted = s2 * (r2 / (freedom * s2 + r2)).sum(axis=1, keepdims=True)
             s2 = np.maximum((freedom + 2.0) / (2.0 * len(r2)) * weighted, _LEAST_PX**2)
         best = cls(np.sqrt(s2), freedom).log_density(r2).sum(axis=1).argmax()
         return cls(float(np.sqrt(s2[best, 0])), float(tried[best]))
@@ -150,9 +150,14 @@ class Problem:
         return self.y - seen - fit.nearness[0] * _shrinking(fit.M, x, seen - self.centre_px)
 
     @cached_property
+    def _known(self) -> np.ndarray:
+        """(n, 2, 3) mm: the positions, 0 in images that are not used."""
+        return np.where(self.used[:, :, None], self.x, 0.0)
+
+    @cached_property
     def _of_matrices(self) -> np.ndarray:
         """(n, 2, 2, 16): derivatives by the entries of the cameras, 0 in images that are not used."""
-        H = np.where(self.used[:, :, None], np.concatenate([self.x, np.ones((len(self), 2, 1))], axis=2), 0.0)
+        H = np.concatenate([self._known, self.used[:, :, None]], axis=2)
         return np.einsum("nck,cv,ij->ncivjk", H, np.eye(2), np.eye(2)).reshape(len(self), 2, 2, 16)
 
     @cached_property
@@ -165,19 +170,21 @@ class Problem:
         """(n, 2, 2, p): derivatives by the 16 entries of M, 9 offsets (mm), 1/distance, additions; 0 in images not used."""
         image = (M[:, :, :3] @ self._of_offsets).reshape(2, 2, len(self), 9).transpose(2, 0, 1, 3)
         seen = (self._of_matrices.reshape(-1, 16) @ M.ravel()).reshape(self.y.shape)
-        rest = [_shrinking(M, self.x, seen - self.centre_px)[..., None], *([] if columns is None else [columns(M)])]
-        rest = [np.where(self.used[:, :, None, None], np.nan_to_num(part), 0.0) for part in rest]
-        return np.concatenate([self._of_matrices, image, *rest], axis=3)
+        parts = [self._of_matrices, image, _shrinking(M, self._known, seen - self.centre_px)[..., None]]
+        if columns is not None:
+            parts.append(np.where(self.used[:, :, None, None], np.nan_to_num(columns(M)), 0.0))
+        return np.concatenate(parts, axis=3)
 
     def _descend(self, beta: np.ndarray, columns: Callable | None, apart: np.ndarray, rounds: int) -> Robust:
         used, y = self.used, np.where(self.used[:, :, None], self.y, 0.0)
         groups = [rows for rows in (used & ~apart[:, None], used & apart[:, None]) if rows.any()]
-        prior = np.repeat([0.0, self.offset_sd**-2, self.nearness_sd**-2], [16, 9, 1])
         M = beta[:16].reshape(2, 2, 4)
+        extra = 0 if columns is None else columns(M).shape[3]
+        prior = np.diag(np.repeat([0.0, self.offset_sd**-2, self.nearness_sd**-2, 0.0], [16, 9, 1, extra]))
         r = y - (self._design(M, None).reshape(-1, 26) @ beta).reshape(y.shape)
         r2 = (r**2).sum(axis=2) / self.noise**2
         # Few rows a parameter: a density with a sharp peak would fit some of them exactly.
-        rich = 2 * used.sum() / (_PARAMETERS + (0 if columns is None else columns(M).shape[3]))
+        rich = 2 * used.sum() / (_PARAMETERS + extra)
         least = 0.0 if rich > 10 else 2.0 if rich > 5 else 10.0
         shapes = [Shape.of(r2[rows], max(float(np.sqrt(np.median(r2[rows]))), _LEAST_PX), least) for rows in groups]
         before, of_noise = -np.inf, -2.0 * np.log(self.noise[used]).sum()
@@ -189,7 +196,7 @@ class Problem:
             root = np.sqrt(weight)[:, :, None]
             D = self._design(M, columns).reshape(y.size, -1)
             J = D * np.broadcast_to(root, y.shape).reshape(-1, 1)
-            information = J.T @ J + np.diag(np.append(prior, np.zeros(D.shape[1] - 26)))
+            information = J.T @ J + prior
             scale = 1.0 / np.sqrt(np.diag(information) + 1e-12)
             information = information * np.outer(scale, scale) + 1e-10 * np.eye(len(scale))  # an unseen addition stays 0
             beta = scale * np.linalg.solve(information, scale * (J.T @ (y * root).reshape(-1)))
@@ -199,7 +206,7 @@ class Problem:
             for i, rows in enumerate(groups):
                 shapes[i] = Shape.of(r2[rows], shapes[i].scale, least, shapes[i].freedom)
                 likelihood += shapes[i].log_density(r2[rows]).sum()
-            total = float(likelihood - 0.5 * prior @ beta[:26] ** 2)
+            total = float(likelihood - 0.5 * beta @ prior @ beta)
             if abs(total - before) < 0.02:
                 break
             before = total
