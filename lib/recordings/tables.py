@@ -3,7 +3,6 @@
 import csv
 import io
 import math
-import re
 import tomllib
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -13,9 +12,6 @@ import numpy as np
 
 from lib.correspondences import LANDMARKS
 from lib.files import write_text
-
-#: Where the number of an empty cell would stand, among others in its line.
-_EMPTY = re.compile(r"(?<![^,\n])(?=,)|(?<=,)(?![^\n])")
 
 
 def columns(axes: Sequence[str], landmarks: Sequence[str] = LANDMARKS) -> list[str]:
@@ -90,9 +86,10 @@ def read_table(path: Path, names: Sequence[str], optional: Sequence[str] = (), n
         found = "; ".join(detail) or "order or repetition"
         raise ValueError(f"{path}, line 1: wrong columns ({found}). Expected: {','.join(wanted)}.")
     found, body = np.full((0, 0), np.nan), text.replace("\r\n", "\n").partition("\n")[2]
-    if body.count("\n") > 99 and not re.search("[\rnN]", body):  # no NaN but that of an empty cell
+    if not any(letter in body for letter in "\rnN"):  # no NaN but that of an empty cell
         with suppress(ValueError):  # the quick way, which names no lines
-            found = np.loadtxt(io.StringIO(_EMPTY.sub("nan", body)), delimiter=",", comments=None, ndmin=2)
+            cells = [line.split(",") for line in body.split("\n") if line]
+            found = np.array([[float(cell or "nan") for cell in row] for row in cells], ndmin=2)
     if found.shape[1] != len(wanted) or np.isinf(found).any():
         found = [[number(cell, place, name) for cell, name in zip(cells, wanted, strict=True)] for place, cells in rows]
     table = np.full((len(found), len(names) + len(optional)), np.nan)
