@@ -12,8 +12,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-_NEXT = np.array([1, 2, 0])  # the axis after each one
-
 
 def points(values: ArrayLike, dimension: int, name: str) -> np.ndarray:
     """`values`, (n, dimension) or a single point, as a float64 array (n, dimension); NaN passes.
@@ -114,7 +112,7 @@ def precision(covariance: np.ndarray, views: np.ndarray) -> np.ndarray:
 
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """`np.cross` of vectors (..., 3), which takes several times as long for few of them."""
-    return (a * b[..., _NEXT] - a[..., _NEXT] * b)[..., _NEXT]
+    return (a * b[..., [1, 2, 0]] - a[..., [1, 2, 0]] * b)[..., [1, 2, 0]]
 
 
 def view_distances2(residual: np.ndarray, covariance: np.ndarray) -> np.ndarray:

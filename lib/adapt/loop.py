@@ -411,10 +411,9 @@ def simulated_like(images: Iterable[np.ndarray], seed: int, progress: bool) -> l
     """Simulated frames in the colours of some images, so that what others look like is not forgotten; kept in the cache."""
     folder = paths.CACHE / "adapt" / "simulated"
     generate(folder, "held_out", _SIMULATED_SHARDS, progress=progress)
-    rng, like, found = np.random.default_rng([seed, 1]), [], []
-    for image in images:
-        lab = cv2.cvtColor(np.ascontiguousarray(image[::4, ::4]), cv2.COLOR_RGB2LAB).reshape(-1, 3)
-        like.append((lab.mean(axis=0), lab.std(axis=0)))
+    pixels = (cv2.cvtColor(np.ascontiguousarray(image[::4, ::4]), cv2.COLOR_RGB2LAB).reshape(-1, 3) for image in images)
+    like = [(lab.mean(axis=0), lab.std(axis=0)) for lab in pixels]
+    rng, found = np.random.default_rng([seed, 1]), []
     for labelled in validation_images(folder):
         lab = cv2.cvtColor(labelled.image, cv2.COLOR_RGB2LAB).astype(np.float32)
         mean, sd = like[rng.integers(len(like))]

@@ -45,8 +45,7 @@ def write(found: Adaptation, folder: str | Path, recording: Recording | None = N
 
 def _pictures(found: Adaptation, recording: Recording) -> list[tuple[str, str]]:
     """(caption, picture) of frames for judging, before above after: the best, the median and the worst after."""
-    order = np.argsort(found.after.relative)
-    order = order[np.isfinite(found.after.relative[order])]
+    order = np.argsort(found.after.relative)[: np.isfinite(found.after.relative).sum()]
     pictures = []
     for name, i in zip(("best", "median", "worst"), (0, len(order) // 2, -1), strict=True) if len(order) else ():
         number = int(found.frames["judge"][order[i]])

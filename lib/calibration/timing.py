@@ -196,13 +196,11 @@ def shift_misfits(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         seen = np.isfinite(u).all(axis=1)
         used = np.isfinite(x[:, seen]).all(axis=2)
         good = used.sum(axis=1) >= max(8, 0.6 * seen.sum())
-        if not good.any():
-            continue
         used, own = used[good], x[good][:, seen]
-        own = own - own[used].mean(axis=0)  # far from the origin the normal equations would lose digits
+        own = own - own[used].sum(axis=0) / max(used.sum(), 1)  # far from the origin the normal equations would lose digits
         H = np.where(used[:, :, None], np.concatenate([own, np.ones((*used.shape, 1))], axis=2), 0.0)
-        u, weight, count = u[seen], used.astype(float), used.sum(axis=1)
-        middle = np.column_stack([(count - 1) // 2, count // 2])  # of the used ones; nanmedian takes ten times as long
+        u, weight = u[seen], used.astype(float)
+        middle = (used.sum(axis=1, keepdims=True) - [1, 0]) // 2  # of the used ones; nanmedian takes ten times as long
         for _ in range(10):
             WH = (H * weight[:, :, None]).transpose(0, 2, 1)
             G = WH @ H

@@ -177,7 +177,7 @@ def _did(
     time_s, pair, labels = draft.frames.time_s, draft.frames[0], draft.annotations
     step = np.diff(time_s) if len(time_s) > 1 else np.array([0.0])
     seen = () if labels is None else (labels.visibility_left, labels.visibility_right)
-    text = Environment(loader=FileSystemLoader(Path(__file__).parent), trim_blocks=True).get_template("did.txt").render(
+    return Environment(loader=FileSystemLoader(Path(__file__).parent), trim_blocks=True).get_template("did.txt").render(
         told=told, stereo=stereo, draft=draft, clock=clock, span_s=np.ptp(time_s), step=step, usual_step=np.median(step),
         is_grey=all((image == image[..., :1]).all() for image in (pair.left, pair.right)),
         gaps=np.isnan(draft.kinematics.x_mm[..., 0]).any(axis=1).sum(),
@@ -185,8 +185,7 @@ def _did(
         zero_s=float(zeros[0] - zeros[1]) if all(zeros) else 0.0,
         silent=np.isnan(draft.landmarks_mm()).all(axis=(1, 2)).sum(),
         labelled=tuple((visibility > 0).any(axis=1).sum() for visibility in seen),
-    )  # fmt: skip
-    return text.rstrip().split("\n")
+    ).rstrip().split("\n")  # fmt: skip
 
 
 def _sources(folder: Path, told: Mapping, stereo: StereoSource) -> list[dict]:

@@ -85,11 +85,10 @@ def read_table(path: Path, names: Sequence[str], optional: Sequence[str] = (), n
         detail = [f"{what}: {', '.join(which)}" for what, which in (("missing", missing), ("unknown", unknown)) if which]
         found = "; ".join(detail) or "order or repetition"
         raise ValueError(f"{path}, line 1: wrong columns ({found}). Expected: {','.join(wanted)}.")
-    found, body = np.full((0, 0), np.nan), text.replace("\r\n", "\n").partition("\n")[2]
+    found, body = np.empty((0, 0)), text.replace("\r\n", "\n").partition("\n")[2]
     if not any(letter in body for letter in "\rnN"):  # no NaN but that of an empty cell
         with suppress(ValueError):  # the quick way, which names no lines
-            cells = [line.split(",") for line in body.split("\n") if line]
-            found = np.array([[float(cell or "nan") for cell in row] for row in cells], ndmin=2)
+            found = np.array([[float(cell or "nan") for cell in row.split(",")] for row in body.split("\n") if row], ndmin=2)
     if found.shape[1] != len(wanted) or np.isinf(found).any():
         found = [[number(cell, place, name) for cell, name in zip(cells, wanted, strict=True)] for place, cells in rows]
     table = np.full((len(found), len(names) + len(optional)), np.nan)

@@ -177,9 +177,8 @@ def assemble(
     grounds = (drawn_ground(one.image, rng) for one in frames[::8])
     bare = [LabelledImage(f"bare {i}", image, np.full((3, 2), np.nan), np.zeros(3)) for i, image in enumerate(grounds)]
     near_by = [LabelledImage(f"near {i}", *sample(rng, **near)) for i in range(len(frames) // 4)]
-    typical = []
-    for recording in map(Recording.open, recordings):  # 16 images of each, spread over it
-        typical += labelled_images(recording, every=max(1, len(recording.frames) // 8))
+    opened = map(Recording.open, recordings)  # 16 images of each, spread over it
+    typical = [one for own in opened for one in labelled_images(own, every=max(1, len(own.frames) // 8))]
     networks = {f"{stage}_network": training.network.halved() for stage, training in stages.items()}
     detector = Detector(**networks, frame_px=FRAME_PX[0])
     detector = fit_error_models(detector, frames[::2] + bare + typical, for_closeups=near_by, progress=True)

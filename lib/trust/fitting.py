@@ -150,29 +150,20 @@ class Problem:
         return self.y - seen - fit.nearness[0] * _shrinking(fit.M, x, seen - self.centre_px)
 
     @cached_property
-    def _known(self) -> np.ndarray:
-        """(n, 2, 3) mm: the positions, 0 in images that are not used."""
-        return np.where(self.used[:, :, None], self.x, 0.0)
-
-    @cached_property
     def _of_matrices(self) -> np.ndarray:
         """(n, 2, 2, 16): derivatives by the entries of the cameras, 0 in images that are not used."""
-        H = np.concatenate([self._known, self.used[:, :, None]], axis=2)
+        H = np.where(self.used[:, :, None], np.concatenate([self.x, np.ones((len(self), 2, 1))], axis=2), 0.0)
         return np.einsum("nck,cv,ij->ncivjk", H, np.eye(2), np.eye(2)).reshape(len(self), 2, 2, 16)
-
-    @cached_property
-    def _of_offsets(self) -> np.ndarray:
-        """(2, 3, n * 9): what the offsets add to the positions for the left and the right image, 0 where it is not used."""
-        own = self.used[:, :, None] & (self.landmark[:, None, None] == np.arange(3))  # (n, 2, 3)
-        return np.einsum("nij,nck->cinkj", self.axes, own).reshape(2, 3, -1)
 
     def _design(self, M: np.ndarray, columns: Callable | None) -> np.ndarray:
         """(n, 2, 2, p): derivatives by the 16 entries of M, 9 offsets (mm), 1/distance, additions; 0 in images not used."""
-        image = (M[:, :, :3] @ self._of_offsets).reshape(2, 2, len(self), 9).transpose(2, 0, 1, 3)
+        x = np.where(self.used[:, :, None], self.x, 0.0)
+        image = (M[:, :, :3].reshape(4, 3) @ self.axes).reshape(len(self), 2, 2, 3)
+        own = np.where(self.used[:, :, None] & (self.landmark[:, None, None] == np.arange(3)), 1.0, 0.0)  # (n, 2, 3)
+        of_offsets = np.einsum("ncij,nck->ncikj", image, own).reshape(len(self), 2, 2, 9)
         seen = (self._of_matrices.reshape(-1, 16) @ M.ravel()).reshape(self.y.shape)
-        parts = [self._of_matrices, image, _shrinking(M, self._known, seen - self.centre_px)[..., None]]
-        if columns is not None:
-            parts.append(np.where(self.used[:, :, None, None], np.nan_to_num(columns(M)), 0.0))
+        parts = [self._of_matrices, of_offsets, _shrinking(M, x, seen - self.centre_px)[..., None]]
+        parts += [] if columns is None else [np.where(self.used[:, :, None, None], np.nan_to_num(columns(M)), 0.0)]
         return np.concatenate(parts, axis=3)
 
     def _descend(self, beta: np.ndarray, columns: Callable | None, apart: np.ndarray, rounds: int) -> Robust:
@@ -192,9 +183,7 @@ class Problem:
             weight = np.zeros(used.shape)
             for rows, shape in zip(groups, shapes, strict=True):
                 weight[rows] = (shape.freedom + 2.0) / (shape.freedom * shape.scale**2 + r2[rows])
-            weight /= self.noise**2
-            root = np.sqrt(weight)[:, :, None]
-            D = self._design(M, columns).reshape(y.size, -1)
+            D, root = self._design(M, columns).reshape(y.size, -1), (np.sqrt(weight) / self.noise)[:, :, None]
             J = D * np.broadcast_to(root, y.shape).reshape(-1, 1)
             information = J.T @ J + prior
             scale = 1.0 / np.sqrt(np.diag(information) + 1e-12)
@@ -202,11 +191,9 @@ class Problem:
             beta = scale * np.linalg.solve(information, scale * (J.T @ (y * root).reshape(-1)))
             M, r = beta[:16].reshape(2, 2, 4), y - (D @ beta).reshape(y.shape)
             r2 = (r**2).sum(axis=2) / self.noise**2
-            likelihood = of_noise
-            for i, rows in enumerate(groups):
-                shapes[i] = Shape.of(r2[rows], shapes[i].scale, least, shapes[i].freedom)
-                likelihood += shapes[i].log_density(r2[rows]).sum()
-            total = float(likelihood - 0.5 * beta @ prior @ beta)
+            shapes = [Shape.of(r2[rows], old.scale, least, old.freedom) for rows, old in zip(groups, shapes, strict=True)]
+            likelihood = sum(shape.log_density(r2[rows]).sum() for rows, shape in zip(groups, shapes, strict=True))
+            total = float(of_noise + likelihood - 0.5 * beta @ prior @ beta)
             if abs(total - before) < 0.02:
                 break
             before = total
@@ -215,16 +202,14 @@ class Problem:
         inverse = np.linalg.inv(information) * np.outer(scale, scale) * design * told
         offset_sd = np.sqrt(np.diag(inverse)[16:25].reshape(3, 3).sum(axis=1))
         nearness = float(beta[25]), float(np.sqrt(inverse[25, 25]))
-        added = beta[26:], inverse[26:, 26:], (D[:, 26:] @ beta[26:]).reshape(y.shape)
-        found = *added, beta[16:25].reshape(3, 3), offset_sd, nearness, inverse[:16, :16]
-        return Robust(beta[:26], M, *found, r, tuple(shapes), total, design)
+        found = beta[26:], inverse[26:, 26:], (D[:, 26:] @ beta[26:]).reshape(y.shape), beta[16:25].reshape(3, 3), offset_sd
+        return Robust(beta[:26], M, *found, nearness, inverse[:16, :16], r, tuple(shapes), total, design)
 
     def _overcount(self, z: np.ndarray) -> float:
         """Variance of the sums of weighted residuals z (n, 2, 2) over stretches of frames, over that of independent ones."""
         stretch = self.frame // max(1, min(_BLOCK, (int(self.frame.max(initial=0)) + 1) // 6))
-        sums = np.zeros((int(stretch.max(initial=0)) + 1, 2))
-        np.add.at(sums, stretch, z.sum(axis=1))
-        return float(max(1.0, ((sums**2).sum(axis=0) / np.maximum((z**2).sum(axis=(0, 1)), 1e-300)).mean()))
+        sums = np.array([np.bincount(stretch, one) for one in z.sum(axis=1).T])  # (2, stretches)
+        return float(max(1.0, ((sums**2).sum(axis=1) / np.maximum((z**2).sum(axis=(0, 1)), 1e-300)).mean()))
 
 
 def _shrinking(M: np.ndarray, x: np.ndarray, from_centre: np.ndarray) -> np.ndarray:
