@@ -1,9 +1,9 @@
 """The mapping file of an import: what lies where in the source, in which units, under which names."""
 
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from lib.correspondences import LANDMARKS
 from lib.recordings.tables import read_toml
@@ -15,17 +15,9 @@ Text = Annotated[str, Field(pattern=r"^[^<>&\x00-\x1f\x7f]*$")]  # it goes into 
 
 
 class _Section(BaseModel):
+    """Pydantic calls `model_post_init`, where a section has one, to refuse keys that do not go together."""
+
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-    def _problem(self) -> str:
-        """What is wrong with the keys together; "" where they agree."""
-        return ""
-
-    @model_validator(mode="after")
-    def _agree(self) -> Self:
-        if problem := self._problem():
-            raise ValueError(problem)
-        return self
 
 
 class Table(_Section):
@@ -57,10 +49,10 @@ class Video(_Section):
     format: Literal["jpg", "png"] = "jpg"
     jpeg_quality: Annotated[int, Field(ge=50, le=100)] = 95
 
-    def _problem(self) -> str:
+    def model_post_init(self, _: object) -> None:
         wanted = [*(["left", "right"] if self.layout == "two" else ["file"]), *({self.times} & {"table", "fps"})]
-        missing = [key for key in wanted if not getattr(self, key)]
-        return f"layout {self.layout!r} with times {self.times!r} needs {' and '.join(missing)}" if missing else ""
+        if missing := [key for key in wanted if not getattr(self, key)]:
+            raise ValueError(f"layout {self.layout!r} with times {self.times!r} needs {' and '.join(missing)}")
 
 
 class Pose(_Section):
@@ -72,10 +64,10 @@ class Pose(_Section):
     gripper: str = ""
     gripper_unit: Literal["rad", "deg", "mm"] = "rad"
 
-    def _problem(self) -> str:
+    def model_post_init(self, _: object) -> None:
         n = {"quaternion_xyzw": 4, "quaternion_wxyz": 4, "matrix": 9}.get(self.rotation_kind, 3)
-        told = len(self.rotation)
-        return f"{self.rotation_kind} has {n} columns, rotation names {told}" if told != n else ""
+        if len(self.rotation) != n:
+            raise ValueError(f"{self.rotation_kind} has {n} columns, rotation names {len(self.rotation)}")
 
 
 class Frame(_Section):
@@ -95,9 +87,9 @@ class Robot(Table):
     search_s: Annotated[float, Field(gt=0)] = 0.5
     frame: Frame = Frame()
 
-    def _problem(self) -> str:
-        one = (self.landmarks is None) != (self.pose is None)
-        return "" if one else "give the columns either of the landmarks or of the pose"
+    def model_post_init(self, _: object) -> None:
+        if (self.landmarks is None) == (self.pose is None):
+            raise ValueError("give the columns either of the landmarks or of the pose")
 
 
 class Hinge(_Section):
@@ -107,9 +99,9 @@ class Hinge(_Section):
     axis: Vector
     jaw_mm: Vector
 
-    def _problem(self) -> str:
-        known = any(self.axis) and any(self.jaw_mm)
-        return "" if known else "axis and jaw_mm are directions, so they cannot be 0: measure them on the tool or its drawing"
+    def model_post_init(self, _: object) -> None:
+        if not any(self.axis) or not any(self.jaw_mm):
+            raise ValueError("axis and jaw_mm are directions, so they cannot be 0: measure them on the tool or its drawing")
 
 
 class Tool(_Section):
@@ -135,9 +127,9 @@ class Labels(_Section):
     first_frame: int = 0
     sides: tuple[str, str] = ("left", "right")
 
-    def _problem(self) -> str:
-        one = bool(self.file) != bool(self.left or self.right)
-        return "" if one else "give either file, which holds both cameras, or left and right"
+    def model_post_init(self, _: object) -> None:
+        if bool(self.file) == bool(self.left or self.right):
+            raise ValueError("give either file, which holds both cameras, or left and right")
 
 
 class Mapping(_Section):
@@ -153,15 +145,15 @@ class Mapping(_Section):
     tool: Tool = Tool()
     labels: Labels | None = None
 
-    def _problem(self) -> str:
+    def model_post_init(self, _: object) -> None:
         ours, columns = set(self.landmarks), self.robot.landmarks
         labels = self.labels.names if self.labels else {}
         if len(ours) < len(self.landmarks):
-            return f"landmarks {list(self.landmarks)} repeat a name"
+            raise ValueError(f"landmarks {list(self.landmarks)} repeat a name")
         if unknown := sorted({*(columns or {}), *labels, *self.tool.landmarks_mm, *self.tool.pivot_s} - ours):
-            return f"landmarks = {list(self.landmarks)} lacks {', '.join(unknown)}, which another table names"
-        missing = sorted(ours - set(columns or ours))
-        return f"robot.landmarks lacks {', '.join(missing)}" if missing else ""
+            raise ValueError(f"landmarks = {list(self.landmarks)} lacks {', '.join(unknown)}, which another table names")
+        if missing := sorted(ours - set(columns or ours)):
+            raise ValueError(f"robot.landmarks lacks {', '.join(missing)}")
 
 
 def read_mapping(path: str | Path) -> Mapping:
