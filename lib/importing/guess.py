@@ -5,6 +5,7 @@ Units that no column's name states are those in which the log's steps and motion
 
 import re
 from collections import Counter
+from contextlib import suppress
 from pathlib import Path
 
 import av
@@ -170,11 +171,8 @@ def _matched(theirs: dict[str, object]) -> dict[str, object]:
 def _labels(paths: dict[str, Path]) -> dict:
     for file, path in paths.items():
         for kind in _LABELS.get(path.suffix, ()):
-            try:
-                names = dict.fromkeys(label.name for label in labels_of(kind, path))
-            except (ValueError, OSError):
-                continue
-            if names:
-                told = {"kind": kind, "file": file, "names": _matched({name: name for name in names})}
-                return told | {"pixel_origin": "corner" if kind in ("cvat", "label_studio") else "centre", "first_frame": 0}
+            with suppress(ValueError, OSError):
+                if names := {label.name: label.name for label in labels_of(kind, path)}:
+                    origin = "corner" if kind in ("cvat", "label_studio") else "centre"
+                    return {"kind": kind, "file": file, "names": _matched(names), "pixel_origin": origin, "first_frame": 0}
     return {}
