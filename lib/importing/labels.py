@@ -134,9 +134,8 @@ def _from_zip(path: Path, name: str) -> str:
 def _label_studio(path: Path) -> Iterator[Label]:
     for task in json.loads(path.read_bytes()):
         image = str(next(iter(task["data"].values())))
-        for result in (r for annotation in task["annotations"][:1] for r in annotation["result"]):
-            if "keypointlabels" not in result["value"]:
-                continue
+        results = (r for annotation in task["annotations"][:1] for r in annotation["result"])
+        for result in (r for r in results if "keypointlabels" in r["value"]):
             value, size = result["value"], (result["original_width"], result["original_height"])
             if not (0 <= value["x"] <= 100 and 0 <= value["y"] <= 100):
                 raise ValueError(f"{path}: {image}: ({value['x']}, {value['y']}) should be in percent of the image.")
@@ -173,9 +172,8 @@ def _sleap(path: Path) -> Iterator[Label]:
         for frame in file["frames"][:]:
             video, number = videos[frame["video"]], frame["frame_idx"]
             image = str(video["filenames"][number]) if video.get("filenames") else f"{video.get('filename', '')}/{number}"
-            for instance in instances[frame["instance_id_start"] : frame["instance_id_end"]]:
-                if instance["instance_type"] != 0:  # 1 is a prediction
-                    continue
+            rows = instances[frame["instance_id_start"] : frame["instance_id_end"]]
+            for instance in rows[rows["instance_type"] == 0]:  # 1 is a prediction
                 for name, point in zip(names, points[instance["point_id_start"] : instance["point_id_end"]], strict=True):
                     seen = np.isfinite([point["x"], point["y"]]).all()
                     x, y = (float(point[axis]) - corner for axis in "xy")
