@@ -153,14 +153,12 @@ def _tool(
         jaws = {} if opening is None else {"opening_rad": np.interp(at, robot_s, opening), "turning": turning}
         found = tool_offsets([RigidTransform(R, t) for R, t in zip(turns, reported_mm[inside], strict=True)], u, **jaws)
         return found, np.sqrt(np.diagonal(found.covariance_mm2, axis1=1, axis2=2))
-    offset, sd = np.full((len(names), 3), np.nan), np.zeros((len(names), 3))
-    for k, name in enumerate(names):
-        if name in tool.pivot_s:
-            low, high = np.subtract(tool.pivot_s[name], zero_s)
-            pivot = pivot_calibration([pose for pose, t in zip(poses, robot_s, strict=True) if low <= t <= high])
-            offset[k], sd[k] = pivot.offset_mm, np.sqrt(np.diagonal(pivot.covariance_mm2)[:3])
-        elif name in tool.landmarks_mm:
-            offset[k] = tool.landmarks_mm[name]
+    offset = np.array([tool.landmarks_mm.get(name, (np.nan, np.nan, np.nan)) for name in names])
+    sd = np.zeros_like(offset)
+    for name, span_s in tool.pivot_s.items():
+        k, (low, high) = names.index(name), np.subtract(span_s, zero_s)
+        pivot = pivot_calibration([pose for pose, t in zip(poses, robot_s, strict=True) if low <= t <= high])
+        offset[k], sd[k] = pivot.offset_mm, np.sqrt(np.diagonal(pivot.covariance_mm2)[:3])
     hinged = tool.hinge is not None and any(turning)
     if lacks := [n for n, x, t in zip(names, offset, turning, strict=True) if np.isnan(x).any() and not (hinged and t)]:
         cure = "give tool.landmarks_mm, tool.pivot_s, tool.hinge, or tool.estimate = true"
