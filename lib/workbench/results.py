@@ -55,9 +55,8 @@ class Table:
 
     def where(self, **equal: object) -> Self:
         """The rows whose entries equal those given, such as ``table.where(method="band", seed=0)``."""
-        for name in equal:
-            if name not in self.columns:
-                raise LookupError(f"{name}: no such column; there are {', '.join(self.columns)}.")
+        if unknown := [name for name in equal if name not in self.columns]:
+            raise LookupError(f"{unknown[0]}: no such column; there are {', '.join(self.columns)}.")
         rows = [row for row in self.rows if all(row.get(name) == value for name, value in equal.items())]
         return Table(rows, self.provenance)
 
