@@ -125,8 +125,9 @@ def topics_of(path: Path) -> dict[str, str]:
 
 def _read_bag(path: Path, table: Table, names: list[str]) -> tuple[list[Decimal], dict[str, np.ndarray]]:
     """Columns of a bag; those of other topics than that of the time are interpolated at its times."""
-    found: dict[str, list] = {name: [] for name in (table.time, *names)}
-    stamps: dict[str, list[Decimal]] = {name.partition(":")[0]: [] for name in found}
+    places = {name: name.partition(":")[::2] for name in (table.time, *names)}  # topic and field
+    found: dict[str, list] = {name: [] for name in places}
+    stamps: dict[str, list[Decimal]] = {topic: [] for topic, _ in places.values()}
     with _bag(path) as reader:
         if missing := sorted(set(stamps) - (there := {c.topic for c in reader.connections})):
             raise ValueError(f"{path}: no topic is called {missing[0]!r}; it has {', '.join(sorted(there))}.")
@@ -134,17 +135,15 @@ def _read_bag(path: Path, table: Table, names: list[str]) -> tuple[list[Decimal]
             message, received = reader.deserialize(raw, c.msgtype), Decimal(received_ns).scaleb(-9)
             header = getattr(message, "header", None)
             stamps[c.topic].append(received if header is None else _field(header, "stamp", str(path)))
-            for name in found:
-                topic, _, field = name.partition(":")
+            for name, (topic, field) in places.items():
                 if topic == c.topic:
                     found[name].append(received if field == "received" else _field(message, field, f"{path}: {name}"))
     time = found[table.time]
     if not time or not isinstance(time[0], Decimal):
         raise ValueError(f"{path}: {table.time!r} is no time; name /topic:header.stamp or /topic:received.")
     columns = {name: np.array(found[name], np.float64) for name in names}
-    for name in names:
-        topic = name.partition(":")[0]
-        if topic != table.time.partition(":")[0]:
+    for name, (topic, _) in places.items():
+        if topic != places[table.time][0]:
             at, known = since(time, time[0]), since(stamps[topic], time[0])
             columns[name] = Kinematics(known, np.tile(columns[name][:, None, None], 3)).at(at)[:, 0, 0]  # blank in a gap
     return time, columns
