@@ -72,9 +72,8 @@ def read(name: str, folder: Path = paths.RESULTS) -> Table | None:
         raise ValueError(f"{origin}: not JSON ({error}); restore it.") from error
     with table.open(encoding="utf-8", newline="") as stream:
         names, *rows = [row for row in csv.reader(stream, strict=True) if row] or [[]]
-    for number, row in enumerate(rows, start=2):
-        if len(row) != len(names):
-            raise ValueError(f"{table}: row {number} does not have {len(names)} entries; restore it.")
+    if odd := [number for number, row in enumerate(rows, start=2) if len(row) != len(names)]:
+        raise ValueError(f"{table}: row {odd[0]} does not have {len(names)} entries; restore it.")
     columns = [_typed(column) for column in zip(*rows, strict=True)]
     return Table([dict(zip(names, row, strict=True)) for row in zip(*columns, strict=True)], provenance)
 
