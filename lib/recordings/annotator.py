@@ -92,11 +92,10 @@ class Annotator:
     def next_frame(self, frame: int) -> int:
         """The most useful frame that is not labelled, of those not yet visited; of equal ones the farthest from any label."""
         self._visited.add(frame)
-        left = np.flatnonzero(~self.complete)
-        fresh = left[~np.isin(left, list(self._visited))]
-        if not len(fresh):
+        left = set(np.flatnonzero(~self.complete).tolist())
+        if left <= self._visited:
             self._visited = {frame}
-            fresh = left[left != frame]
+        fresh = np.array(sorted(left - self._visited))
         if not len(fresh):
             return (frame + 1) % len(self.recording)
         touched = np.flatnonzero((self._marks[..., 2] != 0).any(axis=(0, 2)))
