@@ -161,19 +161,18 @@ class Annotator:
         """The answer to a message of the page, and images as JPEG: hello, show, next, mark, undo, redo."""
         todo, frame, images = message["do"], int(message.get("frame") or 0), []
         answer = {"id": message.get("id")}
+        moves = {"next": lambda: self.next_frame(frame), "undo": self.undo, "redo": self.redo}
         try:
             self._read()  # another page or program may have written
             if todo == "hello":
                 r, key = self.recording, str(self.recording.folder.resolve())
                 answer |= {"name": r.name, "landmarks": r.skeleton, "n": len(r), "size": r.image_size_px, "key": key}
                 frame = int(np.argmax(np.where(self.complete, -1.0, np.nan_to_num(self.usefulness))))
-            elif todo == "next":
-                frame = self.next_frame(frame)
             elif todo == "mark":
                 self._change([tuple(mark) for mark in message["marks"]])
-            elif todo in ("undo", "redo"):
-                changed = self.undo() if todo == "undo" else self.redo()
-                frame = frame if changed is None else changed
+            elif todo in moves:
+                there = moves[todo]()
+                frame = frame if there is None else there
             if todo in ("hello", "next", "show"):
                 pair = self.recording.frames[frame]
                 images = [encoded(one, ".jpg") for one in (pair.left, pair.right)]
