@@ -1,19 +1,17 @@
 """What a detector sees in some frames: anywhere, near where the robot says, or apart from what stands still."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple, Self
 
 import numpy as np
 
 from lib.correspondences import Correspondences, of_recording
-from lib.landmarks import Detector, Landmarks, with_ground
+from lib.landmarks import with_ground
 from lib.landmarks.contrast import levelled
 from lib.landmarks.metrics import tool_length_px
 from lib.recordings import Recording
 from lib.recordings.annotations import CLICK_SD_PX
 
-#: Share of the tool's length: as near to where it should be a detection is taken for right, farther for another thing.
-NEAR = 0.1
 #: A tool stands still if others stand nearer than this share of its length, in so many frames and more with itself.
 _STILL, _STILL_FRAMES = 0.15, 4
 
@@ -61,37 +59,13 @@ def look(
     progress: Callable[[float], None] = lambda done: None,
 ) -> Seen:  # fmt: skip
     """What a detector finds in some frames; with `near` (m, 2, 3, 2) px its later stages alone, which look there."""
-    found, later = [], []
-    if near is not None:
-        # A window shows the whole tool: closeups alone would add their constant error to the place in every round.
-        later = [stage for stage in detector.stages if stage not in ("frame", "tool", "tracking")]
-        later = later if "again" in later else ["tracking", "tracking"]
+    found, known = [], with_ground(detector, recording)
     for i, number in enumerate(frames):
         frame = recording.frames[int(number)]
         pair = np.stack([frame.left, frame.right])
-        if near is None:
-            found.append(detector(pair, **with_ground(detector, recording)))
-        else:
-            known = np.isfinite(near[i]).all(axis=-1)
-            known &= known[:, :1] & known[:, 1:].any(axis=1, keepdims=True)  # no window without base and tip
-            u = np.where(known[..., None], near[i], np.nan)
-            start = Landmarks(u, np.tile(np.eye(2), (2, 3, 1, 1)), known.astype(float))
-            rough = _refined(detector, pair, start, later)
-            if rough.doubtful.any():
-                again = zip(pair, recording.ground(), rough.doubtful, strict=True)
-                again = np.stack([levelled(image, ground) if doubt else image for image, ground, doubt in again])
-                rough = rough.surest(_refined(detector, again, start, later))
-            away = np.linalg.norm(rough.u - u, axis=-1) > NEAR * tool_length_px(u)[:, None]  # that is another thing
-            u, confidence = np.where(away[..., None], np.nan, rough.u), np.where(away, 0.0, rough.confidence)
-            found.append(Landmarks(u, rough.covariance, confidence))
+        found.append(detector(pair, **known) if near is None else detector.near(pair, near[i], **known))
         progress((i + 1) / len(frames))
     return Seen(np.asarray(frames), *(np.stack([getattr(p, n) for p in found]) for n in ("u", "covariance", "confidence")))
-
-
-def _refined(detector: Detector, images: np.ndarray, rough: Landmarks, stages: Sequence[str]) -> Landmarks:
-    for stage in stages:
-        rough = detector.refine(images, rough, stage)
-    return rough
 
 
 def at_rest(seen: Seen, x_mm: np.ndarray) -> np.ndarray:

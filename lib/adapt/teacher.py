@@ -13,12 +13,13 @@ from functools import cache, partial
 import numpy as np
 from scipy.optimize import least_squares
 
-from lib.adapt.looking import NEAR, Seen
+from lib.adapt.looking import Seen
 from lib.calibration import Calibration, CompetingCamerasError, LandmarkOffsets, calibrate, calibrate_as_shown
 from lib.calibration.offsets import Unsettled, carried, tool_axes
 from lib.calibration.timing import clock_error, estimate_time_offset
 from lib.cameras import NearAffineCamera
 from lib.correspondences import LANDMARKS, MIN_CONFIDENCE, DataError
+from lib.landmarks.detector import NEAR
 from lib.landmarks.metrics import tool_length_px
 from lib.recordings import Recording
 from lib.recordings.annotations import CLICK_SD_PX, inside

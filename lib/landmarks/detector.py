@@ -55,6 +55,8 @@ _CANDIDATES, _AGAIN, _NOTHING = 24, 6, 0.01
 #: A sweep looks for tools of these lengths, shares of the image's longer side, in so many turns; chosen on validation images.
 _SWEPT, _TURNS = (0.21, 0.1), 6
 _UNWITNESSED = 0.5  # what a sweep finds has this times its confidence, since the first stage did not see it there
+#: Share of the tool's length: as near to where it is expected a landmark is taken for it, farther off for another thing.
+NEAR = 0.1
 #: Stages that use another stage's network.
 _NETWORK_OF = {"again": "tool", "closer": "closeup", "tracking": "closeup"}
 #: The second look at the tool also sees the mirror image, and the mean counts: low where the two disagree.
@@ -109,10 +111,15 @@ class Landmarks:
     def surest(self, other: Self) -> Self:
         """Of each image these landmarks or the `other` ones: those whose mean confidence is higher."""
         result, better = Landmarks.join([self]), other.confidence.mean(1) > self.confidence.mean(1)
-        result._put(better, other[better])
+        result.put(better, other[better])
         return result
 
-    def _put(self, rows: np.ndarray, values: Self) -> None:
+    def away(self, u: np.ndarray) -> np.ndarray:
+        """(n, 3) bool: landmarks farther than `NEAR` from u (n, 3, 2) px, where they are expected."""
+        return np.linalg.norm(self.u - u, axis=2) > NEAR * tool_length_px(u)[:, None]
+
+    def put(self, rows: np.ndarray, values: Self) -> None:
+        """Replace those of some images."""
         self.u[rows], self.covariance[rows], self.confidence[rows] = values.u, values.covariance, values.confidence
 
 
@@ -251,7 +258,7 @@ class Detector:
             if len(unsure := np.flatnonzero(result.doubtful)):
                 other = self._once(np.stack([look(i) for i in unsure]), sweep=k == len(looks))
                 other = other if k < len(looks) else replace(other, confidence=_UNWITNESSED * other.confidence)
-                result._put(unsure, result[unsure].surest(other))
+                result.put(unsure, result[unsure].surest(other))
         return result
 
     def _once(self, images: np.ndarray, sweep: bool = False) -> Landmarks:
@@ -286,10 +293,30 @@ class Detector:
             with self._threads():
                 part, near = images if usable.size == len(images) else images[usable], previous[usable]  # a pair takes 12 MB
                 found = self.refine(part, near, "tracking")
-                result._put(usable, self.refine(part, found, "tracking", only=view.moved_far(near.u, found.u)))
+                result.put(usable, self.refine(part, found, "tracking", only=view.moved_far(near.u, found.u)))
         if len(lost := np.flatnonzero((result.confidence < min_confidence).any(1))):
-            result._put(lost, self(images[lost], ground=ground and (lambda: ground()[lost])))
+            result.put(lost, self(images[lost], ground=ground and (lambda: ground()[lost])))
         return result.without_unsure()
+
+    def near(self, images: np.ndarray, u: np.ndarray, *, ground: Callable[[], np.ndarray] | None = None) -> Landmarks:
+        """What the later stages see in images (n, h, w, 3) where landmarks u (n, 3, 2) px are expected, NaN = nowhere.
+
+        A landmark farther off than `NEAR` is another thing, and missing.  `ground` as in a call.
+        """
+        known = np.isfinite(u).all(axis=2)
+        known &= known[:, :1] & known[:, 1:].any(axis=1, keepdims=True)  # no window without base and tip
+        u = np.where(known[..., None], u, np.nan)
+        found = Landmarks(u, np.tile(np.eye(2), (len(u), 3, 1, 1)), known.astype(float))
+        # A window shows the whole tool: closeups alone would add their constant error to the place in every round.
+        stages = [stage for stage in self.stages if stage in ("again", "closeup", "closer")]
+        stages = stages if "again" in stages else ["tracking", "tracking"]
+        for stage in stages:
+            found = self.refine(images, found, stage)
+        if ground is not None and len(unsure := np.flatnonzero(found.doubtful)):
+            again = np.stack([levelled(images[i], ground()[i]) for i in unsure])
+            found.put(unsure, found[unsure].surest(self.near(again, u[unsure])))
+        found.confidence[found.away(u)] = 0.0
+        return found.without_unsure()
 
     def _threads(self) -> AbstractContextManager[None]:
         """One thread for small windows, torch's own for whole frames."""
@@ -319,7 +346,7 @@ class Detector:
             best = np.argsort(-likelihood(u, once))[:_AGAIN]
             u, twice = self._looked(images[i], u[best], "again")
             chosen = likelihood(u, twice).argmax()
-            result._put(np.array([i]), replace(Landmarks.none(1), u=tools[best[[chosen]]]))
+            result.put(np.array([i]), replace(Landmarks.none(1), u=tools[best[[chosen]]]))
             height[i] = twice[chosen]
         unsure = searched | (rough.confidence < _SURE).any(1)
         return replace(result, confidence=np.where(unsure[:, None], _SURE * height[:, None], rough.confidence))

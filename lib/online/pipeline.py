@@ -121,7 +121,7 @@ class OnlinePipeline:
             self._rests_on[name] = time_s if fresh else self._rests_on[name]
         before, calibration = tracker.rig, tracker.calibration
         if seen and not told and data.is_complete.any():
-            tracker.take(result, frame)
+            tracker.take(result, frame, self._checks.scene)
         self._name_state(result, blind, told, seen)
         result.rig = tracker.rig
         if tracker.calibration is not calibration or result.motion is not None:
@@ -174,7 +174,14 @@ class OnlinePipeline:
         self._seen = None  # whatever fails now, the next frame is searched as a whole
         known = with_ground(self._detector, self._ground)
         follow = previous is not None and hasattr(self._detector, "track")
-        self._seen = found = self._detector.track(images, previous, **known) if follow else self._detector(images, **known)
+        found = self._detector.track(images, previous, **known) if follow else self._detector(images, **known)
+        if hasattr(self._detector, "near") and (told := self._told_px(kinematics)) is not None:
+            # Where the tool is not found with certainty, or elsewhere, look where the robot says.
+            if len(lost := np.flatnonzero(found.doubtful | found.away(told).any(axis=1))):
+                ground = known.get("ground")
+                near = self._detector.near(images[lost], told[lost], ground=ground and (lambda: ground()[lost]))
+                found.put(lost[~near.doubtful], near[~near.doubtful])
+        self._seen = found
         u = np.where(found.confidence[..., None] >= MIN_CONFIDENCE, found.u, np.nan)
         stated = {"covariance_px2": np.swapaxes(found.covariance, 0, 1), "confidence": np.transpose(found.confidence)}
         index = np.full(len(LANDMARKS), self._index)
@@ -193,6 +200,18 @@ class OnlinePipeline:
             raise ValueError(f"kinematics: expected (3, 3) mm, one landmark a row, got {x.shape}.")
         data = Correspondences.of_points(x, *u, frame=index, landmark=range(len(LANDMARKS)), **stated)
         return Seen(data, lambda rig: data)
+
+    def _told_px(self, kinematics: ArrayLike | Callable | None) -> np.ndarray | None:
+        """(2, 3, 2) px where the rig in force has the landmarks that the robot reports; None if one is not known."""
+        if self.rig is None or kinematics is None:
+            return None
+        nowhere = np.full((2, len(LANDMARKS), 2), np.nan)
+        if callable(kinematics):
+            rows = kinematics(*nowhere[:, None], linear=self.rig.linear)
+        else:
+            rows = Correspondences.of_points(kinematics, *nowhere, landmark=range(len(LANDMARKS)))
+        x_mm = self._tracker.corrected(rows).x_mm
+        return np.stack(self.rig.project(x_mm)) if np.isfinite(x_mm).all() else None
 
     def _surface_jumped(self) -> bool:
         """Whether the newest surface lies elsewhere than the newest one while the landmarks were in view."""

@@ -11,7 +11,8 @@ from lib.calibration import Calibration, LandmarkOffsets, OnlineCalibration, wit
 from lib.calibration.offsets import rows_axes
 from lib.cameras import StereoRig
 from lib.correspondences import Correspondences
-from lib.online.causes import CONVINCING, explain, misfit
+from lib.online.causes import CONVINCING, Explanation, explain, misfit
+from lib.online.checks import Scene
 from lib.online.result import FrameResult, Settings
 from lib.registration import DriftMonitor, MovedCameras
 from lib.trust import judge
@@ -19,6 +20,8 @@ from lib.trust import judge
 _CHI2_4_MEDIAN = 3.357
 _STANDS_OUT = 8.0  # score of a single frame that is not to be believed
 _FAR_MM = 200.0  # of the robot's median position: no tool reaches that far
+_STILL_PX, _MOVES = 3.0, 3.0  # cameras whose landmarks move more than this, and than so many times the scene, stand still
+_PATIENT = 5  # times `Settings.give_up_frames` pass before a rig is given up in front of a scene that stands still
 _PAST = 40  # frames kept to find a late report
 _AGAIN = 30  # frames after a registration in which no microscope moves again; then the registration was no explanation
 
@@ -63,6 +66,7 @@ class RigTracker:
         self._before: StereoRig | None = None  # the rig before, while the frames since are being explained
         self._motion: MovedCameras | None = None  # that led to this rig, and to the one before
         self._motion_before: MovedCameras | None = None
+        self._scene: Scene | None = None  # of the newest frame that agreed with the rig
         self._waiting, self._held, self.rests_on_s, self.doubted_since = 0, False, float("nan"), None
         # Numbers of frames: the newest registration, the newest motion soon after one, from a motion to its registration.
         self._registered, self._again, self._astray = -_AGAIN, -_AGAIN, range(0)
@@ -91,20 +95,20 @@ class RigTracker:
         """Whether the newest registration is doubted, because one not long before it did not last."""
         return index - self._again < _AGAIN
 
-    def take(self, result: FrameResult, frame: Seen) -> None:
-        """A frame with landmarks that both images and the robot know."""
+    def take(self, result: FrameResult, frame: Seen, scene: Scene) -> None:
+        """A frame with landmarks that both images and the robot know, and its scene."""
         if len(self._past) == _PAST and int(self._past[0].frame[0]) not in self._doubtful and self._is_open(self._past[0]):
             self._open = [self._past[0]]
         self._past.append(frame.data)
         accepted = [frame] if self.rig is None else []
         if self.rig is not None:
             with result.stage("register"):
-                accepted = self._watch(result, frame)
+                accepted = self._watch(result, frame, scene)
         if self._takes_in(accepted):
             with result.stage("calibrate"):
                 self._improve(accepted)
         if self.state == "tracking" and accepted:
-            self.rests_on_s = result.time_s
+            self.rests_on_s, self._scene = result.time_s, scene
 
     def _takes_in(self, accepted: list[Seen]) -> bool:
         """As soon as possible, then whenever a quarter more frames are at hand; never again once the cameras moved."""
@@ -155,11 +159,11 @@ class RigTracker:
             return found, [frame for frame, fine in zip(part, used, strict=True) if fine]
         raise refused or ValueError("the robot's positions lie too far apart.")
 
-    def _watch(self, result: FrameResult, frame: Seen) -> list[Seen]:
+    def _watch(self, result: FrameResult, frame: Seen, scene: Scene) -> list[Seen]:
         """Do images and robot still agree?  If not, why not?  Returns frames that may improve the rig."""
         if self.state != "tracking":
             self._since.append(frame)
-            self._resolve(result)
+            self._resolve(result, scene)
             return []
         data, monitor = self.corrected(frame.data), self._monitor
         alarm = monitor.update(data, covariance_px2=self._noise(data), rig_px2=self._rig_covariance(data))
@@ -174,7 +178,7 @@ class RigTracker:
                 self._again = result.index if result.index - self._registered < _AGAIN else self._again
             monitor.forget()
             self._recent.clear()
-            self._resolve(result)
+            self._resolve(result, scene)
             return []
         if monitor.score > _STANDS_OUT:
             self._doubtful.append(int(data.frame[0]))
@@ -185,13 +189,13 @@ class RigTracker:
             return []
         if self._before is not None:  # registered, and made better
             self._since.append(frame)
-            self._resolve(result)
+            self._resolve(result, scene)
             return []
         n = 0 if monitor.statistic < 0.25 else monitor.since
         passed = [self._recent.popleft() for _ in range(len(self._recent) - n)]
         return [frame for frame in passed if int(frame.data.frame[0]) not in self._doubtful]
 
-    def _resolve(self, result: FrameResult) -> None:
+    def _resolve(self, result: FrameResult, scene: Scene) -> None:
         """Explain the frames since, by a motion or by another cause; convinced only if the newest frames agree."""
         first, last = self.settings.registration_frames
         self._since = self._since[-max(last, 30) :]
@@ -205,19 +209,26 @@ class RigTracker:
             return
         frames = [self.corrected(frame.data) for frame in self._since]
         joined = Correspondences.join(frames).complete
+        noise = self._noise(joined) + self._rig_covariance(joined)
+        moved_px = np.full(2, np.nan) if self._scene is None else self._scene.moved_px(scene)
         try:
             past = [self.corrected(part) for part in self._past]
-            found = explain(self._before, frames, past, self._noise(joined), undecided=len(frames) < last)
+            found = explain(self._before, frames, past, noise, undecided=len(frames) < last)
             shifted = found.kind in ("clock", "slipped", "exchanged", "eye")
+            why = "no cause explains the newest frames."
+            if found.kind in ("moved", "optics") and self._stands_still(found.rig, joined.x_mm, moved_px):
+                why = "the scene stands still, so the cameras do: the detector or the robot errs."
+                found, newest = Explanation("none", rig=self._before), newest[-1:]
             if not (found.loss <= CONVINCING if shifted else found.kind == "open" or self._fits(found.rig, newest)):
-                raise ValueError("no cause explains the newest frames.")
+                raise ValueError(why)
         except ValueError as error:
             self.state, self._held = "moved", False
             # The oldest may be from before, or from during the motion.
             self._since = self._since[1 - 2 * first :]
             self._waiting += 1
             self.cause = str(error)
-            if self._waiting > self.settings.give_up_frames:
+            patience = _PATIENT if (moved_px < _STILL_PX).all() else 1
+            if self._waiting > patience * self.settings.give_up_frames:
                 self._start_again(self._since, "no cause explains the images; calibrating afresh")
             raise
         if found.kind == "open":
@@ -258,9 +269,14 @@ class RigTracker:
         self._recent.clear()
         self._monitor.forget()
 
+    def _stands_still(self, rig: StereoRig, x_mm: np.ndarray, moved_px: np.ndarray) -> bool:
+        """Whether `rig`, in place of the one before, would move the landmarks in an image whose scene hardly moved."""
+        step = np.stack(rig.project(x_mm)) - np.stack(self._before.project(x_mm))
+        return bool((np.median(np.linalg.norm(step, axis=2), axis=1) > _STILL_PX + _MOVES * moved_px).any())
+
     def _fits(self, rig: StereoRig, frames: Sequence[Correspondences]) -> bool:
         data = Correspondences.join(frames).complete
-        return bool(len(data) and misfit(rig, data, self._noise(data)) <= CONVINCING * len(data))
+        return bool(len(data) and misfit(rig, data, self._noise(data) + self._rig_covariance(data)) <= CONVINCING * len(data))
 
     def corrected(self, data: Correspondences) -> Correspondences:
         """With the landmarks where the detector sees them; the frames before tell the axes of shut and crossed jaws."""

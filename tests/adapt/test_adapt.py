@@ -202,7 +202,7 @@ def test_a_detector_that_takes_elbows_for_tips_is_no_start(world, recording):
 class LaterStages(StandIn):
     """Its closeups see what the stand-in finds, wherever they are asked to look."""
 
-    stages = ("tracking",)
+    stages, near = ("tracking",), Detector.near
 
     def refine(self, images, rough, stage):
         return self(images)
@@ -533,7 +533,7 @@ def test_labels_that_leave_the_places_open_are_refused(world, recording, monkeyp
 
 def test_labels_teach_a_tool_that_no_closeup_knows(world, recording, tmp_path, monkeypatch):
     class Lost(StandIn):
-        networks, closeup_network, stages = {}, "some", ("frame", "closeup")
+        networks, closeup_network, stages, near = {}, "some", ("frame", "closeup"), Detector.near
         refine = staticmethod(lambda pair, rough, setting: Landmarks.none(2))
 
     class ReachedError(Exception):
@@ -559,7 +559,7 @@ def test_a_base_without_an_edge_does_not_drift_along_the_shaft(world, recording,
     class Blurred(StandIn):
         """Its window errs by half a pixel wherever it is placed; each of its closeups moves the base on by 0.3."""
 
-        networks, closeup_network = {}, "some"
+        networks, closeup_network, near = {}, "some", Detector.near
         stages = ("frame", "tool", "again", "closeup", "closer", "tracking")
 
         @staticmethod
