@@ -14,6 +14,8 @@ from lib.registration import MovedCameras, identify_motion
 #: Rows that a rig explains lose about 5.1 each, 8 log(1 + chi^2 / 4), with 1.7 times the noise 10.
 CONVINCING = 10.0
 _LATEST, _LATEST_EYE = 25, 5  # frames by which a report, and the images of one camera, may be late
+_CROSSED = [0, 2, 1]  # rows of a frame with the tips exchanged
+_LEAST_ZOOM = 0.01  # a smaller change of a camera's zoom, found in few frames, may be noise
 _VOLUME_MM = 0.2  # least extent of positions that tell a change of the optics
 _PLAIN = 10.0  # by how much less likely the motion of a camera must be than any other cause
 _OPEN = 40.0  # the same, for a tool that glides: a late report and a shift of the cameras then look alike at first
@@ -50,6 +52,9 @@ def explain(
     found = Explanation("none", rig=rig) if motion.moved == "none" else Explanation("moved", "", motion.rig, motion)
     swapped = replace(data, u_left=data.u_right, u_right=data.u_left)
     others = [(misfit(rig, swapped, covariance_px2), Explanation("exchanged", "the eyes are exchanged", rig))]
+    crossed = (replace(part, u_left=part.u_left[_CROSSED], u_right=part.u_right[_CROSSED]) for part in frames)
+    if len(crossed := Correspondences.join(crossed).complete) == len(data):
+        others.append((misfit(rig, crossed, covariance_px2), Explanation("exchanged", "the tips are exchanged", rig)))
     late = _lateness(rig, frames, past, covariance_px2)
     others += late
     axes = rows_axes(data)
@@ -59,13 +64,18 @@ def explain(
         text = f"the tool slipped by {np.linalg.norm(offset):.2f} mm"
         others.append((misfit(rig, slipped, covariance_px2, 3), Explanation("slipped", text, rig)))
     depth = np.linalg.svd(data.x_mm - data.x_mm.mean(axis=0), compute_uv=False)[-1] / np.sqrt(len(data))
-    if len(frames) >= 4 and rig.is_affine and depth > _VOLUME_MM:
-        with suppress(np.linalg.LinAlgError):
-            fresh = _refitted(data, covariance_px2)
-            cameras = (fresh.left, fresh.right, rig.left, rig.right)
-            zoom = np.sqrt([np.linalg.norm(np.cross(*camera.linear)) for camera in cameras])  # px per mm, mean of x and y
-            text = f"the optics changed: zoom x {zoom[0] / zoom[2]:.3f} left, x {zoom[1] / zoom[3]:.3f} right"
-            others.append((misfit(fresh, data, covariance_px2, 16), Explanation("optics", text, fresh)))
+    changed = []
+    if rig.is_affine:
+        zoomed = _zoomed(rig, data, covariance_px2)
+        pairs = (zoomed.left, rig.right), (rig.left, zoomed.right), (zoomed.left, zoomed.right)
+        changed = [(StereoRig(*pair), parameters) for pair, parameters in zip(pairs, (3, 3, 6), strict=True)]
+        if len(frames) >= 4 and depth > _VOLUME_MM:
+            with suppress(np.linalg.LinAlgError):
+                changed.append((_refitted(data, covariance_px2), 16))
+    for other, parameters in changed:
+        if np.abs((zoom := _zoom(other, rig)) - 1.0).max() > _LEAST_ZOOM:
+            text = "the optics changed: zoom x {:.3f} left, x {:.3f} right".format(*zoom)
+            others.append((misfit(other, data, covariance_px2, parameters), Explanation("optics", text, other)))
     best, other = min(others, key=lambda pair: pair[0])
     penalty = {"slipped": 3, "optics": 16, "clock": 2, "eye": 2}.get(other.kind, 0) * np.log(2.0 * 2.0 * len(data))
     other = replace(other, loss=(best - penalty) / len(data))
@@ -119,6 +129,28 @@ def _offset(rig: StereoRig, data: Correspondences, axes: np.ndarray, covariance_
         JtW = J.mT @ (weight * (_ROBUST / (_ROBUST + np.einsum("ni,nij,nj->n", r, weight, r)))[:, None, None])
         offset = offset + np.linalg.lstsq((JtW @ J).sum(axis=0), np.einsum("nij,nj->i", JtW, r), rcond=None)[0]
     return offset
+
+
+def _zoom(rig: StereoRig, before: StereoRig) -> np.ndarray:
+    """(2,) zoom of the left and right camera, mean of x and y, over that before."""
+    cameras = (rig.left, rig.right, before.left, before.right)
+    px_per_mm = np.sqrt([np.linalg.norm(np.cross(*camera.linear)) for camera in cameras])
+    return px_per_mm[:2] / px_per_mm[2:]
+
+
+def _zoomed(rig: StereoRig, data: Correspondences, covariance_px2: np.ndarray) -> StereoRig:
+    """The rig with each image scaled and shifted so that it suits the rows, robustly."""
+    cameras, variance = [], np.einsum("nii->n", covariance_px2) / 4.0
+    for camera, u in ((rig.left, data.u_left), (rig.right, data.u_right)):
+        seen, weight = camera.project(data.x_mm), np.ones(len(data))
+        for _ in range(10):
+            share = (weight / variance / (weight / variance).sum())[:, None]
+            from_middle, at = seen - (share * seen).sum(axis=0), u - (share * u).sum(axis=0)
+            scale = (share * from_middle * at).sum() / (share * from_middle**2).sum()
+            weight = _ROBUST / (_ROBUST + ((at - scale * from_middle) ** 2).sum(axis=1) / variance)
+        shift = (share * (u - scale * seen)).sum(axis=0)
+        cameras.append(AffineCamera(scale * camera.matrix + np.column_stack([np.zeros((2, 3)), shift])))
+    return StereoRig(*cameras)
 
 
 def _refitted(data: Correspondences, covariance_px2: np.ndarray) -> StereoRig:

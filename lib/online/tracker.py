@@ -11,7 +11,7 @@ from lib.calibration import Calibration, LandmarkOffsets, OnlineCalibration, wit
 from lib.calibration.offsets import rows_axes
 from lib.cameras import StereoRig
 from lib.correspondences import Correspondences
-from lib.online.causes import CONVINCING, Explanation, explain, misfit
+from lib.online.causes import CONVINCING, explain, misfit
 from lib.online.checks import Scene
 from lib.online.result import FrameResult, Settings
 from lib.registration import DriftMonitor, MovedCameras
@@ -20,7 +20,7 @@ from lib.trust import judge
 _CHI2_4_MEDIAN = 3.357
 _STANDS_OUT = 8.0  # score of a single frame that is not to be believed
 _FAR_MM = 200.0  # of the robot's median position: no tool reaches that far
-_STILL_PX, _MOVES = 3.0, 3.0  # cameras whose landmarks move more than this, and than so many times the scene, stand still
+_STILL_PX, _MOVES = 1.0, 3.0  # cameras by which landmarks move more than this, and so many times the scene, stand still
 _PATIENT = 5  # times `Settings.give_up_frames` pass before a rig is given up in front of a scene that stands still
 _PAST = 40  # frames kept to find a late report
 _AGAIN = 30  # frames after a registration in which no microscope moves again; then the registration was no explanation
@@ -134,7 +134,8 @@ class RigTracker:
             return
         self._tried = len(self._frames)
         found, kept = self._agreed()
-        if (verdict := judge(None, found, robot_accuracy_mm=self.settings.robot_accuracy_mm)).is_red:
+        verdict = judge(None, found, robot_accuracy_mm=self.settings.robot_accuracy_mm)
+        if verdict.is_red or (self.cause and verdict.reasons):  # after a fault nothing doubtful is believed
             raise ValueError("; ".join(reason.text for reason in verdict.reasons))
         self._frames, self._fitted = kept, len(kept)
         self._use(found)
@@ -163,8 +164,7 @@ class RigTracker:
         """Do images and robot still agree?  If not, why not?  Returns frames that may improve the rig."""
         if self.state != "tracking":
             self._since.append(frame)
-            self._resolve(result, scene)
-            return []
+            return self._resolve(result, scene)
         data, monitor = self.corrected(frame.data), self._monitor
         alarm = monitor.update(data, covariance_px2=self._noise(data), rig_px2=self._rig_covariance(data))
         result.drift = monitor.statistic
@@ -178,8 +178,7 @@ class RigTracker:
                 self._again = result.index if result.index - self._registered < _AGAIN else self._again
             monitor.forget()
             self._recent.clear()
-            self._resolve(result, scene)
-            return []
+            return self._resolve(result, scene)
         if monitor.score > _STANDS_OUT:
             self._doubtful.append(int(data.frame[0]))
             result.state, result.cause = "moved", f"this frame alone stands out ({monitor.score:.0f} sd)"
@@ -189,24 +188,26 @@ class RigTracker:
             return []
         if self._before is not None:  # registered, and made better
             self._since.append(frame)
-            self._resolve(result, scene)
-            return []
+            return self._resolve(result, scene)
         n = 0 if monitor.statistic < 0.25 else monitor.since
         passed = [self._recent.popleft() for _ in range(len(self._recent) - n)]
         return [frame for frame in passed if int(frame.data.frame[0]) not in self._doubtful]
 
-    def _resolve(self, result: FrameResult, scene: Scene) -> None:
-        """Explain the frames since, by a motion or by another cause; convinced only if the newest frames agree."""
+    def _resolve(self, result: FrameResult, scene: Scene) -> list[Seen]:
+        """Explain the frames since, by a motion or by another cause; convinced only if the newest frames agree.
+
+        Returns frames that may improve the rig.  The scene contradicts a motion; then the rig was not known well enough.
+        """
         first, last = self.settings.registration_frames
         self._since = self._since[-max(last, 30) :]
         if len(newest := [self.corrected(frame.data) for frame in self._since[-first:]]) < first:
-            return
+            return []
         if self._held and self._fits(self.rig, newest):
             self._settle()
-            return
+            return []
         if self._held and self._waiting % first:
             self._waiting += 1  # as it was: look again in a moment
-            return
+            return []
         frames = [self.corrected(frame.data) for frame in self._since]
         joined = Correspondences.join(frames).complete
         noise = self._noise(joined) + self._rig_covariance(joined)
@@ -215,19 +216,22 @@ class RigTracker:
             past = [self.corrected(part) for part in self._past]
             found = explain(self._before, frames, past, noise, undecided=len(frames) < last)
             shifted = found.kind in ("clock", "slipped", "exchanged", "eye")
-            why = "no cause explains the newest frames."
             if found.kind in ("moved", "optics") and self._stands_still(found.rig, joined.x_mm, moved_px):
-                why = "the scene stands still, so the cameras do: the detector or the robot errs."
-                found, newest = Explanation("none", rig=self._before), newest[-1:]
+                if not self._fits(self._before, newest[-1:], 2 * CONVINCING):
+                    raise ValueError("the scene stands still, so the cameras do: the detector or the robot errs.")
+                since = self._since
+                self._revert(result.index)
+                self._settle()
+                return since
             if not (found.loss <= CONVINCING if shifted else found.kind == "open" or self._fits(found.rig, newest)):
-                raise ValueError(why)
+                raise ValueError("no cause explains the newest frames.")
         except ValueError as error:
             self.state, self._held = "moved", False
             # The oldest may be from before, or from during the motion.
             self._since = self._since[1 - 2 * first :]
             self._waiting += 1
             self.cause = str(error)
-            patience = _PATIENT if (moved_px < _STILL_PX).all() else 1
+            patience = _PATIENT if (moved_px < _MOVES).all() else 1
             if self._waiting > patience * self.settings.give_up_frames:
                 self._start_again(self._since, "no cause explains the images; calibrating afresh")
             raise
@@ -254,6 +258,7 @@ class RigTracker:
             self.rests_on_s, self.doubted_since = result.time_s, None
             if len(self._since) >= last:
                 self._settle()
+        return []
 
     def _revert(self, index: int) -> None:
         """Go back to the rig before the motion, and doubt the surfaces that the other rig made."""
@@ -274,9 +279,9 @@ class RigTracker:
         step = np.stack(rig.project(x_mm)) - np.stack(self._before.project(x_mm))
         return bool((np.median(np.linalg.norm(step, axis=2), axis=1) > _STILL_PX + _MOVES * moved_px).any())
 
-    def _fits(self, rig: StereoRig, frames: Sequence[Correspondences]) -> bool:
+    def _fits(self, rig: StereoRig, frames: Sequence[Correspondences], loss: float = CONVINCING) -> bool:
         data = Correspondences.join(frames).complete
-        return bool(len(data) and misfit(rig, data, self._noise(data) + self._rig_covariance(data)) <= CONVINCING * len(data))
+        return bool(len(data) and misfit(rig, data, self._noise(data) + self._rig_covariance(data)) <= loss * len(data))
 
     def corrected(self, data: Correspondences) -> Correspondences:
         """With the landmarks where the detector sees them; the frames before tell the axes of shut and crossed jaws."""

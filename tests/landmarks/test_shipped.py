@@ -50,6 +50,18 @@ def test_tracking_agrees_with_whole_frames(shipped):
     assert np.median(np.linalg.norm(tracked.u - whole.u, axis=2)[both]) < 0.5
 
 
+def test_a_tool_is_found_where_it_is_expected_and_nowhere_else(shipped):
+    whole, length = shipped.by_default[:2], tool_length_px(shipped.u[:2])
+    expected = whole.u + [[[9.0, -6.0]]]
+    found = shipped.default.near(shipped.images[:2], expected)
+    both = (whole.confidence > 0.5) & (found.confidence > 0.5)
+    assert both.mean() > 0.6 and (np.linalg.norm(found.u - whole.u, axis=2)[both] < 0.03 * length.mean()).all()
+    elsewhere = expected + 1.5 * length.mean()
+    assert (shipped.default.near(shipped.images[:2], elsewhere).confidence < 0.5).all()
+    expected[0, 0] = np.nan  # no window without a base
+    assert np.isnan(shipped.default.near(shipped.images[:2], expected).u[0]).all()
+
+
 def test_an_empty_field_has_no_landmarks_and_disturbs_no_other(shipped):
     ground = np.random.default_rng(0).integers(90, 140, (27, 48, 3), dtype=np.uint8)
     both = np.stack([shipped.images[0], cv2.resize(ground, shipped.images.shape[2:0:-1])])

@@ -8,6 +8,7 @@ from copy import deepcopy
 from dataclasses import replace
 from functools import cache
 
+import cv2
 import numpy as np
 import pytest
 
@@ -145,11 +146,59 @@ def test_exchanged_eyes_are_named_and_come_back():
     assert rig_error_mm(pipeline.rig, world) < 0.05
 
 
-@pytest.mark.parametrize("factor", [1.02, 0.9])
-def test_a_zoom_change_is_named_and_calibrated_afresh(factor):
+def test_exchanged_tips_are_named_and_come_back():
     world, pipeline = calibrated()
-    zoom = 100.0 * factor
-    world.rig = reference_rig(pixels_per_mm=(zoom, zoom))
+    pipeline._detector = lambda images: replace(found := world.detect(images), u=found.u[:, [0, 2, 1]].copy())
+    results = run(pipeline, world, 40)
+    assert not any(measured(results)) and results[-1].cause == "the tips are exchanged"
+    pipeline._detector = world.detect
+    after = run(pipeline, world, 30)
+    assert all(r.state == "tracking" for r in after[10:])
+    assert rig_error_mm(pipeline.rig, world) < 0.05
+
+
+class Scenery(World):
+    """Images of a ground with texture, by which the cameras' motion shows; `tool_px` displaces what is detected alone."""
+
+    tool_px, ground_px = np.zeros(2), np.zeros(2, int)
+
+    @property
+    def images(self):
+        dots = np.random.default_rng(0).integers(0, 200, (27, 48, 3), dtype=np.uint8)
+        dots = np.roll(cv2.resize(dots, (480, 270), interpolation=cv2.INTER_CUBIC), self.ground_px[::-1], axis=(0, 1))
+        return tuple(dots + self.rng.integers(0, 30, (2, *dots.shape), dtype=np.uint8))
+
+    def detect(self, images):
+        found = super().detect(np.empty((2, *BLACK.shape)))
+        return replace(found, u=found.u + self.tool_px)
+
+
+def test_a_scene_that_stands_still_contradicts_a_motion():
+    """The detector sees another place of the tool: the rig is kept, as long as that lasts."""
+    world = Scenery(5, NOISE_PX)
+    before = deepcopy(run(pipeline := make(world, settings=SELDOM), world, 40)[-1].rig)
+    world.tool_px = np.array([16.0, -12.0])
+    results = run(pipeline, world, 25)
+    assert not any(r.motion for r in results) and not any(measured(results))
+    assert "the scene stands still" in results[-1].cause
+    world.tool_px = np.zeros(2)
+    after = run(pipeline, world, 10)
+    assert all(r.state == "tracking" for r in after[3:])
+    assert rig_error_mm(pipeline.rig, world) < 1.5 * rig_error_mm(before, world)
+
+
+def test_a_scene_that_moves_too_agrees_with_a_motion():
+    world = Scenery(5, NOISE_PX)
+    run(pipeline := make(world, settings=SELDOM), world, 40)
+    world.tool_px, world.ground_px = np.array([16.0, -12.0]), np.array([16, -12])
+    results = run(pipeline, world, 12)
+    assert any(r.motion for r in results[:4]) and results[-1].state == "tracking"
+
+
+@pytest.mark.parametrize(("left", "right"), [(1.02, 1.02), (0.9, 0.9), (1.0, 0.95)])
+def test_a_zoom_change_is_named_and_calibrated_afresh(left, right):
+    world, pipeline = calibrated()
+    world.rig = reference_rig(pixels_per_mm=(100.0 * left, 100.0 * right))
     results = run(pipeline, world, 30)
     assert any("the optics changed: zoom x" in r.cause for r in results[:10])
     assert not any(np.isfinite(r.distance_mm).any() for r in results[2:6])

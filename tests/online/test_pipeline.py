@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -208,6 +210,26 @@ def test_landmarks_are_followed_from_frame_to_frame_and_searched_anew_after_a_fa
     results = run(make(world, detector=Follower()), world, 6)
     assert calls == ["whole", "track", "track", "whole", "whole", "track"]
     assert ["detect" in r.failures for r in results] == [False, False, True, True, False, False]
+
+
+def test_a_detector_that_takes_another_tool_looks_where_the_robot_says():
+    world = World(3)
+    asked = []
+
+    class Deceived:
+        def __call__(self, images):
+            found = world.detect(images)
+            return replace(found, u=found.u + [150.0, 90.0]) if world.frame >= 20 else found
+
+        def near(self, images, u, *, ground):
+            asked.append((world.frame, u))
+            return world.detect(images)
+
+    results = run(make(world, detector=Deceived(), settings=SELDOM), world, 30)
+    assert all(r.state == "tracking" for r in results[8:])
+    assert [frame for frame, _ in asked] == list(range(20, 30))
+    told = np.stack(world.rig.project(world.x_mm[29]))
+    assert np.abs(asked[-1][1] - told).max() < 15 and np.abs(results[-1].landmarks.u_left - told[0]).max() < 6
 
 
 def test_what_was_seen_becomes_the_ground_until_the_cameras_move():
