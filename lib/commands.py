@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from lib import files, paths
-from lib.calibration import Calibration, write_opencv, write_ros
+from lib.calibration import Calibration, LandmarkOffsets, with_offsets, write_opencv, write_ros
 from lib.calibration.models import Model
 from lib.cameras import StereoRig
 from lib.correspondences import LANDMARKS, Correspondences, of_recording
@@ -96,9 +96,7 @@ def main_calibrate(argv: list[str]) -> int:
     numbers = {"model": calibration.model, "sigma_u_px": calibration.sigma_u_px, "sigma_x_mm": calibration.sigma_x_mm}
     numbers |= {"rows": int(calibration.inliers.size), "rows_used": int(calibration.inliers.sum())}
     numbers |= {"parameters": calibration.parameter_names, "parameter_covariance": calibration.parameter_covariance.tolist()}
-    numbers |= {"landmark_offsets_mm": calibration.offsets and calibration.offsets.offset.tolist()}
-    numbers |= {"landmark_offsets_turn_axes": calibration.offsets and calibration.offsets.turns}
-    return _done(a, out, "calibration", numbers, verdict)
+    return _done(a, out, "calibration", numbers | _told(calibration.offsets), verdict)
 
 
 def main_reconstruct(argv: list[str]) -> int:
@@ -128,10 +126,10 @@ def main_reconstruct(argv: list[str]) -> int:
 def main_register(argv: list[str]) -> int:
     """`python3 -m lib register`: where cameras that were calibrated before are now, after the microscope was moved."""
     a, recording, out = _parsed("register", main_register, argv)
-    data = _data(a, recording)
-    found = register_images(StereoRig.load(a.rig), data, sigma_x_mm=recording.robot_accuracy_mm, loss="robust")
-    moved = StereoRig.load(a.rig).moved(found.transform)
-    seen = data.complete
+    data, offsets = _data(a, recording), _offsets_beside(a.rig)
+    seen = with_offsets(data, offsets)
+    found = register_images(StereoRig.load(a.rig), seen, sigma_x_mm=recording.robot_accuracy_mm, loss="robust")
+    moved, seen = StereoRig.load(a.rig).moved(found.transform), seen.complete
     epipolar_px = np.abs(moved.epipolar_distance(seen.u_left, seen.u_right))
     error_mm = np.linalg.norm(moved.triangulate(seen.u_left, seen.u_right).x_mm - seen.x_mm, axis=1)
     medians = [float(np.median(values)) if len(values) else None for values in (epipolar_px, error_mm)]
@@ -142,17 +140,38 @@ def main_register(argv: list[str]) -> int:
     shift_mm = np.linalg.norm(found.centre_mm - found.transform.inverse().apply(found.centre_mm))
     print(f"The cameras moved by {shift_mm:.3f} mm at the tool, standard deviation {found.translation_sd_mm.max():.3f} mm.")
     if len(seen):
-        print(f"The tool is now {medians[1]:.3f} mm from where the robot reports it (median).")
+        print(f"The tool is now {medians[1]:.3f} mm from where it is expected (median).")
     found = assess(recording, data, detector=a.detector, **a.options)
-    return _done(a, out, "registration", numbers, Verdict.join([_as_one(moved, found), found.verdict]))
+    verdict = Verdict.join([_as_one(moved, found, offsets), found.verdict])
+    return _done(a, out, "registration", numbers | _told(offsets), verdict)
 
 
-def _as_one(moved: StereoRig, found: Assessment) -> Verdict:
+def _told(offsets: LandmarkOffsets | None) -> dict:
+    """Offsets of the landmarks as result files hold them."""
+    return {"landmark_offsets_mm": offsets and offsets.offset.tolist(), "landmark_offsets_turn_axes": offsets and offsets.turns}
+
+
+def _offsets_beside(rig: Path) -> LandmarkOffsets | None:
+    """Offsets of the landmarks from the robot's report that belong to a rig, by the results beside its file."""
+    for path in (rig.parent / "calibration.json", rig.parent / "registration.json"):
+        told = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+        if told.get("landmark_offsets_mm"):
+            offset = np.array(told["landmark_offsets_mm"])
+            unknown = np.full((*offset.shape, offset.shape[1]), np.nan)
+            return LandmarkOffsets(offset, unknown, np.nan, np.nan, bool(told["landmark_offsets_turn_axes"]))
+    return None
+
+
+def _as_one(moved: StereoRig, found: Assessment, offsets: LandmarkOffsets | None) -> Verdict:
     """Whether one motion of both cameras explains the landmarks about as well as cameras calibrated from them."""
     if found.calibration is None or len(found.data.complete) < _FEWEST:
         return Verdict()
-    x_mm, seen = found.data.x_mm, np.stack([found.data.u_left, found.data.u_right])
-    now, anew = (np.nanmedian(np.linalg.norm(seen - rig.project(x_mm), axis=2)) for rig in (moved, found.calibration.pair))
+    errors = []
+    for rig, own in ((moved, offsets), (found.calibration.pair, found.calibration.offsets)):
+        data = with_offsets(found.data, own)
+        error = np.linalg.norm(np.stack([data.u_left, data.u_right]) - rig.project(data.x_mm), axis=2)
+        errors.append(np.nanmedian(error))
+    now, anew = errors
     level = LEVELS[np.searchsorted(LIMITS["residuals"], now / max(anew, _EXACT_PX))]
     text = f"The moved cameras miss the landmarks by {now:.1f} px (median), cameras calibrated from them by {anew:.1f} px."
     cure = "Did one camera move alone, did zoom or focus change, is --rig of another microscope? Calibrate anew."

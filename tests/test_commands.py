@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from lib import commands, paths
-from lib.calibration import calibrate
+from lib.calibration import LandmarkOffsets, calibrate, with_offsets
 from lib.cameras import StereoRig
 from lib.correspondences import of_recording
 from lib.landmarks import Detector, Landmarks
@@ -77,15 +77,30 @@ def test_register_finds_the_cameras_where_they_are(out, tmp_path, capsys):
     assert StereoRig.load(tmp_path / "moved_rig.json").left.matrix.shape == (2, 4)
 
 
+def test_register_knows_the_offsets_that_the_calibration_removed(tmp_path, monkeypatch, capsys):
+    """Landmarks that are seen 0.2 mm beside the robot's report, in directions of their own: no camera moved."""
+    truth = Recording.open(paths.SHIPPED_RECORDING)
+    offset_mm = np.array([[0.2, 0.0, 0.0], [0.0, 0.2, 0.0], [0.0, -0.1, 0.2]])
+    rows = of_recording(truth, truth.truth.u_left, truth.truth.u_right)
+    beside = with_offsets(rows, LandmarkOffsets(-offset_mm, np.zeros((3, 3, 3)), 0.1, 0.0))
+    monkeypatch.setattr(commands, "_labelled", lambda recording: beside)
+    folder = [str(paths.SHIPPED_RECORDING), *LABELS, "--out", str(tmp_path)]
+    assert commands.main_calibrate([*folder, "--force"]) == 0
+    assert np.abs(json.loads((tmp_path / "calibration.json").read_text())["landmark_offsets_mm"]).max() > 0.05
+    assert commands.main_register([*folder, "--rig", str(tmp_path / "rig.json")]) == 0
+    moved_mm = float(capsys.readouterr().out.split("moved by ")[1].split(" mm")[0])
+    assert moved_mm < 0.03 and "no_common_motion" not in (tmp_path / "registration.json").read_text()
+
+
 def test_register_says_where_no_motion_explains_the_landmarks(out):
     """A rig of another zoom, or of another microscope."""
     rig = StereoRig.load(out / "rig.json")
     other = StereoRig(*(replace(camera, matrix=1.1 * camera.matrix) for camera in (rig.left, rig.right)))
     recording = Recording.open(paths.SHIPPED_RECORDING)
     rows = of_recording(recording, recording.annotations.u_left, recording.annotations.u_right)
-    found = SimpleNamespace(data=rows, calibration=SimpleNamespace(pair=rig))
-    assert commands._as_one(rig, found).reasons == ()
-    (reason,) = commands._as_one(other, found).reasons
+    found = SimpleNamespace(data=rows, calibration=SimpleNamespace(pair=rig, offsets=None))
+    assert commands._as_one(rig, found, None).reasons == ()
+    (reason,) = commands._as_one(other, found, None).reasons
     assert reason.name == "no_common_motion" and reason.level == "not trustworthy" and "--rig" in reason.cure
 
 

@@ -44,6 +44,7 @@ _SHIFT_PX = (37, 21)
 #: The images are halved: features of the retina are larger than a pixel, and it takes a quarter of the time.
 _HALVED = 2
 _RATIO = 0.8  # Lowe's ratio test
+_OVERLAY_PX = 2.0  # what lies nearer to the same place in both images is text or a mark that a recorder wrote there
 _FEWEST = 20  # matches that agree, below which a frame is no witness
 
 
@@ -202,6 +203,7 @@ def feature_matches(recording: Recording, frames: np.ndarray) -> np.ndarray:
         pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(a, b, k=2)
         pairs = [best for best, second in pairs if best.distance < _RATIO * second.distance]
         y = _HALVED * np.array([[*left[m.queryIdx].pt, *right[m.trainIdx].pt] for m in pairs]).reshape(-1, 4)
+        y = y[np.abs(y[:, :2] - y[:, 2:]).max(axis=1) > _OVERLAY_PX]
         if (agree := affine_epipolar(y)[1]).sum() >= _FEWEST:
             found.append(y[agree])
     return np.concatenate(found)
