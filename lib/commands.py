@@ -148,7 +148,8 @@ def main_register(argv: list[str]) -> int:
 
 def _told(offsets: LandmarkOffsets | None) -> dict:
     """Offsets of the landmarks as result files hold them."""
-    return {"landmark_offsets_mm": offsets and offsets.offset.tolist(), "landmark_offsets_turn_axes": offsets and offsets.turns}
+    numbers = {"landmark_offsets_mm": offsets and offsets.offset.tolist()}
+    return numbers | {"landmark_offsets_turn_axes": offsets and offsets.turns}
 
 
 def _offsets_beside(rig: Path) -> LandmarkOffsets | None:

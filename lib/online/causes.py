@@ -1,7 +1,6 @@
 """Why do images and robot disagree?  Each cause fits a few numbers to the frames since; the likeliest wins."""
 
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,7 +15,6 @@ CONVINCING = 10.0
 _LATEST, _LATEST_EYE = 25, 5  # frames by which a report, and the images of one camera, may be late
 _CROSSED = [0, 2, 1]  # rows of a frame with the tips exchanged
 _LEAST_ZOOM = 0.01  # a smaller change of a camera's zoom, found in few frames, may be noise
-_VOLUME_MM = 0.2  # least extent of positions that tell a change of the optics
 _PLAIN = 10.0  # by how much less likely the motion of a camera must be than any other cause
 _OPEN = 40.0  # the same, for a tool that glides: a late report and a shift of the cameras then look alike at first
 _ROBUST = 12.0  # squared residual in standard deviations that begins to count less
@@ -63,21 +61,18 @@ def explain(
         slipped = replace(data, x_mm=data.x_mm + axes @ offset)
         text = f"the tool slipped by {np.linalg.norm(offset):.2f} mm"
         others.append((misfit(rig, slipped, covariance_px2, 3), Explanation("slipped", text, rig)))
-    depth = np.linalg.svd(data.x_mm - data.x_mm.mean(axis=0), compute_uv=False)[-1] / np.sqrt(len(data))
-    changed = []
     if rig.is_affine:
         zoomed = _zoomed(rig, data, covariance_px2)
-        pairs = (zoomed.left, rig.right), (rig.left, zoomed.right), (zoomed.left, zoomed.right)
-        changed = [(StereoRig(*pair), parameters) for pair, parameters in zip(pairs, (3, 3, 6), strict=True)]
-        if len(frames) >= 4 and depth > _VOLUME_MM:
-            with suppress(np.linalg.LinAlgError):
-                changed.append((_refitted(data, covariance_px2), 16))
-    for other, parameters in changed:
-        if np.abs((zoom := _zoom(other, rig)) - 1.0).max() > _LEAST_ZOOM:
-            text = "the optics changed: zoom x {:.3f} left, x {:.3f} right".format(*zoom)
-            others.append((misfit(other, data, covariance_px2, parameters), Explanation("optics", text, other)))
+        pairs = (zoomed.left, rig.right, 3), (rig.left, zoomed.right, 3), (zoomed.left, zoomed.right, 6)
+        for left, right, parameters in pairs:
+            fresh = StereoRig(left, right)
+            cameras = (left, right, rig.left, rig.right)
+            px_per_mm = np.sqrt([np.linalg.norm(np.cross(*camera.linear)) for camera in cameras])  # mean of x and y
+            if np.abs((zoom := px_per_mm[:2] / px_per_mm[2:]) - 1.0).max() > _LEAST_ZOOM:
+                text = "the optics changed: zoom x {:.3f} left, x {:.3f} right".format(*zoom)
+                others.append((misfit(fresh, data, covariance_px2, parameters), Explanation("optics", text, fresh)))
     best, other = min(others, key=lambda pair: pair[0])
-    penalty = {"slipped": 3, "optics": 16, "clock": 2, "eye": 2}.get(other.kind, 0) * np.log(2.0 * 2.0 * len(data))
+    penalty = {"slipped": 3, "clock": 2, "eye": 2}.get(other.kind, 0) * np.log(2.0 * 2.0 * len(data))
     other = replace(other, loss=(best - penalty) / len(data))
     near = min((value for value, _ in late), default=np.inf) - least <= _OPEN
     if undecided and found.kind == "moved" and near and best >= least - _PLAIN:
@@ -131,13 +126,6 @@ def _offset(rig: StereoRig, data: Correspondences, axes: np.ndarray, covariance_
     return offset
 
 
-def _zoom(rig: StereoRig, before: StereoRig) -> np.ndarray:
-    """(2,) zoom of the left and right camera, mean of x and y, over that before."""
-    cameras = (rig.left, rig.right, before.left, before.right)
-    px_per_mm = np.sqrt([np.linalg.norm(np.cross(*camera.linear)) for camera in cameras])
-    return px_per_mm[:2] / px_per_mm[2:]
-
-
 def _zoomed(rig: StereoRig, data: Correspondences, covariance_px2: np.ndarray) -> StereoRig:
     """The rig with each image scaled and shifted so that it suits the rows, robustly."""
     cameras, variance = [], np.einsum("nii->n", covariance_px2) / 4.0
@@ -151,14 +139,3 @@ def _zoomed(rig: StereoRig, data: Correspondences, covariance_px2: np.ndarray) -
         shift = (share * (u - scale * seen)).sum(axis=0)
         cameras.append(AffineCamera(scale * camera.matrix + np.column_stack([np.zeros((2, 3)), shift])))
     return StereoRig(*cameras)
-
-
-def _refitted(data: Correspondences, covariance_px2: np.ndarray) -> StereoRig:
-    """Two affine cameras fitted to the rows, robustly."""
-    y, H = data.stacked_px, np.column_stack([data.x_mm, np.ones(len(data))])
-    variance, weight = np.einsum("nii->n", covariance_px2) / 4.0, np.ones(len(data))
-    for _ in range(10):
-        root = np.sqrt(weight / variance)[:, None]
-        M = np.linalg.lstsq(root * H, root * y, rcond=None)[0].T
-        weight = _ROBUST / (_ROBUST + ((y - H @ M.T) ** 2).sum(axis=1) / variance)
-    return StereoRig(AffineCamera(M[:2]), AffineCamera(M[2:]))

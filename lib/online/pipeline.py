@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from lib.calibration import Calibration, calibrate_as_shown
 from lib.cameras import StereoRig
 from lib.correspondences import LANDMARKS, MIN_CONFIDENCE, Correspondences
-from lib.landmarks import with_ground
+from lib.landmarks import Landmarks, with_ground
 from lib.online.checks import FrameChecks
 from lib.online.distance import Surface, TipDistance
 from lib.online.result import FrameResult, Settings
@@ -174,14 +174,10 @@ class OnlinePipeline:
         self._seen = None  # whatever fails now, the next frame is searched as a whole
         known = with_ground(self._detector, self._ground)
         follow = previous is not None and hasattr(self._detector, "track")
+        told = self._told_px(kinematics) if hasattr(self._detector, "near") else None
+        previous = self._guided(images, previous, told, known) if follow else previous
         found = self._detector.track(images, previous, **known) if follow else self._detector(images, **known)
-        if hasattr(self._detector, "near") and (told := self._told_px(kinematics)) is not None:
-            # Where the tool is not found with certainty, or elsewhere, look where the robot says.
-            if len(lost := np.flatnonzero(found.doubtful | found.away(told).any(axis=1))):
-                ground = known.get("ground")
-                near = self._detector.near(images[lost], told[lost], ground=ground and (lambda: ground()[lost]))
-                found.put(lost[~near.doubtful], near[~near.doubtful])
-        self._seen = found
+        self._seen = found = self._guided(images, found, told, known)
         u = np.where(found.confidence[..., None] >= MIN_CONFIDENCE, found.u, np.nan)
         stated = {"covariance_px2": np.swapaxes(found.covariance, 0, 1), "confidence": np.transpose(found.confidence)}
         index = np.full(len(LANDMARKS), self._index)
@@ -201,15 +197,27 @@ class OnlinePipeline:
         data = Correspondences.of_points(x, *u, frame=index, landmark=range(len(LANDMARKS)), **stated)
         return Seen(data, lambda rig: data)
 
+    def _guided(self, images: np.ndarray, found: Landmarks, told: np.ndarray | None, known: dict) -> Landmarks:
+        """`found`, and what is seen where the robot has the landmarks, `told`, if they are in doubt or elsewhere."""
+        lost = [] if told is None else np.flatnonzero(found.doubtful | found.away(told).any(axis=1))
+        if len(lost):
+            ground = known.get("ground")
+            near = self._detector.near(images[lost], told[lost], ground=ground and (lambda: ground()[lost]))
+            found = Landmarks.join([found])  # a copy
+            found.put(lost[~near.doubtful], near[~near.doubtful])
+        return found
+
     def _told_px(self, kinematics: ArrayLike | Callable | None) -> np.ndarray | None:
         """(2, 3, 2) px where the rig in force has the landmarks that the robot reports; None if one is not known."""
         if self.rig is None or kinematics is None:
             return None
-        nowhere = np.full((2, len(LANDMARKS), 2), np.nan)
+        n = len(LANDMARKS)
+        nowhere = np.full((2, n, 2), np.nan)
         if callable(kinematics):
-            rows = kinematics(*nowhere[:, None], linear=self.rig.linear)
+            nothing = {"covariance_px2": np.full((1, n, 2, 2, 2), np.nan), "confidence": np.zeros((1, n, 2))}
+            rows = kinematics(*nowhere[:, None], linear=self.rig.linear, **nothing)
         else:
-            rows = Correspondences.of_points(kinematics, *nowhere, landmark=range(len(LANDMARKS)))
+            rows = Correspondences.of_points(kinematics, *nowhere, landmark=range(n))
         x_mm = self._tracker.corrected(rows).x_mm
         return np.stack(self.rig.project(x_mm)) if np.isfinite(x_mm).all() else None
 
