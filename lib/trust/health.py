@@ -39,6 +39,7 @@ _LOOKS, _PICTURES = 12, 60  # frames looked at again; pictures compared with tho
 #: Frames further apart in time are not compared for smoothness.
 _NEXT_S = 0.15
 _MIRRORED = partial(np.flip, axis=2)
+_TAILS = 3.0  # most that the RMS of residuals is above their median, gross errors aside
 #: By how much a look is shifted, (x, y) px: no multiple of a network's stride.
 _SHIFT_PX = (37, 21)
 #: The images are halved: features of the retina are larger than a pixel, and it takes a quarter of the time.
@@ -116,7 +117,8 @@ def health(
         near = (time[2:] - time[:-2] <= 2 * _NEXT_S)[:, None, None, None]
         jump[1:-1] = np.where(near, off[1:-1] - np.median([off[:-2], off[1:-1], off[2:]], axis=0), np.nan)
         distance, jump = (np.fmax.reduce(np.linalg.norm(one, axis=-1), axis=2) for one in (off, jump))  # of the worse image
-        parts["robot"] = distance / max(calibration.reprojection_rms_px, 1.0)
+        usual = min(calibration.reprojection_rms_px, _TAILS * np.nanmedian(distance))  # few gross errors hide no others
+        parts["robot"] = distance / max(usual, 1.0)
         parts["smoothness"] = jump / length
         seen = rig.triangulate(y[:, :2], y[:, 2:]).x_mm.reshape(x.shape)
         lengths = [np.linalg.norm(one[:, 1:].mean(axis=1) - one[:, 0], axis=1) for one in (seen, x)]
