@@ -11,7 +11,7 @@ import torch
 from lib.cameras import StereoRig
 from lib.matching.deepmatching import VolumeMatches, correlation_volume, match_volume, peak_ratio
 from lib.matching.descriptors import CHANNELS, MIN_SEEN, PATCH, patch_quality, pixel_descriptors
-from lib.matching.rectification import Rectification, rectify, warp
+from lib.matching.rectification import Rectification, on_image, rectify, warp
 from lib.matching.result import SIGMA_LEFT_PX, Matches
 from lib.parallel import single_threaded_torch
 
@@ -177,8 +177,8 @@ def match_band(images: Images, masks: Masks, rig: StereoRig, where: Where, *, bu
     covariance[:, :2, :2] = SIGMA_LEFT_PX**2 * np.eye(2)
     covariance[:, 2:, 2:] = np.einsum("ij,nj,kj->nik", linear, deviation**2, linear)
     return Matches(
-        rectification.u_left(canvas),
-        rectification.u_right(canvas + displacement * CELL_PX + (0.0, off_line_px)),
+        on_image(rectification.left_from_canvas, canvas),
+        on_image(rectification.right_from_canvas, canvas + displacement * CELL_PX + (0.0, off_line_px)),
         1 / (1 + (sigma[:, 0] / SIGMA_HALF) ** 4),
         covariance, peak_ratio=ratio, reciprocal=found.reciprocal, method="band",
     )  # fmt: skip

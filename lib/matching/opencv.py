@@ -11,7 +11,7 @@ from lib.cameras import StereoRig
 from lib.matching.band import CELL_PX, COARSE_REACH, DOWNSCALE, Images, Masks, Where, plan_search
 from lib.matching.deepmatching import correlation_volume, peak_ratio
 from lib.matching.descriptors import PATCH, patch_quality, pixel_descriptors
-from lib.matching.rectification import warp
+from lib.matching.rectification import on_image, warp
 from lib.matching.result import SIGMA_LEFT_PX, Matches
 from lib.parallel import single_threaded_torch
 
@@ -93,8 +93,8 @@ def match_with(
     canvas = np.column_stack([x - reach, y]).astype(np.float64)
     ratio, textured = _judge((left, right), (valid_left, valid_right), reach, (low, high), canvas.astype(int), -d)
     matches = Matches(
-        rectification.u_left(canvas),
-        rectification.u_right(canvas - np.column_stack([d, np.zeros(len(d))])),
+        on_image(rectification.left_from_canvas, canvas),
+        on_image(rectification.right_from_canvas, canvas - np.column_stack([d, np.zeros(len(d))])),
         np.clip(confidence[y, x], 0.0, 1.0).astype(np.float64),
         np.tile(np.diag([SIGMA_LEFT_PX**2] * 2 + [(SIGMA_PX / scale) ** 2] * 2), (len(d), 1, 1)),
         peak_ratio=ratio, reciprocal=passed[y, x], method=name,

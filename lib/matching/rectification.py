@@ -47,13 +47,10 @@ class Rectification:
             raise ValueError(f"depth_range_mm: {what} is seen by both cameras; they share {near:.1f} to {far:.1f} mm.")
         return max(low, visible[0]), min(high, visible[1])
 
-    def u_left(self, canvas: np.ndarray) -> np.ndarray:
-        """Left pixels (n, 2) of canvas points (n, 2)."""
-        return canvas @ self.left_from_canvas[:, :2].T + self.left_from_canvas[:, 2]
 
-    def u_right(self, canvas: np.ndarray) -> np.ndarray:
-        """Right pixels (n, 2) of (displaced) canvas points (n, 2)."""
-        return canvas @ self.right_from_canvas[:, :2].T + self.right_from_canvas[:, 2]
+def on_image(image_from_canvas: np.ndarray, canvas: np.ndarray) -> np.ndarray:
+    """Image pixels (n, 2) of canvas points (n, 2), which are displaced for the right image."""
+    return canvas @ image_from_canvas[:, :2].T + image_from_canvas[:, 2]
 
 
 def rectify(rig: StereoRig, shape_left: tuple[int, int], shape_right: tuple[int, int], *, scale: float = 1) -> Rectification:

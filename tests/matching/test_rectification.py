@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from lib.cameras import AffineCamera, StereoRig
 from lib.geometry import RigidTransform
 from lib.matching import RECTIFIED
-from lib.matching.rectification import rectify, warp
+from lib.matching.rectification import on_image, rectify, warp
 from lib.simulator.rig import reference_rig
 
 
@@ -41,7 +41,8 @@ def test_rows_are_shared_and_displacement_is_depth(rotation, rolls, zoom, conver
     assert np.allclose(left[:, 1], right[:, 1], atol=1e-6)
     expected = (depth - found.reference_depth_mm) * found.displacement_px_per_mm
     assert np.allclose(right[:, 0] - left[:, 0], expected, atol=1e-6)
-    assert np.allclose(found.u_left(left), u_left) and np.allclose(found.u_right(right), u_right)
+    assert np.allclose(on_image(found.left_from_canvas, left), u_left)
+    assert np.allclose(on_image(found.right_from_canvas, right), u_right)
     assert np.allclose(found.depth_range_mm((expected.min(), expected.max())), (depth.min(), depth.max()))
     near_far = found.depth_range_mm((-10.0, 10.0))  # which both images show, whose centres lie together at 0
     assert np.allclose(found.search_range_px(near_far, (1080, 1920)), (-10, 10))
