@@ -13,7 +13,6 @@ from scipy.special import fdtri, gammainccinv
 
 from lib.calibration.affine import regress
 from lib.correspondences import DataError
-from lib.geometry import cross
 
 FALSE_ALARM = 1e-4
 _SAMPLES = (100, 300, 1000)  # tried one after another, until right ones are among them
@@ -120,8 +119,7 @@ def _by_growth(x: np.ndarray, u: np.ndarray, rng: np.random.Generator, least_mm:
     """
     n, size = len(u), (len(u) + 5) // 2
     centred, H = (np.column_stack([positions, np.ones(n)]) for positions in (x - x.mean(axis=0), x))
-    sets = _samples(centred[:, :3], 300, rng, least_mm)
-    distance2 = _distances2(centred, u, np.linalg.solve(centred[sets], u[sets]))
+    distance2 = _distances2(centred, u, _sampled(centred, u, 300, rng, least_mm))
     best = np.partition(distance2, n // 2, axis=1)[:, n // 2].argmin()  # of the least median
     keep = np.argsort(distance2[best])[:size]
     for _ in range(10):  # concentrate: the rows nearest to their own fit
@@ -152,12 +150,11 @@ def _extent(u: np.ndarray) -> np.ndarray:
     return np.maximum((high - low) / 0.8, 1e-9)
 
 
-def _samples(x: np.ndarray, count: int, rng: np.random.Generator, least_mm: float) -> np.ndarray:
-    """Sets (count, 4) of rows whose four points span a large volume."""
-    n = len(x)
+def _sampled(H: np.ndarray, u: np.ndarray, count: int, rng: np.random.Generator, least_mm: float) -> np.ndarray:
+    """Cameras (count, 4, 2) of H (n, 4) and u (n, 2), each through four points that span a large volume."""
+    n, x = len(H), H[:, :3]
     sets = np.argpartition(rng.random((3 * count, n)), 4, axis=1)[:, :4] if n < 40 else rng.integers(0, n, (3 * count, 4))
-    a, b, c = np.swapaxes(x[sets[:, 1:]] - x[sets[:, :1]], 0, 1)
-    sets = sets[np.argsort(-np.abs(np.einsum("ni,ni->n", cross(a, b), c)))[:count]]  # of the largest volume
+    sets = sets[np.argsort(-np.abs(np.linalg.det(x[sets[:, 1:]] - x[sets[:, :1]])))[:count]]  # of the largest volume
     corners = x[sets] - x[sets].mean(axis=1, keepdims=True)
     thick = np.sqrt(np.maximum(np.linalg.eigvalsh(np.swapaxes(corners, 1, 2) @ corners)[:, 0], 0.0))
     spans = thick > 1e-6 * np.abs(x).max()  # rounding leaves 1e-8
@@ -165,7 +162,8 @@ def _samples(x: np.ndarray, count: int, rng: np.random.Generator, least_mm: floa
         raise DataError("x_mm: no four of the positions span a volume; move the tool through more places and depths.")
     sets, thick = sets[spans], thick[spans]
     fine = thick > least_mm
-    return sets[fine] if fine.sum() >= 20 else sets[np.argsort(-thick)[:20]]
+    sets = sets[fine] if fine.sum() >= 20 else sets[np.argsort(-thick)[:20]]
+    return np.linalg.solve(H[sets], u[sets])
 
 
 def _distances2(H: np.ndarray, u: np.ndarray, M: np.ndarray) -> np.ndarray:
@@ -181,8 +179,8 @@ def _scale_free(distance2: np.ndarray, area: float) -> np.ndarray:
 
 def tightest_sample(x: np.ndarray, u: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """The camera (2, 4) through four of the points x (n, 3) mm that most pixels u (n, 2) are near to."""
-    H, sets = np.column_stack([x, np.ones(len(x))]), _samples(x, 150, rng, 0.0)
-    M = np.linalg.solve(H[sets], u[sets])
+    H = np.column_stack([x, np.ones(len(x))])
+    M = _sampled(H, u, 150, rng, 0.0)
     return M[_scale_free(_distances2(H, u, M), float(np.prod(_extent(u)))).argmin()].T
 
 
@@ -195,8 +193,7 @@ def _tightest(x: np.ndarray, u: np.ndarray, threshold_px: float | None, rng: np.
     some = np.arange(n) if n <= _ROWS_RANKED else rng.choice(n, _ROWS_RANKED, replace=False)
     M, score, near2 = np.empty((0, 4, 2)), np.empty(0), np.empty(0)
     for count in _SAMPLES:
-        sets = _samples(H[:, :3], count, rng, least_mm)
-        new = np.linalg.solve(H[sets], u[sets])
+        new = _sampled(H, u, count, rng, least_mm)
         distance2 = _distances2(H[some], u[some], new)
         ranks = _scale_free(distance2, area) if threshold_px is None else np.minimum(distance2, threshold_px**2).sum(axis=1)
         rank = min(max(6, int(0.15 * len(some))), len(some) - 1)
