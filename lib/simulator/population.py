@@ -242,8 +242,7 @@ def sample(
     speed = rng.normal(0, 2.0 if population == "near" else rng.choice([2.0, 6.0]), 3) * (rng.random() < 0.5)
     moved = replace(pose, base_mm=tuple(np.asarray(pose.base_mm) + 1e-3 * speed))
     shown = {"forceps": forceps, "pose": pose, "later": (moved, 1e-3) if has_landmarks else None}
-    view = render_view(setup.scene, replace(microscope, video=None), window, **shown, rng=rng)
-    image, u, visibility = view.image, view.u, view.visibility
+    image, u, visibility, *_ = render_view(setup.scene, replace(microscope, video=None), window, **shown, rng=rng)
     if tuple(size_px) != window.size_px:
         factor = np.array(size_px) / window.size_px
         image = cv2.resize(image, size_px, interpolation=cv2.INTER_AREA if factor[1] < 1 else cv2.INTER_LINEAR)

@@ -72,10 +72,8 @@ class Augmentation:
                 images, u = both(images, u.to(images.dtype))  # NaN points stay NaN
             if changed:
                 images = torch.cat([self.light()(images[:changed]).clamp(0, 1), images[changed:]])
-        if changed:
-            self._occlude(images[:changed], u[:changed], visibility[:changed], rng)
-        u = u.to(batch.u.dtype)
-        return Batch(images, u, leave_frame(u, visibility, images.shape[-2:]))
+                self._occlude(images[:changed], u[:changed], visibility[:changed], rng)
+        return Batch(images, u.to(batch.u.dtype), leave_frame(u, visibility, images.shape[-2:]))
 
     def light(self) -> K.ImageSequential:
         """The changes of light, focus and sensor."""

@@ -135,9 +135,8 @@ def packed(images: Iterable[LabelledImage], long_side_px: int | None = None) -> 
 def read_scenes(folder: str | Path) -> tuple[np.ndarray, ...]:
     """What `packed` gives, of all shards of scenes in a folder."""
     parts = read_shards(folder, "scenes", ("jpegs", "u", "visibility"))
-    ends = [_read(path, ("jpeg_ends",))[0] for path in sorted(Path(folder).glob("scenes_*.npz"))]
-    before = np.cumsum([0, *(own[-1] for own in ends[:-1])])
-    return np.concatenate([own + start for own, start in zip(ends, before, strict=True)]), *parts
+    ends = (_read(path, ("jpeg_ends",))[0] for path in sorted(Path(folder).glob("scenes_*.npz")))
+    return np.cumsum(np.concatenate([np.diff(own, prepend=0) for own in ends])), *parts
 
 
 def propose(folder: str | Path, detector: str | Path | None = None, *, workers: int | None = None) -> None:
