@@ -13,8 +13,7 @@ def glint_mask(image: ArrayLike, *, grow_px: int = 5) -> np.ndarray:
     image = np.asarray(image)
     if image.dtype != np.uint8 or image.ndim not in (2, 3):
         raise ValueError(f"image: expected a uint8 image (h, w, 3) or (h, w), got {image.dtype} {image.shape}.")
-    channels = 1 if image.ndim == 2 else image.shape[2]
-    core = cv2.inRange(np.ascontiguousarray(image), (245,) * channels, (255,) * channels)
+    core = cv2.inRange(np.ascontiguousarray(image), (245,) * 4, (255,) * 4)  # OpenCV takes as many as there are channels
     return cv2.dilate(core, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * grow_px + 1,) * 2)).astype(bool)
 
 
