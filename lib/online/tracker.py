@@ -2,6 +2,7 @@
 
 from collections import deque
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -15,7 +16,7 @@ from lib.online.causes import CONVINCING, explain, misfit
 from lib.online.checks import Scene
 from lib.online.result import FrameResult, Settings
 from lib.registration import DriftMonitor, MovedCameras
-from lib.trust import judge
+from lib.trust import Verdict, judge
 
 _CHI2_4_MEDIAN = 3.357
 _STANDS_OUT = 8.0  # score of a single frame that is not to be believed
@@ -133,16 +134,19 @@ class RigTracker:
                 self._monitor.follow(self.rig)
             return
         self._tried = len(self._frames)
-        found, kept = self._agreed()
-        verdict = judge(None, found, robot_accuracy_mm=self.settings.robot_accuracy_mm)
+        found, kept = self._agreed(self._frames)
+        verdict = self._judged(found)
         if verdict.is_red or (self.cause and verdict.reasons):  # after a fault nothing doubtful is believed
             raise ValueError("; ".join(reason.text for reason in verdict.reasons))
         self._frames, self._fitted = kept, len(kept)
         self._use(found)
 
-    def _agreed(self) -> tuple[Calibration, list[Seen]]:
+    def _judged(self, found: Calibration) -> Verdict:
+        return judge(None, found, robot_accuracy_mm=self.settings.robot_accuracy_mm)
+
+    def _agreed(self, frames: Sequence[Seen]) -> tuple[Calibration, list[Seen]]:
         """The calibration by most frames, and the frames that agree with it: a bad frame is outvoted, at any place."""
-        frames, first = self._frames, self.settings.calibration_frames[0]
+        first = self.settings.calibration_frames[0]
         base = np.array([np.nanmean(frame.data.x_mm, axis=0) for frame in frames])
         near = np.linalg.norm(base - np.median(base, axis=0), axis=1) < _FAR_MM
         frames = [frame for frame, fine in zip(frames, near, strict=True) if fine]
@@ -217,12 +221,14 @@ class RigTracker:
             found = explain(self._before, frames, past, noise, undecided=len(frames) < last)
             shifted = found.kind in ("clock", "slipped", "exchanged", "eye")
             if found.kind in ("moved", "optics") and self._stands_still(found.rig, joined.x_mm, moved_px):
-                if not self._fits(self._before, newest[-1:], 2 * CONVINCING):
+                since, better = self._since, self._calibrated_anew()
+                if better is None and not self._fits(self._before, newest[-1:], 2 * CONVINCING):
                     raise ValueError("the scene stands still, so the cameras do: the detector or the robot errs.")
-                since = self._since
                 self._revert(result.index)
+                if better is not None:
+                    self._use(better)
                 self._settle()
-                return since
+                return [] if better else since
             if not (found.loss <= CONVINCING if shifted else found.kind == "open" or self._fits(found.rig, newest)):
                 raise ValueError("no cause explains the newest frames.")
         except ValueError as error:
@@ -273,6 +279,19 @@ class RigTracker:
         self._monitor.follow(self.rig)
         self._recent.clear()
         self._monitor.forget()
+
+    def _calibrated_anew(self) -> Calibration | None:
+        """By the frames since, too, if that explains the newest: the cameras stood still and were not known well enough."""
+        first = self.settings.registration_frames[0]
+        if self._given or self._motion_before is not None or self._online is not None or self._waiting % first:
+            return None
+        with suppress(ValueError):
+            found, kept = self._agreed([*self._frames, *self._since])
+            newest = [with_offsets(frame.data, found.offsets) for frame in self._since[-first:]]
+            if not self._judged(found).reasons and self._fits(found.rig, newest):
+                self._frames, self._fitted = kept, len(kept)
+                return found
+        return None
 
     def _stands_still(self, rig: StereoRig, x_mm: np.ndarray, moved_px: np.ndarray) -> bool:
         """Whether `rig`, in place of the one before, would move the landmarks in an image whose scene hardly moved."""
