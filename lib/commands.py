@@ -154,13 +154,13 @@ def _told(offsets: LandmarkOffsets | None) -> dict:
 
 def _offsets_beside(rig: Path) -> LandmarkOffsets | None:
     """Offsets of the landmarks from the robot's report that belong to a rig, by the results beside its file."""
-    for path in (rig.parent / "calibration.json", rig.parent / "registration.json"):
-        told = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
-        if told.get("landmark_offsets_mm"):
-            offset = np.array(told["landmark_offsets_mm"])
-            unknown = np.full((*offset.shape, offset.shape[1]), np.nan)
-            return LandmarkOffsets(offset, unknown, np.nan, np.nan, bool(told["landmark_offsets_turn_axes"]))
-    return None
+    path = rig.parent / ("registration.json" if rig.name.startswith("moved_") else "calibration.json")
+    told = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    if not told.get("landmark_offsets_mm"):
+        return None
+    offset = np.array(told["landmark_offsets_mm"])
+    unknown = np.full((*offset.shape, offset.shape[1]), np.nan)
+    return LandmarkOffsets(offset, unknown, np.nan, np.nan, bool(told["landmark_offsets_turn_axes"]))
 
 
 def _as_one(moved: StereoRig, found: Assessment, offsets: LandmarkOffsets | None) -> Verdict:

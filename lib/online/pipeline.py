@@ -5,6 +5,7 @@ frame is reconstructed, and its landmarks show whether the cameras moved, or wha
 """
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any, Self
 
@@ -213,13 +214,15 @@ class OnlinePipeline:
             return None
         n = len(LANDMARKS)
         nowhere = np.full((2, n, 2), np.nan)
-        if callable(kinematics):
-            nothing = {"covariance_px2": np.full((1, n, 2, 2, 2), np.nan), "confidence": np.zeros((1, n, 2))}
-            rows = kinematics(*nowhere[:, None], linear=self.rig.linear, **nothing)
-        else:
-            rows = Correspondences.of_points(kinematics, *nowhere, landmark=range(n))
-        x_mm = self._tracker.corrected(rows).x_mm
-        return np.stack(self.rig.project(x_mm)) if np.isfinite(x_mm).all() else None
+        with suppress(ValueError):  # positions of another shape, of which the frame's failure will tell, or behind a camera
+            if callable(kinematics):
+                nothing = {"covariance_px2": np.full((1, n, 2, 2, 2), np.nan), "confidence": np.zeros((1, n, 2))}
+                rows = kinematics(*nowhere[:, None], linear=self.rig.linear, **nothing)
+            else:
+                rows = Correspondences.of_points(kinematics, *nowhere, landmark=range(n))
+            x_mm = self._tracker.corrected(rows).x_mm
+            return np.stack(self.rig.project(x_mm)) if np.isfinite(x_mm).all() else None
+        return None
 
     def _surface_jumped(self) -> bool:
         """Whether the newest surface lies elsewhere than the newest one while the landmarks were in view."""

@@ -200,7 +200,8 @@ class RigTracker:
     def _resolve(self, result: FrameResult, scene: Scene) -> list[Seen]:
         """Explain the frames since, by a motion or by another cause; convinced only if the newest frames agree.
 
-        Returns frames that may improve the rig.  The scene contradicts a motion; then the rig was not known well enough.
+        A scene that stands still contradicts a motion: then the rig was not known well enough, or detector or robot err.
+        Returns frames that may improve the rig.
         """
         first, last = self.settings.registration_frames
         self._since = self._since[-max(last, 30) :]
@@ -228,7 +229,7 @@ class RigTracker:
                 if better is not None:
                     self._use(better)
                 self._settle()
-                return [] if better else since
+                return since if better is None else []
             if not (found.loss <= CONVINCING if shifted else found.kind == "open" or self._fits(found.rig, newest)):
                 raise ValueError("no cause explains the newest frames.")
         except ValueError as error:
