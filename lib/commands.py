@@ -155,12 +155,16 @@ def _told(offsets: LandmarkOffsets | None) -> dict:
 def _offsets_beside(rig: Path) -> LandmarkOffsets | None:
     """Offsets of the landmarks from the robot's report that belong to a rig, by the results beside its file."""
     path = rig.parent / ("registration.json" if rig.name.startswith("moved_") else "calibration.json")
-    told = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
-    if not told.get("landmark_offsets_mm"):
+    if not path.is_file():
         return None
-    offset = np.array(told["landmark_offsets_mm"])
-    unknown = np.full((*offset.shape, offset.shape[1]), np.nan)
-    return LandmarkOffsets(offset, unknown, np.nan, np.nan, bool(told["landmark_offsets_turn_axes"]))
+    try:
+        told = json.loads(path.read_text(encoding="utf-8"))
+        offset, turns = told["landmark_offsets_mm"], bool(told["landmark_offsets_turn_axes"])
+        offset = offset and np.array(offset, dtype=np.float64)
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{path}: not the results of {paths.shown(rig)} ({error!r}); calibrate again.") from None
+    unknown = None if offset is None else np.full((*offset.shape, offset.shape[1]), np.nan)
+    return None if offset is None else LandmarkOffsets(offset, unknown, np.nan, np.nan, turns)
 
 
 def _as_one(moved: StereoRig, found: Assessment, offsets: LandmarkOffsets | None) -> Verdict:

@@ -39,7 +39,7 @@ class Scene(NamedTuple):
 
 
 def _moved_px(*images: np.ndarray) -> float:
-    if min(images[0].shape[:2]) < _TILES * _LEAST_PX:
+    if min(images[0].shape[:2]) < _TILES * _LEAST_PX or images[0].shape != images[1].shape:
         return np.nan
     scale, tile = _STEP * np.array(images[0].shape[1::-1]) / _SCENE_PX, np.array(_SCENE_PX) // _TILES
     small = [cv2.resize(cv2.cvtColor(one, cv2.COLOR_RGB2GRAY), _SCENE_PX, interpolation=cv2.INTER_AREA) for one in images]

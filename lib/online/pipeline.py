@@ -175,7 +175,8 @@ class OnlinePipeline:
         self._seen = None  # whatever fails now, the next frame is searched as a whole
         known = with_ground(self._detector, self._ground)
         follow = previous is not None and hasattr(self._detector, "track")
-        told = self._told_px(kinematics) if hasattr(self._detector, "near") else None
+        guides = hasattr(self._detector, "near") and getattr(self._detector, "tool_network", True) is not None
+        told = self._told_px(kinematics) if guides else None
         previous = self._guided(images, previous, told, known) if follow else previous
         found = self._detector.track(images, previous, **known) if follow else self._detector(images, **known)
         self._seen = found = self._guided(images, found, told, known)
@@ -214,7 +215,7 @@ class OnlinePipeline:
             return None
         n = len(LANDMARKS)
         nowhere = np.full((2, n, 2), np.nan)
-        with suppress(ValueError):  # positions of another shape, of which the frame's failure will tell, or behind a camera
+        with suppress(ValueError, TypeError):  # no positions, of which the frame's failure will tell, or behind a camera
             if callable(kinematics):
                 nothing = {"covariance_px2": np.full((1, n, 2, 2, 2), np.nan), "confidence": np.zeros((1, n, 2))}
                 rows = kinematics(*nowhere[:, None], linear=self.rig.linear, **nothing)

@@ -21,7 +21,8 @@ from lib.trust import Verdict, judge
 _CHI2_4_MEDIAN = 3.357
 _STANDS_OUT = 8.0  # score of a single frame that is not to be believed
 _FAR_MM = 200.0  # of the robot's median position: no tool reaches that far
-_STILL_PX, _MOVES = 1.0, 3.0  # cameras by which landmarks move more than this, and so many times the scene, stand still
+#: A scene that moved less stands still.  It contradicts cameras by which landmarks move more than 1 px and 3 times as far.
+_STILL_PX, _NOISE_PX, _TIMES = 3.0, 1.0, 3.0
 _PATIENT = 5  # times `Settings.give_up_frames` pass before a rig is given up in front of a scene that stands still
 _PAST = 40  # frames kept to find a late report
 _AGAIN = 30  # frames after a registration in which no microscope moves again; then the registration was no explanation
@@ -117,9 +118,11 @@ class RigTracker:
         if self._given or self._motion is not None or self._online is not None:
             return self._online is not None and bool(accepted) and self._motion is None
         self._frames += accepted
+        if self.rig is None:
+            self._tried -= max(0, len(self._frames) - 2 * last)  # those that are left out now
+            self._frames = self._frames[-2 * last :]
         n = len(self._frames)
         if self.rig is None:
-            self._frames = self._frames[-2 * last :]
             return n >= first and bool(accepted) and n >= self._tried + (1 if n < 2 * first else 3)
         return n > last or n >= 1.25 * self._fitted
 
@@ -222,14 +225,14 @@ class RigTracker:
             found = explain(self._before, frames, past, noise, undecided=len(frames) < last)
             shifted = found.kind in ("clock", "slipped", "exchanged", "eye")
             if found.kind in ("moved", "optics") and self._stands_still(found.rig, joined.x_mm, moved_px):
-                since, better = self._since, self._calibrated_anew()
-                if better is None and not self._fits(self._before, newest[-1:], 2 * CONVINCING):
+                agree, better = self._since[-first:], self._calibrated_anew()
+                if better is None and not self._fits(self._before, newest):
                     raise ValueError("the scene stands still, so the cameras do: the detector or the robot errs.")
                 self._revert(result.index)
                 if better is not None:
                     self._use(better)
                 self._settle()
-                return since if better is None else []
+                return agree if better is None else []
             if not (found.loss <= CONVINCING if shifted else found.kind == "open" or self._fits(found.rig, newest)):
                 raise ValueError("no cause explains the newest frames.")
         except ValueError as error:
@@ -238,7 +241,7 @@ class RigTracker:
             self._since = self._since[1 - 2 * first :]
             self._waiting += 1
             self.cause = str(error)
-            patience = _PATIENT if (moved_px < _MOVES).all() else 1
+            patience = _PATIENT if (moved_px < _STILL_PX).all() else 1
             if self._waiting > patience * self.settings.give_up_frames:
                 self._start_again(self._since, "no cause explains the images; calibrating afresh")
             raise
@@ -297,11 +300,12 @@ class RigTracker:
     def _stands_still(self, rig: StereoRig, x_mm: np.ndarray, moved_px: np.ndarray) -> bool:
         """Whether `rig`, in place of the one before, would move the landmarks in an image whose scene hardly moved."""
         step = np.stack(rig.project(x_mm)) - np.stack(self._before.project(x_mm))
-        return bool((np.median(np.linalg.norm(step, axis=2), axis=1) > _STILL_PX + _MOVES * moved_px).any())
+        farther = np.median(np.linalg.norm(step, axis=2), axis=1) > _NOISE_PX + _TIMES * moved_px
+        return bool((farther & (moved_px < _STILL_PX)).any())
 
-    def _fits(self, rig: StereoRig, frames: Sequence[Correspondences], loss: float = CONVINCING) -> bool:
+    def _fits(self, rig: StereoRig, frames: Sequence[Correspondences]) -> bool:
         data = Correspondences.join(frames).complete
-        return bool(len(data) and misfit(rig, data, self._noise(data) + self._rig_covariance(data)) <= loss * len(data))
+        return bool(len(data) and misfit(rig, data, self._noise(data) + self._rig_covariance(data)) <= CONVINCING * len(data))
 
     def corrected(self, data: Correspondences) -> Correspondences:
         """With the landmarks where the detector sees them; the frames before tell the axes of shut and crossed jaws."""
