@@ -146,6 +146,16 @@ def test_exchanged_eyes_are_named_and_come_back():
     assert rig_error_mm(pipeline.rig, world) < 0.05
 
 
+def test_a_tool_that_rests_for_long_does_not_block_the_calibration():
+    world = World(5, NOISE_PX)
+    path_mm = world.x_mm.copy()
+    world.x_mm[:] = path_mm[:1]
+    results = run(pipeline := make(world, settings=SELDOM), world, 130)
+    assert {r.state for r in results} == {"calibrating"}
+    world.x_mm = path_mm
+    assert run(pipeline, world, 40)[-1].state == "tracking"
+
+
 def test_exchanged_tips_are_named_and_come_back():
     world, pipeline = calibrated()
     pipeline._detector = lambda images: replace(found := world.detect(images), u=found.u[:, [0, 2, 1]].copy())
