@@ -162,7 +162,8 @@ def _offsets_beside(rig: Path) -> LandmarkOffsets | None:
         offset, turns = told["landmark_offsets_mm"], bool(told["landmark_offsets_turn_axes"])
         offset = offset and np.array(offset, dtype=np.float64)
     except (ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{path}: not the results of {paths.shown(rig)} ({error!r}); calibrate again.") from None
+        what = f"{path}: not the results of {paths.shown(rig)} ({error!r})"
+        raise ValueError(f"{what}; calibrate again, or move that file away.") from None
     unknown = None if offset is None else np.full((*offset.shape, offset.shape[1]), np.nan)
     return None if offset is None else LandmarkOffsets(offset, unknown, np.nan, np.nan, turns)
 
@@ -171,12 +172,12 @@ def _as_one(moved: StereoRig, found: Assessment, offsets: LandmarkOffsets | None
     """Whether one motion of both cameras explains the landmarks about as well as cameras calibrated from them."""
     if found.calibration is None or len(found.data.complete) < _FEWEST:
         return Verdict()
-    errors = []
-    for rig, own in ((moved, offsets), (found.calibration.pair, found.calibration.offsets)):
+
+    def error_px(rig: StereoRig, own: LandmarkOffsets | None) -> float:
         data = with_offsets(found.data, own)
-        error = np.linalg.norm(np.stack([data.u_left, data.u_right]) - rig.project(data.x_mm), axis=2)
-        errors.append(np.nanmedian(error))
-    now, anew = errors
+        return np.nanmedian(np.linalg.norm(np.stack([data.u_left, data.u_right]) - rig.project(data.x_mm), axis=2))
+
+    now, anew = error_px(moved, offsets), error_px(found.calibration.pair, found.calibration.offsets)
     level = LEVELS[np.searchsorted(LIMITS["residuals"], now / max(anew, _EXACT_PX))]
     text = f"The moved cameras miss the landmarks by {now:.1f} px (median), cameras calibrated from them by {anew:.1f} px."
     cure = "Did one camera move alone, did zoom or focus change, is --rig of another microscope? Calibrate anew."

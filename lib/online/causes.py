@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 
@@ -62,15 +63,15 @@ def explain(
         text = f"the tool slipped by {np.linalg.norm(offset):.2f} mm"
         others.append((misfit(rig, slipped, covariance_px2, 3), Explanation("slipped", text, rig)))
     if rig.is_affine:
-        zoomed = _zoomed(rig, data, covariance_px2)
-        pairs = (zoomed.left, rig.right, 3), (rig.left, zoomed.right, 3), (zoomed.left, zoomed.right, 6)
-        for left, right, parameters in pairs:
-            fresh = StereoRig(left, right)
-            cameras = (left, right, rig.left, rig.right)
-            px_per_mm = np.sqrt([np.linalg.norm(np.cross(*camera.linear)) for camera in cameras])  # mean of x and y
-            if np.abs((zoom := px_per_mm[:2] / px_per_mm[2:]) - 1.0).max() > _LEAST_ZOOM:
-                text = "the optics changed: zoom x {:.3f} left, x {:.3f} right".format(*zoom)
-                others.append((misfit(fresh, data, covariance_px2, parameters), Explanation("optics", text, fresh)))
+        sides = (rig.left, data.u_left), (rig.right, data.u_right)
+        choices = (((camera, 1.0), _zoomed(camera, data.x_mm, u, covariance_px2)) for camera, u in sides)
+        for (left, zoom_left), (right, zoom_right) in product(*choices):
+            changes = np.abs([zoom_left - 1.0, zoom_right - 1.0])
+            if changes.max() > _LEAST_ZOOM:
+                text = f"the optics changed: zoom x {zoom_left:.3f} left, x {zoom_right:.3f} right"
+                fresh = StereoRig(left, right)
+                loss = misfit(fresh, data, covariance_px2, 3 * np.count_nonzero(changes))
+                others.append((loss, Explanation("optics", text, fresh)))
     best, other = min(others, key=lambda pair: pair[0])
     penalty = {"slipped": 3, "clock": 2, "eye": 2}.get(other.kind, 0) * np.log(2.0 * 2.0 * len(data))
     other = replace(other, loss=(best - penalty) / len(data))
@@ -126,16 +127,13 @@ def _offset(rig: StereoRig, data: Correspondences, axes: np.ndarray, covariance_
     return offset
 
 
-def _zoomed(rig: StereoRig, data: Correspondences, covariance_px2: np.ndarray) -> StereoRig:
-    """The rig with each image scaled and shifted so that it suits the rows, robustly."""
-    cameras, variance = [], np.einsum("nii->n", covariance_px2) / 4.0
-    for camera, u in ((rig.left, data.u_left), (rig.right, data.u_right)):
-        seen, weight = camera.project(data.x_mm), np.ones(len(data))
-        for _ in range(10):
-            share = (weight / variance / (weight / variance).sum())[:, None]
-            from_middle, at = seen - (share * seen).sum(axis=0), u - (share * u).sum(axis=0)
-            scale = (share * from_middle * at).sum() / (share * from_middle**2).sum()
-            weight = _ROBUST / (_ROBUST + ((at - scale * from_middle) ** 2).sum(axis=1) / variance)
-        shift = (share * (u - scale * seen)).sum(axis=0)
-        cameras.append(AffineCamera(scale * camera.matrix + np.column_stack([np.zeros((2, 3)), shift])))
-    return StereoRig(*cameras)
+def _zoomed(camera: AffineCamera, x_mm: np.ndarray, u: np.ndarray, covariance_px2: np.ndarray) -> tuple[AffineCamera, float]:
+    """The camera with its image scaled and shifted so that x_mm is seen at u, robustly; and that scale."""
+    variance, weight, seen = np.einsum("nii->n", covariance_px2) / 4.0, np.ones(len(u)), camera.project(x_mm)
+    for _ in range(10):
+        share = (weight / variance / (weight / variance).sum())[:, None]
+        from_middle, at = seen - (share * seen).sum(axis=0), u - (share * u).sum(axis=0)
+        scale = float((share * from_middle * at).sum() / (share * from_middle**2).sum())
+        weight = _ROBUST / (_ROBUST + ((at - scale * from_middle) ** 2).sum(axis=1) / variance)
+    shift = (share * (u - scale * seen)).sum(axis=0)
+    return AffineCamera(scale * camera.matrix + np.column_stack([np.zeros((2, 3)), shift])), scale

@@ -40,8 +40,9 @@ class OnlinePipeline:
 
     Args:
         detector: `lib.landmarks.Detector`, or anything alike: images (2, h, w, 3) uint8 RGB to `.u` (2, 3, 2), `.covariance`
-            and `.confidence`.  If it has a method `track(images, previous)`, frames after the first are given to that.  The
-            memory of the images holds the next frame later: a detector that keeps them needs a copy.
+            and `.confidence`.  If it has a method `track(images, previous)`, frames after the first are given to that, and
+            if it has `near`, that looks where the robot says.  The memory of the images holds the next frame later: a
+            detector that keeps them needs a copy.
         rig: A rig or a calibration to start from, kept until the cameras move; None calibrates from the first frames.
         noise_px: Standard deviation of a landmark's residual per coordinate, for a `rig` that is no calibration.
         beside: Reconstruct surfaces in a process beside this one, the newest frame first; else in turn, which gives the
@@ -97,7 +98,8 @@ class OnlinePipeline:
             kinematics: (3, 3) mm, base, tip_1, tip_2 in the robot frame at the time of the frame; NaN or None where the
                 robot said nothing.  Or a function that pairs the detections with the robot's positions at the instants
                 at which their rows were read, given as to `lib.correspondences.pair_with_robot`, and returns the
-                frame's Correspondences: ``partial(of_recording, recording, frames=[index])``.
+                frame's Correspondences: ``partial(of_recording, recording, frames=[index])``.  Before anything is detected
+                it is called with NaN, to tell where the robot has the tool.
             time_s: Of the frame, video clock; None = uniform at `Settings.fps`.
         """
         self._index += 1
