@@ -40,7 +40,7 @@ class OnlinePipeline:
 
     Args:
         detector: `lib.landmarks.Detector`, or anything alike: images (2, h, w, 3) uint8 RGB to `.u` (2, 3, 2), `.covariance`
-            and `.confidence`.  If it has methods `track` and `near`, these follow the tool and look where the robot says.  The
+            and `.confidence`.  If it has methods `track` and `near`, they follow the tool and look where the robot says.  The
             memory of the images holds the next frame later: a detector that keeps them needs a copy.
         rig: A rig or a calibration to start from, kept until the cameras move; None calibrates from the first frames.
         noise_px: Standard deviation of a landmark's residual per coordinate, for a `rig` that is no calibration.
