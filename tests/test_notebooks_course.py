@@ -232,7 +232,9 @@ def test_a_difference_is_refused_and_a_claim_that_fails_says_so(monkeypatch):
     monkeypatch.setattr(report, "RECORDED", {"a_um": 3.0, "b_um": 1.0, "c_um": None})
     told = {"Wide: {a_um:.0f} um.": "{a_um} > 2", "Small: {b_um:.0f} um.": "{b_um} > 2", "{c_um}": "{c_um} > 0"}
     page = course.learnt(told).data
-    assert page.splitlines()[0] == "- Wide: 3 um." and "**Not in this run:** Small" in page and "1 conclusions need" in page
+    assert page.splitlines()[0] == "- Wide: 3 um." and "**Not all of this holds in this run:** Small" in page
+    assert "- One more conclusion is left out" in page
+    assert "2 more conclusions are left out" in course.learnt(told | {"{d_um}": "{d_um} > 0"}).data
 
 
 def test_folded_code_and_solutions_are_folded_in_the_page():

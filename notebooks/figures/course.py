@@ -63,10 +63,12 @@ def learnt(claims: Mapping[str, str]) -> Markdown:
     told = {text: condition for text, condition in claims.items() if {*metrics_named(text + condition)} <= set(known)}
     lines = []
     for text, condition in told.items():
-        doubt = "" if holds(condition, known) else "**Not in this run:** "
+        doubt = "" if holds(condition, known) else "**Not all of this holds in this run:** "
         lines.append(f"- {doubt}{filled(text, known)}")
-    if len(told) < len(claims):
-        lines.append(f"- {len(claims) - len(told)} conclusions need numbers that this run did not measure.")
+    if missing := len(claims) - len(told):
+        rest = "One more conclusion is" if missing == 1 else f"{missing} more conclusions are"
+        why = "The recording may have no truth or no labels, or a real data set, Open3D or a recorded table may be missing."
+        lines.append(f"- {rest} left out, for want of numbers that this run could not measure. {why}")
     return Markdown("\n".join(lines))
 
 

@@ -55,6 +55,13 @@ def half_and_rest(
     return half, with_offsets(rows[1], half.offsets)
 
 
+def held_out_gap_um(half: Calibration, held_out: Correspondences) -> np.ndarray:
+    """Distances (n,) um of the held-out landmarks that both images show, triangulated by `half`, from the robot's report."""
+    test = held_out.complete
+    points = half.rig.triangulate(test.u_left, test.u_right, test.pair_covariance_px2)
+    return 1e3 * np.linalg.norm(points.x_mm - test.x_mm, axis=1)
+
+
 def sealed(page: Figure, verdict: Verdict) -> Figure:
     """A figure with the verdict on the recording's calibration above its title, and the worst reason with its cure."""
     worst = verdict.reasons[0] if verdict.reasons else None
