@@ -6,6 +6,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator
 
 from lib.online import FrameResult
 from notebooks.figures.style import COLOURS, LANDMARK_COLOURS, ON_IMAGE, figure, show_image
@@ -94,10 +95,12 @@ def pipeline_page(
     ax.set_title("4  The retina, heights 2.5 times", **title)
 
     ax = page.add_subplot(grid[1, 1])
-    shown, unit, map_name = (height * 1e3, "height, um", "viridis") if error_um is None else (error_um, "um", "RdBu_r")
-    limit = np.nanquantile(np.abs(shown), 0.98)
-    picture = ax.imshow(shown, cmap=map_name, vmin=-limit, vmax=limit, aspect="equal")
-    page.colorbar(picture, ax=ax, shrink=0.7, label=unit)
+    if error_um is None:
+        picture = ax.imshow(height, cmap="viridis", aspect="equal")
+    else:
+        limit = np.nanquantile(np.abs(error_um), 0.98)
+        picture = ax.imshow(error_um, cmap="RdBu_r", vmin=-limit, vmax=limit, aspect="equal")
+    page.colorbar(picture, ax=ax, shrink=0.7, label="height (mm)" if error_um is None else "um")
     ax.set(xticks=[], yticks=[])
     rms = "" if error_um is None else f", {np.sqrt(np.nanmean(error_um**2)):.0f} um RMS"
     ax.set_title(("5  Height" if error_um is None else "5  Error against the truth") + rms, **title)
@@ -116,6 +119,9 @@ def pipeline_page(
         ax.plot(frames, error, "o-", color=colour, label=method)
     ax.axhline(150, color=COLOURS["baseline"], linestyle="--", label="paper: below 150 um after 3 frames")
     ax.set(xlabel="frames of the tool", ylabel="translation error, um", yscale="log")
+    ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    ax.yaxis.set_major_formatter("{x:g}")
+    ax.yaxis.set_minor_formatter("")
     ax.grid(True, color="#e6e6e6", linewidth=0.6)
     ax.legend(fontsize=8, frameon=False)
     return page

@@ -18,6 +18,11 @@ from notebooks.figures.interactive import explore
 from notebooks.figures.overview import landmarks_on
 from notebooks.figures.style import COLOURS, LANDMARK_COLOURS, figure, show_image
 
+#: What a registration found, in words.
+MOVED = {
+    "none": "no camera moved", "shifted": "both cameras shifted together", "together": "both cameras moved together",
+    "left": "the left camera moved", "right": "the right camera moved", "apart": "the cameras moved apart",
+}  # fmt: skip
 _STATE_COLOURS = dict(zip(STATES, ("#f0f0f0", "white", "#dceaf7", "#b0b0b0", "#f7eec2", "#fde3c8"), strict=True))
 _STAGE_COLOURS = dict(
     zip(STAGES, ("#0072B2", "#56B4E9", "#CC79A7", "#D55E00", "#E69F00", "#009E73", "#999999"), strict=True)
@@ -180,7 +185,7 @@ def dashboard(left: np.ndarray, result: FrameResult) -> Figure:
         scene.plot(*tool[[0, tip]].T, color="black", linewidth=2)
     for name, point in zip(LANDMARK_COLOURS, tool, strict=True):
         scene.scatter(*point, color=LANDMARK_COLOURS[name], edgecolor="black", s=25)
-    scene.set(xlabel="x in mm", ylabel="y in mm", zlabel="height")
+    scene.set(xlabel="x in mm", ylabel="y in mm", zlabel="height in mm")
     for axis in (scene.xaxis, scene.yaxis, scene.zaxis):
         axis.set_major_locator(MaxNLocator(4))
     ranges = np.nanmax(seen, axis=(0, 1)) - np.nanmin(seen, axis=(0, 1))

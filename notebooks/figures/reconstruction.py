@@ -174,7 +174,8 @@ def epipolar_geometry(
         a, b, c = rig.fundamental @ [*point, 1.0]
         x = np.array([0.0, width - 1.0])
         panels["right"].plot(x, -(a * x + c) / b, color=colour, lw=1.6)
-        panels["right"].text(0, -c / b, f"{k + 1} ", ha="right", va="center", fontsize=8)
+        beside = (point[0], -(a * point[0] + c) / b)  # in its own column: at the border numbers would overlap
+        panels["right"].annotate(f"{k + 1}", beside, (0, 2), textcoords="offset points", color=colour, fontsize=9)
         panels["left"].annotate(f"{k + 1}", point, (6, 4), textcoords="offset points", color=colour, fontsize=9)
     span = float(np.abs(distance_px).max()) + 1e-6
     panels["filter"].hist(
@@ -248,7 +249,8 @@ def held_out_curve(
     """Held-out error of candidates (m, 2), in percent above the least; the choice; the true error where it is known."""
     page, ax = figure(width_in=7, height_in=3.4)
     excess = (held_out[:, 1] / held_out[:, 1].min() - 1) * 100
-    ax.plot(held_out[:, 0], excess, "o-", color=COLOURS["ours"], label="held-out error (left axis)")
+    side = "" if error_um is None else " (left axis)"
+    ax.plot(held_out[:, 0], excess, "o-", color=COLOURS["ours"], label=f"held-out error{side}")
     ax.axvline(chosen, color=COLOURS["ours"], ls=":", label="chosen")
     ax.set(xscale="log", xlabel="smoothness mu (px²/mm)", ylabel="held-out L1 error above the least (%)")
     ax.set_yscale("symlog", linthresh=0.1)
@@ -299,12 +301,12 @@ def smoothness_sections(
     reference: dict[str, tuple[np.ndarray, str]],
 ) -> Figure:
     """Sections of three of the surfaces: too rough, in the middle, too smooth."""
-    page, axes = figure(1, 3, width_in=14, height_in=3.1, sharey=True)
+    page, axes = figure(1, 3, width_in=14, height_in=3.4, sharey=True)
     for ax, step in zip(axes, (0, len(smoothness) // 2, -1), strict=True):
         _relative_section(ax, step, depths_mm, position_mm, points, reference)
         ax.set_title(f"mu = {smoothness[step]:.2g} px²/mm")
     axes[0].set_ylabel("depth beyond a smooth bowl (um)")
-    axes[0].legend(loc="best", fontsize=8)
+    page.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", fontsize=8, ncols=3)
     return page
 
 
@@ -513,8 +515,8 @@ def recorded_errors(recorded: Mapping[str, Table], caption: str) -> HTML:
         for setting in ("quality", "fast"):
             found = calibrated.where(setting=setting).columns
             if f"{name}_robot_frame_um" in found:
-                means = (np.mean(found[f"{name}_{key}_um"]) for key in ("robot_frame", "rigid", "affine"))
-                rows.append([f"{setting}: {name.replace('_', ', ')} cameras", *numbers(means)])
+                rms = (np.sqrt(np.mean(found[f"{name}_{key}_um"] ** 2)) for key in ("robot_frame", "rigid", "affine"))
+                rows.append([f"{setting}: {name.replace('_', ', ')} cameras", *numbers(rms)])
     if rows:
         header = ["75 frames", "RMS (um)", "rigid motion taken out", "affine map taken out"]
         tables.append(table(header, rows, f"{caption} Cameras calibrated from 75 detected frames.").data)

@@ -40,6 +40,14 @@ def believed(assessed: Assessment, *, force: bool, affine: bool = False) -> Cali
     return assessed.calibration
 
 
+def cameras_in_words(calibration: Calibration) -> str:
+    """One sentence: the model of the cameras, and their distance where it is finite."""
+    if calibration.pair.is_affine:
+        return f"The cameras are affine (model {calibration.model})."
+    inverse, _ = calibration.inverse_distance_per_mm
+    return f"The cameras are near: their distance is {1 / inverse:.0f} mm (model {calibration.model})."
+
+
 def half_and_rest(
     data: Correspondences, chosen: np.ndarray, *, model: str = "zero_skew"
 ) -> tuple[Calibration | None, Correspondences]:
@@ -73,9 +81,11 @@ def sealed(page: Figure, verdict: Verdict) -> Figure:
 
 
 def whether_true(recording: Recording) -> str:
-    """One sentence: is there a truth that judges the numbers of this recording?"""
+    """What judges the numbers of this recording: its truth, or else the verdict, held-out frames and labels."""
     if recording.truth is None:
-        return "This recording has no truth. Its numbers are judged by held-out frames and by the verdict alone."
+        labels = " Its labels judge the detector (notebook 02)." if recording.annotations else ""
+        judges = "The verdict judges its numbers, and in notebooks 00, 03, 05 and 07 held-out frames do."
+        return f"This recording has no truth. {judges}{labels}"
     return "This recording is simulated. Its truth judges the numbers and computes none of them."
 
 
