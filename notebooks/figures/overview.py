@@ -123,7 +123,7 @@ def pipeline_page(
     ax.yaxis.set_major_formatter("{x:g}")
     ax.yaxis.set_minor_formatter("")
     ax.grid(True, color="#e6e6e6", linewidth=0.6)
-    ax.legend(fontsize=8, frameon=False)
+    ax.legend(fontsize=8, frameon=False, loc="upper left", bbox_to_anchor=(0, -0.16))  # below: curves go everywhere
     return page
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import textwrap
+from collections.abc import Callable
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -86,7 +87,14 @@ def whether_true(recording: Recording) -> str:
         labels = " Its labels judge the detector (notebook 02)." if recording.annotations else ""
         judges = "The verdict judges its numbers, and in notebooks 00, 03, 05 and 07 held-out frames do."
         return f"This recording has no truth. {judges}{labels}"
-    return "This recording is simulated. Its truth judges the numbers and computes none of them."
+    surface = "" if true_surface(recording) else " It holds no surface, so the errors of surfaces are not known."
+    return f"This recording is simulated. Its truth judges the numbers and computes none of them.{surface}"
+
+
+def true_surface(recording: Recording) -> Callable[[np.ndarray], np.ndarray] | None:
+    """The true points (n, 3) mm seen at left pixels (n, 2), as a function; None without a truth, or where it holds no surface."""
+    truth = recording.truth
+    return truth.surface if truth and (truth.folder / "surface.npz").exists() else None
 
 
 def health_chart(found: Health) -> Figure:
