@@ -7,6 +7,7 @@ import dataclasses
 import re
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import matplotlib.pyplot as plt
@@ -19,6 +20,7 @@ from lib.landmarks import Detector, Landmarks
 from lib.recordings import Recording, RecordingWriter
 from lib.workbench import pages, report, results
 from lib.workbench.execution import declared_grid, declared_parameters, parse_parameters
+from notebooks.figures import verdicts
 from tests.remembering import remembering_recordings
 
 WALK = sorted(paths.NOTEBOOKS.glob("*.ipynb"))
@@ -274,6 +276,15 @@ def test_a_red_calibration_gives_no_number_unless_forced(number, small, monkeypa
     run = Run(number, small, monkeypatch)
     assert "not trustworthy" in run.left_out and not [name for name in run.metrics if FOLLOWS.match(name)]
     assert Run(number, small, monkeypatch, force=True).left_out is None
+
+
+def test_what_judges_a_recording_is_said(small, tmp_path):
+    ours, foreign = Recording.open(paths.SHIPPED_RECORDING), Recording.open(small)
+    bare = SimpleNamespace(truth=SimpleNamespace(folder=tmp_path), annotations=None)
+    assert verdicts.true_surface(ours) is not None
+    assert verdicts.true_surface(foreign) is verdicts.true_surface(bare) is None
+    assert "no truth" in verdicts.whether_true(foreign) and "surface" not in verdicts.whether_true(ours)
+    assert "holds no surface" in verdicts.whether_true(bare)
 
 
 @pytest.mark.parametrize(("name", "share"), [("05_registration", "outliers"), ("08_the_robot_labels", "wrong")])
