@@ -132,7 +132,7 @@ def volume_page(recording: Recording) -> Figure:
         axes[1].plot(z, np.full(len(z), k), "o", color=colour, alpha=0.6, markeredgecolor="black", markeredgewidth=0.4)
     if labels:
         width, height = recording.image_size_px
-        axes[0].set(xlim=(0, width), ylim=(height, 0), title="Annotations, left image (px)")
+        axes[0].set(xlim=(0, width), ylim=(height, 0), title="Labels, left image (px)")
     else:
         axes[0].set(xlabel="x (mm)", ylabel="y (mm)", title="The robot's report at the frames")
     axes[0].set_aspect("equal")
