@@ -67,7 +67,7 @@ def half_and_rest(
 def held_out_gap_um(half: Calibration, held_out: Correspondences) -> np.ndarray:
     """Distances (n,) um of the held-out landmarks that both images show, triangulated by `half`, from the robot's report."""
     test = held_out.complete
-    points = half.rig.triangulate(test.u_left, test.u_right, test.pair_covariance_px2)
+    points = half.rig.triangulate(test.u_left, test.u_right, half.detection_covariance(test))
     return 1e3 * np.linalg.norm(points.x_mm - test.x_mm, axis=1)
 
 
@@ -106,7 +106,7 @@ def health_chart(found: Health) -> Figure:
         ax.semilogy(found.frame, found.parts["unfamiliar"][:, 0], "s", ms=3, color="#e69f00", label="unfamiliar picture")
     ax.axhline(1.0, color="#b42318", lw=1)
     ax.set(xlabel="frame", ylabel="score", ylim=(0.9 * score.min(), max(2.0, 1.2 * score.max())))
-    ax.set_title("\n".join(textwrap.wrap(f"Health of the detector: {found.text}", 115)), fontsize=10)
+    ax.set_title("\n".join(textwrap.wrap(f"Health: {found.text}", 115)), fontsize=10)
     ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     ax.yaxis.set_major_formatter("{x:g}")
     ax.yaxis.set_minor_formatter("")
