@@ -68,7 +68,7 @@ def learnt(claims: Mapping[str, str]) -> Markdown:
     if missing := len(claims) - len(told):
         rest = "One more conclusion is" if missing == 1 else f"{missing} more conclusions are"
         why = "The recording may have no truth or no labels, or a real data set, Open3D or a recorded table may be missing."
-        lines.append(f"- {rest} left out: this run could not measure all their numbers. {why}")
+        lines.append(f"- {rest} left out: this run could not measure all the numbers. {why}")
     return Markdown("\n".join(lines))
 
 
