@@ -9,7 +9,7 @@ import numpy as np
 from ipywidgets import IntSlider, VBox
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import LogLocator, MaxNLocator
 from PIL import Image
 
 from lib.online import STAGES, STATES, FrameResult
@@ -139,8 +139,10 @@ def error_timeline(
         ax.axvline(bump_at - 0.5, color=COLOURS["warning"], linestyle="--", label="push")
     if any(np.isfinite(error).any() for error in errors_um.values()):
         ax.set(yscale="log")
+        ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     ax.set(xlabel="frame", ylabel="um", title="Errors against the truth")
     ax.yaxis.set_major_formatter("{x:g}")
+    ax.yaxis.set_minor_formatter("")
     page.legend(loc="outside lower center", ncols=4)
     return page
 
