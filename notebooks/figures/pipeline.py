@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from ipywidgets import IntSlider, VBox
@@ -13,7 +13,6 @@ from matplotlib.ticker import LogLocator, MaxNLocator
 from PIL import Image
 
 from lib.online import STAGES, STATES, FrameResult
-from lib.recordings import StereoFrame
 from notebooks.figures.interactive import explore
 from notebooks.figures.overview import landmarks_on
 from notebooks.figures.style import COLOURS, LANDMARK_COLOURS, figure, show_image
@@ -200,12 +199,12 @@ def dashboard(left: np.ndarray, result: FrameResult) -> Figure:
     return page
 
 
-def frame_browser(frames: Sequence[StereoFrame], results: Sequence[FrameResult], *, start: int = 0) -> VBox:
-    """A slider over the frames with their dashboards; without a browser it shows `start`."""
+def frame_browser(left: Callable[[int], np.ndarray], results: Sequence[FrameResult], *, start: int = 0) -> VBox:
+    """A slider over the frames, `left` of their numbers, with their dashboards; without a browser it shows `start`."""
     slider = IntSlider(value=start, min=0, max=len(results) - 1, continuous_update=False)
 
     def look(frame: int) -> Figure:
         """A frame with what the pipeline found in it, and the surface with the tool above it."""
-        return dashboard(frames[frame].left, results[frame])
+        return dashboard(left(frame), results[frame])
 
     return explore(look, frame=slider)

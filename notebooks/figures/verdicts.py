@@ -92,7 +92,7 @@ def whether_true(recording: Recording) -> str:
 
 
 def true_surface(recording: Recording) -> Callable[[np.ndarray], np.ndarray] | None:
-    """The true points (n, 3) mm seen at left pixels (n, 2), as a function; None without a truth, or where it holds no surface."""
+    """The true points (n, 3) mm seen at left pixels (n, 2), as a function; None where no truth holds a surface."""
     truth = recording.truth
     return truth.surface if truth and (truth.folder / "surface.npz").exists() else None
 
