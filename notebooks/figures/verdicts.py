@@ -19,6 +19,11 @@ from notebooks.figures.style import figure, show_image
 
 #: Fewest rows of a calibration that is to be judged by held-out frames, and of those frames.
 _ROWS = (12, 3)
+#: What a `health_chart` shows.
+HEALTH_CAPTION = (
+    "The score of each frame. Above the red line its landmarks contradict themselves, the other image or the robot, the "
+    "tool's length in it is not the robot's, or its picture is unlike those of the training."
+)
 
 
 def believed(assessed: Assessment, *, force: bool, affine: bool = False) -> Calibration:
@@ -102,11 +107,15 @@ def health_chart(found: Health) -> Figure:
     page, ax = figure(height_in=2.6)
     score = np.clip(np.nan_to_num(found.score, nan=1e2), 1e-2, 1e2)
     ax.semilogy(found.frame, score, "o", ms=4, color="#0072b2", label="worst part")
+    low = score.min()
     if "unfamiliar" in found.parts:
-        ax.semilogy(found.frame, found.parts["unfamiliar"][:, 0], "s", ms=3, color="#e69f00", label="unfamiliar picture")
+        unfamiliar = np.maximum(found.parts["unfamiliar"][:, 0], 1e-2)
+        ax.semilogy(found.frame, unfamiliar, "s", ms=3, color="#e69f00", label="unfamiliar picture")
+        low = np.fmin.reduce(unfamiliar, initial=low)
     ax.axhline(1.0, color="#b42318", lw=1)
-    ax.set(xlabel="frame", ylabel="score", ylim=(0.9 * score.min(), max(2.0, 1.2 * score.max())))
-    ax.set_title("\n".join(textwrap.wrap(f"Health: {found.text}", 115)), fontsize=10)
+    ax.set(xlabel="frame", ylabel="score", ylim=(0.9 * low, max(2.0, 1.2 * score.max())))
+    said = f"{(score > 1).sum()} of {len(score)} frames lie above the line. {found.text}."
+    ax.set_title("\n".join(textwrap.wrap(said, 115)), fontsize=10)
     ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     ax.yaxis.set_major_formatter("{x:g}")
     ax.yaxis.set_minor_formatter("")
