@@ -129,6 +129,8 @@ def error_timeline(
     colours = (COLOURS["ours"], COLOURS["truth"], COLOURS["paper"], COLOURS["baseline"])
     for (name, error), colour in zip(errors_um.items(), colours, strict=False):
         known = np.flatnonzero(np.isfinite(error))
+        if not len(known):
+            continue  # nothing to draw, and nothing for the legend
         # A surface is made in every third frame: a line joins such neighbours, and is broken where more are missing.
         breaks = np.flatnonzero(np.diff(known) > np.diff(known).min(initial=len(error))) + 1
         for k, part in enumerate(np.split(known, breaks)):
