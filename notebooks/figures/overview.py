@@ -111,7 +111,7 @@ def pipeline_page(
         panel.set_anchor("NW")  # images and squares of one row begin at one height
     if not registration_um:
         ax.set_axis_off()
-        ax.text(0.0, 0.9, "Left out: the recording is too short\nto hold frames out.", va="top", transform=ax.transAxes)
+        ax.text(0.0, 0.9, "Left out: half of the frames alone\ngive no calibration.", va="top", transform=ax.transAxes)
         return page
     for (method, (frames, error)), colour in zip(
         registration_um.items(), (COLOURS["paper"], COLOURS["ours"]), strict=False

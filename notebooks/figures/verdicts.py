@@ -64,7 +64,7 @@ def half_and_rest(
             raise ValueError(f"a calibration needs {_ROWS[0]} landmarks seen in both images, its check {_ROWS[1]}.")
         half = calibrate(rows[0], model=model)
     except ValueError as error:
-        print(f"The recording is too short to hold out frames: {error}")
+        print(f"No frames are held out, since the others alone give no calibration: {error}")
         return None, rows[1]
     return half, with_offsets(rows[1], half.offsets)
 
