@@ -66,7 +66,8 @@ def learnt(claims: Mapping[str, str]) -> Markdown:
         doubt = "" if holds(condition, known) else "**Not all of this holds in this run:** "
         lines.append(f"- {doubt}{filled(text, known)}")
     if missing := len(claims) - len(told):
-        rest = "One more conclusion is" if missing == 1 else f"{missing} more conclusions are"
+        more = " more" if told else ""
+        rest = f"One{more} conclusion is" if missing == 1 else f"{missing}{more} conclusions are"
         why = "The recording may have no truth or no labels, or a real data set, Open3D or a recorded table may be missing."
         lines.append(f"- {rest} left out: this run could not measure all the numbers. {why}")
     return Markdown("\n".join(lines))
