@@ -18,6 +18,7 @@ import pytest
 from lib import paths, trust
 from lib.landmarks import Detector, Landmarks
 from lib.recordings import Recording, RecordingWriter
+from lib.trust import check
 from lib.workbench import pages, report, results
 from lib.workbench.execution import declared_grid, declared_parameters, parse_parameters
 from notebooks.figures import verdicts
@@ -276,6 +277,14 @@ def test_a_red_calibration_gives_no_number_unless_forced(number, small, monkeypa
     run = Run(number, small, monkeypatch)
     assert "not trustworthy" in run.left_out and not [name for name in run.metrics if FOLLOWS.match(name)]
     assert Run(number, small, monkeypatch, force=True).left_out is None
+
+
+def test_notebook_7_says_what_to_do_on_a_red_verdict(small, monkeypatch, capsys):
+    red = trust.Verdict((trust.Reason("residuals", trust.LEVELS[-1], "They are large.", "Look."),))
+    assess = check.assess
+    monkeypatch.setattr(check, "assess", lambda *a, **k: dataclasses.replace(assess(*a, **k), verdict=red))
+    assert "not trustworthy" in Run("07", small, monkeypatch).left_out
+    assert re.search(r"^Then what\? +Look\.$", capsys.readouterr().out, re.MULTILINE)
 
 
 def test_what_judges_a_recording_is_said(small, tmp_path):
