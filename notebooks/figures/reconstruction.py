@@ -168,6 +168,7 @@ def epipolar_geometry(
     for name, image, title in (("left", left, "Left: points"), ("right", right, "Right: their lines are parallel")):
         show_image(panels[name], image, title)
         panels[name].set(xlim=(-0.5, image.shape[1] - 0.5), ylim=(image.shape[0] - 0.5, -0.5))
+    dark = {"facecolor": "black", "alpha": 0.55, "edgecolor": "none", "pad": 1.5}
     for k, point in enumerate(u_left):
         colour = ("white", "cyan", "yellow")[k % 3]  # neighbours differ; all are legible on a retina
         panels["left"].plot(*point, "o", color=colour, markeredgecolor="black", markersize=8)
@@ -175,8 +176,8 @@ def epipolar_geometry(
         x = np.array([0.0, width - 1.0])
         panels["right"].plot(x, -(a * x + c) / b, color=colour, lw=1.6)
         beside = (point[0], -(a * point[0] + c) / b)  # in its own column: at the border numbers would overlap
-        panels["right"].annotate(f"{k + 1}", beside, (0, 2), textcoords="offset points", color=colour, fontsize=9)
-        panels["left"].annotate(f"{k + 1}", point, (6, 4), textcoords="offset points", color=colour, fontsize=9)
+        for side, place, apart in (("left", point, (6, 4)), ("right", beside, (0, 3))):
+            panels[side].annotate(f"{k + 1}", place, apart, textcoords="offset points", color=colour, fontsize=9, bbox=dark)
     span = float(np.abs(distance_px).max()) + 1e-6
     panels["filter"].hist(
         [distance_px[kept], distance_px[~kept]],
