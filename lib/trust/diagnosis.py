@@ -1,7 +1,8 @@
 """What is wrong with a recording: hypotheses fitted to its correspondences, and compared with "nothing is wrong".
 
-Those about time are in `lib.trust.clocks`.  Each is fitted under heavy-tailed noise (`lib.trust.fitting`).  Its gain in log
-likelihood, less a penalty for its parameters (BIC), is its evidence.
+Those about time are in `lib.trust.clocks`, those about lenses, axes and eyes in `lib.trust.optics`.  Each is fitted under
+heavy-tailed noise (`lib.trust.fitting`).  Its gain in log likelihood, less a penalty for its parameters (BIC), is its
+evidence.
 """
 
 from collections import ChainMap
@@ -10,34 +11,22 @@ from dataclasses import dataclass, replace
 from itertools import permutations
 
 import numpy as np
-from scipy.ndimage import binary_opening
+from scipy.ndimage import binary_opening, median_filter
 
-from lib.calibration.checks import eyes_exchanged, sides
 from lib.correspondences import LANDMARKS, TRAIN_FURTHER, Correspondences
 from lib.recordings import Kinematics
 from lib.trust.clocks import TIME_TESTS
-from lib.trust.fitting import FITS, SIDES, Case, Hypothesis, Problem, Robust, compared
+from lib.trust.fitting import SIDES, Case, Hypothesis, Problem, Robust, compared
 from lib.trust.health import affine_epipolar
+from lib.trust.optics import axes_and_eyes, finite_distance, lens
 
 _MOST_ROWS, _FEWEST_FRAMES = 1200, 4  # of three frames nothing checks anything
 _UNFIT = f"The detector does not fit these pictures: look at its overlays, {TRAIN_FURTHER}."
-_SCALE = "Check the units and the scale of the {} columns of kinematics.csv, beside those of the others."
 _ROBOT_MM = 0.04  # a robot for eye surgery is better
-#: Standard deviations of a camera's skew and log pixel aspect.
-_SKEW_SD, _ASPECT_SD = 0.002, 0.003
-#: A common log aspect above this is no lens: the images were resized, and their aspect is free.
-_RESIZED = 0.1
-#: Of the jaws' lengths in the log: stretches of time whose means count, and parts of time that err apart.
-_STRETCHES, _PARTS = 60, 8
-#: Least change of length^-2 by a scaled axis, also in standard deviations, and that which a good robot may have.
-_LEAST_SCALED, _SURE_SCALED, _OWN_SD = 0.03, 5.0, 0.006
-#: Least share of the variance that it explains, most that it leaves (RMS), and least turning of the jaws (RMS of n^2).
-_MOST_OF_IT, _ODD, _TURNED = 0.5, 0.03, 0.01
+_LEAST_SPIKE_MM = 0.2
+_OPENED = 1.25  # a smaller factor may be that of constant offsets of the tips, which do no harm
 _RESTS, _RESTS_MM = 4, 0.06  # a tool rests whose landmarks are where they were so many frames before, noise included
 _STILL_PX = 0.3  # detections of one picture differ by less
-BY_GEOMETRY = ("scaled_axis", "mirrored_axis", "exchanged_eyes", "mirrored_images")  # which the residuals do not show
-_ACROSS = 0.15  # sine of a tool's angle to the images, below which it points neither way
-_UPSIDE_DOWN = 20.0  # odds that a microscope sees the tips of a tool below its base
 
 
 def _tip_order(case: Case) -> Iterator[Hypothesis]:
@@ -66,18 +55,6 @@ def _tip_order(case: Case) -> Iterator[Hypothesis]:
     yield case.found("tip_order", fit, 1, (100 * own.mean(), 0.0, "%"), text, cure, on=moved, raw=raw)
 
 
-def _finite_distance(case: Case, fit: Robust) -> Iterator[Hypothesis]:
-    """A perspective that an affine camera has not, beside the best cause so far."""
-    value, sd = fit.nearness
-    far = f"by a working distance of {1 / value:.0f} mm" if value > 0 else "the wrong way, as in a mirrored image"
-    text = f"The residuals are curved {far}: 1/distance is {value:.5f} +- {sd:.5f} per mm."
-    cure = "Calibrate with model='near_affine' (--model near_affine on the command line)."
-    n = 2.0 * case.problem.used.sum()
-    beside = 0.5 * n * float(np.log1p(fit.design * (value / sd) ** 2 / n))  # Wald's test as a ratio of likelihoods
-    raw = min(case.null.total - replace(case.problem, nearness_sd=1e-9).fit(start=case.null.start).total, beside)
-    yield case.found("finite_distance", fit, 1, (value, sd, "1/mm"), text, cure, raw=raw)
-
-
 def _landmark_offset(case: Case) -> Iterator[Hypothesis]:
     """Landmarks that the robot reports far beside where they are seen, always in the tool's same direction."""
     free = replace(case.problem, offset_sd=1.0).fit(start=case.null.start)
@@ -100,6 +77,37 @@ def _tool_bends(case: Case) -> Iterator[Hypothesis]:
         text = f"The tips move {size:.1f} px (RMS) more or less than the base: a tool that bends, or a wrong pivot or angle."
         cure = "Check the tool's geometry and joint angles in the robot's report (lib.calibration.pivot_calibration)."
         yield case.found("tool_bends", fit, 9, (size, 0.0, "px"), text, cure)
+
+
+def _jaw_opening(case: Case) -> Iterator[Hypothesis]:
+    """Tips that lie by a factor farther apart than the robot reports."""
+    tips = case.by_frame(case.problem.x[:, 0])[:, 1:]
+    share = np.array([0.0, -0.5, 0.5, 0.0])[np.minimum(case.problem.landmark, 3)]
+    half = (tips[:, 1] - tips[:, 0])[case.problem.frame] * share[:, None]
+    fit = case.linear(lambda M: np.einsum("cij,nj->nci", M[:, :, :3], half)[..., None])
+    factor, sd = 1.0 + float(fit.theta[0]), float(np.sqrt(fit.covariance[0, 0]))
+    if 0.0 < factor < 1.0 / _OPENED or factor > _OPENED:  # below 0 they are exchanged
+        text = f"In the images the tips are {factor:.2f} +- {sd:.2f} times as far apart as in the robot's report."
+        cure = "Is the opening that it states one jaw's or both jaws'? Check that, and the length of the jaws."
+        yield case.found("jaw_opening", fit, 1, (factor, sd, "times"), text, cure)
+
+
+def _log_spikes(case: Case) -> Iterator[Hypothesis]:
+    """Single samples of the robot's log that lie elsewhere than those before and after them."""
+    if case.kinematics is None:
+        return
+    known = np.isfinite(case.log).all(axis=(1, 2))
+    time, x = case.kinematics.time_s[known], case.log[known]
+    others = median_filter(x, (5, 1, 1))
+    away, step = (np.linalg.norm(d, axis=2).max(axis=1) for d in (x - others, np.diff(x, axis=0)))
+    spikes = np.flatnonzero(away > max(_LEAST_SPIKE_MM, 10 * np.quantile(step, 0.25)))
+    hit = np.abs(case.at_s[:, None] - time[spikes]).min(axis=1, initial=np.inf) < np.median(np.diff(time))
+    if not hit.all() and len(np.unique(case.problem.frame[hit])) >= 3:
+        fit = case.problem.fit(start=case.null.start, apart=hit)
+        size, first = np.median(away[spikes]), time[spikes[0]]
+        text = f"{len(spikes)} samples of kinematics.csv jump by {size:.2g} mm (median) and back, the first at {first:.2f} s."
+        cure = "Leave these cells of kinematics.csv blank."
+        yield case.found("log_spikes", fit, 2, (len(spikes), 0.0, "samples"), text, cure)
 
 
 def _drift(case: Case) -> Iterator[Hypothesis]:
@@ -178,11 +186,12 @@ def _frozen(case: Case) -> Iterator[Hypothesis]:
     problem = case.problem
     if not np.isfinite(problem.time).all() or case.frames < 4:
         return
-    x, y, time = (case.by_frame(v) for v in (problem.x[:, 0], problem.y.reshape(-1, 4), problem.time))
+    x, left, right, time = (case.by_frame(v) for v in (problem.x[:, 0], problem.y[:, 0], problem.y[:, 1], problem.time))
     velocity = np.diff(x, axis=0) / np.diff(time, axis=0)[..., None]
-    sizes = [np.linalg.norm(np.diff(v, axis=0), axis=2) for v in (velocity, x, y)]
+    sizes = [np.linalg.norm(np.diff(v, axis=0), axis=2) for v in (velocity, x, left, right)]
     # (frames,) the largest of the landmarks, -1 where all are missing
-    change, step_x, step_y = (np.where(np.isfinite(size), size, -1.0).max(axis=1) for size in sizes)
+    change, step_x, *steps = (np.where(np.isfinite(size), size, -1.0).max(axis=1) for size in sizes)
+    step_y = np.maximum(*steps)
     straight = binary_opening(np.append((change >= 0) & (change < 2e-3), False))  # five frames on one line
 
     def certain(name: str, fit: Robust, repeated: np.ndarray, text: str, cure: str) -> Hypothesis:
@@ -201,14 +210,19 @@ def _frozen(case: Case) -> Iterator[Hypothesis]:
         cure = "Log the robot at every sample; where it was silent leave the cells blank, so that these frames are not used."
         yield certain("frozen_kinematics", fit, frozen, text, cure)
     noise = min(fit.shapes[0].scale for fit in (case.null, *case.fits.values()))
-    twice = (step_x > 1e-6) & (step_y >= 0) & (step_y < 0.15 * noise)
-    if twice.mean() >= 0.02 and not twice.all():  # each image belongs to the instant at which it was first seen
+    left, right = ((step_x > 1e-6) & (step >= 0) & (step < 0.15 * noise) for step in steps)
+    for views, twice in (([0, 1], left & right), ([0], left & ~right), ([1], right & ~left)):
+        if twice.mean() < 0.02 or twice.all():
+            continue
+        # Each image belongs to the instant at which it was first seen.
         source = np.maximum.accumulate(np.where(np.append(True, ~twice), np.arange(case.frames), 0))[problem.frame]
-        first = np.repeat(x[source, np.minimum(problem.landmark, 2)][:, None], 2, axis=1)
+        first = problem.x.copy()
+        first[:, views] = x[source, np.minimum(problem.landmark, 2)][:, None]
         fit = replace(problem, x=first).fit(start=case.null.start)
-        text = "the detections repeat those of the frame before while the robot moves"
+        who = "" if len(views) == 2 else f" of the {SIDES[views[0]]} image"
+        text = f"the detections{who} repeat those of the frame before while the robot moves"
         cure = "Drop images that the camera delivered twice, and give the others their own times in frames.csv."
-        yield certain("frozen_video", fit, twice, text, cure)
+        yield replace(certain("frozen_video", fit, twice, text, cure), images=tuple(views))
 
 
 def _rigid_tips(case: Case) -> Iterator[Hypothesis]:
@@ -236,119 +250,9 @@ def _rigid_tips(case: Case) -> Iterator[Hypothesis]:
     yield case.found("rigid_tips", fit, 1, (size, 0.0, "mm"), text, cure, raw=fit.total - case.null.total - chosen)
 
 
-def _optics(case: Case, fit: Robust, sign: float) -> Iterator[Hypothesis]:
-    """What an affine camera absorbs: the jaws, and the optics in the fit of the best cause so far, are the witnesses."""
-    rows = [8 * c + 4 * i + j for c in range(2) for i in range(2) for j in range(3)]
-    A, covariance = sign * fit.M[:, :, :3], fit.camera_covariance[np.ix_(rows, rows)]
-    few = 2 * case.problem.used.sum() < 40
-    if few or not np.isfinite(covariance).all() or min(np.linalg.svd(a, compute_uv=False)[1] for a in A) < 1e-6:
-        return
-    if case.misfit(fit) < FITS:  # cameras that fit nothing always have skewed pixels
-        yield from list(_jaws(case)) or _scaled_axis(A, covariance)  # pixels cannot tell x from y
-    yield from _handedness(case, A, covariance)
-
-
-def _constraints(A: np.ndarray) -> np.ndarray:
-    """(..., 4) skew of the left and right camera, log aspects, of A (..., 2, 2, 3): all 0 for square pixels."""
-    size = np.linalg.norm(A, axis=-1)
-    skew = (A[..., 0, :] * A[..., 1, :]).sum(axis=-1) / size.prod(axis=-1)
-    return np.concatenate([skew, np.log(size[..., 0] / size[..., 1])], axis=-1)
-
-
-def _jaws(case: Case) -> Iterator[Hypothesis]:
-    """A robot axis of the wrong scale: the jaws' lengths in the log depend on where they point, and not on the opening alone.
-
-    If a jaw's direction is n and an axis is s times too long, length^-2 is smaller by the factor 1 - (1 - s^-2) n^2.
-    """
-    x = case.log[np.isfinite(case.log).all(axis=(1, 2))]
-    jaws = x[:, 1:] - x[:, :1]
-    squares = (jaws**2).sum(axis=2, keepdims=True)
-    if x.shape[1] != 3 or len(x) < 2 * _PARTS or squares.min() <= 0:
-        return
-    opening = np.linalg.norm(x[:, 2] - x[:, 1], axis=1)
-    n, place = jaws / np.sqrt(squares), x[:, 1:] - x[:, 1:].mean(axis=(0, 1))
-    # Eight numbers of each jaw: length^-2, n^2, n, and its place along itself.  Means of stretches of time have less noise.
-    told = np.dstack([(1 / squares) / (1 / squares).mean(axis=0), n**2, n, (jaws * place).sum(axis=2) / squares[..., 0]])
-    each = int(np.clip(len(x) / _STRETCHES, 1, 100))
-    both = np.vander((opening - opening.mean()) / max(opening.std(), 1e-9), 3), told.reshape(len(x), -1)
-    opened, told = (v[: len(x) // each * each].reshape(-1, each, v.shape[1]).mean(axis=1) for v in both)
-    rest = (told - opened @ np.linalg.lstsq(opened, told, rcond=None)[0]).reshape(-1, 8)  # what the opening leaves
-    length, turns, others = rest[:, 0], rest[:, 1:4], rest[:, 4:]
-    along, common = np.maximum((turns**2).sum(axis=0), 1e-12), turns.T @ length
-    k = (common**2 / along).argmax()
-    slope, total = common[k] / along[k], length @ length
-    # A base that is displaced beside the tips, or tips that lag behind it, change the lengths otherwise.
-    left, otherwise = length - slope * turns[:, k], length - others @ np.linalg.lstsq(others, length, rcond=None)[0]
-    sums = [part.sum() for part in np.array_split(turns[:, k] * left, _PARTS)]  # errors last for a while
-    sd = float(np.hypot(np.linalg.norm(sums) / along[k], _OWN_SD))
-    most = min((1 - _MOST_OF_IT) * total, _ODD**2 * len(rest), 1.1 * otherwise @ otherwise)  # which has three numbers more
-    if abs(slope) >= max(_LEAST_SCALED, _SURE_SCALED * sd) and turns[:, k].std() >= _TURNED and left @ left <= most:
-        scale = float((1 - slope / (slope * (n[..., k] ** 2).mean() - 1)) ** -0.5)
-        text = f"The jaw lengths change with direction. They would not if the robot's {'xyz'[k]} were divided by {scale:.3f}."
-        size = scale, sd * scale / 2, "times", float(1 - left @ left / total)
-        yield Hypothesis("scaled_axis", text, _SCALE.format("xyz"[k]), *size, float(0.5 * (slope / sd) ** 2 - 1.5))
-
-
-def _scaled_axis(A: np.ndarray, covariance: np.ndarray) -> Iterator[Hypothesis]:
-    """A robot axis of the wrong scale: the pixels of A (2, 2, 3), of `covariance` (12, 12), are skewed or oblong."""
-    tolerance = np.diag(np.square([_SKEW_SD, _SKEW_SD, _ASPECT_SD, _ASPECT_SD]))
-    if abs(_constraints(A)[2:].mean()) > _RESIZED:
-        tolerance[2:, 2:] += 1.0
-    near = 1e-6 * np.abs(A).max() * np.eye(12).reshape(12, 2, 2, 3)
-    spacing = np.log(12.0) / 80
-    logs = spacing * np.arange(-80, 81)
-    scales = np.exp(logs[:, None] * np.eye(3)[:, None])[:, :, None, None, None]  # (axes, logs, 1, 1, 1, 3)
-    seen = _constraints(A * scales)
-    J = (_constraints((A + near) * scales) - seen) / near.max()
-    S = np.einsum("abik,ij,abjl->abkl", J, covariance, J) + tolerance
-    misfit = (seen @ np.linalg.solve(S, np.swapaxes(seen, 2, 3)))[..., 0, 0]
-    none = float(misfit[0, 80])
-    for name, values in zip("xyz", misfit, strict=True):
-        best = int(values[1:-1].argmin()) + 1
-        before, least, after = values[best - 1 : best + 2]
-        bend = max(float(before - 2 * least + after) / spacing**2, 1e-9)
-        log = logs[best] + np.clip(0.5 * (before - after) / bend / spacing, -spacing, spacing)
-        scale, sd = float(np.exp(log)), float(np.sqrt(2.0 / bend))  # A times s is plausible: the numbers are s too large
-        text = f"The cameras' pixels are skewed or oblong, and square if the robot's {name} is divided by {scale:.3f}."
-        # Rows that err alike say less than they seem to, and to accuse a robot's axis takes more than to accuse a clock.
-        explained, gain = 1.0 - float(least) / max(none, 1e-9), float(0.5 * (none - least) - 5.5)
-        yield Hypothesis("scaled_axis", text, _SCALE.format(name), scale, sd * scale, "times", explained, gain)
-
-
-def _handedness(case: Case, A: np.ndarray, covariance: np.ndarray) -> Iterator[Hypothesis]:
-    """A left camera on the right, or a tool that points at the cameras: exchanged eyes, or something is mirrored."""
-    view = np.cross(A, np.roll(A, -1, axis=1))[:, 0].sum(axis=0)  # away from the cameras, if nothing is mirrored
-    base, tips = np.split(case.by_frame(case.problem.x[:, 0]), [1], axis=1)
-    tool = tips.mean(axis=1) - base[:, 0]
-    ahead = tool @ view / np.linalg.norm(view) / np.linalg.norm(tool, axis=1)  # of a tool across the view nearly 0
-    near, far = int((ahead < -_ACROSS).sum()), int((ahead > _ACROSS).sum())
-    side, step = sides(A.reshape(4, 3))[0], 1e-6 * np.abs(A).max()
-    J = np.array([(sides((A.ravel() + step * e).reshape(4, 3))[0] - side) / step for e in np.eye(12)])
-    sd = float(np.sqrt(J @ covariance @ J))
-    degrees = np.rad2deg(-side)
-    size = float(degrees), float(np.rad2deg(sd)), "degrees", 1.0, float(0.5 * (side / sd) ** 2)
-    where = f"The left camera stands on the right, by {degrees:.1f} degrees"
-    if eyes_exchanged(A.reshape(4, 3), sd):
-        if near > far:
-            text = f"{where}, and the tool points at the cameras: an axis of the robot is mirrored."
-            cure = "Use a right-handed robot frame: negate one axis, or exchange two, in kinematics.csv."
-            yield Hypothesis("mirrored_axis", text, cure, *size)
-        else:
-            text = f"{where}, and the tool points away from it: the eyes are exchanged, or both are turned by 180 degrees."
-            cure = "Exchange the folders left/ and right/ (or u_left and u_right); if the images are upside down, turn both."
-            yield Hypothesis("exchanged_eyes", text, cure, *size)
-    elif near > far:
-        share = near / (near + far)
-        text = f"In {100 * share:.0f} % of the frames the tips lie nearer to the cameras than the base. If both images are "
-        text += "mirrored, heights and distances have the wrong sign."
-        cure = "Flip both images, and undo what was done to the tips' order. Where the tool does point so, --force goes on."
-        gain = (near - far) * np.log(_UPSIDE_DOWN)
-        yield Hypothesis("mirrored_images", text, cure, 100 * share, 0.0, "%", 2 * share - 1, float(gain))
-
-
 def _unexplained(case: Case, fit: Robust) -> list[Hypothesis]:
     """Residuals that the best cause leaves: the two images disagree with each other (the detector) or with the robot."""
-    problem = case.problem
+    problem = replace(case.problem, seen=case.problem.seen & ~fit.apart[:, None])
     base = case.by_frame(problem.x[:, 0])[problem.frame, 0]
     tools = np.einsum("cij,ncj->nci", fit.M[:, :, :3], problem.x - base[:, None])
     reach = np.linalg.norm(tools, axis=2)[problem.landmark > 0]
@@ -427,14 +331,14 @@ def diagnose(
     if kept.sum() >= max(_FEWEST_FRAMES, 0.25 * len(kept)) and not kept.all():
         case = Case(Problem.of(data.of_frames(np.unique(data.frame)[kept]), image_size_px), *stated)
         whole.fits = ChainMap({}, case.fits)  # its own fits are of other rows
-    tests = [_tip_order, _landmark_offset, _tool_bends, _drift, _bad_part, _camera_moved, _frozen]
-    tests = [*(TIME_TESTS if case.paths else ()), *tests, _rigid_tips]
+    tests = [_tip_order, _landmark_offset, _tool_bends, _jaw_opening, _log_spikes, lens, _drift, _bad_part, _camera_moved]
+    tests = [*(TIME_TESTS if case.paths else ()), *tests, _frozen, _rigid_tips]
     found = [h for test in tests for h in test(whole if test is _frozen else case) if np.isfinite(h.gain)]
     best = Diagnosis(found := compared(found)).best
     fit = case.null if best is None else case.fits.get(best.name, case.null)
     turned = best is not None and best.name == "turned_image" and len(best.images) == 2  # then left is right
-    more = [] if near else list(_finite_distance(case, fit))
-    found += [h for h in (*more, *_optics(case, fit, -1.0 if turned else 1.0)) if np.isfinite(h.gain)]
+    more = [] if near else list(finite_distance(case, fit))
+    found += [h for h in (*more, *axes_and_eyes(case, fit, -1.0 if turned else 1.0)) if np.isfinite(h.gain)]
     best = Diagnosis(found).best
     found += _unexplained(case, case.null if best is None else case.fits.get(best.name, fit))
     return Diagnosis(tuple(sorted(found, key=lambda h: -h.gain)))

@@ -76,6 +76,7 @@ class Robust:
     nearness: tuple[float, float]  # 1/distance, per mm, and its deviation
     camera_covariance: np.ndarray
     residuals: np.ndarray  # (n, 2, 2) px
+    apart: np.ndarray  # (n,) bool: rows of another noise
     shapes: tuple[Shape, ...]
     total: float  # log likelihood with the priors of offsets and distance
     design: float  # by how much correlated rows overstate what they tell
@@ -203,7 +204,7 @@ class Problem:
         offset_sd = np.sqrt(np.diag(inverse)[16:25].reshape(3, 3).sum(axis=1))
         nearness = float(beta[25]), float(np.sqrt(inverse[25, 25]))
         found = beta[26:], inverse[26:, 26:], (D[:, 26:] @ beta[26:]).reshape(y.shape), beta[16:25].reshape(3, 3), offset_sd
-        return Robust(beta[:26], M, *found, nearness, inverse[:16, :16], r, tuple(shapes), total, design)
+        return Robust(beta[:26], M, *found, nearness, inverse[:16, :16], r, apart, tuple(shapes), total, design)
 
     def _overcount(self, z: np.ndarray) -> float:
         """Variance of the sums of weighted residuals z (n, 2, 2) over stretches of frames, over that of independent ones."""
@@ -250,10 +251,10 @@ class Case:
     def __init__(
         self, problem: Problem, kinematics: Kinematics | None, offset_s: float, readout_s: float, size: tuple[int, int] | None
     ) -> None:
-        self.problem, self.readout_s, self.size = problem, readout_s, size
+        self.problem, self.kinematics, self.readout_s, self.size = problem, kinematics, readout_s, size
         self.null, self.fits = problem.fit(), {}
         self.frames = int(problem.frame.max()) + 1
-        self.paths, self._clock_s = None, offset_s
+        self.paths, self._clock_s, self.at_s = None, offset_s, problem.time + offset_s
         time, landmark, x = problem.time, problem.landmark, problem.x[:, 0]
         self.log = self.by_frame(x) if kinematics is None else kinematics.x_mm
         if not np.isfinite(time).all():

@@ -15,8 +15,9 @@ from lib.calibration.checks import extents
 from lib.correspondences import LANDMARKS, TRAIN_FURTHER, Correspondences, NoDetectionError
 from lib.landmarks import Detector, detect
 from lib.recordings import Doubt, Recording
-from lib.trust.diagnosis import BY_GEOMETRY, Diagnosis, diagnose
+from lib.trust.diagnosis import Diagnosis, diagnose
 from lib.trust.health import Health, feature_matches, health, spread
+from lib.trust.optics import BY_GEOMETRY
 
 #: From best to worst.
 LEVELS = ("trustworthy", "doubtful", "not trustworthy")
@@ -213,7 +214,7 @@ def _geometry(data: Correspondences | None, c: Calibration, robot_mm: float) -> 
     cure = "Check axes and units of the kinematics, the order of the tips, and which image is left."
     aspect = float(np.exp(np.abs(np.log(zooms[:, 0] / zooms[:, 1])).max()))
     text = f"A camera's zoom differs by a factor of {aspect:.2f} between x and y; pixels are square within some per cent."
-    yield "aspect", aspect, text, cure, name
+    yield "aspect", aspect, text, f"If the images were resized to another shape, undo that. Otherwise: {cure}", name
     if c.rig is None:
         return
     ratio = float(np.exp(np.abs(np.diff(np.log(zooms).mean(axis=1)))[0]))

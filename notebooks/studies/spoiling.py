@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation
 
 from lib.calibration import Calibration, calibrate
-from lib.cameras import StereoRig
+from lib.cameras import Camera, NearAffineCamera, StereoRig
 from lib.correspondences import Correspondences, pair_with_robot
 from lib.geometry import RigidTransform
 from lib.recordings import Kinematics
@@ -78,6 +78,7 @@ class Scene:
     rate: float = 1.0
     move: tuple[float, RigidTransform] | None = None  # share of the frames before it, and the motion of the rig
     drift_px: float = 0.0
+    edit_rig: Callable[[StereoRig], StereoRig] | None = None  # of the microscope
 
     def path(self) -> Callable[[np.ndarray], np.ndarray]:
         """Times (...,) -> base, tip_1, tip_2 (..., 3, 3) mm in the microscope frame."""
@@ -117,6 +118,7 @@ class Scene:
             inverse_distance_per_mm=self.inverse_distance_per_mm,
         )  # fmt: skip
         rig, landmarks = microscope.rig(pose), self.path()
+        rig = self.edit_rig(rig) if self.edit_rig else rig
         rigs = (rig,) if self.move is None else (rig, rig.moved(self.move[1]))
         time, height = np.arange(self.frames) / self.fps, _SIZE[1]
 
@@ -373,6 +375,54 @@ def _move(degrees: float) -> Callable[[Scene], None]:
     return apply
 
 
+def _spikes(share: float) -> Callable[[Scene], None]:
+    """Single samples of the robot lie a few millimetres off."""
+
+    def edit(scene: Scene, t: np.ndarray, x: np.ndarray) -> np.ndarray:
+        return x + (scene.rng.random((len(x), 1, 1)) < share) * scene.rng.normal(0, 3.0, (len(x), 1, 3))
+
+    return _report(edit)
+
+
+def _opened(factor: float) -> Callable[[Scene], None]:
+    """The log has the tips `factor` times as far apart, as where half an opening angle is taken for the whole."""
+
+    def edit(scene: Scene, t: np.ndarray, x: np.ndarray) -> np.ndarray:
+        middle = x[:, 1:].mean(axis=1, keepdims=True)
+        return np.concatenate([x[:, :1], middle + factor * (x[:, 1:] - middle)], axis=1)
+
+    return _report(edit)
+
+
+def _of_cameras(change: Callable[[Camera], Camera], views: tuple[int, ...] = (0, 1)) -> Callable[[StereoRig], StereoRig]:
+    return lambda rig: StereoRig(*(change(c) if view in views else c for view, c in enumerate((rig.left, rig.right))))
+
+
+def _lens(strength: float) -> Callable[[Camera], Camera]:
+    """Pixels at the corner move outwards by `strength` of their distance from the centre."""
+    centre = (np.array(_SIZE) - 1) / 2
+    k = strength / (centre**2).sum()
+    return lambda c: NearAffineCamera(c.matrix, getattr(c, "inverse_distance_per_mm", 0.0), centre, radial_per_px2=k)
+
+
+def _squeezed(factor: float) -> Callable[[Camera], Camera]:
+    """The width of the image is multiplied."""
+    return lambda camera: replace(camera, matrix=camera.matrix * [[factor], [1.0]])
+
+
+def _repeats(view: int, share: float) -> Callable[[Scene], None]:
+    """One camera delivers some images twice."""
+
+    def edit(scene: Scene, u: np.ndarray) -> np.ndarray:
+        u = u.copy()
+        for i in range(1, len(u)):
+            if scene.rng.random() < share:
+                u[i, :, view] = u[i - 1, :, view]
+        return u
+
+    return _pixels(edit)
+
+
 def _late(view: int, seconds: float) -> Callable[[Scene], None]:
     return _set(camera_late_s=(seconds, 0.0) if view == 0 else (0.0, seconds))
 
@@ -433,6 +483,12 @@ SPOILED: dict[tuple[str, str], tuple[tuple[str, ...], Callable[[Scene], None]]] 
     ("tool bends", "10 %"): (("tool_bends",), _bend(0.10)),
     ("base taken for a tip", ""): (("tip_order",), _order((1, 0, 2))),
     ("robot noise", "100 um"): (("robot_noise",), _set(robot_mm=0.1)),
+    **{("spikes in the log", f"{100 * s:.0f} %"): (("log_spikes",), _spikes(s)) for s in (0.02, 0.1, 0.3)},
+    **{("tips too near or far apart", f"{s}"): (("jaw_opening",), _opened(s)) for s in (0.5, 1.5, 2.0)},
+    **{("lens distorts", f"{100 * s:.0f} %"): (("lens_distortion",), _set(edit_rig=_of_cameras(_lens(s))))
+       for s in (-0.03, 0.03, 0.1)},
+    ("one camera repeats frames", "left, 30 %"): (("frozen_video",), _repeats(0, 0.3)),
+    ("one camera repeats frames", "right, 10 %"): (("frozen_video",), _repeats(1, 0.1)),
 }  # fmt: skip
 
 #: Good recordings: sizes, rigs, noise levels, detectors.
@@ -459,6 +515,8 @@ GOOD: dict[str, dict[str, object]] = {
     "sparse frames": {"fps": 0.8, "frames": 60},
     "1 % of the log blank": {"edit_report": [_blank]},
     "a spike in the log": {"edit_report": [_spike]},
+    "images squeezed by 3 %": {"edit_rig": _of_cameras(_squeezed(0.97))},
+    "left image squeezed by 7 %": {"edit_rig": _of_cameras(_squeezed(0.93), (0,))},
 }
 
 

@@ -7,7 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from lib.correspondences import Correspondences
+from lib.geometry import RigidTransform
 from lib.recordings import Kinematics
+from lib.simulator import Microscope
 from lib.trust import Hypothesis, diagnose
 from notebooks.studies.spoiling import GOOD, SPOILED, Scene, takes
 
@@ -56,6 +59,8 @@ def test_a_spike_in_the_log_is_no_fault_of_the_frames(name):
         ("landmark offset", "1.0 mm", 1000.0), ("bad stretch", "40.0 px", None),
         ("robot noise", "100 um", None), ("camera moved", "1.0 degrees", None), ("detector partly wrong", "50 %", None),
         ("kinematics frozen", "25 %", 24.0), ("left camera late", "40 ms", -40.0),
+        ("tips too near or far apart", "0.5", 2.0), ("lens distorts", "10 %", 10.0), ("spikes in the log", "10 %", None),
+        ("one camera repeats frames", "left, 30 %", None),
     ],
 )  # fmt: skip
 def test_a_fault_is_named_with_its_size_and_its_cure(way, strength, value):
@@ -193,6 +198,21 @@ def test_a_mirrored_image_is_no_scaled_axis():
     best = found(scene.take()).best
     assert best.name == "tip_order" and "What the left image calls" in best.text
     assert best.cure.endswith("If that image is mirrored, flip it instead.")
+
+
+@pytest.mark.parametrize("name", ["images squeezed by 3 %", "left image squeezed by 7 %"])
+def test_squeezed_images_accuse_no_axis(name):
+    assert found(take(**GOOD[name], seed=1)).best is None
+
+
+def test_oblong_pixels_that_an_axis_explains_as_well_name_both():
+    """The robot's axes lie along those of the images, and rows without jaws tell nothing of an axis."""
+    rng = np.random.default_rng(0)
+    rig = Microscope(image_rotation_rad=(0.0, 0.0)).rig(RigidTransform.identity())
+    x = rng.uniform(-4, 4, (90, 3))
+    u = [(v + rng.normal(0, 0.5, v.shape)) * [0.8, 1.0] for v in rig.project(x)]
+    best = diagnose(Correspondences.of_points(x, *u)).best
+    assert best.name == "scaled_axis" and "images were resized" in best.text and best.explained < 0.5
 
 
 def test_frames_that_are_lost_now_and_then_are_no_clock():

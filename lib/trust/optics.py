@@ -1,0 +1,172 @@
+"""Hypotheses about the lenses, the robot's axes, and which eye is which."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from lib.calibration.checks import eyes_exchanged, sides
+from lib.trust.fitting import FITS, Case, Hypothesis, Robust
+
+#: Standard deviations of a camera's skew and log pixel aspect.
+_SKEW_SD, _ASPECT_SD = 0.002, 0.003
+#: By so much a misfit must be smaller to tell resized images from a scaled axis; the share that else counts as explained.
+_RATHER_RESIZED, _UNDECIDED = 9.0, 0.49
+#: Of the jaws' lengths in the log: stretches of time whose means count, and parts of time that err apart.
+_STRETCHES, _PARTS = 60, 8
+#: Least change of length^-2 by a scaled axis, also in standard deviations, and that which a good robot may have.
+_LEAST_SCALED, _SURE_SCALED, _OWN_SD = 0.03, 5.0, 0.006
+#: Least share of the variance that it explains, most that it leaves (RMS), and least turning of the jaws (RMS of n^2).
+_MOST_OF_IT, _ODD, _TURNED = 0.5, 0.03, 0.01
+_ACROSS = 0.15  # sine of a tool's angle to the images, below which it points neither way
+_UPSIDE_DOWN = 20.0  # odds that a microscope sees the tips of a tool below its base
+_SCALE = "Check the units and the scale of the {} columns of kinematics.csv, beside those of the others."
+BY_GEOMETRY = ("scaled_axis", "mirrored_axis", "exchanged_eyes", "mirrored_images")  # which the residuals do not show
+
+
+def finite_distance(case: Case, fit: Robust) -> Iterator[Hypothesis]:
+    """A perspective that an affine camera has not, beside the best cause so far."""
+    value, sd = fit.nearness
+    far = f"by a working distance of {1 / value:.0f} mm" if value > 0 else "the wrong way, as in a mirrored image"
+    text = f"The residuals are curved {far}: 1/distance is {value:.5f} +- {sd:.5f} per mm."
+    cure = "Calibrate with model='near_affine' (--model near_affine on the command line)."
+    n = 2.0 * case.problem.used.sum()
+    beside = 0.5 * n * float(np.log1p(fit.design * (value / sd) ** 2 / n))  # Wald's test as a ratio of likelihoods
+    raw = min(case.null.total - replace(case.problem, nearness_sd=1e-9).fit(start=case.null.start).total, beside)
+    yield case.found("finite_distance", fit, 1, (value, sd, "1/mm"), text, cure, raw=raw)
+
+
+def lens(case: Case) -> Iterator[Hypothesis]:
+    """Lenses that distort: pixels move towards the centre of the image, or away from it, by the cube of their distance."""
+    problem = case.problem
+
+    def columns(M: np.ndarray) -> np.ndarray:
+        v = np.einsum("cij,ncj->nci", M[:, :, :3], problem.x) + M[:, :, 3] - problem.centre_px
+        cubes = v * (v**2).sum(axis=2, keepdims=True) / (problem.centre_px**2).sum()  # 1 at the corners
+        return cubes[..., None] * np.eye(2)[:, None]
+
+    fit = case.linear(columns)
+    left, right = 100 * fit.theta
+    text = f"The lenses distort: the corners of the left image lie {left:.1f} % too far out, of the right one {right:.1f} %."
+    cure = "Calibrate with model='near_affine+radial' (--model near_affine+radial on the command line)."
+    size, sd = np.abs(fit.theta).max(), np.sqrt(np.trace(fit.covariance) / 2)
+    yield case.found("lens_distortion", fit, 2, (100 * size, 100 * sd, "%"), text, cure)
+
+
+def axes_and_eyes(case: Case, fit: Robust, sign: float) -> Iterator[Hypothesis]:
+    """What an affine camera absorbs: the jaws, and the optics in the fit of the best cause so far, are the witnesses."""
+    rows = [8 * c + 4 * i + j for c in range(2) for i in range(2) for j in range(3)]
+    A, covariance = sign * fit.M[:, :, :3], fit.camera_covariance[np.ix_(rows, rows)]
+    few = 2 * case.problem.used.sum() < 40
+    if few or not np.isfinite(covariance).all() or min(np.linalg.svd(a, compute_uv=False)[1] for a in A) < 1e-6:
+        return
+    if case.misfit(fit) < FITS:  # cameras that fit nothing always have skewed pixels
+        yield from list(_jaws(case)) or _scaled_axis(A, covariance)  # pixels cannot tell x from y
+    yield from _handedness(case, A, covariance)
+
+
+def _constraints(A: np.ndarray) -> np.ndarray:
+    """(..., 4) skew of the left and right camera, log aspects, of A (..., 2, 2, 3): all 0 for square pixels."""
+    size = np.linalg.norm(A, axis=-1)
+    skew = (A[..., 0, :] * A[..., 1, :]).sum(axis=-1) / size.prod(axis=-1)
+    return np.concatenate([skew, np.log(size[..., 0] / size[..., 1])], axis=-1)
+
+
+def _jaws(case: Case) -> Iterator[Hypothesis]:
+    """A robot axis of the wrong scale: the jaws' lengths in the log depend on where they point, and not on the opening alone.
+
+    If a jaw's direction is n and an axis is s times too long, length^-2 is smaller by the factor 1 - (1 - s^-2) n^2.
+    """
+    x = case.log[np.isfinite(case.log).all(axis=(1, 2))]
+    jaws = x[:, 1:] - x[:, :1]
+    squares = (jaws**2).sum(axis=2, keepdims=True)
+    if x.shape[1] != 3 or len(x) < 2 * _PARTS or squares.min() <= 0:
+        return
+    opening = np.linalg.norm(x[:, 2] - x[:, 1], axis=1)
+    n, place = jaws / np.sqrt(squares), x[:, 1:] - x[:, 1:].mean(axis=(0, 1))
+    # Eight numbers of each jaw: length^-2, n^2, n, and its place along itself.  Means of stretches of time have less noise.
+    told = np.dstack([(1 / squares) / (1 / squares).mean(axis=0), n**2, n, (jaws * place).sum(axis=2) / squares[..., 0]])
+    each = int(np.clip(len(x) / _STRETCHES, 1, 100))
+    both = np.vander((opening - opening.mean()) / max(opening.std(), 1e-9), 3), told.reshape(len(x), -1)
+    opened, told = (v[: len(x) // each * each].reshape(-1, each, v.shape[1]).mean(axis=1) for v in both)
+    rest = (told - opened @ np.linalg.lstsq(opened, told, rcond=None)[0]).reshape(-1, 8)  # what the opening leaves
+    length, turns, others = rest[:, 0], rest[:, 1:4], rest[:, 4:]
+    along, common = np.maximum((turns**2).sum(axis=0), 1e-12), turns.T @ length
+    k = (common**2 / along).argmax()
+    slope, total = common[k] / along[k], length @ length
+    # A base that is displaced beside the tips, or tips that lag behind it, change the lengths otherwise.
+    left, otherwise = length - slope * turns[:, k], length - others @ np.linalg.lstsq(others, length, rcond=None)[0]
+    sums = [part.sum() for part in np.array_split(turns[:, k] * left, _PARTS)]  # errors last for a while
+    sd = float(np.hypot(np.linalg.norm(sums) / along[k], _OWN_SD))
+    most = min((1 - _MOST_OF_IT) * total, _ODD**2 * len(rest), 1.1 * otherwise @ otherwise)  # which has three numbers more
+    if abs(slope) >= max(_LEAST_SCALED, _SURE_SCALED * sd) and turns[:, k].std() >= _TURNED and left @ left <= most:
+        scale = float((1 - slope / (slope * (n[..., k] ** 2).mean() - 1)) ** -0.5)
+        text = f"The jaw lengths change with direction. They would not if the robot's {'xyz'[k]} were divided by {scale:.3f}."
+        size = scale, sd * scale / 2, "times", float(1 - left @ left / total)
+        yield Hypothesis("scaled_axis", text, _SCALE.format("xyz"[k]), *size, float(0.5 * (slope / sd) ** 2 - 1.5))
+
+
+def _scaled_axis(A: np.ndarray, covariance: np.ndarray) -> Iterator[Hypothesis]:
+    """A robot axis of the wrong scale: the pixels of A (2, 2, 3), of `covariance` (12, 12), are skewed or oblong.
+
+    Images that were resized to another shape make them oblong, too, and do no harm: the cameras take that on.
+    """
+    tolerance = np.diag(np.square([_SKEW_SD, _SKEW_SD, _ASPECT_SD, _ASPECT_SD]))
+    near = 1e-6 * np.abs(A).max() * np.eye(12).reshape(12, 2, 2, 3)
+    spacing = np.log(12.0) / 80
+    logs = spacing * np.arange(-80, 81)
+    scales = np.exp(logs[:, None] * np.eye(3)[:, None])[:, :, None, None, None]  # (axes, logs, 1, 1, 1, 3)
+    seen = _constraints(A * scales)
+    J = (_constraints((A + near) * scales) - seen) / near.max()
+    S = np.einsum("abik,ij,abjl->abkl", J, covariance, J) + tolerance
+    misfit = (seen @ np.linalg.solve(S, np.swapaxes(seen, 2, 3)))[..., 0, 0]
+    stated, information = seen[0, 80, 0], np.linalg.inv(S[0, 80])
+    none, resized = float(misfit[0, 80]), np.inf
+    for free in np.array([[0, 0, 1, 1], [0, 0, 1, 0], [0, 0, 0, 1]]):  # the log aspect of both images, or of one
+        resized = min(resized, none - float((free @ information @ stated) ** 2 / (free @ information @ free)))
+    for name, values in zip("xyz", misfit, strict=True):
+        best = int(values[1:-1].argmin()) + 1
+        before, least, after = values[best - 1 : best + 2]
+        if least > resized + _RATHER_RESIZED:
+            continue
+        bend = max(float(before - 2 * least + after) / spacing**2, 1e-9)
+        log = logs[best] + np.clip(0.5 * (before - after) / bend / spacing, -spacing, spacing)
+        scale, sd = float(np.exp(log)), float(np.sqrt(2.0 / bend))  # A times s is plausible: the numbers are s too large
+        text = f"The cameras' pixels are skewed or oblong, and square if the robot's {name} is divided by {scale:.3f}."
+        # Rows that err alike say less than they seem to, and to accuse a robot's axis takes more than to accuse a clock.
+        explained, gain = 1.0 - float(least) / max(none, 1e-9), float(0.5 * (none - least) - 5.5)
+        if resized < least + _RATHER_RESIZED:
+            text += " They may be oblong as well because the images were resized, which does no harm."
+            explained = min(explained, _UNDECIDED)
+        yield Hypothesis("scaled_axis", text, _SCALE.format(name), scale, sd * scale, "times", explained, gain)
+
+
+def _handedness(case: Case, A: np.ndarray, covariance: np.ndarray) -> Iterator[Hypothesis]:
+    """A left camera on the right, or a tool that points at the cameras: exchanged eyes, or something is mirrored."""
+    view = np.cross(A, np.roll(A, -1, axis=1))[:, 0].sum(axis=0)  # away from the cameras, if nothing is mirrored
+    base, tips = np.split(case.by_frame(case.problem.x[:, 0]), [1], axis=1)
+    tool = tips.mean(axis=1) - base[:, 0]
+    ahead = tool @ view / np.linalg.norm(view) / np.linalg.norm(tool, axis=1)  # of a tool across the view nearly 0
+    near, far = int((ahead < -_ACROSS).sum()), int((ahead > _ACROSS).sum())
+    side, step = sides(A.reshape(4, 3))[0], 1e-6 * np.abs(A).max()
+    J = np.array([(sides((A.ravel() + step * e).reshape(4, 3))[0] - side) / step for e in np.eye(12)])
+    sd = float(np.sqrt(J @ covariance @ J))
+    degrees = np.rad2deg(-side)
+    size = float(degrees), float(np.rad2deg(sd)), "degrees", 1.0, float(0.5 * (side / sd) ** 2)
+    where = f"The left camera stands on the right, by {degrees:.1f} degrees"
+    if eyes_exchanged(A.reshape(4, 3), sd):
+        if near > far:
+            text = f"{where}, and the tool points at the cameras: an axis of the robot is mirrored."
+            cure = "Use a right-handed robot frame: negate one axis, or exchange two, in kinematics.csv."
+            yield Hypothesis("mirrored_axis", text, cure, *size)
+        else:
+            text = f"{where}, and the tool points away from it: the eyes are exchanged, or both are turned by 180 degrees."
+            cure = "Exchange the folders left/ and right/ (or u_left and u_right); if the images are upside down, turn both."
+            yield Hypothesis("exchanged_eyes", text, cure, *size)
+    elif near > far:
+        share = near / (near + far)
+        text = f"In {100 * share:.0f} % of the frames the tips lie nearer to the cameras than the base. If both images are "
+        text += "mirrored, heights and distances have the wrong sign."
+        cure = "Flip both images, and undo what was done to the tips' order. Where the tool does point so, --force goes on."
+        gain = (near - far) * np.log(_UPSIDE_DOWN)
+        yield Hypothesis("mirrored_images", text, cure, 100 * share, 0.0, "%", 2 * share - 1, float(gain))
