@@ -111,14 +111,17 @@ def _log_spikes(case: Case) -> Iterator[Hypothesis]:
 
 
 def _drift(case: Case) -> Iterator[Hypothesis]:
-    """Images that creep at a constant speed."""
+    """Images that creep at a constant speed, or cameras that turn, zoom or move at one."""
     time = case.problem.time
-    if np.isfinite(time).all() and np.ptp(time) > 0:
-        fit = case.linear(np.eye(4).reshape(1, 2, 2, 4) * ((time - time.mean()) / np.ptp(time))[:, None, None, None])
-        size, sd = np.array([np.linalg.norm(fit.theta), np.sqrt(np.trace(fit.covariance))]) / np.sqrt(2.0)
-        text = f"The images creep by {size:.1f} px from the first frame to the last."
-        cure = "Fix the microscope, or calibrate a shorter part (Correspondences.of_frames)."
-        yield case.found("drift", fit, 4, (size, sd, "px"), text, cure)
+    if not np.isfinite(time).all() or np.ptp(time) == 0:
+        return
+    late = ((time - time.mean()) / np.ptp(time))[:, None, None, None, None, None] * case.problem.of_cameras
+    cure = "Fix the microscope and the robot, or calibrate a shorter part (Correspondences.of_frames)."
+    for columns, what in ((late[..., 3], "images creep"), (late, "cameras turn, zoom or move steadily: the images change")):
+        fit = case.linear(columns.reshape(len(time), 2, 2, -1))
+        size = float(np.sqrt(12.0 * (fit.moved_px**2).sum(axis=2).mean()))  # the RMS of a line is 1/sqrt(12) of its range
+        text = f"The {what} by {size:.1f} px from the first frame to the last."
+        yield case.found("drift", fit, fit.theta.size, (size, 0.0, "px"), text, cure)
 
 
 def _bad_part(case: Case) -> Iterator[Hypothesis]:
@@ -158,8 +161,8 @@ def _camera_moved(case: Case) -> Iterator[Hypothesis]:
     z = np.concatenate([H, fit.residuals], axis=2)
 
     def columns(views: tuple[int, ...]) -> np.ndarray:
-        late = H * (problem.frame >= frame)[:, None, None]
-        return np.einsum("nck,cv,ij->ncivjk", late, np.eye(2)[:, views], np.eye(2)).reshape(*H.shape[:2], 2, -1)
+        late = np.where((problem.frame >= frame)[:, None, None, None, None, None], problem.of_cameras, 0.0)
+        return late[:, :, :, views].reshape(len(problem), 2, 2, -1)
 
     for _ in range(2):  # the frame that parts the rows best, under the weights of the fit so far
         weight = np.where(problem.used, 1.0 / (fit.shapes[0].scale ** 2 + (fit.residuals**2).sum(axis=2)), 0.0)
@@ -178,6 +181,7 @@ def _camera_moved(case: Case) -> Iterator[Hypothesis]:
         who = "Both cameras" if len(views) == 2 else f"The {SIDES[views[0]]} camera"
         text = f"{who} moved or zoomed at about frame {frame} of those seen: the images shift by {size:.1f} px."
         cure = "Calibrate before and after on their own. lib.registration.register_images follows a move, and no zoom."
+        cure += " A robot whose zero changed looks the same." * (len(views) == 2)
         yield case.found("camera_moved", fit, 8 * len(views) + 3, (size, 0.0, "px"), text, cure, images=views)
 
 

@@ -151,10 +151,10 @@ class Problem:
         return self.y - seen - fit.nearness[0] * _shrinking(fit.M, x, seen - self.centre_px)
 
     @cached_property
-    def _of_matrices(self) -> np.ndarray:
-        """(n, 2, 2, 16): derivatives by the entries of the cameras, 0 in images that are not used."""
+    def of_cameras(self) -> np.ndarray:
+        """(n, 2, 2, 2, 2, 4): derivatives by the entries of the cameras (2, 2, 4), 0 in images that are not used."""
         H = np.where(self.used[:, :, None], np.concatenate([self.x, np.ones((len(self), 2, 1))], axis=2), 0.0)
-        return np.einsum("nck,cv,ij->ncivjk", H, np.eye(2), np.eye(2)).reshape(len(self), 2, 2, 16)
+        return np.einsum("nck,cv,ij->ncivjk", H, np.eye(2), np.eye(2))
 
     def _design(self, M: np.ndarray, columns: Callable | None) -> np.ndarray:
         """(n, 2, 2, p): derivatives by the 16 entries of M, 9 offsets (mm), 1/distance, additions; 0 in images not used."""
@@ -162,8 +162,9 @@ class Problem:
         image = (M[:, :, :3].reshape(4, 3) @ self.axes).reshape(len(self), 2, 2, 3)
         own = np.where(self.used[:, :, None] & (self.landmark[:, None, None] == np.arange(3)), 1.0, 0.0)  # (n, 2, 3)
         of_offsets = np.einsum("ncij,nck->ncikj", image, own).reshape(len(self), 2, 2, 9)
-        seen = (self._of_matrices.reshape(-1, 16) @ M.ravel()).reshape(self.y.shape)
-        parts = [self._of_matrices, of_offsets, _shrinking(M, x, seen - self.centre_px)[..., None]]
+        of_cameras = self.of_cameras.reshape(len(self), 2, 2, 16)
+        seen = (of_cameras.reshape(-1, 16) @ M.ravel()).reshape(self.y.shape)
+        parts = [of_cameras, of_offsets, _shrinking(M, x, seen - self.centre_px)[..., None]]
         parts += [] if columns is None else [np.where(self.used[:, :, None, None], np.nan_to_num(columns(M)), 0.0)]
         return np.concatenate(parts, axis=3)
 

@@ -60,9 +60,10 @@ def axes_and_eyes(case: Case, fit: Robust, sign: float) -> Iterator[Hypothesis]:
     few = 2 * case.problem.used.sum() < 40
     if few or not np.isfinite(covariance).all() or min(np.linalg.svd(a, compute_uv=False)[1] for a in A) < 1e-6:
         return
-    if case.misfit(fit) < FITS:  # cameras that fit nothing always have skewed pixels
+    if (misfit := case.misfit(fit)) < FITS:  # cameras that fit nothing always have skewed pixels
         yield from list(_jaws(case)) or _scaled_axis(A, covariance)  # pixels cannot tell x from y
-    yield from _handedness(case, A, covariance)
+    if misfit < 2 * FITS:  # nor do they tell left from right
+        yield from _handedness(case, A, covariance)
 
 
 def _constraints(A: np.ndarray) -> np.ndarray:

@@ -410,6 +410,23 @@ def _squeezed(factor: float) -> Callable[[Camera], Camera]:
     return lambda camera: replace(camera, matrix=camera.matrix * [[factor], [1.0]])
 
 
+def _changing(zoom: float, degrees: float) -> Callable[[Scene], None]:
+    """Both images zoom and turn about their centre at a constant speed, from first to last by so much."""
+
+    def edit(scene: Scene, u: np.ndarray) -> np.ndarray:
+        part, centre = np.linspace(0, 1, len(u)), (np.array(_SIZE) - 1) / 2
+        turn = Rotation.from_euler("z", part[:, None] * degrees, degrees=True).as_matrix()[:, None, None, :2, :2]
+        return centre + (1 + zoom * part[:, None, None, None]) * (turn @ (u - centre)[..., None])[..., 0]
+
+    return _pixels(edit)
+
+
+def _of_another(scene: Scene, t: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """The log of another recording with this robot."""
+    other = Scene(np.random.default_rng(scene.rng.integers(1 << 30)), frames=scene.frames, fps=scene.fps)
+    return x.mean(axis=(0, 1)) + other.path()(t)
+
+
 def _repeats(view: int, share: float) -> Callable[[Scene], None]:
     """One camera delivers some images twice."""
 
@@ -487,6 +504,9 @@ SPOILED: dict[tuple[str, str], tuple[tuple[str, ...], Callable[[Scene], None]]] 
     **{("tips too near or far apart", f"{s}"): (("jaw_opening",), _opened(s)) for s in (0.5, 1.5, 2.0)},
     **{("lens distorts", f"{100 * s:.0f} %"): (("lens_distortion",), _set(edit_rig=_of_cameras(_lens(s))))
        for s in (-0.03, 0.03, 0.1)},
+    ("log of another recording", ""): (("robot_noise",), _report(_of_another)),
+    **{("cameras change steadily", f"{100 * zoom:.0f} %, {turn} degrees"): (("drift",), _changing(zoom, turn))
+       for zoom, turn in ((0.02, 0.0), (0.0, 2.0), (0.1, -5.0))},
     ("one camera repeats frames", "left, 30 %"): (("frozen_video",), _repeats(0, 0.3)),
     ("one camera repeats frames", "right, 10 %"): (("frozen_video",), _repeats(1, 0.1)),
 }  # fmt: skip
