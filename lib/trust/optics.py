@@ -48,7 +48,7 @@ def lens(case: Case) -> Iterator[Hypothesis]:
     fit = case.linear(columns)
     left, right = 100 * fit.theta
     text = f"The lenses distort: the corners of the left image lie {left:.1f} % too far out, of the right one {right:.1f} %."
-    cure = "Calibrate with model='near_affine+radial' (--model near_affine+radial on the command line)."
+    cure = "`python3 -m lib calibrate RECORDING --model zero_skew+distance+radial` takes that on."
     size, sd = np.abs(fit.theta).max(), np.sqrt(np.trace(fit.covariance) / 2)
     yield case.found("lens_distortion", fit, 2, (100 * size, 100 * sd, "%"), text, cure)
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from lib.calibration import calibrate
 from lib.correspondences import Correspondences
 from lib.geometry import RigidTransform
 from lib.recordings import Kinematics
@@ -198,6 +200,15 @@ def test_a_mirrored_image_is_no_scaled_axis():
     best = found(scene.take()).best
     assert best.name == "tip_order" and "What the left image calls" in best.text
     assert best.cure.endswith("If that image is mirrored, flip it instead.")
+
+
+def test_the_cure_of_a_lens_that_distorts_mends_it():
+    spoiled = take("lens distorts", "10 %")
+    model = re.search(r"--model (\S+)`", found(spoiled).best.cure)[1]
+    calibration = calibrate(spoiled.data, model=model, image_size_px=spoiled.image_size_px)
+    error_mm = calibration.pair.triangulate(*spoiled.rigs[0].project(spoiled.points_mm)).x_mm - spoiled.points_mm
+    covariance = calibration.point_covariance(spoiled.points_mm, detection=False)
+    assert (error_mm**2).sum() < 4 * np.trace(covariance, axis1=1, axis2=2).sum()
 
 
 @pytest.mark.parametrize("name", ["images squeezed by 3 %", "left image squeezed by 7 %"])
