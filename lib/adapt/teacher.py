@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import partial
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -74,27 +74,20 @@ class RefusalError(DataError):
 def longest_still(recording: Recording, seen: Seen) -> tuple[np.ndarray, str]:
     """The frames before or after the cameras moved, whichever are more, and what to say of it; all if they did not."""
     rows, frames = seen.rows(_clock(recording, seen)[0]), seen.frame
-    used, count = int(Problem.of(rows).used.sum()), len(frames)
-    if used < 60 or count < 24:
+    rows = rows.subset(np.isfinite(rows.x_mm).all(axis=1) & rows.seen.any(axis=1))
+    problem = Problem.of(rows, recording.image_size_px)
+    used = int(problem.used.sum())
+    if used < 60 or len(frames) < 24:
         return frames, ""
-
-    @cache
-    def total(first: int, last: int) -> float:
-        """Log likelihood of cameras of these frames' own."""
-        part = Problem.of(rows.of_frames(frames[first:last]), recording.image_size_px)
-        return part.fit().total if part.used.sum() >= 16 else -np.inf
-
-    def gain(cut: int) -> float:
-        return total(0, cut) + total(cut, count) - total(0, count)
-
-    cut = max(np.unique(np.linspace(0.15, 0.85, 8) * count).astype(int), key=gain)
-    for step in (max(count // 16, 1), 1, 1):
-        cut = max((cut, cut - step, cut + step), key=gain)
+    fit = problem.fit()
+    first = np.unique(rows.frame)[problem.other_cameras(fit)[0]]
+    parts = frames[frames < first], frames[frames >= first]
+    own = sum(Problem.of(rows.of_frames(part), recording.image_size_px).fit().total for part in parts)
     # Cameras of their own have 16 numbers more, and the cut could lie anywhere.
-    if gain(cut) < 16 * np.log(used) / 2 + 12 + _SURE_MOVE * used:
+    if own - fit.total < 16 * np.log(used) / 2 + 12 + _SURE_MOVE * used:
         return frames, ""
-    kept = frames[:cut] if cut >= count - cut else frames[cut:]
-    return kept, f"The cameras moved at about frame {frames[cut]}: only frames {kept[0]} to {kept[-1]} are used."
+    kept = max(parts, key=len)
+    return kept, f"The cameras moved at about frame {first}: only frames {kept[0]} to {kept[-1]} are used."
 
 
 @dataclass(frozen=True, eq=False)

@@ -154,29 +154,12 @@ def _bad_part(case: Case) -> Iterator[Hypothesis]:
 
 def _camera_moved(case: Case) -> Iterator[Hypothesis]:
     """Other cameras from one frame on, both or one."""
-    problem, fit = case.problem, case.null
+    problem = case.problem
     if case.frames < 8:
         return
-    H = np.nan_to_num(np.concatenate([problem.x, np.ones((len(problem), 2, 1))], axis=2))
-    z = np.concatenate([H, fit.residuals], axis=2)
-
-    def columns(views: tuple[int, ...]) -> np.ndarray:
-        late = np.where((problem.frame >= frame)[:, None, None, None, None, None], problem.of_cameras, 0.0)
-        return late[:, :, :, views].reshape(len(problem), 2, 2, -1)
-
-    for _ in range(2):  # the frame that parts the rows best, under the weights of the fit so far
-        weight = np.where(problem.used, 1.0 / (fit.shapes[0].scale ** 2 + (fit.residuals**2).sum(axis=2)), 0.0)
-        moments = np.zeros((case.frames, 2, 6, 6))
-        np.add.at(moments, problem.frame, np.einsum("nc,nci,ncj->ncij", weight, z, z))
-        early, left = np.cumsum(moments, axis=0)[1:-2], 0.0
-        for part in (early, moments.sum(axis=0) - early):
-            G = part[..., :4, :4] + 1e-9 * np.trace(part, axis1=2, axis2=3)[..., None, None] * np.eye(4) + 1e-12 * np.eye(4)
-            open_ = part[..., 4:, 4:] - part[..., 4:, :4] @ np.linalg.solve(G, part[..., :4, 4:])
-            left = left + np.trace(open_, axis1=2, axis2=3).sum(axis=1)
-        frame = int(left.argmin()) + 2
-        fit = case.linear(columns((0, 1)))
+    frame, both = problem.other_cameras(case.null)
     for views in ((0, 1), (0,), (1,)):
-        fit = case.linear(columns(views)) if len(views) < 2 else fit
+        fit = both if len(views) == 2 else case.linear(problem.of_later_cameras(frame, views))
         size = float(np.sqrt((fit.moved_px[problem.frame >= frame][:, list(views)] ** 2).sum(axis=2).mean()))
         who = "Both cameras" if len(views) == 2 else f"The {SIDES[views[0]]} camera"
         text = f"{who} moved or zoomed at about frame {frame} of those seen: the images shift by {size:.1f} px."

@@ -8,7 +8,7 @@ distance, both with a prior: whatever else is wrong, every microscope has these.
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Self
 
 import numpy as np
@@ -144,6 +144,34 @@ class Problem:
                         cameras[1, view] = tightest_sample(x, y, rng)
             start = max((self._descend(beta, columns, apart, 8) for beta in starts), key=lambda fit: fit.total).start
         return self._descend(start, columns, apart, rounds)
+
+    def of_later_cameras(self, frame: int, views: tuple[int, ...] = (0, 1)) -> np.ndarray:
+        """(n, 2, 2, 8 a view): derivatives by what the entries of some cameras change by at a frame."""
+        late = np.where((self.frame >= frame)[:, None, None, None, None, None], self.of_cameras[:, :, :, views], 0.0)
+        return late.reshape(len(self), 2, 2, -1)
+
+    def other_cameras(self, fit: Robust) -> tuple[int, Robust]:
+        """The frame from which on cameras of their own suit the rows best, and the fit with them, from a `fit` without."""
+        z = np.nan_to_num(np.concatenate([self.x, np.ones((len(self), 2, 1)), fit.residuals], axis=2))
+        frames, scale = int(self.frame.max()) + 1, fit.shapes[0].scale
+        weight = np.where(self.used, 1.0 / (scale**2 + scale * np.linalg.norm(fit.residuals, axis=2)), 0.0)
+        moments, left = np.zeros((frames, 2, 6, 6)), 0.0
+        np.add.at(moments, self.frame, np.einsum("nc,nci,ncj->ncij", weight, z, z))
+        early = np.cumsum(moments, axis=0)[1:-2]
+        for part in (early, moments.sum(axis=0) - early):  # by least squares
+            G = part[..., :4, :4] + 1e-9 * np.trace(part, axis1=2, axis2=3)[..., None, None] * np.eye(4) + 1e-12 * np.eye(4)
+            open_ = part[..., 4:, 4:] - part[..., 4:, :4] @ np.linalg.solve(G, part[..., :4, 4:])
+            left = left + np.trace(open_, axis1=2, axis2=3).sum(axis=1)
+
+        @cache
+        def parted(frame: int) -> Robust:
+            columns = self.of_later_cameras(frame)
+            return self.fit(lambda M: columns, start=fit.start)
+
+        cut = int(left.argmin()) + 2
+        for step in (max(frames // 8, 1), max(frames // 16, 1), max(frames // 32, 1), 1, 1):
+            cut = max((cut, max(cut - step, 2), min(cut + step, frames - 2)), key=lambda frame: parted(frame).total)
+        return cut, parted(cut)
 
     def missed(self, fit: Robust, x: np.ndarray) -> np.ndarray:
         """(..., n, 2, 2) px: what the cameras of a fit leave of the pixels at other positions x (..., n, 2, 3)."""
