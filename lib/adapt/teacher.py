@@ -87,7 +87,8 @@ def longest_still(recording: Recording, seen: Seen) -> tuple[np.ndarray, str]:
     if own - fit.total < 16 * np.log(used) / 2 + 12 + _SURE_MOVE * used:
         return frames, ""
     kept = max(parts, key=len)
-    return kept, f"The cameras moved at about frame {first}: only frames {kept[0]} to {kept[-1]} are used."
+    what = f"The cameras moved, or the tool slipped, at about frame {first}"
+    return kept, f"{what}: only frames {kept[0]} to {kept[-1]} are used."
 
 
 @dataclass(frozen=True, eq=False)

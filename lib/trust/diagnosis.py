@@ -24,6 +24,8 @@ _MOST_ROWS, _FEWEST_FRAMES = 1200, 4  # of three frames nothing checks anything
 _UNFIT = f"The detector does not fit these pictures: look at its overlays, {TRAIN_FURTHER}."
 _ROBOT_MM = 0.04  # a robot for eye surgery is better
 _LEAST_SPIKE_MM = 0.2
+_LEAST_OFFSET_UM = 250  # a robot's tool calibration errs by tenths of a mm, which `calibrate` takes on
+_AS_GOOD = 6.0  # by how much more likely cameras that moved, of 16 numbers, may be than a tool that slipped, of three
 _OPENED = 1.25  # a smaller factor may be that of constant offsets of the tips, which do no harm
 _RESTS, _RESTS_MM = 4, 0.06  # a tool rests whose landmarks are where they were so many frames before, noise included
 _STILL_PX = 0.3  # detections of one picture differ by less
@@ -60,7 +62,7 @@ def _landmark_offset(case: Case) -> Iterator[Hypothesis]:
     free = replace(case.problem, offset_sd=1.0).fit(start=case.null.start)
     size = 1e3 * np.linalg.norm(free.offsets, axis=1)
     k = int(size.argmax())
-    if size[k] >= 150:
+    if size[k] >= _LEAST_OFFSET_UM:
         along = ", ".join(f"{1e3 * v:.0f}" for v in free.offsets[k])
         text = f"{LANDMARKS[k]} is seen {size[k]:.0f} um beside the robot's report ({along} um in the tool's axes)."
         cure = "Correct the tool's geometry in the robot's report. --force goes on: `calibrate` removes such offsets."
@@ -153,11 +155,18 @@ def _bad_part(case: Case) -> Iterator[Hypothesis]:
 
 
 def _camera_moved(case: Case) -> Iterator[Hypothesis]:
-    """Other cameras from one frame on, both or one."""
+    """Other cameras from one frame on, both or one; or another place of the tool in the robot's hand."""
     problem = case.problem
     if case.frames < 8:
         return
     frame, both = problem.other_cameras(case.null)
+    slipped = problem.axes * (problem.frame >= frame)[:, None, None]
+    fit = case.linear(lambda M: np.einsum("cij,njk->ncik", M[:, :, :3], slipped))
+    if fit.total > both.total - _AS_GOOD:
+        size, along = 1e3 * np.linalg.norm(fit.theta), ", ".join(f"{1e3 * v:.0f}" for v in fit.theta)
+        text = f"The tool slipped at about frame {frame} of those seen, by {size:.0f} um ({along} um in the tool's axes)."
+        cure = "Fix the tool in its holder, or calibrate before and after on their own."
+        yield case.found("tool_slipped", fit, 6, (size, 0.0, "um"), text, cure)
     for views in ((0, 1), (0,), (1,)):
         fit = both if len(views) == 2 else case.linear(problem.of_later_cameras(frame, views))
         size = float(np.sqrt((fit.moved_px[problem.frame >= frame][:, list(views)] ** 2).sum(axis=2).mean()))

@@ -18,6 +18,7 @@ _STRETCHES, _PARTS = 60, 8
 _LEAST_SCALED, _SURE_SCALED, _OWN_SD = 0.03, 5.0, 0.006
 #: Least share of the variance that it explains, most that it leaves (RMS), and least turning of the jaws (RMS of n^2).
 _MOST_OF_IT, _ODD, _TURNED = 0.5, 0.03, 0.01
+_FIT_SHARE = 0.3  # of the landmarks in each image that must lie near where cameras see them, before these tell anything
 _ACROSS = 0.15  # sine of a tool's angle to the images, below which it points neither way
 _UPSIDE_DOWN = 20.0  # odds that a microscope sees the tips of a tool below its base
 _SCALE = "Check the units and the scale of the {} columns of kinematics.csv, beside those of the others."
@@ -60,7 +61,10 @@ def axes_and_eyes(case: Case, fit: Robust, sign: float) -> Iterator[Hypothesis]:
     few = 2 * case.problem.used.sum() < 40
     if few or not np.isfinite(covariance).all() or min(np.linalg.svd(a, compute_uv=False)[1] for a in A) < 1e-6:
         return
-    if (misfit := case.misfit(fit)) < FITS:  # cameras that fit nothing always have skewed pixels
+    # Cameras that fit nothing always have skewed pixels, one of the two, too.
+    distance, spread = np.linalg.norm(fit.residuals, axis=2), case.problem.y[case.problem.used].std(axis=0).max()
+    each = [np.quantile(own[rows], _FIT_SHARE) / spread for own, rows in zip(distance.T, case.problem.used.T, strict=True)]
+    if (misfit := max(case.misfit(fit), *each)) < FITS:
         yield from list(_jaws(case)) or _scaled_axis(A, covariance)  # pixels cannot tell x from y
     if misfit < 2 * FITS:  # nor do they tell left from right
         yield from _handedness(case, A, covariance)

@@ -361,6 +361,17 @@ def _bend(size: float) -> Callable[[Scene], None]:
     return _report(edit)
 
 
+def _slip(size_mm: float) -> Callable[[Scene], None]:
+    """From the middle on the robot holds the tool elsewhere along its shaft, and does not know it."""
+
+    def edit(scene: Scene, t: np.ndarray, x: np.ndarray) -> np.ndarray:
+        along = x[:, 1:].mean(axis=1) - x[:, 0]
+        along *= size_mm / np.linalg.norm(along, axis=1, keepdims=True) * (t > scene.frames / scene.fps / 2)[:, None]
+        return x + along[:, None]
+
+    return _report(edit)
+
+
 def _order(order: tuple[int, int, int]) -> Callable[[Scene], None]:
     return _report(lambda scene, t, x: x[:, list(order)])
 
@@ -504,6 +515,7 @@ SPOILED: dict[tuple[str, str], tuple[tuple[str, ...], Callable[[Scene], None]]] 
     **{("tips too near or far apart", f"{s}"): (("jaw_opening",), _opened(s)) for s in (0.5, 1.5, 2.0)},
     **{("lens distorts", f"{100 * s:.0f} %"): (("lens_distortion",), _set(edit_rig=_of_cameras(_lens(s))))
        for s in (-0.03, 0.03, 0.1)},
+    **{("tool slips", f"{s} mm"): (("tool_slipped",), _slip(s)) for s in (0.1, 0.5, 2.0)},
     ("log of another recording", ""): (("robot_noise",), _report(_of_another)),
     **{("cameras change steadily", f"{100 * zoom:.0f} %, {turn} degrees"): (("drift",), _changing(zoom, turn))
        for zoom, turn in ((0.02, 0.0), (0.0, 2.0), (0.1, -5.0))},

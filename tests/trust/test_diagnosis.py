@@ -62,7 +62,8 @@ def test_a_spike_in_the_log_is_no_fault_of_the_frames(name):
         ("robot noise", "100 um", None), ("camera moved", "1.0 degrees", None), ("detector partly wrong", "50 %", None),
         ("kinematics frozen", "25 %", 24.0), ("left camera late", "40 ms", -40.0),
         ("tips too near or far apart", "0.5", 2.0), ("lens distorts", "10 %", 10.0), ("spikes in the log", "10 %", None),
-        ("one camera repeats frames", "left, 30 %", None),
+        ("one camera repeats frames", "left, 30 %", None), ("tool slips", "0.5 mm", 500.0),
+        ("cameras change steadily", "10 %, -5.0 degrees", None), ("log of another recording", "", None),
     ],
 )  # fmt: skip
 def test_a_fault_is_named_with_its_size_and_its_cure(way, strength, value):
