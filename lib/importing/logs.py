@@ -17,7 +17,7 @@ from lib.recordings import Kinematics
 from lib.recordings.tables import decoded, number, rows_of
 
 _SECONDS = {"s": Decimal(1), "ms": Decimal("1e-3"), "us": Decimal("1e-6"), "ns": Decimal("1e-9")}
-_MILLIMETRES = {"m": 1e3, "mm": 1.0, "um": 1e-3}
+_MILLIMETRES = {"m": 1e3, "cm": 10.0, "mm": 1.0, "um": 1e-3}
 _EMPTY = {"nan", "NaN", "NAN", "null", "None", "NA"}
 
 
@@ -189,7 +189,7 @@ def read_robot(folder: Path, mapping: Mapping) -> tuple[list[Decimal], np.ndarra
     spread_mm = float(np.linalg.norm(np.diff(np.nanpercentile(x, [5, 95], axis=0), axis=0), axis=2).max())
     if not 0.05 <= spread_mm <= 2000:
         what = f"with length_unit = {robot.length_unit!r} the tool moves over {spread_mm:.3g} mm"
-        raise ValueError(f"{path}: {what}; 0.05 to 2000 mm is plausible. Check length_unit: m, mm or um.")
+        raise ValueError(f"{path}: {what}; 0.05 to 2000 mm is plausible. Check length_unit: m, cm, mm or um.")
     if pose is None:
         return time, x, None, None
     R = turn @ _rotations(path, pose, np.stack([columns[name] for name in pose.rotation], axis=-1))

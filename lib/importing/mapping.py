@@ -80,7 +80,7 @@ class Frame(_Section):
 class Robot(Table):
     """The robot's log: `landmarks` names three columns for each landmark, or `pose` those of the tool."""
 
-    length_unit: Literal["m", "mm", "um"]
+    length_unit: Literal["m", "cm", "mm", "um"]
     landmarks: dict[Name, Columns] | None = None
     pose: Pose | None = None
     offset_s: float | Literal["estimate"] = 0.0
