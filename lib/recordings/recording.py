@@ -38,7 +38,7 @@ _ORDER = "time_s must be a number larger than the row before"
 _LONGER = 5.0  # a log is that many times longer than its video by intent, or if the times of the frames are missing
 _COVERED = 0.75  # share of frames with a position, below which log and video do not fit
 _JUMP_MM = 20.0  # from one sample to the next; no surgical robot moves so
-_SLOW_S = 0.5  # between samples; robots report 10 to 1000 times a second
+_SLOW_S = 0.15  # between samples; robots report 10 to 1000 times a second
 
 
 class Doubt(NamedTuple):
@@ -192,7 +192,7 @@ class Recording:
              f"The robot reports a position in {reported} of {n} frames; {covered} lie between its first and last sample.",
              "Check offset_s and the time_s columns; export the log of the whole video, without gaps."),
             (usual_s > _SLOW_S, "slow_log", f"The robot's log has a sample every {usual_s:.3g} s.",
-             "Is time_s in milliseconds? Give seconds, and ten samples a second or more."),
+             "Is time_s in seconds? Log ten samples a second or more."),
             (jump_mm[k] > _JUMP_MM, "jump",
              f"In kinematics.csv a landmark jumps by {jump_mm[k]:.0f} mm at {log_s[k]:.3f} s (line {k + 2}).",
              "Leave the cells of a wrong sample empty."),

@@ -80,6 +80,9 @@ def read_table(path: Path, names: Sequence[str], optional: Sequence[str] = (), n
     rows = rows_of(path, text)
     header = next(rows, ("", []))[1]
     wanted = [*names, *optional] if set(header) & set(optional) else list(names)
+    if other := next((name for sign, name in ((";", "semicolons"), ("\t", "tabs")) if sign in "".join(header)), ""):
+        cure = "Save it with commas between cells and points in numbers"
+        raise ValueError(f"{path}, line 1: {other} part its cells. {cure}.")
     if header != wanted:
         missing, unknown = ([n for n in one if n not in other] for one, other in ((wanted, header), (header, wanted)))
         detail = [f"{what}: {', '.join(which)}" for what, which in (("missing", missing), ("unknown", unknown)) if which]

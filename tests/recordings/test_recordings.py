@@ -318,6 +318,16 @@ SPOILERS = {
         ValueError,
         "missing: base_x_mm; unknown: base_x_m",
     ),
+    "semicolons": (
+        lambda f: (f / "kinematics.csv").write_text((f / "kinematics.csv").read_text().replace(",", ";")),
+        ValueError,
+        r"kinematics\.csv, line 1: semicolons part its cells\. Save it with commas between cells and points in numbers\.$",
+    ),
+    "tabs": (
+        lambda f: (f / "frames.csv").write_text("frame\ttime_s\n0\t0\n1\t0.04\n"),
+        ValueError,
+        r"frames\.csv, line 1: tabs part its cells",
+    ),
     "no kinematic rows": (
         lambda f: (f / "kinematics.csv").write_text((f / "kinematics.csv").read_text().splitlines()[0] + "\n"),
         ValueError,
@@ -651,6 +661,8 @@ def test_failure_leaves_nothing(tmp_path):
     (34, np.arange(0, 43, 0.1), 0.0, "frame_times"),
     (100, np.arange(0, 2, 0.01), 0.0, "little_overlap"),
     (40, np.arange(-1, 4, 1.0), 0.0, "slow_log"),
+    (40, np.arange(-1, 4, 0.2), 0.0, "slow_log"),
+    (40, np.arange(-1, 4, 0.1) + 0.04 * np.sin(7.0 * np.arange(50)), 0.0, None),
     (40, np.arange(-0.1, 2, 0.01), 500.0, "jump"),
     (40, np.arange(-0.1, 2, 0.01), 0.0, None),
 ])  # fmt: skip
