@@ -93,7 +93,7 @@ def estimate_time_offset(
         start_s, search_s: Middle and half width of the search.
 
     A `DataError` refuses fewer than eight instants inside the kinematics, a tool at rest, rows that agree on no cameras
-    (`NoConsensusError`), and an offset at the end of the search.
+    (`NoConsensusError`), and an offset at the edge of the search.
     """
     time, frame, landmark, y = _rows(data)
     paths = _paths(kinematics)
@@ -154,10 +154,10 @@ def estimate_time_offset(
             if abs(step) < 1e-7:
                 break
     if offset in (low, high):
-        raise DataError(f"search_s: {offset:.3f} s, lies at the end of the search; widen search_s or move start_s.")
+        raise DataError(f"search_s: the search ends at its {'lower' if offset == low else 'upper'} edge; widen search_s.")
     rms_px = float(_rms_px(at(offset)[None], y, views)[0])
     if rms_px > far_px * (3 if clear else 1):  # a path that comes back to where it was has more minima
-        raise DataError(f"search_s: the best, {offset:.3f} s, leaves {rms_px:.0f} px RMS; widen search_s or move start_s.")
+        raise DataError(f"search_s: the search leaves {rms_px:.0f} px RMS at its best; widen search_s.")
     sd = float(np.sqrt(sandwich(image[:, :, None], W, r, frame, landmark)[0][0, 0]))
     return TimeOffset(offset, sd, rms_px, trial, misfit)
 

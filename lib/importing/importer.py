@@ -58,8 +58,10 @@ def import_recording(source: str | Path, mapping: str | Path, out: str | Path, *
     if frames_s[-1] < robot_s[0] or frames_s[0] > robot_s[-1]:
         spans = [f"{time[0]:.3f} to {time[-1]:.3f} s" for time in (robot_time, stereo.time)]
         what = "its times ({}) and those of the frames ({}) do not overlap".format(*spans)
-        cure = ', or say "estimate" where log and video began together' if one_dated and not estimated else ""
-        cure = f"Correct robot.offset_s = {told.robot.offset_s!r} in {mapping} (t_robot = t_video + offset_s){cure}"
+        low, high = sorted(robot_time[end] - stereo.time[end] for end in (0, -1))
+        cure = f"a number from {low:.3f} to {high:.3f}, so that they overlap (t_robot = t_video + offset_s)"
+        cure += ', or say "estimate" where log and video began together' if one_dated and not estimated else ""
+        cure = f"Set robot.offset_s (now {told.robot.offset_s!r}) in {mapping} to {cure}"
         raise ValueError(f"{folder / told.robot.file}: {what}. {cure}.")
     if labels is not None:  # the mean instant at which the rows of a frame's labels were read
         y = np.hstack([labels.u_left[..., 1], labels.u_right[..., 1]])
@@ -81,7 +83,8 @@ def import_recording(source: str | Path, mapping: str | Path, out: str | Path, *
             if labels is not None:
                 writer.annotations(labels.u_left, labels.u_right, labels.visibility_left, labels.visibility_right)
             draft = writer.draft()
-            clock, found = _clock(draft, told.robot.search_s) if estimated else None, None
+            zero_s = float(robot_zero - stereo_zero)
+            clock, found = _clock(draft, told.robot.search_s, zero_s) if estimated else None, None
             if isinstance(clock, TimeOffset):
                 draft = writer.draft(clock.offset_s)
                 found = {"offset_s": round(clock.offset_s, 9), "sd_s": float(f"{clock.sd_s:.3g}")}
@@ -93,8 +96,11 @@ def import_recording(source: str | Path, mapping: str | Path, out: str | Path, *
     return report
 
 
-def _clock(draft: Recording, search_s: float) -> TimeOffset | str:
-    """The offset of the clocks, from labels or else the detector; or why a detector that knows no such tool finds none."""
+def _clock(draft: Recording, search_s: float, zero_s: float = 0.0) -> TimeOffset | str:
+    """The offset of the clocks, from labels or else the detector; or why a detector that knows no such tool finds none.
+
+    The files' own offset is larger than the draft's by `zero_s`.
+    """
     if (labels := draft.annotations) is not None:
         known = {"u_left": labels.u_left, "u_right": labels.u_right}
     elif draft.skeleton != LANDMARKS:
@@ -109,8 +115,10 @@ def _clock(draft: Recording, search_s: float) -> TimeOffset | str:
     except ValueError as error:
         if labels is None and isinstance(error, NoConsensusError | NoDetectionError):
             return str(error).removesuffix(".")
-        cure = "Or state offset_s, where t_robot = t_video + offset_s"
-        raise ValueError(f"robot.offset_s = 'estimate': {error} {cure}.") from None
+        low, high = (zero_s + draft.offset_s + end_s for end_s in (-search_s, search_s))
+        what = str(error).split(": ", 1)[-1].replace("search_s", "robot.search_s")
+        cure = "Or state a number, where t_robot = t_video + offset_s"
+        raise ValueError(f"robot.offset_s, searched from {low:.3f} to {high:.3f} s: {what} {cure}.") from None
     with suppress(DataError, np.linalg.LinAlgError):  # cameras of their own ask for more
         data = paired(replace(draft, offset_s=found.offset_s))
         calibration = calibrate_as_shown(data, image_size_px=draft.image_size_px)

@@ -13,7 +13,7 @@ import pytest
 from lib import paths
 from lib.calibration import calibrate
 from lib.calibration.offsets import tool_axes
-from lib.correspondences import of_recording
+from lib.correspondences import LANDMARKS, of_recording
 from lib.geometry import RigidTransform
 from lib.importing import guess_mapping, import_recording, importer, logs, read_mapping
 from lib.recordings import Annotations, Recording
@@ -258,6 +258,47 @@ def test_the_guess_reads_units_and_frame_times_where_no_name_states_them(shipped
     assert (told.tool.estimate, told.robot.offset_s) == (True, 0.0)
 
 
+@pytest.mark.parametrize("column", ["{name}_{axis}_cm", "{name} {axis} [cm]", "{name}.{axis}(CM)"])
+def test_centimetres_are_guessed_from_the_columns_and_read(column, shipped, tmp_path):
+    few = replace(thinned(shipped, 80), frames=shipped.frames[:6], time_s=shipped.time_s[:6])
+    folder, path = source_of(tmp_path, few, foreign.side_by_side)
+    header = ",".join(["time_s", *(column.format(name=name, axis=axis) for name in LANDMARKS for axis in "xyz")])
+    values = np.column_stack([few.robot_s, few.x_mm.reshape(len(few.x_mm), 9) / 10])
+    np.savetxt(folder / "log.csv", values, "%.7f", ",", header=header, comments="")
+    path.write_text(guess_mapping(folder), "utf-8")
+    told = read_mapping(path)
+    assert told.robot.length_unit == "cm" and told.robot.landmarks["base"][0] == column.format(name="base", axis="x")
+    np.testing.assert_allclose(logs.read_robot(folder, told)[1], few.x_mm, atol=1e-5)
+
+
+@pytest.mark.parametrize("late_s", [0.8, 1_700_000_002])
+def test_a_clock_beyond_its_search_is_refused_with_the_search_and_the_cure(late_s, shipped, tmp_path):
+    """The search is stated between the times as the files have them, also where one clock counts from a date."""
+    late = replace(shipped, robot_s=shipped.robot_s + late_s)
+    folder, mapping = source_of(tmp_path, late, foreign.images, foreign.robot_csv, foreign.labels_coco)
+    mapping.write_text(mapping.read_text("utf-8").replace("[robot]\n", '[robot]\noffset_s = "estimate"\n'), "utf-8")
+    zero = int(late.robot_s[0]) if late_s > 1e6 else 0
+    text = f"^robot.offset_s, searched from {zero - 0.5:.3f} to {zero + 0.5:.3f} s: the search ends at its upper edge; "
+    cure = "widen robot.search_s. Or state a number, where t_robot = t_video + offset_s."
+    with pytest.raises(ValueError, match=f"{text}{cure}$".replace(".", r"\.").replace("+", r"\+")):
+        import_recording(folder, mapping, tmp_path / "eye")
+
+
+def test_the_offsets_named_where_log_and_video_do_not_overlap_make_them_overlap(shipped, tmp_path):
+    few = replace(thinned(shipped, 20), frames=shipped.frames[:6], time_s=shipped.time_s[:6])
+    late = replace(few, robot_s=few.robot_s - few.robot_s[0] + 300.0)
+    folder, mapping = source_of(tmp_path, late, foreign.side_by_side, foreign.robot_csv)
+    text, low, high = mapping.read_text("utf-8"), 300.0, late.robot_s[-1] - few.time_s[-1]
+    mapping.write_text(text.replace("[robot]\n", '[robot]\noffset_s = "estimate"\n'), "utf-8")
+    cure = rf"Set robot\.offset_s \(now 'estimate'\) in .* to a number from {low:.3f} to {high:.3f}, so that they overlap"
+    with pytest.raises(ValueError, match=cure):
+        import_recording(folder, mapping, tmp_path / "eye")
+    for k, offset_s in enumerate((low + 0.001, high - 0.001)):
+        mapping.write_text(text.replace("[robot]\n", f"[robot]\noffset_s = {offset_s:.3f}\n"), "utf-8")
+        import_recording(folder, mapping, tmp_path / f"eye {k}")
+        assert np.isfinite(Recording.open(tmp_path / f"eye {k}").landmarks_mm()).all()
+
+
 def test_a_detector_that_knows_no_such_tool_leaves_the_clock_open(shipped, tmp_path, monkeypatch):
     few = replace(thinned(shipped, 5), frames=shipped.frames[:10], time_s=shipped.time_s[:10])
     folder, mapping = source_of(tmp_path, few, foreign.side_by_side, foreign.robot_csv)
@@ -272,6 +313,12 @@ def test_a_detector_that_knows_no_such_tool_leaves_the_clock_open(shipped, tmp_p
     report = import_recording(folder, mapping, tmp_path / "eye")
     assert report["clock"] is None and Recording.open(tmp_path / "eye").offset_s == 0
     assert any("offset of the clocks was not found" in line and "`check` and `adapt`" in line for line in report["did"])
+    assert not any("fps" in line for line in report["did"])
+    rate = mapping.read_text("utf-8").replace("[robot]", 'times = "fps"\nfps = 2\n[robot]', 1)
+    mapping.write_text(rate, "utf-8")
+    did = import_recording(folder, mapping, tmp_path / "fast")["did"]
+    said = "The frames last 4.5 s with video.fps = 2, the robot's log {:.1f} s. If fps is a guess, correct it first."
+    assert said.format(np.ptp(few.robot_s)) in did
 
 
 def test_offsets_of_the_landmarks_are_no_part_of_the_clock(monkeypatch):
