@@ -3,17 +3,18 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from lib.adapt.looking import Seen
 from lib.adapt.teacher import RefusalError, Teacher
 from lib.landmarks.metrics import errors_px, nees, tool_length_px
 from lib.recordings import Recording
-from lib.trust.health import affine_epipolar, feature_matches
+from lib.trust.health import feature_matches
 
 #: Distances count up to this share of the tool's length, and so does a landmark that is missing.
 _CAP = 0.1
-_FEWEST = 60  # features of the eye, below which the detections' own geometry has to do
+_FEWEST, _NEAR_PX = 16, 1.5  # matches that tell an epipolar geometry, and how far from it right ones may lie
 
 
 def stretches(frames: np.ndarray, time_s: np.ndarray) -> dict[str, np.ndarray]:
@@ -76,18 +77,23 @@ def agreement(teacher: Teacher, seen: Seen) -> Agreement:
 def epipolar_px(recording: Recording, seen: Sequence[Seen], all_seen: Seen) -> list[np.ndarray]:
     """Distances (m, 3) of left and right detections from an epipolar geometry, in px of one image; infinite where missing.
 
-    Features of the eye that both images show tell the geometry; where they are too few, what most of `all_seen` share.
+    Features of the eye that both images show tell it, with what most of `all_seen` share: the tool is nearer than the eye,
+    and where cameras have a finite distance the eye alone says little of the lines there.
     """
-    matches = feature_matches(recording, seen[0].frame)
-    agree = affine_epipolar(matches)[1]
-    if agree.sum() < _FEWEST:
-        matches = all_seen.stacked_px.reshape(-1, 4)
-        agree = affine_epipolar(matches)[1]
-    if agree.sum() < 4:
+    matches = np.concatenate([feature_matches(recording, seen[0].frame), all_seen.stacked_px.reshape(-1, 4)])
+    left, right = np.split(matches[np.isfinite(matches).all(axis=1)], 2, axis=1)
+    F = None
+    if len(left) >= _FEWEST:
+        F = cv2.findFundamentalMat(left, right, cv2.USAC_MAGSAC, _NEAR_PX, 0.9999, 5000)[0]
+    if F is None:
         raise RefusalError("images: left and right share too few features and landmarks, so nothing could judge a gain.")
-    middle = matches[agree].mean(axis=0)
-    normal = np.linalg.svd(matches[agree] - middle, full_matrices=False)[2][3]
-    return [np.nan_to_num(np.sqrt(2) * np.abs((own.stacked_px - middle) @ normal), nan=np.inf) for own in seen]
+    found = []
+    for one in seen:
+        u = np.concatenate([one.u, np.ones((*one.u.shape[:3], 1))], axis=3)
+        lines, back = u[:, 0] @ F.T, u[:, 1] @ F
+        slope = np.sqrt((lines[..., :2] ** 2 + back[..., :2] ** 2).sum(axis=-1))
+        found.append(np.nan_to_num(np.sqrt(2) * np.abs((lines * u[:, 1]).sum(axis=-1)) / slope, nan=np.inf))
+    return found
 
 
 def better(before: np.ndarray, after: np.ndarray) -> tuple[float, float]:

@@ -395,7 +395,7 @@ def _fault(recording: Recording, seen: Seen, calibration: Calibration, *, by_han
     rows = seen.rows(recording)
     rows = replace(rows, confidence=np.where(calibration.view_inliers, rows.confidence, 0.0))
     how = {name: getattr(recording, name) for name in ("kinematics", "offset_s", "readout_s", "image_size_px")}
-    best = diagnose(rows, near=True, **how).best
+    best = diagnose(rows, near=True, offsets=calibration.offsets, **how).best
     return best if best is not None and best.name in FAULTS and best.explained >= _EXPLAINED else None
 
 

@@ -99,16 +99,21 @@ def _frame_order(case: Case) -> Iterator[Hypothesis]:
         return
     trial, misfit = _scan(case, min(2.0, 0.4 * case.paths.span_s))  # lost frames may add up: most fit a later instant
     shifts = step * (np.arange(-8, 9) + round(float(trial[misfit.sum(axis=1).argmin()]) / step))
-    fit, moved, own = case.chosen(case.moved(shifts[:, None]))
-    share = float((np.abs(shifts[own]) > step / 2).mean())
-    if share * case.frames < 3:  # it may be a spike of the log
-        return
-    text = f"{100 * share:.0f} % of the frames fit better {1e3 * shifts[0]:.0f} to {1e3 * shifts[-1]:.0f} ms later."
-    cure = "Sort the frames, look for lost ones, and write each one's true time to frames.csv."
-    counts = np.bincount(own, minlength=len(shifts)) / case.frames
-    chosen = -case.frames * float((counts * np.log(np.maximum(counts, 1e-9))).sum())  # what the choices may cost
-    raw = fit.total - case.null.total - chosen
-    yield case.found("frame_order", fit, np.count_nonzero(counts), (100 * share, 0.0, "%"), text, cure, on=moved, raw=raw)
+    for views in ((0, 1), (0,), (1,)):
+        fit, moved, own = case.chosen(case.moved(shifts[:, None]), views)
+        others = 1e3 * shifts[own][np.abs(shifts[own]) > step / 2]
+        if len(others) < 3:  # it may be a spike of the log
+            continue
+        share, (low, high) = len(others) / case.frames, np.percentile(others, [5, 95])
+        what = "frames" if len(views) == 2 else f"{SIDES[views[0]]} images"
+        text = f"{100 * share:.0f} % of the {what} belong to other instants, mostly {low:+.0f} to {high:+.0f} ms off."
+        cure = "Sort the frames, look for lost ones, and write each one's true time to frames.csv."
+        if len(views) == 1:
+            cure = "Look for images that one camera lost, and pair left and right images of one instant."
+        counts = np.bincount(own, minlength=len(shifts)) / case.frames
+        chosen = -case.frames * float((counts * np.log(np.maximum(counts, 1e-9))).sum())  # what the choices may cost
+        raw, size = fit.total - case.null.total - chosen, (100 * share, 0.0, "%")
+        yield case.found("frame_order", fit, np.count_nonzero(counts), size, text, cure, on=moved, raw=raw, images=views)
 
 
 def _readout(case: Case) -> Iterator[Hypothesis]:

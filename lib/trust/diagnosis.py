@@ -13,6 +13,7 @@ from itertools import permutations
 import numpy as np
 from scipy.ndimage import binary_opening, median_filter
 
+from lib.calibration import LandmarkOffsets
 from lib.correspondences import LANDMARKS, TRAIN_FURTHER, Correspondences
 from lib.recordings import Kinematics
 from lib.trust.clocks import TIME_TESTS
@@ -60,13 +61,15 @@ def _tip_order(case: Case) -> Iterator[Hypothesis]:
 def _landmark_offset(case: Case) -> Iterator[Hypothesis]:
     """Landmarks that the robot reports far beside where they are seen, always in the tool's same direction."""
     free = replace(case.problem, offset_sd=1.0).fit(start=case.null.start)
-    size = 1e3 * np.linalg.norm(free.offsets, axis=1)
-    k = int(size.argmax())
-    if size[k] >= _LEAST_OFFSET_UM:
+    sizes = 1e3 * np.linalg.norm(free.offsets, axis=1)
+    size, sd, k = sizes.max(), 1e3 * free.offset_sd[sizes.argmax()], sizes.argmax()
+    if size - 2.0 * sd > _LEAST_OFFSET_UM:
         along = ", ".join(f"{1e3 * v:.0f}" for v in free.offsets[k])
-        text = f"{LANDMARKS[k]} is seen {size[k]:.0f} um beside the robot's report ({along} um in the tool's axes)."
+        text = f"{LANDMARKS[k]} is seen {size:.0f} um beside the robot's report ({along} um in the tool's axes)."
         cure = "Correct the tool's geometry in the robot's report. --force goes on: `calibrate` removes such offsets."
-        yield case.found("landmark_offset", free, 9, (size[k], 1e3 * free.offset_sd[k], "um"), text, cure)
+        found = case.found("landmark_offset", free, 9, (size, sd, "um"), text, cure)
+        certainty = 0.5 * ((size - _LEAST_OFFSET_UM) / sd) ** 2  # cameras with offsets have no residuals of them
+        yield replace(found, gain=max(found.gain, float(certainty)), explained=float(1.0 - _LEAST_OFFSET_UM / size))
 
 
 def _tool_bends(case: Case) -> Iterator[Hypothesis]:
@@ -286,7 +289,7 @@ class Diagnosis:
 
 def diagnose(
     data: Correspondences, *, kinematics: Kinematics | None = None, offset_s: float = 0.0, readout_s: float = 0.0,
-    image_size_px: tuple[int, int] | None = None, near: bool = False,
+    image_size_px: tuple[int, int] | None = None, near: bool = False, offsets: LandmarkOffsets | None = None,
 ) -> Diagnosis:  # fmt: skip
     """Fit every hypothesis about what could be wrong, and rank them.
 
@@ -296,6 +299,7 @@ def diagnose(
             positions do, where the frames follow each other within 0.25 s.
         offset_s, readout_s, image_size_px: As the recording states them; without a size nothing is said of the read-out time.
         near: The cameras that were calibrated have a finite distance, so that it is no fault.
+        offsets: Of the landmarks, as they were calibrated.  They turn the axes of jaws that are nearly shut.
 
     >>> from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
     >>> rng = np.random.default_rng(0)
@@ -307,7 +311,7 @@ def diagnose(
     frames = np.unique(data.frame)
     if len(data) > _MOST_ROWS:  # a part of the time: neighbours tell of clocks, and which part hardly matters
         data = data.of_frames(frames[np.linspace(0, len(frames) - 1, int(len(frames) * _MOST_ROWS / len(data))).astype(int)])
-    problem = Problem.of(data, image_size_px)
+    problem = Problem.of(data, image_size_px, offsets)
     few = problem.used.all(axis=1).sum() < 6
     if len(frames) < _FEWEST_FRAMES or (few and len(data) < 12):
         return Diagnosis()
@@ -325,7 +329,7 @@ def diagnose(
     x_mm, kept = np.nan_to_num(data.grid("x_mm")), np.ones(len(np.unique(data.frame)), dtype=bool)
     kept[_RESTS:] = np.linalg.norm(x_mm[_RESTS:] - x_mm[:-_RESTS], axis=2).max(axis=1) > _RESTS_MM
     if kept.sum() >= max(_FEWEST_FRAMES, 0.25 * len(kept)) and not kept.all():
-        case = Case(Problem.of(data.of_frames(np.unique(data.frame)[kept]), image_size_px), *stated)
+        case = Case(Problem.of(data.of_frames(np.unique(data.frame)[kept]), image_size_px, offsets), *stated)
         whole.fits = ChainMap({}, case.fits)  # its own fits are of other rows
     tests = [_tip_order, _landmark_offset, _tool_bends, _jaw_opening, _log_spikes, lens, _drift, _bad_part, _camera_moved]
     tests = [*(TIME_TESTS if case.paths else ()), *tests, _frozen, _rigid_tips]

@@ -13,6 +13,7 @@ from typing import Self
 
 import numpy as np
 
+from lib.calibration import LandmarkOffsets
 from lib.calibration.affine import regress
 from lib.calibration.offsets import rows_axes
 from lib.calibration.robust import tightest_sample
@@ -96,14 +97,16 @@ class Problem:
     time: np.ndarray
     centre: np.ndarray
     centre_px: np.ndarray  # (2,) of the images
-    offset_sd: float = 0.03  # mm, before the data: a detector may mark a place beside the landmark
+    offset_sd: float = 0.1  # mm, before the data: a robot's tool calibration errs, and a detector marks a place beside it
     nearness_sd: float = 0.006  # of 1/distance, per mm, before the data: a microscope stands 150 mm away and more
 
     @classmethod
-    def of(cls, data: Correspondences, size: tuple[int, int] | None = None) -> Self:
-        """The rows that the robot reports and an image, of `size` (width, height) px, shows."""
+    def of(
+        cls, data: Correspondences, size: tuple[int, int] | None = None, offsets: LandmarkOffsets | None = None
+    ) -> Self:  # fmt: skip
+        """The rows that the robot reports and an image, of `size` (width, height) px, shows; `offsets` may turn the axes."""
         rows = np.isfinite(data.x_mm).all(axis=1) & data.seen.any(axis=1)
-        axes = np.nan_to_num(rows_axes(data))[rows]
+        axes = np.nan_to_num(rows_axes(data, offsets.offset if offsets and offsets.turns else None))[rows]
         data = data.subset(rows)
         variance = np.trace(data.covariance_px2, axis1=2, axis2=3)
         with np.errstate(all="ignore"):
@@ -317,14 +320,17 @@ class Case:
         table[self.problem.frame[rows], self.problem.landmark[rows]] = values[rows]
         return table
 
-    def chosen(self, x: np.ndarray) -> tuple[Robust, Problem, np.ndarray]:
-        """Each frame with the positions among x (t, n, 3) that suit it best: the fit, its rows, the choices (frames,)."""
+    def chosen(self, x: np.ndarray, views: tuple[int, ...] = (0, 1)) -> tuple[Robust, Problem, np.ndarray]:
+        """Each frame, in some images, with its best of positions x (t, n, 3): the fit, its rows, the choices (frames,)."""
         problem, fit = self.problem, self.null
         for _ in range(5):
             r2 = (problem.missed(fit, np.repeat(x[:, :, None], 2, axis=2)) ** 2).sum(axis=3)
-            loss = np.where(problem.used, np.nan_to_num(np.log1p(r2 / fit.shapes[0].scale ** 2), nan=1e3), 0.0).sum(axis=2)
+            loss = np.where(problem.used, np.nan_to_num(np.log1p(r2 / fit.shapes[0].scale ** 2), nan=1e3), 0.0)
+            loss = loss[:, :, views].sum(axis=2)
             own = np.array([np.bincount(problem.frame, row, self.frames) for row in loss]).argmin(axis=0)
-            moved = replace(problem, x=np.repeat(x[own[problem.frame], np.arange(len(problem))][:, None], 2, axis=1))
+            positions = problem.x.copy()
+            positions[:, views] = x[own[problem.frame], np.arange(len(problem))][:, None]
+            moved = replace(problem, x=positions)
             fit = moved.fit(start=fit.start, rounds=10)
         return fit, moved, own
 

@@ -47,6 +47,7 @@ _HALVED = 2
 _RATIO = 0.8  # Lowe's ratio test
 _OVERLAY_PX = 2.0  # what lies nearer to the same place in both images is text or a mark that a recorder wrote there
 _FEWEST = 20  # matches that agree, below which a frame is no witness
+_AGREE_PX = 4.0  # median distance of these from their own geometry, above which they are matched by chance: a pattern repeats
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,6 +207,7 @@ def feature_matches(recording: Recording, frames: np.ndarray) -> np.ndarray:
         pairs = [best for best, second in pairs if best.distance < _RATIO * second.distance]
         y = _HALVED * np.array([[*left[m.queryIdx].pt, *right[m.trainIdx].pt] for m in pairs]).reshape(-1, 4)
         y = y[np.abs(y[:, :2] - y[:, 2:]).max(axis=1) > _OVERLAY_PX]
-        if (agree := affine_epipolar(y)[1]).sum() >= _FEWEST:
+        distance, agree = affine_epipolar(y)
+        if agree.sum() >= _FEWEST and np.median(distance[agree]) <= _AGREE_PX:
             found.append(y[agree])
     return np.concatenate(found)

@@ -19,10 +19,12 @@ _LEAST_SCALED, _SURE_SCALED, _OWN_SD = 0.03, 5.0, 0.006
 #: Least share of the variance that it explains, most that it leaves (RMS), and least turning of the jaws (RMS of n^2).
 _MOST_OF_IT, _ODD, _TURNED = 0.5, 0.03, 0.01
 _FIT_SHARE = 0.3  # of the landmarks in each image that must lie near where cameras see them, before these tell anything
+_DISTORTION_SD = 0.04  # at the corner, before the data
 _ACROSS = 0.15  # sine of a tool's angle to the images, below which it points neither way
 _UPSIDE_DOWN = 20.0  # odds that a microscope sees the tips of a tool below its base
 _SCALE = "Check the units and the scale of the {} columns of kinematics.csv, beside those of the others."
-BY_GEOMETRY = ("scaled_axis", "mirrored_axis", "exchanged_eyes", "mirrored_images")  # which the residuals do not show
+#: Which the residuals do not show.
+BY_GEOMETRY = ("scaled_axis", "mirrored_axis", "exchanged_eyes", "mirrored_images", "landmark_offset")
 
 
 def finite_distance(case: Case, fit: Robust) -> Iterator[Hypothesis]:
@@ -51,7 +53,8 @@ def lens(case: Case) -> Iterator[Hypothesis]:
     text = f"The lenses distort: the corners of the left image lie {left:.1f} % too far out, of the right one {right:.1f} %."
     cure = "`python3 -m lib calibrate RECORDING --model zero_skew+distance+radial` takes that on."
     size, sd = np.abs(fit.theta).max(), np.sqrt(np.trace(fit.covariance) / 2)
-    yield case.found("lens_distortion", fit, 2, (100 * size, 100 * sd, "%"), text, cure)
+    raw = fit.total - case.null.total - 0.5 * ((fit.theta / _DISTORTION_SD) ** 2).sum()
+    yield case.found("lens_distortion", fit, 2, (100 * size, 100 * sd, "%"), text, cure, raw=raw)
 
 
 def axes_and_eyes(case: Case, fit: Robust, sign: float) -> Iterator[Hypothesis]:

@@ -39,6 +39,8 @@ LIMITS: dict[str, tuple[float, float]] = {
     # Zoom of one camera over the other's, and along x over along y: optics of one microscope differ by some per cent.
     "zoom_ratio": (1.3, 2.0),
     "aspect": (1.08, 1.25),
+    # Degrees by which one image is turned against the other.
+    "roll": (30.0, 90.0),
     # One image is a mirror image (1) or not (0).
     "mirrored": (0.5, np.inf),
     # Standard deviations of a landmark's depth that the calibration adds to the detector's, at the edge of its own volume.
@@ -177,7 +179,8 @@ def _residuals(data: Correspondences | None, c: Calibration, robot_mm: float) ->
     r2, claim2 = (v.reshape(len(v), -1, 2).sum(axis=2) for v in (c.residuals_px[used] ** 2, variance))
     ratio = float(np.sqrt((r2 / (claim2 + np.multiply(gain, robot_mm**2)))[views].mean()))
     text = f"The residuals, {c.reprojection_rms_px:.1f} px RMS, are {ratio:.1f} times what detector and robot claim of each."
-    yield "residuals", ratio, text, f"Read the diagnosis of {_CHECK}: clock, axes, order of tips, detector."
+    more = " With more frames, constant offsets of the landmarks are estimated, too." * (c.offsets is None)
+    yield "residuals", ratio, text, f"Read the diagnosis of {_CHECK}: clock, axes, order of tips, detector.{more}"
 
     # What leaving a row out does to clean data: its residual grows by (1 - leverage)^-1/2.
     m = c.leverage.shape[1]
@@ -224,7 +227,9 @@ def _geometry(data: Correspondences | None, c: Calibration, robot_mm: float) -> 
     yield "convergence_high", min(angle, 180 - angle), text, cure, name
     if angle < 90:
         yield "convergence_low", angle, text, "Are left and right two different cameras?", name
-    mirrored = optics(c).mirrored
+    mirrored, roll = optics(c).mirrored, abs(np.rad2deg(optics(c).roll_rad))
+    text = f"The right image is turned by {roll:.0f} degrees against the left one."
+    yield "roll", roll, text, "Turn it back: surfaces cannot be matched otherwise.", "turned_image"
     text = f"One image is a mirror image ({mirrored}), or an axis of the kinematics is."
     cure = "Flip that image when recording, or exchange the sign of the axis."
     yield "mirrored", mirrored in ("left", "right", "left or right"), text, cure
@@ -284,7 +289,7 @@ def assess(
         behind = (left.depth_ratio(data.x_mm) <= 0) | (right.depth_ratio(data.x_mm) <= 0)
         data = replace(data, x_mm=np.where(behind[:, None], np.nan, data.x_mm))
         straight = replace(data, u_left=left.undistort(data.u_left), u_right=right.undistort(data.u_right))
-    diagnosis = diagnose(straight, near=near, **stated)
+    diagnosis = diagnose(straight, near=near, offsets=calibration and calibration.offsets, **stated)
     found = health(recording, data, calibration, detector=detector)
     verdict = judge(
         data, calibration, diagnosis=diagnosis, health=found, epipolar_px=epipolar_px, error=error,
