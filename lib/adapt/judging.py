@@ -74,13 +74,13 @@ def agreement(teacher: Teacher, seen: Seen) -> Agreement:
     return Agreement(errors_px(found, told).reshape(there.shape), sigmas.reshape(there.shape), tool_length_px(u)[..., None])
 
 
-def epipolar_px(recording: Recording, seen: Sequence[Seen], all_seen: Seen) -> list[np.ndarray]:
+def epipolar_px(recording: Recording, seen: Sequence[Seen], others: Seen) -> list[np.ndarray]:
     """Distances (m, 3) of left and right detections from an epipolar geometry, in px of one image; infinite where missing.
 
-    Features of the eye that both images show tell it, with what most of `all_seen` share: the tool is nearer than the eye,
-    and where cameras have a finite distance the eye alone says little of the lines there.
+    Features of the eye that both images show tell it, with what most of `others`, of other frames, share: the tool is nearer
+    than the eye, and where cameras have a finite distance the eye alone says little of the lines there.
     """
-    matches = np.concatenate([feature_matches(recording, seen[0].frame), all_seen.stacked_px.reshape(-1, 4)])
+    matches = np.concatenate([feature_matches(recording, seen[0].frame), others.stacked_px.reshape(-1, 4)])
     left, right = np.split(matches[np.isfinite(matches).all(axis=1)], 2, axis=1)
     F = None
     if len(left) >= _FEWEST:

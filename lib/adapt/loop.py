@@ -361,7 +361,7 @@ class _Work:
         """Compare the detectors on the frames that took no part."""
         seen = first.of(self.parts["judge"]), best_seen.of(self.parts["judge"])
         agreements = [agreement(teacher, own) for own in seen]
-        distances = epipolar_px(self.recording, seen, best_seen)
+        distances = epipolar_px(self.recording, seen, best_seen.of(self.parts["learn"]))
         length = agreements[0].length_px.mean(axis=1)
         told, spread = teacher.project(self.parts["judge"])
         robot, robot_sd = better(*(own.relative for own in agreements))

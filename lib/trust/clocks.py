@@ -99,7 +99,10 @@ def _frame_order(case: Case) -> Iterator[Hypothesis]:
         return
     trial, misfit = _scan(case, min(2.0, 0.4 * case.paths.span_s))  # lost frames may add up: most fit a later instant
     shifts = step * (np.arange(-8, 9) + round(float(trial[misfit.sum(axis=1).argmin()]) / step))
+    steps_px = np.abs(np.diff(case.by_frame(case.problem.y), axis=0)).max(axis=(1, 3), initial=0.0)
     for views in ((0, 1), (0,), (1,)):
+        if len(views) == 1 and (steps_px[:, views[0]] < 0.1 * steps_px[:, 1 - views[0]]).mean() > 0.02:
+            continue  # images come twice
         fit, moved, own = case.chosen(case.moved(shifts[:, None]), views)
         others = 1e3 * shifts[own][np.abs(shifts[own]) > step / 2]
         if len(others) < 3:  # it may be a spike of the log

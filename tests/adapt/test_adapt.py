@@ -8,15 +8,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from lib.adapt import RefusalError, adapt, loop, report, teach, teacher
+from lib.adapt import RefusalError, adapt, judging, loop, report, teach, teacher
 from lib.adapt.judging import Agreement, better, stretches
 from lib.adapt.looking import Seen, at_rest, look, look_elsewhere
 from lib.calibration.offsets import Unsettled, tool_axes
 from lib.correspondences import DataError
+from lib.geometry import RigidTransform
 from lib.landmarks import Detector, Landmarks
 from lib.recordings import Kinematics
 from lib.recordings.annotations import Annotations, write_coco
-from lib.simulator.rig import ROBOT_FROM_MICROSCOPE
+from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
 from tests.adapt.world import SIZE, Kept, StandIn, World, pupil
 from tests.remembering import remembering_teacher
 
@@ -697,3 +698,18 @@ def test_of_few_labels_only_the_offsets_may_go_on_for_ever(monkeypatch):
     monkeypatch.setattr(teacher, "_fitted", warned(Unsettled))
     with warnings.catch_warnings(action="error"):
         teacher._by_labels(None, few)
+
+
+def test_epipolar_lines_of_the_eye_hold_for_a_tool_that_is_nearer(monkeypatch):
+    """Cameras of a finite distance; the features lie on the eye, the tool millimetres above it."""
+    rng = np.random.default_rng(0)
+    rig = reference_rig(robot_from_microscope=RigidTransform.identity(), inverse_distance_per_mm=1 / 150)
+    eye = np.column_stack([rng.uniform(-7, 7, (300, 2)), rng.uniform(4, 5, 300)])
+    monkeypatch.setattr(judging, "feature_matches", lambda *_: np.hstack(rig.project(eye)) + rng.normal(0, 0.2, (300, 4)))
+    tool = rng.uniform([-6, -4, -4], [6, 4, 2], (40, 3, 3))
+    u = np.stack([v.reshape(40, 3, 2) for v in rig.project(tool.reshape(-1, 3))], axis=1)
+    u += rng.normal(0, 0.2, u.shape)
+    seen = Seen(np.arange(40), u, np.tile(np.eye(2), (40, 2, 3, 1, 1)), np.ones((40, 2, 3)))
+    off = seen._replace(u=u + rng.normal(0, 10, u.shape))
+    right, wrong = judging.epipolar_px(None, [seen.of(np.arange(30, 40)), off.of(np.arange(30, 40))], seen.of(np.arange(30)))
+    assert np.median(right) < 0.5 and np.median(wrong) > 4

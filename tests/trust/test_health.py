@@ -2,7 +2,9 @@
 
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
+import pytest
 
 from lib import paths
 from lib.calibration import calibrate
@@ -10,7 +12,7 @@ from lib.correspondences import LANDMARKS, Correspondences
 from lib.recordings import Recording
 from lib.simulator.rig import ROBOT_FROM_MICROSCOPE, reference_rig
 from lib.trust import health
-from lib.trust.health import LIMITS, affine_epipolar, unfamiliar
+from lib.trust.health import LIMITS, affine_epipolar, feature_matches, unfamiliar
 
 TOOL_MM = np.array([[0.0, 0.0, 0.0], [3.0, -0.5, 0.0], [3.0, 0.5, 0.0]])
 
@@ -80,6 +82,18 @@ def test_epipolar_geometry_of_most_matches():
     distance, agree = affine_epipolar(y)
     assert np.median(distance[agree]) < 1.5 and agree.mean() > 0.6 and np.median(distance[wrong.ravel()]) > 10
     assert np.isnan(affine_epipolar(y[:8])[0]).all()
+
+
+@pytest.mark.parametrize("shuffled", [False, True])
+def test_matches_that_share_no_geometry_are_no_witness(shuffled):
+    """As of a pattern that repeats: each feature has a partner, in any place."""
+    rng = np.random.default_rng(0)
+    left = cv2.resize(rng.integers(0, 255, (108, 192, 3), dtype=np.uint8), (960, 540), interpolation=cv2.INTER_CUBIC)
+    tiles = left.reshape(9, 60, 16, 60, 3).swapaxes(1, 2).reshape(144, 60, 60, 3)
+    order = rng.permutation(144) if shuffled else np.roll(np.arange(144), 1)
+    right = tiles[order].reshape(9, 16, 60, 60, 3).swapaxes(1, 2).reshape(540, 960, 3)
+    found = feature_matches(SimpleNamespace(frames=[SimpleNamespace(left=left, right=right)]), np.array([0]))
+    assert (len(found) == 0) == shuffled
 
 
 def test_an_unlit_picture_and_a_chessboard_are_unfamiliar_and_the_shipped_recording_is_not():

@@ -50,6 +50,12 @@ def names(data, **options):
     return {reason.name: reason.level for reason in judge(data, calibration, **options).reasons}
 
 
+def test_an_image_that_is_turned_against_the_other_is_named():
+    data = made(40, 0)
+    turned = replace(data, u_right=np.array([1919.0, 1079.0]) - data.u_right)
+    assert names(data) == {} and names(turned) == {"turned_image": LEVELS[2]}
+
+
 @pytest.mark.parametrize("n", [6, 8, 12, 40])
 def test_clean_data_of_any_size_are_never_red(n):
     levels = [level for seed in range(15) for level in names(made(n, seed)).values()]
